@@ -1,0 +1,62 @@
+"""Checks and conversions at construction: what is inadmissible is refused by name, value and range."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+
+def as_scalar(x: ArrayLike) -> Float[Array, ""]:
+    """A floating-point JAX scalar, in JAX's default precision."""
+    return as_array(x).reshape(())
+
+
+def as_array(x: ArrayLike) -> Float[Array, "..."]:
+    """A floating-point JAX array, in JAX's default precision (a JAX float array is kept as it is)."""
+    if isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jnp.floating):
+        return x
+    return jnp.asarray(x, dtype=float)
+
+
+def concrete(x: object) -> np.ndarray | None:
+    """`x` as a NumPy array, or None where it is a tracer or no array: those cannot be checked."""
+    if isinstance(x, jax.core.Tracer):
+        return None
+    try:
+        return np.asarray(x, dtype=float)
+    except (TypeError, ValueError):
+        return None
+
+
+def check_range(
+    field: str,
+    x: object,
+    low: float = -np.inf,
+    high: float = np.inf,
+    *,
+    low_open: bool = False,
+    high_open: bool = False,
+) -> None:
+    """Refuse `x` unless every element is a number (not NaN) between `low` and `high`.
+
+    Infinite values are refused as well. Tracers pass: inside a transformation nothing can be said.
+
+    **Raises:** `ValueError` naming `field`, the first offending value and the admissible range.
+    """
+    values = concrete(x)
+    if values is None:
+        return
+    ok = np.isfinite(values)
+    ok &= (values > low) if low_open else (values >= low)
+    ok &= (values < high) if high_open else (values <= high)
+    if not np.all(ok):
+        left = "(" if low_open or low == -np.inf else "["
+        right = ")" if high_open or high == np.inf else "]"
+        bad = float(values[~ok].flat[0])
+        raise ValueError(f"{field} = {bad:g} is outside the admissible range {left}{low:g}, {high:g}{right}")
+
+
+def check_choice(field: str, x: str, choices: tuple[str, ...]) -> None:
+    """Refuse a name that is not among `choices`."""
+    if x not in choices:
+        raise ValueError(f"{field} = {x!r} is none of {', '.join(map(repr, choices))}")

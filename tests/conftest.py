@@ -1,0 +1,30 @@
+"""Every test runs with rank promotion refused; shapes and types of the packages are checked at run time."""
+
+from pathlib import Path
+
+import jax
+import pytest
+from jaxtyping import install_import_hook
+
+jax.config.update("jax_numpy_rank_promotion", "raise")
+
+with install_import_hook(["jaxlidar", "inversion"], "beartype.beartype"):
+    import inversion  # noqa: F401
+    import jaxlidar  # noqa: F401
+
+SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+
+@pytest.fixture
+def shared():
+    """The folder of records and reference results that lies beside the checkout, where there is one."""
+    if not SHARED.is_dir():
+        pytest.skip("the folder of reference data is not beside this checkout")
+    return SHARED
+
+
+@pytest.fixture(params=["float32", "float64"])
+def precision(request):
+    """Runs the test in single and in double precision; gives the name of the floating-point type."""
+    with jax.enable_x64(request.param == "float64"):
+        yield request.param
