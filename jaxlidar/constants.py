@@ -1,0 +1,7 @@
+"""Physical constants in the package's units (CODATA 2018, exact by definition of the SI)."""
+
+SPEED_OF_LIGHT = 0.299792458
+"""Speed of light in vacuum, m/ns."""
+
+PLANCK_TIMES_LIGHT = 6.62607015e-34 * 299792458.0 * 1e9
+"""h c in J nm: a photon of wavelength `w` nm carries `PLANCK_TIMES_LIGHT / w` J."""

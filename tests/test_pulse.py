@@ -1,0 +1,339 @@
+"""Pulses against quadrature in high precision, at the edges of their parameters, and their derivatives."""
+
+import itertools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import mpmath as mp
+import numpy as np
+import pytest
+
+from jaxlidar.pulse import (
+    ExponentiallyModifiedGaussianPulse,
+    GaussianPulse,
+    RectangularPulse,
+    SampledPulse,
+)
+
+TOLERANCE = {"float32": 1e-6, "float64": 1e-13}
+FWHM = 2 * mp.sqrt(2 * mp.log(2))
+
+
+def exact_gaussian(t, jitter, fwhm):
+    s = mp.sqrt((fwhm / FWHM) ** 2 + mp.mpf(jitter) ** 2)
+    if s == 0:
+        return (mp.sign(t) + 1) / 2
+    return mp.ncdf(t / s)
+
+
+def exact_pieces(t, jitter, knots):
+    """The blurred running integral of the power through `knots`, by quadrature between them."""
+    area = sum((b[0] - a[0]) * (a[1] + b[1]) / 2 for a, b in itertools.pairwise(knots))
+    total = mp.mpf(0)
+    for (ta, pa), (tb, pb) in itertools.pairwise(knots):
+        line = lambda u, ta=ta, pa=pa, tb=tb, pb=pb: pa + (pb - pa) * (u - ta) / (tb - ta)  # noqa: E731
+        if jitter == 0:
+            end = min(max(t, ta), tb)
+            total += (end - ta) * (pa + line(end)) / 2
+        else:
+            marks = sorted({ta, tb} | {min(max(t + k * jitter, ta), tb) for k in (-12, -4, 0, 4, 12)})
+            total += mp.quad(lambda u: line(u) * mp.ncdf((t - u) / jitter), marks)  # noqa: B023
+    return total / area
+
+
+def exact_emg(t, jitter, fwhm, decay):
+    if decay == 0:
+        return exact_gaussian(t, jitter, fwhm)
+    s, t = mp.sqrt((fwhm / FWHM) ** 2 + mp.mpf(jitter) ** 2), t + decay
+    if s == 0:
+        return 1 - mp.exp(-t / decay) if t > 0 else mp.mpf(0)
+    # mpmath's range is unlimited, so the textbook form serves with enough digits.
+    with mp.workdps(60):
+        tail = mp.exp(s**2 / (2 * decay**2) - t / decay) * mp.ncdf(t / s - s / decay)
+        return mp.ncdf(t / s) - tail
+
+
+KNOTS = [(-3.0, 0.0), (-1.0, 2.0), (-0.75, 1.5), (4.0, 0.25), (6.0, 1.0)]  # jumps at its end
+SAMPLED = {"time": [a for a, _ in KNOTS], "power": [b for _, b in KNOTS]}
+
+
+def sampled():
+    return SampledPulse(**SAMPLED)
+
+
+CASES = {
+    "gaussian": (lambda: GaussianPulse(6.0), lambda t, j: exact_gaussian(t, j, 6.0)),
+    "gaussian, wide": (lambda: GaussianPulse(1000.0), lambda t, j: exact_gaussian(t, j, 1000.0)),
+    "gaussian, instant": (lambda: GaussianPulse(0.0), lambda t, j: exact_gaussian(t, j, 0.0)),
+    "rectangle": (
+        lambda: RectangularPulse(6.0),
+        lambda t, j: exact_pieces(t, j, [(-3.0, 1.0), (3.0, 1.0)]),
+    ),
+    "rectangle, narrow": (
+        lambda: RectangularPulse(0.0078125),
+        lambda t, j: exact_pieces(t, j, [(-0.00390625, 1.0), (0.00390625, 1.0)]),
+    ),
+    "rectangle, instant": (lambda: RectangularPulse(0.0), lambda t, j: exact_gaussian(t, j, 0.0)),
+    "exponential": (
+        lambda: ExponentiallyModifiedGaussianPulse(3.0, 2.0),
+        lambda t, j: exact_emg(t, j, 3.0, 2.0),
+    ),
+    "exponential, short": (
+        lambda: ExponentiallyModifiedGaussianPulse(6.0, 2.0**-10),
+        lambda t, j: exact_emg(t, j, 6.0, 2.0**-10),
+    ),
+    "exponential, long": (
+        lambda: ExponentiallyModifiedGaussianPulse(2.0**-10, 512.0),
+        lambda t, j: exact_emg(t, j, 2.0**-10, 512.0),
+    ),
+    "exponential, pure": (
+        lambda: ExponentiallyModifiedGaussianPulse(0.0, 3.0),
+        lambda t, j: exact_emg(t, j, 0.0, 3.0),
+    ),
+    "exponential, none": (
+        lambda: ExponentiallyModifiedGaussianPulse(6.0, 0.0),
+        lambda t, j: exact_emg(t, j, 6.0, 0.0),
+    ),
+    "exponential, instant": (
+        lambda: ExponentiallyModifiedGaussianPulse(0.0, 0.0),
+        lambda t, j: exact_gaussian(t, j, 0.0),
+    ),
+    "sampled": (sampled, lambda t, j: exact_pieces(t, j, KNOTS)),
+}
+NAMES = list(CASES)
+# Representable in both precisions, so that rounding of the input is no part of the error.
+TIMES = [
+    -1000.0,
+    -20.0,
+    -6.5,
+    -3.0,
+    -2.75,
+    -1.0,
+    -0.125,
+    0.0,
+    0.00390625,
+    0.5,
+    1.75,
+    3.0,
+    5.5,
+    7.25,
+    31.0,
+    2000.0,
+]
+
+
+@pytest.mark.parametrize("jitter", [0.0, 0.0009765625, 0.25, 2.0, 64.0])
+@pytest.mark.parametrize("name", NAMES)
+def test_cumulative_is_exact(name, jitter, precision):
+    make, exact = CASES[name]
+    expected = np.array([float(exact(mp.mpf(t), mp.mpf(jitter))) for t in TIMES])
+    got = make().cumulative(np.array(TIMES, precision), jitter)
+    assert got.dtype == precision
+    np.testing.assert_allclose(got, expected, rtol=0, atol=TOLERANCE[precision])
+
+
+@pytest.mark.parametrize("ratio", [2.0**k for k in range(-8, 9, 2)])
+def test_exponential_is_exact_for_every_ratio_of_width_to_decay(ratio, precision):
+    """Dense in time, so that both evaluations and the change between them are met."""
+    jitter, decay = 2.0, 2.0 / ratio
+    t = np.linspace(-12, 24, 145)
+    expected = [float(exact_emg(mp.mpf(x), mp.mpf(jitter), 0.0, mp.mpf(decay))) for x in t]
+    got = ExponentiallyModifiedGaussianPulse(0.0, decay).cumulative(t.astype(precision), jitter)
+    np.testing.assert_allclose(got, expected, rtol=0, atol=TOLERANCE[precision])
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_area_is_one_and_the_integral_never_falls(name, precision):
+    low, high = (pulse := CASES[name][0]()).support(0.5)
+    value = np.asarray(pulse.cumulative(np.linspace(low, high, 1001), 0.5))
+    assert value[0] < 1e-6
+    assert value[-1] > 1 - 1e-6
+    assert np.diff(value).min() > -TOLERANCE[precision]
+
+
+@pytest.mark.parametrize("jitter", [0.0, 0.7])
+@pytest.mark.parametrize("name", NAMES)
+def test_support_leaves_out_less_than_it_says(name, jitter):
+    with jax.enable_x64(True):
+        pulse = CASES[name][0]()
+        low, high = pulse.support(jitter)
+        outside = pulse.cumulative(low, jitter) + 1 - pulse.cumulative(high, jitter)
+        if high > low:
+            assert 0 <= float(outside) < 1e-7
+        else:
+            assert low == high == 0.0
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_mean_and_std_are_those_of_the_shape(name, precision):
+    pulse, jitter = CASES[name][0](), 0.5
+    low, high = pulse.support(jitter)
+    edges = np.linspace(low, high, 20001)
+    with jax.enable_x64(True):
+        share = np.diff(np.asarray(pulse.cumulative(edges, jitter)))
+    centres = (edges[1:] + edges[:-1]) / 2
+    mean = np.sum(share * centres)
+    # Bins add their own variance; jitter's adds to the pulse's.
+    variance = np.sum(share * (centres - mean) ** 2) - (edges[1] - edges[0]) ** 2 / 12 - jitter**2
+    np.testing.assert_allclose(pulse.mean, mean, atol=2e-5 * (high - low))
+    np.testing.assert_allclose(pulse.std, np.sqrt(max(variance, 0.0)), atol=2e-4 * (high - low))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_power_is_the_slope_of_the_integral(name):
+    with jax.enable_x64(True):
+        pulse, jitter, step = CASES[name][0](), 0.3, 1e-4
+        t = np.linspace(-9.0, 9.0, 25)
+        slope = (pulse.cumulative(t + step, jitter) - pulse.cumulative(t - step, jitter)) / (2 * step)
+        np.testing.assert_allclose(pulse.power(t, jitter), slope, atol=1e-7)
+
+
+def test_power_of_plain_shapes():
+    np.testing.assert_allclose(
+        RectangularPulse(4.0).power(np.array([-3.0, -2.0, 0.0, 1.9])), [0, 0.125, 0.25, 0.25]
+    )
+    area = np.trapezoid(SAMPLED["power"], SAMPLED["time"])
+    expected = np.interp([-2.0, -0.5, 5.0], *zip(*KNOTS)) / area
+    np.testing.assert_allclose(sampled().power(np.array([-2.0, -0.5, 5.0])), expected, rtol=1e-5)
+    peak = 2 * np.sqrt(np.log(2) / np.pi) / 6
+    np.testing.assert_allclose(GaussianPulse(6.0).power(np.array([0.0, 3.0])), [peak, peak / 2], rtol=1e-5)
+
+
+@pytest.mark.parametrize("jitter", [0.05, 0.9])
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda p: GaussianPulse(p[0]),
+        lambda p: RectangularPulse(p[0]),
+        lambda p: ExponentiallyModifiedGaussianPulse(p[0], p[1]),
+        lambda p: ExponentiallyModifiedGaussianPulse(p[0], 0.01 * p[1]),
+        lambda p: SampledPulse(time=jnp.stack([-p[1], 0.0 * p[0], p[0]]), power=jnp.stack([p[1], p[0], 1.0])),
+    ],
+)
+def test_derivatives_match_central_differences(make, jitter):
+    with jax.enable_x64(True):
+        t = jnp.array([-4.0, -1.3, 0.0, 0.4, 1.25, 3.7])
+        unknowns = jnp.array([2.5, 1.3, jitter])
+
+        def function(x):
+            return make(x).cumulative(t + 0.1 * x[0], x[2])
+
+        forward, reverse = jax.jacfwd(function)(unknowns), jax.jacrev(function)(unknowns)
+        np.testing.assert_allclose(forward, reverse, atol=1e-13)
+        steps = 1e-5 * np.eye(3)
+        numeric = [(function(unknowns + h) - function(unknowns - h)) / 2e-5 for h in steps]
+        np.testing.assert_allclose(forward, np.stack(numeric, -1), atol=2e-8)
+
+        def slope(x):
+            return jax.jacfwd(function)(x)
+
+        numeric = [(slope(unknowns + h) - slope(unknowns - h)) / 2e-5 for h in steps]
+        np.testing.assert_allclose(jax.jacfwd(slope)(unknowns), np.stack(numeric, -1), atol=3e-6)
+
+
+EXTREMES = {
+    "gaussian": lambda p: GaussianPulse(p),
+    "rectangle": lambda p: RectangularPulse(p),
+    "exponential, both": lambda p: ExponentiallyModifiedGaussianPulse(p, p),
+    "exponential, width": lambda p: ExponentiallyModifiedGaussianPulse(p, 3.0),
+    "exponential, decay": lambda p: ExponentiallyModifiedGaussianPulse(3.0, p),
+    "sampled": lambda p: SampledPulse([-1.0, 0.0, 1.0], jnp.stack([p, 1.0 + 0 * p, 0 * p])),
+}
+
+
+@pytest.mark.parametrize("name", list(EXTREMES))
+def test_everything_is_finite_at_the_extremes(name, precision):
+    t = jnp.array([-4e3, -3.0, -1.0, -1e-6, 0.0, 1e-20, 1.0, 3.0, 4e5])
+
+    def function(p, j, t):
+        return EXTREMES[name](p).cumulative(t, j)
+
+    everything = jax.jit(
+        lambda *x: (function(*x), jax.jacrev(function, (0, 1, 2))(*x), jax.jvp(function, x, x))
+    )
+    for width in [0.0, 1e-30, 1e-13, 1e-6, 1e-3, 1.0, 1e3]:
+        for jitter in [0.0, 1e-30, 1e-13, 1e-6, 1.0, 1e3]:
+            value, reverse, forward = everything(jnp.asarray(width), jnp.asarray(jitter), t)
+            assert np.all((value > -1e-6) & (value < 1 + 1e-6)), (width, jitter)
+            for derivative in jax.tree.leaves((reverse, forward)):
+                assert np.all(np.isfinite(derivative)), (width, jitter)
+
+
+def test_instants_are_steps_of_one_half():
+    t = np.array([-1e-3, 0.0, 1e-3])
+    for pulse in (GaussianPulse(0.0), RectangularPulse(0.0), ExponentiallyModifiedGaussianPulse(0.0, 0.0)):
+        np.testing.assert_array_equal(pulse.cumulative(t), [0.0, 0.5, 1.0])
+        np.testing.assert_array_equal(pulse.power(t), 0.0)
+
+
+def test_vanishing_decay_has_the_derivative_of_the_limit():
+    """Time zero is the centroid, so a short tail changes the integral to second order only."""
+    with jax.enable_x64(True):
+        t = jnp.linspace(-5, 5, 11)
+        slope = jax.jacfwd(lambda d: ExponentiallyModifiedGaussianPulse(4.0, d).cumulative(t))(0.0)
+        np.testing.assert_allclose(slope, 0.0, atol=1e-14)
+
+
+def test_a_finely_sampled_shape_is_that_shape(precision):
+    time = np.linspace(-20, 20, 801)
+    pulse = GaussianPulse(6.0)
+    copy = SampledPulse(time, 37.0 * np.asarray(pulse.power(time)))
+    t = np.linspace(-15, 15, 61)
+    # Linear pieces err by (step^2 / 8) p'', here 5e-6 of the area's scale.
+    np.testing.assert_allclose(copy.cumulative(t, 0.4), pulse.cumulative(t, 0.4), atol=2e-5)
+    shifted = SampledPulse(time + 2.0, pulse.power(time))
+    np.testing.assert_allclose(shifted.cumulative(t + 2.0), copy.cumulative(t), atol=2e-6)
+    np.testing.assert_allclose(shifted.mean, 2.0, atol=1e-5)
+    np.testing.assert_allclose(copy.std, pulse.std, rtol=1e-4)
+
+
+def test_a_sampled_pulse_may_be_faint_and_padded(precision):
+    pulse = SampledPulse(time=(0, 1, 2, 3, 4, 5), power=np.array([0, 0, 1e-30, 2e-30, 0, 0]))
+    assert pulse.support() == (1.0, 4.0)
+    np.testing.assert_allclose(
+        pulse.cumulative(np.array([1.0, 2.0, 3.0, 4.0])), [0, 1 / 6, 2 / 3, 1], rtol=1e-6
+    )
+
+
+def test_jit_and_vmap_without_retracing():
+    traces = []
+
+    @eqx.filter_jit
+    def function(pulse, t):
+        traces.append(None)
+        return pulse.cumulative(t, 0.1)
+
+    t = jnp.linspace(-4, 4, 5)
+    for width in (1.0, 2.0, 0.0):
+        np.testing.assert_allclose(
+            function(GaussianPulse(width), t), GaussianPulse(width).cumulative(t, 0.1), atol=1e-6
+        )
+    assert len(traces) == 1
+    many = eqx.filter_vmap(lambda w: RectangularPulse(w).cumulative(t))(jnp.array([0.0, 1.0, 5.0]))
+    np.testing.assert_allclose(many[2], RectangularPulse(5.0).cumulative(t), atol=1e-7)
+    grid = sampled().cumulative(t.reshape(5, 1), 0.2)
+    np.testing.assert_allclose(grid[:, 0], sampled().cumulative(t, 0.2), atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: GaussianPulse(-1.0), r"fwhm = -1 .*\[0, inf"),
+        (lambda: GaussianPulse(np.nan), "fwhm = nan"),
+        (lambda: RectangularPulse(-0.5), "length = -0.5"),
+        (lambda: RectangularPulse(np.inf), "length = inf"),
+        (lambda: ExponentiallyModifiedGaussianPulse(-1.0, 1.0), "fwhm = -1"),
+        (lambda: ExponentiallyModifiedGaussianPulse(1.0, -2.0), "decay = -2"),
+        (lambda: SampledPulse([0.0, 2.0, 1.0], [1.0, 1.0, 1.0]), "time = 2 is followed by 1"),
+        (lambda: SampledPulse([0.0, 0.0], [1.0, 1.0]), "time = 0 is followed by 0"),
+        (lambda: SampledPulse([0.0], [1.0]), "two samples or more"),
+        (lambda: SampledPulse([0.0, 1.0], [1.0, 1.0, 1.0]), "shapes"),
+        (lambda: SampledPulse([0.0, np.nan], [1.0, 1.0]), "time = nan"),
+        (lambda: SampledPulse([0.0, 1.0], [1.0, -0.1]), "power = -0.1"),
+        (lambda: SampledPulse([0.0, 1.0], [0.0, 0.0]), "power = 0 throughout"),
+    ],
+)
+def test_inadmissible_input_is_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
