@@ -27,6 +27,13 @@ def _vector(x: ArrayLike | Sequence[ArrayLike]) -> Float[Array, " n"]:
     return jnp.atleast_1d(_numbers(x))
 
 
+def _position(x: ArrayLike | Sequence[ArrayLike]) -> Float[Array, " 2"]:
+    position = _numbers(x)
+    if position.shape != (2,):
+        raise ValueError(f"position has shape {position.shape}; admissible is (2,), for x and y")
+    return position
+
+
 def _optional_scalar(x: ArrayLike | None) -> Float[Array, ""] | None:
     return None if x is None else as_scalar(x)
 
@@ -69,7 +76,7 @@ class Lidar(eqx.Module):
     energy: Float[Array, "..."] = eqx.field(converter=_numbers, default=1e-3)
     sampling_interval: Float[Array, ""] = eqx.field(converter=as_scalar, default=1.0)
     profile: str = eqx.field(static=True, default="gaussian")
-    position: Float[Array, " 2"] = eqx.field(converter=_vector, default=(0.0, 0.0))
+    position: Float[Array, " 2"] = eqx.field(converter=_position, default=(0.0, 0.0))
     field_of_view: Float[Array, ""] | None = eqx.field(converter=_optional_scalar, default=None)
     jitter: Float[Array, ""] = eqx.field(converter=as_scalar, default=0.0)
     efficiency: Float[Array, "..."] = eqx.field(converter=_numbers, default=1.0)

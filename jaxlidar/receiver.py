@@ -59,6 +59,8 @@ class Receiver(eqx.Module):
             check_range("saturation", self.saturation, 0.0, low_open=True)
         if self.bits is not None:
             check_range("bits", self.bits, 1, 24)
+            if self.bits != int(self.bits):
+                raise ValueError(f"bits = {self.bits} is no whole number in [1, 24]")
             if self.saturation is None:
                 raise ValueError(f"bits = {self.bits} needs a saturation in (0, inf), but saturation = None")
         check_range("background", self.background, 0.0)
@@ -163,8 +165,9 @@ def first_return_window(
     samples = math.ceil(centres.size / ratio - 1e-6)
     lit = jnp.any(energy.reshape(-1, centres.size) > threshold, axis=0)
     first = jnp.argmax(lit).astype(energy.dtype)
-    low = first + ratio * np.arange(samples)[:, None]  # in fine bins from the record's start
-    fine = np.arange(centres.size)[None, :]
-    share = jnp.clip(jnp.minimum(low + ratio, fine + 1.0) - jnp.maximum(low, fine), 0.0)
-    times = centres[0] + step * (low[:, 0] + 0.5 * ratio - 0.5)
+    # In fine bins from the opening, so that neighbours share their edges to the last bit.
+    edges = jnp.asarray(ratio * np.arange(samples + 1), energy.dtype)[:, None]
+    fine = (np.arange(centres.size) - first)[None, :]
+    share = jnp.clip(jnp.minimum(edges[1:], fine + 1) - jnp.maximum(edges[:-1], fine), 0.0)
+    times = centres[0] + step * (first + ratio * np.arange(samples) + 0.5 * ratio - 0.5)
     return times, jnp.einsum("...b,sb->...s", energy, share)

@@ -200,7 +200,6 @@ def test_power_of_plain_shapes():
     np.testing.assert_allclose(GaussianPulse(6.0).power(np.array([0.0, 3.0])), [peak, peak / 2], rtol=1e-5)
 
 
-@pytest.mark.parametrize("jitter", [0.05, 0.9])
 @pytest.mark.parametrize(
     "make",
     [
@@ -211,25 +210,20 @@ def test_power_of_plain_shapes():
         lambda p: SampledPulse(time=jnp.stack([-p[1], 0.0 * p[0], p[0]]), power=jnp.stack([p[1], p[0], 1.0])),
     ],
 )
-def test_derivatives_match_central_differences(make, jitter):
+def test_derivatives_match_central_differences(make):
     with jax.enable_x64(True):
         t = jnp.array([-4.0, -1.3, 0.0, 0.4, 1.25, 3.7])
-        unknowns = jnp.array([2.5, 1.3, jitter])
-
-        def function(x):
-            return make(x).cumulative(t + 0.1 * x[0], x[2])
-
-        forward, reverse = jax.jacfwd(function)(unknowns), jax.jacrev(function)(unknowns)
-        np.testing.assert_allclose(forward, reverse, atol=1e-13)
+        function = jax.jit(lambda x: make(x).cumulative(t + 0.1 * x[0], x[2]))
+        forward, reverse = jax.jit(jax.jacfwd(function)), jax.jit(jax.jacrev(function))
+        second = jax.jit(jax.jacfwd(forward))
         steps = 1e-5 * np.eye(3)
-        numeric = [(function(unknowns + h) - function(unknowns - h)) / 2e-5 for h in steps]
-        np.testing.assert_allclose(forward, np.stack(numeric, -1), atol=2e-8)
-
-        def slope(x):
-            return jax.jacfwd(function)(x)
-
-        numeric = [(slope(unknowns + h) - slope(unknowns - h)) / 2e-5 for h in steps]
-        np.testing.assert_allclose(jax.jacfwd(slope)(unknowns), np.stack(numeric, -1), atol=3e-6)
+        for unknowns in (jnp.array([2.5, 1.3, 0.05]), jnp.array([2.5, 1.3, 0.9])):
+            slope = forward(unknowns)
+            np.testing.assert_allclose(slope, reverse(unknowns), atol=1e-13)
+            numeric = [(function(unknowns + h) - function(unknowns - h)) / 2e-5 for h in steps]
+            np.testing.assert_allclose(slope, np.stack(numeric, -1), atol=2e-8)
+            numeric = [(forward(unknowns + h) - forward(unknowns - h)) / 2e-5 for h in steps]
+            np.testing.assert_allclose(second(unknowns), np.stack(numeric, -1), atol=3e-6)
 
 
 EXTREMES = {
