@@ -1,0 +1,209 @@
+"""GEDI's level 1B reader: a small file written here, the recorded one, and damaged ones."""
+
+import sys
+
+import numpy as np
+import pytest
+
+from jaxlidar.io import read_gedi_l1b
+from jaxlidar.pulse import SampledPulse
+
+h5py = pytest.importorskip("h5py")
+
+RECORD = "GEDI01_B_2019108080338_O01964_T05337_02_003_01_sub.h5"
+
+
+def _tx(reference):
+    t = np.arange(128) - reference
+    return 250 + 900 * np.exp(-0.5 * (t / 6) ** 2)
+
+
+def _write(path, start="right"):
+    """Two beams, of 3 shots (40, 50, 60 bins) and 1 (30). Bin k of shot i holds 200 + 10 i + k / 100."""
+    counts = {"BEAM0001": [40, 50, 60], "BEAM0101": [30]}
+    with h5py.File(path, "w") as file:
+        for b, (name, count) in enumerate(counts.items()):
+            n = len(count)
+            group = file.create_group(name)
+            first = np.cumsum(count) - count
+            if start == "full file":
+                first = first + 123456
+            group["shot_number"] = np.array([10**16 + 10 * b + i for i in range(n)], dtype=np.uint64)
+            group["rx_sample_count"] = np.array(count, dtype=np.uint16)
+            group["rx_sample_start_index"] = (first + 1).astype(np.uint64)
+            group["tx_sample_count"] = np.full(n, 128, dtype=np.uint16)
+            group["tx_sample_start_index"] = (128 * np.arange(n) + 1).astype(np.uint64)
+            waveforms = [200.0 + 10 * i + np.arange(c) / 100 for i, c in enumerate(count)]
+            group["rxwaveform"] = np.concatenate(waveforms).astype(np.float32)
+            group["txwaveform"] = np.concatenate([_tx(55.25 + i) for i in range(n)]).astype(np.float32)
+            group["tx_gloc"] = (55.25 + np.arange(n)).astype(np.float32)
+            group["noise_mean_corrected"] = np.full(n, 199.5)
+            group["noise_stddev_corrected"] = np.full(n, 3.0)
+            where = group.create_group("geolocation")
+            where["elevation_bin0"] = np.full(n, 500.0)
+            where["elevation_lastbin"] = 500.0 - 0.15 * (np.array(count) - 1)
+            where["latitude_lastbin"] = np.full(n, -13.5)
+            where["longitude_lastbin"] = np.full(n, -44.25)
+            where["altitude_instrument"] = np.full(n, 412000.0)
+            where["local_beam_elevation"] = np.full(n, np.deg2rad(88.5), dtype=np.float32)
+            where["local_beam_azimuth"] = np.full(n, np.deg2rad(-160.0), dtype=np.float32)
+    return path
+
+
+@pytest.fixture
+def small(tmp_path):
+    return _write(tmp_path / "small.h5")
+
+
+@pytest.fixture(scope="module")
+def recorded():
+    from conftest import SHARED
+
+    if not (SHARED / "gedi" / RECORD).is_file():
+        pytest.skip("the recorded GEDI file is not beside this checkout")
+    answers = np.load(SHARED / "gedi" / "level2_answers_60_shots.npz")
+    shots = {shot.shot_number: shot for shot in read_gedi_l1b(SHARED / "gedi" / RECORD)}
+    return shots, answers
+
+
+@pytest.mark.parametrize("start", ["right", "full file"])
+def test_fields(tmp_path, start):
+    shots = read_gedi_l1b(_write(tmp_path / "small.h5", start))
+    assert [(s.beam, s.shot_number - 10**16, s.time.size) for s in shots] == [
+        ("BEAM0001", 0, 40),
+        ("BEAM0001", 1, 50),
+        ("BEAM0001", 2, 60),
+        ("BEAM0101", 10, 30),
+    ]
+    shot = shots[1]
+    np.testing.assert_allclose(shot.waveform, 210 + np.arange(50) / 100, rtol=1e-6)
+    np.testing.assert_allclose(shot.signal, shot.waveform - 199.5)
+    np.testing.assert_array_equal(shot.time, np.arange(50))
+    np.testing.assert_allclose(shot.elevation, 500 - 0.15 * np.arange(50))
+    assert (shot.noise_mean, shot.noise_std) == (199.5, 3.0)
+    assert (shot.latitude, shot.longitude, shot.altitude) == (-13.5, -44.25, 412000.0)
+    assert shot.zenith == pytest.approx(1.5, abs=1e-5)
+    assert shot.azimuth == pytest.approx(20.0, abs=1e-4)
+    assert shot.pulse_time[shot.pulse_power.argmax()] == pytest.approx(0, abs=0.5)
+    pulse = SampledPulse(time=shot.pulse_time, power=shot.pulse_power)
+    assert float(pulse.mean) == pytest.approx(0, abs=2e-3)
+    assert float(pulse.std) == pytest.approx(6, rel=5e-3)
+
+
+def test_selection(small):
+    everything = read_gedi_l1b(small)
+
+    def numbers(shot):
+        return [s.shot_number for s in read_gedi_l1b(small, shot)]
+
+    assert numbers(2) == [everything[2].shot_number]
+    assert numbers([3, 0]) == [everything[3].shot_number, everything[0].shot_number]
+    assert numbers(np.array([1])) == [everything[1].shot_number]
+    assert numbers(10**16 + 10) == [10**16 + 10]
+    assert numbers(np.array([10**16 + 1], dtype=np.uint64)) == [10**16 + 1]
+    assert numbers([]) == []
+    for bad in (4, -1, 10**16 + 5):
+        with pytest.raises(ValueError, match=rf"small\.h5.*{bad}.*\[0, 3\]"):
+            read_gedi_l1b(small, bad)
+    with pytest.raises(ValueError, match=r"shot = 0\.5"):
+        read_gedi_l1b(small, np.array([0.5]))
+
+
+def test_wrong_files(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"none\.h5"):
+        read_gedi_l1b(tmp_path / "none.h5")
+    text = tmp_path / "text.h5"
+    text.write_text("no HDF5")
+    with pytest.raises(ValueError, match=r"text\.h5.*HDF5"):
+        read_gedi_l1b(text)
+    other = tmp_path / "other.h5"
+    with h5py.File(other, "w") as file:
+        file["x"] = 1.0
+    with pytest.raises(ValueError, match=r"other\.h5.*BEAM"):
+        read_gedi_l1b(other)
+    cut = tmp_path / "cut.h5"
+    cut.write_bytes(_write(tmp_path / "small.h5").read_bytes()[:5000])
+    with pytest.raises(ValueError, match=r"cut\.h5"):
+        read_gedi_l1b(cut)
+
+
+@pytest.mark.parametrize(
+    ("field", "change", "place"),
+    [
+        ("tx_gloc", None, "tx_gloc.*no such dataset"),
+        ("rxwaveform", None, "rxwaveform.*no such dataset"),
+        ("rxwaveform", lambda x: x[:-1], "rx_sample_start_index.*149"),
+        (
+            "rxwaveform",
+            lambda x: np.where(np.arange(x.size) == 45, np.nan, x),
+            "rxwaveform.*0001.*sample 5 is nan",
+        ),
+        ("tx_sample_count", lambda x: x[:2], "tx_sample_count.*shape"),
+        ("rx_sample_count", lambda x: x * 0, "rx_sample_count.*0000.*0 samples"),
+        ("tx_gloc", lambda x: x * np.nan, "tx_gloc.*nan"),
+        ("tx_gloc", lambda x: x + 100, r"tx_gloc.*155\.25.*\[0, 127\]"),
+        ("noise_stddev_corrected", lambda x: -x, "noise_stddev_corrected.*-3"),
+        ("geolocation/elevation_lastbin", lambda x: x + 99.0, "geolocation/elevation_lastbin.*below"),
+        ("geolocation/elevation_bin0", lambda x: np.array([b"a"] * 3), "geolocation/elevation_bin0.*numbers"),
+    ],
+)
+def test_damage_is_named(small, field, change, place):
+    with h5py.File(small, "r+") as file:
+        group = file["BEAM0001"]
+        old = group[field][()]
+        del group[field]
+        if change is not None:
+            group[field] = change(old)
+    with pytest.raises(ValueError, match=r"small\.h5: /BEAM0001/" + place):
+        read_gedi_l1b(small)
+
+
+def test_without_h5py(small, monkeypatch):
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    with pytest.raises(ImportError, match=r"jaxlidar\[io\]"):
+        read_gedi_l1b(small)
+
+
+def test_record_reads(recorded):
+    shots, _ = recorded
+    assert len(shots) == 300
+    assert len({shot.beam for shot in shots.values()}) == 7
+    for shot in shots.values():
+        # 1 ns is 0.14990 m of range, at a zenith of 0.5 to 1.5 degrees, in air, 0.1498 m of elevation.
+        np.testing.assert_allclose(-np.diff(shot.elevation), 0.1498, rtol=1e-3)
+        assert 0.4 < shot.zenith < 1.6
+        assert abs(np.median(shot.signal[:100])) < 3 * shot.noise_std
+        assert shot.signal.max() > 20 * shot.noise_std
+        width = shot.pulse_time[shot.pulse_power > shot.pulse_power.max() / 2]
+        assert 10 <= width[-1] - width[0] <= 22
+        assert 0 < np.average(shot.pulse_time, weights=shot.pulse_power) < 4
+
+
+def test_record_agrees_with_level_2(recorded):
+    """The products' ground and canopy top lie where the waveforms have them."""
+    shots, answers = recorded
+    ground, top = [], []
+    for i, number in enumerate(answers["shot"]):
+        shot = shots[int(number)]
+        near = np.abs(shot.elevation - answers["elev_lowestmode"][i]) < 2.0
+        ground.append(shot.elevation[near][shot.signal[near].argmax()] - answers["elev_lowestmode"][i])
+        assert (
+            shot.elevation[-1]
+            < answers["elev_lowestmode"][i]
+            < answers["elev_highest"][i]
+            < shot.elevation[0]
+        )
+        # No return above the highest: what is there is noise.
+        above = shot.signal[shot.elevation > answers["elev_highest"][i] + 1.0]
+        top.append(above.max() / shot.noise_std)
+        # rh is in whole centimetres above the lowest mode, cut off.
+        height = answers["elev_highest"][i] - answers["elev_lowestmode"][i]
+        assert height == pytest.approx(answers["rh100"][i] / 100, abs=0.02)
+    assert np.max(np.abs(ground)) < 1.0  # a mode among others may be a shoulder
+    assert abs(np.median(ground)) < 0.1
+    assert np.median(np.abs(ground)) < 0.2  # the local maximum of a noisy echo, in bins of 0.15 m
+    assert np.quantile(top, 0.9) < 5
+    # L2B's energies above and of the ground are the waveform's integral.
+    total = np.array([shots[int(n)].signal.sum() for n in answers["shot"]])
+    ratio = total / (answers["rv"] + answers["rg"])
+    assert abs(np.median(ratio) - 1) < 0.05
