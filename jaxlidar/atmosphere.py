@@ -1,0 +1,239 @@
+r"""The clear air between the lidar and its target: molecules and aerosol in exponential layers.
+
+**Extinction.** Molecules after Bodhaine et al. (1999): with n the refractive index of standard air (Peck
+and Reeder 1972, for 360 ppm CO2) and F its depolarisation (King) factor,
+
+    sigma = 24 pi^3 (n^2 - 1)^2 F / (lambda^4 N^2 (n^2 + 2)^2)
+    tau_R = sigma P A / (m_a g)                                 at sea level and 45 degrees of latitude
+
+(not their fit, eq. 30, which holds to 850 nm and is 0.8 % too high at 1550 nm). Aerosol by the
+visibility V: 3.912/V * (lambda / 550 nm)^-q per km, with the exponent q(V) of Kruse et al. (1962) or,
+which differs below 6 km only, of Kim et al. (2001). Strictly 3.912/V is the extinction of molecules and
+aerosol together; as is customary it is given to the aerosol alone (at 550 nm and 23 km the molecules
+are 7 % of it).
+
+**Return.** A white Lambertian target across the beam at range R sends E A_r T^2 / (pi R^2) of a pulse E
+into an aperture A_r, T^2 the two-way transmittance: that is an apparent reflectance of T^2, the internal
+unit. A layer dr of air with the backscatter coefficient beta (1/m/sr) sends E A_r beta dr T^2 / R^2.
+Hence the air's apparent reflectance per metre of range is pi beta T^2, with
+
+    beta = molecules' extinction / (8 pi / 3 sr) + aerosol's extinction / lidar ratio.
+
+Light scattered more than once in the air is not followed, nor is absorption by gases: keep
+wavelengths off the bands of water vapour (0.94, 1.13, 1.38, 1.87 micrometres) and oxygen (0.76).
+"""
+
+import math
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from jaxlidar._checks import as_array, as_scalar, check_choice, check_range
+
+# Peck and Reeder's formula is fitted to 230..1690 nm and smooth far beyond; aerosol exponents to about 2500.
+_WAVELENGTHS = (230.0, 3000.0)
+_CO2 = 360e-6
+_DENSITY = 2.546899e19  # molecules per cm3 at 288.15 K and 1013.25 hPa
+# Molecules per cm2 above sea level: P A / (m_a g), with g at the air's centre of mass, 5517.56 m, at 45
+# degrees of latitude.
+_COLUMN = 1013250.0 * 6.0221367e23 / ((28.9595 + 15.0556 * _CO2) * 978.9158)
+_MICROMETRE4_PER_CM4 = 1e16
+_MOLECULAR_LIDAR_RATIO = 8 * math.pi / 3
+
+
+def _optional_scalar(x: ArrayLike | None) -> Float[Array, ""] | None:
+    return None if x is None else as_scalar(x)
+
+
+def _wavelength(wavelength: ArrayLike) -> Float[Array, "..."]:
+    wavelength = as_array(wavelength)
+    check_range("wavelength", wavelength, *_WAVELENGTHS)
+    return wavelength
+
+
+def _outer(a: Float[Array, "..."], b: Float[Array, "..."]) -> Float[Array, "..."]:
+    return a.reshape(a.shape + (1,) * b.ndim) * b.reshape((1,) * a.ndim + b.shape)
+
+
+def rayleigh_optical_depth(wavelength: ArrayLike) -> Float[Array, "..."]:
+    """Optical depth of all molecules above sea level (1013.25 hPa, latitude 45 degrees, 360 ppm CO2).
+
+    - `wavelength`: in nm, any shape, 230 to 3000.
+
+    **Raises:** `ValueError` for a wavelength outside.
+
+    Source: Bodhaine, Wood, Dutton and Slusser 1999, J. Atmos. Oceanic Technol. 16, 1854.
+    """
+    micrometres = _wavelength(wavelength) * 1e-3
+    w = micrometres**-2
+    # n - 1 itself, never as a difference.
+    d = 1e-8 * (8060.51 + 2480990.0 / (132.274 - w) + 17455.7 / (39.32957 - w))
+    d = d * (1 + 0.54 * (_CO2 - 300e-6))
+    nitrogen = 1.034 + 3.17e-4 * w
+    oxygen = 1.096 + 1.385e-3 * w + 1.448e-4 * w * w
+    percent = 100 * _CO2
+    king = (78.084 * nitrogen + 20.946 * oxygen + 0.934 + 1.15 * percent) / (
+        78.084 + 20.946 + 0.934 + percent
+    )
+    lorentz = d * (2 + d) / (3 + d * (2 + d))  # (n^2 - 1) / (n^2 + 2)
+    # As one factor, since the density's square does not fit into single precision.
+    scale = _COLUMN * 24 * math.pi**3 / _DENSITY**2 * _MICROMETRE4_PER_CM4
+    return scale * (lorentz * w) ** 2 * king
+
+
+def aerosol_extinction(
+    wavelength: ArrayLike, visibility: ArrayLike, model: str = "kim"
+) -> Float[Array, "..."]:
+    """Extinction coefficient in 1/m of the aerosol where the visibility is measured.
+
+    - `wavelength`: in nm, any shape, 230 to 3000.
+    - `visibility`: in km, positive, a scalar: where a black target's contrast falls to 2 % at 550 nm.
+    - `model`: `"kim"` (default) or `"kruse"`: the exponent of wavelength below 6 km.
+
+    Differentiable in both, but for the exponent's jumps at 50 km and (Kruse) 6 km.
+
+    **Raises:** `ValueError` for a value outside its range and an unknown model.
+
+    Source: Kruse, McGlauchlin and McQuistan 1962, Elements of Infrared Technology; Kim, McArthur and Korevaar
+    2001, Proc. SPIE 4214, 26.
+    """
+    check_range("visibility", visibility, 0.0, low_open=True)
+    check_choice("model", model, ("kim", "kruse"))
+    v = as_scalar(visibility)
+    if model == "kruse":
+        low = 0.585 * jnp.cbrt(v)
+    else:
+        low = jnp.where(v > 1.0, 0.16 * v + 0.34, jnp.maximum(v - 0.5, 0.0))
+    exponent = jnp.where(v > 50.0, 1.6, jnp.where(v < 6.0, low, 1.3))
+    return 3.912e-3 / v * jnp.exp(-exponent * jnp.log(_wavelength(wavelength) / 550.0))
+
+
+class Atmosphere(eqx.Module):
+    """Molecules and aerosol, each thinning exponentially with height.
+
+    Heights are above the reference plane z = 0, in m, and may be negative.
+
+    - `visibility`: at z = 0 in km, positive, or None: no aerosol. Default 23 ("clear").
+    - `rayleigh`: whether there are molecules. Default True.
+    - `aerosol_model`: `"kim"` (default) or `"kruse"`, see `aerosol_extinction`.
+    - `rayleigh_scale_height`: in m, positive. Default 8450: the ratio of the air's column above sea level to
+      its density there at 15 degrees Celsius, so that both the optical depth and the extinction at
+      sea level are right.
+    - `aerosol_scale_height`: in m, positive. Default 1400, within the customary 1200 (Elterman 1968, UV,
+      Visible, and IR Attenuation for Altitudes to 50 km) to 2000: 23 km then means an optical depth of
+      0.24 at 550 nm.
+    - `lidar_ratio`: extinction over backscatter of the aerosol in sr, positive; 20 (sea salt) to 80 (smoke).
+      Default None: no return from the air, molecules included.
+    - `base_height`: of the reference plane above sea level in m, -500 to 9000. Default 0. It thins the
+      molecules; the visibility holds at z = 0 wherever that is.
+
+    All but `rayleigh` and `aerosol_model` are differentiable.
+
+    **Raises:** `ValueError` for a value outside its range and an unknown model.
+    """
+
+    visibility: Float[Array, ""] | None = eqx.field(converter=_optional_scalar, default=23.0)
+    rayleigh: bool = eqx.field(static=True, default=True)
+    aerosol_model: str = eqx.field(static=True, default="kim")
+    rayleigh_scale_height: Float[Array, ""] = eqx.field(converter=as_scalar, default=8450.0)
+    aerosol_scale_height: Float[Array, ""] = eqx.field(converter=as_scalar, default=1400.0)
+    lidar_ratio: Float[Array, ""] | None = eqx.field(converter=_optional_scalar, default=None)
+    base_height: Float[Array, ""] = eqx.field(converter=as_scalar, default=0.0)
+
+    def __check_init__(self):
+        if self.visibility is not None:
+            check_range("visibility", self.visibility, 0.0, low_open=True)
+        check_choice("aerosol_model", self.aerosol_model, ("kim", "kruse"))
+        check_range("rayleigh_scale_height", self.rayleigh_scale_height, 0.0, low_open=True)
+        check_range("aerosol_scale_height", self.aerosol_scale_height, 0.0, low_open=True)
+        if self.lidar_ratio is not None:
+            check_range("lidar_ratio", self.lidar_ratio, 0.0, low_open=True)
+        check_range("base_height", self.base_height, -500.0, 9000.0)
+
+    def _layers(self, wavelength: ArrayLike) -> list[tuple[Array, Array, Array | float]]:
+        """Of molecules and of aerosol: extinction at z = 0 in 1/m, scale height, lidar ratio in sr."""
+        layers: list[tuple[Array, Array, Array | float]] = []
+        if self.rayleigh:
+            height = self.rayleigh_scale_height
+            at_base = jnp.exp(-self.base_height / height) / height
+            layers.append((rayleigh_optical_depth(wavelength) * at_base, height, _MOLECULAR_LIDAR_RATIO))
+        if self.visibility is not None:
+            aerosol = aerosol_extinction(wavelength, self.visibility, self.aerosol_model)
+            ratio = jnp.inf if self.lidar_ratio is None else self.lidar_ratio
+            layers.append((aerosol, self.aerosol_scale_height, ratio))
+        return layers
+
+    def extinction(self, wavelength: ArrayLike, height: ArrayLike) -> Float[Array, "..."]:
+        """Extinction coefficient in 1/m.
+
+        - `wavelength`: in nm, any shape, 230 to 3000.
+        - `height`: in m, any shape.
+
+        Returns an array of the shape of `wavelength` followed by that of `height`.
+
+        **Raises:** `ValueError` for a wavelength outside.
+        """
+        wavelength, height = _wavelength(wavelength), as_array(height)
+        total = jnp.zeros(wavelength.shape + height.shape)
+        for at_zero, scale, _ in self._layers(wavelength):
+            total = total + _outer(at_zero, jnp.exp(-height / scale))
+        return total
+
+    def optical_depth(
+        self, wavelength: ArrayLike, height: ArrayLike, altitude: ArrayLike, zenith: ArrayLike = 0.0
+    ) -> Float[Array, "..."]:
+        """Optical depth along the beam between the sensor and the target, one way.
+
+        The integral of the exponentials in closed form, exact to rounding for thin and for deep layers.
+
+        - `wavelength`: in nm, any shape, 230 to 3000.
+        - `height`: of the target in m, any shape. From a target above the sensor nothing is between.
+        - `altitude`: of the sensor in m, a scalar.
+        - `zenith`: of the beam in degrees, 0 to 89, a scalar; layers are flat. Default 0.
+
+        Returns an array of the shape of `wavelength` followed by that of `height`.
+
+        **Raises:** `ValueError` for a value outside its range.
+        """
+        wavelength, height, altitude = _wavelength(wavelength), as_array(height), as_scalar(altitude)
+        check_range("height", height)
+        check_range("altitude", altitude)
+        check_range("zenith", zenith, 0.0, 89.0)
+        slant = 1 / jnp.cos(jnp.deg2rad(as_scalar(zenith)))
+        between = jnp.maximum(altitude - height, 0.0)
+        total = jnp.zeros(wavelength.shape + height.shape)
+        for at_zero, scale, _ in self._layers(wavelength):
+            column = -jnp.expm1(-between / scale) * jnp.exp(-height / scale) * scale
+            total = total + _outer(at_zero, column)
+        return total * slant
+
+    def two_way_transmittance(
+        self, wavelength: ArrayLike, height: ArrayLike, altitude: ArrayLike, zenith: ArrayLike = 0.0
+    ) -> Float[Array, "..."]:
+        """Share of the light that survives the way from the sensor to the target and back, in [0, 1].
+
+        Arguments, shape of the result and errors are those of `optical_depth`.
+        """
+        return jnp.exp(-2 * self.optical_depth(wavelength, height, altitude, zenith))
+
+    def backscatter(
+        self, wavelength: ArrayLike, height: ArrayLike, altitude: ArrayLike, zenith: ArrayLike = 0.0
+    ) -> Float[Array, "..."]:
+        """The air's own return: apparent reflectance per metre of range, in 1/m.
+
+        pi times backscatter coefficient times two-way transmittance (see the module's docstring), for
+        light scattered once. A bin of the length dr along the beam returns dr times this. Zero where
+        `lidar_ratio` is None.
+
+        Arguments, shape of the result and errors are those of `optical_depth`. Light from other ranges than
+        the reference's also counts by the inverse square of range, which is left to the caller.
+        """
+        transmittance = self.two_way_transmittance(wavelength, height, altitude, zenith)
+        if self.lidar_ratio is None:
+            return jnp.zeros_like(transmittance)
+        height = as_array(height)
+        total = jnp.zeros_like(transmittance)
+        for at_zero, scale, ratio in self._layers(wavelength):
+            total = total + _outer(at_zero / ratio, jnp.exp(-height / scale))
+        return math.pi * total * transmittance
