@@ -1,0 +1,227 @@
+"""Reflectance spectra of bark, wood, litter, soil and more: measured ones bundled, or the user's own.
+
+    jl.spectra("bark")                     names of the bundled ones, of one kind or of all
+    jl.spectrum("bark-birch")(1064.0)      a spectrum is a function of the wavelength in nm
+    jl.read_spectrum_csv("my_soil.csv")
+
+Every reflectance that a scene takes may be a number, one number per wavelength, or a `Spectrum`;
+`reflectance_at` turns all three into one number per wavelength.
+
+The bundled spectra are field and laboratory measurements of 400 to 2450 nm in steps of 10 nm, without
+the bands of water vapour (between 1350 and 1460, and 1790 and 1960 nm), over which a straight line leads.
+Where each comes from is in `data/spectra.md`. They are bidirectional or hemispherical, as their makers
+measured them; the simulator takes them as the reflectance of a Lambertian surface. Two samples of one
+kind easily differ by a fifth: fit `scale` where the level matters.
+"""
+
+import csv
+import difflib
+import functools
+import os
+from importlib import resources
+from pathlib import Path
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from jaxlidar._checks import as_array, as_scalar, check_range, concrete
+
+
+class Spectrum(eqx.Module):
+    """A reflectance that depends on wavelength, linear between its samples.
+
+    - `wavelength`: (samples,) in nm, positive, strictly increasing, at least two.
+    - `reflectance`: (samples,) in [0, 1].
+    - `name`: what it is called. Default "".
+    - `scale`: a factor on the reflectance, not negative and such that none exceeds 1. Default 1. It is
+      there to be fitted, as one unknown for the brightness of a whole spectrum.
+
+    All but `name` are arrays and differentiable.
+
+    **Raises:** `ValueError` for wavelengths that are unsorted or too few, for shapes that differ, and for
+    reflectances outside [0, 1].
+    """
+
+    wavelength: Float[Array, " samples"] = eqx.field(converter=as_array)
+    reflectance: Float[Array, " samples"] = eqx.field(converter=as_array)
+    name: str = eqx.field(static=True, default="")
+    scale: Float[Array, ""] = eqx.field(converter=as_scalar, default=1.0)
+
+    def __check_init__(self):
+        if self.wavelength.shape != self.reflectance.shape or self.wavelength.ndim != 1:
+            raise ValueError(
+                f"wavelength and reflectance have shapes {self.wavelength.shape} and "
+                f"{self.reflectance.shape}; admissible are equal, one-dimensional ones"
+            )
+        if self.wavelength.size < 2:
+            raise ValueError(f"wavelength has {self.wavelength.size} samples; admissible are 2 or more")
+        check_range("wavelength", self.wavelength, 0.0, low_open=True)
+        check_range("reflectance", self.reflectance, 0.0, 1.0)
+        check_range("scale", self.scale, 0.0)
+        wavelength, reflectance, scale = map(concrete, (self.wavelength, self.reflectance, self.scale))
+        if wavelength is not None and np.any(np.diff(wavelength) <= 0):
+            i = int(np.argmax(np.diff(wavelength) <= 0))
+            raise ValueError(
+                f"wavelength = {wavelength[i]:g} is followed by {wavelength[i + 1]:g}; the admissible ones "
+                "increase strictly"
+            )
+        if reflectance is not None and scale is not None:
+            check_range("scale * reflectance", scale * reflectance, 0.0, 1.0 + 1e-6)
+
+    def __call__(self, wavelength: ArrayLike) -> Float[Array, "..."]:
+        """The reflectance at the given wavelengths.
+
+        - `wavelength`: in nm, any shape, within the range of the samples.
+
+        Returns an array shaped as `wavelength`.
+
+        **Raises:** `ValueError` for a wavelength outside that range. Inside a JAX transformation of the
+        wavelength nothing can be raised: there the end values continue.
+        """
+        wavelength = as_array(wavelength)
+        table = concrete(self.wavelength)
+        if table is not None:
+            what = f"wavelength of the spectrum {self.name!r}" if self.name else "wavelength"
+            check_range(what, wavelength, table[0], table[-1])
+        return self.scale * jnp.interp(wavelength, self.wavelength, self.reflectance)
+
+
+def reflectance_at(
+    value: ArrayLike | Spectrum, wavelength: ArrayLike, field: str = "reflectance"
+) -> Float[Array, " wavelengths"]:
+    """A reflectance, however it is given, as one number per wavelength.
+
+    - `value`: one number, (wavelengths,) numbers, or a `Spectrum`.
+    - `wavelength`: (wavelengths,) in nm, or one number.
+    - `field`: how errors call `value`.
+
+    **Raises:** `ValueError` for another number of values than wavelengths, and for a wavelength outside a
+    spectrum's range. That values lie in [0, 1] is checked where they are held.
+    """
+    wavelength = jnp.atleast_1d(as_array(wavelength))
+    if isinstance(value, Spectrum):
+        return value(wavelength)
+    value = as_array(value)
+    if value.shape not in ((), (1,), wavelength.shape):
+        raise ValueError(
+            f"{field} has shape {value.shape}; admissible is one number, or one for each of "
+            f"{wavelength.size} wavelengths"
+        )
+    return jnp.broadcast_to(value, wavelength.shape)
+
+
+@functools.cache
+def _library() -> dict[str, np.ndarray]:
+    with (
+        (resources.files("jaxlidar") / "data" / "spectra.npz").open("rb") as file,
+        np.load(file) as arrays,
+    ):
+        return {key: arrays[key] for key in arrays.files}
+
+
+def spectra(kind: str | None = None) -> dict[str, str]:
+    """Names of the bundled spectra, each with its kind.
+
+    - `kind`: "bark", "wood", "litter", "char", "soil" or "built". Default None: all.
+
+    **Raises:** `ValueError` for an unknown kind.
+    """
+    library = _library()
+    listed = dict(zip(library["name"].tolist(), library["kind"].tolist()))
+    if kind is None:
+        return listed
+    kinds = list(dict.fromkeys(listed.values()))
+    if kind not in kinds:
+        raise ValueError(f"kind = {kind!r} is none of {', '.join(map(repr, kinds))}")
+    return {name: k for name, k in listed.items() if k == kind}
+
+
+def spectrum(name: str) -> Spectrum:
+    """A bundled spectrum, 400 to 2450 nm.
+
+    - `name`: one of `spectra()`.
+
+    **Raises:** `ValueError` for an unknown name, with the names that come close.
+    """
+    library = _library()
+    names = library["name"].tolist()
+    if name not in names:
+        close = difflib.get_close_matches(name, names, n=5, cutoff=0.4) or sorted(
+            set(library["kind"].tolist())
+        )
+        close += [n for n in names if name.lower() in n.split("-") and n not in close]
+        raise ValueError(
+            f"name = {name!r} is no bundled spectrum; close to it are {', '.join(map(repr, close))}; "
+            "jaxlidar.spectra() lists all"
+        )
+    return Spectrum(library["wavelength"], library["reflectance"][names.index(name)], name)
+
+
+def read_spectrum_csv(path: str | os.PathLike[str], name: str | None = None) -> Spectrum:
+    """Read a spectrum from a text file of two columns: wavelength in nm, reflectance in [0, 1].
+
+    - `path`: lines of two numbers, between them a comma, a semicolon, a tab or blanks. Empty lines and
+      lines that start with # are skipped, and the first other line may be a header.
+    - `name`: of the spectrum. Default None: the file's name without its ending.
+
+    **Raises:** `ValueError`, naming the file and the line, for a line that is not two numbers, for a
+    reflectance outside [0, 1] (per cent?), for a wavelength below 100 nm (micrometres?) or not above
+    the one before, and for fewer than two samples; `FileNotFoundError` where there is no such file.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file")
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path}: no text file (byte {error.start} is not UTF-8)") from error
+    samples: list[tuple[float, float]] = []
+    header_allowed = True
+    for number, line in enumerate(lines, 1):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        cells = _cells(line)
+        place = f"{path}, line {number}"
+        try:
+            wavelength, reflectance = map(float, cells)
+        except ValueError:
+            if header_allowed and not _is_number(cells[0]):
+                header_allowed = False
+                continue
+            raise ValueError(f"{place}: {line.strip()!r} is not a wavelength and a reflectance") from None
+        header_allowed = False
+        if not 100 <= wavelength < np.inf:
+            raise ValueError(
+                f"{place}: wavelength = {wavelength:g} is outside the admissible range [100, inf) nm"
+            )
+        if samples and wavelength <= samples[-1][0]:
+            raise ValueError(
+                f"{place}: wavelength = {wavelength:g} follows {samples[-1][0]:g}; the admissible ones "
+                "increase strictly"
+            )
+        if not 0 <= reflectance <= 1:
+            raise ValueError(f"{place}: reflectance = {reflectance:g} is outside the admissible range [0, 1]")
+        samples.append((wavelength, reflectance))
+    if len(samples) < 2:
+        raise ValueError(
+            f"{path}, line {len(lines)}: the file ends after {len(samples)} samples; admissible are 2"
+        )
+    table = np.array(samples)
+    return Spectrum(table[:, 0], table[:, 1], path.stem if name is None else name)
+
+
+def _cells(line: str) -> list[str]:
+    for separator in ",;\t":
+        if separator in line:
+            return next(csv.reader([line.strip()], delimiter=separator))
+    return line.split()
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
