@@ -7,12 +7,14 @@ found from the recorded numbers and is what `GediShot` relies on.
   `rx_open` + `rx_offset` - `tx_gloc` plus a constant of the channel, in samples of 1 ns (to 1e-6 ns in
   some beams, else to whole clock steps of 4 ns). So a bin's elevation is where a target lies whose echo
   has the *Gaussian fit* of the transmitted pulse centred on that bin: time zero of the pulse is
-  `tx_gloc`, counted from sample 0. The pulse is skewed: its largest sample comes about 0.8 ns before,
-  its centroid about 2 ns after (0.3 m of elevation, if confused).
+  `tx_gloc`, counted from sample 0. (Flat ground fitted with the recorded pulse then lies within 0.1 m of
+  level 2's `elev_lowestmode`.) The pulse is skewed: its largest sample comes 0.7 to 1.3 ns before, its
+  centroid 2 to 3 ns after (0.3 to 0.5 m of elevation, if confused).
 - 2 (`bounce_time_offset_lastbin` - `bounce_time_offset_bin0`) is the number of bins less one, in ns: the
   two elevations are those of the first and the last bin, and bins in between lie evenly, 0.1498 m apart.
-- The received waveform is smoothed: noise of neighbouring bins has a correlation of about 0.93 and a
-  standard deviation about half of `noise_stddev_corrected`, which is that of the raw samples.
+- The waveforms are smoothed, the received one as though by a Gaussian of 1.7 ns: noise of neighbouring
+  bins has a correlation of 0.92, 0.71, 0.45, 0.21 and then about none, and a standard deviation about half of
+  `noise_stddev_corrected`. For fits take every fifth bin as independent, or weight accordingly.
 
 Where level 2 answers are at hand (L2A `elev_lowestmode`, `rh`; L2B `pai`, `cover`), match them with
 `GediShot.shot_number`, which is unique in all of the mission.
