@@ -1,0 +1,62 @@
+"""Leaves (or other scatterers) whose reflectance and transmittance are known, in the form of a leaf model."""
+
+from collections.abc import Sequence
+from typing import final
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from jaxlidar._checks import as_array, check_range, concrete
+
+# What R + T may exceed 1 by: the rounding of measured or single-precision values.
+_TOLERANCE = 1e-6
+
+
+@final
+class LeafOptics(eqx.Module):
+    """Given reflectance and transmittance: `R, T = optics(wavelengths)`, as with `Prospect`.
+
+    **Arguments:**
+
+    - `reflectance`: hemispherical reflectance, a number or one per wavelength, in [0, 1];
+    - `transmittance`: hemispherical transmittance, likewise; default 0. The sum is at most 1.
+
+    **Raises:** `ValueError` naming the field, its value and the admissible range. Inside a transformation
+    values cannot be checked.
+    """
+
+    reflectance: Float[Array, "*wavelengths"] = eqx.field(converter=as_array)
+    transmittance: Float[Array, "*wavelengths"] = eqx.field(converter=as_array, default=0.0)
+
+    def __check_init__(self):
+        for name in ("reflectance", "transmittance"):
+            value = getattr(self, name)
+            if value.ndim > 1:
+                raise ValueError(
+                    f"{name} has shape {value.shape}; admissible is a number or one per wavelength"
+                )
+            check_range(name, value, 0.0, 1.0)
+        R, T = self.reflectance, self.transmittance
+        if R.ndim == T.ndim == 1 and R.shape != T.shape:
+            raise ValueError(f"transmittance has {T.size} values where reflectance has {R.size}")
+        R, T = concrete(R), concrete(T)
+        if R is not None and T is not None:
+            check_range("reflectance + transmittance", R + T, 0.0, 1.0 + _TOLERANCE)
+
+    def __call__(
+        self, wavelengths: ArrayLike | Sequence[ArrayLike]
+    ) -> tuple[Float[Array, "*wavelengths"], Float[Array, "*wavelengths"]]:
+        """Reflectance and transmittance, one per wavelength.
+
+        **Arguments:** `wavelengths`: nm, any shape where the optics are numbers, else as many as these.
+
+        **Raises:** `ValueError` where the lengths differ.
+        """
+        shape = np.shape(wavelengths)  # pyright: ignore[reportArgumentType]
+        for name in ("reflectance", "transmittance"):
+            value = getattr(self, name)
+            if value.ndim and value.shape != shape:
+                raise ValueError(f"{name} has {value.size} values, where wavelengths has the shape {shape}")
+        return jnp.broadcast_to(self.reflectance, shape), jnp.broadcast_to(self.transmittance, shape)
