@@ -1,17 +1,18 @@
 """Exponential integrals E1, E2 and the diffuse transmittance 2 E3, in bounded time and with every derivative.
 
-For k < 1, with entire functions P1 and P2,
+For k < 1, with entire functions P1, P2, Pt and Po,
 
-    E1(k) = -ln k + P1(k),   E2(k) = k ln k + P2(k),   2 E3(k) = exp(-k) - k E2(k),
+    E1(k) = -ln k + P1(k),              E2(k) = k ln k + P2(k),
+    2 E3(k) = -k^2 ln k + Pt(k),    1 - 2 E3(k) = k (k ln k + Po(k)),
 
 and for k >= 1, with s = 7 / (k + 2.5) - 1 running from 1 down to -1 at infinity,
 
     En(k) = exp(-k) Qn(s) / (k + n),
 
-whose Qn stay between 0.8 and 1. P1, P2, Q1, Q2 and Q3 are polynomials. Their coefficients, below, come
-from interpolation at Chebyshev nodes in 60-digit arithmetic: 14 and 26 terms for double precision, 8
-and 13 (Q3: 11) for single. P2 is written in powers of 1 - k, so that it loses no digits where it is
-small. The break at k = 1 is where ln k changes sign, hence no subtraction loses more than a bit.
+whose Qn stay between 0.8 and 1.1. The Pn and Qn are polynomials. Their coefficients, below, come from
+interpolation at Chebyshev nodes in 60-digit arithmetic: 14 and 26 terms for double precision, 8 and 13
+(Q3: 11) for single. P2 and Po are written in powers of 1 - k and Pt in those of 3/4 - k, about where they
+are small. The break at k = 1 is where ln k changes sign, hence no subtraction loses more than a bit or two.
 
 Derivatives follow from E3' = -E2, E2' = -E1 and E1' = -exp(-k)/k, not from the polynomials. E1 is
 infinite at k = 0; there the value at the smallest normal number is returned instead, which keeps second
@@ -75,6 +76,58 @@ _SMALL_2_SINGLE = (
     -0.0009609653118,
     -0.0001088046529,
     -2.169551265e-5,
+)
+_SMALL_TAU_DOUBLE = (
+    0.1477121796936938,
+    0.1157449947928558,
+    1.5526587404594492,
+    -0.23450375433732676,
+    -0.02568274558566313,
+    -0.0032004298069991197,
+    -0.00038411412042736867,
+    -4.272898448506414e-05,
+    -4.36631314919352e-06,
+    -4.099251546688844e-07,
+    -3.547223987544608e-08,
+    -2.8449009665109794e-09,
+    -2.0605403630533127e-10,
+    -1.8541825526622164e-11,
+)
+_SMALL_TAU_SINGLE = (
+    0.1477121796,
+    0.1157449922,
+    1.552658756,
+    -0.2345036289,
+    -0.02568335430,
+    -0.003201147833,
+    -0.0003775634718,
+    -5.270947152e-5,
+)
+_SMALL_OMEGA_DOUBLE = (
+    0.7806160656044797,
+    1.4836250520526357,
+    -0.23575888234288464,
+    -0.025052029400032445,
+    -0.0030319362619343373,
+    -0.0003552230262642906,
+    -3.875374475909563e-05,
+    -3.898061578383445e-06,
+    -3.612448138383691e-07,
+    -3.0927351202922676e-08,
+    -2.4510509551087816e-09,
+    -1.841431714933168e-10,
+    -1.1055245637657603e-11,
+    -1.2477633148274264e-12,
+)
+_SMALL_OMEGA_SINGLE = (
+    0.7806160656,
+    1.483625050,
+    -0.2357588405,
+    -0.02505236179,
+    -0.003030644491,
+    -0.0003579300661,
+    -3.565344474e-5,
+    -5.685342257e-6,
 )
 _LARGE_1_DOUBLE = (
     1.0265287338666076,
@@ -244,12 +297,19 @@ def scaled_e2(k: _Reals) -> _Reals:
     return jnp.where(below, lower, _polynomial(s, _LARGE_2_SINGLE, _LARGE_2_DOUBLE) / (large + 2.0))
 
 
+def _lower_tau(small: _Reals) -> _Reals:
+    log_part = small * (small * jnp.log(small))
+    return _polynomial(0.75 - small, _SMALL_TAU_SINGLE, _SMALL_TAU_DOUBLE) - log_part
+
+
+def _upper_tau(large: _Reals, s: _Reals) -> _Reals:
+    return 2.0 * _polynomial(s, _LARGE_3_SINGLE, _LARGE_3_DOUBLE) / (large + 3.0)
+
+
 def scaled_tau(k: _Reals) -> _Reals:
     """2 E3(k) for k < 1, and exp(k) 2 E3(k) from there on."""
     below, small = _small(k)
-    large, s = _large(k)
-    lower = jnp.exp(-small) - small * scaled_e2(small)
-    return jnp.where(below, lower, 2.0 * _polynomial(s, _LARGE_3_SINGLE, _LARGE_3_DOUBLE) / (large + 3.0))
+    return jnp.where(below, _lower_tau(small), _upper_tau(*_large(k)))
 
 
 def _scale(k: _Reals) -> _Reals:
@@ -277,10 +337,11 @@ def tau(k: _Reals) -> _Reals:
 @jax.custom_jvp
 def omega(k: _Reals) -> _Reals:
     """1 - 2 E3(k), the absorptance that belongs to `tau`, without subtraction for small k."""
-    _, small = _small(k)
-    return jnp.where(
-        k < 1, -jnp.expm1(-jnp.minimum(k, 1.0)) + jnp.minimum(k, 1.0) * scaled_e2(small), 1.0 - tau(k)
-    )
+    below, small = _small(k)
+    log_part = small * jnp.log(small)
+    lower = k * (log_part + _polynomial(1.0 - small, _SMALL_OMEGA_SINGLE, _SMALL_OMEGA_DOUBLE))
+    large, s = _large(k)
+    return jnp.where(below, lower, 1.0 - jnp.exp(-large) * _upper_tau(large, s))
 
 
 @jax.custom_jvp
