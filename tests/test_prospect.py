@@ -87,8 +87,7 @@ def test_between_tabulated_wavelengths_coefficients_are_interpolated():
 @pytest.mark.parametrize("version", ["4", "5", "D", "PC"])
 def test_every_trait_is_differentiable(version, precision):
     leaf = Prospect(N=1.7, version=version)
-    slopes = jax.jacfwd(lambda leaf: leaf(LASERS))(leaf)
-    reverse = jax.jacrev(lambda leaf: leaf(LASERS))(leaf)
+    slopes, reverse = (jax.jit(kind(lambda leaf: leaf(LASERS)))(leaf) for kind in (jax.jacfwd, jax.jacrev))
     unit = float(np.finfo(precision).eps)
     given = {name: float(getattr(leaf, name)) for name in ("N", *TRAITS[version])}
     for name in given:
@@ -158,10 +157,11 @@ def test_batches(precision):
     tolerance = 20 * float(np.finfo(precision).eps)
     np.testing.assert_allclose((R_too, T_too), (R, T), rtol=tolerance)
     assert set(slopes) == {"N", *TRAITS["D"]}
+    each = jax.jit(jax.jacfwd(lambda leaf: leaf(some)))
     for i in range(7):
         leaf = jax.tree.map(lambda x, i=i: x[i], leaves)
         np.testing.assert_allclose((R[i], T[i]), leaf(some), rtol=tolerance)
-        for output, expected in enumerate(jax.jacfwd(lambda leaf: leaf(some))(leaf)):
+        for output, expected in enumerate(each(leaf)):
             for name, columns in slopes.items():
                 np.testing.assert_allclose(
                     columns[output][i], getattr(expected, name), rtol=5 * tolerance, atol=tolerance
