@@ -1,5 +1,7 @@
 """Checks and conversions at construction: what is inadmissible is refused by name, value and range."""
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,10 +10,13 @@ from jaxtyping import Array, ArrayLike, Float
 
 def as_scalar(x: ArrayLike) -> Float[Array, ""]:
     """A floating-point JAX scalar, in JAX's default precision."""
-    return as_array(x).reshape(())
+    a = as_array(x)
+    if a.size != 1:
+        raise ValueError(f"an array of shape {a.shape} was given where one number is admissible")
+    return a.reshape(())
 
 
-def as_array(x: ArrayLike) -> Float[Array, "..."]:
+def as_array(x: ArrayLike | Sequence) -> Float[Array, "..."]:
     """A floating-point JAX array, in JAX's default precision (a JAX float array is kept as it is)."""
     if isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jnp.floating):
         return x

@@ -1,0 +1,441 @@
+"""What a scene and a lidar call for: the effects simulated, the bounds on the others, the sizes of all loops."""
+
+import dataclasses
+import math
+
+import numpy as np
+
+from ._checks import concrete
+from .constants import SPEED_OF_LIGHT
+from .layout import KERNEL, Bins, Layout, Scatterer
+from .lidar import Lidar
+from .materials import Isotropic, Specular
+from .pulse import RectangularPulse
+from .scene import Plate, Scene, leaf_optics
+from .spectra import reflectance_at
+
+DEFAULT_RTOL = 0.01
+# Orders are followed while their histories are not more than this (16 orders of four letters, 29 of three).
+MAX_HISTORIES = 5000
+MAX_ORDERS = 100
+# Multiple scattering is followed this long after the last first-order return, ns.
+TAIL = (10.0, 60.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Effect:
+    """One effect: whether it is simulated, why, and the relative change that leaving it out makes at most."""
+
+    name: str
+    simulated: bool
+    reason: str
+    bound: float | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """How a scene will be simulated. Made by `plan`; static: what is off is never compiled.
+
+    `print(plan)` is a table of effects. `n_photons` is per batch; `n_rays` carry the first order.
+    """
+
+    layout: Layout
+    bins: Bins
+    sample_start: float
+    sample_interval: float
+    n_samples: int
+    per_sample: int
+    n_rays: int
+    n_photons: int
+    smooth_footprint: bool
+    random_footprint: bool
+    sharpen: bool
+    degree: int
+    first_degree: int
+    rtol: float
+    effects: tuple[Effect, ...]
+
+    @property
+    def orders(self) -> int:
+        """Scatterings followed."""
+        return self.layout.orders
+
+    @property
+    def is_random(self) -> bool:
+        """Whether anything is drawn at random."""
+        return self.layout.orders > 1 or (self.random_footprint and not self.smooth_footprint)
+
+    def __str__(self) -> str:
+        rows = [("effect", "simulated", "bound", "why")]
+        for e in self.effects:
+            bound = "" if e.bound is None else f"{e.bound:.1e}"
+            rows.append((e.name, "yes" if e.simulated else "no", bound, e.reason))
+        widths = [max(len(r[i]) for r in rows) for i in range(3)]
+        lines = ["  ".join([*(c.ljust(w) for c, w in zip(r, widths)), r[3]]).rstrip() for r in rows]
+        lines.insert(1, "-" * max(map(len, lines)))
+        sizes = (
+            f"{self.n_samples} samples of {self.sample_interval:g} ns from {self.sample_start:g} ns, "
+            f"{self.bins.count} fine bins of {self.bins.width:.3g} ns"
+        )
+        if not self.smooth_footprint:
+            sizes += f", {self.n_rays} rays"
+        if self.orders > 1:
+            sizes += f", {self.n_photons} photons a batch, {self.orders} orders"
+        return "\n".join([*lines, sizes])
+
+
+def plan(
+    lidar: Lidar,
+    scene: Scene,
+    *,
+    rtol: float | None = None,
+    max_orders: int | None = None,
+    max_step: float | None = None,
+    n_photons: int = 8192,
+    n_rays: int = 4096,
+    window: tuple[float, float] | None = None,
+    bin_width: float | None = None,
+    footprint: str = "random",
+) -> Plan:
+    """Decide what `simulate` will do.
+
+    **Arguments:**
+
+    - `rtol`: relative accuracy aimed at; sets how many orders are worth following. Default 0.01.
+    - `max_orders`: scatterings followed, at least 1; None decides from the largest albedo.
+    - `max_step`: longest stretch, m, that the first order takes at once; None is four fine bins. The
+      result does not depend on it.
+    - `n_photons`, `n_rays`: photons per batch and rays of the footprint.
+    - `window`: (first, last) sample time in ns; None covers the scene.
+    - `bin_width`: fine bins in ns, rounded to a fraction of the sampling interval; None: by the pulse.
+    - `footprint`: "random" (each batch shifts the rays, so that the standard error covers them) or "fixed".
+
+    **Raises:** ValueError for inadmissible arguments, for a scene that reaches above the sensor, and if
+    the geometry is being traced by a JAX transformation: make the plan outside and pass it in.
+    """
+    rtol = DEFAULT_RTOL if rtol is None else float(rtol)
+    if not 0 < rtol < 1:
+        raise ValueError(f"rtol = {rtol:g} is outside the admissible range (0, 1)")
+    for name, value, low in (
+        ("n_photons", n_photons, 1),
+        ("n_rays", n_rays, 1),
+        ("max_orders", max_orders, 1),
+    ):
+        if value is not None and (value != int(value) or value < low):
+            raise ValueError(f"{name} = {value} is outside the admissible range [{low}, inf) of integers")
+    if max_step is not None and not 0 < max_step < math.inf:
+        raise ValueError(f"max_step = {max_step:g} is outside the admissible range (0, inf)")
+    if footprint not in ("random", "fixed"):
+        raise ValueError(f"footprint = {footprint!r} is none of 'random', 'fixed'")
+    geometry = _Geometry(lidar, scene)
+    letters = _Letters(lidar, scene)
+    orders, bound, why = _orders(letters, scene, rtol, max_orders)
+    bins, samples = _time(lidar, scene, geometry, orders, window, bin_width)
+    metres = 0.5 * SPEED_OF_LIGHT * bins.width
+    step = geometry.longest_chord if max_step is None else min(max_step, geometry.longest_chord)
+    step = min(step, 4 * metres) if max_step is None else step
+    bins = dataclasses.replace(bins, row=max(math.ceil(step / metres - 1e-6) + 1 + 2, KERNEL))
+    end = bins.start + bins.width * bins.count
+    max_path = SPEED_OF_LIGHT * end + geometry.upstream
+    layout = Layout(
+        materials=letters.materials,
+        letters=letters.letters,
+        leaf=letters.leaf,
+        bark=letters.bark,
+        surfaces=letters.surfaces,
+        full_cover=tuple(not isinstance(s, Plate) or _number(s.coverage) == 1.0 for s in scene.surfaces),
+        has_ground=scene.ground is not None,
+        leaf_isotropic=scene.canopy is not None and isinstance(scene.canopy.leaf, Isotropic),
+        bark_isotropic=scene.canopy is not None and isinstance(scene.canopy.bark, Isotropic),
+        hotspot=scene.canopy is not None and scene.canopy.hotspot,
+        vertical=_number(lidar.zenith) == 0.0,
+        upstream=geometry.upstream,
+        first_steps=geometry.first_steps(step),
+        march_steps=geometry.march_steps(max_path + geometry.upstream),
+        max_step=step,
+        max_path=max_path,
+        lobe=letters.lobe,
+        orders=orders,
+    )
+    plates = len(scene.plates)
+    sharpen = not isinstance(lidar.pulse, RectangularPulse) and _number(lidar.pulse.std) >= bins.width
+    sharpen = sharpen or _number(lidar.jitter) >= bins.width
+    return Plan(
+        layout=layout,
+        bins=bins,
+        sample_start=samples[0],
+        sample_interval=samples[1],
+        n_samples=samples[2],
+        per_sample=samples[3],
+        n_rays=int(n_rays),
+        n_photons=int(n_photons),
+        smooth_footprint=scene.canopy is None,
+        random_footprint=footprint == "random",
+        sharpen=bool(sharpen),
+        degree=_degree(orders, plates),
+        first_degree=1 + 2 * plates,
+        rtol=rtol,
+        effects=_effects(lidar, scene, orders, bound, why),
+    )
+
+
+def _number(x: object) -> float:
+    value = concrete(x)
+    if value is None:
+        raise ValueError(
+            "the geometry is being traced by a JAX transformation, so its sizes are unknown: "
+            "make a plan outside with jaxlidar.plan and pass it as plan="
+        )
+    return float(value)
+
+
+def _numbers(x: object) -> np.ndarray:
+    value = concrete(x)
+    if value is None:
+        _number(x)
+    assert value is not None
+    return value
+
+
+class _Geometry:
+    """Rays at the rim of the footprint against the bounds of everything in the scene, in NumPy."""
+
+    def __init__(self, lidar: Lidar, scene: Scene):
+        self.scene = scene
+        axis = _numbers(lidar.direction).astype(np.float64)
+        slant = _number(lidar.range_to_reference)
+        rim = 2.5 * _number(lidar.footprint_radius)
+        aim = np.append(_numbers(lidar.position), 0.0)
+        across = np.cross(axis, [1.0, 0, 0] if abs(axis[0]) < 0.7 else [0, 1.0, 0])
+        across /= np.linalg.norm(across)
+        other = np.cross(axis, across)
+        turn = np.linspace(0, 2 * np.pi, 33)[:, None]
+        points = np.concatenate([[[0.0, 0, 0]], rim * (np.cos(turn) * across + np.sin(turn) * other)])
+        rays = axis * slant + points
+        distance = np.linalg.norm(rays, axis=1)
+        self.rays = rays / distance[:, None]
+        self.excess = distance - slant
+        levels = []
+        for s in scene.surfaces:
+            plane = s.plane
+            normal = _numbers(plane.normal).astype(np.float64)
+            offset = normal @ (np.array([0, 0, _number(plane.height)]) - aim)
+            towards = self.rays @ normal
+            met = towards < -1e-6 if not isinstance(s, Plate) else np.abs(towards) > 1e-6
+            if met.any():
+                levels.append(((offset - points @ normal) / np.where(met, towards, 1.0))[met])
+        if scene.canopy is not None:
+            v = scene.canopy.voxels
+            self.size = _numbers(v.voxel_size).astype(np.float64)
+            self.shape = np.array(v.shape)
+            low = _numbers(v.origin)[2]
+            for z in (low, low + self.size[2] * self.shape[2]):
+                levels.append((z - points[:, 2]) / self.rays[:, 2])
+        flat = np.concatenate(levels) if levels else np.zeros(1)
+        self.nearest, self.farthest = float(flat.min()), float(flat.max())
+        # Two-way path relative to that of the aim point.
+        self.first = 2.0 * self.nearest
+        self.last = 2.0 * (self.farthest + float(self.excess.max()))
+        margin = 0.05 * (self.farthest - self.nearest) + 1e-3
+        self.upstream = float(-self.nearest + margin)
+        if self.upstream >= slant:
+            raise ValueError(
+                f"altitude = {_number(lidar.altitude):g} m: the scene reaches up to the sensor; "
+                f"admissible is more than {_number(lidar.altitude) + self.upstream - slant:g} m"
+            )
+
+    @property
+    def longest_chord(self) -> float:
+        if self.scene.canopy is None:
+            return 1e-3
+        steep = float(np.abs(self.rays[:, 2]).min())
+        return float(min(np.linalg.norm(self.size), self.size[2] / steep)) * (1 + 1e-5)
+
+    def first_steps(self, step: float) -> int:
+        """Bound on the stretches of a footprint ray."""
+        if self.scene.canopy is None:
+            return 0
+        assert self.scene.canopy is not None
+        steep = np.abs(self.rays[:, 2:]).min()
+        height = self.size[2] * self.shape[2]
+        length = height / steep
+        sideways = np.ceil(np.abs(self.rays[:, :2]).max(0) / steep * height / self.size[:2]) + 1
+        if self.scene.canopy.sides == "open":
+            sideways = np.minimum(sideways, self.shape[:2])
+        faces = self.shape[2] + sideways.sum()
+        divided = 0 if step >= self.longest_chord else math.ceil(length / step)
+        return int(faces + divided + len(self.scene.surfaces) + 2)
+
+    def march_steps(self, longest: float) -> int:
+        """Bound on the voxels that a path of `longest` m crosses."""
+        if self.scene.canopy is None:
+            return 0
+        if self.scene.canopy.sides == "open":
+            return int(self.shape.sum()) + 3
+        return int(self.shape[2] + math.ceil(longest / self.size[0]) + math.ceil(longest / self.size[1])) + 3
+
+
+class _Letters:
+    """Materials, letters and the largest optics of a scene."""
+
+    def __init__(self, lidar: Lidar, scene: Scene):
+        materials: list[str] = []
+        letters: list[str] = []
+        self.albedo: list[float] = []
+        shares: list[float] = []
+
+        def add(
+            name: str, reflectance: object, transmittance: object | None, straight: bool = False
+        ) -> Scatterer:
+            materials.append(name)
+            letters.append(f"{name}.R")
+            r = concrete(reflectance)
+            t = np.zeros(()) if transmittance is None else concrete(transmittance)
+            transmits = transmittance is not None and (t is None or bool(np.any(t > 0)))
+            if transmits:
+                letters.append(f"{name}.T")
+            if r is not None and t is not None:
+                self.albedo.append(float(np.max(r + (0 if straight else t))))
+                if transmits and np.any(r + t > 0):
+                    shares.append(float(np.sum(r) / np.sum(r + t)))
+            else:
+                self.albedo.append(1.0)
+            return Scatterer(
+                len(materials) - 1,
+                len(letters) - (2 if transmits else 1),
+                len(letters) - 1 if transmits else -1,
+            )
+
+        wavelength = lidar.wavelength
+        self.leaf = self.bark = None
+        canopy = scene.canopy
+        if canopy is not None and canopy.voxels.leaf is not None:
+            r, t = leaf_optics(canopy, wavelength)
+            straight = canopy.transmission == "straight"
+            if straight:
+                r_, t_ = concrete(r), concrete(t)
+                if r_ is not None and t_ is not None:
+                    r = r_ / np.maximum(1.0 - t_, 1e-6)
+            self.leaf = add("leaf", r, None if straight or isinstance(canopy.leaf, Isotropic) else t)
+        if canopy is not None and canopy.voxels.bark is not None:
+            value = canopy.bark.albedo if isinstance(canopy.bark, Isotropic) else canopy.bark
+            self.bark = add("bark", reflectance_at(value, wavelength, "bark"), None)
+        surfaces = []
+        if scene.ground is not None:
+            surfaces.append(
+                add(
+                    "ground", reflectance_at(scene.ground.reflectance, wavelength, "ground reflectance"), None
+                )
+            )
+        for i, p in enumerate(scene.plates):
+            name = "plate" if len(scene.plates) == 1 else f"plate {i + 1}"
+            r = reflectance_at(p.reflectance, wavelength, "plate reflectance")
+            t = reflectance_at(p.transmittance, wavelength, "plate transmittance")
+            surfaces.append(add(name, r, t))
+        self.surfaces = tuple(surfaces)
+        self.materials, self.letters = tuple(materials), tuple(letters)
+        share = float(np.mean(shares)) if shares else 0.5
+        # Coarse, so that small changes of optics do not recompile.
+        self.lobe = round(min(max(share, 0.2), 0.8), 1)
+
+
+def _degree(orders: int, plates: int) -> int:
+    """Longest history: every flight, and the way back, may pass every plate."""
+    return orders + (orders + 1) * plates
+
+
+def _orders(
+    letters: _Letters, scene: Scene, rtol: float, max_orders: int | None
+) -> tuple[int, float | None, str]:
+    if scene.canopy is None and len(scene.surfaces) <= 1:
+        return 1, 0.0, "one plane cannot light itself"
+    albedo = max(letters.albedo)
+    kinds, plates = len(letters.letters), len(scene.plates)
+    most = 2
+    while most < MAX_ORDERS and math.comb(_degree(most + 1, plates) + kinds, kinds) <= MAX_HISTORIES:
+        most += 1
+    wanted = most
+    if albedo < 1:
+        # Between scatterings part of the light escapes: at least a fifth, where anything can.
+        wanted = 1 + math.ceil(math.log(rtol / 10) / math.log(max(0.8 * albedo, 1e-6)))
+    orders = min(max(wanted, 2), most) if max_orders is None else int(max_orders)
+    bound = min(albedo**orders / max(1 - albedo, 1e-6), 1.0)
+    return orders, bound, f"orders 1 to {orders}; largest albedo {albedo:.2f}"
+
+
+def _time(
+    lidar: Lidar,
+    scene: Scene,
+    geometry: _Geometry,
+    orders: int,
+    window: tuple[float, float] | None,
+    bin_width: float | None,
+) -> tuple[Bins, tuple[float, float, int, int]]:
+    interval = _number(lidar.sampling_interval)
+    jitter = _number(lidar.jitter)
+    low, high = lidar.pulse.support(jitter)
+    std = math.hypot(_number(lidar.pulse.std), jitter)
+    if bin_width is None:
+        target = min(interval, max(0.25 * std, 0.05 * interval) if std > 0 else 0.5 * interval)
+    else:
+        if not 0 < bin_width < math.inf:
+            raise ValueError(f"bin_width = {bin_width:g} is outside the admissible range (0, inf)")
+        target = bin_width
+    per_sample = max(math.ceil(interval / target - 1e-6), 1)
+    width = interval / per_sample
+    first, last = geometry.first / SPEED_OF_LIGHT, geometry.last / SPEED_OF_LIGHT
+    if orders > 1:
+        last += min(max(3 * (last - first), TAIL[0]), TAIL[1])
+    if window is None:
+        begin = math.floor((first + low) / interval) * interval
+        samples = math.ceil((last + high - begin) / interval) + 1
+    else:
+        begin, end = map(float, window)
+        if not (math.isfinite(begin) and begin < end < math.inf):
+            raise ValueError(f"window = {window} is not (first, last) with first < last, in ns")
+        samples = math.floor((end - begin) / interval + 1e-6) + 1
+        # Returns that the pulse can carry into the window.
+        first = max(first, begin - interval - high)
+        last = max(begin + samples * interval - low, first + width)
+    edge = begin - 0.5 * interval
+    lead = math.ceil((edge - first) / width) + 3
+    count = lead + math.ceil((last - edge) / width) + 3
+    start = edge + width * (0.5 - lead)
+    return Bins(start, width, max(count, 1), KERNEL), (begin, interval, samples, per_sample)
+
+
+def _effects(lidar: Lidar, scene: Scene, orders: int, bound: float | None, why: str) -> tuple[Effect, ...]:
+    canopy = scene.canopy
+    c = SPEED_OF_LIGHT
+    rows = []
+    has = lambda x: "in the scene" if x else "not in the scene"  # noqa: E731
+    leaf = canopy is not None and canopy.voxels.leaf is not None
+    bark = canopy is not None and canopy.voxels.bark is not None
+    rows.append(Effect("leaf", leaf, has(leaf)))
+    rows.append(Effect("bark", bark, has(bark)))
+    rows.append(Effect("plates", bool(scene.plates), has(scene.plates)))
+    ground = scene.ground
+    rows.append(Effect("ground", ground is not None, has(ground)))
+    if ground is not None:
+        slope = _number(ground.slope)
+        spread = 2 * _number(lidar.footprint_radius) / 2 * math.tan(math.radians(slope)) / c
+        rows.append(Effect("slope spread", slope > 0, f"{spread:.2g} ns (standard deviation)"))
+    rows.append(Effect("multiple scattering", orders > 1, why, bound))
+    mirror = any(isinstance(s.law, Specular) for s in scene.surfaces)
+    rows.append(Effect("specular return", mirror, has(mirror)))
+    divergence = _number(lidar.divergence)
+    rows.append(Effect("divergence", divergence > 0, f"{divergence:g} mrad"))
+    fov = lidar.field_of_view
+    rows.append(
+        Effect("field of view", fov is not None, "sees everything" if fov is None else "soft edge of 2 %")
+    )
+    if canopy is not None:
+        path = "hot spot: exp(-tau)" if canopy.hotspot else "independent ways: exp(-2 tau)"
+        rows.append(Effect("hot spot", canopy.hotspot, path))
+    air = scene.atmosphere
+    rows.append(Effect("atmospheric extinction", air is not None, has(air)))
+    if air is not None:
+        rows.append(Effect("scattering within the atmosphere", False, "beyond first order", None))
+    jitter = _number(lidar.jitter)
+    rows.append(Effect("jitter", jitter > 0, f"{jitter:g} ns"))
+    return tuple(rows)

@@ -1,0 +1,233 @@
+"""The one entry: plan, trace in batches until the tolerance is met, waveform."""
+
+import dataclasses
+import math
+import os
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from .lidar import Lidar
+from .plan import Plan
+from .plan import plan as make_plan
+from .scene import Scene, leaf_optics
+from .trace.response import Response, trace
+from .waveform import Waveform, is_straight, total_of, waveform
+
+# Fewer batches give no trustworthy standard error.
+MIN_BATCHES = 8
+
+
+@dataclasses.dataclass(frozen=True)
+class Progress:
+    """How far a simulation has come: batches and photons traced, seconds, and the relative error so far."""
+
+    batches: int
+    photons: int
+    seconds: float
+    error: float
+    rtol: float | None
+
+    def __str__(self) -> str:
+        goal = "" if self.rtol is None else f" (aim {self.rtol:.2g})"
+        return (
+            f"{self.batches} batches, {self.photons} photons, {self.seconds:.1f} s, "
+            f"relative error {self.error:.2g}{goal}"
+        )
+
+
+def simulate(
+    lidar: Lidar,
+    scene: Scene,
+    *,
+    key: PRNGKeyArray,
+    rtol: float | None = None,
+    atol: float = 0.0,
+    n_photons: int | None = None,
+    plan: Plan | None = None,
+    max_orders: int | None = None,
+    max_step: float | None = None,
+    n_rays: int = 4096,
+    window: tuple[float, float] | None = None,
+    bin_width: float | None = None,
+    footprint: str = "random",
+    max_seconds: float = math.inf,
+    progress: Callable[[Progress], None] | None = None,
+) -> Waveform:
+    """The waveform that `lidar` records of `scene`.
+
+    Batches of photons are traced until the error is below the tolerance. The error is the root mean
+    square, over the samples above 1 % of the peak, of standard error over reflectance, for the worst
+    wavelength. Where nothing is random (one plane; a fixed footprint and one order), one pass does.
+
+    **Arguments:**
+
+    - `key`: a JAX random key: the same key gives the same waveform.
+    - `rtol`, `atol`: stop when the error is below `rtol`, or the largest standard error below `atol`. Default
+      0.01, unless `n_photons` is given.
+    - `n_photons`: trace this many photons, in eight batches, whatever the error. Within a JAX
+      transformation (grad, jacfwd, vmap over scenes) `n_photons` and `plan` are needed.
+    - `plan`: what to simulate (`jaxlidar.plan`); the next arguments then have no say.
+    - `max_orders`, `max_step`, `n_rays`, `window`, `bin_width`, `footprint`: see `jaxlidar.plan`.
+    - `max_seconds`: stop after this time, however large the error. An interrupt (Ctrl-C) after eight
+      batches also ends the simulation with what is done.
+    - `progress`: called with a `Progress` after every round of batches; for instance `print`.
+
+    **Raises:** ValueError for inadmissible arguments.
+    """
+    for name, value in (("rtol", rtol), ("max_seconds", max_seconds)):
+        if value is not None and not value > 0:
+            raise ValueError(f"{name} = {value:g} is outside the admissible range (0, inf)")
+    if not atol >= 0:
+        raise ValueError(f"atol = {atol:g} is outside the admissible range [0, inf)")
+    if n_photons is not None and (n_photons != int(n_photons) or n_photons < 1):
+        raise ValueError(f"n_photons = {n_photons} is outside the admissible range [1, inf) of integers")
+    if plan is None:
+        plan = make_plan(
+            lidar,
+            scene,
+            rtol=rtol,
+            max_orders=max_orders,
+            max_step=max_step,
+            n_rays=n_rays,
+            window=window,
+            bin_width=bin_width,
+            footprint=footprint,
+        )
+    if n_photons is not None:
+        plan = dataclasses.replace(plan, n_photons=max(int(n_photons) // MIN_BATCHES, 1))
+    if not plan.is_random:
+        started = time.perf_counter()
+        response, _ = _batch(lidar, scene, plan, key)
+        info = {"photons": 0, "batches": 1, "error": 0.0, "stopped": "nothing is random"}
+        wave = _finish(response, lidar, scene, plan, None)
+        return dataclasses.replace(wave, info={**info, "seconds": time.perf_counter() - started})
+    traced = any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((lidar, scene, key)))
+    if traced:
+        return _simulate_traced(lidar, scene, plan, key)
+    if n_photons is not None:
+        rtol = None
+    elif rtol is None:
+        rtol = plan.rtol
+    return _simulate_batches(
+        lidar, scene, plan, key, rtol, atol, n_photons is not None, max_seconds, progress
+    )
+
+
+def trace_all(lidar: Lidar, scene: Scene, plan: Plan, key: PRNGKeyArray) -> Response | list[Response]:
+    """One batch: a response, or one for each wavelength where leaves transmit straight on."""
+    if not is_straight(scene):
+        return trace(lidar, scene, plan, key)
+    _, t = leaf_optics(scene.canopy, lidar.wavelength)
+    return [trace(lidar, scene, plan, key, t[i]) for i in range(t.size)]
+
+
+def total_all(
+    response: Response | list[Response], lidar: Lidar, scene: Scene, plan: Plan
+) -> Float[Array, "wavelengths samples"]:
+    """Apparent reflectance per sample of a response, or of a list of one for each wavelength."""
+    if not isinstance(response, list):
+        return total_of(response, lidar, scene, plan)
+    return jnp.stack([total_of(r, lidar, scene, plan)[i] for i, r in enumerate(response)])
+
+
+@eqx.filter_jit
+def _batch(lidar: Lidar, scene: Scene, plan: Plan, key: PRNGKeyArray):
+    response = trace_all(lidar, scene, plan, key)
+    return response, total_all(response, lidar, scene, plan)
+
+
+_finish = eqx.filter_jit(
+    lambda response, lidar, scene, plan, stderr: waveform(response, lidar, scene, plan, stderr=stderr)
+)
+
+
+def _simulate_traced(lidar: Lidar, scene: Scene, plan: Plan, key: PRNGKeyArray) -> Waveform:
+    responses, totals = jax.lax.map(
+        lambda k: _batch(lidar, scene, plan, k), jax.random.split(key, MIN_BATCHES)
+    )
+    mean = jax.tree.map(lambda a: jnp.mean(a, axis=0), responses)
+    stderr = jnp.sqrt(jnp.var(jax.lax.stop_gradient(totals), axis=0) / (MIN_BATCHES - 1))
+    return waveform(mean, lidar, scene, plan, stderr=stderr)
+
+
+def _simulate_batches(lidar, scene, plan, key, rtol, atol, fixed, max_seconds, progress) -> Waveform:
+    started = time.perf_counter()
+    total = None
+    means: list[np.ndarray] = []
+    done, wanted, stopped = 0, MIN_BATCHES, "tolerance met"
+    error = math.inf
+
+    def one(n: int):
+        out = _batch(lidar, scene, plan, jax.random.fold_in(key, n))
+        return jax.block_until_ready(out)
+
+    # XLA runs one batch on one core; batches on several threads use them all.
+    with ThreadPoolExecutor(max_workers=max(os.cpu_count() or 1, 1)) as pool:
+        try:
+            while True:
+                # The first batch alone: it compiles.
+                for response, mean in pool.map(one, range(done, wanted)) if done else map(one, range(1)):
+                    total = response if total is None else _add(total, response)
+                    means.append(np.asarray(mean))
+                    done += 1
+                if done < MIN_BATCHES:
+                    continue
+                error, worst = _error(np.stack(means))
+                seconds = time.perf_counter() - started
+                if progress is not None:
+                    progress(Progress(done, done * plan.n_photons, seconds, error, rtol))
+                if fixed:
+                    stopped = "photons traced"
+                    break
+                if error <= rtol or worst <= atol:
+                    break
+                if seconds >= max_seconds:
+                    stopped = "time spent"
+                    break
+                # The error falls with the square root; four times as many at most before looking again.
+                needed = math.ceil(1.1 * done * (error / rtol) ** 2)
+                wanted = int(min(max(needed, done + 2), 4 * done))
+                if math.isfinite(max_seconds):
+                    affordable = done * max_seconds / max(seconds, 1e-9)
+                    wanted = max(min(wanted, int(affordable)), done + 1)
+        except KeyboardInterrupt:
+            if done < MIN_BATCHES:
+                raise
+            pool.shutdown(cancel_futures=True)
+            error, _ = _error(np.stack(means))
+            stopped = "interrupted"
+    mean = jax.tree.map(lambda a: a / done, total)
+    stderr = jnp.asarray(np.std(np.stack(means), axis=0, ddof=1) / math.sqrt(done))
+    wave = _finish(mean, lidar, scene, plan, stderr)
+    info = {
+        "photons": done * plan.n_photons if plan.orders > 1 else 0,
+        "batches": done,
+        "seconds": time.perf_counter() - started,
+        "error": error,
+        "stopped": stopped,
+    }
+    return dataclasses.replace(wave, info=info)
+
+
+@jax.jit
+def _add(a, b):
+    return jax.tree.map(jnp.add, a, b)
+
+
+def _error(means: Float[np.ndarray, "batches wavelengths bins"]) -> tuple[float, float]:
+    """Relative error (see `simulate`) and largest standard error of the mean of batches."""
+    mean = np.mean(means, axis=0)
+    stderr = np.std(means, axis=0, ddof=1) / math.sqrt(len(means))
+    relative = []
+    for m, s in zip(mean, stderr):
+        seen = m > 0.01 * np.max(m)
+        if np.any(seen):
+            relative.append(math.sqrt(np.mean((s[seen] / m[seen]) ** 2)))
+    return max(relative, default=0.0), float(np.max(stderr))

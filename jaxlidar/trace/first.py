@@ -1,0 +1,248 @@
+r"""First order: every ray of the footprint marched through the scene, its expected return deposited.
+
+Nothing is random. With extinction coefficients k_m of the materials m, k their sum, and tau the optical
+depth from the sensor, the return from a stretch of the ray is
+
+    f_m * integral of k_m exp(-kappa tau(s)) ds,    kappa = 2, or 1 with the hot spot,
+
+integrated exactly over every piece of the ray that lies within one voxel and one time bin. f_m is the
+view factor for backscatter: 2/3 for spherically oriented facets (the mean squared cosine 1/3 over the
+mean cosine 1/2, hence Ross's R/3 for leaf area), 1/4 for isotropic scattering.
+"""
+
+import itertools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from .._vector import Scalar, Vec, along, scale
+from ..constants import SPEED_OF_LIGHT
+from ..layout import Bins, Layout
+from ..materials import Specular
+from .deposit import first_bin, instant_row, scatter_rows, smooth_row
+from .footprint import Beam
+from .histories import Histories
+from .march import FAR, Medium, advance, begin, cell_of, hold_in_columns
+from .surfaces import Surface
+
+CHUNK = 256
+FACET_BACKSCATTER = 2.0 / 3.0
+ISOTROPIC_BACKSCATTER = 0.25
+
+
+class Stretches(eqx.Module):
+    """The pieces of one ray between faces: start, length (m), optical depth at the start, voxel."""
+
+    start: Float[Array, "steps"]
+    length: Float[Array, "steps"]
+    depth: Float[Array, "steps"]
+    cell: Int[Array, "steps"]
+
+
+def mean_decay(x: Scalar) -> Scalar:
+    """(1 - exp(-x)) / x for x >= 0, with its derivative, exact down to and at zero."""
+    small = x < 0.1
+    series = jnp.ones_like(x)
+    for n in range(10, 1, -1):
+        series = 1.0 - x / n * series
+    big = jnp.where(small, 1.0, x)
+    return jnp.where(small, series, -jnp.expm1(-big) / big)
+
+
+def march_ray(
+    medium: Medium, x: Vec, w: Vec, end: Scalar, stops: list[Scalar], steps: int, max_step: Scalar
+) -> tuple[Stretches, list[Scalar], Scalar]:
+    """All stretches of one ray up to `end`, and the optical depth at each of `stops` and at its end."""
+    walk = begin(medium, x, w)
+    end = jnp.minimum(end, walk.leave)
+
+    def step(state, _):
+        distance, depth, voxel, at_stops = state
+        face = walk.nearest(voxel)
+        to = jnp.minimum(jnp.minimum(face, end), distance + max_step)
+        for stop in stops:
+            # Plates lie between stretches, not within one.
+            to = jnp.where(stop > distance, jnp.minimum(to, stop), to)
+        to = jnp.maximum(to, distance)
+        cell = cell_of(medium, voxel)
+        k = medium.extinction(cell, w)
+        length = to - distance
+        at_stops = [
+            a + k * jnp.clip(jnp.minimum(stop, to) - distance, 0.0) for a, stop in zip(at_stops, stops)
+        ]
+        crossed = (to >= face) & (to < end)
+        voxel_ = tuple(jnp.where(crossed, m, v) for m, v in zip(advance(walk, voxel), voxel))
+        return (to, depth + k * length, voxel_, at_stops), Stretches(distance, length, depth, cell)
+
+    zero = jnp.zeros_like(end)
+    state = (jnp.minimum(walk.enter, end), zero, walk.voxel, [zero] * len(stops))
+    (_, total, _, at_stops), stretches = lax.scan(step, state, None, length=steps)
+    return stretches, at_stops, total
+
+
+class Passage:
+    """What plates in the way do to light that passes them `ways` times: exponents and their weights.
+
+    A fully covering plate multiplies by T each time; a partial one by (1 - c) + c T, which is expanded
+    so that each term is a monomial in T.
+    """
+
+    def __init__(self, surfaces: tuple[Surface, ...], layout: Layout, ways: int):
+        self.plates = [(i, s, layout.surfaces[i].transmitted) for i, s in enumerate(surfaces) if s.plate]
+        choices = []
+        for i, s, _ in self.plates:
+            c = s.coverage
+            if layout.full_cover[i]:
+                options = [(ways, jnp.ones_like(c) if s.straight else jnp.zeros_like(c))]
+            elif s.straight:
+                terms = {1: [1 - c, c], 2: [(1 - c) ** 2, 2 * c * (1 - c), c**2]}[ways]
+                options = list(enumerate(terms))
+            else:
+                options = [(0, (1 - c) ** ways)]
+            # Where the plate is not in the way, the first option alone stands, with weight one.
+            choices.append([(*option, float(n == 0)) for n, option in enumerate(options)])
+        self.combinations = list(itertools.product(*choices))
+
+    def terms(self, table: Histories, base: int, s: Scalar, met: list[Scalar]):
+        """Pairs of history and weight for light that scatters at distance `s` into history `base`."""
+        successor = jnp.asarray(table.successor)
+        for combination in self.combinations:
+            number = jnp.full(s.shape, base, jnp.int32)
+            weight = jnp.ones_like(s)
+            for (i, _, letter), (exponent, value, absent) in zip(self.plates, combination):
+                above = met[i] < s
+                grown = number
+                for _ in range(exponent if letter >= 0 else 0):
+                    grown = successor[grown, letter]
+                number = jnp.where(above, grown, number)
+                weight = weight * jnp.where(above, value, absent)
+            yield number, weight
+
+
+class FirstOrder(eqx.Module):
+    """Deterministic first-order response and the fate of the light that it describes."""
+
+    weights: Float[Array, "materials histories bins"]
+    arrived: Float[Array, "materials histories"]
+    escaped: Float[Array, "histories"]
+
+
+def first_order(
+    beam: Beam,
+    medium: Medium | None,
+    surfaces: tuple[Surface, ...],
+    layout: Layout,
+    table: Histories,
+    bins: Bins,
+    across: tuple[Float[Array, "rays"], Float[Array, "rays"]],
+    energy: Float[Array, "rays"],
+) -> FirstOrder:
+    """Response of order one. Rays are given by their place across the beam and their share of energy."""
+    count = table.count
+    out_way, both_ways = Passage(surfaces, layout, 1), Passage(surfaces, layout, 2)
+    kappa = 1.0 if layout.hotspot else 2.0
+    successor = table.successor
+    metres = 0.5 * SPEED_OF_LIGHT * bins.width
+    materials = len(layout.materials)
+
+    def rays(across, energy):
+        across, share = hold_in_columns(beam, medium, across)
+        energy = energy * share
+        point, w, excess = beam.ray(across)
+        x = along(point, w, jnp.asarray(-layout.upstream, energy.dtype))
+        excess = excess - layout.upstream
+        met = [s.distance(x, w) for s in surfaces]
+        stop = met[0] if layout.has_ground else jnp.full_like(energy, FAR)
+        visible = energy * beam.in_view(along(x, w, jnp.minimum(stop, layout.upstream)))
+        response = jnp.zeros((materials * count, bins.padded), energy.dtype)
+        arrived = jnp.zeros((materials, count), energy.dtype)
+        at_stops = [jnp.zeros_like(energy) for _ in met]
+        total = jnp.zeros_like(energy)
+
+        if medium is not None:
+            stretch, at_stops, total = jax.vmap(
+                lambda x, w, end, stops: march_ray(
+                    medium, x, w, end, stops, layout.first_steps, jnp.asarray(layout.max_step)
+                ),
+                out_axes=(1, 0, 0),
+            )(x, w, stop, met)
+            k = medium.extinction(stretch.cell, w)
+            begin_ = bins.position(2.0 * (excess + stretch.start) / SPEED_OF_LIGHT)
+            end_ = begin_ + stretch.length / metres
+            number = jnp.round(lax.stop_gradient(begin_))
+            decay, one_way = [], jnp.exp(-stretch.depth) * mean_decay(k * stretch.length) * stretch.length
+            for j in range(bins.row - 2):
+                low = jnp.clip(number + (j - 0.5), begin_, end_)
+                long = (jnp.clip(number + (j + 0.5), begin_, end_) - low) * metres
+                depth = stretch.depth + k * (low - begin_) * metres
+                decay.append(jnp.exp(-kappa * depth) * mean_decay(kappa * k * long) * long)
+            row = smooth_row(jnp.stack(decay, axis=-1))
+            first = first_bin(bins, number - 1, bins.row)
+            for m, part in _parts(medium, layout, stretch.cell, w):
+                base = int(successor[0, part.letter])
+                value = part.extinction * part.backscatter * visible
+                middle = stretch.start + 0.5 * stretch.length
+                for history, share in both_ways.terms(table, base, middle, met):
+                    rows = row * (value * share)[..., None]
+                    response = scatter_rows(response, m * count + history, first, rows)
+                for history, share in out_way.terms(table, 0, middle, met):
+                    arrived = arrived.at[m, history].add(part.extinction * one_way * share * energy)
+
+        for i, (s, law) in enumerate(zip(surfaces, layout.surfaces)):
+            hit = jnp.where((met[i] <= stop) & (met[i] < FAR), s.coverage * energy, 0.0)
+            for history, share in out_way.terms(table, 0, met[i], met):
+                arrived = arrived.at[law.material, history].add(hit * jnp.exp(-at_stops[i]) * share)
+            if isinstance(s.law, Specular):
+                continue
+            at = along(x, w, jnp.where(met[i] < FAR, met[i], 0.0))
+            back = scale(w, jnp.asarray(-1.0))
+            factor = s.law.view_factor(w, s.lit_normal(w), back, beam.half_angle) * beam.in_view(at)
+            time = 2.0 * (excess + jnp.minimum(met[i], 1e9)) / SPEED_OF_LIGHT
+            first, row = instant_row(bins, time, hit * factor * jnp.exp(-kappa * at_stops[i]))
+            for history, share in both_ways.terms(table, int(successor[0, law.reflected]), met[i], met):
+                response = scatter_rows(
+                    response, law.material * count + history, first, row * share[..., None]
+                )
+
+        gone = jnp.where(stop < FAR, 0.0, energy * jnp.exp(-total))
+        escaped = jnp.zeros((count,), energy.dtype)
+        for history, share in out_way.terms(table, 0, stop, met):
+            escaped = escaped.at[history].add(gone * share)
+        return response, arrived, escaped
+
+    n = energy.shape[0]
+    size = min(CHUNK, n)
+    fill = -n % size
+    padded = [jnp.pad(a, (0, fill)).reshape(-1, size) for a in (*across, energy)]
+
+    def body(total, chunk):
+        return jax.tree.map(jnp.add, total, rays((chunk[0], chunk[1]), chunk[2])), None
+
+    zero = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(rays, across, energy))
+    response, arrived, escaped = lax.scan(body, zero, padded)[0]
+    weights = bins.trim(response.reshape(materials, count, bins.padded))
+    return FirstOrder(weights, arrived, escaped)
+
+
+class Part(eqx.Module):
+    """One material of the medium on a ray: its extinction, view factor for backscatter, and letter."""
+
+    extinction: Float[Array, "..."]
+    backscatter: Float[Array, "..."] | float
+    letter: int = eqx.field(static=True)
+
+
+def _parts(medium: Medium, layout: Layout, cell: Int[Array, "..."], w: Vec):
+    if medium.leaf is not None:
+        factor = FACET_BACKSCATTER
+        if layout.leaf_isotropic:
+            factor = ISOTROPIC_BACKSCATTER
+        elif medium.angles is not None:
+            factor = medium.angles.square_at(w) / medium.angles.projection_at(w)
+        yield layout.leaf.material, Part(medium.leaf_at(cell, w), factor, layout.leaf.reflected)
+    if medium.bark is not None:
+        factor = ISOTROPIC_BACKSCATTER if layout.bark_isotropic else FACET_BACKSCATTER
+        yield layout.bark.material, Part(medium.bark_at(cell), factor, layout.bark.reflected)

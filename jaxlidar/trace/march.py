@@ -1,0 +1,302 @@
+"""Exact traversal of the voxel grid: from face to face along straight rays.
+
+Nothing is sampled on the way: within a voxel the extinction coefficient is constant, so the optical
+depth is known at every face and linear between them. Distances to faces are computed from integer
+face numbers, never accumulated. Written for one ray; photons are batched by `jax.vmap`, and a whole
+batch stops as soon as its last ray has.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from .._vector import Scalar, Vec, along, from_frame, to_frame
+from ..materials import ANGLE_NODES, LeafAngles
+from ..voxels import VoxelMap
+from .footprint import Beam
+
+FAR = 1e30
+# Steps between two looks at whether any ray of the batch still moves.
+BLOCK = 16
+
+
+class AngleTables(eqx.Module):
+    """G and the mean squared cosine of a leaf angle distribution, on equal steps of |cos zenith|."""
+
+    projection: Float[Array, "nodes"]
+    square: Float[Array, "nodes"]
+
+    def _at(self, table: Float[Array, "nodes"], w: Vec) -> Scalar:
+        position = jnp.clip(jnp.abs(w[2]), 0.0, 1.0) * (ANGLE_NODES - 1)
+        below = jnp.clip(lax.stop_gradient(position).astype(jnp.int32), 0, ANGLE_NODES - 2)
+        return table[below] + (position - below) * (table[below + 1] - table[below])
+
+    def projection_at(self, w: Vec) -> Scalar:
+        """G of a direction."""
+        return self._at(self.projection, w)
+
+    def square_at(self, w: Vec) -> Scalar:
+        """Mean of (leaf normal . direction)^2."""
+        return self._at(self.square, w)
+
+
+class Medium(eqx.Module):
+    """A voxel map laid out for tracing; positions are relative to the aim point."""
+
+    leaf: Float[Array, "cells"] | None
+    bark: Float[Array, "cells"] | None
+    total: Float[Array, "cells"] | None
+    size: Float[Array, "3"]
+    origin: Float[Array, "3"]
+    angles: AngleTables | None
+    leaf_angles: LeafAngles | None
+    shape: tuple[int, int, int] = eqx.field(static=True)
+    periodic: bool = eqx.field(static=True)
+
+    def leaf_at(self, cell: Int[Array, "*s"], w: Vec) -> Scalar:
+        """Extinction coefficient of leaf for light travelling along `w`, 1/m."""
+        assert self.leaf is not None
+        k = _pick(self.leaf, cell)
+        return k if self.angles is None else k * (2.0 * self.angles.projection_at(w))
+
+    def bark_at(self, cell: Int[Array, "*s"]) -> Scalar:
+        """Extinction coefficient of bark, 1/m."""
+        assert self.bark is not None
+        return _pick(self.bark, cell)
+
+    def extinction(self, cell: Int[Array, "*s"], w: Vec) -> Scalar:
+        """Extinction coefficient of leaf and bark together, 1/m."""
+        if self.total is not None:
+            return _pick(self.total, cell)
+        if self.bark is None:
+            return self.leaf_at(cell, w)
+        return self.leaf_at(cell, w) + self.bark_at(cell)
+
+
+def _pick(table: Float[Array, "cells"], cell: Int[Array, "*s"]) -> Scalar:
+    return table.at[cell].get(mode="promise_in_bounds")
+
+
+def medium_of(voxels: VoxelMap, aim: Float[Array, "3"], periodic: bool, leaf_factor: Scalar) -> Medium:
+    """Lay out a voxel map; `leaf_factor` scales leaf extinction (1 - T where transmission is straight)."""
+    leaf = None if voxels.leaf is None else voxels.leaf.reshape(-1) * leaf_factor
+    bark = None if voxels.bark is None else voxels.bark.reshape(-1)
+    angles = None
+    if voxels.leaf_angles is not None and leaf is not None:
+        angles = AngleTables(*voxels.leaf_angles.tables())
+    total = None
+    if angles is None:
+        total = leaf if bark is None else (bark if leaf is None else leaf + bark)
+    return Medium(
+        leaf,
+        bark,
+        total,
+        voxels.voxel_size,
+        voxels.origin - aim,
+        angles,
+        voxels.leaf_angles if angles is not None else None,
+        voxels.shape,
+        periodic,
+    )
+
+
+class Walk(eqx.Module):
+    """A ray on the grid: distance to face number f along axis k is `gap[k] * f + offset[k]`."""
+
+    gap: Vec
+    offset: Vec
+    still: tuple[Bool[Array, ""], Bool[Array, ""], Bool[Array, ""]]
+    step: tuple[Int[Array, ""], Int[Array, ""], Int[Array, ""]]
+    voxel: tuple[Int[Array, ""], Int[Array, ""], Int[Array, ""]]
+    enter: Float[Array, ""]
+    leave: Float[Array, ""]
+    direction: Vec
+
+    def faces(self, voxel: tuple[Int[Array, ""], ...]) -> tuple[Scalar, ...]:
+        """Distances to the faces at which the ray would leave `voxel` along each axis."""
+        return tuple(
+            jnp.where(still, FAR, gap * (v + (s > 0)) + offset)
+            for gap, offset, still, v, s in zip(self.gap, self.offset, self.still, voxel, self.step)
+        )
+
+    def nearest(self, voxel: tuple[Int[Array, ""], ...]) -> Scalar:
+        """Distance to the face at which the ray leaves `voxel`."""
+        tx, ty, tz = self.faces(voxel)
+        return jnp.minimum(jnp.minimum(tx, ty), tz)
+
+
+def begin(medium: Medium, x: Vec, w: Vec) -> Walk:
+    """Where a ray from `x` along `w` enters the grid (0 if inside) and leaves it, and its first voxel."""
+    near, far = jnp.zeros_like(x[0]), jnp.full_like(x[0], FAR)
+    gap, offset, still, step = [], [], [], []
+    for k in range(3):
+        flat = jnp.abs(w[k]) < 1e-12
+        inverse = 1.0 / jnp.where(flat, 1.0, w[k])
+        lower = medium.origin[k] - x[k]
+        gap.append(medium.size[k] * inverse)
+        offset.append(lower * inverse)
+        still.append(flat)
+        step.append(jnp.where(w[k] > 0, 1, -1))
+        if medium.periodic and k < 2:
+            continue
+        upper = lower + medium.size[k] * medium.shape[k]
+        within = (lower <= 0) & (upper >= 0)
+        a, b = lower * inverse, upper * inverse
+        near = jnp.maximum(near, jnp.where(flat, jnp.where(within, 0.0, FAR), jnp.minimum(a, b)))
+        far = jnp.minimum(far, jnp.where(flat, FAR, jnp.maximum(a, b)))
+    # A ray that misses the grid enters and leaves it at once.
+    met = near < far
+    near, far = jnp.where(met, near, 0.0), jnp.where(met, far, 0.0)
+    voxel = []
+    for k in range(3):
+        place = (x[k] + w[k] * near - medium.origin[k]) / medium.size[k]
+        number = jnp.floor(lax.stop_gradient(place))
+        if not (medium.periodic and k < 2):
+            number = jnp.clip(number, 0, medium.shape[k] - 1)
+        voxel.append(number.astype(jnp.int32))
+    return Walk(tuple(gap), tuple(offset), tuple(still), tuple(step), tuple(voxel), near, far, w)
+
+
+def cell_of(medium: Medium, voxel: tuple[Int[Array, ""], ...]) -> Int[Array, ""]:
+    """Index into the flat arrays; rounding at the last face cannot lead outside."""
+    nx, ny, nz = medium.shape
+    if medium.periodic:
+        i, j = voxel[0] % nx, voxel[1] % ny
+    else:
+        i, j = jnp.clip(voxel[0], 0, nx - 1), jnp.clip(voxel[1], 0, ny - 1)
+    return (i * ny + j) * nz + jnp.clip(voxel[2], 0, nz - 1)
+
+
+def advance(walk: Walk, voxel: tuple[Int[Array, ""], ...]) -> tuple[Int[Array, ""], ...]:
+    """The voxel behind the nearest face; through an edge or a corner, one face at a time."""
+    tx, ty, tz = walk.faces(voxel)
+    x = (tx <= ty) & (tx <= tz)
+    y = ~x & (ty <= tz)
+    z = ~x & ~y
+    return tuple(v + jnp.where(cross, s, 0) for v, s, cross in zip(voxel, walk.step, (x, y, z)))
+
+
+class Free(eqx.Module):
+    """Where a ray's free flight ended.
+
+    - `collided`: in the medium, or else it reached its limit or left the grid.
+    - `cell`: the last voxel. - `entered`, `chord`: distance at which it entered that voxel, and how
+      long the ray is within it, both m. - `depth`: optical depth up to `entered`, or of the whole ray.
+    """
+
+    collided: Bool[Array, "photons"]
+    cell: Int[Array, "photons"]
+    entered: Float[Array, "photons"]
+    chord: Float[Array, "photons"]
+    depth: Float[Array, "photons"]
+
+
+def free_flight(
+    medium: Medium,
+    x: Vec,
+    w: Vec,
+    target: Float[Array, "photons"],
+    limit: Float[Array, "photons"],
+    active: Bool[Array, "photons"],
+    steps: int,
+) -> Free:
+    """Follow rays until their optical depth reaches `target`, their length `limit`, or they leave.
+
+    `steps` bounds the number of faces crossed; batches stop earlier when all their rays have.
+    """
+    walk = jax.vmap(lambda a, b: begin(medium, a, b))(x, w)
+    end = jnp.minimum(walk.leave, limit)
+
+    def one(walk: Walk, end: Scalar, target: Scalar, state):
+        distance, depth, voxel, running = state
+        to = jnp.maximum(jnp.minimum(walk.nearest(voxel), end), distance)
+        more = depth + medium.extinction(cell_of(medium, voxel), walk.direction) * (to - distance)
+        # A ray that collides stays where it entered the voxel.
+        passes = running & (more < target)
+        inside = passes & (to < end)
+        moved = advance(walk, voxel)
+        return (
+            jnp.where(passes, to, distance),
+            jnp.where(passes, more, depth),
+            tuple(jnp.where(inside, m, v) for m, v in zip(moved, voxel)),
+            inside,
+        )
+
+    step = jax.vmap(one)
+
+    def block(state, _):
+        def go(state):
+            return lax.scan(lambda s, _: (step(walk, end, target, s), None), state, None, length=BLOCK)[0]
+
+        return lax.cond(jnp.any(state[3]), go, lambda s: s, state), None
+
+    start = jnp.minimum(walk.enter, end)
+    state = (start, jnp.zeros_like(target), walk.voxel, active & (walk.enter < end))
+    began = state[3]
+    distance, depth, voxel, running = lax.scan(block, state, None, length=-(-steps // BLOCK))[0]
+
+    def last(walk: Walk, end: Scalar, distance: Scalar, voxel):
+        return cell_of(medium, voxel), jnp.maximum(jnp.minimum(walk.nearest(voxel), end) - distance, 0.0)
+
+    cell, chord = jax.vmap(last)(walk, end, distance, voxel)
+    collided = began & (distance < end) & ~running
+    return Free(collided, cell, distance, chord, depth)
+
+
+def hold_in_columns(
+    beam: Beam, medium: Medium | None, across: tuple[Scalar, Scalar]
+) -> tuple[tuple[Scalar, Scalar], Scalar]:
+    """Let the rays of the footprint move with the columns of the grid, and their energy accordingly.
+
+    Values do not change. But the optical depth of a nearly vertical ray jumps, seen from afar, where it
+    crosses into another column: its derivative with respect to a sideways motion of the grid lies in rare,
+    nearly parallel crossings. Rays that move along have none, and the profile of a Gaussian beam makes up
+    for it. The edge of a top-hat would not, so its rays stay, and that derivative stays noisy.
+    """
+    if medium is None or not beam.gaussian:
+        return across, jnp.ones_like(across[0])
+    across_axis = from_frame(beam.axis, (*across, jnp.zeros_like(across[0])))
+    # Where the rays meet the reference plane.
+    flat = along(across_axis, beam.axis, -across_axis[2] / beam.axis[2])
+    moved = []
+    for k in range(2):
+        place = lax.stop_gradient((flat[k] - medium.origin[k]) / medium.size[k])
+        now = medium.origin[k] + medium.size[k] * place
+        moved.append(now - lax.stop_gradient(now))
+    shift = to_frame(beam.axis, (*moved, jnp.zeros_like(across[0])))
+    across = (across[0] + shift[0], across[1] + shift[1])
+    area = medium.size[0] * medium.size[1]
+    density = beam.irradiance(across) * area
+    held = lax.stop_gradient(density)
+    return across, 1.0 + (density - held) / jnp.maximum(held, 1e-30)
+
+
+def depth_to_top(medium: Medium, x: Vec, column: Float[Array, "cells"]) -> Scalar:
+    """Optical depth from `x` straight up, from `column` = the depth above each voxel's upper face."""
+    voxel = []
+    place = []
+    for k in range(3):
+        p = (x[k] - medium.origin[k]) / medium.size[k]
+        place.append(p)
+        voxel.append(jnp.floor(lax.stop_gradient(p)).astype(jnp.int32))
+    nx, ny, nz = medium.shape
+    inside = voxel[2] < nz
+    if not medium.periodic:
+        inside &= (voxel[0] >= 0) & (voxel[0] < nx) & (voxel[1] >= 0) & (voxel[1] < ny)
+    cell = cell_of(medium, tuple(voxel))
+    up = (jnp.zeros_like(x[0]), jnp.zeros_like(x[0]), jnp.ones_like(x[0]))
+    above = jnp.clip(jnp.clip(voxel[2], 0, nz - 1) + 1 - jnp.maximum(place[2], 0.0), 0.0, 1.0)
+    depth = _pick(column, cell) + medium.extinction(cell, up) * above * medium.size[2]
+    return jnp.where(inside, depth, 0.0)
+
+
+def columns(medium: Medium) -> Float[Array, "cells"]:
+    """Optical depth straight up above each voxel's upper face."""
+    cells = jnp.arange(int(np.prod(medium.shape)))
+    one = jnp.ones((), medium.size.dtype)
+    k = medium.extinction(cells, (0.0 * one, 0.0 * one, one)).reshape(medium.shape) * medium.size[2]
+    above = jnp.concatenate([jnp.zeros_like(k[:, :, :1]), k[:, :, :0:-1]], axis=2)
+    return jnp.cumsum(above, axis=2)[:, :, ::-1].reshape(-1)

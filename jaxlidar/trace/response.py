@@ -1,0 +1,138 @@
+"""Geometry traced once: the response of a scene to a pulse without duration, for any optics.
+
+    received[wavelength, bin] = sum over histories h of
+        response[bin, h] * prod over letters s of optics_s[wavelength] ** exponent[h, s]
+
+known in biomedical optics as white Monte Carlo (Alerstam et al. 2008).
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from ..lidar import Lidar
+from ..materials import Specular
+from ..plan import Plan
+from ..scene import Scene
+from .first import FirstOrder, first_order
+from .footprint import Beam, beam_of, lattice, product_rule
+from .higher import higher_orders
+from .histories import Histories, histories
+from .march import Medium, medium_of
+from .mirror import mirror_rays
+from .surfaces import surfaces_of
+
+
+class Response(eqx.Module):
+    """Geometric weight of all paths, by last material, history and fine time bin.
+
+    - `first`: (materials, first histories, bins) order one, apparent reflectance per unit optics.
+    - `higher`: (materials, histories, bins) orders two and above, or None where they were not traced.
+    - `arrived`, `left`: (materials, histories) weight that reached each material, and that went on.
+    - `escaped`, `late`, `remaining`: (histories,) weight that left the scene, that outlasted the window, and
+      that had scatterings left when the last order was reached.
+    """
+
+    first: Float[Array, "materials short bins"]
+    higher: Float[Array, "materials histories bins"] | None
+    arrived: Float[Array, "materials histories"]
+    left: Float[Array, "materials histories"]
+    escaped: Float[Array, "histories"]
+    late: Float[Array, "histories"]
+    remaining: Float[Array, "histories"]
+
+
+def trace(
+    lidar: Lidar,
+    scene: Scene,
+    plan: Plan,
+    key: PRNGKeyArray,
+    leaf_transmittance: Float[Array, ""] | float = 0.0,
+) -> Response:
+    """One batch: the deterministic first order and `plan.n_photons` photons for the higher ones.
+
+    A pure function of arrays, to be compiled, batched and differentiated. `leaf_transmittance` matters only
+    where the canopy's transmission is straight; extinction is then scaled by one minus it.
+    """
+    layout, bins = plan.layout, plan.bins
+    aim = jnp.concatenate([lidar.position, jnp.zeros_like(lidar.position[:1])])
+    beam, surfaces = beam_of(lidar), surfaces_of(scene, aim)
+    medium = None
+    if scene.canopy is not None:
+        straight = scene.canopy.transmission == "straight"
+        factor = jnp.asarray(1.0 - leaf_transmittance if straight else 1.0)
+        medium = medium_of(scene.canopy.voxels, aim, scene.canopy.sides == "periodic", factor)
+    table = histories(len(layout.letters), plan.degree)
+    short = histories(len(layout.letters), plan.first_degree)
+    shift_key, photon_key = jax.random.split(key)
+
+    if plan.smooth_footprint:
+        across, energy = product_rule(beam)
+    else:
+        shift = jax.random.uniform(shift_key, (2,)) if plan.random_footprint else jnp.asarray([0.5, 0.0])
+        across, energy = lattice(beam, plan.n_rays, shift)
+    first = first_order(beam, medium, surfaces, layout, short, bins, across, energy)
+    weights = first.weights
+    for i, surface in enumerate(surfaces):
+        if isinstance(surface.law, Specular):
+            weights = weights + _mirror(beam, medium, surfaces, i, plan, short)
+
+    if plan.layout.orders < 2:
+        straight = [s.straight for s in surfaces]
+        return _only_first(first, weights, plan, short, straight)
+    higher = higher_orders(beam, medium, surfaces, layout, table, bins, photon_key, plan.n_photons)
+    return Response(
+        weights, higher.weights, higher.arrived, higher.left, higher.escaped, higher.late, higher.remaining
+    )
+
+
+def _mirror(
+    beam: Beam, medium: Medium | None, surfaces: tuple, which: int, plan: Plan, table: Histories
+) -> Float[Array, "materials short bins"]:
+    """What comes back from one mirror, through all that lies before it."""
+    across, value = mirror_rays(beam, surfaces[which])
+    # As if it were a Lambertian sheet met at normal incidence, weighted by what the mirror returns.
+    plain = eqx.tree_at(lambda s: s.law, surfaces[which], _Facing())
+    others = tuple(plain if i == which else s for i, s in enumerate(surfaces))
+    response = first_order(beam, medium, others, plan.layout, table, plan.bins, across, value)
+    material = plan.layout.surfaces[which].material
+    keep = jnp.arange(response.weights.shape[0]) == material
+    return jnp.where(keep[:, None, None], response.weights, 0.0)
+
+
+class _Facing(eqx.Module):
+    """View factor one: the value is already in the weight of the ray."""
+
+    def view_factor(self, incident, normal, view, half_angle):
+        return jnp.ones_like(incident[0])
+
+
+def _only_first(
+    first: FirstOrder,
+    weights: Float[Array, "materials short bins"],
+    plan: Plan,
+    table: Histories,
+    straight: list[bool],
+) -> Response:
+    """The fate of light when nothing is followed beyond the first scattering: what scatters remains."""
+    layout = plan.layout
+    left = jnp.zeros_like(first.arrived)
+    remaining = jnp.zeros_like(first.escaped)
+    scatterers = [(s, False) for s in (layout.leaf, layout.bark) if s is not None]
+    scatterers += list(zip(layout.surfaces, straight))
+    for s, passes in scatterers:
+        for letter in (s.reflected, s.transmitted):
+            if letter < 0:
+                continue
+            after = table.successor[:, letter]
+            grown = jnp.where(after != jnp.arange(table.count), first.arrived[s.material], 0.0)
+            left = left.at[s.material, after].add(grown)
+            # What goes straight through a plate was followed to what lies behind it.
+            if not (passes and letter == s.transmitted):
+                remaining = remaining.at[after].add(grown)
+    escaped, late = first.escaped, jnp.zeros_like(remaining)
+    if len(scatterers) == 1 and not (layout.leaf or layout.bark):
+        # Nothing is in the way of what one plane scatters.
+        escaped, remaining = escaped + remaining, late
+    return Response(weights, None, first.arrived, left, escaped, late, remaining)

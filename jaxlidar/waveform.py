@@ -1,0 +1,222 @@
+"""From response to waveform: optics, atmosphere, pulse, sampling, energy."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .constants import SPEED_OF_LIGHT
+from .layout import KERNEL_VARIANCE
+from .lidar import Lidar
+from .materials import Isotropic
+from .plan import Plan
+from .scene import Scene, leaf_optics
+from .spectra import reflectance_at
+from .trace.histories import histories
+from .trace.response import Response
+
+
+class Waveform(eqx.Module):
+    """A simulated waveform.
+
+    - `time`: (bins,) ns, centres of the samples, from the two-way travel time of the reference plane.
+    - `height`: (bins,) m, the height at which light of order one arrives at that time.
+    - `reflectance`: (wavelengths, bins) apparent reflectance per sample, with the transmittance of the
+      atmosphere; sums over bins to that of the target.
+    - `energy`: (wavelengths, bins) J that the detector registers per sample.
+    - `stderr`: (wavelengths, bins) one standard error of `reflectance`; zero where nothing was random.
+    - `components`: dict of arrays like `reflectance`: by material of the last scattering ("ground",
+      "leaf", "bark", "plate"), and by order ("first", "higher").
+    - `neglected`: (wavelengths,) apparent reflectance that orders beyond the last could still add.
+    - `ledger`: dict of (wavelengths,) shares of the emitted energy, before the atmosphere: "returned" into
+      the aperture, "escaped", "absorbed by ...", "after the window", "unfollowed" beyond the last order.
+    - `info`: dict: photons, batches, seconds, error reached and why the simulation stopped.
+    """
+
+    time: Float[Array, "bins"]
+    height: Float[Array, "bins"]
+    reflectance: Float[Array, "wavelengths bins"]
+    energy: Float[Array, "wavelengths bins"]
+    stderr: Float[Array, "wavelengths bins"]
+    components: dict[str, Float[Array, "wavelengths bins"]]
+    neglected: Float[Array, "wavelengths"]
+    ledger: dict[str, Float[Array, "wavelengths"]]
+    wavelength: Float[Array, "wavelengths"]
+    info: dict = eqx.field(static=True)
+
+
+def optics(lidar: Lidar, scene: Scene, plan: Plan) -> Float[Array, "letters wavelengths"]:
+    """Reflectance or transmittance of every letter of the plan.
+
+    Where the canopy's transmission is straight, transmitted light never left its ray, and a collision
+    reflects R / (1 - T).
+    """
+    wavelength = lidar.wavelength
+    values: dict[str, Array] = {}
+    canopy = scene.canopy
+    if canopy is not None and plan.layout.leaf is not None:
+        r, t = leaf_optics(canopy, wavelength)
+        if canopy.transmission == "straight":
+            opaque = jnp.maximum(1.0 - t, 1e-6)
+            values["leaf.R"] = r / opaque
+        else:
+            values["leaf.R"], values["leaf.T"] = r, t
+    if canopy is not None and plan.layout.bark is not None:
+        bark = canopy.bark.albedo if isinstance(canopy.bark, Isotropic) else canopy.bark
+        values["bark.R"] = reflectance_at(bark, wavelength, "bark")
+    if scene.ground is not None:
+        values["ground.R"] = reflectance_at(scene.ground.reflectance, wavelength, "ground reflectance")
+    for i, p in enumerate(scene.plates):
+        name = "plate" if len(scene.plates) == 1 else f"plate {i + 1}"
+        values[f"{name}.R"] = reflectance_at(p.reflectance, wavelength, "plate reflectance")
+        values[f"{name}.T"] = reflectance_at(p.transmittance, wavelength, "plate transmittance")
+    rows = [values[letter] for letter in plan.layout.letters]
+    return jnp.stack(rows) if rows else jnp.zeros((0, wavelength.size))
+
+
+def is_straight(scene: Scene) -> bool:
+    """Whether leaves transmit straight on, so that every wavelength needs its own trace."""
+    return (
+        scene.canopy is not None and scene.canopy.leaf is not None and scene.canopy.transmission == "straight"
+    )
+
+
+def colour(
+    response: Response, optics: Float[Array, "letters wavelengths"], plan: Plan
+) -> tuple[Float[Array, "materials wavelengths bins"], Float[Array, "materials wavelengths bins"]]:
+    """Orders one, and two and above, by material of the last scattering: a matrix product each."""
+    letters = len(plan.layout.letters)
+    short = histories(letters, plan.first_degree).monomials(optics)
+    first = jnp.einsum("hw,mhb->mwb", short, response.first)
+    if response.higher is None:
+        return first, jnp.zeros_like(first)
+    full = histories(letters, plan.degree).monomials(optics)
+    return first, jnp.einsum("hw,mhb->mwb", full, response.higher)
+
+
+def pulse_kernel(lidar: Lidar, plan: Plan) -> Float[Array, "fine samples"]:
+    """Share of a return in fine bin i that each sample receives: the pulse integrated over the sample.
+
+    Where the pulse is smooth on the scale of a fine bin, the second moment of the deposit kernel (see
+    `jaxlidar.trace.deposit`) is taken out, which leaves an error of fourth order in the bin's width.
+    """
+    k = plan.per_sample
+    # Offsets between a sample's centre and a fine bin's, in fine bins, from the last bin to the first.
+    first = (plan.sample_start - plan.bins.start) / plan.bins.width
+    low = -(plan.bins.count - 1) - 1
+    number = np.arange(low, (plan.n_samples - 1) * k + 2)
+    offset = jnp.asarray((number + first) * plan.bins.width)
+    half = 0.5 * plan.sample_interval
+    share = lidar.pulse.cumulative(offset + half, lidar.jitter) - lidar.pulse.cumulative(
+        offset - half, lidar.jitter
+    )
+    if plan.sharpen:
+        bend = share[2:] - 2.0 * share[1:-1] + share[:-2]
+        share = share.at[1:-1].add(-0.5 * KERNEL_VARIANCE * bend)
+    index = np.arange(plan.n_samples)[None, :] * k - np.arange(plan.bins.count)[:, None] - low
+    return share[index]
+
+
+def sample(
+    fine: Float[Array, "*s wavelengths bins"], lidar: Lidar, scene: Scene, plan: Plan
+) -> Float[Array, "*s wavelengths samples"]:
+    """Atmosphere, pulse and sampling: from fine bins to what the digitiser integrates."""
+    return (fine * _clear(lidar, scene, plan)) @ pulse_kernel(lidar, plan)
+
+
+def _clear(lidar: Lidar, scene: Scene, plan: Plan) -> Float[Array, "wavelengths bins"]:
+    time = jnp.asarray(plan.bins.start + plan.bins.width * np.arange(plan.bins.count))
+    if scene.atmosphere is None:
+        return jnp.ones((1, 1), time.dtype)
+    height = jnp.minimum(height_of(lidar, time), 0.999 * lidar.altitude)
+    return scene.atmosphere.two_way_transmittance(lidar.wavelength, height, lidar.altitude, lidar.zenith)
+
+
+def height_of(lidar: Lidar, time: Float[Array, "bins"]) -> Float[Array, "bins"]:
+    """Height above the reference plane (m) from which order one arrives at `time` (ns)."""
+    return -0.5 * SPEED_OF_LIGHT * time * jnp.cos(jnp.deg2rad(lidar.zenith))
+
+
+def total_of(
+    response: Response, lidar: Lidar, scene: Scene, plan: Plan
+) -> Float[Array, "wavelengths samples"]:
+    """Apparent reflectance per sample, all components together."""
+    first, higher = colour(response, optics(lidar, scene, plan), plan)
+    return sample(jnp.sum(first + higher, axis=0), lidar, scene, plan)
+
+
+def ledger_of(
+    response: Response, optics: Float[Array, "letters wavelengths"], plan: Plan
+) -> dict[str, Float[Array, "wavelengths"]]:
+    """Shares of the emitted energy. What a material absorbs is what arrived there less what left."""
+    letters = len(plan.layout.letters)
+    degree = plan.degree if response.higher is not None else plan.first_degree
+    monomials = histories(letters, degree).monomials(optics)
+    absorbed = (response.arrived - response.left) @ monomials
+    ledger = {f"absorbed by {name}": absorbed[i] for i, name in enumerate(plan.layout.materials)}
+    return {
+        "escaped": response.escaped @ monomials,
+        **ledger,
+        "after the window": response.late @ monomials,
+        "unfollowed": response.remaining @ monomials,
+    }
+
+
+def waveform(
+    response: Response | list[Response],
+    lidar: Lidar,
+    scene: Scene,
+    plan: Plan,
+    *,
+    stderr: Float[Array, "wavelengths bins"] | None = None,
+    info: dict | None = None,
+) -> Waveform:
+    """Colour a response and record it.
+
+    **Arguments:**
+
+    - `response`: as traced; a list with one for each wavelength where the canopy's transmission is straight.
+    - `stderr`: standard error of the reflectance, from batches. Default zero.
+    """
+    letters = optics(lidar, scene, plan)
+    if isinstance(response, list):
+        parts = [_coloured(r, letters[:, i : i + 1], plan) for i, r in enumerate(response)]
+        first, higher = (jnp.concatenate([p[k] for p in parts], axis=1) for k in range(2))
+        ledger = {name: jnp.concatenate([p[2][name] for p in parts]) for name in parts[0][2]}
+    else:
+        first, higher, ledger = _coloured(response, letters, plan)
+    names = plan.layout.materials
+    fine = jnp.concatenate([first + higher, jnp.sum(first, 0)[None], jnp.sum(higher, 0)[None]])
+    sampled = sample(fine, lidar, scene, plan)
+    components = dict(zip([*names, "first", "higher"], sampled))
+    total = sampled[-2] + sampled[-1]
+    time = jnp.asarray(plan.sample_start + plan.sample_interval * np.arange(plan.n_samples))
+    slant = lidar.range_to_reference + 0.5 * SPEED_OF_LIGHT * time
+    # E_t * eta * A_r / (pi R^2): the lidar equation of a Lambertian target that fills the footprint.
+    received = lidar.aperture_area / (jnp.pi * jnp.maximum(slant, 1e-3) ** 2)
+    gain = (lidar.energy_per_wavelength * lidar.efficiency_per_wavelength)[:, None] * received
+    returned = (
+        jnp.sum(fine[-2] + fine[-1], axis=-1) * lidar.aperture_area / (jnp.pi * lidar.range_to_reference**2)
+    )
+    # What returns is part of what escaped, or, where only one order was followed, would have.
+    source = "unfollowed" if plan.orders == 1 and len(plan.layout.materials) > 1 else "escaped"
+    reach = jnp.minimum(returned, ledger[source])
+    full = {"returned": reach, **ledger, source: ledger[source] - reach}
+    per_energy = jnp.sum(fine[-2] + fine[-1], axis=-1) / jnp.maximum(full["escaped"], 1e-6)
+    unfollowed = full["unfollowed"] if plan.orders > 1 else jnp.zeros_like(full["unfollowed"])
+    return Waveform(
+        time=time,
+        height=height_of(lidar, time),
+        reflectance=total,
+        energy=total * gain,
+        stderr=jnp.zeros_like(total) if stderr is None else stderr,
+        components=components,
+        neglected=unfollowed * jnp.clip(per_energy, 1.0, 4.0),
+        ledger=full,
+        wavelength=lidar.wavelength,
+        info=info or {},
+    )
+
+
+def _coloured(response: Response, letters: Float[Array, "letters wavelengths"], plan: Plan):
+    return (*colour(response, letters, plan), ledger_of(response, letters, plan))
