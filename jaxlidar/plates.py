@@ -139,8 +139,8 @@ def plate_model(k: Float[ArrayLike, "..."], N: Float[ArrayLike, "..."], surface:
     derivative in k diverges logarithmically at k = 0, where the one returned is large and finite.
 
     Relative errors for k up to 100 and N up to 10, measured: 2e-14 in double precision; in single precision
-    1e-6 for reflectance, absorptance and their derivatives in k, and 1e-6 max(1, N/2) for transmittance and the
-    derivatives in N (dR/dN: twice that), to which each plate adds its rounding.
+    1e-6 for reflectance, absorptance and their derivatives in k, and 1e-6 max(1, N/2) for transmittance and
+    the derivatives in N (dR/dN: twice that), to which each plate adds its rounding.
 
     **Source:** Allen et al. (1969), J. Opt. Soc. Am. 59, 1376; Jacquemoud and Baret (1990), Remote Sens.
     Environ. 34, 75; Stokes (1862), Proc. R. Soc. Lond. 11, 545.
