@@ -152,7 +152,8 @@ class LeafAngles(eqx.Module):
     def __check_init__(self):
         if self.probability.shape != (ANGLE_CELLS,):
             raise ValueError(
-                f"probability has shape {self.probability.shape}; admissible is ({ANGLE_CELLS},), one per degree"
+                f"probability has shape {self.probability.shape}; "
+                f"admissible is ({ANGLE_CELLS},), one per degree"
             )
         check_range("probability", self.probability, 0.0)
 

@@ -1,4 +1,4 @@
-"""What a scene and a lidar call for: the effects simulated, the bounds on the others, the sizes of all loops."""
+"""What a scene and a lidar call for: effects simulated, bounds on the others, sizes of all loops."""
 
 import dataclasses
 import math

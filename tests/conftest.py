@@ -8,7 +8,10 @@ from jaxtyping import install_import_hook
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
-with install_import_hook(["jaxlidar", "inversion"], "beartype.beartype"):
+# An int serves where a float is asked for, as PEP 484 says.
+CHECKER = "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))"
+
+with install_import_hook(["jaxlidar", "inversion"], CHECKER):
     import inversion  # noqa: F401
     import jaxlidar  # noqa: F401
 
