@@ -3,16 +3,14 @@
 import dataclasses
 import math
 
-import numpy as np
-
-from ._checks import concrete
 from .constants import SPEED_OF_LIGHT
-from .layout import KERNEL, Bins, Layout, Scatterer
+from .extent import Extent, number
+from .layout import KERNEL, Bins, Layout
+from .letters import largest_albedo, lobe_probability, scene_optics, spell
 from .lidar import Lidar
 from .materials import Isotropic, Specular
 from .pulse import RectangularPulse
-from .scene import Plate, Scene, leaf_optics
-from .spectra import reflectance_at
+from .scene import Plate, Scene
 
 DEFAULT_RTOL = 0.01
 # Orders are followed while their histories are not more than this (16 orders of four letters, 29 of three).
@@ -127,9 +125,10 @@ def plan(
         raise ValueError(f"max_step = {max_step:g} is outside the admissible range (0, inf)")
     if footprint not in ("random", "fixed"):
         raise ValueError(f"footprint = {footprint!r} is none of 'random', 'fixed'")
-    geometry = _Geometry(lidar, scene)
-    letters = _Letters(lidar, scene)
-    orders, bound, why = _orders(letters, scene, rtol, max_orders)
+    geometry = Extent(lidar, scene)
+    optics = scene_optics(lidar, scene)
+    letters = spell(optics)
+    orders, bound, why = _orders(largest_albedo(optics), len(letters.letters), scene, rtol, max_orders)
     bins, samples = _time(lidar, scene, geometry, orders, window, bin_width)
     metres = 0.5 * SPEED_OF_LIGHT * bins.width
     step = geometry.longest_chord if max_step is None else min(max_step, geometry.longest_chord)
@@ -143,23 +142,23 @@ def plan(
         leaf=letters.leaf,
         bark=letters.bark,
         surfaces=letters.surfaces,
-        full_cover=tuple(not isinstance(s, Plate) or _number(s.coverage) == 1.0 for s in scene.surfaces),
+        full_cover=tuple(not isinstance(s, Plate) or number(s.coverage) == 1.0 for s in scene.surfaces),
         has_ground=scene.ground is not None,
         leaf_isotropic=scene.canopy is not None and isinstance(scene.canopy.leaf, Isotropic),
         bark_isotropic=scene.canopy is not None and isinstance(scene.canopy.bark, Isotropic),
         hotspot=scene.canopy is not None and scene.canopy.hotspot,
-        vertical=_number(lidar.zenith) == 0.0,
+        vertical=number(lidar.zenith) == 0.0,
         upstream=geometry.upstream,
         first_steps=geometry.first_steps(step),
         march_steps=geometry.march_steps(max_path + geometry.upstream),
         max_step=step,
         max_path=max_path,
-        lobe=letters.lobe,
+        lobe=lobe_probability(optics),
         orders=orders,
     )
     plates = len(scene.plates)
-    sharpen = not isinstance(lidar.pulse, RectangularPulse) and _number(lidar.pulse.std) >= bins.width
-    sharpen = sharpen or _number(lidar.jitter) >= bins.width
+    sharpen = not isinstance(lidar.pulse, RectangularPulse) and number(lidar.pulse.std) >= bins.width
+    sharpen = sharpen or number(lidar.jitter) >= bins.width
     return Plan(
         layout=layout,
         bins=bins,
@@ -179,178 +178,17 @@ def plan(
     )
 
 
-def _number(x: object) -> float:
-    value = concrete(x)
-    if value is None:
-        raise ValueError(
-            "the geometry is being traced by a JAX transformation, so its sizes are unknown: "
-            "make a plan outside with jaxlidar.plan and pass it as plan="
-        )
-    return float(value)
-
-
-def _numbers(x: object) -> np.ndarray:
-    value = concrete(x)
-    if value is None:
-        _number(x)
-    assert value is not None
-    return value
-
-
-class _Geometry:
-    """Rays at the rim of the footprint against the bounds of everything in the scene, in NumPy."""
-
-    def __init__(self, lidar: Lidar, scene: Scene):
-        self.scene = scene
-        axis = _numbers(lidar.direction).astype(np.float64)
-        slant = _number(lidar.range_to_reference)
-        rim = 2.5 * _number(lidar.footprint_radius)
-        aim = np.append(_numbers(lidar.position), 0.0)
-        across = np.cross(axis, [1.0, 0, 0] if abs(axis[0]) < 0.7 else [0, 1.0, 0])
-        across /= np.linalg.norm(across)
-        other = np.cross(axis, across)
-        turn = np.linspace(0, 2 * np.pi, 33)[:, None]
-        points = np.concatenate([[[0.0, 0, 0]], rim * (np.cos(turn) * across + np.sin(turn) * other)])
-        rays = axis * slant + points
-        distance = np.linalg.norm(rays, axis=1)
-        self.rays = rays / distance[:, None]
-        self.excess = distance - slant
-        levels = []
-        for s in scene.surfaces:
-            plane = s.plane
-            normal = _numbers(plane.normal).astype(np.float64)
-            offset = normal @ (np.array([0, 0, _number(plane.height)]) - aim)
-            towards = self.rays @ normal
-            met = towards < -1e-6 if not isinstance(s, Plate) else np.abs(towards) > 1e-6
-            if met.any():
-                levels.append(((offset - points @ normal) / np.where(met, towards, 1.0))[met])
-        if scene.canopy is not None:
-            v = scene.canopy.voxels
-            self.size = _numbers(v.voxel_size).astype(np.float64)
-            self.shape = np.array(v.shape)
-            low = _numbers(v.origin)[2]
-            for z in (low, low + self.size[2] * self.shape[2]):
-                levels.append((z - points[:, 2]) / self.rays[:, 2])
-        flat = np.concatenate(levels) if levels else np.zeros(1)
-        self.nearest, self.farthest = float(flat.min()), float(flat.max())
-        # Two-way path relative to that of the aim point.
-        self.first = 2.0 * self.nearest
-        self.last = 2.0 * (self.farthest + float(self.excess.max()))
-        margin = 0.05 * (self.farthest - self.nearest) + 1e-3
-        self.upstream = float(-self.nearest + margin)
-        if self.upstream >= slant:
-            raise ValueError(
-                f"altitude = {_number(lidar.altitude):g} m: the scene reaches up to the sensor; "
-                f"admissible is more than {_number(lidar.altitude) + self.upstream - slant:g} m"
-            )
-
-    @property
-    def longest_chord(self) -> float:
-        if self.scene.canopy is None:
-            return 1e-3
-        steep = float(np.abs(self.rays[:, 2]).min())
-        return float(min(np.linalg.norm(self.size), self.size[2] / steep)) * (1 + 1e-5)
-
-    def first_steps(self, step: float) -> int:
-        """Bound on the stretches of a footprint ray."""
-        if self.scene.canopy is None:
-            return 0
-        assert self.scene.canopy is not None
-        steep = np.abs(self.rays[:, 2:]).min()
-        height = self.size[2] * self.shape[2]
-        length = height / steep
-        sideways = np.ceil(np.abs(self.rays[:, :2]).max(0) / steep * height / self.size[:2]) + 1
-        if self.scene.canopy.sides == "open":
-            sideways = np.minimum(sideways, self.shape[:2])
-        faces = self.shape[2] + sideways.sum()
-        divided = 0 if step >= self.longest_chord else math.ceil(length / step)
-        return int(faces + divided + len(self.scene.surfaces) + 2)
-
-    def march_steps(self, longest: float) -> int:
-        """Bound on the voxels that a path of `longest` m crosses."""
-        if self.scene.canopy is None:
-            return 0
-        if self.scene.canopy.sides == "open":
-            return int(self.shape.sum()) + 3
-        return int(self.shape[2] + math.ceil(longest / self.size[0]) + math.ceil(longest / self.size[1])) + 3
-
-
-class _Letters:
-    """Materials, letters and the largest optics of a scene."""
-
-    def __init__(self, lidar: Lidar, scene: Scene):
-        materials: list[str] = []
-        letters: list[str] = []
-        self.albedo: list[float] = []
-        shares: list[float] = []
-
-        def add(
-            name: str, reflectance: object, transmittance: object | None, straight: bool = False
-        ) -> Scatterer:
-            materials.append(name)
-            letters.append(f"{name}.R")
-            r = concrete(reflectance)
-            t = np.zeros(()) if transmittance is None else concrete(transmittance)
-            transmits = transmittance is not None and (t is None or bool(np.any(t > 0)))
-            if transmits:
-                letters.append(f"{name}.T")
-            if r is not None and t is not None:
-                self.albedo.append(float(np.max(r + (0 if straight else t))))
-                if transmits and np.any(r + t > 0):
-                    shares.append(float(np.sum(r) / np.sum(r + t)))
-            else:
-                self.albedo.append(1.0)
-            return Scatterer(
-                len(materials) - 1,
-                len(letters) - (2 if transmits else 1),
-                len(letters) - 1 if transmits else -1,
-            )
-
-        wavelength = lidar.wavelength
-        self.leaf = self.bark = None
-        canopy = scene.canopy
-        if canopy is not None and canopy.voxels.leaf is not None:
-            r, t = leaf_optics(canopy, wavelength)
-            straight = canopy.transmission == "straight"
-            if straight:
-                r_, t_ = concrete(r), concrete(t)
-                if r_ is not None and t_ is not None:
-                    r = r_ / np.maximum(1.0 - t_, 1e-6)
-            self.leaf = add("leaf", r, None if straight or isinstance(canopy.leaf, Isotropic) else t)
-        if canopy is not None and canopy.voxels.bark is not None:
-            value = canopy.bark.albedo if isinstance(canopy.bark, Isotropic) else canopy.bark
-            self.bark = add("bark", reflectance_at(value, wavelength, "bark"), None)
-        surfaces = []
-        if scene.ground is not None:
-            surfaces.append(
-                add(
-                    "ground", reflectance_at(scene.ground.reflectance, wavelength, "ground reflectance"), None
-                )
-            )
-        for i, p in enumerate(scene.plates):
-            name = "plate" if len(scene.plates) == 1 else f"plate {i + 1}"
-            r = reflectance_at(p.reflectance, wavelength, "plate reflectance")
-            t = reflectance_at(p.transmittance, wavelength, "plate transmittance")
-            surfaces.append(add(name, r, t))
-        self.surfaces = tuple(surfaces)
-        self.materials, self.letters = tuple(materials), tuple(letters)
-        share = float(np.mean(shares)) if shares else 0.5
-        # Coarse, so that small changes of optics do not recompile.
-        self.lobe = round(min(max(share, 0.2), 0.8), 1)
-
-
 def _degree(orders: int, plates: int) -> int:
     """Longest history: every flight, and the way back, may pass every plate."""
     return orders + (orders + 1) * plates
 
 
 def _orders(
-    letters: _Letters, scene: Scene, rtol: float, max_orders: int | None
+    albedo: float, kinds: int, scene: Scene, rtol: float, max_orders: int | None
 ) -> tuple[int, float | None, str]:
     if scene.canopy is None and len(scene.surfaces) <= 1:
         return 1, 0.0, "one plane cannot light itself"
-    albedo = max(letters.albedo)
-    kinds, plates = len(letters.letters), len(scene.plates)
+    plates = len(scene.plates)
     most = 2
     while most < MAX_ORDERS and math.comb(_degree(most + 1, plates) + kinds, kinds) <= MAX_HISTORIES:
         most += 1
@@ -366,15 +204,15 @@ def _orders(
 def _time(
     lidar: Lidar,
     scene: Scene,
-    geometry: _Geometry,
+    geometry: Extent,
     orders: int,
     window: tuple[float, float] | None,
     bin_width: float | None,
 ) -> tuple[Bins, tuple[float, float, int, int]]:
-    interval = _number(lidar.sampling_interval)
-    jitter = _number(lidar.jitter)
+    interval = number(lidar.sampling_interval)
+    jitter = number(lidar.jitter)
     low, high = lidar.pulse.support(jitter)
-    std = math.hypot(_number(lidar.pulse.std), jitter)
+    std = math.hypot(number(lidar.pulse.std), jitter)
     if bin_width is None:
         target = min(interval, max(0.25 * std, 0.05 * interval) if std > 0 else 0.5 * interval)
     else:
@@ -417,13 +255,13 @@ def _effects(lidar: Lidar, scene: Scene, orders: int, bound: float | None, why: 
     ground = scene.ground
     rows.append(Effect("ground", ground is not None, has(ground)))
     if ground is not None:
-        slope = _number(ground.slope)
-        spread = 2 * _number(lidar.footprint_radius) / 2 * math.tan(math.radians(slope)) / c
+        slope = number(ground.slope)
+        spread = 2 * number(lidar.footprint_radius) / 2 * math.tan(math.radians(slope)) / c
         rows.append(Effect("slope spread", slope > 0, f"{spread:.2g} ns (standard deviation)"))
     rows.append(Effect("multiple scattering", orders > 1, why, bound))
     mirror = any(isinstance(s.law, Specular) for s in scene.surfaces)
     rows.append(Effect("specular return", mirror, has(mirror)))
-    divergence = _number(lidar.divergence)
+    divergence = number(lidar.divergence)
     rows.append(Effect("divergence", divergence > 0, f"{divergence:g} mrad"))
     fov = lidar.field_of_view
     rows.append(
@@ -436,6 +274,6 @@ def _effects(lidar: Lidar, scene: Scene, orders: int, bound: float | None, why: 
     rows.append(Effect("atmospheric extinction", air is not None, has(air)))
     if air is not None:
         rows.append(Effect("scattering within the atmosphere", False, "beyond first order", None))
-    jitter = _number(lidar.jitter)
+    jitter = number(lidar.jitter)
     rows.append(Effect("jitter", jitter > 0, f"{jitter:g} ns"))
     return tuple(rows)

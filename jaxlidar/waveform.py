@@ -7,11 +7,10 @@ from jaxtyping import Array, Float
 
 from .constants import SPEED_OF_LIGHT
 from .layout import KERNEL_VARIANCE
+from .letters import scene_optics
 from .lidar import Lidar
-from .materials import Isotropic
 from .plan import Plan
-from .scene import Scene, leaf_optics
-from .spectra import reflectance_at
+from .scene import Scene
 from .trace.histories import histories
 from .trace.response import Response
 
@@ -46,32 +45,14 @@ class Waveform(eqx.Module):
 
 
 def optics(lidar: Lidar, scene: Scene, plan: Plan) -> Float[Array, "letters wavelengths"]:
-    """Reflectance or transmittance of every letter of the plan.
-
-    Where the canopy's transmission is straight, transmitted light never left its ray, and a collision
-    reflects R / (1 - T).
-    """
-    wavelength = lidar.wavelength
+    """Reflectance or transmittance of every letter of the plan."""
     values: dict[str, Array] = {}
-    canopy = scene.canopy
-    if canopy is not None and plan.layout.leaf is not None:
-        r, t = leaf_optics(canopy, wavelength)
-        if canopy.transmission == "straight":
-            opaque = jnp.maximum(1.0 - t, 1e-6)
-            values["leaf.R"] = r / opaque
-        else:
-            values["leaf.R"], values["leaf.T"] = r, t
-    if canopy is not None and plan.layout.bark is not None:
-        bark = canopy.bark.albedo if isinstance(canopy.bark, Isotropic) else canopy.bark
-        values["bark.R"] = reflectance_at(bark, wavelength, "bark")
-    if scene.ground is not None:
-        values["ground.R"] = reflectance_at(scene.ground.reflectance, wavelength, "ground reflectance")
-    for i, p in enumerate(scene.plates):
-        name = "plate" if len(scene.plates) == 1 else f"plate {i + 1}"
-        values[f"{name}.R"] = reflectance_at(p.reflectance, wavelength, "plate reflectance")
-        values[f"{name}.T"] = reflectance_at(p.transmittance, wavelength, "plate transmittance")
+    for o in scene_optics(lidar, scene):
+        values[f"{o.name}.R"] = o.reflectance
+        if o.transmittance is not None:
+            values[f"{o.name}.T"] = o.transmittance
     rows = [values[letter] for letter in plan.layout.letters]
-    return jnp.stack(rows) if rows else jnp.zeros((0, wavelength.size))
+    return jnp.stack(rows) if rows else jnp.zeros((0, lidar.wavelength.size))
 
 
 def is_straight(scene: Scene) -> bool:
