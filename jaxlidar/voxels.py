@@ -1,5 +1,7 @@
 """Voxel maps: where leaf and bark are, as extinction coefficients on a regular grid."""
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -12,7 +14,11 @@ from .materials import LeafAngles
 SOLID_OPTICAL_DEPTH = 40.0
 
 
-def _as_triple(x: ArrayLike) -> Float[Array, "3"]:
+# Numbers, arrays or nested sequences of numbers.
+Numbers = ArrayLike | Sequence
+
+
+def _as_triple(x: Numbers) -> Float[Array, "3"]:
     a = as_array(x)
     return jnp.broadcast_to(a, (3,)) if a.ndim == 0 else a
 
@@ -63,7 +69,9 @@ class VoxelMap(eqx.Module):
     @property
     def shape(self) -> tuple[int, int, int]:
         """Number of voxels along x, y and z."""
-        nx, ny, nz = (self.leaf if self.leaf is not None else self.bark).shape
+        some = self.leaf if self.leaf is not None else self.bark
+        assert some is not None
+        nx, ny, nz = some.shape
         return nx, ny, nz
 
     @property
@@ -73,22 +81,22 @@ class VoxelMap(eqx.Module):
 
     @staticmethod
     def from_extinction(
-        leaf: ArrayLike | None = None,
-        bark: ArrayLike | None = None,
+        leaf: Numbers | None = None,
+        bark: Numbers | None = None,
         *,
-        voxel_size: ArrayLike,
-        origin: ArrayLike = (0.0, 0.0, 0.0),
+        voxel_size: Numbers,
+        origin: Numbers = (0.0, 0.0, 0.0),
     ) -> "VoxelMap":
         """From extinction coefficients in 1/m, the same for every direction. Arrays are (nx, ny, nz)."""
         return VoxelMap(_volume(leaf), _volume(bark), voxel_size, origin)
 
     @staticmethod
     def from_probability(
-        leaf: ArrayLike | None = None,
-        bark: ArrayLike | None = None,
+        leaf: Numbers | None = None,
+        bark: Numbers | None = None,
         *,
-        voxel_size: ArrayLike,
-        origin: ArrayLike = (0.0, 0.0, 0.0),
+        voxel_size: Numbers,
+        origin: Numbers = (0.0, 0.0, 0.0),
     ) -> "VoxelMap":
         """From the probability that a ray crossing one edge length of a voxel meets leaf, or bark.
 
@@ -100,7 +108,7 @@ class VoxelMap(eqx.Module):
         """
         size = _as_triple(voxel_size)
 
-        def extinction(name: str, p: ArrayLike | None) -> Array | None:
+        def extinction(name: str, p: Numbers | None) -> Array | None:
             if p is None:
                 return None
             check_range(name, p, 0.0, 1.0)
@@ -113,12 +121,12 @@ class VoxelMap(eqx.Module):
 
     @staticmethod
     def from_lad(
-        lad: ArrayLike,
+        lad: Numbers,
         *,
-        voxel_size: ArrayLike,
-        origin: ArrayLike = (0.0, 0.0, 0.0),
+        voxel_size: Numbers,
+        origin: Numbers = (0.0, 0.0, 0.0),
         leaf_angles: str | LeafAngles = "spherical",
-        bark: ArrayLike | None = None,
+        bark: Numbers | None = None,
     ) -> "VoxelMap":
         """From leaf area density in m2/m3, (nx, ny, nz); the extinction coefficient is G(direction) * LAD.
 
@@ -126,15 +134,14 @@ class VoxelMap(eqx.Module):
         or a `LeafAngles`; `bark` is an extinction coefficient in 1/m.
         """
         check_range("lad", lad, 0.0)
-        if isinstance(leaf_angles, str):
-            angles = LeafAngles.named(leaf_angles)
-            leaf_angles = None if leaf_angles == "spherical" else angles
-        return VoxelMap(_volume(lad) * 0.5, _volume(bark), voxel_size, origin, leaf_angles)
+        angles = LeafAngles.named(leaf_angles) if isinstance(leaf_angles, str) else leaf_angles
+        spherical = isinstance(leaf_angles, str) and leaf_angles == "spherical"
+        return VoxelMap(0.5 * as_array(lad), _volume(bark), voxel_size, origin, None if spherical else angles)
 
     def mean_extinction(self) -> Float[np.ndarray, "nx ny nz"]:
         """Extinction coefficient of leaf (at G = 1/2) and bark together, 1/m, as a NumPy array."""
-        return sum(np.asarray(a) for a in (self.leaf, self.bark) if a is not None)
+        return np.sum([np.asarray(a) for a in (self.leaf, self.bark) if a is not None], axis=0)
 
 
-def _volume(x: ArrayLike | None) -> Float[Array, "nx ny nz"] | None:
+def _volume(x: Numbers | None) -> Float[Array, "nx ny nz"] | None:
     return None if x is None else as_array(x)

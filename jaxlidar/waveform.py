@@ -102,13 +102,15 @@ def sample(
     fine: Float[Array, "*s wavelengths bins"], lidar: Lidar, scene: Scene, plan: Plan
 ) -> Float[Array, "*s wavelengths samples"]:
     """Atmosphere, pulse and sampling: from fine bins to what the digitiser integrates."""
-    return (fine * _clear(lidar, scene, plan)) @ pulse_kernel(lidar, plan)
+    if scene.atmosphere is not None:
+        clear = _clear(lidar, scene, plan)
+        fine = fine * clear.reshape((1,) * (fine.ndim - 2) + clear.shape)
+    return jnp.einsum("...b,bs->...s", fine, pulse_kernel(lidar, plan))
 
 
 def _clear(lidar: Lidar, scene: Scene, plan: Plan) -> Float[Array, "wavelengths bins"]:
     time = jnp.asarray(plan.bins.start + plan.bins.width * np.arange(plan.bins.count))
-    if scene.atmosphere is None:
-        return jnp.ones((1, 1), time.dtype)
+    assert scene.atmosphere is not None
     height = jnp.minimum(height_of(lidar, time), 0.999 * lidar.altitude)
     return scene.atmosphere.two_way_transmittance(lidar.wavelength, height, lidar.altitude, lidar.zenith)
 
@@ -175,7 +177,7 @@ def waveform(
     slant = lidar.range_to_reference + 0.5 * SPEED_OF_LIGHT * time
     # E_t * eta * A_r / (pi R^2): the lidar equation of a Lambertian target that fills the footprint.
     received = lidar.aperture_area / (jnp.pi * jnp.maximum(slant, 1e-3) ** 2)
-    gain = (lidar.energy_per_wavelength * lidar.efficiency_per_wavelength)[:, None] * received
+    gain = jnp.outer(lidar.energy_per_wavelength * lidar.efficiency_per_wavelength, received)
     returned = (
         jnp.sum(fine[-2] + fine[-1], axis=-1) * lidar.aperture_area / (jnp.pi * lidar.range_to_reference**2)
     )

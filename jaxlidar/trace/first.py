@@ -36,10 +36,10 @@ ISOTROPIC_BACKSCATTER = 0.25
 class Stretches(eqx.Module):
     """The pieces of one ray between faces: start, length (m), optical depth at the start, voxel."""
 
-    start: Float[Array, "steps"]
-    length: Float[Array, "steps"]
-    depth: Float[Array, "steps"]
-    cell: Int[Array, "steps"]
+    start: Float[Array, "*steps"]
+    length: Float[Array, "*steps"]
+    depth: Float[Array, "*steps"]
+    cell: Int[Array, "*steps"]
 
 
 def mean_decay(x: Scalar) -> Scalar:
@@ -145,10 +145,9 @@ def first_order(
     out_way, both_ways = Passage(surfaces, layout, 1), Passage(surfaces, layout, 2)
     kappa = 1.0 if layout.hotspot else 2.0
     successor = table.successor
-    metres = 0.5 * SPEED_OF_LIGHT * bins.width
     materials = len(layout.materials)
 
-    def rays(across, energy):
+    def one_ray(across, energy):
         across, share = hold_in_columns(beam, medium, across)
         energy = energy * share
         point, w, excess = beam.ray(across)
@@ -157,44 +156,29 @@ def first_order(
         met = [s.distance(x, w) for s in surfaces]
         stop = met[0] if layout.has_ground else jnp.full_like(energy, FAR)
         visible = energy * beam.in_view(along(x, w, jnp.minimum(stop, layout.upstream)))
-        response = jnp.zeros((materials * count, bins.padded), energy.dtype)
-        arrived = jnp.zeros((materials, count), energy.dtype)
-        at_stops = [jnp.zeros_like(energy) for _ in met]
-        total = jnp.zeros_like(energy)
+        # Lists of (slot, first bin, row of bins) and of (slot, weight).
+        stretched, instants, arrivals, leaving = [], [], [], []
+        at_stops, total = [jnp.zeros_like(energy) for _ in met], jnp.zeros_like(energy)
 
         if medium is not None:
-            stretch, at_stops, total = jax.vmap(
-                lambda x, w, end, stops: march_ray(
-                    medium, x, w, end, stops, layout.first_steps, jnp.asarray(layout.max_step)
-                ),
-                out_axes=(1, 0, 0),
-            )(x, w, stop, met)
+            step = jnp.asarray(layout.max_step, energy.dtype)
+            stretch, at_stops, total = march_ray(medium, x, w, stop, met, layout.first_steps, step)
             k = medium.extinction(stretch.cell, w)
-            begin_ = bins.position(2.0 * (excess + stretch.start) / SPEED_OF_LIGHT)
-            end_ = begin_ + stretch.length / metres
-            number = jnp.round(lax.stop_gradient(begin_))
-            decay, one_way = [], jnp.exp(-stretch.depth) * mean_decay(k * stretch.length) * stretch.length
-            for j in range(bins.row - 2):
-                low = jnp.clip(number + (j - 0.5), begin_, end_)
-                long = (jnp.clip(number + (j + 0.5), begin_, end_) - low) * metres
-                depth = stretch.depth + k * (low - begin_) * metres
-                decay.append(jnp.exp(-kappa * depth) * mean_decay(kappa * k * long) * long)
-            row = smooth_row(jnp.stack(decay, axis=-1))
-            first = first_bin(bins, number - 1, bins.row)
+            low = bins.position(2.0 * (excess + stretch.start) / SPEED_OF_LIGHT)
+            first, row = _stretch_rows(bins, low, stretch, k, kappa)
+            passing = jnp.exp(-stretch.depth) * mean_decay(k * stretch.length) * stretch.length
+            middle = stretch.start + 0.5 * stretch.length
             for m, part in _parts(medium, layout, stretch.cell, w):
-                base = int(successor[0, part.letter])
-                value = part.extinction * part.backscatter * visible
-                middle = stretch.start + 0.5 * stretch.length
-                for history, share in both_ways.terms(table, base, middle, met):
-                    rows = row * (value * share)[..., None]
-                    response = scatter_rows(response, m * count + history, first, rows)
+                value = part.extinction * (part.backscatter * visible)
+                for history, share in both_ways.terms(table, int(successor[0, part.letter]), middle, met):
+                    stretched.append((m * count + history, first, row * (value * share)[:, None]))
                 for history, share in out_way.terms(table, 0, middle, met):
-                    arrived = arrived.at[m, history].add(part.extinction * one_way * share * energy)
+                    arrivals.append((m * count + history, part.extinction * passing * share * energy))
 
         for i, (s, law) in enumerate(zip(surfaces, layout.surfaces)):
             hit = jnp.where((met[i] <= stop) & (met[i] < FAR), s.coverage * energy, 0.0)
             for history, share in out_way.terms(table, 0, met[i], met):
-                arrived = arrived.at[law.material, history].add(hit * jnp.exp(-at_stops[i]) * share)
+                arrivals.append((law.material * count + history, hit * jnp.exp(-at_stops[i]) * share))
             if isinstance(s.law, Specular):
                 continue
             at = along(x, w, jnp.where(met[i] < FAR, met[i], 0.0))
@@ -203,15 +187,26 @@ def first_order(
             time = 2.0 * (excess + jnp.minimum(met[i], 1e9)) / SPEED_OF_LIGHT
             first, row = instant_row(bins, time, hit * factor * jnp.exp(-kappa * at_stops[i]))
             for history, share in both_ways.terms(table, int(successor[0, law.reflected]), met[i], met):
-                response = scatter_rows(
-                    response, law.material * count + history, first, row * share[..., None]
-                )
+                instants.append((law.material * count + history, first, row * share))
 
         gone = jnp.where(stop < FAR, 0.0, energy * jnp.exp(-total))
-        escaped = jnp.zeros((count,), energy.dtype)
         for history, share in out_way.terms(table, 0, stop, met):
-            escaped = escaped.at[history].add(gone * share)
-        return response, arrived, escaped
+            leaving.append((history, gone * share))
+        return stretched, instants, arrivals, leaving
+
+    def rays(across, energy):
+        # Stretches stay along the first axis, where the march left them.
+        stretched, *others = jax.vmap(one_ray, out_axes=(1, 0, 0, 0))(across, energy)
+        response = jnp.zeros((materials * count, bins.padded), energy.dtype)
+        for slot, first, row in stretched + others[0]:
+            response = scatter_rows(response, slot, first, row)
+        arrived = jnp.zeros((materials * count,), energy.dtype)
+        for slot, weight in others[1]:
+            arrived = arrived.at[slot].add(weight)
+        escaped = jnp.zeros((count,), energy.dtype)
+        for slot, weight in others[2]:
+            escaped = escaped.at[slot].add(weight)
+        return response, arrived.reshape(materials, count), escaped
 
     n = energy.shape[0]
     size = min(CHUNK, n)
@@ -225,6 +220,25 @@ def first_order(
     response, arrived, escaped = lax.scan(body, zero, padded)[0]
     weights = bins.trim(response.reshape(materials, count, bins.padded))
     return FirstOrder(weights, arrived, escaped)
+
+
+def _stretch_rows(
+    bins: Bins, low: Float[Array, "steps"], stretch: Stretches, k: Float[Array, "steps"], kappa: float
+) -> tuple[Int[Array, "steps"], Float[Array, "steps row"]]:
+    """First bin and row of bins of the integral of exp(-kappa tau) ds over each stretch, bin by bin.
+
+    `low` is the position of the start of each stretch on the axis of bins.
+    """
+    metres = 0.5 * SPEED_OF_LIGHT * bins.width
+    high = low + stretch.length / metres
+    number = jnp.round(lax.stop_gradient(low))
+    pieces = []
+    for j in range(bins.row - 2):
+        start = jnp.clip(number + (j - 0.5), low, high)
+        length = (jnp.clip(number + (j + 0.5), low, high) - start) * metres
+        depth = stretch.depth + k * (start - low) * metres
+        pieces.append(jnp.exp(-kappa * depth) * mean_decay(kappa * k * length) * length)
+    return first_bin(bins, number - 1, bins.row), smooth_row(jnp.stack(pieces, axis=-1))
 
 
 class Part(eqx.Module):

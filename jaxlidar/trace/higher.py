@@ -95,7 +95,7 @@ def higher_orders(
         return eqx.tree_at(lambda t: t.remaining, tallies, tallies.remaining.at[last.history].add(over)), None
 
     zero = HigherOrders(
-        jnp.zeros((materials * count, bins.padded)),
+        jnp.zeros((materials, count, bins.padded)),
         jnp.zeros((materials, count)),
         jnp.zeros((materials, count)),
         jnp.zeros((count,)),
@@ -103,8 +103,7 @@ def higher_orders(
         jnp.zeros((count,)),
     )
     tallies, _ = lax.scan(chunk, zero, jnp.arange(chunks, dtype=jnp.uint32))
-    weights = bins.trim(tallies.weights.reshape(materials, count, bins.padded))
-    return eqx.tree_at(lambda t: t.weights, tallies, weights)
+    return eqx.tree_at(lambda t: t.weights, tallies, bins.trim(tallies.weights))
 
 
 def _one_order(setting: Setting, p: Photons, tally: HigherOrders, u: list[Scalar], order: Int[Array, ""]):
@@ -258,7 +257,7 @@ def _deposit(
     # Apparent reflectance refers to the range that the time of arrival stands for.
     spread = ((beam.slant_range + 0.5 * (path + out)) / (beam.slant_range + out)) ** 2
     value = weight * clear * spread * beam.in_view(x)
-    response = tally.weights
+    response = tally.weights.reshape(-1, setting.bins.padded)
     pairs = [(hit.reflected, reflected)]
     if transmitted is not None:
         pairs.append((hit.transmitted, transmitted))
@@ -267,4 +266,4 @@ def _deposit(
         slot = hit.material * setting.table.count + setting.grow(history, letter)
         factor = jnp.where(letter >= 0, factor, 0.0)
         response = scatter_rows(response, slot, first, row * factor[:, None])
-    return eqx.tree_at(lambda t: t.weights, tally, response)
+    return eqx.tree_at(lambda t: t.weights, tally, response.reshape(tally.weights.shape))

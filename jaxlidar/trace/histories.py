@@ -70,7 +70,7 @@ def histories(letters: int, degree: int) -> Histories:
             rows.append([b - a - 1 for a, b in itertools.pairwise(edges)])
         if letters == 0:
             break
-    exponents = np.array(rows, dtype=np.int32).reshape(-1, letters)
+    exponents = np.array(rows, dtype=np.int32).reshape(len(rows), letters)
     number = {tuple(row): i for i, row in enumerate(exponents.tolist())}
     successor = np.empty_like(exponents)
     for i, row in enumerate(exponents.tolist()):
