@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 
@@ -23,9 +24,14 @@ def as_array(x: ArrayLike | Sequence) -> Float[Array, "..."]:
     return jnp.asarray(x, dtype=float)
 
 
+def is_traced(x: object) -> bool:
+    """Whether a JAX transformation is running over `x`, so that its value is not known."""
+    return isinstance(x, Tracer)
+
+
 def concrete(x: object) -> np.ndarray | None:
     """`x` as a NumPy array, or None where it is a tracer or no array: those cannot be checked."""
-    if isinstance(x, jax.core.Tracer):
+    if is_traced(x):
         return None
     try:
         return np.asarray(x, dtype=float)

@@ -1,5 +1,7 @@
 """Vectors as tuples of three arrays: structure-of-arrays keeps the photon loops vectorised."""
 
+from collections.abc import Iterable
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -7,9 +9,10 @@ Scalar = Float[Array, "..."]
 Vec = tuple[Scalar, Scalar, Scalar]
 
 
-def vec(a: Float[Array, "3"]) -> Vec:
-    """The three components of an array."""
-    return a[0], a[1], a[2]
+def vec(a: Float[Array, "3"] | Iterable[Scalar]) -> Vec:
+    """The three components of an array, or three given one after the other."""
+    x, y, z = a
+    return x, y, z
 
 
 def dot(a: Vec, b: Vec) -> Scalar:

@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ._checks import as_array, as_scalar, check_choice, check_range
-from ._vector import Scalar, Vec, dot, from_frame, polar, scale
+from ._vector import Scalar, Vec, dot, from_frame, polar, scale, vec
 
 ANGLE_CELLS = 90
 ANGLE_NODES = 129
@@ -110,7 +110,7 @@ class Specular(AbstractLaw):
         out = from_frame(_mirror(incident, normal), polar(jnp.cos(jnp.minimum(tilt, 1.5)), 2 * np.pi * v))
         # What the lobe would send through the surface is turned back into the lit side.
         below = jnp.minimum(dot(out, normal), 0.0)
-        return tuple(o - 2.0 * below * n for o, n in zip(out, normal))
+        return vec(o - 2.0 * below * n for o, n in zip(out, normal))
 
     def density(self, incident: Vec, normal: Vec, out: Vec) -> Scalar:
         return jnp.ones_like(out[0])
@@ -118,7 +118,7 @@ class Specular(AbstractLaw):
 
 def _mirror(incident: Vec, normal: Vec) -> Vec:
     along = 2.0 * dot(incident, normal)
-    return tuple(i - along * n for i, n in zip(incident, normal))
+    return vec(i - along * n for i, n in zip(incident, normal))
 
 
 class Isotropic(eqx.Module):

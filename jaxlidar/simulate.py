@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from ._checks import is_traced
 from .lidar import Lidar
 from .plan import Plan
 from .plan import plan as make_plan
@@ -108,7 +109,7 @@ def simulate(
         info = {"photons": 0, "batches": 1, "error": 0.0, "stopped": "nothing is random"}
         wave = _finish(response, lidar, scene, plan, None)
         return dataclasses.replace(wave, info={**info, "seconds": time.perf_counter() - started})
-    traced = any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((lidar, scene, key)))
+    traced = any(is_traced(x) for x in jax.tree.leaves((lidar, scene, key)))
     if traced:
         return _simulate_traced(lidar, scene, plan, key)
     if n_photons is not None:
@@ -122,7 +123,7 @@ def simulate(
 
 def trace_all(lidar: Lidar, scene: Scene, plan: Plan, key: PRNGKeyArray) -> Response | list[Response]:
     """One batch: a response, or one for each wavelength where leaves transmit straight on."""
-    if not is_straight(scene):
+    if scene.canopy is None or not is_straight(scene):
         return trace(lidar, scene, plan, key)
     _, t = leaf_optics(scene.canopy, lidar.wavelength)
     return [trace(lidar, scene, plan, key, t[i]) for i in range(t.size)]

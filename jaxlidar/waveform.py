@@ -164,8 +164,9 @@ def waveform(
     letters = optics(lidar, scene, plan)
     if isinstance(response, list):
         parts = [_coloured(r, letters[:, i : i + 1], plan) for i, r in enumerate(response)]
-        first, higher = (jnp.concatenate([p[k] for p in parts], axis=1) for k in range(2))
-        ledger = {name: jnp.concatenate([p[2][name] for p in parts]) for name in parts[0][2]}
+        first = jnp.concatenate([f for f, _, _ in parts], axis=1)
+        higher = jnp.concatenate([h for _, h, _ in parts], axis=1)
+        ledger = {name: jnp.concatenate([part[name] for _, _, part in parts]) for name in parts[0][2]}
     else:
         first, higher, ledger = _coloured(response, letters, plan)
     names = plan.layout.materials
@@ -201,5 +202,7 @@ def waveform(
     )
 
 
-def _coloured(response: Response, letters: Float[Array, "letters wavelengths"], plan: Plan):
+def _coloured(
+    response: Response, letters: Float[Array, "letters wavelengths"], plan: Plan
+) -> tuple[Array, Array, dict[str, Array]]:
     return (*colour(response, letters, plan), ledger_of(response, letters, plan))

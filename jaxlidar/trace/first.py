@@ -250,13 +250,13 @@ class Part(eqx.Module):
 
 
 def _parts(medium: Medium, layout: Layout, cell: Int[Array, "..."], w: Vec):
-    if medium.leaf is not None:
+    if medium.leaf is not None and layout.leaf is not None:
         factor = FACET_BACKSCATTER
         if layout.leaf_isotropic:
             factor = ISOTROPIC_BACKSCATTER
         elif medium.angles is not None:
             factor = medium.angles.square_at(w) / medium.angles.projection_at(w)
         yield layout.leaf.material, Part(medium.leaf_at(cell, w), factor, layout.leaf.reflected)
-    if medium.bark is not None:
+    if medium.bark is not None and layout.bark is not None:
         factor = ISOTROPIC_BACKSCATTER if layout.bark_isotropic else FACET_BACKSCATTER
         yield layout.bark.material, Part(medium.bark_at(cell), factor, layout.bark.reflected)

@@ -111,5 +111,5 @@ def product_rule(
         r, weight = beam.radius * jnp.sqrt(jnp.asarray((x + 1) / 2)), weight / 2
     a = 2 * np.pi * (np.arange(angular) + 0.5) / angular
     ones = np.ones(angular)
-    across = (jnp.outer(r, np.cos(a)).reshape(-1), jnp.outer(r, np.sin(a)).reshape(-1))
-    return across, jnp.asarray(np.outer(weight, ones).reshape(-1) / angular, across[0].dtype)
+    x, y = (jnp.outer(r, jnp.asarray(f(a))).reshape(-1) for f in (np.cos, np.sin))
+    return (x, y), jnp.asarray(np.outer(weight, ones).reshape(-1) / angular, x.dtype)

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from .._vector import Scalar, Vec, along
+from .._vector import Scalar, Vec, along, vec
 from ..constants import SPEED_OF_LIGHT
 from ..layout import Bins, Layout
 from .deposit import instant_row, scatter_rows
@@ -83,12 +83,13 @@ def higher_orders(
             jnp.where(inside, share / photons, 0.0),
             jnp.zeros((size,), jnp.int32),
             jnp.full((size,), -1, jnp.int32),
-            tuple(jnp.zeros_like(r) for _ in range(3)),
+            vec(jnp.zeros_like(r) for _ in range(3)),
             inside,
         )
 
         def order(carry, n):
-            return _one_order(setting, *carry, numbers(lane, n), n), None
+            photons, tally = carry
+            return _one_order(setting, photons, tally, numbers(lane, n), n), None
 
         (last, tallies), _ = lax.scan(order, (start, tallies), jnp.arange(layout.orders))
         over = jnp.where(last.alive, stop(last.weight), 0.0)
@@ -176,8 +177,9 @@ def _one_order(setting: Setting, p: Photons, tally: HigherOrders, u: list[Scalar
     x = along(p.x, p.w, jnp.where(event, distance, 0.0))
     path = p.path + jnp.where(event, distance, 0.0)
     hit = collide(setting, p.w, cell, collided, landed, events, limit, u)
-    weight = jnp.where(event, weight * hit.ratio, 0.0)
+    weight = jnp.where(event, weight, 0.0)
     tally = _arrive(tally, hit.material, history, weight)
+    weight = weight * hit.ratio
     # The first order is deterministic and has been deposited.
     due = jnp.where(event & (order > 0), weight, 0.0)
     tally = _deposit(setting, tally, p.w, x, path, due, history, hit, u)
@@ -233,8 +235,9 @@ def _deposit(
     reflected, transmitted = view_factors(setting, w, v, hit)
     if medium is None:
         clear = jnp.ones_like(path)
-    elif layout.vertical:
-        clear = jnp.exp(-jax.vmap(lambda x: depth_to_top(medium, x, setting.column))(x))
+    elif setting.column is not None:
+        column = setting.column
+        clear = jnp.exp(-jax.vmap(lambda x: depth_to_top(medium, x, column))(x))
     else:
         far = jnp.full_like(path, FAR)
         clear = jnp.exp(-free_flight(medium, x, v, far, far, weight > 0, layout.march_steps).depth)

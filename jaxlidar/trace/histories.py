@@ -63,13 +63,14 @@ class Histories:
 @functools.cache
 def histories(letters: int, degree: int) -> Histories:
     """All histories of at most `degree` scatterings, numbered by degree."""
-    rows = []
+    rows: list[list[int]] = []
     for total in range(degree + 1):
-        for bars in itertools.combinations(range(total + letters - 1), letters - 1) if letters else [()]:
+        # Stars and bars: `letters - 1` bars divide `total` stars.
+        for bars in itertools.combinations(range(total + letters - 1), max(letters - 1, 0)):
             edges = (-1, *bars, total + letters - 1)
             rows.append([b - a - 1 for a, b in itertools.pairwise(edges)])
-        if letters == 0:
-            break
+    if letters == 0:
+        rows = [[]]
     exponents = np.array(rows, dtype=np.int32).reshape(len(rows), letters)
     number = {tuple(row): i for i, row in enumerate(exponents.tolist())}
     successor = np.empty_like(exponents)

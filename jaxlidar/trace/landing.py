@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from .._vector import Scalar, add, along, dot, scale
+from .._vector import Scalar, add, along, dot, scale, vec
 from .photons import Photons, Setting, ratio_of, stop
 from .scatter import drawn_density
 
@@ -24,10 +24,10 @@ def aim(setting: Setting, p: Photons, limit: Scalar, events: list[Scalar], headi
     reach = jnp.where(heading, limit, 1.0)
     direct = along(p.x, p.w, reach)
     held = jax.tree.map(stop, direct)
-    normal, offset = tuple(jnp.zeros_like(reach) for _ in range(3)), jnp.zeros_like(reach)
+    normal, offset = vec(jnp.zeros_like(reach) for _ in range(3)), jnp.zeros_like(reach)
     for s, d in zip(setting.surfaces, events):
         here = d <= limit
-        normal = tuple(jnp.where(here, n, m) for n, m in zip(s.normal, normal))
+        normal = vec(jnp.where(here, n, m) for n, m in zip(s.normal, normal))
         offset = jnp.where(here, s.offset, offset)
     upright = jnp.where(heading, normal[2], 1.0)
 
@@ -65,6 +65,6 @@ def aim(setting: Setting, p: Photons, limit: Scalar, events: list[Scalar], headi
     x, y = (held[k] + (column[k] - stop(column[k])) + fade * apart[k] for k in range(2))
     w, far = seen_from(on_surface(x, y))
     # Values stay those that were drawn, to the last digit.
-    w = tuple(jnp.where(heading, stop(a) + (b - stop(b)), a) for a, b in zip(p.w, w))
+    w = vec(jnp.where(heading, stop(a) + (b - stop(b)), a) for a, b in zip(p.w, w))
     far = jnp.where(heading, stop(limit) + (far - stop(far)), limit)
     return w, far, jnp.where(heading, turned, 1.0)

@@ -17,7 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._vector import dot, to_frame
+from .._vector import dot, to_frame, vec
+from ..materials import Specular
 from .footprint import GOLDEN, Beam, quantile_radius
 from .surfaces import Surface
 
@@ -34,6 +35,7 @@ def mirror_rays(
     The apparent reflectance is per unit reflectance and for a transparent way; rays weigh less towards
     the edges of the lobe. Small angles are assumed between the beam's axis and the mirror image of it.
     """
+    assert isinstance(surface.law, Specular)
     r, a = beam.slant_range, beam.half_angle * beam.slant_range
     # Along the axis; the mirror may lie above the reference plane, before the aim point.
     towards = dot(surface.normal, beam.axis)
@@ -45,7 +47,7 @@ def mirror_rays(
     normal = surface.lit_normal(beam.axis)
     cosine = -dot(normal, beam.axis)
     # Where the image of the axis meets the receiver's plane: along the normal's part across the axis.
-    miss = tuple(2.0 * cosine * distance * (n + cosine * k) for n, k in zip(normal, beam.axis))
+    miss = vec(2.0 * cosine * distance * (n + cosine * k) for n, k in zip(normal, beam.axis))
     across_miss = to_frame(beam.axis, miss)[:2]
 
     widest = jnp.maximum(a, beam.radius)

@@ -2,8 +2,10 @@
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int
 
-from .._vector import Scalar, Vec, dot, polar, scale
+from .._vector import Scalar, Vec, along, dot, polar, scale, vec
+from ..layout import Scatterer
 from ..materials import (
     AbstractLaw,
     EqualAngle,
@@ -16,113 +18,144 @@ from ..materials import (
 )
 from .march import Medium
 from .photons import Hit, Setting, merge, ratio_of, stop
+from .surfaces import Surface
 
 
-def collide(setting: Setting, w, cell, collided, landed, events, limit, u) -> "Hit":
+def collide(
+    setting: Setting,
+    w: Vec,
+    cell: Int[Array, "photons"],
+    collided: Bool[Array, "photons"],
+    landed: Bool[Array, "photons"],
+    events: list[Scalar],
+    limit: Scalar,
+    u: list[Scalar],
+) -> Hit:
     """What was hit, how it scatters, and whereto."""
-    layout, one = setting.layout, jnp.ones_like(limit)
     none = jnp.full(limit.shape, -1, jnp.int32)
+    one = jnp.ones_like(limit)
     hit = Hit(jnp.zeros_like(none), none, one, one, w, none, none, none, w, w)
     if setting.medium is not None:
         hit = merge(collided, _in_medium(setting, setting.medium, w, cell, u), hit)
-    for i, (s, scatterer) in enumerate(zip(setting.surfaces, layout.surfaces)):
+    for i, surface in enumerate(setting.surfaces):
         here = landed & (events[i] <= limit)
-        normal = s.lit_normal(w)
-        out = s.law.sample(*jax.tree.map(stop, (w, normal)), u[4], u[5])
-        facing = _remember(s.law, normal)
-        ratio, onward, letter = ratio_of(s.law.density(w, normal, out)), one, scatterer.reflected
-        letters = jnp.full_like(none, letter)
-        if scatterer.transmitted >= 0:
-            if s.straight:
-                onward = one / layout.lobe
-            else:
-                through = u[1] >= layout.lobe
-                far = about(tuple(-n for n in jax.tree.map(stop, normal)), u[4], u[5])
-                out = tuple(jnp.where(through, f, o) for f, o in zip(far, out))
-                facing = tuple(jnp.where(through, -n, f) for n, f in zip(normal, facing))
-                ratio = jnp.where(through, ratio_of(-dot(normal, far)), ratio)
-                onward = jnp.where(through, 1.0 / (1.0 - layout.lobe), 1.0 / layout.lobe)
-                letters = jnp.where(through, scatterer.transmitted, letters)
-        diffuse = scatterer.transmitted if not s.straight else -1
-        surface = Hit(
-            jnp.full_like(none, scatterer.material),
-            letters,
-            one,
-            onward * ratio,
-            jax.tree.map(stop, out),
-            jnp.full_like(none, i),
-            jnp.full_like(none, scatterer.reflected),
-            jnp.full_like(none, diffuse),
-            normal,
-            jax.tree.map(stop, facing),
-        )
-        hit = merge(here, surface, hit)
+        hit = merge(here, _on_surface(setting, surface, i, w, none, u), hit)
     return hit
 
 
-def _in_medium(setting: Setting, medium: Medium, w, cell, u) -> "Hit":
-    layout = setting.layout
-    leaf_k = None if medium.leaf is None else medium.leaf_at(cell, w)
-    bark_k = None if medium.bark is None else medium.bark_at(cell)
-    like = jnp.zeros_like(cell)
-    parts = []
-    if layout.leaf is not None:
-        onward, letter = jnp.ones_like(u[0]), jnp.full_like(like, layout.leaf.reflected)
-        if bark_k is None:
-            chosen, share = jnp.ones_like(u[1], bool), u[1]
-        else:
-            p = leaf_k / jnp.maximum(leaf_k + bark_k, 1e-30)
-            chosen, share = u[1] < p, u[1] / jnp.maximum(p, 1e-30)
-        ratio = ratio_of(leaf_k)
-        if layout.leaf_isotropic:
-            normal, out, facing = w, anywhere(u[4], u[5]), tuple(0.0 * n for n in w)
-        else:
-            if medium.angles is None:
-                normal = facet_normal(w, u[2], u[3])
-            else:
-                normal, more = _leaf_normal(medium, w, u[2], u[3])
-                ratio = ratio * more
-            out, facing = about(normal, u[4], u[5]), normal
-            if layout.leaf.transmitted >= 0:
-                through = share >= layout.lobe
-                facing = tuple(jnp.where(through, -n, n) for n in normal)
-                lift = jnp.where(through, 2.0 * dot(out, normal), 0.0)
-                out = tuple(o - lift * n for o, n in zip(out, normal))
-                letter = jnp.where(through, layout.leaf.transmitted, letter)
-                onward = jnp.where(through, 1.0 / (1.0 - layout.lobe), 1.0 / layout.lobe)
-        parts.append((chosen, layout.leaf, letter, ratio, onward, out, normal, facing))
-    if layout.bark is not None:
-        chosen = jnp.ones_like(u[1], bool) if not parts else ~parts[0][0]
-        if layout.bark_isotropic:
-            normal, out, facing = w, anywhere(u[4], u[5]), tuple(0.0 * n for n in w)
-        else:
-            normal = facing = facet_normal(w, u[2], u[3])
-            out = about(normal, u[4], u[5])
-        letter = jnp.full_like(like, layout.bark.reflected)
-        one = jnp.ones_like(u[0])
-        parts.append((chosen, layout.bark, letter, ratio_of(bark_k), one, out, normal, facing))
-    hit = None
-    for chosen, scatterer, letter, ratio, onward, out, normal, facing in parts:
-        full = jnp.full_like(like, scatterer.material)
-        none = jnp.full_like(like, -1)
-        part = Hit(
-            full,
-            letter,
-            ratio,
-            onward,
-            jax.tree.map(stop, out),
-            none,
-            jnp.full_like(like, scatterer.reflected),
-            jnp.full_like(like, scatterer.transmitted),
-            jax.tree.map(stop, normal),
-            jax.tree.map(stop, facing),
-        )
-        hit = part if hit is None else merge(chosen, part, hit)
-    assert hit is not None
-    return hit
+def _on_surface(
+    setting: Setting, surface: Surface, number: int, w: Vec, none: Int[Array, "photons"], u: list[Scalar]
+) -> Hit:
+    lobe, scatterer = setting.layout.lobe, setting.layout.surfaces[number]
+    normal = surface.lit_normal(w)
+    incident, upright = jax.tree.map(stop, (w, normal))
+    out = surface.law.sample(incident, upright, u[4], u[5])
+    onward = ratio_of(surface.law.density(w, normal, out))
+    facing, letter = _remember(surface.law, upright), jnp.full_like(none, scatterer.reflected)
+    diffuse = scatterer.transmitted >= 0 and not surface.straight
+    if diffuse:
+        through = u[1] >= lobe
+        below = scale(upright, jnp.asarray(-1.0))
+        far = about(below, u[4], u[5])
+        out, facing = _either(through, far, out), _either(through, below, facing)
+        onward = jnp.where(through, ratio_of(-dot(normal, far)) / (1.0 - lobe), onward / lobe)
+        letter = jnp.where(through, scatterer.transmitted, letter)
+    elif scatterer.transmitted >= 0:
+        # That it is reflected rather than passed was drawn on the way.
+        onward = onward / lobe
+    return Hit(
+        material=jnp.full_like(none, scatterer.material),
+        letter=letter,
+        ratio=jnp.ones_like(onward),
+        onward=onward,
+        w=jax.tree.map(stop, out),
+        on=jnp.full_like(none, number),
+        reflected=jnp.full_like(none, scatterer.reflected),
+        transmitted=jnp.full_like(none, scatterer.transmitted if diffuse else -1),
+        normal=normal,
+        facing=facing,
+    )
 
 
-def _leaf_normal(medium: Medium, w, u, v):
+def _in_medium(setting: Setting, medium: Medium, w: Vec, cell: Int[Array, "photons"], u: list[Scalar]) -> Hit:
+    leaf, bark = setting.layout.leaf, setting.layout.bark
+    if bark is None:
+        assert leaf is not None
+        return _on_leaf(setting, medium, leaf, w, medium.leaf_at(cell, w), u[1], u)
+    bark_k = medium.bark_at(cell)
+    on_bark = _on_bark(setting, bark, w, bark_k, u)
+    if leaf is None:
+        return on_bark
+    leaf_k = medium.leaf_at(cell, w)
+    p = leaf_k / jnp.maximum(leaf_k + bark_k, 1e-30)
+    # What is left of the number that chose leaf chooses the lobe.
+    share = u[1] / jnp.maximum(p, 1e-30)
+    return merge(u[1] < p, _on_leaf(setting, medium, leaf, w, leaf_k, share, u), on_bark)
+
+
+def _on_leaf(
+    setting: Setting, medium: Medium, leaf: Scatterer, w: Vec, k: Scalar, share: Scalar, u: list[Scalar]
+) -> Hit:
+    ratio, onward, lobe = ratio_of(k), jnp.ones_like(k), setting.layout.lobe
+    letter = jnp.full(k.shape, leaf.reflected, jnp.int32)
+    if setting.layout.leaf_isotropic:
+        return _facet(leaf, letter, ratio, onward, anywhere(u[4], u[5]), w, _nowhere(w))
+    if medium.angles is None:
+        normal = facet_normal(w, u[2], u[3])
+    else:
+        normal, more = _leaf_normal(medium, w, u[2], u[3])
+        ratio = ratio * more
+    out, facing = about(normal, u[4], u[5]), normal
+    if leaf.transmitted >= 0:
+        through = share >= lobe
+        facing = _either(through, scale(normal, jnp.asarray(-1.0)), normal)
+        out = along(out, normal, jnp.where(through, -2.0 * dot(out, normal), 0.0))
+        letter = jnp.where(through, leaf.transmitted, letter)
+        onward = jnp.where(through, 1.0 / (1.0 - lobe), 1.0 / lobe)
+    return _facet(leaf, letter, ratio, onward, out, normal, facing)
+
+
+def _on_bark(setting: Setting, bark: Scatterer, w: Vec, k: Scalar, u: list[Scalar]) -> Hit:
+    letter, one = jnp.full(k.shape, bark.reflected, jnp.int32), jnp.ones_like(k)
+    if setting.layout.bark_isotropic:
+        return _facet(bark, letter, ratio_of(k), one, anywhere(u[4], u[5]), w, _nowhere(w))
+    normal = facet_normal(w, u[2], u[3])
+    return _facet(bark, letter, ratio_of(k), one, about(normal, u[4], u[5]), normal, normal)
+
+
+def _facet(
+    scatterer: Scatterer,
+    letter: Int[Array, "photons"],
+    ratio: Scalar,
+    onward: Scalar,
+    out: Vec,
+    normal: Vec,
+    facing: Vec,
+) -> Hit:
+    out, normal, facing = jax.tree.map(stop, (out, normal, facing))
+    return Hit(
+        material=jnp.full_like(letter, scatterer.material),
+        letter=letter,
+        ratio=ratio,
+        onward=onward,
+        w=out,
+        on=jnp.full_like(letter, -1),
+        reflected=jnp.full_like(letter, scatterer.reflected),
+        transmitted=jnp.full_like(letter, scatterer.transmitted),
+        normal=normal,
+        facing=facing,
+    )
+
+
+def _either(where: Bool[Array, "photons"], a: Vec, b: Vec) -> Vec:
+    return vec(jnp.where(where, p, q) for p, q in zip(a, b))
+
+
+def _nowhere(w: Vec) -> Vec:
+    return scale(w, jnp.asarray(0.0))
+
+
+def _leaf_normal(medium: Medium, w: Vec, u: Scalar, v: Scalar) -> tuple[Vec, Scalar]:
     """A normal on the lit side from the leaf angle distribution, and |normal . w| / G(w)."""
     assert medium.leaf_angles is not None
     assert medium.angles is not None
@@ -131,46 +164,38 @@ def _leaf_normal(medium: Medium, w, u, v):
     theta = (number + 0.5) * (0.5 * jnp.pi / p.size)
     normal = polar(jnp.cos(theta), 2 * jnp.pi * v)
     cosine = dot(normal, w)
-    normal = tuple(jnp.where(cosine > 0, -n, n) for n in normal)
+    normal = _either(cosine > 0, scale(normal, jnp.asarray(-1.0)), normal)
     return normal, jnp.abs(cosine) / medium.angles.projection_at(w) * ratio_of(p[number])
 
 
-def view_factors(setting: Setting, w, v, hit):
-    """Apparent reflectance per unit reflectance, and per unit transmittance (None if none has any)."""
+def view_factors(setting: Setting, w: Vec, v: Vec, hit: Hit) -> tuple[Scalar, Scalar | None]:
+    """Apparent reflectance per unit reflectance, and per unit transmittance (None if nothing transmits)."""
     layout, medium = setting.layout, setting.medium
-    reflected = jnp.zeros_like(w[0])
+    reflected, transmitted = jnp.zeros_like(w[0]), jnp.zeros_like(w[0])
     transmits = [s.transmitted >= 0 and not p.straight for s, p in zip(layout.surfaces, setting.surfaces)]
-    if layout.leaf is not None:
-        transmits.append(layout.leaf.transmitted >= 0)
-    transmitted = jnp.zeros_like(w[0]) if any(transmits) else None
     if medium is not None:
         angle = dot(w, v)
-        facet = facet_reflection(angle)
+        front, back = facet_reflection(angle), facet_transmission(angle)
         if layout.leaf is not None:
+            transmits.append(layout.leaf.transmitted >= 0)
             here = (hit.on < 0) & (hit.material == layout.leaf.material)
-            leaf = jnp.full_like(angle, 0.25)
-            if not layout.leaf_isotropic:
-                leaf = facet if medium.angles is None else jnp.maximum(dot(hit.normal, v), 0.0)
-            reflected = jnp.where(here, leaf, reflected)
-            if layout.leaf.transmitted >= 0:
-                through = (
-                    facet_transmission(angle)
-                    if medium.angles is None
-                    else jnp.maximum(-dot(hit.normal, v), 0.0)
-                )
-                transmitted = jnp.where(here, through, transmitted)
+            lit, far = front, back
+            if layout.leaf_isotropic:
+                lit = far = jnp.full_like(angle, 0.25)
+            elif medium.angles is not None:
+                turned = dot(hit.normal, v)
+                lit, far = jnp.maximum(turned, 0.0), jnp.maximum(-turned, 0.0)
+            reflected, transmitted = jnp.where(here, lit, reflected), jnp.where(here, far, transmitted)
         if layout.bark is not None:
             here = (hit.on < 0) & (hit.material == layout.bark.material)
-            reflected = jnp.where(here, 0.25 if layout.bark_isotropic else facet, reflected)
-    for i, (s, scatterer) in enumerate(zip(setting.surfaces, layout.surfaces)):
-        here = hit.on == i
-        normal = s.lit_normal(w)
-        lit = dot(normal, v) > 0
+            reflected = jnp.where(here, 0.25 if layout.bark_isotropic else front, reflected)
+    for i, s in enumerate(setting.surfaces):
+        here, normal = hit.on == i, s.lit_normal(w)
+        turned = dot(normal, v)
         factor = s.law.view_factor(w, normal, v, setting.beam.half_angle)
-        reflected = jnp.where(here, jnp.where(lit, factor, 0.0), reflected)
-        if scatterer.transmitted >= 0 and not s.straight:
-            transmitted = jnp.where(here, jnp.maximum(-dot(normal, v), 0.0), transmitted)
-    return reflected, transmitted
+        reflected = jnp.where(here, jnp.where(turned > 0, factor, 0.0), reflected)
+        transmitted = jnp.where(here, jnp.maximum(-turned, 0.0), transmitted)
+    return reflected, transmitted if any(transmits) else None
 
 
 def _remember(law: AbstractLaw, normal: Vec) -> Vec:

@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._vector import Scalar, Vec, dot, vec
+from .._vector import Scalar, Vec, dot, scale, vec
 from ..materials import AbstractLaw
 from ..scene import Ground, Plate, Scene
 from .march import FAR
@@ -34,7 +34,7 @@ class Surface(eqx.Module):
     def lit_normal(self, w: Vec) -> Vec:
         """The normal of the side on which light travelling along `w` falls."""
         sign = jnp.where(dot(self.normal, w) > 0, -1.0, 1.0)
-        return tuple(n * sign for n in self.normal)
+        return scale(self.normal, sign)
 
 
 def surfaces_of(scene: Scene, aim: Float[Array, "3"]) -> tuple[Surface, ...]:
