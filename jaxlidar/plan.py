@@ -221,6 +221,9 @@ def _time(
         target = bin_width
     per_sample = max(math.ceil(interval / target - 1e-6), 1)
     width = interval / per_sample
+    if lidar.receiver.window == "first return":
+        # Sampled finely here; the digitiser's own bins are laid when the first return is known.
+        interval, per_sample = width, 1
     first, last = geometry.first / SPEED_OF_LIGHT, geometry.last / SPEED_OF_LIGHT
     if orders > 1:
         last += min(max(3 * (last - first), TAIL[0]), TAIL[1])

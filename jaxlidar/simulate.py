@@ -19,7 +19,7 @@ from .plan import Plan
 from .plan import plan as make_plan
 from .scene import Scene, leaf_optics
 from .trace.response import Response, trace
-from .waveform import Waveform, is_straight, total_of, waveform
+from .waveform import Waveform, is_straight, open_at_first_return, total_of, waveform
 
 # Fewer batches give no trustworthy standard error.
 MIN_BATCHES = 8
@@ -108,6 +108,8 @@ def simulate(
         response, _ = _batch(lidar, scene, plan, key)
         info = {"photons": 0, "batches": 1, "error": 0.0, "stopped": "nothing is random"}
         wave = _finish(response, lidar, scene, plan, None)
+        if lidar.receiver.window == "first return" and not is_traced(wave.energy):
+            wave = open_at_first_return(wave, lidar)
         return dataclasses.replace(wave, info={**info, "seconds": time.perf_counter() - started})
     traced = any(is_traced(x) for x in jax.tree.leaves((lidar, scene, key)))
     if traced:
@@ -207,6 +209,8 @@ def _simulate_batches(lidar, scene, plan, key, rtol, atol, fixed, max_seconds, p
     mean = jax.tree.map(lambda a: a / done, total)
     stderr = jnp.asarray(np.std(np.stack(means), axis=0, ddof=1) / math.sqrt(done))
     wave = _finish(mean, lidar, scene, plan, stderr)
+    if lidar.receiver.window == "first return":
+        wave = open_at_first_return(wave, lidar)
     info = {
         "photons": done * plan.n_photons if plan.orders > 1 else 0,
         "batches": done,

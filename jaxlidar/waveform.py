@@ -1,5 +1,7 @@
 """From response to waveform: optics, atmosphere, pulse, sampling, energy."""
 
+import dataclasses
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +12,7 @@ from .layout import KERNEL_VARIANCE
 from .letters import scene_optics
 from .lidar import Lidar
 from .plan import Plan
+from .receiver import first_return_window
 from .scene import Scene
 from .trace.histories import histories
 from .trace.response import Response
@@ -199,6 +202,32 @@ def waveform(
         ledger=full,
         wavelength=lidar.wavelength,
         info=info or {},
+    )
+
+
+def open_at_first_return(wave: Waveform, lidar: Lidar) -> Waveform:
+    """The finely sampled waveform on the digitiser's bins, the first of which opens at the first return.
+
+    See `jaxlidar.first_return_window` for the artefact that this makes. The first return is the first
+    sample above the receiver's detection threshold, and above a thousandth of the peak. Standard
+    errors of the fine samples are added up as if fully correlated.
+    """
+    energy = wave.energy
+    threshold = jnp.maximum(lidar.receiver.detection_threshold, 1e-3 * jnp.max(energy))
+    opened = jnp.cumsum(jnp.any(energy > threshold, axis=0)) > 0
+    arrays = [wave.reflectance, energy, wave.stderr, *wave.components.values()]
+    kept = jnp.stack([jnp.where(opened[None, :], a, 0.0) for a in arrays])
+    # Only the energy opens the window: the other channels are zero before it does.
+    interval = float(lidar.sampling_interval)
+    time, rows = first_return_window(wave.time, kept, interval, jnp.minimum(threshold, 0.0))
+    return dataclasses.replace(
+        wave,
+        time=time,
+        height=height_of(lidar, time),
+        reflectance=rows[0],
+        energy=rows[1],
+        stderr=rows[2],
+        components=dict(zip(wave.components, rows[3:])),
     )
 
 
