@@ -238,6 +238,9 @@ def _time(
         # Returns that the pulse can carry into the window.
         first = max(first, begin - interval - high)
         last = max(begin + samples * interval - low, first + width)
+    if scene.atmosphere is not None and scene.atmosphere.lidar_ratio is not None:
+        # The air returns light from the start.
+        first = min(first, begin - interval - high)
     edge = begin - 0.5 * interval
     lead = math.ceil((edge - first) / width) + 3
     count = lead + math.ceil((last - edge) / width) + 3
@@ -276,6 +279,10 @@ def _effects(lidar: Lidar, scene: Scene, orders: int, bound: float | None, why: 
     air = scene.atmosphere
     rows.append(Effect("atmospheric extinction", air is not None, has(air)))
     if air is not None:
+        scatters = air.lidar_ratio is not None
+        rows.append(
+            Effect("atmospheric backscatter", scatters, "above the scene" if scatters else "no lidar ratio")
+        )
         rows.append(Effect("scattering within the atmosphere", False, "beyond first order", None))
     jitter = number(lidar.jitter)
     rows.append(Effect("jitter", jitter > 0, f"{jitter:g} ns"))

@@ -28,7 +28,7 @@ class Waveform(eqx.Module):
     - `energy`: (wavelengths, bins) J that the detector registers per sample.
     - `stderr`: (wavelengths, bins) one standard error of `reflectance`; zero where nothing was random.
     - `components`: dict of arrays like `reflectance`: by material of the last scattering ("ground",
-      "leaf", "bark", "plate"), and by order ("first", "higher").
+      "leaf", "bark", "plate", "air"), and by order ("first", "higher").
     - `neglected`: (wavelengths,) apparent reflectance that orders beyond the last could still add.
     - `ledger`: dict of (wavelengths,) shares of the emitted energy, before the atmosphere: "returned" into
       the aperture, "escaped", "absorbed by ...", "after the window", "unfollowed" beyond the last order.
@@ -111,11 +111,31 @@ def sample(
     return jnp.einsum("...b,bs->...s", fine, pulse_kernel(lidar, plan))
 
 
-def _clear(lidar: Lidar, scene: Scene, plan: Plan) -> Float[Array, "wavelengths bins"]:
+def _fine_heights(lidar: Lidar, plan: Plan) -> Float[Array, "bins"]:
     time = jnp.asarray(plan.bins.start + plan.bins.width * np.arange(plan.bins.count))
+    return jnp.minimum(height_of(lidar, time), 0.999 * lidar.altitude)
+
+
+def _clear(lidar: Lidar, scene: Scene, plan: Plan) -> Float[Array, "wavelengths bins"]:
     assert scene.atmosphere is not None
-    height = jnp.minimum(height_of(lidar, time), 0.999 * lidar.altitude)
-    return scene.atmosphere.two_way_transmittance(lidar.wavelength, height, lidar.altitude, lidar.zenith)
+    heights = _fine_heights(lidar, plan)
+    return scene.atmosphere.two_way_transmittance(lidar.wavelength, heights, lidar.altitude, lidar.zenith)
+
+
+def returns_air(scene: Scene) -> bool:
+    """Whether the air's own return is simulated: where a lidar ratio is given."""
+    return scene.atmosphere is not None and scene.atmosphere.lidar_ratio is not None
+
+
+def air(lidar: Lidar, scene: Scene, plan: Plan) -> Float[Array, "wavelengths samples"]:
+    """The air's own return, apparent reflectance per sample: single scattering above all of the scene."""
+    assert scene.atmosphere is not None
+    heights = _fine_heights(lidar, plan)
+    per_metre = scene.atmosphere.backscatter(lidar.wavelength, heights, lidar.altitude, lidar.zenith)
+    top = jnp.asarray(plan.layout.upstream) * jnp.cos(jnp.deg2rad(lidar.zenith))
+    length = 0.5 * SPEED_OF_LIGHT * plan.bins.width
+    fine = jnp.where((heights > top)[None, :], per_metre * length, 0.0)
+    return jnp.einsum("wb,bs->ws", fine, pulse_kernel(lidar, plan))
 
 
 def height_of(lidar: Lidar, time: Float[Array, "bins"]) -> Float[Array, "bins"]:
@@ -128,7 +148,8 @@ def total_of(
 ) -> Float[Array, "wavelengths samples"]:
     """Apparent reflectance per sample, all components together."""
     first, higher = colour(response, optics(lidar, scene, plan), plan)
-    return sample(jnp.sum(first + higher, axis=0), lidar, scene, plan)
+    total = sample(jnp.sum(first + higher, axis=0), lidar, scene, plan)
+    return total + air(lidar, scene, plan) if returns_air(scene) else total
 
 
 def ledger_of(
@@ -177,6 +198,10 @@ def waveform(
     sampled = sample(fine, lidar, scene, plan)
     components = dict(zip([*names, "first", "higher"], sampled))
     total = sampled[-2] + sampled[-1]
+    if returns_air(scene):
+        components["air"] = air(lidar, scene, plan)
+        components["first"] = components["first"] + components["air"]
+        total = total + components["air"]
     time = jnp.asarray(plan.sample_start + plan.sample_interval * np.arange(plan.n_samples))
     slant = lidar.range_to_reference + 0.5 * SPEED_OF_LIGHT * time
     # E_t * eta * A_r / (pi R^2): the lidar equation of a Lambertian target that fills the footprint.
