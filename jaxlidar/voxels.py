@@ -43,8 +43,9 @@ class VoxelMap(eqx.Module):
     that differ, or a map with neither leaf nor bark.
     """
 
-    leaf: Float[Array, "nx ny nz"] | None
-    bark: Float[Array, "nx ny nz"] | None
+    # Their shapes are compared below, so that the error can name both.
+    leaf: Float[Array, "..."] | None
+    bark: Float[Array, "..."] | None
     voxel_size: Float[Array, "3"] = eqx.field(converter=_as_triple)
     origin: Float[Array, "3"] = eqx.field(converter=_as_triple)
     leaf_angles: LeafAngles | None = None
@@ -143,5 +144,5 @@ class VoxelMap(eqx.Module):
         return np.sum([np.asarray(a) for a in (self.leaf, self.bark) if a is not None], axis=0)
 
 
-def _volume(x: Numbers | None) -> Float[Array, "nx ny nz"] | None:
+def _volume(x: Numbers | None) -> Float[Array, "..."] | None:
     return None if x is None else as_array(x)

@@ -1,0 +1,89 @@
+"""Inadmissible input is a ValueError at construction that names the field, and the value or the range."""
+
+import jax
+import numpy as np
+import pytest
+
+import jaxlidar as jl
+
+KEY = jax.random.key(0)
+CUBE = np.full((2, 2, 2), 0.5)
+GRID = {"voxel_size": 1.0}
+LEAF = jl.LeafOptics(reflectance=0.4, transmittance=0.3)
+LOW = jl.VoxelMap.from_extinction(leaf=CUBE, **GRID)
+GROUND = jl.Scene(ground=jl.Ground())
+
+
+def voxels(**changes):
+    return jl.VoxelMap.from_extinction(**({"leaf": CUBE} | GRID | changes))
+
+
+CASES = {
+    "negative extinction": (lambda: voxels(leaf=-CUBE), r"leaf extinction = -0.5 .*\[0, inf\)"),
+    "NaN extinction": (lambda: voxels(leaf=CUBE * np.nan), "leaf extinction = nan"),
+    "infinite extinction": (lambda: voxels(bark=CUBE * np.inf), "bark extinction = inf"),
+    "shapes that differ": (lambda: voxels(bark=np.ones((2, 2, 3))), "leaf and bark have the shapes"),
+    "no material": (lambda: voxels(leaf=None), "leaf and bark are both None"),
+    "no voxels": (lambda: voxels(leaf=np.zeros((0, 2, 2))), "shape"),
+    "voxel size": (lambda: voxels(voxel_size=(1.0, -1.0, 1.0)), r"voxel_size = -1 .*\(0, inf\)"),
+    "origin": (lambda: voxels(origin=(0.0, np.nan, 0.0)), "origin = nan"),
+    "p above 1": (
+        lambda: jl.VoxelMap.from_probability(leaf=1.2 * np.ones((1, 1, 1)), **GRID),
+        r"leaf = 1.2 .*\[0, 1\]",
+    ),
+    "p below 0": (lambda: jl.VoxelMap.from_probability(bark=-CUBE, **GRID), "bark = -0.5"),
+    "negative LAD": (lambda: jl.VoxelMap.from_lad(-CUBE, **GRID), "lad = -0.5"),
+    "leaf angles": (lambda: jl.VoxelMap.from_lad(CUBE, leaf_angles="flat", **GRID), "'flat' is none of"),
+    "beta angles": (lambda: jl.LeafAngles.beta(45.0, 60.0), "std = 60"),
+    "R + T": (lambda: jl.LeafOptics(reflectance=0.7, transmittance=0.5), "reflectance . transmittance = 1.2"),
+    "plate R + T": (lambda: jl.Plate(height=0.0, reflectance=0.7, transmittance=0.5), r"= 1.2 .*\[0, 1"),
+    "coverage": (lambda: jl.Plate(height=0.0, reflectance=0.5, coverage=1.5), "coverage = 1.5"),
+    "plate transmission": (
+        lambda: jl.Plate(height=0.0, reflectance=0.5, transmission="odd"),
+        "'odd' is none of",
+    ),
+    "ground reflectance": (lambda: jl.Ground(reflectance=1.5), r"reflectance = 1.5 .*\[0, 1\]"),
+    "ground height": (lambda: jl.Ground(height=np.nan), "height = nan"),
+    "slope": (lambda: jl.Ground(slope=90.0), r"slope = 90 .*\[0, 90\)"),
+    "roughness": (lambda: jl.Specular(roughness=-0.1), "roughness = -0.1"),
+    "albedo": (lambda: jl.Isotropic(albedo=1.1), "albedo = 1.1"),
+    "leaf missing": (lambda: jl.Canopy(LOW), "leaf = None"),
+    "bark missing": (lambda: jl.Canopy(voxels(bark=CUBE), leaf=LEAF), "bark = None"),
+    "bark": (lambda: jl.Canopy(voxels(bark=CUBE), leaf=LEAF, bark=2.0), "bark = 2"),
+    "sides": (lambda: jl.Canopy(LOW, leaf=LEAF, sides="closed"), "'closed' is none of"),
+    "transmission": (lambda: jl.Canopy(LOW, leaf=LEAF, transmission="none"), "'none' is none of"),
+    "rtol": (lambda: jl.simulate(jl.Lidar(), GROUND, key=KEY, rtol=0.0), "rtol = 0"),
+    "atol": (lambda: jl.simulate(jl.Lidar(), GROUND, key=KEY, atol=-1.0), "atol = -1"),
+    "photons": (lambda: jl.simulate(jl.Lidar(), GROUND, key=KEY, n_photons=0), "n_photons = 0"),
+    "orders": (lambda: jl.plan(jl.Lidar(), GROUND, max_orders=0), "max_orders = 0"),
+    "step": (lambda: jl.plan(jl.Lidar(), GROUND, max_step=-1.0), "max_step = -1"),
+    "window": (lambda: jl.plan(jl.Lidar(), GROUND, window=(5.0, 1.0)), "window"),
+    "bin width": (lambda: jl.plan(jl.Lidar(), GROUND, bin_width=0.0), "bin_width = 0"),
+    "footprint": (lambda: jl.plan(jl.Lidar(), GROUND, footprint="odd"), "'odd' is none of"),
+    "scene above the sensor": (
+        lambda: jl.plan(jl.Lidar(altitude=10.0), jl.Scene(ground=jl.Ground(height=20.0))),
+        "altitude = 10",
+    ),
+    "values per wavelength": (
+        lambda: jl.plan(
+            jl.Lidar(wavelength=(532.0, 1064.0)), jl.Scene(ground=jl.Ground(reflectance=[0.1, 0.2, 0.3]))
+        ),
+        "ground reflectance",
+    ),
+    "spectrum": (lambda: jl.spectrum("bark of gold"), "no bundled spectrum"),
+}
+
+
+@pytest.mark.parametrize("name", list(CASES))
+def test_refused(name):
+    make, words = CASES[name]
+    with pytest.raises(ValueError, match=words):
+        make()
+
+
+def test_traced_geometry_needs_a_plan():
+    def height(h):
+        return jl.simulate(jl.Lidar(), jl.Scene(ground=jl.Ground(height=h)), key=KEY).reflectance.sum()
+
+    with pytest.raises(ValueError, match="make a plan outside"):
+        jax.grad(height)(1.0)
