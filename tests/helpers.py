@@ -1,0 +1,91 @@
+"""Shared by the tests: slabs, lidars that record a whole waveform as one sample, batches and z-tests."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Array, PRNGKeyArray
+
+import jaxlidar as jl
+from jaxlidar.simulate import trace_all
+
+# One sample of 1000 ns centred on 400 ns takes in everything that arrives from -100 to 900 ns.
+WHOLE = {"window": (400.0, 401.0), "bin_width": 2.0}
+
+
+def whole_lidar(**changes: Any) -> jl.Lidar:
+    """A lidar 400 km up, of narrow beam, that records one sample of 1000 ns (see `WHOLE`).
+
+    The sum of a waveform then has a standard error of its own, where those of its samples would have to be
+    added with their correlations. From this height every way back to the sensor is vertical.
+    """
+    return jl.Lidar(**({"altitude": 4e5, "divergence": 1e-3, "sampling_interval": 1000.0} | changes))
+
+
+def slab(
+    leaf: float | None = None,
+    bark: float | None = None,
+    *,
+    thickness: float = 10.0,
+    width: float = 40.0,
+    shape: tuple[int, int, int] = (1, 1, 4),
+    origin: tuple[float, float, float] = (-20.0, -20.0, 0.0),
+) -> jl.VoxelMap:
+    """A homogeneous slab of vertical optical depths `leaf` and `bark` (None: not there) on z = 0."""
+    size = (width / shape[0], width / shape[1], thickness / shape[2])
+
+    def fill(depth: float | None) -> np.ndarray | None:
+        return None if depth is None else np.full(shape, depth / thickness)
+
+    return jl.VoxelMap.from_extinction(leaf=fill(leaf), bark=fill(bark), voxel_size=size, origin=origin)
+
+
+def agrees(value: Any, stderr: Any, expected: Any, *, bound: Any = 0.0, sigmas: float = 3.0) -> bool:
+    """z-test: whether all of `value` lie within `sigmas` standard errors of `expected`.
+
+    `bound` is what the expected value may exceed the simulated one by: the orders that were neglected.
+    """
+    off, margin = np.asarray(value, float) - np.asarray(expected, float), sigmas * np.asarray(stderr, float)
+    return bool(np.all(off <= margin) and np.all(off >= -margin - np.asarray(bound, float)))
+
+
+@eqx.filter_jit
+def _wave(lidar: jl.Lidar, scene: jl.Scene, plan: jl.Plan, key: PRNGKeyArray, quantity: Callable) -> Any:
+    response = trace_all(lidar, scene, plan, key)
+    return quantity(jl.waveform(response, lidar, scene, plan))
+
+
+def _itself(wave: jl.Waveform) -> jl.Waveform:
+    return wave
+
+
+def first_wave(lidar: jl.Lidar, scene: jl.Scene, plan: jl.Plan) -> jl.Waveform:
+    """One trace, for what is not random; compiled once for each plan, and faster so than by `simulate`."""
+    assert not plan.is_random
+    return _wave(lidar, scene, plan, jax.random.key(0), _itself)
+
+
+def batch_mean(
+    lidar: jl.Lidar,
+    scene: jl.Scene,
+    plan: jl.Plan,
+    *,
+    seed: int,
+    count: int = 32,
+    quantity: Callable[[jl.Waveform], Any],
+) -> tuple[Any, Any]:
+    """Mean and standard error, over independent batches, of any quantity of a waveform (an array or a tree).
+
+    `quantity` is compiled with the trace: define it once, at module level, so that it is compiled once.
+    """
+    keys = jax.random.split(jax.random.key(seed), count)
+    found = [_wave(lidar, scene, plan, key, quantity) for key in keys]
+
+    def gather(*each: Array) -> np.ndarray:
+        return np.stack([np.asarray(e, float) for e in each])
+
+    table = jax.tree.map(gather, *found)
+    mean = jax.tree.map(lambda t: t.mean(axis=0), table)
+    return mean, jax.tree.map(lambda t: t.std(axis=0, ddof=1) / np.sqrt(count), table)

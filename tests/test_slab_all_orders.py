@@ -1,0 +1,95 @@
+"""Homogeneous slabs, all orders, against discrete ordinates.
+
+A slab of optical depth tau (10 m of voxels with periodic sides) over Lambertian ground, lit and seen from
+straight above, far away. The sum of the waveform is the bidirectional reflectance factor pi I / F. The
+references are plane-parallel solutions with the ways in and out independent (no hot spot): a table for
+isotropic scattering, and for spherically oriented bi-Lambertian leaves a solution computed here with
+Ross's phase function. Tolerance: three standard errors and what the neglected orders may add, and never
+more than 0.5 %.
+"""
+
+import csv
+import warnings
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import WHOLE, batch_mean, whole_lidar
+
+import jaxlidar as jl
+
+THICKNESS = 10.0
+FAR = whole_lidar()
+
+
+def returned(wave):
+    """The sum of the waveform, and what the neglected orders may add."""
+    return jnp.sum(wave.reflectance), wave.neglected[0]
+
+
+def total(tau, leaf, ground, orders, photons, seed=0):
+    """Sum of the waveform, its standard error and the bound on neglected orders."""
+    lad = np.full((2, 2, 20), 2 * tau / THICKNESS)
+    voxels = jl.VoxelMap.from_lad(lad, voxel_size=(5.0, 5.0, THICKNESS / 20))
+    scene = jl.Scene(
+        canopy=jl.Canopy(voxels, leaf=leaf, sides="periodic"), ground=jl.Ground(reflectance=ground)
+    )
+    plan = jl.plan(FAR, scene, max_orders=orders, n_photons=photons // 32, n_rays=256, **WHOLE)
+    (value, neglected), (stderr, _) = batch_mean(FAR, scene, plan, seed=seed, quantity=returned)
+    return float(value), float(stderr), float(neglected)
+
+
+ORDERS = {0.1: 8, 1.0: 30, 2.0: 25, 5.0: 60, 50.0: 60}
+
+
+@pytest.mark.parametrize("tau", [0.1, 1.0, 2.0, 5.0, pytest.param(50.0, marks=pytest.mark.slow)])
+def test_isotropic_scattering(shared, tau):
+    with (shared / "reference" / "slabs_isotropic.csv").open() as file:
+        (row,) = [r for r in csv.DictReader(file) if float(r["tau"]) == tau]
+    leaf = jl.Isotropic(albedo=float(row["omega"]))
+    value, stderr, neglected = total(tau, leaf, float(row["rho_ground"]), ORDERS[tau], 1 << 17)
+    exact = float(row["nadir_BRF_interp"])
+    assert -3 * stderr - neglected < value - exact < 3 * stderr
+    assert value == pytest.approx(exact, rel=5e-3)
+
+
+def ross_brf(reflectance, transmittance, tau, ground, streams=48):
+    """Discrete ordinates with the normalised phase function 8 Gamma / (R + T) of spherical leaves."""
+    from PythonicDISORT import pydisort, subroutines
+
+    x, weight = np.polynomial.legendre.leggauss(400)
+    angle = np.arccos(x)
+    gamma = (reflectance + transmittance) / (3 * np.pi) * (np.sin(angle) - angle * x) + transmittance / 3 * x
+    phase = 8 * gamma / (reflectance + transmittance)
+    basis = np.polynomial.legendre.Legendre.basis
+    moments = [0.5 * np.sum(weight * phase * basis(order)(x)) for order in range(streams)]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        out = pydisort(
+            np.array([tau]),
+            np.array([reflectance + transmittance]),
+            streams,
+            np.array([moments]),
+            1.0,
+            1.0,
+            0.0,
+            BDRF_Fourier_modes=[ground],
+            NFourier=1,
+            NLeg=streams,
+        )
+        return float(np.pi * subroutines.interpolate(out[3])(1.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("reflectance", "transmittance", "tau", "ground"), [(0.4, 0.3, 1.0, 0.2), (0.1, 0.6, 2.0, 0.3)]
+)
+def test_bi_lambertian_leaves(reflectance, transmittance, tau, ground):
+    leaf = jl.LeafOptics(reflectance=reflectance, transmittance=transmittance)
+    value, stderr, neglected = total(tau, leaf, ground, 20, 1 << 17, seed=3)
+    exact = ross_brf(reflectance, transmittance, tau, ground)
+    # The reference itself is good to about 5e-5 at this number of streams.
+    bound = 3 * np.hypot(stderr, 5e-5)
+    assert -bound - neglected < value - exact < bound
+    assert value == pytest.approx(exact, rel=5e-3)
+    # The same test rejects leaves whose two sides are exchanged.
+    assert abs(value - ross_brf(transmittance, reflectance, tau, ground)) > 10 * bound
