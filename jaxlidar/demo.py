@@ -18,17 +18,17 @@ HEIGHT = 15.0
 TRUNK_DIAMETER = 0.89
 CROWN_BASE = 4.0
 CROWN_RADIUS = 3.5
-LEAF_AREA_INDEX = 3.0
+LEAF_AREA_INDEX = 3.5
 WAVELENGTHS = (532.0, 1064.0, 1550.0)
 
 
 def demo_lidar(wavelength: float | tuple[float, ...] = 1064.0) -> Lidar:
-    """A lidar 1000 m above the ground whose footprint, 8 m across, holds the whole tree.
+    """A lidar 1000 m above the ground whose footprint, 6 m across, covers much of the crown.
 
     Pulse 6 ns, sampling interval 1 ns, aperture 0.2 m. `wavelength` is in nm. Default 1064.
     """
     return Lidar(
-        wavelength=wavelength, altitude=1000.0, divergence=8.0, pulse=GaussianPulse(fwhm=6.0), aperture=0.2
+        wavelength=wavelength, altitude=1000.0, divergence=6.0, pulse=GaussianPulse(fwhm=6.0), aperture=0.2
     )
 
 
@@ -57,7 +57,7 @@ def demo_scene(voxel_size: float = 0.25, *, seed: int = 3) -> Scene:
 def tree(voxel_size: float, *, seed: int) -> VoxelMap:
     """Crown and trunk as extinction, in voxels of the edge `voxel_size` (m) round x = y = 0.
 
-    The leaf area index below the crown's outline is 3, the trunk 0.89 m thick at the base and a tenth of that
+    The leaf area index below the crown's outline is 3.5, the trunk 0.89 m thick at the base and a tenth of that
     at its top, 2 m below the tree's. Bark is spread over the voxels that it shares.
     """
     half = round(np.ceil((CROWN_RADIUS + 0.25) / voxel_size))
