@@ -1,0 +1,104 @@
+"""What the benchmarks share: the record of the machine, timing side by side, files written whole."""
+
+import argparse
+import json
+import os
+import platform
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import jax
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+
+def options(description: str, **defaults: int) -> argparse.Namespace:
+    """The command line: `--out` for the folder, and one whole number for each of `defaults`."""
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("--out", default="figures", type=Path, help="folder of the results")
+    for name, value in defaults.items():
+        parser.add_argument(f"--{name}", default=value, type=int)
+    return parser.parse_args()
+
+
+def machine() -> dict[str, object]:
+    """What the times depend on."""
+    return {
+        "processor": _processor(),
+        "cores": os.cpu_count(),
+        "load": round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None,
+        "device": str(jax.devices()[0]),
+        "python": platform.python_version(),
+        "jax": jax.__version__,
+    }
+
+
+def _processor() -> str:
+    cpus = Path("/proc/cpuinfo")
+    if cpus.exists():
+        for line in cpus.read_text().splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    return platform.processor() or platform.machine()
+
+
+def seconds(function: Callable, *arguments) -> float:
+    """Wall time of one call, until its results are there."""
+    start = time.perf_counter()
+    jax.block_until_ready(function(*arguments))
+    return time.perf_counter() - start
+
+
+def race(contestants: Mapping[str, Callable[[], object]], rounds: int) -> dict[str, list[float]]:
+    """Times of all contestants, in turn, round after round, so that other work falls on all alike.
+
+    Each runs once before, to compile.
+    """
+    for run in contestants.values():
+        jax.block_until_ready(run())
+    times: dict[str, list[float]] = {name: [] for name in contestants}
+    for _ in range(rounds):
+        for name, run in contestants.items():
+            times[name].append(seconds(run))
+    return times
+
+
+def best(times: Mapping[str, list[float]]) -> dict[str, float]:
+    """The fastest round of each."""
+    return {name: min(values) for name, values in times.items()}
+
+
+def write_json(path: Path, record: Mapping[str, object]) -> None:
+    """Write under another name first: whoever reads finds the old record or the new one, never half."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    draft = path.with_name(path.name + ".tmp")
+    draft.write_text(json.dumps(record, indent=2) + "\n")
+    draft.replace(path)
+
+
+def new_figure(columns: int = 1, size: tuple[float, float] = (6, 4)):
+    """A figure and its axes."""
+    return plt.subplots(ncols=columns, figsize=size, layout="constrained")
+
+
+def save_figure(figure, path: Path) -> None:
+    """Write a figure as PNG, whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    draft = path.with_name(path.name + ".tmp")
+    figure.savefig(draft, dpi=150, format="png")
+    plt.close(figure)
+    draft.replace(path)
+
+
+def print_table(header: tuple[str, ...], rows: list[tuple]) -> None:
+    """Print rows below a header, numbers to three significant digits."""
+    text = [header, *(tuple(f"{c:.3g}" if isinstance(c, float) else str(c) for c in row) for row in rows)]
+    widths = [max(len(row[i]) for row in text) for i in range(len(header))]
+    for n, row in enumerate(text):
+        cells = [row[0].ljust(widths[0]), *(c.rjust(w) for c, w in zip(row[1:], widths[1:]))]
+        print("  ".join(cells).rstrip())
+        if n == 0:
+            print("  ".join("-" * w for w in widths))

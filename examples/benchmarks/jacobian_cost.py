@@ -1,0 +1,139 @@
+"""A Jacobian of the waveform in eight unknowns against one simulation, same photons and keys.
+
+Run it as `python examples/benchmarks/jacobian_cost.py [--out figures] [--photons 65536] [--rounds 5]`.
+
+Four unknowns are optical (Cab, Cw, N of the leaf, reflectance of the ground), four geometric (height and
+slope of the ground, size of the voxels, leaf area). "structured" pushes only the geometric tangents
+through the trace, together, and gets the optical columns from the traced response, as `inversion.retrieve`
+does; "jacfwd" pushes all eight through everything. Eight batches, one thread per core, warm.
+"""
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from _common import best, machine, new_figure, options, print_table, race, save_figure, write_json
+
+import jaxlidar as jl
+from jaxlidar.simulate import MIN_BATCHES, total_all, trace_all
+
+N, SIZE, ORDERS = 32, 10.0, 10
+OPTICAL = ("Cab", "Cw", "N", "ground reflectance")
+GEOMETRIC = ("ground height", "slope", "voxel size", "leaf area")
+START = (jnp.array([40.0, 0.01, 1.5, 0.3]), jnp.array([0.0, 5.0, 1.0, 1.0]))
+
+
+def scene_at(optical, geometric, extinction) -> jl.Scene:
+    cab, cw, layers, ground = optical
+    height, slope, size, area = geometric
+    leaf = jl.Prospect(N=layers, Cab=cab, Car=8.0, Cant=0.0, Cbrown=0.0, Cw=cw, Cm=0.009)
+    voxels = jl.VoxelMap.from_extinction(
+        leaf=area * extinction, voxel_size=size * SIZE / N, origin=(-5.0, -5.0, 1.0)
+    )
+    return jl.Scene(
+        canopy=jl.Canopy(voxels, leaf=leaf),
+        ground=jl.Ground(height=height, slope=slope, reflectance=ground),
+    )
+
+
+def main() -> None:
+    given = options("Cost of a Jacobian.", photons=65536, rounds=5)
+    place = (np.arange(N) + 0.5) * SIZE / N
+    x, y, z = np.meshgrid(place, place, place, indexing="ij")
+    inside = (x - 5) ** 2 + (y - 5) ** 2 + (z - 5) ** 2 < 3.5**2
+    extinction = jnp.asarray(
+        np.where(inside, 0.5 * np.random.default_rng(0).uniform(0, 2, inside.shape), 0.0)
+    )
+    lidar = jl.Lidar(wavelength=(532.0, 1064.0, 1550.0), divergence=10.0)
+    plan = jl.plan(
+        lidar,
+        scene_at(*START, extinction),
+        max_orders=ORDERS,
+        n_photons=given.photons // MIN_BATCHES,
+        n_rays=8192 // MIN_BATCHES,
+    )
+
+    def response(geometric, optical, key):
+        return trace_all(lidar, scene_at(optical, geometric, extinction), plan, key)
+
+    def colour(response, optical, geometric):
+        return total_all(response, lidar, scene_at(optical, geometric, extinction), plan)
+
+    def simulate(optical, geometric, key):
+        return colour(response(geometric, optical, key), optical, geometric)
+
+    def geometric_columns(optical, geometric, key):
+        def total(g):
+            traced = response(g, optical, key)
+            return colour(traced, optical, g), traced
+
+        push = jax.vmap(lambda t: jax.jvp(total, (geometric,), (t,), has_aux=True), out_axes=(None, -1, None))
+        return push(jnp.eye(geometric.size))
+
+    def structured(optical, geometric, key):
+        value, columns, traced = geometric_columns(optical, geometric, key)
+        return value, jax.jacfwd(lambda o: colour(traced, o, geometric))(optical), columns
+
+    def plain(optical, geometric, key):
+        return jax.jacfwd(simulate, argnums=(0, 1))(optical, geometric, key)
+
+    def optical_columns(optical, geometric, key):
+        traced = response(geometric, optical, key)
+        return jax.jacfwd(lambda o: colour(traced, o, geometric))(optical)
+
+    keys = list(jax.random.split(jax.random.key(0), MIN_BATCHES))
+    pool = ThreadPoolExecutor(os.cpu_count() or 1)
+
+    def over_batches(function):
+        compiled = eqx.filter_jit(function)
+        return lambda: list(pool.map(lambda k: jax.block_until_ready(compiled(*START, k)), keys))
+
+    contestants = {
+        "simulation": over_batches(simulate),
+        "4 optical": over_batches(optical_columns),
+        "4 geometric": over_batches(geometric_columns),
+        "all 8, structured": over_batches(structured),
+        "all 8, jacfwd": over_batches(plain),
+    }
+    times = race(contestants, given.rounds)
+    fastest = best(times)
+    ratio = {name: t / fastest["simulation"] for name, t in fastest.items()}
+
+    _, by_colour, by_trace = contestants["all 8, structured"]()[0]
+    whole = contestants["all 8, jacfwd"]()[0]
+    difference = max(
+        float(jnp.max(jnp.abs(a - b)) / jnp.max(jnp.abs(b))) for a, b in zip((by_colour, by_trace), whole)
+    )
+    record = {
+        "machine": machine(),
+        "photons": given.photons,
+        "orders": ORDERS,
+        "unknowns": {"optical": OPTICAL, "geometric": GEOMETRIC},
+        "seconds": fastest,
+        "seconds_median": {name: float(np.median(t)) for name, t in times.items()},
+        "times_one_simulation": ratio,
+        "structured_against_jacfwd": difference,
+    }
+    write_json(given.out / "jacobian_cost.json", record)
+
+    figure, axes = new_figure(size=(7, 3))
+    names = list(ratio)[::-1]
+    axes.barh(names, [ratio[n] for n in names])
+    axes.axvline(5.0, color="black", linestyle="--", label="five simulations")
+    axes.set(xlabel="times one simulation", title=f"Jacobian, {given.photons} photons, {ORDERS} orders")
+    axes.legend()
+    save_figure(figure, given.out / "jacobian_cost.png")
+
+    medians = record["seconds_median"]
+    print_table(
+        ("", "s, best", "s, median", "times one"), [(n, fastest[n], medians[n], ratio[n]) for n in fastest]
+    )
+    print(f"eight unknowns cost {ratio['all 8, structured']:.2f} simulations (wanted: at most 5)")
+    print(f"structured against jacfwd: {difference:.1e} of the largest derivative")
+
+
+if __name__ == "__main__":
+    main()
