@@ -1,0 +1,276 @@
+"""The command `jaxlidar demo`: a tree's waveform, and its leaf, crown and ground retrieved from a noisy one.
+
+Crown shape and the places of its clumps are taken as known; what is retrieved is listed by `sought`.
+"""
+
+import argparse
+import dataclasses
+import os
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jaxlidar.plot
+import numpy as np
+from jaxlidar.cli import CommandError
+from jaxlidar.demo import HEIGHT, LEAF_AREA_INDEX, WAVELENGTHS, demo_lidar, demo_scene
+from jaxtyping import Array, Float
+from matplotlib.figure import Figure
+
+import jaxlidar as jl
+
+from .result import Retrieval
+from .retrieval import retrieve
+from .unknowns import Unknown, put, settle
+
+# Standard deviation of the added noise: a share of each sample, and a floor relative to the peak.
+NOISE_SHARE, NOISE_FLOOR = 0.02, 0.002
+# What is recorded, in ns: from 17 m above the ground to 9 m below, for light that lingers in the crown.
+WINDOW = (-115.0, 60.0)
+# Photons and rays of each simulation of the retrieval.
+FIT_PHOTONS, FIT_RAYS = 16384, 4096
+RESOLUTION = 130
+
+
+@dataclasses.dataclass(frozen=True)
+class Sought:
+    """A quantity to retrieve, its unit and its true value."""
+
+    unknown: Unknown
+    unit: str
+    truth: float
+
+
+def _with_leaf_area(scene: jl.Scene, index: Array) -> jl.Scene:
+    return eqx.tree_at(
+        lambda s: s.canopy.voxels.leaf, scene, replace_fn=lambda leaf: leaf * (index / LEAF_AREA_INDEX)
+    )
+
+
+def _with_height(scene: jl.Scene, height: Array) -> jl.Scene:
+    """Stretched upward from z = 0, with the same leaf and bark area."""
+    stretch = height / HEIGHT
+
+    def stretched(voxels: jl.VoxelMap) -> list[Any]:
+        size = voxels.voxel_size.at[2].multiply(stretch)
+        return [voxels.leaf / stretch, voxels.bark / stretch, size]
+
+    fields = lambda v: [v.leaf, v.bark, v.voxel_size]  # noqa: E731
+    return eqx.tree_at(lambda s: fields(s.canopy.voxels), scene, stretched(scene.canopy.voxels))
+
+
+def sought(scene: jl.Scene) -> list[Sought]:
+    """What the demo retrieves of `demo_scene`, each from a start that is off."""
+    leaf, ground = scene.canopy.leaf, scene.ground
+    return [
+        Sought(
+            Unknown(lambda s: s.canopy.leaf.Cab, bounds=(5.0, 100.0), start=25.0, name="chlorophyll"),
+            "ug/cm2",
+            float(leaf.Cab),
+        ),
+        Sought(
+            Unknown(lambda s: s.canopy.leaf.Cw, bounds=(0.001, 0.05), start=0.025, name="leaf water"),
+            "cm",
+            float(leaf.Cw),
+        ),
+        Sought(
+            Unknown(lambda s: s.canopy.leaf.N, bounds=(1.0, 3.0), start=2.2, name="leaf structure N"),
+            "",
+            float(leaf.N),
+        ),
+        Sought(
+            Unknown(
+                lambda s: s.ground.reflectance.scale, bounds=(0.2, 2.0), start=0.6, name="ground brightness"
+            ),
+            "of soil-medium",
+            float(ground.reflectance.scale),
+        ),
+        Sought(
+            Unknown(lambda s: s.ground.height, bounds=(-2.0, 2.0), start=0.5, name="ground height"),
+            "m",
+            float(ground.height),
+        ),
+        Sought(
+            Unknown(name="leaf area index", bounds=(1.0, 8.0), start=2.5, apply=_with_leaf_area),
+            "m2/m2",
+            LEAF_AREA_INDEX,
+        ),
+        Sought(
+            Unknown(name="tree height", bounds=(12.0, 18.0), start=14.2, apply=_with_height), "m", HEIGHT
+        ),
+    ]
+
+
+def demo(argv: Sequence[str]) -> int:
+    """Simulate a tree's waveform, retrieve leaf, crown and ground from a noisy one, and draw both."""
+    parser = argparse.ArgumentParser(prog="jaxlidar demo", description=demo.__doc__)
+    add = parser.add_argument
+    add("--out", type=Path, default="jaxlidar-demo", metavar="DIR", help="of the figures; %(default)s")
+    add("--seed", type=int, default=0, help="of photons and noise; default %(default)s")
+    add("--rtol", type=float, default=0.01, help="relative accuracy of the waveform; default %(default)s")
+    add("--quiet", action="store_true", help="show no progress, only the results")
+    add("--voxel-size", type=float, default=0.25, metavar="M", help=argparse.SUPPRESS)
+    options = parser.parse_args(argv)
+    if not 0 < options.rtol < 1:
+        raise CommandError(f"--rtol {options.rtol:g} is outside the admissible range (0, 1).")
+    if not 0 <= options.seed < 2**31:
+        raise CommandError(f"--seed {options.seed} is outside the admissible range [0, 2147483648).")
+    if not 0 < options.voxel_size <= 1:
+        raise CommandError(f"--voxel-size {options.voxel_size:g} is outside the admissible range (0, 1].")
+    # Before the work, so that a folder that cannot be written costs none.
+    options.out.mkdir(parents=True, exist_ok=True)
+    started = time.perf_counter()
+    say = _Say(None if options.quiet else sys.stderr)
+    run(options.out, seed=options.seed, rtol=options.rtol, voxel_size=options.voxel_size, say=say)
+    print(f"\n{time.perf_counter() - started:.0f} s")
+    return 0
+
+
+def run(out: Path, *, seed: int, rtol: float, voxel_size: float, say: Callable[[str], None]) -> Retrieval:
+    """Simulate, retrieve, write `waveform.png` and `retrieval.png` into `out`, print the results.
+
+    **Arguments:** as of the command; `say` is called with lines of progress.
+    """
+    key = jax.random.key(seed)
+    lidar, scene = demo_lidar(WAVELENGTHS), demo_scene(voxel_size)
+    say("simulating the tree (compiles first)")
+    plan = jl.plan(lidar, scene, rtol=rtol, window=WINDOW)
+    wave = jl.simulate(
+        lidar, scene, key=jax.random.fold_in(key, 0), plan=plan, rtol=rtol, progress=lambda p: say(f"  {p}")
+    )
+    path = out / "waveform.png"
+    save(waveform_figure(wave, lidar, scene), path)
+    _print_waveform(wave)
+    print(f"\nfigure: {path}\n")
+    noise = _noise(wave)
+    observed = noisy(wave, noise, seed)
+    asked = sought(scene)
+    settled = settle([a.unknown for a in asked], scene)
+    begin = put(scene, tuple(s.place for s in settled), tuple(s.start for s in settled))
+    start = jl.simulate(lidar, begin, key=jax.random.fold_in(key, 1), plan=plan, rtol=2 * rtol)
+    say("retrieving (compiles first)")
+    fit = retrieve(
+        observed,
+        lidar,
+        scene,
+        [a.unknown for a in asked],
+        noise=noise,
+        key=jax.random.fold_in(key, 2),
+        n_photons=FIT_PHOTONS,
+        n_rays=FIT_RAYS,
+        progress=lambda step: say(f"  {_brief(step)}"),
+    )
+    path = out / "retrieval.png"
+    save(retrieval_figure(observed, noise, start, fit), path)
+    _print_retrieval(fit, asked)
+    print(f"\nfigure: {path}")
+    return fit
+
+
+def _noise(wave: jl.Waveform) -> Float[np.ndarray, "wavelengths bins"]:
+    value = np.asarray(wave.reflectance)
+    floor = NOISE_FLOOR * value.max(axis=1, keepdims=True)
+    return np.sqrt((NOISE_SHARE * value) ** 2 + floor**2 + np.asarray(wave.stderr) ** 2)
+
+
+def noisy(wave: jl.Waveform, noise: Float[np.ndarray, "wavelengths bins"], seed: int) -> jl.Waveform:
+    """The waveform with normal noise of the standard deviation `noise`."""
+    value = np.asarray(wave.reflectance)
+    drawn = np.random.default_rng(seed).normal(size=value.shape)
+    # Its own simulation error is part of the noise already.
+    added = np.sqrt(np.maximum(noise**2 - np.asarray(wave.stderr) ** 2, 0.0))
+    return dataclasses.replace(wave, reflectance=jax.numpy.asarray(value + added * drawn, value.dtype))
+
+
+def waveform_figure(wave: jl.Waveform, lidar: jl.Lidar, scene: jl.Scene) -> Figure:
+    """The scene from the side, and beside it its waveform at 1064 nm with its components."""
+    figure = Figure(figsize=(7.0, 4.2), layout="constrained")
+    left, right = figure.subplots(1, 2, sharey=True, width_ratios=(1, 1.9))
+    jaxlidar.plot.scene(scene, lidar, left)
+    jaxlidar.plot.waveform(wave, right, wavelength=1064.0)
+    left.set_ylim(-4.0, HEIGHT + 1.0)
+    right.set_ylabel("")
+    return figure
+
+
+def retrieval_figure(
+    observed: jl.Waveform, noise: Float[np.ndarray, "wavelengths bins"], start: jl.Waveform, fit: Retrieval
+) -> Figure:
+    """For each wavelength the data, the start and the fit, and the residuals of the fit."""
+    figure = Figure(figsize=(7.4, 4.6), layout="constrained")
+    ratios = (1.5, 1.0) * len(WAVELENGTHS)
+    axes = figure.subplots(1, 2 * len(WAVELENGTHS), sharey=True, width_ratios=ratios)
+    draw = jaxlidar.plot.waveform
+    for i, wavelength in enumerate(WAVELENGTHS):
+        ax, side = axes[2 * i], axes[2 * i + 1]
+        common: dict[str, Any] = {"wavelength": wavelength, "components": False, "sigma": 0.0}
+        look: dict[str, Any] = {"linestyle": "none", "marker": "o", "markersize": 2.2, "color": "#56B4E9"}
+        draw(observed, ax, label="data", **common, **look)
+        draw(start, ax, label="start", color="#D55E00", linestyle=(0, (4, 2)), linewidth=1.0, **common)
+        draw(fit.waveform, ax, label="fit", **common)
+        jaxlidar.plot.residuals(
+            fit.waveform, np.asarray(observed.reflectance), noise, side, wavelength=wavelength
+        )
+        ax.get_legend().remove()
+        for a in (ax, side):
+            a.set_ylim(-6.0, HEIGHT + 2.0)
+            a.set_ylabel("height (m)" if a is axes[0] else "")
+            a.set_xlabel("")
+        ax.locator_params(axis="x", nbins=3)
+        ax.set_xlabel("apparent\nreflectance")
+        side.set_xlabel("residual\n(std. dev.)")
+    lines, names = axes[0].get_legend_handles_labels()
+    figure.legend(lines, names, loc="outside upper center", ncols=3, frameon=False)
+    return figure
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write a PNG under a temporary name beside `path`, then rename it."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        figure.savefig(temporary, format="png", dpi=RESOLUTION)
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _print_waveform(wave: jl.Waveform) -> None:
+    print("apparent reflectance, summed over the waveform")
+    names = ["leaf", "bark", "ground", "first", "higher"]
+    heads = ["leaf", "bark", "ground", "first order", "higher orders", "total", "std. error"]
+    print(f"{'':8}" + "".join(f"{h:>14}" for h in heads))
+    for i, wavelength in enumerate(np.asarray(wave.wavelength)):
+        parts = [float(np.sum(np.asarray(wave.components[n][i]))) for n in names]
+        parts.append(float(np.sum(np.asarray(wave.reflectance[i]))))
+        parts.append(float(np.sqrt(np.sum(np.asarray(wave.stderr[i]) ** 2))))
+        print(f"{wavelength:5.0f} nm" + "".join(f"{p:14.4f}" for p in parts))
+
+
+def _print_retrieval(fit: Retrieval, asked: Sequence[Sought]) -> None:
+    width = max(len(str(a.unknown.name)) for a in asked)
+    print(f"{'retrieved':{width}}  {'true':>8}  {'start':>8}  {'estimate':>8}  {'std. error':>10}  unit")
+    for a in asked:
+        name = str(a.unknown.name)
+        values = (a.truth, float(a.unknown.start), float(fit.values[name]))
+        row = "  ".join(f"{v:8.4g}" for v in values)
+        print(f"{name:{width}}  {row}  {float(fit.stderr[name]):10.2g}  {a.unit}".rstrip())
+    print(f"reduced chi-squared {float(fit.reduced_chi2):.2f}; {fit.status}")
+
+
+def _brief(step: Any) -> str:
+    return str(step).split(";")[0]
+
+
+class _Say:
+    """Lines of progress, or none."""
+
+    def __init__(self, stream: Any):
+        self.stream = stream
+
+    def __call__(self, line: str) -> None:
+        if self.stream is not None:
+            print(line, file=self.stream, flush=True)

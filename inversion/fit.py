@@ -1,0 +1,243 @@
+"""Nonlinear least squares on a simulation that is random.
+
+The residuals are whitened, (simulated - observed) / sigma, with the measurement's noise and that of the
+simulation in sigma; a prior adds one residual per value. With fixed random numbers the simulation is smooth
+but for small jumps, and its derivatives are unbiased estimates of its expectation's. Near the minimum the two
+disagree by a fraction of a standard error and no step improves the fit: there it ends.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array
+
+from .data import Data
+from .model import Evaluation, Model, spread_of
+from .result import Retrieval, Step
+from .uncertainty import correlation_of, decrement, errors_of
+from .unknowns import Settled, inside, outside
+
+# A fit has converged when a Gauss-Newton step would move it by less than this many standard errors,
+_SMALL_STEP = 0.02
+# or by less than these after so many steps that did not improve it.
+_STALLED = ((1, 0.1), (3, 0.3), (8, 1.0))
+# Free numbers change by no more in one step: far out, where the bijection is flat, a fit would be stuck.
+_LONGEST_STEP = 2.0
+# At the solution the weights are renewed if the start's were wrong by more than this, in the mean.
+_WRONG_WEIGHTS = 0.05
+# Within this share of its width from a bound, an unknown is said to lie at it.
+_AT_BOUND = 1e-3
+
+
+def _linear(y: Array, args: tuple[Array, Array, Array]) -> tuple[Array, None]:
+    """Residuals computed at `at`, with their Jacobian there: all that a Gauss-Newton step looks at."""
+    at, residual, jacobian = args
+    return residual + jacobian @ (y - at), None
+
+
+@eqx.filter_jit
+def _begin(solver: Any, y: Array, args: Any) -> Any:
+    struct = eqx.filter_eval_shape(lambda: _linear(y, args)[0])
+    return solver.init(_linear, y, args, {}, struct, None, frozenset())
+
+
+@eqx.filter_jit
+def _advance(solver: Any, y: Array, args: Any, state: Any) -> Any:
+    y, state, _ = solver.step(_linear, y, args, {}, state, frozenset())
+    done, result = solver.terminate(_linear, y, args, {}, state, frozenset())
+    return y, state, done, result == optx.RESULTS.successful
+
+
+class Point:
+    """One simulation: where, what came out, and that as residuals and their Jacobian in natural units."""
+
+    def __init__(self, fit: "Fit", z: np.ndarray, evaluation: Evaluation):
+        self.z, self.evaluation = z, evaluation
+        self.values, self.slope = inside(z, fit.low, fit.high)
+        self.scale = self.values[-1] if fit.scaled else 1.0
+        simulated, jacobian = self.scale * evaluation.total, self.scale * evaluation.jacobian
+        if fit.scaled:
+            jacobian = np.concatenate([jacobian, evaluation.total[..., None]], axis=-1)
+        self.difference = (simulated - fit.data.observed)[fit.data.used]
+        self.jacobian = jacobian[fit.data.used]
+        self.finite = bool(np.all(np.isfinite(self.difference)) and np.all(np.isfinite(self.jacobian)))
+
+
+class Fit:
+    """A fit under way. Vectors are the flattened unknowns, in natural units unless named z."""
+
+    def __init__(
+        self,
+        model: Model,
+        data: Data,
+        settled: list[Settled],
+        scaled: bool,
+        solver: Any,
+        max_steps: int,
+        progress: Callable[[Step], None] | None,
+    ):
+        self.model, self.data, self.settled, self.scaled = model, data, settled, scaled
+        self.solver, self.max_steps, self.progress = solver, max_steps, progress
+        flat = lambda pick: np.concatenate([np.ravel(pick(s)) for s in settled])  # noqa: E731
+        self.low, self.high = flat(lambda s: s.low), flat(lambda s: s.high)
+        self.start = flat(lambda s: np.asarray(s.start, float))
+        self.mean = flat(lambda s: np.zeros_like(s.low) if s.prior is None else s.prior[0])
+        std = flat(lambda s: np.full_like(s.low, np.inf) if s.prior is None else s.prior[1])
+        self.weight = 1.0 / std
+        self.sigma = data.sigma[data.used]
+        self.count, self.history = 0, []
+
+    # -- simulation ------------------------------------------------------------------------------------
+
+    def at(self, z: np.ndarray, *, spread: bool = False) -> Point:
+        values = inside(z, self.low, self.high)[0]
+        return Point(self, z, self.model(values[:-1] if self.scaled else values, spread=spread))
+
+    def residuals(self, p: Point) -> tuple[np.ndarray, np.ndarray]:
+        """Whitened, with the priors' behind them, and their Jacobian in z."""
+        jacobian = np.concatenate([p.jacobian / self.sigma[:, None], np.diag(self.weight)]) * p.slope
+        return np.concatenate([p.difference / self.sigma, (p.values - self.mean) * self.weight]), jacobian
+
+    def reweigh(self, p: Point) -> float:
+        """Take the simulation's noise at `p` into the weights; returns their mean relative change."""
+        noise = np.broadcast_to(spread_of(p.evaluation.batches), self.data.sigma.shape)[self.data.used]
+        sigma = np.hypot(self.data.sigma[self.data.used], p.scale * noise)
+        change = float(np.mean(np.abs(sigma / self.sigma - 1.0)))
+        self.sigma = sigma
+        return change
+
+    def first(self) -> Point:
+        z = outside(self.start, self.low, self.high)
+        p = self.at(z, spread=True)
+        if self.scaled and p.finite:
+            model, observed = p.evaluation.total[self.data.used], self.data.observed[self.data.used]
+            weight = self.data.sigma[self.data.used] ** -2
+            best = np.sum(weight * model * observed) / max(np.sum(weight * model * model), 1e-30)
+            margin = 0.01 * (self.high[-1] - self.low[-1])
+            best = np.clip(best, self.low[-1] + margin, self.high[-1] - margin)
+            z = np.append(z[:-1], outside(best, self.low[-1], self.high[-1]))
+            p = Point(self, z, p.evaluation)
+        return p
+
+    # -- iteration -------------------------------------------------------------------------------------
+
+    def run(self) -> Retrieval:
+        best = self.first()
+        self.count = 1
+        if not best.finite:
+            return self.result(
+                best, False, "failed: at the starting values the simulated waveform is not finite"
+            )
+        self.reweigh(best)
+        best, converged, status = self.descend(best)
+        if converged and best.evaluation.batches is None:
+            best = self.at(best.z, spread=True)
+        if converged and self.reweigh(best) > _WRONG_WEIGHTS and self.count < self.max_steps:
+            best, converged, status = self.descend(best)
+            if best.evaluation.batches is None:
+                best = self.at(best.z, spread=True)
+        return self.result(best, converged, status)
+
+    def descend(self, best: Point) -> tuple[Point, bool, str]:
+        """Steps of the solver until it ends, or no step leads on."""
+        trial, state, y = best, None, jnp.asarray(best.z)
+        remaining, rejected = np.inf, 0
+        while True:
+            r, jacobian = self.residuals(trial)
+            if not trial.finite:
+                # Worse than anything: the solver turns back.
+                r, jacobian = np.full_like(r, 1e8), np.zeros_like(jacobian)
+            args = tuple(jnp.asarray(a, y.dtype) for a in (trial.z, r, jacobian))
+            if state is None:
+                state = _begin(self.solver, y, args)
+            y, state, done, sound = _advance(self.solver, y, args, state)
+            accepted = bool(jnp.all(y == args[0])) and trial.finite
+            if accepted:
+                best, remaining, rejected = trial, decrement(jacobian[:, self.free(trial, r, jacobian)], r), 0
+            else:
+                rejected += 1
+            self.report(trial, accepted)
+            stalled = any(rejected >= n and remaining < limit for n, limit in _STALLED)
+            if bool(done) or remaining < _SMALL_STEP or stalled:
+                return best, True, self.ended("converged")
+            if not bool(sound):
+                return best, False, self.ended("failed: the equations for the next step could not be solved")
+            if self.count >= self.max_steps:
+                return best, False, self.ended("not converged: stopped at max_steps")
+            ahead = jnp.clip(state.y_eval - y, -_LONGEST_STEP, _LONGEST_STEP)
+            state = eqx.tree_at(lambda s: s.y_eval, state, y + ahead)
+            trial = self.at(np.asarray(state.y_eval, float))
+            self.count += 1
+
+    def free(self, p: Point, r: np.ndarray, jacobian: np.ndarray) -> np.ndarray:
+        """Which unknowns are not held by a bound, beyond which the fit would be better."""
+        share, downhill = (p.values - self.low) / (self.high - self.low), -(jacobian.T @ r)
+        return ~((share < _AT_BOUND) & (downhill < 0)) & ~((share > 1 - _AT_BOUND) & (downhill > 0))
+
+    def ended(self, how: str) -> str:
+        return f"{how} after {self.count} simulation{'s' if self.count > 1 else ''}"
+
+    def report(self, p: Point, accepted: bool) -> None:
+        chi2 = float(np.sum((p.difference / self.sigma) ** 2)) / max(self.sigma.size - self.low.size, 1)
+        self.history.append(chi2)
+        if self.progress is not None:
+            self.progress(Step(len(self.history), chi2, accepted, self.named(p.values)))
+
+    # -- result ----------------------------------------------------------------------------------------
+
+    def named(self, flat: np.ndarray) -> dict[str, np.ndarray]:
+        parts = np.split(flat, np.cumsum([s.start.size for s in self.settled])[:-1])
+        return {s.name: part.reshape(s.start.shape) for s, part in zip(self.settled, parts)}
+
+    def result(self, p: Point, converged: bool, status: str) -> Retrieval:
+        n, used, batches = self.low.size, self.data.used, p.evaluation.batches
+        simulation = np.broadcast_to(spread_of(batches), used.shape)
+        deviations = None
+        if batches is not None and p.finite:
+            deviations = (p.scale * (batches - np.mean(batches, axis=0)))[:, used] / self.sigma
+        jacobian = p.jacobian / self.sigma[:, None] if p.finite else np.zeros_like(p.jacobian)
+        measured = (self.data.sigma[used] / self.sigma) ** 2
+        errors = errors_of(jacobian, self.weight**2, self.high - self.low, measured, deviations)
+        labels = [
+            s.name + ("" if s.start.ndim == 0 else str(list(map(int, np.unravel_index(i, s.start.shape)))))
+            for s in self.settled
+            for i in range(s.start.size)
+        ]
+        share = (p.values - self.low) / (self.high - self.low)
+        notes = [
+            ("the data do not determine {} (infinite standard error)", errors.open),
+            ("at the lower bound: {}", share < _AT_BOUND),
+            ("at the upper bound: {}", share > 1 - _AT_BOUND),
+        ]
+        for text, which in notes:
+            if np.any(which):
+                status += "; " + text.format(", ".join(m for m, w in zip(labels, which) if w))
+        residuals = np.zeros(used.shape)
+        residuals[used] = -p.difference / self.sigma
+        freedom = max(self.sigma.size - n + int(np.sum(errors.open)), 1)
+        chi2 = np.sum(residuals**2) / freedom
+
+        def by_name(flat: np.ndarray) -> dict[str, Array]:
+            return {k: jnp.asarray(v) for k, v in self.named(flat).items()}
+
+        flat = p.values[:-1] if self.scaled else p.values
+        return Retrieval(
+            values=by_name(p.values),
+            stderr=by_name(np.sqrt(np.diag(errors.covariance))),
+            simulation_error=by_name(errors.simulation),
+            covariance=jnp.asarray(errors.covariance),
+            correlation=jnp.asarray(correlation_of(errors.covariance)),
+            scene=self.model.scene_at(flat),
+            waveform=self.model.waveform(flat, p.evaluation, np.asarray(simulation)),
+            residuals=jnp.asarray(residuals),
+            reduced_chi2=jnp.asarray(chi2),
+            converged=converged,
+            status=status,
+            steps=self.count,
+            history=tuple(self.history),
+            labels=tuple(labels),
+        )

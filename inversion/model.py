@@ -1,0 +1,185 @@
+"""The simulated waveform and its Jacobian, with each unknown's column got in the cheapest way.
+
+Unknowns on which only the optics depend leave the response as it is: their columns are a small matrix
+product with the traced response. Only geometric unknowns push tangents through the trace, all of them in one
+pass that shares what does not depend on them. Where no unknown is geometric, photons are traced once.
+
+All evaluations use the same random keys, so that the waveform is a smooth function of the unknowns. An
+evaluation averages batches of photons with keys of their own, whose spread is the simulation's own noise.
+"""
+
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.flatten_util
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from jaxlidar import Lidar, Plan, Response, Scene, Waveform
+from jaxlidar import waveform as make_waveform
+from jaxlidar.simulate import MIN_BATCHES, total_all, trace_all
+
+from .unknowns import Place, Settled, put
+
+Values = tuple[Array, ...]
+
+
+@eqx.filter_jit
+def _batch(
+    lidar: Lidar, scene: Scene, plan: Plan, places: tuple[Place, ...], values: Values, key: PRNGKeyArray
+) -> tuple[Any, Float[Array, "wavelengths bins"], Float[Array, "columns wavelengths bins"]]:
+    """Response and total of one batch, and the total's derivatives in the geometric unknowns."""
+    moving = tuple(i for i, p in enumerate(places) if p.geometric)
+    flat, restore = jax.flatten_util.ravel_pytree([values[i] for i in moving])
+
+    def total(flat):
+        moved = dict(zip(moving, restore(flat)))
+        here = put(scene, places, tuple(moved.get(i, v) for i, v in enumerate(values)))
+        response = trace_all(lidar, here, plan, key)
+        return total_all(response, lidar, here, plan), response
+
+    if not moving:
+        value, response = total(flat)
+        return response, value, jnp.zeros((0, *value.shape), value.dtype)
+    # The response without its tangents is the same for all directions, hence not batched.
+    push = jax.vmap(lambda t: jax.jvp(total, (flat,), (t,), has_aux=True), out_axes=(None, 0, None))
+    value, columns, response = push(jnp.eye(flat.size, dtype=flat.dtype))
+    return response, value, columns
+
+
+@eqx.filter_jit
+def _colour(
+    lidar: Lidar, scene: Scene, plan: Plan, places: tuple[Place, ...], values: Values, response: Any
+) -> tuple[Float[Array, "wavelengths bins"], Float[Array, "columns wavelengths bins"]]:
+    """Total of a response, and its derivatives in the optical unknowns."""
+    optical = tuple(i for i, p in enumerate(places) if not p.geometric)
+    flat, restore = jax.flatten_util.ravel_pytree([values[i] for i in optical])
+
+    def total(flat):
+        moved = dict(zip(optical, restore(flat)))
+        here = put(scene, places, tuple(moved.get(i, v) for i, v in enumerate(values)))
+        return total_all(response, lidar, here, plan)
+
+    if not optical:
+        value = total(flat)
+        return value, jnp.zeros((0, *value.shape), value.dtype)
+    push = jax.vmap(lambda t: jax.jvp(total, (flat,), (t,)), out_axes=(None, 0))
+    return push(jnp.eye(flat.size, dtype=flat.dtype))
+
+
+@eqx.filter_jit
+def _recorded(lidar, scene, plan, places, values, response, stderr) -> Waveform:
+    return make_waveform(response, lidar, put(scene, places, values), plan, stderr=stderr)
+
+
+@jax.jit
+def _mean(responses: list[Any]) -> Any:
+    return jax.tree.map(lambda *a: sum(a) / len(a), *responses)
+
+
+class Evaluation(NamedTuple):
+    """The simulated waveform at some values.
+
+    - `total`: (wavelengths, bins) apparent reflectance, the mean of the batches.
+    - `jacobian`: (wavelengths, bins, columns), columns in the order of the flattened unknowns.
+    - `response`: mean of the batches' responses.
+    - `batches`: (batches, wavelengths, bins) the total of each, or None where it was not asked for.
+    """
+
+    total: np.ndarray
+    jacobian: np.ndarray
+    response: Response | list[Response]
+    batches: np.ndarray | None
+
+
+class Model:
+    """The simulated waveform as a function of the unknowns. Traces as seldom as it can."""
+
+    def __init__(self, lidar: Lidar, scene: Scene, plan: Plan, settled: Sequence[Settled], key: PRNGKeyArray):
+        self.lidar, self.scene, self.plan = lidar, scene, plan
+        self.places = tuple(s.place for s in settled)
+        self.shapes = [s.start.shape for s in settled]
+        self.dtypes = [s.start.dtype for s in settled]
+        self.sizes = [s.start.size for s in settled]
+        self.keys = [jax.random.fold_in(key, n) for n in range(MIN_BATCHES if plan.is_random else 1)]
+        self.traces = any(p.geometric for p in self.places)
+        self._kept: tuple[Any, list[Any]] | None = None
+        owner = np.repeat(np.arange(len(self.sizes)), self.sizes)
+        geometric = np.array([p.geometric for p in self.places], bool)[owner]
+        self._order = np.argsort(np.concatenate([np.flatnonzero(geometric), np.flatnonzero(~geometric)]))
+
+    def values(self, flat: Float[np.ndarray, " columns"]) -> Values:
+        """The unknowns' values out of one vector."""
+        parts = np.split(np.asarray(flat), np.cumsum(self.sizes)[:-1])
+        return tuple(jnp.asarray(p.reshape(s), d) for p, s, d in zip(parts, self.shapes, self.dtypes))
+
+    def scene_at(self, flat: Float[np.ndarray, " columns"]) -> Scene:
+        """The scene with these values."""
+        return put(self.scene, self.places, self.values(flat))
+
+    def __call__(self, flat: Float[np.ndarray, " columns"], *, spread: bool = False) -> Evaluation:
+        """Simulate. `spread`: give the batches one by one as well."""
+        values = self.values(flat)
+        common = (self.lidar, self.scene, self.plan, self.places, values)
+        batches, columns = None, None
+        if self.traces or self._kept is None:
+            traced = self._trace(values)
+            responses = [t[0] for t in traced]
+            response = _mean(responses)
+            batches = np.stack([np.asarray(t[1], float) for t in traced])
+            columns = np.mean([np.asarray(t[2], float) for t in traced], axis=0)
+            if not self.traces:
+                self._kept = response, responses
+        else:
+            response, responses = self._kept
+            if spread:
+                batches = np.stack([np.asarray(_colour(*common, r)[0], float) for r in responses])
+        total, more = _colour(*common, response)
+        more = np.asarray(more, float)
+        columns = np.concatenate([more[:0] if columns is None else columns, more])[self._order]
+        return Evaluation(np.asarray(total, float), np.moveaxis(columns, 0, -1), response, batches)
+
+    def _trace(self, values: Values) -> list[Any]:
+        # JAX keeps its precision by thread.
+        double = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
+
+        def one(key):
+            with jax.enable_x64(double):
+                out = _batch(self.lidar, self.scene, self.plan, self.places, values, key)
+                return jax.block_until_ready(out)
+
+        # The first alone: it may compile. One batch runs on one core, so several threads use them all.
+        first = one(self.keys[0])
+        if len(self.keys) == 1:
+            return [first]
+        with ThreadPoolExecutor(max_workers=max(os.cpu_count() or 1, 1)) as pool:
+            return [first, *pool.map(one, self.keys[1:])]
+
+    def waveform(
+        self, flat: Float[np.ndarray, " columns"], evaluation: Evaluation, stderr: np.ndarray
+    ) -> Waveform:
+        """The evaluation as a waveform."""
+        return _recorded(
+            self.lidar,
+            self.scene,
+            self.plan,
+            self.places,
+            self.values(flat),
+            evaluation.response,
+            jnp.asarray(stderr, self.dtypes[0]),
+        )
+
+
+def spread_of(batches: np.ndarray | None) -> np.ndarray | float:
+    """Standard error of the mean of batches, smoothed over five bins; zero where there is one batch."""
+    if batches is None or len(batches) < 2:
+        return 0.0
+    variance = np.var(batches, axis=0, ddof=1) / len(batches)
+    padded = np.pad(variance, ((0, 0), (2, 2)), mode="edge")
+    smooth = np.mean([padded[:, i : i + variance.shape[1]] for i in range(5)], axis=0)
+    return np.sqrt(smooth)

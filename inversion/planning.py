@@ -1,0 +1,99 @@
+"""A plan that holds for every scene within the bounds of the geometric unknowns."""
+
+import dataclasses
+import itertools
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxlidar import Lidar, Plan, Scene
+from jaxlidar import plan as make_plan
+from jaxlidar.extent import Extent
+
+from .unknowns import Settled, put
+
+# Beyond this many geometric unknowns not every corner of the bounds is looked at.
+_ALL_CORNERS = 4
+
+
+def corners(scene: Scene, settled: list[Settled]) -> list[Scene]:
+    """The scene at its start, and with the geometric unknowns at their bounds.
+
+    All combinations of up to four; of more, each alone and all together. An array is at its low or high
+    bounds as a whole.
+    """
+    moving = [i for i, s in enumerate(settled) if s.place.geometric]
+    if len(moving) <= _ALL_CORNERS:
+        sides = [dict(zip(moving, c)) for c in itertools.product("lh", repeat=len(moving))] if moving else []
+    else:
+        sides = [{i: c} for i in moving for c in "lh"] + [dict.fromkeys(moving, c) for c in "lh"]
+    scenes = []
+    for side in [{}, *sides]:
+        values = [
+            s.start if i not in side else jnp.asarray(s.low if side[i] == "l" else s.high, s.start.dtype)
+            for i, s in enumerate(settled)
+        ]
+        scenes.append(put(scene, tuple(s.place for s in settled), tuple(values)))
+    return scenes
+
+
+def plan_for(
+    lidar: Lidar,
+    scene: Scene,
+    settled: list[Settled],
+    time: Float[np.ndarray, " bins"],
+    *,
+    max_orders: int | None,
+    photons: int,
+    rays: int,
+) -> Plan:
+    """The starting scene's plan, with its loops and time bins long enough for all of `corners`.
+
+    Letters, orders and step lengths are the starting scene's. **Raises:** ValueError where a corner is
+    inadmissible, such as a canopy that reaches above the sensor.
+    """
+    interval = float(lidar.sampling_interval)
+    window = (float(time[0]), float(time[0]) + (time.size - 1 + 1e-3) * interval)
+    scenes = corners(scene, settled)
+    common = {"window": window, "n_photons": photons, "n_rays": rays}
+    first = make_plan(lidar, scenes[0], max_orders=max_orders, **common)
+    common.update(max_orders=first.orders, bin_width=first.bins.width)
+    if scene.canopy is not None:
+        common.update(max_step=first.layout.max_step)
+    plans = [first]
+    for corner in scenes[1:]:
+        try:
+            plans.append(make_plan(lidar, corner, **common))
+        except ValueError as error:
+            raise ValueError(f"at the bounds of the unknowns the scene is inadmissible: {error}") from error
+    start = min(p.bins.start for p in plans)
+    end = max(p.bins.start + p.bins.width * p.bins.count for p in plans)
+    bins = dataclasses.replace(
+        first.bins,
+        start=start,
+        count=round((end - start) / first.bins.width),
+        row=max(p.bins.row for p in plans),
+    )
+    upstream = max(p.layout.upstream for p in plans)
+    longest = max(p.layout.max_path - p.layout.upstream for p in plans) + upstream
+    layout = first.layout._replace(
+        upstream=upstream,
+        max_path=longest,
+        first_steps=max(p.layout.first_steps for p in plans),
+        march_steps=max(Extent(lidar, s).march_steps(longest + upstream) for s in scenes),
+        full_cover=tuple(all(c) for c in zip(*(p.layout.full_cover for p in plans))),
+    )
+    return dataclasses.replace(first, layout=layout, bins=bins)
+
+
+def check_samples(plan: Plan, time: Float[np.ndarray, " bins"]) -> None:
+    """Refuse a plan whose samples are not at `time`."""
+    slack = 1e-3 * plan.sample_interval + 4e-7 * float(np.max(np.abs(time)))
+    expected = plan.sample_start + plan.sample_interval * np.arange(plan.n_samples)
+    if time.size != plan.n_samples or np.max(np.abs(expected - time)) > slack:
+        raise ValueError(
+            f"time has {time.size} samples from {time[0]:g} to {time[-1]:g} ns, but the plan has "
+            f"{plan.n_samples} every {plan.sample_interval:g} ns from {plan.sample_start:g} ns; "
+            "they must agree"
+        )

@@ -1,0 +1,73 @@
+"""What a retrieval returns."""
+
+import dataclasses
+from typing import final
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxlidar import Scene, Waveform
+
+
+@dataclasses.dataclass(frozen=True)
+class Step:
+    """One step of a fit: its number, reduced chi-squared and the values tried, and whether they were kept."""
+
+    number: int
+    reduced_chi2: float
+    accepted: bool
+    values: dict[str, np.ndarray]
+
+    def __str__(self) -> str:
+        values = ", ".join(f"{name} = {_short(value)}" for name, value in self.values.items())
+        kept = "" if self.accepted else " (not kept)"
+        return f"step {self.number}: chi2 = {self.reduced_chi2:.4g}{kept}; {values}"
+
+
+@final
+class Retrieval(eqx.Module):
+    """A fitted scene.
+
+    Unknowns are in their natural units, keyed by name. The rows of `covariance` and `correlation` are the
+    flattened unknowns in the order given, named by `labels`.
+
+    - `values`: best values. - `stderr`: one standard error each, of the same shapes; infinite where the data
+      do not determine the unknown.
+    - `simulation_error`: the part of `stderr` that comes from the simulation's own noise: it falls with
+      `n_photons`.
+    - `covariance`, `correlation`: (n, n). An unknown of infinite variance has no covariance with others.
+    - `scene`, `waveform`: as fitted; `waveform.stderr` is the simulation's. The fitted scale is not in it.
+    - `residuals`: (wavelengths, bins) observed minus fitted over its standard deviation; zero where the
+      sample was left out.
+    - `reduced_chi2`: sum of squared residuals over the number of samples less that of determined unknowns.
+    - `converged`: whether the fit ended at a minimum. - `status`: how it ended, in a sentence.
+    - `steps`: waveforms simulated, each with its Jacobian. - `history`: reduced chi-squared of every step.
+    """
+
+    values: dict[str, Float[Array, "..."]]
+    stderr: dict[str, Float[Array, "..."]]
+    simulation_error: dict[str, Float[Array, "..."]]
+    covariance: Float[Array, "n n"]
+    correlation: Float[Array, "n n"]
+    scene: Scene
+    waveform: Waveform
+    residuals: Float[Array, "wavelengths bins"]
+    reduced_chi2: Float[Array, ""]
+    converged: bool = eqx.field(static=True)
+    status: str = eqx.field(static=True)
+    steps: int = eqx.field(static=True)
+    history: tuple[float, ...] = eqx.field(static=True)
+    labels: tuple[str, ...] = eqx.field(static=True)
+
+    def __str__(self) -> str:
+        width = max(map(len, self.values))
+        rows = [
+            f"{name.ljust(width)}  {_short(np.asarray(value))} +- {_short(np.asarray(self.stderr[name]))}"
+            for name, value in self.values.items()
+        ]
+        return "\n".join([*rows, f"reduced chi2 {float(self.reduced_chi2):.3g}; {self.status}"])
+
+
+def _short(value: np.ndarray) -> str:
+    return np.array2string(np.asarray(value), precision=4, threshold=8, edgeitems=3)

@@ -1,0 +1,134 @@
+"""Fits of scenes to waveforms: the one entry."""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import ArrayLike, PRNGKeyArray
+
+from jaxlidar import Lidar, Plan, Scene, Waveform
+from jaxlidar._checks import check_range
+from jaxlidar.simulate import MIN_BATCHES
+
+from .data import data_of
+from .fit import Fit
+from .model import Model
+from .planning import check_samples, plan_for
+from .result import Retrieval, Step
+from .unknowns import Place, Settled, Unknown, settle
+
+_SOLVER = optx.LevenbergMarquardt(rtol=1e-3, atol=1e-3)
+
+
+def retrieve(
+    observed: Waveform | ArrayLike | Sequence,
+    lidar: Lidar,
+    scene: Scene,
+    unknowns: Sequence[Unknown],
+    *,
+    noise: ArrayLike | Sequence,
+    key: PRNGKeyArray,
+    time: ArrayLike | Sequence | None = None,
+    plan: Plan | None = None,
+    n_photons: float = 65536,
+    n_rays: float = 8192,
+    max_orders: int | None = None,
+    solver: optx.AbstractLeastSquaresSolver = _SOLVER,
+    max_steps: float = 50,
+    scale: tuple[float, float] | None = None,
+    noise_floor: float = 1e-3,
+    progress: Callable[[Step], None] | None = None,
+    throw: bool = False,
+) -> Retrieval:
+    """Find the unknowns of a scene from its waveform, with their standard errors.
+
+    Least squares finds the nearest minimum: a height must start within about a pulse length of the truth,
+    else the fit may end in another echo.
+
+    Every simulation of a fit uses the same random numbers, which makes it a smooth function of the unknowns.
+    The noise that it has nevertheless is estimated from its batches, weighs down the samples that it affects
+    and is part of the standard errors; `Retrieval.simulation_error` says how large a part, and more photons
+    lower it. Unknowns on which only optics depend (leaf traits, reflectances, the atmosphere) cost
+    next to nothing, and if all are such, photons are traced once. Fits with equal shapes, plans and unknowns
+    compile once.
+
+    **Arguments:**
+
+    - `observed`: a `Waveform`, of which `reflectance` is fitted, or an array (wavelengths, bins) of apparent
+      reflectance with `time`, or in any other unit with `scale`.
+    - `lidar`, `scene`: the instrument, and the scene at the starting values.
+    - `unknowns`: what to find. Every scene within the bounds must be admissible: a reflectance plus
+      transmittance above one, say, is not noticed.
+    - `noise`: one standard deviation of `observed`, anything that broadcasts to it; samples are taken as
+      independent. Infinity leaves a sample out.
+    - `key`: a JAX random key; another than that of a simulated `observed`.
+    - `time`: (bins,) ns, with an array. Times must lie the lidar's sampling interval apart.
+    - `plan`: what to simulate (`jaxlidar.plan`, its window as `observed`, valid throughout the bounds), with
+      the photons and rays of one of eight batches. Default: planned for the start and the bounds' corners.
+    - `n_photons`, `n_rays`: photons, and rays of the footprint, of one simulation, in eight batches together.
+    - `max_orders`: scatterings followed. Default: by the albedos of the starting scene.
+    - `solver`: any Gauss-Newton method of optimistix. Default: Levenberg-Marquardt. A fit ends as well where
+      a Gauss-Newton step would be below 0.02 standard errors, or is small and improves nothing.
+    - `max_steps`: most simulations, each with its Jacobian. Default 50.
+    - `scale`: bounds of a further unknown, "scale", which multiplies the simulated reflectance, the same for
+      all wavelengths (an uncalibrated receiver); it starts where it fits best. Default: none.
+    - `noise_floor`: share of each wavelength's largest observed value that replaces any smaller `noise`:
+      standard errors of a simulation are zero where no photon came. Default 1e-3.
+    - `progress`: called with a `Step` after every step; for instance `print`.
+    - `throw`: raise RuntimeError where the fit does not converge. Default: `status` says so.
+
+    **Raises:** ValueError for inadmissible arguments, among them a start outside its bounds, samples that do
+    not fit the lidar or the plan, and noise that is negative or NaN.
+    """
+    if len(unknowns) == 0:
+        raise ValueError("unknowns is empty; admissible is one unknown or more")
+    if not isinstance(solver, optx.AbstractGaussNewton):
+        raise ValueError(f"solver = {solver!r} is no Gauss-Newton method of optimistix")
+    for name, value, low in (
+        ("max_steps", max_steps, 1),
+        ("n_photons", n_photons, MIN_BATCHES),
+        ("n_rays", n_rays, MIN_BATCHES),
+    ):
+        if value != int(value) or value < low:
+            raise ValueError(f"{name} = {value} is outside the admissible range [{low}, inf) of integers")
+    # Samples lie at the given times, whatever opened the window.
+    lidar = dataclasses.replace(lidar, receiver=dataclasses.replace(lidar.receiver, window="fixed"))
+    data = data_of(observed, time, noise, noise_floor, lidar)
+    settled = settle(unknowns, scene)
+    if plan is None:
+        plan = plan_for(
+            lidar,
+            scene,
+            settled,
+            data.time,
+            max_orders=max_orders,
+            photons=int(n_photons) // MIN_BATCHES,
+            rays=int(n_rays) // MIN_BATCHES,
+        )
+    check_samples(plan, data.time)
+    # The table of effects is for readers; without it, plans that do the same are equal.
+    model = Model(lidar, scene, dataclasses.replace(plan, effects=()), settled, key)
+    if scale is not None:
+        settled = [*settled, _scale(scale, settled)]
+    result = Fit(model, data, settled, scale is not None, solver, int(max_steps), progress).run()
+    if throw and not result.converged:
+        raise RuntimeError(result.status)
+    return result
+
+
+def _scale(bounds: Any, settled: list[Settled]) -> Settled:
+    try:
+        low, high = (float(b) for b in bounds)
+    except (TypeError, ValueError):
+        raise ValueError(f"scale = {bounds!r} is not a pair (low, high)") from None
+    check_range("scale", [low, high], 0.0)
+    if not low < high:
+        raise ValueError(f"scale = {bounds!r} is not low < high")
+    if any(s.name == "scale" for s in settled):
+        raise ValueError("name = 'scale' is taken by the scale; the unknown needs another one")
+    # Its start waits for the first simulation.
+    start = jnp.asarray(0.5 * (low + high))
+    return Settled("scale", Place(None, None, False), start, np.asarray(low), np.asarray(high), None)

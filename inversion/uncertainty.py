@@ -1,0 +1,93 @@
+r"""Standard errors of a fit, and which unknowns the data leave open.
+
+With whitened Jacobian J and prior precision P, H = J^T J + P, the covariance of the fitted values is
+
+    H^-1 (J^T W J + P) H^-1  +  covariance of (H^-1 J^T d) / batches,
+
+W the share of the weights' variance that is measurement noise and d the deviations of the simulation's
+batches: the second term is the simulation's own noise, with all correlation between its bins and wavelengths.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+# Smallest eigenvalue of the correlation form of H at which a combination counts as determined.
+_COLLINEAR = 1e-6
+
+
+class Errors(NamedTuple):
+    """Covariance in natural units, the part of its diagonal that is the simulation's, and what is left open.
+
+    Open unknowns have an infinite variance and no covariance with others, which are as if these were free.
+    """
+
+    covariance: Float[np.ndarray, "n n"]
+    simulation: Float[np.ndarray, " n"]
+    open: np.ndarray
+
+
+def errors_of(
+    jacobian: Float[np.ndarray, "data n"],
+    precision: Float[np.ndarray, " n"],
+    width: Float[np.ndarray, " n"],
+    measured: Float[np.ndarray, " data"],
+    deviations: Float[np.ndarray, "batches data"] | None,
+) -> Errors:
+    """Covariance at the solution.
+
+    An unknown is open if its standard error exceeds the width of its bounds, alone or together with others.
+
+    **Arguments:**
+
+    - `jacobian`: whitened, in natural units. - `precision`: of the prior, 0 where there is none.
+    - `width`: of the bounds. - `measured`: measurement variance over the variance used for whitening.
+    - `deviations`: of each batch from their mean, whitened.
+    """
+    n = width.size
+    information = jacobian.T @ jacobian + np.diag(precision)
+    scaled = information * np.outer(width, width)
+    opened = np.diag(scaled) < 1.0
+    keep = np.flatnonzero(~opened)
+    norm = np.sqrt(np.diag(information)[keep])
+    value, vector = np.linalg.eigh(information[np.ix_(keep, keep)] / np.outer(norm, norm))
+    known = value > _COLLINEAR
+    opened[keep] |= np.any(vector[:, ~known] ** 2 > 1e-3, axis=1)
+    inverse = np.zeros((n, n))
+    inverse[np.ix_(keep, keep)] = (
+        (vector[:, known] / value[known]) @ vector[:, known].T / np.outer(norm, norm)
+    )
+    middle = (jacobian.T * measured) @ jacobian + np.diag(precision)
+    covariance = inverse @ middle @ inverse
+    simulation = np.zeros((n, n))
+    if deviations is not None and len(deviations) > 1:
+        moved = deviations @ jacobian @ inverse
+        simulation = moved.T @ moved / (len(moved) * (len(moved) - 1))
+    covariance = covariance + simulation
+    opened |= np.diag(covariance) > width**2
+    covariance[opened, :] = 0.0
+    covariance[:, opened] = 0.0
+    covariance[opened, opened] = np.inf
+    return Errors(covariance, np.where(opened, 0.0, np.sqrt(np.diag(simulation))), opened)
+
+
+def correlation_of(covariance: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+    """Correlation matrix; unknowns of infinite or no variance are correlated with none."""
+    std = np.sqrt(np.diag(covariance))
+    fine = np.isfinite(std) & (std > 0)
+    safe = np.where(fine, std, 1.0)
+    correlation = np.where(np.outer(fine, fine), np.where(np.isfinite(covariance), covariance, 0.0), 0.0)
+    correlation = correlation / np.outer(safe, safe)
+    np.fill_diagonal(correlation, 1.0)
+    return correlation
+
+
+def decrement(jacobian: Float[np.ndarray, "data n"], residual: Float[np.ndarray, " data"]) -> float:
+    """How far a Gauss-Newton step would go, in standard errors: the root of the fall in chi-squared."""
+    norm = np.linalg.norm(jacobian, axis=0)
+    seen = norm > 0
+    if not np.any(seen):
+        return 0.0
+    basis, value, _ = np.linalg.svd(jacobian[:, seen] / norm[seen], full_matrices=False)
+    return float(np.linalg.norm(basis[:, value > 1e-3].T @ residual))

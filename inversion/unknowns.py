@@ -1,0 +1,261 @@
+"""What is to be found: values in a scene, their bounds, and how a value is put into the scene.
+
+A bounded value is carried by a smooth bijection, value = low + (high - low) / (1 + exp(-z)), with z free: a
+solver in z can neither leave the bounds nor stop dead at them.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from jaxlidar import Scene
+from jaxlidar._checks import as_array, check_range
+
+# Starting values keep this share of the interval's width away from its ends.
+MARGIN = 0.01
+
+
+def _as_pair(x: Any) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    try:
+        low, high = x
+    except (TypeError, ValueError):
+        raise ValueError(f"bounds = {x!r} is not a pair (low, high)") from None
+    return as_array(low), as_array(high)
+
+
+def _optional_pair(x: Any) -> tuple[Float[Array, "..."], Float[Array, "..."]] | None:
+    if x is None:
+        return None
+    try:
+        mean, std = x
+    except (TypeError, ValueError):
+        raise ValueError(f"prior = {x!r} is not a pair (mean, standard deviation)") from None
+    return as_array(mean), as_array(std)
+
+
+def _optional_array(x: ArrayLike | None) -> Float[Array, "..."] | None:
+    return None if x is None else as_array(x)
+
+
+@final
+class Unknown(eqx.Module):
+    """A value to be retrieved: an array of the scene, or anything that a function puts into the scene.
+
+        Unknown(lambda s: s.canopy.leaf.Cab, bounds=(5.0, 100.0), name="Cab")
+        Unknown(name="leaf area scale", bounds=(0.1, 10.0), start=1.0, apply=lambda s, value: eqx.tree_at(
+            lambda s: s.canopy.voxels.leaf, s, replace_fn=lambda leaf: value * leaf))
+
+    **Arguments:**
+
+    - `where`: picks one array of the scene, of any shape, as for `equinox.tree_at`; its value in the scene is
+      the starting value. An element of an array, or a property, is not such an array: use `apply`.
+    - `bounds`: (low, high) in the unknown's own unit, numbers or arrays that broadcast to the value.
+    - `name`: key of the result. Default: the path to `where`, such as "canopy.leaf.Cab".
+    - `prior`: (mean, standard deviation) of a normal prior, numbers or arrays. Default None: no prior.
+    - `start`: starting value instead of the scene's; needed with `apply`.
+    - `apply`: `apply(scene, value) -> scene` instead of `where`, differentiable, of the same tree structure;
+      for values that move several arrays at once. Unknowns are put in in the order in which they are listed.
+      Define it once, outside of loops: with every new function the simulation is compiled again.
+
+    A start within 1 % of the bounds' width of a bound, or on it, is moved to that distance.
+
+    **Raises:** ValueError for bounds that are not finite and increasing, a standard deviation that is not
+    positive, and unless exactly one of `where` and `apply` is given. `retrieve` raises it for a start outside
+    the bounds and for a `where` that picks no array.
+    """
+
+    where: Callable[[Any], Any] | None = eqx.field(static=True, default=None)
+    bounds: tuple[Float[Array, "..."], Float[Array, "..."]] = eqx.field(converter=_as_pair, kw_only=True)
+    name: str | None = eqx.field(static=True, default=None, kw_only=True)
+    prior: tuple[Float[Array, "..."], Float[Array, "..."]] | None = eqx.field(
+        converter=_optional_pair, default=None, kw_only=True
+    )
+    start: Float[Array, "..."] | None = eqx.field(converter=_optional_array, default=None, kw_only=True)
+    apply: Callable[[Scene, Array], Scene] | None = eqx.field(static=True, default=None, kw_only=True)
+
+    def __check_init__(self):
+        called = "an unknown" if self.name is None else f"unknown {self.name!r}"
+        if (self.where is None) == (self.apply is None):
+            raise ValueError(f"{called}: give either where = ... or apply = ..., and not both")
+        if self.apply is not None and (self.name is None or self.start is None):
+            raise ValueError(f"{called}: with apply = ..., a name and a start are needed")
+        low, high = self.bounds
+        check_range(f"{called}: bounds", low)
+        check_range(f"{called}: bounds", high)
+        if not np.all(np.asarray(low) < np.asarray(high)):
+            raise ValueError(f"{called}: bounds = ({low}, {high}) are not low < high")
+        if self.prior is not None:
+            check_range(f"{called}: prior mean", self.prior[0])
+            check_range(f"{called}: prior standard deviation", self.prior[1], 0.0, low_open=True)
+
+
+class Place(NamedTuple):
+    """How a value enters the scene: hashable, and equal for equal unknowns.
+
+    - `leaf`: number of the scene's leaf that it replaces, or None where `apply` puts it in.
+    - `geometric`: whether light may go elsewhere when it changes.
+    """
+
+    leaf: int | None
+    apply: Callable[[Scene, Array], Scene] | None
+    geometric: bool
+
+
+class Settled(NamedTuple):
+    """An unknown of a given scene. Arrays have the value's shape, in double precision (`start`: JAX's)."""
+
+    name: str
+    place: Place
+    start: Array
+    low: np.ndarray
+    high: np.ndarray
+    prior: tuple[np.ndarray, np.ndarray] | None
+
+
+def settle(unknowns: Sequence[Unknown], scene: Scene) -> list[Settled]:
+    """Find the unknowns in the scene. **Raises:** ValueError for what cannot be retrieved."""
+    optical = optical_leaves(scene)
+    found = [_settle_one(u, scene, optical) for u in unknowns]
+    names = [f.name for f in found]
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"name = {name!r} is given to {names.count(name)} unknowns; each needs its own")
+    leaves = [f.place.leaf for f in found if f.place.leaf is not None]
+    for f in found:
+        if f.place.leaf is not None and leaves.count(f.place.leaf) > 1:
+            raise ValueError(f"unknown {f.name!r} picks an array of the scene that another one picks as well")
+    return found
+
+
+def _settle_one(u: Unknown, scene: Scene, optical: frozenset[int]) -> Settled:
+    number, name, start = None, u.name, u.start
+    if u.where is None:
+        touched = _touched(u, scene)
+    else:
+        number, path = _find(u.where, scene, u.name)
+        touched = frozenset([number])
+        name = path if name is None else name
+        own = jax.tree.leaves(scene)[number]
+        if not eqx.is_inexact_array(own):
+            raise ValueError(
+                f"unknown {name!r} is {own!r}; admissible is a floating-point array of the scene"
+            )
+        start = own if start is None else _broadcast(name, "start", start, own.shape)
+    assert name is not None
+    assert start is not None
+    low, high = (np.asarray(_broadcast(name, "bounds", b, start.shape), float) for b in u.bounds)
+    value = np.asarray(start, float)
+    bad = ~((value >= low) & (value <= high))
+    if np.any(bad):
+        raise ValueError(
+            f"unknown {name!r} starts from {value[bad].flat[0]:g}, which is outside its bounds "
+            f"[{low[bad].flat[0]:g}, {high[bad].flat[0]:g}]"
+        )
+    margin = MARGIN * (high - low)
+    prior = None
+    if u.prior is not None:
+        mean, std = (np.asarray(_broadcast(name, "prior", p, start.shape), float) for p in u.prior)
+        prior = mean, std
+    return Settled(
+        name,
+        Place(number, u.apply, not touched <= optical),
+        jnp.asarray(np.clip(value, low + margin, high - margin), start.dtype),
+        low,
+        high,
+        prior,
+    )
+
+
+def _broadcast(name: str, field: str, x: Array, shape: tuple[int, ...]) -> Array:
+    try:
+        return jnp.broadcast_to(x, shape)
+    except ValueError:
+        raise ValueError(
+            f"unknown {name!r}: {field} has the shape {x.shape}, which does not broadcast to {shape}"
+        ) from None
+
+
+def _find(where: Callable, scene: Scene, name: str | None) -> tuple[int, str]:
+    """Number and path of the leaf that `where` picks."""
+    paths = [path for path, _ in jax.tree_util.tree_leaves_with_path(scene)]
+    marks = [object() for _ in paths]
+    called = "an unknown" if name is None else f"unknown {name!r}"
+    try:
+        picked = where(jax.tree.unflatten(jax.tree.structure(scene), marks))
+    except (AttributeError, IndexError, KeyError, TypeError) as error:
+        raise ValueError(f"{called}: where picks nothing in this scene ({error}); see `apply`") from error
+    for i, mark in enumerate(marks):
+        if picked is mark:
+            return i, jax.tree_util.keystr(paths[i]).lstrip(".")
+    kind = "nothing (None)" if picked is None else f"a {type(picked).__name__}"
+    raise ValueError(f"{called}: where picks {kind}; admissible is one array of the scene")
+
+
+def _touched(u: Unknown, scene: Scene) -> frozenset[int]:
+    """Numbers of the scene's leaves that `apply` does not pass on as they are."""
+    before, structure = jax.tree.flatten(scene)
+    touched: list[int] = []
+
+    def probe(value):
+        assert u.apply is not None
+        after = u.apply(scene, value)
+        if jax.tree.structure(after) != structure:
+            raise ValueError(
+                f"unknown {u.name!r}: apply returns a scene with other parts, or none; admissible is one "
+                "of the same tree structure"
+            )
+        touched.extend(i for i, (a, b) in enumerate(zip(before, jax.tree.leaves(after))) if a is not b)
+
+    jax.eval_shape(probe, u.start)
+    if not touched:
+        raise ValueError(f"unknown {u.name!r}: apply changes nothing in the scene")
+    return frozenset(touched)
+
+
+def optical_leaves(scene: Scene) -> frozenset[int]:
+    """Numbers of the scene's leaves that act only after the trace: the response does not depend on them."""
+    # Where leaves transmit straight on, their transmittance scales extinction.
+    straight = scene.canopy is not None and scene.canopy.transmission == "straight"
+
+    def acts_later(path: tuple[Any, ...]) -> bool:
+        match [getattr(key, "name", None) for key in path]:
+            case ["canopy", "leaf", *_]:
+                return not straight
+            case ["canopy", "bark", *_] | ["ground", "reflectance", *_] | ["atmosphere", *_]:
+                return True
+            case ["plates", _, "reflectance" | "transmittance", *_]:
+                return True
+        return False
+
+    leaves = jax.tree_util.tree_leaves_with_path(scene)
+    return frozenset(i for i, (path, _) in enumerate(leaves) if acts_later(path))
+
+
+def put(scene: Scene, places: tuple[Place, ...], values: tuple[Array, ...]) -> Scene:
+    """The scene with the values in place, in the order of the unknowns."""
+    for place, value in zip(places, values):
+        if place.apply is not None:
+            scene = place.apply(scene, value)
+        else:
+            assert place.leaf is not None
+            leaves, structure = jax.tree.flatten(scene)
+            leaves[place.leaf] = value
+            scene = jax.tree.unflatten(structure, leaves)
+    return scene
+
+
+def inside(z: np.ndarray, low: ArrayLike, high: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    """Value of a free number, and its derivative."""
+    share = 0.5 * (1.0 + np.tanh(0.5 * z))
+    width = np.subtract(high, low)
+    return low + width * share, width * share * (1.0 - share)
+
+
+def outside(value: ArrayLike, low: ArrayLike, high: ArrayLike) -> np.ndarray:
+    """The free number of a value within its bounds: the inverse of `inside`."""
+    return np.log(np.subtract(value, low)) - np.log(np.subtract(high, value))
