@@ -119,7 +119,7 @@ class Fit:
             best = np.sum(weight * model * observed) / max(np.sum(weight * model * model), 1e-30)
             margin = 0.01 * (self.high[-1] - self.low[-1])
             best = np.clip(best, self.low[-1] + margin, self.high[-1] - margin)
-            z = np.append(z[:-1], outside(best, self.low[-1], self.high[-1]))
+            z = outside(np.append(self.start[:-1], best), self.low, self.high)
             p = Point(self, z, p.evaluation)
         return p
 

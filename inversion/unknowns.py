@@ -249,13 +249,12 @@ def put(scene: Scene, places: tuple[Place, ...], values: tuple[Array, ...]) -> S
     return scene
 
 
-def inside(z: np.ndarray, low: ArrayLike, high: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+def inside(z: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Value of a free number, and its derivative."""
     share = 0.5 * (1.0 + np.tanh(0.5 * z))
-    width = np.subtract(high, low)
-    return low + width * share, width * share * (1.0 - share)
+    return low + (high - low) * share, (high - low) * share * (1.0 - share)
 
 
-def outside(value: ArrayLike, low: ArrayLike, high: ArrayLike) -> np.ndarray:
+def outside(value: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """The free number of a value within its bounds: the inverse of `inside`."""
-    return np.log(np.subtract(value, low)) - np.log(np.subtract(high, value))
+    return np.log(value - low) - np.log(high - value)
