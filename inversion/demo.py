@@ -14,21 +14,21 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jaxlidar.plot
 import numpy as np
-from jaxlidar.cli import CommandError
-from jaxlidar.demo import HEIGHT, LEAF_AREA_INDEX, WAVELENGTHS, demo_lidar, demo_scene
 from jaxtyping import Array, Float
 from matplotlib.figure import Figure
 
 import jaxlidar as jl
+import jaxlidar.plot
+from jaxlidar.cli import CommandError
+from jaxlidar.demo import HEIGHT, LEAF_AREA_INDEX, WAVELENGTHS, demo_lidar, demo_scene
 
 from .result import Retrieval
 from .retrieval import retrieve
 from .unknowns import Unknown, put, settle
 
 # Standard deviation of the added noise: a share of each sample, and a floor relative to the peak.
-NOISE_SHARE, NOISE_FLOOR = 0.02, 0.002
+NOISE_SHARE, NOISE_FLOOR = 0.03, 0.01
 # What is recorded, in ns: from 17 m above the ground to 9 m below, for light that lingers in the crown.
 WINDOW = (-115.0, 60.0)
 # Photons and rays of each simulation of the retrieval.
@@ -46,25 +46,20 @@ class Sought:
 
 
 def _with_leaf_area(scene: jl.Scene, index: Array) -> jl.Scene:
-    return eqx.tree_at(
-        lambda s: s.canopy.voxels.leaf, scene, replace_fn=lambda leaf: leaf * (index / LEAF_AREA_INDEX)
-    )
+    share = index / LEAF_AREA_INDEX
+    return eqx.tree_at(lambda s: s.canopy.voxels.leaf, scene, replace_fn=lambda leaf: leaf * share)
 
 
 def _with_height(scene: jl.Scene, height: Array) -> jl.Scene:
     """Stretched upward from z = 0, with the same leaf and bark area."""
     stretch = height / HEIGHT
-
-    def stretched(voxels: jl.VoxelMap) -> list[Any]:
-        size = voxels.voxel_size.at[2].multiply(stretch)
-        return [voxels.leaf / stretch, voxels.bark / stretch, size]
-
-    fields = lambda v: [v.leaf, v.bark, v.voxel_size]  # noqa: E731
-    return eqx.tree_at(lambda s: fields(s.canopy.voxels), scene, stretched(scene.canopy.voxels))
+    fields = lambda s: [s.canopy.voxels.leaf, s.canopy.voxels.bark, s.canopy.voxels.voxel_size]  # noqa: E731
+    leaf, bark, size = fields(scene)
+    return eqx.tree_at(fields, scene, [leaf / stretch, bark / stretch, size.at[2].multiply(stretch)])
 
 
-def sought(scene: jl.Scene) -> list[Sought]:
-    """What the demo retrieves of `demo_scene`, each from a start that is off."""
+def sought(scene: Any) -> list[Sought]:
+    """What the demo retrieves of the scene `demo_scene()`, each from a start that is off."""
     leaf, ground = scene.canopy.leaf, scene.ground
     return [
         Sought(
@@ -78,7 +73,7 @@ def sought(scene: jl.Scene) -> list[Sought]:
             float(leaf.Cw),
         ),
         Sought(
-            Unknown(lambda s: s.canopy.leaf.N, bounds=(1.0, 3.0), start=2.2, name="leaf structure N"),
+            Unknown(lambda s: s.canopy.leaf.N, bounds=(1.0, 3.0), start=2.0, name="leaf structure N"),
             "",
             float(leaf.N),
         ),
@@ -99,9 +94,7 @@ def sought(scene: jl.Scene) -> list[Sought]:
             "m2/m2",
             LEAF_AREA_INDEX,
         ),
-        Sought(
-            Unknown(name="tree height", bounds=(12.0, 18.0), start=14.2, apply=_with_height), "m", HEIGHT
-        ),
+        Sought(Unknown(name="tree height", bounds=(12.0, 18.0), start=14.2, apply=_with_height), "m", HEIGHT),
     ]
 
 
@@ -142,6 +135,8 @@ def run(out: Path, *, seed: int, rtol: float, voxel_size: float, say: Callable[[
     wave = jl.simulate(
         lidar, scene, key=jax.random.fold_in(key, 0), plan=plan, rtol=rtol, progress=lambda p: say(f"  {p}")
     )
+    if wave.info["stopped"] == "interrupted":
+        raise KeyboardInterrupt
     path = out / "waveform.png"
     save(waveform_figure(wave, lidar, scene), path)
     _print_waveform(wave)
@@ -215,14 +210,17 @@ def retrieval_figure(
         jaxlidar.plot.residuals(
             fit.waveform, np.asarray(observed.reflectance), noise, side, wavelength=wavelength
         )
-        ax.get_legend().remove()
+        legend = ax.get_legend()
+        if legend is not None:
+            legend.remove()
         for a in (ax, side):
             a.set_ylim(-6.0, HEIGHT + 2.0)
             a.set_ylabel("height (m)" if a is axes[0] else "")
             a.set_xlabel("")
         ax.locator_params(axis="x", nbins=3)
-        ax.set_xlabel("apparent\nreflectance")
-        side.set_xlabel("residual\n(std. dev.)")
+        # Below the power of ten.
+        ax.set_xlabel("apparent\nreflectance", labelpad=14)
+        side.set_xlabel("residual\n(std. dev.)", labelpad=14)
     lines, names = axes[0].get_legend_handles_labels()
     figure.legend(lines, names, loc="outside upper center", ncols=3, frameon=False)
     return figure
@@ -255,7 +253,7 @@ def _print_retrieval(fit: Retrieval, asked: Sequence[Sought]) -> None:
     print(f"{'retrieved':{width}}  {'true':>8}  {'start':>8}  {'estimate':>8}  {'std. error':>10}  unit")
     for a in asked:
         name = str(a.unknown.name)
-        values = (a.truth, float(a.unknown.start), float(fit.values[name]))
+        values = (a.truth, float(np.asarray(a.unknown.start)), float(fit.values[name]))
         row = "  ".join(f"{v:8.4g}" for v in values)
         print(f"{name:{width}}  {row}  {float(fit.stderr[name]):10.2g}  {a.unit}".rstrip())
     print(f"reduced chi-squared {float(fit.reduced_chi2):.2f}; {fit.status}")

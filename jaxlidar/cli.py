@@ -27,6 +27,8 @@ def spectra(argv: Sequence[str]) -> int:
     parser = argparse.ArgumentParser(prog="jaxlidar spectra", description=spectra.__doc__)
     parser.add_argument("kind", nargs="?", help="bark, wood, litter, char, soil or built; without it, all")
     options = parser.parse_args(argv)
+    import numpy as np
+
     from .spectra import spectra as listed
     from .spectra import spectrum
 
@@ -34,7 +36,7 @@ def spectra(argv: Sequence[str]) -> int:
         names = listed(options.kind)
     except ValueError as error:
         raise CommandError(str(error)) from error
-    at = (532.0, 1064.0, 1550.0)
+    at = np.array([532.0, 1064.0, 1550.0])
     width = max(map(len, names))
     print(f"{'name':{width}}  {'kind':6}  " + "  ".join(f"{w:4.0f} nm" for w in at))
     for name, kind in names.items():

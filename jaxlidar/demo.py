@@ -57,8 +57,8 @@ def demo_scene(voxel_size: float = 0.25, *, seed: int = 3) -> Scene:
 def tree(voxel_size: float, *, seed: int) -> VoxelMap:
     """Crown and trunk as extinction, in voxels of the edge `voxel_size` (m) round x = y = 0.
 
-    The leaf area index below the crown's outline is 3.5, the trunk 0.89 m thick at the base and a tenth of that
-    at its top, 2 m below the tree's. Bark is spread over the voxels that it shares.
+    The leaf area index below the crown's outline is 3.5, the trunk 0.89 m thick at the base and a tenth of
+    that at its top, 2 m below the tree's. Bark is spread over the voxels that it shares.
     """
     half = round(np.ceil((CROWN_RADIUS + 0.25) / voxel_size))
     levels = round(np.ceil(HEIGHT / voxel_size))

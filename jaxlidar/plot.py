@@ -135,12 +135,12 @@ def residuals(
     - `noise`: its standard deviation, a number or of the same shape, positive.
     - `ax`: where to draw. Default None: on a new figure.
     - `wavelength`: in nm, one of the waveform's. Default None: all.
-    - `limit`: where the axis ends, in standard deviations, positive; what lies beyond is drawn at the end as an
-      arrowhead. Default 5.
+    - `limit`: where the axis ends, in standard deviations, positive; what lies beyond is drawn at the end as
+      an arrowhead. Default 5.
     - `style`: of the points, as for `Axes.plot`.
 
-    **Raises:** ValueError for shapes that differ, noise or a limit that is not positive, and a wavelength that
-    the waveform does not have.
+    **Raises:** ValueError for shapes that differ, noise or a limit that is not positive, and a wavelength
+    that the waveform does not have.
     """
     data, spread = np.asarray(observed, dtype=float), np.asarray(noise, dtype=float)
     shape = np.asarray(wave.reflectance).shape

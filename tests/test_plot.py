@@ -1,0 +1,159 @@
+"""The figures: what they draw, with which units, on whose axes."""
+
+import jax
+import matplotlib
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+import jaxlidar as jl
+import jaxlidar.plot as plot
+
+matplotlib.use("agg")
+
+WAVELENGTHS = (532.0, 1064.0, 1550.0)
+
+
+def canopy_scene(**ground):
+    voxels = jl.VoxelMap.from_extinction(
+        leaf=np.full((2, 3, 4), 0.3), bark=np.full((2, 3, 4), 0.02), voxel_size=1.0, origin=(-1.0, -1.5, 2.0)
+    )
+    leaf = jl.LeafOptics(reflectance=0.4, transmittance=0.3)
+    return jl.Scene(canopy=jl.Canopy(voxels, leaf=leaf, bark=0.3), ground=jl.Ground(**ground))
+
+
+@pytest.fixture(scope="module")
+def wave():
+    lidar = jl.Lidar(wavelength=WAVELENGTHS, divergence=1.0)
+    return jl.simulate(lidar, canopy_scene(), key=jax.random.key(0), n_photons=2048, n_rays=64, max_orders=3)
+
+
+@pytest.fixture
+def axes():
+    return Figure().subplots()
+
+
+def drawn(axes):
+    """Names and data of the lines."""
+    return {line.get_label(): line.get_xydata() for line in axes.lines}
+
+
+def test_waveform_has_height_upward_and_its_components(wave, axes):
+    assert plot.waveform(wave, axes, wavelength=1064.0) is axes
+    lines = drawn(axes)
+    assert np.allclose(lines["total"][:, 0], wave.reflectance[1])
+    assert np.allclose(lines["total"][:, 1], wave.height)
+    assert np.allclose(lines["scattered twice\nor more"][:, 0], wave.components["higher"][1])
+    named = {text.get_text() for text in axes.get_legend().get_texts()}
+    assert named == {"leaf", "bark", "ground", "scattered twice\nor more", "total"}
+    assert axes.get_ylabel() == "height (m)"
+    assert axes.get_xlabel() == "apparent reflectance\nper sample of 1 ns"
+    low, high = axes.get_ylim()
+    assert low < 0 < 6 < high
+    assert axes.get_xlim()[0] == 0
+
+
+def test_waveform_of_several_wavelengths_draws_their_totals(wave, axes):
+    plot.waveform(wave, axes)
+    assert [name for name in drawn(axes) if name[0] != "_"] == ["532 nm", "1064 nm", "1550 nm"]
+
+
+def test_waveform_band_is_in_standard_errors(wave, axes):
+    plot.waveform(wave, axes, wavelength=532.0, components=False, sigma=3.0)
+    wide, narrow = axes.collections
+    i = int(np.argmax(wave.stderr[0]))
+    at = np.isclose(wide.get_paths()[0].vertices[:, 1], float(wave.height[i]))
+    width = np.ptp(wide.get_paths()[0].vertices[at, 0])
+    assert np.isclose(width, 6.0 * float(wave.stderr[0, i]), rtol=1e-3)
+    at = np.isclose(narrow.get_paths()[0].vertices[:, 1], float(wave.height[i]))
+    assert np.isclose(np.ptp(narrow.get_paths()[0].vertices[at, 0]), 0.5 * width, rtol=1e-3)
+
+
+def test_waveform_in_joules(wave, axes):
+    plot.waveform(wave, axes, wavelength=1550.0, quantity="energy", label="sent back", color="red")
+    (line,) = axes.lines
+    assert np.allclose(line.get_xdata(), wave.energy[2])
+    assert (line.get_label(), line.get_color()) == ("sent back", "red")
+    assert axes.get_xlabel() == "energy per sample of 1 ns (J)"
+
+
+def test_waveform_draws_what_is_empty_or_noisy(wave, axes):
+    empty = jax.tree.map(jax.numpy.zeros_like, wave)
+    plot.waveform(empty, axes, wavelength=0.0)
+    axes.clear()
+    noisy = jax.tree.map(lambda a: a - 0.001, wave)
+    plot.waveform(noisy, axes, wavelength=float(noisy.wavelength[0]))
+    assert axes.get_xlim()[0] < 0
+
+
+def test_residuals_are_in_standard_deviations(wave, axes):
+    observed = np.asarray(wave.reflectance) + 0.002
+    observed[1, 5] += 1.0
+    assert plot.residuals(wave, observed, 0.001, axes, wavelength=1064.0) is axes
+    points = np.concatenate([line.get_xydata() for line in axes.lines if line.get_marker() == "o"])
+    assert np.allclose(points[:, 0], 2.0, atol=1e-3)
+    (beyond,) = [
+        line.get_xydata() for line in axes.lines if line.get_marker() == ">" and len(line.get_xdata())
+    ]
+    assert np.allclose(beyond, [[0.97 * 5, float(wave.height[5])]])
+    assert axes.get_xlim() == (-5.0, 5.0)
+
+
+def test_scene_shows_canopy_plates_ground_and_beam(axes):
+    scene = canopy_scene(height=0.5, slope=10.0, aspect=90.0)
+    scene = jl.Scene(canopy=scene.canopy, ground=scene.ground, plates=(jl.Plate(1.0, 0.3),))
+    lidar = jl.Lidar(divergence=2.0, position=(0.5, 0.0))
+    assert plot.scene(scene, lidar, axes) is axes
+    named = {text.get_text() for text in axes.get_legend().get_texts()}
+    assert named == {"leaf", "bark", "ground", "plate", "beam (1/e²)"}
+    leaf = axes.images[0]
+    assert leaf.get_extent() == [-1.0, 1.0, 2.0, 6.0]
+    assert np.allclose(leaf.get_array(), 1 - np.exp(-0.9))
+    edges = [line.get_xydata() for line in axes.lines if line.get_label() == "beam (1/e²)"]
+    at_ground = sorted(float(np.interp(0.0, e[:, 1], e[:, 0])) for e in edges)
+    assert np.allclose(at_ground, [-0.5, 1.5], atol=0.01)
+    # The ground falls eastward.
+    outline = axes.collections[0].get_paths()[0].vertices
+    top = {x: outline[outline[:, 0] == x, 1].max() for x in (outline[:, 0].min(), outline[:, 0].max())}
+    (west, high), (east, low) = sorted(top.items())
+    assert np.isclose((low - high) / (east - west), -np.tan(np.deg2rad(10.0)), rtol=1e-4)
+    assert np.isclose(high, 0.5 - west * np.tan(np.deg2rad(10.0)), rtol=1e-4)
+    assert axes.get_ylabel() == "height (m)"
+
+
+def test_scene_from_the_east_and_of_a_tilted_beam(axes):
+    lidar = jl.Lidar(zenith=20.0, azimuth=0.0, divergence=2.0)
+    plot.scene(canopy_scene(), lidar, axes, along="x", legend=False)
+    assert axes.get_xlabel() == "y, north (m)"
+    assert axes.get_legend() is None
+    first, second = (line.get_xydata() for line in axes.lines if line.get_label() == "beam (1/e²)")
+    axis = 0.5 * (first + second)
+    lean = np.diff(axis[:, 0]) / np.diff(axis[:, 1])
+    # Light that travels north comes from the south.
+    assert np.allclose(lean, -np.tan(np.deg2rad(20.0)), rtol=1e-3)
+
+
+def test_an_empty_scene_and_new_figures():
+    from matplotlib import pyplot
+
+    for made in (plot.scene(jl.Scene()), plot.scene(jl.Scene(), jl.Lidar(profile="top-hat"))):
+        assert made.get_ylabel() == "height (m)"
+        pyplot.close(made.figure)
+
+
+@pytest.mark.parametrize(
+    ("call", "says"),
+    [
+        (lambda w: plot.waveform(w, wavelength=700.0), "wavelength = 700 nm is none of the waveform's: 532"),
+        (lambda w: plot.waveform(w, quantity="power"), "quantity = 'power' is none of"),
+        (lambda w: plot.waveform(w, sigma=-1.0), "sigma = -1 is outside"),
+        (lambda w: plot.residuals(w, np.zeros(3), 1.0), r"observed has shape \(3,\)"),
+        (lambda w: plot.residuals(w, w.reflectance, np.ones(3)), r"noise has shape \(3,\)"),
+        (lambda w: plot.residuals(w, w.reflectance, 0.0), "noise = 0 is outside"),
+        (lambda w: plot.residuals(w, w.reflectance, 1.0, limit=0.0), "limit = 0 is outside"),
+        (lambda w: plot.scene(jl.Scene(), along="z"), "along = 'z' is none of"),
+    ],
+)
+def test_inadmissible_input_is_refused(wave, call, says):
+    with pytest.raises(ValueError, match=says):
+        call(wave)
