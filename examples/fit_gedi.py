@@ -38,6 +38,8 @@ ALTITUDE, FOOTPRINT = 400e3, 25.0
 LEAF, GROUND = jl.LeafOptics(reflectance=0.45, transmittance=0.40), 0.20
 # Samples above and below the reference: of 1 ns, or 0.15 m.
 ABOVE, BELOW = 280, 80
+# Records are smoothed as by a Gaussian of this standard deviation, ns; the transmitted pulse is not.
+SMOOTHING = 0.0
 # Noise of neighbouring samples is correlated over five of them.
 INDEPENDENT = 5
 # Relative error of the model: the pulse is itself a record, and no canopy is uniform.
@@ -75,7 +77,7 @@ def scene_of(height, ground=0.0, slope=5.0):
 
 def lidar_of(pulse):
     """GEDI with a pulse. Its footprint is 25 m wide at 1/e^2."""
-    return jl.Lidar(altitude=ALTITUDE, divergence=FOOTPRINT / ALTITUDE * 1e3, aperture=0.8, pulse=pulse)
+    return jl.Lidar(altitude=ALTITUDE, divergence=FOOTPRINT / ALTITUDE * 1e3, aperture=0.8, pulse=pulse, jitter=SMOOTHING)
 
 
 def common_plan():
@@ -126,11 +128,11 @@ def fit(shot, progress=None):
     unknowns = [
         Unknown(name="ground", bounds=(-5.0, 5.0), start=0.0, apply=put_ground),
         Unknown(name="canopy height", bounds=(1.0, 42.0), start=start, apply=put_canopy_height),
-        Unknown(lambda s: s.ground.slope, bounds=(0.0, 25.0), name="slope", prior=(0.0, 10.0)),
+        Unknown(lambda s: s.ground.slope, bounds=(0.0, 25.0), name="slope", prior=(0.0, 4.0)),
         Unknown(
             name="log density",
             bounds=(np.log(1e-4), np.log(3.0)),
-            prior=(np.log(0.03), 1.5),
+            prior=(np.log(0.03), 1.0),
             start=np.full(LAYERS, np.log(0.05)),
             apply=put_density,
         ),
@@ -159,7 +161,7 @@ def summary(shot, result, reference, number):
     return {
         "ground": (ground, float(result.stderr["ground"])),
         "canopy top": (ground + height, float(result.stderr["canopy height"])),
-        "highest return": (highest(shot.elevation[number], fitted, 3 * shot.noise_std), np.nan),
+        "highest return": (highest(shot.elevation[number], fitted, 1.5 * shot.noise_std), np.nan),
         "plant area index": (float(np.mean(density)) * height, np.nan),
     }
 
