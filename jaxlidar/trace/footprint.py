@@ -58,7 +58,7 @@ class Beam(eqx.Module):
     def irradiance(self, across: tuple[Scalar, Scalar]) -> Scalar:
         """Share of the pulse's energy per m2 across the beam."""
         r2 = across[0] ** 2 + across[1] ** 2
-        w2 = jnp.maximum(self.radius, 1e-12) ** 2
+        w2 = jnp.maximum(self.radius, 1e-6) ** 2
         if self.gaussian:
             return 2.0 / (np.pi * w2) * jnp.exp(-jnp.minimum(2.0 * r2 / w2, 80.0))
         return jnp.where(r2 <= w2, 1.0 / (np.pi * w2), 0.0)

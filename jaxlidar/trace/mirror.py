@@ -1,30 +1,37 @@
 r"""First return of a specular surface.
 
-A mirror sends back only what falls into the aperture: rays of the ordinary footprint mostly miss it. So
-pairs of a point e of the beam and a point q of the aperture are taken, and weighted by
+A mirror sends back only what falls into the aperture: rays of the ordinary footprint mostly miss it. With
+e a point of the beam on the mirror, I the irradiance there, m where the mirror image of the beam's axis
+meets the receiver's plane, a the aperture's radius, R the range and r the roughness, the receiver gets
 
-    integral over q of integral over e of  I(e) N(q - 2 e - m; (roughness R)^2) de dq,
+    integral over e of  I(e) P(|m + 2 e|) de,
 
-I the irradiance across the beam, m where the mirror image of the axis meets the receiver's plane; the
-factor 2 is the spreading of the beam on its way back. Pairs come from both factors (given q, e from the
-lobe; and e from the beam) with the balance heuristic, so that any roughness is sampled well. Without
-roughness and at normal incidence the integral is 1 - exp(-2 a^2 / w^2), a the aperture's radius and
+P(d) the share of a Gaussian of standard deviation r R, centred d from the axis, that falls within a of it;
+the factor 2 is the spreading of the beam on its way back. Half of the rays are drawn from I and half from
+P, and weighted by the balance heuristic, so that images much smaller and much larger than the aperture
+are sampled equally well. The sum over a Gaussian beam is known, P(|m|) with the variance w^2 + (r R)^2,
+and the rays are scaled to it. Without roughness and at normal incidence it is 1 - exp(-2 a^2 / w^2),
 w the beam's radius at twice the range.
 """
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.scipy.special import i0e
 from jaxtyping import Array, Float
 
-from .._vector import dot, to_frame, vec
+from .._vector import Scalar, dot, to_frame, vec
 from ..materials import Specular
 from .footprint import GOLDEN, Beam, quantile_radius
 from .surfaces import Surface
 
-PAIRS = 4096
-# Lobes narrower than this are taken as this wide, in units of the beam's or aperture's radius.
+RAYS = 4096
+# Lobes narrower than this are taken as this wide, in units of the aperture's radius.
 _NARROW = 1e-3
+# Keeps quotients of densities finite, with their derivatives in single precision, where all are zero.
+_TINY = 1e-9
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(48)
 
 
 def mirror_rays(
@@ -32,8 +39,8 @@ def mirror_rays(
 ) -> tuple[tuple[Float[Array, "rays"], Float[Array, "rays"]], Float[Array, "rays"]]:
     """Rays across the beam that return from a mirror, and the apparent reflectance each carries.
 
-    The apparent reflectance is per unit reflectance and for a transparent way; rays weigh less towards
-    the edges of the lobe. Small angles are assumed between the beam's axis and the mirror image of it.
+    The apparent reflectance is per unit reflectance and for a transparent way. Small angles are assumed
+    between the beam's axis and the mirror image of it.
     """
     assert isinstance(surface.law, Specular)
     r, a = beam.slant_range, beam.half_angle * beam.slant_range
@@ -48,39 +55,62 @@ def mirror_rays(
     cosine = -dot(normal, beam.axis)
     # Where the image of the axis meets the receiver's plane: along the normal's part across the axis.
     miss = vec(2.0 * cosine * distance * (n + cosine * k) for n, k in zip(normal, beam.axis))
-    across_miss = to_frame(beam.axis, miss)[:2]
+    miss = to_frame(beam.axis, miss)[:2]
+    sigma = jnp.maximum(surface.law.roughness * distance, _NARROW * a)
 
-    widest = jnp.maximum(a, beam.radius)
-    sigma = jnp.maximum(surface.law.roughness * distance, _NARROW * jnp.minimum(widest, a))
-    n = PAIRS // 2
+    n = RAYS // 2
     i = np.arange(n)
-    dtype = r.dtype
+    u = jnp.asarray((i + 0.5) / n, r.dtype)
+    turn = _turn(i * GOLDEN, r)
+    # A second, independent pair of coordinates for the lobe.
+    lobe = sigma * jnp.sqrt(-2.0 * jnp.log1p(-_turn(i * 0.7548776662466927 + 0.5, r)))
+    inside, lobe = _disc(a * jnp.sqrt(u), turn), _disc(lobe, _turn(i * 0.5698402909980532 + 0.5, r))
+    from_beam = _disc(quantile_radius(beam, u), turn)
+    from_aperture = tuple((q - m - g) / 2.0 for q, m, g in zip(inside, miss, lobe))
+    e = tuple(jnp.concatenate([p, q]) for p, q in zip(from_beam, from_aperture))
 
-    def disc(radius, turn):
-        return radius * jnp.cos(2 * np.pi * turn), radius * jnp.sin(2 * np.pi * turn)
+    irradiance = beam.irradiance(e)
+    caught = within(_length(tuple(m + 2.0 * c for m, c in zip(miss, e))), sigma, a)
+    # Densities with which e was drawn: I, and that of points whose image falls into the aperture.
+    drawn = 0.5 * (irradiance + 4.0 * caught / (np.pi * a**2))
+    # Divided by the aperture's squared half-angle, the share of the energy is apparent reflectance.
+    unit = (distance / a) ** 2
+    value = unit * irradiance * caught / jnp.maximum(drawn, _TINY) / (2 * n)
+    if beam.gaussian:
+        found = jnp.sum(value)
+        seen = found > _TINY
+        known = unit * within(_length(miss), jnp.hypot(beam.radius, sigma), a)
+        value = value * jnp.where(seen, known / jnp.where(seen, found, 1.0), 0.0)
+    return (e[0] / wider, e[1] / wider), value
 
-    turn = jnp.asarray((i * GOLDEN) % 1.0, dtype)
-    u = jnp.asarray((i + 0.5) / n, dtype)
-    # A second, independent pair of coordinates for the inner point.
-    v = jnp.asarray((i * 0.7548776662466927 + 0.5) % 1.0, dtype)
-    spin = jnp.asarray((i * 0.5698402909980532 + 0.5) % 1.0, dtype)
-    q = disc(a * jnp.sqrt(u), turn)
-    lobe = disc(sigma * jnp.sqrt(-2.0 * jnp.log1p(-v)), spin)
-    from_lobe = tuple((qk - m - g) / 2.0 for qk, m, g in zip(q, across_miss, lobe))
-    from_beam = disc(quantile_radius(beam, u), turn)
-    q_beam = disc(a * jnp.sqrt(v), spin)
 
-    def value(e, q):
-        irradiance = beam.irradiance(e)
-        off2 = sum((qk - 2.0 * ek - m) ** 2 for qk, ek, m in zip(q, e, across_miss))
-        density = jnp.exp(-jnp.minimum(off2 / (2 * sigma**2), 80.0)) / (2 * np.pi * sigma**2)
-        # Densities of e given q: 4 N from the lobe, I from the beam; half of the pairs from each.
-        sampled = 0.5 * (4.0 * density + irradiance)
-        return irradiance * density / jnp.maximum(sampled, 1e-37)
+def within(distance: Scalar, sigma: Scalar, radius: Scalar) -> Scalar:
+    """Share of a two-dimensional Gaussian within `radius` of a point at `distance` from its centre.
 
-    e = tuple(jnp.concatenate([p, b]) for p, b in zip(from_lobe, from_beam))
-    both = tuple(jnp.concatenate([p, b]) for p, b in zip(q, q_beam))
-    # Captured share of the energy is area of the aperture times the mean; divided by alpha^2 it is
-    # apparent reflectance.
-    share = np.pi * a**2 * value(e, both) / (2 * n)
-    return (e[0] / wider, e[1] / wider), share * (distance / a) ** 2
+    One minus Marcum's Q function; integrated over the ring that a Gaussian of eight `sigma` covers, by a
+    Gauss rule: to 1e-6.
+    """
+    low = jnp.clip(distance - 8.0 * sigma, 0.0, radius)
+    high = jnp.minimum(distance + 8.0 * sigma, radius)
+    half = 0.5 * (high - low)
+
+    def at(node, weight):
+        rho = low + half * (1.0 + node)
+        off = jnp.exp(-0.5 * ((rho - distance) / sigma) ** 2)
+        return weight * half * rho / sigma**2 * off * i0e(rho / sigma * (distance / sigma))
+
+    dtype = distance.dtype
+    return jnp.sum(jax.vmap(at)(jnp.asarray(_NODES, dtype), jnp.asarray(_WEIGHTS, dtype)), axis=0)
+
+
+def _turn(number: np.ndarray, like: Scalar) -> Scalar:
+    return jnp.asarray(number % 1.0, like.dtype)
+
+
+def _disc(radius: Scalar, turn: Scalar) -> tuple[Scalar, Scalar]:
+    return radius * jnp.cos(2 * np.pi * turn), radius * jnp.sin(2 * np.pi * turn)
+
+
+def _length(v: tuple[Scalar, Scalar]) -> Scalar:
+    # Below the root a number that only matters to derivatives at zero.
+    return jnp.sqrt(v[0] ** 2 + v[1] ** 2 + 1e-24)
