@@ -230,9 +230,7 @@ def _error(means: Float[np.ndarray, "batches wavelengths bins"]) -> tuple[float,
     """Relative error (see `simulate`) and largest standard error of the mean of batches."""
     mean = np.mean(means, axis=0)
     stderr = np.std(means, axis=0, ddof=1) / math.sqrt(len(means))
-    relative = []
-    for m, s in zip(mean, stderr):
-        seen = m > 0.01 * np.max(m)
-        if np.any(seen):
-            relative.append(math.sqrt(np.mean((s[seen] / m[seen]) ** 2)))
-    return max(relative, default=0.0), float(np.max(stderr))
+    seen = mean > 0.01 * np.max(mean, axis=1, keepdims=True)
+    squares = np.where(seen, (stderr / np.where(seen, mean, 1.0)) ** 2, 0.0)
+    relative = np.sqrt(np.sum(squares, axis=1) / np.maximum(np.sum(seen, axis=1), 1))
+    return float(np.max(relative, initial=0.0)), float(np.max(stderr))

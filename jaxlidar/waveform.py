@@ -147,8 +147,17 @@ def total_of(
     response: Response, lidar: Lidar, scene: Scene, plan: Plan
 ) -> Float[Array, "wavelengths samples"]:
     """Apparent reflectance per sample, all components together."""
-    first, higher = colour(response, optics(lidar, scene, plan), plan)
-    total = sample(jnp.sum(first + higher, axis=0), lidar, scene, plan)
+    # Sums over materials, and the pulse where no atmosphere lies between, come before the many wavelengths.
+    letters, values = len(plan.layout.letters), optics(lidar, scene, plan)
+    clear = scene.atmosphere is None
+    total = jnp.zeros(())
+    for degree, part in ((plan.first_degree, response.first), (plan.degree, response.higher)):
+        if part is None:
+            continue
+        part = jnp.sum(part, axis=0)
+        part = part @ pulse_kernel(lidar, plan) if clear else part
+        total = total + jnp.einsum("hw,hb->wb", histories(letters, degree).monomials(values), part)
+    total = total if clear else sample(total, lidar, scene, plan)
     return total + air(lidar, scene, plan) if returns_air(scene) else total
 
 

@@ -34,22 +34,29 @@ ISOTROPIC_BACKSCATTER = 0.25
 
 
 class Stretches(eqx.Module):
-    """The pieces of one ray between faces: start, length (m), optical depth at the start, voxel."""
+    """The pieces of one ray between faces: start, length (m), depth at its start, voxel, extinction."""
 
     start: Float[Array, "*steps"]
     length: Float[Array, "*steps"]
     depth: Float[Array, "*steps"]
     cell: Int[Array, "*steps"]
+    extinction: Float[Array, "*steps"]
 
 
 def mean_decay(x: Scalar) -> Scalar:
     """(1 - exp(-x)) / x for x >= 0, with its derivative, exact down to and at zero."""
-    small = x < 0.1
+    return _decay(x)[1]
+
+
+def _decay(x: Scalar) -> tuple[Scalar, Scalar]:
+    """exp(-x) and (1 - exp(-x)) / x."""
+    small = x < 0.5
     series = jnp.ones_like(x)
-    for n in range(10, 1, -1):
-        series = 1.0 - x / n * series
-    big = jnp.where(small, 1.0, x)
-    return jnp.where(small, series, -jnp.expm1(-big) / big)
+    # Terms to the last digit at 0.5; there 1 - exp(-x) has lost no more than one.
+    for n in range(9 if jnp.finfo(x.dtype).bits == 32 else 15, 1, -1):
+        series = 1.0 - x * (1.0 / n) * series
+    passing = jnp.exp(-x)
+    return passing, jnp.where(small, series, (1.0 - passing) / jnp.where(small, 1.0, x))
 
 
 def march_ray(
@@ -75,7 +82,7 @@ def march_ray(
         ]
         crossed = (to >= face) & (to < end)
         voxel_ = tuple(jnp.where(crossed, m, v) for m, v in zip(advance(walk, voxel), voxel))
-        return (to, depth + k * length, voxel_, at_stops), Stretches(distance, length, depth, cell)
+        return (to, depth + k * length, voxel_, at_stops), Stretches(distance, length, depth, cell, k)
 
     zero = jnp.zeros_like(end)
     state = (jnp.minimum(walk.enter, end), zero, walk.voxel, [zero] * len(stops))
@@ -93,11 +100,13 @@ class Passage:
     def __init__(self, surfaces: tuple[Surface, ...], layout: Layout, ways: int):
         self.plates = [(i, s, layout.surfaces[i].transmitted) for i, s in enumerate(surfaces) if s.plate]
         choices = []
-        for i, s, _ in self.plates:
+        for i, s, letter in self.plates:
             c = s.coverage
+            # A plate without a letter for transmittance is opaque.
+            straight = s.straight and letter >= 0
             if layout.full_cover[i]:
-                options = [(ways, jnp.ones_like(c) if s.straight else jnp.zeros_like(c))]
-            elif s.straight:
+                options = [(ways, jnp.ones_like(c) if straight else jnp.zeros_like(c))]
+            elif straight:
                 terms = {1: [1 - c, c], 2: [(1 - c) ** 2, 2 * c * (1 - c), c**2]}[ways]
                 options = list(enumerate(terms))
             else:
@@ -107,7 +116,13 @@ class Passage:
         self.combinations = list(itertools.product(*choices))
 
     def terms(self, table: Histories, base: int, s: Scalar, met: list[Scalar]):
-        """Pairs of history and weight for light that scatters at distance `s` into history `base`."""
+        """Pairs of history and weight for light that scatters at distance `s` into history `base`.
+
+        The history is an array, or where there are no plates a number.
+        """
+        if not self.plates:
+            yield base, jnp.ones_like(s)
+            return
         successor = jnp.asarray(table.successor)
         for combination in self.combinations:
             number = jnp.full(s.shape, base, jnp.int32)
@@ -147,7 +162,7 @@ def first_order(
     successor = table.successor
     materials = len(layout.materials)
 
-    def one_ray(across, energy):
+    def rays(across, energy):
         across, share = hold_in_columns(beam, medium, across)
         energy = energy * share
         point, w, excess = beam.ray(across)
@@ -156,29 +171,51 @@ def first_order(
         met = [s.distance(x, w) for s in surfaces]
         stop = met[0] if layout.has_ground else jnp.full_like(energy, FAR)
         visible = energy * beam.in_view(along(x, w, jnp.minimum(stop, layout.upstream)))
-        # Lists of (slot, first bin, row of bins) and of (slot, weight).
-        stretched, instants, arrivals, leaving = [], [], [], []
+        response = jnp.zeros((materials * count, bins.padded), energy.dtype)
+        arrived = jnp.zeros((materials * count,), energy.dtype)
+        escaped = jnp.zeros((count,), energy.dtype)
         at_stops, total = [jnp.zeros_like(energy) for _ in met], jnp.zeros_like(energy)
+
+        def deposit(stretch: Stretches):
+            """One stretch of all rays: (slot, first bin, pieces) that return, (slot, weight) that arrive."""
+            k = stretch.extinction
+            low = bins.position(2.0 * (excess + stretch.start) / SPEED_OF_LIGHT)
+            first, pieces = _stretch_pieces(bins, low, stretch, kappa)
+            passing = jnp.exp(-stretch.depth) * mean_decay(k * stretch.length) * stretch.length
+            middle = stretch.start + 0.5 * stretch.length
+            returned, arriving = [], []
+            for m, part in _parts(medium, layout, stretch, w):
+                value = part.extinction * (part.backscatter * visible)
+                for history, share in both_ways.terms(table, int(successor[0, part.letter]), middle, met):
+                    slot = jnp.broadcast_to(m * count + history, first.shape)
+                    returned.append((slot, first, [p * (value * share) for p in pieces]))
+                for history, share in out_way.terms(table, 0, middle, met):
+                    weight = part.extinction * passing * share * energy
+                    arriving.append(_together(m * count + history, weight))
+            return returned, arriving
 
         if medium is not None:
             step = jnp.asarray(layout.max_step, energy.dtype)
-            stretch, at_stops, total = march_ray(medium, x, w, stop, met, layout.first_steps, step)
-            k = medium.extinction(stretch.cell, w)
-            low = bins.position(2.0 * (excess + stretch.start) / SPEED_OF_LIGHT)
-            first, row = _stretch_rows(bins, low, stretch, k, kappa)
-            passing = jnp.exp(-stretch.depth) * mean_decay(k * stretch.length) * stretch.length
-            middle = stretch.start + 0.5 * stretch.length
-            for m, part in _parts(medium, layout, stretch.cell, w):
-                value = part.extinction * (part.backscatter * visible)
-                for history, share in both_ways.terms(table, int(successor[0, part.letter]), middle, met):
-                    stretched.append((m * count + history, first, row * (value * share)[:, None]))
-                for history, share in out_way.terms(table, 0, middle, met):
-                    arrivals.append((m * count + history, part.extinction * passing * share * energy))
+            # Stretches stay along the first axis, where the march leaves them: turning them costs as much.
+            stretch, at_stops, total = jax.vmap(
+                lambda x, w, stop, met: march_ray(medium, x, w, stop, met, layout.first_steps, step),
+                out_axes=(1, 0, 0),
+            )(x, w, stop, met)
+            returned, arriving = jax.vmap(deposit)(stretch)
+            for slot, first, pieces in returned:
+                # Without the barrier, every element of the stack would evaluate all pieces anew.
+                row = jnp.stack(lax.optimization_barrier(pieces), axis=-1)
+                response = scatter_rows(response, slot, first, row)
+            # Smoothing is linear: the sum once instead of every stretch.
+            response = smooth_row(response)[:, 1:-1]
+            for slot, weight in arriving:
+                arrived = arrived.at[slot].add(weight)
 
         for i, (s, law) in enumerate(zip(surfaces, layout.surfaces)):
             hit = jnp.where((met[i] <= stop) & (met[i] < FAR), s.coverage * energy, 0.0)
             for history, share in out_way.terms(table, 0, met[i], met):
-                arrivals.append((law.material * count + history, hit * jnp.exp(-at_stops[i]) * share))
+                slot, weight = _together(law.material * count + history, hit * jnp.exp(-at_stops[i]) * share)
+                arrived = arrived.at[slot].add(weight)
             if isinstance(s.law, Specular):
                 continue
             at = along(x, w, jnp.where(met[i] < FAR, met[i], 0.0))
@@ -187,24 +224,12 @@ def first_order(
             time = 2.0 * (excess + jnp.minimum(met[i], 1e9)) / SPEED_OF_LIGHT
             first, row = instant_row(bins, time, hit * factor * jnp.exp(-kappa * at_stops[i]))
             for history, share in both_ways.terms(table, int(successor[0, law.reflected]), met[i], met):
-                instants.append((law.material * count + history, first, row * share))
+                slot = jnp.broadcast_to(law.material * count + history, first.shape)
+                response = scatter_rows(response, slot, first, row * share[:, None])
 
         gone = jnp.where(stop < FAR, 0.0, energy * jnp.exp(-total))
         for history, share in out_way.terms(table, 0, stop, met):
-            leaving.append((history, gone * share))
-        return stretched, instants, arrivals, leaving
-
-    def rays(across, energy):
-        # Stretches stay along the first axis, where the march left them.
-        stretched, *others = jax.vmap(one_ray, out_axes=(1, 0, 0, 0))(across, energy)
-        response = jnp.zeros((materials * count, bins.padded), energy.dtype)
-        for slot, first, row in stretched + others[0]:
-            response = scatter_rows(response, slot, first, row)
-        arrived = jnp.zeros((materials * count,), energy.dtype)
-        for slot, weight in others[1]:
-            arrived = arrived.at[slot].add(weight)
-        escaped = jnp.zeros((count,), energy.dtype)
-        for slot, weight in others[2]:
+            slot, weight = _together(history, gone * share)
             escaped = escaped.at[slot].add(weight)
         return response, arrived.reshape(materials, count), escaped
 
@@ -222,23 +247,30 @@ def first_order(
     return FirstOrder(weights, arrived, escaped)
 
 
-def _stretch_rows(
-    bins: Bins, low: Float[Array, "steps"], stretch: Stretches, k: Float[Array, "steps"], kappa: float
-) -> tuple[Int[Array, "steps"], Float[Array, "steps row"]]:
-    """First bin and row of bins of the integral of exp(-kappa tau) ds over each stretch, bin by bin.
+def _stretch_pieces(
+    bins: Bins, low: Float[Array, "rays"], stretch: Stretches, kappa: float
+) -> tuple[Int[Array, "rays"], list[Float[Array, "rays"]]]:
+    """First bin, and for it and those behind it the integral of exp(-kappa tau) ds over each stretch.
 
     `low` is the position of the start of each stretch on the axis of bins.
     """
     metres = 0.5 * SPEED_OF_LIGHT * bins.width
     high = low + stretch.length / metres
     number = jnp.round(lax.stop_gradient(low))
+    clear, start = jnp.exp(-kappa * stretch.depth), low
     pieces = []
     for j in range(bins.row - 2):
-        start = jnp.clip(number + (j - 0.5), low, high)
-        length = (jnp.clip(number + (j + 0.5), low, high) - start) * metres
-        depth = stretch.depth + k * (start - low) * metres
-        pieces.append(jnp.exp(-kappa * depth) * mean_decay(kappa * k * length) * length)
-    return first_bin(bins, number - 1, bins.row), smooth_row(jnp.stack(pieces, axis=-1))
+        end = jnp.clip(number + (j + 0.5), low, high)
+        length = (end - start) * metres
+        passing, mean = _decay(kappa * stretch.extinction * length)
+        pieces.append(clear * mean * length)
+        clear, start = clear * passing, end
+    return first_bin(bins, number, bins.row - 2), pieces
+
+
+def _together(slot: Int[Array, "rays"] | int, weight: Float[Array, "rays"]):
+    """Slots and weights to add; one sum where all rays have the same slot."""
+    return (slot, jnp.sum(weight)) if isinstance(slot, int) else (slot, weight)
 
 
 class Part(eqx.Module):
@@ -249,14 +281,16 @@ class Part(eqx.Module):
     letter: int = eqx.field(static=True)
 
 
-def _parts(medium: Medium, layout: Layout, cell: Int[Array, "..."], w: Vec):
+def _parts(medium: Medium, layout: Layout, stretch: Stretches, w: Vec):
     if medium.leaf is not None and layout.leaf is not None:
+        k = stretch.extinction if medium.bark is None else medium.leaf_at(stretch.cell, w)
         factor = FACET_BACKSCATTER
         if layout.leaf_isotropic:
             factor = ISOTROPIC_BACKSCATTER
         elif medium.angles is not None:
             factor = medium.angles.square_at(w) / medium.angles.projection_at(w)
-        yield layout.leaf.material, Part(medium.leaf_at(cell, w), factor, layout.leaf.reflected)
+        yield layout.leaf.material, Part(k, factor, layout.leaf.reflected)
     if medium.bark is not None and layout.bark is not None:
+        k = stretch.extinction if medium.leaf is None else medium.bark_at(stretch.cell)
         factor = ISOTROPIC_BACKSCATTER if layout.bark_isotropic else FACET_BACKSCATTER
-        yield layout.bark.material, Part(medium.bark_at(cell), factor, layout.bark.reflected)
+        yield layout.bark.material, Part(k, factor, layout.bark.reflected)
