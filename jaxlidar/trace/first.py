@@ -178,7 +178,7 @@ def first_order(
         escaped = jnp.zeros((count,), energy.dtype)
         at_stops, total = [jnp.zeros_like(energy) for _ in met], jnp.zeros_like(energy)
 
-        def deposit(stretch: Stretches):
+        def deposit(medium: Medium, stretch: Stretches):
             """One stretch of all rays: (slot, first bin, pieces) that return, (slot, weight) that arrive."""
             k = stretch.extinction
             low = bins.position(2.0 * (excess + stretch.start) / SPEED_OF_LIGHT)
@@ -199,11 +199,9 @@ def first_order(
         if medium is not None:
             step = jnp.asarray(layout.max_step, energy.dtype)
             # Stretches stay along the first axis, where the march leaves them: turning them costs as much.
-            stretch, at_stops, total = jax.vmap(
-                lambda x, w, stop, met: march_ray(medium, x, w, stop, met, layout.first_steps, step),
-                out_axes=(1, 0, 0),
-            )(x, w, stop, met)
-            returned, arriving = jax.vmap(deposit)(stretch)
+            march = jax.vmap(march_ray, (None, 0, 0, 0, 0, None, None), (1, 0, 0))
+            stretch, at_stops, total = march(medium, x, w, stop, met, layout.first_steps, step)
+            returned, arriving = jax.vmap(deposit, (None, 0))(medium, stretch)
             for slot, first, pieces in returned:
                 # Without the barrier, every element of the stack would evaluate all pieces anew.
                 row = jnp.stack(lax.optimization_barrier(pieces), axis=-1)

@@ -48,7 +48,7 @@ def mirror_rays(
     towards = dot(surface.normal, beam.axis)
     parallel = jnp.abs(towards) < 1e-9
     distance = r + jnp.where(parallel, 0.0, surface.offset / jnp.where(parallel, 1.0, towards))
-    # From here on `e` is on the mirror, where the beam is wider than on the reference plane.
+    # From here on the beam is as wide as it is on the mirror.
     wider = distance / r
     beam = eqx.tree_at(lambda b: b.radius, beam, beam.radius * wider)
     normal = surface.lit_normal(beam.axis)
@@ -67,10 +67,10 @@ def mirror_rays(
     inside, lobe = _disc(a * jnp.sqrt(u), turn), _disc(lobe, _turn(i * 0.5698402909980532 + 0.5, r))
     from_beam = _disc(quantile_radius(beam, u), turn)
     from_aperture = tuple((q - m - g) / 2.0 for q, m, g in zip(inside, miss, lobe))
-    e = tuple(jnp.concatenate([p, q]) for p, q in zip(from_beam, from_aperture))
+    x, y = (jnp.concatenate([p, q]) for p, q in zip(from_beam, from_aperture))
 
-    irradiance = beam.irradiance(e)
-    caught = within(_length(tuple(m + 2.0 * c for m, c in zip(miss, e))), sigma, a)
+    irradiance = beam.irradiance((x, y))
+    caught = within(_length((miss[0] + 2.0 * x, miss[1] + 2.0 * y)), sigma, a)
     # Densities with which e was drawn: I, and that of points whose image falls into the aperture.
     drawn = 0.5 * (irradiance + 4.0 * caught / (np.pi * a**2))
     # Divided by the aperture's squared half-angle, the share of the energy is apparent reflectance.
@@ -81,7 +81,7 @@ def mirror_rays(
         seen = found > _TINY
         known = unit * within(_length(miss), jnp.hypot(beam.radius, sigma), a)
         value = value * jnp.where(seen, known / jnp.where(seen, found, 1.0), 0.0)
-    return (e[0] / wider, e[1] / wider), value
+    return (x / wider, y / wider), value
 
 
 def within(distance: Scalar, sigma: Scalar, radius: Scalar) -> Scalar:
