@@ -32,7 +32,7 @@ NOISE_SHARE, NOISE_FLOOR = 0.03, 0.01
 # What is recorded, in ns: from 17 m above the ground to 9 m below, for light that lingers in the crown.
 WINDOW = (-115.0, 60.0)
 # Photons and rays of each simulation of the retrieval.
-FIT_PHOTONS, FIT_RAYS = 16384, 4096
+FIT_PHOTONS, FIT_RAYS = 16384, 2048
 RESOLUTION = 130
 
 

@@ -25,10 +25,16 @@ WAVELENGTHS = (532.0, 1064.0, 1550.0)
 def demo_lidar(wavelength: float | tuple[float, ...] = 1064.0) -> Lidar:
     """A lidar 1000 m above the ground whose footprint, 6 m across, covers much of the crown.
 
-    Pulse 6 ns, sampling interval 1 ns, aperture 0.2 m. `wavelength` is in nm. Default 1064.
+    Pulse 6 ns, sampling interval 1 ns, aperture 0.2 m, field of view 8 m across. `wavelength` is in nm.
+    Default 1064.
     """
     return Lidar(
-        wavelength=wavelength, altitude=1000.0, divergence=6.0, pulse=GaussianPulse(fwhm=6.0), aperture=0.2
+        wavelength=wavelength,
+        altitude=1000.0,
+        divergence=6.0,
+        pulse=GaussianPulse(fwhm=6.0),
+        aperture=0.2,
+        field_of_view=8.0,
     )
 
 
