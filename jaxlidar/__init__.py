@@ -5,8 +5,20 @@ optics and geometry -> scene -> plan -> trace -> response -> waveform; fits are 
 
 from ._coefficients import load_coefficients as load_coefficients
 from .atmosphere import Atmosphere as Atmosphere
+from .forest import forest as forest
+from .habits import Branching as Branching
+from .habits import Habit as Habit
+from .habits import broadleaf as broadleaf
+from .habits import conifer as conifer
+from .habits import grow as grow
+from .habits import shrub as shrub
+from .habits import spreading as spreading
 from .leaf import LeafOptics as LeafOptics
 from .lidar import Lidar as Lidar
+from .lsystem import LSystem as LSystem
+from .lsystem import Module as Module
+from .lsystem import Rule as Rule
+from .lsystem import Word as Word
 from .materials import EqualAngle as EqualAngle
 from .materials import Isotropic as Isotropic
 from .materials import Lambertian as Lambertian
@@ -39,6 +51,8 @@ from .spectra import spectra as spectra
 from .spectra import spectrum as spectrum
 from .trace import Response as Response
 from .trace import trace as trace
+from .tree import Tree as Tree
+from .turtle import turtle as turtle
 from .voxels import VoxelMap as VoxelMap
 from .waveform import Waveform as Waveform
 from .waveform import waveform as waveform

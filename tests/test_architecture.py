@@ -25,6 +25,11 @@ STAGES = [
         "atmosphere",
         "lidar",
         "io",
+        "tree",
+        "lsystem",
+        "turtle",
+        "habits",
+        "forest",
     },
     {"voxels"},
     {"scene"},
@@ -33,7 +38,7 @@ STAGES = [
     {"trace"},
     {"waveform"},
     {"simulate"},
-    {"plot", "demo", "cli"},
+    {"plot", "plot_trees", "demo", "cli"},
 ]
 
 
@@ -66,7 +71,7 @@ def test_data_flows_one_way():
 
 
 def test_the_core_neither_plots_nor_prints():
-    outside = {"plot", "io", "cli", "demo"}
+    outside = {"plot", "plot_trees", "io", "cli", "demo"}
     for path in (ROOT / "jaxlidar").rglob("*.py"):
         if path.stem in outside:
             continue
