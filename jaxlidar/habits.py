@@ -25,7 +25,7 @@ from .turtle import turtle
 GOLDEN_ANGLE = 137.50776405
 # Standard deviations in degrees: of a lateral's place round its axis, and of a shoot's turn at each bud.
 DIVERGENCE_SPREAD = 15.0
-SHOOT_SPREAD = 20.0
+SHOOT_SPREAD = 28.0
 BUDS = ("bud_position", "bud_direction", "bud_radius")
 
 
@@ -144,12 +144,9 @@ class Habit:
 
         def shoot(*, rng: np.random.Generator) -> Iterator[Item]:
             count = wood.where("S").size
-            for _ in range(self.shoot_buds):
-                yield from [
-                    ("+", rng.normal(0.0, SHOOT_SPREAD, count)),
-                    ("&", rng.normal(0.0, SHOOT_SPREAD, count)),
-                ]
-                yield from [("f", step), ("J", 0.5 * self.clump_diameter)]
+            for i in range(self.shoot_buds):
+                yield from [("+&"[i % 2], rng.normal(0.0, SHOOT_SPREAD, count)), ("f", step)]
+                yield ("J", 0.5 * self.clump_diameter)
 
         return LSystem(wood, [Rule("S", shoot, random=True)])
 
