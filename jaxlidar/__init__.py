@@ -53,6 +53,9 @@ from .trace import Response as Response
 from .trace import trace as trace
 from .tree import Tree as Tree
 from .turtle import turtle as turtle
+from .voxelise import crop as crop
+from .voxelise import voxelise as voxelise
+from .voxelise import voxelise_points as voxelise_points
 from .voxels import VoxelMap as VoxelMap
 from .waveform import Waveform as Waveform
 from .waveform import waveform as waveform

@@ -1,0 +1,8 @@
+"""Readers of recorded waveforms, voxel maps, point clouds and tree models."""
+
+from .gedi import GediShot as GediShot
+from .gedi import read_gedi_l1b as read_gedi_l1b
+from .las import PointCloud as PointCloud
+from .las import read_las as read_las
+from .qsm import read_qsm as read_qsm
+from .vox import read_vox as read_vox

@@ -1,0 +1,85 @@
+"""Point clouds in LAS and LAZ files."""
+
+import os
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+# Classes of the LAS 1.4 specification that are no return of the scene: low noise and high noise.
+_NOISE = (7, 18)
+
+
+class PointCloud(NamedTuple):
+    """Points of a scan.
+
+    - `position`: (n, 3) m, as in the file, in double precision.
+    - `classification`: (n,) the classes of the LAS specification: 2 ground, 3 to 5 vegetation, ...
+    - `return_number`, `number_of_returns`: (n,) of each pulse.
+    - `intensity`: (n,) as recorded.
+    - `dropped`: how many points the file holds that are not here, by reason.
+    """
+
+    position: Float[np.ndarray, "n 3"]
+    classification: Int[np.ndarray, " n"]
+    return_number: Int[np.ndarray, " n"]
+    number_of_returns: Int[np.ndarray, " n"]
+    intensity: Float[np.ndarray, " n"]
+    dropped: dict[str, int]
+
+
+def read_las(path: str | os.PathLike[str], *, scale: float = 1.0) -> PointCloud:
+    """Read a LAS file, or a LAZ file where laspy has a backend for it.
+
+    Needs laspy (`pip install "jaxlidar[io]"`; for LAZ also lazrs).
+
+    - `path`: the file.
+    - `scale`: metres per unit of length in the file. Default 1.
+
+    Points classified as noise (classes 7 and 18), and those flagged as withheld, are dropped and counted.
+
+    **Raises:** FileNotFoundError; ImportError without laspy; ValueError, naming the file, and for points
+    the record, where it is damaged, cut short, without points or holds coordinates that are not finite.
+
+    **Source:** LAS specification 1.4 (ASPRS).
+    """
+    try:
+        import laspy
+    except ImportError as error:
+        raise ImportError('reading LAS needs laspy: pip install "jaxlidar[io]"') from error
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file")
+    try:
+        with laspy.open(path) as file:
+            said = file.header.point_count
+            cloud = file.read()
+    except laspy.errors.LaspyException as error:
+        raise ValueError(f"{path}: not a readable LAS file ({error})") from error
+    except (ValueError, OSError, EOFError) as error:
+        raise ValueError(f"{path}: damaged ({error})") from error
+    position = scale * np.stack([np.asarray(c, float) for c in (cloud.x, cloud.y, cloud.z)], axis=1)
+    if len(position) != said:
+        raise ValueError(f"{path}: record {len(position)}: the file ends, but its header names {said} points")
+    if said == 0:
+        raise ValueError(f"{path}: the file holds no points")
+    bad = np.flatnonzero(~np.isfinite(position).all(axis=1))
+    if bad.size:
+        raise ValueError(f"{path}: record {bad[0]}: coordinates {position[bad[0]].tolist()} are not finite")
+    classes = np.asarray(cloud.classification).astype(int)
+    noise = np.isin(classes, _NOISE)
+    withheld = np.asarray(cloud.withheld).astype(bool) & ~noise
+    keep = ~(noise | withheld)
+
+    def kept(name: str, kind: type) -> np.ndarray:
+        return np.asarray(cloud[name]).astype(kind)[keep]
+
+    return PointCloud(
+        position[keep],
+        classes[keep],
+        kept("return_number", int),
+        kept("number_of_returns", int),
+        kept("intensity", float),
+        {"noise": int(noise.sum()), "withheld": int(withheld.sum())},
+    )
