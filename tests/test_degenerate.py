@@ -93,7 +93,7 @@ CANOPIES = {
     "slope of 80 degrees": {"slope": 80.0},
     "slope of 80 degrees within the canopy": {"slope": 80.0, "height": 2.5},
     "from 400 km": {"lidar": {"altitude": 4e5, "divergence": 1e-3, "aperture": 0.8}},
-    "a field of view within the footprint": {"lidar": {"field_of_view": 0.01}},
+    "a field of view within the footprint": {"lidar": {"field_of_view": 0.1}},
     "a pulse without width": {"lidar": {"pulse_width": 0.0}},
     "a hairline's aperture": {"lidar": {"aperture": 1e-6}},
 }
