@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 import jaxlidar as jl
 import jaxlidar.plot
 from jaxlidar.cli import CommandError
-from jaxlidar.demo import HEIGHT, LEAF_AREA_INDEX, WAVELENGTHS, demo_lidar, demo_scene
+from jaxlidar.demo import HEIGHT, LEAF_AREA, WAVELENGTHS, demo_lidar, demo_scene
 
 from .result import Retrieval
 from .retrieval import retrieve
@@ -45,8 +45,8 @@ class Sought:
     truth: float
 
 
-def _with_leaf_area(scene: jl.Scene, index: Array) -> jl.Scene:
-    share = index / LEAF_AREA_INDEX
+def _with_leaf_area(scene: jl.Scene, area: Array) -> jl.Scene:
+    share = area / LEAF_AREA
     return eqx.tree_at(lambda s: s.canopy.voxels.leaf, scene, replace_fn=lambda leaf: leaf * share)
 
 
@@ -90,9 +90,9 @@ def sought(scene: Any) -> list[Sought]:
             float(ground.height),
         ),
         Sought(
-            Unknown(name="leaf area index", bounds=(1.0, 8.0), start=2.5, apply=_with_leaf_area),
-            "m2/m2",
-            LEAF_AREA_INDEX,
+            Unknown(name="leaf area", bounds=(50.0, 800.0), start=160.0, apply=_with_leaf_area),
+            "m2",
+            LEAF_AREA,
         ),
         Sought(Unknown(name="tree height", bounds=(12.0, 18.0), start=14.2, apply=_with_height), "m", HEIGHT),
     ]

@@ -22,9 +22,9 @@ from .uncertainty import correlation_of, decrement, errors_of
 from .unknowns import Settled, inside, outside
 
 # A fit has converged when a Gauss-Newton step would move it by less than this many standard errors,
-_SMALL_STEP = 0.02
+_SMALL_STEP = 0.05
 # or by less than these after so many steps that did not improve it.
-_STALLED = ((1, 0.1), (3, 0.3), (8, 1.0))
+_STALLED = ((1, 0.3), (3, 0.6), (8, 1.0))
 # Free numbers change by no more in one step: far out, where the bijection is flat, a fit would be stuck.
 _LONGEST_STEP = 2.0
 # At the solution the weights are renewed if the start's were wrong by more than this, in the mean.
