@@ -20,6 +20,7 @@ derivatives of 2 E3 finite.
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -257,33 +258,40 @@ _LARGE_3_SINGLE = (
     4.035077376e-5,
 )
 
-
 _Reals = Float[Array, "..."]
 
 
 def _polynomial(x: _Reals, single: Sequence[float], double: Sequence[float]) -> _Reals:
-    coefficients = double if x.dtype == jnp.float64 else single
-    total = jnp.full_like(x, coefficients[-1])
+    return polynomial(x, double if x.dtype == jnp.float64 else single)
+
+
+def polynomial(x: _Reals, coefficients: Sequence[Any]) -> _Reals:
+    """The sum of coefficients[i] x^i; they may be arrays."""
+    total = jnp.broadcast_to(jnp.asarray(coefficients[-1], x.dtype), x.shape)
     for c in coefficients[-2::-1]:
         total = total * x + jnp.asarray(c, x.dtype)
     return total
 
 
-def _small(k: _Reals) -> tuple[Bool[Array, "..."], _Reals]:
+def split(k: _Reals) -> tuple[Bool[Array, "..."], _Reals]:
     """Whether k is on the lower side of the break, and k brought there (1 elsewhere)."""
     below = k < 1
     return below, jnp.where(below, jnp.maximum(k, jnp.finfo(k.dtype).tiny), 1.0)
 
 
+def _inverse(large: _Reals) -> _Reals:
+    return 1.0 / (large + 2.5)
+
+
 def _large(k: _Reals) -> tuple[_Reals, _Reals]:
     """k brought to the upper side of the break (1 elsewhere), and the argument s of the polynomials Qn."""
     k = jnp.maximum(k, 1.0)
-    return k, 7.0 / (k + 2.5) - 1.0
+    return k, 7.0 * _inverse(k) - 1.0
 
 
 def scaled_e1(k: _Reals) -> _Reals:
     """E1(k) for k < 1, and exp(k) E1(k) from there on."""
-    below, small = _small(k)
+    below, small = split(k)
     large, s = _large(k)
     lower = _polynomial(small, _SMALL_1_SINGLE, _SMALL_1_DOUBLE) - jnp.log(small)
     return jnp.where(below, lower, _polynomial(s, _LARGE_1_SINGLE, _LARGE_1_DOUBLE) / (large + 1.0))
@@ -291,7 +299,7 @@ def scaled_e1(k: _Reals) -> _Reals:
 
 def scaled_e2(k: _Reals) -> _Reals:
     """E2(k) for k < 1, and exp(k) E2(k) from there on."""
-    below, small = _small(k)
+    below, small = split(k)
     large, s = _large(k)
     lower = small * jnp.log(small) + _polynomial(1.0 - small, _SMALL_2_SINGLE, _SMALL_2_DOUBLE)
     return jnp.where(below, lower, _polynomial(s, _LARGE_2_SINGLE, _LARGE_2_DOUBLE) / (large + 2.0))
@@ -308,12 +316,17 @@ def _upper_tau(large: _Reals, s: _Reals) -> _Reals:
 
 def scaled_tau(k: _Reals) -> _Reals:
     """2 E3(k) for k < 1, and exp(k) 2 E3(k) from there on."""
-    below, small = _small(k)
+    below, small = split(k)
     return jnp.where(below, _lower_tau(small), _upper_tau(*_large(k)))
 
 
 def _scale(k: _Reals) -> _Reals:
     return jnp.where(k < 1, 1.0, jnp.exp(-k))
+
+
+def helpers(k: _Reals) -> tuple[_Reals, _Reals]:
+    """The factor between `tau` and `scaled_tau`, and the reciprocal in the argument of the Qn."""
+    return _scale(k), _inverse(jnp.maximum(k, 1.0))
 
 
 @jax.custom_jvp
@@ -337,7 +350,7 @@ def tau(k: _Reals) -> _Reals:
 @jax.custom_jvp
 def omega(k: _Reals) -> _Reals:
     """1 - 2 E3(k), the absorptance that belongs to `tau`, without subtraction for small k."""
-    below, small = _small(k)
+    below, small = split(k)
     log_part = small * jnp.log(small)
     lower = k * (log_part + _polynomial(1.0 - small, _SMALL_OMEGA_SINGLE, _SMALL_OMEGA_DOUBLE))
     large, s = _large(k)

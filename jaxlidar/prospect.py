@@ -198,7 +198,8 @@ def _material(leaf: Prospect, wavelengths: Any) -> tuple[Array, Surface]:
     x = np.asarray(wavelengths, dtype=float)
     check_range("wavelengths", x, table.wavelength[0], table.wavelength[-1])
     absorption, face = _tabulated(table, x.tobytes(), x.shape, leaf.alpha)
-    return jnp.asarray(absorption, dtype), Surface(*(jnp.asarray(f, dtype) for f in face))
+    # The surface keeps its digits, of which the plate model makes use in single precision too.
+    return jnp.asarray(absorption, dtype), face
 
 
 @functools.lru_cache(maxsize=64)

@@ -4,9 +4,9 @@ Run it as `python examples/benchmarks/prospect_speed.py [folder]`. Writes `prosp
 `prospect_speed.png` into the folder (default `figures/`). The three are timed in turn, round after round, so
 that other work on the machine falls on all alike; ratios are those of the fastest rounds.
 
-On two cores of a shared machine: 15 to 20 us a leaf (2,101 wavelengths), 25 to 30 times faster than prosail
-(450 to 500 us); with all seven derivatives of reflectance and transmittance 2.1 to 2.5 times that. Batches
-of 20 to 100 leaves are best; the Jacobian's results are large, and writing them is a third of its time.
+On two cores of a shared machine: 30 to 40 us a leaf (2,101 wavelengths), 13 to 15 times faster than prosail
+(500 to 570 us); with all seven derivatives of reflectance and transmittance 1.7 times that. Batches of 5 to
+100 leaves are best.
 """
 
 import argparse
