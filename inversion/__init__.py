@@ -1,5 +1,13 @@
 """Retrievals: what a scene must be like for a lidar to have recorded a waveform."""
 
+from .decomposition import Echoes as Echoes
+from .decomposition import find_ground as find_ground
+from .decomposition import gap_probability as gap_probability
+from .decomposition import gaussian_decomposition as gaussian_decomposition
+from .decomposition import plant_area_index as plant_area_index
+from .decomposition import relative_heights as relative_heights
+from .decomposition import richardson_lucy as richardson_lucy
+from .decomposition import wiener as wiener
 from .result import Retrieval as Retrieval
 from .result import Step as Step
 from .retrieval import retrieve as retrieve
