@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from .._vector import Scalar, Vec, along, scale
+from .._vector import Scalar, Vec, along, scale, vec
 from ..constants import SPEED_OF_LIGHT
 from ..layout import Bins, Layout
 from ..materials import Specular
@@ -28,7 +28,7 @@ from .histories import Histories
 from .march import FAR, Medium, advance, begin, cell_of, hold_in_columns
 from .surfaces import Surface
 
-CHUNK = 256
+CHUNK = 512
 FACET_BACKSCATTER = 2.0 / 3.0
 ISOTROPIC_BACKSCATTER = 0.25
 
@@ -178,38 +178,33 @@ def first_order(
         escaped = jnp.zeros((count,), energy.dtype)
         at_stops, total = [jnp.zeros_like(energy) for _ in met], jnp.zeros_like(energy)
 
-        def deposit(medium: Medium, stretch: Stretches):
-            """One stretch of all rays: (slot, first bin, pieces) that return, (slot, weight) that arrive."""
-            k = stretch.extinction
-            low = bins.position(2.0 * (excess + stretch.start) / SPEED_OF_LIGHT)
-            first, pieces = _stretch_pieces(bins, low, stretch, kappa)
-            passing = jnp.exp(-stretch.depth) * mean_decay(k * stretch.length) * stretch.length
-            middle = stretch.start + 0.5 * stretch.length
-            returned, arriving = [], []
-            for m, part in _parts(medium, layout, stretch, w):
-                value = part.extinction * (part.backscatter * visible)
-                for history, share in both_ways.terms(table, int(successor[0, part.letter]), middle, met):
-                    slot = jnp.broadcast_to(m * count + history, first.shape)
-                    returned.append((slot, first, [p * (value * share) for p in pieces]))
-                for history, share in out_way.terms(table, 0, middle, met):
-                    weight = part.extinction * passing * share * energy
-                    arriving.append(_together(m * count + history, weight))
-            return returned, arriving
-
         if medium is not None:
             step = jnp.asarray(layout.max_step, energy.dtype)
             # Stretches stay along the first axis, where the march leaves them: turning them costs as much.
             march = jax.vmap(march_ray, (None, 0, 0, 0, 0, None, None), (1, 0, 0))
             stretch, at_stops, total = march(medium, x, w, stop, met, layout.first_steps, step)
-            returned, arriving = jax.vmap(deposit, (None, 0))(medium, stretch)
-            for slot, first, pieces in returned:
-                # Without the barrier, every element of the stack would evaluate all pieces anew.
-                row = jnp.stack(lax.optimization_barrier(pieces), axis=-1)
-                response = scatter_rows(response, slot, first, row)
+
+            def along_rays(a):
+                return jnp.broadcast_to(a, stretch.start.shape)
+
+            way, before = vec(along_rays(a) for a in w), [along_rays(m) for m in met]
+            k, power = stretch.extinction, along_rays(energy)
+            low = bins.position(2.0 * (along_rays(excess) + stretch.start) / SPEED_OF_LIGHT)
+            first, pieces = _stretch_pieces(bins, low, stretch, kappa)
+            passing = jnp.exp(-stretch.depth) * mean_decay(k * stretch.length) * stretch.length
+            middle = stretch.start + 0.5 * stretch.length
+            for m, part in _parts(medium, layout, stretch, way):
+                value = part.extinction * (part.backscatter * along_rays(visible))
+                for history, share in both_ways.terms(table, int(successor[0, part.letter]), middle, before):
+                    slot = jnp.broadcast_to(m * count + history, first.shape)
+                    row = jnp.moveaxis(pieces, 0, -1) * (value * share)[..., None]
+                    response = scatter_rows(response, slot, first, row)
+                for history, share in out_way.terms(table, 0, middle, before):
+                    weight = part.extinction * passing * share * power
+                    slot, weight = _together(m * count + history, weight)
+                    arrived = arrived.at[slot].add(weight)
             # Smoothing is linear: the sum once instead of every stretch.
             response = smooth_row(response)[:, 1:-1]
-            for slot, weight in arriving:
-                arrived = arrived.at[slot].add(weight)
 
         for i, (s, law) in enumerate(zip(surfaces, layout.surfaces)):
             hit = jnp.where((met[i] <= stop) & (met[i] < FAR), s.coverage * energy, 0.0)
@@ -248,8 +243,8 @@ def first_order(
 
 
 def _stretch_pieces(
-    bins: Bins, low: Float[Array, "rays"], stretch: Stretches, kappa: float
-) -> tuple[Int[Array, "rays"], list[Float[Array, "rays"]]]:
+    bins: Bins, low: Float[Array, "steps rays"], stretch: Stretches, kappa: float
+) -> tuple[Int[Array, "steps rays"], Float[Array, "pieces steps rays"]]:
     """First bin, and for it and those behind it the integral of exp(-kappa tau) ds over each stretch.
 
     `low` is the position of the start of each stretch on the axis of bins.
@@ -257,21 +252,23 @@ def _stretch_pieces(
     metres = 0.5 * SPEED_OF_LIGHT * bins.width
     high = low + stretch.length / metres
     number = jnp.round(lax.stop_gradient(low))
-    clear, start = jnp.exp(-kappa * stretch.depth), low
-    pieces = []
-    for j in range(bins.row - 2):
+    # Rows of an even length are added faster; a piece beyond the end is zero.
+    count = bins.row - 2 + bins.row % 2
+
+    def piece(carry, j):
+        clear, start = carry
         end = jnp.clip(number + (j + 0.5), low, high)
         length = (end - start) * metres
         passing, mean = _decay(kappa * stretch.extinction * length)
-        pieces.append(clear * mean * length)
-        clear, start = clear * passing, end
-    if len(pieces) % 2:
-        # Rows of an even length are stacked and added an eighth faster.
-        pieces.append(jnp.zeros_like(low))
-    return first_bin(bins, number, len(pieces)), pieces
+        return (clear * passing, end), clear * mean * length
+
+    # A scan, so that each piece is computed once: unrolled, compilers compute them anew for every element.
+    start = (jnp.exp(-kappa * stretch.depth), low)
+    _, pieces = lax.scan(piece, start, jnp.arange(count, dtype=low.dtype))
+    return first_bin(bins, number, count), pieces
 
 
-def _together(slot: Int[Array, "rays"] | int, weight: Float[Array, "rays"]):
+def _together(slot: Int[Array, "*s"] | int, weight: Float[Array, "*s"]):
     """Slots and weights to add; one sum where all rays have the same slot."""
     return (slot, jnp.sum(weight)) if isinstance(slot, int) else (slot, weight)
 
