@@ -37,7 +37,7 @@ STAGES = [
     {"plan"},
     {"trace"},
     {"waveform"},
-    {"simulate"},
+    {"simulate", "analog"},
     {"plot", "plot_trees", "demo", "cli"},
 ]
 

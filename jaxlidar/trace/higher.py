@@ -23,16 +23,16 @@ from ..constants import SPEED_OF_LIGHT
 from ..layout import Bins, Layout
 from .deposit import instant_row, scatter_rows
 from .draws import draws
+from .flight import DIMENSIONS, events_of, fly, nearest, plates_ahead
 from .footprint import GOLDEN, Beam, quantile_radius
 from .histories import Histories
 from .landing import aim
 from .march import FAR, Medium, depth_to_top, free_flight, hold_in_columns
-from .photons import EVENT, GAP, THROUGH, Hit, Photons, Setting, ratio_of, stop
+from .photons import THROUGH, Hit, Photons, Setting, ratio_of, stop
 from .scatter import collide, view_factors
 from .surfaces import Surface
 
 CHUNK = 512
-_DIMENSIONS = 6
 
 
 class HigherOrders(eqx.Module):
@@ -59,7 +59,7 @@ def higher_orders(
     """Trace `photons` photons through up to `layout.orders` scatterings; sums are means per photon."""
     footprint_key, draw_key = jax.random.split(key)
     plates = [i for i, s in enumerate(surfaces) if s.plate]
-    numbers = draws(draw_key, layout.orders, _DIMENSIONS + 2 * len(plates))
+    numbers = draws(draw_key, layout.orders, DIMENSIONS + 2 * len(plates))
     shift = jax.random.uniform(footprint_key, (2,))
     setting = Setting(beam, medium, surfaces, layout, table, bins)
     size = min(CHUNK, photons)
@@ -110,47 +110,19 @@ def higher_orders(
 def _one_order(setting: Setting, p: Photons, tally: HigherOrders, u: list[Scalar], order: Int[Array, ""]):
     """Fly, collide, deposit, scatter."""
     layout = setting.layout
-    met, outcomes, ratio = _plates_ahead(setting, p, u)
-    events = [
-        d if not s.plate else jnp.where(o == EVENT, d, FAR)
-        for d, s, o in zip(met, setting.surfaces, outcomes)
-    ]
-    limit = jnp.full_like(p.weight, FAR)
-    for d in events:
-        limit = jnp.minimum(limit, d)
+    met, outcomes, ratio = plates_ahead(setting, p, u[DIMENSIONS:])
+    events = events_of(setting, met, outcomes)
+    limit = nearest(p, events)
     budget = jnp.maximum(layout.max_path - p.path, 0.0)
     if setting.medium is not None and setting.surfaces:
         w, limit, turned = aim(setting, p, limit, events, (order > 0) & (limit < budget))
         p = eqx.tree_at(lambda p: (p.w, p.weight), p, (w, p.weight * turned))
-
-    # Free flight.
-    if setting.medium is None:
-        collided = jnp.zeros_like(p.alive)
-        distance, density = jnp.minimum(limit, budget), jnp.ones_like(p.weight)
-        in_medium = collided
-        cell = jnp.zeros_like(p.history)
-    else:
-        target = -jnp.log(u[0])
-        free = free_flight(
-            setting.medium, p.x, p.w, target, jnp.minimum(limit, budget), p.alive, layout.march_steps
-        )
-        collided, cell = free.collided, free.cell
-        k = jnp.where(collided, setting.medium.extinction(cell, p.w), 1.0)
-        chord = jnp.where(collided, free.chord, 1.0)
-        part = jnp.clip((target - free.depth) / jnp.maximum(k * chord, 1e-30), 0.0, 1.0)
-        part = stop(jnp.where(collided, part, 0.0))
-        depth = free.depth + jnp.where(collided, part * k * chord, 0.0)
-        distance = jnp.where(collided, free.entered + part * chord, jnp.minimum(limit, budget))
-        density = jnp.exp(stop(depth) - depth) * chord / stop(chord)
-        in_medium = ~collided & (free.entered >= budget)
-    landed = p.alive & ~collided & (limit < budget)
-    collided = p.alive & collided
-    event = collided | landed
-    late = p.alive & ~event & ((limit < FAR) | in_medium)
-    escaped = p.alive & ~event & ~late
+    flight = fly(setting, p, limit, budget, u[0])
+    collided, landed, distance = flight.collided, flight.landed, flight.distance
+    event = flight.event
 
     # Plates that were passed on the way.
-    weight, history = p.weight * density, p.history
+    weight, history = p.weight * flight.density, p.history
     for i, (s, d, o) in enumerate(zip(setting.surfaces, met, outcomes)):
         if not s.plate:
             continue
@@ -169,14 +141,14 @@ def _one_order(setting: Setting, p: Photons, tally: HigherOrders, u: list[Scalar
         lambda t: (t.escaped, t.late),
         tally,
         (
-            tally.escaped.at[history].add(jnp.where(escaped, held, 0.0)),
-            tally.late.at[history].add(jnp.where(late, held, 0.0)),
+            tally.escaped.at[history].add(jnp.where(flight.escaped, held, 0.0)),
+            tally.late.at[history].add(jnp.where(flight.late, held, 0.0)),
         ),
     )
 
     x = along(p.x, p.w, jnp.where(event, distance, 0.0))
     path = p.path + jnp.where(event, distance, 0.0)
-    hit = collide(setting, p.w, cell, collided, landed, events, limit, u)
+    hit = collide(setting, p.w, flight.cell, collided, landed, events, limit, u)
     weight = jnp.where(event, weight, 0.0)
     tally = _arrive(tally, hit.material, history, weight)
     weight = weight * hit.ratio
@@ -195,27 +167,6 @@ def _arrive(tally: HigherOrders, material: Array | int, history: Array, weight: 
 
 def _leave(tally: HigherOrders, material: Array | int, history: Array, weight: Scalar) -> HigherOrders:
     return eqx.tree_at(lambda t: t.left, tally, tally.left.at[material, history].add(stop(weight)))
-
-
-def _plates_ahead(setting: Setting, p: Photons, u: list[Scalar]):
-    """Distance to each surface, what will happen at each plate, and the density ratio of that."""
-    met, outcomes, ratios = [], [], []
-    drawn = iter(u[_DIMENSIONS:])
-    for i, s in enumerate(setting.surfaces):
-        met.append(jnp.where(p.on == i, FAR, s.distance(p.x, p.w)))
-        if not s.plate:
-            outcomes.append(None)
-            ratios.append(None)
-            continue
-        v, c = next(drawn), jnp.broadcast_to(s.coverage, p.weight.shape)
-        hit = v < c
-        outcome = jnp.where(hit, EVENT, GAP)
-        if s.straight and setting.layout.surfaces[i].transmitted >= 0:
-            # The lobe is chosen with the number that decided that the plate was hit.
-            outcome = jnp.where(hit & (v >= c * setting.layout.lobe), THROUGH, outcome)
-        outcomes.append(outcome)
-        ratios.append(ratio_of(jnp.where(hit, c, 1.0 - c)))
-    return met, outcomes, ratios
 
 
 def _deposit(
@@ -241,7 +192,7 @@ def _deposit(
     else:
         far = jnp.full_like(path, FAR)
         clear = jnp.exp(-free_flight(medium, x, v, far, far, weight > 0, layout.march_steps).depth)
-    drawn = iter(u[_DIMENSIONS + sum(s.plate for s in setting.surfaces) :])
+    drawn = iter(u[DIMENSIONS + sum(s.plate for s in setting.surfaces) :])
     for i, (s, scatterer) in enumerate(zip(setting.surfaces, layout.surfaces)):
         if not s.plate:
             continue

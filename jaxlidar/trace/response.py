@@ -21,7 +21,7 @@ from .higher import higher_orders
 from .histories import Histories, histories
 from .march import Medium, medium_of
 from .mirror import mirror_rays
-from .surfaces import surfaces_of
+from .surfaces import Surface, surfaces_of
 
 
 class Response(eqx.Module):
@@ -43,6 +43,19 @@ class Response(eqx.Module):
     remaining: Float[Array, "histories"]
 
 
+def geometry_of(
+    lidar: Lidar, scene: Scene, leaf_transmittance: Float[Array, ""] | float
+) -> tuple[Beam, Medium | None, tuple[Surface, ...]]:
+    """Beam, voxels and planes relative to where the beam's axis meets the reference plane."""
+    aim = jnp.concatenate([lidar.position, jnp.zeros_like(lidar.position[:1])])
+    medium = None
+    if scene.canopy is not None:
+        straight = scene.canopy.transmission == "straight"
+        factor = jnp.asarray(1.0 - leaf_transmittance if straight else 1.0)
+        medium = medium_of(scene.canopy.voxels, aim, scene.canopy.sides == "periodic", factor)
+    return beam_of(lidar), medium, surfaces_of(scene, aim)
+
+
 def trace(
     lidar: Lidar,
     scene: Scene,
@@ -56,13 +69,7 @@ def trace(
     where the canopy's transmission is straight; extinction is then scaled by one minus it.
     """
     layout, bins = plan.layout, plan.bins
-    aim = jnp.concatenate([lidar.position, jnp.zeros_like(lidar.position[:1])])
-    beam, surfaces = beam_of(lidar), surfaces_of(scene, aim)
-    medium = None
-    if scene.canopy is not None:
-        straight = scene.canopy.transmission == "straight"
-        factor = jnp.asarray(1.0 - leaf_transmittance if straight else 1.0)
-        medium = medium_of(scene.canopy.voxels, aim, scene.canopy.sides == "periodic", factor)
+    beam, medium, surfaces = geometry_of(lidar, scene, leaf_transmittance)
     table = histories(len(layout.letters), plan.degree)
     short = histories(len(layout.letters), plan.first_degree)
     shift_key, photon_key = jax.random.split(key)

@@ -1,0 +1,104 @@
+"""Flights: what a photon meets next, and how far it gets."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from .._vector import Scalar
+from .march import FAR, free_flight
+from .photons import EVENT, GAP, THROUGH, Photons, Setting, ratio_of, stop
+
+# Random numbers of a flight and of the collision that ends it, beside one for each plate.
+DIMENSIONS = 6
+
+
+class Flight(eqx.Module):
+    """How flights end: in the medium, on a surface, after the window, or never.
+
+    - `cell`: the last voxel. - `distance`: flown, m. - `density`: ratio of the density of that distance.
+    """
+
+    collided: Bool[Array, "photons"]
+    landed: Bool[Array, "photons"]
+    late: Bool[Array, "photons"]
+    escaped: Bool[Array, "photons"]
+    cell: Int[Array, "photons"]
+    distance: Float[Array, "photons"]
+    density: Float[Array, "photons"]
+
+    @property
+    def event(self) -> Bool[Array, "photons"]:
+        """Whether anything was hit."""
+        return self.collided | self.landed
+
+
+def fly(
+    setting: Setting,
+    p: Photons,
+    limit: Float[Array, "photons"],
+    budget: Float[Array, "photons"],
+    u: Float[Array, "photons"],
+) -> Flight:
+    """Let photons fly to a collision at the optical depth -log(u), to a surface at `limit`, or on.
+
+    `budget`: m that are left of the window.
+    """
+    reach = jnp.minimum(limit, budget)
+    if setting.medium is None:
+        collided = in_medium = jnp.zeros_like(p.alive)
+        distance, density = reach, jnp.ones_like(p.weight)
+        cell = jnp.zeros_like(p.history)
+    else:
+        target = -jnp.log(u)
+        free = free_flight(setting.medium, p.x, p.w, target, reach, p.alive, setting.layout.march_steps)
+        collided, cell = free.collided, free.cell
+        k = jnp.where(collided, setting.medium.extinction(cell, p.w), 1.0)
+        chord = jnp.where(collided, free.chord, 1.0)
+        part = jnp.clip((target - free.depth) / jnp.maximum(k * chord, 1e-30), 0.0, 1.0)
+        part = stop(jnp.where(collided, part, 0.0))
+        depth = free.depth + jnp.where(collided, part * k * chord, 0.0)
+        distance = jnp.where(collided, free.entered + part * chord, reach)
+        density = jnp.exp(stop(depth) - depth) * chord / stop(chord)
+        in_medium = ~collided & (free.entered >= budget)
+    landed = p.alive & ~collided & (limit < budget)
+    collided = p.alive & collided
+    nothing = p.alive & ~collided & ~landed
+    late = nothing & ((limit < FAR) | in_medium)
+    return Flight(collided, landed, late, nothing & ~late, cell, distance, density)
+
+
+def events_of(setting: Setting, met: list[Scalar], outcomes: list) -> list[Scalar]:
+    """Distance to each surface if the photon will stop there, else FAR."""
+    return [
+        d if not s.plate else jnp.where(o == EVENT, d, FAR)
+        for d, s, o in zip(met, setting.surfaces, outcomes)
+    ]
+
+
+def nearest(p: Photons, events: list[Scalar]) -> Scalar:
+    """Distance to the nearest surface at which the photon stops."""
+    limit = jnp.full_like(p.weight, FAR)
+    for d in events:
+        limit = jnp.minimum(limit, d)
+    return limit
+
+
+def plates_ahead(setting: Setting, p: Photons, u: list[Scalar]):
+    """Distance to each surface, what will happen at each plate, and the density ratio of that."""
+    met, outcomes, ratios = [], [], []
+    drawn = iter(u)
+    for i, s in enumerate(setting.surfaces):
+        met.append(jnp.where(p.on == i, FAR, s.distance(p.x, p.w)))
+        if not s.plate:
+            outcomes.append(None)
+            ratios.append(None)
+            continue
+        v, c = next(drawn), jnp.broadcast_to(s.coverage, p.weight.shape)
+        hit = v < c
+        outcome = jnp.where(hit, EVENT, GAP)
+        if s.straight and setting.layout.surfaces[i].transmitted >= 0:
+            # The lobe is chosen with the number that decided that the plate was hit.
+            outcome = jnp.where(hit & (v >= c * setting.layout.lobe), THROUGH, outcome)
+        outcomes.append(outcome)
+        ratios.append(ratio_of(jnp.where(hit, c, 1.0 - c)))
+    return met, outcomes, ratios

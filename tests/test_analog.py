@@ -1,0 +1,78 @@
+"""The estimator that the paper describes, against the closed form and against `simulate`."""
+
+import jax
+import numpy as np
+import pytest
+from helpers import agrees, slab
+
+import jaxlidar as jl
+
+LIDAR = jl.Lidar(altitude=1000.0, divergence=1.0)
+CONE = 8.0
+
+
+def total(lidar, scene, photons, *, seed=0, cone=CONE, **planned):
+    """Mean and standard error of the apparent reflectance, by independent photons."""
+    plan = jl.plan(lidar, scene, **planned)
+    returns = jl.analog_returns(lidar, scene, plan, key=jax.random.key(seed), n_photons=photons, cone=cone)
+    weight = np.asarray(returns.weight, float)
+    assert np.all(np.isfinite(weight))
+    assert np.all(np.isfinite(returns.time))
+    return weight.mean(axis=1), weight.std(axis=1, ddof=1) / np.sqrt(photons)
+
+
+def test_a_level_lambertian_ground_returns_its_reflectance():
+    value, stderr = total(LIDAR, jl.Scene(ground=jl.Ground(reflectance=0.5)), 40_000)
+    assert agrees(value, stderr, 0.5)
+    assert not agrees(value, stderr, 0.55)
+
+
+def test_returns_arrive_when_light_does():
+    scene = jl.Scene(ground=jl.Ground(height=-3.0, reflectance=0.5))
+    plan = jl.plan(LIDAR, scene)
+    returns = jl.analog_returns(LIDAR, scene, plan, key=jax.random.key(0), n_photons=2000)
+    there = np.asarray(returns.weight[0]) > 0
+    assert np.allclose(np.asarray(returns.time)[there], 2 * 3.0 / 0.299792458, atol=0.01)
+
+
+def test_a_plate_over_ground_agrees_with_simulate():
+    lidar = jl.Lidar(wavelength=(532.0, 1064.0))
+    plate = jl.Plate(height=2.0, reflectance=[0.36, 0.66], transmittance=[0.08, 0.30])
+    scene = jl.Scene(plates=(plate,), ground=jl.Ground(reflectance=[0.10, 0.75]))
+    value, stderr = total(lidar, scene, 200_000, max_orders=8)
+    wave = jl.simulate(lidar, scene, key=jax.random.key(1), rtol=0.003, max_orders=8)
+    expected = np.sum(wave.reflectance, axis=1)
+    assert agrees(value, stderr, expected)
+    # The plate alone.
+    assert not agrees(value, stderr, [0.36, 0.66])
+
+
+@pytest.mark.parametrize("transmission", ["diffuse", "straight"])
+def test_a_slab_agrees_with_simulate(transmission):
+    leaf = jl.LeafOptics(reflectance=0.45, transmittance=0.35)
+    canopy = jl.Canopy(slab(leaf=1.0), leaf=leaf, transmission=transmission, sides="periodic")
+    scene = jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=0.4))
+    value, stderr = total(LIDAR, scene, 150_000, max_orders=8)
+    wave = jl.simulate(LIDAR, scene, key=jax.random.key(1), rtol=0.01, max_orders=8)
+    expected = float(np.sum(wave.reflectance))
+    # The hot-spot-free way back varies over the cone by a per cent at most.
+    assert agrees(value, stderr + 0.003 * expected, expected)
+    assert not agrees(value, stderr + 0.003 * expected, float(np.sum(wave.components["first"])))
+
+
+def test_bad_input_is_refused():
+    scene = jl.Scene(ground=jl.Ground())
+    plan = jl.plan(LIDAR, scene)
+    for cone in (0.0, 91.0, np.nan):
+        with pytest.raises(ValueError, match="cone"):
+            jl.analog_returns(LIDAR, scene, plan, key=jax.random.key(0), n_photons=10, cone=cone)
+    with pytest.raises(ValueError, match="n_photons"):
+        jl.analog_returns(LIDAR, scene, plan, key=jax.random.key(0), n_photons=0)
+    leaf = jl.LeafOptics(reflectance=0.45, transmittance=0.35)
+    hot = jl.Scene(canopy=jl.Canopy(slab(leaf=1.0), leaf=leaf, hotspot=True))
+    with pytest.raises(ValueError, match="hotspot"):
+        jl.analog_returns(LIDAR, hot, jl.plan(LIDAR, hot), key=jax.random.key(0), n_photons=10)
+    straight = jl.Scene(canopy=jl.Canopy(slab(leaf=1.0), leaf=leaf, transmission="straight"))
+    two = jl.Lidar(wavelength=(532.0, 1064.0))
+    with pytest.raises(ValueError, match="straight"):
+        jl.analog_returns(two, straight, jl.plan(two, straight), key=jax.random.key(0), n_photons=10)
