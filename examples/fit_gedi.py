@@ -32,7 +32,7 @@ import numpy as np
 import inversion
 import jaxlidar as jl
 from inversion import Unknown
-from jaxlidar.io import read_gedi_l1b
+from jaxlidar.io import read_gedi_l1b, whole_file
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -214,8 +214,8 @@ def draw(shot, result, reference, number, path):
     )
     right.set(xlabel="plant area density\n(m²/m³)", xlim=(0, None))
     left.set_ylim(found["ground"][0] - 6, max(found["highest return"][0], found["canopy top"][0]) + 6)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=130)
+    with whole_file(path) as draft:
+        figure.savefig(draft, format="png", dpi=130)
     plt.close(figure)
 
 

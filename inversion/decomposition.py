@@ -144,12 +144,14 @@ def _decompose(t: Samples, y: Samples, sigma: Samples, width: Array, most: int) 
     natural = jnp.stack([jnp.full_like(a, scale), jnp.full_like(a, width), slope], axis=1)
     stderr = jnp.sqrt(jnp.maximum(variance, 0.0)).reshape(-1, 3) * natural
     return Echoes(
-        *(jnp.where(on, v, 0.0) for v in (a, centre, wide)),
-        jnp.where(on[:, None], stderr, 0.0),
-        jnp.sum(on),
-        model(p, on),
-        chi2[best],
-        criterion[best],
+        amplitude=jnp.where(on, a, 0.0),
+        time=jnp.where(on, centre, 0.0),
+        width=jnp.where(on, wide, 0.0),
+        stderr=jnp.where(on[:, None], stderr, 0.0),
+        count=jnp.sum(on),
+        model=model(p, on),
+        chi2=chi2[best],
+        criterion=criterion[best],
     )
 
 

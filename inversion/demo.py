@@ -5,7 +5,6 @@ Crown shape and the places of its clumps are taken as known; what is retrieved i
 
 import argparse
 import dataclasses
-import os
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -22,6 +21,7 @@ import jaxlidar as jl
 import jaxlidar.plot
 from jaxlidar.cli import CommandError
 from jaxlidar.demo import HEIGHT, LEAF_AREA, WAVELENGTHS, demo_lidar, demo_scene
+from jaxlidar.io import whole_file
 
 from .result import Retrieval
 from .retrieval import retrieve
@@ -227,13 +227,9 @@ def retrieval_figure(
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a PNG under a temporary name beside `path`, then rename it."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        figure.savefig(temporary, format="png", dpi=RESOLUTION)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    """Write a PNG, whole or not at all."""
+    with whole_file(path) as draft:
+        figure.savefig(draft, format="png", dpi=RESOLUTION)
 
 
 def _print_waveform(wave: jl.Waveform) -> None:

@@ -6,6 +6,7 @@ optics and geometry -> scene -> plan -> trace -> response -> waveform; fits are 
 from ._coefficients import load_coefficients as load_coefficients
 from .analog import AnalogReturns as AnalogReturns
 from .analog import analog_returns as analog_returns
+from .analog import photon_paths as photon_paths
 from .atmosphere import Atmosphere as Atmosphere
 from .forest import forest as forest
 from .habits import Branching as Branching

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from ._checks import check_range
 from ._vector import along, dot, vec
@@ -66,56 +66,93 @@ def analog_returns(
     """
     check_range("cone", cone, 0.0, 90.0, low_open=True)
     check_range("n_photons", n_photons, 1)
-    if scene.canopy is not None and scene.canopy.hotspot:
-        raise ValueError("hotspot = True; admissible is False: the way back is independent of the way in")
-    transmittance = 0.0
-    if is_straight(scene):
-        assert scene.canopy is not None
-        if lidar.wavelength.size > 1:
-            raise ValueError(
-                f"wavelength has {lidar.wavelength.size} values; 1 where transmission is straight"
-            )
-        transmittance = leaf_optics(scene.canopy, lidar.wavelength)[1][0]
-    beam, medium, surfaces = geometry_of(lidar, scene, transmittance)
-    table = histories(len(plan.layout.letters), plan.degree)
-    setting = Setting(beam, medium, surfaces, plan.layout, table, plan.bins)
+    setting = _setting(lidar, scene, plan)
+    monomials = setting.table.monomials(optics(lidar, scene, plan))
     size = min(CHUNK, n_photons)
-    monomials = table.monomials(optics(lidar, scene, plan))
 
     def chunk(key: PRNGKeyArray) -> tuple[Array, Array]:
-        radius_key, turn_key, key = jax.random.split(key, 3)
-        r = quantile_radius(beam, jax.random.uniform(radius_key, (size,), maxval=1.0 - 1e-7))
-        turn = 2 * jnp.pi * jax.random.uniform(turn_key, (size,))
-        point, w, excess = beam.ray((r * jnp.cos(turn), r * jnp.sin(turn)))
-        up = jnp.asarray(-plan.layout.upstream, r.dtype)
-        none = jnp.zeros((size,), jnp.int32)
-        still = vec(jnp.zeros_like(r) for _ in range(3))
-        start = Photons(
-            along(point, w, up), w, excess + up, jnp.ones_like(r), none, none - 1, still, none == 0
-        )
+        start_key, key = jax.random.split(key)
+        start = _start(setting, size, start_key)
 
         def order(carry, n):
             def go(carry):
-                photons, time, value, history = carry
-                return _one_flight(setting, photons, time, value, history, jax.random.fold_in(key, n), cone)
+                onward, arrived = _one_flight(setting, carry[0], jax.random.fold_in(key, n), cone)
+                return onward, jax.tree.map(
+                    lambda a, b: jnp.where(arrived.value > 0, a, b), arrived, carry[1]
+                )
 
             return lax.cond(jnp.any(carry[0].alive), go, lambda c: c, carry), None
 
+        none = _Arrival(jnp.zeros((size,)), jnp.zeros((size,)), start.history)
         # One flight more than scatterings, to leave the scene.
-        flights = jnp.arange(plan.orders + 1)
-        nothing = (start, jnp.zeros_like(r), jnp.zeros_like(r), none)
-        (_, time, value, history), _ = lax.scan(order, nothing, flights)
-        return time, monomials[history].T * value[None, :]
+        (_, arrived), _ = lax.scan(order, (start, none), jnp.arange(plan.orders + 1))
+        return arrived.time, monomials[arrived.history].T * arrived.value[None, :]
 
     time, weight = lax.map(chunk, jax.random.split(key, -(-n_photons // size)))
     weight = jnp.moveaxis(weight, 1, 0)
     return AnalogReturns(time.reshape(-1)[:n_photons], weight.reshape(weight.shape[0], -1)[:, :n_photons])
 
 
-def _one_flight(
-    setting: Setting, p: Photons, time: Array, value: Array, history: Array, key: Array, cone: float
-):
-    """Fly, be counted if that leads out of the scene to the sensor, else collide and scatter."""
+@eqx.filter_jit
+def photon_paths(
+    lidar: Lidar, scene: Scene, plan: Plan, *, key: PRNGKeyArray, n_photons: int, leaving: float = 5.0
+) -> Float[Array, "photons points 3"]:
+    """Where photons are sent from, where they collide, and `leaving` metres (default 5) of their way out.
+
+    For drawings. They start above the scene; a photon that has collided for the last time stays where it is
+    then. Arguments and errors as for `analog_returns`.
+    """
+    check_range("n_photons", n_photons, 1)
+    setting = _setting(lidar, scene, plan)
+    start_key, key = jax.random.split(key)
+    start = _start(setting, n_photons, start_key)
+
+    def order(p, n):
+        onward, _ = _one_flight(setting, p, jax.random.fold_in(key, n), 90.0)
+        out = along(p.x, p.w, jnp.where(p.alive & ~onward.alive, leaving, 0.0))
+        return onward, jnp.stack([jnp.where(onward.alive, a, b) for a, b in zip(onward.x, out)], axis=-1)
+
+    _, points = lax.scan(order, start, jnp.arange(plan.orders + 1))
+    points = jnp.concatenate([jnp.stack(start.x, axis=-1)[None], points])
+    aim = jnp.concatenate([lidar.position, jnp.zeros_like(lidar.position[:1])])
+    return jnp.moveaxis(points, 0, 1) + aim[None, None, :]
+
+
+class _Arrival(eqx.Module):
+    """Of photons at the sensor; `value` is zero for those that are not there."""
+
+    time: Float[Array, "photons"]
+    value: Float[Array, "photons"]
+    history: Int[Array, "photons"]
+
+
+def _setting(lidar: Lidar, scene: Scene, plan: Plan) -> Setting:
+    if scene.canopy is not None and scene.canopy.hotspot:
+        raise ValueError("hotspot = True; admissible is False: the way back is independent of the way in")
+    transmittance = 0.0
+    if is_straight(scene):
+        assert scene.canopy is not None
+        if lidar.wavelength.size > 1:
+            raise ValueError(f"wavelength has {lidar.wavelength.size} values; 1 if transmission is straight")
+        transmittance = leaf_optics(scene.canopy, lidar.wavelength)[1][0]
+    beam, medium, surfaces = geometry_of(lidar, scene, transmittance)
+    table = histories(len(plan.layout.letters), plan.degree)
+    return Setting(beam, medium, surfaces, plan.layout, table, plan.bins)
+
+
+def _start(setting: Setting, size: int, key: PRNGKeyArray) -> Photons:
+    radius_key, turn_key = jax.random.split(key)
+    r = quantile_radius(setting.beam, jax.random.uniform(radius_key, (size,), maxval=1.0 - 1e-7))
+    turn = 2 * jnp.pi * jax.random.uniform(turn_key, (size,))
+    point, w, excess = setting.beam.ray((r * jnp.cos(turn), r * jnp.sin(turn)))
+    up = jnp.asarray(-setting.layout.upstream, r.dtype)
+    none = jnp.zeros((size,), jnp.int32)
+    still = vec(jnp.zeros_like(r) for _ in range(3))
+    return Photons(along(point, w, up), w, excess + up, jnp.ones_like(r), none, none - 1, still, none == 0)
+
+
+def _one_flight(setting: Setting, p: Photons, key: PRNGKeyArray, cone: float) -> tuple[Photons, _Arrival]:
+    """Fly, arrive if that leads out of the scene to the sensor, else collide and scatter."""
     beam, layout = setting.beam, setting.layout
     plates = sum(s.plate for s in setting.surfaces)
     tiny = jnp.finfo(p.weight.dtype).tiny
@@ -135,9 +172,7 @@ def _one_flight(
     back = flight.escaped & (dot(p.w, beam.view(p.x)) > jnp.cos(jnp.deg2rad(cone)))
     # So that a level Lambertian surface returns its reflectance.
     share = weight * beam.in_view(p.x) / jnp.sin(jnp.deg2rad(cone)) ** 2
-    time = jnp.where(back, (p.path + out) / SPEED_OF_LIGHT, time)
-    value = jnp.where(back, share, value)
-    history = jnp.where(back, letters, history)
+    arrived = _Arrival((p.path + out) / SPEED_OF_LIGHT, jnp.where(back, share, 0.0), letters)
 
     event = flight.event
     flown = jnp.where(event, flight.distance, 0.0)
@@ -153,4 +188,4 @@ def _one_flight(
         hit.facing,
         event,
     )
-    return onward, time, value, history
+    return onward, arrived

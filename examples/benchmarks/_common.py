@@ -11,6 +11,8 @@ from pathlib import Path
 import jax
 import matplotlib
 
+from jaxlidar.io import whole_file
+
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
@@ -72,11 +74,9 @@ def best(times: Mapping[str, list[float]]) -> dict[str, float]:
 
 
 def write_json(path: Path, record: Mapping[str, object]) -> None:
-    """Write under another name first: whoever reads finds the old record or the new one, never half."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_name(path.name + ".tmp")
-    draft.write_text(json.dumps(record, indent=2) + "\n")
-    draft.replace(path)
+    """Write a record, whole or not at all."""
+    with whole_file(path) as draft:
+        draft.write_text(json.dumps(record, indent=2) + "\n")
 
 
 def new_figure(columns: int = 1, size: tuple[float, float] = (6, 4)):
@@ -86,11 +86,9 @@ def new_figure(columns: int = 1, size: tuple[float, float] = (6, 4)):
 
 def save_figure(figure, path: Path) -> None:
     """Write a figure as PNG, whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_name(path.name + ".tmp")
-    figure.savefig(draft, dpi=150, format="png")
+    with whole_file(path) as draft:
+        figure.savefig(draft, dpi=150, format="png")
     plt.close(figure)
-    draft.replace(path)
 
 
 def print_table(header: tuple[str, ...], rows: list[tuple]) -> None:

@@ -1,7 +1,6 @@
 """Full leaf spectra in single precision: time per leaf against looping `prosail`, and of the whole Jacobian.
 
-Run it as `python examples/benchmarks/prospect_speed.py [folder]`. Writes `prospect_speed.json` and
-`prospect_speed.png` into the folder (default `figures/`). The three are timed in turn, round after round, so
+Run it as `python examples/benchmarks/prospect_speed.py [--out figures]`. The three are timed in turn, round after round, so
 that other work on the machine falls on all alike; ratios are those of the fastest rounds.
 
 On two cores of a shared machine: 30 to 40 us a leaf (2,101 wavelengths), 13 to 15 times faster than prosail
@@ -9,23 +8,13 @@ On two cores of a shared machine: 30 to 40 us a leaf (2,101 wavelengths), 13 to 
 100 leaves are best.
 """
 
-import argparse
-import json
-import os
-import platform
-import time
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
-import matplotlib
 import numpy as np
 import prosail
+from _common import best, machine, new_figure, options, race, save_figure, write_json
 
 import jaxlidar as jl
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 
 WAVELENGTHS = np.arange(400.0, 2501.0)
 BATCHES = (1, 5, 20, 100, 500)
@@ -40,12 +29,6 @@ def leaves(n: int) -> tuple[dict[str, np.ndarray], jl.Prospect]:
     return traits, batch
 
 
-def seconds(function, *arguments) -> float:
-    start = time.perf_counter()
-    jax.block_until_ready(function(*arguments))
-    return time.perf_counter() - start
-
-
 def loop(traits: dict[str, np.ndarray], n: int) -> list:
     names = {"N": "n", "Cab": "cab", "Car": "car", "Cant": "ant", "Cbrown": "cbrown", "Cw": "cw", "Cm": "cm"}
     return [
@@ -54,63 +37,47 @@ def loop(traits: dict[str, np.ndarray], n: int) -> list:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Speed of PROSPECT.")
-    parser.add_argument("folder", nargs="?", default="figures", type=Path)
-    parser.add_argument("--leaves", type=int, default=1000)
-    parser.add_argument("--rounds", type=int, default=9)
-    options = parser.parse_args()
-    n, looped = options.leaves, max(1, options.leaves // 20)
+    given = options("Speed of PROSPECT.", leaves=1000, rounds=9)
+    n, looped = given.leaves, max(1, given.leaves // 20)
     traits, batch = leaves(n)
 
-    spectra = {b: jax.jit(lambda x, b=b: jl.prospect_spectra(x, WAVELENGTHS, b)) for b in BATCHES}
-    jacobian = {b: jax.jit(lambda x, b=b: jl.prospect_jacobian(x, WAVELENGTHS, b)) for b in BATCHES}
-    for compiled in (*spectra.values(), *jacobian.values()):
-        seconds(compiled, batch)
-    seconds(loop, traits, 1)
+    contestants = {"prosail": lambda: loop(traits, looped)}
+    for b in BATCHES:
+        spectra = jax.jit(lambda x, b=b: jl.prospect_spectra(x, WAVELENGTHS, b))
+        jacobian = jax.jit(lambda x, b=b: jl.prospect_jacobian(x, WAVELENGTHS, b))
+        contestants[f"spectra {b}"] = lambda run=spectra: run(batch)
+        contestants[f"jacobian {b}"] = lambda run=jacobian: run(batch)
+    times = best(race(contestants, given.rounds))
+    each = {name: t / (looped if name == "prosail" else n) for name, t in times.items()}
 
-    times: dict[str, list[float]] = {}
-    for _ in range(options.rounds):
-        times.setdefault("prosail", []).append(seconds(loop, traits, looped) / looped)
-        for b in BATCHES:
-            times.setdefault(f"spectra {b}", []).append(seconds(spectra[b], batch) / n)
-            times.setdefault(f"jacobian {b}", []).append(seconds(jacobian[b], batch) / n)
-    best = {name: min(values) for name, values in times.items()}
-
-    R, T = spectra[100](batch)
+    R, T = jl.prospect_spectra(batch, WAVELENGTHS, 100)
     theirs = loop(traits, looped)
     error = max(float(abs(R[i] - r).max() + abs(T[i] - t).max()) for i, (_, r, t) in enumerate(theirs))
-    one, whole = (min(best[f"{kind} {b}"] for b in BATCHES) for kind in ("spectra", "jacobian"))
+    one, whole = (min(each[f"{kind} {b}"] for b in BATCHES) for kind in ("spectra", "jacobian"))
     record = {
-        "machine": {
-            "processor": platform.processor() or platform.machine(),
-            "cores": os.cpu_count(),
-            "device": str(jax.devices()[0]),
-            "python": platform.python_version(),
-            "jax": jax.__version__,
-        },
+        "machine": machine(),
         "leaves": n,
         "wavelengths": WAVELENGTHS.size,
-        "seconds_per_leaf": best,
+        "seconds_per_leaf": each,
         "largest_difference": error,
-        "times_faster_than_prosail": best["prosail"] / one,
+        "times_faster_than_prosail": each["prosail"] / one,
         "jacobian_over_evaluation": whole / one,
     }
-    options.folder.mkdir(parents=True, exist_ok=True)
-    (options.folder / "prospect_speed.json").write_text(json.dumps(record, indent=2) + "\n")
+    write_json(given.out / "prospect_speed.json", record)
 
-    figure, axes = plt.subplots(figsize=(6, 4), layout="constrained")
+    figure, axes = new_figure()
     for kind, label in (("spectra", "R and T"), ("jacobian", "with all derivatives")):
-        axes.loglog(BATCHES, [1e6 * best[f"{kind} {b}"] for b in BATCHES], "o-", label=label)
-    axes.axhline(1e6 * best["prosail"], color="black", linestyle="--", label="prosail, R and T")
+        axes.loglog(BATCHES, [1e6 * each[f"{kind} {b}"] for b in BATCHES], "o-", label=label)
+    axes.axhline(1e6 * each["prosail"], color="black", linestyle="--", label="prosail, R and T")
     axes.set(xlabel="leaves per batch", ylabel="time per leaf (µs)", title="PROSPECT-D, 2,101 wavelengths")
     axes.legend()
-    figure.savefig(options.folder / "prospect_speed.png", dpi=150)
+    save_figure(figure, given.out / "prospect_speed.png")
 
-    print(json.dumps(record["machine"]))
+    print(record["machine"])
     print(
-        f"µs a leaf: prosail {1e6 * best['prosail']:.0f}, R and T {1e6 * one:.1f}, Jacobian {1e6 * whole:.1f}"
+        f"µs a leaf: prosail {1e6 * each['prosail']:.0f}, R and T {1e6 * one:.1f}, Jacobian {1e6 * whole:.1f}"
     )
-    print(f"{best['prosail'] / one:.1f} times faster than looping prosail (wanted: 10)")
+    print(f"{each['prosail'] / one:.1f} times faster than looping prosail (wanted: 10)")
     print(f"full Jacobian {whole / one:.2f} times one evaluation (wanted: at most 3)")
     print(f"largest difference from prosail {error:.1e}")
 

@@ -6,3 +6,4 @@ from .las import PointCloud as PointCloud
 from .las import read_las as read_las
 from .qsm import read_qsm as read_qsm
 from .vox import read_vox as read_vox
+from .whole import whole_file as whole_file
