@@ -50,8 +50,9 @@ class Plan:
     sharpen: bool
     degree: int
     first_degree: int
-    rtol: float
-    effects: tuple[Effect, ...]
+    # What is compiled depends on neither.
+    rtol: float = dataclasses.field(compare=False)
+    effects: tuple[Effect, ...] = dataclasses.field(compare=False)
 
     @property
     def orders(self) -> int:

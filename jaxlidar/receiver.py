@@ -69,7 +69,7 @@ class Receiver(eqx.Module):
 
 
 def record(
-    energy: Float[Array, "*channels wavelengths bins"],
+    energy: Float[ArrayLike, "*channels wavelengths bins"],
     wavelength: ArrayLike | Sequence[ArrayLike],
     receiver: Receiver,
     *,
@@ -88,6 +88,7 @@ def record(
     were absent, and through the noise of a realisation with its draws held fixed (so not through Poisson
     counts).
     """
+    energy = as_array(energy)
     expected = energy + receiver.background
     value = expected
     if key is not None:
@@ -122,7 +123,7 @@ def _shot_noise(energy: Array, wavelength: ArrayLike | Sequence[ArrayLike], key:
 
 def first_return_window(
     time: ArrayLike,
-    energy: Float[Array, "*channels bins"],
+    energy: Float[ArrayLike, "*channels bins"],
     interval: float,
     threshold: ArrayLike = 0.0,
 ) -> tuple[Float[Array, " samples"], Float[Array, "*channels samples"]]:
@@ -147,6 +148,7 @@ def first_return_window(
     """
     check_range("interval", interval, 0.0, low_open=True)
     check_range("time", time)
+    energy = as_array(energy)
     centres = np.asarray(time, dtype=float)
     steps = np.diff(centres)
     if centres.ndim != 1 or centres.size < 2 or centres.size != energy.shape[-1]:
@@ -160,7 +162,6 @@ def first_return_window(
             f"time has a step of {worst:g}; admissible are even, positive steps ({step:g} on average)"
         )
 
-    energy = as_array(energy)
     ratio = interval / step
     samples = math.ceil(centres.size / ratio - 1e-6)
     lit = jnp.any(energy.reshape(-1, centres.size) > threshold, axis=0)

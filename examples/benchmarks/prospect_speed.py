@@ -1,7 +1,7 @@
 """Full leaf spectra in single precision: time per leaf against looping `prosail`, and of the whole Jacobian.
 
-Run it as `python examples/benchmarks/prospect_speed.py [--out figures]`. The three are timed in turn, round after round, so
-that other work on the machine falls on all alike; ratios are those of the fastest rounds.
+Run it as `python examples/benchmarks/prospect_speed.py [--out figures]`. The three are timed in turn, round
+after round, so that other work on the machine falls on all alike; ratios are those of the fastest rounds.
 
 On two cores of a shared machine: 30 to 40 us a leaf (2,101 wavelengths), 13 to 15 times faster than prosail
 (500 to 570 us); with all seven derivatives of reflectance and transmittance 1.7 times that. Batches of 5 to
