@@ -1,5 +1,8 @@
 """Retrievals: what a scene must be like for a lidar to have recorded a waveform."""
 
+from .batch import Progress as Progress
+from .batch import Retrievals as Retrievals
+from .batch import retrieve_many as retrieve_many
 from .decomposition import Echoes as Echoes
 from .decomposition import find_ground as find_ground
 from .decomposition import gap_probability as gap_probability
@@ -11,4 +14,5 @@ from .decomposition import wiener as wiener
 from .result import Retrieval as Retrieval
 from .result import Step as Step
 from .retrieval import retrieve as retrieve
+from .unknowns import LogNormal as LogNormal
 from .unknowns import Unknown as Unknown

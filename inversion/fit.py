@@ -4,10 +4,13 @@ The residuals are whitened, (simulated - observed) / sigma, with the measurement
 simulation in sigma; a prior adds one residual per value. With fixed random numbers the simulation is smooth
 but for small jumps, and its derivatives are unbiased estimates of its expectation's. Near the minimum the two
 disagree by a fraction of a standard error and no step improves the fit: there it ends.
+
+A fit is a generator: it yields where it wants the scene simulated, and is sent the simulation. So one fit and
+many at once are the same code.
 """
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Generator, Sequence
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -16,10 +19,10 @@ import optimistix as optx
 from jaxtyping import Array
 
 from .data import Data
-from .model import Evaluation, Model, spread_of
-from .result import Retrieval, Step
+from .model import Evaluation, spread_of
+from .result import Step
 from .uncertainty import correlation_of, decrement, errors_of
-from .unknowns import Settled, inside, outside
+from .unknowns import Priors, Settled, inside, outside
 
 # A fit has converged when a Gauss-Newton step would move it by less than this many standard errors,
 _SMALL_STEP = 0.05
@@ -52,6 +55,68 @@ def _advance(solver: Any, y: Array, args: Any, state: Any) -> Any:
     return y, state, done, result == optx.RESULTS.successful
 
 
+class Request(NamedTuple):
+    """Where a fit wants the scene simulated, and whether with its batches one by one."""
+
+    values: np.ndarray
+    spread: bool
+
+
+class Outcome(NamedTuple):
+    """How a fit ended. Vectors are the flattened unknowns in natural units; see `Retrieval`.
+
+    - `cost`: chi-squared with the measurement's noise, and the priors' share.
+    - `simulation`: (wavelengths, bins) one standard error of the simulated waveform.
+    """
+
+    values: np.ndarray
+    stderr: np.ndarray
+    simulation_error: np.ndarray
+    covariance: np.ndarray
+    correlation: np.ndarray
+    residuals: np.ndarray
+    reduced_chi2: float
+    cost: float
+    converged: bool
+    status: str
+    steps: int
+    history: tuple[float, ...]
+    evaluation: Evaluation
+    simulation: np.ndarray
+
+
+Fitting = Generator[Request, Evaluation, Outcome]
+
+
+def drive(fitting: Fitting, simulate: Callable[[Request], Evaluation]) -> Outcome:
+    """Let one fit run to its end."""
+    try:
+        request = next(fitting)
+        while True:
+            request = fitting.send(simulate(request))
+    except StopIteration as end:
+        return end.value
+
+
+def best_of(fits: "Sequence[Fit]") -> Fitting:
+    """Fits from several starts, one after the other: the one of the least cost, of those that converged.
+
+    **Returns:** its outcome, with the steps of all.
+    """
+    outcomes = []
+    for fit in fits:
+        outcomes.append((yield from fit.run()))
+    best = min(outcomes, key=lambda o: (not o.converged, not np.isfinite(o.cost), o.cost))
+    if len(fits) == 1:
+        return best
+    near = sum(o.converged and o.cost < best.cost + 1.0 for o in outcomes)
+    return best._replace(
+        steps=sum(o.steps for o in outcomes),
+        history=tuple(h for o in outcomes for h in o.history),
+        status=f"{best.status}; {near} of {len(fits)} starts ended there",
+    )
+
+
 class Point:
     """One simulation: where, what came out, and that as residuals and their Jacobian in natural units."""
 
@@ -72,35 +137,35 @@ class Fit:
 
     def __init__(
         self,
-        model: Model,
         data: Data,
         settled: list[Settled],
         scaled: bool,
         solver: Any,
         max_steps: int,
         progress: Callable[[Step], None] | None,
+        start: np.ndarray | None = None,
     ):
-        self.model, self.data, self.settled, self.scaled = model, data, settled, scaled
+        self.data, self.settled, self.scaled = data, settled, scaled
         self.solver, self.max_steps, self.progress = solver, max_steps, progress
         flat = lambda pick: np.concatenate([np.ravel(pick(s)) for s in settled])  # noqa: E731
         self.low, self.high = flat(lambda s: s.low), flat(lambda s: s.high)
-        self.start = flat(lambda s: np.asarray(s.start, float))
-        self.mean = flat(lambda s: np.zeros_like(s.low) if s.prior is None else s.prior[0])
-        std = flat(lambda s: np.full_like(s.low, np.inf) if s.prior is None else s.prior[1])
-        self.weight = 1.0 / std
+        self.start = flat(lambda s: np.asarray(s.start, float)) if start is None else start
+        self.prior = Priors(settled)
         self.sigma = data.sigma[data.used]
         self.count, self.history = 0, []
 
     # -- simulation ------------------------------------------------------------------------------------
 
-    def at(self, z: np.ndarray, *, spread: bool = False) -> Point:
+    def at(self, z: np.ndarray, *, spread: bool = False) -> Generator[Request, Evaluation, Point]:
         values = inside(z, self.low, self.high)[0]
-        return Point(self, z, self.model(values[:-1] if self.scaled else values, spread=spread))
+        evaluation = yield Request(values[:-1] if self.scaled else values, spread)
+        return Point(self, z, evaluation)
 
     def residuals(self, p: Point) -> tuple[np.ndarray, np.ndarray]:
         """Whitened, with the priors' behind them, and their Jacobian in z."""
-        jacobian = np.concatenate([p.jacobian / self.sigma[:, None], np.diag(self.weight)]) * p.slope
-        return np.concatenate([p.difference / self.sigma, (p.values - self.mean) * self.weight]), jacobian
+        off, slope = self.prior(p.values)
+        jacobian = np.concatenate([p.jacobian / self.sigma[:, None], np.diag(slope)]) * p.slope
+        return np.concatenate([p.difference / self.sigma, off]), jacobian
 
     def reweigh(self, p: Point) -> float:
         """Take the simulation's noise at `p` into the weights; returns their mean relative change."""
@@ -110,9 +175,9 @@ class Fit:
         self.sigma = sigma
         return change
 
-    def first(self) -> Point:
+    def first(self) -> Generator[Request, Evaluation, Point]:
         z = outside(self.start, self.low, self.high)
-        p = self.at(z, spread=True)
+        p = yield from self.at(z, spread=True)
         if self.scaled and p.finite:
             model, observed = p.evaluation.total[self.data.used], self.data.observed[self.data.used]
             weight = self.data.sigma[self.data.used] ** -2
@@ -125,24 +190,24 @@ class Fit:
 
     # -- iteration -------------------------------------------------------------------------------------
 
-    def run(self) -> Retrieval:
-        best = self.first()
+    def run(self) -> Fitting:
+        best = yield from self.first()
         self.count = 1
         if not best.finite:
             return self.result(
                 best, False, "failed: at the starting values the simulated waveform is not finite"
             )
         self.reweigh(best)
-        best, converged, status = self.descend(best)
+        best, converged, status = yield from self.descend(best)
         if converged and best.evaluation.batches is None:
-            best = self.at(best.z, spread=True)
+            best = yield from self.at(best.z, spread=True)
         if converged and self.reweigh(best) > _WRONG_WEIGHTS and self.count < self.max_steps:
-            best, converged, status = self.descend(best)
+            best, converged, status = yield from self.descend(best)
             if best.evaluation.batches is None:
-                best = self.at(best.z, spread=True)
+                best = yield from self.at(best.z, spread=True)
         return self.result(best, converged, status)
 
-    def descend(self, best: Point) -> tuple[Point, bool, str]:
+    def descend(self, best: Point) -> Generator[Request, Evaluation, tuple[Point, bool, str]]:
         """Steps of the solver until it ends, or no step leads on."""
         trial, state, y = best, None, jnp.asarray(best.z)
         remaining, rejected = np.inf, 0
@@ -170,7 +235,7 @@ class Fit:
                 return best, False, self.ended("not converged: stopped at max_steps")
             ahead = jnp.clip(state.y_eval - y, -_LONGEST_STEP, _LONGEST_STEP)
             state = eqx.tree_at(lambda s: s.y_eval, state, y + ahead)
-            trial = self.at(np.asarray(state.y_eval, float))
+            trial = yield from self.at(np.asarray(state.y_eval, float))
             self.count += 1
 
     def free(self, p: Point, r: np.ndarray, jacobian: np.ndarray) -> np.ndarray:
@@ -190,10 +255,9 @@ class Fit:
     # -- result ----------------------------------------------------------------------------------------
 
     def named(self, flat: np.ndarray) -> dict[str, np.ndarray]:
-        parts = np.split(flat, np.cumsum([s.start.size for s in self.settled])[:-1])
-        return {s.name: part.reshape(s.start.shape) for s, part in zip(self.settled, parts)}
+        return named(flat, self.settled)
 
-    def result(self, p: Point, converged: bool, status: str) -> Retrieval:
+    def result(self, p: Point, converged: bool, status: str) -> Outcome:
         n, used, batches = self.low.size, self.data.used, p.evaluation.batches
         simulation = np.broadcast_to(spread_of(batches), used.shape)
         deviations = None
@@ -201,12 +265,9 @@ class Fit:
             deviations = (p.scale * (batches - np.mean(batches, axis=0)))[:, used] / self.sigma
         jacobian = p.jacobian / self.sigma[:, None] if p.finite else np.zeros_like(p.jacobian)
         measured = (self.data.sigma[used] / self.sigma) ** 2
-        errors = errors_of(jacobian, self.weight**2, self.high - self.low, measured, deviations)
-        labels = [
-            s.name + ("" if s.start.ndim == 0 else str(list(map(int, np.unravel_index(i, s.start.shape)))))
-            for s in self.settled
-            for i in range(s.start.size)
-        ]
+        off, slope = self.prior(p.values)
+        errors = errors_of(jacobian, slope**2, self.high - self.low, measured, deviations)
+        labels = labels_of(self.settled)
         share = (p.values - self.low) / (self.high - self.low)
         notes = [
             ("the data do not determine {} (infinite standard error)", errors.open),
@@ -221,23 +282,35 @@ class Fit:
         freedom = max(self.sigma.size - n + int(np.sum(errors.open)), 1)
         chi2 = np.sum(residuals**2) / freedom
 
-        def by_name(flat: np.ndarray) -> dict[str, Array]:
-            return {k: jnp.asarray(v) for k, v in self.named(flat).items()}
-
-        flat = p.values[:-1] if self.scaled else p.values
-        return Retrieval(
-            values=by_name(p.values),
-            stderr=by_name(np.sqrt(np.diag(errors.covariance))),
-            simulation_error=by_name(errors.simulation),
-            covariance=jnp.asarray(errors.covariance),
-            correlation=jnp.asarray(correlation_of(errors.covariance)),
-            scene=self.model.scene_at(flat),
-            waveform=self.model.waveform(flat, p.evaluation, np.asarray(simulation)),
-            residuals=jnp.asarray(residuals),
-            reduced_chi2=jnp.asarray(chi2),
+        cost = float(np.sum((p.difference / self.data.sigma[used]) ** 2) + np.sum(off**2))
+        return Outcome(
+            values=p.values,
+            stderr=np.sqrt(np.diag(errors.covariance)),
+            simulation_error=errors.simulation,
+            covariance=errors.covariance,
+            correlation=correlation_of(errors.covariance),
+            residuals=residuals,
+            reduced_chi2=float(chi2),
+            cost=cost if p.finite else np.inf,
             converged=converged,
             status=status,
             steps=self.count,
             history=tuple(self.history),
-            labels=tuple(labels),
+            evaluation=p.evaluation,
+            simulation=np.asarray(simulation),
         )
+
+
+def named(flat: np.ndarray, settled: Sequence[Settled]) -> dict[str, np.ndarray]:
+    """Values by name out of vectors (..., unknowns)."""
+    parts = np.split(flat, np.cumsum([s.start.size for s in settled])[:-1], axis=-1)
+    return {s.name: p.reshape((*flat.shape[:-1], *s.start.shape)) for s, p in zip(settled, parts)}
+
+
+def labels_of(settled: Sequence[Settled]) -> tuple[str, ...]:
+    """Names of the flattened unknowns."""
+    return tuple(
+        s.name + ("" if s.start.ndim == 0 else str(list(map(int, np.unravel_index(i, s.start.shape)))))
+        for s in settled
+        for i in range(s.start.size)
+    )

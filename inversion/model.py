@@ -82,18 +82,36 @@ def _mean(responses: list[Any]) -> Any:
     return jax.tree.map(lambda *a: sum(a) / len(a), *responses)
 
 
+def evaluate(
+    lidar: Lidar, scene: Scene, plan: Plan, places: tuple[Place, ...], values: Values, keys: Array
+) -> tuple[
+    Float[Array, "wavelengths bins"],
+    Float[Array, "columns wavelengths bins"],
+    Float[Array, "batches wavelengths bins"],
+]:
+    """Total, derivatives (geometric columns, then optical ones) and batches of one scene, in one function.
+
+    Pure, to be batched over scenes; `keys` has one random key for each batch of photons.
+    """
+    common = (lidar, scene, plan, places, values)
+    responses, totals, columns = jax.lax.map(lambda key: _batch(*common, key), keys)
+    response = jax.tree.map(lambda a: jnp.mean(a, axis=0), responses)
+    total, more = _colour(*common, response)
+    return total, jnp.concatenate([jnp.mean(columns, axis=0), more]), totals
+
+
 class Evaluation(NamedTuple):
     """The simulated waveform at some values.
 
     - `total`: (wavelengths, bins) apparent reflectance, the mean of the batches.
     - `jacobian`: (wavelengths, bins, columns), columns in the order of the flattened unknowns.
-    - `response`: mean of the batches' responses.
+    - `response`: mean of the batches' responses, or None where many scenes are simulated together.
     - `batches`: (batches, wavelengths, bins) the total of each, or None where it was not asked for.
     """
 
     total: np.ndarray
     jacobian: np.ndarray
-    response: Response | list[Response]
+    response: Response | list[Response] | None
     batches: np.ndarray | None
 
 
@@ -111,7 +129,7 @@ class Model:
         self._kept: tuple[Any, list[Any]] | None = None
         owner = np.repeat(np.arange(len(self.sizes)), self.sizes)
         geometric = np.array([p.geometric for p in self.places], bool)[owner]
-        self._order = np.argsort(np.concatenate([np.flatnonzero(geometric), np.flatnonzero(~geometric)]))
+        self.order = np.argsort(np.concatenate([np.flatnonzero(geometric), np.flatnonzero(~geometric)]))
 
     def values(self, flat: Float[np.ndarray, " columns"]) -> Values:
         """The unknowns' values out of one vector."""
@@ -141,7 +159,7 @@ class Model:
                 batches = np.stack([np.asarray(_colour(*common, r)[0], float) for r in responses])
         total, more = _colour(*common, response)
         more = np.asarray(more, float)
-        columns = np.concatenate([more[:0] if columns is None else columns, more])[self._order]
+        columns = np.concatenate([more[:0] if columns is None else columns, more])[self.order]
         return Evaluation(np.asarray(total, float), np.moveaxis(columns, 0, -1), response, batches)
 
     def _trace(self, values: Values) -> list[Any]:

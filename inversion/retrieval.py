@@ -4,23 +4,24 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jaxtyping import ArrayLike, PRNGKeyArray
+from jaxtyping import Array, ArrayLike, PRNGKeyArray
 
 from jaxlidar import Lidar, Plan, Scene, Waveform
 from jaxlidar._checks import check_range
 from jaxlidar.simulate import MIN_BATCHES
 
-from .data import data_of
-from .fit import Fit
+from .data import Data, data_of
+from .fit import Fit, Outcome, best_of, drive, labels_of, named
 from .model import Model
 from .planning import check_samples, plan_for
 from .result import Retrieval, Step
-from .unknowns import Place, Settled, Unknown, settle
+from .unknowns import Place, Settled, Unknown, latin_hypercube, settle
 
-_SOLVER = optx.LevenbergMarquardt(rtol=1e-3, atol=1e-3)
+SOLVER = optx.LevenbergMarquardt(rtol=1e-3, atol=1e-3)
 
 
 def retrieve(
@@ -36,8 +37,9 @@ def retrieve(
     n_photons: float = 65536,
     n_rays: float = 8192,
     max_orders: int | None = None,
-    solver: optx.AbstractLeastSquaresSolver = _SOLVER,
+    solver: optx.AbstractLeastSquaresSolver = SOLVER,
     max_steps: float = 50,
+    starts: float = 1,
     scale: tuple[float, float] | None = None,
     noise_floor: float = 1e-3,
     progress: Callable[[Step], None] | None = None,
@@ -46,7 +48,7 @@ def retrieve(
     """Find the unknowns of a scene from its waveform, with their standard errors.
 
     Least squares finds the nearest minimum: a height must start within about a pulse length of the truth,
-    else the fit may end in another echo.
+    else the fit may end in another echo. `starts` looks from several places.
 
     Every simulation of a fit uses the same random numbers, which makes it a smooth function of the unknowns.
     The noise that it has nevertheless is estimated from its batches, weighs down the samples that it affects
@@ -72,7 +74,9 @@ def retrieve(
     - `max_orders`: scatterings followed. Default: by the albedos of the starting scene.
     - `solver`: any Gauss-Newton method of optimistix. Default: Levenberg-Marquardt. A fit ends as well where
       a Gauss-Newton step would be below 0.02 standard errors, or is small and improves nothing.
-    - `max_steps`: most simulations, each with its Jacobian. Default 50.
+    - `max_steps`: most simulations, each with its Jacobian, from each start. Default 50.
+    - `starts`: from how many places to fit; the best fit is returned. The first is the scene's own, the
+      others are a Latin hypercube over the bounds. Default 1.
     - `scale`: bounds of a further unknown, "scale", which multiplies the simulated reflectance, the same for
       all wavelengths (an uncalibrated receiver); it starts where it fits best. Default: none.
     - `noise_floor`: share of each wavelength's largest observed value that replaces any smaller `noise`:
@@ -91,6 +95,7 @@ def retrieve(
         ("max_steps", max_steps, 1),
         ("n_photons", n_photons, MIN_BATCHES),
         ("n_rays", n_rays, MIN_BATCHES),
+        ("starts", starts, 1),
     ):
         if value != int(value) or value < low:
             raise ValueError(f"{name} = {value} is outside the admissible range [{low}, inf) of integers")
@@ -109,17 +114,50 @@ def retrieve(
             rays=int(n_rays) // MIN_BATCHES,
         )
     check_samples(plan, data.time)
-    # The table of effects is for readers; without it, plans that do the same are equal.
-    model = Model(lidar, scene, dataclasses.replace(plan, effects=()), settled, key)
+    model = Model(lidar, scene, plan, settled, key)
     if scale is not None:
-        settled = [*settled, _scale(scale, settled)]
-    result = Fit(model, data, settled, scale is not None, solver, int(max_steps), progress).run()
-    if throw and not result.converged:
-        raise RuntimeError(result.status)
-    return result
+        settled = [*settled, scale_of(scale, settled)]
+    fits = fits_from(int(starts), key, data, settled, scale is not None, solver, int(max_steps), progress)
+    outcome = drive(best_of(fits), lambda request: model(request.values, spread=request.spread))
+    if throw and not outcome.converged:
+        raise RuntimeError(outcome.status)
+    return retrieval_of(outcome, model, settled, scale is not None)
 
 
-def _scale(bounds: Any, settled: list[Settled]) -> Settled:
+def fits_from(
+    starts: int, key: PRNGKeyArray, data: Data, settled: list[Settled], scaled: bool, *more: Any
+) -> list[Fit]:
+    """One fit from the unknowns' own start, and others from a Latin hypercube over their bounds."""
+    places = latin_hypercube(settled, starts - 1, jax.random.fold_in(key, 1)) if starts > 1 else []
+    return [Fit(data, settled, scaled, *more, start=place) for place in [None, *places]]
+
+
+def retrieval_of(outcome: Outcome, model: Model, settled: list[Settled], scaled: bool) -> Retrieval:
+    """The outcome of a fit, named."""
+
+    def by_name(flat: np.ndarray) -> dict[str, Array]:
+        return {k: jnp.asarray(v) for k, v in named(flat, settled).items()}
+
+    flat = outcome.values[:-1] if scaled else outcome.values
+    return Retrieval(
+        values=by_name(outcome.values),
+        stderr=by_name(outcome.stderr),
+        simulation_error=by_name(outcome.simulation_error),
+        covariance=jnp.asarray(outcome.covariance),
+        correlation=jnp.asarray(outcome.correlation),
+        scene=model.scene_at(flat),
+        waveform=model.waveform(flat, outcome.evaluation, outcome.simulation),
+        residuals=jnp.asarray(outcome.residuals),
+        reduced_chi2=jnp.asarray(outcome.reduced_chi2),
+        converged=outcome.converged,
+        status=outcome.status,
+        steps=outcome.steps,
+        history=outcome.history,
+        labels=labels_of(settled),
+    )
+
+
+def scale_of(bounds: Any, settled: list[Settled]) -> Settled:
     try:
         low, high = (float(b) for b in bounds)
     except (TypeError, ValueError):

@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from jaxlidar import Scene
 from jaxlidar._checks import as_array, check_range
@@ -28,13 +28,31 @@ def _as_pair(x: Any) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
     return as_array(low), as_array(high)
 
 
-def _optional_pair(x: Any) -> tuple[Float[Array, "..."], Float[Array, "..."]] | None:
-    if x is None:
-        return None
+@final
+class LogNormal(eqx.Module):
+    """A prior on the logarithm of a positive value.
+
+    - `median`: in the value's own unit, positive, a number or an array.
+    - `spread`: standard deviation of the natural logarithm, positive: 0.5 means within a factor of 1.65.
+
+    **Raises:** ValueError for either that is not positive.
+    """
+
+    median: Float[Array, "..."] = eqx.field(converter=as_array)
+    spread: Float[Array, "..."] = eqx.field(converter=as_array)
+
+    def __check_init__(self):
+        check_range("median", self.median, 0.0, low_open=True)
+        check_range("spread", self.spread, 0.0, low_open=True)
+
+
+def _optional_prior(x: Any) -> tuple[Float[Array, "..."], Float[Array, "..."]] | LogNormal | None:
+    if x is None or isinstance(x, LogNormal):
+        return x
     try:
         mean, std = x
     except (TypeError, ValueError):
-        raise ValueError(f"prior = {x!r} is not a pair (mean, standard deviation)") from None
+        raise ValueError(f"prior = {x!r} is no LogNormal and no pair (mean, standard deviation)") from None
     return as_array(mean), as_array(std)
 
 
@@ -56,7 +74,8 @@ class Unknown(eqx.Module):
       the starting value. An element of an array, or a property, is not such an array: use `apply`.
     - `bounds`: (low, high) in the unknown's own unit, numbers or arrays that broadcast to the value.
     - `name`: key of the result. Default: the path to `where`, such as "canopy.leaf.Cab".
-    - `prior`: (mean, standard deviation) of a normal prior, numbers or arrays. Default None: no prior.
+    - `prior`: (mean, standard deviation) of a normal prior, numbers or arrays, or a `LogNormal`, which needs
+      bounds above zero. Default None: no prior.
     - `start`: starting value instead of the scene's; needed with `apply`.
     - `apply`: `apply(scene, value) -> scene` instead of `where`, differentiable, of the same tree structure;
       for values that move several arrays at once. Unknowns are put in in the order in which they are listed.
@@ -72,8 +91,8 @@ class Unknown(eqx.Module):
     where: Callable[[Any], Any] | None = eqx.field(static=True, default=None)
     bounds: tuple[Float[Array, "..."], Float[Array, "..."]] = eqx.field(converter=_as_pair, kw_only=True)
     name: str | None = eqx.field(static=True, default=None, kw_only=True)
-    prior: tuple[Float[Array, "..."], Float[Array, "..."]] | None = eqx.field(
-        converter=_optional_pair, default=None, kw_only=True
+    prior: tuple[Float[Array, "..."], Float[Array, "..."]] | LogNormal | None = eqx.field(
+        converter=_optional_prior, default=None, kw_only=True
     )
     start: Float[Array, "..."] | None = eqx.field(converter=_optional_array, default=None, kw_only=True)
     apply: Callable[[Scene, Array], Scene] | None = eqx.field(static=True, default=None, kw_only=True)
@@ -89,7 +108,10 @@ class Unknown(eqx.Module):
         check_range(f"{called}: bounds", high)
         if not np.all(np.asarray(low) < np.asarray(high)):
             raise ValueError(f"{called}: bounds = ({low}, {high}) are not low < high")
-        if self.prior is not None:
+        if isinstance(self.prior, LogNormal):
+            # Zero itself is never reached: the bijection keeps clear of the bounds.
+            check_range(f"{called}: lower bound, with a log-normal prior,", low, 0.0)
+        elif self.prior is not None:
             check_range(f"{called}: prior mean", self.prior[0])
             check_range(f"{called}: prior standard deviation", self.prior[1], 0.0, low_open=True)
 
@@ -107,7 +129,10 @@ class Place(NamedTuple):
 
 
 class Settled(NamedTuple):
-    """An unknown of a given scene. Arrays have the value's shape, in double precision (`start`: JAX's)."""
+    """An unknown of a given scene. Arrays have the value's shape, in double precision (`start`: JAX's).
+
+    `prior`: mean and standard deviation, of the logarithm where `log_prior`.
+    """
 
     name: str
     place: Place
@@ -115,6 +140,25 @@ class Settled(NamedTuple):
     low: np.ndarray
     high: np.ndarray
     prior: tuple[np.ndarray, np.ndarray] | None
+    log_prior: bool = False
+
+
+class Priors:
+    """What all unknowns' priors add to the residuals of a fit."""
+
+    def __init__(self, settled: Sequence[Settled]):
+        def flat(pick: Callable[[Settled], np.ndarray]) -> np.ndarray:
+            return np.concatenate([np.ravel(pick(s)) for s in settled])
+
+        self.mean = flat(lambda s: np.zeros_like(s.low) if s.prior is None else s.prior[0])
+        self.weight = flat(lambda s: np.zeros_like(s.low) if s.prior is None else 1.0 / s.prior[1])
+        self.log = flat(lambda s: np.full(s.low.shape, s.log_prior))
+
+    def __call__(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """One residual for each value, in standard deviations, and its derivative in the value."""
+        positive = np.where(self.log, np.maximum(values, 1e-300), 1.0)
+        shown = np.where(self.log, np.log(positive), values)
+        return (shown - self.mean) * self.weight, self.weight / positive
 
 
 def settle(unknowns: Sequence[Unknown], scene: Scene) -> list[Settled]:
@@ -157,10 +201,11 @@ def _settle_one(u: Unknown, scene: Scene, optical: frozenset[int]) -> Settled:
             f"[{low[bad].flat[0]:g}, {high[bad].flat[0]:g}]"
         )
     margin = MARGIN * (high - low)
-    prior = None
+    prior, log_prior = None, isinstance(u.prior, LogNormal)
     if u.prior is not None:
-        mean, std = (np.asarray(_broadcast(name, "prior", p, start.shape), float) for p in u.prior)
-        prior = mean, std
+        pair = (u.prior.median, u.prior.spread) if isinstance(u.prior, LogNormal) else u.prior
+        mean, std = (np.asarray(_broadcast(name, "prior", p, start.shape), float) for p in pair)
+        prior = np.log(mean) if log_prior else mean, std
     return Settled(
         name,
         Place(number, u.apply, not touched <= optical),
@@ -168,6 +213,7 @@ def _settle_one(u: Unknown, scene: Scene, optical: frozenset[int]) -> Settled:
         low,
         high,
         prior,
+        log_prior,
     )
 
 
@@ -258,3 +304,20 @@ def inside(z: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray
 def outside(value: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """The free number of a value within its bounds: the inverse of `inside`."""
     return np.log(value - low) - np.log(high - value)
+
+
+def latin_hypercube(
+    settled: Sequence[Settled], count: int, key: PRNGKeyArray
+) -> Float[np.ndarray, "count unknowns"]:
+    """Starting points spread over the bounds: each unknown has one in each of `count` equal intervals.
+
+    **Source:** McKay, Beckman and Conover (1979), Technometrics 21, 239.
+    """
+    low = np.concatenate([np.ravel(s.low) for s in settled])
+    high = np.concatenate([np.ravel(s.high) for s in settled])
+    order_key, place_key = jax.random.split(key)
+    order = jax.vmap(lambda k: jax.random.permutation(k, count))(jax.random.split(order_key, low.size))
+    share = (
+        np.asarray(order).T + np.asarray(jax.random.uniform(place_key, (count, low.size)), float)
+    ) / count
+    return low + (high - low) * np.clip(share, MARGIN, 1.0 - MARGIN)

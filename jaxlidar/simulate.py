@@ -14,6 +14,8 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from ._checks import is_traced
+from .extent import Extent
+from .letters import scene_optics, spell
 from .lidar import Lidar
 from .plan import Plan
 from .plan import plan as make_plan
@@ -80,7 +82,7 @@ def simulate(
       batches also ends the simulation with what is done.
     - `progress`: called with a `Progress` after every round of batches; for instance `print`.
 
-    **Raises:** ValueError for inadmissible arguments.
+    **Raises:** ValueError for inadmissible arguments, and for a plan that would miss parts of the scene.
     """
     for name, value in (("rtol", rtol), ("max_seconds", max_seconds)):
         if value is not None and not value > 0:
@@ -101,6 +103,8 @@ def simulate(
             bin_width=bin_width,
             footprint=footprint,
         )
+    elif not any(is_traced(x) for x in jax.tree.leaves((lidar, scene))):
+        _check_plan(plan, lidar, scene)
     if n_photons is not None:
         plan = dataclasses.replace(plan, n_photons=max(int(n_photons) // MIN_BATCHES, 1))
     if not plan.is_random:
@@ -121,6 +125,22 @@ def simulate(
     return _simulate_batches(
         lidar, scene, plan, key, rtol, atol, n_photons is not None, max_seconds, progress
     )
+
+
+def _check_plan(plan: Plan, lidar: Lidar, scene: Scene) -> None:
+    """Refuse a plan that would miss parts of the scene."""
+    top = -0.5 * Extent(lidar, scene).first
+    if top > plan.layout.upstream:
+        raise ValueError(
+            f"plan starts {plan.layout.upstream:g} m before the reference plane; admissible for this scene "
+            f"is more than {top:g} m: make the plan for the scene that reaches highest"
+        )
+    missing = set(spell(scene_optics(lidar, scene)).letters) - set(plan.layout.letters)
+    if missing:
+        raise ValueError(
+            f"plan has {', '.join(plan.layout.letters) or 'no scatterers'}; admissible for this scene is one "
+            f"that also has {', '.join(sorted(missing))}: make the plan with it"
+        )
 
 
 def trace_all(lidar: Lidar, scene: Scene, plan: Plan, key: PRNGKeyArray) -> Response | list[Response]:

@@ -87,3 +87,13 @@ def test_traced_geometry_needs_a_plan():
 
     with pytest.raises(ValueError, match="make a plan outside"):
         jax.grad(height)(1.0)
+
+
+def test_a_plan_that_would_miss_parts_of_the_scene_is_refused():
+    lidar, low = jl.Lidar(), jl.Scene(ground=jl.Ground())
+    plan = jl.plan(lidar, low)
+    with pytest.raises(ValueError, match="make the plan for the scene that reaches highest"):
+        jl.simulate(lidar, jl.Scene(ground=jl.Ground(height=1.0)), key=jax.random.key(0), plan=plan)
+    plate = jl.Scene(plates=(jl.Plate(height=0.0, reflectance=0.3, transmittance=0.2),))
+    with pytest.raises(ValueError, match=r"also has plate\.R, plate\.T"):
+        jl.simulate(lidar, plate, key=jax.random.key(0), plan=plan)

@@ -435,7 +435,7 @@ def unknown(where=lambda s: s.ground.height, **changes):
         (unknown(bounds=3.0), "not a pair"),
         (unknown(bounds=((0.0, 1.0), 2.0)), "does not broadcast"),
         (unknown(prior=(0.0, 0.0)), "prior standard deviation = 0"),
-        (unknown(prior=1.0), "prior = 1.0 is not a pair"),
+        (unknown(prior=1.0), "prior = 1.0 is no LogNormal"),
         (unknown(lambda s: s.canopy.leaf.Cab), "where picks nothing in this scene"),
         (unknown(lambda s: s.canopy), r"where picks nothing \(None\)"),
         (unknown(lambda s: s.ground), "where picks a Ground; admissible is one array"),

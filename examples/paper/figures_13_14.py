@@ -72,7 +72,7 @@ def main(argv=None) -> dict[str, float]:
     right.set(
         xlabel="time (ns)", ylabel="apparent reflectance per ns", title="received (figure 14)", xlim=(-10, 12)
     )
-    for at, name in ((-2 * HEIGHT / 0.299792458, "leaf plate"), (0.0, "ground")):
+    for at in (-2 * HEIGHT / 0.299792458, 0.0):
         right.axvline(at, color="0.8", linewidth=0.8, zorder=0)
     for ax in (left, right):
         ax.set_ylim(0, None)

@@ -1,0 +1,367 @@
+"""Many fits at once: waveforms of as many footprints, simulated together, each fitted on its own.
+
+Fits run side by side in lanes. What they want simulated is gathered and simulated in one compiled call, and
+sent back; a lane whose fit has ended takes the next footprint. A fit that fails says so and leaves the others
+as they are.
+"""
+
+import dataclasses
+import hashlib
+import os
+import zipfile
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import ArrayLike, Bool, Float, Int, PRNGKeyArray
+
+from jaxlidar import Lidar, Plan, Scene
+from jaxlidar._checks import check_range
+from jaxlidar.io import whole_file
+from jaxlidar.simulate import MIN_BATCHES
+
+from .data import data_of
+from .fit import Fitting, Outcome, Request, best_of, labels_of, named
+from .model import Evaluation, Model, evaluate
+from .planning import check_samples, plan_for
+from .retrieval import SOLVER, fits_from, scale_of
+from .unknowns import Settled, Unknown, settle
+
+
+@dataclasses.dataclass(frozen=True)
+class Progress:
+    """How far a batch has come: fits ended, of how many, how many of them converged."""
+
+    done: int
+    total: int
+    converged: int
+
+    def __str__(self) -> str:
+        return f"{self.done} of {self.total} fits, {self.converged} converged"
+
+
+@final
+class Retrievals(eqx.Module):
+    """Fitted footprints, in the order given. Arrays have a leading axis `footprints`; see `Retrieval`.
+
+    - `values`, `stderr`: by name. - `covariance`: (footprints, n, n).
+    - `reduced_chi2`: (footprints,). - `converged`: (footprints,). - `status`: a sentence for each.
+    - `steps`: (footprints,) waveforms simulated. - `fitted`: (footprints, wavelengths, bins) apparent
+      reflectance, without the scale. - `labels`: names of the rows of `covariance`.
+    """
+
+    values: dict[str, Float[np.ndarray, "footprints ..."]]
+    stderr: dict[str, Float[np.ndarray, "footprints ..."]]
+    covariance: Float[np.ndarray, "footprints n n"]
+    reduced_chi2: Float[np.ndarray, " footprints"]
+    converged: Bool[np.ndarray, " footprints"]
+    steps: Int[np.ndarray, " footprints"]
+    fitted: Float[np.ndarray, "footprints wavelengths bins"]
+    status: tuple[str, ...] = eqx.field(static=True)
+    labels: tuple[str, ...] = eqx.field(static=True)
+
+    def to_xarray(self) -> Any:
+        """As an `xarray.Dataset` over `footprint`. **Raises:** ImportError where xarray is not installed."""
+        import xarray
+
+        def variable(name: str, array: np.ndarray) -> tuple:
+            return (("footprint", *(f"{name} {i}" for i in range(array.ndim - 1))), array)
+
+        columns = {name: variable(name, v) for name, v in self.values.items()}
+        columns |= {f"{name} stderr": variable(name, v) for name, v in self.stderr.items()}
+        columns |= {
+            "reduced_chi2": ("footprint", self.reduced_chi2),
+            "converged": ("footprint", self.converged),
+            "steps": ("footprint", self.steps),
+            "status": ("footprint", np.array(self.status, dtype=object)),
+            "fitted": (("footprint", "wavelength", "bin"), self.fitted),
+        }
+        return xarray.Dataset(columns)
+
+
+def retrieve_many(
+    observed: ArrayLike,
+    lidar: Lidar | Sequence[Lidar],
+    scene: Scene | Sequence[Scene],
+    unknowns: Sequence[Unknown],
+    *,
+    noise: ArrayLike,
+    time: ArrayLike,
+    key: PRNGKeyArray,
+    plan: Plan | None = None,
+    n_photons: float = 65536,
+    n_rays: float = 8192,
+    max_orders: int | None = None,
+    solver: optx.AbstractLeastSquaresSolver = SOLVER,
+    max_steps: float = 50,
+    starts: float = 1,
+    scale: tuple[float, float] | None = None,
+    noise_floor: float = 1e-3,
+    lanes: int = 16,
+    path: str | os.PathLike[str] | None = None,
+    progress: Callable[[Progress], None] | None = None,
+) -> Retrievals:
+    """Fit the unknowns of a scene to many waveforms, each on its own, as `retrieve` does.
+
+    **Arguments:** those of `retrieve`, but
+
+    - `observed`: (footprints, wavelengths, bins) apparent reflectance.
+    - `lidar`, `scene`: one for all, or one for each footprint, alike but for the values of their arrays
+      (such as transmit pulses, or starting values).
+    - `noise`: one standard deviation, anything that broadcasts to `observed`.
+    - `time`: (bins,) ns, of all.
+    - `plan`: for all. Default: made for the first lidar and scene and the bounds' corners.
+    - `lanes`: how many are simulated together: memory grows with it. Default 16.
+    - `path`: of an .npz file that keeps what is done; if it is there, the fits in it are not repeated. It is
+      written after every few fits, and when interrupted. Default None: nothing is kept.
+    - `progress`: called with a `Progress` after every fit.
+
+    **Raises:** ValueError for inadmissible arguments, and for a `path` with other footprints or unknowns.
+    """
+    y = np.asarray(observed, float)
+    if y.ndim != 3 or len(y) == 0:
+        raise ValueError(f"observed has the shape {y.shape}; admissible is (footprints, wavelengths, bins)")
+    try:
+        sigma = np.broadcast_to(np.asarray(noise, float), y.shape)
+    except ValueError:
+        raise ValueError(
+            f"noise has the shape {np.shape(noise)}, which does not broadcast to {y.shape}"
+        ) from None
+    check_range("lanes", lanes, 1)
+    check_range("starts", starts, 1)
+    lidars = [_fixed(a) for a in _one_each("lidar", lidar, len(y))]
+    scenes = _one_each("scene", scene, len(y))
+    settled = [settle(unknowns, s) for s in (scenes if len(scenes) > 1 else scenes[:1])]
+    data = [data_of(y[i], time, sigma[i], noise_floor, lidars[i % len(lidars)]) for i in range(len(y))]
+    if plan is None:
+        plan = plan_for(
+            lidars[0],
+            scenes[0],
+            settled[0],
+            data[0].time,
+            max_orders=max_orders,
+            photons=int(n_photons) // MIN_BATCHES,
+            rays=int(n_rays) // MIN_BATCHES,
+        )
+    check_samples(plan, data[0].time)
+    extra = [] if scale is None else [scale_of(scale, settled[0])]
+
+    def fitting(i: int) -> Fitting:
+        own = [*settled[i % len(settled)], *extra]
+        fits = fits_from(
+            int(starts), jax.random.fold_in(key, i), data[i], own, bool(extra), solver, int(max_steps), None
+        )
+        return best_of(fits)
+
+    names = [*settled[0], *extra]
+    kept = _Kept(path, _fingerprint(y, sigma, names), names)
+    simulate = _Simulator(lidars, scenes, plan, settled[0], key, min(int(lanes), len(y)))
+    ended: dict[int, _Row] = kept.rows
+    todo = [i for i in range(len(y)) if i not in ended]
+    running: dict[int, tuple[Fitting, Request]] = {}
+    try:
+        while todo or running:
+            while todo and len(running) < simulate.lanes:
+                i = todo.pop(0)
+                fit = fitting(i)
+                running[i] = fit, next(fit)
+            found = simulate({i: request for i, (_, request) in running.items()})
+            for i, evaluation in found.items():
+                fit = running[i][0]
+                try:
+                    running[i] = fit, fit.send(evaluation)
+                except StopIteration as end:
+                    del running[i]
+                    ended[i] = _row(end.value)
+                    if progress is not None:
+                        progress(Progress(len(ended), len(y), sum(r.converged for r in ended.values())))
+                    if len(ended) % max(simulate.lanes, 16) == 0:
+                        kept.write()
+    finally:
+        kept.write()
+    rows = [ended[i] for i in range(len(y))]
+    stack = lambda pick: np.stack([pick(r) for r in rows])  # noqa: E731
+    return Retrievals(
+        values=named(stack(lambda r: r.values), names),
+        stderr=named(stack(lambda r: r.stderr), names),
+        covariance=stack(lambda r: r.covariance),
+        reduced_chi2=np.array([r.reduced_chi2 for r in rows]),
+        converged=np.array([r.converged for r in rows]),
+        steps=np.array([r.steps for r in rows]),
+        fitted=stack(lambda r: r.fitted),
+        status=tuple(r.status for r in rows),
+        labels=labels_of(names),
+    )
+
+
+def _fixed(lidar: Lidar) -> Lidar:
+    # Samples lie at the given times, whatever opened the window.
+    return dataclasses.replace(lidar, receiver=dataclasses.replace(lidar.receiver, window="fixed"))
+
+
+def _one_each(field: str, given: Any, count: int) -> list[Any]:
+    if isinstance(given, Lidar | Scene):
+        return [given]
+    given = list(given)
+    if len(given) != count:
+        raise ValueError(f"{field} has {len(given)} elements; admissible is one, or {count} as observed")
+    shape = jax.tree.map(jnp.shape, given[0])
+    for i, other in enumerate(given):
+        same = jax.tree.structure(other) == jax.tree.structure(given[0])
+        if not same or jax.tree.map(jnp.shape, other) != shape:
+            raise ValueError(f"{field} {i} differs from the first in more than the values of its arrays")
+    return given
+
+
+@dataclasses.dataclass(frozen=True)
+class _Row:
+    """What is kept of a fit."""
+
+    values: np.ndarray
+    stderr: np.ndarray
+    covariance: np.ndarray
+    reduced_chi2: float
+    converged: bool
+    steps: int
+    fitted: np.ndarray
+    status: str
+
+
+def _row(o: Outcome) -> _Row:
+    total = np.asarray(o.evaluation.total)
+    return _Row(o.values, o.stderr, o.covariance, o.reduced_chi2, o.converged, o.steps, total, o.status)
+
+
+class _Simulator:
+    """Simulates what all lanes want in one compiled call; several threads share the lanes."""
+
+    def __init__(
+        self,
+        lidars: list[Lidar],
+        scenes: list[Scene],
+        plan: Plan,
+        settled: list[Settled],
+        key: PRNGKeyArray,
+        lanes: int,
+    ):
+        self.model = Model(lidars[0], scenes[0], plan, settled, key)
+        self.threads = min(max(os.cpu_count() or 1, 1), lanes)
+        self.each = -(-lanes // self.threads)
+        self.lanes = self.each * self.threads
+        self.lidars, self.scenes, self.plan = lidars, scenes, plan
+
+    def __call__(self, requests: dict[int, Request]) -> dict[int, Evaluation]:
+        numbers = list(requests)
+        groups = [numbers[i : i + self.each] for i in range(0, len(numbers), self.each)]
+        # JAX keeps its precision by thread.
+        double = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
+
+        def run(group: list[int]) -> dict[int, Evaluation]:
+            with jax.enable_x64(double):
+                return self._group(group, requests)
+
+        first = run(groups[0])
+        with ThreadPoolExecutor(max_workers=self.threads) as pool:
+            for found in pool.map(run, groups[1:]):
+                first |= found
+        return first
+
+    def _group(self, group: list[int], requests: dict[int, Request]) -> dict[int, Evaluation]:
+        # The compiled call has a fixed number of lanes: idle ones repeat the last.
+        padded = [*group, *[group[-1]] * (self.each - len(group))]
+        values = jax.tree.map(
+            lambda *a: jnp.stack(a), *(self.model.values(requests[i].values) for i in padded)
+        )
+        lidar, scene = _stacked(self.lidars, padded), _stacked(self.scenes, padded)
+        model = self.model
+        out = _simulate(
+            lidar,
+            scene,
+            self.plan,
+            model.places,
+            values,
+            jnp.stack(model.keys),
+            len(self.lidars) > 1,
+            len(self.scenes) > 1,
+        )
+        total, columns, batches = (np.asarray(a, float) for a in out)
+        return {
+            i: Evaluation(
+                total[n],
+                np.moveaxis(columns[n][model.order], 0, -1),
+                None,
+                batches[n] if model.plan.is_random else None,
+            )
+            for n, i in enumerate(group)
+        }
+
+
+def _stacked(given: list[Any], numbers: list[int]) -> Any:
+    if len(given) == 1:
+        return given[0]
+    dynamic, static = zip(*(eqx.partition(given[i], eqx.is_array) for i in numbers))
+    return eqx.combine(jax.tree.map(lambda *a: jnp.stack(a), *dynamic), static[0])
+
+
+@eqx.filter_jit
+def _simulate(lidar, scene, plan, places, values, keys, own_lidar: bool, own_scene: bool):
+    lidar, fixed_lidar = eqx.partition(lidar, eqx.is_array)
+    scene, fixed_scene = eqx.partition(scene, eqx.is_array)
+
+    def one(lidar, scene, values):
+        return evaluate(
+            eqx.combine(lidar, fixed_lidar), eqx.combine(scene, fixed_scene), plan, places, values, keys
+        )
+
+    axes = (0 if own_lidar else None, 0 if own_scene else None, 0)
+    return jax.vmap(one, in_axes=axes)(lidar, scene, values)
+
+
+def _fingerprint(y: np.ndarray, sigma: np.ndarray, names: list[Settled]) -> str:
+    digest = hashlib.sha256()
+    for array in (y, np.ascontiguousarray(sigma), *(a for s in names for a in (s.low, s.high))):
+        digest.update(np.ascontiguousarray(array).tobytes())
+    digest.update("\n".join(s.name for s in names).encode())
+    return digest.hexdigest()
+
+
+class _Kept:
+    """The file that keeps what is done."""
+
+    def __init__(self, path: str | os.PathLike[str] | None, fingerprint: str, names: list[Settled]):
+        self.path = None if path is None else Path(path)
+        self.fingerprint = fingerprint
+        self.rows: dict[int, _Row] = {}
+        if self.path is not None and self.path.exists():
+            self._read(self.path)
+
+    def _read(self, path: Path) -> None:
+        try:
+            with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
+                table = {name: file[name] for name in file.files}
+            fingerprint, numbers = str(table["fingerprint"]), table["number"].tolist()
+            columns = {f.name: table[f.name] for f in dataclasses.fields(_Row)}
+        except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile) as error:
+            raise ValueError(f"path = {path} is damaged or no file of fits: {error}") from error
+        if fingerprint != self.fingerprint:
+            raise ValueError(f"path = {path} keeps fits of other footprints, noise, bounds or unknowns")
+        for n, i in enumerate(numbers):
+            fields = {name: column[n] for name, column in columns.items()}
+            self.rows[i] = _Row(**{name: v if v.ndim else v.item() for name, v in fields.items()})
+
+    def write(self) -> None:
+        if self.path is None or not self.rows:
+            return
+        order = sorted(self.rows)
+        table: dict[str, Any] = {
+            f.name: np.array([getattr(self.rows[i], f.name) for i in order]) for f in dataclasses.fields(_Row)
+        }
+        with whole_file(self.path) as draft, draft.open("wb") as file:
+            table |= {"number": np.array(order), "fingerprint": np.array(self.fingerprint)}
+            np.savez(file, allow_pickle=False, **table)
