@@ -1,35 +1,20 @@
-"""Leaf traits from measured reflectance and transmittance: PROSPECT inverted, many leaves at once.
-
-Least squares by Levenberg and Marquardt's method on normal equations. Traits other than N act through the
-absorption of a plate, k = sum(c_i K_i)/N, alone, so with s = dR/dk / N the Jacobian's columns are s K_i and
-dR/dN - s k: the normal matrix needs two derivatives of the plate model and the table's columns, and a fit
-of seven traits costs little more than one of two. Damping is relative to the matrix's diagonal.
-
-A trait stays within its bounds by projection: those on a bound beyond which the fit would be better are held
-there for the step, the others move, and what would leave is put on the bound. Unlike `retrieve`, whose
-unknowns never reach a bound, for leaves without anthocyanins or brown pigments have their minimum on it.
-
-Leaves run in chunks that fit into the processor's cache, each chunk until its slowest leaf has ended.
-
-Source: Marquardt (1963), J. SIAM 11, 431; Bertsekas (1982), SIAM J. Control Optim. 20, 221 (projection).
-"""
+"""Leaf traits from measured reflectance and transmittance: PROSPECT inverted, many leaves at once."""
 
 from collections.abc import Mapping, Sequence
-from functools import partial
-from typing import Any, NamedTuple, final
+from typing import Any, final
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from jaxlidar import Prospect
 from jaxlidar._checks import check_range
 from jaxlidar._coefficients import TRAITS
-from jaxlidar.plates import Surface, plate_model_slopes
+from jaxlidar.plates import Surface
 from jaxlidar.prospect import material
+
+from .leaf_solver import errors_of, fit_all, rounding
 
 _BOUNDS = {
     "N": (1.0, 5.0),
@@ -42,14 +27,6 @@ _BOUNDS = {
     "Cp": (0.0, 0.02),
     "Cc": (0.0, 0.1),
 }
-# A fit has converged when a Gauss-Newton step would move it by less than this many standard errors,
-_SMALL_STEP = 0.02
-# where residuals below so many roundings count as that large.
-_ROUNDINGS = 64
-_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-3, 1e-5, 1e8
-# Smallest eigenvalue of the normal matrix, of unit diagonal, at which a combination counts as determined.
-_COLLINEAR = 1e-5
-
 STATUS = (
     "converged",
     "not converged: stopped at max_steps",
@@ -163,10 +140,11 @@ def invert_leaves(
         if value != int(value) or value < 1:
             raise ValueError(f"{field} = {value} is outside the admissible range [1, inf) of integers")
     dtype = jnp.zeros(()).dtype
+    sigma = jnp.broadcast_to(jnp.asarray(sigma, dtype), observed.shape)
     start, low, high = (jnp.asarray(a, dtype) for a in (start, low, high))
     absorption, face = material(leaf, np.asarray(wavelengths, float))
-    end = _fit_all(
-        (start, low, high, jnp.asarray(observed, dtype), jnp.asarray(1.0 / sigma, dtype)),
+    end = fit_all(
+        (start, low, high, jnp.asarray(observed, dtype), sigma),
         absorption.astype(dtype),
         Surface(*(jnp.asarray(x, dtype) for x in face)),
         len(names),
@@ -175,13 +153,12 @@ def invert_leaves(
     )
     best, index = end.best, [known.index(name) for name in names]
     chi2, square, normal = (np.asarray(a, float) for a in (best.chi2, best.square, best.normal))
-    samples = np.sum(np.isfinite(sigma), axis=(1, 2))
+    samples = np.asarray(end.samples)
     reduced = chi2 / np.maximum(samples - len(names), 1)
     if noise is None:
-        floor = (_ROUNDINGS * float(jnp.finfo(dtype).eps)) ** 2
-        normal = normal / np.maximum(reduced, floor)[:, None, None]
+        normal = normal / np.maximum(reduced, rounding(dtype) ** 2)[:, None, None]
         reduced = np.ones_like(reduced)
-    errors = _errors(normal[:, index][:, :, index], np.asarray(high - low, float)[:, index])
+    errors = errors_of(normal[:, index][:, :, index], np.asarray(high - low, float)[:, index])
     stopped = np.where(np.asarray(end.steps) >= max_steps, 1, 2)
     found = dict(zip(known, best.x.T))
     at_bound = dict(zip(known, ((best.x <= low) | (best.x >= high)).T))
@@ -199,104 +176,10 @@ def invert_leaves(
     )
 
 
-class _Point(NamedTuple):
-    """A leaf at the traits `x`: chi-squared, the same unweighted, half its gradient, normal matrix."""
-
-    x: Float[Array, "*leaves n"]
-    chi2: Float[Array, "*leaves"]
-    square: Float[Array, "*leaves"]
-    slope: Float[Array, "*leaves n"]
-    normal: Float[Array, "*leaves n n"]
-
-
-class _State(NamedTuple):
-    best: _Point
-    damping: Float[Array, "*leaves"]
-    steps: Int[Array, "*leaves"]
-    done: Bool[Array, "*leaves"]
-
-
-@partial(jax.jit, static_argnums=(3, 4, 5))
-def _fit_all(
-    leaves: tuple[Array, ...], absorption: Array, face: Surface, count: int, max_steps: int, chunk: int
-) -> _State:
-    return lax.map(lambda leaf: _fit(leaf, absorption, face, count, max_steps), leaves, batch_size=chunk)
-
-
-def _fit(leaf: tuple[Array, ...], absorption: Array, face: Surface, count: int, max_steps: int) -> _State:
-    """One leaf. Traits that are not sought have equal bounds, which hold them."""
-    start, low, high, observed, weight = leaf
-    used = weight > 0
-    freedom = jnp.maximum(jnp.sum(used) - count, 1)
-    # No residual is known better than to this.
-    floor = (
-        (_ROUNDINGS * jnp.finfo(start.dtype).eps) ** 2 * jnp.sum(weight**2) / jnp.maximum(jnp.sum(used), 1)
-    )
-
-    def at(x: Array) -> _Point:
-        k = jnp.dot(x[1:], absorption, precision=lax.Precision.HIGHEST) / x[0]
-        values, in_k, in_N = (jnp.stack(v[:2]) for v in plate_model_slopes(k, x[0], face))
-        # Else the compiler would compute them again for every sum below.
-        values, in_k, in_N = lax.optimization_barrier((values, in_k, in_N))
-        off = values - observed
-        residual, s = off * weight, in_k * weight / x[0]
-        n = in_N * weight - s * k[None]
-        # Sums over wavelengths with every coefficient: of s s K_i, s n and s residual.
-        rows = jnp.stack([jnp.sum(s * n, axis=0), jnp.sum(s * residual, axis=0)])
-        rows = jnp.concatenate([absorption * jnp.sum(s * s, axis=0)[None], rows])
-        rows = jnp.dot(rows, absorption.T, precision=lax.Precision.HIGHEST)
-        mixed, corner = rows[-2], jnp.sum(n * n)
-        normal = jnp.block([[corner[None, None], mixed[None]], [mixed[:, None], rows[:-2]]])
-        slope = jnp.concatenate([jnp.sum(n * residual)[None], rows[-1]])
-        return _Point(x, jnp.sum(residual**2), jnp.sum(jnp.where(used, off, 0.0) ** 2), slope, normal)
-
-    def step(p: _Point, damping: ArrayLike) -> Array:
-        held = ((p.x <= low) & (p.slope > 0)) | ((p.x >= high) & (p.slope < 0))
-        norm = jnp.sqrt(jnp.diagonal(p.normal))
-        norm = jnp.where(norm > 0, norm, 1.0)
-        apart = held[:, None] | held | (jnp.eye(held.size) > 0)
-        matrix = jnp.where(apart, 0.0, p.normal / (norm[:, None] * norm)) + (1.0 + damping) * jnp.eye(
-            held.size
-        )
-        right = jnp.where(held, 0.0, -p.slope / norm)
-        return jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(matrix), True), right) / norm
-
-    def advance(s: _State) -> _State:
-        trial = at(jnp.clip(s.best.x + step(s.best, s.damping), low, high))
-        better = trial.chi2 < s.best.chi2
-        best = jax.tree.map(partial(jnp.where, better), trial, s.best)
-        damping = jnp.where(better, jnp.maximum(0.1 * s.damping, _LEAST_DAMPING), 10.0 * s.damping)
-        return _State(best, damping, s.steps + 1, ended(best))
-
-    def ended(p: _Point) -> Array:
-        fall = -jnp.dot(p.slope, step(p, _LEAST_DAMPING), precision=lax.Precision.HIGHEST)
-        return fall <= _SMALL_STEP**2 * jnp.maximum(p.chi2 / freedom, floor)
-
-    first = at(start)
-    state = _State(first, jnp.asarray(_FIRST_DAMPING, start.dtype), jnp.asarray(0), ended(first))
-    going = lambda s: ~s.done & (s.steps < max_steps) & (s.damping < _MOST_DAMPING)  # noqa: E731
-    return lax.while_loop(going, advance, state)
-
-
-def _errors(
-    normal: Float[np.ndarray, "leaves n n"], width: Float[np.ndarray, "leaves n"]
-) -> Float[np.ndarray, "leaves n"]:
-    """Standard errors out of normal matrices; infinite where above the bounds' width, or collinear."""
-    norm = np.sqrt(np.diagonal(normal, axis1=1, axis2=2))
-    norm = np.where(norm > 0, norm, 1.0)
-    value, vector = np.linalg.eigh(normal / (norm[:, :, None] * norm[:, None, :]))
-    known = (value > _COLLINEAR)[:, None, :]
-    share = vector**2
-    variance = np.sum(share / np.where(known, value[:, None, :], np.inf), axis=2)
-    lost = np.sum(np.where(known, 0.0, share), axis=2) > 1e-3
-    errors = np.sqrt(variance) / norm
-    return np.where(lost | (errors > width), np.inf, errors)
-
-
 def _data(
     wavelengths: Any, reflectance: Any, transmittance: Any, noise: Any
-) -> tuple[Float[np.ndarray, "leaves 2 wavelengths"], Float[np.ndarray, "leaves 2 wavelengths"]]:
-    """Spectra, zero where there is no sample, and standard deviations, infinite there."""
+) -> tuple[Float[np.ndarray, "leaves 2 wavelengths"], Float[np.ndarray, "_ _ _"]]:
+    """Spectra, NaN where there is no sample, and standard deviations that broadcast to them."""
     x = np.asarray(wavelengths, float)
     if x.ndim != 1 or x.size == 0:
         raise ValueError(f"wavelengths has the shape {x.shape}; admissible is (wavelengths,), one or more")
@@ -310,13 +193,14 @@ def _data(
     for name, s in spectra.items():
         if s.shape != shape or len(s) == 0:
             raise ValueError(
-                f"{name} has the shape {s.shape}; admissible is (leaves, wavelengths) = {shape}, one leaf or more"
+                f"{name} has the shape {s.shape}; admissible is (leaves, wavelengths), one leaf or more, "
+                f"here {shape}"
             )
-        check_range(name, np.where(np.isnan(s), 0.0, s), -1.0, 2.0)
+        check_range(name, s[~np.isnan(s)], -1.0, 2.0)
     observed = np.stack([spectra.get(name, np.full(shape, np.nan)) for name in given], axis=1)
     sigma = np.asarray(1.0 if noise is None else noise, float)
     try:
-        sigma = np.broadcast_to(sigma, observed.shape)
+        np.broadcast_to(sigma, observed.shape)
     except ValueError:
         raise ValueError(
             f"noise has the shape {sigma.shape}, which does not broadcast to (leaves, 2, wavelengths) = "
@@ -324,8 +208,7 @@ def _data(
         ) from None
     if not np.all(sigma > 0):
         raise ValueError(f"noise = {sigma[~(sigma > 0)].flat[0]:g} is outside the admissible range (0, inf]")
-    missing = np.isnan(observed)
-    return np.where(missing, 0.0, observed), np.where(missing, np.inf, sigma)
+    return observed, sigma[(None,) * (3 - sigma.ndim)]
 
 
 def _limits(
