@@ -98,13 +98,12 @@ def _fit(leaf: tuple[Array, ...], absorption: Array, face: Surface, count: int, 
         return Point(x, jnp.sum(residual**2), jnp.sum(jnp.where(used, off, 0.0) ** 2), slope, normal)
 
     def step(p: Point, damping: ArrayLike) -> Array:
-        held = ((p.x <= low) & (p.slope >= 0)) | ((p.x >= high) & (p.slope <= 0))
+        free = ((p.x > low) | (p.slope < 0)) & ((p.x < high) | (p.slope > 0))
         norm = jnp.sqrt(jnp.diagonal(p.normal))
         norm = jnp.where(norm > 0, norm, 1.0)
-        one = jnp.eye(held.size, dtype=bool)
-        matrix = jnp.where(held[:, None] | held, 0.0, p.normal / (norm[:, None] * norm))
-        matrix = jnp.where(one, 1.0 + damping, matrix)
-        right = jnp.where(held, 0.0, -p.slope / norm)
+        matrix = jnp.where(jnp.outer(free, free), p.normal / jnp.outer(norm, norm), 0.0)
+        matrix = jnp.where(jnp.eye(norm.size, dtype=bool), 1.0 + damping, matrix)
+        right = jnp.where(free, -p.slope / norm, 0.0)
         return jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(matrix), True), right) / norm
 
     def advance(s: State) -> State:

@@ -91,7 +91,7 @@ def invert_leaves(
     *,
     unknowns: Sequence[str] | None = None,
     leaf: Prospect | None = None,
-    bounds: Mapping[str, tuple[float, float]] | None = None,
+    bounds: Mapping[str, Sequence[float]] | None = None,
     noise: ArrayLike | Sequence | None = None,
     max_steps: int = 50,
     chunk: int = 20,
@@ -102,9 +102,9 @@ def invert_leaves(
     does not converge, says so in its status and leaves the others alone.
 
     On measured leaves PROSPECT's own error, alike in neighbouring bands, exceeds the noise: standard errors,
-    which take samples as independent, are then too small. All traits of PROSPECT-D together give the best
-    carotenoids; leaves known to be green and without anthocyanins have a better Cab with Cant and Cbrown
-    left at zero: `unknowns=("N", "Cab", "Car", "Cw", "Cm")`.
+    which take samples as independent, are then too small. Which traits to seek matters: without Cant and
+    Cbrown, `unknowns=("N", "Cab", "Car", "Cw", "Cm")`, root mean squared errors in ug/cm2 become 4.9 instead
+    of 6.6 (Cab) and 3.7 instead of 2.7 (Car) on ANGERS, 10.9 instead of 8.7 and 4.8 instead of 2.9 on LOPEX.
 
     **Arguments:**
 
