@@ -30,7 +30,8 @@ from jaxlidar.plates import Surface, plate_model_slopes
 _SMALL_STEP = 0.02
 # residuals counting as so many roundings at least.
 _ROUNDINGS = 64
-_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-3, 1e-5, 1e8
+# Damping falls by ten with every step that improves the fit, the start's included.
+_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-2, 1e-5, 1e8
 # Smallest eigenvalue of the normal matrix, of unit diagonal, at which a combination counts as determined.
 _COLLINEAR = 1e-5
 
@@ -51,31 +52,48 @@ class Point(NamedTuple):
 
 
 class State(NamedTuple):
-    """The best point, the damping of the next step, steps made, whether it has converged, samples used."""
+    """The best point, where to go next and the damping from there, points tried, whether it has converged."""
 
     best: Point
+    trial: Float[Array, "*leaves n"]
     damping: Float[Array, "*leaves"]
     steps: Int[Array, "*leaves"]
     done: Bool[Array, "*leaves"]
-    samples: Int[Array, "*leaves"]
 
 
-@partial(jax.jit, static_argnums=(3, 4, 5))
-def fit_all(
-    leaves: tuple[Array, ...], absorption: Array, face: Surface, count: int, max_steps: int, chunk: int
-) -> State:
-    return lax.map(lambda leaf: _fit(leaf, absorption, face, count, max_steps), leaves, batch_size=chunk)
+class Task(NamedTuple):
+    """Leaves to fit: start and bounds of N and the traits, spectra and their standard deviations.
 
-
-def _fit(leaf: tuple[Array, ...], absorption: Array, face: Surface, count: int, max_steps: int) -> State:
-    """One leaf: start and bounds (N and traits), spectra and standard deviations (2, wavelengths).
-
-    Spectra are NaN or deviations infinite where there is no sample. Traits that are not among the `count`
-    sought have equal bounds, which hold them.
+    Traits that are not sought have equal bounds, which hold them. Spectra are NaN, or deviations infinite,
+    where there is no sample.
     """
-    start, low, high, observed, sigma = leaf
-    used = jnp.isfinite(observed) & jnp.isfinite(sigma)
-    observed, weight = jnp.where(used, observed, 0.0), jnp.where(used, 1.0 / sigma, 0.0)
+
+    start: Float[Array, "*leaves n"]
+    low: Float[Array, "*leaves n"]
+    high: Float[Array, "*leaves n"]
+    observed: Float[Array, "*leaves 2 wavelengths"]
+    sigma: Float[Array, "*leaves 2 wavelengths"]
+
+
+@partial(jax.jit, static_argnames="chunk")
+def fit_all(
+    task: Task, absorption: Array, face: Surface, count: ArrayLike, max_steps: ArrayLike, chunk: int
+) -> State:
+    """Fit leaves, in chunks of at most `chunk`; `count` traits are sought."""
+    leaves = len(task.start)
+    chunks = -(-leaves // chunk)
+    each = -(-leaves // chunks)
+    # The last leaf fills up the last chunk: a smaller one would be compiled by itself.
+    index = jnp.minimum(jnp.arange(chunks * each), leaves - 1).reshape(chunks, each)
+    fit = jax.vmap(lambda leaf: _fit(leaf, absorption, face, count, max_steps))
+    ends = lax.map(lambda i: fit(jax.tree.map(lambda a: a[i], task)), index)
+    return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:leaves], ends)
+
+
+def _fit(leaf: Task, absorption: Array, face: Surface, count: ArrayLike, max_steps: ArrayLike) -> State:
+    start, low, high = leaf.start, leaf.low, leaf.high
+    used = jnp.isfinite(leaf.observed) & jnp.isfinite(leaf.sigma)
+    observed, weight = jnp.where(used, leaf.observed, 0.0), jnp.where(used, 1.0 / leaf.sigma, 0.0)
     samples = jnp.sum(used)
     freedom = jnp.maximum(samples - count, 1)
     floor = rounding(start.dtype) ** 2 * jnp.sum(weight**2) / jnp.maximum(samples, 1)
@@ -106,23 +124,29 @@ def _fit(leaf: tuple[Array, ...], absorption: Array, face: Surface, count: int, 
         right = jnp.where(free, -p.slope / norm, 0.0)
         return jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(matrix), True), right) / norm
 
-    def advance(s: State) -> State:
-        trial = at(jnp.clip(s.best.x + step(s.best, s.damping), low, high))
-        better = trial.chi2 < s.best.chi2
-        best = jax.tree.map(partial(jnp.where, better), trial, s.best)
-        damping = jnp.where(better, jnp.maximum(0.1 * s.damping, _LEAST_DAMPING), 10.0 * s.damping)
-        return State(best, damping, s.steps + 1, ended(best), samples)
-
-    def ended(p: Point) -> Array:
+    def converged(p: Point) -> Array:
         fall = -jnp.dot(p.slope, step(p, _LEAST_DAMPING), precision=lax.Precision.HIGHEST)
         small = _SMALL_STEP**2 * jnp.maximum(p.chi2 / freedom, floor)
         # A fall of a few roundings of chi-squared could not be seen.
-        return fall <= jnp.maximum(small, 8 * jnp.finfo(fall.dtype).eps * p.chi2)
+        small = jnp.maximum(small, 8 * jnp.finfo(fall.dtype).eps * p.chi2)
+        return (fall <= small) & jnp.isfinite(p.chi2)
 
-    first = at(start)
-    state = State(first, jnp.asarray(_FIRST_DAMPING, start.dtype), jnp.asarray(0), ended(first), samples)
-    going = lambda s: ~s.done & (s.steps < max_steps) & (s.damping < _MOST_DAMPING)  # noqa: E731
-    return lax.while_loop(going, advance, state)
+    def advance(s: State) -> State:
+        tried = at(s.trial)
+        better = tried.chi2 < s.best.chi2
+        best = jax.tree.map(partial(jnp.where, better), tried, s.best)
+        damping = jnp.where(better, jnp.maximum(0.1 * s.damping, _LEAST_DAMPING), 10.0 * s.damping)
+        trial = jnp.clip(best.x + step(best, damping), low, high)
+        return State(best, trial, damping, s.steps + 1, converged(best))
+
+    def going(s: State) -> Array:
+        return ~s.done & (s.steps < max_steps) & (s.damping < _MOST_DAMPING)
+
+    # Any point is better than none: the start is tried first.
+    zero = jnp.zeros_like(start)
+    none = Point(start, jnp.full_like(floor, jnp.inf), jnp.zeros_like(floor), zero, jnp.outer(zero, zero))
+    damping = jnp.asarray(_FIRST_DAMPING, start.dtype)
+    return lax.while_loop(going, advance, State(none, start, damping, jnp.asarray(0), jnp.asarray(False)))
 
 
 def errors_of(

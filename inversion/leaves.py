@@ -14,7 +14,7 @@ from jaxlidar._coefficients import TRAITS
 from jaxlidar.plates import Surface
 from jaxlidar.prospect import material
 
-from .leaf_solver import errors_of, fit_all, rounding
+from .leaf_solver import Task, errors_of, fit_all, rounding
 
 _BOUNDS = {
     "N": (1.0, 5.0),
@@ -47,7 +47,7 @@ class LeafFit(eqx.Module):
       there are none.
     - `reduced_chi2`: (leaves,) sum of squared residuals over their variances, by the number of samples less
       that of unknowns. One by construction where no noise was given.
-    - `n_steps`: (leaves,) steps, tried or taken, each one evaluation of the model with its Jacobian.
+    - `n_steps`: (leaves,) points tried, the start included, each one PROSPECT with its Jacobian.
     - `status`: (leaves,) how it ended, number of a sentence of `inversion.leaves.STATUS`; 0 is convergence.
     """
 
@@ -119,10 +119,10 @@ def invert_leaves(
     - `noise`: one standard deviation of all samples, or an array that broadcasts to (leaves, 2, wavelengths),
       the middle axis reflectance and transmittance. Infinity leaves a sample out. Default: alike for all
       and unknown, so that standard errors are scaled by the residuals.
-    - `max_steps`: most steps, 1 or more (default 50; measured leaves need four to fifteen).
-    - `chunk`: leaves fitted at once, 1 or more (default 20; from 10 to 40 are alike).
+    - `max_steps`: most points tried, 1 or more (default 50; measured leaves need five to fifteen).
+    - `chunk`: most leaves fitted at once, 1 or more (default 20; from 10 to 40 are alike).
 
-    Results are in JAX's default precision. Equal shapes compile once.
+    Results are in JAX's default precision. Equal shapes compile once (a few seconds).
 
     **Raises:** ValueError naming field, value and admissible range: spectra outside -1..2 (per cent, say),
     of another shape than each other or than the wavelengths, or both None; wavelengths outside the table;
@@ -144,16 +144,16 @@ def invert_leaves(
     start, low, high = (jnp.asarray(a, dtype) for a in (start, low, high))
     absorption, face = material(leaf, np.asarray(wavelengths, float))
     end = fit_all(
-        (start, low, high, jnp.asarray(observed, dtype), sigma),
+        Task(start, low, high, jnp.asarray(observed, dtype), sigma),
         absorption.astype(dtype),
         Surface(*(jnp.asarray(x, dtype) for x in face)),
         len(names),
         int(max_steps),
-        min(int(chunk), len(observed)),
+        int(chunk),
     )
     best, index = end.best, [known.index(name) for name in names]
     chi2, square, normal = (np.asarray(a, float) for a in (best.chi2, best.square, best.normal))
-    samples = np.asarray(end.samples)
+    samples = np.count_nonzero(~np.isnan(observed) & np.isfinite(sigma), axis=(1, 2))
     reduced = chi2 / np.maximum(samples - len(names), 1)
     if noise is None:
         normal = normal / np.maximum(reduced, rounding(dtype) ** 2)[:, None, None]
