@@ -32,6 +32,8 @@ _SMALL_STEP = 0.02
 _ROUNDINGS = 64
 # Damping falls by ten with every step that improves the fit, the start's included.
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-2, 1e-5, 1e8
+# A first fit, to at least so many bands, gives the start of that to all.
+_FEW_BANDS = 200
 # Smallest eigenvalue of the normal matrix, of unit diagonal, at which a combination counts as determined.
 _COLLINEAR = 1e-5
 
@@ -85,12 +87,25 @@ def fit_all(
     each = -(-leaves // chunks)
     # The last leaf fills up the last chunk: a smaller one would be compiled by itself.
     index = jnp.minimum(jnp.arange(chunks * each), leaves - 1).reshape(chunks, each)
-    fit = jax.vmap(lambda leaf: _fit(leaf, absorption, face, count, max_steps))
-    ends = lax.map(lambda i: fit(jax.tree.map(lambda a: a[i], task)), index)
+    every = absorption.shape[1] // _FEW_BANDS
+
+    def fit(leaf: Task) -> State:
+        if every > 1:
+            # Far from the minimum a part of the bands leads there as well, for a part of the cost.
+            few = leaf._replace(observed=leaf.observed[:, ::every], sigma=leaf.sigma[:, ::every])
+            table, surface = absorption[:, ::every], Surface(*(x[::every] for x in face))
+            near = _fit(few, table, surface, count, max_steps, _FIRST_DAMPING)
+            leaf = leaf._replace(start=near.best.x)
+        damping = _FIRST_DAMPING if every <= 1 else _LEAST_DAMPING
+        return _fit(leaf, absorption, face, count, max_steps, damping)
+
+    ends = lax.map(lambda i: jax.vmap(fit)(jax.tree.map(lambda a: a[i], task)), index)
     return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:leaves], ends)
 
 
-def _fit(leaf: Task, absorption: Array, face: Surface, count: ArrayLike, max_steps: ArrayLike) -> State:
+def _fit(
+    leaf: Task, absorption: Array, face: Surface, count: ArrayLike, max_steps: ArrayLike, damping: float
+) -> State:
     start, low, high = leaf.start, leaf.low, leaf.high
     used = jnp.isfinite(leaf.observed) & jnp.isfinite(leaf.sigma)
     observed, weight = jnp.where(used, leaf.observed, 0.0), jnp.where(used, 1.0 / leaf.sigma, 0.0)
@@ -145,8 +160,8 @@ def _fit(leaf: Task, absorption: Array, face: Surface, count: ArrayLike, max_ste
     # Any point is better than none: the start is tried first.
     zero = jnp.zeros_like(start)
     none = Point(start, jnp.full_like(floor, jnp.inf), jnp.zeros_like(floor), zero, jnp.outer(zero, zero))
-    damping = jnp.asarray(_FIRST_DAMPING, start.dtype)
-    return lax.while_loop(going, advance, State(none, start, damping, jnp.asarray(0), jnp.asarray(False)))
+    first = State(none, start, jnp.asarray(damping, start.dtype), jnp.asarray(0), jnp.asarray(False))
+    return lax.while_loop(going, advance, first)
 
 
 def errors_of(

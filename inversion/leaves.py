@@ -47,7 +47,8 @@ class LeafFit(eqx.Module):
       there are none.
     - `reduced_chi2`: (leaves,) sum of squared residuals over their variances, by the number of samples less
       that of unknowns. One by construction where no noise was given.
-    - `n_steps`: (leaves,) points tried, the start included, each one PROSPECT with its Jacobian.
+    - `n_steps`: (leaves,) points tried with all bands, each one PROSPECT with its Jacobian; two is usual, for
+      spectra of many bands are first fitted at a part of them, and those points are not counted.
     - `status`: (leaves,) how it ended, number of a sentence of `inversion.leaves.STATUS`; 0 is convergence.
     """
 
@@ -119,7 +120,7 @@ def invert_leaves(
     - `noise`: one standard deviation of all samples, or an array that broadcasts to (leaves, 2, wavelengths),
       the middle axis reflectance and transmittance. Infinity leaves a sample out. Default: alike for all
       and unknown, so that standard errors are scaled by the residuals.
-    - `max_steps`: most points tried, 1 or more (default 50; measured leaves need five to fifteen).
+    - `max_steps`: most points tried by a fit, 1 or more (default 50; measured leaves need two to fifteen).
     - `chunk`: most leaves fitted at once, 1 or more (default 20; from 10 to 40 are alike).
 
     Results are in JAX's default precision. Equal shapes compile once (a few seconds).
