@@ -11,7 +11,6 @@ default tolerances) over `prosail.run_prospect`, leaf by leaf. Errors are those 
 linear algebra has one thread: on a busy machine it is up to five times slower with two.
 """
 
-# ruff: noqa: E402
 import argparse
 import os
 from pathlib import Path
