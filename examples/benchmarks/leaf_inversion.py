@@ -116,13 +116,13 @@ def main() -> None:
     figure, axes = plt.subplots(2, 2, figsize=(7, 7), layout="constrained")
     for ax, (name, (_, unit)) in zip(axes.flat, CHEMISTRY.items()):
         for who, marker in (("scipy", "+"), ("jaxlidar", ".")):
-            label = f"{who}: rmse {rmse[who][name]:.3g}"
-            ax.plot(truth[name], found[who][name], marker, linestyle="none", label=label)
+            ax.plot(truth[name], found[who][name], marker, linestyle="none", label=who)
         limit = 1.05 * np.nanmax([truth[name], found["jaxlidar"][name]])
         ax.plot([0, limit], [0, limit], color="black", linewidth=0.8)
-        ax.set(xlim=(0, limit), ylim=(0, limit), title=f"{name} ({unit})")
+        ax.set(xlim=(0, limit), ylim=(0, limit), title=f"{name} ({unit}), rmse {rmse['jaxlidar'][name]:.3g}")
         ax.set(xlabel="measured", ylabel="estimated", aspect="equal")
-        ax.legend(loc="lower right", fontsize="small")
+    # There no leaf lies underneath.
+    axes[1, 0].legend(loc="lower right")
     figure.suptitle(f"{len(R)} measured leaves, PROSPECT-D: {ratio:.0f} times faster than scipy with prosail")
     save_figure(figure, given.out / "leaf_inversion.png")
 
