@@ -8,7 +8,7 @@ FILE is an .npz of leaves as of the ANGERS database: `wavelength_nm`, `R` and `T
 bands, from the same start within the same bounds: here Levenberg and Marquardt's method in single precision
 with PROSPECT's own derivatives, there `scipy.optimize.least_squares` (trust region, finite differences, its
 default tolerances) over `prosail.run_prospect`, leaf by leaf. Errors are those against chemistry. Scipy's
-linear algebra has one thread: on a busy machine it is up to five times slower with two.
+linear algebra has one thread: with two, on a busy machine, it took five times as long.
 """
 
 import argparse
