@@ -11,6 +11,8 @@ from .decomposition import plant_area_index as plant_area_index
 from .decomposition import relative_heights as relative_heights
 from .decomposition import richardson_lucy as richardson_lucy
 from .decomposition import wiener as wiener
+from .leaves import LeafFit as LeafFit
+from .leaves import invert_leaves as invert_leaves
 from .result import Retrieval as Retrieval
 from .result import Step as Step
 from .retrieval import retrieve as retrieve

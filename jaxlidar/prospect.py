@@ -161,7 +161,7 @@ class Prospect(eqx.Module):
         return self._optics(wavelengths)[2]
 
     def _optics(self, wavelengths: Any) -> tuple[Array, Array, Array]:
-        absorption, face = _material(self, wavelengths)
+        absorption, face = material(self, wavelengths)
         return plate_model(self._k(absorption), self.N, face)
 
     def _k(self, absorption: Array) -> Array:
@@ -183,7 +183,7 @@ def _is_zero(value: ArrayLike) -> bool:
     return known is not None and bool(np.all(known == 0))
 
 
-def _material(leaf: Prospect, wavelengths: Any) -> tuple[Array, Surface]:
+def material(leaf: Prospect, wavelengths: Any) -> tuple[Array, Surface]:
     """Specific absorption coefficients (traits, wavelengths) and the surface at the wavelengths."""
     table = shipped(leaf.version) if leaf.coefficients is None else leaf.coefficients
     dtype = leaf.N.dtype
@@ -246,7 +246,7 @@ def prospect_jacobian(
     check_range("batch_size", batch_size, 1.0)
 
     def one(leaf: Prospect) -> tuple[tuple[Array, Array], dict[str, tuple[Array, Array]]]:
-        absorption, face = _material(leaf, wavelengths)
+        absorption, face = material(leaf, wavelengths)
         k = leaf._k(absorption)
         (R, T, _), (R_k, T_k, _), (R_N, T_N, _) = plate_model_slopes(k, leaf.N, face)
         # Else the compiler would compute them again for every trait.

@@ -1,0 +1,261 @@
+"""Traits out of leaf spectra: of leaves that PROSPECT made, and of measured ones with known chemistry."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import prosail
+import pytest
+from scipy.optimize import least_squares
+
+import jaxlidar as jl
+from inversion import invert_leaves
+from inversion.leaves import STATUS
+
+BANDS = np.arange(400.0, 2501.0, 10.0)
+RANGES = {
+    "N": (1.3, 2.5),
+    "Cab": (15.0, 70.0),
+    "Car": (4.0, 16.0),
+    "Cant": (1.0, 5.0),
+    "Cbrown": (0.05, 0.4),
+    "Cw": (0.006, 0.03),
+    "Cm": (0.003, 0.015),
+}
+GREEN = ("N", "Cab", "Car", "Cw", "Cm")
+NOISE = 0.005
+
+
+def random_traits(count, seed=0):
+    random = np.random.default_rng(seed)
+    return {name: random.uniform(*limits, count) for name, limits in RANGES.items()}
+
+
+def spectra(traits, bands=BANDS):
+    """Arrays (leaves, wavelengths) of reflectance and transmittance."""
+    leaves = jax.vmap(lambda t: jl.Prospect(**t))({name: jnp.asarray(v) for name, v in traits.items()})
+    return (np.array(s) for s in jl.prospect_spectra(leaves, bands))
+
+
+def test_traits_without_noise(precision):
+    truth = random_traits(45)
+    fit = invert_leaves(BANDS, *spectra(truth))
+    assert bool(jnp.all(fit.converged))
+    for name, value in truth.items():
+        assert fit.traits[name].dtype == precision
+        np.testing.assert_allclose(fit.traits[name], value, rtol=1e-3 if precision == "float32" else 1e-8)
+    assert float(jnp.max(fit.rmse)) < (3e-6 if precision == "float32" else 1e-12)
+
+
+@pytest.fixture(scope="module")
+def noisy():
+    """Truth, and reflectance and transmittance with noise, of 200 leaves."""
+    truth, random = random_traits(200), np.random.default_rng(1)
+    return truth, [s + NOISE * random.normal(size=s.shape) for s in spectra(truth)]
+
+
+def errors_are_as_stated(fit, truth):
+    """z-test of mean and variance over the leaves; each bound is four standard errors wide."""
+    z = np.stack([(fit.traits[n] - truth[n]) / fit.stderr[n] for n in fit.traits])
+    n = z.shape[1]
+    mean, variance = z.mean(axis=1), z.var(axis=1)
+    return bool(np.all(np.abs(mean) < 4 / np.sqrt(n)) and np.all(np.abs(variance - 1) < 4 * np.sqrt(2 / n)))
+
+
+@pytest.mark.parametrize("noise", [NOISE, None])
+def test_errors_are_as_stated(noisy, noise):
+    truth, data = noisy
+    fit = invert_leaves(BANDS, *data, noise=noise)
+    assert errors_are_as_stated(fit, truth)
+    wrong = truth | {"Cw": truth["Cw"] + 0.5 * np.asarray(fit.stderr["Cw"])}
+    assert not errors_are_as_stated(fit, wrong)
+    if noise is None:
+        np.testing.assert_array_equal(fit.reduced_chi2, 1.0)
+    else:
+        # The mean of chi-squared over f degrees of freedom has a variance of 2/f for each leaf.
+        freedom = 2 * BANDS.size - len(truth)
+        assert abs(float(jnp.mean(fit.reduced_chi2)) - 1) < 4 * np.sqrt(2 / freedom / 200)
+    np.testing.assert_allclose(jnp.mean(fit.rmse), NOISE, rtol=0.02)
+
+
+def test_errors_of_unequal_noise(noisy):
+    truth, (R, T) = noisy
+    more = np.random.default_rng(2).normal(size=T.shape)
+    fit = invert_leaves(
+        BANDS, R, T + 0.02 * more, noise=np.hypot(NOISE, [[0.0], [0.02]]) + np.zeros(BANDS.size)
+    )
+    assert errors_are_as_stated(fit, truth)
+    assert not errors_are_as_stated(invert_leaves(BANDS, R, T + 0.02 * more, noise=NOISE), truth)
+
+
+def test_fixed_traits_keep_their_values_leaf_by_leaf(noisy):
+    truth, data = noisy
+    known = {name: jnp.asarray(truth[name]) for name in ("Cant", "Cbrown")}
+    leaf = jax.vmap(lambda t: jl.Prospect(**t))(known)
+    fit = invert_leaves(BANDS, *data, unknowns=GREEN, leaf=leaf, noise=NOISE)
+    assert tuple(fit.traits) == GREEN
+    np.testing.assert_allclose(fit.leaves.Cant, truth["Cant"], rtol=1e-6)
+    assert errors_are_as_stated(fit, truth)
+
+
+def test_a_missing_sample_is_left_out(noisy):
+    _, (R, T) = noisy
+    holes = R[:30].copy()
+    holes[:, 50] = np.nan
+    keep = np.arange(BANDS.size) != 50
+    sigma = np.full((2, BANDS.size), NOISE)
+    sigma[0, 50] = np.inf
+    nan = invert_leaves(BANDS, holes, T[:30], noise=NOISE)
+    infinite = invert_leaves(BANDS, R[:30], T[:30], noise=sigma)
+    band = invert_leaves(BANDS[keep], R[:30, keep], T[:30, keep], noise=NOISE)
+    gone = invert_leaves(BANDS, holes, np.where(keep, T[:30], np.nan), noise=NOISE)
+    for name, value in nan.traits.items():
+        np.testing.assert_allclose(value, infinite.traits[name], rtol=1e-5)
+        np.testing.assert_allclose(gone.traits[name], band.traits[name], rtol=2e-3, atol=1e-6)
+        np.testing.assert_allclose(gone.stderr[name], band.stderr[name], rtol=2e-3)
+
+
+def test_a_hopeless_leaf_spoils_no_other(noisy):
+    _, data = noisy
+    R, T = (s[:30].copy() for s in data)
+    before = invert_leaves(BANDS, R, T, noise=NOISE)
+    R[7], T[7] = np.nan, np.nan
+    R[8], T[8] = 2.0, -1.0
+    after = invert_leaves(BANDS, R, T, noise=NOISE)
+    others = np.setdiff1d(np.arange(30), [7, 8])
+    assert int(after.status[7]) == STATUS.index("not fitted: no sample to fit, values are those of the start")
+    assert "not determined: N, Cab" in after.sentence(7)
+    assert float(after.traits["Cab"][7]) == 40.0
+    assert "at a bound" in after.sentence(8)
+    assert np.all(np.asarray(after.converged)[others])
+    for name, value in before.traits.items():
+        np.testing.assert_allclose(after.traits[name][others], value[others], rtol=1e-5)
+    assert not any(np.any(np.isnan(a)) for a in jax.tree.leaves(after))
+
+
+def test_what_the_spectra_do_not_say_has_no_error(noisy):
+    _, (R, _) = noisy
+    # Only visible bands, where water does not absorb, and two bands for seven unknowns.
+    visible = BANDS < 700
+    fit = invert_leaves(BANDS[visible], R[:5, visible], noise=NOISE)
+    assert np.all(np.isinf(fit.stderr["Cw"]))
+    few = invert_leaves(BANDS[[20, 60]], R[:5, [20, 60]])
+    assert np.all(np.isinf(few.stderr["Cab"]))
+    assert not any(np.any(np.isnan(a)) for a in jax.tree.leaves((fit, few)))
+
+
+def test_steps_run_out(noisy):
+    _, data = noisy
+    fit = invert_leaves(BANDS, *(s[0] for s in data), max_steps=1)
+    assert fit.sentence(0).startswith("not converged: stopped at max_steps after 1 step")
+    assert "1 not converged" in str(fit)
+
+
+@pytest.mark.parametrize("version", ["4", "5", "PC"])
+def test_other_versions(version):
+    leaf = jl.Prospect(N=1.8, Cab=30.0, Cw=0.015, version=version)
+    fit = invert_leaves(BANDS, *map(np.asarray, leaf(BANDS)), leaf=jl.Prospect(version=version))
+    R, T = jl.prospect_spectra(fit.leaves, BANDS)
+    np.testing.assert_allclose(jnp.stack([R[0], T[0]]), jnp.stack(leaf(BANDS)), atol=2e-5)
+    np.testing.assert_allclose(fit.traits["Cab"], 30.0, rtol=1e-3)
+
+
+ONE = np.full((2, BANDS.size), 0.4)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"wavelengths": BANDS[:5]}, r"reflectance has the shape \(2, 211\); .*\(2, 5\)"),
+        ({"wavelengths": BANDS - 100.0}, r"wavelengths = 300 is outside .*\[400, 2500\]"),
+        ({"wavelengths": 500.0}, r"wavelengths has the shape \(\)"),
+        ({"reflectance": 100 * ONE}, r"reflectance = 40 is outside .*\[-1, 2\]"),
+        ({"reflectance": np.where(BANDS > 500, ONE, np.inf)}, "reflectance = inf"),
+        ({"transmittance": ONE[:1]}, r"transmittance has the shape \(1, 211\)"),
+        ({"reflectance": ONE[:0], "transmittance": None}, r"reflectance has the shape \(0, 211\)"),
+        ({"reflectance": None, "transmittance": None}, "reflectance = None and transmittance = None"),
+        ({"unknowns": ("N", "Cp")}, "'Cp' .* N, Cab, Car, Cant, Cbrown, Cw, Cm"),
+        ({"unknowns": ("N", "N")}, "'N' is given twice"),
+        ({"unknowns": ()}, "unknowns is empty"),
+        ({"bounds": {"Cp": (0.0, 1.0)}}, "bounds: 'Cp' is none of"),
+        ({"bounds": {"N": (0.5, 2.0)}}, r"bounds: lower of N = 0.5 is outside .*\[1"),
+        ({"bounds": {"Cab": (50.0, 20.0)}}, r"bounds: upper of Cab = 20 is outside .*\(50"),
+        ({"bounds": {"Cab": (1.0, 2.0, 3.0)}}, r"Cab = \(1.0, 2.0, 3.0\) is not a pair"),
+        ({"bounds": {"Cab": (50.0, 90.0)}}, r"start of Cab = 40 is outside .*\[50, 90\]"),
+        ({"noise": 0.0}, r"noise = 0 is outside .*\(0, inf\]"),
+        ({"noise": np.nan}, "noise = nan"),
+        ({"noise": np.ones(3)}, r"noise has the shape \(3,\)"),
+        ({"max_steps": 0}, "max_steps = 0"),
+        ({"chunk": 0}, "chunk = 0"),
+        ({"leaf": jax.vmap(lambda n: jl.Prospect(N=n))(jnp.ones(3))}, r"leaf: N has the shape \(3,\)"),
+    ],
+)
+def test_bad_input(changes, message):
+    given = {"wavelengths": BANDS, "reflectance": ONE, "transmittance": ONE} | changes
+    with pytest.raises(ValueError, match=message):
+        invert_leaves(given.pop("wavelengths"), given.pop("reflectance"), given.pop("transmittance"), **given)
+
+
+# -- measured leaves -----------------------------------------------------------------------------------
+
+CHEMISTRY = {
+    "Cab": "leaf_chltot_per_area",
+    "Car": "leaf_cartot_per_area",
+    "Cw": "leaf_water_thickness",
+    "Cm": "leaf_mass_per_area",
+}
+
+
+def measured(shared, name):
+    with np.load(shared / "leaves" / name) as archive:
+        return dict(archive)
+
+
+def error_of(fit, record):
+    """Root mean squared errors, ug/cm2, cm and g/cm2, of the leaves whose chemistry is known."""
+    return {
+        name: float(np.sqrt(np.nanmean((np.asarray(fit.traits[name]) - record[column]) ** 2)))
+        for name, column in CHEMISTRY.items()
+    }
+
+
+def test_measured_leaves_of_angers(shared):
+    """As PROSPECT-D with scipy on all ANGERS leaves, and 5 %; here on every second one."""
+    record = measured(shared, "angers_half.npz")
+    fit = invert_leaves(record["wavelength_nm"], record["R"], record["T"])
+    assert bool(jnp.all(fit.converged))
+    error = error_of(fit, record)
+    for name, reference in {"Cab": 6.65, "Car": 2.67, "Cw": 0.00212, "Cm": 0.00261}.items():
+        assert error[name] < 1.05 * reference, name
+    green = error_of(invert_leaves(record["wavelength_nm"], record["R"], record["T"], unknowns=GREEN), record)
+    # As the docstring says.
+    assert [round(e[n], 1) for n in ("Cab", "Car") for e in (green, error)] == [4.9, 6.6, 3.7, 2.7]
+
+
+def test_measured_leaves_of_lopex(shared):
+    record = measured(shared, "lopex_half.npz")
+    fit = invert_leaves(record["wavelength_nm"], record["R"], record["T"])
+    assert bool(jnp.all(fit.converged))
+    for name, most in {"Cab": 9.0, "Car": 3.0, "Cw": 0.0011, "Cm": 0.0023}.items():
+        assert error_of(fit, record)[name] < most, name
+
+
+def test_against_scipy_with_prosail(shared):
+    """The same minimum, to a tenth of a standard error, by another solver and another model."""
+    record, leaves, step = measured(shared, "angers_half.npz"), [0, 40, 135], 10
+    R, T = (record[s][leaves, ::step].astype(float) for s in "RT")
+    fit = invert_leaves(record["wavelength_nm"][::step], R, T)
+    names = tuple(RANGES)
+
+    def residual(x, r, t):
+        content = dict(zip(("n", "cab", "car", "ant", "cbrown", "cw", "cm"), x))
+        _, model_r, model_t = prosail.run_prospect(**content)
+        off = np.concatenate([model_r[:2051:step] - r, model_t[:2051:step] - t])
+        return np.where(np.isnan(off), 0.0, off)
+
+    low, high = [1.0, *6 * [0.0]], [5.0, 150.0, 50.0, 50.0, 5.0, 0.1, 0.1]
+    for i, data in enumerate(zip(R, T)):
+        best = least_squares(
+            residual, [1.5, 40, 8, 0.1, 0.1, 0.01, 0.009], args=data, bounds=(low, high), x_scale="jac"
+        )
+        for name, value in zip(names, best.x):
+            assert abs(float(fit.traits[name][i]) - value) < 0.1 * float(fit.stderr[name][i]), name
