@@ -9,7 +9,7 @@ import dataclasses
 import hashlib
 import os
 import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, final
@@ -31,7 +31,7 @@ from .fit import Fitting, Outcome, Request, best_of, labels_of, named
 from .model import Evaluation, Model, evaluate
 from .planning import check_samples, plan_for
 from .retrieval import SOLVER, fits_from, scale_of
-from .unknowns import Settled, Unknown, settle
+from .unknowns import Settled, Unknown, settle, start_from
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,6 +101,7 @@ def retrieve_many(
     solver: optx.AbstractLeastSquaresSolver = SOLVER,
     max_steps: float = 50,
     starts: float = 1,
+    start: Mapping[str, ArrayLike] | None = None,
     scale: tuple[float, float] | None = None,
     noise_floor: float = 1e-3,
     lanes: int = 16,
@@ -117,6 +118,7 @@ def retrieve_many(
     - `noise`: one standard deviation, anything that broadcasts to `observed`.
     - `time`: (bins,) ns, of all.
     - `plan`: for all. Default: made for the first lidar and scene and the bounds' corners.
+    - `start`: by name, (footprints, ...) values that unknowns start from, instead of their own.
     - `lanes`: how many are simulated together: memory grows with it. Default 16.
     - `path`: of an .npz file that keeps what is done; if it is there, the fits in it are not repeated. It is
       written after every few fits, and when interrupted. Default None: nothing is kept.
@@ -137,7 +139,7 @@ def retrieve_many(
     check_range("starts", starts, 1)
     lidars = [_fixed(a) for a in _one_each("lidar", lidar, len(y))]
     scenes = _one_each("scene", scene, len(y))
-    settled = [settle(unknowns, s) for s in (scenes if len(scenes) > 1 else scenes[:1])]
+    settled = _started([settle(unknowns, s) for s in scenes], start or {}, len(y))
     data = [data_of(y[i], time, sigma[i], noise_floor, lidars[i % len(lidars)]) for i in range(len(y))]
     if plan is None:
         plan = plan_for(
@@ -198,6 +200,29 @@ def retrieve_many(
         status=tuple(r.status for r in rows),
         labels=labels_of(names),
     )
+
+
+def _started(settled: list[list[Settled]], start: Mapping[str, ArrayLike], count: int) -> list[list[Settled]]:
+    """The unknowns of every footprint, with its own starting values; one list where all are alike."""
+    shapes = {s.name: s.start.shape for s in settled[0]}
+    given = {}
+    for name, values in start.items():
+        if name not in shapes:
+            raise ValueError(f"start has {name!r}; admissible are {', '.join(map(repr, shapes))}")
+        given[name] = np.asarray(values, float)
+        if given[name].shape != (count, *shapes[name]):
+            raise ValueError(
+                f"start of {name!r} has the shape {given[name].shape}; admissible is {(count, *shapes[name])}"
+            )
+    if not given:
+        return settled
+    return [
+        [
+            start_from(s, jnp.asarray(given[s.name][i], s.start.dtype)) if s.name in given else s
+            for s in settled[i % len(settled)]
+        ]
+        for i in range(count)
+    ]
 
 
 def _fixed(lidar: Lidar) -> Lidar:

@@ -193,28 +193,26 @@ def _settle_one(u: Unknown, scene: Scene, optical: frozenset[int]) -> Settled:
     assert name is not None
     assert start is not None
     low, high = (np.asarray(_broadcast(name, "bounds", b, start.shape), float) for b in u.bounds)
-    value = np.asarray(start, float)
-    bad = ~((value >= low) & (value <= high))
-    if np.any(bad):
-        raise ValueError(
-            f"unknown {name!r} starts from {value[bad].flat[0]:g}, which is outside its bounds "
-            f"[{low[bad].flat[0]:g}, {high[bad].flat[0]:g}]"
-        )
-    margin = MARGIN * (high - low)
     prior, log_prior = None, isinstance(u.prior, LogNormal)
     if u.prior is not None:
         pair = (u.prior.median, u.prior.spread) if isinstance(u.prior, LogNormal) else u.prior
         mean, std = (np.asarray(_broadcast(name, "prior", p, start.shape), float) for p in pair)
         prior = np.log(mean) if log_prior else mean, std
-    return Settled(
-        name,
-        Place(number, u.apply, not touched <= optical),
-        jnp.asarray(np.clip(value, low + margin, high - margin), start.dtype),
-        low,
-        high,
-        prior,
-        log_prior,
-    )
+    place = Place(number, u.apply, not touched <= optical)
+    return start_from(Settled(name, place, start, low, high, prior, log_prior), start)
+
+
+def start_from(unknown: Settled, start: Array) -> Settled:
+    """The unknown with another starting value, kept off its bounds. **Raises:** ValueError outside them."""
+    value, low, high = np.asarray(start, float), unknown.low, unknown.high
+    bad = ~((value >= low) & (value <= high))
+    if np.any(bad):
+        raise ValueError(
+            f"unknown {unknown.name!r} starts from {value[bad].flat[0]:g}, which is outside its bounds "
+            f"[{low[bad].flat[0]:g}, {high[bad].flat[0]:g}]"
+        )
+    margin = MARGIN * (high - low)
+    return unknown._replace(start=jnp.asarray(np.clip(value, low + margin, high - margin), start.dtype))
 
 
 def _broadcast(name: str, field: str, x: Array, shape: tuple[int, ...]) -> Array:
