@@ -141,6 +141,7 @@ SLAB = family(
         {"height": 2.3, "leaf": 1e4},
         ("ground inside", "optical depth"),
     ),
+    ("ground on a face", "height", {"height": 2.0, "low": 1.0}, ("ground inside", "faces")),
     ("ground at the top", "rho", {"height": 4.0}, ("ground inside", "faces")),
     ("ground above the canopy", "height", {"height": 4.5}, ("ground inside",)),
     (
