@@ -114,6 +114,7 @@ SLAB_ROWS = (
         ("grazing",),
         {"bounds": (2e-3, 1e-6)},
     ),
+    ("by divergence", "divergence", {}, (), {"bounds": (5e-3, 1e-6)}),
     (
         "by divergence, off nadir",
         "divergence",
@@ -121,6 +122,7 @@ SLAB_ROWS = (
         (),
         {"bounds": (5e-3, 1e-5)},
     ),
+    ("by altitude, off nadir", "altitude", {"zenith": 30.0, "azimuth": 20.0}, ("400 km",)),
     ("through corners of voxels", "leaf", OBLIQUE | {"x": 0.0, "y": 0.0}, ("corners",)),
 )
 SLAB = family(
@@ -162,12 +164,14 @@ HOT_SPOT = family("slab, hot spot", *SLAB_ROWS)
 SMALL = family(
     "one voxel of 1 mm",
     ("optical depth 1", "tau", {}, ("1 mm",)),
+    ("by its size", "size", {}, ("1 mm",)),
     ("optical depth 1e-8", "tau", {"tau": 1e-8}, ("1 mm", "optical depth")),
     ("optical depth 1e4", "tau", {"tau": 1e4}, ("1 mm", "optical depth")),
 )
 LARGE = family(
     "one voxel of 1 km",
     ("optical depth 1", "tau", {}, ("1 km",)),
+    ("by its size", "size", {}, ("1 km",)),
     ("optical depth 1e-8", "tau", {"tau": 1e-8}, ("1 km", "optical depth")),
     ("optical depth 1e4", "tau", {"tau": 1e4}, ("1 km", "optical depth")),
 )

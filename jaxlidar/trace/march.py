@@ -268,6 +268,8 @@ def hold_in_columns(
     """
     if medium is None or not beam.gaussian:
         return across, jnp.ones_like(across[0])
+    # A beam without width has no profile that could make up for it.
+    wide = beam.radius > 1e-6
     across_axis = from_frame(beam.axis, (*across, jnp.zeros_like(across[0])))
     # Where the rays meet the reference plane.
     flat = along(across_axis, beam.axis, -across_axis[2] / beam.axis[2])
@@ -275,11 +277,12 @@ def hold_in_columns(
     for k in range(2):
         place = lax.stop_gradient((flat[k] - medium.origin[k]) / medium.size[k])
         now = medium.origin[k] + medium.size[k] * place
-        moved.append(now - lax.stop_gradient(now))
+        moved.append(jnp.where(wide, now - lax.stop_gradient(now), 0.0))
     shift = to_frame(beam.axis, (*moved, jnp.zeros_like(across[0])))
     across = (across[0] + shift[0], across[1] + shift[1])
-    area = medium.size[0] * medium.size[1]
-    density = beam.irradiance(across) * area
+    # Rays lie farther apart where voxels or the beam are wider.
+    area = medium.size[0] * medium.size[1] * beam.radius**2
+    density = jnp.where(wide, beam.irradiance(across) * area, 1.0)
     held = lax.stop_gradient(density)
     return across, 1.0 + (density - held) / jnp.maximum(held, 1e-30)
 
