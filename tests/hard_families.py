@@ -210,7 +210,7 @@ def slab_family(hotspot, slow=()):
         return simulation(build, SLAB, outputs, widest={"zenith": 85.0}, **more)
 
     answer = functools.partial(answers.slab, kappa=1 if hotspot else 2)
-    return Family(SLAB, make, answer, (1e-5, 1e-9), (2e-4, 1e-6), slow)
+    return Family(SLAB, make, answer, (1e-5, 1e-8), (2e-4, 1e-6), slow)
 
 
 ONE_VOXEL = {"tau": 1.0, "size": 1.0, "R": 0.4, "rho": 0.45}
@@ -337,7 +337,7 @@ FAMILIES = {
     "one voxel of 1 mm": one_voxel_family(1e-3, 1000.0),
     "one voxel of 1 km": one_voxel_family(1e3, 20000.0),
     "crown": Family(CROWN, crown, answers.crown, (1e-5, 1e-9), (1e-4, 1e-9), slow=BOTH),
-    "40 orders": Family(MANY_ORDERS, many_orders, answers.many_orders, (1e-5, 1e-9), (1e-4, 1e-9), slow=BOTH),
+    "40 orders": Family(MANY_ORDERS, many_orders, answers.many_orders, (1e-5, 1e-9), (1e-4, 1e-9), slow=DOUBLE),
     # The second and third terms of the series are from photons.
     "plate": Family(
         PLATE,
