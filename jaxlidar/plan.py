@@ -235,7 +235,8 @@ def _time(
         begin, end = map(float, window)
         if not (math.isfinite(begin) and begin < end < math.inf):
             raise ValueError(f"window = {window} is not (first, last) with first < last, in ns")
-        samples = math.floor((end - begin) / interval + 1e-6) + 1
+        # An interval in single precision is off by its rounding.
+        samples = math.floor((end - begin) / interval * (1 + 1e-6) + 1e-6) + 1
         # Returns that the pulse can carry into the window.
         first = max(first, begin - interval - high)
         last = max(begin + samples * interval - low, first + width)

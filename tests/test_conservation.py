@@ -66,3 +66,12 @@ def test_shares_of_a_single_order_add_up(name):
         jl.Lidar(divergence=2.0), what, key=jax.random.key(0), max_orders=1, n_rays=512, footprint="fixed"
     )
     assert np.allclose(sum(wave.ledger.values()), 1.0, atol=1e-5)
+
+
+def test_small_deposits_on_large_sums():
+    """Of 300,000 photons in one batch; added to a sum one by one, single precision gains or loses 0.2 %."""
+    lidar, what = jl.Lidar(divergence=2.0), scene()
+    plan = jl.plan(lidar, what, max_orders=3, n_photons=300_000, n_rays=512)
+    key = jax.random.key(0)
+    wave = jax.jit(lambda k: jl.waveform(jl.trace(lidar, what, plan, k), lidar, what, plan))(key)
+    np.testing.assert_allclose(sum(wave.ledger.values()), 1.0, atol=2e-4)

@@ -20,9 +20,12 @@ Tolerance: one plane is integrated by a Gauss rule, so only rounding (1e-6), the
 and the divergence (second order, below 1e-5) are left: 1e-4 throughout.
 """
 
+import itertools
+
 import jax
 import numpy as np
 import pytest
+from scipy.integrate import quad
 
 import jaxlidar as jl
 from jaxlidar.constants import SPEED_OF_LIGHT
@@ -168,6 +171,24 @@ def test_pointing_off_nadir_costs_the_cosine_and_forgets_the_azimuth(oblique, ze
     peak = float(waves[0].reflectance.max())
     for wave in waves[1:]:
         np.testing.assert_allclose(wave.reflectance, waves[0].reflectance, atol=TOLERANCE * peak)
+
+
+@pytest.mark.parametrize("field_of_view", [0.05, 0.3, 3.0])
+@pytest.mark.parametrize("profile", ["gaussian", "top-hat"])
+def test_the_edge_of_the_field_of_view(profile, field_of_view):
+    """Of a beam of 0.3 mrad: the share of the energy within it, integrated over its soft edge of 2 %."""
+    lidar = jl.Lidar(profile=profile, field_of_view=field_of_view)
+    wave = jl.simulate(lidar, jl.Scene(ground=jl.Ground(reflectance=0.5)), key=KEY)
+    edge, beam = 0.5 * field_of_view, 0.15
+    end = 4.0 * beam if profile == "gaussian" else beam
+
+    def seen(r):
+        density = np.exp(-2.0 * (r / beam) ** 2) * 4.0 * r if profile == "gaussian" else 2.0 * r
+        return density / beam**2 / (1.0 + np.exp(np.clip((r / edge - 1.0) / 0.02, -80.0, 80.0)))
+
+    pieces = np.clip([0.0, 0.8 * edge, edge, 1.2 * edge, end], 0.0, end)
+    share = sum(quad(seen, a, b)[0] for a, b in itertools.pairwise(pieces))
+    assert total(wave)[0] == pytest.approx(0.5 * share, rel=TOLERANCE)
 
 
 @pytest.mark.parametrize("slope", [0.0, 40.0])

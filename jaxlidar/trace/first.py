@@ -25,7 +25,7 @@ from ..materials import Specular
 from .deposit import first_bin, instant_row, scatter_rows, smooth_row
 from .footprint import Beam
 from .histories import Histories
-from .march import FAR, Medium, advance, begin, cell_of, hold_in_columns
+from .march import FAR, Medium, advance, begin, cell_of, earlier, hold_in_columns, later
 from .surfaces import Surface
 
 CHUNK = 512
@@ -66,21 +66,21 @@ def march_ray(
 ) -> tuple[Stretches, list[Scalar], Scalar]:
     """All stretches of one ray up to `end`, and the optical depth at each of `stops` and at its end."""
     walk = begin(medium, x, w)
-    end = jnp.minimum(end, walk.leave)
+    end = earlier(end, walk.leave)
 
     def step(state, _):
         distance, depth, voxel, at_stops = state
         face = walk.nearest(voxel)
-        to = jnp.minimum(jnp.minimum(face, end), distance + max_step)
+        to = earlier(end, earlier(face, distance + max_step))
         for stop in stops:
             # Plates lie between stretches, not within one.
-            to = jnp.where(stop > distance, jnp.minimum(to, stop), to)
-        to = jnp.maximum(to, distance)
+            to = jnp.where(stop > distance, earlier(to, stop), to)
+        to = later(distance, to)
         cell = cell_of(medium, voxel)
         k = medium.extinction(cell, w)
         length = to - distance
         at_stops = [
-            a + k * jnp.clip(jnp.minimum(stop, to) - distance, 0.0) for a, stop in zip(at_stops, stops)
+            a + k * (later(distance, earlier(stop, to)) - distance) for a, stop in zip(at_stops, stops)
         ]
         crossed = (to >= face) & (to < end)
         voxel_ = tuple(jnp.where(crossed, m, v) for m, v in zip(advance(walk, voxel), voxel))

@@ -101,15 +101,32 @@ def product_rule(
 ) -> tuple[tuple[Scalar, Scalar], Float[Array, "rays"]]:
     """Gauss rule in radius times equal steps in azimuth: spectrally accurate where nothing is rough.
 
-    Gauss-Laguerre in 2 r^2 / w^2 for the Gaussian beam, Gauss-Legendre in r^2 for the top-hat.
+    Gauss-Laguerre in 2 r^2 / w^2 for the Gaussian beam, Gauss-Legendre in r^2 for the top-hat. The edge of
+    a field of view is rough: there, pieces of a Gauss-Legendre rule in r end at it.
     """
-    if beam.gaussian:
+    if beam.view_radius is not None:
+        r, weight = _rule_with_edge(beam, beam.view_radius)
+    elif beam.gaussian:
         x, weight = np.polynomial.laguerre.laggauss(radial)
-        r = beam.radius * jnp.sqrt(jnp.asarray(x / 2))
+        r, weight = beam.radius * jnp.sqrt(jnp.asarray(x / 2)), jnp.asarray(weight)
     else:
         x, weight = np.polynomial.legendre.leggauss(radial)
-        r, weight = beam.radius * jnp.sqrt(jnp.asarray((x + 1) / 2)), weight / 2
+        r, weight = beam.radius * jnp.sqrt(jnp.asarray((x + 1) / 2)), jnp.asarray(weight / 2)
     a = 2 * np.pi * (np.arange(angular) + 0.5) / angular
-    ones = np.ones(angular)
     x, y = (jnp.outer(r, jnp.asarray(f(a))).reshape(-1) for f in (np.cos, np.sin))
-    return (x, y), jnp.asarray(np.outer(weight, ones).reshape(-1) / angular, x.dtype)
+    return (x, y), jnp.repeat(weight / angular, angular)
+
+
+def _rule_with_edge(
+    beam: Beam, edge: Float[Array, ""], order: int = 16
+) -> tuple[Float[Array, "radii"], Float[Array, "radii"]]:
+    """Radii and shares of the energy: Gauss-Legendre in r on pieces that resolve a soft edge of 2 %."""
+    # In units of the beam's radius; beyond four of them a Gaussian beam has 1e-14 of its energy.
+    end = jnp.asarray(4.0 if beam.gaussian else 1.0, edge.dtype)
+    at = edge / jnp.maximum(beam.radius, 1e-9)
+    ends = jnp.stack([0.0 * end, *(jnp.minimum(f * at, end) for f in (0.8, 1.0, 1.2)), end])
+    node, weight = (jnp.asarray(v, edge.dtype)[None, :] for v in np.polynomial.legendre.leggauss(order))
+    half = 0.5 * jnp.diff(ends)[:, None]
+    r = (ends[:-1, None] + half * (1.0 + node)).reshape(-1)
+    density = 4.0 * r * jnp.exp(-2.0 * r * r) if beam.gaussian else 2.0 * r
+    return beam.radius * r, (half * weight).reshape(-1) * density

@@ -33,6 +33,8 @@ from .scatter import collide, view_factors
 from .surfaces import Surface
 
 CHUNK = 512
+# Chunks that are added up by themselves: single precision loses small deposits on a large sum.
+GROUP = 16
 
 
 class HigherOrders(eqx.Module):
@@ -103,7 +105,17 @@ def higher_orders(
         jnp.zeros((count,)),
         jnp.zeros((count,)),
     )
-    tallies, _ = lax.scan(chunk, zero, jnp.arange(chunks, dtype=jnp.uint32))
+    groups = -(-chunks // GROUP)
+    each = -(-chunks // groups)
+
+    def group(tallies, first):
+        more, _ = lax.scan(chunk, zero, first + jnp.arange(each, dtype=jnp.uint32))
+        return jax.tree.map(jnp.add, tallies, more), None
+
+    if groups > 1:
+        tallies, _ = lax.scan(group, zero, each * jnp.arange(groups, dtype=jnp.uint32))
+    else:
+        tallies, _ = group(zero, jnp.uint32(0))
     return eqx.tree_at(lambda t: t.weights, tallies, bins.trim(tallies.weights))
 
 

@@ -1,0 +1,187 @@
+"""What holds for every admissible scene, by random ones: a canopy of few voxels, a plate and sloping ground.
+
+Structure and shapes stay the same, so that all scenes share one compiled simulation for each precision.
+Random numbers do not change either: what must agree is compared photon by photon, in double precision, where
+no photon falls on the other side of a face by rounding.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+import jaxlidar as jl
+
+KEY = jax.random.key(3)
+SHAPE = (2, 2, 3)
+CELLS = int(np.prod(SHAPE))
+
+usually = functools.partial(
+    settings, deadline=None, derandomize=True, database=None, suppress_health_check=[HealthCheck.too_slow]
+)
+shares = st.floats(0.0, 1.0)
+# Mostly ordinary voxels, and some that are empty or solid.
+chances = st.one_of(st.floats(0.0, 0.9), st.sampled_from([0.0, 1.0, 1e-8]))
+volumes = st.lists(chances, min_size=CELLS, max_size=CELLS)
+
+
+@st.composite
+def scenes(draw):
+    """Numbers of an admissible scene; reflectance and transmittance are drawn as their sum and its share."""
+    leaf, leaf_part, plate, plate_part = (draw(shares) for _ in range(4))
+    return {
+        "p_leaf": np.reshape(draw(volumes), SHAPE),
+        "p_bark": np.reshape(draw(volumes), SHAPE),
+        "leaf": np.array([leaf * leaf_part, leaf * (1 - leaf_part)]),
+        "plate": np.array([plate * plate_part, plate * (1 - plate_part)]),
+        "bark": draw(shares),
+        "rho": draw(shares),
+        "coverage": draw(shares),
+        "plate height": draw(st.floats(-1.0, 6.0)),
+        "height": draw(st.floats(-3.0, 3.0)),
+        "slope": draw(st.floats(0.0, 40.0)),
+        "aspect": draw(st.floats(0.0, 360.0)),
+        "zenith": draw(st.floats(0.0, 20.0)),
+        "azimuth": draw(st.floats(0.0, 360.0)),
+        "divergence": draw(st.floats(0.0, 2.0)),
+        # Off the faces of voxels: on one, rounding has to choose a side.
+        "position": np.array([draw(st.sampled_from([-1, 1])) * draw(st.floats(0.05, 0.9)) for _ in range(2)]),
+        "origin": np.array([-1.0, -1.0, 0.5]),
+    }
+
+
+def build(p):
+    lidar = jl.Lidar(
+        divergence=p["divergence"], zenith=p["zenith"], azimuth=p["azimuth"], position=p["position"]
+    )
+    voxels = jl.VoxelMap.from_probability(
+        leaf=p["p_leaf"], bark=p["p_bark"], voxel_size=1.0, origin=p["origin"]
+    )
+    plate = jl.Plate(
+        height=p["plate height"],
+        reflectance=p["plate"][0],
+        transmittance=p["plate"][1],
+        coverage=p["coverage"],
+    )
+    return lidar, jl.Scene(
+        canopy=jl.Canopy(
+            voxels, leaf=jl.LeafOptics(reflectance=p["leaf"][0], transmittance=p["leaf"][1]), bark=p["bark"]
+        ),
+        plates=(plate,),
+        ground=jl.Ground(height=p["height"], reflectance=p["rho"], slope=p["slope"], aspect=p["aspect"]),
+    )
+
+
+@functools.cache
+def compiled(precision):
+    """A waveform out of numbers; the plan is that of the widest of all scenes."""
+    widest = {
+        "p_leaf": np.full(SHAPE, 0.5),
+        "p_bark": np.full(SHAPE, 0.5),
+        "leaf": np.array([0.4, 0.3]),
+        "plate": np.array([0.3, 0.3]),
+        "bark": 0.4,
+        "rho": 0.4,
+        "coverage": 0.5,
+        "plate height": 6.5,
+        "height": -3.0,
+        "slope": 40.0,
+        "aspect": 0.0,
+        "zenith": 20.0,
+        "azimuth": 45.0,
+        "divergence": 2.0,
+        "position": np.zeros(2),
+        "origin": np.array([-1.0, -1.0, 0.5]),
+    }
+    plan = jl.plan(
+        *build(arrays(widest)),
+        max_orders=3,
+        n_photons=128,
+        n_rays=32,
+        window=(-80.0, 120.0),
+        footprint="fixed",
+        max_step=0.5,
+    )
+
+    def simulated(p):
+        lidar, scene = build(p)
+        return jl.waveform(jl.trace(lidar, scene, plan, KEY), lidar, scene, plan)
+
+    return jax.jit(simulated, compiler_options={"xla_backend_optimization_level": 0})
+
+
+def arrays(p):
+    return {name: jnp.asarray(value, float) for name, value in p.items()}
+
+
+def simulate(p, precision="float64"):
+    with jax.enable_x64(precision == "float64"):
+        return jax.tree.map(np.asarray, compiled(precision)(arrays(p)))
+
+
+def alike(found, wanted, tolerance=1e-6):
+    found, wanted = np.asarray(found, float), np.asarray(wanted, float)
+    np.testing.assert_allclose(found, wanted, rtol=0, atol=tolerance * np.max(wanted) + 1e-12)
+
+
+@pytest.mark.parametrize("precision", [pytest.param("float32", marks=pytest.mark.slow), "float64"])
+@usually(max_examples=25)
+@given(p=scenes())
+def test_finite_and_not_negative_and_no_more_than_was_emitted(precision, p):
+    wave = simulate(p, precision)
+    for path, value in jax.tree.leaves_with_path(wave):
+        assert np.all(np.isfinite(value)), path
+    slack = 1e-6 * float(np.max(wave.reflectance)) + 1e-9
+    for name, part in {**wave.components, "all": wave.reflectance}.items():
+        assert float(np.min(part)) >= -slack, name
+    assert np.sum(wave.energy) <= 1e-3
+    np.testing.assert_allclose(np.sum(list(wave.ledger.values()), axis=0), 1.0, atol=2e-5)
+    for name in ("returned", "escaped", "after the window", "unfollowed"):
+        assert float(wave.ledger[name][0]) >= -1e-6, name
+
+
+@usually(max_examples=20)
+@given(scenes(), shares)
+def test_brighter_ground_never_darkens(p, other):
+    low, high = sorted((p["rho"], other))
+    dark, bright = (np.asarray(simulate(p | {"rho": rho}).reflectance) for rho in (low, high))
+    assert np.all(bright - dark >= -1e-6 * np.max(bright) - 1e-12)
+    ground = np.asarray(simulate(p | {"rho": high}).components["ground"])
+    if high - low > 0.1 and np.max(ground) > 1e-3:
+        assert np.max(bright - dark) > 0
+
+
+@usually(max_examples=20)
+@given(scenes(), st.floats(-300.0, 300.0), st.floats(-300.0, 300.0))
+def test_moving_everything_sideways(p, east, north):
+    shift, aspect = np.array([east, north]), np.deg2rad(p["aspect"])
+    # Heights are those at x = y = 0.
+    rise = np.tan(np.deg2rad(p["slope"])) * (east * np.sin(aspect) + north * np.cos(aspect))
+    moved = p | {
+        "position": p["position"] + shift,
+        "origin": p["origin"] + np.append(shift, 0.0),
+        "height": p["height"] + rise,
+    }
+    found, wanted = (simulate(q) for q in (moved, p))
+    alike(found.reflectance, wanted.reflectance)
+
+
+@usually(max_examples=20)
+@given(scenes(), st.integers(1, 3))
+def test_turning_everything_about_the_vertical(p, quarters):
+    """Clockwise by quarter turns: the first order of a beam without divergence, through open voxels."""
+    p = p | {"divergence": 0.0}
+    turned = dict(p)
+    for _ in range(quarters):
+        turned["p_leaf"] = np.rot90(turned["p_leaf"], -1)
+        turned["p_bark"] = np.rot90(turned["p_bark"], -1)
+        x, y = turned["position"]
+        turned["position"] = np.array([y, -x])
+        turned["aspect"] += 90.0
+        turned["azimuth"] += 90.0
+    found, wanted = (simulate(q) for q in (turned, p))
+    alike(found.components["first"], wanted.components["first"])
