@@ -8,6 +8,7 @@ from .analog import AnalogReturns as AnalogReturns
 from .analog import analog_returns as analog_returns
 from .analog import photon_paths as photon_paths
 from .atmosphere import Atmosphere as Atmosphere
+from .effects import Effect as Effect
 from .forest import forest as forest
 from .habits import Branching as Branching
 from .habits import Habit as Habit
@@ -27,7 +28,6 @@ from .materials import Isotropic as Isotropic
 from .materials import Lambertian as Lambertian
 from .materials import LeafAngles as LeafAngles
 from .materials import Specular as Specular
-from .plan import Effect as Effect
 from .plan import Plan as Plan
 from .plan import plan as plan
 from .plates import plate_model as plate_model

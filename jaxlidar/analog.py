@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from ._checks import check_range
 from ._vector import along, dot, vec
 from .constants import SPEED_OF_LIGHT
+from .effects import without
 from .lidar import Lidar
 from .plan import Plan
 from .scene import Scene, leaf_optics
@@ -127,6 +128,7 @@ class _Arrival(eqx.Module):
 
 
 def _setting(lidar: Lidar, scene: Scene, plan: Plan) -> Setting:
+    lidar, scene = without(lidar, scene, plan.off)
     if scene.canopy is not None and scene.canopy.hotspot:
         raise ValueError("hotspot = True; admissible is False: the way back is independent of the way in")
     transmittance = 0.0

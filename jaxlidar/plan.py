@@ -2,13 +2,16 @@
 
 import dataclasses
 import math
+from collections.abc import Mapping
 
+from .bounds import Bounds
 from .constants import SPEED_OF_LIGHT
+from .effects import NAMES, Effect, present, switched_off, without
 from .extent import Extent, number
 from .layout import KERNEL, Bins, Layout
 from .letters import largest_albedo, lobe_probability, scene_optics, spell
 from .lidar import Lidar
-from .materials import Isotropic, Specular
+from .materials import Isotropic
 from .pulse import RectangularPulse
 from .scene import Plate, Scene
 
@@ -18,16 +21,6 @@ MAX_HISTORIES = 5000
 MAX_ORDERS = 100
 # Multiple scattering is followed this long after the last first-order return, ns.
 TAIL = (10.0, 60.0)
-
-
-@dataclasses.dataclass(frozen=True)
-class Effect:
-    """One effect: whether it is simulated, why, and the relative change that leaving it out makes at most."""
-
-    name: str
-    simulated: bool
-    reason: str
-    bound: float | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,6 +43,8 @@ class Plan:
     sharpen: bool
     degree: int
     first_degree: int
+    # Names of the effects that are switched off.
+    off: tuple[str, ...]
     # What is compiled depends on neither.
     rtol: float = dataclasses.field(compare=False)
     effects: tuple[Effect, ...] = dataclasses.field(compare=False)
@@ -65,9 +60,9 @@ class Plan:
         return self.layout.orders > 1 or (self.random_footprint and not self.smooth_footprint)
 
     def __str__(self) -> str:
-        rows = [("effect", "simulated", "bound", "why")]
+        rows = [("effect", "simulated", "changes at most", "why")]
         for e in self.effects:
-            bound = "" if e.bound is None else f"{e.bound:.1e}"
+            bound = "nothing" if e.bound == 0 else f"{100 * e.bound:.2g} % of {e.measure}"
             rows.append((e.name, "yes" if e.simulated else "no", bound, e.reason))
         widths = [max(len(r[i]) for r in rows) for i in range(3)]
         lines = ["  ".join([*(c.ljust(w) for c, w in zip(r, widths)), r[3]]).rstrip() for r in rows]
@@ -76,7 +71,7 @@ class Plan:
             f"{self.n_samples} samples of {self.sample_interval:g} ns from {self.sample_start:g} ns, "
             f"{self.bins.count} fine bins of {self.bins.width:.3g} ns"
         )
-        if not self.smooth_footprint:
+        if not self.smooth_footprint and self.n_rays > 1:
             sizes += f", {self.n_rays} rays"
         if self.orders > 1:
             sizes += f", {self.n_photons} photons a batch, {self.orders} orders"
@@ -95,6 +90,7 @@ def plan(
     window: tuple[float, float] | None = None,
     bin_width: float | None = None,
     footprint: str = "random",
+    effects: Mapping[str, bool] | None = None,
 ) -> Plan:
     """Decide what `simulate` will do.
 
@@ -108,6 +104,11 @@ def plan(
     - `window`: (first, last) sample time in ns; None covers the scene.
     - `bin_width`: fine bins in ns, rounded to a fraction of the sampling interval; None: by the pulse.
     - `footprint`: "random" (each batch shifts the rays, so that the standard error covers them) or "fixed".
+    - `effects`: effects to switch off, by name, as in {"multiple scattering": False}; True asks for what
+      is on anyway and refuses scenes that do not have it. The names are those of the table's first column.
+
+    What the scene does not have is off, and never compiled. All else is on, however small: a plan also
+    serves other values of the same scene, in fits and derivatives.
 
     **Raises:** ValueError for inadmissible arguments, for a scene that reaches above the sensor, and if
     the geometry is being traced by a JAX transformation: make the plan outside and pass it in.
@@ -126,10 +127,15 @@ def plan(
         raise ValueError(f"max_step = {max_step:g} is outside the admissible range (0, inf)")
     if footprint not in ("random", "fixed"):
         raise ValueError(f"footprint = {footprint!r} is none of 'random', 'fixed'")
+    whole = lidar, scene
+    off = switched_off(effects, present(lidar, scene), max_orders)
+    lidar, scene = without(lidar, scene, off)
     geometry = Extent(lidar, scene)
     optics = scene_optics(lidar, scene)
     letters = spell(optics)
-    orders, bound, why = _orders(largest_albedo(optics), len(letters.letters), scene, rtol, max_orders)
+    if "multiple scattering" in off:
+        max_orders = 1
+    orders, why = _orders(largest_albedo(optics), len(letters.letters), scene, rtol, max_orders)
     bins, samples = _time(lidar, scene, geometry, orders, window, bin_width)
     metres = 0.5 * SPEED_OF_LIGHT * bins.width
     step = geometry.longest_chord if max_step is None else min(max_step, geometry.longest_chord)
@@ -167,15 +173,17 @@ def plan(
         sample_interval=samples[1],
         n_samples=samples[2],
         per_sample=samples[3],
-        n_rays=int(n_rays),
+        # A beam without width is one ray.
+        n_rays=1 if "divergence" in off else int(n_rays),
         n_photons=int(n_photons),
-        smooth_footprint=scene.canopy is None,
-        random_footprint=footprint == "random",
+        smooth_footprint=scene.canopy is None and "divergence" not in off,
+        random_footprint=footprint == "random" and "divergence" not in off,
         sharpen=bool(sharpen),
         degree=_degree(orders, plates),
         first_degree=1 + 2 * plates,
+        off=off,
         rtol=rtol,
-        effects=_effects(lidar, scene, orders, bound, why),
+        effects=_effects(*whole, off, orders, why, bins, geometry.upstream),
     )
 
 
@@ -184,11 +192,9 @@ def _degree(orders: int, plates: int) -> int:
     return orders + (orders + 1) * plates
 
 
-def _orders(
-    albedo: float, kinds: int, scene: Scene, rtol: float, max_orders: int | None
-) -> tuple[int, float | None, str]:
+def _orders(albedo: float, kinds: int, scene: Scene, rtol: float, max_orders: int | None) -> tuple[int, str]:
     if scene.canopy is None and len(scene.surfaces) <= 1:
-        return 1, 0.0, "one plane cannot light itself"
+        return 1, "one plane cannot light itself"
     plates = len(scene.plates)
     most = 2
     while most < MAX_ORDERS and math.comb(_degree(most + 1, plates) + kinds, kinds) <= MAX_HISTORIES:
@@ -198,8 +204,9 @@ def _orders(
         # Between scatterings part of the light escapes: at least a fifth, where anything can.
         wanted = 1 + math.ceil(math.log(rtol / 10) / math.log(max(0.8 * albedo, 1e-6)))
     orders = min(max(wanted, 2), most) if max_orders is None else int(max_orders)
-    bound = min(albedo**orders / max(1 - albedo, 1e-6), 1.0)
-    return orders, bound, f"orders 1 to {orders}; largest albedo {albedo:.2f}"
+    if orders == 1:
+        return 1, "one order is asked for"
+    return orders, f"orders 2 to {orders}; largest albedo {albedo:.2f}"
 
 
 def _time(
@@ -250,42 +257,93 @@ def _time(
     return Bins(start, width, max(count, 1), KERNEL), (begin, interval, samples, per_sample)
 
 
-def _effects(lidar: Lidar, scene: Scene, orders: int, bound: float | None, why: str) -> tuple[Effect, ...]:
-    canopy = scene.canopy
-    c = SPEED_OF_LIGHT
+def _effects(
+    lidar: Lidar, scene: Scene, off: tuple[str, ...], orders: int, why: str, bins: Bins, upstream: float
+) -> tuple[Effect, ...]:
+    has, planned = present(lidar, scene), present(*without(lidar, scene, off))
+    reasons = dict.fromkeys(NAMES, "in the scene") | {"multiple scattering": why} | _reasons(lidar, scene)
+    bounds = Bounds(*without(lidar, scene, off), orders)
     rows = []
-    has = lambda x: "in the scene" if x else "not in the scene"  # noqa: E731
-    leaf = canopy is not None and canopy.voxels.leaf is not None
-    bark = canopy is not None and canopy.voxels.bark is not None
-    rows.append(Effect("leaf", leaf, has(leaf)))
-    rows.append(Effect("bark", bark, has(bark)))
-    rows.append(Effect("plates", bool(scene.plates), has(scene.plates)))
-    ground = scene.ground
-    rows.append(Effect("ground", ground is not None, has(ground)))
-    if ground is not None:
-        slope = number(ground.slope)
-        spread = 2 * number(lidar.footprint_radius) / 2 * math.tan(math.radians(slope)) / c
-        rows.append(Effect("slope spread", slope > 0, f"{spread:.2g} ns (standard deviation)"))
-    rows.append(Effect("multiple scattering", orders > 1, why, bound))
-    mirror = any(isinstance(s.law, Specular) for s in scene.surfaces)
-    rows.append(Effect("specular return", mirror, has(mirror)))
-    divergence = number(lidar.divergence)
-    rows.append(Effect("divergence", divergence > 0, f"{divergence:g} mrad"))
-    fov = lidar.field_of_view
-    rows.append(
-        Effect("field of view", fov is not None, "sees everything" if fov is None else "soft edge of 2 %")
-    )
-    if canopy is not None:
-        path = "hot spot: exp(-tau)" if canopy.hotspot else "independent ways: exp(-2 tau)"
-        rows.append(Effect("hot spot", canopy.hotspot, path))
-    air = scene.atmosphere
-    rows.append(Effect("atmospheric extinction", air is not None, has(air)))
-    if air is not None:
-        scatters = air.lidar_ratio is not None
-        rows.append(
-            Effect("atmospheric backscatter", scatters, "above the scene" if scatters else "no lidar ratio")
-        )
-        rows.append(Effect("scattering within the atmosphere", False, "beyond first order", None))
-    jitter = number(lidar.jitter)
-    rows.append(Effect("jitter", jitter > 0, f"{jitter:g} ns"))
+    for name in NAMES:
+        on = planned[name] and name not in off and (name != "multiple scattering" or orders > 1)
+        reason, own = reasons[name], bounds
+        if name in off:
+            # What switching it on again would change.
+            own = Bounds(*without(lidar, scene, tuple(n for n in off if n != name)), orders)
+            reason = "switched off"
+        elif not has[name] and name not in ("multiple scattering", "hot spot"):
+            reason = "not in the scene"
+        elif has[name] and not planned[name] and name != "multiple scattering":
+            reason = "gone with what is switched off"
+        rows.append(Effect(name, on, reason, _bound(name, own, bins, upstream), _measure(name)))
+        if on and name == "multiple scattering":
+            rows.append(
+                Effect(f"orders beyond {orders}", False, "too little is left", bounds.beyond(orders), "sum")
+            )
+    if bounds.scene.atmosphere is not None:
+        # Light that the air scatters and the receiver still gets is at most what was lost.
+        lost = bounds.lost(bins)
+        rows.append(Effect("scattering within the atmosphere", False, "beyond first order", lost, "sum"))
     return tuple(rows)
+
+
+def _measure(name: str) -> str:
+    return "samples" if name in ("slope spread", "divergence", "jitter") else "sum"
+
+
+def _bound(name: str, bounds: Bounds, bins: Bins, upstream: float) -> float:
+    lidar, scene = bounds.lidar, bounds.scene
+    if name == "hot spot":
+        return bounds.hot_spot()
+    if not present(lidar, scene)[name]:
+        return 0.0
+    match name:
+        case "leaf" | "bark":
+            return bounds.part(name)
+        case "plates":
+            return bounds.plates()
+        case "ground":
+            return bounds.ground()
+        case "slope spread":
+            level = without(lidar, scene, ("slope spread",))[1].ground
+            assert level is not None
+            return bounds.slope_spread(level)
+        case "multiple scattering":
+            return bounds.beyond(1)
+        case "divergence":
+            return bounds.divergence()
+        case "field of view":
+            return bounds.field_of_view()
+        case "atmospheric extinction":
+            return bounds.extinction(bins, upstream)
+        case "atmospheric backscatter":
+            return bounds.backscatter(bins, upstream)
+        case "jitter":
+            return bounds.jitter()
+    # A mirror's return may outshine all else.
+    return 1.0
+
+
+def _reasons(lidar: Lidar, scene: Scene) -> dict[str, str]:
+    """Why effects are on, by their size, where more can be said than that they are there."""
+    radius = number(lidar.footprint_radius)
+    slope = 0.0 if scene.ground is None else number(scene.ground.slope)
+    spread = radius * math.tan(math.radians(slope)) / SPEED_OF_LIGHT
+    view = lidar.field_of_view
+    air = scene.atmosphere
+    hotspot = scene.canopy is not None and scene.canopy.hotspot
+    reasons = {
+        "slope spread": f"{slope:g} degrees: {spread:.2g} ns (standard deviation)",
+        "divergence": f"{number(lidar.divergence):g} mrad: a footprint of radius {radius:.3g} m",
+        "field of view": "" if view is None else f"{number(view):g} mrad, with a soft edge of 2 %",
+        "hot spot": "back through the same gap: exp(-tau)"
+        if hotspot
+        else "ways are independent: exp(-2 tau)",
+        "atmospheric backscatter": "above the scene",
+        "jitter": f"{number(lidar.jitter):g} ns",
+    }
+    if scene.canopy is None:
+        reasons["hot spot"] = "not in the scene"
+    if air is not None and air.lidar_ratio is None:
+        reasons["atmospheric backscatter"] = "no lidar ratio"
+    return reasons

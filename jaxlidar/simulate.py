@@ -4,7 +4,7 @@ import dataclasses
 import math
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 
 import equinox as eqx
@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from ._checks import is_traced
+from .effects import without
 from .extent import Extent
 from .letters import scene_optics, spell
 from .lidar import Lidar
@@ -60,6 +61,7 @@ def simulate(
     window: tuple[float, float] | None = None,
     bin_width: float | None = None,
     footprint: str = "random",
+    effects: Mapping[str, bool] | None = None,
     max_seconds: float = math.inf,
     progress: Callable[[Progress], None] | None = None,
 ) -> Waveform:
@@ -77,7 +79,7 @@ def simulate(
     - `n_photons`: trace this many photons, in eight batches, whatever the error. Within a JAX
       transformation (grad, jacfwd, vmap over scenes) `n_photons` and `plan` are needed.
     - `plan`: what to simulate (`jaxlidar.plan`); the next arguments then have no say.
-    - `max_orders`, `max_step`, `n_rays`, `window`, `bin_width`, `footprint`: see `jaxlidar.plan`.
+    - `max_orders`, `max_step`, `n_rays`, `window`, `bin_width`, `footprint`, `effects`: see `jaxlidar.plan`.
     - `max_seconds`: stop after this time, however large the error. An interrupt (Ctrl-C) after eight
       batches also ends the simulation with what is done.
     - `progress`: called with a `Progress` after every round of batches; for instance `print`.
@@ -102,6 +104,7 @@ def simulate(
             window=window,
             bin_width=bin_width,
             footprint=footprint,
+            effects=effects,
         )
     elif not any(is_traced(x) for x in jax.tree.leaves((lidar, scene))):
         _check_plan(plan, lidar, scene)
@@ -129,6 +132,7 @@ def simulate(
 
 def _check_plan(plan: Plan, lidar: Lidar, scene: Scene) -> None:
     """Refuse a plan that would miss parts of the scene."""
+    lidar, scene = without(lidar, scene, plan.off)
     top = -0.5 * Extent(lidar, scene).first
     if top > plan.layout.upstream:
         raise ValueError(
@@ -145,6 +149,7 @@ def _check_plan(plan: Plan, lidar: Lidar, scene: Scene) -> None:
 
 def trace_all(lidar: Lidar, scene: Scene, plan: Plan, key: PRNGKeyArray) -> Response | list[Response]:
     """One batch: a response, or one for each wavelength where leaves transmit straight on."""
+    lidar, scene = without(lidar, scene, plan.off)
     if scene.canopy is None or not is_straight(scene):
         return trace(lidar, scene, plan, key)
     _, t = leaf_optics(scene.canopy, lidar.wavelength)

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .constants import SPEED_OF_LIGHT
+from .effects import without
 from .layout import KERNEL_VARIANCE
 from .letters import scene_optics
 from .lidar import Lidar
@@ -147,6 +148,7 @@ def total_of(
     response: Response, lidar: Lidar, scene: Scene, plan: Plan
 ) -> Float[Array, "wavelengths samples"]:
     """Apparent reflectance per sample, all components together."""
+    lidar, scene = without(lidar, scene, plan.off)
     # Sums over materials, and the pulse where no atmosphere lies between, come before the many wavelengths.
     letters, values = len(plan.layout.letters), optics(lidar, scene, plan)
     clear = scene.atmosphere is None
@@ -194,6 +196,7 @@ def waveform(
     - `response`: as traced; a list with one for each wavelength where the canopy's transmission is straight.
     - `stderr`: standard error of the reflectance, from batches. Default zero.
     """
+    lidar, scene = without(lidar, scene, plan.off)
     letters = optics(lidar, scene, plan)
     if isinstance(response, list):
         parts = [_coloured(r, letters[:, i : i + 1], plan) for i, r in enumerate(response)]

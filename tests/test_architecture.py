@@ -34,6 +34,7 @@ STAGES = [
     {"voxelise", "io"},
     {"scene"},
     {"letters", "extent"},
+    {"effects", "bounds"},
     {"plan"},
     {"trace"},
     {"waveform"},

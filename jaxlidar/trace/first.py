@@ -229,7 +229,11 @@ def first_order(
         return response, arrived.reshape(materials, count), escaped
 
     n = energy.shape[0]
-    size = min(CHUNK, n)
+    if medium is None or n <= CHUNK:
+        # Without a march all rays fit into one chunk, and no loop is compiled.
+        response, arrived, escaped = rays(across, energy)
+        return FirstOrder(bins.trim(response.reshape(materials, count, bins.padded)), arrived, escaped)
+    size = CHUNK
     fill = -n % size
     padded = [jnp.pad(a, (0, fill)).reshape(-1, size) for a in (*across, energy)]
 

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from ..effects import without
 from ..lidar import Lidar
 from ..materials import Specular
 from ..plan import Plan
@@ -68,11 +69,13 @@ def trace(
     A pure function of arrays, to be compiled, batched and differentiated. `leaf_transmittance` matters only
     where the canopy's transmission is straight; extinction is then scaled by one minus it.
     """
+    lidar, scene = without(lidar, scene, plan.off)
     layout, bins = plan.layout, plan.bins
     beam, medium, surfaces = geometry_of(lidar, scene, leaf_transmittance)
     table = histories(len(layout.letters), plan.degree)
     short = histories(len(layout.letters), plan.first_degree)
-    shift_key, photon_key = jax.random.split(key)
+    # What is not random is compiled without random numbers.
+    shift_key, photon_key = jax.random.split(key) if plan.is_random else (key, key)
 
     if plan.smooth_footprint:
         across, energy = product_rule(beam)
@@ -82,7 +85,7 @@ def trace(
     first = first_order(beam, medium, surfaces, layout, short, bins, across, energy)
     weights = first.weights
     for i, surface in enumerate(surfaces):
-        if isinstance(surface.law, Specular):
+        if isinstance(surface.law, Specular) and "specular return" not in plan.off:
             weights = weights + _mirror(beam, medium, surfaces, i, plan, short)
 
     if plan.layout.orders < 2:
