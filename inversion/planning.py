@@ -58,7 +58,7 @@ def plan_for(
     scenes = corners(scene, settled)
     common = {"window": window, "n_photons": photons, "n_rays": rays}
     first = make_plan(lidar, scenes[0], max_orders=max_orders, **common)
-    common.update(max_orders=first.orders, bin_width=first.bins.width)
+    common.update(max_orders=first.orders, bin_width=first.bins.width, describe=False)
     if scene.canopy is not None:
         common.update(max_step=first.layout.max_step)
     plans = [first]

@@ -91,6 +91,7 @@ def plan(
     bin_width: float | None = None,
     footprint: str = "random",
     effects: Mapping[str, bool] | None = None,
+    describe: bool = True,
 ) -> Plan:
     """Decide what `simulate` will do.
 
@@ -106,6 +107,7 @@ def plan(
     - `footprint`: "random" (each batch shifts the rays, so that the standard error covers them) or "fixed".
     - `effects`: effects to switch off, by name, as in {"multiple scattering": False}; True asks for what
       is on anyway and refuses scenes that do not have it. The names are those of the table's first column.
+    - `describe`: whether to make the table of effects, with its bounds; takes some 10 ms.
 
     What the scene does not have is off, and never compiled. All else is on, however small: a plan also
     serves other values of the same scene, in fits and derivatives.
@@ -137,6 +139,7 @@ def plan(
         max_orders = 1
     orders, why = _orders(largest_albedo(optics), len(letters.letters), scene, rtol, max_orders)
     bins, samples = _time(lidar, scene, geometry, orders, window, bin_width)
+    airy = _with_air(bins, lidar, samples)
     metres = 0.5 * SPEED_OF_LIGHT * bins.width
     step = geometry.longest_chord if max_step is None else min(max_step, geometry.longest_chord)
     step = min(step, 4 * metres) if max_step is None else step
@@ -183,7 +186,7 @@ def plan(
         first_degree=1 + 2 * plates,
         off=off,
         rtol=rtol,
-        effects=_effects(*whole, off, orders, why, bins, geometry.upstream),
+        effects=_effects(*whole, off, orders, why, airy, geometry.upstream) if describe else (),
     )
 
 
@@ -255,6 +258,14 @@ def _time(
     count = lead + math.ceil((last - edge) / width) + 3
     start = edge + width * (0.5 - lead)
     return Bins(start, width, max(count, 1), KERNEL), (begin, interval, samples, per_sample)
+
+
+def _with_air(bins: Bins, lidar: Lidar, samples: tuple[float, float, int, int]) -> Bins:
+    """From where on the air's own return would be recorded, whether it is simulated or not."""
+    _, high = lidar.pulse.support(number(lidar.jitter))
+    missing = math.ceil((bins.start - (samples[0] - samples[1] - high)) / bins.width) + 3
+    more = max(missing, 0)
+    return dataclasses.replace(bins, start=bins.start - more * bins.width, count=bins.count + more)
 
 
 def _effects(

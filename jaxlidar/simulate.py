@@ -105,6 +105,7 @@ def simulate(
             bin_width=bin_width,
             footprint=footprint,
             effects=effects,
+            describe=False,
         )
     elif not any(is_traced(x) for x in jax.tree.leaves((lidar, scene))):
         _check_plan(plan, lidar, scene)
