@@ -1,14 +1,14 @@
 """Are retrievals as good as they can be, and as good as they say? Noisy targets from random starts.
 
-Run it as `python examples/benchmarks/retrieval_coverage.py [--out figures] [--targets 200] [--photons 16384]
-[--starts 2]`.
+Run it as `python examples/benchmarks/retrieval_coverage.py [--out figures] [--targets 200] [--photons
+16384] [--starts 2]`.
 
-A layered canopy over ground at three wavelengths; unknown are Cab, water and structure of the leaf, brightness
-of the ground, its height, the canopy's top and its leaf area index. Targets have truths of their own, are
-simulated with other random numbers, eight times the photons and finer steps than the fits use, and get 2 % of
-the peak as noise. Told are the root mean square of (estimate - truth) over the Cramer-Rao bound, how often the
-truth lies within 1.96 standard errors, how many fits converged, and what noise-free targets are missed by.
-"""
+A layered canopy over ground at three wavelengths; unknown are Cab, water and structure of the leaf,
+brightness of the ground, its height, the canopy's top and its leaf area index. Targets have truths of their
+own, are simulated with other random numbers, eight times the photons and finer steps than the fits use, and
+get 2 % of the peak as noise. Told are the root mean square of (estimate - truth) over the Cramer-Rao bound,
+how often the truth lies within 1.96 standard errors, how many fits converged, and what noise-free targets
+are missed by."""
 
 import dataclasses
 import time
