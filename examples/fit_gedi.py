@@ -20,7 +20,8 @@ ground, as in the product, which takes the last mode for the ground. Let them be
 the 60 shots of a savanna the fits find plant areas four times the product's (rank correlation 0.28 instead
 of 0.70) and the ground 0.3 m lower in the median, with the better chi-squared. The plant areas themselves
 are small there, below 0.4, and the product's come from canopy echoes of a few per cent of the ground's:
-splitting the recorded energy at the product's own ground elevation, without any model, ranks them at 0.81."""
+splitting the recorded energy at the product's own ground elevation, without any model, ranks them at 0.81.
+"""
 
 import argparse
 import sys

@@ -8,7 +8,8 @@ brightness of the ground, its height, the canopy's top and its leaf area index. 
 own, are simulated with other random numbers, eight times the photons and finer steps than the fits use, and
 get 2 % of the peak as noise. Told are the root mean square of (estimate - truth) over the Cramer-Rao bound,
 how often the truth lies within 1.96 standard errors, how many fits converged, and what noise-free targets
-are missed by."""
+are missed by.
+"""
 
 import dataclasses
 import time
