@@ -1,22 +1,26 @@
-"""Fit one recorded GEDI waveform: a layered canopy over sloping ground, with the shot's own transmit pulse.
+"""Fit recorded GEDI waveforms: a layered canopy over sloping ground, with each shot's own transmit pulse.
 
     python examples/fit_gedi.py GEDI01_B_....h5 [--shot N] [--answers answers.npz] [--out figures]
+    python examples/fit_gedi.py GEDI01_B_....h5 --all --answers answers.npz [--out figures]
 
-The canopy is horizontally uniform: ten layers of equal thickness from the ground to the canopy's top. Found
-are the elevations of ground and top, the slope (which stands for all that widens the ground's echo), the
-plant area density of every layer, and one factor for the receiver's unknown gain. Reflectances are fixed, in
-the ratio of the level-2B algorithm, rho_v / rho_g = 0.6 / 0.4; another would scale the densities. First order
-only, with the hot spot: light comes back through the gap by which it went in, as gap-probability models have
-it.
+The canopy is horizontally uniform: ten layers of equal thickness up to the canopy's top. Found are the
+elevations of ground and top, the slope (which stands for all that widens the ground's echo), the plant area
+density of every layer, and one factor for the receiver's unknown gain. Reflectances are fixed, in the ratio
+of the level-2B algorithm, rho_v / rho_g = 0.6 / 0.4; another would scale the densities. First order only,
+with the hot spot: light comes back through the gap by which it went in, as gap-probability models have it.
 
 Beside the fit stand the product's answers, where given: `elev_lowestmode`, `pai`, and `elev_highest`. The
 last is where the signal leaves the noise, a metre or two above the canopy as the pulse has a width; the
-fitted waveform is read by the same rule. Fits use elevations relative to a bin near the ground, as single
-precision would blur absolute ones.
+fitted waveform is read by the same rule. With `--all`, every shot of the answers is fitted, in one batch.
+Fits use elevations relative to a bin near the ground, as single precision would blur absolute ones.
 
-Standard errors are those of the noise. The model's own ambiguity is larger: plants within a pulse's length of
-the ground merge with its echo, and the fit then puts the ground lower, and finds more plants, than a product
-that takes the last mode for the ground (0.3 m in the median of 15 shots of a savanna).
+Standard errors are those of the noise. The model's own ambiguity is larger: plants within a pulse's length
+of the ground merge with its echo. Here plants begin 3 m above the ground, and what is lower counts as
+ground, as in the product, which takes the last mode for the ground. Let them begin at the ground, and over
+the 60 shots of a savanna the fits find plant areas four times the product's (rank correlation 0.28 instead
+of 0.70) and the ground 0.3 m lower in the median, with the better chi-squared. The plant areas themselves
+are small there, below 0.4, and the product's come from canopy echoes of a few per cent of the ground's:
+splitting the recorded energy at the product's own ground elevation, without any model, ranks them at 0.81.
 """
 
 import argparse
@@ -38,6 +42,8 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 LAYERS = 10
+# Plants begin so far above the ground, m: about the pulse's length.
+CLEARANCE = 3.0
 ALTITUDE, FOOTPRINT = 400e3, 25.0
 # Spherically oriented leaves return two thirds of their reflectance: rho_v = 0.30.
 LEAF, GROUND = jl.LeafOptics(reflectance=0.45, transmittance=0.40), 0.20
@@ -55,14 +61,14 @@ MODEL_ERROR = 0.01
 
 
 def put_ground(scene, height):
-    """Move the ground, and the canopy on it."""
-    moved = scene.canopy.voxels.origin.at[2].set(height)
+    """Move the ground, and the canopy above it."""
+    moved = scene.canopy.voxels.origin.at[2].set(height + CLEARANCE)
     return eqx.tree_at(lambda s: (s.ground.height, s.canopy.voxels.origin), scene, (height, moved))
 
 
 def put_canopy_height(scene, height):
-    """Stretch the canopy."""
-    size = scene.canopy.voxels.voxel_size.at[2].set(height / LAYERS)
+    """Stretch the canopy: `height` is its top above the ground."""
+    size = scene.canopy.voxels.voxel_size.at[2].set((height - CLEARANCE) / LAYERS)
     return eqx.tree_at(lambda s: s.canopy.voxels.voxel_size, scene, size)
 
 
@@ -75,7 +81,9 @@ def put_density(scene, log_density):
 def scene_of(height, ground=0.0, slope=5.0):
     """Bare of any shot: heights in m above the reference, slope in degrees."""
     voxels = jl.VoxelMap.from_lad(
-        np.full((1, 1, LAYERS), 0.05), voxel_size=(50.0, 50.0, height / LAYERS), origin=(-25.0, -25.0, ground)
+        np.full((1, 1, LAYERS), 0.05),
+        voxel_size=(50.0, 50.0, (height - CLEARANCE) / LAYERS),
+        origin=(-25.0, -25.0, ground + CLEARANCE),
     )
     return jl.Scene(
         canopy=jl.Canopy(voxels, leaf=LEAF, sides="periodic", hotspot=True),
@@ -121,8 +129,24 @@ def guess(shot):
     return last, highest(shot.elevation, shot.signal, 3 * shot.noise_std) - shot.elevation[last]
 
 
-def fit(shot, progress=None):
-    """Fit a shot. Returns the retrieval, the elevation of its reference, and the samples that it saw."""
+def unknowns(start=8.0):
+    """What is found; `start` is the height (m) from which the canopy's top starts."""
+    return [
+        Unknown(name="ground", bounds=(-3.0, 3.0), prior=(0.0, 1.0), start=0.0, apply=put_ground),
+        Unknown(name="canopy height", bounds=(CLEARANCE + 1, 45.0), start=start, apply=put_canopy_height),
+        Unknown(lambda s: s.ground.slope, bounds=(0.0, 30.0), name="slope", prior=(0.0, 15.0)),
+        Unknown(
+            name="log density",
+            bounds=(np.log(1e-4), np.log(3.0)),
+            prior=(np.log(0.03), 0.7),
+            start=np.full(LAYERS, np.log(0.05)),
+            apply=put_density,
+        ),
+    ]
+
+
+def prepare(shot):
+    """Share of the signal in each sample about the last mode, its noise, the samples, and a canopy height."""
     last, height = guess(shot)
     number = np.arange(last - ABOVE, last + BELOW + 1)
     if number[0] < 0 or number[-1] >= shot.time.size:
@@ -132,45 +156,70 @@ def fit(shot, progress=None):
     signal = shot.waveform[number] - np.mean(quiet)
     noise = np.sqrt(CORRELATED) * np.hypot(np.std(quiet), MODEL_ERROR * np.abs(signal))
     noise[number > last + TAIL] = np.inf
-    start = float(np.clip(height - 2.0, 2.0, 35.0))
-    unknowns = [
-        Unknown(name="ground", bounds=(-3.0, 3.0), prior=(0.0, 1.0), start=0.0, apply=put_ground),
-        Unknown(name="canopy height", bounds=(1.0, 42.0), start=start, apply=put_canopy_height),
-        Unknown(lambda s: s.ground.slope, bounds=(0.0, 25.0), name="slope", prior=(0.0, 10.0)),
-        Unknown(
-            name="log density",
-            bounds=(np.log(1e-4), np.log(3.0)),
-            prior=(np.log(0.03), 0.7),
-            start=np.full(LAYERS, np.log(0.05)),
-            apply=put_density,
-        ),
-    ]
+    return signal / signal.sum(), noise / signal.sum(), number, float(np.clip(height, 5.0, 38.0))
+
+
+def lidar_for(shot):
+    """GEDI with the shot's own pulse."""
+    return lidar_of(jl.SampledPulse(time=shot.pulse_time, power=shot.pulse_power))
+
+
+COMMON = {
+    "time": np.arange(-ABOVE, BELOW + 1),
+    "max_steps": 100,
+    # A share of the signal over an apparent reflectance.
+    "scale": (0.0, 20.0),
+}
+
+
+def fit(shot, progress=None):
+    """Fit a shot. Returns the retrieval and the samples that it saw."""
+    signal, noise, number, height = prepare(shot)
     result = inversion.retrieve(
         signal[None, :],
-        lidar_of(jl.SampledPulse(time=shot.pulse_time, power=shot.pulse_power)),
+        lidar_for(shot),
         scene_of(10.0),
-        unknowns,
+        unknowns(height),
         noise=noise[None, :],
-        time=np.arange(-ABOVE, BELOW + 1),
         key=jax.random.key(0),
         plan=common_plan(),
-        scale=(0.0, 4.0 * float(np.sum(signal)) / GROUND),
         progress=progress,
+        **COMMON,
     )
-    return result, float(shot.elevation[last]), number
+    return result, number
 
 
-def summary(shot, result, reference, number):
+def fit_all(shots, path=None, progress=None):
+    """Fit many shots in one batch, kept in `path`. Returns the retrievals and the samples of each shot."""
+    signals, noises, numbers, heights = zip(*(prepare(shot) for shot in shots))
+    found = inversion.retrieve_many(
+        np.stack(signals)[:, None],
+        [lidar_for(shot) for shot in shots],
+        scene_of(10.0),
+        unknowns(),
+        noise=np.stack(noises)[:, None],
+        key=jax.random.key(0),
+        plan=common_plan(),
+        start={"canopy height": np.array(heights)},
+        path=path,
+        progress=progress,
+        **COMMON,
+    )
+    return found, numbers
+
+
+def summary(shot, number, values, stderr, fitted):
     """What is to be compared with the product, and standard errors: elevations (m), plant area index."""
-    fitted = float(result.values["scale"]) * np.asarray(result.waveform.reflectance[0])
-    ground = reference + float(result.values["ground"])
-    height = float(result.values["canopy height"])
-    density = np.exp(np.asarray(result.values["log density"]))
+    reference = float(shot.elevation[number[ABOVE]])
+    ground = reference + float(values["ground"])
+    height = float(values["canopy height"])
+    density = np.exp(np.asarray(values["log density"]))
+    counts = float(values["scale"]) * fitted * float(shot.signal[number].sum())
     return {
-        "ground": (ground, float(result.stderr["ground"])),
-        "canopy top": (ground + height, float(result.stderr["canopy height"])),
-        "highest return": (highest(shot.elevation[number], fitted, 1.5 * shot.noise_std), np.nan),
-        "plant area index": (float(np.mean(density)) * height, np.nan),
+        "ground": (ground, float(stderr["ground"])),
+        "canopy top": (ground + height, float(stderr["canopy height"])),
+        "highest return": (highest(shot.elevation[number], counts, 1.5 * shot.noise_std), np.nan),
+        "plant area index": (float(np.mean(density)) * (height - CLEARANCE), np.nan),
     }
 
 
@@ -182,14 +231,14 @@ def product_answers(path, shot):
     return {name: float(answers[field][match[0]]) for name, field in names.items()} if match.size else {}
 
 
-def draw(shot, result, reference, number, path):
+def draw(shot, result, found, number, path):
     """Record, fit with its components, residuals and densities against elevation."""
     figure, (left, middle, right) = plt.subplots(
         1, 3, figsize=(9, 5.5), sharey=True, width_ratios=[3, 1, 1], layout="constrained"
     )
-    elevation, scale = shot.elevation[number], float(result.values["scale"])
+    elevation = shot.elevation[number]
+    scale = float(result.values["scale"]) * float(shot.signal[number].sum())
     model = scale * np.asarray(result.waveform.reflectance[0])
-    found = summary(shot, result, reference, number)
     signal = shot.signal[number]
     left.plot(signal, elevation, ".", color="0.5", markersize=3, label="recorded")
     for name, label, color in (("leaf", "canopy", "#009e73"), ("ground", "ground", "#d55e00")):
@@ -207,8 +256,8 @@ def draw(shot, result, reference, number, path):
     middle.axvspan(-1, 1, color="0.9")
     middle.plot(np.asarray(result.residuals[0])[used], elevation[used], "k.", markersize=4)
     middle.set(xlabel="residual\n(standard deviations)")
-    height = found["canopy top"][0] - found["ground"][0]
-    edges = found["ground"][0] + height * np.arange(LAYERS + 1) / LAYERS
+    base = found["ground"][0] + CLEARANCE
+    edges = base + (found["canopy top"][0] - base) * np.arange(LAYERS + 1) / LAYERS
     right.stairs(
         np.exp(np.asarray(result.values["log density"])), edges, orientation="horizontal", color="#009e73"
     )
@@ -219,18 +268,74 @@ def draw(shot, result, reference, number, path):
     plt.close(figure)
 
 
+def compare_all(options):
+    """Fit all shots of the answers and compare."""
+    answers = np.load(options.answers)
+    shots, product = [], []
+    for n in answers["shot"]:
+        (shot,) = read_gedi_l1b(options.file, int(n))
+        try:
+            prepare(shot)
+        except ValueError as error:
+            print(error)
+            continue
+        shots.append(shot)
+        product.append(product_answers(options.answers, shot))
+    found, numbers = fit_all(
+        shots, options.out / "gedi_fits.npz", lambda p: print(f"\r{p}", end="", flush=True)
+    )
+    rows = [
+        summary(
+            shot,
+            number,
+            {k: v[i] for k, v in found.values.items()},
+            {k: v[i] for k, v in found.stderr.items()},
+            found.fitted[i, 0],
+        )
+        for i, (shot, number) in enumerate(zip(shots, numbers))
+    ]
+    pairs = {k: np.array([(r[k][0], p[k]) for r, p in zip(rows, product)]) for k in product[0]}
+    off = pairs["ground"][:, 0] - pairs["ground"][:, 1]
+    high = pairs["highest return"][:, 0] - pairs["highest return"][:, 1]
+    rank = np.corrcoef(*(np.argsort(np.argsort(c)) for c in pairs["plant area index"].T))[0, 1]
+    print(f"\n{len(rows)} shots, {found.converged.sum()} converged, in the median")
+    print(
+        f"  ground differs by {np.median(np.abs(off)):.2f} m, highest return by {np.nanmedian(high):+.2f} m"
+    )
+    print(f"  reduced chi2 {np.median(found.reduced_chi2):.2f}")
+    print(f"rank correlation of plant area index {rank:.2f}")
+    figure, (left, right) = plt.subplots(1, 2, figsize=(8, 3.6), layout="constrained")
+    left.hist(np.clip(off, -3, 3), np.linspace(-3, 3, 41), color="0.6")
+    left.set(xlabel="ground, fit minus product (m)", ylabel="shots")
+    x, y = pairs["plant area index"][:, 1], pairs["plant area index"][:, 0]
+    right.loglog(x, y, "o", color="#009e73", markersize=3)
+    right.loglog([1e-3, 1], [1e-3, 1], color="0.7", linewidth=0.8)
+    right.set(xlabel="plant area index, product", ylabel="plant area index, fit")
+    path = options.out / "gedi_all.png"
+    with whole_file(path) as draft:
+        figure.savefig(draft, format="png", dpi=130)
+    plt.close(figure)
+    print(f"figure: {path}")
+    return {"ground": float(np.median(np.abs(off))), "rank": float(rank)}
+
+
 def main(argv=None):
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("file", type=Path, help="a GEDI L1B file (HDF5)")
     parser.add_argument(
         "--shot", type=int, default=19640521100108408, help="index in the file, or shot number"
     )
+    parser.add_argument("--all", action="store_true", help="fit every shot of the answers")
     parser.add_argument("--answers", type=Path, help="npz with the product's answers, by shot number")
     parser.add_argument("--out", type=Path, default=Path("figures"), help="folder for the figure")
     options = parser.parse_args(argv)
+    if options.all:
+        if options.answers is None:
+            parser.error("--all needs --answers")
+        return compare_all(options)
     (shot,) = read_gedi_l1b(options.file, options.shot)
-    result, reference, number = fit(shot)
-    found = summary(shot, result, reference, number)
+    result, number = fit(shot)
+    found = summary(shot, number, result.values, result.stderr, np.asarray(result.waveform.reflectance[0]))
     product = {} if options.answers is None else product_answers(options.answers, shot)
     print(f"shot {shot.shot_number}, {shot.beam}")
     print(f"{'':18}{'fit':>10}{'std. error':>12}{'product':>10}")
@@ -240,7 +345,7 @@ def main(argv=None):
     print(f"slope {float(result.values['slope']):.1f} degrees, with all else that widens the ground's echo")
     print(f"reduced chi2 {float(result.reduced_chi2):.2f}; {result.status}")
     path = options.out / f"gedi_{shot.shot_number}.png"
-    draw(shot, result, reference, number, path)
+    draw(shot, result, found, number, path)
     print(f"figure: {path}")
     return found, product, result
 

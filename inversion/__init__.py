@@ -11,6 +11,10 @@ from .decomposition import plant_area_index as plant_area_index
 from .decomposition import relative_heights as relative_heights
 from .decomposition import richardson_lucy as richardson_lucy
 from .decomposition import wiener as wiener
+from .identifiability import CramerRao as CramerRao
+from .identifiability import Profile as Profile
+from .identifiability import cramer_rao as cramer_rao
+from .identifiability import profile_likelihood as profile_likelihood
 from .leaves import LeafFit as LeafFit
 from .leaves import invert_leaves as invert_leaves
 from .result import Retrieval as Retrieval

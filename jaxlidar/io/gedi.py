@@ -29,6 +29,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from ._pulse import above_pedestal
+
 # Per-shot datasets of a beam's group, and what a GediShot makes of them.
 _PER_SHOT = (
     "shot_number",
@@ -242,6 +244,7 @@ class _Beam:
         # The pointing vector has its elevation above the horizon: it points from the footprint to the sensor.
         above_horizon = self._number("geolocation/local_beam_elevation", i, 0.0, np.pi / 2 + 1e-6)
         towards = self._number("geolocation/local_beam_azimuth", i)
+        pedestal = float(np.median(transmitted[: max(transmitted.size // 4, 1)]))
         return GediShot(
             beam=self.name,
             shot_number=int(self.data["shot_number"][i]),
@@ -251,25 +254,10 @@ class _Beam:
             noise_mean=self._number("noise_mean_corrected", i),
             noise_std=self._number("noise_stddev_corrected", i, 0.0),
             pulse_time=np.arange(transmitted.size) - reference,
-            pulse_power=_without_pedestal(transmitted),
+            pulse_power=above_pedestal(transmitted, pedestal),
             latitude=self._number("geolocation/latitude_lastbin", i, -90.0, 90.0),
             longitude=self._number("geolocation/longitude_lastbin", i, -180.0, 360.0),
             altitude=self._number("geolocation/altitude_instrument", i),
             zenith=max(0.0, 90.0 - float(np.rad2deg(above_horizon))),
             azimuth=float(np.rad2deg(towards) + 180.0) % 360.0,
         )
-
-
-def _without_pedestal(samples: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
-    """The pulse above the median of the leading quarter, from where it leaves zero to where it first returns.
-
-    Beyond, noise cut off at zero would add energy that was never sent.
-    """
-    power = samples - np.median(samples[: max(samples.size // 4, 1)])
-    peak = int(np.argmax(power))
-    low = (np.flatnonzero(power[:peak] <= 0)[-1:] + 1).sum()
-    after = np.flatnonzero(power[peak:] <= 0)
-    high = peak + int(after[0]) if after.size else power.size
-    pulse = np.zeros_like(power)
-    pulse[low:high] = np.maximum(power[low:high], 0.0)
-    return pulse

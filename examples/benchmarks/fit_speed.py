@@ -1,0 +1,120 @@
+"""Fits of the same targets by `inversion.retrieve` and by `scipy.optimize.least_squares`.
+
+Run it as `python examples/benchmarks/fit_speed.py [--out figures] [--targets 4] [--photons 16384]`.
+
+Scene and unknowns are those of `retrieval_coverage.py`: seven unknowns, of which three are geometric, three
+wavelengths, four orders. Both look at the same compiled simulation with the same random numbers, both start
+from the middle of the bounds and both must reach the same chi-squared, to 0.5. scipy has no derivatives but
+finite differences, each of which is a simulation; ours traces the tangents of the geometric unknowns
+together and gets those of the optical ones from the traced response. The second case has only the four
+optical unknowns: ours then traces once."""
+
+import os
+import time
+from concurrent.futures import ThreadPoolExecutor
+
+import equinox as eqx
+import jax
+import numpy as np
+import scipy.optimize
+from _common import machine, new_figure, options, print_table, save_figure, write_json
+from retrieval_coverage import LIDAR, NOISE, RANGES, plan_of, scene_of, unknowns
+
+import inversion
+import jaxlidar as jl
+from inversion.unknowns import put, settle
+from jaxlidar.simulate import MIN_BATCHES, total_all, trace_all
+
+OPTICAL = ("Cab", "Cw", "N", "ground brightness")
+
+
+def main() -> None:
+    given = options("Speed of fits.", targets=4, photons=16384)
+    plan = plan_of(given.photons // MIN_BATCHES)
+    key = jax.random.key(3)
+    pool = ThreadPoolExecutor(os.cpu_count() or 1)
+    random = np.random.default_rng(5)
+    middle = {name: 0.5 * sum(b) for name, (b, _) in RANGES.items()}
+    rows, record = [], {}
+    for case, wanted in (("all seven", tuple(RANGES)), ("four optical", OPTICAL)):
+        sought = [u for u in unknowns() if u.name in wanted]
+        times: dict[str, list[float]] = {"ours": [], "scipy": []}
+        counts: dict[str, list[int]] = {"ours": [], "scipy": []}
+        gaps = []
+        # The first target compiles, and does not count.
+        for number in range(given.targets + 1):
+            truth = {name: float(random.uniform(*r)) for name, (_, r) in RANGES.items()}
+            base = scene_of({**truth, **{name: middle[name] for name in wanted}})
+            wave = jl.simulate(
+                LIDAR, scene_of(truth), key=jax.random.key(100 + number), plan=plan, n_photons=given.photons
+            )
+            sigma = NOISE * np.asarray(wave.reflectance, float).max(axis=1, keepdims=True)
+            observed = np.asarray(wave.reflectance, float)
+            observed = observed + sigma * random.normal(size=observed.shape)
+
+            begun = time.perf_counter()
+            fit = inversion.retrieve(
+                observed, LIDAR, base, sought, noise=sigma, time=wave.time, key=key, plan=plan
+            )
+            ours = time.perf_counter() - begun
+
+            settled = settle(sought, base)
+            places = tuple(s.place for s in settled)
+            keys = [jax.random.fold_in(key, n) for n in range(MIN_BATCHES)]
+
+            def residuals(x, base=base, places=places, keys=keys, observed=observed, sigma=sigma):
+                values = tuple(jax.numpy.asarray(v, jax.numpy.zeros(()).dtype) for v in x)
+                parts = pool.map(lambda k: _simulated(base, plan, places, values, k), keys)
+                return ((np.mean([np.asarray(p, float) for p in parts], axis=0) - observed) / sigma).ravel()
+
+            low, high = (np.array([float(getattr(s, f)) for s in settled]) for f in ("low", "high"))
+            residuals(low + 0.5 * (high - low))
+            begun = time.perf_counter()
+            theirs = scipy.optimize.least_squares(
+                residuals,
+                [float(s.start) for s in settled],
+                bounds=(low, high),
+                x_scale=high - low,
+                # Above the rounding of single precision.
+                diff_step=1e-2,
+                ftol=1e-4,
+                xtol=1e-4,
+                gtol=1e-4,
+            )
+            seconds = time.perf_counter() - begun
+            if number == 0:
+                continue
+            mine = np.sum(residuals([float(fit.values[s.name]) for s in settled]) ** 2)
+            gaps.append(float(mine - 2 * theirs.cost))
+            times["ours"].append(ours)
+            times["scipy"].append(seconds)
+            counts["ours"].append(fit.steps)
+            counts["scipy"].append(int(theirs.nfev + theirs.njev * len(settled)))
+        ratio = float(np.median(np.array(times["scipy"]) / np.array(times["ours"])))
+        record[case] = {
+            "seconds": times,
+            "simulations": counts,
+            "ratio": ratio,
+            "chi2_ours_minus_scipy": gaps,
+        }
+        rows.append((case, np.median(times["ours"]), np.median(times["scipy"]), ratio, max(gaps), min(gaps)))
+    print_table(("unknowns", "ours, s", "scipy, s", "ratio", "chi2, ours - scipy, most", "least"), rows)
+    write_json(given.out / "fit_speed.json", {"machine": machine(), "photons": given.photons, "fits": record})
+    figure, axes = new_figure()
+    for case, r in record.items():
+        axes.loglog(r["seconds"]["ours"], r["seconds"]["scipy"], "o", label=case)
+    both = axes.get_xlim()
+    axes.plot(both, [10 * b for b in both], color="0.7", label="ten times")
+    axes.set(xlabel="inversion.retrieve (s)", ylabel="scipy.optimize.least_squares (s)")
+    axes.legend()
+    save_figure(figure, given.out / "fit_speed.png")
+
+
+@eqx.filter_jit
+def _simulated(scene, plan, places, values, key):
+    here = put(scene, places, values)
+    return total_all(trace_all(LIDAR, here, plan, key), LIDAR, here, plan)
+
+
+if __name__ == "__main__":
+    main()

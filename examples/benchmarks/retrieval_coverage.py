@@ -1,0 +1,211 @@
+"""Are retrievals as good as they can be, and as good as they say? Noisy targets from random starts.
+
+Run it as `python examples/benchmarks/retrieval_coverage.py [--out figures] [--targets 200] [--photons
+16384] [--starts 2]`.
+
+A layered canopy over ground at three wavelengths; unknown are Cab, water and structure of the leaf,
+brightness of the ground, its height, the canopy's top and its leaf area index. Targets have truths of their
+own, are simulated with other random numbers, eight times the photons and finer steps than the fits use, and
+get 2 % of the peak as noise. Told are the root mean square of (estimate - truth) over the Cramer-Rao bound,
+how often the truth lies within 1.96 standard errors, how many fits converged, and what noise-free targets
+are missed by.
+"""
+
+import dataclasses
+import time
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from _common import machine, options, plt, print_table, save_figure, write_json
+
+import inversion
+import jaxlidar as jl
+from inversion import Unknown
+
+LIDAR = jl.Lidar(
+    wavelength=(532.0, 1064.0, 1550.0), divergence=5.0, pulse=jl.GaussianPulse(fwhm=4.0), aperture=0.2
+)
+LAYERS, BASE, ORDERS = 8, 2.0, 4
+WINDOW = (-105.0, 40.0)
+NOISE = 0.02
+# Share of a leaf area of one in each layer.
+SHAPE = np.array([0.4, 0.8, 1.2, 1.5, 1.5, 1.2, 0.9, 0.5]) / 8.0
+SOIL = np.array([0.12, 0.25, 0.33])
+# Name: bounds of the fit, and range of the truths.
+RANGES = {
+    "Cab": ((10.0, 90.0), (25.0, 65.0)),
+    "Cw": ((0.002, 0.04), (0.006, 0.025)),
+    "N": ((1.0, 2.8), (1.3, 2.2)),
+    "ground brightness": ((0.2, 2.5), (0.6, 1.6)),
+    "ground height": ((-1.0, 1.0), (-0.5, 0.5)),
+    "canopy top": ((9.0, 13.0), (10.0, 12.0)),
+    "leaf area index": ((0.3, 5.0), (0.8, 3.0)),
+}
+
+
+def put_top(scene, top):
+    """Stretch the canopy between its base and its top, with the same leaf area."""
+    size = scene.canopy.voxels.voxel_size
+    new = (top - BASE) / LAYERS
+    where = lambda s: (s.canopy.voxels.voxel_size, s.canopy.voxels.leaf)  # noqa: E731
+    return eqx.tree_at(where, scene, (size.at[2].set(new), scene.canopy.voxels.leaf * size[2] / new))
+
+
+def put_area(scene, area):
+    """Leaf area index."""
+    leaf = 0.5 * area * jnp.asarray(SHAPE).reshape(1, 1, LAYERS) / scene.canopy.voxels.voxel_size[2]
+    return eqx.tree_at(lambda s: s.canopy.voxels.leaf, scene, leaf)
+
+
+def put_brightness(scene, value):
+    """Times the soil's reflectance."""
+    return eqx.tree_at(lambda s: s.ground.reflectance, scene, value * jnp.asarray(SOIL))
+
+
+def scene_of(values: dict[str, float]) -> jl.Scene:
+    """The scene with these values."""
+    thick = (values["canopy top"] - BASE) / LAYERS
+    density = values["leaf area index"] * SHAPE / thick
+    voxels = jl.VoxelMap.from_lad(
+        density.reshape(1, 1, LAYERS), voxel_size=(50.0, 50.0, thick), origin=(-25.0, -25.0, BASE)
+    )
+    leaf = jl.Prospect(N=values["N"], Cab=values["Cab"], Car=8.0, Cw=values["Cw"], Cm=0.009)
+    ground = jl.Ground(height=values["ground height"], reflectance=values["ground brightness"] * SOIL)
+    return jl.Scene(canopy=jl.Canopy(voxels, leaf=leaf, sides="periodic"), ground=ground)
+
+
+def unknowns() -> list[Unknown]:
+    """All seven, from the middle of their bounds."""
+    bounds = {name: b for name, (b, _) in RANGES.items()}
+    start = {name: 0.5 * (low + high) for name, (low, high) in bounds.items()}
+
+    def put(name, apply):
+        return Unknown(name=name, bounds=bounds[name], start=start[name], apply=apply)
+
+    return [
+        Unknown(lambda s: s.canopy.leaf.Cab, bounds=bounds["Cab"], name="Cab"),
+        Unknown(lambda s: s.canopy.leaf.Cw, bounds=bounds["Cw"], name="Cw"),
+        Unknown(lambda s: s.canopy.leaf.N, bounds=bounds["N"], name="N"),
+        put("ground brightness", put_brightness),
+        Unknown(lambda s: s.ground.height, bounds=bounds["ground height"], name="ground height"),
+        put("leaf area index", put_area),
+        put("canopy top", put_top),
+    ]
+
+
+def plan_of(photons: int, **changes) -> jl.Plan:
+    """One plan for all scenes within the bounds."""
+    low, high = ({name: float(b[i]) for name, (b, _) in RANGES.items()} for i in (0, 1))
+    largest = scene_of({**high, "ground height": low["ground height"]})
+    return jl.plan(
+        LIDAR, largest, max_orders=ORDERS, window=WINDOW, n_photons=photons, **{"n_rays": 64, **changes}
+    )
+
+
+def main() -> None:
+    given = options("Coverage of retrievals.", targets=200, photons=16384, starts=2)
+    random = np.random.default_rng(0)
+    n = given.targets
+    truth = {name: random.uniform(*r, n) for name, (_, r) in RANGES.items()}
+    scenes = [scene_of({name: float(v[i]) for name, v in truth.items()}) for i in range(n)]
+    # Other random numbers and finer steps than the fits will use.
+    fine = plan_of(given.photons, max_step=0.05)
+    begun = time.perf_counter()
+    waves = [
+        jl.simulate(LIDAR, s, key=jax.random.key(1000 + i), plan=fine, n_photons=8 * given.photons)
+        for i, s in enumerate(scenes)
+    ]
+    clean = np.stack([np.asarray(w.reflectance, float) for w in waves])
+    sigma = NOISE * clean.max(axis=2, keepdims=True) * np.ones_like(clean)
+    simulated = time.perf_counter() - begun
+    print(f"{n} targets simulated in {simulated:.0f} s")
+
+    plan = plan_of(given.photons // 8)
+    times = np.asarray(waves[0].time)
+    start = {name: random.uniform(*b, n) for name, (b, _) in RANGES.items()}
+    common = {"time": times, "key": jax.random.key(7), "plan": plan, "noise_floor": 1e-4}
+    results, seconds = {}, {}
+    observed = clean + sigma * random.normal(size=clean.shape)
+    for name, data, noise in (("noisy", observed, sigma), ("noise-free", clean, 0.1 * sigma)):
+        count = n if name == "noisy" else min(n, 20)
+        begun = time.perf_counter()
+        results[name] = inversion.retrieve_many(
+            data[:count],
+            LIDAR,
+            scene_of({k: 0.5 * (a + b) for k, ((a, b), _) in RANGES.items()}),
+            unknowns(),
+            noise=noise[:count],
+            starts=given.starts,
+            start={k: v[:count] for k, v in start.items()},
+            lanes=8,
+            progress=lambda p: print(f"\r{p}", end="", flush=True),
+            **common,
+        )
+        seconds[name] = time.perf_counter() - begun
+        print(f"\r{name}: {count} fits in {seconds[name]:.0f} s")
+
+    found, bare = results["noisy"], results["noise-free"]
+    bounds = [
+        inversion.cramer_rao(
+            LIDAR, s, at_truth(unknowns(), i, truth), noise=e, key=jax.random.key(8), plan=plan
+        )
+        for i, (s, e) in enumerate(zip(scenes, sigma))
+    ]
+    rows, record = [], {}
+    for name in RANGES:
+        off = found.values[name] - truth[name]
+        least = np.array([float(b.stderr[name]) for b in bounds])
+        good = found.converged
+        ratio = float(np.sqrt(np.mean((off / least)[good] ** 2)))
+        covered = float(np.mean(np.abs(off / found.stderr[name])[good] < 1.96))
+        missed = (bare.values[name] - truth[name][: len(bare.converged)])[bare.converged]
+        scale = np.ptp(RANGES[name][1]) if name == "ground height" else np.mean(truth[name])
+        record[name] = {
+            "rms": float(np.sqrt(np.mean(off[good] ** 2))),
+            "cramer_rao": float(np.sqrt(np.mean(least**2))),
+            "rms_over_bound": ratio,
+            "covered": covered,
+            "noise_free_median": float(np.median(np.abs(missed)) / scale),
+            "noise_free_bias": float(np.mean(missed) / scale),
+        }
+        r = record[name]
+        rows.append(
+            (name, r["rms"], r["cramer_rao"], ratio, covered, r["noise_free_median"], r["noise_free_bias"])
+        )
+    print_table(("unknown", "rms", "bound", "rms/bound", "covered", "noise-free, rel.", "bias, rel."), rows)
+    share = float(found.converged.mean())
+    all_covered = float(np.mean([r["covered"] for r in record.values()]))
+    print(f"converged {share:.3f}; covered {all_covered:.3f} (aim 0.92 to 0.98)")
+    write_json(
+        given.out / "retrieval_coverage.json",
+        {
+            "machine": machine(),
+            "targets": n,
+            "photons": given.photons,
+            "converged": share,
+            "covered": all_covered,
+            "seconds": seconds,
+            "unknowns": record,
+        },
+    )
+
+    figure, axes = plt.subplots(2, 4, figsize=(10, 5), layout="constrained")
+    for ax, name in zip(axes.flat, RANGES):
+        z = (found.values[name] - truth[name]) / found.stderr[name]
+        ax.hist(z[found.converged], np.linspace(-5, 5, 31), density=True, color="0.7")
+        x = np.linspace(-5, 5, 200)
+        ax.plot(x, np.exp(-0.5 * x**2) / np.sqrt(2 * np.pi), color="#D55E00")
+        ax.set(title=name, xlabel="(estimate - truth) / standard error")
+    axes.flat[-1].axis("off")
+    save_figure(figure, given.out / "retrieval_coverage.png")
+
+
+def at_truth(number: int, truth: dict[str, np.ndarray]) -> list[Unknown]:
+    """The unknowns, started from the truth of a target."""
+    return [dataclasses.replace(u, start=float(truth[u.name][number])) for u in unknowns()]
+
+
+if __name__ == "__main__":
+    main()

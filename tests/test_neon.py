@@ -1,0 +1,253 @@
+"""NEON's reader: a small file written here, damaged ones, and the recorded sample."""
+
+import io
+import zipfile
+
+import jax
+import numpy as np
+import pytest
+
+import jaxlidar as jl
+from jaxlidar.io import read_neon
+
+STEP = np.array([0.01, 0.02, -0.1482])
+COLUMNS = ["index", "x", "y", "z", "dx", "dy", "dz", "or", "fr", *(f"V{i}" for i in range(9, 17))]
+
+
+def _pulse(samples, centre, height):
+    return 200 + height * np.exp(-0.5 * ((np.arange(samples) - centre) / 5) ** 2)
+
+
+def _arrays():
+    """Three shots of 60, 70 and 50 samples; the second has a gap. Echoes lie at samples 30 and up."""
+    ret, outgoing = np.zeros((3, 80)), np.zeros((3, 64))
+    geo = np.zeros((3, len(COLUMNS)))
+    for i, count in enumerate((60, 70, 50)):
+        ret[i, :count] = _pulse(count, 30 + i, 300)
+        outgoing[i, :55] = _pulse(55, 22, 500)
+        bin0 = np.array([7e5 + i, 4e6, 300.0])
+        first = bin0 + STEP * (30 + i)
+        geo[i] = [i + 1, *first, *STEP, 22 - 5.9, 30 + i - 5.9, *bin0, *STEP, 22, 0]
+    ret[1, 55:60] = 0
+    impulse, sent = np.zeros(64), np.zeros(64)
+    impulse[:60], sent[:60] = _pulse(60, 25, 900), _pulse(60, 20, 400)
+    return {
+        "ret": ret,
+        "outgoing": outgoing,
+        "system_impulse": impulse,
+        "impulse_outgoing": sent,
+        "geo": geo,
+        "geo_cols": np.array(COLUMNS),
+    }
+
+
+def _write(path, **arrays):
+    np.savez_compressed(path, **{**_arrays(), **arrays})
+    return path
+
+
+@pytest.fixture(scope="module")
+def recorded():
+    from conftest import SHARED
+
+    path = SHARED / "neon" / "neon_harvard_250.npz"
+    if not path.is_file():
+        pytest.skip("NEON's recorded sample is not beside this checkout")
+    return read_neon(path)
+
+
+def test_fields(tmp_path):
+    shots, impulse, dropped = read_neon(_write(tmp_path / "small.npz"))
+    assert dropped == {"without a return": 0, "without a pulse": 0}
+    assert [(s.index, s.waveform.size) for s in shots] == [(1, 60), (2, 70), (3, 50)]
+    shot = shots[1]
+    np.testing.assert_array_equal(np.flatnonzero(~shot.recorded), np.arange(55, 60))
+    assert shot.noise_mean == pytest.approx(200, abs=0.1)
+    assert shot.noise_std < 0.1
+    assert shot.signal[31] == pytest.approx(300, abs=0.1)
+    np.testing.assert_array_equal(shot.signal[55:60], 0)
+    np.testing.assert_allclose(shot.position[10], np.array([7e5 + 1, 4e6, 300]) + 10 * STEP, rtol=1e-12)
+    np.testing.assert_allclose(shot.elevation, 300 - 0.1482 * np.arange(70))
+    assert shot.zenith == pytest.approx(np.rad2deg(np.arctan2(np.hypot(0.01, 0.02), 0.1482)))
+    assert shot.azimuth == pytest.approx(np.rad2deg(np.arctan2(0.01, 0.02)))
+    pulse = jl.SampledPulse(time=shot.pulse_time, power=shot.pulse_power)
+    assert float(pulse.mean) == pytest.approx(0, abs=0.02)
+    assert float(pulse.std) == pytest.approx(5, rel=0.01)
+    assert impulse.time[impulse.power.argmax()] == impulse.pulse_time[impulse.pulse_power.argmax()] == 0
+    assert impulse.power.max() == pytest.approx(900, abs=0.1)
+
+
+def test_places(tmp_path):
+    """Times and places refer to where the beam meets the reference elevation."""
+    shot = read_neon(_write(tmp_path / "small.npz")).shots[0]
+    reference = 300 - 20.5 * 0.1482
+    np.testing.assert_allclose(shot.time_from(reference), np.arange(60) - 20.5, atol=1e-9)
+    np.testing.assert_allclose(shot.position_at(reference), [7e5 + 0.205, 4e6 + 0.41], rtol=1e-12)
+
+
+def test_simulated_ground_is_found(tmp_path):
+    """Ground simulated at a place returns in the sample of its elevation: conventions agree."""
+    shot = read_neon(_write(tmp_path / "small.npz")).shots[0]
+    lidar = jl.Lidar(
+        pulse=jl.SampledPulse(time=shot.pulse_time, power=shot.pulse_power),
+        zenith=shot.zenith,
+        azimuth=shot.azimuth,
+        divergence=0.0,
+    )
+    wave = jl.simulate(
+        lidar, jl.Scene(ground=jl.Ground(reflectance=0.3, height=1.5)), max_orders=1, key=jax.random.key(0)
+    )
+    time = shot.time_from(295.0)
+    echo = np.interp(time, np.asarray(wave.time), np.asarray(wave.reflectance[0]))
+    # Light in air is slower by 3e-4, and the echo lies half a sample at most from its sample.
+    assert shot.elevation[echo.argmax()] == pytest.approx(296.5, abs=0.08)
+
+
+def test_dropped(tmp_path):
+    arrays = _arrays()
+    arrays["ret"][0, 3:] = 0
+    arrays["outgoing"][2] = 0
+    shots, _, dropped = read_neon(_write(tmp_path / "a.npz", **arrays))
+    assert [s.index for s in shots] == [2]
+    assert dropped == {"without a return": 1, "without a pulse": 1}
+    with pytest.raises(ValueError, match=r"b\.npz: ret, outgoing: no shot"):
+        read_neon(_write(tmp_path / "b.npz", ret=np.zeros((3, 80))))
+    with pytest.raises(ValueError, match=r"c\.npz: ret, outgoing: no shot"):
+        read_neon(
+            _write(
+                tmp_path / "c.npz", ret=np.zeros((0, 80)), outgoing=np.zeros((0, 64)), geo=np.zeros((0, 17))
+            )
+        )
+
+
+def test_wrong_files(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"none\.npz"):
+        read_neon(tmp_path / "none.npz")
+    text = tmp_path / "text.npz"
+    text.write_text("no archive")
+    with pytest.raises(ValueError, match=r"text\.npz: no \.npz file"):
+        read_neon(text)
+    with zipfile.ZipFile(tmp_path / "other.npz", "w") as archive:
+        archive.writestr("readme.txt", "no array")
+    with pytest.raises(ValueError, match=r"other\.npz"):
+        read_neon(tmp_path / "other.npz")
+    pickled = io.BytesIO()
+    np.savez(pickled, ret=np.array([{}], dtype=object))
+    (tmp_path / "objects.npz").write_bytes(pickled.getvalue())
+    with pytest.raises(ValueError, match=r"objects\.npz: ret: damaged"):
+        read_neon(tmp_path / "objects.npz")
+
+
+def test_damaged_bytes(tmp_path):
+    """A byte changed anywhere leads to no other error than one that names the file."""
+    whole = _write(tmp_path / "small.npz").read_bytes()
+    bad = tmp_path / "bad.npz"
+    rng = np.random.default_rng(0)
+    for at in [*rng.integers(0, len(whole), 60), *range(0, 40), *range(len(whole) - 60, len(whole))]:
+        changed = bytearray(whole)
+        changed[at] ^= 0x5A
+        bad.write_bytes(changed)
+        said = "bad.npz"
+        try:
+            read_neon(bad)
+        except ValueError as error:
+            said = str(error)
+        assert "bad.npz" in said
+    for size in (0, 10, len(whole) // 2, len(whole) - 1):
+        bad.write_bytes(whole[:size])
+        with pytest.raises(ValueError, match=r"bad\.npz"):
+            read_neon(bad)
+
+
+def _with(index, value):
+    def change(array):
+        array = array.copy()
+        array[index] = value
+        return array
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("key", "change", "place"),
+    [
+        *((key, None, f"{key}: no such array; there are ") for key in _arrays()),
+        *((key, lambda a: a[..., None], f"{key}: shape .* dimensions belong") for key in _arrays()),
+        ("ret", _with((1, 5), np.nan), r"ret: element \(1, 5\) is nan"),
+        ("ret", _with((1, 5), -1.0), r"ret: element \(1, 5\) is -1"),
+        ("ret", lambda a: a.astype(str), "ret: type <U.* where numbers belong"),
+        ("outgoing", _with((0, 0), np.inf), r"outgoing: element \(0, 0\) is inf"),
+        ("outgoing", lambda a: a[:2], "outgoing: 2 shots, but ret has 3"),
+        ("system_impulse", _with(3, np.nan), r"system_impulse: element \(3,\) is nan"),
+        ("impulse_outgoing", lambda a: 0 * a, "impulse_outgoing: fewer than 8 samples"),
+        ("geo", lambda a: a[:, :-1], r"geo: shape \(3, 16\), but ret and geo_cols have \(3, 17\)"),
+        ("geo", _with((2, 11), np.nan), r"geo: element \(2, 11\) is nan"),
+        ("geo", _with((1, 6), 0.1482), "geo: shot 2: dz = 0.1482 m does not lead down"),
+        ("geo", _with((1, 6), -0.3), "geo: shot 2: dx, dy, dz: 0.3"),
+        ("geo", _with((2, 15), 64), "geo: shot 3: V15 = 64"),
+        ("geo", _with((2, 15), -1), "geo: shot 3: V15 = -1"),
+        ("geo_cols", _with(6, "dw"), "geo_cols: no column dz"),
+    ],
+)
+def test_damage_is_named(tmp_path, key, change, place):
+    arrays = _arrays()
+    old = arrays.pop(key)
+    if change is not None:
+        arrays[key] = change(old)
+    np.savez(tmp_path / "small.npz", **arrays)
+    with pytest.raises(ValueError, match=r"small\.npz: " + place):
+        read_neon(tmp_path / "small.npz")
+
+
+def test_record_reads(recorded):
+    shots, _, dropped = recorded
+    assert len(shots) == 250
+    assert sum(dropped.values()) == 0
+    assert [s.index for s in shots] == list(range(1, 251))
+    assert {s.pulse_time.size for s in shots} == {100}
+    assert sorted(np.count_nonzero(~s.recorded) for s in shots)[-5:] == [0, 8, 8, 12, 20]
+    for shot in shots:
+        assert 68 <= shot.waveform.size <= 208
+        assert 4 < shot.zenith < 9
+        assert shot.signal.max() > 20 * shot.noise_std
+        assert 300 < shot.elevation[-1] < shot.elevation[0] < 350
+        lit = shot.pulse_time[shot.pulse_power > shot.pulse_power.max() / 2]
+        assert 13 <= lit[-1] - lit[0] <= 17
+    # Pedestal and noise, as the records before the returns have them.
+    assert shots[0].noise_mean == pytest.approx(210, abs=2)
+    assert 4 < shots[0].noise_std < 7
+
+
+def test_first_returns_lie_where_the_product_has_them(recorded, shared):
+    """By its own elevations, a return rises to half where the pulse does when put at the first return."""
+    geo = np.load(shared / "neon" / "neon_harvard_250.npz")["geo"]
+    errors = []
+    for shot, row in zip(recorded.shots, geo):
+        peak = shot.pulse_power.max()
+        rise = np.argmax(shot.pulse_power > peak / 2)
+        before, after = shot.pulse_power[rise - 1 : rise + 1]
+        half = shot.pulse_time[rise - 1] + (peak / 2 - before) / (after - before)
+        # Time at which the echo of a target at the height z of the first return rises to half.
+        expected = -shot.time_from(row[3])[0] + half
+        errors.append(expected - row[8])
+    assert abs(np.median(errors)) < 0.1
+    assert np.quantile(np.abs(errors), 0.95) < 0.3
+
+
+def test_hard_target_is_a_blurred_pulse(recorded):
+    """The system impulse is its outgoing pulse blurred by 1.9 ns, but for the place and the strength."""
+    impulse = recorded.impulse
+    pulse = jl.SampledPulse(time=impulse.pulse_time, power=impulse.pulse_power)
+    power = jax.jit(lambda t, jitter: pulse.power(t, jitter))
+    near, fine = np.abs(impulse.time) < 30, np.arange(-40.0, 40.0, 0.5)
+
+    def misfit(jitter):
+        left, blurred = [], np.asarray(power(fine, jitter))
+        for shift in np.arange(-1.0, 3.0, 0.1):
+            shape = np.interp(impulse.time[near] + shift, fine, blurred)
+            scale = shape @ impulse.power[near] / (shape @ shape)
+            left.append(np.std(impulse.power[near] - scale * shape) / impulse.power.max())
+        return min(left)
+
+    assert misfit(1.9) < 0.01
+    assert misfit(1.9) < 0.5 * min(misfit(0.5), misfit(4.0))
