@@ -184,7 +184,7 @@ def _one_flight(setting: Setting, p: Photons, key: PRNGKeyArray, cone: float) ->
         along(p.x, p.w, flown),
         hit.w,
         p.path + flown,
-        jnp.where(event, weight * hit.onward, 0.0),
+        jnp.where(event, weight * hit.ratio * hit.onward, 0.0),
         letters,
         hit.on,
         hit.facing,

@@ -21,6 +21,20 @@ def total(lidar, scene, photons, *, seed=0, cone=CONE, **planned):
     return weight.mean(axis=1), weight.std(axis=1, ddof=1) / np.sqrt(photons)
 
 
+@pytest.mark.parametrize("angles", ["planophile", "erectophile"])
+def test_leaves_of_given_angles_agree_with_simulate(angles):
+    voxels = jl.VoxelMap.from_lad(
+        np.full((1, 1, 4), 0.2), voxel_size=(50, 50, 2.5), origin=(-25, -25, 0), leaf_angles=angles
+    )
+    leaf = jl.LeafOptics(reflectance=0.45, transmittance=0.35)
+    scene = jl.Scene(canopy=jl.Canopy(voxels, leaf=leaf, sides="periodic"), ground=jl.Ground(reflectance=0.4))
+    value, stderr = total(LIDAR, scene, 60_000, max_orders=4, cone=12.0)
+    wave = jl.simulate(LIDAR, scene, key=jax.random.key(1), rtol=0.02, max_orders=4)
+    expected = float(np.sum(wave.reflectance))
+    assert agrees(value, stderr + 0.003 * expected, expected)
+    assert not agrees(value, stderr + 0.003 * expected, 1.3 * expected)
+
+
 def test_a_level_lambertian_ground_returns_its_reflectance():
     value, stderr = total(LIDAR, jl.Scene(ground=jl.Ground(reflectance=0.5)), 40_000)
     assert agrees(value, stderr, 0.5)

@@ -50,7 +50,7 @@ def _on_surface(
     normal = surface.lit_normal(w)
     incident, upright = jax.tree.map(stop, (w, normal))
     out = surface.law.sample(incident, upright, u[4], u[5])
-    onward = ratio_of(surface.law.density(w, normal, out))
+    ratio, onward = jnp.ones_like(u[0]), ratio_of(surface.law.density(w, normal, out))
     facing, letter = _remember(surface.law, upright), jnp.full_like(none, scatterer.reflected)
     diffuse = scatterer.transmitted >= 0 and not surface.straight
     if diffuse:
@@ -62,11 +62,11 @@ def _on_surface(
         letter = jnp.where(through, scatterer.transmitted, letter)
     elif scatterer.transmitted >= 0:
         # That it is reflected rather than passed was drawn on the way.
-        onward = onward / lobe
+        ratio = ratio / lobe
     return Hit(
         material=jnp.full_like(none, scatterer.material),
         letter=letter,
-        ratio=jnp.ones_like(onward),
+        ratio=ratio,
         onward=onward,
         w=jax.tree.map(stop, out),
         on=jnp.full_like(none, number),
