@@ -6,9 +6,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-# Bins over which a return at an instant is spread, and the second moment of that, in bins^2.
+# Bins over which a return at an instant is spread.
 KERNEL = 3
-KERNEL_VARIANCE = 0.25
 
 
 @dataclasses.dataclass(frozen=True)
@@ -16,13 +15,19 @@ class Bins:
     """Fine time bins, with margins at both ends that collect what falls outside.
 
     - `start`: centre of the first bin, ns. - `width`: ns. - `count`: bins within the window.
-    - `row`: the most bins that one deposit spans.
+    - `row`: the most bins that one deposit spans. - `kernel`: bins over which an instant is spread.
     """
 
     start: float
     width: float
     count: int
     row: int
+    kernel: int = KERNEL
+
+    @property
+    def kernel_variance(self) -> float:
+        """Second moment of the kernel, a B-spline, in bins^2."""
+        return self.kernel / 12
 
     @property
     def padded(self) -> int:
@@ -53,6 +58,8 @@ class Layout(NamedTuple):
     - `full_cover`: for each surface, whether no ray slips through. - `upstream`: where rays start, m
       above the reference plane along the axis. - `first_steps`, `march_steps`: bounds on faces crossed.
     - `max_step`, `max_path`: m. - `lobe`: probability with which reflection is chosen over transmission.
+    - `drawn_first`: whether order one returns from drawn collisions, as the others. - `independent`: whether
+      photons draw independent numbers.
     """
 
     materials: tuple[str, ...]
@@ -73,3 +80,5 @@ class Layout(NamedTuple):
     max_path: float
     lobe: float
     orders: int
+    drawn_first: bool
+    independent: bool

@@ -11,7 +11,7 @@ from .extent import Extent, number
 from .layout import KERNEL, Bins, Layout
 from .letters import largest_albedo, lobe_probability, scene_optics, spell
 from .lidar import Lidar
-from .materials import Isotropic
+from .materials import Isotropic, Specular
 from .pulse import RectangularPulse
 from .scene import Plate, Scene
 
@@ -57,7 +57,9 @@ class Plan:
     @property
     def is_random(self) -> bool:
         """Whether anything is drawn at random."""
-        return self.layout.orders > 1 or (self.random_footprint and not self.smooth_footprint)
+        if self.layout.orders > 1 or self.layout.drawn_first:
+            return True
+        return self.random_footprint and not self.smooth_footprint
 
     def __str__(self) -> str:
         rows = [("effect", "simulated", "changes at most", "why")]
@@ -91,6 +93,9 @@ def plan(
     bin_width: float | None = None,
     footprint: str = "random",
     effects: Mapping[str, bool] | None = None,
+    first_order: str = "expected",
+    points: str = "lattice",
+    kernel: int = KERNEL,
     describe: bool = True,
 ) -> Plan:
     """Decide what `simulate` will do.
@@ -107,6 +112,11 @@ def plan(
     - `footprint`: "random" (each batch shifts the rays, so that the standard error covers them) or "fixed".
     - `effects`: effects to switch off, by name, as in {"multiple scattering": False}; True asks for what
       is on anyway and refuses scenes that do not have it. The names are those of the table's first column.
+    - `first_order`: "expected" (integrated along every ray) or "drawn" (returns from drawn collisions, as
+      those of the other orders, among which it is then counted).
+    - `points`: "lattice" (low discrepancy) or "independent" random numbers for rays and photons.
+    - `kernel`: fine bins over which an instant is spread: 3 (smooth), 2 (linear) or 1 (the nearest: without
+      derivatives with respect to times). These three are there to show what the defaults are worth.
     - `describe`: whether to make the table of effects, with its bounds; takes some 10 ms.
 
     What the scene does not have is off, and never compiled. All else is on, however small: a plan also
@@ -129,6 +139,11 @@ def plan(
         raise ValueError(f"max_step = {max_step:g} is outside the admissible range (0, inf)")
     if footprint not in ("random", "fixed"):
         raise ValueError(f"footprint = {footprint!r} is none of 'random', 'fixed'")
+    if kernel not in (1, 2, 3):
+        raise ValueError(f"kernel = {kernel} is none of 1, 2, 3")
+    if points not in ("lattice", "independent"):
+        raise ValueError(f"points = {points!r} is none of 'lattice', 'independent'")
+    _check_first(first_order, scene)
     whole = lidar, scene
     off = switched_off(effects, present(lidar, scene), max_orders)
     lidar, scene = without(lidar, scene, off)
@@ -143,7 +158,8 @@ def plan(
     metres = 0.5 * SPEED_OF_LIGHT * bins.width
     step = geometry.longest_chord if max_step is None else min(max_step, geometry.longest_chord)
     step = min(step, 4 * metres) if max_step is None else step
-    bins = dataclasses.replace(bins, row=max(math.ceil(step / metres - 1e-6) + 1 + 2, KERNEL))
+    row = max(math.ceil(step / metres - 1e-6) + 1 + 2, KERNEL)
+    bins = dataclasses.replace(bins, row=row, kernel=int(kernel))
     end = bins.start + bins.width * bins.count
     max_path = SPEED_OF_LIGHT * end + geometry.upstream
     layout = Layout(
@@ -165,6 +181,8 @@ def plan(
         max_path=max_path,
         lobe=lobe_probability(optics),
         orders=orders,
+        drawn_first=first_order == "drawn",
+        independent=points == "independent",
     )
     plates = len(scene.plates)
     sharpen = not isinstance(lidar.pulse, RectangularPulse) and number(lidar.pulse.std) >= bins.width
@@ -188,6 +206,14 @@ def plan(
         rtol=rtol,
         effects=_effects(*whole, off, orders, why, airy, geometry.upstream) if describe else (),
     )
+
+
+def _check_first(first_order: str, scene: Scene) -> None:
+    if first_order not in ("expected", "drawn"):
+        raise ValueError(f"first_order = {first_order!r} is none of 'expected', 'drawn'")
+    mirrors = any(isinstance(s.law, Specular) for s in scene.surfaces)
+    if first_order == "drawn" and (mirrors or (scene.canopy is not None and scene.canopy.hotspot)):
+        raise ValueError("first_order = 'drawn'; admissible with a mirror or a hot spot is 'expected'")
 
 
 def _degree(orders: int, plates: int) -> int:
@@ -257,7 +283,7 @@ def _time(
     lead = math.ceil((edge - first) / width) + 3
     count = lead + math.ceil((last - edge) / width) + 3
     start = edge + width * (0.5 - lead)
-    return Bins(start, width, max(count, 1), KERNEL), (begin, interval, samples, per_sample)
+    return Bins(start, width, max(count, 1), row=KERNEL), (begin, interval, samples, per_sample)
 
 
 def _with_air(bins: Bins, lidar: Lidar, samples: tuple[float, float, int, int]) -> Bins:

@@ -238,7 +238,7 @@ def _simulate_batches(lidar, scene, plan, key, rtol, atol, fixed, max_seconds, p
     if lidar.receiver.window == "first return":
         wave = open_at_first_return(wave, lidar)
     info = {
-        "photons": done * plan.n_photons if plan.orders > 1 else 0,
+        "photons": done * plan.n_photons if plan.orders > 1 or plan.layout.drawn_first else 0,
         "batches": done,
         "seconds": time.perf_counter() - started,
         "error": error,

@@ -9,7 +9,6 @@ from jaxtyping import Array, Float
 
 from .constants import SPEED_OF_LIGHT
 from .effects import without
-from .layout import KERNEL_VARIANCE
 from .letters import scene_optics
 from .lidar import Lidar
 from .plan import Plan
@@ -97,7 +96,7 @@ def pulse_kernel(lidar: Lidar, plan: Plan) -> Float[Array, "fine samples"]:
     )
     if plan.sharpen:
         bend = share[2:] - 2.0 * share[1:-1] + share[:-2]
-        share = share.at[1:-1].add(-0.5 * KERNEL_VARIANCE * bend)
+        share = share.at[1:-1].add(-0.5 * plan.bins.kernel_variance * bend)
     index = np.arange(plan.n_samples)[None, :] * k - np.arange(plan.bins.count)[:, None] - low
     return share[index]
 

@@ -5,36 +5,44 @@ and whose second moment, 1/4 bin^2, does not depend on where in the bin the inst
 derivative with respect to time is continuous. A return that extends over a stretch of the ray is
 integrated bin by bin and smoothed by (1, 10, 1)/12, which gives it the same second moment. That
 common second moment is taken out again when the pulse is applied (`jaxlidar.waveform`).
+
+To show what that is worth, the kernel may have two bins (linear; cloud in cell) or one (the nearest
+bin, whose derivative with respect to time is zero); its second moment is then n/12 bin^2 in the mean.
 """
 
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from ..layout import KERNEL, Bins
-
-_SMOOTH = (1 / 12, 10 / 12, 1 / 12)
+from ..layout import Bins
 
 
 def instant_row(
     bins: Bins, time: Float[Array, "*s"], value: Float[Array, "*s"]
-) -> tuple[Int[Array, "*s"], Float[Array, "*s 3"]]:
-    """First bin (counting the margin) and the three weights of a return at one instant."""
+) -> tuple[Int[Array, "*s"], Float[Array, "*s kernel"]]:
+    """First bin (counting the margin) and the weights of a return at one instant."""
     position = bins.position(time)
-    centre = jnp.round(lax.stop_gradient(position))
-    r = position - centre
-    row = jnp.stack([0.5 * (0.5 - r) ** 2, 0.75 - r * r, 0.5 * (0.5 + r) ** 2], axis=-1)
-    return _first(bins, centre - 1, KERNEL), row * value[..., None]
+    lowest = jnp.round(lax.stop_gradient(position) - 0.5 * (bins.kernel - 1))
+    r = position - lowest
+    match bins.kernel:
+        case 1:
+            row = [jnp.ones_like(r)]
+        case 2:
+            row = [1.0 - r, r]
+        case _:
+            r = r - 1.0
+            row = [0.5 * (0.5 - r) ** 2, 0.75 - r * r, 0.5 * (0.5 + r) ** 2]
+    return _first(bins, lowest, bins.kernel), jnp.stack(row, axis=-1) * value[..., None]
 
 
-def smooth_row(row: Float[Array, "*s n"]) -> Float[Array, "*s n+2"]:
-    """Give bin integrals the second moment of the B-spline."""
+def smooth_row(row: Float[Array, "*s n"], kernel: int) -> Float[Array, "*s n+2"]:
+    """Give bin integrals, whose own second moment is 1/12, that of the kernel."""
     zero = jnp.zeros_like(row[..., :1])
-    a, b, c = _SMOOTH
+    side = (kernel - 1) / 24
     return (
-        a * jnp.concatenate([row, zero, zero], -1)
-        + b * jnp.concatenate([zero, row, zero], -1)
-        + c * jnp.concatenate([zero, zero, row], -1)
+        side * jnp.concatenate([row, zero, zero], -1)
+        + (1.0 - 2.0 * side) * jnp.concatenate([zero, row, zero], -1)
+        + side * jnp.concatenate([zero, zero, row], -1)
     )
 
 

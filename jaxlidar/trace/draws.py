@@ -1,10 +1,11 @@
-"""Random numbers for photons: randomly shifted lattices, one per order and dimension.
+"""Random numbers for photons: randomly shifted lattices, one per order and dimension, or independent ones.
 
 Photon i takes frac(z i + s) in each dimension, in 32-bit integer arithmetic; the shift s is random, so every
 number is uniform and every estimate unbiased whatever z is. For the first collision z belongs to a
 lattice of low discrepancy (Roberts's generalised golden ratio); later it is random, which makes any
 two photons independent. This costs two integer operations where a counter-based generator costs fifty.
 Photons of one batch are not independent: standard errors come from batches with independent keys.
+Independent numbers are there to be compared with.
 """
 
 import equinox as eqx
@@ -14,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray, UInt32
 
 
-class Draws(eqx.Module):
+class Lattices(eqx.Module):
     """Uniform numbers in (0, 1) for each photon, order and dimension."""
 
     step: UInt32[Array, "orders dims"]
@@ -27,7 +28,19 @@ class Draws(eqx.Module):
         ]
 
 
-def draws(key: PRNGKeyArray, orders: int, dims: int) -> Draws:
+class Independent(eqx.Module):
+    """Uniform numbers in (0, 1) for each photon, order and dimension."""
+
+    key: PRNGKeyArray
+    dims: int = eqx.field(static=True)
+
+    def __call__(self, photon: UInt32[Array, "photons"], order: Array) -> list[Float[Array, "photons"]]:
+        """One array for each dimension. Photons are asked for in blocks, known by their first."""
+        key = jax.random.fold_in(jax.random.fold_in(self.key, order), photon[0])
+        return list(_to_unit(jax.random.bits(key, (self.dims, photon.size), jnp.uint32)))
+
+
+def draws(key: PRNGKeyArray, orders: int, dims: int) -> Lattices:
     """Lattices for `orders` collisions of `dims` numbers each."""
     a, b = jax.random.split(key)
     step = jax.random.bits(a, (orders, dims), jnp.uint32) | jnp.uint32(1)
@@ -35,10 +48,10 @@ def draws(key: PRNGKeyArray, orders: int, dims: int) -> Draws:
     root = np.roots([1.0, *[0.0] * (dims - 1), -1.0, -1.0])
     ratio = float(np.real(root[np.argmax(np.real(root))]))
     golden = np.floor(2.0**32 * ((1.0 / ratio ** np.arange(1, dims + 1)) % 1.0)).astype(np.uint32)
-    return Draws(step.at[0].set(jnp.asarray(golden)), shift)
+    return Lattices(step.at[0].set(jnp.asarray(golden)), shift)
 
 
-def _to_unit(bits: UInt32[Array, "photons"]) -> Float[Array, "photons"]:
+def _to_unit(bits: UInt32[Array, "*s"]) -> Float[Array, "*s"]:
     if jnp.finfo(jnp.zeros(()).dtype).bits == 64:
         return (bits.astype(float) + 0.5) * 2.0**-32
     return ((bits >> 9).astype(float) + 0.5) * 2.0**-23

@@ -204,7 +204,7 @@ def first_order(
                     slot, weight = _together(m * count + history, weight)
                     arrived = arrived.at[slot].add(weight)
             # Smoothing is linear: the sum once instead of every stretch.
-            response = smooth_row(response)[:, 1:-1]
+            response = smooth_row(response, bins.kernel)[:, 1:-1]
 
         for i, (s, law) in enumerate(zip(surfaces, layout.surfaces)):
             hit = jnp.where((met[i] <= stop) & (met[i] < FAR), s.coverage * energy, 0.0)

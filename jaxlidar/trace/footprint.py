@@ -5,9 +5,10 @@ slant range of that point: nothing here grows with the altitude, so single preci
 """
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from .._vector import Scalar, Vec, add, dot, from_frame, normalise, scale, vec
 from ..lidar import Lidar
@@ -93,6 +94,15 @@ def lattice(
     u = (i + shift[0]) / count
     turn = jnp.asarray((np.arange(count) * GOLDEN) % 1.0, u.dtype) + shift[1]
     r, a = quantile_radius(beam, jnp.minimum(u, 1.0 - 1e-7)), 2 * np.pi * turn
+    return (r * jnp.cos(a), r * jnp.sin(a)), jnp.full((count,), 1.0 / count, u.dtype)
+
+
+def scattered(
+    beam: Beam, count: int, key: PRNGKeyArray
+) -> tuple[tuple[Scalar, Scalar], Float[Array, "rays"]]:
+    """`count` rays of equal energy at independent places."""
+    u, turn = jax.random.uniform(key, (2, count), maxval=1.0 - 1e-7)
+    r, a = quantile_radius(beam, u), 2 * np.pi * turn
     return (r * jnp.cos(a), r * jnp.sin(a)), jnp.full((count,), 1.0 / count, u.dtype)
 
 

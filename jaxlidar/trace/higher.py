@@ -22,7 +22,7 @@ from .._vector import Scalar, Vec, along, vec
 from ..constants import SPEED_OF_LIGHT
 from ..layout import Bins, Layout
 from .deposit import instant_row, scatter_rows
-from .draws import draws
+from .draws import Independent, draws
 from .flight import DIMENSIONS, events_of, fly, nearest, plates_ahead
 from .footprint import GOLDEN, Beam, quantile_radius
 from .histories import Histories
@@ -61,8 +61,12 @@ def higher_orders(
     """Trace `photons` photons through up to `layout.orders` scatterings; sums are means per photon."""
     footprint_key, draw_key = jax.random.split(key)
     plates = [i for i, s in enumerate(surfaces) if s.plate]
-    numbers = draws(draw_key, layout.orders, DIMENSIONS + 2 * len(plates))
+    dimensions = DIMENSIONS + 2 * len(plates)
     shift = jax.random.uniform(footprint_key, (2,))
+    if layout.independent:
+        numbers, places = Independent(draw_key, dimensions), Independent(footprint_key, 2)
+    else:
+        numbers, places = draws(draw_key, layout.orders, dimensions), None
     setting = Setting(beam, medium, surfaces, layout, table, bins)
     size = min(CHUNK, photons)
     chunks = -(-photons // size)
@@ -70,10 +74,13 @@ def higher_orders(
 
     def chunk(tallies, number):
         lane = number * size + jnp.arange(size, dtype=jnp.uint32)
-        share = (lane.astype(float) + shift[0]) / photons
-        inside = share < 1.0
+        if places is None:
+            share = (lane.astype(float) + shift[0]) / photons
+            turn = (lane * jnp.uint32(GOLDEN * 2**32)).astype(float) * 2.0**-32 + shift[1]
+        else:
+            share, turn = places(lane, jnp.asarray(layout.orders))
+        inside = lane < photons
         r = quantile_radius(beam, jnp.clip(share, 0.0, 1.0 - 1e-7))
-        turn = (lane * jnp.uint32(GOLDEN * 2**32)).astype(float) * 2.0**-32 + shift[1]
         across = (r * jnp.cos(2 * jnp.pi * turn), r * jnp.sin(2 * jnp.pi * turn))
         across, share = hold_in_columns(beam, medium, across)
         point, w, excess = beam.ray(across)
@@ -165,7 +172,7 @@ def _one_order(setting: Setting, p: Photons, tally: HigherOrders, u: list[Scalar
     tally = _arrive(tally, hit.material, history, weight)
     weight = weight * hit.ratio
     # The first order is deterministic and has been deposited.
-    due = jnp.where(event & (order > 0), weight, 0.0)
+    due = jnp.where(event if layout.drawn_first else event & (order > 0), weight, 0.0)
     tally = _deposit(setting, tally, p.w, x, path, due, history, hit, u)
     history = setting.grow(history, hit.letter)
     weight = weight * hit.onward

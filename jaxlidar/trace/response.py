@@ -17,7 +17,7 @@ from ..materials import Specular
 from ..plan import Plan
 from ..scene import Scene
 from .first import FirstOrder, first_order
-from .footprint import Beam, beam_of, lattice, product_rule
+from .footprint import Beam, beam_of, lattice, product_rule, scattered
 from .higher import higher_orders
 from .histories import Histories, histories
 from .march import Medium, medium_of
@@ -79,16 +79,18 @@ def trace(
 
     if plan.smooth_footprint:
         across, energy = product_rule(beam)
+    elif layout.independent:
+        across, energy = scattered(beam, plan.n_rays, shift_key)
     else:
         shift = jax.random.uniform(shift_key, (2,)) if plan.random_footprint else jnp.asarray([0.5, 0.0])
         across, energy = lattice(beam, plan.n_rays, shift)
     first = first_order(beam, medium, surfaces, layout, short, bins, across, energy)
-    weights = first.weights
+    weights = jnp.zeros_like(first.weights) if layout.drawn_first else first.weights
     for i, surface in enumerate(surfaces):
         if isinstance(surface.law, Specular) and "specular return" not in plan.off:
             weights = weights + _mirror(beam, medium, surfaces, i, plan, short)
 
-    if plan.layout.orders < 2:
+    if layout.orders < 2 and not layout.drawn_first:
         straight = [s.straight for s in surfaces]
         return _only_first(first, weights, plan, short, straight)
     higher = higher_orders(beam, medium, surfaces, layout, table, bins, photon_key, plan.n_photons)
