@@ -70,6 +70,8 @@ def simulate(
     Batches of photons are traced until the error is below the tolerance. The error is the root mean
     square, over the samples above 1 % of the peak, of standard error over reflectance, for the worst
     wavelength. Where nothing is random (one plane; a fixed footprint and one order), one pass does.
+    Standard errors are widened for few batches, by Student's t, so that the expected value lies within two
+    of them in 95 % of cases; neglected orders (`Waveform.neglected`) and rounding come on top.
 
     **Arguments:**
 
@@ -182,7 +184,8 @@ def _simulate_traced(lidar: Lidar, scene: Scene, plan: Plan, key: PRNGKeyArray) 
         lambda k: _batch(lidar, scene, plan, k), jax.random.split(key, MIN_BATCHES)
     )
     mean = jax.tree.map(lambda a: jnp.mean(a, axis=0), responses)
-    stderr = jnp.sqrt(jnp.var(jax.lax.stop_gradient(totals), axis=0) / (MIN_BATCHES - 1))
+    spread = jnp.var(jax.lax.stop_gradient(totals), axis=0)
+    stderr = _widening(MIN_BATCHES) * jnp.sqrt(spread / (MIN_BATCHES - 1))
     return waveform(mean, lidar, scene, plan, stderr=stderr)
 
 
@@ -233,7 +236,7 @@ def _simulate_batches(lidar, scene, plan, key, rtol, atol, fixed, max_seconds, p
             error, _ = _error(np.stack(means))
             stopped = "interrupted"
     mean = jax.tree.map(lambda a: a / done, total)
-    stderr = jnp.asarray(np.std(np.stack(means), axis=0, ddof=1) / math.sqrt(done))
+    stderr = jnp.asarray(_standard_error(np.stack(means)))
     wave = _finish(mean, lidar, scene, plan, stderr)
     if lidar.receiver.window == "first return":
         wave = open_at_first_return(wave, lidar)
@@ -252,10 +255,30 @@ def _add(a, b):
     return jax.tree.map(jnp.add, a, b)
 
 
+def _widening(batches: int) -> float:
+    """Quantile of Student's t for the probability of two standard errors of a normal distribution, over two.
+
+    By its expansion in 1 / degrees of freedom (Abramowitz and Stegun 26.7.5): to 0.1 % for eight batches.
+    """
+    x, n = 2.0, batches - 1
+    terms = (
+        (x**3 + x) / 4,
+        (5 * x**5 + 16 * x**3 + 3 * x) / 96,
+        (3 * x**7 + 19 * x**5 + 17 * x**3 - 15 * x) / 384,
+    )
+    return (x + sum(t / n ** (i + 1) for i, t in enumerate(terms))) / x
+
+
+def _standard_error(
+    means: Float[np.ndarray, "batches wavelengths bins"],
+) -> Float[np.ndarray, "wavelengths bins"]:
+    return _widening(len(means)) * np.std(means, axis=0, ddof=1) / math.sqrt(len(means))
+
+
 def _error(means: Float[np.ndarray, "batches wavelengths bins"]) -> tuple[float, float]:
     """Relative error (see `simulate`) and largest standard error of the mean of batches."""
     mean = np.mean(means, axis=0)
-    stderr = np.std(means, axis=0, ddof=1) / math.sqrt(len(means))
+    stderr = _standard_error(means)
     seen = mean > 0.01 * np.max(mean, axis=1, keepdims=True)
     squares = np.where(seen, (stderr / np.where(seen, mean, 1.0)) ** 2, 0.0)
     relative = np.sqrt(np.sum(squares, axis=1) / np.maximum(np.sum(seen, axis=1), 1))

@@ -26,7 +26,8 @@ class Waveform(eqx.Module):
     - `reflectance`: (wavelengths, bins) apparent reflectance per sample, with the transmittance of the
       atmosphere; sums over bins to that of the target.
     - `energy`: (wavelengths, bins) J that the detector registers per sample.
-    - `stderr`: (wavelengths, bins) one standard error of `reflectance`; zero where nothing was random.
+    - `stderr`: (wavelengths, bins) one standard error of `reflectance`; zero where nothing was random. Two of
+      them hold the expected value in 95 % of cases.
     - `components`: dict of arrays like `reflectance`: by material of the last scattering ("ground",
       "leaf", "bark", "plate", "air"), and by order ("first", "higher").
     - `neglected`: (wavelengths,) apparent reflectance that orders beyond the last could still add.
