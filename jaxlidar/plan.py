@@ -88,7 +88,7 @@ def plan(
     max_orders: int | None = None,
     max_step: float | None = None,
     n_photons: int = 8192,
-    n_rays: int = 4096,
+    n_rays: int | None = None,
     window: tuple[float, float] | None = None,
     bin_width: float | None = None,
     footprint: str = "random",
@@ -106,7 +106,8 @@ def plan(
     - `max_orders`: scatterings followed, at least 1; None decides from the largest albedo.
     - `max_step`: longest stretch, m, that the first order takes at once; None is four fine bins. The
       result does not depend on it.
-    - `n_photons`, `n_rays`: photons per batch and rays of the footprint.
+    - `n_photons`, `n_rays`: photons per batch and rays of the footprint; None is 4096 rays where they are
+      all, and 1024 where batches of photons shift them.
     - `window`: (first, last) sample time in ns; None covers the scene.
     - `bin_width`: fine bins in ns, rounded to a fraction of the sampling interval; None: by the pulse.
     - `footprint`: "random" (each batch shifts the rays, so that the standard error covers them) or "fixed".
@@ -153,6 +154,8 @@ def plan(
     if "multiple scattering" in off:
         max_orders = 1
     orders, why = _orders(largest_albedo(optics), len(letters.letters), scene, rtol, max_orders)
+    if n_rays is None:
+        n_rays = 4096 if orders == 1 or footprint == "fixed" else 1024
     bins, samples = _time(lidar, scene, geometry, orders, window, bin_width)
     airy = _with_air(bins, lidar, samples)
     metres = 0.5 * SPEED_OF_LIGHT * bins.width

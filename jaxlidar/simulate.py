@@ -57,7 +57,7 @@ def simulate(
     plan: Plan | None = None,
     max_orders: int | None = None,
     max_step: float | None = None,
-    n_rays: int = 4096,
+    n_rays: int | None = None,
     window: tuple[float, float] | None = None,
     bin_width: float | None = None,
     footprint: str = "random",
@@ -224,7 +224,10 @@ def _simulate_batches(lidar, scene, plan, key, rtol, atol, fixed, max_seconds, p
                     stopped = "time spent"
                     break
                 # The error falls with the square root; four times as many at most before looking again.
-                needed = math.ceil(1.1 * done * (error / rtol) ** 2)
+                needed = done * (error / rtol) ** 2
+                if needed > done:
+                    needed *= (_widening(math.ceil(needed)) / _widening(done)) ** 2
+                needed = math.ceil(1.05 * needed)
                 wanted = int(min(max(needed, done + 2), 4 * done))
                 if math.isfinite(max_seconds):
                     affordable = done * max_seconds / max(seconds, 1e-9)

@@ -32,9 +32,10 @@ from .photons import THROUGH, Hit, Photons, Setting, ratio_of, stop
 from .scatter import collide, view_factors
 from .surfaces import Surface
 
-CHUNK = 512
-# Chunks that are added up by themselves: single precision loses small deposits on a large sum.
-GROUP = 16
+CHUNK = 256
+# Chunks that are traced together, order by order, and added up by themselves: single precision loses small
+# deposits on a large sum.
+GROUP = 32
 
 
 class HigherOrders(eqx.Module):
@@ -70,10 +71,11 @@ def higher_orders(
     setting = Setting(beam, medium, surfaces, layout, table, bins)
     size = min(CHUNK, photons)
     chunks = -(-photons // size)
+    groups = -(-chunks // GROUP)
+    each = -(-chunks // groups)
     count, materials = table.count, len(layout.materials)
 
-    def chunk(tallies, number):
-        lane = number * size + jnp.arange(size, dtype=jnp.uint32)
+    def start(lane):
         if places is None:
             share = (lane.astype(float) + shift[0]) / photons
             turn = (lane * jnp.uint32(GOLDEN * 2**32)).astype(float) * 2.0**-32 + shift[1]
@@ -85,24 +87,41 @@ def higher_orders(
         across, share = hold_in_columns(beam, medium, across)
         point, w, excess = beam.ray(across)
         up = jnp.asarray(-layout.upstream, r.dtype)
-        start = Photons(
+        return Photons(
             along(point, w, up),
             w,
             excess + up,
             jnp.where(inside, share / photons, 0.0),
-            jnp.zeros((size,), jnp.int32),
-            jnp.full((size,), -1, jnp.int32),
+            jnp.zeros(lane.shape, jnp.int32),
+            jnp.full(lane.shape, -1, jnp.int32),
             vec(jnp.zeros_like(r) for _ in range(3)),
             inside,
         )
 
-        def order(carry, n):
-            photons, tally = carry
-            return _one_order(setting, photons, tally, numbers(lane, n), n), None
+    def group(total, number):
+        lane = number * (each * size) + jnp.arange(each * size, dtype=jnp.uint32)
 
-        (last, tallies), _ = lax.scan(order, (start, tallies), jnp.arange(layout.orders))
+        def order(carry, n):
+            def chunk(tally, part):
+                lane, photons = part
+
+                def go(photons, tally):
+                    return _one_order(setting, photons, tally, numbers(lane, n), n)
+
+                # Photons that live come first, so that whole chunks of dead ones are passed over.
+                photons, tally = lax.cond(jnp.any(photons.alive), go, lambda *c: c, photons, tally)
+                return tally, photons
+
+            lanes, photons, tally = carry
+            tally, photons = lax.scan(chunk, tally, (lanes, photons))
+            lanes, photons = _alive_first(lanes, photons)
+            return (lanes, photons, tally), None
+
+        rows = jax.tree.map(lambda a: a.reshape(each, size), (lane, start(lane)))
+        (_, last, tally), _ = lax.scan(order, (*rows, zero), jnp.arange(layout.orders))
         over = jnp.where(last.alive, stop(last.weight), 0.0)
-        return eqx.tree_at(lambda t: t.remaining, tallies, tallies.remaining.at[last.history].add(over)), None
+        tally = eqx.tree_at(lambda t: t.remaining, tally, tally.remaining.at[last.history].add(over))
+        return jax.tree.map(jnp.add, total, tally), None
 
     zero = HigherOrders(
         jnp.zeros((materials, count, bins.padded)),
@@ -112,18 +131,19 @@ def higher_orders(
         jnp.zeros((count,)),
         jnp.zeros((count,)),
     )
-    groups = -(-chunks // GROUP)
-    each = -(-chunks // groups)
-
-    def group(tallies, first):
-        more, _ = lax.scan(chunk, zero, first + jnp.arange(each, dtype=jnp.uint32))
-        return jax.tree.map(jnp.add, tallies, more), None
-
-    if groups > 1:
-        tallies, _ = lax.scan(group, zero, each * jnp.arange(groups, dtype=jnp.uint32))
-    else:
-        tallies, _ = group(zero, jnp.uint32(0))
+    tallies, _ = lax.scan(group, zero, jnp.arange(groups, dtype=jnp.uint32))
     return eqx.tree_at(lambda t: t.weights, tallies, bins.trim(tallies.weights))
+
+
+def _alive_first(lanes: Array, photons: Photons) -> tuple[Array, Photons]:
+    """Bring the photons that live to the front, in their order; all others are dead copies of the first."""
+    alive = photons.alive.reshape(-1)
+    number = jnp.arange(alive.size)
+    place = jnp.where(alive, jnp.cumsum(alive) - 1, alive.size)
+    source = jnp.zeros_like(number).at[place].set(number, mode="drop")
+    lanes, photons = jax.tree.map(lambda a: a.reshape(-1)[source].reshape(a.shape), (lanes, photons))
+    alive = (number < jnp.sum(alive)).reshape(photons.alive.shape)
+    return lanes, eqx.tree_at(lambda p: p.alive, photons, alive)
 
 
 def _one_order(setting: Setting, p: Photons, tally: HigherOrders, u: list[Scalar], order: Int[Array, ""]):
