@@ -2,8 +2,11 @@
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
+import jax
+
+from ._checks import is_traced
 from .bounds import Bounds
 from .constants import SPEED_OF_LIGHT
 from .effects import NAMES, Effect, present, switched_off, without
@@ -273,28 +276,34 @@ def _effects(
 ) -> tuple[Effect, ...]:
     has, planned = present(lidar, scene), present(*without(lidar, scene, off))
     reasons = dict.fromkeys(NAMES, "in the scene") | {"multiple scattering": why} | _reasons(lidar, scene)
-    bounds = Bounds(*without(lidar, scene, off), orders)
+    # What is being traced may have any value.
+    known = not any(is_traced(x) for x in jax.tree.leaves((lidar, scene)))
+
+    def bound(name: str, off: tuple[str, ...]) -> float:
+        pair = without(lidar, scene, off)
+        there = present(*pair) | {"hot spot": pair[1].canopy is not None}
+        if not known or not there.get(name, True):
+            return float(there.get(name, True))
+        return _rules(Bounds(*pair, orders), bins, upstream)[name]()
+
     rows = []
     for name in NAMES:
         on = planned[name] and name not in off and (name != "multiple scattering" or orders > 1)
-        reason, own = reasons[name], bounds
+        reason, others = reasons[name], off
         if name in off:
             # What switching it on again would change.
-            own = Bounds(*without(lidar, scene, tuple(n for n in off if n != name)), orders)
-            reason = "switched off"
+            reason, others = "switched off", tuple(n for n in off if n != name)
         elif not has[name] and name not in ("multiple scattering", "hot spot"):
             reason = "not in the scene"
         elif has[name] and not planned[name] and name != "multiple scattering":
             reason = "gone with what is switched off"
-        rows.append(Effect(name, on, reason, _bound(name, own, bins, upstream), _measure(name)))
+        rows.append(Effect(name, on, reason, bound(name, others), _measure(name)))
         if on and name == "multiple scattering":
-            rows.append(
-                Effect(f"orders beyond {orders}", False, "too little is left", bounds.beyond(orders), "sum")
-            )
-    if bounds.scene.atmosphere is not None:
-        # Light that the air scatters and the receiver still gets is at most what was lost.
-        lost = bounds.lost(bins)
-        rows.append(Effect("scattering within the atmosphere", False, "beyond first order", lost, "sum"))
+            name = f"orders beyond {orders}"
+            rows.append(Effect(name, False, "too little is left", bound(name, off), "sum"))
+    if without(lidar, scene, off)[1].atmosphere is not None:
+        name = "scattering within the atmosphere"
+        rows.append(Effect(name, False, "beyond first order", bound(name, off), "sum"))
     return tuple(rows)
 
 
@@ -302,37 +311,32 @@ def _measure(name: str) -> str:
     return "samples" if name in ("slope spread", "divergence", "jitter") else "sum"
 
 
-def _bound(name: str, bounds: Bounds, bins: Bins, upstream: float) -> float:
-    lidar, scene = bounds.lidar, bounds.scene
-    if name == "hot spot":
-        return bounds.hot_spot()
-    if not present(lidar, scene)[name]:
-        return 0.0
-    match name:
-        case "leaf" | "bark":
-            return bounds.part(name)
-        case "plates":
-            return bounds.plates()
-        case "ground":
-            return bounds.ground()
-        case "slope spread":
-            level = without(lidar, scene, ("slope spread",))[1].ground
-            assert level is not None
-            return bounds.slope_spread(level)
-        case "multiple scattering":
-            return bounds.beyond(1)
-        case "divergence":
-            return bounds.divergence()
-        case "field of view":
-            return bounds.field_of_view()
-        case "atmospheric extinction":
-            return bounds.extinction(bins, upstream)
-        case "atmospheric backscatter":
-            return bounds.backscatter(bins, upstream)
-        case "jitter":
-            return bounds.jitter()
-    # A mirror's return may outshine all else.
-    return 1.0
+def _rules(bounds: Bounds, bins: Bins, upstream: float) -> dict[str, Callable[[], float]]:
+    """The bound of every effect that is there."""
+
+    def slope_spread() -> float:
+        level = without(bounds.lidar, bounds.scene, ("slope spread",))
+        return bounds.slope_spread(Bounds(*level, bounds.orders))
+
+    return {
+        "leaf": lambda: bounds.part("leaf"),
+        "bark": lambda: bounds.part("bark"),
+        "plates": bounds.plates,
+        "ground": bounds.ground,
+        "slope spread": slope_spread,
+        "multiple scattering": lambda: bounds.beyond(1),
+        f"orders beyond {bounds.orders}": lambda: bounds.beyond(bounds.orders),
+        # A mirror's return may outshine all else.
+        "specular return": lambda: 1.0,
+        "divergence": bounds.divergence,
+        "field of view": bounds.field_of_view,
+        "hot spot": bounds.hot_spot,
+        "atmospheric extinction": lambda: bounds.extinction(bins, upstream),
+        "atmospheric backscatter": lambda: bounds.backscatter(bins, upstream),
+        "jitter": bounds.jitter,
+        # Light that the air scatters and the receiver still gets is at most what was lost.
+        "scattering within the atmosphere": lambda: bounds.lost(bins),
+    }
 
 
 def _reasons(lidar: Lidar, scene: Scene) -> dict[str, str]:
@@ -346,7 +350,9 @@ def _reasons(lidar: Lidar, scene: Scene) -> dict[str, str]:
     reasons = {
         "slope spread": f"{slope:g} degrees: {spread:.2g} ns (standard deviation)",
         "divergence": f"{number(lidar.divergence):g} mrad: a footprint of radius {radius:.3g} m",
-        "field of view": "" if view is None else f"{number(view):g} mrad, with a soft edge of 2 %",
+        "field of view": "a soft edge of 2 %"
+        if view is None or is_traced(view)
+        else f"{number(view):g} mrad, with a soft edge of 2 %",
         "hot spot": "back through the same gap: exp(-tau)"
         if hotspot
         else "ways are independent: exp(-2 tau)",
