@@ -186,9 +186,9 @@ class Bounds:
         return np.max(ratio, axis=0)
 
     def _onward(self, name: str, after: Values) -> Values:
-        """Share that a ray scatters at a plate, or where it went through and scatters `after` of the rest."""
-        r, t = self.optics[name]
-        return r + t * after if self.sheets[name].transmission == "straight" else r + t
+        """Share that a ray scatters at a plate, or where it went on and scatters `after` of the rest."""
+        _, scattered, through = self._sheet(name)
+        return scattered + through * after
 
     def _with_orders(self, first: float) -> float:
         """`first` bounds what changes of order one; all of the orders above may come or go beside it."""
