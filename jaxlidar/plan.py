@@ -1,6 +1,7 @@
 """What a scene and a lidar call for: effects simulated, bounds on the others, sizes of all loops."""
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable, Mapping
 
@@ -22,6 +23,8 @@ DEFAULT_RTOL = 0.01
 # Orders are followed while their histories are not more than this (16 orders of four letters, 29 of three).
 MAX_HISTORIES = 5000
 MAX_ORDERS = 100
+# Of scattered light at most this share is scattered again, where any can escape: by experience.
+AGAIN = 0.8
 # Multiple scattering is followed this long after the last first-order return, ns.
 TAIL = (10.0, 60.0)
 
@@ -65,7 +68,7 @@ class Plan:
     def __str__(self) -> str:
         rows = [("effect", "simulated", "changes at most", "why")]
         for e in self.effects:
-            bound = "nothing" if e.bound == 0 else f"{100 * e.bound:.2g} % of {e.measure}"
+            bound = "nothing" if e.bound == 0 else f"{_percent(e.bound)} of {e.measure}"
             rows.append((e.name, "yes" if e.simulated else "no", bound, e.reason))
         widths = [max(len(r[i]) for r in rows) for i in range(3)]
         lines = ["  ".join([*(c.ljust(w) for c, w in zip(r, widths)), r[3]]).rstrip() for r in rows]
@@ -79,6 +82,11 @@ class Plan:
         if self.orders > 1:
             sizes += f", {self.n_photons} photons a batch, {self.orders} orders"
         return "\n".join([*lines, sizes])
+
+
+def _percent(share: float) -> str:
+    # Two digits, also of 100.
+    return f"{float(f'{100 * share:.2g}'):g} %"
 
 
 def plan(
@@ -110,7 +118,7 @@ def plan(
     - `footprint`: "random" (each batch shifts the rays, so that the standard error covers them) or "fixed".
     - `effects`: effects to switch off, by name, as in {"multiple scattering": False}; True asks for what
       is on anyway and refuses scenes that do not have it. The names are those of the table's first column.
-    - `describe`: whether to make the table of effects, with its bounds; takes some 10 ms.
+    - `describe`: whether to make the table of effects, with its bounds; takes some 40 ms.
 
     What the scene does not have is off, and never compiled. All else is on, however small: a plan also
     serves other values of the same scene, in fits and derivatives.
@@ -140,7 +148,7 @@ def plan(
     letters = spell(optics)
     if "multiple scattering" in off:
         max_orders = 1
-    orders, why = _orders(largest_albedo(optics), len(letters.letters), scene, rtol, max_orders)
+    orders, why, left = _orders(largest_albedo(optics), len(letters.letters), scene, rtol, max_orders)
     bins, samples = _time(lidar, scene, geometry, orders, window, bin_width)
     airy = _with_air(bins, lidar, samples)
     metres = 0.5 * SPEED_OF_LIGHT * bins.width
@@ -189,7 +197,7 @@ def plan(
         first_degree=1 + 2 * plates,
         off=off,
         rtol=rtol,
-        effects=_effects(*whole, off, orders, why, airy, geometry.upstream) if describe else (),
+        effects=_effects(*whole, off, orders, (why, left), airy, geometry.upstream) if describe else (),
     )
 
 
@@ -198,21 +206,23 @@ def _degree(orders: int, plates: int) -> int:
     return orders + (orders + 1) * plates
 
 
-def _orders(albedo: float, kinds: int, scene: Scene, rtol: float, max_orders: int | None) -> tuple[int, str]:
+def _orders(
+    albedo: float, kinds: int, scene: Scene, rtol: float, max_orders: int | None
+) -> tuple[int, str, float]:
+    """How many orders to follow, why, and what the others are likely to have."""
     if scene.canopy is None and len(scene.surfaces) <= 1:
-        return 1, "one plane cannot light itself"
+        return 1, "one plane cannot light itself", 0.0
     plates = len(scene.plates)
     most = 2
     while most < MAX_ORDERS and math.comb(_degree(most + 1, plates) + kinds, kinds) <= MAX_HISTORIES:
         most += 1
     wanted = most
     if albedo < 1:
-        # Between scatterings part of the light escapes: at least a fifth, where anything can.
-        wanted = 1 + math.ceil(math.log(rtol / 10) / math.log(max(0.8 * albedo, 1e-6)))
+        wanted = 1 + math.ceil(math.log(rtol / 10) / math.log(max(AGAIN * albedo, 1e-6)))
     orders = min(max(wanted, 2), most) if max_orders is None else int(max_orders)
     if orders == 1:
-        return 1, "one order is asked for"
-    return orders, f"orders 2 to {orders}; largest albedo {albedo:.2f}"
+        return 1, "one order is asked for", 0.0
+    return orders, f"orders 2 to {orders}; largest albedo {albedo:.2f}", (AGAIN * albedo) ** orders
 
 
 def _time(
@@ -272,19 +282,29 @@ def _with_air(bins: Bins, lidar: Lidar, samples: tuple[float, float, int, int]) 
 
 
 def _effects(
-    lidar: Lidar, scene: Scene, off: tuple[str, ...], orders: int, why: str, bins: Bins, upstream: float
+    lidar: Lidar,
+    scene: Scene,
+    off: tuple[str, ...],
+    orders: int,
+    why: tuple[str, float],
+    bins: Bins,
+    upstream: float,
 ) -> tuple[Effect, ...]:
     has, planned = present(lidar, scene), present(*without(lidar, scene, off))
-    reasons = dict.fromkeys(NAMES, "in the scene") | {"multiple scattering": why} | _reasons(lidar, scene)
+    reasons = dict.fromkeys(NAMES, "in the scene") | {"multiple scattering": why[0]} | _reasons(lidar, scene)
     # What is being traced may have any value.
     known = not any(is_traced(x) for x in jax.tree.leaves((lidar, scene)))
+
+    @functools.cache
+    def rules(off: tuple[str, ...]) -> dict[str, Callable[[], float]]:
+        return _rules(Bounds(*without(lidar, scene, off), orders), bins, upstream)
 
     def bound(name: str, off: tuple[str, ...]) -> float:
         pair = without(lidar, scene, off)
         there = present(*pair) | {"hot spot": pair[1].canopy is not None}
         if not known or not there.get(name, True):
             return float(there.get(name, True))
-        return _rules(Bounds(*pair, orders), bins, upstream)[name]()
+        return rules(off)[name]()
 
     rows = []
     for name in NAMES:
@@ -300,7 +320,9 @@ def _effects(
         rows.append(Effect(name, on, reason, bound(name, others), _measure(name)))
         if on and name == "multiple scattering":
             name = f"orders beyond {orders}"
-            rows.append(Effect(name, False, "too little is left", bound(name, off), "sum"))
+            most = bound(name, off)
+            rest = f"likely below {_percent(min(why[1], most))}: light escapes between"
+            rows.append(Effect(name, False, rest, most, "sum"))
     if without(lidar, scene, off)[1].atmosphere is not None:
         name = "scattering within the atmosphere"
         rows.append(Effect(name, False, "beyond first order", bound(name, off), "sum"))
