@@ -135,34 +135,52 @@ class Bounds:
         """Share of the sum that orders above `order` can have.
 
         What is scattered n + 1 times is at most s times what is scattered n times, s the largest share that a
-        ray scatters of its energy, be it after passing plates. All of it returns with the largest view
-        factor at most. What is scattered once is at most `ratio` times what of it returns within the view,
-        with what the view does not see.
+        ray scatters of its energy, be it after passing plates; between two planes, what one of them scatters
+        meets the other. All of it returns with the largest view factor at most.
         """
         if self.scene.canopy is None and len(self.scene.surfaces) <= 1:
             return 0.0
+        brightest = max(map(self._brightest, self.optics), default=0.0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            share = self._between(order) if self._is_plate_over_ground() else self._among(order)
+            x = brightest * share
+            return _worst(np.where(share > 0, 1.0 / (1.0 + 1.0 / x), 0.0))
+
+    def _between(self, order: int) -> Values:
+        """What a plate and the ground scatter to and fro above `order`, beside what returns of order one."""
+        (name,), (r, _) = self.sheets, self.optics["ground"]
+        reflected, scattered, through = self._sheet(name)
+        returned = reflected * self._factors(name)[0] + through**2 * r * self._factors("ground")[0]
+        plate, ground = scattered, through * r
+        for _ in range(order):
+            plate, ground = scattered * ground, r * plate
+        every_other = plate + ground + scattered * ground + r * plate
+        return every_other / (1.0 - r * scattered) / (returned * (1.0 - self.outside))
+
+    def _among(self, order: int) -> Values:
+        """What is scattered above `order`, by anything, beside what returns of order one.
+
+        What is scattered once is at most `ratio` times what of it returns, with what the view does not see.
+        """
         s, passing = np.zeros(self.lidar.wavelength.size), 1.0
         for name, (r, t) in self.optics.items():
             if name not in self.sheets:
                 s = np.maximum(s, r + t)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            ratio = self._scattered_per_return()
-            for name in self.sheets:
-                reflected, scattered, through = self._sheet(name)
-                own = scattered / (reflected * self._factors(name)[0])
-                ratio = np.maximum(ratio, np.where(scattered > 0, own, 0.0))
-                # The way back passes the plate once more; below an opaque one nothing is lit.
-                passing = passing * np.where(through > 0, through, 1.0)
-            # After any plate may come any other: as often as there are plates.
-            for _ in self.sheets:
-                s = np.max([s, *(self._onward(name, s) for name in self.sheets)], axis=0)
-            unseen = np.zeros_like(s)
-            if self.outside > 0:
-                floor = self._returns()[0] * self._through() ** 2 * (1.0 - self.outside)
-                unseen = s * self.outside / floor
-            brightest = max(map(self._brightest, self.optics), default=0.0)
-            x = brightest * s**order / (1.0 - s) * (ratio / passing + unseen)
-            return _worst(np.where(s > 0, 1.0 / (1.0 + 1.0 / x), 0.0))
+        ratio = self._scattered_per_return()
+        for name in self.sheets:
+            reflected, scattered, through = self._sheet(name)
+            own = scattered / (reflected * self._factors(name)[0])
+            ratio = np.maximum(ratio, np.where(scattered > 0, own, 0.0))
+            # The way back passes the plate once more; below an opaque one nothing is lit.
+            passing = passing * np.where(through > 0, through, 1.0)
+        # After any plate may come any other: as often as there are plates.
+        for _ in self.sheets:
+            s = np.max([s, *(self._onward(name, s) for name in self.sheets)], axis=0)
+        unseen = np.zeros_like(s)
+        if self.outside > 0:
+            floor = self._returns()[0] * self._through() ** 2 * (1.0 - self.outside)
+            unseen = s * self.outside / floor
+        return np.where(s > 0, s**order / (1.0 - s) * (ratio / passing + unseen), 0.0)
 
     def _scattered_per_return(self) -> Values:
         """Largest ratio of what canopy and ground scatter of a ray to what of it returns, plates not counted.
