@@ -56,9 +56,9 @@ def plan_for(
     interval = float(lidar.sampling_interval)
     window = (float(time[0]), float(time[0]) + (time.size - 1 + 1e-3) * interval)
     scenes = corners(scene, settled)
-    common = {"window": window, "n_photons": photons, "n_rays": rays}
+    common = {"window": window, "n_photons": photons, "n_rays": rays, "describe": False}
     first = make_plan(lidar, scenes[0], max_orders=max_orders, **common)
-    common.update(max_orders=first.orders, bin_width=first.bins.width, describe=False)
+    common.update(max_orders=first.orders, bin_width=first.bins.width)
     if scene.canopy is not None:
         common.update(max_step=first.layout.max_step)
     plans = [first]

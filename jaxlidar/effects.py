@@ -159,8 +159,10 @@ def _thinned(canopy: Canopy, off: tuple[str, ...]) -> Canopy | None:
 
 
 def _levelled(ground: Ground, lidar: Lidar) -> Ground:
-    """Level ground through the point where the axis of the beam meets the slope."""
+    """Level ground through the point where the axis of the beam meets the slope, if it does."""
     normal, axis = ground.plane.normal, lidar.direction
     rise = normal[2] * ground.height - jnp.sum(normal[:2] * lidar.position)
-    height = rise / jnp.sum(normal * axis) * axis[2]
+    towards = jnp.sum(normal * axis)
+    met = towards < -1e-6
+    height = jnp.where(met, rise / jnp.where(met, towards, -1.0) * axis[2], ground.height)
     return dataclasses.replace(ground, height=height, slope=jnp.zeros_like(ground.slope))

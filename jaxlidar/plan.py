@@ -1,9 +1,13 @@
 """What a scene and a lidar call for: effects simulated, bounds on the others, sizes of all loops."""
 
 import dataclasses
+import functools
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
+import jax
+
+from ._checks import is_traced
 from .bounds import Bounds
 from .constants import SPEED_OF_LIGHT
 from .effects import NAMES, Effect, present, switched_off, without
@@ -19,6 +23,8 @@ DEFAULT_RTOL = 0.01
 # Orders are followed while their histories are not more than this (16 orders of four letters, 29 of three).
 MAX_HISTORIES = 5000
 MAX_ORDERS = 100
+# Of scattered light at most this share is scattered again, where any can escape: by experience.
+AGAIN = 0.8
 # Multiple scattering is followed this long after the last first-order return, ns.
 TAIL = (10.0, 60.0)
 
@@ -64,7 +70,7 @@ class Plan:
     def __str__(self) -> str:
         rows = [("effect", "simulated", "changes at most", "why")]
         for e in self.effects:
-            bound = "nothing" if e.bound == 0 else f"{100 * e.bound:.2g} % of {e.measure}"
+            bound = "nothing" if e.bound == 0 else f"{_percent(e.bound)} of {e.measure}"
             rows.append((e.name, "yes" if e.simulated else "no", bound, e.reason))
         widths = [max(len(r[i]) for r in rows) for i in range(3)]
         lines = ["  ".join([*(c.ljust(w) for c, w in zip(r, widths)), r[3]]).rstrip() for r in rows]
@@ -78,6 +84,11 @@ class Plan:
         if self.orders > 1:
             sizes += f", {self.n_photons} photons a batch, {self.orders} orders"
         return "\n".join([*lines, sizes])
+
+
+def _percent(share: float) -> str:
+    # Two digits, also of 100.
+    return f"{float(f'{100 * share:.2g}'):g} %"
 
 
 def plan(
@@ -118,7 +129,7 @@ def plan(
     - `points`: "lattice" (low discrepancy) or "independent" random numbers for rays and photons.
     - `kernel`: fine bins over which an instant is spread: 3 (smooth), 2 (linear) or 1 (the nearest: without
       derivatives with respect to times). These three are there to show what the defaults are worth.
-    - `describe`: whether to make the table of effects, with its bounds; takes some 10 ms.
+    - `describe`: whether to make the table of effects, with its bounds; takes some 40 ms.
 
     What the scene does not have is off, and never compiled. All else is on, however small: a plan also
     serves other values of the same scene, in fits and derivatives.
@@ -153,7 +164,7 @@ def plan(
     letters = spell(optics)
     if "multiple scattering" in off:
         max_orders = 1
-    orders, why = _orders(largest_albedo(optics), len(letters.letters), scene, rtol, max_orders)
+    orders, why, left = _orders(largest_albedo(optics), len(letters.letters), scene, rtol, max_orders)
     if n_rays is None:
         n_rays = 4096 if orders == 1 or footprint == "fixed" else 1024
     bins, samples = _time(lidar, scene, geometry, orders, window, bin_width)
@@ -207,7 +218,7 @@ def plan(
         first_degree=1 + 2 * plates,
         off=off,
         rtol=rtol,
-        effects=_effects(*whole, off, orders, why, airy, geometry.upstream) if describe else (),
+        effects=_effects(*whole, off, orders, (why, left), airy, geometry.upstream) if describe else (),
     )
 
 
@@ -224,21 +235,23 @@ def _degree(orders: int, plates: int) -> int:
     return orders + (orders + 1) * plates
 
 
-def _orders(albedo: float, kinds: int, scene: Scene, rtol: float, max_orders: int | None) -> tuple[int, str]:
+def _orders(
+    albedo: float, kinds: int, scene: Scene, rtol: float, max_orders: int | None
+) -> tuple[int, str, float]:
+    """How many orders to follow, why, and what the others are likely to have."""
     if scene.canopy is None and len(scene.surfaces) <= 1:
-        return 1, "one plane cannot light itself"
+        return 1, "one plane cannot light itself", 0.0
     plates = len(scene.plates)
     most = 2
     while most < MAX_ORDERS and math.comb(_degree(most + 1, plates) + kinds, kinds) <= MAX_HISTORIES:
         most += 1
     wanted = most
     if albedo < 1:
-        # Between scatterings part of the light escapes: at least a fifth, where anything can.
-        wanted = 1 + math.ceil(math.log(rtol / 10) / math.log(max(0.8 * albedo, 1e-6)))
+        wanted = 1 + math.ceil(math.log(rtol / 10) / math.log(max(AGAIN * albedo, 1e-6)))
     orders = min(max(wanted, 2), most) if max_orders is None else int(max_orders)
     if orders == 1:
-        return 1, "one order is asked for"
-    return orders, f"orders 2 to {orders}; largest albedo {albedo:.2f}"
+        return 1, "one order is asked for", 0.0
+    return orders, f"orders 2 to {orders}; largest albedo {albedo:.2f}", (AGAIN * albedo) ** orders
 
 
 def _time(
@@ -298,32 +311,50 @@ def _with_air(bins: Bins, lidar: Lidar, samples: tuple[float, float, int, int]) 
 
 
 def _effects(
-    lidar: Lidar, scene: Scene, off: tuple[str, ...], orders: int, why: str, bins: Bins, upstream: float
+    lidar: Lidar,
+    scene: Scene,
+    off: tuple[str, ...],
+    orders: int,
+    why: tuple[str, float],
+    bins: Bins,
+    upstream: float,
 ) -> tuple[Effect, ...]:
     has, planned = present(lidar, scene), present(*without(lidar, scene, off))
-    reasons = dict.fromkeys(NAMES, "in the scene") | {"multiple scattering": why} | _reasons(lidar, scene)
-    bounds = Bounds(*without(lidar, scene, off), orders)
+    reasons = dict.fromkeys(NAMES, "in the scene") | {"multiple scattering": why[0]} | _reasons(lidar, scene)
+    # What is being traced may have any value.
+    known = not any(is_traced(x) for x in jax.tree.leaves((lidar, scene)))
+
+    @functools.cache
+    def rules(off: tuple[str, ...]) -> dict[str, Callable[[], float]]:
+        return _rules(Bounds(*without(lidar, scene, off), orders), bins, upstream)
+
+    def bound(name: str, off: tuple[str, ...]) -> float:
+        pair = without(lidar, scene, off)
+        there = present(*pair) | {"hot spot": pair[1].canopy is not None}
+        if not known or not there.get(name, True):
+            return float(there.get(name, True))
+        return rules(off)[name]()
+
     rows = []
     for name in NAMES:
         on = planned[name] and name not in off and (name != "multiple scattering" or orders > 1)
-        reason, own = reasons[name], bounds
+        reason, others = reasons[name], off
         if name in off:
             # What switching it on again would change.
-            own = Bounds(*without(lidar, scene, tuple(n for n in off if n != name)), orders)
-            reason = "switched off"
+            reason, others = "switched off", tuple(n for n in off if n != name)
         elif not has[name] and name not in ("multiple scattering", "hot spot"):
             reason = "not in the scene"
         elif has[name] and not planned[name] and name != "multiple scattering":
             reason = "gone with what is switched off"
-        rows.append(Effect(name, on, reason, _bound(name, own, bins, upstream), _measure(name)))
+        rows.append(Effect(name, on, reason, bound(name, others), _measure(name)))
         if on and name == "multiple scattering":
-            rows.append(
-                Effect(f"orders beyond {orders}", False, "too little is left", bounds.beyond(orders), "sum")
-            )
-    if bounds.scene.atmosphere is not None:
-        # Light that the air scatters and the receiver still gets is at most what was lost.
-        lost = bounds.lost(bins)
-        rows.append(Effect("scattering within the atmosphere", False, "beyond first order", lost, "sum"))
+            name = f"orders beyond {orders}"
+            most = bound(name, off)
+            rest = f"likely below {_percent(min(why[1], most))}: light escapes between"
+            rows.append(Effect(name, False, rest, most, "sum"))
+    if without(lidar, scene, off)[1].atmosphere is not None:
+        name = "scattering within the atmosphere"
+        rows.append(Effect(name, False, "beyond first order", bound(name, off), "sum"))
     return tuple(rows)
 
 
@@ -331,37 +362,32 @@ def _measure(name: str) -> str:
     return "samples" if name in ("slope spread", "divergence", "jitter") else "sum"
 
 
-def _bound(name: str, bounds: Bounds, bins: Bins, upstream: float) -> float:
-    lidar, scene = bounds.lidar, bounds.scene
-    if name == "hot spot":
-        return bounds.hot_spot()
-    if not present(lidar, scene)[name]:
-        return 0.0
-    match name:
-        case "leaf" | "bark":
-            return bounds.part(name)
-        case "plates":
-            return bounds.plates()
-        case "ground":
-            return bounds.ground()
-        case "slope spread":
-            level = without(lidar, scene, ("slope spread",))[1].ground
-            assert level is not None
-            return bounds.slope_spread(level)
-        case "multiple scattering":
-            return bounds.beyond(1)
-        case "divergence":
-            return bounds.divergence()
-        case "field of view":
-            return bounds.field_of_view()
-        case "atmospheric extinction":
-            return bounds.extinction(bins, upstream)
-        case "atmospheric backscatter":
-            return bounds.backscatter(bins, upstream)
-        case "jitter":
-            return bounds.jitter()
-    # A mirror's return may outshine all else.
-    return 1.0
+def _rules(bounds: Bounds, bins: Bins, upstream: float) -> dict[str, Callable[[], float]]:
+    """The bound of every effect that is there."""
+
+    def slope_spread() -> float:
+        level = without(bounds.lidar, bounds.scene, ("slope spread",))
+        return bounds.slope_spread(Bounds(*level, bounds.orders))
+
+    return {
+        "leaf": lambda: bounds.part("leaf"),
+        "bark": lambda: bounds.part("bark"),
+        "plates": bounds.plates,
+        "ground": bounds.ground,
+        "slope spread": slope_spread,
+        "multiple scattering": lambda: bounds.beyond(1),
+        f"orders beyond {bounds.orders}": lambda: bounds.beyond(bounds.orders),
+        # A mirror's return may outshine all else.
+        "specular return": lambda: 1.0,
+        "divergence": bounds.divergence,
+        "field of view": bounds.field_of_view,
+        "hot spot": bounds.hot_spot,
+        "atmospheric extinction": lambda: bounds.extinction(bins, upstream),
+        "atmospheric backscatter": lambda: bounds.backscatter(bins, upstream),
+        "jitter": bounds.jitter,
+        # Light that the air scatters and the receiver still gets is at most what was lost.
+        "scattering within the atmosphere": lambda: bounds.lost(bins),
+    }
 
 
 def _reasons(lidar: Lidar, scene: Scene) -> dict[str, str]:
@@ -375,7 +401,9 @@ def _reasons(lidar: Lidar, scene: Scene) -> dict[str, str]:
     reasons = {
         "slope spread": f"{slope:g} degrees: {spread:.2g} ns (standard deviation)",
         "divergence": f"{number(lidar.divergence):g} mrad: a footprint of radius {radius:.3g} m",
-        "field of view": "" if view is None else f"{number(view):g} mrad, with a soft edge of 2 %",
+        "field of view": "a soft edge of 2 %"
+        if view is None or is_traced(view)
+        else f"{number(view):g} mrad, with a soft edge of 2 %",
         "hot spot": "back through the same gap: exp(-tau)"
         if hotspot
         else "ways are independent: exp(-2 tau)",

@@ -1,11 +1,12 @@
-"""Only the effects a scene calls for: what is off is not compiled, what is left out lies within its bound."""
+"""Only the effects a scene calls for: what is off is not compiled, and every choice can be overridden."""
 
 import dataclasses
+
 import equinox as eqx
 import jax
 import numpy as np
 import pytest
-from helpers import batch_mean, first_wave, slab
+from helpers import slab
 
 import jaxlidar as jl
 from jaxlidar.effects import NAMES, without
@@ -15,6 +16,7 @@ PLATE = jl.Plate(height=3.0, reflectance=0.4, transmittance=0.3, coverage=0.5)
 LEAF = jl.LeafOptics(reflectance=0.1, transmittance=0.05)
 LEAVES = jl.Canopy(slab(0.8), leaf=LEAF)
 TREES = jl.Canopy(slab(0.8, 0.1), leaf=LEAF, bark=0.3)
+HAZE = jl.Atmosphere(visibility=10.0, lidar_ratio=30.0)
 SIZES = {"n_photons": 512, "n_rays": 256, "window": (-100.0, 50.0)}
 LOOPS = ("scan[", "while[", "cond[")
 RANDOM = ("random_", "threefry")
@@ -97,149 +99,6 @@ def test_the_trace_never_sees_a_wavelength(canopy):
     one, three = jl.Lidar(), jl.Lidar(wavelength=(532.0, 1064.0, 1550.0))
     plan = planned(one, scene, max_orders=3)
     assert traced(one, scene, plan) == traced(three, scene, plan)
-
-
-# What is left out lies within its bound.
-
-FAR = jl.Lidar(divergence=5.0)
-SLOPING = jl.Scene(ground=jl.Ground(reflectance=0.3, slope=20.0, aspect=30.0))
-HAZE = jl.Atmosphere(visibility=10.0, lidar_ratio=30.0)
-CASES = {
-    "slope spread": (FAR, SLOPING, "slope spread"),
-    "slope spread, off axis": (jl.Lidar(divergence=2.0, position=(3.0, -2.0)), SLOPING, "slope spread"),
-    "divergence": (FAR, SLOPING, "divergence"),
-    "divergence, flat": (jl.Lidar(divergence=60.0), jl.Scene(ground=GROUND), "divergence"),
-    "divergence, top-hat, slanted": (
-        jl.Lidar(divergence=3.0, profile="top-hat", zenith=20.0),
-        jl.Scene(ground=GROUND),
-        "divergence",
-    ),
-    "divergence, rectangular pulse": (
-        jl.Lidar(divergence=3.0, pulse=jl.RectangularPulse(length=1.0)),
-        jl.Scene(ground=jl.Ground(slope=20.0)),
-        "divergence",
-    ),
-    "field of view": (jl.Lidar(divergence=5.0, field_of_view=6.0), jl.Scene(ground=GROUND), "field of view"),
-    "jitter": (jl.Lidar(jitter=1.0), SLOPING, "jitter"),
-    "jitter, trees": (
-        jl.Lidar(jitter=2.0, pulse=jl.RectangularPulse(length=3.0)),
-        jl.Scene(canopy=TREES, ground=GROUND),
-        "jitter",
-    ),
-    "extinction": (FAR, jl.Scene(ground=GROUND, atmosphere=jl.Atmosphere()), "atmospheric extinction"),
-    "extinction, two wavelengths": (
-        jl.Lidar(wavelength=(532.0, 1550.0)),
-        jl.Scene(canopy=LEAVES, ground=GROUND, atmosphere=HAZE),
-        "atmospheric extinction",
-    ),
-    "backscatter": (
-        jl.Lidar(wavelength=532.0),
-        jl.Scene(ground=jl.Ground(reflectance=0.02), atmosphere=HAZE),
-        "atmospheric backscatter",
-    ),
-    "hot spot": (
-        jl.Lidar(),
-        jl.Scene(canopy=jl.Canopy(slab(0.8), leaf=LEAF, hotspot=True), ground=GROUND),
-        "hot spot",
-    ),
-    "leaf": (jl.Lidar(), jl.Scene(canopy=TREES, ground=GROUND), "leaf"),
-    "bark": (jl.Lidar(), jl.Scene(canopy=TREES, ground=GROUND), "bark"),
-    "bright bark": (
-        jl.Lidar(),
-        jl.Scene(canopy=jl.Canopy(slab(0.1, 0.1), leaf=LEAF, bark=0.9), ground=jl.Ground(reflectance=0.02)),
-        "bark",
-    ),
-    "plates": (jl.Lidar(), jl.Scene(plates=(PLATE,), ground=GROUND), "plates"),
-    "ground": (jl.Lidar(), jl.Scene(plates=(PLATE,), ground=GROUND), "ground"),
-    "mirror": (
-        jl.Lidar(),
-        jl.Scene(ground=jl.Ground(reflectance=0.1, law=jl.Specular(roughness=0.2))),
-        "specular return",
-    ),
-}
-
-
-def change(with_, without_, measure):
-    """What `jaxlidar.Effect` bounds."""
-    a, b = (np.asarray(w.reflectance, float) for w in (with_, without_))
-    sums = a.sum(axis=1), b.sum(axis=1)
-    if measure == "sum":
-        return np.max(np.abs(sums[0] - sums[1]) / np.maximum(*sums))
-    return np.max(np.abs(a - b).sum(axis=1) / (sums[0] + sums[1]))
-
-
-@pytest.mark.parametrize("case", CASES)
-def test_what_order_one_changes_lies_within_the_bound(case):
-    lidar, scene, name = CASES[case]
-    settings = {"max_orders": 1, "footprint": "fixed"}
-    plans = [planned(lidar, scene, **settings, effects={name: on}) for on in (True, False)]
-    row = effect(plans[0], name)
-    assert row.simulated
-    assert not effect(plans[1], name).simulated
-    assert effect(plans[1], name).bound == pytest.approx(row.bound, rel=1e-3)
-    found = change(*(first_wave(lidar, scene, plan) for plan in plans), row.measure)
-    # Both are in single precision, and rays stand for a footprint.
-    assert 0 < found <= 1.003 * row.bound + 1e-6
-    assert found >= row.bound / 30
-
-
-def sum_of(wave):
-    return wave.reflectance.sum(axis=1)
-
-
-def orders_of(wave):
-    return {key: wave.components[key].sum(axis=1) for key in ("first", "higher")}
-
-
-DARK = jl.Canopy(slab(1.0, width=400.0), leaf=LEAF, sides="periodic")
-MANY = {
-    "leaves": jl.Scene(canopy=DARK),
-    "leaves over ground": jl.Scene(canopy=DARK, ground=jl.Ground(reflectance=0.2)),
-    "plate over ground": jl.Scene(plates=(PLATE,), ground=GROUND),
-    "two plates": jl.Scene(plates=(PLATE, jl.Plate(height=1.0, reflectance=0.5)), ground=GROUND),
-    "isotropic": jl.Scene(canopy=jl.Canopy(slab(1.0), leaf=jl.Isotropic(albedo=0.3)), ground=GROUND),
-}
-
-
-LONG = ("leaves", "two plates", "isotropic")
-
-
-@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow if n in LONG else ()) for n in MANY])
-def test_higher_orders_lie_within_the_bound(name):
-    scene, lidar = MANY[name], jl.Lidar()
-    plan = planned(lidar, scene, max_orders=5)
-    mean, stderr = batch_mean(lidar, scene, plan, seed=3, count=8, quantity=orders_of)
-    found = mean["higher"] / (mean["first"] + mean["higher"])
-    bound = effect(plan, "multiple scattering").bound
-    assert np.all(found - 4 * stderr["higher"] / mean["first"] <= bound)
-    assert np.all(found >= bound / 40)
-    rest = effect(plan, "orders beyond 5")
-    assert not rest.simulated
-    assert 0 < rest.bound < bound
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["bark", "field of view"])
-def test_what_all_orders_change_lies_within_the_bound(name):
-    canopy = jl.Canopy(slab(0.4, 0.1, width=400.0), leaf=LEAF, bark=0.1, sides="periodic")
-    scene = jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=0.1))
-    lidar = jl.Lidar(divergence=5.0, field_of_view=5.0)
-    plans = [planned(lidar, scene, max_orders=4, effects={name: on}) for on in (True, False)]
-    (a, one), (b, other) = (batch_mean(lidar, scene, p, seed=5, count=8, quantity=sum_of) for p in plans)
-    found = np.abs(a - b) / np.maximum(a, b)
-    bound = effect(plans[0], name).bound
-    assert np.all(found - 4 * np.hypot(one, other) / np.maximum(a, b) <= bound)
-    assert np.all(found >= bound / 30)
-
-
-def test_brighter_scenes_have_larger_bounds_up_to_one():
-    def bound(albedo):
-        scene = jl.Scene(canopy=jl.Canopy(slab(1.0), leaf=jl.Isotropic(albedo=albedo)), ground=GROUND)
-        return effect(planned(jl.Lidar(), scene, max_orders=8), "orders beyond 8").bound
-
-    bounds = [bound(a) for a in (0.1, 0.5, 0.9, 1.0)]
-    assert bounds == sorted(bounds)
-    assert bounds[-1] == 1.0
 
 
 # Choices.

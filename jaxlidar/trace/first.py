@@ -229,19 +229,25 @@ def first_order(
         return response, arrived.reshape(materials, count), escaped
 
     n = energy.shape[0]
-    if medium is None or n <= CHUNK:
-        # Without a march all rays fit into one chunk, and no loop is compiled.
+    fill = -n % CHUNK
+    padded = [jnp.pad(a, (0, fill)).reshape(-1, CHUNK) for a in (*across, energy)]
+
+    def chunk(x, y, e):
+        return rays((x, y), e)
+
+    if n <= CHUNK:
         response, arrived, escaped = rays(across, energy)
-        return FirstOrder(bins.trim(response.reshape(materials, count, bins.padded)), arrived, escaped)
-    size = CHUNK
-    fill = -n % size
-    padded = [jnp.pad(a, (0, fill)).reshape(-1, size) for a in (*across, energy)]
+    elif medium is None:
+        # Without a march all chunks fit into the memory at once, and no loop is compiled.
+        each = jax.vmap(chunk)(*padded)
+        response, arrived, escaped = jax.tree.map(lambda a: jnp.sum(a, axis=0), each)
+    else:
+        zero = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(rays, across, energy))
 
-    def body(total, chunk):
-        return jax.tree.map(jnp.add, total, rays((chunk[0], chunk[1]), chunk[2])), None
+        def add(total, part):
+            return jax.tree.map(jnp.add, total, chunk(*part)), None
 
-    zero = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(rays, across, energy))
-    response, arrived, escaped = lax.scan(body, zero, padded)[0]
+        response, arrived, escaped = lax.scan(add, zero, padded)[0]
     weights = bins.trim(response.reshape(materials, count, bins.padded))
     return FirstOrder(weights, arrived, escaped)
 

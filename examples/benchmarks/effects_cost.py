@@ -1,0 +1,144 @@
+"""What a plan saves: the time of scenes with their own plan and with everything on.
+
+Run it as `python examples/benchmarks/effects_cost.py [--out figures] [--rounds 3] [--photons 65536]`.
+
+"Everything on" is the same scene as a general simulator would trace it, with the machinery of all that is not
+there: a voxel canopy with leaf and bark, empty where the scene has none, that rays and photons march through;
+all scattering orders that its leaves call for; air that takes and returns hardly any light; a receiver that
+sees a hundred times the beam's width; a jitter of a picosecond; a slope of a thousandth of a degree; a
+footprint of random rays. Plates are not added: histories would be too many (`plan.MAX_HISTORIES`); beside the
+one of the third scene only three orders fit, and its own plan follows as few.
+
+Both have the default rays and photons, the same window, bins and orders, and return the same light (asserted,
+to 2 %), except where the plan has one order. Times are of `simulate`, warm, in turn; the fastest
+counts. The first calls, which compile, are given apart.
+"""
+
+import dataclasses
+
+import jax
+import numpy as np
+from _common import best, machine, new_figure, options, print_table, race, save_figure, seconds, write_json
+
+import jaxlidar as jl
+
+N, SIZE = 32, 10.0
+WINDOW = (-90.0, 59.0)
+LIDAR = jl.Lidar(divergence=3.0)
+SEES_ALL = jl.Lidar(divergence=3.0, field_of_view=300.0, jitter=1e-3)
+LEAF = jl.LeafOptics(reflectance=0.45, transmittance=0.4)
+CLEAR = jl.Atmosphere(visibility=1e5, lidar_ratio=50.0)
+GROUND = jl.Ground(reflectance=0.3)
+
+
+def canopy(leaf: float | None, bark: float | None) -> jl.Canopy:
+    """A crown of 7 m on a trunk of 1 m, with mean extinctions in 1/m: zero is empty, None is not there."""
+    place = (np.arange(N) + 0.5) * SIZE / N
+    x, y, z = np.meshgrid(place, place, place, indexing="ij")
+    crown = (x - 5) ** 2 + (y - 5) ** 2 + (z - 6) ** 2 < 3.5**2
+    trunk = ((x - 5) ** 2 + (y - 5) ** 2 < 0.25) & (z < 6)
+    random = np.random.default_rng(0).uniform(0, 2, crown.shape)
+    voxels = jl.VoxelMap.from_extinction(
+        leaf=None if leaf is None else np.where(crown, leaf * random, 0.0),
+        bark=None if bark is None else np.where(trunk, 10 * bark, np.where(crown, 0.1 * bark, 0.0)),
+        voxel_size=SIZE / N,
+        origin=(-5.0, -5.0, 0.0),
+    )
+    return jl.Canopy(voxels, leaf=LEAF, bark=0.4)
+
+
+def scenes() -> dict[str, tuple[jl.Lidar, jl.Scene, jl.Scene, dict[str, bool]]]:
+    """For each: lidar and scene, the scene with everything, and what its plan switches off."""
+    plate = jl.Plate(height=5.0, reflectance=0.45, transmittance=0.45, coverage=0.7)
+    slope = jl.Ground(reflectance=0.3, slope=10.0)
+    leaves, one = jl.Scene(canopy=canopy(0.4, None), ground=GROUND), {"multiple scattering": False}
+    tree = jl.Scene(canopy=canopy(0.4, 0.2), ground=slope, atmosphere=CLEAR)
+
+    def all_of(scene: jl.Scene, leaf: float = 0.0) -> jl.Scene:
+        ground = dataclasses.replace(scene.ground, slope=max(float(scene.ground.slope), 1e-3))
+        return dataclasses.replace(scene, canopy=canopy(leaf, 0.0), ground=ground, atmosphere=CLEAR)
+
+    flat, sloping = jl.Scene(ground=GROUND), jl.Scene(ground=slope)
+    plates = jl.Scene(plates=(plate,), ground=GROUND)
+    return {
+        "flat ground": (LIDAR, flat, all_of(flat), {}),
+        "sloping ground": (LIDAR, sloping, all_of(sloping), {}),
+        "plate over ground": (LIDAR, plates, all_of(plates), {}),
+        "leaves, order one": (LIDAR, leaves, all_of(leaves, 0.4), one),
+        "leaves, all orders": (LIDAR, leaves, all_of(leaves, 0.4), {}),
+        "tree, all there is": (SEES_ALL, tree, tree, {}),
+    }
+
+
+def main() -> None:
+    given = options("What plans save.", rounds=3, photons=65536)
+    results, rows = [], []
+    for name, (lidar, scene, whole, off) in scenes().items():
+
+        def runs(lidar, scene, plan):
+            return lambda: (
+                jl.simulate(
+                    lidar, scene, key=jax.random.key(0), n_photons=given.photons, plan=plan
+                ).reflectance
+            )
+
+        general = jl.plan(SEES_ALL, whole, window=WINDOW)
+        orders = general.orders if scene.canopy or scene.plates else None
+        common = {"window": WINDOW, "bin_width": general.bins.width, "max_orders": None if off else orders}
+        own = jl.plan(lidar, scene, effects=off, **common)
+        contestants = {"plan": runs(lidar, scene, own), "everything": runs(SEES_ALL, whole, general)}
+        # What scenes share is compiled anew for each.
+        jax.clear_caches()
+        cold = {which: seconds(run) for which, run in contestants.items()}
+        times = best(race(contestants, given.rounds))
+        sums = {which: float(run().sum()) for which, run in contestants.items()}
+        if not off:
+            np.testing.assert_allclose(sums["plan"], sums["everything"], rtol=0.02)
+        ratio = times["everything"] / times["plan"]
+        results.append(
+            {
+                "scene": name,
+                "seconds": times,
+                "seconds_with_compilation": cold,
+                "ratio": ratio,
+                "reflectance": sums,
+                "orders": {"plan": own.orders, "everything": general.orders},
+            }
+        )
+        followed = f"{own.orders} / {general.orders}"
+        rows.append((name, followed, 1e3 * times["plan"], 1e3 * times["everything"], ratio, *cold.values()))
+    record = {"machine": machine(), "photons": given.photons, "rounds": given.rounds, "scenes": results}
+    write_json(given.out / "effects_cost.json", record)
+
+    figure, axes = new_figure(size=(7, 4))
+    places = np.arange(len(results))
+    for shift, which, label in ((-0.2, "plan", "its plan"), (0.2, "everything", "everything on")):
+        axes.barh(places + shift, [1e3 * r["seconds"][which] for r in results], 0.4, label=label)
+    for place, r in zip(places, results):
+        longest = 1e3 * max(r["seconds"].values())
+        axes.text(1.15 * longest, place, f"{r['ratio']:.3g}x", va="center")
+    axes.set(
+        xscale="log",
+        xlim=(1, 5e3 * max(max(r["seconds"].values()) for r in results)),
+        xlabel="ms, warm",
+        title="One waveform",
+    )
+    axes.set_yticks(places, [r["scene"] for r in results])
+    axes.invert_yaxis()
+    axes.legend(loc="lower center", bbox_to_anchor=(0.5, -0.35), ncols=2, frameon=False)
+    save_figure(figure, given.out / "effects_cost.png")
+
+    header = (
+        "scene",
+        "orders",
+        "ms, plan",
+        "ms, everything",
+        "ratio",
+        "s, plan, cold",
+        "s, everything, cold",
+    )
+    print_table(header, rows)
+
+
+if __name__ == "__main__":
+    main()
