@@ -1,9 +1,10 @@
 """Worker of `peers.py`: the same crown, without ground, by MCX-CL on an OpenCL runtime for the CPU.
 
 MCX has no Lambertian ground, and its detectors collect over all directions. So it computes what it is made
-for, the fluence in every voxel and gate, and the light that voxels scatter towards the receiver is
-carried there afterwards, exactly: this converges far faster than counting the photons that leave within a cone
-about the vertical. Gates of 1 ns are taken as evenly filled. Photons are followed without a limit of orders.
+for, the fluence in every voxel and gate, and the light that voxels scatter towards the receiver is carried
+there afterwards. This converges far faster than counting the photons that leave within a cone about the
+vertical. Gates of 1 ns are taken as evenly filled. What a photon leaves in a voxel is booked when it leaves
+the voxel, half a crossing late on average, which is taken off. There is no limit of orders.
 
 OpenCL runtimes are found through `OCL_ICD_VENDORS`, or in the system; else PoCL from its wheel is taken,
 whose compiler (LLVM 14) does not know the newest processors.
@@ -75,8 +76,8 @@ def main() -> None:
         "gpuid": 1,
     }
 
-    # Apparent reflectance per unit of fluence: pi, times the density of scattering per angle, times the way out,
-    # the mean over the voxel of its own transmittance.
+    # Apparent reflectance per unit of fluence: pi, times the density of scattering per angle, times the way
+    # out, with the mean over the voxel of its own transmittance.
     depth = extinction * edge
     above = np.cumsum(depth, axis=2) - depth
     own = np.where(depth > 0, -np.expm1(-depth) / np.where(depth > 0, depth, 1), 1)
@@ -93,7 +94,7 @@ def main() -> None:
         by_depth = np.einsum("xyz,xyzt->zt", weight, flux) * 1e6 * 1e-9 * range_of
         total = np.zeros(edges.size - 1)
         for row, back in zip(by_depth, out_of):
-            opened = np.arange(GATES + 1) + back / LIGHT - 2 * size / LIGHT
+            opened = np.arange(GATES + 1) + (back - 0.5 * edge - 2 * size) / LIGHT
             total += np.diff(np.interp(edges, opened, np.concatenate([[0.0], np.cumsum(row)])))
         return total
 

@@ -1,7 +1,7 @@
 """Worker of `peers.py`: the same scene rendered by Mitsuba 3 with mitransient.
 
-Laser and receiver stand at one point. Their roles are exchanged, which light paths allow: the sensor sends its
-rays over the laser's disc, uniformly, and a point emitter stands for the receiver, which sees everything.
+Laser and receiver stand at one point. Their roles are exchanged, which light paths allow: the sensor sends
+its rays over the laser's disc, uniformly, and a point emitter stands for the receiver, which sees everything.
 No ray is then wasted, and every scattering is connected with the receiver. `"camera"` is the set-up that
 a user of a renderer would begin with: a spot and a camera that looks at the square of 10 m x 10 m.
 
