@@ -30,8 +30,8 @@ mitransient 1.3.1 leaves stretches between null collisions out of path lengths. 
 corrects that, or says that it could not, when only totals can be compared. "Spot and camera" is the set-up
 that a user of a renderer begins with; its camera sees the square of 10 m x 10 m alone, so it is not tested.
 MCX books light when it leaves a voxel, by gates of 1 ns: compare its totals, its samples are that coarse.
-
-for a half angle of 10 degrees, from its rate and the Poisson statistics of equal photons.
+MCX's own way is to count photons that leave within a cone; how long that would take is computed, not
+measured, for a half angle of 10 degrees, from its rate and the Poisson statistics of equal photons.
 """
 
 import os
