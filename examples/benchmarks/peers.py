@@ -257,6 +257,7 @@ def main() -> None:
         ", ".join(f"{n} {r:g}" for n, r in TARGET.items()),
         "wanted",
     )
+    print("load before:", ", ".join(f"{name} {value:.1f}" for name, value in load.items()))
     for name, note in notes.items():
         print(f"{name}: {note}")
 
@@ -266,11 +267,12 @@ def draw(runs: dict, results: list[dict], path: Path) -> None:
     figure, axes = new_figure(3, (15, 4.5))
     names = list(dict.fromkeys(r["code"] for r in results))
     colour = {name: f"C{i}" for i, name in enumerate(names)}
+    style = dict(zip(names, ("-", "--", "-.", ":")))
     at = WINDOW[0] + np.arange(SAMPLES)
     for ax, case in zip(axes, CASES):
         for name, run in runs[case, "6 ns"].items():
             mean, deviation = run["waves"].mean(axis=0), run["waves"].std(axis=0, ddof=1)
-            ax.plot(at, mean, color=colour[name], lw=1, label=name)
+            ax.plot(at, mean, style[name], color=colour[name], lw=1.5, label=name)
             low = np.maximum(mean - 2 * deviation, 1e-9)
             ax.fill_between(at, low, mean + 2 * deviation, color=colour[name], alpha=0.3, lw=0)
         ax.set(
