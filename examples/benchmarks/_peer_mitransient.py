@@ -33,6 +33,10 @@ def load():
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_mono")
+    import drjit as dr
+
+    # Dr.Jit counts the thread that calls, but lets it wait: by default one core is idle.
+    dr.set_thread_count((os.cpu_count() or 1) + 1)
     import mitransient
 
     return mi, mitransient
