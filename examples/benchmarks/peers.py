@@ -1,0 +1,296 @@
+"""jaxlidar beside Mitsuba 3 with mitransient, and MCX-CL: seconds until a waveform is known to 1 %.
+
+Run it as `python examples/benchmarks/peers.py [--out figures] [--repeats 8]` after
+`pip install -e '.[bench]'`, which brings the peers where they run on a CPU. A peer that is not there is left
+out, and said to be. Each runs in a process of its own. mitransient needs an LLVM library
+(`DRJIT_LIBLLVM_PATH`, or the one that the extra brings), pmcxcl an OpenCL runtime (see `_peer_mcx.py`).
+
+The scene: 64^3 voxels of 10 m / 64; in a sphere of radius 3.5 m the extinction is 0.5 U(0, 2) 1/m, rounded to
+1/200 1/m because MCX numbers its media; isotropic scattering with albedo 0.9; Lambertian ground of
+reflectance 0.3. The laser lights a disc of 5 m from 1000 m; 200 samples of 1 ns; up to 15 scatterings. The
+receiver sees everything: jaxlidar's field of view is round with a soft edge, a camera's square and sharp.
+Compared are the returns of an instant pulse in samples of 1 ns, which is what the peers compute, and those of
+a pulse of 6 ns, with which the peers' histograms of 0.05 ns are convolved afterwards, at no charge.
+
+The error is the root mean square, over the samples above 1 % of the peak, of the standard deviation over
+repetitions over the mean; seconds to 1 % = seconds * (error / 0.01)^2. A repetition does about the work that
+1 % takes. jaxlidar's is `simulate(..., rtol=0.01)` with defaults but for orders and window, so its seconds
+are real ones. The first call, which compiles, is not counted but given. CPU seconds depend less on
+what else the machine does. Agreement is tested on sums of 5 ns (jaxlidar spreads an instant over three of
+its fine bins) and on totals, in standard errors of the difference.
+
+What the peers do and jaxlidar does not: Mitsuba takes meshes, any material, camera and emitter,
+polarisation, and images, and gives the gradient in all voxels by one backward pass; MCX has refraction,
+anisotropic phase functions, detectors in contact and maps of fluence. Both are made for GPUs; on a CPU
+they are far from home. What the peers do not: MCX has no Lambertian ground (so the crown stands alone
+for it), no limit of orders and no return to a distant receiver, which is computed here from its fluence;
+neither has the optics of all wavelengths from one trace, standard errors, or a stop at a tolerance.
+
+mitransient 1.3.1 leaves stretches between null collisions out of path lengths. `_peer_mitransient.py`
+corrects that, or says that it could not, when only totals can be compared. "Spot and camera" is the set-up
+that a user of a renderer begins with; its camera sees the square of 10 m x 10 m alone, so it is not tested.
+MCX books light when it leaves a voxel, by gates of 1 ns: compare its totals, its samples are that coarse.
+MCX's own way is to count photons that leave within a cone; how long that would take is computed, not
+measured, for a half angle of 10 degrees, from its rate and the Poisson statistics of equal photons.
+"""
+
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+from _common import machine, new_figure, options, print_table, save_figure, write_json
+from simulation_cost import LIDAR, ORDERS, SIZE, WINDOW, N, scenes
+
+import jaxlidar as jl
+
+FINE, SAMPLES, LEVELS = 0.05, 200, 200
+ALBEDO, SOIL = 0.9, 0.3
+PULSES = {"instant": 0.0, "6 ns": 6.0}
+# Sums of five samples, so that the ground's return lies in the middle of one.
+FIRST, BLOCK = 3, 5
+CONE = 10.0
+# Rays and photons of one repetition: about 1 % of error.
+WORK = {"mitransient_samples": 2**19, "mcx_photons": 400_000}
+TARGET = {"mitransient": 15.0, "MCX-CL": 50.0}
+CASES = {"ground": "crown over ground", "alone": "crown alone"}
+
+
+def crown() -> np.ndarray:
+    """Extinction in 1/m."""
+    k = np.asarray(scenes()["crown over ground"].canopy.voxels.leaf, dtype=float)
+    return np.rint(k * LEVELS) / LEVELS
+
+
+def ours(extinction: np.ndarray, case: str, pulse: float, repeats: int) -> dict:
+    """Repetitions of `simulate` to 1 %."""
+    voxels = jl.VoxelMap.from_extinction(
+        leaf=extinction, voxel_size=SIZE / N, origin=(-SIZE / 2, -SIZE / 2, 0.0)
+    )
+    canopy = jl.Canopy(voxels, leaf=jl.Isotropic(albedo=ALBEDO))
+    scene = jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=SOIL) if case == "ground" else None)
+    lidar = jl.Lidar(divergence=LIDAR.divergence, profile="top-hat", pulse=jl.GaussianPulse(pulse))
+    waves, times, infos = [], [], []
+    for seed in range(repeats + 1):
+        start, work = time.perf_counter(), time.process_time()
+        key = jax.random.key(seed)
+        wave = jl.simulate(lidar, scene, key=key, rtol=0.01, max_orders=ORDERS, window=WINDOW)
+        waves.append(np.asarray(wave.reflectance[0], dtype=float))
+        times.append((time.perf_counter() - start, time.process_time() - work))
+        infos.append(wave.info)
+    return {
+        "waves": np.array(waves[1:]),
+        "times": np.array(times[1:]),
+        "first": times[0][0],
+        "own_error": float(np.mean([i["error"] for i in infos[1:]])),
+        "photons": float(np.mean([i["photons"] for i in infos[1:]])),
+        "neglected": float(wave.neglected[0]),
+    }
+
+
+def peer(worker: str, given: Path) -> dict[str, np.ndarray] | str:
+    """What a worker measured, or why it did not."""
+    with tempfile.TemporaryDirectory() as folder:
+        result = Path(folder, "result.npz")
+        command = [sys.executable, str(Path(__file__).with_name(worker)), str(given), str(result)]
+        done = subprocess.run(command, capture_output=True, text=True, errors="replace")
+        if not result.exists():
+            lines = (done.stderr.strip() or done.stdout.strip() or "no message").splitlines()
+            reason = next((line for line in lines if line.startswith("error:")), "")
+            return "; ".join(filter(None, (lines[-1], reason, f"exit status {done.returncode}")))
+        return dict(np.load(result))
+
+
+def sampled(fine: np.ndarray, pulse: float) -> np.ndarray:
+    """Histograms of fine bins as the digitiser's samples of returns of a Gaussian pulse."""
+    if pulse > 0:
+        sigma = pulse / np.sqrt(8 * np.log(2)) / FINE
+        reach = np.arange(-int(5 * sigma), int(5 * sigma) + 1)
+        kernel = np.exp(-0.5 * (reach / sigma) ** 2)
+        fine = np.array([np.convolve(row, kernel / kernel.sum(), "same") for row in fine])
+    return fine.reshape(len(fine), SAMPLES, -1).sum(axis=-1)
+
+
+def judge(run: dict) -> dict[str, float]:
+    """Error of one repetition, and what 1 % costs."""
+    mean, deviation = run["waves"].mean(axis=0), run["waves"].std(axis=0, ddof=1)
+    seen = mean > 0.01 * mean.max()
+    error = float(np.sqrt(np.mean((deviation[seen] / mean[seen]) ** 2)))
+    wall, cpu = np.median(run["times"], axis=0)
+    to_goal = (error / 0.01) ** 2
+    return {
+        "error": error,
+        "samples_seen": int(seen.sum()),
+        "seconds": float(wall),
+        "cpu_seconds": float(cpu),
+        "seconds_to_1_percent": float(wall * to_goal),
+        "cpu_seconds_to_1_percent": float(cpu * to_goal),
+        "first_call_seconds": float(run["first"]),
+        "total": float(run["waves"].sum(axis=1).mean()),
+        **{k: run[k] for k in ("own_error", "photons", "neglected") if k in run},
+    }
+
+
+def counted(run: dict, photons: int) -> float:
+    """Seconds to 1 % where photons that leave within a cone are counted, at the rate of `run`."""
+    mean = run["waves"].mean(axis=0)
+    # Of the light that a Lambertian target scatters, sin^2 leaves within the cone.
+    share = np.sin(np.deg2rad(CONE)) ** 2 * mean[mean > 0.01 * mean.max()]
+    return float(np.mean(1 / share) / 0.01**2 * np.median(run["times"][:, 0]) / photons)
+
+
+def agreement(a: np.ndarray, b: np.ndarray) -> dict[str, float]:
+    """Differences in standard errors: of the totals, and root mean square and largest of the sums of 5 ns."""
+
+    def z(x, y):
+        error = np.sqrt(x.var(axis=0, ddof=1) / len(x) + y.var(axis=0, ddof=1) / len(y))
+        return (x.mean(axis=0) - y.mean(axis=0)) / np.maximum(error, 1e-30)
+
+    last = FIRST + (SAMPLES - FIRST) // BLOCK * BLOCK
+    sums = [w[:, FIRST:last].reshape(len(w), -1, BLOCK).sum(axis=-1) for w in (a, b)]
+    bright = sums[0].mean(axis=0) > 0.01 * sums[0].mean(axis=0).max()
+    by_block = z(sums[0][:, bright], sums[1][:, bright])
+    relative = sums[1][:, bright].mean(axis=0) / sums[0][:, bright].mean(axis=0) - 1
+    freedom = len(a) + len(b) - 2
+    return {
+        "total_z": float(z(a.sum(axis=1), b.sum(axis=1))),
+        "total_relative": float(b.sum(axis=1).mean() / a.sum(axis=1).mean() - 1),
+        "rms_z": float(np.sqrt(np.mean(by_block**2))),
+        "largest_z": float(np.abs(by_block).max()),
+        "rms_relative": float(np.sqrt(np.mean(relative**2))),
+        "blocks": int(bright.sum()),
+        # Errors estimated from few repetitions make Student's distribution of them.
+        "rms_z_expected": float(np.sqrt(freedom / (freedom - 2))),
+    }
+
+
+def main() -> None:
+    given = options("jaxlidar beside peers.", repeats=8)
+    if given.repeats < 3:
+        raise SystemExit(f"--repeats = {given.repeats} is below 3: no standard deviation to speak of")
+    extinction = crown()
+    shared = {"extinction": extinction, "albedo": ALBEDO, "reflectance": SOIL, "orders": ORDERS, "size": SIZE}
+    shared |= {"altitude": float(LIDAR.altitude), "radius": float(LIDAR.footprint_radius), "fine": FINE}
+    shared |= {"start": WINDOW[0] - 0.5, "count": round(SAMPLES / FINE), "repeats": given.repeats, **WORK}
+
+    runs: dict[tuple[str, str], dict[str, dict]] = {}
+    load = {"jaxlidar": os.getloadavg()[0]}
+    for case in CASES:
+        for pulse, fwhm in PULSES.items():
+            runs[case, pulse] = {"jaxlidar": ours(extinction, case, fwhm, given.repeats)}
+    notes: dict[str, str] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder, "given.npz")
+        np.savez(file, **shared)
+        for name, worker in (("mitransient", "_peer_mitransient.py"), ("MCX-CL", "_peer_mcx.py")):
+            load[name] = os.getloadavg()[0]
+            found = peer(worker, file)
+            if isinstance(found, str):
+                notes[name] = f"left out: {found}"
+                continue
+            notes[name] = str(found["version"])
+            if not found.get("corrected", True):
+                notes[name] += ", path lengths not corrected: only totals are comparable"
+            for (case, pulse), run in runs.items():
+                for label, key in ((name, case), (f"{name}, spot and camera", "camera")):
+                    if f"{key}_waves" in found and (key == case or case == "ground"):
+                        waves = sampled(found[f"{key}_waves"], PULSES[pulse])
+                        times, first = found[f"{key}_times"], float(found[f"{key}_first"])
+                        run[label] = {"waves": waves, "times": times, "first": first}
+
+    results, rows = [], []
+    for (case, pulse), run in runs.items():
+        mine = judge(run["jaxlidar"])
+        for name, one in run.items():
+            its = judge(one)
+            comparable = name in TARGET
+            if name != "jaxlidar":
+                its["ratio"] = its["seconds_to_1_percent"] / mine["seconds_to_1_percent"]
+                its["cpu_ratio"] = its["cpu_seconds_to_1_percent"] / mine["cpu_seconds_to_1_percent"]
+            if comparable:
+                its["agreement"] = agreement(run["jaxlidar"]["waves"], one["waves"])
+            if name == "MCX-CL":
+                its["seconds_if_counted_computed"] = counted(one, WORK["mcx_photons"])
+                notes["counted"] = notes.get("counted", "MCX-CL counting photons, computed s to 1 %") + (
+                    f"; {pulse} {its['seconds_if_counted_computed']:.3g}"
+                )
+            results.append({"case": CASES[case], "pulse": pulse, "code": name, **its})
+            test = its.get("agreement")
+            rows.append(
+                (
+                    f"{CASES[case]}, {pulse}: {name}",
+                    its["seconds"],
+                    100 * its["error"],
+                    its["seconds_to_1_percent"],
+                    its["cpu_seconds_to_1_percent"],
+                    its.get("ratio", ""),
+                    its.get("cpu_ratio", ""),
+                    its["first_call_seconds"],
+                    its["total"],
+                    f"{test['total_z']:.1f}, {test['rms_z']:.2f} ({test['rms_z_expected']:.2f})"
+                    if test
+                    else "",
+                )
+            )
+    record = {"machine": {**machine(), "load_before": load}, "notes": notes, "wanted": TARGET}
+    write_json(given.out / "peers.json", {**record, "work": WORK, "results": results})
+    draw(runs, results, given.out / "peers.png")
+    head = (
+        "",
+        "s",
+        "error %",
+        "s to 1 %",
+        "CPU s",
+        "ratio",
+        "CPU ratio",
+        "s, first",
+        "total",
+        "z: total, rms",
+    )
+    print_table(head, rows)
+    print(
+        "ratio: of the seconds to 1 % to jaxlidar's;",
+        ", ".join(f"{n} {r:g}" for n, r in TARGET.items()),
+        "wanted",
+    )
+    print("load before:", ", ".join(f"{name} {value:.1f}" for name, value in load.items()))
+    for name, note in notes.items():
+        print(f"{name}: {note}")
+
+
+def draw(runs: dict, results: list[dict], path: Path) -> None:
+    """Waveforms with bands of two standard errors of one repetition, and what 1 % costs."""
+    figure, axes = new_figure(3, (15, 4.5))
+    names = list(dict.fromkeys(r["code"] for r in results))
+    colour = {name: f"C{i}" for i, name in enumerate(names)}
+    style = dict(zip(names, ("-", "--", "-.", ":")))
+    at = WINDOW[0] + np.arange(SAMPLES)
+    for ax, case in zip(axes, CASES):
+        for name, run in runs[case, "6 ns"].items():
+            mean, deviation = run["waves"].mean(axis=0), run["waves"].std(axis=0, ddof=1)
+            ax.plot(at, mean, style[name], color=colour[name], lw=1.5, label=name)
+            low = np.maximum(mean - 2 * deviation, 1e-9)
+            ax.fill_between(at, low, mean + 2 * deviation, color=colour[name], alpha=0.3, lw=0)
+        ax.set(
+            yscale="log", ylim=(1e-6, 0.1), xlim=(-75, 105), xlabel="time (ns)", title=f"{CASES[case]}, 6 ns"
+        )
+        ax.legend()
+    axes[0].set_ylabel("apparent reflectance per ns")
+    places = {key: n for n, key in enumerate(runs)}
+    keys = {(CASES[case], pulse): n for (case, pulse), n in places.items()}
+    for name in names:
+        own = [r for r in results if r["code"] == name]
+        x = [keys[r["case"], r["pulse"]] for r in own]
+        axes[2].semilogy(x, [r["seconds_to_1_percent"] for r in own], "o", color=colour[name], label=name)
+        axes[2].semilogy(x, [r["cpu_seconds_to_1_percent"] for r in own], "x", color=colour[name])
+    axes[2].set_xticks(list(keys.values()), ["\n".join(k) for k in keys], fontsize=8)
+    axes[2].set(ylabel="seconds to 1 %: wall (o), CPU (x)", xlim=(-0.5, len(keys) - 0.5))
+    save_figure(figure, path)
+
+
+if __name__ == "__main__":
+    main()
