@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import pytest
 from jaxtyping import install_import_hook
@@ -16,6 +17,19 @@ with install_import_hook(["jaxlidar", "inversion"], CHECKER):
     import jaxlidar  # noqa: F401
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+# Every compiled program keeps some ten memory mappings; Linux grants a process 65530, and XLA dies beyond.
+MAPPINGS = 40_000
+
+
+@pytest.fixture(autouse=True)
+def room_to_compile():
+    """Forget compiled programs before there are too many for one process."""
+    yield
+    maps = Path("/proc/self/maps")
+    if maps.exists() and maps.read_bytes().count(b"\n") > MAPPINGS:
+        jax.clear_caches()
+        eqx.clear_caches()
 
 
 @pytest.fixture

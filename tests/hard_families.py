@@ -332,7 +332,7 @@ FAMILIES = {
     ),
     "equal-angle": law_family(jl.EqualAngle, answers.equal_angle, (1e-5, 1e-9), (1e-4, 1e-9), DOUBLE),
     "mirror": law_family(jl.Specular, answers.mirror, (1e-5, 1e-6), (1e-4, 1e-4), DOUBLE),
-    "slab": slab_family(hotspot=False),
+    "slab": slab_family(hotspot=False, slow=DOUBLE),
     "slab, hot spot": slab_family(hotspot=True, slow=BOTH),
     "one voxel of 1 mm": one_voxel_family(1e-3, 1000.0),
     "one voxel of 1 km": one_voxel_family(1e3, 20000.0),

@@ -32,7 +32,9 @@ def test_every_figure_of_the_paper_that_shows_numbers_has_a_script():
     assert "introduction" in SCRIPTS
 
 
-@pytest.mark.parametrize("name", SCRIPTS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.slow if n == "introduction" else ()) for n in SCRIPTS]
+)
 def test_a_script_runs_and_asserts_what_the_paper_concludes(script, name, tmp_path, capsys):
     found = script(name).main(["--small", "--out", str(tmp_path)])
     assert found

@@ -84,7 +84,9 @@ def test_between_tabulated_wavelengths_coefficients_are_interpolated():
         assert leaf(550.5)[0].shape == ()
 
 
-@pytest.mark.parametrize("version", ["4", "5", "D", "PC"])
+@pytest.mark.parametrize(
+    "version", ["D", "PC", *(pytest.param(v, marks=pytest.mark.slow) for v in ("4", "5"))]
+)
 def test_every_trait_is_differentiable(version, precision):
     leaf = Prospect(N=1.7, version=version)
     slopes, reverse = (jax.jit(kind(lambda leaf: leaf(LASERS)))(leaf) for kind in (jax.jacfwd, jax.jacrev))

@@ -42,7 +42,9 @@ def total(tau, leaf, ground, orders, photons, seed=0):
 ORDERS = {0.1: 8, 1.0: 30, 2.0: 25, 5.0: 60, 50.0: 60}
 
 
-@pytest.mark.parametrize("tau", [0.1, 1.0, 2.0, 5.0, pytest.param(50.0, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "tau", [0.1, 1.0, 5.0, *(pytest.param(tau, marks=pytest.mark.slow) for tau in (2.0, 50.0))]
+)
 def test_isotropic_scattering(shared, tau):
     with (shared / "reference" / "slabs_isotropic.csv").open() as file:
         (row,) = [r for r in csv.DictReader(file) if float(r["tau"]) == tau]
@@ -83,7 +85,8 @@ def ross_brf(reflectance, transmittance, tau, ground, streams=48):
 
 
 @pytest.mark.parametrize(
-    ("reflectance", "transmittance", "tau", "ground"), [(0.4, 0.3, 1.0, 0.2), (0.1, 0.6, 2.0, 0.3)]
+    ("reflectance", "transmittance", "tau", "ground"),
+    [(0.4, 0.3, 1.0, 0.2), pytest.param(0.1, 0.6, 2.0, 0.3, marks=pytest.mark.slow)],
 )
 def test_bi_lambertian_leaves(reflectance, transmittance, tau, ground):
     leaf = jl.LeafOptics(reflectance=reflectance, transmittance=transmittance)
