@@ -280,6 +280,7 @@ class _Simulator:
         self.each = -(-lanes // self.threads)
         self.lanes = self.each * self.threads
         self.lidars, self.scenes, self.plan = lidars, scenes, plan
+        self.compiled = False
 
     def __call__(self, requests: dict[int, Request]) -> dict[int, Evaluation]:
         numbers = list(requests)
@@ -291,11 +292,14 @@ class _Simulator:
             with jax.enable_x64(double):
                 return self._group(group, requests)
 
-        first = run(groups[0])
+        found: dict[int, Evaluation] = {}
+        if not self.compiled:
+            # One alone compiles for all.
+            found, groups, self.compiled = run(groups[0]), groups[1:], True
         with ThreadPoolExecutor(max_workers=self.threads) as pool:
-            for found in pool.map(run, groups[1:]):
-                first |= found
-        return first
+            for more in pool.map(run, groups):
+                found |= more
+        return found
 
     def _group(self, group: list[int], requests: dict[int, Request]) -> dict[int, Evaluation]:
         # The compiled call has a fixed number of lanes: idle ones repeat the last.
@@ -344,8 +348,16 @@ def _simulate(lidar, scene, plan, places, values, keys, own_lidar: bool, own_sce
             eqx.combine(lidar, fixed_lidar), eqx.combine(scene, fixed_scene), plan, places, values, keys
         )
 
-    axes = (0 if own_lidar else None, 0 if own_scene else None, 0)
-    return jax.vmap(one, in_axes=axes)(lidar, scene, values)
+    if plan.orders == 1:
+        axes = (0 if own_lidar else None, 0 if own_scene else None, 0)
+        return jax.vmap(one, in_axes=axes)(lidar, scene, values)
+
+    # Together, photons of all lanes would go on until the last one of them is gone.
+    def in_turn(own):
+        return one(own[0] if own_lidar else lidar, own[1] if own_scene else scene, own[2])
+
+    mapped = (lidar if own_lidar else None, scene if own_scene else None, values)
+    return jax.lax.map(in_turn, mapped)
 
 
 def _fingerprint(y: np.ndarray, sigma: np.ndarray, names: list[Settled]) -> str:
