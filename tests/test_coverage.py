@@ -13,7 +13,7 @@ FOLDER = Path(__file__).parents[1] / "examples" / "benchmarks"
 def test_retrievals_reach_the_bound_and_their_intervals_cover(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(FOLDER))
     monkeypatch.delitem(sys.modules, "_common", raising=False)
-    options = ["--targets", "16", "--photons", "8192", "--starts", "1", "--exact", "2"]
+    options = ["--targets", "16", "--photons", "8192", "--starts", "2", "--exact", "2"]
     monkeypatch.setattr(sys, "argv", ["retrieval_coverage.py", "--out", str(tmp_path), *options])
     try:
         found = importlib.import_module("retrieval_coverage").main()

@@ -168,7 +168,7 @@ def main() -> dict:
     print(f"noise-free: {few} fits in {seconds['noise-free']:.0f} s")
     bounds = [
         inversion.cramer_rao(
-            LIDAR, s, at_truth(unknowns(), i, truth), noise=e, key=jax.random.key(8), plan=plan
+            LIDAR, s, at_truth(i, truth), noise=e, key=jax.random.key(8), plan=plan
         )
         for i, (s, e) in enumerate(zip(scenes, sigma))
     ]
