@@ -298,28 +298,31 @@ def ground_times(case: Case, photons: int) -> dict:
     }
 
 
+def lines(ax, curves, x: str, y: str = "error", scales: str = "loglog", skip: int = 0) -> None:
+    """One line for each of `curves`: pairs of label and points."""
+    for colour, (label, points) in zip(COLOURS[skip:], curves):
+        getattr(ax, scales)([p[x] for p in points], [p[y] for p in points], "o-", color=colour, label=label)
+
+
 def draw(record: dict, path) -> None:
     """Work and precision on each scene, then the knobs."""
-    figure, axes = plt.subplots(3, 4, figsize=(13, 9), layout="constrained")
+    plt.rcParams.update({"legend.fontsize": 7, "legend.frameon": False, "lines.markersize": 4})
+    figure, axes = plt.subplots(3, 4, figsize=(12, 8.5), layout="constrained")
+    for ax in axes.flat:
+        ax.set_ylabel("relative error")
     for ax, (name, found) in zip(axes[0], record["scenes"].items()):
-        for colour, (key, points) in zip(COLOURS, found["curves"].items()):
-            ax.loglog(
-                [p["seconds"] for p in points], [p["error"] for p in points], "o-", color=colour, label=key
-            )
-        ax.set(title=name, xlabel="seconds")
-    axes[0, 0].legend()
-    axes[0, 2].legend()
-    for colour, (name, found) in zip(COLOURS, list(record["scenes"].items())[1:]):
-        points = found["orders"]
-        axes[1, 0].semilogy(
-            [p["value"] for p in points], [p["error"] for p in points], "o-", color=colour, label=name
-        )
-        axes[2, 0].semilogy(
-            [p["value"] for p in points], [p["memory"] / 2**20 for p in points], "o-", color=colour
-        )
-    axes[1, 0].set(title="orders", xlabel="orders kept")
-    axes[2, 0].set(title="memory", xlabel="orders kept", ylabel="MiB of a batch")
-    axes[1, 0].legend()
+        analog = [("analog", found["curves"]["analog"])]
+        lines(ax, analog, "seconds", skip=len(COLOURS) - 1)
+        lines(ax, [c for c in found["curves"].items() if c[0] != "analog"], "seconds")
+        ax.set(title=name, xlabel="seconds", xlim=(1e-4, 20.0), ylim=(5e-5, 1.0))
+    axes[0, 1].legend(loc="lower left")
+    orders = [(n, found["orders"]) for n, found in record["scenes"].items() if "orders" in found]
+    lines(axes[1, 0], orders, "value", scales="semilogy")
+    lines(axes[2, 0], orders, "value", "memory", scales="semilogy")
+    axes[1, 0].set(xlabel="orders kept")
+    axes[2, 0].set(xlabel="orders kept", ylabel="bytes of a batch")
+    axes[2, 0].legend()
+    knobs = {key: found["points"] for key, found in record["knobs"].items()}
     places = {
         "fine": axes[1, 1],
         "rays": axes[1, 2],
@@ -328,22 +331,19 @@ def draw(record: dict, path) -> None:
         "bits": axes[2, 2],
     }
     for start, ax in places.items():
-        for colour, (key, found) in zip(
-            COLOURS, ((k, v) for k, v in record["knobs"].items() if k.startswith(start))
-        ):
-            value, error = ([p[f] for p in found["points"]] for f in ("value", "error"))
-            ax.loglog(value, error, "o-", color=colour, label=key)
-        ax.set(xlabel=next(k for k in record["knobs"] if k.startswith(start)).split(", ")[0])
-        ax.legend()
-    for colour, key in zip(COLOURS, ("rays, lattice", "step (m)", "voxel (m)", "fine bin (ns), kernel 3")):
-        points = record["knobs"][key]["points"]
-        axes[2, 3].loglog(
-            [p["seconds"] for p in points], [p["error"] for p in points], "o-", color=colour, label=key
-        )
-    axes[2, 3].set(title="deterministic knobs", xlabel="seconds")
-    axes[2, 3].legend()
-    for ax in (*axes[:2].flat, *axes[2, 1:]):
-        ax.set_ylabel("relative error")
+        own = [(key.split(", ")[-1], points) for key, points in knobs.items() if key.startswith(start)]
+        lines(ax, own, "value")
+        ax.set(xlabel=next(k for k in knobs if k.startswith(start)).split(", ")[0])
+        ax.set_xticks([p["value"] for p in own[0][1]], [f"{p['value']:g}" for p in own[0][1]])
+        ax.minorticks_off()
+        if len(own) > 1:
+            ax.legend()
+    axes[1, 3].set_ylim(1e-8, 1e-4)
+    axes[2, 1].set_ylim(0.05, 1.0)
+    some = ("rays, lattice", "step (m)", "voxel (m)", "fine bin (ns), kernel 3")
+    lines(axes[2, 3], [(key, knobs[key]) for key in some], "seconds")
+    axes[2, 3].set(xlabel="seconds", ylim=(1e-7, 1e3))
+    axes[2, 3].legend(loc="upper left")
     save_figure(figure, path)
 
 

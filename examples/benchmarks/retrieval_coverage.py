@@ -167,9 +167,7 @@ def main() -> dict:
     seconds["noise-free"] = time.perf_counter() - begun
     print(f"noise-free: {few} fits in {seconds['noise-free']:.0f} s")
     bounds = [
-        inversion.cramer_rao(
-            LIDAR, s, at_truth(i, truth), noise=e, key=jax.random.key(8), plan=plan
-        )
+        inversion.cramer_rao(LIDAR, s, at_truth(i, truth), noise=e, key=jax.random.key(8), plan=plan)
         for i, (s, e) in enumerate(zip(scenes, sigma))
     ]
     rows, record = [], {}
