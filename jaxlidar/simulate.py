@@ -115,9 +115,8 @@ def simulate(
         plan = dataclasses.replace(plan, n_photons=max(int(n_photons) // MIN_BATCHES, 1))
     if not plan.is_random:
         started = time.perf_counter()
-        response, _ = _batch(lidar, scene, plan, key)
         info = {"photons": 0, "batches": 1, "error": 0.0, "stopped": "nothing is random"}
-        wave = _finish(response, lidar, scene, plan, None)
+        wave = _once(lidar, scene, plan, key)
         if lidar.receiver.window == "first return" and not is_traced(wave.energy):
             wave = open_at_first_return(wave, lidar)
         return dataclasses.replace(wave, info={**info, "seconds": time.perf_counter() - started})
@@ -172,6 +171,11 @@ def total_all(
 def _batch(lidar: Lidar, scene: Scene, plan: Plan, key: PRNGKeyArray):
     response = trace_all(lidar, scene, plan, key)
     return response, total_all(response, lidar, scene, plan)
+
+
+@eqx.filter_jit
+def _once(lidar: Lidar, scene: Scene, plan: Plan, key: PRNGKeyArray) -> Waveform:
+    return waveform(trace_all(lidar, scene, plan, key), lidar, scene, plan)
 
 
 _finish = eqx.filter_jit(
