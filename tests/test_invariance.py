@@ -71,6 +71,7 @@ def alike(found, wanted, rtol=1e-4):
     np.testing.assert_allclose(found, wanted, rtol=0, atol=rtol * peak)
 
 
+@pytest.mark.slow
 def test_chunks_do_not_matter(plain, monkeypatch):
     plan, wave = plain
     for name, size in (("higher", 96), ("first", 100)):
