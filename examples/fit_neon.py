@@ -3,15 +3,16 @@
     python examples/fit_neon.py neon.npz [--shots 9] [--out figures]
 
 The file is what `jaxlidar.io.read_neon` reads. Canopies are as in `fit_gedi.py`: horizontally uniform, ten
-layers of equal thickness from the ground to the top, first order with the hot spot. Found are the elevations
-of ground and top, every layer's plant area density, and the receiver's gain. The pulse is 15 ns (2.3 m) long
-and a layer 1 to 2 m thick: two crowns within one layer's reach make one echo of the fit.
+layers of equal thickness from 3 m above the ground to the top, first order with the hot spot. Found are the
+elevations of ground and top, every layer's plant area density, and the receiver's gain. The pulse is 15 ns
+(2.3 m) long and a layer 1 to 2 m thick: two crowns within one layer's reach make one echo of the fit.
 
 Fitted are the longest returns that have three echoes or more: one or two echoes cannot tell ground from
 canopy, and most returns of a closed forest end within it. The ground's elevation stands beside the last echo
-of the Gaussian decomposition. They differ where plants lie within a pulse's length of the ground: a Gaussian
-takes both for one echo, and the model takes what leads that echo for plants (of nine shots of Harvard Forest
-the fitted ground is 0.3 m lower in the median). No answers are known here.
+of the Gaussian decomposition; of nine shots of Harvard Forest it lies 0.2 m higher in the median. They differ
+where something returns light within a pulse's length of the ground, which the model has no plants for, and
+where the ground is hardly seen: one of the nine fits puts it below the record, and does not converge. No
+answers are known here.
 """
 
 import argparse
