@@ -1,7 +1,7 @@
 """Are retrievals as good as they can be, and as good as they say? Noisy targets from random starts.
 
 Run it as `python examples/benchmarks/retrieval_coverage.py [--out figures] [--targets 200] [--photons
-16384] [--starts 2] [--exact 8]`. What is fitted is kept in the folder, and not fitted again.
+8192] [--starts 2] [--exact 8]`. What is fitted is kept in the folder, and not fitted again.
 
 A layered canopy over ground at three wavelengths; unknown are Cab, water and structure of the leaf,
 brightness of the ground, its height, the canopy's top and its leaf area index. Targets have truths of their
@@ -105,7 +105,7 @@ def plan_of(photons: int, **changes) -> jl.Plan:
 
 
 def main() -> dict:
-    given = options("Coverage of retrievals.", targets=200, photons=16384, starts=2, exact=8)
+    given = options("Coverage of retrievals.", targets=200, photons=8192, starts=2, exact=8)
     random = np.random.default_rng(0)
     n = given.targets
     truth = {name: random.uniform(*r, n) for name, (_, r) in RANGES.items()}
@@ -214,8 +214,9 @@ def main() -> dict:
         ax.hist(z[found.converged], np.linspace(-5, 5, 31), density=True, color="0.7")
         x = np.linspace(-5, 5, 200)
         ax.plot(x, np.exp(-0.5 * x**2) / np.sqrt(2 * np.pi), color="#D55E00")
-        ax.set(title=name, xlabel="(estimate - truth) / standard error")
+        ax.set_title(name)
     axes.flat[-1].axis("off")
+    figure.supxlabel("(estimate - truth) / standard error")
     save_figure(figure, given.out / "retrieval_coverage.png")
     return {"converged": share, "covered": all_covered, "unknowns": record}
 
