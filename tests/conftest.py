@@ -1,9 +1,5 @@
 """Every test runs with rank promotion refused; shapes and types of the packages are checked at run time."""
 
-import atexit
-import os
-import shutil
-import tempfile
 from pathlib import Path
 
 import equinox as eqx
@@ -12,14 +8,6 @@ import pytest
 from jaxtyping import install_import_hook
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
-
-# What several tests compile alike is compiled once, by whichever process comes first.
-CACHE = "JAX_COMPILATION_CACHE_DIR"
-if CACHE not in os.environ:
-    os.environ[CACHE] = tempfile.mkdtemp(prefix="jaxlidar-tests-")
-    atexit.register(shutil.rmtree, os.environ[CACHE], ignore_errors=True)
-jax.config.update("jax_compilation_cache_dir", os.environ[CACHE])
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
 
 # An int serves where a float is asked for, as PEP 484 says.
 CHECKER = "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))"
