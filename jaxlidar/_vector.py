@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -13,6 +14,17 @@ def vec(a: Float[Array, "3"] | Iterable[Scalar]) -> Vec:
     """The three components of an array, or three given one after the other."""
     x, y, z = a
     return x, y, z
+
+
+@jax.custom_jvp
+def with_derivative_of(value: Scalar, other: Scalar) -> Scalar:
+    """`value`, which varies as `other` does. What only `other` needs is not computed without derivatives."""
+    return value
+
+
+@with_derivative_of.defjvp
+def _(primals, tangents):
+    return primals[0], tangents[1]
 
 
 def dot(a: Vec, b: Vec) -> Scalar:

@@ -162,7 +162,8 @@ def _one_flight(setting: Setting, p: Photons, key: PRNGKeyArray, cone: float) ->
     met, outcomes, _ = plates_ahead(setting, p, u[DIMENSIONS:])
     events = events_of(setting, met, outcomes)
     limit = nearest(p, events)
-    flight = fly(setting, p, limit, jnp.maximum(layout.max_path - p.path, 0.0), u[0])
+    flights = fly(setting, p, limit, jnp.maximum(layout.max_path - p.path, 0.0), u[0][None])
+    flight = jax.tree.map(lambda a: a[0], flights)
     weight, letters = p.weight, p.history
     for i, (s, d, o) in enumerate(zip(setting.surfaces, met, outcomes)):
         if s.plate:

@@ -58,8 +58,8 @@ class Layout(NamedTuple):
     - `full_cover`: for each surface, whether no ray slips through. - `upstream`: where rays start, m
       above the reference plane along the axis. - `first_steps`, `march_steps`: bounds on faces crossed.
     - `max_step`, `max_path`: m. - `lobe`: probability with which reflection is chosen over transmission.
-    - `drawn_first`: whether order one returns from drawn collisions, as the others. - `independent`: whether
-      photons draw independent numbers.
+    - `ends`: points of each flight from which light returns. - `drawn_first`: whether order one returns from
+      drawn collisions, as the others. - `independent`: whether photons draw independent numbers.
     """
 
     materials: tuple[str, ...]
@@ -80,5 +80,6 @@ class Layout(NamedTuple):
     max_path: float
     lobe: float
     orders: int
+    ends: int
     drawn_first: bool
     independent: bool

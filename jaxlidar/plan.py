@@ -107,6 +107,7 @@ def plan(
     first_order: str = "expected",
     points: str = "lattice",
     kernel: int = KERNEL,
+    ends: int = 4,
     describe: bool = True,
 ) -> Plan:
     """Decide what `simulate` will do.
@@ -128,7 +129,10 @@ def plan(
       those of the other orders, among which it is then counted).
     - `points`: "lattice" (low discrepancy) or "independent" random numbers for rays and photons.
     - `kernel`: fine bins over which an instant is spread: 3 (smooth), 2 (linear) or 1 (the nearest: without
-      derivatives with respect to times). These three are there to show what the defaults are worth.
+      derivatives with respect to times).
+    - `ends`: points of each flight through a canopy from which light returns, one in each stratum of the
+      probability of getting there; 1 is the collision alone. These four are there to show what the defaults
+      are worth.
     - `describe`: whether to make the table of effects, with its bounds; takes some 40 ms.
 
     What the scene does not have is off, and never compiled. All else is on, however small: a plan also
@@ -144,6 +148,7 @@ def plan(
         ("n_photons", n_photons, 1),
         ("n_rays", n_rays, 1),
         ("max_orders", max_orders, 1),
+        ("ends", ends, 1),
     ):
         if value is not None and (value != int(value) or value < low):
             raise ValueError(f"{name} = {value} is outside the admissible range [{low}, inf) of integers")
@@ -195,6 +200,8 @@ def plan(
         max_path=max_path,
         lobe=lobe_probability(optics),
         orders=orders,
+        # Without a canopy all ends of a flight are on the same surface.
+        ends=1 if scene.canopy is None else int(ends),
         drawn_first=first_order == "drawn",
         independent=points == "independent",
     )

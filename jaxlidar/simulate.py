@@ -6,6 +6,7 @@ import os
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -26,6 +27,13 @@ from .waveform import Waveform, is_straight, open_at_first_return, total_of, wav
 
 # Fewer batches give no trustworthy standard error.
 MIN_BATCHES = 8
+# Batches run side by side, so none may spread over several cores: they would wait for one another.
+ONE_CORE: dict[str, Any] = {
+    "compiler_options": {
+        "xla_cpu_multi_thread_eigen": False,
+        "xla_cpu_enable_concurrency_optimized_scheduler": False,
+    }
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -167,7 +175,7 @@ def total_all(
     return jnp.stack([total_of(r, lidar, scene, plan)[i] for i, r in enumerate(response)])
 
 
-@eqx.filter_jit
+@eqx.filter_jit(**ONE_CORE)
 def _batch(lidar: Lidar, scene: Scene, plan: Plan, key: PRNGKeyArray):
     response = trace_all(lidar, scene, plan, key)
     return response, total_all(response, lidar, scene, plan)
@@ -204,17 +212,14 @@ def _simulate_batches(lidar, scene, plan, key, rtol, atol, fixed, max_seconds, p
         out = _batch(lidar, scene, plan, jax.random.fold_in(key, n))
         return jax.block_until_ready(out)
 
-    # XLA runs one batch on one core; batches on several threads use them all.
+    # Threads that ask for a program at once wait for one compilation.
     with ThreadPoolExecutor(max_workers=max(os.cpu_count() or 1, 1)) as pool:
         try:
             while True:
-                # The first batch alone: it compiles.
-                for response, mean in pool.map(one, range(done, wanted)) if done else map(one, range(1)):
+                for response, mean in pool.map(one, range(done, wanted)):
                     total = response if total is None else _add(total, response)
                     means.append(np.asarray(mean))
                     done += 1
-                if done < MIN_BATCHES:
-                    continue
                 error, worst = _error(np.stack(means))
                 seconds = time.perf_counter() - started
                 if progress is not None:
@@ -231,8 +236,9 @@ def _simulate_batches(lidar, scene, plan, key, rtol, atol, fixed, max_seconds, p
                 needed = done * (error / rtol) ** 2
                 if needed > done:
                     needed *= (_widening(math.ceil(needed)) / _widening(done)) ** 2
-                needed = math.ceil(1.05 * needed)
-                wanted = int(min(max(needed, done + 2), 4 * done))
+                # In fours: what is left of a round would leave cores idle.
+                needed = 4 * math.ceil(1.05 * needed / 4)
+                wanted = int(min(max(needed, done + 4), 4 * done))
                 if math.isfinite(max_seconds):
                     affordable = done * max_seconds / max(seconds, 1e-9)
                     wanted = max(min(wanted, int(affordable)), done + 1)

@@ -70,21 +70,21 @@ def march_ray(
 
     def step(state, _):
         distance, depth, voxel, at_stops = state
-        face = walk.nearest(voxel)
+        faces = lax.optimization_barrier(walk.faces(voxel))
+        face = earlier(earlier(faces[0], faces[1]), faces[2])
         to = earlier(end, earlier(face, distance + max_step))
         for stop in stops:
             # Plates lie between stretches, not within one.
             to = jnp.where(stop > distance, earlier(to, stop), to)
-        to = later(distance, to)
         cell = cell_of(medium, voxel)
         k = medium.extinction(cell, w)
+        to, cell, k = lax.optimization_barrier((later(distance, to), cell, k))
         length = to - distance
         at_stops = [
             a + k * (later(distance, earlier(stop, to)) - distance) for a, stop in zip(at_stops, stops)
         ]
-        crossed = (to >= face) & (to < end)
-        voxel_ = tuple(jnp.where(crossed, m, v) for m, v in zip(advance(walk, voxel), voxel))
-        return (to, depth + k * length, voxel_, at_stops), Stretches(distance, length, depth, cell, k)
+        moved = advance(walk, voxel, faces, (to >= face) & (to < end))
+        return (to, depth + k * length, moved, at_stops), Stretches(distance, length, depth, cell, k)
 
     zero = jnp.zeros_like(end)
     state = (jnp.minimum(walk.enter, end), zero, walk.voxel, [zero] * len(stops))

@@ -1,10 +1,13 @@
 """Flights: what a photon meets next, and how far it gets."""
 
+import functools
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .._vector import Scalar
+from .._vector import Scalar, with_derivative_of
 from .march import FAR, free_flight
 from .photons import EVENT, GAP, THROUGH, Photons, Setting, ratio_of, stop
 
@@ -18,16 +21,16 @@ class Flight(eqx.Module):
     - `cell`: the last voxel. - `distance`: flown, m. - `density`: ratio of the density of that distance.
     """
 
-    collided: Bool[Array, "photons"]
-    landed: Bool[Array, "photons"]
-    late: Bool[Array, "photons"]
-    escaped: Bool[Array, "photons"]
-    cell: Int[Array, "photons"]
-    distance: Float[Array, "photons"]
-    density: Float[Array, "photons"]
+    collided: Bool[Array, "*photons"]
+    landed: Bool[Array, "*photons"]
+    late: Bool[Array, "*photons"]
+    escaped: Bool[Array, "*photons"]
+    cell: Int[Array, "*photons"]
+    distance: Float[Array, "*photons"]
+    density: Float[Array, "*photons"]
 
     @property
-    def event(self) -> Bool[Array, "photons"]:
+    def event(self) -> Bool[Array, "*photons"]:
         """Whether anything was hit."""
         return self.collided | self.landed
 
@@ -37,33 +40,37 @@ def fly(
     p: Photons,
     limit: Float[Array, "photons"],
     budget: Float[Array, "photons"],
-    u: Float[Array, "photons"],
+    u: Float[Array, "ends photons"],
 ) -> Flight:
-    """Let photons fly to a collision at the optical depth -log(u), to a surface at `limit`, or on.
+    """Let photons fly to collisions at the optical depths -log(u), to a surface at `limit`, or on.
 
-    `budget`: m that are left of the window.
+    `budget`: m that are left of the window. There is one end of the flight for each number in `u`.
     """
     reach = jnp.minimum(limit, budget)
+    wide = functools.partial(jnp.broadcast_to, shape=u.shape)
     if setting.medium is None:
-        collided = in_medium = jnp.zeros_like(p.alive)
-        distance, density = reach, jnp.ones_like(p.weight)
-        cell = jnp.zeros_like(p.history)
+        collided = in_medium = jnp.zeros(u.shape, bool)
+        distance, density = wide(reach), jnp.ones_like(u)
+        cell = jnp.zeros(u.shape, jnp.int32)
     else:
-        target = -jnp.log(u)
-        free = free_flight(setting.medium, p.x, p.w, target, reach, p.alive, setting.layout.march_steps)
+        medium, target = setting.medium, -jnp.log(u)
+        steps, box = setting.layout.march_steps, setting.occupied
+        free = free_flight(medium, p.x, p.w, target, reach, p.alive, steps, box)
         collided, cell = free.collided, free.cell
-        k = jnp.where(collided, setting.medium.extinction(cell, p.w), 1.0)
+        k = jnp.where(collided, jax.vmap(medium.extinction, (0, None))(cell, p.w), 1.0)
         chord = jnp.where(collided, free.chord, 1.0)
         part = jnp.clip((target - free.depth) / jnp.maximum(k * chord, 1e-30), 0.0, 1.0)
         part = stop(jnp.where(collided, part, 0.0))
-        depth = free.depth + jnp.where(collided, part * k * chord, 0.0)
-        distance = jnp.where(collided, free.entered + part * chord, reach)
+        depth = jnp.where(collided, free.depth + part * k * chord, wide(free.total))
+        distance = jnp.where(collided, free.entered + part * chord, wide(reach))
         density = jnp.exp(stop(depth) - depth) * chord / stop(chord)
-        in_medium = ~collided & (free.entered >= budget)
-    landed = p.alive & ~collided & (limit < budget)
-    collided = p.alive & collided
-    nothing = p.alive & ~collided & ~landed
-    late = nothing & ((limit < FAR) | in_medium)
+        density = with_derivative_of(jnp.ones_like(density), density)
+        in_medium = ~collided & wide(free.distance >= budget)
+    alive = wide(p.alive)
+    landed = alive & ~collided & wide(limit < budget)
+    collided = alive & collided
+    nothing = alive & ~collided & ~landed
+    late = nothing & (wide(limit < FAR) | in_medium)
     return Flight(collided, landed, late, nothing & ~late, cell, distance, density)
 
 

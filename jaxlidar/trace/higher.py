@@ -1,9 +1,10 @@
 r"""Orders two and above: photons that collide, scatter and at every collision return what is expected.
 
 Photons carry no energy, only the geometric weight of their path and the number of its history. Each
-order draws one collision: the optical depth to it, the material, the direction onward. At the
-collision the photon deposits the probability of returning from there (pi times the density of
-scattering towards the sensor, times the transmittance of the way there).
+order draws a collision: the optical depth to it, the material, the direction onward. From there the
+photon deposits the probability of returning (pi times the density of scattering towards the sensor,
+times the transmittance of the way there). It does so from several points of the flight, `layout.ends`,
+one in each stratum of the probability of getting there, and goes on from one of them.
 
 Derivatives: what is drawn is held fixed (directions, materials, and the place of a collision as a
 fraction of the ray's chord through its voxel), and the density with which it was drawn stays in the weight
@@ -11,6 +12,8 @@ as p / stop_gradient(p). Voxel sizes, heights and extinction move positions, pat
 continuously, so the derivative of an expected value is the expected value of the derivative. An
 extinction coefficient that is exactly zero is never met, and its derivative here is zero.
 """
+
+import functools
 
 import equinox as eqx
 import jax
@@ -23,7 +26,7 @@ from ..constants import SPEED_OF_LIGHT
 from ..layout import Bins, Layout
 from .deposit import instant_row, scatter_rows
 from .draws import Independent, draws
-from .flight import DIMENSIONS, events_of, fly, nearest, plates_ahead
+from .flight import DIMENSIONS, Flight, events_of, fly, nearest, plates_ahead
 from .footprint import GOLDEN, Beam, quantile_radius
 from .histories import Histories
 from .landing import aim
@@ -148,7 +151,7 @@ def _alive_first(lanes: Array, photons: Photons) -> tuple[Array, Photons]:
 
 def _one_order(setting: Setting, p: Photons, tally: HigherOrders, u: list[Scalar], order: Int[Array, ""]):
     """Fly, collide, deposit, scatter."""
-    layout = setting.layout
+    layout, ends = setting.layout, setting.layout.ends
     met, outcomes, ratio = plates_ahead(setting, p, u[DIMENSIONS:])
     events = events_of(setting, met, outcomes)
     limit = nearest(p, events)
@@ -156,25 +159,40 @@ def _one_order(setting: Setting, p: Photons, tally: HigherOrders, u: list[Scalar
     if setting.medium is not None and setting.surfaces:
         w, limit, turned = aim(setting, p, limit, events, (order > 0) & (limit < budget))
         p = eqx.tree_at(lambda p: (p.w, p.weight), p, (w, p.weight * turned))
-    flight = fly(setting, p, limit, budget, u[0])
-    collided, landed, distance = flight.collided, flight.landed, flight.distance
-    event = flight.event
+    # One number says in which stratum the photon goes on, and where in each stratum the points are.
+    chosen = jnp.floor(u[0] * ends)
+    strata = jnp.stack([(i + (u[0] * ends - chosen)) / ends for i in range(ends)])
+    wide = functools.partial(jnp.broadcast_to, shape=strata.shape)
+    flights = fly(setting, p, limit, budget, jnp.maximum(strata, 1e-9))
+    p, u, flights, events, limit = lax.optimization_barrier((p, u, flights, events, limit))
+
+    def pick(a: Array) -> Array:
+        return jnp.take_along_axis(a, chosen.astype(jnp.int32)[None], 0, mode="promise_in_bounds")[0]
 
     # Plates that were passed on the way.
-    weight, history = p.weight * flight.density, p.history
+    weight, history = wide(p.weight) * flights.density, wide(p.history)
     for i, (s, d, o) in enumerate(zip(setting.surfaces, met, outcomes)):
         if not s.plate:
             continue
-        own = events[i] <= distance
-        passed = p.alive & (d < FAR) & ((d < distance) | ~event) & ~own
-        weight = weight * jnp.where(passed | (landed & own), ratio[i], 1.0)
-        through = passed & (o == THROUGH)
+        own = wide(events[i]) <= flights.distance
+        passed = wide(p.alive & (d < FAR)) & ((wide(d) < flights.distance) | ~flights.event) & ~own
+        weight = weight * jnp.where(passed | (flights.landed & own), wide(ratio[i]), 1.0)
+        through = passed & wide(o == THROUGH)
         scatterer = layout.surfaces[i]
-        tally = _arrive(tally, scatterer.material, history, jnp.where(through, weight, 0.0))
+        gone = pick(jnp.where(through, weight, 0.0))
+        tally = _arrive(tally, scatterer.material, pick(history), gone)
         history = jnp.where(through, setting.grow(history, scatterer.transmitted), history)
         weight = jnp.where(through, weight / (1.0 - layout.lobe), weight)
-        tally = _leave(tally, scatterer.material, history, jnp.where(through, weight, 0.0))
+        tally = _leave(tally, scatterer.material, pick(history), gone / (1.0 - layout.lobe))
 
+    if layout.drawn_first:
+        tally = _return(setting, p, flights, events, limit, weight, history, u, tally)
+    else:
+        # The first order is deterministic and has been deposited.
+        given = (setting, p, flights, events, limit, weight, history, u)
+        tally = lax.cond(order > 0, lambda t: _return(*given, t), lambda t: t, tally)
+
+    flight, weight, history = jax.tree.map(pick, (flights, weight, history))
     held = stop(weight)
     tally = eqx.tree_at(
         lambda t: (t.escaped, t.late),
@@ -184,20 +202,41 @@ def _one_order(setting: Setting, p: Photons, tally: HigherOrders, u: list[Scalar
             tally.late.at[history].add(jnp.where(flight.late, held, 0.0)),
         ),
     )
-
-    x = along(p.x, p.w, jnp.where(event, distance, 0.0))
-    path = p.path + jnp.where(event, distance, 0.0)
-    hit = collide(setting, p.w, flight.cell, collided, landed, events, limit, u)
-    weight = jnp.where(event, weight, 0.0)
+    flown = jnp.where(flight.event, flight.distance, 0.0)
+    hit = collide(setting, p.w, flight.cell, flight.collided, flight.landed, events, limit, u)
+    weight = jnp.where(flight.event, weight, 0.0)
     tally = _arrive(tally, hit.material, history, weight)
-    weight = weight * hit.ratio
-    # The first order is deterministic and has been deposited.
-    due = jnp.where(event if layout.drawn_first else event & (order > 0), weight, 0.0)
-    tally = _deposit(setting, tally, p.w, x, path, due, history, hit, u)
     history = setting.grow(history, hit.letter)
-    weight = weight * hit.onward
+    weight = weight * hit.ratio * hit.onward
     tally = _leave(tally, hit.material, history, weight)
-    return Photons(x, hit.w, path, weight, history, hit.on, hit.facing, event), tally
+    x = along(p.x, p.w, flown)
+    return Photons(x, hit.w, p.path + flown, weight, history, hit.on, hit.facing, flight.event), tally
+
+
+def _return(
+    setting: Setting,
+    p: Photons,
+    flights: Flight,
+    events: list[Scalar],
+    limit: Scalar,
+    weight: Float[Array, "ends photons"],
+    history: Int[Array, "ends photons"],
+    u: list[Scalar],
+    tally: HigherOrders,
+) -> HigherOrders:
+    """Deposit from every end of the flights its share of what is expected to return."""
+    ends = setting.layout.ends
+
+    def flat(tree):
+        return jax.tree.map(lambda a: jnp.broadcast_to(a, (ends, a.shape[-1])).reshape(-1), tree)
+
+    p, flights, events, limit, u, history = flat((p, flights, events, limit, u, history))
+    flown = jnp.where(flights.event, flights.distance, 0.0)
+    hit = collide(setting, p.w, flights.cell, flights.collided, flights.landed, events, limit, u)
+    value = jnp.where(flights.event, flat(weight), 0.0) * hit.ratio / ends
+    x = along(p.x, p.w, flown)
+    given = lax.optimization_barrier((p.w, x, p.path + flown, value, history, hit, u))
+    return _deposit(setting, tally, *given)
 
 
 def _arrive(tally: HigherOrders, material: Array | int, history: Array, weight: Scalar) -> HigherOrders:
@@ -229,8 +268,8 @@ def _deposit(
         column = setting.column
         clear = jnp.exp(-jax.vmap(lambda x: depth_to_top(medium, x, column))(x))
     else:
-        far = jnp.full_like(path, FAR)
-        clear = jnp.exp(-free_flight(medium, x, v, far, far, weight > 0, layout.march_steps).depth)
+        none, far = jnp.zeros((0, path.size)), jnp.full_like(path, FAR)
+        clear = jnp.exp(-free_flight(medium, x, v, none, far, weight > 0, layout.march_steps).total)
     drawn = iter(u[DIMENSIONS + sum(s.plate for s in setting.surfaces) :])
     for i, (s, scatterer) in enumerate(zip(setting.surfaces, layout.surfaces)):
         if not s.plate:
@@ -254,7 +293,7 @@ def _deposit(
     pairs = [(hit.reflected, reflected)]
     if transmitted is not None:
         pairs.append((hit.transmitted, transmitted))
-    first, row = instant_row(setting.bins, time, value)
+    first, row = lax.optimization_barrier(instant_row(setting.bins, time, value))
     for letter, factor in pairs:
         slot = hit.material * setting.table.count + setting.grow(history, letter)
         factor = jnp.where(letter >= 0, factor, 0.0)

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from .._vector import Scalar, add, along, dot, scale, vec
+from .._vector import Scalar, add, along, dot, scale, vec, with_derivative_of
 from .photons import Photons, Setting, ratio_of, stop
 from .scatter import drawn_density
 
@@ -64,7 +64,7 @@ def aim(setting: Setting, p: Photons, limit: Scalar, events: list[Scalar], headi
     turned = 1.0 + (1.0 - fade) * (ratio - 1.0) + gradient[0] * apart[0] + gradient[1] * apart[1]
     x, y = (held[k] + (column[k] - stop(column[k])) + fade * apart[k] for k in range(2))
     w, far = seen_from(on_surface(x, y))
-    # Values stay those that were drawn, to the last digit.
-    w = vec(jnp.where(heading, stop(a) + (b - stop(b)), a) for a, b in zip(p.w, w))
-    far = jnp.where(heading, stop(limit) + (far - stop(far)), limit)
-    return w, far, jnp.where(heading, turned, 1.0)
+    # Values stay those that were drawn.
+    w = vec(with_derivative_of(a, jnp.where(heading, b, a)) for a, b in zip(p.w, w))
+    far = with_derivative_of(limit, jnp.where(heading, far, limit))
+    return w, far, with_derivative_of(jnp.ones_like(far), jnp.where(heading, turned, 1.0))

@@ -4,10 +4,12 @@ Nothing is sampled on the way: within a voxel the extinction coefficient is cons
 depth is known at every face and linear between them. Distances to faces are computed from integer
 face numbers, never accumulated. Written for one ray; photons are batched by `jax.vmap`, and a whole
 batch stops as soon as its last ray has.
+
+What several results of a step share is held by `lax.optimization_barrier`: the CPU compiler would compute
+it anew for each of them, which takes three times as long.
 """
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -103,29 +105,23 @@ def medium_of(voxels: VoxelMap, aim: Float[Array, "3"], periodic: bool, leaf_fac
     )
 
 
+# First voxel and one past the last, along each axis.
+Box = tuple[tuple[Int[Array, ""], ...], tuple[Int[Array, ""], ...]]
+
+
 class Walk(eqx.Module):
-    """A ray on the grid: distance to face number f along axis k is `gap[k] * f + offset[k]`."""
+    """A ray on the grid: it leaves voxel v along axis k at the distance `gap[k] * v[k] + offset[k]`."""
 
     gap: Vec
     offset: Vec
-    still: tuple[Bool[Array, ""], Bool[Array, ""], Bool[Array, ""]]
-    step: tuple[Int[Array, ""], Int[Array, ""], Int[Array, ""]]
-    voxel: tuple[Int[Array, ""], Int[Array, ""], Int[Array, ""]]
-    enter: Float[Array, ""]
-    leave: Float[Array, ""]
-    direction: Vec
+    step: tuple[Int[Array, "*s"], Int[Array, "*s"], Int[Array, "*s"]]
+    voxel: tuple[Int[Array, "*s"], Int[Array, "*s"], Int[Array, "*s"]]
+    enter: Float[Array, "*s"]
+    leave: Float[Array, "*s"]
 
-    def faces(self, voxel: tuple[Int[Array, ""], ...]) -> tuple[Scalar, ...]:
+    def faces(self, voxel: tuple[Int[Array, "*s"], ...]) -> tuple[Scalar, ...]:
         """Distances to the faces at which the ray would leave `voxel` along each axis."""
-        return tuple(
-            jnp.where(still, FAR, gap * (v + (s > 0)) + offset)
-            for gap, offset, still, v, s in zip(self.gap, self.offset, self.still, voxel, self.step)
-        )
-
-    def nearest(self, voxel: tuple[Int[Array, ""], ...]) -> Scalar:
-        """Distance to the face at which the ray leaves `voxel`."""
-        tx, ty, tz = self.faces(voxel)
-        return earlier(earlier(tx, ty), tz)
+        return tuple(gap * v + offset for gap, offset, v in zip(self.gap, self.offset, voxel))
 
 
 def earlier(a: Scalar, b: Scalar) -> Scalar:
@@ -138,21 +134,24 @@ def later(a: Scalar, b: Scalar) -> Scalar:
     return jnp.where(b > a, b, a)
 
 
-def begin(medium: Medium, x: Vec, w: Vec) -> Walk:
-    """Where a ray from `x` along `w` enters the grid (0 if inside) and leaves it, and its first voxel."""
+def begin(medium: Medium, x: Vec, w: Vec, box: Box | None = None) -> Walk:
+    """Where a ray from `x` along `w` enters the grid (0 if inside) and leaves it, and its first voxel.
+
+    With `box`, where it enters and leaves that part of the grid.
+    """
     near, far = jnp.zeros_like(x[0]), jnp.full_like(x[0], FAR)
-    gap, offset, still, step = [], [], [], []
+    gap, offset, step = [], [], []
+    low, high = box if box is not None else ((0, 0, 0), medium.shape)
     for k in range(3):
-        flat = jnp.abs(w[k]) < 1e-12
+        flat, ahead = jnp.abs(w[k]) < 1e-12, w[k] > 0
         inverse = 1.0 / jnp.where(flat, 1.0, w[k])
         lower = medium.origin[k] - x[k]
-        gap.append(medium.size[k] * inverse)
-        offset.append(lower * inverse)
-        still.append(flat)
-        step.append(jnp.where(w[k] > 0, 1, -1))
+        gap.append(jnp.where(flat, 0.0, medium.size[k] * inverse))
+        offset.append(jnp.where(flat, FAR, (lower + jnp.where(ahead, medium.size[k], 0.0)) * inverse))
+        step.append(jnp.where(ahead, 1, -1))
         if medium.periodic and k < 2:
             continue
-        upper = lower + medium.size[k] * medium.shape[k]
+        lower, upper = lower + medium.size[k] * low[k], lower + medium.size[k] * high[k]
         within = (lower <= 0) & (upper >= 0)
         a, b = lower * inverse, upper * inverse
         near = jnp.maximum(near, jnp.where(flat, jnp.where(within, 0.0, FAR), jnp.minimum(a, b)))
@@ -167,10 +166,10 @@ def begin(medium: Medium, x: Vec, w: Vec) -> Walk:
         if not (medium.periodic and k < 2):
             number = jnp.clip(number, 0, medium.shape[k] - 1)
         voxel.append(number.astype(jnp.int32))
-    return Walk(tuple(gap), tuple(offset), tuple(still), tuple(step), tuple(voxel), near, far, w)
+    return Walk(tuple(gap), tuple(offset), tuple(step), tuple(voxel), near, far)
 
 
-def cell_of(medium: Medium, voxel: tuple[Int[Array, ""], ...]) -> Int[Array, ""]:
+def cell_of(medium: Medium, voxel: tuple[Int[Array, "*s"], ...]) -> Int[Array, "*s"]:
     """Index into the flat arrays; rounding at the last face cannot lead outside."""
     nx, ny, nz = medium.shape
     if medium.periodic:
@@ -180,80 +179,94 @@ def cell_of(medium: Medium, voxel: tuple[Int[Array, ""], ...]) -> Int[Array, ""]
     return (i * ny + j) * nz + jnp.clip(voxel[2], 0, nz - 1)
 
 
-def advance(walk: Walk, voxel: tuple[Int[Array, ""], ...]) -> tuple[Int[Array, ""], ...]:
-    """The voxel behind the nearest face; through an edge or a corner, one face at a time."""
-    tx, ty, tz = walk.faces(voxel)
+def advance(walk: Walk, voxel: tuple[Int[Array, "*s"], ...], faces: tuple[Scalar, ...], go: Bool[Array, "*s"]):
+    """The voxel behind the nearest face if `go`; through an edge or a corner, one face at a time."""
+    tx, ty, tz = faces
     x = (tx <= ty) & (tx <= tz)
     y = ~x & (ty <= tz)
     z = ~x & ~y
-    return tuple(v + jnp.where(cross, s, 0) for v, s, cross in zip(voxel, walk.step, (x, y, z)))
+    return tuple(v + jnp.where(go & cross, s, 0) for v, s, cross in zip(voxel, walk.step, (x, y, z)))
+
+
+def occupied(medium: Medium) -> Box:
+    """The box that holds all voxels with any extinction: photons need not be followed outside."""
+    tables = [t for t in (medium.leaf, medium.bark) if t is not None]
+    full = jnp.any(jnp.stack(tables) > 0, axis=0).reshape(medium.shape)
+    low, high = [], []
+    for axis, n in enumerate(medium.shape):
+        layers = jnp.any(full, axis=[k for k in range(3) if k != axis])
+        low.append(jnp.min(jnp.where(layers, jnp.arange(n), n)))
+        high.append(jnp.max(jnp.where(layers, jnp.arange(1, n + 1), 0)))
+    return tuple(low), tuple(high)
 
 
 class Free(eqx.Module):
-    """Where a ray's free flight ended.
+    """Free flights, and where on them the optical depth reaches the targets.
 
-    - `collided`: in the medium, or else it reached its limit or left the grid.
-    - `cell`: the last voxel. - `entered`, `chord`: distance at which it entered that voxel, and how
-      long the ray is within it, both m. - `depth`: optical depth up to `entered`, or of the whole ray.
+    - `collided`: in the medium, before the limit. - `cell`: the voxel of that. - `entered`, `chord`: distance
+      at which it was entered, and how long the ray is within it, both m. - `depth`: optical depth there.
+    - `distance`, `total`: of the whole flight, m and optical depth; without meaning after the last target.
     """
 
-    collided: Bool[Array, "photons"]
-    cell: Int[Array, "photons"]
-    entered: Float[Array, "photons"]
-    chord: Float[Array, "photons"]
-    depth: Float[Array, "photons"]
+    collided: Bool[Array, "targets photons"]
+    cell: Int[Array, "targets photons"]
+    entered: Float[Array, "targets photons"]
+    chord: Float[Array, "targets photons"]
+    depth: Float[Array, "targets photons"]
+    distance: Float[Array, "photons"]
+    total: Float[Array, "photons"]
 
 
 def free_flight(
     medium: Medium,
     x: Vec,
     w: Vec,
-    target: Float[Array, "photons"],
+    targets: Float[Array, "targets photons"],
     limit: Float[Array, "photons"],
     active: Bool[Array, "photons"],
     steps: int,
+    box: Box | None = None,
 ) -> Free:
-    """Follow rays until their optical depth reaches `target`, their length `limit`, or they leave.
+    """Follow rays to their largest target, to their length `limit`, or until they leave the grid, or `box`.
 
-    `steps` bounds the number of faces crossed; batches stop earlier when all their rays have.
+    `steps` bounds the number of faces crossed; batches stop earlier when all their rays have. Without
+    targets, rays are followed to their end.
     """
-    walk = jax.vmap(lambda a, b: begin(medium, a, b))(x, w)
+    walk = begin(medium, x, w, box)
     end = earlier(walk.leave, limit)
+    most = jnp.max(targets, axis=0) if len(targets) else jnp.full_like(limit, jnp.inf)
+    walk, end, targets, most = lax.optimization_barrier((walk, end, targets, most))
 
-    def one(walk: Walk, end: Scalar, target: Scalar, state):
-        distance, depth, voxel, running = state
-        to = later(distance, earlier(end, walk.nearest(voxel)))
-        more = depth + medium.extinction(cell_of(medium, voxel), walk.direction) * (to - distance)
-        # A ray that collides stays where it entered the voxel.
-        passes = running & (more < target)
-        inside = passes & (to < end)
-        moved = advance(walk, voxel)
-        return (
-            jnp.where(passes, to, distance),
-            jnp.where(passes, more, depth),
-            tuple(jnp.where(inside, m, v) for m, v in zip(moved, voxel)),
-            inside,
-        )
+    def wide(a: Array) -> Array:
+        return jnp.broadcast_to(a, targets.shape)
 
-    step = jax.vmap(one)
+    def step(state, _):
+        distance, depth, voxel, running, held = state
+        faces = lax.optimization_barrier(walk.faces(voxel))
+        to = later(distance, earlier(end, earlier(earlier(faces[0], faces[1]), faces[2])))
+        cell = cell_of(medium, voxel)
+        more = depth + medium.extinction(cell, w) * (to - distance)
+        to, more, cell = lax.optimization_barrier((to, more, cell))
+        here = wide(running) & (wide(depth) <= targets) & (targets < wide(more))
+        go = running & (more <= most) & (to < end)
+        here, go = lax.optimization_barrier((here, go))
+        held = tuple(jnp.where(here, wide(a), b) for a, b in zip((distance, to, depth, cell), held))
+        moved = advance(walk, voxel, faces, go)
+        return (jnp.where(running, to, distance), jnp.where(running, more, depth), moved, go, held), None
 
     def block(state, _):
         def go(state):
-            return lax.scan(lambda s, _: (step(walk, end, target, s), None), state, None, length=BLOCK)[0]
+            return lax.scan(step, state, None, length=BLOCK)[0]
 
         return lax.cond(jnp.any(state[3]), go, lambda s: s, state), None
 
+    zero = jnp.zeros_like(targets)
+    held = (zero - 1.0, zero, zero, zero.astype(jnp.int32))
     start = jnp.minimum(walk.enter, end)
-    state = (start, jnp.zeros_like(target), walk.voxel, active & (walk.enter < end))
-    began = state[3]
-    distance, depth, voxel, running = lax.scan(block, state, None, length=-(-steps // BLOCK))[0]
-
-    def last(walk: Walk, end: Scalar, distance: Scalar, voxel):
-        return cell_of(medium, voxel), later(distance, earlier(end, walk.nearest(voxel))) - distance
-
-    cell, chord = jax.vmap(last)(walk, end, distance, voxel)
-    collided = began & (distance < end) & ~running
-    return Free(collided, cell, distance, chord, depth)
+    state = (start, jnp.zeros_like(limit), walk.voxel, active & (walk.enter < end), held)
+    distance, total, _, _, held = lax.scan(block, state, None, length=-(-steps // BLOCK))[0]
+    entered, left, depth, cell = held
+    return Free(entered >= 0, cell, entered, left - entered, depth, distance, total)
 
 
 def hold_in_columns(

@@ -6,11 +6,11 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from .._vector import Scalar, Vec
+from .._vector import Scalar, Vec, with_derivative_of
 from ..layout import Bins, Layout
 from .footprint import Beam
 from .histories import Histories
-from .march import Medium, columns
+from .march import Box, Medium, columns, occupied
 from .surfaces import Surface
 
 stop = lax.stop_gradient
@@ -67,6 +67,7 @@ class Setting(eqx.Module):
     table: Histories = eqx.field(static=True)
     bins: Bins = eqx.field(static=True)
     column: Float[Array, "cells"] | None
+    occupied: Box | None
     successor: Int[Array, "histories letters"]
 
     def __init__(
@@ -81,11 +82,12 @@ class Setting(eqx.Module):
         self.beam, self.medium, self.surfaces = beam, medium, surfaces
         self.layout, self.table, self.bins = layout, table, bins
         self.column = columns(medium) if medium is not None and layout.vertical else None
+        self.occupied = None if medium is None else occupied(medium)
         self.successor = jnp.asarray(table.successor)
 
     def grow(
-        self, history: Int[Array, "photons"], letter: Int[Array, "photons"] | int
-    ) -> Int[Array, "photons"]:
+        self, history: Int[Array, "*photons"], letter: Int[Array, "*photons"] | int
+    ) -> Int[Array, "*photons"]:
         """The history with one more scattering; unchanged where the letter is -1."""
         if isinstance(letter, int):
             return self.successor[history, letter] if letter >= 0 else history
@@ -102,4 +104,4 @@ def ratio_of(density: Scalar) -> Scalar:
     """One, with the relative derivative of a density; no derivative where the density is zero."""
     held = stop(density)
     safe = jnp.where(held == 0, 1.0, held)
-    return jnp.where(held == 0, 1.0, 1.0 + (density - held) / safe)
+    return with_derivative_of(jnp.ones_like(held), jnp.where(held == 0, 1.0, density / safe))
