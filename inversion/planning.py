@@ -76,12 +76,12 @@ def plan_for(
         row=max(p.bins.row for p in plans),
     )
     upstream = max(p.layout.upstream for p in plans)
-    longest = max(p.layout.max_path - p.layout.upstream for p in plans) + upstream
+    last = max(p.layout.last for p in plans)
     layout = first.layout._replace(
         upstream=upstream,
-        max_path=longest,
+        last=last,
         first_steps=max(p.layout.first_steps for p in plans),
-        march_steps=max(Extent(lidar, s).march_steps(longest + upstream) for s in scenes),
+        march_steps=max(Extent(lidar, s).march_steps(last + upstream) for s in scenes),
         full_cover=tuple(all(c) for c in zip(*(p.layout.full_cover for p in plans))),
     )
     return dataclasses.replace(first, layout=layout, bins=bins)

@@ -8,6 +8,8 @@ from jaxtyping import Array, Float
 
 Scalar = Float[Array, "..."]
 Vec = tuple[Scalar, Scalar, Scalar]
+# Distance, m, of what is never met.
+FAR = 1e30
 
 
 def vec(a: Float[Array, "3"] | Iterable[Scalar]) -> Vec:

@@ -11,7 +11,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from ._checks import check_range
-from ._vector import along, dot, vec
+from ._vector import FAR, along, dot, vec
 from .constants import SPEED_OF_LIGHT
 from .effects import without
 from .lidar import Lidar
@@ -20,7 +20,6 @@ from .scene import Scene, leaf_optics
 from .trace.flight import DIMENSIONS, events_of, fly, nearest, plates_ahead
 from .trace.footprint import quantile_radius
 from .trace.histories import histories
-from .trace.march import FAR
 from .trace.photons import THROUGH, Photons, Setting
 from .trace.response import geometry_of
 from .trace.scatter import collide
@@ -162,7 +161,7 @@ def _one_flight(setting: Setting, p: Photons, key: PRNGKeyArray, cone: float) ->
     met, outcomes, _ = plates_ahead(setting, p, u[DIMENSIONS:])
     events = events_of(setting, met, outcomes)
     limit = nearest(p, events)
-    flights = fly(setting, p, limit, jnp.maximum(layout.max_path - p.path, 0.0), u[0][None])
+    flights = fly(setting, p, limit, beam.budget(p.x, p.w, layout.last - p.path), u[0][None])
     flight = jax.tree.map(lambda a: a[0], flights)
     weight, letters = p.weight, p.history
     for i, (s, d, o) in enumerate(zip(setting.surfaces, met, outcomes)):

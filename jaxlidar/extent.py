@@ -100,9 +100,12 @@ class Extent:
         return int(self.shape[2] + sideways.sum() + divided + len(self.scene.surfaces) + 2)
 
     def march_steps(self, longest: float) -> int:
-        """Bound on the voxels that a path of `longest` m crosses."""
+        """Bound on the voxels that a flight crosses from which light returns `longest` m after the first."""
         if self.scene.canopy is None:
             return 0
         if self.scene.canopy.sides == "open":
             return int(self.shape.sum()) + 3
-        return int(self.shape[2] + sum(math.ceil(longest / s) for s in self.size[:2])) + 3
+        # A flight of s m within the canopy lengthens the way by at least s (1 - sin) - height cos.
+        height, cos = self.size[2] * self.shape[2], float(np.abs(self.rays[:, 2]).min())
+        flight = (longest + height * cos) / (1.0 - math.sqrt(1.0 - cos * cos))
+        return int(self.shape[2] + sum(math.ceil(flight / s) for s in self.size[:2])) + 3

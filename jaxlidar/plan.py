@@ -1,16 +1,12 @@
 """What a scene and a lidar call for: effects simulated, bounds on the others, sizes of all loops."""
 
 import dataclasses
-import functools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
-import jax
-
-from ._checks import is_traced
-from .bounds import Bounds
 from .constants import SPEED_OF_LIGHT
-from .effects import NAMES, Effect, present, switched_off, without
+from .effect_table import effect_table, percent
+from .effects import Effect, present, switched_off, without
 from .extent import Extent, number
 from .layout import KERNEL, Bins, Layout
 from .letters import largest_albedo, lobe_probability, scene_optics, spell
@@ -70,7 +66,7 @@ class Plan:
     def __str__(self) -> str:
         rows = [("effect", "simulated", "changes at most", "why")]
         for e in self.effects:
-            bound = "nothing" if e.bound == 0 else f"{_percent(e.bound)} of {e.measure}"
+            bound = "nothing" if e.bound == 0 else f"{percent(e.bound)} of {e.measure}"
             rows.append((e.name, "yes" if e.simulated else "no", bound, e.reason))
         widths = [max(len(r[i]) for r in rows) for i in range(3)]
         lines = ["  ".join([*(c.ljust(w) for c, w in zip(r, widths)), r[3]]).rstrip() for r in rows]
@@ -84,11 +80,6 @@ class Plan:
         if self.orders > 1:
             sizes += f", {self.n_photons} photons a batch, {self.orders} orders"
         return "\n".join([*lines, sizes])
-
-
-def _percent(share: float) -> str:
-    # Two digits, also of 100.
-    return f"{float(f'{100 * share:.2g}'):g} %"
 
 
 def plan(
@@ -179,8 +170,7 @@ def plan(
     step = min(step, 4 * metres) if max_step is None else step
     row = max(math.ceil(step / metres - 1e-6) + 1 + 2, KERNEL)
     bins = dataclasses.replace(bins, row=row, kernel=int(kernel))
-    end = bins.start + bins.width * bins.count
-    max_path = SPEED_OF_LIGHT * end + geometry.upstream
+    last = SPEED_OF_LIGHT * (bins.start + bins.width * bins.count)
     layout = Layout(
         materials=letters.materials,
         letters=letters.letters,
@@ -195,9 +185,9 @@ def plan(
         vertical=number(lidar.zenith) == 0.0,
         upstream=geometry.upstream,
         first_steps=geometry.first_steps(step),
-        march_steps=geometry.march_steps(max_path + geometry.upstream),
+        march_steps=geometry.march_steps(last + geometry.upstream),
         max_step=step,
-        max_path=max_path,
+        last=last,
         lobe=lobe_probability(optics),
         orders=orders,
         # Without a canopy all ends of a flight are on the same surface.
@@ -225,7 +215,7 @@ def plan(
         first_degree=1 + 2 * plates,
         off=off,
         rtol=rtol,
-        effects=_effects(*whole, off, orders, (why, left), airy, geometry.upstream) if describe else (),
+        effects=effect_table(*whole, off, orders, (why, left), airy, geometry.upstream) if describe else (),
     )
 
 
@@ -315,110 +305,3 @@ def _with_air(bins: Bins, lidar: Lidar, samples: tuple[float, float, int, int]) 
     missing = math.ceil((bins.start - (samples[0] - samples[1] - high)) / bins.width) + 3
     more = max(missing, 0)
     return dataclasses.replace(bins, start=bins.start - more * bins.width, count=bins.count + more)
-
-
-def _effects(
-    lidar: Lidar,
-    scene: Scene,
-    off: tuple[str, ...],
-    orders: int,
-    why: tuple[str, float],
-    bins: Bins,
-    upstream: float,
-) -> tuple[Effect, ...]:
-    has, planned = present(lidar, scene), present(*without(lidar, scene, off))
-    reasons = dict.fromkeys(NAMES, "in the scene") | {"multiple scattering": why[0]} | _reasons(lidar, scene)
-    # What is being traced may have any value.
-    known = not any(is_traced(x) for x in jax.tree.leaves((lidar, scene)))
-
-    @functools.cache
-    def rules(off: tuple[str, ...]) -> dict[str, Callable[[], float]]:
-        return _rules(Bounds(*without(lidar, scene, off), orders), bins, upstream)
-
-    def bound(name: str, off: tuple[str, ...]) -> float:
-        pair = without(lidar, scene, off)
-        there = present(*pair) | {"hot spot": pair[1].canopy is not None}
-        if not known or not there.get(name, True):
-            return float(there.get(name, True))
-        return rules(off)[name]()
-
-    rows = []
-    for name in NAMES:
-        on = planned[name] and name not in off and (name != "multiple scattering" or orders > 1)
-        reason, others = reasons[name], off
-        if name in off:
-            # What switching it on again would change.
-            reason, others = "switched off", tuple(n for n in off if n != name)
-        elif not has[name] and name not in ("multiple scattering", "hot spot"):
-            reason = "not in the scene"
-        elif has[name] and not planned[name] and name != "multiple scattering":
-            reason = "gone with what is switched off"
-        rows.append(Effect(name, on, reason, bound(name, others), _measure(name)))
-        if on and name == "multiple scattering":
-            name = f"orders beyond {orders}"
-            most = bound(name, off)
-            rest = f"likely below {_percent(min(why[1], most))}: light escapes between"
-            rows.append(Effect(name, False, rest, most, "sum"))
-    if without(lidar, scene, off)[1].atmosphere is not None:
-        name = "scattering within the atmosphere"
-        rows.append(Effect(name, False, "beyond first order", bound(name, off), "sum"))
-    return tuple(rows)
-
-
-def _measure(name: str) -> str:
-    return "samples" if name in ("slope spread", "divergence", "jitter") else "sum"
-
-
-def _rules(bounds: Bounds, bins: Bins, upstream: float) -> dict[str, Callable[[], float]]:
-    """The bound of every effect that is there."""
-
-    def slope_spread() -> float:
-        level = without(bounds.lidar, bounds.scene, ("slope spread",))
-        return bounds.slope_spread(Bounds(*level, bounds.orders))
-
-    return {
-        "leaf": lambda: bounds.part("leaf"),
-        "bark": lambda: bounds.part("bark"),
-        "plates": bounds.plates,
-        "ground": bounds.ground,
-        "slope spread": slope_spread,
-        "multiple scattering": lambda: bounds.beyond(1),
-        f"orders beyond {bounds.orders}": lambda: bounds.beyond(bounds.orders),
-        # A mirror's return may outshine all else.
-        "specular return": lambda: 1.0,
-        "divergence": bounds.divergence,
-        "field of view": bounds.field_of_view,
-        "hot spot": bounds.hot_spot,
-        "atmospheric extinction": lambda: bounds.extinction(bins, upstream),
-        "atmospheric backscatter": lambda: bounds.backscatter(bins, upstream),
-        "jitter": bounds.jitter,
-        # Light that the air scatters and the receiver still gets is at most what was lost.
-        "scattering within the atmosphere": lambda: bounds.lost(bins),
-    }
-
-
-def _reasons(lidar: Lidar, scene: Scene) -> dict[str, str]:
-    """Why effects are on, by their size, where more can be said than that they are there."""
-    radius = number(lidar.footprint_radius)
-    slope = 0.0 if scene.ground is None else number(scene.ground.slope)
-    spread = radius * math.tan(math.radians(slope)) / SPEED_OF_LIGHT
-    view = lidar.field_of_view
-    air = scene.atmosphere
-    hotspot = scene.canopy is not None and scene.canopy.hotspot
-    reasons = {
-        "slope spread": f"{slope:g} degrees: {spread:.2g} ns (standard deviation)",
-        "divergence": f"{number(lidar.divergence):g} mrad: a footprint of radius {radius:.3g} m",
-        "field of view": "a soft edge of 2 %"
-        if view is None or is_traced(view)
-        else f"{number(view):g} mrad, with a soft edge of 2 %",
-        "hot spot": "back through the same gap: exp(-tau)"
-        if hotspot
-        else "ways are independent: exp(-2 tau)",
-        "atmospheric backscatter": "above the scene",
-        "jitter": f"{number(lidar.jitter):g} ns",
-    }
-    if scene.canopy is None:
-        reasons["hot spot"] = "not in the scene"
-    if air is not None and air.lidar_ratio is None:
-        reasons["atmospheric backscatter"] = "no lidar ratio"
-    return reasons

@@ -1,5 +1,7 @@
 """What can be chosen in place of defaults estimates the same; and what one plate sends to another."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -18,6 +20,7 @@ PLATES = jl.Scene(
     plates=(jl.Plate(height=6.0, reflectance=0.4, transmittance=0.3, coverage=0.5, transmission="straight"),),
     ground=jl.Ground(reflectance=0.3),
 )
+BETWEEN = dataclasses.replace(SCENE, plates=PLATES.plates)
 SIZES = {"n_photons": 2048, "n_rays": 512, "window": (-80.0, 40.0)}
 
 
@@ -35,6 +38,9 @@ CHOICES = {
     "drawn": ({"first_order": "drawn"}, SCENE, 3),
     "drawn, one order": ({"first_order": "drawn"}, SCENE, 1),
     "drawn, plates": ({"first_order": "drawn"}, PLATES, 2),
+    "one end": ({"ends": 1}, SCENE, 3),
+    "seven ends, drawn": ({"ends": 7, "first_order": "drawn"}, SCENE, 3),
+    "ends between plates": ({"ends": 1}, BETWEEN, 3),
     "independent": ({"points": "independent"}, SCENE, 3),
 }
 
@@ -76,6 +82,12 @@ def test_what_is_expected_varies_less_than_what_is_drawn():
     assert np.median(drawn) > 10 * np.median(expected)
 
 
+def test_four_ends_vary_less_than_one():
+    _, four = mean_of(SCENE, 3, 1)
+    _, one = mean_of(SCENE, 3, 1, ends=1)
+    assert np.median(one) > 1.3 * np.median(four)
+
+
 @pytest.mark.parametrize(("kernel", "kept"), [(1, 0), (2, 1), (3, 2)])
 def test_moments_of_kernels(kernel, kept):
     """Weights sum to one, the mean time is kept from two bins on, the second moment with three."""
@@ -104,6 +116,7 @@ BAD = {
     "first order": ({"first_order": "odd"}, "'odd' is none of 'expected', 'drawn'"),
     "points": ({"points": "odd"}, "'odd' is none of 'lattice', 'independent'"),
     "kernel": ({"kernel": 4}, "kernel = 4 is none of 1, 2, 3"),
+    "ends": ({"ends": 0}, r"ends = 0 is outside the admissible range \[1, inf\) of integers"),
 }
 
 

@@ -35,6 +35,7 @@ STAGES = [
     {"scene"},
     {"letters", "extent"},
     {"effects", "bounds"},
+    {"effect_table"},
     {"plan"},
     {"trace"},
     {"waveform"},

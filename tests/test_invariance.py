@@ -24,12 +24,13 @@ LEAF = {"reflectance": np.array([0.1, 0.45, 0.3]), "transmittance": np.array([0.
 SIZES = {"max_orders": 4, "n_rays": 512, "bin_width": 0.5, "window": (-80.0, 60.0)}
 
 
-def build(shift=(0.0, 0.0, 0.0), turns=0, divide=1, zenith=20.0, pick=slice(None)):
+def build(shift=(0.0, 0.0, 0.0), turns=0, divide=1, zenith=20.0, pick=slice(None), empty=0):
     """The scene and its lidar, moved by `shift`, turned clockwise by quarter `turns` about the beam's aim."""
     k = np.rot90(EXTINCTION, -turns, axes=(0, 1))
     for axis in range(3):
         k = np.repeat(k, divide, axis=axis)
-    low = np.array([-3.0, -3.0, 0.5]) + shift
+    k = np.pad(k, ((empty, empty), (empty, empty), (0, empty)))
+    low = np.array([-3.0 - empty * EDGE, -3.0 - empty * EDGE, 0.5]) + shift
     voxels = jl.VoxelMap.from_extinction(leaf=0.8 * k, bark=0.2 * k, voxel_size=EDGE / divide, origin=low)
     aspect, azimuth = np.deg2rad(30.0), np.deg2rad(50.0)
     # The height of a plane is that below the origin.
@@ -102,6 +103,16 @@ def test_moving_everything_sideways_changes_nothing(plain):
     lidar, scene = build(shift=(250.0, -120.0, 0.0))
     moved = jl.simulate(lidar, scene, key=KEY, plan=plan, n_photons=4096)
     alike(moved.reflectance, wave.reflectance)
+
+
+def test_empty_voxels_around_the_crown_change_nothing(plain):
+    _, wave = plain
+    lidar, scene = build(empty=3)
+    larger = jl.plan(lidar, scene, n_photons=512, **SIZES)
+    found = jl.simulate(lidar, scene, key=KEY, plan=larger, n_photons=4096)
+    alike(found.reflectance, wave.reflectance)
+    for name, share in found.ledger.items():
+        np.testing.assert_allclose(share, wave.ledger[name], atol=1e-4, err_msg=name)
 
 
 def test_a_lower_scene_shifts_the_time(plain):

@@ -347,7 +347,7 @@ def test_the_plan_serves_the_corners_of_the_bounds():
     for corner in scenes:
         own = jl.plan(LIDAR, corner, max_orders=2, window=(-260.0, 59.0), max_step=plan.layout.max_step)
         assert own.layout.upstream <= plan.layout.upstream
-        assert own.layout.max_path <= plan.layout.max_path
+        assert own.layout.last <= plan.layout.last
         assert own.layout.first_steps <= plan.layout.first_steps
         assert own.layout.march_steps <= plan.layout.march_steps
         assert own.bins.width == plan.bins.width

@@ -251,6 +251,7 @@ def random_knobs(name: str, case: Case, batches: int, photons: int) -> dict:
         "default": {},
         "independent numbers": {"points": "independent"},
         "drawn first order": {"first_order": "drawn"},
+        "one end a flight": {"ends": 1},
     }
     long = run(case, 8 * batches, case.plan(**size, bin_width=0.25), seed=10**6)
     reference = long.mean

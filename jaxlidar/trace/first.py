@@ -18,14 +18,14 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from .._vector import Scalar, Vec, along, scale, vec
+from .._vector import FAR, Scalar, Vec, along, scale, vec
 from ..constants import SPEED_OF_LIGHT
 from ..layout import Bins, Layout
 from ..materials import Specular
 from .deposit import first_bin, instant_row, scatter_rows, smooth_row
 from .footprint import Beam
 from .histories import Histories
-from .march import FAR, Medium, advance, begin, cell_of, earlier, hold_in_columns, later
+from .march import Medium, advance, begin, cell_of, earlier, hold_in_columns, later
 from .surfaces import Surface
 
 CHUNK = 512

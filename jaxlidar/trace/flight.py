@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .._vector import Scalar, with_derivative_of
-from .march import FAR, free_flight
+from .._vector import FAR, Scalar, with_derivative_of
+from .march import free_flight
 from .photons import EVENT, GAP, THROUGH, Photons, Setting, ratio_of, stop
 
 # Random numbers of a flight and of the collision that ends it, beside one for each plate.

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from .._vector import Scalar, Vec, add, dot, from_frame, normalise, scale, vec
+from .._vector import FAR, Scalar, Vec, add, dot, from_frame, normalise, scale, vec
 from ..lidar import Lidar
 
 GOLDEN = (np.sqrt(5.0) - 1) / 2
@@ -44,6 +44,16 @@ class Beam(eqx.Module):
     def view(self, point: Vec) -> Vec:
         """Unit vector from `point` to the sensor."""
         return normalise(add(scale(self.axis, -self.slant_range), scale(point, jnp.asarray(-1.0))))
+
+    def budget(self, x: Vec, w: Vec, left: Scalar) -> Scalar:
+        """How far light may fly from `x` along `w` and be back at the sensor within `left` m.
+
+        `left` is relative to the slant range. The way back begins on an ellipsoid about `x` and the sensor.
+        """
+        r, out = self.slant_range, self.excess(x)
+        divisor = r * (1.0 + dot(self.axis, w)) + left + dot(x, w)
+        flight = 0.5 * (left - out) * (2.0 * r + left + out) / jnp.where(divisor > 0, divisor, 1.0)
+        return jnp.where(left < out, 0.0, jnp.where(divisor > 0, jnp.minimum(flight, FAR), FAR))
 
     def in_view(self, point: Vec) -> Scalar:
         """How much of `point` the receiver sees, 0..1: its field of view with a soft edge of 2 %."""

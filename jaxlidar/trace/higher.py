@@ -21,7 +21,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from .._vector import Scalar, Vec, along, vec
+from .._vector import FAR, Scalar, Vec, along, vec
 from ..constants import SPEED_OF_LIGHT
 from ..layout import Bins, Layout
 from .deposit import instant_row, scatter_rows
@@ -30,7 +30,7 @@ from .flight import DIMENSIONS, Flight, events_of, fly, nearest, plates_ahead
 from .footprint import GOLDEN, Beam, quantile_radius
 from .histories import Histories
 from .landing import aim
-from .march import FAR, Medium, depth_to_top, free_flight, hold_in_columns
+from .march import Medium, depth_to_top, free_flight, hold_in_columns
 from .photons import THROUGH, Hit, Photons, Setting, ratio_of, stop
 from .scatter import collide, view_factors
 from .surfaces import Surface
@@ -155,7 +155,7 @@ def _one_order(setting: Setting, p: Photons, tally: HigherOrders, u: list[Scalar
     met, outcomes, ratio = plates_ahead(setting, p, u[DIMENSIONS:])
     events = events_of(setting, met, outcomes)
     limit = nearest(p, events)
-    budget = jnp.maximum(layout.max_path - p.path, 0.0)
+    budget = stop(setting.beam.budget(p.x, p.w, layout.last - p.path))
     if setting.medium is not None and setting.surfaces:
         w, limit, turned = aim(setting, p, limit, events, (order > 0) & (limit < budget))
         p = eqx.tree_at(lambda p: (p.w, p.weight), p, (w, p.weight * turned))

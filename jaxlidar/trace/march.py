@@ -2,8 +2,8 @@
 
 Nothing is sampled on the way: within a voxel the extinction coefficient is constant, so the optical
 depth is known at every face and linear between them. Distances to faces are computed from integer
-face numbers, never accumulated. Written for one ray; photons are batched by `jax.vmap`, and a whole
-batch stops as soon as its last ray has.
+face numbers, never accumulated. A batch of photons stops as soon as the last of
+them has.
 
 What several results of a step share is held by `lax.optimization_barrier`: the CPU compiler would compute
 it anew for each of them, which takes three times as long.
@@ -15,12 +15,11 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from .._vector import Scalar, Vec, along, from_frame, to_frame
+from .._vector import FAR, Scalar, Vec, along, from_frame, to_frame
 from ..materials import ANGLE_NODES, LeafAngles
 from ..voxels import VoxelMap
 from .footprint import Beam
 
-FAR = 1e30
 # Steps between two looks at whether any ray of the batch still moves.
 BLOCK = 16
 
@@ -179,7 +178,9 @@ def cell_of(medium: Medium, voxel: tuple[Int[Array, "*s"], ...]) -> Int[Array, "
     return (i * ny + j) * nz + jnp.clip(voxel[2], 0, nz - 1)
 
 
-def advance(walk: Walk, voxel: tuple[Int[Array, "*s"], ...], faces: tuple[Scalar, ...], go: Bool[Array, "*s"]):
+def advance(
+    walk: Walk, voxel: tuple[Int[Array, "*s"], ...], faces: tuple[Scalar, ...], go: Bool[Array, "*s"]
+) -> tuple[Int[Array, "*s"], ...]:
     """The voxel behind the nearest face if `go`; through an edge or a corner, one face at a time."""
     tx, ty, tz = faces
     x = (tx <= ty) & (tx <= tz)

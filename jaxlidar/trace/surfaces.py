@@ -4,10 +4,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._vector import Scalar, Vec, dot, scale, vec
+from .._vector import FAR, Scalar, Vec, dot, scale, vec
 from ..materials import AbstractLaw
 from ..scene import Ground, Plate, Scene
-from .march import FAR
 
 
 class Surface(eqx.Module):
