@@ -6,12 +6,8 @@ as they are.
 """
 
 import dataclasses
-import hashlib
 import os
-import zipfile
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from typing import Any, final
 
 import equinox as eqx
@@ -23,11 +19,12 @@ from jaxtyping import ArrayLike, Bool, Float, Int, PRNGKeyArray
 
 from jaxlidar import Lidar, Plan, Scene
 from jaxlidar._checks import check_range
-from jaxlidar.io import whole_file
+from jaxlidar._threads import ONE_CORE, side_by_side
 from jaxlidar.simulate import MIN_BATCHES
 
 from .data import data_of
-from .fit import Fitting, Outcome, Request, best_of, labels_of, named
+from .fit import Fitting, Request, best_of, labels_of, named
+from .kept import Kept, Row, fingerprint, row_of
 from .model import Evaluation, Model, evaluate
 from .planning import check_samples, plan_for
 from .retrieval import SOLVER, fits_from, scale_of
@@ -162,9 +159,9 @@ def retrieve_many(
         return best_of(fits)
 
     names = [*settled[0], *extra]
-    kept = _Kept(path, _fingerprint(y, sigma, names), names)
+    kept = Kept(path, fingerprint(y, sigma, names))
     simulate = _Simulator(lidars, scenes, plan, settled[0], key, min(int(lanes), len(y)))
-    ended: dict[int, _Row] = kept.rows
+    ended: dict[int, Row] = kept.rows
     todo = [i for i in range(len(y)) if i not in ended]
     running: dict[int, tuple[Fitting, Request]] = {}
     try:
@@ -180,7 +177,7 @@ def retrieve_many(
                     running[i] = fit, fit.send(evaluation)
                 except StopIteration as end:
                     del running[i]
-                    ended[i] = _row(end.value)
+                    ended[i] = row_of(end.value)
                     if progress is not None:
                         progress(Progress(len(ended), len(y), sum(r.converged for r in ended.values())))
                     if len(ended) % max(simulate.lanes, 16) == 0:
@@ -244,25 +241,6 @@ def _one_each(field: str, given: Any, count: int) -> list[Any]:
     return given
 
 
-@dataclasses.dataclass(frozen=True)
-class _Row:
-    """What is kept of a fit."""
-
-    values: np.ndarray
-    stderr: np.ndarray
-    covariance: np.ndarray
-    reduced_chi2: float
-    converged: bool
-    steps: int
-    fitted: np.ndarray
-    status: str
-
-
-def _row(o: Outcome) -> _Row:
-    total = np.asarray(o.evaluation.total)
-    return _Row(o.values, o.stderr, o.covariance, o.reduced_chi2, o.converged, o.steps, total, o.status)
-
-
 class _Simulator:
     """Simulates what all lanes want in one compiled call; several threads share the lanes."""
 
@@ -280,24 +258,13 @@ class _Simulator:
         self.each = -(-lanes // self.threads)
         self.lanes = self.each * self.threads
         self.lidars, self.scenes, self.plan = lidars, scenes, plan
-        self.compiled = False
 
     def __call__(self, requests: dict[int, Request]) -> dict[int, Evaluation]:
         numbers = list(requests)
         groups = [numbers[i : i + self.each] for i in range(0, len(numbers), self.each)]
-        # JAX keeps its precision by thread.
-        double = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
-
-        def run(group: list[int]) -> dict[int, Evaluation]:
-            with jax.enable_x64(double):
-                return self._group(group, requests)
-
         found: dict[int, Evaluation] = {}
-        if not self.compiled:
-            # One alone compiles for all.
-            found, groups, self.compiled = run(groups[0]), groups[1:], True
-        with ThreadPoolExecutor(max_workers=self.threads) as pool:
-            for more in pool.map(run, groups):
+        with side_by_side(self.threads) as run:
+            for more in run(lambda group: self._group(group, requests), groups):
                 found |= more
         return found
 
@@ -338,7 +305,7 @@ def _stacked(given: list[Any], numbers: list[int]) -> Any:
     return eqx.combine(jax.tree.map(lambda *a: jnp.stack(a), *dynamic), static[0])
 
 
-@eqx.filter_jit
+@eqx.filter_jit(**ONE_CORE)
 def _simulate(lidar, scene, plan, places, values, keys, own_lidar: bool, own_scene: bool):
     lidar, fixed_lidar = eqx.partition(lidar, eqx.is_array)
     scene, fixed_scene = eqx.partition(scene, eqx.is_array)
@@ -358,47 +325,3 @@ def _simulate(lidar, scene, plan, places, values, keys, own_lidar: bool, own_sce
 
     mapped = (lidar if own_lidar else None, scene if own_scene else None, values)
     return jax.lax.map(in_turn, mapped)
-
-
-def _fingerprint(y: np.ndarray, sigma: np.ndarray, names: list[Settled]) -> str:
-    digest = hashlib.sha256()
-    for array in (y, np.ascontiguousarray(sigma), *(a for s in names for a in (s.low, s.high))):
-        digest.update(np.ascontiguousarray(array).tobytes())
-    digest.update("\n".join(s.name for s in names).encode())
-    return digest.hexdigest()
-
-
-class _Kept:
-    """The file that keeps what is done."""
-
-    def __init__(self, path: str | os.PathLike[str] | None, fingerprint: str, names: list[Settled]):
-        self.path = None if path is None else Path(path)
-        self.fingerprint = fingerprint
-        self.rows: dict[int, _Row] = {}
-        if self.path is not None and self.path.exists():
-            self._read(self.path)
-
-    def _read(self, path: Path) -> None:
-        try:
-            with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-                table = {name: file[name] for name in file.files}
-            fingerprint, numbers = str(table["fingerprint"]), table["number"].tolist()
-            columns = {f.name: table[f.name] for f in dataclasses.fields(_Row)}
-        except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile) as error:
-            raise ValueError(f"path = {path} is damaged or no file of fits: {error}") from error
-        if fingerprint != self.fingerprint:
-            raise ValueError(f"path = {path} keeps fits of other footprints, noise, bounds or unknowns")
-        for n, i in enumerate(numbers):
-            fields = {name: column[n] for name, column in columns.items()}
-            self.rows[i] = _Row(**{name: v if v.ndim else v.item() for name, v in fields.items()})
-
-    def write(self) -> None:
-        if self.path is None or not self.rows:
-            return
-        order = sorted(self.rows)
-        table: dict[str, Any] = {
-            f.name: np.array([getattr(self.rows[i], f.name) for i in order]) for f in dataclasses.fields(_Row)
-        }
-        with whole_file(self.path) as draft, draft.open("wb") as file:
-            table |= {"number": np.array(order), "fingerprint": np.array(self.fingerprint)}
-            np.savez(file, allow_pickle=False, **table)

@@ -8,9 +8,7 @@ All evaluations use the same random keys, so that the waveform is a smooth funct
 evaluation averages batches of photons with keys of their own, whose spread is the simulation's own noise.
 """
 
-import os
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -22,6 +20,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxlidar import Lidar, Plan, Response, Scene, Waveform
 from jaxlidar import waveform as make_waveform
+from jaxlidar._threads import ONE_CORE, side_by_side
 from jaxlidar.simulate import MIN_BATCHES, total_all, trace_all
 
 from .unknowns import Place, Settled, put
@@ -29,7 +28,7 @@ from .unknowns import Place, Settled, put
 Values = tuple[Array, ...]
 
 
-@eqx.filter_jit
+@eqx.filter_jit(**ONE_CORE)
 def _batch(
     lidar: Lidar, scene: Scene, plan: Plan, places: tuple[Place, ...], values: Values, key: PRNGKeyArray
 ) -> tuple[Any, Float[Array, "wavelengths bins"], Float[Array, "columns wavelengths bins"]]:
@@ -163,20 +162,11 @@ class Model:
         return Evaluation(np.asarray(total, float), np.moveaxis(columns, 0, -1), response, batches)
 
     def _trace(self, values: Values) -> list[Any]:
-        # JAX keeps its precision by thread.
-        double = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
-
         def one(key):
-            with jax.enable_x64(double):
-                out = _batch(self.lidar, self.scene, self.plan, self.places, values, key)
-                return jax.block_until_ready(out)
+            return _batch(self.lidar, self.scene, self.plan, self.places, values, key)
 
-        # The first alone: it may compile. One batch runs on one core, so several threads use them all.
-        first = one(self.keys[0])
-        if len(self.keys) == 1:
-            return [first]
-        with ThreadPoolExecutor(max_workers=max(os.cpu_count() or 1, 1)) as pool:
-            return [first, *pool.map(one, self.keys[1:])]
+        with side_by_side() as run:
+            return list(run(one, self.keys))
 
     def waveform(
         self, flat: Float[np.ndarray, " columns"], evaluation: Evaluation, stderr: np.ndarray

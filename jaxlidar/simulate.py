@@ -2,11 +2,8 @@
 
 import dataclasses
 import math
-import os
 import time
 from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -15,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from ._checks import is_traced
+from ._threads import ONE_CORE, side_by_side
 from .effects import without
 from .extent import Extent
 from .letters import scene_optics, spell
@@ -27,13 +25,6 @@ from .waveform import Waveform, is_straight, open_at_first_return, total_of, wav
 
 # Fewer batches give no trustworthy standard error.
 MIN_BATCHES = 8
-# Batches run side by side, so none may spread over several cores: they would wait for one another.
-ONE_CORE: dict[str, Any] = {
-    "compiler_options": {
-        "xla_cpu_multi_thread_eigen": False,
-        "xla_cpu_enable_concurrency_optimized_scheduler": False,
-    }
-}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -209,14 +200,12 @@ def _simulate_batches(lidar, scene, plan, key, rtol, atol, fixed, max_seconds, p
     error = math.inf
 
     def one(n: int):
-        out = _batch(lidar, scene, plan, jax.random.fold_in(key, n))
-        return jax.block_until_ready(out)
+        return _batch(lidar, scene, plan, jax.random.fold_in(key, n))
 
-    # Threads that ask for a program at once wait for one compilation.
-    with ThreadPoolExecutor(max_workers=max(os.cpu_count() or 1, 1)) as pool:
+    with side_by_side() as run:
         try:
             while True:
-                for response, mean in pool.map(one, range(done, wanted)):
+                for response, mean in run(one, range(done, wanted)):
                     total = response if total is None else _add(total, response)
                     means.append(np.asarray(mean))
                     done += 1
@@ -245,7 +234,6 @@ def _simulate_batches(lidar, scene, plan, key, rtol, atol, fixed, max_seconds, p
         except KeyboardInterrupt:
             if done < MIN_BATCHES:
                 raise
-            pool.shutdown(cancel_futures=True)
             error, _ = _error(np.stack(means))
             stopped = "interrupted"
     mean = jax.tree.map(lambda a: a / done, total)

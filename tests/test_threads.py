@@ -1,0 +1,60 @@
+"""Programs side by side: results in order, JAX as the caller has set it, nothing left after an error."""
+
+import os
+import threading
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxlidar as jl
+from jaxlidar._threads import side_by_side
+
+
+@pytest.mark.skipif(os.cpu_count() == 1, reason="one core has one thread")
+def test_results_come_in_order_from_several_threads():
+    meeting = threading.Barrier(2, timeout=30)
+
+    def one(n):
+        # Passes only if two run at once.
+        if n < 2:
+            meeting.wait()
+        return jnp.asarray(n) ** 2
+
+    with side_by_side(2) as run:
+        assert [int(v) for v in run(one, range(9))] == [n**2 for n in range(9)]
+
+
+@pytest.mark.parametrize("double", [False, True])
+def test_precision_is_the_callers(double):
+    with jax.enable_x64(double), side_by_side(2) as run:
+        kinds = {str(v.dtype) for v in run(lambda n: jnp.ones(n + 1), range(4))}
+    assert kinds == {"float64" if double else "float32"}
+
+
+def test_what_waits_is_dropped_after_an_error():
+    begun = []
+
+    def one(n):
+        begun.append(n)
+        if n == 0:
+            raise RuntimeError("first")
+
+    with pytest.raises(RuntimeError, match="first"), side_by_side(1) as run:
+        list(run(one, range(1000)))
+    assert len(begun) < 1000
+
+
+@pytest.mark.parametrize("double", [False, True])
+def test_simulate_keeps_the_precision(double):
+    kind = "float64" if double else "float32"
+    with jax.enable_x64(double):
+        voxels = jl.VoxelMap.from_lad(np.full((1, 1, 4), 0.2), voxel_size=2.0, origin=(-1.0, -1.0, 0.0))
+        canopy = jl.Canopy(voxels, leaf=jl.Isotropic(albedo=0.8))
+        scene = jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=0.3))
+        wave = jl.simulate(jl.Lidar(), scene, key=jax.random.key(0), n_photons=256, max_orders=2, n_rays=64)
+    assert str(wave.reflectance.dtype) == str(wave.stderr.dtype) == kind
+    # No batch was rounded to single precision.
+    batch = np.asarray(wave.components["higher"]) * 8
+    assert np.any(batch != batch.astype("float32")) == double
