@@ -28,7 +28,6 @@ from .unknowns import Place, Settled, put
 Values = tuple[Array, ...]
 
 
-@eqx.filter_jit(**ONE_CORE)
 def _batch(
     lidar: Lidar, scene: Scene, plan: Plan, places: tuple[Place, ...], values: Values, key: PRNGKeyArray
 ) -> tuple[Any, Float[Array, "wavelengths bins"], Float[Array, "columns wavelengths bins"]]:
@@ -49,6 +48,9 @@ def _batch(
     push = jax.vmap(lambda t: jax.jvp(total, (flat,), (t,), has_aux=True), out_axes=(None, 0, None))
     value, columns, response = push(jnp.eye(flat.size, dtype=flat.dtype))
     return response, value, columns
+
+
+_compiled_batch = eqx.filter_jit(_batch, **ONE_CORE)
 
 
 @eqx.filter_jit
@@ -163,7 +165,7 @@ class Model:
 
     def _trace(self, values: Values) -> list[Any]:
         def one(key):
-            return _batch(self.lidar, self.scene, self.plan, self.places, values, key)
+            return _compiled_batch(self.lidar, self.scene, self.plan, self.places, values, key)
 
         with side_by_side() as run:
             return list(run(one, self.keys))

@@ -166,10 +166,12 @@ def total_all(
     return jnp.stack([total_of(r, lidar, scene, plan)[i] for i, r in enumerate(response)])
 
 
-@eqx.filter_jit(**ONE_CORE)
 def _batch(lidar: Lidar, scene: Scene, plan: Plan, key: PRNGKeyArray):
     response = trace_all(lidar, scene, plan, key)
     return response, total_all(response, lidar, scene, plan)
+
+
+_compiled_batch = eqx.filter_jit(_batch, **ONE_CORE)
 
 
 @eqx.filter_jit
@@ -200,7 +202,7 @@ def _simulate_batches(lidar, scene, plan, key, rtol, atol, fixed, max_seconds, p
     error = math.inf
 
     def one(n: int):
-        return _batch(lidar, scene, plan, jax.random.fold_in(key, n))
+        return _compiled_batch(lidar, scene, plan, jax.random.fold_in(key, n))
 
     with side_by_side() as run:
         try:

@@ -12,7 +12,7 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 # From data to waveform: a module may import from its own stage and from those before it.
 STAGES = [
-    {"constants", "_checks", "_vector", "_expint", "_coefficients", "_twofold"},
+    {"constants", "_checks", "_threads", "_vector", "_expint", "_coefficients", "_twofold"},
     {
         "layout",
         "pulse",

@@ -11,9 +11,10 @@ import sys
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import WHOLE, agrees, batch_mean, whole_lidar
+from helpers import WHOLE, agrees, batch_mean, slab, whole_lidar
 
 import jaxlidar as jl
 
@@ -157,6 +158,28 @@ def test_turning_and_dividing(totals, changes):
         assert agrees(a, np.hypot(c, d), b)
     # The same test rejects higher orders that are 5 % off.
     assert not agrees(1.05 * value[1], np.hypot(stderr[1], totals[1][1]), totals[0][1])
+
+
+def test_within_a_transformation():
+    """Compiled by the caller, for several scenes at once, and differentiated."""
+    lidar = jl.Lidar(divergence=4.0)
+
+    def scene_of(rho):
+        canopy = jl.Canopy(slab(0.8), leaf=jl.Isotropic(albedo=0.6))
+        return jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=rho))
+
+    plan = jl.plan(lidar, scene_of(0.3), max_orders=2, n_rays=64)
+
+    def reflectance(rho):
+        return jl.simulate(lidar, scene_of(rho), key=KEY, plan=plan, n_photons=512).reflectance[0]
+
+    values = jnp.asarray([0.2, 0.4])
+    many = jax.jit(jax.vmap(reflectance))(values)
+    for value, found in zip(values, many):
+        alike(found, reflectance(value), 1e-5)
+    slope = jax.jacfwd(reflectance)(0.3)
+    # The second order is linear in the ground's reflectance, too: the ground cannot light itself.
+    alike(slope, (many[1] - many[0]) / 0.2, 1e-4)
 
 
 def test_the_plan_is_a_value():

@@ -122,8 +122,8 @@ def test_canopy_and_ground_at_three_wavelengths(target, monkeypatch):
 def test_optics_alone_trace_once(target, monkeypatch):
     """Leaf traits and reflectances never move light: the photons of the first simulation serve them all."""
     calls = []
-    batch = inversion.model._batch
-    monkeypatch.setattr("inversion.model._batch", lambda *args: (calls.append(1), batch(*args))[1])
+    batch = inversion.model._compiled_batch
+    monkeypatch.setattr("inversion.model._compiled_batch", lambda *args: (calls.append(1), batch(*args))[1])
     optical = [UNKNOWNS[0], UNKNOWNS[2], UNKNOWNS[4]]
     start = canopy_scene(Cab=60.0, Cw=0.02, ground=(0.2, 0.2, 0.2))
     fit = retrieve_canopy(target, 2, start, optical)
