@@ -18,7 +18,7 @@ from .lidar import Lidar
 from .plan import Plan
 from .scene import Scene, leaf_optics
 from .trace.flight import DIMENSIONS, events_of, fly, nearest, plates_ahead
-from .trace.footprint import quantile_radius
+from .trace.footprint import across_beam
 from .trace.histories import histories
 from .trace.photons import THROUGH, Photons, Setting
 from .trace.response import geometry_of
@@ -143,13 +143,14 @@ def _setting(lidar: Lidar, scene: Scene, plan: Plan) -> Setting:
 
 def _start(setting: Setting, size: int, key: PRNGKeyArray) -> Photons:
     radius_key, turn_key = jax.random.split(key)
-    r = quantile_radius(setting.beam, jax.random.uniform(radius_key, (size,), maxval=1.0 - 1e-7))
-    turn = 2 * jnp.pi * jax.random.uniform(turn_key, (size,))
-    point, w, excess = setting.beam.ray((r * jnp.cos(turn), r * jnp.sin(turn)))
-    up = jnp.asarray(-setting.layout.upstream, r.dtype)
+    share, turn = jax.random.uniform(radius_key, (size,)), jax.random.uniform(turn_key, (size,))
+    point, w, excess = setting.beam.ray(across_beam(setting.beam, share, turn))
+    up = jnp.asarray(-setting.layout.upstream, excess.dtype)
     none = jnp.zeros((size,), jnp.int32)
-    still = vec(jnp.zeros_like(r) for _ in range(3))
-    return Photons(along(point, w, up), w, excess + up, jnp.ones_like(r), none, none - 1, still, none == 0)
+    still = vec(jnp.zeros_like(excess) for _ in range(3))
+    return Photons(
+        along(point, w, up), w, excess + up, jnp.ones_like(excess), none, none - 1, still, none == 0
+    )
 
 
 def _one_flight(setting: Setting, p: Photons, key: PRNGKeyArray, cone: float) -> tuple[Photons, _Arrival]:

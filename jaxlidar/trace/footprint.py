@@ -89,11 +89,15 @@ def beam_of(lidar: Lidar) -> Beam:
     )
 
 
-def quantile_radius(beam: Beam, u: Scalar) -> Scalar:
-    """Radius within which the share `u` (below 1) of the energy lies, in m."""
-    if beam.gaussian:
-        return beam.radius * jnp.sqrt(-0.5 * jnp.log1p(-u))
-    return beam.radius * jnp.sqrt(u)
+def disc(radius: Scalar, turn: Scalar) -> tuple[Scalar, Scalar]:
+    """Coordinates of the point at `radius` and `turn`, the latter in turns."""
+    return radius * jnp.cos(2 * np.pi * turn), radius * jnp.sin(2 * np.pi * turn)
+
+
+def across_beam(beam: Beam, share: Scalar, turn: Scalar) -> tuple[Scalar, Scalar]:
+    """The point, m, at `turn`, within whose radius the share `share` of the energy lies."""
+    share = jnp.clip(share, 0.0, 1.0 - 1e-7)
+    return disc(beam.radius * jnp.sqrt(-0.5 * jnp.log1p(-share) if beam.gaussian else share), turn)
 
 
 def lattice(
@@ -103,17 +107,15 @@ def lattice(
     i = jnp.arange(count)
     u = (i + shift[0]) / count
     turn = jnp.asarray((np.arange(count) * GOLDEN) % 1.0, u.dtype) + shift[1]
-    r, a = quantile_radius(beam, jnp.minimum(u, 1.0 - 1e-7)), 2 * np.pi * turn
-    return (r * jnp.cos(a), r * jnp.sin(a)), jnp.full((count,), 1.0 / count, u.dtype)
+    return across_beam(beam, u, turn), jnp.full((count,), 1.0 / count, u.dtype)
 
 
 def scattered(
     beam: Beam, count: int, key: PRNGKeyArray
 ) -> tuple[tuple[Scalar, Scalar], Float[Array, "rays"]]:
     """`count` rays of equal energy at independent places."""
-    u, turn = jax.random.uniform(key, (2, count), maxval=1.0 - 1e-7)
-    r, a = quantile_radius(beam, u), 2 * np.pi * turn
-    return (r * jnp.cos(a), r * jnp.sin(a)), jnp.full((count,), 1.0 / count, u.dtype)
+    u, turn = jax.random.uniform(key, (2, count))
+    return across_beam(beam, u, turn), jnp.full((count,), 1.0 / count, u.dtype)
 
 
 def product_rule(

@@ -27,7 +27,7 @@ from ..layout import Bins, Layout
 from .deposit import instant_row, scatter_rows
 from .draws import Independent, draws
 from .flight import DIMENSIONS, Flight, events_of, fly, nearest, plates_ahead
-from .footprint import GOLDEN, Beam, quantile_radius
+from .footprint import GOLDEN, Beam, across_beam
 from .histories import Histories
 from .landing import aim
 from .march import Medium, depth_to_top, free_flight, hold_in_columns
@@ -85,11 +85,9 @@ def higher_orders(
         else:
             share, turn = places(lane, jnp.asarray(layout.orders))
         inside = lane < photons
-        r = quantile_radius(beam, jnp.clip(share, 0.0, 1.0 - 1e-7))
-        across = (r * jnp.cos(2 * jnp.pi * turn), r * jnp.sin(2 * jnp.pi * turn))
-        across, share = hold_in_columns(beam, medium, across)
+        across, share = hold_in_columns(beam, medium, across_beam(beam, share, turn))
         point, w, excess = beam.ray(across)
-        up = jnp.asarray(-layout.upstream, r.dtype)
+        up = jnp.asarray(-layout.upstream, excess.dtype)
         return Photons(
             along(point, w, up),
             w,
@@ -97,7 +95,7 @@ def higher_orders(
             jnp.where(inside, share / photons, 0.0),
             jnp.zeros(lane.shape, jnp.int32),
             jnp.full(lane.shape, -1, jnp.int32),
-            vec(jnp.zeros_like(r) for _ in range(3)),
+            vec(jnp.zeros_like(excess) for _ in range(3)),
             inside,
         )
 
@@ -160,7 +158,7 @@ def _one_order(setting: Setting, p: Photons, tally: HigherOrders, u: list[Scalar
         w, limit, turned = aim(setting, p, limit, events, (order > 0) & (limit < budget))
         p = eqx.tree_at(lambda p: (p.w, p.weight), p, (w, p.weight * turned))
     # One number says in which stratum the photon goes on, and where in each stratum the points are.
-    chosen = jnp.floor(u[0] * ends)
+    chosen = jnp.minimum(jnp.floor(u[0] * ends), ends - 1)
     strata = jnp.stack([(i + (u[0] * ends - chosen)) / ends for i in range(ends)])
     wide = functools.partial(jnp.broadcast_to, shape=strata.shape)
     flights = fly(setting, p, limit, budget, jnp.maximum(strata, 1e-9))

@@ -23,7 +23,7 @@ from jaxtyping import Array, Float
 
 from .._vector import Scalar, dot, to_frame, vec
 from ..materials import Specular
-from .footprint import GOLDEN, Beam, quantile_radius
+from .footprint import GOLDEN, Beam, across_beam, disc
 from .surfaces import Surface
 
 RAYS = 4096
@@ -64,8 +64,8 @@ def mirror_rays(
     turn = _turn(i * GOLDEN, r)
     # A second, independent pair of coordinates for the lobe.
     lobe = sigma * jnp.sqrt(-2.0 * jnp.log1p(-_turn(i * 0.7548776662466927 + 0.5, r)))
-    inside, lobe = _disc(a * jnp.sqrt(u), turn), _disc(lobe, _turn(i * 0.5698402909980532 + 0.5, r))
-    from_beam = _disc(quantile_radius(beam, u), turn)
+    inside, lobe = disc(a * jnp.sqrt(u), turn), disc(lobe, _turn(i * 0.5698402909980532 + 0.5, r))
+    from_beam = across_beam(beam, u, turn)
     from_aperture = tuple((q - m - g) / 2.0 for q, m, g in zip(inside, miss, lobe))
     x, y = (jnp.concatenate([p, q]) for p, q in zip(from_beam, from_aperture))
 
@@ -105,10 +105,6 @@ def within(distance: Scalar, sigma: Scalar, radius: Scalar) -> Scalar:
 
 def _turn(number: np.ndarray, like: Scalar) -> Scalar:
     return jnp.asarray(number % 1.0, like.dtype)
-
-
-def _disc(radius: Scalar, turn: Scalar) -> tuple[Scalar, Scalar]:
-    return radius * jnp.cos(2 * np.pi * turn), radius * jnp.sin(2 * np.pi * turn)
 
 
 def _length(v: tuple[Scalar, Scalar]) -> Scalar:
