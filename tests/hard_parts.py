@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxlidar as jl
-from jaxlidar.trace.march import FAR, free_flight, medium_of
+from jaxlidar.trace.march import free_flight, medium_of
 
 PROBABILITY = {"p_leaf": 0.3, "p_bark": 0.1, "edge": 0.5}
 
@@ -41,8 +41,8 @@ def chord(periodic):
         voxels = jl.VoxelMap.from_extinction(leaf=k, voxel_size=1.0)
         medium = medium_of(voxels, jnp.zeros(3), periodic, jnp.ones(()))
         x, w = (tuple(p[n][None] for n in names) for names in ("xyz", "uvw"))
-        never = jnp.full((1,), FAR)
-        return free_flight(medium, x, w, never, p["limit"][None], jnp.ones((1,), bool), 512).depth
+        none, active = jnp.zeros((0, 1)), jnp.ones((1,), bool)
+        return free_flight(medium, x, w, none, p["limit"][None], active, 512).total
 
     return measure
 
