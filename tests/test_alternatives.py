@@ -45,7 +45,9 @@ CHOICES = {
 }
 
 
-@pytest.mark.parametrize("case", CHOICES)
+@pytest.mark.parametrize(
+    "case", [pytest.param(c, marks=pytest.mark.slow if c == "seven ends, drawn" else ()) for c in CHOICES]
+)
 def test_the_same_is_estimated(case):
     choice, scene, orders = CHOICES[case]
     a, one = mean_of(scene, orders, 1)

@@ -21,7 +21,7 @@ def total(lidar, scene, photons, *, seed=0, cone=CONE, **planned):
     return weight.mean(axis=1), weight.std(axis=1, ddof=1) / np.sqrt(photons)
 
 
-@pytest.mark.parametrize("angles", ["planophile", "erectophile"])
+@pytest.mark.parametrize("angles", [pytest.param("planophile", marks=pytest.mark.slow), "erectophile"])
 def test_leaves_of_given_angles_agree_with_simulate(angles):
     voxels = jl.VoxelMap.from_lad(
         np.full((1, 1, 4), 0.2), voxel_size=(50, 50, 2.5), origin=(-25, -25, 0), leaf_angles=angles

@@ -45,7 +45,12 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("name", list(CASES))
+LONG = ("planophile leaves", "no ground")
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.slow if n in LONG else ()) for n in CASES]
+)
 def test_shares_add_up(name):
     what, zenith = CASES[name]
     lidar = jl.Lidar(wavelength=(532.0, 1064.0), zenith=zenith, divergence=2.0)

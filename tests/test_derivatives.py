@@ -130,6 +130,7 @@ def test_derivatives_are_not_noisier_than_their_differences(estimates):
         assert np.all(np.std(exact, axis=0) < 10 * np.std(difference, axis=0)), name
 
 
+@pytest.mark.slow
 def test_forward_and_reverse_agree():
     """J v by forward mode and w J v by reverse mode are the same number."""
     _, table = SCENES["nadir, slope"]

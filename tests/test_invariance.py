@@ -173,13 +173,16 @@ def test_within_a_transformation():
     def reflectance(rho):
         return jl.simulate(lidar, scene_of(rho), key=KEY, plan=plan, n_photons=512).reflectance[0]
 
+    def with_slope(rho):
+        return jax.jvp(reflectance, (rho,), (jnp.ones_like(rho),))
+
     values = jnp.asarray([0.2, 0.4])
-    many = jax.jit(jax.vmap(reflectance))(values)
+    many, slopes = jax.jit(jax.vmap(with_slope))(values)
     for value, found in zip(values, many):
         alike(found, reflectance(value), 1e-5)
-    slope = jax.jacfwd(reflectance)(0.3)
     # The second order is linear in the ground's reflectance, too: the ground cannot light itself.
-    alike(slope, (many[1] - many[0]) / 0.2, 1e-4)
+    alike(slopes[0], (many[1] - many[0]) / 0.2, 1e-4)
+    alike(slopes[1], slopes[0], 1e-4)
 
 
 def test_the_plan_is_a_value():

@@ -231,6 +231,7 @@ def test_measured_leaves_of_angers(shared):
     assert [round(e[n], 1) for n in ("Cab", "Car") for e in (green, error)] == [4.9, 6.6, 3.7, 2.7]
 
 
+@pytest.mark.slow
 def test_measured_leaves_of_lopex(shared):
     record = measured(shared, "lopex_half.npz")
     fit = invert_leaves(record["wavelength_nm"], record["R"], record["T"])

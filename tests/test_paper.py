@@ -26,6 +26,9 @@ def script(monkeypatch):
     sys.modules.pop("_common", None)
 
 
+LONG = ("introduction", "figure_07", "figure_08", "figure_09")
+
+
 def test_every_figure_of_the_paper_that_shows_numbers_has_a_script():
     figures = {int(part) for name in SCRIPTS for part in name.split("_")[1:] if name.startswith("figure")}
     assert figures == {1, 2, 5, 6, 7, 8, 9, 10, 12, 13, 14}
@@ -33,7 +36,7 @@ def test_every_figure_of_the_paper_that_shows_numbers_has_a_script():
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=pytest.mark.slow if n == "introduction" else ()) for n in SCRIPTS]
+    "name", [pytest.param(n, marks=pytest.mark.slow if n in LONG else ()) for n in SCRIPTS]
 )
 def test_a_script_runs_and_asserts_what_the_paper_concludes(script, name, tmp_path, capsys):
     found = script(name).main(["--small", "--out", str(tmp_path)])

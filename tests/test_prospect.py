@@ -136,6 +136,7 @@ def test_new_values_compile_nothing():
     assert values[0][0] > values[1][0]
 
 
+@pytest.mark.slow
 def test_traced_wavelengths(precision):
     leaf = Prospect()
     np.testing.assert_allclose(
@@ -152,6 +153,7 @@ def many(n):
     return jax.vmap(lambda *traits: Prospect(*traits))(*map(jnp.asarray, values))
 
 
+@pytest.mark.slow
 def test_batches(precision):
     leaves, some = many(7), np.array([450.0, 700.5, 1550.0])
     R, T = jax.jit(lambda leaves: prospect_spectra(leaves, some, batch_size=3))(leaves)
