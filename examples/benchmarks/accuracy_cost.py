@@ -169,8 +169,8 @@ def bias_of(found: Run, reference: Run) -> float:
     mean, seen = reference.mean, reference.mean > 0.01 * reference.mean.max()
     variance = sum(r.waves[:, seen].var(axis=0, ddof=1) / len(r.waves) for r in (found, reference))
     excess = np.mean(((found.mean - mean)[seen] ** 2 - variance) / mean[seen] ** 2)
-    # Three standard errors of an excess that is noise alone.
-    noise = 3.0 * np.sqrt(2.0) * np.sqrt(np.mean((variance / mean[seen] ** 2) ** 2) / seen.sum() * 5.0)
+    # Five standard errors of an excess that is noise alone: samples are correlated, and their tails long.
+    noise = 5.0 * np.sqrt(2.0) * np.sqrt(np.mean((variance / mean[seen] ** 2) ** 2) / seen.sum() * 5.0)
     return float(np.sqrt(excess)) if excess > noise else 0.0
 
 
