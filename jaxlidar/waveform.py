@@ -200,16 +200,22 @@ def waveform(
     """
     lidar, scene = without(lidar, scene, plan.off)
     letters = optics(lidar, scene, plan)
+    # The pulse, and the sum over all time as one more sample, come before the many wavelengths if they can.
+    early = None if scene.atmosphere is not None else _pulse_and_sum(lidar, plan)
     if isinstance(response, list):
+        response = [_seen_through(r, early) for r in response]
         parts = [_coloured(r, letters[:, i : i + 1], plan) for i, r in enumerate(response)]
         first = jnp.concatenate([f for f, _, _ in parts], axis=1)
         higher = jnp.concatenate([h for _, h, _ in parts], axis=1)
         ledger = {name: jnp.concatenate([part[name] for _, _, part in parts]) for name in parts[0][2]}
     else:
-        first, higher, ledger = _coloured(response, letters, plan)
+        first, higher, ledger = _coloured(_seen_through(response, early), letters, plan)
     names = plan.layout.materials
-    fine = jnp.concatenate([first + higher, jnp.sum(first, 0)[None], jnp.sum(higher, 0)[None]])
-    sampled = sample(fine, lidar, scene, plan)
+    lines = jnp.concatenate([first + higher, jnp.sum(first, 0)[None], jnp.sum(higher, 0)[None]])
+    if early is None:
+        sampled, whole = sample(lines, lidar, scene, plan), jnp.sum(lines[-2] + lines[-1], axis=-1)
+    else:
+        sampled, whole = lines[..., :-1], lines[-2, :, -1] + lines[-1, :, -1]
     components = dict(zip([*names, "first", "higher"], sampled))
     total = sampled[-2] + sampled[-1]
     if returns_air(scene):
@@ -221,14 +227,12 @@ def waveform(
     # E_t * eta * A_r / (pi R^2): the lidar equation of a Lambertian target that fills the footprint.
     received = lidar.aperture_area / (jnp.pi * jnp.maximum(slant, 1e-3) ** 2)
     gain = jnp.outer(lidar.energy_per_wavelength * lidar.efficiency_per_wavelength, received)
-    returned = (
-        jnp.sum(fine[-2] + fine[-1], axis=-1) * lidar.aperture_area / (jnp.pi * lidar.range_to_reference**2)
-    )
+    returned = whole * lidar.aperture_area / (jnp.pi * lidar.range_to_reference**2)
     # What returns is part of what escaped, or, where only one order was followed, would have.
     source = "unfollowed" if plan.orders == 1 and len(plan.layout.materials) > 1 else "escaped"
     reach = jnp.minimum(returned, ledger[source])
     full = {"returned": reach, **ledger, source: ledger[source] - reach}
-    per_energy = jnp.sum(fine[-2] + fine[-1], axis=-1) / jnp.maximum(full["escaped"], 1e-6)
+    per_energy = whole / jnp.maximum(full["escaped"], 1e-6)
     unfollowed = full["unfollowed"] if plan.orders > 1 else jnp.zeros_like(full["unfollowed"])
     return Waveform(
         time=time,
@@ -268,6 +272,18 @@ def open_at_first_return(wave: Waveform, lidar: Lidar) -> Waveform:
         stderr=rows[2],
         components=dict(zip(wave.components, rows[3:])),
     )
+
+
+def _pulse_and_sum(lidar: Lidar, plan: Plan) -> Float[Array, "fine columns"]:
+    return jnp.concatenate([pulse_kernel(lidar, plan), jnp.ones((plan.bins.count, 1))], axis=1)
+
+
+def _seen_through(response: Response, matrix: Float[Array, "fine columns"] | None) -> Response:
+    """The response with its fine bins turned into columns of `matrix`; as it is with None."""
+    if matrix is None:
+        return response
+    higher = None if response.higher is None else response.higher @ matrix
+    return dataclasses.replace(response, first=response.first @ matrix, higher=higher)
 
 
 def _coloured(
