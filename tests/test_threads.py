@@ -1,7 +1,9 @@
 """Programs side by side: results in order, JAX as the caller has set it, nothing left after an error."""
 
 import os
+import sys
 import threading
+import time
 
 import jax
 import jax.numpy as jnp
@@ -40,21 +42,30 @@ def test_what_waits_is_dropped_after_an_error():
         begun.append(n)
         if n == 0:
             raise RuntimeError("first")
+        time.sleep(1.0)
 
     with pytest.raises(RuntimeError, match="first"), side_by_side(1) as run:
-        list(run(one, range(1000)))
-    assert len(begun) < 1000
+        list(run(one, range(100)))
+    # One may have begun before the error was seen.
+    assert len(begun) <= 2
 
 
 @pytest.mark.parametrize("double", [False, True])
-def test_simulate_keeps_the_precision(double):
+def test_simulate_keeps_the_precision(double, monkeypatch):
     kind = "float64" if double else "float32"
+    module, kinds = sys.modules["jaxlidar.simulate"], []
+    batch = module._compiled_batch
+
+    def watched(*args):
+        out = batch(*args)
+        kinds.append(str(out[1].dtype))
+        return out
+
+    monkeypatch.setattr(module, "_compiled_batch", watched)
     with jax.enable_x64(double):
         voxels = jl.VoxelMap.from_lad(np.full((1, 1, 4), 0.2), voxel_size=2.0, origin=(-1.0, -1.0, 0.0))
         canopy = jl.Canopy(voxels, leaf=jl.Isotropic(albedo=0.8))
         scene = jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=0.3))
         wave = jl.simulate(jl.Lidar(), scene, key=jax.random.key(0), n_photons=256, max_orders=2, n_rays=64)
     assert str(wave.reflectance.dtype) == str(wave.stderr.dtype) == kind
-    # No batch was rounded to single precision.
-    batch = np.asarray(wave.components["higher"]) * 8
-    assert np.any(batch != batch.astype("float32")) == double
+    assert kinds == [kind] * 8
