@@ -77,11 +77,13 @@ def plan_for(
     )
     upstream = max(p.layout.upstream for p in plans)
     last = max(p.layout.last for p in plans)
+    extents = [Extent(lidar, s) for s in scenes]
     layout = first.layout._replace(
         upstream=upstream,
         last=last,
+        max_flight=max(e.longest_flight(last + upstream) for e in extents),
         first_steps=max(p.layout.first_steps for p in plans),
-        march_steps=max(Extent(lidar, s).march_steps(last + upstream) for s in scenes),
+        march_steps=max(e.march_steps(last + upstream) for e in extents),
         full_cover=tuple(all(c) for c in zip(*(p.layout.full_cover for p in plans))),
     )
     return dataclasses.replace(first, layout=layout, bins=bins)

@@ -162,7 +162,7 @@ def _one_flight(setting: Setting, p: Photons, key: PRNGKeyArray, cone: float) ->
     met, outcomes, _ = plates_ahead(setting, p, u[DIMENSIONS:])
     events = events_of(setting, met, outcomes)
     limit = nearest(p, events)
-    flights = fly(setting, p, limit, beam.budget(p.x, p.w, layout.last - p.path), u[0][None])
+    flights = fly(setting, p, limit, setting.budget(p), u[0][None])
     flight = jax.tree.map(lambda a: a[0], flights)
     weight, letters = p.weight, p.history
     for i, (s, d, o) in enumerate(zip(setting.surfaces, met, outcomes)):

@@ -5,6 +5,7 @@ import math
 import numpy as np
 
 from ._checks import concrete
+from ._vector import FAR
 from .lidar import Lidar
 from .scene import Plate, Scene
 
@@ -99,13 +100,23 @@ class Extent:
         divided = 0 if step >= self.longest_chord else math.ceil(height / steep / step)
         return int(self.shape[2] + sideways.sum() + divided + len(self.scene.surfaces) + 2)
 
+    def longest_flight(self, longest: float) -> float:
+        """Longest flight, m, that is followed: all from which light returns `longest` m after the first.
+
+        Within a canopy without sides, under a beam of more than 64 degrees, light could fly towards the
+        sensor almost for ever: there, ten times `longest` and the height of the canopy at most.
+        """
+        if self.scene.canopy is None or self.scene.canopy.sides == "open":
+            return FAR
+        # A flight of s m within the canopy lengthens the way by at least s (1 - sin) - height cos.
+        height, cos = self.size[2] * self.shape[2], float(np.abs(self.rays[:, 2]).min())
+        return float((longest + height * cos) / max(1.0 - math.sqrt(1.0 - cos * cos), 0.1))
+
     def march_steps(self, longest: float) -> int:
-        """Bound on the voxels that a flight crosses from which light returns `longest` m after the first."""
+        """Bound on the voxels that such a flight crosses."""
         if self.scene.canopy is None:
             return 0
         if self.scene.canopy.sides == "open":
             return int(self.shape.sum()) + 3
-        # A flight of s m within the canopy lengthens the way by at least s (1 - sin) - height cos.
-        height, cos = self.size[2] * self.shape[2], float(np.abs(self.rays[:, 2]).min())
-        flight = (longest + height * cos) / (1.0 - math.sqrt(1.0 - cos * cos))
+        flight = self.longest_flight(longest)
         return int(self.shape[2] + sum(math.ceil(flight / s) for s in self.size[:2])) + 3

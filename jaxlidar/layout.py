@@ -57,8 +57,8 @@ class Layout(NamedTuple):
     - `materials`, `letters`: names, in order. - `leaf`, `bark`, `surfaces`: the scatterers.
     - `full_cover`: for each surface, whether no ray slips through. - `upstream`: where rays start, m
       above the reference plane along the axis. - `first_steps`, `march_steps`: bounds on faces crossed.
-    - `max_step`: m. - `last`: longest path to the sensor that is recorded, m relative to
-      the way to the reference plane. - `lobe`: probability with which reflection is chosen over transmission.
+    - `max_step`, `max_flight`: m. - `last`: longest path to the sensor that is recorded, m relative to the
+      way to the reference plane. - `lobe`: probability with which reflection is chosen over transmission.
     - `ends`: points of each flight from which light returns. - `drawn_first`: whether order one returns from
       drawn collisions, as the others. - `independent`: whether photons draw independent numbers.
     """
@@ -78,6 +78,7 @@ class Layout(NamedTuple):
     first_steps: int
     march_steps: int
     max_step: float
+    max_flight: float
     last: float
     lobe: float
     orders: int

@@ -187,6 +187,7 @@ def plan(
         first_steps=geometry.first_steps(step),
         march_steps=geometry.march_steps(last + geometry.upstream),
         max_step=step,
+        max_flight=geometry.longest_flight(last + geometry.upstream),
         last=last,
         lobe=lobe_probability(optics),
         orders=orders,

@@ -6,9 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxlidar._vector import along
 from jaxlidar.lidar import Lidar
 from jaxlidar.pulse import GaussianPulse, RectangularPulse
 from jaxlidar.receiver import Receiver
+from jaxlidar.trace.footprint import beam_of
 
 
 def test_without_arguments_it_is_table_1(precision):
@@ -118,3 +120,20 @@ def test_values_are_leaves_and_do_not_retrace():
 def test_inadmissible_input_is_refused(fields, message):
     with pytest.raises(ValueError, match=message):
         Lidar(**fields)
+
+
+def test_light_that_flies_its_whole_budget_is_back_in_time():
+    """From points about an oblique beam, in random directions: at the end, the path is used up."""
+    rng = np.random.default_rng(0)
+    with jax.enable_x64(True):
+        beam = beam_of(Lidar(altitude=800.0, zenith=35.0, azimuth=20.0))
+        x = tuple(jnp.asarray(v) for v in rng.uniform(-30.0, 30.0, (3, 200)))
+        w = rng.normal(size=(3, 200))
+        w = tuple(jnp.asarray(v) for v in w / np.linalg.norm(w, axis=0))
+        left = jnp.asarray(rng.uniform(-50.0, 100.0, 200))
+        flight = beam.budget(x, w, left)
+        back = np.asarray(flight + beam.excess(along(x, w, flight)))
+        possible = np.asarray(beam.excess(x) < left)
+    assert 50 < possible.sum() < 200
+    np.testing.assert_allclose(back[possible], left[possible], atol=1e-6)
+    assert np.all(np.asarray(flight)[~possible] == 0.0)

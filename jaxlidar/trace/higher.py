@@ -153,7 +153,7 @@ def _one_order(setting: Setting, p: Photons, tally: HigherOrders, u: list[Scalar
     met, outcomes, ratio = plates_ahead(setting, p, u[DIMENSIONS:])
     events = events_of(setting, met, outcomes)
     limit = nearest(p, events)
-    budget = stop(setting.beam.budget(p.x, p.w, layout.last - p.path))
+    budget = stop(setting.budget(p))
     if setting.medium is not None and setting.surfaces:
         w, limit, turned = aim(setting, p, limit, events, (order > 0) & (limit < budget))
         p = eqx.tree_at(lambda p: (p.w, p.weight), p, (w, p.weight * turned))

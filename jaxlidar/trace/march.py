@@ -2,11 +2,10 @@
 
 Nothing is sampled on the way: within a voxel the extinction coefficient is constant, so the optical
 depth is known at every face and linear between them. Distances to faces are computed from integer
-face numbers, never accumulated. A batch of photons stops as soon as the last of
-them has.
+face numbers, never accumulated. A batch of photons stops as soon as the last of them has.
 
 What several results of a step share is held by `lax.optimization_barrier`: the CPU compiler would compute
-it anew for each of them, which takes three times as long.
+it anew for each of them.
 """
 
 import equinox as eqx

@@ -85,6 +85,10 @@ class Setting(eqx.Module):
         self.occupied = None if medium is None else occupied(medium)
         self.successor = jnp.asarray(table.successor)
 
+    def budget(self, p: Photons) -> Float[Array, "photons"]:
+        """How far photons may fly, m, so that their light can still be recorded."""
+        return jnp.minimum(self.beam.budget(p.x, p.w, self.layout.last - p.path), self.layout.max_flight)
+
     def grow(
         self, history: Int[Array, "*photons"], letter: Int[Array, "*photons"] | int
     ) -> Int[Array, "*photons"]:
