@@ -36,7 +36,7 @@ import numpy as np
 import inversion
 import jaxlidar as jl
 from inversion import Unknown
-from jaxlidar.io import read_gedi_l1b, whole_file
+from jaxlidar.io import atomic_write, read_gedi_l1b
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -263,7 +263,7 @@ def draw(shot, result, found, number, path):
     )
     right.set(xlabel="plant area density\n(m²/m³)", xlim=(0, None))
     left.set_ylim(found["ground"][0] - 6, max(found["highest return"][0], found["canopy top"][0]) + 6)
-    with whole_file(path) as draft:
+    with atomic_write(path) as draft:
         figure.savefig(draft, format="png", dpi=130)
     plt.close(figure)
 
@@ -312,7 +312,7 @@ def compare_all(options):
     right.loglog([1e-3, 1], [1e-3, 1], color="0.7", linewidth=0.8)
     right.set(xlabel="plant area index, product", ylabel="plant area index, fit")
     path = options.out / "gedi_all.png"
-    with whole_file(path) as draft:
+    with atomic_write(path) as draft:
         figure.savefig(draft, format="png", dpi=130)
     plt.close(figure)
     print(f"figure: {path}")

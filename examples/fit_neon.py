@@ -27,7 +27,7 @@ from fit_gedi import GROUND, LAYERS, put_canopy_height, put_density, put_ground,
 import inversion
 import jaxlidar as jl
 from inversion import Unknown
-from jaxlidar.io import read_neon, whole_file
+from jaxlidar.io import atomic_write, read_neon
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -163,7 +163,7 @@ def draw(shots, echoes, found, reference, path):
     figure.supxlabel("signal (counts)")
     figure.supylabel("elevation (m)")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=5, frameon=False)
-    with whole_file(path) as draft:
+    with atomic_write(path) as draft:
         figure.savefig(draft, format="png", dpi=130)
     plt.close(figure)
 

@@ -18,13 +18,12 @@ import optimistix as optx
 from jaxtyping import ArrayLike, Bool, Float, Int, PRNGKeyArray
 
 from jaxlidar import Lidar, Plan, Scene
-from jaxlidar._checks import check_range
-from jaxlidar._threads import ONE_CORE, side_by_side
+from jaxlidar.extend import ONE_CORE, check_range, side_by_side
 from jaxlidar.simulate import MIN_BATCHES
 
+from .checkpoint import Kept, Row, fingerprint, row_of
 from .data import data_of
 from .fit import Fitting, Request, best_of, labels_of, named
-from .kept import Kept, Row, fingerprint, row_of
 from .model import Evaluation, Model, evaluate
 from .planning import check_samples, plan_for
 from .retrieval import SOLVER, fits_from, scale_of

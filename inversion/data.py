@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxlidar import Lidar, Waveform
-from jaxlidar._checks import check_range
+from jaxlidar.extend import check_range
 
 
 class Data(NamedTuple):

@@ -15,7 +15,7 @@ import optimistix as optx
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from jaxlidar._checks import as_array, check_range
+from jaxlidar.extend import as_array, check_range
 
 _SOLVER = optx.LevenbergMarquardt(rtol=1e-4, atol=1e-4)
 _STEPS = 60

@@ -20,8 +20,8 @@ from matplotlib.figure import Figure
 import jaxlidar as jl
 import jaxlidar.plot
 from jaxlidar.cli import CommandError
-from jaxlidar.demo import HEIGHT, LEAF_AREA, WAVELENGTHS, demo_lidar, demo_scene
-from jaxlidar.io import whole_file
+from jaxlidar.io import atomic_write
+from jaxlidar.plants.demo import HEIGHT, LEAF_AREA, WAVELENGTHS, demo_lidar, demo_scene
 
 from .result import Retrieval
 from .retrieval import retrieve
@@ -228,7 +228,7 @@ def retrieval_figure(
 
 def save(figure: Figure, path: Path) -> None:
     """Write a PNG, whole or not at all."""
-    with whole_file(path) as draft:
+    with atomic_write(path) as draft:
         figure.savefig(draft, format="png", dpi=RESOLUTION)
 
 

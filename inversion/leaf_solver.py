@@ -25,7 +25,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from jaxlidar.plates import Surface, plate_model_slopes
+from jaxlidar.optics.plate_model import Surface, plate_model_slopes
 
 # A fit has converged when a Gauss-Newton step would move it by less than this many standard errors,
 _SMALL_STEP = 0.02

@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from jaxlidar import Prospect
-from jaxlidar._checks import check_range
-from jaxlidar._coefficients import TRAITS
-from jaxlidar.plates import Surface
-from jaxlidar.prospect import material
+from jaxlidar.extend import check_range
+from jaxlidar.optics.coefficients import TRAITS
+from jaxlidar.optics.plate_model import Surface
+from jaxlidar.optics.prospect import material
 
 from .leaf_solver import Task, errors_of, fit_all, rounding
 

@@ -18,9 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxlidar import Lidar, Plan, Response, Scene, Waveform
-from jaxlidar import waveform as make_waveform
-from jaxlidar._threads import ONE_CORE, side_by_side
+from jaxlidar import Lidar, Plan, Response, Scene, Waveform, waveform_of
+from jaxlidar.extend import ONE_CORE, side_by_side
 from jaxlidar.simulate import MIN_BATCHES, total_all, trace_all
 
 from .unknowns import Place, Settled, put
@@ -75,7 +74,7 @@ def _colour(
 
 @eqx.filter_jit
 def _recorded(lidar, scene, plan, places, values, response, stderr) -> Waveform:
-    return make_waveform(response, lidar, put(scene, places, values), plan, stderr=stderr)
+    return waveform_of(response, lidar, put(scene, places, values), plan, stderr=stderr)
 
 
 @jax.jit

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from jaxlidar import Lidar, Plan, Scene
 from jaxlidar import plan as make_plan
-from jaxlidar.extent import Extent
+from jaxlidar.planning.path_lengths import PathLengths
 
 from .unknowns import Settled, put
 
@@ -60,7 +60,7 @@ def plan_for(
     first = make_plan(lidar, scenes[0], max_orders=max_orders, **common)
     common.update(max_orders=first.orders, bin_width=first.bins.width)
     if scene.canopy is not None:
-        common.update(max_step=first.layout.max_step)
+        common.update(max_step=first.trace.max_step)
     plans = [first]
     for corner in scenes[1:]:
         try:
@@ -75,18 +75,18 @@ def plan_for(
         count=round((end - start) / first.bins.width),
         row=max(p.bins.row for p in plans),
     )
-    upstream = max(p.layout.upstream for p in plans)
-    last = max(p.layout.last for p in plans)
-    extents = [Extent(lidar, s) for s in scenes]
-    layout = first.layout._replace(
+    upstream = max(p.trace.upstream for p in plans)
+    last = max(p.trace.last for p in plans)
+    extents = [PathLengths(lidar, s) for s in scenes]
+    trace = first.trace._replace(
         upstream=upstream,
         last=last,
         max_flight=max(e.longest_flight(last + upstream) for e in extents),
-        first_steps=max(p.layout.first_steps for p in plans),
+        first_steps=max(p.trace.first_steps for p in plans),
         march_steps=max(e.march_steps(last + upstream) for e in extents),
-        full_cover=tuple(all(c) for c in zip(*(p.layout.full_cover for p in plans))),
+        full_cover=tuple(all(c) for c in zip(*(p.trace.full_cover for p in plans))),
     )
-    return dataclasses.replace(first, layout=layout, bins=bins)
+    return dataclasses.replace(first, trace=trace, bins=bins)
 
 
 def check_samples(plan: Plan, time: Float[np.ndarray, " bins"]) -> None:

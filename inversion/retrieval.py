@@ -11,7 +11,7 @@ import optimistix as optx
 from jaxtyping import Array, ArrayLike, PRNGKeyArray
 
 from jaxlidar import Lidar, Plan, Scene, Waveform
-from jaxlidar._checks import check_range
+from jaxlidar.extend import check_range
 from jaxlidar.simulate import MIN_BATCHES
 
 from .data import Data, data_of

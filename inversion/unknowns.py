@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from jaxlidar import Scene
-from jaxlidar._checks import as_array, check_range
+from jaxlidar.extend import as_array, check_range
 
 # Starting values keep this share of the interval's width away from its ends.
 MARGIN = 0.01

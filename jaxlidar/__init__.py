@@ -3,62 +3,100 @@
 optics and geometry -> scene -> plan -> trace -> response -> waveform; fits are in the package `inversion`.
 """
 
-from ._coefficients import load_coefficients as load_coefficients
-from .analog import AnalogReturns as AnalogReturns
-from .analog import analog_returns as analog_returns
-from .analog import photon_paths as photon_paths
-from .atmosphere import Atmosphere as Atmosphere
-from .effects import Effect as Effect
-from .forest import forest as forest
-from .habits import Branching as Branching
-from .habits import Habit as Habit
-from .habits import broadleaf as broadleaf
-from .habits import conifer as conifer
-from .habits import grow as grow
-from .habits import shrub as shrub
-from .habits import spreading as spreading
-from .leaf import LeafOptics as LeafOptics
-from .lidar import Lidar as Lidar
-from .lsystem import LSystem as LSystem
-from .lsystem import Module as Module
-from .lsystem import Rule as Rule
-from .lsystem import Word as Word
-from .materials import EqualAngle as EqualAngle
-from .materials import Isotropic as Isotropic
-from .materials import Lambertian as Lambertian
-from .materials import LeafAngles as LeafAngles
-from .materials import Specular as Specular
-from .plan import Plan as Plan
-from .plan import plan as plan
-from .plates import plate_model as plate_model
-from .prospect import Prospect as Prospect
-from .prospect import prospect_jacobian as prospect_jacobian
-from .prospect import prospect_spectra as prospect_spectra
-from .pulse import AbstractPulse as AbstractPulse
-from .pulse import ExponentiallyModifiedGaussianPulse as ExponentiallyModifiedGaussianPulse
-from .pulse import GaussianPulse as GaussianPulse
-from .pulse import RectangularPulse as RectangularPulse
-from .pulse import SampledPulse as SampledPulse
-from .receiver import Receiver as Receiver
-from .receiver import first_return_window as first_return_window
-from .receiver import record as record
-from .scene import Canopy as Canopy
-from .scene import Ground as Ground
-from .scene import Plate as Plate
-from .scene import Scene as Scene
-from .simulate import Progress as Progress
-from .simulate import simulate as simulate
-from .spectra import Spectrum as Spectrum
-from .spectra import read_spectrum_csv as read_spectrum_csv
-from .spectra import spectra as spectra
-from .spectra import spectrum as spectrum
-from .trace import Response as Response
-from .trace import trace as trace
-from .tree import Tree as Tree
-from .turtle import turtle as turtle
-from .voxelise import crop as crop
-from .voxelise import voxelise as voxelise
-from .voxelise import voxelise_points as voxelise_points
-from .voxels import VoxelMap as VoxelMap
-from .waveform import Waveform as Waveform
-from .waveform import waveform as waveform
+from jaxlidar._constants import SPEED_OF_LIGHT
+from jaxlidar.analog import AnalogReturns, analog_returns, photon_paths
+from jaxlidar.instrument.lidar import Lidar
+from jaxlidar.instrument.pulse import (
+    AbstractPulse,
+    ExponentiallyModifiedGaussianPulse,
+    GaussianPulse,
+    RectangularPulse,
+    SampledPulse,
+)
+from jaxlidar.instrument.receiver import Receiver, first_return_window, record
+from jaxlidar.optics.coefficients import load_coefficients
+from jaxlidar.optics.laws import AbstractLaw, EqualAngle, Lambertian, Specular
+from jaxlidar.optics.leaf import LeafOptics
+from jaxlidar.optics.leaf_angles import LeafAngles
+from jaxlidar.optics.phase import Isotropic
+from jaxlidar.optics.plate_model import plate_model
+from jaxlidar.optics.prospect import Prospect, prospect_jacobian, prospect_spectra
+from jaxlidar.optics.spectra import Spectrum, read_spectrum_csv, spectra, spectrum
+from jaxlidar.planning.effects import Effect
+from jaxlidar.planning.plan import Plan, plan
+from jaxlidar.plants.forest import forest
+from jaxlidar.plants.habits import Branching, Habit, broadleaf, conifer, grow, shrub, spreading
+from jaxlidar.plants.lsystem import LSystem, Module, Rule, Word
+from jaxlidar.plants.tree import Tree
+from jaxlidar.plants.turtle import turtle
+from jaxlidar.plants.voxelise import crop, voxelise, voxelise_points
+from jaxlidar.scenes.atmosphere import Atmosphere
+from jaxlidar.scenes.scene import Canopy, Ground, Plate, Scene
+from jaxlidar.scenes.voxels import VoxelMap
+from jaxlidar.simulate import Progress, simulate
+from jaxlidar.trace.response import Response, trace_scene
+from jaxlidar.waveform import Waveform, waveform_of
+
+__all__ = [
+    "SPEED_OF_LIGHT",
+    "AbstractLaw",
+    "AbstractPulse",
+    "AnalogReturns",
+    "Atmosphere",
+    "Branching",
+    "Canopy",
+    "Effect",
+    "EqualAngle",
+    "ExponentiallyModifiedGaussianPulse",
+    "GaussianPulse",
+    "Ground",
+    "Habit",
+    "Isotropic",
+    "LSystem",
+    "Lambertian",
+    "LeafAngles",
+    "LeafOptics",
+    "Lidar",
+    "Module",
+    "Plan",
+    "Plate",
+    "Progress",
+    "Prospect",
+    "Receiver",
+    "RectangularPulse",
+    "Response",
+    "Rule",
+    "SampledPulse",
+    "Scene",
+    "Specular",
+    "Spectrum",
+    "Tree",
+    "VoxelMap",
+    "Waveform",
+    "Word",
+    "analog_returns",
+    "broadleaf",
+    "conifer",
+    "crop",
+    "first_return_window",
+    "forest",
+    "grow",
+    "load_coefficients",
+    "photon_paths",
+    "plan",
+    "plate_model",
+    "prospect_jacobian",
+    "prospect_spectra",
+    "read_spectrum_csv",
+    "record",
+    "shrub",
+    "simulate",
+    "spectra",
+    "spectrum",
+    "spreading",
+    "trace_scene",
+    "turtle",
+    "voxelise",
+    "voxelise_points",
+    "waveform_of",
+]

@@ -39,6 +39,28 @@ def concrete(x: object) -> np.ndarray | None:
         return None
 
 
+def known_number(x: object) -> float:
+    """A concrete number.
+
+    **Raises:** ValueError where `x` is being traced by a JAX transformation.
+    """
+    return float(known_array(x))
+
+
+def known_array(x: object) -> np.ndarray:
+    """A concrete array, in double precision.
+
+    **Raises:** ValueError where `x` is being traced by a JAX transformation.
+    """
+    value = concrete(x)
+    if value is None:
+        raise ValueError(
+            "the geometry is being traced by a JAX transformation, so its sizes are unknown: "
+            "make a plan outside with jaxlidar.plan and pass it as plan="
+        )
+    return value
+
+
 def check_range(
     field: str,
     x: object,

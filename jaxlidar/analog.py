@@ -10,20 +10,20 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from ._checks import check_range
-from ._vector import FAR, along, dot, vec
-from .constants import SPEED_OF_LIGHT
-from .effects import without
-from .lidar import Lidar
-from .plan import Plan
-from .scene import Scene, leaf_optics
-from .trace.flight import DIMENSIONS, events_of, fly, nearest, plates_ahead
-from .trace.footprint import across_beam
-from .trace.histories import histories
-from .trace.photons import THROUGH, Photons, Setting
-from .trace.response import geometry_of
-from .trace.scatter import collide
-from .waveform import is_straight, optics
+from jaxlidar._checks import check_range
+from jaxlidar._constants import SPEED_OF_LIGHT
+from jaxlidar._vectors import FAR, along, dot, vec
+from jaxlidar.instrument.lidar import Lidar
+from jaxlidar.planning.effects import without
+from jaxlidar.planning.plan import Plan
+from jaxlidar.scenes.scene import Scene, leaf_optics
+from jaxlidar.trace.collisions import collide
+from jaxlidar.trace.flight import DIMENSIONS, events_of, fly, nearest, plates_ahead
+from jaxlidar.trace.footprint import across_beam
+from jaxlidar.trace.histories import histories
+from jaxlidar.trace.photons import THROUGH, Photons, Setting
+from jaxlidar.trace.response import geometry_of
+from jaxlidar.waveform import is_straight, optics
 
 CHUNK = 512
 
@@ -137,15 +137,15 @@ def _setting(lidar: Lidar, scene: Scene, plan: Plan) -> Setting:
             raise ValueError(f"wavelength has {lidar.wavelength.size} values; 1 if transmission is straight")
         transmittance = leaf_optics(scene.canopy, lidar.wavelength)[1][0]
     beam, medium, surfaces = geometry_of(lidar, scene, transmittance)
-    table = histories(len(plan.layout.letters), plan.degree)
-    return Setting(beam, medium, surfaces, plan.layout, table, plan.bins)
+    table = histories(len(plan.trace.letters), plan.degree)
+    return Setting(beam, medium, surfaces, plan.trace, table, plan.bins)
 
 
 def _start(setting: Setting, size: int, key: PRNGKeyArray) -> Photons:
     radius_key, turn_key = jax.random.split(key)
     share, turn = jax.random.uniform(radius_key, (size,)), jax.random.uniform(turn_key, (size,))
     point, w, excess = setting.beam.ray(across_beam(setting.beam, share, turn))
-    up = jnp.asarray(-setting.layout.upstream, excess.dtype)
+    up = jnp.asarray(-setting.trace.upstream, excess.dtype)
     none = jnp.zeros((size,), jnp.int32)
     still = vec(jnp.zeros_like(excess) for _ in range(3))
     return Photons(
@@ -155,7 +155,7 @@ def _start(setting: Setting, size: int, key: PRNGKeyArray) -> Photons:
 
 def _one_flight(setting: Setting, p: Photons, key: PRNGKeyArray, cone: float) -> tuple[Photons, _Arrival]:
     """Fly, arrive if that leads out of the scene to the sensor, else collide and scatter."""
-    beam, layout = setting.beam, setting.layout
+    beam, trace = setting.beam, setting.trace
     plates = sum(s.plate for s in setting.surfaces)
     tiny = jnp.finfo(p.weight.dtype).tiny
     u = list(jax.random.uniform(key, (DIMENSIONS + plates, p.weight.size), p.weight.dtype, tiny))
@@ -168,8 +168,8 @@ def _one_flight(setting: Setting, p: Photons, key: PRNGKeyArray, cone: float) ->
     for i, (s, d, o) in enumerate(zip(setting.surfaces, met, outcomes)):
         if s.plate:
             through = p.alive & (o == THROUGH) & (d < FAR) & ((d < flight.distance) | ~flight.event)
-            letters = jnp.where(through, setting.grow(letters, layout.surfaces[i].transmitted), letters)
-            weight = jnp.where(through, weight / (1.0 - layout.lobe), weight)
+            letters = jnp.where(through, setting.grow(letters, trace.surfaces[i].transmitted), letters)
+            weight = jnp.where(through, weight / (1.0 - trace.lobe), weight)
 
     out = beam.excess(p.x)
     back = flight.escaped & (dot(p.w, beam.view(p.x)) > jnp.cos(jnp.deg2rad(cone)))

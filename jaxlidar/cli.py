@@ -29,8 +29,8 @@ def spectra(argv: Sequence[str]) -> int:
     options = parser.parse_args(argv)
     import numpy as np
 
-    from .spectra import spectra as listed
-    from .spectra import spectrum
+    from jaxlidar.optics.spectra import spectra as listed
+    from jaxlidar.optics.spectra import spectrum
 
     try:
         names = listed(options.kind)

@@ -11,17 +11,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from ._checks import is_traced
-from ._threads import ONE_CORE, side_by_side
-from .effects import without
-from .extent import Extent
-from .letters import scene_optics, spell
-from .lidar import Lidar
-from .plan import Plan
-from .plan import plan as make_plan
-from .scene import Scene, leaf_optics
-from .trace.response import Response, trace
-from .waveform import Waveform, is_straight, open_at_first_return, total_of, waveform
+from jaxlidar._checks import is_traced
+from jaxlidar._threads import ONE_CORE, side_by_side
+from jaxlidar.instrument.lidar import Lidar
+from jaxlidar.planning.effects import without
+from jaxlidar.planning.path_lengths import PathLengths
+from jaxlidar.planning.plan import Plan
+from jaxlidar.planning.plan import plan as make_plan
+from jaxlidar.planning.scatterers import scene_optics, spell
+from jaxlidar.scenes.scene import Scene, leaf_optics
+from jaxlidar.trace.response import Response, trace_scene
+from jaxlidar.waveform import Waveform, is_straight, open_at_first_return, total_of, waveform_of
 
 # Fewer batches give no trustworthy standard error.
 MIN_BATCHES = 8
@@ -134,16 +134,16 @@ def simulate(
 def _check_plan(plan: Plan, lidar: Lidar, scene: Scene) -> None:
     """Refuse a plan that would miss parts of the scene."""
     lidar, scene = without(lidar, scene, plan.off)
-    top = -0.5 * Extent(lidar, scene).first
-    if top > plan.layout.upstream:
+    top = -0.5 * PathLengths(lidar, scene).first
+    if top > plan.trace.upstream:
         raise ValueError(
-            f"plan starts {plan.layout.upstream:g} m before the reference plane; admissible for this scene "
+            f"plan starts {plan.trace.upstream:g} m before the reference plane; admissible for this scene "
             f"is more than {top:g} m: make the plan for the scene that reaches highest"
         )
-    missing = set(spell(scene_optics(lidar, scene)).letters) - set(plan.layout.letters)
+    missing = set(spell(scene_optics(lidar, scene)).letters) - set(plan.trace.letters)
     if missing:
         raise ValueError(
-            f"plan has {', '.join(plan.layout.letters) or 'no scatterers'}; admissible for this scene is one "
+            f"plan has {', '.join(plan.trace.letters) or 'no scatterers'}; admissible for this scene is one "
             f"that also has {', '.join(sorted(missing))}: make the plan with it"
         )
 
@@ -152,9 +152,9 @@ def trace_all(lidar: Lidar, scene: Scene, plan: Plan, key: PRNGKeyArray) -> Resp
     """One batch: a response, or one for each wavelength where leaves transmit straight on."""
     lidar, scene = without(lidar, scene, plan.off)
     if scene.canopy is None or not is_straight(scene):
-        return trace(lidar, scene, plan, key)
+        return trace_scene(lidar, scene, plan, key)
     _, t = leaf_optics(scene.canopy, lidar.wavelength)
-    return [trace(lidar, scene, plan, key, t[i]) for i in range(t.size)]
+    return [trace_scene(lidar, scene, plan, key, t[i]) for i in range(t.size)]
 
 
 def total_all(
@@ -176,11 +176,11 @@ _compiled_batch = eqx.filter_jit(_batch, **ONE_CORE)
 
 @eqx.filter_jit
 def _once(lidar: Lidar, scene: Scene, plan: Plan, key: PRNGKeyArray) -> Waveform:
-    return waveform(trace_all(lidar, scene, plan, key), lidar, scene, plan)
+    return waveform_of(trace_all(lidar, scene, plan, key), lidar, scene, plan)
 
 
 _finish = eqx.filter_jit(
-    lambda response, lidar, scene, plan, stderr: waveform(response, lidar, scene, plan, stderr=stderr)
+    lambda response, lidar, scene, plan, stderr: waveform_of(response, lidar, scene, plan, stderr=stderr)
 )
 
 
@@ -191,7 +191,7 @@ def _simulate_traced(lidar: Lidar, scene: Scene, plan: Plan, key: PRNGKeyArray) 
     mean = jax.tree.map(lambda a: jnp.mean(a, axis=0), responses)
     spread = jnp.var(jax.lax.stop_gradient(totals), axis=0)
     stderr = _widening(MIN_BATCHES) * jnp.sqrt(spread / (MIN_BATCHES - 1))
-    return waveform(mean, lidar, scene, plan, stderr=stderr)
+    return waveform_of(mean, lidar, scene, plan, stderr=stderr)
 
 
 def _simulate_batches(lidar, scene, plan, key, rtol, atol, fixed, max_seconds, progress) -> Waveform:
@@ -244,7 +244,7 @@ def _simulate_batches(lidar, scene, plan, key, rtol, atol, fixed, max_seconds, p
     if lidar.receiver.window == "first return":
         wave = open_at_first_return(wave, lidar)
     info = {
-        "photons": done * plan.n_photons if plan.orders > 1 or plan.layout.drawn_first else 0,
+        "photons": done * plan.n_photons if plan.orders > 1 or plan.trace.drawn_first else 0,
         "batches": done,
         "seconds": time.perf_counter() - started,
         "error": error,

@@ -8,15 +8,15 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from .constants import SPEED_OF_LIGHT
-from .effects import without
-from .letters import scene_optics
-from .lidar import Lidar
-from .plan import Plan
-from .receiver import first_return_window
-from .scene import Scene
-from .trace.histories import histories
-from .trace.response import Response
+from jaxlidar._constants import SPEED_OF_LIGHT
+from jaxlidar.instrument.lidar import Lidar
+from jaxlidar.instrument.receiver import first_return_window
+from jaxlidar.planning.effects import without
+from jaxlidar.planning.plan import Plan
+from jaxlidar.planning.scatterers import scene_optics
+from jaxlidar.scenes.scene import Scene
+from jaxlidar.trace.histories import histories
+from jaxlidar.trace.response import Response
 
 
 class Waveform(eqx.Module):
@@ -56,7 +56,7 @@ def optics(lidar: Lidar, scene: Scene, plan: Plan) -> Float[Array, "letters wave
         values[f"{o.name}.R"] = o.reflectance
         if o.transmittance is not None:
             values[f"{o.name}.T"] = o.transmittance
-    rows = [values[letter] for letter in plan.layout.letters]
+    rows = [values[letter] for letter in plan.trace.letters]
     return jnp.stack(rows) if rows else jnp.zeros((0, lidar.wavelength.size))
 
 
@@ -71,7 +71,7 @@ def colour(
     response: Response, optics: Float[Array, "letters wavelengths"], plan: Plan
 ) -> tuple[Float[Array, "materials wavelengths bins"], Float[Array, "materials wavelengths bins"]]:
     """Orders one, and two and above, by material of the last scattering: a matrix product each."""
-    letters = len(plan.layout.letters)
+    letters = len(plan.trace.letters)
     short = histories(letters, plan.first_degree).monomials(optics)
     first = jnp.einsum("hw,mhb->mwb", short, response.first)
     if response.higher is None:
@@ -135,7 +135,7 @@ def air(lidar: Lidar, scene: Scene, plan: Plan) -> Float[Array, "wavelengths sam
     assert scene.atmosphere is not None
     heights = _fine_heights(lidar, plan)
     per_metre = scene.atmosphere.backscatter(lidar.wavelength, heights, lidar.altitude, lidar.zenith)
-    top = jnp.asarray(plan.layout.upstream) * jnp.cos(jnp.deg2rad(lidar.zenith))
+    top = jnp.asarray(plan.trace.upstream) * jnp.cos(jnp.deg2rad(lidar.zenith))
     length = 0.5 * SPEED_OF_LIGHT * plan.bins.width
     fine = jnp.where((heights > top)[None, :], per_metre * length, 0.0)
     return jnp.einsum("wb,bs->ws", fine, pulse_kernel(lidar, plan))
@@ -152,7 +152,7 @@ def total_of(
     """Apparent reflectance per sample, all components together."""
     lidar, scene = without(lidar, scene, plan.off)
     # Sums over materials, and the pulse where no atmosphere lies between, come before the many wavelengths.
-    letters, values = len(plan.layout.letters), optics(lidar, scene, plan)
+    letters, values = len(plan.trace.letters), optics(lidar, scene, plan)
     clear = scene.atmosphere is None
     total = jnp.zeros(())
     for degree, part in ((plan.first_degree, response.first), (plan.degree, response.higher)):
@@ -169,11 +169,11 @@ def ledger_of(
     response: Response, optics: Float[Array, "letters wavelengths"], plan: Plan
 ) -> dict[str, Float[Array, "wavelengths"]]:
     """Shares of the emitted energy. What a material absorbs is what arrived there less what left."""
-    letters = len(plan.layout.letters)
+    letters = len(plan.trace.letters)
     degree = plan.degree if response.higher is not None else plan.first_degree
     monomials = histories(letters, degree).monomials(optics)
     absorbed = (response.arrived - response.left) @ monomials
-    ledger = {f"absorbed by {name}": absorbed[i] for i, name in enumerate(plan.layout.materials)}
+    ledger = {f"absorbed by {name}": absorbed[i] for i, name in enumerate(plan.trace.materials)}
     return {
         "escaped": response.escaped @ monomials,
         **ledger,
@@ -182,7 +182,7 @@ def ledger_of(
     }
 
 
-def waveform(
+def waveform_of(
     response: Response | list[Response],
     lidar: Lidar,
     scene: Scene,
@@ -210,7 +210,7 @@ def waveform(
         ledger = {name: jnp.concatenate([part[name] for _, _, part in parts]) for name in parts[0][2]}
     else:
         first, higher, ledger = _coloured(_seen_through(response, early), letters, plan)
-    names = plan.layout.materials
+    names = plan.trace.materials
     lines = jnp.concatenate([first + higher, jnp.sum(first, 0)[None], jnp.sum(higher, 0)[None]])
     if early is None:
         sampled, whole = sample(lines, lidar, scene, plan), jnp.sum(lines[-2] + lines[-1], axis=-1)
@@ -229,7 +229,7 @@ def waveform(
     gain = jnp.outer(lidar.energy_per_wavelength * lidar.efficiency_per_wavelength, received)
     returned = whole * lidar.aperture_area / (jnp.pi * lidar.range_to_reference**2)
     # What returns is part of what escaped, or, where only one order was followed, would have.
-    source = "unfollowed" if plan.orders == 1 and len(plan.layout.materials) > 1 else "escaped"
+    source = "unfollowed" if plan.orders == 1 and len(plan.trace.materials) > 1 else "escaped"
     reach = jnp.minimum(returned, ledger[source])
     full = {"returned": reach, **ledger, source: ledger[source] - reach}
     per_energy = whole / jnp.maximum(full["escaped"], 1e-6)

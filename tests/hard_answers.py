@@ -10,7 +10,7 @@ import itertools
 import numpy as np
 from mpmath import mp, mpf
 
-from jaxlidar._coefficients import TRAITS, shipped
+from jaxlidar.optics.coefficients import TRAITS, shipped
 
 C = mpf("0.299792458")
 DIGITS = 100

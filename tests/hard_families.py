@@ -47,7 +47,7 @@ def simulation(build, usual, outputs, **settings):
 
     def measure(p):
         lidar, scene = build(p)
-        return outputs(lidar, scene, plan, jl.trace(lidar, scene, plan, KEY))
+        return outputs(lidar, scene, plan, jl.trace_scene(lidar, scene, plan, KEY))
 
     return measure
 
@@ -64,7 +64,7 @@ def parts(*names):
     """Sums of components, or of all shares of energy."""
 
     def outputs(lidar, scene, plan, response):
-        wave = jl.waveform(response, lidar, scene, plan)
+        wave = jl.waveform_of(response, lidar, scene, plan)
         absorbed = [v[0] for k, v in wave.ledger.items() if k.startswith("absorbed")]
         sums = {
             "shares": sum(wave.ledger.values())[0],

@@ -54,7 +54,7 @@ def agrees(value: Any, stderr: Any, expected: Any, *, bound: Any = 0.0, sigmas: 
 @eqx.filter_jit
 def _wave(lidar: jl.Lidar, scene: jl.Scene, plan: jl.Plan, key: PRNGKeyArray, quantity: Callable) -> Any:
     response = trace_all(lidar, scene, plan, key)
-    return quantity(jl.waveform(response, lidar, scene, plan))
+    return quantity(jl.waveform_of(response, lidar, scene, plan))
 
 
 def _itself(wave: jl.Waveform) -> jl.Waveform:

@@ -8,7 +8,7 @@ import pytest
 from helpers import WHOLE, agrees, batch_mean, slab, whole_lidar
 
 import jaxlidar as jl
-from jaxlidar.layout import Bins
+from jaxlidar.planning.trace_plan import Bins
 from jaxlidar.trace.deposit import instant_row
 
 LIDAR = jl.Lidar(divergence=2.0, sampling_interval=5.0)
@@ -75,7 +75,7 @@ def test_what_one_plate_scatters_down_returns_from_the_next(transmission):
     one_way = 0.5 * 0.5 * 0.7 * 0.4 * 0.5
     assert agrees(mean, stderr, 2 * one_way)
     # Without the probability of reflection in the weight of one path.
-    assert not agrees(mean, stderr, one_way * (1 + plan.layout.lobe))
+    assert not agrees(mean, stderr, one_way * (1 + plan.trace.lobe))
 
 
 def test_what_is_expected_varies_less_than_what_is_drawn():

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxlidar.atmosphere import Atmosphere, aerosol_extinction, rayleigh_optical_depth
+from jaxlidar.scenes.atmosphere import Atmosphere, aerosol_extinction, rayleigh_optical_depth
 
 WAVELENGTHS = np.array([355.0, 532.0, 1064.0, 1550.0])
 

@@ -160,7 +160,7 @@ def test_reading_only_the_first_lines_is_no_failure():
 
 
 def test_the_demo_tree_has_the_size_that_is_said():
-    from jaxlidar.demo import HEIGHT, LEAF_AREA, demo_scene
+    from jaxlidar.plants.demo import HEIGHT, LEAF_AREA, demo_scene
 
     voxels = demo_scene(0.25).canopy.voxels
     leaf, bark = np.asarray(voxels.leaf), np.asarray(voxels.bark)

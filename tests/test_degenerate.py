@@ -24,7 +24,7 @@ def evaluate(lidar, scene, plan, key, mode):
 
     def simulated(numbers):
         beam, target = eqx.combine(numbers, rest)
-        wave = jl.waveform(jl.trace(beam, target, plan, key), beam, target, plan)
+        wave = jl.waveform_of(jl.trace_scene(beam, target, plan, key), beam, target, plan)
         other = (wave.components, wave.neglected, wave.ledger, wave.time, wave.height)
         return (wave.reflectance, wave.energy / 1e-12), other
 

@@ -28,7 +28,7 @@ import pytest
 from scipy.integrate import quad
 
 import jaxlidar as jl
-from jaxlidar.constants import SPEED_OF_LIGHT
+from jaxlidar import SPEED_OF_LIGHT
 
 KEY = jax.random.key(20)
 TOLERANCE = 1e-4

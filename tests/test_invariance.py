@@ -79,12 +79,12 @@ def test_chunks_do_not_matter(plain, monkeypatch):
     for name, size in (("higher", 96), ("first", 100)):
         monkeypatch.setattr(sys.modules[f"jaxlidar.trace.{name}"], "CHUNK", size)
     # Two functions, so that each is compiled with its own sizes.
-    again = eqx.filter_jit(lambda *a: jl.waveform(jl.trace(*a), *a[:3]).reflectance)
+    again = eqx.filter_jit(lambda *a: jl.waveform_of(jl.trace_scene(*a), *a[:3]).reflectance)
     lidar, scene = build()
     key = jax.random.fold_in(KEY, 0)
     small = again(lidar, scene, plan, key)
     monkeypatch.undo()
-    whole = eqx.filter_jit(lambda *a: jl.waveform(jl.trace(*a), *a[:3]).reflectance)
+    whole = eqx.filter_jit(lambda *a: jl.waveform_of(jl.trace_scene(*a), *a[:3]).reflectance)
     alike(small, whole(lidar, scene, plan, key), 1e-5)
     assert float(np.max(wave.components["higher"])) > 0.01 * float(np.max(wave.reflectance))
 

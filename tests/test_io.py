@@ -5,8 +5,8 @@ import sys
 import numpy as np
 import pytest
 
+from jaxlidar.instrument.pulse import SampledPulse
 from jaxlidar.io import read_gedi_l1b
-from jaxlidar.pulse import SampledPulse
 
 h5py = pytest.importorskip("h5py")
 

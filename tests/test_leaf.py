@@ -2,7 +2,7 @@ import jax
 import numpy as np
 import pytest
 
-from jaxlidar.leaf import LeafOptics
+from jaxlidar.optics.leaf import LeafOptics
 
 LASERS = np.array([532.0, 1064.0])
 

@@ -22,7 +22,7 @@ import pytest
 from helpers import WHOLE, agrees, whole_lidar
 
 import jaxlidar as jl
-from jaxlidar.constants import SPEED_OF_LIGHT
+from jaxlidar import SPEED_OF_LIGHT
 
 KEY = jax.random.key(21)
 R, T, RHO = 0.3, 0.5, 0.6

@@ -6,10 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxlidar._vector import along
-from jaxlidar.lidar import Lidar
-from jaxlidar.pulse import GaussianPulse, RectangularPulse
-from jaxlidar.receiver import Receiver
+from jaxlidar.extend import along
+from jaxlidar.instrument.lidar import Lidar
+from jaxlidar.instrument.pulse import GaussianPulse, RectangularPulse
+from jaxlidar.instrument.receiver import Receiver
 from jaxlidar.trace.footprint import beam_of
 
 

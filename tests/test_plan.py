@@ -9,7 +9,7 @@ import pytest
 from helpers import slab
 
 import jaxlidar as jl
-from jaxlidar.effects import NAMES, without
+from jaxlidar.planning.effects import NAMES, without
 
 GROUND = jl.Ground(reflectance=0.3)
 PLATE = jl.Plate(height=3.0, reflectance=0.4, transmittance=0.3, coverage=0.5)
@@ -26,7 +26,7 @@ def traced(lidar, scene, plan):
     """The trace as text, as it is compiled; the lidar's arrays are in it as far as they are used."""
 
     def run(scene, key):
-        return jl.trace(lidar, scene, plan, key)
+        return jl.trace_scene(lidar, scene, plan, key)
 
     return str(eqx.filter_make_jaxpr(run)(scene, jax.random.key(0))[0])
 
@@ -55,7 +55,7 @@ def test_ground_alone_with_all_that_a_lidar_may_have_has_no_loop_either():
     plan = planned(lidar, scene)
 
     def run(lidar, scene, key):
-        return jl.waveform(jl.trace(lidar, scene, plan, key), lidar, scene, plan).reflectance
+        return jl.waveform_of(jl.trace_scene(lidar, scene, plan, key), lidar, scene, plan).reflectance
 
     text = str(eqx.filter_make_jaxpr(run)(lidar, scene, jax.random.key(0))[0])
     assert not any(word in text for word in LOOPS + RANDOM)
@@ -85,10 +85,12 @@ def test_what_is_not_there_has_no_letter():
         planned(jl.Lidar(), bare, max_orders=3),
         planned(jl.Lidar(), with_bark, max_orders=3, effects={"bark": False}),
     ]
-    assert "bark.R" in plans[0].layout.letters
-    assert plans[1].layout.letters == plans[2].layout.letters == ("leaf.R", "leaf.T", "ground.R")
+    assert "bark.R" in plans[0].trace.letters
+    assert plans[1].trace.letters == plans[2].trace.letters == ("leaf.R", "leaf.T", "ground.R")
     assert traced(jl.Lidar(), bare, plans[1]) == traced(jl.Lidar(), bare, plans[2])
-    weights = jax.eval_shape(lambda key: jl.trace(jl.Lidar(), with_bark, plans[2], key), jax.random.key(0))
+    weights = jax.eval_shape(
+        lambda key: jl.trace_scene(jl.Lidar(), with_bark, plans[2], key), jax.random.key(0)
+    )
     assert weights.first.shape[0] == 2
     assert weights.first.shape[1] == 4
 

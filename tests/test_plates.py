@@ -13,7 +13,7 @@ import mpmath
 import numpy as np
 import pytest
 
-from jaxlidar.plates import Surface, plate_model, plate_model_slopes, surface
+from jaxlidar.optics.plate_model import Surface, plate_model, plate_model_slopes, surface
 
 KS = (0.0, 1e-8, 1e-4, 1e-2, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
 NS = (1.0, 1.0001, 1.5, 2.0, 3.4, 10.0)

@@ -7,7 +7,7 @@ import pytest
 from matplotlib.figure import Figure
 
 import jaxlidar as jl
-import jaxlidar.plot as plot
+from jaxlidar import plot
 
 matplotlib.use("agg")
 

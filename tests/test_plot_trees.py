@@ -6,7 +6,7 @@ import pytest
 from matplotlib.figure import Figure
 
 import jaxlidar as jl
-import jaxlidar.plot_trees as plot_trees
+from jaxlidar.plot import trees as plot_trees
 
 matplotlib.use("agg")
 

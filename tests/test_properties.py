@@ -109,7 +109,7 @@ def compiled(precision):
 
     def simulated(p):
         lidar, scene = build(p)
-        return jl.waveform(jl.trace(lidar, scene, plan, KEY), lidar, scene, plan)
+        return jl.waveform_of(jl.trace_scene(lidar, scene, plan, KEY), lidar, scene, plan)
 
     return jax.jit(simulated, compiler_options={"xla_backend_optimization_level": 0})
 

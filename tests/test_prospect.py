@@ -9,9 +9,9 @@ import prosail
 import pytest
 from scipy.optimize import brentq
 
-from jaxlidar._coefficients import TRAITS, load_coefficients, shipped
-from jaxlidar.plates import plate_model, surface
-from jaxlidar.prospect import Prospect, prospect_jacobian, prospect_spectra
+from jaxlidar.optics.coefficients import TRAITS, load_coefficients, shipped
+from jaxlidar.optics.plate_model import plate_model, surface
+from jaxlidar.optics.prospect import Prospect, prospect_jacobian, prospect_spectra
 
 WAVELENGTHS = np.arange(400.0, 2501.0)
 LASERS = np.array([532.0, 1064.0, 1550.0])

@@ -10,7 +10,7 @@ import mpmath as mp
 import numpy as np
 import pytest
 
-from jaxlidar.pulse import (
+from jaxlidar.instrument.pulse import (
     ExponentiallyModifiedGaussianPulse,
     GaussianPulse,
     RectangularPulse,

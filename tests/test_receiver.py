@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxlidar.constants import PLANCK_TIMES_LIGHT
-from jaxlidar.receiver import Receiver, first_return_window, record
+from jaxlidar._constants import PLANCK_TIMES_LIGHT
+from jaxlidar.instrument.receiver import Receiver, first_return_window, record
 
 WAVELENGTH = np.array([532.0, 1064.0])
 PHOTON = PLANCK_TIMES_LIGHT / WAVELENGTH

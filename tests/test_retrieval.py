@@ -345,11 +345,11 @@ def test_the_plan_serves_the_corners_of_the_bounds():
     scenes = corners(scene, settled)
     assert len(scenes) == 17
     for corner in scenes:
-        own = jl.plan(LIDAR, corner, max_orders=2, window=(-260.0, 59.0), max_step=plan.layout.max_step)
-        assert own.layout.upstream <= plan.layout.upstream
-        assert own.layout.last <= plan.layout.last
-        assert own.layout.first_steps <= plan.layout.first_steps
-        assert own.layout.march_steps <= plan.layout.march_steps
+        own = jl.plan(LIDAR, corner, max_orders=2, window=(-260.0, 59.0), max_step=plan.trace.max_step)
+        assert own.trace.upstream <= plan.trace.upstream
+        assert own.trace.last <= plan.trace.last
+        assert own.trace.first_steps <= plan.trace.first_steps
+        assert own.trace.march_steps <= plan.trace.march_steps
         assert own.bins.width == plan.bins.width
         assert own.bins.row <= plan.bins.row
         assert own.bins.start >= plan.bins.start - 1e-6

@@ -21,7 +21,7 @@ from helpers import first_wave, slab
 from scipy.integrate import quad
 
 import jaxlidar as jl
-from jaxlidar.constants import SPEED_OF_LIGHT
+from jaxlidar import SPEED_OF_LIGHT
 
 KEY = jax.random.key(22)
 THICKNESS, RHO = 10.0, 0.45

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxlidar.spectra import Spectrum, read_spectrum_csv, reflectance_at, spectra, spectrum
+from jaxlidar.optics.spectra import Spectrum, read_spectrum_csv, reflectance_at, spectra, spectrum
 
 LASERS = np.array([532.0, 1064.0, 1550.0])
 WAVELENGTH, REFLECTANCE = np.array([400.0, 500.0, 900.0]), np.array([0.1, 0.3, 0.2])

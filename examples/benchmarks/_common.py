@@ -1,4 +1,4 @@
-"""What the benchmarks share: the record of the machine, timing side by side, files written whole."""
+"""What the benchmarks share: the record of the machine, timing side by side, atomic file writes."""
 
 import argparse
 import json
@@ -11,7 +11,7 @@ from pathlib import Path
 import jax
 import matplotlib
 
-from jaxlidar.io import whole_file
+from jaxlidar.io import atomic_write
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -74,8 +74,8 @@ def best(times: Mapping[str, list[float]]) -> dict[str, float]:
 
 
 def write_json(path: Path, record: Mapping[str, object]) -> None:
-    """Write a record, whole or not at all."""
-    with whole_file(path) as draft:
+    """Write a record, atomically."""
+    with atomic_write(path) as draft:
         draft.write_text(json.dumps(record, indent=2) + "\n")
 
 
@@ -85,8 +85,8 @@ def new_figure(columns: int = 1, size: tuple[float, float] = (6, 4)):
 
 
 def save_figure(figure, path: Path) -> None:
-    """Write a figure as PNG, whole or not at all."""
-    with whole_file(path) as draft:
+    """Write a figure as PNG, atomically."""
+    with atomic_write(path) as draft:
         figure.savefig(draft, dpi=150, format="png")
     plt.close(figure)
 

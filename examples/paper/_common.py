@@ -9,7 +9,7 @@ import matplotlib
 import numpy as np
 
 import jaxlidar as jl
-from jaxlidar.io import whole_file
+from jaxlidar.io import atomic_write
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -47,7 +47,7 @@ def new_figure(columns: int = 1, rows: int = 1, height: float = 2.6, width: floa
 
 def save(figure, path: Path) -> None:
     """Write a PNG, whole or not at all."""
-    with whole_file(path) as draft:
+    with atomic_write(path) as draft:
         figure.savefig(draft, format="png", dpi=200)
     plt.close(figure)
     print(path)

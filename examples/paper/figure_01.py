@@ -7,7 +7,7 @@ import numpy as np
 from _common import options, plt, save, table
 
 import jaxlidar as jl
-from jaxlidar import plot_trees
+import jaxlidar.plot
 
 
 def main(argv=None) -> dict[str, float]:
@@ -27,7 +27,7 @@ def main(argv=None) -> dict[str, float]:
 
     figure = plt.figure(figsize=(7.0, 4.0), layout="constrained")
     axes = [figure.add_subplot(1, 2, i, projection="3d") for i in (1, 2)]
-    plot_trees.leaf_on_and_off(tree, axes, **({"max_buds": 2000} if given.small else {}))
+    jaxlidar.plot.leaf_on_and_off(tree, axes, **({"max_buds": 2000} if given.small else {}))
     save(figure, given.out / "paper_figure_01.png")
     return {name: value for name, (_, value) in sizes.items()}
 

@@ -1,13 +1,25 @@
-"""Readers of recorded waveforms, voxel maps, point clouds and tree models."""
+"""Readers of recorded waveforms, voxel maps, point clouds and tree models, and atomic file writes."""
 
-from .gedi import GediShot as GediShot
-from .gedi import read_gedi_l1b as read_gedi_l1b
-from .las import PointCloud as PointCloud
-from .las import read_las as read_las
-from .neon import NeonImpulse as NeonImpulse
-from .neon import NeonRead as NeonRead
-from .neon import NeonShot as NeonShot
-from .neon import read_neon as read_neon
-from .qsm import read_qsm as read_qsm
-from .vox import read_vox as read_vox
-from .whole import whole_file as whole_file
+from jaxlidar._files import atomic_write
+from jaxlidar.io.gedi import GediShot, read_gedi_l1b
+from jaxlidar.io.las import PointCloud, read_las
+from jaxlidar.io.neon import NeonImpulse, NeonRead, NeonShot, read_neon
+from jaxlidar.io.qsm import read_qsm
+from jaxlidar.io.text import TreeRead, VoxelsRead
+from jaxlidar.io.vox import read_vox
+
+__all__ = [
+    "GediShot",
+    "NeonImpulse",
+    "NeonRead",
+    "NeonShot",
+    "PointCloud",
+    "TreeRead",
+    "VoxelsRead",
+    "atomic_write",
+    "read_gedi_l1b",
+    "read_las",
+    "read_neon",
+    "read_qsm",
+    "read_vox",
+]

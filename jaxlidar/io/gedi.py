@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from ._pulse import above_pedestal
+from jaxlidar.io.pedestal import above_pedestal
 
 # Per-shot datasets of a beam's group, and what a GediShot makes of them.
 _PER_SHOT = (

@@ -29,8 +29,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..constants import SPEED_OF_LIGHT
-from ._pulse import above_pedestal
+from jaxlidar._constants import SPEED_OF_LIGHT
+from jaxlidar.io.pedestal import above_pedestal
 
 # The columns of `geo` that are used.
 _COLUMNS = ("index", "dx", "dy", "dz", "V9", "V10", "V11", "V15", "V16")

@@ -4,8 +4,8 @@ import os
 
 import numpy as np
 
-from ..tree import Tree
-from ._text import TreeRead, cells_of, lines_of, number_in
+from jaxlidar.io.text import TreeRead, cells_of, lines_of, number_in
+from jaxlidar.plants.tree import Tree
 
 # Names of the columns in use, without case, spaces and underscores.
 _COLUMNS = {

@@ -5,9 +5,9 @@ import re
 
 import numpy as np
 
-from ..materials import LeafAngles
-from ..voxels import VoxelMap
-from ._text import VoxelsRead, cells_of, lines_of, number_in
+from jaxlidar.io.text import VoxelsRead, cells_of, lines_of, number_in
+from jaxlidar.optics.leaf_angles import LeafAngles
+from jaxlidar.scenes.voxels import VoxelMap
 
 _FIRST_LINE = "VOXEL SPACE"
 _DENSITY = ("PadBVTotal", "attenuation_FPL_unbiasedMLE")

@@ -1,5 +1,1 @@
-"""The response tracer: geometry to the geometric weight of every scattering history."""
-
-from .response import Response, trace
-
-__all__ = ["Response", "trace"]
+"""The response tracer: from geometry to the geometric weight of every scattering history."""

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from ..layout import Bins
+from jaxlidar.planning.trace_plan import Bins
 
 
 def instant_row(

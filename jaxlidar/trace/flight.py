@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .._vector import FAR, Scalar, with_derivative_of
-from .march import free_flight
-from .photons import EVENT, GAP, THROUGH, Photons, Setting, ratio_of, stop
+from jaxlidar._vectors import FAR, Scalar, with_derivative_of
+from jaxlidar.trace.march import free_flight
+from jaxlidar.trace.photons import EVENT, GAP, THROUGH, Photons, Setting, ratio_of, stop
 
 # Random numbers of a flight and of the collision that ends it, beside one for each plate.
 DIMENSIONS = 6
@@ -54,7 +54,7 @@ def fly(
         cell = jnp.zeros(u.shape, jnp.int32)
     else:
         medium, target = setting.medium, -jnp.log(u)
-        steps, box = setting.layout.march_steps, setting.occupied
+        steps, box = setting.trace.march_steps, setting.occupied
         free = free_flight(medium, p.x, p.w, target, reach, p.alive, steps, box)
         collided, cell = free.collided, free.cell
         k = jnp.where(collided, jax.vmap(medium.extinction, (0, None))(cell, p.w), 1.0)
@@ -103,9 +103,9 @@ def plates_ahead(setting: Setting, p: Photons, u: list[Scalar]):
         v, c = next(drawn), jnp.broadcast_to(s.coverage, p.weight.shape)
         hit = v < c
         outcome = jnp.where(hit, EVENT, GAP)
-        if s.straight and setting.layout.surfaces[i].transmitted >= 0:
+        if s.straight and setting.trace.surfaces[i].transmitted >= 0:
             # The lobe is chosen with the number that decided that the plate was hit.
-            outcome = jnp.where(hit & (v >= c * setting.layout.lobe), THROUGH, outcome)
+            outcome = jnp.where(hit & (v >= c * setting.trace.lobe), THROUGH, outcome)
         outcomes.append(outcome)
         ratios.append(ratio_of(jnp.where(hit, c, 1.0 - c)))
     return met, outcomes, ratios

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from .._vector import FAR, Scalar, Vec, add, dot, from_frame, normalise, scale, vec
-from ..lidar import Lidar
+from jaxlidar._vectors import FAR, Scalar, Vec, add, dot, from_frame, normalise, scale, vec
+from jaxlidar.instrument.lidar import Lidar
 
 GOLDEN = (np.sqrt(5.0) - 1) / 2
 

@@ -14,10 +14,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from .._vector import FAR, Scalar, Vec, along, from_frame, to_frame
-from ..materials import ANGLE_NODES, LeafAngles
-from ..voxels import VoxelMap
-from .footprint import Beam
+from jaxlidar._vectors import FAR, Scalar, Vec
+from jaxlidar.optics.leaf_angles import ANGLE_NODES, LeafAngles
+from jaxlidar.scenes.voxels import VoxelMap
 
 # Steps between two looks at whether any ray of the batch still moves.
 BLOCK = 16
@@ -267,37 +266,6 @@ def free_flight(
     distance, total, _, _, held = lax.scan(block, state, None, length=-(-steps // BLOCK))[0]
     entered, left, depth, cell = held
     return Free(entered >= 0, cell, entered, left - entered, depth, distance, total)
-
-
-def hold_in_columns(
-    beam: Beam, medium: Medium | None, across: tuple[Scalar, Scalar]
-) -> tuple[tuple[Scalar, Scalar], Scalar]:
-    """Let the rays of the footprint move with the columns of the grid, and their energy accordingly.
-
-    Values do not change. But the optical depth of a nearly vertical ray jumps, seen from afar, where it
-    crosses into another column: its derivative with respect to a sideways motion of the grid lies in rare,
-    nearly parallel crossings. Rays that move along have none, and the profile of a Gaussian beam makes up
-    for it. The edge of a top-hat would not, so its rays stay, and that derivative stays noisy.
-    """
-    if medium is None or not beam.gaussian:
-        return across, jnp.ones_like(across[0])
-    # A beam without width has no profile that could make up for it.
-    wide = beam.radius > 1e-6
-    across_axis = from_frame(beam.axis, (*across, jnp.zeros_like(across[0])))
-    # Where the rays meet the reference plane.
-    flat = along(across_axis, beam.axis, -across_axis[2] / beam.axis[2])
-    moved = []
-    for k in range(2):
-        place = lax.stop_gradient((flat[k] - medium.origin[k]) / medium.size[k])
-        now = medium.origin[k] + medium.size[k] * place
-        moved.append(jnp.where(wide, now - lax.stop_gradient(now), 0.0))
-    shift = to_frame(beam.axis, (*moved, jnp.zeros_like(across[0])))
-    across = (across[0] + shift[0], across[1] + shift[1])
-    # Rays lie farther apart where voxels or the beam are wider.
-    area = medium.size[0] * medium.size[1] * beam.radius**2
-    density = jnp.where(wide, beam.irradiance(across) * area, 1.0)
-    held = lax.stop_gradient(density)
-    return across, 1.0 + (density - held) / jnp.maximum(held, 1e-30)
 
 
 def depth_to_top(medium: Medium, x: Vec, column: Float[Array, "cells"]) -> Scalar:

@@ -21,10 +21,10 @@ import numpy as np
 from jax.scipy.special import i0e
 from jaxtyping import Array, Float
 
-from .._vector import Scalar, dot, to_frame, vec
-from ..materials import Specular
-from .footprint import GOLDEN, Beam, across_beam, disc
-from .surfaces import Surface
+from jaxlidar._vectors import Scalar, dot, to_frame, vec
+from jaxlidar.optics.laws import Specular
+from jaxlidar.trace.footprint import GOLDEN, Beam, across_beam, disc
+from jaxlidar.trace.surfaces import Surface
 
 RAYS = 4096
 # Lobes narrower than this are taken as this wide, in units of the aperture's radius.

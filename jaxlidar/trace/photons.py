@@ -6,12 +6,12 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from .._vector import Scalar, Vec, with_derivative_of
-from ..layout import Bins, Layout
-from .footprint import Beam
-from .histories import Histories
-from .march import Box, Medium, columns, occupied
-from .surfaces import Surface
+from jaxlidar._vectors import Scalar, Vec, with_derivative_of
+from jaxlidar.planning.trace_plan import Bins, TracePlan
+from jaxlidar.trace.footprint import Beam
+from jaxlidar.trace.histories import Histories
+from jaxlidar.trace.march import Box, Medium, columns, occupied
+from jaxlidar.trace.surfaces import Surface
 
 stop = lax.stop_gradient
 
@@ -63,7 +63,7 @@ class Setting(eqx.Module):
     beam: Beam
     medium: Medium | None
     surfaces: tuple[Surface, ...]
-    layout: Layout = eqx.field(static=True)
+    trace: TracePlan = eqx.field(static=True)
     table: Histories = eqx.field(static=True)
     bins: Bins = eqx.field(static=True)
     column: Float[Array, "cells"] | None
@@ -75,19 +75,19 @@ class Setting(eqx.Module):
         beam: Beam,
         medium: Medium | None,
         surfaces: tuple[Surface, ...],
-        layout: Layout,
+        trace: TracePlan,
         table: Histories,
         bins: Bins,
     ):
         self.beam, self.medium, self.surfaces = beam, medium, surfaces
-        self.layout, self.table, self.bins = layout, table, bins
-        self.column = columns(medium) if medium is not None and layout.vertical else None
+        self.trace, self.table, self.bins = trace, table, bins
+        self.column = columns(medium) if medium is not None and trace.vertical else None
         self.occupied = None if medium is None else occupied(medium)
         self.successor = jnp.asarray(table.successor)
 
     def budget(self, p: Photons) -> Float[Array, "photons"]:
         """How far photons may fly, m, so that their light can still be recorded."""
-        return jnp.minimum(self.beam.budget(p.x, p.w, self.layout.last - p.path), self.layout.max_flight)
+        return jnp.minimum(self.beam.budget(p.x, p.w, self.trace.last - p.path), self.trace.max_flight)
 
     def grow(
         self, history: Int[Array, "*photons"], letter: Int[Array, "*photons"] | int

@@ -11,18 +11,18 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from ..effects import without
-from ..lidar import Lidar
-from ..materials import Specular
-from ..plan import Plan
-from ..scene import Scene
-from .first import FirstOrder, first_order
-from .footprint import Beam, beam_of, lattice, product_rule, scattered
-from .higher import higher_orders
-from .histories import Histories, histories
-from .march import Medium, medium_of
-from .mirror import mirror_rays
-from .surfaces import Surface, surfaces_of
+from jaxlidar.instrument.lidar import Lidar
+from jaxlidar.optics.laws import Specular
+from jaxlidar.planning.effects import without
+from jaxlidar.planning.plan import Plan
+from jaxlidar.scenes.scene import Scene
+from jaxlidar.trace.first_order import FirstOrder, first_order
+from jaxlidar.trace.footprint import Beam, beam_of, lattice, product_rule, scattered
+from jaxlidar.trace.higher_orders import higher_orders
+from jaxlidar.trace.histories import Histories, histories
+from jaxlidar.trace.march import Medium, medium_of
+from jaxlidar.trace.mirror import mirror_rays
+from jaxlidar.trace.surfaces import Surface, surfaces_of
 
 
 class Response(eqx.Module):
@@ -57,7 +57,7 @@ def geometry_of(
     return beam_of(lidar), medium, surfaces_of(scene, aim)
 
 
-def trace(
+def trace_scene(
     lidar: Lidar,
     scene: Scene,
     plan: Plan,
@@ -70,30 +70,30 @@ def trace(
     where the canopy's transmission is straight; extinction is then scaled by one minus it.
     """
     lidar, scene = without(lidar, scene, plan.off)
-    layout, bins = plan.layout, plan.bins
+    trace, bins = plan.trace, plan.bins
     beam, medium, surfaces = geometry_of(lidar, scene, leaf_transmittance)
-    table = histories(len(layout.letters), plan.degree)
-    short = histories(len(layout.letters), plan.first_degree)
+    table = histories(len(trace.letters), plan.degree)
+    short = histories(len(trace.letters), plan.first_degree)
     # What is not random is compiled without random numbers.
     shift_key, photon_key = jax.random.split(key) if plan.is_random else (key, key)
 
     if plan.smooth_footprint:
         across, energy = product_rule(beam)
-    elif layout.independent:
+    elif trace.independent:
         across, energy = scattered(beam, plan.n_rays, shift_key)
     else:
         shift = jax.random.uniform(shift_key, (2,)) if plan.random_footprint else jnp.asarray([0.5, 0.0])
         across, energy = lattice(beam, plan.n_rays, shift)
-    first = first_order(beam, medium, surfaces, layout, short, bins, across, energy)
-    weights = jnp.zeros_like(first.weights) if layout.drawn_first else first.weights
+    first = first_order(beam, medium, surfaces, trace, short, bins, across, energy)
+    weights = jnp.zeros_like(first.weights) if trace.drawn_first else first.weights
     for i, surface in enumerate(surfaces):
         if isinstance(surface.law, Specular) and "specular return" not in plan.off:
             weights = weights + _mirror(beam, medium, surfaces, i, plan, short)
 
-    if layout.orders < 2 and not layout.drawn_first:
+    if trace.orders < 2 and not trace.drawn_first:
         straight = [s.straight for s in surfaces]
         return _only_first(first, weights, plan, short, straight)
-    higher = higher_orders(beam, medium, surfaces, layout, table, bins, photon_key, plan.n_photons)
+    higher = higher_orders(beam, medium, surfaces, trace, table, bins, photon_key, plan.n_photons)
     return Response(
         weights, higher.weights, higher.arrived, higher.left, higher.escaped, higher.late, higher.remaining
     )
@@ -107,8 +107,8 @@ def _mirror(
     # As if it were a Lambertian sheet met at normal incidence, weighted by what the mirror returns.
     plain = eqx.tree_at(lambda s: s.law, surfaces[which], _Facing())
     others = tuple(plain if i == which else s for i, s in enumerate(surfaces))
-    response = first_order(beam, medium, others, plan.layout, table, plan.bins, across, value)
-    material = plan.layout.surfaces[which].material
+    response = first_order(beam, medium, others, plan.trace, table, plan.bins, across, value)
+    material = plan.trace.surfaces[which].material
     keep = jnp.arange(response.weights.shape[0]) == material
     return jnp.where(keep[:, None, None], response.weights, 0.0)
 
@@ -128,11 +128,11 @@ def _only_first(
     straight: list[bool],
 ) -> Response:
     """The fate of light when nothing is followed beyond the first scattering: what scatters remains."""
-    layout = plan.layout
+    trace = plan.trace
     left = jnp.zeros_like(first.arrived)
     remaining = jnp.zeros_like(first.escaped)
-    scatterers = [(s, False) for s in (layout.leaf, layout.bark) if s is not None]
-    scatterers += list(zip(layout.surfaces, straight))
+    scatterers = [(s, False) for s in (trace.leaf, trace.bark) if s is not None]
+    scatterers += list(zip(trace.surfaces, straight))
     for s, passes in scatterers:
         for letter in (s.reflected, s.transmitted):
             if letter < 0:
@@ -144,7 +144,7 @@ def _only_first(
             if not (passes and letter == s.transmitted):
                 remaining = remaining.at[after].add(grown)
     escaped, late = first.escaped, jnp.zeros_like(remaining)
-    if len(scatterers) == 1 and not (layout.leaf or layout.bark):
+    if len(scatterers) == 1 and not (trace.leaf or trace.bark):
         # Nothing is in the way of what one plane scatters.
         escaped, remaining = escaped + remaining, late
     return Response(weights, None, first.arrived, left, escaped, late, remaining)

@@ -4,9 +4,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._vector import FAR, Scalar, Vec, dot, scale, vec
-from ..materials import AbstractLaw
-from ..scene import Ground, Plate, Scene
+from jaxlidar._vectors import FAR, Scalar, Vec, dot, scale, vec
+from jaxlidar.optics.laws import AbstractLaw
+from jaxlidar.scenes.scene import Ground, Plate, Scene
 
 
 class Surface(eqx.Module):

@@ -1,0 +1,157 @@
+"""The lidar: where it is, where it points, what it sends and how it records.
+
+Axes: x east, y north, z up; the reference plane is z = 0. The beam axis meets it at `position`, and
+the sensor stands a slant range back along the axis. Time zero of every waveform is the two-way travel to
+that meeting point.
+"""
+
+import math
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from jaxlidar._checks import as_array, as_scalar, check_choice, check_range, concrete
+from jaxlidar.instrument.pulse import AbstractPulse, GaussianPulse
+from jaxlidar.instrument.receiver import Receiver
+
+
+def _numbers(x: ArrayLike | Sequence[ArrayLike]) -> Float[Array, "..."]:
+    return as_array(x if isinstance(x, jax.Array) else jnp.asarray(x, dtype=float))
+
+
+def _vector(x: ArrayLike | Sequence[ArrayLike]) -> Float[Array, " n"]:
+    return jnp.atleast_1d(_numbers(x))
+
+
+def _position(x: ArrayLike | Sequence[ArrayLike]) -> Float[Array, " 2"]:
+    position = _numbers(x)
+    if position.shape != (2,):
+        raise ValueError(f"position has shape {position.shape}; admissible is (2,), for x and y")
+    return position
+
+
+def _optional_scalar(x: ArrayLike | None) -> Float[Array, ""] | None:
+    return None if x is None else as_scalar(x)
+
+
+class Lidar(eqx.Module):
+    """A full-waveform lidar. Without arguments it is that of Table 1 of the paper: 1064 nm, 6 ns,
+    0.3 mrad and an aperture of 0.2 m, looking straight down from 1000 m.
+
+    - `wavelength`: in nm, one number or strictly increasing ones, stored as (wavelengths,). Default 1064.
+    - `altitude`: height of the sensor above the reference plane z = 0 in m, positive. Default 1000.
+    - `pulse`: shape of the transmitted pulse. Default `GaussianPulse(fwhm=6.0)`.
+    - `divergence`: full angle of the beam in mrad, not negative: between the directions at 1/e^2 of
+      the axial irradiance, or across the disc of a top-hat. Default 0.3.
+    - `aperture`: diameter of the receiver in m, positive. Default 0.2.
+    - `zenith`: angle between the beam and the vertical in degrees, 0 to 89. Default 0 (nadir).
+    - `azimuth`: compass direction in which the beam travels, degrees clockwise from north (+y).
+      Default 0; without effect on the axis at nadir.
+    - `energy`: J per pulse, positive, one number or one per wavelength. Default 1e-3.
+    - `sampling_interval`: of the digitiser in ns, positive. Default 1.
+    - `profile`: irradiance across the beam, `"gaussian"` (default) or `"top-hat"`.
+    - `position`: (x, y) in m where the beam axis meets the reference plane: the footprint's centre. At nadir
+      it is also the sensor's horizontal position. Default (0, 0).
+    - `field_of_view`: full angle of the receiver in mrad, positive, or None (default): it sees everything.
+    - `jitter`: standard deviation of the timing error in ns, not negative. Default 0.
+    - `efficiency`: of the optics and the detector together, in (0, 1], one number or one per
+      wavelength. Default 1.
+    - `receiver`: detection, noise and digitisation. Default `Receiver()`: a perfect record.
+
+    **Raises:** `ValueError` for a value outside its range, for unsorted wavelengths, for an unknown profile,
+    and where energies or efficiencies are neither one nor one per wavelength.
+    """
+
+    wavelength: Float[Array, " wavelengths"] = eqx.field(converter=_vector, default=1064.0)
+    altitude: Float[Array, ""] = eqx.field(converter=as_scalar, default=1000.0)
+    pulse: AbstractPulse = eqx.field(default_factory=GaussianPulse)
+    divergence: Float[Array, ""] = eqx.field(converter=as_scalar, default=0.3)
+    aperture: Float[Array, ""] = eqx.field(converter=as_scalar, default=0.2)
+    zenith: Float[Array, ""] = eqx.field(converter=as_scalar, default=0.0)
+    azimuth: Float[Array, ""] = eqx.field(converter=as_scalar, default=0.0)
+    energy: Float[Array, "..."] = eqx.field(converter=_numbers, default=1e-3)
+    sampling_interval: Float[Array, ""] = eqx.field(converter=as_scalar, default=1.0)
+    profile: str = eqx.field(static=True, default="gaussian")
+    position: Float[Array, " 2"] = eqx.field(converter=_position, default=(0.0, 0.0))
+    field_of_view: Float[Array, ""] | None = eqx.field(converter=_optional_scalar, default=None)
+    jitter: Float[Array, ""] = eqx.field(converter=as_scalar, default=0.0)
+    efficiency: Float[Array, "..."] = eqx.field(converter=_numbers, default=1.0)
+    receiver: Receiver = eqx.field(default_factory=Receiver)
+
+    def __check_init__(self):
+        check_range("wavelength", self.wavelength, 0.0, low_open=True)
+        wavelength = concrete(self.wavelength)
+        if wavelength is not None and (wavelength.size == 0 or np.any(np.diff(wavelength) <= 0)):
+            raise ValueError(
+                f"wavelength = {wavelength.tolist()} is not admissible: one or more, strictly increasing, "
+                "in (0, inf)"
+            )
+        check_range("altitude", self.altitude, 0.0, low_open=True)
+        check_range("divergence", self.divergence, 0.0)
+        check_range("aperture", self.aperture, 0.0, low_open=True)
+        check_range("zenith", self.zenith, 0.0, 89.0)
+        check_range("azimuth", self.azimuth)
+        check_range("energy", self.energy, 0.0, low_open=True)
+        check_range("sampling_interval", self.sampling_interval, 0.0, low_open=True)
+        check_choice("profile", self.profile, ("gaussian", "top-hat"))
+        check_range("position", self.position)
+        if self.field_of_view is not None:
+            check_range("field_of_view", self.field_of_view, 0.0, low_open=True)
+        check_range("jitter", self.jitter, 0.0)
+        check_range("efficiency", self.efficiency, 0.0, 1.0, low_open=True)
+        for field, value in (("energy", self.energy), ("efficiency", self.efficiency)):
+            if value.shape not in ((), (1,), self.wavelength.shape):
+                raise ValueError(
+                    f"{field} has shape {value.shape}; admissible is one number or one per wavelength, "
+                    f"{self.wavelength.shape}"
+                )
+
+    @property
+    def direction(self) -> Float[Array, " 3"]:
+        """Unit vector in which the beam travels."""
+        zenith, azimuth = jnp.deg2rad(self.zenith), jnp.deg2rad(self.azimuth)
+        across = jnp.sin(zenith)
+        return jnp.stack([across * jnp.sin(azimuth), across * jnp.cos(azimuth), -jnp.cos(zenith)])
+
+    @property
+    def range_to_reference(self) -> Float[Array, ""]:
+        """Distance in m along the beam axis from the sensor to the reference plane."""
+        return self.altitude / jnp.cos(jnp.deg2rad(self.zenith))
+
+    @property
+    def sensor(self) -> Float[Array, " 3"]:
+        """Where the sensor stands, in m."""
+        foot = jnp.concatenate([self.position, jnp.zeros_like(self.position[:1])])
+        return foot - self.range_to_reference * self.direction
+
+    @property
+    def footprint_radius(self) -> Float[Array, ""]:
+        """Radius in m of the beam's cross-section at the reference plane (1/e^2, or the top-hat's edge).
+
+        Across the beam: on the plane itself the footprint is longer by 1/cos(zenith) along the azimuth.
+        """
+        return self.range_to_reference * self.divergence * 0.5e-3
+
+    @property
+    def aperture_area(self) -> Float[Array, ""]:
+        """Area of the receiver's aperture in m2."""
+        return 0.25 * math.pi * self.aperture**2
+
+    @property
+    def aperture_half_angle(self) -> Float[Array, ""]:
+        """Half the angle in rad under which the reference plane sees the aperture."""
+        return 0.5 * self.aperture / self.range_to_reference
+
+    @property
+    def energy_per_wavelength(self) -> Float[Array, " wavelengths"]:
+        """J per pulse, for each wavelength."""
+        return jnp.broadcast_to(self.energy, self.wavelength.shape)
+
+    @property
+    def efficiency_per_wavelength(self) -> Float[Array, " wavelengths"]:
+        """The efficiency of optics and detector, for each wavelength."""
+        return jnp.broadcast_to(self.efficiency, self.wavelength.shape)

@@ -1,0 +1,174 @@
+"""The receiver: what the detector and the digitiser make of the energy that arrives.
+
+`record` turns expected energies per sample into a record, with or without one realisation of the noise;
+`first_return_window` opens the sampling bins at the first return, as the paper does.
+"""
+
+import math
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from jaxlidar._checks import as_array, as_scalar, check_choice, check_range
+from jaxlidar._constants import PLANCK_TIMES_LIGHT
+
+# Above this expectation a Poisson count is drawn as a normal variable (skewness below 1e-3): the exact
+# sampler counts in 32 bits.
+_POISSON_MAX = 1e6
+
+
+def _optional_scalar(x: ArrayLike | None) -> Float[Array, ""] | None:
+    return None if x is None else as_scalar(x)
+
+
+class Receiver(eqx.Module):
+    """Detection and digitisation of a waveform. Without arguments: a perfect record.
+
+    Energies are those detected, that is, after the efficiency of optics and detector.
+
+    - `detection_threshold`: J per sample, not negative; samples below it read zero. Default 0: nothing
+      is lost, and electronic noise may make a sample negative.
+    - `saturation`: J per sample, positive; larger samples read this. Default None: no limit.
+    - `bits`: the digitiser's resolution, 1 to 24, over [0, `saturation`], which it requires. Default
+      None: not quantised.
+    - `background`: J per sample, not negative, added to every sample (sunlight, dark current). Default 0.
+    - `photon_noise`: whether a noisy record has the shot noise of signal and background. Default True.
+    - `electronic_noise`: standard deviation of additive normal noise, J per sample, not negative.
+      Default 0.
+    - `window`: `"fixed"` (default): samples at fixed instants; `"first return"`: the sampling bins open at
+      the first return, as in the paper (see `first_return_window`).
+
+    **Raises:** `ValueError` for a value outside its range, and for `bits` without `saturation`.
+    """
+
+    detection_threshold: Float[Array, ""] = eqx.field(converter=as_scalar, default=0.0)
+    saturation: Float[Array, ""] | None = eqx.field(converter=_optional_scalar, default=None)
+    bits: int | None = eqx.field(static=True, default=None)
+    background: Float[Array, ""] = eqx.field(converter=as_scalar, default=0.0)
+    photon_noise: bool = eqx.field(static=True, default=True)
+    electronic_noise: Float[Array, ""] = eqx.field(converter=as_scalar, default=0.0)
+    window: str = eqx.field(static=True, default="fixed")
+
+    def __check_init__(self):
+        check_range("detection_threshold", self.detection_threshold, 0.0)
+        if self.saturation is not None:
+            check_range("saturation", self.saturation, 0.0, low_open=True)
+        if self.bits is not None:
+            check_range("bits", self.bits, 1, 24)
+            if self.bits != int(self.bits):
+                raise ValueError(f"bits = {self.bits} is no whole number in [1, 24]")
+            if self.saturation is None:
+                raise ValueError(f"bits = {self.bits} needs a saturation in (0, inf), but saturation = None")
+        check_range("background", self.background, 0.0)
+        check_range("electronic_noise", self.electronic_noise, 0.0)
+        check_choice("window", self.window, ("fixed", "first return"))
+
+
+def record(
+    energy: Float[ArrayLike, "*channels wavelengths bins"],
+    wavelength: ArrayLike | Sequence[ArrayLike],
+    receiver: Receiver,
+    *,
+    key: Array | None = None,
+) -> Float[Array, "*channels wavelengths bins"]:
+    """The recorded waveform: background and noise, then saturation, detection threshold, quantisation.
+
+    - `energy`: expected detected energy per sample in J, not negative.
+    - `wavelength`: in nm, one number or (wavelengths,): a photon carries h c / wavelength.
+    - `receiver`: what to apply.
+    - `key`: a random key: the result is one realisation (Poisson counts of the photons of signal and
+      background, a normal variable in their place beyond a million expected; normal electronic noise).
+      Default None: the record of the expected energies, without noise.
+
+    Returns J per sample, shaped as `energy`. Derivatives pass through the quantisation as though it
+    were absent, and through the noise of a realisation with its draws held fixed (so not through Poisson
+    counts).
+    """
+    energy = as_array(energy)
+    expected = energy + receiver.background
+    value = expected
+    if key is not None:
+        photon_key, electronic_key = jax.random.split(key)
+        if receiver.photon_noise:
+            value = _shot_noise(expected, wavelength, photon_key)
+        noise = jax.random.normal(electronic_key, energy.shape, energy.dtype)
+        value = value + receiver.electronic_noise * noise
+    if receiver.saturation is not None:
+        value = jnp.minimum(value, receiver.saturation)
+    threshold = receiver.detection_threshold
+    value = jnp.where((threshold > 0) & (value < threshold), 0.0, value)
+    if receiver.bits is not None and receiver.saturation is not None:
+        step = receiver.saturation / (2**receiver.bits - 1)
+        level = jnp.clip(jnp.round(value / step), 0, 2**receiver.bits - 1)
+        # In this order the value is the level exactly and the derivative that of `value`.
+        value = jax.lax.stop_gradient(level * step) + (value - jax.lax.stop_gradient(value))
+    return value
+
+
+def _shot_noise(energy: Array, wavelength: ArrayLike | Sequence[ArrayLike], key: Array) -> Array:
+    photon = PLANCK_TIMES_LIGHT / jnp.asarray(wavelength, dtype=energy.dtype)
+    photon = jnp.broadcast_to(photon.reshape(-1, 1), energy.shape)
+    photons = energy / photon
+    count_key, normal_key = jax.random.split(key)
+    many = photons > _POISSON_MAX
+    counts = jax.random.poisson(count_key, jax.lax.stop_gradient(jnp.where(many, 1.0, photons)))
+    normal = jax.random.normal(normal_key, energy.shape, energy.dtype)
+    large = jnp.where(many, photons, 1.0)
+    return photon * jnp.where(many, large + jnp.sqrt(large) * normal, counts.astype(energy.dtype))
+
+
+def first_return_window(
+    time: ArrayLike,
+    energy: Float[ArrayLike, "*channels bins"],
+    interval: float,
+    threshold: ArrayLike = 0.0,
+) -> tuple[Float[Array, " samples"], Float[Array, "*channels samples"]]:
+    """A finely sampled waveform on bins of `interval` that start with the first return.
+
+    So the paper samples (its section 2.1), and notes the artefact: where the bins lie depends on the scene.
+    The first echo always starts flush with a bin, where fixed instants would split it over two, and the
+    echoes after it fall as their distance from the first has it: a peak (the paper's ground) reads too high.
+    Real digitisers sample at instants of their own: not for use except to reproduce the paper's figures.
+
+    - `time`: (bins,) centres of the fine bins in ns, evenly spaced, at least two; concrete.
+    - `energy`: J per fine bin, taken as uniform within it.
+    - `interval`: of the new bins in ns, positive; concrete, a multiple of the fine one or not.
+    - `threshold`: J per fine bin; the window opens with the first bin in which any channel exceeds it
+      (at the start of the record where none does). Default 0.
+
+    Returns the new centres in ns and the energy per new bin. From the opening on energy is conserved;
+    what came earlier, none at a threshold of zero, is not recorded. There are always
+    ceil(record length / `interval`) bins, the last ones empty.
+
+    **Raises:** `ValueError` for an interval that is not positive and for times uneven or fewer than two.
+    """
+    check_range("interval", interval, 0.0, low_open=True)
+    check_range("time", time)
+    energy = as_array(energy)
+    centres = np.asarray(time, dtype=float)
+    steps = np.diff(centres)
+    if centres.ndim != 1 or centres.size < 2 or centres.size != energy.shape[-1]:
+        raise ValueError(f"time has shape {centres.shape}; admissible is one per bin of energy, two or more")
+    step = float((centres[-1] - centres[0]) / steps.size)
+    # Times in single precision are even to their rounding only.
+    slack = 1e-4 * abs(step) + 4e-7 * float(np.max(np.abs(centres)))
+    if step <= 0 or np.max(np.abs(steps - step)) > slack:
+        worst = float(steps[np.argmax(np.abs(steps - step))])
+        raise ValueError(
+            f"time has a step of {worst:g}; admissible are even, positive steps ({step:g} on average)"
+        )
+
+    ratio = interval / step
+    samples = math.ceil(centres.size / ratio - 1e-6)
+    lit = jnp.any(energy.reshape(-1, centres.size) > threshold, axis=0)
+    first = jnp.argmax(lit).astype(energy.dtype)
+    # In fine bins from the opening, so that neighbours share their edges to the last bit.
+    edges = jnp.asarray(ratio * np.arange(samples + 1), energy.dtype)[:, None]
+    fine = (np.arange(centres.size) - first)[None, :]
+    share = jnp.clip(jnp.minimum(edges[1:], fine + 1) - jnp.maximum(edges[:-1], fine), 0.0)
+    times = centres[0] + step * (first + ratio * np.arange(samples) + 0.5 * ratio - 0.5)
+    return times, jnp.einsum("...b,sb->...s", energy, share)

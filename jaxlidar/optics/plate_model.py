@@ -1,0 +1,397 @@
+"""The generalised plate model: a leaf as N absorbing plates with rough surfaces, without cancellation.
+
+*Surface* (Stern 1964; Allen 1973). Light arriving within the cone of half-angle alpha around the normal
+is reflected with the mean r = 2/(1 - c^2) * integral over mu in [c, 1] of mu R(mu), c = cos alpha, where
+
+    R(mu) = ((mu - g)/(mu + g))^2 / 2 + ((n^2 mu - g)/(n^2 mu + g))^2 / 2,   g = sqrt(n^2 - 1 + mu^2).
+
+The mean is taken as an average over mu, which is smooth at alpha = 0 and 90 degrees, by Gauss-Legendre
+quadrature; r and 1 - r come from separate sums of positive terms.
+
+*Plate* (Allen et al. 1969). With the diffuse transmittance tau = 2 E3(k) of the interior, omega = 1 - tau
+and q = t21 + r21 omega (which is 1 - r21 tau), one plate has t = t12 t21 tau / (q (1 + r21 tau)),
+r = r12 + r21 tau t and the absorptance A = 1 - r - t = t12 omega / q. For the first plate, lit within the
+cone, t12 and r12 are replaced by those of alpha.
+
+*Pile* (Stokes 1862) of M = N - 1 plates, M real. With y = A (2 r + A), the decay per plate is
+v = exp(-beta) = 2 t / (2 t + y + sqrt(y (y + 4 t))); with V = v^M, g = v/t, W = (1 - V^2)/(1 - v^2) and
+s = 1 + r^2 - t^2 = (r + A)(1 + t) + r^2,
+
+    D = s g W + 1 + V^2,  Rs = 2 r g W/D,  Ts = 2 V/D,  1 - Rs - Ts = (g W A (A + 2 t) + (1 - V)^2)/D.
+
+Nothing here subtracts, so that all three keep their digits from transparent (A = 0: V = 1, W = M) to
+opaque. Single precision needs more than that, for V = v^M magnifies the rounding of beta by M beta, which
+reaches 80: there v is corrected and beta carried with twice the digits (`jaxlidar._double_single`).
+The derivatives below are the derivatives of these expressions, put into the same form: textbook
+Stokes' a, b and their square root are not differentiable at A = 0, while the result is.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.custom_derivatives import SymbolicZero
+from jaxtyping import Array, ArrayLike, Bool, Float
+
+from jaxlidar import _double_single as pair
+from jaxlidar import _expint
+from jaxlidar._double_single import DoubleSingle
+
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(32)
+_NODES, _WEIGHTS = (_NODES + 1) / 2, _WEIGHTS / 2
+
+_Reals = Float[Array, "..."]
+Triple = tuple[_Reals, _Reals, _Reals]
+
+
+class Surface(NamedTuple):
+    """What a leaf's surface does to light: mean reflectances and transmittances, each of one shape.
+
+    `t_alpha`, `r_alpha`: of light within the cone of incidence, from outside; `t12`, `r12`: of diffuse light
+    from outside; `t21`, `r21`: of diffuse light from inside. Each pair adds up to 1.
+    """
+
+    t_alpha: Any
+    r_alpha: Any
+    t12: Any
+    r12: Any
+    t21: Any
+    r21: Any
+
+
+def surface(n: ArrayLike, alpha: float | int = 40.0) -> Surface:
+    """Mean reflectances and transmittances of a dielectric surface.
+
+    **Arguments:**
+
+    - `n`: refractive index, any shape, at least 1. Exact to rounding from 1.01 on.
+    - `alpha`: half-angle of the cone of incidence, degrees, 0..90 (default 40, PROSPECT's).
+
+    **Returns:** a `Surface` of arrays shaped like `n`: JAX arrays where `n` is one, else NumPy arrays of
+    float64.
+
+    **Source:** Stern (1964), Appl. Opt. 3, 111; Allen (1973), J. Opt. Soc. Am. 63, 664.
+    """
+    xp: Any = jnp if isinstance(n, jax.Array) else np
+    index = n if isinstance(n, jax.Array) else np.asarray(n, dtype=float)
+    t_alpha, r_alpha = _cone(xp, index, alpha)
+    t12, r12 = _cone(xp, index, 90.0)
+    square = index * index
+    # r21 = 1 - t12/n^2, as a sum.
+    return Surface(t_alpha, r_alpha, t12, r12, t12 / square, r12 + t12 * ((index - 1) * (index + 1) / square))
+
+
+def _cone(xp: Any, n: Any, alpha: float | int) -> tuple[Any, Any]:
+    c = np.cos(np.deg2rad(alpha)) if alpha < 90 else 0.0
+    n = n[..., None]
+    mu = np.broadcast_to(c + (1 - c) * _NODES, (1,) * (n.ndim - 1) + _NODES.shape).astype(n.dtype)
+    weight = (2 / (1 + c) * _WEIGHTS * (c + (1 - c) * _NODES)).reshape(mu.shape).astype(n.dtype)
+    g = xp.sqrt((n - 1) * (n + 1) + mu * mu)
+    square = n * n
+    across, along = 1 / (mu + g), 1 / (square * mu + g)
+    transmitted = 2 * mu * g * (across * across + square * along * along)
+    # (mu - g)/(mu + g) = -(n^2 - 1)/(mu + g)^2, and likewise in the plane of incidence.
+    excess = (n - 1) * (n + 1)
+    s_wave = excess * across * across
+    p_wave = excess * ((square + 1) * mu * mu - 1) * along * along
+    reflected = (s_wave * s_wave + p_wave * p_wave) / 2
+    return xp.sum(weight * transmitted, axis=-1), xp.sum(weight * reflected, axis=-1)
+
+
+def plate_model(k: Float[ArrayLike, "..."], N: Float[ArrayLike, "..."], surface: Surface) -> Triple:
+    """Reflectance, transmittance and absorptance of a leaf of N plates.
+
+    **Arguments:**
+
+    - `k`: optical depth of one plate (absorption coefficient times thickness), 0 or more.
+    - `N`: number of plates, real, 1 or more. `k` and `N` are not checked, for they are mostly traced.
+    - `surface`: as `surface` gives it.
+
+    Shapes broadcast against each other.
+
+    **Returns:** the three, of the common shape; their sum is 1 to rounding, and each has its own digits: the
+    absorptance of a nearly transparent leaf is no difference of numbers near 1.
+
+    All are differentiable in all arguments, also at k = 0, N = 1 and where they underflow. The second
+    derivative in k diverges logarithmically at k = 0, where the one returned is large and finite.
+
+    Relative errors for k up to 100, N up to 10 and n from 1.2 to 1.55, measured: 2e-14 in double precision.
+    In single precision 7e-7 for the three, 1e-6 for the derivatives of transmittance and those in N, and
+    1.2e-6 for dR/dk, dA/dk and dR/dN, each at the worst of 400,000 random points (999 of 1,000 lie within
+    8e-7); derivatives below 1e-30 lose digits on their way to zero. There a surface of NumPy numbers counts
+    with all its digits; one of JAX arrays, which are rounded, costs up to 3e-7 more.
+
+    **Source:** Allen et al. (1969), J. Opt. Soc. Am. 59, 1376; Jacquemoud and Baret (1990), Remote Sens.
+    Environ. 34, 75; Stokes (1862), Proc. R. Soc. Lond. 11, 545.
+    """
+    k, N, face, bounces = _common(k, N, surface)
+    return _leaf(k, N - 1, face, bounces)
+
+
+def plate_model_slopes(
+    k: Float[ArrayLike, "..."], N: Float[ArrayLike, "..."], surface: Surface
+) -> tuple[Triple, Triple, Triple]:
+    """The same with its derivatives in k and in N, which share most of the work.
+
+    **Arguments:** as for `plate_model`.
+
+    **Returns:** reflectance, transmittance and absorptance; their derivatives in `k`; those in `N`.
+    """
+    k, N, face, bounces = _common(k, N, surface)
+    return _everything(k, N - 1, face, bounces)
+
+
+def _common(k: Any, N: Any, surface: Surface) -> tuple[_Reals, _Reals, Surface, DoubleSingle | None]:
+    """Arrays of one shape and type, and in single precision kappa = (r12 + r21)/t21 in double-single."""
+    dtype = jnp.result_type(k, N, float)
+    bounces = None
+    if dtype == jnp.float32:
+        if any(isinstance(x, jax.Array) for x in surface):
+            r12, r21, t21 = (jnp.asarray(x, dtype) for x in (surface.r12, surface.r21, surface.t21))
+            total = pair.plus(pair.split(r21), pair.split(r12))
+            bounces = pair.over(total, pair.split(t21), 1 / t21)
+        else:
+            bounces = pair.constant((np.asarray(surface.r12, float) + surface.r21) / surface.t21)
+    arrays = (k, N, *surface, *(bounces or ()))
+    k, N, *face = jnp.broadcast_arrays(*(jnp.asarray(x, dtype) for x in arrays))
+    return k, N, Surface(*face[:6]), bounces and DoubleSingle(*face[6:])
+
+
+class _State(NamedTuple):
+    """What values and derivatives share, in the names of the module's docstring."""
+
+    tau: Array
+    t: Array
+    r: Array
+    A: Array
+    Ta: Array
+    Ra: Array
+    Aa: Array
+    q: Array
+    p: Array
+    y: Array
+    s: Array
+    g: Array
+    v: Array
+    w: Array  # 1 - v
+    beta: Array
+    V: Array
+    Z: Array  # 1 - V
+    W: Array
+    D: Array
+
+
+def _state(k: _Reals, M: _Reals, face: Surface, bounces: DoubleSingle | None) -> _State:
+    # The barriers keep the compiler from computing these again for every output (twice as fast on the CPU).
+    tau, omega = jax.lax.optimization_barrier((_expint.tau(k), _expint.omega(k)))
+    q, p = face.t21 + face.r21 * omega, 1 + face.r21 * tau
+    inside = face.t21 * tau / (q * p)
+    t, Ta = face.t12 * inside, face.t_alpha * inside
+    r, Ra = face.r12 + face.r21 * tau * t, face.r_alpha + face.r21 * tau * Ta
+    absorbed = omega / q
+    A, Aa = face.t12 * absorbed, face.t_alpha * absorbed
+    y = A * (2 * r + A)
+    s = (r + A) * (1 + t) + r * r
+    clear = y <= 0
+    root = jnp.where(clear, 0.0, jnp.sqrt(jnp.where(clear, 1.0, y * (y + 4 * t))))
+    per_total = 1 / (2 * t + y + root)
+    g, w = 2 * per_total, (y + root) * per_total
+    v = t * g
+    fine = None
+    if bounces is not None:
+        scaled = face.t12 * face.t21 * _expint.scaled_tau(k) / (q * p) * g
+        exact, fine = pair.refined(*jax.lax.stop_gradient((k, w, scaled, bounces)))
+        w = w + (exact[0] - jax.lax.stop_gradient(w))
+        v = v + (exact[1] - jax.lax.stop_gradient(v))
+    beta, V, Z = jax.lax.optimization_barrier(_decay(w, jax.lax.stop_gradient(v), M, fine))
+    W = jnp.where(clear, M, Z * (1 + V) / (jnp.where(clear, 1.0, w) * (1 + v)))
+    D = s * g * W + 1 + V * V
+    return _State(tau, t, r, A, Ta, Ra, Aa, q, p, y, s, g, v, w, beta, V, Z, W, D)
+
+
+@jax.custom_jvp
+def _decay(w: _Reals, v: _Reals, M: _Reals, fine: DoubleSingle | None) -> Triple:
+    """beta = -ln v, V = v^M and 1 - V, where v = 1 - w is given in both forms."""
+    if fine is not None:
+        return pair.single(fine), *pair.exp_minus(pair.times(pair.split(M), fine))
+    thin = w < 0.3
+    v = jnp.maximum(v, jnp.finfo(v.dtype).tiny)
+    beta = -jnp.where(thin, jnp.log1p(-jnp.where(thin, w, 0.0)), jnp.log(jnp.where(thin, 1.0, v)))
+    return beta, jnp.exp(-M * beta), -jnp.expm1(-M * beta)
+
+
+@_decay.defjvp
+def _decay_jvp(primals, tangents):
+    _, v, M, _ = primals
+    dw, _, dM, _ = tangents
+    beta, V, Z = _decay(*primals)
+    dbeta = dw / jnp.maximum(v, jnp.finfo(v.dtype).tiny)
+    dV = -V * (beta * dM + M * dbeta)
+    return (beta, V, Z), (dbeta, dV, -dV)
+
+
+@jax.custom_jvp
+@jax.jit
+def _leaf(k: _Reals, M: _Reals, face: Surface, bounces: DoubleSingle | None) -> Triple:
+    return _values(_state(k, M, face, bounces))
+
+
+@jax.jit
+def _everything(
+    k: _Reals, M: _Reals, face: Surface, bounces: DoubleSingle | None
+) -> tuple[Triple, Triple, Triple]:
+    """Values, derivatives in k and derivatives in M."""
+    x = _state(k, M, face, bounces)
+    return _values(x), _slopes_k(x, k, M, face), _slopes_M(x)
+
+
+@jax.jit
+def _change(k: _Reals, M: _Reals, face: Surface, bounces: DoubleSingle | None, dface: Surface) -> Triple:
+    """What a change of the surface does."""
+    return jax.jvp(lambda f: _values(_state(k, M, f, bounces)), (face,), (dface,))[1]
+
+
+def _pile(x: _State) -> Triple:
+    """Rs, Ts and 1 - Rs - Ts."""
+    per_D = 1 / x.D
+    lost = x.g * x.W * x.A * (x.A + 2 * x.t) + x.Z * x.Z
+    return 2 * x.r * x.g * x.W * per_D, 2 * x.V * per_D, lost * per_D
+
+
+def _values(x: _State) -> Triple:
+    Rs, Ts, As = _pile(x)
+    into = x.Ta / (1 - Rs * x.r)
+    return x.Ra + into * Rs * x.t, into * Ts, x.Aa + into * (As + Rs * x.A)
+
+
+def _leaf_jvp(primals, tangents):
+    k, M, face, bounces = primals
+    dk, dM, dface, _ = tangents
+    out, in_k, in_M = _everything(k, M, face, bounces)
+    total: list = [jnp.zeros_like(k)] * 3
+    for slopes, change in ((in_k, dk), (in_M, dM)):
+        if not isinstance(change, SymbolicZero):
+            total = [a + b * change for a, b in zip(total, slopes)]
+    if not all(isinstance(d, SymbolicZero) for d in dface):
+        dface = Surface(*(jnp.zeros_like(k) if isinstance(d, SymbolicZero) else d for d in dface))
+        total = [a + b for a, b in zip(total, _change(k, M, face, bounces, dface))]
+    return out, tuple(total)
+
+
+_leaf.defjvp(_leaf_jvp, symbolic_zeros=True)
+
+
+def _slopes_M(x: _State) -> Triple:
+    """Derivatives of the leaf's reflectance, transmittance and absorptance in M."""
+    r, t, A, g, V = x.r, x.t, x.A, x.g, x.V
+    P = _beta_share(x)
+    square, rest = 1 + V * V, x.Z * (1 + V)
+    per_D = 1 / x.D
+    dRs = 8 * r * g * P * (V * per_D) ** 2
+    log_Ts = -(x.s * g * P * square + x.beta * rest) * per_D
+    gain = x.s * x.Z * x.Z / 2 + V * A * (2 * t + A) + x.w * (1 + x.v) * rest / (2 * g)
+    dAs = 4 * g * P * V * gain * per_D * per_D
+    Rs, Ts, As = _pile(x)
+    inverse = 1 / (1 - Rs * r)
+    into = x.Ta * inverse
+    again = r * dRs * inverse
+    return (
+        into * inverse * t * dRs,
+        into * Ts * (log_Ts + again),
+        into * (dAs + A * dRs + (As + Rs * A) * again),
+    )
+
+
+def _slopes_k(x: _State, k: _Reals, M: _Reals, face: Surface) -> Triple:
+    """Derivatives of the leaf's reflectance, transmittance and absorptance in k."""
+    r, t, A, g, v, V, W, per_D = x.r, x.t, x.A, x.g, x.v, x.V, x.W, 1 / x.D
+    slope = _expint.log_slope(k)
+    rho = face.r21 * x.tau
+    log_t = slope * (1 + rho * rho) / (x.q * x.p)
+    dt, dr, dA = t * log_t, rho * t * (log_t + slope), -slope * t * x.p / x.q
+    dy, ds = 2 * ((r + A) * dA + A * dr), 2 * (r * dr - t * dt)
+
+    P = _beta_share(x)
+    square, rest = 1 + V * V, x.Z * (1 + V)
+    a = M * x.beta
+    flat = a <= 0
+    V_sinhc = jnp.where(flat, V, rest / jnp.where(flat, 1.0, 2 * a))
+    V_psi = _scaled_psi(a, V, rest)
+    VV_phi = _scaled_phi(2 * a, V * V, rest * square)
+    coth = P * (1 + v * v)  # beta coth(beta)
+    phi_2 = _langevin(x.beta, coth)
+    gamma = 4 * g * g * M * P * P * (4 * M * M * VV_phi * coth + V * V * phi_2)
+    h = 4 * g * g * P * P * M * (M * M * V_psi - V_sinhc * phi_2)
+    per_sum = 1 / (1 + v) ** 2
+    drain = g * (2 * v * W * square + 4 * M * V * V) * per_sum
+    dRs = 2 * per_D * (g * W * dr - r * per_D * (gamma * dy + (g * W) ** 2 * ds + drain * log_t))
+    fall = 2 * x.s * g * (2 * v * W + M * square) * per_sum + 2 * M * W * x.w * x.w
+    log_Ts = (fall * log_t - 2 * g * W * ds - (x.s * h + 2 * M * g * W) * dy) * (per_D / 2)
+
+    Rs, Ts, _ = _pile(x)
+    inverse = 1 / (1 - Rs * r)
+    into = x.Ta * inverse
+    # All contributions to either are negative; the absorptance takes what they lose.
+    dR = rho * x.Ta * (log_t + slope) + into * (
+        Rs * t * log_t + inverse * (t * dRs + Rs * Rs * t * dr) + Rs * dt
+    )
+    dT = into * Ts * (log_t + log_Ts + (r * dRs + Rs * dr) * inverse)
+    return dR, dT, -(dR + dT)
+
+
+def _beta_share(x: _State) -> _Reals:
+    """beta/(1 - v^2), which is 1/2 at beta = 0."""
+    clear = x.y <= 0
+    return jnp.where(clear, 0.5, x.beta / (jnp.where(clear, 1.0, x.w) * (1 + x.v)))
+
+
+def _scaled_psi(a: _Reals, decay: _Reals, rest: _Reals) -> _Reals:
+    """exp(-a) (cosh a - sinh(a)/a)/a^2; `decay` = exp(-a), `rest` = 1 - exp(-2 a).
+
+    Here and below, a Taylor series in a^2 below a = 1.5, where the difference would lose digits.
+    """
+    near, z, far = _ranges(a)
+    series = _expint.polynomial(z, [(2 * j + 2) / math.factorial(2 * j + 3) for j in range(_terms(a))])
+    return jnp.where(near, decay * series, (1 - rest / 2 - rest / 2 * far) * (far * far))
+
+
+def _scaled_phi(a: _Reals, decay: _Reals, rest: _Reals) -> _Reals:
+    """exp(-a) (sinh(a)/a - 1)/a^2, with the same arguments."""
+    near, z, far = _ranges(a)
+    series = _expint.polynomial(z, [1 / math.factorial(2 * j + 3) for j in range(_terms(a))])
+    return jnp.where(near, decay * series, (rest / 2 * far - decay) * (far * far))
+
+
+def _langevin(a: _Reals, coth: _Reals) -> _Reals:
+    """(a coth a - 1)/a^2, given `coth` = a coth a; for small a by Lambert's continued fraction in a^2."""
+    near, z, far = _ranges(a)
+    numerator, denominator = _LAMBERT[a.dtype == jnp.float64]
+    return jnp.where(
+        near, _expint.polynomial(z, numerator) / _expint.polynomial(z, denominator), (coth - 1) * (far * far)
+    )
+
+
+def _ranges(a: _Reals) -> tuple[Bool[Array, "..."], _Reals, _Reals]:
+    """Whether the series serves; its argument a^2; 1/a for the closed form."""
+    near = a < 1.5
+    return near, jnp.where(near, a * a, 0.0), 1 / jnp.maximum(a, 1.5)
+
+
+def _terms(a: _Reals) -> int:
+    return 10 if a.dtype == jnp.float64 else 6
+
+
+def _lambert(depth: int) -> tuple[Sequence[float], Sequence[float]]:
+    """1/(3 + z/(5 + z/(7 + ...))), cut after `depth` levels, as a ratio of polynomials in z."""
+    numerator, denominator = np.array([1.0]), np.array([2.0 * depth + 1])
+    for b in range(2 * depth - 1, 1, -2):
+        # b + z numerator/denominator, then its reciprocal.
+        up = np.polynomial.polynomial.polyadd(b * denominator, np.concatenate([[0.0], numerator]))
+        numerator, denominator = denominator, up
+    return (numerator / denominator[0]).tolist(), (denominator / denominator[0]).tolist()
+
+
+_LAMBERT = {False: _lambert(5), True: _lambert(9)}

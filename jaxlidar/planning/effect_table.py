@@ -1,0 +1,128 @@
+"""The table of effects that a plan shows: what is simulated, why, and what leaving it out changes at most."""
+
+import functools
+import math
+from collections.abc import Callable
+
+import jax
+
+from jaxlidar._checks import is_traced, known_number
+from jaxlidar._constants import SPEED_OF_LIGHT
+from jaxlidar.instrument.lidar import Lidar
+from jaxlidar.planning.bounds import Bounds
+from jaxlidar.planning.effects import NAMES, Effect, present, without
+from jaxlidar.planning.trace_plan import Bins
+from jaxlidar.scenes.scene import Scene
+
+
+def percent(share: float) -> str:
+    """A share in percent, to two digits, also of 100."""
+    return f"{float(f'{100 * share:.2g}'):g} %"
+
+
+def effect_table(
+    lidar: Lidar,
+    scene: Scene,
+    off: tuple[str, ...],
+    orders: int,
+    why: tuple[str, float],
+    bins: Bins,
+    upstream: float,
+) -> tuple[Effect, ...]:
+    """A row for every effect; `why`: why so many orders are followed, and what the others likely have."""
+    has, planned = present(lidar, scene), present(*without(lidar, scene, off))
+    reasons = dict.fromkeys(NAMES, "in the scene") | {"multiple scattering": why[0]} | _reasons(lidar, scene)
+    # What is being traced may have any value.
+    known = not any(is_traced(x) for x in jax.tree.leaves((lidar, scene)))
+
+    @functools.cache
+    def rules(off: tuple[str, ...]) -> dict[str, Callable[[], float]]:
+        return _rules(Bounds(*without(lidar, scene, off), orders), bins, upstream)
+
+    def bound(name: str, off: tuple[str, ...]) -> float:
+        pair = without(lidar, scene, off)
+        there = present(*pair) | {"hot spot": pair[1].canopy is not None}
+        if not known or not there.get(name, True):
+            return float(there.get(name, True))
+        return rules(off)[name]()
+
+    rows = []
+    for name in NAMES:
+        on = planned[name] and name not in off and (name != "multiple scattering" or orders > 1)
+        reason, others = reasons[name], off
+        if name in off:
+            # What switching it on again would change.
+            reason, others = "switched off", tuple(n for n in off if n != name)
+        elif not has[name] and name not in ("multiple scattering", "hot spot"):
+            reason = "not in the scene"
+        elif has[name] and not planned[name] and name != "multiple scattering":
+            reason = "gone with what is switched off"
+        rows.append(Effect(name, on, reason, bound(name, others), _measure(name)))
+        if on and name == "multiple scattering":
+            name = f"orders beyond {orders}"
+            most = bound(name, off)
+            rest = f"likely below {percent(min(why[1], most))}: light escapes between"
+            rows.append(Effect(name, False, rest, most, "sum"))
+    if without(lidar, scene, off)[1].atmosphere is not None:
+        name = "scattering within the atmosphere"
+        rows.append(Effect(name, False, "beyond first order", bound(name, off), "sum"))
+    return tuple(rows)
+
+
+def _measure(name: str) -> str:
+    return "samples" if name in ("slope spread", "divergence", "jitter") else "sum"
+
+
+def _rules(bounds: Bounds, bins: Bins, upstream: float) -> dict[str, Callable[[], float]]:
+    """The bound of every effect that is there."""
+
+    def slope_spread() -> float:
+        level = without(bounds.lidar, bounds.scene, ("slope spread",))
+        return bounds.slope_spread(Bounds(*level, bounds.orders))
+
+    return {
+        "leaf": lambda: bounds.part("leaf"),
+        "bark": lambda: bounds.part("bark"),
+        "plates": bounds.plates,
+        "ground": bounds.ground,
+        "slope spread": slope_spread,
+        "multiple scattering": lambda: bounds.beyond(1),
+        f"orders beyond {bounds.orders}": lambda: bounds.beyond(bounds.orders),
+        # A mirror's return may outshine all else.
+        "specular return": lambda: 1.0,
+        "divergence": bounds.divergence,
+        "field of view": bounds.field_of_view,
+        "hot spot": bounds.hot_spot,
+        "atmospheric extinction": lambda: bounds.extinction(bins, upstream),
+        "atmospheric backscatter": lambda: bounds.backscatter(bins, upstream),
+        "jitter": bounds.jitter,
+        # Light that the air scatters and the receiver still gets is at most what was lost.
+        "scattering within the atmosphere": lambda: bounds.lost(bins),
+    }
+
+
+def _reasons(lidar: Lidar, scene: Scene) -> dict[str, str]:
+    """Why effects are on, by their size, where more can be said than that they are there."""
+    radius = known_number(lidar.footprint_radius)
+    slope = 0.0 if scene.ground is None else known_number(scene.ground.slope)
+    spread = radius * math.tan(math.radians(slope)) / SPEED_OF_LIGHT
+    view = lidar.field_of_view
+    air = scene.atmosphere
+    hotspot = scene.canopy is not None and scene.canopy.hotspot
+    reasons = {
+        "slope spread": f"{slope:g} degrees: {spread:.2g} ns (standard deviation)",
+        "divergence": f"{known_number(lidar.divergence):g} mrad: a footprint of radius {radius:.3g} m",
+        "field of view": "a soft edge of 2 %"
+        if view is None or is_traced(view)
+        else f"{known_number(view):g} mrad, with a soft edge of 2 %",
+        "hot spot": "back through the same gap: exp(-tau)"
+        if hotspot
+        else "ways are independent: exp(-2 tau)",
+        "atmospheric backscatter": "above the scene",
+        "jitter": f"{known_number(lidar.jitter):g} ns",
+    }
+    if scene.canopy is None:
+        reasons["hot spot"] = "not in the scene"
+    if air is not None and air.lidar_ratio is None:
+        reasons["atmospheric backscatter"] = "no lidar ratio"
+    return reasons

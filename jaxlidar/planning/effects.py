@@ -1,0 +1,168 @@
+"""The effects that a plan lists, and a lidar and a scene without those that are switched off."""
+
+import dataclasses
+from collections.abc import Mapping
+
+import jax.numpy as jnp
+
+from jaxlidar._checks import known_number
+from jaxlidar.instrument.lidar import Lidar
+from jaxlidar.optics.laws import Specular
+from jaxlidar.scenes.scene import Canopy, Ground, Scene
+
+# In the order of the table; each can be switched.
+NAMES = (
+    "leaf",
+    "bark",
+    "plates",
+    "ground",
+    "slope spread",
+    "multiple scattering",
+    "specular return",
+    "divergence",
+    "field of view",
+    "hot spot",
+    "atmospheric extinction",
+    "atmospheric backscatter",
+    "jitter",
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Effect:
+    """One effect: whether it is simulated, why, and how much leaving it out changes at most.
+
+    `bound` is, for the worst wavelength and everything else as planned, a bound on the `measure` of the
+    change between the waveform with the effect and the one without it, over a window that covers the scene:
+
+    - "sum": difference of the sums over all samples, relative to the larger sum.
+    - "samples": sum of the absolute differences of samples, relative to both sums together; where the sums
+      are equal, the share of the energy that is found in other samples.
+
+    Both lie between 0 (no change) and 1, which always holds and stands where no better bound is simple. The
+    bound of an effect that is simulated says how large it may be.
+    """
+
+    name: str
+    simulated: bool
+    reason: str
+    bound: float
+    measure: str
+
+
+def present(lidar: Lidar, scene: Scene) -> dict[str, bool]:
+    """Which of `NAMES` a lidar and a scene have."""
+    canopy, air = scene.canopy, scene.atmosphere
+    return {
+        "leaf": canopy is not None and canopy.voxels.leaf is not None,
+        "bark": canopy is not None and canopy.voxels.bark is not None,
+        "plates": bool(scene.plates),
+        "ground": scene.ground is not None,
+        "slope spread": scene.ground is not None and known_number(scene.ground.slope) > 0,
+        # One plane cannot light itself.
+        "multiple scattering": canopy is not None or len(scene.surfaces) > 1,
+        "specular return": any(isinstance(s.law, Specular) for s in scene.surfaces),
+        "divergence": known_number(lidar.divergence) > 0,
+        "field of view": lidar.field_of_view is not None,
+        "hot spot": canopy is not None and canopy.hotspot,
+        "atmospheric extinction": air is not None,
+        "atmospheric backscatter": air is not None and air.lidar_ratio is not None,
+        "jitter": known_number(lidar.jitter) > 0,
+    }
+
+
+def switched_off(
+    effects: Mapping[str, bool] | None, has: Mapping[str, bool], max_orders: int | None
+) -> tuple[str, ...]:
+    """Names of the effects that are in the scene and that `effects` switches off.
+
+    **Raises:** ValueError for names or values that are inadmissible, and where `effects` switches on what is
+    not in the scene or contradicts itself or `max_orders`.
+    """
+    effects = effects or {}
+    for name, value in effects.items():
+        if name not in NAMES:
+            raise ValueError(f"effects: {name!r} is none of {', '.join(map(repr, NAMES))}")
+        if value is not True and value is not False:
+            raise ValueError(f"effects[{name!r}] = {value!r}; admissible is True or False")
+        if value and not has[name]:
+            there = ", ".join(repr(n) for n in NAMES if has[n]) or "none"
+            raise ValueError(
+                f"effects[{name!r}] = True, but it is not in the scene; admissible to switch on: {there}"
+            )
+    orders = effects.get("multiple scattering")
+    if max_orders is not None and orders is not None and orders != (max_orders > 1):
+        raise ValueError(
+            f"effects['multiple scattering'] = {orders}, but max_orders = {max_orders}; they must agree"
+        )
+    off = tuple(name for name in NAMES if has[name] and effects.get(name) is False)
+    for name, needs in (
+        ("atmospheric backscatter", ("atmospheric extinction",)),
+        ("slope spread", ("ground",)),
+        ("hot spot", ("leaf", "bark")),
+    ):
+        needed = [n for n in needs if has[n]]
+        if effects.get(name) and all(n in off for n in needed):
+            raise ValueError(
+                f"effects[{name!r}] = True, but {' and '.join(map(repr, needed))} = False; "
+                "admissible with it is True"
+            )
+    return off
+
+
+def without(lidar: Lidar, scene: Scene, off: tuple[str, ...]) -> tuple[Lidar, Scene]:
+    """The lidar and the scene without the effects named in `off`; done twice, it changes nothing more.
+
+    The air goes with its extinction: without it there is nothing that could send light back. "multiple
+    scattering" and "specular return" belong to neither; the plan's orders and the tracer leave them out.
+    """
+    if not off:
+        return lidar, scene
+    if "divergence" in off:
+        lidar = dataclasses.replace(lidar, divergence=jnp.zeros_like(lidar.divergence))
+    if "field of view" in off:
+        lidar = dataclasses.replace(lidar, field_of_view=None)
+    if "jitter" in off:
+        lidar = dataclasses.replace(lidar, jitter=jnp.zeros_like(lidar.jitter))
+    canopy, ground, air = scene.canopy, scene.ground, scene.atmosphere
+    if canopy is not None:
+        canopy = _thinned(canopy, off)
+    if ground is not None and "slope spread" in off:
+        ground = _levelled(ground, lidar)
+    if air is not None and "atmospheric backscatter" in off:
+        air = dataclasses.replace(air, lidar_ratio=None)
+    return lidar, Scene(
+        canopy=canopy,
+        plates=() if "plates" in off else scene.plates,
+        ground=None if "ground" in off else ground,
+        atmosphere=None if "atmospheric extinction" in off else air,
+    )
+
+
+def _thinned(canopy: Canopy, off: tuple[str, ...]) -> Canopy | None:
+    leaf = None if "leaf" in off else canopy.voxels.leaf
+    bark = None if "bark" in off else canopy.voxels.bark
+    if leaf is None and bark is None:
+        return None
+    return dataclasses.replace(
+        canopy,
+        voxels=dataclasses.replace(
+            canopy.voxels,
+            leaf=leaf,
+            bark=bark,
+            leaf_angles=None if leaf is None else canopy.voxels.leaf_angles,
+        ),
+        leaf=None if leaf is None else canopy.leaf,
+        bark=None if bark is None else canopy.bark,
+        hotspot=canopy.hotspot and "hot spot" not in off,
+    )
+
+
+def _levelled(ground: Ground, lidar: Lidar) -> Ground:
+    """Level ground through the point where the axis of the beam meets the slope, if it does."""
+    normal, axis = ground.plane.normal, lidar.direction
+    rise = normal[2] * ground.height - jnp.sum(normal[:2] * lidar.position)
+    towards = jnp.sum(normal * axis)
+    met = towards < -1e-6
+    height = jnp.where(met, rise / jnp.where(met, towards, -1.0) * axis[2], ground.height)
+    return dataclasses.replace(ground, height=height, slope=jnp.zeros_like(ground.slope))

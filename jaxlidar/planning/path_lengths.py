@@ -1,0 +1,100 @@
+"""How far a scene reaches along the beam: the bounds of every loop, found before anything is traced."""
+
+import math
+
+import numpy as np
+
+from jaxlidar._checks import known_array, known_number
+from jaxlidar._vectors import FAR
+from jaxlidar.instrument.lidar import Lidar
+from jaxlidar.scenes.scene import Plate, Scene
+
+
+class PathLengths:
+    """The rim of the footprint against the bounds of everything in the scene.
+
+    - `first`, `last`: two-way path, m, of the first and the last return of order one, relative to that of
+      the aim point. - `upstream`: how far before the reference plane, m, all rays start.
+    """
+
+    def __init__(self, lidar: Lidar, scene: Scene):
+        self.scene = scene
+        axis = known_array(lidar.direction)
+        slant = known_number(lidar.range_to_reference)
+        rim = 2.5 * known_number(lidar.footprint_radius)
+        aim = np.append(known_array(lidar.position), 0.0)
+        across = np.cross(axis, [1.0, 0, 0] if abs(axis[0]) < 0.7 else [0, 1.0, 0])
+        across /= np.linalg.norm(across)
+        other = np.cross(axis, across)
+        turn = np.linspace(0, 2 * np.pi, 33)[:, None]
+        circle = rim * (np.cos(turn) * across + np.sin(turn) * other)
+        points = np.concatenate([np.zeros((1, 3)), circle])
+        rays = axis * slant + points
+        distance = np.linalg.norm(rays, axis=1)
+        self.rays = rays / distance[:, None]
+        levels = []
+        for s in scene.surfaces:
+            normal = known_array(s.plane.normal)
+            offset = normal @ (np.array([0, 0, known_number(s.plane.height)]) - aim)
+            towards = self.rays @ normal
+            met = towards < -1e-6 if not isinstance(s, Plate) else np.abs(towards) > 1e-6
+            if met.any():
+                levels.append(((offset - points @ normal) / np.where(met, towards, 1.0))[met])
+        if scene.canopy is not None:
+            v = scene.canopy.voxels
+            self.size, self.shape = known_array(v.voxel_size), np.array(v.shape)
+            low = known_array(v.origin)[2]
+            for z in (low, low + self.size[2] * self.shape[2]):
+                levels.append((z - points[:, 2]) / self.rays[:, 2])
+        along = np.concatenate(levels) if levels else np.zeros(1)
+        nearest, farthest = float(along.min()), float(along.max())
+        self.first = 2.0 * nearest
+        self.last = 2.0 * (farthest + float(distance.max()) - slant)
+        self.upstream = 0.05 * (farthest - nearest) + 1e-3 - nearest
+        if self.upstream >= slant:
+            altitude = known_number(lidar.altitude)
+            raise ValueError(
+                f"altitude = {altitude:g} m: the scene reaches up to the sensor; "
+                f"admissible is more than {altitude + self.upstream - slant:g} m"
+            )
+
+    @property
+    def longest_chord(self) -> float:
+        """The longest piece, m, of a footprint ray within one voxel."""
+        if self.scene.canopy is None:
+            return 1e-3
+        steep = float(np.abs(self.rays[:, 2]).min())
+        return float(min(np.linalg.norm(self.size), self.size[2] / steep)) * (1 + 1e-5)
+
+    def first_steps(self, step: float) -> int:
+        """Bound on the stretches of a footprint ray, none longer than `step` m."""
+        if self.scene.canopy is None:
+            return 0
+        steep = np.abs(self.rays[:, 2]).min()
+        height = self.size[2] * self.shape[2]
+        sideways = np.ceil(np.abs(self.rays[:, :2]).max(0) / steep * height / self.size[:2]) + 1
+        if self.scene.canopy.sides == "open":
+            sideways = np.minimum(sideways, self.shape[:2])
+        divided = 0 if step >= self.longest_chord else math.ceil(height / steep / step)
+        return int(self.shape[2] + sideways.sum() + divided + len(self.scene.surfaces) + 2)
+
+    def longest_flight(self, longest: float) -> float:
+        """Longest flight, m, that is followed: all from which light returns `longest` m after the first.
+
+        Within a canopy without sides, under a beam of more than 64 degrees, light could fly towards the
+        sensor almost for ever: there, ten times `longest` and the height of the canopy at most.
+        """
+        if self.scene.canopy is None or self.scene.canopy.sides == "open":
+            return FAR
+        # A flight of s m within the canopy lengthens the way by at least s (1 - sin) - height cos.
+        height, cos = self.size[2] * self.shape[2], float(np.abs(self.rays[:, 2]).min())
+        return float((longest + height * cos) / max(1.0 - math.sqrt(1.0 - cos * cos), 0.1))
+
+    def march_steps(self, longest: float) -> int:
+        """Bound on the voxels that such a flight crosses."""
+        if self.scene.canopy is None:
+            return 0
+        if self.scene.canopy.sides == "open":
+            return int(self.shape.sum()) + 3
+        flight = self.longest_flight(longest)
+        return int(self.shape[2] + sum(math.ceil(flight / s) for s in self.size[:2])) + 3

@@ -1,0 +1,310 @@
+"""What a scene and a lidar call for: effects simulated, bounds on the others, sizes of all loops."""
+
+import dataclasses
+import math
+from collections.abc import Mapping
+
+from jaxlidar._checks import known_number
+from jaxlidar._constants import SPEED_OF_LIGHT
+from jaxlidar.instrument.lidar import Lidar
+from jaxlidar.instrument.pulse import RectangularPulse
+from jaxlidar.optics.laws import Specular
+from jaxlidar.optics.phase import Isotropic
+from jaxlidar.planning.effect_table import effect_table, percent
+from jaxlidar.planning.effects import Effect, present, switched_off, without
+from jaxlidar.planning.path_lengths import PathLengths
+from jaxlidar.planning.scatterers import largest_albedo, lobe_probability, scene_optics, spell
+from jaxlidar.planning.trace_plan import KERNEL, Bins, TracePlan
+from jaxlidar.scenes.scene import Plate, Scene
+
+DEFAULT_RTOL = 0.01
+# Orders are followed while their histories are not more than this (16 orders of four letters, 29 of three).
+MAX_HISTORIES = 5000
+MAX_ORDERS = 100
+# Of scattered light at most this share is scattered again, where any can escape: by experience.
+AGAIN = 0.8
+# Multiple scattering is followed this long after the last first-order return, ns.
+TAIL = (10.0, 60.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """How a scene will be simulated. Made by `plan`; static: what is off is never compiled.
+
+    `print(plan)` is a table of effects. `n_photons` is per batch; `n_rays` carry the first order.
+    """
+
+    trace: TracePlan
+    bins: Bins
+    sample_start: float
+    sample_interval: float
+    n_samples: int
+    per_sample: int
+    n_rays: int
+    n_photons: int
+    smooth_footprint: bool
+    random_footprint: bool
+    sharpen: bool
+    degree: int
+    first_degree: int
+    # Names of the effects that are switched off.
+    off: tuple[str, ...]
+    # What is compiled depends on neither.
+    rtol: float = dataclasses.field(compare=False)
+    effects: tuple[Effect, ...] = dataclasses.field(compare=False)
+
+    @property
+    def orders(self) -> int:
+        """Scatterings followed."""
+        return self.trace.orders
+
+    @property
+    def is_random(self) -> bool:
+        """Whether anything is drawn at random."""
+        if self.trace.orders > 1 or self.trace.drawn_first:
+            return True
+        return self.random_footprint and not self.smooth_footprint
+
+    def __str__(self) -> str:
+        rows = [("effect", "simulated", "changes at most", "why")]
+        for e in self.effects:
+            bound = "nothing" if e.bound == 0 else f"{percent(e.bound)} of {e.measure}"
+            rows.append((e.name, "yes" if e.simulated else "no", bound, e.reason))
+        widths = [max(len(r[i]) for r in rows) for i in range(3)]
+        lines = ["  ".join([*(c.ljust(w) for c, w in zip(r, widths)), r[3]]).rstrip() for r in rows]
+        lines.insert(1, "-" * max(map(len, lines)))
+        sizes = (
+            f"{self.n_samples} samples of {self.sample_interval:g} ns from {self.sample_start:g} ns, "
+            f"{self.bins.count} fine bins of {self.bins.width:.3g} ns"
+        )
+        if not self.smooth_footprint and self.n_rays > 1:
+            sizes += f", {self.n_rays} rays"
+        if self.orders > 1:
+            sizes += f", {self.n_photons} photons a batch, {self.orders} orders"
+        return "\n".join([*lines, sizes])
+
+
+def plan(
+    lidar: Lidar,
+    scene: Scene,
+    *,
+    rtol: float | None = None,
+    max_orders: int | None = None,
+    max_step: float | None = None,
+    n_photons: int = 8192,
+    n_rays: int | None = None,
+    window: tuple[float, float] | None = None,
+    bin_width: float | None = None,
+    footprint: str = "random",
+    effects: Mapping[str, bool] | None = None,
+    first_order: str = "expected",
+    points: str = "lattice",
+    kernel: int = KERNEL,
+    ends: int = 4,
+    describe: bool = True,
+) -> Plan:
+    """Decide what `simulate` will do.
+
+    **Arguments:**
+
+    - `rtol`: relative accuracy aimed at; sets how many orders are worth following. Default 0.01.
+    - `max_orders`: scatterings followed, at least 1; None decides from the largest albedo.
+    - `max_step`: longest stretch, m, that the first order takes at once; None is four fine bins. The
+      result does not depend on it.
+    - `n_photons`, `n_rays`: photons per batch and rays of the footprint; None is 4096 rays where they are
+      all, and 1024 where batches of photons shift them.
+    - `window`: (first, last) sample time in ns; None covers the scene.
+    - `bin_width`: fine bins in ns, rounded to a fraction of the sampling interval; None: by the pulse.
+    - `footprint`: "random" (each batch shifts the rays, so that the standard error covers them) or "fixed".
+    - `effects`: effects to switch off, by name, as in {"multiple scattering": False}; True asks for what
+      is on anyway and refuses scenes that do not have it. The names are those of the table's first column.
+    - `first_order`: "expected" (integrated along every ray) or "drawn" (returns from drawn collisions, as
+      those of the other orders, among which it is then counted).
+    - `points`: "lattice" (low discrepancy) or "independent" random numbers for rays and photons.
+    - `kernel`: fine bins over which an instant is spread: 3 (smooth), 2 (linear) or 1 (the nearest: without
+      derivatives with respect to times).
+    - `ends`: points of each flight through a canopy from which light returns, one in each stratum of the
+      probability of getting there; 1 is the collision alone. These four are there to show what the defaults
+      are worth.
+    - `describe`: whether to make the table of effects, with its bounds; takes some 40 ms.
+
+    What the scene does not have is off, and never compiled. All else is on, however small: a plan also
+    serves other values of the same scene, in fits and derivatives.
+
+    **Raises:** ValueError for inadmissible arguments, for a scene that reaches above the sensor, and if
+    the geometry is being traced by a JAX transformation: make the plan outside and pass it in.
+    """
+    rtol = DEFAULT_RTOL if rtol is None else float(rtol)
+    if not 0 < rtol < 1:
+        raise ValueError(f"rtol = {rtol:g} is outside the admissible range (0, 1)")
+    for name, value, low in (
+        ("n_photons", n_photons, 1),
+        ("n_rays", n_rays, 1),
+        ("max_orders", max_orders, 1),
+        ("ends", ends, 1),
+    ):
+        if value is not None and (value != int(value) or value < low):
+            raise ValueError(f"{name} = {value} is outside the admissible range [{low}, inf) of integers")
+    if max_step is not None and not 0 < max_step < math.inf:
+        raise ValueError(f"max_step = {max_step:g} is outside the admissible range (0, inf)")
+    if footprint not in ("random", "fixed"):
+        raise ValueError(f"footprint = {footprint!r} is none of 'random', 'fixed'")
+    if kernel not in (1, 2, 3):
+        raise ValueError(f"kernel = {kernel} is none of 1, 2, 3")
+    if points not in ("lattice", "independent"):
+        raise ValueError(f"points = {points!r} is none of 'lattice', 'independent'")
+    _check_first(first_order, scene)
+    whole = lidar, scene
+    off = switched_off(effects, present(lidar, scene), max_orders)
+    lidar, scene = without(lidar, scene, off)
+    geometry = PathLengths(lidar, scene)
+    optics = scene_optics(lidar, scene)
+    letters = spell(optics)
+    if "multiple scattering" in off:
+        max_orders = 1
+    orders, why, left = _orders(largest_albedo(optics), len(letters.letters), scene, rtol, max_orders)
+    if n_rays is None:
+        n_rays = 4096 if orders == 1 or footprint == "fixed" else 1024
+    bins, samples = _time(lidar, scene, geometry, orders, window, bin_width)
+    airy = _with_air(bins, lidar, samples)
+    metres = 0.5 * SPEED_OF_LIGHT * bins.width
+    step = geometry.longest_chord if max_step is None else min(max_step, geometry.longest_chord)
+    step = min(step, 4 * metres) if max_step is None else step
+    row = max(math.ceil(step / metres - 1e-6) + 1 + 2, KERNEL)
+    bins = dataclasses.replace(bins, row=row, kernel=int(kernel))
+    last = SPEED_OF_LIGHT * (bins.start + bins.width * bins.count)
+    trace = TracePlan(
+        materials=letters.materials,
+        letters=letters.letters,
+        leaf=letters.leaf,
+        bark=letters.bark,
+        surfaces=letters.surfaces,
+        full_cover=tuple(not isinstance(s, Plate) or known_number(s.coverage) == 1.0 for s in scene.surfaces),
+        has_ground=scene.ground is not None,
+        leaf_isotropic=scene.canopy is not None and isinstance(scene.canopy.leaf, Isotropic),
+        bark_isotropic=scene.canopy is not None and isinstance(scene.canopy.bark, Isotropic),
+        hotspot=scene.canopy is not None and scene.canopy.hotspot,
+        vertical=known_number(lidar.zenith) == 0.0,
+        upstream=geometry.upstream,
+        first_steps=geometry.first_steps(step),
+        march_steps=geometry.march_steps(last + geometry.upstream),
+        max_step=step,
+        max_flight=geometry.longest_flight(last + geometry.upstream),
+        last=last,
+        lobe=lobe_probability(optics),
+        orders=orders,
+        # Without a canopy all ends of a flight are on the same surface.
+        ends=1 if scene.canopy is None else int(ends),
+        drawn_first=first_order == "drawn",
+        independent=points == "independent",
+    )
+    plates = len(scene.plates)
+    sharpen = not isinstance(lidar.pulse, RectangularPulse) and known_number(lidar.pulse.std) >= bins.width
+    sharpen = sharpen or known_number(lidar.jitter) >= bins.width
+    return Plan(
+        trace=trace,
+        bins=bins,
+        sample_start=samples[0],
+        sample_interval=samples[1],
+        n_samples=samples[2],
+        per_sample=samples[3],
+        # A beam without width is one ray.
+        n_rays=1 if "divergence" in off else int(n_rays),
+        n_photons=int(n_photons),
+        smooth_footprint=scene.canopy is None and "divergence" not in off,
+        random_footprint=footprint == "random" and "divergence" not in off,
+        sharpen=bool(sharpen),
+        degree=_degree(orders, plates),
+        first_degree=1 + 2 * plates,
+        off=off,
+        rtol=rtol,
+        effects=effect_table(*whole, off, orders, (why, left), airy, geometry.upstream) if describe else (),
+    )
+
+
+def _check_first(first_order: str, scene: Scene) -> None:
+    if first_order not in ("expected", "drawn"):
+        raise ValueError(f"first_order = {first_order!r} is none of 'expected', 'drawn'")
+    mirrors = any(isinstance(s.law, Specular) for s in scene.surfaces)
+    if first_order == "drawn" and (mirrors or (scene.canopy is not None and scene.canopy.hotspot)):
+        raise ValueError("first_order = 'drawn'; admissible with a mirror or a hot spot is 'expected'")
+
+
+def _degree(orders: int, plates: int) -> int:
+    """Longest history: every flight, and the way back, may pass every plate."""
+    return orders + (orders + 1) * plates
+
+
+def _orders(
+    albedo: float, kinds: int, scene: Scene, rtol: float, max_orders: int | None
+) -> tuple[int, str, float]:
+    """How many orders to follow, why, and what the others are likely to have."""
+    if scene.canopy is None and len(scene.surfaces) <= 1:
+        return 1, "one plane cannot light itself", 0.0
+    plates = len(scene.plates)
+    most = 2
+    while most < MAX_ORDERS and math.comb(_degree(most + 1, plates) + kinds, kinds) <= MAX_HISTORIES:
+        most += 1
+    wanted = most
+    if albedo < 1:
+        wanted = 1 + math.ceil(math.log(rtol / 10) / math.log(max(AGAIN * albedo, 1e-6)))
+    orders = min(max(wanted, 2), most) if max_orders is None else int(max_orders)
+    if orders == 1:
+        return 1, "one order is asked for", 0.0
+    return orders, f"orders 2 to {orders}; largest albedo {albedo:.2f}", (AGAIN * albedo) ** orders
+
+
+def _time(
+    lidar: Lidar,
+    scene: Scene,
+    geometry: PathLengths,
+    orders: int,
+    window: tuple[float, float] | None,
+    bin_width: float | None,
+) -> tuple[Bins, tuple[float, float, int, int]]:
+    interval = known_number(lidar.sampling_interval)
+    jitter = known_number(lidar.jitter)
+    low, high = lidar.pulse.support(jitter)
+    std = math.hypot(known_number(lidar.pulse.std), jitter)
+    if bin_width is None:
+        target = min(interval, max(0.25 * std, 0.05 * interval) if std > 0 else 0.5 * interval)
+    else:
+        if not 0 < bin_width < math.inf:
+            raise ValueError(f"bin_width = {bin_width:g} is outside the admissible range (0, inf)")
+        target = bin_width
+    per_sample = max(math.ceil(interval / target - 1e-6), 1)
+    width = interval / per_sample
+    if lidar.receiver.window == "first return":
+        # Sampled finely here; the digitiser's own bins are laid when the first return is known.
+        interval, per_sample = width, 1
+    first, last = geometry.first / SPEED_OF_LIGHT, geometry.last / SPEED_OF_LIGHT
+    if orders > 1:
+        last += min(max(3 * (last - first), TAIL[0]), TAIL[1])
+    if window is None:
+        begin = math.floor((first + low) / interval) * interval
+        samples = math.ceil((last + high - begin) / interval) + 1
+    else:
+        begin, end = map(float, window)
+        if not (math.isfinite(begin) and begin < end < math.inf):
+            raise ValueError(f"window = {window} is not (first, last) with first < last, in ns")
+        # An interval in single precision is off by its rounding.
+        samples = math.floor((end - begin) / interval * (1 + 1e-6) + 1e-6) + 1
+        # Returns that the pulse can carry into the window.
+        first = max(first, begin - interval - high)
+        last = max(begin + samples * interval - low, first + width)
+    if scene.atmosphere is not None and scene.atmosphere.lidar_ratio is not None:
+        # The air returns light from the start.
+        first = min(first, begin - interval - high)
+    edge = begin - 0.5 * interval
+    lead = math.ceil((edge - first) / width) + 3
+    count = lead + math.ceil((last - edge) / width) + 3
+    start = edge + width * (0.5 - lead)
+    return Bins(start, width, max(count, 1), row=KERNEL), (begin, interval, samples, per_sample)
+
+
+def _with_air(bins: Bins, lidar: Lidar, samples: tuple[float, float, int, int]) -> Bins:
+    """From where on the air's own return would be recorded, whether it is simulated or not."""
+    _, high = lidar.pulse.support(known_number(lidar.jitter))
+    missing = math.ceil((bins.start - (samples[0] - samples[1] - high)) / bins.width) + 3
+    more = max(missing, 0)
+    return dataclasses.replace(bins, start=bins.start - more * bins.width, count=bins.count + more)

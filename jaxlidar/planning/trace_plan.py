@@ -1,0 +1,87 @@
+"""The static shape of a trace: time bins, which scatterers exist, their letters, the sizes of every loop."""
+
+import dataclasses
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+# Bins over which a return at an instant is spread.
+KERNEL = 3
+
+
+@dataclasses.dataclass(frozen=True)
+class Bins:
+    """Fine time bins, with margins at both ends that collect what falls outside.
+
+    - `start`: centre of the first bin, ns. - `width`: ns. - `count`: bins within the window.
+    - `row`: the most bins that one deposit spans. - `kernel`: bins over which an instant is spread.
+    """
+
+    start: float
+    width: float
+    count: int
+    row: int
+    kernel: int = KERNEL
+
+    @property
+    def kernel_variance(self) -> float:
+        """Second moment of the kernel, a B-spline, in bins^2."""
+        return self.kernel / 12
+
+    @property
+    def padded(self) -> int:
+        """Bins with the margins."""
+        return self.count + 2 * self.row
+
+    def position(self, time: Float[Array, "*s"]) -> Float[Array, "*s"]:
+        """Time in units of bins; integers are centres; beyond the margins it stays at their ends."""
+        return jnp.clip((time - self.start) / self.width, -self.row, self.count + self.row)
+
+    def trim(self, padded: Float[Array, "... padded"]) -> Float[Array, "... bins"]:
+        """Without the margins."""
+        return padded[..., self.row : self.row + self.count]
+
+
+class Scatterer(NamedTuple):
+    """Number of a material and of its letters; -1 where it has no such letter."""
+
+    material: int
+    reflected: int
+    transmitted: int
+
+
+class TracePlan(NamedTuple):
+    """Everything that the tracer must know before it is compiled. Made by `jaxlidar.plan`.
+
+    - `materials`, `letters`: names, in order. - `leaf`, `bark`, `surfaces`: the scatterers.
+    - `full_cover`: for each surface, whether no ray slips through. - `upstream`: where rays start, m
+      above the reference plane along the axis. - `first_steps`, `march_steps`: bounds on faces crossed.
+    - `max_step`, `max_flight`: m. - `last`: longest path to the sensor that is recorded, m relative to the
+      way to the reference plane. - `lobe`: probability with which reflection is chosen over transmission.
+    - `ends`: points of each flight from which light returns. - `drawn_first`: whether order one returns from
+      drawn collisions, as the others. - `independent`: whether photons draw independent numbers.
+    """
+
+    materials: tuple[str, ...]
+    letters: tuple[str, ...]
+    leaf: Scatterer | None
+    bark: Scatterer | None
+    surfaces: tuple[Scatterer, ...]
+    full_cover: tuple[bool, ...]
+    has_ground: bool
+    leaf_isotropic: bool
+    bark_isotropic: bool
+    hotspot: bool
+    vertical: bool
+    upstream: float
+    first_steps: int
+    march_steps: int
+    max_step: float
+    max_flight: float
+    last: float
+    lobe: float
+    orders: int
+    ends: int
+    drawn_first: bool
+    independent: bool

@@ -1,0 +1,1 @@
+"""Plants as geometry: L-systems, trees, forests, and their voxels."""

@@ -1,0 +1,58 @@
+"""The scene that `jaxlidar demo` shows: a tree 15 m tall on bare soil, under one large footprint."""
+
+from jaxlidar.instrument.lidar import Lidar
+from jaxlidar.instrument.pulse import GaussianPulse
+from jaxlidar.optics.prospect import Prospect
+from jaxlidar.optics.spectra import spectrum
+from jaxlidar.plants.habits import grow
+from jaxlidar.plants.voxelise import voxelise
+from jaxlidar.scenes.scene import Canopy, Ground, Scene
+from jaxlidar.scenes.voxels import VoxelMap
+
+HEIGHT = 15.0
+LEAF_AREA = 250.0
+WAVELENGTHS = (532.0, 1064.0, 1550.0)
+
+
+def demo_lidar(wavelength: float | tuple[float, ...] = 1064.0) -> Lidar:
+    """A lidar 1000 m above the ground whose footprint, 6 m across, covers much of the crown.
+
+    Pulse 6 ns, sampling interval 1 ns, aperture 0.2 m, field of view 8 m across. `wavelength` is in nm.
+    Default 1064.
+    """
+    return Lidar(
+        wavelength=wavelength,
+        altitude=1000.0,
+        divergence=6.0,
+        pulse=GaussianPulse(fwhm=6.0),
+        aperture=0.2,
+        field_of_view=8.0,
+    )
+
+
+def demo_scene(voxel_size: float = 0.25, *, seed: int = 0) -> Scene:
+    """The tree on soil of medium brightness, at z = 0. The leaf is PROSPECT-D's; the bark is measured.
+
+    **Arguments:**
+
+    - `voxel_size`: edge in m, above 0 and at most 1. Default 0.25.
+    - `seed`: of the tree's growth. Default 0.
+
+    **Raises:** ValueError for a size outside (0, 1].
+    """
+    if not 0 < voxel_size <= 1:
+        raise ValueError(f"voxel_size = {voxel_size:g} is outside the admissible range (0, 1]")
+    return Scene(
+        canopy=Canopy(
+            tree(voxel_size, seed=seed),
+            leaf=Prospect(N=1.6, Cab=45.0, Car=10.0, Cw=0.012, Cm=0.008),
+            bark=spectrum("bark-oak"),
+        ),
+        ground=Ground(height=0.0, reflectance=spectrum("soil-medium")),
+    )
+
+
+def tree(voxel_size: float, *, seed: int) -> VoxelMap:
+    """The tree of the default habit with its 250 m2 of leaves, in voxels of the edge `voxel_size` (m)."""
+    grown = grow(seed=seed)
+    return voxelise(grown, voxel_size, leaf_area=LEAF_AREA / len(grown.bud_position), wood="surface")

@@ -1,0 +1,172 @@
+"""The turtle: a word of an L-system read as instructions in space, giving branch segments and leaf buds.
+
+The turtle has a position, a heading H, its left L and its up U = H x L, and a radius. Angles are in degrees,
+lengths in m; numbers in brackets may be left out, and the turtle's own `angle`, `length` and radius serve.
+
+| symbol | what the turtle does |
+| --- | --- |
+| `F(length, radius, radius at the end)` | moves forward and leaves a branch segment |
+| `f(length)` | moves forward |
+| `+(angle)`, `-(angle)` | turns left, right |
+| `&(angle)`, `^(angle)` | pitches down, up |
+| `\\(angle)`, `/(angle)` | rolls left, right |
+| `|` | turns round |
+| `$` | rolls so that its left is horizontal |
+| `T(angle)` | bends upward by angle * sin(heading's angle from the vertical); downward if negative |
+| `!(radius)` | sets the radius |
+| `J(radius)` | leaves a leaf bud |
+| `[`, `]` | remembers, returns to the remembered state: what stands between is a branch |
+
+All other symbols are passed over. Source: Prusinkiewicz and Lindenmayer (1990), sections 1.5, 1.10 and 2.1.
+"""
+
+from math import cos, radians, sin, sqrt
+
+import numpy as np
+
+from jaxlidar._checks import check_range
+from jaxlidar.plants.lsystem import Word
+from jaxlidar.plants.tree import Tree
+
+Vector = tuple[float, float, float]
+# Of heading (0), left (1) and up (2): which turns towards which, and in which sense.
+TURNS = {"+": (0, 1, 1), "-": (0, 1, -1), "&": (0, 2, -1), "^": (0, 2, 1), "\\": (1, 2, -1), "/": (1, 2, 1)}
+# Sine of the angle from the vertical, below which a heading counts as vertical.
+VERTICAL = 1e-9
+
+
+def turtle(
+    word: Word | str,
+    *,
+    angle: float = 90.0,
+    length: float = 1.0,
+    radius: float = 0.01,
+    bud_radius: float = 0.03,
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    heading: tuple[float, float, float] = (0.0, 0.0, 1.0),
+    left: tuple[float, float, float] = (-1.0, 0.0, 0.0),
+) -> Tree:
+    """Walk along a word. The symbols are those of the module's docstring.
+
+    **Arguments:**
+
+    - `word`: a `Word`, or a string of plain symbols.
+    - `angle`: degrees, where a symbol gives none. Default 90.
+    - `length`: m, where a symbol gives none. Default 1.
+    - `radius`: m, the branch radius to start with. Default 0.01.
+    - `bud_radius`: m, where `J` gives none. Default 0.03.
+    - `position`: m, where to start. Default the origin.
+    - `heading`: where to look at first, of any length. Default up.
+    - `left`: where the left is then; what of it is along the heading does not count. Default west.
+
+    **Returns:** a `Tree`. A segment's order is the number of branchings on the way to it.
+
+    **Raises:** ValueError for brackets that do not match, radii that are not positive, a heading of zero
+    length or along `left`, and numbers that are not finite.
+    """
+    word = word if isinstance(word, Word) else Word.of(word)
+    for name, value in (("angle", angle), ("length", length), ("position", position)):
+        check_range(name, value)
+    check_range("radius", radius, 0.0, low_open=True)
+    check_range("bud_radius", bud_radius, 0.0, low_open=True)
+    frame = _frame(heading, left)
+    x, y, z = map(float, position)
+    parent, order, branching = -1, 0, False
+    # Plain numbers in flat lists and no calls: this loop takes most of the time that a tree takes.
+    ends: list[float] = []
+    links: list[int] = []
+    buds: list[float] = []
+    memory = []
+    for code, arity, row in zip(word.codes.tolist(), word.arity.tolist(), word.parameters.tolist()):
+        symbol = chr(code)
+        if symbol in TURNS:
+            i, j, sign = TURNS[symbol]
+            a = radians(row[0] if arity else angle)
+            c, s = cos(a), sign * sin(a)
+            (a0, a1, a2), (b0, b1, b2) = frame[i], frame[j]
+            frame[i] = (c * a0 + s * b0, c * a1 + s * b1, c * a2 + s * b2)
+            frame[j] = (c * b0 - s * a0, c * b1 - s * a1, c * b2 - s * a2)
+        elif symbol in "Ff":
+            step = row[0] if arity else length
+            hx, hy, hz = frame[0]
+            bx, by, bz = x + step * hx, y + step * hy, z + step * hz
+            if symbol == "F":
+                begin = row[1] if arity > 1 else radius
+                radius = row[2] if arity > 2 else begin
+                # A branch is one order above what it grows on; stems that share a base are trunks.
+                order += branching and parent >= 0
+                ends += (x, y, z, bx, by, bz, begin, radius)
+                links += (parent, order)
+                parent, branching = len(links) // 2 - 1, False
+            x, y, z = bx, by, bz
+        elif symbol == "J":
+            buds += (x, y, z, *frame[0], row[0] if arity else bud_radius)
+        elif symbol == "[":
+            memory.append((x, y, z, tuple(frame), radius, parent, order, branching))
+            branching = True
+        elif symbol == "]":
+            if not memory:
+                raise ValueError("word has a ']' without its '['")
+            x, y, z, kept, radius, parent, order, branching = memory.pop()
+            frame = list(kept)
+        elif symbol == "T":
+            # Turned about the horizontal axis k = H x z, by the formula of Rodrigues.
+            hx, hy, _ = frame[0]
+            across = sqrt(hx * hx + hy * hy)
+            if across > VERTICAL:
+                kx, ky = hy / across, -hx / across
+                a = radians(across * (row[0] if arity else angle))
+                c, s = cos(a), sin(a)
+                for i, (vx, vy, vz) in enumerate(frame):
+                    along = (kx * vx + ky * vy) * (1 - c)
+                    frame[i] = (
+                        vx * c + s * ky * vz + kx * along,
+                        vy * c - s * kx * vz + ky * along,
+                        vz * c + s * (kx * vy - ky * vx),
+                    )
+        elif symbol == "!":
+            radius = row[0] if arity else radius
+        elif symbol == "|":
+            frame = [tuple(-v for v in frame[0]), tuple(-v for v in frame[1]), frame[2]]
+        elif symbol == "$":
+            hx, hy, hz = frame[0]
+            across = sqrt(hx * hx + hy * hy)
+            # Straight up, any left is horizontal.
+            if across > VERTICAL:
+                lx, ly = -hy / across, hx / across
+                frame = [frame[0], (lx, ly, 0.0), (-hz * ly, hz * lx, hx * ly - hy * lx)]
+    if memory:
+        raise ValueError(f"word has {len(memory)} '[' without their ']'")
+    wood = np.array(ends, dtype=float).reshape(-1, 8)
+    link = np.array(links, dtype=int).reshape(-1, 2)
+    bud = np.array(buds, dtype=float).reshape(-1, 7)
+    # Many turns leave a rounding error in the frame.
+    direction = bud[:, 3:6] / np.linalg.norm(bud[:, 3:6], axis=1, keepdims=True)
+    return Tree(
+        start=wood[:, :3],
+        end=wood[:, 3:6],
+        radius_start=wood[:, 6],
+        radius_end=wood[:, 7],
+        parent=link[:, 0],
+        order=link[:, 1],
+        bud_position=bud[:, :3],
+        bud_direction=direction,
+        bud_radius=bud[:, 6],
+    )
+
+
+def _frame(heading: Vector, left: Vector) -> list[Vector]:
+    """Heading, left and up, orthonormal."""
+    ahead = np.asarray(heading, dtype=float)
+    aside = np.asarray(left, dtype=float)
+    for name, value in (("heading", ahead), ("left", aside)):
+        check_range(name, value)
+        check_range(f"length of {name}", np.linalg.norm(value), 0.0, low_open=True)
+    ahead = ahead / np.linalg.norm(ahead)
+    aside = aside / np.linalg.norm(aside)
+    aside = aside - (aside @ ahead) * ahead
+    if np.linalg.norm(aside) < 1e-9:
+        raise ValueError(f"left = {tuple(left)} is along the heading; any other direction is admissible")
+    aside = aside / np.linalg.norm(aside)
+    above = np.cross(ahead, aside)
+    return [(float(v[0]), float(v[1]), float(v[2])) for v in (ahead, aside, above)]

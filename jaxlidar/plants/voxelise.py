@@ -1,0 +1,342 @@
+"""Trees and point clouds into voxels: branches, leaf clumps and points as shares of a regular grid.
+
+Thin branch segments and clumps are filled with points of known volume, `voxel_size / samples` apart: a
+frustum is cut into slabs, each of which carries its exact volume on a disc of points. Segments with a radius
+of four such distances or more take the centres of subvoxels that lie within them instead, so that a voxel
+inside is full. Every point counts in the voxel in which it lies; the sum over voxels is the solids' volume
+whatever the voxels. What is uncertain is how it is shared between neighbours: a voxel that the side of a
+trunk cuts through is off by about 1 % of its volume with 8 samples (root mean square, measured).
+"""
+
+from collections.abc import Iterable
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxlidar._checks import check_choice, check_range
+from jaxlidar.plants.tree import Tree
+from jaxlidar.scenes.voxels import VoxelMap
+
+_GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
+# Points are made and counted for so many segments or clumps at a time.
+_CHUNK = 2000
+# More points for one solid would not change a voxel by 0.1 %.
+_MOST = 200_000
+
+
+def voxelise(
+    trees: Tree | Iterable[Tree],
+    voxel_size: float | tuple[float, float, float],
+    *,
+    leaf_area: float | None = None,
+    wood: str = "volume",
+    samples: int = 8,
+    origin: tuple[float, float, float] | None = None,
+    shape: tuple[int, int, int] | None = None,
+) -> VoxelMap:
+    """A map of leaf and bark of one tree, or of several together.
+
+    **Arguments:**
+
+    - `trees`: one, or several, for instance a `forest`.
+    - `voxel_size`: edges in m, one number for cubes.
+    - `leaf_area`: one-sided leaf area of every clump in m2, spread evenly through its sphere: leaf then has
+      the extinction coefficient area / (2 volume). None (default): a clump fills its sphere, and the
+      probability of leaf is the share of the voxel that clumps occupy. The radius of clumps is the tree's;
+      see `Tree.with_bud_radius`.
+    - `wood`: "volume" (default): the probability of bark is the share of the voxel that wood occupies. Twigs
+      much thinner than a voxel then intercept less than their width would. "surface": the extinction
+      coefficient is a quarter of the surface per volume, as a thin convex body's of random orientation is
+      (Cauchy), or that of the share of volume where it is larger.
+    - `samples`: points per edge of a voxel, at least 1. Default 8.
+    - `origin`, `shape`: lower corner in m and numbers of voxels, together, to fill a grid of one's own. By
+      default the smallest grid that holds everything, with faces at multiples of the edge, so that maps of
+      neighbouring trees fit together.
+
+    Where solids overlap, as branches do at joints, a voxel is at most full: what it cannot hold goes to the
+    voxels around it, as a joint swells, so that volumes are conserved.
+
+    **Raises:** ValueError for inadmissible arguments, for trees with neither wood nor clumps, and for trees
+    that reach out of the grid given.
+
+    **Source:** Cauchy (1841); for the meaning of a voxel's probabilities, `VoxelMap.from_probability`.
+    """
+    trees = [trees] if isinstance(trees, Tree) else list(trees)
+    size = _edges(voxel_size)
+    check_choice("wood", wood, ("volume", "surface"))
+    if leaf_area is not None:
+        check_range("leaf_area", leaf_area, 0.0)
+    if samples != int(samples) or samples < 1:
+        raise ValueError(f"samples = {samples} is outside the admissible range [1, inf) of integers")
+    tree = Tree.joined(trees)
+    if not len(tree.start) and not len(tree.bud_position):
+        raise ValueError("trees have neither wood nor clumps; there is nothing to voxelise")
+    grid = _Grid.of(*_reach(tree), size, origin, shape)
+    apart = float(size.min()) / samples
+    volume, surface, leaf = grid.empty(), grid.empty(), grid.empty()
+    thick = np.minimum(tree.radius_start, tree.radius_end) >= 4 * apart
+    for i in np.flatnonzero(thick).tolist():
+        grid.count(*_subvoxels_in(tree, i, size / samples), volume)
+    thin = np.flatnonzero(~thick)
+    for part in np.split(thin, range(_CHUNK, len(thin), _CHUNK)):
+        grid.count(*_in_frustums(tree, part, apart), volume)
+    if wood == "surface":
+        for part in np.split(np.arange(len(thick)), range(_CHUNK, len(thick), _CHUNK)):
+            grid.count(*_in_frustums(tree, part, apart, on_surface=True), surface)
+    for i in range(0, len(tree.bud_position), _CHUNK):
+        grid.count(*_in_spheres(tree, slice(i, i + _CHUNK), apart, leaf_area), leaf)
+    return _map(grid, leaf, volume, surface, tree, leaf_area, wood)
+
+
+def voxelise_points(
+    points: Float[np.ndarray, "n 3"],
+    voxel_size: float | tuple[float, float, float],
+    *,
+    leaf_area: float,
+    is_wood: Bool[np.ndarray, " n"] | None = None,
+    wood_probability: float = 1.0,
+    min_points: int = 1,
+    origin: tuple[float, float, float] | None = None,
+    shape: tuple[int, int, int] | None = None,
+) -> VoxelMap:
+    """A map from a point cloud, such as one of a terrestrial scan.
+
+    Points alone do not tell how much leaf there is: the area is given, and shared out among the voxels in
+    proportion to their points. (A scan sees less of what stands behind; maps that know the beams, such as
+    AMAPVox makes, do better: `jaxlidar.io.read_vox`.)
+
+    **Arguments:**
+
+    - `points`: (n, 3) positions in m.
+    - `voxel_size`: edges in m, one number for cubes.
+    - `leaf_area`: one-sided area of all leaves together, m2.
+    - `is_wood`: (n,) which points lie on wood; by default none.
+    - `wood_probability`: of bark in a voxel that holds points on wood. Default 1.
+    - `min_points`: a voxel with fewer leaf points, or fewer wood points, counts as without. Default 1.
+    - `origin`, `shape`: as for `voxelise`.
+
+    **Raises:** ValueError for inadmissible arguments and for points that lie out of the grid given.
+    """
+    check_range("points", points)
+    check_range("leaf_area", leaf_area, 0.0)
+    check_range("wood_probability", wood_probability, 0.0, 1.0)
+    check_range("min_points", min_points, 1)
+    if len(points) == 0:
+        raise ValueError("points is empty; at least one point is admissible")
+    on_wood = np.zeros(len(points), bool) if is_wood is None else is_wood
+    if len(on_wood) != len(points):
+        raise ValueError(f"is_wood has {len(on_wood)} elements; admissible is one a point, {len(points)}")
+    size = _edges(voxel_size)
+    # A point on the upper face still counts in the voxel below it.
+    grid = _Grid.of(points.min(axis=0), np.nextafter(points.max(axis=0), np.inf), size, origin, shape)
+    leaf, wood = grid.empty(), grid.empty()
+    for chosen, into in ((~on_wood, leaf), (on_wood, wood)):
+        grid.count(points[chosen], np.ones(int(chosen.sum())), into)
+        into[into < min_points] = 0.0
+    total = leaf.sum()
+    if total == 0 and leaf_area > 0:
+        raise ValueError(f"leaf_area = {leaf_area:g} m2, but no voxel holds {min_points} or more leaf points")
+    density = leaf * (leaf_area / max(total, 1.0) / size.prod())
+    bark = None
+    if on_wood.any():
+        share = np.where(wood > 0, wood_probability, 0.0)
+        bark = VoxelMap.from_probability(bark=share, voxel_size=size).bark
+    return VoxelMap.from_lad(density, bark=bark, voxel_size=size, origin=grid.low)
+
+
+def crop(voxels: VoxelMap) -> VoxelMap:
+    """The same map without the empty layers at its sides; one voxel remains where all are empty."""
+    full = voxels.mean_extinction() > 0
+    if not full.any():
+        full[0, 0, 0] = True
+    parts, first = [], []
+    for axis in range(3):
+        (found,) = np.nonzero(full.any(axis=tuple(k for k in range(3) if k != axis)))
+        parts.append(slice(found[0], found[-1] + 1))
+        first.append(found[0])
+    inside = tuple(parts)
+    return VoxelMap(
+        None if voxels.leaf is None else voxels.leaf[inside],
+        None if voxels.bark is None else voxels.bark[inside],
+        voxels.voxel_size,
+        voxels.origin + voxels.voxel_size * np.array(first),
+        voxels.leaf_angles,
+    )
+
+
+class _Grid:
+    """A regular grid in double precision."""
+
+    def __init__(self, low: np.ndarray, size: np.ndarray, shape: tuple[int, ...]):
+        self.low, self.size, self.shape = low, size, shape
+
+    @staticmethod
+    def of(low, high, size, origin, shape) -> "_Grid":
+        """The grid asked for, or the smallest around the box from `low` to `high`."""
+        if (origin is None) != (shape is None):
+            raise ValueError("origin and shape belong together: give both or neither")
+        if origin is None:
+            first = np.floor(low / size + 1e-9)
+            count = np.maximum(np.ceil(high / size - 1e-9) - first, 1)
+            return _Grid(first * size, size, tuple(int(n) for n in count))
+        check_range("origin", origin)
+        check_range("shape", shape, 1)
+        grid = _Grid(np.asarray(origin, float), size, tuple(int(n) for n in shape))
+        top = grid.low + size * grid.shape
+        if np.any(low < grid.low - 1e-9 * size) or np.any(high > top + 1e-9 * size):
+            asked = f"origin = {tuple(grid.low.tolist())} and shape = {grid.shape}"
+            reach = f"from {np.round(low, 3).tolist()} to {np.round(high, 3).tolist()} m"
+            raise ValueError(f"{asked}: what is to be voxelised reaches {reach}, out of the grid")
+        return grid
+
+    def empty(self) -> np.ndarray:
+        return np.zeros(self.shape)
+
+    def count(self, place: np.ndarray, amount: np.ndarray, into: np.ndarray) -> None:
+        """Add amounts at places to an array of the grid. Rounding at the outer faces leads inwards."""
+        number = np.floor((place - self.low) / self.size).astype(np.int64)
+        number = np.clip(number, 0, np.array(self.shape) - 1)
+        flat = np.ravel_multi_index(tuple(number.T), self.shape)
+        into += np.bincount(flat, amount, into.size).reshape(self.shape)
+
+
+def _edges(voxel_size: float | tuple[float, float, float]) -> np.ndarray:
+    check_range("voxel_size", voxel_size, 0.0, low_open=True)
+    size = np.asarray(voxel_size, float)
+    if size.shape not in ((), (3,)):
+        raise ValueError(f"voxel_size has the shape {size.shape}; admissible is one number, or three")
+    return np.broadcast_to(size, (3,)).copy()
+
+
+def _reach(tree: Tree) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper corner of a box around all wood and clumps."""
+    axis = (tree.end - tree.start) / np.maximum(tree.length, 1e-30)[:, None]
+    # How far a disc across the axis reaches along x, y and z.
+    wide = np.sqrt(np.maximum(1.0 - axis * axis, 0.0))
+    lows, highs = [], []
+    for centre, reach in (
+        (tree.start, tree.radius_start[:, None] * wide),
+        (tree.end, tree.radius_end[:, None] * wide),
+        (tree.bud_position, tree.bud_radius[:, None]),
+    ):
+        if len(centre):
+            lows.append((centre - reach).min(axis=0))
+            highs.append((centre + reach).max(axis=0))
+    return np.min(lows, axis=0), np.max(highs, axis=0)
+
+
+def _subvoxels_in(tree: Tree, i: int, step: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Centres of the subvoxels within a branch segment, and its volume shared among them."""
+    start, a, b = tree.start[i], tree.radius_start[i], tree.radius_end[i]
+    axis = tree.end[i] - start
+    length = max(float(np.linalg.norm(axis)), 1e-30)
+    axis = axis / length
+    wide = np.sqrt(np.maximum(1.0 - axis * axis, 0.0)) * max(a, b)
+    low, high = (f(start, tree.end[i]) for f in (np.minimum, np.maximum))
+    number = (
+        np.arange(int(np.floor(lo / d)), int(np.ceil(hi / d)) + 1)
+        for lo, hi, d in zip(low - wide, high + wide, step)
+    )
+    place = np.stack([n.ravel() for n in np.meshgrid(*number, indexing="ij")], axis=1)
+    place = (place + 0.5) * step
+    along = (place - start) @ axis
+    across2 = np.sum((place - start) ** 2, axis=1) - along**2
+    place = place[(along >= 0) & (along < length) & (across2 <= (a + (b - a) * along / length) ** 2)]
+    if not len(place):
+        # Thinner than a subvoxel is long: at its middle.
+        place = (start + 0.5 * length * axis)[None, :]
+    volume = np.pi / 3 * np.linalg.norm(tree.end[i] - start) * (a * a + a * b + b * b)
+    return place, np.full(len(place), volume / len(place))
+
+
+def _in_frustums(
+    tree: Tree, part: np.ndarray, apart: float, *, on_surface: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points within branch segments, or on their sides, about `apart` m from each other; their shares.
+
+    Shares are of the volume in m3, or of the lateral surface in m2.
+    """
+    start, end = tree.start[part], tree.end[part]
+    a, b = tree.radius_start[part], tree.radius_end[part]
+    length = np.linalg.norm(end - start, axis=1)
+    widest = np.maximum(a, b) / apart
+    wide = np.clip(np.ceil(2 * np.pi * widest if on_surface else np.pi * widest**2), 3, _MOST).astype(int)
+    slabs = np.clip(np.ceil(length / apart), 1, np.maximum(_MOST // wide, 1)).astype(int)
+    axis = (end - start) / np.maximum(length, 1e-30)[:, None]
+    # Two directions across the axis, from whichever of x and z is less along it.
+    other = np.where(np.abs(axis[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
+    u = np.cross(axis, other)
+    u /= np.maximum(np.linalg.norm(u, axis=1), 1e-30)[:, None]
+    v = np.cross(axis, u)
+
+    def spread(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """For each of `counts` things, `counts` members: whose they are, and their numbers from 0."""
+        owner = np.repeat(np.arange(len(counts)), counts)
+        return owner, np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
+
+    segment, slab = spread(slabs)
+    lower, upper = slab / slabs[segment], (slab + 1) / slabs[segment]
+    slope, thick = (b - a)[segment], length[segment] / slabs[segment]
+    inner, outer = a[segment] + slope * lower, a[segment] + slope * upper
+    if on_surface:
+        amount = np.pi * (inner + outer) * np.hypot(thick, outer - inner)
+    else:
+        amount = np.pi / 3 * thick * (inner**2 + inner * outer + outer**2)
+    owner, point = spread(wide[segment])
+    s = segment[owner]
+    # Discs of successive slabs are turned against each other, and their points lie at different depths.
+    turn = _GOLDEN_ANGLE * point + 2.399 * slab[owner]
+    depth = lower[owner] + (upper - lower)[owner] * ((point * 0.7548776662466927 + 0.5) % 1.0)
+    r = a[s] + (b - a)[s] * depth
+    if not on_surface:
+        r *= np.sqrt((point + 0.5) / wide[s])
+    place = start[s] + (end - start)[s] * depth[:, None]
+    place += (r * np.cos(turn))[:, None] * u[s] + (r * np.sin(turn))[:, None] * v[s]
+    return place, (amount / wide[segment])[owner]
+
+
+def _in_spheres(
+    tree: Tree, part: slice, apart: float, leaf_area: float | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points within clumps; the volume, or the leaf area, at each."""
+    centre, radius = tree.bud_position[part], tree.bud_radius[part]
+    n = int(np.clip(np.ceil(4 / 3 * np.pi * (radius.max() / apart) ** 3), 32, _MOST))
+    i = np.arange(n)
+    height = 1.0 - 2.0 * ((i * 0.7548776662466927 + 0.5) % 1.0)
+    across = np.sqrt(1.0 - height * height)
+    unit = np.stack([across * np.cos(_GOLDEN_ANGLE * i), across * np.sin(_GOLDEN_ANGLE * i), height], axis=1)
+    unit *= np.cbrt((i + 0.5) / n)[:, None]
+    place = centre[:, None, :] + radius[:, None, None] * unit
+    amount = np.full(len(radius), leaf_area) if leaf_area is not None else 4 / 3 * np.pi * radius**3
+    return place.reshape(-1, 3), np.repeat(amount / n, n)
+
+
+def _settled(share: np.ndarray) -> np.ndarray:
+    """Shares of at most 1 with the same sum: what is too much spreads to the neighbours, again and again."""
+    if share.sum() >= share.size:
+        raise ValueError(f"trees = {share.sum():.3g} voxels of material, but the grid has {share.size}")
+    while True:
+        excess = np.maximum(share - 1.0, 0.0)
+        share = share - excess
+        if excess.sum() <= 1e-4 * share.sum():
+            return share
+        for axis in range(3):
+            # At the sides of the grid it stays within.
+            around = np.pad(excess, [(int(k == axis),) * 2 for k in range(3)], mode="edge")
+            around = np.moveaxis(around, axis, 0)
+            share += np.moveaxis(around[:-2] + around[2:], 0, axis) / 6
+
+
+def _map(grid: _Grid, leaf, volume, surface, tree: Tree, leaf_area: float | None, wood: str) -> VoxelMap:
+    cell = grid.size.prod()
+    bark = None
+    if len(tree.start):
+        solid = VoxelMap.from_probability(bark=_settled(volume / cell), voxel_size=grid.size).bark
+        bark = solid if wood == "volume" else np.maximum(np.asarray(solid), surface / (4.0 * cell))
+    green = None
+    if len(tree.bud_position):
+        if leaf_area is None:
+            green = VoxelMap.from_probability(leaf=_settled(leaf / cell), voxel_size=grid.size).leaf
+        else:
+            green = 0.5 * leaf / cell
+    return VoxelMap.from_extinction(leaf=green, bark=bark, voxel_size=grid.size, origin=grid.low)

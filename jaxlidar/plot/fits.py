@@ -1,0 +1,77 @@
+"""Residuals of a fit against height."""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import ArrayLike
+from matplotlib.axes import Axes
+
+from jaxlidar.plot.style import TOTAL, WAVELENGTH_COLOURS, axes_or_new, frame_height, wavelengths_of
+from jaxlidar.waveform import Waveform
+
+
+def residuals(
+    wave: Waveform,
+    observed: ArrayLike,
+    noise: ArrayLike,
+    ax: Axes | None = None,
+    *,
+    wavelength: float | None = None,
+    limit: float = 5.0,
+    **style: Any,
+) -> Axes:
+    """Draw (observed - simulated)/noise against height, over bands of one and two standard deviations.
+
+    **Arguments:**
+
+    - `wave`: the simulated `Waveform`, such as that of a fit.
+    - `observed`: (wavelengths, bins) apparent reflectance at the waveform's samples.
+    - `noise`: its standard deviation, a number or of the same shape, positive.
+    - `ax`: where to draw. Default None: on a new figure.
+    - `wavelength`: in nm, one of the waveform's. Default None: all.
+    - `limit`: where the axis ends, in standard deviations, positive; what lies beyond is drawn at the end as
+      an arrowhead. Default 5.
+    - `style`: of the points, as for `Axes.plot`.
+
+    **Raises:** ValueError for shapes that differ, noise or a limit that is not positive, and a wavelength
+    that the waveform does not have.
+    """
+    data, spread = np.asarray(observed, dtype=float), np.asarray(noise, dtype=float)
+    shape = np.asarray(wave.reflectance).shape
+    if data.shape != shape:
+        raise ValueError(f"observed has shape {data.shape}; admissible is the waveform's, {shape}")
+    if spread.ndim and spread.shape != shape:
+        raise ValueError(f"noise has shape {spread.shape}; admissible is a number or the waveform's {shape}")
+    if not np.all(spread > 0):
+        raise ValueError(f"noise = {np.min(spread):g} is outside the admissible range (0, inf)")
+    if not limit > 0:
+        raise ValueError(f"limit = {limit:g} is outside the admissible range (0, inf)")
+    chosen = wavelengths_of(wave, wavelength)
+    ax = axes_or_new(ax, (2.2, 4.2))
+    height = np.asarray(wave.height)
+    score = (data - np.asarray(wave.reflectance)) / spread
+    for width, strength in ((2.0, 0.12), (1.0, 0.15)):
+        ax.axvspan(-width, width, color=TOTAL, alpha=strength, linewidth=0)
+    ax.axvline(0.0, color=TOTAL, linewidth=0.6)
+    for number, i in enumerate(chosen):
+        colour = TOTAL if len(chosen) == 1 else WAVELENGTH_COLOURS[number % len(WAVELENGTH_COLOURS)]
+        look = {"color": colour, "marker": "o", "markersize": 2.0, "linestyle": "none", **style}
+        if len(chosen) > 1:
+            look.setdefault("label", f"{float(wave.wavelength[i]):g} nm")
+        inside = np.abs(score[i]) <= limit
+        ax.plot(score[i][inside], height[inside], **look)
+        for side, marker in ((-1, "<"), (1, ">")):
+            beyond = side * score[i] > limit
+            ax.plot(
+                np.full(beyond.sum(), 0.97 * side * limit),
+                height[beyond],
+                **{**look, "marker": marker, "label": "_"},
+            )
+    frame_height(ax, height, np.maximum(np.asarray(wave.reflectance), data)[chosen])
+    ax.set_xlim(-limit, limit)
+    ax.set_xlabel("residual\n(standard deviations)")
+    if len(chosen) > 1:
+        ax.legend(
+            loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False, fontsize="small", markerscale=3
+        )
+    return ax

@@ -1,0 +1,121 @@
+"""Scenes from the side."""
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import LinearSegmentedColormap
+
+from jaxlidar.instrument.lidar import Lidar
+from jaxlidar.plot.style import BEAM, COLOURS, axes_or_new
+from jaxlidar.scenes.scene import Ground, Plate, Scene
+
+
+def scene(
+    scene: Scene,
+    lidar: Lidar | None = None,
+    ax: Axes | None = None,
+    *,
+    along: str = "y",
+    legend: bool = True,
+) -> Axes:
+    """Draw a scene from the side: optical depth of leaf and bark, plates, ground and the beam.
+
+    Leaf and bark are shaded by 1 - exp(-optical depth) of a horizontal look through the whole voxel map;
+    planes are cut at the middle of the map (or of the footprint, where there is no map).
+
+    **Arguments:**
+
+    - `scene`: a `Scene`.
+    - `lidar`: whose beam is drawn, out to 1/e^2 of the axial irradiance or to the top-hat's edge. Default
+      None: no beam.
+    - `ax`: where to draw. Default None: on a new figure.
+    - `along`: "y" (default) looks north, x to the right; "x" looks west, y to the right.
+    - `legend`: whether to name what is drawn. Default True.
+
+    **Raises:** ValueError for another `along`.
+    """
+    if along not in ("x", "y"):
+        raise ValueError(f"along = {along!r} is none of 'x', 'y'")
+    ax = axes_or_new(ax, (3.5, 4.2))
+    across, depth = (0, 1) if along == "y" else (1, 0)
+    radius = 0.0 if lidar is None else float(lidar.footprint_radius)
+    centre = np.zeros(2) if lidar is None else np.asarray(lidar.position, dtype=float)
+    low, high, top = centre[across] - 1.3 * radius, centre[across] + 1.3 * radius, 0.0
+    middle = centre[depth]
+    entries: list[Any] = []
+    if scene.canopy is not None:
+        voxels = scene.canopy.voxels
+        origin, end = np.asarray(voxels.origin, dtype=float), np.asarray(voxels.top, dtype=float)
+        low, high, top = min(low, origin[across]), max(high, end[across]), end[2]
+        middle = 0.5 * (origin[depth] + end[depth])
+        extent = (origin[across], end[across], origin[2], end[2])
+        edge = float(voxels.voxel_size[depth])
+        entries += _voxels(ax, voxels.leaf, "leaf", depth, edge, extent)
+        entries += _voxels(ax, voxels.bark, "bark", depth, edge, extent)
+    if high <= low:
+        low, high = centre[across] - 1.0, centre[across] + 1.0
+    sides = np.array([low, high])
+    levels = [top]
+    for surface in scene.surfaces:
+        z = _cut(surface, sides, across, middle)
+        levels += z.tolist()
+        if isinstance(surface, Plate):
+            entries += ax.plot(sides, z, color=COLOURS["plate"], linewidth=2.5, label="plate")
+    bottom, top = min(levels), max(levels)
+    room = max(0.06 * (top - bottom), 0.2)
+    if scene.ground is not None:
+        z = _cut(scene.ground, sides, across, middle)
+        # Deep enough for whoever then widens the limits.
+        deep = bottom - 10 * (top - bottom + room)
+        look = {"color": COLOURS["ground"], "linewidth": 0, "zorder": 3, "label": "ground"}
+        entries.append(ax.fill_between(sides, z, deep, **look))
+    if lidar is not None:
+        entries += _beam(ax, lidar, across, bottom, top + 10 * room)
+    ax.set_xlim(low, high)
+    ax.set_ylim(bottom - room, top + room)
+    ax.set_aspect("equal")
+    ax.set_xlabel("x, east (m)" if along == "y" else "y, north (m)")
+    ax.set_ylabel("height (m)")
+    if legend and entries:
+        named = {entry.get_label(): entry for entry in entries}
+        look = {"frameon": False, "fontsize": "small", "ncols": 2, "handlelength": 1.5, "columnspacing": 1.2}
+        ax.legend(named.values(), named.keys(), loc="lower center", bbox_to_anchor=(0.5, 1.0), **look)
+    return ax
+
+
+def _voxels(
+    ax: Axes, extinction: Any, name: str, depth: int, edge: float, extent: tuple[float, float, float, float]
+) -> list[Any]:
+    if extinction is None or not np.any(np.asarray(extinction) > 0):
+        return []
+    opaque = -np.expm1(-np.asarray(extinction, dtype=float).sum(axis=depth) * edge)
+    colours = LinearSegmentedColormap.from_list(name, [COLOURS[name] + "00", COLOURS[name]])
+    ax.imshow(
+        opaque.T, cmap=colours, vmin=0.0, vmax=1.0, origin="lower", extent=extent, interpolation="nearest"
+    )
+    return ax.plot([], [], "s", color=COLOURS[name], label=name)
+
+
+def _beam(ax: Axes, lidar: Lidar, across: int, bottom: float, top: float) -> list[Any]:
+    """The beam's edges in the plane through its axis."""
+    z = np.array([bottom, top])
+    zenith, azimuth = np.deg2rad(float(lidar.zenith)), np.deg2rad(float(lidar.azimuth))
+    lean = -np.tan(zenith) * (np.sin(azimuth), np.cos(azimuth))[across]
+    axis = float(lidar.position[across]) + lean * z
+    shrink = 1.0 - z / float(lidar.altitude)
+    # The footprint on a horizontal plane is longer along the direction of travel.
+    stretch = np.sqrt(1.0 + lean**2)
+    half = float(lidar.footprint_radius) * shrink * stretch
+    ax.fill_betweenx(z, axis - half, axis + half, color=BEAM, alpha=0.07, linewidth=0)
+    name = "beam (1/e²)" if lidar.profile == "gaussian" else "beam"
+    look = {"color": BEAM, "linewidth": 1.0, "linestyle": (0, (4, 2)), "label": name}
+    return [line for side in (-1, 1) for line in ax.plot(axis + side * half, z, **look)]
+
+
+def _cut(surface: Ground | Plate, sides: np.ndarray, across: int, middle: float) -> np.ndarray:
+    plane = surface.plane
+    normal = np.asarray(plane.normal, dtype=float)
+    point = np.full((2, 2), middle)
+    point[:, across] = sides
+    return float(plane.height) - point @ normal[:2] / normal[2]

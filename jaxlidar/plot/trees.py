@@ -1,0 +1,151 @@
+"""Figures of trees and forests in three dimensions, leaf-on and leaf-off.
+
+Every function draws on the `mpl_toolkits.mplot3d.Axes3D` that it is given, or on a new figure's, and returns
+it; nothing is shown and nothing is saved.
+"""
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from mpl_toolkits.mplot3d import Axes3D, proj3d
+from mpl_toolkits.mplot3d.art3d import Line3DCollection
+
+from jaxlidar._checks import check_range
+from jaxlidar.plants.tree import Tree
+from jaxlidar.plot.style import COLOURS
+
+# A line thinner than this, in points, fades away.
+THINNEST = 0.25
+
+
+def tree(
+    tree: Tree | Iterable[Tree],
+    ax: Axes3D | None = None,
+    *,
+    leaves: bool = True,
+    alpha: float = 0.25,
+    max_buds: int = 60_000,
+    elevation: float = 8.0,
+    azimuth: float = 200.0,
+) -> Axes3D:
+    """Draw the branch segments as lines as wide as the wood, and the leaf buds as translucent points.
+
+    Widths and sizes are to the scale of the axes as they are when this is called.
+
+    **Arguments:**
+
+    - `tree`: a `Tree`, or several, such as a forest.
+    - `ax`: where to draw. Default None: on a new figure.
+    - `leaves`: whether to draw the buds. Default True.
+    - `alpha`: opacity of a bud, in [0, 1]. Default 0.25.
+    - `max_buds`: where there are more, so many are drawn, each larger for those left out. Default 60,000.
+    - `elevation`: of the view above the horizon, degrees. Default 8.
+    - `azimuth`: where the viewer stands, degrees clockwise from north. Default 200.
+
+    **Raises:** ValueError for trees without any segment, and for `alpha` or `max_buds` outside their ranges.
+    """
+    check_range("alpha", alpha, 0.0, 1.0)
+    check_range("max_buds", max_buds, 1)
+    whole = _whole(tree)
+    if not len(whole.start):
+        raise ValueError("tree has 0 segments; at least 1 is admissible")
+    ax = _axes(ax)
+    scale = _frame(ax, whole, elevation, azimuth)
+    width = scale * (whole.radius_start + whole.radius_end)
+    lines = Line3DCollection(
+        np.stack([whole.start, whole.end], axis=1).tolist(),
+        linewidths=np.maximum(width, THINNEST).tolist(),
+        colors=COLOURS["bark"],
+        capstyle="round",
+        label="bark",
+    )
+    ax.add_collection3d(lines)
+    if leaves and len(whole.bud_radius):
+        # Every k-th bud: their order follows the branches, so that these are spread evenly.
+        every = -(-len(whole.bud_radius) // max_buds)
+        place = whole.bud_position[::every]
+        size: Any = every * (2 * scale * whole.bud_radius[::every]) ** 2
+        ax.scatter(
+            *place.T, s=size, color=COLOURS["leaf"], alpha=alpha, linewidths=0, depthshade=False, label="leaf"
+        )
+    return ax
+
+
+def leaf_on_and_off(
+    tree: Tree | Iterable[Tree], axes: Sequence[Axes3D] | None = None, **style: Any
+) -> tuple[Axes3D, Axes3D]:
+    """Draw the same wood twice, with its leaves and without.
+
+    **Arguments:**
+
+    - `tree`: a `Tree`, or several.
+    - `axes`: two. Default None: on a new figure, side by side.
+    - `style`: as for `tree`.
+
+    **Raises:** ValueError for another number of axes.
+    """
+    whole = _whole(tree)
+    if axes is None:
+        from matplotlib import pyplot
+
+        figure = pyplot.figure(figsize=(9.0, 5.0), layout="constrained")
+        axes = [figure.add_subplot(1, 2, i, projection="3d") for i in (1, 2)]
+    if len(axes) != 2:
+        raise ValueError(f"axes has {len(axes)} elements; admissible are 2")
+    return _titled(whole, axes[0], True, style), _titled(whole, axes[1], False, style)
+
+
+def _titled(whole: Tree, ax: Axes3D, leaves: bool, style: dict[str, Any]) -> Axes3D:
+    ax = tree(whole, ax, **{**style, "leaves": leaves})
+    ax.set_title("leaf-on" if leaves else "leaf-off", fontsize="medium")
+    return ax
+
+
+def _whole(tree: Tree | Iterable[Tree]) -> Tree:
+    return tree if isinstance(tree, Tree) else Tree.joined(tree)
+
+
+def _frame(ax: Axes3D, whole: Tree, elevation: float, azimuth: float) -> float:
+    """Limits in equal scale round wood and leaves, and the axes' names; gives the points that 1 m takes."""
+    points = np.concatenate([whole.start, whole.end, whole.bud_position])
+    low, high = points.min(axis=0), points.max(axis=0)
+    low[2] = min(low[2], whole.base[2])
+    room = 0.02 * np.max(high - low)
+    # Trees stay upright and round, however narrow: east and north have the same limits' width.
+    middle, half = 0.5 * (low + high), 0.5 * np.max((high - low)[:2]) + room
+    ax.set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half))
+    ax.set(zlim=(low[2], high[2] + room))
+    # matplotlib's azimuth is counted from the x axis, counterclockwise.
+    ax.view_init(elev=elevation, azim=90.0 - azimuth)
+    sides = np.array([2 * half, 2 * half, high[2] + room - low[2]])
+    # Tall boxes would reach over the edges of the figure.
+    zoom: Any = min(1.0, 0.75 * float(np.linalg.norm(sides) / sides[2]))
+    ax.set_box_aspect(sides.tolist(), zoom=zoom)
+    ax.set(xlabel="x, east (m)", ylabel="y, north (m)", zlabel="height (m)")
+    ax.tick_params(labelsize="x-small")
+    ax.locator_params(nbins=5)
+    return _points_per_metre(ax)
+
+
+def _points_per_metre(ax: Axes3D) -> float:
+    """Measured on the middle of the axes, by what the projection makes of a vertical metre."""
+    low, high = ax.get_xlim(), ax.get_ylim()
+    x, y, z = np.mean(low), np.mean(high), np.mean(ax.get_zlim())
+    ax.apply_aspect()
+    ends = [proj3d.proj_transform(x, y, z + up, ax.get_proj())[:2] for up in (-0.5, 0.5)]
+    pixels = np.diff(ax.transData.transform(ends), axis=0)
+    figure = ax.get_figure()
+    assert isinstance(figure, Figure)
+    return float(np.hypot(*pixels[0])) * 72 / figure.dpi
+
+
+def _axes(ax: Axes3D | None) -> Axes3D:
+    if ax is not None:
+        return ax
+    from matplotlib import pyplot
+
+    made = pyplot.figure(figsize=(5.0, 5.0), layout="constrained").add_subplot(projection="3d")
+    assert isinstance(made, Axes3D)
+    return made

@@ -1,0 +1,107 @@
+"""Waveforms, height upward."""
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from jaxlidar.plot.style import (
+    COLOURS,
+    OTHER,
+    TOTAL,
+    WAVELENGTH_COLOURS,
+    axes_or_new,
+    frame_height,
+    wavelengths_of,
+)
+from jaxlidar.waveform import Waveform
+
+
+def waveform(
+    wave: Waveform,
+    ax: Axes | None = None,
+    *,
+    wavelength: float | None = None,
+    quantity: str = "reflectance",
+    components: bool = True,
+    sigma: float = 2.0,
+    label: str | None = None,
+    **style: Any,
+) -> Axes:
+    """Draw a waveform, height upward.
+
+    For one wavelength: the total as a line, what comes from each material as an area from zero, and what
+    was scattered more than once as a dashed line. For several: the totals.
+
+    **Arguments:**
+
+    - `wave`: a `Waveform`.
+    - `ax`: where to draw. Default None: on a new figure.
+    - `wavelength`: in nm, one of the waveform's. Default None: all.
+    - `quantity`: "reflectance" (default: apparent reflectance) or "energy" (J; without components).
+    - `components`: whether materials and orders are drawn too, where there is one wavelength. Default True.
+    - `sigma`: half-width of the band round the total, in standard errors; 0 draws none. Default 2. Half as
+      wide a band is drawn more strongly within it.
+    - `label`: of the total. Default None: "total", or the wavelength.
+    - `style`: of the total's line, as for `Axes.plot`.
+
+    **Raises:** ValueError for a wavelength that the waveform does not have, another quantity, or a negative
+    `sigma`.
+    """
+    if quantity not in ("reflectance", "energy"):
+        raise ValueError(f"quantity = {quantity!r} is none of 'reflectance', 'energy'")
+    if not sigma >= 0:
+        raise ValueError(f"sigma = {sigma:g} is outside the admissible range [0, inf)")
+    chosen = wavelengths_of(wave, wavelength)
+    ax = axes_or_new(ax, (3.5, 4.2))
+    height = np.asarray(wave.height)
+    total = np.asarray(wave.reflectance if quantity == "reflectance" else wave.energy)
+    gain = total / np.where(np.asarray(wave.reflectance) > 0, np.asarray(wave.reflectance), np.inf)
+    stderr = np.asarray(wave.stderr) * gain
+    alone = len(chosen) == 1
+    for number, i in enumerate(chosen):
+        colour = style.get("color", TOTAL if alone else WAVELENGTH_COLOURS[number % len(WAVELENGTH_COLOURS)])
+        if alone and components and quantity == "reflectance":
+            _components(ax, wave, i)
+        for width, strength in ((sigma, 0.15), (0.5 * sigma, 0.2)):
+            if np.any(width * stderr[i] > 0):
+                low, high = total[i] - width * stderr[i], total[i] + width * stderr[i]
+                ax.fill_betweenx(height, low, high, color=colour, alpha=strength, linewidth=0)
+        name = ("total" if alone else f"{float(wave.wavelength[i]):g} nm") if label is None else label
+        ax.plot(total[i], height, **{"color": colour, "linewidth": 1.4, "label": name, **style})
+    frame_height(ax, height, total[chosen])
+    if not np.any(total[chosen] < 0):
+        ax.set_xlim(left=0.0)
+    ax.locator_params(axis="x", nbins=5)
+    ax.ticklabel_format(axis="x", style="sci", scilimits=(-2, 3), useMathText=True)
+    interval = abs(float(wave.time[1] - wave.time[0])) if wave.time.size > 1 else None
+    each = "sample" if interval is None else f"sample of {interval:.3g} ns"
+    ax.set_xlabel(
+        f"apparent reflectance\nper {each}" if quantity == "reflectance" else f"energy per {each} (J)"
+    )
+    if alone:
+        ax.set_title(f"{float(wave.wavelength[chosen[0]]):g} nm", fontsize="medium")
+    ax.legend(frameon=False, fontsize="small")
+    return ax
+
+
+def _components(ax: Axes, wave: Waveform, i: int) -> None:
+    height = np.asarray(wave.height)
+    names = [n for n in wave.components if n not in ("first", "higher")]
+    peaks = {n: float(np.max(np.asarray(wave.components[n][i]), initial=0.0)) for n in names}
+    for name in sorted(names, key=lambda n: -peaks[n]):
+        if peaks[name] > 0:
+            part = np.asarray(wave.components[name][i])
+            colour = COLOURS.get(name.split()[0], OTHER)
+            ax.fill_betweenx(height, 0.0, part, color=colour, alpha=0.45, linewidth=0, label=name)
+            ax.plot(part, height, color=colour, linewidth=0.8)
+    higher = np.asarray(wave.components["higher"][i])
+    if np.any(higher > 0):
+        ax.plot(
+            higher,
+            height,
+            color=TOTAL,
+            linewidth=1.0,
+            linestyle=(0, (4, 2)),
+            label="scattered twice\nor more",
+        )

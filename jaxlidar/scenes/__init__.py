@@ -1,0 +1,1 @@
+"""Scenes: voxel maps, surfaces, atmosphere."""

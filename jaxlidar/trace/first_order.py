@@ -1,0 +1,307 @@
+r"""First order: every ray of the footprint marched through the scene, its expected return deposited.
+
+Nothing is random. With extinction coefficients k_m of the materials m, k their sum, and tau the optical
+depth from the sensor, the return from a stretch of the ray is
+
+    f_m * integral of k_m exp(-kappa tau(s)) ds,    kappa = 2, or 1 with the hot spot,
+
+integrated exactly over every piece of the ray that lies within one voxel and one time bin. f_m is the
+view factor for backscatter: 2/3 for spherically oriented facets (the mean squared cosine 1/3 over the
+mean cosine 1/2, hence Ross's R/3 for leaf area), 1/4 for isotropic scattering.
+"""
+
+import itertools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from jaxlidar._constants import SPEED_OF_LIGHT
+from jaxlidar._vectors import FAR, Scalar, Vec, along, scale, vec
+from jaxlidar.optics.facets import FACET_BACKSCATTER
+from jaxlidar.optics.laws import Specular
+from jaxlidar.planning.trace_plan import Bins, TracePlan
+from jaxlidar.trace.deposit import first_bin, instant_row, scatter_rows, smooth_row
+from jaxlidar.trace.footprint import Beam
+from jaxlidar.trace.histories import Histories
+from jaxlidar.trace.march import Medium, advance, begin, cell_of, earlier, later
+from jaxlidar.trace.reparametrise import hold_in_columns
+from jaxlidar.trace.surfaces import Surface
+
+CHUNK = 512
+ISOTROPIC_BACKSCATTER = 0.25
+
+
+class Stretches(eqx.Module):
+    """The pieces of one ray between faces: start, length (m), depth at its start, voxel, extinction."""
+
+    start: Float[Array, "*steps"]
+    length: Float[Array, "*steps"]
+    depth: Float[Array, "*steps"]
+    cell: Int[Array, "*steps"]
+    extinction: Float[Array, "*steps"]
+
+
+def mean_decay(x: Scalar) -> Scalar:
+    """(1 - exp(-x)) / x for x >= 0, with its derivative, exact down to and at zero."""
+    return _decay(x)[1]
+
+
+def _decay(x: Scalar) -> tuple[Scalar, Scalar]:
+    """exp(-x) and (1 - exp(-x)) / x, the latter for small x as exp(-x/2) sinh(x/2) / (x/2)."""
+    small = x < 1.0
+    square = 0.25 * x * x
+    series = jnp.ones_like(x)
+    # Terms to the last digit at 1.
+    for n in range(3 if jnp.finfo(x.dtype).bits == 32 else 7, 0, -1):
+        series = 1.0 + square * (1.0 / (2 * n * (2 * n + 1))) * series
+    half = jnp.exp(-0.5 * x)
+    passing = half * half
+    return passing, jnp.where(small, half * series, (1.0 - passing) / jnp.where(small, 1.0, x))
+
+
+def march_ray(
+    medium: Medium, x: Vec, w: Vec, end: Scalar, stops: list[Scalar], steps: int, max_step: Scalar
+) -> tuple[Stretches, list[Scalar], Scalar]:
+    """All stretches of one ray up to `end`, and the optical depth at each of `stops` and at its end."""
+    walk = begin(medium, x, w)
+    end = earlier(end, walk.leave)
+
+    def step(state, _):
+        distance, depth, voxel, at_stops = state
+        faces = lax.optimization_barrier(walk.faces(voxel))
+        face = earlier(earlier(faces[0], faces[1]), faces[2])
+        to = earlier(end, earlier(face, distance + max_step))
+        for stop in stops:
+            # Plates lie between stretches, not within one.
+            to = jnp.where(stop > distance, earlier(to, stop), to)
+        cell = cell_of(medium, voxel)
+        k = medium.extinction(cell, w)
+        to, cell, k = lax.optimization_barrier((later(distance, to), cell, k))
+        length = to - distance
+        at_stops = [
+            a + k * (later(distance, earlier(stop, to)) - distance) for a, stop in zip(at_stops, stops)
+        ]
+        moved = advance(walk, voxel, faces, (to >= face) & (to < end))
+        return (to, depth + k * length, moved, at_stops), Stretches(distance, length, depth, cell, k)
+
+    zero = jnp.zeros_like(end)
+    state = (jnp.minimum(walk.enter, end), zero, walk.voxel, [zero] * len(stops))
+    (_, total, _, at_stops), stretches = lax.scan(step, state, None, length=steps)
+    return stretches, at_stops, total
+
+
+class Passage:
+    """What plates in the way do to light that passes them `ways` times: exponents and their weights.
+
+    A fully covering plate multiplies by T each time; a partial one by (1 - c) + c T, which is expanded
+    so that each term is a monomial in T.
+    """
+
+    def __init__(self, surfaces: tuple[Surface, ...], trace: TracePlan, ways: int):
+        self.plates = [(i, s, trace.surfaces[i].transmitted) for i, s in enumerate(surfaces) if s.plate]
+        choices = []
+        for i, s, letter in self.plates:
+            c = s.coverage
+            # A plate without a letter for transmittance is opaque.
+            straight = s.straight and letter >= 0
+            if trace.full_cover[i]:
+                options = [(ways, jnp.ones_like(c) if straight else jnp.zeros_like(c))]
+            elif straight:
+                terms = {1: [1 - c, c], 2: [(1 - c) ** 2, 2 * c * (1 - c), c**2]}[ways]
+                options = list(enumerate(terms))
+            else:
+                options = [(0, (1 - c) ** ways)]
+            # Where the plate is not in the way, the first option alone stands, with weight one.
+            choices.append([(*option, float(n == 0)) for n, option in enumerate(options)])
+        self.combinations = list(itertools.product(*choices))
+
+    def terms(self, table: Histories, base: int, s: Scalar, met: list[Scalar]):
+        """Pairs of history and weight for light that scatters at distance `s` into history `base`.
+
+        The history is an array, or where there are no plates a number.
+        """
+        if not self.plates:
+            yield base, jnp.ones_like(s)
+            return
+        successor = jnp.asarray(table.successor)
+        for combination in self.combinations:
+            number = jnp.full(s.shape, base, jnp.int32)
+            weight = jnp.ones_like(s)
+            for (i, _, letter), (exponent, value, absent) in zip(self.plates, combination):
+                above = met[i] < s
+                grown = number
+                for _ in range(exponent if letter >= 0 else 0):
+                    grown = successor[grown, letter]
+                number = jnp.where(above, grown, number)
+                weight = weight * jnp.where(above, value, absent)
+            yield number, weight
+
+
+class FirstOrder(eqx.Module):
+    """Deterministic first-order response and the fate of the light that it describes."""
+
+    weights: Float[Array, "materials histories bins"]
+    arrived: Float[Array, "materials histories"]
+    escaped: Float[Array, "histories"]
+
+
+def first_order(
+    beam: Beam,
+    medium: Medium | None,
+    surfaces: tuple[Surface, ...],
+    trace: TracePlan,
+    table: Histories,
+    bins: Bins,
+    across: tuple[Float[Array, "rays"], Float[Array, "rays"]],
+    energy: Float[Array, "rays"],
+) -> FirstOrder:
+    """Response of order one. Rays are given by their place across the beam and their share of energy."""
+    count = table.count
+    out_way, both_ways = Passage(surfaces, trace, 1), Passage(surfaces, trace, 2)
+    kappa = 1.0 if trace.hotspot else 2.0
+    successor = table.successor
+    materials = len(trace.materials)
+
+    def rays(across, energy):
+        across, share = hold_in_columns(beam, medium, across)
+        energy = energy * share
+        point, w, excess = beam.ray(across)
+        x = along(point, w, jnp.asarray(-trace.upstream, energy.dtype))
+        excess = excess - trace.upstream
+        met = [s.distance(x, w) for s in surfaces]
+        stop = met[0] if trace.has_ground else jnp.full_like(energy, FAR)
+        visible = energy * beam.in_view(along(x, w, jnp.minimum(stop, trace.upstream)))
+        response = jnp.zeros((materials * count, bins.padded), energy.dtype)
+        arrived = jnp.zeros((materials * count,), energy.dtype)
+        escaped = jnp.zeros((count,), energy.dtype)
+        at_stops, total = [jnp.zeros_like(energy) for _ in met], jnp.zeros_like(energy)
+
+        if medium is not None:
+            step = jnp.asarray(trace.max_step, energy.dtype)
+            # Stretches stay along the first axis, where the march leaves them: turning them costs as much.
+            march = jax.vmap(march_ray, (None, 0, 0, 0, 0, None, None), (1, 0, 0))
+            stretch, at_stops, total = march(medium, x, w, stop, met, trace.first_steps, step)
+
+            def along_rays(a):
+                return jnp.broadcast_to(a, stretch.start.shape)
+
+            way, before = vec(along_rays(a) for a in w), [along_rays(m) for m in met]
+            k, power = stretch.extinction, along_rays(energy)
+            low = bins.position(2.0 * (along_rays(excess) + stretch.start) / SPEED_OF_LIGHT)
+            first, pieces = _stretch_pieces(bins, low, stretch, kappa)
+            passing = jnp.exp(-stretch.depth) * mean_decay(k * stretch.length) * stretch.length
+            middle = stretch.start + 0.5 * stretch.length
+            for m, part in _parts(medium, trace, stretch, way):
+                value = part.extinction * (part.backscatter * along_rays(visible))
+                for history, share in both_ways.terms(table, int(successor[0, part.letter]), middle, before):
+                    slot = jnp.broadcast_to(m * count + history, first.shape)
+                    row = jnp.moveaxis(pieces, 0, -1) * (value * share)[..., None]
+                    response = scatter_rows(response, slot, first, row)
+                for history, share in out_way.terms(table, 0, middle, before):
+                    weight = part.extinction * passing * share * power
+                    slot, weight = _together(m * count + history, weight)
+                    arrived = arrived.at[slot].add(weight)
+            # Smoothing is linear: the sum once instead of every stretch.
+            response = smooth_row(response, bins.kernel)[:, 1:-1]
+
+        for i, (s, law) in enumerate(zip(surfaces, trace.surfaces)):
+            hit = jnp.where((met[i] <= stop) & (met[i] < FAR), s.coverage * energy, 0.0)
+            for history, share in out_way.terms(table, 0, met[i], met):
+                slot, weight = _together(law.material * count + history, hit * jnp.exp(-at_stops[i]) * share)
+                arrived = arrived.at[slot].add(weight)
+            if isinstance(s.law, Specular):
+                continue
+            at = along(x, w, jnp.where(met[i] < FAR, met[i], 0.0))
+            back = scale(w, jnp.asarray(-1.0))
+            factor = s.law.view_factor(w, s.lit_normal(w), back, beam.half_angle) * beam.in_view(at)
+            time = 2.0 * (excess + jnp.minimum(met[i], 1e9)) / SPEED_OF_LIGHT
+            first, row = instant_row(bins, time, hit * factor * jnp.exp(-kappa * at_stops[i]))
+            for history, share in both_ways.terms(table, int(successor[0, law.reflected]), met[i], met):
+                slot = jnp.broadcast_to(law.material * count + history, first.shape)
+                response = scatter_rows(response, slot, first, row * share[:, None])
+
+        gone = jnp.where(stop < FAR, 0.0, energy * jnp.exp(-total))
+        for history, share in out_way.terms(table, 0, stop, met):
+            slot, weight = _together(history, gone * share)
+            escaped = escaped.at[slot].add(weight)
+        return response, arrived.reshape(materials, count), escaped
+
+    n = energy.shape[0]
+    fill = -n % CHUNK
+    padded = [jnp.pad(a, (0, fill)).reshape(-1, CHUNK) for a in (*across, energy)]
+
+    def chunk(x, y, e):
+        return rays((x, y), e)
+
+    if n <= CHUNK:
+        response, arrived, escaped = rays(across, energy)
+    elif medium is None:
+        # Without a march all chunks fit into the memory at once, and no loop is compiled.
+        each = jax.vmap(chunk)(*padded)
+        response, arrived, escaped = jax.tree.map(lambda a: jnp.sum(a, axis=0), each)
+    else:
+        zero = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(rays, across, energy))
+
+        def add(total, part):
+            return jax.tree.map(jnp.add, total, chunk(*part)), None
+
+        response, arrived, escaped = lax.scan(add, zero, padded)[0]
+    weights = bins.trim(response.reshape(materials, count, bins.padded))
+    return FirstOrder(weights, arrived, escaped)
+
+
+def _stretch_pieces(
+    bins: Bins, low: Float[Array, "steps rays"], stretch: Stretches, kappa: float
+) -> tuple[Int[Array, "steps rays"], Float[Array, "pieces steps rays"]]:
+    """First bin, and for it and those behind it the integral of exp(-kappa tau) ds over each stretch.
+
+    `low` is the position of the start of each stretch on the axis of bins.
+    """
+    metres = 0.5 * SPEED_OF_LIGHT * bins.width
+    high = low + stretch.length / metres
+    number = jnp.round(lax.stop_gradient(low))
+    # Rows of an even length are added faster; a piece beyond the end is zero.
+    count = bins.row - 2 + bins.row % 2
+
+    def piece(carry, j):
+        clear, start = carry
+        end = jnp.clip(number + (j + 0.5), low, high)
+        length = (end - start) * metres
+        passing, mean = _decay(kappa * stretch.extinction * length)
+        return (clear * passing, end), clear * mean * length
+
+    # A scan, so that each piece is computed once: unrolled, compilers compute them anew for every element.
+    start = (jnp.exp(-kappa * stretch.depth), low)
+    _, pieces = lax.scan(piece, start, jnp.arange(count, dtype=low.dtype))
+    return first_bin(bins, number, count), pieces
+
+
+def _together(slot: Int[Array, "*s"] | int, weight: Float[Array, "*s"]):
+    """Slots and weights to add; one sum where all rays have the same slot."""
+    return (slot, jnp.sum(weight)) if isinstance(slot, int) else (slot, weight)
+
+
+class Part(eqx.Module):
+    """One material of the medium on a ray: its extinction, view factor for backscatter, and letter."""
+
+    extinction: Float[Array, "..."]
+    backscatter: Float[Array, "..."] | float
+    letter: int = eqx.field(static=True)
+
+
+def _parts(medium: Medium, trace: TracePlan, stretch: Stretches, w: Vec):
+    if medium.leaf is not None and trace.leaf is not None:
+        k = stretch.extinction if medium.bark is None else medium.leaf_at(stretch.cell, w)
+        factor = FACET_BACKSCATTER
+        if trace.leaf_isotropic:
+            factor = ISOTROPIC_BACKSCATTER
+        elif medium.angles is not None:
+            factor = medium.angles.square_at(w) / medium.angles.projection_at(w)
+        yield trace.leaf.material, Part(k, factor, trace.leaf.reflected)
+    if medium.bark is not None and trace.bark is not None:
+        k = stretch.extinction if medium.leaf is None else medium.bark_at(stretch.cell)
+        factor = ISOTROPIC_BACKSCATTER if trace.bark_isotropic else FACET_BACKSCATTER
+        yield trace.bark.material, Part(k, factor, trace.bark.reflected)

@@ -1,0 +1,299 @@
+r"""Orders two and above: photons that collide, scatter and at every collision return what is expected.
+
+Photons carry no energy, only the geometric weight of their path and the number of its history. Each
+order draws a collision: the optical depth to it, the material, the direction onward. From there the
+photon deposits the probability of returning (pi times the density of scattering towards the sensor,
+times the transmittance of the way there). It does so from several points of the flight, `trace.ends`,
+one in each stratum of the probability of getting there, and goes on from one of them.
+
+Derivatives: what is drawn is held fixed (directions, materials, and the place of a collision as a
+fraction of the ray's chord through its voxel), and the density with which it was drawn stays in the weight
+as p / stop_gradient(p). Voxel sizes, heights and extinction move positions, path lengths and densities
+continuously, so the derivative of an expected value is the expected value of the derivative. An
+extinction coefficient that is exactly zero is never met, and its derivative here is zero.
+"""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from jaxlidar._constants import SPEED_OF_LIGHT
+from jaxlidar._vectors import FAR, Scalar, Vec, along, vec
+from jaxlidar.planning.trace_plan import Bins, TracePlan
+from jaxlidar.trace.collisions import collide, view_factors
+from jaxlidar.trace.deposit import instant_row, scatter_rows
+from jaxlidar.trace.flight import DIMENSIONS, Flight, events_of, fly, nearest, plates_ahead
+from jaxlidar.trace.footprint import GOLDEN, Beam, across_beam
+from jaxlidar.trace.histories import Histories
+from jaxlidar.trace.march import Medium, depth_to_top, free_flight
+from jaxlidar.trace.photons import THROUGH, Hit, Photons, Setting, ratio_of, stop
+from jaxlidar.trace.random_numbers import Independent, draws
+from jaxlidar.trace.reparametrise import aim, hold_in_columns
+from jaxlidar.trace.surfaces import Surface
+
+CHUNK = 256
+# Chunks that are traced together, order by order, and added up by themselves: single precision loses small
+# deposits on a large sum.
+GROUP = 32
+
+
+class HigherOrders(eqx.Module):
+    """Response of orders two and above, and the fate of all light (see `jaxlidar.trace.response`)."""
+
+    weights: Float[Array, "materials histories bins"]
+    arrived: Float[Array, "materials histories"]
+    left: Float[Array, "materials histories"]
+    escaped: Float[Array, "histories"]
+    late: Float[Array, "histories"]
+    remaining: Float[Array, "histories"]
+
+
+def higher_orders(
+    beam: Beam,
+    medium: Medium | None,
+    surfaces: tuple[Surface, ...],
+    trace: TracePlan,
+    table: Histories,
+    bins: Bins,
+    key: PRNGKeyArray,
+    photons: int,
+) -> HigherOrders:
+    """Trace `photons` photons through up to `trace.orders` scatterings; sums are means per photon."""
+    footprint_key, draw_key = jax.random.split(key)
+    plates = [i for i, s in enumerate(surfaces) if s.plate]
+    dimensions = DIMENSIONS + 2 * len(plates)
+    shift = jax.random.uniform(footprint_key, (2,))
+    if trace.independent:
+        numbers, places = Independent(draw_key, dimensions), Independent(footprint_key, 2)
+    else:
+        numbers, places = draws(draw_key, trace.orders, dimensions), None
+    setting = Setting(beam, medium, surfaces, trace, table, bins)
+    size = min(CHUNK, photons)
+    chunks = -(-photons // size)
+    groups = -(-chunks // GROUP)
+    each = -(-chunks // groups)
+    count, materials = table.count, len(trace.materials)
+
+    def start(lane):
+        if places is None:
+            share = (lane.astype(float) + shift[0]) / photons
+            turn = (lane * jnp.uint32(GOLDEN * 2**32)).astype(float) * 2.0**-32 + shift[1]
+        else:
+            share, turn = places(lane, jnp.asarray(trace.orders))
+        inside = lane < photons
+        across, share = hold_in_columns(beam, medium, across_beam(beam, share, turn))
+        point, w, excess = beam.ray(across)
+        up = jnp.asarray(-trace.upstream, excess.dtype)
+        return Photons(
+            along(point, w, up),
+            w,
+            excess + up,
+            jnp.where(inside, share / photons, 0.0),
+            jnp.zeros(lane.shape, jnp.int32),
+            jnp.full(lane.shape, -1, jnp.int32),
+            vec(jnp.zeros_like(excess) for _ in range(3)),
+            inside,
+        )
+
+    def group(total, number):
+        lane = number * (each * size) + jnp.arange(each * size, dtype=jnp.uint32)
+
+        def order(carry, n):
+            def chunk(tally, part):
+                lane, photons = part
+
+                def go(photons, tally):
+                    return _one_order(setting, photons, tally, numbers(lane, n), n)
+
+                # Photons that live come first, so that whole chunks of dead ones are passed over.
+                photons, tally = lax.cond(jnp.any(photons.alive), go, lambda *c: c, photons, tally)
+                return tally, photons
+
+            lanes, photons, tally = carry
+            tally, photons = lax.scan(chunk, tally, (lanes, photons))
+            lanes, photons = _alive_first(lanes, photons)
+            return (lanes, photons, tally), None
+
+        rows = jax.tree.map(lambda a: a.reshape(each, size), (lane, start(lane)))
+        (_, last, tally), _ = lax.scan(order, (*rows, zero), jnp.arange(trace.orders))
+        over = jnp.where(last.alive, stop(last.weight), 0.0)
+        tally = eqx.tree_at(lambda t: t.remaining, tally, tally.remaining.at[last.history].add(over))
+        return jax.tree.map(jnp.add, total, tally), None
+
+    zero = HigherOrders(
+        jnp.zeros((materials, count, bins.padded)),
+        jnp.zeros((materials, count)),
+        jnp.zeros((materials, count)),
+        jnp.zeros((count,)),
+        jnp.zeros((count,)),
+        jnp.zeros((count,)),
+    )
+    tallies, _ = lax.scan(group, zero, jnp.arange(groups, dtype=jnp.uint32))
+    return eqx.tree_at(lambda t: t.weights, tallies, bins.trim(tallies.weights))
+
+
+def _alive_first(lanes: Array, photons: Photons) -> tuple[Array, Photons]:
+    """Bring the photons that live to the front, in their order; all others are dead copies of the first."""
+    alive = photons.alive.reshape(-1)
+    number = jnp.arange(alive.size)
+    place = jnp.where(alive, jnp.cumsum(alive) - 1, alive.size)
+    source = jnp.zeros_like(number).at[place].set(number, mode="drop")
+    lanes, photons = jax.tree.map(lambda a: a.reshape(-1)[source].reshape(a.shape), (lanes, photons))
+    alive = (number < jnp.sum(alive)).reshape(photons.alive.shape)
+    return lanes, eqx.tree_at(lambda p: p.alive, photons, alive)
+
+
+def _one_order(setting: Setting, p: Photons, tally: HigherOrders, u: list[Scalar], order: Int[Array, ""]):
+    """Fly, collide, deposit, scatter."""
+    trace, ends = setting.trace, setting.trace.ends
+    met, outcomes, ratio = plates_ahead(setting, p, u[DIMENSIONS:])
+    events = events_of(setting, met, outcomes)
+    limit = nearest(p, events)
+    budget = stop(setting.budget(p))
+    if setting.medium is not None and setting.surfaces:
+        w, limit, turned = aim(setting, p, limit, events, (order > 0) & (limit < budget))
+        p = eqx.tree_at(lambda p: (p.w, p.weight), p, (w, p.weight * turned))
+    # One number says in which stratum the photon goes on, and where in each stratum the points are.
+    chosen = jnp.minimum(jnp.floor(u[0] * ends), ends - 1)
+    strata = jnp.stack([(i + (u[0] * ends - chosen)) / ends for i in range(ends)])
+    wide = functools.partial(jnp.broadcast_to, shape=strata.shape)
+    flights = fly(setting, p, limit, budget, jnp.maximum(strata, 1e-9))
+    p, u, flights, events, limit = lax.optimization_barrier((p, u, flights, events, limit))
+
+    def pick(a: Array) -> Array:
+        return jnp.take_along_axis(a, chosen.astype(jnp.int32)[None], 0, mode="promise_in_bounds")[0]
+
+    # Plates that were passed on the way.
+    weight, history = wide(p.weight) * flights.density, wide(p.history)
+    for i, (s, d, o) in enumerate(zip(setting.surfaces, met, outcomes)):
+        if not s.plate:
+            continue
+        own = wide(events[i]) <= flights.distance
+        passed = wide(p.alive & (d < FAR)) & ((wide(d) < flights.distance) | ~flights.event) & ~own
+        weight = weight * jnp.where(passed | (flights.landed & own), wide(ratio[i]), 1.0)
+        through = passed & wide(o == THROUGH)
+        scatterer = trace.surfaces[i]
+        gone = pick(jnp.where(through, weight, 0.0))
+        tally = _arrive(tally, scatterer.material, pick(history), gone)
+        history = jnp.where(through, setting.grow(history, scatterer.transmitted), history)
+        weight = jnp.where(through, weight / (1.0 - trace.lobe), weight)
+        tally = _leave(tally, scatterer.material, pick(history), gone / (1.0 - trace.lobe))
+
+    if trace.drawn_first:
+        tally = _return(setting, p, flights, events, limit, weight, history, u, tally)
+    else:
+        # The first order is deterministic and has been deposited.
+        given = (setting, p, flights, events, limit, weight, history, u)
+        tally = lax.cond(order > 0, lambda t: _return(*given, t), lambda t: t, tally)
+
+    flight, weight, history = jax.tree.map(pick, (flights, weight, history))
+    held = stop(weight)
+    tally = eqx.tree_at(
+        lambda t: (t.escaped, t.late),
+        tally,
+        (
+            tally.escaped.at[history].add(jnp.where(flight.escaped, held, 0.0)),
+            tally.late.at[history].add(jnp.where(flight.late, held, 0.0)),
+        ),
+    )
+    flown = jnp.where(flight.event, flight.distance, 0.0)
+    hit = collide(setting, p.w, flight.cell, flight.collided, flight.landed, events, limit, u)
+    weight = jnp.where(flight.event, weight, 0.0)
+    tally = _arrive(tally, hit.material, history, weight)
+    history = setting.grow(history, hit.letter)
+    weight = weight * hit.ratio * hit.onward
+    tally = _leave(tally, hit.material, history, weight)
+    x = along(p.x, p.w, flown)
+    return Photons(x, hit.w, p.path + flown, weight, history, hit.on, hit.facing, flight.event), tally
+
+
+def _return(
+    setting: Setting,
+    p: Photons,
+    flights: Flight,
+    events: list[Scalar],
+    limit: Scalar,
+    weight: Float[Array, "ends photons"],
+    history: Int[Array, "ends photons"],
+    u: list[Scalar],
+    tally: HigherOrders,
+) -> HigherOrders:
+    """Deposit from every end of the flights its share of what is expected to return."""
+    ends = setting.trace.ends
+
+    def flat(tree):
+        return jax.tree.map(lambda a: jnp.broadcast_to(a, (ends, a.shape[-1])).reshape(-1), tree)
+
+    p, flights, events, limit, u, history = flat((p, flights, events, limit, u, history))
+    flown = jnp.where(flights.event, flights.distance, 0.0)
+    hit = collide(setting, p.w, flights.cell, flights.collided, flights.landed, events, limit, u)
+    value = jnp.where(flights.event, flat(weight), 0.0) * hit.ratio / ends
+    x = along(p.x, p.w, flown)
+    given = lax.optimization_barrier((p.w, x, p.path + flown, value, history, hit, u))
+    return _deposit(setting, tally, *given)
+
+
+def _arrive(tally: HigherOrders, material: Array | int, history: Array, weight: Scalar) -> HigherOrders:
+    return eqx.tree_at(lambda t: t.arrived, tally, tally.arrived.at[material, history].add(stop(weight)))
+
+
+def _leave(tally: HigherOrders, material: Array | int, history: Array, weight: Scalar) -> HigherOrders:
+    return eqx.tree_at(lambda t: t.left, tally, tally.left.at[material, history].add(stop(weight)))
+
+
+def _deposit(
+    setting: Setting,
+    tally: HigherOrders,
+    w: Vec,
+    x: Vec,
+    path: Scalar,
+    weight: Scalar,
+    history: Int[Array, "photons"],
+    hit: Hit,
+    u: list[Scalar],
+) -> HigherOrders:
+    """Return what is expected to reach the sensor from each collision."""
+    beam, trace, medium = setting.beam, setting.trace, setting.medium
+    v = beam.view(x)
+    reflected, transmitted = view_factors(setting, w, v, hit)
+    if medium is None:
+        clear = jnp.ones_like(path)
+    elif setting.column is not None:
+        column = setting.column
+        clear = jnp.exp(-jax.vmap(lambda x: depth_to_top(medium, x, column))(x))
+    else:
+        none, far = jnp.zeros((0, path.size)), jnp.full_like(path, FAR)
+        clear = jnp.exp(-free_flight(medium, x, v, none, far, weight > 0, trace.march_steps).total)
+    drawn = iter(u[DIMENSIONS + sum(s.plate for s in setting.surfaces) :])
+    for i, (s, scatterer) in enumerate(zip(setting.surfaces, trace.surfaces)):
+        if not s.plate:
+            continue
+        covered = next(drawn) < s.coverage
+        crossed = (s.distance(x, v) < FAR) & (hit.on != i)
+        c = jnp.broadcast_to(s.coverage, path.shape)
+        ratio = ratio_of(jnp.where(covered, c, 1.0 - c))
+        if s.straight:
+            history = jnp.where(crossed & covered, setting.grow(history, scatterer.transmitted), history)
+            through = ratio if scatterer.transmitted >= 0 else jnp.where(covered, 0.0, ratio)
+        else:
+            through = jnp.where(covered, 0.0, ratio)
+        clear = clear * jnp.where(crossed, through, 1.0)
+    out = beam.excess(x)
+    time = (path + out) / SPEED_OF_LIGHT
+    # Apparent reflectance refers to the range that the time of arrival stands for.
+    spread = ((beam.slant_range + 0.5 * (path + out)) / (beam.slant_range + out)) ** 2
+    value = weight * clear * spread * beam.in_view(x)
+    response = tally.weights.reshape(-1, setting.bins.padded)
+    pairs = [(hit.reflected, reflected)]
+    if transmitted is not None:
+        pairs.append((hit.transmitted, transmitted))
+    first, row = lax.optimization_barrier(instant_row(setting.bins, time, value))
+    for letter, factor in pairs:
+        slot = hit.material * setting.table.count + setting.grow(history, letter)
+        factor = jnp.where(letter >= 0, factor, 0.0)
+        response = scatter_rows(response, slot, first, row * factor[:, None])
+    return eqx.tree_at(lambda t: t.weights, tally, response.reshape(tally.weights.shape))

@@ -1,0 +1,104 @@
+"""Rays that head for a surface, and how they move with the geometry."""
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool
+
+from jaxlidar._vectors import Scalar, add, along, dot, from_frame, scale, to_frame, vec, with_derivative_of
+from jaxlidar.trace.collisions import drawn_density
+from jaxlidar.trace.footprint import Beam
+from jaxlidar.trace.march import Medium
+from jaxlidar.trace.photons import Photons, Setting, ratio_of, stop
+
+
+def aim(setting: Setting, p: Photons, limit: Scalar, events: list[Scalar], heading: Bool[Array, "photons"]):
+    """Direction, distance and density ratio of rays towards a surface, as geometry moves them.
+
+    The transmittance of the way back jumps where a landing point crosses from below one column of
+    voxels to the next. With the direction held fixed, points would cross; with the point held fixed
+    in its column, rays that start just above the surface would have to turn without bound. So points move
+    with the share `fade` of the former motion: none at a column's faces, and nearly all for rays
+    shorter than the way to the next face. Values do not change, only derivatives.
+    """
+    medium = setting.medium
+    assert medium is not None
+    heading &= p.alive
+    reach = jnp.where(heading, limit, 1.0)
+    direct = along(p.x, p.w, reach)
+    held = jax.tree.map(stop, direct)
+    normal, offset = vec(jnp.zeros_like(reach) for _ in range(3)), jnp.zeros_like(reach)
+    for s, d in zip(setting.surfaces, events):
+        here = d <= limit
+        normal = vec(jnp.where(here, n, m) for n, m in zip(s.normal, normal))
+        offset = jnp.where(here, s.offset, offset)
+    upright = jnp.where(heading, normal[2], 1.0)
+
+    def on_surface(x, y):
+        z = (offset - normal[0] * x - normal[1] * y) / upright
+        return x, y, jnp.where(heading, z, direct[2])
+
+    def seen_from(point):
+        way = add(point, scale(p.x, jnp.asarray(-1.0)))
+        far2 = jnp.maximum(dot(way, way), 1e-20)
+        return scale(way, 1.0 / jnp.sqrt(far2)), jnp.sqrt(far2)
+
+    # Fixed in the column.
+    size, origin = medium.size[:2], medium.origin[:2]
+    place = [stop((held[k] - origin[k]) / size[k]) for k in range(2)]
+    column = on_surface(*(origin[k] + size[k] * place[k] for k in range(2)))
+    w, far = seen_from(column)
+    # Per area of the map, from which the sloping surface is projected.
+    density = (
+        drawn_density(p.facing, w) * jnp.abs(dot(normal, w) / upright) / (far * far) * (size[0] * size[1])
+    )
+    ratio = jnp.where(heading, ratio_of(density), 1.0)
+
+    rise = jnp.maximum(stop(reach * jnp.abs(dot(normal, p.w))), 1e-6)
+    fades, slopes = [], []
+    for k in range(2):
+        within = place[k] - jnp.floor(place[k])
+        nearest = jnp.minimum(within, 1.0 - within) * stop(size[k])
+        fades.append(jnp.minimum(nearest / rise, 1.0))
+        slopes.append(jnp.where(nearest < rise, jnp.where(within < 0.5, 1.0, -1.0) / rise, 0.0))
+    fade = fades[0] * fades[1]
+    gradient = (slopes[0] * fades[1], slopes[1] * fades[0])
+    apart = [(direct[k] - held[k]) - (column[k] - stop(column[k])) for k in range(2)]
+    turned = 1.0 + (1.0 - fade) * (ratio - 1.0) + gradient[0] * apart[0] + gradient[1] * apart[1]
+    x, y = (held[k] + (column[k] - stop(column[k])) + fade * apart[k] for k in range(2))
+    w, far = seen_from(on_surface(x, y))
+    # Values stay those that were drawn.
+    w = vec(with_derivative_of(a, jnp.where(heading, b, a)) for a, b in zip(p.w, w))
+    far = with_derivative_of(limit, jnp.where(heading, far, limit))
+    return w, far, with_derivative_of(jnp.ones_like(far), jnp.where(heading, turned, 1.0))
+
+
+def hold_in_columns(
+    beam: Beam, medium: Medium | None, across: tuple[Scalar, Scalar]
+) -> tuple[tuple[Scalar, Scalar], Scalar]:
+    """Let the rays of the footprint move with the columns of the grid, and their energy accordingly.
+
+    Values do not change. But the optical depth of a nearly vertical ray jumps, seen from afar, where it
+    crosses into another column: its derivative with respect to a sideways motion of the grid lies in rare,
+    nearly parallel crossings. Rays that move along have none, and the profile of a Gaussian beam makes up
+    for it. The edge of a top-hat would not, so its rays stay, and that derivative stays noisy.
+    """
+    if medium is None or not beam.gaussian:
+        return across, jnp.ones_like(across[0])
+    # A beam without width has no profile that could make up for it.
+    wide = beam.radius > 1e-6
+    across_axis = from_frame(beam.axis, (*across, jnp.zeros_like(across[0])))
+    # Where the rays meet the reference plane.
+    flat = along(across_axis, beam.axis, -across_axis[2] / beam.axis[2])
+    moved = []
+    for k in range(2):
+        place = lax.stop_gradient((flat[k] - medium.origin[k]) / medium.size[k])
+        now = medium.origin[k] + medium.size[k] * place
+        moved.append(jnp.where(wide, now - lax.stop_gradient(now), 0.0))
+    shift = to_frame(beam.axis, (*moved, jnp.zeros_like(across[0])))
+    across = (across[0] + shift[0], across[1] + shift[1])
+    # Rays lie farther apart where voxels or the beam are wider.
+    area = medium.size[0] * medium.size[1] * beam.radius**2
+    density = jnp.where(wide, beam.irradiance(across) * area, 1.0)
+    held = lax.stop_gradient(density)
+    return across, 1.0 + (density - held) / jnp.maximum(held, 1e-30)
