@@ -8,23 +8,23 @@ as they are.
 import dataclasses
 import os
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, final
+from typing import Any, NamedTuple, final
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jaxtyping import ArrayLike, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 
 from jaxlidar import Lidar, Plan, Scene
 from jaxlidar.extend import ONE_CORE, check_range, side_by_side
-from jaxlidar.simulate import MIN_BATCHES
+from jaxlidar.planning.plan import MIN_BATCHES
 
 from .checkpoint import Kept, Row, fingerprint, row_of
 from .data import data_of
 from .fit import Fitting, Request, best_of, labels_of, named
-from .model import Evaluation, Model, evaluate
+from .model import Evaluation, Model, Problem, evaluate
 from .planning import check_samples, plan_for
 from .retrieval import SOLVER, fits_from, scale_of
 from .unknowns import Settled, Unknown, settle, start_from
@@ -256,7 +256,7 @@ class _Simulator:
         self.threads = min(max(os.cpu_count() or 1, 1), lanes)
         self.each = -(-lanes // self.threads)
         self.lanes = self.each * self.threads
-        self.lidars, self.scenes, self.plan = lidars, scenes, plan
+        self.lidars, self.scenes = lidars, scenes
 
     def __call__(self, requests: dict[int, Request]) -> dict[int, Evaluation]:
         numbers = list(requests)
@@ -275,23 +275,16 @@ class _Simulator:
         )
         lidar, scene = _stacked(self.lidars, padded), _stacked(self.scenes, padded)
         model = self.model
-        out = _simulate(
-            lidar,
-            scene,
-            self.plan,
-            model.places,
-            values,
-            jnp.stack(model.keys),
-            len(self.lidars) > 1,
-            len(self.scenes) > 1,
-        )
+        problem = dataclasses.replace(model.problem, lidar=lidar, scene=scene)
+        own = Own(len(self.lidars) > 1, len(self.scenes) > 1)
+        out = _simulate(problem, values, jnp.stack(model.keys), own)
         total, columns, batches = (np.asarray(a, float) for a in out)
         return {
             i: Evaluation(
                 total[n],
                 np.moveaxis(columns[n][model.order], 0, -1),
                 None,
-                batches[n] if model.plan.is_random else None,
+                batches[n] if model.problem.plan.is_random else None,
             )
             for n, i in enumerate(group)
         }
@@ -304,23 +297,29 @@ def _stacked(given: list[Any], numbers: list[int]) -> Any:
     return eqx.combine(jax.tree.map(lambda *a: jnp.stack(a), *dynamic), static[0])
 
 
+class Own(NamedTuple):
+    """Whether every footprint has a lidar, or a scene, of its own."""
+
+    lidar: bool
+    scene: bool
+
+
 @eqx.filter_jit(**ONE_CORE)
-def _simulate(lidar, scene, plan, places, values, keys, own_lidar: bool, own_scene: bool):
-    lidar, fixed_lidar = eqx.partition(lidar, eqx.is_array)
-    scene, fixed_scene = eqx.partition(scene, eqx.is_array)
+def _simulate(problem: Problem, values: Any, keys: Array, own: Own) -> tuple[Array, Array, Array]:
+    lidar, fixed_lidar = eqx.partition(problem.lidar, eqx.is_array)
+    scene, fixed_scene = eqx.partition(problem.scene, eqx.is_array)
 
-    def one(lidar, scene, values):
-        return evaluate(
-            eqx.combine(lidar, fixed_lidar), eqx.combine(scene, fixed_scene), plan, places, values, keys
-        )
+    def one(lidar: Lidar, scene: Scene, values: Any) -> tuple[Array, Array, Array]:
+        lidar, scene = eqx.combine(lidar, fixed_lidar), eqx.combine(scene, fixed_scene)
+        return evaluate(dataclasses.replace(problem, lidar=lidar, scene=scene), values, keys)
 
-    if plan.orders == 1:
-        axes = (0 if own_lidar else None, 0 if own_scene else None, 0)
+    if problem.plan.orders == 1:
+        axes = (0 if own.lidar else None, 0 if own.scene else None, 0)
         return jax.vmap(one, in_axes=axes)(lidar, scene, values)
 
     # Together, photons of all lanes would go on until the last one of them is gone.
-    def in_turn(own):
-        return one(own[0] if own_lidar else lidar, own[1] if own_scene else scene, own[2])
+    def in_turn(each: tuple) -> tuple[Array, Array, Array]:
+        return one(each[0] if own.lidar else lidar, each[1] if own.scene else scene, each[2])
 
-    mapped = (lidar if own_lidar else None, scene if own_scene else None, values)
+    mapped = (lidar if own.lidar else None, scene if own.scene else None, values)
     return jax.lax.map(in_turn, mapped)

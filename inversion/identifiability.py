@@ -13,7 +13,7 @@ from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 from jaxlidar import Lidar, Plan, Scene, Waveform
 from jaxlidar import plan as make_plan
 from jaxlidar.extend import check_range
-from jaxlidar.simulate import MIN_BATCHES
+from jaxlidar.planning.plan import MIN_BATCHES
 
 from .data import data_of, time_axis
 from .fit import labels_of, named

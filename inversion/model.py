@@ -8,7 +8,7 @@ All evaluations use the same random keys, so that the waveform is a smooth funct
 evaluation averages batches of photons with keys of their own, whose spread is the simulation's own noise.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -18,29 +18,55 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxlidar import Lidar, Plan, Response, Scene, Waveform, waveform_of
+from jaxlidar import Lidar, Plan, Response, Scene, Setup, Waveform, reduce, total_of, trace_scene, waveform_of
 from jaxlidar.extend import ONE_CORE, side_by_side
-from jaxlidar.simulate import MIN_BATCHES, total_all, trace_all
+from jaxlidar.planning.plan import MIN_BATCHES
 
 from .unknowns import Place, Settled, put
 
 Values = tuple[Array, ...]
 
 
+class Problem(eqx.Module):
+    """What a waveform is simulated of, but for the unknowns' values."""
+
+    lidar: Lidar
+    scene: Scene
+    plan: Plan = eqx.field(static=True)
+    places: tuple[Place, ...] = eqx.field(static=True)
+
+    def at(self, values: Values) -> Setup:
+        """With these values."""
+        return reduce(self.lidar, put(self.scene, self.places, values), self.plan)
+
+    def moving(self, values: Values, *, geometric: bool) -> tuple[Array, Callable[[Array], Setup]]:
+        """The values of the geometric unknowns, or of the others, as one vector; and the setup for such a
+        one.
+
+        The others keep their values.
+        """
+        numbers = [i for i, place in enumerate(self.places) if place.geometric == geometric]
+        flat, restore = jax.flatten_util.ravel_pytree([values[i] for i in numbers])
+
+        def setup(flat: Array) -> Setup:
+            moved = dict(zip(numbers, restore(flat)))
+            return self.at(tuple(moved.get(i, v) for i, v in enumerate(values)))
+
+        return flat, setup
+
+
 def _batch(
-    lidar: Lidar, scene: Scene, plan: Plan, places: tuple[Place, ...], values: Values, key: PRNGKeyArray
-) -> tuple[Any, Float[Array, "wavelengths bins"], Float[Array, "columns wavelengths bins"]]:
+    problem: Problem, values: Values, key: PRNGKeyArray
+) -> tuple[Response, Float[Array, "wavelengths bins"], Float[Array, "columns wavelengths bins"]]:
     """Response and total of one batch, and the total's derivatives in the geometric unknowns."""
-    moving = tuple(i for i, p in enumerate(places) if p.geometric)
-    flat, restore = jax.flatten_util.ravel_pytree([values[i] for i in moving])
+    flat, setup_at = problem.moving(values, geometric=True)
 
-    def total(flat):
-        moved = dict(zip(moving, restore(flat)))
-        here = put(scene, places, tuple(moved.get(i, v) for i, v in enumerate(values)))
-        response = trace_all(lidar, here, plan, key)
-        return total_all(response, lidar, here, plan), response
+    def total(flat: Array) -> tuple[Array, Response]:
+        setup = setup_at(flat)
+        response = trace_scene(setup, key)
+        return total_of(response, setup), response
 
-    if not moving:
+    if not flat.size:
         value, response = total(flat)
         return response, value, jnp.zeros((0, *value.shape), value.dtype)
     # The response without its tangents is the same for all directions, hence not batched.
@@ -54,18 +80,15 @@ _compiled_batch = eqx.filter_jit(_batch, **ONE_CORE)
 
 @eqx.filter_jit
 def _colour(
-    lidar: Lidar, scene: Scene, plan: Plan, places: tuple[Place, ...], values: Values, response: Any
+    problem: Problem, values: Values, response: Response
 ) -> tuple[Float[Array, "wavelengths bins"], Float[Array, "columns wavelengths bins"]]:
     """Total of a response, and its derivatives in the optical unknowns."""
-    optical = tuple(i for i, p in enumerate(places) if not p.geometric)
-    flat, restore = jax.flatten_util.ravel_pytree([values[i] for i in optical])
+    flat, setup_at = problem.moving(values, geometric=False)
 
-    def total(flat):
-        moved = dict(zip(optical, restore(flat)))
-        here = put(scene, places, tuple(moved.get(i, v) for i, v in enumerate(values)))
-        return total_all(response, lidar, here, plan)
+    def total(flat: Array) -> Array:
+        return total_of(response, setup_at(flat))
 
-    if not optical:
+    if not flat.size:
         value = total(flat)
         return value, jnp.zeros((0, *value.shape), value.dtype)
     push = jax.vmap(lambda t: jax.jvp(total, (flat,), (t,)), out_axes=(None, 0))
@@ -73,8 +96,8 @@ def _colour(
 
 
 @eqx.filter_jit
-def _recorded(lidar, scene, plan, places, values, response, stderr) -> Waveform:
-    return waveform_of(response, lidar, put(scene, places, values), plan, stderr=stderr)
+def _recorded(problem: Problem, values: Values, response: Response, stderr: Array) -> Waveform:
+    return waveform_of(response, problem.at(values), stderr=stderr)
 
 
 @jax.jit
@@ -83,7 +106,7 @@ def _mean(responses: list[Any]) -> Any:
 
 
 def evaluate(
-    lidar: Lidar, scene: Scene, plan: Plan, places: tuple[Place, ...], values: Values, keys: Array
+    problem: Problem, values: Values, keys: Array
 ) -> tuple[
     Float[Array, "wavelengths bins"],
     Float[Array, "columns wavelengths bins"],
@@ -93,10 +116,9 @@ def evaluate(
 
     Pure, to be batched over scenes; `keys` has one random key for each batch of photons.
     """
-    common = (lidar, scene, plan, places, values)
-    responses, totals, columns = jax.lax.map(lambda key: _batch(*common, key), keys)
+    responses, totals, columns = jax.lax.map(lambda key: _batch(problem, values, key), keys)
     response = jax.tree.map(lambda a: jnp.mean(a, axis=0), responses)
-    total, more = _colour(*common, response)
+    total, more = _colour(problem, values, response)
     return total, jnp.concatenate([jnp.mean(columns, axis=0), more]), totals
 
 
@@ -111,7 +133,7 @@ class Evaluation(NamedTuple):
 
     total: np.ndarray
     jacobian: np.ndarray
-    response: Response | list[Response] | None
+    response: Response | None
     batches: np.ndarray | None
 
 
@@ -119,16 +141,15 @@ class Model:
     """The simulated waveform as a function of the unknowns. Traces as seldom as it can."""
 
     def __init__(self, lidar: Lidar, scene: Scene, plan: Plan, settled: Sequence[Settled], key: PRNGKeyArray):
-        self.lidar, self.scene, self.plan = lidar, scene, plan
-        self.places = tuple(s.place for s in settled)
+        self.problem = Problem(lidar, scene, plan, tuple(s.place for s in settled))
         self.shapes = [s.start.shape for s in settled]
         self.dtypes = [s.start.dtype for s in settled]
         self.sizes = [s.start.size for s in settled]
         self.keys = [jax.random.fold_in(key, n) for n in range(MIN_BATCHES if plan.is_random else 1)]
-        self.traces = any(p.geometric for p in self.places)
+        self.traces = any(p.geometric for p in self.problem.places)
         self._kept: tuple[Any, list[Any]] | None = None
         owner = np.repeat(np.arange(len(self.sizes)), self.sizes)
-        geometric = np.array([p.geometric for p in self.places], bool)[owner]
+        geometric = np.array([p.geometric for p in self.problem.places], bool)[owner]
         self.order = np.argsort(np.concatenate([np.flatnonzero(geometric), np.flatnonzero(~geometric)]))
 
     def values(self, flat: Float[np.ndarray, " columns"]) -> Values:
@@ -138,12 +159,11 @@ class Model:
 
     def scene_at(self, flat: Float[np.ndarray, " columns"]) -> Scene:
         """The scene with these values."""
-        return put(self.scene, self.places, self.values(flat))
+        return put(self.problem.scene, self.problem.places, self.values(flat))
 
     def __call__(self, flat: Float[np.ndarray, " columns"], *, spread: bool = False) -> Evaluation:
         """Simulate. `spread`: give the batches one by one as well."""
         values = self.values(flat)
-        common = (self.lidar, self.scene, self.plan, self.places, values)
         batches, columns = None, None
         if self.traces or self._kept is None:
             traced = self._trace(values)
@@ -156,15 +176,17 @@ class Model:
         else:
             response, responses = self._kept
             if spread:
-                batches = np.stack([np.asarray(_colour(*common, r)[0], float) for r in responses])
-        total, more = _colour(*common, response)
+                batches = np.stack(
+                    [np.asarray(_colour(self.problem, values, r)[0], float) for r in responses]
+                )
+        total, more = _colour(self.problem, values, response)
         more = np.asarray(more, float)
         columns = np.concatenate([more[:0] if columns is None else columns, more])[self.order]
         return Evaluation(np.asarray(total, float), np.moveaxis(columns, 0, -1), response, batches)
 
     def _trace(self, values: Values) -> list[Any]:
         def one(key):
-            return _compiled_batch(self.lidar, self.scene, self.plan, self.places, values, key)
+            return _compiled_batch(self.problem, values, key)
 
         with side_by_side() as run:
             return list(run(one, self.keys))
@@ -173,15 +195,9 @@ class Model:
         self, flat: Float[np.ndarray, " columns"], evaluation: Evaluation, stderr: np.ndarray
     ) -> Waveform:
         """The evaluation as a waveform."""
-        return _recorded(
-            self.lidar,
-            self.scene,
-            self.plan,
-            self.places,
-            self.values(flat),
-            evaluation.response,
-            jnp.asarray(stderr, self.dtypes[0]),
-        )
+        assert evaluation.response is not None
+        error = jnp.asarray(stderr, self.dtypes[0])
+        return _recorded(self.problem, self.values(flat), evaluation.response, error)
 
 
 def spread_of(batches: np.ndarray | None) -> np.ndarray | float:

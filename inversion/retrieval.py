@@ -12,7 +12,7 @@ from jaxtyping import Array, ArrayLike, PRNGKeyArray
 
 from jaxlidar import Lidar, Plan, Scene, Waveform
 from jaxlidar.extend import check_range
-from jaxlidar.simulate import MIN_BATCHES
+from jaxlidar.planning.plan import MIN_BATCHES
 
 from .data import Data, data_of
 from .fit import Fit, Outcome, best_of, drive, labels_of, named

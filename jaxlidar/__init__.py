@@ -15,15 +15,16 @@ from jaxlidar.instrument.pulse import (
 )
 from jaxlidar.instrument.receiver import Receiver, first_return_window, record
 from jaxlidar.optics.coefficients import load_coefficients
-from jaxlidar.optics.laws import AbstractLaw, EqualAngle, Lambertian, Specular
+from jaxlidar.optics.laws import AbstractLaw, AbstractMirror, EqualAngle, Lambertian, Specular
 from jaxlidar.optics.leaf import LeafOptics
 from jaxlidar.optics.leaf_angles import LeafAngles
-from jaxlidar.optics.phase import Isotropic
+from jaxlidar.optics.phase import AbstractPhase, HenyeyGreenstein, Isotropic
 from jaxlidar.optics.plate_model import plate_model
 from jaxlidar.optics.prospect import Prospect, prospect_jacobian, prospect_spectra
 from jaxlidar.optics.spectra import Spectrum, read_spectrum_csv, spectra, spectrum
 from jaxlidar.planning.effects import Effect
 from jaxlidar.planning.plan import Plan, plan
+from jaxlidar.planning.setup import Setup, reduce
 from jaxlidar.plants.forest import forest
 from jaxlidar.plants.habits import Branching, Habit, broadleaf, conifer, grow, shrub, spreading
 from jaxlidar.plants.lsystem import LSystem, Module, Rule, Word
@@ -31,16 +32,25 @@ from jaxlidar.plants.tree import Tree
 from jaxlidar.plants.turtle import turtle
 from jaxlidar.plants.voxelise import crop, voxelise, voxelise_points
 from jaxlidar.scenes.atmosphere import Atmosphere
-from jaxlidar.scenes.scene import Canopy, Ground, Plate, Scene
+from jaxlidar.scenes.canopy import Canopy
+from jaxlidar.scenes.scene import Scene
+from jaxlidar.scenes.shapes import AbstractShape, Plane
+from jaxlidar.scenes.surfaces import AbstractGround, AbstractSheet, AbstractSurface, Ground, Plate
 from jaxlidar.scenes.voxels import VoxelMap
 from jaxlidar.simulate import Progress, simulate
 from jaxlidar.trace.response import Response, trace_scene
-from jaxlidar.waveform import Waveform, waveform_of
+from jaxlidar.waveform import Waveform, total_of, waveform_of
 
 __all__ = [
     "SPEED_OF_LIGHT",
+    "AbstractGround",
     "AbstractLaw",
+    "AbstractMirror",
+    "AbstractPhase",
     "AbstractPulse",
+    "AbstractShape",
+    "AbstractSheet",
+    "AbstractSurface",
     "AnalogReturns",
     "Atmosphere",
     "Branching",
@@ -51,6 +61,7 @@ __all__ = [
     "GaussianPulse",
     "Ground",
     "Habit",
+    "HenyeyGreenstein",
     "Isotropic",
     "LSystem",
     "Lambertian",
@@ -59,6 +70,7 @@ __all__ = [
     "Lidar",
     "Module",
     "Plan",
+    "Plane",
     "Plate",
     "Progress",
     "Prospect",
@@ -68,6 +80,7 @@ __all__ = [
     "Rule",
     "SampledPulse",
     "Scene",
+    "Setup",
     "Specular",
     "Spectrum",
     "Tree",
@@ -89,11 +102,13 @@ __all__ = [
     "prospect_spectra",
     "read_spectrum_csv",
     "record",
+    "reduce",
     "shrub",
     "simulate",
     "spectra",
     "spectrum",
     "spreading",
+    "total_of",
     "trace_scene",
     "turtle",
     "voxelise",

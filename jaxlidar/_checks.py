@@ -17,6 +17,11 @@ def as_scalar(x: ArrayLike) -> Float[Array, ""]:
     return a.reshape(())
 
 
+def as_optional_scalar(x: ArrayLike | None) -> Float[Array, ""] | None:
+    """A floating-point JAX scalar, or None for None."""
+    return None if x is None else as_scalar(x)
+
+
 def as_array(x: ArrayLike | Sequence) -> Float[Array, "..."]:
     """A floating-point JAX array, in JAX's default precision (a JAX float array is kept as it is)."""
     if isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jnp.floating):
@@ -87,6 +92,16 @@ def check_range(
         right = ")" if high_open or high == np.inf else "]"
         bad = float(values[~ok].flat[0])
         raise ValueError(f"{field} = {bad:g} is outside the admissible range {left}{low:g}, {high:g}{right}")
+
+
+def check_integer(field: str, x: float, low: int = 1) -> int:
+    """A whole number of at least `low`, as an int.
+
+    **Raises:** `ValueError` naming `field`, the value and the admissible range.
+    """
+    if x != x or x in (np.inf, -np.inf) or x != int(x) or x < low:
+        raise ValueError(f"{field} = {x} is outside the admissible range [{low}, inf) of integers")
+    return int(x)
 
 
 def check_choice(field: str, x: str, choices: tuple[str, ...]) -> None:

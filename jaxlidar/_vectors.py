@@ -4,6 +4,7 @@ from collections.abc import Iterable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 Scalar = Float[Array, "..."]
@@ -78,7 +79,17 @@ def to_frame(axis: Vec, world: Vec) -> Vec:
     return dot(first, world), dot(second, world), dot(axis, world)
 
 
+def cross(a: Vec, b: Vec) -> Vec:
+    """Vector product."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
 def polar(cosine: Scalar, azimuth: Scalar) -> Vec:
     """Unit vector from the cosine of its polar angle and its azimuth in radians."""
     sine = jnp.sqrt(jnp.maximum(1.0 - cosine * cosine, 0.0))
     return sine * jnp.cos(azimuth), sine * jnp.sin(azimuth), cosine
+
+
+def about(normal: Vec, u: Scalar, v: Scalar) -> Vec:
+    """A direction drawn by the cosine law about `normal`, with two uniform numbers."""
+    return from_frame(normal, polar(jnp.sqrt(1.0 - u), 2 * np.pi * v))

@@ -10,20 +10,21 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from jaxlidar._checks import check_range
+from jaxlidar._checks import check_integer, check_range
 from jaxlidar._constants import SPEED_OF_LIGHT
-from jaxlidar._vectors import FAR, along, dot, vec
+from jaxlidar._vectors import FAR, along, dot
 from jaxlidar.instrument.lidar import Lidar
-from jaxlidar.planning.effects import without
 from jaxlidar.planning.plan import Plan
-from jaxlidar.scenes.scene import Scene, leaf_optics
+from jaxlidar.planning.setup import reduce
+from jaxlidar.scenes.scene import Scene
 from jaxlidar.trace.collisions import collide
-from jaxlidar.trace.flight import DIMENSIONS, events_of, fly, nearest, plates_ahead
+from jaxlidar.trace.flight import events_of, fly, nearest, plates_ahead
 from jaxlidar.trace.footprint import across_beam
-from jaxlidar.trace.histories import histories
-from jaxlidar.trace.photons import THROUGH, Photons, Setting
-from jaxlidar.trace.response import geometry_of
-from jaxlidar.waveform import is_straight, optics
+from jaxlidar.trace.higher_orders import from_the_beam
+from jaxlidar.trace.photons import THROUGH, Photons
+from jaxlidar.trace.random_numbers import Draw
+from jaxlidar.trace.setting import Setting, setting_of
+from jaxlidar.waveform import optics_of
 
 CHUNK = 512
 
@@ -65,9 +66,9 @@ def analog_returns(
     on their own cannot have; and for several wavelengths where leaves transmit straight on.
     """
     check_range("cone", cone, 0.0, 90.0, low_open=True)
-    check_range("n_photons", n_photons, 1)
+    check_integer("n_photons", n_photons)
     setting = _setting(lidar, scene, plan)
-    monomials = setting.table.monomials(optics(lidar, scene, plan))
+    monomials = setting.table.monomials(optics_of(reduce(lidar, scene, plan)))
     size = min(CHUNK, n_photons)
 
     def chunk(key: PRNGKeyArray) -> tuple[Array, Array]:
@@ -102,7 +103,7 @@ def photon_paths(
     For drawings. They start above the scene; a photon that has collided for the last time stays where it is
     then. Arguments and errors as for `analog_returns`.
     """
-    check_range("n_photons", n_photons, 1)
+    check_integer("n_photons", n_photons)
     setting = _setting(lidar, scene, plan)
     start_key, key = jax.random.split(key)
     start = _start(setting, n_photons, start_key)
@@ -127,49 +128,53 @@ class _Arrival(eqx.Module):
 
 
 def _setting(lidar: Lidar, scene: Scene, plan: Plan) -> Setting:
-    lidar, scene = without(lidar, scene, plan.off)
-    if scene.canopy is not None and scene.canopy.hotspot:
+    setup = reduce(lidar, scene, plan)
+    canopy = setup.scene.canopy
+    if canopy is not None and canopy.hotspot:
         raise ValueError("hotspot = True; admissible is False: the way back is independent of the way in")
-    transmittance = 0.0
-    if is_straight(scene):
-        assert scene.canopy is not None
-        if lidar.wavelength.size > 1:
-            raise ValueError(f"wavelength has {lidar.wavelength.size} values; 1 if transmission is straight")
-        transmittance = leaf_optics(scene.canopy, lidar.wavelength)[1][0]
-    beam, medium, surfaces = geometry_of(lidar, scene, transmittance)
-    table = histories(len(plan.trace.letters), plan.degree)
-    return Setting(beam, medium, surfaces, plan.trace, table, plan.bins)
+    if canopy is None or not canopy.is_straight:
+        return setting_of(setup)
+    if lidar.wavelength.size > 1:
+        raise ValueError(f"wavelength has {lidar.wavelength.size} values; 1 if transmission is straight")
+    return setting_of(setup, canopy.leaf_optics(lidar.wavelength)[1][0])
 
 
 def _start(setting: Setting, size: int, key: PRNGKeyArray) -> Photons:
     radius_key, turn_key = jax.random.split(key)
     share, turn = jax.random.uniform(radius_key, (size,)), jax.random.uniform(turn_key, (size,))
     point, w, excess = setting.beam.ray(across_beam(setting.beam, share, turn))
-    up = jnp.asarray(-setting.trace.upstream, excess.dtype)
+    up = jnp.asarray(-setting.plan.upstream, excess.dtype)
     none = jnp.zeros((size,), jnp.int32)
-    still = vec(jnp.zeros_like(excess) for _ in range(3))
     return Photons(
-        along(point, w, up), w, excess + up, jnp.ones_like(excess), none, none - 1, still, none == 0
+        along(point, w, up),
+        w,
+        excess + up,
+        jnp.ones_like(excess),
+        none,
+        none - 1,
+        from_the_beam(excess),
+        none == 0,
     )
 
 
 def _one_flight(setting: Setting, p: Photons, key: PRNGKeyArray, cone: float) -> tuple[Photons, _Arrival]:
     """Fly, arrive if that leads out of the scene to the sensor, else collide and scatter."""
-    beam, trace = setting.beam, setting.trace
+    beam, plan = setting.beam, setting.plan
     plates = sum(s.plate for s in setting.surfaces)
     tiny = jnp.finfo(p.weight.dtype).tiny
-    u = list(jax.random.uniform(key, (DIMENSIONS + plates, p.weight.size), p.weight.dtype, tiny))
-    met, outcomes, _ = plates_ahead(setting, p, u[DIMENSIONS:])
+    shape = (Draw.dimensions(plates, back=False), p.weight.size)
+    draw = Draw.of(list(jax.random.uniform(key, shape, p.weight.dtype, tiny)), plates)
+    met, outcomes, _ = plates_ahead(setting, p, draw.ahead)
     events = events_of(setting, met, outcomes)
     limit = nearest(p, events)
-    flights = fly(setting, p, limit, setting.budget(p), u[0][None])
+    flights = fly(setting, p, limit, setting.budget(p), draw.flight[None])
     flight = jax.tree.map(lambda a: a[0], flights)
     weight, letters = p.weight, p.history
     for i, (s, d, o) in enumerate(zip(setting.surfaces, met, outcomes)):
         if s.plate:
             through = p.alive & (o == THROUGH) & (d < FAR) & ((d < flight.distance) | ~flight.event)
-            letters = jnp.where(through, setting.grow(letters, trace.surfaces[i].transmitted), letters)
-            weight = jnp.where(through, weight / (1.0 - trace.lobe), weight)
+            letters = jnp.where(through, setting.grow(letters, plan.surfaces[i].transmitted), letters)
+            weight = jnp.where(through, weight / (1.0 - plan.lobe), weight)
 
     out = beam.excess(p.x)
     back = flight.escaped & (dot(p.w, beam.view(p.x)) > jnp.cos(jnp.deg2rad(cone)))
@@ -179,16 +184,18 @@ def _one_flight(setting: Setting, p: Photons, key: PRNGKeyArray, cone: float) ->
 
     event = flight.event
     flown = jnp.where(event, flight.distance, 0.0)
-    hit = collide(setting, p.w, flight.cell, flight.collided, flight.landed, events, limit, u)
+    x = along(p.x, p.w, flown)
+    landed = flight.landed_on(events, limit)
+    hit = collide(setting, x, p.w, flight.cell, flight.collided, landed, draw)
     letters = setting.grow(letters, hit.letter)
     onward = Photons(
-        along(p.x, p.w, flown),
+        x,
         hit.w,
         p.path + flown,
         jnp.where(event, weight * hit.ratio * hit.onward, 0.0),
         letters,
         hit.on,
-        hit.facing,
+        hit.sent,
         event,
     )
     return onward, arrived

@@ -1,6 +1,7 @@
 """From response to waveform: optics, atmosphere, pulse, sampling, energy."""
 
 import dataclasses
+from typing import final
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,14 +12,14 @@ from jaxtyping import Array, Float
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.instrument.receiver import first_return_window
-from jaxlidar.planning.effects import without
 from jaxlidar.planning.plan import Plan
-from jaxlidar.planning.scatterers import scene_optics
-from jaxlidar.scenes.scene import Scene
-from jaxlidar.trace.histories import histories
+from jaxlidar.planning.scatterers import letter_values
+from jaxlidar.planning.setup import Setup
+from jaxlidar.trace.histories import Histories, histories
 from jaxlidar.trace.response import Response
 
 
+@final
 class Waveform(eqx.Module):
     """A simulated waveform.
 
@@ -49,35 +50,21 @@ class Waveform(eqx.Module):
     info: dict = eqx.field(static=True)
 
 
-def optics(lidar: Lidar, scene: Scene, plan: Plan) -> Float[Array, "letters wavelengths"]:
+def optics_of(setup: Setup) -> Float[Array, "letters wavelengths"]:
     """Reflectance or transmittance of every letter of the plan."""
-    values: dict[str, Array] = {}
-    for o in scene_optics(lidar, scene):
-        values[f"{o.name}.R"] = o.reflectance
-        if o.transmittance is not None:
-            values[f"{o.name}.T"] = o.transmittance
-    rows = [values[letter] for letter in plan.trace.letters]
-    return jnp.stack(rows) if rows else jnp.zeros((0, lidar.wavelength.size))
-
-
-def is_straight(scene: Scene) -> bool:
-    """Whether leaves transmit straight on, so that every wavelength needs its own trace."""
-    return (
-        scene.canopy is not None and scene.canopy.leaf is not None and scene.canopy.transmission == "straight"
-    )
+    return letter_values(setup.lidar, setup.scene, setup.plan.trace.letters)
 
 
 def colour(
-    response: Response, optics: Float[Array, "letters wavelengths"], plan: Plan
-) -> tuple[Float[Array, "materials wavelengths bins"], Float[Array, "materials wavelengths bins"]]:
-    """Orders one, and two and above, by material of the last scattering: a matrix product each."""
-    letters = len(plan.trace.letters)
-    short = histories(letters, plan.first_degree).monomials(optics)
-    first = jnp.einsum("hw,mhb->mwb", short, response.first)
-    if response.higher is None:
-        return first, jnp.zeros_like(first)
-    full = histories(letters, plan.degree).monomials(optics)
-    return first, jnp.einsum("hw,mhb->mwb", full, response.higher)
+    weights: Float[Array, "traces *rest histories columns"],
+    table: Histories,
+    optics: Float[Array, "letters wavelengths"],
+) -> Float[Array, "*rest wavelengths columns"]:
+    """The sum over histories of their weights times their optics: a matrix product."""
+    if len(weights) == 1:
+        return jnp.einsum("hw,...hc->...wc", table.monomials(optics), weights[0])
+    # Each trace has one wavelength.
+    return jnp.einsum("hw,w...hc->...wc", table.monomials(optics), weights)
 
 
 def pulse_kernel(lidar: Lidar, plan: Plan) -> Float[Array, "fine samples"]:
@@ -104,37 +91,35 @@ def pulse_kernel(lidar: Lidar, plan: Plan) -> Float[Array, "fine samples"]:
     return lax.optimization_barrier(share)[index]
 
 
-def sample(
-    fine: Float[Array, "*s wavelengths bins"], lidar: Lidar, scene: Scene, plan: Plan
-) -> Float[Array, "*s wavelengths samples"]:
-    """Atmosphere, pulse and sampling: from fine bins to what the digitiser integrates."""
-    if scene.atmosphere is not None:
-        clear = _clear(lidar, scene, plan)
-        fine = fine * clear.reshape((1,) * (fine.ndim - 2) + clear.shape)
-    return jnp.einsum("...b,bs->...s", fine, pulse_kernel(lidar, plan))
+def _fine_heights(setup: Setup) -> Float[Array, "bins"]:
+    bins = setup.plan.bins
+    time = jnp.asarray(bins.start + bins.width * np.arange(bins.count))
+    return jnp.minimum(height_of(setup.lidar, time), 0.999 * setup.lidar.altitude)
 
 
-def _fine_heights(lidar: Lidar, plan: Plan) -> Float[Array, "bins"]:
-    time = jnp.asarray(plan.bins.start + plan.bins.width * np.arange(plan.bins.count))
-    return jnp.minimum(height_of(lidar, time), 0.999 * lidar.altitude)
+def _through_air(
+    fine: Float[Array, "*s wavelengths bins"], setup: Setup
+) -> Float[Array, "*s wavelengths bins"]:
+    """Returns in fine bins as the air between dims them."""
+    lidar, air = setup.lidar, setup.scene.atmosphere
+    assert air is not None
+    heights = _fine_heights(setup)
+    clear = air.two_way_transmittance(lidar.wavelength, heights, lidar.altitude, lidar.zenith)
+    return fine * clear.reshape((1,) * (fine.ndim - 2) + clear.shape)
 
 
-def _clear(lidar: Lidar, scene: Scene, plan: Plan) -> Float[Array, "wavelengths bins"]:
-    assert scene.atmosphere is not None
-    heights = _fine_heights(lidar, plan)
-    return scene.atmosphere.two_way_transmittance(lidar.wavelength, heights, lidar.altitude, lidar.zenith)
-
-
-def returns_air(scene: Scene) -> bool:
+def returns_air(setup: Setup) -> bool:
     """Whether the air's own return is simulated: where a lidar ratio is given."""
-    return scene.atmosphere is not None and scene.atmosphere.lidar_ratio is not None
+    air = setup.scene.atmosphere
+    return air is not None and air.lidar_ratio is not None
 
 
-def air(lidar: Lidar, scene: Scene, plan: Plan) -> Float[Array, "wavelengths samples"]:
+def air(setup: Setup) -> Float[Array, "wavelengths samples"]:
     """The air's own return, apparent reflectance per sample: single scattering above all of the scene."""
-    assert scene.atmosphere is not None
-    heights = _fine_heights(lidar, plan)
-    per_metre = scene.atmosphere.backscatter(lidar.wavelength, heights, lidar.altitude, lidar.zenith)
+    lidar, plan, atmosphere = setup.lidar, setup.plan, setup.scene.atmosphere
+    assert atmosphere is not None
+    heights = _fine_heights(setup)
+    per_metre = atmosphere.backscatter(lidar.wavelength, heights, lidar.altitude, lidar.zenith)
     top = jnp.asarray(plan.trace.upstream) * jnp.cos(jnp.deg2rad(lidar.zenith))
     length = 0.5 * SPEED_OF_LIGHT * plan.bins.width
     fine = jnp.where((heights > top)[None, :], per_metre * length, 0.0)
@@ -146,47 +131,50 @@ def height_of(lidar: Lidar, time: Float[Array, "bins"]) -> Float[Array, "bins"]:
     return -0.5 * SPEED_OF_LIGHT * time * jnp.cos(jnp.deg2rad(lidar.zenith))
 
 
-def total_of(
-    response: Response, lidar: Lidar, scene: Scene, plan: Plan
-) -> Float[Array, "wavelengths samples"]:
-    """Apparent reflectance per sample, all components together."""
-    lidar, scene = without(lidar, scene, plan.off)
+def _tables(plan: Plan) -> tuple[Histories, Histories]:
+    letters = len(plan.trace.letters)
+    return histories(letters, plan.first_degree), histories(letters, plan.degree)
+
+
+def total_of(response: Response, setup: Setup) -> Float[Array, "wavelengths samples"]:
+    """Apparent reflectance per sample, all components together.
+
+    **Arguments:** `response`: of `jaxlidar.trace_scene`. - `setup`: that it was traced with.
+    """
     # Sums over materials, and the pulse where no atmosphere lies between, come before the many wavelengths.
-    letters, values = len(plan.trace.letters), optics(lidar, scene, plan)
-    clear = scene.atmosphere is None
+    values, clear = optics_of(setup), setup.scene.atmosphere is None
+    kernel = pulse_kernel(setup.lidar, setup.plan)
     total = jnp.zeros(())
-    for degree, part in ((plan.first_degree, response.first), (plan.degree, response.higher)):
+    for table, part in zip(_tables(setup.plan), (response.first, response.higher)):
         if part is None:
             continue
-        part = jnp.sum(part, axis=0)
-        part = part @ pulse_kernel(lidar, plan) if clear else part
-        total = total + jnp.einsum("hw,hb->wb", histories(letters, degree).monomials(values), part)
-    total = total if clear else sample(total, lidar, scene, plan)
-    return total + air(lidar, scene, plan) if returns_air(scene) else total
+        part = jnp.sum(part, axis=1)
+        total = total + colour(part @ kernel if clear else part, table, values)
+    total = total if clear else jnp.einsum("wb,bs->ws", _through_air(total, setup), kernel)
+    return total + air(setup) if returns_air(setup) else total
 
 
-def ledger_of(
-    response: Response, optics: Float[Array, "letters wavelengths"], plan: Plan
-) -> dict[str, Float[Array, "wavelengths"]]:
+def ledger_of(response: Response, setup: Setup) -> dict[str, Float[Array, "wavelengths"]]:
     """Shares of the emitted energy. What a material absorbs is what arrived there less what left."""
-    letters = len(plan.trace.letters)
-    degree = plan.degree if response.higher is not None else plan.first_degree
-    monomials = histories(letters, degree).monomials(optics)
-    absorbed = (response.arrived - response.left) @ monomials
-    ledger = {f"absorbed by {name}": absorbed[i] for i, name in enumerate(plan.trace.materials)}
+    short, full = _tables(setup.plan)
+    table, values = short if response.higher is None else full, optics_of(setup)
+
+    def shares(weights: Array) -> Array:
+        return colour(weights[..., None], table, values)[..., 0]
+
+    absorbed = shares(response.arrived - response.left)
+    ledger = {f"absorbed by {name}": absorbed[i] for i, name in enumerate(setup.plan.trace.materials)}
     return {
-        "escaped": response.escaped @ monomials,
+        "escaped": shares(response.escaped),
         **ledger,
-        "after the window": response.late @ monomials,
-        "unfollowed": response.remaining @ monomials,
+        "after the window": shares(response.late),
+        "unfollowed": shares(response.remaining),
     }
 
 
 def waveform_of(
-    response: Response | list[Response],
-    lidar: Lidar,
-    scene: Scene,
-    plan: Plan,
+    response: Response,
+    setup: Setup,
     *,
     stderr: Float[Array, "wavelengths bins"] | None = None,
     info: dict | None = None,
@@ -195,38 +183,68 @@ def waveform_of(
 
     **Arguments:**
 
-    - `response`: as traced; a list with one for each wavelength where the canopy's transmission is straight.
+    - `response`: of `jaxlidar.trace_scene`, or the mean of several.
+    - `setup`: that it was traced with; its optics may differ.
     - `stderr`: standard error of the reflectance, from batches. Default zero.
+    - `info`: of the waveform. Default empty.
+
+    **Returns:** a `Waveform`. For an example see `jaxlidar.trace_scene`.
     """
-    lidar, scene = without(lidar, scene, plan.off)
-    letters = optics(lidar, scene, plan)
+    lidar, plan, values = setup.lidar, setup.plan, optics_of(setup)
+    names, kernel = plan.trace.materials, pulse_kernel(lidar, plan)
     # The pulse, and the sum over all time as one more sample, come before the many wavelengths if they can.
-    early = None if scene.atmosphere is not None else _pulse_and_sum(lidar, plan)
-    if isinstance(response, list):
-        response = [_seen_through(r, early) for r in response]
-        parts = [_coloured(r, letters[:, i : i + 1], plan) for i, r in enumerate(response)]
-        first = jnp.concatenate([f for f, _, _ in parts], axis=1)
-        higher = jnp.concatenate([h for _, h, _ in parts], axis=1)
-        ledger = {name: jnp.concatenate([part[name] for _, _, part in parts]) for name in parts[0][2]}
-    else:
-        first, higher, ledger = _coloured(_seen_through(response, early), letters, plan)
-    names = plan.trace.materials
+    clear = setup.scene.atmosphere is None
+    early = jnp.concatenate([kernel, jnp.ones((plan.bins.count, 1))], axis=1) if clear else None
+    orders = [
+        None if part is None else colour(part if early is None else part @ early, table, values)
+        for table, part in zip(_tables(plan), (response.first, response.higher))
+    ]
+    first, higher = orders
+    assert first is not None
+    higher = jnp.zeros_like(first) if higher is None else higher
     lines = jnp.concatenate([first + higher, jnp.sum(first, 0)[None], jnp.sum(higher, 0)[None]])
     if early is None:
-        sampled, whole = sample(lines, lidar, scene, plan), jnp.sum(lines[-2] + lines[-1], axis=-1)
+        sampled = jnp.einsum("...b,bs->...s", _through_air(lines, setup), kernel)
+        whole = jnp.sum(lines[-2] + lines[-1], axis=-1)
     else:
         sampled, whole = lines[..., :-1], lines[-2, :, -1] + lines[-1, :, -1]
     components = dict(zip([*names, "first", "higher"], sampled))
     total = sampled[-2] + sampled[-1]
-    if returns_air(scene):
-        components["air"] = air(lidar, scene, plan)
+    if returns_air(setup):
+        components["air"] = air(setup)
         components["first"] = components["first"] + components["air"]
         total = total + components["air"]
     time = jnp.asarray(plan.sample_start + plan.sample_interval * np.arange(plan.n_samples))
+    ledger, neglected = _balance(ledger_of(response, setup), whole, setup)
+    return Waveform(
+        time=time,
+        height=height_of(lidar, time),
+        reflectance=total,
+        energy=total * _received(lidar, time),
+        stderr=jnp.zeros_like(total) if stderr is None else stderr,
+        components=components,
+        neglected=neglected,
+        ledger=ledger,
+        wavelength=lidar.wavelength,
+        info=info or {},
+    )
+
+
+def _received(lidar: Lidar, time: Float[Array, "bins"]) -> Float[Array, "wavelengths bins"]:
+    """J per apparent reflectance, E_t eta A_r / (pi R^2): a Lambertian target that fills the footprint."""
     slant = lidar.range_to_reference + 0.5 * SPEED_OF_LIGHT * time
-    # E_t * eta * A_r / (pi R^2): the lidar equation of a Lambertian target that fills the footprint.
-    received = lidar.aperture_area / (jnp.pi * jnp.maximum(slant, 1e-3) ** 2)
-    gain = jnp.outer(lidar.energy_per_wavelength * lidar.efficiency_per_wavelength, received)
+    share = lidar.aperture_area / (jnp.pi * jnp.maximum(slant, 1e-3) ** 2)
+    return jnp.outer(lidar.energy_per_wavelength * lidar.efficiency_per_wavelength, share)
+
+
+def _balance(
+    ledger: dict[str, Float[Array, "wavelengths"]], whole: Float[Array, "wavelengths"], setup: Setup
+) -> tuple[dict[str, Float[Array, "wavelengths"]], Float[Array, "wavelengths"]]:
+    """The ledger with what returns into the aperture, and what neglected orders could still return.
+
+    `whole`: apparent reflectance summed over all time.
+    """
+    lidar, plan = setup.lidar, setup.plan
     returned = whole * lidar.aperture_area / (jnp.pi * lidar.range_to_reference**2)
     # What returns is part of what escaped, or, where only one order was followed, would have.
     source = "unfollowed" if plan.orders == 1 and len(plan.trace.materials) > 1 else "escaped"
@@ -234,18 +252,7 @@ def waveform_of(
     full = {"returned": reach, **ledger, source: ledger[source] - reach}
     per_energy = whole / jnp.maximum(full["escaped"], 1e-6)
     unfollowed = full["unfollowed"] if plan.orders > 1 else jnp.zeros_like(full["unfollowed"])
-    return Waveform(
-        time=time,
-        height=height_of(lidar, time),
-        reflectance=total,
-        energy=total * gain,
-        stderr=jnp.zeros_like(total) if stderr is None else stderr,
-        components=components,
-        neglected=unfollowed * jnp.clip(per_energy, 1.0, 4.0),
-        ledger=full,
-        wavelength=lidar.wavelength,
-        info=info or {},
-    )
+    return full, unfollowed * jnp.clip(per_energy, 1.0, 4.0)
 
 
 def open_at_first_return(wave: Waveform, lidar: Lidar) -> Waveform:
@@ -272,21 +279,3 @@ def open_at_first_return(wave: Waveform, lidar: Lidar) -> Waveform:
         stderr=rows[2],
         components=dict(zip(wave.components, rows[3:])),
     )
-
-
-def _pulse_and_sum(lidar: Lidar, plan: Plan) -> Float[Array, "fine columns"]:
-    return jnp.concatenate([pulse_kernel(lidar, plan), jnp.ones((plan.bins.count, 1))], axis=1)
-
-
-def _seen_through(response: Response, matrix: Float[Array, "fine columns"] | None) -> Response:
-    """The response with its fine bins turned into columns of `matrix`; as it is with None."""
-    if matrix is None:
-        return response
-    higher = None if response.higher is None else response.higher @ matrix
-    return dataclasses.replace(response, first=response.first @ matrix, higher=higher)
-
-
-def _coloured(
-    response: Response, letters: Float[Array, "letters wavelengths"], plan: Plan
-) -> tuple[Array, Array, dict[str, Array]]:
-    return (*colour(response, letters, plan), ledger_of(response, letters, plan))

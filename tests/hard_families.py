@@ -17,7 +17,6 @@ import numpy as np
 from helpers import WHOLE, whole_lidar
 
 import jaxlidar as jl
-from jaxlidar.simulate import total_all
 
 KEY = jax.random.key(24)
 DOUBLE, BOTH = ("float64",), ("float32", "float64")
@@ -46,25 +45,25 @@ def simulation(build, usual, outputs, **settings):
     plan = jl.plan(*build({k: jnp.asarray(v, float) for k, v in widest.items()}), **settings)
 
     def measure(p):
-        lidar, scene = build(p)
-        return outputs(lidar, scene, plan, jl.trace_scene(lidar, scene, plan, KEY))
+        setup = jl.reduce(*build(p), plan)
+        return outputs(setup, jl.trace_scene(setup, KEY))
 
     return measure
 
 
-def samples(lidar, scene, plan, response):
-    return total_all(response, lidar, scene, plan)[0]
+def samples(setup, response):
+    return jl.total_of(response, setup)[0]
 
 
-def summed(lidar, scene, plan, response):
-    return jnp.sum(samples(lidar, scene, plan, response))[None]
+def summed(setup, response):
+    return jnp.sum(samples(setup, response))[None]
 
 
 def parts(*names):
     """Sums of components, or of all shares of energy."""
 
-    def outputs(lidar, scene, plan, response):
-        wave = jl.waveform_of(response, lidar, scene, plan)
+    def outputs(setup, response):
+        wave = jl.waveform_of(response, setup)
         absorbed = [v[0] for k, v in wave.ledger.items() if k.startswith("absorbed")]
         sums = {
             "shares": sum(wave.ledger.values())[0],

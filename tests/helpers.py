@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import Array, PRNGKeyArray
 
 import jaxlidar as jl
-from jaxlidar.simulate import trace_all
 
 # One sample of 1000 ns centred on 400 ns takes in everything that arrives from -100 to 900 ns.
 WHOLE = {"window": (400.0, 401.0), "bin_width": 2.0}
@@ -53,8 +52,8 @@ def agrees(value: Any, stderr: Any, expected: Any, *, bound: Any = 0.0, sigmas: 
 
 @eqx.filter_jit
 def _wave(lidar: jl.Lidar, scene: jl.Scene, plan: jl.Plan, key: PRNGKeyArray, quantity: Callable) -> Any:
-    response = trace_all(lidar, scene, plan, key)
-    return quantity(jl.waveform_of(response, lidar, scene, plan))
+    setup = jl.reduce(lidar, scene, plan)
+    return quantity(jl.waveform_of(jl.trace_scene(setup, key), setup))
 
 
 def _itself(wave: jl.Waveform) -> jl.Waveform:

@@ -8,6 +8,7 @@ import pytest
 from helpers import WHOLE, agrees, batch_mean, slab, whole_lidar
 
 import jaxlidar as jl
+from jaxlidar.planning.alternatives import with_alternatives
 from jaxlidar.planning.trace_plan import Bins
 from jaxlidar.trace.deposit import instant_row
 
@@ -30,7 +31,7 @@ def samples(wave):
 
 
 def mean_of(scene, orders, seed, **choice):
-    plan = jl.plan(LIDAR, scene, max_orders=orders, **SIZES, **choice)
+    plan = with_alternatives(jl.plan(LIDAR, scene, max_orders=orders, **SIZES), **choice)
     return batch_mean(LIDAR, scene, plan, seed=seed, count=24, quantity=samples)
 
 
@@ -107,9 +108,8 @@ def test_moments_of_kernels(kernel, kept):
 
 @pytest.mark.parametrize("kernel", [1, 2])
 def test_plain_kernels_sum_to_the_same(kernel):
-    plans = [
-        jl.plan(LIDAR, SCENE, max_orders=1, footprint="fixed", kernel=k, n_rays=256) for k in (3, kernel)
-    ]
+    plan = jl.plan(LIDAR, SCENE, max_orders=1, footprint="fixed", n_rays=256)
+    plans = [with_alternatives(plan, kernel=k) for k in (3, kernel)]
     sums = [batch_mean(LIDAR, SCENE, plan, seed=0, count=2, quantity=samples)[0].sum() for plan in plans]
     assert sums[1] == pytest.approx(sums[0], rel=1e-3)
 
@@ -126,7 +126,7 @@ BAD = {
 def test_bad_choices_are_refused(case):
     choice, message = BAD[case]
     with pytest.raises(ValueError, match=message):
-        jl.plan(LIDAR, SCENE, **choice)
+        with_alternatives(jl.plan(LIDAR, SCENE), **choice)
 
 
 def test_mirrors_and_hot_spots_cannot_be_drawn():
@@ -134,4 +134,4 @@ def test_mirrors_and_hot_spots_cannot_be_drawn():
     hot = jl.Scene(canopy=jl.Canopy(slab(0.8), leaf=jl.Isotropic(albedo=0.5), hotspot=True))
     for scene in (mirror, hot):
         with pytest.raises(ValueError, match="admissible with a mirror or a hot spot is 'expected'"):
-            jl.plan(LIDAR, scene, first_order="drawn")
+            with_alternatives(jl.plan(LIDAR, scene), first_order="drawn")

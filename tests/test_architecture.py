@@ -38,16 +38,20 @@ HELPERS = {path.stem for path in (ROOT / "jaxlidar").glob("_*.py")} - {"__init__
 ORDER = {
     "optics": ["coefficients", "plate_model", "spectra", "prospect"],
     "instrument": ["pulse", "receiver", "lidar"],
-    "scenes": ["voxels", "atmosphere", "scene"],
+    "scenes": ["voxels", "atmosphere", "shapes", "surfaces", "canopy", "scene"],
     "plants": ["lsystem", "tree", "turtle", "habits", "voxelise", "forest", "demo"],
     "planning": [
         "trace_plan",
         "path_lengths",
         "scatterers",
         "effects",
+        "backscatter",
         "bounds",
         "effect_table",
         "plan",
+        "alternatives",
+        "plan_check",
+        "setup",
     ],
     "trace": [
         "histories",
@@ -57,6 +61,7 @@ ORDER = {
         "random_numbers",
         "march",
         "photons",
+        "setting",
         "collisions",
         "flight",
         "reparametrise",
@@ -138,6 +143,9 @@ def test_no_name_hides_its_module():
                 continue
             importlib.import_module(name)
             assert isinstance(getattr(sys.modules[room], own), types.ModuleType), name
+    module = sys.modules["jaxlidar.simulate"]
+    public = {n for n, v in vars(module).items() if getattr(v, "__module__", "") == module.__name__}
+    assert {n for n in public if not n.startswith("_")} <= set(jaxlidar.__all__)
 
 
 def test_the_core_neither_plots_nor_prints():

@@ -78,5 +78,6 @@ def test_small_deposits_on_large_sums():
     lidar, what = jl.Lidar(divergence=2.0), scene()
     plan = jl.plan(lidar, what, max_orders=3, n_photons=300_000, n_rays=512)
     key = jax.random.key(0)
-    wave = jax.jit(lambda k: jl.waveform_of(jl.trace_scene(lidar, what, plan, k), lidar, what, plan))(key)
+    setup = jl.reduce(lidar, what, plan)
+    wave = jax.jit(lambda k: jl.waveform_of(jl.trace_scene(setup, k), setup))(key)
     np.testing.assert_allclose(sum(wave.ledger.values()), 1.0, atol=2e-4)

@@ -24,7 +24,8 @@ def evaluate(lidar, scene, plan, key, mode):
 
     def simulated(numbers):
         beam, target = eqx.combine(numbers, rest)
-        wave = jl.waveform_of(jl.trace_scene(beam, target, plan, key), beam, target, plan)
+        setup = jl.reduce(beam, target, plan)
+        wave = jl.waveform_of(jl.trace_scene(setup, key), setup)
         other = (wave.components, wave.neglected, wave.ledger, wave.time, wave.height)
         return (wave.reflectance, wave.energy / 1e-12), other
 

@@ -14,7 +14,6 @@ import pytest
 from scipy.stats import norm
 
 import jaxlidar as jl
-from jaxlidar.simulate import total_all, trace_all
 
 KEYS = 12
 RANDOM = np.random.default_rng(5)
@@ -81,7 +80,8 @@ def estimates(request):
 
     def measure(p, key):
         scene = build(p)
-        return total_all(trace_all(lidar, scene, plan, key), lidar, scene, plan)[0] @ moments
+        setup = jl.reduce(lidar, scene, plan)
+        return jl.total_of(jl.trace_scene(setup, key), setup)[0] @ moments
 
     value, jacobian = jax.jit(measure), jax.jit(jax.jacfwd(measure))
     keys = jax.random.split(jax.random.key(11), KEYS)
@@ -141,7 +141,8 @@ def test_forward_and_reverse_agree():
 
     def measure(p):
         scene = build(p)
-        return jnp.sum(total_all(trace_all(lidar, scene, plan, key), lidar, scene, plan) ** 2)
+        setup = jl.reduce(lidar, scene, plan)
+        return jnp.sum(jl.total_of(jl.trace_scene(setup, key), setup) ** 2)
 
     gradient = eqx.filter_jit(jax.grad(measure))(start)
     tangent = {name: jnp.asarray(0.5 + 0.1 * i) for i, name in enumerate(start)}

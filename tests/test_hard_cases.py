@@ -148,9 +148,8 @@ def test_a_batch_of_ten_million_photons():
     """Each carries a ten-millionth, less than single precision tells apart at one half."""
     lidar, scene = whole_lidar(), over_ground(jl.LeafOptics(reflectance=0.0, transmittance=0.0))
     plan = jl.plan(lidar, scene, max_orders=2, n_photons=10_000_000, n_rays=64, **WHOLE)
-    wave = jax.jit(lambda key: jl.waveform_of(jl.trace_scene(lidar, scene, plan, key), lidar, scene, plan))(
-        KEY
-    )
+    setup = jl.reduce(lidar, scene, plan)
+    wave = jax.jit(lambda key: jl.waveform_of(jl.trace_scene(setup, key), setup))(KEY)
     np.testing.assert_allclose(sum(wave.ledger.values()), 1.0, atol=2e-4)
     # A slab of optical depth 0.9; ground of reflectance 0.4.
     passed = np.exp(-0.9)

@@ -73,18 +73,23 @@ def alike(found, wanted, rtol=1e-4):
     np.testing.assert_allclose(found, wanted, rtol=0, atol=rtol * peak)
 
 
+def traced(lidar, scene, plan, key):
+    setup = jl.reduce(lidar, scene, plan)
+    return jl.waveform_of(jl.trace_scene(setup, key), setup).reflectance
+
+
 @pytest.mark.slow
 def test_chunks_do_not_matter(plain, monkeypatch):
     plan, wave = plain
-    for name, size in (("higher", 96), ("first", 100)):
+    for name, size in (("higher_orders", 96), ("first_order", 100)):
         monkeypatch.setattr(sys.modules[f"jaxlidar.trace.{name}"], "CHUNK", size)
     # Two functions, so that each is compiled with its own sizes.
-    again = eqx.filter_jit(lambda *a: jl.waveform_of(jl.trace_scene(*a), *a[:3]).reflectance)
+    again = eqx.filter_jit(lambda *given: traced(*given))
     lidar, scene = build()
     key = jax.random.fold_in(KEY, 0)
     small = again(lidar, scene, plan, key)
     monkeypatch.undo()
-    whole = eqx.filter_jit(lambda *a: jl.waveform_of(jl.trace_scene(*a), *a[:3]).reflectance)
+    whole = eqx.filter_jit(lambda *given: traced(*given))
     alike(small, whole(lidar, scene, plan, key), 1e-5)
     assert float(np.max(wave.components["higher"])) > 0.01 * float(np.max(wave.reflectance))
 

@@ -26,7 +26,7 @@ def traced(lidar, scene, plan):
     """The trace as text, as it is compiled; the lidar's arrays are in it as far as they are used."""
 
     def run(scene, key):
-        return jl.trace_scene(lidar, scene, plan, key)
+        return jl.trace_scene(jl.reduce(lidar, scene, plan), key)
 
     return str(eqx.filter_make_jaxpr(run)(scene, jax.random.key(0))[0])
 
@@ -55,7 +55,8 @@ def test_ground_alone_with_all_that_a_lidar_may_have_has_no_loop_either():
     plan = planned(lidar, scene)
 
     def run(lidar, scene, key):
-        return jl.waveform_of(jl.trace_scene(lidar, scene, plan, key), lidar, scene, plan).reflectance
+        setup = jl.reduce(lidar, scene, plan)
+        return jl.waveform_of(jl.trace_scene(setup, key), setup).reflectance
 
     text = str(eqx.filter_make_jaxpr(run)(lidar, scene, jax.random.key(0))[0])
     assert not any(word in text for word in LOOPS + RANDOM)
@@ -89,10 +90,9 @@ def test_what_is_not_there_has_no_letter():
     assert plans[1].trace.letters == plans[2].trace.letters == ("leaf.R", "leaf.T", "ground.R")
     assert traced(jl.Lidar(), bare, plans[1]) == traced(jl.Lidar(), bare, plans[2])
     weights = jax.eval_shape(
-        lambda key: jl.trace_scene(jl.Lidar(), with_bark, plans[2], key), jax.random.key(0)
+        lambda key: jl.trace_scene(jl.reduce(jl.Lidar(), with_bark, plans[2]), key), jax.random.key(0)
     )
-    assert weights.first.shape[0] == 2
-    assert weights.first.shape[1] == 4
+    assert weights.first.shape[:3] == (1, 2, 4)
 
 
 @pytest.mark.parametrize("canopy", [None, TREES])

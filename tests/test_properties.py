@@ -109,7 +109,8 @@ def compiled(precision):
 
     def simulated(p):
         lidar, scene = build(p)
-        return jl.waveform_of(jl.trace_scene(lidar, scene, plan, KEY), lidar, scene, plan)
+        setup = jl.reduce(lidar, scene, plan)
+        return jl.waveform_of(jl.trace_scene(setup, KEY), setup)
 
     return jax.jit(simulated, compiler_options={"xla_backend_optimization_level": 0})
 

@@ -16,7 +16,7 @@ from inversion.model import Model
 from inversion.planning import corners, plan_for
 from inversion.uncertainty import errors_of
 from inversion.unknowns import inside, optical_leaves, outside, settle
-from jaxlidar.simulate import MIN_BATCHES, total_all, trace_all
+from jaxlidar.planning.plan import MIN_BATCHES
 
 LIDAR = jl.Lidar(
     wavelength=(532.0, 1064.0, 1550.0), altitude=500.0, divergence=8.0, pulse=jl.GaussianPulse(fwhm=4.0)
@@ -111,8 +111,8 @@ def test_canopy_and_ground_at_three_wavelengths(target, monkeypatch):
     def traced(*args):
         raise AssertionError("the trace was compiled again")
 
-    monkeypatch.setattr("inversion.model.trace_all", traced)
-    monkeypatch.setattr("inversion.model.total_all", traced)
+    monkeypatch.setattr("inversion.model.trace_scene", traced)
+    monkeypatch.setattr("inversion.model.total_of", traced)
     fresh = [dataclasses.replace(u) for u in UNKNOWNS]
     again = retrieve_canopy(target, 1, start_scene(Cab=50.0), fresh)
     assert_recovered(again, TRUTH)
@@ -174,7 +174,8 @@ def test_jacobian_is_that_of_the_simulation():
                 leaf_area(scene, area),
                 (Cab, Cw, height, jnp.stack([first, second])),
             )
-            return total_all(trace_all(lidar, here, plan, jax.random.key(0)), lidar, here, plan)
+            setup = jl.reduce(lidar, here, plan)
+            return jl.total_of(jl.trace_scene(setup, jax.random.key(0)), setup)
 
         for i in range(at.size):
             step = 1e-4 * at[i] * np.eye(at.size)[i]

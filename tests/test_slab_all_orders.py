@@ -57,21 +57,16 @@ def test_isotropic_scattering(shared, tau):
     assert value == pytest.approx(exact, rel=5e-3)
 
 
-def ross_brf(reflectance, transmittance, tau, ground, streams=48):
-    """Discrete ordinates with the normalised phase function 8 Gamma / (R + T) of spherical leaves."""
+def discrete_ordinates(moments, albedo, tau, ground):
+    """Bidirectional reflectance factor, straight down and up, for a phase function's Legendre moments."""
     from PythonicDISORT import pydisort, subroutines
 
-    x, weight = np.polynomial.legendre.leggauss(400)
-    angle = np.arccos(x)
-    gamma = (reflectance + transmittance) / (3 * np.pi) * (np.sin(angle) - angle * x) + transmittance / 3 * x
-    phase = 8 * gamma / (reflectance + transmittance)
-    basis = np.polynomial.legendre.Legendre.basis
-    moments = [0.5 * np.sum(weight * phase * basis(order)(x)) for order in range(streams)]
+    streams = len(moments)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         out = pydisort(
             np.array([tau]),
-            np.array([reflectance + transmittance]),
+            np.array([albedo]),
             streams,
             np.array([moments]),
             1.0,
@@ -82,6 +77,30 @@ def ross_brf(reflectance, transmittance, tau, ground, streams=48):
             NLeg=streams,
         )
         return float(np.pi * subroutines.interpolate(out[3])(1.0, 0.0))
+
+
+def ross_brf(reflectance, transmittance, tau, ground, streams=48):
+    """With the normalised phase function 8 Gamma / (R + T) of spherical leaves."""
+    x, weight = np.polynomial.legendre.leggauss(400)
+    angle = np.arccos(x)
+    gamma = (reflectance + transmittance) / (3 * np.pi) * (np.sin(angle) - angle * x) + transmittance / 3 * x
+    phase = 8 * gamma / (reflectance + transmittance)
+    basis = np.polynomial.legendre.Legendre.basis
+    moments = [0.5 * np.sum(weight * phase * basis(order)(x)) for order in range(streams)]
+    return discrete_ordinates(moments, reflectance + transmittance, tau, ground)
+
+
+@pytest.mark.parametrize("g", [0.5, pytest.param(-0.3, marks=pytest.mark.slow)])
+def test_henyey_greenstein_scattering(g):
+    value, stderr, neglected = total(1.0, jl.HenyeyGreenstein(albedo=0.9, g=g), 0.2, 20, 1 << 17, seed=5)
+    moments = g ** np.arange(64)
+    exact = discrete_ordinates(moments, 0.9, 1.0, 0.2)
+    bound = 3 * np.hypot(stderr, 5e-5)
+    assert -bound - neglected < value - exact < bound
+    assert value == pytest.approx(exact, rel=5e-3)
+    # The same test rejects isotropic scattering, and a lobe the other way.
+    for wrong in (0.0, -g):
+        assert abs(value - discrete_ordinates(wrong ** np.arange(64), 0.9, 1.0, 0.2)) > 5 * bound
 
 
 @pytest.mark.parametrize(

@@ -24,11 +24,13 @@ import numpy as np
 from _common import machine, options, plt, print_table, save_figure, write_json
 
 import jaxlidar as jl
-from jaxlidar.simulate import total_all, trace_all
+from jaxlidar.planning.alternatives import with_alternatives
 from jaxlidar.waveform import pulse_kernel
 
 LIDAR = jl.Lidar(wavelength=1064.0, divergence=5.0)
 CONE = 10.0
+# Settings that change the estimator, not the plan.
+ALTERNATIVES = ("first_order", "points", "kernel", "ends")
 TARGETS = (0.1, 0.01, 0.001)
 LEAF = jl.LeafOptics(reflectance=0.45, transmittance=0.45)
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
@@ -45,7 +47,9 @@ class Case:
 
     def plan(self, **settings) -> jl.Plan:
         """By default all orders, and the other settings as `jaxlidar.plan` chooses them."""
-        return jl.plan(LIDAR, self.scene, **({"max_orders": self.orders, "window": self.window} | settings))
+        other = {name: settings.pop(name) for name in ALTERNATIVES if name in settings}
+        usual = {"max_orders": self.orders, "window": self.window}
+        return with_alternatives(jl.plan(LIDAR, self.scene, **(usual | settings)), **other)
 
 
 def tree_scene(voxel_size: float) -> jl.Scene:
@@ -93,7 +97,8 @@ def run(case: Case, batches: int, plan: jl.Plan, seed: int = 0, x64: bool = Fals
         scene = case.scene if not x64 else jax.tree.map(lambda a: a.astype(float), case.scene)
 
         def batch(scene, key):
-            return total_all(trace_all(LIDAR, scene, plan, key), LIDAR, scene, plan)[0]
+            setup = jl.reduce(LIDAR, scene, plan)
+            return jl.total_of(jl.trace_scene(setup, key), setup)[0]
 
         keys = [jax.random.key(seed + i) for i in range(batches if plan.is_random else 5)]
         begun = time.perf_counter()

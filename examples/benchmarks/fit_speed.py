@@ -23,7 +23,7 @@ from retrieval_coverage import LIDAR, NOISE, RANGES, plan_of, scene_of, unknowns
 import inversion
 import jaxlidar as jl
 from inversion.unknowns import put, settle
-from jaxlidar.simulate import MIN_BATCHES, total_all, trace_all
+from jaxlidar.planning.plan import MIN_BATCHES
 
 OPTICAL = ("Cab", "Cw", "N", "ground brightness")
 
@@ -112,8 +112,8 @@ def main() -> None:
 
 @eqx.filter_jit
 def _simulated(scene, plan, places, values, key):
-    here = put(scene, places, values)
-    return total_all(trace_all(LIDAR, here, plan, key), LIDAR, here, plan)
+    setup = jl.reduce(LIDAR, put(scene, places, values), plan)
+    return jl.total_of(jl.trace_scene(setup, key), setup)
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ import numpy as np
 from _common import best, machine, new_figure, options, print_table, race, save_figure, write_json
 
 import jaxlidar as jl
-from jaxlidar.simulate import MIN_BATCHES, total_all, trace_all
+from jaxlidar.planning.plan import MIN_BATCHES
 
 N, SIZE, ORDERS = 32, 10.0, 10
 OPTICAL = ("Cab", "Cw", "N", "ground reflectance")
@@ -57,10 +57,10 @@ def main() -> None:
     )
 
     def response(geometric, optical, key):
-        return trace_all(lidar, scene_at(optical, geometric, extinction), plan, key)
+        return jl.trace_scene(jl.reduce(lidar, scene_at(optical, geometric, extinction), plan), key)
 
     def colour(response, optical, geometric):
-        return total_all(response, lidar, scene_at(optical, geometric, extinction), plan)
+        return jl.total_of(response, jl.reduce(lidar, scene_at(optical, geometric, extinction), plan))
 
     def simulate(optical, geometric, key):
         return colour(response(geometric, optical, key), optical, geometric)

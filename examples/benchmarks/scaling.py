@@ -17,7 +17,6 @@ from _common import machine, new_figure, options, print_table, save_figure, seco
 from simulation_cost import LIDAR, SIZE, WINDOW
 
 import jaxlidar as jl
-from jaxlidar.simulate import total_all, trace_all
 
 ORDERS = 4
 
@@ -43,7 +42,8 @@ def cost(scene: jl.Scene, photons: int, rays: int) -> tuple[float, int, float]:
     )
 
     def batch(scene, key):
-        return total_all(trace_all(LIDAR, scene, plan, key), LIDAR, scene, plan)
+        setup = jl.reduce(LIDAR, scene, plan)
+        return jl.total_of(jl.trace_scene(setup, key), setup)
 
     key = jax.random.key(0)
     compiled = eqx.filter_jit(batch).lower(scene, key).compile()

@@ -14,7 +14,6 @@ import numpy as np
 from _common import best, machine, new_figure, options, print_table, race, save_figure, seconds, write_json
 
 import jaxlidar as jl
-from jaxlidar.simulate import total_all, trace_all
 
 TOLERANCES = (0.1, 0.03, 0.01)
 N, SIZE, ORDERS = 64, 10.0, 15
@@ -46,10 +45,10 @@ def split(scene: jl.Scene, rounds: int) -> dict[str, float]:
     key = jax.random.key(0)
 
     def traced(plan):
-        return eqx.filter_jit(lambda scene, key: trace_all(LIDAR, scene, plan, key))
+        return eqx.filter_jit(lambda scene, key: jl.trace_scene(jl.reduce(LIDAR, scene, plan), key))
 
     all_orders, first, higher = traced(plan), traced(single), traced(few)
-    colour = eqx.filter_jit(lambda response, scene: total_all(response, LIDAR, scene, plan))
+    colour = eqx.filter_jit(lambda response, scene: jl.total_of(response, jl.reduce(LIDAR, scene, plan)))
     response = all_orders(scene, key)
     return best(
         race(

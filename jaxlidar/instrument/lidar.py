@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxlidar._checks import as_array, as_scalar, check_choice, check_range, concrete
+from jaxlidar._checks import as_array, as_optional_scalar, as_scalar, check_choice, check_range, concrete
 from jaxlidar.instrument.pulse import AbstractPulse, GaussianPulse
 from jaxlidar.instrument.receiver import Receiver
 
@@ -32,10 +32,6 @@ def _position(x: ArrayLike | Sequence[ArrayLike]) -> Float[Array, " 2"]:
     if position.shape != (2,):
         raise ValueError(f"position has shape {position.shape}; admissible is (2,), for x and y")
     return position
-
-
-def _optional_scalar(x: ArrayLike | None) -> Float[Array, ""] | None:
-    return None if x is None else as_scalar(x)
 
 
 class Lidar(eqx.Module):
@@ -77,7 +73,7 @@ class Lidar(eqx.Module):
     sampling_interval: Float[Array, ""] = eqx.field(converter=as_scalar, default=1.0)
     profile: str = eqx.field(static=True, default="gaussian")
     position: Float[Array, " 2"] = eqx.field(converter=_position, default=(0.0, 0.0))
-    field_of_view: Float[Array, ""] | None = eqx.field(converter=_optional_scalar, default=None)
+    field_of_view: Float[Array, ""] | None = eqx.field(converter=as_optional_scalar, default=None)
     jitter: Float[Array, ""] = eqx.field(converter=as_scalar, default=0.0)
     efficiency: Float[Array, "..."] = eqx.field(converter=_numbers, default=1.0)
     receiver: Receiver = eqx.field(default_factory=Receiver)

@@ -180,6 +180,11 @@ class AbstractPulse(eqx.Module):
     def std(self) -> Float[Array, ""]:
         """The pulse's standard deviation in ns, without jitter."""
 
+    @property
+    @abc.abstractmethod
+    def finest(self) -> Float[Array, ""]:
+        """Scale (ns) of the finest feature over which the power changes smoothly; zero where it jumps."""
+
     @abc.abstractmethod
     def support(self, jitter: ArrayLike = 0.0) -> tuple[float, float]:
         """Times (low, high) in ns outside which less than 1e-7 of the energy lies.
@@ -223,6 +228,10 @@ class GaussianPulse(AbstractPulse):
     def std(self) -> Float[Array, ""]:
         return self.fwhm / _FWHM_PER_SIGMA
 
+    @property
+    def finest(self) -> Float[Array, ""]:
+        return self.std
+
     def support(self, jitter: ArrayLike = 0.0) -> tuple[float, float]:
         reach = _GAUSSIAN_REACH * math.hypot(float(self.std), float(as_scalar(jitter)))
         return -reach, reach
@@ -251,6 +260,10 @@ class RectangularPulse(AbstractPulse):
     @property
     def std(self) -> Float[Array, ""]:
         return self.length / math.sqrt(12)
+
+    @property
+    def finest(self) -> Float[Array, ""]:
+        return jnp.zeros_like(self.length)
 
     def support(self, jitter: ArrayLike = 0.0) -> tuple[float, float]:
         reach = 0.5 * float(self.length) + _GAUSSIAN_REACH * float(as_scalar(jitter))
@@ -287,6 +300,10 @@ class ExponentiallyModifiedGaussianPulse(AbstractPulse):
     @property
     def std(self) -> Float[Array, ""]:
         return _norm(self.fwhm / _FWHM_PER_SIGMA, self.decay)
+
+    @property
+    def finest(self) -> Float[Array, ""]:
+        return self.std
 
     def support(self, jitter: ArrayLike = 0.0) -> tuple[float, float]:
         decay = float(self.decay)
@@ -361,6 +378,10 @@ class SampledPulse(AbstractPulse):
         centre, length, mean, rise = self._pieces()
         centre = centre - self.mean
         return jnp.sqrt(jnp.sum(length * (mean * (centre**2 + length**2 / 12) + rise * centre * length / 3)))
+
+    @property
+    def finest(self) -> Float[Array, ""]:
+        return self.std
 
     def support(self, jitter: ArrayLike = 0.0) -> tuple[float, float]:
         time, lit = np.asarray(self.time, dtype=float), np.flatnonzero(np.asarray(self.samples))

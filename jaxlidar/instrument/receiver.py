@@ -13,16 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxlidar._checks import as_array, as_scalar, check_choice, check_range
+from jaxlidar._checks import as_array, as_optional_scalar, as_scalar, check_choice, check_range
 from jaxlidar._constants import PLANCK_TIMES_LIGHT
 
 # Above this expectation a Poisson count is drawn as a normal variable (skewness below 1e-3): the exact
 # sampler counts in 32 bits.
 _POISSON_MAX = 1e6
-
-
-def _optional_scalar(x: ArrayLike | None) -> Float[Array, ""] | None:
-    return None if x is None else as_scalar(x)
 
 
 class Receiver(eqx.Module):
@@ -46,7 +42,7 @@ class Receiver(eqx.Module):
     """
 
     detection_threshold: Float[Array, ""] = eqx.field(converter=as_scalar, default=0.0)
-    saturation: Float[Array, ""] | None = eqx.field(converter=_optional_scalar, default=None)
+    saturation: Float[Array, ""] | None = eqx.field(converter=as_optional_scalar, default=None)
     bits: int | None = eqx.field(static=True, default=None)
     background: Float[Array, ""] = eqx.field(converter=as_scalar, default=0.0)
     photon_noise: bool = eqx.field(static=True, default=True)

@@ -1,16 +1,15 @@
 r"""Facets: flat Lambertian pieces of leaf or bark, turned every way, that light in a voxel meets.
 
-With spherical orientation they scatter by Ross's phase function (Ross 1981, eq. II.3.8; Shultis and
-Myneni 1988).
-Its reflected part, per unit projected area, is the *view factor* 2/(3 pi) (sin b - b cos b), b the angle
-between
-incident and view direction: apparent reflectance per unit reflectance, pi times the density per steradian.
+With spherical orientation they scatter by Ross's phase function (Ross 1981, eq. II.3.8; Shultis and Myneni
+1988). Its reflected part, per unit projected area, is the *view factor* 2/(3 pi) (sin b - b cos b), b the
+angle between incident and view direction: apparent reflectance per unit reflectance, pi times the density per
+steradian.
 """
 
 import jax.numpy as jnp
 import numpy as np
 
-from jaxlidar._vectors import Scalar, Vec, from_frame, polar, scale
+from jaxlidar._vectors import Scalar, Vec, about, scale
 
 # Backscatter of spherically oriented facets: the mean squared cosine 1/3 over the mean cosine 1/2, hence
 # Ross's R/3 for leaf area.
@@ -40,9 +39,4 @@ def _arccos(c: Scalar) -> Scalar:
 
 def facet_normal(incident: Vec, u: Scalar, v: Scalar) -> Vec:
     """Normal of a spherically oriented facet that was hit: density |n . incident| / pi, on the lit side."""
-    return from_frame(scale(incident, jnp.asarray(-1.0)), polar(jnp.sqrt(1.0 - u), 2 * np.pi * v))
-
-
-def about(normal: Vec, u: Scalar, v: Scalar) -> Vec:
-    """A direction by the cosine law about `normal`."""
-    return from_frame(normal, polar(jnp.sqrt(1.0 - u), 2 * np.pi * v))
+    return about(scale(incident, jnp.asarray(-1.0)), u, v)

@@ -8,21 +8,24 @@ ray holds for the footprint: a ratio of sums lies between the least and the larg
 Taken as the same with and without an effect: the transmittance of the air within the depth of the scene.
 """
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from jaxlidar._checks import known_array, known_number
 from jaxlidar._constants import SPEED_OF_LIGHT
+from jaxlidar._vectors import vec
 from jaxlidar.instrument.lidar import Lidar
-from jaxlidar.optics.laws import EqualAngle, Lambertian
-from jaxlidar.optics.phase import Isotropic
+from jaxlidar.optics.facets import FACET_BACKSCATTER
+from jaxlidar.optics.laws import AbstractMirror
+from jaxlidar.planning.backscatter import PerRay, Rays, backscatter, footprint_rays
 from jaxlidar.planning.scatterers import scene_optics
 from jaxlidar.planning.trace_plan import Bins
-from jaxlidar.scenes.scene import Canopy, Ground, Plate, Scene
+from jaxlidar.scenes.canopy import Canopy
+from jaxlidar.scenes.scene import Scene
+from jaxlidar.scenes.surfaces import AbstractSheet, AbstractSurface
 
 Values = Float[np.ndarray, "wavelengths"]
-Rays = Float[np.ndarray, "rays 3"]
-PerRay = Float[np.ndarray, "rays"]
 # Cells of the pulse; more would add up the rounding of single precision.
 _CELLS = 400
 # A mirror's view factor is as large as its lobe is narrow.
@@ -37,7 +40,7 @@ class Bounds:
         self.slant = known_number(lidar.range_to_reference)
         self.half_angle = known_number(lidar.aperture_half_angle)
         self.axis = known_array(lidar.direction)
-        self.rays, self.seen = self._footprint(known_number(lidar.footprint_radius))
+        self.rays, self.seen = footprint_rays(lidar)
         self.outside = 1.0 - float(np.mean(self.seen))
         optics = scene_optics(lidar, scene)
         zero = np.zeros(lidar.wavelength.size)
@@ -49,23 +52,8 @@ class Bounds:
             for o in optics
         }
         self.surface = dict(zip([n for n in self.optics if n not in ("leaf", "bark")], scene.surfaces))
-        self.sheets = {n: s for n, s in self.surface.items() if isinstance(s, Plate)}
+        self.sheets = {n: s for n, s in self.surface.items() if isinstance(s, AbstractSheet)}
         self.kappa = 1.0 if scene.canopy is not None and scene.canopy.hotspot else 2.0
-
-    def _footprint(self, radius: float) -> tuple[Rays, PerRay]:
-        """Directions of rays of equal energy, and how much of each the receiver sees."""
-        u, turn = ((np.arange(n) + 0.5) / n for n in (64, 32))
-        r = radius * (np.sqrt(-0.5 * np.log1p(-u)) if self.lidar.profile == "gaussian" else np.sqrt(u))
-        first = np.cross(self.axis, [1.0, 0, 0] if abs(self.axis[0]) < 0.7 else [0, 1.0, 0])
-        first /= np.linalg.norm(first)
-        circle = np.outer(np.cos(2 * np.pi * turn), first)
-        circle = circle + np.outer(np.sin(2 * np.pi * turn), np.cross(self.axis, first))
-        rays = (self.axis * self.slant + r[:, None, None] * circle).reshape(-1, 3)
-        seen = np.ones_like(r)
-        if self.lidar.field_of_view is not None:
-            edge = self.slant * known_number(self.lidar.field_of_view) * 0.5e-3
-            seen = 1.0 / (1.0 + np.exp(np.clip((r / edge - 1.0) / 0.02, -80.0, 80.0)))
-        return rays / np.linalg.norm(rays, axis=1)[:, None], np.repeat(seen, turn.size)
 
     # What materials do.
 
@@ -76,35 +64,35 @@ class Bounds:
             factor = self._facing(self.surface[name], self.rays)
             return (0.0, _MIRROR) if factor is None else (float(factor.min()), float(factor.max()))
         assert canopy is not None
-        if isinstance(canopy.leaf if name == "leaf" else canopy.bark, Isotropic):
-            return 0.25, 0.25
+        phase = canopy.leaf_phase if name == "leaf" else canopy.bark_phase
+        if phase is not None:
+            factor = backscatter(phase, self.rays)
+            return float(factor.min()), float(factor.max())
         if name == "leaf" and canopy.voxels.leaf_angles is not None:
             mean, square = (known_array(t) for t in canopy.voxels.leaf_angles.tables())
             found = np.interp(np.abs(self.rays[:, 2]), np.linspace(0, 1, mean.size), square / mean)
             return float(found.min()), float(found.max())
-        return 2.0 / 3.0, 2.0 / 3.0
+        return FACET_BACKSCATTER, FACET_BACKSCATTER
 
     def _brightest(self, name: str) -> float:
         """Largest view factor of what a material scatters, from anywhere to anywhere."""
         canopy = self.scene.canopy
-        if name in ("leaf", "bark"):
-            assert canopy is not None
-            if isinstance(canopy.leaf if name == "leaf" else canopy.bark, Isotropic):
-                return 0.25
-            return 1.0 if name == "leaf" and canopy.voxels.leaf_angles is not None else 2.0 / 3.0
-        law = self.surface[name].law
-        if isinstance(law, EqualAngle):
-            return 2.0 / (np.pi * self.half_angle)
-        return 1.0 if isinstance(law, Lambertian) else _MIRROR
+        if name not in ("leaf", "bark"):
+            return self.surface[name].law.largest_view_factor(self.half_angle)
+        assert canopy is not None
+        phase = canopy.leaf_phase if name == "leaf" else canopy.bark_phase
+        if phase is not None:
+            return phase.largest_view_factor()
+        # Spherically oriented facets are brightest straight back.
+        return 1.0 if name == "leaf" and canopy.voxels.leaf_angles is not None else FACET_BACKSCATTER
 
-    def _facing(self, surface: Ground | Plate, rays: Rays) -> PerRay | None:
+    def _facing(self, surface: AbstractSurface, rays: Rays) -> PerRay | None:
         """View factors for backscatter of rays, zero from under the ground; None for a mirror."""
-        cosine = -rays @ known_array(surface.plane.normal)
-        cosine = np.abs(cosine) if isinstance(surface, Plate) else np.maximum(cosine, 0.0)
-        if isinstance(surface.law, EqualAngle):
-            sine2 = np.maximum(1.0 - cosine**2, 0.0)
-            return np.where(cosine > 0, 1.0 / (np.pi * np.sqrt(sine2 + self.half_angle**2 / 4)), 0.0)
-        return cosine if isinstance(surface.law, Lambertian) else None
+        if isinstance(surface.law, AbstractMirror):
+            return None
+        normal, _ = surface.shape.tangent(vec(jnp.zeros(3)))
+        upward = np.stack([known_array(n) for n in normal])
+        return backscatter(surface.law, rays, upward, self.half_angle, isinstance(surface, AbstractSheet))
 
     def _sheet(self, name: str) -> tuple[Values, Values, Values]:
         """Shares of all light, whether it meets the plate or not, that are reflected, scattered, or go on."""
@@ -296,7 +284,13 @@ class Bounds:
         return (bottom - known_number(self.lidar.altitude)) / self.rays[:, 2]
 
     def _change(
-        self, one: Ground | Plate, rays: Rays, other: Ground | Plate, others: Rays, seen: PerRay, uneven: bool
+        self,
+        one: AbstractSurface,
+        rays: Rays,
+        other: AbstractSurface,
+        others: Rays,
+        seen: PerRay,
+        uneven: bool,
     ) -> float:
         """Bound on the samples' change as each ray is replaced by another, of which the share `seen` is seen.
 
@@ -314,13 +308,9 @@ class Bounds:
             return float(np.max(change / np.maximum(both, 1e-30)))
         return float(np.sum(change) / max(np.sum(both), 1e-30))
 
-    def _distance(self, surface: Ground | Plate, rays: Rays) -> PerRay:
-        normal = known_array(surface.plane.normal)
+    def _distance(self, surface: AbstractSurface, rays: Rays) -> PerRay:
         sensor = np.append(known_array(self.lidar.position), 0.0) - self.slant * self.axis
-        towards = rays @ normal
-        return (normal[2] * known_number(surface.plane.height) - normal @ sensor) / np.where(
-            np.abs(towards) > 1e-9, towards, 1e-9
-        )
+        return surface.shape.crossing(np.broadcast_to(sensor, rays.shape), rays)[0]
 
     def _steepness(self) -> float:
         """Half the total variation of the pulse's power, 1/ns: of one with a single peak, the peak."""

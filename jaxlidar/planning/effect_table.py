@@ -8,11 +8,14 @@ import jax
 
 from jaxlidar._checks import is_traced, known_number
 from jaxlidar._constants import SPEED_OF_LIGHT
+from jaxlidar.instrument.field_of_view import EDGE
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.planning.bounds import Bounds
 from jaxlidar.planning.effects import NAMES, Effect, present, without
 from jaxlidar.planning.trace_plan import Bins
 from jaxlidar.scenes.scene import Scene
+from jaxlidar.scenes.shapes import Plane
+from jaxlidar.scenes.surfaces import Ground
 
 
 def percent(share: float) -> str:
@@ -32,8 +35,9 @@ def effect_table(
     """A row for every effect; `why`: why so many orders are followed, and what the others likely have."""
     has, planned = present(lidar, scene), present(*without(lidar, scene, off))
     reasons = dict.fromkeys(NAMES, "in the scene") | {"multiple scattering": why[0]} | _reasons(lidar, scene)
-    # What is being traced may have any value.
+    # What is being traced may have any value; and only planes are bounded.
     known = not any(is_traced(x) for x in jax.tree.leaves((lidar, scene)))
+    known = known and all(isinstance(s.shape, Plane) for s in scene.surfaces)
 
     @functools.cache
     def rules(off: tuple[str, ...]) -> dict[str, Callable[[], float]]:
@@ -104,7 +108,7 @@ def _rules(bounds: Bounds, bins: Bins, upstream: float) -> dict[str, Callable[[]
 def _reasons(lidar: Lidar, scene: Scene) -> dict[str, str]:
     """Why effects are on, by their size, where more can be said than that they are there."""
     radius = known_number(lidar.footprint_radius)
-    slope = 0.0 if scene.ground is None else known_number(scene.ground.slope)
+    slope = known_number(scene.ground.slope) if isinstance(scene.ground, Ground) else 0.0
     spread = radius * math.tan(math.radians(slope)) / SPEED_OF_LIGHT
     view = lidar.field_of_view
     air = scene.atmosphere
@@ -112,9 +116,9 @@ def _reasons(lidar: Lidar, scene: Scene) -> dict[str, str]:
     reasons = {
         "slope spread": f"{slope:g} degrees: {spread:.2g} ns (standard deviation)",
         "divergence": f"{known_number(lidar.divergence):g} mrad: a footprint of radius {radius:.3g} m",
-        "field of view": "a soft edge of 2 %"
+        "field of view": f"a soft edge of {percent(EDGE)}"
         if view is None or is_traced(view)
-        else f"{known_number(view):g} mrad, with a soft edge of 2 %",
+        else f"{known_number(view):g} mrad, with a soft edge of {percent(EDGE)}",
         "hot spot": "back through the same gap: exp(-tau)"
         if hotspot
         else "ways are independent: exp(-2 tau)",

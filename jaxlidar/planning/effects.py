@@ -7,8 +7,11 @@ import jax.numpy as jnp
 
 from jaxlidar._checks import known_number
 from jaxlidar.instrument.lidar import Lidar
-from jaxlidar.optics.laws import Specular
-from jaxlidar.scenes.scene import Canopy, Ground, Scene
+from jaxlidar.optics.laws import AbstractMirror
+from jaxlidar.scenes.canopy import Canopy
+from jaxlidar.scenes.scene import Scene
+from jaxlidar.scenes.shapes import Plane
+from jaxlidar.scenes.surfaces import Ground
 
 # In the order of the table; each can be switched.
 NAMES = (
@@ -50,6 +53,17 @@ class Effect:
     measure: str
 
 
+def only_planes(scene: Scene) -> bool:
+    """Whether there is nothing but infinite planes in the scene."""
+    return scene.canopy is None and all(isinstance(s.shape, Plane) for s in scene.surfaces)
+
+
+def can_light_itself(scene: Scene) -> bool:
+    """Whether light that a part of the scene scatters can meet the scene again: one plane's cannot."""
+    surfaces = scene.surfaces
+    return scene.canopy is not None or len(surfaces) > 1 or any(s.shape.lights_itself for s in surfaces)
+
+
 def present(lidar: Lidar, scene: Scene) -> dict[str, bool]:
     """Which of `NAMES` a lidar and a scene have."""
     canopy, air = scene.canopy, scene.atmosphere
@@ -58,10 +72,9 @@ def present(lidar: Lidar, scene: Scene) -> dict[str, bool]:
         "bark": canopy is not None and canopy.voxels.bark is not None,
         "plates": bool(scene.plates),
         "ground": scene.ground is not None,
-        "slope spread": scene.ground is not None and known_number(scene.ground.slope) > 0,
-        # One plane cannot light itself.
-        "multiple scattering": canopy is not None or len(scene.surfaces) > 1,
-        "specular return": any(isinstance(s.law, Specular) for s in scene.surfaces),
+        "slope spread": isinstance(scene.ground, Ground) and known_number(scene.ground.slope) > 0,
+        "multiple scattering": can_light_itself(scene),
+        "specular return": any(isinstance(s.law, AbstractMirror) for s in scene.surfaces),
         "divergence": known_number(lidar.divergence) > 0,
         "field of view": lidar.field_of_view is not None,
         "hot spot": canopy is not None and canopy.hotspot,
@@ -127,7 +140,7 @@ def without(lidar: Lidar, scene: Scene, off: tuple[str, ...]) -> tuple[Lidar, Sc
     canopy, ground, air = scene.canopy, scene.ground, scene.atmosphere
     if canopy is not None:
         canopy = _thinned(canopy, off)
-    if ground is not None and "slope spread" in off:
+    if isinstance(ground, Ground) and "slope spread" in off:
         ground = _levelled(ground, lidar)
     if air is not None and "atmospheric backscatter" in off:
         air = dataclasses.replace(air, lidar_ratio=None)
@@ -160,7 +173,7 @@ def _thinned(canopy: Canopy, off: tuple[str, ...]) -> Canopy | None:
 
 def _levelled(ground: Ground, lidar: Lidar) -> Ground:
     """Level ground through the point where the axis of the beam meets the slope, if it does."""
-    normal, axis = ground.plane.normal, lidar.direction
+    normal, axis = ground.shape.upward, lidar.direction
     rise = normal[2] * ground.height - jnp.sum(normal[:2] * lidar.position)
     towards = jnp.sum(normal * axis)
     met = towards < -1e-6

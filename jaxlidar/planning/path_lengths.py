@@ -7,7 +7,8 @@ import numpy as np
 from jaxlidar._checks import known_array, known_number
 from jaxlidar._vectors import FAR
 from jaxlidar.instrument.lidar import Lidar
-from jaxlidar.scenes.scene import Plate, Scene
+from jaxlidar.scenes.scene import Scene
+from jaxlidar.scenes.surfaces import AbstractSheet
 
 
 class PathLengths:
@@ -34,12 +35,10 @@ class PathLengths:
         self.rays = rays / distance[:, None]
         levels = []
         for s in scene.surfaces:
-            normal = known_array(s.plane.normal)
-            offset = normal @ (np.array([0, 0, known_number(s.plane.height)]) - aim)
-            towards = self.rays @ normal
-            met = towards < -1e-6 if not isinstance(s, Plate) else np.abs(towards) > 1e-6
+            crossed, towards = s.shape.crossing(points + aim, self.rays)
+            met = np.abs(towards) > 1e-6 if isinstance(s, AbstractSheet) else towards < -1e-6
             if met.any():
-                levels.append(((offset - points @ normal) / np.where(met, towards, 1.0))[met])
+                levels.append(crossed[met])
         if scene.canopy is not None:
             v = scene.canopy.voxels
             self.size, self.shape = known_array(v.voxel_size), np.array(v.shape)

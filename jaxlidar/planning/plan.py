@@ -4,25 +4,28 @@ import dataclasses
 import math
 from collections.abc import Mapping
 
-from jaxlidar._checks import known_number
+from jaxlidar._checks import check_choice, check_integer, known_number
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar.instrument.lidar import Lidar
-from jaxlidar.instrument.pulse import RectangularPulse
-from jaxlidar.optics.laws import Specular
-from jaxlidar.optics.phase import Isotropic
+from jaxlidar.optics.laws import AbstractMirror
 from jaxlidar.planning.effect_table import effect_table, percent
-from jaxlidar.planning.effects import Effect, present, switched_off, without
+from jaxlidar.planning.effects import Effect, can_light_itself, only_planes, present, switched_off, without
 from jaxlidar.planning.path_lengths import PathLengths
 from jaxlidar.planning.scatterers import largest_albedo, lobe_probability, scene_optics, spell
 from jaxlidar.planning.trace_plan import KERNEL, Bins, TracePlan
-from jaxlidar.scenes.scene import Plate, Scene
+from jaxlidar.scenes.scene import Scene
+from jaxlidar.scenes.surfaces import AbstractSheet
 
 DEFAULT_RTOL = 0.01
+# Fewer batches give no trustworthy standard error.
+MIN_BATCHES = 8
 # Orders are followed while their histories are not more than this (16 orders of four letters, 29 of three).
 MAX_HISTORIES = 5000
 MAX_ORDERS = 100
 # Of scattered light at most this share is scattered again, where any can escape: by experience.
 AGAIN = 0.8
+# Points of each flight through a canopy from which light returns.
+ENDS = 4
 # Multiple scattering is followed this long after the last first-order return, ns.
 TAIL = (10.0, 60.0)
 
@@ -97,10 +100,6 @@ def plan(
     bin_width: float | None = None,
     footprint: str = "random",
     effects: Mapping[str, bool] | None = None,
-    first_order: str = "expected",
-    points: str = "lattice",
-    kernel: int = KERNEL,
-    ends: int = 4,
     describe: bool = True,
 ) -> Plan:
     """Decide what `simulate` will do.
@@ -118,14 +117,6 @@ def plan(
     - `footprint`: "random" (each batch shifts the rays, so that the standard error covers them) or "fixed".
     - `effects`: effects to switch off, by name, as in {"multiple scattering": False}; True asks for what
       is on anyway and refuses scenes that do not have it. The names are those of the table's first column.
-    - `first_order`: "expected" (integrated along every ray) or "drawn" (returns from drawn collisions, as
-      those of the other orders, among which it is then counted).
-    - `points`: "lattice" (low discrepancy) or "independent" random numbers for rays and photons.
-    - `kernel`: fine bins over which an instant is spread: 3 (smooth), 2 (linear) or 1 (the nearest: without
-      derivatives with respect to times).
-    - `ends`: points of each flight through a canopy from which light returns, one in each stratum of the
-      probability of getting there; 1 is the collision alone. These four are there to show what the defaults
-      are worth.
     - `describe`: whether to make the table of effects, with its bounds; takes some 40 ms.
 
     What the scene does not have is off, and never compiled. All else is on, however small: a plan also
@@ -137,23 +128,13 @@ def plan(
     rtol = DEFAULT_RTOL if rtol is None else float(rtol)
     if not 0 < rtol < 1:
         raise ValueError(f"rtol = {rtol:g} is outside the admissible range (0, 1)")
-    for name, value, low in (
-        ("n_photons", n_photons, 1),
-        ("n_rays", n_rays, 1),
-        ("max_orders", max_orders, 1),
-        ("ends", ends, 1),
-    ):
-        if value is not None and (value != int(value) or value < low):
-            raise ValueError(f"{name} = {value} is outside the admissible range [{low}, inf) of integers")
+    check_integer("n_photons", n_photons)
+    for name, value in (("n_rays", n_rays), ("max_orders", max_orders)):
+        if value is not None:
+            check_integer(name, value)
     if max_step is not None and not 0 < max_step < math.inf:
         raise ValueError(f"max_step = {max_step:g} is outside the admissible range (0, inf)")
-    if footprint not in ("random", "fixed"):
-        raise ValueError(f"footprint = {footprint!r} is none of 'random', 'fixed'")
-    if kernel not in (1, 2, 3):
-        raise ValueError(f"kernel = {kernel} is none of 1, 2, 3")
-    if points not in ("lattice", "independent"):
-        raise ValueError(f"points = {points!r} is none of 'lattice', 'independent'")
-    _check_first(first_order, scene)
+    check_choice("footprint", footprint, ("random", "fixed"))
     whole = lidar, scene
     off = switched_off(effects, present(lidar, scene), max_orders)
     lidar, scene = without(lidar, scene, off)
@@ -171,7 +152,7 @@ def plan(
     step = geometry.longest_chord if max_step is None else min(max_step, geometry.longest_chord)
     step = min(step, 4 * metres) if max_step is None else step
     row = max(math.ceil(step / metres - 1e-6) + 1 + 2, KERNEL)
-    bins = dataclasses.replace(bins, row=row, kernel=int(kernel))
+    bins = dataclasses.replace(bins, row=row)
     last = SPEED_OF_LIGHT * (bins.start + bins.width * bins.count)
     trace = TracePlan(
         materials=letters.materials,
@@ -179,10 +160,11 @@ def plan(
         leaf=letters.leaf,
         bark=letters.bark,
         surfaces=letters.surfaces,
-        full_cover=tuple(not isinstance(s, Plate) or known_number(s.coverage) == 1.0 for s in scene.surfaces),
+        full_cover=tuple(
+            not isinstance(s, AbstractSheet) or known_number(s.coverage) == 1.0 for s in scene.surfaces
+        ),
+        mirrors=tuple(isinstance(s.law, AbstractMirror) for s in scene.surfaces),
         has_ground=scene.ground is not None,
-        leaf_isotropic=scene.canopy is not None and isinstance(scene.canopy.leaf, Isotropic),
-        bark_isotropic=scene.canopy is not None and isinstance(scene.canopy.bark, Isotropic),
         hotspot=scene.canopy is not None and scene.canopy.hotspot,
         vertical=known_number(lidar.zenith) == 0.0,
         upstream=geometry.upstream,
@@ -194,13 +176,12 @@ def plan(
         lobe=lobe_probability(optics),
         orders=orders,
         # Without a canopy all ends of a flight are on the same surface.
-        ends=1 if scene.canopy is None else int(ends),
-        drawn_first=first_order == "drawn",
-        independent=points == "independent",
+        ends=1 if scene.canopy is None else ENDS,
+        drawn_first=False,
+        independent=False,
     )
     plates = len(scene.plates)
-    sharpen = not isinstance(lidar.pulse, RectangularPulse) and known_number(lidar.pulse.std) >= bins.width
-    sharpen = sharpen or known_number(lidar.jitter) >= bins.width
+    finest = max(known_number(lidar.pulse.finest), known_number(lidar.jitter))
     return Plan(
         trace=trace,
         bins=bins,
@@ -211,23 +192,15 @@ def plan(
         # A beam without width is one ray.
         n_rays=1 if "divergence" in off else int(n_rays),
         n_photons=int(n_photons),
-        smooth_footprint=scene.canopy is None and "divergence" not in off,
+        smooth_footprint=only_planes(scene) and "divergence" not in off,
         random_footprint=footprint == "random" and "divergence" not in off,
-        sharpen=bool(sharpen),
+        sharpen=finest >= bins.width,
         degree=_degree(orders, plates),
         first_degree=1 + 2 * plates,
         off=off,
         rtol=rtol,
         effects=effect_table(*whole, off, orders, (why, left), airy, geometry.upstream) if describe else (),
     )
-
-
-def _check_first(first_order: str, scene: Scene) -> None:
-    if first_order not in ("expected", "drawn"):
-        raise ValueError(f"first_order = {first_order!r} is none of 'expected', 'drawn'")
-    mirrors = any(isinstance(s.law, Specular) for s in scene.surfaces)
-    if first_order == "drawn" and (mirrors or (scene.canopy is not None and scene.canopy.hotspot)):
-        raise ValueError("first_order = 'drawn'; admissible with a mirror or a hot spot is 'expected'")
 
 
 def _degree(orders: int, plates: int) -> int:
@@ -239,7 +212,7 @@ def _orders(
     albedo: float, kinds: int, scene: Scene, rtol: float, max_orders: int | None
 ) -> tuple[int, str, float]:
     """How many orders to follow, why, and what the others are likely to have."""
-    if scene.canopy is None and len(scene.surfaces) <= 1:
+    if not can_light_itself(scene):
         return 1, "one plane cannot light itself", 0.0
     plates = len(scene.plates)
     most = 2

@@ -1,5 +1,6 @@
-"""The scatterers of a scene and the letters with which histories are spelled: leaf.R, leaf.T, ground.R ..."""
+"""The scatterers of a scene, and the letters that spell their histories: leaf.R, leaf.T, ground.R."""
 
+from collections import Counter
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -8,10 +9,11 @@ from jaxtyping import Array, Float
 
 from jaxlidar._checks import concrete
 from jaxlidar.instrument.lidar import Lidar
-from jaxlidar.optics.phase import Isotropic
+from jaxlidar.optics.phase import AbstractPhase
 from jaxlidar.optics.spectra import reflectance_at
 from jaxlidar.planning.trace_plan import Scatterer
-from jaxlidar.scenes.scene import Scene, leaf_optics
+from jaxlidar.scenes.scene import Scene
+from jaxlidar.scenes.surfaces import AbstractSheet
 
 
 class Optics(NamedTuple):
@@ -32,6 +34,17 @@ class Letters(NamedTuple):
     surfaces: tuple[Scatterer, ...]
 
 
+def surface_names(scene: Scene) -> list[str]:
+    """What the scene's surfaces are called, in their order; several of one name are numbered from 1."""
+    names = [surface.name for surface in scene.surfaces]
+    many, seen = Counter(names), Counter()
+    numbered = []
+    for name in names:
+        seen[name] += 1
+        numbered.append(name if many[name] == 1 else f"{name} {seen[name]}")
+    return numbered
+
+
 def scene_optics(lidar: Lidar, scene: Scene) -> list[Optics]:
     """Optics of every scatterer at the lidar's wavelengths: leaf, bark, ground, plates, as far as there.
 
@@ -41,22 +54,19 @@ def scene_optics(lidar: Lidar, scene: Scene) -> list[Optics]:
     wavelength, found = lidar.wavelength, []
     canopy = scene.canopy
     if canopy is not None and canopy.voxels.leaf is not None:
-        r, t = leaf_optics(canopy, wavelength)
+        r, t = canopy.leaf_optics(wavelength)
         if canopy.transmission == "straight":
             found.append(Optics("leaf", r / jnp.maximum(1.0 - t, 1e-6), None))
         else:
-            found.append(Optics("leaf", r, None if isinstance(canopy.leaf, Isotropic) else t))
+            found.append(Optics("leaf", r, None if isinstance(canopy.leaf, AbstractPhase) else t))
     if canopy is not None and canopy.voxels.bark is not None:
-        bark = canopy.bark.albedo if isinstance(canopy.bark, Isotropic) else canopy.bark
-        assert bark is not None
-        found.append(Optics("bark", reflectance_at(bark, wavelength, "bark"), None))
-    if scene.ground is not None:
-        r = reflectance_at(scene.ground.reflectance, wavelength, "ground reflectance")
-        found.append(Optics("ground", r, None))
-    for i, p in enumerate(scene.plates):
-        name = "plate" if len(scene.plates) == 1 else f"plate {i + 1}"
-        r = reflectance_at(p.reflectance, wavelength, f"{name} reflectance")
-        found.append(Optics(name, r, reflectance_at(p.transmittance, wavelength, f"{name} transmittance")))
+        found.append(Optics("bark", canopy.bark_reflectance(wavelength), None))
+    for name, surface in zip(surface_names(scene), scene.surfaces):
+        r = reflectance_at(surface.reflectance, wavelength, f"{name} reflectance")
+        t = None
+        if isinstance(surface, AbstractSheet):
+            t = reflectance_at(surface.transmittance, wavelength, f"{name} transmittance")
+        found.append(Optics(name, r, t))
     return found
 
 
@@ -76,6 +86,19 @@ def spell(optics: list[Optics]) -> Letters:
     surfaces = tuple(s for name, s in scatterers.items() if name not in ("leaf", "bark"))
     names = tuple(scatterers)
     return Letters(names, tuple(letters), scatterers.get("leaf"), scatterers.get("bark"), surfaces)
+
+
+def letter_values(
+    lidar: Lidar, scene: Scene, letters: tuple[str, ...]
+) -> Float[Array, "letters wavelengths"]:
+    """Reflectance or transmittance of every letter."""
+    values: dict[str, Array] = {}
+    for o in scene_optics(lidar, scene):
+        values[f"{o.name}.R"] = o.reflectance
+        if o.transmittance is not None:
+            values[f"{o.name}.T"] = o.transmittance
+    rows = [values[letter] for letter in letters]
+    return jnp.stack(rows) if rows else jnp.zeros((0, lidar.wavelength.size))
 
 
 def largest_albedo(optics: list[Optics]) -> float:

@@ -55,8 +55,9 @@ class TracePlan(NamedTuple):
     """Everything that the tracer must know before it is compiled. Made by `jaxlidar.plan`.
 
     - `materials`, `letters`: names, in order. - `leaf`, `bark`, `surfaces`: the scatterers.
-    - `full_cover`: for each surface, whether no ray slips through. - `upstream`: where rays start, m
-      above the reference plane along the axis. - `first_steps`, `march_steps`: bounds on faces crossed.
+    - `full_cover`, `mirrors`: for each surface, whether no ray slips through, and whether it is a mirror.
+    - `upstream`: where rays start, m above the reference plane along the axis. - `first_steps`,
+      `march_steps`: bounds on faces crossed.
     - `max_step`, `max_flight`: m. - `last`: longest path to the sensor that is recorded, m relative to the
       way to the reference plane. - `lobe`: probability with which reflection is chosen over transmission.
     - `ends`: points of each flight from which light returns. - `drawn_first`: whether order one returns from
@@ -69,9 +70,8 @@ class TracePlan(NamedTuple):
     bark: Scatterer | None
     surfaces: tuple[Scatterer, ...]
     full_cover: tuple[bool, ...]
+    mirrors: tuple[bool, ...]
     has_ground: bool
-    leaf_isotropic: bool
-    bark_isotropic: bool
     hotspot: bool
     vertical: bool
     upstream: float

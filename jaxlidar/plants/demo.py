@@ -6,7 +6,9 @@ from jaxlidar.optics.prospect import Prospect
 from jaxlidar.optics.spectra import spectrum
 from jaxlidar.plants.habits import grow
 from jaxlidar.plants.voxelise import voxelise
-from jaxlidar.scenes.scene import Canopy, Ground, Scene
+from jaxlidar.scenes.canopy import Canopy
+from jaxlidar.scenes.scene import Scene
+from jaxlidar.scenes.surfaces import Ground
 from jaxlidar.scenes.voxels import VoxelMap
 
 HEIGHT = 15.0

@@ -8,7 +8,8 @@ from matplotlib.colors import LinearSegmentedColormap
 
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.plot.style import BEAM, COLOURS, axes_or_new
-from jaxlidar.scenes.scene import Ground, Plate, Scene
+from jaxlidar.scenes.scene import Scene
+from jaxlidar.scenes.surfaces import AbstractSheet, AbstractSurface
 
 
 def scene(
@@ -60,7 +61,7 @@ def scene(
     for surface in scene.surfaces:
         z = _cut(surface, sides, across, middle)
         levels += z.tolist()
-        if isinstance(surface, Plate):
+        if isinstance(surface, AbstractSheet):
             entries += ax.plot(sides, z, color=COLOURS["plate"], linewidth=2.5, label="plate")
     bottom, top = min(levels), max(levels)
     room = max(0.06 * (top - bottom), 0.2)
@@ -113,9 +114,9 @@ def _beam(ax: Axes, lidar: Lidar, across: int, bottom: float, top: float) -> lis
     return [line for side in (-1, 1) for line in ax.plot(axis + side * half, z, **look)]
 
 
-def _cut(surface: Ground | Plate, sides: np.ndarray, across: int, middle: float) -> np.ndarray:
-    plane = surface.plane
-    normal = np.asarray(plane.normal, dtype=float)
-    point = np.full((2, 2), middle)
-    point[:, across] = sides
-    return float(plane.height) - point @ normal[:2] / normal[2]
+def _cut(surface: AbstractSurface, sides: np.ndarray, across: int, middle: float) -> np.ndarray:
+    """Heights of a surface at two places, where a plumb line meets it."""
+    points = np.full((2, 3), middle)
+    points[:, across], points[:, 2] = sides, 0.0
+    depth, _ = surface.shape.crossing(points, np.tile([0.0, 0.0, -1.0], (2, 1)))
+    return -depth

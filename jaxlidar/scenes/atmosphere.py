@@ -29,7 +29,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxlidar._checks import as_array, as_scalar, check_choice, check_range
+from jaxlidar._checks import as_array, as_optional_scalar, as_scalar, check_choice, check_range
 
 # Peck and Reeder's formula is fitted to 230..1690 nm and smooth far beyond; aerosol exponents to about 2500.
 _WAVELENGTHS = (230.0, 3000.0)
@@ -40,10 +40,6 @@ _DENSITY = 2.546899e19  # molecules per cm3 at 288.15 K and 1013.25 hPa
 _COLUMN = 1013250.0 * 6.0221367e23 / ((28.9595 + 15.0556 * _CO2) * 978.9158)
 _MICROMETRE4_PER_CM4 = 1e16
 _MOLECULAR_LIDAR_RATIO = 8 * math.pi / 3
-
-
-def _optional_scalar(x: ArrayLike | None) -> Float[Array, ""] | None:
-    return None if x is None else as_scalar(x)
 
 
 def _wavelength(wavelength: ArrayLike) -> Float[Array, "..."]:
@@ -133,12 +129,12 @@ class Atmosphere(eqx.Module):
     **Raises:** `ValueError` for a value outside its range and an unknown model.
     """
 
-    visibility: Float[Array, ""] | None = eqx.field(converter=_optional_scalar, default=23.0)
+    visibility: Float[Array, ""] | None = eqx.field(converter=as_optional_scalar, default=23.0)
     rayleigh: bool = eqx.field(static=True, default=True)
     aerosol_model: str = eqx.field(static=True, default="kim")
     rayleigh_scale_height: Float[Array, ""] = eqx.field(converter=as_scalar, default=8450.0)
     aerosol_scale_height: Float[Array, ""] = eqx.field(converter=as_scalar, default=1400.0)
-    lidar_ratio: Float[Array, ""] | None = eqx.field(converter=_optional_scalar, default=None)
+    lidar_ratio: Float[Array, ""] | None = eqx.field(converter=as_optional_scalar, default=None)
     base_height: Float[Array, ""] = eqx.field(converter=as_scalar, default=0.0)
 
     def __check_init__(self):

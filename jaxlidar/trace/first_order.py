@@ -6,11 +6,11 @@ depth from the sensor, the return from a stretch of the ray is
     f_m * integral of k_m exp(-kappa tau(s)) ds,    kappa = 2, or 1 with the hot spot,
 
 integrated exactly over every piece of the ray that lies within one voxel and one time bin. f_m is the
-view factor for backscatter: 2/3 for spherically oriented facets (the mean squared cosine 1/3 over the
-mean cosine 1/2, hence Ross's R/3 for leaf area), 1/4 for isotropic scattering.
+view factor for backscatter (`jaxlidar.optics.facets`, `jaxlidar.optics.phase`).
 """
 
 import itertools
+from collections.abc import Iterator
 
 import equinox as eqx
 import jax
@@ -21,17 +21,16 @@ from jaxtyping import Array, Float, Int
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._vectors import FAR, Scalar, Vec, along, scale, vec
 from jaxlidar.optics.facets import FACET_BACKSCATTER
-from jaxlidar.optics.laws import Specular
+from jaxlidar.optics.laws import AbstractMirror
 from jaxlidar.planning.trace_plan import Bins, TracePlan
 from jaxlidar.trace.deposit import first_bin, instant_row, scatter_rows, smooth_row
-from jaxlidar.trace.footprint import Beam
 from jaxlidar.trace.histories import Histories
 from jaxlidar.trace.march import Medium, advance, begin, cell_of, earlier, later
-from jaxlidar.trace.reparametrise import hold_in_columns
+from jaxlidar.trace.reparametrise import footprint_rays
+from jaxlidar.trace.setting import Setting
 from jaxlidar.trace.surfaces import Surface
 
 CHUNK = 512
-ISOTROPIC_BACKSCATTER = 0.25
 
 
 class Stretches(eqx.Module):
@@ -100,14 +99,14 @@ class Passage:
     so that each term is a monomial in T.
     """
 
-    def __init__(self, surfaces: tuple[Surface, ...], trace: TracePlan, ways: int):
-        self.plates = [(i, s, trace.surfaces[i].transmitted) for i, s in enumerate(surfaces) if s.plate]
+    def __init__(self, surfaces: tuple[Surface, ...], plan: TracePlan, ways: int):
+        self.plates = [(i, s, plan.surfaces[i].transmitted) for i, s in enumerate(surfaces) if s.plate]
         choices = []
         for i, s, letter in self.plates:
             c = s.coverage
             # A plate without a letter for transmittance is opaque.
             straight = s.straight and letter >= 0
-            if trace.full_cover[i]:
+            if plan.full_cover[i]:
                 options = [(ways, jnp.ones_like(c) if straight else jnp.zeros_like(c))]
             elif straight:
                 terms = {1: [1 - c, c], 2: [(1 - c) ** 2, 2 * c * (1 - c), c**2]}[ways]
@@ -141,49 +140,56 @@ class Passage:
 
 
 class FirstOrder(eqx.Module):
-    """Deterministic first-order response and the fate of the light that it describes."""
+    """Deterministic first-order response and the fate of the light that it describes.
+
+    `scattered`: what of the light that arrived is scattered at all, per unit optics.
+    """
 
     weights: Float[Array, "materials histories bins"]
     arrived: Float[Array, "materials histories"]
+    scattered: Float[Array, "materials histories"]
     escaped: Float[Array, "histories"]
 
 
 def first_order(
-    beam: Beam,
-    medium: Medium | None,
-    surfaces: tuple[Surface, ...],
-    trace: TracePlan,
-    table: Histories,
-    bins: Bins,
+    setting: Setting,
     across: tuple[Float[Array, "rays"], Float[Array, "rays"]],
     energy: Float[Array, "rays"],
+    *,
+    mirror: int | None = None,
 ) -> FirstOrder:
-    """Response of order one. Rays are given by their place across the beam and their share of energy."""
+    """Response of order one.
+
+    Rays are given by their place across the beam and their share of energy. With `mirror`, they carry what
+    that surface returns of them (see `jaxlidar.trace.mirror`), and nothing else is deposited.
+    """
+    beam, medium, surfaces = setting.beam, setting.medium, setting.surfaces
+    plan, table, bins = setting.plan, setting.short, setting.bins
     count = table.count
-    out_way, both_ways = Passage(surfaces, trace, 1), Passage(surfaces, trace, 2)
-    kappa = 1.0 if trace.hotspot else 2.0
+    out_way, both_ways = Passage(surfaces, plan, 1), Passage(surfaces, plan, 2)
+    kappa = 1.0 if plan.hotspot else 2.0
     successor = table.successor
-    materials = len(trace.materials)
+    materials = len(plan.materials)
 
     def rays(across, energy):
-        across, share = hold_in_columns(beam, medium, across)
+        across, share = footprint_rays(beam, medium, across)
         energy = energy * share
         point, w, excess = beam.ray(across)
-        x = along(point, w, jnp.asarray(-trace.upstream, energy.dtype))
-        excess = excess - trace.upstream
+        x = along(point, w, jnp.asarray(-plan.upstream, energy.dtype))
+        excess = excess - plan.upstream
         met = [s.distance(x, w) for s in surfaces]
-        stop = met[0] if trace.has_ground else jnp.full_like(energy, FAR)
-        visible = energy * beam.in_view(along(x, w, jnp.minimum(stop, trace.upstream)))
+        stop = met[0] if plan.has_ground else jnp.full_like(energy, FAR)
+        visible = energy * beam.in_view(along(x, w, jnp.minimum(stop, plan.upstream)))
         response = jnp.zeros((materials * count, bins.padded), energy.dtype)
         arrived = jnp.zeros((materials * count,), energy.dtype)
-        escaped = jnp.zeros((count,), energy.dtype)
+        scattered, escaped = arrived, jnp.zeros((count,), energy.dtype)
         at_stops, total = [jnp.zeros_like(energy) for _ in met], jnp.zeros_like(energy)
 
         if medium is not None:
-            step = jnp.asarray(trace.max_step, energy.dtype)
+            step = jnp.asarray(plan.max_step, energy.dtype)
             # Stretches stay along the first axis, where the march leaves them: turning them costs as much.
             march = jax.vmap(march_ray, (None, 0, 0, 0, 0, None, None), (1, 0, 0))
-            stretch, at_stops, total = march(medium, x, w, stop, met, trace.first_steps, step)
+            stretch, at_stops, total = march(medium, x, w, stop, met, plan.first_steps, step)
 
             def along_rays(a):
                 return jnp.broadcast_to(a, stretch.start.shape)
@@ -194,7 +200,7 @@ def first_order(
             first, pieces = _stretch_pieces(bins, low, stretch, kappa)
             passing = jnp.exp(-stretch.depth) * mean_decay(k * stretch.length) * stretch.length
             middle = stretch.start + 0.5 * stretch.length
-            for m, part in _parts(medium, trace, stretch, way):
+            for m, part in _parts(medium, plan, stretch, way) if mirror is None else ():
                 value = part.extinction * (part.backscatter * along_rays(visible))
                 for history, share in both_ways.terms(table, int(successor[0, part.letter]), middle, before):
                     slot = jnp.broadcast_to(m * count + history, first.shape)
@@ -202,32 +208,37 @@ def first_order(
                     response = scatter_rows(response, slot, first, row)
                 for history, share in out_way.terms(table, 0, middle, before):
                     weight = part.extinction * passing * share * power
-                    slot, weight = _together(m * count + history, weight)
-                    arrived = arrived.at[slot].add(weight)
-            # Smoothing is linear: the sum once instead of every stretch.
-            response = smooth_row(response, bins.kernel)[:, 1:-1]
+                    arrived = _add(arrived, m * count + history, weight)
+            # Smoothing is linear: the sum once instead of every stretch. What collides scatters entirely.
+            response, scattered = smooth_row(response, bins.kernel)[:, 1:-1], arrived
 
-        for i, (s, law) in enumerate(zip(surfaces, trace.surfaces)):
-            hit = jnp.where((met[i] <= stop) & (met[i] < FAR), s.coverage * energy, 0.0)
-            for history, share in out_way.terms(table, 0, met[i], met):
-                slot, weight = _together(law.material * count + history, hit * jnp.exp(-at_stops[i]) * share)
-                arrived = arrived.at[slot].add(weight)
-            if isinstance(s.law, Specular):
+        for i, (s, scatterer) in enumerate(zip(surfaces, plan.surfaces)):
+            if mirror is not None and i != mirror:
                 continue
+            hit = jnp.where((met[i] <= stop) & (met[i] < FAR), s.coverage * energy, 0.0)
             at = along(x, w, jnp.where(met[i] < FAR, met[i], 0.0))
-            back = scale(w, jnp.asarray(-1.0))
-            factor = s.law.view_factor(w, s.lit_normal(w), back, beam.half_angle) * beam.in_view(at)
+            normal, back = s.lit_normal(at, w), scale(w, jnp.asarray(-1.0))
+            for history, share in out_way.terms(table, 0, met[i], met):
+                weight = hit * jnp.exp(-at_stops[i]) * share
+                slot = scatterer.material * count + history
+                arrived = _add(arrived, slot, weight)
+                scattered = _add(scattered, slot, weight * s.law.albedo(w, normal))
+            if mirror is None and isinstance(s.law, AbstractMirror):
+                continue
+            seen = beam.in_view(at)
+            if mirror is None:
+                seen = s.law.view_factor(w, normal, back, beam.half_angle) * seen
             time = 2.0 * (excess + jnp.minimum(met[i], 1e9)) / SPEED_OF_LIGHT
-            first, row = instant_row(bins, time, hit * factor * jnp.exp(-kappa * at_stops[i]))
-            for history, share in both_ways.terms(table, int(successor[0, law.reflected]), met[i], met):
-                slot = jnp.broadcast_to(law.material * count + history, first.shape)
+            first, row = instant_row(bins, time, hit * seen * jnp.exp(-kappa * at_stops[i]))
+            for history, share in both_ways.terms(table, int(successor[0, scatterer.reflected]), met[i], met):
+                slot = jnp.broadcast_to(scatterer.material * count + history, first.shape)
                 response = scatter_rows(response, slot, first, row * share[:, None])
 
         gone = jnp.where(stop < FAR, 0.0, energy * jnp.exp(-total))
         for history, share in out_way.terms(table, 0, stop, met):
-            slot, weight = _together(history, gone * share)
-            escaped = escaped.at[slot].add(weight)
-        return response, arrived.reshape(materials, count), escaped
+            escaped = _add(escaped, history, gone * share)
+        shape = (materials, count)
+        return response, arrived.reshape(shape), scattered.reshape(shape), escaped
 
     n = energy.shape[0]
     fill = -n % CHUNK
@@ -237,20 +248,20 @@ def first_order(
         return rays((x, y), e)
 
     if n <= CHUNK:
-        response, arrived, escaped = rays(across, energy)
+        response, *fate = rays(across, energy)
     elif medium is None:
         # Without a march all chunks fit into the memory at once, and no loop is compiled.
         each = jax.vmap(chunk)(*padded)
-        response, arrived, escaped = jax.tree.map(lambda a: jnp.sum(a, axis=0), each)
+        response, *fate = jax.tree.map(lambda a: jnp.sum(a, axis=0), each)
     else:
         zero = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(rays, across, energy))
 
         def add(total, part):
             return jax.tree.map(jnp.add, total, chunk(*part)), None
 
-        response, arrived, escaped = lax.scan(add, zero, padded)[0]
+        response, *fate = lax.scan(add, zero, padded)[0]
     weights = bins.trim(response.reshape(materials, count, bins.padded))
-    return FirstOrder(weights, arrived, escaped)
+    return FirstOrder(weights, *fate)
 
 
 def _stretch_pieces(
@@ -284,6 +295,13 @@ def _together(slot: Int[Array, "*s"] | int, weight: Float[Array, "*s"]):
     return (slot, jnp.sum(weight)) if isinstance(slot, int) else (slot, weight)
 
 
+def _add(
+    into: Float[Array, "slots"], slot: Int[Array, "*s"] | int, weight: Float[Array, "*s"]
+) -> Float[Array, "slots"]:
+    slot, weight = _together(slot, weight)
+    return into.at[slot].add(weight)
+
+
 class Part(eqx.Module):
     """One material of the medium on a ray: its extinction, view factor for backscatter, and letter."""
 
@@ -292,16 +310,20 @@ class Part(eqx.Module):
     letter: int = eqx.field(static=True)
 
 
-def _parts(medium: Medium, trace: TracePlan, stretch: Stretches, w: Vec):
-    if medium.leaf is not None and trace.leaf is not None:
+def _parts(medium: Medium, plan: TracePlan, stretch: Stretches, w: Vec) -> Iterator[tuple[int, Part]]:
+    """Number of each material of the medium, and what it returns from stretches of rays along `w`."""
+    back = scale(w, jnp.asarray(-1.0))
+    if medium.leaf is not None and plan.leaf is not None:
         k = stretch.extinction if medium.bark is None else medium.leaf_at(stretch.cell, w)
         factor = FACET_BACKSCATTER
-        if trace.leaf_isotropic:
-            factor = ISOTROPIC_BACKSCATTER
+        if medium.leaf_phase is not None:
+            factor = medium.leaf_phase.view_factor(w, back)
         elif medium.angles is not None:
             factor = medium.angles.square_at(w) / medium.angles.projection_at(w)
-        yield trace.leaf.material, Part(k, factor, trace.leaf.reflected)
-    if medium.bark is not None and trace.bark is not None:
+        yield plan.leaf.material, Part(k, factor, plan.leaf.reflected)
+    if medium.bark is not None and plan.bark is not None:
         k = stretch.extinction if medium.leaf is None else medium.bark_at(stretch.cell)
-        factor = ISOTROPIC_BACKSCATTER if trace.bark_isotropic else FACET_BACKSCATTER
-        yield trace.bark.material, Part(k, factor, trace.bark.reflected)
+        factor = FACET_BACKSCATTER
+        if medium.bark_phase is not None:
+            factor = medium.bark_phase.view_factor(w, back)
+        yield plan.bark.material, Part(k, factor, plan.bark.reflected)

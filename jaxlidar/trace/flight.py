@@ -9,10 +9,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxlidar._vectors import FAR, Scalar, with_derivative_of
 from jaxlidar.trace.march import free_flight
-from jaxlidar.trace.photons import EVENT, GAP, THROUGH, Photons, Setting, ratio_of, stop
-
-# Random numbers of a flight and of the collision that ends it, beside one for each plate.
-DIMENSIONS = 6
+from jaxlidar.trace.photons import EVENT, GAP, THROUGH, Photons, ratio_of, stop
+from jaxlidar.trace.setting import Setting
 
 
 class Flight(eqx.Module):
@@ -34,6 +32,10 @@ class Flight(eqx.Module):
         """Whether anything was hit."""
         return self.collided | self.landed
 
+    def landed_on(self, events: list[Scalar], limit: Scalar) -> list[Bool[Array, "*photons"]]:
+        """For each surface, whether the flight ends on it."""
+        return [self.landed & (event <= limit) for event in events]
+
 
 def fly(
     setting: Setting,
@@ -54,7 +56,7 @@ def fly(
         cell = jnp.zeros(u.shape, jnp.int32)
     else:
         medium, target = setting.medium, -jnp.log(u)
-        steps, box = setting.trace.march_steps, setting.occupied
+        steps, box = setting.plan.march_steps, setting.occupied
         free = free_flight(medium, p.x, p.w, target, reach, p.alive, steps, box)
         collided, cell = free.collided, free.cell
         k = jnp.where(collided, jax.vmap(medium.extinction, (0, None))(cell, p.w), 1.0)
@@ -90,12 +92,13 @@ def nearest(p: Photons, events: list[Scalar]) -> Scalar:
     return limit
 
 
-def plates_ahead(setting: Setting, p: Photons, u: list[Scalar]):
+def plates_ahead(setting: Setting, p: Photons, ahead: tuple[Scalar, ...]):
     """Distance to each surface, what will happen at each plate, and the density ratio of that."""
     met, outcomes, ratios = [], [], []
-    drawn = iter(u)
+    drawn = iter(ahead)
     for i, s in enumerate(setting.surfaces):
-        met.append(jnp.where(p.on == i, FAR, s.distance(p.x, p.w)))
+        distance = s.distance(p.x, p.w)
+        met.append(distance if s.shape.lights_itself else jnp.where(p.on == i, FAR, distance))
         if not s.plate:
             outcomes.append(None)
             ratios.append(None)
@@ -103,9 +106,9 @@ def plates_ahead(setting: Setting, p: Photons, u: list[Scalar]):
         v, c = next(drawn), jnp.broadcast_to(s.coverage, p.weight.shape)
         hit = v < c
         outcome = jnp.where(hit, EVENT, GAP)
-        if s.straight and setting.trace.surfaces[i].transmitted >= 0:
+        if s.straight and setting.plan.surfaces[i].transmitted >= 0:
             # The lobe is chosen with the number that decided that the plate was hit.
-            outcome = jnp.where(hit & (v >= c * setting.trace.lobe), THROUGH, outcome)
+            outcome = jnp.where(hit & (v >= c * setting.plan.lobe), THROUGH, outcome)
         outcomes.append(outcome)
         ratios.append(ratio_of(jnp.where(hit, c, 1.0 - c)))
     return met, outcomes, ratios

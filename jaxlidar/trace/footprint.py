@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxlidar._vectors import FAR, Scalar, Vec, add, dot, from_frame, normalise, scale, vec
+from jaxlidar.instrument.field_of_view import seen
 from jaxlidar.instrument.lidar import Lidar
 
 GOLDEN = (np.sqrt(5.0) - 1) / 2
@@ -56,7 +57,7 @@ class Beam(eqx.Module):
         return jnp.where(left < out, 0.0, jnp.where(divisor > 0, jnp.minimum(flight, FAR), FAR))
 
     def in_view(self, point: Vec) -> Scalar:
-        """How much of `point` the receiver sees, 0..1: its field of view with a soft edge of 2 %."""
+        """How much of `point` the receiver sees, 0..1: its field of view with a soft edge."""
         if self.view_radius is None:
             return jnp.ones_like(point[0])
         along = dot(point, self.axis)
@@ -64,7 +65,7 @@ class Beam(eqx.Module):
         # The field widens with distance from the sensor.
         edge = self.view_radius * (1.0 + along / self.slant_range)
         off = jnp.sqrt(jnp.maximum(off2, 1e-12 * edge * edge))
-        return 1.0 / (1.0 + jnp.exp(jnp.clip((off / edge - 1.0) / 0.02, -80.0, 80.0)))
+        return seen(off / edge)
 
     def irradiance(self, across: tuple[Scalar, Scalar]) -> Scalar:
         """Share of the pulse's energy per m2 across the beam."""

@@ -3,7 +3,7 @@ r"""Orders two and above: photons that collide, scatter and at every collision r
 Photons carry no energy, only the geometric weight of their path and the number of its history. Each
 order draws a collision: the optical depth to it, the material, the direction onward. From there the
 photon deposits the probability of returning (pi times the density of scattering towards the sensor,
-times the transmittance of the way there). It does so from several points of the flight, `trace.ends`,
+times the transmittance of the way there). It does so from several points of the flight, `plan.ends`,
 one in each stratum of the probability of getting there, and goes on from one of them.
 
 Derivatives: what is drawn is held fixed (directions, materials, and the place of a collision as a
@@ -23,17 +23,15 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._vectors import FAR, Scalar, Vec, along, vec
-from jaxlidar.planning.trace_plan import Bins, TracePlan
 from jaxlidar.trace.collisions import collide, view_factors
 from jaxlidar.trace.deposit import instant_row, scatter_rows
-from jaxlidar.trace.flight import DIMENSIONS, Flight, events_of, fly, nearest, plates_ahead
-from jaxlidar.trace.footprint import GOLDEN, Beam, across_beam
-from jaxlidar.trace.histories import Histories
-from jaxlidar.trace.march import Medium, depth_to_top, free_flight
-from jaxlidar.trace.photons import THROUGH, Hit, Photons, Setting, ratio_of, stop
-from jaxlidar.trace.random_numbers import Independent, draws
-from jaxlidar.trace.reparametrise import aim, hold_in_columns
-from jaxlidar.trace.surfaces import Surface
+from jaxlidar.trace.flight import Flight, events_of, fly, nearest, plates_ahead
+from jaxlidar.trace.footprint import GOLDEN, across_beam
+from jaxlidar.trace.march import depth_to_top, free_flight
+from jaxlidar.trace.photons import THROUGH, Hit, Photons, Scattering, ratio_of, stop
+from jaxlidar.trace.random_numbers import Draw, Independent, lattices
+from jaxlidar.trace.reparametrise import footprint_rays, rays_to_surfaces
+from jaxlidar.trace.setting import COSINE_LAW, Setting
 
 CHUNK = 256
 # Chunks that are traced together, order by order, and added up by themselves: single precision loses small
@@ -52,42 +50,33 @@ class HigherOrders(eqx.Module):
     remaining: Float[Array, "histories"]
 
 
-def higher_orders(
-    beam: Beam,
-    medium: Medium | None,
-    surfaces: tuple[Surface, ...],
-    trace: TracePlan,
-    table: Histories,
-    bins: Bins,
-    key: PRNGKeyArray,
-    photons: int,
-) -> HigherOrders:
-    """Trace `photons` photons through up to `trace.orders` scatterings; sums are means per photon."""
+def higher_orders(setting: Setting, key: PRNGKeyArray, photons: int) -> HigherOrders:
+    """Trace `photons` photons through up to `plan.orders` scatterings; sums are means per photon."""
+    beam, medium, plan, bins = setting.beam, setting.medium, setting.plan, setting.bins
     footprint_key, draw_key = jax.random.split(key)
-    plates = [i for i, s in enumerate(surfaces) if s.plate]
-    dimensions = DIMENSIONS + 2 * len(plates)
+    plates = sum(s.plate for s in setting.surfaces)
+    dimensions = Draw.dimensions(plates)
     shift = jax.random.uniform(footprint_key, (2,))
-    if trace.independent:
+    if plan.independent:
         numbers, places = Independent(draw_key, dimensions), Independent(footprint_key, 2)
     else:
-        numbers, places = draws(draw_key, trace.orders, dimensions), None
-    setting = Setting(beam, medium, surfaces, trace, table, bins)
+        numbers, places = lattices(draw_key, plan.orders, dimensions), None
     size = min(CHUNK, photons)
     chunks = -(-photons // size)
     groups = -(-chunks // GROUP)
     each = -(-chunks // groups)
-    count, materials = table.count, len(trace.materials)
+    count, materials = setting.table.count, len(plan.materials)
 
     def start(lane):
         if places is None:
             share = (lane.astype(float) + shift[0]) / photons
             turn = (lane * jnp.uint32(GOLDEN * 2**32)).astype(float) * 2.0**-32 + shift[1]
         else:
-            share, turn = places(lane, jnp.asarray(trace.orders))
+            share, turn = places(lane, jnp.asarray(plan.orders))
         inside = lane < photons
-        across, share = hold_in_columns(beam, medium, across_beam(beam, share, turn))
+        across, share = footprint_rays(beam, medium, across_beam(beam, share, turn))
         point, w, excess = beam.ray(across)
-        up = jnp.asarray(-trace.upstream, excess.dtype)
+        up = jnp.asarray(-plan.upstream, excess.dtype)
         return Photons(
             along(point, w, up),
             w,
@@ -95,7 +84,7 @@ def higher_orders(
             jnp.where(inside, share / photons, 0.0),
             jnp.zeros(lane.shape, jnp.int32),
             jnp.full(lane.shape, -1, jnp.int32),
-            vec(jnp.zeros_like(excess) for _ in range(3)),
+            from_the_beam(excess),
             inside,
         )
 
@@ -107,7 +96,7 @@ def higher_orders(
                 lane, photons = part
 
                 def go(photons, tally):
-                    return _one_order(setting, photons, tally, numbers(lane, n), n)
+                    return _one_order(setting, photons, tally, Draw.of(numbers(lane, n), plates), n)
 
                 # Photons that live come first, so that whole chunks of dead ones are passed over.
                 photons, tally = lax.cond(jnp.any(photons.alive), go, lambda *c: c, photons, tally)
@@ -119,7 +108,7 @@ def higher_orders(
             return (lanes, photons, tally), None
 
         rows = jax.tree.map(lambda a: a.reshape(each, size), (lane, start(lane)))
-        (_, last, tally), _ = lax.scan(order, (*rows, zero), jnp.arange(trace.orders))
+        (_, last, tally), _ = lax.scan(order, (*rows, zero), jnp.arange(plan.orders))
         over = jnp.where(last.alive, stop(last.weight), 0.0)
         tally = eqx.tree_at(lambda t: t.remaining, tally, tally.remaining.at[last.history].add(over))
         return jax.tree.map(jnp.add, total, tally), None
@@ -136,6 +125,12 @@ def higher_orders(
     return eqx.tree_at(lambda t: t.weights, tallies, bins.trim(tallies.weights))
 
 
+def from_the_beam(like: Scalar) -> Scattering:
+    """How photons were sent that come from the lidar: about no normal."""
+    nowhere = vec(jnp.zeros_like(like) for _ in range(3))
+    return Scattering(jnp.full(like.shape, COSINE_LAW, jnp.int32), nowhere, nowhere)
+
+
 def _alive_first(lanes: Array, photons: Photons) -> tuple[Array, Photons]:
     """Bring the photons that live to the front, in their order; all others are dead copies of the first."""
     alive = photons.alive.reshape(-1)
@@ -147,22 +142,22 @@ def _alive_first(lanes: Array, photons: Photons) -> tuple[Array, Photons]:
     return lanes, eqx.tree_at(lambda p: p.alive, photons, alive)
 
 
-def _one_order(setting: Setting, p: Photons, tally: HigherOrders, u: list[Scalar], order: Int[Array, ""]):
+def _one_order(setting: Setting, p: Photons, tally: HigherOrders, draw: Draw, order: Int[Array, ""]):
     """Fly, collide, deposit, scatter."""
-    trace, ends = setting.trace, setting.trace.ends
-    met, outcomes, ratio = plates_ahead(setting, p, u[DIMENSIONS:])
+    plan, ends = setting.plan, setting.plan.ends
+    met, outcomes, ratio = plates_ahead(setting, p, draw.ahead)
     events = events_of(setting, met, outcomes)
     limit = nearest(p, events)
     budget = stop(setting.budget(p))
     if setting.medium is not None and setting.surfaces:
-        w, limit, turned = aim(setting, p, limit, events, (order > 0) & (limit < budget))
+        w, limit, turned = rays_to_surfaces(setting, p, limit, events, (order > 0) & (limit < budget))
         p = eqx.tree_at(lambda p: (p.w, p.weight), p, (w, p.weight * turned))
     # One number says in which stratum the photon goes on, and where in each stratum the points are.
-    chosen = jnp.minimum(jnp.floor(u[0] * ends), ends - 1)
-    strata = jnp.stack([(i + (u[0] * ends - chosen)) / ends for i in range(ends)])
+    chosen = jnp.minimum(jnp.floor(draw.flight * ends), ends - 1)
+    strata = jnp.stack([(i + (draw.flight * ends - chosen)) / ends for i in range(ends)])
     wide = functools.partial(jnp.broadcast_to, shape=strata.shape)
     flights = fly(setting, p, limit, budget, jnp.maximum(strata, 1e-9))
-    p, u, flights, events, limit = lax.optimization_barrier((p, u, flights, events, limit))
+    p, draw, flights, events, limit = lax.optimization_barrier((p, draw, flights, events, limit))
 
     def pick(a: Array) -> Array:
         return jnp.take_along_axis(a, chosen.astype(jnp.int32)[None], 0, mode="promise_in_bounds")[0]
@@ -176,18 +171,18 @@ def _one_order(setting: Setting, p: Photons, tally: HigherOrders, u: list[Scalar
         passed = wide(p.alive & (d < FAR)) & ((wide(d) < flights.distance) | ~flights.event) & ~own
         weight = weight * jnp.where(passed | (flights.landed & own), wide(ratio[i]), 1.0)
         through = passed & wide(o == THROUGH)
-        scatterer = trace.surfaces[i]
+        scatterer = plan.surfaces[i]
         gone = pick(jnp.where(through, weight, 0.0))
         tally = _arrive(tally, scatterer.material, pick(history), gone)
         history = jnp.where(through, setting.grow(history, scatterer.transmitted), history)
-        weight = jnp.where(through, weight / (1.0 - trace.lobe), weight)
-        tally = _leave(tally, scatterer.material, pick(history), gone / (1.0 - trace.lobe))
+        weight = jnp.where(through, weight / (1.0 - plan.lobe), weight)
+        tally = _leave(tally, scatterer.material, pick(history), gone / (1.0 - plan.lobe))
 
-    if trace.drawn_first:
-        tally = _return(setting, p, flights, events, limit, weight, history, u, tally)
+    if plan.drawn_first:
+        tally = _return(setting, p, flights, events, limit, weight, history, draw, tally)
     else:
         # The first order is deterministic and has been deposited.
-        given = (setting, p, flights, events, limit, weight, history, u)
+        given = (setting, p, flights, events, limit, weight, history, draw)
         tally = lax.cond(order > 0, lambda t: _return(*given, t), lambda t: t, tally)
 
     flight, weight, history = jax.tree.map(pick, (flights, weight, history))
@@ -201,14 +196,15 @@ def _one_order(setting: Setting, p: Photons, tally: HigherOrders, u: list[Scalar
         ),
     )
     flown = jnp.where(flight.event, flight.distance, 0.0)
-    hit = collide(setting, p.w, flight.cell, flight.collided, flight.landed, events, limit, u)
+    x = along(p.x, p.w, flown)
+    landed = flight.landed_on(events, limit)
+    hit = collide(setting, x, p.w, flight.cell, flight.collided, landed, draw)
     weight = jnp.where(flight.event, weight, 0.0)
     tally = _arrive(tally, hit.material, history, weight)
     history = setting.grow(history, hit.letter)
     weight = weight * hit.ratio * hit.onward
     tally = _leave(tally, hit.material, history, weight)
-    x = along(p.x, p.w, flown)
-    return Photons(x, hit.w, p.path + flown, weight, history, hit.on, hit.facing, flight.event), tally
+    return Photons(x, hit.w, p.path + flown, weight, history, hit.on, hit.sent, flight.event), tally
 
 
 def _return(
@@ -219,21 +215,22 @@ def _return(
     limit: Scalar,
     weight: Float[Array, "ends photons"],
     history: Int[Array, "ends photons"],
-    u: list[Scalar],
+    draw: Draw,
     tally: HigherOrders,
 ) -> HigherOrders:
     """Deposit from every end of the flights its share of what is expected to return."""
-    ends = setting.trace.ends
+    ends = setting.plan.ends
 
     def flat(tree):
         return jax.tree.map(lambda a: jnp.broadcast_to(a, (ends, a.shape[-1])).reshape(-1), tree)
 
-    p, flights, events, limit, u, history = flat((p, flights, events, limit, u, history))
+    p, flights, events, limit, draw, history = flat((p, flights, events, limit, draw, history))
     flown = jnp.where(flights.event, flights.distance, 0.0)
-    hit = collide(setting, p.w, flights.cell, flights.collided, flights.landed, events, limit, u)
-    value = jnp.where(flights.event, flat(weight), 0.0) * hit.ratio / ends
     x = along(p.x, p.w, flown)
-    given = lax.optimization_barrier((p.w, x, p.path + flown, value, history, hit, u))
+    landed = flights.landed_on(events, limit)
+    hit = collide(setting, x, p.w, flights.cell, flights.collided, landed, draw)
+    value = jnp.where(flights.event, flat(weight), 0.0) * hit.ratio / ends
+    given = lax.optimization_barrier((p.w, x, p.path + flown, value, history, hit, draw))
     return _deposit(setting, tally, *given)
 
 
@@ -254,12 +251,12 @@ def _deposit(
     weight: Scalar,
     history: Int[Array, "photons"],
     hit: Hit,
-    u: list[Scalar],
+    draw: Draw,
 ) -> HigherOrders:
     """Return what is expected to reach the sensor from each collision."""
-    beam, trace, medium = setting.beam, setting.trace, setting.medium
+    beam, plan, medium = setting.beam, setting.plan, setting.medium
     v = beam.view(x)
-    reflected, transmitted = view_factors(setting, w, v, hit)
+    reflected, transmitted = view_factors(setting, x, w, v, hit)
     if medium is None:
         clear = jnp.ones_like(path)
     elif setting.column is not None:
@@ -267,13 +264,15 @@ def _deposit(
         clear = jnp.exp(-jax.vmap(lambda x: depth_to_top(medium, x, column))(x))
     else:
         none, far = jnp.zeros((0, path.size)), jnp.full_like(path, FAR)
-        clear = jnp.exp(-free_flight(medium, x, v, none, far, weight > 0, trace.march_steps).total)
-    drawn = iter(u[DIMENSIONS + sum(s.plate for s in setting.surfaces) :])
-    for i, (s, scatterer) in enumerate(zip(setting.surfaces, trace.surfaces)):
+        clear = jnp.exp(-free_flight(medium, x, v, none, far, weight > 0, plan.march_steps).total)
+    drawn = iter(draw.behind)
+    for i, (s, scatterer) in enumerate(zip(setting.surfaces, plan.surfaces)):
         if not s.plate:
             continue
         covered = next(drawn) < s.coverage
-        crossed = (s.distance(x, v) < FAR) & (hit.on != i)
+        crossed = s.distance(x, v) < FAR
+        if not s.shape.lights_itself:
+            crossed &= hit.on != i
         c = jnp.broadcast_to(s.coverage, path.shape)
         ratio = ratio_of(jnp.where(covered, c, 1.0 - c))
         if s.straight:

@@ -16,7 +16,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxlidar._vectors import FAR, Scalar, Vec
 from jaxlidar.optics.leaf_angles import ANGLE_NODES, LeafAngles
-from jaxlidar.scenes.voxels import VoxelMap
+from jaxlidar.optics.phase import AbstractPhase
+from jaxlidar.scenes.canopy import Canopy
 
 # Steps between two looks at whether any ray of the batch still moves.
 BLOCK = 16
@@ -52,6 +53,8 @@ class Medium(eqx.Module):
     origin: Float[Array, "3"]
     angles: AngleTables | None
     leaf_angles: LeafAngles | None
+    leaf_phase: AbstractPhase | None
+    bark_phase: AbstractPhase | None
     shape: tuple[int, int, int] = eqx.field(static=True)
     periodic: bool = eqx.field(static=True)
 
@@ -79,8 +82,9 @@ def _pick(table: Float[Array, "cells"], cell: Int[Array, "*s"]) -> Scalar:
     return table.at[cell].get(mode="promise_in_bounds")
 
 
-def medium_of(voxels: VoxelMap, aim: Float[Array, "3"], periodic: bool, leaf_factor: Scalar) -> Medium:
-    """Lay out a voxel map; `leaf_factor` scales leaf extinction (1 - T where transmission is straight)."""
+def medium_of(canopy: Canopy, aim: Float[Array, "3"], leaf_factor: Scalar) -> Medium:
+    """Lay out a canopy; `leaf_factor` scales leaf extinction (1 - T where transmission is straight)."""
+    voxels = canopy.voxels
     leaf = None if voxels.leaf is None else voxels.leaf.reshape(-1) * leaf_factor
     bark = None if voxels.bark is None else voxels.bark.reshape(-1)
     angles = None
@@ -90,15 +94,17 @@ def medium_of(voxels: VoxelMap, aim: Float[Array, "3"], periodic: bool, leaf_fac
     if angles is None:
         total = leaf if bark is None else (bark if leaf is None else leaf + bark)
     return Medium(
-        leaf,
-        bark,
-        total,
-        voxels.voxel_size,
-        voxels.origin - aim,
-        angles,
-        voxels.leaf_angles if angles is not None else None,
-        voxels.shape,
-        periodic,
+        leaf=leaf,
+        bark=bark,
+        total=total,
+        size=voxels.voxel_size,
+        origin=voxels.origin - aim,
+        angles=angles,
+        leaf_angles=voxels.leaf_angles if angles is not None else None,
+        leaf_phase=None if leaf is None else canopy.leaf_phase,
+        bark_phase=None if bark is None else canopy.bark_phase,
+        shape=voxels.shape,
+        periodic=canopy.sides == "periodic",
     )
 
 

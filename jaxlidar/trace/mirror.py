@@ -22,7 +22,7 @@ from jax.scipy.special import i0e
 from jaxtyping import Array, Float
 
 from jaxlidar._vectors import Scalar, dot, to_frame, vec
-from jaxlidar.optics.laws import Specular
+from jaxlidar.optics.laws import AbstractMirror
 from jaxlidar.trace.footprint import GOLDEN, Beam, across_beam, disc
 from jaxlidar.trace.surfaces import Surface
 
@@ -42,16 +42,18 @@ def mirror_rays(
     The apparent reflectance is per unit reflectance and for a transparent way. Small angles are assumed
     between the beam's axis and the mirror image of it.
     """
-    assert isinstance(surface.law, Specular)
+    assert isinstance(surface.law, AbstractMirror)
     r, a = beam.slant_range, beam.half_angle * beam.slant_range
     # Along the axis; the mirror may lie above the reference plane, before the aim point.
-    towards = dot(surface.normal, beam.axis)
+    aim = vec(jnp.zeros(3, r.dtype))
+    upward, offset = surface.shape.tangent(aim)
+    towards = dot(upward, beam.axis)
     parallel = jnp.abs(towards) < 1e-9
-    distance = r + jnp.where(parallel, 0.0, surface.offset / jnp.where(parallel, 1.0, towards))
+    distance = r + jnp.where(parallel, 0.0, offset / jnp.where(parallel, 1.0, towards))
     # From here on the beam is as wide as it is on the mirror.
     wider = distance / r
     beam = eqx.tree_at(lambda b: b.radius, beam, beam.radius * wider)
-    normal = surface.lit_normal(beam.axis)
+    normal = surface.lit_normal(aim, beam.axis)
     cosine = -dot(normal, beam.axis)
     # Where the image of the axis meets the receiver's plane: along the normal's part across the axis.
     miss = vec(2.0 * cosine * distance * (n + cosine * k) for n, k in zip(normal, beam.axis))

@@ -8,11 +8,42 @@ Photons of one batch are not independent: standard errors come from batches with
 Independent numbers are there to be compared with.
 """
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray, UInt32
+
+Uniform = Float[Array, "..."]
+
+
+class Draw(eqx.Module):
+    """The uniform numbers of one order of a photon's path, by what they decide.
+
+    - `flight`: where the flight ends. - `choice`: which material is hit, and whether light is reflected.
+    - `normal`: of the facet that is hit. - `direction`: onward. - `ahead`, `behind`: for each plate, whether
+      light on its way, and on the way back to the sensor, meets it.
+    """
+
+    flight: Uniform
+    choice: Uniform
+    normal: tuple[Uniform, Uniform]
+    direction: tuple[Uniform, Uniform]
+    ahead: tuple[Uniform, ...]
+    behind: tuple[Uniform, ...]
+
+    @staticmethod
+    def of(numbers: Sequence[Uniform], plates: int) -> "Draw":
+        """Out of six numbers and two, or one, for each plate."""
+        a, b, c, d, e, f, *rest = numbers
+        return Draw(a, b, (c, d), (e, f), tuple(rest[:plates]), tuple(rest[plates:]))
+
+    @staticmethod
+    def dimensions(plates: int, *, back: bool = True) -> int:
+        """How many numbers an order takes; `back`: whether light returns from every collision."""
+        return 6 + plates * (2 if back else 1)
 
 
 class Lattices(eqx.Module):
@@ -40,7 +71,7 @@ class Independent(eqx.Module):
         return list(_to_unit(jax.random.bits(key, (self.dims, photon.size), jnp.uint32)))
 
 
-def draws(key: PRNGKeyArray, orders: int, dims: int) -> Lattices:
+def lattices(key: PRNGKeyArray, orders: int, dims: int) -> Lattices:
     """Lattices for `orders` collisions of `dims` numbers each."""
     a, b = jax.random.split(key)
     step = jax.random.bits(a, (orders, dims), jnp.uint32) | jnp.uint32(1)

@@ -1,18 +1,36 @@
-"""Rays that head for a surface, and how they move with the geometry."""
+"""Reparametrised rays: how rays move with the geometry, so that derivatives of what jumps are unbiased.
+
+The optical depth of a ray jumps where it crosses from one column of voxels to the next. Rays are therefore
+moved along with the columns, and their weights by the change of density that this makes. Values do not
+change, only derivatives. (In rendering the idea is known as reparametrising discontinuous integrands: Loubet
+et al. 2019, ACM Trans. Graph. 38, 228.)
+"""
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Bool
 
-from jaxlidar._vectors import Scalar, add, along, dot, from_frame, scale, to_frame, vec, with_derivative_of
-from jaxlidar.trace.collisions import drawn_density
+from jaxlidar._vectors import (
+    Scalar,
+    Vec,
+    add,
+    along,
+    dot,
+    from_frame,
+    scale,
+    to_frame,
+    vec,
+    with_derivative_of,
+)
 from jaxlidar.trace.footprint import Beam
 from jaxlidar.trace.march import Medium
-from jaxlidar.trace.photons import Photons, Setting, ratio_of, stop
+from jaxlidar.trace.photons import Photons, ratio_of, stop
+from jaxlidar.trace.setting import Setting
 
 
-def aim(setting: Setting, p: Photons, limit: Scalar, events: list[Scalar], heading: Bool[Array, "photons"]):
+def rays_to_surfaces(
+    setting: Setting, p: Photons, limit: Scalar, events: list[Scalar], heading: Bool[Array, "photons"]
+) -> tuple[Vec, Scalar, Scalar]:
     """Direction, distance and density ratio of rays towards a surface, as geometry moves them.
 
     The transmittance of the way back jumps where a landing point crosses from below one column of
@@ -30,8 +48,9 @@ def aim(setting: Setting, p: Photons, limit: Scalar, events: list[Scalar], headi
     normal, offset = vec(jnp.zeros_like(reach) for _ in range(3)), jnp.zeros_like(reach)
     for s, d in zip(setting.surfaces, events):
         here = d <= limit
-        normal = vec(jnp.where(here, n, m) for n, m in zip(s.normal, normal))
-        offset = jnp.where(here, s.offset, offset)
+        own, at = s.shape.tangent(direct)
+        normal = vec(jnp.where(here, n, m) for n, m in zip(own, normal))
+        offset = jnp.where(here, at, offset)
     upright = jnp.where(heading, normal[2], 1.0)
 
     def on_surface(x, y):
@@ -50,7 +69,7 @@ def aim(setting: Setting, p: Photons, limit: Scalar, events: list[Scalar], headi
     w, far = seen_from(column)
     # Per area of the map, from which the sloping surface is projected.
     density = (
-        drawn_density(p.facing, w) * jnp.abs(dot(normal, w) / upright) / (far * far) * (size[0] * size[1])
+        setting.density(p.sent, w) * jnp.abs(dot(normal, w) / upright) / (far * far) * (size[0] * size[1])
     )
     ratio = jnp.where(heading, ratio_of(density), 1.0)
 
@@ -73,7 +92,7 @@ def aim(setting: Setting, p: Photons, limit: Scalar, events: list[Scalar], headi
     return w, far, with_derivative_of(jnp.ones_like(far), jnp.where(heading, turned, 1.0))
 
 
-def hold_in_columns(
+def footprint_rays(
     beam: Beam, medium: Medium | None, across: tuple[Scalar, Scalar]
 ) -> tuple[tuple[Scalar, Scalar], Scalar]:
     """Let the rays of the footprint move with the columns of the grid, and their energy accordingly.
@@ -92,13 +111,13 @@ def hold_in_columns(
     flat = along(across_axis, beam.axis, -across_axis[2] / beam.axis[2])
     moved = []
     for k in range(2):
-        place = lax.stop_gradient((flat[k] - medium.origin[k]) / medium.size[k])
+        place = stop((flat[k] - medium.origin[k]) / medium.size[k])
         now = medium.origin[k] + medium.size[k] * place
-        moved.append(jnp.where(wide, now - lax.stop_gradient(now), 0.0))
+        moved.append(jnp.where(wide, now - stop(now), 0.0))
     shift = to_frame(beam.axis, (*moved, jnp.zeros_like(across[0])))
     across = (across[0] + shift[0], across[1] + shift[1])
     # Rays lie farther apart where voxels or the beam are wider.
     area = medium.size[0] * medium.size[1] * beam.radius**2
     density = jnp.where(wide, beam.irradiance(across) * area, 1.0)
-    held = lax.stop_gradient(density)
+    held = stop(density)
     return across, 1.0 + (density - held) / jnp.maximum(held, 1e-30)
