@@ -1,24 +1,43 @@
-"""Retrievals: what a scene must be like for a lidar to have recorded a waveform."""
+"""Retrieval of scene properties from waveforms: fits with standard errors, and tools that need no model."""
 
-from .batch import Progress as Progress
-from .batch import Retrievals as Retrievals
-from .batch import retrieve_many as retrieve_many
-from .decomposition import Echoes as Echoes
-from .decomposition import find_ground as find_ground
-from .decomposition import gap_probability as gap_probability
-from .decomposition import gaussian_decomposition as gaussian_decomposition
-from .decomposition import plant_area_index as plant_area_index
-from .decomposition import relative_heights as relative_heights
-from .decomposition import richardson_lucy as richardson_lucy
-from .decomposition import wiener as wiener
-from .identifiability import CramerRao as CramerRao
-from .identifiability import Profile as Profile
-from .identifiability import cramer_rao as cramer_rao
-from .identifiability import profile_likelihood as profile_likelihood
-from .leaves import LeafFit as LeafFit
-from .leaves import invert_leaves as invert_leaves
-from .result import Retrieval as Retrieval
-from .result import Step as Step
-from .retrieval import retrieve as retrieve
-from .unknowns import LogNormal as LogNormal
-from .unknowns import Unknown as Unknown
+from .batch import Progress, Retrievals, retrieve_many
+from .decomposition import (
+    Echoes,
+    find_ground,
+    gap_probability,
+    gaussian_decomposition,
+    plant_area_index,
+    relative_heights,
+    richardson_lucy,
+    wiener,
+)
+from .identifiability import CramerRao, Profile, cramer_rao, profile_likelihood
+from .leaves import LeafFit, invert_leaves
+from .result import Retrieval, Step
+from .retrieval import retrieve
+from .unknowns import LogNormal, Unknown
+
+__all__ = [
+    "CramerRao",
+    "Echoes",
+    "LeafFit",
+    "LogNormal",
+    "Profile",
+    "Progress",
+    "Retrieval",
+    "Retrievals",
+    "Step",
+    "Unknown",
+    "cramer_rao",
+    "find_ground",
+    "gap_probability",
+    "gaussian_decomposition",
+    "invert_leaves",
+    "plant_area_index",
+    "profile_likelihood",
+    "relative_heights",
+    "retrieve",
+    "retrieve_many",
+    "richardson_lucy",
+    "wiener",
+]

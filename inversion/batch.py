@@ -1,8 +1,8 @@
-"""Many fits at once: waveforms of as many footprints, simulated together, each fitted on its own.
+"""Retrieval from many waveforms: footprints are simulated together, and each is fitted on its own.
 
-Fits run side by side in lanes. What they want simulated is gathered and simulated in one compiled call, and
-sent back; a lane whose fit has ended takes the next footprint. A fit that fails says so and leaves the others
-as they are.
+Fits run side by side in lanes. The simulations that they request are gathered, run in one compiled call, and
+sent back. A lane whose fit has ended takes the next footprint. A fit that fails is marked as such and does
+not affect the others.
 """
 
 import dataclasses
@@ -32,7 +32,19 @@ from .unknowns import Settled, Unknown, settle, start_from
 
 @dataclasses.dataclass(frozen=True)
 class Progress:
-    """How far a batch has come: fits ended, of how many, how many of them converged."""
+    """Progress of `retrieve_many`.
+
+    - `done`: fits that have ended.
+    - `total`: fits in all.
+    - `converged`: fits that have converged.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> import inversion
+    >>> print(inversion.Progress(done=3, total=10, converged=2))
+    3 of 10 fits, 2 converged
+    """
 
     done: int
     total: int
@@ -44,12 +56,32 @@ class Progress:
 
 @final
 class Retrievals(eqx.Module):
-    """Fitted footprints, in the order given. Arrays have a leading axis `footprints`; see `Retrieval`.
+    """The results of `retrieve_many`: one fit per footprint, in the order given.
 
-    - `values`, `stderr`: by name. - `covariance`: (footprints, n, n).
-    - `reduced_chi2`: (footprints,). - `converged`: (footprints,). - `status`: a sentence for each.
-    - `steps`: (footprints,) waveforms simulated. - `fitted`: (footprints, wavelengths, bins) apparent
-      reflectance, without the scale. - `labels`: names of the rows of `covariance`.
+    Arrays have a leading axis `footprints`. The quantities are those of `Retrieval`.
+
+    - `values`: by name, (footprints, ...) best values.
+    - `stderr`: by name, (footprints, ...) one standard error; infinite where the data do not constrain the
+      unknown.
+    - `covariance`: (footprints, n, n).
+    - `reduced_chi2`: (footprints,).
+    - `converged`: (footprints,) whether the fit ended at a minimum.
+    - `steps`: (footprints,) waveforms simulated, each with its Jacobian.
+    - `fitted`: (footprints, wavelengths, bins) apparent reflectance, without the scale.
+    - `status`: a sentence for each footprint on how its fit ended.
+    - `labels`: names of the rows of `covariance`.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> import inversion, jax
+    >>> scene = jl.Scene(ground=jl.Ground(height=0.5))
+    >>> wave = jl.simulate(jl.Lidar(), scene, key=jax.random.key(0))
+    >>> unknown = inversion.Unknown(lambda s: s.ground.reflectance, bounds=(0.0, 1.0), name="brightness")
+    >>> more = {"noise": 0.001, "time": wave.time, "key": jax.random.key(1)}
+    >>> fits = inversion.retrieve_many(wave.reflectance[None], jl.Lidar(), scene, [unknown], **more)
+    >>> fits.labels, fits.covariance.shape, fits.converged.tolist()
+    (('brightness',), (1, 1, 1), [True])
     """
 
     values: dict[str, Float[np.ndarray, "footprints ..."]]
@@ -63,7 +95,13 @@ class Retrievals(eqx.Module):
     labels: tuple[str, ...] = eqx.field(static=True)
 
     def to_xarray(self) -> Any:
-        """As an `xarray.Dataset` over `footprint`. **Raises:** ImportError where xarray is not installed."""
+        """The results as an `xarray.Dataset` over the dimension `footprint`.
+
+        **Returns:** an `xarray.Dataset` with a variable for each unknown, "... stderr" for its standard
+        error, and `reduced_chi2`, `converged`, `steps`, `status` and `fitted`.
+
+        **Raises:** ImportError where xarray is not installed.
+        """
         import xarray
 
         def variable(name: str, array: np.ndarray) -> tuple:
@@ -104,23 +142,46 @@ def retrieve_many(
     path: str | os.PathLike[str] | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> Retrievals:
-    """Fit the unknowns of a scene to many waveforms, each on its own, as `retrieve` does.
+    """Retrieve unknowns of a scene from many waveforms, each on its own, as `retrieve` does for one.
 
-    **Arguments:** those of `retrieve`, but
+    A fit that fails says so in its status and does not affect the others.
 
-    - `observed`: (footprints, wavelengths, bins) apparent reflectance.
-    - `lidar`, `scene`: one for all, or one for each footprint, alike but for the values of their arrays
-      (such as transmit pulses, or starting values).
-    - `noise`: one standard deviation, anything that broadcasts to `observed`.
-    - `time`: (bins,) ns, of all.
-    - `plan`: for all. Default: made for the first lidar and scene and the bounds' corners.
-    - `start`: by name, (footprints, ...) values that unknowns start from, instead of their own.
-    - `lanes`: how many are simulated together: memory grows with it. Default 16.
-    - `path`: of an .npz file that keeps what is done; if it is there, the fits in it are not repeated. It is
-      written after every few fits, and when interrupted. Default None: nothing is kept.
+    **Arguments:**
+
+    - `observed`: (footprints, wavelengths, bins) apparent reflectance, or in any other unit with `scale`.
+    - `lidar`, `scene`: one for all footprints, or one for each. Those of different footprints may differ only
+      in the values of their arrays (such as transmit pulses, or starting values).
+    - `noise`: one standard deviation, in [0, inf], anything that broadcasts to `observed`.
+    - `time`: (bins,) ns, the same for all footprints.
+    - `unknowns`, `key`, `n_photons`, `n_rays`, `max_orders`: as for `retrieve`.
+    - `solver`, `max_steps`, `starts`, `scale`, `noise_floor`: as for `retrieve`.
+    - `plan`: one for all footprints. Default None: made for the first lidar and scene and the corners of the
+      bounds.
+    - `start`: by name, (footprints, ...) values that unknowns start from. Default None: their own.
+    - `lanes`: number of footprints simulated together, at least 1; memory grows with it. Default 16.
+    - `path`: an .npz file, the checkpoint of finished fits. Where it exists, the fits in it are not repeated.
+      It is written after every few fits, and when interrupted. It belongs to `observed`, `noise` and the
+      names and bounds of the unknowns; changes of other arguments are not noticed. Default None: no file.
     - `progress`: called with a `Progress` after every fit.
 
-    **Raises:** ValueError for inadmissible arguments, and for a `path` with other footprints or unknowns.
+    **Returns:** a `Retrievals`.
+
+    **Raises:** ValueError for inadmissible arguments, and for a `path` that is damaged or belongs to other
+    footprints, noise, bounds or unknowns.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> import inversion, jax
+    >>> import numpy as np
+    >>> scene = jl.Scene(ground=jl.Ground(height=0.5, reflectance=0.4))
+    >>> wave = jl.simulate(jl.Lidar(), scene, key=jax.random.key(0))
+    >>> unknown = inversion.Unknown(lambda s: s.ground.reflectance, bounds=(0.0, 1.0), name="brightness")
+    >>> observed = np.stack([0.5 * wave.reflectance, wave.reflectance])
+    >>> more = {"noise": 0.001, "time": wave.time, "key": jax.random.key(1)}
+    >>> fits = inversion.retrieve_many(observed, jl.Lidar(), scene, [unknown], **more)
+    >>> fits.values["brightness"].round(3).tolist()
+    [0.2, 0.4]
     """
     y = np.asarray(observed, float)
     if y.ndim != 3 or len(y) == 0:
@@ -199,7 +260,7 @@ def retrieve_many(
 
 
 def _started(settled: list[list[Settled]], start: Mapping[str, ArrayLike], count: int) -> list[list[Settled]]:
-    """The unknowns of every footprint, with its own starting values; one list where all are alike."""
+    """The unknowns of every footprint, with its own starting values; one list where all are the same."""
     shapes = {s.name: s.start.shape for s in settled[0]}
     given = {}
     for name, values in start.items():
@@ -222,7 +283,7 @@ def _started(settled: list[list[Settled]], start: Mapping[str, ArrayLike], count
 
 
 def _fixed(lidar: Lidar) -> Lidar:
-    # Samples lie at the given times, whatever opened the window.
+    # Samples lie at the given times, whatever opened the recording window.
     return dataclasses.replace(lidar, receiver=dataclasses.replace(lidar.receiver, window="fixed"))
 
 
@@ -241,7 +302,7 @@ def _one_each(field: str, given: Any, count: int) -> list[Any]:
 
 
 class _Simulator:
-    """Simulates what all lanes want in one compiled call; several threads share the lanes."""
+    """Simulates the requests of all lanes in one compiled call; several threads share the lanes."""
 
     def __init__(
         self,
@@ -317,7 +378,7 @@ def _simulate(problem: Problem, values: Any, keys: Array, own: Own) -> tuple[Arr
         axes = (0 if own.lidar else None, 0 if own.scene else None, 0)
         return jax.vmap(one, in_axes=axes)(lidar, scene, values)
 
-    # Together, photons of all lanes would go on until the last one of them is gone.
+    # Batched with vmap, every lane would be traced until the photons of the slowest have ended.
     def in_turn(each: tuple) -> tuple[Array, Array, Array]:
         return one(each[0] if own.lidar else lidar, each[1] if own.scene else scene, each[2])
 

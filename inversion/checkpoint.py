@@ -1,4 +1,4 @@
-"""What is kept of a batch of fits, and the file that keeps it."""
+"""Checkpoint of finished fits: its rows and its file."""
 
 import dataclasses
 import hashlib
@@ -17,7 +17,7 @@ from .unknowns import Settled
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """What is kept of a fit."""
+    """Checkpoint of one finished fit."""
 
     values: np.ndarray
     stderr: np.ndarray
@@ -30,13 +30,13 @@ class Row:
 
 
 def row_of(o: Outcome) -> Row:
-    """What is kept of how a fit ended."""
+    """The row of a fit's outcome."""
     total = np.asarray(o.evaluation.total)
     return Row(o.values, o.stderr, o.covariance, o.reduced_chi2, o.converged, o.steps, total, o.status)
 
 
 def fingerprint(y: np.ndarray, sigma: np.ndarray, names: list[Settled]) -> str:
-    """Of the data and the unknowns that fits belong to."""
+    """Hash of the data and of the names and bounds of the unknowns that fits belong to."""
     digest = hashlib.sha256()
     for array in (y, np.ascontiguousarray(sigma), *(a for s in names for a in (s.low, s.high))):
         digest.update(np.ascontiguousarray(array).tobytes())
@@ -45,7 +45,7 @@ def fingerprint(y: np.ndarray, sigma: np.ndarray, names: list[Settled]) -> str:
 
 
 class Kept:
-    """The file that keeps what is done; with the path None, nothing is kept.
+    """The checkpoint file of finished fits. With the path None, nothing is written.
 
     **Raises:** ValueError where the file is damaged or has another fingerprint.
     """
@@ -72,7 +72,7 @@ class Kept:
             self.rows[i] = Row(**{name: v if v.ndim else v.item() for name, v in fields.items()})
 
     def write(self) -> None:
-        """Put all rows into the file."""
+        """Write all rows to the file."""
         if self.path is None or not self.rows:
             return
         order = sorted(self.rows)

@@ -1,4 +1,4 @@
-"""What was measured, checked: waveforms and their noise."""
+"""Checked observations: waveforms, their sample times and their noise."""
 
 from typing import NamedTuple
 
@@ -18,12 +18,12 @@ class Data(NamedTuple):
 
     @property
     def used(self) -> np.ndarray:
-        """Which samples count."""
+        """Which samples are fitted."""
         return np.isfinite(self.sigma)
 
 
 def data_of(observed: object, time: object, noise: object, floor: float, lidar: Lidar) -> Data:
-    """Read and check the arguments of `retrieve`. **Raises:** ValueError."""
+    """Read and check the observations passed to `retrieve`. **Raises:** ValueError where inadmissible."""
     if isinstance(observed, Waveform):
         if time is not None:
             raise ValueError("time is given, but observed is a Waveform, which has its own")
@@ -75,7 +75,7 @@ def _array(field: str, x: object) -> np.ndarray:
 
 
 def time_axis(time: object, lidar: Lidar) -> Float[np.ndarray, " bins"]:
-    """The sample times in double precision. **Raises:** ValueError unless a sampling interval apart."""
+    """Sample times in double precision. **Raises:** ValueError unless they lie a sampling interval apart."""
     t = _array("time", time)
     if t.ndim != 1 or t.size == 0 or not np.all(np.isfinite(t)):
         raise ValueError(f"time has the shape {t.shape}; admissible is (bins,), finite, one bin or more")

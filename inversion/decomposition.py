@@ -1,9 +1,9 @@
-r"""What waveforms are compared by, without a model of the scene: echoes, deconvolution, heights, gaps.
+r"""Waveform processing without a model of the scene: echoes, deconvolution, heights, gap probability.
 
-Everything takes single waveforms, (bins,), and can be batched with `jax.vmap`. Functions of a waveform's
-numbers alone are differentiable in them: `relative_heights`, `gap_probability`, `plant_area_index`,
-`richardson_lucy`, `wiener`. What counts or chooses (`gaussian_decomposition`, `find_ground`) has derivatives
-of what it chose.
+All functions take single waveforms, (bins,), and can be batched with `jax.vmap`. `relative_heights`,
+`gap_probability`, `plant_area_index`, `richardson_lucy` and `wiener` are differentiable in the waveform.
+`gaussian_decomposition` and `find_ground` make discrete choices (the number of echoes, the lowest mode);
+their derivatives are those for the choice made.
 """
 
 from collections.abc import Sequence
@@ -19,20 +19,33 @@ from jaxlidar.extend import as_array, check_range
 
 _SOLVER = optx.LevenbergMarquardt(rtol=1e-4, atol=1e-4)
 _STEPS = 60
-# An echo is no narrower than this share of the pulse, and no wider than so many of it.
+# Least and largest width of an echo, in widths of the pulse.
 _NARROWEST, _WIDEST = 0.5, 8.0
 
 Samples = Float[Array, " bins"]
 
 
 class Echoes(NamedTuple):
-    """Gaussian echoes of a waveform, in the order of time; those beyond `count` are zero.
+    """Gaussian echoes of a waveform, in order of time; entries beyond `count` are zero.
 
-    - `amplitude`, `time`, `width`: (echoes,) height of the peak, its place in ns, standard deviation in ns.
-    - `stderr`: (echoes, 3) one standard error of each of the three.
-    - `count`: how many echoes there are.
-    - `model`: (bins,) their sum. - `chi2`: sum of squared residuals over `noise`. - `criterion`: Bayesian
-      information criterion, chi2 + 3 count ln(bins).
+    - `amplitude`: (echoes,) height of the peak, in units of the waveform.
+    - `time`: (echoes,) time of the peak in ns.
+    - `width`: (echoes,) standard deviation in ns.
+    - `stderr`: (echoes, 3) one standard error of each of the three above.
+    - `count`: number of echoes.
+    - `model`: (bins,) the sum of the echoes.
+    - `chi2`: sum of squared residuals over `noise`.
+    - `criterion`: Bayesian information criterion, chi2 + 3 count ln(bins).
+
+    **Example:**
+
+    >>> import inversion, jax, numpy as np
+    >>> time = np.arange(0.0, 60.0)
+    >>> power = np.exp(-0.5 * ((time - 20.0) / 3.0) ** 2)
+    >>> decompose = jax.jit(lambda y: inversion.gaussian_decomposition(time, y, noise=0.01, width=3.0))
+    >>> echoes = decompose(power)
+    >>> print(f"{int(echoes.count)}: {float(echoes.time[0]):.1f} ns, width {float(echoes.width[0]):.1f} ns")
+    1: 20.0 ns, width 3.0 ns
     """
 
     amplitude: Float[Array, " echoes"]
@@ -53,22 +66,36 @@ def gaussian_decomposition(
     width: Float[ArrayLike, ""],
     max_echoes: int = 6,
 ) -> Echoes:
-    """A waveform as a sum of Gaussians, as many as the Bayesian information criterion asks for.
+    """Gaussian decomposition of a waveform, with the number of echoes by the Bayesian information criterion.
 
     Echoes are added one at a time where the residual, smoothed by the pulse, is largest, and all are fitted
-    again by Levenberg-Marquardt; of the sums of 0 .. `max_echoes` the one of the least criterion is kept.
+    again by Levenberg-Marquardt. Of the fits with 0 to `max_echoes` echoes, the one with the lowest criterion
+    is returned. No echo is negative. Call it within `jax.jit`, which compiles faster than single operations.
 
     **Arguments:**
 
-    - `time`: (bins,) ns, increasing in equal steps. - `power`: (bins,) background removed.
-    - `noise`: standard deviation, of all samples or of each.
-    - `width`: standard deviation of the pulse in ns, from which echoes start; they end between half of it
-      and eight times it.
-    - `max_echoes`: at least 1. Default 6.
+    - `time`: (bins,) ns, increasing in equal steps.
+    - `power`: (bins,) waveform in any unit, background removed.
+    - `noise`: standard deviation of `power`, above 0, one number or (bins,).
+    - `width`: standard deviation of the pulse in ns, above 0. Widths of echoes start from it and end between
+      half of it and eight times it.
+    - `max_echoes`: most echoes, at least 1. Default 6.
+
+    **Returns:** an `Echoes`, with `max_echoes` entries.
 
     **Raises:** ValueError for inadmissible arguments.
 
     **Source:** Wagner et al. (2006), ISPRS J. Photogramm. 60, 100; Schwarz (1978), Ann. Stat. 6, 461.
+
+    **Example:**
+
+    >>> import inversion, jax, numpy as np
+    >>> time = np.arange(0.0, 60.0)
+    >>> power = sum(a * np.exp(-0.5 * ((time - t) / 3.0) ** 2) for a, t in ((1.0, 20.0), (0.5, 40.0)))
+    >>> decompose = jax.jit(lambda y: inversion.gaussian_decomposition(time, y, noise=0.01, width=3.0))
+    >>> echoes = decompose(power)
+    >>> [f"{float(t):.1f}" for t in echoes.time[: echoes.count]]
+    ['20.0', '40.0']
     """
     t, y = as_array(time), as_array(power)
     sigma = jnp.broadcast_to(as_array(noise), y.shape)
@@ -90,7 +117,7 @@ def _decompose(t: Samples, y: Samples, sigma: Samples, width: Array, most: int) 
     scale = jnp.maximum(jnp.max(jnp.abs(y)), jnp.finfo(y.dtype).tiny)
 
     def unpack(p: Float[Array, "echoes 3"]) -> tuple[Array, Array, Array]:
-        """Amplitude, place and width of free numbers of order one."""
+        """Amplitude, time and width out of free parameters of order one."""
         low, high = jnp.log(_NARROWEST), jnp.log(_WIDEST)
         wide = jnp.exp(low + (high - low) * jax.nn.sigmoid(p[:, 2])) * width
         return scale * p[:, 0], t[0] + width * p[:, 1], wide
@@ -103,7 +130,7 @@ def _decompose(t: Samples, y: Samples, sigma: Samples, width: Array, most: int) 
     def residual(p: Float[Array, "echoes 3"], on: Bool[Array, " echoes"]) -> Samples:
         return (model(p, on) - y) / sigma
 
-    # The free number of the pulse's own width.
+    # The free parameter of the pulse's own width.
     share = -jnp.log(_NARROWEST) / (jnp.log(_WIDEST) - jnp.log(_NARROWEST))
     own = jnp.log(share) - jnp.log1p(-share)
 
@@ -163,20 +190,37 @@ def _half_step(t: Samples, step: Array) -> Array:
 def richardson_lucy(
     power: Float[ArrayLike, " bins"], pulse: Float[ArrayLike, " lags"], *, iterations: int = 50
 ) -> Samples:
-    """Deconvolution of a waveform from its pulse that keeps its energy and stays positive.
+    """Richardson-Lucy deconvolution of a waveform: it conserves energy and is never negative.
 
-    - `power`: (bins,). Negative samples, which noise makes, count as zero.
-    - `pulse`: (lags,) an odd number of samples, time zero in the middle, not negative.
-    - `iterations`: 1 or more; more of them resolve more, and amplify noise. Default 50.
+    **Arguments:**
+
+    - `power`: (bins,) waveform, background removed. Negative samples, which noise makes, count as zero.
+    - `pulse`: (lags,) transmitted pulse at the waveform's sampling, an odd number of samples with time zero
+      in the middle, not negative; its scale does not matter.
+    - `iterations`: 1 or more. More of them resolve more and amplify noise. Default 50.
+
+    **Returns:** (bins,) the deconvolved waveform, in units of `power`.
+
+    **Raises:** ValueError for inadmissible arguments.
 
     **Source:** Richardson (1972), J. Opt. Soc. Am. 62, 55; Lucy (1974), Astron. J. 79, 745.
+
+    **Example:**
+
+    >>> import inversion, numpy as np
+    >>> pulse = np.exp(-0.5 * (np.arange(-12.0, 13.0) / 3.0) ** 2)
+    >>> target = np.where(np.arange(60) == 30, 1.0, 0.0)
+    >>> power = np.convolve(target, pulse / pulse.sum(), mode="same")
+    >>> sharp = inversion.richardson_lucy(power, pulse)
+    >>> print(f"peak {power[30]:.2f} to {float(sharp[30]):.2f}, energy {float(sharp.sum()):.2f}")
+    peak 0.13 to 0.38, energy 1.00
     """
     y, h = jnp.maximum(as_array(power), 0.0), _kernel(pulse)
     if iterations != int(iterations) or iterations < 1:
         raise ValueError(f"iterations = {iterations} is outside the admissible range [1, inf) of integers")
     check_range("pulse", pulse, 0.0)
     tiny = 1e-6 * jnp.maximum(jnp.max(y), 1e-30)
-    # What of each place is recorded at all: less at the ends.
+    # Share of each bin's energy that is recorded: less at the ends.
     seen = jnp.convolve(jnp.ones_like(y), h[::-1], mode="same")
 
     def better(x: Samples, _: None) -> tuple[Samples, None]:
@@ -189,19 +233,36 @@ def richardson_lucy(
 def wiener(
     power: Float[ArrayLike, " bins"], pulse: Float[ArrayLike, " lags"], *, noise_to_signal: float
 ) -> Samples:
-    """Deconvolution by Wiener's filter.
+    """Deconvolution of a waveform by a Wiener filter.
 
-    - `power`: (bins,). - `pulse`: (lags,) as for `richardson_lucy`, but of any sign.
-    - `noise_to_signal`: power of the noise over that of the signal, above 0; constant in frequency.
+    **Arguments:**
+
+    - `power`: (bins,) waveform, background removed.
+    - `pulse`: (lags,) as for `richardson_lucy`, but of any sign.
+    - `noise_to_signal`: power of the noise over that of the signal, above 0, the same at all frequencies.
+
+    **Returns:** (bins,) the deconvolved waveform, in units of `power`; it may be negative.
+
+    **Raises:** ValueError for inadmissible arguments.
 
     **Source:** Wiener (1949), Extrapolation, Interpolation, and Smoothing of Stationary Time Series.
+
+    **Example:**
+
+    >>> import inversion, numpy as np
+    >>> pulse = np.exp(-0.5 * (np.arange(-12.0, 13.0) / 3.0) ** 2)
+    >>> target = np.where(np.arange(60) == 30, 1.0, 0.0)
+    >>> power = np.convolve(target, pulse / pulse.sum(), mode="same")
+    >>> sharp = inversion.wiener(power, pulse, noise_to_signal=1e-4)
+    >>> print(f"peak {power[30]:.2f} to {float(sharp[30]):.2f}")
+    peak 0.13 to 0.32
     """
     check_range("noise_to_signal", noise_to_signal, 0.0, low_open=True)
     y, h = as_array(power), _kernel(pulse)
     n = y.size + h.size - 1
     spectrum = jnp.fft.rfft(h, n)
     gain = jnp.conj(spectrum) / (jnp.abs(spectrum) ** 2 + noise_to_signal)
-    # The pulse begins half of its length before its time zero.
+    # The pulse begins half its length before its time zero.
     begun = jnp.pad(y, ((h.size - 1) // 2, (h.size - 1) // 2))
     return jnp.fft.irfft(jnp.fft.rfft(begun) * gain, n)[: y.size]
 
@@ -221,12 +282,29 @@ def relative_heights(
     ground: Float[ArrayLike, ""] = 0.0,
     levels: Float[ArrayLike, " levels"] | Sequence[float] = (25.0, 50.0, 75.0, 95.0, 98.0, 100.0),
 ) -> Float[Array, " levels"]:
-    """RH metrics: heights above `ground` below which the given percentages of the energy return.
+    """Relative heights (RH metrics): heights above ground below which given percentages of the energy return.
 
-    - `height`: (bins,) m, decreasing with time, as `Waveform.height`. - `power`: (bins,) background removed;
-      negative samples count as zero. - `ground`: its height in m. - `levels`: per cent, 0..100.
+    **Arguments:**
+
+    - `height`: (bins,) m, decreasing with time, as `Waveform.height`.
+    - `power`: (bins,) waveform, background removed. Negative samples count as zero.
+    - `ground`: height of the ground in m. Default 0.
+    - `levels`: (levels,) percentages, 0 to 100. Default (25, 50, 75, 95, 98, 100).
+
+    **Returns:** (levels,) heights in m.
+
+    **Raises:** ValueError for `levels` outside 0 to 100.
 
     **Source:** Dubayah et al. (2020), Sci. Remote Sens. 1, 100002.
+
+    **Example:**
+
+    >>> import inversion, numpy as np
+    >>> height = np.arange(20.0, -5.0, -0.5)
+    >>> power = np.where((height >= 1.0) & (height <= 15.0), 1.0, 0.0)
+    >>> rh50, rh75 = inversion.relative_heights(height, power, ground=1.0, levels=(50.0, 75.0))
+    >>> print(f"{float(rh50):.1f} m, {float(rh75):.1f} m")
+    7.0 m, 10.6 m
     """
     check_range("levels", levels, 0.0, 100.0)
     z, y = as_array(height)[::-1], jnp.maximum(as_array(power), 0.0)[::-1]
@@ -242,12 +320,28 @@ def find_ground(
     *,
     threshold: float,
 ) -> Float[Array, ""]:
-    """Height of the lowest mode: the last local maximum above `threshold`, NaN where there is none.
+    """Height of the ground, taken as the lowest mode: the last local maximum above `threshold`.
 
-    Between samples, it is the vertex of the parabola through the three largest. Smooth noisy waveforms
-    before.
+    Between samples, it is the vertex of the parabola through the maximum and its two neighbours. Smooth noisy
+    waveforms first.
 
-    - `height`: (bins,) m, decreasing with time. - `power`: (bins,). - `threshold`: in units of power.
+    **Arguments:**
+
+    - `height`: (bins,) m, decreasing with time, as `Waveform.height`.
+    - `power`: (bins,) waveform.
+    - `threshold`: in units of `power`.
+
+    **Returns:** the height in m; NaN where there is no such maximum.
+
+    **Raises:** ValueError for a `threshold` that is not finite.
+
+    **Example:**
+
+    >>> import inversion, numpy as np
+    >>> height = np.arange(20.0, -5.0, -0.25)
+    >>> power = 0.5 * np.exp(-0.5 * ((height - 12.0) / 2.0) ** 2) + np.exp(-0.5 * ((height - 1.6) / 0.5) ** 2)
+    >>> print(f"{float(inversion.find_ground(height, power, threshold=0.1)):.1f} m")
+    1.6 m
     """
     check_range("threshold", threshold)
     z, y = as_array(height), as_array(power)
@@ -263,15 +357,29 @@ def find_ground(
 def gap_probability(
     canopy: Float[ArrayLike, " bins"], ground: Float[ArrayLike, ""], *, reflectance_ratio: float = 1.5
 ) -> Samples:
-    """Probability of a gap from above the canopy down to each sample, in the direction of the beam.
+    """Gap probability from above the canopy down to each sample, in the direction of the beam.
 
     P(z) = 1 - Rv(z) / (Rv + Rg rho_v / rho_g), with Rv(z) the energy that the canopy returned from above z.
 
-    - `canopy`: (bins,) the canopy's return, from the top down. - `ground`: energy of the ground's return.
-    - `reflectance_ratio`: rho_v / rho_g of apparent reflectances. Default 1.5, GEDI's.
+    **Arguments:**
+
+    - `canopy`: (bins,) energy of the canopy's return per sample, from the top down.
+    - `ground`: energy of the ground's return, in the same unit.
+    - `reflectance_ratio`: rho_v / rho_g, of apparent reflectances, above 0. Default 1.5, GEDI's.
+
+    **Returns:** (bins,) gap probability.
+
+    **Raises:** ValueError for a `reflectance_ratio` that is not above 0.
 
     **Source:** Ni-Meister et al. (2001), IEEE Trans. Geosci. Remote Sens. 39, 1943; Tang and Armston (2019),
     GEDI footprint canopy cover and vertical profile metrics (theoretical basis document).
+
+    **Example:**
+
+    >>> import inversion
+    >>> gap = inversion.gap_probability([0.1, 0.2, 0.1], 0.2)
+    >>> [f"{float(p):.2f}" for p in gap]
+    ['0.86', '0.57', '0.43']
     """
     check_range("reflectance_ratio", reflectance_ratio, 0.0, low_open=True)
     above = jnp.cumsum(as_array(canopy))
@@ -284,7 +392,23 @@ def plant_area_index(
 ) -> Float[Array, "*s"]:
     """Plant area index above each level from the gap probability there: -ln(P) cos(zenith) / (G Omega).
 
-    - `gap`: above 0, at most 1. - `zenith`: of the beam in degrees. - `projection`: G. - `clumping`: Omega.
+    **Arguments:**
+
+    - `gap`: gap probability P, of any shape, above 0, at most 1.
+    - `zenith`: angle between the beam and the vertical in degrees, 0 to below 90. Default 0.
+    - `projection`: G, mean projection of unit plant area onto the plane across the beam, above 0, at most 1.
+      Default 0.5 (random orientations).
+    - `clumping`: clumping index Omega, above 0. Default 1 (random positions).
+
+    **Returns:** m2 of plant area per m2 of ground, of the shape of `gap`.
+
+    **Raises:** ValueError for arguments outside their ranges.
+
+    **Example:**
+
+    >>> import inversion
+    >>> print(f"{float(inversion.plant_area_index(0.5)):.2f}")
+    1.39
     """
     check_range("gap", gap, 0.0, 1.0, low_open=True)
     check_range("zenith", zenith, 0.0, 90.0, high_open=True)

@@ -1,6 +1,6 @@
-"""The command `jaxlidar demo`: a tree's waveform, and its leaf, crown and ground retrieved from a noisy one.
+"""The command `jaxlidar demo`: simulate a tree's waveform, add noise, and retrieve leaf, crown and ground.
 
-Crown shape and the places of its clumps are taken as known; what is retrieved is listed by `sought`.
+The shape of the crown and the positions of its clumps are taken as known; `sought` lists the unknowns.
 """
 
 import argparse
@@ -29,7 +29,7 @@ from .unknowns import Unknown, put, settle
 
 # Standard deviation of the added noise: a share of each sample, and a floor relative to the peak.
 NOISE_SHARE, NOISE_FLOOR = 0.03, 0.01
-# What is recorded, in ns: from 17 m above the ground to 9 m below, for light that lingers in the crown.
+# Recording window in ns: from 17 m above the ground to 9 m below, for multiple scattering in the crown.
 WINDOW = (-115.0, 60.0)
 # Photons and rays of each simulation of the retrieval.
 FIT_PHOTONS, FIT_RAYS = 16384, 2048
@@ -59,7 +59,7 @@ def _with_height(scene: jl.Scene, height: Array) -> jl.Scene:
 
 
 def sought(scene: Any) -> list[Sought]:
-    """What the demo retrieves of the scene `demo_scene()`, each from a start that is off."""
+    """The unknowns of the demo in the scene `demo_scene()`, each with a start that differs from the truth."""
     leaf, ground = scene.canopy.leaf, scene.ground
     return [
         Sought(
@@ -114,7 +114,7 @@ def demo(argv: Sequence[str]) -> int:
         raise CommandError(f"--seed {options.seed} is outside the admissible range [0, 2147483648).")
     if not 0 < options.voxel_size <= 1:
         raise CommandError(f"--voxel-size {options.voxel_size:g} is outside the admissible range (0, 1].")
-    # Before the work, so that a folder that cannot be written costs none.
+    # Made first, so that a folder that cannot be written ends the command before the work.
     options.out.mkdir(parents=True, exist_ok=True)
     started = time.perf_counter()
     say = _Say(None if options.quiet else sys.stderr)
@@ -126,7 +126,11 @@ def demo(argv: Sequence[str]) -> int:
 def run(out: Path, *, seed: int, rtol: float, voxel_size: float, say: Callable[[str], None]) -> Retrieval:
     """Simulate, retrieve, write `waveform.png` and `retrieval.png` into `out`, print the results.
 
-    **Arguments:** as of the command; `say` is called with lines of progress.
+    **Arguments:** those of the command; `say` is called with lines of progress.
+
+    **Returns:** the `Retrieval`.
+
+    **Raises:** KeyboardInterrupt where the simulation is interrupted.
     """
     key = jax.random.key(seed)
     lidar, scene = demo_lidar(WAVELENGTHS), demo_scene(voxel_size)
@@ -176,13 +180,13 @@ def noisy(wave: jl.Waveform, noise: Float[np.ndarray, "wavelengths bins"], seed:
     """The waveform with normal noise of the standard deviation `noise`."""
     value = np.asarray(wave.reflectance)
     drawn = np.random.default_rng(seed).normal(size=value.shape)
-    # Its own simulation error is part of the noise already.
+    # The waveform's own simulation error is part of `noise` already.
     added = np.sqrt(np.maximum(noise**2 - np.asarray(wave.stderr) ** 2, 0.0))
     return dataclasses.replace(wave, reflectance=jax.numpy.asarray(value + added * drawn, value.dtype))
 
 
 def waveform_figure(wave: jl.Waveform, lidar: jl.Lidar, scene: jl.Scene) -> Figure:
-    """The scene from the side, and beside it its waveform at 1064 nm with its components."""
+    """Figure of the scene from the side, and of its waveform at 1064 nm with components."""
     figure = Figure(figsize=(7.0, 4.2), layout="constrained")
     left, right = figure.subplots(1, 2, sharey=True, width_ratios=(1, 1.9))
     jaxlidar.plot.scene(scene, lidar, left)
@@ -195,7 +199,7 @@ def waveform_figure(wave: jl.Waveform, lidar: jl.Lidar, scene: jl.Scene) -> Figu
 def retrieval_figure(
     observed: jl.Waveform, noise: Float[np.ndarray, "wavelengths bins"], start: jl.Waveform, fit: Retrieval
 ) -> Figure:
-    """For each wavelength the data, the start and the fit, and the residuals of the fit."""
+    """Figure of data, start, fit and residuals of the fit, for each wavelength."""
     figure = Figure(figsize=(7.4, 4.6), layout="constrained")
     ratios = (1.5, 1.0) * len(WAVELENGTHS)
     axes = figure.subplots(1, 2 * len(WAVELENGTHS), sharey=True, width_ratios=ratios)
@@ -227,7 +231,7 @@ def retrieval_figure(
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a PNG, whole or not at all."""
+    """Write a PNG file atomically."""
     with atomic_write(path) as draft:
         figure.savefig(draft, format="png", dpi=RESOLUTION)
 

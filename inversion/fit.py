@@ -1,12 +1,12 @@
-"""Nonlinear least squares on a simulation that is random.
+"""Nonlinear least squares with a stochastic simulation.
 
-The residuals are whitened, (simulated - observed) / sigma, with the measurement's noise and that of the
-simulation in sigma; a prior adds one residual per value. With fixed random numbers the simulation is smooth
-but for small jumps, and its derivatives are unbiased estimates of its expectation's. Near the minimum the two
-disagree by a fraction of a standard error and no step improves the fit: there it ends.
+The residuals are whitened, (simulated - observed) / sigma, where sigma holds the noise of the measurement and
+of the simulation; a prior adds one residual per value. With fixed random numbers the simulation is smooth
+except for small jumps, and its derivatives are unbiased estimates of the derivatives of its expectation. Near
+the minimum the two disagree by a fraction of a standard error and no step improves the fit: it ends there.
 
-A fit is a generator: it yields where it wants the scene simulated, and is sent the simulation. So one fit and
-many at once are the same code.
+A fit is a generator: it yields the values at which it needs a simulation, and is sent the result. The same
+code serves one fit and many at once.
 """
 
 from collections.abc import Callable, Generator, Sequence
@@ -24,20 +24,20 @@ from .result import Step
 from .uncertainty import correlation_of, decrement, errors_of
 from .unknowns import Priors, Settled, inside, outside
 
-# A fit has converged when a Gauss-Newton step would move it by less than this many standard errors,
+# A fit has converged when a Gauss-Newton step would move it by less than this many standard errors.
 _SMALL_STEP = 0.05
-# or by less than these after so many steps that did not improve it.
+# It has also converged after (so many rejected steps, if the step is below so many standard errors).
 _STALLED = ((1, 0.3), (3, 0.6), (8, 1.0))
-# Free numbers change by no more in one step: far out, where the bijection is flat, a fit would be stuck.
+# Largest change of a free parameter in one step: far out the bijection is flat, and a fit would be stuck.
 _LONGEST_STEP = 2.0
-# At the solution the weights are renewed if the start's were wrong by more than this, in the mean.
+# At the solution the weights are renewed if those of the start differ by more than this, in the mean.
 _WRONG_WEIGHTS = 0.05
-# Within this share of its width from a bound, an unknown is said to lie at it.
+# An unknown closer to a bound than this share of the bounds' width is reported as at the bound.
 _AT_BOUND = 1e-3
 
 
 def _linear(y: Array, args: tuple[Array, Array, Array]) -> tuple[Array, None]:
-    """Residuals computed at `at`, with their Jacobian there: all that a Gauss-Newton step looks at."""
+    """Linear model of the residuals about `at`, which is all that a Gauss-Newton step needs."""
     at, residual, jacobian = args
     return residual + jacobian @ (y - at), None
 
@@ -56,16 +56,16 @@ def _advance(solver: Any, y: Array, args: Any, state: Any) -> Any:
 
 
 class Request(NamedTuple):
-    """Where a fit wants the scene simulated, and whether with its batches one by one."""
+    """Values at which a fit needs a simulation, and whether it needs the batches one by one."""
 
     values: np.ndarray
     spread: bool
 
 
 class Outcome(NamedTuple):
-    """How a fit ended. Vectors are the flattened unknowns in natural units; see `Retrieval`.
+    """Result of a fit. Vectors are the flattened unknowns in natural units; see `Retrieval`.
 
-    - `cost`: chi-squared with the measurement's noise, and the priors' share.
+    - `cost`: chi-squared with the measurement's noise only, plus that of the priors.
     - `simulation`: (wavelengths, bins) one standard error of the simulated waveform.
     """
 
@@ -89,7 +89,7 @@ Fitting = Generator[Request, Evaluation, Outcome]
 
 
 def drive(fitting: Fitting, simulate: Callable[[Request], Evaluation]) -> Outcome:
-    """Let one fit run to its end."""
+    """Run one fit to its end."""
     try:
         request = next(fitting)
         while True:
@@ -99,9 +99,9 @@ def drive(fitting: Fitting, simulate: Callable[[Request], Evaluation]) -> Outcom
 
 
 def best_of(fits: "Sequence[Fit]") -> Fitting:
-    """Fits from several starts, one after the other: the one of the least cost, of those that converged.
+    """Run fits from several starts, one after the other, and select the converged one of the lowest cost.
 
-    **Returns:** its outcome, with the steps of all.
+    **Returns:** its outcome, with the steps of all fits.
     """
     outcomes = []
     for fit in fits:
@@ -118,7 +118,7 @@ def best_of(fits: "Sequence[Fit]") -> Fitting:
 
 
 class Point:
-    """One simulation: where, what came out, and that as residuals and their Jacobian in natural units."""
+    """One simulation: the values, its result, and the residuals with their Jacobian in natural units."""
 
     def __init__(self, fit: "Fit", z: np.ndarray, evaluation: Evaluation):
         self.z, self.evaluation = z, evaluation
@@ -133,7 +133,7 @@ class Point:
 
 
 class Fit:
-    """A fit under way. Vectors are the flattened unknowns, in natural units unless named z."""
+    """A running fit. Vectors are the flattened unknowns, in natural units unless named z."""
 
     def __init__(
         self,
@@ -162,13 +162,13 @@ class Fit:
         return Point(self, z, evaluation)
 
     def residuals(self, p: Point) -> tuple[np.ndarray, np.ndarray]:
-        """Whitened, with the priors' behind them, and their Jacobian in z."""
+        """Whitened residuals, then those of the priors, and their Jacobian in z."""
         off, slope = self.prior(p.values)
         jacobian = np.concatenate([p.jacobian / self.sigma[:, None], np.diag(slope)]) * p.slope
         return np.concatenate([p.difference / self.sigma, off]), jacobian
 
     def reweigh(self, p: Point) -> float:
-        """Take the simulation's noise at `p` into the weights; returns their mean relative change."""
+        """Include the simulation's noise at `p` in the weights. **Returns:** their mean relative change."""
         noise = np.broadcast_to(spread_of(p.evaluation.batches), self.data.sigma.shape)[self.data.used]
         sigma = np.hypot(self.data.sigma[self.data.used], p.scale * noise)
         change = float(np.mean(np.abs(sigma / self.sigma - 1.0)))
@@ -208,13 +208,13 @@ class Fit:
         return self.result(best, converged, status)
 
     def descend(self, best: Point) -> Generator[Request, Evaluation, tuple[Point, bool, str]]:
-        """Steps of the solver until it ends, or no step leads on."""
+        """Run the solver until it ends or no step improves the fit."""
         trial, state, y = best, None, jnp.asarray(best.z)
         remaining, rejected = np.inf, 0
         while True:
             r, jacobian = self.residuals(trial)
             if not trial.finite:
-                # Worse than anything: the solver turns back.
+                # So large that the solver rejects the step.
                 r, jacobian = np.full_like(r, 1e8), np.zeros_like(jacobian)
             args = tuple(jnp.asarray(a, y.dtype) for a in (trial.z, r, jacobian))
             if state is None:
@@ -239,7 +239,7 @@ class Fit:
             self.count += 1
 
     def free(self, p: Point, r: np.ndarray, jacobian: np.ndarray) -> np.ndarray:
-        """Which unknowns are not held by a bound, beyond which the fit would be better."""
+        """Which unknowns are free: not at a bound beyond which the fit would be better."""
         share, downhill = (p.values - self.low) / (self.high - self.low), -(jacobian.T @ r)
         return ~((share < _AT_BOUND) & (downhill < 0)) & ~((share > 1 - _AT_BOUND) & (downhill > 0))
 
@@ -302,7 +302,7 @@ class Fit:
 
 
 def named(flat: np.ndarray, settled: Sequence[Settled]) -> dict[str, np.ndarray]:
-    """Values by name out of vectors (..., unknowns)."""
+    """Values by name from vectors (..., unknowns)."""
     parts = np.split(flat, np.cumsum([s.start.size for s in settled])[:-1], axis=-1)
     return {s.name: p.reshape((*flat.shape[:-1], *s.start.shape)) for s, p in zip(settled, parts)}
 

@@ -1,4 +1,4 @@
-"""What a waveform can tell, before and after it is recorded: Cramer-Rao bounds and profile likelihoods."""
+"""Identifiability of unknowns from waveforms: Cramer-Rao bounds and profile likelihoods."""
 
 import itertools
 from collections.abc import Callable, Sequence
@@ -26,14 +26,29 @@ from .unknowns import Priors, Unknown, put, settle
 
 @final
 class CramerRao(eqx.Module):
-    """The least standard errors that any unbiased retrieval can have.
+    """The result of `cramer_rao`: the smallest standard errors that an unbiased retrieval can have.
 
-    Rows of the matrices are the flattened unknowns, named by `labels`, in natural units.
+    Rows of the matrices are the flattened unknowns, named by `labels`, in natural units. `print(bound)` shows
+    a summary, with pairs of unknowns whose correlation exceeds 0.95.
 
-    - `stderr`: by name; infinite where the waveforms do not determine the unknown, alone or with others.
+    - `stderr`: by name; infinite where the waveforms do not constrain the unknown, alone or in combination
+      with others.
     - `covariance`: (n, n) inverse of the Fisher information, priors included; infinite variances as in
-      `stderr`. - `correlation`: (n, n). - `information`: (n, n) Fisher information.
-    - `undetermined`: labels of the unknowns to which the waveforms are blind.
+      `stderr`.
+    - `correlation`: (n, n).
+    - `information`: (n, n) Fisher information, priors included.
+    - `labels`: names of the rows.
+    - `undetermined`: labels of the unknowns that the waveforms do not constrain.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> import inversion, jax
+    >>> scene = jl.Scene(ground=jl.Ground())
+    >>> height = inversion.Unknown(lambda s: s.ground.height, bounds=(-2.0, 2.0))
+    >>> bound = inversion.cramer_rao(jl.Lidar(), scene, [height], noise=0.001, key=jax.random.key(0))
+    >>> bound.labels, bound.undetermined
+    (('ground.height',), ())
     """
 
     stderr: dict[str, Float[Array, "..."]]
@@ -74,22 +89,36 @@ def cramer_rao(
     n_rays: float = 8192,
     max_orders: int | None = None,
 ) -> CramerRao:
-    """What waveforms of a scene can tell about its unknowns: the Fisher information at the scene's values.
+    """Cramer-Rao bounds of the unknowns of a scene: the smallest standard errors, before data are recorded.
 
-    For independent normal noise: information = J^T diag(1/noise^2) J + that of the priors, J the waveform's
-    derivatives. An unknown with a start of its own (`Unknown(start=)`) is taken there.
+    For independent normal noise, the Fisher information is J^T diag(1/noise^2) J plus that of the priors,
+    with J the derivatives of the waveform at the scene's values. An unknown with a start of its own
+    (`Unknown(start=)`) is taken there.
 
     **Arguments:**
 
     - `lidar`, `scene`, `unknowns`, `key`, `n_photons`, `n_rays`, `max_orders`: as for `retrieve`.
-    - `noise`: standard deviation of the apparent reflectance per sample, anything that broadcasts to
-      (wavelengths, bins), above 0; infinity leaves a sample out.
-    - `time`: (bins,) ns, sample times. Default: those of `plan`.
-    - `plan`: default: the scene's.
+    - `noise`: standard deviation of the apparent reflectance per sample, above 0, anything that broadcasts to
+      (wavelengths, bins). Infinity leaves a sample out.
+    - `time`: (bins,) ns, sample times. Default None: those of `plan`.
+    - `plan`: what to simulate (`jaxlidar.plan`); it replaces `n_photons`, `n_rays` and `max_orders`. Default
+      None: planned for the scene, and with `time` for the corners of the bounds as well.
+
+    **Returns:** a `CramerRao`.
 
     **Raises:** ValueError for inadmissible arguments.
 
     **Source:** Kay (1993), Fundamentals of Statistical Signal Processing, chapter 3.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> import inversion, jax
+    >>> scene = jl.Scene(ground=jl.Ground())
+    >>> height = inversion.Unknown(lambda s: s.ground.height, bounds=(-2.0, 2.0), name="height")
+    >>> bound = inversion.cramer_rao(jl.Lidar(), scene, [height], noise=0.001, key=jax.random.key(0))
+    >>> print(f"{float(bound.stderr['height']):.3f} m")
+    0.005 m
     """
     settled = settle(unknowns, scene)
     if plan is None:
@@ -137,11 +166,23 @@ def cramer_rao(
 
 @final
 class Profile(eqx.Module):
-    """The best fit for each of several values of one unknown.
+    """The result of `profile_likelihood`: the best fit at each of several values of one unknown.
 
-    - `values`: (points,) of the unknown. - `chi2`: (points,) chi-squared, priors included, less its least.
-    - `others`: by name, (points, ...) the values of the other unknowns.
-    - `converged`: (points,) whether these fits did.
+    - `values`: (points,) values of the unknown.
+    - `chi2`: (points,) chi-squared, priors included, less its minimum.
+    - `others`: by name, (points, ...) fitted values of the other unknowns.
+    - `converged`: (points,) whether the fit converged.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> import inversion
+    >>> import numpy as np
+    >>> chi2, converged = np.array([4.0, 0.0, 4.0, 16.0]), np.full(4, True)
+    >>> profile = inversion.Profile(np.array([0.0, 0.1, 0.2, 0.3]), chi2, others={}, converged=converged)
+    >>> low, high = profile.interval(0.95)
+    >>> print(f"{low:.3f} to {high:.3f}")
+    0.002 to 0.198
     """
 
     values: Float[np.ndarray, " points"]
@@ -150,10 +191,18 @@ class Profile(eqx.Module):
     converged: Any
 
     def interval(self, level: float = 0.683) -> tuple[float, float]:
-        """Where chi-squared is below the quantile of `level`, in (0, 1); its root is interpolated linearly.
+        """Confidence interval of the unknown: where chi-squared is below the quantile of `level`.
 
-        An end is infinite where chi-squared stays below it as far as the values reach: to that side, the
-        waveform does not say.
+        The root of chi-squared is interpolated linearly between the values.
+
+        **Arguments:**
+
+        - `level`: probability, in (0, 1). Default 0.683.
+
+        **Returns:** (low, high). An end is infinite where chi-squared stays below the quantile up to the last
+        value: the waveform does not constrain the unknown to that side, as far as the values reach.
+
+        **Raises:** ValueError for a `level` outside (0, 1).
         """
         check_range("level", level, 0.0, 1.0, low_open=True, high_open=True)
         limit = float(jax.scipy.special.ndtri(0.5 * (1.0 + level)))
@@ -184,20 +233,40 @@ def profile_likelihood(
     progress: Callable[[int], None] | None = None,
     **more: Any,
 ) -> Profile:
-    """Fit all unknowns but one, for each of several values of that one.
+    """Profile likelihood of one unknown: all others are fitted at each of several fixed values of it.
 
-    Where chi-squared is no parabola of the unknown, as when two explanations compete, its standard error
-    misleads, and the profile's interval does not. Each fit starts where its neighbour ended, from the value
-    nearest to the scene's own outwards.
+    Where chi-squared is not a parabola of the unknown, as when two solutions compete, the standard error is
+    misleading; the interval of the profile is not. Fits begin at the value nearest to the unknown's start and
+    proceed outwards; each starts from the result of its neighbour.
 
-    **Arguments:** those of `retrieve`, and
+    **Arguments:**
 
-    - `name`: of the unknown to be held, a single number. It is put into the scene before the others.
-    - `values`: (points,) increasing, within its bounds.
-    - `progress`: called with the number of each value that is done.
+    - `observed`, `lidar`, `scene`, `unknowns`, `noise`, `key`, `time`, `plan`: as for `retrieve`, but with
+      two unknowns or more.
+    - `name`: name of the unknown that is held fixed; it must be a single number. Its value is put into the
+      scene before the others.
+    - `values`: (points,) values of that unknown, two or more, increasing, within its bounds.
+    - `progress`: called with the index of each value when its fit has ended.
+    - `more`: further arguments of `retrieve`, for all fits.
 
-    **Raises:** ValueError for a name that is none of the unknowns', for values that are not increasing or
+    **Returns:** a `Profile`.
+
+    **Raises:** ValueError for a `name` that no unknown has, for `values` that are not increasing or lie
     outside the bounds, for a single unknown, and as `retrieve` does.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> import inversion, jax
+    >>> scene = jl.Scene(ground=jl.Ground(height=0.5))
+    >>> wave = jl.simulate(jl.Lidar(), scene, key=jax.random.key(0))
+    >>> height = inversion.Unknown(lambda s: s.ground.height, bounds=(-2.0, 2.0), name="height")
+    >>> brightness = inversion.Unknown(lambda s: s.ground.reflectance, bounds=(0.0, 1.0))
+    >>> unknowns, more = [height, brightness], {"noise": 0.005, "key": jax.random.key(1)}
+    >>> values = [0.4, 0.5, 0.6]
+    >>> profile = inversion.profile_likelihood(wave, jl.Lidar(), scene, unknowns, "height", values, **more)
+    >>> print("{:.2f} m to {:.2f} m".format(*profile.interval()))
+    0.47 m to 0.53 m
     """
     settled = settle(unknowns, scene)
     names = [s.name for s in settled]
@@ -228,7 +297,7 @@ def profile_likelihood(
     middle = int(np.argmin(np.abs(points - float(held.start))))
     found: dict[int, Any] = {}
     for numbers in (range(middle, points.size), range(middle - 1, -1, -1)):
-        # Where the neighbour towards the middle ended.
+        # The result of the neighbour towards the middle.
         last = found.get(middle)
         for i in numbers:
             here = put(

@@ -1,17 +1,18 @@
-"""Levenberg and Marquardt's method for PROSPECT: the fit of many leaves, and its standard errors.
+"""Levenberg-Marquardt solver for PROSPECT: the fit of many leaves, and its standard errors.
 
 Traits other than N act through the absorption of a plate, k = sum(c_i K_i)/N, alone. So with s = dR/dk / N
 the Jacobian's columns are s K_i and dR/dN - s k: the normal equations need two derivatives of the plate model
 and products with the table, and a fit of seven traits costs little more than one of two. Damping is relative
 to the diagonal of the normal matrix.
 
-A trait stays within its bounds by projection: one on a bound beyond which the fit would be better is held
-there for the step, the others move, and what would leave is put on the bound. Unlike `retrieve`, whose
-unknowns never reach a bound, for leaves without anthocyanins or brown pigments have their minimum on it.
+Bounds are kept by projection: a trait on a bound beyond which the fit would be better is held there for the
+step, the others move, and a trait that would leave its bounds is set to the bound. In `retrieve` unknowns
+never reach a bound; here they can, because leaves without anthocyanins or brown pigments have their minimum
+on one.
 
 Leaves run in chunks that fit into the processor's cache, each chunk until its slowest leaf has ended. On
 measured leaves `optimistix.LevenbergMarquardt` under `jax.vmap`, with unknowns that never reach a bound, took
-more than 20 times as long, for some leaves ran to the last step.
+more than 20 times as long, because some leaves ran to the last step.
 
 Source: Marquardt (1963), J. SIAM 11, 431; Bertsekas (1982), SIAM J. Control Optim. 20, 221 (projection).
 """
@@ -25,27 +26,28 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from jaxlidar.optics.plate_model import Surface, plate_model_slopes
+from jaxlidar.optics.leaf_surface import LeafSurface
+from jaxlidar.optics.plate_model import plate_model_slopes
 
-# A fit has converged when a Gauss-Newton step would move it by less than this many standard errors,
+# A fit has converged when a Gauss-Newton step would move it by less than this many standard errors.
 _SMALL_STEP = 0.02
-# residuals counting as so many roundings at least.
+# Residuals count as at least this many roundings.
 _ROUNDINGS = 64
-# Damping falls by ten with every step that improves the fit, the start's included.
+# Damping falls by ten with every step that improves the fit, including the first evaluation.
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-2, 1e-5, 1e8
-# A first fit, to at least so many bands, gives the start of that to all.
+# A first fit, to at least this many bands, gives the start of the fit to all bands.
 _FEW_BANDS = 200
 # Smallest eigenvalue of the normal matrix, of unit diagonal, at which a combination counts as determined.
 _COLLINEAR = 1e-5
 
 
 def rounding(dtype: Any) -> float:
-    """What no residual is known better than, of reflectances in this precision."""
+    """Least uncertainty of a residual of reflectances in this precision."""
     return _ROUNDINGS * float(jnp.finfo(dtype).eps)
 
 
 class Point(NamedTuple):
-    """A leaf at the traits `x`: chi-squared, the same unweighted, half its gradient, normal matrix."""
+    """A leaf at the traits `x`: chi-squared, unweighted sum of squares, half the gradient, normal matrix."""
 
     x: Float[Array, "*leaves n"]
     chi2: Float[Array, "*leaves"]
@@ -55,7 +57,7 @@ class Point(NamedTuple):
 
 
 class State(NamedTuple):
-    """The best point, where to go next and the damping from there, points tried, whether it has converged."""
+    """State of a fit: best point, next trial and its damping, points tried, whether it has converged."""
 
     best: Point
     trial: Float[Array, "*leaves n"]
@@ -67,7 +69,7 @@ class State(NamedTuple):
 class Task(NamedTuple):
     """Leaves to fit: start and bounds of N and the traits, spectra and their standard deviations.
 
-    Traits that are not sought have equal bounds, which hold them. Spectra are NaN, or deviations infinite,
+    Traits that are not unknowns have equal bounds, which fix them. Spectra are NaN, or deviations infinite,
     where there is no sample.
     """
 
@@ -80,21 +82,21 @@ class Task(NamedTuple):
 
 @partial(jax.jit, static_argnames="chunk")
 def fit_all(
-    task: Task, absorption: Array, face: Surface, count: ArrayLike, max_steps: ArrayLike, chunk: int
+    task: Task, absorption: Array, face: LeafSurface, count: ArrayLike, max_steps: ArrayLike, chunk: int
 ) -> State:
-    """Fit leaves, in chunks of at most `chunk`; `count` traits are sought."""
+    """Fit leaves, in chunks of at most `chunk`; `count` is the number of unknowns."""
     leaves = len(task.start)
     chunks = -(-leaves // chunk)
     each = -(-leaves // chunks)
-    # The last leaf fills up the last chunk: a smaller one would be compiled by itself.
+    # The last chunk is filled up with the last leaf: a smaller one would be compiled separately.
     index = jnp.minimum(jnp.arange(chunks * each), leaves - 1).reshape(chunks, each)
     every = absorption.shape[1] // _FEW_BANDS
 
     def fit(leaf: Task) -> State:
         if every > 1:
-            # Far from the minimum a part of the bands leads there as well, for a part of the cost.
+            # Far from the minimum, a part of the bands gives steps as good at a part of the cost.
             few = leaf._replace(observed=leaf.observed[:, ::every], sigma=leaf.sigma[:, ::every])
-            table, surface = absorption[:, ::every], Surface(*(x[::every] for x in face))
+            table, surface = absorption[:, ::every], LeafSurface(*(x[::every] for x in face))
             near = _fit(few, table, surface, count, max_steps, _FIRST_DAMPING)
             leaf = leaf._replace(start=near.best.x)
         damping = _FIRST_DAMPING if every <= 1 else _LEAST_DAMPING
@@ -105,7 +107,7 @@ def fit_all(
 
 
 def _fit(
-    leaf: Task, absorption: Array, face: Surface, count: ArrayLike, max_steps: ArrayLike, damping: float
+    leaf: Task, absorption: Array, face: LeafSurface, count: ArrayLike, max_steps: ArrayLike, damping: float
 ) -> State:
     start, low, high = leaf.start, leaf.low, leaf.high
     used = jnp.isfinite(leaf.observed) & jnp.isfinite(leaf.sigma)
@@ -117,7 +119,7 @@ def _fit(
     def at(x: Array) -> Point:
         k = jnp.dot(x[1:], absorption, precision=lax.Precision.HIGHEST) / x[0]
         values, in_k, in_N = (jnp.stack(v[:2]) for v in plate_model_slopes(k, x[0], face))
-        # Else the compiler would compute them again for every sum below.
+        # Without the barrier the compiler would compute them again for every sum below.
         values, in_k, in_N = lax.optimization_barrier((values, in_k, in_N))
         off = values - observed
         residual, s = off * weight, in_k * weight / x[0]
@@ -143,7 +145,7 @@ def _fit(
     def converged(p: Point) -> Array:
         fall = -jnp.dot(p.slope, step(p, _LEAST_DAMPING), precision=lax.Precision.HIGHEST)
         small = _SMALL_STEP**2 * jnp.maximum(p.chi2 / freedom, floor)
-        # A fall of a few roundings of chi-squared could not be seen.
+        # A fall of chi-squared by a few roundings is not measurable.
         small = jnp.maximum(small, 8 * jnp.finfo(fall.dtype).eps * p.chi2)
         return (fall <= small) & jnp.isfinite(p.chi2)
 
@@ -158,7 +160,7 @@ def _fit(
     def going(s: State) -> Array:
         return ~s.done & (s.steps < max_steps) & (s.damping < _MOST_DAMPING)
 
-    # Any point is better than none: the start is tried first.
+    # Chi-squared begins at infinity, so that the start, tried first, is accepted.
     zero = jnp.zeros_like(start)
     none = Point(start, jnp.full_like(floor, jnp.inf), jnp.zeros_like(floor), zero, jnp.outer(zero, zero))
     first = State(none, start, jnp.asarray(damping, start.dtype), jnp.asarray(0), jnp.asarray(False))
@@ -168,7 +170,7 @@ def _fit(
 def errors_of(
     normal: Float[np.ndarray, "leaves n n"], width: Float[np.ndarray, "leaves n"]
 ) -> Float[np.ndarray, "leaves n"]:
-    """Standard errors out of normal matrices; infinite where above `width`, the bounds', or collinear."""
+    """Standard errors from normal matrices; infinite where collinear or above the bounds' `width`."""
     norm = np.sqrt(np.diagonal(normal, axis1=1, axis2=2))
     norm = np.where(norm > 0, norm, 1.0)
     value, vector = np.linalg.eigh(normal / (norm[:, :, None] * norm[:, None, :]))

@@ -1,4 +1,4 @@
-"""Leaf traits from measured reflectance and transmittance: PROSPECT inverted, many leaves at once."""
+"""Retrieval of leaf traits from reflectance and transmittance: inversion of PROSPECT for many leaves."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, final
@@ -11,7 +11,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 from jaxlidar import Prospect
 from jaxlidar.extend import check_range
 from jaxlidar.optics.coefficients import TRAITS
-from jaxlidar.optics.plate_model import Surface
+from jaxlidar.optics.leaf_surface import LeafSurface
 from jaxlidar.optics.prospect import material
 
 from .leaf_solver import Task, errors_of, fit_all, rounding
@@ -37,19 +37,34 @@ STATUS = (
 
 @final
 class LeafFit(eqx.Module):
-    """Fitted leaves. Dictionaries are keyed by the names of the unknowns, in the units of `Prospect`.
+    """The result of `invert_leaves`: leaf traits and their standard errors.
 
-    - `traits`: (leaves,) best values. - `stderr`: one standard error each; infinite where the spectra do not
-      determine the trait. Of a trait on a bound, as if the bound were not there.
-    - `at_bound`: whether the value lies on one of its bounds.
+    Dictionaries are keyed by the names of the unknowns, in the units of `Prospect`. `print(fit)` shows a
+    summary.
+
+    - `traits`: by name, (leaves,) best values.
+    - `stderr`: by name, (leaves,) one standard error; infinite where the spectra do not constrain the trait.
+      That of a trait on a bound is computed as if there were no bound.
+    - `at_bound`: by name, (leaves,) whether the value lies on one of its bounds.
     - `leaves`: the fitted leaves, for `prospect_spectra`: a `Prospect` whose traits have shape (leaves,).
-    - `rmse`: (leaves,) root of the mean squared residual of all samples used, of both spectra; zero where
+    - `rmse`: (leaves,) root mean square of the residuals of all samples used, of both spectra; zero where
       there are none.
-    - `reduced_chi2`: (leaves,) sum of squared residuals over their variances, by the number of samples less
-      that of unknowns. One by construction where no noise was given.
-    - `n_steps`: (leaves,) points tried with all bands, each one PROSPECT with its Jacobian; two is usual, for
-      spectra of many bands are first fitted at a part of them, and those points are not counted.
-    - `status`: (leaves,) how it ended, number of a sentence of `inversion.leaves.STATUS`; 0 is convergence.
+    - `reduced_chi2`: (leaves,) sum of squared residuals over their variances, divided by the number of
+      samples less that of unknowns. One by construction where no noise was given.
+    - `n_steps`: (leaves,) points tried with all bands, each one PROSPECT with its Jacobian. Two is usual:
+      spectra of many bands are first fitted to a part of them, and those points are not counted.
+    - `status`: (leaves,) how the fit ended, index of a sentence of `inversion.leaves.STATUS`; 0 is
+      convergence.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> import inversion
+    >>> import numpy as np
+    >>> bands = np.arange(400.0, 2501.0, 10.0)
+    >>> fit = inversion.invert_leaves(bands, *jl.Prospect(Cw=0.012)(bands))
+    >>> fit.converged.tolist(), f"{float(fit.leaves.Cw[0]):.3f} cm"
+    ([True], '0.012 cm')
     """
 
     traits: dict[str, Float[Array, " leaves"]]
@@ -63,11 +78,18 @@ class LeafFit(eqx.Module):
 
     @property
     def converged(self) -> Bool[Array, " leaves"]:
-        """Which leaves ended at a minimum."""
+        """Whether the fit ended at a minimum, for each leaf."""
         return self.status == 0
 
     def sentence(self, leaf: int) -> str:
-        """How the fit of one leaf ended."""
+        """How the fit of one leaf ended, in a sentence that names traits not determined or at a bound.
+
+        **Arguments:**
+
+        - `leaf`: index of the leaf.
+
+        **Returns:** the sentence.
+        """
         text = f"{STATUS[int(self.status[leaf])]} after {int(self.n_steps[leaf])} steps"
         notes = {
             "not determined": [name for name, e in self.stderr.items() if not np.isfinite(e[leaf])],
@@ -97,40 +119,56 @@ def invert_leaves(
     max_steps: int = 50,
     chunk: int = 20,
 ) -> LeafFit:
-    """Find the traits of leaves from directional-hemispherical reflectance and transmittance.
+    """Retrieve leaf traits from directional-hemispherical reflectance and transmittance, by PROSPECT.
 
-    Every leaf is fitted by itself: samples that are missing are left out, and a leaf without any, or one that
-    does not converge, says so in its status and leaves the others alone.
+    Every leaf is fitted on its own. Missing samples are left out. A leaf that has no sample or does not
+    converge is marked so in its status and does not affect the others. Results are in JAX's default
+    precision. Equal shapes compile once (a few seconds).
 
-    On measured leaves PROSPECT's own error, alike in neighbouring bands, exceeds the noise: standard errors,
-    which take samples as independent, are then too small. Which traits to seek matters: without Cant and
-    Cbrown, `unknowns=("N", "Cab", "Car", "Cw", "Cm")`, root mean squared errors in ug/cm2 become 4.9 instead
-    of 6.6 (Cab) and 3.7 instead of 2.7 (Car) on ANGERS, 10.9 instead of 8.7 and 4.8 instead of 2.9 on LOPEX.
+    On measured leaves PROSPECT's own error, which is correlated between neighbouring bands, exceeds the
+    noise. Standard errors take samples as independent and are then too small. The choice of traits matters:
+    without Cant and Cbrown, `unknowns=("N", "Cab", "Car", "Cw", "Cm")`, root mean squared errors in ug/cm2
+    become 4.9 instead of 6.6 (Cab) and 3.7 instead of 2.7 (Car) on ANGERS, 10.9 instead of 8.7 and 4.8
+    instead of 2.9 on LOPEX.
 
     **Arguments:**
 
-    - `wavelengths`: (wavelengths,) nm, in any order, within PROSPECT's 400..2500.
+    - `wavelengths`: (wavelengths,) nm, in any order, within PROSPECT's 400 to 2500.
     - `reflectance`, `transmittance`: (leaves, wavelengths) fractions, or (wavelengths,) of one leaf; NaN
-      where a sample is missing. Either may be None, but without transmittance N is hardly told from the rest.
-    - `unknowns`: names out of "N" and the traits of the version. Default: all of them.
-    - `leaf`: gives the version, alpha and coefficients, the values that unknowns start from and those that
-      the others keep; its traits are scalars or of shape (leaves,). Default `Prospect()`.
-    - `bounds`: (low, high) by name. Default: N 1..5; Cab 0..150, Car and Cant 0..50 ug/cm2; Cbrown 0..5;
-      Cw 0..0.1 cm; Cm and Cc 0..0.1, Cp 0..0.02 g/cm2.
-    - `noise`: one standard deviation of all samples, or an array that broadcasts to (leaves, 2, wavelengths),
-      the middle axis reflectance and transmittance. Infinity leaves a sample out. Default: alike for all
-      and unknown, so that standard errors are scaled by the residuals.
-    - `max_steps`: most points tried by a fit, 1 or more (default 50; measured leaves need two to fifteen).
-    - `chunk`: most leaves fitted at once, 1 or more (default 20; from 10 to 40 are alike).
+      where a sample is missing. One of the two may be None, but without transmittance the data hardly
+      constrain N apart from the other traits.
+    - `unknowns`: names out of "N" and the traits of the version. Default None: all of them.
+    - `leaf`: a `Prospect` that gives the version, alpha and coefficients, the starting values of the unknowns
+      and the fixed values of the other traits; its traits are scalars or of shape (leaves,). Default None:
+      that of `Prospect()`.
+    - `bounds`: (low, high) by name. Default None: N 1 to 5; Cab 0 to 150, Car and Cant 0 to 50 ug/cm2; Cbrown
+      0 to 5; Cw 0 to 0.1 cm; Cm and Cc 0 to 0.1, Cp 0 to 0.02 g/cm2. Those given replace these by name.
+    - `noise`: one standard deviation, above 0, of all samples, or an array that broadcasts to
+      (leaves, 2, wavelengths), the middle axis reflectance and transmittance. Infinity leaves a sample out.
+      Default None: unknown and the same for all samples; standard errors are then scaled by the residuals.
+    - `max_steps`: most points tried by a fit, 1 or more; measured leaves need two to fifteen. Default 50.
+    - `chunk`: most leaves fitted at once, 1 or more; speed is the same from 10 to 40. Default 20.
 
-    Results are in JAX's default precision. Equal shapes compile once (a few seconds).
+    **Returns:** a `LeafFit`.
 
-    **Raises:** ValueError naming field, value and admissible range: spectra outside -1..2 (per cent, say),
-    of another shape than each other or than the wavelengths, or both None; wavelengths outside the table;
-    noise that is not above 0; unknowns or bounds that are none of the version's, or twice; bounds that do not
-    increase or admit N below 1 or negative contents; a start outside its bounds; max_steps or chunk below 1.
+    **Raises:** ValueError naming field, value and admissible range: spectra outside -1 to 2 (in per cent,
+    say), of shapes that differ or do not fit the wavelengths, or both None; wavelengths outside the table;
+    noise that is not above 0; unknowns or bounds that the version does not have, or given twice; bounds that
+    do not increase or admit N below 1 or negative contents; a start outside its bounds; `max_steps` or
+    `chunk` below 1.
 
     **Source:** Jacquemoud et al. (1996), Remote Sens. Environ. 56, 194; Feret et al. (2017), 193, 204.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> import inversion
+    >>> import numpy as np
+    >>> bands = np.arange(400.0, 2501.0, 10.0)
+    >>> reflectance, transmittance = jl.Prospect(Cab=50.0, Cw=0.012)(bands)
+    >>> fit = inversion.invert_leaves(bands, reflectance, transmittance)
+    >>> print(f"Cab {float(fit.traits['Cab'][0]):.1f} ug/cm2, Cw {float(fit.traits['Cw'][0]):.3f} cm")
+    Cab 50.0 ug/cm2, Cw 0.012 cm
     """
     leaf = Prospect() if leaf is None else leaf
     known = ("N", *TRAITS[leaf.version])
@@ -147,7 +185,7 @@ def invert_leaves(
     end = fit_all(
         Task(start, low, high, jnp.asarray(observed, dtype), sigma),
         absorption.astype(dtype),
-        Surface(*(jnp.asarray(x, dtype) for x in face)),
+        LeafSurface(*(jnp.asarray(x, dtype) for x in face)),
         len(names),
         int(max_steps),
         int(chunk),
@@ -163,7 +201,7 @@ def invert_leaves(
     stopped = np.where(np.asarray(end.steps) >= max_steps, 1, 2)
     found = dict(zip(known, best.x.T))
     at_bound = dict(zip(known, ((best.x <= low) | (best.x >= high)).T))
-    # Traits that the version does not know are zero.
+    # Traits that the version does not have are zero.
     shown = {name: found.get(name, jnp.zeros_like(best.chi2)) for name in _BOUNDS}
     return LeafFit(
         traits={name: found[name] for name in names},
@@ -215,7 +253,7 @@ def _data(
 def _limits(
     leaf: Prospect, known: tuple[str, ...], names: tuple[str, ...], bounds: Mapping[str, Any], count: int
 ) -> list[Float[np.ndarray, "leaves traits"]]:
-    """Start, lower and upper bounds of N and all traits; those that are not sought have no room."""
+    """Start, lower and upper bounds of N and all traits; traits that are not unknowns have equal bounds."""
     admissible = ", ".join(known)
     for i, name in enumerate(names):
         if name not in known or name in names[:i]:

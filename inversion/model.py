@@ -1,11 +1,11 @@
-"""The simulated waveform and its Jacobian, with each unknown's column got in the cheapest way.
+"""The simulated waveform and its Jacobian, with each unknown's column computed in the cheapest way.
 
-Unknowns on which only the optics depend leave the response as it is: their columns are a small matrix
-product with the traced response. Only geometric unknowns push tangents through the trace, all of them in one
-pass that shares what does not depend on them. Where no unknown is geometric, photons are traced once.
+Optical unknowns do not change the response: their columns are a small matrix product with the traced
+response. Geometric unknowns need tangents pushed through the trace, all of them in one pass that shares what
+does not depend on them. Where no unknown is geometric, photons are traced once.
 
 All evaluations use the same random keys, so that the waveform is a smooth function of the unknowns. An
-evaluation averages batches of photons with keys of their own, whose spread is the simulation's own noise.
+evaluation averages batches of photons, each with its own key; their spread is the simulation's own noise.
 """
 
 from collections.abc import Callable, Sequence
@@ -28,7 +28,7 @@ Values = tuple[Array, ...]
 
 
 class Problem(eqx.Module):
-    """What a waveform is simulated of, but for the unknowns' values."""
+    """Inputs of a simulation, except the values of the unknowns."""
 
     lidar: Lidar
     scene: Scene
@@ -36,14 +36,13 @@ class Problem(eqx.Module):
     places: tuple[Place, ...] = eqx.field(static=True)
 
     def at(self, values: Values) -> Setup:
-        """With these values."""
+        """The setup with these values."""
         return reduce(self.lidar, put(self.scene, self.places, values), self.plan)
 
     def moving(self, values: Values, *, geometric: bool) -> tuple[Array, Callable[[Array], Setup]]:
-        """The values of the geometric unknowns, or of the others, as one vector; and the setup for such a
-        one.
+        """The values of the geometric (or optical) unknowns as one vector, and the setup as its function.
 
-        The others keep their values.
+        The other unknowns keep their values.
         """
         numbers = [i for i, place in enumerate(self.places) if place.geometric == geometric]
         flat, restore = jax.flatten_util.ravel_pytree([values[i] for i in numbers])
@@ -69,7 +68,7 @@ def _batch(
     if not flat.size:
         value, response = total(flat)
         return response, value, jnp.zeros((0, *value.shape), value.dtype)
-    # The response without its tangents is the same for all directions, hence not batched.
+    # The response without its tangents is the same in all directions, hence not batched.
     push = jax.vmap(lambda t: jax.jvp(total, (flat,), (t,), has_aux=True), out_axes=(None, 0, None))
     value, columns, response = push(jnp.eye(flat.size, dtype=flat.dtype))
     return response, value, columns
@@ -138,7 +137,7 @@ class Evaluation(NamedTuple):
 
 
 class Model:
-    """The simulated waveform as a function of the unknowns. Traces as seldom as it can."""
+    """The simulated waveform as a function of the unknowns. Photons are traced no more often than needed."""
 
     def __init__(self, lidar: Lidar, scene: Scene, plan: Plan, settled: Sequence[Settled], key: PRNGKeyArray):
         self.problem = Problem(lidar, scene, plan, tuple(s.place for s in settled))
@@ -153,7 +152,7 @@ class Model:
         self.order = np.argsort(np.concatenate([np.flatnonzero(geometric), np.flatnonzero(~geometric)]))
 
     def values(self, flat: Float[np.ndarray, " columns"]) -> Values:
-        """The unknowns' values out of one vector."""
+        """The unknowns' values from one vector."""
         parts = np.split(np.asarray(flat), np.cumsum(self.sizes)[:-1])
         return tuple(jnp.asarray(p.reshape(s), d) for p, s, d in zip(parts, self.shapes, self.dtypes))
 
@@ -162,7 +161,7 @@ class Model:
         return put(self.problem.scene, self.problem.places, self.values(flat))
 
     def __call__(self, flat: Float[np.ndarray, " columns"], *, spread: bool = False) -> Evaluation:
-        """Simulate. `spread`: give the batches one by one as well."""
+        """Simulate at the values `flat`; with `spread`, give the batches one by one as well."""
         values = self.values(flat)
         batches, columns = None, None
         if self.traces or self._kept is None:

@@ -1,4 +1,4 @@
-"""A plan that holds for every scene within the bounds of the geometric unknowns."""
+"""Plans that are valid for every scene within the bounds of the geometric unknowns."""
 
 import dataclasses
 import itertools
@@ -13,15 +13,15 @@ from jaxlidar.planning.path_lengths import PathLengths
 
 from .unknowns import Settled, put
 
-# Beyond this many geometric unknowns not every corner of the bounds is looked at.
+# With more geometric unknowns than this, not every corner of the bounds is examined.
 _ALL_CORNERS = 4
 
 
 def corners(scene: Scene, settled: list[Settled]) -> list[Scene]:
     """The scene at its start, and with the geometric unknowns at their bounds.
 
-    All combinations of up to four; of more, each alone and all together. An array is at its low or high
-    bounds as a whole.
+    All combinations for up to four unknowns; for more, each alone and all together. An array is at its low or
+    its high bounds as a whole.
     """
     moving = [i for i, s in enumerate(settled) if s.place.geometric]
     if len(moving) <= _ALL_CORNERS:
@@ -48,10 +48,11 @@ def plan_for(
     photons: int,
     rays: int,
 ) -> Plan:
-    """The starting scene's plan, with its loops and time bins long enough for all of `corners`.
+    """The plan of the starting scene, with loops and time bins long enough for all `corners`.
 
-    Letters, orders and step lengths are the starting scene's. **Raises:** ValueError where a corner is
-    inadmissible, such as a canopy that reaches above the sensor.
+    Letters, orders and step lengths are those of the starting scene.
+
+    **Raises:** ValueError where a corner is inadmissible, such as a canopy that reaches above the sensor.
     """
     interval = float(lidar.sampling_interval)
     window = (float(time[0]), float(time[0]) + (time.size - 1 + 1e-3) * interval)
@@ -90,7 +91,7 @@ def plan_for(
 
 
 def check_samples(plan: Plan, time: Float[np.ndarray, " bins"]) -> None:
-    """Refuse a plan whose samples are not at `time`."""
+    """Check that the samples of a plan are at `time`. **Raises:** ValueError where they are not."""
     slack = 1e-3 * plan.sample_interval + 4e-7 * float(np.max(np.abs(time)))
     expected = plan.sample_start + plan.sample_interval * np.arange(plan.n_samples)
     if time.size != plan.n_samples or np.max(np.abs(expected - time)) > slack:

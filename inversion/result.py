@@ -1,4 +1,4 @@
-"""What a retrieval returns."""
+"""Records of a retrieval: its steps and its result."""
 
 import dataclasses
 from typing import final
@@ -12,7 +12,20 @@ from jaxlidar import Scene, Waveform
 
 @dataclasses.dataclass(frozen=True)
 class Step:
-    """One step of a fit: its number, reduced chi-squared and the values tried, and whether they were kept."""
+    """One step of a fit, as `retrieve` passes it to `progress`.
+
+    - `number`: from 1 on.
+    - `reduced_chi2`: reduced chi-squared at the values tried.
+    - `accepted`: whether the values tried were kept.
+    - `values`: by name, the values tried.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> import inversion
+    >>> print(inversion.Step(number=2, reduced_chi2=1.5, accepted=False, values={"height": 0.25}))
+    step 2: chi2 = 1.5 (not kept); height = 0.25
+    """
 
     number: int
     reduced_chi2: float
@@ -27,22 +40,38 @@ class Step:
 
 @final
 class Retrieval(eqx.Module):
-    """A fitted scene.
+    """The result of `retrieve`: values of the unknowns, their standard errors, and the fitted scene.
 
     Unknowns are in their natural units, keyed by name. The rows of `covariance` and `correlation` are the
-    flattened unknowns in the order given, named by `labels`.
+    flattened unknowns in the order given, named by `labels`. `print(fit)` shows a summary.
 
-    - `values`: best values. - `stderr`: one standard error each, of the same shapes; infinite where the data
-      do not determine the unknown.
-    - `simulation_error`: the part of `stderr` that comes from the simulation's own noise: it falls with
+    - `values`: best values.
+    - `stderr`: one standard error each, of the same shapes; infinite where the data do not constrain the
+      unknown.
+    - `simulation_error`: the part of `stderr` that comes from the simulation's own noise; it falls with
       `n_photons`.
     - `covariance`, `correlation`: (n, n). An unknown of infinite variance has no covariance with others.
-    - `scene`, `waveform`: as fitted; `waveform.stderr` is the simulation's. The fitted scale is not in it.
+    - `scene`: the fitted scene.
+    - `waveform`: the fitted waveform, without the fitted scale; its `stderr` is the simulation's.
     - `residuals`: (wavelengths, bins) observed minus fitted over its standard deviation; zero where the
       sample was left out.
     - `reduced_chi2`: sum of squared residuals over the number of samples less that of determined unknowns.
-    - `converged`: whether the fit ended at a minimum. - `status`: how it ended, in a sentence.
-    - `steps`: waveforms simulated, each with its Jacobian. - `history`: reduced chi-squared of every step.
+    - `converged`: whether the fit ended at a minimum.
+    - `status`: how the fit ended, in a sentence.
+    - `steps`: waveforms simulated, each with its Jacobian.
+    - `history`: reduced chi-squared of every step.
+    - `labels`: names of the flattened unknowns.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> import inversion, jax
+    >>> truth, start = jl.Scene(ground=jl.Ground(height=0.5)), jl.Scene(ground=jl.Ground())
+    >>> wave = jl.simulate(jl.Lidar(), truth, key=jax.random.key(0))
+    >>> height = inversion.Unknown(lambda s: s.ground.height, bounds=(-2.0, 2.0))
+    >>> fit = inversion.retrieve(wave, jl.Lidar(), start, [height], noise=0.001, key=jax.random.key(1))
+    >>> fit.converged, fit.labels, f"{float(fit.scene.ground.height):.3f} m"
+    (True, ('ground.height',), '0.500 m')
     """
 
     values: dict[str, Float[Array, "..."]]

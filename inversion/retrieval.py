@@ -1,4 +1,4 @@
-"""Fits of scenes to waveforms: the one entry."""
+"""Retrieval of scene properties from one waveform."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -45,47 +45,67 @@ def retrieve(
     progress: Callable[[Step], None] | None = None,
     throw: bool = False,
 ) -> Retrieval:
-    """Find the unknowns of a scene from its waveform, with their standard errors.
+    """Retrieve unknowns of a scene from one waveform, with standard errors, by nonlinear least squares.
 
-    Least squares finds the nearest minimum: a height must start within about a pulse length of the truth,
-    else the fit may end in another echo. `starts` looks from several places.
+    Least squares finds the nearest local minimum: a height must start within about a pulse length of the
+    truth, else the fit may end in another echo. `starts` fits from several starting points.
 
-    Every simulation of a fit uses the same random numbers, which makes it a smooth function of the unknowns.
-    The noise that it has nevertheless is estimated from its batches, weighs down the samples that it affects
-    and is part of the standard errors; `Retrieval.simulation_error` says how large a part, and more photons
-    lower it. Unknowns on which only optics depend (leaf traits, reflectances, the atmosphere) cost
-    next to nothing, and if all are such, photons are traced once. Fits with equal shapes, plans and unknowns
-    compile once.
+    All simulations of a fit use the same random numbers, so that the waveform is a smooth function of the
+    unknowns. The remaining noise of the simulation is estimated from its batches. It lowers the weight of the
+    samples that it affects and is part of the standard errors. `Retrieval.simulation_error` gives that part;
+    more photons lower it. Unknowns that act through optics alone (leaf traits, reflectances, the atmosphere)
+    cost next to nothing; if all unknowns are such, photons are traced once. Fits with equal shapes, plans and
+    unknowns compile once.
 
     **Arguments:**
 
     - `observed`: a `Waveform`, of which `reflectance` is fitted, or an array (wavelengths, bins) of apparent
       reflectance with `time`, or in any other unit with `scale`.
-    - `lidar`, `scene`: the instrument, and the scene at the starting values.
-    - `unknowns`: what to find. Every scene within the bounds must be admissible: a reflectance plus
-      transmittance above one, say, is not noticed.
-    - `noise`: one standard deviation of `observed`, anything that broadcasts to it; samples are taken as
-      independent. Infinity leaves a sample out.
-    - `key`: a JAX random key; another than that of a simulated `observed`.
-    - `time`: (bins,) ns, with an array. Times must lie the lidar's sampling interval apart.
-    - `plan`: what to simulate (`jaxlidar.plan`, its window as `observed`, valid throughout the bounds), with
-      the photons and rays of one of eight batches. Default: planned for the start and the bounds' corners.
-    - `n_photons`, `n_rays`: photons, and rays of the footprint, of one simulation, in eight batches together.
-    - `max_orders`: scatterings followed. Default: by the albedos of the starting scene.
-    - `solver`: any Gauss-Newton method of optimistix. Default: Levenberg-Marquardt. A fit ends as well where
-      a Gauss-Newton step would be below 0.02 standard errors, or is small and improves nothing.
+    - `lidar`: the instrument.
+    - `scene`: the scene at the starting values.
+    - `unknowns`: what to retrieve, one `Unknown` or more. Every scene within the bounds must be admissible: a
+      sum of reflectance and transmittance above one, say, is not noticed.
+    - `noise`: one standard deviation of `observed`, in [0, inf], anything that broadcasts to it. Samples are
+      taken as independent. Infinity leaves a sample out.
+    - `key`: a JAX random key, other than that of a simulated `observed`.
+    - `time`: (bins,) ns, needed where `observed` is an array. Times must lie the lidar's sampling interval
+      apart. Default None: those of the `Waveform`.
+    - `plan`: what to simulate (`jaxlidar.plan`, with the window of `observed`, valid throughout the bounds),
+      with the photons and rays of one of eight batches. It replaces `n_photons`, `n_rays` and `max_orders`.
+      Default None: planned for the start and the corners of the bounds.
+    - `n_photons`: photons of one simulation, all eight batches together, at least 8. Default 65536.
+    - `n_rays`: rays of the footprint of one simulation, all eight batches together, at least 8. Default 8192.
+    - `max_orders`: orders of scattering. Default None: chosen by the albedos of the starting scene.
+    - `solver`: a Gauss-Newton method of optimistix. Default: Levenberg-Marquardt. A fit also ends where a
+      Gauss-Newton step would be below 0.05 standard errors, or where small steps no longer improve it.
     - `max_steps`: most simulations, each with its Jacobian, from each start. Default 50.
-    - `starts`: from how many places to fit; the best fit is returned. The first is the scene's own, the
-      others are a Latin hypercube over the bounds. Default 1.
-    - `scale`: bounds of a further unknown, "scale", which multiplies the simulated reflectance, the same for
-      all wavelengths (an uncalibrated receiver); it starts where it fits best. Default: none.
-    - `noise_floor`: share of each wavelength's largest observed value that replaces any smaller `noise`:
-      standard errors of a simulation are zero where no photon came. Default 1e-3.
+    - `starts`: number of starting points; the best fit is returned. The first is the scene's own, the others
+      are a Latin hypercube over the bounds. Default 1.
+    - `scale`: (low, high), bounds of a further unknown, "scale", which multiplies the simulated reflectance,
+      the same for all wavelengths (an uncalibrated receiver). It starts where it fits best. Default None: no
+      such unknown.
+    - `noise_floor`: share of each wavelength's largest observed value, 0 to 1, that replaces any smaller
+      `noise`: standard errors of a simulation are zero where no photon came. Default 1e-3.
     - `progress`: called with a `Step` after every step; for instance `print`.
-    - `throw`: raise RuntimeError where the fit does not converge. Default: `status` says so.
+    - `throw`: whether to raise RuntimeError where the fit does not converge. Default False: only
+      `Retrieval.status` says so.
+
+    **Returns:** a `Retrieval`.
 
     **Raises:** ValueError for inadmissible arguments, among them a start outside its bounds, samples that do
-    not fit the lidar or the plan, and noise that is negative or NaN.
+    not fit the lidar or the plan, and noise that is negative or NaN. RuntimeError where `throw` is set and
+    the fit does not converge.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> import inversion, jax
+    >>> truth, start = jl.Scene(ground=jl.Ground(height=0.5)), jl.Scene(ground=jl.Ground())
+    >>> wave = jl.simulate(jl.Lidar(), truth, key=jax.random.key(0))
+    >>> height = inversion.Unknown(lambda s: s.ground.height, bounds=(-2.0, 2.0), name="height")
+    >>> fit = inversion.retrieve(wave, jl.Lidar(), start, [height], noise=0.001, key=jax.random.key(1))
+    >>> print(f"{float(fit.values['height']):.3f} +- {float(fit.stderr['height']):.3f} m")
+    0.500 +- 0.005 m
     """
     if len(unknowns) == 0:
         raise ValueError("unknowns is empty; admissible is one unknown or more")
@@ -99,7 +119,7 @@ def retrieve(
     ):
         if value != int(value) or value < low:
             raise ValueError(f"{name} = {value} is outside the admissible range [{low}, inf) of integers")
-    # Samples lie at the given times, whatever opened the window.
+    # Samples lie at the given times, whatever opened the recording window.
     lidar = dataclasses.replace(lidar, receiver=dataclasses.replace(lidar.receiver, window="fixed"))
     data = data_of(observed, time, noise, noise_floor, lidar)
     settled = settle(unknowns, scene)
@@ -127,13 +147,13 @@ def retrieve(
 def fits_from(
     starts: int, key: PRNGKeyArray, data: Data, settled: list[Settled], scaled: bool, *more: Any
 ) -> list[Fit]:
-    """One fit from the unknowns' own start, and others from a Latin hypercube over their bounds."""
+    """One fit from the unknowns' own start, and further ones from a Latin hypercube over their bounds."""
     places = latin_hypercube(settled, starts - 1, jax.random.fold_in(key, 1)) if starts > 1 else []
     return [Fit(data, settled, scaled, *more, start=place) for place in [None, *places]]
 
 
 def retrieval_of(outcome: Outcome, model: Model, settled: list[Settled], scaled: bool) -> Retrieval:
-    """The outcome of a fit, named."""
+    """A `Retrieval` from the outcome of a fit, with values keyed by name."""
 
     def by_name(flat: np.ndarray) -> dict[str, Array]:
         return {k: jnp.asarray(v) for k, v in named(flat, settled).items()}
@@ -158,6 +178,7 @@ def retrieval_of(outcome: Outcome, model: Model, settled: list[Settled], scaled:
 
 
 def scale_of(bounds: Any, settled: list[Settled]) -> Settled:
+    """The unknown "scale" of an uncalibrated receiver. **Raises:** ValueError for inadmissible bounds."""
     try:
         low, high = (float(b) for b in bounds)
     except (TypeError, ValueError):
@@ -167,6 +188,6 @@ def scale_of(bounds: Any, settled: list[Settled]) -> Settled:
         raise ValueError(f"scale = {bounds!r} is not low < high")
     if any(s.name == "scale" for s in settled):
         raise ValueError("name = 'scale' is taken by the scale; the unknown needs another one")
-    # Its start waits for the first simulation.
+    # Its start is set after the first simulation.
     start = jnp.asarray(0.5 * (low + high))
     return Settled("scale", Place(None, None, False), start, np.asarray(low), np.asarray(high), None)

@@ -1,11 +1,12 @@
-r"""Standard errors of a fit, and which unknowns the data leave open.
+r"""Standard errors of a fit, and which unknowns the data do not constrain.
 
 With whitened Jacobian J and prior precision P, H = J^T J + P, the covariance of the fitted values is
 
     H^-1 (J^T W J + P) H^-1  +  covariance of (H^-1 J^T d) / batches,
 
-W the share of the weights' variance that is measurement noise and d the deviations of the simulation's
-batches: the second term is the simulation's own noise, with all correlation between its bins and wavelengths.
+with W the share of the weights' variance that is measurement noise, and d the deviations of the simulation's
+batches from their mean. The second term is the simulation's own noise, with all correlation between its bins
+and wavelengths.
 """
 
 from typing import NamedTuple
@@ -18,9 +19,12 @@ _COLLINEAR = 1e-6
 
 
 class Errors(NamedTuple):
-    """Covariance in natural units, the part of its diagonal that is the simulation's, and what is left open.
+    """Covariance of the unknowns in natural units.
 
-    Open unknowns have an infinite variance and no covariance with others, which are as if these were free.
+    - `covariance`: of all unknowns. Open ones have an infinite variance and no covariance with the others,
+      whose covariance is as if the open ones were free.
+    - `simulation`: standard errors from the simulation's noise alone.
+    - `open`: whether the data do not constrain the unknown.
     """
 
     covariance: Float[np.ndarray, "n n"]
@@ -37,13 +41,18 @@ def errors_of(
 ) -> Errors:
     """Covariance at the solution.
 
-    An unknown is open if its standard error exceeds the width of its bounds, alone or together with others.
+    An unknown is open if its standard error exceeds the width of its bounds, alone or in combination with
+    others.
 
     **Arguments:**
 
-    - `jacobian`: whitened, in natural units. - `precision`: of the prior, 0 where there is none.
-    - `width`: of the bounds. - `measured`: measurement variance over the variance used for whitening.
+    - `jacobian`: whitened, in natural units.
+    - `precision`: of the prior, 0 where there is none.
+    - `width`: of the bounds.
+    - `measured`: measurement variance over the variance used for whitening.
     - `deviations`: of each batch from their mean, whitened.
+
+    **Returns:** an `Errors`.
     """
     n = width.size
     information = jacobian.T @ jacobian + np.diag(precision)
@@ -73,7 +82,7 @@ def errors_of(
 
 
 def correlation_of(covariance: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
-    """Correlation matrix; unknowns of infinite or no variance are correlated with none."""
+    """Correlation matrix; unknowns of infinite or zero variance have no correlation with others."""
     std = np.sqrt(np.diag(covariance))
     fine = np.isfinite(std) & (std > 0)
     safe = np.where(fine, std, 1.0)
@@ -84,7 +93,7 @@ def correlation_of(covariance: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n
 
 
 def decrement(jacobian: Float[np.ndarray, "data n"], residual: Float[np.ndarray, " data"]) -> float:
-    """How far a Gauss-Newton step would go, in standard errors: the root of the fall in chi-squared."""
+    """Length of a Gauss-Newton step in standard errors: the root of the fall in chi-squared."""
     norm = np.linalg.norm(jacobian, axis=0)
     seen = norm > 0
     if not np.any(seen):

@@ -1,7 +1,7 @@
-"""What is to be found: values in a scene, their bounds, and how a value is put into the scene.
+"""Unknowns of a retrieval: their bounds, priors and starting values, and how a value enters the scene.
 
-A bounded value is carried by a smooth bijection, value = low + (high - low) / (1 + exp(-z)), with z free: a
-solver in z can neither leave the bounds nor stop dead at them.
+A bounded value is a smooth bijection of a free parameter z, value = low + (high - low) / (1 + exp(-z)): a
+solver in z never reaches the bounds.
 """
 
 from collections.abc import Callable, Sequence
@@ -16,7 +16,7 @@ from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 from jaxlidar import Scene
 from jaxlidar.extend import as_array, check_range
 
-# Starting values keep this share of the interval's width away from its ends.
+# Least distance of a starting value from a bound, as a share of the bounds' width.
 MARGIN = 0.01
 
 
@@ -30,12 +30,24 @@ def _as_pair(x: Any) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
 
 @final
 class LogNormal(eqx.Module):
-    """A prior on the logarithm of a positive value.
+    """A log-normal prior: a normal distribution of the logarithm of a positive unknown.
 
-    - `median`: in the value's own unit, positive, a number or an array.
-    - `spread`: standard deviation of the natural logarithm, positive: 0.5 means within a factor of 1.65.
+    **Arguments:**
 
-    **Raises:** ValueError for either that is not positive.
+    - `median`: in the unknown's own unit, positive, a number or an array.
+    - `spread`: standard deviation of the natural logarithm, positive, a number or an array. For instance, 0.5
+      means within a factor of 1.65 of the median, to one standard deviation.
+
+    **Raises:** ValueError for a `median` or `spread` that is not positive.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> import inversion
+    >>> prior = inversion.LogNormal(median=0.3, spread=0.5)
+    >>> unknown = inversion.Unknown(lambda s: s.ground.reflectance, bounds=(0.0, 1.0), prior=prior)
+    >>> print(f"{float(unknown.prior.median):.1f}")
+    0.3
     """
 
     median: Float[Array, "..."] = eqx.field(converter=as_array)
@@ -62,30 +74,41 @@ def _optional_array(x: ArrayLike | None) -> Float[Array, "..."] | None:
 
 @final
 class Unknown(eqx.Module):
-    """A value to be retrieved: an array of the scene, or anything that a function puts into the scene.
+    """An unknown of a retrieval: an array of the scene, or a value that a function puts into the scene.
 
-        Unknown(lambda s: s.canopy.leaf.Cab, bounds=(5.0, 100.0), name="Cab")
-        Unknown(name="leaf area scale", bounds=(0.1, 10.0), start=1.0, apply=lambda s, value: eqx.tree_at(
-            lambda s: s.canopy.voxels.leaf, s, replace_fn=lambda leaf: value * leaf))
+    A start on a bound, or closer to it than 1 % of the bounds' width, is moved to that distance.
 
     **Arguments:**
 
-    - `where`: picks one array of the scene, of any shape, as for `equinox.tree_at`; its value in the scene is
-      the starting value. An element of an array, or a property, is not such an array: use `apply`.
-    - `bounds`: (low, high) in the unknown's own unit, numbers or arrays that broadcast to the value.
-    - `name`: key of the result. Default: the path to `where`, such as "canopy.leaf.Cab".
+    - `where`: picks one array of the scene, of any shape, as for `equinox.tree_at`. An element of an array,
+      or a property, is no such array: use `apply`. Default None.
+    - `bounds`: (low, high) in the unknown's own unit, finite, low below high, numbers or arrays that
+      broadcast to the value.
+    - `name`: key of the result; needed with `apply`. Default None: the path to `where`, such as
+      "canopy.leaf.Cab".
     - `prior`: (mean, standard deviation) of a normal prior, numbers or arrays, or a `LogNormal`, which needs
-      bounds above zero. Default None: no prior.
-    - `start`: starting value instead of the scene's; needed with `apply`.
-    - `apply`: `apply(scene, value) -> scene` instead of `where`, differentiable, of the same tree structure;
-      for values that move several arrays at once. Unknowns are put in in the order in which they are listed.
-      Define it once, outside of loops: with every new function the simulation is compiled again.
+      bounds of 0 or above. Default None: no prior.
+    - `start`: starting value within the bounds; needed with `apply`. Default None: the scene's value.
+    - `apply`: a function `apply(scene, value) -> scene`, given instead of `where`, for values that change
+      several arrays at once. It must be differentiable and keep the tree structure of the scene. Unknowns are
+      applied in the order in which they are listed. Define the function once, outside of loops: every new one
+      compiles the simulation again. Default None.
 
-    A start within 1 % of the bounds' width of a bound, or on it, is moved to that distance.
+    **Raises:** ValueError for bounds that are not finite and increasing, for a standard deviation that is not
+    positive, unless exactly one of `where` and `apply` is given, and for an `apply` without `name` and
+    `start`. `retrieve` raises it for a start outside the bounds and for a `where` that picks no array.
 
-    **Raises:** ValueError for bounds that are not finite and increasing, a standard deviation that is not
-    positive, and unless exactly one of `where` and `apply` is given. `retrieve` raises it for a start outside
-    the bounds and for a `where` that picks no array.
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> import inversion
+    >>> import equinox as eqx
+    >>> Cab = inversion.Unknown(lambda s: s.canopy.leaf.Cab, bounds=(5.0, 100.0), name="Cab")
+    >>> def scale_leaf_area(scene, factor):
+    ...     return eqx.tree_at(lambda s: s.canopy.voxels.leaf, scene, replace_fn=lambda leaf: factor * leaf)
+    >>> area = inversion.Unknown(apply=scale_leaf_area, name="leaf area", bounds=(0.1, 10.0), start=1.0)
+    >>> Cab.name, area.name
+    ('Cab', 'leaf area')
     """
 
     where: Callable[[Any], Any] | None = eqx.field(static=True, default=None)
@@ -109,7 +132,7 @@ class Unknown(eqx.Module):
         if not np.all(np.asarray(low) < np.asarray(high)):
             raise ValueError(f"{called}: bounds = ({low}, {high}) are not low < high")
         if isinstance(self.prior, LogNormal):
-            # Zero itself is never reached: the bijection keeps clear of the bounds.
+            # Zero is admissible: the bijection never reaches the bounds.
             check_range(f"{called}: lower bound, with a log-normal prior,", low, 0.0)
         elif self.prior is not None:
             check_range(f"{called}: prior mean", self.prior[0])
@@ -119,8 +142,8 @@ class Unknown(eqx.Module):
 class Place(NamedTuple):
     """How a value enters the scene: hashable, and equal for equal unknowns.
 
-    - `leaf`: number of the scene's leaf that it replaces, or None where `apply` puts it in.
-    - `geometric`: whether light may go elsewhere when it changes.
+    - `leaf`: number of the scene's leaf that it replaces, or None where `apply` sets it.
+    - `geometric`: whether a change of the value may change the paths of light.
     """
 
     leaf: int | None
@@ -144,7 +167,7 @@ class Settled(NamedTuple):
 
 
 class Priors:
-    """What all unknowns' priors add to the residuals of a fit."""
+    """Residuals that the priors of all unknowns add to a fit."""
 
     def __init__(self, settled: Sequence[Settled]):
         def flat(pick: Callable[[Settled], np.ndarray]) -> np.ndarray:
@@ -162,7 +185,7 @@ class Priors:
 
 
 def settle(unknowns: Sequence[Unknown], scene: Scene) -> list[Settled]:
-    """Find the unknowns in the scene. **Raises:** ValueError for what cannot be retrieved."""
+    """Locate the unknowns in the scene. **Raises:** ValueError for what cannot be retrieved."""
     optical = optical_leaves(scene)
     found = [_settle_one(u, scene, optical) for u in unknowns]
     names = [f.name for f in found]
@@ -203,7 +226,7 @@ def _settle_one(u: Unknown, scene: Scene, optical: frozenset[int]) -> Settled:
 
 
 def start_from(unknown: Settled, start: Array) -> Settled:
-    """The unknown with another starting value, kept off its bounds. **Raises:** ValueError outside them."""
+    """The unknown with another start, at a margin from its bounds. **Raises:** ValueError outside them."""
     value, low, high = np.asarray(start, float), unknown.low, unknown.high
     bad = ~((value >= low) & (value <= high))
     if np.any(bad):
@@ -241,7 +264,7 @@ def _find(where: Callable, scene: Scene, name: str | None) -> tuple[int, str]:
 
 
 def _touched(u: Unknown, scene: Scene) -> frozenset[int]:
-    """Numbers of the scene's leaves that `apply` does not pass on as they are."""
+    """Numbers of the scene's leaves that `apply` changes."""
     before, structure = jax.tree.flatten(scene)
     touched: list[int] = []
 
@@ -263,7 +286,7 @@ def _touched(u: Unknown, scene: Scene) -> frozenset[int]:
 
 def optical_leaves(scene: Scene) -> frozenset[int]:
     """Numbers of the scene's leaves that act only after the trace: the response does not depend on them."""
-    # Where leaves transmit straight on, their transmittance scales extinction.
+    # Where transmitted light goes straight on, the leaves' transmittance scales extinction.
     straight = scene.canopy is not None and scene.canopy.transmission == "straight"
 
     def acts_later(path: tuple[Any, ...]) -> bool:
@@ -281,7 +304,7 @@ def optical_leaves(scene: Scene) -> frozenset[int]:
 
 
 def put(scene: Scene, places: tuple[Place, ...], values: tuple[Array, ...]) -> Scene:
-    """The scene with the values in place, in the order of the unknowns."""
+    """The scene with the values of the unknowns, applied in their order."""
     for place, value in zip(places, values):
         if place.apply is not None:
             scene = place.apply(scene, value)
@@ -294,13 +317,13 @@ def put(scene: Scene, places: tuple[Place, ...], values: tuple[Array, ...]) -> S
 
 
 def inside(z: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Value of a free number, and its derivative."""
+    """Value at a free parameter, and its derivative."""
     share = 0.5 * (1.0 + np.tanh(0.5 * z))
     return low + (high - low) * share, (high - low) * share * (1.0 - share)
 
 
 def outside(value: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """The free number of a value within its bounds: the inverse of `inside`."""
+    """Free parameter of a value within its bounds: the inverse of `inside`."""
     return np.log(value - low) - np.log(high - value)
 
 

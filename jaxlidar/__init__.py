@@ -1,8 +1,16 @@
-"""A differentiable simulator of full-waveform lidar.
+"""A differentiable simulator of full-waveform lidar in JAX.
 
-optics and geometry -> scene -> plan -> trace -> response -> waveform; fits are in the package `inversion`.
+`simulate` gives the waveform of a `Lidar` over a `Scene`. Its steps can also be taken one by one: `plan`,
+`reduce`, `trace_scene`, `waveform_of`.
+
+Readers of files are in `jaxlidar.io`, figures in `jaxlidar.plot`, and what extensions build on in
+`jaxlidar.extend`. Retrieval of scene properties from waveforms is in the package `inversion`.
 """
 
+import importlib
+from typing import TYPE_CHECKING, Any
+
+from jaxlidar import extend, io
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar.analog import AnalogReturns, analog_returns, photon_paths
 from jaxlidar.instrument.lidar import Lidar
@@ -18,6 +26,7 @@ from jaxlidar.optics.coefficients import load_coefficients
 from jaxlidar.optics.laws import AbstractLaw, AbstractMirror, EqualAngle, Lambertian, Specular
 from jaxlidar.optics.leaf import LeafOptics
 from jaxlidar.optics.leaf_angles import LeafAngles
+from jaxlidar.optics.leaf_surface import LeafSurface, leaf_surface
 from jaxlidar.optics.phase import AbstractPhase, HenyeyGreenstein, Isotropic
 from jaxlidar.optics.plate_model import plate_model
 from jaxlidar.optics.prospect import Prospect, prospect_jacobian, prospect_spectra
@@ -40,6 +49,9 @@ from jaxlidar.scenes.voxels import VoxelMap
 from jaxlidar.simulate import Progress, simulate
 from jaxlidar.trace.response import Response, trace_scene
 from jaxlidar.waveform import Waveform, total_of, waveform_of
+
+if TYPE_CHECKING:
+    from jaxlidar import plot
 
 __all__ = [
     "SPEED_OF_LIGHT",
@@ -67,6 +79,7 @@ __all__ = [
     "Lambertian",
     "LeafAngles",
     "LeafOptics",
+    "LeafSurface",
     "Lidar",
     "Module",
     "Plan",
@@ -91,13 +104,17 @@ __all__ = [
     "broadleaf",
     "conifer",
     "crop",
+    "extend",
     "first_return_window",
     "forest",
     "grow",
+    "io",
+    "leaf_surface",
     "load_coefficients",
     "photon_paths",
     "plan",
     "plate_model",
+    "plot",
     "prospect_jacobian",
     "prospect_spectra",
     "read_spectrum_csv",
@@ -115,3 +132,10 @@ __all__ = [
     "voxelise_points",
     "waveform_of",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    # matplotlib takes a while to import: only for those who draw.
+    if name == "plot":
+        return importlib.import_module("jaxlidar.plot")
+    raise AttributeError(f"module 'jaxlidar' has no attribute {name!r}")

@@ -1,4 +1,11 @@
-"""Physical constants in the package's units (CODATA 2018, exact by definition of the SI)."""
+"""Physical constants in the package's units (CODATA 2018, exact by definition of the SI).
+
+**Example:** the range of a target whose echo arrives 6671.3 ns after the pulse was sent, in m.
+
+>>> import jaxlidar as jl
+>>> print(f"{0.5 * jl.SPEED_OF_LIGHT * 6671.3:.1f}")
+1000.0
+"""
 
 SPEED_OF_LIGHT = 0.299792458
 """Speed of light in vacuum, m/ns."""

@@ -1,7 +1,8 @@
-"""The paper's own estimator (section 1.4): photons that are followed until they are back, gone or absorbed.
+"""Analog Monte Carlo, the paper's own estimator (section 1.4), for comparison.
 
-Kept to be compared with: it shares flights, collisions and optics with the tracer, but neither expected
-returns at every collision, nor a deterministic first order, nor stratified numbers.
+Photons are followed one by one until they leave the scene. The estimator shares flights, collisions and
+optics with the tracer, but has neither expected returns at every collision, nor a deterministic first order,
+nor stratified random numbers.
 """
 
 import equinox as eqx
@@ -20,21 +21,29 @@ from jaxlidar.scenes.scene import Scene
 from jaxlidar.trace.collisions import collide
 from jaxlidar.trace.flight import events_of, fly, nearest, plates_ahead
 from jaxlidar.trace.footprint import across_beam
-from jaxlidar.trace.higher_orders import from_the_beam
 from jaxlidar.trace.photons import THROUGH, Photons
 from jaxlidar.trace.random_numbers import Draw
-from jaxlidar.trace.setting import Setting, setting_of
+from jaxlidar.trace.setting import Setting, setting_of, unscattered
 from jaxlidar.waveform import optics_of
 
 CHUNK = 512
 
 
 class AnalogReturns(eqx.Module):
-    """What became of each photon.
+    """Arrival times and weights of photons followed one by one, as `analog_returns` gives them.
 
-    - `time`: (photons,) ns, of arrival at the sensor if it was sent at time zero; 0 where it did not return.
-    - `weight`: (wavelengths, photons) apparent reflectance that it stands for; 0 where it did not return. The
-      sum over photons, divided by their number, estimates the apparent reflectance of the scene.
+    - `time`: (photons,) ns, of arrival at the sensor, from the two-way travel time of the reference plane, as
+      in `Waveform.time`; 0 where it did not return.
+    - `weight`: (wavelengths, photons) apparent reflectance that the photon stands for; 0 where it did not
+      return. The sum over photons, divided by their number, estimates the apparent reflectance of the scene.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> import jax.numpy as jnp
+    >>> returns = jl.AnalogReturns(time=jnp.array([0.0, 12.5]), weight=jnp.array([[0.0, 0.8]]))
+    >>> print(f"{float(returns.weight.sum() / returns.time.size):.2f}")
+    0.40
     """
 
     time: Float[Array, "photons"]
@@ -51,19 +60,39 @@ def analog_returns(
     n_photons: int,
     cone: float = 10.0,
 ) -> AnalogReturns:
-    """Follow photons one by one and count those that leave within a cone about the direction to the sensor.
+    """Times and weights of photons that leave the scene within a cone about the direction to the sensor.
 
-    At 1000 m an aperture of 0.2 m would see one photon in 10^8, so the cone stands in for it, here as in the
-    paper; the estimate is that of `simulate` averaged over the cone. Independent random numbers throughout.
+    Photons are followed one by one, with independent random numbers. At 1000 m an aperture of 0.2 m would see
+    one photon in 10^8, so the cone stands in for it, here as in the paper. The estimate is that of
+    `simulate`, averaged over the cone.
 
     **Arguments:**
 
-    - `plan`: of `jaxlidar.plan`; its window and orders bound what is followed.
-    - `n_photons`: how many, at least 1.
-    - `cone`: half-angle, degrees, in (0, 90]. Default 10. Smaller is less biased and returns fewer.
+    - `lidar`: a `Lidar`.
+    - `scene`: a `Scene`.
+    - `plan`: a `Plan` made by `jaxlidar.plan`; its window and orders bound what is followed.
+    - `key`: a JAX random key.
+    - `n_photons`: number of photons, at least 1.
+    - `cone`: half-angle of the cone, degrees, in (0, 90]. A smaller one is less biased and returns fewer
+      photons. Default 10.
 
-    **Raises:** ValueError for values outside their ranges; for a hot spot, which photons that fly back
-    on their own cannot have; and for several wavelengths where leaves transmit straight on.
+    **Returns:** an `AnalogReturns`.
+
+    **Raises:** ValueError for values outside their ranges; for a canopy with the hot spot, because photons
+    that fly back on their own take ways independent of their ways in; and for several wavelengths where
+    leaves transmit straight on.
+
+    **Source:** section 1.4 of the paper.
+
+    **Example:**
+
+    >>> import jax
+    >>> import jaxlidar as jl
+    >>> lidar, scene = jl.Lidar(), jl.Scene(ground=jl.Ground(reflectance=0.4))
+    >>> key = jax.random.key(0)
+    >>> returns = jl.analog_returns(lidar, scene, jl.plan(lidar, scene), key=key, n_photons=50_000)
+    >>> print(f"{float(returns.weight.mean()):.1f}")
+    0.4
     """
     check_range("cone", cone, 0.0, 90.0, low_open=True)
     check_integer("n_photons", n_photons)
@@ -98,10 +127,31 @@ def analog_returns(
 def photon_paths(
     lidar: Lidar, scene: Scene, plan: Plan, *, key: PRNGKeyArray, n_photons: int, leaving: float = 5.0
 ) -> Float[Array, "photons points 3"]:
-    """Where photons are sent from, where they collide, and `leaving` metres (default 5) of their way out.
+    """Points along the paths of photons, for drawings: where they are sent, collide and leave the scene.
 
-    For drawings. They start above the scene; a photon that has collided for the last time stays where it is
-    then. Arguments and errors as for `analog_returns`.
+    **Arguments:**
+
+    - `lidar`: a `Lidar`.
+    - `scene`: a `Scene`.
+    - `plan`: a `Plan` made by `jaxlidar.plan`; its window and orders bound what is followed.
+    - `key`: a JAX random key.
+    - `n_photons`: number of photons, at least 1.
+    - `leaving`: length of the way out of the scene that is given, m. Default 5.
+
+    **Returns:** (photons, points, 3) x, y, z in m, with two points more than the plan has orders: the start
+    above the scene, the collisions, and the end of the way out. The points that remain are again the last
+    collision.
+
+    **Raises:** ValueError as for `analog_returns`.
+
+    **Example:**
+
+    >>> import jax
+    >>> import jaxlidar as jl
+    >>> lidar, scene = jl.Lidar(), jl.Scene(ground=jl.Ground())
+    >>> paths = jl.photon_paths(lidar, scene, jl.plan(lidar, scene), key=jax.random.key(0), n_photons=4)
+    >>> print(paths.shape, f"{abs(float(paths[0, 1, 2])):.2f}")
+    (4, 3, 3) 0.00
     """
     check_integer("n_photons", n_photons)
     setting = _setting(lidar, scene, plan)
@@ -120,7 +170,7 @@ def photon_paths(
 
 
 class _Arrival(eqx.Module):
-    """Of photons at the sensor; `value` is zero for those that are not there."""
+    """Photons at the sensor; `value` is zero for those that do not arrive."""
 
     time: Float[Array, "photons"]
     value: Float[Array, "photons"]
@@ -152,13 +202,13 @@ def _start(setting: Setting, size: int, key: PRNGKeyArray) -> Photons:
         jnp.ones_like(excess),
         none,
         none - 1,
-        from_the_beam(excess),
+        unscattered(excess),
         none == 0,
     )
 
 
 def _one_flight(setting: Setting, p: Photons, key: PRNGKeyArray, cone: float) -> tuple[Photons, _Arrival]:
-    """Fly, arrive if that leads out of the scene to the sensor, else collide and scatter."""
+    """Fly; arrive, if the flight leads out of the scene to the sensor; otherwise collide and scatter."""
     beam, plan = setting.beam, setting.plan
     plates = sum(s.plate for s in setting.surfaces)
     tiny = jnp.finfo(p.weight.dtype).tiny

@@ -1,8 +1,8 @@
 """The command `jaxlidar`: `jaxlidar demo`, `jaxlidar spectra`, `jaxlidar --version`.
 
-A command is a function that takes the arguments after its name and returns an exit status. Besides the ones
-here, every entry point of the group `jaxlidar.commands` is one, so that packages that build on this one can
-add theirs: `demo` comes from the package `inversion`.
+A command is a function that takes the arguments after its name and returns an exit status. Besides those of
+this module, every entry point of the group `jaxlidar.commands` is a command, so that packages that build on
+this one can add theirs: `demo` comes from the package `inversion`.
 
 Exit statuses: 0 done, 1 failed (a sentence on the standard error says why), 2 wrong usage, 130 interrupted.
 """
@@ -19,7 +19,7 @@ Command = Callable[[Sequence[str]], int]
 
 
 class CommandError(Exception):
-    """What went wrong, in a sentence for the user."""
+    """An error whose message is a sentence for the user."""
 
 
 def spectra(argv: Sequence[str]) -> int:
@@ -54,7 +54,7 @@ def version() -> str:
 
 
 def commands() -> Mapping[str, Command | metadata.EntryPoint]:
-    """Commands by name; those of other packages are entry points, to be loaded when called for."""
+    """Commands by name. Those of other packages are entry points, which are loaded when they are run."""
     added = {point.name: point for point in metadata.entry_points(group=COMMANDS)}
     return {**added, "spectra": spectra}
 
@@ -62,9 +62,18 @@ def commands() -> Mapping[str, Command | metadata.EntryPoint]:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command.
 
+    **Arguments:**
+
     - `argv`: arguments without the program's name. Default None: those of the process.
 
-    Returns the exit status. Only `SystemExit` is raised, by wrong usage and by `--help`.
+    **Returns:** the exit status.
+
+    **Raises:** only SystemExit, for wrong usage and for `--help`.
+
+    **Example:**
+
+    >>> from jaxlidar.cli import main
+    >>> main(["spectra", "wood"])  # doctest: +SKIP
     """
     known = commands()
     parser = argparse.ArgumentParser(
@@ -86,7 +95,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except CommandError as error:
         return _fail(str(error), 1)
     except BrokenPipeError:
-        # Whoever read the output (head, less) has seen enough; keep the interpreter from flushing it again.
+        # The reader of the output (head, less) has closed it; keep the interpreter from flushing it again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except OSError as error:

@@ -1,4 +1,4 @@
-"""The one entry: plan, reduce, trace in batches until the tolerance is met, waveform."""
+"""`simulate`: make the plan, trace batches of photons until the tolerance is met, and record the waveform."""
 
 import dataclasses
 import math
@@ -27,10 +27,21 @@ from jaxlidar.waveform import Waveform, open_at_first_return, total_of, waveform
 
 @dataclasses.dataclass(frozen=True)
 class Progress:
-    """How far a simulation has come.
+    """How far a running simulation has come; `simulate` gives it to its argument `progress`.
 
-    - `batches`, `photons`: traced so far. - `seconds`: spent. - `error`: the relative error so far.
-    - `rtol`: the error aimed at, or None.
+    Printed, it is one line of text.
+
+    - `batches`: batches traced so far.
+    - `photons`: photons traced so far.
+    - `seconds`: time spent so far.
+    - `error`: relative error of the waveform so far, as `simulate` defines it.
+    - `rtol`: relative error aimed at, or None where the number of photons is given.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> print(jl.Progress(batches=8, photons=65536, seconds=1.5, error=0.004, rtol=0.01))
+    8 batches, 65536 photons, 1.5 s, relative error 0.004 (aim 0.01)
     """
 
     batches: int
@@ -68,33 +79,45 @@ def simulate(
 ) -> Waveform:
     """The waveform that `lidar` records of `scene`.
 
-    Batches of photons are traced until the error is below the tolerance. The error is the root mean
-    square, over the samples above 1 % of the peak, of standard error over reflectance, for the worst
-    wavelength. Where nothing is random (one plane; a fixed footprint and one order), one pass does.
-    Standard errors are widened for few batches, by Student's t, so that the expected value lies within two
-    of them in 95 % of cases; neglected orders (`Waveform.neglected`) and rounding come on top.
+    Batches of photons are traced until the error is below the tolerance. The error is the root mean square,
+    over the samples above 1 % of the peak, of standard error over reflectance, for the worst wavelength.
+    Where nothing is random (one order, over planes alone or with a fixed footprint), one pass is made.
+    Standard errors are widened for few batches, by Student's t, so that the expected value lies within two of
+    them in 95 % of cases. Neglected orders (`Waveform.neglected`) and rounding come on top.
+
+    Within a JAX transformation (grad, jacfwd, vmap over scenes) eight batches are traced, whatever the error.
+    Where geometry is transformed, the plan must be made outside and passed as `plan`.
+
+    An interrupt (Ctrl-C) after eight batches ends the simulation with what is done.
 
     **Arguments:**
 
-    - `key`: a JAX random key: the same key gives the same waveform.
-    - `rtol`, `atol`: stop when the error is below `rtol`, or the largest standard error below `atol`. `rtol`
-      is 0.01 by default, or the plan's, unless `n_photons` is given; `atol` is 0.
-    - `n_photons`: trace this many photons, in eight batches, whatever the error. Within a JAX
-      transformation (grad, jacfwd, vmap over scenes) `n_photons` and `plan` are needed.
-    - `plan`: what to simulate (`jaxlidar.plan`). Cannot be combined with the arguments of the next line.
+    - `lidar`: a `Lidar`.
+    - `scene`: a `Scene`.
+    - `key`: a JAX random key. The same key gives the same waveform.
+    - `rtol`: stop when the error is below this, in (0, 1). Default None: the plan's, 0.01 if not given there.
+    - `atol`: stop also when the largest standard error of the reflectance is below this, not negative.
+      Default 0.
+    - `n_photons`: trace this many photons, in eight batches, whatever the error; at least 1. Default None: as
+      many as the tolerances need.
+    - `plan`: a `Plan` made by `jaxlidar.plan`. Cannot be combined with the arguments of the next line.
+      Default None: made here.
     - `max_orders`, `max_step`, `n_rays`, `window`, `bin_width`, `footprint`, `effects`: see `jaxlidar.plan`.
-    - `max_seconds`: stop after this time, however large the error. Default: none. An interrupt (Ctrl-C) after
-      eight batches also ends the simulation with what is done.
-    - `progress`: called with a `Progress` after every round of batches; for instance `print`.
+      Default None: as there.
+    - `max_seconds`: stop after this time in s, however large the error; positive. At least eight batches are
+      traced. Default inf.
+    - `progress`: a function called with a `Progress` after every round of batches; for instance `print`.
+      Default None.
 
-    **Returns:** a `Waveform`.
+    **Returns:** a `Waveform`. Its `info` says how many photons were traced and why the simulation stopped.
 
     **Raises:** ValueError for inadmissible arguments, for a plan that would miss parts of the scene, and for
-    a plan together with planning arguments.
+    a plan together with planning arguments. KeyboardInterrupt where it is interrupted before eight batches.
 
     **Example:**
 
-    >>> import jax, jaxlidar as jl
+    >>> import jax
+    >>> import jaxlidar as jl
     >>> scene = jl.Scene(ground=jl.Ground(reflectance=0.4))
     >>> wave = jl.simulate(jl.Lidar(), scene, key=jax.random.key(0))
     >>> print(f"{float(wave.reflectance.sum()):.4f}")
@@ -117,7 +140,7 @@ def simulate(
 
 
 class _Goal(NamedTuple):
-    """When to stop: a number of photons, or tolerances; `rtol` None is the plan's."""
+    """When to stop: after a number of photons, or below tolerances. `rtol` None takes the plan's."""
 
     rtol: float | None
     atol: float
@@ -136,7 +159,7 @@ def _goal(rtol: float | None, atol: float, n_photons: int | None, max_seconds: f
 
 
 def _planned(lidar: Lidar, scene: Scene, plan: Plan | None, goal: _Goal, planning: dict[str, Any]) -> Plan:
-    """The plan given, checked, or one made here."""
+    """The plan that was given, checked; or else one made here."""
     given = {name: value for name, value in planning.items() if value is not None}
     if plan is None:
         plan = make_plan(lidar, scene, rtol=goal.rtol, describe=False, **given)
@@ -154,7 +177,7 @@ def _planned(lidar: Lidar, scene: Scene, plan: Plan | None, goal: _Goal, plannin
 def _trace_until(
     setup: Setup, key: PRNGKeyArray, goal: _Goal, progress: Callable[[Progress], None] | None
 ) -> tuple[Response, Array | None, dict[str, Any]]:
-    """The mean response, the standard error of its waveform (None: nothing is random), and what it took."""
+    """The mean response, the standard error of its waveform (None: nothing is random), and the `info`."""
     if not setup.plan.is_random:
         started = time.perf_counter()
         response = jax.block_until_ready(_compiled_trace(setup, key))

@@ -1,4 +1,4 @@
-"""From response to waveform: optics, atmosphere, pulse, sampling, energy."""
+"""From response to waveform: optics, atmosphere, pulse, sampling and energy."""
 
 import dataclasses
 from typing import final
@@ -21,21 +21,33 @@ from jaxlidar.trace.response import Response
 
 @final
 class Waveform(eqx.Module):
-    """A simulated waveform.
+    """A simulated waveform: apparent reflectance and received energy by wavelength and sample.
 
-    - `time`: (bins,) ns, centres of the samples, from the two-way travel time of the reference plane.
-    - `height`: (bins,) m, the height at which light of order one arrives at that time.
+    - `time`: (bins,) ns, centres of the samples. Zero is the two-way travel time of the reference plane.
+    - `height`: (bins,) m, the height from which light of order one arrives at that time.
     - `reflectance`: (wavelengths, bins) apparent reflectance per sample, with the transmittance of the
-      atmosphere; sums over bins to that of the target.
+      atmosphere; its sum over bins is that of the target.
     - `energy`: (wavelengths, bins) J that the detector registers per sample.
-    - `stderr`: (wavelengths, bins) one standard error of `reflectance`; zero where nothing was random. Two of
-      them hold the expected value in 95 % of cases.
-    - `components`: dict of arrays like `reflectance`: by material of the last scattering ("ground",
-      "leaf", "bark", "plate", "air"), and by order ("first", "higher").
+    - `stderr`: (wavelengths, bins) one standard error of `reflectance`; zero where nothing was random. The
+      expected value lies within two of them in 95 % of cases.
+    - `components`: dict of arrays like `reflectance`: by material of the last scattering ("ground", "leaf",
+      "bark", "plate", "air"), and by order ("first", "higher").
     - `neglected`: (wavelengths,) apparent reflectance that orders beyond the last could still add.
     - `ledger`: dict of (wavelengths,) shares of the emitted energy, before the atmosphere: "returned" into
       the aperture, "escaped", "absorbed by ...", "after the window", "unfollowed" beyond the last order.
-    - `info`: dict: photons, batches, seconds, error reached and why the simulation stopped.
+    - `wavelength`: (wavelengths,) nm, the lidar's.
+    - `info`: dict: "photons", "batches", "seconds", "error" reached, and why the simulation "stopped".
+
+    **Example:**
+
+    >>> import jax
+    >>> import jaxlidar as jl
+    >>> scene = jl.Scene(ground=jl.Ground(reflectance=0.4))
+    >>> wave = jl.simulate(jl.Lidar(), scene, key=jax.random.key(0))
+    >>> print(sorted(wave.components), wave.info["stopped"])
+    ['first', 'ground', 'higher'] nothing is random
+    >>> print(f"{float(wave.ledger['absorbed by ground'][0]):.2f}")
+    0.60
     """
 
     time: Float[Array, "bins"]
@@ -51,7 +63,7 @@ class Waveform(eqx.Module):
 
 
 def optics_of(setup: Setup) -> Float[Array, "letters wavelengths"]:
-    """Reflectance or transmittance of every letter of the plan."""
+    """Reflectance or transmittance of every letter of the plan, by wavelength."""
     return letter_values(setup.lidar, setup.scene, setup.plan.trace.letters)
 
 
@@ -60,7 +72,7 @@ def colour(
     table: Histories,
     optics: Float[Array, "letters wavelengths"],
 ) -> Float[Array, "*rest wavelengths columns"]:
-    """The sum over histories of their weights times their optics: a matrix product."""
+    """The sum over histories of weight times the product of optics, by wavelength: a matrix product."""
     if len(weights) == 1:
         return jnp.einsum("hw,...hc->...wc", table.monomials(optics), weights[0])
     # Each trace has one wavelength.
@@ -87,7 +99,7 @@ def pulse_kernel(lidar: Lidar, plan: Plan) -> Float[Array, "fine samples"]:
         bend = share[2:] - 2.0 * share[1:-1] + share[:-2]
         share = share.at[1:-1].add(-0.5 * plan.bins.kernel_variance * bend)
     index = np.arange(plan.n_samples)[None, :] * k - np.arange(plan.bins.count)[:, None] - low
-    # Fused into the gather, the pulse would be computed anew for every element.
+    # Fused into the gather, the pulse would be computed again for every element.
     return lax.optimization_barrier(share)[index]
 
 
@@ -100,7 +112,7 @@ def _fine_heights(setup: Setup) -> Float[Array, "bins"]:
 def _through_air(
     fine: Float[Array, "*s wavelengths bins"], setup: Setup
 ) -> Float[Array, "*s wavelengths bins"]:
-    """Returns in fine bins as the air between dims them."""
+    """Returns in fine bins after attenuation by the atmosphere on both ways."""
     lidar, air = setup.lidar, setup.scene.atmosphere
     assert air is not None
     heights = _fine_heights(setup)
@@ -109,13 +121,13 @@ def _through_air(
 
 
 def returns_air(setup: Setup) -> bool:
-    """Whether the air's own return is simulated: where a lidar ratio is given."""
+    """Whether the atmosphere's own backscatter is simulated: it is where a lidar ratio is given."""
     air = setup.scene.atmosphere
     return air is not None and air.lidar_ratio is not None
 
 
 def air(setup: Setup) -> Float[Array, "wavelengths samples"]:
-    """The air's own return, apparent reflectance per sample: single scattering above all of the scene."""
+    """Backscatter of the air, apparent reflectance per sample: single scattering, above all of the scene."""
     lidar, plan, atmosphere = setup.lidar, setup.plan, setup.scene.atmosphere
     assert atmosphere is not None
     heights = _fine_heights(setup)
@@ -139,7 +151,27 @@ def _tables(plan: Plan) -> tuple[Histories, Histories]:
 def total_of(response: Response, setup: Setup) -> Float[Array, "wavelengths samples"]:
     """Apparent reflectance per sample, all components together.
 
-    **Arguments:** `response`: of `jaxlidar.trace_scene`. - `setup`: that it was traced with.
+    This is `Waveform.reflectance` on the plan's samples, without the components, energy and ledger of
+    `waveform_of`.
+
+    **Arguments:**
+
+    - `response`: a `Response` of `jaxlidar.trace_scene`, or the mean of several.
+    - `setup`: the `Setup` that it was traced with; its optics may differ.
+
+    **Returns:** (wavelengths, samples) apparent reflectance.
+
+    **Example:**
+
+    >>> import equinox as eqx
+    >>> import jax
+    >>> import jaxlidar as jl
+    >>> lidar, scene = jl.Lidar(), jl.Scene(ground=jl.Ground(reflectance=0.4))
+    >>> setup = jl.reduce(lidar, scene, jl.plan(lidar, scene))
+    >>> response = eqx.filter_jit(jl.trace_scene)(setup, jax.random.key(0))
+    >>> total = eqx.filter_jit(jl.total_of)(response, setup)
+    >>> print(f"{float(total.sum()):.3f}")
+    0.400
     """
     # Sums over materials, and the pulse where no atmosphere lies between, come before the many wavelengths.
     values, clear = optics_of(setup), setup.scene.atmosphere is None
@@ -155,7 +187,7 @@ def total_of(response: Response, setup: Setup) -> Float[Array, "wavelengths samp
 
 
 def ledger_of(response: Response, setup: Setup) -> dict[str, Float[Array, "wavelengths"]]:
-    """Shares of the emitted energy. What a material absorbs is what arrived there less what left."""
+    """Shares of the emitted energy by fate. A material absorbs what arrived there less what left."""
     short, full = _tables(setup.plan)
     table, values = short if response.higher is None else full, optics_of(setup)
 
@@ -179,16 +211,30 @@ def waveform_of(
     stderr: Float[Array, "wavelengths bins"] | None = None,
     info: dict | None = None,
 ) -> Waveform:
-    """Colour a response and record it.
+    """The waveform of a response: with the optics, atmosphere, pulse, sampling and energy of a setup.
+
+    The optics may differ from those at tracing: one response serves all reflectances and transmittances.
 
     **Arguments:**
 
-    - `response`: of `jaxlidar.trace_scene`, or the mean of several.
-    - `setup`: that it was traced with; its optics may differ.
-    - `stderr`: standard error of the reflectance, from batches. Default zero.
-    - `info`: of the waveform. Default empty.
+    - `response`: a `Response` of `jaxlidar.trace_scene`, or the mean of several.
+    - `setup`: the `Setup` that it was traced with; its optics may differ.
+    - `stderr`: (wavelengths, samples) standard error of the reflectance, from batches. Default None: zero.
+    - `info`: dict for `Waveform.info`. Default None: empty.
 
-    **Returns:** a `Waveform`. For an example see `jaxlidar.trace_scene`.
+    **Returns:** a `Waveform` on the plan's samples.
+
+    **Example:**
+
+    >>> import equinox as eqx
+    >>> import jax
+    >>> import jaxlidar as jl
+    >>> lidar, scenes = jl.Lidar(), [jl.Scene(ground=jl.Ground(reflectance=r)) for r in (0.2, 0.8)]
+    >>> dark, bright = (jl.reduce(lidar, scene, jl.plan(lidar, scenes[0])) for scene in scenes)
+    >>> response = eqx.filter_jit(jl.trace_scene)(dark, jax.random.key(0))
+    >>> wave = eqx.filter_jit(jl.waveform_of)(response, bright)
+    >>> print(f"{float(wave.reflectance.sum()):.3f}")
+    0.800
     """
     lidar, plan, values = setup.lidar, setup.plan, optics_of(setup)
     names, kernel = plan.trace.materials, pulse_kernel(lidar, plan)
@@ -240,7 +286,7 @@ def _received(lidar: Lidar, time: Float[Array, "bins"]) -> Float[Array, "wavelen
 def _balance(
     ledger: dict[str, Float[Array, "wavelengths"]], whole: Float[Array, "wavelengths"], setup: Setup
 ) -> tuple[dict[str, Float[Array, "wavelengths"]], Float[Array, "wavelengths"]]:
-    """The ledger with what returns into the aperture, and what neglected orders could still return.
+    """The ledger including what returns into the aperture, and what neglected orders could still return.
 
     `whole`: apparent reflectance summed over all time.
     """
@@ -256,11 +302,11 @@ def _balance(
 
 
 def open_at_first_return(wave: Waveform, lidar: Lidar) -> Waveform:
-    """The finely sampled waveform on the digitiser's bins, the first of which opens at the first return.
+    """The finely sampled waveform on the bins of the digitiser, which start at the first return.
 
-    See `jaxlidar.first_return_window` for the artefact that this makes. The first return is the first
-    sample above the receiver's detection threshold, and above a thousandth of the peak. Standard
-    errors of the fine samples are added up as if fully correlated.
+    See `jaxlidar.first_return_window` for the artefact that this makes. The first return is the first sample
+    above the receiver's detection threshold and above a thousandth of the peak. Standard errors of the fine
+    samples are added up as if fully correlated.
     """
     energy = wave.energy
     threshold = jnp.maximum(lidar.receiver.detection_threshold, 1e-3 * jnp.max(energy))

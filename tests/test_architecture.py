@@ -36,8 +36,8 @@ ROOMS = [
 HELPERS = {path.stem for path in (ROOT / "jaxlidar").glob("_*.py")} - {"__init__"}
 # Within rooms, files in the order in which they use one another; those not named use none of the others.
 ORDER = {
-    "optics": ["coefficients", "plate_model", "spectra", "prospect"],
-    "instrument": ["pulse", "receiver", "lidar"],
+    "optics": ["coefficients", "leaf_surface", "plate_model", "spectra", "prospect"],
+    "instrument": ["pulse_integrals", "pulse", "receiver", "lidar"],
     "scenes": ["voxels", "atmosphere", "shapes", "surfaces", "canopy", "scene"],
     "plants": ["lsystem", "tree", "turtle", "habits", "voxelise", "forest", "demo"],
     "planning": [

@@ -17,11 +17,6 @@ import jaxlidar as jl
 from jaxlidar import cli
 
 ROOT = Path(__file__).resolve().parents[1]
-README = (ROOT / "README.md").read_text()
-
-
-def readme_blocks(language):
-    return re.findall(rf"^```{language}\n(.*?)^```", README, re.MULTILINE | re.DOTALL)
 
 
 def test_spectra_are_listed_with_reflectances(capsys):
@@ -131,23 +126,6 @@ def test_figures_are_renamed_when_whole(tmp_path):
     with pytest.raises(OSError, match="full"):
         inversion.demo.save(Failing(), tmp_path / "a.png")
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("number", range(len(readme_blocks("python"))))
-def test_the_readme_examples_run_as_printed(number, capsys):
-    names = {}
-    exec(compile(readme_blocks("python")[number], "README.md", "exec"), names)
-    assert np.all(np.isfinite(np.asarray(names["wave"].reflectance)))
-    assert "multiple scattering" in capsys.readouterr().out
-
-
-def test_the_readme_names_what_there_is():
-    for path in re.findall(r"\]\(([^):]+)\)", README):
-        assert (ROOT / path).exists(), path
-    commands = [shlex.split(line)[0] for block in readme_blocks("sh") for line in block.splitlines()]
-    assert set(commands) <= {"python3", "jaxlidar"}
-    picture = ROOT / "examples" / "figures" / "waveform.png"
-    assert picture.stat().st_size < 150_000
 
 
 def test_reading_only_the_first_lines_is_no_failure():

@@ -13,7 +13,8 @@ import mpmath
 import numpy as np
 import pytest
 
-from jaxlidar.optics.plate_model import Surface, plate_model, plate_model_slopes, surface
+from jaxlidar.optics.leaf_surface import LeafSurface, leaf_surface
+from jaxlidar.optics.plate_model import plate_model, plate_model_slopes
 
 KS = (0.0, 1e-8, 1e-4, 1e-2, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
 NS = (1.0, 1.0001, 1.5, 2.0, 3.4, 10.0)
@@ -89,7 +90,7 @@ static_surface = functools.cache(surface)
 
 def surfaces(where):
     each = [static_surface(n, alpha) for *_, n, alpha in where]
-    return Surface(*(np.array(column) for column in zip(*each)))
+    return LeafSurface(*(np.array(column) for column in zip(*each)))
 
 
 def derivatives(k, N, face):
@@ -119,9 +120,9 @@ def test_against_the_textbook_in_150_digits(precision):
 
 def test_a_surface_that_is_rounded_costs_its_rounding():
     k, N = (x.ravel() for x in jnp.meshgrid(jnp.geomspace(1e-3, 8, 30), jnp.linspace(1, 10, 10)))
-    face = surface(np.full(k.size, 1.42))
+    face = leaf_surface(np.full(k.size, 1.42))
     exactly, rounded = (
-        np.asarray(plate_model_slopes(k, N, f)) for f in (face, Surface(*map(jnp.asarray, face)))
+        np.asarray(plate_model_slopes(k, N, f)) for f in (face, LeafSurface(*map(jnp.asarray, face)))
     )
     np.testing.assert_allclose(rounded, exactly, rtol=1.5e-6)
 
@@ -138,7 +139,7 @@ def test_energy_is_conserved(precision):
 
 def test_slopes_are_the_derivatives(precision):
     k, N = jnp.array([0.0, 1e-3, 0.2, 2.0]), jnp.array([1.0, 1.5, 3.0, 2.0])
-    face = Surface(*(jnp.asarray(f, precision) for f in surface(np.full(4, 1.42))))
+    face = LeafSurface(*(jnp.asarray(f, precision) for f in leaf_surface(np.full(4, 1.42))))
     values, in_k, in_N = plate_model_slopes(k, N, face)
     np.testing.assert_allclose(
         jnp.stack([*values, *in_k, *in_N]), jax.jit(derivatives)(k, N, face), rtol=1e-6
@@ -148,7 +149,7 @@ def test_slopes_are_the_derivatives(precision):
 def test_reverse_equals_forward(precision):
     unit = float(np.finfo(precision).eps)
     k, N = jnp.array([0.0, 0.0, 0.1, 0.5, 50.0]), jnp.array([1.0, 2.0, 1.0, 2.3, 9.0])
-    face = Surface(*(jnp.asarray(f, precision) for f in surface(np.full(5, 1.42))))
+    face = LeafSurface(*(jnp.asarray(f, precision) for f in leaf_surface(np.full(5, 1.42))))
     forward, backward = (
         quick_jit(jax.vmap(jacobian(plate_model, argnums=(0, 1, 2))))(k, N, face)
         for jacobian in (jax.jacfwd, jax.jacrev)
@@ -163,7 +164,7 @@ def test_derivatives_in_the_surface():
 
         @jax.jit
         def of_index(n):
-            return plate_model(k, N, surface(jnp.full(3, n), 59.0))
+            return plate_model(k, N, leaf_surface(jnp.full(3, n), 59.0))
 
         _, slopes = jax.jvp(of_index, (1.42,), (1.0,))
         for slope, up, down in zip(slopes, of_index(1.42 + h), of_index(1.42 - h)):
@@ -172,7 +173,7 @@ def test_derivatives_in_the_surface():
 
 def test_second_derivatives():
     with jax.enable_x64(True):
-        face, h = surface(1.42), 1e-5
+        face, h = leaf_surface(1.42), 1e-5
         k, N = jnp.array([1e-3, 0.2, 0.5, 3.0]), jnp.array([1.5, 1.0, 3.0, 2.0])
 
         def reflectance(k, N):
@@ -215,16 +216,16 @@ def test_nothing_is_nan_or_infinite(precision):
 def test_surface(alpha, precision):
     for n in (1.01, 1.2, 1.55, 2.5):
         exact_alpha, exact_12 = float(cone(n, alpha)), float(cone(n, 90.0))
-        want = Surface(
+        want = LeafSurface(
             exact_alpha, 1 - exact_alpha, exact_12, 1 - exact_12, exact_12 / n**2, 1 - exact_12 / n**2
         )
-        np.testing.assert_allclose(surface(n, alpha), want, rtol=3e-12)
+        np.testing.assert_allclose(leaf_surface(n, alpha), want, rtol=3e-12)
         # Traced or JAX indices go through working precision.
-        got = surface(jnp.asarray(n), alpha)
+        got = leaf_surface(jnp.asarray(n), alpha)
         np.testing.assert_allclose(
-            got, surface(float(jnp.asarray(n)), alpha), rtol=8 * float(np.finfo(precision).eps)
+            got, leaf_surface(float(jnp.asarray(n)), alpha), rtol=8 * float(np.finfo(precision).eps)
         )
 
 
 def test_no_surface():
-    np.testing.assert_allclose(surface(1.0, 40.0), (1, 0, 1, 0, 1, 0), atol=1e-15)
+    np.testing.assert_allclose(leaf_surface(1.0, 40.0), (1, 0, 1, 0, 1, 0), atol=1e-15)

@@ -10,7 +10,8 @@ import pytest
 from scipy.optimize import brentq
 
 from jaxlidar.optics.coefficients import TRAITS, load_coefficients, shipped
-from jaxlidar.optics.plate_model import plate_model, surface
+from jaxlidar.optics.leaf_surface import leaf_surface
+from jaxlidar.optics.plate_model import plate_model
 from jaxlidar.optics.prospect import Prospect, prospect_jacobian, prospect_spectra
 
 WAVELENGTHS = np.arange(400.0, 2501.0)
@@ -59,7 +60,7 @@ def test_table_4_from_its_absorptances():
         for wavelength, expected, about in zip(LASERS, TABLE_4, (0.2756, 0.0098, 0.0487)):
             n = float(np.interp(wavelength, table.wavelength, table.index))
 
-            face, target = surface(n, 40.0), expected[2] / 100
+            face, target = leaf_surface(n, 40.0), expected[2] / 100
             optics = partial(optics_of_total, face=face)
             K = brentq(lambda K, optics=optics, target=target: optics(K)[2] - target, 1e-6, 5.0)
             assert abs(K / about - 1) < 0.005
@@ -78,7 +79,7 @@ def test_between_tabulated_wavelengths_coefficients_are_interpolated():
         table, leaf = shipped("D"), Prospect()
         n = np.mean(table.index[[150, 151]])
         K = np.mean(table.absorption[:, [150, 151]], axis=1) @ [40.0, 8.0, 0.0, 0.0, 0.01, 0.009]
-        R, T, A = plate_model(K / 1.5, 1.5, surface(n))
+        R, T, A = plate_model(K / 1.5, 1.5, leaf_surface(n))
         np.testing.assert_allclose(leaf(550.5), (R, T), rtol=1e-14)
         np.testing.assert_allclose(leaf.absorptance(550.5), A, rtol=1e-14)
         assert leaf(550.5)[0].shape == ()

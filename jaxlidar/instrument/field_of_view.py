@@ -1,4 +1,4 @@
-"""The soft edge of a receiver's field of view: once for the tracer, once more for the plan's bounds."""
+"""The soft edge of the receiver's field of view, for the tracer (JAX) and for the plan's bounds (NumPy)."""
 
 from typing import Any
 
@@ -9,11 +9,16 @@ EDGE = 0.02
 
 
 def seen(off_axis: Any, xp: Any = jnp) -> Any:
-    """Share of a point that the receiver sees, 0..1, smooth so that it has a derivative.
+    """Share of the light from a point that the receiver sees, in [0, 1].
+
+    The edge is smooth, so that the share has a derivative.
 
     **Arguments:**
 
-    - `off_axis`: its distance from the axis over the radius of the field of view there, any shape.
-    - `xp`: `jax.numpy` (default) or `numpy`.
+    - `off_axis`: distance of the point from the axis over the radius of the field of view at that range, any
+      shape.
+    - `xp`: array module, `jax.numpy` or `numpy`. Default `jax.numpy`.
+
+    **Returns:** an array shaped as `off_axis`.
     """
     return 1.0 / (1.0 + xp.exp(xp.clip((off_axis - 1.0) / EDGE, -80.0, 80.0)))

@@ -1,8 +1,8 @@
-"""The lidar: where it is, where it points, what it sends and how it records.
+"""The lidar: sensor position, beam, pulse and receiver.
 
-Axes: x east, y north, z up; the reference plane is z = 0. The beam axis meets it at `position`, and
-the sensor stands a slant range back along the axis. Time zero of every waveform is the two-way travel to
-that meeting point.
+Axes: x east, y north, z up; the reference plane is z = 0. The beam axis meets this plane at `position`, and
+the sensor stands a slant range back along the axis. Time zero of every waveform is the two-way travel time
+to that meeting point.
 """
 
 import math
@@ -35,31 +35,46 @@ def _position(x: ArrayLike | Sequence[ArrayLike]) -> Float[Array, " 2"]:
 
 
 class Lidar(eqx.Module):
-    """A full-waveform lidar. Without arguments it is that of Table 1 of the paper: 1064 nm, 6 ns,
-    0.3 mrad and an aperture of 0.2 m, looking straight down from 1000 m.
+    """A full-waveform lidar: its position and pointing, beam, pulse and receiver.
 
-    - `wavelength`: in nm, one number or strictly increasing ones, stored as (wavelengths,). Default 1064.
+    The defaults are those of Table 1 of the paper: 1064 nm, a pulse of 6 ns, a divergence of 0.3 mrad and an
+    aperture of 0.2 m, looking straight down from 1000 m.
+
+    **Arguments:**
+
+    - `wavelength`: nm, positive, one number or several that increase strictly; stored as (wavelengths,).
+      Default 1064.
     - `altitude`: height of the sensor above the reference plane z = 0 in m, positive. Default 1000.
-    - `pulse`: shape of the transmitted pulse. Default `GaussianPulse(fwhm=6.0)`.
-    - `divergence`: full angle of the beam in mrad, not negative: between the directions at 1/e^2 of
-      the axial irradiance, or across the disc of a top-hat. Default 0.3.
+    - `pulse`: shape of the transmitted pulse, an `AbstractPulse`. Default `GaussianPulse(fwhm=6.0)`.
+    - `divergence`: full angle of the beam in mrad, not negative. For a Gaussian beam it is measured between
+      the directions at 1/e^2 of the axial irradiance, for a top-hat across the disc. Default 0.3.
     - `aperture`: diameter of the receiver in m, positive. Default 0.2.
-    - `zenith`: angle between the beam and the vertical in degrees, 0 to 89. Default 0 (nadir).
-    - `azimuth`: compass direction in which the beam travels, degrees clockwise from north (+y).
-      Default 0; without effect on the axis at nadir.
-    - `energy`: J per pulse, positive, one number or one per wavelength. Default 1e-3.
-    - `sampling_interval`: of the digitiser in ns, positive. Default 1.
-    - `profile`: irradiance across the beam, `"gaussian"` (default) or `"top-hat"`.
-    - `position`: (x, y) in m where the beam axis meets the reference plane: the footprint's centre. At nadir
-      it is also the sensor's horizontal position. Default (0, 0).
-    - `field_of_view`: full angle of the receiver in mrad, positive, or None (default): it sees everything.
+    - `zenith`: angle between the beam and the vertical in degrees, in [0, 89]. Default 0 (nadir).
+    - `azimuth`: compass direction in which the beam travels, degrees clockwise from north (+y). At nadir it
+      does not change the beam axis. Default 0.
+    - `energy`: transmitted energy per pulse in J, positive, one number or one per wavelength. Default 1e-3.
+    - `sampling_interval`: interval between the digitiser's samples in ns, positive. Default 1.
+    - `profile`: irradiance across the beam, "gaussian" or "top-hat". Default "gaussian".
+    - `position`: (x, y) in m where the beam axis meets the reference plane: the centre of the footprint. At
+      nadir it is also the sensor's horizontal position. Default (0, 0).
+    - `field_of_view`: full angle of the receiver's field of view in mrad, positive. Default None: no limit.
     - `jitter`: standard deviation of the timing error in ns, not negative. Default 0.
-    - `efficiency`: of the optics and the detector together, in (0, 1], one number or one per
-      wavelength. Default 1.
+    - `efficiency`: of the optics and the detector together, in (0, 1], one number or one per wavelength.
+      Default 1.
     - `receiver`: detection, noise and digitisation. Default `Receiver()`: a perfect record.
 
-    **Raises:** `ValueError` for a value outside its range, for unsorted wavelengths, for an unknown profile,
-    and where energies or efficiencies are neither one nor one per wavelength.
+    **Raises:** ValueError for a value outside its range, for wavelengths that do not increase strictly, for
+    an unknown profile, for a position that is not two numbers, and where the energies or efficiencies are
+    neither one number nor one per wavelength.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> lidar = jl.Lidar(wavelength=[532.0, 1064.0], altitude=500.0, zenith=10.0)
+    >>> print(f"range {lidar.range_to_reference:.1f} m, footprint radius {lidar.footprint_radius:.4f} m")
+    range 507.7 m, footprint radius 0.0762 m
+    >>> print([f"{x:.1f}" for x in lidar.sensor])
+    ['0.0', '-88.2', '500.0']
     """
 
     wavelength: Float[Array, " wavelengths"] = eqx.field(converter=_vector, default=1064.0)
@@ -108,27 +123,28 @@ class Lidar(eqx.Module):
 
     @property
     def direction(self) -> Float[Array, " 3"]:
-        """Unit vector in which the beam travels."""
+        """Unit vector (3,) in which the beam travels."""
         zenith, azimuth = jnp.deg2rad(self.zenith), jnp.deg2rad(self.azimuth)
         across = jnp.sin(zenith)
         return jnp.stack([across * jnp.sin(azimuth), across * jnp.cos(azimuth), -jnp.cos(zenith)])
 
     @property
     def range_to_reference(self) -> Float[Array, ""]:
-        """Distance in m along the beam axis from the sensor to the reference plane."""
+        """Slant range in m: distance along the beam axis from the sensor to the reference plane."""
         return self.altitude / jnp.cos(jnp.deg2rad(self.zenith))
 
     @property
     def sensor(self) -> Float[Array, " 3"]:
-        """Where the sensor stands, in m."""
+        """Position (3,) of the sensor in m."""
         foot = jnp.concatenate([self.position, jnp.zeros_like(self.position[:1])])
         return foot - self.range_to_reference * self.direction
 
     @property
     def footprint_radius(self) -> Float[Array, ""]:
-        """Radius in m of the beam's cross-section at the reference plane (1/e^2, or the top-hat's edge).
+        """Radius of the footprint in m: of the beam's cross-section at the reference plane.
 
-        Across the beam: on the plane itself the footprint is longer by 1/cos(zenith) along the azimuth.
+        It is taken at 1/e^2 of the axial irradiance, or at the edge of a top-hat, and perpendicular to the
+        beam. On the plane itself the footprint is longer by 1/cos(zenith) along the azimuth.
         """
         return self.range_to_reference * self.divergence * 0.5e-3
 
@@ -139,15 +155,15 @@ class Lidar(eqx.Module):
 
     @property
     def aperture_half_angle(self) -> Float[Array, ""]:
-        """Half the angle in rad under which the reference plane sees the aperture."""
+        """Half-angle in rad of the aperture as seen from the reference plane."""
         return 0.5 * self.aperture / self.range_to_reference
 
     @property
     def energy_per_wavelength(self) -> Float[Array, " wavelengths"]:
-        """J per pulse, for each wavelength."""
+        """Transmitted energy in J per pulse, (wavelengths,)."""
         return jnp.broadcast_to(self.energy, self.wavelength.shape)
 
     @property
     def efficiency_per_wavelength(self) -> Float[Array, " wavelengths"]:
-        """The efficiency of optics and detector, for each wavelength."""
+        """Efficiency of optics and detector, (wavelengths,)."""
         return jnp.broadcast_to(self.efficiency, self.wavelength.shape)

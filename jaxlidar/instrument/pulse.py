@@ -1,20 +1,20 @@
-"""Transmitted pulses: unit-area shapes whose integrals, blurred by timing jitter, are closed forms.
+"""Transmitted pulses: shapes of unit area whose integrals, blurred by timing jitter, are closed forms.
 
-A digitiser records energy per bin, so what a simulation needs of a pulse is its running integral
+A digitiser records energy per bin, so a simulation needs the running integral of the pulse,
 
     F(t) = integral from -inf to t of (p * g_j)(u) du,
 
-where `p` is the pulse and `g_j` a Gaussian of standard deviation `j` (the timing jitter): the energy of
+where `p` is the pulse and `g_j` a Gaussian of standard deviation `j` (the timing jitter). The energy of
 an echo in a bin is a difference of two values of `F`. With Phi the normal distribution function and
 s^2 = sigma^2 + j^2,
 
-- Gaussian: F = Phi(t/s);
-- rectangle, and each linear piece of a sampled pulse: integrated error functions, written as the
-  unblurred integral plus terms that decay, so that nothing cancels far away; where the piece is shorter
-  than 2 j these do cancel, and Gauss-Legendre quadrature (exact to rounding there) takes over;
-- exponentially modified Gaussian (Grushka 1972, Anal. Chem. 44, 1733): F = Phi(z) - phi(z) M(s/tau - z),
-  with z measured from the Gaussian's centre and M the Mills ratio, by Laplace's continued fraction for
-  large arguments: nothing overflows, and tau = 0 is the Gaussian.
+- Gaussian: F = Phi(t/s).
+- Rectangle, and each linear piece of a sampled pulse: integrated error functions, written as the
+  unblurred integral plus terms that decay, so that nothing cancels far away. Where the piece is shorter
+  than 2 j these terms do cancel, and Gauss-Legendre quadrature (exact to rounding there) is used.
+- Exponentially modified Gaussian (Grushka 1972, Anal. Chem. 44, 1733): F = Phi(z) - phi(z) M(s/tau - z),
+  with z measured from the Gaussian's centre and M the Mills ratio. For large arguments M is Laplace's
+  continued fraction: nothing overflows, and tau = 0 is the Gaussian.
 
 Every formula and its derivatives stay finite at zero width and zero jitter, where F is a unit step of
 value 1/2 at the step.
@@ -23,193 +23,127 @@ value 1/2 at the step.
 import abc
 import math
 from collections.abc import Sequence
+from typing import final
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.special import erfc
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxlidar._checks import as_array, as_scalar, check_range, concrete
+from jaxlidar.instrument.pulse_integrals import (
+    distribution,
+    exponential_part,
+    piece,
+    quadrature_sum,
+    score,
+)
 
 _FWHM_PER_SIGMA = 2 * math.sqrt(2 * math.log(2))
-# A width below this (ns) counts as zero: a millionth of a light wave's period, and its inverse cube still
-# fits into float32, as second derivatives need.
-_NEGLIGIBLE = 1e-12
-# Phi and phi are 1 or 0 to the last bit beyond; clipping here keeps inf * 0 out of the derivatives.
-_SCORE_MAX = 40.0
 # A normal variable lies outside +-5.5 sigma with probability 3.8e-8, an exponential one beyond 16.8
 # mean lives with 5.1e-8: together below the 1e-7 that `support` promises.
 _GAUSSIAN_REACH = 5.5
 _EXPONENTIAL_REACH = 16.8
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(10)
 
 
 def _vector(x: ArrayLike | Sequence[ArrayLike]) -> Float[Array, " samples"]:
     return as_array(x if isinstance(x, jax.Array) else jnp.asarray(x, dtype=float))
 
 
-def _norm(a: Array, b: Array) -> Array:
-    """sqrt(a^2 + b^2) whose derivative is finite at zero."""
-    square = a * a + b * b
-    positive = square > _NEGLIGIBLE**2
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)
-
-
-def _score(t: Array, sigma: Array) -> Array:
-    """t / sigma within +-40; for a sigma of zero the sign of t times 40."""
-    inside = (sigma > _NEGLIGIBLE) & (jnp.abs(t) < _SCORE_MAX * sigma)
-    ratio = jnp.where(inside, t, 0.0) / jnp.where(inside, sigma, 1.0)
-    return jnp.where(inside, ratio, _SCORE_MAX * jnp.sign(t))
-
-
-def _density(z: Array) -> Array:
-    return jnp.exp(-0.5 * z * z) / math.sqrt(2 * math.pi)
-
-
-def _distribution(z: Array) -> Array:
-    return 0.5 * erfc(-z / math.sqrt(2))
-
-
-def _decaying(z: Array) -> tuple[Array, Array]:
-    """Once and twice integrated Phi(z) less the same of the unit step: the first even and vanishing at
-    infinity, the second odd (an integration constant dropped)."""
-    tail, density = _distribution(-jnp.abs(z)), _density(z)
-    once = density - jnp.abs(z) * tail
-    twice = jnp.sign(z) * (0.25 - 0.5 * ((z * z + 1) * tail - jnp.abs(z) * density))
-    return once, twice
-
-
-@jax.custom_jvp
-def _wide_piece(t: Array, length: Array, sigma: Array) -> tuple[Array, Array]:
-    """`_piece` for length > 2 sigma."""
-    once_high, twice_high = _decaying(_score(t + length / 2, sigma))
-    once_low, twice_low = _decaying(_score(t - length / 2, sigma))
-    ratio = sigma / length
-    q = jnp.clip(2 * t / length, -1.0, 1.0)
-    even = (1 + q) / 2 + ratio * (once_high - once_low)
-    odd = (q * q - 1) / 4 - ratio * (once_high + once_low) + 2 * ratio**2 * (twice_high - twice_low)
-    return even, odd
-
-
-@_wide_piece.defjvp
-def _wide_piece_jvp(primals, tangents):
-    # By hand, since the two parts of each sum have kinks at the ends that only cancel in the sum.
-    t, length, sigma = primals
-    dt, dlength, dsigma = tangents
-    even, odd = _wide_piece(t, length, sigma)
-    high, low = _score(t + length / 2, sigma), _score(t - length / 2, sigma)
-    rise, total = _distribution(high) - _distribution(low), _distribution(high) + _distribution(low)
-    density_high, density_low = _density(high), _density(low)
-    deven = rise * dt + (density_high - density_low) * dsigma + (total / 2 - even) * dlength
-    dodd = (
-        (2 * even - total) * dt
-        + (2 * sigma / length * rise - density_high - density_low) * dsigma
-        - (rise / 2 + 2 * odd) * dlength
-    )
-    return (even, odd), (deven / length, dodd / length)
-
-
-def _narrow_piece(t: Array, length: Array, sigma: Array) -> tuple[Array, Array]:
-    """`_piece` for length <= 2 sigma: quadrature, whose error is below 1e-15 there."""
-    even = odd = jnp.zeros_like(t)
-    for x, weight in zip(_NODES.tolist(), _WEIGHTS.tolist()):
-        value = 0.5 * weight * _distribution(_score(t - 0.5 * x * length, sigma))
-        even, odd = even + value, odd + x * value
-    return even, odd
-
-
-def _piece(t: Array, length: Array, sigma: Array) -> tuple[Array, Array]:
-    """Halves of the integrals over x in [-1, 1] of Phi((t - x length/2)/sigma) and of x times that.
-
-    A linear piece of mean power m and half rise d, centred on zero, has the blurred running integral
-    length * (m * first + d * second).
-    """
-    wide = (length > 2 * sigma) & (length > _NEGLIGIBLE)
-    wide_even, wide_odd = _wide_piece(t, jnp.where(wide, length, 1.0), jnp.where(wide, sigma, 0.0))
-    even, odd = _narrow_piece(t, length, sigma)
-    return jnp.where(wide, wide_even, even), jnp.where(wide, wide_odd, odd)
-
-
-def _exponential_part(t: Array, sigma: Array, decay: Array) -> Array:
-    """phi(z) M(sigma/decay - z) with z = t/sigma: what an exponential tail takes off Phi(z)."""
-    z = _score(t, sigma)
-    room = sigma - decay * z
-    large = (room > 4 * decay) & (room > _NEGLIGIBLE)  # the argument of M exceeds 4
-    v = jnp.where(large, decay, 0.0) / jnp.where(large, room, 1.0)
-    # Laplace's continued fraction of M(1/v), smooth at v = 0, closed by its tail for equal terms: 16 terms
-    # leave 3e-13 of it.
-    fraction = 0.5 * (1 + jnp.sqrt(1 + 68 * v * v))
-    for k in range(16, 0, -1):
-        fraction = 1 + k * v * v / fraction
-    by_fraction = _density(z) * v / fraction
-    # Elsewhere as it stands: the exponent stays below 8.
-    direct = ~large & (decay > _NEGLIGIBLE)
-    rate = 1 / jnp.where(direct, decay, 1.0)
-    width, time = jnp.where(direct, sigma, 0.0), jnp.where(direct, t, 0.0)
-    shifted = _distribution(_score(time - width * width * rate, width))
-    as_it_stands = jnp.exp(rate * (0.5 * width * width * rate - time)) * shifted
-    return jnp.where(large, by_fraction, jnp.where(direct, as_it_stands, 0.0))
-
-
 class AbstractPulse(eqx.Module):
-    """The shape of the transmitted pulse: power against time in ns, normalised to unit area.
+    """The shape of a transmitted pulse: power against time in ns, normalised to unit area.
 
-    Pure, and differentiable in time, jitter and every parameter. Subclasses are final.
+    A pulse of your own is one class in one file: derive it from this, give `cumulative`, `mean`, `std`,
+    `finest` and `support`, and pass it as `pulse=` of a `Lidar`. `power` follows from `cumulative`. Methods
+    are pure, written with `jax.numpy` (see `jaxlidar.extend`), and differentiable in time, jitter and every
+    field. Subclasses are final.
+
+    **Example:** the share of a pulse's energy that falls into one sample of 1 ns.
+
+    >>> import jaxlidar as jl
+    >>> pulse = jl.GaussianPulse(fwhm=6.0)
+    >>> print(f"{pulse.cumulative(0.5) - pulse.cumulative(-0.5):.4f}")
+    0.1556
     """
 
     @abc.abstractmethod
     def cumulative(self, t: ArrayLike, jitter: ArrayLike = 0.0) -> Float[Array, "..."]:
-        """The share of the pulse's energy that has passed by time `t`.
+        """Share of the pulse's energy that has passed by time `t`.
+
+        **Arguments:**
 
         - `t`: times in ns, any shape.
-        - `jitter`: standard deviation of the timing error in ns (not negative), a scalar. The
-          pulse is convolved with a Gaussian of that width. Default 0.
+        - `jitter`: standard deviation of the timing error in ns, not negative, one number. The pulse is
+          convolved with a Gaussian of this width. Default 0.
 
-        Returns an array shaped as `t`, rising from 0 to 1.
+        **Returns:** an array shaped as `t`, rising from 0 to 1.
         """
 
     @property
     @abc.abstractmethod
     def mean(self) -> Float[Array, ""]:
-        """The pulse's centroid in ns."""
+        """Centroid of the pulse in ns."""
 
     @property
     @abc.abstractmethod
     def std(self) -> Float[Array, ""]:
-        """The pulse's standard deviation in ns, without jitter."""
+        """Standard deviation of the pulse in ns, without jitter."""
 
     @property
     @abc.abstractmethod
     def finest(self) -> Float[Array, ""]:
-        """Scale (ns) of the finest feature over which the power changes smoothly; zero where it jumps."""
+        """Scale in ns of the finest feature of a smooth pulse; zero where the power jumps.
+
+        A plan compares it with the width of the fine bins in which returns are collected. Where the pulse is
+        smooth over a bin, the blur that the bins add is taken out.
+        """
 
     @abc.abstractmethod
     def support(self, jitter: ArrayLike = 0.0) -> tuple[float, float]:
-        """Times (low, high) in ns outside which less than 1e-7 of the energy lies.
+        """Times (low, high) in ns outside which less than 1e-7 of the energy lies, for the size of windows.
 
-        For sizing windows: Python numbers, hence for concrete parameters only; inside a transformation
-        JAX raises its `ConcretizationTypeError`.
+        **Arguments:**
+
+        - `jitter`: standard deviation of the timing error in ns. Default 0.
+
+        **Returns:** two Python numbers.
+
+        **Raises:** JAX's `ConcretizationTypeError` inside a JAX transformation: the parameters must be known.
         """
 
     def power(self, t: ArrayLike, jitter: ArrayLike = 0.0) -> Float[Array, "..."]:
-        """The pulse's power at times `t` (ns, any shape) per unit of energy, in 1/ns.
+        """Power of the pulse per unit of energy in 1/ns: the derivative of `cumulative`.
 
-        The derivative of `cumulative`; half the jump where the power jumps. A pulse of zero width has no
-        finite power: its step counts as flat, and the result is zero everywhere.
+        **Arguments:**
+
+        - `t`: times in ns, any shape.
+        - `jitter`: standard deviation of the timing error in ns. Default 0.
+
+        **Returns:** an array shaped as `t`. Where the power jumps, it is half the jump. A pulse of zero width
+        has no finite power: its step counts as flat, and the result is zero everywhere.
         """
         t = as_array(t)
         return jax.jvp(lambda u: self.cumulative(u, jitter), (t,), (jnp.ones_like(t),))[1]
 
 
+@final
 class GaussianPulse(AbstractPulse):
     """A Gaussian pulse, centred on time zero.
 
-    - `fwhm`: full width at half maximum in ns, not negative; zero is an instant. Default 6 (Table 1 of
-      the paper).
+    **Arguments:**
 
-    **Raises:** `ValueError` for a negative or non-finite width.
+    - `fwhm`: full width at half maximum in ns, not negative; zero is an instantaneous pulse. Default 6 (Table
+      1 of the paper).
+
+    **Raises:** ValueError for a negative or non-finite width.
+
+    **Example:** at half the width the power is half the maximum.
+
+    >>> import jaxlidar as jl
+    >>> pulse = jl.GaussianPulse(fwhm=4.0)
+    >>> print(f"{pulse.power(2.0) / pulse.power(0.0):.3f}")
+    0.500
     """
 
     fwhm: Float[Array, ""] = eqx.field(converter=as_scalar, default=6.0)
@@ -218,7 +152,7 @@ class GaussianPulse(AbstractPulse):
         check_range("fwhm", self.fwhm, 0.0)
 
     def cumulative(self, t: ArrayLike, jitter: ArrayLike = 0.0) -> Float[Array, "..."]:
-        return _distribution(_score(as_array(t), _norm(self.std, as_scalar(jitter))))
+        return distribution(score(as_array(t), quadrature_sum(self.std, as_scalar(jitter))))
 
     @property
     def mean(self) -> Float[Array, ""]:
@@ -237,12 +171,23 @@ class GaussianPulse(AbstractPulse):
         return -reach, reach
 
 
+@final
 class RectangularPulse(AbstractPulse):
     """A pulse of constant power, centred on time zero.
 
-    - `length`: duration in ns, not negative; zero is an instant. Default 6 (Table 1 of the paper).
+    **Arguments:**
 
-    **Raises:** `ValueError` for a negative or non-finite length.
+    - `length`: duration in ns, not negative; zero is an instantaneous pulse. Default 6 (Table 1 of the
+      paper).
+
+    **Raises:** ValueError for a negative or non-finite length.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> pulse = jl.RectangularPulse(length=6.0)
+    >>> print(f"{pulse.std:.3f} ns, {pulse.cumulative(1.5):.2f} of the energy by 1.5 ns")
+    1.732 ns, 0.75 of the energy by 1.5 ns
     """
 
     length: Float[Array, ""] = eqx.field(converter=as_scalar, default=6.0)
@@ -251,7 +196,7 @@ class RectangularPulse(AbstractPulse):
         check_range("length", self.length, 0.0)
 
     def cumulative(self, t: ArrayLike, jitter: ArrayLike = 0.0) -> Float[Array, "..."]:
-        return _piece(as_array(t), self.length, jnp.abs(as_scalar(jitter)))[0]
+        return piece(as_array(t), self.length, jnp.abs(as_scalar(jitter)))[0]
 
     @property
     def mean(self) -> Float[Array, ""]:
@@ -270,15 +215,27 @@ class RectangularPulse(AbstractPulse):
         return -reach, reach
 
 
+@final
 class ExponentiallyModifiedGaussianPulse(AbstractPulse):
-    """A Gaussian convolved with a decaying exponential: a sharp rise and a long tail.
+    """A Gaussian convolved with a decaying exponential: a pulse with a sharp rise and a long tail.
 
     Time zero is the centroid; the Gaussian's centre lies `decay` before it.
 
-    - `fwhm`: full width at half maximum of the Gaussian in ns, not negative.
-    - `decay`: mean life of the exponential in ns, not negative; zero is the Gaussian pulse.
+    **Arguments:**
 
-    **Raises:** `ValueError` for a negative or non-finite width or decay.
+    - `fwhm`: full width at half maximum of the Gaussian in ns, not negative.
+    - `decay`: mean life of the exponential in ns, not negative; zero gives the Gaussian pulse.
+
+    **Raises:** ValueError for a negative or non-finite width or decay.
+
+    **Source:** Grushka (1972), Anal. Chem. 44, 1733.
+
+    **Example:** more than half of the energy precedes the centroid, because of the long tail.
+
+    >>> import jaxlidar as jl
+    >>> pulse = jl.ExponentiallyModifiedGaussianPulse(fwhm=3.0, decay=2.0)
+    >>> print(f"{pulse.cumulative(0.0):.3f} of the energy, standard deviation {pulse.std:.3f} ns")
+    0.570 of the energy, standard deviation 2.371 ns
     """
 
     fwhm: Float[Array, ""] = eqx.field(converter=as_scalar)
@@ -289,9 +246,9 @@ class ExponentiallyModifiedGaussianPulse(AbstractPulse):
         check_range("decay", self.decay, 0.0)
 
     def cumulative(self, t: ArrayLike, jitter: ArrayLike = 0.0) -> Float[Array, "..."]:
-        sigma = _norm(self.fwhm / _FWHM_PER_SIGMA, as_scalar(jitter))
+        sigma = quadrature_sum(self.fwhm / _FWHM_PER_SIGMA, as_scalar(jitter))
         from_centre = as_array(t) + self.decay
-        return _distribution(_score(from_centre, sigma)) - _exponential_part(from_centre, sigma, self.decay)
+        return distribution(score(from_centre, sigma)) - exponential_part(from_centre, sigma, self.decay)
 
     @property
     def mean(self) -> Float[Array, ""]:
@@ -299,7 +256,7 @@ class ExponentiallyModifiedGaussianPulse(AbstractPulse):
 
     @property
     def std(self) -> Float[Array, ""]:
-        return _norm(self.fwhm / _FWHM_PER_SIGMA, self.decay)
+        return quadrature_sum(self.fwhm / _FWHM_PER_SIGMA, self.decay)
 
     @property
     def finest(self) -> Float[Array, ""]:
@@ -311,17 +268,31 @@ class ExponentiallyModifiedGaussianPulse(AbstractPulse):
         return -decay - reach, -decay + reach + _EXPONENTIAL_REACH * decay
 
 
+@final
 class SampledPulse(AbstractPulse):
     """A recorded transmit waveform: linear between its samples, zero outside, scaled to unit area.
 
-    Time zero is that of the given time axis: subtract the centroid (`mean`) from `time` for a pulse
-    whose echoes lie where a symmetric pulse's do. Remove a recorded baseline before.
+    Time zero is that of the given time axis. Subtract the centroid (`mean`) from `time` to place echoes where
+    those of a symmetric pulse lie. Subtract the baseline of a record before.
+
+    **Arguments:**
 
     - `time`: (samples,) in ns, strictly increasing, at least two.
-    - `power`: (samples,) in any unit, not negative, not all zero.
+    - `power`: (samples,) in any unit, not negative, not all zero. Stored as `samples`, since `power` is a
+      method.
 
-    **Raises:** `ValueError` for times that are unsorted or too few, for shapes that differ, and for power
-    that is negative, non-finite or zero throughout.
+    **Raises:** ValueError for times that do not increase strictly, are too few or are not finite, for shapes
+    that differ, and for power that is negative, non-finite or zero throughout.
+
+    **Example:** a triangular pulse, moved so that its centroid lies at time zero.
+
+    >>> import jaxlidar as jl
+    >>> import numpy as np
+    >>> time, power = np.array([0.0, 2.0, 8.0]), np.array([0.0, 5.0, 0.0])
+    >>> centroid = jl.SampledPulse(time, power).mean
+    >>> pulse = jl.SampledPulse(time - centroid, power)
+    >>> print(f"centroid {centroid:.3f} ns, standard deviation {pulse.std:.3f} ns")
+    centroid 3.333 ns, standard deviation 1.700 ns
     """
 
     time: Float[Array, " samples"]
@@ -362,7 +333,7 @@ class SampledPulse(AbstractPulse):
         sigma = jnp.abs(as_scalar(jitter))
 
         def at(time):
-            even, odd = _piece(time - centre, length, sigma)
+            even, odd = piece(time - centre, length, sigma)
             return jnp.sum(length * (mean * even + rise * odd))
 
         t = as_array(t)

@@ -1,7 +1,7 @@
-"""The receiver: what the detector and the digitiser make of the energy that arrives.
+"""The receiver: how the detector and the digitiser record the energy that arrives.
 
-`record` turns expected energies per sample into a record, with or without one realisation of the noise;
-`first_return_window` opens the sampling bins at the first return, as the paper does.
+`record` turns expected energies per sample into a record, with or without one realisation of the noise.
+`first_return_window` starts the sampling bins at the first return, as the paper does.
 """
 
 import math
@@ -22,23 +22,35 @@ _POISSON_MAX = 1e6
 
 
 class Receiver(eqx.Module):
-    """Detection and digitisation of a waveform. Without arguments: a perfect record.
+    """Detection, noise and digitisation of a waveform. The default is a perfect record.
 
-    Energies are those detected, that is, after the efficiency of optics and detector.
+    All energies are detected energies, that is, after the efficiency of optics and detector.
 
-    - `detection_threshold`: J per sample, not negative; samples below it read zero. Default 0: nothing
-      is lost, and electronic noise may make a sample negative.
-    - `saturation`: J per sample, positive; larger samples read this. Default None: no limit.
-    - `bits`: the digitiser's resolution, 1 to 24, over [0, `saturation`], which it requires. Default
-      None: not quantised.
+    **Arguments:**
+
+    - `detection_threshold`: J per sample, not negative; samples below it are recorded as zero. Default 0: no
+      signal is lost, and electronic noise may make a sample negative.
+    - `saturation`: J per sample, positive; larger samples are recorded as this value. Default None: no limit.
+    - `bits`: resolution of the digitiser, an integer in [1, 24], over the range [0, `saturation`]; it needs a
+      saturation. Default None: not quantised.
     - `background`: J per sample, not negative, added to every sample (sunlight, dark current). Default 0.
     - `photon_noise`: whether a noisy record has the shot noise of signal and background. Default True.
-    - `electronic_noise`: standard deviation of additive normal noise, J per sample, not negative.
-      Default 0.
-    - `window`: `"fixed"` (default): samples at fixed instants; `"first return"`: the sampling bins open at
-      the first return, as in the paper (see `first_return_window`).
+    - `electronic_noise`: standard deviation of additive normal noise in J per sample, not negative. Default
+      0.
+    - `window`: "fixed": samples at fixed instants; "first return": the sampling bins start at the first
+      return, as in the paper (see `first_return_window`). Default "fixed".
 
-    **Raises:** `ValueError` for a value outside its range, and for `bits` without `saturation`.
+    **Raises:** ValueError for a value outside its range, for an unknown window, and for `bits` without
+    `saturation`.
+
+    **Example:** a digitiser of two bits has four levels.
+
+    >>> import jaxlidar as jl
+    >>> import numpy as np
+    >>> receiver = jl.Receiver(saturation=3e-15, bits=2)
+    >>> recorded = jl.record(np.array([[0.4e-15, 1.2e-15, 5e-15]]), 1064.0, receiver)
+    >>> print([f"{x:.1e}" for x in recorded[0]])
+    ['0.0e+00', '1.0e-15', '3.0e-15']
     """
 
     detection_threshold: Float[Array, ""] = eqx.field(converter=as_scalar, default=0.0)
@@ -71,18 +83,31 @@ def record(
     *,
     key: Array | None = None,
 ) -> Float[Array, "*channels wavelengths bins"]:
-    """The recorded waveform: background and noise, then saturation, detection threshold, quantisation.
+    """The waveform that a receiver records of given energies.
 
-    - `energy`: expected detected energy per sample in J, not negative.
-    - `wavelength`: in nm, one number or (wavelengths,): a photon carries h c / wavelength.
-    - `receiver`: what to apply.
-    - `key`: a random key: the result is one realisation (Poisson counts of the photons of signal and
-      background, a normal variable in their place beyond a million expected; normal electronic noise).
-      Default None: the record of the expected energies, without noise.
+    Background and noise are added; saturation, detection threshold and quantisation follow in this order.
 
-    Returns J per sample, shaped as `energy`. Derivatives pass through the quantisation as though it
-    were absent, and through the noise of a realisation with its draws held fixed (so not through Poisson
-    counts).
+    **Arguments:**
+
+    - `energy`: (..., wavelengths, bins) expected detected energy in J per sample, not negative.
+    - `wavelength`: nm, one number or (wavelengths,): a photon carries the energy h c / wavelength.
+    - `receiver`: the `Receiver` that records.
+    - `key`: a JAX random key: the result is one realisation of the noise. The photons of signal and
+      background are Poisson counts, or a normal variable where more than a million are expected; electronic
+      noise is normal. Default None: the record of the expected energies, without noise.
+
+    **Returns:** J per sample, an array shaped as `energy`. Derivatives pass through the quantisation as if it
+    were absent. They pass through the noise of a realisation with its draws held fixed, so not through
+    Poisson counts.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> import numpy as np
+    >>> receiver = jl.Receiver(detection_threshold=3e-16, saturation=1e-15)
+    >>> recorded = jl.record(np.array([[2e-16, 6e-16, 17e-16]]), 1064.0, receiver)
+    >>> print([f"{x:.1e}" for x in recorded[0]])
+    ['0.0e+00', '6.0e-16', '1.0e-15']
     """
     energy = as_array(energy)
     expected = energy + receiver.background
@@ -123,24 +148,38 @@ def first_return_window(
     interval: float,
     threshold: ArrayLike = 0.0,
 ) -> tuple[Float[Array, " samples"], Float[Array, "*channels samples"]]:
-    """A finely sampled waveform on bins of `interval` that start with the first return.
+    """A finely sampled waveform on coarser bins that start at the first return.
 
-    So the paper samples (its section 2.1), and notes the artefact: where the bins lie depends on the scene.
-    The first echo always starts flush with a bin, where fixed instants would split it over two, and the
-    echoes after it fall as their distance from the first has it: a peak (the paper's ground) reads too high.
-    Real digitisers sample at instants of their own: not for use except to reproduce the paper's figures.
+    The paper samples in this way (its section 2.1) and notes the artefact: the position of the bins depends
+    on the scene. The first echo always starts at the edge of a bin, where samples at fixed instants would
+    split it over two bins. Later echoes fall where their distance from the first puts them, so that a peak
+    (the paper's ground) reads too high. Real digitisers sample at instants of their own. Use this only to
+    reproduce the paper's figures.
 
-    - `time`: (bins,) centres of the fine bins in ns, evenly spaced, at least two; concrete.
-    - `energy`: J per fine bin, taken as uniform within it.
-    - `interval`: of the new bins in ns, positive; concrete, a multiple of the fine one or not.
-    - `threshold`: J per fine bin; the window opens with the first bin in which any channel exceeds it
-      (at the start of the record where none does). Default 0.
+    **Arguments:**
 
-    Returns the new centres in ns and the energy per new bin. From the opening on energy is conserved;
-    what came earlier, none at a threshold of zero, is not recorded. There are always
-    ceil(record length / `interval`) bins, the last ones empty.
+    - `time`: (bins,) centres of the fine bins in ns, evenly spaced, at least two; not traced by JAX.
+    - `energy`: (..., bins) J per fine bin, taken as uniform within the bin.
+    - `interval`: width of the new bins in ns, positive, not traced by JAX. It need not be a multiple of the
+      fine width.
+    - `threshold`: J per fine bin; the window starts at the first fine bin in which any channel exceeds it, or
+      at the start of the record where none does. Default 0.
 
-    **Raises:** `ValueError` for an interval that is not positive and for times uneven or fewer than two.
+    **Returns:** the centres of the new bins in ns, (samples,), and the energy per new bin, (..., samples).
+    Energy from the start of the window on is conserved. Earlier energy (none at a threshold of zero) is not
+    recorded. There are always ceil(record length / `interval`) bins; the last ones are empty.
+
+    **Raises:** ValueError for an interval that is not positive, and for times that are uneven, fewer than
+    two, or not one per bin of `energy`.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> import numpy as np
+    >>> time, energy = np.arange(6.0), np.array([0.0, 0.0, 1.0, 1.0, 2.0, 2.0])
+    >>> centres, samples = jl.first_return_window(time, energy, interval=2.0)
+    >>> print(centres, samples)
+    [2.5 4.5 6.5] [2. 4. 0.]
     """
     check_range("interval", interval, 0.0, low_open=True)
     check_range("time", time)

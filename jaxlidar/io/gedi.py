@@ -1,22 +1,22 @@
-"""Recorded waveforms: GEDI's level 1B product.
+"""Reader of recorded waveforms: GEDI's level 1B product.
 
-What the fields of a GEDI shot refer to is not all in the product's data dictionary; the following was
-found from the recorded numbers and is what `GediShot` relies on.
+The product's data dictionary does not say everything about what the fields of a shot refer to. The following
+was found from the recorded numbers, and `GediShot` relies on it.
 
-- The time from transmission to the first received bin, 2 `bounce_time_offset_bin0`, equals
-  `rx_open` + `rx_offset` - `tx_gloc` plus a constant of the channel, in samples of 1 ns (to 1e-6 ns in
-  some beams, else to whole clock steps of 4 ns). So a bin's elevation is where a target lies whose echo
-  has the *Gaussian fit* of the transmitted pulse centred on that bin: time zero of the pulse is
-  `tx_gloc`, counted from sample 0. (Flat ground fitted with the recorded pulse then lies within 0.1 m of
-  level 2's `elev_lowestmode`.) The pulse is skewed: its largest sample comes 0.7 to 1.3 ns before, its
-  centroid 2 to 3 ns after (0.3 to 0.5 m of elevation, if confused).
-- 2 (`bounce_time_offset_lastbin` - `bounce_time_offset_bin0`) is the number of bins less one, in ns: the
-  two elevations are those of the first and the last bin, and bins in between lie evenly, 0.1498 m apart.
-- The waveforms are smoothed, the received one as though by a Gaussian of 1.7 ns: noise of neighbouring
-  bins has a correlation of 0.92, 0.71, 0.45, 0.21 and then about none, and a standard deviation about half of
+- The time from transmission to the first received bin, 2 `bounce_time_offset_bin0`, equals `rx_open` +
+  `rx_offset` - `tx_gloc` plus a constant of the channel, in samples of 1 ns (to 1e-6 ns in some beams, else
+  to whole clock steps of 4 ns). So the elevation of a bin is where a target lies whose echo has the *Gaussian
+  fit* of the transmitted pulse centred on that bin: time zero of the pulse is `tx_gloc`, counted from sample
+  0. (Flat ground fitted with the recorded pulse then lies within 0.1 m of level 2's `elev_lowestmode`.) The
+  pulse is skewed: its largest sample comes 0.7 to 1.3 ns before, its centroid 2 to 3 ns after (0.3 to 0.5 m
+  of elevation, if confused).
+- 2 (`bounce_time_offset_lastbin` - `bounce_time_offset_bin0`) is the number of bins less one, in ns: the two
+  elevations are those of the first and the last bin, and bins in between lie evenly, 0.1498 m apart.
+- The waveforms are smoothed, the received one as though by a Gaussian of 1.7 ns: noise of neighbouring bins
+  has a correlation of 0.92, 0.71, 0.45, 0.21 and then about none, and a standard deviation about half of
   `noise_stddev_corrected`. For fits take every fifth bin as independent, or weight accordingly.
 
-Where level 2 answers are at hand (L2A `elev_lowestmode`, `rh`; L2B `pai`, `cover`), match them with
+Level 2 results (L2A `elev_lowestmode`, `rh`; L2B `pai`, `cover`) belong to the shot with the same
 `GediShot.shot_number`, which is unique in all of the mission.
 """
 
@@ -61,15 +61,27 @@ class GediShot:
     - `elevation`: (bins,) m above the WGS-84 ellipsoid, decreasing: where a target lies whose echo of
       `pulse_power` has its time zero in that bin.
     - `waveform`: (bins,) received, in counts, noise included.
-    - `noise_mean`, `noise_std`: of the received noise in counts, as the product gives them.
+    - `noise_mean`, `noise_std`: mean and standard deviation of the received noise in counts, as the product
+      gives them.
     - `pulse_time`: (samples,) ns, zero at the reference of `elevation`.
-    - `pulse_power`: (samples,) transmitted, in counts: pedestal removed, not negative, and zero before
-      and after the pulse. For `SampledPulse(time=shot.pulse_time, power=shot.pulse_power)`.
+    - `pulse_power`: (samples,) transmitted, in counts: pedestal removed, not negative, and zero before and
+      after the pulse. For `SampledPulse(time=shot.pulse_time, power=shot.pulse_power)`.
     - `latitude`, `longitude`: of the last bin in degrees.
     - `altitude`: of the instrument in m above the ellipsoid.
     - `zenith`: of the beam at the footprint in degrees, as in `Lidar`.
-    - `azimuth`: in degrees clockwise from north, the horizontal direction in which the light travels down,
-      as in `Lidar`.
+    - `azimuth`: in degrees clockwise from north, the horizontal direction in which the light travels down, as
+      in `Lidar`.
+
+    **Example:**
+
+    >>> import numpy as np
+    >>> from jaxlidar.io import GediShot
+    >>> bins = {"time": np.arange(3.0), "elevation": np.array([20.3, 20.15, 20.0])}
+    >>> pulse = {"pulse_time": np.array([-1.0, 0.0, 1.0]), "pulse_power": np.array([0.0, 80.0, 0.0])}
+    >>> place = {"latitude": -20.0, "longitude": 25.0, "altitude": 4e5, "zenith": 0.5, "azimuth": 90.0}
+    >>> received = {"waveform": np.array([200.0, 260.0, 205.0]), "noise_mean": 202.0, "noise_std": 2.0}
+    >>> GediShot(beam="BEAM0101", shot_number=1, **bins, **received, **pulse, **place).signal
+    array([-2., 58.,  3.])
     """
 
     beam: str
@@ -96,26 +108,36 @@ class GediShot:
 def read_gedi_l1b(
     path: str | os.PathLike[str], shot: int | np.integer | Sequence[int] | np.ndarray | None = None
 ) -> list[GediShot]:
-    """Read shots from a GEDI L1B file, or from a subset of one in the same layout.
+    """The shots of a GEDI L1B file, or of a subset of one in the same layout.
 
-    Needs h5py (`pip install "jaxlidar[io]"`). Only the shots asked for are read into memory.
+    This needs h5py (`pip install "jaxlidar[io]"`). Only the shots asked for are read into memory.
+
+    Start indices are used where they fit the stored samples. Where they do not, as in subsets that kept the
+    numbering of the full file, the shots lie end to end, and the counts say where.
+
+    **Arguments:**
 
     - `path`: an HDF5 file.
-    - `shot`: which shots. None (default) is all of them, beam after beam in the order of the file. An
-      integer, or a list of them, picks: below the number of shots in the file it is an index into that
-      order, counted from 0, else a shot number.
+    - `shot`: which shots, an integer or several. A number below the number of shots in the file is an index,
+      from 0, into all shots, beam after beam in the order of the file; any other is a shot number. Default
+      None: all.
 
-    Returns a list of `GediShot`, in the order asked for; one integer gives a list of one.
+    **Returns:** a list of `GediShot`, in the order asked for; one integer gives a list of one.
 
-    Start indices are used where they fit the stored samples. Where they do not, as in subsets that
-    kept the numbering of the full file, the shots lie end to end and the counts say where.
+    **Raises:** FileNotFoundError where there is no such file. ImportError without h5py. ValueError, naming
+    the file and the place, for a file that is not HDF5, is damaged, is no GEDI L1B product or holds a shot
+    whose numbers make no sense, and for a shot that it does not hold.
 
-    **Raises:** `FileNotFoundError` where there is no such file; `ImportError` without h5py; `ValueError`,
-    naming the file and the place, for a file that is not HDF5, is damaged, is no GEDI L1B product or holds
-    a shot whose numbers make no sense, and for a shot that it does not hold.
+    **Source:** GEDI L1B product data dictionary (Dubayah et al. 2020, doi:10.5067/GEDI/GEDI01_B.002); Luthcke
+    et al. 2019, GEDI waveform geolocation for L1 and L2 products (theoretical basis document).
 
-    Source: GEDI L1B product data dictionary (Dubayah et al. 2020, doi:10.5067/GEDI/GEDI01_B.002); Luthcke et
-    al. 2019, GEDI waveform geolocation for L1 and L2 products (theoretical basis document).
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> import jaxlidar.io
+    >>> (shot,) = jaxlidar.io.read_gedi_l1b("GEDI01_B.h5", shot=0)  # doctest: +SKIP
+    >>> pulse = jl.SampledPulse(time=shot.pulse_time, power=shot.pulse_power)  # doctest: +SKIP
+    >>> lidar = jl.Lidar(pulse=pulse, zenith=shot.zenith, azimuth=shot.azimuth)  # doctest: +SKIP
     """
     try:
         import h5py
@@ -161,7 +183,7 @@ def _select(path: Path, beams: list["_Beam"], shot: Any) -> Iterable[tuple["_Bea
 
 
 class _Beam:
-    """The group of one beam: its per-shot numbers, and where each shot's samples lie."""
+    """The group of one beam: its numbers for each shot, and where the samples of each shot lie."""
 
     def __init__(self, path: Path, file: Any, name: str):
         self.path, self.file, self.name = path, file, name

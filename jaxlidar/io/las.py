@@ -1,4 +1,4 @@
-"""Point clouds in LAS and LAZ files."""
+"""Reader of point clouds in LAS and LAZ files."""
 
 import os
 from pathlib import Path
@@ -7,18 +7,27 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-# Classes of the LAS 1.4 specification that are no return of the scene: low noise and high noise.
+# Classes of the LAS 1.4 specification that are not returns of the scene: low noise and high noise.
 _NOISE = (7, 18)
 
 
 class PointCloud(NamedTuple):
-    """Points of a scan.
+    """Points of a laser scan.
 
-    - `position`: (n, 3) m, as in the file, in double precision.
-    - `classification`: (n,) the classes of the LAS specification: 2 ground, 3 to 5 vegetation, ...
-    - `return_number`, `number_of_returns`: (n,) of each pulse.
+    - `position`: (n, 3) m, as in the file times the scale, in double precision.
+    - `classification`: (n,) classes of the LAS specification: 2 ground, 3 to 5 vegetation, ...
+    - `return_number`, `number_of_returns`: (n,) number of the return, and of all returns of its pulse.
     - `intensity`: (n,) as recorded.
-    - `dropped`: how many points the file holds that are not here, by reason.
+    - `dropped`: how many points of the file were left out, by reason.
+
+    **Example:**
+
+    >>> import numpy as np
+    >>> from jaxlidar.io import PointCloud
+    >>> one, two = np.array([1, 1]), np.array([[0.0, 0.0, 1.0], [0.5, 0.0, 9.0]])
+    >>> cloud = PointCloud(two, np.array([2, 5]), one, one, np.array([40.0, 25.0]), {"noise": 0})
+    >>> print(cloud.position[cloud.classification == 5])
+    [[0.5 0.  9. ]]
     """
 
     position: Float[np.ndarray, "n 3"]
@@ -30,19 +39,34 @@ class PointCloud(NamedTuple):
 
 
 def read_las(path: str | os.PathLike[str], *, scale: float = 1.0) -> PointCloud:
-    """Read a LAS file, or a LAZ file where laspy has a backend for it.
+    """The points of a LAS file, or of a LAZ file where laspy has a backend for it.
 
-    Needs laspy (`pip install "jaxlidar[io]"`; for LAZ also lazrs).
+    This needs laspy (`pip install "jaxlidar[io]"`; for LAZ also lazrs). Points classified as noise (classes 7
+    and 18) and those flagged as withheld are dropped and counted.
+
+    **Arguments:**
 
     - `path`: the file.
     - `scale`: metres per unit of length in the file. Default 1.
 
-    Points classified as noise (classes 7 and 18), and those flagged as withheld, are dropped and counted.
+    **Returns:** a `PointCloud`. Its `dropped` counts points as "noise" and "withheld".
 
-    **Raises:** FileNotFoundError; ImportError without laspy; ValueError, naming the file, and for points
-    the record, where it is damaged, cut short, without points or holds coordinates that are not finite.
+    **Raises:** FileNotFoundError where there is no such file. ImportError without laspy. ValueError, naming
+    the file, and for points the record, where it is damaged, cut short, without points or holds coordinates
+    that are not finite.
 
     **Source:** LAS specification 1.4 (ASPRS).
+
+    **Example:**
+
+    >>> import laspy, pathlib, tempfile
+    >>> import jaxlidar.io
+    >>> path, file = pathlib.Path(tempfile.mkdtemp()) / "scan.las", laspy.create()
+    >>> file.x, file.y, file.z, file.classification = [0.0, 1.0], [0.0, 0.0], [5.0, 90.0], [2, 18]
+    >>> file.write(path)
+    >>> cloud = jaxlidar.io.read_las(path)
+    >>> print(cloud.position, cloud.dropped)
+    [[0. 0. 5.]] {'noise': 1, 'withheld': 0}
     """
     try:
         import laspy

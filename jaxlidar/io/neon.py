@@ -1,22 +1,21 @@
-"""Recorded waveforms: NEON's airborne full-waveform lidar, as an .npz of arrays.
+"""Reader of recorded waveforms: NEON's airborne full-waveform lidar, as an .npz of arrays.
 
-The arrays are those of the sample that comes with the R package waveformlidar, with its names for the
-columns of the geolocation. What they refer to was found from the recorded numbers and is what `NeonShot`
-relies on.
+The arrays are those of the sample that comes with the R package waveformlidar, with its names for the columns
+of the geolocation. What they refer to was found from the recorded numbers, and `NeonShot` relies on it.
 
 - (`V9`, `V10`, `V11`) is where sample `V16` (0 throughout) of the return lies, and (`dx`, `dy`, `dz`) is the
   way from one sample to the next, 0.14986 m: half of what light travels in air in 1 ns.
 - (`x`, `y`, `z`), the position of the first return, lies at the sample `fr` + `V15` - `or`, to 0.0001 m of
-  height. `fr` and `or` are where the return and the outgoing pulse rise to half of their height, `V15` the
+  height. `fr` and `or` are where the return and the outgoing pulse rise to half of their height, `V15` is the
   outgoing pulse's largest sample, counted from 0. So a sample lies where a target is whose echo has the
   largest sample of the outgoing pulse there: that is time zero of the pulse.
 - A hard target's echo is broader than its outgoing pulse, as though by a Gaussian of 1.9 ns
-  (`Lidar(jitter=1.9)`), and so rises to half 0.5 ns earlier: ground fitted with time zero as above lies
-  0.07 m below the discrete returns of flat targets.
-- Zeros are no samples: they fill rows to a common length, and the gaps between segments of a return.
+  (`Lidar(jitter=1.9)`), and so rises to half 0.5 ns earlier: ground fitted with time zero as above lies 0.07
+  m below the discrete returns of flat targets.
+- Zeros are not samples: they fill rows to a common length, and the gaps between segments of a return.
 - The pedestal is that of the digitiser: samples before the returns do not vary with the outgoing pulse's, nor
   from shot to shot by more than noise. Noise is correlated over about 5 samples.
-- The sample's horizontal positions have seven digits, that is 1 m in northing.
+- The horizontal positions in the sample have seven digits, that is 1 m in northing.
 """
 
 import dataclasses
@@ -34,7 +33,7 @@ from jaxlidar.io.pedestal import above_pedestal
 
 # The columns of `geo` that are used.
 _COLUMNS = ("index", "dx", "dy", "dz", "V9", "V10", "V11", "V15", "V16")
-# So many samples at the beginning of a return, and of an outgoing pulse, lie before what is recorded.
+# Numbers of samples at the beginning of a return, and of an outgoing pulse, that hold only noise.
 _QUIET, _QUIET_PULSE = 8, 5
 # Standard deviation of normal numbers over their median absolute deviation.
 _STD_PER_MAD = 1.4826
@@ -48,18 +47,29 @@ class NeonShot:
 
     - `index`: the file's number of the shot.
     - `waveform`: (samples,) received, in counts, noise included; 0 where nothing was recorded.
-    - `recorded`: (samples,) whether it was: a return may consist of several segments.
-    - `noise_mean`, `noise_std`: of the noise in counts, estimated from what precedes the returns of all shots
-      of the file.
+    - `recorded`: (samples,) whether it was recorded: a return may consist of several segments.
+    - `noise_mean`, `noise_std`: mean and standard deviation of the noise in counts, estimated from what
+      precedes the returns of all shots of the file.
     - `position`: (samples, 3) easting, northing, elevation in m: where a target lies whose echo of
       `pulse_power` has its time zero in that sample.
     - `pulse_time`: (pulse samples,) ns, zero at the largest sample of the outgoing pulse.
     - `pulse_power`: (pulse samples,) outgoing, in counts: pedestal removed, not negative, and zero before and
-      after the pulse. For `SampledPulse(time=shot.pulse_time, power=shot.pulse_power)`; alike in length in
-      all shots of a file.
+      after the pulse. For `SampledPulse(time=shot.pulse_time, power=shot.pulse_power)`. Its length is the
+      same in all shots of a file.
     - `zenith`: of the beam in degrees, as in `Lidar`.
     - `azimuth`: in degrees clockwise from north, the horizontal direction in which the light travels down, as
       in `Lidar`.
+
+    **Example:**
+
+    >>> import numpy as np
+    >>> from jaxlidar.io import NeonShot
+    >>> way = np.array([[0.0, 0.0, 20.15], [0.0, 0.0, 20.0], [0.0, 0.0, 19.85]])
+    >>> received = {"waveform": np.array([10.0, 90.0, 12.0]), "recorded": np.full(3, True), "position": way}
+    >>> pulse = {"pulse_time": np.array([-1.0, 0.0, 1.0]), "pulse_power": np.array([0.0, 80.0, 0.0])}
+    >>> shot = NeonShot(index=1, noise_mean=10.0, noise_std=1.0, zenith=0.0, azimuth=0.0, **received, **pulse)
+    >>> print(shot.signal, shot.time_from(20.0).round(2))
+    [ 0. 80.  2.] [-1.  0.  1.]
     """
 
     index: int
@@ -80,13 +90,13 @@ class NeonShot:
 
     @property
     def elevation(self) -> Float[np.ndarray, " samples"]:
-        """Of the samples in m, decreasing."""
+        """Elevation of the samples in m, decreasing."""
         return self.position[:, 2]
 
     def time_from(self, elevation: float) -> Float[np.ndarray, " samples"]:
         """Times of the samples in ns, for a simulation whose reference plane z = 0 lies at `elevation` (m).
 
-        Zero is the two-way travel to where the beam axis meets that plane; times before are negative.
+        Zero is the two-way travel time to where the beam axis meets that plane; earlier times are negative.
         """
         first, last = self.elevation[0], self.elevation[-1]
         return np.arange(self.waveform.size) - (self.waveform.size - 1) * (elevation - first) / (last - first)
@@ -98,10 +108,20 @@ class NeonShot:
 
 
 class NeonImpulse(NamedTuple):
-    """What the instrument makes of a pulse: the echo of a hard target at nadir. Counts, pedestal removed.
+    """The system impulse: a hard target's echo at nadir, and its outgoing pulse, in counts above the
+    pedestal.
 
     - `time`, `power`: (samples,) of the echo, ns from its largest sample.
     - `pulse_time`, `pulse_power`: (pulse samples,) of the outgoing pulse, ns from its largest sample.
+
+    **Example:**
+
+    >>> import numpy as np
+    >>> from jaxlidar.io import NeonImpulse
+    >>> ns = np.array([-1.0, 0.0, 1.0])
+    >>> impulse = NeonImpulse(ns, np.array([30.0, 60.0, 30.0]), ns, np.array([20.0, 80.0, 20.0]))
+    >>> print(f"{impulse.power.sum() / impulse.pulse_power.sum():.1f}")
+    1.0
     """
 
     time: Float[np.ndarray, " samples"]
@@ -111,7 +131,21 @@ class NeonImpulse(NamedTuple):
 
 
 class NeonRead(NamedTuple):
-    """Shots from a file and its system impulse; `dropped` counts the shots left out, by reason."""
+    """What `read_neon` returns: the shots of a file and its system impulse.
+
+    - `shots`: list of `NeonShot`, in the order of the file.
+    - `impulse`: the `NeonImpulse`.
+    - `dropped`: how many shots of the file were left out, by reason.
+
+    **Example:**
+
+    >>> import numpy as np
+    >>> from jaxlidar.io import NeonImpulse, NeonRead
+    >>> impulse = NeonImpulse(*np.array([[-1.0, 0.0], [30.0, 60.0], [-1.0, 0.0], [20.0, 80.0]]))
+    >>> read = NeonRead([], impulse, {"without a return": 2, "without a pulse": 0})
+    >>> sum(read.dropped.values())
+    2
+    """
 
     shots: list[NeonShot]
     impulse: NeonImpulse
@@ -119,21 +153,36 @@ class NeonRead(NamedTuple):
 
 
 def read_neon(path: str | os.PathLike[str]) -> NeonRead:
-    """Read full-waveform returns of NEON's airborne lidar.
+    """The full-waveform returns of NEON's airborne lidar in a file.
+
+    **Arguments:**
 
     - `path`: an .npz file with `ret` (shots, samples), `outgoing` (shots, pulse samples), `system_impulse`
-      and `impulse_outgoing` (one-dimensional), in counts, rows filled up with zeros; and `geo`
-      (shots, columns), the geolocation, with the columns' names in `geo_cols`.
+      and `impulse_outgoing` (one-dimensional), in counts, rows filled up with zeros; and `geo` (shots,
+      columns), the geolocation, with the names of its columns in `geo_cols`.
 
-    **Returns:** the shots in the order of the file, the system impulse, and what was dropped, by reason:
-    shots that have fewer than 8 samples ("without a return") and those with fewer of the outgoing pulse
-    ("without a pulse").
+    **Returns:** a `NeonRead`: the shots in the order of the file, the system impulse, and what was dropped,
+    by reason: shots that have fewer than 8 samples ("without a return") and those with fewer of the outgoing
+    pulse ("without a pulse").
 
-    **Raises:** FileNotFoundError; ValueError, naming the file and the key, for a file that is no .npz or is
-    damaged, arrays that are missing, of the wrong shape or no numbers, samples that are negative or not
-    finite, and shots whose geolocation makes no sense.
+    **Raises:** FileNotFoundError where there is no such file. ValueError, naming the file and the key, for a
+    file that is no .npz or is damaged, arrays that are missing, of the wrong shape or not numbers, samples
+    that are negative or not finite, and shots whose geolocation makes no sense.
 
     **Source:** Zhou et al. (2017), ISPRS J. Photogramm. 129, 131.
+
+    **Example:**
+
+    >>> import numpy as np, pathlib, tempfile
+    >>> import jaxlidar.io
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "shots.npz"
+    >>> echo = np.array([10.0] * 8 + [50.0, 90.0, 50.0, 10.0])
+    >>> waveforms = {"ret": [echo], "outgoing": [echo], "system_impulse": echo, "impulse_outgoing": echo}
+    >>> geo = {"index": 1, "dx": 0, "dy": 0, "dz": -0.15, "V9": 500, "V10": 700, "V11": 30, "V15": 9}
+    >>> np.savez(path, **waveforms, geo=[[*geo.values(), 0]], geo_cols=[*geo, "V16"])
+    >>> (shot,), impulse, dropped = jaxlidar.io.read_neon(path)
+    >>> print(f"{shot.signal.max():.1f} counts at {shot.elevation[np.argmax(shot.signal)]:.2f} m")
+    80.0 counts at 28.65 m
     """
     path = Path(path)
     data = _arrays(path)
@@ -230,7 +279,7 @@ def _counts(path: Path, data: dict[str, np.ndarray], key: str, ndim: int) -> np.
 
 
 def _columns(path: Path, data: dict[str, np.ndarray], shots: int) -> tuple[dict[str, np.ndarray], str]:
-    """The geolocation by column, and how messages name it."""
+    """The columns of the geolocation, and the place that messages about them name."""
     geo, names = _numbers(path, data, "geo", 2), _array(path, data, "geo_cols", 1).tolist()
     if geo.shape != (shots, len(names)):
         raise ValueError(f"{path}: geo: shape {geo.shape}, but ret and geo_cols have {(shots, len(names))}")

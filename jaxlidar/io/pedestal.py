@@ -1,13 +1,13 @@
-"""What the readers of recorded waveforms share."""
+"""Removal of the pedestal, which the readers of recorded waveforms share."""
 
 import numpy as np
 from jaxtyping import Float
 
 
 def above_pedestal(samples: Float[np.ndarray, " samples"], pedestal: float) -> Float[np.ndarray, " samples"]:
-    """The pulse above its pedestal, from where it leaves zero to where it first returns.
+    """The pulse above its pedestal, from where it leaves zero to where it first returns to zero.
 
-    Beyond, noise cut off at zero would add energy that was never sent.
+    Outside, noise cut off at zero would add energy that was never sent.
     """
     power = samples - pedestal
     peak = int(np.argmax(power))

@@ -1,4 +1,4 @@
-"""Quantitative structure models: trees as tables of cylinders."""
+"""Reader of quantitative structure models: trees as tables of cylinders."""
 
 import os
 
@@ -18,7 +18,7 @@ _COLUMNS = {
 
 
 def read_qsm(path: str | os.PathLike[str], *, scale: float = 1.0) -> TreeRead:
-    """Read a table of cylinders, as SimpleForest or aRchi write it.
+    r"""The tree of a quantitative structure model: a table of cylinders, as SimpleForest or aRchi write it.
 
     **Arguments:**
 
@@ -26,12 +26,23 @@ def read_qsm(path: str | os.PathLike[str], *, scale: float = 1.0) -> TreeRead:
       ID, parentID, startX .. endZ and radius, in any order and case; branchOrder where there is one.
     - `scale`: metres per unit of length in the file. Default 1.
 
-    **Returns:** the `Tree`, leaf-off, each cylinder a segment of constant radius, and what was dropped, by
-    reason: cylinders "without a length". Children of those grow from their parents.
+    **Returns:** a `TreeRead`: the `Tree`, leaf-off, each cylinder a segment of constant radius, and what was
+    dropped, by reason: cylinders "without a length". Children of those grow from their parents.
 
-    **Raises:** FileNotFoundError; ValueError, naming the file and the line, for columns that are missing,
-    rows of the wrong length, what is no number, radii that are not positive, IDs given twice, parents that
-    are not there, and cylinders that are their own ancestors.
+    **Raises:** FileNotFoundError where there is no such file. ValueError, naming the file and the line, for
+    columns that are missing, rows of the wrong length, cells that are not numbers, radii that are not
+    positive, IDs given twice, parents that are not there, and cylinders that are their own ancestors.
+
+    **Example:**
+
+    >>> import pathlib, tempfile
+    >>> import jaxlidar.io
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "tree.csv"
+    >>> names = "ID,parentID,startX,startY,startZ,endX,endY,endZ,radius"
+    >>> _ = path.write_text(f"{names}\n1,-1,0,0,0,0,0,2,0.1\n2,1,0,0,2,1,0,3,0.05\n")
+    >>> tree, dropped = jaxlidar.io.read_qsm(path)
+    >>> print(f"{tree.height:.1f} m, {tree.trunk_diameter:.1f} m", dropped)
+    3.0 m, 0.2 m {'without a length': 0}
     """
     path, lines = lines_of(path)
     if not lines:
@@ -87,7 +98,7 @@ def read_qsm(path: str | os.PathLike[str], *, scale: float = 1.0) -> TreeRead:
 
 
 def _parents_first(path, rows: list[dict], skipped: dict[int, int], line_of: dict[int, int]) -> list[dict]:
-    """The rows, parents before their children. A negative parent is none."""
+    """The rows, parents before their children. A negative parent means none."""
     children: dict[int, list[dict]] = {}
     for row in rows:
         parent = int(row["parent"])

@@ -1,4 +1,4 @@
-"""What the readers of text files share: numbers with their place, and a record of what was left out."""
+"""What the readers of text files share: numbers with their place, and records of what was left out."""
 
 import csv
 import os
@@ -10,14 +10,40 @@ from jaxlidar.scenes.voxels import VoxelMap
 
 
 class VoxelsRead(NamedTuple):
-    """A voxel map from a file; `dropped` counts what the file holds and the map does not, by reason."""
+    """What `read_vox` returns: a voxel map and what was left out of it.
+
+    - `voxels`: a `VoxelMap`.
+    - `dropped`: how many voxels of the file do not have their density in the map, by reason.
+
+    **Example:**
+
+    >>> import numpy as np
+    >>> import jaxlidar as jl
+    >>> from jaxlidar.io import VoxelsRead
+    >>> leaves = jl.VoxelMap.from_lad(np.ones((1, 1, 2)), voxel_size=1.0)
+    >>> voxels, dropped = VoxelsRead(leaves, {"not sampled": 0})
+    >>> print(voxels.shape, dropped)
+    (1, 1, 2) {'not sampled': 0}
+    """
 
     voxels: VoxelMap
     dropped: dict[str, int]
 
 
 class TreeRead(NamedTuple):
-    """A tree from a file; `dropped` counts what the file holds and the tree does not, by reason."""
+    """What `read_qsm` returns: a tree and what was left out of it.
+
+    - `tree`: a `Tree`.
+    - `dropped`: how many cylinders of the file are not in the tree, by reason.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> from jaxlidar.io import TreeRead
+    >>> tree, dropped = TreeRead(jl.grow(jl.shrub()), {"without a length": 0})
+    >>> print(tree.height > 0, dropped)
+    True {'without a length': 0}
+    """
 
     tree: Tree
     dropped: dict[str, int]
@@ -43,7 +69,7 @@ def number_in(path: Path, line: int, column: str, text: str) -> float:
 
 
 def cells_of(path: Path, line: int, text: str, columns: int, delimiter: str) -> list[str]:
-    """The cells of a line, of which there must be `columns`."""
+    """The cells of a line. There must be `columns` cells."""
     if delimiter == " ":
         cells = text.split()
     else:

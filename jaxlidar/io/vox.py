@@ -1,4 +1,4 @@
-"""Voxel maps of AMAPVox (.vox text files)."""
+"""Reader of voxel maps of AMAPVox (.vox text files)."""
 
 import os
 import re
@@ -16,26 +16,39 @@ _DENSITY = ("PadBVTotal", "attenuation_FPL_unbiasedMLE")
 def read_vox(
     path: str | os.PathLike[str], *, density: str | None = None, fill: float = 0.0, name: str = "leaf"
 ) -> VoxelsRead:
-    """Read plant area density from an AMAPVox file.
+    r"""The voxel map of plant area density in an AMAPVox file.
 
     **Arguments:**
 
     - `path`: a text file that begins with "VOXEL SPACE".
-    - `density`: the column of plant area density, m2/m3. Default "PadBVTotal"; a column whose name begins
-      with "attenuation" holds extinction coefficients, 1/m, and is doubled.
+    - `density`: the column of plant area density, m2/m3; a column whose name begins with "attenuation" holds
+      extinction coefficients, 1/m, which are doubled. Default None: "PadBVTotal", or, where it is missing,
+      "attenuation_FPL_unbiasedMLE".
     - `fill`: density of voxels that no beam sampled, m2/m3. Default 0.
-    - `name`: what the plant area is taken for, "leaf" (default) or "bark".
+    - `name`: what the plant area is taken for, "leaf" or "bark". Default "leaf".
 
-    **Returns:** the `VoxelMap` and what was dropped, by reason: voxels that no beam sampled ("not sampled")
-    or whose density is not a number ("without a density"), which have the density `fill`, and voxels below
-    the ground ("below the ground") that hold a density, which is left out. Leaf angles are those that the
-    file names (`lad_type`).
+    **Returns:** a `VoxelsRead`: the `VoxelMap` and what was dropped, by reason: voxels that no beam sampled
+    ("not sampled") or whose density is not a number ("without a density"), which have the density `fill`, and
+    voxels below the ground ("below the ground") that hold a density, which is left out. Leaf angles are those
+    that the file names (`lad_type`).
 
-    **Raises:** FileNotFoundError; ValueError, naming the file and the line, for what is damaged: a first
-    line or a header that is missing or makes no sense, rows of the wrong length or number, indices outside
-    the grid or given twice, negative densities.
+    **Raises:** FileNotFoundError where there is no such file. ValueError, naming the file and the line, for
+    what is damaged: a first line or a header that is missing or makes no sense, rows of the wrong length or
+    number, indices outside the grid or given twice, negative densities.
 
     **Source:** Vincent et al. (2017), Remote Sens. Environ. 190, 273; AMAPVox's output format.
+
+    **Example:**
+
+    >>> import pathlib, tempfile
+    >>> import jaxlidar.io
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "plot.vox"
+    >>> lines = ["VOXEL SPACE", "#min_corner:(0,0,0)", "#max_corner:(1,1,2)", "#split:(1,1,2)"]
+    >>> lines += ["i j k PadBVTotal", "0 0 0 NaN", "0 0 1 1.5"]
+    >>> _ = path.write_text("\n".join(lines))
+    >>> voxels, dropped = jaxlidar.io.read_vox(path)
+    >>> print(voxels.leaf, dropped["without a density"])
+    [[[0.   0.75]]] 1
     """
     path, lines = lines_of(path)
     if not lines or lines[0].strip() != _FIRST_LINE:

@@ -1,1 +1,1 @@
-"""Optics: what leaves, bark and surfaces do to light, and the laws by which they scatter it."""
+"""Optics: reflectance and transmittance of leaves, bark and surfaces, and the laws by which they scatter."""

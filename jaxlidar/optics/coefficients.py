@@ -1,4 +1,4 @@
-"""Tables of refractive index and specific absorption: those shipped, and a reader for the authors' file."""
+"""Tables of leaf refractive index and specific absorption: shipped ones, and a reader for PROSPECT-PRO's."""
 
 import functools
 import hashlib
@@ -32,14 +32,17 @@ _HEADER = {
 
 
 class Coefficients:
-    """A table of leaf material: constants, equal where their numbers are equal, hence usable as static.
+    """A table of leaf refractive index and specific absorption coefficients against wavelength.
 
-    - `wavelength`: (wavelengths,) nm, increasing;
-    - `index`: (wavelengths,) refractive index;
-    - `absorption`: (traits, wavelengths) specific absorption coefficients, per unit of the trait;
-    - `traits`: their names.
+    Tables of equal numbers are equal and have the same hash, so that a table can be a static field. All
+    arrays are read-only NumPy arrays of float64.
 
-    All are read-only NumPy arrays of float64.
+    **Arguments:**
+
+    - `wavelength`: (wavelengths,) nm, increasing.
+    - `index`: (wavelengths,) refractive index.
+    - `absorption`: (traits, wavelengths) specific absorption coefficients, per unit of the trait.
+    - `traits`: names of the traits.
     """
 
     def __init__(
@@ -68,7 +71,14 @@ class Coefficients:
 
 @functools.cache
 def shipped(version: str) -> Coefficients:
-    """The table of version "4", "5", "D" or "PC", read on first use."""
+    """The shipped table of a PROSPECT version, read on first use.
+
+    **Arguments:**
+
+    - `version`: "4", "5", "D" or "PC".
+
+    **Returns:** a `Coefficients`.
+    """
     path = importlib.resources.files("jaxlidar") / "data" / "prospect_coefficients.npz"
     with path.open("rb") as file, np.load(file) as archive:
         wavelength, D = archive["wavelength"], archive["D"]
@@ -84,21 +94,33 @@ def shipped(version: str) -> Coefficients:
 
 
 def load_coefficients(path: str | os.PathLike[str]) -> Coefficients:
-    """Read the coefficients of PROSPECT-PRO from its authors' file `dataSpec_PRO.txt`.
+    r"""The coefficients of PROSPECT-PRO, read from its authors' file `dataSpec_PRO.txt`.
 
-    The file (of the R package jbferet/prospect, MIT) is a table of white-space separated columns under a
-    header that names them: lambda (nm), nrefrac, SAC_CHL, SAC_CAR, SAC_ANT (cm2/ug), SAC_BROWN, SAC_EWT
-    (1/cm), SAC_PROT and SAC_CBC (cm2/g), in any order; further columns are passed over.
+    The file (of the R package jbferet/prospect, MIT licence) is a table of columns separated by white space,
+    under a header that names them: lambda (nm), nrefrac, SAC_CHL, SAC_CAR, SAC_ANT (cm2/ug), SAC_BROWN,
+    SAC_EWT (1/cm), SAC_PROT and SAC_CBC (cm2/g), in any order. Further columns are ignored.
 
-    **Arguments:** `path`: where the file lies.
+    **Arguments:**
 
-    **Returns:** a table for `Prospect(version="PRO", coefficients=...)`.
+    - `path`: path of the file.
 
-    **Raises:** `OSError` where the file cannot be opened; `ValueError` naming file and line where it is
-    damaged: columns missing, a row too short or too long, something that is no finite number, a negative
-    coefficient, a refractive index below 1, wavelengths that do not increase, fewer than two rows.
+    **Returns:** a table of coefficients for `Prospect(version="PRO", coefficients=...)`.
+
+    **Raises:** OSError where the file cannot be opened. ValueError, naming the file and the line, where
+    columns are missing, a row is too short or too long, a value is not a finite number, a coefficient is
+    negative, a refractive index is below 1, wavelengths do not increase, or there are fewer than two rows.
 
     **Source:** Feret et al. (2021), Remote Sens. Environ. 252, 112173.
+
+    **Example:** a file of two wavelengths.
+
+    >>> import jaxlidar as jl
+    >>> import pathlib, tempfile
+    >>> header = "lambda nrefrac SAC_CHL SAC_CAR SAC_ANT SAC_BROWN SAC_EWT SAC_PROT SAC_CBC"
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "dataSpec_PRO.txt"
+    >>> _ = path.write_text(f"{header}\n1064 1.42 0 0 0 0.01 0.1 4 2\n1065 1.42 0 0 0 0.01 0.1 4 2\n")
+    >>> jl.load_coefficients(path)
+    Coefficients(1064..1065 nm: Cab, Car, Cant, Cbrown, Cw, Cp, Cc)
     """
     name = os.fspath(path)
     with open(path, encoding="utf-8", errors="replace") as file:

@@ -1,9 +1,9 @@
-r"""Facets: flat Lambertian pieces of leaf or bark, turned every way, that light in a voxel meets.
+"""Facets: flat Lambertian pieces of leaf or bark that light meets in a voxel.
 
-With spherical orientation they scatter by Ross's phase function (Ross 1981, eq. II.3.8; Shultis and Myneni
-1988). Its reflected part, per unit projected area, is the *view factor* 2/(3 pi) (sin b - b cos b), b the
-angle between incident and view direction: apparent reflectance per unit reflectance, pi times the density per
-steradian.
+Spherically oriented facets scatter by Ross's phase function (Ross 1981, eq. II.3.8; Shultis and Myneni 1988).
+Its reflected part, per unit projected area, is the *view factor* 2/(3 pi) (sin b - b cos b), with b the angle
+between incident and view direction. A view factor is an apparent reflectance per unit reflectance: pi times
+the density per steradian.
 """
 
 import jax.numpy as jnp
@@ -17,14 +17,28 @@ FACET_BACKSCATTER = 2.0 / 3.0
 
 
 def facet_reflection(cos_angle: Scalar) -> Scalar:
-    """View factor of reflection by spherically oriented facets; `cos_angle` = incident . view."""
+    """View factor of reflection by spherically oriented facets.
+
+    **Arguments:**
+
+    - `cos_angle`: cosine of the angle between incident and view direction, any shape.
+
+    **Returns:** an array shaped as `cos_angle`.
+    """
     c = jnp.clip(cos_angle, -1.0, 1.0)
     b = _arccos(c)
     return 2.0 / (3.0 * np.pi) * (jnp.sqrt(_one_minus_square(c)) - b * c)
 
 
 def facet_transmission(cos_angle: Scalar) -> Scalar:
-    """View factor of diffuse transmission by spherically oriented facets."""
+    """View factor of diffuse transmission by spherically oriented facets.
+
+    **Arguments:**
+
+    - `cos_angle`: cosine of the angle between incident and view direction, any shape.
+
+    **Returns:** an array shaped as `cos_angle`.
+    """
     return facet_reflection(-cos_angle)
 
 
@@ -38,5 +52,15 @@ def _arccos(c: Scalar) -> Scalar:
 
 
 def facet_normal(incident: Vec, u: Scalar, v: Scalar) -> Vec:
-    """Normal of a spherically oriented facet that was hit: density |n . incident| / pi, on the lit side."""
+    """Normal of the spherically oriented facet that light hits, drawn at random.
+
+    Its density is |n . incident| / pi, on the lit side.
+
+    **Arguments:**
+
+    - `incident`: unit vector of travel.
+    - `u`, `v`: numbers that are uniform in (0, 1).
+
+    **Returns:** a unit vector.
+    """
     return about(scale(incident, jnp.asarray(-1.0)), u, v)

@@ -1,17 +1,17 @@
-r"""Laws of reflection: how a surface distributes the light that it reflects.
+"""Laws of reflection: how a surface distributes the light that it reflects over directions.
 
-Everything is normalised by reflectance, which the tracer never sees. The *view factor* of a law is its
-apparent reflectance per unit reflectance, pi times the energy per steradian that it sends towards the
-receiver:
+Everything is normalised by reflectance, which the tracer does not need. The *view factor* of a law is its
+apparent reflectance per unit reflectance: pi times the energy per steradian that it sends towards the
+receiver.
 
     Lambertian      cos(theta)
-    equal-angle     1 / (pi sqrt(sin^2(theta) + alpha^2 / 4)),  alpha the aperture's half-angle
+    equal-angle     1 / (pi sqrt(sin^2(theta) + alpha^2 / 4)),  alpha the half-angle of the aperture
 
-The equal-angle law (the paper's "every angle equally likely") has the density 1/(pi^2 sin theta), singular at
-the normal; the form above is its average over the aperture, exact at the normal.
+The equal-angle law (the paper's "every angle equally likely") has the density 1/(pi^2 sin theta), which is
+singular at the normal. The form above is its average over the aperture, exact at the normal.
 
 A law of your own is one class in one file: derive it from `AbstractLaw`, give its five methods, and pass it
-as `law=`. `jaxlidar/README.md` shows Minnaert's.
+as `law=`. `examples/minnaert.py` shows Minnaert's law.
 """
 
 import abc
@@ -27,50 +27,114 @@ from jaxlidar._vectors import Scalar, Vec, about, cross, dot, from_frame, polar,
 
 
 class AbstractLaw(eqx.Module):
-    """How a surface distributes what it reflects: the five methods that trace and plan need.
+    """A law of reflection: how a surface distributes the light that it reflects over directions.
 
-    Directions are unit vectors, (x, y, z) tuples of arrays of one shape; `incident` is the direction in which
-    the light travels, `normal` that of the side it falls on, `out` and `view` lead away from the surface.
-    Methods are pure, written with `jax.numpy` (see `jaxlidar.extend`), and differentiable in directions and
-    fields.
+    A law of your own is one class in one file: derive it from this, give its five methods, and pass it as
+    `law=` of a `Ground` or a `Plate`. `examples/minnaert.py` shows Minnaert's law.
+
+    Directions are unit vectors, given as (x, y, z) tuples of arrays of one shape. `incident` is the direction
+    in which the light travels, `normal` is the normal on the lit side, `out` and `view` lead away from the
+    surface. Methods are pure, written with `jax.numpy` (see `jaxlidar.extend`), and differentiable in
+    directions and fields.
 
     A law is consistent if, for an aperture that shrinks to nothing,
 
         view_factor = pi * albedo * density,
 
-    and light that `sample` draws has that density. It is reciprocal if view_factor / |cosine of out| is the
-    same with incident and out exchanged.
+    and light that `sample` draws has that density. It is reciprocal if view_factor / |cosine of out| stays
+    the same when incident and out are exchanged.
+
+    **Example:** straight back from a horizontal surface.
+
+    >>> import jaxlidar as jl
+    >>> import jax.numpy as jnp
+    >>> from jaxlidar.extend import vec
+    >>> down, up = vec(jnp.array([0.0, 0.0, -1.0])), vec(jnp.array([0.0, 0.0, 1.0]))
+    >>> view_factor = jl.Lambertian().view_factor(down, up, up, jnp.array(1e-4))
+    >>> print(f"{view_factor:.1f}, density {jl.Lambertian().density(down, up, up):.4f} per sr")
+    1.0, density 0.3183 per sr
     """
 
     @abc.abstractmethod
     def view_factor(self, incident: Vec, normal: Vec, view: Vec, half_angle: Scalar) -> Scalar:
         """Apparent reflectance per unit reflectance towards `view`, averaged over the receiver's aperture.
 
-        `half_angle`: of the aperture as seen from the surface, rad; laws without a singularity pass it over.
+        **Arguments:**
+
+        - `incident`, `normal`, `view`: unit vectors, as above.
+        - `half_angle`: half-angle of the aperture as seen from the surface, rad. Laws without a singularity
+          ignore it.
+
+        **Returns:** an array shaped as the components of `incident`.
         """
 
     @abc.abstractmethod
     def albedo(self, incident: Vec, normal: Vec) -> Scalar:
-        """Share of the light that is reflected at all, per unit reflectance, in [0, 1]; most laws: one."""
+        """Directional-hemispherical reflectance per unit reflectance, in [0, 1]; one for most laws.
+
+        This is the share of the light that is reflected at all.
+
+        **Arguments:**
+
+        - `incident`, `normal`: unit vectors, as above.
+
+        **Returns:** an array shaped as the components of `incident`.
+        """
 
     @abc.abstractmethod
     def sample(self, incident: Vec, normal: Vec, u: Scalar, v: Scalar) -> Vec:
-        """A direction drawn with two numbers that are uniform in (0, 1)."""
+        """A direction of reflection, drawn at random.
+
+        **Arguments:**
+
+        - `incident`, `normal`: unit vectors, as above.
+        - `u`, `v`: numbers that are uniform in (0, 1).
+
+        **Returns:** a unit vector that leads away from the surface.
+        """
 
     @abc.abstractmethod
     def density(self, incident: Vec, normal: Vec, out: Vec) -> Scalar:
-        """Probability per steradian with which `sample` draws `out`; zero below the surface."""
+        """Probability per steradian with which `sample` draws `out`; zero below the surface.
+
+        **Arguments:**
+
+        - `incident`, `normal`, `out`: unit vectors, as above.
+
+        **Returns:** an array shaped as the components of `incident`.
+        """
 
     @abc.abstractmethod
     def largest_view_factor(self, half_angle: float) -> float:
-        """A bound on the view factor over all directions, for the plan; infinite if there is none."""
+        """An upper bound on the view factor over all directions, for the plan.
+
+        **Arguments:**
+
+        - `half_angle`: half-angle of the aperture as seen from the reference plane, rad.
+
+        **Returns:** a number; infinite where there is no bound.
+        """
 
 
 class AbstractMirror(AbstractLaw):
-    """A law whose lobe about the mirror direction may be narrower than the rays of a footprint are apart.
+    """A law of reflection with a lobe about the mirror direction that may be very narrow.
 
-    Its first return is integrated over beam, lobe and aperture (`jaxlidar.trace.mirror`), in place of
-    `view_factor`.
+    The lobe may be narrower than the angle between neighbouring rays of a footprint. The first return is
+    therefore not computed from `view_factor`: it is integrated over beam, lobe and aperture, with a Gaussian
+    lobe of the standard deviation `roughness` (`jaxlidar.trace.mirror`).
+
+    A mirror of your own is one class in one file: derive it from this, and give the five methods of
+    `AbstractLaw` and the field
+
+    - `roughness`: standard deviation of the reflected direction about the mirror direction along each of two
+      perpendicular axes, rad.
+
+    **Example:** the view factor of a perfect mirror has no bound.
+
+    >>> import jaxlidar as jl
+    >>> mirror = jl.Specular(roughness=0.0)
+    >>> isinstance(mirror, jl.AbstractMirror), mirror.largest_view_factor(1e-4)
+    (True, inf)
     """
 
     roughness: eqx.AbstractVar[Float[Array, ""]]
@@ -78,7 +142,18 @@ class AbstractMirror(AbstractLaw):
 
 @final
 class Lambertian(AbstractLaw):
-    """Equal radiance into every direction of the lit side: intensity by the cosine law."""
+    """Lambertian reflection: equal radiance in all directions of the lit side (intensity by the cosine law).
+
+    **Example:** the apparent reflectance of ground, per unit reflectance, seen at 60 degrees from its normal.
+
+    >>> import jaxlidar as jl
+    >>> import jax.numpy as jnp
+    >>> from jaxlidar.extend import polar
+    >>> up, view = (polar(jnp.cos(jnp.deg2rad(a)), jnp.array(0.0)) for a in (0.0, 60.0))
+    >>> down = tuple(-x for x in up)
+    >>> print(f"{jl.Lambertian().view_factor(down, up, view, jnp.array(1e-4)):.3f}")
+    0.500
+    """
 
     def view_factor(self, incident: Vec, normal: Vec, view: Vec, half_angle: Scalar) -> Scalar:
         return jnp.maximum(dot(normal, view), 0.0)
@@ -98,7 +173,21 @@ class Lambertian(AbstractLaw):
 
 @final
 class EqualAngle(AbstractLaw):
-    """Polar angle from the normal uniform in [0, 90] degrees: the paper's "every angle equally likely"."""
+    """Reflection with a polar angle uniform in [0, 90] degrees: the paper's "every angle equally likely".
+
+    The angle is measured from the surface normal. The density 1/(pi^2 sin theta) is singular there; the view
+    factor is its average over the receiver's aperture.
+
+    **Example:** the apparent reflectance of ground, per unit reflectance, seen at 60 degrees from its normal.
+
+    >>> import jaxlidar as jl
+    >>> import jax.numpy as jnp
+    >>> from jaxlidar.extend import polar
+    >>> up, view = (polar(jnp.cos(jnp.deg2rad(a)), jnp.array(0.0)) for a in (0.0, 60.0))
+    >>> down = tuple(-x for x in up)
+    >>> print(f"{jl.EqualAngle().view_factor(down, up, view, jnp.array(1e-4)):.3f}")
+    0.368
+    """
 
     def view_factor(self, incident: Vec, normal: Vec, view: Vec, half_angle: Scalar) -> Scalar:
         sine = jnp.sqrt(_square_of_sine(normal, view) + half_angle**2 / 4)
@@ -120,26 +209,35 @@ class EqualAngle(AbstractLaw):
 
 
 def _square_of_sine(normal: Vec, out: Vec) -> Scalar:
-    """Of the angle between two unit vectors: |n x v|^2, without cancellation near the normal."""
+    """Squared sine of the angle between two unit vectors: |n x v|^2, without cancellation near the normal."""
     across = cross(normal, out)
     return dot(across, across)
 
 
 @final
 class Specular(AbstractMirror):
-    """A mirror whose facets are tilted a little: a Gaussian lobe about the mirror direction.
+    """Specular reflection: a mirror of slightly tilted facets, with a Gaussian lobe about its direction.
+
+    The first return is exact for any roughness (see `jaxlidar.trace.mirror`). Paths of two or more
+    scatterings that end at the mirror reach the receiver only within its lobe. They are unbiased, but so rare
+    below a roughness of about 0.01 rad that few photons show one. The derivative of such paths with respect
+    to the mirror's slope leaves out the rotation of the lobe.
 
     **Arguments:**
 
-    - `roughness`: standard deviation of the reflected direction about the mirror direction along
-      each of two perpendicular axes, rad, in [0, 0.5]; 0 (default) is a perfect mirror.
-
-    The first return is exact for any roughness (see `jaxlidar.trace.mirror`). Paths of two or more
-    scatterings whose last one is the mirror reach the receiver only within its lobe: they are
-    unbiased, but so rare below a roughness of about 0.01 rad that few photons will show one. The
-    derivative of such paths with respect to the mirror's slope leaves out the turning of the lobe.
+    - `roughness`: standard deviation of the reflected direction about the mirror direction along each of two
+      perpendicular axes, rad, in [0, 0.5]; 0 is a perfect mirror. Default 0.
 
     **Raises:** ValueError for a roughness outside its range.
+
+    **Example:** straight back, a lobe of 0.1 rad is 1 / (2 * 0.1^2) times as bright as a Lambertian surface.
+
+    >>> import jaxlidar as jl
+    >>> import jax.numpy as jnp
+    >>> from jaxlidar.extend import vec
+    >>> down, up = vec(jnp.array([0.0, 0.0, -1.0])), vec(jnp.array([0.0, 0.0, 1.0]))
+    >>> print(f"{jl.Specular(roughness=0.1).view_factor(down, up, up, jnp.array(1e-4)):.1f}")
+    50.0
     """
 
     roughness: Float[Array, ""] = eqx.field(converter=as_scalar, default=0.0)

@@ -1,4 +1,4 @@
-"""Leaves (or other scatterers) whose reflectance and transmittance are known, in the form of a leaf model."""
+"""Leaves (or other scatterers) of known reflectance and transmittance, in the form of a leaf model."""
 
 from collections.abc import Sequence
 from typing import final
@@ -16,15 +16,24 @@ _TOLERANCE = 1e-6
 
 @final
 class LeafOptics(eqx.Module):
-    """Given reflectance and transmittance: `R, T = optics(wavelengths)`, as with `Prospect`.
+    """Leaf optics from given reflectance and transmittance: `R, T = optics(wavelengths)`, as with `Prospect`.
 
     **Arguments:**
 
-    - `reflectance`: hemispherical reflectance, a number or one per wavelength, in [0, 1];
-    - `transmittance`: hemispherical transmittance, likewise; default 0. The sum is at most 1.
+    - `reflectance`: hemispherical reflectance, one number or one per wavelength, in [0, 1].
+    - `transmittance`: hemispherical transmittance, one number or one per wavelength, in [0, 1]. The sum with
+      the reflectance is at most 1. Default 0.
 
-    **Raises:** `ValueError` naming the field, its value and the admissible range. Inside a transformation
-    values cannot be checked.
+    **Raises:** ValueError, naming the field, its value and the admissible range, for values outside their
+    range, for a sum above 1, for more than one dimension, and for different numbers of values. Inside a JAX
+    transformation values cannot be checked.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> R, T = jl.LeafOptics(reflectance=[0.1, 0.45], transmittance=[0.05, 0.4])([532.0, 1064.0])
+    >>> print([f"{x:.2f}" for x in R], [f"{x:.2f}" for x in T])
+    ['0.10', '0.45'] ['0.05', '0.40']
     """
 
     reflectance: Float[Array, "*wavelengths"] = eqx.field(converter=as_array)
@@ -50,9 +59,14 @@ class LeafOptics(eqx.Module):
     ) -> tuple[Float[Array, "*wavelengths"], Float[Array, "*wavelengths"]]:
         """Reflectance and transmittance, one per wavelength.
 
-        **Arguments:** `wavelengths`: nm, any shape where the optics are numbers, else as many as these.
+        **Arguments:**
 
-        **Raises:** `ValueError` where the lengths differ.
+        - `wavelengths`: nm, of any shape where the optics are single numbers, else as many as there are
+          values.
+
+        **Returns:** reflectance and transmittance, shaped as `wavelengths`.
+
+        **Raises:** ValueError where the numbers of values and wavelengths differ.
         """
         shape = np.shape(wavelengths)  # pyright: ignore[reportArgumentType]
         for name in ("reflectance", "transmittance"):

@@ -1,4 +1,4 @@
-"""Distributions of leaf inclination, and G of a canopy that has them."""
+"""Distributions of leaf inclination, and the projection function G of a canopy that has them."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -12,15 +12,26 @@ ANGLE_NODES = 129
 
 
 class LeafAngles(eqx.Module):
-    """Distribution of leaf inclination, uniform in azimuth, as probabilities of one-degree cells.
+    """A leaf angle distribution, uniform in azimuth, as probabilities of cells of one degree of inclination.
 
-    Made by `LeafAngles.named` or `LeafAngles.beta`; extinction of a canopy of leaf area density LAD is
-    G(direction) * LAD. The spherical distribution needs no table (G = 1/2): a `VoxelMap` holds None.
+    Usually made by `LeafAngles.named` or `LeafAngles.beta`. The extinction coefficient of a canopy of leaf
+    area density LAD is G(direction) * LAD. The spherical distribution needs no table (G = 1/2): there
+    `leaf_angles` of a `VoxelMap` is None.
 
     **Arguments:**
 
-    - `probability`: (90,) probability that the inclination lies within 0..1, 1..2, ... 89..90 degrees;
-      normalised here.
+    - `probability`: (90,) probability that the inclination lies within 0..1, 1..2, ... 89..90 degrees, not
+      negative; need not sum to one, for it is normalised where it is used.
+
+    **Raises:** ValueError for another shape, and for negative or non-finite values.
+
+    **Example:** G of a canopy of mostly horizontal leaves, seen from above.
+
+    >>> import jaxlidar as jl
+    >>> angles = jl.LeafAngles.named("planophile")
+    >>> G, _ = angles.tables()
+    >>> print(f"{G[-1]:.3f}")
+    0.849
     """
 
     probability: Float[Array, "90"] = eqx.field(converter=as_array)
@@ -35,7 +46,18 @@ class LeafAngles(eqx.Module):
 
     @staticmethod
     def named(name: str) -> "LeafAngles":
-        """de Wit's (1965) planophile, erectophile, plagiophile, extremophile, or uniform, or spherical."""
+        """A leaf angle distribution by its name.
+
+        **Arguments:**
+
+        - `name`: "planophile", "erectophile", "plagiophile", "extremophile", "uniform" or "spherical".
+
+        **Returns:** a `LeafAngles`.
+
+        **Raises:** ValueError for an unknown name.
+
+        **Source:** de Wit (1965).
+        """
         check_choice(
             "leaf_angles",
             name,
@@ -54,9 +76,19 @@ class LeafAngles(eqx.Module):
 
     @staticmethod
     def beta(mean: float | Array, std: float | Array) -> "LeafAngles":
-        """Beta distribution (Goel and Strebel 1984) of a mean and a standard deviation in degrees.
+        """A Beta distribution of leaf inclination, differentiable in its mean and standard deviation.
 
-        Differentiable in both. Raises ValueError where no Beta distribution has these moments.
+        **Arguments:**
+
+        - `mean`: mean inclination in degrees, in (0, 90).
+        - `std`: standard deviation of the inclination in degrees, in (0, 45).
+
+        **Returns:** a `LeafAngles`.
+
+        **Raises:** ValueError for values outside their ranges, and where no Beta distribution has these
+        moments.
+
+        **Source:** Goel and Strebel (1984).
         """
         check_range("mean", mean, 0.0, 90.0, low_open=True, high_open=True)
         check_range("std", std, 0.0, 45.0, low_open=True, high_open=True)
@@ -69,11 +101,17 @@ class LeafAngles(eqx.Module):
         return LeafAngles(density / jnp.sum(density))
 
     def normalised(self) -> Float[Array, "90"]:
-        """Probabilities that sum to one."""
+        """Probabilities of the cells, (90,), scaled to sum to one."""
         return self.probability / jnp.sum(self.probability)
 
     def tables(self) -> tuple[Float[Array, "129"], Float[Array, "129"]]:
-        """Mean of |direction . normal| (which is G) and of its square, on equal steps of |cos zenith|."""
+        """Projection function G and the mean squared cosine, by direction.
+
+        **Returns:** the means over leaf normals of |direction . normal| (this is G) and of its square, (129,)
+        each, at equal steps of |cos zenith| from 0 (horizontal) to 1 (vertical).
+
+        **Source:** Warren Wilson (1960).
+        """
         mu = np.linspace(0.0, 1.0, ANGLE_NODES)[:, None]
         theta = np.deg2rad(np.arange(ANGLE_CELLS) + 0.5)[None, :]
         c, s = mu * np.cos(theta), np.sqrt(1 - mu**2) * np.sin(theta)

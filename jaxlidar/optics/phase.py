@@ -1,7 +1,7 @@
-r"""Phase functions: how a volume scatters, in place of the facets of leaves or bark.
+"""Phase functions: how a volume scatters, in place of the facets of leaves or bark.
 
 The *view factor* of a phase function is pi times its density per steradian: apparent reflectance per unit
-single scattering albedo. With beta the angle by which light is turned,
+single scattering albedo. With beta the scattering angle,
 
     isotropic            1 / 4
     Henyey-Greenstein    (1 - g^2) / (4 (1 + g^2 - 2 g cos beta)^(3/2))
@@ -26,45 +26,93 @@ ISOTROPIC_VIEW_FACTOR = 0.25
 
 
 class AbstractPhase(eqx.Module):
-    """How a volume scatters: an albedo, and the three methods that trace and plan need.
+    """A phase function with its single scattering albedo: how a volume scatters light.
 
-    Directions are unit vectors of travel, (x, y, z) tuples of arrays of one shape. Methods are pure, written
-    with `jax.numpy` (see `jaxlidar.extend`), and differentiable in directions and fields. A phase function is
-    normalised: the integral of view_factor / pi over all directions is one.
+    A phase function of your own is one class in one file: derive it from this, give its three methods
+    (`view_factor`, `sample`, `largest_view_factor`) and the field below, and pass it as `leaf=` or `bark=` of
+    a `Canopy`.
 
     - `albedo`: single scattering albedo, one number or one per wavelength, in [0, 1].
 
-    All other fields are the same for all wavelengths: they decide where light goes, which is traced once.
+    All other fields are the same for all wavelengths: they decide the directions of light, which are traced
+    once for all wavelengths.
+
+    Directions are unit vectors of travel, given as (x, y, z) tuples of arrays of one shape. Methods are pure,
+    written with `jax.numpy` (see `jaxlidar.extend`), and differentiable in directions and fields. A phase
+    function is normalised: the integral of view_factor / pi over all directions is one.
+
+    **Example:** probability per steradian of isotropic scattering, 1 / (4 pi).
+
+    >>> import jaxlidar as jl
+    >>> import jax.numpy as jnp
+    >>> from jaxlidar.extend import vec
+    >>> down, up = vec(jnp.array([0.0, 0.0, -1.0])), vec(jnp.array([0.0, 0.0, 1.0]))
+    >>> print(f"{jl.Isotropic(albedo=0.9).density(down, up):.4f}")
+    0.0796
     """
 
     albedo: eqx.AbstractVar[Float[Array, "..."]]
 
     @abc.abstractmethod
     def view_factor(self, incident: Vec, view: Vec) -> Scalar:
-        """Pi times the probability per steradian of scattering from `incident` into `view`."""
+        """Pi times the probability per steradian of scattering from `incident` into `view`.
+
+        **Arguments:**
+
+        - `incident`, `view`: unit vectors of travel.
+
+        **Returns:** an array shaped as the components of `incident`.
+        """
 
     @abc.abstractmethod
     def sample(self, incident: Vec, u: Scalar, v: Scalar) -> Vec:
-        """A direction drawn with that density, by two numbers that are uniform in (0, 1)."""
+        """A direction of scattering, drawn at random with this density.
+
+        **Arguments:**
+
+        - `incident`: unit vector of travel.
+        - `u`, `v`: numbers that are uniform in (0, 1).
+
+        **Returns:** a unit vector of travel.
+        """
 
     @abc.abstractmethod
     def largest_view_factor(self) -> float:
-        """A bound on the view factor over all directions, for the plan; infinite if there is none."""
+        """An upper bound on the view factor over all directions, for the plan.
+
+        **Returns:** a number; infinite where there is no bound.
+        """
 
     def density(self, incident: Vec, out: Vec) -> Scalar:
-        """Probability per steradian of scattering from `incident` into `out`."""
+        """Probability per steradian of scattering from `incident` into `out`.
+
+        **Arguments:**
+
+        - `incident`, `out`: unit vectors of travel.
+
+        **Returns:** an array shaped as the components of `incident`.
+        """
         return self.view_factor(incident, out) / np.pi
 
 
 @final
 class Isotropic(AbstractPhase):
-    """Volume scattering, equal into all directions: what discrete ordinates often compute.
+    """Isotropic volume scattering, the same in all directions: often assumed by discrete ordinates codes.
 
     **Arguments:**
 
     - `albedo`: single scattering albedo, one number or one per wavelength, in [0, 1].
 
     **Raises:** ValueError for an albedo outside its range.
+
+    **Example:** a canopy of isotropic scatterers at two wavelengths.
+
+    >>> import jaxlidar as jl
+    >>> import numpy as np
+    >>> voxels = jl.VoxelMap.from_lad(np.full((2, 2, 5), 0.5), voxel_size=1.0, origin=(-1.0, -1.0, 2.0))
+    >>> canopy = jl.Canopy(voxels, leaf=jl.Isotropic(albedo=[0.1, 0.9]))
+    >>> print([f"{a:.1f}" for a in canopy.leaf.albedo])
+    ['0.1', '0.9']
     """
 
     albedo: Float[Array, "..."] = eqx.field(converter=as_array)
@@ -84,16 +132,27 @@ class Isotropic(AbstractPhase):
 
 @final
 class HenyeyGreenstein(AbstractPhase):
-    """Volume scattering with a forward or backward lobe.
+    """Volume scattering by Henyey and Greenstein's phase function: a forward or a backward lobe.
 
     **Arguments:**
 
     - `albedo`: single scattering albedo, one number or one per wavelength, in [0, 1].
-    - `g`: mean cosine of the scattering angle, in [-0.95, 0.95]; 0 (default) is isotropic, positive forward.
+    - `g`: mean cosine of the scattering angle, in [-0.95, 0.95]; 0 is isotropic, positive values scatter
+      forward. Default 0.
 
     **Raises:** ValueError for values outside their ranges.
 
     **Source:** Henyey and Greenstein (1941), Astrophys. J. 93, 70.
+
+    **Example:** view factors of forward scattering and of backscatter.
+
+    >>> import jaxlidar as jl
+    >>> import jax.numpy as jnp
+    >>> from jaxlidar.extend import vec
+    >>> down, up = vec(jnp.array([0.0, 0.0, -1.0])), vec(jnp.array([0.0, 0.0, 1.0]))
+    >>> phase = jl.HenyeyGreenstein(albedo=0.9, g=0.5)
+    >>> print(f"{phase.view_factor(down, down):.3f} forward, {phase.view_factor(down, up):.3f} back")
+    1.500 forward, 0.056 back
     """
 
     albedo: Float[Array, "..."] = eqx.field(converter=as_array)

@@ -1,11 +1,11 @@
-"""PROSPECT: leaf reflectance and transmittance from 400 to 2500 nm out of structure and chemistry.
+"""PROSPECT: leaf reflectance and transmittance from 400 to 2500 nm, from leaf structure and chemistry.
 
 The absorption of one of the leaf's N plates is k = sum(c_i K_i)/N, with the contents c_i per leaf area and
-the specific absorption coefficients K_i of leaf material; `jaxlidar.optics.plate_model` turns k, N and the
+the specific absorption coefficients K_i of leaf material. `jaxlidar.optics.plate_model` turns k, N and the
 refractive index into reflectance and transmittance. Coefficients are interpolated linearly between the
 table's wavelengths, before anything is computed from them.
 
-Versions differ in their coefficients and in the traits that they know (RSE: Remote Sens. Environ.):
+The versions differ in their coefficients and in their traits (RSE: Remote Sens. Environ.):
 
 | version | traits besides N | calibration |
 | --- | --- | --- |
@@ -32,7 +32,8 @@ from jaxtyping import Array, ArrayLike, Float
 
 from jaxlidar._checks import as_scalar, check_choice, check_range, concrete
 from jaxlidar.optics.coefficients import TRAITS, Coefficients, shipped
-from jaxlidar.optics.plate_model import Surface, plate_model, plate_model_slopes, surface
+from jaxlidar.optics.leaf_surface import LeafSurface, leaf_surface
+from jaxlidar.optics.plate_model import plate_model, plate_model_slopes
 
 _DEFAULTS = {
     "Cab": 40.0,
@@ -51,32 +52,44 @@ _Batch = Float[Array, "leaves *wavelengths"]
 
 @final
 class Prospect(eqx.Module):
-    """A leaf by PROSPECT. `R, T = leaf(wavelengths)`.
+    """A leaf by the PROSPECT model: `R, T = leaf(wavelengths)` are its reflectance and transmittance.
 
-    **Arguments**, all scalars. A trait left out has the default below where the version knows it, and is 0
-    where it does not.
-
-    - `N`: number of elementary plates, real, 1 or more (default 1.5);
-    - `Cab`: chlorophyll a + b, ug/cm2 (40);
-    - `Car`: carotenoids, ug/cm2 (8);
-    - `Cant`: anthocyanins, ug/cm2 (0);
-    - `Cbrown`: brown pigments, arbitrary units (0);
-    - `Cw`: equivalent water thickness, cm (0.01);
-    - `Cm`: dry matter, g/cm2 (0.009);
-    - `Cp`: protein, g/cm2 (0.001);
-    - `Cc`: cellulose and lignin ("PC") or carbon-based constituents ("PRO"), g/cm2 (0.009);
-    - `version`: "4", "5", "D" (default), "PC" or "PRO", see the module;
-    - `alpha`: half-angle of the cone of incidence, degrees, 0..90 (40). Fixed: not differentiable;
-    - `coefficients`: for "PRO", and only there, the table that `load_coefficients` reads.
-
-    Traits may be traced, and every output is differentiable in each. For many leaves map over the
+    Every output is differentiable in every trait, and traits may be traced. For many leaves map over the
     construction, e.g. `jax.vmap(lambda N, Cab: Prospect(N=N, Cab=Cab))(N, Cab)`, and see `prospect_spectra`.
 
-    **Raises:** `ValueError` naming field, value and admissible range: a trait that is negative, not finite,
-    no scalar, or unknown to the version and not 0 (hence `Cm` with "PC" and "PRO"); N below 1; alpha
-    outside 0..90; an unknown version; `coefficients` missing or out of place. Traced values pass unchecked.
+    **Arguments:** all traits are single numbers. A trait of None has the value given below where the version
+    has this trait, and is 0 otherwise.
+
+    - `N`: number of elementary plates, real, 1 or more. Default 1.5.
+    - `Cab`: chlorophyll a + b, ug/cm2, not negative. Default None: 40.
+    - `Car`: carotenoids, ug/cm2, not negative. Default None: 8.
+    - `Cant`: anthocyanins, ug/cm2, not negative. Default None: 0.
+    - `Cbrown`: brown pigments, arbitrary units, not negative. Default None: 0.
+    - `Cw`: equivalent water thickness, cm, not negative. Default None: 0.01.
+    - `Cm`: dry matter, g/cm2, not negative. Default None: 0.009.
+    - `Cp`: protein, g/cm2, not negative. Default None: 0.001.
+    - `Cc`: cellulose and lignin ("PC") or carbon-based constituents ("PRO"), g/cm2, not negative. Default
+      None: 0.009.
+    - `version`: "4", "5", "D", "PC" or "PRO"; their traits are listed in `jaxlidar.optics.prospect`. Default
+      "D".
+    - `alpha`: half-angle of the cone of incidence, degrees, in [0, 90]. Fixed: not differentiable. Default
+      40.
+    - `coefficients`: for version "PRO", and only for it, the table from `load_coefficients`. Default None.
+
+    **Raises:** ValueError, naming field, value and admissible range: for a trait that is negative, not finite
+    or not a single number, for a trait other than 0 that the version does not have (hence `Cm` with "PC" and
+    "PRO"), for N below 1, alpha outside [0, 90], an unknown version, and `coefficients` that are missing or
+    not admissible. Traced values are not checked.
 
     **Source:** Jacquemoud and Baret (1990), Remote Sens. Environ. 34, 75, and those of the versions.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> leaf = jl.Prospect(N=1.5, Cab=30.0, Cw=0.012)
+    >>> R, T = leaf([532.0, 1064.0])
+    >>> print([f"{x:.2f}" for x in R], [f"{x:.2f}" for x in T])
+    ['0.16', '0.44'] ['0.16', '0.48']
     """
 
     N: Float[Array, ""]
@@ -132,31 +145,45 @@ class Prospect(eqx.Module):
 
     @classmethod
     def paper(cls) -> "Prospect":
-        """The leaf that reproduces the published lidar simulator's Table 4.
+        """The leaf that reproduces Table 4 of the published lidar simulator.
 
-        At 532, 1064 and 1550 nm that table gives reflectances of 36, 66 and 57 %, transmittances of 8, 30
-        and 27 %, computed by PROSPECT 2.01, whose coefficients are not public in full. This is PROSPECT-D
-        with N = 3.4, Cab = 20 ug/cm2 and Cw = 0.002 cm from the paper's Table 3, and with Car = 6.07 ug/cm2
-        and Cm = 0.00463 g/cm2 for what version 2.01 folded into its columns: fitted to Table 4, within 0.25
-        percentage points (rms).
+        At 532, 1064 and 1550 nm that table gives reflectances of 36, 66 and 57 % and transmittances of 8, 30
+        and 27 %, computed by PROSPECT 2.01, whose coefficients are not public in full. This leaf is
+        PROSPECT-D with N = 3.4, Cab = 20 ug/cm2 and Cw = 0.002 cm from the paper's Table 3. Car = 6.07 ug/cm2
+        and Cm = 0.00463 g/cm2, which stand for what version 2.01 folded into its columns, were fitted to
+        Table 4; they match it within 0.25 percentage points (rms).
+
+        **Returns:** a `Prospect`.
         """
         return cls(N=3.4, Cab=20.0, Car=6.07, Cant=0.0, Cbrown=0.0, Cw=0.002, Cm=0.00463)
 
     def __call__(self, wavelengths: ArrayLike | Sequence[ArrayLike]) -> tuple[_Spectrum, _Spectrum]:
-        """Reflectance and transmittance (hemispherical, for light within the cone `alpha`).
+        """Hemispherical reflectance and transmittance for light within the cone of incidence `alpha`.
 
-        **Arguments:** `wavelengths`: nm, any shape, within the table (400..2500 for those shipped). Traced
-        wavelengths are admitted: they cannot be checked (outside the table they give NaN), and the surface
-        is then computed in working precision.
+        **Arguments:**
 
-        **Raises:** `ValueError` where a wavelength lies outside the table or is not a number.
+        - `wavelengths`: nm, any shape, within the table (400 to 2500 for those shipped). Traced wavelengths
+          are admitted but cannot be checked: outside the table they give NaN. The surface is then computed in
+          working precision.
+
+        **Returns:** reflectance and transmittance, shaped as `wavelengths`.
+
+        **Raises:** ValueError where a wavelength lies outside the table or is not a number.
         """
         return self._optics(wavelengths)[:2]
 
     def absorptance(self, wavelengths: ArrayLike | Sequence[ArrayLike]) -> _Spectrum:
-        """1 - R - T, computed without subtraction: a nearly transparent leaf's has all its digits.
+        """Absorptance, 1 - R - T, accurate also for nearly transparent leaves.
 
-        **Arguments**, **Raises:** as for calling the leaf.
+        It is computed without subtraction.
+
+        **Arguments:**
+
+        - `wavelengths`: nm, as for calling the leaf.
+
+        **Returns:** an array shaped as `wavelengths`.
+
+        **Raises:** ValueError where a wavelength lies outside the table or is not a number.
         """
         return self._optics(wavelengths)[2]
 
@@ -183,8 +210,8 @@ def _is_zero(value: ArrayLike) -> bool:
     return known is not None and bool(np.all(known == 0))
 
 
-def material(leaf: Prospect, wavelengths: Any) -> tuple[Array, Surface]:
-    """Specific absorption coefficients (traits, wavelengths) and the surface at the wavelengths."""
+def material(leaf: Prospect, wavelengths: Any) -> tuple[Array, LeafSurface]:
+    """Specific absorption coefficients (traits, wavelengths) and the surface, at the wavelengths."""
     table = shipped(leaf.version) if leaf.coefficients is None else leaf.coefficients
     dtype = leaf.N.dtype
     if isinstance(wavelengths, Tracer):
@@ -194,38 +221,50 @@ def material(leaf: Prospect, wavelengths: Any) -> tuple[Array, Surface]:
         columns = [
             jnp.interp(x, grid, jnp.asarray(c, dtype), **outside) for c in (table.index, *table.absorption)
         ]
-        return jnp.stack(columns[1:]), surface(columns[0], leaf.alpha)
+        return jnp.stack(columns[1:]), leaf_surface(columns[0], leaf.alpha)
     x = np.asarray(wavelengths, dtype=float)
     check_range("wavelengths", x, table.wavelength[0], table.wavelength[-1])
     absorption, face = _tabulated(table, x.tobytes(), x.shape, leaf.alpha)
-    # The surface keeps its digits, of which the plate model makes use in single precision too.
+    # The surface stays in double precision: the plate model uses its digits in single precision too.
     return jnp.asarray(absorption, dtype), face
 
 
 @functools.lru_cache(maxsize=64)
 def _tabulated(
     table: Coefficients, wavelengths: bytes, shape: tuple[int, ...], alpha: float
-) -> tuple[np.ndarray, Surface]:
+) -> tuple[np.ndarray, LeafSurface]:
     x = np.frombuffer(wavelengths).reshape(shape)
     absorption = np.stack([np.interp(x, table.wavelength, c) for c in table.absorption])
-    return absorption, surface(np.interp(x, table.wavelength, table.index), alpha)
+    return absorption, leaf_surface(np.interp(x, table.wavelength, table.index), alpha)
 
 
 def prospect_spectra(
     leaves: Prospect, wavelengths: ArrayLike | Sequence[ArrayLike], batch_size: int = 100
 ) -> tuple[_Batch, _Batch]:
-    """Reflectance and transmittance of many leaves, fast: batches that fit into the processor's cache.
+    """Reflectance and transmittance of many leaves, computed in batches that fit into the processor's cache.
+
+    Call it under `jax.jit`.
 
     **Arguments:**
 
     - `leaves`: a `Prospect` whose traits have a leading axis, all of one length, as `jax.vmap` over its
-      construction returns it;
-    - `wavelengths`: nm, as for one leaf;
-    - `batch_size`: leaves evaluated at once (default 100). One batch of 10,000 takes longer than 100 of 100.
+      construction returns it.
+    - `wavelengths`: nm, as for one leaf.
+    - `batch_size`: leaves evaluated at once, an integer, at least 1. One batch of 10,000 takes longer than
+      100 batches of 100. Default 100.
 
-    **Returns:** two arrays, (leaves, wavelengths).
+    **Returns:** reflectance and transmittance, (leaves, wavelengths) each.
 
-    **Raises:** `ValueError` as one leaf does, and where `batch_size` is below 1. Call it under `jax.jit`.
+    **Raises:** ValueError as for one leaf, and where `batch_size` is below 1.
+
+    **Example:** leaves of two thicknesses.
+
+    >>> import jaxlidar as jl
+    >>> import jax
+    >>> leaves = jax.vmap(lambda N: jl.Prospect(N=N))(jax.numpy.array([1.2, 2.0]))
+    >>> R, T = jl.prospect_spectra(leaves, [1064.0])
+    >>> print([f"{x:.2f}" for x in R[:, 0]], [f"{x:.2f}" for x in T[:, 0]])
+    ['0.38', '0.51'] ['0.53', '0.40']
     """
     check_range("batch_size", batch_size, 1.0)
     return jax.lax.map(lambda leaf: leaf(wavelengths), leaves, batch_size=batch_size)
@@ -236,12 +275,29 @@ def prospect_jacobian(
 ) -> tuple[tuple[_Batch, _Batch], dict[str, tuple[_Batch, _Batch]]]:
     """Spectra of many leaves with their derivatives in every trait, at less than three times the cost.
 
-    All traits but N act through k alone, so that the plate model is differentiated twice only.
+    All traits but N act through k alone, so the plate model is differentiated only twice.
 
-    **Arguments**, **Raises:** as for `prospect_spectra`, in smaller batches (20), for results are larger.
+    **Arguments:**
 
-    **Returns:** reflectance and transmittance, (leaves, wavelengths) each, and by name ("N" and the traits of
-    the version) the derivatives of the two, of the same shape, per unit of the trait.
+    - `leaves`: a `Prospect` whose traits have a leading axis, as for `prospect_spectra`.
+    - `wavelengths`: nm, as for one leaf.
+    - `batch_size`: leaves evaluated at once, an integer, at least 1. Batches are smaller than those of
+      `prospect_spectra`, since the results are larger. Default 20.
+
+    **Returns:** first the reflectance and transmittance, (leaves, wavelengths) each. Then a dict, by name
+    ("N" and the traits of the version), of the derivatives of these two, of the same shape, per unit of the
+    trait.
+
+    **Raises:** ValueError as for one leaf, and where `batch_size` is below 1.
+
+    **Example:** how reflectance at 550 nm falls with chlorophyll, per ug/cm2.
+
+    >>> import jaxlidar as jl
+    >>> import jax
+    >>> leaves = jax.vmap(lambda Cab: jl.Prospect(Cab=Cab))(jax.numpy.array([20.0, 60.0]))
+    >>> (R, T), slopes = jl.prospect_jacobian(leaves, [550.0])
+    >>> print([f"{x:.4f}" for x in slopes["Cab"][0][:, 0]])
+    ['-0.0053', '-0.0015']
     """
     check_range("batch_size", batch_size, 1.0)
 

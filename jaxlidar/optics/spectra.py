@@ -1,17 +1,17 @@
-"""Reflectance spectra of bark, wood, litter, soil and more: measured ones bundled, or the user's own.
+"""Reflectance spectra of bark, wood, litter, soil and more: measured ones that are bundled, or your own.
 
     jl.spectra("bark")                     names of the bundled ones, of one kind or of all
     jl.spectrum("bark-birch")(1064.0)      a spectrum is a function of the wavelength in nm
     jl.read_spectrum_csv("my_soil.csv")
 
-Every reflectance that a scene takes may be a number, one number per wavelength, or a `Spectrum`;
+Every reflectance of a scene may be one number, one number per wavelength, or a `Spectrum`.
 `reflectance_at` turns all three into one number per wavelength.
 
-The bundled spectra are field and laboratory measurements of 400 to 2450 nm in steps of 10 nm, without
-the bands of water vapour (between 1350 and 1460, and 1790 and 1960 nm), over which a straight line leads.
-Where each comes from is in `data/spectra.md`. They are bidirectional or hemispherical, as their makers
-measured them; the simulator takes them as the reflectance of a Lambertian surface. Two samples of one
-kind easily differ by a fifth: fit `scale` where the level matters.
+The bundled spectra are field and laboratory measurements from 400 to 2450 nm in steps of 10 nm. The bands of
+water vapour (between 1350 and 1460, and 1790 and 1960 nm) are left out and bridged by a straight line.
+`data/spectra.md` lists their sources. They are bidirectional or hemispherical, as measured; the simulator
+takes them as the reflectance of a Lambertian surface. Two samples of one kind easily differ by a fifth: fit
+`scale` where the level matters.
 """
 
 import csv
@@ -30,18 +30,27 @@ from jaxlidar._checks import as_array, as_scalar, check_range, concrete
 
 
 class Spectrum(eqx.Module):
-    """A reflectance that depends on wavelength, linear between its samples.
+    """A reflectance spectrum, linear between its samples: `spectrum(wavelength)` is the reflectance.
+
+    All fields but `name` are arrays and differentiable.
+
+    **Arguments:**
 
     - `wavelength`: (samples,) in nm, positive, strictly increasing, at least two.
     - `reflectance`: (samples,) in [0, 1].
-    - `name`: what it is called. Default "".
-    - `scale`: a factor on the reflectance, not negative and such that none exceeds 1. Default 1. It is
-      there to be fitted, as one unknown for the brightness of a whole spectrum.
+    - `name`: name of the spectrum. Default "".
+    - `scale`: a factor on the reflectance, not negative and such that no reflectance exceeds 1. It can be
+      fitted, as one unknown for the brightness of a whole spectrum. Default 1.
 
-    All but `name` are arrays and differentiable.
+    **Raises:** ValueError for wavelengths that are not positive, do not increase strictly or are too few, for
+    shapes that differ, for a negative scale, and for reflectances outside [0, 1], scaled or not.
 
-    **Raises:** `ValueError` for wavelengths that are unsorted or too few, for shapes that differ, and for
-    reflectances outside [0, 1].
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> soil = jl.Spectrum([400.0, 1000.0, 2400.0], [0.1, 0.3, 0.4], name="my soil")
+    >>> print(f"{soil(1064.0):.3f}")
+    0.305
     """
 
     wavelength: Float[Array, " samples"] = eqx.field(converter=as_array)
@@ -73,12 +82,14 @@ class Spectrum(eqx.Module):
     def __call__(self, wavelength: ArrayLike) -> Float[Array, "..."]:
         """The reflectance at the given wavelengths.
 
-        - `wavelength`: in nm, any shape, within the range of the samples.
+        **Arguments:**
 
-        Returns an array shaped as `wavelength`.
+        - `wavelength`: nm, any shape, within the range of the samples.
 
-        **Raises:** `ValueError` for a wavelength outside that range. Inside a JAX transformation of the
-        wavelength nothing can be raised: there the end values continue.
+        **Returns:** an array shaped as `wavelength`.
+
+        **Raises:** ValueError for a wavelength outside the range of the samples. Inside a JAX transformation
+        of the wavelength nothing can be raised: the end values are used there.
         """
         wavelength = as_array(wavelength)
         table = concrete(self.wavelength)
@@ -91,14 +102,18 @@ class Spectrum(eqx.Module):
 def reflectance_at(
     value: ArrayLike | Spectrum, wavelength: ArrayLike, field: str = "reflectance"
 ) -> Float[Array, " wavelengths"]:
-    """A reflectance, however it is given, as one number per wavelength.
+    """A reflectance in any of its forms, as one number per wavelength.
+
+    **Arguments:**
 
     - `value`: one number, (wavelengths,) numbers, or a `Spectrum`.
-    - `wavelength`: (wavelengths,) in nm, or one number.
-    - `field`: how errors call `value`.
+    - `wavelength`: nm, (wavelengths,) or one number.
+    - `field`: name of `value` in error messages. Default "reflectance".
 
-    **Raises:** `ValueError` for another number of values than wavelengths, and for a wavelength outside a
-    spectrum's range. That values lie in [0, 1] is checked where they are held.
+    **Returns:** (wavelengths,) reflectances. That they lie in [0, 1] is checked where they are stored.
+
+    **Raises:** ValueError where the numbers of values and wavelengths differ, and for a wavelength outside
+    the range of a spectrum.
     """
     wavelength = jnp.atleast_1d(as_array(wavelength))
     if isinstance(value, Spectrum):
@@ -122,11 +137,21 @@ def _library() -> dict[str, np.ndarray]:
 
 
 def spectra(kind: str | None = None) -> dict[str, str]:
-    """Names of the bundled spectra, each with its kind.
+    """Names of the bundled reflectance spectra, each with its kind.
+
+    **Arguments:**
 
     - `kind`: "bark", "wood", "litter", "char", "soil" or "built". Default None: all.
 
-    **Raises:** `ValueError` for an unknown kind.
+    **Returns:** a dict from name to kind.
+
+    **Raises:** ValueError for an unknown kind.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> sorted(jl.spectra("built"))
+    ['asphalt', 'concrete', 'gravel']
     """
     library = _library()
     listed = dict(zip(library["name"].tolist(), library["kind"].tolist()))
@@ -139,11 +164,23 @@ def spectra(kind: str | None = None) -> dict[str, str]:
 
 
 def spectrum(name: str) -> Spectrum:
-    """A bundled spectrum, 400 to 2450 nm.
+    """A bundled reflectance spectrum, from 400 to 2450 nm.
 
-    - `name`: one of `spectra()`.
+    **Arguments:**
 
-    **Raises:** `ValueError` for an unknown name, with the names that come close.
+    - `name`: one of the names that `spectra` lists.
+
+    **Returns:** a `Spectrum`.
+
+    **Raises:** ValueError for an unknown name; the message lists similar names.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> import numpy as np
+    >>> bark = jl.spectrum("bark-birch")
+    >>> print([f"{x:.2f}" for x in bark(np.array([532.0, 1064.0]))])
+    ['0.33', '0.51']
     """
     library = _library()
     names = library["name"].tolist()
@@ -160,15 +197,30 @@ def spectrum(name: str) -> Spectrum:
 
 
 def read_spectrum_csv(path: str | os.PathLike[str], name: str | None = None) -> Spectrum:
-    """Read a spectrum from a text file of two columns: wavelength in nm, reflectance in [0, 1].
+    r"""A reflectance spectrum, read from a text file of two columns: wavelength in nm, reflectance in [0, 1].
 
-    - `path`: lines of two numbers, between them a comma, a semicolon, a tab or blanks. Empty lines and
-      lines that start with # are skipped, and the first other line may be a header.
-    - `name`: of the spectrum. Default None: the file's name without its ending.
+    **Arguments:**
 
-    **Raises:** `ValueError`, naming the file and the line, for a line that is not two numbers, for a
-    reflectance outside [0, 1] (per cent?), for a wavelength below 100 nm (micrometres?) or not above
-    the one before, and for fewer than two samples; `FileNotFoundError` where there is no such file.
+    - `path`: path of the file. Its lines hold two numbers, separated by a comma, a semicolon, a tab or
+      blanks. Empty lines and lines that start with # are skipped, and the first other line may be a header.
+    - `name`: name of the spectrum. Default None: the file's name without its ending.
+
+    **Returns:** a `Spectrum`.
+
+    **Raises:** FileNotFoundError where there is no such file. ValueError, naming the file and the line, for a
+    line that is not two numbers, for a reflectance outside [0, 1] (per cent?), for a wavelength below 100 nm
+    (micrometres?) or not above the one before, for fewer than two samples, and for a file that is not UTF-8
+    text.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> import pathlib, tempfile
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "soil.csv"
+    >>> _ = path.write_text("wavelength,reflectance\n400,0.1\n1000,0.3\n2400,0.4\n")
+    >>> soil = jl.read_spectrum_csv(path)
+    >>> print(soil.name, f"{soil(700.0):.2f}")
+    soil 0.20
     """
     path = Path(path)
     if not path.is_file():

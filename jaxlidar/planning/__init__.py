@@ -1,1 +1,1 @@
-"""Plans: what will be simulated, why, to what bound, and the sizes of all loops."""
+"""Plans: which effects are simulated and why, bounds on what each changes, and the sizes of all loops."""

@@ -1,4 +1,4 @@
-"""Other estimators, to compare with: what the choices that are built in are worth."""
+"""Alternative estimators: with them, the gain of the estimators that are built in can be measured."""
 
 import dataclasses
 
@@ -15,22 +15,31 @@ def with_alternatives(
     kernel: int = KERNEL,
     ends: int | None = None,
 ) -> Plan:
-    """The same plan with other estimators. For comparisons and benchmarks; nobody else needs it.
+    """The same plan with other estimators, for comparisons and benchmarks only.
 
     **Arguments:**
 
-    - `plan`: of `jaxlidar.plan`.
-    - `first_order`: "expected" (default: integrated along every ray) or "drawn" (returns from drawn
-      collisions, as those of the other orders, among which it is then counted).
-    - `points`: "lattice" (default: of low discrepancy) or "independent" random numbers for rays and photons.
-    - `kernel`: fine bins over which an instant is spread: 3 (default, smooth), 2 (linear) or 1 (the nearest:
-      without derivatives with respect to times).
+    - `plan`: a `Plan` made by `jaxlidar.plan`.
+    - `first_order`: "expected" (integrated along every ray) or "drawn" (returns from drawn collisions, as
+      those of the other orders, among which it is then counted). Default "expected".
+    - `points`: "lattice" (of low discrepancy) or "independent" random numbers for rays and photons. Default
+      "lattice".
+    - `kernel`: fine bins over which an instant is spread: 3 (smooth), 2 (linear) or 1 (the nearest: without
+      derivatives with respect to times). Default 3.
     - `ends`: points of each flight through a canopy from which light returns, one in each stratum of the
-      probability of getting there; 1 is the collision alone. Default None: the plan's, 4.
+      probability of getting there; at least 1, which is the collision alone. Default None: the plan's, 4.
 
     **Returns:** a `Plan`.
 
     **Raises:** ValueError for other values, and for a drawn first order with a mirror or a hot spot.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> from jaxlidar.planning.alternatives import with_alternatives
+    >>> plan = jl.plan(jl.Lidar(), jl.Scene(ground=jl.Ground()))
+    >>> with_alternatives(plan, kernel=1).bins.kernel
+    1
     """
     check_choice("first_order", first_order, ("expected", "drawn"))
     check_choice("points", points, ("lattice", "independent"))

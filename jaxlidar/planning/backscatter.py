@@ -1,4 +1,4 @@
-"""What rays of the footprint send back, by any law: the ground on which bounds stand."""
+"""Backscatter of the footprint's rays by any scattering law; the bounds of a plan are computed from it."""
 
 import equinox as eqx
 import jax
@@ -18,7 +18,7 @@ PerRay = Float[np.ndarray, "rays"]
 
 
 def footprint_rays(lidar: Lidar) -> tuple[Rays, PerRay]:
-    """Directions of rays of equal energy, and how much of each the receiver sees."""
+    """Directions of footprint rays of equal energy, and the share of each that the receiver sees."""
     axis, slant = known_array(lidar.direction), known_number(lidar.range_to_reference)
     radius = known_number(lidar.footprint_radius)
     u, turn = ((np.arange(n) + 0.5) / n for n in (64, 32))
@@ -49,11 +49,11 @@ def backscatter(
     half_angle: float = 0.0,
     two_sided: bool = False,
 ) -> PerRay:
-    """View factors of rays towards where they came from; zero from below, unless `two_sided`."""
+    """View factors of rays for light scattered straight back; zero from below, unless `two_sided`."""
     normal = np.zeros(3) if normal is None else normal
     below = rays @ normal > 0
     lit = np.where(below & two_sided, -1.0, 1.0)[:, None] * normal
-    # A ratio of sums of these is taken to many digits.
+    # In double precision: bounds are ratios of sums of these.
     with jax.enable_x64(True):
         incident, upward = (vec(jnp.asarray(a)) for a in (rays.T, lit.T))
         found = np.asarray(_view_factor(law, incident, upward, jnp.asarray(half_angle)), float)

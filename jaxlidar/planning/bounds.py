@@ -1,11 +1,11 @@
-"""How much leaving out an effect changes, at most: cheap, by arguments that hold for every scene.
+"""Upper bounds on what leaving out an effect changes: cheap to compute, and valid for every scene.
 
-Within a canopy the return of order one is the integral of k R v exp(-kappa tau), kappa 2 or, with the hot
-spot, 1. What one ray returns is thus a mean, with weights that add up to one, of R v / kappa of leaf and
-bark and R v of the ground, R the reflectance and v the view factor for backscatter. What holds for every
-ray holds for the footprint: a ratio of sums lies between the least and the largest ratio.
+Within a canopy the return of order one is the integral of k R v exp(-kappa tau), with kappa 2 or, with the
+hot spot, 1. So what one ray returns is a weighted mean of R v / kappa of leaf and bark and R v of the ground,
+with weights that add up to one; R is the reflectance and v the view factor for backscatter. What holds for
+every ray holds for the footprint: a ratio of sums lies between the least and the largest ratio.
 
-Taken as the same with and without an effect: the transmittance of the air within the depth of the scene.
+The transmittance of the air within the depth of the scene is taken to be the same with and without an effect.
 """
 
 import jax.numpy as jnp
@@ -33,7 +33,7 @@ _MIRROR = 1e30
 
 
 class Bounds:
-    """Bounds on what each effect changes (see `jaxlidar.Effect`) in a scene simulated up to some order."""
+    """Bounds on what each effect changes (see `jaxlidar.Effect`) in a scene simulated up to a given order."""
 
     def __init__(self, lidar: Lidar, scene: Scene, orders: int):
         self.lidar, self.scene, self.orders = lidar, scene, orders
@@ -75,7 +75,7 @@ class Bounds:
         return FACET_BACKSCATTER, FACET_BACKSCATTER
 
     def _brightest(self, name: str) -> float:
-        """Largest view factor of what a material scatters, from anywhere to anywhere."""
+        """Largest view factor of what a material scatters, for any two directions."""
         canopy = self.scene.canopy
         if name not in ("leaf", "bark"):
             return self.surface[name].law.largest_view_factor(self.half_angle)
@@ -87,7 +87,7 @@ class Bounds:
         return 1.0 if name == "leaf" and canopy.voxels.leaf_angles is not None else FACET_BACKSCATTER
 
     def _facing(self, surface: AbstractSurface, rays: Rays) -> PerRay | None:
-        """View factors for backscatter of rays, zero from under the ground; None for a mirror."""
+        """View factors of rays for backscatter, zero from under the ground; None for a mirror."""
         if isinstance(surface.law, AbstractMirror):
             return None
         normal, _ = surface.shape.tangent(vec(jnp.zeros(3)))
@@ -95,14 +95,16 @@ class Bounds:
         return backscatter(surface.law, rays, upward, self.half_angle, isinstance(surface, AbstractSheet))
 
     def _sheet(self, name: str) -> tuple[Values, Values, Values]:
-        """Shares of all light, whether it meets the plate or not, that are reflected, scattered, or go on."""
+        """Shares of all light, whether it meets the plate or not: reflected, scattered, passed straight."""
         plate, (r, t) = self.sheets[name], self.optics[name]
         cover, straight = known_number(plate.coverage), plate.transmission == "straight"
         return cover * r, cover * (r if straight else r + t), 1 - cover + cover * t * straight
 
     def _returns(self, leave_out: str | None = None) -> tuple[Values, Values]:
-        """Least and largest return of order one of a ray, plates not counted. Without ground a ray may
-        meet nothing."""
+        """Least and largest return of order one of a ray, without plates.
+
+        Where there is no ground, a ray may meet nothing.
+        """
         least = np.full(self.lidar.wavelength.size, np.inf)
         most = np.zeros_like(least)
         for name in ("leaf", "bark", "ground"):
@@ -113,22 +115,22 @@ class Bounds:
         return (least if self.scene.ground is not None else np.zeros_like(least)), most
 
     def _through(self) -> Values:
-        """Share of what meets no plate, or goes straight through them all, one way."""
+        """Share that meets no plate or goes straight through all plates, one way."""
         return np.prod([np.ones(self.lidar.wavelength.size), *(self._sheet(n)[2] for n in self.sheets)], 0)
 
     def _from_plates(self) -> Values:
-        """Most that all plates return of order one."""
+        """Largest return of order one of all plates together."""
         own = [self._sheet(n)[0] * self._factors(n)[1] for n in self.sheets]
         return np.sum([np.zeros(self.lidar.wavelength.size), *own], axis=0)
 
     # Bounds by effect.
 
     def beyond(self, order: int) -> float:
-        """Share of the sum that orders above `order` can have.
+        """Largest share of the sum that orders above `order` can have.
 
-        What is scattered n + 1 times is at most s times what is scattered n times, s the largest share that a
-        ray scatters of its energy, be it after passing plates; between two planes, what one of them scatters
-        meets the other. All of it returns with the largest view factor at most.
+        What is scattered n + 1 times is at most s times what is scattered n times. s is the largest share
+        that a ray scatters of its energy, also after passing plates; between two planes, what one of them
+        scatters meets the other. All of it returns with the largest view factor at most.
         """
         if self.scene.canopy is None and len(self.scene.surfaces) <= 1:
             return 0.0
@@ -139,7 +141,7 @@ class Bounds:
             return _worst(np.where(share > 0, 1.0 / (1.0 + 1.0 / x), 0.0))
 
     def _between(self, order: int) -> Values:
-        """What a plate and the ground scatter to and fro above `order`, beside what returns of order one."""
+        """What a plate and the ground scatter between them above `order`, per return of order one."""
         (name,), (r, _) = self.sheets, self.optics["ground"]
         reflected, scattered, through = self._sheet(name)
         returned = reflected * self._factors(name)[0] + through**2 * r * self._factors("ground")[0]
@@ -150,9 +152,10 @@ class Bounds:
         return every_other / (1.0 - r * scattered) / (returned * (1.0 - self.outside))
 
     def _among(self, order: int) -> Values:
-        """What is scattered above `order`, by anything, beside what returns of order one.
+        """What anything scatters above `order`, per return of order one.
 
-        What is scattered once is at most `ratio` times what of it returns, with what the view does not see.
+        What is scattered once is at most `ratio` times what of it returns, plus what is outside the field of
+        view.
         """
         s, passing = np.zeros(self.lidar.wavelength.size), 1.0
         for name, (r, t) in self.optics.items():
@@ -175,10 +178,10 @@ class Bounds:
         return np.where(s > 0, s**order / (1.0 - s) * (ratio / passing + unseen), 0.0)
 
     def _scattered_per_return(self) -> Values:
-        """Largest ratio of what canopy and ground scatter of a ray to what of it returns, plates not counted.
+        """Largest ratio of what canopy and ground scatter of a ray to what of it returns, without plates.
 
-        Where the share x of a ray passes the canopy, this scatters 1 - x and returns 1 - x^kappa over kappa.
-        The ray may also end before the ground.
+        Where the share x of a ray passes the canopy, the canopy scatters 1 - x and returns (1 - x^kappa) /
+        kappa. The ray may also end before the ground.
         """
         canopy = self.scene.canopy
         x = np.linspace(1.0 if canopy is None else np.exp(-self._depth(canopy)), 1.0, 201)[:, None]
@@ -196,19 +199,19 @@ class Bounds:
         return np.max(ratio, axis=0)
 
     def _onward(self, name: str, after: Values) -> Values:
-        """Share that a ray scatters at a plate, or where it went on and scatters `after` of the rest."""
+        """Share of a ray that a plate scatters, or passes on to where the share `after` is scattered."""
         _, scattered, through = self._sheet(name)
         return scattered + through * after
 
     def _with_orders(self, first: float) -> float:
-        """`first` bounds what changes of order one; all of the orders above may come or go beside it."""
+        """The bound for all orders: `first` bounds the change of order one, all of the others may change."""
         higher = self.beyond(1) if self.orders > 1 else 0.0
         return 1.0 - (1.0 - first) * (1.0 - higher)
 
     def part(self, name: str) -> float:
-        """Leaf or bark: shades what is there, by its depth along the beam, and returns light of its own.
+        """Leaf or bark: shades all else, by its depth along the beam, and returns light of its own.
 
-        Where no ground is, there may be nothing else in view.
+        Where there is no ground, nothing else may be in view.
         """
         canopy = self.scene.canopy
         if canopy is None or self.scene.ground is None or self.scene.plates:
@@ -233,7 +236,7 @@ class Bounds:
         return self._with_orders(_worst(np.maximum(np.maximum(darker, brighter), 0.0)))
 
     def ground(self) -> float:
-        """The ground: all may be its; below one plate, what goes through that beside what it returns."""
+        """The ground: up to the whole return; below one plate, its return through that beside the plate's."""
         if not self._is_plate_over_ground():
             return 1.0
         (name,) = self.sheets
@@ -249,7 +252,7 @@ class Bounds:
         return bool(np.all(above > 0) and np.all(above < below))
 
     def slope_spread(self, level: "Bounds") -> float:
-        """Slope: every ray's delay and view factor beside those on the level ground of `level`."""
+        """Slope: delay and view factor of every ray, compared with those on the level ground of `level`."""
         one, other, canopy = self.scene.ground, level.scene.ground, self.scene.canopy
         assert one is not None
         assert other is not None
@@ -264,7 +267,7 @@ class Bounds:
         return max(self._with_orders(change), level._with_orders(change))
 
     def divergence(self) -> float:
-        """Width of the beam: every ray's delay, view factor and place in view beside the axis's."""
+        """Width of the beam: delay, view factor and share seen of every ray, beside those of the axis."""
         if self.scene.canopy is not None or not self._ordered():
             return 1.0
         axis, seen = np.broadcast_to(self.axis, self.rays.shape), np.ones_like(self.seen)
@@ -272,13 +275,13 @@ class Bounds:
         return self._with_orders(max(worst, default=0.0))
 
     def _ordered(self) -> bool:
-        """Whether all rays meet the surfaces in the same order, so that these shade each other alike."""
+        """Whether all rays meet the surfaces in the same order; then these shade each other equally."""
         distances = [self._distance(s, self.rays) for s in self.scene.surfaces]
         order = np.argsort(distances, axis=0) if distances else np.zeros((0, 1))
         return bool(np.all(order == order[:, :1]))
 
     def _lowest(self, canopy: Canopy) -> PerRay:
-        """Distance along rays at which the lowest layer that holds anything ends."""
+        """Distance along rays to the bottom of the lowest layer that is not empty."""
         empty = np.argmax(self._layers(canopy) > 0)
         bottom = known_array(canopy.voxels.origin)[2] + known_number(canopy.voxels.voxel_size[2]) * empty
         return (bottom - known_number(self.lidar.altitude)) / self.rays[:, 2]
@@ -292,7 +295,7 @@ class Bounds:
         seen: PerRay,
         uneven: bool,
     ) -> float:
-        """Bound on the samples' change as each ray is replaced by another, of which the share `seen` is seen.
+        """Bound on the samples' change as each ray is replaced by another, seen by the share `seen`.
 
         The absolute difference of two pulses a time d apart is, added up, at most twice `steepness` times d.
         Where rays have uneven energies, the ray that changes most counts.
@@ -313,7 +316,7 @@ class Bounds:
         return surface.shape.crossing(np.broadcast_to(sensor, rays.shape), rays)[0]
 
     def _steepness(self) -> float:
-        """Half the total variation of the pulse's power, 1/ns: of one with a single peak, the peak."""
+        """Half the total variation of the pulse's power, 1/ns; with a single peak this is the peak."""
         low, high = self.lidar.pulse.support(known_number(self.lidar.jitter))
         if not high > low:
             return np.inf
@@ -324,14 +327,14 @@ class Bounds:
         return known_array(self.lidar.pulse.cumulative(np.linspace(low, high, _CELLS + 1), jitter))
 
     def jitter(self) -> float:
-        """Jitter: every return's pulse beside the one without; sums of them differ by no larger share."""
+        """Jitter: one return's pulse with it and without it; sums of pulses differ by no larger share."""
         jitter = known_number(self.lidar.jitter)
         low, high = self.lidar.pulse.support(jitter)
         with_, plain = (np.diff(self._passed(low, high, j)) for j in (jitter, 0.0))
         return min(0.5 * float(np.sum(np.abs(with_ - plain))), 1.0)
 
     def field_of_view(self) -> float:
-        """What the brightest part of the footprint has outside, beside the darkest inside."""
+        """Field of view: the brightest that the footprint may be outside it, beside the darkest inside."""
         if self.scene.canopy is None and len(self.scene.surfaces) == 1:
             (surface,) = self.scene.surfaces
             factor = self._facing(surface, self.rays)
@@ -343,7 +346,7 @@ class Bounds:
         return self._with_orders(_worst(_share(most * self.outside, least * (1.0 - self.outside))))
 
     def hot_spot(self) -> float:
-        """exp(-tau) of the way back, beside 1: at most 1 - exp(-tau) of every return of order one."""
+        """Hot spot: of every return of order one, at most 1 - exp(-tau), tau the depth of the way back."""
         canopy = self.scene.canopy
         return 0.0 if canopy is None else 1.0 - float(np.exp(-self._depth(canopy)))
 
@@ -367,11 +370,11 @@ class Bounds:
         )
 
     def extinction(self, bins: Bins, upstream: float) -> float:
-        """1 - two-way transmittance to the last bin; the air's own return goes with it."""
+        """Extinction, two-way, to the last bin; without it the air's own return is left out too."""
         return max(self.lost(bins), self.backscatter(bins, upstream))
 
     def lost(self, bins: Bins) -> float:
-        """Share that the air takes of the light that goes farthest."""
+        """Share that the air takes of the light with the longest way."""
         air = self.scene.atmosphere
         if air is None:
             return 0.0
@@ -379,7 +382,7 @@ class Bounds:
         return 1.0 - float(np.min(known_array(depth)))
 
     def backscatter(self, bins: Bins, upstream: float) -> float:
-        """The air's own return within the bins, beside the least return of the scene."""
+        """The air's own return within the bins, relative to it and the least return of the scene."""
         air = self.scene.atmosphere
         if air is None or air.lidar_ratio is None:
             return 0.0
@@ -404,5 +407,5 @@ def _share(part: Values, rest: Values) -> Values:
 
 
 def _worst(share: Values) -> float:
-    """The largest of all wavelengths; 1 where undefined."""
+    """The largest of all wavelengths; 1 where it is undefined."""
     return float(min(np.max(np.where(np.isnan(share), 1.0, share), initial=0.0), 1.0))

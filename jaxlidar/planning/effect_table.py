@@ -32,10 +32,10 @@ def effect_table(
     bins: Bins,
     upstream: float,
 ) -> tuple[Effect, ...]:
-    """A row for every effect; `why`: why so many orders are followed, and what the others likely have."""
+    """A row for every effect. `why`: why so many orders are followed, and the likely share of the others."""
     has, planned = present(lidar, scene), present(*without(lidar, scene, off))
     reasons = dict.fromkeys(NAMES, "in the scene") | {"multiple scattering": why[0]} | _reasons(lidar, scene)
-    # What is being traced may have any value; and only planes are bounded.
+    # Values that are being traced are unknown, and bounds hold for planes only.
     known = not any(is_traced(x) for x in jax.tree.leaves((lidar, scene)))
     known = known and all(isinstance(s.shape, Plane) for s in scene.surfaces)
 
@@ -78,7 +78,7 @@ def _measure(name: str) -> str:
 
 
 def _rules(bounds: Bounds, bins: Bins, upstream: float) -> dict[str, Callable[[], float]]:
-    """The bound of every effect that is there."""
+    """For every effect, the function that computes its bound."""
 
     def slope_spread() -> float:
         level = without(bounds.lidar, bounds.scene, ("slope spread",))
@@ -92,7 +92,7 @@ def _rules(bounds: Bounds, bins: Bins, upstream: float) -> dict[str, Callable[[]
         "slope spread": slope_spread,
         "multiple scattering": lambda: bounds.beyond(1),
         f"orders beyond {bounds.orders}": lambda: bounds.beyond(bounds.orders),
-        # A mirror's return may outshine all else.
+        # A mirror's return may exceed all others by far.
         "specular return": lambda: 1.0,
         "divergence": bounds.divergence,
         "field of view": bounds.field_of_view,
@@ -100,13 +100,13 @@ def _rules(bounds: Bounds, bins: Bins, upstream: float) -> dict[str, Callable[[]
         "atmospheric extinction": lambda: bounds.extinction(bins, upstream),
         "atmospheric backscatter": lambda: bounds.backscatter(bins, upstream),
         "jitter": bounds.jitter,
-        # Light that the air scatters and the receiver still gets is at most what was lost.
+        # What the air scatters to the receiver beyond first order is at most what was lost.
         "scattering within the atmosphere": lambda: bounds.lost(bins),
     }
 
 
 def _reasons(lidar: Lidar, scene: Scene) -> dict[str, str]:
-    """Why effects are on, by their size, where more can be said than that they are there."""
+    """Why effects are simulated, with their size, where more can be said than that they are in the scene."""
     radius = known_number(lidar.footprint_radius)
     slope = known_number(scene.ground.slope) if isinstance(scene.ground, Ground) else 0.0
     spread = radius * math.tan(math.radians(slope)) / SPEED_OF_LIGHT

@@ -1,4 +1,4 @@
-"""The effects that a plan lists, and a lidar and a scene without those that are switched off."""
+"""The effects that a plan lists, and the removal of those that are switched off from a lidar and a scene."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -33,17 +33,26 @@ NAMES = (
 
 @dataclasses.dataclass(frozen=True)
 class Effect:
-    """One effect: whether it is simulated, why, and how much leaving it out changes at most.
+    """One row of a plan's table: an effect, whether it is simulated, why, and a bound on what it changes.
 
-    `bound` is, for the worst wavelength and everything else as planned, a bound on the `measure` of the
-    change between the waveform with the effect and the one without it, over a window that covers the scene:
+    - `name`: of the effect, as in the first column of the printed plan.
+    - `simulated`: whether it is simulated.
+    - `reason`: why, in words.
+    - `bound`: the most that leaving the effect out changes, in terms of `measure`, in [0, 1]: for the worst
+      wavelength, everything else as planned, over a window that covers the scene. For an effect that is
+      simulated it says how large the effect may be. It is 1, which always holds, where no better bound is
+      simple.
+    - `measure`: how waveforms with and without the effect are compared. "sum": difference of the sums over
+      all samples, relative to the larger sum. "samples": sum of the absolute differences of samples, relative
+      to both sums together; where the sums are equal, the share of the energy that is found in other samples.
 
-    - "sum": difference of the sums over all samples, relative to the larger sum.
-    - "samples": sum of the absolute differences of samples, relative to both sums together; where the sums
-      are equal, the share of the energy that is found in other samples.
+    **Example:**
 
-    Both lie between 0 (no change) and 1, which always holds and stands where no better bound is simple. The
-    bound of an effect that is simulated says how large it may be.
+    >>> import jaxlidar as jl
+    >>> plan = jl.plan(jl.Lidar(), jl.Scene(ground=jl.Ground(slope=10.0)))
+    >>> spread = {effect.name: effect for effect in plan.effects}["slope spread"]
+    >>> print(spread.simulated, f"{spread.bound:.2f}", spread.measure)
+    True 0.02 samples
     """
 
     name: str
@@ -54,18 +63,18 @@ class Effect:
 
 
 def only_planes(scene: Scene) -> bool:
-    """Whether there is nothing but infinite planes in the scene."""
+    """Whether the scene consists of infinite planes alone."""
     return scene.canopy is None and all(isinstance(s.shape, Plane) for s in scene.surfaces)
 
 
 def can_light_itself(scene: Scene) -> bool:
-    """Whether light that a part of the scene scatters can meet the scene again: one plane's cannot."""
+    """Whether light that is scattered in the scene can meet the scene again; that of one plane cannot."""
     surfaces = scene.surfaces
     return scene.canopy is not None or len(surfaces) > 1 or any(s.shape.lights_itself for s in surfaces)
 
 
 def present(lidar: Lidar, scene: Scene) -> dict[str, bool]:
-    """Which of `NAMES` a lidar and a scene have."""
+    """Whether a lidar and a scene have each effect of `NAMES`."""
     canopy, air = scene.canopy, scene.atmosphere
     return {
         "leaf": canopy is not None and canopy.voxels.leaf is not None,
@@ -87,7 +96,7 @@ def present(lidar: Lidar, scene: Scene) -> dict[str, bool]:
 def switched_off(
     effects: Mapping[str, bool] | None, has: Mapping[str, bool], max_orders: int | None
 ) -> tuple[str, ...]:
-    """Names of the effects that are in the scene and that `effects` switches off.
+    """Names of the effects that the lidar and the scene have and that `effects` switches off.
 
     **Raises:** ValueError for names or values that are inadmissible, and where `effects` switches on what is
     not in the scene or contradicts itself or `max_orders`.
@@ -124,10 +133,11 @@ def switched_off(
 
 
 def without(lidar: Lidar, scene: Scene, off: tuple[str, ...]) -> tuple[Lidar, Scene]:
-    """The lidar and the scene without the effects named in `off`; done twice, it changes nothing more.
+    """The lidar and the scene without the effects named in `off`. Applied twice, it changes nothing more.
 
-    The air goes with its extinction: without it there is nothing that could send light back. "multiple
-    scattering" and "specular return" belong to neither; the plan's orders and the tracer leave them out.
+    Without its extinction the air is removed, and its backscatter with it. "multiple scattering" and
+    "specular return" belong neither to the lidar nor to the scene: the plan's orders and the tracer leave
+    them out.
     """
     if not off:
         return lidar, scene
@@ -172,7 +182,7 @@ def _thinned(canopy: Canopy, off: tuple[str, ...]) -> Canopy | None:
 
 
 def _levelled(ground: Ground, lidar: Lidar) -> Ground:
-    """Level ground through the point where the axis of the beam meets the slope, if it does."""
+    """Level ground through the point where the beam axis meets the slope, if it does."""
     normal, axis = ground.shape.upward, lidar.direction
     rise = normal[2] * ground.height - jnp.sum(normal[:2] * lidar.position)
     towards = jnp.sum(normal * axis)

@@ -1,4 +1,4 @@
-"""How far a scene reaches along the beam: the bounds of every loop, found before anything is traced."""
+"""How far a scene reaches along the beam; from this the bounds of all loops are set before tracing."""
 
 import math
 
@@ -12,10 +12,13 @@ from jaxlidar.scenes.surfaces import AbstractSheet
 
 
 class PathLengths:
-    """The rim of the footprint against the bounds of everything in the scene.
+    """Path lengths from the rim of the footprint to the bounds of everything in the scene.
 
-    - `first`, `last`: two-way path, m, of the first and the last return of order one, relative to that of
-      the aim point. - `upstream`: how far before the reference plane, m, all rays start.
+    - `first`, `last`: two-way path, m, of the first and the last return of order one, relative to that of the
+      aim point.
+    - `upstream`: distance before the reference plane, m, at which all rays start.
+
+    **Raises:** ValueError where the scene reaches up to the sensor.
     """
 
     def __init__(self, lidar: Lidar, scene: Scene):
@@ -59,7 +62,7 @@ class PathLengths:
 
     @property
     def longest_chord(self) -> float:
-        """The longest piece, m, of a footprint ray within one voxel."""
+        """Longest piece, m, of a footprint ray within one voxel."""
         if self.scene.canopy is None:
             return 1e-3
         steep = float(np.abs(self.rays[:, 2]).min())
@@ -78,10 +81,11 @@ class PathLengths:
         return int(self.shape[2] + sideways.sum() + divided + len(self.scene.surfaces) + 2)
 
     def longest_flight(self, longest: float) -> float:
-        """Longest flight, m, that is followed: all from which light returns `longest` m after the first.
+        """Length, m, up to which flights are followed.
 
-        Within a canopy without sides, under a beam of more than 64 degrees, light could fly towards the
-        sensor almost for ever: there, ten times `longest` and the height of the canopy at most.
+        It takes in all flights whose light returns within `longest` m of the first return. But within a
+        periodic canopy, under a beam of more than 64 degrees, light could fly towards the sensor almost for
+        ever. There, the length is at most ten times the sum of `longest` and the height of the canopy.
         """
         if self.scene.canopy is None or self.scene.canopy.sides == "open":
             return FAR
@@ -90,7 +94,7 @@ class PathLengths:
         return float((longest + height * cos) / max(1.0 - math.sqrt(1.0 - cos * cos), 0.1))
 
     def march_steps(self, longest: float) -> int:
-        """Bound on the voxels that such a flight crosses."""
+        """Bound on the voxels that a flight of `longest_flight` crosses."""
         if self.scene.canopy is None:
             return 0
         if self.scene.canopy.sides == "open":

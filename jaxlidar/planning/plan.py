@@ -1,4 +1,4 @@
-"""What a scene and a lidar call for: effects simulated, bounds on the others, sizes of all loops."""
+"""The plan of a simulation: effects simulated, bounds on what each changes, and sizes of all loops."""
 
 import dataclasses
 import math
@@ -22,7 +22,7 @@ MIN_BATCHES = 8
 # Orders are followed while their histories are not more than this (16 orders of four letters, 29 of three).
 MAX_HISTORIES = 5000
 MAX_ORDERS = 100
-# Of scattered light at most this share is scattered again, where any can escape: by experience.
+# The share of scattered light that is scattered again is taken to be at most this, where any can escape.
 AGAIN = 0.8
 # Points of each flight through a canopy from which light returns.
 ENDS = 4
@@ -32,9 +32,33 @@ TAIL = (10.0, 60.0)
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """How a scene will be simulated. Made by `plan`; static: what is off is never compiled.
+    """How a lidar and a scene will be simulated: effects, time bins, orders and numbers of rays and photons.
 
-    `print(plan)` is a table of effects. `n_photons` is per batch; `n_rays` carry the first order.
+    Plans are made by `jaxlidar.plan`. Printed, a plan is a table of effects, followed by a line of sizes. It
+    is static: what a plan leaves out is never compiled.
+
+    - `trace`: what the tracer must know before it is compiled.
+    - `bins`: the fine time bins, into which returns are sorted.
+    - `sample_start`, `sample_interval`: time of the first sample, and the interval between samples, ns.
+    - `n_samples`: number of samples.
+    - `per_sample`: fine bins per sample.
+    - `n_rays`: rays of the footprint, which carry the first order.
+    - `n_photons`: photons per batch, which carry the higher orders.
+    - `smooth_footprint`: whether a quadrature rule takes the place of the rays, as it does over planes.
+    - `random_footprint`: whether each batch shifts the rays at random.
+    - `sharpen`: whether the spread of returns over fine bins is taken out again when the pulse is applied.
+    - `degree`, `first_degree`: most scatterings and passages through plates on a path, of all orders and of
+      order one.
+    - `off`: names of the effects that are switched off.
+    - `rtol`: relative accuracy aimed at.
+    - `effects`: the table, an `Effect` for every row; empty where it was not asked for.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> plan = jl.plan(jl.Lidar(), jl.Scene(ground=jl.Ground()))
+    >>> print(str(plan).splitlines()[-1])
+    31 samples of 1 ns from -15 ns, 7 fine bins of 0.5 ns
     """
 
     trace: TracePlan
@@ -52,13 +76,13 @@ class Plan:
     first_degree: int
     # Names of the effects that are switched off.
     off: tuple[str, ...]
-    # What is compiled depends on neither.
+    # Compiled programs depend on neither of these.
     rtol: float = dataclasses.field(compare=False)
     effects: tuple[Effect, ...] = dataclasses.field(compare=False)
 
     @property
     def orders(self) -> int:
-        """Scatterings followed."""
+        """Number of scatterings that are followed."""
         return self.trace.orders
 
     @property
@@ -102,28 +126,48 @@ def plan(
     effects: Mapping[str, bool] | None = None,
     describe: bool = True,
 ) -> Plan:
-    """Decide what `simulate` will do.
+    """The plan of what `simulate` will do for a lidar and a scene.
+
+    Effects that the lidar and the scene do not have are off, and never compiled. All others are on, however
+    small, unless they are switched off: a plan also serves other values of the same scene, in fits and
+    derivatives.
 
     **Arguments:**
 
-    - `rtol`: relative accuracy aimed at; sets how many orders are worth following. Default 0.01.
-    - `max_orders`: scatterings followed, at least 1; None decides from the largest albedo.
-    - `max_step`: longest stretch, m, that the first order takes at once; None is four fine bins. The
-      result does not depend on it.
-    - `n_photons`, `n_rays`: photons per batch and rays of the footprint; None is 4096 rays where they are
-      all, and 1024 where batches of photons shift them.
-    - `window`: (first, last) sample time in ns; None covers the scene.
-    - `bin_width`: fine bins in ns, rounded to a fraction of the sampling interval; None: by the pulse.
+    - `lidar`: a `Lidar`.
+    - `scene`: a `Scene`.
+    - `rtol`: relative accuracy aimed at, in (0, 1); sets how many orders are worth following. Default None:
+      0.01.
+    - `max_orders`: number of scatterings followed, at least 1. Default None: from `rtol` and the largest
+      albedo.
+    - `max_step`: longest stretch, m, that the first order takes at once; positive. The result does not depend
+      on it. Default None: four fine bins.
+    - `n_photons`: photons per batch, at least 1. Default 8192.
+    - `n_rays`: rays of the footprint per batch, at least 1; without effect over planes alone, where a
+      quadrature rule takes their place. Default None: 4096 with one order or a fixed footprint, else 1024.
+    - `window`: (first, last) sample time, ns. Default None: covers the scene.
+    - `bin_width`: width of the fine bins, ns, positive; reduced to a whole fraction of the sampling interval.
+      Default None: a quarter of the standard deviation of the pulse with its jitter, between 0.05 and 1
+      sampling intervals; half an interval for a pulse without duration.
     - `footprint`: "random" (each batch shifts the rays, so that the standard error covers them) or "fixed".
-    - `effects`: effects to switch off, by name, as in {"multiple scattering": False}; True asks for what
-      is on anyway and refuses scenes that do not have it. The names are those of the table's first column.
-    - `describe`: whether to make the table of effects, with its bounds; takes some 40 ms.
+      Default "random".
+    - `effects`: effects to switch off, by name, as in {"multiple scattering": False}; True asks for what is
+      on anyway and refuses scenes that do not have it. The names are those of the table's first column.
+      Default None.
+    - `describe`: whether to make the table of effects with its bounds, which takes some 40 ms. Default True.
 
-    What the scene does not have is off, and never compiled. All else is on, however small: a plan also
-    serves other values of the same scene, in fits and derivatives.
+    **Returns:** a `Plan`; `print` shows it as a table.
 
-    **Raises:** ValueError for inadmissible arguments, for a scene that reaches above the sensor, and if
-    the geometry is being traced by a JAX transformation: make the plan outside and pass it in.
+    **Raises:** ValueError for inadmissible arguments, for a scene that reaches up to the sensor, and if the
+    geometry is being traced by a JAX transformation: make the plan outside and pass it in.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> scene = jl.Scene(ground=jl.Ground(slope=10.0))
+    >>> plan = jl.plan(jl.Lidar(), scene, effects={"divergence": False})
+    >>> print(plan.orders, [effect.name for effect in plan.effects if effect.simulated])
+    1 ['ground', 'slope spread']
     """
     rtol = DEFAULT_RTOL if rtol is None else float(rtol)
     if not 0 < rtol < 1:
@@ -211,7 +255,7 @@ def _degree(orders: int, plates: int) -> int:
 def _orders(
     albedo: float, kinds: int, scene: Scene, rtol: float, max_orders: int | None
 ) -> tuple[int, str, float]:
-    """How many orders to follow, why, and what the others are likely to have."""
+    """How many orders to follow, why, and an estimate of the share of the others."""
     if not can_light_itself(scene):
         return 1, "one plane cannot light itself", 0.0
     plates = len(scene.plates)
@@ -276,7 +320,7 @@ def _time(
 
 
 def _with_air(bins: Bins, lidar: Lidar, samples: tuple[float, float, int, int]) -> Bins:
-    """From where on the air's own return would be recorded, whether it is simulated or not."""
+    """Bins that reach back to where the air's own return would begin, whether it is simulated or not."""
     _, high = lidar.pulse.support(known_number(lidar.jitter))
     missing = math.ceil((bins.start - (samples[0] - samples[1] - high)) / bins.width) + 3
     more = max(missing, 0)

@@ -1,4 +1,4 @@
-"""Whether a plan that was made earlier serves a lidar and a scene."""
+"""A check that a plan made earlier fits a lidar and a scene."""
 
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.planning.effects import without

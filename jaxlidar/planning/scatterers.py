@@ -17,7 +17,7 @@ from jaxlidar.scenes.surfaces import AbstractSheet
 
 
 class Optics(NamedTuple):
-    """What one scatterer does to light: (wavelengths,) reflectance and transmittance (None: opaque)."""
+    """Reflectance and transmittance (None: opaque) of one scatterer, each (wavelengths,)."""
 
     name: str
     reflectance: Float[Array, "wavelengths"]
@@ -25,7 +25,7 @@ class Optics(NamedTuple):
 
 
 class Letters(NamedTuple):
-    """Materials and letters by number. `surfaces` has the ground first, if there is one, then the plates."""
+    """Numbered materials and letters. `surfaces` has the ground first, if there is one, then the plates."""
 
     materials: tuple[str, ...]
     letters: tuple[str, ...]
@@ -35,7 +35,7 @@ class Letters(NamedTuple):
 
 
 def surface_names(scene: Scene) -> list[str]:
-    """What the scene's surfaces are called, in their order; several of one name are numbered from 1."""
+    """Names of the scene's surfaces, in their order; several of one name are numbered from 1."""
     names = [surface.name for surface in scene.surfaces]
     many, seen = Counter(names), Counter()
     numbered = []
@@ -46,10 +46,10 @@ def surface_names(scene: Scene) -> list[str]:
 
 
 def scene_optics(lidar: Lidar, scene: Scene) -> list[Optics]:
-    """Optics of every scatterer at the lidar's wavelengths: leaf, bark, ground, plates, as far as there.
+    """Optics of every scatterer in the scene at the lidar's wavelengths: leaf, bark, ground, plates.
 
-    Where the canopy's transmission is straight, transmitted light never left its ray: a collision
-    then reflects R / (1 - T), and nothing is transmitted.
+    Where the canopy's transmission is straight, transmitted light stays on its ray: a collision then reflects
+    R / (1 - T), and nothing is transmitted.
     """
     wavelength, found = lidar.wavelength, []
     canopy = scene.canopy
@@ -71,7 +71,7 @@ def scene_optics(lidar: Lidar, scene: Scene) -> list[Optics]:
 
 
 def spell(optics: list[Optics]) -> Letters:
-    """Number materials and letters; a transmittance known to be zero throughout has no letter."""
+    """Numbers of materials and letters; a transmittance known to be zero throughout has no letter."""
     letters: list[str] = []
     scatterers: dict[str, Scatterer] = {}
     for material, o in enumerate(optics):
@@ -91,7 +91,7 @@ def spell(optics: list[Optics]) -> Letters:
 def letter_values(
     lidar: Lidar, scene: Scene, letters: tuple[str, ...]
 ) -> Float[Array, "letters wavelengths"]:
-    """Reflectance or transmittance of every letter."""
+    """Reflectance or transmittance of every letter, by wavelength."""
     values: dict[str, Array] = {}
     for o in scene_optics(lidar, scene):
         values[f"{o.name}.R"] = o.reflectance
@@ -102,7 +102,7 @@ def letter_values(
 
 
 def largest_albedo(optics: list[Optics]) -> float:
-    """Largest R + T of any scatterer and wavelength; 1 where it is being traced."""
+    """Largest R + T of any scatterer and wavelength; 1 where its value is being traced."""
     albedos = [0.0]
     for o in optics:
         total = concrete(o.reflectance if o.transmittance is None else o.reflectance + o.transmittance)
@@ -111,9 +111,9 @@ def largest_albedo(optics: list[Optics]) -> float:
 
 
 def lobe_probability(optics: list[Optics]) -> float:
-    """With what probability photons are reflected rather than transmitted: about R / (R + T) on average.
+    """Probability with which photons are reflected rather than transmitted: about the mean of R / (R + T).
 
-    In steps of a tenth, so that small changes of optics do not recompile.
+    It is rounded to a tenth, so that small changes of optics do not recompile.
     """
     shares = []
     for o in optics:

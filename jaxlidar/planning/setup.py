@@ -12,9 +12,21 @@ from jaxlidar.scenes.scene import Scene
 
 @final
 class Setup(eqx.Module):
-    """A lidar and a scene without what a plan leaves out: all that tracing and recording need.
+    """A lidar and a scene without what a plan leaves out, and the plan: all that tracing and recording need.
 
-    Made by `reduce`. The plan is static; lidar and scene are traced and differentiated.
+    Setups are made by `reduce`. The plan is static; lidar and scene can be traced and differentiated.
+
+    - `lidar`: a `Lidar`.
+    - `scene`: a `Scene`.
+    - `plan`: a `Plan`.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> lidar, scene = jl.Lidar(jitter=1.0), jl.Scene(ground=jl.Ground())
+    >>> setup = jl.reduce(lidar, scene, jl.plan(lidar, scene, effects={"jitter": False}))
+    >>> print(float(setup.lidar.jitter), setup.plan.off)
+    0.0 ('jitter',)
     """
 
     lidar: Lidar
@@ -23,12 +35,13 @@ class Setup(eqx.Module):
 
 
 def reduce(lidar: Lidar, scene: Scene, plan: Plan) -> Setup:
-    """Take what a plan leaves out of a lidar and a scene. Everything below works on the result.
+    """The lidar and the scene without what a plan leaves out, ready to be traced.
 
     **Arguments:**
 
-    - `lidar`, `scene`: as given by the user.
-    - `plan`: of `jaxlidar.plan`.
+    - `lidar`: a `Lidar`, with all its effects.
+    - `scene`: a `Scene`, with all its effects.
+    - `plan`: a `Plan` made by `jaxlidar.plan`.
 
     **Returns:** a `Setup`.
 

@@ -1,4 +1,4 @@
-"""The static shape of a trace: time bins, which scatterers exist, their letters, the sizes of every loop."""
+"""The static shape of a trace: time bins, scatterers and their letters, and the sizes of all loops."""
 
 import dataclasses
 from typing import NamedTuple
@@ -14,8 +14,11 @@ KERNEL = 3
 class Bins:
     """Fine time bins, with margins at both ends that collect what falls outside.
 
-    - `start`: centre of the first bin, ns. - `width`: ns. - `count`: bins within the window.
-    - `row`: the most bins that one deposit spans. - `kernel`: bins over which an instant is spread.
+    - `start`: centre of the first bin, ns.
+    - `width`: of a bin, ns.
+    - `count`: bins within the window.
+    - `row`: the most bins that one deposit spans.
+    - `kernel`: bins over which a return at an instant is spread.
     """
 
     start: float
@@ -31,20 +34,20 @@ class Bins:
 
     @property
     def padded(self) -> int:
-        """Bins with the margins."""
+        """Number of bins with the margins."""
         return self.count + 2 * self.row
 
     def position(self, time: Float[Array, "*s"]) -> Float[Array, "*s"]:
-        """Time in units of bins; integers are centres; beyond the margins it stays at their ends."""
+        """Time in units of bins, clipped to the margins; integers are centres of bins."""
         return jnp.clip((time - self.start) / self.width, -self.row, self.count + self.row)
 
     def trim(self, padded: Float[Array, "... padded"]) -> Float[Array, "... bins"]:
-        """Without the margins."""
+        """The bins without the margins."""
         return padded[..., self.row : self.row + self.count]
 
 
 class Scatterer(NamedTuple):
-    """Number of a material and of its letters; -1 where it has no such letter."""
+    """Numbers of a material and of its letters; -1 where it has no such letter."""
 
     material: int
     reflected: int
@@ -54,14 +57,20 @@ class Scatterer(NamedTuple):
 class TracePlan(NamedTuple):
     """Everything that the tracer must know before it is compiled. Made by `jaxlidar.plan`.
 
-    - `materials`, `letters`: names, in order. - `leaf`, `bark`, `surfaces`: the scatterers.
+    - `materials`, `letters`: names, in order.
+    - `leaf`, `bark`, `surfaces`: the scatterers.
     - `full_cover`, `mirrors`: for each surface, whether no ray slips through, and whether it is a mirror.
-    - `upstream`: where rays start, m above the reference plane along the axis. - `first_steps`,
-      `march_steps`: bounds on faces crossed.
-    - `max_step`, `max_flight`: m. - `last`: longest path to the sensor that is recorded, m relative to the
-      way to the reference plane. - `lobe`: probability with which reflection is chosen over transmission.
-    - `ends`: points of each flight from which light returns. - `drawn_first`: whether order one returns from
-      drawn collisions, as the others. - `independent`: whether photons draw independent numbers.
+    - `has_ground`, `hotspot`: whether the scene has a ground, and a canopy with the hot spot.
+    - `vertical`: whether the beam is at nadir.
+    - `upstream`: where rays start, m above the reference plane along the axis.
+    - `first_steps`, `march_steps`: bounds on the faces crossed by a ray of order one, and by a flight.
+    - `max_step`, `max_flight`: longest stretch of order one, and longest flight, m.
+    - `last`: longest path to the sensor that is recorded, m relative to the way to the reference plane.
+    - `lobe`: probability with which reflection is chosen over transmission.
+    - `orders`: scatterings followed.
+    - `ends`: points of each flight from which light returns.
+    - `drawn_first`: whether order one returns from drawn collisions, as the others do.
+    - `independent`: whether photons draw independent numbers.
     """
 
     materials: tuple[str, ...]

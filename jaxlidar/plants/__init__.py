@@ -1,1 +1,1 @@
-"""Plants as geometry: L-systems, trees, forests, and their voxels."""
+"""Plants as geometry: L-systems, trees, forests, and their voxel maps."""

@@ -17,10 +17,24 @@ WAVELENGTHS = (532.0, 1064.0, 1550.0)
 
 
 def demo_lidar(wavelength: float | tuple[float, ...] = 1064.0) -> Lidar:
-    """A lidar 1000 m above the ground whose footprint, 6 m across, covers much of the crown.
+    """The lidar of the demonstration: 1000 m above the ground, with a footprint 6 m across.
 
-    Pulse 6 ns, sampling interval 1 ns, aperture 0.2 m, field of view 8 m across. `wavelength` is in nm.
-    Default 1064.
+    The footprint covers much of the crown. The pulse is 6 ns long, the sampling interval 1 ns, the aperture
+    0.2 m, and the field of view 8 m across.
+
+    **Arguments:**
+
+    - `wavelength`: nm, one number or several. Default 1064.
+
+    **Returns:** a `Lidar`.
+
+    **Raises:** ValueError for an inadmissible wavelength.
+
+    **Example:**
+
+    >>> from jaxlidar.plants.demo import demo_lidar
+    >>> float(demo_lidar().altitude)
+    1000.0
     """
     return Lidar(
         wavelength=wavelength,
@@ -33,14 +47,18 @@ def demo_lidar(wavelength: float | tuple[float, ...] = 1064.0) -> Lidar:
 
 
 def demo_scene(voxel_size: float = 0.25, *, seed: int = 0) -> Scene:
-    """The tree on soil of medium brightness, at z = 0. The leaf is PROSPECT-D's; the bark is measured.
+    """The scene of the demonstration: one tree on soil of medium brightness, at z = 0.
+
+    Leaf reflectance and transmittance are those of PROSPECT-D. The reflectance of the bark is measured.
 
     **Arguments:**
 
-    - `voxel_size`: edge in m, above 0 and at most 1. Default 0.25.
-    - `seed`: of the tree's growth. Default 0.
+    - `voxel_size`: voxel edge in m, above 0 and at most 1. Default 0.25.
+    - `seed`: random seed of the tree's growth. Default 0.
 
-    **Raises:** ValueError for a size outside (0, 1].
+    **Returns:** a `Scene`.
+
+    **Raises:** ValueError for a voxel size outside (0, 1].
     """
     if not 0 < voxel_size <= 1:
         raise ValueError(f"voxel_size = {voxel_size:g} is outside the admissible range (0, 1]")
@@ -55,6 +73,6 @@ def demo_scene(voxel_size: float = 0.25, *, seed: int = 0) -> Scene:
 
 
 def tree(voxel_size: float, *, seed: int) -> VoxelMap:
-    """The tree of the default habit with its 250 m2 of leaves, in voxels of the edge `voxel_size` (m)."""
+    """The voxel map of the default tree with 250 m2 of leaves; `voxel_size` is the voxel edge in m."""
     grown = grow(seed=seed)
     return voxelise(grown, voxel_size, leaf_area=LEAF_AREA / len(grown.bud_position), wood="surface")

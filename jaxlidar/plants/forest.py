@@ -1,4 +1,4 @@
-"""Forests: trees of given habits, placed at random by density with a minimum distance."""
+"""Forests: trees of given habits, placed at random with a given stem density and a minimum distance."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -10,7 +10,7 @@ from jaxlidar._checks import check_range
 from jaxlidar.plants.habits import Habit, grow
 from jaxlidar.plants.tree import Tree
 
-# Darts in a row that find no room, after which an area is taken as full.
+# The area is taken as full after this many rejected positions in a row.
 FRUITLESS = 20_000
 BATCH = 200
 
@@ -27,29 +27,38 @@ def forest(
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
     seed: int | np.random.Generator = 0,
 ) -> list[Tree]:
-    """Place trees on a level rectangle, each turned by an azimuth of its own.
+    """Grow a forest stand: trees at random positions on a level rectangle, each with a random azimuth.
 
-    Positions are drawn one by one, evenly over the rectangle, and kept where no stem stands closer than the
-    minimum distance (random sequential addition). Crowns may reach over the edges.
+    Positions are drawn one by one, uniformly over the rectangle. A position is kept if no other stem is
+    closer than the minimum distance (random sequential addition). Crowns may reach over the edges.
 
     **Arguments:**
 
     - `habits`: a `Habit` or several. Default None: `broadleaf()`.
-    - `density`: stems per hectare, positive; density times area is rounded to whole trees, at least one.
-    - `area`: (east, north) sides in m, positive.
-    - `minimum_distance`: between stems, m, 0 or more. Default 2.
-    - `shares`: of each habit, in proportion to which trees are drawn; 0 or more, not all 0. Default None:
+    - `density`: stems per hectare, positive. Density times area is rounded to whole trees, at least one.
+    - `area`: (east, north) side lengths in m, positive.
+    - `minimum_distance`: smallest distance between stems in m, 0 or more. Default 2.
+    - `shares`: relative frequency of each habit, one number per habit, 0 or more, not all 0. Default None:
       equal.
-    - `size`: (low, high) positive factor on heights and trunk diameters, drawn evenly. Default (1, 1).
-    - `individuals`: how many of each habit are grown; trees are drawn from those, so that some are the same
-      but for their azimuth. Default 8. None: every tree is grown, which takes longer.
-    - `origin`: of the south-west corner, at the ground, m. Default (0, 0, 0).
-    - `seed`: of all that is drawn, or a generator. Default 0.
+    - `size`: (low, high), positive: the range of a factor on height and trunk diameter, drawn uniformly for
+      each individual grown. Trunks do not get thinner than the habit's smallest diameter. Default (1, 1).
+    - `individuals`: how many different trees are grown of each habit, at most; 1 or more. The trees of the
+      stand are drawn from these, so that some differ in position and azimuth only. None: every tree is
+      grown separately, which takes longer. Default 8.
+    - `origin`: (x, y, z) of the south-west corner at the ground, m. Default (0, 0, 0).
+    - `seed`: random seed, or a NumPy generator. Default 0.
 
-    **Returns:** the trees, in the order in which they were placed; each one's place is its `base`.
+    **Returns:** a list of `Tree`, in the order of placement. The position of a tree is its `base`.
 
-    **Raises:** ValueError for what is outside the ranges above, and where so many trees cannot be placed at
-    that distance: random placement fills at most about 0.7 / minimum_distance^2 stems per m2.
+    **Raises:** ValueError for arguments outside the ranges above, and if so many trees cannot be placed at
+    that distance. Random placement fills at most about 0.7 / minimum_distance^2 stems per m2.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> trees = jl.forest(jl.shrub(stems=2), density=200.0, area=(30.0, 20.0), individuals=2)
+    >>> print(f"{len(trees)} trees of {trees[0].height:.1f} m")
+    12 trees of 2.5 m
     """
     kinds = [Habit()] if habits is None else [habits] if isinstance(habits, Habit) else list(habits)
     if not kinds:
@@ -97,7 +106,7 @@ def forest(
 def _places(
     count: int, area: tuple[float, float], distance: float, density: float, rng: np.random.Generator
 ) -> Float[np.ndarray, "{count} 2"]:
-    """Points by dart throwing."""
+    """Random positions, no two of them closer than `distance`."""
     placed = np.empty((count, 2))
     done, missed = 0, 0
     while done < count:

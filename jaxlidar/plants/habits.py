@@ -1,11 +1,11 @@
-"""How trees grow: habits, which are the numbers of an L-system that branches by da Vinci's rule.
+"""Growth habits of trees: parameters of an L-system whose branching follows da Vinci's rule.
 
-Where an axis of diameter d branches, d^p = sum of d_i^p over those that go on, with p = 2: the cross-section
-is kept (da Vinci; Richter 1970, The Notebooks of Leonardo da Vinci, 394). An axis goes on as thinner wood and
-gives the rest to its laterals. From any point to the tip of its axis is a length in proportion to
-d^`length_exponent`, so that laterals are shorter than what they grow on, and crowns get their outline from
-how the cross-section is shared. An axis ends where a fork would be thinner than `smallest_diameter`, in a
-twig that tapers to exactly that. What is thinner is not wood here: shoots, on which the buds sit.
+Where an axis of diameter d branches, d^p = sum of d_i^p over the axis that continues and its laterals. With
+p = 2 the cross-section is conserved (da Vinci; Richter 1970, The Notebooks of Leonardo da Vinci, 394). The
+length from any point of an axis to its tip is proportional to d^`length_exponent`. Laterals are therefore
+shorter than the axis that bears them, and the outline of the crown follows from how the cross-section is
+shared. An axis ends where a fork would be thinner than `smallest_diameter`: in a twig that tapers to exactly
+that diameter. Thinner wood is not modelled; buds sit on shoots without wood.
 
 The default, `broadleaf()`, is the tree of Table 2 of the paper: 15 m tall, 0.89 m thick at the base, branches
 down to 0.03 m, leaf clumps 0.06 m across.
@@ -23,7 +23,7 @@ from jaxlidar.plants.tree import Tree
 from jaxlidar.plants.turtle import turtle
 
 GOLDEN_ANGLE = 137.50776405
-# Standard deviations in degrees: of a lateral's place round its axis, and of a shoot's turn at each bud.
+# Standard deviations in degrees: of a lateral's azimuth around its axis, and of a shoot's bend at each bud.
 DIVERGENCE_SPREAD = 15.0
 SHOOT_SPREAD = 28.0
 BUDS = ("bud_position", "bud_direction", "bud_radius")
@@ -31,23 +31,31 @@ BUDS = ("bud_position", "bud_direction", "bud_radius")
 
 @dataclass(frozen=True)
 class Branching:
-    """How an axis branches.
+    """The branching pattern of an axis: number, thickness and angles of its lateral branches.
 
     **Arguments:**
 
-    - `laterals`: how many at a node, 1 or more; a fork near the twigs, where so many would be too thin, has
-      one. Default 1.
+    - `laterals`: number of lateral branches at a node, 1 or more. Near the twigs, where so many would be too
+      thin, a node has one. Default 1.
     - `share`: (low, high) share of the cross-section that the laterals of a node take together, within
-      [0, 1]; drawn evenly for each. No lateral gets thicker than what goes on. Default (0.2, 0.5).
-    - `angle`: degrees between a lateral and what goes on, 0 to 180. Where there is one lateral, both turn
-      away from the axis, the thicker one less. Default 50.
-    - `angle_spread`: standard deviation of `angle`, degrees. Default 8.
-    - `divergence`: degrees round the axis from node to node. Default the golden angle, 137.5.
-    - `bend`: standard deviation of the turns along an axis of the smallest diameter, degrees a piece of an
-      internode; thicker wood bends less, by the fourth root of its diameter. Default 7.
-    - `tropism`: degrees by which a horizontal piece turns up; negative is down. Default 2.
+      [0, 1]; drawn uniformly. No lateral gets thicker than the axis that continues. Default (0.2, 0.5).
+    - `angle`: angle between a lateral and the axis that continues, degrees, 0 to 180. With one lateral, both
+      turn away from the old direction, the thicker one less. Default 50.
+    - `angle_spread`: standard deviation of `angle`, degrees, 0 or more. Default 8.
+    - `divergence`: rotation around the axis from one node to the next, degrees. A normal deviate with a
+      standard deviation of 15 degrees is added. Default: the golden angle, 137.5.
+    - `bend`: standard deviation of the random bends of an axis of the smallest diameter, degrees per piece
+      of an internode, 0 or more. Thicker wood bends less, by the fourth root of its diameter. Default 7.
+    - `tropism`: upward bend of a horizontal piece, degrees; negative is downward. Default 2.
 
-    **Raises:** ValueError for what is outside the ranges above.
+    **Raises:** ValueError for values outside the ranges above.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> habit = jl.conifer(trunk=jl.Branching(laterals=4, angle=80.0))
+    >>> print(f"whorls of {habit.trunk.laterals}, {habit.trunk.angle} degrees from the trunk")
+    whorls of 4, 80.0 degrees from the trunk
     """
 
     laterals: int = 1
@@ -72,29 +80,44 @@ class Branching:
 
 @dataclass(frozen=True)
 class Habit:
-    """The habit of a tree: sizes and proportions from which `grow` makes individuals.
+    """The growth habit of a tree: sizes and branching proportions from which `grow` makes individuals.
+
+    Defaults give the broadleaved tree of Table 2 of the paper.
 
     **Arguments:**
 
-    - `height`: m, from the base to the highest wood. Default 15.
-    - `trunk_diameter`: m, at the base, of the thickest stem. Default 0.89.
-    - `smallest_diameter`: m, of the branches; at most `trunk_diameter`. Default 0.03.
-    - `clump_diameter`: m, of the leaves round a bud. Default 0.06.
-    - `exponent`: p of da Vinci's rule, positive. Default 2.
-    - `length_exponent`: of diameter, to which the lengths of axes are in proportion, positive. Default 0.8.
-    - `bole`: share of the trunk's length below its first node, in [0, 1). Default 0.2.
-    - `stems`: how many grow from the base, 1 or more. Default 1.
-    - `stem_angle`: degrees by which they lean outward, 0 to 90. Default 0.
-    - `trunk`, `branches`: how axes of order 0, and all others, branch.
-    - `pieces`: segments into which an internode is divided, to bend between. Default 3.
+    - `height`: from the base to the highest wood, m, positive. Default 15.
+    - `trunk_diameter`: diameter of the thickest stem at the base, m, positive. Default 0.89.
+    - `smallest_diameter`: diameter at the ends of the branches, m, positive, at most `trunk_diameter`.
+      Default 0.03.
+    - `clump_diameter`: diameter of the leaf clump around a bud, m, positive. Default 0.06.
+    - `exponent`: exponent p of da Vinci's rule, positive. Default 2.
+    - `length_exponent`: exponent q in length ~ diameter^q, for the length from a point of an axis to its tip;
+      positive. Default 0.65.
+    - `bole`: share of the trunk's length that is below its first node, in [0, 1). Default 0.08.
+    - `stems`: number of stems that grow from the base, 1 or more. All but the first have 0.6 to 1 times
+      `trunk_diameter`, drawn uniformly. Default 1.
+    - `stem_angle`: outward lean of the stems, degrees, 0 to 90. Each stem leans by 0.4 to 1.3 times this,
+      drawn uniformly. Default 0.
+    - `trunk`: `Branching` of the axes of order 0. Default `Branching()`.
+    - `branches`: `Branching` of all other axes. Default `Branching()`.
+    - `pieces`: number of straight segments in an internode, 1 or more. Default 3.
     - `twig`: length of the twig beyond the last fork, as a share of the length that an axis as thin as
-      `smallest_diameter` would have; positive. Default 0.4.
-    - `shoots`: on each twig, 0 or more. Default 8.
-    - `shoot_length`: m, positive. Default 0.6.
-    - `shoot_angle`: degrees between shoot and twig, 0 to 180. Default 50.
-    - `shoot_buds`: on each shoot, at even distances, 1 or more. Default 8.
+      `smallest_diameter` would have; positive. Twigs that start thicker are longer. Default 0.4.
+    - `shoots`: number of shoots on each twig, 0 or more. The last one continues the twig. Default 8.
+    - `shoot_length`: length of a shoot, m, positive. Default 0.6.
+    - `shoot_angle`: angle between shoot and twig, degrees, 0 to 180. Default 50.
+    - `shoot_buds`: number of buds on each shoot, at equal distances, 1 or more. Default 8.
 
-    **Raises:** ValueError for what is outside the ranges above.
+    **Raises:** ValueError for values outside the ranges above.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> habit = jl.Habit(height=12.0, trunk_diameter=0.5, smallest_diameter=0.1)
+    >>> tree = jl.grow(habit, seed=1)
+    >>> print(f"{tree.height:.1f} m tall, {tree.trunk_diameter:.1f} m thick")
+    12.0 m tall, 0.5 m thick
     """
 
     height: float = 15.0
@@ -128,10 +151,13 @@ class Habit:
             check_range(name, getattr(self, name), low)
 
     def wood(self) -> LSystem:
-        """The L-system of the wood.
+        """The L-system that grows the wood.
 
-        `R` is the root, `A(d)` and `B(d)` are the growing ends of trunk and branches of diameter d (m), `S`
-        is a shoot yet to be; the rest is the turtle's. Lengths are relative: 1 is the trunk above the bole.
+        `R` is the root. `A(d)` and `B(d)` are the growing ends of trunk and branches of diameter d (m). `S`
+        marks where `foliage` puts a shoot. All other symbols are those of `jaxlidar.turtle`. Lengths are
+        relative: 1 is the length of the trunk above the bole.
+
+        **Returns:** an `LSystem`.
         """
         rules = [Rule("R", self._stems, random=True)]
         for symbol, how in (("A", self.trunk), ("B", self.branches)):
@@ -139,7 +165,14 @@ class Habit:
         return LSystem("R", rules)
 
     def foliage(self, wood: Word) -> LSystem:
-        """The L-system that, in one step, puts shoots and buds on wood whose lengths are in m."""
+        """The L-system that puts shoots and buds on the wood in one step.
+
+        **Arguments:**
+
+        - `wood`: the word of the wood, with lengths in m.
+
+        **Returns:** an `LSystem`.
+        """
         step = self.shoot_length / self.shoot_buds
 
         def shoot(*, rng: np.random.Generator) -> Iterator[Item]:
@@ -151,7 +184,7 @@ class Habit:
         return LSystem(wood, [Rule("S", shoot, random=True)])
 
     def _path(self, diameter: Any) -> Any:
-        """Relative length from where an axis has this diameter to its tip."""
+        """Relative length from the point where an axis has this diameter to its tip."""
         return (diameter / self.trunk_diameter) ** self.length_exponent
 
     def _stems(self, *, rng: np.random.Generator) -> Iterator[Item]:
@@ -164,7 +197,7 @@ class Habit:
             yield from [("A", d), "]"]
 
     def _axis(self, symbol: str, how: Branching) -> list[Rule]:
-        """Branch into as many laterals as `how` says; if they would be too thin, fork; if so again, end."""
+        """Rules of an axis: the laterals of `how`; one lateral if those are too thin; else a twig."""
         p, smallest = self.exponent, self.smallest_diameter
         many, two = ((n * smallest**p) ** (1 / p) for n in (how.laterals + 1, 2))
 
@@ -187,7 +220,7 @@ class Habit:
         self, symbol: str, d: Any, laterals: int, how: Branching, rng: np.random.Generator
     ) -> Iterator[Item]:
         n, p = len(d), self.exponent
-        # Even the thinnest lateral is wood, and none is thicker than what goes on.
+        # No lateral is thinner than the smallest diameter or thicker than the axis that continues.
         low, high = (self.smallest_diameter / d) ** p, 1 / (laterals + 1)
         shares = np.clip(rng.uniform(*how.share, (laterals, n)) / laterals, np.minimum(low, high), high)
         rest = 1 - shares.sum(axis=0)
@@ -217,7 +250,7 @@ class Habit:
     def _internode(
         self, length: Any, begin: Any, end: Any, how: Branching, rng: np.random.Generator, shoots: Any
     ) -> Iterator[Item]:
-        """Pieces that bend, with the shoots spread over their ends; `begin` and `end` are diameters."""
+        """Pieces with bends between them and shoots at their ends; `begin` and `end` are diameters in m."""
         k = self.pieces
         bend = how.bend * (self.smallest_diameter / begin) ** 0.25
         for i in range(k):
@@ -229,17 +262,27 @@ class Habit:
 
 
 def grow(habit: Habit | None = None, *, seed: int | np.random.Generator = 0) -> Tree:
-    """Grow one individual, with its base at the origin.
+    """Grow one tree of a habit, with its base at the origin.
 
-    The wood is rewritten until no end of it can branch, its lengths are scaled to the habit's height, then
-    shoots and buds are put on. Buds whose clumps would reach below the base are left out.
+    The L-system of the wood is rewritten until no axis can branch further. Lengths are then scaled to the
+    height of the habit, and shoots and buds are added. Buds whose clumps would reach below the base are left
+    out.
 
     **Arguments:**
 
-    - `habit`: a `Habit`. Default None: `broadleaf()`, the tree of Table 2.
-    - `seed`: of all that is drawn, or a generator. Default 0.
+    - `habit`: a `Habit`. Default None: `broadleaf()`, the tree of Table 2 of the paper.
+    - `seed`: random seed, or a NumPy generator. Default 0.
 
-    **Raises:** ValueError where the habit lets the wood grow nowhere upward.
+    **Returns:** a `Tree`.
+
+    **Raises:** ValueError if the wood of the habit does not grow upward at all.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> tree = jl.grow(jl.shrub(height=1.0), seed=3)
+    >>> print(f"{tree.height:.2f} m tall, {int(tree.roots.sum())} stems")
+    1.00 m tall, 9 stems
     """
     habit = broadleaf() if habit is None else habit
     rng = np.random.default_rng(seed)
@@ -258,12 +301,44 @@ def grow(habit: Habit | None = None, *, seed: int | np.random.Generator = 0) -> 
 
 
 def broadleaf(**changes: Any) -> Habit:
-    """A broadleaved tree grown in the open: Table 2's. `changes` are fields of `Habit` that differ."""
+    """The habit of an open-grown broadleaved tree: the tree of Table 2 of the paper, 15 m tall.
+
+    **Arguments:**
+
+    - `changes`: fields of `Habit` with other values, by name.
+
+    **Returns:** a `Habit`.
+
+    **Raises:** ValueError for values outside the ranges of `Habit`; TypeError for unknown fields.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> habit = jl.broadleaf(height=20.0)
+    >>> habit.height, habit.trunk_diameter, habit.smallest_diameter
+    (20.0, 0.89, 0.03)
+    """
     return replace(Habit(), **changes)
 
 
 def conifer(**changes: Any) -> Habit:
-    """A spruce-like conifer: one straight trunk, whorls of branches, a conical crown. Changes as above."""
+    """The habit of a spruce-like conifer: a straight trunk, whorls of branches, a conical crown, 20 m tall.
+
+    **Arguments:**
+
+    - `changes`: fields of `Habit` with other values, by name.
+
+    **Returns:** a `Habit`.
+
+    **Raises:** ValueError for values outside the ranges of `Habit`; TypeError for unknown fields.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> habit = jl.conifer(height=25.0)
+    >>> print(f"{habit.height} m tall, whorls of {habit.trunk.laterals} branches")
+    25.0 m tall, whorls of 5 branches
+    """
     habit = Habit(
         height=20.0,
         trunk_diameter=0.4,
@@ -280,7 +355,23 @@ def conifer(**changes: Any) -> Habit:
 
 
 def spreading(**changes: Any) -> Habit:
-    """A broadleaved tree wider than tall, as an umbrella thorn or an old oak in a field. Changes as above."""
+    """The habit of a spreading broadleaved tree, 10 m tall and mostly wider, such as an old oak in a field.
+
+    **Arguments:**
+
+    - `changes`: fields of `Habit` with other values, by name.
+
+    **Returns:** a `Habit`.
+
+    **Raises:** ValueError for values outside the ranges of `Habit`; TypeError for unknown fields.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> tree = jl.grow(jl.spreading(smallest_diameter=0.1))
+    >>> print(f"{tree.height:.1f} m tall, {tree.trunk_diameter:.1f} m thick")
+    10.0 m tall, 0.7 m thick
+    """
     habit = Habit(
         height=10.0,
         trunk_diameter=0.7,
@@ -293,7 +384,23 @@ def spreading(**changes: Any) -> Habit:
 
 
 def shrub(**changes: Any) -> Habit:
-    """A shrub of many stems from one base. Changes as above."""
+    """The habit of a shrub with nine stems from one base, 2.5 m tall.
+
+    **Arguments:**
+
+    - `changes`: fields of `Habit` with other values, by name.
+
+    **Returns:** a `Habit`.
+
+    **Raises:** ValueError for values outside the ranges of `Habit`; TypeError for unknown fields.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> habit = jl.shrub(height=1.5, stems=4)
+    >>> print(f"{habit.stems} stems, {habit.height} m tall")
+    4 stems, 1.5 m tall
+    """
     habit = Habit(
         height=2.5,
         trunk_diameter=0.05,

@@ -1,23 +1,14 @@
 """L-systems: words of modules, and rules that rewrite all modules of a word at once.
 
-A module is a symbol with numbers, a word is a sequence of modules, and a rule replaces a module by a word
+A module is a symbol with parameters, a word is a sequence of modules, and a rule replaces a module by a word
 (Prusinkiewicz and Lindenmayer 1990, The Algorithmic Beauty of Plants, chapter 1). Rules are parametric (they
-compute with the module's numbers), conditional, and stochastic (those that apply compete by weight); they do
-not look at neighbours. What the symbols mean in space is in `jaxlidar.turtle`.
+compute with the parameters of the module), conditional, and stochastic (among the rules that apply, one is
+chosen by weight). They are context-free: they do not look at neighbouring modules. `jaxlidar.turtle` turns a
+word into geometry.
 
-All modules of one symbol are rewritten together, so that a rule sees arrays, one element a module: write
-NumPy expressions, and write cases as rules with conditions. A binary tree whose branches end at 1 cm:
-
-    import jaxlidar as jl
-
-    grow = jl.Rule(
-        "A",
-        lambda r: [("F", 50 * r, r), "[", ("+", 35), ("A", 0.8 * r), "]", ("-", 20), "/", ("A", 0.6 * r)],
-        condition=lambda r: r >= 0.01,
-    )
-    end = jl.Rule("A", lambda r: "J", condition=lambda r: r < 0.01)
-    word = jl.LSystem([("A", 0.1)], [grow, end]).rewrite()
-    tree = jl.turtle(word, angle=90)
+All modules of one symbol are rewritten together. A rule therefore receives arrays with one element per
+module: write NumPy expressions, and write different cases as rules with conditions. An example is in
+`jaxlidar.LSystem`.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -32,7 +23,19 @@ Item = str | tuple[Any, ...]
 
 
 class Module(NamedTuple):
-    """A symbol, one character, with its parameters."""
+    """One module of a word: a symbol with its parameters.
+
+    **Arguments:**
+
+    - `symbol`: one character.
+    - `parameters`: a tuple of numbers. Default ().
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> print(jl.Module("F", (2.0, 0.1)))
+    F(2,0.1)
+    """
 
     symbol: str
     parameters: tuple[float, ...] = ()
@@ -43,13 +46,22 @@ class Module(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Word:
-    """A sequence of modules, held as arrays. `Word.of` makes one; iterating gives each `Module`.
+    """A word of an L-system: a sequence of n modules, stored as arrays.
+
+    `Word.of` makes one. Iterating over a word gives each `Module`.
 
     **Arguments:**
 
     - `codes`: (n,) Unicode code points of the symbols.
-    - `arity`: (n,) how many parameters each module has.
-    - `parameters`: (n, p) parameters, NaN beyond a module's arity.
+    - `arity`: (n,) number of parameters of each module.
+    - `parameters`: (n, p) parameters; NaN beyond the arity of a module.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> word = jl.Word.of([("F", 2.0), "[", ("+", 30.0), "J]J"])
+    >>> print(word, len(word), word.alphabet)
+    F(2)[+(30)J]J 6 +FJ[]
     """
 
     codes: UInt32[np.ndarray, " n"]
@@ -58,7 +70,14 @@ class Word:
 
     @staticmethod
     def of(items: str | Iterable[Item]) -> "Word":
-        """From a string of plain symbols, or a sequence of strings and of (symbol, parameter, ...).
+        """Make a word of symbols and parameters.
+
+        **Arguments:**
+
+        - `items`: a string of symbols without parameters, or a sequence of such strings and of tuples
+          (symbol, parameter, ...).
+
+        **Returns:** a `Word`.
 
         **Raises:** ValueError for symbols that are not one character and parameters that are not finite.
         """
@@ -77,31 +96,50 @@ class Word:
 
     @property
     def alphabet(self) -> str:
-        """The symbols that occur, sorted."""
+        """The different symbols of the word, sorted, as one string."""
         return "".join(map(chr, np.unique(self.codes).tolist()))
 
     def where(self, symbol: str) -> Int[np.ndarray, " k"]:
-        """Indices of the modules with this symbol."""
+        """Indices of all modules with one symbol.
+
+        **Arguments:**
+
+        - `symbol`: one character.
+
+        **Returns:** (k,) indices from 0, ascending.
+        """
         return np.flatnonzero(self.codes == ord(symbol))
 
 
 @dataclass(frozen=True)
 class Rule:
-    """What replaces a module.
+    """A production rule of an L-system: what replaces a module.
+
+    Functions of a rule receive the parameters of the modules as separate (k,) arrays, one element for each
+    of the k modules.
 
     **Arguments:**
 
-    - `symbol`: one character, the predecessor.
-    - `produce`: from the module's parameters, (k,) arrays over the k modules that the rule replaces, to the
-      successor: a string of plain symbols, or a sequence of strings and of (symbol, parameter, ...) whose
-      parameters are numbers or (k,) arrays. An empty sequence removes the module.
-    - `condition`: from the same arrays to booleans, where the rule applies. Default None: everywhere.
-    - `weight`: among the rules that apply to a module, one is chosen with probability proportional to its
-      weight. Positive; or, as `condition`, from the parameters to (k,) weights, zero or more. Default 1.
-    - `random`: whether `produce` draws parameters; it is then given a `numpy.random.Generator` as `rng=`.
-      Default False.
+    - `symbol`: the symbol of the module that is replaced (the predecessor), one character.
+    - `produce`: function of the parameters that returns the successor: a string of symbols without
+      parameters, or a sequence of such strings and of tuples (symbol, parameter, ...). Parameters are numbers
+      or (k,) arrays. An empty sequence removes the module.
+    - `condition`: function of the parameters that returns (k,) booleans: where the rule applies. Default
+      None: everywhere.
+    - `weight`: among the rules that apply to a module, one is chosen with a probability proportional to its
+      weight. A positive number, or a function of the parameters that returns (k,) weights, 0 or more.
+      Default 1.
+    - `random`: whether `produce` draws random numbers. It then receives a `numpy.random.Generator` as the
+      keyword argument `rng`. Default False.
 
     **Raises:** ValueError for a symbol that is not one character and a weight that is not positive.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> grow = jl.Rule("A", lambda n: ["F", ("A", n - 1)], condition=lambda n: n > 0)
+    >>> print(jl.LSystem([("A", 3)], [grow]).rewrite())
+    FFFA(0)
     """
 
     symbol: str
@@ -116,7 +154,16 @@ class Rule:
             raise ValueError(f"weight = {self.weight:g} is outside the admissible range (0, inf)")
 
     def weights(self, parameters: Float[np.ndarray, "p k"]) -> Float[np.ndarray, " k"]:
-        """The weight for each module, zero where the condition does not hold."""
+        """Weight of the rule for each module; zero where the condition does not hold.
+
+        **Arguments:**
+
+        - `parameters`: (p, k) the p parameters of k modules.
+
+        **Returns:** (k,) weights.
+
+        **Raises:** ValueError for weights that are negative or not finite.
+        """
         weight = self.weight(*parameters) if callable(self.weight) else self.weight
         weights = np.broadcast_to(np.asarray(weight, dtype=float), parameters.shape[1:])
         if not np.all(np.isfinite(weights) & (weights >= 0)):
@@ -129,12 +176,24 @@ class Rule:
 
 @dataclass(frozen=True)
 class LSystem:
-    """An axiom and rules. A module to which no rule applies stays as it is.
+    """An L-system: an axiom, which is the word to start from, and production rules.
+
+    A module to which no rule applies stays as it is.
 
     **Arguments:**
 
-    - `axiom`: the word to start from, in the form that `Word.of` takes, or a `Word`.
-    - `rules`: of any number of symbols, in any order.
+    - `axiom`: a `Word`, or symbols and parameters in the form that `Word.of` takes.
+    - `rules`: a sequence of `Rule`, for any number of symbols, in any order.
+
+    **Example:** a binary tree whose branches end at a radius of 1 cm.
+
+    >>> import jaxlidar as jl
+    >>> def fork(r):
+    ...     return [("F", 50 * r, r), "[", ("+", 35), ("A", 0.8 * r), "]", ("-", 20), "/", ("A", 0.6 * r)]
+    >>> rules = [jl.Rule("A", fork, lambda r: r >= 0.01), jl.Rule("A", lambda r: "J", lambda r: r < 0.01)]
+    >>> tree = jl.turtle(jl.LSystem([("A", 0.1)], rules).rewrite(), angle=90)
+    >>> print(f"{len(tree.start)} segments, {len(tree.bud_position)} buds")
+    153 segments, 154 buds
     """
 
     axiom: str | Sequence[Item] | Word
@@ -155,17 +214,20 @@ class LSystem:
         max_modules: int = 10_000_000,
         max_steps: int = 10_000,
     ) -> Word:
-        """The word after `steps` rewritings, or, by default, after as many as it takes until no rule applies.
+        """The word after a number of rewriting steps; by default, the word to which no rule applies any more.
 
         **Arguments:**
 
-        - `steps`: how many, 0 or more. Default None: until the word is stable.
-        - `seed`: of the stochastic choices, or a generator. Default 0.
-        - `max_modules`: a longer word is refused. Default ten million.
-        - `max_steps`: where `steps` is None, how many rewritings may be needed. Default 10,000.
+        - `steps`: number of steps, 0 or more. Default None: until no rule applies.
+        - `seed`: random seed of stochastic rules, or a NumPy generator. Default 0.
+        - `max_modules`: largest admissible length of the word. Default 10,000,000.
+        - `max_steps`: largest admissible number of steps where `steps` is None. Default 10,000.
 
-        **Raises:** ValueError for negative `steps`, words longer than `max_modules`, words that are not
-        stable after `max_steps`, and rules whose successors are malformed or not finite.
+        **Returns:** a `Word`.
+
+        **Raises:** ValueError for negative `steps`, words longer than `max_modules`, words to which rules
+        still apply after `max_steps`, rules whose successors are malformed or not finite, rules with
+        inadmissible weights, and symbols that occur with different numbers of parameters.
         """
         if steps is not None and steps < 0:
             raise ValueError(f"steps = {steps} is outside the admissible range [0, inf)")
@@ -232,7 +294,7 @@ class LSystem:
 
 
 def _choose(weights: Float[np.ndarray, "rules k"], rng: np.random.Generator) -> Int[np.ndarray, " k"]:
-    """For each module the number of the rule that replaces it; -1 where none applies."""
+    """For each module, the index of the rule that replaces it; -1 where none applies."""
     upper = np.cumsum(weights, axis=0)
     none = upper[-1] <= 0
     if np.all(np.count_nonzero(weights, axis=0) <= 1):

@@ -1,4 +1,4 @@
-"""A tree as geometry: branch segments, each a cone frustum, and leaf buds, each a clump of leaves."""
+"""The geometry of a tree: branch segments, which are cone frustums, and leaf clumps around buds."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
@@ -11,23 +11,31 @@ from jaxlidar._checks import check_range
 
 @dataclass(frozen=True, eq=False)
 class Tree:
-    """Branch segments and leaf buds, in metres, x east, y north, z up.
+    """The geometry of a tree: n branch segments, each a cone frustum, and m spherical leaf clumps.
 
-    Segments are ordered so that a parent comes before its children; several roots make several stems. Arrays
-    are double precision.
+    Coordinates are in metres, x east, y north, z up. A parent segment comes before its children. A tree with
+    several roots has several stems. Arrays are NumPy arrays in double precision.
 
     **Arguments:**
 
-    - `start`, `end`: (n, 3) the ends of each segment's axis.
-    - `radius_start`, `radius_end`: (n,) its radii there, positive.
-    - `parent`: (n,) index of the segment on which it grows, -1 for a root.
-    - `order`: (n,) branching order: 0 for the trunk, 1 for what branches off it, and so on.
-    - `bud_position`: (m, 3) centres of the leaf clumps.
-    - `bud_direction`: (m, 3) unit vectors in which the leaves' axes point.
-    - `bud_radius`: (m,) radii of the clumps, positive.
+    - `start`, `end`: (n, 3) the two ends of each segment's axis, m.
+    - `radius_start`, `radius_end`: (n,) radii at these ends, m, positive.
+    - `parent`: (n,) index of the segment on which each segment grows; -1 for a root.
+    - `order`: (n,) branching order, 0 or more: 0 for the trunk, 1 for branches on the trunk, and so on.
+    - `bud_position`: (m, 3) centres of the leaf clumps, m.
+    - `bud_direction`: (m, 3) unit vectors along the axes of the leaves.
+    - `bud_radius`: (m,) radii of the clumps, m, positive.
 
-    **Raises:** ValueError for what is not finite, radii that are not positive, directions that are not unit
-    vectors, and parents that do not come before their children.
+    **Raises:** ValueError for arrays of other shapes, values that are not finite, radii that are not
+    positive, negative orders, directions that are not unit vectors, and parents that do not come before their
+    children.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> tree = jl.turtle("F[+FJ]FJ", angle=45, length=2.0, radius=0.1)
+    >>> print(f"{tree.height:.1f} m tall, {tree.wood_volume:.3f} m3 of wood, orders {tree.order.tolist()}")
+    4.0 m tall, 0.188 m3 of wood, orders [0, 1, 0]
     """
 
     start: Float[np.ndarray, "n 3"]
@@ -66,7 +74,16 @@ class Tree:
 
     @staticmethod
     def joined(trees: Iterable["Tree"]) -> "Tree":
-        """The segments and buds of all trees as one."""
+        """Join the segments and leaf clumps of several trees into one `Tree`.
+
+        **Arguments:**
+
+        - `trees`: any number of `Tree`, at least one.
+
+        **Returns:** a `Tree` with the stems of all.
+
+        **Raises:** ValueError if there is no tree.
+        """
         trees = tuple(trees)
         if not trees:
             raise ValueError("trees is empty; at least one tree is admissible")
@@ -78,66 +95,96 @@ class Tree:
 
     @property
     def roots(self) -> Bool[np.ndarray, " n"]:
-        """Whether each segment grows from the ground, not from another segment."""
+        """Whether each segment is a root: it grows from the ground, not from another segment."""
         return self.parent < 0
 
     @property
     def base(self) -> Float[np.ndarray, "3"]:
-        """The mean of the points where the roots start, m."""
+        """Position of the stem base: the mean of the points where the roots start, m."""
         return self.start[self.roots].mean(axis=0) if len(self.start) else np.zeros(3)
 
     @property
     def height(self) -> float:
-        """From the base to the highest point of the wood's axes, m. Leaf clumps do not count."""
+        """Height of the wood: from the base to the highest point of the axes, m. Leaf clumps do not count."""
         if not len(self.start):
             return 0.0
         return float(max(self.start[:, 2].max(), self.end[:, 2].max()) - self.base[2])
 
     @property
     def trunk_diameter(self) -> float:
-        """At the base, of the thickest stem, m."""
+        """Diameter of the thickest stem at its base, m."""
         return 2 * float(self.radius_start[self.roots].max(initial=0.0))
 
     @property
     def smallest_diameter(self) -> float:
-        """Of all segments, m; infinite where there is none."""
+        """Smallest diameter of all segments, m; infinite if there are no segments."""
         return 2 * float(np.minimum(self.radius_start, self.radius_end).min(initial=np.inf))
 
     @property
     def length(self) -> Float[np.ndarray, " n"]:
-        """Of each segment, m."""
+        """Length of each segment, m."""
         return np.linalg.norm(self.end - self.start, axis=1)
 
     @property
     def wood_volume(self) -> float:
-        """Sum of the frustums, pi/3 l (a^2 + a b + b^2), in m3. Overlaps at the joints count twice."""
+        """Volume of wood in m3: the sum of pi/3 l (a^2 + a b + b^2). Overlaps at the joints count twice."""
         a, b = self.radius_start, self.radius_end
         return float(np.sum(np.pi / 3 * self.length * (a * a + a * b + b * b)))
 
     @property
     def clump_volume(self) -> float:
-        """Sum of the clumps' spheres in m3. Overlaps count twice."""
+        """Volume of the leaf clumps in m3: the sum of their spheres. Overlaps count twice."""
         return float(np.sum(4 / 3 * np.pi * self.bud_radius**3))
 
     def leafless(self) -> "Tree":
-        """The same wood without buds: the tree leaf-off."""
+        """The tree in leaf-off condition: the same wood without leaf clumps.
+
+        **Returns:** a `Tree`.
+        """
         return replace(
             self, bud_position=np.zeros((0, 3)), bud_direction=np.zeros((0, 3)), bud_radius=np.zeros(0)
         )
 
     def with_bud_radius(self, radius: float) -> "Tree":
-        """The same tree with clumps of another radius (m), that is with more or less leaf cover."""
+        """The same tree with leaf clumps of another radius, that is with more or less leaf cover.
+
+        **Arguments:**
+
+        - `radius`: radius of all clumps, m, positive.
+
+        **Returns:** a `Tree`.
+
+        **Raises:** ValueError for a radius that is not positive.
+        """
         check_range("radius", radius, 0.0, low_open=True)
         return replace(self, bud_radius=np.full(len(self.bud_radius), float(radius)))
 
     def translated(self, offset: tuple[float, float, float] | Float[np.ndarray, "3"]) -> "Tree":
-        """Moved by `offset` = (east, north, up) in m."""
+        """The tree moved to another place.
+
+        **Arguments:**
+
+        - `offset`: (east, north, up) displacement, m.
+
+        **Returns:** a `Tree`.
+
+        **Raises:** ValueError for an offset that is not finite.
+        """
         by = np.asarray(offset, dtype=float)
         check_range("offset", by)
         return replace(self, start=self.start + by, end=self.end + by, bud_position=self.bud_position + by)
 
     def rotated(self, angle: float) -> "Tree":
-        """Turned round the z axis by `angle` in degrees, clockwise seen from above, as azimuths are."""
+        """The tree turned about the z axis through the origin.
+
+        **Arguments:**
+
+        - `angle`: degrees, clockwise seen from above, as azimuths are.
+
+        **Returns:** a `Tree`.
+
+        **Raises:** ValueError for an angle that is not finite.
+        """
         check_range("angle", angle)
         c, s = np.cos(np.deg2rad(angle)), np.sin(np.deg2rad(angle))
         turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
@@ -150,7 +197,16 @@ class Tree:
         )
 
     def scaled(self, factor: float) -> "Tree":
-        """All lengths and radii, of wood and clumps, times `factor`, about the origin."""
+        """The tree scaled about the origin: all coordinates and radii, of wood and leaf clumps.
+
+        **Arguments:**
+
+        - `factor`: scale factor, positive.
+
+        **Returns:** a `Tree`.
+
+        **Raises:** ValueError for a factor that is not positive.
+        """
         check_range("factor", factor, 0.0, low_open=True)
         return replace(
             self,

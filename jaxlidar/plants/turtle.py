@@ -1,24 +1,4 @@
-"""The turtle: a word of an L-system read as instructions in space, giving branch segments and leaf buds.
-
-The turtle has a position, a heading H, its left L and its up U = H x L, and a radius. Angles are in degrees,
-lengths in m; numbers in brackets may be left out, and the turtle's own `angle`, `length` and radius serve.
-
-| symbol | what the turtle does |
-| --- | --- |
-| `F(length, radius, radius at the end)` | moves forward and leaves a branch segment |
-| `f(length)` | moves forward |
-| `+(angle)`, `-(angle)` | turns left, right |
-| `&(angle)`, `^(angle)` | pitches down, up |
-| `\\(angle)`, `/(angle)` | rolls left, right |
-| `|` | turns round |
-| `$` | rolls so that its left is horizontal |
-| `T(angle)` | bends upward by angle * sin(heading's angle from the vertical); downward if negative |
-| `!(radius)` | sets the radius |
-| `J(radius)` | leaves a leaf bud |
-| `[`, `]` | remembers, returns to the remembered state: what stands between is a branch |
-
-All other symbols are passed over. Source: Prusinkiewicz and Lindenmayer (1990), sections 1.5, 1.10 and 2.1.
-"""
+"""Turtle interpretation of L-systems: a word becomes branch segments and leaf buds in space."""
 
 from math import cos, radians, sin, sqrt
 
@@ -29,9 +9,9 @@ from jaxlidar.plants.lsystem import Word
 from jaxlidar.plants.tree import Tree
 
 Vector = tuple[float, float, float]
-# Of heading (0), left (1) and up (2): which turns towards which, and in which sense.
+# Axes are heading (0), left (1) and up (2): the first turns towards the second, with this sign.
 TURNS = {"+": (0, 1, 1), "-": (0, 1, -1), "&": (0, 2, -1), "^": (0, 2, 1), "\\": (1, 2, -1), "/": (1, 2, 1)}
-# Sine of the angle from the vertical, below which a heading counts as vertical.
+# A heading counts as vertical if the sine of its angle from the vertical is below this.
 VERTICAL = 1e-9
 
 
@@ -46,23 +26,55 @@ def turtle(
     heading: tuple[float, float, float] = (0.0, 0.0, 1.0),
     left: tuple[float, float, float] = (-1.0, 0.0, 0.0),
 ) -> Tree:
-    """Walk along a word. The symbols are those of the module's docstring.
+    """The tree geometry that a word of an L-system describes, by turtle interpretation.
+
+    A turtle moves through space as the symbols say, and adds branch segments and leaf buds to the tree. It
+    has a position, a heading H, a left L, an up U = H x L, and a branch radius. Angles are in degrees,
+    lengths and radii in m. Parameters in parentheses may be left out; then `angle`, `length`, `bud_radius`
+    and the turtle's own radius are used.
+
+    - `F(length, radius, end radius)`: moves forward and adds a branch segment. Without an end radius, the
+      segment is a cylinder.
+    - `f(length)`: moves forward.
+    - `+(angle)`, `-(angle)`: turns left, right.
+    - `&(angle)`, `^(angle)`: pitches down, up.
+    - `\\(angle)`, `/(angle)`: rolls left, right.
+    - `|`: turns to the opposite direction, about U.
+    - `$`: rolls so that L is horizontal.
+    - `T(angle)`: bends the heading upward by angle * sin(angle between the heading and the vertical);
+      downward if `angle` is negative.
+    - `!(radius)`: sets the branch radius.
+    - `J(radius)`: adds a leaf bud.
+    - `[`, `]`: stores the state, and returns to the state stored last. A branch stands between them.
+
+    All other symbols are skipped.
 
     **Arguments:**
 
-    - `word`: a `Word`, or a string of plain symbols.
-    - `angle`: degrees, where a symbol gives none. Default 90.
-    - `length`: m, where a symbol gives none. Default 1.
-    - `radius`: m, the branch radius to start with. Default 0.01.
-    - `bud_radius`: m, where `J` gives none. Default 0.03.
-    - `position`: m, where to start. Default the origin.
-    - `heading`: where to look at first, of any length. Default up.
-    - `left`: where the left is then; what of it is along the heading does not count. Default west.
+    - `word`: a `Word`, or a string of symbols without parameters.
+    - `angle`: angle of symbols without a parameter, degrees. Default 90.
+    - `length`: length of symbols without a parameter, m. Default 1.
+    - `radius`: branch radius at the start, m, positive. Default 0.01.
+    - `bud_radius`: radius of leaf clumps where `J` has no parameter, m, positive. Default 0.03.
+    - `position`: (x, y, z) of the start, m. Default (0, 0, 0).
+    - `heading`: heading at the start, a vector of any length but zero. Default (0, 0, 1): up.
+    - `left`: left at the start, a vector not along the heading; only its part across the heading counts.
+      Default (-1, 0, 0): west.
 
-    **Returns:** a `Tree`. A segment's order is the number of branchings on the way to it.
+    **Returns:** a `Tree`. The order of a segment is the number of branchings between it and its root.
 
-    **Raises:** ValueError for brackets that do not match, radii that are not positive, a heading of zero
-    length or along `left`, and numbers that are not finite.
+    **Raises:** ValueError for brackets that do not match, radii that are not positive, a heading or left of
+    zero length, a left along the heading, and numbers that are not finite.
+
+    **Source:** Prusinkiewicz and Lindenmayer (1990), The Algorithmic Beauty of Plants, sections 1.5, 1.10 and
+    2.1.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> tree = jl.turtle("F[+FJ]FJ", angle=45, length=2.0, radius=0.1)
+    >>> print(f"{len(tree.start)} segments; buds at heights {tree.bud_position[:, 2].round(2).tolist()} m")
+    3 segments; buds at heights [3.41, 4.0] m
     """
     word = word if isinstance(word, Word) else Word.of(word)
     for name, value in (("angle", angle), ("length", length), ("position", position)):

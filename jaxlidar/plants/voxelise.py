@@ -1,11 +1,11 @@
-"""Trees and point clouds into voxels: branches, leaf clumps and points as shares of a regular grid.
+"""Voxel maps of trees and point clouds: branches, leaf clumps and points are shared out on a regular grid.
 
-Thin branch segments and clumps are filled with points of known volume, `voxel_size / samples` apart: a
-frustum is cut into slabs, each of which carries its exact volume on a disc of points. Segments with a radius
-of four such distances or more take the centres of subvoxels that lie within them instead, so that a voxel
-inside is full. Every point counts in the voxel in which it lies; the sum over voxels is the solids' volume
-whatever the voxels. What is uncertain is how it is shared between neighbours: a voxel that the side of a
-trunk cuts through is off by about 1 % of its volume with 8 samples (root mean square, measured).
+Thin branch segments and leaf clumps are filled with points of known volume, `voxel_size / samples` apart. A
+frustum is cut into slabs, and each slab's exact volume is shared among the points of a disc. Segments with a
+radius of four such distances or more use the centres of the subvoxels that lie within them, so that a voxel
+inside is full. Every point counts in the voxel in which it lies. The sum over voxels is the volume of the
+solids, whatever the voxel size. Only the division between neighbouring voxels is uncertain: a voxel that the
+side of a trunk cuts through is off by about 1 % of its volume with 8 samples (root mean square, measured).
 """
 
 from collections.abc import Iterable
@@ -18,7 +18,7 @@ from jaxlidar.plants.tree import Tree
 from jaxlidar.scenes.voxels import VoxelMap
 
 _GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
-# Points are made and counted for so many segments or clumps at a time.
+# Points are made and counted for this many segments or clumps at a time.
 _CHUNK = 2000
 # More points for one solid would not change a voxel by 0.1 %.
 _MOST = 200_000
@@ -34,32 +34,43 @@ def voxelise(
     origin: tuple[float, float, float] | None = None,
     shape: tuple[int, int, int] | None = None,
 ) -> VoxelMap:
-    """A map of leaf and bark of one tree, or of several together.
+    """The voxel map of leaf and bark of one tree, or of several trees together.
+
+    Where solids overlap, as branches do at joints, a voxel is at most full. The excess volume goes to the
+    voxels around it, so that volumes are conserved.
 
     **Arguments:**
 
-    - `trees`: one, or several, for instance a `forest`.
-    - `voxel_size`: edges in m, one number for cubes.
-    - `leaf_area`: one-sided leaf area of every clump in m2, spread evenly through its sphere: leaf then has
-      the extinction coefficient area / (2 volume). None (default): a clump fills its sphere, and the
-      probability of leaf is the share of the voxel that clumps occupy. The radius of clumps is the tree's;
-      see `Tree.with_bud_radius`.
-    - `wood`: "volume" (default): the probability of bark is the share of the voxel that wood occupies. Twigs
-      much thinner than a voxel then intercept less than their width would. "surface": the extinction
-      coefficient is a quarter of the surface per volume, as a thin convex body's of random orientation is
-      (Cauchy), or that of the share of volume where it is larger.
-    - `samples`: points per edge of a voxel, at least 1. Default 8.
-    - `origin`, `shape`: lower corner in m and numbers of voxels, together, to fill a grid of one's own. By
-      default the smallest grid that holds everything, with faces at multiples of the edge, so that maps of
-      neighbouring trees fit together.
+    - `trees`: a `Tree`, or several, for instance a `forest`.
+    - `voxel_size`: voxel edges in m, positive: one number for cubes, or three.
+    - `leaf_area`: one-sided leaf area of every clump in m2, 0 or more, spread evenly through its sphere. The
+      extinction coefficient of leaf is then area / (2 volume). None: a clump fills its sphere, and the
+      probability of leaf is the share of the voxel that clumps occupy. The clump radius is that of the tree;
+      see `Tree.with_bud_radius`. Default None.
+    - `wood`: "volume": the probability of bark is the share of the voxel that wood occupies. Twigs much
+      thinner than a voxel then intercept less light than their width would. "surface": the extinction
+      coefficient is a quarter of the wood surface per volume, as for thin convex bodies of random orientation
+      (Cauchy), or that of "volume" where it is larger. Default "volume".
+    - `samples`: points per voxel edge, an integer of at least 1. Default 8.
+    - `origin`, `shape`: lower corner (x, y, z) in m and numbers of voxels (nx, ny, nz) of the grid; give both
+      or neither. Default None: the smallest grid that holds everything, with faces at multiples of the edge,
+      so that the maps of neighbouring trees fit together.
 
-    Where solids overlap, as branches do at joints, a voxel is at most full: what it cannot hold goes to the
-    voxels around it, as a joint swells, so that volumes are conserved.
+    **Returns:** a `VoxelMap`.
 
-    **Raises:** ValueError for inadmissible arguments, for trees with neither wood nor clumps, and for trees
-    that reach out of the grid given.
+    **Raises:** ValueError for inadmissible arguments, for trees with neither wood nor clumps, for trees that
+    reach out of a given grid, and for more material than the grid can hold.
 
     **Source:** Cauchy (1841); for the meaning of a voxel's probabilities, `VoxelMap.from_probability`.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> tree = jl.grow(jl.shrub(height=1.0, stems=1))
+    >>> voxels = jl.voxelise(tree, 0.2, leaf_area=0.001)
+    >>> leaf_area = float(2 * voxels.leaf.sum()) * 0.2**3
+    >>> print(f"{leaf_area / len(tree.bud_position):.4f} m2 per clump")
+    0.0010 m2 per clump
     """
     trees = [trees] if isinstance(trees, Tree) else list(trees)
     size = _edges(voxel_size)
@@ -99,23 +110,36 @@ def voxelise_points(
     origin: tuple[float, float, float] | None = None,
     shape: tuple[int, int, int] | None = None,
 ) -> VoxelMap:
-    """A map from a point cloud, such as one of a terrestrial scan.
+    """The voxel map of a point cloud, such as a terrestrial laser scan.
 
-    Points alone do not tell how much leaf there is: the area is given, and shared out among the voxels in
-    proportion to their points. (A scan sees less of what stands behind; maps that know the beams, such as
-    AMAPVox makes, do better: `jaxlidar.io.read_vox`.)
+    Points alone do not tell the leaf area. The total leaf area is therefore given, and shared out among the
+    voxels in proportion to their numbers of points. A scan has fewer points on what is occluded. Maps that
+    account for the paths of the beams, such as those of AMAPVox, are better: `jaxlidar.io.read_vox`.
 
     **Arguments:**
 
     - `points`: (n, 3) positions in m.
-    - `voxel_size`: edges in m, one number for cubes.
-    - `leaf_area`: one-sided area of all leaves together, m2.
-    - `is_wood`: (n,) which points lie on wood; by default none.
-    - `wood_probability`: of bark in a voxel that holds points on wood. Default 1.
-    - `min_points`: a voxel with fewer leaf points, or fewer wood points, counts as without. Default 1.
-    - `origin`, `shape`: as for `voxelise`.
+    - `voxel_size`: voxel edges in m, positive: one number for cubes, or three.
+    - `leaf_area`: one-sided area of all leaves together, m2, 0 or more.
+    - `is_wood`: (n,) booleans: which points lie on wood. Default None: no point.
+    - `wood_probability`: probability of bark in a voxel with points on wood, in [0, 1]. Default 1.
+    - `min_points`: a voxel with fewer leaf points than this has no leaf, and one with fewer wood points has
+      no wood; 1 or more. Default 1.
+    - `origin`, `shape`: lower corner (x, y, z) in m and numbers of voxels (nx, ny, nz) of the grid; give both
+      or neither. Default None: as for `voxelise`.
 
-    **Raises:** ValueError for inadmissible arguments and for points that lie out of the grid given.
+    **Returns:** a `VoxelMap` with spherical leaf angles.
+
+    **Raises:** ValueError for inadmissible arguments, for points outside a given grid, and for a positive
+    leaf area where no voxel has enough leaf points.
+
+    **Example:**
+
+    >>> import numpy as np, jaxlidar as jl
+    >>> points = np.random.default_rng(0).uniform(0.0, 2.0, (1000, 3))
+    >>> voxels = jl.voxelise_points(points, 0.5, leaf_area=6.0)
+    >>> print(voxels.shape, f"{float(2 * voxels.leaf.sum()) * 0.5**3:.2f} m2")
+    (4, 4, 4) 6.00 m2
     """
     check_range("points", points)
     check_range("leaf_area", leaf_area, 0.0)
@@ -145,7 +169,23 @@ def voxelise_points(
 
 
 def crop(voxels: VoxelMap) -> VoxelMap:
-    """The same map without the empty layers at its sides; one voxel remains where all are empty."""
+    """The voxel map without the empty layers at its sides. One voxel remains if all are empty.
+
+    **Arguments:**
+
+    - `voxels`: a `VoxelMap`.
+
+    **Returns:** a `VoxelMap` of the same voxels, smaller, with `origin` moved to its new corner.
+
+    **Example:**
+
+    >>> import numpy as np, jaxlidar as jl
+    >>> density = np.zeros((6, 6, 6))
+    >>> density[2:4, 1:4, 3] = 1.0
+    >>> smaller = jl.crop(jl.VoxelMap.from_lad(density, voxel_size=0.5))
+    >>> print(smaller.shape, smaller.origin.tolist())
+    (2, 3, 1) [1.0, 0.5, 1.5]
+    """
     full = voxels.mean_extinction() > 0
     if not full.any():
         full[0, 0, 0] = True
@@ -165,14 +205,14 @@ def crop(voxels: VoxelMap) -> VoxelMap:
 
 
 class _Grid:
-    """A regular grid in double precision."""
+    """A regular voxel grid in double precision."""
 
     def __init__(self, low: np.ndarray, size: np.ndarray, shape: tuple[int, ...]):
         self.low, self.size, self.shape = low, size, shape
 
     @staticmethod
     def of(low, high, size, origin, shape) -> "_Grid":
-        """The grid asked for, or the smallest around the box from `low` to `high`."""
+        """The given grid, or the smallest one around the box from `low` to `high`."""
         if (origin is None) != (shape is None):
             raise ValueError("origin and shape belong together: give both or neither")
         if origin is None:
@@ -193,7 +233,7 @@ class _Grid:
         return np.zeros(self.shape)
 
     def count(self, place: np.ndarray, amount: np.ndarray, into: np.ndarray) -> None:
-        """Add amounts at places to an array of the grid. Rounding at the outer faces leads inwards."""
+        """Add amounts at positions to an array of the grid. Positions outside count in the nearest voxel."""
         number = np.floor((place - self.low) / self.size).astype(np.int64)
         number = np.clip(number, 0, np.array(self.shape) - 1)
         flat = np.ravel_multi_index(tuple(number.T), self.shape)
@@ -211,7 +251,7 @@ def _edges(voxel_size: float | tuple[float, float, float]) -> np.ndarray:
 def _reach(tree: Tree) -> tuple[np.ndarray, np.ndarray]:
     """Lower and upper corner of a box around all wood and clumps."""
     axis = (tree.end - tree.start) / np.maximum(tree.length, 1e-30)[:, None]
-    # How far a disc across the axis reaches along x, y and z.
+    # Extent along x, y and z of a unit disc across the axis.
     wide = np.sqrt(np.maximum(1.0 - axis * axis, 0.0))
     lows, highs = [], []
     for centre, reach in (
@@ -226,7 +266,7 @@ def _reach(tree: Tree) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _subvoxels_in(tree: Tree, i: int, step: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Centres of the subvoxels within a branch segment, and its volume shared among them."""
+    """Centres of the subvoxels within a branch segment, and the share of its volume at each."""
     start, a, b = tree.start[i], tree.radius_start[i], tree.radius_end[i]
     axis = tree.end[i] - start
     length = max(float(np.linalg.norm(axis)), 1e-30)
@@ -243,7 +283,7 @@ def _subvoxels_in(tree: Tree, i: int, step: np.ndarray) -> tuple[np.ndarray, np.
     across2 = np.sum((place - start) ** 2, axis=1) - along**2
     place = place[(along >= 0) & (along < length) & (across2 <= (a + (b - a) * along / length) ** 2)]
     if not len(place):
-        # Thinner than a subvoxel is long: at its middle.
+        # No centre lies within a thin or short segment: all of its volume counts at its middle.
         place = (start + 0.5 * length * axis)[None, :]
     volume = np.pi / 3 * np.linalg.norm(tree.end[i] - start) * (a * a + a * b + b * b)
     return place, np.full(len(place), volume / len(place))
@@ -252,7 +292,7 @@ def _subvoxels_in(tree: Tree, i: int, step: np.ndarray) -> tuple[np.ndarray, np.
 def _in_frustums(
     tree: Tree, part: np.ndarray, apart: float, *, on_surface: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Points within branch segments, or on their sides, about `apart` m from each other; their shares.
+    """Points within branch segments, or on their sides, about `apart` m from each other, and their shares.
 
     Shares are of the volume in m3, or of the lateral surface in m2.
     """
@@ -263,14 +303,14 @@ def _in_frustums(
     wide = np.clip(np.ceil(2 * np.pi * widest if on_surface else np.pi * widest**2), 3, _MOST).astype(int)
     slabs = np.clip(np.ceil(length / apart), 1, np.maximum(_MOST // wide, 1)).astype(int)
     axis = (end - start) / np.maximum(length, 1e-30)[:, None]
-    # Two directions across the axis, from whichever of x and z is less along it.
+    # Two directions across the axis: from z, or from x where the axis is close to vertical.
     other = np.where(np.abs(axis[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
     u = np.cross(axis, other)
     u /= np.maximum(np.linalg.norm(u, axis=1), 1e-30)[:, None]
     v = np.cross(axis, u)
 
     def spread(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """For each of `counts` things, `counts` members: whose they are, and their numbers from 0."""
+        """For groups of `counts` members: the group of each member, and its number from 0 within it."""
         owner = np.repeat(np.arange(len(counts)), counts)
         return owner, np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
 
@@ -284,7 +324,7 @@ def _in_frustums(
         amount = np.pi / 3 * thick * (inner**2 + inner * outer + outer**2)
     owner, point = spread(wide[segment])
     s = segment[owner]
-    # Discs of successive slabs are turned against each other, and their points lie at different depths.
+    # Discs of successive slabs are rotated against each other, and their points lie at different depths.
     turn = _GOLDEN_ANGLE * point + 2.399 * slab[owner]
     depth = lower[owner] + (upper - lower)[owner] * ((point * 0.7548776662466927 + 0.5) % 1.0)
     r = a[s] + (b - a)[s] * depth
@@ -298,7 +338,7 @@ def _in_frustums(
 def _in_spheres(
     tree: Tree, part: slice, apart: float, leaf_area: float | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Points within clumps; the volume, or the leaf area, at each."""
+    """Points within leaf clumps, and the volume, or the leaf area, at each."""
     centre, radius = tree.bud_position[part], tree.bud_radius[part]
     n = int(np.clip(np.ceil(4 / 3 * np.pi * (radius.max() / apart) ** 3), 32, _MOST))
     i = np.arange(n)
@@ -312,7 +352,7 @@ def _in_spheres(
 
 
 def _settled(share: np.ndarray) -> np.ndarray:
-    """Shares of at most 1 with the same sum: what is too much spreads to the neighbours, again and again."""
+    """Shares of at most 1 with the same sum: the excess spreads to the neighbours, until little is left."""
     if share.sum() >= share.size:
         raise ValueError(f"trees = {share.sum():.3g} voxels of material, but the grid has {share.size}")
     while True:
@@ -321,7 +361,7 @@ def _settled(share: np.ndarray) -> np.ndarray:
         if excess.sum() <= 1e-4 * share.sum():
             return share
         for axis in range(3):
-            # At the sides of the grid it stays within.
+            # Nothing leaves the grid at its sides.
             around = np.pad(excess, [(int(k == axis),) * 2 for k in range(3)], mode="edge")
             around = np.moveaxis(around, axis, 0)
             share += np.moveaxis(around[:-2] + around[2:], 0, axis) / 6

@@ -1,8 +1,7 @@
 """Figures: waveforms with height upward, scenes from the side, residuals of a fit, trees in three dimensions.
 
-Every function draws on the axes that it is given, or on a new figure's, and returns them; nothing is shown
-and
-nothing is saved. Import it by name: `import jaxlidar.plot`.
+Every function draws on the axes that it is given, or on those of a new figure, and returns them; nothing is
+shown and nothing is saved. The package, and matplotlib with it, is imported when it is first used.
 """
 
 from jaxlidar.plot.fits import residuals

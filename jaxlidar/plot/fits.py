@@ -1,4 +1,4 @@
-"""Residuals of a fit against height."""
+"""Figures of the residuals of a fit against height."""
 
 from typing import Any
 
@@ -20,21 +20,33 @@ def residuals(
     limit: float = 5.0,
     **style: Any,
 ) -> Axes:
-    """Draw (observed - simulated)/noise against height, over bands of one and two standard deviations.
+    """Axes with (observed - simulated) / noise against height, over bands of one and two standard deviations.
 
     **Arguments:**
 
     - `wave`: the simulated `Waveform`, such as that of a fit.
     - `observed`: (wavelengths, bins) apparent reflectance at the waveform's samples.
     - `noise`: its standard deviation, a number or of the same shape, positive.
-    - `ax`: where to draw. Default None: on a new figure.
+    - `ax`: the axes to draw on. Default None: those of a new figure.
     - `wavelength`: in nm, one of the waveform's. Default None: all.
-    - `limit`: where the axis ends, in standard deviations, positive; what lies beyond is drawn at the end as
-      an arrowhead. Default 5.
+    - `limit`: where the axis ends, in standard deviations, positive; points beyond are drawn at the end as
+      arrowheads. Default 5.
     - `style`: of the points, as for `Axes.plot`.
+
+    **Returns:** the axes.
 
     **Raises:** ValueError for shapes that differ, noise or a limit that is not positive, and a wavelength
     that the waveform does not have.
+
+    **Example:**
+
+    >>> import jax, jaxlidar as jl
+    >>> import jaxlidar.plot
+    >>> from matplotlib.figure import Figure
+    >>> wave = jl.simulate(jl.Lidar(), jl.Scene(ground=jl.Ground()), key=jax.random.key(0))
+    >>> ax = jaxlidar.plot.residuals(wave, 1.01 * wave.reflectance, 0.001, Figure().subplots())
+    >>> print(f"up to {ax.get_xlim()[1]:.1f} standard deviations")
+    up to 5.0 standard deviations
     """
     data, spread = np.asarray(observed, dtype=float), np.asarray(noise, dtype=float)
     shape = np.asarray(wave.reflectance).shape

@@ -1,4 +1,4 @@
-"""Scenes from the side."""
+"""Figures of scenes from the side."""
 
 from typing import Any
 
@@ -20,21 +20,33 @@ def scene(
     along: str = "y",
     legend: bool = True,
 ) -> Axes:
-    """Draw a scene from the side: optical depth of leaf and bark, plates, ground and the beam.
+    """Axes with a scene from the side: optical depth of leaf and bark, plates, ground and the beam.
 
-    Leaf and bark are shaded by 1 - exp(-optical depth) of a horizontal look through the whole voxel map;
-    planes are cut at the middle of the map (or of the footprint, where there is no map).
+    Leaf and bark are shaded by 1 - exp(-optical depth) of a horizontal view through the whole voxel map.
+    Planes are cut at the middle of the map, or of the footprint where there is no map.
 
     **Arguments:**
 
     - `scene`: a `Scene`.
-    - `lidar`: whose beam is drawn, out to 1/e^2 of the axial irradiance or to the top-hat's edge. Default
-      None: no beam.
-    - `ax`: where to draw. Default None: on a new figure.
-    - `along`: "y" (default) looks north, x to the right; "x" looks west, y to the right.
+    - `lidar`: a `Lidar`, whose beam is drawn, out to 1/e^2 of the axial irradiance or to the edge of a
+      top-hat. Default None: no beam.
+    - `ax`: the axes to draw on. Default None: those of a new figure.
+    - `along`: the direction of view: "y" looks north, x to the right; "x" looks west, y to the right. Default
+      "y".
     - `legend`: whether to name what is drawn. Default True.
 
+    **Returns:** the axes.
+
     **Raises:** ValueError for another `along`.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> import jaxlidar.plot
+    >>> from matplotlib.figure import Figure
+    >>> ax = jaxlidar.plot.scene(jl.Scene(ground=jl.Ground()), jl.Lidar(), Figure().subplots())
+    >>> print([text.get_text() for text in ax.get_legend().get_texts()])
+    ['ground', 'beam (1/e²)']
     """
     if along not in ("x", "y"):
         raise ValueError(f"along = {along!r} is none of 'x', 'y'")
@@ -67,7 +79,7 @@ def scene(
     room = max(0.06 * (top - bottom), 0.2)
     if scene.ground is not None:
         z = _cut(scene.ground, sides, across, middle)
-        # Deep enough for whoever then widens the limits.
+        # Deep enough if the limits are widened afterwards.
         deep = bottom - 10 * (top - bottom + room)
         look = {"color": COLOURS["ground"], "linewidth": 0, "zorder": 3, "label": "ground"}
         entries.append(ax.fill_between(sides, z, deep, **look))
@@ -115,7 +127,7 @@ def _beam(ax: Axes, lidar: Lidar, across: int, bottom: float, top: float) -> lis
 
 
 def _cut(surface: AbstractSurface, sides: np.ndarray, across: int, middle: float) -> np.ndarray:
-    """Heights of a surface at two places, where a plumb line meets it."""
+    """Heights of a surface at two places, where vertical lines meet it."""
     points = np.full((2, 3), middle)
     points[:, across], points[:, 2] = sides, 0.0
     depth, _ = surface.shape.crossing(points, np.tile([0.0, 0.0, -1.0], (2, 1)))

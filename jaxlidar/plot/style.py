@@ -1,6 +1,6 @@
-"""What figures share: colours, axes, and limits round what is visible.
+"""What figures share: colours, axes, and limits around what is visible.
 
-Colours are those of Okabe and Ito (2008), which are told apart whatever one's colour vision.
+Colours are those of Okabe and Ito (2008), which can be told apart with any colour vision.
 """
 
 from collections.abc import Sequence
@@ -16,12 +16,12 @@ OTHER = "#999999"
 TOTAL = "#1A1A1A"
 BEAM = "#D55E00"
 WAVELENGTH_COLOURS = ("#0072B2", "#D55E00", "#CC79A7", "#009E73", "#E69F00", "#56B4E9")
-# What is drawn lies where the waveform exceeds this share of its peak.
+# Figures show heights at which the waveform exceeds this share of its peak.
 VISIBLE = 0.004
 
 
 def wavelengths_of(wave: Waveform, wavelength: float | None) -> Sequence[int]:
-    """Rows of the waveform at `wavelength` (nm); all of them for None."""
+    """Rows of the waveform at `wavelength` (nm); all rows for None."""
     has = np.asarray(wave.wavelength, dtype=float)
     if wavelength is None:
         return range(has.size)
@@ -33,7 +33,7 @@ def wavelengths_of(wave: Waveform, wavelength: float | None) -> Sequence[int]:
 
 
 def frame_height(ax: Axes, height: Float[np.ndarray, " bins"], total: np.ndarray) -> None:
-    """Limits round what is visible of any of the waveforms, and the axis' name."""
+    """Set the limits around what is visible of any of the waveforms, and the name of the axis."""
     peak = np.max(total, axis=-1, keepdims=True)
     seen = height[np.any(total > VISIBLE * np.maximum(peak, 1e-300), axis=0)]
     if seen.size > 1 and np.ptp(seen) > 0:

@@ -1,7 +1,7 @@
 """Figures of trees and forests in three dimensions, leaf-on and leaf-off.
 
-Every function draws on the `mpl_toolkits.mplot3d.Axes3D` that it is given, or on a new figure's, and returns
-it; nothing is shown and nothing is saved.
+Every function draws on the `mpl_toolkits.mplot3d.Axes3D` that it is given, or on that of a new figure, and
+returns it; nothing is shown and nothing is saved.
 """
 
 from collections.abc import Iterable, Sequence
@@ -16,7 +16,7 @@ from jaxlidar._checks import check_range
 from jaxlidar.plants.tree import Tree
 from jaxlidar.plot.style import COLOURS
 
-# A line thinner than this, in points, fades away.
+# Lines are not drawn thinner than this, in points: they would be too faint.
 THINNEST = 0.25
 
 
@@ -30,21 +30,33 @@ def tree(
     elevation: float = 8.0,
     azimuth: float = 200.0,
 ) -> Axes3D:
-    """Draw the branch segments as lines as wide as the wood, and the leaf buds as translucent points.
+    """Axes with trees: branch segments as lines as wide as the wood, leaf buds as translucent points.
 
-    Widths and sizes are to the scale of the axes as they are when this is called.
+    Widths and sizes are to the scale of the axes at the time of the call.
 
     **Arguments:**
 
     - `tree`: a `Tree`, or several, such as a forest.
-    - `ax`: where to draw. Default None: on a new figure.
+    - `ax`: the three-dimensional axes to draw on. Default None: those of a new figure.
     - `leaves`: whether to draw the buds. Default True.
     - `alpha`: opacity of a bud, in [0, 1]. Default 0.25.
-    - `max_buds`: where there are more, so many are drawn, each larger for those left out. Default 60,000.
+    - `max_buds`: the most buds that are drawn, at least 1. Where there are more, about as many are drawn,
+      each larger for those left out. Default 60,000.
     - `elevation`: of the view above the horizon, degrees. Default 8.
-    - `azimuth`: where the viewer stands, degrees clockwise from north. Default 200.
+    - `azimuth`: direction towards the viewer, degrees clockwise from north. Default 200.
+
+    **Returns:** the axes.
 
     **Raises:** ValueError for trees without any segment, and for `alpha` or `max_buds` outside their ranges.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> import jaxlidar.plot
+    >>> from matplotlib.figure import Figure
+    >>> ax = jaxlidar.plot.tree(jl.grow(jl.shrub()), Figure().add_subplot(projection="3d"))
+    >>> print(ax.get_zlabel())
+    height (m)
     """
     check_range("alpha", alpha, 0.0, 1.0)
     check_range("max_buds", max_buds, 1)
@@ -76,15 +88,26 @@ def tree(
 def leaf_on_and_off(
     tree: Tree | Iterable[Tree], axes: Sequence[Axes3D] | None = None, **style: Any
 ) -> tuple[Axes3D, Axes3D]:
-    """Draw the same wood twice, with its leaves and without.
+    """Two axes with the same trees, one with leaves and one without.
 
     **Arguments:**
 
-    - `tree`: a `Tree`, or several.
-    - `axes`: two. Default None: on a new figure, side by side.
-    - `style`: as for `tree`.
+    - `tree`: a `Tree`, or several, such as a forest.
+    - `axes`: two three-dimensional axes. Default None: those of a new figure, side by side.
+    - `style`: further arguments of `tree`.
 
-    **Raises:** ValueError for another number of axes.
+    **Returns:** the two axes, leaf-on first.
+
+    **Raises:** ValueError for another number of axes, and as for `tree`.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> import jaxlidar.plot
+    >>> from matplotlib.figure import Figure
+    >>> axes = Figure().subplots(1, 2, subplot_kw={"projection": "3d"})
+    >>> print([ax.get_title() for ax in jaxlidar.plot.leaf_on_and_off(jl.grow(jl.shrub()), axes)])
+    ['leaf-on', 'leaf-off']
     """
     whole = _whole(tree)
     if axes is None:
@@ -108,7 +131,7 @@ def _whole(tree: Tree | Iterable[Tree]) -> Tree:
 
 
 def _frame(ax: Axes3D, whole: Tree, elevation: float, azimuth: float) -> float:
-    """Limits in equal scale round wood and leaves, and the axes' names; gives the points that 1 m takes."""
+    """Limits in equal scale around wood and leaves, and the names of the axes; gives the points per metre."""
     points = np.concatenate([whole.start, whole.end, whole.bud_position])
     low, high = points.min(axis=0), points.max(axis=0)
     low[2] = min(low[2], whole.base[2])
@@ -130,7 +153,7 @@ def _frame(ax: Axes3D, whole: Tree, elevation: float, azimuth: float) -> float:
 
 
 def _points_per_metre(ax: Axes3D) -> float:
-    """Measured on the middle of the axes, by what the projection makes of a vertical metre."""
+    """Points per metre at the middle of the axes, from the projection of a vertical metre."""
     low, high = ax.get_xlim(), ax.get_ylim()
     x, y, z = np.mean(low), np.mean(high), np.mean(ax.get_zlim())
     ax.apply_aspect()

@@ -1,4 +1,4 @@
-"""Waveforms, height upward."""
+"""Figures of waveforms, height upward."""
 
 from typing import Any
 
@@ -28,25 +28,38 @@ def waveform(
     label: str | None = None,
     **style: Any,
 ) -> Axes:
-    """Draw a waveform, height upward.
+    """Axes with a waveform, height upward.
 
-    For one wavelength: the total as a line, what comes from each material as an area from zero, and what
-    was scattered more than once as a dashed line. For several: the totals.
+    For one wavelength: the total as a line, the return of each material as an area from zero, and the light
+    that was scattered more than once as a dashed line. For several wavelengths: the totals.
 
     **Arguments:**
 
     - `wave`: a `Waveform`.
-    - `ax`: where to draw. Default None: on a new figure.
+    - `ax`: the axes to draw on. Default None: those of a new figure.
     - `wavelength`: in nm, one of the waveform's. Default None: all.
-    - `quantity`: "reflectance" (default: apparent reflectance) or "energy" (J; without components).
+    - `quantity`: "reflectance" (apparent reflectance) or "energy" (J; without components). Default
+      "reflectance".
     - `components`: whether materials and orders are drawn too, where there is one wavelength. Default True.
-    - `sigma`: half-width of the band round the total, in standard errors; 0 draws none. Default 2. Half as
-      wide a band is drawn more strongly within it.
-    - `label`: of the total. Default None: "total", or the wavelength.
+    - `sigma`: half-width of the band around the total, in standard errors, not negative; 0 draws none. Within
+      it a band of half the width is drawn more strongly. Default 2.
+    - `label`: name of the total in the legend. Default None: "total", or the wavelength.
     - `style`: of the total's line, as for `Axes.plot`.
+
+    **Returns:** the axes.
 
     **Raises:** ValueError for a wavelength that the waveform does not have, another quantity, or a negative
     `sigma`.
+
+    **Example:**
+
+    >>> import jax, jaxlidar as jl
+    >>> import jaxlidar.plot
+    >>> from matplotlib.figure import Figure
+    >>> wave = jl.simulate(jl.Lidar(), jl.Scene(ground=jl.Ground()), key=jax.random.key(0))
+    >>> ax = jaxlidar.plot.waveform(wave, Figure().subplots())
+    >>> print(ax.get_ylabel(), [text.get_text() for text in ax.get_legend().get_texts()])
+    height (m) ['ground', 'total']
     """
     if quantity not in ("reflectance", "energy"):
         raise ValueError(f"quantity = {quantity!r} is none of 'reflectance', 'energy'")

@@ -1,1 +1,1 @@
-"""Scenes: voxel maps, surfaces, atmosphere."""
+"""Scenes: canopies in voxels, surfaces, atmosphere."""

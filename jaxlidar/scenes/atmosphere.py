@@ -1,4 +1,4 @@
-r"""The clear air between the lidar and its target: molecules and aerosol in exponential layers.
+r"""The clear atmosphere between lidar and target: molecules and aerosol in exponential layers.
 
 **Extinction.** Molecules after Bodhaine et al. (1999): with n the refractive index of standard air (Peck
 and Reeder 1972, for 360 ppm CO2) and F its depolarisation (King) factor,
@@ -6,21 +6,21 @@ and Reeder 1972, for 360 ppm CO2) and F its depolarisation (King) factor,
     sigma = 24 pi^3 (n^2 - 1)^2 F / (lambda^4 N^2 (n^2 + 2)^2)
     tau_R = sigma P A / (m_a g)                                 at sea level and 45 degrees of latitude
 
-(not their fit, eq. 30, which holds to 850 nm and is 0.8 % too high at 1550 nm). Aerosol by the
-visibility V: 3.912/V * (lambda / 550 nm)^-q per km, with the exponent q(V) of Kruse et al. (1962) or,
-which differs below 6 km only, of Kim et al. (2001). Strictly 3.912/V is the extinction of molecules and
-aerosol together; as is customary it is given to the aerosol alone (at 550 nm and 23 km the molecules
-are 7 % of it).
+(not their fit, eq. 30, which holds to 850 nm and is 0.8 % too high at 1550 nm). The extinction of aerosol
+follows from the visibility V: 3.912/V * (lambda / 550 nm)^-q per km, with the exponent q(V) of Kruse et al.
+(1962) or of Kim et al. (2001), which differ below 6 km only. Strictly, 3.912/V is the extinction of molecules
+and aerosol together; as is customary, it is taken as that of the aerosol alone (at 550 nm and 23 km the
+molecules are 7 % of it).
 
-**Return.** A white Lambertian target across the beam at range R sends E A_r T^2 / (pi R^2) of a pulse E
-into an aperture A_r, T^2 the two-way transmittance: that is an apparent reflectance of T^2, the internal
-unit. A layer dr of air with the backscatter coefficient beta (1/m/sr) sends E A_r beta dr T^2 / R^2.
-Hence the air's apparent reflectance per metre of range is pi beta T^2, with
+**Return.** A white Lambertian target across the beam at range R sends E A_r T^2 / (pi R^2) of a pulse of
+energy E into an aperture A_r, where T^2 is the two-way transmittance. Its apparent reflectance, the internal
+unit, is T^2. A layer dr of air with the backscatter coefficient beta (1/m/sr) sends E A_r beta dr T^2 / R^2.
+The apparent reflectance of the air per metre of range is therefore pi beta T^2, with
 
     beta = molecules' extinction / (8 pi / 3 sr) + aerosol's extinction / lidar ratio.
 
-Light scattered more than once in the air is not followed, nor is absorption by gases: keep
-wavelengths off the bands of water vapour (0.94, 1.13, 1.38, 1.87 micrometres) and oxygen (0.76).
+Multiple scattering in the air and absorption by gases are not simulated. Avoid wavelengths in the absorption
+bands of water vapour (0.94, 1.13, 1.38, 1.87 micrometres) and oxygen (0.76).
 """
 
 import math
@@ -53,17 +53,29 @@ def _outer(a: Float[Array, "..."], b: Float[Array, "..."]) -> Float[Array, "..."
 
 
 def rayleigh_optical_depth(wavelength: ArrayLike) -> Float[Array, "..."]:
-    """Optical depth of all molecules above sea level (1013.25 hPa, latitude 45 degrees, 360 ppm CO2).
+    """Rayleigh optical depth of the whole atmosphere above sea level.
 
-    - `wavelength`: in nm, any shape, 230 to 3000.
+    It holds for 1013.25 hPa, a latitude of 45 degrees and 360 ppm CO2.
 
-    **Raises:** `ValueError` for a wavelength outside.
+    **Arguments:**
 
-    Source: Bodhaine, Wood, Dutton and Slusser 1999, J. Atmos. Oceanic Technol. 16, 1854.
+    - `wavelength`: nm, any shape, 230 to 3000.
+
+    **Returns:** an array of the shape of `wavelength`.
+
+    **Raises:** ValueError for a wavelength outside its range.
+
+    **Source:** Bodhaine, Wood, Dutton and Slusser 1999, J. Atmos. Oceanic Technol. 16, 1854.
+
+    **Example:**
+
+    >>> from jaxlidar.scenes.atmosphere import rayleigh_optical_depth
+    >>> print(f"{float(rayleigh_optical_depth(532.0)):.3f}")
+    0.111
     """
     micrometres = _wavelength(wavelength) * 1e-3
     w = micrometres**-2
-    # n - 1 itself, never as a difference.
+    # n - 1 itself, not as a difference, which would lose digits.
     d = 1e-8 * (8060.51 + 2480990.0 / (132.274 - w) + 17455.7 / (39.32957 - w))
     d = d * (1 + 0.54 * (_CO2 - 300e-6))
     nitrogen = 1.034 + 3.17e-4 * w
@@ -73,7 +85,7 @@ def rayleigh_optical_depth(wavelength: ArrayLike) -> Float[Array, "..."]:
         78.084 + 20.946 + 0.934 + percent
     )
     lorentz = d * (2 + d) / (3 + d * (2 + d))  # (n^2 - 1) / (n^2 + 2)
-    # As one factor, since the density's square does not fit into single precision.
+    # One factor, because the square of the density does not fit into single precision.
     scale = _COLUMN * 24 * math.pi**3 / _DENSITY**2 * _MICROMETRE4_PER_CM4
     return scale * (lorentz * w) ** 2 * king
 
@@ -81,18 +93,30 @@ def rayleigh_optical_depth(wavelength: ArrayLike) -> Float[Array, "..."]:
 def aerosol_extinction(
     wavelength: ArrayLike, visibility: ArrayLike, model: str = "kim"
 ) -> Float[Array, "..."]:
-    """Extinction coefficient in 1/m of the aerosol where the visibility is measured.
+    """Extinction coefficient of aerosol in 1/m at the height where the visibility is measured.
 
-    - `wavelength`: in nm, any shape, 230 to 3000.
-    - `visibility`: in km, positive, a scalar: where a black target's contrast falls to 2 % at 550 nm.
-    - `model`: `"kim"` (default) or `"kruse"`: the exponent of wavelength below 6 km.
+    Differentiable in wavelength and visibility, except at the jumps of the exponent at 50 km and (Kruse)
+    6 km.
 
-    Differentiable in both, but for the exponent's jumps at 50 km and (Kruse) 6 km.
+    **Arguments:**
 
-    **Raises:** `ValueError` for a value outside its range and an unknown model.
+    - `wavelength`: nm, any shape, 230 to 3000.
+    - `visibility`: km, positive, a scalar: the distance at which the contrast of a black target falls to 2 %
+      at 550 nm.
+    - `model`: "kim" or "kruse": the exponent of wavelength for visibilities below 6 km. Default "kim".
 
-    Source: Kruse, McGlauchlin and McQuistan 1962, Elements of Infrared Technology; Kim, McArthur and Korevaar
-    2001, Proc. SPIE 4214, 26.
+    **Returns:** an array of the shape of `wavelength`.
+
+    **Raises:** ValueError for a value outside its range and for an unknown model.
+
+    **Source:** Kruse, McGlauchlin and McQuistan 1962, Elements of Infrared Technology; Kim, McArthur and
+    Korevaar 2001, Proc. SPIE 4214, 26.
+
+    **Example:**
+
+    >>> from jaxlidar.scenes.atmosphere import aerosol_extinction
+    >>> print(f"{1000 * float(aerosol_extinction(550.0, 23.0)):.3f} per km")
+    0.170 per km
     """
     check_range("visibility", visibility, 0.0, low_open=True)
     check_choice("model", model, ("kim", "kruse"))
@@ -106,27 +130,38 @@ def aerosol_extinction(
 
 
 class Atmosphere(eqx.Module):
-    """Molecules and aerosol, each thinning exponentially with height.
+    """A clear atmosphere: molecules and aerosol whose densities fall exponentially with height.
 
-    Heights are above the reference plane z = 0, in m, and may be negative.
+    Heights are above the reference plane z = 0, in m, and may be negative. All arguments but `rayleigh` and
+    `aerosol_model` are differentiable.
 
-    - `visibility`: at z = 0 in km, positive, or None: no aerosol. Default 23 ("clear").
-    - `rayleigh`: whether there are molecules. Default True.
-    - `aerosol_model`: `"kim"` (default) or `"kruse"`, see `aerosol_extinction`.
-    - `rayleigh_scale_height`: in m, positive. Default 8450: the ratio of the air's column above sea level to
-      its density there at 15 degrees Celsius, so that both the optical depth and the extinction at
-      sea level are right.
-    - `aerosol_scale_height`: in m, positive. Default 1400, within the customary 1200 (Elterman 1968, UV,
-      Visible, and IR Attenuation for Altitudes to 50 km) to 2000: 23 km then means an optical depth of
-      0.24 at 550 nm.
-    - `lidar_ratio`: extinction over backscatter of the aerosol in sr, positive; 20 (sea salt) to 80 (smoke).
-      Default None: no return from the air, molecules included.
-    - `base_height`: of the reference plane above sea level in m, -500 to 9000. Default 0. It thins the
-      molecules; the visibility holds at z = 0 wherever that is.
+    **Arguments:**
 
-    All but `rayleigh` and `aerosol_model` are differentiable.
+    - `visibility`: visibility at z = 0 in km, positive, or None: no aerosol. Default 23 ("clear").
+    - `rayleigh`: whether molecules scatter light (Rayleigh scattering). Default True.
+    - `aerosol_model`: "kim" or "kruse": how aerosol extinction depends on the wavelength for visibilities
+      below 6 km (Kim et al. 2001, Kruse et al. 1962). Default "kim".
+    - `rayleigh_scale_height`: m, positive. Default 8450: the ratio of the air column above sea level to the
+      density there at 15 degrees Celsius, so that both optical depth and extinction at sea level are right.
+    - `aerosol_scale_height`: m, positive. Default 1400, within the customary 1200 (Elterman 1968, UV,
+      Visible, and IR Attenuation for Altitudes to 50 km) to 2000. A visibility of 23 km is then an optical
+      depth of 0.24 at 550 nm.
+    - `lidar_ratio`: ratio of extinction to backscatter coefficient of the aerosol, sr, positive; from 20 (sea
+      salt) to 80 (smoke). Default None: no return from the air, neither from aerosol nor from molecules.
+    - `base_height`: height of the reference plane above sea level, m, -500 to 9000. It reduces the density of
+      molecules only; `visibility` holds at z = 0 whatever the base height. Default 0.
 
-    **Raises:** `ValueError` for a value outside its range and an unknown model.
+    **Raises:** ValueError for a value outside its range and for an unknown model.
+
+    **Source:** see `jaxlidar.scenes.atmosphere` for the equations.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> air = jl.Atmosphere(visibility=10.0)
+    >>> transmittance = air.two_way_transmittance(1064.0, height=0.0, altitude=1000.0)
+    >>> print(f"{float(transmittance):.3f}")
+    0.788
     """
 
     visibility: Float[Array, ""] | None = eqx.field(converter=as_optional_scalar, default=23.0)
@@ -148,7 +183,7 @@ class Atmosphere(eqx.Module):
         check_range("base_height", self.base_height, -500.0, 9000.0)
 
     def _layers(self, wavelength: ArrayLike) -> list[tuple[Array, Array, Array | float]]:
-        """Of molecules and of aerosol: extinction at z = 0 in 1/m, scale height, lidar ratio in sr."""
+        """For molecules and for aerosol: extinction at z = 0 in 1/m, scale height in m, lidar ratio in sr."""
         layers: list[tuple[Array, Array, Array | float]] = []
         if self.rayleigh:
             height = self.rayleigh_scale_height
@@ -161,14 +196,16 @@ class Atmosphere(eqx.Module):
         return layers
 
     def extinction(self, wavelength: ArrayLike, height: ArrayLike) -> Float[Array, "..."]:
-        """Extinction coefficient in 1/m.
+        """Extinction coefficient of the air in 1/m.
 
-        - `wavelength`: in nm, any shape, 230 to 3000.
-        - `height`: in m, any shape.
+        **Arguments:**
 
-        Returns an array of the shape of `wavelength` followed by that of `height`.
+        - `wavelength`: nm, any shape, 230 to 3000.
+        - `height`: m, any shape.
 
-        **Raises:** `ValueError` for a wavelength outside.
+        **Returns:** an array of the shape of `wavelength` followed by that of `height`.
+
+        **Raises:** ValueError for a wavelength outside its range.
         """
         wavelength, height = _wavelength(wavelength), as_array(height)
         total = jnp.zeros(wavelength.shape + height.shape)
@@ -179,18 +216,21 @@ class Atmosphere(eqx.Module):
     def optical_depth(
         self, wavelength: ArrayLike, height: ArrayLike, altitude: ArrayLike, zenith: ArrayLike = 0.0
     ) -> Float[Array, "..."]:
-        """Optical depth along the beam between the sensor and the target, one way.
+        """One-way optical depth of the air along the beam between sensor and target.
 
-        The integral of the exponentials in closed form, exact to rounding for thin and for deep layers.
+        The exponentials are integrated in closed form, exact to rounding for thin and for deep layers. The
+        atmosphere is plane-parallel.
 
-        - `wavelength`: in nm, any shape, 230 to 3000.
-        - `height`: of the target in m, any shape. From a target above the sensor nothing is between.
-        - `altitude`: of the sensor in m, a scalar.
-        - `zenith`: of the beam in degrees, 0 to 89, a scalar; layers are flat. Default 0.
+        **Arguments:**
 
-        Returns an array of the shape of `wavelength` followed by that of `height`.
+        - `wavelength`: nm, any shape, 230 to 3000.
+        - `height`: height of the target, m, any shape. For a target above the sensor the result is zero.
+        - `altitude`: height of the sensor, m, a scalar.
+        - `zenith`: zenith angle of the beam, degrees, 0 to 89, a scalar. Default 0.
 
-        **Raises:** `ValueError` for a value outside its range.
+        **Returns:** an array of the shape of `wavelength` followed by that of `height`.
+
+        **Raises:** ValueError for a value outside its range.
         """
         wavelength, height, altitude = _wavelength(wavelength), as_array(height), as_scalar(altitude)
         check_range("height", height)
@@ -207,23 +247,31 @@ class Atmosphere(eqx.Module):
     def two_way_transmittance(
         self, wavelength: ArrayLike, height: ArrayLike, altitude: ArrayLike, zenith: ArrayLike = 0.0
     ) -> Float[Array, "..."]:
-        """Share of the light that survives the way from the sensor to the target and back, in [0, 1].
+        """Two-way transmittance of the air between sensor and target, in [0, 1].
 
-        Arguments, shape of the result and errors are those of `optical_depth`.
+        **Arguments:** `wavelength`, `height`, `altitude`, `zenith`: as for `optical_depth`.
+
+        **Returns:** an array of the shape of `wavelength` followed by that of `height`.
+
+        **Raises:** ValueError for a value outside its range.
         """
         return jnp.exp(-2 * self.optical_depth(wavelength, height, altitude, zenith))
 
     def backscatter(
         self, wavelength: ArrayLike, height: ArrayLike, altitude: ArrayLike, zenith: ArrayLike = 0.0
     ) -> Float[Array, "..."]:
-        """The air's own return: apparent reflectance per metre of range, in 1/m.
+        """Return of the air itself: apparent reflectance per metre of range, in 1/m.
 
-        pi times backscatter coefficient times two-way transmittance (see the module's docstring), for
-        light scattered once. A bin of the length dr along the beam returns dr times this. Zero where
-        `lidar_ratio` is None.
+        This is pi times backscatter coefficient times two-way transmittance (see
+        `jaxlidar.scenes.atmosphere`), for light scattered once. A range bin of length dr returns dr times
+        this. It is zero where `lidar_ratio` is None. For ranges other than the reference range, the caller
+        applies the inverse square of range.
 
-        Arguments, shape of the result and errors are those of `optical_depth`. Light from other ranges than
-        the reference's also counts by the inverse square of range, which is left to the caller.
+        **Arguments:** `wavelength`, `height`, `altitude`, `zenith`: as for `optical_depth`.
+
+        **Returns:** an array of the shape of `wavelength` followed by that of `height`.
+
+        **Raises:** ValueError for a value outside its range.
         """
         transmittance = self.two_way_transmittance(wavelength, height, altitude, zenith)
         if self.lidar_ratio is None:

@@ -1,4 +1,4 @@
-"""The canopy: a voxel map with the optics of its leaf and bark."""
+"""The canopy: a voxel map with the optical properties of its leaf and bark."""
 
 from collections.abc import Callable
 from typing import Any, final
@@ -21,22 +21,36 @@ def _as_bark(x: Any) -> Any:
 
 @final
 class Canopy(eqx.Module):
-    """Leaf and bark in voxels.
+    """A canopy: leaf and bark in voxels, with their optical properties.
 
     **Arguments:**
 
     - `voxels`: a `VoxelMap`.
-    - `leaf`: leaf optics: a `Prospect`, a `LeafOptics`, anything that gives (reflectance, transmittance)
-      for wavelengths in nm, or a volume scatterer such as `Isotropic`. Needed where the map has leaf.
-    - `bark`: reflectance of bark: one number, one per wavelength, a `Spectrum`, or a volume scatterer. Needed
-      where the map has bark.
-    - `transmission`: "diffuse" (default: transmitted light leaves the far side of the leaf by the cosine
-      law) or "straight" (the paper: it keeps its direction; extinction then depends on the wavelength).
-    - `hotspot`: False (default): the ways in and out are independent, first order as exp(-2 tau). True:
-      first-order light returns through the gap by which it came, exp(-tau), as gap models assume.
-    - `sides`: "open" (default: nothing beyond the map) or "periodic" (the map repeats without end).
+    - `leaf`: leaf optics: a `Prospect`, a `LeafOptics`, any function of the wavelengths in nm that returns
+      (reflectance, transmittance), or a volume scatterer such as `Isotropic`. Needed where the map has leaf.
+      Default None.
+    - `bark`: reflectance of bark: one number, one per wavelength, a `Spectrum`, or a volume scatterer. In
+      [0, 1]. Needed where the map has bark. Default None.
+    - `transmission`: "diffuse": transmitted light leaves the far side of the leaf by the cosine law.
+      "straight" (as in the paper): it keeps its direction; extinction then depends on the wavelength.
+      Default "diffuse".
+    - `hotspot`: False: the attenuations on the way in and out are independent, and first-order light is
+      attenuated by exp(-2 tau). True: first-order light returns through the gap by which it entered, with
+      exp(-tau), as gap models assume. Default False.
+    - `sides`: "open": there is nothing beyond the map. "periodic": the map repeats without end. Default
+      "open".
 
-    **Raises:** ValueError for missing optics, bark reflectance outside [0, 1] or unknown choices.
+    **Raises:** ValueError for missing optics, a bark reflectance outside [0, 1] and unknown choices;
+    TypeError if `voxels` is not a `VoxelMap`.
+
+    **Example:**
+
+    >>> import numpy as np, jaxlidar as jl
+    >>> voxels = jl.VoxelMap.from_lad(np.full((4, 4, 10), 0.5), voxel_size=1.0)
+    >>> canopy = jl.Canopy(voxels, leaf=jl.Prospect(N=1.5, Cab=40.0, Car=8.0, Cw=0.01, Cm=0.009))
+    >>> reflectance, transmittance = canopy.leaf_optics(np.array([1064.0]))
+    >>> print(f"R = {float(reflectance[0]):.2f}, T = {float(transmittance[0]):.2f}")
+    R = 0.44, T = 0.48
     """
 
     voxels: VoxelMap
@@ -60,27 +74,31 @@ class Canopy(eqx.Module):
 
     @property
     def leaf_phase(self) -> AbstractPhase | None:
-        """The phase function of the leaf, where it is no facets."""
+        """The phase function of leaf if leaf is a volume scatterer, else None."""
         return self.leaf if isinstance(self.leaf, AbstractPhase) else None
 
     @property
     def bark_phase(self) -> AbstractPhase | None:
-        """The phase function of the bark, where it is no facets."""
+        """The phase function of bark if bark is a volume scatterer, else None."""
         return self.bark if isinstance(self.bark, AbstractPhase) else None
 
     @property
     def is_straight(self) -> bool:
-        """Whether leaves transmit straight on, so that every wavelength has an extinction of its own."""
+        """Whether transmitted light keeps its direction; extinction then depends on the wavelength."""
         return self.leaf is not None and self.transmission == "straight"
 
     def leaf_optics(
         self, wavelength: Float[Array, "wavelengths"]
     ) -> tuple[Float[Array, "wavelengths"], Float[Array, "wavelengths"]]:
-        """Leaf reflectance and transmittance; for a volume scatterer, the albedo and zero.
+        """Leaf reflectance and transmittance; for a volume scatterer, its albedo and zero.
 
-        **Arguments:** `wavelength`: nm.
+        **Arguments:**
 
-        **Raises:** ValueError if R + T exceeds 1.
+        - `wavelength`: (wavelengths,) nm.
+
+        **Returns:** (reflectance, transmittance), each (wavelengths,).
+
+        **Raises:** ValueError if one of them is outside [0, 1], or their sum exceeds 1.
         """
         if isinstance(self.leaf, AbstractPhase):
             albedo = reflectance_at(self.leaf.albedo, wavelength, "leaf albedo")
@@ -96,9 +114,16 @@ class Canopy(eqx.Module):
         return r, t
 
     def bark_reflectance(self, wavelength: Float[Array, "wavelengths"]) -> Float[Array, "wavelengths"]:
-        """Reflectance of bark; for a volume scatterer, the albedo.
+        """Reflectance of bark; for a volume scatterer, its albedo.
 
-        **Arguments:** `wavelength`: nm.
+        **Arguments:**
+
+        - `wavelength`: (wavelengths,) nm.
+
+        **Returns:** (wavelengths,) reflectance.
+
+        **Raises:** ValueError for another number of values than wavelengths, and for a wavelength outside the
+        range of a spectrum.
         """
         bark = self.bark.albedo if isinstance(self.bark, AbstractPhase) else self.bark
         assert bark is not None

@@ -1,4 +1,4 @@
-"""What the lidar looks at: canopy, plates, ground and atmosphere, and nothing that is not there."""
+"""The scene that a lidar observes: canopy, plates, ground and atmosphere, each of them optional."""
 
 from typing import Any, final
 
@@ -15,16 +15,26 @@ def _as_plates(x: Any) -> Any:
 
 @final
 class Scene(eqx.Module):
-    """Everything in the beam's way. What is None or empty is not there and costs nothing.
+    """A scene: the canopy, plates, ground and atmosphere that a lidar observes.
+
+    Each part is optional. A part that is None or empty takes no computing time.
 
     **Arguments:**
 
-    - `canopy`: a `Canopy` or None (default).
-    - `plates`: a tuple of `Plate`, or of other surfaces that light may pass. Default: none.
-    - `ground`: a `Ground`, another surface at which light ends, or None (default).
-    - `atmosphere`: an `Atmosphere` or None (default).
+    - `canopy`: a `Canopy`, or None. Default None.
+    - `plates`: a sequence of `Plate`, or of other `AbstractSheet`. Default ().
+    - `ground`: a `Ground`, another `AbstractGround`, or None. Default None.
+    - `atmosphere`: an `Atmosphere`, or None. Default None.
 
-    **Raises:** TypeError for things of another kind.
+    **Raises:** TypeError for an argument of another type.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> plate = jl.Plate(height=5.0, reflectance=0.4, transmittance=0.4, coverage=0.5)
+    >>> scene = jl.Scene(plates=[plate], ground=jl.Ground(reflectance=0.3))
+    >>> [surface.name for surface in scene.surfaces]
+    ['ground', 'plate']
     """
 
     canopy: Canopy | None = None
@@ -49,5 +59,5 @@ class Scene(eqx.Module):
 
     @property
     def surfaces(self) -> tuple[AbstractSurface, ...]:
-        """The ground, if any, then the plates: the order in which the tracer counts them."""
+        """All surfaces: the ground, if there is one, then the plates, as the tracer numbers them."""
         return (() if self.ground is None else (self.ground,)) + self.plates

@@ -1,4 +1,4 @@
-"""Shapes of surfaces: where rays meet them."""
+"""Shapes of surfaces, and where rays meet them."""
 
 import abc
 from typing import Any, final
@@ -11,54 +11,121 @@ from jaxtyping import Array, Float
 from jaxlidar._checks import known_array
 from jaxlidar._vectors import FAR, Scalar, Vec, dot, vec
 
-# Cosine between a direction and a normal, below which they never meet.
+# Rays whose direction has a cosine with the normal below this never meet the plane.
 _PARALLEL = 1e-9
 
 
 class AbstractShape(eqx.Module):
-    """Where a surface lies. Its upper side is the one that its normal points to.
+    """The shape and position of a surface in space.
 
-    Points and directions are (x, y, z) tuples of arrays of one shape, in m; directions are unit vectors.
+    Derive your own shape from this class and define its five methods. The upper side of a surface is the
+    side to which its normal points. Points (in m) and directions (unit vectors) are (x, y, z) tuples of
+    arrays of one shape.
+
+    **Example:** the shape of a level ground, met 8 m below a point.
+
+    >>> import jaxlidar as jl
+    >>> shape = jl.Ground(height=2.0).shape
+    >>> isinstance(shape, jl.AbstractShape)
+    True
+    >>> float(shape.distance((0.0, 0.0, 10.0), (0.0, 0.0, -1.0)))
+    8.0
     """
 
     @property
     @abc.abstractmethod
     def lights_itself(self) -> bool:
-        """Whether light that leaves it can meet it again; `distance` then passes over where it starts."""
+        """Whether light that leaves the surface can meet it again.
+
+        If True, `distance` must leave out the point where the light starts.
+        """
 
     @abc.abstractmethod
     def moved(self, by: Float[Array, "3"]) -> "AbstractShape":
-        """The same shape, displaced by `by` (m)."""
+        """The same shape, moved.
+
+        **Arguments:**
+
+        - `by`: (3,) displacement, m.
+
+        **Returns:** an `AbstractShape`.
+        """
 
     @abc.abstractmethod
     def distance(self, x: Vec, w: Vec) -> Scalar:
-        """How far (m) from `x` along `w` it is first met; FAR, 1e30, where it is behind or missed."""
+        """Distance in m from a point to the first intersection along a direction.
+
+        **Arguments:**
+
+        - `x`: points, m.
+        - `w`: directions.
+
+        **Returns:** distances in m; 1e30 where the surface is behind the point or is missed.
+        """
 
     @abc.abstractmethod
     def tangent(self, x: Vec) -> tuple[Vec, Scalar]:
-        """Upper unit normal at the point `x` of it, and the offset of its plane, normal . point."""
+        """The tangent plane at a point of the surface.
+
+        **Arguments:**
+
+        - `x`: points on the surface, m.
+
+        **Returns:** the upper unit normal, and the offset of the plane in m, which is normal . point.
+        """
 
     @abc.abstractmethod
     def crossing(
         self, points: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]
     ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-        """Signed distances at which straight lines cross it, and cosines between direction and normal there.
+        """Signed distances at which straight lines cross the surface, and the cosines of incidence there.
 
-        In double precision, for plans, which bound all lengths of paths by them: a shape that is curved or
-        ends gives the least and the largest that any line near by can have, at different elements.
+        Used by plans to bound the lengths of all paths, in double precision. A shape that is curved or
+        bounded gives the smallest and the largest values that any line nearby can have, at different
+        elements.
+
+        **Arguments:**
+
+        - `points`: (n, 3) points on the lines, m.
+        - `directions`: (n, 3) directions of the lines.
+
+        **Returns:** (n,) distances in m, and (n,) cosines between direction and normal.
         """
 
 
 @final
 class Plane(AbstractShape):
-    """An infinite plane through the point `foot`, its upper unit normal `upward`."""
+    """An infinite plane. `Plane.of` makes one of height, slope and aspect.
+
+    **Arguments:**
+
+    - `upward`: (3,) upper unit normal.
+    - `foot`: (3,) a point of the plane, m.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> plane = jl.Plane.of(height=2.0, slope=60.0, aspect=90.0)
+    >>> print(f"normal: {float(plane.upward[0]):.3f} east, {float(plane.upward[2]):.3f} up")
+    normal: 0.866 east, 0.500 up
+    """
 
     upward: Float[Array, "3"]
     foot: Float[Array, "3"]
 
     @staticmethod
     def of(height: Float[Array, ""], slope: Float[Array, ""], aspect: Float[Array, ""]) -> "Plane":
-        """Through (0, 0, height), its normal tilted by `slope` towards the azimuth `aspect` (degrees)."""
+        """The plane through (0, 0, height) of a given slope and aspect.
+
+        **Arguments:**
+
+        - `height`: height at x = y = 0, m.
+        - `slope`: angle between the normal and the vertical, degrees.
+        - `aspect`: azimuth to which the normal is tilted, degrees clockwise from north (+y). The plane falls
+          in this direction.
+
+        **Returns:** a `Plane`.
+        """
         s, a = jnp.deg2rad(slope), jnp.deg2rad(aspect)
         upward = jnp.stack([jnp.sin(s) * jnp.sin(a), jnp.sin(s) * jnp.cos(a), jnp.cos(s)])
         zero = jnp.zeros_like(height)

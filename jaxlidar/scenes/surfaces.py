@@ -16,18 +16,18 @@ Reflectance = Float[Array, ""] | Float[Array, "wavelengths"] | Spectrum
 
 
 def as_reflectance(x: Any) -> Any:
-    """A reflectance as it is kept in a field: a `Spectrum`, or an array."""
+    """Convert a reflectance to what fields hold: a `Spectrum`, an array, or None."""
     return x if isinstance(x, Spectrum) or x is None else as_array(x)
 
 
 def check_reflectance(field: str, x: Any) -> None:
-    """Refuse a reflectance outside [0, 1]; a `Spectrum` checks its own."""
+    """Raise ValueError for a reflectance outside [0, 1]. A `Spectrum` checks its own values."""
     if not isinstance(x, Spectrum):
         check_range(field, x, 0.0, 1.0)
 
 
 def check_sum(field: str, reflectance: Any, transmittance: Any) -> None:
-    """Refuse R + T above 1 (beyond rounding) where both can be read."""
+    """Raise ValueError if R + T exceeds 1 by more than rounding, where both values are known."""
     if isinstance(reflectance, Spectrum) or isinstance(transmittance, Spectrum):
         return
     r, t = concrete(reflectance), concrete(transmittance)
@@ -38,10 +38,21 @@ def check_sum(field: str, reflectance: Any, transmittance: Any) -> None:
 
 
 class AbstractSurface(eqx.Module):
-    """A surface that light meets: what trace and plan need to know of one. Derive from one of the two below.
+    """A surface that reflects light: what the tracer and plans need to know about it.
 
-    - `reflectance`: one number, one per wavelength, or a `Spectrum`.
-    - `law`: how it reflects.
+    Derive your own surface from `AbstractGround` or `AbstractSheet`.
+
+    **Arguments:**
+
+    - `reflectance`: one number, one per wavelength, or a `Spectrum`; in [0, 1].
+    - `law`: the scattering law, an `AbstractLaw`.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> surfaces = (jl.Ground(reflectance=0.3), jl.Plate(height=5.0, reflectance=0.4))
+    >>> [isinstance(surface, jl.AbstractSurface) for surface in surfaces]
+    [True, True]
     """
 
     reflectance: eqx.AbstractVar[Reflectance]
@@ -50,31 +61,59 @@ class AbstractSurface(eqx.Module):
     @property
     @abc.abstractmethod
     def name(self) -> str:
-        """What it is called in a waveform's components; several of a name are numbered from 1."""
+        """Name of the surface in `Waveform.components`. Several surfaces of one name are numbered from 1."""
 
     @property
     @abc.abstractmethod
     def shape(self) -> AbstractShape:
-        """Where it lies."""
+        """Shape and position of the surface."""
 
 
 class AbstractGround(AbstractSurface):
-    """A surface at which light ends, met from above alone; a `Scene` has one at most.
+    """A ground: an opaque surface that light meets from above only. A `Scene` has at most one.
 
-    A ground of your own is one class in one file: derive it from this, give its fields, name and shape, and
-    pass it as `ground=` of a `Scene`.
+    To add your own ground, derive a class from this one, define its fields, name and shape, and pass it as
+    `ground=` of a `Scene`.
+
+    **Arguments:**
+
+    - `reflectance`: one number, one per wavelength, or a `Spectrum`; in [0, 1].
+    - `law`: the scattering law, an `AbstractLaw`.
+
+    **Example:** a smooth water surface at z = 0.
+
+    >>> import jax, jaxlidar as jl
+    >>> class Water(jl.AbstractGround):
+    ...     reflectance: jax.Array | float = 0.02
+    ...     law: jl.AbstractLaw = jl.Specular(roughness=0.1)
+    ...     name = "water"
+    ...     shape = jl.Plane.of(0.0, 0.0, 0.0)
+    >>> jl.Scene(ground=Water()).surfaces[0].name
+    'water'
     """
 
 
 class AbstractSheet(AbstractSurface):
-    """A surface that light meets from both sides and may pass; a `Scene` has any number of them.
+    """A sheet: a surface that light meets from both sides and may pass. A `Scene` has any number of them.
 
-    A sheet of your own is one class in one file: derive it from this, give its fields, name and shape, and
-    pass it in `plates=` of a `Scene`.
+    To add your own sheet, derive a class from this one, define its fields, name and shape, and pass it in
+    `plates=` of a `Scene`.
 
-    - `transmittance`: one number, one per wavelength, or a `Spectrum`.
-    - `coverage`: probability that light that crosses the sheet meets it.
-    - `transmission`: "straight" (the direction is kept) or "diffuse" (cosine law into the far side).
+    **Arguments:**
+
+    - `reflectance`: one number, one per wavelength, or a `Spectrum`; in [0, 1].
+    - `law`: the scattering law, an `AbstractLaw`.
+    - `transmittance`: one number, one per wavelength, or a `Spectrum`; in [0, 1].
+    - `coverage`: probability that light that crosses the sheet meets material, in [0, 1].
+    - `transmission`: "straight" (transmitted light keeps its direction) or "diffuse" (it leaves the far side
+      by the cosine law).
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> sheet = jl.Plate(height=5.0, reflectance=0.4, transmittance=0.4, transmission="diffuse")
+    >>> isinstance(sheet, jl.AbstractSheet), sheet.name
+    (True, 'plate')
     """
 
     transmittance: eqx.AbstractVar[Reflectance]
@@ -84,18 +123,27 @@ class AbstractSheet(AbstractSurface):
 
 @final
 class Ground(AbstractGround):
-    """The ground: an infinite opaque plane.
+    """The ground: an infinite opaque plane, level or sloping.
 
     **Arguments:**
 
-    - `height`: m, at x = y = 0. Default 0.
-    - `reflectance`: one number, one per wavelength, or a `Spectrum`. Default 0.3.
-    - `slope`: degrees from the horizontal, 0 to below 90. Default 0.
-    - `aspect`: degrees clockwise from north (+y): the horizontal direction in which the ground falls. Default
-      0.
-    - `law`: `Lambertian()` (default), `EqualAngle()`, `Specular(roughness=)`, or another `AbstractLaw`.
+    - `height`: height at x = y = 0, m. Default 0.
+    - `reflectance`: one number, one per wavelength, or a `Spectrum`; in [0, 1]. Default 0.3.
+    - `slope`: angle from the horizontal, degrees, 0 to below 90. Default 0.
+    - `aspect`: horizontal direction in which the ground falls, degrees clockwise from north (+y). Default 0.
+    - `law`: the scattering law: `Lambertian()`, `EqualAngle()`, `Specular(roughness=...)`, or another
+      `AbstractLaw`. Default `Lambertian()`.
 
-    **Raises:** ValueError for a reflectance outside [0, 1] or a slope outside [0, 90).
+    **Raises:** ValueError for a reflectance outside [0, 1], a slope outside [0, 90), and values that are not
+    finite.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> ground = jl.Ground(height=100.0, reflectance=jl.spectrum("soil-medium"), slope=20.0, aspect=180.0)
+    >>> north, up = ground.shape.upward[1:]
+    >>> print(f"normal: {float(north):.3f} north, {float(up):.3f} up")
+    normal: -0.342 north, 0.940 up
     """
 
     height: Float[Array, ""] = eqx.field(converter=as_scalar, default=0.0)
@@ -121,20 +169,33 @@ class Ground(AbstractGround):
 
 @final
 class Plate(AbstractSheet):
-    """An infinite sheet with a reflectance and a transmittance, alike on both sides: the paper's leaf plate.
+    """A leaf plate: an infinite sheet with a reflectance and a transmittance, the same on both sides.
+
+    This is the leaf plate of the paper.
 
     **Arguments:**
 
-    - `height`: m, at x = y = 0.
-    - `reflectance`, `transmittance`: one number, one per wavelength, or a `Spectrum`; their sum at most 1.
-      `transmittance` is 0 by default.
-    - `coverage`: probability that a ray meets the sheet, independently at every crossing. Default 1.
-    - `slope`, `aspect`: as for `Ground`. Default 0.
-    - `transmission`: "straight" (default, as in the paper: the direction is kept) or "diffuse" (cosine
-      law into the far side).
-    - `law`: how it reflects. Default `Lambertian()`.
+    - `height`: height at x = y = 0, m.
+    - `reflectance`: one number, one per wavelength, or a `Spectrum`; in [0, 1].
+    - `transmittance`: one number, one per wavelength, or a `Spectrum`; in [0, 1]. The sum of reflectance and
+      transmittance is at most 1. Default 0.
+    - `coverage`: probability that a ray meets the plate, independently at every crossing; in [0, 1].
+      Default 1.
+    - `slope`: angle from the horizontal, degrees, 0 to below 90. Default 0.
+    - `aspect`: horizontal direction in which the plate falls, degrees clockwise from north (+y). Default 0.
+    - `transmission`: "straight" (as in the paper: transmitted light keeps its direction) or "diffuse" (it
+      leaves the far side by the cosine law). Default "straight".
+    - `law`: the scattering law, an `AbstractLaw`. Default `Lambertian()`.
 
-    **Raises:** ValueError for values outside [0, 1] and for reflectance + transmittance above 1.
+    **Raises:** ValueError for values outside the ranges above, and for an unknown `transmission`. The sum of
+    reflectance and transmittance is not checked where one of them is a `Spectrum`.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> plate = jl.Plate(height=5.0, reflectance=0.4, transmittance=0.45, coverage=0.5)
+    >>> print(f"{float(1 - plate.reflectance - plate.transmittance):.2f} of the light is absorbed")
+    0.15 of the light is absorbed
     """
 
     height: Float[Array, ""] = eqx.field(converter=as_scalar)

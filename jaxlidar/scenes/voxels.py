@@ -1,4 +1,4 @@
-"""Voxel maps: where leaf and bark are, as extinction coefficients on a regular grid."""
+"""Voxel maps: extinction coefficients of leaf and bark on a regular grid."""
 
 from collections.abc import Sequence
 
@@ -10,7 +10,7 @@ from jaxtyping import Array, ArrayLike, Float
 from jaxlidar._checks import as_array, check_range
 from jaxlidar.optics.leaf_angles import LeafAngles
 
-# Optical depth of one edge of a voxel in which a ray surely meets material (p = 1): exp(-40) = 4e-18.
+# Optical depth along one edge of a solid voxel (probability 1): exp(-40) = 4e-18.
 SOLID_OPTICAL_DEPTH = 40.0
 
 
@@ -24,23 +24,30 @@ def _as_triple(x: Numbers) -> Float[Array, "3"]:
 
 
 class VoxelMap(eqx.Module):
-    """Leaf and bark in a box of equal voxels, x east, y north, z up.
+    """A voxel map: extinction coefficients of leaf and bark in a box of equal voxels, x east, y north, z up.
 
-    Made by `VoxelMap.from_probability`, `VoxelMap.from_extinction` or `VoxelMap.from_lad`. Within a
-    voxel the material is spread evenly: what a ray meets depends on the length of its chord, not on how
-    the chord is divided.
+    It is made by `VoxelMap.from_lad`, `VoxelMap.from_probability` or `VoxelMap.from_extinction`. Within a
+    voxel the material is spread evenly as a turbid medium. The interception of a ray depends on the length of
+    its path through the voxel only.
 
     **Arguments:**
 
     - `leaf`: (nx, ny, nz) extinction coefficient of leaf in 1/m for the projection function G = 1/2, that
-      is half the leaf area density; or None where there is no leaf.
-    - `bark`: the same for bark, whose facets are taken as spherically oriented; or None.
-    - `voxel_size`: (3,) edges in m.
+      is half the leaf area density, 0 or more; or None: no leaf.
+    - `bark`: (nx, ny, nz) the same for bark, whose facets are taken as spherically oriented; or None.
+    - `voxel_size`: (3,) voxel edges in m, positive; or one number for cubes.
     - `origin`: (3,) lower south-west corner in m.
-    - `leaf_angles`: distribution of leaf inclination; None is spherical.
+    - `leaf_angles`: distribution of leaf inclination, a `LeafAngles`, or None: spherical. Default None.
 
-    **Raises:** ValueError for negative, infinite or NaN extinction, sizes that are not positive, shapes
-    that differ, or a map with neither leaf nor bark.
+    **Raises:** ValueError for extinction that is negative or not finite, sizes that are not positive, leaf
+    and bark of different shapes, and a map with neither leaf nor bark.
+
+    **Example:**
+
+    >>> import numpy as np, jaxlidar as jl
+    >>> voxels = jl.VoxelMap.from_lad(np.full((4, 4, 10), 0.5), voxel_size=(1, 1, 2), origin=(-2, -2, 3))
+    >>> print(voxels.shape, voxels.top.tolist(), f"{float(voxels.leaf[0, 0, 0]):.2f} per m")
+    (4, 4, 10) [2.0, 2.0, 23.0] 0.25 per m
     """
 
     # Their shapes are compared below, so that the error can name both.
@@ -69,7 +76,7 @@ class VoxelMap(eqx.Module):
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """Number of voxels along x, y and z."""
+        """Numbers of voxels along x, y and z."""
         some = self.leaf if self.leaf is not None else self.bark
         assert some is not None
         nx, ny, nz = some.shape
@@ -77,7 +84,7 @@ class VoxelMap(eqx.Module):
 
     @property
     def top(self) -> Float[Array, "3"]:
-        """Upper north-east corner in m."""
+        """(3,) upper north-east corner in m."""
         return self.origin + self.voxel_size * jnp.asarray(self.shape, self.origin.dtype)
 
     @staticmethod
@@ -88,7 +95,18 @@ class VoxelMap(eqx.Module):
         voxel_size: Numbers,
         origin: Numbers = (0.0, 0.0, 0.0),
     ) -> "VoxelMap":
-        """From extinction coefficients in 1/m, the same for every direction. Arrays are (nx, ny, nz)."""
+        """Make a voxel map of extinction coefficients that are the same for every direction.
+
+        **Arguments:**
+
+        - `leaf`, `bark`: (nx, ny, nz) extinction coefficients in 1/m, 0 or more, or None. Default None.
+        - `voxel_size`: (3,) voxel edges in m, positive; or one number for cubes.
+        - `origin`: (3,) lower south-west corner in m. Default (0, 0, 0).
+
+        **Returns:** a `VoxelMap`.
+
+        **Raises:** ValueError for what `VoxelMap` does not admit.
+        """
         return VoxelMap(_volume(leaf), _volume(bark), voxel_size, origin)
 
     @staticmethod
@@ -99,13 +117,21 @@ class VoxelMap(eqx.Module):
         voxel_size: Numbers,
         origin: Numbers = (0.0, 0.0, 0.0),
     ) -> "VoxelMap":
-        """From the probability that a ray crossing one edge length of a voxel meets leaf, or bark.
+        """Make a voxel map of the probabilities p that a ray crossing one voxel edge meets leaf, or bark.
 
-        The extinction coefficient is -log1p(-p)/edge, the edge being the vertical one where voxels are
-        not cubes. p = 1, a solid trunk, is legal and taken as an optical depth of 40 per edge, with no
-        derivative with respect to p there.
+        The extinction coefficient is -log1p(-p)/edge. Where voxels are not cubes, the edge is the vertical
+        one. A solid trunk, p = 1, is admissible: it has an optical depth of 40 per edge, and its derivative
+        with respect to p is zero.
 
-        **Raises:** ValueError where a probability lies outside [0, 1].
+        **Arguments:**
+
+        - `leaf`, `bark`: (nx, ny, nz) probabilities in [0, 1], or None. Default None.
+        - `voxel_size`: (3,) voxel edges in m, positive; or one number for cubes.
+        - `origin`: (3,) lower south-west corner in m. Default (0, 0, 0).
+
+        **Returns:** a `VoxelMap`.
+
+        **Raises:** ValueError for a probability outside [0, 1], and for what `VoxelMap` does not admit.
         """
         size = _as_triple(voxel_size)
 
@@ -129,10 +155,20 @@ class VoxelMap(eqx.Module):
         leaf_angles: str | LeafAngles = "spherical",
         bark: Numbers | None = None,
     ) -> "VoxelMap":
-        """From leaf area density in m2/m3, (nx, ny, nz); the extinction coefficient is G(direction) * LAD.
+        """Make a voxel map of leaf area density (LAD). The extinction coefficient is G(direction) * LAD.
 
-        `leaf_angles` is "spherical", "planophile", "erectophile", "plagiophile", "extremophile", "uniform"
-        or a `LeafAngles`; `bark` is an extinction coefficient in 1/m.
+        **Arguments:**
+
+        - `lad`: (nx, ny, nz) one-sided leaf area density in m2/m3, 0 or more.
+        - `voxel_size`: (3,) voxel edges in m, positive; or one number for cubes.
+        - `origin`: (3,) lower south-west corner in m. Default (0, 0, 0).
+        - `leaf_angles`: "spherical", "planophile", "erectophile", "plagiophile", "extremophile", "uniform",
+          or a `LeafAngles`. Default "spherical".
+        - `bark`: (nx, ny, nz) extinction coefficient of bark in 1/m, 0 or more, or None. Default None.
+
+        **Returns:** a `VoxelMap`.
+
+        **Raises:** ValueError for a negative density, an unknown name, and what `VoxelMap` does not admit.
         """
         check_range("lad", lad, 0.0)
         angles = LeafAngles.named(leaf_angles) if isinstance(leaf_angles, str) else leaf_angles
@@ -140,7 +176,10 @@ class VoxelMap(eqx.Module):
         return VoxelMap(0.5 * as_array(lad), _volume(bark), voxel_size, origin, None if spherical else angles)
 
     def mean_extinction(self) -> Float[np.ndarray, "nx ny nz"]:
-        """Extinction coefficient of leaf (at G = 1/2) and bark together, 1/m, as a NumPy array."""
+        """Extinction coefficient of leaf (at G = 1/2) and bark together.
+
+        **Returns:** (nx, ny, nz) NumPy array in 1/m.
+        """
         return np.sum([np.asarray(a) for a in (self.leaf, self.bark) if a is not None], axis=0)
 
 

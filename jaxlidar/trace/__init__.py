@@ -1,1 +1,1 @@
-"""The response tracer: from geometry to the geometric weight of every scattering history."""
+"""The response tracer: from the geometry of a scene to the weight of every scattering history."""

@@ -1,4 +1,4 @@
-"""Collisions: what is hit, whereto it scatters, and what of it the receiver sees."""
+"""Collisions: what is hit, in which direction it scatters, and how much of that the receiver sees."""
 
 import jax
 import jax.numpy as jnp
@@ -24,10 +24,11 @@ def collide(
     landed: list[Bool[Array, "photons"]],
     draw: Draw,
 ) -> Hit:
-    """What photons that fly along `w` hit at `x`, how it scatters, and whereto.
+    """What photons that fly along `w` hit at `x`, and how and in which direction it scatters.
 
-    `cell`, `collided`: the voxel, and whether they collide in it. - `landed`: for each surface, whether they
-    land on it.
+    - `cell`: the voxel.
+    - `collided`: whether they collide in the voxel.
+    - `landed`: for each surface, whether they land on it.
     """
     one = jnp.ones_like(w[0])
     none = jnp.full(one.shape, -1, jnp.int32)
@@ -60,7 +61,7 @@ def _on_surface(setting: Setting, surface: Surface, number: int, x: Vec, w: Vec,
         onward = jnp.where(through, ratio_of(-dot(normal, far)) / (1.0 - lobe), onward / lobe)
         letter = jnp.where(through, scatterer.transmitted, letter)
     elif scatterer.transmitted >= 0:
-        # That it is reflected rather than passed was drawn on the way.
+        # Whether it is reflected or passes was drawn on the way.
         ratio = ratio / lobe
     return Hit(
         material=jnp.full_like(none, scatterer.material),
@@ -87,7 +88,7 @@ def _in_medium(setting: Setting, medium: Medium, w: Vec, cell: Int[Array, "photo
         return on_bark
     leaf_k = medium.leaf_at(cell, w)
     p = leaf_k / jnp.maximum(leaf_k + bark_k, 1e-30)
-    # What is left of the number that chose leaf chooses the lobe.
+    # Rescaled, the number that chose leaf also chooses the lobe.
     share = draw.choice / jnp.maximum(p, 1e-30)
     return merge(draw.choice < p, _on_leaf(setting, medium, leaf, w, leaf_k, share, draw), on_bark)
 
@@ -141,7 +142,7 @@ def _within(
     normal: Vec,
     facing: Vec,
 ) -> Hit:
-    """A collision within a voxel, which scatters by the law of that number, about the normal `facing`."""
+    """A collision within a voxel, scattered about the normal `facing` by the law of that number."""
     incident, out, normal, facing = jax.tree.map(stop, (incident, out, normal, facing))
     return Hit(
         material=jnp.full_like(letter, scatterer.material),
@@ -175,9 +176,10 @@ def _leaf_normal(medium: Medium, w: Vec, u: Scalar, v: Scalar) -> tuple[Vec, Sca
 
 
 def view_factors(setting: Setting, x: Vec, w: Vec, v: Vec, hit: Hit) -> tuple[Scalar, Scalar | None]:
-    """What of light that collides at `x`, flying along `w`, is seen along `v`.
+    """View factors towards `v` of light that collides at `x`, flying along `w`.
 
-    Apparent reflectance per unit reflectance, and per unit transmittance (None if nothing transmits).
+    They are apparent reflectance per unit reflectance, and per unit transmittance (None if nothing
+    transmits).
     """
     plan, medium = setting.plan, setting.medium
     reflected, transmitted = jnp.zeros_like(w[0]), jnp.zeros_like(w[0])

@@ -1,13 +1,13 @@
 """Soft time binning: deposits of energy into fine bins, smooth in time and exactly conserving.
 
-A return at an instant is spread over three bins by the quadratic B-spline, whose weights sum to one
-and whose second moment, 1/4 bin^2, does not depend on where in the bin the instant falls; the
-derivative with respect to time is continuous. A return that extends over a stretch of the ray is
-integrated bin by bin and smoothed by (1, 10, 1)/12, which gives it the same second moment. That
-common second moment is taken out again when the pulse is applied (`jaxlidar.waveform`).
+A return at an instant is spread over three bins by the quadratic B-spline. Its weights sum to one, its second
+moment, 1/4 bin^2, does not depend on where in the bin the instant falls, and its derivative with respect to
+time is continuous. A return that extends over a stretch of the ray is integrated bin by bin and smoothed by
+(1, 10, 1)/12, which gives it the same second moment. That common second moment is taken out again when the
+pulse is applied (`jaxlidar.waveform`).
 
-To show what that is worth, the kernel may have two bins (linear; cloud in cell) or one (the nearest
-bin, whose derivative with respect to time is zero); its second moment is then n/12 bin^2 in the mean.
+For comparison the kernel may have two bins (linear; cloud in cell) or one (the nearest bin, whose derivative
+with respect to time is zero); its second moment is then n/12 bin^2 in the mean.
 """
 
 import jax.numpy as jnp
@@ -20,7 +20,7 @@ from jaxlidar.planning.trace_plan import Bins
 def instant_row(
     bins: Bins, time: Float[Array, "*s"], value: Float[Array, "*s"]
 ) -> tuple[Int[Array, "*s"], Float[Array, "*s kernel"]]:
-    """First bin (counting the margin) and the weights of a return at one instant."""
+    """First bin (counting the margin) and weights of a return at one instant."""
     position = bins.position(time)
     lowest = jnp.round(lax.stop_gradient(position) - 0.5 * (bins.kernel - 1))
     r = position - lowest
@@ -36,7 +36,7 @@ def instant_row(
 
 
 def smooth_row(row: Float[Array, "*s n"], kernel: int) -> Float[Array, "*s n+2"]:
-    """Give bin integrals, whose own second moment is 1/12, that of the kernel."""
+    """Bin integrals, whose own second moment is 1/12 bin^2, smoothed to the second moment of the kernel."""
     zero = jnp.zeros_like(row[..., :1])
     side = (kernel - 1) / 24
     return (
@@ -52,7 +52,7 @@ def _first(bins: Bins, first: Float[Array, "*s"], length: int) -> Int[Array, "*s
 
 
 def first_bin(bins: Bins, first: Float[Array, "*s"], length: int) -> Int[Array, "*s"]:
-    """Index, counting the margin, of bin number `first` as the start of a row of `length` bins."""
+    """Index, counting the margin, of bin number `first`, where a row of `length` bins starts."""
     return _first(bins, first, length)
 
 
@@ -62,7 +62,7 @@ def scatter_rows(
     first: Int[Array, "*s"],
     rows: Float[Array, "*s n"],
 ) -> Float[Array, "slots padded"]:
-    """Add rows of contiguous bins. One windowed scatter costs about as much as one single element."""
+    """Add rows of contiguous bins. One windowed scatter costs about as much as adding one element."""
     slots, padded = into.shape
     index = (slot * padded + first).reshape(-1, 1)
     numbers = lax.ScatterDimensionNumbers(

@@ -1,12 +1,12 @@
-r"""First order: every ray of the footprint marched through the scene, its expected return deposited.
+r"""First order: every ray of the footprint is marched through the scene, and its expected return deposited.
 
-Nothing is random. With extinction coefficients k_m of the materials m, k their sum, and tau the optical
-depth from the sensor, the return from a stretch of the ray is
+Nothing is random. With extinction coefficients k_m of the materials m, their sum k, and the optical depth tau
+from the sensor, the return from a stretch of the ray is
 
     f_m * integral of k_m exp(-kappa tau(s)) ds,    kappa = 2, or 1 with the hot spot,
 
-integrated exactly over every piece of the ray that lies within one voxel and one time bin. f_m is the
-view factor for backscatter (`jaxlidar.optics.facets`, `jaxlidar.optics.phase`).
+integrated exactly over every piece of the ray that lies within one voxel and one time bin. f_m is the view
+factor for backscatter (`jaxlidar.optics.facets`, `jaxlidar.optics.phase`).
 """
 
 import itertools
@@ -34,7 +34,7 @@ CHUNK = 512
 
 
 class Stretches(eqx.Module):
-    """The pieces of one ray between faces: start, length (m), depth at its start, voxel, extinction."""
+    """Pieces of one ray between faces: start, length (m), depth at its start, voxel, extinction (1/m)."""
 
     start: Float[Array, "*steps"]
     length: Float[Array, "*steps"]
@@ -44,7 +44,7 @@ class Stretches(eqx.Module):
 
 
 def mean_decay(x: Scalar) -> Scalar:
-    """(1 - exp(-x)) / x for x >= 0, with its derivative, exact down to and at zero."""
+    """(1 - exp(-x)) / x for x >= 0, with its derivative; accurate down to and at zero."""
     return _decay(x)[1]
 
 
@@ -93,10 +93,10 @@ def march_ray(
 
 
 class Passage:
-    """What plates in the way do to light that passes them `ways` times: exponents and their weights.
+    """Transmission of light by the plates it passes `ways` times, as exponents and their weights.
 
-    A fully covering plate multiplies by T each time; a partial one by (1 - c) + c T, which is expanded
-    so that each term is a monomial in T.
+    A fully covering plate multiplies by T each time; a partial one by (1 - c) + c T, which is expanded so
+    that each term is a monomial in T.
     """
 
     def __init__(self, surfaces: tuple[Surface, ...], plan: TracePlan, ways: int):
@@ -120,7 +120,7 @@ class Passage:
     def terms(self, table: Histories, base: int, s: Scalar, met: list[Scalar]):
         """Pairs of history and weight for light that scatters at distance `s` into history `base`.
 
-        The history is an array, or where there are no plates a number.
+        The history is an array, or a number where there are no plates.
         """
         if not self.plates:
             yield base, jnp.ones_like(s)
@@ -140,9 +140,9 @@ class Passage:
 
 
 class FirstOrder(eqx.Module):
-    """Deterministic first-order response and the fate of the light that it describes.
+    """Deterministic first-order response, and the fate of the light that it describes.
 
-    `scattered`: what of the light that arrived is scattered at all, per unit optics.
+    `scattered`: how much of the light that arrived is scattered at all, per unit optics.
     """
 
     weights: Float[Array, "materials histories bins"]
@@ -160,8 +160,9 @@ def first_order(
 ) -> FirstOrder:
     """Response of order one.
 
-    Rays are given by their place across the beam and their share of energy. With `mirror`, they carry what
-    that surface returns of them (see `jaxlidar.trace.mirror`), and nothing else is deposited.
+    `across` and `energy` give the place of each ray across the beam and its share of energy. With `mirror`,
+    the rays carry what that surface returns of them (see `jaxlidar.trace.mirror`), and nothing else is
+    deposited.
     """
     beam, medium, surfaces = setting.beam, setting.medium, setting.surfaces
     plan, table, bins = setting.plan, setting.short, setting.bins
@@ -187,7 +188,7 @@ def first_order(
 
         if medium is not None:
             step = jnp.asarray(plan.max_step, energy.dtype)
-            # Stretches stay along the first axis, where the march leaves them: turning them costs as much.
+            # Stretches stay along the first axis, where the march leaves them: transposing costs as much.
             march = jax.vmap(march_ray, (None, 0, 0, 0, 0, None, None), (1, 0, 0))
             stretch, at_stops, total = march(medium, x, w, stop, met, plan.first_steps, step)
 
@@ -209,7 +210,7 @@ def first_order(
                 for history, share in out_way.terms(table, 0, middle, before):
                     weight = part.extinction * passing * share * power
                     arrived = _add(arrived, m * count + history, weight)
-            # Smoothing is linear: the sum once instead of every stretch. What collides scatters entirely.
+            # Smoothing is linear, so only the sum is smoothed. All that collides is scattered.
             response, scattered = smooth_row(response, bins.kernel)[:, 1:-1], arrived
 
         for i, (s, scatterer) in enumerate(zip(surfaces, plan.surfaces)):
@@ -267,7 +268,7 @@ def first_order(
 def _stretch_pieces(
     bins: Bins, low: Float[Array, "steps rays"], stretch: Stretches, kappa: float
 ) -> tuple[Int[Array, "steps rays"], Float[Array, "pieces steps rays"]]:
-    """First bin, and for it and those behind it the integral of exp(-kappa tau) ds over each stretch.
+    """First bin of each stretch, and the integrals of exp(-kappa tau) ds over its pieces, bin by bin.
 
     `low` is the position of the start of each stretch on the axis of bins.
     """
@@ -284,7 +285,7 @@ def _stretch_pieces(
         passing, mean = _decay(kappa * stretch.extinction * length)
         return (clear * passing, end), clear * mean * length
 
-    # A scan, so that each piece is computed once: unrolled, compilers compute them anew for every element.
+    # A scan computes each piece once; unrolled, compilers recompute them for every element.
     start = (jnp.exp(-kappa * stretch.depth), low)
     _, pieces = lax.scan(piece, start, jnp.arange(count, dtype=low.dtype))
     return first_bin(bins, number, count), pieces

@@ -1,4 +1,4 @@
-"""Flights: what a photon meets next, and how far it gets."""
+"""Flights: what a photon meets next, and how far it flies."""
 
 import functools
 
@@ -16,7 +16,10 @@ from jaxlidar.trace.setting import Setting
 class Flight(eqx.Module):
     """How flights end: in the medium, on a surface, after the window, or never.
 
-    - `cell`: the last voxel. - `distance`: flown, m. - `density`: ratio of the density of that distance.
+    - `collided`, `landed`, `late`, `escaped`: which of these.
+    - `cell`: the last voxel.
+    - `distance`: flown, m.
+    - `density`: ratio of the density of that distance.
     """
 
     collided: Bool[Array, "*photons"]
@@ -46,7 +49,7 @@ def fly(
 ) -> Flight:
     """Let photons fly to collisions at the optical depths -log(u), to a surface at `limit`, or on.
 
-    `budget`: m that are left of the window. There is one end of the flight for each number in `u`.
+    `budget` is the length in m that is left of the window. A flight has one end for each number in `u`.
     """
     reach = jnp.minimum(limit, budget)
     wide = functools.partial(jnp.broadcast_to, shape=u.shape)
@@ -93,7 +96,7 @@ def nearest(p: Photons, events: list[Scalar]) -> Scalar:
 
 
 def plates_ahead(setting: Setting, p: Photons, ahead: tuple[Scalar, ...]):
-    """Distance to each surface, what will happen at each plate, and the density ratio of that."""
+    """Distance to each surface, what will happen at each plate, and the density ratio of that outcome."""
     met, outcomes, ratios = [], [], []
     drawn = iter(ahead)
     for i, s in enumerate(setting.surfaces):

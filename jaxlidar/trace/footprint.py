@@ -1,7 +1,7 @@
-"""The beam's cross-section as a set of rays, and the geometry between rays and sensor.
+"""The cross-section of the beam as a set of rays, and the geometry between rays and sensor.
 
-Positions are relative to where the beam axis meets the reference plane, and path lengths to the
-slant range of that point: nothing here grows with the altitude, so single precision serves at 400 km.
+Positions are relative to where the beam axis meets the reference plane, and path lengths to the slant range
+of that point: no number grows with the altitude, so single precision is enough at 400 km.
 """
 
 import equinox as eqx
@@ -37,7 +37,7 @@ class Beam(eqx.Module):
         return point, direction, self.excess(point)
 
     def excess(self, point: Vec) -> Scalar:
-        """Distance from the sensor minus the slant range, m, without cancellation."""
+        """Distance from the sensor minus the slant range, m, computed without cancellation."""
         r = self.slant_range
         x = 2.0 * dot(point, self.axis) + dot(point, point) / r
         return x / (1.0 + jnp.sqrt(jnp.maximum(1.0 + x / r, 1e-12)))
@@ -47,7 +47,7 @@ class Beam(eqx.Module):
         return normalise(add(scale(self.axis, -self.slant_range), scale(point, jnp.asarray(-1.0))))
 
     def budget(self, x: Vec, w: Vec, left: Scalar) -> Scalar:
-        """How far light may fly from `x` along `w` and be back at the sensor within `left` m.
+        """How far, m, light may fly from `x` along `w` and be back at the sensor within `left` m.
 
         `left` is relative to the slant range. The way back begins on an ellipsoid about `x` and the sensor.
         """
@@ -57,7 +57,7 @@ class Beam(eqx.Module):
         return jnp.where(left < out, 0.0, jnp.where(divisor > 0, jnp.minimum(flight, FAR), FAR))
 
     def in_view(self, point: Vec) -> Scalar:
-        """How much of `point` the receiver sees, 0..1: its field of view with a soft edge."""
+        """Share of the light from `point` that the receiver sees, 0..1: its field of view has a soft edge."""
         if self.view_radius is None:
             return jnp.ones_like(point[0])
         along = dot(point, self.axis)
@@ -91,12 +91,12 @@ def beam_of(lidar: Lidar) -> Beam:
 
 
 def disc(radius: Scalar, turn: Scalar) -> tuple[Scalar, Scalar]:
-    """Coordinates of the point at `radius` and `turn`, the latter in turns."""
+    """Coordinates of the point at `radius` in the direction `turn`, in turns."""
     return radius * jnp.cos(2 * np.pi * turn), radius * jnp.sin(2 * np.pi * turn)
 
 
 def across_beam(beam: Beam, share: Scalar, turn: Scalar) -> tuple[Scalar, Scalar]:
-    """The point, m, at `turn`, within whose radius the share `share` of the energy lies."""
+    """The point, m, in the direction `turn`, whose radius encloses the share `share` of the energy."""
     share = jnp.clip(share, 0.0, 1.0 - 1e-7)
     return disc(beam.radius * jnp.sqrt(-0.5 * jnp.log1p(-share) if beam.gaussian else share), turn)
 
@@ -122,10 +122,11 @@ def scattered(
 def product_rule(
     beam: Beam, radial: int = 12, angular: int = 32
 ) -> tuple[tuple[Scalar, Scalar], Float[Array, "rays"]]:
-    """Gauss rule in radius times equal steps in azimuth: spectrally accurate where nothing is rough.
+    """Gauss rule in radius times equal steps in azimuth: spectrally accurate where the integrand is smooth.
 
-    Gauss-Laguerre in 2 r^2 / w^2 for the Gaussian beam, Gauss-Legendre in r^2 for the top-hat. The edge of
-    a field of view is rough: there, pieces of a Gauss-Legendre rule in r end at it.
+    It is Gauss-Laguerre in 2 r^2 / w^2 for the Gaussian beam, and Gauss-Legendre in r^2 for the top-hat. At
+    the edge of a field of view the integrand is not smooth: there, pieces of a Gauss-Legendre rule in r end
+    at the edge.
     """
     if beam.view_radius is not None:
         r, weight = _rule_with_edge(beam, beam.view_radius)

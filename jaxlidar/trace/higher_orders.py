@@ -1,16 +1,16 @@
-r"""Orders two and above: photons that collide, scatter and at every collision return what is expected.
+r"""Orders two and above: photons collide, scatter, and deposit the expected return of every collision.
 
-Photons carry no energy, only the geometric weight of their path and the number of its history. Each
-order draws a collision: the optical depth to it, the material, the direction onward. From there the
-photon deposits the probability of returning (pi times the density of scattering towards the sensor,
-times the transmittance of the way there). It does so from several points of the flight, `plan.ends`,
-one in each stratum of the probability of getting there, and goes on from one of them.
+Photons carry no energy, only the geometric weight of their path and the number of its history. Each order
+draws a collision: the optical depth to it, the material, the direction onward. From there the photon deposits
+the probability of returning (pi times the density of scattering towards the sensor, times the transmittance
+of the way there). It does so from several points of the flight, `plan.ends`, one in each stratum of the
+probability of getting there, and goes on from one of them.
 
-Derivatives: what is drawn is held fixed (directions, materials, and the place of a collision as a
-fraction of the ray's chord through its voxel), and the density with which it was drawn stays in the weight
-as p / stop_gradient(p). Voxel sizes, heights and extinction move positions, path lengths and densities
-continuously, so the derivative of an expected value is the expected value of the derivative. An
-extinction coefficient that is exactly zero is never met, and its derivative here is zero.
+Derivatives: what is drawn is held fixed (directions, materials, and the place of a collision as a fraction of
+the ray's chord through its voxel), and the density with which it was drawn stays in the weight as p /
+stop_gradient(p). Voxel sizes, heights and extinction move positions, path lengths and densities continuously,
+so the derivative of an expected value is the expected value of the derivative. Photons never collide where
+the extinction coefficient is exactly zero, and the derivative with respect to it is zero here.
 """
 
 import functools
@@ -22,19 +22,19 @@ from jax import lax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from jaxlidar._constants import SPEED_OF_LIGHT
-from jaxlidar._vectors import FAR, Scalar, Vec, along, vec
+from jaxlidar._vectors import FAR, Scalar, Vec, along
 from jaxlidar.trace.collisions import collide, view_factors
 from jaxlidar.trace.deposit import instant_row, scatter_rows
 from jaxlidar.trace.flight import Flight, events_of, fly, nearest, plates_ahead
 from jaxlidar.trace.footprint import GOLDEN, across_beam
 from jaxlidar.trace.march import depth_to_top, free_flight
-from jaxlidar.trace.photons import THROUGH, Hit, Photons, Scattering, ratio_of, stop
+from jaxlidar.trace.photons import THROUGH, Hit, Photons, ratio_of, stop
 from jaxlidar.trace.random_numbers import Draw, Independent, lattices
 from jaxlidar.trace.reparametrise import footprint_rays, rays_to_surfaces
-from jaxlidar.trace.setting import COSINE_LAW, Setting
+from jaxlidar.trace.setting import Setting, unscattered
 
 CHUNK = 256
-# Chunks that are traced together, order by order, and added up by themselves: single precision loses small
+# Chunks that are traced together, order by order. Each group has its own sum: single precision loses small
 # deposits on a large sum.
 GROUP = 32
 
@@ -84,7 +84,7 @@ def higher_orders(setting: Setting, key: PRNGKeyArray, photons: int) -> HigherOr
             jnp.where(inside, share / photons, 0.0),
             jnp.zeros(lane.shape, jnp.int32),
             jnp.full(lane.shape, -1, jnp.int32),
-            from_the_beam(excess),
+            unscattered(excess),
             inside,
         )
 
@@ -98,7 +98,7 @@ def higher_orders(setting: Setting, key: PRNGKeyArray, photons: int) -> HigherOr
                 def go(photons, tally):
                     return _one_order(setting, photons, tally, Draw.of(numbers(lane, n), plates), n)
 
-                # Photons that live come first, so that whole chunks of dead ones are passed over.
+                # Living photons come first, so that whole chunks of dead ones are skipped.
                 photons, tally = lax.cond(jnp.any(photons.alive), go, lambda *c: c, photons, tally)
                 return tally, photons
 
@@ -125,14 +125,8 @@ def higher_orders(setting: Setting, key: PRNGKeyArray, photons: int) -> HigherOr
     return eqx.tree_at(lambda t: t.weights, tallies, bins.trim(tallies.weights))
 
 
-def from_the_beam(like: Scalar) -> Scattering:
-    """How photons were sent that come from the lidar: about no normal."""
-    nowhere = vec(jnp.zeros_like(like) for _ in range(3))
-    return Scattering(jnp.full(like.shape, COSINE_LAW, jnp.int32), nowhere, nowhere)
-
-
 def _alive_first(lanes: Array, photons: Photons) -> tuple[Array, Photons]:
-    """Bring the photons that live to the front, in their order; all others are dead copies of the first."""
+    """Bring the living photons to the front, in their order; all others are dead copies of the first."""
     alive = photons.alive.reshape(-1)
     number = jnp.arange(alive.size)
     place = jnp.where(alive, jnp.cumsum(alive) - 1, alive.size)
@@ -218,7 +212,7 @@ def _return(
     draw: Draw,
     tally: HigherOrders,
 ) -> HigherOrders:
-    """Deposit from every end of the flights its share of what is expected to return."""
+    """Deposit the expected return of every end of the flights, each its share."""
     ends = setting.plan.ends
 
     def flat(tree):
@@ -253,7 +247,7 @@ def _deposit(
     hit: Hit,
     draw: Draw,
 ) -> HigherOrders:
-    """Return what is expected to reach the sensor from each collision."""
+    """Deposit the expected return of each collision."""
     beam, plan, medium = setting.beam, setting.plan, setting.medium
     v = beam.view(x)
     reflected, transmitted = view_factors(setting, x, w, v, hit)

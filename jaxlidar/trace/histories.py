@@ -1,8 +1,8 @@
 """Scattering histories: how often each letter (leaf.R, leaf.T, ground.R, ...) occurred on a path.
 
-The order of the scatterings does not matter to the product of their reflectances, so a history is a
-tuple of exponents. All of total degree up to the longest path are numbered by degree: the
-histories of short paths come first. There are C(degree + letters, letters) of them.
+The product of reflectances does not depend on the order of the scatterings, so a history is a tuple of
+exponents. All of total degree up to the longest path are numbered by degree: the histories of short paths
+come first. There are C(degree + letters, letters) of them.
 """
 
 import dataclasses
@@ -43,7 +43,7 @@ class Histories:
         return int(self.exponents[-1].sum()) if self.letters else 0
 
     def up_to(self, degree: int) -> int:
-        """Number of histories of at most `degree` scatterings: they come first."""
+        """Number of histories of at most `degree` scatterings; they come first."""
         return math.comb(degree + self.letters, self.letters)
 
     def monomials(self, optics: Float[Array, "letters wavelengths"]) -> Float[Array, "histories wavelengths"]:

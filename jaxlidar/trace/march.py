@@ -1,11 +1,11 @@
 """Exact traversal of the voxel grid: from face to face along straight rays.
 
-Nothing is sampled on the way: within a voxel the extinction coefficient is constant, so the optical
-depth is known at every face and linear between them. Distances to faces are computed from integer
-face numbers, never accumulated. A batch of photons stops as soon as the last of them has.
+Nothing is sampled on the way: within a voxel the extinction coefficient is constant, so the optical depth is
+known at every face and linear between them. Distances to faces are computed from integer face numbers, never
+accumulated. A batch of photons stops as soon as the last of them has stopped.
 
-What several results of a step share is held by `lax.optimization_barrier`: the CPU compiler would compute
-it anew for each of them.
+Values that several results of a step share are held by `lax.optimization_barrier`; the CPU compiler would
+otherwise compute them again for each result.
 """
 
 import equinox as eqx
@@ -19,7 +19,7 @@ from jaxlidar.optics.leaf_angles import ANGLE_NODES, LeafAngles
 from jaxlidar.optics.phase import AbstractPhase
 from jaxlidar.scenes.canopy import Canopy
 
-# Steps between two looks at whether any ray of the batch still moves.
+# Steps between two checks whether any ray of the batch still moves.
 BLOCK = 16
 
 
@@ -39,7 +39,7 @@ class AngleTables(eqx.Module):
         return self._at(self.projection, w)
 
     def square_at(self, w: Vec) -> Scalar:
-        """Mean of (leaf normal . direction)^2."""
+        """Mean of (leaf normal . direction)^2 of a direction."""
         return self._at(self.square, w)
 
 
@@ -83,7 +83,7 @@ def _pick(table: Float[Array, "cells"], cell: Int[Array, "*s"]) -> Scalar:
 
 
 def medium_of(canopy: Canopy, aim: Float[Array, "3"], leaf_factor: Scalar) -> Medium:
-    """Lay out a canopy; `leaf_factor` scales leaf extinction (1 - T where transmission is straight)."""
+    """The medium of a canopy; `leaf_factor` scales leaf extinction (1 - T where transmission is straight)."""
     voxels = canopy.voxels
     leaf = None if voxels.leaf is None else voxels.leaf.reshape(-1) * leaf_factor
     bark = None if voxels.bark is None else voxels.bark.reshape(-1)
@@ -128,19 +128,19 @@ class Walk(eqx.Module):
 
 
 def earlier(a: Scalar, b: Scalar) -> Scalar:
-    """The smaller of two; of equal ones the first, where `minimum` has half of both derivatives."""
+    """The smaller of two numbers. Of equal ones the first, where `minimum` has half of both derivatives."""
     return jnp.where(b < a, b, a)
 
 
 def later(a: Scalar, b: Scalar) -> Scalar:
-    """The larger of two; of equal ones the first."""
+    """The larger of two numbers; of equal ones the first."""
     return jnp.where(b > a, b, a)
 
 
 def begin(medium: Medium, x: Vec, w: Vec, box: Box | None = None) -> Walk:
     """Where a ray from `x` along `w` enters the grid (0 if inside) and leaves it, and its first voxel.
 
-    With `box`, where it enters and leaves that part of the grid.
+    With `box`, the same for that part of the grid.
     """
     near, far = jnp.zeros_like(x[0]), jnp.full_like(x[0], FAR)
     gap, offset, step = [], [], []
@@ -173,7 +173,7 @@ def begin(medium: Medium, x: Vec, w: Vec, box: Box | None = None) -> Walk:
 
 
 def cell_of(medium: Medium, voxel: tuple[Int[Array, "*s"], ...]) -> Int[Array, "*s"]:
-    """Index into the flat arrays; rounding at the last face cannot lead outside."""
+    """Index into the flat arrays, clipped against rounding at the last face."""
     nx, ny, nz = medium.shape
     if medium.periodic:
         i, j = voxel[0] % nx, voxel[1] % ny
@@ -194,7 +194,7 @@ def advance(
 
 
 def occupied(medium: Medium) -> Box:
-    """The box that holds all voxels with any extinction: photons need not be followed outside."""
+    """The box that holds all voxels with any extinction; outside it photons need not be followed."""
     tables = [t for t in (medium.leaf, medium.bark) if t is not None]
     full = jnp.any(jnp.stack(tables) > 0, axis=0).reshape(medium.shape)
     low, high = [], []
@@ -208,9 +208,12 @@ def occupied(medium: Medium) -> Box:
 class Free(eqx.Module):
     """Free flights, and where on them the optical depth reaches the targets.
 
-    - `collided`: in the medium, before the limit. - `cell`: the voxel of that. - `entered`, `chord`: distance
-      at which it was entered, and how long the ray is within it, both m. - `depth`: optical depth there.
-    - `distance`, `total`: of the whole flight, m and optical depth; without meaning after the last target.
+    - `collided`: whether this is in the medium and before the limit.
+    - `cell`: the voxel where it is.
+    - `entered`, `chord`: distance at which the voxel was entered, and length of the ray within it, m.
+    - `depth`: optical depth at `entered`.
+    - `distance`, `total`: length, m, and optical depth of the whole flight; without meaning after the last
+      target.
     """
 
     collided: Bool[Array, "targets photons"]
@@ -234,7 +237,7 @@ def free_flight(
 ) -> Free:
     """Follow rays to their largest target, to their length `limit`, or until they leave the grid, or `box`.
 
-    `steps` bounds the number of faces crossed; batches stop earlier when all their rays have. Without
+    `steps` bounds the number of faces crossed; a batch stops earlier when all its rays have stopped. Without
     targets, rays are followed to their end.
     """
     walk = begin(medium, x, w, box)
@@ -275,7 +278,7 @@ def free_flight(
 
 
 def depth_to_top(medium: Medium, x: Vec, column: Float[Array, "cells"]) -> Scalar:
-    """Optical depth from `x` straight up, from `column` = the depth above each voxel's upper face."""
+    """Optical depth from `x` straight up; `column` is the depth above each voxel's upper face."""
     voxel = []
     place = []
     for k in range(3):

@@ -1,17 +1,18 @@
 r"""First return of a specular surface.
 
-A mirror sends back only what falls into the aperture: rays of the ordinary footprint mostly miss it. With
-e a point of the beam on the mirror, I the irradiance there, m where the mirror image of the beam's axis
-meets the receiver's plane, a the aperture's radius, R the range and r the roughness, the receiver gets
+A mirror sends back only what falls into the aperture, which rays of the ordinary footprint mostly miss. Let e
+be a point of the beam on the mirror, I the irradiance there, m the point where the mirror image of the beam
+axis meets the receiver's plane, a the radius of the aperture, R the range and r the roughness. The receiver
+gets
 
     integral over e of  I(e) P(|m + 2 e|) de,
 
-P(d) the share of a Gaussian of standard deviation r R, centred d from the axis, that falls within a of it;
-the factor 2 is the spreading of the beam on its way back. Half of the rays are drawn from I and half from
-P, and weighted by the balance heuristic, so that images much smaller and much larger than the aperture
-are sampled equally well. The sum over a Gaussian beam is known, P(|m|) with the variance w^2 + (r R)^2,
-and the rays are scaled to it. Without roughness and at normal incidence it is 1 - exp(-2 a^2 / w^2),
-w the beam's radius at twice the range.
+where P(d) is the share of a Gaussian of standard deviation r R, centred d from the axis, that falls within a
+of it; the factor 2 is the spreading of the beam on its way back. Half of the rays are drawn from I and half
+from P, and weighted by the balance heuristic, so that images much smaller and much larger than the aperture
+are sampled equally well. The sum over a Gaussian beam is known, P(|m|) with the variance w^2 + (r R)^2, and
+the rays are scaled to it. Without roughness and at normal incidence it is 1 - exp(-2 a^2 / w^2), w being the
+radius of the beam at twice the range.
 """
 
 import equinox as eqx
@@ -29,7 +30,7 @@ from jaxlidar.trace.surfaces import Surface
 RAYS = 4096
 # Lobes narrower than this are taken as this wide, in units of the aperture's radius.
 _NARROW = 1e-3
-# Keeps quotients of densities finite, with their derivatives in single precision, where all are zero.
+# Keeps quotients of densities and their derivatives finite in single precision where all are zero.
 _TINY = 1e-9
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(48)
 
@@ -37,10 +38,10 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(48)
 def mirror_rays(
     beam: Beam, surface: Surface
 ) -> tuple[tuple[Float[Array, "rays"], Float[Array, "rays"]], Float[Array, "rays"]]:
-    """Rays across the beam that return from a mirror, and the apparent reflectance each carries.
+    """Rays across the beam that return from a mirror, and the apparent reflectance that each carries.
 
-    The apparent reflectance is per unit reflectance and for a transparent way. Small angles are assumed
-    between the beam's axis and the mirror image of it.
+    The apparent reflectance is per unit reflectance and for a transparent way. The angle between the beam
+    axis and its mirror image is assumed to be small.
     """
     assert isinstance(surface.law, AbstractMirror)
     r, a = beam.slant_range, beam.half_angle * beam.slant_range
@@ -89,8 +90,8 @@ def mirror_rays(
 def within(distance: Scalar, sigma: Scalar, radius: Scalar) -> Scalar:
     """Share of a two-dimensional Gaussian within `radius` of a point at `distance` from its centre.
 
-    One minus Marcum's Q function; integrated over the ring that a Gaussian of eight `sigma` covers, by a
-    Gauss rule: to 1e-6.
+    This is one minus Marcum's Q function, integrated by a Gauss rule over the ring that a Gaussian of eight
+    `sigma` covers; accurate to 1e-6.
     """
     low = jnp.clip(distance - 8.0 * sigma, 0.0, radius)
     high = jnp.minimum(distance + 8.0 * sigma, radius)
@@ -110,5 +111,5 @@ def _turn(number: np.ndarray, like: Scalar) -> Scalar:
 
 
 def _length(v: tuple[Scalar, Scalar]) -> Scalar:
-    # Below the root a number that only matters to derivatives at zero.
+    # The small number keeps the derivative at zero finite.
     return jnp.sqrt(v[0] ** 2 + v[1] ** 2 + 1e-24)

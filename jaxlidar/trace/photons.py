@@ -1,4 +1,4 @@
-"""Photons, and what they hit."""
+"""The state of photons, and of their collisions."""
 
 import equinox as eqx
 import jax
@@ -23,7 +23,7 @@ class Scattering(eqx.Module):
 
 
 class Photons(eqx.Module):
-    """The state of a chunk of photons: `on` is the surface a photon stands on, or -1."""
+    """The state of a chunk of photons. `on` is the surface from which a photon starts, or -1."""
 
     x: Vec
     w: Vec
@@ -39,9 +39,12 @@ class Hit(eqx.Module):
     """A collision.
 
     - `material`, `letter`: what was hit, and the letter that was drawn.
-    - `ratio`: density ratio of the collision. - `onward`: weight ratio of going on along `w`.
-    - `on`: the surface, or -1. - `reflected`, `transmitted`: letters of what returns from here, or -1.
-    - `normal`: of the facet or of the lit side. - `sent`: how the photon goes on.
+    - `ratio`: density ratio of the collision.
+    - `onward`: weight ratio of going on along `w`.
+    - `on`: the surface, or -1.
+    - `reflected`, `transmitted`: letters of what returns from here, or -1.
+    - `normal`: of the facet or of the lit side.
+    - `sent`: how the photon goes on.
     """
 
     material: Int[Array, "photons"]

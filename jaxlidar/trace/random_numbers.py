@@ -1,11 +1,11 @@
 """Random numbers for photons: randomly shifted lattices, one per order and dimension, or independent ones.
 
-Photon i takes frac(z i + s) in each dimension, in 32-bit integer arithmetic; the shift s is random, so every
-number is uniform and every estimate unbiased whatever z is. For the first collision z belongs to a
-lattice of low discrepancy (Roberts's generalised golden ratio); later it is random, which makes any
-two photons independent. This costs two integer operations where a counter-based generator costs fifty.
-Photons of one batch are not independent: standard errors come from batches with independent keys.
-Independent numbers are there to be compared with.
+Photon i takes frac(z i + s) in each dimension, in 32-bit integer arithmetic. The shift s is random, so every
+number is uniform and every estimate unbiased, whatever z is. For the first collision z belongs to a lattice
+of low discrepancy (Roberts's generalised golden ratio); later it is random, which makes any two photons
+independent. This costs two integer operations where a counter-based generator costs fifty. Photons of one
+batch are not independent: standard errors come from batches with independent keys. Independent numbers serve
+for comparison.
 """
 
 from collections.abc import Sequence
@@ -22,9 +22,11 @@ Uniform = Float[Array, "..."]
 class Draw(eqx.Module):
     """The uniform numbers of one order of a photon's path, by what they decide.
 
-    - `flight`: where the flight ends. - `choice`: which material is hit, and whether light is reflected.
-    - `normal`: of the facet that is hit. - `direction`: onward. - `ahead`, `behind`: for each plate, whether
-      light on its way, and on the way back to the sensor, meets it.
+    - `flight`: where the flight ends.
+    - `choice`: which material is hit, and whether light is reflected.
+    - `normal`: of the facet that is hit.
+    - `direction`: onward.
+    - `ahead`, `behind`: for each plate, whether light meets it on its way, and on the way back to the sensor.
     """
 
     flight: Uniform
@@ -36,18 +38,18 @@ class Draw(eqx.Module):
 
     @staticmethod
     def of(numbers: Sequence[Uniform], plates: int) -> "Draw":
-        """Out of six numbers and two, or one, for each plate."""
+        """A `Draw` from six numbers and two, or one, for each plate."""
         a, b, c, d, e, f, *rest = numbers
         return Draw(a, b, (c, d), (e, f), tuple(rest[:plates]), tuple(rest[plates:]))
 
     @staticmethod
     def dimensions(plates: int, *, back: bool = True) -> int:
-        """How many numbers an order takes; `back`: whether light returns from every collision."""
+        """How many numbers an order takes. `back`: whether light returns from every collision."""
         return 6 + plates * (2 if back else 1)
 
 
 class Lattices(eqx.Module):
-    """Uniform numbers in (0, 1) for each photon, order and dimension."""
+    """Uniform numbers in (0, 1) for each photon, order and dimension, from shifted lattices."""
 
     step: UInt32[Array, "orders dims"]
     shift: UInt32[Array, "orders dims"]
@@ -60,13 +62,13 @@ class Lattices(eqx.Module):
 
 
 class Independent(eqx.Module):
-    """Uniform numbers in (0, 1) for each photon, order and dimension."""
+    """Independent uniform numbers in (0, 1) for each photon, order and dimension."""
 
     key: PRNGKeyArray
     dims: int = eqx.field(static=True)
 
     def __call__(self, photon: UInt32[Array, "photons"], order: Array) -> list[Float[Array, "photons"]]:
-        """One array for each dimension. Photons are asked for in blocks, known by their first."""
+        """One array for each dimension. Photons come in blocks, each known by its first photon."""
         key = jax.random.fold_in(jax.random.fold_in(self.key, order), photon[0])
         return list(_to_unit(jax.random.bits(key, (self.dims, photon.size), jnp.uint32)))
 

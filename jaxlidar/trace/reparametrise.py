@@ -1,9 +1,9 @@
-"""Reparametrised rays: how rays move with the geometry, so that derivatives of what jumps are unbiased.
+"""Reparametrised rays: rays move with the geometry, so that derivatives of what jumps are unbiased.
 
 The optical depth of a ray jumps where it crosses from one column of voxels to the next. Rays are therefore
-moved along with the columns, and their weights by the change of density that this makes. Values do not
-change, only derivatives. (In rendering the idea is known as reparametrising discontinuous integrands: Loubet
-et al. 2019, ACM Trans. Graph. 38, 228.)
+moved along with the columns, and their weights change with the density. Values do not change, only
+derivatives. (In rendering this is known as reparametrising discontinuous integrands: Loubet et al. 2019, ACM
+Trans. Graph. 38, 228.)
 """
 
 import jax
@@ -33,11 +33,11 @@ def rays_to_surfaces(
 ) -> tuple[Vec, Scalar, Scalar]:
     """Direction, distance and density ratio of rays towards a surface, as geometry moves them.
 
-    The transmittance of the way back jumps where a landing point crosses from below one column of
-    voxels to the next. With the direction held fixed, points would cross; with the point held fixed
-    in its column, rays that start just above the surface would have to turn without bound. So points move
-    with the share `fade` of the former motion: none at a column's faces, and nearly all for rays
-    shorter than the way to the next face. Values do not change, only derivatives.
+    The transmittance of the way back jumps where a landing point crosses from below one column of voxels to
+    the next. With the direction held fixed, points would cross; with the point held fixed in its column, rays
+    that start just above the surface would have to turn without bound. So points move with the share `fade`
+    of the motion at a fixed direction: none at the faces of a column, and nearly all for rays shorter than
+    the way to the next face. Values do not change, only derivatives.
     """
     medium = setting.medium
     assert medium is not None
@@ -95,12 +95,13 @@ def rays_to_surfaces(
 def footprint_rays(
     beam: Beam, medium: Medium | None, across: tuple[Scalar, Scalar]
 ) -> tuple[tuple[Scalar, Scalar], Scalar]:
-    """Let the rays of the footprint move with the columns of the grid, and their energy accordingly.
+    """The rays of the footprint, moved with the columns of the grid, and the change of their energy.
 
-    Values do not change. But the optical depth of a nearly vertical ray jumps, seen from afar, where it
-    crosses into another column: its derivative with respect to a sideways motion of the grid lies in rare,
-    nearly parallel crossings. Rays that move along have none, and the profile of a Gaussian beam makes up
-    for it. The edge of a top-hat would not, so its rays stay, and that derivative stays noisy.
+    Values do not change, only derivatives. The optical depth of a nearly vertical ray jumps where it crosses
+    into another column, so its derivative with respect to a sideways motion of the grid lies in rare, nearly
+    parallel crossings. Rays that move along with the columns do not cross, and the profile of a Gaussian beam
+    makes up for their motion. The edge of a top-hat would not, so its rays stay, and that derivative stays
+    noisy.
     """
     if medium is None or not beam.gaussian:
         return across, jnp.ones_like(across[0])

@@ -1,9 +1,9 @@
-"""Geometry traced once: the response of a scene to a pulse without duration, for any optics.
+"""The response of a scene to a pulse without duration: geometry is traced once, for any optics.
 
     received[wavelength, bin] = sum over histories h of
         response[bin, h] * prod over letters s of optics_s[wavelength] ** exponent[h, s]
 
-known in biomedical optics as white Monte Carlo (Alerstam et al. 2008).
+This is known in biomedical optics as white Monte Carlo (Alerstam et al. 2008).
 """
 
 from typing import final
@@ -24,16 +24,28 @@ from jaxlidar.trace.setting import Setting, setting_of
 
 @final
 class Response(eqx.Module):
-    """Geometric weight of all paths, by last material, history and fine time bin.
+    """The geometric weight of all paths, by last material, scattering history and fine time bin.
 
-    The first axis has one trace for all wavelengths; or, where leaves transmit straight on, so that
-    extinction depends on the wavelength, one for each.
+    Multiplied by the optics of each history (see `jaxlidar.waveform_of`) it gives the waveform. The first
+    axis has one trace for all wavelengths; or, where leaves transmit straight on, so that extinction depends
+    on the wavelength, one for each.
 
     - `first`: (traces, materials, first histories, bins) order one, apparent reflectance per unit optics.
     - `higher`: (traces, materials, histories, bins) orders two and above, or None where they were not traced.
     - `arrived`, `left`: (traces, materials, histories) weight that reached each material, and that went on.
     - `escaped`, `late`, `remaining`: (traces, histories) weight that left the scene, that outlasted the
       window, and that had scatterings left when the last order was reached.
+
+    **Example:**
+
+    >>> import equinox as eqx
+    >>> import jax
+    >>> import jaxlidar as jl
+    >>> lidar, scene = jl.Lidar(), jl.Scene(ground=jl.Ground(reflectance=0.4))
+    >>> setup = jl.reduce(lidar, scene, jl.plan(lidar, scene))
+    >>> response = eqx.filter_jit(jl.trace_scene)(setup, jax.random.key(0))
+    >>> print(response.first.shape[:2], f"{float(response.first.sum()):.3f}")
+    (1, 1) 1.000
     """
 
     first: Float[Array, "traces materials short bins"]
@@ -46,25 +58,27 @@ class Response(eqx.Module):
 
 
 def trace_scene(setup: Setup, key: PRNGKeyArray) -> Response:
-    """One batch: the deterministic first order and `plan.n_photons` photons for the higher ones.
+    """The response of one batch: the deterministic first order, and photons for the higher ones.
 
-    A pure function of arrays, to be compiled, batched and differentiated. Wavelengths enter only where leaves
-    transmit straight on.
+    A batch has `plan.n_photons` photons. The function is pure, to be compiled, batched and differentiated.
+    Wavelengths enter only where leaves transmit straight on.
 
     **Arguments:**
 
-    - `setup`: of `jaxlidar.reduce`.
+    - `setup`: a `Setup` made by `jaxlidar.reduce`.
     - `key`: a JAX random key.
 
     **Returns:** a `Response`, for `jaxlidar.waveform_of`.
 
     **Example:**
 
-    >>> import jax, jaxlidar as jl
+    >>> import equinox as eqx
+    >>> import jax
+    >>> import jaxlidar as jl
     >>> lidar, scene = jl.Lidar(), jl.Scene(ground=jl.Ground(reflectance=0.4))
     >>> setup = jl.reduce(lidar, scene, jl.plan(lidar, scene))
-    >>> response = jl.trace_scene(setup, jax.random.key(0))
-    >>> wave = jl.waveform_of(response, setup)
+    >>> response = eqx.filter_jit(jl.trace_scene)(setup, jax.random.key(0))
+    >>> wave = eqx.filter_jit(jl.waveform_of)(response, setup)
     >>> print(f"{float(wave.reflectance.sum()):.4f}")
     0.4000
     """
@@ -105,7 +119,7 @@ def _trace(setting: Setting, plan: Plan, key: PRNGKeyArray) -> Response:
 def _only_first(
     setting: Setting, first: FirstOrder, weights: Float[Array, "materials short bins"]
 ) -> Response:
-    """The fate of light when nothing is followed beyond the first scattering: what scatters remains."""
+    """The response where nothing is followed beyond the first scattering: what is scattered remains."""
     plan, table = setting.plan, setting.short
     left = jnp.zeros_like(first.arrived)
     remaining = jnp.zeros_like(first.escaped)

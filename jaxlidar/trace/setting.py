@@ -1,10 +1,10 @@
-"""The scene as constants of a trace: beam, voxels, planes and laws, relative to the aim point."""
+"""The scene as the tracer sees it: beam, voxels, surfaces and laws, relative to the aim point."""
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxlidar._vectors import Scalar, Vec
+from jaxlidar._vectors import Scalar, Vec, vec
 from jaxlidar.optics.laws import AbstractLaw, Lambertian
 from jaxlidar.optics.phase import AbstractPhase
 from jaxlidar.planning.setup import Setup
@@ -15,18 +15,20 @@ from jaxlidar.trace.march import Box, Medium, columns, medium_of, occupied
 from jaxlidar.trace.photons import Photons, Scattering
 from jaxlidar.trace.surfaces import Surface, surfaces_of
 
-# By which facets, plates that transmit diffusely and most surfaces send light on: the first of all laws.
+# Number of the law by which facets, diffusely transmitting plates and most surfaces send light on: the first.
 COSINE_LAW = 0
 
 
 class Setting(eqx.Module):
-    """What first and higher orders share.
+    """What the first and the higher orders share.
 
     - `beam`, `medium`, `surfaces`: the geometry; ground first, then plates.
-    - `laws`: by which photons are sent on; `surface_laws`, `leaf_law`, `bark_law` are numbers of them.
-    - `plan`, `bins`: sizes. - `short`, `table`: histories of order one, and of all orders.
-    - `column`: optical depth straight up from every voxel, for a beam at nadir. - `occupied`: the box that
-      holds all voxels with any extinction. - `successor`: of every history, for every letter.
+    - `laws`: by which photons are sent on. `surface_laws`, `leaf_law`, `bark_law`: numbers of them.
+    - `plan`, `bins`: sizes.
+    - `short`, `table`: histories of order one, and of all orders.
+    - `column`: optical depth straight up from every voxel, for a beam at nadir.
+    - `occupied`: the box that holds all voxels with any extinction.
+    - `successor`: of every history, for every letter.
     """
 
     beam: Beam
@@ -58,7 +60,7 @@ class Setting(eqx.Module):
         return jnp.where(letter >= 0, grown, history)
 
     def density(self, sent: Scattering, w: Vec) -> Scalar:
-        """Probability per steradian with which photons would have been sent along `w`, not quite zero."""
+        """Probability per steradian with which photons would have been sent along `w`; at least 1e-6."""
         density = _density(self.laws[0], sent, w)
         for number, law in enumerate(self.laws[1:], 1):
             density = jnp.where(sent.law == number, _density(law, sent, w), density)
@@ -72,7 +74,7 @@ def _density(law: AbstractLaw | AbstractPhase, sent: Scattering, w: Vec) -> Scal
 
 
 def setting_of(setup: Setup, leaf_transmittance: Float[Array, ""] | float = 0.0) -> Setting:
-    """Lay out a scene for tracing.
+    """The setting of a setup.
 
     `leaf_transmittance` matters only where the canopy's transmission is straight: extinction is then scaled
     by one minus it.
@@ -112,3 +114,9 @@ def setting_of(setup: Setup, leaf_transmittance: Float[Array, ""] | float = 0.0)
         short=histories(letters, plan.first_degree),
         table=table,
     )
+
+
+def unscattered(like: Scalar) -> Scattering:
+    """The `Scattering` of photons that come from the lidar: about no normal."""
+    nowhere = vec(jnp.zeros_like(like) for _ in range(3))
+    return Scattering(jnp.full(like.shape, COSINE_LAW, jnp.int32), nowhere, nowhere)

@@ -12,7 +12,7 @@ from jaxlidar.scenes.surfaces import AbstractSheet, AbstractSurface
 
 
 class Surface(eqx.Module):
-    """One surface; its shape is relative to the aim point."""
+    """One surface, with its shape relative to the aim point."""
 
     shape: AbstractShape
     coverage: Float[Array, ""]
@@ -22,7 +22,7 @@ class Surface(eqx.Module):
     straight: bool = eqx.field(static=True)
 
     def distance(self, x: Vec, w: Vec) -> Scalar:
-        """How far from `x` along `w` it is met; FAR if behind, missed, or met from under the ground."""
+        """Distance from `x` along `w` to the surface; FAR if behind, missed, or met from under the ground."""
         s = self.shape.distance(x, w)
         if self.plate:
             return s
@@ -30,14 +30,14 @@ class Surface(eqx.Module):
         return jnp.where(dot(normal, w) < 0, s, FAR)
 
     def lit_normal(self, x: Vec, w: Vec) -> Vec:
-        """At the point `x`, the normal of the side on which light travelling along `w` falls."""
+        """Normal, at the point `x`, of the side that light travelling along `w` falls on."""
         normal, _ = self.shape.tangent(x)
         sign = jnp.where(dot(normal, w) > 0, -1.0, 1.0)
         return scale(normal, sign)
 
 
 def surfaces_of(scene: Scene, aim: Float[Array, "3"]) -> tuple[Surface, ...]:
-    """Ground first, then plates, relative to the aim point."""
+    """The surfaces of a scene, ground first, then plates, relative to the aim point."""
     one = jnp.ones_like(aim[0])
 
     def surface(s: AbstractSurface) -> Surface:

@@ -1,0 +1,253 @@
+"""Write README.md of this folder from the records in `results/`: no figure in it is typed by hand.
+
+Run it as `python examples/benchmarks/make_readme.py` after a benchmark, run with `--out
+examples/benchmarks/results`, has renewed its record.
+"""
+
+import json
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+
+from jaxlidar.io import atomic_write
+
+HERE = Path(__file__).resolve().parent
+RESULTS = HERE / "results"
+
+HEAD = """# Benchmarks: what accuracy costs, and other codes beside
+
+Each script measures one thing, writes a record (JSON) and a figure, and says in its first lines what is
+compared with what. This page is made from the records in `results/` by `make_readme.py`.
+
+```sh
+pip install -e '.[bench]'
+python examples/benchmarks/accuracy_cost.py --out examples/benchmarks/results
+python examples/benchmarks/make_readme.py
+```
+
+Times are seconds of wall time, warm: programs are compiled before. A tilde marks what is extrapolated.
+"""
+
+
+def number(x: float | None, digits: int = 2) -> str:
+    """To so many significant digits."""
+    if x is None:
+        return ""
+    short = f"{x:.{digits}g}"
+    return f"{float(short):,g}" if 1e-3 <= abs(x) < 1e6 else short
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table of Markdown."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def page_of(*paragraphs: str) -> str:
+    """Paragraphs and tables with empty lines between."""
+    return "\n\n".join(paragraphs)
+
+
+def machine(record: dict) -> str:
+    """What a record was measured on."""
+    m = record["machine"]
+    return f"Measured on {m['cores']} cores ({m['processor']}), Python {m['python']}, jax {m['jax']}."
+
+
+def accuracy(record: dict) -> str:
+    def cell(pair: Sequence) -> str:
+        return "not reached" if pair[0] is None else f"{'~' if pair[1] else ''}{number(pair[0])} s"
+
+    rows = []
+    for name, found in record["scenes"].items():
+        ours, analog = found["times"]["ours"], found["times"]["analog"]
+        ratios = [number(a[0] / o[0]) for a, o in zip(analog, ours) if a[0] and o[0]]
+        rows.append([name, *map(cell, ours), ", ".join(ratios) + " times longer"])
+    targets = [f"{100 * t:g} %" for t in record["targets"]]
+    orders = [
+        [key, "no effect" if v["order"] is None else number(v["order"])] for key, v in record["knobs"].items()
+    ]
+    return page_of(
+        "Seconds until the error (root mean square over samples above 1 % of the peak, relative, at 1064 nm) "
+        "is down to a target, and how much longer the paper's estimator takes, target by target.",
+        table(["scene", *targets, "the paper's estimator takes"], rows),
+        "Effect of each setting: errors of the first order against the finest of their kind.",
+        table(["setting", "error falls as the power"], orders),
+    )
+
+
+def peers(record: dict) -> str:
+    rows = [
+        [
+            f"{r['case']}, {r['pulse']}",
+            r["code"],
+            number(r["seconds_to_1_percent"]),
+            number(r["cpu_seconds_to_1_percent"]),
+            number(r.get("ratio")),
+            number(r["first_call_seconds"]),
+            number(r["total"], 4),
+        ]
+        for r in record["results"]
+    ]
+    head = ["scene, pulse", "code", "s to 1 %", "CPU s to 1 %", "times ours", "s, first call", "total"]
+    return page_of(
+        "Seconds until a waveform is known to 1 %, beside codes that compute the same: a crown of 64³ voxels "
+        "and 15 scatterings. They do much that jaxlidar does not (meshes, any material and camera, "
+        "polarisation); they have no histories that colour one trace for all wavelengths, and no tolerance.",
+        table(head, rows),
+    )
+
+
+def simulation(record: dict) -> str:
+    rows = [
+        [
+            r["scene"],
+            number(r["rtol"]),
+            number(r["seconds"]),
+            number(r["seconds_with_compilation"]),
+            f"{r['photons']:,}",
+            number(r["error"]),
+        ]
+        for r in record["simulations"]
+    ]
+    return table(["scene", "rtol", "s", "s, first call", "photons", "error reached"], rows)
+
+
+def scaling(record: dict) -> str:
+    rows = [[f"{r['n']:,} photons", number(r["seconds"]), f"{r['bytes']:,.0f}"] for r in record["photons"]]
+    rows += [[f"{r['side']}³ voxels", number(r["seconds"]), f"{r['bytes']:,.0f}"] for r in record["voxels"]]
+    photons, voxels = (
+        number(record[f"slope of seconds over {n}"]) for n in ("photons", "voxels along a side")
+    )
+    return page_of(
+        table(["one batch of", "s", "bytes beside the scene"], rows),
+        f"Time grows with the photons to the power {photons}, with the voxels along a side to the power "
+        f"{voxels}.",
+    )
+
+
+def effects(record: dict) -> str:
+    rows = [
+        [r["scene"], number(r["seconds"]["plan"]), number(r["seconds"]["everything"]), number(r["ratio"])]
+        for r in record["scenes"]
+    ]
+    return page_of(
+        f"To {record['percent']} %: the scene's own plan beside everything on (empty voxels, all orders, "
+        "air, field of view, jitter ...).",
+        table(["scene", "own plan, s", "everything, s", "times longer"], rows),
+    )
+
+
+def march(record: dict) -> str:
+    ratio = record["jaxlidar_over_numba"]
+    rows = [[name, number(1e-6 * rate)] for name, rate in record["rays_per_second"].items()]
+    return page_of(
+        table(["first order", "million rays a second"], rows),
+        f"Over a parallel numba kernel of the same traversal: {number(ratio['all cores'])} of its rate on "
+        f"all cores, {number(ratio['one thread'])} on one.",
+    )
+
+
+def wavelengths(record: dict) -> str:
+    times = record["times_one_wavelength"]
+    rows = [[f"{int(n):,}", number(record["seconds"][n]), number(times[n], 3)] for n in times]
+    return page_of(f"{record['photons']:,} photons.", table(["wavelengths", "s", "times one"], rows))
+
+
+def jacobian(record: dict) -> str:
+    rows = [[n, number(record["seconds"][n]), number(r)] for n, r in record["times_one_simulation"].items()]
+    return page_of(f"{record['photons']:,} photons.", table(["columns", "s", "simulations"], rows))
+
+
+def fits(record: dict) -> str:
+    def median(values: Sequence[float]) -> float:
+        ordered = sorted(values)
+        return 0.5 * (ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2])
+
+    rows = [
+        [case, *(number(median(r["seconds"][who])) for who in ("ours", "scipy")), number(r["ratio"])]
+        for case, r in record["fits"].items()
+    ]
+    return page_of(
+        f"The same simulation of {record['photons']:,} photons under both, to the same chi-squared.",
+        table(["unknowns", "retrieve, s", "scipy, s", "times faster"], rows),
+    )
+
+
+def coverage(record: dict) -> str:
+    rows = [
+        [
+            name,
+            number(r["rms"]),
+            number(r["rms_over_bound"], 3),
+            f"{100 * r['covered']:.1f} %",
+            number(r["noise_free_median"]),
+        ]
+        for name, r in record["unknowns"].items()
+    ]
+    head = ["unknown", "rms error", "over the Cramer-Rao bound", "within 95 % intervals", "noise-free"]
+    return page_of(
+        f"{record['targets']} noisy targets (three wavelengths, 2 % of the peak) from random starts, "
+        f"{record['photons']:,} photons a batch: {100 * record['converged']:.0f} % converge, and "
+        f"{100 * record['covered']:.1f} % of the truths lie within the 95 % intervals. Noise-free: relative.",
+        table(head, rows),
+    )
+
+
+def prospect(record: dict) -> str:
+    each = record["seconds_per_leaf"]
+    kinds = ("prosail", "spectra", "jacobian")
+    rows = [[kind, number(1e6 * min(t for n, t in each.items() if n.startswith(kind)))] for kind in kinds]
+    return page_of(
+        table(["2,101 wavelengths", "us a leaf"], rows),
+        f"{number(record['times_faster_than_prosail'])} times faster than looping prosail; all derivatives "
+        f"cost {number(record['jacobian_over_evaluation'])} evaluations.",
+    )
+
+
+def leaves(record: dict) -> str:
+    rows = [
+        [who, number(1e3 * record["seconds_per_leaf"][who]), *(number(v, 3) for v in rmse.values())]
+        for who, rmse in record["rmse"].items()
+    ]
+    head = ["", "ms a leaf", *(f"rms error of {name}" for name in record["rmse"]["scipy"])]
+    return page_of(
+        f"{record['leaves']} measured leaves, all bands.",
+        table(head, rows),
+        f"{number(record['times_faster'])} times faster than scipy over prosail.",
+    )
+
+
+SECTIONS: dict[str, tuple[str, Callable[[dict], str]]] = {
+    "accuracy_cost": ("What accuracy costs", accuracy),
+    "simulation_cost": ("What `simulate` costs", simulation),
+    "peers": ("Other codes", peers),
+    "effects_cost": ("What plans save", effects),
+    "scaling": ("How cost grows", scaling),
+    "first_order_march": ("The first order beside a kernel written by hand", march),
+    "one_trace_all_wavelengths": ("Many wavelengths from one trace", wavelengths),
+    "jacobian_cost": ("A Jacobian in eight unknowns", jacobian),
+    "fit_speed": ("Fits beside scipy", fits),
+    "retrieval_coverage": ("How good retrievals are, and how good they say they are", coverage),
+    "prospect_speed": ("PROSPECT beside prosail", prospect),
+    "leaf_inversion": ("Traits of measured leaves", leaves),
+}
+
+
+def page() -> str:
+    """The text of README.md."""
+    parts = [HEAD]
+    for name, (title, section) in SECTIONS.items():
+        path = RESULTS / f"{name}.json"
+        if not path.exists():
+            parts.append(f"## {title}\n\n`{name}.py`. There is no record of it yet.\n")
+            continue
+        record = json.loads(path.read_text())
+        parts.append(f"## {title}\n\n`{name}.py`. {machine(record)}\n\n{section(record)}\n")
+        if path.with_suffix(".png").exists():
+            parts.append(f"![{title}](results/{name}.png)\n")
+    return "\n".join(parts)
+
+
+if __name__ == "__main__":
+    with atomic_write(HERE / "README.md") as draft:
+        draft.write_text(page())

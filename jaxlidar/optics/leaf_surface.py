@@ -1,0 +1,84 @@
+"""The surface of a leaf: mean Fresnel reflectances and transmittances, without cancellation."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import ArrayLike
+
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(32)
+_NODES, _WEIGHTS = (_NODES + 1) / 2, _WEIGHTS / 2
+
+
+class LeafSurface(NamedTuple):
+    """Mean reflectances and transmittances of a leaf's surface, each an array of one shape.
+
+    - `t_alpha`, `r_alpha`: of light within the cone of incidence, from outside.
+    - `t12`, `r12`: of diffuse light from outside.
+    - `t21`, `r21`: of diffuse light from inside.
+
+    Each pair adds up to 1.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> face = jl.leaf_surface(1.45)
+    >>> print(f"{face.t12 + face.r12:.3f} {face.t21:.3f}")
+    1.000 0.436
+    """
+
+    t_alpha: Any
+    r_alpha: Any
+    t12: Any
+    r12: Any
+    t21: Any
+    r21: Any
+
+
+def leaf_surface(n: ArrayLike, alpha: float | int = 40.0) -> LeafSurface:
+    """Mean reflectances and transmittances of a dielectric surface.
+
+    **Arguments:**
+
+    - `n`: refractive index, any shape, at least 1. Exact to rounding from 1.01 on.
+    - `alpha`: half-angle of the cone of incidence, degrees, in [0, 90]. Default 40, as in PROSPECT.
+
+    **Returns:** a `LeafSurface` of arrays shaped as `n`: JAX arrays where `n` is one, else NumPy arrays of
+    float64.
+
+    **Source:** Stern (1964), Appl. Opt. 3, 111; Allen (1973), J. Opt. Soc. Am. 63, 664.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> face = jl.leaf_surface(1.45)
+    >>> print(f"{face.r_alpha:.3f} within the cone, {face.r12:.3f} diffuse")
+    0.035 within the cone, 0.084 diffuse
+    """
+    xp: Any = jnp if isinstance(n, jax.Array) else np
+    index = n if isinstance(n, jax.Array) else np.asarray(n, dtype=float)
+    t_alpha, r_alpha = _cone(xp, index, alpha)
+    t12, r12 = _cone(xp, index, 90.0)
+    square = index * index
+    # r21 = 1 - t12/n^2, as a sum.
+    return LeafSurface(
+        t_alpha, r_alpha, t12, r12, t12 / square, r12 + t12 * ((index - 1) * (index + 1) / square)
+    )
+
+
+def _cone(xp: Any, n: Any, alpha: float | int) -> tuple[Any, Any]:
+    c = np.cos(np.deg2rad(alpha)) if alpha < 90 else 0.0
+    n = n[..., None]
+    mu = np.broadcast_to(c + (1 - c) * _NODES, (1,) * (n.ndim - 1) + _NODES.shape).astype(n.dtype)
+    weight = (2 / (1 + c) * _WEIGHTS * (c + (1 - c) * _NODES)).reshape(mu.shape).astype(n.dtype)
+    g = xp.sqrt((n - 1) * (n + 1) + mu * mu)
+    square = n * n
+    across, along = 1 / (mu + g), 1 / (square * mu + g)
+    transmitted = 2 * mu * g * (across * across + square * along * along)
+    # (mu - g)/(mu + g) = -(n^2 - 1)/(mu + g)^2, and likewise in the plane of incidence.
+    excess = (n - 1) * (n + 1)
+    s_wave = excess * across * across
+    p_wave = excess * ((square + 1) * mu * mu - 1) * along * along
+    reflected = (s_wave * s_wave + p_wave * p_wave) / 2
+    return xp.sum(weight * transmitted, axis=-1), xp.sum(weight * reflected, axis=-1)
