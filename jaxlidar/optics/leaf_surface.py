@@ -25,7 +25,7 @@ class LeafSurface(NamedTuple):
     >>> import jaxlidar as jl
     >>> face = jl.leaf_surface(1.45)
     >>> print(f"{face.t12 + face.r12:.3f} {face.t21:.3f}")
-    1.000 0.436
+    1.000 0.435
     """
 
     t_alpha: Any
