@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from jaxlidar import extend, io
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar.analog import AnalogReturns, analog_returns, photon_paths
+from jaxlidar.energy import EnergyBudget, energy_budget
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.instrument.pulse import (
     AbstractPulse,
@@ -68,6 +69,7 @@ __all__ = [
     "Branching",
     "Canopy",
     "Effect",
+    "EnergyBudget",
     "EqualAngle",
     "ExponentiallyModifiedGaussianPulse",
     "GaussianPulse",
@@ -104,6 +106,7 @@ __all__ = [
     "broadleaf",
     "conifer",
     "crop",
+    "energy_budget",
     "extend",
     "first_return_window",
     "forest",

@@ -27,6 +27,7 @@ ROOMS = [
     "trace",
     "waveform",
     "simulate",
+    "energy",
     "analog",
     "io",
     "plot",
@@ -64,6 +65,7 @@ ORDER = {
         "setting",
         "collisions",
         "flight",
+        "fates",
         "reparametrise",
         "mirror",
         "first_order",
@@ -98,7 +100,7 @@ def test_jaxlidar_never_imports_inversion():
 
 def test_the_top_level_has_few_modules():
     found = {path.stem for path in (ROOT / "jaxlidar").glob("[!_]*.py")}
-    assert found == {"simulate", "waveform", "analog", "cli", "extend"}
+    assert found == {"simulate", "waveform", "energy", "analog", "cli", "extend"}
     folders = {path.name for path in (ROOT / "jaxlidar").iterdir() if (path / "__init__.py").exists()}
     assert folders == {"optics", "instrument", "scenes", "plants", "planning", "trace", "io", "plot"}
 

@@ -1,0 +1,206 @@
+"""Energy budgets: what a scene absorbs, returns to the sky and lets through to the ground, at any time."""
+
+import dataclasses
+import math
+import time
+from collections.abc import Callable
+from typing import final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from jaxlidar._checks import check_choice, check_integer, check_range, known_array
+from jaxlidar._statistics import standard_error
+from jaxlidar._threads import ONE_CORE, side_by_side
+from jaxlidar.instrument.lidar import Lidar
+from jaxlidar.planning.plan import MIN_BATCHES
+from jaxlidar.planning.plan import plan as make_plan
+from jaxlidar.planning.setup import Setup, reduce
+from jaxlidar.scenes.scene import Scene
+from jaxlidar.trace.fates import Fates, follow, from_beam, from_the_sky
+from jaxlidar.trace.setting import setting_of
+from jaxlidar.waveform import optics_of
+
+# Photons of a batch.
+BATCH = 8192
+# Heights of the canopy over which a flight is followed where the canopy has no sides.
+REACH = 300.0
+
+
+@final
+class EnergyBudget(eqx.Module):
+    """Shares of the emitted energy, (wavelengths,) each.
+
+    - `absorbed`: by material, as in `Waveform.ledger`. - `returned`: to the sky, in whatever direction.
+    - `transmitted`: arrived at the ground, every time light did: ground that reflects sees more than one
+      pass.
+    - `below`: left downward, where there is no ground. - `unfollowed`: not followed to its end.
+    - `stderr`: one standard error of each, by name: materials, "returned", "transmitted", "below".
+    - `wavelength`: nm. - `info`: photons, batches, seconds, largest standard error and why it stopped.
+
+    What is absorbed, returned, below and unfollowed adds up to one.
+
+    **Example:**
+
+    >>> import jax, jaxlidar as jl
+    >>> scene = jl.Scene(ground=jl.Ground(reflectance=0.4))
+    >>> budget = jl.energy_budget(jl.Lidar(), scene, key=jax.random.key(0))
+    >>> print(f"{float(budget.absorbed['ground'][0]):.2f}")
+    0.60
+    """
+
+    absorbed: dict[str, Float[Array, "wavelengths"]]
+    returned: Float[Array, "wavelengths"]
+    transmitted: Float[Array, "wavelengths"]
+    below: Float[Array, "wavelengths"]
+    unfollowed: Float[Array, "wavelengths"]
+    stderr: dict[str, Float[Array, "wavelengths"]]
+    wavelength: Float[Array, "wavelengths"]
+    info: dict = eqx.field(static=True)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Report:
+    """How far a budget has come."""
+
+    batches: int
+    photons: int
+    seconds: float
+    error: float
+    rtol: float
+
+    def __str__(self) -> str:
+        return (
+            f"{self.batches} batches, {self.photons} photons, {self.seconds:.1f} s, "
+            f"largest standard error {self.error:.2g} (aim {self.rtol:.2g})"
+        )
+
+
+def energy_budget(
+    lidar: Lidar,
+    scene: Scene,
+    *,
+    key: PRNGKeyArray,
+    rtol: float = 0.002,
+    illumination: str = "beam",
+    max_orders: int = 10_000,
+    max_photons: int = 1 << 26,
+    progress: Callable[[_Report], None] | None = None,
+) -> EnergyBudget:
+    """What a scene absorbs, returns to the sky and lets through, of light that is followed to its end.
+
+    Unlike `Waveform.ledger` it knows no window and no last order: photons carry their energy, and end where
+    they are absorbed or leave. The atmosphere, the receiver and the pulse do not count.
+
+    **Arguments:**
+
+    - `lidar`: its beam, or its direction, sends the light; at its wavelengths.
+    - `scene`: a `Scene`; its atmosphere is passed over.
+    - `key`: a JAX random key: the same key gives the same budget.
+    - `rtol`: stop when the largest standard error of any share is below this share of the emitted energy, in
+      (0, 1). Default 0.002.
+    - `illumination`: "beam" (default), or "parallel": light from the beam's direction over one period of a
+      canopy with periodic sides.
+    - `max_orders`: scatterings followed, at least 1; what is left then is `unfollowed`. Default 10,000.
+    - `max_photons`: stop after so many, at least 1, whatever the error. Default 2**26.
+    - `progress`: called with a report after every round; for instance `print`. Default None.
+
+    **Returns:** an `EnergyBudget`.
+
+    **Raises:** ValueError for values outside their ranges, and for parallel light where the canopy has open
+    sides.
+
+    **Example:**
+
+    >>> import jax, jaxlidar as jl
+    >>> plate = jl.Plate(height=2.0, reflectance=0.5, transmittance=0.3)
+    >>> scene = jl.Scene(plates=(plate,), ground=jl.Ground(reflectance=1.0))
+    >>> budget = jl.energy_budget(jl.Lidar(), scene, key=jax.random.key(0))
+    >>> print(f"{float(budget.returned[0]):.2f}")  # 0.5 + 0.3 * 0.3 / (1 - 0.5)
+    0.68
+    """
+    check_range("rtol", rtol, 0.0, 1.0, low_open=True, high_open=True)
+    check_choice("illumination", illumination, ("beam", "parallel"))
+    max_orders = check_integer("max_orders", max_orders)
+    max_photons = check_integer("max_photons", max_photons)
+    if illumination == "parallel" and (scene.canopy is None or scene.canopy.sides != "periodic"):
+        raise ValueError("illumination = 'parallel'; that is admissible where the canopy has periodic sides")
+    setup = _endless(reduce(lidar, scene, make_plan(lidar, scene, max_orders=1, describe=False)))
+    started = time.perf_counter()
+    found: list[Fates] = []
+    wanted, stopped, error = MIN_BATCHES, "tolerance met", math.inf
+
+    def one(n: int) -> Fates:
+        return _batch(setup, jax.random.fold_in(key, n), illumination == "parallel", max_orders)
+
+    with side_by_side() as run:
+        while True:
+            found += run(one, range(len(found), wanted))
+            table = jax.tree.map(lambda *a: np.stack([np.asarray(x, float) for x in a]), *found)
+            spread = jax.tree.map(standard_error, table)
+            error = max(float(np.max(a, initial=0.0)) for a in jax.tree.leaves(spread))
+            photons, seconds = len(found) * BATCH, time.perf_counter() - started
+            if progress is not None:
+                progress(_Report(len(found), photons, seconds, error, rtol))
+            if error <= rtol:
+                break
+            if photons >= max_photons:
+                stopped = "photons traced"
+                break
+            needed = math.ceil(1.1 * len(found) * (error / rtol) ** 2)
+            most = -(-max_photons // BATCH)
+            wanted = min(max(needed, len(found) + 4), 4 * len(found), max(most, len(found) + 1))
+    info = {
+        "photons": len(found) * BATCH,
+        "batches": len(found),
+        "seconds": time.perf_counter() - started,
+        "error": error,
+        "stopped": stopped,
+    }
+    mean = jax.tree.map(lambda a: jnp.asarray(a.mean(axis=0)), table)
+    names = setup.plan.trace.materials
+    errors = dict(zip(names, map(jnp.asarray, spread.absorbed)))
+    errors |= {"returned": spread.up, "transmitted": spread.on_ground, "below": spread.down}
+    return EnergyBudget(
+        absorbed=dict(zip(names, mean.absorbed)),
+        returned=mean.up,
+        transmitted=mean.on_ground,
+        below=mean.down,
+        unfollowed=mean.unfollowed,
+        stderr={name: jnp.asarray(value) for name, value in errors.items()},
+        wavelength=lidar.wavelength,
+        info=info,
+    )
+
+
+def _endless(setup: Setup) -> Setup:
+    """With flights that are followed as far as it takes, whatever the record's window is."""
+    canopy, trace = setup.scene.canopy, setup.plan.trace
+    if canopy is None or canopy.sides == "open":
+        return setup
+    size, shape = known_array(canopy.voxels.voxel_size), canopy.voxels.shape
+    flight = REACH * float(size[2]) * shape[2]
+    steps = shape[2] + sum(math.ceil(flight / s) for s in size[:2]) + 3
+    trace = trace._replace(max_flight=flight, march_steps=int(steps))
+    return dataclasses.replace(setup, plan=dataclasses.replace(setup.plan, trace=trace))
+
+
+@eqx.filter_jit(**ONE_CORE)
+def _batch(setup: Setup, key: PRNGKeyArray, parallel: bool, max_orders: int) -> Fates:
+    source = from_the_sky if parallel else from_beam
+    optics, canopy = optics_of(setup), setup.scene.canopy
+    if canopy is None or not canopy.is_straight:
+        return follow(setting_of(setup), optics, key, BATCH, source, max_orders)
+    # Where leaves transmit straight on, every wavelength has an extinction of its own.
+    _, transmittance = canopy.leaf_optics(setup.lidar.wavelength)
+
+    def one(given: tuple[Array, Array]) -> Fates:
+        t, own = given
+        return follow(setting_of(setup, t), own[:, None], key, BATCH, source, max_orders)
+
+    each = jax.lax.map(one, (transmittance, optics.T))
+    absorbed = jnp.moveaxis(each.absorbed[..., 0], 0, 1)
+    return Fates(absorbed, *(a[:, 0] for a in (each.up, each.down, each.on_ground, each.unfollowed)))

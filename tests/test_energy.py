@@ -1,0 +1,183 @@
+"""Energy budgets against closed forms, discrete ordinates and the open forests of RAMI4PILPS.
+
+A plate (R, T) over ground of reflectance r returns R + T^2 r / (1 - R r). Slabs and forests are lit by
+parallel light over one period of a canopy without sides. Shares are compared within three standard errors,
+those of the forests within 0.01, and at a zenith angle of 83 degrees, where one arrangement of the crowns
+differs from another, within 0.01 and two standard deviations of one arrangement.
+"""
+
+import csv
+
+import jax
+import numpy as np
+import pytest
+from helpers import slab
+
+import jaxlidar as jl
+
+KEY = jax.random.key(3)
+PLATE = jl.Plate(height=2.0, reflectance=(0.5, 0.1), transmittance=(0.3, 0.6))
+LIDAR = jl.Lidar(wavelength=(650.0, 850.0))
+
+
+def total(budget):
+    return sum([*budget.absorbed.values(), budget.returned, budget.below, budget.unfollowed])
+
+
+def close(value, exact, stderr, sigmas=4.0):
+    return bool(np.all(np.abs(np.asarray(value) - exact) < sigmas * np.asarray(stderr) + 1e-6))
+
+
+@pytest.mark.parametrize("transmission", ["straight", "diffuse"])
+def test_a_plate_over_ground(transmission):
+    plate = jl.Plate(2.0, PLATE.reflectance, PLATE.transmittance, transmission=transmission)
+    scene = jl.Scene(plates=(plate,), ground=jl.Ground(reflectance=(0.9, 0.2)))
+    budget = jl.energy_budget(LIDAR, scene, key=KEY, rtol=0.005)
+    R, T, r = (np.array(a) for a in ((0.5, 0.1), (0.3, 0.6), (0.9, 0.2)))
+    arrived = T / (1 - R * r)
+    exact = {
+        "returned": R + T * r * arrived,
+        "transmitted": arrived,
+        "ground": (1 - r) * arrived,
+        "plate": (1 - R - T) * (1 + r * arrived),
+    }
+    found = {"returned": budget.returned, "transmitted": budget.transmitted, **budget.absorbed}
+    for name, value in exact.items():
+        assert close(found[name], value, budget.stderr[name]), name
+    # The same test rejects a plate that is met once only.
+    assert not close(budget.transmitted, T, budget.stderr["transmitted"])
+    np.testing.assert_allclose(total(budget), 1.0, atol=0.01)
+
+
+def test_two_plates_share_what_they_absorb():
+    """Black sheets that transmit: the upper one absorbs 1 - T1 of all, the lower 1 - T2 of the rest."""
+    plates = (jl.Plate(1.0, 0.0, 0.5), jl.Plate(3.0, 0.0, 0.2))
+    budget = jl.energy_budget(jl.Lidar(), jl.Scene(plates=plates), key=KEY, rtol=0.005)
+    assert close(budget.absorbed["plate 2"], 0.8, budget.stderr["plate 2"])
+    assert close(budget.absorbed["plate 1"], 0.2 * 0.5, budget.stderr["plate 1"])
+    assert close(budget.below, 0.1, budget.stderr["below"])
+
+
+def test_albedo_one_returns_everything():
+    canopy = jl.Canopy(slab(2.0), leaf=jl.Isotropic(albedo=1.0), sides="periodic")
+    scene = jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=1.0))
+    budget = jl.energy_budget(jl.Lidar(), scene, key=KEY, rtol=0.02, illumination="parallel")
+    assert float(budget.unfollowed[0]) < 1e-3
+    np.testing.assert_allclose(float(budget.returned[0]), 1.0, atol=0.06)
+    assert float(budget.absorbed["leaf"][0]) == 0.0
+
+
+@pytest.mark.parametrize(
+    "row", [1, *(pytest.param(n, marks=pytest.mark.slow) for n in (0, 2, 3, 5, 9, 13, 17))]
+)
+def test_slabs_against_discrete_ordinates(shared, row):
+    with (shared / "reference" / "slabs_isotropic.csv").open() as file:
+        given = {name: float(value) for name, value in list(csv.DictReader(file))[row].items()}
+    leaf = jl.Isotropic(albedo=given["omega"])
+    scene = jl.Scene(
+        canopy=jl.Canopy(slab(given["tau"]), leaf=leaf, sides="periodic"),
+        ground=jl.Ground(reflectance=given["rho_ground"]),
+    )
+    budget = jl.energy_budget(jl.Lidar(), scene, key=KEY, rtol=0.001, illumination="parallel")
+    exact = {
+        "returned": given["plane_albedo"],
+        "transmitted": given["Fdown_ground"],
+        "leaf": given["absorbed_medium"],
+        "ground": given["absorbed_ground"],
+    }
+    found = {"returned": budget.returned, "transmitted": budget.transmitted, **budget.absorbed}
+    for name, value in exact.items():
+        assert close(found[name], value, budget.stderr[name]), name
+
+
+def test_a_beam_and_its_ledger_agree():
+    voxels = jl.VoxelMap.from_lad(np.full((6, 6, 8), 0.6), voxel_size=0.5, origin=(-1.5, -1.5, 2.0))
+    canopy = jl.Canopy(voxels, leaf=jl.LeafOptics(reflectance=0.2, transmittance=0.1))
+    scene = jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=0.2))
+    budget = jl.energy_budget(jl.Lidar(divergence=1.0), scene, key=KEY, rtol=0.002)
+    wave = jl.simulate(
+        jl.Lidar(divergence=1.0), scene, key=KEY, n_photons=65536, max_orders=6, window=(-60.0, 400.0)
+    )
+    for material in ("leaf", "ground"):
+        off = float(wave.ledger[f"absorbed by {material}"][0] - budget.absorbed[material][0])
+        assert abs(off) < 5 * float(budget.stderr[material][0]) + 2e-3
+
+
+def spheres(count, seed, size=0.5, side=250.0, low=2.0):
+    """Crowns of radius 5 m that do not overlap, centres at 7 to 11 m, on a periodic square."""
+    rng = np.random.default_rng(seed)
+    centres = np.empty((0, 3))
+    while len(centres) < count:
+        dart = np.append(rng.uniform(0, side, 2), rng.uniform(7.0, 11.0))
+        away = centres - dart
+        away[:, :2] -= side * np.round(away[:, :2] / side)
+        if np.all(np.sum(away**2, axis=1) >= 100.0):
+            centres = np.vstack([centres, dart])
+    cells, layers, wide = round(side / size), round(14.0 / size), round(10.0 / size) + 2
+    share = np.zeros((cells, cells, layers))
+    within = (np.arange(4) + 0.5) / 4 * size
+    for x, y, z in centres:
+        first = [int(np.floor((c - 5.0) / size)) for c in (x, y, z - low)]
+        index = [np.arange(n, n + wide) for n in first]
+        away = [(n[:, None] * size + within).ravel() - c for n, c in zip(index, (x, y, z - low))]
+        a, b, c = (d**2 for d in away)
+        inside = a[:, None, None] + b[None, :, None] + c[None, None, :] < 25.0
+        part = inside.reshape(wide, 4, wide, 4, wide, 4).mean(axis=(1, 3, 5))
+        there = (index[2] >= 0) & (index[2] < layers)
+        share[np.ix_(index[0] % cells, index[1] % cells, index[2][there])] += part[:, :, there]
+    lad = 0.75 * np.minimum(share, 1.0)
+    return jl.VoxelMap.from_lad(lad, voxel_size=size, origin=(0.0, 0.0, low))
+
+
+SOILS = {"BLK": (0.0, 0.0), "MED": (0.1217, 0.2142), "SNW": (0.9640, 0.5568)}
+LEAF = jl.LeafOptics(reflectance=(0.0735, 0.3912), transmittance=(0.0566, 0.4146))
+
+
+def fluxes(voxels, soil, zenith):
+    """Absorbed by leaves, reflected and transmitted: (red, near infrared) each."""
+    canopy = jl.Canopy(voxels, leaf=LEAF, sides="periodic")
+    scene = jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=SOILS[soil]))
+    lidar = jl.Lidar(wavelength=(650.0, 850.0), zenith=zenith)
+    budget = jl.energy_budget(lidar, scene, key=KEY, rtol=0.002, illumination="parallel")
+    values = {"abs": budget.absorbed["leaf"], "ref": budget.returned, "tran": budget.transmitted}
+    return {name: np.asarray(value, float) for name, value in values.items()}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("crowns", "canopy"), [(80, 50), (239, 150), (398, 250)])
+def test_open_forests_of_rami4pilps(shared, crowns, canopy):
+    with (shared / "reference" / "rami4pilps.csv").open() as file:
+        rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
+    wanted = {
+        (r["band"].split()[-1], r["soil"], int(r["zenith"]), r["flux"]): float(r["value"])
+        for r in rows
+        if int(r["canopy"]) == canopy
+    }
+    assert len(wanted) == 54
+    voxels = [spheres(crowns, seed) for seed in range(4)]
+    off = {}
+    for soil in SOILS:
+        for zenith in (27, 60, 83):
+            several = [fluxes(v, soil, float(zenith)) for v in (voxels if zenith == 83 else voxels[:1])]
+            for flux in ("abs", "ref", "tran"):
+                each = np.array([one[flux] for one in several])
+                spread = 2 * each.std(axis=0, ddof=1) if zenith == 83 else np.zeros(2)
+                for number, band in enumerate(("red", "nir")):
+                    name = (band, soil, zenith, flux)
+                    off[name] = abs(each[0, number] - wanted[name]) - spread[number]
+    worst = max(off, key=off.get)
+    assert off[worst] < 0.01, (worst, off[worst])
+
+
+BAD = [
+    ({"rtol": 0.0}, r"rtol = 0 is outside the admissible range \(0, 1\)"),
+    ({"illumination": "sun"}, "illumination = 'sun' is none of 'beam', 'parallel'"),
+    ({"illumination": "parallel"}, "that is admissible where the canopy has periodic"),
+    ({"max_orders": 0}, "max_orders = 0 is outside"),
+]
+
+
+@pytest.mark.parametrize(("given", "message"), BAD)
+def test_bad_input(given, message):
+    with pytest.raises(ValueError, match=message):
+        jl.energy_budget(jl.Lidar(), jl.Scene(plates=(PLATE,)), key=KEY, **given)
