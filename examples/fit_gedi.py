@@ -282,7 +282,7 @@ def compare_all(options):
         shots.append(shot)
         product.append(product_answers(options.answers, shot))
     found, numbers = fit_all(
-        shots, options.out / "gedi_fits.npz", lambda p: print(f"\r{p}", end="", flush=True)
+        shots, options.out / "gedi_fits.sqlite", lambda p: print(f"\r{p}", end="", flush=True)
     )
     rows = [
         summary(

@@ -8,9 +8,8 @@ from .decomposition import (
     gaussian_decomposition,
     plant_area_index,
     relative_heights,
-    richardson_lucy,
-    wiener,
 )
+from .deconvolution import richardson_lucy, wiener
 from .identifiability import CramerRao, Profile, cramer_rao, profile_likelihood
 from .leaves import LeafFit, invert_leaves
 from .result import Retrieval, Step

@@ -8,25 +8,25 @@ not affect the others.
 import dataclasses
 import os
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple, final
+from typing import Any, final
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import ArrayLike, Bool, Float, Int, PRNGKeyArray
 
 from jaxlidar import Lidar, Plan, Scene
-from jaxlidar.extend import ONE_CORE, check_range, side_by_side
-from jaxlidar.planning.plan import MIN_BATCHES
+from jaxlidar.extend import check_integer, check_key, check_kind
 
-from .checkpoint import Kept, Row, fingerprint, row_of
-from .data import data_of
+from .checkpoint import Frame, Row, kept_fits, row_of
+from .data import at_fixed_times, data_of, noise_of, numbers
+from .fingerprint import fingerprint
 from .fit import Fitting, Request, best_of, labels_of, named
-from .model import Evaluation, Model, Problem, evaluate
-from .planning import check_samples, plan_for
-from .retrieval import SOLVER, fits_from, scale_of
+from .lanes import Simulator
+from .planning import batch_sizes, check_samples, plan_for
+from .retrieval import SOLVER, check_progress, check_solution, fits_from, scale_of
 from .unknowns import Settled, Unknown, settle, start_from
 
 
@@ -120,13 +120,13 @@ class Retrievals(eqx.Module):
 
 
 def retrieve_many(
-    observed: ArrayLike,
+    observed: ArrayLike | Sequence,
     lidar: Lidar | Sequence[Lidar],
     scene: Scene | Sequence[Scene],
     unknowns: Sequence[Unknown],
     *,
-    noise: ArrayLike,
-    time: ArrayLike,
+    noise: ArrayLike | Sequence,
+    time: ArrayLike | Sequence,
     key: PRNGKeyArray,
     plan: Plan | None = None,
     n_photons: float = 65536,
@@ -135,7 +135,7 @@ def retrieve_many(
     solver: optx.AbstractLeastSquaresSolver = SOLVER,
     max_steps: float = 50,
     starts: float = 1,
-    start: Mapping[str, ArrayLike] | None = None,
+    start: Mapping[str, ArrayLike | Sequence] | None = None,
     scale: tuple[float, float] | None = None,
     noise_floor: float = 1e-3,
     lanes: int = 16,
@@ -159,15 +159,18 @@ def retrieve_many(
       bounds.
     - `start`: by name, (footprints, ...) values that unknowns start from. Default None: their own.
     - `lanes`: number of footprints simulated together, at least 1; memory grows with it. Default 16.
-    - `path`: an .npz file, the checkpoint of finished fits. Where it exists, the fits in it are not repeated.
-      It is written after every few fits, and when interrupted. It belongs to `observed`, `noise` and the
-      names and bounds of the unknowns; changes of other arguments are not noticed. Default None: no file.
+    - `path`: a file (of SQLite) that keeps every fit once it has ended, so that a run that was interrupted or
+      killed goes on where it stopped. It belongs to the problem: everything that the result depends on must
+      be as it was, and only `lanes` and `progress` may change. One run at a time can use it. Where it cannot
+      be written any more, as on a full disk, a warning says so once and the fits go on. Default None: no
+      file.
     - `progress`: called with a `Progress` after every fit.
 
     **Returns:** a `Retrievals`.
 
-    **Raises:** ValueError for inadmissible arguments, and for a `path` that is damaged or belongs to other
-    footprints, noise, bounds or unknowns.
+    **Raises:** ValueError for inadmissible arguments, and for a `path` that is damaged, no file of fits, or
+    one of another problem, of which it says what differs. TypeError for arguments of another kind. OSError
+    for a `path` that cannot be written, before any fit, or that another run uses.
 
     **Example:**
 
@@ -183,69 +186,82 @@ def retrieve_many(
     >>> fits.values["brightness"].round(3).tolist()
     [0.2, 0.4]
     """
-    y = np.asarray(observed, float)
+    y = numbers("observed", observed)
     if y.ndim != 3 or len(y) == 0:
         raise ValueError(f"observed has the shape {y.shape}; admissible is (footprints, wavelengths, bins)")
-    try:
-        sigma = np.broadcast_to(np.asarray(noise, float), y.shape)
-    except ValueError:
-        raise ValueError(
-            f"noise has the shape {np.shape(noise)}, which does not broadcast to {y.shape}"
-        ) from None
-    check_range("lanes", lanes, 1)
-    check_range("starts", starts, 1)
-    lidars = [_fixed(a) for a in _one_each("lidar", lidar, len(y))]
-    scenes = _one_each("scene", scene, len(y))
-    settled = _started([settle(unknowns, s) for s in scenes], start or {}, len(y))
+    sigma = noise_of(noise, y.shape)
+    check_key(key)
+    check_progress(progress)
+    check_kind("path", path, str | os.PathLike | None, "a path, or None")
+    lanes = min(check_integer("lanes", lanes), len(y))
+    solver, max_steps, starts = check_solution(solver, max_steps, starts)
+    photons, rays = batch_sizes(n_photons, n_rays)
+    lidars = [at_fixed_times(a) for a in _one_each("lidar", lidar, Lidar, len(y))]
+    scenes = _one_each("scene", scene, Scene, len(y))
+    settled = _started([settle(unknowns, s) for s in scenes], {} if start is None else start, len(y))
     data = [data_of(y[i], time, sigma[i], noise_floor, lidars[i % len(lidars)]) for i in range(len(y))]
+    axis = data[0].time
+    extra = [] if scale is None else [scale_of(scale, settled[0])]
+    names = [*settled[0], *extra]
+    parts = {
+        "observed": y,
+        "noise": sigma,
+        "time": axis,
+        "noise_floor": float(noise_floor),
+        "lidar": lidars,
+        "scene": scenes,
+        **_parts_of(settled),
+        "scale": [(s.low, s.high) for s in extra],
+        "key": key,
+        "plan": plan,
+        # A plan replaces them.
+        "n_photons": photons if plan is None else None,
+        "n_rays": rays if plan is None else None,
+        "max_orders": max_orders if plan is None else None,
+        "solver": solver,
+        "max_steps": max_steps,
+        "starts": starts,
+    }
     if plan is None:
         plan = plan_for(
-            lidars[0],
-            scenes[0],
-            settled[0],
-            data[0].time,
-            max_orders=max_orders,
-            photons=int(n_photons) // MIN_BATCHES,
-            rays=int(n_rays) // MIN_BATCHES,
+            lidars[0], scenes[0], settled[0], axis, max_orders=max_orders, photons=photons, rays=rays
         )
-    check_samples(plan, data[0].time)
-    extra = [] if scale is None else [scale_of(scale, settled[0])]
+    check_samples(plan, axis)
 
     def fitting(i: int) -> Fitting:
         own = [*settled[i % len(settled)], *extra]
-        fits = fits_from(
-            int(starts), jax.random.fold_in(key, i), data[i], own, bool(extra), solver, int(max_steps), None
-        )
-        return best_of(fits)
+        lane_key = jax.random.fold_in(key, i)
+        return best_of(fits_from(starts, lane_key, data[i], own, bool(extra), solver, max_steps, None))
 
-    names = [*settled[0], *extra]
-    kept = Kept(path, fingerprint(y, sigma, names))
-    simulate = _Simulator(lidars, scenes, plan, settled[0], key, min(int(lanes), len(y)))
-    ended: dict[int, Row] = kept.rows
-    todo = [i for i in range(len(y)) if i not in ended]
-    running: dict[int, tuple[Fitting, Request]] = {}
-    try:
+    frame = Frame(len(y), sum(s.start.size for s in names), y.shape[1:])
+    with kept_fits(path, {} if path is None else fingerprint(parts), frame) as kept:
+        ended = kept.rows
+        simulate = Simulator(lidars, scenes, plan, settled[0], key, lanes)
+        todo = [i for i in range(len(y)) if i not in ended]
+        running: dict[int, tuple[Fitting, Request]] = {}
         while todo or running:
             while todo and len(running) < simulate.lanes:
                 i = todo.pop(0)
                 fit = fitting(i)
                 running[i] = fit, next(fit)
-            found = simulate({i: request for i, (_, request) in running.items()})
-            for i, evaluation in found.items():
+            for i, evaluation in simulate({i: request for i, (_, request) in running.items()}).items():
                 fit = running[i][0]
                 try:
                     running[i] = fit, fit.send(evaluation)
                 except StopIteration as end:
                     del running[i]
-                    ended[i] = row_of(end.value)
+                    kept.add(i, row_of(end.value))
                     if progress is not None:
                         progress(Progress(len(ended), len(y), sum(r.converged for r in ended.values())))
-                    if len(ended) % max(simulate.lanes, 16) == 0:
-                        kept.write()
-    finally:
-        kept.write()
-    rows = [ended[i] for i in range(len(y))]
-    stack = lambda pick: np.stack([pick(r) for r in rows])  # noqa: E731
+    return _gathered([ended[i] for i in range(len(y))], names)
+
+
+def _gathered(rows: list[Row], names: list[Settled]) -> Retrievals:
+    """The results from those of all footprints."""
+
+    def stack(pick: Callable[[Row], np.ndarray]) -> np.ndarray:
+        return np.stack([pick(r) for r in rows])
+
     return Retrievals(
         values=named(stack(lambda r: r.values), names),
         stderr=named(stack(lambda r: r.stderr), names),
@@ -259,14 +275,26 @@ def retrieve_many(
     )
 
 
-def _started(settled: list[list[Settled]], start: Mapping[str, ArrayLike], count: int) -> list[list[Settled]]:
+def _parts_of(settled: list[list[Settled]]) -> dict[str, Any]:
+    """What fits depend on of the unknowns, by name: those of the first footprint, and the starts of all."""
+    parts: dict[str, Any] = {"unknowns": [s.name for s in settled[0]]}
+    for s, *others in zip(*settled):
+        parts[f"place of {s.name!r}"] = s.place
+        parts[f"bounds of {s.name!r}"] = s.low, s.high
+        parts[f"prior of {s.name!r}"] = s.prior, s.log_prior
+        parts[f"start of {s.name!r}"] = [s.start, *(other.start for other in others)]
+    return parts
+
+
+def _started(settled: list[list[Settled]], start: Mapping[str, Any], count: int) -> list[list[Settled]]:
     """The unknowns of every footprint, with its own starting values; one list where all are the same."""
+    check_kind("start", start, Mapping, "a mapping from names of unknowns to values")
     shapes = {s.name: s.start.shape for s in settled[0]}
     given = {}
     for name, values in start.items():
         if name not in shapes:
             raise ValueError(f"start has {name!r}; admissible are {', '.join(map(repr, shapes))}")
-        given[name] = np.asarray(values, float)
+        given[name] = numbers(f"start of {name!r}", values)
         if given[name].shape != (count, *shapes[name]):
             raise ValueError(
                 f"start of {name!r} has the shape {given[name].shape}; admissible is {(count, *shapes[name])}"
@@ -282,105 +310,19 @@ def _started(settled: list[list[Settled]], start: Mapping[str, ArrayLike], count
     ]
 
 
-def _fixed(lidar: Lidar) -> Lidar:
-    # Samples lie at the given times, whatever opened the recording window.
-    return dataclasses.replace(lidar, receiver=dataclasses.replace(lidar.receiver, window="fixed"))
-
-
-def _one_each(field: str, given: Any, count: int) -> list[Any]:
-    if isinstance(given, Lidar | Scene):
+def _one_each(field: str, given: Any, kind: type, count: int) -> list[Any]:
+    """One for all footprints, or one for each. **Raises:** as `retrieve_many`."""
+    if isinstance(given, kind):
         return [given]
+    check_kind(field, given, Sequence, f"one {kind.__name__}, or a sequence of one for each footprint")
     given = list(given)
     if len(given) != count:
         raise ValueError(f"{field} has {len(given)} elements; admissible is one, or {count} as observed")
+    for i, other in enumerate(given):
+        check_kind(f"{field} {i}", other, kind, f"a {kind.__name__}")
     shape = jax.tree.map(jnp.shape, given[0])
     for i, other in enumerate(given):
         same = jax.tree.structure(other) == jax.tree.structure(given[0])
         if not same or jax.tree.map(jnp.shape, other) != shape:
             raise ValueError(f"{field} {i} differs from the first in more than the values of its arrays")
     return given
-
-
-class _Simulator:
-    """Simulates the requests of all lanes in one compiled call; several threads share the lanes."""
-
-    def __init__(
-        self,
-        lidars: list[Lidar],
-        scenes: list[Scene],
-        plan: Plan,
-        settled: list[Settled],
-        key: PRNGKeyArray,
-        lanes: int,
-    ):
-        self.model = Model(lidars[0], scenes[0], plan, settled, key)
-        self.threads = min(max(os.cpu_count() or 1, 1), lanes)
-        self.each = -(-lanes // self.threads)
-        self.lanes = self.each * self.threads
-        self.lidars, self.scenes = lidars, scenes
-
-    def __call__(self, requests: dict[int, Request]) -> dict[int, Evaluation]:
-        numbers = list(requests)
-        groups = [numbers[i : i + self.each] for i in range(0, len(numbers), self.each)]
-        found: dict[int, Evaluation] = {}
-        with side_by_side(self.threads) as run:
-            for more in run(lambda group: self._group(group, requests), groups):
-                found |= more
-        return found
-
-    def _group(self, group: list[int], requests: dict[int, Request]) -> dict[int, Evaluation]:
-        # The compiled call has a fixed number of lanes: idle ones repeat the last.
-        padded = [*group, *[group[-1]] * (self.each - len(group))]
-        values = jax.tree.map(
-            lambda *a: jnp.stack(a), *(self.model.values(requests[i].values) for i in padded)
-        )
-        lidar, scene = _stacked(self.lidars, padded), _stacked(self.scenes, padded)
-        model = self.model
-        problem = dataclasses.replace(model.problem, lidar=lidar, scene=scene)
-        own = Own(len(self.lidars) > 1, len(self.scenes) > 1)
-        out = _simulate(problem, values, jnp.stack(model.keys), own)
-        total, columns, batches = (np.asarray(a, float) for a in out)
-        return {
-            i: Evaluation(
-                total[n],
-                np.moveaxis(columns[n][model.order], 0, -1),
-                None,
-                batches[n] if model.problem.plan.is_random else None,
-            )
-            for n, i in enumerate(group)
-        }
-
-
-def _stacked(given: list[Any], numbers: list[int]) -> Any:
-    if len(given) == 1:
-        return given[0]
-    dynamic, static = zip(*(eqx.partition(given[i], eqx.is_array) for i in numbers))
-    return eqx.combine(jax.tree.map(lambda *a: jnp.stack(a), *dynamic), static[0])
-
-
-class Own(NamedTuple):
-    """Whether every footprint has a lidar, or a scene, of its own."""
-
-    lidar: bool
-    scene: bool
-
-
-@eqx.filter_jit(**ONE_CORE)
-def _simulate(problem: Problem, values: Any, keys: Array, own: Own) -> tuple[Array, Array, Array]:
-    lidar, fixed_lidar = eqx.partition(problem.lidar, eqx.is_array)
-    scene, fixed_scene = eqx.partition(problem.scene, eqx.is_array)
-
-    def one(lidar: Lidar, scene: Scene, values: Any) -> tuple[Array, Array, Array]:
-        lidar, scene = eqx.combine(lidar, fixed_lidar), eqx.combine(scene, fixed_scene)
-        return evaluate(dataclasses.replace(problem, lidar=lidar, scene=scene), values, keys)
-
-    if problem.plan.orders == 1:
-        axes = (0 if own.lidar else None, 0 if own.scene else None, 0)
-        return jax.vmap(one, in_axes=axes)(lidar, scene, values)
-
-    # Batched with vmap, every lane would be traced until the photons of the slowest have ended.
-    def in_turn(each: tuple) -> tuple[Array, Array, Array]:
-        return one(each[0] if own.lidar else lidar, each[1] if own.scene else scene, each[2])
-
-    mapped = (lidar if own.lidar else None, scene if own.scene else None, values)
-    return jax.lax.map(in_turn, mapped)

@@ -1,12 +1,13 @@
 """Checked observations: waveforms, their sample times and their noise."""
 
-from typing import NamedTuple
+import dataclasses
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxlidar import Lidar, Waveform
-from jaxlidar.extend import check_range
+from jaxlidar.extend import check_kind, check_numbers, check_range
 
 
 class Data(NamedTuple):
@@ -20,6 +21,12 @@ class Data(NamedTuple):
     def used(self) -> np.ndarray:
         """Which samples are fitted."""
         return np.isfinite(self.sigma)
+
+
+def at_fixed_times(lidar: Lidar) -> Lidar:
+    """The lidar without what opens its recording window: samples lie at given times."""
+    check_kind("lidar", lidar, Lidar, "a Lidar")
+    return dataclasses.replace(lidar, receiver=dataclasses.replace(lidar.receiver, window="fixed"))
 
 
 def data_of(observed: object, time: object, noise: object, floor: float, lidar: Lidar) -> Data:
@@ -38,17 +45,13 @@ def data_of(observed: object, time: object, noise: object, floor: float, lidar: 
     elif time is None:
         raise ValueError("time = None, but observed is an array: its sample times are needed")
     t = time_axis(time, lidar)
-    y = _array("observed", observed)
+    y = numbers("observed", observed)
     if y.ndim == 1:
         y = y[None, :]
     shape = (lidar.wavelength.size, t.size)
     if y.shape != shape:
         raise ValueError(f"observed has the shape {y.shape}; admissible is (wavelengths, bins) = {shape}")
-    sigma = _array("noise", noise)
-    try:
-        sigma = np.broadcast_to(sigma, shape).copy()
-    except ValueError:
-        raise ValueError(f"noise has the shape {sigma.shape}, which does not broadcast to {shape}") from None
+    sigma = noise_of(noise, shape)
     if not np.all(sigma >= 0):
         bad = sigma[~(sigma >= 0)].flat[0]
         raise ValueError(f"noise = {bad:g} is outside the admissible range [0, inf]")
@@ -67,16 +70,27 @@ def data_of(observed: object, time: object, noise: object, floor: float, lidar: 
     return Data(t, np.where(used, y, 0.0), sigma)
 
 
-def _array(field: str, x: object) -> np.ndarray:
+def noise_of(noise: object, shape: tuple[int, ...]) -> np.ndarray:
+    """Standard deviations of this shape. **Raises:** ValueError for what does not broadcast to it."""
+    sigma = numbers("noise", noise)
+    try:
+        return np.broadcast_to(sigma, shape).copy()
+    except ValueError:
+        raise ValueError(f"noise has the shape {sigma.shape}, which does not broadcast to {shape}") from None
+
+
+def numbers(field: str, x: Any) -> np.ndarray:
+    """An array in double precision. **Raises:** TypeError for no numbers, ValueError for ragged rows."""
+    check_numbers(field, x)
     try:
         return np.asarray(x, dtype=float)
-    except (TypeError, ValueError):
-        raise ValueError(f"{field} = {x!r} is no array of numbers") from None
+    except ValueError:
+        raise ValueError(f"{field} has rows of different lengths; admissible is a regular array") from None
 
 
 def time_axis(time: object, lidar: Lidar) -> Float[np.ndarray, " bins"]:
     """Sample times in double precision. **Raises:** ValueError unless they lie a sampling interval apart."""
-    t = _array("time", time)
+    t = numbers("time", time)
     if t.ndim != 1 or t.size == 0 or not np.all(np.isfinite(t)):
         raise ValueError(f"time has the shape {t.shape}; admissible is (bins,), finite, one bin or more")
     interval = float(lidar.sampling_interval)

@@ -1,12 +1,13 @@
-r"""Waveform processing without a model of the scene: echoes, deconvolution, heights, gap probability.
+r"""Waveform processing without a model of the scene: echoes, heights, gap probability.
 
 All functions take single waveforms, (bins,), and can be batched with `jax.vmap`. `relative_heights`,
-`gap_probability`, `plant_area_index`, `richardson_lucy` and `wiener` are differentiable in the waveform.
-`gaussian_decomposition` and `find_ground` make discrete choices (the number of echoes, the lowest mode);
-their derivatives are those for the choice made.
+`gap_probability` and `plant_area_index` are differentiable in the waveform. `gaussian_decomposition` and
+`find_ground` make discrete choices (the number of echoes, the lowest mode); their derivatives are those for
+the choice made.
 """
 
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -15,7 +16,7 @@ import optimistix as optx
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from jaxlidar.extend import as_array, check_range
+from jaxlidar.extend import as_array, check_integer, check_range
 
 _SOLVER = optx.LevenbergMarquardt(rtol=1e-4, atol=1e-4)
 _STEPS = 60
@@ -39,11 +40,10 @@ class Echoes(NamedTuple):
 
     **Example:**
 
-    >>> import inversion, jax, numpy as np
+    >>> import inversion, numpy as np
     >>> time = np.arange(0.0, 60.0)
     >>> power = np.exp(-0.5 * ((time - 20.0) / 3.0) ** 2)
-    >>> decompose = jax.jit(lambda y: inversion.gaussian_decomposition(time, y, noise=0.01, width=3.0))
-    >>> echoes = decompose(power)
+    >>> echoes = inversion.gaussian_decomposition(time, power, noise=0.01, width=3.0)
     >>> print(f"{int(echoes.count)}: {float(echoes.time[0]):.1f} ns, width {float(echoes.width[0]):.1f} ns")
     1: 20.0 ns, width 3.0 ns
     """
@@ -70,7 +70,7 @@ def gaussian_decomposition(
 
     Echoes are added one at a time where the residual, smoothed by the pulse, is largest, and all are fitted
     again by Levenberg-Marquardt. Of the fits with 0 to `max_echoes` echoes, the one with the lowest criterion
-    is returned. No echo is negative. Call it within `jax.jit`, which compiles faster than single operations.
+    is returned. No echo is negative. Equal numbers of bins and echoes compile once.
 
     **Arguments:**
 
@@ -89,27 +89,30 @@ def gaussian_decomposition(
 
     **Example:**
 
-    >>> import inversion, jax, numpy as np
+    >>> import inversion, numpy as np
     >>> time = np.arange(0.0, 60.0)
     >>> power = sum(a * np.exp(-0.5 * ((time - t) / 3.0) ** 2) for a, t in ((1.0, 20.0), (0.5, 40.0)))
-    >>> decompose = jax.jit(lambda y: inversion.gaussian_decomposition(time, y, noise=0.01, width=3.0))
-    >>> echoes = decompose(power)
+    >>> echoes = inversion.gaussian_decomposition(time, power, noise=0.01, width=3.0)
     >>> [f"{float(t):.1f}" for t in echoes.time[: echoes.count]]
     ['20.0', '40.0']
     """
-    t, y = as_array(time), as_array(power)
-    sigma = jnp.broadcast_to(as_array(noise), y.shape)
+    t, y, sigma = as_array(time), as_array(power), as_array(noise)
+    most = check_integer("max_echoes", max_echoes)
+    if t.shape != y.shape or t.ndim != 1 or t.size < 2:
+        raise ValueError(
+            f"time and power have the shapes {t.shape} and {y.shape}; admissible is (bins,) for both, two or "
+            "more"
+        )
+    if sigma.shape not in ((), y.shape):
+        raise ValueError(f"noise has the shape {sigma.shape}; admissible is () or {y.shape}")
     check_range("noise", noise, 0.0, low_open=True)
     check_range("width", width, 0.0, low_open=True)
     check_range("power", power)
     check_range("steps of time", jnp.diff(t), 0.0, low_open=True)
-    if max_echoes != int(max_echoes) or max_echoes < 1:
-        raise ValueError(f"max_echoes = {max_echoes} is outside the admissible range [1, inf) of integers")
-    if t.shape != y.shape:
-        raise ValueError(f"time and power have the shapes {t.shape} and {y.shape}; they must agree")
-    return _decompose(t, y, sigma, as_array(width), int(max_echoes))
+    return _decompose(t, y, jnp.broadcast_to(sigma, y.shape), as_array(width), most)
 
 
+@partial(jax.jit, static_argnames="most")
 def _decompose(t: Samples, y: Samples, sigma: Samples, width: Array, most: int) -> Echoes:
     step = t[1] - t[0]
     kernel = jnp.exp(-0.5 * ((t - 0.5 * (t[0] + t[-1])) / width) ** 2)
@@ -185,94 +188,6 @@ def _decompose(t: Samples, y: Samples, sigma: Samples, width: Array, most: int) 
 def _half_step(t: Samples, step: Array) -> Array:
     """How far the centre of a kernel of an even number of samples lies from a sample."""
     return jnp.where(t.size % 2 == 0, 0.5 * step, 0.0)
-
-
-def richardson_lucy(
-    power: Float[ArrayLike, " bins"], pulse: Float[ArrayLike, " lags"], *, iterations: int = 50
-) -> Samples:
-    """Richardson-Lucy deconvolution of a waveform: it conserves energy and is never negative.
-
-    **Arguments:**
-
-    - `power`: (bins,) waveform, background removed. Negative samples, which noise makes, count as zero.
-    - `pulse`: (lags,) transmitted pulse at the waveform's sampling, an odd number of samples with time zero
-      in the middle, not negative; its scale does not matter.
-    - `iterations`: 1 or more. More of them resolve more and amplify noise. Default 50.
-
-    **Returns:** (bins,) the deconvolved waveform, in units of `power`.
-
-    **Raises:** ValueError for inadmissible arguments.
-
-    **Source:** Richardson (1972), J. Opt. Soc. Am. 62, 55; Lucy (1974), Astron. J. 79, 745.
-
-    **Example:**
-
-    >>> import inversion, numpy as np
-    >>> pulse = np.exp(-0.5 * (np.arange(-12.0, 13.0) / 3.0) ** 2)
-    >>> target = np.where(np.arange(60) == 30, 1.0, 0.0)
-    >>> power = np.convolve(target, pulse / pulse.sum(), mode="same")
-    >>> sharp = inversion.richardson_lucy(power, pulse)
-    >>> print(f"peak {power[30]:.2f} to {float(sharp[30]):.2f}, energy {float(sharp.sum()):.2f}")
-    peak 0.13 to 0.38, energy 1.00
-    """
-    y, h = jnp.maximum(as_array(power), 0.0), _kernel(pulse)
-    if iterations != int(iterations) or iterations < 1:
-        raise ValueError(f"iterations = {iterations} is outside the admissible range [1, inf) of integers")
-    check_range("pulse", pulse, 0.0)
-    tiny = 1e-6 * jnp.maximum(jnp.max(y), 1e-30)
-    # Share of each bin's energy that is recorded: less at the ends.
-    seen = jnp.convolve(jnp.ones_like(y), h[::-1], mode="same")
-
-    def better(x: Samples, _: None) -> tuple[Samples, None]:
-        ratio = y / jnp.maximum(jnp.convolve(x, h, mode="same"), tiny)
-        return x * jnp.convolve(ratio, h[::-1], mode="same") / seen, None
-
-    return lax.scan(better, jnp.full_like(y, jnp.mean(y)), None, length=int(iterations))[0]
-
-
-def wiener(
-    power: Float[ArrayLike, " bins"], pulse: Float[ArrayLike, " lags"], *, noise_to_signal: float
-) -> Samples:
-    """Deconvolution of a waveform by a Wiener filter.
-
-    **Arguments:**
-
-    - `power`: (bins,) waveform, background removed.
-    - `pulse`: (lags,) as for `richardson_lucy`, but of any sign.
-    - `noise_to_signal`: power of the noise over that of the signal, above 0, the same at all frequencies.
-
-    **Returns:** (bins,) the deconvolved waveform, in units of `power`; it may be negative.
-
-    **Raises:** ValueError for inadmissible arguments.
-
-    **Source:** Wiener (1949), Extrapolation, Interpolation, and Smoothing of Stationary Time Series.
-
-    **Example:**
-
-    >>> import inversion, numpy as np
-    >>> pulse = np.exp(-0.5 * (np.arange(-12.0, 13.0) / 3.0) ** 2)
-    >>> target = np.where(np.arange(60) == 30, 1.0, 0.0)
-    >>> power = np.convolve(target, pulse / pulse.sum(), mode="same")
-    >>> sharp = inversion.wiener(power, pulse, noise_to_signal=1e-4)
-    >>> print(f"peak {power[30]:.2f} to {float(sharp[30]):.2f}")
-    peak 0.13 to 0.32
-    """
-    check_range("noise_to_signal", noise_to_signal, 0.0, low_open=True)
-    y, h = as_array(power), _kernel(pulse)
-    n = y.size + h.size - 1
-    spectrum = jnp.fft.rfft(h, n)
-    gain = jnp.conj(spectrum) / (jnp.abs(spectrum) ** 2 + noise_to_signal)
-    # The pulse begins half its length before its time zero.
-    begun = jnp.pad(y, ((h.size - 1) // 2, (h.size - 1) // 2))
-    return jnp.fft.irfft(jnp.fft.rfft(begun) * gain, n)[: y.size]
-
-
-def _kernel(pulse: Float[ArrayLike, " lags"]) -> Float[Array, " lags"]:
-    h = as_array(pulse)
-    check_range("pulse", pulse)
-    if h.ndim != 1 or h.size % 2 == 0:
-        raise ValueError(f"pulse has the shape {h.shape}; admissible is (lags,) with an odd number of lags")
-    return h / jnp.sum(h)
 
 
 def relative_heights(

@@ -1,5 +1,6 @@
 """Identifiability of unknowns from waveforms: Cramer-Rao bounds and profile likelihoods."""
 
+import inspect
 import itertools
 from collections.abc import Callable, Sequence
 from typing import Any, final
@@ -12,14 +13,13 @@ from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from jaxlidar import Lidar, Plan, Scene, Waveform
 from jaxlidar import plan as make_plan
-from jaxlidar.extend import check_range
-from jaxlidar.planning.plan import MIN_BATCHES
+from jaxlidar.extend import check_key, check_kinds, check_range
 
-from .data import data_of, time_axis
+from .data import at_fixed_times, data_of, noise_of, numbers, time_axis
 from .fit import labels_of, named
 from .model import Model
-from .planning import check_samples, plan_for
-from .retrieval import retrieve
+from .planning import batch_sizes, check_samples, plan_for
+from .retrieval import check_progress, check_solution, retrieve, scale_of
 from .uncertainty import correlation_of, errors_of
 from .unknowns import Priors, Unknown, put, settle
 
@@ -106,7 +106,7 @@ def cramer_rao(
 
     **Returns:** a `CramerRao`.
 
-    **Raises:** ValueError for inadmissible arguments.
+    **Raises:** ValueError for inadmissible arguments, TypeError for arguments of another kind.
 
     **Source:** Kay (1993), Fundamentals of Statistical Signal Processing, chapter 3.
 
@@ -120,30 +120,20 @@ def cramer_rao(
     >>> print(f"{float(bound.stderr['height']):.3f} m")
     0.005 m
     """
+    check_kinds(lidar, scene)
+    check_key(key)
+    lidar = at_fixed_times(lidar)
+    photons, rays = batch_sizes(n_photons, n_rays)
     settled = settle(unknowns, scene)
+    axis = None if time is None else time_axis(time, lidar)
     if plan is None:
-        photons, rays = int(n_photons) // MIN_BATCHES, int(n_rays) // MIN_BATCHES
-        if time is None:
+        if axis is None:
             plan = make_plan(lidar, scene, max_orders=max_orders, n_photons=photons, n_rays=rays)
         else:
-            plan = plan_for(
-                lidar,
-                scene,
-                settled,
-                time_axis(time, lidar),
-                max_orders=max_orders,
-                photons=photons,
-                rays=rays,
-            )
-    if time is not None:
-        check_samples(plan, time_axis(time, lidar))
-    shape = (lidar.wavelength.size, plan.n_samples)
-    try:
-        sigma = np.broadcast_to(np.asarray(noise, float), shape)
-    except ValueError:
-        raise ValueError(
-            f"noise has the shape {np.shape(noise)}, which does not broadcast to {shape}"
-        ) from None
+            plan = plan_for(lidar, scene, settled, axis, max_orders=max_orders, photons=photons, rays=rays)
+    if axis is not None:
+        check_samples(plan, axis)
+    sigma = noise_of(noise, (lidar.wavelength.size, plan.n_samples))
     if not np.all(sigma > 0):
         raise ValueError(f"noise = {np.min(sigma):g} is outside the admissible range (0, inf]")
     start = np.concatenate([np.ravel(np.asarray(s.start, float)) for s in settled])
@@ -268,6 +258,16 @@ def profile_likelihood(
     >>> print("{:.2f} m to {:.2f} m".format(*profile.interval()))
     0.47 m to 0.53 m
     """
+    check_kinds(lidar, scene)
+    # Names that `retrieve` does not know are found before the work.
+    given = inspect.signature(retrieve).bind(observed, lidar, scene, unknowns, noise=noise, key=key, **more)
+    given.apply_defaults()
+    own = given.arguments
+    check_solution(own["solver"], own["max_steps"], own["starts"])
+    check_progress(progress)
+    check_key(key)
+    lidar = at_fixed_times(lidar)
+    photons, rays = batch_sizes(own["n_photons"], own["n_rays"])
     settled = settle(unknowns, scene)
     names = [s.name for s in settled]
     if name not in names:
@@ -278,28 +278,30 @@ def profile_likelihood(
             f"name = {name!r} has {held.start.size} values beside {len(settled) - 1} unknowns; admissible is "
             "one value beside one unknown or more"
         )
-    points = np.asarray(values, float)
+    points = numbers("values", values)
     if points.ndim != 1 or points.size < 2 or not np.all(np.diff(points) > 0):
         raise ValueError(f"values has the shape {points.shape}; admissible are two or more, increasing")
     check_range("values", points, float(held.low), float(held.high))
     others = [u for u, s in zip(unknowns, settled) if s is not held]
-    data = data_of(observed, time, noise, more.get("noise_floor", 1e-3), lidar)
+    if own["scale"] is not None:
+        scale_of(own["scale"], settled)
+    data = data_of(observed, time, noise, own["noise_floor"], lidar)
     if plan is None:
         plan = plan_for(
             lidar,
             scene,
             settled,
             data.time,
-            max_orders=more.get("max_orders"),
-            photons=int(more.get("n_photons", 65536)) // MIN_BATCHES,
-            rays=int(more.get("n_rays", 8192)) // MIN_BATCHES,
+            max_orders=own["max_orders"],
+            photons=photons,
+            rays=rays,
         )
     middle = int(np.argmin(np.abs(points - float(held.start))))
     found: dict[int, Any] = {}
-    for numbers in (range(middle, points.size), range(middle - 1, -1, -1)):
+    for order in (range(middle, points.size), range(middle - 1, -1, -1)):
         # The result of the neighbour towards the middle.
         last = found.get(middle)
-        for i in numbers:
+        for i in order:
             here = put(
                 scene, (held.place,), (jnp.asarray(points[i], held.start.dtype).reshape(held.start.shape),)
             )

@@ -9,12 +9,20 @@ from jaxtyping import Float
 
 from jaxlidar import Lidar, Plan, Scene
 from jaxlidar import plan as make_plan
+from jaxlidar.extend import check_integer, check_kind
 from jaxlidar.planning.path_lengths import PathLengths
+from jaxlidar.planning.plan import MIN_BATCHES
 
 from .unknowns import Settled, put
 
 # With more geometric unknowns than this, not every corner of the bounds is examined.
 _ALL_CORNERS = 4
+
+
+def batch_sizes(n_photons: float, n_rays: float) -> tuple[int, int]:
+    """Photons and rays of each batch of a simulation. **Raises:** ValueError for less than one in a batch."""
+    photons = check_integer("n_photons", n_photons, MIN_BATCHES)
+    return photons // MIN_BATCHES, check_integer("n_rays", n_rays, MIN_BATCHES) // MIN_BATCHES
 
 
 def corners(scene: Scene, settled: list[Settled]) -> list[Scene]:
@@ -92,6 +100,7 @@ def plan_for(
 
 def check_samples(plan: Plan, time: Float[np.ndarray, " bins"]) -> None:
     """Check that the samples of a plan are at `time`. **Raises:** ValueError where they are not."""
+    check_kind("plan", plan, Plan, "a Plan")
     slack = 1e-3 * plan.sample_interval + 4e-7 * float(np.max(np.abs(time)))
     expected = plan.sample_start + plan.sample_interval * np.arange(plan.n_samples)
     if time.size != plan.n_samples or np.max(np.abs(expected - time)) > slack:

@@ -1,6 +1,5 @@
 """Retrieval of scene properties from one waveform."""
 
-import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -11,13 +10,12 @@ import optimistix as optx
 from jaxtyping import Array, ArrayLike, PRNGKeyArray
 
 from jaxlidar import Lidar, Plan, Scene, Waveform
-from jaxlidar.extend import check_range
-from jaxlidar.planning.plan import MIN_BATCHES
+from jaxlidar.extend import check_integer, check_key, check_kinds, check_range
 
-from .data import Data, data_of
+from .data import Data, at_fixed_times, data_of
 from .fit import Fit, Outcome, best_of, drive, labels_of, named
 from .model import Model
-from .planning import check_samples, plan_for
+from .planning import batch_sizes, check_samples, plan_for
 from .result import Retrieval, Step
 from .unknowns import Place, Settled, Unknown, latin_hypercube, settle
 
@@ -93,8 +91,8 @@ def retrieve(
     **Returns:** a `Retrieval`.
 
     **Raises:** ValueError for inadmissible arguments, among them a start outside its bounds, samples that do
-    not fit the lidar or the plan, and noise that is negative or NaN. RuntimeError where `throw` is set and
-    the fit does not converge.
+    not fit the lidar or the plan, and noise that is negative or NaN. TypeError for arguments of another kind.
+    RuntimeError where `throw` is set and the fit does not converge.
 
     **Example:**
 
@@ -107,41 +105,38 @@ def retrieve(
     >>> print(f"{float(fit.values['height']):.3f} +- {float(fit.stderr['height']):.3f} m")
     0.500 +- 0.005 m
     """
-    if len(unknowns) == 0:
-        raise ValueError("unknowns is empty; admissible is one unknown or more")
-    if not isinstance(solver, optx.AbstractGaussNewton):
-        raise ValueError(f"solver = {solver!r} is no Gauss-Newton method of optimistix")
-    for name, value, low in (
-        ("max_steps", max_steps, 1),
-        ("n_photons", n_photons, MIN_BATCHES),
-        ("n_rays", n_rays, MIN_BATCHES),
-        ("starts", starts, 1),
-    ):
-        if value != int(value) or value < low:
-            raise ValueError(f"{name} = {value} is outside the admissible range [{low}, inf) of integers")
-    # Samples lie at the given times, whatever opened the recording window.
-    lidar = dataclasses.replace(lidar, receiver=dataclasses.replace(lidar.receiver, window="fixed"))
+    check_kinds(lidar, scene)
+    check_key(key)
+    solver, max_steps, starts = check_solution(solver, max_steps, starts)
+    check_progress(progress)
+    photons, rays = batch_sizes(n_photons, n_rays)
+    lidar = at_fixed_times(lidar)
     data = data_of(observed, time, noise, noise_floor, lidar)
     settled = settle(unknowns, scene)
+    extra = [] if scale is None else [scale_of(scale, settled)]
     if plan is None:
-        plan = plan_for(
-            lidar,
-            scene,
-            settled,
-            data.time,
-            max_orders=max_orders,
-            photons=int(n_photons) // MIN_BATCHES,
-            rays=int(n_rays) // MIN_BATCHES,
-        )
+        plan = plan_for(lidar, scene, settled, data.time, max_orders=max_orders, photons=photons, rays=rays)
     check_samples(plan, data.time)
     model = Model(lidar, scene, plan, settled, key)
-    if scale is not None:
-        settled = [*settled, scale_of(scale, settled)]
-    fits = fits_from(int(starts), key, data, settled, scale is not None, solver, int(max_steps), progress)
+    settled = [*settled, *extra]
+    fits = fits_from(starts, key, data, settled, scale is not None, solver, max_steps, progress)
     outcome = drive(best_of(fits), lambda request: model(request.values, spread=request.spread))
     if throw and not outcome.converged:
         raise RuntimeError(outcome.status)
     return retrieval_of(outcome, model, settled, scale is not None)
+
+
+def check_solution(solver: Any, max_steps: float, starts: float) -> tuple[Any, int, int]:
+    """How fits are to be solved, checked. **Raises:** ValueError where inadmissible."""
+    if not isinstance(solver, optx.AbstractGaussNewton):
+        raise ValueError(f"solver = {solver!r} is no Gauss-Newton method of optimistix")
+    return solver, check_integer("max_steps", max_steps), check_integer("starts", starts)
+
+
+def check_progress(progress: object) -> None:
+    """Refuse what cannot be called after a step or fit."""
+    if not (progress is None or callable(progress)):
+        raise TypeError(f"progress = {progress!r} is no function")
 
 
 def fits_from(

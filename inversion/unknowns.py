@@ -4,6 +4,7 @@ A bounded value is a smooth bijection of a free parameter z, value = low + (high
 solver in z never reaches the bounds.
 """
 
+import difflib
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, final
 
@@ -14,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from jaxlidar import Scene
-from jaxlidar.extend import as_array, check_range
+from jaxlidar.extend import as_array, check_kind, check_range
 
 # Least distance of a starting value from a bound, as a share of the bounds' width.
 MARGIN = 0.01
@@ -25,7 +26,7 @@ def _as_pair(x: Any) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         low, high = x
     except (TypeError, ValueError):
         raise ValueError(f"bounds = {x!r} is not a pair (low, high)") from None
-    return as_array(low), as_array(high)
+    return as_array(low, "lower bound"), as_array(high, "upper bound")
 
 
 @final
@@ -65,11 +66,11 @@ def _optional_prior(x: Any) -> tuple[Float[Array, "..."], Float[Array, "..."]] |
         mean, std = x
     except (TypeError, ValueError):
         raise ValueError(f"prior = {x!r} is no LogNormal and no pair (mean, standard deviation)") from None
-    return as_array(mean), as_array(std)
+    return as_array(mean, "prior mean"), as_array(std, "prior standard deviation")
 
 
 def _optional_array(x: ArrayLike | None) -> Float[Array, "..."] | None:
-    return None if x is None else as_array(x)
+    return None if x is None else as_array(x, "start")
 
 
 @final
@@ -80,12 +81,12 @@ class Unknown(eqx.Module):
 
     **Arguments:**
 
-    - `where`: picks one array of the scene, of any shape, as for `equinox.tree_at`. An element of an array,
-      or a property, is no such array: use `apply`. Default None.
+    - `where`: the place of one array in the scene, of any shape: its path, such as "canopy.leaf.Cab" or
+      "plates[0].height", or a function that picks it, as for `equinox.tree_at`. An element of an array, or a
+      property, is no such array: use `apply`. Default None.
     - `bounds`: (low, high) in the unknown's own unit, finite, low below high, numbers or arrays that
       broadcast to the value.
-    - `name`: key of the result; needed with `apply`. Default None: the path to `where`, such as
-      "canopy.leaf.Cab".
+    - `name`: key of the result; needed with `apply`. Default None: the path of `where`.
     - `prior`: (mean, standard deviation) of a normal prior, numbers or arrays, or a `LogNormal`, which needs
       bounds of 0 or above. Default None: no prior.
     - `start`: starting value within the bounds; needed with `apply`. Default None: the scene's value.
@@ -94,16 +95,20 @@ class Unknown(eqx.Module):
       applied in the order in which they are listed. Define the function once, outside of loops: every new one
       compiles the simulation again. Default None.
 
+    An unknown given by a path can be pickled and sent to other processes; one given by a function can be if
+    the function can, which a lambda cannot.
+
     **Raises:** ValueError for bounds that are not finite and increasing, for a standard deviation that is not
     positive, unless exactly one of `where` and `apply` is given, and for an `apply` without `name` and
-    `start`. `retrieve` raises it for a start outside the bounds and for a `where` that picks no array.
+    `start`. TypeError for a `where` or `apply` of another kind. `retrieve` raises ValueError for a start
+    outside the bounds, and for a `where` that is no array of the scene, with the paths nearest to it.
 
     **Example:**
 
     >>> import jaxlidar as jl
     >>> import inversion
     >>> import equinox as eqx
-    >>> Cab = inversion.Unknown(lambda s: s.canopy.leaf.Cab, bounds=(5.0, 100.0), name="Cab")
+    >>> Cab = inversion.Unknown("canopy.leaf.Cab", bounds=(5.0, 100.0), name="Cab")
     >>> def scale_leaf_area(scene, factor):
     ...     return eqx.tree_at(lambda s: s.canopy.voxels.leaf, scene, replace_fn=lambda leaf: factor * leaf)
     >>> area = inversion.Unknown(apply=scale_leaf_area, name="leaf area", bounds=(0.1, 10.0), start=1.0)
@@ -111,7 +116,7 @@ class Unknown(eqx.Module):
     ('Cab', 'leaf area')
     """
 
-    where: Callable[[Any], Any] | None = eqx.field(static=True, default=None)
+    where: str | Callable[[Any], Any] | None = eqx.field(static=True, default=None)
     bounds: tuple[Float[Array, "..."], Float[Array, "..."]] = eqx.field(converter=_as_pair, kw_only=True)
     name: str | None = eqx.field(static=True, default=None, kw_only=True)
     prior: tuple[Float[Array, "..."], Float[Array, "..."]] | LogNormal | None = eqx.field(
@@ -124,6 +129,10 @@ class Unknown(eqx.Module):
         called = "an unknown" if self.name is None else f"unknown {self.name!r}"
         if (self.where is None) == (self.apply is None):
             raise ValueError(f"{called}: give either where = ... or apply = ..., and not both")
+        if not (self.where is None or isinstance(self.where, str) or callable(self.where)):
+            raise TypeError(f"{called}: where = {self.where!r} is no path and no function")
+        if not (self.apply is None or callable(self.apply)):
+            raise TypeError(f"{called}: apply = {self.apply!r} is no function")
         if self.apply is not None and (self.name is None or self.start is None):
             raise ValueError(f"{called}: with apply = ..., a name and a start are needed")
         low, high = self.bounds
@@ -186,6 +195,12 @@ class Priors:
 
 def settle(unknowns: Sequence[Unknown], scene: Scene) -> list[Settled]:
     """Locate the unknowns in the scene. **Raises:** ValueError for what cannot be retrieved."""
+    check_kind("scene", scene, Scene, "a Scene")
+    check_kind("unknowns", unknowns, Sequence, "a sequence of Unknown")
+    for i, unknown in enumerate(unknowns):
+        check_kind(f"unknowns[{i}]", unknown, Unknown, "an Unknown")
+    if len(unknowns) == 0:
+        raise ValueError("unknowns is empty; admissible is one unknown or more")
     optical = optical_leaves(scene)
     found = [_settle_one(u, scene, optical) for u in unknowns]
     names = [f.name for f in found]
@@ -212,7 +227,7 @@ def _settle_one(u: Unknown, scene: Scene, optical: frozenset[int]) -> Settled:
             raise ValueError(
                 f"unknown {name!r} is {own!r}; admissible is a floating-point array of the scene"
             )
-        start = own if start is None else _broadcast(name, "start", start, own.shape)
+        start = as_array(own) if start is None else _broadcast(name, "start", start, own.shape)
     assert name is not None
     assert start is not None
     low, high = (np.asarray(_broadcast(name, "bounds", b, start.shape), float) for b in u.bounds)
@@ -247,18 +262,27 @@ def _broadcast(name: str, field: str, x: Array, shape: tuple[int, ...]) -> Array
         ) from None
 
 
-def _find(where: Callable, scene: Scene, name: str | None) -> tuple[int, str]:
-    """Number and path of the leaf that `where` picks."""
-    paths = [path for path, _ in jax.tree_util.tree_leaves_with_path(scene)]
-    marks = [object() for _ in paths]
+def _find(where: str | Callable, scene: Scene, name: str | None) -> tuple[int, str]:
+    """Number and path of the leaf at `where`."""
+    leaves = jax.tree_util.tree_leaves_with_path(scene)
+    paths = [jax.tree_util.keystr(path).lstrip(".") for path, _ in leaves]
     called = "an unknown" if name is None else f"unknown {name!r}"
+    if isinstance(where, str):
+        if where in paths:
+            return paths.index(where), where
+        near = difflib.get_close_matches(where, paths, n=3, cutoff=0.0)
+        raise ValueError(
+            f"{called}: where = {where!r} is no array of this scene; the nearest are "
+            f"{', '.join(map(repr, near))}"
+        )
+    marks = [object() for _ in paths]
     try:
         picked = where(jax.tree.unflatten(jax.tree.structure(scene), marks))
     except (AttributeError, IndexError, KeyError, TypeError) as error:
         raise ValueError(f"{called}: where picks nothing in this scene ({error}); see `apply`") from error
     for i, mark in enumerate(marks):
         if picked is mark:
-            return i, jax.tree_util.keystr(paths[i]).lstrip(".")
+            return i, paths[i]
     kind = "nothing (None)" if picked is None else f"a {type(picked).__name__}"
     raise ValueError(f"{called}: where picks {kind}; admissible is one array of the scene")
 

@@ -11,6 +11,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from jaxlidar import extend, io
+from jaxlidar._checks import UnitWarning
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar.analog import AnalogReturns, analog_returns, photon_paths
 from jaxlidar.energy import EnergyBudget, energy_budget
@@ -47,7 +48,7 @@ from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.shapes import AbstractShape, Plane
 from jaxlidar.scenes.surfaces import AbstractGround, AbstractSheet, AbstractSurface, Ground, Plate
 from jaxlidar.scenes.voxels import VoxelMap
-from jaxlidar.simulate import Progress, simulate
+from jaxlidar.simulate import LateLightWarning, Progress, simulate
 from jaxlidar.trace.response import Response, trace_scene
 from jaxlidar.waveform import Waveform, total_of, waveform_of
 
@@ -79,6 +80,7 @@ __all__ = [
     "Isotropic",
     "LSystem",
     "Lambertian",
+    "LateLightWarning",
     "LeafAngles",
     "LeafOptics",
     "LeafSurface",
@@ -99,6 +101,7 @@ __all__ = [
     "Specular",
     "Spectrum",
     "Tree",
+    "UnitWarning",
     "VoxelMap",
     "Waveform",
     "Word",

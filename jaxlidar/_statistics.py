@@ -3,7 +3,7 @@
 import math
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import ArrayLike, Float
 
 # Samples below this share of the peak do not count in the error of a waveform.
 COUNTS = 0.01
@@ -23,15 +23,34 @@ def widening(batches: int) -> float:
     return (x + sum(t / n ** (i + 1) for i, t in enumerate(terms))) / x
 
 
-def standard_error(means: Float[np.ndarray, "batches *shape"]) -> Float[np.ndarray, "*shape"]:
-    """Of the mean of batches, widened for few of them."""
-    return widening(len(means)) * np.std(means, axis=0, ddof=1) / math.sqrt(len(means))
+class Moments:
+    """Mean and spread of batches, one after the other, in double precision; arrays of any one shape."""
+
+    def __init__(self):
+        self.count = 0
+        self.mean = np.zeros(())
+        self._squares = np.zeros(())
+
+    def add(self, value: Float[ArrayLike, "*shape"]) -> None:
+        """Take one more batch in (Welford 1962, Technometrics 4, 419)."""
+        value = np.asarray(value, float)
+        self.count += 1
+        off = value - self.mean
+        self.mean = self.mean + off / self.count
+        self._squares = self._squares + off * (value - self.mean)
+
+    @property
+    def stderr(self) -> Float[np.ndarray, "*shape"]:
+        """Standard error of the mean, widened for few batches; infinite for one."""
+        if self.count < 2:
+            return np.full_like(self.mean, np.inf)
+        spread = np.sqrt(np.maximum(self._squares, 0.0) / (self.count - 1))
+        return widening(self.count) * spread / math.sqrt(self.count)
 
 
-def errors_of(means: Float[np.ndarray, "batches wavelengths bins"]) -> tuple[float, float]:
-    """Relative error (see `jaxlidar.simulate`) and largest standard error of the mean of batches."""
-    mean = np.mean(means, axis=0)
-    stderr = standard_error(means)
+def errors_of(moments: Moments) -> tuple[float, float]:
+    """Relative error of a waveform (see `jaxlidar.simulate`), and its largest standard error."""
+    mean, stderr = moments.mean, moments.stderr
     seen = mean > COUNTS * np.max(mean, axis=1, keepdims=True)
     squares = np.where(seen, (stderr / np.where(seen, mean, 1.0)) ** 2, 0.0)
     relative = np.sqrt(np.sum(squares, axis=1) / np.maximum(np.sum(seen, axis=1), 1))

@@ -11,13 +11,13 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from jaxlidar._checks import check_integer, check_range
+from jaxlidar._checks import check_integer, check_key, check_range
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._vectors import FAR, along, dot
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.planning.plan import Plan
 from jaxlidar.planning.setup import reduce
-from jaxlidar.scenes.scene import Scene
+from jaxlidar.scenes.scene import Scene, check_kinds
 from jaxlidar.trace.collisions import collide
 from jaxlidar.trace.flight import events_of, fly, nearest, plates_ahead
 from jaxlidar.trace.footprint import across_beam
@@ -94,6 +94,8 @@ def analog_returns(
     >>> print(f"{float(returns.weight.mean()):.1f}")
     0.4
     """
+    check_kinds(lidar, scene)
+    check_key(key)
     check_range("cone", cone, 0.0, 90.0, low_open=True)
     check_integer("n_photons", n_photons)
     setting = _setting(lidar, scene, plan)
@@ -153,6 +155,8 @@ def photon_paths(
     >>> print(paths.shape, f"{abs(float(paths[0, 1, 2])):.2f}")
     (4, 3, 3) 0.00
     """
+    check_kinds(lidar, scene)
+    check_key(key)
     check_integer("n_photons", n_photons)
     setting = _setting(lidar, scene, plan)
     start_key, key = jax.random.split(key)

@@ -12,14 +12,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxlidar._checks import check_choice, check_integer, check_range, known_array
-from jaxlidar._statistics import standard_error
+from jaxlidar._checks import check_choice, check_integer, check_key, check_range, known_array
+from jaxlidar._programs import Program
+from jaxlidar._statistics import Moments
 from jaxlidar._threads import ONE_CORE, side_by_side
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.planning.plan import MIN_BATCHES
 from jaxlidar.planning.plan import plan as make_plan
 from jaxlidar.planning.setup import Setup, reduce
-from jaxlidar.scenes.scene import Scene
+from jaxlidar.scenes.scene import Scene, check_kinds
 from jaxlidar.trace.fates import Fates, follow, from_beam, from_the_sky
 from jaxlidar.trace.setting import setting_of
 from jaxlidar.waveform import optics_of
@@ -38,7 +39,8 @@ class EnergyBudget(eqx.Module):
     - `transmitted`: arrived at the ground, every time light did: ground that reflects sees more than one
       pass.
     - `below`: left downward, where there is no ground. - `unfollowed`: not followed to its end.
-    - `stderr`: one standard error of each, by name: materials, "returned", "transmitted", "below".
+    - `stderr`: one standard error of each, by name: materials, "returned", "transmitted", "below",
+      "unfollowed".
     - `wavelength`: nm. - `info`: photons, batches, seconds, largest standard error and why it stopped.
 
     What is absorbed, returned, below and unfollowed adds up to one.
@@ -87,7 +89,7 @@ def energy_budget(
     rtol: float = 0.002,
     illumination: str = "beam",
     max_orders: int = 10_000,
-    max_photons: int = 1 << 26,
+    max_photons: int = 100_000_000,
     progress: Callable[[_Report], None] | None = None,
 ) -> EnergyBudget:
     """What a scene absorbs, returns to the sky and lets through, of light that is followed to its end.
@@ -105,13 +107,13 @@ def energy_budget(
     - `illumination`: "beam" (default), or "parallel": light from the beam's direction over one period of a
       canopy with periodic sides.
     - `max_orders`: scatterings followed, at least 1; what is left then is `unfollowed`. Default 10,000.
-    - `max_photons`: stop after so many, at least 1, whatever the error. Default 2**26.
+    - `max_photons`: stop after so many, at least 1, whatever the error. Default 100,000,000.
     - `progress`: called with a report after every round; for instance `print`. Default None.
 
     **Returns:** an `EnergyBudget`.
 
     **Raises:** ValueError for values outside their ranges, and for parallel light where the canopy has open
-    sides.
+    sides; TypeError for things of another kind.
 
     **Example:**
 
@@ -122,6 +124,8 @@ def energy_budget(
     >>> print(f"{float(budget.returned[0]):.2f}")  # 0.5 + 0.3 * 0.3 / (1 - 0.5)
     0.68
     """
+    check_kinds(lidar, scene)
+    check_key(key)
     check_range("rtol", rtol, 0.0, 1.0, low_open=True, high_open=True)
     check_choice("illumination", illumination, ("beam", "parallel"))
     max_orders = check_integer("max_orders", max_orders)
@@ -130,47 +134,44 @@ def energy_budget(
         raise ValueError("illumination = 'parallel'; that is admissible where the canopy has periodic sides")
     setup = _endless(reduce(lidar, scene, make_plan(lidar, scene, max_orders=1, describe=False)))
     started = time.perf_counter()
-    found: list[Fates] = []
-    wanted, stopped, error = MIN_BATCHES, "tolerance met", math.inf
+    moments = Moments()
+    wanted, stopped, error, n = MIN_BATCHES, "tolerance met", math.inf, lidar.wavelength.size
 
-    def one(n: int) -> Fates:
-        return _batch(setup, jax.random.fold_in(key, n), illumination == "parallel", max_orders)
+    def one(number: int) -> Fates:
+        return _compiled(setup, jax.random.fold_in(key, number), illumination == "parallel", max_orders)
 
     with side_by_side() as run:
         while True:
-            found += run(one, range(len(found), wanted))
-            table = jax.tree.map(lambda *a: np.stack([np.asarray(x, float) for x in a]), *found)
-            spread = jax.tree.map(standard_error, table)
-            error = max(float(np.max(a, initial=0.0)) for a in jax.tree.leaves(spread))
-            photons, seconds = len(found) * BATCH, time.perf_counter() - started
+            for fates in run(one, range(moments.count, wanted)):
+                moments.add(np.concatenate([np.asarray(a).reshape(-1, n) for a in jax.tree.leaves(fates)]))
+            error, done = float(np.max(moments.stderr, initial=0.0)), moments.count
+            photons, seconds = done * BATCH, time.perf_counter() - started
             if progress is not None:
-                progress(_Report(len(found), photons, seconds, error, rtol))
+                progress(_Report(done, photons, seconds, error, rtol))
             if error <= rtol:
                 break
             if photons >= max_photons:
                 stopped = "photons traced"
                 break
-            needed = math.ceil(1.1 * len(found) * (error / rtol) ** 2)
-            most = -(-max_photons // BATCH)
-            wanted = min(max(needed, len(found) + 4), 4 * len(found), max(most, len(found) + 1))
+            needed = math.ceil(1.1 * done * (error / rtol) ** 2)
+            wanted = min(max(needed, done + 4), 4 * done, max(-(-max_photons // BATCH), done + 1))
     info = {
-        "photons": len(found) * BATCH,
-        "batches": len(found),
+        "photons": moments.count * BATCH,
+        "batches": moments.count,
         "seconds": time.perf_counter() - started,
         "error": error,
         "stopped": stopped,
     }
-    mean = jax.tree.map(lambda a: jnp.asarray(a.mean(axis=0)), table)
     names = setup.plan.trace.materials
-    errors = dict(zip(names, map(jnp.asarray, spread.absorbed)))
-    errors |= {"returned": spread.up, "transmitted": spread.on_ground, "below": spread.down}
+    rows = [*names, "returned", "below", "transmitted", "unfollowed"]
+    mean, stderr = (dict(zip(rows, map(jnp.asarray, a))) for a in (moments.mean, moments.stderr))
     return EnergyBudget(
-        absorbed=dict(zip(names, mean.absorbed)),
-        returned=mean.up,
-        transmitted=mean.on_ground,
-        below=mean.down,
-        unfollowed=mean.unfollowed,
-        stderr={name: jnp.asarray(value) for name, value in errors.items()},
+        absorbed={name: mean[name] for name in names},
+        returned=mean["returned"],
+        transmitted=mean["transmitted"],
+        below=mean["below"],
+        unfollowed=mean["unfollowed"],
+        stderr=stderr,
         wavelength=lidar.wavelength,
         info=info,
     )
@@ -188,8 +189,7 @@ def _endless(setup: Setup) -> Setup:
     return dataclasses.replace(setup, plan=dataclasses.replace(setup.plan, trace=trace))
 
 
-@eqx.filter_jit(**ONE_CORE)
-def _batch(setup: Setup, key: PRNGKeyArray, parallel: bool, max_orders: int) -> Fates:
+def _trace(setup: Setup, key: PRNGKeyArray, parallel: bool, max_orders: int) -> Fates:
     source = from_the_sky if parallel else from_beam
     optics, canopy = optics_of(setup), setup.scene.canopy
     if canopy is None or not canopy.is_straight:
@@ -204,3 +204,6 @@ def _batch(setup: Setup, key: PRNGKeyArray, parallel: bool, max_orders: int) -> 
     each = jax.lax.map(one, (transmittance, optics.T))
     absorbed = jnp.moveaxis(each.absorbed[..., 0], 0, 1)
     return Fates(absorbed, *(a[:, 0] for a in (each.up, each.down, each.on_ground, each.unfollowed)))
+
+
+_compiled = Program(_trace, **ONE_CORE)

@@ -2,14 +2,29 @@
 
 For laws, pulses and elements of your own, and for packages on top such as `inversion`:
 
-- fields: `as_array`, `as_scalar` convert them, `check_range`, `check_choice` refuse what is inadmissible;
-  `concrete` tells known values from those that a JAX transformation is tracing.
+- fields: `as_array`, `as_scalar` convert them; `check_range`, `check_integer`, `check_choice` refuse values,
+  `check_kind`, `check_numbers`, `check_key` things of another kind; `concrete` tells known values from those
+  that a JAX transformation is tracing.
 - directions: a `Vec` is a tuple of three arrays, x, y and z; `dot`, `scale`, `add`, `normalise`; `polar` and
   `from_frame` make directions about an axis, `about` draws one by the cosine law.
+- ranges: a class states them by field, `ranges = {"slope": Range(0.0, 90.0)}`; its constructor calls
+  `check_ranges`, and `inadmissible` finds values outside them where JAX is tracing, `reasons` says which.
+- `check_kinds` refuses what is no lidar or no scene.
 - `side_by_side` runs compiled programs on as many threads as there are cores; compile them with `ONE_CORE`.
 """
 
-from jaxlidar._checks import as_array, as_scalar, check_choice, check_range, concrete
+from jaxlidar._checks import (
+    as_array,
+    as_scalar,
+    check_choice,
+    check_integer,
+    check_key,
+    check_kind,
+    check_numbers,
+    check_range,
+    concrete,
+)
+from jaxlidar._ranges import Range, check_ranges, inadmissible, reasons
 from jaxlidar._threads import ONE_CORE, side_by_side
 from jaxlidar._vectors import (
     Scalar,
@@ -25,9 +40,11 @@ from jaxlidar._vectors import (
     scale,
     vec,
 )
+from jaxlidar.scenes.scene import check_kinds
 
 __all__ = [
     "ONE_CORE",
+    "Range",
     "Scalar",
     "Vec",
     "about",
@@ -36,13 +53,21 @@ __all__ = [
     "as_array",
     "as_scalar",
     "check_choice",
+    "check_integer",
+    "check_key",
+    "check_kind",
+    "check_kinds",
+    "check_numbers",
     "check_range",
+    "check_ranges",
     "concrete",
     "cross",
     "dot",
     "from_frame",
+    "inadmissible",
     "normalise",
     "polar",
+    "reasons",
     "scale",
     "side_by_side",
     "vec",

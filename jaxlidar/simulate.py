@@ -3,26 +3,31 @@
 import dataclasses
 import math
 import time
+import warnings
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxlidar._checks import check_integer, check_range, is_traced
-from jaxlidar._statistics import batches_needed, errors_of, standard_error, widening
+from jaxlidar._checks import check_integer, check_key, check_range, is_traced
+from jaxlidar._programs import Program
+from jaxlidar._statistics import Moments, batches_needed, errors_of, widening
+from jaxlidar._summary import NOTABLE, late_share, percent
 from jaxlidar._threads import ONE_CORE, side_by_side
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.planning.plan import MIN_BATCHES, Plan
 from jaxlidar.planning.plan import plan as make_plan
 from jaxlidar.planning.plan_check import check_plan
 from jaxlidar.planning.setup import Setup, reduce
-from jaxlidar.scenes.scene import Scene
+from jaxlidar.scenes.scene import Scene, check_kinds
 from jaxlidar.trace.response import Response, trace_scene
-from jaxlidar.waveform import Waveform, open_at_first_return, total_of, waveform_of
+from jaxlidar.waveform import Balance, Waveform, balance_of, open_at_first_return, total_of, waveform_of
+
+# Photons of one batch at most: a batch cannot be interrupted.
+LARGEST_BATCH = 65_536
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,6 +79,7 @@ def simulate(
     bin_width: float | None = None,
     footprint: str | None = None,
     effects: Mapping[str, bool] | None = None,
+    max_memory: float | None = None,
     max_seconds: float = math.inf,
     progress: Callable[[Progress], None] | None = None,
 ) -> Waveform:
@@ -102,8 +108,8 @@ def simulate(
       many as the tolerances need.
     - `plan`: a `Plan` made by `jaxlidar.plan`. Cannot be combined with the arguments of the next line.
       Default None: made here.
-    - `max_orders`, `max_step`, `n_rays`, `window`, `bin_width`, `footprint`, `effects`: see `jaxlidar.plan`.
-      Default None: as there.
+    - `max_orders`, `max_step`, `n_rays`, `window`, `bin_width`, `footprint`, `effects`, `max_memory`: see
+      `jaxlidar.plan`. Default None: as there.
     - `max_seconds`: stop after this time in s, however large the error; positive. At least eight batches are
       traced. Default inf.
     - `progress`: a function called with a `Progress` after every round of batches; for instance `print`.
@@ -123,6 +129,8 @@ def simulate(
     >>> print(f"{float(wave.reflectance.sum()):.4f}")
     0.4000
     """
+    check_kinds(lidar, scene)
+    check_key(key)
     planning = {
         "max_orders": max_orders,
         "max_step": max_step,
@@ -131,12 +139,19 @@ def simulate(
         "bin_width": bin_width,
         "footprint": footprint,
         "effects": effects,
+        "max_memory": max_memory,
     }
     goal = _goal(rtol, atol, n_photons, max_seconds)
-    plan = _planned(lidar, scene, plan, goal, planning)
+    given = plan
+    plan = _planned(lidar, scene, given, goal, planning)
     setup = reduce(lidar, scene, plan)
     traced = _trace_until(setup, key, goal, progress)
-    return _recorded(setup, *traced)
+    if given is None and traced.beyond > plan.rtol and plan.orders < plan.limits.most_orders:
+        # Orders beyond the last matter: follow as many as there is room for.
+        planning["max_orders"] = plan.limits.most_orders
+        setup = reduce(lidar, scene, _planned(lidar, scene, None, goal, planning))
+        traced = _trace_until(setup, key, goal, progress)
+    return _recorded(setup, traced)
 
 
 class _Goal(NamedTuple):
@@ -171,105 +186,154 @@ def _planned(lidar: Lidar, scene: Scene, plan: Plan | None, goal: _Goal, plannin
         check_plan(plan, lidar, scene)
     if goal.n_photons is None:
         return plan
-    return dataclasses.replace(plan, n_photons=max(goal.n_photons // MIN_BATCHES, 1))
+    # In eight batches, or in more of a size that leaves time to look up.
+    return dataclasses.replace(plan, n_photons=min(max(goal.n_photons // MIN_BATCHES, 1), LARGEST_BATCH))
+
+
+class _Traced(NamedTuple):
+    """The mean response, standard errors of its waveform and ledger (None: nothing is random), and what it
+    took.
+
+    `beyond`: share that orders beyond the last may add, where that is known and the plan chose the orders.
+    """
+
+    response: Response
+    stderr: Array | None
+    ledger_stderr: dict[str, Array] | None
+    info: dict[str, Any]
+    beyond: float = 0.0
 
 
 def _trace_until(
     setup: Setup, key: PRNGKeyArray, goal: _Goal, progress: Callable[[Progress], None] | None
-) -> tuple[Response, Array | None, dict[str, Any]]:
-    """The mean response, the standard error of its waveform (None: nothing is random), and the `info`."""
+) -> _Traced:
     if not setup.plan.is_random:
         started = time.perf_counter()
         response = jax.block_until_ready(_compiled_trace(setup, key))
-        seconds = time.perf_counter() - started
-        stopped = "nothing is random"
-        return (
-            response,
-            None,
-            {"photons": 0, "batches": 1, "error": 0.0, "stopped": stopped, "seconds": seconds},
-        )
+        info = {"photons": 0, "batches": 1, "error": 0.0, "stopped": "nothing is random"}
+        return _Traced(response, None, None, {**info, "seconds": time.perf_counter() - started})
     if any(is_traced(x) for x in jax.tree.leaves((setup, key))):
-        return (*_trace_within(setup, key), {})
+        return _trace_within(setup, key)
     return _trace_batches(setup, key, goal, progress)
 
 
-def _recorded(setup: Setup, response: Response, stderr: Array | None, info: dict[str, Any]) -> Waveform:
+def _recorded(setup: Setup, traced: _Traced) -> Waveform:
     """The waveform of a response, on the digitiser's bins."""
-    wave = _compiled_waveform(response, setup, stderr=stderr)
-    if setup.lidar.receiver.window == "first return" and not is_traced(wave.energy):
-        wave = open_at_first_return(wave, setup.lidar)
-    return dataclasses.replace(wave, info=info)
+    errors = {"stderr": traced.stderr, "ledger_stderr": traced.ledger_stderr}
+    wave = dataclasses.replace(_compiled_waveform(traced.response, setup, **errors), info=traced.info)
+    if is_traced(wave.energy):
+        return wave
+    if setup.plan.limits.automatic_window and late_share(wave) >= NOTABLE:
+        end = setup.plan.sample_start + setup.plan.sample_interval * setup.plan.n_samples
+        warnings.warn(
+            f"{percent(late_share(wave))} of the light is still on its way when the record ends at {end:.4g} "
+            "ns: give window=, or see Waveform.ledger",
+            LateLightWarning,
+            stacklevel=3,
+        )
+    return open_at_first_return(wave, setup.lidar) if setup.lidar.receiver.window == "first return" else wave
 
 
-def _batch(setup: Setup, key: PRNGKeyArray) -> tuple[Response, Float[Array, "wavelengths samples"]]:
+class LateLightWarning(UserWarning):
+    """The warning that a record ends while a hundredth of the light or more is still on its way.
+
+    It is given where the plan chose the window. A `window=` of your own is taken as it is.
+
+    **Example:** light goes to and fro between bright surfaces.
+
+    >>> import warnings
+    >>> import jax, jaxlidar as jl
+    >>> scene = jl.Scene(plates=[jl.Plate(80.0, 0.4, 0.5)], ground=jl.Ground(reflectance=0.9))
+    >>> with warnings.catch_warnings(record=True) as found:
+    ...     warnings.simplefilter("always")
+    ...     wave = jl.simulate(jl.Lidar(), scene, key=jax.random.key(0), n_photons=10000)
+    >>> found[0].category.__name__
+    'LateLightWarning'
+    """
+
+
+def _batch(setup: Setup, key: PRNGKeyArray) -> tuple[Response, Float[Array, "wavelengths samples"], Balance]:
     response = trace_scene(setup, key)
-    return response, total_of(response, setup)
+    return response, total_of(response, setup), balance_of(response, setup)
 
 
-_compiled_batch = eqx.filter_jit(_batch, **ONE_CORE)
-_compiled_trace = eqx.filter_jit(trace_scene)
-_compiled_waveform = eqx.filter_jit(
-    lambda response, setup, stderr: waveform_of(response, setup, stderr=stderr)
-)
+_compiled_batch = Program(_batch, **ONE_CORE)
+_compiled_trace = Program(trace_scene)
+_compiled_waveform = Program(waveform_of)
 
 
-def _trace_within(setup: Setup, key: PRNGKeyArray) -> tuple[Response, Array]:
+def _trace_within(setup: Setup, key: PRNGKeyArray) -> _Traced:
     """A fixed number of batches, within a JAX transformation."""
-    responses, totals = jax.lax.map(lambda k: _batch(setup, k), jax.random.split(key, MIN_BATCHES))
+    responses, totals, balances = jax.lax.map(lambda k: _batch(setup, k), jax.random.split(key, MIN_BATCHES))
+
+    def stderr(each: Array) -> Array:
+        spread = jnp.var(jax.lax.stop_gradient(each), axis=0)
+        return widening(MIN_BATCHES) * jnp.sqrt(spread / (MIN_BATCHES - 1))
+
     mean = jax.tree.map(lambda a: jnp.mean(a, axis=0), responses)
-    spread = jnp.var(jax.lax.stop_gradient(totals), axis=0)
-    return mean, widening(MIN_BATCHES) * jnp.sqrt(spread / (MIN_BATCHES - 1))
+    return _Traced(mean, stderr(totals), jax.tree.map(stderr, balances.ledger), {})
 
 
 def _trace_batches(
     setup: Setup, key: PRNGKeyArray, goal: _Goal, progress: Callable[[Progress], None] | None
-) -> tuple[Response, Array, dict[str, Any]]:
+) -> _Traced:
     """Batches on all cores, round after round, until the goal is reached."""
     started, plan = time.perf_counter(), setup.plan
-    fixed, rtol = goal.n_photons is not None, plan.rtol if goal.rtol is None else goal.rtol
+    rtol = plan.rtol if goal.rtol is None else goal.rtol
+    fixed = None if goal.n_photons is None else max(MIN_BATCHES, -(-goal.n_photons // plan.n_photons))
+    counted = plan.n_photons if plan.orders > 1 or plan.trace.drawn_first else 0
     total: Any = None
-    means: list[np.ndarray] = []
+    waves, shares, neglected = Moments(), Moments(), Moments()
     wanted, stopped, error = MIN_BATCHES, "tolerance met", math.inf
 
-    def one(n: int) -> tuple[Response, Array]:
+    def one(n: int) -> tuple[Response, Array, Balance]:
         return _compiled_batch(setup, jax.random.fold_in(key, n))
 
     with side_by_side() as run:
         try:
             while True:
-                for response, mean in run(one, range(len(means), wanted)):
+                for response, mean, balance in run(one, range(waves.count, wanted)):
                     total = response if total is None else _add(total, response)
-                    means.append(np.asarray(mean))
-                done, seconds = len(means), time.perf_counter() - started
-                error, worst = errors_of(np.stack(means))
+                    waves.add(mean)
+                    shares.add(np.stack([np.asarray(a) for a in balance.ledger.values()]))
+                    neglected.add(balance.neglected)
+                    names = list(balance.ledger)
+                done, seconds = waves.count, time.perf_counter() - started
+                error, worst = errors_of(waves)
                 if progress is not None:
-                    progress(Progress(done, done * plan.n_photons, seconds, error, None if fixed else rtol))
-                if fixed:
+                    progress(Progress(done, done * counted, seconds, error, None if fixed else rtol))
+                if fixed is not None and done >= fixed:
                     stopped = "photons traced"
                     break
-                if error <= rtol or worst <= goal.atol:
+                if fixed is None and (error <= rtol or worst <= goal.atol):
                     break
                 if seconds >= goal.max_seconds:
                     stopped = "time spent"
                     break
-                wanted = batches_needed(done, error, rtol)
+                # Rounds are short, so that time and interrupts are looked at in between.
+                wanted = min(fixed, 4 * done) if fixed is not None else batches_needed(done, error, rtol)
                 if math.isfinite(goal.max_seconds):
                     affordable = done * goal.max_seconds / max(seconds, 1e-9)
                     wanted = max(min(wanted, int(affordable)), done + 1)
         except KeyboardInterrupt:
-            if len(means) < MIN_BATCHES:
+            if waves.count < MIN_BATCHES:
                 raise
-            error, _ = errors_of(np.stack(means))
+            error, _ = errors_of(waves)
             stopped = "interrupted"
-    mean = jax.tree.map(lambda a: a / len(means), total)
+    beyond = float(np.max(neglected.mean / np.maximum(waves.mean.sum(axis=1), 1e-30), initial=0.0))
+    beyond = beyond if plan.limits.automatic_orders else 0.0
+    if stopped == "tolerance met" and beyond > rtol:
+        stopped = f"orders beyond {plan.orders} may add {percent(beyond)}"
     info = {
-        "photons": len(means) * plan.n_photons if plan.orders > 1 or plan.trace.drawn_first else 0,
-        "batches": len(means),
+        "photons": waves.count * counted,
+        "batches": waves.count,
         "seconds": time.perf_counter() - started,
         "error": error,
         "stopped": stopped,
     }
-    return mean, jnp.asarray(standard_error(np.stack(means))), info
+    mean = jax.tree.map(lambda a: a / waves.count, total)
+    ledger_stderr = {name: jnp.asarray(row) for name, row in zip(names, shares.stderr)}
+    return _Traced(mean, jnp.asarray(waves.stderr), ledger_stderr, info, beyond)
 
 
 @jax.jit

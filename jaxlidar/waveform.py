@@ -1,18 +1,21 @@
 """From response to waveform: optics, atmosphere, pulse, sampling and energy."""
 
 import dataclasses
-from typing import final
+from typing import NamedTuple, final
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Float
 
+from jaxlidar._checks import check_range, is_traced
 from jaxlidar._constants import SPEED_OF_LIGHT
+from jaxlidar._summary import summary
 from jaxlidar.instrument.lidar import Lidar
-from jaxlidar.instrument.receiver import first_return_window
+from jaxlidar.instrument.receiver import first_return_window, record
 from jaxlidar.planning.plan import Plan
+from jaxlidar.planning.sampling import sampling_of
 from jaxlidar.planning.scatterers import letter_values
 from jaxlidar.planning.setup import Setup
 from jaxlidar.trace.histories import Histories, histories
@@ -35,6 +38,12 @@ class Waveform(eqx.Module):
     - `neglected`: (wavelengths,) apparent reflectance that orders beyond the last could still add.
     - `ledger`: dict of (wavelengths,) shares of the emitted energy, before the atmosphere: "returned" into
       the aperture, "escaped", "absorbed by ...", "after the window", "unfollowed" beyond the last order.
+    - `ledger_stderr`: dict like `ledger`, one standard error each; zero where nothing was random.
+    - `lost`: (wavelengths,) apparent reflectance that arrives before or after all fine bins of the plan: late
+      multiple scattering, or, where the geometry was traced by a JAX transformation, what a plan does not
+      cover.
+    - `recorded`: (wavelengths, bins) J that the receiver records of `energy`, without noise: background
+      added, saturated, cut at the detection threshold, quantised. `jaxlidar.record` draws noise as well.
     - `wavelength`: (wavelengths,) nm, the lidar's.
     - `info`: dict: "photons", "batches", "seconds", "error" reached, and why the simulation "stopped".
 
@@ -58,8 +67,28 @@ class Waveform(eqx.Module):
     components: dict[str, Float[Array, "wavelengths bins"]]
     neglected: Float[Array, "wavelengths"]
     ledger: dict[str, Float[Array, "wavelengths"]]
+    ledger_stderr: dict[str, Float[Array, "wavelengths"]]
+    lost: Float[Array, "wavelengths"]
+    recorded: Float[Array, "wavelengths bins"]
     wavelength: Float[Array, "wavelengths"]
     info: dict = eqx.field(static=True)
+
+    def nan_where_lost(self, share: float = 0.01) -> "Waveform":
+        """The same waveform, NaN at wavelengths that lost more than a share of their reflectance.
+
+        For use within JAX transformations, where a plan that does not fit cannot be refused.
+
+        **Arguments:** `share`: of `lost` in the sum of `reflectance` and `lost`, above 0. Default 0.01.
+        """
+        check_range("share", share, 0.0, low_open=True)
+        whole = jnp.sum(self.reflectance, axis=1) + self.lost
+        good = self.lost <= share * whole
+        return dataclasses.replace(self, reflectance=jnp.where(good[:, None], self.reflectance, jnp.nan))
+
+    def __str__(self) -> str:
+        if any(is_traced(x) for x in (self.time, self.reflectance)):
+            return repr(self)
+        return summary(self)
 
 
 def optics_of(setup: Setup) -> Float[Array, "letters wavelengths"]:
@@ -77,30 +106,6 @@ def colour(
         return jnp.einsum("hw,...hc->...wc", table.monomials(optics), weights[0])
     # Each trace has one wavelength.
     return jnp.einsum("hw,w...hc->...wc", table.monomials(optics), weights)
-
-
-def pulse_kernel(lidar: Lidar, plan: Plan) -> Float[Array, "fine samples"]:
-    """Share of a return in fine bin i that each sample receives: the pulse integrated over the sample.
-
-    Where the pulse is smooth on the scale of a fine bin, the second moment of the deposit kernel (see
-    `jaxlidar.trace.deposit`) is taken out, which leaves an error of fourth order in the bin's width.
-    """
-    k = plan.per_sample
-    # Offsets between a sample's centre and a fine bin's, in fine bins, from the last bin to the first.
-    first = (plan.sample_start - plan.bins.start) / plan.bins.width
-    low = -(plan.bins.count - 1) - 1
-    number = np.arange(low, (plan.n_samples - 1) * k + 2)
-    offset = jnp.asarray((number + first) * plan.bins.width)
-    half = 0.5 * plan.sample_interval
-    share = lidar.pulse.cumulative(offset + half, lidar.jitter) - lidar.pulse.cumulative(
-        offset - half, lidar.jitter
-    )
-    if plan.sharpen:
-        bend = share[2:] - 2.0 * share[1:-1] + share[:-2]
-        share = share.at[1:-1].add(-0.5 * plan.bins.kernel_variance * bend)
-    index = np.arange(plan.n_samples)[None, :] * k - np.arange(plan.bins.count)[:, None] - low
-    # Fused into the gather, the pulse would be computed again for every element.
-    return lax.optimization_barrier(share)[index]
 
 
 def _fine_heights(setup: Setup) -> Float[Array, "bins"]:
@@ -135,7 +140,7 @@ def air(setup: Setup) -> Float[Array, "wavelengths samples"]:
     top = jnp.asarray(plan.trace.upstream) * jnp.cos(jnp.deg2rad(lidar.zenith))
     length = 0.5 * SPEED_OF_LIGHT * plan.bins.width
     fine = jnp.where((heights > top)[None, :], per_metre * length, 0.0)
-    return jnp.einsum("wb,bs->ws", fine, pulse_kernel(lidar, plan))
+    return sampling_of(lidar, plan)(fine)
 
 
 def height_of(lidar: Lidar, time: Float[Array, "bins"]) -> Float[Array, "bins"]:
@@ -175,33 +180,53 @@ def total_of(response: Response, setup: Setup) -> Float[Array, "wavelengths samp
     """
     # Sums over materials, and the pulse where no atmosphere lies between, come before the many wavelengths.
     values, clear = optics_of(setup), setup.scene.atmosphere is None
-    kernel = pulse_kernel(setup.lidar, setup.plan)
+    sampling = sampling_of(setup.lidar, setup.plan)
     total = jnp.zeros(())
     for table, part in zip(_tables(setup.plan), (response.first, response.higher)):
-        if part is None:
-            continue
-        part = jnp.sum(part, axis=1)
-        total = total + colour(part @ kernel if clear else part, table, values)
-    total = total if clear else jnp.einsum("wb,bs->ws", _through_air(total, setup), kernel)
-    return total + air(setup) if returns_air(setup) else total
+        if part is not None:
+            part = jnp.sum(part, axis=1)
+            total = total + colour(sampling(part) if clear else part, table, values)
+    total = total if clear else sampling(_through_air(total, setup))
+    return setup.admissible * (total + air(setup) if returns_air(setup) else total)
 
 
-def ledger_of(response: Response, setup: Setup) -> dict[str, Float[Array, "wavelengths"]]:
+class Balance(NamedTuple):
+    """Where the emitted energy went, (wavelengths,) each: see `Waveform`."""
+
+    ledger: dict[str, Float[Array, "wavelengths"]]
+    neglected: Float[Array, "wavelengths"]
+    lost: Float[Array, "wavelengths"]
+
+
+def balance_of(response: Response, setup: Setup) -> Balance:
     """Shares of the emitted energy by fate. A material absorbs what arrived there less what left."""
-    short, full = _tables(setup.plan)
-    table, values = short if response.higher is None else full, optics_of(setup)
+    lidar, plan, values = setup.lidar, setup.plan, optics_of(setup)
+    short, full = _tables(plan)
+    table = short if response.higher is None else full
 
-    def shares(weights: Array) -> Array:
+    def shares(weights: Array, table: Histories = table) -> Array:
         return colour(weights[..., None], table, values)[..., 0]
 
+    whole = shares(jnp.sum(response.first, axis=(1, 3)), short)
+    lost = shares(jnp.sum(response.first_outside, axis=1), short)
+    if response.higher is not None and response.higher_outside is not None:
+        whole = whole + shares(jnp.sum(response.higher, axis=(1, 3)))
+        lost = lost + shares(jnp.sum(response.higher_outside, axis=1))
     absorbed = shares(response.arrived - response.left)
-    ledger = {f"absorbed by {name}": absorbed[i] for i, name in enumerate(setup.plan.trace.materials)}
-    return {
+    ledger = {
         "escaped": shares(response.escaped),
-        **ledger,
+        **{f"absorbed by {name}": absorbed[i] for i, name in enumerate(plan.trace.materials)},
         "after the window": shares(response.late),
         "unfollowed": shares(response.remaining),
     }
+    returned = whole * lidar.aperture_area / (jnp.pi * lidar.range_to_reference**2)
+    # What returns is part of what escaped, or, where only one order was followed, would have.
+    source = "unfollowed" if plan.orders == 1 and len(plan.trace.materials) > 1 else "escaped"
+    reach = jnp.minimum(returned, ledger[source])
+    ledger = {"returned": reach, **ledger, source: ledger[source] - reach}
+    per_energy = whole / jnp.maximum(ledger["escaped"], 1e-6)
+    unfollowed = ledger["unfollowed"] if plan.orders > 1 else jnp.zeros_like(whole)
+    return Balance(ledger, unfollowed * jnp.clip(per_energy, 1.0, 4.0), lost)
 
 
 def waveform_of(
@@ -209,6 +234,7 @@ def waveform_of(
     setup: Setup,
     *,
     stderr: Float[Array, "wavelengths bins"] | None = None,
+    ledger_stderr: dict[str, Float[Array, "wavelengths"]] | None = None,
     info: dict | None = None,
 ) -> Waveform:
     """The waveform of a response: with the optics, atmosphere, pulse, sampling and energy of a setup.
@@ -220,6 +246,7 @@ def waveform_of(
     - `response`: a `Response` of `jaxlidar.trace_scene`, or the mean of several.
     - `setup`: the `Setup` that it was traced with; its optics may differ.
     - `stderr`: (wavelengths, samples) standard error of the reflectance, from batches. Default None: zero.
+    - `ledger_stderr`: standard errors of the ledger, from batches. Default None: zero.
     - `info`: dict for `Waveform.info`. Default None: empty.
 
     **Returns:** a `Waveform` on the plan's samples.
@@ -237,40 +264,37 @@ def waveform_of(
     0.800
     """
     lidar, plan, values = setup.lidar, setup.plan, optics_of(setup)
-    names, kernel = plan.trace.materials, pulse_kernel(lidar, plan)
-    # The pulse, and the sum over all time as one more sample, come before the many wavelengths if they can.
-    clear = setup.scene.atmosphere is None
-    early = jnp.concatenate([kernel, jnp.ones((plan.bins.count, 1))], axis=1) if clear else None
-    orders = [
-        None if part is None else colour(part if early is None else part @ early, table, values)
+    sampling, clear = sampling_of(lidar, plan), setup.scene.atmosphere is None
+    # The pulse comes before the many wavelengths if it can.
+    first, higher = (
+        None if part is None else colour(sampling(part) if clear else part, table, values)
         for table, part in zip(_tables(plan), (response.first, response.higher))
-    ]
-    first, higher = orders
+    )
     assert first is not None
     higher = jnp.zeros_like(first) if higher is None else higher
     lines = jnp.concatenate([first + higher, jnp.sum(first, 0)[None], jnp.sum(higher, 0)[None]])
-    if early is None:
-        sampled = jnp.einsum("...b,bs->...s", _through_air(lines, setup), kernel)
-        whole = jnp.sum(lines[-2] + lines[-1], axis=-1)
-    else:
-        sampled, whole = lines[..., :-1], lines[-2, :, -1] + lines[-1, :, -1]
-    components = dict(zip([*names, "first", "higher"], sampled))
+    sampled = setup.admissible * (lines if clear else sampling(_through_air(lines, setup)))
+    components = dict(zip([*plan.trace.materials, "first", "higher"], sampled))
     total = sampled[-2] + sampled[-1]
     if returns_air(setup):
         components["air"] = air(setup)
         components["first"] = components["first"] + components["air"]
         total = total + components["air"]
     time = jnp.asarray(plan.sample_start + plan.sample_interval * np.arange(plan.n_samples))
-    ledger, neglected = _balance(ledger_of(response, setup), whole, setup)
+    ledger, neglected, lost = balance_of(response, setup)
+    energy = total * _received(lidar, time)
     return Waveform(
         time=time,
         height=height_of(lidar, time),
         reflectance=total,
-        energy=total * _received(lidar, time),
+        energy=energy,
         stderr=jnp.zeros_like(total) if stderr is None else stderr,
         components=components,
         neglected=neglected,
         ledger=ledger,
+        ledger_stderr=jax.tree.map(jnp.zeros_like, ledger) if ledger_stderr is None else ledger_stderr,
+        lost=lost,
+        recorded=record(energy, lidar.wavelength, lidar.receiver),
         wavelength=lidar.wavelength,
         info=info or {},
     )
@@ -281,24 +305,6 @@ def _received(lidar: Lidar, time: Float[Array, "bins"]) -> Float[Array, "wavelen
     slant = lidar.range_to_reference + 0.5 * SPEED_OF_LIGHT * time
     share = lidar.aperture_area / (jnp.pi * jnp.maximum(slant, 1e-3) ** 2)
     return jnp.outer(lidar.energy_per_wavelength * lidar.efficiency_per_wavelength, share)
-
-
-def _balance(
-    ledger: dict[str, Float[Array, "wavelengths"]], whole: Float[Array, "wavelengths"], setup: Setup
-) -> tuple[dict[str, Float[Array, "wavelengths"]], Float[Array, "wavelengths"]]:
-    """The ledger including what returns into the aperture, and what neglected orders could still return.
-
-    `whole`: apparent reflectance summed over all time.
-    """
-    lidar, plan = setup.lidar, setup.plan
-    returned = whole * lidar.aperture_area / (jnp.pi * lidar.range_to_reference**2)
-    # What returns is part of what escaped, or, where only one order was followed, would have.
-    source = "unfollowed" if plan.orders == 1 and len(plan.trace.materials) > 1 else "escaped"
-    reach = jnp.minimum(returned, ledger[source])
-    full = {"returned": reach, **ledger, source: ledger[source] - reach}
-    per_energy = whole / jnp.maximum(full["escaped"], 1e-6)
-    unfollowed = full["unfollowed"] if plan.orders > 1 else jnp.zeros_like(full["unfollowed"])
-    return full, unfollowed * jnp.clip(per_energy, 1.0, 4.0)
 
 
 def open_at_first_return(wave: Waveform, lidar: Lidar) -> Waveform:
@@ -324,4 +330,5 @@ def open_at_first_return(wave: Waveform, lidar: Lidar) -> Waveform:
         energy=rows[1],
         stderr=rows[2],
         components=dict(zip(wave.components, rows[3:])),
+        recorded=record(rows[1], wave.wavelength, lidar.receiver),
     )

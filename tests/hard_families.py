@@ -143,10 +143,10 @@ def law_family(law, answer, bounds, slopes, slow=()):
             kind = jl.Specular(roughness=p["roughness"]) if law is jl.Specular else law()
             return lidar, jl.Scene(ground=jl.Ground(reflectance=p["rho"], slope=p["slope"], law=kind))
 
-        def outputs(lidar, scene, plan, response):
-            alpha = lidar.aperture_half_angle
+        def outputs(setup, response):
+            alpha = setup.lidar.aperture_half_angle
             # Reflectances are in the thousands; a mirror's is by share of the pulse.
-            return summed(lidar, scene, plan, response) * (alpha**2 if law is jl.Specular else alpha)
+            return summed(setup, response) * (alpha**2 if law is jl.Specular else alpha)
 
         return simulation(build, usual, outputs, window=(-30.0, 30.0), widest={"slope": 80.0})
 

@@ -39,7 +39,9 @@ def chord(periodic):
     def measure(p):
         k = p["k"] * (1.0 + p["contrast"] * jnp.asarray(sign))
         voxels = jl.VoxelMap.from_extinction(leaf=k, voxel_size=1.0)
-        medium = medium_of(voxels, jnp.zeros(3), periodic, jnp.ones(()))
+        leaf = jl.LeafOptics(reflectance=0.5, transmittance=0.3)
+        canopy = jl.Canopy(voxels, leaf=leaf, sides="periodic" if periodic else "open")
+        medium = medium_of(canopy, jnp.zeros(3), jnp.ones(()))
         x, w = (tuple(p[n][None] for n in names) for names in ("xyz", "uvw"))
         none, active = jnp.zeros((0, 1)), jnp.ones((1,), bool)
         return free_flight(medium, x, w, none, p["limit"][None], active, 512).total

@@ -70,6 +70,23 @@ def test_chi2_of_what_is_left_is_that_of_noise(many):
     assert abs(mean - freedom) < 4 * np.sqrt(2 * freedom / right.sum())
 
 
+def test_equal_shapes_compile_once(caplog):
+    """JAX says what it compiles. A new number of bins is heard, a second waveform of them is not."""
+    time = np.arange(-31.0, 32.0)
+    with jax.log_compiles():
+        gaussian_decomposition(time, echoes(ECHOES[1:2], time), noise=0.02, width=3.0)
+        assert any("_decompose" in said for said in caplog.messages)
+        caplog.clear()
+        found = gaussian_decomposition(time, echoes(ECHOES[1:], time), noise=0.01, width=2.5)
+        assert not caplog.messages
+        assert int(found.count) == 2
+        richardson_lucy(time, pulse(lags=7))
+        assert any("_richardson_lucy" in said for said in caplog.messages)
+        caplog.clear()
+        richardson_lucy(time + 100.0, pulse(lags=7))
+        assert not caplog.messages
+
+
 def test_noise_alone_holds_no_echo():
     none = gaussian_decomposition(TIME, noisy(1, []), noise=0.02, width=3.0)
     assert int(none.count) == 0

@@ -1,5 +1,7 @@
 """Cramer-Rao bounds against closed forms, profile likelihoods, and blind waveforms."""
 
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
@@ -85,10 +87,10 @@ def target():
     return np.asarray(wave.reflectance) + noise, np.asarray(wave.time)
 
 
-def profile(target, name, values, unknowns=UNKNOWNS, **more):
+def profile(target, name, values, unknowns=UNKNOWNS, lidar=LIDAR, **more):
     observed, time = target
     given = {"noise": NOISE, "time": time, "key": KEY, "noise_floor": 0.0, **more}
-    return inversion.profile_likelihood(observed, LIDAR, SCENE, unknowns, name, values, **given)
+    return inversion.profile_likelihood(observed, lidar, SCENE, unknowns, name, values, **given)
 
 
 def test_a_profile_of_a_linear_problem_is_the_standard_error(target):
@@ -116,6 +118,19 @@ def test_an_interval_that_the_values_do_not_close_is_infinite(target):
     assert high == np.inf
 
 
+def test_samples_lie_at_given_times_whatever_opened_the_window(target):
+    opened = dataclasses.replace(LIDAR, receiver=jl.Receiver(window="first return"))
+    for more in ({"time": target[1]}, {}):
+        bound, same = (
+            inversion.cramer_rao(lidar, SCENE, UNKNOWNS, noise=NOISE, key=KEY, **more)
+            for lidar in (opened, LIDAR)
+        )
+        assert np.array_equal(bound.covariance, same.covariance)
+    values = [0.09, 0.1, 0.11]
+    found, same = (profile(target, "height", values, lidar=lidar) for lidar in (opened, LIDAR))
+    assert np.array_equal(found.chi2, same.chi2)
+
+
 def test_bad_input_is_refused(target):
     for change, words in (
         ({"name": "depth"}, "name = 'depth' is none of the unknowns: height, reflectance"),
@@ -123,6 +138,8 @@ def test_bad_input_is_refused(target):
         ({"unknowns": [HEIGHT]}, "beside 0 unknowns"),
         ({"values": [0.2, 0.1]}, "two or more, increasing"),
         ({"values": [0.1, 5.0]}, "values = 5 is outside"),
+        ({"unknowns": []}, "unknowns is empty"),
+        ({"n_photons": 4}, "n_photons = 4 is outside"),
     ):
         with pytest.raises(ValueError, match=words):
             profile(target, **{"name": "height", "values": [0.0, 0.1], **change})
@@ -130,6 +147,11 @@ def test_bad_input_is_refused(target):
         inversion.cramer_rao(LIDAR, SCENE, UNKNOWNS, noise=0.0, key=KEY)
     with pytest.raises(ValueError, match="does not broadcast"):
         inversion.cramer_rao(LIDAR, SCENE, UNKNOWNS, noise=np.ones(3), key=KEY)
+    with pytest.raises(ValueError, match="unknowns is empty; admissible is one unknown or more"):
+        inversion.cramer_rao(LIDAR, SCENE, [], noise=NOISE, key=KEY)
+    for name in ("n_photons", "n_rays"):
+        with pytest.raises(ValueError, match=rf"{name} = 4 is outside the admissible range \[8, inf\)"):
+            inversion.cramer_rao(LIDAR, SCENE, UNKNOWNS, noise=NOISE, key=KEY, **{name: 4})
     found = profile(target, "height", [0.08, 0.12])
     with pytest.raises(ValueError, match="level = 1 is outside"):
         found.interval(1.0)

@@ -18,7 +18,7 @@ def _tx(reference):
     return 250 + 900 * np.exp(-0.5 * (t / 6) ** 2)
 
 
-def _write(path, start="right"):
+def write_small(path, start="right"):
     """Two beams, of 3 shots (40, 50, 60 bins) and 1 (30). Bin k of shot i holds 200 + 10 i + k / 100."""
     counts = {"BEAM0001": [40, 50, 60], "BEAM0101": [30]}
     with h5py.File(path, "w") as file:
@@ -52,7 +52,7 @@ def _write(path, start="right"):
 
 @pytest.fixture
 def small(tmp_path):
-    return _write(tmp_path / "small.h5")
+    return write_small(tmp_path / "small.h5")
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +68,7 @@ def recorded():
 
 @pytest.mark.parametrize("start", ["right", "full file"])
 def test_fields(tmp_path, start):
-    shots = read_gedi_l1b(_write(tmp_path / "small.h5", start))
+    shots = read_gedi_l1b(write_small(tmp_path / "small.h5", start))
     assert [(s.beam, s.shot_number - 10**16, s.time.size) for s in shots] == [
         ("BEAM0001", 0, 40),
         ("BEAM0001", 1, 50),
@@ -122,7 +122,7 @@ def test_wrong_files(tmp_path):
     with pytest.raises(ValueError, match=r"other\.h5.*BEAM"):
         read_gedi_l1b(other)
     cut = tmp_path / "cut.h5"
-    cut.write_bytes(_write(tmp_path / "small.h5").read_bytes()[:5000])
+    cut.write_bytes(write_small(tmp_path / "small.h5").read_bytes()[:5000])
     with pytest.raises(ValueError, match=r"cut\.h5"):
         read_gedi_l1b(cut)
 
@@ -145,6 +145,22 @@ def test_wrong_files(tmp_path):
         ("noise_stddev_corrected", lambda x: -x, "noise_stddev_corrected.*-3"),
         ("geolocation/elevation_lastbin", lambda x: x + 99.0, "geolocation/elevation_lastbin.*below"),
         ("geolocation/elevation_bin0", lambda x: np.array([b"a"] * 3), "geolocation/elevation_bin0.*numbers"),
+        (
+            "geolocation/elevation_lastbin",
+            lambda x: 500 - 1.1 * (500 - x),
+            r"geolocation/elevation_lastbin, shot .*0000: 0\.165 m from bin to bin, where 1 ns .* 0\.1498 m",
+        ),
+        ("geolocation/local_beam_azimuth", lambda x: x - 10, r"geolocation/local_beam_azimuth.* -12.*6\.28"),
+        ("txwaveform", lambda x: 0 * x + 250, "txwaveform, shot .*0000: a pulse without energy.* 250 counts"),
+        ("txwaveform", lambda x: 1e30 * x, r"txwaveform, shot .*0000: sample 0 is 2\.5e\+32"),
+        (
+            "tx_sample_start_index",
+            lambda x: x.astype("f2") * np.inf,
+            "tx_sample_start_index, shot .*0000: inf",
+        ),
+        ("tx_sample_count", lambda x: x + 0.5, r"tx_sample_count, shot .*0000: 128\.5 is no whole number"),
+        ("shot_number", lambda x: x.astype(float), "shot_number: type float64 where whole numbers belong"),
+        ("tx_gloc", lambda x: x[0], r"tx_gloc: shape \(\), where one dimension belongs"),
     ],
 )
 def test_damage_is_named(small, field, change, place):
@@ -156,6 +172,48 @@ def test_damage_is_named(small, field, change, place):
             group[field] = change(old)
     with pytest.raises(ValueError, match=r"small\.h5: /BEAM0001/" + place):
         read_gedi_l1b(small)
+
+
+@pytest.mark.parametrize(
+    ("how", "says"),
+    [
+        ({"shape": (2**33,)}, "8589934592 numbers are declared, but the file holds 0 of 1 parts"),
+        ({"shape": (2**33,), "chunks": (2**20,)}, "the file holds 0 of 8192 parts"),
+        ({"shape": (3,), "chunks": (2**28,), "maxshape": (None,), "compression": 9}, "0 of 1 parts"),
+        ({"shape": (3,), "external": [("elsewhere.bin", 0, 24)]}, "3 numbers are declared, but"),
+    ],
+)
+def test_what_a_file_declares_but_does_not_hold_is_not_allocated(small, how, says):
+    with h5py.File(small, "r+") as file:
+        del file["BEAM0001/noise_mean_corrected"]
+        file["BEAM0001"].create_dataset("noise_mean_corrected", dtype="f8", **how)
+    with pytest.raises(ValueError, match=r"small\.h5: /BEAM0001/noise_mean_corrected: .*" + says):
+        read_gedi_l1b(small)
+
+
+def test_a_chunk_far_larger_than_the_file_is_refused(small):
+    with h5py.File(small, "r+") as file:
+        old = file["BEAM0001/tx_gloc"][()]
+        del file["BEAM0001/tx_gloc"]
+        chunked = {"chunks": (2**23,), "maxshape": (None,), "compression": 9}
+        file["BEAM0001"].create_dataset("tx_gloc", data=old, **chunked)
+    with pytest.raises(ValueError, match="/BEAM0001/tx_gloc: 33554432 bytes are declared in a file of"):
+        read_gedi_l1b(small)
+
+
+def test_beams_without_a_shot_that_is_asked_for_are_not_read(small):
+    with h5py.File(small, "r+") as file:
+        del file["BEAM0101/rxwaveform"]
+    assert [shot.beam for shot in read_gedi_l1b(small, [0, 10**16 + 2])] == ["BEAM0001"] * 2
+    with pytest.raises(ValueError, match="/BEAM0101/rxwaveform: no such dataset"):
+        read_gedi_l1b(small, 3)
+
+
+def test_shots_apart_are_those_of_the_whole(small):
+    everything = read_gedi_l1b(small)
+    for shot, i in zip(read_gedi_l1b(small, [3, 0, 2, 0]), (3, 0, 2, 0)):
+        np.testing.assert_array_equal(shot.waveform, everything[i].waveform)
+        np.testing.assert_array_equal(shot.pulse_power, everything[i].pulse_power)
 
 
 def test_without_h5py(small, monkeypatch):

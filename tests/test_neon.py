@@ -41,7 +41,7 @@ def _arrays():
     }
 
 
-def _write(path, **arrays):
+def write_small(path, **arrays):
     np.savez_compressed(path, **{**_arrays(), **arrays})
     return path
 
@@ -57,7 +57,7 @@ def recorded():
 
 
 def test_fields(tmp_path):
-    shots, impulse, dropped = read_neon(_write(tmp_path / "small.npz"))
+    shots, impulse, dropped = read_neon(write_small(tmp_path / "small.npz"))
     assert dropped == {"without a return": 0, "without a pulse": 0}
     assert [(s.index, s.waveform.size) for s in shots] == [(1, 60), (2, 70), (3, 50)]
     shot = shots[1]
@@ -79,7 +79,7 @@ def test_fields(tmp_path):
 
 def test_places(tmp_path):
     """Times and places refer to where the beam meets the reference elevation."""
-    shot = read_neon(_write(tmp_path / "small.npz")).shots[0]
+    shot = read_neon(write_small(tmp_path / "small.npz")).shots[0]
     reference = 300 - 20.5 * 0.1482
     np.testing.assert_allclose(shot.time_from(reference), np.arange(60) - 20.5, atol=1e-9)
     np.testing.assert_allclose(shot.position_at(reference), [7e5 + 0.205, 4e6 + 0.41], rtol=1e-12)
@@ -87,7 +87,7 @@ def test_places(tmp_path):
 
 def test_simulated_ground_is_found(tmp_path):
     """Ground simulated at a place returns in the sample of its elevation: conventions agree."""
-    shot = read_neon(_write(tmp_path / "small.npz")).shots[0]
+    shot = read_neon(write_small(tmp_path / "small.npz")).shots[0]
     lidar = jl.Lidar(
         pulse=jl.SampledPulse(time=shot.pulse_time, power=shot.pulse_power),
         zenith=shot.zenith,
@@ -107,14 +107,14 @@ def test_dropped(tmp_path):
     arrays = _arrays()
     arrays["ret"][0, 3:] = 0
     arrays["outgoing"][2] = 0
-    shots, _, dropped = read_neon(_write(tmp_path / "a.npz", **arrays))
+    shots, _, dropped = read_neon(write_small(tmp_path / "a.npz", **arrays))
     assert [s.index for s in shots] == [2]
     assert dropped == {"without a return": 1, "without a pulse": 1}
     with pytest.raises(ValueError, match=r"b\.npz: ret, outgoing: no shot"):
-        read_neon(_write(tmp_path / "b.npz", ret=np.zeros((3, 80))))
+        read_neon(write_small(tmp_path / "b.npz", ret=np.zeros((3, 80))))
     with pytest.raises(ValueError, match=r"c\.npz: ret, outgoing: no shot"):
         read_neon(
-            _write(
+            write_small(
                 tmp_path / "c.npz", ret=np.zeros((0, 80)), outgoing=np.zeros((0, 64)), geo=np.zeros((0, 17))
             )
         )
@@ -140,7 +140,7 @@ def test_wrong_files(tmp_path):
 
 def test_damaged_bytes(tmp_path):
     """A byte changed anywhere leads to no other error than one that names the file."""
-    whole = _write(tmp_path / "small.npz").read_bytes()
+    whole = write_small(tmp_path / "small.npz").read_bytes()
     bad = tmp_path / "bad.npz"
     rng = np.random.default_rng(0)
     for at in [*rng.integers(0, len(whole), 60), *range(0, 40), *range(len(whole) - 60, len(whole))]:
@@ -187,6 +187,12 @@ def _with(index, value):
         ("geo", _with((2, 15), 64), "geo: shot 3: V15 = 64"),
         ("geo", _with((2, 15), -1), "geo: shot 3: V15 = -1"),
         ("geo_cols", _with(6, "dw"), "geo_cols: no column dz"),
+        ("ret", _with((1, 5), 1e10), r"ret: element \(1, 5\) is 1e\+10; counts"),
+        ("ret", lambda a: a[:, :0], r"ret: shape \(3, 0\) has no columns"),
+        ("system_impulse", lambda a: 0 * a + 200.1, "system_impulse: a pulse without energy.* 200.1 counts"),
+        ("geo", _with((2, 15), 21.5), "geo: shot 3: V15 = 21.5"),
+        ("geo", _with((2, 0), 2.5), "geo: row 2: index = 2.5 is no whole number"),
+        ("geo", _with((1, 9), 1e12), r"geo: shot 2: V9, V10, V11, V16: the return lies beyond 1e\+09 m"),
     ],
 )
 def test_damage_is_named(tmp_path, key, change, place):
@@ -197,6 +203,68 @@ def test_damage_is_named(tmp_path, key, change, place):
     np.savez(tmp_path / "small.npz", **arrays)
     with pytest.raises(ValueError, match=r"small\.npz: " + place):
         read_neon(tmp_path / "small.npz")
+
+
+def _replaced(path, name, content, **how):
+    """The small file with one member replaced."""
+    whole = write_small(path).read_bytes()
+    with (
+        zipfile.ZipFile(io.BytesIO(whole)) as old,
+        zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, **how) as new,
+    ):
+        for member in old.namelist():
+            new.writestr(member, content if member == name else old.read(member))
+        if name not in old.namelist():
+            new.writestr(name, content)
+    return path
+
+
+def _npy(header, data=b""):
+    return b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header.encode() + data
+
+
+@pytest.mark.parametrize(
+    ("shape", "kind", "says"),
+    [
+        ((10**9,), "<f8", "float64 of shape .* takes 8000000000 bytes; there are 64"),
+        ((2**62, 4), "<f8", "takes .* bytes; there are 64"),
+        ((9,), "<f8", "takes 72 bytes; there are 64"),
+        ((7,), "<f8", "takes 56 bytes; there are 64"),
+        ((10**9,), "<U0", "there are 64"),
+        ((8,), "|O", "it holds Python objects"),
+        ((8,), "no type", "not a valid dtype"),
+    ],
+)
+def test_a_header_that_declares_another_size_is_refused_before_it_is_believed(tmp_path, shape, kind, says):
+    header = repr({"descr": kind, "fortran_order": False, "shape": shape})
+    path = _replaced(tmp_path / "a.npz", "system_impulse.npy", _npy(header, bytes(64)))
+    with pytest.raises(ValueError, match=rf"a\.npz: system_impulse: damaged \(.*{says}"):
+        read_neon(path)
+
+
+def test_an_archive_that_unpacks_to_a_thousand_times_its_size_is_refused(tmp_path):
+    zeros = np.zeros((3, 2**21))
+    path = _replaced(tmp_path / "bomb.npz", "ret.npy", _npy("{}") + zeros.tobytes())
+    assert path.stat().st_size < 2**17
+    with pytest.raises(ValueError, match=r"bomb\.npz: ret: 50331\d+ bytes are declared in a file of"):
+        read_neon(path)
+
+
+def test_only_arrays_in_use_are_read(tmp_path):
+    path = _replaced(tmp_path / "more.npz", "notes.npy", b"no array at all")
+    assert len(read_neon(path).shots) == 3
+
+
+def test_other_packings_are_refused(tmp_path):
+    whole = write_small(tmp_path / "small.npz").read_bytes()
+    with (
+        zipfile.ZipFile(io.BytesIO(whole)) as old,
+        zipfile.ZipFile(tmp_path / "packed.npz", "w", zipfile.ZIP_LZMA) as new,
+    ):
+        for member in old.namelist():
+            new.writestr(member, old.read(member))
+    with pytest.raises(ValueError, match=r"packed\.npz: ret: packed by method 14"):
+        read_neon(tmp_path / "packed.npz")
 
 
 def test_record_reads(recorded):

@@ -25,10 +25,12 @@ RANDOM = ("random_", "threefry")
 def traced(lidar, scene, plan):
     """The trace as text, as it is compiled; the lidar's arrays are in it as far as they are used."""
 
-    def run(scene, key):
-        return jl.trace_scene(jl.reduce(lidar, scene, plan), key)
+    setup = jl.reduce(lidar, scene, plan)
 
-    return str(eqx.filter_make_jaxpr(run)(scene, jax.random.key(0))[0])
+    def run(scene, key):
+        return jl.trace_scene(dataclasses.replace(setup, scene=scene), key)
+
+    return str(eqx.filter_make_jaxpr(run)(setup.scene, jax.random.key(0))[0])
 
 
 def planned(lidar, scene, **settings):

@@ -85,7 +85,7 @@ def points(precision):
     return [(real(k), real(N), n, a) for k in KS for N in NS for n in INDICES for a in ALPHAS]
 
 
-static_surface = functools.cache(surface)
+static_surface = functools.cache(leaf_surface)
 
 
 def surfaces(where):

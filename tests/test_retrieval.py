@@ -145,7 +145,7 @@ def test_the_tracer_does_not_look_at_optical_leaves():
     optical = optical_leaves(scene)
     leaves, structure = jax.tree.flatten(scene)
     blind = jax.tree.unflatten(structure, [None if i in optical else x for i, x in enumerate(leaves)])
-    eqx.filter_eval_shape(jl.trace, LIDAR, blind, plan, jax.random.key(0))
+    eqx.filter_eval_shape(jl.trace_scene, jl.reduce(LIDAR, blind, plan), jax.random.key(0))
     assert len(optical) == len(
         jax.tree.leaves([scene.canopy.leaf, 0.4, scene.ground.reflectance, scene.atmosphere, 0.3, 0.2])
     )
@@ -413,6 +413,8 @@ def unknown(where=lambda s: s.ground.height, **changes):
         (wrong(noise=0.0, noise_floor=0.0), "admissible is a noise above 0"),
         (wrong(noise_floor=-1.0), "noise_floor = -1"),
         (wrong(max_steps=0), "max_steps = 0"),
+        (wrong(starts=1.5), "starts = 1.5 is outside"),
+        (wrong(max_steps=np.nan), "max_steps = nan is outside"),
         (wrong(n_photons=4), r"n_photons = 4 is outside the admissible range \[8, inf\)"),
         (wrong(time=TIME), "has its own"),
         (wrong(observed=np.zeros((2, 41))), "sample times are needed"),
@@ -437,6 +439,7 @@ def unknown(where=lambda s: s.ground.height, **changes):
         (unknown(bounds=((0.0, 1.0), 2.0)), "does not broadcast"),
         (unknown(prior=(0.0, 0.0)), "prior standard deviation = 0"),
         (unknown(prior=1.0), "prior = 1.0 is no LogNormal"),
+        (unknown("ground.hight"), "where = 'ground.hight' is no array .* nearest are 'ground.height'"),
         (unknown(lambda s: s.canopy.leaf.Cab), "where picks nothing in this scene"),
         (unknown(lambda s: s.canopy), r"where picks nothing \(None\)"),
         (unknown(lambda s: s.ground), "where picks a Ground; admissible is one array"),

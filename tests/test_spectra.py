@@ -147,6 +147,12 @@ def test_csv(tmp_path, text):
         ("400,0.1\n390,0.2\n", "line 2: wavelength = 390 follows 400"),
         ("400,0.1\n", "line 1: the file ends after 1 samples"),
         ("", "ends after 0 samples"),
+        ("4x0,0.1\n500,0.2\n600,0.3\n", "line 1: '4x0,0.1'"),
+        ("400,0.1\n1e39,0.2\n", r"line 2: wavelength = 1e\+39 .*\[100, inf\) nm of single precision"),
+        ("400,0.1\n400.00001,0.2\n", "line 2: wavelength = 400 follows 400"),
+        ('400,0.1\n500,"0.2\n', "line 2: '500,\"0.2'"),
+        ("400,0.1\n" + "5" * 200_000 + ",0.2\n", "line 2: '5{40}' is not"),
+        ("400,0.1\n500,0.2\x0c600,0.3\n", "line 2: '500,0.2"),
     ],
 )
 def test_damaged_csv(tmp_path, text, message):
@@ -158,8 +164,8 @@ def test_damaged_csv(tmp_path, text, message):
 
 def test_no_text(tmp_path):
     path = tmp_path / "image.csv"
-    path.write_bytes(b"\xff\xd8\xff\xe0")
-    with pytest.raises(ValueError, match=r"image\.csv: no text file"):
+    path.write_bytes(b"400,0.1\n\xff\xd8\xff\xe0")
+    with pytest.raises(ValueError, match=r"image\.csv: no text file: line 2 is not UTF-8"):
         read_spectrum_csv(path)
     with pytest.raises(FileNotFoundError, match=r"none\.csv"):
         read_spectrum_csv(tmp_path / "none.csv")

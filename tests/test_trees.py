@@ -259,7 +259,7 @@ def test_a_hundred_default_trees():
     [
         (lambda: jl.Habit(height=-1.0), "height = -1 is outside"),
         (lambda: jl.Habit(trunk_diameter=np.nan), "trunk_diameter = nan is outside"),
-        (lambda: jl.Habit(smallest_diameter=1.0), "smallest_diameter = 1 is outside .* \\[0, 0.89\\]"),
+        (lambda: jl.Habit(smallest_diameter=1.0), "smallest_diameter = 1 is outside .* \\(0, 0.89\\]"),
         (lambda: jl.Habit(smallest_diameter=0.0), "smallest_diameter = 0 is outside"),
         (lambda: jl.Habit(clump_diameter=0.0), "clump_diameter = 0 is outside"),
         (lambda: jl.Habit(exponent=0.0), "exponent = 0 is outside"),

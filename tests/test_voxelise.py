@@ -218,7 +218,7 @@ TREE, POINTS = wood((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 0.1), np.zeros((2, 3))
         (lambda: voxelise_points(POINTS, 0.1, leaf_area=-1.0), "leaf_area = -1"),
         (lambda: voxelise_points(POINTS, 0.1, leaf_area=1.0, min_points=3), "3 or more leaf points"),
         (lambda: voxelise_points(POINTS, 0.1, leaf_area=1.0, wood_probability=1.5), "wood_probability = 1.5"),
-        (lambda: voxelise_points(NOTHING, 0.1, leaf_area=1.0), "points is empty"),
+        (lambda: voxelise_points(NOTHING, 0.1, leaf_area=1.0), r"points has shape \(0, 3\)"),
         (lambda: voxelise_points(POINTS * np.nan, 0.1, leaf_area=1.0), "points = nan"),
     ],
 )

@@ -25,7 +25,7 @@ from _common import machine, options, plt, print_table, save_figure, write_json
 
 import jaxlidar as jl
 from jaxlidar.planning.alternatives import with_alternatives
-from jaxlidar.waveform import pulse_kernel
+from jaxlidar.planning.sampling import sampling_of
 
 LIDAR = jl.Lidar(wavelength=1064.0, divergence=5.0)
 CONE = 10.0
@@ -121,7 +121,8 @@ def run(case: Case, batches: int, plan: jl.Plan, seed: int = 0, x64: bool = Fals
 def run_analog(case: Case, photons: int, groups: int) -> Run:
     """Waveforms of groups of analog photons; a group counts as a batch."""
     plan = case.plan(bin_width=0.5)
-    kernel = np.asarray(pulse_kernel(LIDAR, dataclasses.replace(plan, sharpen=False)), float)
+    whole = dataclasses.replace(plan, bins=dataclasses.replace(plan.bins, kernel=0))
+    kernel = np.asarray(sampling_of(LIDAR, whole).matrix(), float)
     edges = plan.bins.start + plan.bins.width * (np.arange(plan.bins.count + 1) - 0.5)
 
     def group(number):

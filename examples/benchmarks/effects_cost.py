@@ -27,7 +27,7 @@ WINDOW = (-90.0, 59.0)
 LIDAR = jl.Lidar(divergence=3.0)
 SEES_ALL = jl.Lidar(divergence=3.0, field_of_view=300.0, jitter=1e-3)
 LEAF = jl.LeafOptics(reflectance=0.45, transmittance=0.4)
-CLEAR = jl.Atmosphere(visibility=1e5, lidar_ratio=50.0)
+CLEAR = jl.Atmosphere(visibility=1e3, lidar_ratio=50.0)
 GROUND = jl.Ground(reflectance=0.3)
 
 

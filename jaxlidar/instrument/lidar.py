@@ -7,33 +7,36 @@ to that meeting point.
 
 import math
 from collections.abc import Sequence
+from typing import ClassVar, final
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxlidar._checks import as_array, as_optional_scalar, as_scalar, check_choice, check_range, concrete
+from jaxlidar._checks import (
+    array,
+    as_array,
+    briefly,
+    check_choice,
+    check_kind,
+    concrete,
+    coordinates,
+    optional_scalar,
+    scalar,
+    warn_units,
+)
+from jaxlidar._ranges import Range, check_ranges
 from jaxlidar.instrument.pulse import AbstractPulse, GaussianPulse
 from jaxlidar.instrument.receiver import Receiver
 
 
-def _numbers(x: ArrayLike | Sequence[ArrayLike]) -> Float[Array, "..."]:
-    return as_array(x if isinstance(x, jax.Array) else jnp.asarray(x, dtype=float))
+def _wavelengths(x: ArrayLike | Sequence[ArrayLike]) -> Float[Array, "..."]:
+    return jnp.atleast_1d(as_array(x, "wavelength"))
 
 
-def _vector(x: ArrayLike | Sequence[ArrayLike]) -> Float[Array, " n"]:
-    return jnp.atleast_1d(_numbers(x))
-
-
-def _position(x: ArrayLike | Sequence[ArrayLike]) -> Float[Array, " 2"]:
-    position = _numbers(x)
-    if position.shape != (2,):
-        raise ValueError(f"position has shape {position.shape}; admissible is (2,), for x and y")
-    return position
-
-
+@final
+@briefly
 class Lidar(eqx.Module):
     """A full-waveform lidar: its position and pointing, beam, pulse and receiver.
 
@@ -65,7 +68,8 @@ class Lidar(eqx.Module):
 
     **Raises:** ValueError for a value outside its range, for wavelengths that do not increase strictly, for
     an unknown profile, for a position that is not two numbers, and where the energies or efficiencies are
-    neither one number nor one per wavelength.
+    neither one number nor one per wavelength; TypeError for a thing of another kind. A value so far from that
+    of any instrument that another unit is likely gives a `UnitWarning`.
 
     **Example:**
 
@@ -77,49 +81,63 @@ class Lidar(eqx.Module):
     ['0.0', '-88.2', '500.0']
     """
 
-    wavelength: Float[Array, " wavelengths"] = eqx.field(converter=_vector, default=1064.0)
-    altitude: Float[Array, ""] = eqx.field(converter=as_scalar, default=1000.0)
+    wavelength: Float[Array, " wavelengths"] = eqx.field(converter=_wavelengths, default=1064.0)
+    altitude: Float[Array, ""] = eqx.field(converter=scalar("altitude"), default=1000.0)
     pulse: AbstractPulse = eqx.field(default_factory=GaussianPulse)
-    divergence: Float[Array, ""] = eqx.field(converter=as_scalar, default=0.3)
-    aperture: Float[Array, ""] = eqx.field(converter=as_scalar, default=0.2)
-    zenith: Float[Array, ""] = eqx.field(converter=as_scalar, default=0.0)
-    azimuth: Float[Array, ""] = eqx.field(converter=as_scalar, default=0.0)
-    energy: Float[Array, "..."] = eqx.field(converter=_numbers, default=1e-3)
-    sampling_interval: Float[Array, ""] = eqx.field(converter=as_scalar, default=1.0)
+    divergence: Float[Array, ""] = eqx.field(converter=scalar("divergence"), default=0.3)
+    aperture: Float[Array, ""] = eqx.field(converter=scalar("aperture"), default=0.2)
+    zenith: Float[Array, ""] = eqx.field(converter=scalar("zenith"), default=0.0)
+    azimuth: Float[Array, ""] = eqx.field(converter=scalar("azimuth"), default=0.0)
+    energy: Float[Array, "..."] = eqx.field(converter=array("energy"), default=1e-3)
+    sampling_interval: Float[Array, ""] = eqx.field(converter=scalar("sampling_interval"), default=1.0)
     profile: str = eqx.field(static=True, default="gaussian")
-    position: Float[Array, " 2"] = eqx.field(converter=_position, default=(0.0, 0.0))
-    field_of_view: Float[Array, ""] | None = eqx.field(converter=as_optional_scalar, default=None)
-    jitter: Float[Array, ""] = eqx.field(converter=as_scalar, default=0.0)
-    efficiency: Float[Array, "..."] = eqx.field(converter=_numbers, default=1.0)
+    position: Float[Array | np.ndarray, " 2"] = eqx.field(
+        converter=coordinates("position", 2), default=(0.0, 0.0)
+    )
+    field_of_view: Float[Array, ""] | None = eqx.field(
+        converter=optional_scalar("field_of_view"), default=None
+    )
+    jitter: Float[Array, ""] = eqx.field(converter=scalar("jitter"), default=0.0)
+    efficiency: Float[Array, "..."] = eqx.field(converter=array("efficiency"), default=1.0)
     receiver: Receiver = eqx.field(default_factory=Receiver)
 
+    ranges: ClassVar = {
+        "wavelength": Range(0.0, low_open=True),
+        "altitude": Range(0.0, low_open=True),
+        "divergence": Range(0.0),
+        "aperture": Range(0.0, low_open=True),
+        "zenith": Range(0.0, 89.0, mirrored=True),
+        "azimuth": Range(),
+        "energy": Range(0.0, low_open=True),
+        "sampling_interval": Range(0.0, low_open=True),
+        "position": Range(),
+        "field_of_view": Range(0.0, low_open=True),
+        "jitter": Range(0.0),
+        "efficiency": Range(0.0, 1.0, low_open=True),
+    }
+
     def __check_init__(self):
-        check_range("wavelength", self.wavelength, 0.0, low_open=True)
+        check_kind("pulse", self.pulse, AbstractPulse, "a pulse, such as GaussianPulse(fwhm=6.0)")
+        check_kind("receiver", self.receiver, Receiver, "a Receiver")
+        if self.wavelength.ndim != 1:
+            raise ValueError(
+                f"wavelength has shape {self.wavelength.shape}; admissible is one number or (wavelengths,)"
+            )
+        check_ranges(self)
         wavelength = concrete(self.wavelength)
         if wavelength is not None and (wavelength.size == 0 or np.any(np.diff(wavelength) <= 0)):
             raise ValueError(
                 f"wavelength = {wavelength.tolist()} is not admissible: one or more, strictly increasing, "
                 "in (0, inf)"
             )
-        check_range("altitude", self.altitude, 0.0, low_open=True)
-        check_range("divergence", self.divergence, 0.0)
-        check_range("aperture", self.aperture, 0.0, low_open=True)
-        check_range("zenith", self.zenith, 0.0, 89.0)
-        check_range("azimuth", self.azimuth)
-        check_range("energy", self.energy, 0.0, low_open=True)
-        check_range("sampling_interval", self.sampling_interval, 0.0, low_open=True)
         check_choice("profile", self.profile, ("gaussian", "top-hat"))
-        check_range("position", self.position)
-        if self.field_of_view is not None:
-            check_range("field_of_view", self.field_of_view, 0.0, low_open=True)
-        check_range("jitter", self.jitter, 0.0)
-        check_range("efficiency", self.efficiency, 0.0, 1.0, low_open=True)
         for field, value in (("energy", self.energy), ("efficiency", self.efficiency)):
             if value.shape not in ((), (1,), self.wavelength.shape):
                 raise ValueError(
                     f"{field} has shape {value.shape}; admissible is one number or one per wavelength, "
                     f"{self.wavelength.shape}"
                 )
+        warn_units(self)
 
     @property
     def direction(self) -> Float[Array, " 3"]:

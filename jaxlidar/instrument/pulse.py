@@ -23,7 +23,7 @@ value 1/2 at the step.
 import abc
 import math
 from collections.abc import Sequence
-from typing import final
+from typing import ClassVar, final
 
 import equinox as eqx
 import jax
@@ -31,7 +31,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxlidar._checks import as_array, as_scalar, check_range, concrete
+from jaxlidar._checks import as_array, as_scalar, briefly, check_range, concrete, scalar, warn_units
+from jaxlidar._ranges import Range, check_ranges
 from jaxlidar.instrument.pulse_integrals import (
     distribution,
     exponential_part,
@@ -45,10 +46,6 @@ _FWHM_PER_SIGMA = 2 * math.sqrt(2 * math.log(2))
 # mean lives with 5.1e-8: together below the 1e-7 that `support` promises.
 _GAUSSIAN_REACH = 5.5
 _EXPONENTIAL_REACH = 16.8
-
-
-def _vector(x: ArrayLike | Sequence[ArrayLike]) -> Float[Array, " samples"]:
-    return as_array(x if isinstance(x, jax.Array) else jnp.asarray(x, dtype=float))
 
 
 class AbstractPulse(eqx.Module):
@@ -93,10 +90,10 @@ class AbstractPulse(eqx.Module):
     @property
     @abc.abstractmethod
     def finest(self) -> Float[Array, ""]:
-        """Scale in ns of the finest feature of a smooth pulse; zero where the power jumps.
+        """Scale in ns of the finest feature of the pulse; zero where the power jumps.
 
-        A plan compares it with the width of the fine bins in which returns are collected. Where the pulse is
-        smooth over a bin, the blur that the bins add is taken out.
+        For a Gaussian it is the standard deviation. The width of the fine bins, in which returns are
+        collected, follows it.
         """
 
     @abc.abstractmethod
@@ -128,6 +125,7 @@ class AbstractPulse(eqx.Module):
 
 
 @final
+@briefly
 class GaussianPulse(AbstractPulse):
     """A Gaussian pulse, centred on time zero.
 
@@ -146,10 +144,13 @@ class GaussianPulse(AbstractPulse):
     0.500
     """
 
-    fwhm: Float[Array, ""] = eqx.field(converter=as_scalar, default=6.0)
+    fwhm: Float[Array, ""] = eqx.field(converter=scalar("fwhm"), default=6.0)
+
+    ranges: ClassVar = {"fwhm": Range(0.0)}
 
     def __check_init__(self):
-        check_range("fwhm", self.fwhm, 0.0)
+        check_ranges(self)
+        warn_units(self)
 
     def cumulative(self, t: ArrayLike, jitter: ArrayLike = 0.0) -> Float[Array, "..."]:
         return distribution(score(as_array(t), quadrature_sum(self.std, as_scalar(jitter))))
@@ -172,6 +173,7 @@ class GaussianPulse(AbstractPulse):
 
 
 @final
+@briefly
 class RectangularPulse(AbstractPulse):
     """A pulse of constant power, centred on time zero.
 
@@ -190,10 +192,13 @@ class RectangularPulse(AbstractPulse):
     1.732 ns, 0.75 of the energy by 1.5 ns
     """
 
-    length: Float[Array, ""] = eqx.field(converter=as_scalar, default=6.0)
+    length: Float[Array, ""] = eqx.field(converter=scalar("length"), default=6.0)
+
+    ranges: ClassVar = {"length": Range(0.0)}
 
     def __check_init__(self):
-        check_range("length", self.length, 0.0)
+        check_ranges(self)
+        warn_units(self)
 
     def cumulative(self, t: ArrayLike, jitter: ArrayLike = 0.0) -> Float[Array, "..."]:
         return piece(as_array(t), self.length, jnp.abs(as_scalar(jitter)))[0]
@@ -216,6 +221,7 @@ class RectangularPulse(AbstractPulse):
 
 
 @final
+@briefly
 class ExponentiallyModifiedGaussianPulse(AbstractPulse):
     """A Gaussian convolved with a decaying exponential: a pulse with a sharp rise and a long tail.
 
@@ -238,12 +244,14 @@ class ExponentiallyModifiedGaussianPulse(AbstractPulse):
     0.570 of the energy, standard deviation 2.371 ns
     """
 
-    fwhm: Float[Array, ""] = eqx.field(converter=as_scalar)
-    decay: Float[Array, ""] = eqx.field(converter=as_scalar)
+    fwhm: Float[Array, ""] = eqx.field(converter=scalar("fwhm"))
+    decay: Float[Array, ""] = eqx.field(converter=scalar("decay"))
+
+    ranges: ClassVar = {"fwhm": Range(0.0), "decay": Range(0.0)}
 
     def __check_init__(self):
-        check_range("fwhm", self.fwhm, 0.0)
-        check_range("decay", self.decay, 0.0)
+        check_ranges(self)
+        warn_units(self)
 
     def cumulative(self, t: ArrayLike, jitter: ArrayLike = 0.0) -> Float[Array, "..."]:
         sigma = quadrature_sum(self.fwhm / _FWHM_PER_SIGMA, as_scalar(jitter))
@@ -260,7 +268,7 @@ class ExponentiallyModifiedGaussianPulse(AbstractPulse):
 
     @property
     def finest(self) -> Float[Array, ""]:
-        return self.std
+        return self.fwhm / _FWHM_PER_SIGMA
 
     def support(self, jitter: ArrayLike = 0.0) -> tuple[float, float]:
         decay = float(self.decay)
@@ -269,6 +277,7 @@ class ExponentiallyModifiedGaussianPulse(AbstractPulse):
 
 
 @final
+@briefly
 class SampledPulse(AbstractPulse):
     """A recorded transmit waveform: linear between its samples, zero outside, scaled to unit area.
 
@@ -298,9 +307,11 @@ class SampledPulse(AbstractPulse):
     time: Float[Array, " samples"]
     samples: Float[Array, " samples"]
 
+    ranges: ClassVar = {"time": Range(), "samples": Range(0.0)}
+
     def __init__(self, time: ArrayLike | Sequence[ArrayLike], power: ArrayLike | Sequence[ArrayLike]):
-        self.time = _vector(time)
-        self.samples = _vector(power)  # `power` names the method
+        self.time = as_array(time, "time")
+        self.samples = as_array(power, "power")  # `power` names the method
 
     def __check_init__(self):
         time, power = concrete(self.time), concrete(self.samples)
@@ -309,8 +320,9 @@ class SampledPulse(AbstractPulse):
                 f"time and power have shapes {self.time.shape} and {self.samples.shape}; the admissible ones "
                 "are equal, one-dimensional, of two samples or more"
             )
-        check_range("time", self.time)
+        # The user calls it power.
         check_range("power", self.samples, 0.0)
+        check_ranges(self)
         if time is not None and np.any(np.diff(time) <= 0):
             i = int(np.argmax(np.diff(time) <= 0))
             raise ValueError(
@@ -352,7 +364,16 @@ class SampledPulse(AbstractPulse):
 
     @property
     def finest(self) -> Float[Array, ""]:
-        return self.std
+        """Scale in ns of the finest feature: the largest power over the sharpest change of its slope.
+
+        Never more than the standard deviation; zero where the record begins or ends with more than a
+        hundredth of the largest power.
+        """
+        slope = jnp.diff(self.samples) / jnp.diff(self.time)
+        bend = jnp.max(jnp.abs(jnp.diff(slope, prepend=0.0, append=0.0)))
+        most = jnp.max(self.samples)
+        jumps = jnp.maximum(self.samples[0], self.samples[-1]) > 0.01 * most
+        return jnp.where(jumps, 0.0, jnp.minimum(most / bend, self.std))
 
     def support(self, jitter: ArrayLike = 0.0) -> tuple[float, float]:
         time, lit = np.asarray(self.time, dtype=float), np.flatnonzero(np.asarray(self.samples))

@@ -6,6 +6,7 @@
 
 import math
 from collections.abc import Sequence
+from typing import ClassVar, final
 
 import equinox as eqx
 import jax
@@ -13,14 +14,31 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxlidar._checks import as_array, as_optional_scalar, as_scalar, check_choice, check_range
+from jaxlidar._checks import (
+    as_array,
+    as_scalar,
+    briefly,
+    check_choice,
+    check_flag,
+    check_integer,
+    check_key,
+    check_kind,
+    check_number,
+    check_range,
+    optional_scalar,
+    scalar,
+    warn_unit,
+)
 from jaxlidar._constants import PLANCK_TIMES_LIGHT
+from jaxlidar._ranges import Range, check_ranges
 
 # Above this expectation a Poisson count is drawn as a normal variable (skewness below 1e-3): the exact
 # sampler counts in 32 bits.
 _POISSON_MAX = 1e6
 
 
+@final
+@briefly
 class Receiver(eqx.Module):
     """Detection, noise and digitisation of a waveform. The default is a perfect record.
 
@@ -41,7 +59,7 @@ class Receiver(eqx.Module):
       return, as in the paper (see `first_return_window`). Default "fixed".
 
     **Raises:** ValueError for a value outside its range, for an unknown window, and for `bits` without
-    `saturation`.
+    `saturation`; TypeError for a thing of another kind.
 
     **Example:** a digitiser of two bits has four levels.
 
@@ -53,26 +71,28 @@ class Receiver(eqx.Module):
     ['0.0e+00', '1.0e-15', '3.0e-15']
     """
 
-    detection_threshold: Float[Array, ""] = eqx.field(converter=as_scalar, default=0.0)
-    saturation: Float[Array, ""] | None = eqx.field(converter=as_optional_scalar, default=None)
+    detection_threshold: Float[Array, ""] = eqx.field(converter=scalar("detection_threshold"), default=0.0)
+    saturation: Float[Array, ""] | None = eqx.field(converter=optional_scalar("saturation"), default=None)
     bits: int | None = eqx.field(static=True, default=None)
-    background: Float[Array, ""] = eqx.field(converter=as_scalar, default=0.0)
+    background: Float[Array, ""] = eqx.field(converter=scalar("background"), default=0.0)
     photon_noise: bool = eqx.field(static=True, default=True)
-    electronic_noise: Float[Array, ""] = eqx.field(converter=as_scalar, default=0.0)
+    electronic_noise: Float[Array, ""] = eqx.field(converter=scalar("electronic_noise"), default=0.0)
     window: str = eqx.field(static=True, default="fixed")
 
+    ranges: ClassVar = {
+        "detection_threshold": Range(0.0),
+        "saturation": Range(0.0, low_open=True),
+        "background": Range(0.0),
+        "electronic_noise": Range(0.0),
+    }
+
     def __check_init__(self):
-        check_range("detection_threshold", self.detection_threshold, 0.0)
-        if self.saturation is not None:
-            check_range("saturation", self.saturation, 0.0, low_open=True)
+        check_flag("photon_noise", self.photon_noise)
+        check_ranges(self)
         if self.bits is not None:
-            check_range("bits", self.bits, 1, 24)
-            if self.bits != int(self.bits):
-                raise ValueError(f"bits = {self.bits} is no whole number in [1, 24]")
+            check_integer("bits", self.bits, 1, 24)
             if self.saturation is None:
                 raise ValueError(f"bits = {self.bits} needs a saturation in (0, inf), but saturation = None")
-        check_range("background", self.background, 0.0)
-        check_range("electronic_noise", self.electronic_noise, 0.0)
         check_choice("window", self.window, ("fixed", "first return"))
 
 
@@ -100,6 +120,9 @@ def record(
     were absent. They pass through the noise of a realisation with its draws held fixed, so not through
     Poisson counts.
 
+    **Raises:** ValueError where `energy` has fewer than two axes, for wavelengths that are not positive, and
+    for neither one nor one per row of `energy`; TypeError for a thing of another kind.
+
     **Example:**
 
     >>> import jaxlidar as jl
@@ -109,10 +132,21 @@ def record(
     >>> print([f"{x:.1e}" for x in recorded[0]])
     ['0.0e+00', '6.0e-16', '1.0e-15']
     """
-    energy = as_array(energy)
+    energy, wavelength = as_array(energy, "energy"), as_array(wavelength, "wavelength")
+    check_kind("receiver", receiver, Receiver, "a Receiver")
+    if energy.ndim < 2:
+        raise ValueError(f"energy has shape {energy.shape}; admissible is (..., wavelengths, bins)")
+    check_range("wavelength", wavelength, 0.0, low_open=True)
+    warn_unit("wavelength", wavelength)
+    if wavelength.shape not in ((), (1,), energy.shape[-2:-1]):
+        raise ValueError(
+            f"wavelength has shape {wavelength.shape}; admissible is one number, or one for each of the "
+            f"{energy.shape[-2]} wavelengths of energy"
+        )
     expected = energy + receiver.background
     value = expected
     if key is not None:
+        check_key(key)
         photon_key, electronic_key = jax.random.split(key)
         if receiver.photon_noise:
             value = _shot_noise(expected, wavelength, photon_key)
@@ -130,8 +164,8 @@ def record(
     return value
 
 
-def _shot_noise(energy: Array, wavelength: ArrayLike | Sequence[ArrayLike], key: Array) -> Array:
-    photon = PLANCK_TIMES_LIGHT / jnp.asarray(wavelength, dtype=energy.dtype)
+def _shot_noise(energy: Array, wavelength: Array, key: Array) -> Array:
+    photon = PLANCK_TIMES_LIGHT / wavelength.astype(energy.dtype)
     photon = jnp.broadcast_to(photon.reshape(-1, 1), energy.shape)
     photons = energy / photon
     count_key, normal_key = jax.random.split(key)
@@ -181,12 +215,12 @@ def first_return_window(
     >>> print(centres, samples)
     [2.5 4.5 6.5] [2. 4. 0.]
     """
-    check_range("interval", interval, 0.0, low_open=True)
+    check_number("interval", interval, 0.0, low_open=True)
     check_range("time", time)
-    energy = as_array(energy)
+    energy, threshold = as_array(energy, "energy"), as_scalar(threshold, "threshold")
     centres = np.asarray(time, dtype=float)
     steps = np.diff(centres)
-    if centres.ndim != 1 or centres.size < 2 or centres.size != energy.shape[-1]:
+    if centres.ndim != 1 or centres.size < 2 or energy.shape[-1:] != centres.shape:
         raise ValueError(f"time has shape {centres.shape}; admissible is one per bin of energy, two or more")
     step = float((centres[-1] - centres[0]) / steps.size)
     # Times in single precision are even to their rounding only.

@@ -4,9 +4,8 @@ from jaxlidar._files import atomic_write
 from jaxlidar.io.gedi import GediShot, read_gedi_l1b
 from jaxlidar.io.las import PointCloud, read_las
 from jaxlidar.io.neon import NeonImpulse, NeonRead, NeonShot, read_neon
-from jaxlidar.io.qsm import read_qsm
-from jaxlidar.io.text import TreeRead, VoxelsRead
-from jaxlidar.io.vox import read_vox
+from jaxlidar.io.qsm import TreeRead, read_qsm
+from jaxlidar.io.vox import VoxelsRead, read_vox
 
 __all__ = [
     "GediShot",

@@ -20,35 +20,19 @@ Level 2 results (L2A `elev_lowestmode`, `rh`; L2B `pai`, `cover`) belong to the 
 `GediShot.shot_number`, which is unique in all of the mission.
 """
 
+import contextlib
 import dataclasses
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from jaxlidar.io.checks import STEP, STEP_TOLERANCE, existing
+from jaxlidar.io.gedi_beam import Beam, refusing
 from jaxlidar.io.pedestal import above_pedestal
-
-# Per-shot datasets of a beam's group, and what a GediShot makes of them.
-_PER_SHOT = (
-    "shot_number",
-    "rx_sample_count",
-    "rx_sample_start_index",
-    "tx_sample_count",
-    "tx_sample_start_index",
-    "tx_gloc",
-    "noise_mean_corrected",
-    "noise_stddev_corrected",
-    "geolocation/elevation_bin0",
-    "geolocation/elevation_lastbin",
-    "geolocation/latitude_lastbin",
-    "geolocation/longitude_lastbin",
-    "geolocation/altitude_instrument",
-    "geolocation/local_beam_elevation",
-    "geolocation/local_beam_azimuth",
-)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -110,7 +94,8 @@ def read_gedi_l1b(
 ) -> list[GediShot]:
     """The shots of a GEDI L1B file, or of a subset of one in the same layout.
 
-    This needs h5py (`pip install "jaxlidar[io]"`). Only the shots asked for are read into memory.
+    This needs h5py (`pip install "jaxlidar[io]"`). Of beams without a shot that is asked for nothing is read
+    but, to find shots by number, the numbers.
 
     Start indices are used where they fit the stored samples. Where they do not, as in subsets that kept the
     numbering of the full file, the shots lie end to end, and the counts say where.
@@ -125,8 +110,9 @@ def read_gedi_l1b(
     **Returns:** a list of `GediShot`, in the order asked for; one integer gives a list of one.
 
     **Raises:** FileNotFoundError where there is no such file. ImportError without h5py. ValueError, naming
-    the file and the place, for a file that is not HDF5, is damaged, is no GEDI L1B product or holds a shot
-    whose numbers make no sense, and for a shot that it does not hold.
+    the file and the place, for a file that is not HDF5, is damaged or declares more than it can hold, is no
+    GEDI L1B product or holds a shot whose numbers make no sense, such as a pulse without energy or bins that
+    are not 1 ns apart, and for a shot that it does not hold.
 
     **Source:** GEDI L1B product data dictionary (Dubayah et al. 2020, doi:10.5067/GEDI/GEDI01_B.002); Luthcke
     et al. 2019, GEDI waveform geolocation for L1 and L2 products (theoretical basis document).
@@ -143,27 +129,27 @@ def read_gedi_l1b(
         import h5py
     except ImportError as error:
         raise ImportError('reading HDF5 needs h5py: pip install "jaxlidar[io]"') from error
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
-    try:
-        file = h5py.File(path, "r")
-    except OSError as error:
-        raise ValueError(f"{path}: not a readable HDF5 file ({error})") from error
-    with file:
-        names = [name for name in map(str, file) if name.startswith("BEAM")]
+    path = existing(path)
+    with contextlib.ExitStack() as stack:
+        with refusing(f"{path}: not a readable HDF5 file"):
+            file = stack.enter_context(h5py.File(path, "r"))
+            names = [name for name in map(str, file) if name.startswith("BEAM")]
         if not names:
             raise ValueError(f"{path}: no group BEAM...: no GEDI L1B product")
-        beams = [_Beam(path, file, name) for name in names]
-        return [beam.shot(i) for beam, i in _select(path, beams, shot)]
+        chosen = _select(path, [Beam(path, file, name) for name in names], shot)
+        wanted: dict[Beam, set[int]] = {}
+        for beam, i in chosen:
+            wanted.setdefault(beam, set()).add(i)
+        read = {beam: _shots(beam, sorted(indices)) for beam, indices in wanted.items()}
+        return [read[beam][i] for beam, i in chosen]
 
 
-def _select(path: Path, beams: list["_Beam"], shot: Any) -> Iterable[tuple["_Beam", int]]:
+def _select(path: Path, beams: list[Beam], shot: Any) -> list[tuple[Beam, int]]:
     order = [(beam, i) for beam in beams for i in range(len(beam))]
     if shot is None:
         return order
     wanted = [shot] if isinstance(shot, int | np.integer) else list(shot)
-    by_number: dict[int, tuple[_Beam, int]] = {}
+    by_number: dict[int, tuple[Beam, int]] = {}
     chosen = []
     for number in wanted:
         if not isinstance(number, int | np.integer) or isinstance(number, bool):
@@ -172,7 +158,7 @@ def _select(path: Path, beams: list["_Beam"], shot: Any) -> Iterable[tuple["_Bea
             chosen.append(order[int(number)])
             continue
         if not by_number:
-            by_number = {int(beam.data["shot_number"][i]): (beam, i) for beam, i in order}
+            by_number = {int(n): (beam, i) for beam in beams for i, n in enumerate(beam.shot_number)}
         if int(number) not in by_number:
             raise ValueError(
                 f"{path}: shot = {number} is neither an index in [0, {len(order) - 1}] "
@@ -182,104 +168,40 @@ def _select(path: Path, beams: list["_Beam"], shot: Any) -> Iterable[tuple["_Bea
     return chosen
 
 
-class _Beam:
-    """The group of one beam: its numbers for each shot, and where the samples of each shot lie."""
+def _shots(beam: Beam, indices: list[int]) -> dict[int, GediShot]:
+    received, transmitted = beam.samples("rx", indices), beam.samples("tx", indices)
+    return {i: _shot(beam, i, received[i], transmitted[i]) for i in indices}
 
-    def __init__(self, path: Path, file: Any, name: str):
-        self.path, self.file, self.name = path, file, name
-        self.data = {field: self._read(field) for field in _PER_SHOT}
-        for field, values in self.data.items():
-            if values.shape != self.data["shot_number"].shape or values.ndim != 1:
-                raise ValueError(
-                    f"{self._at(field)}: shape {values.shape}, but shot_number has the shape "
-                    f"{self.data['shot_number'].shape}"
-                )
-        self.offsets = {kind: self._offsets(kind) for kind in ("rx", "tx")}
 
-    def __len__(self) -> int:
-        return self.data["shot_number"].size
-
-    def _at(self, field: str, shot: int | None = None) -> str:
-        place = f"{self.path}: /{self.name}/{field}"
-        return place if shot is None else f"{place}, shot {int(self.data['shot_number'][shot])}"
-
-    def _dataset(self, field: str) -> Any:
-        node = self.file.get(f"{self.name}/{field}")
-        if node is None or not hasattr(node, "shape"):
-            raise ValueError(f"{self._at(field)}: no such dataset; it is part of a GEDI L1B product")
-        if node.dtype.kind not in "iuf":
-            raise ValueError(f"{self._at(field)}: type {node.dtype} where numbers belong")
-        return node
-
-    def _read(self, field: str, where: slice = slice(None)) -> np.ndarray:
-        node = self._dataset(field)
-        try:
-            return node[where]
-        except (OSError, RuntimeError, ValueError) as error:
-            raise ValueError(f"{self._at(field)}: damaged ({error})") from error
-
-    def _offsets(self, kind: str) -> np.ndarray:
-        """Index of each shot's first sample, from 0."""
-        size = self._dataset(f"{kind}waveform").size
-        count = self.data[f"{kind}_sample_count"].astype(np.int64)
-        given = self.data[f"{kind}_sample_start_index"].astype(np.int64) - 1
-        end = given + count
-        if np.all(given >= 0) and np.all(end <= size) and np.all(given[1:] >= end[:-1]):
-            return given
-        if count.sum() != size:
-            raise ValueError(
-                f"{self._at(f'{kind}_sample_start_index')}: neither do the indices fit the {size} samples "
-                f"stored, nor do the counts ({count.sum()} in all)"
-            )
-        return np.cumsum(count) - count
-
-    def _samples(self, kind: str, i: int) -> np.ndarray:
-        count, start = int(self.data[f"{kind}_sample_count"][i]), int(self.offsets[kind][i])
-        if count < 2:
-            raise ValueError(
-                f"{self._at(f'{kind}_sample_count', i)}: {count} samples; at least 2 belong here"
-            )
-        samples = self._read(f"{kind}waveform", slice(start, start + count)).astype(np.float64)
-        if not np.all(np.isfinite(samples)):
-            bad = int(np.argmin(np.isfinite(samples)))
-            raise ValueError(f"{self._at(f'{kind}waveform', i)}: sample {bad} is {samples[bad]}")
-        return samples
-
-    def _number(self, field: str, i: int, low: float = -np.inf, high: float = np.inf) -> float:
-        value = float(self.data[field][i])
-        if not (np.isfinite(value) and low <= value <= high):
-            raise ValueError(
-                f"{self._at(field, i)}: {value:g} is outside the admissible range [{low:g}, {high:g}]"
-            )
-        return value
-
-    def shot(self, i: int) -> GediShot:
-        received, transmitted = self._samples("rx", i), self._samples("tx", i)
-        top = self._number("geolocation/elevation_bin0", i)
-        bottom = self._number("geolocation/elevation_lastbin", i)
-        if bottom >= top:
-            raise ValueError(
-                f"{self._at('geolocation/elevation_lastbin', i)}: {bottom:g} m is not below the first bin, "
-                f"{top:g} m"
-            )
-        reference = self._number("tx_gloc", i, 0.0, transmitted.size - 1)
-        # The pointing vector has its elevation above the horizon: it points from the footprint to the sensor.
-        above_horizon = self._number("geolocation/local_beam_elevation", i, 0.0, np.pi / 2 + 1e-6)
-        towards = self._number("geolocation/local_beam_azimuth", i)
-        pedestal = float(np.median(transmitted[: max(transmitted.size // 4, 1)]))
-        return GediShot(
-            beam=self.name,
-            shot_number=int(self.data["shot_number"][i]),
-            time=np.arange(received.size, dtype=np.float64),
-            elevation=np.linspace(top, bottom, received.size),
-            waveform=received,
-            noise_mean=self._number("noise_mean_corrected", i),
-            noise_std=self._number("noise_stddev_corrected", i, 0.0),
-            pulse_time=np.arange(transmitted.size) - reference,
-            pulse_power=above_pedestal(transmitted, pedestal),
-            latitude=self._number("geolocation/latitude_lastbin", i, -90.0, 90.0),
-            longitude=self._number("geolocation/longitude_lastbin", i, -180.0, 360.0),
-            altitude=self._number("geolocation/altitude_instrument", i),
-            zenith=max(0.0, 90.0 - float(np.rad2deg(above_horizon))),
-            azimuth=float(np.rad2deg(towards) + 180.0) % 360.0,
+def _shot(beam: Beam, i: int, received: np.ndarray, transmitted: np.ndarray) -> GediShot:
+    # The pointing vector has its elevation above the horizon: it points from the footprint to the sensor.
+    above_horizon = beam.number("geolocation/local_beam_elevation", i, 0.0, np.pi / 2 + 1e-6)
+    towards = beam.number("geolocation/local_beam_azimuth", i, -2 * np.pi, 2 * np.pi)
+    top = beam.number("geolocation/elevation_bin0", i)
+    bottom = beam.number("geolocation/elevation_lastbin", i)
+    place = beam.at("geolocation/elevation_lastbin", i)
+    if bottom >= top:
+        raise ValueError(f"{place}: {bottom:g} m is not below the first bin, {top:g} m")
+    step, expected = (top - bottom) / (received.size - 1), STEP * np.sin(above_horizon)
+    if abs(step - expected) > STEP_TOLERANCE * expected:
+        raise ValueError(
+            f"{place}: {step:g} m from bin to bin, where 1 ns along the beam is {expected:.4f} m of elevation"
         )
+    reference = beam.number("tx_gloc", i, 0.0, transmitted.size - 1)
+    pedestal = float(np.median(transmitted[: max(transmitted.size // 4, 1)]))
+    return GediShot(
+        beam=beam.name,
+        shot_number=int(beam.shot_number[i]),
+        time=np.arange(received.size, dtype=np.float64),
+        elevation=np.linspace(top, bottom, received.size),
+        waveform=received,
+        noise_mean=beam.number("noise_mean_corrected", i),
+        noise_std=beam.number("noise_stddev_corrected", i, 0.0),
+        pulse_time=np.arange(transmitted.size) - reference,
+        pulse_power=above_pedestal(transmitted, pedestal, beam.at("txwaveform", i)),
+        latitude=beam.number("geolocation/latitude_lastbin", i, -90.0, 90.0),
+        longitude=beam.number("geolocation/longitude_lastbin", i, -180.0, 360.0),
+        altitude=beam.number("geolocation/altitude_instrument", i),
+        zenith=max(0.0, 90.0 - float(np.rad2deg(above_horizon))),
+        azimuth=float(np.rad2deg(towards) + 180.0) % 360.0,
+    )

@@ -1,11 +1,15 @@
 """Reader of point clouds in LAS and LAZ files."""
 
 import os
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
+
+from jaxlidar._checks import check_range
+from jaxlidar.io.checks import FARTHEST, existing
+from jaxlidar.io.las_header import read_header
+from jaxlidar.io.laz import unpack
 
 # Classes of the LAS 1.4 specification that are not returns of the scene: low noise and high noise.
 _NOISE = (7, 18)
@@ -39,9 +43,9 @@ class PointCloud(NamedTuple):
 
 
 def read_las(path: str | os.PathLike[str], *, scale: float = 1.0) -> PointCloud:
-    """The points of a LAS file, or of a LAZ file where laspy has a backend for it.
+    """The points of a LAS or LAZ file.
 
-    This needs laspy (`pip install "jaxlidar[io]"`; for LAZ also lazrs). Points classified as noise (classes 7
+    This needs laspy, and lazrs for LAZ (`pip install "jaxlidar[io]"`). Points classified as noise (classes 7
     and 18) and those flagged as withheld are dropped and counted.
 
     **Arguments:**
@@ -51,9 +55,10 @@ def read_las(path: str | os.PathLike[str], *, scale: float = 1.0) -> PointCloud:
 
     **Returns:** a `PointCloud`. Its `dropped` counts points as "noise" and "withheld".
 
-    **Raises:** FileNotFoundError where there is no such file. ImportError without laspy. ValueError, naming
-    the file, and for points the record, where it is damaged, cut short, without points or holds coordinates
-    that are not finite.
+    **Raises:** FileNotFoundError where there is no such file. ImportError without laspy, or without lazrs
+    for LAZ. ValueError, naming the file and the place (for points the record), where it is damaged, cut
+    short, without points, declares more than it can hold or holds coordinates that are not on Earth.
+    ValueError for a scale that is not positive.
 
     **Source:** LAS specification 1.4 (ASPRS).
 
@@ -72,25 +77,26 @@ def read_las(path: str | os.PathLike[str], *, scale: float = 1.0) -> PointCloud:
         import laspy
     except ImportError as error:
         raise ImportError('reading LAS needs laspy: pip install "jaxlidar[io]"') from error
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
-    try:
-        with laspy.open(path) as file:
-            said = file.header.point_count
-            cloud = file.read()
-    except laspy.errors.LaspyException as error:
-        raise ValueError(f"{path}: not a readable LAS file ({error})") from error
-    except (ValueError, OSError, EOFError) as error:
-        raise ValueError(f"{path}: damaged ({error})") from error
-    position = scale * np.stack([np.asarray(c, float) for c in (cloud.x, cloud.y, cloud.z)], axis=1)
-    if len(position) != said:
-        raise ValueError(f"{path}: record {len(position)}: the file ends, but its header names {said} points")
-    if said == 0:
-        raise ValueError(f"{path}: the file holds no points")
-    bad = np.flatnonzero(~np.isfinite(position).all(axis=1))
-    if bad.size:
-        raise ValueError(f"{path}: record {bad[0]}: coordinates {position[bad[0]].tolist()} are not finite")
+    check_range("scale", scale, 0.0, low_open=True)
+    path = existing(path)
+    with path.open("rb") as file:
+        header = read_header(path, file)
+        if header.laszip is None:
+            file.seek(header.start)
+            content = file.read(header.points * header.point_size)
+        else:
+            content = unpack(path, file, header)
+    point_format = laspy.PointFormat(header.point_format)
+    if header.extra_bytes:
+        point_format.add_extra_dimension(laspy.ExtraBytesParams("extra", f"{header.extra_bytes}u1"))
+    cloud = laspy.PackedPointRecord.from_buffer(content, point_format)
+    units = (np.asarray(cloud[name], float) for name in "XYZ")
+    position = scale * np.stack([u * s + o for u, s, o in zip(units, header.scales, header.offsets)], axis=1)
+    far = np.flatnonzero(~(np.abs(position) <= FARTHEST).all(axis=1))
+    if far.size:
+        raise ValueError(
+            f"{path}: record {far[0]}: coordinates {position[far[0]].tolist()} lie beyond {FARTHEST:g} m"
+        )
     classes = np.asarray(cloud.classification).astype(int)
     noise = np.isin(classes, _NOISE)
     withheld = np.asarray(cloud.withheld).astype(bool) & ~noise

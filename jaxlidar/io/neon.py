@@ -20,25 +20,23 @@ of the geolocation. What they refer to was found from the recorded numbers, and 
 
 import dataclasses
 import os
-import zipfile
-import zlib
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxlidar._constants import SPEED_OF_LIGHT
+from jaxlidar.io.checks import FARTHEST, LARGEST_WHOLE, MOST_COUNTS, STEP, STEP_TOLERANCE, column_of
+from jaxlidar.io.npz import arrays_of
 from jaxlidar.io.pedestal import above_pedestal
 
-# The columns of `geo` that are used.
-_COLUMNS = ("index", "dx", "dy", "dz", "V9", "V10", "V11", "V15", "V16")
+# The arrays that are used, and the columns of `geo`.
+_ARRAYS = ("ret", "outgoing", "system_impulse", "impulse_outgoing", "geo", "geo_cols")
+_COLUMNS: tuple[str, ...] = ("index", "dx", "dy", "dz", "V9", "V10", "V11", "V15", "V16")
 # Numbers of samples at the beginning of a return, and of an outgoing pulse, that hold only noise.
 _QUIET, _QUIET_PULSE = 8, 5
 # Standard deviation of normal numbers over their median absolute deviation.
 _STD_PER_MAD = 1.4826
-# What NumPy and zipfile raise for damaged archives.
-_DAMAGED = (OSError, EOFError, KeyError, NotImplementedError, ValueError, zipfile.BadZipFile, zlib.error)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -94,15 +92,23 @@ class NeonShot:
         return self.position[:, 2]
 
     def time_from(self, elevation: float) -> Float[np.ndarray, " samples"]:
-        """Times of the samples in ns, for a simulation whose reference plane z = 0 lies at `elevation` (m).
+        """Times of the samples in ns, for a simulation whose reference plane z = 0 lies at `elevation`.
 
-        Zero is the two-way travel time to where the beam axis meets that plane; earlier times are negative.
+        **Arguments:** `elevation`: of the plane, m.
+
+        **Returns:** (samples,) ns. Zero is the two-way travel time to where the beam axis meets that plane;
+        earlier times are negative.
         """
         first, last = self.elevation[0], self.elevation[-1]
         return np.arange(self.waveform.size) - (self.waveform.size - 1) * (elevation - first) / (last - first)
 
     def position_at(self, elevation: float) -> Float[np.ndarray, " 2"]:
-        """Easting and northing in m of where the beam axis meets `elevation` (m)."""
+        """Where the beam axis meets an elevation.
+
+        **Arguments:** `elevation`: m.
+
+        **Returns:** easting and northing, m.
+        """
         first, last = self.position[0], self.position[-1]
         return first[:2] + (last - first)[:2] * (elevation - first[2]) / (last[2] - first[2])
 
@@ -166,8 +172,9 @@ def read_neon(path: str | os.PathLike[str]) -> NeonRead:
     pulse ("without a pulse").
 
     **Raises:** FileNotFoundError where there is no such file. ValueError, naming the file and the key, for a
-    file that is no .npz or is damaged, arrays that are missing, of the wrong shape or not numbers, samples
-    that are negative or not finite, and shots whose geolocation makes no sense.
+    file that is no .npz, is damaged or declares more than it can hold, arrays that are missing, of the wrong
+    shape or not numbers, samples that are negative or not finite, pulses without energy, and shots whose
+    geolocation makes no sense.
 
     **Source:** Zhou et al. (2017), ISPRS J. Photogramm. 129, 131.
 
@@ -185,15 +192,12 @@ def read_neon(path: str | os.PathLike[str]) -> NeonRead:
     80.0 counts at 28.65 m
     """
     path = Path(path)
-    data = _arrays(path)
+    data = arrays_of(path, _ARRAYS)
     ret, outgoing = _counts(path, data, "ret", 2), _counts(path, data, "outgoing", 2)
-    geo, where = _columns(path, data, len(ret))
     if len(outgoing) != len(ret):
         raise ValueError(f"{path}: outgoing: {len(outgoing)} shots, but ret has {len(ret)}")
-    impulse = [_counts(path, data, key, 1) for key in ("system_impulse", "impulse_outgoing")]
-    for key, samples in zip(("system_impulse", "impulse_outgoing"), impulse):
-        if np.count_nonzero(samples) < _QUIET:
-            raise ValueError(f"{path}: {key}: fewer than {_QUIET} samples")
+    geo = _geolocation(path, data, len(ret))
+    system, sent = (_impulse(path, data, key) for key in ("system_impulse", "impulse_outgoing"))
 
     has_return = np.count_nonzero(ret, axis=1) >= _QUIET
     has_pulse = np.count_nonzero(outgoing, axis=1) >= _QUIET
@@ -204,58 +208,68 @@ def read_neon(path: str | os.PathLike[str]) -> NeonRead:
     mean = float(np.median(quiet.mean(axis=1)))
     std = float(_STD_PER_MAD * np.median(np.abs(quiet - mean)))
     pedestal = float(np.median([_recorded(outgoing[i])[:_QUIET_PULSE].mean() for i in kept]))
-    shots = []
-    for i in kept:
-        place = f"shot {int(geo['index'][i])}"
-        step = np.array([geo[c][i] for c in ("dx", "dy", "dz")])
-        _check_step(f"{where}: {place}", step)
-        count = int(np.flatnonzero(ret[i])[-1]) + 1
-        number = np.arange(count) - geo["V16"][i]
-        bin0 = np.array([geo[c][i] for c in ("V9", "V10", "V11")])
-        peak = geo["V15"][i]
-        if not 0 <= peak < outgoing.shape[1] or outgoing[i, int(peak)] <= pedestal:
-            raise ValueError(f"{where}: {place}: V15 = {peak:g} is no sample of the outgoing pulse")
-        east, north, down = step / np.linalg.norm(step)
-        shots.append(
-            NeonShot(
-                index=int(geo["index"][i]),
-                waveform=ret[i, :count].copy(),
-                recorded=ret[i, :count] > 0,
-                noise_mean=mean,
-                noise_std=std,
-                position=bin0 + number[:, None] * step,
-                pulse_time=np.arange(outgoing.shape[1]) - peak,
-                pulse_power=above_pedestal(outgoing[i], pedestal),
-                zenith=float(np.rad2deg(np.arctan2(np.hypot(east, north), -down))),
-                azimuth=float(np.rad2deg(np.arctan2(east, north))) % 360.0,
-            )
-        )
+    shots = [_shot(path, geo[i], ret[i], mean, std, outgoing[i], pedestal) for i in kept]
     dropped = {"without a return": int((~has_return).sum()), "without a pulse": int((~has_pulse).sum())}
-    return NeonRead(shots, NeonImpulse(*_centred(impulse[0]), *_centred(impulse[1])), dropped)
+    return NeonRead(shots, NeonImpulse(*system, *sent), dropped)
 
 
-def _arrays(path: Path) -> dict[str, np.ndarray]:
-    """All arrays of an .npz file."""
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
-    if not zipfile.is_zipfile(path):
-        raise ValueError(f"{path}: no .npz file, or the end of one is missing")
-    key, data = "the archive", {}
-    try:
-        # NumPy does not close files that it opens and finds damaged.
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-            for key in file.files:
-                data[key] = np.asarray(file[key])
-    except _DAMAGED as error:
-        raise ValueError(f"{path}: {key}: damaged ({error})") from error
-    return data
+def _shot(
+    path: Path,
+    geo: dict[str, float],
+    received: np.ndarray,
+    noise_mean: float,
+    noise_std: float,
+    sent: np.ndarray,
+    pedestal: float,
+) -> NeonShot:
+    shot = f"shot {geo['index']:.0f}"
+    place = f"{path}: geo: {shot}"
+    step = np.array([geo["dx"], geo["dy"], geo["dz"]])
+    length = float(np.linalg.norm(step))
+    if abs(length - STEP) > STEP_TOLERANCE * STEP:
+        raise ValueError(
+            f"{place}: dx, dy, dz: {length:g} m from sample to sample, where 1 ns is {STEP:.4f} m"
+        )
+    if step[2] >= 0:
+        raise ValueError(f"{place}: dz = {step[2]:g} m does not lead down")
+    samples = np.arange(np.flatnonzero(received)[-1] + 1)
+    position = np.array([geo["V9"], geo["V10"], geo["V11"]]) + (samples - geo["V16"])[:, None] * step
+    if np.abs(position).max() > FARTHEST:
+        raise ValueError(f"{place}: V9, V10, V11, V16: the return lies beyond {FARTHEST:g} m")
+    peak = geo["V15"]
+    if not (0 <= peak < sent.size and peak.is_integer()) or sent[int(peak)] <= pedestal:
+        raise ValueError(f"{place}: V15 = {peak:g} is no sample of the outgoing pulse")
+    east, north, up = step / length
+    waveform = received[: samples.size].copy()
+    return NeonShot(
+        index=int(geo["index"]),
+        waveform=waveform,
+        recorded=waveform > 0,
+        noise_mean=noise_mean,
+        noise_std=noise_std,
+        position=position,
+        pulse_time=np.arange(sent.size) - peak,
+        pulse_power=above_pedestal(sent, pedestal, f"{path}: outgoing: {shot}"),
+        zenith=float(np.rad2deg(np.arctan2(np.hypot(east, north), -up))),
+        azimuth=float(np.rad2deg(np.arctan2(east, north))) % 360.0,
+    )
+
+
+def _impulse(path: Path, data: dict[str, np.ndarray], key: str) -> tuple[np.ndarray, np.ndarray]:
+    """Times from the largest sample, and power above the pedestal."""
+    samples = _counts(path, data, key, 1)
+    if np.count_nonzero(samples) < _QUIET:
+        raise ValueError(f"{path}: {key}: fewer than {_QUIET} samples")
+    pedestal = float(_recorded(samples)[:_QUIET_PULSE].mean())
+    time = np.arange(samples.size) - float(np.argmax(samples))
+    return time, above_pedestal(samples, pedestal, f"{path}: {key}")
 
 
 def _array(path: Path, data: dict[str, np.ndarray], key: str, ndim: int) -> np.ndarray:
-    if key not in data:
-        raise ValueError(f"{path}: {key}: no such array; there are {', '.join(data) or 'none'}")
     if data[key].ndim != ndim:
         raise ValueError(f"{path}: {key}: shape {data[key].shape} where {ndim} dimensions belong")
+    if 0 in data[key].shape[1:]:
+        raise ValueError(f"{path}: {key}: shape {data[key].shape} has no columns")
     return data[key]
 
 
@@ -263,7 +277,8 @@ def _numbers(path: Path, data: dict[str, np.ndarray], key: str, ndim: int) -> np
     array = _array(path, data, key, ndim)
     if array.dtype.kind not in "iuf":
         raise ValueError(f"{path}: {key}: type {array.dtype} where numbers belong")
-    array = array.astype(np.float64)
+    with np.errstate(over="ignore"):
+        array = array.astype(np.float64)
     if not np.all(np.isfinite(array)):
         place = tuple(int(n) for n in np.argwhere(~np.isfinite(array))[0])
         raise ValueError(f"{path}: {key}: element {place} is {array[place]}")
@@ -272,37 +287,28 @@ def _numbers(path: Path, data: dict[str, np.ndarray], key: str, ndim: int) -> np
 
 def _counts(path: Path, data: dict[str, np.ndarray], key: str, ndim: int) -> np.ndarray:
     array = _numbers(path, data, key, ndim)
-    if np.any(array < 0):
-        place = tuple(int(n) for n in np.argwhere(array < 0)[0])
-        raise ValueError(f"{path}: {key}: element {place} is {array[place]:g}; counts are not negative")
+    wrong = (array < 0) | (array > MOST_COUNTS)
+    if np.any(wrong):
+        place = tuple(int(n) for n in np.argwhere(wrong)[0])
+        raise ValueError(
+            f"{path}: {key}: element {place} is {array[place]:g}; counts are not negative, and at most "
+            f"{MOST_COUNTS:g}"
+        )
     return array
 
 
-def _columns(path: Path, data: dict[str, np.ndarray], shots: int) -> tuple[dict[str, np.ndarray], str]:
-    """The columns of the geolocation, and the place that messages about them name."""
+def _geolocation(path: Path, data: dict[str, np.ndarray], shots: int) -> list[dict[str, float]]:
+    """The columns of the geolocation that are used, shot by shot."""
     geo, names = _numbers(path, data, "geo", 2), _array(path, data, "geo_cols", 1).tolist()
     if geo.shape != (shots, len(names)):
         raise ValueError(f"{path}: geo: shape {geo.shape}, but ret and geo_cols have {(shots, len(names))}")
-    for needed in _COLUMNS:
-        if needed not in names:
-            raise ValueError(f"{path}: geo_cols: no column {needed}; there are {', '.join(map(str, names))}")
-    return {name: geo[:, names.index(name)] for name in _COLUMNS}, f"{path}: geo"
-
-
-def _check_step(place: str, step: np.ndarray) -> None:
-    length = float(np.linalg.norm(step))
-    # One part in a hundred leaves room for air.
-    if abs(length / (SPEED_OF_LIGHT / 2) - 1) > 0.01:
-        raise ValueError(f"{place}: dx, dy, dz: {length:g} m from sample to sample, where 1 ns is 0.1499 m")
-    if step[2] >= 0:
-        raise ValueError(f"{place}: dz = {step[2]:g} m does not lead down")
+    used = [column_of(f"{path}: geo_cols", names, name) for name in _COLUMNS]
+    rows = [dict(zip(_COLUMNS, row)) for row in geo[:, used].tolist()]
+    for i, index in enumerate(row["index"] for row in rows):
+        if not (index.is_integer() and abs(index) <= LARGEST_WHOLE):
+            raise ValueError(f"{path}: geo: row {i}: index = {index:g} is no whole number")
+    return rows
 
 
 def _recorded(row: np.ndarray) -> np.ndarray:
     return row[row > 0]
-
-
-def _centred(samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Times from the largest sample, and power above the pedestal."""
-    pedestal = float(_recorded(samples)[:_QUIET_PULSE].mean())
-    return np.arange(samples.size) - float(np.argmax(samples)), above_pedestal(samples, pedestal)

@@ -1,10 +1,15 @@
 """Reader of quantitative structure models: trees as tables of cylinders."""
 
+import math
 import os
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-from jaxlidar.io.text import TreeRead, cells_of, lines_of, number_in
+from jaxlidar._checks import check_range
+from jaxlidar.io.checks import FARTHEST, column_of
+from jaxlidar.io.text import cells_of, lines_of, number_in, whole_in
 from jaxlidar.plants.tree import Tree
 
 # Names of the columns in use, without case, spaces and underscores.
@@ -15,6 +20,27 @@ _COLUMNS = {
     **{f"{end}{axis}": (f"{end}{axis}",) for end in ("start", "end") for axis in "xyz"},
     "radius": ("radius", "radiuscyl"),
 }
+_WHOLE = ("id", "parent", "order")
+_LENGTHS = (*(f"{end}{axis}" for end in ("start", "end") for axis in "xyz"), "radius")
+
+
+class TreeRead(NamedTuple):
+    """What `read_qsm` returns: a tree and what was left out of it.
+
+    - `tree`: a `Tree`.
+    - `dropped`: how many cylinders of the file are not in the tree, by reason.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> from jaxlidar.io import TreeRead
+    >>> tree, dropped = TreeRead(jl.grow(jl.shrub()), {"without a length": 0})
+    >>> print(tree.height > 0, dropped)
+    True {'without a length': 0}
+    """
+
+    tree: Tree
+    dropped: dict[str, int]
 
 
 def read_qsm(path: str | os.PathLike[str], *, scale: float = 1.0) -> TreeRead:
@@ -30,8 +56,9 @@ def read_qsm(path: str | os.PathLike[str], *, scale: float = 1.0) -> TreeRead:
     dropped, by reason: cylinders "without a length". Children of those grow from their parents.
 
     **Raises:** FileNotFoundError where there is no such file. ValueError, naming the file and the line, for
-    columns that are missing, rows of the wrong length, cells that are not numbers, radii that are not
-    positive, IDs given twice, parents that are not there, and cylinders that are their own ancestors.
+    columns that are missing, rows of the wrong length, cells that are not numbers, or not whole ones where
+    those belong, places that are not on Earth, radii that are not positive, IDs given twice, parents that are
+    not there, and cylinders that are their own ancestors. ValueError for a scale that is not positive.
 
     **Example:**
 
@@ -44,52 +71,42 @@ def read_qsm(path: str | os.PathLike[str], *, scale: float = 1.0) -> TreeRead:
     >>> print(f"{tree.height:.1f} m, {tree.trunk_diameter:.1f} m", dropped)
     3.0 m, 0.2 m {'without a length': 0}
     """
+    check_range("scale", scale, 0.0, low_open=True)
     path, lines = lines_of(path)
     if not lines:
         raise ValueError(f"{path}: line 1: the file is empty")
     delimiter = max(",;\t", key=lines[0].count)
-    names = [c.strip().lower().replace("_", "") for c in lines[0].split(delimiter)]
-    column = {}
-    for name, spelled in _COLUMNS.items():
-        found = [names.index(s) for s in spelled if s in names]
-        if not found and name != "order":
-            raise ValueError(f"{path}: line 1: no column {spelled[0]}; there are {', '.join(names)}")
-        column[name] = found[0] if found else None
-
-    rows, line_of, dropped = [], {}, {"without a length": 0}
-    skipped: dict[int, int] = {}
+    names = [c.strip().lower().replace("_", "") for c in cells_of(path, 1, lines[0], delimiter)]
+    column = _columns(path, names)
+    rows: dict[int, _Cylinder] = {}
     for number, text in enumerate(lines[1:], 2):
         if not text.strip():
             continue
-        cells = cells_of(path, number, text, len(names), delimiter)
-        row = {k: number_in(path, number, k, cells[i]) for k, i in column.items() if i is not None}
-        if not all(np.isfinite(list(row.values()))):
-            raise ValueError(f"{path}: line {number}: a value is not finite")
-        own = int(row["id"])
-        if own in line_of:
-            raise ValueError(f"{path}: line {number}: ID {own} was given in line {line_of[own]}")
-        line_of[own] = number
-        if not row["radius"] > 0:
-            raise ValueError(f"{path}: line {number}: radius = {row['radius']:g} is outside (0, inf)")
-        if all(row[f"start{a}"] == row[f"end{a}"] for a in "xyz"):
-            dropped["without a length"] += 1
-            skipped[own] = int(row["parent"])
+        row = _cylinder(path, number, column, cells_of(path, number, text, delimiter, len(names)), scale)
+        if row.id in rows:
+            raise ValueError(f"{path}: line {number}: ID {row.id} was given in line {rows[row.id].line}")
+        rows[row.id] = row
+    kept, parents, dropped = [], [], {"without a length": 0}
+    # Where each cylinder stands in the tree. One without a length stands where its parent does.
+    index = {-1: -1}
+    for row in _parents_first(path, rows):
+        index[row.id] = index[row.parent]
+        if sum((e - s) ** 2 for s, e in zip(row.start, row.end)) > 0:
+            parents.append(index[row.parent])
+            index[row.id] = len(kept)
+            kept.append(row)
         else:
-            rows.append(row)
-    if not rows:
+            dropped["without a length"] += 1
+    if not kept:
         raise ValueError(f"{path}: line {len(lines)}: there is no cylinder in the file")
-    rows = _parents_first(path, rows, skipped, line_of)
-    index = {int(row["id"]): i for i, row in enumerate(rows)}
-    table = {k: np.array([row[k] for row in rows]) for k in rows[0]}
-    start, end = (scale * np.stack([table[f"{w}{a}"] for a in "xyz"], axis=1) for w in ("start", "end"))
-    radius = scale * table["radius"]
+    radius = np.array([row.radius for row in kept])
     tree = Tree(
-        start=start,
-        end=end,
+        start=np.array([row.start for row in kept]),
+        end=np.array([row.end for row in kept]),
         radius_start=radius,
         radius_end=radius.copy(),
-        parent=np.array([index.get(int(row["parent"]), -1) for row in rows]),
-        order=table.get("order", np.zeros(len(rows))).astype(int),
+        parent=np.array(parents),
+        order=np.array([row.order for row in kept]),
         bud_position=np.zeros((0, 3)),
         bud_direction=np.zeros((0, 3)),
         bud_radius=np.zeros(0),
@@ -97,27 +114,61 @@ def read_qsm(path: str | os.PathLike[str], *, scale: float = 1.0) -> TreeRead:
     return TreeRead(tree, dropped)
 
 
-def _parents_first(path, rows: list[dict], skipped: dict[int, int], line_of: dict[int, int]) -> list[dict]:
-    """The rows, parents before their children. A negative parent means none."""
-    children: dict[int, list[dict]] = {}
-    for row in rows:
-        parent = int(row["parent"])
-        for _ in range(len(skipped) + 1):
-            if parent not in skipped:
-                break
-            parent = skipped[parent]
-        if parent >= 0 and parent not in line_of:
-            line = line_of[int(row["id"])]
-            raise ValueError(f"{path}: line {line}: parent {parent} is not in the file")
-        row["parent"] = max(parent, -1)
-        children.setdefault(int(row["parent"]), []).append(row)
-    ordered, ahead = [], children.get(-1, [])[::-1]
+class _Cylinder(NamedTuple):
+    """A row of the table, with lengths in m. A parent of -1 means none."""
+
+    line: int
+    id: int
+    parent: int
+    order: int
+    start: list[float]
+    end: list[float]
+    radius: float
+
+
+def _columns(path: Path, names: list[str]) -> dict[str, int]:
+    """Where each column in use stands. Branch orders may be missing."""
+    column = {}
+    for name, spelled in _COLUMNS.items():
+        present = [s for s in spelled if s in names]
+        if present or name != "order":
+            column[name] = column_of(f"{path}: line 1", names, present[0] if present else spelled[0])
+    return column
+
+
+def _cylinder(path: Path, line: int, column: dict[str, int], cells: list[str], scale: float) -> _Cylinder:
+    place = f"{path}: line {line}"
+    whole = {k: whole_in(path, line, k, cells[column[k]]) for k in _WHOLE if k in column}
+    length = {k: scale * number_in(path, line, k, cells[column[k]]) for k in _LENGTHS}
+    for k, value in length.items():
+        if not math.isfinite(value):
+            raise ValueError(f"{place}: {k} is not finite")
+        if abs(value) > FARTHEST:
+            raise ValueError(f"{place}: {k} = {value:g} m lies beyond {FARTHEST:g} m")
+    if whole["id"] < 0:
+        raise ValueError(f"{place}: ID {whole['id']} is outside [0, inf)")
+    if not length["radius"] > 0:
+        raise ValueError(f"{place}: radius = {length['radius']:g} m is outside (0, inf)")
+    order = whole.get("order", 0)
+    if order < 0:
+        raise ValueError(f"{place}: order = {order} is outside [0, inf)")
+    start, end = ([length[f"{which}{axis}"] for axis in "xyz"] for which in ("start", "end"))
+    return _Cylinder(line, whole["id"], max(whole["parent"], -1), order, start, end, length["radius"])
+
+
+def _parents_first(path: Path, rows: dict[int, _Cylinder]) -> list[_Cylinder]:
+    """The rows, parents before their children."""
+    children: dict[int, list[int]] = {}
+    for row in rows.values():
+        if row.parent != -1 and row.parent not in rows:
+            raise ValueError(f"{path}: line {row.line}: parent {row.parent} is not in the file")
+        children.setdefault(row.parent, []).append(row.id)
+    ordered, ahead = {}, children.get(-1, [])[::-1]
     while ahead:
-        row = ahead.pop()
-        ordered.append(row)
-        ahead.extend(children.get(int(row["id"]), [])[::-1])
-    if len(ordered) < len(rows):
-        reached = {int(row["id"]) for row in ordered}
-        line = min(line_of[int(row["id"])] for row in rows if int(row["id"]) not in reached)
-        raise ValueError(f"{path}: line {line}: the cylinder is its own ancestor")
-    return ordered
+        own = ahead.pop()
+        ordered[own] = rows[own]
+        ahead.extend(children.get(own, [])[::-1])
+    for row in rows.values():
+        if row.id not in ordered:
+            raise ValueError(f"{path}: line {row.line}: the cylinder is its own ancestor")
+    return list(ordered.values())

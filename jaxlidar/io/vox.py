@@ -1,16 +1,47 @@
 """Reader of voxel maps of AMAPVox (.vox text files)."""
 
+import math
 import os
 import re
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-from jaxlidar.io.text import VoxelsRead, cells_of, lines_of, number_in
+from jaxlidar._checks import check_choice, check_range
+from jaxlidar.io.checks import FARTHEST, column_of
+from jaxlidar.io.text import cells_of, lines_of, number_in, whole_in
 from jaxlidar.optics.leaf_angles import LeafAngles
 from jaxlidar.scenes.voxels import VoxelMap
 
 _FIRST_LINE = "VOXEL SPACE"
 _DENSITY = ("PadBVTotal", "attenuation_FPL_unbiasedMLE")
+# Columns that say which voxels no beam sampled, and which lie below the ground.
+_OPTIONAL = ("nbSampling", "ground_distance")
+_HEADER = ("min_corner", "max_corner", "split", "lad_type")
+# The largest density that is finite in single precision.
+_MOST = float(np.finfo(np.float32).max)
+
+
+class VoxelsRead(NamedTuple):
+    """What `read_vox` returns: a voxel map and what was left out of it.
+
+    - `voxels`: a `VoxelMap`.
+    - `dropped`: how many voxels of the file do not have their density in the map, by reason.
+
+    **Example:**
+
+    >>> import numpy as np
+    >>> import jaxlidar as jl
+    >>> from jaxlidar.io import VoxelsRead
+    >>> leaves = jl.VoxelMap.from_lad(np.ones((1, 1, 2)), voxel_size=1.0)
+    >>> voxels, dropped = VoxelsRead(leaves, {"not sampled": 0})
+    >>> print(voxels.shape, dropped)
+    (1, 1, 2) {'not sampled': 0}
+    """
+
+    voxels: VoxelMap
+    dropped: dict[str, int]
 
 
 def read_vox(
@@ -33,8 +64,10 @@ def read_vox(
     that the file names (`lad_type`).
 
     **Raises:** FileNotFoundError where there is no such file. ValueError, naming the file and the line, for
-    what is damaged: a first line or a header that is missing or makes no sense, rows of the wrong length or
-    number, indices outside the grid or given twice, negative densities.
+    what is damaged: a first line or a header that is missing or makes no sense, columns that
+    are missing or given twice, rows of the wrong length or number, indices outside the grid or given twice,
+    negative densities. ValueError for a `fill` that is
+    negative or not finite and for another `name`.
 
     **Source:** Vincent et al. (2017), Remote Sens. Environ. 190, 273; AMAPVox's output format.
 
@@ -50,74 +83,89 @@ def read_vox(
     >>> print(voxels.leaf, dropped["without a density"])
     [[[0.   0.75]]] 1
     """
+    check_choice("name", name, ("leaf", "bark"))
+    check_range("fill", fill, 0.0)
     path, lines = lines_of(path)
-    if not lines or lines[0].strip() != _FIRST_LINE:
-        raise ValueError(f"{path}: line 1: {_FIRST_LINE!r} is missing: no AMAPVox file")
-    head, at = {}, 1
-    while at < len(lines) and lines[at].startswith("#"):
-        for key, value in re.findall(r"#([\w-]+):(\([^)]*\)|\S+)", lines[at]):
-            head[key] = (value, at + 1)
-        at += 1
-    if at == len(lines):
-        raise ValueError(f"{path}: line {at}: the file ends where the names of the columns belong")
+    head, at = _header(path, lines)
     low, high = (_triple(path, head, key) for key in ("min_corner", "max_corner"))
     split = _triple(path, head, "split")
     shape = tuple(int(n) for n in split)
     if any(n != s or n < 1 for n, s in zip(shape, split)):
         raise ValueError(f"{path}: line {head['split'][1]}: split = {head['split'][0]} are no whole numbers")
-    if not all(h > b for h, b in zip(high, low)):
+    if not all(np.float32(h - b) > 0 for h, b in zip(high, low)):
         raise ValueError(f"{path}: line {head['max_corner'][1]}: max_corner does not lie beyond min_corner")
     names = lines[at].split()
-    column = density or next((c for c in _DENSITY if c in names), _DENSITY[0])
-    for needed in ("i", "j", "k", column):
-        if needed not in names:
-            raise ValueError(f"{path}: line {at + 1}: no column {needed}; there are {', '.join(names)}")
-    sampled = names.index("nbSampling") if "nbSampling" in names else None
-    ground = names.index("ground_distance") if "ground_distance" in names else None
+    if density is None:
+        density = next((c for c in _DENSITY if c in names), _DENSITY[0])
+    needed = ("i", "j", "k", density, *(c for c in _OPTIONAL if c in names))
+    column = {c: column_of(f"{path}: line {at + 1}", names, c) for c in needed}
 
+    rows = [(number, text) for number, text in enumerate(lines[at + 1 :], at + 2) if text.strip()]
+    if len(rows) < (count := math.prod(shape)):
+        raise ValueError(f"{path}: line {len(lines)}: {count - len(rows)} of {count} voxels are missing")
     values, seen = np.full(shape, float(fill)), np.zeros(shape, bool)
     dropped = {"not sampled": 0, "without a density": 0, "below the ground": 0}
-    factor = 2.0 if column.startswith("attenuation") else 1.0
-    for number, text in enumerate(lines[at + 1 :], at + 2):
-        if not text.strip():
-            continue
-        cells = cells_of(path, number, text, len(names), " ")
-        voxel = tuple(int(number_in(path, number, c, cells[names.index(c)])) for c in "ijk")
+    factor = 2.0 if density.startswith("attenuation") else 1.0
+    for number, text in rows:
+        cells = cells_of(path, number, text, " ", len(names))
+        voxel = tuple(whole_in(path, number, c, cells[column[c]]) for c in "ijk")
         if any(not 0 <= v < n for v, n in zip(voxel, shape)):
             raise ValueError(f"{path}: line {number}: voxel {voxel} lies outside the grid {shape}")
         if seen[voxel]:
             raise ValueError(f"{path}: line {number}: voxel {voxel} is given a second time")
         seen[voxel] = True
-        value = factor * number_in(path, number, column, cells[names.index(column)])
+        row = {c: number_in(path, number, c, cells[column[c]]) for c in needed[3:]}
+        value = factor * row[density]
         if np.isnan(value):
             dropped["without a density"] += 1
-        elif not 0 <= value < np.inf:
-            raise ValueError(f"{path}: line {number}: {column} = {value:g} is outside the range [0, inf)")
-        elif sampled is not None and number_in(path, number, "nbSampling", cells[sampled]) == 0:
+        elif not 0 <= value <= _MOST:
+            raise ValueError(
+                f"{path}: line {number}: {density} = {value:g} is outside the range [0, inf) of single "
+                "precision"
+            )
+        elif row.get("nbSampling") == 0:
             dropped["not sampled"] += 1
-        elif ground is not None and number_in(path, number, "ground_distance", cells[ground]) < 0:
+        elif row.get("ground_distance", 0.0) < 0:
             dropped["below the ground"] += int(value > 0)
             values[voxel] = 0.0
         else:
             values[voxel] = value
-    if not seen.all():
-        raise ValueError(f"{path}: line {len(lines)}: {int((~seen).sum())} of {seen.size} voxels are missing")
     size = (np.array(high) - low) / shape
-    angles = head.get("lad_type", ("Spherical", 0))[0].lower()
     if name == "bark":
         voxels = VoxelMap.from_extinction(bark=0.5 * values, voxel_size=size, origin=low)
-    elif angles == "spherical":
-        voxels = VoxelMap.from_lad(values, voxel_size=size, origin=low)
     else:
-        try:
-            leaning = LeafAngles.named(angles)
-        except ValueError as error:
-            raise ValueError(f"{path}: line {head['lad_type'][1]}: {error}") from error
-        voxels = VoxelMap.from_lad(values, voxel_size=size, origin=low, leaf_angles=leaning)
+        angles = _leaf_angles(path, head)
+        voxels = VoxelMap.from_lad(values, voxel_size=size, origin=low, leaf_angles=angles)
     return VoxelsRead(voxels, dropped)
 
 
-def _triple(path, head: dict[str, tuple[str, int]], key: str) -> tuple[float, float, float]:
+def _header(path: Path, lines: list[str]) -> tuple[dict[str, tuple[str, int]], int]:
+    """What the header says and in which line, by name; and the index of the first line after it."""
+    if not lines or lines[0].strip() != _FIRST_LINE:
+        raise ValueError(f"{path}: line 1: {_FIRST_LINE!r} is missing: no AMAPVox file")
+    head: dict[str, tuple[str, int]] = {}
+    for number, line in enumerate(lines[1:], 2):
+        if not line.startswith("#"):
+            return head, number - 1
+        for key, value in re.findall(r"#([\w-]+):(\([^)]*\)|\S+)", line):
+            if key in _HEADER and key in head:
+                raise ValueError(f"{path}: line {number}: #{key} was given in line {head[key][1]}")
+            head[key] = (value, number)
+    raise ValueError(f"{path}: line {len(lines)}: the file ends where the names of the columns belong")
+
+
+def _leaf_angles(path: Path, head: dict[str, tuple[str, int]]) -> str | LeafAngles:
+    """The leaf angles that the header names."""
+    angles, line = head.get("lad_type", ("spherical", 0))
+    if angles.lower() == "spherical":
+        return "spherical"
+    try:
+        return LeafAngles.named(angles.lower())
+    except ValueError as error:
+        raise ValueError(f"{path}: line {line}: {error}") from error
+
+
+def _triple(path: Path, head: dict[str, tuple[str, int]], key: str) -> tuple[float, float, float]:
     if key not in head:
         raise ValueError(f"{path}: line 2: the header has no #{key}")
     text, line = head[key]
@@ -125,4 +173,6 @@ def _triple(path, head: dict[str, tuple[str, int]], key: str) -> tuple[float, fl
     if len(parts) != 3:
         raise ValueError(f"{path}: line {line}: {key} = {text} are not three numbers")
     x, y, z = (number_in(path, line, key, part) for part in parts)
+    if not all(abs(v) <= FARTHEST for v in (x, y, z)):
+        raise ValueError(f"{path}: line {line}: {key} = {text} lies beyond {FARTHEST:g}")
     return x, y, z

@@ -19,6 +19,7 @@ TRAITS: dict[str, tuple[str, ...]] = {
 
 # The header of the authors' dataSpec_PRO.txt. SAC_LMA is there for the other versions; PRO splits it.
 _INDEX = "nrefrac"
+_LARGEST = float(np.finfo(np.float32).max)
 _HEADER = {
     "lambda": "wavelength",
     "SAC_CHL": "Cab",
@@ -159,8 +160,9 @@ def _number(text: str, column: str, name: str, line: int) -> float:
         value = float(text)
     except ValueError:
         value = math.nan
-    if not math.isfinite(value) or value < 0:
+    if not 0 <= value <= _LARGEST:
         raise ValueError(
-            f"{name}, line {line}: {column} = {text!r} is no number in the admissible range [0, inf)"
+            f"{name}, line {line}: {column} = {text[:40]!r} is no number in the admissible range [0, inf) of "
+            "single precision"
         )
     return value

@@ -15,14 +15,15 @@ as `law=`. `examples/minnaert.py` shows Minnaert's law.
 """
 
 import abc
-from typing import final
+from typing import ClassVar, final
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxlidar._checks import as_scalar, check_range
+from jaxlidar._checks import briefly, scalar
+from jaxlidar._ranges import Range, check_ranges
 from jaxlidar._vectors import Scalar, Vec, about, cross, dot, from_frame, polar, vec
 
 
@@ -141,6 +142,7 @@ class AbstractMirror(AbstractLaw):
 
 
 @final
+@briefly
 class Lambertian(AbstractLaw):
     """Lambertian reflection: equal radiance in all directions of the lit side (intensity by the cosine law).
 
@@ -172,6 +174,7 @@ class Lambertian(AbstractLaw):
 
 
 @final
+@briefly
 class EqualAngle(AbstractLaw):
     """Reflection with a polar angle uniform in [0, 90] degrees: the paper's "every angle equally likely".
 
@@ -215,6 +218,7 @@ def _square_of_sine(normal: Vec, out: Vec) -> Scalar:
 
 
 @final
+@briefly
 class Specular(AbstractMirror):
     """Specular reflection: a mirror of slightly tilted facets, with a Gaussian lobe about its direction.
 
@@ -228,7 +232,7 @@ class Specular(AbstractMirror):
     - `roughness`: standard deviation of the reflected direction about the mirror direction along each of two
       perpendicular axes, rad, in [0, 0.5]; 0 is a perfect mirror. Default 0.
 
-    **Raises:** ValueError for a roughness outside its range.
+    **Raises:** ValueError for a roughness outside its range; TypeError for what is no number.
 
     **Example:** straight back, a lobe of 0.1 rad is 1 / (2 * 0.1^2) times as bright as a Lambertian surface.
 
@@ -240,10 +244,12 @@ class Specular(AbstractMirror):
     50.0
     """
 
-    roughness: Float[Array, ""] = eqx.field(converter=as_scalar, default=0.0)
+    roughness: Float[Array, ""] = eqx.field(converter=scalar("roughness"), default=0.0)
+
+    ranges: ClassVar = {"roughness": Range(0.0, 0.5)}
 
     def __check_init__(self):
-        check_range("roughness", self.roughness, 0.0, 0.5)
+        check_ranges(self)
 
     def view_factor(self, incident: Vec, normal: Vec, view: Vec, half_angle: Scalar) -> Scalar:
         mirror = _mirror(incident, normal)

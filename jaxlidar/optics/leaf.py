@@ -1,20 +1,19 @@
 """Leaves (or other scatterers) of known reflectance and transmittance, in the form of a leaf model."""
 
 from collections.abc import Sequence
-from typing import final
+from typing import ClassVar, final
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxlidar._checks import as_array, check_range, concrete
-
-# What R + T may exceed 1 by: the rounding of measured or single-precision values.
-_TOLERANCE = 1e-6
+from jaxlidar._checks import array, briefly
+from jaxlidar._ranges import SHARE, SUM_OF_SHARES, check_ranges
 
 
 @final
+@briefly
 class LeafOptics(eqx.Module):
     """Leaf optics from given reflectance and transmittance: `R, T = optics(wavelengths)`, as with `Prospect`.
 
@@ -25,8 +24,8 @@ class LeafOptics(eqx.Module):
       the reflectance is at most 1. Default 0.
 
     **Raises:** ValueError, naming the field, its value and the admissible range, for values outside their
-    range, for a sum above 1, for more than one dimension, and for different numbers of values. Inside a JAX
-    transformation values cannot be checked.
+    range, for a sum above 1, for more than one dimension, and for different numbers of values; TypeError for
+    what is no number. Inside a JAX transformation values cannot be checked.
 
     **Example:**
 
@@ -36,23 +35,26 @@ class LeafOptics(eqx.Module):
     ['0.10', '0.45'] ['0.05', '0.40']
     """
 
-    reflectance: Float[Array, "*wavelengths"] = eqx.field(converter=as_array)
-    transmittance: Float[Array, "*wavelengths"] = eqx.field(converter=as_array, default=0.0)
+    reflectance: Float[Array, "*wavelengths"] = eqx.field(converter=array("reflectance"))
+    transmittance: Float[Array, "*wavelengths"] = eqx.field(converter=array("transmittance"), default=0.0)
+
+    ranges: ClassVar = {
+        "reflectance": SHARE,
+        "transmittance": SHARE,
+        "reflectance + transmittance": SUM_OF_SHARES,
+    }
 
     def __check_init__(self):
         for name in ("reflectance", "transmittance"):
             value = getattr(self, name)
-            if value.ndim > 1:
+            if value.ndim > 1 or value.size == 0:
                 raise ValueError(
                     f"{name} has shape {value.shape}; admissible is a number or one per wavelength"
                 )
-            check_range(name, value, 0.0, 1.0)
         R, T = self.reflectance, self.transmittance
         if R.ndim == T.ndim == 1 and R.shape != T.shape:
             raise ValueError(f"transmittance has {T.size} values where reflectance has {R.size}")
-        R, T = concrete(R), concrete(T)
-        if R is not None and T is not None:
-            check_range("reflectance + transmittance", R + T, 0.0, 1.0 + _TOLERANCE)
+        check_ranges(self)
 
     def __call__(
         self, wavelengths: ArrayLike | Sequence[ArrayLike]

@@ -1,16 +1,21 @@
 """Distributions of leaf inclination, and the projection function G of a canopy that has them."""
 
+from typing import ClassVar, final
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxlidar._checks import as_array, as_scalar, check_choice, check_range
+from jaxlidar._checks import array, as_scalar, briefly, check_choice, check_range, concrete
+from jaxlidar._ranges import Range, check_ranges
 
 ANGLE_CELLS = 90
 ANGLE_NODES = 129
 
 
+@final
+@briefly
 class LeafAngles(eqx.Module):
     """A leaf angle distribution, uniform in azimuth, as probabilities of cells of one degree of inclination.
 
@@ -21,9 +26,10 @@ class LeafAngles(eqx.Module):
     **Arguments:**
 
     - `probability`: (90,) probability that the inclination lies within 0..1, 1..2, ... 89..90 degrees, not
-      negative; need not sum to one, for it is normalised where it is used.
+      negative and not all zero; need not sum to one, for it is normalised where it is used.
 
-    **Raises:** ValueError for another shape, and for negative or non-finite values.
+    **Raises:** ValueError for another shape, for negative or non-finite values, and where all are zero;
+    TypeError for what is no number.
 
     **Example:** G of a canopy of mostly horizontal leaves, seen from above.
 
@@ -34,7 +40,9 @@ class LeafAngles(eqx.Module):
     0.849
     """
 
-    probability: Float[Array, "90"] = eqx.field(converter=as_array)
+    probability: Float[Array, "90"] = eqx.field(converter=array("probability"))
+
+    ranges: ClassVar = {"probability": Range(0.0)}
 
     def __check_init__(self):
         if self.probability.shape != (ANGLE_CELLS,):
@@ -42,7 +50,10 @@ class LeafAngles(eqx.Module):
                 f"probability has shape {self.probability.shape}; "
                 f"admissible is ({ANGLE_CELLS},), one per degree"
             )
-        check_range("probability", self.probability, 0.0)
+        check_ranges(self)
+        known = concrete(self.probability)
+        if known is not None:
+            check_range("sum of probability", known.sum(), 0.0, low_open=True)
 
     @staticmethod
     def named(name: str) -> "LeafAngles":
@@ -92,7 +103,7 @@ class LeafAngles(eqx.Module):
         """
         check_range("mean", mean, 0.0, 90.0, low_open=True, high_open=True)
         check_range("std", std, 0.0, 45.0, low_open=True, high_open=True)
-        m, s = as_scalar(mean) / 90.0, as_scalar(std) / 90.0
+        m, s = as_scalar(mean, "mean") / 90.0, as_scalar(std, "std") / 90.0
         spread = m * (1 - m) / s**2 - 1
         check_range("mean (90 - mean) / std^2", spread + 1, 1.0, low_open=True)
         x = jnp.asarray((np.arange(ANGLE_CELLS) + 0.5) / ANGLE_CELLS)

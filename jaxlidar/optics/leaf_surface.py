@@ -7,6 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
+from jaxlidar._checks import check_number, check_range
+
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(32)
 _NODES, _WEIGHTS = (_NODES + 1) / 2, _WEIGHTS / 2
 
@@ -47,6 +49,8 @@ def leaf_surface(n: ArrayLike, alpha: float | int = 40.0) -> LeafSurface:
     **Returns:** a `LeafSurface` of arrays shaped as `n`: JAX arrays where `n` is one, else NumPy arrays of
     float64.
 
+    **Raises:** ValueError for values outside these ranges; TypeError for what is no number.
+
     **Source:** Stern (1964), Appl. Opt. 3, 111; Allen (1973), J. Opt. Soc. Am. 63, 664.
 
     **Example:**
@@ -56,6 +60,8 @@ def leaf_surface(n: ArrayLike, alpha: float | int = 40.0) -> LeafSurface:
     >>> print(f"{face.r_alpha:.3f} within the cone, {face.r12:.3f} diffuse")
     0.035 within the cone, 0.084 diffuse
     """
+    check_range("n", n, 1.0)
+    check_number("alpha", alpha, 0.0, 90.0)
     xp: Any = jnp if isinstance(n, jax.Array) else np
     index = n if isinstance(n, jax.Array) else np.asarray(n, dtype=float)
     t_alpha, r_alpha = _cone(xp, index, alpha)

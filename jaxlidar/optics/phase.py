@@ -11,14 +11,15 @@ three methods, and pass it as `leaf=` or `bark=` of a `Canopy`.
 """
 
 import abc
-from typing import final
+from typing import ClassVar, final
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxlidar._checks import as_array, as_scalar, check_range
+from jaxlidar._checks import array, briefly, scalar
+from jaxlidar._ranges import SHARE, Range, check_ranges
 from jaxlidar._vectors import Scalar, Vec, dot, from_frame, polar
 
 # Of isotropic scattering.
@@ -95,7 +96,15 @@ class AbstractPhase(eqx.Module):
         return self.view_factor(incident, out) / np.pi
 
 
+def _check(phase: AbstractPhase) -> None:
+    albedo = phase.albedo
+    if albedo.ndim > 1 or albedo.size == 0:
+        raise ValueError(f"albedo has shape {albedo.shape}; admissible is a number or one per wavelength")
+    check_ranges(phase)
+
+
 @final
+@briefly
 class Isotropic(AbstractPhase):
     """Isotropic volume scattering, the same in all directions: often assumed by discrete ordinates codes.
 
@@ -103,7 +112,8 @@ class Isotropic(AbstractPhase):
 
     - `albedo`: single scattering albedo, one number or one per wavelength, in [0, 1].
 
-    **Raises:** ValueError for an albedo outside its range.
+    **Raises:** ValueError for an albedo outside its range or of more than one dimension; TypeError for what
+    is no number.
 
     **Example:** a canopy of isotropic scatterers at two wavelengths.
 
@@ -115,10 +125,12 @@ class Isotropic(AbstractPhase):
     ['0.1', '0.9']
     """
 
-    albedo: Float[Array, "..."] = eqx.field(converter=as_array)
+    albedo: Float[Array, "..."] = eqx.field(converter=array("albedo"))
+
+    ranges: ClassVar = {"albedo": SHARE}
 
     def __check_init__(self):
-        check_range("albedo", self.albedo, 0.0, 1.0)
+        _check(self)
 
     def view_factor(self, incident: Vec, view: Vec) -> Scalar:
         return jnp.full_like(incident[0], ISOTROPIC_VIEW_FACTOR)
@@ -131,6 +143,7 @@ class Isotropic(AbstractPhase):
 
 
 @final
+@briefly
 class HenyeyGreenstein(AbstractPhase):
     """Volume scattering by Henyey and Greenstein's phase function: a forward or a backward lobe.
 
@@ -140,7 +153,8 @@ class HenyeyGreenstein(AbstractPhase):
     - `g`: mean cosine of the scattering angle, in [-0.95, 0.95]; 0 is isotropic, positive values scatter
       forward. Default 0.
 
-    **Raises:** ValueError for values outside their ranges.
+    **Raises:** ValueError for values outside their ranges and for an albedo of more than one dimension;
+    TypeError for what is no number.
 
     **Source:** Henyey and Greenstein (1941), Astrophys. J. 93, 70.
 
@@ -155,12 +169,13 @@ class HenyeyGreenstein(AbstractPhase):
     1.500 forward, 0.056 back
     """
 
-    albedo: Float[Array, "..."] = eqx.field(converter=as_array)
-    g: Float[Array, ""] = eqx.field(converter=as_scalar, default=0.0)
+    albedo: Float[Array, "..."] = eqx.field(converter=array("albedo"))
+    g: Float[Array, ""] = eqx.field(converter=scalar("g"), default=0.0)
+
+    ranges: ClassVar = {"albedo": SHARE, "g": Range(-0.95, 0.95)}
 
     def __check_init__(self):
-        check_range("albedo", self.albedo, 0.0, 1.0)
-        check_range("g", self.g, -0.95, 0.95)
+        _check(self)
 
     def view_factor(self, incident: Vec, view: Vec) -> Scalar:
         g = self.g

@@ -21,7 +21,7 @@ carbon-based constituents in "PRO". Numerical limits: see `jaxlidar.plate_model`
 
 import functools
 from collections.abc import Sequence
-from typing import Any, final
+from typing import Any, ClassVar, final
 
 import equinox as eqx
 import jax
@@ -30,7 +30,19 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxlidar._checks import as_scalar, check_choice, check_range, concrete
+from jaxlidar._checks import (
+    as_scalar,
+    briefly,
+    check_choice,
+    check_integer,
+    check_kind,
+    check_number,
+    check_numbers,
+    check_range,
+    concrete,
+    warn_units,
+)
+from jaxlidar._ranges import Range, check_ranges
 from jaxlidar.optics.coefficients import TRAITS, Coefficients, shipped
 from jaxlidar.optics.leaf_surface import LeafSurface, leaf_surface
 from jaxlidar.optics.plate_model import plate_model, plate_model_slopes
@@ -51,6 +63,7 @@ _Batch = Float[Array, "leaves *wavelengths"]
 
 
 @final
+@briefly
 class Prospect(eqx.Module):
     """A leaf by the PROSPECT model: `R, T = leaf(wavelengths)` are its reflectance and transmittance.
 
@@ -79,7 +92,8 @@ class Prospect(eqx.Module):
     **Raises:** ValueError, naming field, value and admissible range: for a trait that is negative, not finite
     or not a single number, for a trait other than 0 that the version does not have (hence `Cm` with "PC" and
     "PRO"), for N below 1, alpha outside [0, 90], an unknown version, and `coefficients` that are missing or
-    not admissible. Traced values are not checked.
+    not admissible. TypeError for what is no number. Traced values are not checked. A content so large that
+    another unit is likely, such as a `Cw` in micrometres, gives a `UnitWarning`.
 
     **Source:** Jacquemoud and Baret (1990), Remote Sens. Environ. 34, 75, and those of the versions.
 
@@ -105,6 +119,8 @@ class Prospect(eqx.Module):
     alpha: float = eqx.field(static=True)
     coefficients: Coefficients | None = eqx.field(static=True)
 
+    ranges: ClassVar = {"N": Range(1.0)} | dict.fromkeys(_DEFAULTS, Range(0.0))
+
     def __init__(
         self,
         N: ArrayLike = 1.5,
@@ -127,10 +143,12 @@ class Prospect(eqx.Module):
                 f"coefficients = {coefficients!r} with version {version!r}: version 'PRO' needs a table from "
                 "load_coefficients, and the other versions admit None only"
             )
-        check_range("alpha", alpha, 0.0, 90.0)
+        if coefficients is not None:
+            check_kind("coefficients", coefficients, Coefficients, "a table from load_coefficients")
+        check_number("alpha", alpha, 0.0, 90.0)
         pigments = {"Cab": Cab, "Car": Car, "Cant": Cant, "Cbrown": Cbrown}
         given = {**pigments, "Cw": Cw, "Cm": Cm, "Cp": Cp, "Cc": Cc}
-        self.N = _scalar("N", N, 1.0)
+        self.N = _scalar("N", N)
         for name, value in given.items():
             known = name in TRAITS[version]
             if value is None:
@@ -140,8 +158,10 @@ class Prospect(eqx.Module):
                     f"{name} = {value} is no trait of version {version!r} ({', '.join(TRAITS[version])}): "
                     "only 0 is admissible"
                 )
-            setattr(self, name, _scalar(name, value, 0.0))
+            setattr(self, name, _scalar(name, value))
         self.version, self.alpha, self.coefficients = version, float(alpha), coefficients
+        check_ranges(self)
+        warn_units(self)
 
     @classmethod
     def paper(cls) -> "Prospect":
@@ -196,12 +216,12 @@ class Prospect(eqx.Module):
         return jnp.tensordot(contents, absorption, 1, precision=jax.lax.Precision.HIGHEST) / self.N
 
 
-def _scalar(name: str, value: ArrayLike, low: float) -> Float[Array, ""]:
+def _scalar(name: str, value: ArrayLike) -> Float[Array, ""]:
+    check_numbers(name, value)
     if np.size(value) != 1:
         raise ValueError(
             f"{name} has shape {np.shape(value)}; a leaf's traits are scalars, see prospect_spectra"
         )
-    check_range(name, value, low)
     return as_scalar(value)
 
 
@@ -255,7 +275,8 @@ def prospect_spectra(
 
     **Returns:** reflectance and transmittance, (leaves, wavelengths) each.
 
-    **Raises:** ValueError as for one leaf, and where `batch_size` is below 1.
+    **Raises:** ValueError as for one leaf, for a single leaf, and where `batch_size` is no integer of at
+    least 1; TypeError for leaves of another kind.
 
     **Example:** leaves of two thicknesses.
 
@@ -266,8 +287,15 @@ def prospect_spectra(
     >>> print([f"{x:.2f}" for x in R[:, 0]], [f"{x:.2f}" for x in T[:, 0]])
     ['0.38', '0.51'] ['0.53', '0.40']
     """
-    check_range("batch_size", batch_size, 1.0)
+    batch_size = _check_batch(leaves, batch_size)
     return jax.lax.map(lambda leaf: leaf(wavelengths), leaves, batch_size=batch_size)
+
+
+def _check_batch(leaves: Prospect, batch_size: int) -> int:
+    check_kind("leaves", leaves, Prospect, "a Prospect of many leaves, as jax.vmap returns it")
+    if leaves.N.ndim == 0:
+        raise ValueError("leaves has traits of shape (); admissible are traits of shape (leaves,)")
+    return check_integer("batch_size", batch_size)
 
 
 def prospect_jacobian(
@@ -288,7 +316,8 @@ def prospect_jacobian(
     ("N" and the traits of the version), of the derivatives of these two, of the same shape, per unit of the
     trait.
 
-    **Raises:** ValueError as for one leaf, and where `batch_size` is below 1.
+    **Raises:** ValueError as for one leaf, for a single leaf, and where `batch_size` is no integer of at
+    least 1; TypeError for leaves of another kind.
 
     **Example:** how reflectance at 550 nm falls with chlorophyll, per ug/cm2.
 
@@ -299,7 +328,7 @@ def prospect_jacobian(
     >>> print([f"{x:.4f}" for x in slopes["Cab"][0][:, 0]])
     ['-0.0053', '-0.0015']
     """
-    check_range("batch_size", batch_size, 1.0)
+    batch_size = _check_batch(leaves, batch_size)
 
     def one(leaf: Prospect) -> tuple[tuple[Array, Array], dict[str, tuple[Array, Array]]]:
         absorption, face = material(leaf, wavelengths)

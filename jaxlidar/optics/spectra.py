@@ -14,21 +14,40 @@ takes them as the reflectance of a Lambertian surface. Two samples of one kind e
 `scale` where the level matters.
 """
 
+import codecs
+import contextlib
 import csv
 import difflib
 import functools
 import os
 from importlib import resources
 from pathlib import Path
+from typing import ClassVar, final
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxlidar._checks import as_array, as_scalar, check_range, concrete
+from jaxlidar._checks import (
+    array,
+    as_array,
+    briefly,
+    check_choice,
+    check_kind,
+    check_range,
+    concrete,
+    scalar,
+    warn_units,
+)
+from jaxlidar._ranges import SHARE, SUM_OF_SHARES, Range, check_ranges
+
+# nm: the largest number that is finite in single precision.
+_LONGEST = float(np.finfo(np.float32).max)
 
 
+@final
+@briefly
 class Spectrum(eqx.Module):
     """A reflectance spectrum, linear between its samples: `spectrum(wavelength)` is the reflectance.
 
@@ -53,10 +72,17 @@ class Spectrum(eqx.Module):
     0.305
     """
 
-    wavelength: Float[Array, " samples"] = eqx.field(converter=as_array)
-    reflectance: Float[Array, " samples"] = eqx.field(converter=as_array)
+    wavelength: Float[Array, " samples"] = eqx.field(converter=array("wavelength"))
+    reflectance: Float[Array, " samples"] = eqx.field(converter=array("reflectance"))
     name: str = eqx.field(static=True, default="")
-    scale: Float[Array, ""] = eqx.field(converter=as_scalar, default=1.0)
+    scale: Float[Array, ""] = eqx.field(converter=scalar("scale"), default=1.0)
+
+    ranges: ClassVar = {
+        "wavelength": Range(0.0, low_open=True),
+        "reflectance": SHARE,
+        "scale": Range(0.0),
+        "scale * reflectance": SUM_OF_SHARES,
+    }
 
     def __check_init__(self):
         if self.wavelength.shape != self.reflectance.shape or self.wavelength.ndim != 1:
@@ -66,18 +92,15 @@ class Spectrum(eqx.Module):
             )
         if self.wavelength.size < 2:
             raise ValueError(f"wavelength has {self.wavelength.size} samples; admissible are 2 or more")
-        check_range("wavelength", self.wavelength, 0.0, low_open=True)
-        check_range("reflectance", self.reflectance, 0.0, 1.0)
-        check_range("scale", self.scale, 0.0)
-        wavelength, reflectance, scale = map(concrete, (self.wavelength, self.reflectance, self.scale))
+        check_ranges(self)
+        wavelength = concrete(self.wavelength)
         if wavelength is not None and np.any(np.diff(wavelength) <= 0):
             i = int(np.argmax(np.diff(wavelength) <= 0))
             raise ValueError(
                 f"wavelength = {wavelength[i]:g} is followed by {wavelength[i + 1]:g}; the admissible ones "
                 "increase strictly"
             )
-        if reflectance is not None and scale is not None:
-            check_range("scale * reflectance", scale * reflectance, 0.0, 1.0 + 1e-6)
+        warn_units(self)
 
     def __call__(self, wavelength: ArrayLike) -> Float[Array, "..."]:
         """The reflectance at the given wavelengths.
@@ -145,7 +168,7 @@ def spectra(kind: str | None = None) -> dict[str, str]:
 
     **Returns:** a dict from name to kind.
 
-    **Raises:** ValueError for an unknown kind.
+    **Raises:** ValueError for an unknown kind; TypeError for what is no name.
 
     **Example:**
 
@@ -157,9 +180,7 @@ def spectra(kind: str | None = None) -> dict[str, str]:
     listed = dict(zip(library["name"].tolist(), library["kind"].tolist()))
     if kind is None:
         return listed
-    kinds = list(dict.fromkeys(listed.values()))
-    if kind not in kinds:
-        raise ValueError(f"kind = {kind!r} is none of {', '.join(map(repr, kinds))}")
+    check_choice("kind", kind, tuple(dict.fromkeys(listed.values())))
     return {name: k for name, k in listed.items() if k == kind}
 
 
@@ -172,7 +193,7 @@ def spectrum(name: str) -> Spectrum:
 
     **Returns:** a `Spectrum`.
 
-    **Raises:** ValueError for an unknown name; the message lists similar names.
+    **Raises:** ValueError for an unknown name; it lists similar names. TypeError for what is no name.
 
     **Example:**
 
@@ -183,6 +204,7 @@ def spectrum(name: str) -> Spectrum:
     ['0.33', '0.51']
     """
     library = _library()
+    check_kind("name", name, str, "a name that jaxlidar.spectra lists")
     names = library["name"].tolist()
     if name not in names:
         close = difflib.get_close_matches(name, names, n=5, cutoff=0.4) or sorted(
@@ -202,7 +224,8 @@ def read_spectrum_csv(path: str | os.PathLike[str], name: str | None = None) -> 
     **Arguments:**
 
     - `path`: path of the file. Its lines hold two numbers, separated by a comma, a semicolon, a tab or
-      blanks. Empty lines and lines that start with # are skipped, and the first other line may be a header.
+      blanks. Empty lines and lines that start with # are skipped, and the first other line may be a header,
+      in which no cell is a number.
     - `name`: name of the spectrum. Default None: the file's name without its ending.
 
     **Returns:** a `Spectrum`.
@@ -225,13 +248,14 @@ def read_spectrum_csv(path: str | os.PathLike[str], name: str | None = None) -> 
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: no text file (byte {error.start} is not UTF-8)") from error
     samples: list[tuple[float, float]] = []
     header_allowed = True
-    for number, line in enumerate(lines, 1):
+    lines = path.read_bytes().removeprefix(codecs.BOM_UTF8).splitlines()
+    for number, content in enumerate(lines, 1):
+        try:
+            line = content.decode()
+        except UnicodeDecodeError as error:
+            raise ValueError(f"{path}: no text file: line {number} is not UTF-8") from error
         if not line.strip() or line.lstrip().startswith("#"):
             continue
         cells = _cells(line)
@@ -239,16 +263,19 @@ def read_spectrum_csv(path: str | os.PathLike[str], name: str | None = None) -> 
         try:
             wavelength, reflectance = map(float, cells)
         except ValueError:
-            if header_allowed and not _is_number(cells[0]):
+            if header_allowed and not any(map(_is_number, cells)):
                 header_allowed = False
                 continue
-            raise ValueError(f"{place}: {line.strip()!r} is not a wavelength and a reflectance") from None
+            shown = line.strip()[:40]
+            raise ValueError(f"{place}: {shown!r} is not a wavelength and a reflectance") from None
         header_allowed = False
-        if not 100 <= wavelength < np.inf:
+        if not 100 <= wavelength <= _LONGEST:
             raise ValueError(
                 f"{place}: wavelength = {wavelength:g} is outside the admissible range [100, inf) nm"
+                " of single precision"
             )
-        if samples and wavelength <= samples[-1][0]:
+        # Samples closer than single precision tells apart are no samples of their own.
+        if samples and np.float32(wavelength) <= np.float32(samples[-1][0]):
             raise ValueError(
                 f"{place}: wavelength = {wavelength:g} follows {samples[-1][0]:g}; the admissible ones "
                 "increase strictly"
@@ -267,7 +294,9 @@ def read_spectrum_csv(path: str | os.PathLike[str], name: str | None = None) -> 
 def _cells(line: str) -> list[str]:
     for separator in ",;\t":
         if separator in line:
-            return next(csv.reader([line.strip()], delimiter=separator))
+            with contextlib.suppress(csv.Error):
+                return next(csv.reader([line.strip()], delimiter=separator, strict=True))
+            return [line]
     return line.split()
 
 

@@ -8,33 +8,32 @@ import jax
 
 from jaxlidar._checks import is_traced, known_number
 from jaxlidar._constants import SPEED_OF_LIGHT
+from jaxlidar._summary import percent
 from jaxlidar.instrument.field_of_view import EDGE
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.planning.bounds import Bounds
 from jaxlidar.planning.effects import NAMES, Effect, present, without
+from jaxlidar.planning.orders import Orders
 from jaxlidar.planning.trace_plan import Bins
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.shapes import Plane
 from jaxlidar.scenes.surfaces import Ground
 
 
-def percent(share: float) -> str:
-    """A share in percent, to two digits, also of 100."""
-    return f"{float(f'{100 * share:.2g}'):g} %"
-
-
 def effect_table(
     lidar: Lidar,
     scene: Scene,
     off: tuple[str, ...],
-    orders: int,
-    why: tuple[str, float],
+    chosen: Orders,
     bins: Bins,
     upstream: float,
 ) -> tuple[Effect, ...]:
-    """A row for every effect. `why`: why so many orders are followed, and the likely share of the others."""
+    """A row for every effect. `chosen`: how many orders are followed, and why."""
+    orders = chosen.count
     has, planned = present(lidar, scene), present(*without(lidar, scene, off))
-    reasons = dict.fromkeys(NAMES, "in the scene") | {"multiple scattering": why[0]} | _reasons(lidar, scene)
+    reasons = (
+        dict.fromkeys(NAMES, "in the scene") | {"multiple scattering": chosen.why} | _reasons(lidar, scene)
+    )
     # Values that are being traced are unknown, and bounds hold for planes only.
     known = not any(is_traced(x) for x in jax.tree.leaves((lidar, scene)))
     known = known and all(isinstance(s.shape, Plane) for s in scene.surfaces)
@@ -65,8 +64,12 @@ def effect_table(
         if on and name == "multiple scattering":
             name = f"orders beyond {orders}"
             most = bound(name, off)
-            rest = f"likely below {percent(min(why[1], most))}: light escapes between"
-            rows.append(Effect(name, False, rest, most, "sum"))
+            likely = min(chosen.beyond, most)
+            rows.append(Effect(name, False, f"likely below {percent(likely)}", most, "sum"))
+            late = "light on its way at the end of the record"
+            rows.append(
+                Effect("after the window", False, late, bound(name="multiple scattering", off=off), "sum")
+            )
     if without(lidar, scene, off)[1].atmosphere is not None:
         name = "scattering within the atmosphere"
         rows.append(Effect(name, False, "beyond first order", bound(name, off), "sum"))

@@ -10,6 +10,9 @@ from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.surfaces import AbstractSheet
 
+# Voxels along one flight at most: a batch waits for its longest flight.
+MOST_VOXELS = 16_384
+
 
 class PathLengths:
     """Path lengths from the rim of the footprint to the bounds of everything in the scene.
@@ -84,14 +87,16 @@ class PathLengths:
         """Length, m, up to which flights are followed.
 
         It takes in all flights whose light returns within `longest` m of the first return. But within a
-        periodic canopy, under a beam of more than 64 degrees, light could fly towards the sensor almost for
-        ever. There, the length is at most ten times the sum of `longest` and the height of the canopy.
+        periodic canopy light could fly on almost for ever: under a beam of more than 64 degrees the length is
+        at most ten times the sum of `longest` and the height of the canopy, and no flight crosses more than
+        `MOST_VOXELS` voxels.
         """
         if self.scene.canopy is None or self.scene.canopy.sides == "open":
             return FAR
         # A flight of s m within the canopy lengthens the way by at least s (1 - sin) - height cos.
         height, cos = self.size[2] * self.shape[2], float(np.abs(self.rays[:, 2]).min())
-        return float((longest + height * cos) / max(1.0 - math.sqrt(1.0 - cos * cos), 0.1))
+        flight = (longest + height * cos) / max(1.0 - math.sqrt(1.0 - cos * cos), 0.1)
+        return float(min(flight, max(MOST_VOXELS - self.shape[2], 1) / np.sum(1.0 / self.size[:2])))
 
     def march_steps(self, longest: float) -> int:
         """Bound on the voxels that a flight of `longest_flight` crosses."""

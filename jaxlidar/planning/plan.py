@@ -3,31 +3,47 @@
 import dataclasses
 import math
 from collections.abc import Mapping
+from typing import NamedTuple
 
-from jaxlidar._checks import check_choice, check_integer, known_number
+from jaxlidar._checks import check_choice, check_integer, check_range, known_number
 from jaxlidar._constants import SPEED_OF_LIGHT
+from jaxlidar._summary import percent
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.optics.laws import AbstractMirror
-from jaxlidar.planning.effect_table import effect_table, percent
-from jaxlidar.planning.effects import Effect, can_light_itself, only_planes, present, switched_off, without
+from jaxlidar.planning.effect_table import effect_table
+from jaxlidar.planning.effects import Effect, only_planes, present, switched_off, without
+from jaxlidar.planning.local_origin import about_aim
+from jaxlidar.planning.memory import check_memory, in_words, predicted
+from jaxlidar.planning.orders import degree_of, orders_of, tail_of
 from jaxlidar.planning.path_lengths import PathLengths
 from jaxlidar.planning.scatterers import largest_albedo, lobe_probability, scene_optics, spell
 from jaxlidar.planning.trace_plan import KERNEL, Bins, TracePlan
-from jaxlidar.scenes.scene import Scene
+from jaxlidar.scenes.scene import Scene, check_kinds
 from jaxlidar.scenes.surfaces import AbstractSheet
 
 DEFAULT_RTOL = 0.01
 # Fewer batches give no trustworthy standard error.
 MIN_BATCHES = 8
-# Orders are followed while their histories are not more than this (16 orders of four letters, 29 of three).
-MAX_HISTORIES = 5000
-MAX_ORDERS = 100
-# The share of scattered light that is scattered again is taken to be at most this, where any can escape.
-AGAIN = 0.8
 # Points of each flight through a canopy from which light returns.
 ENDS = 4
-# Multiple scattering is followed this long after the last first-order return, ns.
-TAIL = (10.0, 60.0)
+
+
+class Limits(NamedTuple):
+    """What a plan was made for.
+
+    - `first`, `last`: times (ns) of the first and the last return of order one. - `albedo`: the largest.
+    - `finest`: scale (ns) of the finest feature of the pulse.
+    - `automatic_orders`, `automatic_window`: whether the plan chose them. - `most_orders`: how many could be
+      followed.
+    """
+
+    first: float
+    last: float
+    albedo: float
+    finest: float
+    automatic_orders: bool
+    automatic_window: bool
+    most_orders: int
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,18 +62,21 @@ class Plan:
     - `n_photons`: photons per batch, which carry the higher orders.
     - `smooth_footprint`: whether a quadrature rule takes the place of the rays, as it does over planes.
     - `random_footprint`: whether each batch shifts the rays at random.
-    - `sharpen`: whether the spread of returns over fine bins is taken out again when the pulse is applied.
     - `degree`, `first_degree`: most scatterings and passages through plates on a path, of all orders and of
       order one.
+    - `reach`: times (ns) between which the pulse's energy lies.
     - `off`: names of the effects that are switched off.
     - `rtol`: relative accuracy aimed at.
+    - `likely_beyond`: estimated share of the light of orders beyond the last.
+    - `limits`: what the plan was made for, and a lidar and a scene that use it must keep to.
+    - `memory`: bytes that a simulation is predicted to take.
     - `effects`: the table, an `Effect` for every row; empty where it was not asked for.
 
     **Example:**
 
     >>> import jaxlidar as jl
     >>> plan = jl.plan(jl.Lidar(), jl.Scene(ground=jl.Ground()))
-    >>> print(str(plan).splitlines()[-1])
+    >>> print(str(plan).splitlines()[-2])
     31 samples of 1 ns from -15 ns, 7 fine bins of 0.5 ns
     """
 
@@ -71,13 +90,16 @@ class Plan:
     n_photons: int
     smooth_footprint: bool
     random_footprint: bool
-    sharpen: bool
     degree: int
     first_degree: int
+    reach: tuple[float, float]
     # Names of the effects that are switched off.
     off: tuple[str, ...]
-    # Compiled programs depend on neither of these.
+    # Compiled programs depend on none of these.
     rtol: float = dataclasses.field(compare=False)
+    likely_beyond: float = dataclasses.field(compare=False)
+    limits: Limits = dataclasses.field(compare=False)
+    memory: float = dataclasses.field(compare=False)
     effects: tuple[Effect, ...] = dataclasses.field(compare=False)
 
     @property
@@ -108,7 +130,7 @@ class Plan:
             sizes += f", {self.n_rays} rays"
         if self.orders > 1:
             sizes += f", {self.n_photons} photons a batch, {self.orders} orders"
-        return "\n".join([*lines, sizes])
+        return "\n".join([*lines, sizes, f"about {in_words(self.memory)} of memory"])
 
 
 def plan(
@@ -124,6 +146,7 @@ def plan(
     bin_width: float | None = None,
     footprint: str = "random",
     effects: Mapping[str, bool] | None = None,
+    max_memory: float | None = None,
     describe: bool = True,
 ) -> Plan:
     """The plan of what `simulate` will do for a lidar and a scene.
@@ -145,21 +168,24 @@ def plan(
     - `n_photons`: photons per batch, at least 1. Default 8192.
     - `n_rays`: rays of the footprint per batch, at least 1; without effect over planes alone, where a
       quadrature rule takes their place. Default None: 4096 with one order or a fixed footprint, else 1024.
-    - `window`: (first, last) sample time, ns. Default None: covers the scene.
+    - `window`: (first, last) sample time, ns. Default None: covers the scene, and multiple scattering until
+      little of it is left, or 300 ns at most.
     - `bin_width`: width of the fine bins, ns, positive; reduced to a whole fraction of the sampling interval.
-      Default None: a quarter of the standard deviation of the pulse with its jitter, between 0.05 and 1
-      sampling intervals; half an interval for a pulse without duration.
+      Default None: a quarter of the pulse's finest feature with its jitter, between 0.05 and 1 sampling
+      intervals; half an interval for a pulse without duration.
     - `footprint`: "random" (each batch shifts the rays, so that the standard error covers them) or "fixed".
       Default "random".
     - `effects`: effects to switch off, by name, as in {"multiple scattering": False}; True asks for what is
       on anyway and refuses scenes that do not have it. The names are those of the table's first column.
       Default None.
+    - `max_memory`: GB that the simulation may take, positive. Default None: a quarter of the machine's.
     - `describe`: whether to make the table of effects with its bounds, which takes some 40 ms. Default True.
 
     **Returns:** a `Plan`; `print` shows it as a table.
 
-    **Raises:** ValueError for inadmissible arguments, for a scene that reaches up to the sensor, and if the
-    geometry is being traced by a JAX transformation: make the plan outside and pass it in.
+    **Raises:** ValueError for inadmissible arguments, for a scene that reaches up to the sensor, for what
+    would take more memory than `max_memory`, and if the geometry is being traced by a JAX transformation:
+    make the plan outside and pass it in.
 
     **Example:**
 
@@ -169,6 +195,7 @@ def plan(
     >>> print(plan.orders, [effect.name for effect in plan.effects if effect.simulated])
     1 ['ground', 'slope spread']
     """
+    check_kinds(lidar, scene)
     rtol = DEFAULT_RTOL if rtol is None else float(rtol)
     if not 0 < rtol < 1:
         raise ValueError(f"rtol = {rtol:g} is outside the admissible range (0, 1)")
@@ -178,8 +205,10 @@ def plan(
             check_integer(name, value)
     if max_step is not None and not 0 < max_step < math.inf:
         raise ValueError(f"max_step = {max_step:g} is outside the admissible range (0, inf)")
+    if max_memory is not None:
+        check_range("max_memory", max_memory, 0.0, low_open=True)
     check_choice("footprint", footprint, ("random", "fixed"))
-    whole = lidar, scene
+    whole = lidar, scene = about_aim(lidar, scene)
     off = switched_off(effects, present(lidar, scene), max_orders)
     lidar, scene = without(lidar, scene, off)
     geometry = PathLengths(lidar, scene)
@@ -187,10 +216,12 @@ def plan(
     letters = spell(optics)
     if "multiple scattering" in off:
         max_orders = 1
-    orders, why, left = _orders(largest_albedo(optics), len(letters.letters), scene, rtol, max_orders)
+    chosen = orders_of(scene, optics, len(letters.letters), rtol, max_orders)
+    orders, plates = chosen.count, len(scene.plates)
     if n_rays is None:
         n_rays = 4096 if orders == 1 or footprint == "fixed" else 1024
-    bins, samples = _time(lidar, scene, geometry, orders, window, bin_width)
+    tail = tail_of(scene, optics, geometry.first / SPEED_OF_LIGHT, geometry.last / SPEED_OF_LIGHT)
+    bins, samples = _time(lidar, scene, geometry, tail if orders > 1 else 0.0, window, bin_width)
     airy = _with_air(bins, lidar, samples)
     metres = 0.5 * SPEED_OF_LIGHT * bins.width
     step = geometry.longest_chord if max_step is None else min(max_step, geometry.longest_chord)
@@ -224,8 +255,11 @@ def plan(
         drawn_first=False,
         independent=False,
     )
-    plates = len(scene.plates)
-    finest = max(known_number(lidar.pulse.finest), known_number(lidar.jitter))
+    degree, first_degree = degree_of(orders, plates), 1 + 2 * plates
+    reach = lidar.pulse.support(known_number(lidar.jitter))
+    spanned = math.ceil((reach[1] - reach[0] + samples[1]) / bins.width) + 5
+    memory = predicted(trace, bins, degree, first_degree, samples[2], spanned)
+    check_memory(memory, max_memory)
     return Plan(
         trace=trace,
         bins=bins,
@@ -238,53 +272,41 @@ def plan(
         n_photons=int(n_photons),
         smooth_footprint=only_planes(scene) and "divergence" not in off,
         random_footprint=footprint == "random" and "divergence" not in off,
-        sharpen=finest >= bins.width,
-        degree=_degree(orders, plates),
-        first_degree=1 + 2 * plates,
+        degree=degree,
+        first_degree=first_degree,
+        reach=reach,
         off=off,
         rtol=rtol,
-        effects=effect_table(*whole, off, orders, (why, left), airy, geometry.upstream) if describe else (),
+        likely_beyond=chosen.beyond,
+        limits=Limits(
+            geometry.first / SPEED_OF_LIGHT,
+            geometry.last / SPEED_OF_LIGHT,
+            largest_albedo(optics),
+            math.hypot(known_number(lidar.pulse.finest), known_number(lidar.jitter)),
+            max_orders is None,
+            window is None,
+            chosen.most,
+        ),
+        memory=memory,
+        effects=effect_table(*whole, off, chosen, airy, geometry.upstream) if describe else (),
     )
-
-
-def _degree(orders: int, plates: int) -> int:
-    """Longest history: every flight, and the way back, may pass every plate."""
-    return orders + (orders + 1) * plates
-
-
-def _orders(
-    albedo: float, kinds: int, scene: Scene, rtol: float, max_orders: int | None
-) -> tuple[int, str, float]:
-    """How many orders to follow, why, and an estimate of the share of the others."""
-    if not can_light_itself(scene):
-        return 1, "one plane cannot light itself", 0.0
-    plates = len(scene.plates)
-    most = 2
-    while most < MAX_ORDERS and math.comb(_degree(most + 1, plates) + kinds, kinds) <= MAX_HISTORIES:
-        most += 1
-    wanted = most
-    if albedo < 1:
-        wanted = 1 + math.ceil(math.log(rtol / 10) / math.log(max(AGAIN * albedo, 1e-6)))
-    orders = min(max(wanted, 2), most) if max_orders is None else int(max_orders)
-    if orders == 1:
-        return 1, "one order is asked for", 0.0
-    return orders, f"orders 2 to {orders}; largest albedo {albedo:.2f}", (AGAIN * albedo) ** orders
 
 
 def _time(
     lidar: Lidar,
     scene: Scene,
     geometry: PathLengths,
-    orders: int,
+    tail: float,
     window: tuple[float, float] | None,
     bin_width: float | None,
 ) -> tuple[Bins, tuple[float, float, int, int]]:
     interval = known_number(lidar.sampling_interval)
     jitter = known_number(lidar.jitter)
     low, high = lidar.pulse.support(jitter)
-    std = math.hypot(known_number(lidar.pulse.std), jitter)
+    lasts = math.hypot(known_number(lidar.pulse.std), jitter) > 0
+    finest = math.hypot(known_number(lidar.pulse.finest), jitter)
     if bin_width is None:
-        target = min(interval, max(0.25 * std, 0.05 * interval) if std > 0 else 0.5 * interval)
+        target = min(interval, max(0.25 * finest, 0.05 * interval) if lasts else 0.5 * interval)
     else:
         if not 0 < bin_width < math.inf:
             raise ValueError(f"bin_width = {bin_width:g} is outside the admissible range (0, inf)")
@@ -295,8 +317,7 @@ def _time(
         # Sampled finely here; the digitiser's own bins are laid when the first return is known.
         interval, per_sample = width, 1
     first, last = geometry.first / SPEED_OF_LIGHT, geometry.last / SPEED_OF_LIGHT
-    if orders > 1:
-        last += min(max(3 * (last - first), TAIL[0]), TAIL[1])
+    last += tail
     if window is None:
         begin = math.floor((first + low) / interval) * interval
         samples = math.ceil((last + high - begin) / interval) + 1

@@ -13,7 +13,7 @@ from jaxlidar.optics.phase import AbstractPhase
 from jaxlidar.optics.spectra import reflectance_at
 from jaxlidar.planning.trace_plan import Scatterer
 from jaxlidar.scenes.scene import Scene
-from jaxlidar.scenes.surfaces import AbstractSheet
+from jaxlidar.scenes.surfaces import AbstractSheet, check_sum
 
 
 class Optics(NamedTuple):
@@ -66,6 +66,7 @@ def scene_optics(lidar: Lidar, scene: Scene) -> list[Optics]:
         t = None
         if isinstance(surface, AbstractSheet):
             t = reflectance_at(surface.transmittance, wavelength, f"{name} transmittance")
+            check_sum(f"{name} reflectance + transmittance", r, t)
         found.append(Optics(name, r, t))
     return found
 

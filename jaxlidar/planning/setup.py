@@ -3,11 +3,17 @@
 from typing import final
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
 
+from jaxlidar._checks import check_kind, is_traced
+from jaxlidar._ranges import inadmissible
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.planning.effects import without
+from jaxlidar.planning.local_origin import about_aim
 from jaxlidar.planning.plan import Plan
-from jaxlidar.scenes.scene import Scene
+from jaxlidar.scenes.scene import Scene, check_kinds
 
 
 @final
@@ -19,6 +25,7 @@ class Setup(eqx.Module):
     - `lidar`: a `Lidar`.
     - `scene`: a `Scene`.
     - `plan`: a `Plan`.
+    - `admissible`: 1; NaN where a traced value lies outside its range. Waveforms are multiplied by it.
 
     **Example:**
 
@@ -32,10 +39,11 @@ class Setup(eqx.Module):
     lidar: Lidar
     scene: Scene
     plan: Plan = eqx.field(static=True)
+    admissible: Float[Array, ""]
 
 
 def reduce(lidar: Lidar, scene: Scene, plan: Plan) -> Setup:
-    """The lidar and the scene without what a plan leaves out, ready to be traced.
+    """The lidar and the scene without what a plan leaves out, with coordinates about the aim point.
 
     **Arguments:**
 
@@ -43,7 +51,12 @@ def reduce(lidar: Lidar, scene: Scene, plan: Plan) -> Setup:
     - `scene`: a `Scene`, with all its effects.
     - `plan`: a `Plan` made by `jaxlidar.plan`.
 
+    Within a JAX transformation values cannot be refused: waveforms are NaN where a traced value lies outside
+    the range that its class states. `jaxlidar.extend.reasons` says which.
+
     **Returns:** a `Setup`.
+
+    **Raises:** TypeError for things of another kind.
 
     **Example:**
 
@@ -53,4 +66,9 @@ def reduce(lidar: Lidar, scene: Scene, plan: Plan) -> Setup:
     >>> float(jl.reduce(lidar, scene, plan).scene.ground.slope)
     0.0
     """
-    return Setup(*without(lidar, scene, plan.off), plan)
+    check_kinds(lidar, scene)
+    check_kind("plan", plan, Plan, "a Plan that jaxlidar.plan made")
+    admissible = jnp.ones(())
+    if any(is_traced(x) for x in jax.tree.leaves((lidar, scene))):
+        admissible = jnp.where(inadmissible((lidar, scene)), jnp.nan, admissible)
+    return Setup(*without(*about_aim(lidar, scene), plan.off), plan, admissible)

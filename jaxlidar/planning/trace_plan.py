@@ -6,6 +6,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+# Elements up to which the pulse is a matrix of fine bins and samples; beyond, it is a band.
+DENSE = 1 << 22
 # Bins over which a return at an instant is spread.
 KERNEL = 3
 
@@ -41,9 +43,13 @@ class Bins:
         """Time in units of bins, clipped to the margins; integers are centres of bins."""
         return jnp.clip((time - self.start) / self.width, -self.row, self.count + self.row)
 
-    def trim(self, padded: Float[Array, "... padded"]) -> Float[Array, "... bins"]:
-        """The bins without the margins."""
-        return padded[..., self.row : self.row + self.count]
+    def trimmed(
+        self, padded: Float[Array, "*s padded"]
+    ) -> tuple[Float[Array, "*s bins"], Float[Array, "*s"]]:
+        """Without the margins, and what these hold together: all that falls outside."""
+        inside = padded[..., self.row : self.row + self.count]
+        before, after = padded[..., : self.row], padded[..., self.row + self.count :]
+        return inside, jnp.sum(before, axis=-1) + jnp.sum(after, axis=-1)
 
 
 class Scatterer(NamedTuple):

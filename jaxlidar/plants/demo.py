@@ -1,5 +1,6 @@
 """The scene that `jaxlidar demo` shows: a tree 15 m tall on bare soil, under one large footprint."""
 
+from jaxlidar._checks import check_number
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.instrument.pulse import GaussianPulse
 from jaxlidar.optics.prospect import Prospect
@@ -60,8 +61,7 @@ def demo_scene(voxel_size: float = 0.25, *, seed: int = 0) -> Scene:
 
     **Raises:** ValueError for a voxel size outside (0, 1].
     """
-    if not 0 < voxel_size <= 1:
-        raise ValueError(f"voxel_size = {voxel_size:g} is outside the admissible range (0, 1]")
+    check_number("voxel_size", voxel_size, 0.0, 1.0, low_open=True)
     return Scene(
         canopy=Canopy(
             tree(voxel_size, seed=seed),

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from jaxlidar._checks import check_range
+from jaxlidar._checks import check_integer, check_kind, check_number, check_range, check_shape
 from jaxlidar.plants.habits import Habit, grow
 from jaxlidar.plants.tree import Tree
 
@@ -51,7 +51,8 @@ def forest(
     **Returns:** a list of `Tree`, in the order of placement. The position of a tree is its `base`.
 
     **Raises:** ValueError for arguments outside the ranges above, and if so many trees cannot be placed at
-    that distance. Random placement fills at most about 0.7 / minimum_distance^2 stems per m2.
+    that distance; TypeError for what is no `Habit`. Random placement fills at most about
+    0.7 / minimum_distance^2 stems per m2.
 
     **Example:**
 
@@ -60,24 +61,31 @@ def forest(
     >>> print(f"{len(trees)} trees of {trees[0].height:.1f} m")
     12 trees of 2.5 m
     """
+    check_kind("habits", habits, Habit | Sequence | None, "a Habit or several")
     kinds = [Habit()] if habits is None else [habits] if isinstance(habits, Habit) else list(habits)
     if not kinds:
         raise ValueError("habits is empty; at least one habit is admissible")
-    check_range("density", density, 0.0, low_open=True)
+    for habit in kinds:
+        check_kind("one of habits", habit, Habit, "a Habit")
+    check_number("density", density, 0.0, low_open=True)
     check_range("area", area, 0.0, low_open=True)
-    check_range("minimum_distance", minimum_distance, 0.0)
+    check_shape("area", area, (2,))
+    check_number("minimum_distance", minimum_distance, 0.0)
     check_range("size", size, 0.0, low_open=True)
+    check_shape("size", size, (2,))
     if size[0] > size[1]:
         raise ValueError(f"size = {size} is not (low, high) with low <= high")
     check_range("origin", origin)
+    check_shape("origin", origin, (3,))
     if individuals is not None:
-        check_range("individuals", individuals, 1)
-    weight = np.ones(len(kinds)) if shares is None else np.asarray(shares, dtype=float)
+        individuals = check_integer("individuals", individuals)
+    shares = [1.0] * len(kinds) if shares is None else shares
+    check_range("shares", shares, 0.0)
+    weight = np.asarray(shares, dtype=float)
     if weight.shape != (len(kinds),):
         raise ValueError(
             f"shares has {weight.size} elements; admissible is one for each of {len(kinds)} habits"
         )
-    check_range("shares", weight, 0.0)
     check_range("sum of shares", weight.sum(), 0.0, low_open=True)
 
     rng = np.random.default_rng(seed)

@@ -6,18 +6,15 @@ length from any point of an axis to its tip is proportional to d^`length_exponen
 shorter than the axis that bears them, and the outline of the crown follows from how the cross-section is
 shared. An axis ends where a fork would be thinner than `smallest_diameter`: in a twig that tapers to exactly
 that diameter. Thinner wood is not modelled; buds sit on shoots without wood.
-
-The default, `broadleaf()`, is the tree of Table 2 of the paper: 15 m tall, 0.89 m thick at the base, branches
-down to 0.03 m, leaf clumps 0.06 m across.
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 
-from jaxlidar._checks import check_range
+from jaxlidar._checks import briefly, check_integer, check_kind, check_number, check_shape, warn_units
 from jaxlidar.plants.lsystem import Item, LSystem, Rule, Word
 from jaxlidar.plants.tree import Tree
 from jaxlidar.plants.turtle import turtle
@@ -29,6 +26,7 @@ SHOOT_SPREAD = 28.0
 BUDS = ("bud_position", "bud_direction", "bud_radius")
 
 
+@final
 @dataclass(frozen=True)
 class Branching:
     """The branching pattern of an axis: number, thickness and angles of its lateral branches.
@@ -48,7 +46,7 @@ class Branching:
       of an internode, 0 or more. Thicker wood bends less, by the fourth root of its diameter. Default 7.
     - `tropism`: upward bend of a horizontal piece, degrees; negative is downward. Default 2.
 
-    **Raises:** ValueError for values outside the ranges above.
+    **Raises:** ValueError for values outside the ranges above; TypeError for what is no number.
 
     **Example:**
 
@@ -67,17 +65,21 @@ class Branching:
     tropism: float = 2.0
 
     def __post_init__(self):
-        check_range("laterals", self.laterals, 1)
-        check_range("share", self.share, 0.0, 1.0)
+        object.__setattr__(self, "laterals", check_integer("laterals", self.laterals))
+        check_shape("share", self.share, (2,))
+        for share in self.share:
+            check_number("share", share, 0.0, 1.0)
         if self.share[0] > self.share[1]:
             raise ValueError(f"share = {self.share} is not (low, high) with low <= high")
-        check_range("angle", self.angle, 0.0, 180.0)
-        check_range("angle_spread", self.angle_spread, 0.0)
-        check_range("divergence", self.divergence)
-        check_range("bend", self.bend, 0.0)
-        check_range("tropism", self.tropism)
+        check_number("angle", self.angle, 0.0, 180.0)
+        check_number("angle_spread", self.angle_spread, 0.0)
+        check_number("divergence", self.divergence)
+        check_number("bend", self.bend, 0.0)
+        check_number("tropism", self.tropism)
 
 
+@final
+@briefly
 @dataclass(frozen=True)
 class Habit:
     """The growth habit of a tree: sizes and branching proportions from which `grow` makes individuals.
@@ -109,7 +111,7 @@ class Habit:
     - `shoot_angle`: angle between shoot and twig, degrees, 0 to 180. Default 50.
     - `shoot_buds`: number of buds on each shoot, at equal distances, 1 or more. Default 8.
 
-    **Raises:** ValueError for values outside the ranges above.
+    **Raises:** ValueError for values outside these ranges, TypeError for other kinds; warns of sizes in cm.
 
     **Example:**
 
@@ -139,16 +141,18 @@ class Habit:
     shoot_buds: int = 8
 
     def __post_init__(self):
-        for name in ("height", "trunk_diameter", "smallest_diameter", "clump_diameter", "exponent"):
-            check_range(name, getattr(self, name), 0.0, low_open=True)
-        check_range("smallest_diameter", self.smallest_diameter, 0.0, self.trunk_diameter)
-        for name in ("length_exponent", "twig", "shoot_length"):
-            check_range(name, getattr(self, name), 0.0, low_open=True)
-        check_range("bole", self.bole, 0.0, 1.0, high_open=True)
-        check_range("stem_angle", self.stem_angle, 0.0, 90.0)
-        check_range("shoot_angle", self.shoot_angle, 0.0, 180.0)
+        sizes = ("height", "trunk_diameter", "clump_diameter", "twig", "shoot_length")
+        for name in (*sizes, "exponent", "length_exponent"):
+            check_number(name, getattr(self, name), 0.0, low_open=True)
+        check_number("smallest_diameter", self.smallest_diameter, 0.0, self.trunk_diameter, low_open=True)
+        check_number("bole", self.bole, 0.0, 1.0, high_open=True)
+        check_number("stem_angle", self.stem_angle, 0.0, 90.0)
+        check_number("shoot_angle", self.shoot_angle, 0.0, 180.0)
         for name, low in (("stems", 1), ("pieces", 1), ("shoots", 0), ("shoot_buds", 1)):
-            check_range(name, getattr(self, name), low)
+            object.__setattr__(self, name, check_integer(name, getattr(self, name), low))
+        check_kind("trunk", self.trunk, Branching, "a Branching")
+        check_kind("branches", self.branches, Branching, "a Branching")
+        warn_units(self)
 
     def wood(self) -> LSystem:
         """The L-system that grows the wood.
@@ -241,10 +245,8 @@ class Habit:
         # An axis of just the smallest diameter may have come out thinner by rounding.
         d, thin = np.maximum(d, self.smallest_diameter), self.smallest_diameter
         turn = rng.uniform(0.0, 360.0, len(d))
-        shoots = [
-            ("/", turn + i * GOLDEN_ANGLE, self.shoot_angle * (i < self.shoots - 1))
-            for i in range(self.shoots)
-        ]
+        last = self.shoots - 1
+        shoots = [("/", turn + i * GOLDEN_ANGLE, self.shoot_angle * (i < last)) for i in range(last + 1)]
         yield from self._internode(np.maximum(length, 0.0), d, thin, how, rng, shoots)
 
     def _internode(
@@ -275,7 +277,7 @@ def grow(habit: Habit | None = None, *, seed: int | np.random.Generator = 0) -> 
 
     **Returns:** a `Tree`.
 
-    **Raises:** ValueError if the wood of the habit does not grow upward at all.
+    **Raises:** ValueError if the wood of the habit does not grow upward; TypeError for what is no `Habit`.
 
     **Example:**
 
@@ -285,6 +287,7 @@ def grow(habit: Habit | None = None, *, seed: int | np.random.Generator = 0) -> 
     1.00 m tall, 9 stems
     """
     habit = broadleaf() if habit is None else habit
+    check_kind("habit", habit, Habit, "a Habit or None")
     rng = np.random.default_rng(seed)
     word = habit.wood().rewrite(seed=rng)
     relative = turtle(word).height
@@ -318,7 +321,7 @@ def broadleaf(**changes: Any) -> Habit:
     >>> habit.height, habit.trunk_diameter, habit.smallest_diameter
     (20.0, 0.89, 0.03)
     """
-    return replace(Habit(), **changes)
+    return Habit(**changes)
 
 
 def conifer(**changes: Any) -> Habit:
@@ -348,10 +351,9 @@ def conifer(**changes: Any) -> Habit:
         bole=0.08,
         trunk=Branching(laterals=5, share=(0.14, 0.24), angle=85.0, bend=1.0, tropism=3.0),
         branches=Branching(share=(0.15, 0.35), angle=50.0, divergence=180.0, bend=4.0, tropism=0.0),
-        shoots=8,
         shoot_length=0.3,
     )
-    return replace(habit, **changes)
+    return Habit(**(vars(habit) | changes))
 
 
 def spreading(**changes: Any) -> Habit:
@@ -380,7 +382,7 @@ def spreading(**changes: Any) -> Habit:
         trunk=Branching(share=(0.45, 0.5), angle=95.0, tropism=1.0),
         branches=Branching(share=(0.35, 0.5), angle=64.0, tropism=3.0),
     )
-    return replace(habit, **changes)
+    return Habit(**(vars(habit) | changes))
 
 
 def shrub(**changes: Any) -> Habit:
@@ -415,4 +417,4 @@ def shrub(**changes: Any) -> Habit:
         shoot_length=0.25,
         shoot_buds=6,
     )
-    return replace(habit, **changes)
+    return Habit(**(vars(habit) | changes))

@@ -13,10 +13,12 @@ module: write NumPy expressions, and write different cases as rules with conditi
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, final
 
 import numpy as np
 from jaxtyping import Float, Int, UInt32
+
+from jaxlidar._checks import check_flag, check_integer, check_kind, check_number, kind_of
 
 # A run of plain symbols, or one symbol with its numbers (in a rule's successor: arrays).
 Item = str | tuple[Any, ...]
@@ -44,6 +46,7 @@ class Module(NamedTuple):
         return self.symbol + (f"({','.join(f'{p:g}' for p in self.parameters)})" if self.parameters else "")
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Word:
     """A word of an L-system: a sequence of n modules, stored as arrays.
@@ -79,8 +82,10 @@ class Word:
 
         **Returns:** a `Word`.
 
-        **Raises:** ValueError for symbols that are not one character and parameters that are not finite.
+        **Raises:** ValueError for symbols that are not one character and parameters that are not finite;
+        TypeError for what is no sequence.
         """
+        check_kind("items", items, Iterable, "a string, or a sequence of strings and tuples")
         codes, arity, parameters = _successor(items, 1, "the word")
         return Word(codes, arity, parameters[0])
 
@@ -111,6 +116,7 @@ class Word:
         return np.flatnonzero(self.codes == ord(symbol))
 
 
+@final
 @dataclass(frozen=True)
 class Rule:
     """A production rule of an L-system: what replaces a module.
@@ -132,7 +138,8 @@ class Rule:
     - `random`: whether `produce` draws random numbers. It then receives a `numpy.random.Generator` as the
       keyword argument `rng`. Default False.
 
-    **Raises:** ValueError for a symbol that is not one character and a weight that is not positive.
+    **Raises:** ValueError for a symbol that is not one character and a weight that is not positive; TypeError
+    for a successor, condition or weight of another kind.
 
     **Example:**
 
@@ -150,8 +157,13 @@ class Rule:
 
     def __post_init__(self):
         _check_symbol(self.symbol, "symbol")
-        if not callable(self.weight) and not (np.isfinite(self.weight) and self.weight > 0):
-            raise ValueError(f"weight = {self.weight:g} is outside the admissible range (0, inf)")
+        if not callable(self.produce):
+            raise TypeError(f"produce is {kind_of(self.produce)}; admissible is a function of the parameters")
+        if self.condition is not None and not callable(self.condition):
+            raise TypeError(f"condition is {kind_of(self.condition)}; admissible is a function or None")
+        if not callable(self.weight):
+            check_number("weight", self.weight, 0.0, low_open=True)
+        check_flag("random", self.random)
 
     def weights(self, parameters: Float[np.ndarray, "p k"]) -> Float[np.ndarray, " k"]:
         """Weight of the rule for each module; zero where the condition does not hold.
@@ -174,6 +186,7 @@ class Rule:
         return weights if self.condition is None else np.where(self.condition(*parameters), weights, 0.0)
 
 
+@final
 @dataclass(frozen=True)
 class LSystem:
     """An L-system: an axiom, which is the word to start from, and production rules.
@@ -184,6 +197,8 @@ class LSystem:
 
     - `axiom`: a `Word`, or symbols and parameters in the form that `Word.of` takes.
     - `rules`: a sequence of `Rule`, for any number of symbols, in any order.
+
+    **Raises:** TypeError for rules of another kind.
 
     **Example:** a binary tree whose branches end at a radius of 1 cm.
 
@@ -202,7 +217,9 @@ class LSystem:
 
     def __post_init__(self):
         by_symbol: dict[str, list[Rule]] = {}
+        check_kind("rules", self.rules, Sequence, "a sequence of Rule, as in [rule]")
         for rule in self.rules:
+            check_kind("one of rules", rule, Rule, "a Rule")
             by_symbol.setdefault(rule.symbol, []).append(rule)
         object.__setattr__(self, "_by_symbol", by_symbol)
 
@@ -225,12 +242,14 @@ class LSystem:
 
         **Returns:** a `Word`.
 
-        **Raises:** ValueError for negative `steps`, words longer than `max_modules`, words to which rules
-        still apply after `max_steps`, rules whose successors are malformed or not finite, rules with
-        inadmissible weights, and symbols that occur with different numbers of parameters.
+        **Raises:** ValueError for `steps` that are negative or no integer, words longer than `max_modules`,
+        words to which rules still apply after `max_steps`, rules whose successors are malformed or not
+        finite, rules with inadmissible weights, and symbols that occur with different numbers of parameters.
         """
-        if steps is not None and steps < 0:
-            raise ValueError(f"steps = {steps} is outside the admissible range [0, inf)")
+        if steps is not None:
+            steps = check_integer("steps", steps, 0)
+        max_modules = check_integer("max_modules", max_modules)
+        max_steps = check_integer("max_steps", max_steps)
         rng = np.random.default_rng(seed)
         word = self.axiom if isinstance(self.axiom, Word) else Word.of(self.axiom)
         for _ in range(max_steps if steps is None else steps):

@@ -2,13 +2,16 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
+from typing import final
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxlidar._checks import check_range
+from jaxlidar._checks import briefly, check_kind, check_number, check_range, check_shape
 
 
+@final
+@briefly
 @dataclass(frozen=True, eq=False)
 class Tree:
     """The geometry of a tree: n branch segments, each a cone frustum, and m spherical leaf clumps.
@@ -28,7 +31,7 @@ class Tree:
 
     **Raises:** ValueError for arrays of other shapes, values that are not finite, radii that are not
     positive, negative orders, directions that are not unit vectors, and parents that do not come before their
-    children.
+    children; TypeError for what is no NumPy array, and for parents and orders that are no integers.
 
     **Example:**
 
@@ -49,6 +52,12 @@ class Tree:
     bud_radius: Float[np.ndarray, " m"]
 
     def __post_init__(self):
+        for field in fields(self):
+            check_kind(field.name, getattr(self, field.name), np.ndarray, "a NumPy array")
+        for name in ("parent", "order"):
+            dtype = getattr(self, name).dtype
+            if not np.issubdtype(dtype, np.integer):
+                raise TypeError(f"{name} is an array of {dtype}; admissible are integers")
         n, m = len(self.start), len(self.bud_position)
         for name, shape in (
             *((name, (n, 3)) for name in ("start", "end")),
@@ -56,9 +65,7 @@ class Tree:
             *((name, (m, 3)) for name in ("bud_position", "bud_direction")),
             ("bud_radius", (m,)),
         ):
-            has = np.shape(getattr(self, name))
-            if has != shape:
-                raise ValueError(f"{name} has the shape {has}; admissible is {shape}")
+            check_shape(name, getattr(self, name), shape)
         for name in ("start", "end", "bud_position", "bud_direction"):
             check_range(name, getattr(self, name))
         for name in ("radius_start", "radius_end", "bud_radius"):
@@ -82,11 +89,14 @@ class Tree:
 
         **Returns:** a `Tree` with the stems of all.
 
-        **Raises:** ValueError if there is no tree.
+        **Raises:** ValueError if there is no tree; TypeError for what is no `Tree`.
         """
+        check_kind("trees", trees, Iterable, "several Tree, as in [tree, other]")
         trees = tuple(trees)
         if not trees:
             raise ValueError("trees is empty; at least one tree is admissible")
+        for tree in trees:
+            check_kind("one of trees", tree, Tree, "a Tree")
         parts = {f.name: np.concatenate([getattr(t, f.name) for t in trees]) for f in fields(Tree)}
         sizes = [len(t.start) for t in trees]
         offset = np.repeat(np.cumsum([0, *sizes[:-1]]), sizes)
@@ -156,7 +166,7 @@ class Tree:
 
         **Raises:** ValueError for a radius that is not positive.
         """
-        check_range("radius", radius, 0.0, low_open=True)
+        check_number("radius", radius, 0.0, low_open=True)
         return replace(self, bud_radius=np.full(len(self.bud_radius), float(radius)))
 
     def translated(self, offset: tuple[float, float, float] | Float[np.ndarray, "3"]) -> "Tree":
@@ -168,10 +178,11 @@ class Tree:
 
         **Returns:** a `Tree`.
 
-        **Raises:** ValueError for an offset that is not finite.
+        **Raises:** ValueError for an offset that is not finite or not three numbers.
         """
+        check_range("offset", offset)
+        check_shape("offset", offset, (3,))
         by = np.asarray(offset, dtype=float)
-        check_range("offset", by)
         return replace(self, start=self.start + by, end=self.end + by, bud_position=self.bud_position + by)
 
     def rotated(self, angle: float) -> "Tree":
@@ -185,7 +196,7 @@ class Tree:
 
         **Raises:** ValueError for an angle that is not finite.
         """
-        check_range("angle", angle)
+        check_number("angle", angle)
         c, s = np.cos(np.deg2rad(angle)), np.sin(np.deg2rad(angle))
         turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
         return replace(
@@ -207,7 +218,7 @@ class Tree:
 
         **Raises:** ValueError for a factor that is not positive.
         """
-        check_range("factor", factor, 0.0, low_open=True)
+        check_number("factor", factor, 0.0, low_open=True)
         return replace(
             self,
             start=self.start * factor,

@@ -4,7 +4,7 @@ from math import cos, radians, sin, sqrt
 
 import numpy as np
 
-from jaxlidar._checks import check_range
+from jaxlidar._checks import check_kind, check_number, check_range, check_shape
 from jaxlidar.plants.lsystem import Word
 from jaxlidar.plants.tree import Tree
 
@@ -64,7 +64,8 @@ def turtle(
     **Returns:** a `Tree`. The order of a segment is the number of branchings between it and its root.
 
     **Raises:** ValueError for brackets that do not match, radii that are not positive, a heading or left of
-    zero length, a left along the heading, and numbers that are not finite.
+    zero length, a left along the heading, and numbers that are not finite or of another shape; TypeError for
+    a word of another kind.
 
     **Source:** Prusinkiewicz and Lindenmayer (1990), The Algorithmic Beauty of Plants, sections 1.5, 1.10 and
     2.1.
@@ -76,11 +77,14 @@ def turtle(
     >>> print(f"{len(tree.start)} segments; buds at heights {tree.bud_position[:, 2].round(2).tolist()} m")
     3 segments; buds at heights [3.41, 4.0] m
     """
+    check_kind("word", word, Word | str, "a Word or a string")
     word = word if isinstance(word, Word) else Word.of(word)
-    for name, value in (("angle", angle), ("length", length), ("position", position)):
-        check_range(name, value)
-    check_range("radius", radius, 0.0, low_open=True)
-    check_range("bud_radius", bud_radius, 0.0, low_open=True)
+    check_number("angle", angle)
+    check_number("length", length)
+    check_number("radius", radius, 0.0, low_open=True)
+    check_number("bud_radius", bud_radius, 0.0, low_open=True)
+    check_range("position", position)
+    check_shape("position", position, (3,))
     frame = _frame(heading, left)
     x, y, z = map(float, position)
     parent, order, branching = -1, 0, False
@@ -169,13 +173,12 @@ def turtle(
 
 def _frame(heading: Vector, left: Vector) -> list[Vector]:
     """Heading, left and up, orthonormal."""
-    ahead = np.asarray(heading, dtype=float)
-    aside = np.asarray(left, dtype=float)
-    for name, value in (("heading", ahead), ("left", aside)):
+    for name, value in (("heading", heading), ("left", left)):
         check_range(name, value)
+        check_shape(name, value, (3,))
         check_range(f"length of {name}", np.linalg.norm(value), 0.0, low_open=True)
-    ahead = ahead / np.linalg.norm(ahead)
-    aside = aside / np.linalg.norm(aside)
+    ahead = np.asarray(heading, dtype=float) / np.linalg.norm(heading)
+    aside = np.asarray(left, dtype=float) / np.linalg.norm(left)
     aside = aside - (aside @ ahead) * ahead
     if np.linalg.norm(aside) < 1e-9:
         raise ValueError(f"left = {tuple(left)} is along the heading; any other direction is admissible")

@@ -13,7 +13,15 @@ from collections.abc import Iterable
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxlidar._checks import check_choice, check_range
+from jaxlidar._checks import (
+    check_choice,
+    check_integer,
+    check_kind,
+    check_number,
+    check_range,
+    check_shape,
+    kind_of,
+)
 from jaxlidar.plants.tree import Tree
 from jaxlidar.scenes.voxels import VoxelMap
 
@@ -59,7 +67,7 @@ def voxelise(
     **Returns:** a `VoxelMap`.
 
     **Raises:** ValueError for inadmissible arguments, for trees with neither wood nor clumps, for trees that
-    reach out of a given grid, and for more material than the grid can hold.
+    reach out of a given grid, and for more material than the grid can hold; TypeError for what is no `Tree`.
 
     **Source:** Cauchy (1841); for the meaning of a voxel's probabilities, `VoxelMap.from_probability`.
 
@@ -72,13 +80,13 @@ def voxelise(
     >>> print(f"{leaf_area / len(tree.bud_position):.4f} m2 per clump")
     0.0010 m2 per clump
     """
+    check_kind("trees", trees, Tree | Iterable, "a Tree or several")
     trees = [trees] if isinstance(trees, Tree) else list(trees)
     size = _edges(voxel_size)
     check_choice("wood", wood, ("volume", "surface"))
     if leaf_area is not None:
-        check_range("leaf_area", leaf_area, 0.0)
-    if samples != int(samples) or samples < 1:
-        raise ValueError(f"samples = {samples} is outside the admissible range [1, inf) of integers")
+        check_number("leaf_area", leaf_area, 0.0)
+    samples = check_integer("samples", samples)
     tree = Tree.joined(trees)
     if not len(tree.start) and not len(tree.bud_position):
         raise ValueError("trees have neither wood nor clumps; there is nothing to voxelise")
@@ -131,7 +139,7 @@ def voxelise_points(
     **Returns:** a `VoxelMap` with spherical leaf angles.
 
     **Raises:** ValueError for inadmissible arguments, for points outside a given grid, and for a positive
-    leaf area where no voxel has enough leaf points.
+    leaf area where no voxel has enough leaf points; TypeError where `is_wood` is no array of booleans.
 
     **Example:**
 
@@ -142,14 +150,16 @@ def voxelise_points(
     (4, 4, 4) 6.00 m2
     """
     check_range("points", points)
-    check_range("leaf_area", leaf_area, 0.0)
-    check_range("wood_probability", wood_probability, 0.0, 1.0)
-    check_range("min_points", min_points, 1)
-    if len(points) == 0:
-        raise ValueError("points is empty; at least one point is admissible")
-    on_wood = np.zeros(len(points), bool) if is_wood is None else is_wood
-    if len(on_wood) != len(points):
-        raise ValueError(f"is_wood has {len(on_wood)} elements; admissible is one a point, {len(points)}")
+    points = np.asarray(points, float)
+    if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
+        raise ValueError(f"points has shape {points.shape}; admissible is (n, 3), with one point or more")
+    check_number("leaf_area", leaf_area, 0.0)
+    check_number("wood_probability", wood_probability, 0.0, 1.0)
+    min_points = check_integer("min_points", min_points)
+    on_wood = np.zeros(len(points), bool) if is_wood is None else np.asarray(is_wood)
+    if on_wood.dtype != bool:
+        raise TypeError(f"is_wood is {kind_of(is_wood)}; admissible is an array of booleans, one a point")
+    check_shape("is_wood", on_wood, (len(points),))
     size = _edges(voxel_size)
     # A point on the upper face still counts in the voxel below it.
     grid = _Grid.of(points.min(axis=0), np.nextafter(points.max(axis=0), np.inf), size, origin, shape)
@@ -177,6 +187,8 @@ def crop(voxels: VoxelMap) -> VoxelMap:
 
     **Returns:** a `VoxelMap` of the same voxels, smaller, with `origin` moved to its new corner.
 
+    **Raises:** TypeError for what is no `VoxelMap`.
+
     **Example:**
 
     >>> import numpy as np, jaxlidar as jl
@@ -186,6 +198,7 @@ def crop(voxels: VoxelMap) -> VoxelMap:
     >>> print(smaller.shape, smaller.origin.tolist())
     (2, 3, 1) [1.0, 0.5, 1.5]
     """
+    check_kind("voxels", voxels, VoxelMap, "a VoxelMap")
     full = voxels.mean_extinction() > 0
     if not full.any():
         full[0, 0, 0] = True
@@ -199,7 +212,7 @@ def crop(voxels: VoxelMap) -> VoxelMap:
         None if voxels.leaf is None else voxels.leaf[inside],
         None if voxels.bark is None else voxels.bark[inside],
         voxels.voxel_size,
-        voxels.origin + voxels.voxel_size * np.array(first),
+        np.asarray(voxels.origin, float) + np.asarray(voxels.voxel_size, float) * first,
         voxels.leaf_angles,
     )
 
@@ -220,8 +233,10 @@ class _Grid:
             count = np.maximum(np.ceil(high / size - 1e-9) - first, 1)
             return _Grid(first * size, size, tuple(int(n) for n in count))
         check_range("origin", origin)
+        check_shape("origin", origin, (3,))
         check_range("shape", shape, 1)
-        grid = _Grid(np.asarray(origin, float), size, tuple(int(n) for n in shape))
+        check_shape("shape", shape, (3,))
+        grid = _Grid(np.asarray(origin, float), size, tuple(check_integer("shape", n) for n in shape))
         top = grid.low + size * grid.shape
         if np.any(low < grid.low - 1e-9 * size) or np.any(high > top + 1e-9 * size):
             asked = f"origin = {tuple(grid.low.tolist())} and shape = {grid.shape}"
@@ -242,10 +257,8 @@ class _Grid:
 
 def _edges(voxel_size: float | tuple[float, float, float]) -> np.ndarray:
     check_range("voxel_size", voxel_size, 0.0, low_open=True)
-    size = np.asarray(voxel_size, float)
-    if size.shape not in ((), (3,)):
-        raise ValueError(f"voxel_size has the shape {size.shape}; admissible is one number, or three")
-    return np.broadcast_to(size, (3,)).copy()
+    check_shape("voxel_size", voxel_size, (), (3,))
+    return np.broadcast_to(np.asarray(voxel_size, float), (3,)).copy()
 
 
 def _reach(tree: Tree) -> tuple[np.ndarray, np.ndarray]:

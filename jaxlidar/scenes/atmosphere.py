@@ -24,12 +24,24 @@ bands of water vapour (0.94, 1.13, 1.38, 1.87 micrometres) and oxygen (0.76).
 """
 
 import math
+from typing import ClassVar, final
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxlidar._checks import as_array, as_optional_scalar, as_scalar, check_choice, check_range
+from jaxlidar._checks import (
+    as_array,
+    as_scalar,
+    briefly,
+    check_choice,
+    check_flag,
+    check_range,
+    optional_scalar,
+    scalar,
+    warn_units,
+)
+from jaxlidar._ranges import Range, check_ranges
 
 # Peck and Reeder's formula is fitted to 230..1690 nm and smooth far beyond; aerosol exponents to about 2500.
 _WAVELENGTHS = (230.0, 3000.0)
@@ -43,7 +55,7 @@ _MOLECULAR_LIDAR_RATIO = 8 * math.pi / 3
 
 
 def _wavelength(wavelength: ArrayLike) -> Float[Array, "..."]:
-    wavelength = as_array(wavelength)
+    wavelength = as_array(wavelength, "wavelength")
     check_range("wavelength", wavelength, *_WAVELENGTHS)
     return wavelength
 
@@ -120,7 +132,7 @@ def aerosol_extinction(
     """
     check_range("visibility", visibility, 0.0, low_open=True)
     check_choice("model", model, ("kim", "kruse"))
-    v = as_scalar(visibility)
+    v = as_scalar(visibility, "visibility")
     if model == "kruse":
         low = 0.585 * jnp.cbrt(v)
     else:
@@ -129,6 +141,8 @@ def aerosol_extinction(
     return 3.912e-3 / v * jnp.exp(-exponent * jnp.log(_wavelength(wavelength) / 550.0))
 
 
+@final
+@briefly
 class Atmosphere(eqx.Module):
     """A clear atmosphere: molecules and aerosol whose densities fall exponentially with height.
 
@@ -151,7 +165,8 @@ class Atmosphere(eqx.Module):
     - `base_height`: height of the reference plane above sea level, m, -500 to 9000. It reduces the density of
       molecules only; `visibility` holds at z = 0 whatever the base height. Default 0.
 
-    **Raises:** ValueError for a value outside its range and for an unknown model.
+    **Raises:** ValueError for a value outside its range and for an unknown model; TypeError for a thing of
+    another kind. A scale height that is likely given in km gives a `UnitWarning`.
 
     **Source:** see `jaxlidar.scenes.atmosphere` for the equations.
 
@@ -164,23 +179,31 @@ class Atmosphere(eqx.Module):
     0.788
     """
 
-    visibility: Float[Array, ""] | None = eqx.field(converter=as_optional_scalar, default=23.0)
+    visibility: Float[Array, ""] | None = eqx.field(converter=optional_scalar("visibility"), default=23.0)
     rayleigh: bool = eqx.field(static=True, default=True)
     aerosol_model: str = eqx.field(static=True, default="kim")
-    rayleigh_scale_height: Float[Array, ""] = eqx.field(converter=as_scalar, default=8450.0)
-    aerosol_scale_height: Float[Array, ""] = eqx.field(converter=as_scalar, default=1400.0)
-    lidar_ratio: Float[Array, ""] | None = eqx.field(converter=as_optional_scalar, default=None)
-    base_height: Float[Array, ""] = eqx.field(converter=as_scalar, default=0.0)
+    rayleigh_scale_height: Float[Array, ""] = eqx.field(
+        converter=scalar("rayleigh_scale_height"), default=8450.0
+    )
+    aerosol_scale_height: Float[Array, ""] = eqx.field(
+        converter=scalar("aerosol_scale_height"), default=1400.0
+    )
+    lidar_ratio: Float[Array, ""] | None = eqx.field(converter=optional_scalar("lidar_ratio"), default=None)
+    base_height: Float[Array, ""] = eqx.field(converter=scalar("base_height"), default=0.0)
+
+    ranges: ClassVar = {
+        "visibility": Range(0.0, low_open=True),
+        "rayleigh_scale_height": Range(0.0, low_open=True),
+        "aerosol_scale_height": Range(0.0, low_open=True),
+        "lidar_ratio": Range(0.0, low_open=True),
+        "base_height": Range(-500.0, 9000.0),
+    }
 
     def __check_init__(self):
-        if self.visibility is not None:
-            check_range("visibility", self.visibility, 0.0, low_open=True)
+        check_flag("rayleigh", self.rayleigh)
         check_choice("aerosol_model", self.aerosol_model, ("kim", "kruse"))
-        check_range("rayleigh_scale_height", self.rayleigh_scale_height, 0.0, low_open=True)
-        check_range("aerosol_scale_height", self.aerosol_scale_height, 0.0, low_open=True)
-        if self.lidar_ratio is not None:
-            check_range("lidar_ratio", self.lidar_ratio, 0.0, low_open=True)
-        check_range("base_height", self.base_height, -500.0, 9000.0)
+        check_ranges(self)
+        warn_units(self)
 
     def _layers(self, wavelength: ArrayLike) -> list[tuple[Array, Array, Array | float]]:
         """For molecules and for aerosol: extinction at z = 0 in 1/m, scale height in m, lidar ratio in sr."""
@@ -207,7 +230,7 @@ class Atmosphere(eqx.Module):
 
         **Raises:** ValueError for a wavelength outside its range.
         """
-        wavelength, height = _wavelength(wavelength), as_array(height)
+        wavelength, height = _wavelength(wavelength), as_array(height, "height")
         total = jnp.zeros(wavelength.shape + height.shape)
         for at_zero, scale, _ in self._layers(wavelength):
             total = total + _outer(at_zero, jnp.exp(-height / scale))
@@ -232,11 +255,12 @@ class Atmosphere(eqx.Module):
 
         **Raises:** ValueError for a value outside its range.
         """
-        wavelength, height, altitude = _wavelength(wavelength), as_array(height), as_scalar(altitude)
+        wavelength, height = _wavelength(wavelength), as_array(height, "height")
+        altitude, zenith = as_scalar(altitude, "altitude"), as_scalar(zenith, "zenith")
         check_range("height", height)
         check_range("altitude", altitude)
         check_range("zenith", zenith, 0.0, 89.0)
-        slant = 1 / jnp.cos(jnp.deg2rad(as_scalar(zenith)))
+        slant = 1 / jnp.cos(jnp.deg2rad(zenith))
         between = jnp.maximum(altitude - height, 0.0)
         total = jnp.zeros(wavelength.shape + height.shape)
         for at_zero, scale, _ in self._layers(wavelength):

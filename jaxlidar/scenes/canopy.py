@@ -1,25 +1,35 @@
 """The canopy: a voxel map with the optical properties of its leaf and bark."""
 
 from collections.abc import Callable
-from typing import Any, final
+from typing import Any, ClassVar, final
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
-from jaxlidar._checks import check_choice, check_range, concrete
+from jaxlidar._checks import (
+    briefly,
+    check_choice,
+    check_flag,
+    check_kind,
+    check_range,
+    concrete,
+    kind_of,
+)
+from jaxlidar._ranges import SHARE
 from jaxlidar.optics.phase import AbstractPhase
-from jaxlidar.optics.spectra import reflectance_at
-from jaxlidar.scenes.surfaces import Reflectance, as_reflectance, check_reflectance
+from jaxlidar.optics.spectra import Spectrum, reflectance_at
+from jaxlidar.scenes.surfaces import Reflectance, check_reflectance, reflectance_field
 from jaxlidar.scenes.voxels import VoxelMap
 
 
 def _as_bark(x: Any) -> Any:
-    return x if isinstance(x, AbstractPhase) else as_reflectance(x)
+    return x if isinstance(x, AbstractPhase | None) else reflectance_field("bark")(x)
 
 
 @final
+@briefly
 class Canopy(eqx.Module):
     """A canopy: leaf and bark in voxels, with their optical properties.
 
@@ -41,7 +51,7 @@ class Canopy(eqx.Module):
       "open".
 
     **Raises:** ValueError for missing optics, a bark reflectance outside [0, 1] and unknown choices;
-    TypeError if `voxels` is not a `VoxelMap`.
+    TypeError for a thing of another kind.
 
     **Example:**
 
@@ -60,9 +70,19 @@ class Canopy(eqx.Module):
     hotspot: bool = eqx.field(static=True, default=False)
     sides: str = eqx.field(static=True, default="open")
 
+    ranges: ClassVar = {"bark": SHARE}
+
     def __check_init__(self):
-        if not isinstance(self.voxels, VoxelMap):
-            raise TypeError(f"voxels is a {type(self.voxels).__name__}; admissible is a VoxelMap")
+        check_kind("voxels", self.voxels, VoxelMap, "a VoxelMap")
+        # A class can be called too, and so can a spectrum, but neither gives reflectance and transmittance.
+        if isinstance(self.leaf, type | Spectrum) or not (
+            callable(self.leaf) or isinstance(self.leaf, AbstractPhase | None)
+        ):
+            raise TypeError(
+                f"leaf is {kind_of(self.leaf)}; admissible are leaf optics, such as "
+                "LeafOptics(reflectance=0.4, transmittance=0.3), or a volume scatterer"
+            )
+        check_flag("hotspot", self.hotspot)
         if self.voxels.leaf is not None and self.leaf is None:
             raise ValueError("leaf = None, but the voxel map has leaf: give its optics")
         if self.voxels.bark is not None and self.bark is None:
@@ -88,7 +108,7 @@ class Canopy(eqx.Module):
         return self.leaf is not None and self.transmission == "straight"
 
     def leaf_optics(
-        self, wavelength: Float[Array, "wavelengths"]
+        self, wavelength: Float[ArrayLike, "wavelengths"]
     ) -> tuple[Float[Array, "wavelengths"], Float[Array, "wavelengths"]]:
         """Leaf reflectance and transmittance; for a volume scatterer, its albedo and zero.
 
@@ -98,14 +118,18 @@ class Canopy(eqx.Module):
 
         **Returns:** (reflectance, transmittance), each (wavelengths,).
 
-        **Raises:** ValueError if one of them is outside [0, 1], or their sum exceeds 1.
+        **Raises:** ValueError if one of them is outside [0, 1], or their sum exceeds 1; TypeError where the
+        leaf optics return something else than the two.
         """
         if isinstance(self.leaf, AbstractPhase):
             albedo = reflectance_at(self.leaf.albedo, wavelength, "leaf albedo")
             return albedo, jnp.zeros_like(albedo)
         assert self.leaf is not None
         wl = np.asarray(wavelength) if concrete(wavelength) is not None else wavelength
-        r, t = self.leaf(wl)
+        optics = self.leaf(wl)
+        if not isinstance(optics, tuple) or len(optics) != 2:
+            raise TypeError(f"leaf returns {kind_of(optics)}; admissible is (reflectance, transmittance)")
+        r, t = optics
         check_range("leaf reflectance", r, 0.0, 1.0 + 1e-6)
         check_range("leaf transmittance", t, 0.0, 1.0 + 1e-6)
         check_range("leaf reflectance + transmittance", r + t, 0.0, 1.0 + 1e-5)
@@ -113,7 +137,7 @@ class Canopy(eqx.Module):
         r, t = (reflectance_at(value, wavelength, name) for value, name in zip((r, t), names))
         return r, t
 
-    def bark_reflectance(self, wavelength: Float[Array, "wavelengths"]) -> Float[Array, "wavelengths"]:
+    def bark_reflectance(self, wavelength: Float[ArrayLike, "wavelengths"]) -> Float[Array, "wavelengths"]:
         """Reflectance of bark; for a volume scatterer, its albedo.
 
         **Arguments:**

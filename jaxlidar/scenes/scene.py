@@ -1,19 +1,24 @@
 """The scene that a lidar observes: canopy, plates, ground and atmosphere, each of them optional."""
 
+from collections.abc import Iterable
 from typing import Any, final
 
 import equinox as eqx
 
+from jaxlidar._checks import briefly, check_kind, kind_of
+from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.scenes.atmosphere import Atmosphere
 from jaxlidar.scenes.canopy import Canopy
 from jaxlidar.scenes.surfaces import AbstractGround, AbstractSheet, AbstractSurface
+from jaxlidar.scenes.voxels import VoxelMap
 
 
 def _as_plates(x: Any) -> Any:
-    return x if isinstance(x, AbstractSurface) else tuple(x)
+    return tuple(x) if isinstance(x, Iterable) else x
 
 
 @final
+@briefly
 class Scene(eqx.Module):
     """A scene: the canopy, plates, ground and atmosphere that a lidar observes.
 
@@ -43,21 +48,53 @@ class Scene(eqx.Module):
     atmosphere: Atmosphere | None = None
 
     def __check_init__(self):
-        kinds = {"canopy": Canopy, "ground": AbstractGround, "atmosphere": Atmosphere}
-        for field, kind in kinds.items():
-            value = getattr(self, field)
-            if value is not None and not isinstance(value, kind):
-                name = kind.__name__.removeprefix("Abstract")
-                raise TypeError(f"{field} is a {type(value).__name__}; admissible is a {name} or None")
-        if not isinstance(self.plates, tuple):
-            raise TypeError(
-                f"plates is a {type(self.plates).__name__}; admissible is a tuple, as in (plate,)"
-            )
+        hint = ", as in Canopy(voxels, leaf=...)" if isinstance(self.canopy, VoxelMap) else ""
+        for field, kind, admissible in (
+            ("canopy", Canopy, f"a Canopy or None{hint}"),
+            ("ground", AbstractGround, "a Ground or None, as in Ground(reflectance=0.3)"),
+            ("atmosphere", Atmosphere, "an Atmosphere or None"),
+        ):
+            check_kind(field, getattr(self, field), kind | None, admissible)
+        check_kind("plates", self.plates, tuple, "a tuple, as in (plate,)")
         for plate in self.plates:
             if not isinstance(plate, AbstractSheet):
-                raise TypeError(f"plates has a {type(plate).__name__}; admissible is a tuple of Plate")
+                raise TypeError(f"plates has {kind_of(plate)}; admissible is a tuple of Plate")
 
     @property
     def surfaces(self) -> tuple[AbstractSurface, ...]:
         """All surfaces: the ground, if there is one, then the plates, as the tracer numbers them."""
         return (() if self.ground is None else (self.ground,)) + self.plates
+
+
+def check_kinds(lidar: Any, scene: Any) -> None:
+    """Refuse what is no lidar, or no scene, before anything is computed with it.
+
+    **Arguments:**
+
+    - `lidar`: what is admissible as a `Lidar`.
+    - `scene`: what is admissible as a `Scene`.
+
+    **Raises:** TypeError that says what each is, and what to do.
+    """
+    if isinstance(lidar, Scene) and isinstance(scene, Lidar):
+        raise TypeError("lidar is a Scene and scene is a Lidar: they are swapped")
+    for field, x, kind in (("lidar", lidar, Lidar), ("scene", scene, Scene)):
+        name = kind.__name__
+        if isinstance(x, list | tuple):
+            many = " (to fit many shots: inversion.retrieve_many)" if kind is Lidar else ""
+            raise TypeError(
+                f"{field} is {kind_of(x)}; admissible is one {name}: simulate several in a loop{many}"
+            )
+        part = next((part for part, kinds in _PARTS.items() if isinstance(x, kinds)), None)
+        hint = f", as in Scene({part})" if kind is Scene and part else ""
+        check_kind(field, x, kind, f"a {name}{hint}")
+
+
+# What is given as a scene where a part of one was meant.
+_PARTS = {
+    "canopy=canopy": Canopy,
+    "canopy=Canopy(voxels, leaf=...)": VoxelMap,
+    "plates=(plate,)": AbstractSheet,
+    "ground=ground": AbstractGround,
+    "atmosphere=atmosphere": Atmosphere,
+}

@@ -1,14 +1,15 @@
 """Shapes of surfaces, and where rays meet them."""
 
 import abc
+from collections.abc import Sequence
 from typing import Any, final
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
-from jaxlidar._checks import known_array
+from jaxlidar._checks import as_scalar, known_array
 from jaxlidar._vectors import FAR, Scalar, Vec, dot, vec
 
 # Rays whose direction has a cosine with the normal below this never meet the plane.
@@ -25,10 +26,12 @@ class AbstractShape(eqx.Module):
     **Example:** the shape of a level ground, met 8 m below a point.
 
     >>> import jaxlidar as jl
+    >>> import jax.numpy as jnp
+    >>> from jaxlidar.extend import vec
     >>> shape = jl.Ground(height=2.0).shape
     >>> isinstance(shape, jl.AbstractShape)
     True
-    >>> float(shape.distance((0.0, 0.0, 10.0), (0.0, 0.0, -1.0)))
+    >>> float(shape.distance(vec(jnp.array([0.0, 0.0, 10.0])), vec(jnp.array([0.0, 0.0, -1.0]))))
     8.0
     """
 
@@ -114,22 +117,26 @@ class Plane(AbstractShape):
     foot: Float[Array, "3"]
 
     @staticmethod
-    def of(height: Float[Array, ""], slope: Float[Array, ""], aspect: Float[Array, ""]) -> "Plane":
-        """The plane through (0, 0, height) of a given slope and aspect.
+    def of(
+        height: ArrayLike, slope: ArrayLike, aspect: ArrayLike, position: ArrayLike | Sequence = (0.0, 0.0)
+    ) -> "Plane":
+        """The plane of a given slope and aspect through a point.
 
         **Arguments:**
 
-        - `height`: height at x = y = 0, m.
+        - `height`: height of the point, m.
         - `slope`: angle between the normal and the vertical, degrees.
         - `aspect`: azimuth to which the normal is tilted, degrees clockwise from north (+y). The plane falls
           in this direction.
+        - `position`: (2,) horizontal place of the point, m. Default (0, 0).
 
         **Returns:** a `Plane`.
         """
-        s, a = jnp.deg2rad(slope), jnp.deg2rad(aspect)
+        height = as_scalar(height, "height")
+        s, a = jnp.deg2rad(as_scalar(slope, "slope")), jnp.deg2rad(as_scalar(aspect, "aspect"))
         upward = jnp.stack([jnp.sin(s) * jnp.sin(a), jnp.sin(s) * jnp.cos(a), jnp.cos(s)])
-        zero = jnp.zeros_like(height)
-        return Plane(upward, jnp.stack([zero, zero, height]))
+        place = jnp.asarray(position, height.dtype)
+        return Plane(upward, jnp.stack([place[0], place[1], height]))
 
     @property
     def lights_itself(self) -> bool:

@@ -1,12 +1,26 @@
 """Surfaces of a scene: the ground and the plates above it."""
 
 import abc
-from typing import Any, final
+from collections.abc import Callable
+from typing import Any, ClassVar, TypeVar, final
 
 import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from jaxlidar._checks import as_array, as_scalar, check_choice, check_range, concrete
+from jaxlidar._checks import (
+    as_array,
+    briefly,
+    check_choice,
+    check_kind,
+    check_numbers,
+    check_range,
+    concrete,
+    coordinates,
+    scalar,
+)
+from jaxlidar._ranges import SHARE, SUM_OF_SHARES, Range, check_ranges
 from jaxlidar.optics.laws import AbstractLaw, Lambertian
 from jaxlidar.optics.spectra import Spectrum
 from jaxlidar.scenes.shapes import AbstractShape, Plane
@@ -14,27 +28,73 @@ from jaxlidar.scenes.shapes import AbstractShape, Plane
 # A reflectance is one number, one number per wavelength, or a spectrum.
 Reflectance = Float[Array, ""] | Float[Array, "wavelengths"] | Spectrum
 
+_PLACED = {
+    "height": Range(),
+    "slope": Range(0.0, 90.0, high_open=True, mirrored=True),
+    "aspect": Range(),
+    "position": Range(),
+}
 
-def as_reflectance(x: Any) -> Any:
-    """Convert a reflectance to what fields hold: a `Spectrum`, an array, or None."""
-    return x if isinstance(x, Spectrum) or x is None else as_array(x)
+
+def reflectance_field(field: str) -> Callable[[Any], Any]:
+    """The converter of a field that is a reflectance: a `Spectrum` as it is, or numbers to an array."""
+
+    def convert(x: Any) -> Any:
+        if isinstance(x, Spectrum):
+            return x
+        check_numbers(field, x, "real numbers or a Spectrum")
+        return as_array(x, field)
+
+    return convert
 
 
 def check_reflectance(field: str, x: Any) -> None:
-    """Raise ValueError for a reflectance outside [0, 1]. A `Spectrum` checks its own values."""
-    if not isinstance(x, Spectrum):
-        check_range(field, x, 0.0, 1.0)
+    """Raise ValueError for a reflectance outside [0, 1] or of more axes than one.
+
+    A `Spectrum` checks its own values.
+    """
+    if isinstance(x, Spectrum):
+        return
+    check_range(field, x, *SHARE[:2])
+    if x.ndim > 1 or x.size == 0:
+        raise ValueError(
+            f"{field} has shape {x.shape}; admissible is one number, one per wavelength, or a Spectrum"
+        )
 
 
 def check_sum(field: str, reflectance: Any, transmittance: Any) -> None:
-    """Raise ValueError if R + T exceeds 1 by more than rounding, where both values are known."""
-    if isinstance(reflectance, Spectrum) or isinstance(transmittance, Spectrum):
+    """Raise ValueError if R + T exceeds 1 by more than rounding, where both values are known.
+
+    A spectrum is compared with one number, or over the wavelengths that both have with a spectrum. Of several
+    numbers beside a spectrum nothing can be said: their wavelengths are not known.
+    """
+    both = (reflectance, transmittance)
+    sizes = [x.size for x in both if not isinstance(x, Spectrum) and x.size != 1]
+    if len(set(sizes)) > 1:
+        raise ValueError(f"{field}: {sizes[0]} values and {sizes[1]} values; they must be one per wavelength")
+    tables = [
+        known for x in both if isinstance(x, Spectrum) and (known := concrete(x.wavelength)) is not None
+    ]
+    # Between samples a spectrum is linear: the sum is largest at a sample.
+    at = np.concatenate([*tables, []])
+    for table in tables:
+        at = at[(at >= table[0]) & (at <= table[-1])]
+    r, t = (_known(x, at, among_spectra=bool(tables)) for x in both)
+    if r is None or t is None:
         return
-    r, t = concrete(reflectance), concrete(transmittance)
-    if r is not None and t is not None:
-        if r.ndim == t.ndim == 1 and r.shape != t.shape:
-            raise ValueError(f"{field}: {r.size} values and {t.size} values; they must be one per wavelength")
-        check_range(field, r + t, 0.0, 1.0 + 1e-6)
+    check_range(field, r + t, *SUM_OF_SHARES[:2])
+
+
+def _known(x: Any, at: np.ndarray, *, among_spectra: bool) -> np.ndarray | None:
+    """Values of a reflectance: of a spectrum at some wavelengths, of numbers as they are. None: not known."""
+    if isinstance(x, Spectrum):
+        parts = [concrete(part) for part in (x.wavelength, x.reflectance, x.scale)]
+        if any(part is None for part in parts):
+            return None
+        wavelength, values, factor = map(np.asarray, parts)
+        return factor * np.interp(at, wavelength, values)
+    values = concrete(x)
+    return None if values is None or (among_spectra and values.size > 1) else values
 
 
 class AbstractSurface(eqx.Module):
@@ -67,6 +127,16 @@ class AbstractSurface(eqx.Module):
     @abc.abstractmethod
     def shape(self) -> AbstractShape:
         """Shape and position of the surface."""
+
+    def moved(self, by: Float[np.ndarray, "2"]) -> "AbstractSurface | None":
+        """The same surface, moved horizontally; None where a surface does not define this.
+
+        Scenes of surfaces that all define it lose nothing in single precision where coordinates are millions
+        of metres.
+
+        **Arguments:** `by`: (2,) displacement to the east and to the north, m, in double precision.
+        """
+        return None
 
 
 class AbstractGround(AbstractSurface):
@@ -122,20 +192,22 @@ class AbstractSheet(AbstractSurface):
 
 
 @final
+@briefly
 class Ground(AbstractGround):
     """The ground: an infinite opaque plane, level or sloping.
 
     **Arguments:**
 
-    - `height`: height at x = y = 0, m. Default 0.
+    - `height`: height at `position`, m. Default 0.
     - `reflectance`: one number, one per wavelength, or a `Spectrum`; in [0, 1]. Default 0.3.
     - `slope`: angle from the horizontal, degrees, 0 to below 90. Default 0.
     - `aspect`: horizontal direction in which the ground falls, degrees clockwise from north (+y). Default 0.
     - `law`: the scattering law: `Lambertian()`, `EqualAngle()`, `Specular(roughness=...)`, or another
       `AbstractLaw`. Default `Lambertian()`.
+    - `position`: (2,) horizontal place (x, y) in m at which the ground has its height. Default (0, 0).
 
-    **Raises:** ValueError for a reflectance outside [0, 1], a slope outside [0, 90), and values that are not
-    finite.
+    **Raises:** ValueError for a reflectance outside [0, 1] or of more axes than one, a slope outside [0, 90),
+    and values that are not finite; TypeError for a thing of another kind.
 
     **Example:**
 
@@ -146,17 +218,21 @@ class Ground(AbstractGround):
     normal: -0.342 north, 0.940 up
     """
 
-    height: Float[Array, ""] = eqx.field(converter=as_scalar, default=0.0)
-    reflectance: Reflectance = eqx.field(converter=as_reflectance, default=0.3)
-    slope: Float[Array, ""] = eqx.field(converter=as_scalar, default=0.0)
-    aspect: Float[Array, ""] = eqx.field(converter=as_scalar, default=0.0)
+    height: Float[Array, ""] = eqx.field(converter=scalar("height"), default=0.0)
+    reflectance: Reflectance = eqx.field(converter=reflectance_field("reflectance"), default=0.3)
+    slope: Float[Array, ""] = eqx.field(converter=scalar("slope"), default=0.0)
+    aspect: Float[Array, ""] = eqx.field(converter=scalar("aspect"), default=0.0)
     law: AbstractLaw = Lambertian()
+    position: Float[Array | np.ndarray, " 2"] = eqx.field(
+        converter=coordinates("position", 2), default=(0.0, 0.0)
+    )
+
+    ranges: ClassVar = _PLACED | {"reflectance": SHARE}
 
     def __check_init__(self):
-        check_range("height", self.height)
+        check_kind("law", self.law, AbstractLaw, "a law of reflection, such as Lambertian()")
+        check_ranges(self)
         check_reflectance("reflectance", self.reflectance)
-        check_range("slope", self.slope, 0.0, 90.0, high_open=True)
-        check_range("aspect", self.aspect)
 
     @property
     def name(self) -> str:
@@ -164,10 +240,14 @@ class Ground(AbstractGround):
 
     @property
     def shape(self) -> Plane:
-        return Plane.of(self.height, self.slope, self.aspect)
+        return Plane.of(self.height, self.slope, self.aspect, self.position)
+
+    def moved(self, by: Float[np.ndarray, "2"]) -> "Ground":
+        return _moved(self, by)
 
 
 @final
+@briefly
 class Plate(AbstractSheet):
     """A leaf plate: an infinite sheet with a reflectance and a transmittance, the same on both sides.
 
@@ -175,7 +255,7 @@ class Plate(AbstractSheet):
 
     **Arguments:**
 
-    - `height`: height at x = y = 0, m.
+    - `height`: height at `position`, m.
     - `reflectance`: one number, one per wavelength, or a `Spectrum`; in [0, 1].
     - `transmittance`: one number, one per wavelength, or a `Spectrum`; in [0, 1]. The sum of reflectance and
       transmittance is at most 1. Default 0.
@@ -186,9 +266,12 @@ class Plate(AbstractSheet):
     - `transmission`: "straight" (as in the paper: transmitted light keeps its direction) or "diffuse" (it
       leaves the far side by the cosine law). Default "straight".
     - `law`: the scattering law, an `AbstractLaw`. Default `Lambertian()`.
+    - `position`: (2,) horizontal place (x, y) in m at which the plate has its height. Default (0, 0).
 
-    **Raises:** ValueError for values outside the ranges above, and for an unknown `transmission`. The sum of
-    reflectance and transmittance is not checked where one of them is a `Spectrum`.
+    **Raises:** ValueError for values outside the ranges above, and for an unknown `transmission`; TypeError
+    for a thing of another kind. A `Spectrum` is added to one number, or to another `Spectrum`, at all
+    wavelengths that it has, whichever of them a lidar uses. A `Spectrum` beside one number per wavelength is
+    not checked.
 
     **Example:**
 
@@ -198,23 +281,31 @@ class Plate(AbstractSheet):
     0.15 of the light is absorbed
     """
 
-    height: Float[Array, ""] = eqx.field(converter=as_scalar)
-    reflectance: Reflectance = eqx.field(converter=as_reflectance)
-    transmittance: Reflectance = eqx.field(converter=as_reflectance, default=0.0)
-    coverage: Float[Array, ""] = eqx.field(converter=as_scalar, default=1.0)
-    slope: Float[Array, ""] = eqx.field(converter=as_scalar, default=0.0)
-    aspect: Float[Array, ""] = eqx.field(converter=as_scalar, default=0.0)
+    height: Float[Array, ""] = eqx.field(converter=scalar("height"))
+    reflectance: Reflectance = eqx.field(converter=reflectance_field("reflectance"))
+    transmittance: Reflectance = eqx.field(converter=reflectance_field("transmittance"), default=0.0)
+    coverage: Float[Array, ""] = eqx.field(converter=scalar("coverage"), default=1.0)
+    slope: Float[Array, ""] = eqx.field(converter=scalar("slope"), default=0.0)
+    aspect: Float[Array, ""] = eqx.field(converter=scalar("aspect"), default=0.0)
     transmission: str = eqx.field(static=True, default="straight")
     law: AbstractLaw = Lambertian()
+    position: Float[Array | np.ndarray, " 2"] = eqx.field(
+        converter=coordinates("position", 2), default=(0.0, 0.0)
+    )
+
+    ranges: ClassVar = _PLACED | {
+        "reflectance": SHARE,
+        "transmittance": SHARE,
+        "reflectance + transmittance": SUM_OF_SHARES,
+        "coverage": SHARE,
+    }
 
     def __check_init__(self):
-        check_range("height", self.height)
+        check_kind("law", self.law, AbstractLaw, "a law of reflection, such as Lambertian()")
         check_reflectance("reflectance", self.reflectance)
         check_reflectance("transmittance", self.transmittance)
         check_sum("reflectance + transmittance", self.reflectance, self.transmittance)
-        check_range("coverage", self.coverage, 0.0, 1.0)
-        check_range("slope", self.slope, 0.0, 90.0, high_open=True)
-        check_range("aspect", self.aspect)
+        check_ranges(self)
         check_choice("transmission", self.transmission, ("straight", "diffuse"))
 
     @property
@@ -223,4 +314,25 @@ class Plate(AbstractSheet):
 
     @property
     def shape(self) -> Plane:
-        return Plane.of(self.height, self.slope, self.aspect)
+        return Plane.of(self.height, self.slope, self.aspect, self.position)
+
+    def moved(self, by: Float[np.ndarray, "2"]) -> "Plate":
+        return _moved(self, by)
+
+
+Planar = TypeVar("Planar", Ground, Plate)
+
+
+def _moved(surface: Planar, by: Float[np.ndarray, "2"]) -> Planar:
+    """The surface moved; where its slope is known, what has its height is told at x = y = 0."""
+    place = concrete(surface.position)
+    if place is None:
+        return eqx.tree_at(lambda s: s.position, surface, surface.position + jnp.asarray(by, float))
+    place = place + by
+    slope, aspect = concrete(surface.slope), concrete(surface.aspect)
+    if slope is None or aspect is None:
+        return eqx.tree_at(lambda s: s.position, surface, jnp.asarray(place, float))
+    fall = np.tan(np.deg2rad(slope)) * np.stack([np.sin(np.deg2rad(aspect)), np.cos(np.deg2rad(aspect))])
+    rise, known = fall @ place, concrete(surface.height)
+    height = surface.height + rise if known is None else known + rise
+    return eqx.tree_at(lambda s: (s.height, s.position), surface, (jnp.asarray(height, float), jnp.zeros(2)))

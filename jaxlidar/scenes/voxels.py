@@ -1,13 +1,23 @@
 """Voxel maps: extinction coefficients of leaf and bark on a regular grid."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import ClassVar, final
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxlidar._checks import as_array, check_range
+from jaxlidar._checks import (
+    as_array,
+    briefly,
+    check_kind,
+    check_range,
+    check_shape,
+    coordinates,
+    warn_units,
+)
+from jaxlidar._ranges import Range, check_ranges
 from jaxlidar.optics.leaf_angles import LeafAngles
 
 # Optical depth along one edge of a solid voxel (probability 1): exp(-40) = 4e-18.
@@ -18,11 +28,28 @@ SOLID_OPTICAL_DEPTH = 40.0
 Numbers = ArrayLike | Sequence
 
 
-def _as_triple(x: Numbers) -> Float[Array, "3"]:
-    a = as_array(x)
-    return jnp.broadcast_to(a, (3,)) if a.ndim == 0 else a
+def _triple(field: str) -> Callable[[Numbers], Float[Array, "3"]]:
+    """The converter of a field that is three numbers, or one that stands for all three."""
+
+    def convert(x: Numbers) -> Float[Array, "3"]:
+        a = as_array(x, field)
+        check_shape(field, a, (), (3,))
+        return jnp.broadcast_to(a, (3,))
+
+    return convert
 
 
+def _volume(field: str) -> Callable[[Numbers | None], Float[Array, "..."] | None]:
+    """The converter of a field that is an array of numbers or None."""
+
+    def convert(x: Numbers | None) -> Float[Array, "..."] | None:
+        return None if x is None else as_array(x, field)
+
+    return convert
+
+
+@final
+@briefly
 class VoxelMap(eqx.Module):
     """A voxel map: extinction coefficients of leaf and bark in a box of equal voxels, x east, y north, z up.
 
@@ -40,7 +67,9 @@ class VoxelMap(eqx.Module):
     - `leaf_angles`: distribution of leaf inclination, a `LeafAngles`, or None: spherical. Default None.
 
     **Raises:** ValueError for extinction that is negative or not finite, sizes that are not positive, leaf
-    and bark of different shapes, and a map with neither leaf nor bark.
+    and bark of different shapes, an edge or origin that is neither one number nor three, and a map with
+    neither leaf nor bark; TypeError for a thing of another kind. Edges so far from those of any map that
+    another unit is likely give a `UnitWarning`.
 
     **Example:**
 
@@ -51,13 +80,21 @@ class VoxelMap(eqx.Module):
     """
 
     # Their shapes are compared below, so that the error can name both.
-    leaf: Float[Array, "..."] | None
-    bark: Float[Array, "..."] | None
-    voxel_size: Float[Array, "3"] = eqx.field(converter=_as_triple)
-    origin: Float[Array, "3"] = eqx.field(converter=_as_triple)
+    leaf: Float[Array, "..."] | None = eqx.field(converter=_volume("leaf"))
+    bark: Float[Array, "..."] | None = eqx.field(converter=_volume("bark"))
+    voxel_size: Float[Array, "3"] = eqx.field(converter=_triple("voxel_size"))
+    origin: Float[Array | np.ndarray, "3"] = eqx.field(converter=coordinates("origin", 3))
     leaf_angles: LeafAngles | None = None
 
+    ranges: ClassVar = {
+        "leaf": Range(0.0),
+        "bark": Range(0.0),
+        "voxel_size": Range(0.0, low_open=True),
+        "origin": Range(),
+    }
+
     def __check_init__(self):
+        check_kind("leaf_angles", self.leaf_angles, LeafAngles | None, "a LeafAngles or None")
         if self.leaf is None and self.bark is None:
             raise ValueError("leaf and bark are both None; a voxel map holds at least one of them")
         shapes = {a.shape for a in (self.leaf, self.bark) if a is not None}
@@ -68,11 +105,8 @@ class VoxelMap(eqx.Module):
             raise ValueError(
                 f"leaf or bark has the shape {shape}; admissible is (nx, ny, nz), each at least 1"
             )
-        for name, value in (("leaf", self.leaf), ("bark", self.bark)):
-            if value is not None:
-                check_range(f"{name} extinction", value, 0.0)
-        check_range("voxel_size", self.voxel_size, 0.0, low_open=True)
-        check_range("origin", self.origin)
+        check_ranges(self)
+        warn_units(self)
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -85,7 +119,7 @@ class VoxelMap(eqx.Module):
     @property
     def top(self) -> Float[Array, "3"]:
         """(3,) upper north-east corner in m."""
-        return self.origin + self.voxel_size * jnp.asarray(self.shape, self.origin.dtype)
+        return jnp.asarray(self.origin + self.voxel_size * np.asarray(self.shape, float))
 
     @staticmethod
     def from_extinction(
@@ -107,7 +141,7 @@ class VoxelMap(eqx.Module):
 
         **Raises:** ValueError for what `VoxelMap` does not admit.
         """
-        return VoxelMap(_volume(leaf), _volume(bark), voxel_size, origin)
+        return VoxelMap(leaf, bark, voxel_size, origin)
 
     @staticmethod
     def from_probability(
@@ -133,13 +167,14 @@ class VoxelMap(eqx.Module):
 
         **Raises:** ValueError for a probability outside [0, 1], and for what `VoxelMap` does not admit.
         """
-        size = _as_triple(voxel_size)
+        size = _triple("voxel_size")(voxel_size)
+        check_range("voxel_size", size, 0.0, low_open=True)
 
         def extinction(name: str, p: Numbers | None) -> Array | None:
             if p is None:
                 return None
             check_range(name, p, 0.0, 1.0)
-            p = as_array(p)
+            p = as_array(p, name)
             open_ = p < 1.0
             depth = jnp.where(open_, -jnp.log1p(-jnp.where(open_, p, 0.0)), SOLID_OPTICAL_DEPTH)
             return depth / size[2]
@@ -171,9 +206,10 @@ class VoxelMap(eqx.Module):
         **Raises:** ValueError for a negative density, an unknown name, and what `VoxelMap` does not admit.
         """
         check_range("lad", lad, 0.0)
+        check_kind("leaf_angles", leaf_angles, str | LeafAngles, "a name or a LeafAngles")
         angles = LeafAngles.named(leaf_angles) if isinstance(leaf_angles, str) else leaf_angles
         spherical = isinstance(leaf_angles, str) and leaf_angles == "spherical"
-        return VoxelMap(0.5 * as_array(lad), _volume(bark), voxel_size, origin, None if spherical else angles)
+        return VoxelMap(0.5 * as_array(lad, "lad"), bark, voxel_size, origin, None if spherical else angles)
 
     def mean_extinction(self) -> Float[np.ndarray, "nx ny nz"]:
         """Extinction coefficient of leaf (at G = 1/2) and bark together.
@@ -181,7 +217,3 @@ class VoxelMap(eqx.Module):
         **Returns:** (nx, ny, nz) NumPy array in 1/m.
         """
         return np.sum([np.asarray(a) for a in (self.leaf, self.bark) if a is not None], axis=0)
-
-
-def _volume(x: Numbers | None) -> Float[Array, "..."] | None:
-    return None if x is None else as_array(x)

@@ -146,6 +146,7 @@ class FirstOrder(eqx.Module):
     """
 
     weights: Float[Array, "materials histories bins"]
+    outside: Float[Array, "materials histories"]
     arrived: Float[Array, "materials histories"]
     scattered: Float[Array, "materials histories"]
     escaped: Float[Array, "histories"]
@@ -261,8 +262,8 @@ def first_order(
             return jax.tree.map(jnp.add, total, chunk(*part)), None
 
         response, *fate = lax.scan(add, zero, padded)[0]
-    weights = bins.trim(response.reshape(materials, count, bins.padded))
-    return FirstOrder(weights, *fate)
+    weights, outside = bins.trimmed(response.reshape(materials, count, bins.padded))
+    return FirstOrder(weights, outside, *fate)
 
 
 def _stretch_pieces(

@@ -19,7 +19,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._vectors import FAR, Scalar, Vec, along
@@ -43,6 +43,7 @@ class HigherOrders(eqx.Module):
     """Response of orders two and above, and the fate of all light (see `jaxlidar.trace.response`)."""
 
     weights: Float[Array, "materials histories bins"]
+    outside: Float[Array, "materials histories"]
     arrived: Float[Array, "materials histories"]
     left: Float[Array, "materials histories"]
     escaped: Float[Array, "histories"]
@@ -117,12 +118,13 @@ def higher_orders(setting: Setting, key: PRNGKeyArray, photons: int) -> HigherOr
         jnp.zeros((materials, count, bins.padded)),
         jnp.zeros((materials, count)),
         jnp.zeros((materials, count)),
+        jnp.zeros((materials, count)),
         jnp.zeros((count,)),
         jnp.zeros((count,)),
         jnp.zeros((count,)),
     )
     tallies, _ = lax.scan(group, zero, jnp.arange(groups, dtype=jnp.uint32))
-    return eqx.tree_at(lambda t: t.weights, tallies, bins.trim(tallies.weights))
+    return eqx.tree_at(lambda t: (t.weights, t.outside), tallies, bins.trimmed(tallies.weights))
 
 
 def _alive_first(lanes: Array, photons: Photons) -> tuple[Array, Photons]:
@@ -156,21 +158,31 @@ def _one_order(setting: Setting, p: Photons, tally: HigherOrders, draw: Draw, or
     def pick(a: Array) -> Array:
         return jnp.take_along_axis(a, chosen.astype(jnp.int32)[None], 0, mode="promise_in_bounds")[0]
 
-    # Plates that were passed on the way.
+    # Plates that were passed on the way. Histories do not depend on the order; what arrives at a plate does.
     weight, history = wide(p.weight) * flights.density, wide(p.history)
+    passes: dict[int, Bool[Array, "ends photons"]] = {}
     for i, (s, d, o) in enumerate(zip(setting.surfaces, met, outcomes)):
         if not s.plate:
             continue
         own = wide(events[i]) <= flights.distance
         passed = wide(p.alive & (d < FAR)) & ((wide(d) < flights.distance) | ~flights.event) & ~own
         weight = weight * jnp.where(passed | (flights.landed & own), wide(ratio[i]), 1.0)
-        through = passed & wide(o == THROUGH)
-        scatterer = plan.surfaces[i]
-        gone = pick(jnp.where(through, weight, 0.0))
-        tally = _arrive(tally, scatterer.material, pick(history), gone)
+        passes[i] = passed & wide(o == THROUGH)
+    before = pick(weight), pick(history)
+    for i, through in passes.items():
+        scatterer, here = plan.surfaces[i], pick(through)
+        gone, arrived = before
+        for j, other in passes.items():
+            if j != i:
+                nearer = here & pick(other) & (met[j] < met[i])
+                gone = jnp.where(nearer, gone / (1.0 - plan.lobe), gone)
+                arrived = jnp.where(nearer, setting.grow(arrived, plan.surfaces[j].transmitted), arrived)
+        gone = jnp.where(here, gone, 0.0)
+        tally = _arrive(tally, scatterer.material, arrived, gone)
+        onward = setting.grow(arrived, scatterer.transmitted)
+        tally = _leave(tally, scatterer.material, onward, gone / (1.0 - plan.lobe))
         history = jnp.where(through, setting.grow(history, scatterer.transmitted), history)
         weight = jnp.where(through, weight / (1.0 - plan.lobe), weight)
-        tally = _leave(tally, scatterer.material, pick(history), gone / (1.0 - plan.lobe))
 
     if plan.drawn_first:
         tally = _return(setting, p, flights, events, limit, weight, history, draw, tally)

@@ -98,7 +98,7 @@ def medium_of(canopy: Canopy, aim: Float[Array, "3"], leaf_factor: Scalar) -> Me
         bark=bark,
         total=total,
         size=voxels.voxel_size,
-        origin=voxels.origin - aim,
+        origin=jnp.asarray(voxels.origin) - aim,
         angles=angles,
         leaf_angles=voxels.leaf_angles if angles is not None else None,
         leaf_phase=None if leaf is None else canopy.leaf_phase,

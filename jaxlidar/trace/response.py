@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from jaxlidar._checks import check_key, check_kind
 from jaxlidar.planning.plan import Plan
 from jaxlidar.planning.setup import Setup
 from jaxlidar.trace.first_order import FirstOrder, first_order
@@ -32,6 +33,8 @@ class Response(eqx.Module):
 
     - `first`: (traces, materials, first histories, bins) order one, apparent reflectance per unit optics.
     - `higher`: (traces, materials, histories, bins) orders two and above, or None where they were not traced.
+    - `first_outside`: (traces, materials, first histories), `higher_outside`: (traces, materials, histories)
+      what arrives before the first bin or after the last.
     - `arrived`, `left`: (traces, materials, histories) weight that reached each material, and that went on.
     - `escaped`, `late`, `remaining`: (traces, histories) weight that left the scene, that outlasted the
       window, and that had scatterings left when the last order was reached.
@@ -50,6 +53,8 @@ class Response(eqx.Module):
 
     first: Float[Array, "traces materials short bins"]
     higher: Float[Array, "traces materials histories bins"] | None
+    first_outside: Float[Array, "traces materials short"]
+    higher_outside: Float[Array, "traces materials histories"] | None
     arrived: Float[Array, "traces materials histories"]
     left: Float[Array, "traces materials histories"]
     escaped: Float[Array, "traces histories"]
@@ -70,6 +75,8 @@ def trace_scene(setup: Setup, key: PRNGKeyArray) -> Response:
 
     **Returns:** a `Response`, for `jaxlidar.waveform_of`.
 
+    **Raises:** TypeError for things of another kind.
+
     **Example:**
 
     >>> import equinox as eqx
@@ -82,6 +89,8 @@ def trace_scene(setup: Setup, key: PRNGKeyArray) -> Response:
     >>> print(f"{float(wave.reflectance.sum()):.4f}")
     0.4000
     """
+    check_kind("setup", setup, Setup, "a Setup, as in reduce(lidar, scene, plan)")
+    check_key(key)
     canopy = setup.scene.canopy
     if canopy is None or not canopy.is_straight:
         return _trace(setting_of(setup), setup.plan, key)
@@ -113,7 +122,8 @@ def _trace(setting: Setting, plan: Plan, key: PRNGKeyArray) -> Response:
         return _only_first(setting, first, weights)
     higher = higher_orders(setting, photon_key, plan.n_photons)
     fate = (higher.arrived, higher.left, higher.escaped, higher.late, higher.remaining)
-    return Response(weights[None], higher.weights[None], *(a[None] for a in fate))
+    outside = (first.outside[None], higher.outside[None])
+    return Response(weights[None], higher.weights[None], *outside, *(a[None] for a in fate))
 
 
 def _only_first(
@@ -139,4 +149,5 @@ def _only_first(
     if len(scatterers) == 1 and not (plan.leaf or plan.bark):
         # Nothing is in the way of what one plane scatters.
         escaped, remaining = escaped + remaining, late
-    return Response(weights[None], None, *(a[None] for a in (first.arrived, left, escaped, late, remaining)))
+    fate = (first.arrived, left, escaped, late, remaining)
+    return Response(weights[None], None, first.outside[None], None, *(a[None] for a in fate))

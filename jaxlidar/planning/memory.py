@@ -1,0 +1,58 @@
+"""Memory that a simulation takes, predicted before anything is allocated."""
+
+import math
+import os
+
+import jax.numpy as jnp
+
+from jaxlidar.planning.trace_plan import DENSE, Bins, TracePlan
+
+# Copies of a batch's response that are alive at once: sums of photons, of groups, and the result.
+_COPIES = 4
+
+
+def machine_memory() -> float:
+    """Bytes of memory of this machine; 8 GB where that cannot be known."""
+    try:
+        return float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    except (AttributeError, OSError, ValueError):
+        return 8e9
+
+
+def predicted(
+    trace: TracePlan, bins: Bins, degree: int, first_degree: int, samples: int, pulse: int
+) -> float:
+    """Bytes of the responses of all batches that run at once, their sum, and the pulse.
+
+    **Arguments:** `degree`, `first_degree`: of histories. - `samples`: of the record. - `pulse`: fine bins
+    that the pulse spans.
+    """
+    item = jnp.zeros(()).dtype.itemsize
+    letters, materials = len(trace.letters), len(trace.materials)
+    full = math.comb(degree + letters, letters) if trace.orders > 1 or trace.drawn_first else 0
+    short = math.comb(first_degree + letters, letters)
+    response = item * materials * (full + short) * bins.padded
+    matrix = item * min(bins.count * samples, max(DENSE, pulse))
+    return response * (_COPIES * (os.cpu_count() or 1) + 2) + 2 * matrix
+
+
+def in_words(size: float) -> str:
+    """Bytes, MB or GB, to two digits."""
+    for unit, one in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
+        if size >= one:
+            return f"{float(f'{size / one:.2g}'):g} {unit}"
+    return f"{size:.0f} bytes"
+
+
+def check_memory(size: float, most: float | None) -> None:
+    """Refuse what does not fit.
+
+    **Raises:** ValueError with the numbers, and what to change.
+    """
+    limit = 0.25 * machine_memory() if most is None else most * 1e9
+    if size > limit:
+        raise ValueError(
+            f"the simulation would take about {in_words(size)} of memory; admissible is max_memory = "
+            f"{limit / 1e9:.3g} GB: follow fewer orders (max_orders=), record a shorter window (window=), "
+            "use wider fine bins (bin_width=), or have fewer plates or materials"
+        )
