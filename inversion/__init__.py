@@ -1,5 +1,6 @@
 """Retrieval of scene properties from waveforms: fits with standard errors, and tools that need no model."""
 
+from . import files
 from .batch import Progress, Retrievals, retrieve_many
 from .decomposition import (
     Echoes,
@@ -28,6 +29,7 @@ __all__ = [
     "Step",
     "Unknown",
     "cramer_rao",
+    "files",
     "find_ground",
     "gap_probability",
     "gaussian_decomposition",

@@ -3,10 +3,7 @@
 The shape of the crown and the positions of its clumps are taken as known; `sought` lists the unknowns.
 """
 
-import argparse
 import dataclasses
-import sys
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,7 +16,6 @@ from matplotlib.figure import Figure
 
 import jaxlidar as jl
 import jaxlidar.plot
-from jaxlidar.cli import CommandError
 from jaxlidar.io import atomic_write
 from jaxlidar.plants.demo import HEIGHT, LEAF_AREA, WAVELENGTHS, demo_lidar, demo_scene
 
@@ -96,31 +92,6 @@ def sought(scene: Any) -> list[Sought]:
         ),
         Sought(Unknown(name="tree height", bounds=(12.0, 18.0), start=14.2, apply=_with_height), "m", HEIGHT),
     ]
-
-
-def demo(argv: Sequence[str]) -> int:
-    """Simulate a tree's waveform, retrieve leaf, crown and ground from a noisy one, and draw both."""
-    parser = argparse.ArgumentParser(prog="jaxlidar demo", description=demo.__doc__)
-    add = parser.add_argument
-    add("--out", type=Path, default="jaxlidar-demo", metavar="DIR", help="of the figures; %(default)s")
-    add("--seed", type=int, default=0, help="of photons and noise; default %(default)s")
-    add("--rtol", type=float, default=0.01, help="relative accuracy of the waveform; default %(default)s")
-    add("--quiet", action="store_true", help="show no progress, only the results")
-    add("--voxel-size", type=float, default=0.25, metavar="M", help=argparse.SUPPRESS)
-    options = parser.parse_args(argv)
-    if not 0 < options.rtol < 1:
-        raise CommandError(f"--rtol {options.rtol:g} is outside the admissible range (0, 1).")
-    if not 0 <= options.seed < 2**31:
-        raise CommandError(f"--seed {options.seed} is outside the admissible range [0, 2147483648).")
-    if not 0 < options.voxel_size <= 1:
-        raise CommandError(f"--voxel-size {options.voxel_size:g} is outside the admissible range (0, 1].")
-    # Made first, so that a folder that cannot be written ends the command before the work.
-    options.out.mkdir(parents=True, exist_ok=True)
-    started = time.perf_counter()
-    say = _Say(None if options.quiet else sys.stderr)
-    run(options.out, seed=options.seed, rtol=options.rtol, voxel_size=options.voxel_size, say=say)
-    print(f"\n{time.perf_counter() - started:.0f} s")
-    return 0
 
 
 def run(out: Path, *, seed: int, rtol: float, voxel_size: float, say: Callable[[str], None]) -> Retrieval:
@@ -263,7 +234,7 @@ def _brief(step: Any) -> str:
     return str(step).split(";")[0]
 
 
-class _Say:
+class Say:
     """Lines of progress, or none."""
 
     def __init__(self, stream: Any):

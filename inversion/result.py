@@ -1,6 +1,7 @@
 """Records of a retrieval: its steps and its result."""
 
 import dataclasses
+import os
 from typing import final
 
 import equinox as eqx
@@ -8,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxlidar import Scene, Waveform
+from jaxlidar.io import save
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,6 +91,15 @@ class Retrieval(eqx.Module):
     history: tuple[float, ...] = eqx.field(static=True)
     labels: tuple[str, ...] = eqx.field(static=True)
 
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the result as a netCDF file, which `jaxlidar.open` reads.
+
+        **Arguments:** `path`: the file to write.
+
+        **Raises:** what `jaxlidar.io.save` raises.
+        """
+        save(self, path)
+
     def __str__(self) -> str:
         width = max(map(len, self.values))
         rows = [
@@ -96,6 +107,13 @@ class Retrieval(eqx.Module):
             for name, value in self.values.items()
         ]
         return "\n".join([*rows, f"reduced chi2 {float(self.reduced_chi2):.3g}; {self.status}"])
+
+    def _repr_html_(self) -> str:
+        """What notebooks show: the summary, the fitted waveform and its residuals."""
+        # matplotlib takes a while to import: only for those who look.
+        from jaxlidar.plot.html import fit_html
+
+        return fit_html(str(self), self.waveform, self.residuals)
 
 
 def _short(value: np.ndarray) -> str:

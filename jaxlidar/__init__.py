@@ -24,6 +24,7 @@ from jaxlidar.instrument.pulse import (
     SampledPulse,
 )
 from jaxlidar.instrument.receiver import Receiver, first_return_window, record
+from jaxlidar.io.netcdf import open, repeat
 from jaxlidar.optics.coefficients import load_coefficients
 from jaxlidar.optics.laws import AbstractLaw, AbstractMirror, EqualAngle, Lambertian, Specular
 from jaxlidar.optics.leaf import LeafOptics
@@ -117,6 +118,7 @@ __all__ = [
     "io",
     "leaf_surface",
     "load_coefficients",
+    "open",
     "photon_paths",
     "plan",
     "plate_model",
@@ -126,6 +128,7 @@ __all__ = [
     "read_spectrum_csv",
     "record",
     "reduce",
+    "repeat",
     "shrub",
     "simulate",
     "spectra",

@@ -1,7 +1,9 @@
 """From response to waveform: optics, atmosphere, pulse, sampling and energy."""
 
 import dataclasses
-from typing import NamedTuple, final
+import importlib
+import os
+from typing import Any, NamedTuple, final
 
 import equinox as eqx
 import jax
@@ -85,10 +87,30 @@ class Waveform(eqx.Module):
         good = self.lost <= share * whole
         return dataclasses.replace(self, reflectance=jnp.where(good[:, None], self.reflectance, jnp.nan))
 
+    def save(self, path: str | os.PathLike[str], case: Any = None) -> None:
+        """Write the waveform as a netCDF file, which `jaxlidar.open` reads.
+
+        **Arguments:**
+
+        - `path`: the file to write.
+        - `case`: the `jaxlidar.io.Case` that was simulated, so that `jaxlidar.repeat` can do it again.
+          Default None: not kept.
+
+        **Raises:** what `jaxlidar.io.save` raises.
+        """
+        # Files lie above the core, which asks for them by name.
+        importlib.import_module("jaxlidar.io.netcdf").save(self, path, case)
+
     def __str__(self) -> str:
         if any(is_traced(x) for x in (self.time, self.reflectance)):
             return repr(self)
         return summary(self)
+
+    def _repr_html_(self) -> str | None:
+        """What notebooks show: the summary and a small figure."""
+        if any(is_traced(x) for x in (self.time, self.reflectance)):
+            return None
+        return importlib.import_module("jaxlidar.plot.html").waveform_html(self)
 
 
 def optics_of(setup: Setup) -> Float[Array, "letters wavelengths"]:

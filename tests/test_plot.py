@@ -25,7 +25,8 @@ def canopy_scene(**ground):
 @pytest.fixture(scope="module")
 def wave():
     lidar = jl.Lidar(wavelength=WAVELENGTHS, divergence=1.0)
-    return jl.simulate(lidar, canopy_scene(), key=jax.random.key(0), n_photons=2048, n_rays=64, max_orders=3)
+    sizes = {"n_photons": 2048, "n_rays": 64, "max_orders": 3, "window": (-60.0, 120.0)}
+    return jl.simulate(lidar, canopy_scene(), key=jax.random.key(0), **sizes)
 
 
 @pytest.fixture
@@ -157,3 +158,55 @@ def test_an_empty_scene_and_new_figures():
 def test_inadmissible_input_is_refused(wave, call, says):
     with pytest.raises(ValueError, match=says):
         call(wave)
+
+
+def test_ledger_adds_up_and_names_what_is_seen(wave, axes):
+    assert plot.ledger(wave, axes) is axes
+    assert [t.get_text() for t in axes.get_yticklabels()] == ["532 nm", "1064 nm", "1550 nm"]
+    ends = np.zeros(3)
+    for bar in axes.patches:
+        row = round(bar.get_y() + 0.4)
+        ends[row] = max(ends[row], bar.get_x() + bar.get_width())
+    assert np.allclose(ends, 100.0, atol=0.2)
+    bars = {bar.get_label(): [part.get_width() for part in bar] for bar in axes.containers}
+    assert np.allclose(bars["absorbed by leaf"], 100 * np.asarray(wave.ledger["absorbed by leaf"]))
+
+
+def test_accuracy_has_the_error_and_the_aim(wave, axes):
+    steps = [jl.Progress(8 * n, 65536 * n, 0.1 * n, 0.02 / n**0.5, 0.01) for n in (4, 1)]
+    assert plot.accuracy(steps, axes) is axes
+    lines = drawn(axes)
+    assert np.allclose(lines["relative error"], [[65536, 0.02], [262144, 0.01]])
+    assert np.allclose(np.prod(lines["square root of the photons"] ** [0.5, 1.0], axis=1), 0.01 * 512)
+    assert "aim 0.01" in lines
+    axes.clear()
+    plot.accuracy([wave], axes)
+    assert drawn(axes)["relative error"][0, 0] == wave.info["photons"]
+    with pytest.raises(ValueError, match="steps has no photons"):
+        plot.accuracy([], axes)
+
+
+def test_spectra_of_leaves_and_surfaces(axes):
+    leaf = jl.Prospect(Cab=20.0)
+    assert plot.spectrum(leaf, axes, wavelength=[532.0, 1064.0]) is axes
+    lines = drawn(axes)
+    R, T = leaf([532.0, 1064.0])
+    assert np.allclose(lines["reflectance"][:, 1], R)
+    assert np.allclose(lines["transmittance"][:, 1], T)
+    plot.spectrum(jl.LeafOptics(reflectance=0.9), axes, label="bright")
+    plot.spectrum(jl.spectrum("soil-medium"), axes)
+    assert {"bright", "soil-medium"} <= set(drawn(axes))
+    # What is drawn last does not push what was drawn first out of sight.
+    assert axes.get_ylim()[1] > 0.9
+
+
+def test_fit_shows_data_model_and_residuals(wave):
+    observed = np.asarray(wave.reflectance) + 0.002
+    pair = Figure().subplots(1, 2)
+    left, right = plot.fit(wave, observed, 0.001, pair, wavelength=1064.0)
+    assert np.allclose(drawn(left)["observed"][:, 0], observed[1])
+    assert np.allclose(drawn(left)["fitted"][:, 0], wave.reflectance[1])
+    points = np.concatenate([line.get_xydata() for line in right.lines if line.get_marker() == "o"])
+    assert np.allclose(points[:, 0], 2.0, atol=1e-3)
+    with pytest.raises(ValueError, match="axes has 1 axes; admissible are 2"):
+        plot.fit(wave, observed, 0.001, [left])

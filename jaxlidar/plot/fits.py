@@ -1,5 +1,6 @@
-"""Figures of the residuals of a fit against height."""
+"""Figures of fits and their residuals against height."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -87,3 +88,63 @@ def residuals(
             loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False, fontsize="small", markerscale=3
         )
     return ax
+
+
+def fit(
+    wave: Waveform,
+    observed: ArrayLike,
+    noise: ArrayLike,
+    axes: Sequence[Axes] | None = None,
+    *,
+    wavelength: float | None = None,
+    limit: float = 5.0,
+) -> Sequence[Axes]:
+    """Two axes with a fit: observed samples over the fitted waveform, and beside them the residuals.
+
+    **Arguments:**
+
+    - `wave`: the fitted `Waveform`.
+    - `observed`: (wavelengths, bins) apparent reflectance at the waveform's samples.
+    - `noise`: its standard deviation, a number or of the same shape, positive.
+    - `axes`: two axes to draw on. Default None: those of a new figure.
+    - `wavelength`: in nm, one of the waveform's. Default None: all.
+    - `limit`: where the axis of the residuals ends, in standard deviations, positive. Default 5.
+
+    **Returns:** the two axes.
+
+    **Raises:** ValueError for other than two axes, and what `residuals` raises.
+
+    **Example:**
+
+    >>> import jax, jaxlidar as jl
+    >>> import jaxlidar.plot
+    >>> from matplotlib.figure import Figure
+    >>> wave = jl.simulate(jl.Lidar(), jl.Scene(ground=jl.Ground()), key=jax.random.key(0))
+    >>> pair = Figure().subplots(1, 2, sharey=True)
+    >>> left, right = jaxlidar.plot.fit(wave, 1.01 * wave.reflectance, 0.001, pair)
+    >>> print([text.get_text() for text in left.get_legend().get_texts()])
+    ['observed', 'fitted']
+    """
+    if axes is None:
+        from matplotlib import pyplot
+
+        axes = pyplot.subplots(1, 2, figsize=(6.0, 4.2), sharey=True, layout="constrained")[1]
+    assert axes is not None
+    if len(axes) != 2:
+        raise ValueError(f"axes has {len(axes)} axes; admissible are 2")
+    left, right = axes
+    residuals(wave, observed, noise, right, wavelength=wavelength, limit=limit)
+    right.set_ylabel("")
+    chosen, height = wavelengths_of(wave, wavelength), np.asarray(wave.height)
+    data, model = np.asarray(observed, float), np.asarray(wave.reflectance)
+    for number, i in enumerate(chosen):
+        several = len(chosen) > 1
+        colour = WAVELENGTH_COLOURS[number % len(WAVELENGTH_COLOURS)] if several else TOTAL
+        named = f", {float(wave.wavelength[i]):g} nm" if several else ""
+        look = {"marker": "o", "markersize": 2.5, "linestyle": "none", "markerfacecolor": "none"}
+        left.plot(data[i], height, color=colour, label=f"observed{named}", **look)
+        left.plot(model[i], height, color=colour, linewidth=1.0, label=f"fitted{named}")
+    frame_height(left, height, np.maximum(model, data)[chosen])
+    left.set_xlabel("apparent reflectance\nper sample")
+    left.legend(frameon=False, fontsize="small", loc="lower center", bbox_to_anchor=(0.5, 1.0))
+    return axes

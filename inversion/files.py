@@ -1,0 +1,37 @@
+"""Retrievals as netCDF files: what `jaxlidar.io.save` and `jaxlidar.open` must know of them."""
+
+from jaxlidar.io import keep_as_netcdf
+
+from .batch import Retrievals
+from .result import Retrieval
+
+_OWN = "units of the unknown"
+_QUANTITIES = {
+    "values": (_OWN, "best value of an unknown"),
+    "stderr": (_OWN, "standard error of an unknown"),
+    "covariance": (_OWN, "covariance of the unknowns, in the order of labels"),
+    "reduced_chi2": ("1", "sum of squared residuals over the degrees of freedom"),
+}
+
+keep_as_netcdf(
+    Retrieval,
+    "scene properties retrieved from a lidar waveform",
+    {
+        **_QUANTITIES,
+        "simulation_error": (_OWN, "part of the standard error that the simulation's noise makes"),
+        "correlation": ("1", "correlation of the unknowns, in the order of labels"),
+        "residuals": ("1", "observed minus fitted over its standard deviation"),
+    },
+    dimensions={"n": "labels", "bins": "time", "wavelengths": "wavelength"},
+)
+keep_as_netcdf(
+    Retrievals,
+    "scene properties retrieved from many lidar waveforms",
+    {
+        **_QUANTITIES,
+        "converged": ("1", "whether the fit ended at a minimum"),
+        "steps": ("1", "waveforms simulated, each with its Jacobian"),
+        "fitted": ("1", "fitted apparent reflectance per sample, without the scale"),
+    },
+    dimensions={"n": "labels", "footprints": "footprint", "bins": "time", "wavelengths": "wavelength"},
+)

@@ -1,0 +1,8 @@
+"""`python -m jaxlidar.cli`."""
+
+import sys
+
+from jaxlidar.cli import main
+
+if __name__ == "__main__":
+    sys.exit(main())

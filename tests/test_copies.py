@@ -1,0 +1,155 @@
+"""Every public object can be copied and pickled, and shows itself in notebooks."""
+
+import base64
+import copy
+import dataclasses
+import inspect
+import pickle
+import re
+
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+
+import inversion
+import jaxlidar as jl
+
+PLACES = (jl, jl.io, inversion)
+CLASSES = {
+    f"{place.__name__}.{name}": thing
+    for place in PLACES
+    for name in place.__all__
+    if inspect.isclass(thing := vars(place).get(name)) and not inspect.isabstract(thing)
+}
+LIDAR, SCENE = jl.Lidar(), jl.Scene(ground=jl.Ground(reflectance=jl.spectrum("soil-medium")))
+VOXELS = jl.VoxelMap.from_lad(np.ones((1, 1, 2)), voxel_size=1.0, leaf_angles="planophile")
+
+
+def grown(length):
+    return ["A"]
+
+
+# Those that take what is not an array; others are made of nothing but arrays.
+MADE = {
+    "jaxlidar.Atmosphere": jl.Atmosphere(),
+    "jaxlidar.Branching": jl.Branching(),
+    "jaxlidar.Canopy": jl.Canopy(VOXELS, leaf=jl.Prospect(), bark=0.3),
+    "jaxlidar.EqualAngle": jl.EqualAngle(),
+    "jaxlidar.ExponentiallyModifiedGaussianPulse": jl.ExponentiallyModifiedGaussianPulse(3.0, 2.0),
+    "jaxlidar.GaussianPulse": jl.GaussianPulse(),
+    "jaxlidar.Ground": SCENE.ground,
+    "jaxlidar.Habit": jl.broadleaf(),
+    "jaxlidar.HenyeyGreenstein": jl.HenyeyGreenstein(0.9, 0.5),
+    "jaxlidar.Isotropic": jl.Isotropic(0.9),
+    "jaxlidar.LSystem": jl.LSystem([("A", 0.1)], [jl.Rule("A", grown)]),
+    "jaxlidar.Lambertian": jl.Lambertian(),
+    "jaxlidar.LateLightWarning": jl.LateLightWarning("late"),
+    "jaxlidar.LeafAngles": VOXELS.leaf_angles,
+    "jaxlidar.LeafOptics": jl.LeafOptics(0.4, 0.3),
+    "jaxlidar.LeafSurface": jl.leaf_surface(1.4),
+    "jaxlidar.Lidar": LIDAR,
+    "jaxlidar.Module": jl.Module("A", (1.0,)),
+    "jaxlidar.Plan": jl.plan(LIDAR, SCENE),
+    "jaxlidar.Effect": jl.plan(LIDAR, SCENE).effects[0],
+    "jaxlidar.Plane": SCENE.ground.shape,
+    "jaxlidar.Plate": jl.Plate(1.0, 0.3),
+    "jaxlidar.Progress": jl.Progress(1, 2, 3.0, 4.0, None),
+    "jaxlidar.Prospect": jl.Prospect(),
+    "jaxlidar.Receiver": jl.Receiver(saturation=1.0, bits=8),
+    "jaxlidar.RectangularPulse": jl.RectangularPulse(),
+    "jaxlidar.Rule": jl.Rule("A", grown),
+    "jaxlidar.SampledPulse": jl.SampledPulse([0.0, 1.0, 2.0], [0.0, 1.0, 0.0]),
+    "jaxlidar.Scene": SCENE,
+    "jaxlidar.Setup": jl.reduce(LIDAR, SCENE, jl.plan(LIDAR, SCENE)),
+    "jaxlidar.Specular": jl.Specular(0.1),
+    "jaxlidar.Spectrum": jl.spectrum("bark-oak"),
+    "jaxlidar.Tree": jl.grow(jl.shrub()),
+    "jaxlidar.VoxelMap": VOXELS,
+    "jaxlidar.Word": jl.LSystem([("A", 0.1)], [jl.Rule("A", grown)]).rewrite(1),
+    "jaxlidar.io.Case": jl.io.Case(LIDAR, SCENE, jax.random.key(0), {"rtol": 0.1}),
+    "inversion.LogNormal": inversion.LogNormal(0.3, 0.5),
+    "inversion.Progress": inversion.Progress(1, 2, 1),
+    "inversion.Step": inversion.Step(1, 2.0, True, {"a": np.ones(2)}),
+    "inversion.Unknown": inversion.Unknown("ground.height", bounds=(0.0, 1.0)),
+}
+
+
+def bare(kind):
+    """A record of arrays, without its checks: pickling looks at nothing else."""
+    if issubclass(kind, tuple):
+        return kind._make(np.full(2, i + 0.5) for i in range(len(kind._fields)))
+    thing = object.__new__(kind)
+    for i, field in enumerate(dataclasses.fields(kind)):
+        object.__setattr__(thing, field.name, jax.numpy.full(2, i + 0.5))
+    return thing
+
+
+def content(x):
+    """All that an object is made of, to compare."""
+    if isinstance(x, jax.Array) and jax.numpy.issubdtype(x.dtype, jax.dtypes.prng_key):
+        return "key", np.asarray(jax.random.key_data(x)).tobytes()
+    if isinstance(x, jax.Array | np.ndarray):
+        return type(x).__name__, np.asarray(x).dtype.str, np.shape(x), np.asarray(x).tobytes()
+    if isinstance(x, dict):
+        return {name: content(value) for name, value in x.items()}
+    if isinstance(x, tuple | list):
+        return type(x), [content(value) for value in x]
+    if isinstance(x, type) or inspect.isroutine(x) or not hasattr(x, "__dict__"):
+        return x
+    if isinstance(x, Exception):
+        return type(x), x.args
+    return type(x), {name: content(value) for name, value in vars(x).items() if not name.startswith("__")}
+
+
+@pytest.mark.parametrize("name", CLASSES)
+def test_it_can_be_pickled_and_copied(name):
+    thing = MADE.get(name)
+    sent = bare(CLASSES[name]) if thing is None else thing
+    assert type(sent) is CLASSES[name]
+    for back in (pickle.loads(pickle.dumps(sent)), copy.copy(sent), copy.deepcopy(sent)):
+        assert content(back) == content(sent)
+
+
+def test_another_content_is_noticed():
+    assert content(jl.Plate(1.0, 0.3)) != content(jl.Plate(1.0, 0.3000001))
+    assert content(jl.io.Case(LIDAR)) != content(jl.io.Case(jl.Lidar(zenith=1.0)))
+
+
+@pytest.fixture(scope="module")
+def fit():
+    wave = jl.simulate(LIDAR, jl.Scene(ground=jl.Ground()), key=jax.random.key(0))
+    values = {"<height>": jax.numpy.asarray(0.5)}
+    matrix, more = jax.numpy.ones((1, 1)), {"steps": 3, "history": (1.0,), "labels": ("<height>",)}
+    return inversion.Retrieval(
+        values, values, values, matrix, matrix, SCENE, wave, 0.5 + 0 * wave.reflectance, matrix[0, 0],
+        converged=True, status="done", **more,
+    )  # fmt: skip
+
+
+def pictures(page):
+    found = re.findall(r'<img [^>]*src="data:image/png;base64,([^"]+)"', page)
+    return [base64.b64decode(data) for data in found]
+
+
+def test_notebooks_show_a_waveform_with_its_figure(fit):
+    page = fit.waveform._repr_html_()
+    assert "Waveform of" in page
+    (picture,) = pictures(page)
+    assert picture.startswith(b"\x89PNG")
+    assert len(picture) < 50_000
+
+
+def test_notebooks_show_a_fit_with_its_residuals(fit):
+    page = fit._repr_html_()
+    assert "&lt;height&gt;" in page
+    assert "<height>" not in page
+    assert len(pictures(page)) == 1
+    assert "reduced chi2" in str(fit)
+
+
+def test_what_is_traced_shows_no_figure(fit):
+    found = []
+    dynamic, static = eqx.partition(fit.waveform, eqx.is_array)
+    jax.make_jaxpr(lambda d: found.append(eqx.combine(d, static)._repr_html_()))(dynamic)
+    assert found == [None]

@@ -1,0 +1,258 @@
+"""Results as netCDF: they come back to the bit, carry their units and case, and damage does not pass."""
+
+import builtins
+import dataclasses
+import json
+from importlib import metadata
+
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+from jaxtyping import Float
+
+import inversion
+import jaxlidar as jl
+from jaxlidar.io import netcdf
+
+h5py = pytest.importorskip("h5py")
+
+
+@pytest.fixture(scope="module")
+def case():
+    scene = jl.Scene(ground=jl.Ground(slope=5.0), plates=(jl.Plate(2.0, 0.3, 0.2, 0.5),))
+    lidar = jl.Lidar(wavelength=(532.0, 1064.0))
+    return jl.io.Case(lidar, scene, jax.random.key(3), {"n_photons": 8192, "max_orders": 3})
+
+
+@pytest.fixture(scope="module")
+def wave(case):
+    return case.simulate()
+
+
+@pytest.fixture(scope="module")
+def fit(wave, case):
+    rng = np.random.default_rng(0)
+    values = {"ground height": np.float32(0.1), "scene/leaf": rng.random(3), "a.b": rng.random((2, 2))}
+    values = {name: jax.numpy.asarray(v) for name, v in values.items()}
+    n = 8
+    return inversion.Retrieval(
+        values=values,
+        stderr={name: v + np.inf for name, v in values.items()},
+        simulation_error=values,
+        covariance=jax.numpy.asarray(rng.random((n, n))),
+        correlation=jax.numpy.eye(n),
+        scene=case.scene,
+        waveform=wave,
+        residuals=wave.reflectance,
+        reduced_chi2=jax.numpy.asarray(1.1),
+        converged=True,
+        status="converged: it ended at a minimum",
+        steps=7,
+        history=(3.0, 1.0 / 3.0, np.inf),
+        labels=tuple(f"label {i}" for i in range(n)),
+    )
+
+
+@pytest.fixture(scope="module")
+def fits():
+    rng = np.random.default_rng(1)
+    return inversion.Retrievals(
+        values={"Cab": rng.random(5), "layers": rng.random((5, 3))},
+        stderr={"Cab": rng.random(5), "layers": rng.random((5, 3))},
+        covariance=rng.random((5, 4, 4)),
+        reduced_chi2=rng.random(5),
+        converged=np.array([True, False, True, True, False]),
+        steps=np.arange(5),
+        fitted=rng.random((5, 2, 7)),
+        status=("done", "ü", "", "failed: no photon", "done"),
+        labels=("Cab", "layers[0]", "layers[1]", "layers[2]"),
+    )
+
+
+def same(got, sent):
+    """Equal to the bit; types, names and static fields too."""
+    pairs = list(zip(jax.tree.leaves(got), jax.tree.leaves(sent)))
+    kinds = all(isinstance(a, np.ndarray) == isinstance(b, np.ndarray) for a, b in pairs)
+    bits = all(
+        np.asarray(a).dtype == np.asarray(b).dtype and np.asarray(a).tobytes() == np.asarray(b).tobytes()
+        for a, b in pairs
+    )
+    return jax.tree.structure(got) == jax.tree.structure(sent) and kinds and bits
+
+
+@pytest.mark.parametrize("name", ["wave", "fit", "fits"])
+def test_it_comes_back_to_the_bit(name, request, tmp_path):
+    sent = request.getfixturevalue(name)
+    jl.io.save(sent, tmp_path / "a.nc")
+    assert same(jl.open(tmp_path / "a.nc"), sent)
+    other = eqx.tree_at(lambda r: jax.tree.leaves(r)[0], sent, replace_fn=lambda x: x + 1)
+    assert not same(jl.open(tmp_path / "a.nc"), other)
+
+
+def test_double_precision_comes_back_in_single(wave, tmp_path):
+    with jax.enable_x64(True):
+        double = jax.tree.map(lambda x: np.asarray(x, np.float64) / 3, wave)
+        double = jax.tree.map(jax.numpy.asarray, double)
+        double.save(tmp_path / "a.nc")
+    assert same(jl.open(tmp_path / "a.nc"), double)
+
+
+def test_methods_save_as_well(wave, fit, tmp_path):
+    wave.save(tmp_path / "wave.nc")
+    fit.save(tmp_path / "fit.nc")
+    assert same(jl.open(tmp_path / "wave.nc"), wave)
+    assert same(jl.open(tmp_path / "fit.nc").scene, fit.scene)
+
+
+def test_a_run_is_repeated_bit_for_bit(wave, case, tmp_path):
+    path = tmp_path / "a.nc"
+    wave.save(path, case)
+    again = jl.repeat(path)
+    assert jax.tree.all(jax.tree.map(np.array_equal, again, with_info(wave, again.info)))
+    other = jl.io.Case(case.lidar, case.scene, jax.random.key(4), case.arguments).simulate()
+    assert not np.array_equal(other.reflectance, wave.reflectance)
+    assert again.info["photons"] == wave.info["photons"] > 0
+    kept = jl.io.read_case(path)
+    assert same((kept.lidar, kept.scene), (case.lidar, case.scene))
+
+
+def with_info(wave, info):
+    return type(wave)(**{**vars(wave), "info": info})
+
+
+def test_what_cannot_be_repeated_is_refused(wave, case, tmp_path):
+    path = tmp_path / "a.nc"
+    wave.save(path)
+    with pytest.raises(ValueError, match=r"a.nc: /case: no such attribute: it was saved without its case"):
+        jl.repeat(path)
+    with_info(wave, {**wave.info, "stopped": "interrupted"}).save(path, case)
+    with pytest.raises(ValueError, match=r"a.nc: the run ended early \(interrupted\)"):
+        jl.repeat(path)
+    wave.save(path, case)
+    with jax.enable_x64(True), pytest.raises(ValueError, match="simulated in float32; JAX is configured for"):
+        jl.repeat(path)
+    with pytest.raises(ValueError, match=r"case has a lidar of .* not the case that it was simulated from"):
+        wave.save(path, jl.io.Case(jl.Lidar()))
+
+
+def test_xarray_opens_it_with_coordinates_and_units(wave, case, tmp_path):
+    xarray = pytest.importorskip("xarray")
+    wave.save(tmp_path / "a.nc", case)
+    with xarray.open_dataset(tmp_path / "a.nc", engine="h5netcdf", decode_timedelta=False) as data:
+        assert set(data.coords) == {"time", "wavelength", "component", "fate", "height"}
+        assert data.reflectance.dims == ("wavelength", "time")
+        assert data.time.attrs["units"] == "ns"
+        assert data.attrs["Conventions"] == "CF-1.11"
+        assert "[scene.ground]" in data.attrs["case"]
+        assert set(json.loads(data.attrs["versions"])) == {"jaxlidar", "jax", "jaxlib", "numpy"}
+        ground = data.components.sel(component="ground", wavelength=532.0)
+        assert np.array_equal(ground, wave.components["ground"][0])
+        assert all({"units", "long_name"} <= set(v.attrs) for v in data.data_vars.values())
+
+
+def test_every_quantity_of_a_known_class_has_units():
+
+    for layout in netcdf.LAYOUTS.values():
+        if layout.kind.__module__.startswith(("jaxlidar", "inversion")):
+            names = {f.name for f in dataclasses.fields(layout.kind) if not f.metadata.get("static")}
+            assert names - {"scene", "waveform"} == set(layout.quantities)
+
+
+@pytest.mark.parametrize("name", ["wave", "fits"])
+def test_damage_does_not_pass(name, request, tmp_path):
+    """Whatever byte is another, or wherever the file ends: it is refused by name, or nothing is lost."""
+    sent, path = request.getfixturevalue(name), tmp_path / "a.nc"
+    jl.io.save(sent, path)
+    whole, refused = path.read_bytes(), 0
+    rng = np.random.default_rng(5)
+    for at in rng.integers(0, len(whole), 60):
+        path.write_bytes(whole[:at] + bytes([whole[at] ^ rng.integers(1, 256)]) + whole[at + 1 :])
+        try:
+            back = jl.open(path)
+        except ValueError as error:
+            refused += str(error).startswith(str(path))
+        else:
+            assert same(back, sent), at
+    assert refused > 5
+    for end in (0, 7, 100, len(whole) // 2, len(whole) - 1):
+        path.write_bytes(whole[:end])
+        with pytest.raises(ValueError, match=r"a.nc: "):
+            jl.open(path)
+
+
+def test_damaged_numbers_are_refused_with_their_place(wave, tmp_path):
+    path = tmp_path / "a.nc"
+    wave.save(path)
+    whole, row = path.read_bytes(), np.asarray(wave.recorded).tobytes()
+    assert whole.count(row) >= 1
+    at = whole.rindex(row) + 5
+    path.write_bytes(whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :])
+    with pytest.raises(ValueError, match=r"a.nc: /(recorded|energy): damaged"):
+        jl.open(path)
+
+
+def test_other_files_are_refused(wave, tmp_path):
+    with pytest.raises(FileNotFoundError, match="no such file"):
+        jl.open(tmp_path / "none.nc")
+    with h5py.File(tmp_path / "a.nc", "w") as file:
+        file["x"] = 1.0
+    with pytest.raises(ValueError, match=r"a.nc: no attribute jaxlidar_kind"):
+        jl.open(tmp_path / "a.nc")
+    wave.save(tmp_path / "a.nc")
+    with h5py.File(tmp_path / "a.nc", "r+") as file:
+        file.attrs["jaxlidar_format"] = 9
+    with pytest.raises(ValueError, match=r"jaxlidar_format = 9 is outside \[1, 1\]"):
+        jl.open(tmp_path / "a.nc")
+    wave.save(tmp_path / "a.nc")
+    with h5py.File(tmp_path / "a.nc", "r+") as file:
+        del file["lost"]
+    with pytest.raises(ValueError, match=r"a.nc: /lost: no such variable"):
+        jl.open(tmp_path / "a.nc")
+
+
+class Heights(eqx.Module):
+    top: Float[np.ndarray, " trees"]
+
+
+def test_a_class_of_another_package_is_found_by_its_entry_point(tmp_path, monkeypatch):
+    with pytest.raises(TypeError, match="result is of the class Heights; admissible are"):
+        jl.io.save(Heights(np.ones(2)), tmp_path / "a.nc")
+    monkeypatch.setattr(netcdf, "LAYOUTS", dict(netcdf.LAYOUTS))
+    jl.io.keep_as_netcdf(Heights, "heights", {"top": ("m", "height")})
+    jl.io.save(Heights(np.array([1.0, 2.0])), tmp_path / "a.nc")
+    layout = netcdf.LAYOUTS.pop("Heights")
+    with pytest.raises(ValueError, match=r"a.nc: it holds a Heights, which is not known here"):
+        jl.open(tmp_path / "a.nc")
+
+    class Point:
+        name = "Heights"
+
+        def load(self):
+            netcdf.LAYOUTS["Heights"] = layout
+
+    monkeypatch.setattr(metadata, "entry_points", lambda group: [Point()] if group == netcdf.FILES else [])
+    assert jl.open(tmp_path / "a.nc").top.tolist() == [1.0, 2.0]
+
+
+def test_without_the_library_it_says_what_to_install(wave, tmp_path, monkeypatch):
+    real = builtins.__import__
+
+    def missing(name, *args, **kwargs):
+        if name == "h5netcdf":
+            raise ImportError(name)
+        return real(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", missing)
+    with pytest.raises(ImportError, match=r"pip install 'jaxlidar\[io\]'"):
+        wave.save(tmp_path / "a.nc")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_failed_write_leaves_the_old_file(wave, tmp_path):
+    path = tmp_path / "a.nc"
+    wave.save(path)
+    with pytest.raises(TypeError, match="a set is nothing that a file can hold"):
+        with_info(wave, {"seeds": {1, 2}}).save(path)
+    assert same(jl.open(path), wave)
+    assert list(tmp_path.iterdir()) == [path]
