@@ -272,8 +272,7 @@ def compare_all(options):
     """Fit all shots of the answers and compare."""
     answers = np.load(options.answers)
     shots, product = [], []
-    for n in answers["shot"]:
-        (shot,) = read_gedi_l1b(options.file, int(n))
+    for shot in read_gedi_l1b(options.file, answers["shot"]):
         try:
             prepare(shot)
         except ValueError as error:

@@ -59,12 +59,11 @@ def echoes_of(shots):
     found = []
     for shot in shots:
         pad = (0, size - shot.waveform.size)
-        noise = np.nan_to_num(np.pad(noise_of(shot), pad, constant_values=np.inf), posinf=1e6)
+        noise = np.pad(noise_of(shot), pad, constant_values=np.inf)
         echoes = inversion.gaussian_decomposition(
             np.arange(size), np.pad(shot.signal, pad), noise=noise, width=PULSE_WIDTH
         )
         time = np.asarray(echoes.time)[: int(echoes.count)]
-        time = time[(time >= 0) & (time < shot.waveform.size)]
         found.append(np.interp(time, np.arange(shot.waveform.size), shot.elevation))
     return found
 

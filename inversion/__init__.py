@@ -2,15 +2,11 @@
 
 from . import files
 from .batch import Progress, Retrievals, retrieve_many
-from .decomposition import (
-    Echoes,
-    find_ground,
-    gap_probability,
-    gaussian_decomposition,
-    plant_area_index,
-    relative_heights,
-)
+from .cover import GroundAndCanopy, gap_probability, ground_and_canopy, plant_area_index
+from .decomposition import Echoes, gaussian_decomposition
 from .deconvolution import richardson_lucy, wiener
+from .gedi import GediMetrics, GediSettings, gedi_metrics, gedi_settings
+from .heights import SignalEnds, find_ground, relative_heights, signal_ends
 from .identifiability import CramerRao, Profile, cramer_rao, profile_likelihood
 from .leaves import LeafFit, invert_leaves
 from .result import Retrieval, Step
@@ -20,12 +16,16 @@ from .unknowns import LogNormal, Unknown
 __all__ = [
     "CramerRao",
     "Echoes",
+    "GediMetrics",
+    "GediSettings",
+    "GroundAndCanopy",
     "LeafFit",
     "LogNormal",
     "Profile",
     "Progress",
     "Retrieval",
     "Retrievals",
+    "SignalEnds",
     "Step",
     "Unknown",
     "cramer_rao",
@@ -33,6 +33,9 @@ __all__ = [
     "find_ground",
     "gap_probability",
     "gaussian_decomposition",
+    "gedi_metrics",
+    "gedi_settings",
+    "ground_and_canopy",
     "invert_leaves",
     "plant_area_index",
     "profile_likelihood",
@@ -40,5 +43,6 @@ __all__ = [
     "retrieve",
     "retrieve_many",
     "richardson_lucy",
+    "signal_ends",
     "wiener",
 ]

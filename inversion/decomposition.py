@@ -1,14 +1,25 @@
-r"""Waveform processing without a model of the scene: echoes, heights, gap probability.
+r"""Decomposition of records into echoes: Gaussians, or copies of a recorded pulse.
 
-All functions take single waveforms, (bins,), and can be batched with `jax.vmap`. `relative_heights`,
-`gap_probability` and `plant_area_index` are differentiable in the waveform. `gaussian_decomposition` and
-`find_ground` make discrete choices (the number of echoes, the lowest mode); their derivatives are those for
-the choice made.
+Echoes are added one at a time where the residual, filtered by the pulse, is largest, and all are fitted again
+by Levenberg-Marquardt. The number of echoes is that with the lowest chi^2 + penalty, where an echo of m
+parameters costs (Gaussians, m = 3)
+
+    m ln(bins),        copies of a pulse, m = 2 or 3:   (m + 1) ln(bins),
+
+the Bayesian information criterion, and for copies one more, as the place of an echo is searched for among all
+bins.
+
+Copies of a pulse are shifted, and broadened by Gaussians, in the Fourier domain, which is exact for a pulse
+that its sampling resolves. A recorded pulse has errors of its own. They are counted as noise of `pulse_error`
+times the amplitude that the energy within a pulse's length would have as one echo; so the rest that an
+imperfect pulse leaves of a strong echo is not taken for weak ones.
+
+Derivatives are those for the number of echoes found.
 """
 
-from collections.abc import Sequence
-from functools import partial
-from typing import NamedTuple
+from collections.abc import Callable
+from functools import lru_cache, partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,27 +27,36 @@ import optimistix as optx
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
+from inversion.pulses import Pulse, pulse_samples, steps_of
+from inversion.records import ladder, over_shots, pad
 from jaxlidar.extend import as_array, check_integer, check_range
 
-_SOLVER = optx.LevenbergMarquardt(rtol=1e-4, atol=1e-4)
-_STEPS = 60
-# Least and largest width of an echo, in widths of the pulse.
-_NARROWEST, _WIDEST = 0.5, 8.0
+_SOLVER = optx.LevenbergMarquardt(rtol=1e-3, atol=1e-3)
+_STEPS = 40
+# Echoes are added until so many in a row have not lowered the criterion.
+_PATIENCE = 2
+# Least and largest width of a Gaussian echo, and of what broadens a copy, in widths of the pulse.
+_WIDTHS = {"gaussian": (0.5, 8.0), "copies": (0.5, 8.0), "broadened": (0.1, 8.0)}
+# ... from which their fits start, and how much an echo costs, in ln(bins).
+_START = {"gaussian": 1.0, "copies": 1.0, "broadened": 0.4}
+_COST = {"gaussian": 3, "copies": 3, "broadened": 4}
 
-Samples = Float[Array, " bins"]
+Free = Float[Array, "echoes 3"]
+On = Bool[Array, " echoes"]
 
 
 class Echoes(NamedTuple):
-    """Gaussian echoes of a waveform, in order of time; entries beyond `count` are zero.
+    """Echoes of a record, in order of time; entries beyond `count` are zero. Several records have a dimension
+    before.
 
-    - `amplitude`: (echoes,) height of the peak, in units of the waveform.
-    - `time`: (echoes,) time of the peak in ns.
-    - `width`: (echoes,) standard deviation in ns.
+    - `amplitude`: (echoes,) height of the peak, in units of the record; of a copy, before it is broadened.
+    - `time`: (echoes,) time of the peak in ns; of a copy, of the pulse's time zero.
+    - `width`: (echoes,) standard deviation in ns; of a copy, that of the Gaussian that broadens it, or 0.
     - `stderr`: (echoes, 3) one standard error of each of the three above.
     - `count`: number of echoes.
     - `model`: (bins,) the sum of the echoes.
-    - `chi2`: sum of squared residuals over `noise`.
-    - `criterion`: Bayesian information criterion, chi2 + 3 count ln(bins).
+    - `chi2`: sum of squared residuals over the noise.
+    - `criterion`: `chi2` and the cost of all echoes.
 
     **Example:**
 
@@ -48,44 +68,53 @@ class Echoes(NamedTuple):
     1: 20.0 ns, width 3.0 ns
     """
 
-    amplitude: Float[Array, " echoes"]
-    time: Float[Array, " echoes"]
-    width: Float[Array, " echoes"]
-    stderr: Float[Array, "echoes 3"]
-    count: Int[Array, ""]
-    model: Samples
-    chi2: Float[Array, ""]
-    criterion: Float[Array, ""]
+    amplitude: Float[Array, "... echoes"]
+    time: Float[Array, "... echoes"]
+    width: Float[Array, "... echoes"]
+    stderr: Float[Array, "... echoes 3"]
+    count: Int[Array, "..."]
+    model: Float[Array, "... bins"]
+    chi2: Float[Array, "..."]
+    criterion: Float[Array, "..."]
 
 
 def gaussian_decomposition(
     time: Float[ArrayLike, " bins"],
-    power: Float[ArrayLike, " bins"],
+    power: Float[ArrayLike, "... bins"],
     *,
-    noise: Float[ArrayLike, ""] | Float[ArrayLike, " bins"],
-    width: Float[ArrayLike, ""],
+    noise: Float[ArrayLike, "..."],
+    width: Float[ArrayLike, ""] | None = None,
+    pulse: Pulse | None = None,
+    broaden: bool = True,
+    pulse_error: float = 0.01,
     max_echoes: int = 6,
 ) -> Echoes:
-    """Gaussian decomposition of a waveform, with the number of echoes by the Bayesian information criterion.
+    """Echoes of a record, Gaussians or copies of a recorded pulse, their number by a penalised criterion.
 
-    Echoes are added one at a time where the residual, smoothed by the pulse, is largest, and all are fitted
-    again by Levenberg-Marquardt. Of the fits with 0 to `max_echoes` echoes, the one with the lowest criterion
-    is returned. No echo is negative. Equal numbers of bins and echoes compile once.
+    System pulses are no Gaussians: where the pulse was recorded, give it, or a hard target will have two
+    echoes or more. Records are padded to a ladder of sizes (64, 96, 128, 192, ... bins); each is compiled
+    once, for each number of records. No echo is negative, and none lies outside the record.
 
     **Arguments:**
 
     - `time`: (bins,) ns, increasing in equal steps.
-    - `power`: (bins,) waveform in any unit, background removed.
-    - `noise`: standard deviation of `power`, above 0, one number or (bins,).
-    - `width`: standard deviation of the pulse in ns, above 0. Widths of echoes start from it and end between
-      half of it and eight times it.
+    - `power`: (bins,) record in any unit, background removed; or (shots, bins).
+    - `noise`: standard deviation of `power`, above 0: one number, or of the shape of `power`. Where it is
+      infinite, samples do not count.
+    - `width`: for Gaussian echoes: standard deviation of the pulse in ns, above 0. Widths of echoes start
+      from it and end between half of it and eight times it.
+    - `pulse`: for copies: a recorded pulse, or the system's impulse, at the record's sampling, (lags,), an
+      odd number of samples with time zero in the middle, or (shots, lags); or a `jaxlidar` pulse.
+    - `broaden`: whether copies may be broadened by Gaussians, where that lowers the criterion. Default True.
+    - `pulse_error`: standard deviation of the errors of `pulse` over its peak, 0 or more. Default 0.01.
     - `max_echoes`: most echoes, at least 1. Default 6.
 
     **Returns:** an `Echoes`, with `max_echoes` entries.
 
-    **Raises:** ValueError for inadmissible arguments.
+    **Raises:** ValueError for inadmissible arguments, and unless either `width` or `pulse` is given.
 
-    **Source:** Wagner et al. (2006), ISPRS J. Photogramm. 60, 100; Schwarz (1978), Ann. Stat. 6, 461.
+    **Source:** Wagner et al. (2006), ISPRS J. Photogramm. 60, 100; Schwarz (1978), Ann. Stat. 6, 461; Zhang
+    and Siegmund (2007), Biometrics 63, 22 (places found by search).
 
     **Example:**
 
@@ -98,235 +127,202 @@ def gaussian_decomposition(
     """
     t, y, sigma = as_array(time), as_array(power), as_array(noise)
     most = check_integer("max_echoes", max_echoes)
-    if t.shape != y.shape or t.ndim != 1 or t.size < 2:
+    if t.ndim != 1 or y.ndim < 1 or t.shape != y.shape[-1:] or t.size < 2:
         raise ValueError(
-            f"time and power have the shapes {t.shape} and {y.shape}; admissible is (bins,) for both, two or "
-            "more"
+            f"time and power have the shapes {t.shape} and {y.shape}; admissible is (bins,) and (..., bins), "
+            "two or more"
         )
-    if sigma.shape not in ((), y.shape):
+    if sigma.shape not in ((), t.shape, y.shape):
         raise ValueError(f"noise has the shape {sigma.shape}; admissible is () or {y.shape}")
-    check_range("noise", noise, 0.0, low_open=True)
-    check_range("width", width, 0.0, low_open=True)
+    if (width is None) == (pulse is None):
+        raise ValueError("width and pulse: admissible is one of them")
+    check_range("noise", jnp.where(jnp.isposinf(sigma), 1.0, sigma), 0.0, low_open=True)
     check_range("power", power)
     check_range("steps of time", jnp.diff(t), 0.0, low_open=True)
-    return _decompose(t, y, jnp.broadcast_to(sigma, y.shape), as_array(width), most)
+    check_range("pulse_error", pulse_error, 0.0)
+    size = ladder(t.size)
+    weight = jnp.broadcast_to(1.0 / sigma, y.shape)
+    arrays = pad(y, size), pad(weight, size), t[1] - t[0]
+    if pulse is None:
+        assert width is not None
+        check_range("width", width, 0.0, low_open=True)
+        found = _program("gaussian", most)(*arrays, jnp.ones(1), as_array(width), jnp.zeros(()))
+    else:
+        lags, error = pulse_samples(pulse, steps_of(time)), as_array(pulse_error)
+        found = _program("copies", most)(*arrays, lags, jnp.ones(()), error)
+        if broaden:
+            other = _program("broadened", most)(*arrays, lags, jnp.ones(()), error)
+            better = other.criterion < found.criterion
+            found = jax.tree.map(partial(_choose, better), other, found)
+    placed = jnp.where(found.amplitude > 0, t[0] + found.time, 0.0)
+    return found._replace(time=placed, model=found.model[..., : t.size])
 
 
-@partial(jax.jit, static_argnames="most")
-def _decompose(t: Samples, y: Samples, sigma: Samples, width: Array, most: int) -> Echoes:
-    step = t[1] - t[0]
-    kernel = jnp.exp(-0.5 * ((t - 0.5 * (t[0] + t[-1])) / width) ** 2)
-    log_n = jnp.log(jnp.asarray(y.size, y.dtype))
+def _choose(where: Array, a: Array, b: Array) -> Array:
+    return jnp.where(where.reshape(where.shape + (1,) * (a.ndim - where.ndim)), a, b)
+
+
+@lru_cache
+def _program(kind: str, most: int) -> Callable[..., Echoes]:
+    """The compiled decomposition into one kind of echoes."""
+
+    def decompose(*arguments: Array) -> Echoes:
+        return _decompose(kind, most, *arguments)
+
+    decompose.__name__ = "_decompose"
+    return over_shots(1, 1, 0, 1, 0, 0, in_turn=True)(decompose)
+
+
+class _Shapes(NamedTuple):
+    """How echoes of a kind look: their sum, and amplitude and place of the best new one."""
+
+    width: Array
+    model: Callable[[Array, Array, Array], Array]
+    seed: Callable[[Array, Array], tuple[Array, Array]]
+
+
+class _State(NamedTuple):
+    """A fit with some echoes."""
+
+    p: Free
+    on: On
+    chi2: Array
+    criterion: Array
+
+
+def _gaussians(size: int, width: Array) -> _Shapes:
+    place = jnp.arange(size, dtype=width.dtype)
+    # Of an odd number of samples, so that its middle is one.
+    kernel = jnp.exp(-0.5 * ((place[: size - 1] - (size // 2 - 1)) / width) ** 2)
+
+    def model(a, centre, wide):
+        away = (place[None, :] - centre[:, None]) / wide[:, None]
+        return jnp.sum(a[:, None] * jnp.exp(-0.5 * away * away), axis=0)
+
+    def seed(left, weight):
+        matched = jnp.convolve(left * weight**2, kernel, mode="same")
+        return matched, jnp.convolve(weight**2, kernel**2, mode="same")
+
+    return _Shapes(width, model, seed)
+
+
+def _copies(size: int, pulse: Array) -> _Shapes:
+    padded = ladder(size + pulse.size)
+    half = pulse.size // 2
+    first = jnp.roll(jnp.pad(pulse, (0, padded - pulse.size)), -half)
+    spectrum, square = jnp.fft.rfft(first), jnp.fft.rfft(first**2)
+    omega = 2.0 * jnp.pi * jnp.fft.rfftfreq(padded).astype(pulse.dtype)
+
+    def model(a, centre, wide):
+        damping = -0.5 * (omega[None, :] * wide[:, None]) ** 2
+        turns = jnp.exp(lax.complex(damping, -omega[None, :] * centre[:, None]))
+        return jnp.fft.irfft(spectrum * jnp.sum(a[:, None] * turns, axis=0), padded)[:size]
+
+    def correlate(samples, with_spectrum):
+        return jnp.fft.irfft(jnp.fft.rfft(samples, padded) * jnp.conj(with_spectrum), padded)[:size]
+
+    def seed(left, weight):
+        return correlate(left * weight**2, spectrum), correlate(weight**2, square)
+
+    return _Shapes(jnp.sum(pulse) / jnp.sqrt(2.0 * jnp.pi), model, seed)
+
+
+def _with_pulse_error(y: Array, weight: Array, pulse: Array, error: Array) -> Array:
+    """Weights of samples whose noise holds the pulse's errors too."""
+    size = ladder(y.size + pulse.size)
+    half, energy = pulse.size // 2, jnp.where(weight > 0, y * y, 0.0)
+    near = jnp.fft.irfft(jnp.fft.rfft(energy, size) * jnp.fft.rfft(jnp.ones(pulse.size, y.dtype), size), size)
+    amplitude2 = jnp.maximum(near[half : half + y.size], 0.0) / jnp.sum(pulse**2)
+    return weight / jnp.sqrt(1.0 + (weight * error) ** 2 * amplitude2)
+
+
+def _decompose(
+    kind: str, most: int, y: Array, weight: Array, step: Array, pulse: Array, width: Array, error: Array
+) -> Echoes:
+    if kind == "gaussian":
+        shapes = _gaussians(y.size, width / step)
+    else:
+        shapes, weight = _copies(y.size, pulse), _with_pulse_error(y, weight, pulse, error)
+    used = weight > 0
+    count, first, last = jnp.sum(used), jnp.argmax(used), y.size - 1 - jnp.argmax(used[::-1])
+    log_n = jnp.log(jnp.maximum(count, 2).astype(y.dtype))
     scale = jnp.maximum(jnp.max(jnp.abs(y)), jnp.finfo(y.dtype).tiny)
-
-    def unpack(p: Float[Array, "echoes 3"]) -> tuple[Array, Array, Array]:
-        """Amplitude, time and width out of free parameters of order one."""
-        low, high = jnp.log(_NARROWEST), jnp.log(_WIDEST)
-        wide = jnp.exp(low + (high - low) * jax.nn.sigmoid(p[:, 2])) * width
-        return scale * p[:, 0], t[0] + width * p[:, 1], wide
-
-    def model(p: Float[Array, "echoes 3"], on: Bool[Array, " echoes"]) -> Samples:
-        a, centre, wide = unpack(p)
-        away = (t[None, :] - centre[:, None]) / wide[:, None]
-        return jnp.sum(jnp.where(on[:, None], a[:, None] * jnp.exp(-0.5 * away * away), 0.0), axis=0)
-
-    def residual(p: Float[Array, "echoes 3"], on: Bool[Array, " echoes"]) -> Samples:
-        return (model(p, on) - y) / sigma
-
-    # The free parameter of the pulse's own width.
-    share = -jnp.log(_NARROWEST) / (jnp.log(_WIDEST) - jnp.log(_NARROWEST))
+    low, high = (jnp.log(jnp.asarray(end, y.dtype)) for end in _WIDTHS[kind])
+    share = (jnp.log(_START[kind]) - low) / (high - low)
     own = jnp.log(share) - jnp.log1p(-share)
 
-    def add(carry, k):
-        p, on = carry
-        left = (y - model(p, on)) / sigma**2
-        matched = jnp.convolve(left, kernel, mode="same")
-        norm = jnp.convolve(1.0 / sigma**2, kernel**2, mode="same")
-        best = jnp.argmax(matched / jnp.sqrt(norm))
-        amplitude = matched[best] / norm[best]
-        place = t[best] - _half_step(t, step)
-        p = p.at[k].set(jnp.stack([amplitude / scale, (place - t[0]) / width, own]))
+    def unpack(p: Free) -> tuple[Array, Array, Array]:
+        """Amplitude, place and width, in samples, out of free parameters of order one."""
+        wide = jnp.exp(low + (high - low) * jax.nn.sigmoid(p[:, 2])) * shapes.width
+        return scale * p[:, 0], shapes.width * p[:, 1], jnp.zeros_like(wide) if kind == "copies" else wide
+
+    def model(p: Free, on: On) -> Array:
+        a, centre, wide = unpack(p)
+        return shapes.model(jnp.where(on, a, 0.0), centre, wide)
+
+    def residual(p: Free, on: On) -> Array:
+        return (model(p, on) - y) * weight
+
+    none = jnp.sum((y * weight) ** 2)
+    nothing = _State(jnp.zeros((most, 3), y.dtype), jnp.zeros(most, bool), none, none)
+
+    def add(state: _State, k: Array) -> _State:
+        p, on = state.p, state.on
+        matched, norm = shapes.seed(y - model(p, on), weight)
+        norm = jnp.maximum(norm, jnp.finfo(y.dtype).tiny)
+        best = jnp.argmax(jnp.where(used, matched / jnp.sqrt(norm), -jnp.inf))
+        p = p.at[k].set(jnp.stack([matched[best] / norm[best] / scale, best / shapes.width, own]))
         on = on.at[k].set(True)
         fitted = optx.least_squares(residual, _SOLVER, p, args=on, max_steps=_STEPS, throw=False).value
-        good = jnp.all(jnp.isfinite(fitted))
-        p = jnp.where(good, fitted, p)
+        p = jnp.where(jnp.all(jnp.isfinite(fitted)), fitted, p)
         chi2 = jnp.sum(residual(p, on) ** 2)
-        # Echoes are returns: none may be negative.
-        positive = jnp.all(jnp.where(on, p[:, 0] > 0, True))
-        criterion = jnp.where(positive, chi2 + 3 * (k + 1) * log_n, jnp.inf)
-        return (p, on), (p, on, chi2, criterion)
+        # Echoes are returns of what was recorded: none may be negative, or outside.
+        a, centre, _ = unpack(p)
+        sound = jnp.all(jnp.where(on, (a > 0) & (centre >= first) & (centre <= last), True))
+        return _State(p, on, chi2, jnp.where(sound, chi2 + _COST[kind] * (k + 1) * log_n, jnp.inf))
 
-    nothing = (jnp.zeros((most, 3), y.dtype), jnp.zeros(most, bool))
-    _, (p, on, chi2, criterion) = lax.scan(add, nothing, jnp.arange(most))
-    none = jnp.sum((y / sigma) ** 2)
-    p, on = (jnp.concatenate([a[None], b]) for a, b in zip(nothing, (p, on)))
-    chi2, criterion = (jnp.concatenate([none[None], c]) for c in (chi2, criterion))
-    best = jnp.argmin(criterion)
-    p, on = p[best], on[best]
+    def step_on(carry: tuple[_State, _State, Array], k: Array) -> tuple[tuple[_State, _State, Array], None]:
+        last, best, failed = carry
+        last = lax.cond(
+            failed < _PATIENCE,
+            add,
+            lambda state, _: state._replace(criterion=jnp.full((), jnp.inf, y.dtype)),
+            last,
+            k,
+        )
+        better = last.criterion < best.criterion
+        best = jax.tree.map(partial(_choose, better), last, best)
+        return (last, best, jnp.where(better, 0, failed + 1)), None
+
+    carry = (nothing, nothing, jnp.zeros((), int))
+    (_, found, _), _ = lax.scan(step_on, carry, jnp.arange(most))
+    p, on = found.p, found.on
     order = jnp.argsort(jnp.where(on, p[:, 1], jnp.inf))
     p, on = p[order], on[order]
-    jacobian = jax.jacfwd(residual)(p, on).reshape(y.size, -1)
-    # Inactive echoes have no column; one on their diagonal keeps the inverse.
-    idle = jnp.where(jnp.repeat(on, 3), 0.0, 1.0)
-    variance = jnp.diagonal(jnp.linalg.pinv(jacobian.T @ jacobian + jnp.diag(idle)))
     a, centre, wide = unpack(p)
-    slope = jax.vmap(jax.grad(lambda q: unpack(q[None])[2][0]))(p)[:, 2]
-    natural = jnp.stack([jnp.full_like(a, scale), jnp.full_like(a, width), slope], axis=1)
-    stderr = jnp.sqrt(jnp.maximum(variance, 0.0)).reshape(-1, 3) * natural
     return Echoes(
         amplitude=jnp.where(on, a, 0.0),
-        time=jnp.where(on, centre, 0.0),
-        width=jnp.where(on, wide, 0.0),
-        stderr=jnp.where(on[:, None], stderr, 0.0),
+        time=jnp.where(on, centre * step, 0.0),
+        width=jnp.where(on, wide * step, 0.0),
+        stderr=jnp.where(on[:, None], _errors(residual, unpack, p, on, kind) * _units(step, y.dtype), 0.0),
         count=jnp.sum(on),
         model=model(p, on),
-        chi2=chi2[best],
-        criterion=criterion[best],
+        chi2=found.chi2,
+        criterion=found.criterion,
     )
 
 
-def _half_step(t: Samples, step: Array) -> Array:
-    """How far the centre of a kernel of an even number of samples lies from a sample."""
-    return jnp.where(t.size % 2 == 0, 0.5 * step, 0.0)
+def _units(step: Array, kind: Any) -> Array:
+    return jnp.stack([jnp.ones((), kind), step, step])[None, :]
 
 
-def relative_heights(
-    height: Float[ArrayLike, " bins"],
-    power: Float[ArrayLike, " bins"],
-    *,
-    ground: Float[ArrayLike, ""] = 0.0,
-    levels: Float[ArrayLike, " levels"] | Sequence[float] = (25.0, 50.0, 75.0, 95.0, 98.0, 100.0),
-) -> Float[Array, " levels"]:
-    """Relative heights (RH metrics): heights above ground below which given percentages of the energy return.
-
-    **Arguments:**
-
-    - `height`: (bins,) m, decreasing with time, as `Waveform.height`.
-    - `power`: (bins,) waveform, background removed. Negative samples count as zero.
-    - `ground`: height of the ground in m. Default 0.
-    - `levels`: (levels,) percentages, 0 to 100. Default (25, 50, 75, 95, 98, 100).
-
-    **Returns:** (levels,) heights in m.
-
-    **Raises:** ValueError for `levels` outside 0 to 100.
-
-    **Source:** Dubayah et al. (2020), Sci. Remote Sens. 1, 100002.
-
-    **Example:**
-
-    >>> import inversion, numpy as np
-    >>> height = np.arange(20.0, -5.0, -0.5)
-    >>> power = np.where((height >= 1.0) & (height <= 15.0), 1.0, 0.0)
-    >>> rh50, rh75 = inversion.relative_heights(height, power, ground=1.0, levels=(50.0, 75.0))
-    >>> print(f"{float(rh50):.1f} m, {float(rh75):.1f} m")
-    7.0 m, 10.6 m
-    """
-    check_range("levels", levels, 0.0, 100.0)
-    z, y = as_array(height)[::-1], jnp.maximum(as_array(power), 0.0)[::-1]
-    below = jnp.cumsum(y)
-    # Energy up to the middle of each sample.
-    share = (below - 0.5 * y) / jnp.maximum(below[-1], jnp.finfo(y.dtype).tiny)
-    return jnp.interp(as_array(levels) / 100.0, share, z) - as_array(ground)
-
-
-def find_ground(
-    height: Float[ArrayLike, " bins"],
-    power: Float[ArrayLike, " bins"],
-    *,
-    threshold: float,
-) -> Float[Array, ""]:
-    """Height of the ground, taken as the lowest mode: the last local maximum above `threshold`.
-
-    Between samples, it is the vertex of the parabola through the maximum and its two neighbours. Smooth noisy
-    waveforms first.
-
-    **Arguments:**
-
-    - `height`: (bins,) m, decreasing with time, as `Waveform.height`.
-    - `power`: (bins,) waveform.
-    - `threshold`: in units of `power`.
-
-    **Returns:** the height in m; NaN where there is no such maximum.
-
-    **Raises:** ValueError for a `threshold` that is not finite.
-
-    **Example:**
-
-    >>> import inversion, numpy as np
-    >>> height = np.arange(20.0, -5.0, -0.25)
-    >>> power = 0.5 * np.exp(-0.5 * ((height - 12.0) / 2.0) ** 2) + np.exp(-0.5 * ((height - 1.6) / 0.5) ** 2)
-    >>> print(f"{float(inversion.find_ground(height, power, threshold=0.1)):.1f} m")
-    1.6 m
-    """
-    check_range("threshold", threshold)
-    z, y = as_array(height), as_array(power)
-    peak = (y[1:-1] > y[:-2]) & (y[1:-1] >= y[2:]) & (y[1:-1] > threshold)
-    last = y.size - 2 - jnp.argmax(peak[::-1])
-    before, top, after = y[last - 1], y[last], y[last + 1]
-    bend = 2.0 * top - before - after
-    shift = 0.5 * (after - before) / jnp.where(bend > 0, bend, 1.0)
-    found = z[last] + shift * 0.5 * (z[last + 1] - z[last - 1])
-    return jnp.where(jnp.any(peak), found, jnp.nan)
-
-
-def gap_probability(
-    canopy: Float[ArrayLike, " bins"], ground: Float[ArrayLike, ""], *, reflectance_ratio: float = 1.5
-) -> Samples:
-    """Gap probability from above the canopy down to each sample, in the direction of the beam.
-
-    P(z) = 1 - Rv(z) / (Rv + Rg rho_v / rho_g), with Rv(z) the energy that the canopy returned from above z.
-
-    **Arguments:**
-
-    - `canopy`: (bins,) energy of the canopy's return per sample, from the top down.
-    - `ground`: energy of the ground's return, in the same unit.
-    - `reflectance_ratio`: rho_v / rho_g, of apparent reflectances, above 0. Default 1.5, GEDI's.
-
-    **Returns:** (bins,) gap probability.
-
-    **Raises:** ValueError for a `reflectance_ratio` that is not above 0.
-
-    **Source:** Ni-Meister et al. (2001), IEEE Trans. Geosci. Remote Sens. 39, 1943; Tang and Armston (2019),
-    GEDI footprint canopy cover and vertical profile metrics (theoretical basis document).
-
-    **Example:**
-
-    >>> import inversion
-    >>> gap = inversion.gap_probability([0.1, 0.2, 0.1], 0.2)
-    >>> [f"{float(p):.2f}" for p in gap]
-    ['0.86', '0.57', '0.43']
-    """
-    check_range("reflectance_ratio", reflectance_ratio, 0.0, low_open=True)
-    above = jnp.cumsum(as_array(canopy))
-    total = above[-1] + as_array(ground) * reflectance_ratio
-    return 1.0 - above / jnp.where(total > 0, total, 1.0)
-
-
-def plant_area_index(
-    gap: Float[ArrayLike, "*s"], *, zenith: float = 0.0, projection: float = 0.5, clumping: float = 1.0
-) -> Float[Array, "*s"]:
-    """Plant area index above each level from the gap probability there: -ln(P) cos(zenith) / (G Omega).
-
-    **Arguments:**
-
-    - `gap`: gap probability P, of any shape, above 0, at most 1.
-    - `zenith`: angle between the beam and the vertical in degrees, 0 to below 90. Default 0.
-    - `projection`: G, mean projection of unit plant area onto the plane across the beam, above 0, at most 1.
-      Default 0.5 (random orientations).
-    - `clumping`: clumping index Omega, above 0. Default 1 (random positions).
-
-    **Returns:** m2 of plant area per m2 of ground, of the shape of `gap`.
-
-    **Raises:** ValueError for arguments outside their ranges.
-
-    **Example:**
-
-    >>> import inversion
-    >>> print(f"{float(inversion.plant_area_index(0.5)):.2f}")
-    1.39
-    """
-    check_range("gap", gap, 0.0, 1.0, low_open=True)
-    check_range("zenith", zenith, 0.0, 90.0, high_open=True)
-    check_range("projection", projection, 0.0, 1.0, low_open=True)
-    check_range("clumping", clumping, 0.0, low_open=True)
-    return -jnp.log(as_array(gap)) * jnp.cos(jnp.deg2rad(zenith)) / (projection * clumping)
+def _errors(residual: Callable, unpack: Callable, p: Free, on: On, kind: str) -> Array:
+    """(echoes, 3) standard errors of amplitude, place and width, in samples."""
+    columns = jax.jacfwd(residual)(p, on).reshape(-1, p.size)
+    # Parameters that do nothing have no column; one on their diagonal keeps the inverse.
+    free = jnp.asarray([1.0, 1.0, 0.0 if kind == "copies" else 1.0], p.dtype)
+    idle = 1.0 - jnp.where(on, 1.0, 0.0)[:, None] * free[None, :]
+    variance = jnp.diagonal(jnp.linalg.pinv(columns.T @ columns + jnp.diag(idle.reshape(-1))))
+    slopes = jax.vmap(jax.jacfwd(lambda q: jnp.stack([part[0] for part in unpack(q[None])])))(p)
+    natural = jnp.diagonal(slopes, axis1=1, axis2=2)
+    return jnp.sqrt(jnp.maximum(variance, 0.0)).reshape(-1, 3) * natural

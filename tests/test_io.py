@@ -1,5 +1,6 @@
 """GEDI's level 1B reader: a small file written here, the recorded one, and damaged ones."""
 
+import dataclasses
 import sys
 
 import numpy as np
@@ -286,3 +287,28 @@ def test_time_zero_of_the_pulse(recorded):
     # 0.07 m remain, as level 2 fits other shapes. With the centroid for time zero it would be 0.4 m.
     assert abs(np.mean(errors)) < 0.1
     assert np.std(errors) < 0.1
+
+
+def test_flags_stay_with_the_shot(small):
+    """Absent in this subset; where they are, each shot keeps its own, and a damaged one is refused."""
+    assert [(s.degrade, s.stale_return) for s in read_gedi_l1b(small)] == [(None, None)] * 4
+    with h5py.File(small, "a") as file:
+        file["BEAM0001/geolocation/degrade"] = np.array([0, 30, 80], np.int8)
+        file["BEAM0001/stale_return_flag"] = np.array([0, 1, 0], np.uint8)
+    shots = read_gedi_l1b(small)
+    assert [s.degrade for s in shots] == [0, 30, 80, None]
+    assert [s.stale_return for s in shots] == [0, 1, 0, None]
+    with h5py.File(small, "a") as file:
+        del file["BEAM0001/stale_return_flag"]
+        file["BEAM0001/stale_return_flag"] = np.array([0, 1], np.uint8)
+    with pytest.raises(ValueError, match="stale_return_flag: shape"):
+        read_gedi_l1b(small)
+
+
+def test_saturated_records_are_told(small, recorded):
+    shot = read_gedi_l1b(small, 0)[0]
+    assert shot.saturated == 0
+    clipped = dataclasses.replace(shot, waveform=np.minimum(shot.waveform, shot.waveform[30]))
+    assert clipped.saturated == 10
+    shots, _ = recorded
+    assert not any(s.saturated or s.degrade or s.stale_return for s in shots.values())

@@ -34,6 +34,9 @@ from jaxlidar.io.checks import STEP, STEP_TOLERANCE, existing
 from jaxlidar.io.gedi_beam import Beam, refusing
 from jaxlidar.io.pedestal import above_pedestal
 
+# Equal samples in a row that noise does not make.
+_FLAT = 3
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class GediShot:
@@ -55,6 +58,10 @@ class GediShot:
     - `zenith`: of the beam at the footprint in degrees, as in `Lidar`.
     - `azimuth`: in degrees clockwise from north, the horizontal direction in which the light travels down, as
       in `Lidar`.
+    - `degrade`: the product's flag of degraded pointing or positioning, 0 where neither is. Default None: not
+      in the file.
+    - `stale_return`: the product's flag, 1 where no return was detected on board and the place of an earlier
+      shot's return chose the samples. Default None: not in the file.
 
     **Example:**
 
@@ -82,6 +89,19 @@ class GediShot:
     altitude: float
     zenith: float
     azimuth: float
+    degrade: int | None = None
+    stale_return: int | None = None
+
+    @property
+    def saturated(self) -> int:
+        """Most samples in a row at the largest value of the record, where they are three or more, else 0.
+
+        The level 1B product has no flag of saturation. A receiver or digitiser at its limit repeats one
+        value.
+        """
+        ends = np.flatnonzero(np.diff(np.r_[False, self.waveform == self.waveform.max(), False]))
+        longest = int(np.max(ends[1::2] - ends[::2]))
+        return longest if longest >= _FLAT else 0
 
     @property
     def signal(self) -> Float[np.ndarray, " bins"]:
@@ -204,4 +224,6 @@ def _shot(beam: Beam, i: int, received: np.ndarray, transmitted: np.ndarray) -> 
         altitude=beam.number("geolocation/altitude_instrument", i),
         zenith=max(0.0, 90.0 - float(np.rad2deg(above_horizon))),
         azimuth=float(np.rad2deg(towards) + 180.0) % 360.0,
+        degrade=beam.flag("degrade", i),
+        stale_return=beam.flag("stale_return", i),
     )

@@ -28,6 +28,8 @@ _PER_SHOT = (
     "geolocation/local_beam_elevation",
     "geolocation/local_beam_azimuth",
 )
+# Flags that a GediShot keeps; subsets may have left them out.
+FLAGS = {"degrade": "geolocation/degrade", "stale_return": "stale_return_flag"}
 # What h5py raises for damaged files.
 _DAMAGED = (OSError, RuntimeError, ValueError, KeyError, TypeError, AttributeError, OverflowError)
 
@@ -70,6 +72,11 @@ class Beam:
                 f"{self.at(field, shot)}: {value:g} is outside the admissible range [{low:g}, {high:g}]"
             )
         return value
+
+    def flag(self, name: str, shot: int) -> int | None:
+        """A flag of a shot, or None where the file does not have it."""
+        values = self._flags.get(name)
+        return None if values is None else int(values[shot])
 
     def samples(self, kind: str, shots: Sequence[int]) -> dict[int, np.ndarray]:
         """The samples of several shots, in increasing order, of the received ("rx") or sent ("tx") waveform.
@@ -114,6 +121,23 @@ class Beam:
                     f"{self.at(field)}: shape {shape}, but shot_number has the shape {(self.size,)}"
                 )
         return {field: self._read(field) for field in _PER_SHOT}
+
+    @functools.cached_property
+    def _flags(self) -> dict[str, np.ndarray]:
+        found = {}
+        for name, field in FLAGS.items():
+            with refusing(f"{self.at(field)}: damaged"):
+                absent = f"{self.name}/{field}" not in self.file
+            if absent:
+                continue
+            values = self._read(field)
+            if values.shape != (self.size,) or values.dtype.kind not in "iu":
+                raise ValueError(
+                    f"{self.at(field)}: shape {values.shape} and type {values.dtype}, where a whole number "
+                    f"for each of {self.size} shots belongs"
+                )
+            found[name] = values
+        return found
 
     @functools.cached_property
     def _start_and_count(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
