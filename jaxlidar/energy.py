@@ -12,22 +12,24 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxlidar._checks import check_choice, check_integer, check_key, check_range, known_array
+from jaxlidar._checks import check_choice, check_integer, check_key, check_range, known_number
 from jaxlidar._programs import Program
-from jaxlidar._statistics import Moments
+from jaxlidar._statistics import Moments, batches_needed
 from jaxlidar._threads import ONE_CORE, side_by_side
 from jaxlidar.instrument.lidar import Lidar
+from jaxlidar.planning.path_lengths import PathLengths
 from jaxlidar.planning.plan import MIN_BATCHES
 from jaxlidar.planning.plan import plan as make_plan
 from jaxlidar.planning.setup import Setup, reduce
 from jaxlidar.scenes.scene import Scene, check_kinds
+from jaxlidar.simulate import Progress
 from jaxlidar.trace.fates import Fates, follow, from_beam, from_the_sky
 from jaxlidar.trace.setting import setting_of
 from jaxlidar.waveform import optics_of
 
 # Photons of a batch.
 BATCH = 8192
-# Heights of the canopy over which a flight is followed where the canopy has no sides.
+# Heights of the canopy over which a flight is followed at most where the canopy has no sides.
 REACH = 300.0
 
 
@@ -64,23 +66,6 @@ class EnergyBudget(eqx.Module):
     info: dict = eqx.field(static=True)
 
 
-@dataclasses.dataclass(frozen=True)
-class _Report:
-    """How far a budget has come."""
-
-    batches: int
-    photons: int
-    seconds: float
-    error: float
-    rtol: float
-
-    def __str__(self) -> str:
-        return (
-            f"{self.batches} batches, {self.photons} photons, {self.seconds:.1f} s, "
-            f"largest standard error {self.error:.2g} (aim {self.rtol:.2g})"
-        )
-
-
 def energy_budget(
     lidar: Lidar,
     scene: Scene,
@@ -90,7 +75,7 @@ def energy_budget(
     illumination: str = "beam",
     max_orders: int = 10_000,
     max_photons: int = 100_000_000,
-    progress: Callable[[_Report], None] | None = None,
+    progress: Callable[[Progress], None] | None = None,
 ) -> EnergyBudget:
     """What a scene absorbs, returns to the sky and lets through, of light that is followed to its end.
 
@@ -108,12 +93,15 @@ def energy_budget(
       canopy with periodic sides.
     - `max_orders`: scatterings followed, at least 1; what is left then is `unfollowed`. Default 10,000.
     - `max_photons`: stop after so many, at least 1, whatever the error. Default 100,000,000.
-    - `progress`: called with a report after every round; for instance `print`. Default None.
+    - `progress`: a function called with a `Progress` after every round; for instance `print`. Default None.
+
+    An interrupt (Ctrl-C) after eight batches ends it with what is done.
 
     **Returns:** an `EnergyBudget`.
 
     **Raises:** ValueError for values outside their ranges, and for parallel light where the canopy has open
-    sides; TypeError for things of another kind.
+    sides; TypeError for things of another kind; KeyboardInterrupt where it is interrupted before eight
+    batches.
 
     **Example:**
 
@@ -141,20 +129,26 @@ def energy_budget(
         return _compiled(setup, jax.random.fold_in(key, number), illumination == "parallel", max_orders)
 
     with side_by_side() as run:
-        while True:
-            for fates in run(one, range(moments.count, wanted)):
-                moments.add(np.concatenate([np.asarray(a).reshape(-1, n) for a in jax.tree.leaves(fates)]))
-            error, done = float(np.max(moments.stderr, initial=0.0)), moments.count
-            photons, seconds = done * BATCH, time.perf_counter() - started
-            if progress is not None:
-                progress(_Report(done, photons, seconds, error, rtol))
-            if error <= rtol:
-                break
-            if photons >= max_photons:
-                stopped = "photons traced"
-                break
-            needed = math.ceil(1.1 * done * (error / rtol) ** 2)
-            wanted = min(max(needed, done + 4), 4 * done, max(-(-max_photons // BATCH), done + 1))
+        try:
+            while True:
+                for fates in run(one, range(moments.count, wanted)):
+                    moments.add(
+                        np.concatenate([np.asarray(a).reshape(-1, n) for a in jax.tree.leaves(fates)])
+                    )
+                error, done = float(np.max(moments.stderr, initial=0.0)), moments.count
+                photons, seconds = done * BATCH, time.perf_counter() - started
+                if progress is not None:
+                    progress(Progress(done, photons, seconds, error, rtol))
+                if error <= rtol:
+                    break
+                if photons >= max_photons:
+                    stopped = "photons traced"
+                    break
+                wanted = min(batches_needed(done, error, rtol), max(-(-max_photons // BATCH), done + 1))
+        except KeyboardInterrupt:
+            if moments.count < MIN_BATCHES:
+                raise
+            error, stopped = float(np.max(moments.stderr, initial=0.0)), "interrupted"
     info = {
         "photons": moments.count * BATCH,
         "batches": moments.count,
@@ -182,10 +176,10 @@ def _endless(setup: Setup) -> Setup:
     canopy, trace = setup.scene.canopy, setup.plan.trace
     if canopy is None or canopy.sides == "open":
         return setup
-    size, shape = known_array(canopy.voxels.voxel_size), canopy.voxels.shape
-    flight = REACH * float(size[2]) * shape[2]
-    steps = shape[2] + sum(math.ceil(flight / s) for s in size[:2]) + 3
-    trace = trace._replace(max_flight=flight, march_steps=int(steps))
+    lengths = PathLengths(setup.lidar, setup.scene)
+    height = known_number(canopy.voxels.voxel_size[2]) * canopy.voxels.shape[2]
+    flight = min(REACH * height, lengths.longest_march)
+    trace = trace._replace(max_flight=flight, march_steps=lengths.voxels_along(flight))
     return dataclasses.replace(setup, plan=dataclasses.replace(setup.plan, trace=trace))
 
 

@@ -32,14 +32,14 @@ LARGEST_BATCH = 65_536
 
 @dataclasses.dataclass(frozen=True)
 class Progress:
-    """How far a running simulation has come; `simulate` gives it to its argument `progress`.
+    """How far a simulation has come; `simulate` and `energy_budget` give it to their argument `progress`.
 
     Printed, it is one line of text.
 
     - `batches`: batches traced so far.
     - `photons`: photons traced so far.
     - `seconds`: time spent so far.
-    - `error`: relative error of the waveform so far, as `simulate` defines it.
+    - `error`: relative error so far: of the waveform, as `simulate` defines it, or of the emitted energy.
     - `rtol`: relative error aimed at, or None where the number of photons is given.
 
     **Example:**
@@ -146,11 +146,14 @@ def simulate(
     plan = _planned(lidar, scene, given, goal, planning)
     setup = reduce(lidar, scene, plan)
     traced = _trace_until(setup, key, goal, progress)
-    if given is None and traced.beyond > plan.rtol and plan.orders < plan.limits.most_orders:
+    spent = traced.info.get("seconds", 0.0)
+    if given is None and traced.beyond > 0 and plan.orders < plan.limits.most_orders and spent < max_seconds:
         # Orders beyond the last matter: follow as many as there is room for.
         planning["max_orders"] = plan.limits.most_orders
-        setup = reduce(lidar, scene, _planned(lidar, scene, None, goal, planning))
-        traced = _trace_until(setup, key, goal, progress)
+        plan = _planned(lidar, scene, None, goal, planning)
+        plan = dataclasses.replace(plan, limits=plan.limits._replace(automatic_orders=True))
+        setup = reduce(lidar, scene, plan)
+        traced = _trace_until(setup, key, goal._replace(max_seconds=max_seconds - spent), progress)
     return _recorded(setup, traced)
 
 
@@ -194,7 +197,7 @@ class _Traced(NamedTuple):
     """The mean response, standard errors of its waveform and ledger (None: nothing is random), and what it
     took.
 
-    `beyond`: share that orders beyond the last may add, where that is known and the plan chose the orders.
+    `beyond`: share that orders beyond the last may add, where nothing else was short of the goal; else 0.
     """
 
     response: Response
@@ -320,10 +323,11 @@ def _trace_batches(
                 raise
             error, _ = errors_of(waves)
             stopped = "interrupted"
-    beyond = float(np.max(neglected.mean / np.maximum(waves.mean.sum(axis=1), 1e-30), initial=0.0))
-    beyond = beyond if plan.limits.automatic_orders else 0.0
-    if stopped == "tolerance met" and beyond > rtol:
-        stopped = f"orders beyond {plan.orders} may add {percent(beyond)}"
+    beyond = 0.0
+    if stopped == "tolerance met" and plan.limits.automatic_orders:
+        share = float(np.max(neglected.mean / np.maximum(waves.mean.sum(axis=1), 1e-30), initial=0.0))
+        if share > rtol and float(np.max(neglected.mean, initial=0.0)) > goal.atol:
+            beyond, stopped = share, f"orders beyond {plan.orders} may add {percent(share)}"
     info = {
         "photons": waves.count * counted,
         "batches": waves.count,

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import jaxtyping
 import numpy as np
 import pytest
 
@@ -184,3 +185,9 @@ def test_rows_of_a_vmapped_product_are_right():
     R = jnp.asarray(matrix, jnp.float32)
     got = jax.jit(jax.vmap(lambda r: jnp.sum((R @ r) ** 2)))(jnp.asarray(rows, jnp.float32))
     assert np.allclose(got, np.sum((rows @ matrix.T) ** 2, axis=1), rtol=1e-4)
+
+
+def test_shapes_and_types_are_checked_in_tests():
+    """Whoever imports the package before conftest's hook is in place switches the checks off."""
+    with pytest.raises(jaxtyping.TypeCheckError):
+        jaxlidar.waveform.height_of(jaxlidar.Lidar(), jnp.zeros((2, 2)))

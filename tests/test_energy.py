@@ -181,3 +181,18 @@ BAD = [
 def test_bad_input(given, message):
     with pytest.raises(ValueError, match=message):
         jl.energy_budget(jl.Lidar(), jl.Scene(plates=(PLATE,)), key=KEY, **given)
+
+
+def test_an_interrupt_keeps_what_is_done():
+    scene = jl.Scene(ground=jl.Ground(reflectance=0.4), plates=(PLATE,))
+    seen = []
+
+    def interrupt(progress):
+        seen.append(str(progress))
+        raise KeyboardInterrupt
+
+    budget = jl.energy_budget(LIDAR, scene, key=KEY, rtol=1e-5, progress=interrupt)
+    assert budget.info["stopped"] == "interrupted"
+    assert budget.info["batches"] == 8
+    assert seen[0].endswith("(aim 1e-05)")
+    np.testing.assert_allclose(total(budget), 1.0, atol=0.01)

@@ -8,6 +8,7 @@ import pytest
 from helpers import slab
 
 import jaxlidar as jl
+from jaxlidar.planning import orders
 from jaxlidar.simulate import LateLightWarning
 
 KEY = jax.random.key(5)
@@ -60,6 +61,9 @@ def test_the_table_has_a_row_for_it():
     (row,) = (effect for effect in few.effects if effect.name == "after the window")
     (more,) = (effect for effect in many.effects if effect.name == "after the window")
     assert row.bound < more.bound
+    # A window of one's own may leave out all.
+    own = jl.plan(LIDAR, dense(0.3, 10.0), window=(-90.0, -80.0))
+    assert next(effect.bound for effect in own.effects if effect.name == "after the window") == 1.0
     assert "window" in str(many)
 
 
@@ -77,6 +81,30 @@ def test_tolerance_is_met_only_if_the_neglected_orders_are_below_it():
     assert jl.plan(LIDAR, scene, rtol=0.03, describe=False).likely_beyond >= float(
         wave.ledger["unfollowed"][0]
     ) - 3 * float(wave.ledger_stderr["unfollowed"][0])
+
+
+def test_more_orders_are_followed_where_too_few_were_planned(monkeypatch):
+    """The plan is made to expect that little is scattered again: two orders, of 6 that there is room for."""
+    monkeypatch.setattr(orders, "scattered_again", lambda scene, optics: 1e-3)
+    monkeypatch.setattr(orders, "MAX_HISTORIES", 60)
+    seen = []
+    given = {"key": KEY, "rtol": 0.05, "window": (-90.0, 60.0), "progress": lambda _: seen.append(len(seen))}
+    wave = jl.simulate(LIDAR, dense(0.9, 3.0), **given)
+    orders_followed = jl.plan(LIDAR, dense(0.9, 3.0), window=(-90.0, 60.0), describe=False).limits.most_orders
+    assert orders_followed > 2
+    assert wave.info["stopped"].startswith(f"orders beyond {orders_followed} may add")
+
+    # Time that is spent, and memory, are limits of both attempts together.
+    def interrupt(_):
+        raise KeyboardInterrupt
+
+    early = jl.simulate(LIDAR, dense(0.9, 3.0), **given | {"progress": interrupt})
+    assert early.info["stopped"] == "interrupted"
+    short = jl.simulate(LIDAR, dense(0.9, 3.0), **given, max_seconds=1e-6)
+    assert short.info["stopped"].startswith("orders beyond 2 may add")
+    three = jl.plan(LIDAR, dense(0.9, 3.0), window=(-90.0, 60.0), max_orders=3, describe=False)
+    tight = jl.simulate(LIDAR, dense(0.9, 3.0), **given, max_memory=1.0001 * three.memory / 1e9)
+    assert tight.info["stopped"].startswith("orders beyond 3 may add")
 
 
 def test_orders_that_the_user_chose_are_enough_for_the_user():

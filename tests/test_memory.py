@@ -9,7 +9,7 @@ from helpers import slab
 
 import jaxlidar as jl
 from jaxlidar.planning import memory, sampling
-from jaxlidar.planning.memory import check_memory, in_words
+from jaxlidar.planning.memory import check_memory, in_words, memory_limit
 from jaxlidar.planning.sampling import sampling_of
 
 KEY = jax.random.key(2)
@@ -41,7 +41,7 @@ def test_the_limit_is_the_users():
 
 def test_sizes_in_words():
     assert [in_words(x) for x in (20.0, 2.34e4, 5.6e6, 1.234e10)] == ["20 bytes", "23 kB", "5.6 MB", "12 GB"]
-    check_memory(0.9e9, 1.0)
+    check_memory(0.9e9, memory_limit(1.0))
     assert memory.machine_memory() > 1e8
 
 

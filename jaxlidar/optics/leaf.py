@@ -70,7 +70,7 @@ class LeafOptics(eqx.Module):
 
         **Raises:** ValueError where the numbers of values and wavelengths differ.
         """
-        shape = np.shape(wavelengths)  # pyright: ignore[reportArgumentType]
+        shape = np.shape(wavelengths)  # pyright: ignore[reportArgumentType, reportCallIssue]
         for name in ("reflectance", "transmittance"):
             value = getattr(self, name)
             if value.ndim and value.shape != shape:

@@ -27,8 +27,13 @@ def effect_table(
     chosen: Orders,
     bins: Bins,
     upstream: float,
+    whole_first: bool,
 ) -> tuple[Effect, ...]:
-    """A row for every effect. `chosen`: how many orders are followed, and why."""
+    """A row for every effect.
+
+    `chosen`: how many orders are followed, and why. `whole_first`: whether the record takes in all of order
+    one.
+    """
     orders = chosen.count
     has, planned = present(lidar, scene), present(*without(lidar, scene, off))
     reasons = (
@@ -66,10 +71,9 @@ def effect_table(
             most = bound(name, off)
             likely = min(chosen.beyond, most)
             rows.append(Effect(name, False, f"likely below {percent(likely)}", most, "sum"))
-            late = "light on its way at the end of the record"
-            rows.append(
-                Effect("after the window", False, late, bound(name="multiple scattering", off=off), "sum")
-            )
+            late = bound("multiple scattering", off) if whole_first else 1.0
+            reason = "light on its way at the end of the record"
+            rows.append(Effect("after the window", False, reason, late, "sum"))
     if without(lidar, scene, off)[1].atmosphere is not None:
         name = "scattering within the atmosphere"
         rows.append(Effect(name, False, "beyond first order", bound(name, off), "sum"))

@@ -44,12 +44,16 @@ def in_words(size: float) -> str:
     return f"{size:.0f} bytes"
 
 
-def check_memory(size: float, most: float | None) -> None:
+def memory_limit(most: float | None) -> float:
+    """Bytes that a simulation may take: `most` GB, or a quarter of the machine's memory."""
+    return 0.25 * machine_memory() if most is None else most * 1e9
+
+
+def check_memory(size: float, limit: float) -> None:
     """Refuse what does not fit.
 
     **Raises:** ValueError with the numbers, and what to change.
     """
-    limit = 0.25 * machine_memory() if most is None else most * 1e9
     if size > limit:
         raise ValueError(
             f"the simulation would take about {in_words(size)} of memory; admissible is max_memory = "

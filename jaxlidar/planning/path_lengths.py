@@ -96,7 +96,12 @@ class PathLengths:
         # A flight of s m within the canopy lengthens the way by at least s (1 - sin) - height cos.
         height, cos = self.size[2] * self.shape[2], float(np.abs(self.rays[:, 2]).min())
         flight = (longest + height * cos) / max(1.0 - math.sqrt(1.0 - cos * cos), 0.1)
-        return float(min(flight, max(MOST_VOXELS - self.shape[2], 1) / np.sum(1.0 / self.size[:2])))
+        return float(min(flight, self.longest_march))
+
+    @property
+    def longest_march(self) -> float:
+        """Length, m, of the longest flight through a periodic canopy that crosses `MOST_VOXELS` at most."""
+        return float(max(MOST_VOXELS - self.shape[2], 1) / np.sum(1.0 / self.size[:2]))
 
     def march_steps(self, longest: float) -> int:
         """Bound on the voxels that a flight of `longest_flight` crosses."""
@@ -104,5 +109,8 @@ class PathLengths:
             return 0
         if self.scene.canopy.sides == "open":
             return int(self.shape.sum()) + 3
-        flight = self.longest_flight(longest)
+        return self.voxels_along(self.longest_flight(longest))
+
+    def voxels_along(self, flight: float) -> int:
+        """Bound on the voxels of a periodic canopy that a flight of some length, m, crosses."""
         return int(self.shape[2] + sum(math.ceil(flight / s) for s in self.size[:2])) + 3

@@ -13,7 +13,7 @@ from jaxlidar.optics.laws import AbstractMirror
 from jaxlidar.planning.effect_table import effect_table
 from jaxlidar.planning.effects import Effect, only_planes, present, switched_off, without
 from jaxlidar.planning.local_origin import about_aim
-from jaxlidar.planning.memory import check_memory, in_words, predicted
+from jaxlidar.planning.memory import check_memory, in_words, memory_limit, predicted
 from jaxlidar.planning.orders import degree_of, orders_of, tail_of
 from jaxlidar.planning.path_lengths import PathLengths
 from jaxlidar.planning.scatterers import largest_albedo, lobe_probability, scene_optics, spell
@@ -33,8 +33,8 @@ class Limits(NamedTuple):
 
     - `first`, `last`: times (ns) of the first and the last return of order one. - `albedo`: the largest.
     - `finest`: scale (ns) of the finest feature of the pulse.
-    - `automatic_orders`, `automatic_window`: whether the plan chose them. - `most_orders`: how many could be
-      followed.
+    - `automatic_orders`, `automatic_window`: whether the plan chose them. - `most_orders`: how many there is
+      room for.
     """
 
     first: float
@@ -258,8 +258,17 @@ def plan(
     degree, first_degree = degree_of(orders, plates), 1 + 2 * plates
     reach = lidar.pulse.support(known_number(lidar.jitter))
     spanned = math.ceil((reach[1] - reach[0] + samples[1]) / bins.width) + 5
-    memory = predicted(trace, bins, degree, first_degree, samples[2], spanned)
-    check_memory(memory, max_memory)
+    limit = memory_limit(max_memory)
+
+    def memory_of(orders: int) -> float:
+        return predicted(trace, bins, degree_of(orders, plates), first_degree, samples[2], spanned)
+
+    memory = memory_of(orders)
+    check_memory(memory, limit)
+    most = max(n for n in range(orders, max(chosen.most, orders) + 1) if memory_of(n) <= limit)
+    rows = ()
+    if describe:
+        rows = effect_table(*whole, off, chosen, airy, geometry.upstream, whole_first=window is None)
     return Plan(
         trace=trace,
         bins=bins,
@@ -285,10 +294,10 @@ def plan(
             math.hypot(known_number(lidar.pulse.finest), known_number(lidar.jitter)),
             max_orders is None,
             window is None,
-            chosen.most,
+            most,
         ),
         memory=memory,
-        effects=effect_table(*whole, off, chosen, airy, geometry.upstream) if describe else (),
+        effects=rows,
     )
 
 
