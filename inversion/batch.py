@@ -129,8 +129,8 @@ def retrieve_many(
     time: ArrayLike | Sequence,
     key: PRNGKeyArray,
     plan: Plan | None = None,
-    n_photons: float = 65536,
-    n_rays: float = 8192,
+    n_photons: float | None = None,
+    n_rays: float | None = None,
     max_orders: int | None = None,
     solver: optx.AbstractLeastSquaresSolver = SOLVER,
     max_steps: float = 50,
@@ -195,7 +195,7 @@ def retrieve_many(
     check_kind("path", path, str | os.PathLike | None, "a path, or None")
     lanes = min(check_integer("lanes", lanes), len(y))
     solver, max_steps, starts = check_solution(solver, max_steps, starts)
-    photons, rays = batch_sizes(n_photons, n_rays)
+    photons, rays = batch_sizes(n_photons, n_rays, max_orders, plan)
     lidars = [at_fixed_times(a) for a in _one_each("lidar", lidar, Lidar, len(y))]
     scenes = _one_each("scene", scene, Scene, len(y))
     settled = _started([settle(unknowns, s) for s in scenes], {} if start is None else start, len(y))
@@ -214,10 +214,10 @@ def retrieve_many(
         "scale": [(s.low, s.high) for s in extra],
         "key": key,
         "plan": plan,
-        # A plan replaces them.
+        # A plan has its own.
         "n_photons": photons if plan is None else None,
         "n_rays": rays if plan is None else None,
-        "max_orders": max_orders if plan is None else None,
+        "max_orders": max_orders,
         "solver": solver,
         "max_steps": max_steps,
         "starts": starts,

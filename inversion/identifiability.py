@@ -85,8 +85,8 @@ def cramer_rao(
     key: PRNGKeyArray,
     time: ArrayLike | Sequence | None = None,
     plan: Plan | None = None,
-    n_photons: float = 65536,
-    n_rays: float = 8192,
+    n_photons: float | None = None,
+    n_rays: float | None = None,
     max_orders: int | None = None,
 ) -> CramerRao:
     """Cramer-Rao bounds of the unknowns of a scene: the smallest standard errors, before data are recorded.
@@ -101,8 +101,8 @@ def cramer_rao(
     - `noise`: standard deviation of the apparent reflectance per sample, above 0, anything that broadcasts to
       (wavelengths, bins). Infinity leaves a sample out.
     - `time`: (bins,) ns, sample times. Default None: those of `plan`.
-    - `plan`: what to simulate (`jaxlidar.plan`); it replaces `n_photons`, `n_rays` and `max_orders`. Default
-      None: planned for the scene, and with `time` for the corners of the bounds as well.
+    - `plan`: what to simulate (`jaxlidar.plan`). Default None: planned for the scene, and with `time` for the
+      corners of the bounds as well.
 
     **Returns:** a `CramerRao`.
 
@@ -123,7 +123,7 @@ def cramer_rao(
     check_kinds(lidar, scene)
     check_key(key)
     lidar = at_fixed_times(lidar)
-    photons, rays = batch_sizes(n_photons, n_rays)
+    photons, rays = batch_sizes(n_photons, n_rays, max_orders, plan)
     settled = settle(unknowns, scene)
     axis = None if time is None else time_axis(time, lidar)
     if plan is None:
@@ -267,7 +267,7 @@ def profile_likelihood(
     check_progress(progress)
     check_key(key)
     lidar = at_fixed_times(lidar)
-    photons, rays = batch_sizes(own["n_photons"], own["n_rays"])
+    photons, rays = batch_sizes(own["n_photons"], own["n_rays"], own["max_orders"], plan)
     settled = settle(unknowns, scene)
     names = [s.name for s in settled]
     if name not in names:
@@ -296,6 +296,8 @@ def profile_likelihood(
             photons=photons,
             rays=rays,
         )
+    # The plan has them now.
+    more = {name: value for name, value in more.items() if name not in ("n_photons", "n_rays", "max_orders")}
     middle = int(np.argmin(np.abs(points - float(held.start))))
     found: dict[int, Any] = {}
     for order in (range(middle, points.size), range(middle - 1, -1, -1)):

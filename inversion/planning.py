@@ -10,6 +10,7 @@ from jaxtyping import Float
 from jaxlidar import Lidar, Plan, Scene
 from jaxlidar import plan as make_plan
 from jaxlidar.extend import check_integer, check_kind
+from jaxlidar.planning.ladder import rung
 from jaxlidar.planning.path_lengths import PathLengths
 from jaxlidar.planning.plan import MIN_BATCHES
 
@@ -19,10 +20,26 @@ from .unknowns import Settled, put
 _ALL_CORNERS = 4
 
 
-def batch_sizes(n_photons: float, n_rays: float) -> tuple[int, int]:
-    """Photons and rays of each batch of a simulation. **Raises:** ValueError for less than one in a batch."""
-    photons = check_integer("n_photons", n_photons, MIN_BATCHES)
-    return photons // MIN_BATCHES, check_integer("n_rays", n_rays, MIN_BATCHES) // MIN_BATCHES
+# Of all batches together, where neither they nor a plan are given.
+N_PHOTONS, N_RAYS = 65536, 8192
+
+
+def batch_sizes(
+    n_photons: float | None, n_rays: float | None, max_orders: int | None, plan: Plan | None
+) -> tuple[int, int]:
+    """Photons and rays of each batch of a simulation.
+
+    **Raises:** ValueError for less than one in a batch, and for a plan together with what it would replace.
+    """
+    own = {"n_photons": n_photons, "n_rays": n_rays, "max_orders": max_orders}
+    given = [name for name, value in own.items() if value is not None]
+    if plan is not None and given:
+        raise ValueError(
+            f"plan is given together with {', '.join(given)}; admissible is either: make the plan with them"
+        )
+    photons = check_integer("n_photons", N_PHOTONS if n_photons is None else n_photons, MIN_BATCHES)
+    rays = check_integer("n_rays", N_RAYS if n_rays is None else n_rays, MIN_BATCHES)
+    return photons // MIN_BATCHES, rays // MIN_BATCHES
 
 
 def corners(scene: Scene, settled: list[Settled]) -> list[Scene]:
@@ -87,12 +104,13 @@ def plan_for(
     upstream = max(p.trace.upstream for p in plans)
     last = max(p.trace.last for p in plans)
     extents = [PathLengths(lidar, s) for s in scenes]
-    trace = first.trace._replace(
+    trace = dataclasses.replace(
+        first.trace,
         upstream=upstream,
         last=last,
         max_flight=max(e.longest_flight(last + upstream) for e in extents),
         first_steps=max(p.trace.first_steps for p in plans),
-        march_steps=max(e.march_steps(last + upstream) for e in extents),
+        march_steps=rung(max(e.march_steps(last + upstream) for e in extents)),
         full_cover=tuple(all(c) for c in zip(*(p.trace.full_cover for p in plans))),
     )
     return dataclasses.replace(first, trace=trace, bins=bins)

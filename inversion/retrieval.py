@@ -32,8 +32,8 @@ def retrieve(
     key: PRNGKeyArray,
     time: ArrayLike | Sequence | None = None,
     plan: Plan | None = None,
-    n_photons: float = 65536,
-    n_rays: float = 8192,
+    n_photons: float | None = None,
+    n_rays: float | None = None,
     max_orders: int | None = None,
     solver: optx.AbstractLeastSquaresSolver = SOLVER,
     max_steps: float = 50,
@@ -69,10 +69,12 @@ def retrieve(
     - `time`: (bins,) ns, needed where `observed` is an array. Times must lie the lidar's sampling interval
       apart. Default None: those of the `Waveform`.
     - `plan`: what to simulate (`jaxlidar.plan`, with the window of `observed`, valid throughout the bounds),
-      with the photons and rays of one of eight batches. It replaces `n_photons`, `n_rays` and `max_orders`.
-      Default None: planned for the start and the corners of the bounds.
-    - `n_photons`: photons of one simulation, all eight batches together, at least 8. Default 65536.
-    - `n_rays`: rays of the footprint of one simulation, all eight batches together, at least 8. Default 8192.
+      with the photons and rays of one of eight batches. Default None: planned for the start and the corners
+      of the bounds.
+    - `n_photons`: photons of one simulation, all eight batches together, at least 8. Default None: 65536, or
+      what `plan` has.
+    - `n_rays`: rays of the footprint of one simulation, all eight batches together, at least 8. Default None:
+      8192, or what `plan` has.
     - `max_orders`: orders of scattering. Default None: chosen by the albedos of the starting scene.
     - `solver`: a Gauss-Newton method of optimistix. Default: Levenberg-Marquardt. A fit also ends where a
       Gauss-Newton step would be below 0.05 standard errors, or where small steps no longer improve it.
@@ -91,7 +93,8 @@ def retrieve(
     **Returns:** a `Retrieval`.
 
     **Raises:** ValueError for inadmissible arguments, among them a start outside its bounds, samples that do
-    not fit the lidar or the plan, and noise that is negative or NaN. TypeError for arguments of another kind.
+    not fit the lidar or the plan, a plan together with photons, rays or orders, and noise that is negative or
+    NaN. TypeError for arguments of another kind.
     RuntimeError where `throw` is set and the fit does not converge.
 
     **Example:**
@@ -109,7 +112,7 @@ def retrieve(
     check_key(key)
     solver, max_steps, starts = check_solution(solver, max_steps, starts)
     check_progress(progress)
-    photons, rays = batch_sizes(n_photons, n_rays)
+    photons, rays = batch_sizes(n_photons, n_rays, max_orders, plan)
     lidar = at_fixed_times(lidar)
     data = data_of(observed, time, noise, noise_floor, lidar)
     settled = settle(unknowns, scene)

@@ -19,12 +19,12 @@ from jaxlidar.planning.plan import Plan
 from jaxlidar.planning.setup import reduce
 from jaxlidar.scenes.scene import Scene, check_kinds
 from jaxlidar.trace.collisions import collide
+from jaxlidar.trace.colouring import optics_of
 from jaxlidar.trace.flight import events_of, fly, nearest, plates_ahead
 from jaxlidar.trace.footprint import across_beam
 from jaxlidar.trace.photons import THROUGH, Photons
 from jaxlidar.trace.random_numbers import Draw
 from jaxlidar.trace.setting import Setting, setting_of, unscattered
-from jaxlidar.waveform import optics_of
 
 CHUNK = 512
 

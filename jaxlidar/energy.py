@@ -23,9 +23,9 @@ from jaxlidar.planning.plan import plan as make_plan
 from jaxlidar.planning.setup import Setup, reduce
 from jaxlidar.scenes.scene import Scene, check_kinds
 from jaxlidar.simulate import Progress
+from jaxlidar.trace.colouring import optics_of
 from jaxlidar.trace.fates import Fates, follow, from_beam, from_the_sky
 from jaxlidar.trace.setting import setting_of
-from jaxlidar.waveform import optics_of
 
 # Photons of a batch.
 BATCH = 8192
@@ -179,7 +179,7 @@ def _endless(setup: Setup) -> Setup:
     lengths = PathLengths(setup.lidar, setup.scene)
     height = known_number(canopy.voxels.voxel_size[2]) * canopy.voxels.shape[2]
     flight = min(REACH * height, lengths.longest_march)
-    trace = trace._replace(max_flight=flight, march_steps=lengths.voxels_along(flight))
+    trace = dataclasses.replace(trace, max_flight=flight, march_steps=lengths.voxels_along(flight))
     return dataclasses.replace(setup, plan=dataclasses.replace(setup.plan, trace=trace))
 
 

@@ -18,16 +18,21 @@ from jaxlidar._statistics import Moments, batches_needed, errors_of, widening
 from jaxlidar._summary import NOTABLE, late_share, percent
 from jaxlidar._threads import ONE_CORE, side_by_side
 from jaxlidar.instrument.lidar import Lidar
+from jaxlidar.planning.ladder import rung
 from jaxlidar.planning.plan import MIN_BATCHES, Plan
 from jaxlidar.planning.plan import plan as make_plan
 from jaxlidar.planning.plan_check import check_plan
 from jaxlidar.planning.setup import Setup, reduce
 from jaxlidar.scenes.scene import Scene, check_kinds
-from jaxlidar.trace.response import Response, trace_scene
-from jaxlidar.waveform import Balance, Waveform, balance_of, open_at_first_return, total_of, waveform_of
+from jaxlidar.trace.colouring import Balance, Recording, balance, recording_of, total
+from jaxlidar.trace.response import Response, trace_settings
+from jaxlidar.trace.setting import Setting, settings_of
+from jaxlidar.waveform import Waveform, open_at_first_return, recorded, trimmed
 
 # Photons of one batch at most: a batch cannot be interrupted.
 LARGEST_BATCH = 65_536
+# Programs that colour have room for at least so many wavelengths.
+FEW_WAVELENGTHS = 4
 
 
 @dataclasses.dataclass(frozen=True)
@@ -144,17 +149,36 @@ def simulate(
     goal = _goal(rtol, atol, n_photons, max_seconds)
     given = plan
     plan = _planned(lidar, scene, given, goal, planning)
-    setup = reduce(lidar, scene, plan)
-    traced = _trace_until(setup, key, goal, progress)
+    ready = _prepared(reduce(lidar, scene, plan))
+    traced = _trace_until(ready, key, goal, progress)
     spent = traced.info.get("seconds", 0.0)
     if given is None and traced.beyond > 0 and plan.orders < plan.limits.most_orders and spent < max_seconds:
         # Orders beyond the last matter: follow as many as there is room for.
         planning["max_orders"] = plan.limits.most_orders
         plan = _planned(lidar, scene, None, goal, planning)
         plan = dataclasses.replace(plan, limits=plan.limits._replace(automatic_orders=True))
-        setup = reduce(lidar, scene, plan)
-        traced = _trace_until(setup, key, goal._replace(max_seconds=max_seconds - spent), progress)
-    return _recorded(setup, traced)
+        ready = _prepared(reduce(lidar, scene, plan))
+        traced = _trace_until(ready, key, goal._replace(max_seconds=max_seconds - spent), progress)
+    return _recorded(ready, traced)
+
+
+class _Ready(NamedTuple):
+    """A setup as the compiled programs take it. `several`: whether there is a setting for each wavelength."""
+
+    setup: Setup
+    settings: Setting
+    several: bool
+    recording: Recording
+
+
+def _prepared(setup: Setup) -> _Ready:
+    settings, several = settings_of(setup)
+    if any(is_traced(x) for x in jax.tree.leaves(setup)):
+        return _Ready(setup, settings, several, recording_of(setup))
+    recording, many = recording_of(setup, rung(setup.plan.n_samples, 1)), setup.lidar.wavelength.size
+    if not several:
+        recording = recording.with_room(max(rung(many, 2 if many <= 16 else 16), FEW_WAVELENGTHS))
+    return _Ready(setup, settings, several, recording)
 
 
 class _Goal(NamedTuple):
@@ -207,34 +231,46 @@ class _Traced(NamedTuple):
     beyond: float = 0.0
 
 
+def _one_batch(setup: Setup, key: PRNGKeyArray) -> Waveform:
+    """The waveform of a single batch, without standard errors, by the programs that `simulate` compiles."""
+    ready = _prepared(setup)
+    program = _compiled_batch if setup.plan.is_random else _compiled_trace
+    wave = _compiled_waveform(program(ready.settings, ready.several, key), ready.recording)
+    return trimmed(wave, setup.lidar.wavelength.size, setup.plan.n_samples)
+
+
 def _trace_until(
-    setup: Setup, key: PRNGKeyArray, goal: _Goal, progress: Callable[[Progress], None] | None
+    ready: _Ready, key: PRNGKeyArray, goal: _Goal, progress: Callable[[Progress], None] | None
 ) -> _Traced:
-    if not setup.plan.is_random:
+    if not ready.setup.plan.is_random:
         started = time.perf_counter()
-        response = jax.block_until_ready(_compiled_trace(setup, key))
+        response = jax.block_until_ready(_compiled_trace(ready.settings, ready.several, key))
         info = {"photons": 0, "batches": 1, "error": 0.0, "stopped": "nothing is random"}
         return _Traced(response, None, None, {**info, "seconds": time.perf_counter() - started})
-    if any(is_traced(x) for x in jax.tree.leaves((setup, key))):
-        return _trace_within(setup, key)
-    return _trace_batches(setup, key, goal, progress)
+    if any(is_traced(x) for x in jax.tree.leaves((ready.setup, key))):
+        return _trace_within(ready, key)
+    return _trace_batches(ready, key, goal, progress)
 
 
-def _recorded(setup: Setup, traced: _Traced) -> Waveform:
+def _recorded(ready: _Ready, traced: _Traced) -> Waveform:
     """The waveform of a response, on the digitiser's bins."""
+    plan, lidar = ready.setup.plan, ready.setup.lidar
+    wave = _compiled_waveform(traced.response, ready.recording)
+    wave = trimmed(wave, lidar.wavelength.size, plan.n_samples)
     errors = {"stderr": traced.stderr, "ledger_stderr": traced.ledger_stderr}
-    wave = dataclasses.replace(_compiled_waveform(traced.response, setup, **errors), info=traced.info)
+    known = {name: value for name, value in errors.items() if value is not None}
+    wave = dataclasses.replace(wave, info=traced.info, **known)
     if is_traced(wave.energy):
         return wave
-    if setup.plan.limits.automatic_window and late_share(wave) >= NOTABLE:
-        end = setup.plan.sample_start + setup.plan.sample_interval * setup.plan.n_samples
+    if plan.limits.automatic_window and late_share(wave) >= NOTABLE:
+        end = plan.sample_start + plan.sample_interval * plan.n_samples
         warnings.warn(
             f"{percent(late_share(wave))} of the light is still on its way when the record ends at {end:.4g} "
             "ns: give window=, or see Waveform.ledger",
             LateLightWarning,
             stacklevel=3,
         )
-    return open_at_first_return(wave, setup.lidar) if setup.lidar.receiver.window == "first return" else wave
+    return open_at_first_return(wave, lidar) if lidar.receiver.window == "first return" else wave
 
 
 class LateLightWarning(UserWarning):
@@ -255,19 +291,24 @@ class LateLightWarning(UserWarning):
     """
 
 
-def _batch(setup: Setup, key: PRNGKeyArray) -> tuple[Response, Float[Array, "wavelengths samples"], Balance]:
-    response = trace_scene(setup, key)
-    return response, total_of(response, setup), balance_of(response, setup)
+def _results(response: Response, recording: Recording) -> tuple[Float[Array, "wavelengths samples"], Balance]:
+    return total(response, recording), balance(response, recording)
 
 
-_compiled_batch = Program(_batch, **ONE_CORE)
-_compiled_trace = Program(trace_scene)
-_compiled_waveform = Program(waveform_of)
+_compiled_trace = Program(trace_settings)
+_compiled_batch = Program(trace_settings, **ONE_CORE)
+_compiled_results = Program(_results, **ONE_CORE)
+_compiled_waveform = Program(recorded)
 
 
-def _trace_within(setup: Setup, key: PRNGKeyArray) -> _Traced:
+def _trace_within(ready: _Ready, key: PRNGKeyArray) -> _Traced:
     """A fixed number of batches, within a JAX transformation."""
-    responses, totals, balances = jax.lax.map(lambda k: _batch(setup, k), jax.random.split(key, MIN_BATCHES))
+
+    def batch(key: PRNGKeyArray) -> tuple[Response, Array, Balance]:
+        response = trace_settings(ready.settings, ready.several, key)
+        return response, *_results(response, ready.recording)
+
+    responses, totals, balances = jax.lax.map(batch, jax.random.split(key, MIN_BATCHES))
 
     def stderr(each: Array) -> Array:
         spread = jnp.var(jax.lax.stop_gradient(each), axis=0)
@@ -278,29 +319,31 @@ def _trace_within(setup: Setup, key: PRNGKeyArray) -> _Traced:
 
 
 def _trace_batches(
-    setup: Setup, key: PRNGKeyArray, goal: _Goal, progress: Callable[[Progress], None] | None
+    ready: _Ready, key: PRNGKeyArray, goal: _Goal, progress: Callable[[Progress], None] | None
 ) -> _Traced:
     """Batches on all cores, round after round, until the goal is reached."""
-    started, plan = time.perf_counter(), setup.plan
+    started, plan = time.perf_counter(), ready.setup.plan
     rtol = plan.rtol if goal.rtol is None else goal.rtol
     fixed = None if goal.n_photons is None else max(MIN_BATCHES, -(-goal.n_photons // plan.n_photons))
+    many = ready.setup.lidar.wavelength.size
     counted = plan.n_photons if plan.orders > 1 or plan.trace.drawn_first else 0
-    total: Any = None
+    whole: Any = None
     waves, shares, neglected = Moments(), Moments(), Moments()
     wanted, stopped, error = MIN_BATCHES, "tolerance met", math.inf
 
     def one(n: int) -> tuple[Response, Array, Balance]:
-        return _compiled_batch(setup, jax.random.fold_in(key, n))
+        response = _compiled_batch(ready.settings, ready.several, jax.random.fold_in(key, n))
+        return response, *_compiled_results(response, ready.recording)
 
     with side_by_side() as run:
         try:
             while True:
-                for response, mean, balance in run(one, range(waves.count, wanted)):
-                    total = response if total is None else _add(total, response)
-                    waves.add(mean)
-                    shares.add(np.stack([np.asarray(a) for a in balance.ledger.values()]))
-                    neglected.add(balance.neglected)
-                    names = list(balance.ledger)
+                for response, mean, shared in run(one, range(waves.count, wanted)):
+                    whole = response if whole is None else _add(whole, response)
+                    waves.add(np.asarray(mean)[:many, : plan.n_samples])
+                    shares.add(np.stack([np.asarray(a)[:many] for a in shared.ledger.values()]))
+                    neglected.add(np.asarray(shared.neglected)[:many])
+                    names = list(shared.ledger)
                 done, seconds = waves.count, time.perf_counter() - started
                 error, worst = errors_of(waves)
                 if progress is not None:
@@ -335,9 +378,14 @@ def _trace_batches(
         "error": error,
         "stopped": stopped,
     }
-    mean = jax.tree.map(lambda a: a / waves.count, total)
+    mean = _shared_out(whole, jnp.asarray(float(waves.count)))
     ledger_stderr = {name: jnp.asarray(row) for name, row in zip(names, shares.stderr)}
     return _Traced(mean, jnp.asarray(waves.stderr), ledger_stderr, info, beyond)
+
+
+@jax.jit
+def _shared_out(whole: Any, count: Array) -> Any:
+    return jax.tree.map(lambda a: a / count, whole)
 
 
 @jax.jit

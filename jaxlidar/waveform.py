@@ -3,7 +3,7 @@
 import dataclasses
 import importlib
 import os
-from typing import Any, NamedTuple, final
+from typing import Any, final
 
 import equinox as eqx
 import jax
@@ -16,11 +16,8 @@ from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._summary import summary
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.instrument.receiver import first_return_window, record
-from jaxlidar.planning.plan import Plan
-from jaxlidar.planning.sampling import sampling_of
-from jaxlidar.planning.scatterers import letter_values
 from jaxlidar.planning.setup import Setup
-from jaxlidar.trace.histories import Histories, histories
+from jaxlidar.trace.colouring import Recording, balance, components, height_of, recording_of, total
 from jaxlidar.trace.response import Response
 
 
@@ -113,68 +110,6 @@ class Waveform(eqx.Module):
         return importlib.import_module("jaxlidar.plot.html").waveform_html(self)
 
 
-def optics_of(setup: Setup) -> Float[Array, "letters wavelengths"]:
-    """Reflectance or transmittance of every letter of the plan, by wavelength."""
-    return letter_values(setup.lidar, setup.scene, setup.plan.trace.letters)
-
-
-def colour(
-    weights: Float[Array, "traces *rest histories columns"],
-    table: Histories,
-    optics: Float[Array, "letters wavelengths"],
-) -> Float[Array, "*rest wavelengths columns"]:
-    """The sum over histories of weight times the product of optics, by wavelength: a matrix product."""
-    if len(weights) == 1:
-        return jnp.einsum("hw,...hc->...wc", table.monomials(optics), weights[0])
-    # Each trace has one wavelength.
-    return jnp.einsum("hw,w...hc->...wc", table.monomials(optics), weights)
-
-
-def _fine_heights(setup: Setup) -> Float[Array, "bins"]:
-    bins = setup.plan.bins
-    time = jnp.asarray(bins.start + bins.width * np.arange(bins.count))
-    return jnp.minimum(height_of(setup.lidar, time), 0.999 * setup.lidar.altitude)
-
-
-def _through_air(
-    fine: Float[Array, "*s wavelengths bins"], setup: Setup
-) -> Float[Array, "*s wavelengths bins"]:
-    """Returns in fine bins after attenuation by the atmosphere on both ways."""
-    lidar, air = setup.lidar, setup.scene.atmosphere
-    assert air is not None
-    heights = _fine_heights(setup)
-    clear = air.two_way_transmittance(lidar.wavelength, heights, lidar.altitude, lidar.zenith)
-    return fine * clear.reshape((1,) * (fine.ndim - 2) + clear.shape)
-
-
-def returns_air(setup: Setup) -> bool:
-    """Whether the atmosphere's own backscatter is simulated: it is where a lidar ratio is given."""
-    air = setup.scene.atmosphere
-    return air is not None and air.lidar_ratio is not None
-
-
-def air(setup: Setup) -> Float[Array, "wavelengths samples"]:
-    """Backscatter of the air, apparent reflectance per sample: single scattering, above all of the scene."""
-    lidar, plan, atmosphere = setup.lidar, setup.plan, setup.scene.atmosphere
-    assert atmosphere is not None
-    heights = _fine_heights(setup)
-    per_metre = atmosphere.backscatter(lidar.wavelength, heights, lidar.altitude, lidar.zenith)
-    top = jnp.asarray(plan.trace.upstream) * jnp.cos(jnp.deg2rad(lidar.zenith))
-    length = 0.5 * SPEED_OF_LIGHT * plan.bins.width
-    fine = jnp.where((heights > top)[None, :], per_metre * length, 0.0)
-    return sampling_of(lidar, plan)(fine)
-
-
-def height_of(lidar: Lidar, time: Float[Array, "bins"]) -> Float[Array, "bins"]:
-    """Height above the reference plane (m) from which order one arrives at `time` (ns)."""
-    return -0.5 * SPEED_OF_LIGHT * time * jnp.cos(jnp.deg2rad(lidar.zenith))
-
-
-def _tables(plan: Plan) -> tuple[Histories, Histories]:
-    letters = len(plan.trace.letters)
-    return histories(letters, plan.first_degree), histories(letters, plan.degree)
-
-
 def total_of(response: Response, setup: Setup) -> Float[Array, "wavelengths samples"]:
     """Apparent reflectance per sample, all components together.
 
@@ -200,55 +135,7 @@ def total_of(response: Response, setup: Setup) -> Float[Array, "wavelengths samp
     >>> print(f"{float(total.sum()):.3f}")
     0.400
     """
-    # Sums over materials, and the pulse where no atmosphere lies between, come before the many wavelengths.
-    values, clear = optics_of(setup), setup.scene.atmosphere is None
-    sampling = sampling_of(setup.lidar, setup.plan)
-    total = jnp.zeros(())
-    for table, part in zip(_tables(setup.plan), (response.first, response.higher)):
-        if part is not None:
-            part = jnp.sum(part, axis=1)
-            total = total + colour(sampling(part) if clear else part, table, values)
-    total = total if clear else sampling(_through_air(total, setup))
-    return setup.admissible * (total + air(setup) if returns_air(setup) else total)
-
-
-class Balance(NamedTuple):
-    """Where the emitted energy went, (wavelengths,) each: see `Waveform`."""
-
-    ledger: dict[str, Float[Array, "wavelengths"]]
-    neglected: Float[Array, "wavelengths"]
-    lost: Float[Array, "wavelengths"]
-
-
-def balance_of(response: Response, setup: Setup) -> Balance:
-    """Shares of the emitted energy by fate. A material absorbs what arrived there less what left."""
-    lidar, plan, values = setup.lidar, setup.plan, optics_of(setup)
-    short, full = _tables(plan)
-    table = short if response.higher is None else full
-
-    def shares(weights: Array, table: Histories = table) -> Array:
-        return colour(weights[..., None], table, values)[..., 0]
-
-    whole = shares(jnp.sum(response.first, axis=(1, 3)), short)
-    lost = shares(jnp.sum(response.first_outside, axis=1), short)
-    if response.higher is not None and response.higher_outside is not None:
-        whole = whole + shares(jnp.sum(response.higher, axis=(1, 3)))
-        lost = lost + shares(jnp.sum(response.higher_outside, axis=1))
-    absorbed = shares(response.arrived - response.left)
-    ledger = {
-        "escaped": shares(response.escaped),
-        **{f"absorbed by {name}": absorbed[i] for i, name in enumerate(plan.trace.materials)},
-        "after the window": shares(response.late),
-        "unfollowed": shares(response.remaining),
-    }
-    returned = whole * lidar.aperture_area / (jnp.pi * lidar.range_to_reference**2)
-    # What returns is part of what escaped, or, where only one order was followed, would have.
-    source = "unfollowed" if plan.orders == 1 and len(plan.trace.materials) > 1 else "escaped"
-    reach = jnp.minimum(returned, ledger[source])
-    ledger = {"returned": reach, **ledger, source: ledger[source] - reach}
-    per_energy = whole / jnp.maximum(ledger["escaped"], 1e-6)
-    unfollowed = ledger["unfollowed"] if plan.orders > 1 else jnp.zeros_like(whole)
-    return Balance(ledger, unfollowed * jnp.clip(per_energy, 1.0, 4.0), lost)
+    return total(response, recording_of(setup))
 
 
 def waveform_of(
@@ -285,41 +172,48 @@ def waveform_of(
     >>> print(f"{float(wave.reflectance.sum()):.3f}")
     0.800
     """
-    lidar, plan, values = setup.lidar, setup.plan, optics_of(setup)
-    sampling, clear = sampling_of(lidar, plan), setup.scene.atmosphere is None
-    # The pulse comes before the many wavelengths if it can.
-    first, higher = (
-        None if part is None else colour(sampling(part) if clear else part, table, values)
-        for table, part in zip(_tables(plan), (response.first, response.higher))
-    )
-    assert first is not None
-    higher = jnp.zeros_like(first) if higher is None else higher
-    lines = jnp.concatenate([first + higher, jnp.sum(first, 0)[None], jnp.sum(higher, 0)[None]])
-    sampled = setup.admissible * (lines if clear else sampling(_through_air(lines, setup)))
-    components = dict(zip([*plan.trace.materials, "first", "higher"], sampled))
-    total = sampled[-2] + sampled[-1]
-    if returns_air(setup):
-        components["air"] = air(setup)
-        components["first"] = components["first"] + components["air"]
-        total = total + components["air"]
-    time = jnp.asarray(plan.sample_start + plan.sample_interval * np.arange(plan.n_samples))
-    ledger, neglected, lost = balance_of(response, setup)
-    energy = total * _received(lidar, time)
+    wave = recorded(response, recording_of(setup))
+    given = {"stderr": stderr, "ledger_stderr": ledger_stderr, "info": info}
+    return dataclasses.replace(wave, **{name: value for name, value in given.items() if value is not None})
+
+
+def recorded(response: Response, recording: Recording) -> Waveform:
+    """The waveform of a response, without standard errors."""
+    lidar, time = recording.lidar, recording.time
+    parts = components(response, recording)
+    reflectance = parts["first"] + parts["higher"]
+    ledger, neglected, lost = balance(response, recording)
+    energy = reflectance * _received(lidar, time)
     return Waveform(
         time=time,
         height=height_of(lidar, time),
-        reflectance=total,
+        reflectance=reflectance,
         energy=energy,
-        stderr=jnp.zeros_like(total) if stderr is None else stderr,
-        components=components,
+        stderr=jnp.zeros_like(reflectance),
+        components=parts,
         neglected=neglected,
         ledger=ledger,
-        ledger_stderr=jax.tree.map(jnp.zeros_like, ledger) if ledger_stderr is None else ledger_stderr,
+        ledger_stderr=jax.tree.map(jnp.zeros_like, ledger),
         lost=lost,
         recorded=record(energy, lidar.wavelength, lidar.receiver),
         wavelength=lidar.wavelength,
-        info=info or {},
+        info={},
     )
+
+
+def trimmed(wave: Waveform, wavelengths: int, samples: int) -> Waveform:
+    """The first wavelengths and samples of a waveform."""
+    if wave.reflectance.shape == (wavelengths, samples):
+        return wave
+
+    def cut(a: Array, *shape: int) -> Array:
+        # Slices of what is known are not worth a compilation.
+        here = a if is_traced(a) else np.asarray(a)
+        return jnp.asarray(here[tuple(slice(n) for n in shape)])
+
+    time, height = cut(wave.time, samples), cut(wave.height, samples)
+    wave = jax.tree.map(lambda a: cut(a, *(wavelengths, samples)[: a.ndim]), wave)
+    return dataclasses.replace(wave, time=time, height=height)
 
 
 def _received(lidar: Lidar, time: Float[Array, "bins"]) -> Float[Array, "wavelengths bins"]:

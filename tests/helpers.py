@@ -3,12 +3,13 @@
 from collections.abc import Callable
 from typing import Any
 
-import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Array, PRNGKeyArray
+from jaxtyping import Array
 
 import jaxlidar as jl
+from jaxlidar.extend import side_by_side
+from jaxlidar.simulate import _one_batch
 
 # One sample of 1000 ns centred on 400 ns takes in everything that arrives from -100 to 900 ns.
 WHOLE = {"window": (400.0, 401.0), "bin_width": 2.0}
@@ -50,20 +51,10 @@ def agrees(value: Any, stderr: Any, expected: Any, *, bound: Any = 0.0, sigmas: 
     return bool(np.all(off <= margin) and np.all(off >= -margin - np.asarray(bound, float)))
 
 
-@eqx.filter_jit
-def _wave(lidar: jl.Lidar, scene: jl.Scene, plan: jl.Plan, key: PRNGKeyArray, quantity: Callable) -> Any:
-    setup = jl.reduce(lidar, scene, plan)
-    return quantity(jl.waveform_of(jl.trace_scene(setup, key), setup))
-
-
-def _itself(wave: jl.Waveform) -> jl.Waveform:
-    return wave
-
-
 def first_wave(lidar: jl.Lidar, scene: jl.Scene, plan: jl.Plan) -> jl.Waveform:
-    """One trace, for what is not random; compiled once for each plan, and faster so than by `simulate`."""
+    """One trace, for what is not random."""
     assert not plan.is_random
-    return _wave(lidar, scene, plan, jax.random.key(0), _itself)
+    return _one_batch(jl.reduce(lidar, scene, plan), jax.random.key(0))
 
 
 def batch_mean(
@@ -75,12 +66,11 @@ def batch_mean(
     count: int = 32,
     quantity: Callable[[jl.Waveform], Any],
 ) -> tuple[Any, Any]:
-    """Mean and standard error, over independent batches, of any quantity of a waveform (an array or a tree).
-
-    `quantity` is compiled with the trace: define it once, at module level, so that it is compiled once.
-    """
-    keys = jax.random.split(jax.random.key(seed), count)
-    found = [_wave(lidar, scene, plan, key, quantity) for key in keys]
+    """Mean and standard error, over batches, of any quantity of a waveform (an array or a tree)."""
+    setup = jl.reduce(lidar, scene, plan)
+    with side_by_side() as run:
+        waves = run(lambda key: _one_batch(setup, key), jax.random.split(jax.random.key(seed), count))
+        found = [quantity(jax.tree.map(np.asarray, wave)) for wave in waves]
 
     def gather(*each: Array) -> np.ndarray:
         return np.stack([np.asarray(e, float) for e in each])

@@ -44,6 +44,7 @@ ORDER = {
     "plants": ["lsystem", "tree", "turtle", "habits", "voxelise", "forest", "demo"],
     "planning": [
         "trace_plan",
+        "ladder",
         "local_origin",
         "memory",
         "path_lengths",
@@ -76,6 +77,7 @@ ORDER = {
         "first_order",
         "higher_orders",
         "response",
+        "colouring",
     ],
 }
 MODULES = sorted(path for folder in ("jaxlidar", "inversion") for path in (ROOT / folder).rglob("*.py"))

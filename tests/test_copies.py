@@ -65,6 +65,7 @@ MADE = {
     "jaxlidar.Specular": jl.Specular(0.1),
     "jaxlidar.Spectrum": jl.spectrum("bark-oak"),
     "jaxlidar.Tree": jl.grow(jl.shrub()),
+    "jaxlidar.UnitWarning": jl.UnitWarning("divergence"),
     "jaxlidar.VoxelMap": VOXELS,
     "jaxlidar.Word": jl.LSystem([("A", 0.1)], [jl.Rule("A", grown)]).rewrite(1),
     "jaxlidar.io.Case": jl.io.Case(LIDAR, SCENE, jax.random.key(0), {"rtol": 0.1}),

@@ -416,6 +416,7 @@ def unknown(where=lambda s: s.ground.height, **changes):
         (wrong(starts=1.5), "starts = 1.5 is outside"),
         (wrong(max_steps=np.nan), "max_steps = nan is outside"),
         (wrong(n_photons=4), r"n_photons = 4 is outside the admissible range \[8, inf\)"),
+        (wrong(plan=jl.plan(PLAIN, jl.Scene(ground=jl.Ground())), n_rays=64), "together with n_rays"),
         (wrong(time=TIME), "has its own"),
         (wrong(observed=np.zeros((2, 41))), "sample times are needed"),
         (

@@ -75,6 +75,19 @@ def accuracy(record: dict) -> str:
     )
 
 
+def changes(record: dict) -> str:
+    rows = [
+        [r["change"], number(r["seconds"]), number(r["warm"]), ", ".join(f"`{c}`" for c in r["compiled"])]
+        for r in record["changes"]
+    ]
+    return page_of(
+        "Seconds of a call of `simulate` with three wavelengths after one thing was changed, and of the same "
+        "call again. Sizes go up a short ladder, and numbers are arguments of compiled programs: most "
+        "changes compile nothing of the trace (`trace_settings`).",
+        table(["change", "s", "s, again", "compiled, beside single operations"], rows),
+    )
+
+
 def peers(record: dict) -> str:
     rows = [
         [
@@ -220,6 +233,7 @@ def leaves(record: dict) -> str:
 SECTIONS: dict[str, tuple[str, Callable[[dict], str]]] = {
     "accuracy_cost": ("What accuracy costs", accuracy),
     "simulation_cost": ("What `simulate` costs", simulation),
+    "everyday_changes": ("What a change of a scene costs", changes),
     "peers": ("Other codes", peers),
     "effects_cost": ("What plans save", effects),
     "scaling": ("How cost grows", scaling),

@@ -54,7 +54,8 @@ def with_alternatives(
     return dataclasses.replace(
         plan,
         bins=dataclasses.replace(plan.bins, kernel=kernel),
-        trace=trace._replace(
+        trace=dataclasses.replace(
+            trace,
             drawn_first=first_order == "drawn",
             independent=points == "independent",
             ends=trace.ends if ends is None else ends,

@@ -29,7 +29,7 @@ def predicted(
     """
     item = jnp.zeros(()).dtype.itemsize
     letters, materials = len(trace.letters), len(trace.materials)
-    full = math.comb(degree + letters, letters) if trace.orders > 1 or trace.drawn_first else 0
+    full = math.comb(degree + letters, letters) if trace.order_steps > 1 or trace.drawn_first else 0
     short = math.comb(first_degree + letters, letters)
     response = item * materials * (full + short) * bins.padded
     matrix = item * min(bins.count * samples, max(DENSE, pulse))

@@ -8,6 +8,7 @@ import numpy as np
 from jaxlidar._checks import concrete, known_array, known_number
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar.planning.effects import can_light_itself
+from jaxlidar.planning.ladder import rung
 from jaxlidar.planning.scatterers import Optics, largest_albedo
 from jaxlidar.scenes.canopy import Canopy
 from jaxlidar.scenes.scene import Scene
@@ -15,6 +16,8 @@ from jaxlidar.scenes.scene import Scene
 # Orders are followed while their histories are not more than this (16 orders of four letters, 29 of three).
 MAX_HISTORIES = 5000
 MAX_ORDERS = 100
+# There is room for no more than this where the user does not ask for it.
+MOST_ROOM = 7000
 # The share of scattered light that is scattered again is taken to be at least this, times the albedo.
 AGAIN = 0.8
 # Multiple scattering is recorded this long after the last first-order return, ns, at least and at most.
@@ -41,6 +44,15 @@ class Orders(NamedTuple):
 def degree_of(orders: int, plates: int) -> int:
     """Longest history: every flight, and the way back, may pass every plate."""
     return orders + (orders + 1) * plates
+
+
+def order_steps(orders: int, plates: int, letters: int) -> int:
+    """Length of the loop over orders: up the ladder, where the table of histories stays small.
+
+    Many orders have few photons: there the steps of the ladder are long.
+    """
+    steps = rung(orders, 2 if orders <= 16 else 1)
+    return steps if math.comb(degree_of(steps, plates) + letters, letters) <= MOST_ROOM else orders
 
 
 def mean_depth(canopy: Canopy) -> float:

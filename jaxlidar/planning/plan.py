@@ -12,9 +12,10 @@ from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.optics.laws import AbstractMirror
 from jaxlidar.planning.effect_table import effect_table
 from jaxlidar.planning.effects import Effect, only_planes, present, switched_off, without
+from jaxlidar.planning.ladder import rung
 from jaxlidar.planning.local_origin import about_aim
 from jaxlidar.planning.memory import check_memory, in_words, memory_limit, predicted
-from jaxlidar.planning.orders import degree_of, orders_of, tail_of
+from jaxlidar.planning.orders import degree_of, order_steps, orders_of, tail_of
 from jaxlidar.planning.path_lengths import PathLengths
 from jaxlidar.planning.scatterers import largest_albedo, lobe_probability, scene_optics, spell
 from jaxlidar.planning.trace_plan import KERNEL, Bins, TracePlan
@@ -53,7 +54,7 @@ class Plan:
     Plans are made by `jaxlidar.plan`. Printed, a plan is a table of effects, followed by a line of sizes. It
     is static: what a plan leaves out is never compiled.
 
-    - `trace`: what the tracer must know before it is compiled.
+    - `trace`: what the tracer must know: scatterers, lengths, sizes of loops.
     - `bins`: the fine time bins, into which returns are sorted.
     - `sample_start`, `sample_interval`: time of the first sample, and the interval between samples, ns.
     - `n_samples`: number of samples.
@@ -105,12 +106,12 @@ class Plan:
     @property
     def orders(self) -> int:
         """Number of scatterings that are followed."""
-        return self.trace.orders
+        return int(self.trace.orders)
 
     @property
     def is_random(self) -> bool:
         """Whether anything is drawn at random."""
-        if self.trace.orders > 1 or self.trace.drawn_first:
+        if self.trace.order_steps > 1 or self.trace.drawn_first:
             return True
         return self.random_footprint and not self.smooth_footprint
 
@@ -218,6 +219,10 @@ def plan(
         max_orders = 1
     chosen = orders_of(scene, optics, len(letters.letters), rtol, max_orders)
     orders, plates = chosen.count, len(scene.plates)
+
+    def steps_of(orders: int) -> int:
+        return order_steps(orders, plates, len(letters.letters))
+
     if n_rays is None:
         n_rays = 4096 if orders == 1 or footprint == "fixed" else 1024
     tail = tail_of(scene, optics, geometry.first / SPEED_OF_LIGHT, geometry.last / SPEED_OF_LIGHT)
@@ -227,8 +232,8 @@ def plan(
     step = geometry.longest_chord if max_step is None else min(max_step, geometry.longest_chord)
     step = min(step, 4 * metres) if max_step is None else step
     row = max(math.ceil(step / metres - 1e-6) + 1 + 2, KERNEL)
-    bins = dataclasses.replace(bins, row=row)
     last = SPEED_OF_LIGHT * (bins.start + bins.width * bins.count)
+    bins = dataclasses.replace(bins, row=row, count=rung(bins.count, 4))
     trace = TracePlan(
         materials=letters.materials,
         letters=letters.letters,
@@ -243,25 +248,26 @@ def plan(
         hotspot=scene.canopy is not None and scene.canopy.hotspot,
         vertical=known_number(lidar.zenith) == 0.0,
         upstream=geometry.upstream,
-        first_steps=geometry.first_steps(step),
-        march_steps=geometry.march_steps(last + geometry.upstream),
+        first_steps=rung(geometry.first_steps(step), 8),
+        march_steps=rung(geometry.march_steps(last + geometry.upstream)),
         max_step=step,
         max_flight=geometry.longest_flight(last + geometry.upstream),
         last=last,
         lobe=lobe_probability(optics),
         orders=orders,
+        order_steps=steps_of(orders),
         # Without a canopy all ends of a flight are on the same surface.
         ends=1 if scene.canopy is None else ENDS,
         drawn_first=False,
         independent=False,
     )
-    degree, first_degree = degree_of(orders, plates), 1 + 2 * plates
+    degree, first_degree = degree_of(steps_of(orders), plates), 1 + 2 * plates
     reach = lidar.pulse.support(known_number(lidar.jitter))
     spanned = math.ceil((reach[1] - reach[0] + samples[1]) / bins.width) + 5
     limit = memory_limit(max_memory)
 
     def memory_of(orders: int) -> float:
-        return predicted(trace, bins, degree_of(orders, plates), first_degree, samples[2], spanned)
+        return predicted(trace, bins, degree_of(steps_of(orders), plates), first_degree, samples[2], spanned)
 
     memory = memory_of(orders)
     check_memory(memory, limit)

@@ -77,7 +77,7 @@ def _times(plan: Plan, lidar: Lidar, scene: Scene) -> Iterator[str]:
             f"its rays start {trace.upstream:g} m before the reference plane; the scene reaches to {top:g} m"
         )
     first, last = lengths.first / SPEED_OF_LIGHT, lengths.last / SPEED_OF_LIGHT
-    begin, end = bins.start, bins.start + bins.width * (bins.count - 1)
+    begin, end = bins.start, trace.last / SPEED_OF_LIGHT - bins.width
     if not limits.automatic_window:
         # What a window leaves out is the caller's choice, for scenes no larger than the plan's.
         begin, end = min(begin, limits.first), max(end, limits.last)

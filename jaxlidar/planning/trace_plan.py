@@ -1,8 +1,12 @@
-"""The static shape of a trace: time bins, scatterers and their letters, and the sizes of all loops."""
+"""What a trace must know: time bins, scatterers and their letters, lengths, and the sizes of all loops.
 
-import dataclasses
-from typing import NamedTuple
+Compiled programs depend on what is static here, names and sizes. Numbers are their arguments: a setting has
+arrays in their place (see `jaxlidar.trace.setting`).
+"""
 
+from typing import NamedTuple, final
+
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -12,8 +16,8 @@ DENSE = 1 << 22
 KERNEL = 3
 
 
-@dataclasses.dataclass(frozen=True)
-class Bins:
+@final
+class Bins(eqx.Module):
     """Fine time bins, with margins at both ends that collect what falls outside.
 
     - `start`: centre of the first bin, ns.
@@ -25,9 +29,9 @@ class Bins:
 
     start: float
     width: float
-    count: int
-    row: int
-    kernel: int = KERNEL
+    count: int = eqx.field(static=True)
+    row: int = eqx.field(static=True)
+    kernel: int = eqx.field(static=True, default=KERNEL)
 
     @property
     def kernel_variance(self) -> float:
@@ -60,8 +64,9 @@ class Scatterer(NamedTuple):
     transmitted: int
 
 
-class TracePlan(NamedTuple):
-    """Everything that the tracer must know before it is compiled. Made by `jaxlidar.plan`.
+@final
+class TracePlan(eqx.Module):
+    """Everything that the tracer must know of a plan. Made by `jaxlidar.plan`.
 
     - `materials`, `letters`: names, in order.
     - `leaf`, `bark`, `surfaces`: the scatterers.
@@ -73,30 +78,31 @@ class TracePlan(NamedTuple):
     - `max_step`, `max_flight`: longest stretch of order one, and longest flight, m.
     - `last`: longest path to the sensor that is recorded, m relative to the way to the reference plane.
     - `lobe`: probability with which reflection is chosen over transmission.
-    - `orders`: scatterings followed.
+    - `orders`: scatterings followed. `order_steps`: the length of the loop over them.
     - `ends`: points of each flight from which light returns.
     - `drawn_first`: whether order one returns from drawn collisions, as the others do.
     - `independent`: whether photons draw independent numbers.
     """
 
-    materials: tuple[str, ...]
-    letters: tuple[str, ...]
-    leaf: Scatterer | None
-    bark: Scatterer | None
-    surfaces: tuple[Scatterer, ...]
-    full_cover: tuple[bool, ...]
-    mirrors: tuple[bool, ...]
-    has_ground: bool
-    hotspot: bool
-    vertical: bool
+    materials: tuple[str, ...] = eqx.field(static=True)
+    letters: tuple[str, ...] = eqx.field(static=True)
+    leaf: Scatterer | None = eqx.field(static=True)
+    bark: Scatterer | None = eqx.field(static=True)
+    surfaces: tuple[Scatterer, ...] = eqx.field(static=True)
+    full_cover: tuple[bool, ...] = eqx.field(static=True)
+    mirrors: tuple[bool, ...] = eqx.field(static=True)
+    has_ground: bool = eqx.field(static=True)
+    hotspot: bool = eqx.field(static=True)
+    vertical: bool = eqx.field(static=True)
     upstream: float
-    first_steps: int
-    march_steps: int
+    first_steps: int = eqx.field(static=True)
+    march_steps: int = eqx.field(static=True)
     max_step: float
     max_flight: float
     last: float
     lobe: float
     orders: int
-    ends: int
-    drawn_first: bool
-    independent: bool
+    order_steps: int = eqx.field(static=True)
+    ends: int = eqx.field(static=True)
+    drawn_first: bool = eqx.field(static=True)
+    independent: bool = eqx.field(static=True)

@@ -60,7 +60,7 @@ def from_the_sky(setting: Setting, key: PRNGKeyArray, count: int) -> tuple[Vec, 
     medium = setting.medium
     assert medium is not None
     u, v = jax.random.uniform(key, (2, count))
-    low, high = medium.origin, medium.origin + medium.size * jnp.asarray(medium.shape)
+    low, high = medium.origin, medium.origin + medium.size * medium.counts
     x, y = (low[k] + s * (high[k] - low[k]) for k, s in enumerate((u, v)))
     top = jnp.full_like(u, high[2])
     return (x, y, top), vec(jnp.broadcast_to(c, u.shape) for c in setting.beam.axis)

@@ -51,9 +51,10 @@ class HigherOrders(eqx.Module):
     remaining: Float[Array, "histories"]
 
 
-def higher_orders(setting: Setting, key: PRNGKeyArray, photons: int) -> HigherOrders:
-    """Trace `photons` photons through up to `plan.orders` scatterings; sums are means per photon."""
+def higher_orders(setting: Setting, key: PRNGKeyArray) -> HigherOrders:
+    """Trace a batch of photons through up to `plan.orders` scatterings; sums are means per photon."""
     beam, medium, plan, bins = setting.beam, setting.medium, setting.plan, setting.bins
+    photons = setting.sizes.photons
     footprint_key, draw_key = jax.random.split(key)
     plates = sum(s.plate for s in setting.surfaces)
     dimensions = Draw.dimensions(plates)
@@ -61,7 +62,7 @@ def higher_orders(setting: Setting, key: PRNGKeyArray, photons: int) -> HigherOr
     if plan.independent:
         numbers, places = Independent(draw_key, dimensions), Independent(footprint_key, 2)
     else:
-        numbers, places = lattices(draw_key, plan.orders, dimensions), None
+        numbers, places = lattices(draw_key, plan.order_steps, dimensions), None
     size = min(CHUNK, photons)
     chunks = -(-photons // size)
     groups = -(-chunks // GROUP)
@@ -73,7 +74,7 @@ def higher_orders(setting: Setting, key: PRNGKeyArray, photons: int) -> HigherOr
             share = (lane.astype(float) + shift[0]) / photons
             turn = (lane * jnp.uint32(GOLDEN * 2**32)).astype(float) * 2.0**-32 + shift[1]
         else:
-            share, turn = places(lane, jnp.asarray(plan.orders))
+            share, turn = places(lane, jnp.asarray(plan.order_steps))
         inside = lane < photons
         across, share = footprint_rays(beam, medium, across_beam(beam, share, turn))
         point, w, excess = beam.ray(across)
@@ -92,7 +93,7 @@ def higher_orders(setting: Setting, key: PRNGKeyArray, photons: int) -> HigherOr
     def group(total, number):
         lane = number * (each * size) + jnp.arange(each * size, dtype=jnp.uint32)
 
-        def order(carry, n):
+        def one_order(carry, n):
             def chunk(tally, part):
                 lane, photons = part
 
@@ -106,10 +107,14 @@ def higher_orders(setting: Setting, key: PRNGKeyArray, photons: int) -> HigherOr
             lanes, photons, tally = carry
             tally, photons = lax.scan(chunk, tally, (lanes, photons))
             lanes, photons = _alive_first(lanes, photons)
-            return (lanes, photons, tally), None
+            return lanes, photons, tally
+
+        def order(carry, n):
+            # The loop is as long as the ladder of sizes has it.
+            return lax.cond(n < plan.orders, one_order, lambda carry, _: carry, carry, n), None
 
         rows = jax.tree.map(lambda a: a.reshape(each, size), (lane, start(lane)))
-        (_, last, tally), _ = lax.scan(order, (*rows, zero), jnp.arange(plan.orders))
+        (_, last, tally), _ = lax.scan(order, (*rows, zero), jnp.arange(plan.order_steps))
         over = jnp.where(last.alive, stop(last.weight), 0.0)
         tally = eqx.tree_at(lambda t: t.remaining, tally, tally.remaining.at[last.history].add(over))
         return jax.tree.map(jnp.add, total, tally), None

@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxlidar._vectors import FAR, Scalar, Vec
 from jaxlidar.optics.leaf_angles import ANGLE_NODES, LeafAngles
 from jaxlidar.optics.phase import AbstractPhase
+from jaxlidar.planning.ladder import rung
 from jaxlidar.scenes.canopy import Canopy
 
 # Steps between two checks whether any ray of the batch still moves.
@@ -44,7 +45,10 @@ class AngleTables(eqx.Module):
 
 
 class Medium(eqx.Module):
-    """A voxel map laid out for tracing; positions are relative to the aim point."""
+    """A voxel map laid out for tracing; positions are relative to the aim point.
+
+    The arrays have room for `shape` voxels, of which the map has `counts`.
+    """
 
     leaf: Float[Array, "cells"] | None
     bark: Float[Array, "cells"] | None
@@ -55,6 +59,7 @@ class Medium(eqx.Module):
     leaf_angles: LeafAngles | None
     leaf_phase: AbstractPhase | None
     bark_phase: AbstractPhase | None
+    counts: Int[Array, "3"]
     shape: tuple[int, int, int] = eqx.field(static=True)
     periodic: bool = eqx.field(static=True)
 
@@ -85,8 +90,13 @@ def _pick(table: Float[Array, "cells"], cell: Int[Array, "*s"]) -> Scalar:
 def medium_of(canopy: Canopy, aim: Float[Array, "3"], leaf_factor: Scalar) -> Medium:
     """The medium of a canopy; `leaf_factor` scales leaf extinction (1 - T where transmission is straight)."""
     voxels = canopy.voxels
-    leaf = None if voxels.leaf is None else voxels.leaf.reshape(-1) * leaf_factor
-    bark = None if voxels.bark is None else voxels.bark.reshape(-1)
+    shape = _room(voxels.shape)
+
+    def laid_out(table: Float[Array, "nx ny nz"]) -> Float[Array, "cells"]:
+        return jnp.pad(table, [(0, room - n) for room, n in zip(shape, voxels.shape)]).reshape(-1)
+
+    leaf = None if voxels.leaf is None else laid_out(voxels.leaf) * leaf_factor
+    bark = None if voxels.bark is None else laid_out(voxels.bark)
     angles = None
     if voxels.leaf_angles is not None and leaf is not None:
         angles = AngleTables(*voxels.leaf_angles.tables())
@@ -103,9 +113,17 @@ def medium_of(canopy: Canopy, aim: Float[Array, "3"], leaf_factor: Scalar) -> Me
         leaf_angles=voxels.leaf_angles if angles is not None else None,
         leaf_phase=None if leaf is None else canopy.leaf_phase,
         bark_phase=None if bark is None else canopy.bark_phase,
-        shape=voxels.shape,
+        counts=jnp.asarray(voxels.shape, jnp.int32),
+        shape=shape,
         periodic=canopy.sides == "periodic",
     )
+
+
+def _room(shape: tuple[int, ...]) -> tuple[int, int, int]:
+    """Voxels along each axis for which there is room: up the ladder, in small steps where there are many."""
+    # One more than a round number of voxels needs no more room.
+    x, y, z = (n if n == 1 else rung(n + 1, 2 if n <= 32 else 8) for n in shape)
+    return x, y, z
 
 
 # First voxel and one past the last, along each axis.
@@ -144,7 +162,7 @@ def begin(medium: Medium, x: Vec, w: Vec, box: Box | None = None) -> Walk:
     """
     near, far = jnp.zeros_like(x[0]), jnp.full_like(x[0], FAR)
     gap, offset, step = [], [], []
-    low, high = box if box is not None else ((0, 0, 0), medium.shape)
+    low, high = box if box is not None else ((0, 0, 0), tuple(medium.counts))
     for k in range(3):
         flat, ahead = jnp.abs(w[k]) < 1e-12, w[k] > 0
         inverse = 1.0 / jnp.where(flat, 1.0, w[k])
@@ -167,19 +185,26 @@ def begin(medium: Medium, x: Vec, w: Vec, box: Box | None = None) -> Walk:
         place = (x[k] + w[k] * near - medium.origin[k]) / medium.size[k]
         number = jnp.floor(lax.stop_gradient(place))
         if not (medium.periodic and k < 2):
-            number = jnp.clip(number, 0, medium.shape[k] - 1)
+            number = jnp.clip(number, 0, medium.counts[k] - 1)
         voxel.append(number.astype(jnp.int32))
     return Walk(tuple(gap), tuple(offset), tuple(step), tuple(voxel), near, far)
 
 
 def cell_of(medium: Medium, voxel: tuple[Int[Array, "*s"], ...]) -> Int[Array, "*s"]:
     """Index into the flat arrays, clipped against rounding at the last face."""
-    nx, ny, nz = medium.shape
+    nx, ny, nz = medium.counts
     if medium.periodic:
-        i, j = voxel[0] % nx, voxel[1] % ny
+        i, j = _wrapped(voxel[0], nx), _wrapped(voxel[1], ny)
     else:
         i, j = jnp.clip(voxel[0], 0, nx - 1), jnp.clip(voxel[1], 0, ny - 1)
-    return (i * ny + j) * nz + jnp.clip(voxel[2], 0, nz - 1)
+    _, along_y, along_z = medium.shape
+    return (i * along_y + j) * along_z + jnp.clip(voxel[2], 0, nz - 1)
+
+
+def _wrapped(number: Int[Array, "*s"], count: Int[Array, ""]) -> Int[Array, "*s"]:
+    """The remainder of a voxel's number; by floating point, for processors divide integers one by one."""
+    turns = jnp.floor((number.astype(jnp.float32) + 0.5) * (1.0 / count.astype(jnp.float32)))
+    return number - turns.astype(number.dtype) * count
 
 
 def advance(
@@ -285,7 +310,7 @@ def depth_to_top(medium: Medium, x: Vec, column: Float[Array, "cells"]) -> Scala
         p = (x[k] - medium.origin[k]) / medium.size[k]
         place.append(p)
         voxel.append(jnp.floor(lax.stop_gradient(p)).astype(jnp.int32))
-    nx, ny, nz = medium.shape
+    nx, ny, nz = medium.counts
     inside = voxel[2] < nz
     if not medium.periodic:
         inside &= (voxel[0] >= 0) & (voxel[0] < nx) & (voxel[1] >= 0) & (voxel[1] < ny)

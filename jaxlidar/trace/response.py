@@ -14,13 +14,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxlidar._checks import check_key, check_kind
-from jaxlidar.planning.plan import Plan
 from jaxlidar.planning.setup import Setup
 from jaxlidar.trace.first_order import FirstOrder, first_order
 from jaxlidar.trace.footprint import lattice, product_rule, scattered
 from jaxlidar.trace.higher_orders import higher_orders
 from jaxlidar.trace.mirror import mirror_rays
-from jaxlidar.trace.setting import Setting, setting_of
+from jaxlidar.trace.setting import Setting, settings_of
 
 
 @final
@@ -91,36 +90,39 @@ def trace_scene(setup: Setup, key: PRNGKeyArray) -> Response:
     """
     check_kind("setup", setup, Setup, "a Setup, as in reduce(lidar, scene, plan)")
     check_key(key)
-    canopy = setup.scene.canopy
-    if canopy is None or not canopy.is_straight:
-        return _trace(setting_of(setup), setup.plan, key)
-    _, transmittance = canopy.leaf_optics(setup.lidar.wavelength)
-    each = jax.lax.map(lambda t: _trace(setting_of(setup, t), setup.plan, key), transmittance)
+    return trace_settings(*settings_of(setup), key)
+
+
+def trace_settings(settings: Setting, several: bool, key: PRNGKeyArray) -> Response:
+    """The response of one batch. `several`: whether there is a setting for each wavelength."""
+    if not several:
+        return _trace(settings, key)
+    each = jax.lax.map(lambda setting: _trace(setting, key), settings)
     return jax.tree.map(lambda a: a[:, 0], each)
 
 
-def _trace(setting: Setting, plan: Plan, key: PRNGKeyArray) -> Response:
+def _trace(setting: Setting, key: PRNGKeyArray) -> Response:
     """The response of one trace."""
-    beam, surfaces = setting.beam, setting.surfaces
+    beam, surfaces, plan, sizes = setting.beam, setting.surfaces, setting.plan, setting.sizes
     # What is not random is compiled without random numbers.
-    shift_key, photon_key = jax.random.split(key) if plan.is_random else (key, key)
+    shift_key, photon_key = jax.random.split(key) if sizes.random else (key, key)
 
-    if plan.smooth_footprint:
+    if sizes.smooth:
         across, energy = product_rule(beam)
-    elif plan.trace.independent:
-        across, energy = scattered(beam, plan.n_rays, shift_key)
+    elif plan.independent:
+        across, energy = scattered(beam, sizes.rays, shift_key)
     else:
-        shift = jax.random.uniform(shift_key, (2,)) if plan.random_footprint else jnp.asarray([0.5, 0.0])
-        across, energy = lattice(beam, plan.n_rays, shift)
+        shift = jax.random.uniform(shift_key, (2,)) if sizes.shifted else jnp.asarray([0.5, 0.0])
+        across, energy = lattice(beam, sizes.rays, shift)
     first = first_order(setting, across, energy)
-    weights = jnp.zeros_like(first.weights) if plan.trace.drawn_first else first.weights
-    for i, is_mirror in enumerate(plan.trace.mirrors):
-        if is_mirror and "specular return" not in plan.off:
+    weights = jnp.zeros_like(first.weights) if plan.drawn_first else first.weights
+    for i, is_mirror in enumerate(plan.mirrors):
+        if is_mirror and sizes.specular:
             weights = weights + first_order(setting, *mirror_rays(beam, surfaces[i]), mirror=i).weights
 
-    if plan.orders < 2 and not plan.trace.drawn_first:
+    if plan.order_steps < 2 and not plan.drawn_first:
         return _only_first(setting, first, weights)
-    higher = higher_orders(setting, photon_key, plan.n_photons)
+    higher = higher_orders(setting, photon_key)
     fate = (higher.arrived, higher.left, higher.escaped, higher.late, higher.remaining)
     outside = (first.outside[None], higher.outside[None])
     return Response(weights[None], higher.weights[None], *outside, *(a[None] for a in fate))

@@ -1,14 +1,21 @@
 """The scene as the tracer sees it: beam, voxels, surfaces and laws, relative to the aim point."""
 
+from typing import NamedTuple
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from jaxlidar._programs import Program
 from jaxlidar._vectors import Scalar, Vec, vec
+from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.optics.laws import AbstractLaw, Lambertian
 from jaxlidar.optics.phase import AbstractPhase
+from jaxlidar.planning.plan import Plan
 from jaxlidar.planning.setup import Setup
 from jaxlidar.planning.trace_plan import Bins, TracePlan
+from jaxlidar.scenes.scene import Scene
 from jaxlidar.trace.footprint import Beam, beam_of
 from jaxlidar.trace.histories import Histories, histories
 from jaxlidar.trace.march import Box, Medium, columns, medium_of, occupied
@@ -19,13 +26,46 @@ from jaxlidar.trace.surfaces import Surface, surfaces_of
 COSINE_LAW = 0
 
 
+class Sizes(NamedTuple):
+    """What of a plan a trace depends on, beside its `TracePlan` and its bins.
+
+    - `rays`, `photons`: of a batch. - `smooth`, `shifted`: whether a quadrature rule takes the place of the
+      rays, and whether each batch shifts them at random. - `random`: whether anything is drawn.
+    - `specular`: whether mirrors return light to the sensor. - `degree`, `first_degree`: most scatterings of
+      a history.
+    """
+
+    rays: int
+    photons: int
+    smooth: bool
+    shifted: bool
+    random: bool
+    specular: bool
+    degree: int
+    first_degree: int
+
+
+def sizes_of(plan: Plan) -> Sizes:
+    """The sizes of a plan."""
+    return Sizes(
+        plan.n_rays,
+        plan.n_photons,
+        plan.smooth_footprint,
+        plan.random_footprint,
+        plan.is_random,
+        "specular return" not in plan.off,
+        plan.degree,
+        plan.first_degree,
+    )
+
+
 class Setting(eqx.Module):
-    """What the first and the higher orders share.
+    """What the first and the higher orders share. Programs that trace are compiled for its sizes alone.
 
     - `beam`, `medium`, `surfaces`: the geometry; ground first, then plates.
     - `laws`: by which photons are sent on. `surface_laws`, `leaf_law`, `bark_law`: numbers of them.
-    - `plan`, `bins`: sizes.
-    - `short`, `table`: histories of order one, and of all orders.
+    - `plan`, `bins`: of the plan, with arrays for numbers.
+    - `sizes`: the rest of the plan.
     - `column`: optical depth straight up from every voxel, for a beam at nadir.
     - `occupied`: the box that holds all voxels with any extinction.
     - `successor`: of every history, for every letter.
@@ -38,13 +78,22 @@ class Setting(eqx.Module):
     column: Float[Array, "cells"] | None
     occupied: Box | None
     successor: Int[Array, "histories letters"]
+    plan: TracePlan
+    bins: Bins
     surface_laws: tuple[int, ...] = eqx.field(static=True)
     leaf_law: int = eqx.field(static=True)
     bark_law: int = eqx.field(static=True)
-    plan: TracePlan = eqx.field(static=True)
-    bins: Bins = eqx.field(static=True)
-    short: Histories = eqx.field(static=True)
-    table: Histories = eqx.field(static=True)
+    sizes: Sizes = eqx.field(static=True)
+
+    @property
+    def short(self) -> Histories:
+        """Histories of order one."""
+        return histories(len(self.plan.letters), self.sizes.first_degree)
+
+    @property
+    def table(self) -> Histories:
+        """Histories of all orders."""
+        return histories(len(self.plan.letters), self.sizes.degree)
 
     def budget(self, p: Photons) -> Float[Array, "photons"]:
         """How far photons may fly, m, so that their light can still be recorded."""
@@ -79,7 +128,35 @@ def setting_of(setup: Setup, leaf_transmittance: Float[Array, ""] | float = 0.0)
     `leaf_transmittance` matters only where the canopy's transmission is straight: extinction is then scaled
     by one minus it.
     """
-    lidar, scene, plan = setup.lidar, setup.scene, setup.plan
+    plan = setup.plan
+    trace, bins = jax.tree.map(jnp.asarray, (plan.trace, plan.bins))
+    factor = jnp.asarray(1.0 - leaf_transmittance)
+    return _set_out(_without_spectrum(setup.lidar), setup.scene, trace, bins, factor, sizes_of(plan))
+
+
+def _without_spectrum(lidar: Lidar) -> Lidar:
+    """The lidar with one wavelength: geometry is the same for all."""
+    one = jnp.ones((1,), lidar.wavelength.dtype)
+    return eqx.tree_at(lambda v: (v.wavelength, v.energy, v.efficiency), lidar, (one, one, one))
+
+
+def settings_of(setup: Setup) -> tuple[Setting, bool]:
+    """The setting of a setup, and whether it has a leading axis: one setting for each wavelength."""
+    canopy = setup.scene.canopy
+    if canopy is None or not canopy.is_straight:
+        return setting_of(setup), False
+    _, transmittance = canopy.leaf_optics(setup.lidar.wavelength)
+    return eqx.filter_vmap(lambda t: setting_of(setup, t))(transmittance), True
+
+
+def _arrange(
+    lidar: Lidar,
+    scene: Scene,
+    plan: TracePlan,
+    bins: Bins,
+    factor: Float[Array, ""],
+    sizes: Sizes,
+) -> Setting:
     aim = jnp.concatenate([lidar.position, jnp.zeros_like(lidar.position[:1])])
     laws: list[AbstractLaw | AbstractPhase] = [Lambertian()]
 
@@ -91,29 +168,28 @@ def setting_of(setup: Setup, leaf_transmittance: Float[Array, ""] | float = 0.0)
 
     medium, leaf_law, bark_law = None, COSINE_LAW, COSINE_LAW
     if scene.canopy is not None:
-        factor = jnp.asarray(1.0 - leaf_transmittance if scene.canopy.is_straight else 1.0)
-        medium = medium_of(scene.canopy, aim, factor)
+        medium = medium_of(scene.canopy, aim, factor if scene.canopy.is_straight else jnp.ones_like(factor))
         leaf_law, bark_law = number(medium.leaf_phase), number(medium.bark_phase)
     surfaces = surfaces_of(scene, aim)
     surface_laws = tuple(number(s.law) for s in surfaces)
-    letters = len(plan.trace.letters)
-    table = histories(letters, plan.degree)
     return Setting(
         beam=beam_of(lidar),
         medium=medium,
         surfaces=surfaces,
         laws=tuple(laws),
-        column=columns(medium) if medium is not None and plan.trace.vertical else None,
+        column=columns(medium) if medium is not None and plan.vertical else None,
         occupied=None if medium is None else occupied(medium),
-        successor=jnp.asarray(table.successor),
+        successor=jnp.asarray(histories(len(plan.letters), sizes.degree).successor),
+        plan=plan,
+        bins=bins,
         surface_laws=surface_laws,
         leaf_law=leaf_law,
         bark_law=bark_law,
-        plan=plan.trace,
-        bins=plan.bins,
-        short=histories(letters, plan.first_degree),
-        table=table,
+        sizes=sizes,
     )
+
+
+_set_out = Program(_arrange)
 
 
 def unscattered(like: Scalar) -> Scattering:

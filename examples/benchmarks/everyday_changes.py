@@ -1,0 +1,117 @@
+"""What a change of a scene costs a user: the first call, and everyday changes after it.
+
+Run it as `python examples/benchmarks/everyday_changes.py [--out figures]`. Every call is timed twice; the
+second time is its work without compilation. Programs compiled are counted as XLA reports them.
+"""
+
+import logging
+import re
+import time
+import warnings
+
+import jax
+import numpy as np
+from _common import machine, new_figure, options, print_table, save_figure, write_json
+
+import jaxlidar as jl
+
+CHANGES = {
+    "first call": {},
+    "rtol 0.05 to 0.02": {"rtol": 0.02},
+    "slope 5 to 6": {"slope": 6.0},
+    "ground 0.3 m higher": {"height": 0.3},
+    "pulse of 5 ns": {"length": 5.0},
+    "one wavelength of three": {"wavelength": 1064.0},
+    "zenith 10": {"zenith": 10.0},
+    "zenith 11": {"zenith": 11.0},
+    "another window": {"window": (-125.0, 70.0)},
+    "one more layer of voxels": {"shape": (8, 8, 21)},
+    "one more row of voxels": {"shape": (9, 8, 20)},
+    "leaf angles": {"angles": "planophile"},
+    "other leaf angles": {"angles": "erectophile"},
+    "bark": {"bark": True},
+    "divergence 2 to 1.5": {"divergence": 1.5},
+    "chlorophyll": {"Cab": 50.0},
+}
+# Compilations that take less are of single operations.
+NOTABLE = 0.1
+
+
+class Compilations(logging.Handler):
+    """Collects what JAX says of its compilations: name and seconds."""
+
+    def __init__(self):
+        super().__init__()
+        self.found: list[tuple[str, float]] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        said = re.match(r"Finished XLA compilation of jit\((.*?)\) in ([\d.e-]+) sec", record.getMessage())
+        if said:
+            self.found.append((said[1], float(said[2])))
+
+
+def simulate(
+    rtol=0.05,
+    slope=5.0,
+    height=0.0,
+    length=6.0,
+    wavelength=(532.0, 1064.0, 1550.0),
+    zenith=0.0,
+    window=(-120.0, 60.0),
+    shape=(8, 8, 20),
+    angles="spherical",
+    bark=False,
+    divergence=2.0,
+    Cab=40.0,
+) -> None:
+    """A simulation of the README's scene, with changes."""
+    density = np.full(shape, 0.5)
+    voxels = jl.VoxelMap.from_lad(
+        density,
+        bark=0.05 * density if bark else None,
+        voxel_size=0.5,
+        origin=(-2, -2, 5),
+        leaf_angles=angles,
+    )
+    leaf = jl.Prospect(N=1.5, Cab=Cab, Car=8.0, Cw=0.01, Cm=0.009)
+    canopy = jl.Canopy(voxels, leaf=leaf, bark=0.3 if bark else None)
+    scene = jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=0.3, slope=slope, height=height))
+    pulse = jl.GaussianPulse(fwhm=length)
+    lidar = jl.Lidar(wavelength=wavelength, divergence=divergence, zenith=zenith, pulse=pulse)
+    jl.simulate(lidar, scene, key=jax.random.key(0), rtol=rtol, window=window)
+
+
+def main() -> None:
+    given = options("What a change of a scene costs.")
+    warnings.simplefilter("ignore", jl.LateLightWarning)
+    heard = Compilations()
+    log = logging.getLogger("jax")
+    log.addHandler(heard)
+    log.propagate = False
+    jax.config.update("jax_log_compiles", True)
+    results = []
+    for name, change in CHANGES.items():
+        heard.found.clear()
+        times = []
+        for _ in range(2):
+            start = time.perf_counter()
+            simulate(**change)
+            times.append(time.perf_counter() - start)
+        large = [what for what, took in heard.found if took > NOTABLE]
+        results.append({"change": name, "seconds": times[0], "warm": times[1], "compiled": large})
+    write_json(given.out / "everyday_changes.json", {"machine": machine(), "changes": results})
+
+    figure, axes = new_figure(size=(7, 5))
+    names = [r["change"] for r in results]
+    axes.barh(names, [r["seconds"] for r in results], label="with compilation")
+    axes.barh(names, [r["warm"] for r in results], label="again")
+    axes.invert_yaxis()
+    axes.set(xlabel="seconds", title="a call of simulate after a change", xscale="log")
+    axes.legend()
+    save_figure(figure, given.out / "everyday_changes.png")
+    rows = [(r["change"], r["seconds"], r["warm"], ", ".join(r["compiled"])) for r in results]
+    print_table(("change", "s", "s, again", "compiled"), rows)
+
+
+if __name__ == "__main__":
+    main()

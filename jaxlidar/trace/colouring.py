@@ -1,0 +1,223 @@
+"""From response to samples: optics of every history, the atmosphere, the pulse, and where the energy went."""
+
+import dataclasses
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxlidar._constants import SPEED_OF_LIGHT
+from jaxlidar._programs import Program
+from jaxlidar.instrument.lidar import Lidar
+from jaxlidar.planning.sampling import Sampling, sampling_of
+from jaxlidar.planning.scatterers import letter_values
+from jaxlidar.planning.setup import Setup
+from jaxlidar.scenes.atmosphere import Atmosphere
+from jaxlidar.trace.histories import Histories, histories
+from jaxlidar.trace.response import Response
+
+
+class Recording(eqx.Module):
+    """What turns a response into samples. Programs are compiled for its sizes alone. Made by `recording_of`.
+
+    - `optics`: reflectance or transmittance of every letter. - `sampling`: pulse and digitiser.
+    - `time`: of the samples, ns. - `clear`: two-way transmittance of the atmosphere in fine bins, and `air`:
+      its own return in samples; None where there is none. - `admissible`: see `Setup`.
+    - `materials`: their names. - `first_degree`, `degree`: of histories. - `one_order`: whether no more was
+      followed.
+    """
+
+    optics: Float[Array, "letters wavelengths"]
+    sampling: Sampling
+    time: Float[Array, "samples"]
+    clear: Float[Array, "wavelengths fine"] | None
+    air: Float[Array, "wavelengths samples"] | None
+    admissible: Float[Array, ""]
+    lidar: Lidar
+    materials: tuple[str, ...] = eqx.field(static=True)
+    first_degree: int = eqx.field(static=True)
+    degree: int = eqx.field(static=True)
+    one_order: bool = eqx.field(static=True)
+
+    @property
+    def short(self) -> Histories:
+        """Histories of order one."""
+        return histories(len(self.optics), self.first_degree)
+
+    @property
+    def table(self) -> Histories:
+        """Histories of all orders."""
+        return histories(len(self.optics), self.degree)
+
+    def with_room(self, wavelengths: int) -> "Recording":
+        """The same recording with copies of the last wavelength, so that there are `wavelengths`."""
+        more = wavelengths - self.lidar.wavelength.size
+        if more <= 0:
+            return self
+
+        def grown(a: Array, axis: int = 0) -> Array:
+            if a.ndim == 0 or a.shape[axis] == 1 < wavelengths - more:
+                return a
+            last = np.repeat(np.take(np.asarray(a), [-1], axis), more, axis)
+            return jnp.asarray(np.concatenate([a, last], axis))
+
+        lidar = self.lidar
+        parts = (grown(lidar.wavelength), grown(lidar.energy), grown(lidar.efficiency))
+        return dataclasses.replace(
+            self,
+            optics=grown(self.optics, 1),
+            clear=None if self.clear is None else grown(self.clear),
+            air=None if self.air is None else grown(self.air),
+            lidar=eqx.tree_at(lambda v: (v.wavelength, v.energy, v.efficiency), lidar, parts),
+        )
+
+
+def optics_of(setup: Setup) -> Float[Array, "letters wavelengths"]:
+    """Reflectance or transmittance of every letter of the plan, by wavelength."""
+    return letter_values(setup.lidar, setup.scene, setup.plan.trace.letters)
+
+
+def recording_of(setup: Setup, samples: int | None = None) -> Recording:
+    """The recording of a setup, of its first `samples` samples. Default None: the plan's."""
+    lidar, plan, air = setup.lidar, setup.plan, setup.scene.atmosphere
+    samples = samples or plan.n_samples
+    sampling = sampling_of(lidar, plan, samples)
+    clear = own = None
+    if air is not None:
+        bins = plan.bins
+        fine = jnp.asarray(bins.start + bins.width * np.arange(bins.count))
+        clear, own = _through(air, lidar, fine, jnp.asarray(plan.trace.upstream), jnp.asarray(bins.width))
+        own = None if own is None else sampling(own)
+    return Recording(
+        optics=optics_of(setup),
+        sampling=sampling,
+        time=jnp.asarray(plan.sample_start + plan.sample_interval * np.arange(samples)),
+        clear=clear,
+        air=own,
+        admissible=setup.admissible,
+        lidar=lidar,
+        materials=plan.trace.materials,
+        first_degree=plan.first_degree,
+        degree=plan.degree,
+        one_order=plan.orders == 1,
+    )
+
+
+def _atmosphere(
+    air: Atmosphere,
+    lidar: Lidar,
+    time: Float[Array, "fine"],
+    upstream: Float[Array, ""],
+    width: Float[Array, ""],
+) -> tuple[Float[Array, "wavelengths fine"], Float[Array, "wavelengths fine"] | None]:
+    """Two-way transmittance in fine bins; and what the air itself returns, where a lidar ratio is given.
+
+    The latter is single scattering, above all of the scene.
+    """
+    heights = jnp.minimum(height_of(lidar, time), 0.999 * lidar.altitude)
+    clear = air.two_way_transmittance(lidar.wavelength, heights, lidar.altitude, lidar.zenith)
+    if air.lidar_ratio is None:
+        return clear, None
+    per_metre = air.backscatter(lidar.wavelength, heights, lidar.altitude, lidar.zenith)
+    top = upstream * jnp.cos(jnp.deg2rad(lidar.zenith))
+    length = 0.5 * SPEED_OF_LIGHT * width
+    return clear, jnp.where((heights > top)[None, :], per_metre * length, 0.0)
+
+
+_through = Program(_atmosphere)
+
+
+def height_of(lidar: Lidar, time: Float[Array, "bins"]) -> Float[Array, "bins"]:
+    """Height above the reference plane (m) from which order one arrives at `time` (ns)."""
+    return -0.5 * SPEED_OF_LIGHT * time * jnp.cos(jnp.deg2rad(lidar.zenith))
+
+
+def colour(
+    weights: Float[Array, "traces *rest histories columns"],
+    table: Histories,
+    optics: Float[Array, "letters wavelengths"],
+) -> Float[Array, "*rest wavelengths columns"]:
+    """The sum over histories of weight times the product of optics, by wavelength: a matrix product."""
+    if len(weights) == 1:
+        return jnp.einsum("hw,...hc->...wc", table.monomials(optics), weights[0])
+    # Each trace has one wavelength.
+    return jnp.einsum("hw,w...hc->...wc", table.monomials(optics), weights)
+
+
+def _seen(
+    weights: Float[Array, "traces *rest histories bins"], table: Histories, recording: Recording
+) -> Float[Array, "*rest wavelengths samples"]:
+    """Samples by wavelength of weights by history and fine bin: optics, atmosphere, pulse."""
+    sampling, optics, clear = recording.sampling, recording.optics, recording.clear
+    count, wavelengths = table.count, optics.shape[1]
+    pulse_last = (wavelengths * (count + sampling.samples)) * sampling.bins
+    pulse_first = (count * (sampling.bins + wavelengths)) * sampling.samples
+    if clear is None and len(weights) == 1 and pulse_first < pulse_last:
+        return colour(sampling(weights), table, optics)
+    fine = colour(weights, table, optics)
+    if clear is not None:
+        fine = fine * clear.reshape((1,) * (fine.ndim - 2) + clear.shape)
+    return sampling(fine)
+
+
+def total(response: Response, recording: Recording) -> Float[Array, "wavelengths samples"]:
+    """Apparent reflectance per sample, all components together."""
+    found = jnp.zeros(())
+    for table, part in zip((recording.short, recording.table), (response.first, response.higher)):
+        if part is not None:
+            found = found + _seen(jnp.sum(part, axis=1), table, recording)
+    return recording.admissible * (found if recording.air is None else found + recording.air)
+
+
+def components(response: Response, recording: Recording) -> dict[str, Float[Array, "wavelengths samples"]]:
+    """Apparent reflectance per sample, by material of the last scattering and by order."""
+    first = _seen(response.first, recording.short, recording)
+    higher = jnp.zeros_like(first)
+    if response.higher is not None:
+        higher = _seen(response.higher, recording.table, recording)
+    lines = jnp.concatenate([first + higher, jnp.sum(first, 0)[None], jnp.sum(higher, 0)[None]])
+    found = dict(zip([*recording.materials, "first", "higher"], recording.admissible * lines))
+    if recording.air is not None:
+        found["air"] = recording.air
+        found["first"] = found["first"] + recording.air
+    return found
+
+
+class Balance(NamedTuple):
+    """Where the emitted energy went, (wavelengths,) each: see `Waveform`."""
+
+    ledger: dict[str, Float[Array, "wavelengths"]]
+    neglected: Float[Array, "wavelengths"]
+    lost: Float[Array, "wavelengths"]
+
+
+def balance(response: Response, recording: Recording) -> Balance:
+    """Shares of the emitted energy by fate. A material absorbs what arrived there less what left."""
+    lidar, values, short = recording.lidar, recording.optics, recording.short
+    table = short if response.higher is None else recording.table
+
+    def shares(weights: Array, table: Histories = table) -> Array:
+        return colour(weights[..., None], table, values)[..., 0]
+
+    whole = shares(jnp.sum(response.first, axis=(1, 3)), short)
+    lost = shares(jnp.sum(response.first_outside, axis=1), short)
+    if response.higher is not None and response.higher_outside is not None:
+        whole = whole + shares(jnp.sum(response.higher, axis=(1, 3)))
+        lost = lost + shares(jnp.sum(response.higher_outside, axis=1))
+    absorbed = shares(response.arrived - response.left)
+    ledger = {
+        "escaped": shares(response.escaped),
+        **{f"absorbed by {name}": absorbed[i] for i, name in enumerate(recording.materials)},
+        "after the window": shares(response.late),
+        "unfollowed": shares(response.remaining),
+    }
+    returned = whole * lidar.aperture_area / (jnp.pi * lidar.range_to_reference**2)
+    # What returns is part of what escaped, or, where only one order was followed, would have.
+    source = "unfollowed" if recording.one_order and len(recording.materials) > 1 else "escaped"
+    reach = jnp.minimum(returned, ledger[source])
+    ledger = {"returned": reach, **ledger, source: ledger[source] - reach}
+    per_energy = whole / jnp.maximum(ledger["escaped"], 1e-6)
+    unfollowed = jnp.zeros_like(whole) if recording.one_order else ledger["unfollowed"]
+    return Balance(ledger, unfollowed * jnp.clip(per_energy, 1.0, 4.0), lost)

@@ -1,0 +1,108 @@
+"""Programs are compiled for the sizes of a short ladder: everyday changes of a scene compile nothing anew."""
+
+import importlib
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxlidar as jl
+from jaxlidar.planning.ladder import rung
+
+# The package's name `simulate` is the function.
+simulation = importlib.import_module("jaxlidar.simulate")
+KEY = jax.random.key(0)
+SHAPE = (8, 8, 18)
+
+
+def simulate(**changes):
+    """The waveform of a crown over ground, with changes, and how it was simulated."""
+    given = {"rtol": 0.05, "window": (-120.0, 60.0), "shape": SHAPE, "angles": "planophile"} | changes
+    lidar = {"wavelength": (532.0, 1064.0, 1550.0), "divergence": 2.0, "zenith": 5.0}
+    lidar |= {name: given[name] for name in ("wavelength", "divergence", "zenith", "pulse") if name in given}
+    ground = {"reflectance": 0.3, "slope": 5.0}
+    ground |= {name: given[name] for name in ("slope", "height") if name in given}
+    voxels = jl.VoxelMap.from_lad(
+        np.full(given["shape"], 0.5),
+        voxel_size=0.5,
+        origin=(-2, -2, 5),
+        leaf_angles=jl.LeafAngles.named(given["angles"]),
+    )
+    leaf = jl.Prospect(N=1.5, Cab=given.get("Cab", 40.0), Car=8.0, Cw=0.01, Cm=0.009)
+    scene = jl.Scene(canopy=jl.Canopy(voxels, leaf=leaf), ground=jl.Ground(**ground))
+    return jl.simulate(jl.Lidar(**lidar), scene, key=KEY, rtol=given["rtol"], window=given["window"])
+
+
+CHANGES = {
+    "tolerance": {"rtol": 0.02},
+    "slope": {"slope": 6.0},
+    "height of the ground": {"height": 0.3},
+    "pulse": {"pulse": jl.GaussianPulse(fwhm=5.0)},
+    "fewer wavelengths": {"wavelength": 1064.0},
+    "zenith": {"zenith": 6.0},
+    "window": {"window": (-125.0, 70.0)},
+    "one more layer": {"shape": (8, 8, 19)},
+    "one more tree": {"shape": (9, 8, 18)},
+    "divergence": {"divergence": 1.5},
+    "leaf angles": {"angles": "erectophile"},
+    "chlorophyll": {"Cab": 50.0},
+}
+
+
+@pytest.fixture(scope="module")
+def compiled():
+    """Counts the versions of the programs, after a first simulation."""
+    programs = [getattr(simulation, f"_compiled_{name}") for name in ("batch", "results", "waveform")]
+    for program in programs:
+        program.versions.clear()
+    simulate()
+    return lambda: [len(program.versions) for program in programs]
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_everyday_changes_compile_nothing(compiled, name):
+    before = compiled()
+    wave = simulate(**CHANGES[name])
+    assert compiled() == before
+    assert np.all(np.isfinite(wave.reflectance))
+
+
+def test_a_new_effect_does_compile(compiled):
+    """The counting can fail: the trace of a beam at nadir is another program."""
+    before = compiled()
+    simulate(zenith=0.0)
+    assert compiled()[0] == before[0] + 1
+
+
+def test_room_changes_no_value():
+    """A plan without room to spare gives the same waveform, to rounding."""
+    scene = jl.Scene(
+        canopy=jl.Canopy(
+            jl.VoxelMap.from_lad(np.full((3, 2, 5), 0.8), voxel_size=1.0, origin=(-1.5, -1.0, 2.0)),
+            leaf=jl.LeafOptics(reflectance=0.4, transmittance=0.3),
+        ),
+        ground=jl.Ground(reflectance=0.4),
+    )
+    lidar = jl.Lidar(divergence=2.0, wavelength=(1000.0, 1064.0, 1100.0))
+    given = {"key": KEY, "n_photons": 20_000, "max_orders": 5, "window": (-60.0, 30.0)}
+    wave = jl.simulate(lidar, scene, **given)
+    # Within a transformation nothing is rounded up but what the plan has.
+    setup = jl.reduce(lidar, scene, jl.plan(lidar, scene, max_orders=5, window=(-60.0, 30.0), n_photons=2500))
+    assert setup.plan.trace.order_steps == 6
+    total = jax.jit(lambda key: jl.total_of(jl.trace_scene(setup, key), setup))
+    totals = [np.asarray(total(jax.random.fold_in(KEY, n))) for n in range(8)]
+    np.testing.assert_allclose(wave.reflectance, np.mean(totals, axis=0), rtol=1e-4, atol=1e-7)
+    assert wave.reflectance.shape == (3, setup.plan.n_samples)
+    assert float(jnp.max(wave.components["higher"])) > 0
+
+
+@pytest.mark.parametrize("steps", [1, 2, 8])
+def test_the_ladder(steps):
+    sizes = np.arange(1, 3000)
+    rungs = np.array([rung(int(n), steps) for n in sizes])
+    assert np.all(rungs >= sizes)
+    assert np.all(rungs <= np.maximum(np.ceil(sizes * (1 + 1.0 / steps)), 2))
+    assert np.all(np.diff(rungs) >= 0)
+    assert np.all([rung(int(n), steps) == n for n in rungs])
+    assert len(np.unique(rungs)) <= 12 * steps + 2
