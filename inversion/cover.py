@@ -4,6 +4,7 @@
 differentiable.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -121,7 +122,10 @@ def _below_and_above(z, y, count, pulse, ground, top, bottom):
 
 
 def gap_probability(
-    canopy: Float[ArrayLike, " bins"], ground: Float[ArrayLike, ""], *, reflectance_ratio: float = 1.5
+    canopy: Float[ArrayLike, " bins"] | Sequence[float],
+    ground: Float[ArrayLike, ""],
+    *,
+    reflectance_ratio: float = 1.5,
 ) -> Samples:
     """Gap probability from above the canopy down to each sample, in the direction of the beam.
 

@@ -58,7 +58,7 @@ def test_simulate_keeps_the_precision(double, monkeypatch):
 
     def watched(*args):
         out = batch(*args)
-        kinds.append(str(out[1].dtype))
+        kinds.append(str(out.first.dtype))
         return out
 
     monkeypatch.setattr(module, "_compiled_batch", watched)
