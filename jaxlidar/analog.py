@@ -5,13 +5,15 @@ optics with the tracer, but has neither expected returns at every collision, nor
 nor stratified random numbers.
 """
 
+from typing import final
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from jaxlidar._checks import check_integer, check_key, check_range
+from jaxlidar._checks import briefly, check_integer, check_key, check_range
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._vectors import FAR, along, dot
 from jaxlidar.instrument.lidar import Lidar
@@ -29,6 +31,8 @@ from jaxlidar.trace.setting import Setting, setting_of, unscattered
 CHUNK = 512
 
 
+@final
+@briefly
 class AnalogReturns(eqx.Module):
     """Arrival times and weights of photons followed one by one, as `analog_returns` gives them.
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxlidar._checks import check_choice, check_integer, check_key, check_range, known_number
+from jaxlidar._checks import briefly, check_choice, check_integer, check_key, check_range, known_number
 from jaxlidar._programs import Program
 from jaxlidar._statistics import Moments, batches_needed
 from jaxlidar._threads import ONE_CORE, side_by_side
@@ -34,6 +34,7 @@ REACH = 300.0
 
 
 @final
+@briefly
 class EnergyBudget(eqx.Module):
     """Shares of the emitted energy, (wavelengths,) each.
 

@@ -18,21 +18,18 @@ from jaxlidar._statistics import Moments, batches_needed, errors_of, widening
 from jaxlidar._summary import NOTABLE, late_share, percent
 from jaxlidar._threads import ONE_CORE, side_by_side
 from jaxlidar.instrument.lidar import Lidar
-from jaxlidar.planning.ladder import rung
 from jaxlidar.planning.plan import MIN_BATCHES, Plan
 from jaxlidar.planning.plan import plan as make_plan
 from jaxlidar.planning.plan_check import check_plan
 from jaxlidar.planning.setup import Setup, reduce
 from jaxlidar.scenes.scene import Scene, check_kinds
-from jaxlidar.trace.colouring import Balance, Recording, balance, recording_of, total
+from jaxlidar.trace.colouring import Balance, Recording, balance, recording_of, recording_with_room, total
 from jaxlidar.trace.response import Response, trace_settings
 from jaxlidar.trace.setting import Setting, settings_of
 from jaxlidar.waveform import Waveform, open_at_first_return, recorded, trimmed
 
 # Photons of one batch at most: a batch cannot be interrupted.
 LARGEST_BATCH = 65_536
-# Programs that colour have room for at least so many wavelengths.
-FEW_WAVELENGTHS = 4
 
 
 @dataclasses.dataclass(frozen=True)
@@ -175,9 +172,7 @@ def _prepared(setup: Setup) -> _Ready:
     settings, several = settings_of(setup)
     if any(is_traced(x) for x in jax.tree.leaves(setup)):
         return _Ready(setup, settings, several, recording_of(setup))
-    recording, many = recording_of(setup, rung(setup.plan.n_samples, 1)), setup.lidar.wavelength.size
-    if not several:
-        recording = recording.with_room(max(rung(many, 2 if many <= 16 else 16), FEW_WAVELENGTHS))
+    recording = recording_of(setup) if several else recording_with_room(setup)
     return _Ready(setup, settings, several, recording)
 
 

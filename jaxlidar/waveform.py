@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxlidar._checks import check_range, is_traced
+from jaxlidar._checks import briefly, check_range, is_traced
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._summary import summary
 from jaxlidar.instrument.lidar import Lidar
@@ -22,6 +22,7 @@ from jaxlidar.trace.response import Response
 
 
 @final
+@briefly
 class Waveform(eqx.Module):
     """A simulated waveform: apparent reflectance and received energy by wavelength and sample.
 

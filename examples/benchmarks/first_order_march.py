@@ -171,7 +171,9 @@ def main() -> None:
     lidar, scene = jl.Lidar(divergence=10.0), crown()
     plan = jl.plan(lidar, scene, max_orders=1, footprint="fixed", n_rays=given.rays)
 
-    trace = eqx.filter_jit(lambda lidar, scene, key: jl.trace_scene(jl.reduce(lidar, scene, plan), key).first)
+    trace = eqx.filter_jit(
+        lambda lidar, scene, key: jl.trace_scene(jl.reduce(lidar, scene, plan), key).first[0]
+    )
     keys = list(jax.random.split(jax.random.key(0), BATCHES))
     pool = ThreadPoolExecutor(cores)
 

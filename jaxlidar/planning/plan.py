@@ -248,7 +248,7 @@ def plan(
         hotspot=scene.canopy is not None and scene.canopy.hotspot,
         vertical=known_number(lidar.zenith) == 0.0,
         upstream=geometry.upstream,
-        first_steps=rung(geometry.first_steps(step), 8),
+        first_steps=rung(geometry.first_steps(step), 16),
         march_steps=rung(geometry.march_steps(last + geometry.upstream)),
         max_step=step,
         max_flight=geometry.longest_flight(last + geometry.upstream),

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxlidar._checks import check_kind, is_traced
+from jaxlidar._checks import briefly, check_kind, is_traced
 from jaxlidar._ranges import inadmissible
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.planning.effects import without
@@ -17,6 +17,7 @@ from jaxlidar.scenes.scene import Scene, check_kinds
 
 
 @final
+@briefly
 class Setup(eqx.Module):
     """A lidar and a scene without what a plan leaves out, and the plan: all that tracing and recording need.
 

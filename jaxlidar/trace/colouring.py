@@ -11,12 +11,17 @@ from jaxtyping import Array, Float
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._programs import Program
 from jaxlidar.instrument.lidar import Lidar
+from jaxlidar.planning.ladder import rung
+from jaxlidar.planning.orders import degree_of
 from jaxlidar.planning.sampling import Sampling, sampling_of
 from jaxlidar.planning.scatterers import letter_values
 from jaxlidar.planning.setup import Setup
 from jaxlidar.scenes.atmosphere import Atmosphere
 from jaxlidar.trace.histories import Histories, histories
 from jaxlidar.trace.response import Response
+
+# Programs have room for at least so many wavelengths; more than `_MANY` are a spectrum.
+_FEW, _MANY = 4, 16
 
 
 class Recording(eqx.Module):
@@ -25,7 +30,7 @@ class Recording(eqx.Module):
     - `optics`: reflectance or transmittance of every letter. - `sampling`: pulse and digitiser.
     - `time`: of the samples, ns. - `clear`: two-way transmittance of the atmosphere in fine bins, and `air`:
       its own return in samples; None where there is none. - `admissible`: see `Setup`.
-    - `materials`: their names. - `first_degree`, `degree`: of histories. - `one_order`: whether no more was
+    - `materials`: their names. - `first_degree`, `degree`: of histories. - `one_order`: whether no more were
       followed.
     """
 
@@ -79,10 +84,24 @@ def optics_of(setup: Setup) -> Float[Array, "letters wavelengths"]:
     return letter_values(setup.lidar, setup.scene, setup.plan.trace.letters)
 
 
-def recording_of(setup: Setup, samples: int | None = None) -> Recording:
-    """The recording of a setup, of its first `samples` samples. Default None: the plan's."""
+def recording_of(setup: Setup) -> Recording:
+    """The recording of a setup, for its sizes as they are."""
+    return _recording(setup, setup.plan.n_samples, degree_of(setup.plan.orders, len(setup.scene.plates)))
+
+
+def recording_with_room(setup: Setup) -> Recording:
+    """The recording of a setup, with sizes on the ladder, and wavelengths to spare.
+
+    Where wavelengths are many, colouring takes longer than compiling it again: sizes then are as they are.
+    """
+    plan, many = setup.plan, setup.lidar.wavelength.size
+    if many > _MANY:
+        return recording_of(setup).with_room(rung(many, 16))
+    return _recording(setup, rung(plan.n_samples, 1), plan.degree).with_room(max(rung(many), _FEW))
+
+
+def _recording(setup: Setup, samples: int, degree: int) -> Recording:
     lidar, plan, air = setup.lidar, setup.plan, setup.scene.atmosphere
-    samples = samples or plan.n_samples
     sampling = sampling_of(lidar, plan, samples)
     clear = own = None
     if air is not None:
@@ -100,7 +119,7 @@ def recording_of(setup: Setup, samples: int | None = None) -> Recording:
         lidar=lidar,
         materials=plan.trace.materials,
         first_degree=plan.first_degree,
-        degree=plan.degree,
+        degree=degree,
         one_order=plan.orders == 1,
     )
 
@@ -139,7 +158,11 @@ def colour(
     table: Histories,
     optics: Float[Array, "letters wavelengths"],
 ) -> Float[Array, "*rest wavelengths columns"]:
-    """The sum over histories of weight times the product of optics, by wavelength: a matrix product."""
+    """The sum over histories of weight times the product of optics, by wavelength: a matrix product.
+
+    Histories beyond the table have no weight.
+    """
+    weights = weights[..., : table.count, :]
     if len(weights) == 1:
         return jnp.einsum("hw,...hc->...wc", table.monomials(optics), weights[0])
     # Each trace has one wavelength.
@@ -151,6 +174,7 @@ def _seen(
 ) -> Float[Array, "*rest wavelengths samples"]:
     """Samples by wavelength of weights by history and fine bin: optics, atmosphere, pulse."""
     sampling, optics, clear = recording.sampling, recording.optics, recording.clear
+    weights = weights[..., : table.count, :]
     count, wavelengths = table.count, optics.shape[1]
     pulse_last = (wavelengths * (count + sampling.samples)) * sampling.bins
     pulse_first = (count * (sampling.bins + wavelengths)) * sampling.samples

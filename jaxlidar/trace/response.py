@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxlidar._checks import check_key, check_kind
+from jaxlidar._checks import briefly, check_key, check_kind
 from jaxlidar.planning.setup import Setup
 from jaxlidar.trace.first_order import FirstOrder, first_order
 from jaxlidar.trace.footprint import lattice, product_rule, scattered
@@ -23,6 +23,7 @@ from jaxlidar.trace.setting import Setting, settings_of
 
 
 @final
+@briefly
 class Response(eqx.Module):
     """The geometric weight of all paths, by last material, scattering history and fine time bin.
 
