@@ -8,7 +8,6 @@ from typing import Any, final
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from jaxlidar._checks import briefly, check_range, is_traced
@@ -207,14 +206,11 @@ def trimmed(wave: Waveform, wavelengths: int, samples: int) -> Waveform:
     if wave.reflectance.shape == (wavelengths, samples):
         return wave
 
-    def cut(a: Array, *shape: int) -> Array:
-        # Slices of what is known are not worth a compilation.
-        here = a if is_traced(a) else np.asarray(a)
-        return jnp.asarray(here[tuple(slice(n) for n in shape)])
-
-    time, height = cut(wave.time, samples), cut(wave.height, samples)
-    wave = jax.tree.map(lambda a: cut(a, *(wavelengths, samples)[: a.ndim]), wave)
-    return dataclasses.replace(wave, time=time, height=height)
+    # Slices are not worth a compilation.
+    known = jax.device_get(wave)
+    cut = jax.tree.map(lambda a: a[tuple(slice(n) for n in (wavelengths, samples)[: a.ndim])], known)
+    times = (known.time[:samples], known.height[:samples])
+    return jax.device_put(eqx.tree_at(lambda w: (w.time, w.height), cut, times))
 
 
 def _received(lidar: Lidar, time: Float[Array, "bins"]) -> Float[Array, "wavelengths bins"]:

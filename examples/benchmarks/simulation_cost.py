@@ -80,7 +80,7 @@ def main() -> None:
             warm = min(seconds(lambda: run().reflectance) for _ in range(given.rounds))
             info = wave.info
             results.append(
-                {"scene": name, "rtol": rtol, "seconds": warm, "seconds_with_compilation": cold, **info}
+                {**info, "scene": name, "rtol": rtol, "seconds": warm, "seconds_with_compilation": cold}
             )
             rows.append((name, rtol, warm, cold, info["photons"], info["batches"], info["error"]))
     parts = split(scenes()["crown over ground"], 3 * given.rounds)

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from typing import ClassVar, final
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
@@ -33,6 +34,19 @@ from jaxlidar.instrument.receiver import Receiver
 
 def _wavelengths(x: ArrayLike | Sequence[ArrayLike]) -> Float[Array, "..."]:
     return jnp.atleast_1d(as_array(x, "wavelength"))
+
+
+@jax.jit
+def _towards(zenith: Float[Array, ""], azimuth: Float[Array, ""]) -> Float[Array, "3"]:
+    """Unit vector of the beam. Compiled, for it is asked for often."""
+    zenith, azimuth = jnp.deg2rad(zenith), jnp.deg2rad(azimuth)
+    across = jnp.sin(zenith)
+    return jnp.stack([across * jnp.sin(azimuth), across * jnp.cos(azimuth), -jnp.cos(zenith)])
+
+
+@jax.jit
+def _slant(altitude: Float[Array, ""], zenith: Float[Array, ""]) -> Float[Array, ""]:
+    return altitude / jnp.cos(jnp.deg2rad(zenith))
 
 
 @final
@@ -142,14 +156,12 @@ class Lidar(eqx.Module):
     @property
     def direction(self) -> Float[Array, " 3"]:
         """Unit vector (3,) in which the beam travels."""
-        zenith, azimuth = jnp.deg2rad(self.zenith), jnp.deg2rad(self.azimuth)
-        across = jnp.sin(zenith)
-        return jnp.stack([across * jnp.sin(azimuth), across * jnp.cos(azimuth), -jnp.cos(zenith)])
+        return _towards(self.zenith, self.azimuth)
 
     @property
     def range_to_reference(self) -> Float[Array, ""]:
         """Slant range in m: distance along the beam axis from the sensor to the reference plane."""
-        return self.altitude / jnp.cos(jnp.deg2rad(self.zenith))
+        return _slant(self.altitude, self.zenith)
 
     @property
     def sensor(self) -> Float[Array, " 3"]:

@@ -234,6 +234,7 @@ def plan(
     row = max(math.ceil(step / metres - 1e-6) + 1 + 2, KERNEL)
     last = SPEED_OF_LIGHT * (bins.start + bins.width * bins.count)
     bins = dataclasses.replace(bins, row=row, count=rung(bins.count, 4))
+    first_steps = geometry.first_steps(step)
     trace = TracePlan(
         materials=letters.materials,
         letters=letters.letters,
@@ -248,7 +249,7 @@ def plan(
         hotspot=scene.canopy is not None and scene.canopy.hotspot,
         vertical=known_number(lidar.zenith) == 0.0,
         upstream=geometry.upstream,
-        first_steps=rung(geometry.first_steps(step), 16),
+        first_steps=rung(first_steps, 8 if first_steps <= 128 else 16),
         march_steps=rung(geometry.march_steps(last + geometry.upstream)),
         max_step=step,
         max_flight=geometry.longest_flight(last + geometry.upstream),

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from typing import Any, final
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
@@ -96,6 +97,18 @@ class AbstractShape(eqx.Module):
         """
 
 
+@jax.jit
+def _tilted(slope: Float[Array, ""], aspect: Float[Array, ""]) -> Float[Array, "3"]:
+    """Upper unit normal. Compiled, for it is asked for often."""
+    s, a = jnp.deg2rad(slope), jnp.deg2rad(aspect)
+    return jnp.stack([jnp.sin(s) * jnp.sin(a), jnp.sin(s) * jnp.cos(a), jnp.cos(s)])
+
+
+@jax.jit
+def _above(place: Float[Array, "2"], height: Float[Array, ""]) -> Float[Array, "3"]:
+    return jnp.stack([place[0], place[1], height])
+
+
 @final
 class Plane(AbstractShape):
     """An infinite plane. `Plane.of` makes one of height, slope and aspect.
@@ -133,10 +146,8 @@ class Plane(AbstractShape):
         **Returns:** a `Plane`.
         """
         height = as_scalar(height, "height")
-        s, a = jnp.deg2rad(as_scalar(slope, "slope")), jnp.deg2rad(as_scalar(aspect, "aspect"))
-        upward = jnp.stack([jnp.sin(s) * jnp.sin(a), jnp.sin(s) * jnp.cos(a), jnp.cos(s)])
-        place = jnp.asarray(position, height.dtype)
-        return Plane(upward, jnp.stack([place[0], place[1], height]))
+        upward = _tilted(as_scalar(slope, "slope"), as_scalar(aspect, "aspect"))
+        return Plane(upward, _above(jnp.asarray(position, height.dtype), height))
 
     @property
     def lights_itself(self) -> bool:

@@ -20,6 +20,8 @@ from jaxlidar.optics.phase import AbstractPhase
 from jaxlidar.planning.ladder import rung
 from jaxlidar.scenes.canopy import Canopy
 
+# Voxels of a map that is laid out without room to spare.
+LARGE = 1 << 17
 # Steps between two checks whether any ray of the batch still moves.
 BLOCK = 16
 
@@ -120,9 +122,11 @@ def medium_of(canopy: Canopy, aim: Float[Array, "3"], leaf_factor: Scalar) -> Me
 
 
 def _room(shape: tuple[int, ...]) -> tuple[int, int, int]:
-    """Voxels along each axis for which there is room: up the ladder, in small steps where there are many."""
-    # One more than a round number of voxels needs no more room.
-    x, y, z = (n if n == 1 else rung(n + 1, 2 if n <= 32 else 8) for n in shape)
+    """Voxels along each axis for which there is room: up the ladder, where the map is not large."""
+    x, y, z = shape
+    if x * y * z <= LARGE:
+        # One more than a round number of voxels needs no more room.
+        x, y, z = (n if n == 1 else rung(n + 1, 2 if n <= 32 else 8) for n in shape)
     return x, y, z
 
 
