@@ -163,7 +163,7 @@ CHANGES = [
     ("n_photons", {"n_photons": 1024}),
     ("n_rays", {"n_rays": 128}),
     ("max_orders", {"max_orders": 3}),
-    ("plan", {"plan": other_plan()}),
+    ("plan", {"plan": other_plan(), "n_photons": None, "n_rays": None, "max_orders": None}),
 ]
 
 
