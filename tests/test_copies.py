@@ -68,7 +68,7 @@ MADE = {
     "jaxlidar.UnitWarning": jl.UnitWarning("divergence"),
     "jaxlidar.VoxelMap": VOXELS,
     "jaxlidar.Word": jl.LSystem([("A", 0.1)], [jl.Rule("A", grown)]).rewrite(1),
-    "jaxlidar.io.Case": jl.io.Case(LIDAR, SCENE, jax.random.key(0), {"rtol": 0.1}),
+    "jaxlidar.io.Case": jl.io.Case(LIDAR, SCENE, jax.random.PRNGKey(0), {"rtol": 0.1}),
     "inversion.LogNormal": inversion.LogNormal(0.3, 0.5),
     "inversion.Progress": inversion.Progress(1, 2, 1),
     "inversion.Step": inversion.Step(1, 2.0, True, {"a": np.ones(2)}),
