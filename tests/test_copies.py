@@ -68,7 +68,7 @@ MADE = {
     "jaxlidar.UnitWarning": jl.UnitWarning("divergence"),
     "jaxlidar.VoxelMap": VOXELS,
     "jaxlidar.Word": jl.LSystem([("A", 0.1)], [jl.Rule("A", grown)]).rewrite(1),
-    "jaxlidar.io.Case": jl.io.Case(LIDAR, SCENE, jax.random.PRNGKey(0), {"rtol": 0.1}),
+    "jaxlidar.io.Case": jl.io.Case(LIDAR, SCENE, jax.random.key(0), {"rtol": 0.1}),
     "inversion.LogNormal": inversion.LogNormal(0.3, 0.5),
     "inversion.Progress": inversion.Progress(1, 2, 1),
     "inversion.Step": inversion.Step(1, 2.0, True, {"a": np.ones(2)}),
@@ -154,3 +154,18 @@ def test_what_is_traced_shows_no_figure(fit):
     dynamic, static = eqx.partition(fit.waveform, eqx.is_array)
     jax.make_jaxpr(lambda d: found.append(eqx.combine(d, static)._repr_html_()))(dynamic)
     assert found == [None]
+
+
+@pytest.mark.parametrize("copied", [lambda x: pickle.loads(pickle.dumps(x)), copy.copy, copy.deepcopy])
+@pytest.mark.parametrize("make", [jax.random.key, jax.random.PRNGKey, lambda n: None])
+def test_keys_of_copied_cases_draw_the_same(copied, make):
+    """Poisson numbers too, for which generators are told apart by identity; here and with other keys."""
+    key = make(3)
+    back = copied(jl.io.Case(key=key)).key
+    if key is None:
+        assert back is None
+        return
+    for again, other in ((back, key), (jax.random.split(back)[1], jax.random.split(key)[1])):
+        np.testing.assert_array_equal(
+            jax.random.poisson(again, 2.0, (9,)), jax.random.poisson(other, 2.0, (9,))
+        )

@@ -78,6 +78,14 @@ class Case:
             check_key(self.key)
         check_keys(self.arguments, _arguments(), "arguments")
 
+    def __getstate__(self) -> dict[str, Any]:
+        # A key that is pickled comes back with a generator of its own, which Poisson numbers refuse, its own
+        # and those of other keys.
+        return {**vars(self), "key": None if self.key is None else _key_table(self.key)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state, key=None if state["key"] is None else _key_of(state["key"]))
+
     def simulate(self, progress: Callable[[Progress], None] | None = None) -> Waveform:
         """The waveform of this case.
 
