@@ -26,7 +26,7 @@ from jaxlidar.trace.flight import events_of, fly, nearest, plates_ahead
 from jaxlidar.trace.footprint import across_beam
 from jaxlidar.trace.photons import THROUGH, Photons
 from jaxlidar.trace.random_numbers import Draw
-from jaxlidar.trace.setting import Setting, setting_of, unscattered
+from jaxlidar.trace.setting import Setting, setting_of, straight_transmittance, unscattered
 
 CHUNK = 512
 
@@ -190,11 +190,12 @@ def _setting(lidar: Lidar, scene: Scene, plan: Plan) -> Setting:
     canopy = setup.scene.canopy
     if canopy is not None and canopy.hotspot:
         raise ValueError("hotspot = True; admissible is False: the way back is independent of the way in")
-    if canopy is None or not canopy.is_straight:
+    transmittance = straight_transmittance(setup)
+    if transmittance is None:
         return setting_of(setup)
-    if lidar.wavelength.size > 1:
-        raise ValueError(f"wavelength has {lidar.wavelength.size} values; 1 if transmission is straight")
-    return setting_of(setup, canopy.leaf_optics(lidar.wavelength)[1][0])
+    if transmittance.size > 1:
+        raise ValueError(f"wavelength has {transmittance.size} values; 1 if transmission is straight")
+    return setting_of(setup).thinned(transmittance[0])
 
 
 def _start(setting: Setting, size: int, key: PRNGKeyArray) -> Photons:

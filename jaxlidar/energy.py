@@ -25,7 +25,7 @@ from jaxlidar.scenes.scene import Scene, check_kinds
 from jaxlidar.simulate import Progress
 from jaxlidar.trace.colouring import optics_of
 from jaxlidar.trace.fates import Fates, follow, from_beam, from_the_sky
-from jaxlidar.trace.setting import setting_of
+from jaxlidar.trace.setting import setting_of, straight_transmittance
 
 # Photons of a batch.
 BATCH = 8192
@@ -186,15 +186,14 @@ def _endless(setup: Setup) -> Setup:
 
 def _trace(setup: Setup, key: PRNGKeyArray, parallel: bool, max_orders: int) -> Fates:
     source = from_the_sky if parallel else from_beam
-    optics, canopy = optics_of(setup), setup.scene.canopy
-    if canopy is None or not canopy.is_straight:
-        return follow(setting_of(setup), optics, key, BATCH, source, max_orders)
+    optics, setting, transmittance = optics_of(setup), setting_of(setup), straight_transmittance(setup)
+    if transmittance is None:
+        return follow(setting, optics, key, BATCH, source, max_orders)
     # Where leaves transmit straight on, every wavelength has an extinction of its own.
-    _, transmittance = canopy.leaf_optics(setup.lidar.wavelength)
 
     def one(given: tuple[Array, Array]) -> Fates:
         t, own = given
-        return follow(setting_of(setup, t), own[:, None], key, BATCH, source, max_orders)
+        return follow(setting.thinned(t), own[:, None], key, BATCH, source, max_orders)
 
     each = jax.lax.map(one, (transmittance, optics.T))
     absorbed = jnp.moveaxis(each.absorbed[..., 0], 0, 1)

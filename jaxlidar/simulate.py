@@ -24,8 +24,8 @@ from jaxlidar.planning.plan_check import check_plan
 from jaxlidar.planning.setup import Setup, reduce
 from jaxlidar.scenes.scene import Scene, check_kinds
 from jaxlidar.trace.colouring import Balance, Recording, balance, recording_of, recording_with_room, total
-from jaxlidar.trace.response import Response, trace_settings
-from jaxlidar.trace.setting import Setting, settings_of
+from jaxlidar.trace.response import Response, trace_setting
+from jaxlidar.trace.setting import Setting, setting_of, straight_transmittance
 from jaxlidar.waveform import Waveform, open_at_first_return, recorded, trimmed
 
 # Photons of one batch at most: a batch cannot be interrupted.
@@ -146,7 +146,7 @@ def simulate(
     goal = _goal(rtol, atol, n_photons, max_seconds)
     given = plan
     plan = _planned(lidar, scene, given, goal, planning)
-    ready = _prepared(reduce(lidar, scene, plan))
+    ready = _prepared(reduce(lidar, scene, plan), key)
     traced = _trace_until(ready, key, goal, progress)
     spent = traced.info.get("seconds", 0.0)
     if given is None and traced.beyond > 0 and plan.orders < plan.limits.most_orders and spent < max_seconds:
@@ -154,26 +154,25 @@ def simulate(
         planning["max_orders"] = plan.limits.most_orders
         plan = _planned(lidar, scene, None, goal, planning)
         plan = dataclasses.replace(plan, limits=plan.limits._replace(automatic_orders=True))
-        ready = _prepared(reduce(lidar, scene, plan))
+        ready = _prepared(reduce(lidar, scene, plan), key)
         traced = _trace_until(ready, key, goal._replace(max_seconds=max_seconds - spent), progress)
     return _recorded(ready, traced)
 
 
 class _Ready(NamedTuple):
-    """A setup as the compiled programs take it. `several`: whether there is a setting for each wavelength."""
+    """A setup as the compiled programs take it. `transmittance`: see `straight_transmittance`."""
 
     setup: Setup
-    settings: Setting
-    several: bool
+    setting: Setting
+    transmittance: Array | None
     recording: Recording
 
 
-def _prepared(setup: Setup) -> _Ready:
-    settings, several = settings_of(setup)
-    if any(is_traced(x) for x in jax.tree.leaves(setup)):
-        return _Ready(setup, settings, several, recording_of(setup))
-    recording = recording_of(setup) if several else recording_with_room(setup)
-    return _Ready(setup, settings, several, recording)
+def _prepared(setup: Setup, key: PRNGKeyArray) -> _Ready:
+    transmittance = straight_transmittance(setup)
+    exact = transmittance is not None or any(is_traced(x) for x in jax.tree.leaves((setup, key)))
+    recording = recording_of(setup) if exact else recording_with_room(setup)
+    return _Ready(setup, setting_of(setup), transmittance, recording)
 
 
 class _Goal(NamedTuple):
@@ -226,20 +225,12 @@ class _Traced(NamedTuple):
     beyond: float = 0.0
 
 
-def _one_batch(setup: Setup, key: PRNGKeyArray) -> Waveform:
-    """The waveform of a single batch, without standard errors, by the programs that `simulate` compiles."""
-    ready = _prepared(setup)
-    program = _compiled_batch if setup.plan.is_random else _compiled_trace
-    wave = _compiled_waveform(program(ready.settings, ready.several, key), ready.recording)
-    return trimmed(wave, setup.lidar.wavelength.size, setup.plan.n_samples)
-
-
 def _trace_until(
     ready: _Ready, key: PRNGKeyArray, goal: _Goal, progress: Callable[[Progress], None] | None
 ) -> _Traced:
     if not ready.setup.plan.is_random:
         started = time.perf_counter()
-        response = jax.block_until_ready(_compiled_trace(ready.settings, ready.several, key))
+        response = jax.block_until_ready(_compiled_trace(ready.setting, ready.transmittance, key))
         info = {"photons": 0, "batches": 1, "error": 0.0, "stopped": "nothing is random"}
         return _Traced(response, None, None, {**info, "seconds": time.perf_counter() - started})
     if any(is_traced(x) for x in jax.tree.leaves((ready.setup, key))):
@@ -290,8 +281,8 @@ def _results(response: Response, recording: Recording) -> tuple[Float[Array, "wa
     return total(response, recording), balance(response, recording)
 
 
-_compiled_trace = Program(trace_settings)
-_compiled_batch = Program(trace_settings, **ONE_CORE)
+_compiled_trace = Program(trace_setting)
+_compiled_batch = Program(trace_setting, **ONE_CORE)
 _compiled_results = Program(_results, **ONE_CORE)
 _compiled_waveform = Program(recorded)
 
@@ -300,7 +291,7 @@ def _trace_within(ready: _Ready, key: PRNGKeyArray) -> _Traced:
     """A fixed number of batches, within a JAX transformation."""
 
     def batch(key: PRNGKeyArray) -> tuple[Response, Array, Balance]:
-        response = trace_settings(ready.settings, ready.several, key)
+        response = trace_setting(ready.setting, ready.transmittance, key)
         return response, *_results(response, ready.recording)
 
     responses, totals, balances = jax.lax.map(batch, jax.random.split(key, MIN_BATCHES))
@@ -327,7 +318,7 @@ def _trace_batches(
     wanted, stopped, error = MIN_BATCHES, "tolerance met", math.inf
 
     def one(n: int) -> tuple[Response, Array, Balance]:
-        response = _compiled_batch(ready.settings, ready.several, jax.random.fold_in(key, n))
+        response = _compiled_batch(ready.setting, ready.transmittance, jax.random.fold_in(key, n))
         return response, *_compiled_results(response, ready.recording)
 
     with side_by_side() as run:

@@ -41,7 +41,7 @@ def chord(periodic):
         voxels = jl.VoxelMap.from_extinction(leaf=k, voxel_size=1.0)
         leaf = jl.LeafOptics(reflectance=0.5, transmittance=0.3)
         canopy = jl.Canopy(voxels, leaf=leaf, sides="periodic" if periodic else "open")
-        medium = medium_of(canopy, jnp.zeros(3), jnp.ones(()))
+        medium = medium_of(canopy, jnp.zeros(3))
         x, w = (tuple(p[n][None] for n in names) for names in ("xyz", "uvw"))
         none, active = jnp.zeros((0, 1)), jnp.ones((1,), bool)
         return free_flight(medium, x, w, none, p["limit"][None], active, 512).total

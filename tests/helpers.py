@@ -5,11 +5,12 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, PRNGKeyArray
 
 import jaxlidar as jl
 from jaxlidar.extend import side_by_side
-from jaxlidar.simulate import _one_batch
+from jaxlidar.simulate import _compiled_batch, _compiled_trace, _compiled_waveform, _prepared
+from jaxlidar.waveform import trimmed
 
 # One sample of 1000 ns centred on 400 ns takes in everything that arrives from -100 to 900 ns.
 WHOLE = {"window": (400.0, 401.0), "bin_width": 2.0}
@@ -51,10 +52,18 @@ def agrees(value: Any, stderr: Any, expected: Any, *, bound: Any = 0.0, sigmas: 
     return bool(np.all(off <= margin) and np.all(off >= -margin - np.asarray(bound, float)))
 
 
+def one_batch(setup: jl.Setup, key: PRNGKeyArray) -> jl.Waveform:
+    """The waveform of a single batch, by the programs that `simulate` compiles."""
+    ready = _prepared(setup, key)
+    program = _compiled_batch if setup.plan.is_random else _compiled_trace
+    wave = _compiled_waveform(program(ready.setting, ready.transmittance, key), ready.recording)
+    return trimmed(wave, setup.lidar.wavelength.size, setup.plan.n_samples)
+
+
 def first_wave(lidar: jl.Lidar, scene: jl.Scene, plan: jl.Plan) -> jl.Waveform:
     """One trace, for what is not random."""
     assert not plan.is_random
-    return _one_batch(jl.reduce(lidar, scene, plan), jax.random.key(0))
+    return one_batch(jl.reduce(lidar, scene, plan), jax.random.key(0))
 
 
 def batch_mean(
@@ -69,7 +78,7 @@ def batch_mean(
     """Mean and standard error, over batches, of any quantity of a waveform (an array or a tree)."""
     setup = jl.reduce(lidar, scene, plan)
     with side_by_side() as run:
-        waves = run(lambda key: _one_batch(setup, key), jax.random.split(jax.random.key(seed), count))
+        waves = run(lambda key: one_batch(setup, key), jax.random.split(jax.random.key(seed), count))
         found = [quantity(jax.tree.map(np.asarray, wave)) for wave in waves]
 
     def gather(*each: Array) -> np.ndarray:

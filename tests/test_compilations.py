@@ -106,3 +106,19 @@ def test_the_ladder(steps):
     assert np.all(np.diff(rungs) >= 0)
     assert np.all([rung(int(n), steps) == n for n in rungs])
     assert len(np.unique(rungs)) <= 12 * steps + 2
+
+
+def test_keys_can_be_mapped_over():
+    """The sizes of what JAX transforms are those of the plan, with a known scene too."""
+    scene = jl.Scene(plates=(jl.Plate(5.0, 0.3, 0.3),), ground=jl.Ground())
+    plan = jl.plan(jl.Lidar(), scene, max_orders=2)
+    keys = jax.random.split(KEY, 2)
+
+    def wave(key):
+        return jl.simulate(jl.Lidar(), scene, key=key, plan=plan, n_photons=800)
+
+    waves = jax.jit(jax.vmap(wave))(keys)
+    assert waves.reflectance.shape == (2, 1, plan.n_samples)
+    # The first order is the same for all keys.
+    first = wave(keys[0]).components["first"]
+    np.testing.assert_allclose(waves.components["first"][1], first, rtol=0, atol=1e-6 * float(first.max()))

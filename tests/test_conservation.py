@@ -10,9 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import one_batch
 
 import jaxlidar as jl
-from jaxlidar.simulate import _one_batch
 
 RANDOM = np.random.default_rng(2)
 LEAF, BARK = RANDOM.uniform(0, 1, (4, 4, 6)), RANDOM.uniform(0, 0.2, (4, 4, 6))
@@ -80,5 +80,5 @@ def test_small_deposits_on_large_sums():
     plan = jl.plan(lidar, what, max_orders=3, n_photons=300_000, n_rays=512)
     key = jax.random.key(0)
     setup = jl.reduce(lidar, what, plan)
-    wave = _one_batch(setup, key)
+    wave = one_batch(setup, key)
     np.testing.assert_allclose(sum(wave.ledger.values()), 1.0, atol=2e-4)

@@ -10,11 +10,10 @@ import pytest
 from hard_answers import value_and_slope
 from hard_cases import CASES, KNOWN_FAILURES
 from hard_families import FAMILIES
-from helpers import WHOLE, first_wave, whole_lidar
+from helpers import WHOLE, first_wave, one_batch, whole_lidar
 
 import inversion
 import jaxlidar as jl
-from jaxlidar.simulate import _one_batch
 
 KEY = jax.random.key(24)
 
@@ -150,7 +149,7 @@ def test_a_batch_of_ten_million_photons():
     lidar, scene = whole_lidar(), over_ground(jl.LeafOptics(reflectance=0.0, transmittance=0.0))
     plan = jl.plan(lidar, scene, max_orders=2, n_photons=10_000_000, n_rays=64, **WHOLE)
     setup = jl.reduce(lidar, scene, plan)
-    wave = _one_batch(setup, KEY)
+    wave = one_batch(setup, KEY)
     np.testing.assert_allclose(sum(wave.ledger.values()), 1.0, atol=2e-4)
     # A slab of optical depth 0.9; ground of reflectance 0.4.
     passed = np.exp(-0.9)

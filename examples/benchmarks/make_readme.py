@@ -83,7 +83,7 @@ def changes(record: dict) -> str:
     return page_of(
         "Seconds of a call of `simulate` with three wavelengths after one thing was changed, and of the same "
         "call again. Sizes go up a short ladder, and numbers are arguments of compiled programs: most "
-        "changes compile nothing of the trace (`trace_settings`).",
+        "changes compile nothing of the trace (`trace_setting`).",
         table(["change", "s", "s, again", "compiled, beside single operations"], rows),
     )
 

@@ -20,18 +20,19 @@ def machine_memory() -> float:
 
 
 def predicted(
-    trace: TracePlan, bins: Bins, degree: int, first_degree: int, samples: int, pulse: int
+    trace: TracePlan, bins: Bins, degree: int, first_degree: int, samples: int, pulse: int, traces: int
 ) -> float:
     """Bytes of the responses of all batches that run at once, their sum, and the pulse.
 
     **Arguments:** `degree`, `first_degree`: of histories. - `samples`: of the record. - `pulse`: fine bins
-    that the pulse spans.
+    that the pulse spans. - `traces`: of a response; one for each wavelength where leaves transmit straight
+    on.
     """
     item = jnp.zeros(()).dtype.itemsize
     letters, materials = len(trace.letters), len(trace.materials)
     full = math.comb(degree + letters, letters) if trace.order_steps > 1 or trace.drawn_first else 0
     short = math.comb(first_degree + letters, letters)
-    response = item * materials * (full + short) * bins.padded
+    response = item * traces * materials * (full + short) * bins.padded
     matrix = item * min(bins.count * samples, max(DENSE, pulse))
     return response * (_COPIES * (os.cpu_count() or 1) + 2) + 2 * matrix
 

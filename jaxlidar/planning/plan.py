@@ -266,9 +266,13 @@ def plan(
     reach = lidar.pulse.support(known_number(lidar.jitter))
     spanned = math.ceil((reach[1] - reach[0] + samples[1]) / bins.width) + 5
     limit = memory_limit(max_memory)
+    straight = scene.canopy is not None and scene.canopy.is_straight
+    traces = lidar.wavelength.size if straight else 1
 
     def memory_of(orders: int) -> float:
-        return predicted(trace, bins, degree_of(steps_of(orders), plates), first_degree, samples[2], spanned)
+        return predicted(
+            trace, bins, degree_of(steps_of(orders), plates), first_degree, samples[2], spanned, traces
+        )
 
     memory = memory_of(orders)
     check_memory(memory, limit)

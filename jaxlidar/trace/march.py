@@ -8,6 +8,8 @@ Values that several results of a step share are held by `lax.optimization_barrie
 otherwise compute them again for each result.
 """
 
+import dataclasses
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -84,31 +86,38 @@ class Medium(eqx.Module):
             return self.leaf_at(cell, w)
         return self.leaf_at(cell, w) + self.bark_at(cell)
 
+    def thinned(self, share: Float[Array, ""]) -> "Medium":
+        """The medium with a share of the leaf's extinction."""
+        leaf = None if self.leaf is None else self.leaf * share
+        total = None if self.total is None else _together(leaf, self.bark)
+        return dataclasses.replace(self, leaf=leaf, total=total)
+
+
+def _together(leaf: Array | None, bark: Array | None) -> Array | None:
+    return leaf if bark is None else (bark if leaf is None else leaf + bark)
+
 
 def _pick(table: Float[Array, "cells"], cell: Int[Array, "*s"]) -> Scalar:
     return table.at[cell].get(mode="promise_in_bounds")
 
 
-def medium_of(canopy: Canopy, aim: Float[Array, "3"], leaf_factor: Scalar) -> Medium:
-    """The medium of a canopy; `leaf_factor` scales leaf extinction (1 - T where transmission is straight)."""
+def medium_of(canopy: Canopy, aim: Float[Array, "3"]) -> Medium:
+    """The medium of a canopy."""
     voxels = canopy.voxels
     shape = _room(voxels.shape)
 
     def laid_out(table: Float[Array, "nx ny nz"]) -> Float[Array, "cells"]:
         return jnp.pad(table, [(0, room - n) for room, n in zip(shape, voxels.shape)]).reshape(-1)
 
-    leaf = None if voxels.leaf is None else laid_out(voxels.leaf) * leaf_factor
+    leaf = None if voxels.leaf is None else laid_out(voxels.leaf)
     bark = None if voxels.bark is None else laid_out(voxels.bark)
     angles = None
     if voxels.leaf_angles is not None and leaf is not None:
         angles = AngleTables(*voxels.leaf_angles.tables())
-    total = None
-    if angles is None:
-        total = leaf if bark is None else (bark if leaf is None else leaf + bark)
     return Medium(
         leaf=leaf,
         bark=bark,
-        total=total,
+        total=_together(leaf, bark) if angles is None else None,
         size=voxels.voxel_size,
         origin=jnp.asarray(voxels.origin) - aim,
         angles=angles,

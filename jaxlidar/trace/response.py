@@ -19,7 +19,7 @@ from jaxlidar.trace.first_order import FirstOrder, first_order
 from jaxlidar.trace.footprint import lattice, product_rule, scattered
 from jaxlidar.trace.higher_orders import higher_orders
 from jaxlidar.trace.mirror import mirror_rays
-from jaxlidar.trace.setting import Setting, settings_of
+from jaxlidar.trace.setting import Setting, setting_of, straight_transmittance
 
 
 @final
@@ -91,14 +91,16 @@ def trace_scene(setup: Setup, key: PRNGKeyArray) -> Response:
     """
     check_kind("setup", setup, Setup, "a Setup, as in reduce(lidar, scene, plan)")
     check_key(key)
-    return trace_settings(*settings_of(setup), key)
+    return trace_setting(setting_of(setup), straight_transmittance(setup), key)
 
 
-def trace_settings(settings: Setting, several: bool, key: PRNGKeyArray) -> Response:
-    """The response of one batch. `several`: whether there is a setting for each wavelength."""
-    if not several:
-        return _trace(settings, key)
-    each = jax.lax.map(lambda setting: _trace(setting, key), settings)
+def trace_setting(
+    setting: Setting, transmittance: Float[Array, "wavelengths"] | None, key: PRNGKeyArray
+) -> Response:
+    """The response of one batch. `transmittance`: see `straight_transmittance`."""
+    if transmittance is None:
+        return _trace(setting, key)
+    each = jax.lax.map(lambda t: _trace(setting.thinned(t), key), transmittance)
     return jax.tree.map(lambda a: a[:, 0], each)
 
 

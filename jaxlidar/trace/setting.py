@@ -1,5 +1,6 @@
 """The scene as the tracer sees it: beam, voxels, surfaces and laws, relative to the aim point."""
 
+import dataclasses
 from typing import NamedTuple
 
 import equinox as eqx
@@ -95,6 +96,13 @@ class Setting(eqx.Module):
         """Histories of all orders."""
         return histories(len(self.plan.letters), self.sizes.degree)
 
+    def thinned(self, transmittance: Float[Array, ""]) -> "Setting":
+        """The setting where leaves transmit so much straight on: as if there were fewer."""
+        assert self.medium is not None
+        medium = self.medium.thinned(1.0 - transmittance)
+        column = None if self.column is None else columns(medium)
+        return dataclasses.replace(self, medium=medium, column=column)
+
     def budget(self, p: Photons) -> Float[Array, "photons"]:
         """How far photons may fly, m, so that their light can still be recorded."""
         return jnp.minimum(self.beam.budget(p.x, p.w, self.plan.last - p.path), self.plan.max_flight)
@@ -122,16 +130,21 @@ def _density(law: AbstractLaw | AbstractPhase, sent: Scattering, w: Vec) -> Scal
     return law.density(sent.incident, sent.normal, w)
 
 
-def setting_of(setup: Setup, leaf_transmittance: Float[Array, ""] | float = 0.0) -> Setting:
-    """The setting of a setup.
+def setting_of(setup: Setup) -> Setting:
+    """The setting of a setup, without wavelengths."""
+    trace, bins = jax.tree.map(jnp.asarray, (setup.plan.trace, setup.plan.bins))
+    return _set_out(_without_spectrum(setup.lidar), setup.scene, trace, bins, sizes_of(setup.plan))
 
-    `leaf_transmittance` matters only where the canopy's transmission is straight: extinction is then scaled
-    by one minus it.
+
+def straight_transmittance(setup: Setup) -> Float[Array, "wavelengths"] | None:
+    """What leaves transmit straight on, at every wavelength; None where they do not.
+
+    Extinction then depends on the wavelength.
     """
-    plan = setup.plan
-    trace, bins = jax.tree.map(jnp.asarray, (plan.trace, plan.bins))
-    factor = jnp.asarray(1.0 - leaf_transmittance)
-    return _set_out(_without_spectrum(setup.lidar), setup.scene, trace, bins, factor, sizes_of(plan))
+    canopy = setup.scene.canopy
+    if canopy is None or not canopy.is_straight:
+        return None
+    return canopy.leaf_optics(setup.lidar.wavelength)[1]
 
 
 def _without_spectrum(lidar: Lidar) -> Lidar:
@@ -140,21 +153,11 @@ def _without_spectrum(lidar: Lidar) -> Lidar:
     return eqx.tree_at(lambda v: (v.wavelength, v.energy, v.efficiency), lidar, (one, one, one))
 
 
-def settings_of(setup: Setup) -> tuple[Setting, bool]:
-    """The setting of a setup, and whether it has a leading axis: one setting for each wavelength."""
-    canopy = setup.scene.canopy
-    if canopy is None or not canopy.is_straight:
-        return setting_of(setup), False
-    _, transmittance = canopy.leaf_optics(setup.lidar.wavelength)
-    return eqx.filter_vmap(lambda t: setting_of(setup, t))(transmittance), True
-
-
 def _arrange(
     lidar: Lidar,
     scene: Scene,
     plan: TracePlan,
     bins: Bins,
-    factor: Float[Array, ""],
     sizes: Sizes,
 ) -> Setting:
     aim = jnp.concatenate([lidar.position, jnp.zeros_like(lidar.position[:1])])
@@ -168,7 +171,7 @@ def _arrange(
 
     medium, leaf_law, bark_law = None, COSINE_LAW, COSINE_LAW
     if scene.canopy is not None:
-        medium = medium_of(scene.canopy, aim, factor if scene.canopy.is_straight else jnp.ones_like(factor))
+        medium = medium_of(scene.canopy, aim)
         leaf_law, bark_law = number(medium.leaf_phase), number(medium.bark_phase)
     surfaces = surfaces_of(scene, aim)
     surface_laws = tuple(number(s.law) for s in surfaces)
@@ -177,7 +180,7 @@ def _arrange(
         medium=medium,
         surfaces=surfaces,
         laws=tuple(laws),
-        column=columns(medium) if medium is not None and plan.vertical else None,
+        column=None if medium is None or not plan.vertical else columns(medium),
         occupied=None if medium is None else occupied(medium),
         successor=jnp.asarray(histories(len(plan.letters), sizes.degree).successor),
         plan=plan,
