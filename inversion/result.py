@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+from collections.abc import Mapping
 from typing import final
 
 import equinox as eqx
@@ -32,7 +33,7 @@ class Step:
     number: int
     reduced_chi2: float
     accepted: bool
-    values: dict[str, np.ndarray]
+    values: Mapping[str, np.ndarray | float]
 
     def __str__(self) -> str:
         values = ", ".join(f"{name} = {_short(value)}" for name, value in self.values.items())
@@ -116,5 +117,5 @@ class Retrieval(eqx.Module):
         return fit_html(str(self), self.waveform, self.residuals)
 
 
-def _short(value: np.ndarray) -> str:
+def _short(value: np.ndarray | float) -> str:
     return np.array2string(np.asarray(value), precision=4, threshold=8, edgeitems=3)
