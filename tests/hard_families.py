@@ -337,9 +337,7 @@ FAMILIES = {
     "one voxel of 1 mm": one_voxel_family(1e-3, 1000.0),
     "one voxel of 1 km": one_voxel_family(1e3, 20000.0),
     "crown": Family(CROWN, crown, answers.crown, (1e-5, 1e-9), (1e-4, 1e-9), slow=BOTH),
-    "40 orders": Family(
-        MANY_ORDERS, many_orders, answers.many_orders, (1e-5, 1e-9), (1e-4, 1e-9), slow=DOUBLE
-    ),
+    "40 orders": Family(MANY_ORDERS, many_orders, answers.many_orders, (1e-5, 1e-9), (1e-4, 1e-9), slow=BOTH),
     # The second and third terms of the series are from photons.
     "plate": Family(
         PLATE,

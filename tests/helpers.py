@@ -1,16 +1,32 @@
 """Shared by the tests: slabs, lidars that record a whole waveform as one sample, batches and z-tests."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import jax
 import numpy as np
+import pytest
 from jaxtyping import Array, PRNGKeyArray
 
 import jaxlidar as jl
 from jaxlidar.extend import side_by_side
 from jaxlidar.simulate import _compiled_batch, _compiled_trace, _compiled_waveform, _prepared
 from jaxlidar.waveform import trimmed
+
+
+def slow_unless(chosen: Iterable, names: Iterable) -> list:
+    """Parameters of a test, tuples of several, of which those that are not chosen are left to `-m slow`."""
+    chosen = list(chosen)
+
+    def one(x: Any) -> Any:
+        values = x if isinstance(x, tuple) else (x,)
+        return pytest.param(*values, marks=() if x in chosen else pytest.mark.slow)
+
+    return [one(x) for x in names]
+
+
+# Double precision is left to `-m slow`.
+NARROW = pytest.mark.parametrize("precision", slow_unless(["float32"], ["float32", "float64"]), indirect=True)
 
 # One sample of 1000 ns centred on 400 ns takes in everything that arrives from -100 to 900 ns.
 WHOLE = {"window": (400.0, 401.0), "bin_width": 2.0}

@@ -5,7 +5,7 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import WHOLE, agrees, batch_mean, slab, whole_lidar
+from helpers import WHOLE, agrees, batch_mean, slab, slow_unless, whole_lidar
 
 import jaxlidar as jl
 from jaxlidar.planning.alternatives import with_alternatives
@@ -46,9 +46,7 @@ CHOICES = {
 }
 
 
-@pytest.mark.parametrize(
-    "case", [pytest.param(c, marks=pytest.mark.slow if c == "seven ends, drawn" else ()) for c in CHOICES]
-)
+@pytest.mark.parametrize("case", slow_unless([], CHOICES))
 def test_the_same_is_estimated(case):
     choice, scene, orders = CHOICES[case]
     a, one = mean_of(scene, orders, 1)
@@ -63,7 +61,7 @@ def second(wave):
     return wave.components["higher"].sum(axis=1)
 
 
-@pytest.mark.parametrize("transmission", ["diffuse", "straight"])
+@pytest.mark.parametrize("transmission", slow_unless(["straight"], ["diffuse", "straight"]))
 def test_what_one_plate_scatters_down_returns_from_the_next(transmission):
     """Two paths, there and back: scattered by the upper plate, reflected by the lower, through a gap."""
     upper = jl.Plate(height=6.0, reflectance=0.0, transmittance=0.5, coverage=0.5, transmission="diffuse")
@@ -79,6 +77,7 @@ def test_what_one_plate_scatters_down_returns_from_the_next(transmission):
     assert not agrees(mean, stderr, one_way * (1 + plan.trace.lobe))
 
 
+@pytest.mark.slow
 def test_what_is_expected_varies_less_than_what_is_drawn():
     _, expected = mean_of(SCENE, 1, 1)
     _, drawn = mean_of(SCENE, 1, 1, first_order="drawn")
@@ -106,7 +105,7 @@ def test_moments_of_kernels(kernel, kept):
         assert (np.ptp(moment) < 1e-4) == (n <= kept)
 
 
-@pytest.mark.parametrize("kernel", [1, 2])
+@pytest.mark.parametrize("kernel", slow_unless([2], [1, 2]))
 def test_plain_kernels_sum_to_the_same(kernel):
     plan = jl.plan(LIDAR, SCENE, max_orders=1, footprint="fixed", n_rays=256)
     plans = [with_alternatives(plan, kernel=k) for k in (3, kernel)]

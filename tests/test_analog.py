@@ -3,7 +3,7 @@
 import jax
 import numpy as np
 import pytest
-from helpers import agrees, slab
+from helpers import agrees, slab, slow_unless
 
 import jaxlidar as jl
 
@@ -21,7 +21,7 @@ def total(lidar, scene, photons, *, seed=0, cone=CONE, **planned):
     return weight.mean(axis=1), weight.std(axis=1, ddof=1) / np.sqrt(photons)
 
 
-@pytest.mark.parametrize("angles", [pytest.param("planophile", marks=pytest.mark.slow), "erectophile"])
+@pytest.mark.parametrize("angles", slow_unless([], ["planophile", "erectophile"]))
 def test_leaves_of_given_angles_agree_with_simulate(angles):
     voxels = jl.VoxelMap.from_lad(
         np.full((1, 1, 4), 0.2), voxel_size=(50, 50, 2.5), origin=(-25, -25, 0), leaf_angles=angles
@@ -49,6 +49,7 @@ def test_returns_arrive_when_light_does():
     assert np.allclose(np.asarray(returns.time)[there], 2 * 3.0 / 0.299792458, atol=0.01)
 
 
+@pytest.mark.slow
 def test_a_plate_over_ground_agrees_with_simulate():
     lidar = jl.Lidar(wavelength=(532.0, 1064.0))
     plate = jl.Plate(height=2.0, reflectance=[0.36, 0.66], transmittance=[0.08, 0.30])
@@ -61,7 +62,7 @@ def test_a_plate_over_ground_agrees_with_simulate():
     assert not agrees(value, stderr, [0.36, 0.66])
 
 
-@pytest.mark.parametrize("transmission", ["diffuse", "straight"])
+@pytest.mark.parametrize("transmission", slow_unless([], ["diffuse", "straight"]))
 def test_a_slab_agrees_with_simulate(transmission):
     leaf = jl.LeafOptics(reflectance=0.45, transmittance=0.35)
     canopy = jl.Canopy(slab(leaf=1.0), leaf=leaf, transmission=transmission, sides="periodic")

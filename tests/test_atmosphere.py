@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import NARROW
 
 from jaxlidar.scenes.atmosphere import Atmosphere, aerosol_extinction, rayleigh_optical_depth
 
@@ -143,6 +144,7 @@ def test_backscatter_value():
     assert float(air.backscatter(532.0, 100.0, 100.0)) == pytest.approx(expected, rel=1e-5)
 
 
+@NARROW
 def test_derivatives(precision):
     air = Atmosphere(visibility=15.0, lidar_ratio=50.0, base_height=200.0)
     heights = jnp.linspace(0.0, 30.0, 4)

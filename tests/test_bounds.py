@@ -3,7 +3,7 @@
 import jax
 import numpy as np
 import pytest
-from helpers import batch_mean, first_wave, slab
+from helpers import batch_mean, first_wave, slab, slow_unless
 
 import jaxlidar as jl
 
@@ -132,10 +132,6 @@ DEFAULT = (
     "plate before a slope that faces the beam",
     "mirror",
 )
-
-
-def slow_unless(chosen, names):
-    return [pytest.param(n, marks=() if n in chosen else pytest.mark.slow) for n in names]
 
 
 def change(with_, without_, measure):

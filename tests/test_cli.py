@@ -279,6 +279,7 @@ def test_interrupts_and_failures_to_write_leave_no_traceback(monkeypatch, capsys
     assert capsys.readouterr().err.strip().count("\n") == 0
 
 
+@pytest.mark.slow
 def test_demo_retrieves_the_truth_and_writes_figures(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(inversion.demo, "FIT_PHOTONS", 4096)
     monkeypatch.setattr(inversion.demo, "FIT_RAYS", 1024)

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import one_batch
+from helpers import one_batch, slow_unless
 
 import jaxlidar as jl
 
@@ -46,12 +46,7 @@ CASES = {
 }
 
 
-LONG = ("planophile leaves", "no ground")
-
-
-@pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=pytest.mark.slow if n in LONG else ()) for n in CASES]
-)
+@pytest.mark.parametrize("name", slow_unless(["absorbing", "periodic, off nadir"], CASES))
 def test_shares_add_up(name):
     what, zenith = CASES[name]
     lidar = jl.Lidar(wavelength=(532.0, 1064.0), zenith=zenith, divergence=2.0)
@@ -74,6 +69,7 @@ def test_shares_of_a_single_order_add_up(name):
     assert np.allclose(sum(wave.ledger.values()), 1.0, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_small_deposits_on_large_sums():
     """Of 300,000 photons in one batch; added to a sum one by one, single precision gains or loses 0.2 %."""
     lidar, what = jl.Lidar(divergence=2.0), scene()

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import NARROW
 
 import jaxlidar as jl
 
@@ -105,23 +106,11 @@ def plan_of(lidar, scene, **changes):
     return jl.plan(lidar, scene, **(settings | changes))
 
 
-# By default the narrower precision and the gradient alone, as compiling takes long.
-FAMILY = pytest.mark.parametrize(
-    ("kind", "modes"),
-    [
-        pytest.param("float32", ("reverse",), id="float32"),
-        pytest.param("float32", ("forward", "reverse"), marks=pytest.mark.slow, id="float32 both"),
-        pytest.param("float64", ("forward", "reverse"), marks=pytest.mark.slow, id="float64 both"),
-    ],
-)
-
-
-@FAMILY
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CANOPIES)
-def test_canopies(name, kind, modes):
-    with jax.enable_x64(kind == "float64"):
-        plan = plan_of(*canopy(height=4.5, slope=80.0))
-        check(*canopy(**CANOPIES[name]), plan, modes)
+def test_canopies(name, precision):
+    plan = plan_of(*canopy(height=4.5, slope=80.0))
+    check(*canopy(**CANOPIES[name]), plan, ("forward", "reverse"))
 
 
 # Made within a test: numbers take the precision that is in use then.
@@ -140,6 +129,7 @@ GROUNDS = {
 
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("name", GROUNDS)
+@NARROW
 def test_grounds(name, law, ground_plans, precision):
     beam, ground = GROUNDS[name]
     beam = dict(beam)
@@ -164,6 +154,7 @@ def test_a_scene_with_nothing_in_it(precision):
     check(lidar, jl.Scene(), jl.plan(lidar, jl.Scene()), ("forward", "reverse"))
 
 
+@NARROW
 def test_one_voxel_and_one_sample(precision):
     """Of optical depth 1e-8, 1 and 1e4, first order: 2/3 R (1 - exp(-2 tau)) / 2."""
     lidar = jl.Lidar(pulse=jl.RectangularPulse(length=0.0), divergence=1e-3, sampling_interval=100.0)

@@ -90,6 +90,7 @@ def test_slabs_against_discrete_ordinates(shared, row):
         assert close(found[name], value, budget.stderr[name]), name
 
 
+@pytest.mark.slow
 def test_a_beam_and_its_ledger_agree():
     voxels = jl.VoxelMap.from_lad(np.full((6, 6, 8), 0.6), voxel_size=0.5, origin=(-1.5, -1.5, 2.0))
     canopy = jl.Canopy(voxels, leaf=jl.LeafOptics(reflectance=0.2, transmittance=0.1))

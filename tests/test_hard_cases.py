@@ -203,6 +203,7 @@ def test_fits_that_start_at_a_bound(reflectance, height):
         assert 0 < float(fit.stderr[name]) < 0.1
 
 
+@pytest.mark.slow
 def test_chlorophyll_is_undetermined_at_1064_nm():
     """Not given with a covariance, however large; what the waveform does tell is found beside it."""
     lidar = jl.Lidar(wavelength=1064.0, altitude=500.0, divergence=4.0)

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import WHOLE, agrees, batch_mean, slab, whole_lidar
+from helpers import WHOLE, agrees, batch_mean, slab, slow_unless, whole_lidar
 
 import jaxlidar as jl
 
@@ -111,6 +111,7 @@ def test_moving_everything_sideways_changes_nothing(plain):
     alike(moved.reflectance, wave.reflectance)
 
 
+@pytest.mark.slow
 def test_empty_voxels_around_the_crown_change_nothing(plain):
     _, wave = plain
     lidar, scene = build(empty=3)
@@ -156,7 +157,11 @@ def expectation(**changes):
     return batch_mean(far, scene, jl.plan(far, scene, **BATCHES), seed=5, quantity=sums)
 
 
-@pytest.mark.parametrize("changes", [{"turns": 1}, {"divide": 2}], ids=["quarter turn", "voxels in eight"])
+@pytest.mark.parametrize(
+    "changes",
+    slow_unless([{"turns": 1}], [{"turns": 1}, {"divide": 2}]),
+    ids=["quarter turn", "voxels in eight"],
+)
 def test_turning_and_dividing(totals, changes):
     value, stderr = expectation(**changes)
     for a, b, c, d in zip(value, totals[0], stderr, totals[1]):
@@ -165,6 +170,7 @@ def test_turning_and_dividing(totals, changes):
     assert not agrees(1.05 * value[1], np.hypot(stderr[1], totals[1][1]), totals[0][1])
 
 
+@pytest.mark.slow
 def test_within_a_transformation():
     """Compiled by the caller, for several scenes at once, and differentiated."""
     lidar = jl.Lidar(divergence=4.0)

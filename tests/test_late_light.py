@@ -83,6 +83,7 @@ def test_tolerance_is_met_only_if_the_neglected_orders_are_below_it():
     ) - 3 * float(wave.ledger_stderr["unfollowed"][0])
 
 
+@pytest.mark.slow
 def test_more_orders_are_followed_where_too_few_were_planned(monkeypatch):
     """The plan is made to expect that little is scattered again: two orders, of 6 that there is room for."""
     monkeypatch.setattr(orders, "scattered_again", lambda scene, optics: 1e-3)

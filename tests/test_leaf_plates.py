@@ -19,7 +19,7 @@ batches or more) plus the neglected orders. A sum of geometric series wrong in o
 import jax
 import numpy as np
 import pytest
-from helpers import WHOLE, agrees, whole_lidar
+from helpers import WHOLE, agrees, slow_unless, whole_lidar
 
 import jaxlidar as jl
 from jaxlidar import SPEED_OF_LIGHT
@@ -62,9 +62,8 @@ def all_orders(coverage=1.0, denominator=None, passing=None):
     return coverage * R + passing**2 * RHO / denominator
 
 
-@pytest.mark.parametrize(
-    ("transmission", "coverage"), [("straight", 0.6), ("diffuse", 1.0), ("diffuse", 0.6)]
-)
+@pytest.mark.parametrize("transmission", ["straight", "diffuse"])
+@pytest.mark.parametrize("coverage", slow_unless([0.6], [0.6, 1.0]))
 def test_all_orders(transmission, coverage):
     wave = jl.simulate(
         whole_lidar(),
@@ -82,7 +81,7 @@ def test_all_orders(transmission, coverage):
     assert not agrees(*found, all_orders(coverage, denominator=1 - RHO * T), bound=wave.neglected[0])
 
 
-@pytest.mark.parametrize(("lower", "upper"), [(0.5, 0.4), (0.5, 0.0)])
+@pytest.mark.parametrize(("lower", "upper"), slow_unless([(0.5, 0.4)], [(0.5, 0.4), (0.5, 0.0)]))
 def test_two_plates_shade_what_lies_below(lower, upper):
     """Each passes 1 - c + c T on either way, opaque ones (T = 0) as well."""
     plates = (

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import mpmath
 import numpy as np
 import pytest
+from helpers import NARROW
 
 from jaxlidar.optics.leaf_surface import LeafSurface, leaf_surface
 from jaxlidar.optics.plate_model import plate_model, plate_model_slopes
@@ -146,6 +147,7 @@ def test_slopes_are_the_derivatives(precision):
     )
 
 
+@NARROW
 def test_reverse_equals_forward(precision):
     unit = float(np.finfo(precision).eps)
     k, N = jnp.array([0.0, 0.0, 0.1, 0.5, 50.0]), jnp.array([1.0, 2.0, 1.0, 2.3, 9.0])
@@ -188,6 +190,7 @@ def test_second_derivatives():
         np.testing.assert_allclose(second[1], [in_k[1], in_N[1]], rtol=1e-6)
 
 
+@NARROW
 def test_nothing_is_nan_or_infinite(precision):
     grid = [
         (k, N, n, a)

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import prosail
 import pytest
+from helpers import slow_unless
 from scipy.optimize import brentq
 
 from jaxlidar.optics.coefficients import TRAITS, load_coefficients, shipped
@@ -85,9 +86,7 @@ def test_between_tabulated_wavelengths_coefficients_are_interpolated():
         assert leaf(550.5)[0].shape == ()
 
 
-@pytest.mark.parametrize(
-    "version", ["D", "PC", *(pytest.param(v, marks=pytest.mark.slow) for v in ("4", "5"))]
-)
+@pytest.mark.parametrize("version", slow_unless(["D"], ["D", "PC", "4", "5"]))
 def test_every_trait_is_differentiable(version, precision):
     leaf = Prospect(N=1.7, version=version)
     slopes, reverse = (jax.jit(kind(lambda leaf: leaf(LASERS)))(leaf) for kind in (jax.jacfwd, jax.jacrev))

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
+from helpers import NARROW
 
 import inversion
 import jaxlidar as jl
@@ -80,6 +81,7 @@ def assert_recovered(fit, truth, limit=4.0):
         assert np.max(np.abs(z)) < limit, (name, fit.values[name], fit.stderr[name])
 
 
+@pytest.mark.slow
 def test_canopy_and_ground_at_three_wavelengths(target, monkeypatch):
     """Leaf traits, ground reflectance and height, leaf area; a second target of the same shape reuses all."""
     steps = []
@@ -211,6 +213,7 @@ def retrieve_ground(observed=None, unknowns=GROUND, noise=1e-3, scene=None, lida
     return inversion.retrieve(observed, lidar, scene, unknowns, noise=noise, key=jax.random.key(0), **more)
 
 
+@NARROW
 def test_errors_are_as_large_as_stated(precision):
     """Over realisations of the noise, deviations over standard errors have variance 1, chi2 has mean 1."""
     wave, rng = ground_wave(), np.random.default_rng(0)

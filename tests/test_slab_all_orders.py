@@ -14,7 +14,7 @@ import warnings
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import WHOLE, batch_mean, whole_lidar
+from helpers import WHOLE, batch_mean, slow_unless, whole_lidar
 
 import jaxlidar as jl
 
@@ -42,9 +42,7 @@ def total(tau, leaf, ground, orders, photons, seed=0):
 ORDERS = {0.1: 8, 1.0: 30, 2.0: 25, 5.0: 60, 50.0: 60}
 
 
-@pytest.mark.parametrize(
-    "tau", [0.1, 1.0, 5.0, *(pytest.param(tau, marks=pytest.mark.slow) for tau in (2.0, 50.0))]
-)
+@pytest.mark.parametrize("tau", slow_unless([1.0], [0.1, 1.0, 2.0, 5.0, 50.0]))
 def test_isotropic_scattering(shared, tau):
     with (shared / "reference" / "slabs_isotropic.csv").open() as file:
         (row,) = [r for r in csv.DictReader(file) if float(r["tau"]) == tau]

@@ -109,6 +109,7 @@ def test_surfaces_of_a_name_are_numbered():
     assert materials == ("ground", "plate 1", "disc", "plate 2")
 
 
+@pytest.mark.slow
 def test_derivative_in_the_height_of_a_disc():
     """The mean time of its echo: 2 / c per metre."""
     lidar = jl.Lidar(divergence=0.1, pulse=jl.GaussianPulse(fwhm=4.0))

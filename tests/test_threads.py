@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import slow_unless
 
 import jaxlidar as jl
 from jaxlidar._threads import side_by_side
@@ -50,7 +51,7 @@ def test_what_waits_is_dropped_after_an_error():
     assert len(begun) <= 2
 
 
-@pytest.mark.parametrize("double", [False, True])
+@pytest.mark.parametrize("double", slow_unless([True], [False, True]))
 def test_simulate_keeps_the_precision(double, monkeypatch):
     kind = "float64" if double else "float32"
     module, kinds = sys.modules["jaxlidar.simulate"], []
