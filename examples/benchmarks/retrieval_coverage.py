@@ -139,7 +139,7 @@ def main() -> dict:
         starts=given.starts,
         start=start,
         lanes=8,
-        path=given.out / f"retrieval_coverage_{n}.npz",
+        path=given.out / f"retrieval_coverage_{n}.sqlite",
         progress=lambda p: print(f"\r{p}", end="", flush=True),
         **common,
     )
