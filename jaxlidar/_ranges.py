@@ -28,7 +28,8 @@ class Range(NamedTuple):
     """An admissible range of finite numbers, with its limits or without them.
 
     `mirrored`: a traced value may also be negative, and means the same to the other side, as angles from the
-    vertical do: fits and differences pass through zero.
+    vertical do: fits and differences pass through zero. `increasing`: each number is also larger than the one
+    before; of what is known, constructors see to it.
 
     **Example:** the ranges of a module of your own.
 
@@ -50,6 +51,7 @@ class Range(NamedTuple):
     low_open: bool = False
     high_open: bool = False
     mirrored: bool = False
+    increasing: bool = False
 
 
 # A reflectance, a transmittance, a probability.
@@ -107,8 +109,9 @@ def reasons(tree: Any) -> dict[str, Bool[Array, ""]]:
 
 
 def outside(x: Any, admissible: Range) -> Bool[Array, ""]:
-    """Whether any element of `x` is not finite, or lies outside a range by more than rounding."""
-    x, (low, high, low_open, high_open, mirrored) = as_array(x), admissible
+    """Whether any element of `x` is not finite, out of order, or outside a range by more than rounding."""
+    x, (low, high, low_open, high_open, mirrored, increasing) = as_array(x), admissible
+    in_order = jnp.all(jnp.diff(x) > 0) if increasing and x.ndim else True
     x = jnp.abs(x) if mirrored else x
     slack = _ROUNDING * float(jnp.finfo(x.dtype).eps)
     inside = jnp.isfinite(x)
@@ -116,7 +119,7 @@ def outside(x: Any, admissible: Range) -> Bool[Array, ""]:
         inside &= x > low if low_open else x >= low - slack * max(abs(low), 1.0)
     if high < np.inf:
         inside &= x < high if high_open else x <= high + slack * max(abs(high), 1.0)
-    return ~jnp.all(inside)
+    return ~(in_order & jnp.all(inside))
 
 
 def _openness(admissible: Range) -> dict[str, bool]:

@@ -115,6 +115,17 @@ def test_each_of_a_batch_and_of_the_wavelengths():
         plate(jnp.array([0.1, 0.1, 0.1]))
 
 
+def test_what_is_out_of_order_is_found():
+    lidar = jax.jit(lambda x: inadmissible(jl.Lidar(wavelength=x)))
+    pulse = jax.jit(lambda x: inadmissible(jl.SampledPulse(x, [0.0, 1.0, 0.0])))
+    for found, good in ((lidar, [532.0, 1064.0, 1550.0]), (pulse, [-1.0, 0.0, 2.0])):
+        assert not found(jnp.array(good))
+        assert found(jnp.array([good[0], good[2], good[1]]))
+        assert found(jnp.array([good[0], good[1], good[1]]))
+    spectrum = jax.jit(lambda x: inadmissible(jl.Spectrum(x, [0.1, 0.2, 0.3])))
+    assert spectrum(jnp.array([500.0, 700.0, 600.0]))
+
+
 def test_values_changed_after_construction_are_found():
     ground = eqx.tree_at(lambda g: g.slope, jl.Ground(), jnp.asarray(200.0))
     assert inadmissible(ground)

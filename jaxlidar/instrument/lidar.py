@@ -116,7 +116,7 @@ class Lidar(eqx.Module):
     receiver: Receiver = eqx.field(default_factory=Receiver)
 
     ranges: ClassVar = {
-        "wavelength": Range(0.0, low_open=True),
+        "wavelength": Range(0.0, low_open=True, increasing=True),
         "altitude": Range(0.0, low_open=True),
         "divergence": Range(0.0),
         "aperture": Range(0.0, low_open=True),

@@ -307,7 +307,7 @@ class SampledPulse(AbstractPulse):
     time: Float[Array, " samples"]
     samples: Float[Array, " samples"]
 
-    ranges: ClassVar = {"time": Range(), "samples": Range(0.0)}
+    ranges: ClassVar = {"time": Range(increasing=True), "samples": Range(0.0)}
 
     def __init__(self, time: ArrayLike | Sequence[ArrayLike], power: ArrayLike | Sequence[ArrayLike]):
         self.time = as_array(time, "time")

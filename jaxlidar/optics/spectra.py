@@ -78,7 +78,7 @@ class Spectrum(eqx.Module):
     scale: Float[Array, ""] = eqx.field(converter=scalar("scale"), default=1.0)
 
     ranges: ClassVar = {
-        "wavelength": Range(0.0, low_open=True),
+        "wavelength": Range(0.0, low_open=True, increasing=True),
         "reflectance": SHARE,
         "scale": Range(0.0),
         "scale * reflectance": SUM_OF_SHARES,
