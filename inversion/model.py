@@ -19,12 +19,14 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxlidar import Lidar, Plan, Response, Scene, Setup, Waveform, reduce, total_of, trace_scene, waveform_of
-from jaxlidar.extend import ONE_CORE, side_by_side
+from jaxlidar.extend import ONE_CORE, concrete, side_by_side
 from jaxlidar.planning.plan import MIN_BATCHES
 
 from .unknowns import Place, Settled, put
 
 Values = tuple[Array, ...]
+# Of coordinates, m.
+FINEST = 1e-3
 
 
 class Problem(eqx.Module):
@@ -136,10 +138,26 @@ class Evaluation(NamedTuple):
     batches: np.ndarray | None
 
 
+def check_place(lidar: Lidar) -> None:
+    """Refuse coordinates that JAX's precision rounds by more than a millimetre: programs take them so.
+
+    **Raises:** ValueError with the rounding.
+    """
+    place = concrete(lidar.position)
+    kind = jnp.zeros(()).dtype
+    rounding = 0.0 if place is None else float(np.max(np.spacing(np.abs(place).astype(kind))))
+    if place is not None and rounding > FINEST:
+        raise ValueError(
+            f"position = {place.tolist()} m is rounded by {rounding:.1g} m in {kind}; admissible for fits is "
+            f"{FINEST:g} m: tell the lidar and the scene from a place nearby, or enable double precision"
+        )
+
+
 class Model:
     """The simulated waveform as a function of the unknowns. Photons are traced no more often than needed."""
 
     def __init__(self, lidar: Lidar, scene: Scene, plan: Plan, settled: Sequence[Settled], key: PRNGKeyArray):
+        check_place(lidar)
         self.problem = Problem(lidar, scene, plan, tuple(s.place for s in settled))
         self.shapes = [s.start.shape for s in settled]
         self.dtypes = [s.start.dtype for s in settled]

@@ -93,8 +93,9 @@ def retrieve(
     **Returns:** a `Retrieval`.
 
     **Raises:** ValueError for inadmissible arguments, among them a start outside its bounds, samples that do
-    not fit the lidar or the plan, a plan together with photons, rays or orders, and noise that is negative or
-    NaN. TypeError for arguments of another kind.
+    not fit the lidar or the plan, a plan together with photons, rays or orders, noise that is negative or
+    NaN, and a lidar so far from x = y = 0 that its place is rounded by more than a millimetre. TypeError for
+    arguments of another kind.
     RuntimeError where `throw` is set and the fit does not converge.
 
     **Example:**

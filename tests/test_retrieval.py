@@ -243,6 +243,14 @@ def test_a_truth_beyond_the_bounds_is_reported():
     assert fit.reduced_chi2 > 2
 
 
+def test_coordinates_that_single_precision_rounds_are_refused():
+    far = dataclasses.replace(PLAIN, position=np.array([4e5, 5e6]))
+    with pytest.raises(ValueError, match=r"rounded by 0.5 m in float32; admissible for fits is 0.001 m"):
+        retrieve_ground(lidar=far)
+    with jax.enable_x64(True):
+        inversion.model.check_place(jl.Lidar(position=(4e5, 5e6)))
+
+
 def test_a_start_on_a_bound_is_moved_inside():
     fit = retrieve_ground(scene=ground_scene(-1.0, (0.0, 1.0)))
     assert_recovered(fit, {"height": 0.1, "reflectance": [0.2, 0.4]})
