@@ -178,7 +178,6 @@ def test_one_voxel_and_one_sample(precision):
 
 PLATES = {
     "a millimetre above the ground": {},
-    "on the ground": {"height": 0.0},
     "below the ground": {"height": -0.5},
     "nowhere": {"coverage": 0.0},
     "everywhere": {"coverage": 1.0},

@@ -116,3 +116,24 @@ def test_a_tilted_plate_over_tilted_ground():
     cosine = np.cos(np.deg2rad(20.0))
     assert float(wave.components["plate"].sum()) == pytest.approx(R * cosine, rel=1e-4)
     assert float(wave.components["ground"].sum()) == pytest.approx(T**2 * RHO * cosine, rel=1e-4)
+
+
+def test_what_lies_in_one_plane_is_refused_and_is_nan_where_it_is_traced():
+    plate, ground = jl.Plate(2.0, R, T, slope=10.0), jl.Ground(height=2.0, slope=10.0)
+    with pytest.raises(
+        ValueError, match=r"plates\[0\] lies 0 m from the plane of the ground: .* 0.0001 m or more"
+    ):
+        jl.Scene(plates=(plate,), ground=ground)
+    with pytest.raises(ValueError, match=r"plates\[2\] lies 5e-05 m from the plane of plates\[0\]"):
+        jl.Scene(plates=(jl.Plate(0.0, R), jl.Plate(1.0, R), jl.Plate(5e-5, R)))
+    # Planes that cross one another are told apart.
+    jl.Scene(plates=(plate, jl.Plate(2.0, R, slope=11.0)), ground=jl.Ground(height=1.999, slope=10.0))
+
+    def scene(height):
+        return jl.Scene(plates=(jl.Plate(height, R),), ground=jl.Ground())
+
+    lidar = whole_lidar()
+    plan = jl.plan(lidar, scene(1.0), max_orders=1, **WHOLE)
+    seen = jax.jit(lambda h: jl.simulate(lidar, scene(h), key=KEY, plan=plan).reflectance.sum())
+    assert np.isfinite(seen(0.001))
+    assert np.isnan(seen(0.0))

@@ -1,16 +1,23 @@
 """The scene that a lidar observes: canopy, plates, ground and atmosphere, each of them optional."""
 
-from collections.abc import Iterable
+import itertools
+from collections.abc import Iterable, Iterator
 from typing import Any, final
 
 import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
 
-from jaxlidar._checks import briefly, check_kind, kind_of
+from jaxlidar._checks import briefly, check_kind, concrete, kind_of
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.scenes.atmosphere import Atmosphere
 from jaxlidar.scenes.canopy import Canopy
+from jaxlidar.scenes.shapes import Plane
 from jaxlidar.scenes.surfaces import AbstractGround, AbstractSheet, AbstractSurface
 from jaxlidar.scenes.voxels import VoxelMap
+
+# Parallel planes that are closer, m, are one and the same in single precision: which is met first is unknown.
+APART = 1e-4
 
 
 def _as_plates(x: Any) -> Any:
@@ -31,7 +38,8 @@ class Scene(eqx.Module):
     - `ground`: a `Ground`, another `AbstractGround`, or None. Default None.
     - `atmosphere`: an `Atmosphere`, or None. Default None.
 
-    **Raises:** TypeError for an argument of another type.
+    **Raises:** TypeError for an argument of another type; ValueError for a plate in the plane of the
+    ground or of another plate.
 
     **Example:**
 
@@ -59,11 +67,35 @@ class Scene(eqx.Module):
         for plate in self.plates:
             if not isinstance(plate, AbstractSheet):
                 raise TypeError(f"plates has {kind_of(plate)}; admissible is a tuple of Plate")
+        names = (() if self.ground is None else ("the ground",)) + tuple(
+            f"plates[{i}]" for i in range(len(self.plates))
+        )
+        for (low, high), gap in _gaps(self.surfaces):
+            if (known := concrete(gap)) is not None and known < APART:
+                raise ValueError(
+                    f"{names[high]} lies {known:.1g} m from the plane of {names[low]}: which is met first is "
+                    f"unknown; admissible is {APART:g} m or more"
+                )
 
     @property
     def surfaces(self) -> tuple[AbstractSurface, ...]:
         """All surfaces: the ground, if there is one, then the plates, as the tracer numbers them."""
         return (() if self.ground is None else (self.ground,)) + self.plates
+
+
+def _gaps(surfaces: tuple[AbstractSurface, ...]) -> Iterator[tuple[tuple[int, int], Float[Array, ""]]]:
+    """Numbers of any two infinite planes, and their distance, m; infinite where they are not parallel."""
+    planes = [(i, s.shape) for i, s in enumerate(surfaces)] if len(surfaces) > 1 else []
+    planes = [(i, shape) for i, shape in planes if isinstance(shape, Plane)]
+    for (i, one), (j, other) in itertools.combinations(planes, 2):
+        parallel = jnp.abs(jnp.sum(one.upward * other.upward)) > 1.0 - 1e-6
+        gap = jnp.abs(jnp.sum(one.upward * (other.foot - one.foot)))
+        yield (i, j), jnp.where(parallel, gap, jnp.inf)
+
+
+def in_one_plane(scene: Scene) -> Bool[Array, ""]:
+    """Whether any two surfaces lie in one plane; for scenes that JAX is tracing."""
+    return jnp.any(jnp.asarray([gap < APART for _, gap in _gaps(scene.surfaces)], bool))
 
 
 def check_kinds(lidar: Any, scene: Any) -> None:
