@@ -11,7 +11,7 @@ import csv
 import jax
 import numpy as np
 import pytest
-from helpers import slab
+from helpers import slab, slow_unless
 
 import jaxlidar as jl
 
@@ -67,9 +67,7 @@ def test_albedo_one_returns_everything():
     assert float(budget.absorbed["leaf"][0]) == 0.0
 
 
-@pytest.mark.parametrize(
-    "row", [1, *(pytest.param(n, marks=pytest.mark.slow) for n in (0, 2, 3, 5, 9, 13, 17))]
-)
+@pytest.mark.parametrize("row", slow_unless([1], range(5)))
 def test_slabs_against_discrete_ordinates(shared, row):
     with (shared / "reference" / "slabs_isotropic.csv").open() as file:
         given = {name: float(value) for name, value in list(csv.DictReader(file))[row].items()}
