@@ -104,7 +104,8 @@ def test_a_disc_in_the_ledger_and_in_the_plan():
 
 def test_surfaces_of_a_name_are_numbered():
     plate = jl.Plate(height=1.0, reflectance=0.2)
-    what = jl.Scene(plates=(plate, Disc(5.0, 4.0, reflectance=0.5), plate), ground=jl.Ground())
+    other = jl.Plate(height=2.0, reflectance=0.2)
+    what = jl.Scene(plates=(plate, Disc(5.0, 4.0, reflectance=0.5), other), ground=jl.Ground())
     materials = jl.plan(LIDAR, what, max_orders=1, describe=False).trace.materials
     assert materials == ("ground", "plate 1", "disc", "plate 2")
 
