@@ -33,6 +33,9 @@ volumes = st.lists(chances, min_size=CELLS, max_size=CELLS)
 def scenes(draw):
     """Numbers of an admissible scene; reflectance and transmittance are drawn as their sum and its share."""
     leaf, leaf_part, plate, plate_part = (draw(shares) for _ in range(4))
+    height = draw(st.floats(-3.0, 3.0))
+    # Not in one plane: which is met first is then unknown.
+    apart = st.floats(-1.0, 6.0).filter(lambda h: abs(h - height) > 1e-3)
     return {
         "p_leaf": np.reshape(draw(volumes), SHAPE),
         "p_bark": np.reshape(draw(volumes), SHAPE),
@@ -41,8 +44,8 @@ def scenes(draw):
         "bark": draw(shares),
         "rho": draw(shares),
         "coverage": draw(shares),
-        "plate height": draw(st.floats(-1.0, 6.0)),
-        "height": draw(st.floats(-3.0, 3.0)),
+        "plate height": draw(apart),
+        "height": height,
         "slope": draw(st.floats(0.0, 40.0)),
         "aspect": draw(st.floats(0.0, 360.0)),
         "zenith": draw(st.floats(0.0, 20.0)),
