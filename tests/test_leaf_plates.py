@@ -137,3 +137,4 @@ def test_what_lies_in_one_plane_is_refused_and_is_nan_where_it_is_traced():
     seen = jax.jit(lambda h: jl.simulate(lidar, scene(h), key=KEY, plan=plan).reflectance.sum())
     assert np.isfinite(seen(0.001))
     assert np.isnan(seen(0.0))
+    assert jax.jit(lambda h: jl.extend.reasons(scene(h)))(0.0)["gap"]

@@ -13,7 +13,7 @@ from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.planning.effects import without
 from jaxlidar.planning.local_origin import about_aim
 from jaxlidar.planning.plan import Plan
-from jaxlidar.scenes.scene import Scene, check_kinds, in_one_plane
+from jaxlidar.scenes.scene import Scene, check_kinds
 
 
 @final
@@ -71,6 +71,5 @@ def reduce(lidar: Lidar, scene: Scene, plan: Plan) -> Setup:
     check_kind("plan", plan, Plan, "a Plan that jaxlidar.plan made")
     admissible = jnp.ones(())
     if any(is_traced(x) for x in jax.tree.leaves((lidar, scene))):
-        wrong = inadmissible((lidar, scene)) | in_one_plane(scene)
-        admissible = jnp.where(wrong, jnp.nan, admissible)
+        admissible = jnp.where(inadmissible((lidar, scene)), jnp.nan, admissible)
     return Setup(*without(*about_aim(lidar, scene), plan.off), plan, admissible)

@@ -2,13 +2,15 @@
 
 import itertools
 from collections.abc import Iterable, Iterator
-from typing import Any, final
+from typing import Any, ClassVar, final
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from jaxlidar._checks import briefly, check_kind, concrete, kind_of
+from jaxlidar._ranges import Range
+from jaxlidar._vectors import FAR
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.scenes.atmosphere import Atmosphere
 from jaxlidar.scenes.canopy import Canopy
@@ -55,6 +57,8 @@ class Scene(eqx.Module):
     ground: AbstractGround | None = None
     atmosphere: Atmosphere | None = None
 
+    ranges: ClassVar = {"gap": Range(APART)}
+
     def __check_init__(self):
         hint = ", as in Canopy(voxels, leaf=...)" if isinstance(self.canopy, VoxelMap) else ""
         for field, kind, admissible in (
@@ -78,24 +82,25 @@ class Scene(eqx.Module):
                 )
 
     @property
+    def gap(self) -> Float[Array, ""] | None:
+        """The least distance, m, between parallel planes of the scene; None where there are no two."""
+        gaps = [gap for _, gap in _gaps(self.surfaces)]
+        return jnp.min(jnp.stack(gaps)) if gaps else None
+
+    @property
     def surfaces(self) -> tuple[AbstractSurface, ...]:
         """All surfaces: the ground, if there is one, then the plates, as the tracer numbers them."""
         return (() if self.ground is None else (self.ground,)) + self.plates
 
 
 def _gaps(surfaces: tuple[AbstractSurface, ...]) -> Iterator[tuple[tuple[int, int], Float[Array, ""]]]:
-    """Numbers of any two infinite planes, and their distance, m; infinite where they are not parallel."""
+    """Numbers of any two infinite planes, and their distance, m; 1e30 where they are not parallel."""
     planes = [(i, s.shape) for i, s in enumerate(surfaces)] if len(surfaces) > 1 else []
     planes = [(i, shape) for i, shape in planes if isinstance(shape, Plane)]
     for (i, one), (j, other) in itertools.combinations(planes, 2):
         parallel = jnp.abs(jnp.sum(one.upward * other.upward)) > 1.0 - 1e-6
         gap = jnp.abs(jnp.sum(one.upward * (other.foot - one.foot)))
-        yield (i, j), jnp.where(parallel, gap, jnp.inf)
-
-
-def in_one_plane(scene: Scene) -> Bool[Array, ""]:
-    """Whether any two surfaces lie in one plane; for scenes that JAX is tracing."""
-    return jnp.any(jnp.asarray([gap < APART for _, gap in _gaps(scene.surfaces)], bool))
+        yield (i, j), jnp.where(parallel, gap, FAR)
 
 
 def check_kinds(lidar: Any, scene: Any) -> None:
