@@ -168,9 +168,10 @@ def retrieve_many(
 
     **Returns:** a `Retrievals`.
 
-    **Raises:** ValueError for inadmissible arguments, and for a `path` that is damaged, no file of fits, or
-    one of another problem, of which it says what differs. TypeError for arguments of another kind. OSError
-    for a `path` that cannot be written, before any fit, or that another run uses.
+    **Raises:** ValueError for inadmissible arguments, as `retrieve` does, and for a `path` that is
+    damaged, no file of fits, or one of another problem, of which it says what differs. TypeError for
+    arguments of another kind. OSError for a `path` that cannot be written, before any fit, or that another
+    run uses.
 
     **Example:**
 

@@ -25,8 +25,8 @@ from jaxlidar.planning.plan import MIN_BATCHES
 from .unknowns import Place, Settled, put
 
 Values = tuple[Array, ...]
-# Of coordinates, m.
-FINEST = 1e-3
+# Rounding of coordinates, m, with which fits are still admissible.
+ROUNDING = 1e-3
 
 
 class Problem(eqx.Module):
@@ -139,17 +139,18 @@ class Evaluation(NamedTuple):
 
 
 def check_place(lidar: Lidar) -> None:
-    """Refuse coordinates that JAX's precision rounds by more than a millimetre: programs take them so.
+    """Refuse places that JAX's precision rounds by more than a millimetre: the fit's programs round them.
 
     **Raises:** ValueError with the rounding.
     """
-    place = concrete(lidar.position)
-    kind = jnp.zeros(()).dtype
-    rounding = 0.0 if place is None else float(np.max(np.spacing(np.abs(place).astype(kind))))
-    if place is not None and rounding > FINEST:
+    place, kind = concrete(lidar.position), jnp.zeros(()).dtype
+    if place is None:
+        return
+    rounding = float(np.max(np.spacing(np.abs(place).astype(kind))))
+    if rounding > ROUNDING:
         raise ValueError(
             f"position = {place.tolist()} m is rounded by {rounding:.1g} m in {kind}; admissible for fits is "
-            f"{FINEST:g} m: tell the lidar and the scene from a place nearby, or enable double precision"
+            f"{ROUNDING:g} m: tell the lidar and the scene from a place nearby, or enable double precision"
         )
 
 

@@ -1,7 +1,7 @@
 """Random scenes, as a user would simulate them: what is returned is right to its error, or something is said.
 
-Every scene is simulated again with more of everything: a third of the error, twice the fine bins, four times
-the rays, and twice the orders where there is room for them.
+Every scene is simulated again with more of everything: a third of the error, fine bins of half the width,
+four times the rays, and twice the orders where there is room for them.
 """
 
 import warnings
@@ -105,9 +105,9 @@ def simulated(lidar, scene, **more):
     return wave, bool(said) or wave.info["stopped"] not in ("tolerance met", "nothing is random")
 
 
-def disagreement(wave, better, key="reflectance"):
+def disagreement(wave, better):
     """The largest excess of a difference over what the two waveforms say of their errors; 1 is too much."""
-    ours, theirs = (np.asarray(getattr(w, key), float)[0] for w in (wave, better))
+    ours, theirs = (np.asarray(w.reflectance, float)[0] for w in (wave, better))
     error = np.hypot(np.asarray(wave.stderr, float)[0], np.asarray(better.stderr, float)[0])
     # The few batches of samples with little light are skew.
     seen = theirs > 0.01 * np.max(theirs)
@@ -153,7 +153,7 @@ def test_right_to_its_error_or_something_is_said(case):
 
 @pytest.mark.slow
 def test_a_wrong_waveform_is_noticed():
-    """Ground that is brighter by a tenth, and a window that leaves out the ground."""
+    """Ground that is brighter by a tenth."""
     ground = jl.Ground(reflectance=0.3)
     plates = (jl.Plate(8.0, 0.3, 0.3),)
     lidar, scene = jl.Lidar(), jl.Scene(plates=plates, ground=ground)
