@@ -9,18 +9,23 @@ from .gedi import GediMetrics, GediSettings, gedi_metrics, gedi_settings
 from .heights import SignalEnds, find_ground, relative_heights, signal_ends
 from .identifiability import CramerRao, Profile, cramer_rao, profile_likelihood
 from .leaves import LeafFit, invert_leaves
+from .photons import PhotonHeights, photon_ground_and_canopy
+from .points import EchoPoints, echo_points
+from .quality import Verdict, judge_fit, judge_fits, judge_record
 from .result import Retrieval, Step
 from .retrieval import retrieve
 from .unknowns import LogNormal, Unknown
 
 __all__ = [
     "CramerRao",
+    "EchoPoints",
     "Echoes",
     "GediMetrics",
     "GediSettings",
     "GroundAndCanopy",
     "LeafFit",
     "LogNormal",
+    "PhotonHeights",
     "Profile",
     "Progress",
     "Retrieval",
@@ -28,7 +33,9 @@ __all__ = [
     "SignalEnds",
     "Step",
     "Unknown",
+    "Verdict",
     "cramer_rao",
+    "echo_points",
     "files",
     "find_ground",
     "gap_probability",
@@ -37,6 +44,10 @@ __all__ = [
     "gedi_settings",
     "ground_and_canopy",
     "invert_leaves",
+    "judge_fit",
+    "judge_fits",
+    "judge_record",
+    "photon_ground_and_canopy",
     "plant_area_index",
     "profile_likelihood",
     "relative_heights",

@@ -8,6 +8,7 @@ not affect the others.
 import dataclasses
 import os
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
 from typing import Any, final
 
 import equinox as eqx
@@ -18,15 +19,17 @@ import optimistix as optx
 from jaxtyping import ArrayLike, Bool, Float, Int, PRNGKeyArray
 
 from jaxlidar import Lidar, Plan, Scene
-from jaxlidar.extend import check_integer, check_key, check_kind
+from jaxlidar.extend import briefly, check_integer, check_key, check_kind, fingerprint
+from jaxlidar.io import save
 
-from .checkpoint import Frame, Row, kept_fits, row_of
+from .checkpoint import Frame, Row, kept_fits
 from .data import at_fixed_times, data_of, noise_of, numbers
-from .fingerprint import fingerprint
-from .fit import Fitting, Request, best_of, labels_of, named
-from .lanes import Simulator
+from .fit import labels_of, named
+from .job import Job, fits, fits_by
+from .lanes import Lanes
 from .planning import batch_sizes, check_samples, plan_for
-from .retrieval import SOLVER, check_progress, check_solution, fits_from, scale_of
+from .quality import Verdict, judge_fits
+from .retrieval import SOLVER, check_progress, check_solution, scale_of
 from .unknowns import Settled, Unknown, settle, start_from
 
 
@@ -55,6 +58,7 @@ class Progress:
 
 
 @final
+@briefly
 class Retrievals(eqx.Module):
     """The results of `retrieve_many`: one fit per footprint, in the order given.
 
@@ -63,8 +67,9 @@ class Retrievals(eqx.Module):
     - `values`: by name, (footprints, ...) best values.
     - `stderr`: by name, (footprints, ...) one standard error; infinite where the data do not constrain the
       unknown.
+    - `robust_stderr`, `prior_share`, `at_bound`: by name, (footprints, ...).
     - `covariance`: (footprints, n, n).
-    - `reduced_chi2`: (footprints,).
+    - `reduced_chi2`, `second_minimum`, `independent_samples`: (footprints,).
     - `converged`: (footprints,) whether the fit ended at a minimum.
     - `steps`: (footprints,) waveforms simulated, each with its Jacobian.
     - `fitted`: (footprints, wavelengths, bins) apparent reflectance, without the scale.
@@ -86,19 +91,39 @@ class Retrievals(eqx.Module):
 
     values: dict[str, Float[np.ndarray, "footprints ..."]]
     stderr: dict[str, Float[np.ndarray, "footprints ..."]]
+    robust_stderr: dict[str, Float[np.ndarray, "footprints ..."]]
+    prior_share: dict[str, Float[np.ndarray, "footprints ..."]]
+    at_bound: dict[str, Bool[np.ndarray, "footprints ..."]]
     covariance: Float[np.ndarray, "footprints n n"]
     reduced_chi2: Float[np.ndarray, " footprints"]
+    second_minimum: Float[np.ndarray, " footprints"]
+    independent_samples: Float[np.ndarray, " footprints"]
     converged: Bool[np.ndarray, " footprints"]
     steps: Int[np.ndarray, " footprints"]
     fitted: Float[np.ndarray, "footprints wavelengths bins"]
     status: tuple[str, ...] = eqx.field(static=True)
     labels: tuple[str, ...] = eqx.field(static=True)
 
+    @property
+    def quality(self) -> tuple[Verdict, ...]:
+        """Whether each fit can be trusted, with reasons: `inversion.judge_fits` with all unknowns."""
+        return judge_fits(self)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the results as a netCDF file, which `jaxlidar.open` reads.
+
+        **Arguments:** `path`: the file to write.
+
+        **Raises:** what `jaxlidar.io.save` raises.
+        """
+        save(self, path)
+
     def to_xarray(self) -> Any:
         """The results as an `xarray.Dataset` over the dimension `footprint`.
 
         **Returns:** an `xarray.Dataset` with a variable for each unknown, "... stderr" for its standard
-        error, and `reduced_chi2`, `converged`, `steps`, `status` and `fitted`.
+        error, "... robust stderr", "... prior share" and "... at bound", and `reduced_chi2`,
+        `second_minimum`, `independent_samples`, `converged`, `steps`, `status` and `fitted`.
 
         **Raises:** ImportError where xarray is not installed.
         """
@@ -108,9 +133,13 @@ class Retrievals(eqx.Module):
             return (("footprint", *(f"{name} {i}" for i in range(array.ndim - 1))), array)
 
         columns = {name: variable(name, v) for name, v in self.values.items()}
-        columns |= {f"{name} stderr": variable(name, v) for name, v in self.stderr.items()}
+        for field in ("stderr", "robust_stderr", "prior_share", "at_bound"):
+            called = field.replace("_", " ")
+            columns |= {f"{name} {called}": variable(name, v) for name, v in getattr(self, field).items()}
         columns |= {
             "reduced_chi2": ("footprint", self.reduced_chi2),
+            "second_minimum": ("footprint", self.second_minimum),
+            "independent_samples": ("footprint", self.independent_samples),
             "converged": ("footprint", self.converged),
             "steps": ("footprint", self.steps),
             "status": ("footprint", np.array(self.status, dtype=object)),
@@ -140,6 +169,7 @@ def retrieve_many(
     noise_floor: float = 1e-3,
     lanes: int = 16,
     path: str | os.PathLike[str] | None = None,
+    executor: Executor | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> Retrievals:
     """Retrieve unknowns of a scene from many waveforms, each on its own, as `retrieve` does for one.
@@ -161,17 +191,20 @@ def retrieve_many(
     - `lanes`: number of footprints simulated together, at least 1; memory grows with it. Default 16.
     - `path`: a file (of SQLite) that keeps every fit once it has ended, so that a run that was interrupted or
       killed goes on where it stopped. It belongs to the problem: everything that the result depends on must
-      be as it was, and only `lanes` and `progress` may change. One run at a time can use it. Where it cannot
-      be written any more, as on a full disk, a warning says so once and the fits go on. Default None: no
-      file.
+      be as it was, and only `lanes`, `executor` and `progress` may change. One run at a time can use it.
+      Where it cannot be written any more, as on a full disk, a warning says so once and the fits go on.
+      Default None: no file.
+    - `executor`: a `concurrent.futures.Executor`, whose workers fit chunks of footprints, as for
+      `jaxlidar.simulate_many`. What the unknowns have must be such that it can be sent to them: paths, or
+      functions of a module. A chunk whose worker dies gets a second try. Default None: this process.
     - `progress`: called with a `Progress` after every fit.
 
-    **Returns:** a `Retrievals`.
+    **Returns:** a `Retrievals`, which does not depend on the number of workers.
 
     **Raises:** ValueError for inadmissible arguments, as `retrieve` does, and for a `path` that is
     damaged, no file of fits, or one of another problem, of which it says what differs. TypeError for
     arguments of another kind. OSError for a `path` that cannot be written, before any fit, or that another
-    run uses.
+    run uses. RuntimeError where the workers of a chunk die twice.
 
     **Example:**
 
@@ -194,7 +227,8 @@ def retrieve_many(
     check_key(key)
     check_progress(progress)
     check_kind("path", path, str | os.PathLike | None, "a path, or None")
-    lanes = min(check_integer("lanes", lanes), len(y))
+    check_kind("executor", executor, Executor | None, "a concurrent.futures.Executor, or None")
+    lanes = check_integer("lanes", lanes)
     solver, max_steps, starts = check_solution(solver, max_steps, starts)
     photons, rays = batch_sizes(n_photons, n_rays, max_orders, plan)
     lidars = [at_fixed_times(a) for a in _one_each("lidar", lidar, Lidar, len(y))]
@@ -229,31 +263,17 @@ def retrieve_many(
         )
     check_samples(plan, axis)
 
-    def fitting(i: int) -> Fitting:
-        own = [*settled[i % len(settled)], *extra]
-        lane_key = jax.random.fold_in(key, i)
-        return best_of(fits_from(starts, lane_key, data[i], own, bool(extra), solver, max_steps, None))
-
+    how = (plan, solver, max_steps, starts, Lanes.of(min(lanes, len(y))))
+    job = Job(range(len(y)), data, lidars, scenes, settled, extra, *how)
     frame = Frame(len(y), sum(s.start.size for s in names), y.shape[1:])
     with kept_fits(path, {} if path is None else fingerprint(parts), frame) as kept:
         ended = kept.rows
-        simulate = Simulator(lidars, scenes, plan, settled[0], key, lanes)
         todo = [i for i in range(len(y)) if i not in ended]
-        running: dict[int, tuple[Fitting, Request]] = {}
-        while todo or running:
-            while todo and len(running) < simulate.lanes:
-                i = todo.pop(0)
-                fit = fitting(i)
-                running[i] = fit, next(fit)
-            for i, evaluation in simulate({i: request for i, (_, request) in running.items()}).items():
-                fit = running[i][0]
-                try:
-                    running[i] = fit, fit.send(evaluation)
-                except StopIteration as end:
-                    del running[i]
-                    kept.add(i, row_of(end.value))
-                    if progress is not None:
-                        progress(Progress(len(ended), len(y), sum(r.converged for r in ended.values())))
+        here = executor is None
+        for i, row in fits(job, key, todo) if here else fits_by(executor, job, key, todo):
+            kept.add(i, row)
+            if progress is not None:
+                progress(Progress(len(ended), len(y), sum(r.converged for r in ended.values())))
     return _gathered([ended[i] for i in range(len(y))], names)
 
 
@@ -266,8 +286,13 @@ def _gathered(rows: list[Row], names: list[Settled]) -> Retrievals:
     return Retrievals(
         values=named(stack(lambda r: r.values), names),
         stderr=named(stack(lambda r: r.stderr), names),
+        robust_stderr=named(stack(lambda r: r.robust_stderr), names),
+        prior_share=named(stack(lambda r: r.prior_share), names),
+        at_bound=named(stack(lambda r: r.at_bound), names),
         covariance=stack(lambda r: r.covariance),
         reduced_chi2=np.array([r.reduced_chi2 for r in rows]),
+        second_minimum=np.array([r.second_minimum for r in rows]),
+        independent_samples=np.array([r.independent_samples for r in rows]),
         converged=np.array([r.converged for r in rows]),
         steps=np.array([r.steps for r in rows]),
         fitted=stack(lambda r: r.fitted),

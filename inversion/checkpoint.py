@@ -35,8 +35,13 @@ class Row:
 
     values: np.ndarray
     stderr: np.ndarray
+    robust_stderr: np.ndarray
+    prior_share: np.ndarray
+    at_bound: np.ndarray
     covariance: np.ndarray
     reduced_chi2: float
+    second_minimum: float
+    independent_samples: float
     converged: bool
     steps: int
     fitted: np.ndarray
@@ -45,8 +50,8 @@ class Row:
 
 def row_of(o: Outcome) -> Row:
     """The row of a fit's outcome."""
-    total = np.asarray(o.evaluation.total)
-    return Row(o.values, o.stderr, o.covariance, o.reduced_chi2, o.converged, o.steps, total, o.status)
+    own = {f.name: getattr(o, f.name) for f in dataclasses.fields(Row) if f.name != "fitted"}
+    return Row(**own, fitted=np.asarray(o.evaluation.total))
 
 
 class Frame(NamedTuple):
@@ -184,8 +189,13 @@ def _unpacked(packed: bytes, frame: Frame) -> Row:
     forms = {
         "values": ("f", (n,)),
         "stderr": ("f", (n,)),
+        "robust_stderr": ("f", (n,)),
+        "prior_share": ("f", (n,)),
+        "at_bound": ("b", (n,)),
         "covariance": ("f", (n, n)),
         "reduced_chi2": ("f", ()),
+        "second_minimum": ("f", ()),
+        "independent_samples": ("f", ()),
         "converged": ("b", ()),
         "steps": ("i", ()),
         "fitted": ("f", frame.waveform),
@@ -201,7 +211,12 @@ def _unpacked(packed: bytes, frame: Frame) -> Row:
     if row.steps < 1 or not np.all(np.isfinite(row.values)):
         raise ValueError(f"values = {row.values} after {row.steps} steps; admissible are finite ones after 1")
     # What has not converged may have no finite waveform, and an unknown left open has an infinite error.
-    known = np.isfinite(row.reduced_chi2) and np.all(np.isfinite(row.fitted)) and np.all(row.stderr >= 0)
+    known = (
+        np.isfinite(row.reduced_chi2)
+        and np.all(np.isfinite(row.fitted))
+        and np.all(row.robust_stderr >= row.stderr)
+    )
+    known = known and np.all(row.stderr >= 0)
     if row.converged and not (known and not np.any(np.isnan(row.covariance))):
         raise ValueError("it is said to have converged, but its numbers are not finite")
     return row

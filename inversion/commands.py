@@ -11,6 +11,7 @@ import jax
 import numpy as np
 
 import jaxlidar as jl
+from jaxlidar.cli.shared import ResultPath
 
 from . import demo as demonstration
 from .retrieval import retrieve as fit_waveform
@@ -56,7 +57,7 @@ def _unknown(ctx: Any, parameter: Any, given: tuple[str, ...]) -> list[Unknown]:
 
 
 @click.command()
-@click.argument("observed", type=click.Path(exists=True, dir_okay=False, path_type=Path), metavar="WAVE.nc")
+@click.argument("observed", type=ResultPath(exists=True), metavar="WAVE.nc")
 @click.argument("start", type=click.Path(exists=True, dir_okay=False, path_type=Path), metavar="CASE.toml")
 @click.option(
     "--unknown",
@@ -69,9 +70,7 @@ def _unknown(ctx: Any, parameter: Any, given: tuple[str, ...]) -> list[Unknown]:
 )
 @click.option("--noise", type=click.FloatRange(0, min_open=True), help="Standard deviation of the samples.")
 @click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=0, help="Of the photons of the fit.")
-@click.option(
-    "-o", "--out", type=click.Path(dir_okay=False, path_type=Path), help="Write the result as netCDF."
-)
+@click.option("-o", "--out", type=ResultPath(), help="Write the result as netCDF, or as Zarr (.zarr).")
 @click.option(
     "--plot", type=click.Path(dir_okay=False, path_type=Path), help="Draw the fit and its residuals."
 )

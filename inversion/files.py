@@ -9,8 +9,13 @@ _OWN = "units of the unknown"
 _QUANTITIES = {
     "values": (_OWN, "best value of an unknown"),
     "stderr": (_OWN, "standard error of an unknown"),
+    "robust_stderr": (_OWN, "standard error of an unknown, widened by misfit and the spread over starts"),
+    "prior_share": ("1", "share of the information on an unknown that is the prior's"),
+    "at_bound": ("1", "whether an unknown lies at one of its bounds"),
     "covariance": (_OWN, "covariance of the unknowns, in the order of labels"),
     "reduced_chi2": ("1", "sum of squared residuals over the degrees of freedom"),
+    "second_minimum": ("1", "rise in chi-squared to a second minimum, in units of independent samples"),
+    "independent_samples": ("1", "independent samples that tell as much as the correlated ones fitted"),
 }
 
 keep_as_netcdf(

@@ -19,9 +19,10 @@ import optimistix as optx
 from jaxtyping import Array
 
 from .data import Data
+from .misfit import misfit_of
 from .model import Evaluation, spread_of
 from .result import Step
-from .uncertainty import correlation_of, decrement, errors_of
+from .uncertainty import Errors, correlation_of, decrement, errors_of
 from .unknowns import Priors, Settled, inside, outside
 
 # A fit has converged when a Gauss-Newton step would move it by less than this many standard errors.
@@ -83,6 +84,11 @@ class Outcome(NamedTuple):
     history: tuple[float, ...]
     evaluation: Evaluation
     simulation: np.ndarray
+    robust_stderr: np.ndarray
+    prior_share: np.ndarray
+    at_bound: np.ndarray
+    second_minimum: float
+    independent_samples: float
 
 
 Fitting = Generator[Request, Evaluation, Outcome]
@@ -109,12 +115,34 @@ def best_of(fits: "Sequence[Fit]") -> Fitting:
     best = min(outcomes, key=lambda o: (not o.converged, not np.isfinite(o.cost), o.cost))
     if len(fits) == 1:
         return best
+    second, robust = among(best, [o for o in outcomes if o.converged and o is not best])
     near = sum(o.converged and o.cost < best.cost + 1.0 for o in outcomes)
     return best._replace(
         steps=sum(o.steps for o in outcomes),
         history=tuple(h for o in outcomes for h in o.history),
         status=f"{best.status}; {near} of {len(fits)} starts ended there",
+        second_minimum=second,
+        robust_stderr=robust,
     )
+
+
+def among(best: Outcome, others: Sequence[Outcome]) -> tuple[float, np.ndarray]:
+    """How much likelier the best end is than the next, and standard errors with the spread over ends.
+
+    Ends are alike within two standard errors of all unknowns. Chi-squared counts correlated samples by what
+    they tell, and in units of the best fit's; an end weighs exp(-rise / 2).
+    """
+    telling = (
+        best.independent_samples / max(np.count_nonzero(best.residuals), 1) / max(best.reduced_chi2, 1.0)
+    )
+    second, variance, weight = np.inf, np.zeros_like(best.values), 1.0
+    for other in others:
+        rise, away = max(other.cost - best.cost, 0.0) * telling, other.values - best.values
+        if np.any(np.abs(away) > 2.0 * best.robust_stderr):
+            second = min(second, rise)
+        variance += np.exp(-0.5 * rise) * away**2
+        weight += np.exp(-0.5 * rise)
+    return float(second), np.hypot(best.robust_stderr, np.sqrt(variance / weight))
 
 
 class Point:
@@ -267,12 +295,14 @@ class Fit:
         measured = (self.data.sigma[used] / self.sigma) ** 2
         off, slope = self.prior(p.values)
         errors = errors_of(jacobian, slope**2, self.high - self.low, measured, deviations)
+        stderr = np.sqrt(np.diag(errors.covariance))
+        robust, samples = self.widened(p, stderr, errors, jacobian, slope**2)
         labels = labels_of(self.settled)
         share = (p.values - self.low) / (self.high - self.low)
         notes = [
             ("the data do not determine {} (infinite standard error)", errors.open),
-            ("at the lower bound: {}", share < _AT_BOUND),
-            ("at the upper bound: {}", share > 1 - _AT_BOUND),
+            ("at the lower bound: {}", low := share < _AT_BOUND),
+            ("at the upper bound: {}", high := share > 1 - _AT_BOUND),
         ]
         for text, which in notes:
             if np.any(which):
@@ -285,7 +315,7 @@ class Fit:
         cost = float(np.sum((p.difference / self.data.sigma[used]) ** 2) + np.sum(off**2))
         return Outcome(
             values=p.values,
-            stderr=np.sqrt(np.diag(errors.covariance)),
+            stderr=stderr,
             simulation_error=errors.simulation,
             covariance=errors.covariance,
             correlation=correlation_of(errors.covariance),
@@ -298,7 +328,28 @@ class Fit:
             history=tuple(self.history),
             evaluation=p.evaluation,
             simulation=np.asarray(simulation),
+            robust_stderr=robust,
+            prior_share=errors.prior_share,
+            at_bound=low | high,
+            second_minimum=np.inf,
+            independent_samples=samples,
         )
+
+    def widened(
+        self, p: Point, stderr: np.ndarray, errors: Errors, jacobian: np.ndarray, precision: np.ndarray
+    ) -> tuple[np.ndarray, float]:
+        """Standard errors widened by misfit, and how many independent samples tell as much as all."""
+        if not p.finite:
+            return stderr, float(self.sigma.size)
+        used = self.data.used
+        signal = (p.difference + self.data.observed[used]) / self.sigma
+        open = errors.open
+        told = float(np.sum(1.0 - errors.prior_share[~open]))
+        difference = p.difference / self.sigma
+        wavelength, sample = np.nonzero(used)
+        misfit = misfit_of(difference, jacobian, precision, told, signal, (wavelength, sample))
+        variance = np.diag(errors.inverse @ (misfit.middle + np.diag(precision)) @ errors.inverse)
+        return np.where(open, np.inf, np.maximum(stderr, np.sqrt(variance))), misfit.samples
 
 
 def named(flat: np.ndarray, settled: Sequence[Settled]) -> dict[str, np.ndarray]:

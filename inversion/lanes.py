@@ -21,6 +21,24 @@ from .model import Evaluation, Model, Problem, evaluate
 from .unknowns import Settled
 
 
+class Lanes(NamedTuple):
+    """So many threads, each with so many lanes."""
+
+    threads: int
+    each: int
+
+    @property
+    def number(self) -> int:
+        """Lanes of all threads."""
+        return self.threads * self.each
+
+    @staticmethod
+    def of(number: int) -> "Lanes":
+        """At least so many lanes, on all cores."""
+        threads = min(max(os.cpu_count() or 1, 1), number)
+        return Lanes(threads, -(-number // threads))
+
+
 class Simulator:
     """Simulates the requests of all lanes in one compiled call; several threads share the lanes."""
 
@@ -31,26 +49,23 @@ class Simulator:
         plan: Plan,
         settled: list[Settled],
         key: PRNGKeyArray,
-        lanes: int,
+        lanes: Lanes,
     ):
         self.model = Model(lidars[0], scenes[0], plan, settled, key)
-        self.threads = min(max(os.cpu_count() or 1, 1), lanes)
-        self.each = -(-lanes // self.threads)
-        self.lanes = self.each * self.threads
-        self.lidars, self.scenes = lidars, scenes
+        self.lanes, self.lidars, self.scenes = lanes, lidars, scenes
 
     def __call__(self, requests: dict[int, Request]) -> dict[int, Evaluation]:
         numbers = list(requests)
-        groups = [numbers[i : i + self.each] for i in range(0, len(numbers), self.each)]
+        groups = [numbers[i : i + self.lanes.each] for i in range(0, len(numbers), self.lanes.each)]
         found: dict[int, Evaluation] = {}
-        with side_by_side(self.threads) as run:
+        with side_by_side(self.lanes.threads) as run:
             for more in run(lambda group: self._group(group, requests), groups):
                 found |= more
         return found
 
     def _group(self, group: list[int], requests: dict[int, Request]) -> dict[int, Evaluation]:
         # The compiled call has a fixed number of lanes: idle ones repeat the last.
-        padded = [*group, *[group[-1]] * (self.each - len(group))]
+        padded = [*group, *[group[-1]] * (self.lanes.each - len(group))]
         values = jax.tree.map(
             lambda *a: jnp.stack(a), *(self.model.values(requests[i].values) for i in padded)
         )

@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt solver for PROSPECT: the fit of many leaves, and its standard errors.
+"""Levenberg-Marquardt solver for PROSPECT: the fit of many leaves.
 
 Traits other than N act through the absorption of a plate, k = sum(c_i K_i)/N, alone. So with s = dR/dk / N
 the Jacobian's columns are s K_i and dR/dN - s k: the normal equations need two derivatives of the plate model
@@ -17,12 +17,12 @@ more than 20 times as long, because some leaves ran to the last step.
 Source: Marquardt (1963), J. SIAM 11, 431; Bertsekas (1982), SIAM J. Control Optim. 20, 221 (projection).
 """
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
@@ -37,8 +37,6 @@ _ROUNDINGS = 64
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-2, 1e-5, 1e8
 # A first fit, to at least this many bands, gives the start of the fit to all bands.
 _FEW_BANDS = 200
-# Smallest eigenvalue of the normal matrix, of unit diagonal, at which a combination counts as determined.
-_COLLINEAR = 1e-5
 
 
 def rounding(dtype: Any) -> float:
@@ -80,16 +78,22 @@ class Task(NamedTuple):
     sigma: Float[Array, "*leaves 2 wavelengths"]
 
 
+def in_chunks(each: Callable[[Any], Any], leaves: Any, chunk: int) -> Any:
+    """`each` of all leaves, arrays' first axis, in chunks of at most `chunk`."""
+    count = len(jax.tree.leaves(leaves)[0])
+    chunks = -(-count // chunk)
+    size = -(-count // chunks)
+    # The last chunk is filled up with the last leaf: a smaller one would be compiled separately.
+    index = jnp.minimum(jnp.arange(chunks * size), count - 1).reshape(chunks, size)
+    ends = lax.map(lambda i: jax.vmap(each)(jax.tree.map(lambda a: a[i], leaves)), index)
+    return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:count], ends)
+
+
 @partial(jax.jit, static_argnames="chunk")
 def fit_all(
     task: Task, absorption: Array, face: LeafSurface, count: ArrayLike, max_steps: ArrayLike, chunk: int
 ) -> State:
     """Fit leaves, in chunks of at most `chunk`; `count` is the number of unknowns."""
-    leaves = len(task.start)
-    chunks = -(-leaves // chunk)
-    each = -(-leaves // chunks)
-    # The last chunk is filled up with the last leaf: a smaller one would be compiled separately.
-    index = jnp.minimum(jnp.arange(chunks * each), leaves - 1).reshape(chunks, each)
     every = absorption.shape[1] // _FEW_BANDS
 
     def fit(leaf: Task) -> State:
@@ -102,8 +106,7 @@ def fit_all(
         damping = _FIRST_DAMPING if every <= 1 else _LEAST_DAMPING
         return _fit(leaf, absorption, face, count, max_steps, damping)
 
-    ends = lax.map(lambda i: jax.vmap(fit)(jax.tree.map(lambda a: a[i], task)), index)
-    return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:leaves], ends)
+    return in_chunks(fit, task, chunk)
 
 
 def _fit(
@@ -165,18 +168,3 @@ def _fit(
     none = Point(start, jnp.full_like(floor, jnp.inf), jnp.zeros_like(floor), zero, jnp.outer(zero, zero))
     first = State(none, start, jnp.asarray(damping, start.dtype), jnp.asarray(0), jnp.asarray(False))
     return lax.while_loop(going, advance, first)
-
-
-def errors_of(
-    normal: Float[np.ndarray, "leaves n n"], width: Float[np.ndarray, "leaves n"]
-) -> Float[np.ndarray, "leaves n"]:
-    """Standard errors from normal matrices; infinite where collinear or above the bounds' `width`."""
-    norm = np.sqrt(np.diagonal(normal, axis1=1, axis2=2))
-    norm = np.where(norm > 0, norm, 1.0)
-    value, vector = np.linalg.eigh(normal / (norm[:, :, None] * norm[:, None, :]))
-    known = (value > _COLLINEAR)[:, None, :]
-    share = vector**2
-    variance = np.sum(share / np.where(known, value[:, None, :], np.inf), axis=2)
-    lost = np.sum(np.where(known, 0.0, share), axis=2) > 1e-3
-    errors = np.sqrt(variance) / norm
-    return np.where(lost | (errors > width), np.inf, errors)

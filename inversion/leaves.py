@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, final
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
@@ -14,7 +15,9 @@ from jaxlidar.optics.coefficients import TRAITS
 from jaxlidar.optics.leaf_surface import LeafSurface
 from jaxlidar.optics.prospect import material
 
-from .leaf_solver import Task, errors_of, fit_all, rounding
+from .leaf_domains import bands_of, domains_of
+from .leaf_errors import Stage, inverse_root, trait_errors
+from .leaf_solver import State, Task, fit_all
 
 _BOUNDS = {
     "N": (1.0, 5.0),
@@ -43,12 +46,13 @@ class LeafFit(eqx.Module):
     summary.
 
     - `traits`: by name, (leaves,) best values.
-    - `stderr`: by name, (leaves,) one standard error; infinite where the spectra do not constrain the trait.
-      That of a trait on a bound is computed as if there were no bound.
+    - `stderr`: by name, (leaves,) one standard error, of noise and PROSPECT's own error; infinite where the
+      spectra do not constrain the trait. That of a trait on a bound is computed as if there were no bound.
     - `at_bound`: by name, (leaves,) whether the value lies on one of its bounds.
+    - `domain`: by name, (intervals, 2) first and last wavelength, nm, of the bands that gave the trait.
     - `leaves`: the fitted leaves, for `prospect_spectra`: a `Prospect` whose traits have shape (leaves,).
     - `rmse`: (leaves,) root mean square of the residuals of all samples used, of both spectra; zero where
-      there are none.
+      there are none. This and the next two are of the fit to all bands.
     - `reduced_chi2`: (leaves,) sum of squared residuals over their variances, divided by the number of
       samples less that of unknowns. One by construction where no noise was given.
     - `n_steps`: (leaves,) points tried with all bands, each one PROSPECT with its Jacobian. Two is usual:
@@ -70,6 +74,7 @@ class LeafFit(eqx.Module):
     traits: dict[str, Float[Array, " leaves"]]
     stderr: dict[str, Float[Array, " leaves"]]
     at_bound: dict[str, Bool[Array, " leaves"]]
+    domain: dict[str, Float[Array, "intervals 2"]]
     leaves: Prospect
     rmse: Float[Array, " leaves"]
     reduced_chi2: Float[Array, " leaves"]
@@ -115,6 +120,7 @@ def invert_leaves(
     unknowns: Sequence[str] | None = None,
     leaf: Prospect | None = None,
     bounds: Mapping[str, Sequence[float]] | None = None,
+    domain: str | Mapping[str, Sequence] | None = None,
     noise: ArrayLike | Sequence | None = None,
     max_steps: int = 50,
     chunk: int = 20,
@@ -125,11 +131,23 @@ def invert_leaves(
     converge is marked so in its status and does not affect the others. Results are in JAX's default
     precision. Equal shapes compile once (a few seconds).
 
-    On measured leaves PROSPECT's own error, which is correlated between neighbouring bands, exceeds the
-    noise. Standard errors take samples as independent and are then too small. The choice of traits matters:
-    without Cant and Cbrown, `unknowns=("N", "Cab", "Car", "Cw", "Cm")`, root mean squared errors in ug/cm2
-    become 4.9 instead of 6.6 (Cab) and 3.7 instead of 2.7 (Car) on ANGERS, 10.9 instead of 8.7 and 4.8
-    instead of 2.9 on LOPEX.
+    Standard errors hold PROSPECT's own error too, correlated over wavelengths; its size and length follow
+    from the residuals of each leaf. They do not hold what residuals do not show, such as an absorption
+    coefficient that is wrong by the same factor everywhere.
+
+    Root mean squared errors on the measured leaves of two databases, and how many of them lie within two
+    standard errors:
+
+    | | Cab, ug/cm2 | Car, ug/cm2 | Cw, cm | Cm, g/cm2 |
+    | --- | --- | --- | --- | --- |
+    | ANGERS, all bands | 6.6, 85 % | 2.7, 82 % | 0.0022, 96 % | 0.0027, 75 % |
+    | ANGERS, recommended | 4.7, 92 % | 2.2, 90 % | 0.0014, 99 % | 0.0010, 99 % |
+    | LOPEX, all bands | 8.7, 78 % | 2.9, 69 % | 0.0010, 100 % | 0.0022, 55 % |
+    | LOPEX, recommended | 10.7, 69 % | 2.6, 69 % | 0.0008, 100 % | 0.0013, 100 % |
+
+    The recommended domains serve Car, Cw and Cm on both; for Cab they are worse on LOPEX. Without Cant and
+    Cbrown, `unknowns=("N", "Cab", "Car", "Cw", "Cm")`, the error of Cab over all bands becomes 4.9 and that
+    of Car 3.7 on ANGERS, 10.9 and 4.8 on LOPEX.
 
     **Arguments:**
 
@@ -143,9 +161,13 @@ def invert_leaves(
       that of `Prospect()`.
     - `bounds`: (low, high) by name. Default None: N 1 to 5; Cab 0 to 150, Car and Cant 0 to 50 ug/cm2; Cbrown
       0 to 5; Cw 0 to 0.1 cm; Cm and Cc 0 to 0.1, Cp 0 to 0.02 g/cm2. Those given replace these by name.
+    - `domain`: the bands that each trait comes from: (low, high) in nm by name, or several such pairs, or
+      "recommended": Cab 700 to 720, Car 520 to 560, Cw and Cm 1700 to 2400. All bands are fitted first.
+      Traits of equal domains are then fitted together to their bands, with N if both spectra are given; the
+      others keep their values. Traits without a domain come from all bands. Default None: all do.
     - `noise`: one standard deviation, above 0, of all samples, or an array that broadcasts to
       (leaves, 2, wavelengths), the middle axis reflectance and transmittance. Infinity leaves a sample out.
-      Default None: unknown and the same for all samples; standard errors are then scaled by the residuals.
+      PROSPECT's own error comes on top. Default None: unknown and the same for all samples.
     - `max_steps`: most points tried by a fit, 1 or more; measured leaves need two to fifteen. Default 50.
     - `chunk`: most leaves fitted at once, 1 or more; speed is the same from 10 to 40. Default 20.
 
@@ -154,10 +176,13 @@ def invert_leaves(
     **Raises:** ValueError naming field, value and admissible range: spectra outside -1 to 2 (in per cent,
     say), of shapes that differ or do not fit the wavelengths, or both None; wavelengths outside the table;
     noise that is not above 0; unknowns or bounds that the version does not have, or given twice; bounds that
-    do not increase or admit N below 1 or negative contents; a start outside its bounds; `max_steps` or
-    `chunk` below 1.
+    do not increase or admit N below 1 or negative contents; a start outside its bounds; a domain that is no
+    pair of wavelengths, of no unknown, or of which the wavelengths do not span half; `max_steps` or `chunk`
+    below 1.
 
-    **Source:** Jacquemoud et al. (1996), Remote Sens. Environ. 56, 194; Feret et al. (2017), 193, 204.
+    **Source:** Jacquemoud et al. (1996), Remote Sens. Environ. 56, 194; Feret et al. (2017), 193, 204;
+    domains of Feret et al. (2019), 231, 110959 and Spafford et al. (2021), 252, 112176, who fit other
+    traits along with Cab and Car and fix the rest at common values; errors as in `inversion.leaf_errors`.
 
     **Example:**
 
@@ -178,40 +203,75 @@ def invert_leaves(
     for field, value in (("max_steps", max_steps), ("chunk", chunk)):
         if value != int(value) or value < 1:
             raise ValueError(f"{field} = {value} is outside the admissible range [1, inf) of integers")
+    x = np.asarray(wavelengths, float)
+    groups = [(group, *bands_of(x, span, group)) for span, group in domains_of(domain, names).items()]
     dtype = jnp.zeros(()).dtype
+    absorption, face = material(leaf, x)
+    absorption, face = absorption.astype(dtype), jax.tree.map(lambda a: jnp.asarray(a, dtype), face)
     sigma = jnp.broadcast_to(jnp.asarray(sigma, dtype), observed.shape)
     start, low, high = (jnp.asarray(a, dtype) for a in (start, low, high))
-    absorption, face = material(leaf, np.asarray(wavelengths, float))
-    end = fit_all(
-        Task(start, low, high, jnp.asarray(observed, dtype), sigma),
-        absorption.astype(dtype),
-        LeafSurface(*(jnp.asarray(x, dtype) for x in face)),
-        len(names),
-        int(max_steps),
-        int(chunk),
+    task = Task(start, low, high, jnp.asarray(observed, dtype), sigma)
+
+    def fit(task: Task, free: Sequence[str], bands: np.ndarray) -> tuple[State, Stage, np.ndarray]:
+        """The fit of some traits, the others fixed, to some bands, and which traits it leaves open."""
+        fixed = np.array([name not in free for name in known])
+        end = fit_all(
+            task._replace(
+                low=jnp.where(fixed[None], task.start, task.low),
+                high=jnp.where(fixed[None], task.start, task.high),
+                observed=task.observed[..., bands],
+                sigma=task.sigma[..., bands],
+            ),
+            absorption[:, bands],
+            LeafSurface(*(a[bands] for a in face)),
+            len(free),
+            int(max_steps),
+            int(chunk),
+        )
+        normal = np.asarray(end.best.normal, float)
+        root, lost = inverse_root(normal * np.outer(~fixed, ~fixed))
+        root = root * ~fixed[:, None]
+        link = root @ root.transpose(0, 2, 1) @ (normal * fixed)
+        used = jnp.broadcast_to(jnp.asarray(bands, dtype), (len(normal), x.size))
+        return end, Stage(end.best.x, jnp.asarray(root, dtype), jnp.asarray(link, dtype), used), lost
+
+    end, stage, lost = fit(task, names, np.ones(x.size, bool))
+    stages, ends = [stage._replace(link=jnp.zeros_like(stage.link))], [end]
+    of, best = np.zeros(len(known), int), end.best.x
+    domains = {name: np.array([[x.min(), x.max()]]) for name in names}
+    both = reflectance is not None and transmittance is not None
+    for group, bands, span in groups:
+        # Of one spectrum alone, the bands of a domain do not tell N apart from the traits.
+        free = [n for n in names if n in group or (n == "N" and both)]
+        other, stage, open_ = fit(task._replace(start=end.best.x), free, bands)
+        mine = np.array([name in group for name in known])
+        of[mine] = len(stages)
+        best, lost = jnp.where(mine[None], other.best.x, best), np.where(mine, open_, lost)
+        domains |= dict.fromkeys(group, span)
+        stages, ends = [*stages, stage], [*ends, other]
+    errors = trait_errors(
+        x, task.observed, sigma, absorption, face, stages, of, noise is not None, int(chunk)
     )
-    best, index = end.best, [known.index(name) for name in names]
-    chi2, square, normal = (np.asarray(a, float) for a in (best.chi2, best.square, best.normal))
+    errors = jnp.where(lost | (errors > task.high - task.low), jnp.inf, errors)
     samples = np.count_nonzero(~np.isnan(observed) & np.isfinite(sigma), axis=(1, 2))
-    reduced = chi2 / np.maximum(samples - len(names), 1)
-    if noise is None:
-        normal = normal / np.maximum(reduced, rounding(dtype) ** 2)[:, None, None]
-        reduced = np.ones_like(reduced)
-    errors = errors_of(normal[:, index][:, :, index], np.asarray(high - low, float)[:, index])
-    stopped = np.where(np.asarray(end.steps) >= max_steps, 1, 2)
-    found = dict(zip(known, best.x.T))
-    at_bound = dict(zip(known, ((best.x <= low) | (best.x >= high)).T))
+    reduced = end.best.chi2 / np.maximum(samples - len(names), 1)
+    done = jnp.stack([e.done for e in ends])
+    tried = jnp.stack([e.steps for e in ends])
+    stopped = jnp.where(jnp.any(~done & (tried >= max_steps), axis=0), 1, 2)
+    found, error = (dict(zip(known, a.T)) for a in (best, errors))
+    at_bound = dict(zip(known, ((best <= task.low) | (best >= task.high)).T))
     # Traits that the version does not have are zero.
-    shown = {name: found.get(name, jnp.zeros_like(best.chi2)) for name in _BOUNDS}
+    shown = {name: found.get(name, jnp.zeros_like(reduced)) for name in _BOUNDS}
     return LeafFit(
         traits={name: found[name] for name in names},
-        stderr=dict(zip(names, jnp.asarray(errors.T, dtype))),
+        stderr={name: error[name] for name in names},
         at_bound={name: at_bound[name] for name in names},
+        domain={name: jnp.asarray(domains[name], dtype) for name in names},
         leaves=eqx.tree_at(lambda p: [getattr(p, n) for n in _BOUNDS], leaf, list(shown.values())),
-        rmse=jnp.asarray(np.sqrt(square / np.maximum(samples, 1)), dtype),
-        reduced_chi2=jnp.asarray(reduced, dtype),
+        rmse=jnp.sqrt(end.best.square / np.maximum(samples, 1)),
+        reduced_chi2=jnp.ones_like(reduced) if noise is None else reduced,
         n_steps=end.steps,
-        status=jnp.asarray(np.where(samples == 0, 3, np.where(end.done, 0, stopped))),
+        status=jnp.where(samples == 0, 3, jnp.where(jnp.all(done, axis=0), 0, stopped)),
     )
 
 

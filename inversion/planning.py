@@ -10,6 +10,7 @@ from jaxtyping import Float
 from jaxlidar import Lidar, Plan, Scene
 from jaxlidar import plan as make_plan
 from jaxlidar.extend import check_integer, check_kind
+from jaxlidar.planning.effects import empty
 from jaxlidar.planning.ladder import rung
 from jaxlidar.planning.path_lengths import PathLengths
 from jaxlidar.planning.plan import MIN_BATCHES
@@ -83,6 +84,8 @@ def plan_for(
     window = (float(time[0]), float(time[0]) + (time.size - 1 + 1e-3) * interval)
     scenes = corners(scene, settled)
     common = {"window": window, "n_photons": photons, "n_rays": rays, "describe": False}
+    # What is zero at the start may be more elsewhere.
+    common["effects"] = dict.fromkeys(empty(scenes[0]), True)
     first = make_plan(lidar, scenes[0], max_orders=max_orders, **common)
     common.update(max_orders=first.orders, bin_width=first.bins.width)
     if scene.canopy is not None:

@@ -7,10 +7,13 @@ from typing import final
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxlidar import Scene, Waveform
+from jaxlidar.extend import briefly
 from jaxlidar.io import save
+
+from .quality import Verdict, judge_fit
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,6 +45,7 @@ class Step:
 
 
 @final
+@briefly
 class Retrieval(eqx.Module):
     """The result of `retrieve`: values of the unknowns, their standard errors, and the fitted scene.
 
@@ -51,6 +55,10 @@ class Retrieval(eqx.Module):
     - `values`: best values.
     - `stderr`: one standard error each, of the same shapes; infinite where the data do not constrain the
       unknown.
+    - `robust_stderr`: `stderr` widened by misfit and, with several starts, by the spread over their ends;
+      never narrower. To be used for records, which no model fits to the noise: see `inversion.misfit`.
+    - `prior_share`: share of the information on each unknown that is the prior's, 0 to 1.
+    - `at_bound`: whether an unknown lies at one of its bounds.
     - `simulation_error`: the part of `stderr` that comes from the simulation's own noise; it falls with
       `n_photons`.
     - `covariance`, `correlation`: (n, n). An unknown of infinite variance has no covariance with others.
@@ -59,6 +67,10 @@ class Retrieval(eqx.Module):
     - `residuals`: (wavelengths, bins) observed minus fitted over its standard deviation; zero where the
       sample was left out.
     - `reduced_chi2`: sum of squared residuals over the number of samples less that of determined unknowns.
+    - `second_minimum`: rise in chi-squared, in units of the reduced one and of independent samples, from the
+      best end to the next that lies elsewhere; infinite where no start ended there.
+    - `independent_samples`: how many independent samples tell as much as those fitted, whose residuals are
+      correlated.
     - `converged`: whether the fit ended at a minimum.
     - `status`: how the fit ended, in a sentence.
     - `steps`: waveforms simulated, each with its Jacobian.
@@ -79,6 +91,9 @@ class Retrieval(eqx.Module):
 
     values: dict[str, Float[Array, "..."]]
     stderr: dict[str, Float[Array, "..."]]
+    robust_stderr: dict[str, Float[Array, "..."]]
+    prior_share: dict[str, Float[Array, "..."]]
+    at_bound: dict[str, Bool[Array, "..."]]
     simulation_error: dict[str, Float[Array, "..."]]
     covariance: Float[Array, "n n"]
     correlation: Float[Array, "n n"]
@@ -86,11 +101,18 @@ class Retrieval(eqx.Module):
     waveform: Waveform
     residuals: Float[Array, "wavelengths bins"]
     reduced_chi2: Float[Array, ""]
+    second_minimum: Float[Array, ""]
+    independent_samples: Float[Array, ""]
     converged: bool = eqx.field(static=True)
     status: str = eqx.field(static=True)
     steps: int = eqx.field(static=True)
     history: tuple[float, ...] = eqx.field(static=True)
     labels: tuple[str, ...] = eqx.field(static=True)
+
+    @property
+    def quality(self) -> Verdict:
+        """Whether the fit can be trusted, with reasons: `inversion.judge_fit` with all unknowns."""
+        return judge_fit(self)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the result as a netCDF file, which `jaxlidar.open` reads.

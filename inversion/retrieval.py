@@ -161,6 +161,9 @@ def retrieval_of(outcome: Outcome, model: Model, settled: list[Settled], scaled:
     return Retrieval(
         values=by_name(outcome.values),
         stderr=by_name(outcome.stderr),
+        robust_stderr=by_name(outcome.robust_stderr),
+        prior_share=by_name(outcome.prior_share),
+        at_bound=by_name(outcome.at_bound),
         simulation_error=by_name(outcome.simulation_error),
         covariance=jnp.asarray(outcome.covariance),
         correlation=jnp.asarray(outcome.correlation),
@@ -168,6 +171,8 @@ def retrieval_of(outcome: Outcome, model: Model, settled: list[Settled], scaled:
         waveform=model.waveform(flat, outcome.evaluation, outcome.simulation),
         residuals=jnp.asarray(outcome.residuals),
         reduced_chi2=jnp.asarray(outcome.reduced_chi2),
+        second_minimum=jnp.asarray(outcome.second_minimum),
+        independent_samples=jnp.asarray(outcome.independent_samples),
         converged=outcome.converged,
         status=outcome.status,
         steps=outcome.steps,

@@ -6,7 +6,7 @@ With whitened Jacobian J and prior precision P, H = J^T J + P, the covariance of
 
 with W the share of the weights' variance that is measurement noise, and d the deviations of the simulation's
 batches from their mean. The second term is the simulation's own noise, with all correlation between its bins
-and wavelengths.
+and wavelengths. The diagonal of H^-1 P is the share of what is known of each unknown that is the prior's.
 """
 
 from typing import NamedTuple
@@ -25,11 +25,15 @@ class Errors(NamedTuple):
       whose covariance is as if the open ones were free.
     - `simulation`: standard errors from the simulation's noise alone.
     - `open`: whether the data do not constrain the unknown.
+    - `inverse`: of the information H; zero where no eigenvalue tells.
+    - `prior_share`: of the information on each unknown, from 0 (all from the data) to 1 (all from the prior).
     """
 
     covariance: Float[np.ndarray, "n n"]
     simulation: Float[np.ndarray, " n"]
     open: np.ndarray
+    inverse: Float[np.ndarray, "n n"]
+    prior_share: Float[np.ndarray, " n"]
 
 
 def errors_of(
@@ -58,6 +62,7 @@ def errors_of(
     information = jacobian.T @ jacobian + np.diag(precision)
     scaled = information * np.outer(width, width)
     opened = np.diag(scaled) < 1.0
+    alone = precision / np.where(precision > 0, np.diag(information), 1.0)
     keep = np.flatnonzero(~opened)
     norm = np.sqrt(np.diag(information)[keep])
     value, vector = np.linalg.eigh(information[np.ix_(keep, keep)] / np.outer(norm, norm))
@@ -67,6 +72,7 @@ def errors_of(
     inverse[np.ix_(keep, keep)] = (
         (vector[:, known] / value[known]) @ vector[:, known].T / np.outer(norm, norm)
     )
+    share = np.clip(np.where(opened, alone, np.diag(inverse) * precision), 0.0, 1.0)
     middle = (jacobian.T * measured) @ jacobian + np.diag(precision)
     covariance = inverse @ middle @ inverse
     simulation = np.zeros((n, n))
@@ -78,7 +84,8 @@ def errors_of(
     covariance[opened, :] = 0.0
     covariance[:, opened] = 0.0
     covariance[opened, opened] = np.inf
-    return Errors(covariance, np.where(opened, 0.0, np.sqrt(np.diag(simulation))), opened)
+    simulated = np.where(opened, 0.0, np.sqrt(np.diag(simulation)))
+    return Errors(covariance, simulated, opened, inverse, share)
 
 
 def correlation_of(covariance: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:

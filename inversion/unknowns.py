@@ -317,7 +317,10 @@ def optical_leaves(scene: Scene) -> frozenset[int]:
         match [getattr(key, "name", None) for key in path]:
             case ["canopy", "leaf", *_]:
                 return not straight
-            case ["canopy", "bark", *_] | ["ground", "reflectance", *_] | ["atmosphere", *_]:
+            case ["ground", "reflectance", *_]:
+                # Where it varies from place to place, light is traced with it.
+                return scene.ground is None or scene.ground.pattern is None
+            case ["canopy", "bark", *_] | ["atmosphere", *_]:
                 return True
             case ["plates", _, "reflectance" | "transmittance", *_]:
                 return True

@@ -13,9 +13,16 @@ from typing import TYPE_CHECKING, Any
 from jaxlidar import extend, io
 from jaxlidar._checks import UnitWarning
 from jaxlidar._constants import SPEED_OF_LIGHT
+from jaxlidar._workers import LostWorkersWarning
 from jaxlidar.analog import AnalogReturns, analog_returns, photon_paths
+from jaxlidar.campaign.coverage import OffMapWarning
+from jaxlidar.campaign.progress import SurveyProgress
+from jaxlidar.campaign.run import simulate_many
+from jaxlidar.campaign.truths import Truths
+from jaxlidar.campaign.waveforms import Waveforms
 from jaxlidar.energy import EnergyBudget, energy_budget
 from jaxlidar.instrument.lidar import Lidar
+from jaxlidar.instrument.photon_counter import PhotonCounter, PhotonEvents
 from jaxlidar.instrument.pulse import (
     AbstractPulse,
     ExponentiallyModifiedGaussianPulse,
@@ -24,6 +31,8 @@ from jaxlidar.instrument.pulse import (
     SampledPulse,
 )
 from jaxlidar.instrument.receiver import Receiver, first_return_window, record
+from jaxlidar.instrument.scan import AbstractScan, Conical, Oscillating, RotatingPolygon
+from jaxlidar.instrument.survey import Survey
 from jaxlidar.io.netcdf import open, repeat
 from jaxlidar.optics.coefficients import load_coefficients
 from jaxlidar.optics.laws import AbstractLaw, AbstractMirror, EqualAngle, Lambertian, Specular
@@ -40,6 +49,7 @@ from jaxlidar.planning.setup import Setup, reduce
 from jaxlidar.plants.forest import forest
 from jaxlidar.plants.habits import Branching, Habit, broadleaf, conifer, grow, shrub, spreading
 from jaxlidar.plants.lsystem import LSystem, Module, Rule, Word
+from jaxlidar.plants.meshes import Mesh, voxelise_mesh
 from jaxlidar.plants.tree import Tree
 from jaxlidar.plants.turtle import turtle
 from jaxlidar.plants.voxelise import crop, voxelise, voxelise_points
@@ -48,9 +58,11 @@ from jaxlidar.scenes.canopy import Canopy
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.shapes import AbstractShape, Plane
 from jaxlidar.scenes.surfaces import AbstractGround, AbstractSheet, AbstractSurface, Ground, Plate
+from jaxlidar.scenes.terrain import Terrain
 from jaxlidar.scenes.voxels import VoxelMap
 from jaxlidar.simulate import LateLightWarning, Progress, simulate
 from jaxlidar.trace.response import Response, trace_scene
+from jaxlidar.truth import Truth, truth_of
 from jaxlidar.waveform import Waveform, total_of, waveform_of
 
 if TYPE_CHECKING:
@@ -63,6 +75,7 @@ __all__ = [
     "AbstractMirror",
     "AbstractPhase",
     "AbstractPulse",
+    "AbstractScan",
     "AbstractShape",
     "AbstractSheet",
     "AbstractSurface",
@@ -70,6 +83,7 @@ __all__ = [
     "Atmosphere",
     "Branching",
     "Canopy",
+    "Conical",
     "Effect",
     "EnergyBudget",
     "EqualAngle",
@@ -86,7 +100,13 @@ __all__ = [
     "LeafOptics",
     "LeafSurface",
     "Lidar",
+    "LostWorkersWarning",
+    "Mesh",
     "Module",
+    "OffMapWarning",
+    "Oscillating",
+    "PhotonCounter",
+    "PhotonEvents",
     "Plan",
     "Plane",
     "Plate",
@@ -95,16 +115,23 @@ __all__ = [
     "Receiver",
     "RectangularPulse",
     "Response",
+    "RotatingPolygon",
     "Rule",
     "SampledPulse",
     "Scene",
     "Setup",
     "Specular",
     "Spectrum",
+    "Survey",
+    "SurveyProgress",
+    "Terrain",
     "Tree",
+    "Truth",
+    "Truths",
     "UnitWarning",
     "VoxelMap",
     "Waveform",
+    "Waveforms",
     "Word",
     "analog_returns",
     "broadleaf",
@@ -131,13 +158,16 @@ __all__ = [
     "repeat",
     "shrub",
     "simulate",
+    "simulate_many",
     "spectra",
     "spectrum",
     "spreading",
     "total_of",
     "trace_scene",
+    "truth_of",
     "turtle",
     "voxelise",
+    "voxelise_mesh",
     "voxelise_points",
     "waveform_of",
 ]

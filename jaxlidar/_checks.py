@@ -254,7 +254,14 @@ def _is_ragged(x: object) -> bool:
     """Whether a nested sequence has rows of different lengths."""
     if not isinstance(x, Sequence):
         return False
-    return any(map(_is_ragged, x)) or len({jnp.shape(a) for a in x}) > 1  # pyright: ignore[reportArgumentType]
+    return any(map(_is_ragged, x)) or len({_shape(a) for a in x}) > 1
+
+
+def _shape(x: Any) -> tuple[int, ...]:
+    """The shape of a number, an array or a nested sequence that is not ragged."""
+    if not isinstance(x, Sequence):
+        return np.shape(x)
+    return (len(x), *(_shape(x[0]) if len(x) else ()))
 
 
 def check_key(key: Any) -> None:

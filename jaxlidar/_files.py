@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,7 +11,8 @@ from pathlib import Path
 def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     """A temporary path beside `path`, which takes its place when the block ends without an error.
 
-    Whoever reads `path` finds the old file or the new one, never half. Missing folders are made.
+    Whoever reads `path` finds the old file or the new one, never half. Missing folders are made. The block
+    may also make a folder: the old one is moved aside first.
 
     **Arguments:** `path`: the file to write.
 
@@ -31,8 +33,20 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     draft = path.with_name(f".{path.name}.{os.getpid()}.part")
+    aside = draft.with_suffix(".old")
     try:
         yield draft
-        draft.replace(path)
+        if draft.is_dir() and path.is_dir():
+            path.replace(aside)
+        try:
+            draft.replace(path)
+        except OSError:
+            if aside.exists():
+                aside.replace(path)
+            raise
     finally:
-        draft.unlink(missing_ok=True)
+        for left in (draft, aside):
+            if left.is_dir():
+                shutil.rmtree(left)
+            else:
+                left.unlink(missing_ok=True)

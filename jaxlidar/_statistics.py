@@ -1,6 +1,7 @@
 """Means of batches and their standard errors."""
 
 import math
+from typing import Any
 
 import numpy as np
 from jaxtyping import ArrayLike, Float
@@ -9,7 +10,7 @@ from jaxtyping import ArrayLike, Float
 COUNTS = 0.01
 
 
-def widening(batches: int) -> float:
+def widening(batches: Any) -> Any:
     """Quantile of Student's t for the probability of two standard errors of a normal distribution, over two.
 
     By its expansion in 1 / degrees of freedom (Abramowitz and Stegun 26.7.5): to 0.1 % for eight batches.
@@ -50,11 +51,18 @@ class Moments:
 
 def errors_of(moments: Moments) -> tuple[float, float]:
     """Relative error of a waveform (see `jaxlidar.simulate`), and its largest standard error."""
-    mean, stderr = moments.mean, moments.stderr
-    seen = mean > COUNTS * np.max(mean, axis=1, keepdims=True)
-    squares = np.where(seen, (stderr / np.where(seen, mean, 1.0)) ** 2, 0.0)
-    relative = np.sqrt(np.sum(squares, axis=1) / np.maximum(np.sum(seen, axis=1), 1))
-    return float(np.max(relative, initial=0.0)), float(np.max(stderr))
+    return float(relative_error(moments.mean, moments.stderr)), float(np.max(moments.stderr))
+
+
+def relative_error(mean: Any, stderr: Any, xp: Any = np) -> Any:
+    """Root mean square of stderr / mean over the samples that count, for the worst wavelength.
+
+    `mean`, `stderr`: (*shots, wavelengths, samples). `xp`: NumPy, or `jax.numpy` within compiled programs.
+    """
+    seen = mean > COUNTS * xp.max(mean, axis=-1, keepdims=True)
+    squares = xp.where(seen, (stderr / xp.where(seen, mean, 1.0)) ** 2, 0.0)
+    relative = xp.sqrt(xp.sum(squares, axis=-1) / xp.maximum(xp.sum(seen, axis=-1), 1))
+    return xp.max(relative, axis=-1, initial=0.0)
 
 
 def batches_needed(batches: int, error: float, rtol: float) -> int:

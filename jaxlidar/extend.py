@@ -10,12 +10,16 @@ For laws, pulses and elements of your own, and for packages on top such as `inve
 - ranges: a class states them by field, `ranges = {"slope": Range(0.0, 90.0)}`; its constructor calls
   `check_ranges`, and `inadmissible` finds values outside them where JAX is tracing, `reasons` says which.
 - `check_kinds` refuses what is no lidar or no scene.
+- `briefly` lets `help` show a class's arguments without their types.
+- `fingerprint` tells whether all that a result depends on is as it was.
 - `side_by_side` runs compiled programs on as many threads as there are cores; compile them with `ONE_CORE`.
+- `outcomes` does tasks that `task` makes, here or by the workers of an executor.
 """
 
 from jaxlidar._checks import (
     as_array,
     as_scalar,
+    briefly,
     check_choice,
     check_integer,
     check_key,
@@ -24,6 +28,7 @@ from jaxlidar._checks import (
     check_range,
     concrete,
 )
+from jaxlidar._fingerprint import fingerprint
 from jaxlidar._ranges import Range, check_ranges, inadmissible, reasons
 from jaxlidar._threads import ONE_CORE, side_by_side
 from jaxlidar._vectors import (
@@ -40,6 +45,7 @@ from jaxlidar._vectors import (
     scale,
     vec,
 )
+from jaxlidar._workers import outcomes, task
 from jaxlidar.scenes.scene import check_kinds
 
 __all__ = [
@@ -52,6 +58,7 @@ __all__ = [
     "along",
     "as_array",
     "as_scalar",
+    "briefly",
     "check_choice",
     "check_integer",
     "check_key",
@@ -63,12 +70,15 @@ __all__ = [
     "concrete",
     "cross",
     "dot",
+    "fingerprint",
     "from_frame",
     "inadmissible",
     "normalise",
+    "outcomes",
     "polar",
     "reasons",
     "scale",
     "side_by_side",
+    "task",
     "vec",
 ]

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxlidar._checks import check_integer, check_key, check_range, is_traced
+from jaxlidar._checks import check_flag, check_integer, check_key, check_range, is_traced
 from jaxlidar._programs import Program
 from jaxlidar._statistics import Moments, batches_needed, errors_of, widening
 from jaxlidar._summary import NOTABLE, late_share, percent
@@ -26,6 +26,7 @@ from jaxlidar.scenes.scene import Scene, check_kinds
 from jaxlidar.trace.colouring import Balance, Recording, balance, recording_of, recording_with_room, total
 from jaxlidar.trace.response import Response, trace_setting
 from jaxlidar.trace.setting import Setting, setting_of, straight_transmittance
+from jaxlidar.truth import truth_of_setup
 from jaxlidar.waveform import Waveform, open_at_first_return, recorded, trimmed
 
 # Photons of one batch at most: a batch cannot be interrupted.
@@ -83,6 +84,7 @@ def simulate(
     effects: Mapping[str, bool] | None = None,
     max_memory: float | None = None,
     max_seconds: float = math.inf,
+    truth: bool = False,
     progress: Callable[[Progress], None] | None = None,
 ) -> Waveform:
     """The waveform that `lidar` records of `scene`.
@@ -114,6 +116,8 @@ def simulate(
       `jaxlidar.plan`. Default None: as there.
     - `max_seconds`: stop after this time in s, however large the error; positive. At least eight batches are
       traced. Default inf.
+    - `truth`: whether to add what the beam meets in the scene, as labels for algorithms: `Waveform.truth`.
+      Default False.
     - `progress`: a function called with a `Progress` after every round of batches; for instance `print`.
       Default None.
 
@@ -133,6 +137,7 @@ def simulate(
     """
     check_kinds(lidar, scene)
     check_key(key)
+    check_flag("truth", truth)
     planning = {
         "max_orders": max_orders,
         "max_step": max_step,
@@ -156,7 +161,8 @@ def simulate(
         plan = dataclasses.replace(plan, limits=plan.limits._replace(automatic_orders=True))
         ready = _prepared(reduce(lidar, scene, plan), key)
         traced = _trace_until(ready, key, goal._replace(max_seconds=max_seconds - spent), progress)
-    return _recorded(ready, traced)
+    wave = _recorded(ready, traced)
+    return dataclasses.replace(wave, truth=truth_of_setup(ready.setup)) if truth else wave
 
 
 class _Ready(NamedTuple):

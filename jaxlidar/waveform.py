@@ -18,6 +18,7 @@ from jaxlidar.instrument.receiver import first_return_window, record
 from jaxlidar.planning.setup import Setup
 from jaxlidar.trace.colouring import Recording, balance, components, height_of, recording_of, total
 from jaxlidar.trace.response import Response
+from jaxlidar.truth import Truth
 
 
 @final
@@ -45,6 +46,7 @@ class Waveform(eqx.Module):
       added, saturated, cut at the detection threshold, quantised. `jaxlidar.record` draws noise as well.
     - `wavelength`: (wavelengths,) nm, the lidar's.
     - `info`: dict: "photons", "batches", "seconds", "error" reached, and why the simulation "stopped".
+    - `truth`: a `Truth`, what the beam meets in the scene; None where it was not asked for.
 
     **Example:**
 
@@ -71,6 +73,13 @@ class Waveform(eqx.Module):
     recorded: Float[Array, "wavelengths bins"]
     wavelength: Float[Array, "wavelengths"]
     info: dict = eqx.field(static=True)
+    truth: Truth | None = None
+
+    @property
+    def first_order_share(self) -> Float[Array, "wavelengths"]:
+        """Share of `reflectance` that was scattered once, (wavelengths,); 1 where nothing returns."""
+        first, whole = (jnp.sum(a, axis=1) for a in (self.components["first"], self.reflectance))
+        return jnp.where(whole > 0, first / jnp.where(whole > 0, whole, 1.0), 1.0)
 
     def nan_where_lost(self, share: float = 0.01) -> "Waveform":
         """The same waveform, NaN at wavelengths that lost more than a share of their reflectance.
@@ -183,7 +192,7 @@ def recorded(response: Response, recording: Recording) -> Waveform:
     parts = components(response, recording)
     reflectance = parts["first"] + parts["higher"]
     ledger, neglected, lost = balance(response, recording)
-    energy = reflectance * _received(lidar, time)
+    energy = reflectance * received(lidar, time)
     return Waveform(
         time=time,
         height=height_of(lidar, time),
@@ -213,7 +222,7 @@ def trimmed(wave: Waveform, wavelengths: int, samples: int) -> Waveform:
     return jax.device_put(eqx.tree_at(lambda w: (w.time, w.height), cut, times))
 
 
-def _received(lidar: Lidar, time: Float[Array, "bins"]) -> Float[Array, "wavelengths bins"]:
+def received(lidar: Lidar, time: Float[Array, "bins"]) -> Float[Array, "wavelengths bins"]:
     """J per apparent reflectance, E_t eta A_r / (pi R^2): a Lambertian target that fills the footprint."""
     slant = lidar.range_to_reference + 0.5 * SPEED_OF_LIGHT * time
     share = lidar.aperture_area / (jnp.pi * jnp.maximum(slant, 1e-3) ** 2)

@@ -26,11 +26,13 @@ ROOMS = [
     "plants",
     "planning",
     "trace",
+    "truth",
     "waveform",
     "simulate",
     "energy",
     "analog",
     "io",
+    "campaign",
     "plot",
     "cli",
 ]
@@ -39,14 +41,26 @@ HELPERS = {path.stem for path in (ROOT / "jaxlidar").glob("_*.py")} - {"__init__
 # Within rooms, files in the order in which they use one another; those not named use none of the others.
 ORDER = {
     "optics": ["coefficients", "leaf_surface", "plate_model", "spectra", "prospect"],
-    "instrument": ["pulse_integrals", "pulse", "receiver", "lidar"],
-    "scenes": ["voxels", "atmosphere", "shapes", "surfaces", "canopy", "scene"],
-    "plants": ["lsystem", "tree", "turtle", "habits", "voxelise", "forest", "demo"],
+    "instrument": ["pulse_integrals", "pulse", "photon_counter", "receiver", "lidar", "scan", "survey"],
+    "scenes": [
+        "raster",
+        "shapes",
+        "height_field",
+        "surfaces",
+        "terrain",
+        "voxels",
+        "atmosphere",
+        "canopy",
+        "scene",
+    ],
+    "plants": ["lsystem", "tree", "turtle", "habits", "grid", "voxelise", "meshes", "forest", "demo"],
     "planning": [
         "trace_plan",
         "ladder",
         "local_origin",
         "memory",
+        "rims",
+        "parallel_light",
         "path_lengths",
         "scatterers",
         "effects",
@@ -69,6 +83,8 @@ ORDER = {
         "march",
         "photons",
         "setting",
+        "labels",
+        "nodes",
         "collisions",
         "flight",
         "fates",
@@ -78,6 +94,23 @@ ORDER = {
         "higher_orders",
         "response",
         "colouring",
+        "node_response",
+    ],
+    "campaign": [
+        "progress",
+        "records",
+        "coverage",
+        "irradiance",
+        "tiles",
+        "shots",
+        "shared",
+        "sharing",
+        "ways",
+        "truths",
+        "with_truth",
+        "waveforms",
+        "gathering",
+        "run",
     ],
 }
 MODULES = sorted(path for folder in ("jaxlidar", "inversion") for path in (ROOT / folder).rglob("*.py"))
@@ -107,9 +140,10 @@ def test_jaxlidar_never_imports_inversion():
 
 def test_the_top_level_has_few_modules():
     found = {path.stem for path in (ROOT / "jaxlidar").glob("[!_]*.py")}
-    assert found == {"simulate", "waveform", "energy", "analog", "extend"}
+    assert found == {"simulate", "waveform", "truth", "energy", "analog", "extend"}
     folders = {path.name for path in (ROOT / "jaxlidar").iterdir() if (path / "__init__.py").exists()}
-    assert folders == {"optics", "instrument", "scenes", "plants", "planning", "trace", "io", "plot", "cli"}
+    files = {"waveform", "truth", "simulate", "energy", "analog"}
+    assert folders == set(ROOMS) - files
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "jaxlidar").rglob("*.py")), ids=named)

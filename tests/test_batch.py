@@ -1,5 +1,6 @@
 """Many fits at once: the same as one at a time, each on its own, and resumed where they were interrupted."""
 
+import concurrent.futures
 import dataclasses
 import subprocess
 import sys
@@ -7,6 +8,7 @@ import sys
 import jax
 import numpy as np
 import pytest
+from test_campaign import Dying
 
 import inversion
 import jaxlidar as jl
@@ -44,6 +46,34 @@ def fit(footprints, lidar=LIDAR, scene=START, unknowns=UNKNOWNS, **more):
     observed, noise, time = footprints
     given = {"noise": noise, "time": time, "key": jax.random.key(1), "lanes": 6, **more}
     return inversion.retrieve_many(observed, lidar, scene, unknowns, **given)
+
+
+@pytest.mark.parametrize("own", [{}, {"starts": 2}, {"max_orders": 2, "n_photons": 1024, "max_steps": 3}])
+def test_workers_give_the_same_fits(footprints, own):
+    """One lidar for all, and for each, with an unknown that starts elsewhere in each footprint."""
+    own |= {"lidar": [LIDAR] * COUNT, "start": {"height": np.linspace(-0.2, 0.7, COUNT)}, "lanes": 2}
+    here, seen = fit(footprints, **own), []
+    with concurrent.futures.ThreadPoolExecutor(2) as pool:
+        there = fit(footprints, **own, executor=pool, progress=seen.append)
+    assert here.status == there.status
+    for name in ("values", "stderr", "covariance", "reduced_chi2", "converged", "steps", "fitted"):
+        pairs = zip(jax.tree.leaves(getattr(here, name)), jax.tree.leaves(getattr(there, name)), strict=True)
+        assert all(np.array_equal(a, b) for a, b in pairs), name
+    assert [p.done for p in seen] == list(range(1, COUNT + 1))
+
+
+def test_a_worker_that_dies_costs_its_fits_a_second_try(footprints, tmp_path):
+    here, path = fit(footprints, lanes=2), tmp_path / "fits.sqlite"
+    dying = Dying([1])
+    assert np.array_equal(fit(footprints, lanes=2, executor=dying).fitted, here.fitted)
+    assert dying.given.count(1) == 2
+    with pytest.raises(RuntimeError, match="the workers of chunk 1 died twice"):
+        fit(footprints, lanes=2, executor=Dying([1, 1]), path=path)
+    # What the others had done is kept.
+    seen = []
+    again = fit(footprints, lanes=2, path=path, progress=seen.append)
+    assert np.array_equal(again.fitted, here.fitted)
+    assert seen[0].done > 1
 
 
 def test_every_footprint_is_found_within_its_errors(footprints):

@@ -52,6 +52,13 @@ PARTS = {
     "Scene": jl.Scene(),
     "Ground": with_ground(height=1 / 3, reflectance=(0.1, 0.2), slope=89.9, aspect=-720.1),
     "Plate": jl.Scene(plates=[jl.Plate(1.1, 0.2, 0.3), jl.Plate(2.2, [0.1], 0.0, 0.5, 1.0, 2.0, "diffuse")]),
+    "Terrain": jl.Scene(ground=jl.Terrain(
+        RANDOM.random((3, 2)), (0.7, 1 / 3), (4e6 / 7, 1e-9), RANDOM.random((3, 2)), sides="periodic",
+        relief=False,
+    )),
+    "Survey": jl.Survey(
+        jl.Lidar(altitude=1 / 3e-4), 6e5 + RANDOM.random((40, 2)), RANDOM.random(40), 1 / 3
+    ),
     "EqualAngle": with_ground(law=jl.EqualAngle()),
     "Lambertian": jl.Scene(plates=(jl.Plate(1.0, 0.1, law=jl.Lambertian()),)),
     "Specular": with_ground(law=jl.Specular(roughness=0.0123)),
@@ -70,7 +77,8 @@ PARTS = {
 
 
 def case_of(part, **more):
-    return jl.io.Case(**{"lidar" if isinstance(part, jl.Lidar) else "scene": part}, **more)
+    kinds = {jl.Lidar: "lidar", jl.Survey: "survey", jl.Scene: "scene"}
+    return jl.io.Case(**{kinds[type(part)]: part}, **more)
 
 
 def round_trip(case, tmp_path):
@@ -104,7 +112,8 @@ def test_every_class_comes_back_to_the_bit(name, x64, tmp_path):
         if x64:
             sent = jax.tree.map(lambda x: x * (1 - 2**-50), sent)
         back = round_trip(case_of(sent), tmp_path)
-        assert same((back.lidar, back.scene), (case_of(sent).lidar, case_of(sent).scene))
+        case = case_of(sent)
+        assert same((back.lidar, back.survey, back.scene), (case.lidar, case.survey, case.scene))
 
 
 def test_one_bit_is_noticed():
@@ -115,7 +124,9 @@ def test_one_bit_is_noticed():
 def test_every_class_is_tried():
     classes = {name for name, kind in kinds().items() if isinstance(kind, type)}
     of_plants = {"Habit", "Branching"}
-    assert classes - of_plants - {"Plane"} == {name.partition(",")[0] for name in PARTS}
+    # Patterns of scans are no part of the survey that they make.
+    scans = {"Oscillating", "RotatingPolygon", "Conical"}
+    assert classes - of_plants - scans - {"Plane"} == {name.partition(",")[0] for name in PARTS}
 
 
 def numbers_of(kind):
@@ -129,7 +140,7 @@ def test_every_quantity_has_a_unit_or_is_a_pure_number():
     pure = {"N", "Cbrown", "albedo", "bits", "coverage", "efficiency", "g", "leaf", "bark", "probability"}
     pure |= {"reflectance", "transmittance", "scale", "power", "index", "absorption", "leaf_angles", "fill"}
     pure |= {"rtol", "atol", "n_photons", "n_rays", "lad", "upward", "foot", "a", "b"}
-    pure |= {"density", "shares", "size", "share", "exponent", "length_exponent", "bole", "twig"}
+    pure |= {"density", "shares", "size", "share", "exponent", "length_exponent", "bole", "twig", "beams"}
     for name, kind in kinds().items():
         for argument in numbers_of(kind):
             known = argument in UNITS or (kind, argument) in UNITS_OF
@@ -290,6 +301,54 @@ def test_files_lie_relative_to_the_case(tmp_path, monkeypatch):
     (tmp_path / "a.toml").write_text(text.replace(", fill = 0.0", ""))
     with pytest.raises(ValueError, match=r"1 without a density.*give fill"):
         jl.io.read_case(tmp_path / "a.toml")
+
+
+def test_terrain_is_read_from_its_file_and_kept_in_numbers(tmp_path):
+    head = "ncols 2\nnrows 2\nxllcorner 600000\nyllcorner 5200000\ncellsize 10\n"
+    (tmp_path / "hill.asc").write_text(head + "7 8\n5 6\n")
+    (tmp_path / "a.toml").write_text(
+        "[scene.ground]\nkind = 'read_dem'\npath = 'hill.asc'\nreflectance = 0.2"
+    )
+    scene = jl.io.read_case(tmp_path / "a.toml").scene
+    assert scene.ground.heights.tolist() == [[5.0, 7.0], [6.0, 8.0]]
+    assert scene.ground.origin.tolist() == [600005.0, 5200005.0]
+    jl.io.write_case(tmp_path / "b.toml", jl.io.Case(scene=scene))
+    assert "# m" in next(x for x in (tmp_path / "b.toml").read_text().splitlines() if x.startswith("heights"))
+    assert eqx.tree_equal(jl.io.read_case(tmp_path / "b.toml").scene, scene)
+
+
+SURVEY = """
+[lidar]
+altitude = 500
+[survey]
+kind = "Survey.scan"
+pattern = {kind = "Conical", half_angle = 20.0, frequency = 40.0}
+start = [0, 0]
+end = [0, 10]
+speed = 50.0
+pulse_rate = 25.0
+[scene.ground]
+[simulate]
+seed = 0
+max_orders = 1
+"""
+
+
+def test_surveys_are_told_by_a_few_numbers(tmp_path):
+    (tmp_path / "a.toml").write_text(SURVEY)
+    case = jl.io.read_case(tmp_path / "a.toml")
+    line = {"start": (0, 0), "end": (0, 10), "speed": 50.0, "pulse_rate": 25.0}
+    scan = jl.Conical(half_angle=20.0, frequency=40.0)
+    assert same(case.survey, jl.Survey.scan(jl.Lidar(altitude=500.0), scan, **line))
+    many = case.simulate(path=tmp_path / "many.nc")
+    assert many.reflectance.shape[:2] == (6, 1)
+    assert len(jl.open(tmp_path / "many.nc")) == 6
+    with pytest.raises(ValueError, match=r"arguments\.atol is not known; the nearest"):
+        jl.io.Case(survey=case.survey, arguments={"atol": 0.1})
+    with pytest.raises(ValueError, match="the case has no scene and no key"):
+        jl.io.Case(survey=case.survey).simulate()
+    with pytest.raises(ValueError, match="without a survey"):
+        jl.io.Case(jl.Lidar(), case.scene, case.key).simulate(path=tmp_path / "one.nc")
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):

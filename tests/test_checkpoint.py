@@ -28,8 +28,13 @@ def row(number, **changes):
     made = Row(
         values=np.array([0.5, number]),
         stderr=np.array([0.1, np.inf]),
+        robust_stderr=np.array([0.2, np.inf]),
+        prior_share=np.array([0.0, 1.0]),
+        at_bound=np.array([False, True]),
         covariance=np.diag([0.01, np.inf]),
         reduced_chi2=1.25,
+        second_minimum=np.inf,
+        independent_samples=17.5,
         converged=True,
         steps=4,
         fitted=np.linspace(0.0, 1.0, 30)[None],
@@ -173,7 +178,7 @@ KINDS = ["a file for a folder", "a folder for a file", "a system's folder", "a c
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_cannot_be_written_is_found_before_the_work(tmp_path, monkeypatch, kind):
-    monkeypatch.setattr("inversion.batch.Simulator", lambda *_: pytest.fail("the work began"))
+    monkeypatch.setattr("inversion.job.Simulator", lambda *_: pytest.fail("the work began"))
     with pytest.raises(OSError, match=r"path = .* cannot be written: "):
         inversion.retrieve_many(**PROBLEM | {"path": unwritable(kind, tmp_path)})
 

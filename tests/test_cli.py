@@ -39,8 +39,9 @@ def test_help_names_every_command_and_shows_examples(capsys):
         assert re.search(rf"Examples?:\n    +jaxlidar {name}\b", out), name
 
 
-def test_simulate_writes_what_was_simulated_and_how(tmp_path, capsys):
-    out, plot = tmp_path / "a.nc", tmp_path / "a.png"
+@pytest.mark.parametrize("suffix", [".nc", ".zarr"])
+def test_simulate_writes_what_was_simulated_and_how(tmp_path, capsys, suffix):
+    out, plot = tmp_path / f"a{suffix}", tmp_path / "a.png"
     case = SCENES / "flat_ground.toml"
     assert cli.main(["simulate", str(case), "-o", str(out), "--plot", str(plot)]) == 0
     printed, said = capsys.readouterr()
@@ -57,6 +58,41 @@ def test_simulate_writes_what_was_simulated_and_how(tmp_path, capsys):
     assert np.array_equal(table["reflectance_1064nm"].astype(np.float32), jl.open(out).reflectance[0])
     assert cli.main(["convert", str(out), str(tmp_path / "b.toml")]) == 0
     assert float(jl.io.read_case(tmp_path / "b.toml").scene.ground.reflectance) == 0.5
+
+
+SURVEY = """
+[survey]
+kind = "Survey.grid"
+lidar = {kind = "Lidar"}
+low = [0, 0]
+high = [20, 0]
+spacing = 10.0
+[scene.ground]
+slope = 5.0
+"""
+
+
+@pytest.mark.parametrize("suffix", [".nc", ".zarr"])
+def test_a_survey_is_simulated_shot_by_shot(tmp_path, capsys, suffix):
+    case, out, plot = tmp_path / "a.toml", tmp_path / f"a{suffix}", tmp_path / "a.png"
+    case.write_text(SURVEY)
+    assert cli.main(["simulate", str(case), "-o", str(out), "--plot", str(plot)]) == 0
+    assert capsys.readouterr().out.startswith("3 waveforms of ")
+    assert len(jl.open(out)) == 3
+    # The same call finds it done.
+    assert cli.main(["simulate", str(case), "-o", str(out)]) == 0
+    assert capsys.readouterr().out.startswith("3 waveforms of ")
+    assert plot.read_bytes().startswith(b"\x89PNG")
+    assert cli.main(["info", str(out)]) == 0
+    assert capsys.readouterr().out == f"{jl.open(out)}\n"
+    assert cli.main(["info", str(case)]) == 0
+    assert "survey: Survey(" in capsys.readouterr().out
+    assert cli.main(["plan", str(case)]) == 0
+    assert "slope spread" in capsys.readouterr().out
+    # The file has its case.
+    assert cli.main(["convert", str(out), str(tmp_path / "b.toml")]) == 0
+    assert len(jl.io.read_case(tmp_path / "b.toml").survey) == 3
+    assert np.array_equal(jl.repeat(out).reflectance, jl.open(out).reflectance)
 
 
 def test_an_interrupted_simulation_is_kept(tmp_path, capsys, monkeypatch):
@@ -105,29 +141,6 @@ def test_prospect_prints_and_writes_spectra(tmp_path, capsys):
     assert np.loadtxt(tmp_path / "a.csv", delimiter=",", skiprows=1).shape == (2101, 3)
 
 
-@pytest.mark.parametrize(
-    ("name", "text", "says"),
-    [
-        ("a.csv", "400,0.1\n2400,0.4\n", "spectrum 'a' of 2 samples from 400 to 2400 nm"),
-        ("a.toml", "[scene.ground]\nslope = 5", "scene: Scene("),
-        (
-            "a.vox",
-            "VOXEL SPACE\n#min_corner:(0,0,0)\n#max_corner:(1,1,2)\n#split:(1,1,2)\n"
-            "i j k PadBVTotal\n0 0 0 NaN\n0 0 1 1.5\n",
-            "1 x 1 x 2 voxels of 1 x 1 x 1 m from (0, 0, 0) m\nleaf: 1.5 m2\n1 voxels without a density",
-        ),
-    ],
-)
-def test_info_reads_what_there_is(name, text, says, tmp_path, capsys):
-    (tmp_path / name).write_text(text)
-    assert cli.main(["info", str(tmp_path / name)]) == 0
-    assert capsys.readouterr().out.startswith(says)
-    if name == "a.vox":
-        assert cli.main(["convert", str(tmp_path / name), str(tmp_path / "b.toml")]) == 0
-        assert "taken as empty: 1 voxels without a density" in capsys.readouterr().err
-        assert jl.io.read_case(tmp_path / "b.toml").scene.canopy.voxels.shape == (1, 1, 2)
-
-
 def test_retrieve_finds_the_ground(tmp_path, capsys):
     scene = jl.Scene(ground=jl.Ground(height=0.5))
     jl.simulate(jl.Lidar(), scene, key=jax.random.key(0)).save(tmp_path / "wave.nc")
@@ -159,11 +172,14 @@ def test_compiled_programs_are_kept_unless_refused(tmp_path):
             capture_output=True,
             text=True,
         )
+        assert done.stderr == ""
         return done.stdout.splitlines()[-1].rpartition(" ")
 
     folder, _, status = kept()
     assert status == "0"
     assert folder.startswith(str(tmp_path)) or sys.platform != "linux"
+    # What reads them has nothing to say.
+    assert kept()[0] == folder
     assert kept("--no-cache")[0] == "None"
 
 
@@ -312,9 +328,10 @@ def test_figures_are_renamed_when_whole(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_reading_only_the_first_lines_is_no_failure():
+def test_reading_only_the_first_lines_is_no_failure(tmp_path):
     code = "import sys; from jaxlidar.cli import main; sys.exit(main(['spectra']))"
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
+    environment["XDG_CACHE_HOME"] = str(tmp_path)
     command = f"{shlex.quote(sys.executable)} -c {shlex.quote(code)} | head -n 1"
     ended = subprocess.run(command, shell=True, env=environment, capture_output=True, text=True)
     assert ended.stderr == ""

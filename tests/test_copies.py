@@ -45,6 +45,8 @@ MADE = {
     "jaxlidar.LSystem": jl.LSystem([("A", 0.1)], [jl.Rule("A", grown)]),
     "jaxlidar.Lambertian": jl.Lambertian(),
     "jaxlidar.LateLightWarning": jl.LateLightWarning("late"),
+    "jaxlidar.LostWorkersWarning": jl.LostWorkersWarning("lost"),
+    "jaxlidar.OffMapWarning": jl.OffMapWarning("off"),
     "jaxlidar.LeafAngles": VOXELS.leaf_angles,
     "jaxlidar.LeafOptics": jl.LeafOptics(0.4, 0.3),
     "jaxlidar.LeafSurface": jl.leaf_surface(1.4),
@@ -123,7 +125,8 @@ def fit():
     values = {"<height>": jax.numpy.asarray(0.5)}
     matrix, more = jax.numpy.ones((1, 1)), {"steps": 3, "history": (1.0,), "labels": ("<height>",)}
     return inversion.Retrieval(
-        values, values, values, matrix, matrix, SCENE, wave, 0.5 + 0 * wave.reflectance, matrix[0, 0],
+        values, values, values, values, {"<height>": values["<height>"] > 1.0}, values, matrix, matrix, SCENE,
+        wave, 0.5 + 0 * wave.reflectance, matrix[0, 0], matrix[0, 0], matrix[0, 0],
         converged=True, status="done", **more,
     )  # fmt: skip
 

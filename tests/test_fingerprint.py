@@ -16,7 +16,7 @@ import scipy.special
 import inversion
 import jaxlidar as jl
 from inversion import LogNormal, Unknown
-from inversion.fingerprint import digest_of
+from jaxlidar._fingerprint import digest_of
 from jaxlidar.optics.coefficients import Coefficients, shipped
 
 TIME = np.arange(-60.0, 21.0)
@@ -75,7 +75,7 @@ def begin(**problem):
         raise SimulationBegunError
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("inversion.batch.Simulator", simulator)
+        patch.setattr("inversion.job.Simulator", simulator)
         try:
             inversion.retrieve_many(**problem)
         except SimulationBegunError:

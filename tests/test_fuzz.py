@@ -3,9 +3,12 @@
 import sys
 
 import pytest
-from fuzz import FEW, GOOD, KINDS, PLANTED, hunt, mutants, reader_of, verdict
+from fuzz import FEW, GOOD, hunt, mutants, reader_of, verdict
+from fuzz_kinds import KINDS, PLANTED
 
 FILES = [name for name in KINDS if name != "planted"]
+# What reads a kind of file beside the library itself.
+NEEDS = {"laz": "lazrs", "tiff": "rasterio"}
 linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="children are bounded on Linux only")
 
 
@@ -14,8 +17,8 @@ def verdicts(tmp_path):
     """Gives the verdict and the message for the first mutants of small files, read in this process."""
 
     def read_all(name, count):
-        if name == "laz":
-            pytest.importorskip("lazrs")
+        if name in NEEDS:
+            pytest.importorskip(NEEDS[name])
         kind = KINDS[name]
         for number, data, _ in mutants(name, 0, count, recorded=False):
             path = tmp_path / f"{name}-{number}{kind.ending}"
@@ -41,8 +44,8 @@ def test_what_is_planted_is_found_in_one_process(verdicts):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", FILES)
 def test_mutants(name):
-    if name == "laz":
-        pytest.importorskip("lazrs")
+    if name in NEEDS:
+        pytest.importorskip(NEEDS[name])
     outcomes = hunt(name, FEW[KINDS[name].of])
     assert not [outcome for outcome in outcomes if outcome.verdict not in GOOD]
     for good in GOOD:

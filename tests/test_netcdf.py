@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 import inversion
 import jaxlidar as jl
-from jaxlidar.io import netcdf
+from jaxlidar.io import layouts
 
 h5py = pytest.importorskip("h5py")
 
@@ -39,6 +39,9 @@ def fit(wave, case):
     return inversion.Retrieval(
         values=values,
         stderr={name: v + np.inf for name, v in values.items()},
+        robust_stderr={name: v + np.inf for name, v in values.items()},
+        prior_share=values,
+        at_bound={name: v > 0.5 for name, v in values.items()},
         simulation_error=values,
         covariance=jax.numpy.asarray(rng.random((n, n))),
         correlation=jax.numpy.eye(n),
@@ -46,6 +49,8 @@ def fit(wave, case):
         waveform=wave,
         residuals=wave.reflectance,
         reduced_chi2=jax.numpy.asarray(1.1),
+        second_minimum=jax.numpy.asarray(np.inf),
+        independent_samples=jax.numpy.asarray(12.5),
         converged=True,
         status="converged: it ended at a minimum",
         steps=7,
@@ -60,8 +65,13 @@ def fits():
     return inversion.Retrievals(
         values={"Cab": rng.random(5), "layers": rng.random((5, 3))},
         stderr={"Cab": rng.random(5), "layers": rng.random((5, 3))},
+        robust_stderr={"Cab": rng.random(5), "layers": rng.random((5, 3))},
+        prior_share={"Cab": rng.random(5), "layers": rng.random((5, 3))},
+        at_bound={"Cab": rng.random(5) > 0.5, "layers": rng.random((5, 3)) > 0.5},
         covariance=rng.random((5, 4, 4)),
         reduced_chi2=rng.random(5),
+        second_minimum=rng.random(5),
+        independent_samples=rng.random(5),
         converged=np.array([True, False, True, True, False]),
         steps=np.arange(5),
         fitted=rng.random((5, 2, 7)),
@@ -98,7 +108,9 @@ def test_double_precision_comes_back_in_single(wave, tmp_path):
     assert same(jl.open(tmp_path / "a.nc"), double)
 
 
-def test_methods_save_as_well(wave, fit, tmp_path):
+def test_methods_save_as_well(wave, fit, fits, tmp_path):
+    fits.save(tmp_path / "fits.nc")
+    assert same(jl.open(tmp_path / "fits.nc"), fits)
     wave.save(tmp_path / "wave.nc")
     fit.save(tmp_path / "fit.nc")
     assert same(jl.open(tmp_path / "wave.nc"), wave)
@@ -153,10 +165,10 @@ def test_xarray_opens_it_with_coordinates_and_units(wave, case, tmp_path):
 
 def test_every_quantity_of_a_known_class_has_units():
 
-    for layout in netcdf.LAYOUTS.values():
+    for layout in layouts.LAYOUTS.values():
         if layout.kind.__module__.startswith(("jaxlidar", "inversion")):
             names = {f.name for f in dataclasses.fields(layout.kind) if not f.metadata.get("static")}
-            assert names - {"scene", "waveform"} == set(layout.quantities)
+            assert names - {"scene", "waveform", "truth"} == set(layout.quantities)
 
 
 @pytest.mark.parametrize("name", ["wave", "fits"])
@@ -218,10 +230,11 @@ class Heights(eqx.Module):
 def test_a_class_of_another_package_is_found_by_its_entry_point(tmp_path, monkeypatch):
     with pytest.raises(TypeError, match="result is of the class Heights; admissible are"):
         jl.io.save(Heights(np.ones(2)), tmp_path / "a.nc")
-    monkeypatch.setattr(netcdf, "LAYOUTS", dict(netcdf.LAYOUTS))
+    # Forgotten again when the test ends.
+    monkeypatch.setitem(layouts.LAYOUTS, "Heights", None)
     jl.io.keep_as_netcdf(Heights, "heights", {"top": ("m", "height")})
     jl.io.save(Heights(np.array([1.0, 2.0])), tmp_path / "a.nc")
-    layout = netcdf.LAYOUTS.pop("Heights")
+    layout = layouts.LAYOUTS.pop("Heights")
     with pytest.raises(ValueError, match=r"a.nc: it holds a Heights, which is not known here"):
         jl.open(tmp_path / "a.nc")
 
@@ -229,9 +242,9 @@ def test_a_class_of_another_package_is_found_by_its_entry_point(tmp_path, monkey
         name = "Heights"
 
         def load(self):
-            netcdf.LAYOUTS["Heights"] = layout
+            layouts.LAYOUTS["Heights"] = layout
 
-    monkeypatch.setattr(metadata, "entry_points", lambda group: [Point()] if group == netcdf.FILES else [])
+    monkeypatch.setattr(metadata, "entry_points", lambda group: [Point()] if group == layouts.FILES else [])
     assert jl.open(tmp_path / "a.nc").top.tolist() == [1.0, 2.0]
 
 

@@ -152,3 +152,33 @@ def test_what_leaves_the_bins_under_a_transformation_is_lost_and_said():
     np.testing.assert_array_equal(marked.reflectance[0], found.reflectance[0])
     with pytest.raises(ValueError, match="share = 0"):
         found.nan_where_lost(0.0)
+
+
+def with_bark(extinction):
+    bark = np.full((4, 4, 4), extinction)
+    voxels = jl.VoxelMap.from_extinction(leaf=np.full((4, 4, 4), 0.3), bark=bark, voxel_size=1.0)
+    return jl.Scene(canopy=jl.Canopy(voxels, leaf=LEAF, bark=0.3), ground=jl.Ground(reflectance=0.3))
+
+
+def test_what_is_zero_everywhere_is_not_in_the_scene():
+    none, little = with_bark(0.0), with_bark(1e-3)
+    plan = jl.plan(LIDAR, none)
+    assert {row.name: row.reason for row in plan.effects}["bark"] == "zero everywhere"
+    assert plan.trace.letters == ("leaf.R", "leaf.T", "ground.R")
+    assert jl.reduce(LIDAR, none, plan).scene.canopy.voxels.bark is None
+    asked = jl.plan(LIDAR, none, effects={"bark": True}, describe=False)
+    assert "bark.R" in asked.trace.letters
+    assert "bark" not in asked.off
+    check_plan(asked, LIDAR, little)
+    with pytest.raises(ValueError, match="for a map without bark"):
+        check_plan(plan, LIDAR, little)
+    with pytest.raises(ValueError, match=r'make the plan with effects={"bark": True}'):
+        eqx.filter_eval_shape(lambda scene: jl.reduce(LIDAR, scene, plan).admissible, none)
+
+
+def test_a_map_of_zeros_is_no_canopy():
+    zeros = jl.VoxelMap.from_extinction(leaf=np.zeros((4, 4, 4)), voxel_size=1.0)
+    ground = jl.Ground(reflectance=0.3)
+    plan = jl.plan(LIDAR, jl.Scene(canopy=jl.Canopy(zeros, leaf=LEAF), ground=ground), describe=False)
+    assert plan.orders == 1
+    assert not plan.is_random

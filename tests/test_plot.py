@@ -134,6 +134,20 @@ def test_scene_from_the_east_and_of_a_tilted_beam(axes):
     assert np.allclose(lean, -np.tan(np.deg2rad(20.0)), rtol=1e-3)
 
 
+def test_terrain_is_drawn_at_the_middle_of_the_map(axes):
+    heights = np.add.outer([0.0, 2.0, 1.0, 3.0], [0.0, 0.5])
+    terrain = jl.Terrain(heights, (1.0, 3.0), (-1.5, -1.5))
+    scene = jl.Scene(canopy=canopy_scene().canopy, ground=terrain)
+    plot.scene(scene, ax=axes)
+    outline = axes.collections[0].get_paths()[0].vertices
+    for x, height in ((-1.0, 1.25), (-0.5, 2.25), (0.5, 1.25), (1.0, 2.25)):
+        near = np.isclose(outline[:, 0], x, atol=2e-3)
+        assert np.isclose(outline[near, 1].max(), height, atol=0.01)
+    axes.clear()
+    plot.scene(jl.Scene(ground=terrain), ax=axes, along="x")
+    assert axes.get_xlim() == (-1.5, 1.5)
+
+
 def test_an_empty_scene_and_new_figures():
     from matplotlib import pyplot
 
@@ -210,3 +224,27 @@ def test_fit_shows_data_model_and_residuals(wave):
     assert np.allclose(points[:, 0], 2.0, atol=1e-3)
     with pytest.raises(ValueError, match="axes has 1 axes; admissible are 2"):
         plot.fit(wave, observed, 0.001, [left])
+
+
+def test_photons_are_drawn_at_their_heights_in_the_colours_of_their_labels(axes):
+    wave = jl.simulate(jl.Lidar(energy=1e-9), jl.Scene(ground=jl.Ground(height=2.0)), key=jax.random.key(0))
+    sun = jl.PhotonCounter(background_rate=1e7)
+    events = jl.record(wave, receiver=sun, mode="photons", key=jax.random.key(1), pulses=50)
+    assert plot.photons(events, ax=axes) is axes
+    lines = drawn(axes)
+    assert np.array_equal(lines["signal"][:, 1], events.height[events.signal])
+    assert np.array_equal(lines["noise"][:, 1], events.height[~events.signal])
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("shot", "height (m)")
+    axes.clear()
+    label = np.where(events.height > 2.0, 2, 1)
+    plot.photons(events, [70.0], axes, label=label, color="red")
+    lines = drawn(axes)
+    assert set(lines) == {"ground", "canopy"}
+    assert np.array_equal(lines["canopy"][:, 1], events.height[label == 2])
+    assert np.all(lines["canopy"][:, 0] == 70.0)
+    assert {line.get_color() for line in axes.lines} == {"red"}
+    assert axes.get_xlabel() == "distance along the track (m)"
+    with pytest.raises(ValueError, match=r"distance has shape \(2,\)"):
+        plot.photons(events, [1.0, 2.0], axes)
+    with pytest.raises(ValueError, match=r"label = 4 is outside the admissible range \[0, 3\]"):
+        plot.photons(events, ax=axes, label=label + 2)

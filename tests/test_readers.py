@@ -6,7 +6,7 @@ import sys
 import laspy
 import numpy as np
 import pytest
-from fuzz import small_cloud
+from fuzz_kinds import small_cloud
 
 from jaxlidar.io import read_las, read_qsm, read_vox
 from jaxlidar.optics.coefficients import load_coefficients

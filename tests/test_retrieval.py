@@ -151,6 +151,9 @@ def test_the_tracer_does_not_look_at_optical_leaves():
     assert len(optical) == len(
         jax.tree.leaves([scene.canopy.leaf, 0.4, scene.ground.reflectance, scene.atmosphere, 0.3, 0.2])
     )
+    # A reflectance that varies from place to place is traced.
+    terrain = jl.Terrain([[0.0, 1.0], [0.0, 1.0]], 50.0, (-25.0, -25.0), reflectance=[[0.1, 0.2], [0.3, 0.4]])
+    assert not optical_leaves(jl.Scene(ground=terrain))
     # Leaves that transmit straight on scale extinction.
     straight = canopy_scene(transmission="straight")
     assert [s.place.geometric for s in settle(UNKNOWNS, straight)] == [True, True, False, True, True]

@@ -10,6 +10,7 @@ from typing import Any
 import click
 
 from jaxlidar.io import atomic_write
+from jaxlidar.io.zarr_groups import is_zarr
 from jaxlidar.simulate import Progress
 
 CASE = click.argument("case", type=click.Path(dir_okay=False, path_type=Path), metavar="CASE.toml")
@@ -19,9 +20,22 @@ PLOT = click.option(
 QUIET = click.option("--quiet", is_flag=True, help="Show no progress.")
 
 
+class ResultPath(click.Path):
+    """A path of a file; or of a folder, if its name ends as that of a Zarr store."""
+
+    def __init__(self, exists: bool = False):
+        super().__init__(exists=exists, path_type=Path)
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> Any:
+        path: Any = super().convert(value, param, ctx)
+        if path.is_dir() and not is_zarr(path):
+            self.fail(f"File {str(value)!r} is a directory.", param, ctx)
+        return path
+
+
 def out(help: str) -> Callable[[Any], Any]:
     """The option `-o`."""
-    return click.option("-o", "--out", type=click.Path(dir_okay=False, path_type=Path), help=help)
+    return click.option("-o", "--out", type=ResultPath(), help=help)
 
 
 def new_axes(width: float, height: float, **options: Any) -> Any:
@@ -62,6 +76,22 @@ def progress_of_simulation(quiet: bool) -> Iterator[Callable[[Progress], None]]:
         )
         bar.set_description(f"{now.photons:,} photons, error {now.error:.2g}", refresh=False)
         bar.n = round(100 * min(share, 1.0))
+        bar.refresh()
+
+    with bar:
+        yield show
+
+
+@contextlib.contextmanager
+def progress_of_survey(quiet: bool, shots: int) -> Iterator[Callable[[Any], None]]:
+    """A bar on the standard error while `simulate_many` runs; none where that is no terminal."""
+    from tqdm import tqdm
+
+    disable = True if quiet else None
+    bar = tqdm(total=shots, unit=" shots", disable=disable, file=sys.stderr, leave=False, desc="simulating")
+
+    def show(now: Any) -> None:
+        bar.n = now.done
         bar.refresh()
 
     with bar:

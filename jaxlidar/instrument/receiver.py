@@ -1,12 +1,13 @@
 """The receiver: how the detector and the digitiser record the energy that arrives.
 
-`record` turns expected energies per sample into a record, with or without one realisation of the noise.
+`record` turns expected energies per sample into a record, with or without one realisation of the noise, or
+into the events of a `PhotonCounter`.
 `first_return_window` starts the sampling bins at the first return, as the paper does.
 """
 
 import math
 from collections.abc import Sequence
-from typing import ClassVar, final
+from typing import Any, ClassVar, Literal, TypeAlias, final, overload
 
 import equinox as eqx
 import jax
@@ -24,6 +25,7 @@ from jaxlidar._checks import (
     check_key,
     check_kind,
     check_number,
+    check_numbers,
     check_range,
     optional_scalar,
     scalar,
@@ -31,10 +33,13 @@ from jaxlidar._checks import (
 )
 from jaxlidar._constants import PLANCK_TIMES_LIGHT
 from jaxlidar._ranges import Range, check_ranges
+from jaxlidar.instrument.photon_counter import PhotonCounter, PhotonEvents, count_photons
 
 # Above this expectation a Poisson count is drawn as a normal variable (skewness below 1e-3): the exact
 # sampler counts in 32 bits.
 _POISSON_MAX = 1e6
+
+Wavelengths: TypeAlias = ArrayLike | Sequence[ArrayLike]
 
 
 @final
@@ -96,44 +101,98 @@ class Receiver(eqx.Module):
         check_choice("window", self.window, ("fixed", "first return"))
 
 
+@overload
 def record(
-    energy: Float[ArrayLike, "*channels wavelengths bins"],
-    wavelength: ArrayLike | Sequence[ArrayLike],
-    receiver: Receiver,
+    wave: Any,
+    wavelength: Wavelengths | None = None,
+    receiver: Receiver | None = None,
     *,
     key: Array | None = None,
-) -> Float[Array, "*channels wavelengths bins"]:
-    """The waveform that a receiver records of given energies.
+    mode: Literal["waveform"] = "waveform",
+    pulses: int = 1,
+) -> Float[Array, "*channels wavelengths bins"]: ...
 
-    Background and noise are added; saturation, detection threshold and quantisation follow in this order.
+
+@overload
+def record(
+    wave: Any,
+    wavelength: Wavelengths | None = None,
+    receiver: PhotonCounter | None = None,
+    *,
+    key: Array | None = None,
+    mode: Literal["photons"],
+    pulses: int = 1,
+) -> PhotonEvents: ...
+
+
+def record(
+    wave: Any,
+    wavelength: Wavelengths | None = None,
+    receiver: Receiver | PhotonCounter | None = None,
+    *,
+    key: Array | None = None,
+    mode: str = "waveform",
+    pulses: int = 1,
+) -> Float[Array, "*channels wavelengths bins"] | PhotonEvents:
+    """What a receiver records of a waveform: samples, or photon events.
+
+    Of samples, background and noise are added; saturation, detection threshold and quantisation follow in
+    this order. How events are drawn is in `jaxlidar.instrument.photon_counter`.
 
     **Arguments:**
 
-    - `energy`: (..., wavelengths, bins) expected detected energy in J per sample, not negative.
-    - `wavelength`: nm, one number or (wavelengths,): a photon carries the energy h c / wavelength.
-    - `receiver`: the `Receiver` that records.
-    - `key`: a JAX random key: the result is one realisation of the noise. The photons of signal and
-      background are Poisson counts, or a normal variable where more than a million are expected; electronic
-      noise is normal. Default None: the record of the expected energies, without noise.
+    - `wave`: a `Waveform` or `Waveforms`. Where `mode` is "waveform", also an array (..., wavelengths, bins)
+      of expected detected energies in J per sample, not negative.
+    - `wavelength`: nm, one number or (wavelengths,), where `wave` is an array: a photon carries the energy
+      h c / wavelength. Default None: the waveform's.
+    - `receiver`: the `Receiver` that records, or the `PhotonCounter` where `mode` is "photons". Default None:
+      one with its defaults.
+    - `key`: a JAX random key. Photon events need one. Of samples, the result is one realisation of the noise.
+      The photons of signal and background are Poisson counts, or a normal variable where more than a million
+      are expected; electronic noise is normal. Default None: the samples of the expected energies, without
+      noise.
+    - `mode`: "waveform" for samples or "photons" for events. Default "waveform".
+    - `pulses`: of how many pulses, each with the waveform's energy, events are drawn; an integer of at least
+      1. Default 1, which it is for samples.
 
-    **Returns:** J per sample, an array shaped as `energy`. Derivatives pass through the quantisation as if it
-    were absent. They pass through the noise of a realisation with its draws held fixed, so not through
-    Poisson counts.
+    **Returns:** J per sample, an array shaped as the energies; or `PhotonEvents`. Derivatives of samples pass
+    through the quantisation as if it were absent. They pass through the noise of a realisation with its draws
+    held fixed, so not through Poisson counts. Events are NumPy arrays, without derivatives.
 
-    **Raises:** ValueError where `energy` has fewer than two axes, for wavelengths that are not positive, and
-    for neither one nor one per row of `energy`; TypeError for a thing of another kind.
+    **Raises:** ValueError where the energies have fewer than two axes, for wavelengths that are not positive,
+    and for neither one nor one per row of the energies; for events, also where energies below zero take more
+    than 1 % from a waveform, and where there would be more than 10^8; TypeError for a thing of another kind.
 
-    **Example:**
+    **Example:** samples, and the events of ten pulses over the same ground.
 
+    >>> import jax
     >>> import jaxlidar as jl
     >>> import numpy as np
     >>> receiver = jl.Receiver(detection_threshold=3e-16, saturation=1e-15)
     >>> recorded = jl.record(np.array([[2e-16, 6e-16, 17e-16]]), 1064.0, receiver)
     >>> print([f"{x:.1e}" for x in recorded[0]])
     ['0.0e+00', '6.0e-16', '1.0e-15']
+    >>> lidar = jl.Lidar(wavelength=532.0, energy=1e-9)
+    >>> wave = jl.simulate(lidar, jl.Scene(ground=jl.Ground()), key=jax.random.key(0))
+    >>> counter = jl.PhotonCounter(background_rate=5e6)
+    >>> print(jl.record(wave, receiver=counter, mode="photons", key=jax.random.key(1), pulses=10))
+    69 photon events of 1 shot with 10 pulses each: 1 of background; 8 lost to dead time
     """
-    energy, wavelength = as_array(energy, "energy"), as_array(wavelength, "wavelength")
-    check_kind("receiver", receiver, Receiver, "a Receiver")
+    check_choice("mode", mode, ("waveform", "photons"))
+    given = hasattr(wave, "energy")
+    if given and wavelength is not None:
+        raise ValueError("wavelength is given, but wave is a waveform, which has its own")
+    if mode == "photons":
+        return count_photons(wave, PhotonCounter() if receiver is None else receiver, key, pulses)
+    if pulses != 1:
+        raise ValueError(f"pulses = {pulses}; admissible is 1 where mode = 'waveform'")
+    samples: Any = wave.energy if given else wave
+    light: Any = wave.wavelength if given else wavelength
+    check_numbers("wavelength", light)
+    energy, wavelength = as_array(samples, "energy"), as_array(light, "wavelength")
+    receiver = Receiver() if receiver is None else receiver
+    check_kind("receiver", receiver, Receiver, "a Receiver where mode = 'waveform'")
+    assert isinstance(receiver, Receiver)
     if energy.ndim < 2:
         raise ValueError(f"energy has shape {energy.shape}; admissible is (..., wavelengths, bins)")
     check_range("wavelength", wavelength, 0.0, low_open=True)
@@ -143,6 +202,10 @@ def record(
             f"wavelength has shape {wavelength.shape}; admissible is one number, or one for each of the "
             f"{energy.shape[-2]} wavelengths of energy"
         )
+    return _samples(energy, wavelength, receiver, key)
+
+
+def _samples(energy: Array, wavelength: Array, receiver: Receiver, key: Array | None) -> Array:
     expected = energy + receiver.background
     value = expected
     if key is not None:

@@ -1,31 +1,56 @@
-"""Readers of recorded waveforms, voxel maps, point clouds and tree models, and atomic file writes."""
+"""Readers of recorded waveforms, voxel maps, points, tree models, meshes and terrain; writers of results."""
 
 from jaxlidar._files import atomic_write
+from jaxlidar.io.airborne import AirborneShot, Returns, Scanner, Segment
+from jaxlidar.io.airborne_shots import AirborneShots, ShotStack, stack_shots
 from jaxlidar.io.case import Case, write_case
+from jaxlidar.io.dem import DemRead, read_dem
 from jaxlidar.io.gedi import GediShot, read_gedi_l1b
+from jaxlidar.io.gedi_writer import write_gedi_l1b
 from jaxlidar.io.las import PointCloud, read_las
-from jaxlidar.io.neon import NeonImpulse, NeonRead, NeonShot, read_neon
+from jaxlidar.io.las_waveforms import read_las_waveforms
+from jaxlidar.io.las_write import write_las, write_las_waveforms
+from jaxlidar.io.neon import NeonImpulse, NeonRead, read_neon
 from jaxlidar.io.netcdf import keep_as_netcdf, read_case, save
+from jaxlidar.io.obj import MeshRead, read_obj
+from jaxlidar.io.pulsewaves import read_pulsewaves
 from jaxlidar.io.qsm import TreeRead, read_qsm
+from jaxlidar.io.rasters import write_raster
 from jaxlidar.io.vox import VoxelsRead, read_vox
 
 __all__ = [
+    "AirborneShot",
+    "AirborneShots",
     "Case",
+    "DemRead",
     "GediShot",
+    "MeshRead",
     "NeonImpulse",
     "NeonRead",
-    "NeonShot",
     "PointCloud",
+    "Returns",
+    "Scanner",
+    "Segment",
+    "ShotStack",
     "TreeRead",
     "VoxelsRead",
     "atomic_write",
     "keep_as_netcdf",
     "read_case",
+    "read_dem",
     "read_gedi_l1b",
     "read_las",
+    "read_las_waveforms",
     "read_neon",
+    "read_obj",
+    "read_pulsewaves",
     "read_qsm",
     "read_vox",
     "save",
+    "stack_shots",
     "write_case",
+    "write_gedi_l1b",
+    "write_las",
+    "write_las_waveforms",
+    "write_raster",
 ]

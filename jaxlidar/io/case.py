@@ -1,4 +1,4 @@
-"""Cases: a lidar, a scene and how they are simulated, kept in a TOML file that a person can write.
+"""Cases: a lidar or a survey, a scene and how they are simulated, in a TOML file that a person can write.
 
     [lidar]
     altitude = 500.0                                  # m; what is left out has the default of the class
@@ -16,6 +16,7 @@
 
 import dataclasses
 import functools
+import importlib
 import inspect
 import os
 from collections.abc import Callable, Mapping
@@ -29,23 +30,25 @@ from jaxtyping import PRNGKeyArray
 from jaxlidar._checks import check_integer, check_key, check_kind
 from jaxlidar._files import atomic_write
 from jaxlidar.instrument.lidar import Lidar
+from jaxlidar.instrument.survey import Survey
 from jaxlidar.io.kinds import UNITS, Argument
 from jaxlidar.io.npz import arrays_of
 from jaxlidar.io.tables import Arrays, check_keys, table_of, value_of
 from jaxlidar.io.toml import tables_of, text_of
 from jaxlidar.scenes.scene import Scene
-from jaxlidar.simulate import Progress, simulate
-from jaxlidar.waveform import Waveform
+from jaxlidar.simulate import simulate
 
 # Arguments of `simulate` that a file cannot hold, or that a case has as fields of its own.
 _NOT_KEPT = ("lidar", "scene", "key", "plan", "progress")
-SECTIONS = ("lidar", "scene", "simulate")
+SECTIONS = ("lidar", "survey", "scene", "simulate")
+# Arguments of `simulate_many`; `simulate` has all but the last as well.
+_OF_SURVEYS = ("rtol", "max_orders", "truth", "shared")
 
 
 @final
 @dataclasses.dataclass(frozen=True, eq=False)
 class Case:
-    """A lidar, a scene and how they are simulated. Any of them may be missing in a file.
+    """A lidar or a survey, a scene and how they are simulated. Any of them may be missing in a file.
 
     **Arguments:**
 
@@ -53,9 +56,11 @@ class Case:
     - `scene`: a `Scene`, or None. Default None.
     - `key`: a JAX random key, or None. Default None.
     - `arguments`: by name, other arguments of `jaxlidar.simulate`, such as `rtol`; all but `plan` and
-      `progress`. Default: none.
+      `progress`. With a survey: `rtol`, `max_orders` and `shared`. Default: none.
+    - `survey`: a `Survey`, which is simulated in place of the lidar, or None. Default None.
 
-    **Raises:** TypeError for a thing of another kind; ValueError for an unknown argument.
+    **Raises:** TypeError for a thing of another kind; ValueError for an unknown argument, and for one that
+    `jaxlidar.simulate_many` does not have, with a survey.
 
     **Example:**
 
@@ -70,13 +75,15 @@ class Case:
     scene: Scene | None = None
     key: PRNGKeyArray | None = None
     arguments: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    survey: Survey | None = None
 
     def __post_init__(self):
         check_kind("lidar", self.lidar, Lidar | None, "a Lidar or None")
         check_kind("scene", self.scene, Scene | None, "a Scene or None")
         if self.key is not None:
             check_key(self.key)
-        check_keys(self.arguments, _arguments(), "arguments")
+        check_kind("survey", self.survey, Survey | None, "a Survey or None")
+        check_keys(self.arguments, _arguments() if self.survey is None else _OF_SURVEYS, "arguments")
 
     def __getstate__(self) -> dict[str, Any]:
         # A key that is pickled comes back with a generator of its own, which Poisson numbers refuse, its own
@@ -86,18 +93,35 @@ class Case:
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state, key=None if state["key"] is None else _key_of(state["key"]))
 
-    def simulate(self, progress: Callable[[Progress], None] | None = None) -> Waveform:
-        """The waveform of this case.
+    def simulate(
+        self, progress: Callable[[Any], None] | None = None, path: str | os.PathLike[str] | None = None
+    ) -> Any:
+        """The waveform of this case, or those of its survey.
 
-        **Arguments:** `progress`: as for `jaxlidar.simulate`. Default None.
+        **Arguments:**
 
-        **Returns:** a `Waveform`.
+        - `progress`: as for `jaxlidar.simulate`, or for `jaxlidar.simulate_many`. Default None.
+        - `path`: of a survey alone, as for `jaxlidar.simulate_many`. Default None.
 
-        **Raises:** ValueError where lidar, scene or key are missing, and what `jaxlidar.simulate` raises.
+        **Returns:** a `Waveform`, or the `Waveforms` of a survey.
+
+        **Raises:** ValueError where lidar, scene or key are missing, and for a `path` without a survey; what
+        `jaxlidar.simulate` or `jaxlidar.simulate_many` raises.
         """
-        if self.lidar is None or self.scene is None or self.key is None:
-            missing = [name for name in ("lidar", "scene", "key") if getattr(self, name) is None]
+        shots = "lidar" if self.survey is None else "survey"
+        missing = [name for name in (shots, "scene", "key") if getattr(self, name) is None]
+        if self.scene is None or self.key is None or missing:
             raise ValueError(f"the case has no {' and no '.join(missing)}: nothing can be simulated")
+        if self.survey is not None:
+            # Campaigns lie above the files, which ask for them by name.
+            many = importlib.import_module("jaxlidar.campaign.run").simulate_many
+            given = {"key": self.key, "path": path, "progress": progress, **self.arguments}
+            return many(self.survey, self.scene, **given)
+        if path is not None:
+            raise ValueError(
+                f"path = {os.fspath(path)!r} is given without a survey; use save on the waveform"
+            )
+        assert self.lidar is not None
         return simulate(self.lidar, self.scene, key=self.key, progress=progress, **self.arguments)
 
 
@@ -115,7 +139,7 @@ def case_text(case: Case, file: str | None = None) -> tuple[str, dict[str, np.nd
     """A case as TOML, and the arrays that lie apart from it, by name; `file` is where they will lie."""
     arrays: dict[str, np.ndarray] = {}
     tables: dict[str, tuple[dict[str, Any], Callable[..., Any]]] = {}
-    for name, part in (("lidar", case.lidar), ("scene", case.scene)):
+    for name, part in (("lidar", case.lidar), ("survey", case.survey), ("scene", case.scene)):
         if part is not None:
             tables[name] = (_with_file(table_of(part, name, arrays), file), type(part))
     given = {key: table_of(value, f"simulate.{key}", arrays) for key, value in case.arguments.items()}
@@ -148,14 +172,20 @@ def case_of(text: str, path: Path, arrays: Arrays) -> Case:
     try:
         tables = tables_of(text, path)
         check_keys(tables, SECTIONS, "")
+        survey = tables.get("survey")
+        if isinstance(survey, dict) and "lidar" not in survey and "lidar" in tables:
+            # The lidar of the case is that of its survey.
+            tables = {**tables, "survey": {**survey, "lidar": tables["lidar"]}}
         parts = {
             name: value_of(tables[name], Argument(kind, False, "", name), name, arrays, path.parent)
-            for name, kind in (("lidar", Lidar), ("scene", Scene))
+            for name, kind in (("lidar", Lidar), ("survey", Survey), ("scene", Scene))
             if name in tables
         }
         given = tables.get("simulate", {})
         check_kind("simulate", given, dict, "a table")
         known = _arguments()
+        if survey is not None:
+            known = {**known, "shared": Argument(bool | None, False, "", "shared")}
         check_keys(given, (*known, "seed", "key", "key_kind"), "simulate")
         arguments = {
             name: value_of(given[name], known[name], f"simulate.{name}", arrays, path.parent)

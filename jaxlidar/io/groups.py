@@ -4,7 +4,6 @@ import dataclasses
 import hashlib
 import json
 import re
-import typing
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -14,26 +13,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxlidar.instrument.lidar import Lidar
+from jaxlidar.io.annotations import shape_of, values_of
 from jaxlidar.io.case import Case, case_of, case_text
 from jaxlidar.io.gedi_beam import refusing
 from jaxlidar.io.kinds import is_tuple
+from jaxlidar.io.rows import BLOCK, CHECKSUMS, Rows, blank, check_rows, mapped, row_fields
+from jaxlidar.io.zarr_groups import ZarrGroup
 from jaxlidar.scenes.scene import Scene
 
 # Names of fields that a case takes the place of, and which part of it they are.
 PARTS: dict[Any, str] = {Scene: "scene", Lidar: "lidar"}
-
-
-def shape_of(annotation: Any) -> list[str] | None:
-    """The dimensions of an annotated array; None for what is no array."""
-    shape = getattr(annotation, "dim_str", None)
-    return None if shape is None else shape.split()
-
-
-def values_of(annotation: Any) -> Any:
-    """What the values of a dict are; None for what is no dict of arrays."""
-    arguments = typing.get_args(annotation)
-    is_dict = typing.get_origin(annotation) is dict and len(arguments) == 2
-    return arguments[1] if is_dict and shape_of(arguments[1]) is not None else None
 
 
 def spelled(name: str) -> str:
@@ -62,11 +51,28 @@ class Writer:
 
     def result(self, group: Any, value: Any) -> None:
         """Write an object of a known class."""
-        layout = self.layouts[type(value).__name__]
-        self._fields(group, layout, value)
-        group.attrs["text_sha256"] = text_digest(group, layout)
+        rows = self.frame(group, value)
+        if rows is not None:
+            values = {name: getattr(value, name) for name in (*rows.fields, *rows.inner)}
+            for start in range(0, len(rows.sums), BLOCK):
+                some = slice(start, start + BLOCK)
+                rows.add(some, jax.tree.map(lambda a, some=some: a[some], values))
+            rows.end()
 
-    def _fields(self, group: Any, layout: Any, value: Any) -> None:
+    def frame(self, group: Any, value: Any) -> Rows | None:
+        """Write an object of a known class but for its rows, if it has any: these are for the caller."""
+        layout = self.layouts[type(value).__name__]
+        inner = self._fields(group, layout, value)
+        group.attrs["text_sha256"] = text_digest(group, layout)
+        if layout.rows is None:
+            return None
+        name = layout.dimensions.get(layout.rows, layout.rows)
+        group.create_variable(CHECKSUMS, (name,), dtype=np.dtype(np.uint32))
+        return Rows(group, layout, group.dimensions[name].size, value, inner)
+
+    def _fields(self, group: Any, layout: Any, value: Any) -> dict[str, Rows]:
+        """Write all but rows, and give those of objects within, which have a row for each of the whole."""
+        rows = {}
         for field in dataclasses.fields(value):
             part = getattr(value, field.name)
             name, shape, each = field.name, shape_of(field.type), values_of(field.type)
@@ -77,9 +83,14 @@ class Writer:
             elif each is not None and "..." not in (shape := shape_of(each) or []):
                 keys = layout.items.get(name, f"{name}_item")
                 self._names(group, keys, list(part))
-                whole = (
-                    np.stack([np.asarray(a) for a in part.values()]) if part else _none(group, layout, shape)
-                )
+                arrays = [np.asarray(a) for a in part.values()]
+                if not arrays:
+                    whole = _none(group, layout, shape)
+                elif name in row_fields(layout):
+                    # Rows follow later.
+                    whole = blank(len(arrays), arrays[0][None])
+                else:
+                    whole = np.stack(arrays)
                 self._array(group, layout, name, name, [keys, *shape], whole)
             elif each is not None:
                 for number, (key, array) in enumerate(part.items()):
@@ -92,9 +103,15 @@ class Writer:
             elif type(part).__name__ in self.layouts:
                 inner = group.create_group(name)
                 inner.attrs["jaxlidar_kind"] = type(part).__name__
-                self.result(inner, part)
+                if layout.rows is None:
+                    self.result(inner, part)
+                elif (of_part := self.frame(inner, part)) is not None:
+                    rows[name] = of_part
+            elif part is None:
+                self._static(group, name, part)
             else:
                 raise TypeError(f"{name} is of the class {type(part).__name__}, which no file can hold")
+        return rows
 
     def case(self, group: Any, name: str, case: Case) -> None:
         """Write a case as an attribute of TOML, and its arrays into a group beside."""
@@ -133,7 +150,10 @@ class Writer:
             named[at:at] = [f"{name}.{axis}" for axis in range(extra)]
         # A dimension cannot be two axes of one variable.
         dimensions = [d if d not in named[:i] else f"{d}_{i + 1}" for i, d in enumerate(named)]
-        made = _variable(group, name, dimensions, array)
+        if field in row_fields(layout):
+            made = _row_variable(group, name, dimensions, array, shape.index(layout.rows))
+        else:
+            made = _variable(group, name, dimensions, array)
         units, long_name = layout.quantities[field]
         made.attrs["units"], made.attrs["long_name"] = units, long_name
         beside = [c for c, along in layout.coordinates.items() if along in dimensions and c != field]
@@ -171,6 +191,15 @@ def _variable(group: Any, name: str, dimensions: list[str], array: np.ndarray) -
     return made
 
 
+def _row_variable(group: Any, name: str, dimensions: list[str], array: np.ndarray, axis: int) -> Any:
+    """A variable whose rows follow: in one piece, or in chunks of rows where the store has chunks."""
+    _dimensions(group, dimensions, array.shape)
+    chunks: dict[str, Any] = {}
+    if isinstance(group, ZarrGroup):
+        chunks = {"chunks": [BLOCK if i == axis else n for i, n in enumerate(array.shape)]}
+    return group.create_variable(name, tuple(dimensions), dtype=array.dtype, **chunks)
+
+
 class Reader:
     """Reads objects from groups. `layout_of` gives what is known of a class, by name, for a file."""
 
@@ -185,6 +214,9 @@ class Reader:
         if digest != kept:
             raise ValueError(f"{self.path}: {place or '/'}: damaged (the checksum of its texts is another)")
         fields = {f.name: self._field(group, layout, f, place) for f in dataclasses.fields(layout.kind)}
+        if layout.rows is not None:
+            sums = self._numbers(group, CHECKSUMS, f"{place}/{CHECKSUMS}")
+            check_rows(f"{self.path}: {place or '/'}", sums, {n: fields[n] for n in row_fields(layout)})
         try:
             return layout.kind(**fields)
         except (ValueError, TypeError) as error:
@@ -195,14 +227,15 @@ class Reader:
         shape, each = shape_of(field.type), values_of(field.type)
         if field.metadata.get("static"):
             return self._static(group, name, field.type, at)
+        rows = name in row_fields(layout)
         if shape is not None:
-            return self._array(group, name, field.type, at)
+            return self._array(group, name, field.type, at, rows)
         if each is not None and "..." not in (shape_of(each) or []):
             keys = self._names(group, layout.items.get(name, f"{name}_item"), place)
-            rows = self._array(group, name, each, at)
-            if len(rows) != len(keys):
-                raise ValueError(f"{self.path}: {at}: {len(rows)} rows for {len(keys)} names")
-            return dict(zip(keys, rows))
+            arrays = self._array(group, name, each, at, rows)
+            if len(arrays) != len(keys):
+                raise ValueError(f"{self.path}: {at}: {len(arrays)} rows for {len(keys)} names")
+            return dict(zip(keys, arrays))
         if each is not None:
             with refusing(f"{self.path}: {place or '/'}: damaged"):
                 listed = [v for v in group.variables if v.startswith(f"{name}.")]
@@ -216,6 +249,8 @@ class Reader:
         if field.type in PARTS:
             return getattr(self.case(group, name, place), PARTS[field.type])
         if name not in group.groups:
+            if name in group.attrs and self._static(group, name, field.type, at) is None:
+                return None
             raise ValueError(f"{self.path}: {at}: no such group")
         inner = group.groups[name]
         return self.result(inner, self._attribute(inner, "jaxlidar_kind", at), at)
@@ -260,16 +295,16 @@ class Reader:
         with refusing(f"{self.path}: {at}: damaged"):
             return [n.decode() for n in group.variables[name][...]]
 
-    def _numbers(self, group: Any, name: str, at: str) -> np.ndarray:
+    def _numbers(self, group: Any, name: str, at: str, rows: bool = False) -> np.ndarray:
         if name not in group.variables:
             raise ValueError(f"{self.path}: {at}: no such variable")
         with refusing(f"{self.path}: {at}: damaged"):
             variable = group.variables[name]
-            array = np.asarray(variable[...])
+            array = mapped(self.path, variable) if rows else np.asarray(variable[...])
             return array.astype(bool) if variable.attrs.get("dtype") == "bool" else array
 
-    def _array(self, group: Any, name: str, annotation: Any, at: str) -> Any:
-        array = self._numbers(group, name, at)
+    def _array(self, group: Any, name: str, annotation: Any, at: str, rows: bool = False) -> Any:
+        array = self._numbers(group, name, at, rows)
         if annotation.array_type is np.ndarray:
             return array
         # Double precision stays so, whatever JAX's is now.

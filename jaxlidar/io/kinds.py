@@ -5,12 +5,15 @@ import functools
 import inspect
 import types
 import typing
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
 
 from jaxlidar.instrument.pulse import SampledPulse
+from jaxlidar.instrument.survey import Survey
+from jaxlidar.io.dem import DemRead, read_dem
+from jaxlidar.io.obj import MeshRead, read_obj
 from jaxlidar.io.vox import VoxelsRead, read_vox
 from jaxlidar.optics.coefficients import Coefficients, load_coefficients
 from jaxlidar.optics.leaf_angles import LeafAngles
@@ -18,18 +21,22 @@ from jaxlidar.optics.prospect import Prospect
 from jaxlidar.optics.spectra import read_spectrum_csv, spectrum
 from jaxlidar.plants.forest import forest
 from jaxlidar.plants.habits import Branching, Habit, broadleaf, conifer, grow, shrub, spreading
+from jaxlidar.plants.meshes import voxelise_mesh
 from jaxlidar.plants.voxelise import crop, voxelise
 from jaxlidar.scenes.surfaces import AbstractGround, AbstractSheet, Ground, Plate
 from jaxlidar.scenes.voxels import VoxelMap
 
 # Classes of these rooms are kinds, if the package exports them.
 ROOMS = ("jaxlidar.optics.", "jaxlidar.instrument.", "jaxlidar.scenes.")
+# But for what comes after a simulation.
+RECORDS = ("PhotonCounter", "PhotonEvents")
 # Other ways to make a part of a scene.
 MAKERS: tuple[Callable[..., Any], ...] = (
-    *(Branching, Habit, broadleaf, conifer, shrub, spreading, grow, forest, voxelise, crop),
+    *(Branching, Habit, broadleaf, conifer, shrub, spreading, grow, forest, voxelise, voxelise_mesh, crop),
     *(VoxelMap.from_lad, VoxelMap.from_extinction, VoxelMap.from_probability),
+    *(Survey.grid, Survey.track, Survey.scan),
     *(LeafAngles.named, LeafAngles.beta, Prospect.paper),
-    *(spectrum, read_spectrum_csv, read_vox, load_coefficients, Coefficients),
+    *(spectrum, read_spectrum_csv, read_vox, read_dem, read_obj, load_coefficients, Coefficients),
 )
 # What a table without `kind` stands for where any class of these is admissible.
 USUAL = {AbstractGround: Ground, AbstractSheet: Plate}
@@ -50,8 +57,10 @@ UNITS = {
     "azimuth": COMPASS,
     "background": "J per sample",
     "base_height": "m",
+    "beam_spacing": "m",
     "bend": DEGREES,
     "bin_width": "ns",
+    "bounds": "m",
     "Cab": "ug/cm2",
     "Cant": "ug/cm2",
     "Car": "ug/cm2",
@@ -64,14 +73,19 @@ UNITS = {
     "detection_threshold": "J per sample",
     "divergence": "mrad",
     "electronic_noise": "J per sample",
+    "end": "m",
     "energy": "J",
     "field_of_view": "mrad",
+    "frequency": "1/s",
     "fwhm": "ns",
+    "half_angle": DEGREES,
     "height": "m",
+    "heights": "m",
     "jitter": "ns",
     "leaf_area": "m2",
     "length": "ns",
     "lidar_ratio": "sr",
+    "line_rate": "1/s",
     "max_seconds": "s",
     "mean": DEGREES,
     "std": DEGREES,
@@ -79,6 +93,7 @@ UNITS = {
     "minimum_distance": "m",
     "origin": "m",
     "position": "m",
+    "pulse_rate": "1/s",
     "rayleigh_scale_height": "m",
     "roughness": "rad",
     "sampling_interval": "ns",
@@ -87,6 +102,9 @@ UNITS = {
     "shoot_length": "m",
     "slope": DEGREES,
     "smallest_diameter": "m",
+    "spacing": "m",
+    "speed": "m/s",
+    "start": "m",
     "stem_angle": DEGREES,
     "time": "ns",
     "tropism": DEGREES,
@@ -100,6 +118,9 @@ UNITS = {
 # Where the same name has a unit in one class alone.
 UNITS_OF = {
     (Branching, "divergence"): DEGREES,
+    (read_dem, "fill"): "m",
+    (Survey.grid, "low"): "m",
+    (Survey.grid, "high"): "m",
     (VoxelMap, "leaf"): "1/m",
     (VoxelMap, "bark"): "1/m",
 }
@@ -127,6 +148,7 @@ def kinds() -> Mapping[str, Callable[..., Any]]:
         and issubclass(value, eqx.Module)
         and value.__module__.startswith(ROOMS)
         and not inspect.isabstract(value)
+        and name not in RECORDS
     }
     return {**classes, **{maker.__qualname__: maker for maker in MAKERS}}
 
@@ -150,11 +172,15 @@ def arguments_of(maker: Callable[..., Any]) -> Mapping[str, Argument]:
 
 
 def made(maker: Callable[..., Any], arguments: Mapping[str, Any]) -> Any:
-    """What a class or function gives, and from a reader that reports what it dropped, the voxel map alone.
+    """What a class or function gives; of what a reader reports, the voxel map, terrain or mesh alone.
 
     **Raises:** what `maker` raises; ValueError where a reader left anything out.
     """
     result = maker(**arguments)
+    if isinstance(result, DemRead):
+        return result.terrain
+    if isinstance(result, MeshRead):
+        return result.mesh
     if not isinstance(result, VoxelsRead):
         return result
     left_out = ", ".join(f"{count} {reason}" for reason, count in result.dropped.items() if count)
@@ -175,7 +201,7 @@ def choices(annotation: Any) -> tuple[Any, ...]:
 def item_of(annotation: Any) -> Any:
     """What the items of a sequence may be."""
     for choice in choices(annotation):
-        if typing.get_origin(choice) in (tuple, list, Iterable) and typing.get_args(choice):
+        if typing.get_origin(choice) in (tuple, list, Iterable, Sequence) and typing.get_args(choice):
             return typing.get_args(choice)[0]
     return Any
 

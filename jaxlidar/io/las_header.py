@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from jaxlidar.io.checks import check_unpacked
+from jaxlidar.io.variable_records import variable_records
 
 # The public header block: signature, version, sizes of header and records, legacy count, scales and offsets;
 # of LAS 1.4 the extended records and the count.
@@ -36,6 +37,7 @@ class LasHeader:
     - `points`: number of points, and `start`: where they begin, in bytes.
     - `scales`, `offsets`: of x, y and z.
     - `laszip`: the record that says how points are compressed; None where they are not.
+    - `records`: place and length of each variable length record, by user and number.
     """
 
     point_format: int
@@ -44,7 +46,16 @@ class LasHeader:
     start: int
     scales: tuple[float, ...]
     offsets: tuple[float, ...]
-    laszip: bytes | None
+    laszip: bytes | None = None
+    records: dict[tuple[bytes, int], tuple[int, int]] = dataclasses.field(default_factory=dict)
+
+    def record(self, file: BinaryIO, user: bytes, number: int) -> bytes | None:
+        """The content of a variable length record; None where there is none."""
+        if (user, number) not in self.records:
+            return None
+        at, length = self.records[user, number]
+        file.seek(at)
+        return file.read(length)
 
     @property
     def extra_bytes(self) -> int:
@@ -77,7 +88,7 @@ def read_header(path: Path, file: BinaryIO) -> LasHeader:
             raise ValueError(
                 f"{path}: header: {count} extended records from {extended} on do not fit into {size} bytes"
             )
-    header = LasHeader(kind & ~_COMPRESSED, point_size, points, start, tuple(xyz[:3]), tuple(xyz[3:]), None)
+    header = LasHeader(kind & ~_COMPRESSED, point_size, points, start, tuple(xyz[:3]), tuple(xyz[3:]))
     if header.point_format not in PARTS or header.extra_bytes < 0:
         raise ValueError(f"{path}: header: point format {header.point_format}, records of {point_size} bytes")
     for axis, scale, offset in zip("xyz", xyz[:3], xyz[3:]):
@@ -87,7 +98,9 @@ def read_header(path: Path, file: BinaryIO) -> LasHeader:
             raise ValueError(f"{path}: header: offset of {axis} = {offset:g} is not finite")
     if points == 0:
         raise ValueError(f"{path}: header: the file holds no points")
-    laszip = _laszip(path, file, header_size, start, records)
+    found = variable_records(path, file, _RECORD, header_size, start, records, "points")
+    header = dataclasses.replace(header, records={(r.user, r.number): (r.place, r.length) for r in found})
+    laszip = header.record(file, *_LASZIP)
     if not kind & _COMPRESSED:
         if start + points * point_size > size:
             raise ValueError(
@@ -99,21 +112,3 @@ def read_header(path: Path, file: BinaryIO) -> LasHeader:
     if laszip is None:
         raise ValueError(f"{path}: header: points are compressed, but no record {_LASZIP[1]} says how")
     return dataclasses.replace(header, laszip=laszip)
-
-
-def _laszip(path: Path, file: BinaryIO, at: int, end: int, count: int) -> bytes | None:
-    """Of the variable length records between two places, the one that says how points are compressed."""
-    found = None
-    for i in range(count):
-        if at + _RECORD.size > end:
-            raise ValueError(f"{path}: header: {count} variable length records, but there is room for {i}")
-        file.seek(at)
-        user, number, length = _RECORD.unpack(file.read(_RECORD.size))
-        at += _RECORD.size + length
-        if at > end:
-            raise ValueError(
-                f"{path}: variable length record {i}: its {length} bytes run into the points, from {end} on"
-            )
-        if (user.split(b"\0")[0], number) == _LASZIP:
-            found = file.read(length)
-    return found

@@ -1,7 +1,7 @@
 """Reader of recorded waveforms: NEON's airborne full-waveform lidar, as an .npz of arrays.
 
 The arrays are those of the sample that comes with the R package waveformlidar, with its names for the columns
-of the geolocation. What they refer to was found from the recorded numbers, and `NeonShot` relies on it.
+of the geolocation. What they refer to was found from the recorded numbers, and `read_neon` relies on it.
 
 - (`V9`, `V10`, `V11`) is where sample `V16` (0 throughout) of the return lies, and (`dx`, `dy`, `dz`) is the
   way from one sample to the next, 0.14986 m: half of what light travels in air in 1 ns.
@@ -18,14 +18,15 @@ of the geolocation. What they refer to was found from the recorded numbers, and 
 - The horizontal positions in the sample have seven digits, that is 1 m in northing.
 """
 
-import dataclasses
 import os
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
+from jaxlidar.io.airborne import AirborneShot, Segment
+from jaxlidar.io.airborne_shots import QUIET, QUIET_PULSE, Levels, levels_of
 from jaxlidar.io.checks import FARTHEST, LARGEST_WHOLE, MOST_COUNTS, STEP, STEP_TOLERANCE, column_of
 from jaxlidar.io.npz import arrays_of
 from jaxlidar.io.pedestal import above_pedestal
@@ -33,84 +34,6 @@ from jaxlidar.io.pedestal import above_pedestal
 # The arrays that are used, and the columns of `geo`.
 _ARRAYS = ("ret", "outgoing", "system_impulse", "impulse_outgoing", "geo", "geo_cols")
 _COLUMNS: tuple[str, ...] = ("index", "dx", "dy", "dz", "V9", "V10", "V11", "V15", "V16")
-# Numbers of samples at the beginning of a return, and of an outgoing pulse, that hold only noise.
-_QUIET, _QUIET_PULSE = 8, 5
-# Standard deviation of normal numbers over their median absolute deviation.
-_STD_PER_MAD = 1.4826
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class NeonShot:
-    """One shot of NEON's airborne lidar, in double precision. Samples are 1 ns; the first is the highest.
-
-    - `index`: the file's number of the shot.
-    - `waveform`: (samples,) received, in counts, noise included; 0 where nothing was recorded.
-    - `recorded`: (samples,) whether it was recorded: a return may consist of several segments.
-    - `noise_mean`, `noise_std`: mean and standard deviation of the noise in counts, estimated from what
-      precedes the returns of all shots of the file.
-    - `position`: (samples, 3) easting, northing, elevation in m: where a target lies whose echo of
-      `pulse_power` has its time zero in that sample.
-    - `pulse_time`: (pulse samples,) ns, zero at the largest sample of the outgoing pulse.
-    - `pulse_power`: (pulse samples,) outgoing, in counts: pedestal removed, not negative, and zero before and
-      after the pulse. For `SampledPulse(time=shot.pulse_time, power=shot.pulse_power)`. Its length is the
-      same in all shots of a file.
-    - `zenith`: of the beam in degrees, as in `Lidar`.
-    - `azimuth`: in degrees clockwise from north, the horizontal direction in which the light travels down, as
-      in `Lidar`.
-
-    **Example:**
-
-    >>> import numpy as np
-    >>> from jaxlidar.io import NeonShot
-    >>> way = np.array([[0.0, 0.0, 20.15], [0.0, 0.0, 20.0], [0.0, 0.0, 19.85]])
-    >>> received = {"waveform": np.array([10.0, 90.0, 12.0]), "recorded": np.full(3, True), "position": way}
-    >>> pulse = {"pulse_time": np.array([-1.0, 0.0, 1.0]), "pulse_power": np.array([0.0, 80.0, 0.0])}
-    >>> shot = NeonShot(index=1, noise_mean=10.0, noise_std=1.0, zenith=0.0, azimuth=0.0, **received, **pulse)
-    >>> print(shot.signal, shot.time_from(20.0).round(2))
-    [ 0. 80.  2.] [-1.  0.  1.]
-    """
-
-    index: int
-    waveform: Float[np.ndarray, " samples"]
-    recorded: Bool[np.ndarray, " samples"]
-    noise_mean: float
-    noise_std: float
-    position: Float[np.ndarray, "samples 3"]
-    pulse_time: Float[np.ndarray, " pulse_samples"]
-    pulse_power: Float[np.ndarray, " pulse_samples"]
-    zenith: float
-    azimuth: float
-
-    @property
-    def signal(self) -> Float[np.ndarray, " samples"]:
-        """The received waveform less the mean noise, in counts; 0 where nothing was recorded."""
-        return np.where(self.recorded, self.waveform - self.noise_mean, 0.0)
-
-    @property
-    def elevation(self) -> Float[np.ndarray, " samples"]:
-        """Elevation of the samples in m, decreasing."""
-        return self.position[:, 2]
-
-    def time_from(self, elevation: float) -> Float[np.ndarray, " samples"]:
-        """Times of the samples in ns, for a simulation whose reference plane z = 0 lies at `elevation`.
-
-        **Arguments:** `elevation`: of the plane, m.
-
-        **Returns:** (samples,) ns. Zero is the two-way travel time to where the beam axis meets that plane;
-        earlier times are negative.
-        """
-        first, last = self.elevation[0], self.elevation[-1]
-        return np.arange(self.waveform.size) - (self.waveform.size - 1) * (elevation - first) / (last - first)
-
-    def position_at(self, elevation: float) -> Float[np.ndarray, " 2"]:
-        """Where the beam axis meets an elevation.
-
-        **Arguments:** `elevation`: m.
-
-        **Returns:** easting and northing, m.
-        """
-        first, last = self.position[0], self.position[-1]
-        return first[:2] + (last - first)[:2] * (elevation - first[2]) / (last[2] - first[2])
 
 
 class NeonImpulse(NamedTuple):
@@ -139,7 +62,7 @@ class NeonImpulse(NamedTuple):
 class NeonRead(NamedTuple):
     """What `read_neon` returns: the shots of a file and its system impulse.
 
-    - `shots`: list of `NeonShot`, in the order of the file.
+    - `shots`: list of `AirborneShot`, in the order of the file, in counts.
     - `impulse`: the `NeonImpulse`.
     - `dropped`: how many shots of the file were left out, by reason.
 
@@ -153,7 +76,7 @@ class NeonRead(NamedTuple):
     2
     """
 
-    shots: list[NeonShot]
+    shots: list[AirborneShot]
     impulse: NeonImpulse
     dropped: dict[str, int]
 
@@ -199,29 +122,31 @@ def read_neon(path: str | os.PathLike[str]) -> NeonRead:
     geo = _geolocation(path, data, len(ret))
     system, sent = (_impulse(path, data, key) for key in ("system_impulse", "impulse_outgoing"))
 
-    has_return = np.count_nonzero(ret, axis=1) >= _QUIET
-    has_pulse = np.count_nonzero(outgoing, axis=1) >= _QUIET
+    has_return = np.count_nonzero(ret, axis=1) >= QUIET
+    has_pulse = np.count_nonzero(outgoing, axis=1) >= QUIET
     kept = np.flatnonzero(has_return & has_pulse)
     if kept.size == 0:
         raise ValueError(f"{path}: ret, outgoing: no shot has both a return and a pulse")
-    quiet = np.stack([_recorded(ret[i])[:_QUIET] for i in kept])
-    mean = float(np.median(quiet.mean(axis=1)))
-    std = float(_STD_PER_MAD * np.median(np.abs(quiet - mean)))
-    pedestal = float(np.median([_recorded(outgoing[i])[:_QUIET_PULSE].mean() for i in kept]))
-    shots = [_shot(path, geo[i], ret[i], mean, std, outgoing[i], pedestal) for i in kept]
+    recorded = ([(Segment(_recorded(rows[i]), 0.0),) for rows in (outgoing, ret)] for i in kept)
+    levels = levels_of((sent, received) for sent, received in recorded)
+    shots = [_shot(path, geo[i], ret[i], outgoing[i], levels) for i in kept]
     dropped = {"without a return": int((~has_return).sum()), "without a pulse": int((~has_pulse).sum())}
     return NeonRead(shots, NeonImpulse(*system, *sent), dropped)
+
+
+def _segments(row: np.ndarray) -> tuple[Segment, ...]:
+    """What was recorded of a return, in pieces between zeros."""
+    ends = np.flatnonzero(np.diff(np.r_[False, row > 0, False]))
+    return tuple(Segment(row[a:b], float(a)) for a, b in zip(ends[::2], ends[1::2]))
 
 
 def _shot(
     path: Path,
     geo: dict[str, float],
     received: np.ndarray,
-    noise_mean: float,
-    noise_std: float,
     sent: np.ndarray,
-    pedestal: float,
-) -> NeonShot:
+    levels: Levels,
+) -> AirborneShot:
     shot = f"shot {geo['index']:.0f}"
     place = f"{path}: geo: {shot}"
     step = np.array([geo["dx"], geo["dy"], geo["dz"]])
@@ -232,35 +157,28 @@ def _shot(
         )
     if step[2] >= 0:
         raise ValueError(f"{place}: dz = {step[2]:g} m does not lead down")
-    samples = np.arange(np.flatnonzero(received)[-1] + 1)
-    position = np.array([geo["V9"], geo["V10"], geo["V11"]]) + (samples - geo["V16"])[:, None] * step
-    if np.abs(position).max() > FARTHEST:
+    anchor = np.array([geo["V9"], geo["V10"], geo["V11"]]) - geo["V16"] * step
+    returning = _segments(received)
+    last = anchor + returning[-1].time[-1] * step
+    if max(np.abs(anchor).max(), np.abs(last).max()) > FARTHEST:
         raise ValueError(f"{place}: V9, V10, V11, V16: the return lies beyond {FARTHEST:g} m")
     peak = geo["V15"]
-    if not (0 <= peak < sent.size and peak.is_integer()) or sent[int(peak)] <= pedestal:
+    if not (0 <= peak < sent.size and peak.is_integer()) or sent[int(peak)] <= levels.pedestal:
         raise ValueError(f"{place}: V15 = {peak:g} is no sample of the outgoing pulse")
-    east, north, up = step / length
-    waveform = received[: samples.size].copy()
-    return NeonShot(
-        index=int(geo["index"]),
-        waveform=waveform,
-        recorded=waveform > 0,
-        noise_mean=noise_mean,
-        noise_std=noise_std,
-        position=position,
-        pulse_time=np.arange(sent.size) - peak,
-        pulse_power=above_pedestal(sent, pedestal, f"{path}: outgoing: {shot}"),
-        zenith=float(np.rad2deg(np.arctan2(np.hypot(east, north), -up))),
-        azimuth=float(np.rad2deg(np.arctan2(east, north))) % 360.0,
+    # Its message says where a pulse has no energy.
+    above_pedestal(sent, levels.pedestal, f"{path}: outgoing: {shot}")
+    segments = {"returning": returning, "outgoing": (Segment(sent, -peak),)}
+    return AirborneShot(
+        int(geo["index"]), anchor=anchor, direction=step, **segments, **levels._asdict(), pulse_zero=0.0
     )
 
 
 def _impulse(path: Path, data: dict[str, np.ndarray], key: str) -> tuple[np.ndarray, np.ndarray]:
     """Times from the largest sample, and power above the pedestal."""
     samples = _counts(path, data, key, 1)
-    if np.count_nonzero(samples) < _QUIET:
-        raise ValueError(f"{path}: {key}: fewer than {_QUIET} samples")
-    pedestal = float(_recorded(samples)[:_QUIET_PULSE].mean())
+    if np.count_nonzero(samples) < QUIET:
+        raise ValueError(f"{path}: {key}: fewer than {QUIET} samples")
+    pedestal = float(_recorded(samples)[:QUIET_PULSE].mean())
     time = np.arange(samples.size) - float(np.argmax(samples))
     return time, above_pedestal(samples, pedestal, f"{path}: {key}")
 

@@ -1,135 +1,56 @@
-"""Results as netCDF-4 files, by the CF conventions, and back: `save`, `open`, `repeat`.
-
-What is written of a class follows from its annotations: an array of shape "wavelengths bins" has these two
-dimensions, a dict of such arrays one more, static fields are attributes, and modules in fields are groups.
-A class is made known by `keep_as_netcdf` with the units and names of its fields, so that other packages can
-add theirs; jaxlidar finds them by the entry points `jaxlidar.files`.
-"""
+"""Results as netCDF-4 files or Zarr stores, by the CF conventions, and back: `save`, `open`, `repeat`."""
 
 import contextlib
 import datetime
 import json
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator
 from importlib import metadata
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
 
 from jaxlidar._files import atomic_write
+from jaxlidar.instrument.photon_counter import PhotonEvents
 from jaxlidar.io.case import Case
 from jaxlidar.io.case import read_case as read_case_text
 from jaxlidar.io.gedi_beam import refusing
-from jaxlidar.io.tables import nearest
-from jaxlidar.simulate import Progress
+from jaxlidar.io.layouts import LAYOUTS, keep_as_netcdf, layout_of
+from jaxlidar.io.zarr_groups import ZarrGroup, is_zarr, opened
+from jaxlidar.truth import Truth
 from jaxlidar.waveform import Waveform
 
 CONVENTIONS = "CF-1.11"
 # The layout of the files. A reader refuses those that are newer.
 FORMAT = 1
-FILES = "jaxlidar.files"
 HDF5 = b"\x89HDF\r\n\x1a\n"
+# The file that makes a folder a Zarr store of version 3.
+ZARR = "zarr.json"
 # Reasons why a simulation stopped that depend on more than its arguments.
 NOT_REPEATABLE = ("time spent", "interrupted")
 
 
-class Layout(NamedTuple):
-    """How a class is written: its title, and for its fields (units, long name).
-
-    `dimensions` renames those of the annotations; `items` names the dimension of a dict's keys.
-    `coordinates` are fields that lie along a dimension beside the coordinate of its own name.
-    """
-
-    kind: type
-    title: str
-    quantities: Mapping[str, tuple[str, str]]
-    dimensions: Mapping[str, str]
-    items: Mapping[str, str]
-    coordinates: Mapping[str, str]
-
-
-LAYOUTS: dict[str, Layout] = {}
-
-
-def keep_as_netcdf(
-    kind: type,
-    title: str,
-    quantities: Mapping[str, tuple[str, str]],
-    *,
-    dimensions: Mapping[str, str] | None = None,
-    items: Mapping[str, str] | None = None,
-    coordinates: Mapping[str, str] | None = None,
-) -> None:
-    """Let `save` and `open` know a class of results, an `equinox.Module` whose fields are annotated.
-
-    Fields are arrays, dicts of arrays, modules that are known themselves, a `Scene` or a `Lidar`; static ones
-    are what JSON holds.
-
-    **Arguments:**
-
-    - `kind`: the class.
-    - `title`: what it is, in a few words.
-    - `quantities`: (units, long name) of every field that is an array or a dict of arrays.
-    - `dimensions`: by the names in annotations, those in the file, where they differ. A dimension named as a
-      field of one axis makes it a coordinate. Default None: none.
-    - `items`: names of the dimensions that the keys of dicts make. Default None: the fields' own, with
-      "_item".
-    - `coordinates`: fields that are further coordinates, each with the dimension that it lies along. Default
-      None: none.
-
-    **Returns:** nothing.
-
-    **Example:**
-
-    >>> import equinox as eqx, numpy as np, pathlib, tempfile
-    >>> import jaxlidar as jl
-    >>> from jaxtyping import Float
-    >>> class Heights(eqx.Module):
-    ...     top: Float[np.ndarray, " trees"]
-    >>> jl.io.keep_as_netcdf(Heights, "heights of trees", {"top": ("m", "height of the highest twig")})
-    >>> path = pathlib.Path(tempfile.mkdtemp()) / "trees.nc"
-    >>> jl.io.save(Heights(np.array([12.5, 20.0])), path)
-    >>> jl.open(path).top
-    array([12.5, 20. ])
-    """
-    LAYOUTS[kind.__name__] = Layout(kind, title, quantities, dimensions or {}, items or {}, coordinates or {})
-
-
-def layout_of(name: str, path: Path) -> Layout:
-    """How a class is written, by its name; the package that has it is asked first."""
-    if name not in LAYOUTS:
-        for point in metadata.entry_points(group=FILES):
-            if point.name == name:
-                point.load()
-    if name not in LAYOUTS:
-        raise ValueError(
-            f"{path}: it holds a {name}, which is not known here ({nearest(name, LAYOUTS)}): import the "
-            "package that has it first"
-        )
-    return LAYOUTS[name]
-
-
 def save(result: Any, path: str | os.PathLike[str], case: Case | None = None) -> None:
-    """Write a `Waveform`, or another result, as netCDF: with units, names, and where it comes from.
+    """Write a `Waveform`, or another result, as netCDF or Zarr: with units, names, and where it comes from.
 
     The file appears when it is whole. Numbers are exact: `jaxlidar.open` gives the same bits. Any program
-    that knows netCDF-4 reads it, `xarray.open_dataset` for one.
+    that knows netCDF-4 reads it, `xarray.open_dataset` for one; or Zarr, `xarray.open_zarr`.
 
     **Arguments:**
 
     - `result`: a `Waveform`, or an object of any other class that `keep_as_netcdf` was told of, such as
       `inversion.Retrieval` and `inversion.Retrievals`.
-    - `path`: the file to write.
-    - `case`: the `Case` that a waveform was simulated from, kept with it so that `jaxlidar.repeat` can
-      simulate it again. Default None: not kept.
+    - `path`: the file to write, or the folder of a Zarr store, whose name ends in ".zarr".
+    - `case`: the `Case` that a waveform, or those of a survey, were simulated from, kept with them so that
+      `jaxlidar.repeat` can simulate them again. Default None: not kept.
 
     **Returns:** nothing.
 
     **Raises:** TypeError for an object that no file can hold, or whose scene has classes of one's own.
-    ImportError where h5netcdf is not installed. ValueError for a case of other wavelengths. OSError for a
-    path that cannot be written.
+    ImportError where h5netcdf, or zarr, is not installed. ValueError for a case of other wavelengths or
+    shots, and where a ".zarr" is there that is no Zarr store. OSError for a path that cannot be written.
 
     **Example:**
 
@@ -142,21 +63,60 @@ def save(result: Any, path: str | os.PathLike[str], case: Case | None = None) ->
     >>> print(f"{float(jl.open(path).reflectance.sum()):.3f}")
     0.400
     """
-    from jaxlidar.io.groups import Writer
+    if case is not None:
+        _check_case(result, case)
+    with _new_file(result, path) as (writer, file):
+        writer.result(file, result)
+        if case is not None:
+            writer.case(file, "case", case)
 
-    path, name = Path(path), type(result).__name__
-    if name not in LAYOUTS or LAYOUTS[name].kind is not type(result):
-        raise TypeError(f"result is of the class {name}; admissible are {', '.join(sorted(LAYOUTS))}")
-    if case is not None and case.lidar is not None and hasattr(result, "wavelength"):
-        sent, received = np.asarray(case.lidar.wavelength), np.asarray(result.wavelength)
+
+def _check_case(result: Any, case: Case) -> None:
+    """**Raises:** ValueError where a result cannot be that of a case."""
+    lidar = case.lidar if case.survey is None else case.survey.lidar
+    if lidar is not None and hasattr(result, "wavelength"):
+        sent, received = np.asarray(lidar.wavelength), np.asarray(result.wavelength)
         if not np.array_equal(sent, received):
             raise ValueError(
                 f"case has a lidar of {sent.tolist()} nm, the waveform is of {received.tolist()} nm: it is "
                 "not the case that it was simulated from"
             )
-    netcdf = _h5netcdf()
+    place = getattr(result, "position", None)
+    if (case.survey is None) != (place is None):
+        raise ValueError("a case with a survey belongs to Waveforms, one without to a Waveform")
+    if case.survey is not None and not np.array_equal(case.survey.position, np.asarray(place)):
+        raise ValueError("the shots of the case have another position than the waveforms")
+
+
+@contextlib.contextmanager
+def by_rows(result: Any, path: str | os.PathLike[str], case: Case | None = None) -> Iterator[Any]:
+    """Write a result whose rows are only known later: what the block is given adds them.
+
+    The arrays of `result` with rows have the right shape and type, but their values do not count. `case` is
+    kept as by `save`.
+    """
+    with _new_file(result, path) as (writer, file):
+        if case is not None:
+            writer.case(file, "case", case)
+        rows = writer.frame(file, result)
+        yield rows
+        rows.end()
+
+
+@contextlib.contextmanager
+def _new_file(result: Any, path: str | os.PathLike[str]) -> Iterator[tuple[Any, Any]]:
+    """A file that appears under its name when the block ends: what writes into it, and its root group."""
+    from jaxlidar.io.groups import Writer
+
+    path, name = Path(path), type(result).__name__
+    if name not in LAYOUTS or LAYOUTS[name].kind is not type(result):
+        raise TypeError(f"result is of the class {name}; admissible are {', '.join(sorted(LAYOUTS))}")
+    if is_zarr(path) and path.exists() and not (path / ZARR).is_file():
+        raise ValueError(f"{path}: it is there already and no Zarr store; nothing is overwritten")
     now = f"{datetime.datetime.now(datetime.UTC):%Y-%m-%dT%H:%M:%SZ}"
-    with atomic_write(path) as draft, netcdf.File(draft, "w") as file:
+    with contextlib.ExitStack() as stack:
+        draft = stack.enter_context(atomic_write(path))
+        file = opened(draft, "w") if is_zarr(path) else stack.enter_context(_h5netcdf().File(draft, "w"))
         file.attrs.update(
             {
                 "Conventions": CONVENTIONS,
@@ -170,10 +130,7 @@ def save(result: Any, path: str | os.PathLike[str], case: Case | None = None) ->
                 "precision": precision(),
             }
         )
-        writer = Writer(LAYOUTS)
-        writer.result(file, result)
-        if case is not None:
-            writer.case(file, "case", case)
+        yield Writer(LAYOUTS), file
 
 
 def version(package: str) -> str:
@@ -199,16 +156,9 @@ def _h5netcdf() -> Any:
 
 def _with_file(path: str | os.PathLike[str], use: Callable[[Path, Any], Any]) -> Any:
     """What `use` makes of an open file of this package."""
-    path, netcdf = Path(path), _h5netcdf()
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
-    # HDF5 keeps files that it has opened by name, damaged ones too; not those that are opened for it.
-    with path.open("rb") as stream, contextlib.ExitStack() as opened:
-        if stream.read(len(HDF5)) != HDF5:
-            raise ValueError(f"{path}: byte 0: no netCDF-4 file")
-        stream.seek(0)
-        with refusing(f"{path}: damaged"):
-            file = opened.enter_context(netcdf.File(stream, "r"))
+    path = Path(path)
+    with contextlib.ExitStack() as stack:
+        file = _zarr_store(path) if is_zarr(path) else _netcdf_file(path, stack)
         with refusing(f"{path}: the attributes: damaged"):
             attributes = dict(file.attrs)
         if "jaxlidar_kind" not in attributes:
@@ -221,16 +171,43 @@ def _with_file(path: str | os.PathLike[str], use: Callable[[Path, Any], Any]) ->
         return use(path, file)
 
 
+def _netcdf_file(path: Path, stack: contextlib.ExitStack) -> Any:
+    """A netCDF-4 file that is open until the stack closes. **Raises:** as `open`."""
+    netcdf = _h5netcdf()
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file")
+    # HDF5 keeps files that it has opened by name, damaged ones too; not those that are opened for it.
+    stream = stack.enter_context(path.open("rb"))
+    if stream.read(len(HDF5)) != HDF5:
+        raise ValueError(f"{path}: byte 0: no netCDF-4 file")
+    stream.seek(0)
+    with refusing(f"{path}: damaged"):
+        return stack.enter_context(netcdf.File(stream, "r"))
+
+
+def _zarr_store(path: Path) -> ZarrGroup:
+    """A Zarr store. **Raises:** as `open`."""
+    if not path.is_dir():
+        raise FileNotFoundError(f"{path}: no such folder")
+    if not (path / ZARR).is_file():
+        raise ValueError(f"{path}: no Zarr store of version 3: it has no {ZARR}")
+    with refusing(f"{path}: damaged"):
+        return opened(path, "r")
+
+
 def open(path: str | os.PathLike[str]) -> Any:
     """What `save` wrote: a `Waveform`, or another result.
 
-    **Arguments:** `path`: a file of `jaxlidar.io.save`.
+    Waveforms of surveys in netCDF files are compared with their checksums, but not read into memory: their
+    arrays are mapped (`numpy.memmap`), and read where they are used.
+
+    **Arguments:** `path`: a file, or a Zarr store, of `jaxlidar.io.save`.
 
     **Returns:** an object of the class that was saved, with the same bits.
 
     **Raises:** FileNotFoundError where there is no such file. ValueError, naming the file and the place, for
-    one that is damaged, or not written by `save`, or whose class is not known. ImportError where h5netcdf is
-    not installed.
+    one that is damaged, or not written by `save`, or whose class is not known. ImportError where h5netcdf, or
+    zarr, is not installed.
 
     **Example:**
 
@@ -256,7 +233,7 @@ def read_case(path: str | os.PathLike[str]) -> Case:
     **Arguments:**
 
     - `path`: a TOML file with the tables `lidar`, `scene` and `simulate`, any of which may be missing; files
-      that it names lie relative to it. Or a netCDF file of `jaxlidar.io.save`.
+      that it names lie relative to it. Or a file, or Zarr store, of `jaxlidar.io.save`.
 
     **Returns:** a `Case`.
 
@@ -277,25 +254,28 @@ def read_case(path: str | os.PathLike[str]) -> Case:
     from jaxlidar.io.groups import Reader
 
     path = Path(path)
-    if path.is_file():
+    kept = is_zarr(path)
+    if not kept and path.is_file():
         with path.open("rb") as start:
-            if start.read(len(HDF5)) == HDF5:
-                return _with_file(path, lambda path, file: Reader(path, layout_of).case(file, "case", ""))
-    return read_case_text(path)
+            kept = start.read(len(HDF5)) == HDF5
+    if not kept:
+        return read_case_text(path)
+    return _with_file(path, lambda path, file: Reader(path, layout_of).case(file, "case", ""))
 
 
-def repeat(path: str | os.PathLike[str], progress: Callable[[Progress], None] | None = None) -> Waveform:
-    """Simulate again the waveform of a file that was saved with its case.
+def repeat(path: str | os.PathLike[str], progress: Callable[[Any], None] | None = None) -> Any:
+    """Simulate again the waveform of a file that was saved with its case, or the waveforms of a survey.
 
     On the same machine, with the same versions (the attribute `versions`), the waveform is the same bit for
-    bit, but for `info["seconds"]`.
+    bit, but for `info["seconds"]`. Files that `simulate_many` wrote have their case, unless the scene has
+    classes of one's own.
 
     **Arguments:**
 
     - `path`: a file of `jaxlidar.io.save`, saved with `case`.
-    - `progress`: as for `jaxlidar.simulate`. Default None.
+    - `progress`: as for `jaxlidar.simulate`, or `jaxlidar.simulate_many`. Default None.
 
-    **Returns:** a `Waveform`.
+    **Returns:** a `Waveform`, or the `Waveforms` of a survey, in memory.
 
     **Raises:** ValueError for a file without a case, for a run that an interrupt or `max_seconds` ended, and
     where JAX's precision is another; and what `jaxlidar.io.read_case` raises.
@@ -343,4 +323,46 @@ keep_as_netcdf(
     dimensions={"bins": "time", "wavelengths": "wavelength"},
     items={"components": "component", "ledger": "fate", "ledger_stderr": "fate"},
     coordinates={"height": "time"},
+)
+
+keep_as_netcdf(
+    PhotonEvents,
+    "photon events of a simulated lidar",
+    {
+        "time": ("ns", "recorded time after the two-way travel time of the reference plane"),
+        "height": ("m", "height above the reference plane from which light of order one arrives"),
+        "shot": ("1", "number of the shot"),
+        "pulse": ("1", "number of the pulse of the shot"),
+        "pixel": ("1", "number of the pixel"),
+        "wavelength": ("nm", "wavelength of the lidar"),
+        "signal": ("1", "whether light of the waveform made the event"),
+        "lost": ("1", "photons that arrived while their pixel was blind"),
+        "window": ("m", "heights between which the record lies"),
+    },
+    dimensions={"2": "end"},
+)
+
+# What `Truth` has, and that of many shots as well.
+TRUTH = {
+    "returns": ("1", "apparent reflectance of order one per sample by material, of a pulse without duration"),
+    "gap_probability": ("1", "share of the beam that meets nothing down to the end of the sample"),
+    "leaf_area_density": ("m2 m-3", "one-sided area of leaf per volume"),
+    "bark_area_density": ("m2 m-3", "half of the surface of bark per volume"),
+    "plant_area_index": ("1", "area of leaf and bark per area of ground, above the end of the sample"),
+    "top_height": ("m", "height above which plants and plates intercept 1 % of the beam"),
+    "surface_height": ("m", "mean height at which the beam meets the surface"),
+    "surface_spread": ("m", "standard deviation of the height at which the beam meets the surface"),
+}
+# Its samples may be finer than those of the waveform that it belongs to.
+keep_as_netcdf(
+    Truth,
+    "truth of a simulated lidar waveform",
+    {
+        "time": ("ns", "time of arrival after the two-way travel time of the reference plane"),
+        "height": ("m", "height above the reference plane from which light of order one arrives"),
+        **TRUTH,
+    },
+    dimensions={"bins": "sample", "wavelengths": "wavelength"},
+    items={"returns": "material", "surface_height": "surface", "surface_spread": "surface"},
+    coordinates={"time": "sample", "height": "sample"},
 )

@@ -12,11 +12,10 @@ from jaxlidar._summary import percent
 from jaxlidar.instrument.field_of_view import EDGE
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.planning.bounds import Bounds
-from jaxlidar.planning.effects import NAMES, Effect, present, without
+from jaxlidar.planning.effects import NAMES, Effect, planes, present, without
 from jaxlidar.planning.orders import Orders
 from jaxlidar.planning.trace_plan import Bins
 from jaxlidar.scenes.scene import Scene
-from jaxlidar.scenes.shapes import Plane
 from jaxlidar.scenes.surfaces import Ground
 
 
@@ -41,7 +40,7 @@ def effect_table(
     )
     # Values that are being traced are unknown, and bounds hold for planes only.
     known = not any(is_traced(x) for x in jax.tree.leaves((lidar, scene)))
-    known = known and all(isinstance(s.shape, Plane) for s in scene.surfaces)
+    known = known and planes(scene)
 
     @functools.cache
     def rules(off: tuple[str, ...]) -> dict[str, Callable[[], float]]:
@@ -60,7 +59,9 @@ def effect_table(
         reason, others = reasons[name], off
         if name in off:
             # What switching it on again would change.
-            reason, others = "switched off", tuple(n for n in off if n != name)
+            unlike = "the terrain is a plane" if name == "relief" else "zero everywhere"
+            reason = "switched off" if has[name] else unlike
+            others = tuple(n for n in off if n != name)
         elif not has[name] and name not in ("multiple scattering", "hot spot"):
             reason = "not in the scene"
         elif has[name] and not planned[name] and name != "multiple scattering":

@@ -5,13 +5,14 @@ from collections.abc import Mapping
 
 import jax.numpy as jnp
 
-from jaxlidar._checks import known_number
+from jaxlidar._checks import concrete, known_number
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.optics.laws import AbstractMirror
 from jaxlidar.scenes.canopy import Canopy
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.shapes import Plane
-from jaxlidar.scenes.surfaces import Ground
+from jaxlidar.scenes.surfaces import AbstractGround, Ground
+from jaxlidar.scenes.terrain import Terrain
 
 # In the order of the table; each can be switched.
 NAMES = (
@@ -19,6 +20,7 @@ NAMES = (
     "bark",
     "plates",
     "ground",
+    "relief",
     "slope spread",
     "multiple scattering",
     "specular return",
@@ -63,8 +65,42 @@ class Effect:
 
 
 def only_planes(scene: Scene) -> bool:
-    """Whether the scene consists of infinite planes alone."""
-    return scene.canopy is None and all(isinstance(s.shape, Plane) for s in scene.surfaces)
+    """Whether the scene consists of infinite planes alone, each of them the same throughout."""
+    return scene.canopy is None and planes(scene)
+
+
+def planes(scene: Scene) -> bool:
+    """Whether all surfaces of the scene are infinite planes, each of them the same throughout."""
+    return all(isinstance(s.shape, Plane) and s.pattern is None for s in scene.surfaces)
+
+
+def is_flat(ground: AbstractGround | None) -> bool:
+    """Whether the ground is terrain whose heights, which must be known, lie in a plane."""
+    return isinstance(ground, Terrain) and ground.relief and ground.is_plane()
+
+
+def flattened(scene: Scene, effects: Mapping[str, bool] | None) -> Scene:
+    """The scene with flat terrain as a plane, unless `effects` asks for relief."""
+    if not is_flat(scene.ground) or (effects or {}).get("relief") is True:
+        return scene
+    return without_relief(scene)
+
+
+def empty(scene: Scene, effects: Mapping[str, bool] | None = None) -> tuple[str, ...]:
+    """Which of "leaf" and "bark" are known to be zero everywhere, but for those that `effects` asks for."""
+    if scene.canopy is None:
+        return ()
+    known = {name: concrete(getattr(scene.canopy.voxels, name)) for name in ("leaf", "bark")}
+    asked = effects or {}
+    return tuple(n for n, a in known.items() if a is not None and not a.any() and asked.get(n) is not True)
+
+
+def without_relief(scene: Scene) -> Scene:
+    """The scene with its terrain, if there is any, as a plane."""
+    ground = scene.ground
+    if not isinstance(ground, Terrain) or not ground.relief:
+        return scene
+    return dataclasses.replace(scene, ground=ground.without_relief())
 
 
 def can_light_itself(scene: Scene) -> bool:
@@ -75,13 +111,14 @@ def can_light_itself(scene: Scene) -> bool:
 
 def present(lidar: Lidar, scene: Scene) -> dict[str, bool]:
     """Whether a lidar and a scene have each effect of `NAMES`."""
-    canopy, air = scene.canopy, scene.atmosphere
+    canopy, air, ground = scene.canopy, scene.atmosphere, scene.ground
     return {
         "leaf": canopy is not None and canopy.voxels.leaf is not None,
         "bark": canopy is not None and canopy.voxels.bark is not None,
         "plates": bool(scene.plates),
         "ground": scene.ground is not None,
-        "slope spread": isinstance(scene.ground, Ground) and known_number(scene.ground.slope) > 0,
+        "relief": isinstance(ground, Terrain) and ground.relief,
+        "slope spread": isinstance(ground, Ground) and known_number(ground.slope) > 0,
         "multiple scattering": can_light_itself(scene),
         "specular return": any(isinstance(s.law, AbstractMirror) for s in scene.surfaces),
         "divergence": known_number(lidar.divergence) > 0,
@@ -120,6 +157,7 @@ def switched_off(
     off = tuple(name for name in NAMES if has[name] and effects.get(name) is False)
     for name, needs in (
         ("atmospheric backscatter", ("atmospheric extinction",)),
+        ("relief", ("ground",)),
         ("slope spread", ("ground",)),
         ("hot spot", ("leaf", "bark")),
     ):
@@ -150,6 +188,8 @@ def without(lidar: Lidar, scene: Scene, off: tuple[str, ...]) -> tuple[Lidar, Sc
     canopy, ground, air = scene.canopy, scene.ground, scene.atmosphere
     if canopy is not None:
         canopy = _thinned(canopy, off)
+    if "relief" in off:
+        ground = without_relief(scene).ground
     if isinstance(ground, Ground) and "slope spread" in off:
         ground = _levelled(ground, lidar)
     if air is not None and "atmospheric backscatter" in off:

@@ -7,6 +7,8 @@ import numpy as np
 from jaxlidar._checks import known_array, known_number
 from jaxlidar._vectors import FAR
 from jaxlidar.instrument.lidar import Lidar
+from jaxlidar.instrument.survey import Survey
+from jaxlidar.planning.rims import rims_of
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.surfaces import AbstractSheet
 
@@ -17,6 +19,8 @@ MOST_VOXELS = 16_384
 class PathLengths:
     """Path lengths from the rim of the footprint to the bounds of everything in the scene.
 
+    Those of a survey are bounds for all of its shots.
+
     - `first`, `last`: two-way path, m, of the first and the last return of order one, relative to that of the
       aim point.
     - `upstream`: distance before the reference plane, m, at which all rays start.
@@ -24,21 +28,11 @@ class PathLengths:
     **Raises:** ValueError where the scene reaches up to the sensor.
     """
 
-    def __init__(self, lidar: Lidar, scene: Scene):
+    def __init__(self, lidar: Lidar, scene: Scene, survey: Survey | None = None):
         self.scene = scene
-        axis = known_array(lidar.direction)
-        slant = known_number(lidar.range_to_reference)
-        rim = 2.5 * known_number(lidar.footprint_radius)
-        aim = np.append(known_array(lidar.position), 0.0)
-        across = np.cross(axis, [1.0, 0, 0] if abs(axis[0]) < 0.7 else [0, 1.0, 0])
-        across /= np.linalg.norm(across)
-        other = np.cross(axis, across)
-        turn = np.linspace(0, 2 * np.pi, 33)[:, None]
-        circle = rim * (np.cos(turn) * across + np.sin(turn) * other)
-        points = np.concatenate([np.zeros((1, 3)), circle])
-        rays = axis * slant + points
-        distance = np.linalg.norm(rays, axis=1)
-        self.rays = rays / distance[:, None]
+        shots = Survey.of(lidar) if survey is None else survey
+        self.vertical = not np.any(shots.zenith)
+        aim, points, self.rays, distance, slant = (a.reshape(-1, *a.shape[2:]) for a in rims_of(shots, 2.5))
         levels = []
         for s in scene.surfaces:
             crossed, towards = s.shape.crossing(points + aim, self.rays)
@@ -54,13 +48,14 @@ class PathLengths:
         along = np.concatenate(levels) if levels else np.zeros(1)
         nearest, farthest = float(along.min()), float(along.max())
         self.first = 2.0 * nearest
-        self.last = 2.0 * (farthest + float(distance.max()) - slant)
+        self.last = 2.0 * (farthest + float(np.max(distance - slant)))
         self.upstream = 0.05 * (farthest - nearest) + 1e-3 - nearest
-        if self.upstream >= slant:
+        lowest = float(np.min(slant))
+        if self.upstream >= lowest:
             altitude = known_number(lidar.altitude)
             raise ValueError(
                 f"altitude = {altitude:g} m: the scene reaches up to the sensor; "
-                f"admissible is more than {altitude + self.upstream - slant:g} m"
+                f"admissible is more than {altitude + self.upstream - lowest:g} m"
             )
 
     @property

@@ -5,18 +5,21 @@ import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from jaxlidar._checks import check_choice, check_integer, check_range, known_number
+from jaxlidar._checks import check_choice, check_integer, check_range, known_array, known_number
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._summary import percent
 from jaxlidar.instrument.lidar import Lidar
+from jaxlidar.instrument.survey import Survey
 from jaxlidar.optics.laws import AbstractMirror
 from jaxlidar.planning.effect_table import effect_table
-from jaxlidar.planning.effects import Effect, only_planes, present, switched_off, without
+from jaxlidar.planning.effects import Effect, empty, flattened, only_planes, present, switched_off, without
 from jaxlidar.planning.ladder import rung
 from jaxlidar.planning.local_origin import about_aim
 from jaxlidar.planning.memory import check_memory, in_words, memory_limit, predicted
 from jaxlidar.planning.orders import degree_of, order_steps, orders_of, tail_of
+from jaxlidar.planning.parallel_light import parallel_light
 from jaxlidar.planning.path_lengths import PathLengths
+from jaxlidar.planning.rims import check_on_terrain
 from jaxlidar.planning.scatterers import largest_albedo, lobe_probability, scene_optics, spell
 from jaxlidar.planning.trace_plan import KERNEL, Bins, TracePlan
 from jaxlidar.scenes.scene import Scene, check_kinds
@@ -35,7 +38,8 @@ class Limits(NamedTuple):
     - `first`, `last`: times (ns) of the first and the last return of order one. - `albedo`: the largest.
     - `finest`: scale (ns) of the finest feature of the pulse.
     - `automatic_orders`, `automatic_window`: whether the plan chose them. - `most_orders`: how many there is
-      room for.
+      room for. - `flat`: whether terrain was found to be a plane.
+    - `empty`: which of "leaf" and "bark" were found to be zero everywhere.
     """
 
     first: float
@@ -45,6 +49,8 @@ class Limits(NamedTuple):
     automatic_orders: bool
     automatic_window: bool
     most_orders: int
+    flat: bool
+    empty: tuple[str, ...]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -135,7 +141,7 @@ class Plan:
 
 
 def plan(
-    lidar: Lidar,
+    lidar: Lidar | Survey,
     scene: Scene,
     *,
     rtol: float | None = None,
@@ -158,7 +164,8 @@ def plan(
 
     **Arguments:**
 
-    - `lidar`: a `Lidar`.
+    - `lidar`: a `Lidar`; or a `Survey`: the plan then serves all of its shots; its table is that of a shot
+      in their middle with the largest zenith.
     - `scene`: a `Scene`.
     - `rtol`: relative accuracy aimed at, in (0, 1); sets how many orders are worth following. Default None:
       0.01.
@@ -177,16 +184,17 @@ def plan(
     - `footprint`: "random" (each batch shifts the rays, so that the standard error covers them) or "fixed".
       Default "random".
     - `effects`: effects to switch off, by name, as in {"multiple scattering": False}; True asks for what is
-      on anyway and refuses scenes that do not have it. The names are those of the table's first column.
-      Default None.
+      on anyway and refuses scenes that do not have it. Only leaf or bark that is zero everywhere, and relief
+      of terrain that is a plane, are off unless True asks for them. The names are those of the table's first
+      column. Default None.
     - `max_memory`: GB that the simulation may take, positive. Default None: a quarter of the machine's.
     - `describe`: whether to make the table of effects with its bounds, which takes some 40 ms. Default True.
 
     **Returns:** a `Plan`; `print` shows it as a table.
 
-    **Raises:** ValueError for inadmissible arguments, for a scene that reaches up to the sensor, for what
-    would take more memory than `max_memory`, and if the geometry is being traced by a JAX transformation:
-    make the plan outside and pass it in.
+    **Raises:** ValueError for inadmissible arguments, for a scene that reaches up to the sensor, for a
+    footprint that lies partly off the terrain, for what would take more memory than `max_memory`, and if the
+    geometry is being traced by a JAX transformation: make the plan outside and pass it in.
 
     **Example:**
 
@@ -196,6 +204,8 @@ def plan(
     >>> print(plan.orders, [effect.name for effect in plan.effects if effect.simulated])
     1 ['ground', 'slope spread']
     """
+    survey = lidar if isinstance(lidar, Survey) else None
+    lidar = lidar.middle if isinstance(lidar, Survey) else lidar
     check_kinds(lidar, scene)
     rtol = DEFAULT_RTOL if rtol is None else float(rtol)
     if not 0 < rtol < 1:
@@ -209,10 +219,18 @@ def plan(
     if max_memory is not None:
         check_range("max_memory", max_memory, 0.0, low_open=True)
     check_choice("footprint", footprint, ("random", "fixed"))
-    whole = lidar, scene = about_aim(lidar, scene)
+    check_on_terrain(lidar if survey is None else survey, scene)
+    survey = None if survey is None else survey.about(known_array(lidar.position))
+    lidar, given = about_aim(lidar, scene)
+    nothing = empty(given, effects)
+    given = without(lidar, given, nothing)[1]
+    scene = flattened(given, effects)
+    whole = lidar, scene
     off = switched_off(effects, present(lidar, scene), max_orders)
+    flat = scene is not given
+    off = (*off, *(("relief",) if flat else ()), *nothing)
     lidar, scene = without(lidar, scene, off)
-    geometry = PathLengths(lidar, scene)
+    geometry = PathLengths(lidar, scene, survey)
     optics = scene_optics(lidar, scene)
     letters = spell(optics)
     if "multiple scattering" in off:
@@ -247,7 +265,7 @@ def plan(
         mirrors=tuple(isinstance(s.law, AbstractMirror) for s in scene.surfaces),
         has_ground=scene.ground is not None,
         hotspot=scene.canopy is not None and scene.canopy.hotspot,
-        vertical=known_number(lidar.zenith) == 0.0,
+        vertical=geometry.vertical,
         upstream=geometry.upstream,
         first_steps=rung(first_steps, 8 if first_steps <= 128 else 16),
         march_steps=rung(geometry.march_steps(last + geometry.upstream)),
@@ -280,6 +298,10 @@ def plan(
     rows = ()
     if describe:
         rows = effect_table(*whole, off, chosen, airy, geometry.upstream, whole_first=window is None)
+        if survey is not None and geometry.vertical:
+            bound = parallel_light(survey, geometry.upstream, geometry.last / SPEED_OF_LIGHT)
+            reason = "neglected where footprints share light"
+            rows += (Effect("spreading of rays", False, reason, bound, "samples"),)
     return Plan(
         trace=trace,
         bins=bins,
@@ -306,6 +328,8 @@ def plan(
             max_orders is None,
             window is None,
             most,
+            flat,
+            nothing,
         ),
         memory=memory,
         effects=rows,

@@ -7,14 +7,16 @@ from jaxlidar._checks import known_number
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.optics.laws import AbstractMirror
-from jaxlidar.planning.effects import only_planes, without
+from jaxlidar.planning.effects import empty, only_planes, without
 from jaxlidar.planning.local_origin import about_aim
 from jaxlidar.planning.orders import orders_of
 from jaxlidar.planning.path_lengths import PathLengths
 from jaxlidar.planning.plan import Plan
+from jaxlidar.planning.rims import check_on_terrain
 from jaxlidar.planning.scatterers import largest_albedo, scene_optics, spell
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.surfaces import AbstractSheet
+from jaxlidar.scenes.terrain import Terrain
 
 # Lengths and times may differ by the rounding of single precision.
 _ROUNDING = 1e-5
@@ -25,6 +27,15 @@ def check_plan(plan: Plan, lidar: Lidar, scene: Scene) -> None:
 
     **Raises:** ValueError that names what does not fit, with numbers.
     """
+    check_on_terrain(lidar, scene)
+    ground = scene.ground
+    if plan.limits.flat and isinstance(ground, Terrain) and ground.relief and not ground.is_plane():
+        raise ValueError("the plan does not fit: it takes the terrain for a plane; make one for this terrain")
+    for name in plan.limits.empty:
+        if name not in empty(scene):
+            raise ValueError(
+                f"the plan does not fit: it is for a map without {name}; make one for this scene"
+            )
     lidar, scene = without(*about_aim(lidar, scene), plan.off)
     for sentence in (*_kinds(plan, lidar, scene), *_times(plan, lidar, scene), *_pulse(plan, lidar)):
         raise ValueError(f"the plan does not fit: {sentence}; make one for this lidar and this scene")

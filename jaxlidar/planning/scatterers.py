@@ -62,7 +62,7 @@ def scene_optics(lidar: Lidar, scene: Scene) -> list[Optics]:
     if canopy is not None and canopy.voxels.bark is not None:
         found.append(Optics("bark", canopy.bark_reflectance(wavelength), None))
     for name, surface in zip(surface_names(scene), scene.surfaces):
-        r = reflectance_at(surface.reflectance, wavelength, f"{name} reflectance")
+        r = reflectance_at(surface.brightest, wavelength, f"{name} reflectance")
         t = None
         if isinstance(surface, AbstractSheet):
             t = reflectance_at(surface.transmittance, wavelength, f"{name} transmittance")

@@ -14,6 +14,7 @@ from jaxlidar.planning.effects import without
 from jaxlidar.planning.local_origin import about_aim
 from jaxlidar.planning.plan import Plan
 from jaxlidar.scenes.scene import Scene, check_kinds
+from jaxlidar.scenes.terrain import Terrain
 
 
 @final
@@ -57,7 +58,8 @@ def reduce(lidar: Lidar, scene: Scene, plan: Plan) -> Setup:
 
     **Returns:** a `Setup`.
 
-    **Raises:** TypeError for things of another kind.
+    **Raises:** TypeError for things of another kind; ValueError for heights of terrain that are being traced
+    with a plan for a plane, and for leaf or bark with one for a map that has none.
 
     **Example:**
 
@@ -69,6 +71,18 @@ def reduce(lidar: Lidar, scene: Scene, plan: Plan) -> Setup:
     """
     check_kinds(lidar, scene)
     check_kind("plan", plan, Plan, "a Plan that jaxlidar.plan made")
+    ground = scene.ground
+    if plan.limits.flat and isinstance(ground, Terrain) and is_traced(ground.heights):
+        raise ValueError(
+            "the plan takes the terrain for a plane, but its heights are being traced by a JAX "
+            'transformation; make the plan with effects={"relief": True}'
+        )
+    for name in plan.limits.empty:
+        if scene.canopy is not None and is_traced(getattr(scene.canopy.voxels, name)):
+            raise ValueError(
+                f"the plan is for a map whose {name} is zero everywhere, but {name} is being traced by a JAX "
+                f'transformation; make the plan with effects={{"{name}": True}}'
+            )
     admissible = jnp.ones(())
     if any(is_traced(x) for x in jax.tree.leaves((lidar, scene))):
         admissible = jnp.where(inadmissible((lidar, scene)), jnp.nan, admissible)

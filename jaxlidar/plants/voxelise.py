@@ -3,12 +3,13 @@
 Thin branch segments and leaf clumps are filled with points of known volume, `voxel_size / samples` apart. A
 frustum is cut into slabs, and each slab's exact volume is shared among the points of a disc. Segments with a
 radius of four such distances or more use the centres of the subvoxels that lie within them, so that a voxel
-inside is full. Every point counts in the voxel in which it lies. The sum over voxels is the volume of the
-solids, whatever the voxel size. Only the division between neighbouring voxels is uncertain: a voxel that the
-side of a trunk cuts through is off by about 1 % of its volume with 8 samples (root mean square, measured).
+inside is full. Every point counts in the voxel in which it lies, and a clump within one voxel counts there as
+a whole. The sum over voxels is the volume of the solids, whatever the voxel size. Only the division between
+neighbouring voxels is uncertain: a voxel that the side of a trunk cuts through is off by about 1 % of its
+volume with 8 samples (root mean square, measured).
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -22,12 +23,13 @@ from jaxlidar._checks import (
     check_shape,
     kind_of,
 )
+from jaxlidar.plants.grid import Grid, edges
 from jaxlidar.plants.tree import Tree
 from jaxlidar.scenes.voxels import VoxelMap
 
 _GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
-# Points are made and counted for this many segments or clumps at a time.
-_CHUNK = 2000
+# Points are made and counted for this many segments or clumps at a time, and clumps as wholes for so many.
+_CHUNK, _WHOLE = 2000, 500_000
 # More points for one solid would not change a voxel by 0.1 %.
 _MOST = 200_000
 
@@ -82,7 +84,7 @@ def voxelise(
     """
     check_kind("trees", trees, Tree | Iterable, "a Tree or several")
     trees = [trees] if isinstance(trees, Tree) else list(trees)
-    size = _edges(voxel_size)
+    size = edges(voxel_size)
     check_choice("wood", wood, ("volume", "surface"))
     if leaf_area is not None:
         check_number("leaf_area", leaf_area, 0.0)
@@ -90,7 +92,7 @@ def voxelise(
     tree = Tree.joined(trees)
     if not len(tree.start) and not len(tree.bud_position):
         raise ValueError("trees have neither wood nor clumps; there is nothing to voxelise")
-    grid = _Grid.of(*_reach(tree), size, origin, shape)
+    grid = Grid.of(*_reach(tree), size, origin, shape)
     apart = float(size.min()) / samples
     volume, surface, leaf = grid.empty(), grid.empty(), grid.empty()
     thick = np.minimum(tree.radius_start, tree.radius_end) >= 4 * apart
@@ -102,8 +104,11 @@ def voxelise(
     if wood == "surface":
         for part in np.split(np.arange(len(thick)), range(_CHUNK, len(thick), _CHUNK)):
             grid.count(*_in_frustums(tree, part, apart, on_surface=True), surface)
-    for i in range(0, len(tree.bud_position), _CHUNK):
-        grid.count(*_in_spheres(tree, slice(i, i + _CHUNK), apart, leaf_area), leaf)
+    for part in _parts(len(tree.bud_position), _WHOLE):
+        within = grid.within_a_voxel(tree.bud_position[part], tree.bud_radius[part])
+        grid.count(*_at_centres(tree, part[within], leaf_area), leaf)
+        for some in _parts(int(np.sum(~within)), _CHUNK):
+            grid.count(*_in_spheres(tree, part[~within][some], apart, leaf_area), leaf)
     return _map(grid, leaf, volume, surface, tree, leaf_area, wood)
 
 
@@ -160,9 +165,9 @@ def voxelise_points(
     if on_wood.dtype != bool:
         raise TypeError(f"is_wood is {kind_of(is_wood)}; admissible is an array of booleans, one a point")
     check_shape("is_wood", on_wood, (len(points),))
-    size = _edges(voxel_size)
+    size = edges(voxel_size)
     # A point on the upper face still counts in the voxel below it.
-    grid = _Grid.of(points.min(axis=0), np.nextafter(points.max(axis=0), np.inf), size, origin, shape)
+    grid = Grid.of(points.min(axis=0), np.nextafter(points.max(axis=0), np.inf), size, origin, shape)
     leaf, wood = grid.empty(), grid.empty()
     for chosen, into in ((~on_wood, leaf), (on_wood, wood)):
         grid.count(points[chosen], np.ones(int(chosen.sum())), into)
@@ -215,50 +220,6 @@ def crop(voxels: VoxelMap) -> VoxelMap:
         np.asarray(voxels.origin, float) + np.asarray(voxels.voxel_size, float) * first,
         voxels.leaf_angles,
     )
-
-
-class _Grid:
-    """A regular voxel grid in double precision."""
-
-    def __init__(self, low: np.ndarray, size: np.ndarray, shape: tuple[int, ...]):
-        self.low, self.size, self.shape = low, size, shape
-
-    @staticmethod
-    def of(low, high, size, origin, shape) -> "_Grid":
-        """The given grid, or the smallest one around the box from `low` to `high`."""
-        if (origin is None) != (shape is None):
-            raise ValueError("origin and shape belong together: give both or neither")
-        if origin is None:
-            first = np.floor(low / size + 1e-9)
-            count = np.maximum(np.ceil(high / size - 1e-9) - first, 1)
-            return _Grid(first * size, size, tuple(int(n) for n in count))
-        check_range("origin", origin)
-        check_shape("origin", origin, (3,))
-        check_range("shape", shape, 1)
-        check_shape("shape", shape, (3,))
-        grid = _Grid(np.asarray(origin, float), size, tuple(check_integer("shape", n) for n in shape))
-        top = grid.low + size * grid.shape
-        if np.any(low < grid.low - 1e-9 * size) or np.any(high > top + 1e-9 * size):
-            asked = f"origin = {tuple(grid.low.tolist())} and shape = {grid.shape}"
-            reach = f"from {np.round(low, 3).tolist()} to {np.round(high, 3).tolist()} m"
-            raise ValueError(f"{asked}: what is to be voxelised reaches {reach}, out of the grid")
-        return grid
-
-    def empty(self) -> np.ndarray:
-        return np.zeros(self.shape)
-
-    def count(self, place: np.ndarray, amount: np.ndarray, into: np.ndarray) -> None:
-        """Add amounts at positions to an array of the grid. Positions outside count in the nearest voxel."""
-        number = np.floor((place - self.low) / self.size).astype(np.int64)
-        number = np.clip(number, 0, np.array(self.shape) - 1)
-        flat = np.ravel_multi_index(tuple(number.T), self.shape)
-        into += np.bincount(flat, amount, into.size).reshape(self.shape)
-
-
-def _edges(voxel_size: float | tuple[float, float, float]) -> np.ndarray:
-    check_range("voxel_size", voxel_size, 0.0, low_open=True)
-    check_shape("voxel_size", voxel_size, (), (3,))
-    return np.broadcast_to(np.asarray(voxel_size, float), (3,)).copy()
 
 
 def _reach(tree: Tree) -> tuple[np.ndarray, np.ndarray]:
@@ -348,11 +309,24 @@ def _in_frustums(
     return place, (amount / wide[segment])[owner]
 
 
+def _parts(count: int, most: int) -> Iterator[np.ndarray]:
+    """The numbers from 0 to `count`, at most so many at a time."""
+    for start in range(0, count, most):
+        yield np.arange(start, min(start + most, count))
+
+
+def _at_centres(tree: Tree, part: np.ndarray, leaf_area: float | None) -> tuple[np.ndarray, np.ndarray]:
+    """Centres of leaf clumps, and the volume, or the leaf area, of each."""
+    radius = tree.bud_radius[part]
+    amount = np.full(len(radius), leaf_area) if leaf_area is not None else 4 / 3 * np.pi * radius**3
+    return tree.bud_position[part], amount
+
+
 def _in_spheres(
-    tree: Tree, part: slice, apart: float, leaf_area: float | None
+    tree: Tree, part: np.ndarray, apart: float, leaf_area: float | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Points within leaf clumps, and the volume, or the leaf area, at each."""
-    centre, radius = tree.bud_position[part], tree.bud_radius[part]
+    (centre, amount), radius = _at_centres(tree, part, leaf_area), tree.bud_radius[part]
     n = int(np.clip(np.ceil(4 / 3 * np.pi * (radius.max() / apart) ** 3), 32, _MOST))
     i = np.arange(n)
     height = 1.0 - 2.0 * ((i * 0.7548776662466927 + 0.5) % 1.0)
@@ -360,7 +334,6 @@ def _in_spheres(
     unit = np.stack([across * np.cos(_GOLDEN_ANGLE * i), across * np.sin(_GOLDEN_ANGLE * i), height], axis=1)
     unit *= np.cbrt((i + 0.5) / n)[:, None]
     place = centre[:, None, :] + radius[:, None, None] * unit
-    amount = np.full(len(radius), leaf_area) if leaf_area is not None else 4 / 3 * np.pi * radius**3
     return place.reshape(-1, 3), np.repeat(amount / n, n)
 
 
@@ -380,7 +353,7 @@ def _settled(share: np.ndarray) -> np.ndarray:
             share += np.moveaxis(around[:-2] + around[2:], 0, axis) / 6
 
 
-def _map(grid: _Grid, leaf, volume, surface, tree: Tree, leaf_area: float | None, wood: str) -> VoxelMap:
+def _map(grid: Grid, leaf, volume, surface, tree: Tree, leaf_area: float | None, wood: str) -> VoxelMap:
     cell = grid.size.prod()
     bark = None
     if len(tree.start):

@@ -1,4 +1,4 @@
-"""Figures: waveforms with height upward, scenes from the side, fits, spectra, trees, where the light went.
+"""Figures: waveforms and photons with height upward, scenes from the side, surveys from above, fits, spectra.
 
 Every function draws on the axes that it is given, or on those of a new figure, and returns them; nothing is
 shown and nothing is saved. The package, and matplotlib with it, is imported when it is first used.
@@ -6,8 +6,10 @@ shown and nothing is saved. The package, and matplotlib with it, is imported whe
 
 from jaxlidar.plot.fits import fit, residuals
 from jaxlidar.plot.light import accuracy, ledger
+from jaxlidar.plot.photon_events import photons
 from jaxlidar.plot.scenes import scene
 from jaxlidar.plot.spectra import spectrum
+from jaxlidar.plot.surveys import survey
 from jaxlidar.plot.trees import leaf_on_and_off, tree
 from jaxlidar.plot.waveforms import waveform
 
@@ -16,9 +18,11 @@ __all__ = [
     "fit",
     "leaf_on_and_off",
     "ledger",
+    "photons",
     "residuals",
     "scene",
     "spectrum",
+    "survey",
     "tree",
     "waveform",
 ]

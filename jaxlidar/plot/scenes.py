@@ -9,7 +9,8 @@ from matplotlib.colors import LinearSegmentedColormap
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.plot.style import BEAM, COLOURS, axes_or_new
 from jaxlidar.scenes.scene import Scene
-from jaxlidar.scenes.surfaces import AbstractSheet, AbstractSurface
+from jaxlidar.scenes.surfaces import AbstractGround, AbstractSheet, AbstractSurface
+from jaxlidar.scenes.terrain import Terrain
 
 
 def scene(
@@ -23,7 +24,7 @@ def scene(
     """Axes with a scene from the side: optical depth of leaf and bark, plates, ground and the beam.
 
     Leaf and bark are shaded by 1 - exp(-optical depth) of a horizontal view through the whole voxel map.
-    Planes are cut at the middle of the map, or of the footprint where there is no map.
+    Planes and terrain are cut at the middle of the map, or of the footprint where there is no map.
 
     **Arguments:**
 
@@ -66,23 +67,27 @@ def scene(
         edge = float(voxels.voxel_size[depth])
         entries += _voxels(ax, voxels.leaf, "leaf", depth, edge, extent)
         entries += _voxels(ax, voxels.bark, "bark", depth, edge, extent)
+    if isinstance(scene.ground, Terrain) and high <= low:
+        # Nothing but terrain: all of it.
+        ends = np.stack([np.asarray(scene.ground.origin, dtype=float), scene.ground.end])
+        (low, high), middle = ends[:, across], ends[:, depth].mean()
     if high <= low:
         low, high = centre[across] - 1.0, centre[across] + 1.0
     sides = np.array([low, high])
-    levels = [top]
+    profile = _profile(scene.ground, sides, across, middle)
+    levels = [top] if scene.canopy is not None or not isinstance(scene.ground, Terrain) else []
     for surface in scene.surfaces:
-        z = _cut(surface, sides, across, middle)
+        z = profile[1] if surface is scene.ground else _cut(surface, sides, across, middle)
         levels += z.tolist()
         if isinstance(surface, AbstractSheet):
             entries += ax.plot(sides, z, color=COLOURS["plate"], linewidth=2.5, label="plate")
     bottom, top = min(levels), max(levels)
     room = max(0.06 * (top - bottom), 0.2)
     if scene.ground is not None:
-        z = _cut(scene.ground, sides, across, middle)
         # Deep enough if the limits are widened afterwards.
         deep = bottom - 10 * (top - bottom + room)
         look = {"color": COLOURS["ground"], "linewidth": 0, "zorder": 3, "label": "ground"}
-        entries.append(ax.fill_between(sides, z, deep, **look))
+        entries.append(ax.fill_between(*profile, deep, **look))
     if lidar is not None:
         entries += _beam(ax, lidar, across, bottom, top + 10 * room)
     ax.set_xlim(low, high)
@@ -124,6 +129,23 @@ def _beam(ax: Axes, lidar: Lidar, across: int, bottom: float, top: float) -> lis
     name = "beam (1/e²)" if lidar.profile == "gaussian" else "beam"
     look = {"color": BEAM, "linewidth": 1.0, "linestyle": (0, (4, 2)), "label": name}
     return [line for side in (-1, 1) for line in ax.plot(axis + side * half, z, **look)]
+
+
+def _profile(
+    ground: AbstractGround | None, sides: np.ndarray, across: int, middle: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Places and heights of the ground between two sides, as far as there is ground."""
+    if ground is None:
+        return sides, np.zeros(0)
+    if not (isinstance(ground, Terrain) and ground.relief):
+        return sides, _cut(ground, sides, across, middle)
+    place, depth = np.linspace(sides[0], sides[1], 800), np.array([middle])
+    if ground.sides == "open":
+        low, high = np.asarray(ground.origin, dtype=float), ground.end
+        place = np.clip(place, low[across], high[across])
+        depth = np.clip(depth, low[1 - across], high[1 - across])
+    x, y = (place, depth[0] + 0.0 * place)[:: 1 if across == 0 else -1]
+    return place, np.asarray(ground.height_at(x, y), dtype=float)
 
 
 def _cut(surface: AbstractSurface, sides: np.ndarray, across: int, middle: float) -> np.ndarray:

@@ -6,6 +6,7 @@ from typing import Any, ClassVar, final
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxlidar._checks import briefly, check_kind, concrete, kind_of
@@ -16,6 +17,7 @@ from jaxlidar.scenes.atmosphere import Atmosphere
 from jaxlidar.scenes.canopy import Canopy
 from jaxlidar.scenes.shapes import Plane
 from jaxlidar.scenes.surfaces import AbstractGround, AbstractSheet, AbstractSurface
+from jaxlidar.scenes.terrain import Terrain
 from jaxlidar.scenes.voxels import VoxelMap
 
 # Parallel planes that are closer, m, are one and the same in single precision: which is met first is unknown.
@@ -37,11 +39,12 @@ class Scene(eqx.Module):
 
     - `canopy`: a `Canopy`, or None. Default None.
     - `plates`: a sequence of `Plate`, or of other `AbstractSheet`. Default ().
-    - `ground`: a `Ground`, another `AbstractGround`, or None. Default None.
+    - `ground`: a `Ground`, a `Terrain`, another `AbstractGround`, or None. Default None.
     - `atmosphere`: an `Atmosphere`, or None. Default None.
 
     **Raises:** TypeError for an argument of another type; ValueError for a plate in the plane of the
-    ground or of another plate.
+    ground or of another plate, and for a canopy with periodic sides over terrain that does not repeat as it
+    does.
 
     **Example:**
 
@@ -68,6 +71,8 @@ class Scene(eqx.Module):
         ):
             check_kind(field, getattr(self, field), kind | None, admissible)
         check_kind("plates", self.plates, tuple, "a tuple, as in (plate,)")
+        if self.canopy is not None and isinstance(self.ground, Terrain):
+            check_periods(self.canopy, self.ground)
         for plate in self.plates:
             if not isinstance(plate, AbstractSheet):
                 raise TypeError(f"plates has {kind_of(plate)}; admissible is a tuple of Plate")
@@ -101,6 +106,26 @@ def _gaps(surfaces: tuple[AbstractSurface, ...]) -> Iterator[tuple[tuple[int, in
         parallel = jnp.abs(jnp.sum(one.upward * other.upward)) > 1.0 - 1e-6
         gap = jnp.abs(jnp.sum(one.upward * (other.foot - one.foot)))
         yield (i, j), jnp.where(parallel, gap, FAR)
+
+
+def check_periods(canopy: Canopy, terrain: Terrain) -> None:
+    """Refuse a canopy without sides over terrain that does not repeat as it does.
+
+    **Raises:** ValueError with both periods.
+    """
+    size, spacing = concrete(canopy.voxels.voxel_size), concrete(terrain.spacing)
+    if canopy.sides == "open" or size is None or spacing is None:
+        return
+    if terrain.sides == "open":
+        raise ValueError(
+            "the canopy has sides = 'periodic', the terrain 'open'; admissible for both is 'periodic'"
+        )
+    own, other = size[:2] * canopy.voxels.shape[:2], spacing * terrain.heights.shape
+    if not np.allclose(own, other, rtol=1e-5, atol=0.0):
+        raise ValueError(
+            f"the canopy repeats after {own[0]:g} m and {own[1]:g} m, the terrain after {other[0]:g} m and "
+            f"{other[1]:g} m; admissible are equal periods"
+        )
 
 
 def check_kinds(lidar: Any, scene: Any) -> None:

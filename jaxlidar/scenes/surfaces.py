@@ -23,6 +23,7 @@ from jaxlidar._checks import (
 from jaxlidar._ranges import SHARE, SUM_OF_SHARES, Range, check_ranges
 from jaxlidar.optics.laws import AbstractLaw, Lambertian
 from jaxlidar.optics.spectra import Spectrum
+from jaxlidar.scenes.raster import Raster
 from jaxlidar.scenes.shapes import AbstractShape, Plane
 
 # A reflectance is one number, one number per wavelength, or a spectrum.
@@ -127,6 +128,19 @@ class AbstractSurface(eqx.Module):
     @abc.abstractmethod
     def shape(self) -> AbstractShape:
         """Shape and position of the surface."""
+
+    @property
+    def pattern(self) -> Raster | None:
+        """What the reflectance is multiplied by at each place; None where it is the same everywhere.
+
+        It belongs to the geometry: light is traced with it.
+        """
+        return None
+
+    @property
+    def brightest(self) -> Reflectance:
+        """The reflectance at the brightest place."""
+        return self.reflectance
 
     def moved(self, by: Float[np.ndarray, "2"]) -> "AbstractSurface | None":
         """The same surface, moved horizontally; None where a surface does not define this.

@@ -14,11 +14,13 @@ from jaxlidar._checks import (
     check_kind,
     check_range,
     check_shape,
+    concrete,
     coordinates,
     warn_units,
 )
 from jaxlidar._ranges import Range, check_ranges
 from jaxlidar.optics.leaf_angles import LeafAngles
+from jaxlidar.scenes.terrain import Terrain
 
 # Optical depth along one edge of a solid voxel (probability 1): exp(-40) = 4e-18.
 SOLID_OPTICAL_DEPTH = 40.0
@@ -210,6 +212,55 @@ class VoxelMap(eqx.Module):
         angles = LeafAngles.named(leaf_angles) if isinstance(leaf_angles, str) else leaf_angles
         spherical = isinstance(leaf_angles, str) and leaf_angles == "spherical"
         return VoxelMap(0.5 * as_array(lad, "lad"), bark, voxel_size, origin, None if spherical else angles)
+
+    def above(self, terrain: Terrain) -> "VoxelMap":
+        """The same map above a terrain, where its z is height above the ground.
+
+        Every column is lifted by the mean height of the terrain below it. What a voxel holds is shared
+        between the two voxels that it then lies in, so that the optical depth of each column stays as it is.
+        Below a slope, the lowest voxels of a column lie partly in the ground.
+
+        **Arguments:**
+
+        - `terrain`: a `Terrain` below all columns; its heights must be known.
+
+        **Returns:** a `VoxelMap` with more layers, as many as the terrain rises by.
+
+        **Raises:** ValueError for a map that lies partly off the terrain, and within a JAX transformation;
+        TypeError for what is no `Terrain`.
+
+        **Example:**
+
+        >>> import numpy as np, jaxlidar as jl
+        >>> hill = jl.Terrain([[10.0, 10.0], [14.0, 14.0]], spacing=4.0)
+        >>> trees = jl.VoxelMap.from_lad(np.ones((2, 2, 3)), voxel_size=2.0).above(hill)
+        >>> print(trees.shape, trees.origin.tolist(), trees.leaf[:, 0].tolist())
+        (2, 2, 5) [0.0, 0.0, 10.0] [[0.25, 0.5, 0.5, 0.25, 0.0], [0.0, 0.25, 0.5, 0.5, 0.25]]
+        """
+        check_kind("terrain", terrain, Terrain, "a Terrain")
+        size, origin, heights = (concrete(a) for a in (self.voxel_size, self.origin, terrain.heights))
+        if size is None or origin is None or heights is None:
+            raise ValueError("a JAX transformation is tracing the map or the terrain: lift the map outside")
+        (nx, ny, nz), within = self.shape, (np.arange(3) + 0.5) / 3
+        x, y = (o + d * np.add.outer(np.arange(n), within) for o, d, n in zip(origin, size, (nx, ny)))
+        at = np.broadcast_arrays(x[:, :, None, None], y[None, None])
+        lift = np.asarray(terrain.height_at(*at), float).mean(axis=(1, 3)) / size[2]
+        base = np.floor(lift.min())
+        whole = np.floor(lift - base).astype(int)
+        part = jnp.asarray(lift - base - whole, float)[:, :, None]
+        layers = int(np.ceil((lift - base).max()))
+        # Layer k takes from layers k - whole and k - whole - 1 of the map, which is empty beyond its own.
+        source = np.arange(nz + layers) - whole[:, :, None] + layers + 1
+
+        def lifted(k: Float[Array, "nx ny nz"] | None) -> Float[Array, "nx ny _"] | None:
+            if k is None:
+                return None
+            k = jnp.pad(k, ((0, 0), (0, 0), (layers + 1, layers)))
+            upper, lower = (jnp.take_along_axis(k, jnp.asarray(s), axis=2) for s in (source, source - 1))
+            return (1.0 - part) * upper + part * lower
+
+        place = origin + np.array([0.0, 0.0, base * size[2]])
+        return VoxelMap(lifted(self.leaf), lifted(self.bark), self.voxel_size, place, self.leaf_angles)
 
     def mean_extinction(self) -> Float[np.ndarray, "nx ny nz"]:
         """Extinction coefficient of leaf (at G = 1/2) and bark together.

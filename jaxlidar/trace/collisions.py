@@ -47,7 +47,7 @@ def _on_surface(setting: Setting, surface: Surface, number: int, x: Vec, w: Vec,
     incident, upright = jax.tree.map(stop, (w, normal))
     out = jax.tree.map(stop, law.sample(incident, upright, *draw.direction))
     ratio = jnp.ones_like(draw.choice)
-    onward = law.albedo(w, normal) * ratio_of(law.density(w, normal, out))
+    onward = surface.by_place(x, law.albedo(w, normal)) * ratio_of(law.density(w, normal, out))
     none = jnp.full(ratio.shape, -1, jnp.int32)
     sent_by, facing = jnp.full_like(none, setting.surface_laws[number]), upright
     letter = jnp.full_like(none, scatterer.reflected)
@@ -204,7 +204,7 @@ def view_factors(setting: Setting, x: Vec, w: Vec, v: Vec, hit: Hit) -> tuple[Sc
     for i, s in enumerate(setting.surfaces):
         here, normal = hit.on == i, s.lit_normal(x, w)
         turned = dot(normal, v)
-        factor = s.law.view_factor(w, normal, v, setting.beam.half_angle)
+        factor = s.by_place(x, s.law.view_factor(w, normal, v, setting.beam.half_angle))
         reflected = jnp.where(here, jnp.where(turned > 0, factor, 0.0), reflected)
         transmitted = jnp.where(here, jnp.maximum(-turned, 0.0), transmitted)
     return reflected, transmitted if any(transmits) else None

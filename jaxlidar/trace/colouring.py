@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._programs import Program
 from jaxlidar.instrument.lidar import Lidar
+from jaxlidar.planning.effects import can_light_itself
 from jaxlidar.planning.ladder import rung
 from jaxlidar.planning.orders import degree_of
 from jaxlidar.planning.sampling import Sampling, sampling_of
@@ -31,7 +32,7 @@ class Recording(eqx.Module):
     - `time`: of the samples, ns. - `clear`: two-way transmittance of the atmosphere in fine bins, and `air`:
       its own return in samples; None where there is none. - `admissible`: see `Setup`.
     - `materials`: their names. - `first_degree`, `degree`: of histories. - `one_order`: whether no more were
-      followed.
+      followed. - `again`: whether light that is scattered can meet the scene again.
     """
 
     optics: Float[Array, "letters wavelengths"]
@@ -45,6 +46,7 @@ class Recording(eqx.Module):
     first_degree: int = eqx.field(static=True)
     degree: int = eqx.field(static=True)
     one_order: bool = eqx.field(static=True)
+    again: bool = eqx.field(static=True)
 
     @property
     def short(self) -> Histories:
@@ -121,6 +123,7 @@ def _recording(setup: Setup, samples: int, degree: int) -> Recording:
         first_degree=plan.first_degree,
         degree=degree,
         one_order=plan.orders == 1,
+        again=can_light_itself(setup.scene),
     )
 
 
@@ -217,9 +220,24 @@ class Balance(NamedTuple):
     lost: Float[Array, "wavelengths"]
 
 
-def balance(response: Response, recording: Recording) -> Balance:
-    """Shares of the emitted energy by fate. A material absorbs what arrived there less what left."""
-    lidar, values, short = recording.lidar, recording.optics, recording.short
+class Shares(NamedTuple):
+    """Sums of a response, (wavelengths,) each: of apparent reflectance, and of energy by fate.
+
+    - `whole`, `lost`: apparent reflectance within all fine bins, and before and after them.
+    - `absorbed`: by each material; (materials, wavelengths). - `escaped`, `late`, `remaining`: energy.
+    """
+
+    whole: Float[Array, "wavelengths"]
+    lost: Float[Array, "wavelengths"]
+    absorbed: Float[Array, "materials wavelengths"]
+    escaped: Float[Array, "wavelengths"]
+    late: Float[Array, "wavelengths"]
+    remaining: Float[Array, "wavelengths"]
+
+
+def shares_of(response: Response, recording: Recording) -> Shares:
+    """The sums of a response. A material absorbs what arrived there less what left."""
+    values, short = recording.optics, recording.short
     table = short if response.higher is None else recording.table
 
     def shares(weights: Array, table: Histories = table) -> Array:
@@ -230,18 +248,35 @@ def balance(response: Response, recording: Recording) -> Balance:
     if response.higher is not None and response.higher_outside is not None:
         whole = whole + shares(jnp.sum(response.higher, axis=(1, 3)))
         lost = lost + shares(jnp.sum(response.higher_outside, axis=1))
-    absorbed = shares(response.arrived - response.left)
+    return Shares(
+        whole,
+        lost,
+        shares(response.arrived - response.left),
+        shares(response.escaped),
+        shares(response.late),
+        shares(response.remaining),
+    )
+
+
+def balance(response: Response, recording: Recording) -> Balance:
+    """Shares of the emitted energy by fate."""
+    return balance_of(shares_of(response, recording), recording)
+
+
+def balance_of(sums: Shares, recording: Recording) -> Balance:
+    """Shares of the emitted energy by fate, from the sums of a response."""
+    lidar, whole = recording.lidar, sums.whole
     ledger = {
-        "escaped": shares(response.escaped),
-        **{f"absorbed by {name}": absorbed[i] for i, name in enumerate(recording.materials)},
-        "after the window": shares(response.late),
-        "unfollowed": shares(response.remaining),
+        "escaped": sums.escaped,
+        **{f"absorbed by {name}": sums.absorbed[i] for i, name in enumerate(recording.materials)},
+        "after the window": sums.late,
+        "unfollowed": sums.remaining,
     }
     returned = whole * lidar.aperture_area / (jnp.pi * lidar.range_to_reference**2)
     # What returns is part of what escaped, or, where only one order was followed, would have.
-    source = "unfollowed" if recording.one_order and len(recording.materials) > 1 else "escaped"
+    source = "unfollowed" if recording.one_order and recording.again else "escaped"
     reach = jnp.minimum(returned, ledger[source])
     ledger = {"returned": reach, **ledger, source: ledger[source] - reach}
     per_energy = whole / jnp.maximum(ledger["escaped"], 1e-6)
     unfollowed = jnp.zeros_like(whole) if recording.one_order else ledger["unfollowed"]
-    return Balance(ledger, unfollowed * jnp.clip(per_energy, 1.0, 4.0), lost)
+    return Balance(ledger, unfollowed * jnp.clip(per_energy, 1.0, 4.0), sums.lost)

@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from jaxlidar._vectors import FAR, Scalar, Vec, along, vec
 from jaxlidar.planning.trace_plan import Scatterer
+from jaxlidar.scenes.height_field import HeightField
 from jaxlidar.trace.collisions import collide
 from jaxlidar.trace.flight import events_of, fly, nearest, plates_ahead
 from jaxlidar.trace.footprint import across_beam
@@ -56,13 +57,16 @@ def from_beam(setting: Setting, key: PRNGKeyArray, count: int) -> tuple[Vec, Vec
 
 
 def from_the_sky(setting: Setting, key: PRNGKeyArray, count: int) -> tuple[Vec, Vec]:
-    """Parallel light over one period of the voxel map, which enters at its top."""
+    """Parallel light over one period of the voxel map, which enters at its top, or above all terrain."""
     medium = setting.medium
     assert medium is not None
     u, v = jax.random.uniform(key, (2, count))
     low, high = medium.origin, medium.origin + medium.size * medium.counts
     x, y = (low[k] + s * (high[k] - low[k]) for k, s in enumerate((u, v)))
     top = jnp.full_like(u, high[2])
+    for s in setting.surfaces:
+        if isinstance(s.shape, HeightField):
+            top = jnp.maximum(top, s.shape.high)
     return (x, y, top), vec(jnp.broadcast_to(c, u.shape) for c in setting.beam.axis)
 
 
@@ -156,7 +160,7 @@ def _one_order(setting: Setting, optics: Array, walk: _Walk, key: PRNGKeyArray) 
     on_ground = fates.on_ground
     for s, here, scatterer in zip(setting.surfaces, landed, plan.surfaces):
         arrived = jnp.where(here[:, None], energy, 0.0)
-        scattered = s.law.albedo(p.w, s.lit_normal(x, p.w))
+        scattered = s.by_place(x, s.law.albedo(p.w, s.lit_normal(x, p.w)))
         absorbed = absorbed.at[scatterer.material].add(lost(scatterer, arrived, scattered))
         if not s.plate:
             on_ground = on_ground + jnp.sum(arrived, axis=0)

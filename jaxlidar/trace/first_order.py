@@ -11,6 +11,7 @@ factor for backscatter (`jaxlidar.optics.facets`, `jaxlidar.optics.phase`).
 
 import itertools
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -26,7 +27,7 @@ from jaxlidar.planning.trace_plan import Bins, TracePlan
 from jaxlidar.trace.deposit import first_bin, instant_row, scatter_rows, smooth_row
 from jaxlidar.trace.histories import Histories
 from jaxlidar.trace.march import Medium, advance, begin, cell_of, earlier, later
-from jaxlidar.trace.reparametrise import footprint_rays
+from jaxlidar.trace.reparametrise import footprint_rays, rays_to_terrain, sees_terrain
 from jaxlidar.trace.setting import Setting
 from jaxlidar.trace.surfaces import Surface
 
@@ -152,6 +153,48 @@ class FirstOrder(eqx.Module):
     escaped: Float[Array, "histories"]
 
 
+class Sent(NamedTuple):
+    """Rays of the footprint: where they start above the scene, their directions, and what they meet.
+
+    - `x`, `w`: start and direction. - `excess`: way from the sensor to the start, m, less the slant range.
+    - `energy`: share of the pulse's. - `met`: distance to each surface, m; `stop`: to the ground.
+    """
+
+    x: Vec
+    w: Vec
+    excess: Scalar
+    energy: Scalar
+    met: list[Scalar]
+    stop: Scalar
+
+
+def sent_rays(setting: Setting, across: tuple[Scalar, Scalar], energy: Scalar) -> Sent:
+    """The rays through `across`, which carry the shares `energy`."""
+    beam, plan = setting.beam, setting.plan
+    across, share = footprint_rays(beam, setting.medium, across)
+    energy = energy * share
+    if sees_terrain(setting):
+        across, share = rays_to_terrain(setting, across)
+        energy = energy * share
+    point, w, excess = beam.ray(across)
+    x = along(point, w, jnp.asarray(-plan.upstream, energy.dtype))
+    met = [s.distance(x, w) for s in setting.surfaces]
+    stop = met[0] if plan.has_ground else jnp.full_like(energy, FAR)
+    return Sent(x, w, excess - plan.upstream, energy, met, stop)
+
+
+def march_rays(setting: Setting, sent: Sent) -> tuple[Stretches, list[Scalar], Scalar]:
+    """As `march_ray`, for all rays, up to the ground; `stops` are the surfaces.
+
+    Stretches stay along the first axis, where the march leaves them: transposing costs as much.
+    """
+    plan, medium = setting.plan, setting.medium
+    assert medium is not None
+    step = jnp.asarray(plan.max_step, sent.energy.dtype)
+    march = jax.vmap(march_ray, (None, 0, 0, 0, 0, None, None), (1, 0, 0))
+    return march(medium, sent.x, sent.w, sent.stop, sent.met, plan.first_steps, step)
+
+
 def first_order(
     setting: Setting,
     across: tuple[Float[Array, "rays"], Float[Array, "rays"]],
@@ -174,13 +217,7 @@ def first_order(
     materials = len(plan.materials)
 
     def rays(across, energy):
-        across, share = footprint_rays(beam, medium, across)
-        energy = energy * share
-        point, w, excess = beam.ray(across)
-        x = along(point, w, jnp.asarray(-plan.upstream, energy.dtype))
-        excess = excess - plan.upstream
-        met = [s.distance(x, w) for s in surfaces]
-        stop = met[0] if plan.has_ground else jnp.full_like(energy, FAR)
+        x, w, excess, energy, met, stop = sent = sent_rays(setting, across, energy)
         visible = energy * beam.in_view(along(x, w, jnp.minimum(stop, plan.upstream)))
         response = jnp.zeros((materials * count, bins.padded), energy.dtype)
         arrived = jnp.zeros((materials * count,), energy.dtype)
@@ -188,10 +225,7 @@ def first_order(
         at_stops, total = [jnp.zeros_like(energy) for _ in met], jnp.zeros_like(energy)
 
         if medium is not None:
-            step = jnp.asarray(plan.max_step, energy.dtype)
-            # Stretches stay along the first axis, where the march leaves them: transposing costs as much.
-            march = jax.vmap(march_ray, (None, 0, 0, 0, 0, None, None), (1, 0, 0))
-            stretch, at_stops, total = march(medium, x, w, stop, met, plan.first_steps, step)
+            stretch, at_stops, total = march_rays(setting, sent)
 
             def along_rays(a):
                 return jnp.broadcast_to(a, stretch.start.shape)
@@ -199,7 +233,7 @@ def first_order(
             way, before = vec(along_rays(a) for a in w), [along_rays(m) for m in met]
             k, power = stretch.extinction, along_rays(energy)
             low = bins.position(2.0 * (along_rays(excess) + stretch.start) / SPEED_OF_LIGHT)
-            first, pieces = _stretch_pieces(bins, low, stretch, kappa)
+            first, pieces = stretch_pieces(bins, low, stretch, kappa)
             passing = jnp.exp(-stretch.depth) * mean_decay(k * stretch.length) * stretch.length
             middle = stretch.start + 0.5 * stretch.length
             for m, part in _parts(medium, plan, stretch, way) if mirror is None else ():
@@ -224,10 +258,10 @@ def first_order(
                 weight = hit * jnp.exp(-at_stops[i]) * share
                 slot = scatterer.material * count + history
                 arrived = _add(arrived, slot, weight)
-                scattered = _add(scattered, slot, weight * s.law.albedo(w, normal))
+                scattered = _add(scattered, slot, weight * s.by_place(at, s.law.albedo(w, normal)))
             if mirror is None and isinstance(s.law, AbstractMirror):
                 continue
-            seen = beam.in_view(at)
+            seen = s.by_place(at, beam.in_view(at))
             if mirror is None:
                 seen = s.law.view_factor(w, normal, back, beam.half_angle) * seen
             time = 2.0 * (excess + jnp.minimum(met[i], 1e9)) / SPEED_OF_LIGHT
@@ -266,7 +300,7 @@ def first_order(
     return FirstOrder(weights, outside, *fate)
 
 
-def _stretch_pieces(
+def stretch_pieces(
     bins: Bins, low: Float[Array, "steps rays"], stretch: Stretches, kappa: float
 ) -> tuple[Int[Array, "steps rays"], Float[Array, "pieces steps rays"]]:
     """First bin of each stretch, and the integrals of exp(-kappa tau) ds over its pieces, bin by bin.

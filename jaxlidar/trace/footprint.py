@@ -4,6 +4,8 @@ Positions are relative to where the beam axis meets the reference plane, and pat
 of that point: no number grows with the altitude, so single precision is enough at 400 km.
 """
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -18,7 +20,10 @@ GOLDEN = (np.sqrt(5.0) - 1) / 2
 
 
 class Beam(eqx.Module):
-    """Axis, slant range and receiver of a lidar, as the tracer needs them."""
+    """Axis, slant range and receiver of a lidar, as the tracer needs them.
+
+    `parallel`: whether all rays are parallel to the axis, and the receiver is as far away as it is wide.
+    """
 
     axis: Vec
     slant_range: Float[Array, ""]
@@ -26,24 +31,34 @@ class Beam(eqx.Module):
     half_angle: Float[Array, ""]
     view_radius: Float[Array, ""] | None
     gaussian: bool = eqx.field(static=True)
+    parallel: bool = eqx.field(static=True, default=False)
 
     def ray(self, across: tuple[Scalar, Scalar]) -> tuple[Vec, Vec, Scalar]:
         """Point, direction and relative distance from the sensor of the ray through `across` (m).
 
-        `across` are coordinates in the plane through the aim point perpendicular to the axis.
+        `across` are coordinates in the plane through the aim point perpendicular to the axis; of parallel
+        light, horizontal ones.
         """
+        if self.parallel:
+            point = (*across, jnp.zeros_like(across[0]))
+            return point, vec(jnp.broadcast_to(c, across[0].shape) for c in self.axis), self.excess(point)
         point = from_frame(self.axis, (across[0], across[1], jnp.zeros_like(across[0])))
         direction = normalise(add(scale(self.axis, self.slant_range), point))
         return point, direction, self.excess(point)
 
     def excess(self, point: Vec) -> Scalar:
         """Distance from the sensor minus the slant range, m, computed without cancellation."""
+        if self.parallel:
+            # The front of a beam is curved: light of the footprint comes later by this in the mean.
+            return dot(point, self.axis) + 0.25 * self.radius**2 / self.slant_range
         r = self.slant_range
         x = 2.0 * dot(point, self.axis) + dot(point, point) / r
         return x / (1.0 + jnp.sqrt(jnp.maximum(1.0 + x / r, 1e-12)))
 
     def view(self, point: Vec) -> Vec:
         """Unit vector from `point` to the sensor."""
+        if self.parallel:
+            return vec(jnp.broadcast_to(-c, point[0].shape) for c in self.axis)
         return normalise(add(scale(self.axis, -self.slant_range), scale(point, jnp.asarray(-1.0))))
 
     def budget(self, x: Vec, w: Vec, left: Scalar) -> Scalar:
@@ -52,6 +67,10 @@ class Beam(eqx.Module):
         `left` is relative to the slant range. The way back begins on an ellipsoid about `x` and the sensor.
         """
         r, out = self.slant_range, self.excess(x)
+        if self.parallel:
+            # Near zero only for light that is on its way back, which may fly on.
+            flight = (left - out) / jnp.maximum(1.0 + dot(self.axis, w), 1e-9)
+            return jnp.where(left < out, 0.0, jnp.minimum(flight, FAR))
         divisor = r * (1.0 + dot(self.axis, w)) + left + dot(x, w)
         flight = 0.5 * (left - out) * (2.0 * r + left + out) / jnp.where(divisor > 0, divisor, 1.0)
         return jnp.where(left < out, 0.0, jnp.where(divisor > 0, jnp.minimum(flight, FAR), FAR))
@@ -88,6 +107,12 @@ def beam_of(lidar: Lidar) -> Beam:
         view,
         lidar.profile == "gaussian",
     )
+
+
+def parallel_beam(lidar: Lidar) -> Beam:
+    """Parallel light from where the lidar is. Rays may be anywhere across it; all of the scene is seen."""
+    beam = beam_of(lidar)
+    return dataclasses.replace(beam, view_radius=None, gaussian=False, parallel=True)
 
 
 def disc(radius: Scalar, turn: Scalar) -> tuple[Scalar, Scalar]:

@@ -27,34 +27,50 @@ from jaxlidar.trace.collisions import collide, view_factors
 from jaxlidar.trace.deposit import instant_row, scatter_rows
 from jaxlidar.trace.flight import Flight, events_of, fly, nearest, plates_ahead
 from jaxlidar.trace.footprint import GOLDEN, across_beam
+from jaxlidar.trace.labels import Label, book
 from jaxlidar.trace.march import depth_to_top, free_flight
+from jaxlidar.trace.nodes import Nodes
 from jaxlidar.trace.photons import THROUGH, Hit, Photons, ratio_of, stop
 from jaxlidar.trace.random_numbers import Draw, Independent, lattices
-from jaxlidar.trace.reparametrise import footprint_rays, rays_to_surfaces
+from jaxlidar.trace.reparametrise import (
+    footprint_rays,
+    moves_landings,
+    rays_to_surfaces,
+    rays_to_terrain,
+    sees_terrain,
+)
 from jaxlidar.trace.setting import Setting, unscattered
 
 CHUNK = 256
+# The same where light falls on a large scene: a chunk waits for its longest flight.
+FEW = 64
 # Chunks that are traced together, order by order. Each group has its own sum: single precision loses small
 # deposits on a large sum.
 GROUP = 32
 
 
 class HigherOrders(eqx.Module):
-    """Response of orders two and above, and the fate of all light (see `jaxlidar.trace.response`)."""
+    """Response of orders two and above, and the fate of all light (see `jaxlidar.trace.response`).
 
-    weights: Float[Array, "materials histories bins"]
-    outside: Float[Array, "materials histories"]
-    arrived: Float[Array, "materials histories"]
-    left: Float[Array, "materials histories"]
-    escaped: Float[Array, "histories"]
-    late: Float[Array, "histories"]
-    remaining: Float[Array, "histories"]
+    The last axis but bins is that of histories; or, with `Nodes`, of nodes and wavelengths.
+    """
+
+    weights: Float[Array, "materials labels bins"]
+    outside: Float[Array, "materials labels"]
+    arrived: Float[Array, "materials labels"]
+    left: Float[Array, "materials labels"]
+    escaped: Float[Array, "labels"]
+    late: Float[Array, "labels"]
+    remaining: Float[Array, "labels"]
 
 
-def higher_orders(setting: Setting, key: PRNGKeyArray) -> HigherOrders:
-    """Trace a batch of photons through up to `plan.orders` scatterings; sums are means per photon."""
+def higher_orders(setting: Setting, key: PRNGKeyArray, nodes: Nodes | None = None) -> HigherOrders:
+    """Trace a batch of photons through up to `plan.orders` scatterings; sums are means per photon.
+
+    With `nodes`, light enters about these and is booked under them: sums are means per photon of a node.
+    """
     beam, medium, plan, bins = setting.beam, setting.medium, setting.plan, setting.bins
-    photons = setting.sizes.photons
+    photons = setting.sizes.photons if nodes is None else nodes.photons
     footprint_key, draw_key = jax.random.split(key)
     plates = sum(s.plate for s in setting.surfaces)
     dimensions = Draw.dimensions(plates)
@@ -63,13 +79,16 @@ def higher_orders(setting: Setting, key: PRNGKeyArray) -> HigherOrders:
         numbers, places = Independent(draw_key, dimensions), Independent(footprint_key, 2)
     else:
         numbers, places = lattices(draw_key, plan.order_steps, dimensions), None
-    size = min(CHUNK, photons)
+    size = min(CHUNK if nodes is None else FEW, photons)
     chunks = -(-photons // size)
-    groups = -(-chunks // GROUP)
+    groups = -(-chunks * size // (GROUP * CHUNK))
     each = -(-chunks // groups)
-    count, materials = setting.table.count, len(plan.materials)
+    count, materials = setting.table.count if nodes is None else nodes.labels(setting), len(plan.materials)
+    terrain = sees_terrain(setting)
 
-    def start(lane):
+    def begin(lane):
+        if nodes is not None:
+            return nodes.start(setting, lane, footprint_key)
         if places is None:
             share = (lane.astype(float) + shift[0]) / photons
             turn = (lane * jnp.uint32(GOLDEN * 2**32)).astype(float) * 2.0**-32 + shift[1]
@@ -77,9 +96,12 @@ def higher_orders(setting: Setting, key: PRNGKeyArray) -> HigherOrders:
             share, turn = places(lane, jnp.asarray(plan.order_steps))
         inside = lane < photons
         across, share = footprint_rays(beam, medium, across_beam(beam, share, turn))
+        if terrain:
+            across, more = rays_to_terrain(setting, across)
+            share = share * more
         point, w, excess = beam.ray(across)
         up = jnp.asarray(-plan.upstream, excess.dtype)
-        return Photons(
+        return lane, Photons(
             along(point, w, up),
             w,
             excess + up,
@@ -113,10 +135,12 @@ def higher_orders(setting: Setting, key: PRNGKeyArray) -> HigherOrders:
             # The loop is as long as the ladder of sizes has it.
             return lax.cond(n < plan.orders, one_order, lambda carry, _: carry, carry, n), None
 
-        rows = jax.tree.map(lambda a: a.reshape(each, size), (lane, start(lane)))
+        lane, photons = begin(lane)
+        rows = jax.tree.map(lambda a: a.reshape(each, size), (lane, photons))
         (_, last, tally), _ = lax.scan(order, (*rows, zero), jnp.arange(plan.order_steps))
-        over = jnp.where(last.alive, stop(last.weight), 0.0)
-        tally = eqx.tree_at(lambda t: t.remaining, tally, tally.remaining.at[last.history].add(over))
+        over = jnp.where(last.alive, last.weight, 0.0)
+        remaining = book(tally.remaining, (), Label.of(last), over)
+        tally = eqx.tree_at(lambda t: t.remaining, tally, remaining)
         return jax.tree.map(jnp.add, total, tally), None
 
     zero = HigherOrders(
@@ -150,7 +174,7 @@ def _one_order(setting: Setting, p: Photons, tally: HigherOrders, draw: Draw, or
     events = events_of(setting, met, outcomes)
     limit = nearest(p, events)
     budget = stop(setting.budget(p))
-    if setting.medium is not None and setting.surfaces:
+    if moves_landings(setting):
         w, limit, turned = rays_to_surfaces(setting, p, limit, events, (order > 0) & (limit < budget))
         p = eqx.tree_at(lambda p: (p.w, p.weight), p, (w, p.weight * turned))
     # One number says in which stratum the photon goes on, and where in each stratum the points are.
@@ -164,7 +188,7 @@ def _one_order(setting: Setting, p: Photons, tally: HigherOrders, draw: Draw, or
         return jnp.take_along_axis(a, chosen.astype(jnp.int32)[None], 0, mode="promise_in_bounds")[0]
 
     # Plates that were passed on the way. Histories do not depend on the order; what arrives at a plate does.
-    weight, history = wide(p.weight) * flights.density, wide(p.history)
+    weight, label = wide(p.weight) * flights.density, jax.tree.map(wide, Label.of(p))
     passes: dict[int, Bool[Array, "ends photons"]] = {}
     for i, (s, d, o) in enumerate(zip(setting.surfaces, met, outcomes)):
         if not s.plate:
@@ -173,7 +197,7 @@ def _one_order(setting: Setting, p: Photons, tally: HigherOrders, draw: Draw, or
         passed = wide(p.alive & (d < FAR)) & ((wide(d) < flights.distance) | ~flights.event) & ~own
         weight = weight * jnp.where(passed | (flights.landed & own), wide(ratio[i]), 1.0)
         passes[i] = passed & wide(o == THROUGH)
-    before = pick(weight), pick(history)
+    before = pick(weight), jax.tree.map(pick, label)
     for i, through in passes.items():
         scatterer, here = plan.surfaces[i], pick(through)
         gone, arrived = before
@@ -181,29 +205,28 @@ def _one_order(setting: Setting, p: Photons, tally: HigherOrders, draw: Draw, or
             if j != i:
                 nearer = here & pick(other) & (met[j] < met[i])
                 gone = jnp.where(nearer, gone / (1.0 - plan.lobe), gone)
-                arrived = jnp.where(nearer, setting.grow(arrived, plan.surfaces[j].transmitted), arrived)
+                arrived = arrived.grown_where(nearer, setting, plan.surfaces[j].transmitted)
         gone = jnp.where(here, gone, 0.0)
         tally = _arrive(tally, scatterer.material, arrived, gone)
-        onward = setting.grow(arrived, scatterer.transmitted)
+        onward = arrived.grown(setting, scatterer.transmitted)
         tally = _leave(tally, scatterer.material, onward, gone / (1.0 - plan.lobe))
-        history = jnp.where(through, setting.grow(history, scatterer.transmitted), history)
+        label = label.grown_where(through, setting, scatterer.transmitted)
         weight = jnp.where(through, weight / (1.0 - plan.lobe), weight)
 
     if plan.drawn_first:
-        tally = _return(setting, p, flights, events, limit, weight, history, draw, tally)
+        tally = _return(setting, p, flights, events, limit, weight, label, draw, tally)
     else:
         # The first order is deterministic and has been deposited.
-        given = (setting, p, flights, events, limit, weight, history, draw)
+        given = (setting, p, flights, events, limit, weight, label, draw)
         tally = lax.cond(order > 0, lambda t: _return(*given, t), lambda t: t, tally)
 
-    flight, weight, history = jax.tree.map(pick, (flights, weight, history))
-    held = stop(weight)
+    flight, weight, label = jax.tree.map(pick, (flights, weight, label))
     tally = eqx.tree_at(
         lambda t: (t.escaped, t.late),
         tally,
         (
-            tally.escaped.at[history].add(jnp.where(flight.escaped, held, 0.0)),
-            tally.late.at[history].add(jnp.where(flight.late, held, 0.0)),
+            book(tally.escaped, (), label, jnp.where(flight.escaped, weight, 0.0)),
+            book(tally.late, (), label, jnp.where(flight.late, weight, 0.0)),
         ),
     )
     flown = jnp.where(flight.event, flight.distance, 0.0)
@@ -211,11 +234,14 @@ def _one_order(setting: Setting, p: Photons, tally: HigherOrders, draw: Draw, or
     landed = flight.landed_on(events, limit)
     hit = collide(setting, x, p.w, flight.cell, flight.collided, landed, draw)
     weight = jnp.where(flight.event, weight, 0.0)
-    tally = _arrive(tally, hit.material, history, weight)
-    history = setting.grow(history, hit.letter)
+    tally = _arrive(tally, hit.material, label, weight)
+    label = label.grown(setting, hit.letter)
     weight = weight * hit.ratio * hit.onward
-    tally = _leave(tally, hit.material, history, weight)
-    return Photons(x, hit.w, p.path + flown, weight, history, hit.on, hit.sent, flight.event), tally
+    tally = _leave(tally, hit.material, label, weight)
+    onward = Photons(
+        x, hit.w, p.path + flown, weight, label.number, hit.on, hit.sent, flight.event, label.tints
+    )
+    return onward, tally
 
 
 def _return(
@@ -225,7 +251,7 @@ def _return(
     events: list[Scalar],
     limit: Scalar,
     weight: Float[Array, "ends photons"],
-    history: Int[Array, "ends photons"],
+    label: Label,
     draw: Draw,
     tally: HigherOrders,
 ) -> HigherOrders:
@@ -235,22 +261,22 @@ def _return(
     def flat(tree):
         return jax.tree.map(lambda a: jnp.broadcast_to(a, (ends, a.shape[-1])).reshape(-1), tree)
 
-    p, flights, events, limit, draw, history = flat((p, flights, events, limit, draw, history))
+    p, flights, events, limit, draw, label = flat((p, flights, events, limit, draw, label))
     flown = jnp.where(flights.event, flights.distance, 0.0)
     x = along(p.x, p.w, flown)
     landed = flights.landed_on(events, limit)
     hit = collide(setting, x, p.w, flights.cell, flights.collided, landed, draw)
     value = jnp.where(flights.event, flat(weight), 0.0) * hit.ratio / ends
-    given = lax.optimization_barrier((p.w, x, p.path + flown, value, history, hit, draw))
+    given = lax.optimization_barrier((p.w, x, p.path + flown, value, label, hit, draw))
     return _deposit(setting, tally, *given)
 
 
-def _arrive(tally: HigherOrders, material: Array | int, history: Array, weight: Scalar) -> HigherOrders:
-    return eqx.tree_at(lambda t: t.arrived, tally, tally.arrived.at[material, history].add(stop(weight)))
+def _arrive(tally: HigherOrders, material: Array | int, label: Label, weight: Scalar) -> HigherOrders:
+    return eqx.tree_at(lambda t: t.arrived, tally, book(tally.arrived, (material,), label, weight))
 
 
-def _leave(tally: HigherOrders, material: Array | int, history: Array, weight: Scalar) -> HigherOrders:
-    return eqx.tree_at(lambda t: t.left, tally, tally.left.at[material, history].add(stop(weight)))
+def _leave(tally: HigherOrders, material: Array | int, label: Label, weight: Scalar) -> HigherOrders:
+    return eqx.tree_at(lambda t: t.left, tally, book(tally.left, (material,), label, weight))
 
 
 def _deposit(
@@ -260,7 +286,7 @@ def _deposit(
     x: Vec,
     path: Scalar,
     weight: Scalar,
-    history: Int[Array, "photons"],
+    label: Label,
     hit: Hit,
     draw: Draw,
 ) -> HigherOrders:
@@ -279,6 +305,9 @@ def _deposit(
     drawn = iter(draw.behind)
     for i, (s, scatterer) in enumerate(zip(setting.surfaces, plan.surfaces)):
         if not s.plate:
+            if s.shape.lights_itself and not beam.parallel:
+                # A ground may hide its own slopes, and what stands on them, from the sensor.
+                clear = jnp.where(s.distance(x, v) < FAR, 0.0, clear)
             continue
         covered = next(drawn) < s.coverage
         crossed = s.distance(x, v) < FAR
@@ -287,7 +316,7 @@ def _deposit(
         c = jnp.broadcast_to(s.coverage, path.shape)
         ratio = ratio_of(jnp.where(covered, c, 1.0 - c))
         if s.straight:
-            history = jnp.where(crossed & covered, setting.grow(history, scatterer.transmitted), history)
+            label = label.grown_where(crossed & covered, setting, scatterer.transmitted)
             through = ratio if scatterer.transmitted >= 0 else jnp.where(covered, 0.0, ratio)
         else:
             through = jnp.where(covered, 0.0, ratio)
@@ -303,7 +332,9 @@ def _deposit(
         pairs.append((hit.transmitted, transmitted))
     first, row = lax.optimization_barrier(instant_row(setting.bins, time, value))
     for letter, factor in pairs:
-        slot = hit.material * setting.table.count + setting.grow(history, letter)
         factor = jnp.where(letter >= 0, factor, 0.0)
-        response = scatter_rows(response, slot, first, row * factor[:, None])
+        for slot, tint in label.grown(setting, letter).slots():
+            slot = hit.material * tally.weights.shape[1] + slot
+            left = factor if tint is None else factor * tint
+            response = scatter_rows(response, slot, first, row * left[:, None])
     return eqx.tree_at(lambda t: t.weights, tally, response.reshape(tally.weights.shape))

@@ -8,7 +8,6 @@ come first. There are C(degree + letters, letters) of them.
 import dataclasses
 import functools
 import itertools
-import math
 
 import jax.numpy as jnp
 import numpy as np
@@ -41,10 +40,6 @@ class Histories:
     def degree(self) -> int:
         """Largest number of scatterings."""
         return int(self.exponents[-1].sum()) if self.letters else 0
-
-    def up_to(self, degree: int) -> int:
-        """Number of histories of at most `degree` scatterings; they come first."""
-        return math.comb(degree + self.letters, self.letters)
 
     def monomials(self, optics: Float[Array, "letters wavelengths"]) -> Float[Array, "histories wavelengths"]:
         """Product over the letters of optics to the power of the history's exponents.

@@ -23,7 +23,10 @@ class Scattering(eqx.Module):
 
 
 class Photons(eqx.Module):
-    """The state of a chunk of photons. `on` is the surface from which a photon starts, or -1."""
+    """The state of a chunk of photons. `on` is the surface from which a photon starts, or -1.
+
+    `history` and `tints`: see `jaxlidar.trace.labels`.
+    """
 
     x: Vec
     w: Vec
@@ -33,6 +36,7 @@ class Photons(eqx.Module):
     on: Int[Array, "photons"]
     sent: Scattering
     alive: Bool[Array, "photons"]
+    tints: tuple[Float[Array, "photons"], ...] = ()
 
 
 class Hit(eqx.Module):

@@ -54,7 +54,7 @@ class Lattices(eqx.Module):
     step: UInt32[Array, "orders dims"]
     shift: UInt32[Array, "orders dims"]
 
-    def __call__(self, photon: UInt32[Array, "photons"], order: Array) -> list[Float[Array, "photons"]]:
+    def __call__(self, photon: UInt32[Array, "*photons"], order: Array) -> list[Float[Array, "*photons"]]:
         """One array for each dimension."""
         return [
             _to_unit(photon * self.step[order, d] + self.shift[order, d]) for d in range(self.step.shape[1])

@@ -110,13 +110,7 @@ def _trace(setting: Setting, key: PRNGKeyArray) -> Response:
     # What is not random is compiled without random numbers.
     shift_key, photon_key = jax.random.split(key) if sizes.random else (key, key)
 
-    if sizes.smooth:
-        across, energy = product_rule(beam)
-    elif plan.independent:
-        across, energy = scattered(beam, sizes.rays, shift_key)
-    else:
-        shift = jax.random.uniform(shift_key, (2,)) if sizes.shifted else jnp.asarray([0.5, 0.0])
-        across, energy = lattice(beam, sizes.rays, shift)
+    across, energy = footprint_of(setting, shift_key)
     first = first_order(setting, across, energy)
     weights = jnp.zeros_like(first.weights) if plan.drawn_first else first.weights
     for i, is_mirror in enumerate(plan.mirrors):
@@ -124,14 +118,27 @@ def _trace(setting: Setting, key: PRNGKeyArray) -> Response:
             weights = weights + first_order(setting, *mirror_rays(beam, surfaces[i]), mirror=i).weights
 
     if plan.order_steps < 2 and not plan.drawn_first:
-        return _only_first(setting, first, weights)
+        return only_first(setting, first, weights)
     higher = higher_orders(setting, photon_key)
     fate = (higher.arrived, higher.left, higher.escaped, higher.late, higher.remaining)
     outside = (first.outside[None], higher.outside[None])
     return Response(weights[None], higher.weights[None], *outside, *(a[None] for a in fate))
 
 
-def _only_first(
+def footprint_of(
+    setting: Setting, key: PRNGKeyArray
+) -> tuple[tuple[Float[Array, "rays"], Float[Array, "rays"]], Float[Array, "rays"]]:
+    """Places of the footprint's rays across the beam, and their shares of its energy."""
+    beam, sizes = setting.beam, setting.sizes
+    if sizes.smooth:
+        return product_rule(beam)
+    if setting.plan.independent:
+        return scattered(beam, sizes.rays, key)
+    shift = jax.random.uniform(key, (2,)) if sizes.shifted else jnp.asarray([0.5, 0.0])
+    return lattice(beam, sizes.rays, shift)
+
+
+def only_first(
     setting: Setting, first: FirstOrder, weights: Float[Array, "materials short bins"]
 ) -> Response:
     """The response where nothing is followed beyond the first scattering: what is scattered remains."""
@@ -151,7 +158,8 @@ def _only_first(
             if not (passes and letter == s.transmitted):
                 remaining = remaining.at[after].add(grown)
     escaped, late = first.escaped, jnp.zeros_like(remaining)
-    if len(scatterers) == 1 and not (plan.leaf or plan.bark):
+    lights_itself = any(surface.shape.lights_itself for surface in setting.surfaces)
+    if len(scatterers) == 1 and not (plan.leaf or plan.bark or lights_itself):
         # Nothing is in the way of what one plane scatters.
         escaped, remaining = escaped + remaining, late
     fate = (first.arrived, left, escaped, late, remaining)

@@ -70,6 +70,8 @@ class Setting(eqx.Module):
     - `column`: optical depth straight up from every voxel, for a beam at nadir.
     - `occupied`: the box that holds all voxels with any extinction.
     - `successor`: of every history, for every letter.
+    - `optics`: of every letter, by wavelength, where they are applied while light is traced, which is then
+      told apart by its place of entry (see `jaxlidar.trace.nodes`); None where histories keep them.
     """
 
     beam: Beam
@@ -85,6 +87,7 @@ class Setting(eqx.Module):
     leaf_law: int = eqx.field(static=True)
     bark_law: int = eqx.field(static=True)
     sizes: Sizes = eqx.field(static=True)
+    optics: Float[Array, "letters wavelengths"] | None = None
 
     @property
     def short(self) -> Histories:
@@ -193,6 +196,19 @@ def _arrange(
 
 
 _set_out = Program(_arrange)
+
+
+def aimed(setting: Setting, lidar: Lidar, by: Float[Array, "2"]) -> Setting:
+    """The setting for a lidar that aims elsewhere, `by` m to the east and to the north, and otherwise.
+
+    What the map and the terrain cost is not computed again: a shot costs the same over a map of any size.
+    """
+    back = -jnp.concatenate([by, jnp.zeros_like(by[:1])])
+    medium = setting.medium
+    if medium is not None:
+        medium = eqx.tree_at(lambda m: m.origin, medium, medium.origin + back)
+    surfaces = tuple(surface.moved(back) for surface in setting.surfaces)
+    return dataclasses.replace(setting, beam=beam_of(lidar), medium=medium, surfaces=surfaces)
 
 
 def unscattered(like: Scalar) -> Scattering:

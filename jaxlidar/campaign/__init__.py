@@ -1,0 +1,1 @@
+"""Many waveforms at once: all shots of a survey over one scene."""

@@ -1,0 +1,246 @@
+"""Shots that share light: the scene is traced once, and every footprint is a weighted sum over nodes.
+
+What returns is linear in what is sent. Parallel light falls on all of the scene that footprints cover, about
+the nodes of a grid (`jaxlidar.trace.nodes`), and is told apart by its node. A footprint's waveform is the sum
+of those of the nodes, with the coefficients of its irradiance; its variance is the sum of variances, with
+their squares.
+"""
+
+import dataclasses
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from jaxlidar._programs import Program
+from jaxlidar._statistics import relative_error, widening
+from jaxlidar._threads import ONE_CORE
+from jaxlidar.campaign.records import BatchMoments, Record, record_of_shot
+from jaxlidar.campaign.tiles import Tile
+from jaxlidar.planning.plan import MIN_BATCHES
+from jaxlidar.planning.setup import Setup
+from jaxlidar.trace.colouring import Recording, Shares, balance_of, components, recording_of, shares_of
+from jaxlidar.trace.footprint import parallel_beam
+from jaxlidar.trace.node_response import trace_nodes, without_histories
+from jaxlidar.trace.nodes import Nodes
+from jaxlidar.trace.setting import Setting, aimed, setting_of
+
+# Batches of one tile at most: a tolerance that is out of reach ends here.
+MOST_BATCHES = 1024
+# Shots that are finished together.
+TOGETHER = 256
+# Footprints of which a tile has less than this share are not waited for.
+_SMALL = 1e-3
+
+
+class Ready(NamedTuple):
+    """What tiles have in common. `recording` is without histories, and without what the `air` returns."""
+
+    setting: Setting
+    recording: Recording
+    air: Any
+    spacing: float
+
+
+def ready_for(setup: Setup, spacing: float) -> Ready:
+    """What all tiles over a grid of that spacing have in common."""
+    recording = recording_of(setup)
+    without_air = dataclasses.replace(without_histories(recording), air=None)
+    return Ready(setting_of(setup), without_air, recording.air, spacing)
+
+
+class Sums(NamedTuple):
+    """Of nodes, in one batch: what errors are wanted of, and samples by line.
+
+    - `total`: (nodes, wavelengths, samples), all lines together. - `fates`: `jaxlidar.trace.colouring.Shares`
+      of each, as a dict.
+    - `lines`: (nodes, lines, wavelengths, samples): materials, then order one.
+    """
+
+    total: Any
+    fates: Any
+    lines: Any
+
+
+class Part(NamedTuple):
+    """What a tile adds to its shots: to means, to variances, and photons. `shots`: their numbers."""
+
+    shots: Int[np.ndarray, " shots"]
+    lines: Float[np.ndarray, "shots lines wavelengths samples"]
+    fates: dict[str, Float[np.ndarray, "shots *rows wavelengths"]]
+    variance: Float[np.ndarray, "shots wavelengths samples"]
+    fates_variance: dict[str, Float[np.ndarray, "shots *rows wavelengths"]]
+    photons: Int[np.ndarray, " shots"]
+
+
+class _Batches(NamedTuple):
+    """So many batches: moments of `total` and `fates`, and the mean of `lines`."""
+
+    count: int
+    moments: BatchMoments
+    lines: Any
+
+    def joined(self, other: "_Batches") -> "_Batches":
+        """Both together."""
+        whole = self.count + other.count
+        lines = self.lines + other.count / whole * (other.lines - self.lines)
+        return _Batches(whole, self.moments.joined(self.count, other.moments, other.count), lines)
+
+
+def _of_nodes(setting: Setting, nodes: Nodes, recording: Recording, key: PRNGKeyArray) -> Sums:
+    """One batch."""
+    response = trace_nodes(setting, nodes, key)
+
+    def of_one(response: Any) -> Sums:
+        parts, fates = components(response, recording), shares_of(response, recording)._asdict()
+        lines = jnp.stack([*(parts[name] for name in recording.materials), parts["first"]])
+        return Sums(parts["first"] + parts["higher"], fates, lines)
+
+    return jax.vmap(of_one)(response)
+
+
+def _batches(
+    setting: Setting,
+    recording: Recording,
+    nodes: Nodes,
+    aim: Float[Array, "2"],
+    key: PRNGKeyArray,
+    first: Int[Array, ""],
+    count: Int[Array, ""],
+) -> tuple[BatchMoments, Array]:
+    """Moments of `count` batches from number `first` on, and their mean lines."""
+    lidar = recording.lidar
+    setting = aimed(setting, lidar, aim - lidar.position)
+    setting = dataclasses.replace(setting, beam=parallel_beam(lidar), optics=recording.optics)
+
+    def batch(n: Array) -> Sums:
+        return _of_nodes(setting, nodes, recording, jax.random.fold_in(key, first + n))
+
+    def step(n: Array, state: tuple[BatchMoments, Array]) -> tuple[BatchMoments, Array]:
+        (moments, lines), found, number = state, batch(n), n + 1.0
+        return moments.add((found.total, found.fates), number), lines + (found.lines - lines) / number
+
+    zero: Sums = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(batch, first))
+    none = (zero.total, zero.fates)
+    return jax.lax.fori_loop(0, count, step, (BatchMoments(none, none), zero.lines))
+
+
+_several = Program(_batches, **ONE_CORE)
+
+
+def trace_tile(ready: Ready, tile: Tile, number: int, rtol: float, key: PRNGKeyArray) -> Part:
+    """What a tile adds to its shots, traced until its error is below the tolerance for all of them.
+
+    A tile that has the share s of a footprint's light may be off by rtol / sqrt(s): then all tiles together
+    are off by rtol.
+    """
+    nodes = Nodes(
+        jnp.asarray(tile.place, float),
+        jnp.asarray(ready.spacing, float),
+        *(
+            jnp.asarray(a, k)
+            for of in (tile.photons, tile.rays)
+            for a, k in zip(of, (jnp.int32, jnp.int32, float))
+        ),
+    )
+    key = jax.random.fold_in(key, number)
+
+    def more(first: int, count: int) -> _Batches:
+        sizes = jnp.asarray(first, jnp.int32), jnp.asarray(count, jnp.int32)
+        aim = jnp.asarray(tile.aim, float)
+        given = (ready.setting, ready.recording, nodes, aim, key, *sizes)
+        return _Batches(count, *jax.tree.map(np.asarray, _several(*given)))
+
+    share = tile.part.sum(axis=1)
+    waited = share > _SMALL
+    found = more(0, MIN_BATCHES)
+    while found.count < MOST_BATCHES:
+        mean = _summed(tile.part[waited], found.moments.mean[0])
+        error = np.sqrt(_variance(tile.part[waited], found.moments.squares[0], found.count))
+        worst = float(np.max(relative_error(mean, error) * np.sqrt(share[waited]), initial=0.0)) / rtol
+        if worst <= 1.0:
+            break
+        wanted = int(np.ceil(1.05 * found.count * min(worst, 3.0) ** 2))
+        found = found.joined(more(found.count, min(max(wanted - found.count, 2), MOST_BATCHES - found.count)))
+    lit = np.abs(tile.part) > 0
+    per_node = np.bincount(tile.photons.node, minlength=tile.part.shape[1])
+    variance, fates_variance = (_variance(tile.part, a, found.count) for a in found.moments.squares)
+    # Light that is put elsewhere about a node is an error as large as what the node returns of it.
+    variance = variance + _summed(tile.astray**2, found.moments.mean[0] ** 2)
+    return Part(
+        tile.shots,
+        _summed(tile.part, found.lines),
+        _summed(tile.part, found.moments.mean[1]),
+        variance,
+        fates_variance,
+        (lit @ per_node) * found.count,
+    )
+
+
+def record_of(ready: Ready, parts: Iterable[Part], shots: slice) -> Record:
+    """The records of some shots, at most `TOGETHER`, from what tiles add to them, one after the other."""
+    whole: Any = None
+    for part in parts:
+        mine = (part.shots >= shots.start) & (part.shots < shots.stop)
+        each = part._asdict()
+        numbers = each.pop("shots")[mine] - shots.start
+        if whole is None:
+            whole = jax.tree.map(lambda a: np.zeros((TOGETHER, *a.shape[1:])), each)
+        jax.tree.map(lambda w, a, of=numbers, m=mine: np.add.at(w, of, a[m]), whole, each)
+    variances = whole["fates_variance"], whole["variance"]
+    known = (whole["lines"], whole["fates"], *jax.tree.map(np.sqrt, variances))
+    given = jax.tree.map(lambda a: jnp.asarray(a, float), known)
+    finished, number = _finished(ready.recording, ready.air, *given), shots.stop - shots.start
+    found: Record = jax.tree.map(lambda a: np.asarray(a)[:number], finished)
+    return found._replace(photons=whole["photons"][:number].astype(int))
+
+
+def _finish(
+    recording: Recording,
+    air: Float[Array, "wavelengths samples"] | None,
+    lines: Float[Array, "lines wavelengths samples"],
+    fates: dict[str, Float[Array, "*rows wavelengths"]],
+    fates_stderr: dict[str, Float[Array, "*rows wavelengths"]],
+    stderr: Float[Array, "wavelengths samples"],
+) -> Record:
+    """The record of one shot; `air`: what the air itself returns."""
+    parts = dict(zip(recording.materials, lines))
+    total, first = jnp.sum(lines[:-1], axis=0), lines[-1]
+    parts |= {"first": first, "higher": total - first}
+    if air is not None:
+        parts |= {"air": air, "first": first + air}
+        total = total + air
+    balance, errors = (balance_of(Shares(**f), recording) for f in (fates, fates_stderr))
+    # What returns is taken from one of the others, which keeps its error.
+    held = {"escaped": "escaped", "after the window": "late", "unfollowed": "remaining"}
+    ledger_stderr = errors.ledger | {name: fates_stderr[fate] for name, fate in held.items()}
+    error = relative_error(total, stderr, jnp)
+    photons = jnp.zeros((), jnp.int32)
+    return record_of_shot(recording, parts, balance, stderr, ledger_stderr, error, photons)
+
+
+def _finish_all(recording: Recording, air: Array | None, *arrays: Any) -> Record:
+    return jax.vmap(lambda *own: _finish(recording, air, *own))(*arrays)
+
+
+_finished = Program(_finish_all)
+
+
+def _summed(part: Float[np.ndarray, "shots nodes"], values: Any) -> Any:
+    """Sums over nodes, with the coefficients of every shot, of a tree of arrays."""
+
+    def one(a: np.ndarray) -> np.ndarray:
+        return (part @ a.reshape(len(a), -1)).reshape(len(part), *a.shape[1:])
+
+    return jax.tree.map(one, values)
+
+
+def _variance(part: Float[np.ndarray, "shots nodes"], squares: Any, count: int) -> Any:
+    """Variances of the means of batches, summed over nodes; widened for few batches of few nodes."""
+    weight = part * part
+    nodes = weight.sum(axis=1) ** 2 / np.maximum((weight**2).sum(axis=1), 1e-30)
+    wide = widening(1.0 + (count - 1.0) * np.maximum(nodes, 1.0)) ** 2 / (count * (count - 1.0))
+    return _summed((weight * wide[:, None]).astype(part.dtype), squares)

@@ -1,0 +1,100 @@
+"""Whether shots can share light, and whether that pays."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxlidar._checks import known_number
+from jaxlidar._summary import percent
+from jaxlidar.campaign.irradiance import Patches, patches
+from jaxlidar.campaign.tiles import Lit, Tile, lit, tiles
+from jaxlidar.instrument.survey import Survey
+from jaxlidar.optics.laws import AbstractMirror
+from jaxlidar.planning.parallel_light import parallel_light
+from jaxlidar.planning.setup import Setup
+
+# Shares of the tolerance that parallel light and the grid of nodes may take.
+_PARALLEL, _GRID = 0.5, 0.2
+# The same for the finest grid, if it takes more.
+_COARSE = 0.5
+# Coefficients below this share of the tolerance, of the largest, do not count.
+_FAINT = 0.01
+# A shot of its own has so many times the photons in a batch: here batches are many and small. Rays of order
+# one, which cost little, are as many.
+_FEWER = 4.0
+# Sharing pays where so many footprints overlap in the mean, and shots are so many.
+_OVERLAP, _FEWEST = 1.3, 4
+
+
+class Sharing(NamedTuple):
+    """Tiles of nodes that take the place of shots.
+
+    - `spacing`: of the nodes, m.
+    - `parallel`: bound on what parallel light changes, see `jaxlidar.planning.parallel_light`.
+    """
+
+    tiles: list[Tile]
+    spacing: float
+    parallel: float
+
+
+def sharing(survey: Survey, setup: Setup, rtol: float, asked: bool | None) -> Sharing | None:
+    """How the shots of a survey share light; None where they do not.
+
+    `survey` and `setup` have the same origin of coordinates. `asked`: whether they shall; None: if it pays.
+
+    **Raises:** ValueError where they shall and cannot.
+    """
+    if asked is False:
+        return None
+    reason = why_apart(survey, setup, rtol)
+    if reason is not None:
+        if asked:
+            raise ValueError(f"shared = True, but {reason}; admissible is None or False")
+        return None
+    if asked is None and len(survey) < _FEWEST:
+        return None
+    found = patches(survey, _GRID * rtol)
+    if found.misplaced > _COARSE * rtol:
+        if asked:
+            raise ValueError(
+                f"shared = True, but the finest grid misplaces {percent(found.misplaced)} of the light, at "
+                f"rtol = {rtol:g}; admissible is None or False"
+            )
+        return None
+    nodes = lit(found, _FAINT * rtol)
+    if asked is None and nodes.overlap < _OVERLAP:
+        return None
+    return Sharing(_tiles(found, nodes, setup), found.spacing, _parallel(survey, setup))
+
+
+def _parallel(survey: Survey, setup: Setup) -> float:
+    return parallel_light(survey, setup.plan.trace.upstream, setup.plan.limits.last)
+
+
+def _tiles(found: Patches, nodes: Lit, setup: Setup) -> list[Tile]:
+    plan = setup.plan
+    whole = float(nodes.light.sum()) * nodes.overlap / len(found.first)
+    photons = plan.n_photons / _FEWER / whole if plan.orders > 1 else 0.0
+    return tiles(found, nodes, photons, plan.n_rays / whole)
+
+
+def why_apart(survey: Survey, setup: Setup, rtol: float) -> str | None:
+    """Why the shots of a survey cannot share light; None where they can."""
+    canopy, lidar = setup.scene.canopy, setup.lidar
+    if np.any(survey.zenith > 0):
+        return f"zenith = {float(survey.zenith.max()):g}, and light is shared straight down alone"
+    if lidar.field_of_view is not None:
+        return "the lidar has a field of view, which is another for every footprint"
+    if not setup.plan.is_random:
+        return "nothing is random"
+    if known_number(lidar.divergence) == 0:
+        return "the beam has no width"
+    if canopy is not None and canopy.is_straight:
+        return "transmission = 'straight': light of every wavelength goes its own way"
+    if any(isinstance(s.law, AbstractMirror) for s in setup.scene.surfaces):
+        return "a surface is a mirror"
+    bound = _parallel(survey, setup)
+    if bound > _PARALLEL * rtol:
+        return f"light that is not parallel changes up to {percent(bound)} of samples, at rtol = {rtol:g}"
+    return None

@@ -1,0 +1,132 @@
+"""Writer of maps of a survey: one number for each shot of a grid, as bands of a GeoTIFF."""
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import ArrayLike
+
+from jaxlidar._checks import check_kind, check_numbers, check_range, check_shape
+from jaxlidar._files import atomic_write
+
+_TIFF = (".tif", ".tiff")
+# Shots lie on a grid if they are off by less than this share of its spacing.
+_OFF = 1e-3
+
+
+def write_raster(
+    path: str | os.PathLike[str],
+    values: Mapping[str, ArrayLike | Sequence],
+    position: ArrayLike | Sequence,
+    *,
+    crs: str | None = None,
+) -> None:
+    """Write maps, such as heights, cover or ground that were retrieved for the shots of a grid, as a GeoTIFF.
+
+    Every shot is the middle of a cell. Cells without a shot have no data, and so have those whose number is
+    NaN: they are NaN in the file, which says so. Numbers keep their bits: bands are of float64.
+
+    **Arguments:**
+
+    - `path`: the file to write, .tif or .tiff.
+    - `values`: (shots,) numbers by name; each becomes a band of that name.
+    - `position`: (shots, 2) x and y of the shots in m, on a grid along x and y, such as
+      `Survey.grid(...).position`, in any order.
+    - `crs`: the coordinate reference system of `position`, such as "EPSG:32633". Default None: not known.
+
+    **Returns:** nothing.
+
+    **Raises:** ImportError where `rasterio` is not installed, which the extra `io` installs. ValueError for
+    values of another number, infinite ones, shots that are not on a grid or twice at one place, an unknown
+    `crs`, and another kind of file. OSError for a path that cannot be written.
+
+    **Source:** OGC GeoTIFF 1.1.
+
+    **Example:**
+
+    >>> import pathlib, tempfile
+    >>> import jaxlidar as jl
+    >>> survey = jl.Survey.grid(jl.Lidar(), low=(0, 0), high=(20, 10), spacing=10.0)
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "heights.tif"
+    >>> jl.io.write_raster(path, {"RH98": [18.0, 17.5, 19.0, 21.0, 20.5, 22.0]}, survey.position)
+    >>> terrain, _, _ = jl.io.read_dem(path)
+    >>> print(terrain.origin.tolist(), terrain.heights[:, 0].tolist())
+    [0.0, 0.0] [18.0, 17.5, 19.0]
+    """
+    try:
+        import rasterio
+        from rasterio.errors import CRSError
+    except ImportError as error:
+        raise ImportError("GeoTIFF needs the package rasterio: pip install 'jaxlidar[io]'") from error
+    path = Path(path)
+    if path.suffix.lower() not in _TIFF:
+        raise ValueError(f"path = {path} ends in {path.suffix!r}; admissible are {', '.join(_TIFF)}")
+    check_kind("values", values, Mapping, "a mapping of names to (shots,) numbers")
+    check_kind("crs", crs, str | None, "the name of a coordinate reference system, or None")
+    if not values:
+        raise ValueError("values is empty; admissible is one map or more")
+    cells, origin, spacing, shape = _grid(position)
+    bands = np.full((len(values), *shape), np.nan)
+    for band, (name, of_shots) in zip(bands, values.items()):
+        check_numbers(f"values of {name!r}", of_shots)
+        known = np.asarray(of_shots, float)
+        check_shape(f"values of {name!r}", known, (len(cells),))
+        check_range(f"values of {name!r}", np.where(np.isnan(known), 0.0, known))
+        # Rows run from north to south.
+        band[shape[0] - 1 - cells[:, 1], cells[:, 0]] = known
+    west, north = origin[0] - 0.5 * spacing[0], origin[1] + (shape[0] - 0.5) * spacing[1]
+    transform = rasterio.Affine(spacing[0], 0.0, west, 0.0, -spacing[1], north)
+    profile: dict[str, Any] = {"driver": "GTiff", "count": len(bands), "dtype": "float64", "nodata": np.nan}
+    try:
+        profile["crs"] = None if crs is None else rasterio.CRS.from_string(crs)
+    except CRSError as error:
+        raise ValueError(f"crs = {crs!r} is not known ({error})") from error
+    profile |= {"height": shape[0], "width": shape[1], "transform": transform}
+    with atomic_write(path) as draft, rasterio.open(draft, "w", **profile) as file:
+        file.write(bands)
+        for number, name in enumerate(values, 1):
+            file.set_band_description(number, name)
+
+
+def _grid(position: ArrayLike | Sequence) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[int, int]]:
+    """Column and row of every shot from the south-west, where that is, spacing, and (rows, columns)."""
+    check_numbers("position", position)
+    place = np.asarray(position, float)
+    if place.ndim != 2 or place.shape[1] != 2 or len(place) == 0:
+        raise ValueError(f"position has the shape {place.shape}; admissible is (shots, 2), one or more")
+    check_range("position", place)
+    low = place.min(axis=0)
+    spacing = np.array([_step(place[:, axis], low[axis]) for axis in range(2)])
+    # One row or column alone has the spacing of the other.
+    spacing = np.where(spacing > 0, spacing, spacing.max())
+    spacing = np.where(spacing > 0, spacing, 1.0)
+    number = (place - low) / spacing
+    cells = np.round(number).astype(int)
+    off = np.abs(number - cells).max(axis=1)
+    if np.any(off > _OFF):
+        worst = int(np.argmax(off))
+        raise ValueError(
+            f"position: shot {worst} at {place[worst].tolist()} m is off the grid of {spacing.tolist()} m "
+            f"from {low.tolist()}; admissible are shots on a grid along x and y"
+        )
+    columns, rows = (int(n) + 1 for n in cells.max(axis=0))
+    unique, first = np.unique(cells[:, 1] * columns + cells[:, 0], return_index=True)
+    if len(unique) < len(cells):
+        twice = int(np.setdiff1d(np.arange(len(cells)), first)[0])
+        raise ValueError(
+            f"position: shot {twice} lies where another one does; admissible is one for each cell"
+        )
+    return cells, low, spacing, (rows, columns)
+
+
+def _step(x: np.ndarray, low: float) -> float:
+    """The smallest distance between different coordinates, or 0 where there is one alone."""
+    apart = np.diff(np.unique(x))
+    apart = apart[apart > _OFF * max(float(np.ptp(x)), 1e-9) / len(x)]
+    if apart.size == 0:
+        return 0.0
+    # The mean over all of them is exact where single steps are rounded.
+    smallest = float(apart.min())
+    return float(np.ptp(x)) / max(round(float(np.ptp(x)) / smallest), 1)

@@ -1,0 +1,26 @@
+"""What parallel light in place of a beam's own would change: footprints that share light take it for such."""
+
+import math
+
+from jaxlidar._checks import known_number
+from jaxlidar._constants import SPEED_OF_LIGHT
+from jaxlidar.instrument.survey import Survey
+
+
+def parallel_light(survey: Survey, upstream: float, last: float) -> float:
+    """Bound on the share of samples that parallel light changes, for shots that look straight down.
+
+    At the height h above the reference plane a footprint of the radius w is narrower by the share h / R. A
+    Gaussian so changed has 2 / e of that share elsewhere on either side, 1.5 h / R in all. Light at the rim
+    arrives later than the mean, which is kept, by w^2 / (2 R), and inclined by w / R.
+
+    **Arguments:** `upstream`: where rays start, m above the reference plane. `last`: time of the last return
+    of order one, ns.
+    """
+    lidar = survey.lidar
+    distance, radius = float(survey.slant_range.min()), float(survey.footprint_radius.max())
+    height = max(abs(upstream), 0.5 * SPEED_OF_LIGHT * abs(last))
+    interval = known_number(lidar.sampling_interval) / math.sqrt(12.0)
+    lasts = math.hypot(known_number(lidar.pulse.std), known_number(lidar.jitter), interval)
+    late = 0.5 * radius**2 / distance / SPEED_OF_LIGHT / lasts
+    return min(1.5 * height / distance + late + radius / distance, 1.0)

@@ -1,0 +1,250 @@
+"""Terrain: a ground of measured or modelled heights."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, ClassVar, final
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from jaxlidar._checks import (
+    array,
+    as_array,
+    briefly,
+    check_choice,
+    check_flag,
+    check_kind,
+    check_range,
+    check_shape,
+    concrete,
+    coordinates,
+    known_array,
+)
+from jaxlidar._ranges import SHARE, Range, check_ranges
+from jaxlidar._vectors import normalise
+from jaxlidar.optics.laws import AbstractLaw, AbstractMirror, Lambertian
+from jaxlidar.optics.spectra import Spectrum
+from jaxlidar.scenes.height_field import HeightField
+from jaxlidar.scenes.raster import Raster
+from jaxlidar.scenes.shapes import AbstractShape, Plane
+from jaxlidar.scenes.surfaces import (
+    AbstractGround,
+    Ground,
+    Reflectance,
+    check_reflectance,
+    reflectance_field,
+)
+
+# Heights that depart from a plane by less than this share of the spacing, and than rounding, are a plane's.
+_LEVEL = 1e-5
+_ROUNDING = 4 * float(np.finfo(np.float32).eps)
+
+
+def _pair(field: str) -> Callable[[Any], Float[Array, "2"]]:
+    """The converter of a field that is two numbers, or one that stands for both."""
+
+    def convert(x: Any) -> Float[Array, "2"]:
+        a = as_array(x, field)
+        check_shape(field, a, (), (2,))
+        return jnp.broadcast_to(a, (2,))
+
+    return convert
+
+
+@final
+@briefly
+class Terrain(AbstractGround):
+    """Terrain: an opaque ground whose height is given at the nodes of a grid, and bilinear in between.
+
+    It takes the place of `Ground` in a `Scene`. Light that one slope scatters can meet another, and what
+    slopes hide from the sensor is not seen. Heights that lie in a plane are traced as a plane, without end;
+    for derivatives with respect to such heights the plan is made with effects={"relief": True}. Derivatives
+    of higher orders leave out how slopes come to hide one another as heights change.
+
+    **Arguments:**
+
+    - `heights`: (nx, ny) heights of the nodes, m, x east along the first axis and y north along the second;
+      at least 2 x 2.
+    - `spacing`: (2,) distances between nodes along x and y, m, positive; or one number for both.
+    - `origin`: (2,) place (x, y) of the south-west node, m. It is kept in double precision. Default (0, 0).
+    - `reflectance`: one number, one per wavelength, a `Spectrum`, or a raster: (nx, ny) values at the nodes,
+      bilinear in between, for all wavelengths. In [0, 1]. Default 0.3.
+    - `law`: the scattering law: `Lambertian()`, `EqualAngle()` or another `AbstractLaw`, but no mirror.
+      Default `Lambertian()`.
+    - `sides`: "open": there is nothing beyond the outermost nodes, and footprints must lie within them.
+      "periodic": the terrain repeats without end, node nx being node 0 again; below a canopy whose sides are
+      periodic, with the same period. Default "open".
+    - `relief`: False for the plane of best fit in place of the heights. Default True.
+
+    **Raises:** ValueError for fewer nodes than 2 x 2, a spacing that is not positive, a reflectance outside
+    [0, 1], a raster of another shape than the heights, values that are not finite, and a mirror; TypeError
+    for a thing of another kind.
+
+    **Example:** the waveform of a ridge, met at its top.
+
+    >>> import jax, jaxlidar as jl
+    >>> ridge = jl.Terrain([[0.0, 0.0], [2.0, 2.0], [0.0, 0.0]], spacing=4.0, origin=(-4.0, -2.0))
+    >>> float(ridge.height_at(1.0, 0.0))
+    1.5
+    >>> wave = jl.simulate(jl.Lidar(), jl.Scene(ground=ridge), key=jax.random.key(0), max_orders=1)
+    >>> print(f"{float(wave.reflectance.sum()):.3f}, of {0.3 * 2 / 5**0.5:.3f}")
+    0.268, of 0.268
+    """
+
+    heights: Float[Array, "..."] = eqx.field(converter=array("heights"))
+    spacing: Float[Array, "2"] = eqx.field(converter=_pair("spacing"))
+    origin: Float[Array | np.ndarray, "2"] = eqx.field(converter=coordinates("origin", 2), default=(0.0, 0.0))
+    reflectance: Reflectance | Float[Array, "nx ny"] = eqx.field(
+        converter=reflectance_field("reflectance"), default=0.3
+    )
+    law: AbstractLaw = Lambertian()
+    sides: str = eqx.field(static=True, default="open")
+    relief: bool = eqx.field(static=True, default=True)
+
+    ranges: ClassVar = {
+        "heights": Range(),
+        "spacing": Range(0.0, low_open=True),
+        "origin": Range(),
+        "reflectance": SHARE,
+    }
+
+    def __check_init__(self):
+        check_choice("sides", self.sides, ("open", "periodic"))
+        check_flag("relief", self.relief)
+        check_kind("law", self.law, AbstractLaw, "a law of reflection, such as Lambertian()")
+        if isinstance(self.law, AbstractMirror):
+            raise ValueError(
+                "law is a mirror; admissible on terrain is another law (a Ground may be a mirror)"
+            )
+        if self.heights.ndim != 2 or min(self.heights.shape) < 2:
+            raise ValueError(
+                f"heights has shape {self.heights.shape}; admissible is (nx, ny), each at least 2"
+            )
+        check_ranges(self)
+        raster = self._raster_of_reflectance
+        if raster is None:
+            check_reflectance("reflectance", self.reflectance)
+        elif raster.shape != self.heights.shape:
+            raise ValueError(
+                f"reflectance has shape {raster.shape}; admissible is one number, one per "
+                f"wavelength, a Spectrum, or one per node: {self.heights.shape}"
+            )
+
+    @property
+    def _raster_of_reflectance(self) -> Float[Array, "nx ny"] | None:
+        """The reflectance if it is given by node, otherwise None."""
+        reflectance = self.reflectance
+        return None if isinstance(reflectance, Spectrum) or reflectance.ndim != 2 else reflectance
+
+    def _raster(self, values: Float[Array, "nx ny"]) -> Raster:
+        return Raster.of(values, self.spacing, jnp.asarray(self.origin, float), self.sides == "periodic")
+
+    @property
+    def name(self) -> str:
+        return "ground"
+
+    @property
+    def shape(self) -> AbstractShape:
+        return HeightField.of(self._raster(self.heights)) if self.relief else self._plane()
+
+    @property
+    def pattern(self) -> Raster | None:
+        if (raster := self._raster_of_reflectance) is None:
+            return None
+        largest = jnp.max(raster)
+        return self._raster(raster / jnp.where(largest > 0, largest, 1.0))
+
+    @property
+    def brightest(self) -> Reflectance:
+        raster = self._raster_of_reflectance
+        return self.reflectance if raster is None else jnp.max(raster)
+
+    def moved(self, by: Float[np.ndarray, "2"]) -> "Terrain":
+        place = concrete(self.origin)
+        origin = self.origin + jnp.asarray(by, float) if place is None else jnp.asarray(place + by, float)
+        return eqx.tree_at(lambda s: s.origin, self, origin)
+
+    @property
+    def end(self) -> Float[np.ndarray, "2"]:
+        """(2,) place of the outermost north-east node, or of the first that is a repetition, m."""
+        cells = np.asarray(self.heights.shape) - (self.sides == "open")
+        return known_array(self.origin) + known_array(self.spacing) * cells
+
+    def height_at(self, x: ArrayLike, y: ArrayLike) -> Float[Array, "..."]:
+        """Height of the terrain, or of its plane of best fit without relief.
+
+        **Arguments:**
+
+        - `x`, `y`: places, m, of one shape. They are taken relative to the origin in double precision where
+          both are known.
+
+        **Returns:** heights, m, shaped as `x` and `y`.
+
+        **Raises:** ValueError for places off the terrain, where its sides are open.
+        """
+        known, origin = [concrete(v) for v in (x, y)], concrete(self.origin)
+        if origin is None or known[0] is None or known[1] is None:
+            here, east, north = self, jnp.asarray(x), jnp.asarray(y)
+        else:
+            here = eqx.tree_at(lambda s: s.origin, self, jnp.zeros(2))
+            east, north = (jnp.asarray(v - o, float) for v, o in zip(known, origin))
+            if self.sides == "open" and self.relief:
+                for axis, v, low, high in zip("xy", known, origin, self.end):
+                    check_range(axis, v, low, high)
+        shape = here.shape
+        if isinstance(shape, HeightField):
+            return shape.heights.value((east, north))
+        normal, offset = shape.tangent((east, north, jnp.zeros_like(east)))
+        return (offset - normal[0] * east - normal[1] * north) / normal[2]
+
+    def is_plane(self) -> bool:
+        """Whether all heights, which must be known, lie in one plane; where the sides are periodic, level."""
+        heights, spacing = known_array(self.heights), known_array(self.spacing)
+        slope, mean = self._best_fit(heights, spacing)
+        x, y = (d * n for d, n in zip(spacing, _from_middle(heights.shape)))
+        apart = np.abs(heights - mean - slope[0] * x[:, None] - slope[1] * y)
+        slack = _LEVEL * float(spacing.min()) + _ROUNDING * float(np.abs(heights).max())
+        return bool(apart.max() <= slack)
+
+    def without_relief(self) -> "Ground | Terrain":
+        """The plane of best fit: a `Ground`, unless heights are being traced or the reflectance varies."""
+        varies = self._raster_of_reflectance is not None
+        if varies or concrete(self.heights) is None or concrete(self.origin) is None:
+            return dataclasses.replace(self, relief=False)
+        heights, spacing = known_array(self.heights), known_array(self.spacing)
+        (east, north), mean = self._best_fit(heights, spacing)
+        x, y = known_array(self.origin) + 0.5 * spacing * (np.asarray(heights.shape) - 1.0)
+        slope = np.rad2deg(np.arctan(np.hypot(east, north)))
+        aspect = np.rad2deg(np.arctan2(-east, -north)) if slope > 0 else 0.0
+        # Told at x = y = 0: near the beam, once the scene is told relative to it.
+        return Ground(
+            height=mean - east * x - north * y,
+            reflectance=self.reflectance,
+            slope=slope,
+            aspect=aspect,
+            law=self.law,
+        )
+
+    def _plane(self) -> Plane:
+        (east, north), mean = self._best_fit(self.heights, self.spacing)
+        half = 0.5 * (np.asarray(self.heights.shape) - 1.0)
+        middle = jnp.asarray(self.origin, float) + self.spacing * half
+        upward = normalise((-east, -north, jnp.ones_like(mean)))
+        return Plane(jnp.stack(upward), jnp.append(middle, mean))
+
+    def _best_fit(self, heights: Any, spacing: Any) -> tuple[tuple[Any, Any], Any]:
+        """Rise per m to the east and to the north, and mean height, of the plane of least squares."""
+        mean = heights.mean()
+        if self.sides == "periodic":
+            return (0.0 * mean, 0.0 * mean), mean
+        x, y = _from_middle(heights.shape)
+        east = (heights * x[:, None]).mean() / (x * x).mean() / spacing[0]
+        return (east, (heights * y[None, :]).mean() / (y * y).mean() / spacing[1]), mean
+
+
+def _from_middle(shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers of nodes along x and y, from the middle."""
+    nx, ny = shape
+    return np.arange(nx) - 0.5 * (nx - 1), np.arange(ny) - 0.5 * (ny - 1)

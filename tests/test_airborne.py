@@ -1,0 +1,136 @@
+"""The record that all readers of airborne waveforms give, and stacks of several."""
+
+import dataclasses
+import pickle
+
+import jax
+import numpy as np
+import pytest
+
+import jaxlidar as jl
+from jaxlidar.io import AirborneShot, Segment, stack_shots
+
+WAY = np.array([0.02, 0.01, -0.1482])
+ANCHOR = np.array([5e5, 4e6, 300.0])
+
+
+def shot_of(*returning, **changes):
+    own = {"anchor": ANCHOR, "direction": WAY, "returning": returning}
+    return AirborneShot(7, **(own | changes))
+
+
+def echo(start, *samples, **changes):
+    return Segment(np.array(samples, np.uint8), start, **changes)
+
+
+def test_one_segment():
+    shot = shot_of(echo(10.25, 3, 4, 90, 5, step=2.0), noise_mean=3.0)
+    np.testing.assert_array_equal(shot.time, [10.25, 12.25, 14.25, 16.25])
+    np.testing.assert_array_equal(shot.waveform, [3, 4, 90, 5])
+    np.testing.assert_array_equal(shot.signal, [0, 1, 87, 2])
+    assert shot.recorded.all()
+    np.testing.assert_allclose(shot.position[2], ANCHOR + 14.25 * WAY, rtol=1e-14)
+    assert shot.zenith == pytest.approx(np.rad2deg(np.arctan2(np.hypot(0.02, 0.01), 0.1482)))
+    assert shot.azimuth == pytest.approx(np.rad2deg(np.arctan2(0.02, 0.01)))
+    np.testing.assert_allclose(shot.time_from(shot.elevation[2]), [-4, -2, 0, 2], atol=1e-9)
+    np.testing.assert_allclose(shot.position_at(shot.elevation[2]), shot.position[2, :2], rtol=1e-14)
+
+
+def test_several_segments_with_a_gap_between_them():
+    """Segments are in order of time; they begin where they begin, also between samples of the first."""
+    shot = shot_of(echo(105.003, 7, 8), echo(100.0, 1, 2, 3), noise_mean=1.0)
+    np.testing.assert_array_equal(shot.recorded, [1, 1, 1, 0, 0, 1, 1])
+    np.testing.assert_array_equal(shot.waveform, [1, 2, 3, 0, 0, 7, 8])
+    np.testing.assert_array_equal(shot.signal, [0, 1, 2, 0, 0, 6, 7])
+    np.testing.assert_allclose(shot.time[[0, 2, 5, 6]], [100, 102, 105.003, 106.003], rtol=1e-14)
+    assert np.all(np.diff(shot.time) > 0)
+    # One that follows at once, half a sample off at most, leaves no gap.
+    assert shot_of(echo(0.4, 1, 2), echo(2.0, 3)).recorded.all()
+
+
+def test_channels_are_kept_apart():
+    shot = shot_of(echo(5.0, 1, 9, channel=1), echo(6.4, 2, 4, channel=0))
+    np.testing.assert_array_equal(shot.waveform, [1, 9])
+    np.testing.assert_array_equal(shot.of_channel(0).waveform, [2, 4])
+    with pytest.raises(ValueError, match=r"shot 7: channel = 2 is none of \[0, 1\]"):
+        shot.of_channel(2)
+
+
+def test_the_digitiser_has_a_gain_and_an_offset():
+    shot = shot_of(echo(0.0, 0, 100, gain=0.5, offset=-3.0))
+    np.testing.assert_array_equal(shot.waveform, [-3.0, 47.0])
+
+
+def test_the_pulse():
+    sent = Segment(np.array([12, 11, 10, 60, 90, 40, 10, 9]), -4.0)
+    shot = shot_of(echo(0.0, 1), outgoing=(sent,), pedestal=10.0)
+    np.testing.assert_array_equal(shot.pulse_time, np.arange(-4.0, 4.0))
+    np.testing.assert_array_equal(shot.pulse_power, [0, 0, 0, 50, 80, 30, 0, 0])
+    other = dataclasses.replace(shot, pulse_zero=1.0)
+    np.testing.assert_array_equal(other.pulse_time, np.arange(-5.0, 3.0))
+    with pytest.raises(ValueError, match="shot 7: no outgoing pulse"):
+        _ = shot_of(echo(0.0, 1)).pulse_power
+    with pytest.raises(ValueError, match="shot 7: outgoing: a pulse without energy"):
+        _ = dataclasses.replace(shot, pedestal=90.0).pulse_power
+
+
+def test_a_simulated_echo_lies_at_its_place():
+    """A target put where a sample lies returns its echo in this sample."""
+    sent = Segment(np.array([0, 30, 80, 30, 0]), -2.0)
+    shot = shot_of(Segment(np.zeros(60, int), 40.0), outgoing=(sent,))
+    lidar = jl.Lidar(
+        pulse=jl.SampledPulse(time=shot.pulse_time, power=shot.pulse_power),
+        zenith=shot.zenith,
+        azimuth=shot.azimuth,
+        divergence=0.0,
+    )
+    reference = float(shot.elevation[35])
+    scene = jl.Scene(ground=jl.Ground(height=float(shot.elevation[25]) - reference))
+    wave = jl.simulate(lidar, scene, max_orders=1, key=jax.random.key(0))
+    samples = np.interp(shot.time_from(reference), np.asarray(wave.time), np.asarray(wave.reflectance[0]))
+    assert samples.argmax() == 25
+
+
+def test_degrees():
+    """Directions in degrees become metres with the factors for each axis."""
+    metres = np.array([88_000.0, 111_000.0, 1.0])
+    shot = shot_of(echo(0.0, 1), direction=WAY / metres, metres=metres)
+    assert shot.zenith == pytest.approx(shot_of(echo(0.0, 1)).zenith)
+    assert shot.azimuth == pytest.approx(shot_of(echo(0.0, 1)).azimuth)
+    assert shot.is_geographic
+    assert not shot_of(echo(0.0, 1)).is_geographic
+
+
+@pytest.mark.parametrize(
+    ("segments", "says"),
+    [
+        ([], "no returning segment"),
+        ([echo(0.0)], "a segment of 0 samples"),
+        ([echo(np.nan, 1)], "from nan ns"),
+        ([echo(0.0, 1, step=0.0)], "every 0 ns"),
+        ([echo(0.0, 1, gain=np.inf)], "gain inf"),
+        ([echo(0.0, 1, 2, 3), echo(2.0, 4)], "segments of channel 0 overlap"),
+        ([echo(0.0, 1), echo(5.0, 1, step=2.0)], "segments of channel 0 have different steps"),
+        ([echo(0.0, 1), echo(1e9, 1)], r"1000000001 samples from the first to the last; at most 1000000"),
+    ],
+)
+def test_records_that_make_no_sense(segments, says):
+    with pytest.raises(ValueError, match=f"shot 7: .*{says}"):
+        shot_of(*segments)
+
+
+def test_a_shot_is_sent_elsewhere():
+    shot = pickle.loads(pickle.dumps(shot_of(echo(0.0, 1, 2), noise_std=0.5)))
+    np.testing.assert_array_equal(shot.waveform, [1, 2])
+
+
+def test_stacks():
+    shots = [shot_of(echo(40.0, 3, 9, 3), noise_mean=3.0), shot_of(echo(1.0, 5, 8), echo(6.0, 7))]
+    stack = stack_shots(shots)
+    np.testing.assert_array_equal(stack.time, np.arange(6))
+    np.testing.assert_array_equal(stack.signal, [[0, 6, 0, 0, 0, 0], [5, 8, 0, 0, 0, 7]])
+    np.testing.assert_array_equal(stack.recorded, [[1, 1, 1, 0, 0, 0], [1, 1, 0, 0, 0, 1]])
+    with pytest.raises(ValueError, match=r"sampling intervals \[1\.0, 2\.0\] ns; admissible is one"):
+        stack_shots([shots[0], shot_of(echo(0.0, 1, step=2.0))])
+    with pytest.raises(ValueError, match=r"sampling intervals \[\] ns"):
+        stack_shots([])

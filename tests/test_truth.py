@@ -1,0 +1,259 @@
+r"""Truth of one beam against closed forms: slabs, plates, slopes, half-planes of canopy, amplitudes.
+
+A slab of plant area density a, of which leaf has the share s, from its top z1 down to z0, seen at the zenith
+angle theta (mu = cos(theta)) lets the share exp(-G a (z1 - z) / mu) pass down to z. A beam of radius w (at
+1/e^2, or the edge of a top-hat) meets a plane of slope alpha at heights whose standard deviation is
+tan(alpha) w / 2: the variance of x is w^2/4 for both profiles. Of a half-plane x > d a Gaussian beam lights
+the share Phi(-2 d / w), a top-hat the segment (arccos(q) - q sqrt(1 - q^2)) / pi, q = d / w.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import NARROW, slow_unless
+from scipy.stats import norm
+
+import jaxlidar as jl
+
+KEY = jax.random.key(3)
+HIGH = {"altitude": 4e5, "pulse": jl.GaussianPulse(fwhm=6.0)}
+NARROW_BEAM = HIGH | {"divergence": 1e-3}
+# A footprint of radius 5 m.
+WIDE_BEAM = HIGH | {"divergence": 0.025}
+# Metres of a sample.
+SAMPLE = 0.5 * jl.SPEED_OF_LIGHT
+LEAF = jl.LeafOptics(0.45, 0.3)
+
+
+def stand(lad, *, bark=None, size=1.0, origin=(-20.0, -20.0, 2.0), ground=None, angles="spherical", **canopy):
+    """A canopy above ground."""
+    voxels = jl.VoxelMap.from_lad(lad, voxel_size=size, origin=origin, leaf_angles=angles, bark=bark)
+    canopy = {"leaf": LEAF, "bark": None if bark is None else 0.4} | canopy
+    return jl.Scene(canopy=jl.Canopy(voxels, **canopy), ground=ground or jl.Ground(reflectance=0.3))
+
+
+def ends(truth):
+    """Heights of the lower ends of all samples."""
+    height = np.asarray(truth.height, float)
+    return height + 0.5 * np.diff(height)[0]
+
+
+@NARROW
+@pytest.mark.parametrize(("zenith", "angles"), [(0.0, "planophile"), (40.0, "spherical")])
+def test_a_slab_is_seen_as_it_is(precision, zenith, angles):
+    a, bark, low, top = 0.6, 0.1, 2.0, 12.0
+    shape = (40, 40, 5)
+    scene = stand(
+        np.full(shape, a), bark=np.full(shape, bark), size=(1.0, 1.0, 2.0), angles=angles, sides="periodic"
+    )
+    # Off nadir, shells of equal range cut a wide beam at many heights.
+    truth = jl.truth_of(jl.Lidar(zenith=zenith, **HIGH, divergence=0.0), scene)
+    mu = np.cos(np.deg2rad(zenith))
+    G = 0.5
+    if angles != "spherical":
+        G = float(jl.LeafAngles.named(angles).tables()[0][-1])
+    depth = np.clip(top - ends(truth), 0.0, top - low)
+    tolerance = 2e-5 if precision == "float32" else 1e-9
+    gap = np.exp(-(G * a + bark) * depth / mu)
+    assert np.allclose(truth.gap_probability, gap, atol=tolerance)
+    assert np.allclose(truth.plant_area_index, (a + 2 * bark) * depth, atol=50 * tolerance)
+    assert not np.allclose(truth.gap_probability, np.exp(-(G * a + bark) * (depth + 0.1) / mu), atol=1e-3)
+    inside = (np.asarray(truth.height) < top - 0.2) & (np.asarray(truth.height) > low + 0.2)
+    outside = (np.asarray(truth.height) > top + 0.2) | (np.asarray(truth.height) < low - 0.2)
+    for name, density in (("leaf", a), ("bark", 2 * bark)):
+        found = np.asarray(getattr(truth, f"{name}_area_density"), float)
+        assert np.allclose(found[inside], density, rtol=50 * tolerance), name
+        assert np.all(found[outside] == 0.0), name
+    expected = top + np.log(0.99) * mu / (G * a + bark)
+    assert float(truth.top_height) == pytest.approx(expected, abs=SAMPLE)
+
+
+def test_plates_intercept_in_turn():
+    plates = [jl.Plate(3.0, 0.4, coverage=0.5), jl.Plate(7.0, 0.2, 0.3, coverage=0.25), jl.Plate(-9.0, 0.4)]
+    scene = jl.Scene(plates=plates, ground=jl.Ground(reflectance=0.3))
+    truth = jl.truth_of(jl.Lidar(**NARROW_BEAM), scene)
+    expected = np.where(ends(truth) < 3.0, 0.375, np.where(ends(truth) < 7.0, 0.75, 1.0))
+    assert np.allclose(truth.gap_probability, expected, atol=1e-6)
+    assert float(truth.top_height) == pytest.approx(7.0, abs=SAMPLE)
+    heights = {name: float(z) for name, z in truth.surface_height.items()}
+    assert np.isnan(heights.pop("plate 3"))
+    assert heights == pytest.approx({"ground": 0.0, "plate 1": 3.0, "plate 2": 7.0}, abs=1e-4)
+    assert np.allclose(truth.plant_area_index, 0.0)
+    # Each layer's amplitude, at its own height: opaque sheets let the share 1 - coverage pass twice.
+    amplitudes = {name: float(jnp.sum(a)) for name, a in truth.returns.items()}
+    through = 0.75 + 0.25 * 0.3
+    layers = {"plate 2": 0.25 * 0.2, "plate 1": 0.5 * 0.4 * through**2, "ground": 0.3 * 0.25 * through**2}
+    assert amplitudes == pytest.approx(layers | {"plate 3": 0.0}, rel=1e-4)
+    for name, a in truth.returns.items():
+        if name != "plate 3":
+            centre = float(jnp.sum(a[0] * truth.height) / jnp.sum(a[0]))
+            assert centre == pytest.approx(heights[name], abs=0.1), name
+
+
+@NARROW
+@pytest.mark.parametrize("profile", ["gaussian", "top-hat"])
+def test_slopes_spread_heights(profile, precision):
+    lidar = jl.Lidar(profile=profile, position=(40.0, 0.0), **WIDE_BEAM)
+    ground = jl.Ground(height=1500.0, slope=20.0, aspect=90.0)
+    truth = jl.truth_of(lidar, jl.Scene(ground=ground))
+    slope = np.tan(np.deg2rad(20.0))
+    height = 1500.0 - 40.0 * slope
+    # Nearer to the sensor the beam is narrower.
+    spread = 2.5 * slope * (1.0 - height / 4e5)
+    accuracy = 1e-3 if precision == "float32" else 1e-4
+    assert float(truth.surface_height["ground"]) == pytest.approx(height, abs=accuracy)
+    assert float(truth.surface_spread["ground"]) == pytest.approx(spread, rel=accuracy)
+    # Above terrain the footprint is a set of rays.
+    x = np.arange(-40.0, 121.0, 20.0)
+    heights = np.broadcast_to(1500.0 - slope * x[:, None], (x.size, x.size))
+    hill = jl.Terrain(heights + 1e-3 * (x > 110.0), spacing=20.0, origin=(-40.0, -80.0))
+    rays = jl.truth_of(lidar, jl.Scene(ground=hill))
+    assert float(rays.surface_height["ground"]) == pytest.approx(height, abs=2e-3)
+    assert float(rays.surface_spread["ground"]) == pytest.approx(spread, rel=5e-3)
+    assert np.isnan(float(rays.top_height))
+
+
+def test_level_ground_has_no_spread_off_nadir():
+    truth = jl.truth_of(jl.Lidar(zenith=30.0, **WIDE_BEAM), jl.Scene(ground=jl.Ground(2.0)))
+    assert float(truth.surface_height["ground"]) == pytest.approx(2.0, abs=1e-5)
+    assert float(truth.surface_spread["ground"]) == pytest.approx(0.0, abs=1e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("profile", ["gaussian", "top-hat"])
+def test_half_of_a_footprint_is_weighted_by_its_light(profile):
+    """A canopy on x > 2, denser by far than the one on x < 2; 4096 rays leave a thousandth."""
+    lad = np.full((40, 1, 4), 0.1)
+    lad[22:] = 1.0
+    scene = stand(lad, size=(1.0, 40.0, 2.0))
+    lidar = jl.Lidar(profile=profile, **WIDE_BEAM)
+    q = 2.0 / 5.0
+    segment = (np.arccos(q) - q * np.sqrt(1 - q * q)) / np.pi
+    share = {"gaussian": norm.cdf(-2.0 * q), "top-hat": segment}
+
+    def gap(share):
+        return share * np.exp(-0.5 * 8.0) + (1.0 - share) * np.exp(-0.5 * 0.8)
+
+    def found(rays):
+        plan = jl.plan(lidar, scene, max_orders=1, n_rays=rays)
+        return jl.truth_of(lidar, scene, plan=plan)
+
+    fine = found(4096)
+    assert float(fine.gap_probability[-1]) == pytest.approx(gap(share[profile]), abs=1e-3)
+    area = 8.0 * share[profile] + 0.8 * (1.0 - share[profile])
+    assert float(fine.plant_area_index[-1]) == pytest.approx(area, rel=3e-3)
+    other = share["top-hat" if profile == "gaussian" else "gaussian"]
+    assert float(fine.gap_probability[-1]) != pytest.approx(gap(other), abs=1e-3)
+    # Fewer rays are near it.
+    assert np.allclose(found(512).gap_probability, fine.gap_probability, atol=8e-3)
+
+
+SCENES = {
+    "leaf and bark, hot spot": lambda: stand(
+        np.full((40, 40, 10), 0.3), bark=np.full((40, 40, 10), 0.05), hotspot=True
+    ),
+    "straight transmission": lambda: dataclasses.replace(
+        stand(
+            np.full((40, 40, 10), 0.3), leaf=jl.LeafOptics([0.1, 0.4], [0.1, 0.4]), transmission="straight"
+        ),
+        atmosphere=jl.Atmosphere(visibility=5.0, lidar_ratio=50.0),
+    ),
+    "mirror": lambda: jl.Scene(
+        plates=[jl.Plate(3.0, 0.4, coverage=0.5)],
+        ground=jl.Ground(reflectance=0.3, law=jl.Specular(roughness=0.02)),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", slow_unless(["mirror"], SCENES))
+def test_returns_are_order_one_before_the_pulse(name):
+    lidar = jl.Lidar(wavelength=(532.0, 1064.0), **NARROW_BEAM)
+    scene = SCENES[name]()
+    wave = jl.simulate(lidar, scene, key=KEY, max_orders=1, footprint="fixed", truth=True)
+    truth = wave.truth
+    assert np.array_equal(truth.time, wave.time)
+    assert np.array_equal(truth.height, wave.height)
+    assert set(truth.returns) == set(wave.components) - {"first", "higher"}
+    for material, returned in truth.returns.items():
+        recorded, returned = np.asarray(wave.components[material]), np.asarray(returned)
+        if material == "air":
+            continue
+        assert np.allclose(returned.sum(axis=1), recorded.sum(axis=1), rtol=1e-3), material
+        # The pulse is symmetric, and moves nothing.
+        centres = [(a * np.asarray(wave.height)).sum(axis=1) / a.sum(axis=1) for a in (returned, recorded)]
+        assert np.allclose(*centres, atol=0.08), material
+    assert np.allclose(wave.first_order_share, 1.0)
+    if scene.canopy is not None:
+        # Gaps are those of the geometry, however much leaves let through.
+        bark = 0.05 if scene.canopy.voxels.bark is not None else 0.0
+        assert float(truth.gap_probability[-1]) == pytest.approx(np.exp(-10 * (0.15 + bark)), rel=1e-3)
+
+
+@pytest.mark.slow
+def test_shares_of_order_one():
+    wave = jl.simulate(jl.Lidar(), SCENES["leaf and bark, hot spot"](), key=KEY, max_orders=3, rtol=0.2)
+    whole = wave.reflectance.sum(axis=1)
+    assert np.allclose(wave.first_order_share, 1.0 - wave.components["higher"].sum(axis=1) / whole, atol=1e-6)
+    assert 0.5 < float(wave.first_order_share[0]) < 0.99
+    nothing = jax.tree.map(jnp.zeros_like, wave)
+    assert np.array_equal(nothing.first_order_share, [1.0])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("k", [0.0, 0.2, 40.0])
+def test_derivatives_are_those_of_the_closed_form(k, precision):
+    lidar = jl.Lidar(**NARROW_BEAM)
+
+    def scene(k):
+        voxels = jl.VoxelMap(jnp.full((40, 40, 10), k), None, 1.0, (-20.0, -20.0, 2.0))
+        ground = jl.Ground(reflectance=0.3)
+        return jl.Scene(canopy=jl.Canopy(voxels, leaf=LEAF), ground=ground)
+
+    plan = jl.plan(lidar, scene(0.2), max_orders=1, n_rays=1)
+
+    def truth(k):
+        return jl.truth_of(lidar, scene(k), plan=plan)
+
+    value, tangent = jax.jvp(jax.jit(truth), (jnp.asarray(k),), (jnp.ones(()),))
+    for leaf in (*jax.tree.leaves(value), *jax.tree.leaves(tangent)):
+        assert np.all(np.isfinite(leaf)) or (k == 0.0 and leaf.ndim == 0)
+    # Of the gap's values the rounding of one remains.
+    assert float(tangent.gap_probability[-1]) == pytest.approx(-10.0 * np.exp(-10.0 * k), abs=1e-4)
+    assert float(tangent.plant_area_index[-1]) == pytest.approx(20.0, rel=1e-5)
+    back = jax.grad(lambda k: truth(k).gap_probability.sum())(jnp.asarray(k))
+    assert float(back) == pytest.approx(float(tangent.gap_probability.sum()), rel=1e-3, abs=1e-5)
+
+
+@pytest.mark.slow
+def test_what_is_nowhere_is_nan_and_all_else_is_finite():
+    for scene in (jl.Scene(plates=[jl.Plate(1.0, 0.5)]), stand(np.ones((40, 40, 3)), ground=jl.Ground(-3.0))):
+        truth = jl.truth_of(jl.Lidar(**NARROW_BEAM), scene)
+        assert all(np.all(np.isfinite(a)) for a in jax.tree.leaves(truth))
+    empty = jl.truth_of(jl.Lidar(**NARROW_BEAM), jl.Scene(ground=jl.Ground()))
+    assert np.isnan(float(empty.top_height))
+    assert np.array_equal(np.asarray(empty.gap_probability), np.ones(empty.time.size))
+    # Solid voxels leave no gap.
+    solid = jl.VoxelMap.from_probability(leaf=np.ones((4, 4, 3)), voxel_size=10.0, origin=(-20, -20, 0))
+    none = jl.truth_of(jl.Lidar(**NARROW_BEAM), jl.Scene(canopy=jl.Canopy(solid, leaf=LEAF)))
+    assert float(none.gap_probability[-1]) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_window_that_opens_at_the_first_return_has_finer_truth():
+    lidar = jl.Lidar(receiver=jl.Receiver(window="first return"), **NARROW_BEAM)
+    wave = jl.simulate(lidar, jl.Scene(ground=jl.Ground()), key=KEY, truth=True)
+    assert wave.truth.time.size > wave.time.size
+    assert float(wave.truth.surface_height["ground"]) == pytest.approx(0.0, abs=1e-5)
+
+
+def test_bad_input_is_refused():
+    lidar, scene = jl.Lidar(), jl.Scene(ground=jl.Ground())
+    with pytest.raises(TypeError, match="truth"):
+        jl.simulate(lidar, scene, key=KEY, truth="yes")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(TypeError, match="plan"):
+        jl.truth_of(lidar, scene, plan=3)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match="the plan does not fit"):
+        jl.truth_of(lidar, jl.Scene(ground=jl.Ground(100.0)), plan=jl.plan(lidar, scene))
+    assert jl.simulate(lidar, scene, key=KEY).truth is None
