@@ -223,10 +223,73 @@ def leaves(record: dict) -> str:
         for who, rmse in record["rmse"].items()
     ]
     head = ["", "ms a leaf", *(f"rms error of {name}" for name in record["rmse"]["scipy"])]
+    covered = [
+        [
+            leaves,
+            domain,
+            *(
+                f"{number(error, 3)}, {number(100 * found['within two standard errors'][name])} %"
+                for name, error in found["rmse"].items()
+            ),
+        ]
+        for leaves, domains in record["domains"].items()
+        for domain, found in domains.items()
+    ]
     return page_of(
         f"{record['leaves']} measured leaves, all bands.",
         table(head, rows),
         f"{number(record['times_faster'])} times faster than scipy over prosail.",
+        "By the bands that traits come from: rms errors, share of leaves within two standard errors. Leaves "
+        "made by PROSPECT have noise and a smooth error of the model.",
+        table(["leaves", "domain", *record["rmse"]["scipy"]], covered),
+    )
+
+
+def campaign(record: dict) -> str:
+    ways, side = record["ways"], record["side"]
+    faster = ways["footprints, simulate"]["ms per shot"] / ways["footprints, shared"]["ms per shot"]
+    faster_scan = ways["scan, simulate"]["ms per shot"] / ways["scan, apart"]["ms per shot"]
+    largest = record["by side"][-1]
+    hectares, rough = largest["side"] ** 2 / 1e4, f"{number(100 * record['rough'])} %"
+    hours = 100 * largest["seconds"] / hectares * record["machine"]["cores"] / 3600
+    return page_of(
+        f"Trees of {side} m x {side} m at voxels of 1 m over rolling terrain. Footprints of 25 m from orbit, "
+        "all orders, to 1 %: with light that they share; traced one by one by one program; and by a call of "
+        "`simulate` for each. Shots of a scanner, 0.3 m wide, at first order, to 2 %: by one program, and by "
+        "a call for each.",
+        table(
+            ("way", "shots", "ms a shot", "error, median"),
+            [
+                (
+                    name,
+                    number(r["shots"], 4),
+                    number(r["ms per shot"]),
+                    f"{number(100 * r['error, median'])} %",
+                )
+                for name, r in ways.items()
+            ],
+        ),
+        f"Sharing light is {number(faster)} times faster than calls, one program for a scan "
+        f"{number(faster_scan)} times. The process took at most {number(record['peak GB'])} GB.",
+        f"More footprints over the same trees, to {rough}, cost little more:",
+        table(
+            ("footprints", "s", "ms each"),
+            [
+                (number(r["shots"], 5), number(r["seconds"]), number(r["ms per shot"]))
+                for r in record["by shots"]
+            ],
+        ),
+        f"As many footprints per hectare over more trees, to {rough}:",
+        table(
+            ("ha", "footprints", "s"),
+            [
+                (number(r["side"] ** 2 / 1e4), number(r["shots"], 5), number(r["seconds"]))
+                for r in record["by side"]
+            ],
+        ),
+        f"On paper: tiles do not depend on one another, so a square kilometre to {rough} takes "
+        f"{number(hours)} core hours, and a country of 100,000 km2 {number(hours * 1e5 / 24 / 1e4)} days of "
+        "10,000 cores. Waveforms are written as they come; a map must fit into memory, 4 bytes a voxel.",
     )
 
 
@@ -234,6 +297,7 @@ SECTIONS: dict[str, tuple[str, Callable[[dict], str]]] = {
     "accuracy_cost": ("What accuracy costs", accuracy),
     "simulation_cost": ("What `simulate` costs", simulation),
     "everyday_changes": ("What a change of a scene costs", changes),
+    "campaign": ("What thousands of footprints cost", campaign),
     "peers": ("Other codes", peers),
     "effects_cost": ("What plans save", effects),
     "scaling": ("How cost grows", scaling),

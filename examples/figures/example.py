@@ -1,4 +1,4 @@
-"""Draw the example of README.md: run it as `python examples/figures/example.py`."""
+"""Draw the first example of README.md: run it as `python examples/figures/example.py`."""
 
 import contextlib
 import re
@@ -17,7 +17,7 @@ HERE = Path(__file__).resolve().parent
 def main() -> None:
     """Run the example as it is printed and save its picture."""
     page = (HERE.parents[1] / "README.md").read_text()
-    (code,) = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    code = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)[0]
     names: dict = {}
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
         exec(code, names)

@@ -1,0 +1,182 @@
+"""What the fits of recorded waveforms share: a layered canopy, tables of results, a page of pictures."""
+
+import contextlib
+import csv
+
+import equinox as eqx
+import jax.numpy as jnp
+import matplotlib
+import numpy as np
+from tqdm import tqdm
+
+import jaxlidar as jl
+from jaxlidar.io import atomic_write
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+LAYERS = 10
+# Spherically oriented leaves return two thirds of their reflectance: rho_v = 0.30, over rho_g as 0.6 / 0.4.
+LEAF, GROUND = jl.LeafOptics(reflectance=0.45, transmittance=0.40), 0.20
+QUALITIES = ("good", "doubtful", "bad")
+
+
+class Layers:
+    """A horizontally uniform canopy: ten layers of equal thickness from a clearance above the ground up.
+
+    Its methods put unknowns into a scene, as `inversion.Unknown(apply=...)` needs them.
+    """
+
+    def __init__(self, clearance):
+        self.clearance = clearance
+
+    def put_ground(self, scene, height):
+        """Move the ground, and the canopy above it."""
+        moved = jnp.asarray(scene.canopy.voxels.origin).at[2].set(height + self.clearance)
+        return eqx.tree_at(lambda s: (s.ground.height, s.canopy.voxels.origin), scene, (height, moved))
+
+    def put_height(self, scene, height):
+        """Stretch the canopy: `height` is its top above the ground."""
+        step = (height - self.clearance) / LAYERS
+        size = jnp.asarray(scene.canopy.voxels.voxel_size).at[2].set(step)
+        return eqx.tree_at(lambda s: s.canopy.voxels.voxel_size, scene, size)
+
+    def put_density(self, scene, log_density):
+        """Logarithm of the layers' plant area density in m2/m3, from below."""
+        extinction = 0.5 * jnp.exp(log_density).reshape(1, 1, LAYERS)
+        return eqx.tree_at(lambda s: s.canopy.voxels.leaf, scene, extinction)
+
+    def scene(self, height, ground=0.0, slope=5.0):
+        """Bare of any shot: heights in m above the reference, slope in degrees."""
+        voxels = jl.VoxelMap.from_lad(
+            np.full((1, 1, LAYERS), 0.05),
+            voxel_size=(50.0, 50.0, (height - self.clearance) / LAYERS),
+            origin=(-25.0, -25.0, ground + self.clearance),
+        )
+        return jl.Scene(
+            canopy=jl.Canopy(voxels, leaf=LEAF, sides="periodic", hotspot=True),
+            ground=jl.Ground(height=ground, reflectance=GROUND, slope=slope),
+        )
+
+    def columns(self, fits, i, verdict):
+        """What every table has of fit `i` of many: plant area, shares of the priors, and the verdict."""
+        height, log_density = float(fits.values["canopy height"][i]), fits.values["log density"][i]
+        density = np.exp(log_density)
+        return {
+            "pai_layers": float(np.mean(density)) * (height - self.clearance),
+            "clearance": self.clearance,
+            "density": density,
+            "density_stderr": density * fits.robust_stderr["log density"][i],
+            **{f"prior_share_{n.replace(' ', '_')}": np.mean(s[i]) for n, s in fits.prior_share.items()},
+            "reduced_chi2": float(fits.reduced_chi2[i]),
+            "steps": int(fits.steps[i]),
+            "status": fits.status[i],
+            "quality": verdict.quality,
+            "reasons": "; ".join(verdict.reasons),
+        }
+
+
+@contextlib.contextmanager
+def progress_bar():
+    """A function that shows how many fits have ended; silent where the standard error is no terminal."""
+    with tqdm(unit=" fits", disable=None, leave=False) as bar:
+
+        def show(progress):
+            bar.total, bar.n = progress.total, progress.done
+            bar.set_postfix_str(f"{progress.converged} converged")
+
+        yield show
+
+
+def bad_row(reason, **known):
+    """The row of a shot that was not fitted."""
+    return {**known, "quality": "bad", "reasons": str(reason)}
+
+
+def columns_of(rows):
+    """The rows' values by name, as arrays with the shots first; NaN or "" where a row has none."""
+    found = {}
+    for name in dict.fromkeys(name for row in rows for name in row):
+        sample = next(np.asarray(row[name]) for row in rows if name in row)
+        text = sample.dtype.kind == "U"
+        empty = "" if text else np.full(sample.shape, np.nan)
+        values = [row.get(name, empty) for row in rows]
+        found[name] = np.array(values, dtype=object if text else None)
+    return found
+
+
+def write_tables(rows, stem, units):
+    """One row a shot: as CSV, and as netCDF with the `units` of the columns.
+
+    **Returns:** the two paths.
+    """
+    import xarray
+
+    columns = columns_of(rows)
+    flat = {}
+    for name, values in columns.items():
+        parts = values.reshape(len(rows), -1).T
+        flat |= {name if values.ndim == 1 else f"{name}_{i}": part for i, part in enumerate(parts)}
+    table, dataset = (stem.with_name(f"{stem.name}.{kind}") for kind in ("csv", "nc"))
+    with atomic_write(table) as draft, draft.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(flat)
+        writer.writerows(zip(*flat.values()))
+    sets = {
+        name: (
+            ("shot", *(f"{name}_number" for _ in v.shape[1:])),
+            v,
+            {"units": units[name]} if name in units else {},
+        )
+        for name, v in columns.items()
+    }
+    with atomic_write(dataset) as draft:
+        xarray.Dataset(sets).to_netcdf(draft, engine="h5netcdf")
+    return table, dataset
+
+
+def draw_shot(axes, picture):
+    """Record and fit against elevation, with what was found."""
+    axes.plot(picture["signal"], picture["elevation"], ".", color="0.6", markersize=3, label="recorded")
+    axes.plot(picture["fitted"], picture["elevation"], color="black", linewidth=1.2, label="fit")
+    styles = {"ground": ("#d55e00", "-"), "canopy top": ("#009e73", "--"), "reference": ("#0072b2", ":")}
+    for name, (color, style) in styles.items():
+        if name in picture:
+            axes.axhline(picture[name], color=color, linestyle=style, linewidth=1.0, label=name)
+    low, high = picture["ground"] - 6.0, max(picture["ground"] + 12.0, picture["canopy top"] + 4.0)
+    axes.set_ylim(low, high)
+    axes.set_xlabel("signal (counts)", fontsize=8)
+    axes.set_title(picture["title"], fontsize=9)
+
+
+def draw_page(pictures, pairs, path):
+    """The best, middle and worst fits, by reduced chi-squared, and scatter plots.
+
+    `pictures` are in any order, with "chi2"; `pairs` maps a quantity to two arrays, the reference's first.
+    """
+    ordered = sorted(pictures, key=lambda p: p["chi2"])
+    middle = max(len(ordered) // 2 - 1, 0)
+    groups = {"best": ordered[:3], "median": ordered[middle : middle + 3], "worst": ordered[-3:]}
+    if len(ordered) <= 3:
+        groups = {"all": ordered}
+    rows = len(groups) + bool(pairs)
+    figure, grid = plt.subplots(rows, 3, figsize=(9, 3.2 * rows), layout="constrained", squeeze=False)
+    for row, (name, group) in zip(grid, groups.items()):
+        for axes, picture in zip(row, group):
+            draw_shot(axes, picture)
+        for axes in row[len(group) :]:
+            axes.set_axis_off()
+        row[0].set_ylabel(f"{name} fits\nelevation (m)")
+    handles = grid[0, 0].get_legend_handles_labels()
+    for axes, (name, (reference, found)) in zip(grid[-1] if pairs else (), pairs.items()):
+        both = np.concatenate([reference, found])
+        ends = np.nanmin(both), np.nanmax(both)
+        axes.plot(ends, ends, color="0.7", linewidth=0.8)
+        axes.plot(reference, found, "o", color="#009e73", markersize=3)
+        axes.set(xlabel=f"{name}, reference", ylabel=f"{name}, fit")
+    for axes in grid[-1][len(pairs) :] if pairs else ():
+        axes.set_axis_off()
+    figure.legend(*handles, loc="outside upper center", ncols=5, frameon=False)
+    with atomic_write(path) as draft:
+        figure.savefig(draft, format="png", dpi=110)
+    plt.close(figure)

@@ -1,0 +1,87 @@
+"""Make the pictures of examples/README.md: run it as `python examples/figures/gallery.py`.
+
+Those of notebooks are taken from their stored results, so that both show the same.
+"""
+
+import base64
+import json
+import runpy
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+import jax
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.figure import Figure
+
+import jaxlidar as jl
+import jaxlidar.plot
+from jaxlidar.io import atomic_write, read_case
+
+EXAMPLES = Path(__file__).resolve().parents[1]
+GALLERY = EXAMPLES / "figures" / "gallery"
+# Which of a notebook's pictures stands for it, from 0.
+CHOSEN = {
+    "first_waveform": 1,
+    "leaf_traits": 3,
+    "ground_under_trees": 2,
+    "peak_detectors": 0,
+    "hectare": 1,
+    "recorded_shots": 0,
+}
+
+
+def picture(notebook: str) -> bytes:
+    """The picture (PNG) that stands for a notebook."""
+    cells = json.loads((EXAMPLES / "notebooks" / f"{notebook}.ipynb").read_text())["cells"]
+    data = [output.get("data", {}) for cell in cells for output in cell.get("outputs", [])]
+    stored = [each["image/png"] for each in data if "image/png" in each]
+    return base64.b64decode("".join(stored[CHOSEN[notebook]]))
+
+
+def scenes() -> Figure:
+    """The tree of the paper's cases, as its file says."""
+    case = read_case(EXAMPLES / "scenes" / "tree.toml")
+    figure, ax = plt.subplots(figsize=(4.5, 4.0), layout="constrained")
+    jaxlidar.plot.scene(case.scene, case.lidar, ax)
+    return figure
+
+
+def paper() -> Figure:
+    """The paper's Figure 1."""
+    figure = plt.figure(figsize=(6.0, 3.5), layout="constrained")
+    axes = [figure.add_subplot(1, 2, i, projection="3d") for i in (1, 2)]
+    jaxlidar.plot.leaf_on_and_off(jl.grow(jl.broadleaf(), seed=0), axes, max_buds=2000)
+    return figure
+
+
+def minnaert() -> Figure:
+    """What slopes return by two laws of reflection."""
+    minnaerts = runpy.run_path(str(EXAMPLES / "minnaert.py"))["Minnaert"]
+    figure, ax = plt.subplots(figsize=(4.5, 3.0), layout="constrained")
+    slopes = np.arange(0.0, 75.0, 5.0)
+    laws = {"Lambertian": jl.Lambertian(), "Minnaert, k = 1.5": minnaerts(k=1.5)}
+    for (name, law), colour in zip(laws.items(), ("#0072B2", "#D55E00")):
+        scenes = [jl.Scene(ground=jl.Ground(reflectance=0.3, slope=slope, law=law)) for slope in slopes]
+        waves = [jl.simulate(jl.Lidar(), scene, key=jax.random.key(0)) for scene in scenes]
+        ax.plot(slopes, [float(wave.reflectance.sum()) for wave in waves], color=colour, label=name)
+    ax.set(xlabel="slope of the ground (degrees)", ylabel="apparent reflectance", ylim=(0, None))
+    ax.legend(frameon=False)
+    return figure
+
+
+def main() -> None:
+    """Write all pictures."""
+    GALLERY.mkdir(exist_ok=True)
+    for notebook in CHOSEN:
+        with atomic_write(GALLERY / f"{notebook}.png") as draft:
+            draft.write_bytes(picture(notebook))
+    for draw in (scenes, paper, minnaert):
+        with atomic_write(GALLERY / f"{draw.__name__}.png") as draft:
+            draw().savefig(draft, dpi=80, format="png")
+
+
+if __name__ == "__main__":
+    main()
