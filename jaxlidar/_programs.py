@@ -6,6 +6,7 @@ import functools
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import Any
 
 import equinox as eqx
@@ -32,9 +33,22 @@ class Program:
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         dynamic, static = eqx.partition((args, kwargs), eqx.is_array)
-        leaves, structure = jax.tree.flatten(dynamic)
-        if any(map(is_traced, leaves)):
+        if any(map(is_traced, jax.tree.leaves(dynamic))):
             return self.function(*args, **kwargs)
+        return self._version(dynamic, static)(dynamic)
+
+    def begin(self, *args: Any, **kwargs: Any) -> Any:
+        """Begin to compile for arguments of this kind, in a thread of its own.
+
+        Arrays may be given, or shapes that another `begin` has returned.
+
+        **Returns:** the shapes of the result, in place of its arrays.
+        """
+        dynamic, static = eqx.partition((args, kwargs), _is_shape)
+        return self._version(dynamic, static).begin(dynamic)
+
+    def _version(self, dynamic: Any, static: Any) -> "_Version":
+        leaves, structure = jax.tree.flatten(dynamic)
         fixed, shape = jax.tree.flatten(static)
         config: Any = jax.config
         kinds = tuple((a.shape, a.dtype, getattr(a, "weak_type", False)) for a in leaves)
@@ -47,7 +61,11 @@ class Program:
             self.versions.move_to_end(key)
             while len(self.versions) > self.most:
                 self.versions.popitem(last=False)
-        return version(dynamic)
+        return version
+
+
+def _is_shape(x: Any) -> bool:
+    return eqx.is_array(x) or isinstance(x, jax.ShapeDtypeStruct)
 
 
 class _Version:
@@ -64,13 +82,32 @@ class _Version:
 
         compiled.__name__ = getattr(function, "__name__", "program")
         self.compiled, self.ready = jax.jit(compiled, **options), False
+        self.shapes: Any = None
+        self.ahead: Future | None = None
 
     def __call__(self, dynamic: Any) -> Any:
         if not self.ready:
             # Threads that ask at once wait for one compilation.
             with self._lock:
+                if self.ahead is not None:
+                    wait([self.ahead])
                 found = self.compiled(dynamic)
                 self.ready = True
         else:
             found = self.compiled(dynamic)
         return eqx.combine(found, self.rest)
+
+    def begin(self, dynamic: Any) -> Any:
+        with self._lock:
+            if self.shapes is None:
+                # Tracing takes the caller's precision, which JAX keeps by thread; compiling needs it no more.
+                traced = self.compiled.trace(dynamic)
+                self.shapes = traced.out_info
+                if not self.ready:
+                    self.ahead = _ahead().submit(traced.lower().compile)
+        return eqx.combine(self.shapes, self.rest)
+
+
+@functools.cache
+def _ahead() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(2, thread_name_prefix="compile")

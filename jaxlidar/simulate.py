@@ -24,7 +24,14 @@ from jaxlidar.planning.plan_check import check_plan
 from jaxlidar.planning.setup import Setup, reduce
 from jaxlidar.scenes.scene import Scene, check_kinds
 from jaxlidar.trace.colouring import Balance, Recording, balance, recording_of, recording_with_room, total
-from jaxlidar.trace.response import Response, trace_setting
+from jaxlidar.trace.response import (
+    Response,
+    follows,
+    joined,
+    trace_first,
+    trace_higher,
+    trace_setting,
+)
 from jaxlidar.trace.setting import Setting, setting_of, straight_transmittance
 from jaxlidar.truth import truth_of_setup
 from jaxlidar.waveform import Waveform, open_at_first_return, recorded, trimmed
@@ -289,8 +296,12 @@ def _results(response: Response, recording: Recording) -> tuple[Float[Array, "wa
 
 _compiled_trace = Program(trace_setting)
 _compiled_batch = Program(trace_setting, **ONE_CORE)
+_compiled_first = Program(trace_first, **ONE_CORE)
+_compiled_higher = Program(trace_higher, **ONE_CORE)
 _compiled_results = Program(_results, **ONE_CORE)
 _compiled_waveform = Program(recorded)
+_shared_out = Program(lambda whole, count: jax.tree.map(lambda a: a / count, whole))
+_add = Program(lambda a, b: jax.tree.map(jnp.add, a, b))
 
 
 def _trace_within(ready: _Ready, key: PRNGKeyArray) -> _Traced:
@@ -310,6 +321,19 @@ def _trace_within(ready: _Ready, key: PRNGKeyArray) -> _Traced:
     return _Traced(mean, stderr(totals), jax.tree.map(stderr, balances.ledger), {})
 
 
+def _begin_to_compile(ready: _Ready, key: PRNGKeyArray) -> None:
+    """All that batches need, side by side; what takes longest first."""
+    arguments = (ready.setting, ready.transmittance, key)
+    if follows(ready.setting):
+        higher = _compiled_higher.begin(*arguments)
+        response = joined(_compiled_first.begin(*arguments), higher)
+    else:
+        response = _compiled_batch.begin(*arguments)
+    for program in (_compiled_results, _compiled_waveform):
+        program.begin(response, ready.recording)
+    _add.begin(response, response)
+
+
 def _trace_batches(
     ready: _Ready, key: PRNGKeyArray, goal: _Goal, progress: Callable[[Progress], None] | None
 ) -> _Traced:
@@ -323,10 +347,18 @@ def _trace_batches(
     waves, shares, neglected = Moments(), Moments(), Moments()
     wanted, stopped, error = MIN_BATCHES, "tolerance met", math.inf
 
+    arguments = (ready.setting, ready.transmittance)
+
+    def batch(key: PRNGKeyArray) -> Response:
+        if not follows(ready.setting):
+            return _compiled_batch(*arguments, key)
+        return joined(_compiled_first(*arguments, key), _compiled_higher(*arguments, key))
+
     def one(n: int) -> tuple[Response, Array, Balance]:
-        response = _compiled_batch(ready.setting, ready.transmittance, jax.random.fold_in(key, n))
+        response = batch(jax.random.fold_in(key, n))
         return response, *_compiled_results(response, ready.recording)
 
+    _begin_to_compile(ready, key)
     with side_by_side() as run:
         try:
             while True:
@@ -373,13 +405,3 @@ def _trace_batches(
     mean = _shared_out(whole, jnp.asarray(float(waves.count)))
     ledger_stderr = {name: jnp.asarray(row) for name, row in zip(names, shares.stderr)}
     return _Traced(mean, jnp.asarray(waves.stderr), ledger_stderr, info, beyond)
-
-
-@jax.jit
-def _shared_out(whole: Any, count: Array) -> Any:
-    return jax.tree.map(lambda a: a / count, whole)
-
-
-@jax.jit
-def _add(a: Any, b: Any) -> Any:
-    return jax.tree.map(jnp.add, a, b)

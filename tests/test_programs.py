@@ -100,3 +100,32 @@ def test_resident_memory_levels_off_over_a_hundred_shapes():
     done = subprocess.run([sys.executable, "-c", SHAPES], capture_output=True, text=True, check=True)
     used = json.loads(done.stdout)
     assert used[-1] - used[49] < 0.25 * (used[24] - used[0]) + 60.0, used
+
+
+def test_a_program_that_has_begun_is_compiled_once():
+    """Its shapes are known at once, also those that follow from shapes; a call waits for it."""
+    counted, after = Counted(), Counted()
+    first, second = Program(counted), Program(lambda found: after(found["twice"]))
+    shapes = first.begin(jnp.arange(3.0))
+    assert shapes["twice"].shape == (3,)
+    assert (shapes["name"], shapes["size"]) == ("a name", 3)
+    assert second.begin(shapes)["twice"].dtype == jnp.float32
+    assert second.begin(shapes)["size"] == 3
+    np.testing.assert_array_equal(second(first(jnp.arange(3.0)))["twice"], [0.0, 4.0, 8.0])
+    assert (counted.times, after.times) == (1, 1)
+
+
+def test_precision_of_a_program_that_has_begun_is_the_callers():
+    program = Program(Counted())
+    with jax.enable_x64(True):
+        assert program.begin(np.float64(1.0) + jnp.zeros(2))["twice"].dtype == jnp.float64
+        assert program(jnp.ones(2))["twice"].dtype == jnp.float64
+    assert program(jnp.ones(2))["twice"].dtype == jnp.float32
+
+
+def test_what_fails_in_a_program_that_has_begun_fails_where_it_is_called():
+    def refuse(x):
+        raise ValueError("no such value")
+
+    with pytest.raises(ValueError, match="no such value"):
+        Program(refuse).begin(jnp.zeros(2))

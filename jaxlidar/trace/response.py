@@ -6,7 +6,8 @@
 This is known in biomedical optics as white Monte Carlo (Alerstam et al. 2008).
 """
 
-from typing import final
+from collections.abc import Callable
+from typing import TypeVar, final
 
 import equinox as eqx
 import jax
@@ -17,9 +18,11 @@ from jaxlidar._checks import briefly, check_key, check_kind
 from jaxlidar.planning.setup import Setup
 from jaxlidar.trace.first_order import FirstOrder, first_order
 from jaxlidar.trace.footprint import lattice, product_rule, scattered
-from jaxlidar.trace.higher_orders import higher_orders
+from jaxlidar.trace.higher_orders import HigherOrders, higher_orders
 from jaxlidar.trace.mirror import mirror_rays
 from jaxlidar.trace.setting import Setting, setting_of, straight_transmittance
+
+Traced = TypeVar("Traced")
 
 
 @final
@@ -98,31 +101,81 @@ def trace_setting(
     setting: Setting, transmittance: Float[Array, "wavelengths"] | None, key: PRNGKeyArray
 ) -> Response:
     """The response of one batch. `transmittance`: see `straight_transmittance`."""
+    if follows(setting):
+        return joined(trace_first(setting, transmittance, key), trace_higher(setting, transmittance, key))
+    return _for_each(lambda setting: only_first(setting, *_first(setting, key)), setting, transmittance)
+
+
+def follows(setting: Setting) -> bool:
+    """Whether light is followed beyond its first scattering."""
+    return setting.plan.order_steps >= 2 or setting.plan.drawn_first
+
+
+class First(eqx.Module):
+    """Order one of a response that has more: `first` and `first_outside` of `Response`."""
+
+    weights: Float[Array, "traces materials short bins"]
+    outside: Float[Array, "traces materials short"]
+
+
+# First and higher orders share nothing, so that they can be compiled side by side.
+def trace_first(
+    setting: Setting, transmittance: Float[Array, "wavelengths"] | None, key: PRNGKeyArray
+) -> First:
+    """Order one of a batch."""
+
+    def trace(setting: Setting) -> First:
+        first, weights = _first(setting, key)
+        return First(weights[None], first.outside[None])
+
+    return _for_each(trace, setting, transmittance)
+
+
+def trace_higher(
+    setting: Setting, transmittance: Float[Array, "wavelengths"] | None, key: PRNGKeyArray
+) -> HigherOrders:
+    """Orders two and above of a batch, and the fate of all light."""
+
+    def trace(setting: Setting) -> HigherOrders:
+        return jax.tree.map(lambda a: a[None], higher_orders(setting, _keys(setting, key)[1]))
+
+    return _for_each(trace, setting, transmittance)
+
+
+def joined(first: First, higher: HigherOrders) -> Response:
+    """The response of all orders."""
+    fate = (higher.arrived, higher.left, higher.escaped, higher.late, higher.remaining)
+    return Response(first.weights, higher.weights, first.outside, higher.outside, *fate)
+
+
+def _for_each(
+    trace: Callable[[Setting], Traced], setting: Setting, transmittance: Float[Array, "wavelengths"] | None
+) -> Traced:
+    """One trace for all wavelengths, or one for each transmittance, along the first axis."""
     if transmittance is None:
-        return _trace(setting, key)
-    each = jax.lax.map(lambda t: _trace(setting.thinned(t), key), transmittance)
+        return trace(setting)
+    each = jax.lax.map(lambda t: trace(setting.thinned(t)), transmittance)
     return jax.tree.map(lambda a: a[:, 0], each)
 
 
-def _trace(setting: Setting, key: PRNGKeyArray) -> Response:
-    """The response of one trace."""
-    beam, surfaces, plan, sizes = setting.beam, setting.surfaces, setting.plan, setting.sizes
-    # What is not random is compiled without random numbers.
-    shift_key, photon_key = jax.random.split(key) if sizes.random else (key, key)
+def _keys(setting: Setting, key: PRNGKeyArray) -> tuple[PRNGKeyArray, PRNGKeyArray]:
+    """Keys of the footprint and of photons; what is not random is compiled without random numbers."""
+    if not setting.sizes.random:
+        return key, key
+    shift, photons = jax.random.split(key)
+    return shift, photons
 
-    across, energy = footprint_of(setting, shift_key)
+
+def _first(setting: Setting, key: PRNGKeyArray) -> tuple[FirstOrder, Float[Array, "materials short bins"]]:
+    """Order one, and its weights together with what mirrors return; none where the order is drawn."""
+    across, energy = footprint_of(setting, _keys(setting, key)[0])
     first = first_order(setting, across, energy)
-    weights = jnp.zeros_like(first.weights) if plan.drawn_first else first.weights
-    for i, is_mirror in enumerate(plan.mirrors):
-        if is_mirror and sizes.specular:
-            weights = weights + first_order(setting, *mirror_rays(beam, surfaces[i]), mirror=i).weights
-
-    if plan.order_steps < 2 and not plan.drawn_first:
-        return only_first(setting, first, weights)
-    higher = higher_orders(setting, photon_key)
-    fate = (higher.arrived, higher.left, higher.escaped, higher.late, higher.remaining)
-    outside = (first.outside[None], higher.outside[None])
-    return Response(weights[None], higher.weights[None], *outside, *(a[None] for a in fate))
+    weights = jnp.zeros_like(first.weights) if setting.plan.drawn_first else first.weights
+    for i, is_mirror in enumerate(setting.plan.mirrors):
+        if is_mirror and setting.sizes.specular:
+            rays = mirror_rays(setting.beam, setting.surfaces[i])
+            weights = weights + first_order(setting, *rays, mirror=i).weights
+    return first, weights
 
 
 def footprint_of(
