@@ -61,6 +61,7 @@ def second(wave):
     return wave.components["higher"].sum(axis=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("transmission", slow_unless(["straight"], ["diffuse", "straight"]))
 def test_what_one_plate_scatters_down_returns_from_the_next(transmission):
     """Two paths, there and back: scattered by the upper plate, reflected by the lower, through a gap."""
@@ -84,6 +85,7 @@ def test_what_is_expected_varies_less_than_what_is_drawn():
     assert np.median(drawn) > 10 * np.median(expected)
 
 
+@pytest.mark.slow
 def test_four_ends_vary_less_than_one():
     _, four = mean_of(SCENE, 3, 1)
     _, one = mean_of(SCENE, 3, 1, ends=1)

@@ -8,6 +8,7 @@ import sys
 import jax
 import numpy as np
 import pytest
+from helpers import slow_unless
 from test_campaign import Dying
 
 import inversion
@@ -48,7 +49,9 @@ def fit(footprints, lidar=LIDAR, scene=START, unknowns=UNKNOWNS, **more):
     return inversion.retrieve_many(observed, lidar, scene, unknowns, **given)
 
 
-@pytest.mark.parametrize("own", [{}, {"starts": 2}, {"max_orders": 2, "n_photons": 1024, "max_steps": 3}])
+@pytest.mark.parametrize(
+    "own", slow_unless([{}], [{}, {"starts": 2}, {"max_orders": 2, "n_photons": 1024, "max_steps": 3}])
+)
 def test_workers_give_the_same_fits(footprints, own):
     """One lidar for all, and for each, with an unknown that starts elsewhere in each footprint."""
     own |= {"lidar": [LIDAR] * COUNT, "start": {"height": np.linspace(-0.2, 0.7, COUNT)}, "lanes": 2}

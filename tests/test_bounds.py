@@ -126,10 +126,7 @@ DEFAULT = (
     "jitter",
     "extinction",
     "backscatter",
-    "hot spot",
-    "leaf",
     "plates",
-    "plate before a slope that faces the beam",
     "mirror",
 )
 
@@ -176,6 +173,7 @@ MANY = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", slow_unless(("leaves over ground",), MANY))
 def test_higher_orders_lie_within_the_bound(name):
     scene, lidar = MANY[name], jl.Lidar()

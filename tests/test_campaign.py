@@ -88,7 +88,7 @@ def top_hats(count):
     ("kind", "shared"),
     [
         (nadir, True),
-        (nadir, False),
+        pytest.param(nadir, False, marks=pytest.mark.slow),
         pytest.param(top_hats, True, marks=pytest.mark.slow),
         pytest.param(scan, False, marks=pytest.mark.slow),
     ],

@@ -11,6 +11,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from helpers import slow_unless
 from matplotlib.figure import Figure
 
 import inversion.demo
@@ -39,7 +40,7 @@ def test_help_names_every_command_and_shows_examples(capsys):
         assert re.search(rf"Examples?:\n    +jaxlidar {name}\b", out), name
 
 
-@pytest.mark.parametrize("suffix", [".nc", ".zarr"])
+@pytest.mark.parametrize("suffix", slow_unless([".nc"], [".nc", ".zarr"]))
 def test_simulate_writes_what_was_simulated_and_how(tmp_path, capsys, suffix):
     out, plot = tmp_path / f"a{suffix}", tmp_path / "a.png"
     case = SCENES / "flat_ground.toml"
@@ -72,7 +73,7 @@ slope = 5.0
 """
 
 
-@pytest.mark.parametrize("suffix", [".nc", ".zarr"])
+@pytest.mark.parametrize("suffix", slow_unless([".nc"], [".nc", ".zarr"]))
 def test_a_survey_is_simulated_shot_by_shot(tmp_path, capsys, suffix):
     case, out, plot = tmp_path / "a.toml", tmp_path / f"a{suffix}", tmp_path / "a.png"
     case.write_text(SURVEY)

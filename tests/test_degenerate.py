@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import NARROW
+from helpers import NARROW, slow_unless
 
 import jaxlidar as jl
 
@@ -127,7 +127,7 @@ GROUNDS = {
 }
 
 
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", slow_unless(["Lambertian"], LAWS))
 @pytest.mark.parametrize("name", GROUNDS)
 @NARROW
 def test_grounds(name, law, ground_plans, precision):
@@ -154,6 +154,7 @@ def test_a_scene_with_nothing_in_it(precision):
     check(lidar, jl.Scene(), jl.plan(lidar, jl.Scene()), ("forward", "reverse"))
 
 
+@pytest.mark.slow
 @NARROW
 def test_one_voxel_and_one_sample(precision):
     """Of optical depth 1e-8, 1 and 1e4, first order: 2/3 R (1 - exp(-2 tau)) / 2."""

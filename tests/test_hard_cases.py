@@ -134,6 +134,7 @@ def over_ground(leaf, n_layers=3):
     return jl.Scene(canopy=jl.Canopy(voxels, leaf=leaf, sides="periodic"), ground=jl.Ground(reflectance=0.4))
 
 
+@pytest.mark.slow
 def test_batches_of_one_photon():
     lidar, scene = whole_lidar(), over_ground(jl.LeafOptics(reflectance=0.5, transmittance=0.3))
     plan = jl.plan(lidar, scene, max_orders=3, n_rays=64, **WHOLE)
@@ -184,6 +185,7 @@ def fitted(observed, lidar, start, unknowns):
     return inversion.retrieve(observed, lidar, start, unknowns, noise=noise, key=jax.random.key(1), **more)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("reflectance", "height"), [(0.0, -1.0), (1.0, 1.0), (0.0, 1.0)], ids=["low", "high", "both"]
 )

@@ -182,6 +182,7 @@ START = {"slope": jnp.asarray(20.0), "k": jnp.asarray(1.6)}
 LIDAR = whole_lidar()
 
 
+@pytest.mark.slow
 def test_the_ledger_of_all_orders_adds_up():
     wave = jl.simulate(LIDAR, below_plate(START), key=jax.random.key(1), n_photons=65536, **WHOLE)
     assert float(sum(wave.ledger.values())[0]) == pytest.approx(1.0, abs=1e-4)
@@ -205,6 +206,7 @@ def derivatives(law, name, step):
     return exact.mean() - slopes.mean(), np.hypot(*(a.std(ddof=1) / np.sqrt(len(a)) for a in (exact, slopes)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "step"), slow_unless([("slope", 1.0)], [("k", 0.05), ("slope", 1.0)]))
 def test_derivatives_of_a_law_of_ones_own(name, step):
     off, stderr = derivatives(Minnaert, name, step)

@@ -62,7 +62,7 @@ def all_orders(coverage=1.0, denominator=None, passing=None):
     return coverage * R + passing**2 * RHO / denominator
 
 
-@pytest.mark.parametrize("transmission", ["straight", "diffuse"])
+@pytest.mark.parametrize("transmission", slow_unless(["diffuse"], ["straight", "diffuse"]))
 @pytest.mark.parametrize("coverage", slow_unless([0.6], [0.6, 1.0]))
 def test_all_orders(transmission, coverage):
     wave = jl.simulate(
@@ -81,6 +81,7 @@ def test_all_orders(transmission, coverage):
     assert not agrees(*found, all_orders(coverage, denominator=1 - RHO * T), bound=wave.neglected[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("lower", "upper"), slow_unless([(0.5, 0.4)], [(0.5, 0.4), (0.5, 0.0)]))
 def test_two_plates_shade_what_lies_below(lower, upper):
     """Each passes 1 - c + c T on either way, opaque ones (T = 0) as well."""

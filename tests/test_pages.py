@@ -24,7 +24,12 @@ def blocks(path, language):
     return re.findall(rf"^```{language}\n(.*?)^```", path.read_text(), re.MULTILINE | re.DOTALL)
 
 
-EXAMPLES = [(path, number) for path in PAGES for number in range(len(blocks(path, "python")))]
+# The second one of the front page simulates a hectare.
+EXAMPLES = [
+    pytest.param(path, number, marks=pytest.mark.slow if (path, number) == (ROOT / "README.md", 1) else ())
+    for path in PAGES
+    for number in range(len(blocks(path, "python")))
+]
 
 
 @pytest.mark.parametrize(

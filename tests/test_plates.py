@@ -173,6 +173,7 @@ def test_derivatives_in_the_surface():
             np.testing.assert_allclose(slope, (up - down) / (2 * h), rtol=1e-7, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_second_derivatives():
     with jax.enable_x64(True):
         face, h = leaf_surface(1.42), 1e-5

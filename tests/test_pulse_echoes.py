@@ -58,6 +58,7 @@ def test_two_targets_are_told_apart_and_errors_are_as_stated():
     assert np.all(np.abs(z.var(axis=0) - 1) < 4.5 * np.sqrt(2 / n))
 
 
+@pytest.mark.slow
 def test_a_wide_target_is_a_broadened_copy():
     """Of a Gaussian pulse: the variances add."""
     pulse = jl.GaussianPulse(fwhm=9.0)

@@ -121,6 +121,7 @@ def test_canopy_and_ground_at_three_wavelengths(target, monkeypatch):
     assert not np.array_equal(again.values["Cab"], fit.values["Cab"])
 
 
+@pytest.mark.slow
 def test_optics_alone_trace_once(target, monkeypatch):
     """Leaf traits and reflectances never move light: the photons of the first simulation serve them all."""
     calls = []
@@ -160,6 +161,7 @@ def test_the_tracer_does_not_look_at_optical_leaves():
     assert [s.place.geometric for s in settle(UNKNOWNS, canopy_scene())] == [False, True, False, True, False]
 
 
+@pytest.mark.slow
 def test_jacobian_is_that_of_the_simulation():
     """Against central differences, where the simulation is smooth: first order, double precision."""
     with jax.enable_x64(True):
@@ -259,6 +261,7 @@ def test_a_start_on_a_bound_is_moved_inside():
     assert_recovered(fit, {"height": 0.1, "reflectance": [0.2, 0.4]})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("apply", [lambda s, value: eqx.tree_at(lambda s: s.ground.aspect, s, value), None])
 def test_an_unknown_to_which_the_data_are_blind(apply):
     """The direction of no slope; and two values of which only the product shows."""

@@ -14,6 +14,7 @@ def ridges():
     return jl.Terrain(heights, 1.0, (-40.0, -40.0), reflectance=0.3)
 
 
+@pytest.mark.slow
 def test_shared_light_over_terrain_below_plates_and_air():
     """All that photons can meet, at two wavelengths, and where all light goes."""
     survey = nadir(4, wavelength=(532.0, 1064.0))

@@ -60,9 +60,9 @@ def expected(case, kappa, mu, path):
         ("bark", 0.0, False),
         ("isotropic bark", 0.0, True),
         ("leaf and bark", 30.0, False),
-        ("leaf and bark", 30.0, True),
-        ("straight", 0.0, False),
-        ("straight", 30.0, True),
+        pytest.param("leaf and bark", 30.0, True, marks=pytest.mark.slow),
+        pytest.param("straight", 0.0, False, marks=pytest.mark.slow),
+        pytest.param("straight", 30.0, True, marks=pytest.mark.slow),
     ],
 )
 def test_cumulative_profile(case, zenith, hotspot):

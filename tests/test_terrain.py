@@ -215,6 +215,7 @@ def test_a_raster_of_equal_numbers_is_one_number():
     np.testing.assert_allclose(one, other, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_black_terrain():
     wave = jl.simulate(jl.Lidar(), jl.Scene(ground=hills(reflectance=0.0 * HILLS)), key=KEY, max_orders=1)
     assert float(jnp.abs(wave.reflectance).max()) == 0.0
@@ -229,7 +230,10 @@ NODE[10, 8] = -1.0
 
 @pytest.mark.parametrize(
     ("zenith", "orders", "photons", "keys", "heights"),
-    [(25.0, 1, 4096, 6, HILLS), pytest.param(0.0, 4, 65536, 60, BOWL, marks=pytest.mark.slow)],
+    [
+        pytest.param(25.0, 1, 4096, 6, HILLS, marks=pytest.mark.slow),
+        pytest.param(0.0, 4, 65536, 60, BOWL, marks=pytest.mark.slow),
+    ],
 )
 def test_derivatives_with_respect_to_heights(zenith, orders, photons, keys, heights):
     """Amplitude of the relief, one node and the reflectance of a strip, against central differences.

@@ -71,6 +71,7 @@ def test_a_slab_is_seen_as_it_is(precision, zenith, angles):
     assert float(truth.top_height) == pytest.approx(expected, abs=SAMPLE)
 
 
+@pytest.mark.slow
 def test_plates_intercept_in_turn():
     plates = [jl.Plate(3.0, 0.4, coverage=0.5), jl.Plate(7.0, 0.2, 0.3, coverage=0.25), jl.Plate(-9.0, 0.4)]
     scene = jl.Scene(plates=plates, ground=jl.Ground(reflectance=0.3))

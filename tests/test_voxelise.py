@@ -190,6 +190,7 @@ def test_a_point_on_the_upper_face_counts():
     assert 2 * float(voxels.leaf.sum()) == pytest.approx(2.0)
 
 
+@pytest.mark.slow
 def test_a_voxelised_tree_is_simulated():
     tree = Tree.joined(
         [wood((0.0, 0.0, 0.0), (0.0, 0.0, 4.0), 0.2, 0.05), clumps((0.1, 0.0, 4.2), radius=0.3)]
