@@ -1,5 +1,6 @@
 """The command: what it prints, what it writes, and how it ends."""
 
+import contextlib
 import os
 import re
 import shlex
@@ -27,7 +28,7 @@ def as_installed(monkeypatch):
     """The commands of `inversion` as an installed package adds them; compiled programs are not kept."""
     points = [metadata.EntryPoint(n, f"inversion.commands:{n}", cli.COMMANDS) for n in ("demo", "retrieve")]
     monkeypatch.setattr(metadata, "entry_points", lambda group: points if group == cli.COMMANDS else [])
-    monkeypatch.setattr("jaxlidar.cli.group.keep_programs", lambda: None)
+    monkeypatch.setattr("jaxlidar.cli.group.kept_programs", contextlib.nullcontext)
 
 
 def test_help_names_every_command_and_shows_examples(capsys):
@@ -159,29 +160,26 @@ def test_retrieve_finds_the_ground(tmp_path, capsys):
 
 
 def test_compiled_programs_are_kept_unless_refused(tmp_path):
+    """In a folder of the user's cache, and JAX is configured as before when the command has ended."""
     code = (
-        "import sys, jax; from jaxlidar.cli import main; status = main(sys.argv[1:]);"
-        "print(jax.config.values['jax_compilation_cache_dir'], status)"
+        "import sys, jax; from jaxlidar.cli import main; before = dict(jax.config.values);"
+        "print(main(sys.argv[1:]), jax.config.values == before)"
     )
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(tmp_path)}
     environment.pop("JAX_COMPILATION_CACHE_DIR", None)
 
     def kept(*argv):
-        done = subprocess.run(
-            [sys.executable, "-c", code, *argv, "spectra", "char"],
-            env=environment,
-            capture_output=True,
-            text=True,
-        )
+        command = [sys.executable, "-c", code, *argv, "prospect", "--N", "1.5"]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True)
+        # What reads programs has nothing to say.
         assert done.stderr == ""
-        return done.stdout.splitlines()[-1].rpartition(" ")
+        assert done.stdout.splitlines()[-1] == "0 True"
+        return {path.name for path in tmp_path.rglob("*-cache")}
 
-    folder, _, status = kept()
-    assert status == "0"
-    assert folder.startswith(str(tmp_path)) or sys.platform != "linux"
-    # What reads them has nothing to say.
-    assert kept()[0] == folder
-    assert kept("--no-cache")[0] == "None"
+    assert not kept("--no-cache")
+    programs = kept()
+    assert programs or sys.platform != "linux"
+    assert kept() == programs
 
 
 def test_a_command_that_cannot_be_loaded_says_so(monkeypatch, capsys):

@@ -1,5 +1,6 @@
 """The command's `info` and `convert`: what they say of files, and what they make of them."""
 
+import contextlib
 import re
 
 import numpy as np
@@ -15,7 +16,7 @@ from jaxlidar import cli
 
 @pytest.fixture(autouse=True)
 def no_programs(monkeypatch):
-    monkeypatch.setattr("jaxlidar.cli.group.keep_programs", lambda: None)
+    monkeypatch.setattr("jaxlidar.cli.group.kept_programs", contextlib.nullcontext)
 
 
 @pytest.mark.parametrize(

@@ -1,12 +1,16 @@
 """Compiled programs, kept in the user's cache folder from one call of the command to the next."""
 
+import contextlib
 import hashlib
 import platform
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import jax
 import platformdirs
+from jax.experimental.compilation_cache import compilation_cache
 
 # Programs that compile faster are not worth a file.
 SECONDS = 0.3
@@ -28,19 +32,38 @@ def _processor() -> str:
     return hashlib.sha256(known.encode()).hexdigest()[:12]
 
 
-def keep_programs() -> None:
-    """Let JAX keep what it compiles. Where the folder cannot be made, a warning says that nothing is kept."""
+@contextlib.contextmanager
+def kept_programs() -> Iterator[None]:
+    """Within it, JAX keeps what it compiles; a warning says where the folder cannot be made.
+
+    Afterwards JAX is configured as before: what calls the command from Python may want something else.
+    """
     if jax.config.values.get("jax_compilation_cache_dir"):
         # The user's own choice.
+        yield
         return
     try:
         folder = cache_folder()
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         warnings.warn(f"compiled programs are not kept: {error}", stacklevel=2)
+        yield
         return
+    wanted: dict[str, Any] = {
+        "jax_compilation_cache_dir": str(folder),
+        "jax_persistent_cache_min_compile_time_secs": SECONDS,
+    }
     if jax.__version_info__ < (0, 11) and jax.config.values.get("jax_logging_level") in (None, "NOTSET"):
         # That XLA warns of each program that it reads, as it takes its own settings for features.
-        jax.config.update("jax_logging_level", "CRITICAL")
-    jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", SECONDS)
+        wanted["jax_logging_level"] = "CRITICAL"
+    before = {name: jax.config.values[name] for name in wanted}
+    for name, value in wanted.items():
+        jax.config.update(name, value)
+    # JAX looks at the folder once.
+    compilation_cache.reset_cache()
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            jax.config.update(name, value)
+        compilation_cache.reset_cache()

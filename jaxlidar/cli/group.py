@@ -6,7 +6,7 @@ from typing import Any
 import click
 
 from jaxlidar.cli import COMMANDS, version
-from jaxlidar.cli.cache import keep_programs
+from jaxlidar.cli.cache import kept_programs
 from jaxlidar.cli.files import convert, info
 from jaxlidar.cli.optics import prospect, spectra
 from jaxlidar.cli.simulation import plan, simulate
@@ -55,7 +55,8 @@ def _loaded(point: metadata.EntryPoint) -> click.Command:
 )
 @click.version_option(version(), message="jaxlidar %(version)s")
 @click.option("--cache/--no-cache", default=True, help="Keep compiled programs for the next call.")
-def jaxlidar(cache: bool) -> Any:
+@click.pass_context
+def jaxlidar(context: click.Context, cache: bool) -> Any:
     """A differentiable simulator of full-waveform lidar."""
     if cache:
-        keep_programs()
+        context.with_resource(kept_programs())
