@@ -159,7 +159,11 @@ class Model:
 
     def __init__(self, lidar: Lidar, scene: Scene, plan: Plan, settled: Sequence[Settled], key: PRNGKeyArray):
         check_place(lidar)
-        self.problem = Problem(lidar, scene, plan, tuple(s.place for s in settled))
+        places = [s.place for s in settled]
+        if not plan.trace.keeps_histories:
+            # Optics are applied while light is traced.
+            places = [place._replace(geometric=True) for place in places]
+        self.problem = Problem(lidar, scene, plan, tuple(places))
         self.shapes = [s.start.shape for s in settled]
         self.dtypes = [s.start.dtype for s in settled]
         self.sizes = [s.start.size for s in settled]

@@ -83,8 +83,8 @@ def analog_returns(
     **Returns:** an `AnalogReturns`.
 
     **Raises:** ValueError for values outside their ranges; for a canopy with the hot spot, because photons
-    that fly back on their own take ways independent of their ways in; and for several wavelengths where
-    leaves transmit straight on.
+    that fly back on their own take ways independent of their ways in; for several wavelengths where leaves
+    transmit straight on; and for a plan of so many orders that it keeps no histories.
 
     **Source:** section 1.4 of the paper.
 
@@ -190,6 +190,10 @@ def _setting(lidar: Lidar, scene: Scene, plan: Plan) -> Setting:
     canopy = setup.scene.canopy
     if canopy is not None and canopy.hotspot:
         raise ValueError("hotspot = True; admissible is False: the way back is independent of the way in")
+    if not plan.trace.keeps_histories:
+        raise ValueError(
+            f"plan has {plan.orders} orders, too many to keep histories; follow fewer (max_orders=)"
+        )
     transmittance = straight_transmittance(setup)
     if transmittance is None:
         return setting_of(setup)

@@ -146,7 +146,9 @@ def truth_of_setup(setup: Setup) -> Truth:
 def of_first_order(setup: Setup) -> Setup:
     """The setup for light that is scattered once, of a pulse without duration; nothing is random."""
     plan, lidar = setup.plan, setup.lidar
-    trace = dataclasses.replace(plan.trace, orders=1, order_steps=1, drawn_first=False, independent=False)
+    trace = dataclasses.replace(
+        plan.trace, orders=1, order_steps=1, drawn_first=False, independent=False, keeps_histories=True
+    )
     # Labels shall be no less accurate than waveforms of many batches.
     rays = plan.n_rays if plan.n_rays == 1 else max(plan.n_rays, _CHUNK)
     same = {"random_footprint": False, "degree": plan.first_degree}

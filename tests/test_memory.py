@@ -1,17 +1,24 @@
 """What does not fit into memory is refused with numbers; long records need no matrix."""
 
 import dataclasses
+import subprocess
+import sys
+from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
-from helpers import slab
+from helpers import slab, slow_unless
 
+import inversion
 import jaxlidar as jl
+from inversion.model import Model
+from inversion.unknowns import settle
 from jaxlidar.planning import memory, sampling
 from jaxlidar.planning.memory import check_memory, in_words, memory_limit
 from jaxlidar.planning.sampling import sampling_of
 
+ROOT = Path(__file__).resolve().parents[1]
 KEY = jax.random.key(2)
 GROUND = jl.Ground(reflectance=0.3)
 
@@ -23,8 +30,82 @@ def plates(count):
 def test_many_plates_are_refused_before_anything_is_allocated():
     canopy = jl.Canopy(slab(1.0), leaf=jl.LeafOptics(0.4, 0.4))
     scene = jl.Scene(canopy=canopy, plates=plates(4), ground=GROUND)
-    with pytest.raises(ValueError, match=r"would take about .* GB of memory; admissible is max_memory"):
-        jl.plan(jl.Lidar(), scene, max_orders=12, describe=False)
+    lidar = jl.Lidar(wavelength=np.linspace(500.0, 1600.0, memory.FEW + 1))
+    with pytest.raises(ValueError, match=r"would take about .* GB of memory; .* at most 8 wavelengths"):
+        jl.plan(lidar, scene, max_orders=12, describe=False)
+
+
+def applied(plan):
+    """The plan where optics are applied while light is traced."""
+    return dataclasses.replace(plan, trace=dataclasses.replace(plan.trace, keeps_histories=False), degree=0)
+
+
+TWO = jl.Lidar(wavelength=(532.0, 1064.0))
+LEAF = jl.LeafOptics(0.3, 0.2)
+SCENES = {
+    "leaf and bark over ground": {"ground": GROUND, "canopy": {"bark": 0.4}},
+    "straight": {"ground": GROUND, "canopy": {"transmission": "straight"}},
+    "plates over ground": {
+        "ground": GROUND,
+        "plates": (jl.Plate(6.0, 0.3, 0.2, coverage=0.6),),
+        "canopy": {},
+    },
+}
+
+
+@pytest.mark.parametrize("name", slow_unless(["leaf and bark over ground"], SCENES))
+def test_optics_applied_while_light_is_traced_give_the_same(name):
+    """The same photons, and so the same waveform, errors and ledger, to rounding."""
+    given = dict(SCENES[name])
+    bark = [0.1] if "bark" in given["canopy"] else []
+    leaf = jl.Prospect(Cab=40.0) if "straight" not in name else LEAF
+    canopy = jl.Canopy(slab(0.5, *bark), leaf=leaf, **given.pop("canopy"))
+    scene = jl.Scene(canopy=canopy, **given)
+    plan = jl.plan(TWO, scene, max_orders=4, describe=False)
+    assert plan.trace.keeps_histories
+    a, b = (jl.simulate(TWO, scene, key=KEY, plan=p, n_photons=2048) for p in (plan, applied(plan)))
+    for found in ("reflectance", "stderr", "neglected"):
+        np.testing.assert_allclose(getattr(b, found), getattr(a, found), rtol=2e-4, atol=1e-7)
+    assert a.ledger.keys() == b.ledger.keys()
+    for name, share in a.ledger.items():
+        np.testing.assert_allclose(b.ledger[name], share, rtol=2e-4, atol=1e-6)
+    for name, part in a.components.items():
+        np.testing.assert_allclose(b.components[name], part, rtol=2e-4, atol=1e-7)
+
+
+@pytest.mark.slow
+def test_derivatives_where_optics_are_applied_while_light_is_traced():
+    """In an optical and in a geometric value."""
+
+    def total(plan, x):
+        canopy = jl.Canopy(slab(0.5), leaf=jl.LeafOptics(x[0], 0.2))
+        scene = jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=0.3, height=x[1]))
+        setup = jl.reduce(TWO, scene, plan)
+        return jl.total_of(jl.trace_scene(setup, KEY), setup)
+
+    scene = jl.Scene(canopy=jl.Canopy(slab(0.5), leaf=LEAF), ground=GROUND)
+    plan = jl.plan(TWO, scene, max_orders=4, n_photons=2048, window=(-100.0, 60.0), describe=False)
+    x = jax.numpy.array([0.3, 0.1])
+    a, b = (jax.jit(jax.jacfwd(lambda x, p=p: total(p, x)))(x) for p in (plan, applied(plan)))
+    assert np.max(np.abs(a)) > 1e-3
+    np.testing.assert_allclose(b, a, rtol=2e-3, atol=1e-5 * np.max(np.abs(a)))
+
+
+def test_when_optics_are_applied_while_light_is_traced():
+    """Where histories take much more memory, and wavelengths are few; fits then trace for every optics."""
+    scene = jl.Scene(canopy=jl.Canopy(slab(1.0), leaf=jl.LeafOptics(0.5, 0.5)), ground=jl.Ground(0.0, 1.0))
+    long = {"max_orders": 300, "window": (-81.0, 3000.0), "describe": False}
+    plan = jl.plan(jl.Lidar(), scene, **long)
+    assert not plan.trace.keeps_histories
+    assert plan.memory < 1e9
+    assert "optics applied while light is traced" in str(plan)
+    assert jl.plan(jl.Lidar(), scene, describe=False, max_orders=10).trace.keeps_histories
+    unknown = inversion.Unknown("ground.reflectance", bounds=(0.1, 1.0))
+    settled = settle([unknown], scene)
+    for given, traces in ((plan, True), (jl.plan(jl.Lidar(), scene, describe=False, max_orders=3), False)):
+        assert Model(jl.Lidar(), scene, given, settled, KEY).traces == traces
+    with pytest.raises(ValueError, match="300 orders, too many to keep histories"):
+        jl.analog_returns(jl.Lidar(), scene, plan, key=KEY, n_photons=10)
 
 
 def test_the_limit_is_the_users():
@@ -83,3 +164,49 @@ def test_the_band_is_the_matrix(pulse, window, monkeypatch):
     # The same test rejects a band that is a bin off.
     wrong = dataclasses.replace(band, first=band.first + 1)
     assert not np.allclose(wrong(fine), expected, atol=1e-6 * float(np.max(expected)))
+
+
+MEASURED = """
+import sys, threading, time
+import jax, numpy as np
+import jaxlidar as jl
+
+def resident():
+    return int(open("/proc/self/statm").read().split()[1]) * 4096
+
+orders, end, bark = int(sys.argv[1]), float(sys.argv[2]), float(sys.argv[3])
+voxels = jl.VoxelMap.from_extinction(
+    leaf=np.full((2, 2, 4), 0.2), bark=np.full((2, 2, 4), bark), voxel_size=2.0, origin=(-2.0, -2.0, 0.0)
+)
+canopy = jl.Canopy(voxels, leaf=jl.LeafOptics(0.4, 0.3), bark=0.3)
+scene = jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=0.3))
+lidar = jl.Lidar(wavelength=np.linspace(500.0, 1600.0, 9))
+given = {"window": (-81.0, end), "max_memory": 15.0}
+jl.simulate(lidar, scene, key=jax.random.key(0), max_orders=2, n_photons=8192, **given)
+plan = jl.plan(lidar, scene, max_orders=orders, **given)
+base, peak, done = resident(), 0, False
+
+def watch():
+    global peak
+    while not done:
+        peak = max(peak, resident())
+        time.sleep(0.005)
+
+watcher = threading.Thread(target=watch)
+watcher.start()
+jl.simulate(lidar, scene, key=jax.random.key(0), plan=plan, n_photons=65536)
+done = True
+watcher.join()
+print(plan.memory, peak - base)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="resident memory is read as on Linux")
+@pytest.mark.parametrize(("orders", "end", "bark"), [(9, 500.0, 0.05), (13, 800.0, 0.05)])
+def test_memory_is_as_predicted(orders, end, bark):
+    """To 30 %."""
+    command = [sys.executable, "-c", MEASURED, str(orders), str(end), str(bark)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT)
+    predicted, measured = map(float, done.stdout.split())
+    assert measured == pytest.approx(predicted, rel=0.3)

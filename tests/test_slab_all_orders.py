@@ -9,7 +9,10 @@ more than 0.5 %.
 """
 
 import csv
+import subprocess
+import sys
 import warnings
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,6 +21,7 @@ from helpers import WHOLE, batch_mean, slow_unless, whole_lidar
 
 import jaxlidar as jl
 
+ROOT = Path(__file__).resolve().parents[1]
 THICKNESS = 10.0
 FAR = whole_lidar()
 
@@ -115,3 +119,31 @@ def test_bi_lambertian_leaves(reflectance, transmittance, tau, ground):
     assert value == pytest.approx(exact, rel=5e-3)
     # The same test rejects leaves whose two sides are exchanged.
     assert abs(value - ross_brf(transmittance, reflectance, tau, ground)) > 10 * bound
+
+
+WHITE = """
+import resource, sys
+import jax, numpy as np
+import jaxlidar as jl
+voxels = jl.VoxelMap.from_extinction(leaf=np.ones((1, 1, 1)), voxel_size=10.0, origin=(-5.0, -5.0, 0.0))
+canopy = jl.Canopy(voxels, leaf=jl.Isotropic(albedo=1.0), sides="periodic")
+scene = jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=0.2))
+lidar = jl.Lidar(altitude=4e5, divergence=1e-3)
+given = {"window": (-81.0, 3000.0), "max_orders": 300, "n_photons": 1 << 17}
+waves = [jl.simulate(lidar, scene, key=jax.random.key(n), **given) for n in range(4)]
+print(*(float(wave.reflectance.sum()) for wave in waves), float(waves[0].neglected[0]))
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
+"""
+
+
+@pytest.mark.slow
+def test_a_white_slab_over_a_long_record():
+    """Optical depth 10, all light, within half a per cent, and within 3 GB."""
+    done = subprocess.run([sys.executable, "-c", WHITE], capture_output=True, text=True, check=True, cwd=ROOT)
+    first, memory = done.stdout.splitlines()
+    *sums, neglected = map(float, first.split())
+    exact = discrete_ordinates([1.0] + [0.0] * 63, 1.0 - 1e-9, 10.0, 0.2)
+    mean, stderr = np.mean(sums), np.std(sums, ddof=1) / np.sqrt(len(sums))
+    assert abs(mean - exact) < 4 * stderr + neglected
+    assert mean == pytest.approx(exact, rel=5e-3)
+    assert float(memory) < 3e9

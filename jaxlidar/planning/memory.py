@@ -8,7 +8,12 @@ import jax.numpy as jnp
 from jaxlidar.planning.trace_plan import DENSE, Bins, TracePlan
 
 # Copies of a batch's response that are alive at once: sums of photons, of groups, and the result.
-_COPIES = 4
+_COPIES = 3
+# Bytes that compiling takes.
+_COMPILING = 150e6
+# Bytes of a response from which on optics may be applied while light is traced, and for how many wavelengths.
+LARGE = 1e9
+FEW = 8
 
 
 def machine_memory() -> float:
@@ -22,7 +27,7 @@ def machine_memory() -> float:
 def predicted(
     trace: TracePlan, bins: Bins, degree: int, first_degree: int, samples: int, pulse: int, traces: int
 ) -> float:
-    """Bytes of the responses of all batches that run at once, their sum, and the pulse.
+    """Bytes of the responses of all batches that run at once, their sum, the pulse, and of compiling.
 
     **Arguments:** `degree`, `first_degree`: of histories. - `samples`: of the record. - `pulse`: fine bins
     that the pulse spans. - `traces`: of a response; one for each wavelength where leaves transmit straight
@@ -34,7 +39,16 @@ def predicted(
     short = math.comb(first_degree + letters, letters)
     response = item * traces * materials * (full + short) * bins.padded
     matrix = item * min(bins.count * samples, max(DENSE, pulse))
-    return response * (_COPIES * (os.cpu_count() or 1) + 2) + 2 * matrix
+    return response * (_COPIES * (os.cpu_count() or 1) + 1) + 2 * matrix + _COMPILING
+
+
+def keeps_histories(kept: float, applied: float, limit: float, wavelengths: int) -> bool:
+    """Whether histories keep optics apart, so that one trace serves all wavelengths and all optics.
+
+    Optics are applied while light is traced where histories take far more memory, `kept` in place of
+    `applied` bytes, and wavelengths, whose deposits are then made one by one, are few.
+    """
+    return kept <= min(limit, LARGE) or applied >= kept or wavelengths > FEW
 
 
 def in_words(size: float) -> str:
@@ -59,5 +73,5 @@ def check_memory(size: float, limit: float) -> None:
         raise ValueError(
             f"the simulation would take about {in_words(size)} of memory; admissible is max_memory = "
             f"{limit / 1e9:.3g} GB: follow fewer orders (max_orders=), record a shorter window (window=), "
-            "use wider fine bins (bin_width=), or have fewer plates or materials"
+            f"use wider fine bins (bin_width=), have fewer plates or materials, or at most {FEW} wavelengths"
         )

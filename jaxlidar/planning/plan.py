@@ -15,7 +15,7 @@ from jaxlidar.planning.effect_table import effect_table
 from jaxlidar.planning.effects import Effect, empty, flattened, only_planes, present, switched_off, without
 from jaxlidar.planning.ladder import rung
 from jaxlidar.planning.local_origin import about_aim
-from jaxlidar.planning.memory import check_memory, in_words, memory_limit, predicted
+from jaxlidar.planning.memory import check_memory, in_words, keeps_histories, memory_limit, predicted
 from jaxlidar.planning.orders import degree_of, order_steps, orders_of, tail_of
 from jaxlidar.planning.parallel_light import parallel_light
 from jaxlidar.planning.path_lengths import PathLengths
@@ -137,6 +137,8 @@ class Plan:
             sizes += f", {self.n_rays} rays"
         if self.orders > 1:
             sizes += f", {self.n_photons} photons a batch, {self.orders} orders"
+        if not self.trace.keeps_histories:
+            sizes += ", optics applied while light is traced"
         return "\n".join([*lines, sizes, f"about {in_words(self.memory)} of memory"])
 
 
@@ -285,16 +287,18 @@ def plan(
     spanned = math.ceil((reach[1] - reach[0] + samples[1]) / bins.width) + 5
     limit = memory_limit(max_memory)
     straight = scene.canopy is not None and scene.canopy.is_straight
-    traces = lidar.wavelength.size if straight else 1
+    wavelengths = lidar.wavelength.size
 
-    def memory_of(orders: int) -> float:
-        return predicted(
-            trace, bins, degree_of(steps_of(orders), plates), first_degree, samples[2], spanned, traces
-        )
+    def memory_of(orders: int, keeps: bool) -> float:
+        most, traces = degree_of(steps_of(orders), plates), wavelengths if straight or not keeps else 1
+        return predicted(trace, bins, most if keeps else 0, first_degree, samples[2], spanned, traces)
 
-    memory = memory_of(orders)
+    keeps = keeps_histories(memory_of(orders, True), memory_of(orders, False), limit, wavelengths)
+    trace = dataclasses.replace(trace, keeps_histories=keeps)
+    degree = degree if keeps else 0
+    memory = memory_of(orders, keeps)
     check_memory(memory, limit)
-    most = max(n for n in range(orders, max(chosen.most, orders) + 1) if memory_of(n) <= limit)
+    most = max(n for n in range(orders, max(chosen.most, orders) + 1) if memory_of(n, keeps) <= limit)
     rows = ()
     if describe:
         rows = effect_table(*whole, off, chosen, airy, geometry.upstream, whole_first=window is None)

@@ -82,6 +82,7 @@ class TracePlan(eqx.Module):
     - `ends`: points of each flight from which light returns.
     - `drawn_first`: whether order one returns from drawn collisions, as the others do.
     - `independent`: whether photons draw independent numbers.
+    - `keeps_histories`: whether histories keep optics apart; else these are applied while light is traced.
     """
 
     materials: tuple[str, ...] = eqx.field(static=True)
@@ -106,3 +107,4 @@ class TracePlan(eqx.Module):
     ends: int = eqx.field(static=True)
     drawn_first: bool = eqx.field(static=True)
     independent: bool = eqx.field(static=True)
+    keeps_histories: bool = eqx.field(static=True, default=True)

@@ -88,7 +88,9 @@ def optics_of(setup: Setup) -> Float[Array, "letters wavelengths"]:
 
 def recording_of(setup: Setup) -> Recording:
     """The recording of a setup, for its sizes as they are."""
-    return _recording(setup, setup.plan.n_samples, degree_of(setup.plan.orders, len(setup.scene.plates)))
+    plan = setup.plan
+    degree = degree_of(plan.orders, len(setup.scene.plates)) if plan.trace.keeps_histories else 0
+    return _recording(setup, plan.n_samples, degree)
 
 
 def recording_with_room(setup: Setup) -> Recording:
@@ -120,7 +122,7 @@ def _recording(setup: Setup, samples: int, degree: int) -> Recording:
         admissible=setup.admissible,
         lidar=lidar,
         materials=plan.trace.materials,
-        first_degree=plan.first_degree,
+        first_degree=plan.first_degree if plan.trace.keeps_histories else 0,
         degree=degree,
         one_order=plan.orders == 1,
         again=can_light_itself(setup.scene),

@@ -52,7 +52,8 @@ GROUP = 32
 class HigherOrders(eqx.Module):
     """Response of orders two and above, and the fate of all light (see `jaxlidar.trace.response`).
 
-    The last axis but bins is that of histories; or, with `Nodes`, of nodes and wavelengths.
+    The last axis but bins is that of histories; or, where optics are applied, of wavelengths, with `Nodes` of
+    nodes and wavelengths.
     """
 
     weights: Float[Array, "materials labels bins"]
@@ -83,7 +84,9 @@ def higher_orders(setting: Setting, key: PRNGKeyArray, nodes: Nodes | None = Non
     chunks = -(-photons // size)
     groups = -(-chunks * size // (GROUP * CHUNK))
     each = -(-chunks // groups)
-    count, materials = setting.table.count if nodes is None else nodes.labels(setting), len(plan.materials)
+    materials = len(plan.materials)
+    colours = 0 if setting.optics is None else setting.optics.shape[1]
+    count = setting.table.count if not colours else colours * (1 if nodes is None else len(nodes.place))
     terrain = sees_terrain(setting)
 
     def begin(lane):
@@ -110,6 +113,7 @@ def higher_orders(setting: Setting, key: PRNGKeyArray, nodes: Nodes | None = Non
             jnp.full(lane.shape, -1, jnp.int32),
             unscattered(excess),
             inside,
+            tuple(jnp.ones_like(excess) for _ in range(colours)),
         )
 
     def group(total, number):

@@ -59,11 +59,6 @@ class Nodes(eqx.Module):
         """Number of photons."""
         return self.node.size
 
-    def labels(self, setting: Setting) -> int:
-        """Number of labels: one for every node and wavelength."""
-        assert setting.optics is not None
-        return len(self.place) * setting.optics.shape[1]
-
     def start(
         self, setting: Setting, lane: UInt32[Array, "photons"], key: PRNGKeyArray
     ) -> tuple[UInt32[Array, "photons"], Photons]:

@@ -6,6 +6,7 @@
 This is known in biomedical optics as white Monte Carlo (Alerstam et al. 2008).
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import TypeVar, final
 
@@ -31,8 +32,9 @@ class Response(eqx.Module):
     """The geometric weight of all paths, by last material, scattering history and fine time bin.
 
     Multiplied by the optics of each history (see `jaxlidar.waveform_of`) it gives the waveform. The first
-    axis has one trace for all wavelengths; or, where leaves transmit straight on, so that extinction depends
-    on the wavelength, one for each.
+    axis has one trace for all wavelengths; or one for each, where leaves transmit straight on, so that
+    extinction depends on the wavelength, and where optics are applied while light is traced, because
+    histories would be too many: then there is one history, and its optics are 1.
 
     - `first`: (traces, materials, first histories, bins) order one, apparent reflectance per unit optics.
     - `higher`: (traces, materials, histories, bins) orders two and above, or None where they were not traced.
@@ -126,7 +128,11 @@ def trace_first(
 
     def trace(setting: Setting) -> First:
         first, weights = _first(setting, key)
-        return First(weights[None], first.outside[None])
+        if setting.optics is None:
+            return First(weights[None], first.outside[None])
+        monomials = setting.short.monomials(setting.optics)
+        coloured = (jnp.einsum("hw,mh...->wm...", monomials, a) for a in (weights, first.outside))
+        return First(*(jnp.expand_dims(a, 2) for a in coloured))
 
     return _for_each(trace, setting, transmittance)
 
@@ -137,9 +143,18 @@ def trace_higher(
     """Orders two and above of a batch, and the fate of all light."""
 
     def trace(setting: Setting) -> HigherOrders:
-        return jax.tree.map(lambda a: a[None], higher_orders(setting, _keys(setting, key)[1]))
+        found = higher_orders(setting, _keys(setting, key)[1])
+        if setting.optics is None:
+            return jax.tree.map(lambda a: a[None], found)
+        # Wavelengths, in place of histories, become traces with one history each.
+        return jax.tree.map(lambda a: _as_traces(a, min(a.ndim - 1, 1)), found)
 
     return _for_each(trace, setting, transmittance)
+
+
+def _as_traces(a: Array, wavelengths: int) -> Array:
+    """With the axis of wavelengths in front, and one history in its place."""
+    return jnp.expand_dims(jnp.moveaxis(a, wavelengths, 0), wavelengths + 1)
 
 
 def joined(first: First, higher: HigherOrders) -> Response:
@@ -154,7 +169,13 @@ def _for_each(
     """One trace for all wavelengths, or one for each transmittance, along the first axis."""
     if transmittance is None:
         return trace(setting)
-    each = jax.lax.map(lambda t: trace(setting.thinned(t)), transmittance)
+
+    def one(given: tuple[Array, Array | None]) -> Traced:
+        t, optics = given
+        own = None if optics is None else optics[:, None]
+        return trace(dataclasses.replace(setting.thinned(t), optics=own))
+
+    each = jax.lax.map(one, (transmittance, None if setting.optics is None else setting.optics.T))
     return jax.tree.map(lambda a: a[:, 0], each)
 
 

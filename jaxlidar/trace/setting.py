@@ -14,6 +14,7 @@ from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.optics.laws import AbstractLaw, Lambertian
 from jaxlidar.optics.phase import AbstractPhase
 from jaxlidar.planning.plan import Plan
+from jaxlidar.planning.scatterers import letter_values
 from jaxlidar.planning.setup import Setup
 from jaxlidar.planning.trace_plan import Bins, TracePlan
 from jaxlidar.scenes.scene import Scene
@@ -70,8 +71,9 @@ class Setting(eqx.Module):
     - `column`: optical depth straight up from every voxel, for a beam at nadir.
     - `occupied`: the box that holds all voxels with any extinction.
     - `successor`: of every history, for every letter.
-    - `optics`: of every letter, by wavelength, where they are applied while light is traced, which is then
-      told apart by its place of entry (see `jaxlidar.trace.nodes`); None where histories keep them.
+    - `optics`: of every letter, by wavelength, where they are applied while light is traced, because it is
+      told apart by its place of entry (see `jaxlidar.trace.nodes`), or because histories would be too many;
+      None where histories keep them.
     """
 
     beam: Beam
@@ -134,9 +136,12 @@ def _density(law: AbstractLaw | AbstractPhase, sent: Scattering, w: Vec) -> Scal
 
 
 def setting_of(setup: Setup) -> Setting:
-    """The setting of a setup, without wavelengths."""
+    """The setting of a setup, without wavelengths, unless optics are applied while light is traced."""
     trace, bins = jax.tree.map(jnp.asarray, (setup.plan.trace, setup.plan.bins))
-    return _set_out(_without_spectrum(setup.lidar), setup.scene, trace, bins, sizes_of(setup.plan))
+    setting = _set_out(_without_spectrum(setup.lidar), setup.scene, trace, bins, sizes_of(setup.plan))
+    if trace.keeps_histories:
+        return setting
+    return dataclasses.replace(setting, optics=letter_values(setup.lidar, setup.scene, trace.letters))
 
 
 def straight_transmittance(setup: Setup) -> Float[Array, "wavelengths"] | None:
