@@ -3,8 +3,9 @@
 MCX has no Lambertian ground, and its detectors collect over all directions. So it computes what it is made
 for, the fluence in every voxel and gate, and the light that voxels scatter towards the receiver is carried
 there afterwards. This converges far faster than counting the photons that leave within a cone about the
-vertical. Gates of 1 ns are taken as evenly filled. What a photon leaves in a voxel is booked when it leaves
-the voxel, half a crossing late on average, which is taken off. There is no limit of orders.
+vertical. Gates (of 1 ns, where `mcx_gate` says nothing else) are taken as evenly filled. What a photon leaves
+in a voxel is booked when it leaves the voxel, half a crossing late on average, which is taken off. There is
+no limit of orders.
 
 OpenCL runtimes are found through `OCL_ICD_VENDORS`, or in the system; else PoCL from its wheel is taken,
 whose compiler (LLVM 14) does not know the newest processors.
@@ -20,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 LIGHT = 0.299792458  # m/ns
-GATES = 120  # of 1 ns; nothing comes later
+END = 120  # ns; nothing comes later
 
 
 def load():
@@ -53,6 +54,8 @@ def main() -> None:
         raise RuntimeError(f"{levels.size} levels of extinction; MCX takes 254 in volumes of bytes")
     number = extinction.shape[2]
     edge = size / number
+    width = float(given.get("mcx_gate", 1.0))
+    gates = round(END / width)
     slope = float(given["radius"]) / altitude
     settings = {
         "vol": np.asfortranarray(1 + label.reshape(extinction.shape), dtype=np.uint8),
@@ -60,8 +63,8 @@ def main() -> None:
         "unitinmm": 1e3 * edge,
         "tstart": 0.0,
         # A little less: rounding must not open a second window of gates.
-        "tend": (GATES - 0.01) * 1e-9,
-        "tstep": 1e-9,
+        "tend": (gates - 0.01) * width * 1e-9,
+        "tstep": width * 1e-9,
         "srctype": "disk",
         "srcpos": [extinction.shape[0] / 2, extinction.shape[1] / 2, 0.0],
         # The fourth number is the focal length; where it is negative, rays diverge.
@@ -84,17 +87,17 @@ def main() -> None:
     weight = 0.25 * albedo * extinction * np.exp(-above) * own * edge**3
     out_of = edge * (np.arange(number) + 0.5)
     # The apparent reflectance refers to the range that the time of arrival stands for.
-    gate = np.arange(GATES) + 0.5
+    gate = width * (np.arange(gates) + 0.5)
     half_way = altitude - size + 0.5 * (LIGHT * gate[None, :] + out_of[:, None])
     range_of = (half_way / (altitude - size + out_of[:, None])) ** 2
     edges = given["start"] + given["fine"] * np.arange(int(given["count"]) + 1)
 
     def wave(flux: np.ndarray) -> np.ndarray:
         # Per mm2 and s to per m2 and gate.
-        by_depth = np.einsum("xyz,xyzt->zt", weight, flux) * 1e6 * 1e-9 * range_of
+        by_depth = np.einsum("xyz,xyzt->zt", weight, flux) * 1e6 * 1e-9 * width * range_of
         total = np.zeros(edges.size - 1)
         for row, back in zip(by_depth, out_of):
-            opened = np.arange(GATES + 1) + (back - 0.5 * edge - 2 * size) / LIGHT
+            opened = width * np.arange(gates + 1) + (back - 0.5 * edge - 2 * size) / LIGHT
             total += np.diff(np.interp(edges, opened, np.concatenate([[0.0], np.cumsum(row)])))
         return total
 

@@ -148,6 +148,8 @@ def main() -> None:
         ("alone", 0.0, False),
         ("camera", float(given["reflectance"]), True),
     ):
+        if case not in given.get("cases", (case,)):
+            continue
         target = scene(mi, given, reflectance, camera, FIXED if corrected else PLUGIN)
         integrator = target.integrator()
         waves, times = [], []

@@ -5,8 +5,10 @@ examples/benchmarks/results`, has renewed its record.
 """
 
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+
+from _writing import number, page_of, table
 
 from jaxlidar.io import atomic_write
 
@@ -26,25 +28,6 @@ python examples/benchmarks/make_readme.py
 
 Times are seconds of wall time, warm: programs are compiled before. A tilde marks what is extrapolated.
 """
-
-
-def number(x: float | None, digits: int = 2) -> str:
-    """To so many significant digits."""
-    if x is None:
-        return ""
-    short = f"{x:.{digits}g}"
-    return f"{float(short):,g}" if 1e-3 <= abs(x) < 1e6 else short
-
-
-def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table of Markdown."""
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
-
-
-def page_of(*paragraphs: str) -> str:
-    """Paragraphs and tables with empty lines between."""
-    return "\n\n".join(paragraphs)
 
 
 def machine(record: dict) -> str:

@@ -66,7 +66,16 @@ def crown() -> np.ndarray:
     return np.rint(k * LEVELS) / LEVELS
 
 
-def ours(extinction: np.ndarray, case: str, pulse: float, repeats: int) -> dict:
+def task(extinction: np.ndarray, repeats: int) -> dict:
+    """What the workers are given."""
+    return {
+        **{"extinction": extinction, "albedo": ALBEDO, "reflectance": SOIL, "orders": ORDERS, "size": SIZE},
+        **{"altitude": float(LIDAR.altitude), "radius": float(LIDAR.footprint_radius), "fine": FINE},
+        **{"start": WINDOW[0] - 0.5, "count": round(SAMPLES / FINE), "repeats": repeats, **WORK},
+    }
+
+
+def ours(extinction: np.ndarray, case: str, pulse: float, repeats: int, orders: int = ORDERS) -> dict:
     """Repetitions of `simulate` to 1 %."""
     voxels = jl.VoxelMap.from_extinction(
         leaf=extinction, voxel_size=SIZE / N, origin=(-SIZE / 2, -SIZE / 2, 0.0)
@@ -78,7 +87,7 @@ def ours(extinction: np.ndarray, case: str, pulse: float, repeats: int) -> dict:
     for seed in range(repeats + 1):
         start, work = time.perf_counter(), time.process_time()
         key = jax.random.key(seed)
-        wave = jl.simulate(lidar, scene, key=key, rtol=0.01, max_orders=ORDERS, window=WINDOW)
+        wave = jl.simulate(lidar, scene, key=key, rtol=0.01, max_orders=orders, window=WINDOW)
         waves.append(np.asarray(wave.reflectance[0], dtype=float))
         times.append((time.perf_counter() - start, time.process_time() - work))
         infos.append(wave.info)
@@ -143,6 +152,12 @@ def counted(run: dict, photons: int) -> float:
     return float(np.mean(1 / share) / 0.01**2 * np.median(run["times"][:, 0]) / photons)
 
 
+def block_sums(waves: np.ndarray) -> np.ndarray:
+    """Sums of 5 ns of waveforms, the first from sample number `FIRST` on."""
+    last = FIRST + (SAMPLES - FIRST) // BLOCK * BLOCK
+    return waves[:, FIRST:last].reshape(len(waves), -1, BLOCK).sum(axis=-1)
+
+
 def agreement(a: np.ndarray, b: np.ndarray) -> dict[str, float]:
     """Differences in standard errors: of the totals, and root mean square and largest of the sums of 5 ns."""
 
@@ -150,8 +165,7 @@ def agreement(a: np.ndarray, b: np.ndarray) -> dict[str, float]:
         error = np.sqrt(x.var(axis=0, ddof=1) / len(x) + y.var(axis=0, ddof=1) / len(y))
         return (x.mean(axis=0) - y.mean(axis=0)) / np.maximum(error, 1e-30)
 
-    last = FIRST + (SAMPLES - FIRST) // BLOCK * BLOCK
-    sums = [w[:, FIRST:last].reshape(len(w), -1, BLOCK).sum(axis=-1) for w in (a, b)]
+    sums = [block_sums(w) for w in (a, b)]
     bright = sums[0].mean(axis=0) > 0.01 * sums[0].mean(axis=0).max()
     by_block = z(sums[0][:, bright], sums[1][:, bright])
     relative = sums[1][:, bright].mean(axis=0) / sums[0][:, bright].mean(axis=0) - 1
@@ -173,9 +187,6 @@ def main() -> None:
     if given.repeats < 3:
         raise SystemExit(f"--repeats = {given.repeats} is below 3: no standard deviation to speak of")
     extinction = crown()
-    shared = {"extinction": extinction, "albedo": ALBEDO, "reflectance": SOIL, "orders": ORDERS, "size": SIZE}
-    shared |= {"altitude": float(LIDAR.altitude), "radius": float(LIDAR.footprint_radius), "fine": FINE}
-    shared |= {"start": WINDOW[0] - 0.5, "count": round(SAMPLES / FINE), "repeats": given.repeats, **WORK}
 
     runs: dict[tuple[str, str], dict[str, dict]] = {}
     load = {"jaxlidar": os.getloadavg()[0]}
@@ -185,7 +196,7 @@ def main() -> None:
     notes: dict[str, str] = {}
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder, "given.npz")
-        np.savez(file, **shared)
+        np.savez(file, **task(extinction, given.repeats))
         for name, worker in (("mitransient", "_peer_mitransient.py"), ("MCX-CL", "_peer_mcx.py")):
             load[name] = os.getloadavg()[0]
             found = peer(worker, file)

@@ -1,0 +1,136 @@
+"""Recorded LVIS shots: a simulated canopy over ground fitted to each, and what it leaves of the record.
+
+    python examples/validation/recorded_lvis.py PLS [--out figures] [--shots 40]
+
+PLS is a PulseWaves file (.pls beside .wvs). Of the shots that do not saturate, so many, evenly spread, are
+fitted by ten layers of leaves over a slope, as in `examples/fit_gedi.py`, with each shot's own outgoing
+pulse, from the ground of the matched pulse (`find_ground`). The flight of light is checked too: the file's
+places of samples, 2 ns apart, against the speed of light. The two digitisers, which record odd and even
+samples, have their own pedestals."""
+
+import sys
+
+import jax
+import numpy as np
+from _validation import COLOURS, finish, options, row
+from fit_gedi import CANOPY, UNKNOWNS
+
+import inversion
+import jaxlidar as jl
+from jaxlidar.io import read_pulsewaves
+
+STEP, SATURATED, QUIET = 2.0, 215.0, 60
+FOOTPRINT, ALTITUDE = 20.0, 8000.0
+# m: half the way of light in 2 ns, in air.
+WAY = 0.5 * 0.299792458 * STEP / 1.0003
+# Samples above and below the ground; errors of the model, of the peak; what may be left of it.
+ABOVE, BELOW, MODEL, LEFT = 180, 40, 0.01, 0.03
+TIME = STEP * np.arange(-ABOVE, BELOW + 1)
+
+
+def signal_of(shot):
+    """Samples less the pedestal of their own digitiser, and the standard deviation of what is quiet."""
+    samples = shot.waveform.astype(float)
+    for odd in (0, 1):
+        samples[odd::2] -= samples[odd:QUIET:2].mean()
+    return samples, samples[:QUIET].std()
+
+
+def lidar_of(pulse):
+    """LVIS with a pulse."""
+    divergence = 1e3 * FOOTPRINT / ALTITUDE
+    return jl.Lidar(altitude=ALTITUDE, divergence=divergence, sampling_interval=STEP, pulse=pulse)
+
+
+def fitted(shots, signals, noise, middle):
+    """The fits, and signals about the samples `middle`, over their peaks."""
+    at = np.array(middle)[:, None] + np.arange(-ABOVE, BELOW + 1)
+    outside = (at < 0) | (at >= shots[0].waveform.size)
+    peak = np.max(signals, axis=1, keepdims=True)
+    power = np.take_along_axis(np.array(signals) / peak, np.where(outside, 0, at), axis=1)
+    sigma = np.where(outside, np.inf, np.hypot(np.array(noise)[:, None] / peak, MODEL))
+    lit = np.argmax((power > 5 * sigma) & ~outside, axis=1)
+    pulses = [jl.SampledPulse(time=s.pulse_time, power=s.pulse_power) for s in shots]
+    plan = {
+        "max_orders": 1,
+        "window": (TIME[0], TIME[-1]),
+        "bin_width": 2.0,
+        "n_rays": 64,
+        "footprint": "fixed",
+    }
+    fits = inversion.retrieve_many(
+        np.where(outside, 0.0, power)[:, None],
+        [lidar_of(pulse) for pulse in pulses],
+        CANOPY.scene(10.0),
+        UNKNOWNS,
+        noise=sigma[:, None],
+        time=TIME,
+        key=jax.random.key(0),
+        plan=jl.plan(lidar_of(jl.GaussianPulse(fwhm=40.0)), CANOPY.scene(48.0, -3.0, 25.0), **plan),
+        start={"canopy height": np.clip((ABOVE - lit) * WAY, 2.0, 44.0)},
+        max_steps=100,
+        scale=(0.0, 1e3),
+    )
+    return fits, power, np.isfinite(sigma)
+
+
+def main(argv=None):
+    given = options(__doc__, argv, "pls", shots=40)
+    everything = [s for s in read_pulsewaves(given.pls) if 100.0 < s.waveform.max() < SATURATED]
+    shots = everything[:: max(1, len(everything) // given.shots)][: given.shots]
+    signals, noise = zip(*map(signal_of, shots))
+    rows, middle = [], []
+    for shot, samples, sigma in zip(shots, signals, noise):
+        metres = np.linalg.norm((shot.position[-1] - shot.position[0]) * shot.metres) / (shot.time.size - 1)
+        what, case = "places of two samples apart", f"shot {shot.index}"
+        rows.append(row(what, "the speed of light", case, metres, WAY, bound=5e-4, unit="m"))
+        lags = STEP * np.arange(-30, 31)
+        pulse = np.interp(lags, shot.pulse_time, shot.pulse_power, left=0.0, right=0.0)
+        found = float(inversion.find_ground(shot.elevation, samples, pulse=pulse, noise=sigma))
+        middle.append(int(np.argmin(np.abs(shot.elevation - found))))
+    fits, power, used = fitted(shots, signals, noise, middle)
+    model = np.asarray(fits.values["scale"], float).reshape(-1, 1) * np.asarray(fits.fitted, float)[:, 0]
+    off = np.where(used, model - power, 0.0)
+    for i, shot in enumerate(shots):
+        rms, rest = np.sqrt(np.mean(off[i, used[i]] ** 2)), noise[i] / signals[i].max()
+        case = f"shot {shot.index}"
+        rows.append(
+            row(
+                "simulation less record, rms over the peak", "the record's noise", case, rms, rest, bound=LEFT
+            )
+        )
+
+    def draw(figure):
+        left, right = figure.subplots(1, 2)
+        worst = np.argsort([np.sum(o**2) for o in off])[:: max(1, len(off) // 5)]
+        for n, i in enumerate(worst):
+            left.plot(np.where(used[i], power[i], np.nan) + n, TIME, ".", color="0.5", ms=3, label="recorded")
+            left.plot(model[i] + n, TIME, color=COLOURS[0], lw=1.0, label="simulated")
+        left.invert_yaxis()
+        left.set(title="from the best fit to the worst", ylabel="time (ns)", xlabel="over the peak")
+        left.legend(*(part[:2] for part in left.get_legend_handles_labels()))
+        right.plot(TIME, off.T, color="0.8", lw=0.5)
+        right.plot(TIME, off.mean(axis=0), color=COLOURS[1], label=f"mean of {len(shots)} shots")
+        right.set(title="simulated less recorded, over the peak", xlabel="time (ns)")
+        right.legend()
+
+    return finish(
+        given,
+        "recorded_lvis",
+        rows,
+        title="Recorded LVIS shots",
+        seen="""Left, records and fitted simulations, from the best fit to the worst. Right, what the
+        simulation leaves of the records: it crosses zero where it should not only where the ground is no
+        slope.""",
+        unchecked="""This is the weakest comparison: no answers are known for these shots, and ten layers can
+        imitate much. Saturated shots are left out.""",
+        draw=draw,
+        of_others=True,
+        size=(11.0, 5.0),
+        shots=len(shots),
+    )
+
+
+if __name__ == "__main__":
+    main()
+    sys.exit(0)
