@@ -27,10 +27,11 @@ def main(argv=None):
         asked={"cases": ["ground", "alone"]},
         title="A crown against mitransient",
         seen="""Above the waveforms, below their relative differences with bars of two standard errors. Peak,
-        decay and the ground's echo agree in height and in time.""",
+        decay and the ground's echo agree in height and in time. Over ground a little more comes back here in
+        all, by more than the errors say: less than a thousandth, which is not explained.""",
         unchecked="""Isotropic scattering alone, no leaves' phase function; light above 1 % of the peak.
         mitransient 1.3.1 leaves stretches between null collisions out of path lengths, which is corrected in
-        a copy.""",
+        a copy. Its histogram has bins of 0.05 ns, which move steep sides by more than the bars.""",
     )
 
 

@@ -120,8 +120,8 @@ def main(argv=None):
         rows,
         title="Recorded LVIS shots",
         seen="""Left, records and fitted simulations, from the best fit to the worst. Right, what the
-        simulation leaves of the records: it crosses zero where it should not only where the ground is no
-        slope.""",
+        simulation leaves of the records: its mean is below zero after the ground, where receivers have a
+        tail and light of higher orders, which the fit leaves out, comes back.""",
         unchecked="""This is the weakest comparison: no answers are known for these shots, and ten layers can
         imitate much. Saturated shots are left out.""",
         draw=draw,
