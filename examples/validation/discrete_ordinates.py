@@ -1,6 +1,6 @@
 """Slabs of leaves over ground, all orders, against discrete ordinates (PythonicDISORT).
 
-    python examples/validation/discrete_ordinates.py [--out figures] [--rtol 0.001]
+    python examples/validation/discrete_ordinates.py [--out figures] [--rtol 0.002]
 
 Plane-parallel slabs lit from straight above over Lambertian ground: the bidirectional reflectance factor at
 nadir is the sum of a waveform (`simulate`), and what is returned, let through and absorbed are shares of the
@@ -83,7 +83,7 @@ def simulated(tau, leaf, ground, orders, rtol, key):
 
 
 def main(argv=None):
-    given = options(__doc__, argv, rtol=1e-3, slabs=len(SLABS))
+    given = options(__doc__, argv, rtol=2e-3, slabs=len(SLABS))
     rows = []
     keys = jax.random.split(jax.random.key(0), len(SLABS))
     for key, (case, slab) in steps(given, list(zip(keys, SLABS.items()))[: given.slabs]):
