@@ -1,6 +1,6 @@
 """Waveforms of a crown by all orders against MCX-CL, which follows photons through media of tissue.
 
-    python examples/validation/mcx_crown.py [--out figures] [--repeats 16]
+    python examples/validation/mcx_crown.py [--out figures] [--repeats 6]
 
 Needs `pip install 'jaxlidar[bench]'`. The scene is the crown without ground of the benchmark
 (`examples/benchmarks/peers.py`): 64^3 voxels of random extinction in a sphere, isotropic scattering with
@@ -20,7 +20,7 @@ GATE, CROSSING = 0.25, 0.52
 
 
 def main(argv=None):
-    given = options(__doc__, argv, repeats=16)
+    given = options(__doc__, argv, repeats=6)
     return compare(
         given,
         "mcx_crown",
