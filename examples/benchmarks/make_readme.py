@@ -8,6 +8,7 @@ import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from _gpu import PAGE
 from _writing import number, page_of, table
 
 from jaxlidar.io import atomic_write
@@ -306,6 +307,7 @@ def page() -> str:
         parts.append(f"## {title}\n\n`{name}.py`. {machine(record)}\n\n{section(record)}\n")
         if path.with_suffix(".png").exists():
             parts.append(f"![{title}](results/{name}.png)\n")
+    parts.append(PAGE)
     return "\n".join(parts)
 
 
