@@ -2,7 +2,7 @@
 
 from . import files
 from .batch import Progress, Retrievals, retrieve_many
-from .cover import GroundAndCanopy, gap_probability, ground_and_canopy, plant_area_index
+from .cover import GroundAndCanopy, gap_probability, ground_and_canopy, plant_area_index, plant_area_profile
 from .decomposition import Echoes, gaussian_decomposition
 from .deconvolution import richardson_lucy, wiener
 from .gedi import GediMetrics, GediSettings, gedi_metrics, gedi_settings
@@ -11,12 +11,15 @@ from .identifiability import CramerRao, Profile, cramer_rao, profile_likelihood
 from .leaves import LeafFit, invert_leaves
 from .photons import PhotonHeights, photon_ground_and_canopy
 from .points import EchoPoints, echo_points
+from .priors import LogNormal, Smooth
+from .profiles import AveragingKernel, put_profile
 from .quality import Verdict, judge_fit, judge_fits, judge_record
 from .result import Retrieval, Step
 from .retrieval import retrieve
-from .unknowns import LogNormal, Unknown
+from .unknowns import Unknown
 
 __all__ = [
+    "AveragingKernel",
     "CramerRao",
     "EchoPoints",
     "Echoes",
@@ -31,6 +34,7 @@ __all__ = [
     "Retrieval",
     "Retrievals",
     "SignalEnds",
+    "Smooth",
     "Step",
     "Unknown",
     "Verdict",
@@ -49,7 +53,9 @@ __all__ = [
     "judge_record",
     "photon_ground_and_canopy",
     "plant_area_index",
+    "plant_area_profile",
     "profile_likelihood",
+    "put_profile",
     "relative_heights",
     "retrieve",
     "retrieve_many",

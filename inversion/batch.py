@@ -24,12 +24,13 @@ from jaxlidar.io import save
 
 from .checkpoint import Frame, Row, kept_fits
 from .data import at_fixed_times, data_of, noise_of, numbers
-from .fit import labels_of, named
+from .fit import bounds_of, labels_of, named, smooth_names
 from .job import Job, fits, fits_by
 from .lanes import Lanes
 from .planning import batch_sizes, check_samples, plan_for
+from .profiles import AveragingKernel, averaging_kernel_of, band_of
 from .quality import Verdict, judge_fits
-from .retrieval import SOLVER, check_progress, check_solution, scale_of
+from .retrieval import SOLVER, check_progress, check_solution, check_solver, scale_of
 from .unknowns import Settled, Unknown, settle, start_from
 
 
@@ -68,7 +69,8 @@ class Retrievals(eqx.Module):
     - `stderr`: by name, (footprints, ...) one standard error; infinite where the data do not constrain the
       unknown.
     - `robust_stderr`, `prior_share`, `at_bound`: by name, (footprints, ...).
-    - `covariance`: (footprints, n, n).
+    - `covariance`, `averaging`: (footprints, n, n).
+    - `strength`: by name, (footprints,). `bounds`: by name, (2, ...), those of all footprints.
     - `reduced_chi2`, `second_minimum`, `independent_samples`: (footprints,).
     - `converged`: (footprints,) whether the fit ended at a minimum.
     - `steps`: (footprints,) waveforms simulated, each with its Jacobian.
@@ -98,6 +100,9 @@ class Retrievals(eqx.Module):
     reduced_chi2: Float[np.ndarray, " footprints"]
     second_minimum: Float[np.ndarray, " footprints"]
     independent_samples: Float[np.ndarray, " footprints"]
+    averaging: Float[np.ndarray, "footprints n n"]
+    strength: dict[str, Float[np.ndarray, " footprints"]]
+    bounds: dict[str, Float[np.ndarray, "2 ..."]]
     converged: Bool[np.ndarray, " footprints"]
     steps: Int[np.ndarray, " footprints"]
     fitted: Float[np.ndarray, "footprints wavelengths bins"]
@@ -108,6 +113,38 @@ class Retrievals(eqx.Module):
     def quality(self) -> tuple[Verdict, ...]:
         """Whether each fit can be trusted, with reasons: `inversion.judge_fits` with all unknowns."""
         return judge_fits(self)
+
+    def band(self, name: str, level: float = 0.95, *, robust: bool = False) -> tuple[np.ndarray, np.ndarray]:
+        """Credible band of an unknown, within its bounds: see `inversion.profiles`.
+
+        **Arguments:**
+
+        - `name`: of the unknown.
+        - `level`: probability, in (0, 1). Default 0.95.
+        - `robust`: with `robust_stderr` in place of `stderr`. Default False.
+
+        **Returns:** (low, high), each of the shape of the values; the bounds, where the standard error is
+        infinite.
+
+        **Raises:** ValueError for a name that the fit has not, and a `level` outside (0, 1).
+        """
+        return band_of(self, name, level, robust)
+
+    def averaging_kernel(self, name: str, spacing: float = 1.0) -> AveragingKernel:
+        """How the estimate of a profile follows the truth, and its height resolution.
+
+        Other unknowns are taken as fitted along, and strengths of smoothness priors as known.
+
+        **Arguments:**
+
+        - `name`: of the unknown.
+        - `spacing`: distance between layers, positive, such as in m. Default 1: the resolution is in layers.
+
+        **Returns:** an `AveragingKernel`, of NumPy arrays.
+
+        **Raises:** ValueError for a name that the fit has not, and a `spacing` that is not positive.
+        """
+        return averaging_kernel_of(self, name, spacing)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the results as a netCDF file, which `jaxlidar.open` reads.
@@ -234,6 +271,7 @@ def retrieve_many(
     lidars = [at_fixed_times(a) for a in _one_each("lidar", lidar, Lidar, len(y))]
     scenes = _one_each("scene", scene, Scene, len(y))
     settled = _started([settle(unknowns, s) for s in scenes], {} if start is None else start, len(y))
+    check_solver(solver, settled[0])
     data = [data_of(y[i], time, sigma[i], noise_floor, lidars[i % len(lidars)]) for i in range(len(y))]
     axis = data[0].time
     extra = [] if scale is None else [scale_of(scale, settled[0])]
@@ -265,7 +303,7 @@ def retrieve_many(
 
     how = (plan, solver, max_steps, starts, Lanes.of(min(lanes, len(y))))
     job = Job(range(len(y)), data, lidars, scenes, settled, extra, *how)
-    frame = Frame(len(y), sum(s.start.size for s in names), y.shape[1:])
+    frame = Frame(len(y), sum(s.start.size for s in names), y.shape[1:], len(smooth_names(names)))
     with kept_fits(path, {} if path is None else fingerprint(parts), frame) as kept:
         ended = kept.rows
         todo = [i for i in range(len(y)) if i not in ended]
@@ -293,6 +331,9 @@ def _gathered(rows: list[Row], names: list[Settled]) -> Retrievals:
         reduced_chi2=np.array([r.reduced_chi2 for r in rows]),
         second_minimum=np.array([r.second_minimum for r in rows]),
         independent_samples=np.array([r.independent_samples for r in rows]),
+        averaging=stack(lambda r: r.averaging),
+        strength=dict(zip(smooth_names(names), stack(lambda r: r.strength).T)),
+        bounds=bounds_of(names),
         converged=np.array([r.converged for r in rows]),
         steps=np.array([r.steps for r in rows]),
         fitted=stack(lambda r: r.fitted),
@@ -307,7 +348,7 @@ def _parts_of(settled: list[list[Settled]]) -> dict[str, Any]:
     for s, *others in zip(*settled):
         parts[f"place of {s.name!r}"] = s.place
         parts[f"bounds of {s.name!r}"] = s.low, s.high
-        parts[f"prior of {s.name!r}"] = s.prior, s.log_prior
+        parts[f"prior of {s.name!r}"] = (s.prior, s.log_prior) if s.smooth is None else s.smooth
         parts[f"start of {s.name!r}"] = [s.start, *(other.start for other in others)]
     return parts
 

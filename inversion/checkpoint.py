@@ -42,6 +42,8 @@ class Row:
     reduced_chi2: float
     second_minimum: float
     independent_samples: float
+    averaging: np.ndarray
+    strength: np.ndarray
     converged: bool
     steps: int
     fitted: np.ndarray
@@ -55,11 +57,12 @@ def row_of(o: Outcome) -> Row:
 
 
 class Frame(NamedTuple):
-    """How many fits there are, their unknowns, and the shape of a waveform."""
+    """How many fits there are, their unknowns, the shape of a waveform, and smoothness priors."""
 
     fits: int
     unknowns: int
     waveform: tuple[int, ...]
+    smooth: int = 0
 
 
 class Kept:
@@ -196,6 +199,8 @@ def _unpacked(packed: bytes, frame: Frame) -> Row:
         "reduced_chi2": ("f", ()),
         "second_minimum": ("f", ()),
         "independent_samples": ("f", ()),
+        "averaging": ("f", (n, n)),
+        "strength": ("f", (frame.smooth,)),
         "converged": ("b", ()),
         "steps": ("i", ()),
         "fitted": ("f", frame.waveform),

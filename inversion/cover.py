@@ -1,19 +1,21 @@
 """Ground and canopy in a record's energy, gap probability and plant area, without a model of the scene.
 
-`gap_probability` and `plant_area_index` are formulas; `ground_and_canopy` splits a record. All are
-differentiable.
+`gap_probability` and `plant_area_index` are formulas; `ground_and_canopy` splits a record, and
+`plant_area_profile` makes layers of it. All are differentiable.
 """
 
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from inversion.heights import SignalEnds, find_ground, record, signal_ends
 from inversion.pulses import METRES_PER_NS, Pulse, pulse_samples, response, steps_of
 from inversion.records import over_shots
-from jaxlidar.extend import as_array, check_range
+from jaxlidar.extend import as_array, check_range, concrete
 
 Samples = Float[Array, " bins"]
 
@@ -185,3 +187,103 @@ def plant_area_index(
     check_range("projection", projection, 0.0, 1.0, low_open=True)
     check_range("clumping", clumping, 0.0, low_open=True)
     return -jnp.log(as_array(gap)) * jnp.cos(jnp.deg2rad(zenith)) / (projection * clumping)
+
+
+def plant_area_profile(
+    height: Float[ArrayLike, "... bins"],
+    power: Float[ArrayLike, "... bins"],
+    *,
+    edges: Float[ArrayLike, " edges"] | Sequence[float],
+    pulse: Pulse,
+    ground: Float[ArrayLike, "..."] | None = None,
+    ends: SignalEnds | tuple[ArrayLike, ArrayLike] | None = None,
+    noise: Float[ArrayLike, "..."] | None = None,
+    reflectance_ratio: float = 1.5,
+    zenith: float = 0.0,
+    projection: float = 0.5,
+    clumping: float = 1.0,
+    smallest_gap: float = 1e-3,
+) -> Float[Array, "... layers"]:
+    """Plant area density of layers by the closed-form gap inversion, as GEDI's level 2B has it.
+
+    The ground's energy is that of `ground_and_canopy`; its echo is taken as even about its mode, of the shape
+    that its lower half shows, and subtracted. What is left, cumulated from the top, gives the gap
+    probability at the edges of the layers, and its logarithm's differences the plant area. Noise is not
+    smoothed: densities may be negative. The pulse is not taken out: layers thinner than it share their
+    plants. Differentiable in `power`.
+
+    **Arguments:**
+
+    - `height`, `power`, `pulse`, `ground`, `ends`, `noise`, `reflectance_ratio`: as for `ground_and_canopy`.
+    - `edges`: (edges,) heights of the layers' edges above the ground in m, increasing, at least two.
+    - `zenith`, `projection`, `clumping`: as for `plant_area_index`.
+    - `smallest_gap`: gap probabilities below it are taken for it, in (0, 1). Default 1e-3.
+
+    **Returns:** (layers,) or (shots, layers) m2 of plant area per m3, from the lowest layer up. NaN where no
+    ground was found.
+
+    **Raises:** ValueError for inadmissible arguments.
+
+    **Source:** Ni-Meister et al. (2001), IEEE Trans. Geosci. Remote Sens. 39, 1943; Tang and Armston (2019),
+    GEDI footprint canopy cover and vertical profile metrics (theoretical basis document).
+
+    **Example:** an even canopy of plant area 2 between 4 and 12 m, as bright as the ground.
+
+    >>> import inversion, numpy as np
+    >>> height = np.arange(20.0, -8.0, -0.1)
+    >>> gap = np.exp(-0.125 * np.clip(12.0 - height, 0.0, 8.0))
+    >>> power = np.diff(1.0 - gap, append=1.0 - gap[-1])
+    >>> power[np.argmin(np.abs(height))] += gap[-1]
+    >>> pulse = np.exp(-0.5 * (np.arange(-9.0, 10.0) / 3.0) ** 2)
+    >>> power = np.convolve(power, pulse / pulse.sum(), mode="same")
+    >>> edges = [2.0, 6.0, 10.0, 14.0]
+    >>> given = {"edges": edges, "pulse": pulse, "reflectance_ratio": 1.0}
+    >>> density = inversion.plant_area_profile(height, power, **given)
+    >>> [f"{float(d):.2f}" for d in density]
+    ['0.12', '0.25', '0.12']
+    """
+    check_range("smallest_gap", smallest_gap, 0.0, 1.0, low_open=True, high_open=True)
+    levels = as_array(edges, "edges")
+    known = concrete(levels)
+    if levels.ndim != 1 or levels.size < 2 or (known is not None and not np.all(np.diff(known) > 0)):
+        raise ValueError(f"edges = {edges}; admissible are two heights or more, increasing")
+    if ends is None:
+        ends = signal_ends(height, power, pulse=pulse, noise=noise)
+    split = ground_and_canopy(
+        height, power, pulse=pulse, ground=ground, ends=ends, noise=noise, reflectance_ratio=reflectance_ratio
+    )
+    z, y, count = record(height, power)
+    lags = pulse_samples(pulse, steps_of(height, METRES_PER_NS))
+    total = split.canopy + split.ground * reflectance_ratio
+    above = _canopy_above(z, y, count, lags, split.height, split.ground, *map(as_array, ends), levels)
+    above = jnp.clip(above, 0.0, split.canopy[..., None])
+    gap = 1.0 - above / jnp.where(total > 0, total, 1.0)[..., None]
+    gap = jnp.where((total > 0)[..., None], jnp.maximum(gap, smallest_gap), jnp.nan)
+    depth = jnp.diff(jnp.log(gap), axis=-1) / jnp.diff(levels)[(None,) * (gap.ndim - 1)]
+    check_range("zenith", zenith, 0.0, 90.0, high_open=True)
+    check_range("projection", projection, 0.0, 1.0, low_open=True)
+    check_range("clumping", clumping, 0.0, low_open=True)
+    return depth * jnp.cos(jnp.deg2rad(zenith)) / (projection * clumping)
+
+
+@over_shots(1, 1, 0, 1, 0, 0, 0, 0, 1)
+def _canopy_above(z, y, count, pulse, ground, energy, top, bottom, levels):
+    """The canopy's energy from above heights over the ground: all of it, less the ground's even echo."""
+    step = z[0] - z[1]
+    real = jnp.arange(y.size) < count
+    mode = ground - response(pulse).mode * step
+
+    def between(low, high):
+        share = jnp.clip((z + 0.5 * step - low) / step, 0.0, 1.0)
+        share = share - jnp.clip((z + 0.5 * step - high) / step, 0.0, 1.0)
+        return jnp.sum(jnp.where(real, y * share, 0.0))
+
+    half = jnp.maximum(between(bottom, mode), 1e-30)
+
+    def one(level):
+        # Of the ground's upper half, as much comes from above a level as, mirrored, of the lower half.
+        rise = jnp.maximum(ground + level - mode, 0.0)
+        share = jnp.clip(between(bottom, mode - rise) / half, 0.0, 1.0)
+        return between(ground + level, top) - 0.5 * energy * share
+
+    return jax.vmap(one)(levels)

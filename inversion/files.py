@@ -15,6 +15,12 @@ _QUANTITIES = {
     "covariance": (_OWN, "covariance of the unknowns, in the order of labels"),
     "reduced_chi2": ("1", "sum of squared residuals over the degrees of freedom"),
     "second_minimum": ("1", "rise in chi-squared to a second minimum, in units of independent samples"),
+    "averaging": (
+        "ratio of the units of the unknowns",
+        "derivatives of the estimates in the truth, in the order of labels",
+    ),
+    "strength": (_OWN, "strength of a smoothness prior, in the unit of the unknown"),
+    "bounds": (_OWN, "lower and upper bounds of an unknown"),
     "independent_samples": ("1", "independent samples that tell as much as the correlated ones fitted"),
 }
 

@@ -19,11 +19,13 @@ import optimistix as optx
 from jaxtyping import Array
 
 from .data import Data
+from .descent import descend_within
 from .misfit import misfit_of
 from .model import Evaluation, spread_of
+from .priors import Priors, inside, outside
 from .result import Step
 from .uncertainty import Errors, correlation_of, decrement, errors_of
-from .unknowns import Priors, Settled, inside, outside
+from .unknowns import Settled
 
 # A fit has converged when a Gauss-Newton step would move it by less than this many standard errors.
 _SMALL_STEP = 0.05
@@ -35,6 +37,8 @@ _LONGEST_STEP = 2.0
 _WRONG_WEIGHTS = 0.05
 # An unknown closer to a bound than this share of the bounds' width is reported as at the bound.
 _AT_BOUND = 1e-3
+# Strengths of smoothness priors stay once none changes by more than this share; so many are tried.
+_SAME_STRENGTH, _MOST_STRENGTHS = 0.1, 12
 
 
 def _linear(y: Array, args: tuple[Array, Array, Array]) -> tuple[Array, None]:
@@ -66,7 +70,8 @@ class Request(NamedTuple):
 class Outcome(NamedTuple):
     """Result of a fit. Vectors are the flattened unknowns in natural units; see `Retrieval`.
 
-    - `cost`: chi-squared with the measurement's noise only, plus that of the priors.
+    - `cost`: chi-squared with the measurement's noise only, plus that of the priors (-2 ln of their density).
+    - `strength`: of the smoothness priors.
     - `simulation`: (wavelengths, bins) one standard error of the simulated waveform.
     """
 
@@ -89,6 +94,8 @@ class Outcome(NamedTuple):
     at_bound: np.ndarray
     second_minimum: float
     independent_samples: float
+    averaging: np.ndarray
+    strength: np.ndarray
 
 
 Fitting = Generator[Request, Evaluation, Outcome]
@@ -189,10 +196,10 @@ class Fit:
         evaluation = yield Request(values[:-1] if self.scaled else values, spread)
         return Point(self, z, evaluation)
 
-    def residuals(self, p: Point) -> tuple[np.ndarray, np.ndarray]:
-        """Whitened residuals, then those of the priors, and their Jacobian in z."""
+    def natural(self, p: Point) -> tuple[np.ndarray, np.ndarray]:
+        """Whitened residuals, then those of the priors, and their Jacobian in natural units."""
         off, slope = self.prior(p.values)
-        jacobian = np.concatenate([p.jacobian / self.sigma[:, None], np.diag(slope)]) * p.slope
+        jacobian = np.concatenate([p.jacobian / self.sigma[:, None], slope])
         return np.concatenate([p.difference / self.sigma, off]), jacobian
 
     def reweigh(self, p: Point) -> float:
@@ -226,21 +233,38 @@ class Fit:
                 best, False, "failed: at the starting values the simulated waveform is not finite"
             )
         self.reweigh(best)
-        best, converged, status = yield from self.descend(best)
+        best, converged, status = yield from self.settle_down(best)
         if converged and best.evaluation.batches is None:
             best = yield from self.at(best.z, spread=True)
         if converged and self.reweigh(best) > _WRONG_WEIGHTS and self.count < self.max_steps:
-            best, converged, status = yield from self.descend(best)
+            best, converged, status = yield from self.settle_down(best)
             if best.evaluation.batches is None:
                 best = yield from self.at(best.z, spread=True)
         return self.result(best, converged, status)
+
+    def settle_down(self, best: Point) -> Generator[Request, Evaluation, tuple[Point, bool, str]]:
+        """Descend, with strengths of smoothness priors by the data: each is that of the fit with it."""
+        for _ in range(_MOST_STRENGTHS):
+            way = self.descend(best)
+            if self.prior.blocks:
+                way = descend_within(self, best, _SMALL_STEP, _STALLED)
+            best, converged, status = yield from way
+            if not converged or not self.prior.by_the_data:
+                return best, converged, status
+            white = best.difference / self.sigma, best.jacobian / self.sigma[:, None]
+            strengths = self.prior.likeliest(best.values, *white)
+            if np.all(np.abs(np.log(strengths / self.prior.strengths)) < _SAME_STRENGTH):
+                return best, True, status
+            self.prior.put(strengths)
+        return best, False, self.ended("not converged: the strength of a smoothness prior did not settle")
 
     def descend(self, best: Point) -> Generator[Request, Evaluation, tuple[Point, bool, str]]:
         """Run the solver until it ends or no step improves the fit."""
         trial, state, y = best, None, jnp.asarray(best.z)
         remaining, rejected = np.inf, 0
         while True:
-            r, jacobian = self.residuals(trial)
+            r, jacobian = self.natural(trial)
+            jacobian = jacobian * trial.slope
             if not trial.finite:
                 # So large that the solver rejects the step.
                 r, jacobian = np.full_like(r, 1e8), np.zeros_like(jacobian)
@@ -269,7 +293,8 @@ class Fit:
     def free(self, p: Point, r: np.ndarray, jacobian: np.ndarray) -> np.ndarray:
         """Which unknowns are free: not at a bound beyond which the fit would be better."""
         share, downhill = (p.values - self.low) / (self.high - self.low), -(jacobian.T @ r)
-        return ~((share < _AT_BOUND) & (downhill < 0)) & ~((share > 1 - _AT_BOUND) & (downhill > 0))
+        held = ((share < _AT_BOUND) & (downhill < 0)) | ((share > 1 - _AT_BOUND) & (downhill > 0))
+        return ~held
 
     def ended(self, how: str) -> str:
         return f"{how} after {self.count} simulation{'s' if self.count > 1 else ''}"
@@ -294,9 +319,11 @@ class Fit:
         jacobian = p.jacobian / self.sigma[:, None] if p.finite else np.zeros_like(p.jacobian)
         measured = (self.data.sigma[used] / self.sigma) ** 2
         off, slope = self.prior(p.values)
-        errors = errors_of(jacobian, slope**2, self.high - self.low, measured, deviations)
+        precision = slope.T @ slope
+        width = self.high - self.low
+        errors = errors_of(jacobian, precision, width, measured, deviations, self.prior.basis)
         stderr = np.sqrt(np.diag(errors.covariance))
-        robust, samples = self.widened(p, stderr, errors, jacobian, slope**2)
+        robust, samples = self.widened(p, stderr, errors, jacobian, precision)
         labels = labels_of(self.settled)
         share = (p.values - self.low) / (self.high - self.low)
         notes = [
@@ -312,7 +339,7 @@ class Fit:
         freedom = max(self.sigma.size - n + int(np.sum(errors.open)), 1)
         chi2 = np.sum(residuals**2) / freedom
 
-        cost = float(np.sum((p.difference / self.data.sigma[used]) ** 2) + np.sum(off**2))
+        cost = float(np.sum((p.difference / self.data.sigma[used]) ** 2) + np.sum(off**2)) + self.prior.volume
         return Outcome(
             values=p.values,
             stderr=stderr,
@@ -333,6 +360,8 @@ class Fit:
             at_bound=low | high,
             second_minimum=np.inf,
             independent_samples=samples,
+            averaging=errors.averaging,
+            strength=self.prior.strengths,
         )
 
     def widened(
@@ -348,7 +377,7 @@ class Fit:
         difference = p.difference / self.sigma
         wavelength, sample = np.nonzero(used)
         misfit = misfit_of(difference, jacobian, precision, told, signal, (wavelength, sample))
-        variance = np.diag(errors.inverse @ (misfit.middle + np.diag(precision)) @ errors.inverse)
+        variance = np.diag(errors.inverse @ (misfit.middle + precision) @ errors.inverse)
         return np.where(open, np.inf, np.maximum(stderr, np.sqrt(variance))), misfit.samples
 
 
@@ -356,6 +385,16 @@ def named(flat: np.ndarray, settled: Sequence[Settled]) -> dict[str, np.ndarray]
     """Values by name from vectors (..., unknowns)."""
     parts = np.split(flat, np.cumsum([s.start.size for s in settled])[:-1], axis=-1)
     return {s.name: p.reshape((*flat.shape[:-1], *s.start.shape)) for s, p in zip(settled, parts)}
+
+
+def bounds_of(settled: Sequence[Settled]) -> dict[str, np.ndarray]:
+    """Lower and upper bounds by name, (2, ...)."""
+    return {s.name: np.stack([s.low, s.high]) for s in settled}
+
+
+def smooth_names(settled: Sequence[Settled]) -> list[str]:
+    """Names of the unknowns with smoothness priors."""
+    return [s.name for s in settled if s.smooth is not None]
 
 
 def labels_of(settled: Sequence[Settled]) -> tuple[str, ...]:

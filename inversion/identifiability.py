@@ -19,9 +19,10 @@ from .data import at_fixed_times, data_of, noise_of, numbers, time_axis
 from .fit import labels_of, named
 from .model import Model
 from .planning import batch_sizes, check_samples, plan_for
+from .priors import Priors, known_priors
 from .retrieval import check_progress, check_solution, retrieve, scale_of
 from .uncertainty import correlation_of, errors_of
-from .unknowns import Priors, Unknown, put, settle
+from .unknowns import Unknown, put, settle
 
 
 @final
@@ -125,6 +126,7 @@ def cramer_rao(
     lidar = at_fixed_times(lidar)
     photons, rays = batch_sizes(n_photons, n_rays, max_orders, plan)
     settled = settle(unknowns, scene)
+    priors = known_priors(settled)
     axis = None if time is None else time_axis(time, lidar)
     if plan is None:
         if axis is None:
@@ -139,16 +141,17 @@ def cramer_rao(
     start = np.concatenate([np.ravel(np.asarray(s.start, float)) for s in settled])
     evaluation = Model(lidar, scene, plan, settled, key)(start)
     jacobian = (evaluation.jacobian / sigma[..., None]).reshape(-1, start.size)
-    precision = Priors(settled)(start)[1] ** 2
+    slope = priors(start)[1]
+    precision = slope.T @ slope
     width = np.concatenate([np.ravel(s.high - s.low) for s in settled])
-    errors = errors_of(jacobian, precision, width, np.ones(len(jacobian)), None)
+    errors = errors_of(jacobian, precision, width, np.ones(len(jacobian)), None, priors.basis)
     labels = labels_of(settled)
     std = np.sqrt(np.diag(errors.covariance))
     return CramerRao(
         stderr={k: jnp.asarray(v) for k, v in named(std, settled).items()},
         covariance=jnp.asarray(errors.covariance),
         correlation=jnp.asarray(correlation_of(errors.covariance)),
-        information=jnp.asarray(jacobian.T @ jacobian + np.diag(precision)),
+        information=jnp.asarray(jacobian.T @ jacobian + precision),
         labels=labels,
         undetermined=tuple(label for label, o in zip(labels, errors.open) if o),
     )
@@ -269,6 +272,7 @@ def profile_likelihood(
     lidar = at_fixed_times(lidar)
     photons, rays = batch_sizes(own["n_photons"], own["n_rays"], own["max_orders"], plan)
     settled = settle(unknowns, scene)
+    priors = known_priors(settled)
     names = [s.name for s in settled]
     if name not in names:
         raise ValueError(f"name = {name!r} is none of the unknowns: {', '.join(names)}")
@@ -325,7 +329,6 @@ def profile_likelihood(
             if progress is not None:
                 progress(i)
     fits = [found[i] for i in range(points.size)]
-    priors = Priors(settled)
     chi2 = np.array([_chi2(f, settled, priors, name, p) for f, p in zip(fits, points)])
     return Profile(
         values=points,

@@ -50,7 +50,7 @@ class Misfit(NamedTuple):
 def misfit_of(
     residual: Float[np.ndarray, " data"],
     jacobian: Float[np.ndarray, "data n"],
-    precision: Float[np.ndarray, " n"],
+    precision: Float[np.ndarray, "n n"],
     determined: float,
     signal: Float[np.ndarray, " data"],
     place: tuple[Int[np.ndarray, " data"], Int[np.ndarray, " data"]],
@@ -60,7 +60,7 @@ def misfit_of(
     **Arguments:**
 
     - `residual`, `jacobian`: whitened by the stated noise.
-    - `precision`: of the priors, 0 where there is none.
+    - `precision`: matrix of the priors, 0 where there is none.
     - `determined`: number of unknowns that the data determine.
     - `signal`: simulated, in standard deviations of the stated noise.
     - `place`: number of the wavelength, and of the sample.
@@ -75,7 +75,7 @@ def misfit_of(
     size = np.where(size > 1e-100, size, 1.0)
     both = both / size
     # The prior's information; collinear unknowns are kept apart.
-    prior = np.diag(np.append(precision, 0.0) / size**2 + _ROUNDING)
+    prior = np.pad(precision, (0, 1)) / np.outer(size, size) + _ROUNDING * np.eye(size.size)
     share = np.abs(signal) / max(np.max(np.abs(signal)), 1e-300)
     # Every phi with every k^2.
     phi, excess = (a.ravel() for a in np.meshgrid(_CORRELATIONS, _EXCESSES, indexing="ij"))

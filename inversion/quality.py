@@ -9,8 +9,8 @@ amount to:
 | end | | not converged |
 | misfit | reduced chi-squared above 3, or 1 + 4 sqrt(2 / n) if more | above 10, or 1 + 12 sqrt(2 / n) |
 | undetermined | an unknown has an infinite standard error | |
-| bound | an unknown lies at a bound | |
-| prior | the prior has more than half of the information on an unknown | |
+| bound | an unknown lies at a bound, unless its prior is one of smoothness | |
+| prior | the prior has more than half of the information on an unknown, the same | |
 | second minimum | another end within 4 in chi-squared, counted as independent samples | |
 
 and those of a record before any fit (`judge_record`), with the noise's standard deviation s:
@@ -144,9 +144,9 @@ def _judge(fit: Any, about: Sequence[str] | None, at: Any) -> Verdict:
         if name not in fit.values:
             raise ValueError(f"about has {name!r}; admissible are {', '.join(map(repr, fit.values))}")
 
-    def those(field: str, wrong: Any) -> str:
+    def those(field: str, wrong: Any, but: Iterable[str] = ()) -> str:
         found = getattr(fit, field)
-        return ", ".join(n for n in names if np.any(wrong(np.asarray(found[n])[at])))
+        return ", ".join(n for n in names if n not in but and np.any(wrong(np.asarray(found[n])[at])))
 
     found = []
     if not of("converged"):
@@ -158,9 +158,9 @@ def _judge(fit: Any, about: Sequence[str] | None, at: Any) -> Verdict:
         found.append((_DOUBTFUL if chi2 <= limits[1] else _BAD, f"misfit: reduced chi-squared {chi2:.3g}"))
     if open := those("stderr", np.isinf):
         found.append((_DOUBTFUL, f"undetermined: {open}"))
-    if bound := those("at_bound", np.asarray):
+    if bound := those("at_bound", np.asarray, but=fit.strength):
         found.append((_DOUBTFUL, f"at a bound: {bound}"))
-    if prior := those("prior_share", lambda share: share > _PRIOR):
+    if prior := those("prior_share", lambda share: share > _PRIOR, but=fit.strength):
         found.append((_DOUBTFUL, f"from the prior: {prior}"))
     if (rise := float(of("second_minimum"))) < _SECOND:
         found.append((_DOUBTFUL, f"second minimum: {rise:.2g} above in chi-squared"))

@@ -13,6 +13,7 @@ from jaxlidar import Scene, Waveform
 from jaxlidar.extend import briefly
 from jaxlidar.io import save
 
+from .profiles import AveragingKernel, averaging_kernel_of, band_of
 from .quality import Verdict, judge_fit
 
 
@@ -71,6 +72,9 @@ class Retrieval(eqx.Module):
       best end to the next that lies elsewhere; infinite where no start ended there.
     - `independent_samples`: how many independent samples tell as much as those fitted, whose residuals are
       correlated.
+    - `averaging`: (n, n) how the estimates follow the truth, d estimate / d truth: see `averaging_kernel`.
+    - `strength`: that of each smoothness prior (`Smooth`), as given or by the data.
+    - `bounds`: (2, ...) lower and upper bounds of each unknown.
     - `converged`: whether the fit ended at a minimum.
     - `status`: how the fit ended, in a sentence.
     - `steps`: waveforms simulated, each with its Jacobian.
@@ -103,6 +107,9 @@ class Retrieval(eqx.Module):
     reduced_chi2: Float[Array, ""]
     second_minimum: Float[Array, ""]
     independent_samples: Float[Array, ""]
+    averaging: Float[Array, "n n"]
+    strength: dict[str, Float[Array, ""]]
+    bounds: dict[str, Float[Array, "2 ..."]]
     converged: bool = eqx.field(static=True)
     status: str = eqx.field(static=True)
     steps: int = eqx.field(static=True)
@@ -113,6 +120,38 @@ class Retrieval(eqx.Module):
     def quality(self) -> Verdict:
         """Whether the fit can be trusted, with reasons: `inversion.judge_fit` with all unknowns."""
         return judge_fit(self)
+
+    def band(self, name: str, level: float = 0.95, *, robust: bool = False) -> tuple[np.ndarray, np.ndarray]:
+        """Credible band of an unknown, within its bounds: see `inversion.profiles`.
+
+        **Arguments:**
+
+        - `name`: of the unknown.
+        - `level`: probability, in (0, 1). Default 0.95.
+        - `robust`: with `robust_stderr` in place of `stderr`. Default False.
+
+        **Returns:** (low, high), each of the shape of the values; the bounds, where the standard error is
+        infinite.
+
+        **Raises:** ValueError for a name that the fit has not, and a `level` outside (0, 1).
+        """
+        return band_of(self, name, level, robust)
+
+    def averaging_kernel(self, name: str, spacing: float = 1.0) -> AveragingKernel:
+        """How the estimate of a profile follows the truth, and its height resolution.
+
+        Other unknowns are taken as fitted along, and strengths of smoothness priors as known.
+
+        **Arguments:**
+
+        - `name`: of the unknown.
+        - `spacing`: distance between layers, positive, such as in m. Default 1: the resolution is in layers.
+
+        **Returns:** an `AveragingKernel`, of NumPy arrays.
+
+        **Raises:** ValueError for a name that the fit has not, and a `spacing` that is not positive.
+        """
+        return averaging_kernel_of(self, name, spacing)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the result as a netCDF file, which `jaxlidar.open` reads.

@@ -13,7 +13,7 @@ from jaxlidar import Lidar, Plan, Scene, Waveform
 from jaxlidar.extend import check_integer, check_key, check_kinds, check_range
 
 from .data import Data, at_fixed_times, data_of
-from .fit import Fit, Outcome, best_of, drive, labels_of, named
+from .fit import Fit, Outcome, best_of, bounds_of, drive, labels_of, named, smooth_names
 from .model import Model
 from .planning import batch_sizes, check_samples, plan_for
 from .result import Retrieval, Step
@@ -77,7 +77,8 @@ def retrieve(
       8192, or what `plan` has.
     - `max_orders`: orders of scattering. Default None: chosen by the albedos of the starting scene.
     - `solver`: a Gauss-Newton method of optimistix. Default: Levenberg-Marquardt. A fit also ends where a
-      Gauss-Newton step would be below 0.05 standard errors, or where small steps no longer improve it.
+      Gauss-Newton step would be below 0.05 standard errors, or where small steps no longer improve it. With
+      a `Smooth` prior, only the default is admissible: steps are then solved within the bounds.
     - `max_steps`: most simulations, each with its Jacobian, from each start. Default 50.
     - `starts`: number of starting points; the best fit is returned. The first is the scene's own, the others
       are a Latin hypercube over the bounds. Default 1.
@@ -117,6 +118,7 @@ def retrieve(
     lidar = at_fixed_times(lidar)
     data = data_of(observed, time, noise, noise_floor, lidar)
     settled = settle(unknowns, scene)
+    check_solver(solver, settled)
     extra = [] if scale is None else [scale_of(scale, settled)]
     if plan is None:
         plan = plan_for(lidar, scene, settled, data.time, max_orders=max_orders, photons=photons, rays=rays)
@@ -135,6 +137,16 @@ def check_solution(solver: Any, max_steps: float, starts: float) -> tuple[Any, i
     if not isinstance(solver, optx.AbstractGaussNewton):
         raise ValueError(f"solver = {solver!r} is no Gauss-Newton method of optimistix")
     return solver, check_integer("max_steps", max_steps), check_integer("starts", starts)
+
+
+def check_solver(solver: Any, settled: Sequence[Settled]) -> None:
+    """Refuse another solver for profiles, which have their own: see `inversion.descent`."""
+    smooth = [s.name for s in settled if s.smooth is not None]
+    if smooth and solver != SOLVER:
+        raise ValueError(
+            f"solver = {solver!r}, but unknown {smooth[0]!r} has a Smooth prior; admissible with one is the "
+            "default"
+        )
 
 
 def check_progress(progress: object) -> None:
@@ -173,6 +185,9 @@ def retrieval_of(outcome: Outcome, model: Model, settled: list[Settled], scaled:
         reduced_chi2=jnp.asarray(outcome.reduced_chi2),
         second_minimum=jnp.asarray(outcome.second_minimum),
         independent_samples=jnp.asarray(outcome.independent_samples),
+        averaging=jnp.asarray(outcome.averaging),
+        strength=dict(zip(smooth_names(settled), map(jnp.asarray, outcome.strength))),
+        bounds={k: jnp.asarray(v) for k, v in bounds_of(settled).items()},
         converged=outcome.converged,
         status=outcome.status,
         steps=outcome.steps,

@@ -27,6 +27,7 @@ class Errors(NamedTuple):
     - `open`: whether the data do not constrain the unknown.
     - `inverse`: of the information H; zero where no eigenvalue tells.
     - `prior_share`: of the information on each unknown, from 0 (all from the data) to 1 (all from the prior).
+    - `averaging`: H^-1 J^T J, how the estimates follow the truth.
     """
 
     covariance: Float[np.ndarray, "n n"]
@@ -34,14 +35,16 @@ class Errors(NamedTuple):
     open: np.ndarray
     inverse: Float[np.ndarray, "n n"]
     prior_share: Float[np.ndarray, " n"]
+    averaging: Float[np.ndarray, "n n"]
 
 
 def errors_of(
     jacobian: Float[np.ndarray, "data n"],
-    precision: Float[np.ndarray, " n"],
+    precision: Float[np.ndarray, "n n"],
     width: Float[np.ndarray, " n"],
     measured: Float[np.ndarray, " data"],
     deviations: Float[np.ndarray, "batches data"] | None,
+    basis: Float[np.ndarray, "n n"] | None = None,
 ) -> Errors:
     """Covariance at the solution.
 
@@ -51,18 +54,22 @@ def errors_of(
     **Arguments:**
 
     - `jacobian`: whitened, in natural units.
-    - `precision`: of the prior, 0 where there is none.
+    - `precision`: matrix of the prior, 0 where there is none.
     - `width`: of the bounds.
     - `measured`: measurement variance over the variance used for whitening.
     - `deviations`: of each batch from their mean, whitened.
+    - `basis`: columns in which a prior that correlates unknowns is the identity. Default None: there is none.
 
     **Returns:** an `Errors`.
     """
     n = width.size
-    information = jacobian.T @ jacobian + np.diag(precision)
-    scaled = information * np.outer(width, width)
-    opened = np.diag(scaled) < 1.0
-    alone = precision / np.where(precision > 0, np.diag(information), 1.0)
+    basis = np.eye(n) if basis is None else basis
+    data = jacobian.T @ jacobian
+    information = basis.T @ (data + precision) @ basis
+    mixed = np.any(basis != np.diag(np.diag(basis)), axis=0)
+    opened = np.diag(information) * np.where(mixed, 1.0, width) ** 2 < 1.0 - 1e-6
+    own = np.diag(precision)
+    alone = own / np.where(own > 0, own + np.diag(data), 1.0)
     keep = np.flatnonzero(~opened)
     norm = np.sqrt(np.diag(information)[keep])
     value, vector = np.linalg.eigh(information[np.ix_(keep, keep)] / np.outer(norm, norm))
@@ -72,8 +79,9 @@ def errors_of(
     inverse[np.ix_(keep, keep)] = (
         (vector[:, known] / value[known]) @ vector[:, known].T / np.outer(norm, norm)
     )
-    share = np.clip(np.where(opened, alone, np.diag(inverse) * precision), 0.0, 1.0)
-    middle = (jacobian.T * measured) @ jacobian + np.diag(precision)
+    inverse = basis @ inverse @ basis.T
+    share = np.clip(np.where(opened, alone, np.diag(inverse @ precision)), 0.0, 1.0)
+    middle = (jacobian.T * measured) @ jacobian + precision
     covariance = inverse @ middle @ inverse
     simulation = np.zeros((n, n))
     if deviations is not None and len(deviations) > 1:
@@ -85,7 +93,7 @@ def errors_of(
     covariance[:, opened] = 0.0
     covariance[opened, opened] = np.inf
     simulated = np.where(opened, 0.0, np.sqrt(np.diag(simulation)))
-    return Errors(covariance, simulated, opened, inverse, share)
+    return Errors(covariance, simulated, opened, inverse, share, inverse @ data)
 
 
 def correlation_of(covariance: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:

@@ -17,6 +17,10 @@ from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 from jaxlidar import Scene
 from jaxlidar.extend import as_array, check_kind, check_range
 
+from .priors import LogNormal, Smooth
+
+# (mean, standard deviation), or a prior with a name.
+Prior = tuple[Float[Array, "..."], Float[Array, "..."]] | LogNormal | Smooth
 # Least distance of a starting value from a bound, as a share of the bounds' width.
 MARGIN = 0.01
 
@@ -29,43 +33,15 @@ def _as_pair(x: Any) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
     return as_array(low, "lower bound"), as_array(high, "upper bound")
 
 
-@final
-class LogNormal(eqx.Module):
-    """A log-normal prior: a normal distribution of the logarithm of a positive unknown.
-
-    **Arguments:**
-
-    - `median`: in the unknown's own unit, positive, a number or an array.
-    - `spread`: standard deviation of the natural logarithm, positive, a number or an array. For instance, 0.5
-      means within a factor of 1.65 of the median, to one standard deviation.
-
-    **Raises:** ValueError for a `median` or `spread` that is not positive.
-
-    **Example:**
-
-    >>> import jaxlidar as jl
-    >>> import inversion
-    >>> prior = inversion.LogNormal(median=0.3, spread=0.5)
-    >>> unknown = inversion.Unknown(lambda s: s.ground.reflectance, bounds=(0.0, 1.0), prior=prior)
-    >>> print(f"{float(unknown.prior.median):.1f}")
-    0.3
-    """
-
-    median: Float[Array, "..."] = eqx.field(converter=as_array)
-    spread: Float[Array, "..."] = eqx.field(converter=as_array)
-
-    def __check_init__(self):
-        check_range("median", self.median, 0.0, low_open=True)
-        check_range("spread", self.spread, 0.0, low_open=True)
-
-
-def _optional_prior(x: Any) -> tuple[Float[Array, "..."], Float[Array, "..."]] | LogNormal | None:
-    if x is None or isinstance(x, LogNormal):
+def _optional_prior(x: Any) -> Prior | None:
+    if x is None or isinstance(x, LogNormal | Smooth):
         return x
     try:
         mean, std = x
     except (TypeError, ValueError):
-        raise ValueError(f"prior = {x!r} is no LogNormal and no pair (mean, standard deviation)") from None
+        raise ValueError(
+            f"prior = {x!r} is no LogNormal, no Smooth and no pair (mean, standard deviation)"
+        ) from None
     return as_array(mean, "prior mean"), as_array(std, "prior standard deviation")
 
 
@@ -87,8 +63,9 @@ class Unknown(eqx.Module):
     - `bounds`: (low, high) in the unknown's own unit, finite, low below high, numbers or arrays that
       broadcast to the value.
     - `name`: key of the result; needed with `apply`. Default None: the path of `where`.
-    - `prior`: (mean, standard deviation) of a normal prior, numbers or arrays, or a `LogNormal`, which needs
-      bounds of 0 or above. Default None: no prior.
+    - `prior`: (mean, standard deviation) of a normal prior, numbers or arrays, a `LogNormal`, which needs
+      bounds of 0 or above, or a `Smooth`, for profiles: arrays of two values or more along one axis. Default
+      None: no prior.
     - `start`: starting value within the bounds; needed with `apply`. Default None: the scene's value.
     - `apply`: a function `apply(scene, value) -> scene`, given instead of `where`, for values that change
       several arrays at once. It must be differentiable and keep the tree structure of the scene. Unknowns are
@@ -119,9 +96,7 @@ class Unknown(eqx.Module):
     where: str | Callable[[Any], Any] | None = eqx.field(static=True, default=None)
     bounds: tuple[Float[Array, "..."], Float[Array, "..."]] = eqx.field(converter=_as_pair, kw_only=True)
     name: str | None = eqx.field(static=True, default=None, kw_only=True)
-    prior: tuple[Float[Array, "..."], Float[Array, "..."]] | LogNormal | None = eqx.field(
-        converter=_optional_prior, default=None, kw_only=True
-    )
+    prior: Prior | None = eqx.field(converter=_optional_prior, default=None, kw_only=True)
     start: Float[Array, "..."] | None = eqx.field(converter=_optional_array, default=None, kw_only=True)
     apply: Callable[[Scene, Array], Scene] | None = eqx.field(static=True, default=None, kw_only=True)
 
@@ -143,7 +118,7 @@ class Unknown(eqx.Module):
         if isinstance(self.prior, LogNormal):
             # Zero is admissible: the bijection never reaches the bounds.
             check_range(f"{called}: lower bound, with a log-normal prior,", low, 0.0)
-        elif self.prior is not None:
+        elif isinstance(self.prior, tuple):
             check_range(f"{called}: prior mean", self.prior[0])
             check_range(f"{called}: prior standard deviation", self.prior[1], 0.0, low_open=True)
 
@@ -163,7 +138,7 @@ class Place(NamedTuple):
 class Settled(NamedTuple):
     """An unknown of a given scene. Arrays have the value's shape, in double precision (`start`: JAX's).
 
-    `prior`: mean and standard deviation, of the logarithm where `log_prior`.
+    `prior`: mean and standard deviation, of the logarithm where `log_prior`. `smooth`: a smoothness prior.
     """
 
     name: str
@@ -173,24 +148,7 @@ class Settled(NamedTuple):
     high: np.ndarray
     prior: tuple[np.ndarray, np.ndarray] | None
     log_prior: bool = False
-
-
-class Priors:
-    """Residuals that the priors of all unknowns add to a fit."""
-
-    def __init__(self, settled: Sequence[Settled]):
-        def flat(pick: Callable[[Settled], np.ndarray]) -> np.ndarray:
-            return np.concatenate([np.ravel(pick(s)) for s in settled])
-
-        self.mean = flat(lambda s: np.zeros_like(s.low) if s.prior is None else s.prior[0])
-        self.weight = flat(lambda s: np.zeros_like(s.low) if s.prior is None else 1.0 / s.prior[1])
-        self.log = flat(lambda s: np.full(s.low.shape, s.log_prior))
-
-    def __call__(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """One residual for each value, in standard deviations, and its derivative in the value."""
-        positive = np.where(self.log, np.maximum(values, 1e-300), 1.0)
-        shown = np.where(self.log, np.log(positive), values)
-        return (shown - self.mean) * self.weight, self.weight / positive
+    smooth: Smooth | None = None
 
 
 def settle(unknowns: Sequence[Unknown], scene: Scene) -> list[Settled]:
@@ -231,13 +189,22 @@ def _settle_one(u: Unknown, scene: Scene, optical: frozenset[int]) -> Settled:
     assert name is not None
     assert start is not None
     low, high = (np.asarray(_broadcast(name, "bounds", b, start.shape), float) for b in u.bounds)
-    prior, log_prior = None, isinstance(u.prior, LogNormal)
-    if u.prior is not None:
+    prior, log_prior, smooth = None, isinstance(u.prior, LogNormal), None
+    if isinstance(u.prior, Smooth):
+        smooth = u.prior
+        if not (start.size > 1 and max(start.shape) == start.size):
+            raise ValueError(
+                f"unknown {name!r} has the shape {start.shape}; admissible with a Smooth prior are two "
+                "values or more along one axis"
+            )
+        if smooth.mean is not None:
+            _broadcast(name, "mean", smooth.mean, start.shape)
+    elif u.prior is not None:
         pair = (u.prior.median, u.prior.spread) if isinstance(u.prior, LogNormal) else u.prior
         mean, std = (np.asarray(_broadcast(name, "prior", p, start.shape), float) for p in pair)
         prior = np.log(mean) if log_prior else mean, std
     place = Place(number, u.apply, not touched <= optical)
-    return start_from(Settled(name, place, start, low, high, prior, log_prior), start)
+    return start_from(Settled(name, place, start, low, high, prior, log_prior, smooth), start)
 
 
 def start_from(unknown: Settled, start: Array) -> Settled:
@@ -341,17 +308,6 @@ def put(scene: Scene, places: tuple[Place, ...], values: tuple[Array, ...]) -> S
             leaves[place.leaf] = value
             scene = jax.tree.unflatten(structure, leaves)
     return scene
-
-
-def inside(z: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Value at a free parameter, and its derivative."""
-    share = 0.5 * (1.0 + np.tanh(0.5 * z))
-    return low + (high - low) * share, (high - low) * share * (1.0 - share)
-
-
-def outside(value: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Free parameter of a value within its bounds: the inverse of `inside`."""
-    return np.log(value - low) - np.log(high - value)
 
 
 def latin_hypercube(

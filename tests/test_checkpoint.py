@@ -35,6 +35,8 @@ def row(number, **changes):
         reduced_chi2=1.25,
         second_minimum=np.inf,
         independent_samples=17.5,
+        averaging=np.diag([0.9, 0.0]),
+        strength=np.zeros(0),
         converged=True,
         steps=4,
         fitted=np.linspace(0.0, 1.0, 30)[None],

@@ -73,6 +73,7 @@ MADE = {
     "jaxlidar.io.Case": jl.io.Case(LIDAR, SCENE, jax.random.key(0), {"rtol": 0.1}),
     "inversion.LogNormal": inversion.LogNormal(0.3, 0.5),
     "inversion.Progress": inversion.Progress(1, 2, 1),
+    "inversion.Smooth": inversion.Smooth(4.0, spacing=1.5, mean=[0.1, 0.2]),
     "inversion.Step": inversion.Step(1, 2.0, True, {"a": np.ones(2)}),
     "inversion.Unknown": inversion.Unknown("ground.height", bounds=(0.0, 1.0)),
 }
@@ -126,7 +127,8 @@ def fit():
     matrix, more = jax.numpy.ones((1, 1)), {"steps": 3, "history": (1.0,), "labels": ("<height>",)}
     return inversion.Retrieval(
         values, values, values, values, {"<height>": values["<height>"] > 1.0}, values, matrix, matrix, SCENE,
-        wave, 0.5 + 0 * wave.reflectance, matrix[0, 0], matrix[0, 0], matrix[0, 0],
+        wave, 0.5 + 0 * wave.reflectance, matrix[0, 0], matrix[0, 0], matrix[0, 0], matrix, {},
+        {"<height>": jax.numpy.array([0.0, 1.0])},
         converged=True, status="done", **more,
     )  # fmt: skip
 

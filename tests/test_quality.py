@@ -71,6 +71,7 @@ SOUND = types.SimpleNamespace(
     reduced_chi2=np.array(1.2),
     independent_samples=np.array(40.0),
     second_minimum=np.array(np.inf),
+    strength={},
     converged=True,
 )
 
@@ -108,7 +109,7 @@ def test_checks_of_a_fit(quality, reason, changes):
 
 def test_prior_share_is_that_of_the_information():
     jacobian = np.array([[2.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-    share = errors_of(jacobian, np.array([0.0, 3.0, 5.0]), np.full(3, 10.0), np.ones(2), None).prior_share
+    share = errors_of(jacobian, np.diag([0.0, 3.0, 5.0]), np.full(3, 10.0), np.ones(2), None).prior_share
     np.testing.assert_allclose(share, [0.0, 0.75, 1.0])
 
 
@@ -151,7 +152,7 @@ def test_robust_errors_are_those_of_many_draws(phi):
     for _ in range(80):
         noise = draws(rng, phi)
         values = inverse @ (jacobian.T @ noise)
-        misfit = misfit_of(noise - jacobian @ values, jacobian, np.zeros(3), 3.0, np.ones(100), place)
+        misfit = misfit_of(noise - jacobian @ values, jacobian, np.zeros((3, 3)), 3.0, np.ones(100), place)
         found.append(values)
         stated.append(np.diag(inverse @ misfit.middle @ inverse))
     spread = np.std(found, axis=0)
@@ -166,7 +167,7 @@ def test_gaps_and_wavelengths_count_as_such():
     residual = draws(rng, 0.9, 100)
 
     def misfit(*place):
-        return misfit_of(residual, ones, np.zeros(1), 1.0, np.ones(100), place)
+        return misfit_of(residual, ones, np.zeros((1, 1)), 1.0, np.ones(100), place)
 
     dense = misfit(one, bins)
     assert dense.samples < 40
@@ -180,7 +181,7 @@ def test_unseen_and_collinear_unknowns_have_finite_middles():
     rng, place = np.random.default_rng(7), (np.zeros(50, int), np.arange(50))
     wave, none = rng.normal(size=50), np.zeros(50)
     jacobian = np.stack([wave, 2.0 * wave, none, none], axis=1)
-    found = misfit_of(rng.normal(size=50), jacobian, np.array([0, 0, 0, 1e12]), 2.0, np.ones(50), place)
+    found = misfit_of(rng.normal(size=50), jacobian, np.diag([0, 0, 0, 1e12]), 2.0, np.ones(50), place)
     assert np.all(np.isfinite(found.middle))
     assert 0 < found.samples <= 50
 

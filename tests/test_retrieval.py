@@ -15,8 +15,9 @@ import jaxlidar as jl
 from inversion import Unknown
 from inversion.model import Model
 from inversion.planning import corners, plan_for
+from inversion.priors import inside, outside
 from inversion.uncertainty import errors_of
-from inversion.unknowns import inside, optical_leaves, outside, settle
+from inversion.unknowns import optical_leaves, settle
 from jaxlidar.planning.plan import MIN_BATCHES
 
 LIDAR = jl.Lidar(
@@ -397,16 +398,16 @@ def test_errors_of_a_linear_problem():
     rng = np.random.default_rng(0)
     a, b = rng.normal(size=(2, 50))
     jacobian = np.stack([a, b, 2.0 * b], axis=1)
-    errors = errors_of(jacobian, np.zeros(3), np.full(3, 10.0), np.ones(50), None)
+    errors = errors_of(jacobian, np.zeros((3, 3)), np.full(3, 10.0), np.ones(50), None)
     assert errors.open.tolist() == [False, True, True]
     expected = np.linalg.inv(jacobian[:, :2].T @ jacobian[:, :2])[0, 0]
     assert errors.covariance[0, 0] == pytest.approx(expected)
-    errors = errors_of(jacobian, np.array([0.0, 0.0, 4.0]), np.full(3, 10.0), np.ones(50), None)
+    errors = errors_of(jacobian, np.diag([0.0, 0.0, 4.0]), np.full(3, 10.0), np.ones(50), None)
     full = np.linalg.inv(jacobian.T @ jacobian + np.diag([0.0, 0.0, 4.0]))
     np.testing.assert_allclose(errors.covariance, full, atol=1e-12)
     # Batches that deviate as the first column does, with variance 8: their mean has the variance 1.
     deviations = np.outer(np.tile([1.0, -1.0], 4) * np.sqrt(7.0), a)
-    errors = errors_of(a[:, None], np.zeros(1), np.full(1, 10.0), np.zeros(50), deviations)
+    errors = errors_of(a[:, None], np.zeros((1, 1)), np.full(1, 10.0), np.zeros(50), deviations)
     assert errors.simulation[0] == pytest.approx(1.0)
     assert errors.covariance[0, 0] == pytest.approx(1.0)
 
@@ -456,7 +457,7 @@ def unknown(where=lambda s: s.ground.height, **changes):
         (unknown(bounds=3.0), "not a pair"),
         (unknown(bounds=((0.0, 1.0), 2.0)), "does not broadcast"),
         (unknown(prior=(0.0, 0.0)), "prior standard deviation = 0"),
-        (unknown(prior=1.0), "prior = 1.0 is no LogNormal"),
+        (unknown(prior=1.0), "prior = 1.0 is no LogNormal, no Smooth"),
         (unknown("ground.hight"), "where = 'ground.hight' is no array .* nearest are 'ground.height'"),
         (unknown(lambda s: s.canopy.leaf.Cab), "where picks nothing in this scene"),
         (unknown(lambda s: s.canopy), r"where picks nothing \(None\)"),
