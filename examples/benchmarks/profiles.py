@@ -71,7 +71,8 @@ def draw(random: np.random.Generator, slope: float) -> dict:
         "slope": abs(random.normal(slope, SPREAD["slope"])),
         "height": random.normal(0.0, SPREAD["height"]),
         "soil": SOIL * np.exp(SPREAD["reflectance"] * random.normal()),
-        "leaf": LEAF * np.exp(SPREAD["reflectance"] * random.normal()),
+        # What leaves reflect and transmit is at most all.
+        "leaf": min(LEAF * np.exp(SPREAD["reflectance"] * random.normal()), 0.6),
     }
 
 
@@ -103,11 +104,13 @@ def unknowns(slope: float | None) -> list[Unknown]:
     ]
 
 
-def recorded(stands: list[dict], orders: int, columns: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def recorded(
+    stands: list[dict], orders: int, columns: int, window=WINDOW
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Waveforms without noise, their times and heights."""
     steep = stand(np.ones(LAYERS), 38.0 if columns > 1 else 0.0, columns=columns)
     size = {"n_rays": 4096, "n_photons": 2**18} if columns > 1 else {"n_rays": 8, "n_photons": 8}
-    plan = jl.plan(LIDAR, steep, max_orders=orders, window=WINDOW, **size)
+    plan = jl.plan(LIDAR, steep, max_orders=orders, window=window, **size)
     waves = []
     for i, own in enumerate(stands):
         scene = stand(own["density"], own["slope"], own["height"], own["soil"], own["leaf"], columns)
@@ -144,21 +147,31 @@ def compare(given, slope: float, number: int, orders: int, ratios: tuple[float, 
     start = stand(np.full(LAYERS, 0.1), max(slope, 3.0))
     largest = stand(np.full(LAYERS, 0.1), 45.0)
     plan = jl.plan(LIDAR, largest, max_orders=1, window=WINDOW, n_rays=RAYS // 8)
-    begun = time.perf_counter()
-    fits = inversion.retrieve_many(
-        observed[:, None],
-        LIDAR,
-        start,
-        unknowns(slope),
-        noise=sigma[:, None, None],
-        time=times,
-        key=jax.random.key(7),
-        plan=plan,
-        lanes=4,
-        path=given.out / f"profiles_{slope:g}_{orders}_{number}.sqlite",
-        progress=lambda p: print(f"\r{slope:g} degrees, orders {orders}: {p}", end="", flush=True),
-    )
-    seconds = (time.perf_counter() - begun) / len(rows)
+
+    def fit(some: slice, path=None) -> inversion.Retrievals:
+        return inversion.retrieve_many(
+            observed[some, None],
+            LIDAR,
+            start,
+            unknowns(slope),
+            noise=sigma[some, None, None],
+            time=times,
+            key=jax.random.key(7),
+            plan=plan,
+            lanes=4,
+            path=path,
+            progress=lambda p: print(f"\r{slope:g} degrees, orders {orders}: {p}", end="", flush=True),
+        )
+
+    fits = fit(slice(None), given.out / f"profiles_{slope:g}_{orders}_{number}.sqlite")
+    # Some once more, which are not in the file: all is compiled once they begin.
+    few = slice(0, len(rows), number) if slope == SLOPES[1] else slice(0)
+    seconds = 0.0
+    if len(range(*few.indices(len(rows)))) and orders == 1:
+        fit(few)
+        begun = time.perf_counter()
+        fit(few)
+        seconds = (time.perf_counter() - begun) / len(range(*few.indices(len(rows))))
     print()
     low, high = fits.band("plants")
     kernel = fits.averaging_kernel("plants", THICK)
@@ -201,11 +214,12 @@ def batch(number: int) -> dict:
     """Seconds of many profiles on level ground."""
     random = np.random.default_rng(99)
     stands = [draw(random, 0.0) | {"slope": 0.0} for _ in range(number)]
-    clean, times, _ = recorded(stands, 1, 1)
+    window = (-240.0, 50.0)
+    clean, times, _ = recorded(stands, 1, 1, window)
     sigma = clean.max(axis=1) / 30.0
     observed = clean + sigma[:, None] * random.normal(size=clean.shape)
     start = stand(np.full(LAYERS, 0.1), columns=1)
-    plan = jl.plan(LIDAR, start, max_orders=1, window=WINDOW, n_rays=1)
+    plan = jl.plan(LIDAR, start, max_orders=1, window=window, n_rays=1)
 
     def fit(some: slice) -> inversion.Retrievals:
         return inversion.retrieve_many(
@@ -260,13 +274,14 @@ def summary(rows: list[dict]) -> dict:
         "resolution": float(np.median(of("resolution"))),
         "converged": float(np.mean(of("converged"))),
         "steps": float(np.mean(of("steps"))),
-        "seconds": float(np.mean(of("seconds"))),
+        "seconds": float(np.max(of("seconds"))),
     }
 
 
 def main() -> dict:
     given = options("Vertical profiles.", stands=12, batch=1000, scattered=6)
     given.out.mkdir(parents=True, exist_ok=True)
+    many = batch(given.batch)
     rows = [r for slope in SLOPES for r in compare(given, slope, given.stands, 1, RATIOS)]
     scattered = [r for slope in SLOPES for r in compare(given, slope, given.scattered, ORDERS, (30.0,))]
     cells = [
@@ -284,7 +299,7 @@ def main() -> dict:
         "cells": cells,
         "scattered": summary(scattered),
         "orders": ORDERS,
-        "batch": batch(given.batch),
+        "batch": many,
         "rows": [{k: v for k, v in r.items() if k not in ("profile", "band")} for r in rows + scattered],
     }
     names = ("slope", "ratio", "fit", "closed", "better", "better_than_true_ratio", "covered", "resolution")
