@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, final
+from typing import TYPE_CHECKING, Any, final
 
 import equinox as eqx
 import numpy as np
@@ -234,7 +234,8 @@ class Priors:
                 return self._deviance(values, data, pull, tried)
 
             near = np.log(np.clip(block.strength * np.array([1.0 / _LEAP, _LEAP]), *block.range))
-            strengths[i] = np.exp(optimize.minimize_scalar(deviance, bounds=near, method="bounded").x)
+            found: Any = optimize.minimize_scalar(deviance, bounds=near, method="bounded")
+            strengths[i] = np.exp(found.x)
         return strengths
 
     def _deviance(

@@ -63,10 +63,10 @@ def errors_of(
     **Returns:** an `Errors`.
     """
     n = width.size
-    basis = np.eye(n) if basis is None else basis
+    columns = np.eye(n) if basis is None else basis
     data = jacobian.T @ jacobian
-    information = basis.T @ (data + precision) @ basis
-    mixed = np.any(basis != np.diag(np.diag(basis)), axis=0)
+    information = columns.T @ (data + precision) @ columns
+    mixed = np.any(columns != np.diag(np.diag(columns)), axis=0)
     opened = np.diag(information) * np.where(mixed, 1.0, width) ** 2 < 1.0 - 1e-6
     own = np.diag(precision)
     alone = own / np.where(own > 0, own + np.diag(data), 1.0)
@@ -79,7 +79,7 @@ def errors_of(
     inverse[np.ix_(keep, keep)] = (
         (vector[:, known] / value[known]) @ vector[:, known].T / np.outer(norm, norm)
     )
-    inverse = basis @ inverse @ basis.T
+    inverse = columns @ inverse @ columns.T
     share = np.clip(np.where(opened, alone, np.diag(inverse @ precision)), 0.0, 1.0)
     middle = (jacobian.T * measured) @ jacobian + precision
     covariance = inverse @ middle @ inverse

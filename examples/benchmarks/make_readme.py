@@ -300,8 +300,8 @@ def profiles(record: dict) -> str:
     return page_of(
         f"Profiles of {record['layers']} layers of {record['thickness']:g} m from simulated GEDI-like "
         "waveforms, by fits with a smoothness prior and by the closed-form gap inversion of level 2B, which "
-        "is told the ground's true height and where the signal ends. Errors are root mean squares over layers "
-        f"in m2/m3, medians over {record['stands']} stands.",
+        "is told the ground's true height and where the signal ends. Errors are root mean squares over layers"
+        f" in m2/m3, medians over {record['stands']} stands.",
         table(
             (
                 "slope",
@@ -316,8 +316,8 @@ def profiles(record: dict) -> str:
             ),
             rows,
         ),
-        f"Of all {every['profiles']} profiles, the fit is better in {percent(every['better'])}, in the median "
-        f"by a factor of {number(every['factor'])}; in {percent(every['better_than_true_ratio'])} by "
+        f"Of all {every['profiles']} profiles, the fit is better in {percent(every['better'])}, in the median"
+        f" by a factor of {number(every['factor'])}; in {percent(every['better_than_true_ratio'])} by "
         f"{number(every['factor_true_ratio'])} where the closed form is told the true ratio of reflectances. "
         f"Total plant area is off by {number(every['area_error'])} (closed form "
         f"{number(every['area_error_closed'])}); {percent(every['converged'])} of the fits converged, after "
