@@ -14,6 +14,11 @@ that its sampling resolves. A recorded pulse has errors of its own. They are cou
 times the amplitude that the energy within a pulse's length would have as one echo; so the rest that an
 imperfect pulse leaves of a strong echo is not taken for weak ones.
 
+Free parameters are smooth bijections of what they stand for, so that no echo leaves the record: its place
+lies between the first and the last sample that count, and its height, broadened, between zero and the highest
+that the record supports, one standard deviation above a sample. Noise in proportion to the signal has next
+to no weight where the signal is strong: without the bounds, echoes grow there beyond any sample.
+
 Derivatives are those for the number of echoes found.
 """
 
@@ -40,6 +45,10 @@ _WIDTHS = {"gaussian": (0.5, 8.0), "copies": (0.5, 8.0), "broadened": (0.1, 8.0)
 # ... from which their fits start, and how much an echo costs, in ln(bins).
 _START = {"gaussian": 1.0, "copies": 1.0, "broadened": 0.4}
 _COST = {"gaussian": 3, "copies": 3, "broadened": 4}
+# An echo is at most so many standard deviations above the record; fits start at this share from bounds.
+_ABOVE, _MARGIN = 1.0, 0.01
+# Noise below this share of the largest sample counts as much: so finely models are computed.
+_ROUNDING = 1e-4
 
 Free = Float[Array, "echoes 3"]
 On = Bool[Array, " echoes"]
@@ -93,14 +102,16 @@ def gaussian_decomposition(
 
     System pulses are no Gaussians: where the pulse was recorded, give it, or a hard target will have two
     echoes or more. Records are padded to a ladder of sizes (64, 96, 128, 192, ... bins); each is compiled
-    once, for each number of records. No echo is negative, and none lies outside the record.
+    once, for each number of records. No echo is negative, none lies outside the record, and none is higher
+    than the record by one standard deviation of its noise. Where a record begins or ends within an echo,
+    what is seen of it is an echo at that end.
 
     **Arguments:**
 
     - `time`: (bins,) ns, increasing in equal steps.
     - `power`: (bins,) record in any unit, background removed; or (shots, bins).
     - `noise`: standard deviation of `power`, above 0: one number, or of the shape of `power`. Where it is
-      infinite, samples do not count.
+      infinite, samples do not count. Below 1e-4 of the largest sample it counts as that.
     - `width`: for Gaussian echoes: standard deviation of the pulse in ns, above 0. Widths of echoes start
       from it and end between half of it and eight times it.
     - `pulse`: for copies: a recorded pulse, or the system's impulse, at the record's sampling, (lags,), an
@@ -246,15 +257,28 @@ def _decompose(
     used = weight > 0
     count, first, last = jnp.sum(used), jnp.argmax(used), y.size - 1 - jnp.argmax(used[::-1])
     log_n = jnp.log(jnp.maximum(count, 2).astype(y.dtype))
+    y = jnp.where(used, y, 0.0)
     scale = jnp.maximum(jnp.max(jnp.abs(y)), jnp.finfo(y.dtype).tiny)
+    weight = jnp.where(used, weight / jnp.sqrt(1.0 + (_ROUNDING * scale * weight) ** 2), 0.0)
+    # A peak between two samples is higher than both.
+    narrow = shapes.width * (_WIDTHS[kind][0] if kind == "gaussian" else 1.0)
+    between = jnp.exp(0.125 / jnp.maximum(narrow, 0.5) ** 2)
+    highest = between * jnp.max(jnp.where(used, y + _ABOVE / jnp.where(used, weight, 1.0), 0.0))
+    highest = jnp.maximum(highest, jnp.finfo(y.dtype).tiny)
     low, high = (jnp.log(jnp.asarray(end, y.dtype)) for end in _WIDTHS[kind])
-    share = (jnp.log(_START[kind]) - low) / (high - low)
-    own = jnp.log(share) - jnp.log1p(-share)
+    own = _free((jnp.log(_START[kind]) - low) / (high - low))
+    length = jnp.maximum(last - first, 1).astype(y.dtype)
+    # In the middle of the record one unit is a width.
+    stretch = 4.0 * shapes.width / length
+    far = _free(jnp.ones(3, y.dtype))[None, :] * jnp.stack([0.5, 1.0 / stretch, 1.0])[None, :]
 
     def unpack(p: Free) -> tuple[Array, Array, Array]:
         """Amplitude, place and width, in samples, out of free parameters of order one."""
         wide = jnp.exp(low + (high - low) * jax.nn.sigmoid(p[:, 2])) * shapes.width
-        return scale * p[:, 0], shapes.width * p[:, 1], jnp.zeros_like(wide) if kind == "copies" else wide
+        height, centre = highest * jax.nn.sigmoid(p[:, 0]), first + length * jax.nn.sigmoid(stretch * p[:, 1])
+        if kind == "broadened":
+            height *= jnp.hypot(1.0, wide / shapes.width)
+        return height, centre, jnp.zeros_like(wide) if kind == "copies" else wide
 
     def model(p: Free, on: On) -> Array:
         a, centre, wide = unpack(p)
@@ -262,6 +286,19 @@ def _decompose(
 
     def residual(p: Free, on: On) -> Array:
         return (model(p, on) - y) * weight
+
+    def errors(a: Array, centre: Array, wide: Array, on: On) -> Array:
+        """(echoes, 3) standard errors of amplitude, place and width, in samples."""
+        unit = jnp.stack([highest, shapes.width, shapes.width])
+
+        def scaled(q: Free) -> Array:
+            a, centre, wide = (q * unit[None, :]).T
+            return shapes.model(jnp.where(on, a, 0.0), centre, wide) * weight
+
+        return (
+            _errors(scaled, jnp.stack([a, centre, wide], axis=1) / unit[None, :], on, kind == "copies")
+            * unit[None, :]
+        )
 
     none = jnp.sum((y * weight) ** 2)
     nothing = _State(jnp.zeros((most, 3), y.dtype), jnp.zeros(most, bool), none, none)
@@ -271,15 +308,14 @@ def _decompose(
         matched, norm = shapes.seed(y - model(p, on), weight)
         norm = jnp.maximum(norm, jnp.finfo(y.dtype).tiny)
         best = jnp.argmax(jnp.where(used, matched / jnp.sqrt(norm), -jnp.inf))
-        p = p.at[k].set(jnp.stack([matched[best] / norm[best] / scale, best / shapes.width, own]))
+        begin = [_free(matched[best] / norm[best] / highest), _free((best - first) / length) / stretch, own]
+        # Far out the bijections are flat: what an echo fewer had pushed there would stay.
+        p = jnp.clip(p, -far, far).at[k].set(jnp.stack(begin))
         on = on.at[k].set(True)
         fitted = optx.least_squares(residual, _SOLVER, p, args=on, max_steps=_STEPS, throw=False).value
         p = jnp.where(jnp.all(jnp.isfinite(fitted)), fitted, p)
         chi2 = jnp.sum(residual(p, on) ** 2)
-        # Echoes are returns of what was recorded: none may be negative, or outside.
-        a, centre, _ = unpack(p)
-        sound = jnp.all(jnp.where(on, (a > 0) & (centre >= first) & (centre <= last), True))
-        return _State(p, on, chi2, jnp.where(sound, chi2 + _COST[kind] * (k + 1) * log_n, jnp.inf))
+        return _State(p, on, chi2, chi2 + _COST[kind] * (k + 1) * log_n)
 
     def step_on(carry: tuple[_State, _State, Array], k: Array) -> tuple[tuple[_State, _State, Array], None]:
         last, best, failed = carry
@@ -304,7 +340,7 @@ def _decompose(
         amplitude=jnp.where(on, a, 0.0),
         time=jnp.where(on, centre * step, 0.0),
         width=jnp.where(on, wide * step, 0.0),
-        stderr=jnp.where(on[:, None], _errors(residual, unpack, p, on, kind) * _units(step, y.dtype), 0.0),
+        stderr=jnp.where(on[:, None], errors(a, centre, wide, on) * _units(step, y.dtype), 0.0),
         count=jnp.sum(on),
         model=model(p, on),
         chi2=found.chi2,
@@ -316,13 +352,22 @@ def _units(step: Array, kind: Any) -> Array:
     return jnp.stack([jnp.ones((), kind), step, step])[None, :]
 
 
-def _errors(residual: Callable, unpack: Callable, p: Free, on: On, kind: str) -> Array:
-    """(echoes, 3) standard errors of amplitude, place and width, in samples."""
-    columns = jax.jacfwd(residual)(p, on).reshape(-1, p.size)
+def _errors(whitened: Callable, q: Free, on: On, without_width: bool) -> Array:
+    """(echoes, 3) standard errors of the parameters of a whitened model."""
+    columns = jax.jacfwd(whitened)(q).reshape(-1, q.size)
     # Parameters that do nothing have no column; one on their diagonal keeps the inverse.
-    free = jnp.asarray([1.0, 1.0, 0.0 if kind == "copies" else 1.0], p.dtype)
+    free = jnp.asarray([1.0, 1.0, 0.0 if without_width else 1.0], q.dtype)
     idle = 1.0 - jnp.where(on, 1.0, 0.0)[:, None] * free[None, :]
+    columns = columns * (1.0 - idle.reshape(1, -1))
+    size = jnp.sqrt(jnp.sum(columns**2, axis=0))
+    size = jnp.where(size > 0, size, 1.0)
+    columns = columns / size[None, :]
     variance = jnp.diagonal(jnp.linalg.pinv(columns.T @ columns + jnp.diag(idle.reshape(-1))))
-    slopes = jax.vmap(jax.jacfwd(lambda q: jnp.stack([part[0] for part in unpack(q[None])])))(p)
-    natural = jnp.diagonal(slopes, axis1=1, axis2=2)
-    return jnp.sqrt(jnp.maximum(variance, 0.0)).reshape(-1, 3) * natural
+    errors = (jnp.sqrt(jnp.maximum(variance, 0.0)) / size).reshape(-1, 3)
+    return jnp.where(idle > 0, 0.0, errors)
+
+
+def _free(share: Array) -> Array:
+    """The free parameter of a share of what bounds leave, at a margin from them."""
+    share = jnp.clip(share, _MARGIN, 1.0 - _MARGIN)
+    return jnp.log(share) - jnp.log1p(-share)

@@ -110,3 +110,42 @@ def test_samples_of_infinite_noise_do_not_count():
 def test_bad_input_is_refused(settings, says):
     with pytest.raises(ValueError, match=says):
         gaussian_decomposition(TIME, TIME, noise=1.0, **settings)
+
+
+def proportional(count, seed):
+    """Records of up to three echoes, some of which lie beyond the ends, with noise in proportion to them."""
+    random = np.random.default_rng(seed)
+    echoes, place = random.uniform(0.1, 1.0, (count, 3)), random.uniform(-3.0, 62.0, (count, 3))
+    echoes *= np.arange(3) < random.integers(1, 4, (count, 1))
+    time = np.arange(60.0)
+    shape = np.exp(-0.5 * ((time - place[..., None]) / 2.5) ** 2)
+    clean = np.einsum("re,ret->rt", echoes, shape)
+    noise = random.choice([0.02, 0.05, 0.1], (count, 1)) * clean + 1e-9
+    return clean + noise * random.normal(size=clean.shape), noise
+
+
+def inside(found, power, noise):
+    """Whether all echoes lie within their records, none of them higher than the noise allows."""
+    on = np.arange(np.shape(found.time)[-1]) < np.asarray(found.count)[:, None]
+    top = np.max(power + noise, axis=1, keepdims=True)
+    sane = (np.asarray(found.time) >= 0) & (np.asarray(found.time) <= power.shape[1] - 1)
+    # A peak between samples is higher than both: of half the pulse's width, by so much.
+    return np.all(~on | (sane & (np.asarray(found.amplitude) <= 1.1 * top)), axis=1)
+
+
+@pytest.mark.parametrize("count", [200, pytest.param(4000, marks=pytest.mark.slow)])
+def test_no_echo_leaves_its_record_with_noise_in_proportion(count):
+    power, noise = proportional(count, 8)
+    lag, time = np.arange(-20.0, 21.0), np.arange(60.0)
+    pulse = np.exp(-0.5 * (lag / 2.5) ** 2)
+    for kind in ({"width": 2.5}, {"pulse": pulse, "broaden": False}):
+        found = gaussian_decomposition(time, power, noise=noise, **kind, max_echoes=4)
+        assert np.all(inside(found, power, noise))
+        # A strong echo is never lost to the bounds.
+        lit = np.max(power[:, 5:-5], axis=1) > 0.1
+        assert np.all(np.asarray(found.count)[lit] > 0)
+    # Echoes that ran away are seen by the measure.
+    far = found._replace(time=found.time.at[0, 0].set(61.0))
+    high = found._replace(amplitude=found.amplitude.at[1, 0].set(2.0 * float(power[1].max())))
+    assert not inside(far, power, noise)[0]
+    assert not inside(high, power, noise)[1]
