@@ -2,23 +2,27 @@
 
 from . import files
 from .batch import Progress, Retrievals, retrieve_many
+from .counts import Amplitudes, amplitudes
 from .cover import GroundAndCanopy, gap_probability, ground_and_canopy, plant_area_index, plant_area_profile
 from .decomposition import Echoes, gaussian_decomposition
 from .deconvolution import richardson_lucy, wiener
 from .gedi import GediMetrics, GediSettings, gedi_metrics, gedi_settings
 from .heights import SignalEnds, find_ground, relative_heights, signal_ends
 from .identifiability import CramerRao, Profile, cramer_rao, profile_likelihood
+from .impulse import receiver_impulse, recorded_pulse
 from .leaves import LeafFit, invert_leaves
 from .photons import PhotonHeights, photon_ground_and_canopy
 from .points import EchoPoints, echo_points
 from .priors import LogNormal, Smooth
 from .profiles import AveragingKernel, put_profile
 from .quality import Verdict, judge_fit, judge_fits, judge_record
+from .recorder import Recorder
 from .result import Retrieval, Step
 from .retrieval import retrieve
 from .unknowns import Unknown
 
 __all__ = [
+    "Amplitudes",
     "AveragingKernel",
     "CramerRao",
     "EchoPoints",
@@ -31,6 +35,7 @@ __all__ = [
     "PhotonHeights",
     "Profile",
     "Progress",
+    "Recorder",
     "Retrieval",
     "Retrievals",
     "SignalEnds",
@@ -38,6 +43,7 @@ __all__ = [
     "Step",
     "Unknown",
     "Verdict",
+    "amplitudes",
     "cramer_rao",
     "echo_points",
     "files",
@@ -56,6 +62,8 @@ __all__ = [
     "plant_area_profile",
     "profile_likelihood",
     "put_profile",
+    "receiver_impulse",
+    "recorded_pulse",
     "relative_heights",
     "retrieve",
     "retrieve_many",

@@ -30,6 +30,7 @@ from .lanes import Lanes
 from .planning import batch_sizes, check_samples, plan_for
 from .profiles import AveragingKernel, averaging_kernel_of, band_of
 from .quality import Verdict, judge_fits
+from .recorder import Recorder, check_names, settled_terms
 from .retrieval import SOLVER, check_progress, check_solution, check_solver, scale_of
 from .unknowns import Settled, Unknown, settle, start_from
 
@@ -203,6 +204,7 @@ def retrieve_many(
     starts: float = 1,
     start: Mapping[str, ArrayLike | Sequence] | None = None,
     scale: tuple[float, float] | None = None,
+    recorder: Recorder | Sequence[Recorder] | None = None,
     noise_floor: float = 1e-3,
     lanes: int = 16,
     path: str | os.PathLike[str] | None = None,
@@ -222,6 +224,7 @@ def retrieve_many(
     - `time`: (bins,) ns, the same for all footprints.
     - `unknowns`, `key`, `n_photons`, `n_rays`, `max_orders`: as for `retrieve`.
     - `solver`, `max_steps`, `starts`, `scale`, `noise_floor`: as for `retrieve`.
+    - `recorder`: as for `retrieve`, one for all footprints, or one for each, with the same unknowns.
     - `plan`: one for all footprints. Default None: made for the first lidar and scene and the corners of the
       bounds.
     - `start`: by name, (footprints, ...) values that unknowns start from. Default None: their own.
@@ -275,7 +278,10 @@ def retrieve_many(
     data = [data_of(y[i], time, sigma[i], noise_floor, lidars[i % len(lidars)]) for i in range(len(y))]
     axis = data[0].time
     extra = [] if scale is None else [scale_of(scale, settled[0])]
-    names = [*settled[0], *extra]
+    recorders = [None] if recorder is None else _one_each("recorder", recorder, Recorder, len(y))
+    check_names(recorders[0], settled[0])
+    terms = [] if recorders[0] is None else settled_terms(recorders[0])
+    names = [*settled[0], *terms, *extra]
     parts = {
         "observed": y,
         "noise": sigma,
@@ -285,6 +291,7 @@ def retrieve_many(
         "scene": scenes,
         **_parts_of(settled),
         "scale": [(s.low, s.high) for s in extra],
+        "recorder": recorders,
         "key": key,
         "plan": plan,
         # A plan has its own.
@@ -302,7 +309,7 @@ def retrieve_many(
     check_samples(plan, axis)
 
     how = (plan, solver, max_steps, starts, Lanes.of(min(lanes, len(y))))
-    job = Job(range(len(y)), data, lidars, scenes, settled, extra, *how)
+    job = Job(range(len(y)), data, lidars, scenes, settled, extra, recorders, *how)
     frame = Frame(len(y), sum(s.start.size for s in names), y.shape[1:], len(smooth_names(names)))
     with kept_fits(path, {} if path is None else fingerprint(parts), frame) as kept:
         ended = kept.rows

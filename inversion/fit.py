@@ -22,7 +22,9 @@ from .data import Data
 from .descent import descend_within
 from .misfit import misfit_of
 from .model import Evaluation, spread_of
+from .noise import Noise, blocks
 from .priors import Priors, inside, outside
+from .recorder import Terms
 from .result import Step
 from .uncertainty import Errors, correlation_of, decrement, errors_of
 from .unknowns import Settled
@@ -158,12 +160,10 @@ class Point:
     def __init__(self, fit: "Fit", z: np.ndarray, evaluation: Evaluation):
         self.z, self.evaluation = z, evaluation
         self.values, self.slope = inside(z, fit.low, fit.high)
-        self.scale = self.values[-1] if fit.scaled else 1.0
-        simulated, jacobian = self.scale * evaluation.total, self.scale * evaluation.jacobian
-        if fit.scaled:
-            jacobian = np.concatenate([jacobian, evaluation.total[..., None]], axis=-1)
-        self.difference = (simulated - fit.data.observed)[fit.data.used]
-        self.jacobian = jacobian[fit.data.used]
+        self.own = fit.own(self.values)
+        recorded = fit.terms(evaluation.total, evaluation.jacobian, self.own)
+        self.difference = (recorded.total - fit.data.observed)[fit.data.used]
+        self.jacobian = recorded.jacobian[fit.data.used]
         self.finite = bool(np.all(np.isfinite(self.difference)) and np.all(np.isfinite(self.jacobian)))
 
 
@@ -174,53 +174,55 @@ class Fit:
         self,
         data: Data,
         settled: list[Settled],
-        scaled: bool,
+        terms: Terms,
         solver: Any,
         max_steps: int,
         progress: Callable[[Step], None] | None,
         start: np.ndarray | None = None,
     ):
-        self.data, self.settled, self.scaled = data, settled, scaled
+        self.data, self.settled, self.terms = data, [*settled, *terms.settled], terms
         self.solver, self.max_steps, self.progress = solver, max_steps, progress
-        flat = lambda pick: np.concatenate([np.ravel(pick(s)) for s in settled])  # noqa: E731
+        flat = lambda pick: np.concatenate([np.ravel(pick(s)) for s in self.settled])  # noqa: E731
         self.low, self.high = flat(lambda s: s.low), flat(lambda s: s.high)
         self.start = flat(lambda s: np.asarray(s.start, float)) if start is None else start
-        self.prior = Priors(settled)
-        self.sigma = data.sigma[data.used]
+        self.prior = Priors(self.settled)
+        self.noise = Noise(data.sigma[data.used])
         self.count, self.history = 0, []
 
     # -- simulation ------------------------------------------------------------------------------------
 
     def at(self, z: np.ndarray, *, spread: bool = False) -> Generator[Request, Evaluation, Point]:
         values = inside(z, self.low, self.high)[0]
-        evaluation = yield Request(values[:-1] if self.scaled else values, spread)
+        evaluation = yield Request(values[: values.size - self.terms.count], spread)
         return Point(self, z, evaluation)
+
+    def own(self, values: np.ndarray) -> np.ndarray:
+        """Those of the recorder's terms."""
+        return values[values.size - self.terms.count :]
 
     def natural(self, p: Point) -> tuple[np.ndarray, np.ndarray]:
         """Whitened residuals, then those of the priors, and their Jacobian in natural units."""
         off, slope = self.prior(p.values)
-        jacobian = np.concatenate([p.jacobian / self.sigma[:, None], slope])
-        return np.concatenate([p.difference / self.sigma, off]), jacobian
+        jacobian = np.concatenate([self.noise.white(p.jacobian), slope])
+        return np.concatenate([self.noise.white(p.difference), off]), jacobian
 
     def reweigh(self, p: Point) -> float:
-        """Include the simulation's noise at `p` in the weights. **Returns:** their mean relative change."""
-        noise = np.broadcast_to(spread_of(p.evaluation.batches), self.data.sigma.shape)[self.data.used]
-        sigma = np.hypot(self.data.sigma[self.data.used], p.scale * noise)
-        change = float(np.mean(np.abs(sigma / self.sigma - 1.0)))
-        self.sigma = sigma
-        return change
+        """Include the noise of simulation and pulse at `p`. **Returns:** the mean relative change."""
+        used, batches = self.data.used, p.evaluation.batches
+        received = None if batches is None else self.terms.received(batches, p.own)
+        noise = np.broadcast_to(spread_of(received), used.shape)[used]
+        pulse = self.terms.pulse_noise(p.evaluation.total, p.own)
+        before = self.noise.sigma
+        self.noise = Noise(np.hypot(self.data.sigma[used], noise), blocks(pulse, used))
+        return float(np.mean(np.abs(self.noise.sigma / before - 1.0)))
 
     def first(self) -> Generator[Request, Evaluation, Point]:
         z = outside(self.start, self.low, self.high)
         p = yield from self.at(z, spread=True)
-        if self.scaled and p.finite:
-            model, observed = p.evaluation.total[self.data.used], self.data.observed[self.data.used]
-            weight = self.data.sigma[self.data.used] ** -2
-            best = np.sum(weight * model * observed) / max(np.sum(weight * model * model), 1e-30)
-            margin = 0.01 * (self.high[-1] - self.low[-1])
-            best = np.clip(best, self.low[-1] + margin, self.high[-1] - margin)
-            z = outside(np.append(self.start[:-1], best), self.low, self.high)
-            p = Point(self, z, p.evaluation)
+        if self.terms.count and p.finite:
+            best = self.terms.best(p.own, p.evaluation.total, self.data.observed, self.data.sigma)
+            start = np.append(self.start[: self.start.size - self.terms.count], best)
+            p = Point(self, outside(start, self.low, self.high), p.evaluation)
         return p
 
     # -- iteration -------------------------------------------------------------------------------------
@@ -251,7 +253,7 @@ class Fit:
             best, converged, status = yield from way
             if not converged or not self.prior.by_the_data:
                 return best, converged, status
-            white = best.difference / self.sigma, best.jacobian / self.sigma[:, None]
+            white = self.noise.white(best.difference), self.noise.white(best.jacobian)
             strengths = self.prior.likeliest(best.values, *white)
             if np.all(np.abs(np.log(strengths / self.prior.strengths)) < _SAME_STRENGTH):
                 return best, True, status
@@ -300,7 +302,8 @@ class Fit:
         return f"{how} after {self.count} simulation{'s' if self.count > 1 else ''}"
 
     def report(self, p: Point, accepted: bool) -> None:
-        chi2 = float(np.sum((p.difference / self.sigma) ** 2)) / max(self.sigma.size - self.low.size, 1)
+        freedom = max(p.difference.size - self.low.size, 1)
+        chi2 = float(np.sum(self.noise.white(p.difference) ** 2)) / freedom
         self.history.append(chi2)
         if self.progress is not None:
             self.progress(Step(len(self.history), chi2, accepted, self.named(p.values)))
@@ -315,9 +318,10 @@ class Fit:
         simulation = np.broadcast_to(spread_of(batches), used.shape)
         deviations = None
         if batches is not None and p.finite:
-            deviations = (p.scale * (batches - np.mean(batches, axis=0)))[:, used] / self.sigma
-        jacobian = p.jacobian / self.sigma[:, None] if p.finite else np.zeros_like(p.jacobian)
-        measured = (self.data.sigma[used] / self.sigma) ** 2
+            received = self.terms.received(batches - np.mean(batches, axis=0), p.own)
+            deviations = self.noise.white(received[:, used].T).T
+        jacobian = self.noise.white(p.jacobian) if p.finite else np.zeros_like(p.jacobian)
+        measured = (self.data.sigma[used] / self.noise.alone) ** 2
         off, slope = self.prior(p.values)
         precision = slope.T @ slope
         width = self.high - self.low
@@ -335,11 +339,12 @@ class Fit:
             if np.any(which):
                 status += "; " + text.format(", ".join(m for m, w in zip(labels, which) if w))
         residuals = np.zeros(used.shape)
-        residuals[used] = -p.difference / self.sigma
-        freedom = max(self.sigma.size - n + int(np.sum(errors.open)), 1)
+        residuals[used] = -self.noise.white(p.difference)
+        freedom = max(p.difference.size - n + int(np.sum(errors.open)), 1)
         chi2 = np.sum(residuals**2) / freedom
 
-        cost = float(np.sum((p.difference / self.data.sigma[used]) ** 2) + np.sum(off**2)) + self.prior.volume
+        plain = self.noise._replace(alone=self.data.sigma[used])
+        cost = float(np.sum(plain.white(p.difference) ** 2) + np.sum(off**2)) + self.prior.volume
         return Outcome(
             values=p.values,
             stderr=stderr,
@@ -369,12 +374,12 @@ class Fit:
     ) -> tuple[np.ndarray, float]:
         """Standard errors widened by misfit, and how many independent samples tell as much as all."""
         if not p.finite:
-            return stderr, float(self.sigma.size)
+            return stderr, float(p.difference.size)
         used = self.data.used
-        signal = (p.difference + self.data.observed[used]) / self.sigma
+        signal = (p.difference + self.data.observed[used]) / self.noise.sigma
         open = errors.open
         told = float(np.sum(1.0 - errors.prior_share[~open]))
-        difference = p.difference / self.sigma
+        difference = self.noise.white(p.difference)
         wavelength, sample = np.nonzero(used)
         misfit = misfit_of(difference, jacobian, precision, told, signal, (wavelength, sample))
         variance = np.diag(errors.inverse @ (misfit.middle + precision) @ errors.inverse)

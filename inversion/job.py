@@ -18,6 +18,7 @@ from .checkpoint import Row, row_of
 from .data import Data
 from .fit import Fitting, Request, best_of
 from .lanes import Lanes, Simulator
+from .recorder import Recorder, Terms
 from .retrieval import fits_from
 from .unknowns import Settled
 
@@ -30,7 +31,7 @@ class Job:
     """The footprints to fit. `lidars`, `scenes` and `settled` have one for all, or one for each.
 
     - `numbers`: of the footprints, from which their keys are made. - `settled`: unknowns of each.
-    - `scale`: none or one more unknown.
+    - `scale`: none or one more unknown. - `recorders`: one for all, or one for each.
     """
 
     numbers: Sequence[int]
@@ -39,6 +40,7 @@ class Job:
     scenes: list[Scene]
     settled: list[list[Settled]]
     scale: list[Settled]
+    recorders: list[Recorder | None]
     plan: Plan
     solver: optx.AbstractLeastSquaresSolver
     max_steps: int
@@ -58,6 +60,7 @@ class Job:
             lidars=own(self.lidars),
             scenes=own(self.scenes),
             settled=own(self.settled),
+            recorders=own(self.recorders),
             lanes=self.lanes._replace(threads=1),
         )
 
@@ -66,9 +69,11 @@ def fits(job: Job, key: PRNGKeyArray, todo: Sequence[int]) -> Iterator[tuple[int
     """The fits of the footprints at the places `todo` of a job, as they end, with these places."""
 
     def fitting(i: int) -> Fitting:
-        own = [*job.settled[i % len(job.settled)], *job.scale]
+        own, data = job.settled[i % len(job.settled)], job.data[i]
+        lidar, recorder = job.lidars[i % len(job.lidars)], job.recorders[i % len(job.recorders)]
+        terms = Terms(recorder, job.scale, lidar, data.time.size)
         own_key, more = jax.random.fold_in(key, job.numbers[i]), (job.solver, job.max_steps, None)
-        return best_of(fits_from(job.starts, own_key, job.data[i], own, bool(job.scale), *more))
+        return best_of(fits_from(job.starts, own_key, data, own, terms, *more))
 
     simulate = Simulator(job.lidars, job.scenes, job.plan, job.settled[0], key, job.lanes)
     waiting, running = list(todo), dict[int, tuple[Fitting, Request]]()

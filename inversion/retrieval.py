@@ -10,12 +10,13 @@ import optimistix as optx
 from jaxtyping import Array, ArrayLike, PRNGKeyArray
 
 from jaxlidar import Lidar, Plan, Scene, Waveform
-from jaxlidar.extend import check_integer, check_key, check_kinds, check_range
+from jaxlidar.extend import check_integer, check_key, check_kind, check_kinds, check_range
 
 from .data import Data, at_fixed_times, data_of
 from .fit import Fit, Outcome, best_of, bounds_of, drive, labels_of, named, smooth_names
 from .model import Model
 from .planning import batch_sizes, check_samples, plan_for
+from .recorder import Recorder, Terms, check_names
 from .result import Retrieval, Step
 from .unknowns import Place, Settled, Unknown, latin_hypercube, settle
 
@@ -39,6 +40,7 @@ def retrieve(
     max_steps: float = 50,
     starts: float = 1,
     scale: tuple[float, float] | None = None,
+    recorder: Recorder | None = None,
     noise_floor: float = 1e-3,
     progress: Callable[[Step], None] | None = None,
     throw: bool = False,
@@ -85,6 +87,8 @@ def retrieve(
     - `scale`: (low, high), bounds of a further unknown, "scale", which multiplies the simulated reflectance,
       the same for all wavelengths (an uncalibrated receiver). It starts where it fits best. Default None: no
       such unknown.
+    - `recorder`: what the recorder adds, a `Recorder`: its receiver's response, offsets of its digitisers,
+      and the noise of the recorded pulse. Default None: nothing.
     - `noise_floor`: share of each wavelength's largest observed value, 0 to 1, that replaces any smaller
       `noise`: standard errors of a simulation are zero where no photon came. Default 1e-3.
     - `progress`: called with a `Step` after every step; for instance `print`.
@@ -119,17 +123,19 @@ def retrieve(
     data = data_of(observed, time, noise, noise_floor, lidar)
     settled = settle(unknowns, scene)
     check_solver(solver, settled)
+    check_kind("recorder", recorder, Recorder | None, "a Recorder, or None")
     extra = [] if scale is None else [scale_of(scale, settled)]
+    check_names(recorder, settled)
     if plan is None:
         plan = plan_for(lidar, scene, settled, data.time, max_orders=max_orders, photons=photons, rays=rays)
     check_samples(plan, data.time)
     model = Model(lidar, scene, plan, settled, key)
-    settled = [*settled, *extra]
-    fits = fits_from(starts, key, data, settled, scale is not None, solver, max_steps, progress)
+    terms = Terms(recorder, extra, lidar, data.time.size)
+    fits = fits_from(starts, key, data, settled, terms, solver, max_steps, progress)
     outcome = drive(best_of(fits), lambda request: model(request.values, spread=request.spread))
     if throw and not outcome.converged:
         raise RuntimeError(outcome.status)
-    return retrieval_of(outcome, model, settled, scale is not None)
+    return retrieval_of(outcome, model, [*settled, *terms.settled], terms.count)
 
 
 def check_solution(solver: Any, max_steps: float, starts: float) -> tuple[Any, int, int]:
@@ -156,20 +162,24 @@ def check_progress(progress: object) -> None:
 
 
 def fits_from(
-    starts: int, key: PRNGKeyArray, data: Data, settled: list[Settled], scaled: bool, *more: Any
+    starts: int, key: PRNGKeyArray, data: Data, settled: list[Settled], terms: Terms, *more: Any
 ) -> list[Fit]:
     """One fit from the unknowns' own start, and further ones from a Latin hypercube over their bounds."""
-    places = latin_hypercube(settled, starts - 1, jax.random.fold_in(key, 1)) if starts > 1 else []
-    return [Fit(data, settled, scaled, *more, start=place) for place in [None, *places]]
+    places = (
+        latin_hypercube([*settled, *terms.settled], starts - 1, jax.random.fold_in(key, 1))
+        if starts > 1
+        else []
+    )
+    return [Fit(data, settled, terms, *more, start=place) for place in [None, *places]]
 
 
-def retrieval_of(outcome: Outcome, model: Model, settled: list[Settled], scaled: bool) -> Retrieval:
-    """A `Retrieval` from the outcome of a fit, with values keyed by name."""
+def retrieval_of(outcome: Outcome, model: Model, settled: list[Settled], terms: int) -> Retrieval:
+    """A `Retrieval` from the outcome of a fit, with values by name; the last ones are the recorder's."""
 
     def by_name(flat: np.ndarray) -> dict[str, Array]:
         return {k: jnp.asarray(v) for k, v in named(flat, settled).items()}
 
-    flat = outcome.values[:-1] if scaled else outcome.values
+    flat = outcome.values[: outcome.values.size - terms]
     return Retrieval(
         values=by_name(outcome.values),
         stderr=by_name(outcome.stderr),

@@ -1,0 +1,44 @@
+"""Noise of a record's samples, and whitening by it."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy import linalg
+
+
+class Noise(NamedTuple):
+    """Independent noise, and what is common to samples.
+
+    - `alone`: (samples,) standard deviation of each sample's own noise.
+    - `common`: (samples, lags) what one standard deviation of each of several other errors does to the
+      samples, or None.
+    """
+
+    alone: Float[np.ndarray, " samples"]
+    common: Float[np.ndarray, "samples lags"] | None = None
+
+    @property
+    def sigma(self) -> Float[np.ndarray, " samples"]:
+        """Standard deviation of each sample, of all its noise."""
+        if self.common is None:
+            return self.alone
+        return np.sqrt(self.alone**2 + np.sum(self.common**2, axis=1))
+
+    def white(self, x: Float[np.ndarray, "samples ..."]) -> Float[np.ndarray, "samples ..."]:
+        """Differences, or columns of them, made independent and of unit variance."""
+        own = x / self.alone.reshape(-1, *(1,) * (x.ndim - 1))
+        if self.common is None:
+            return own
+        shared = self.common / self.alone[:, None]
+        root = np.linalg.cholesky(np.eye(len(shared)) + shared @ shared.T)
+        return linalg.solve_triangular(root, own, lower=True)
+
+
+def blocks(
+    common: Float[np.ndarray, "wavelengths bins lags"] | None, used: Bool[np.ndarray, "wavelengths bins"]
+) -> Float[np.ndarray, "samples all_lags"] | None:
+    """The common errors of the samples that are used; those of different wavelengths are independent."""
+    if common is None:
+        return None
+    return linalg.block_diag(*(one[which] for one, which in zip(common, used)))
