@@ -278,7 +278,9 @@ def retrieve_many(
     data = [data_of(y[i], time, sigma[i], noise_floor, lidars[i % len(lidars)]) for i in range(len(y))]
     axis = data[0].time
     extra = [] if scale is None else [scale_of(scale, settled[0])]
-    recorders = [None] if recorder is None else _one_each("recorder", recorder, Recorder, len(y))
+    recorders: list[Recorder | None] = (
+        [None] if recorder is None else _one_each("recorder", recorder, Recorder, len(y))
+    )
     check_names(recorders[0], settled[0])
     terms = [] if recorders[0] is None else settled_terms(recorders[0])
     names = [*settled[0], *terms, *extra]

@@ -41,4 +41,4 @@ def blocks(
     """The common errors of the samples that are used; those of different wavelengths are independent."""
     if common is None:
         return None
-    return linalg.block_diag(*(one[which] for one, which in zip(common, used)))
+    return np.asarray(linalg.block_diag(*(one[which] for one, which in zip(common, used))))

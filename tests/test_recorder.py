@@ -37,10 +37,10 @@ def echoes(pulse, heights, jitter=0.0):
     return np.stack(clean) / shares.max()
 
 
-def fits_of(records, pulses, noise, recorder, near=0.0, **more):
+def fits_of(records, pulses, noise, recorder, near=None, **more):
     """Fits that start near the heights, as echoes tell them."""
     lidars = [jl.Lidar(pulse=pulse) for pulse in pulses]
-    more["start"] = {"height": np.broadcast_to(near, len(records)) + 0.05}
+    more["start"] = {"height": np.broadcast_to(0.0 if near is None else near, len(records)) + 0.05}
     settings = {"scale": (0.01, 1e3), "key": jax.random.key(0), "time": TIME, "plan": shape(pulses[0])}
     return inversion.retrieve_many(
         records[:, None],
