@@ -90,11 +90,11 @@ def test_elementary_functions(run, capsys):
     assert capsys.readouterr() == ("", "")
 
     def plant(module):
-        ours, exact = module.FUNCTIONS["E1(k)"]
-        module.FUNCTIONS["E1(k)"] = ours, lambda k: exact(k) * (1 + 1e-5)
+        exact = module.LAYER["2 E3(k)"]
+        module.LAYER["2 E3(k)"] = lambda k: exact(k) * (1 + 1e-5)
 
     wrong = run("mpmath_plate", "--points", "8", planted=plant)
-    assert not holds(wrong, "E1(k)")
+    assert not holds(wrong, "2 E3(k)")
     assert holds(wrong, "leaf")
 
 
