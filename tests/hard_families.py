@@ -345,7 +345,7 @@ FAMILIES = {
         functools.partial(answers.plate_over_ground, orders=PLATE_ORDERS),
         (2e-3, 2e-3),
         (1e-2, 1e-2),
-        DOUBLE,
+        BOTH,
     ),
     "probability": Family(
         hard_parts.PROBABILITY, hard_parts.probability, answers.probability, (1e-6, 1e-14), (1e-6, 1e-14)

@@ -164,6 +164,7 @@ def test_other_versions(version):
     np.testing.assert_allclose(fit.traits["Cab"], 30.0, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_domains(noisy):
     """Each trait from its own bands: changes of all others leave it as it is, and the answer says so."""
     _, (R, T) = noisy
