@@ -295,14 +295,22 @@ def _results(response: Response, recording: Recording) -> tuple[Float[Array, "wa
     return total(response, recording), balance(response, recording)
 
 
+def _over(whole: Any, count: Array) -> Any:
+    return jax.tree.map(lambda a: a / count, whole)
+
+
+def _sum(a: Any, b: Any) -> Any:
+    return jax.tree.map(jnp.add, a, b)
+
+
 _compiled_trace = Program(trace_setting)
 _compiled_batch = Program(trace_setting, **ONE_CORE)
 _compiled_first = Program(trace_first, **ONE_CORE)
 _compiled_higher = Program(trace_higher, **ONE_CORE)
 _compiled_results = Program(_results, **ONE_CORE)
 _compiled_waveform = Program(recorded)
-_shared_out = Program(lambda whole, count: jax.tree.map(lambda a: a / count, whole))
-_add = Program(lambda a, b: jax.tree.map(jnp.add, a, b))
+_shared_out = Program(_over)
+_add = Program(_sum)
 
 
 def _trace_within(ready: _Ready, key: PRNGKeyArray) -> _Traced:
