@@ -107,6 +107,9 @@ def main() -> None:
     axes.barh(names, [r["warm"] for r in results], label="again")
     axes.invert_yaxis()
     axes.set(xlabel="seconds", title="a call of simulate after a change", xscale="log")
+    ticks = (0.2, 0.5, 1, 2, 5, 10)
+    axes.set_xticks(ticks, [f"{t:g}" for t in ticks])
+    axes.minorticks_off()
     axes.legend()
     save_figure(figure, given.out / "everyday_changes.png")
     rows = [(r["change"], r["seconds"], r["warm"], ", ".join(r["compiled"])) for r in results]
