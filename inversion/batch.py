@@ -28,7 +28,7 @@ from .fit import bounds_of, labels_of, named, smooth_names
 from .job import Job, fits, fits_by
 from .lanes import Lanes
 from .planning import batch_sizes, check_samples, plan_for
-from .profiles import AveragingKernel, averaging_kernel_of, band_of
+from .profiles import AbstractFitted
 from .quality import Verdict, judge_fits
 from .recorder import Recorder, check_names, settled_terms
 from .retrieval import SOLVER, check_progress, check_solution, check_solver, scale_of
@@ -61,7 +61,7 @@ class Progress:
 
 @final
 @briefly
-class Retrievals(eqx.Module):
+class Retrievals(AbstractFitted):
     """The results of `retrieve_many`: one fit per footprint, in the order given.
 
     Arrays have a leading axis `footprints`. The quantities are those of `Retrieval`.
@@ -114,38 +114,6 @@ class Retrievals(eqx.Module):
     def quality(self) -> tuple[Verdict, ...]:
         """Whether each fit can be trusted, with reasons: `inversion.judge_fits` with all unknowns."""
         return judge_fits(self)
-
-    def band(self, name: str, level: float = 0.95, *, robust: bool = False) -> tuple[np.ndarray, np.ndarray]:
-        """Credible band of an unknown, within its bounds: see `inversion.profiles`.
-
-        **Arguments:**
-
-        - `name`: of the unknown.
-        - `level`: probability, in (0, 1). Default 0.95.
-        - `robust`: with `robust_stderr` in place of `stderr`. Default False.
-
-        **Returns:** (low, high), each of the shape of the values; the bounds, where the standard error is
-        infinite.
-
-        **Raises:** ValueError for a name that the fit has not, and a `level` outside (0, 1).
-        """
-        return band_of(self, name, level, robust)
-
-    def averaging_kernel(self, name: str, spacing: float = 1.0) -> AveragingKernel:
-        """How the estimate of a profile follows the truth, and its height resolution.
-
-        Other unknowns are taken as fitted along, and strengths of smoothness priors as known.
-
-        **Arguments:**
-
-        - `name`: of the unknown.
-        - `spacing`: distance between layers, positive, such as in m. Default 1: the resolution is in layers.
-
-        **Returns:** an `AveragingKernel`, of NumPy arrays.
-
-        **Raises:** ValueError for a name that the fit has not, and a `spacing` that is not positive.
-        """
-        return averaging_kernel_of(self, name, spacing)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the results as a netCDF file, which `jaxlidar.open` reads.

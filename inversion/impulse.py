@@ -114,6 +114,7 @@ def receiver_impulse(
             f"pulses, echoes and noise are {len(pulses)}, {len(echoes)} and {len(noise)}; admissible are as "
             "many, one or more"
         )
+    check_integer("interleaved", interleaved)
     lags = np.arange(-check_integer("before", before, 0), check_integer("after", after, 0) + 1)
     shots = [_Shot(*each, interleaved) for each in zip(pulses, echoes, noise)]
     shape = np.where(lags == 0, 1.0, 0.0)

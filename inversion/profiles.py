@@ -12,7 +12,7 @@ bounds.
 over diagonal: Purser and Huang (1993), J. Appl. Meteorol. 32, 1211.
 """
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -22,10 +22,6 @@ from scipy import special
 
 from jaxlidar import Plane, Scene
 from jaxlidar.extend import check_kind, check_range
-
-if TYPE_CHECKING:
-    from .batch import Retrievals
-    from .result import Retrieval
 
 
 def put_profile(scene: Scene, density: Float[Array, " layers"]) -> Scene:
@@ -106,7 +102,7 @@ class AveragingKernel(NamedTuple):
     resolution: Float[np.ndarray, "... layers"]
 
 
-def averaging_kernel_of(fit: "Retrieval | Retrievals", name: str, spacing: float) -> AveragingKernel:
+def averaging_kernel_of(fit: "AbstractFitted", name: str, spacing: float) -> AveragingKernel:
     """The averaging kernel of an unknown of a fit, or of each of many."""
     check_range("spacing", spacing, 0.0, low_open=True)
     place = _place(fit, name)
@@ -117,7 +113,7 @@ def averaging_kernel_of(fit: "Retrieval | Retrievals", name: str, spacing: float
     return AveragingKernel(matrix, np.sum(diagonal, axis=-1), resolution)
 
 
-def band_of(fit: "Retrieval | Retrievals", name: str, level: float, robust: bool) -> tuple[Any, Any]:
+def band_of(fit: "AbstractFitted", name: str, level: float, robust: bool) -> tuple[Any, Any]:
     """The credible band of an unknown of a fit, or of each of many."""
     check_range("level", level, 0.0, 1.0, low_open=True, high_open=True)
     check_kind("robust", robust, bool, "True or False")
@@ -129,6 +125,48 @@ def band_of(fit: "Retrieval | Retrievals", name: str, level: float, robust: bool
     reach = special.ndtri(0.5 + 0.5 * level) * np.where(known, stderr, 0.0)
     below, above = np.maximum(values - reach, low), np.minimum(values + reach, high)
     return np.where(known, below, low), np.where(known, above, high)
+
+
+class AbstractFitted(eqx.Module):
+    """What a fit, and each of many, tells of its unknowns as profiles."""
+
+    values: eqx.AbstractVar[dict[str, Any]]
+    stderr: eqx.AbstractVar[dict[str, Any]]
+    robust_stderr: eqx.AbstractVar[dict[str, Any]]
+    averaging: eqx.AbstractVar[Any]
+    bounds: eqx.AbstractVar[dict[str, Any]]
+
+    def band(self, name: str, level: float = 0.95, *, robust: bool = False) -> tuple[np.ndarray, np.ndarray]:
+        """Credible band of an unknown, within its bounds: see `inversion.profiles`.
+
+        **Arguments:**
+
+        - `name`: of the unknown.
+        - `level`: probability, in (0, 1). Default 0.95.
+        - `robust`: with `robust_stderr` in place of `stderr`. Default False.
+
+        **Returns:** (low, high), each of the shape of the values; the bounds, where the standard error is
+        infinite.
+
+        **Raises:** ValueError for a name that the fit has not, and a `level` outside (0, 1).
+        """
+        return band_of(self, name, level, robust)
+
+    def averaging_kernel(self, name: str, spacing: float = 1.0) -> AveragingKernel:
+        """How the estimate of a profile follows the truth, and its height resolution.
+
+        Other unknowns are taken as fitted along, and strengths of smoothness priors as known.
+
+        **Arguments:**
+
+        - `name`: of the unknown.
+        - `spacing`: distance between layers, positive, such as in m. Default 1: the resolution is in layers.
+
+        **Returns:** an `AveragingKernel`, of NumPy arrays.
+
+        **Raises:** ValueError for a name that the fit has not, and a `spacing` that is not positive.
+        """
+        return averaging_kernel_of(self, name, spacing)
 
 
 def _place(fit: Any, name: str) -> slice:

@@ -13,7 +13,7 @@ from jaxlidar import Scene, Waveform
 from jaxlidar.extend import briefly
 from jaxlidar.io import save
 
-from .profiles import AveragingKernel, averaging_kernel_of, band_of
+from .profiles import AbstractFitted
 from .quality import Verdict, judge_fit
 
 
@@ -47,7 +47,7 @@ class Step:
 
 @final
 @briefly
-class Retrieval(eqx.Module):
+class Retrieval(AbstractFitted):
     """The result of `retrieve`: values of the unknowns, their standard errors, and the fitted scene.
 
     Unknowns are in their natural units, keyed by name. The rows of `covariance` and `correlation` are the
@@ -120,38 +120,6 @@ class Retrieval(eqx.Module):
     def quality(self) -> Verdict:
         """Whether the fit can be trusted, with reasons: `inversion.judge_fit` with all unknowns."""
         return judge_fit(self)
-
-    def band(self, name: str, level: float = 0.95, *, robust: bool = False) -> tuple[np.ndarray, np.ndarray]:
-        """Credible band of an unknown, within its bounds: see `inversion.profiles`.
-
-        **Arguments:**
-
-        - `name`: of the unknown.
-        - `level`: probability, in (0, 1). Default 0.95.
-        - `robust`: with `robust_stderr` in place of `stderr`. Default False.
-
-        **Returns:** (low, high), each of the shape of the values; the bounds, where the standard error is
-        infinite.
-
-        **Raises:** ValueError for a name that the fit has not, and a `level` outside (0, 1).
-        """
-        return band_of(self, name, level, robust)
-
-    def averaging_kernel(self, name: str, spacing: float = 1.0) -> AveragingKernel:
-        """How the estimate of a profile follows the truth, and its height resolution.
-
-        Other unknowns are taken as fitted along, and strengths of smoothness priors as known.
-
-        **Arguments:**
-
-        - `name`: of the unknown.
-        - `spacing`: distance between layers, positive, such as in m. Default 1: the resolution is in layers.
-
-        **Returns:** an `AveragingKernel`, of NumPy arrays.
-
-        **Raises:** ValueError for a name that the fit has not, and a `spacing` that is not positive.
-        """
-        return averaging_kernel_of(self, name, spacing)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the result as a netCDF file, which `jaxlidar.open` reads.

@@ -7,7 +7,7 @@ PAGE = """## On a GPU: a design
 
 The tracer has run on CPUs only. It is plain JAX and asks for nothing else, but as it is written a GPU would wait: a
 march is a loop of small steps, and each step would be kernels of its own, whose launches take longer than their work.
-What each part is, and what would become of it:
+What each part is, and what would become of it; nothing of this has been measured:
 
 | part | what it does | on a GPU |
 | --- | --- | --- |
@@ -29,8 +29,4 @@ Two rules must not. The same key gives the same waveform: atomic additions come 
 summed by segments, which also makes sums repeatable. Derivatives need no march of their own: with voxels held fixed, the
 derivative of a depth is a sum over the same steps, of lengths times derivatives of coefficients and of coefficients
 times derivatives of lengths, so that the kernel's rule walks once more and carries one number for each direction.
-
-Where the time would go, from counts of memory traffic alone: a batch of 8,192 photons makes some ten million steps, each
-a gather of one sector of the second-level cache. At the rates that vendors state, these take well below a millisecond,
-so that sorting the deposits, and not the march, would decide.
 """
