@@ -47,6 +47,10 @@ class Program:
         dynamic, static = eqx.partition((args, kwargs), _is_shape)
         return self._version(dynamic, static).begin(dynamic)
 
+    def is_compiled(self, *args: Any, **kwargs: Any) -> bool:
+        """Whether a call with such arguments compiles nothing."""
+        return self._version(*eqx.partition((args, kwargs), _is_shape)).ready
+
     def _version(self, dynamic: Any, static: Any) -> "_Version":
         leaves, structure = jax.tree.flatten(dynamic)
         fixed, shape = jax.tree.flatten(static)

@@ -333,6 +333,10 @@ def _trace_within(ready: _Ready, key: PRNGKeyArray) -> _Traced:
 def _begin_to_compile(ready: _Ready, key: PRNGKeyArray) -> None:
     """All that batches need, side by side; what takes longest first."""
     arguments = (ready.setting, ready.transmittance, key)
+    longest = _compiled_higher if follows(ready.setting) else _compiled_batch
+    if longest.is_compiled(*arguments):
+        # What else may be new compiles fast: looking for it would cost every call.
+        return
     if follows(ready.setting):
         higher = _compiled_higher.begin(*arguments)
         response = joined(_compiled_first.begin(*arguments), higher)

@@ -111,8 +111,11 @@ def test_a_program_that_has_begun_is_compiled_once():
     assert (shapes["name"], shapes["size"]) == ("a name", 3)
     assert second.begin(shapes)["twice"].dtype == jnp.float32
     assert second.begin(shapes)["size"] == 3
+    assert not first.is_compiled(jnp.arange(3.0))
     np.testing.assert_array_equal(second(first(jnp.arange(3.0)))["twice"], [0.0, 4.0, 8.0])
     assert (counted.times, after.times) == (1, 1)
+    assert first.is_compiled(jnp.arange(3.0))
+    assert not first.is_compiled(jnp.arange(4.0))
 
 
 def test_precision_of_a_program_that_has_begun_is_the_callers():
