@@ -64,7 +64,7 @@ def _batch(
 
     def total(flat: Array) -> tuple[Array, Response]:
         setup = setup_at(flat)
-        response = trace_scene(setup, key)
+        response = trace_scene(setup, key, reverse=False)
         return total_of(response, setup), response
 
     if not flat.size:

@@ -184,9 +184,9 @@ class _Ready(NamedTuple):
 def _prepared(setup: Setup, key: PRNGKeyArray) -> _Ready:
     transmittance = straight_transmittance(setup)
     own_traces = transmittance is not None or not setup.plan.trace.keeps_histories
-    exact = own_traces or any(is_traced(x) for x in jax.tree.leaves((setup, key)))
-    recording = recording_of(setup) if exact else recording_with_room(setup)
-    return _Ready(setup, setting_of(setup), transmittance, recording)
+    traced = any(is_traced(x) for x in jax.tree.leaves((setup, key)))
+    recording = recording_of(setup) if own_traces or traced else recording_with_room(setup)
+    return _Ready(setup, setting_of(setup, reverse=traced), transmittance, recording)
 
 
 class _Goal(NamedTuple):

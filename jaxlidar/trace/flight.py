@@ -60,7 +60,7 @@ def fly(
     else:
         medium, target = setting.medium, -jnp.log(u)
         steps, box = setting.plan.march_steps, setting.occupied
-        free = free_flight(medium, p.x, p.w, target, reach, p.alive, steps, box)
+        free = free_flight(medium, p.x, p.w, target, reach, p.alive, steps, box, reverse=setting.reverse)
         collided, cell = free.collided, free.cell
         k = jnp.where(collided, jax.vmap(medium.extinction, (0, None))(cell, p.w), 1.0)
         chord = jnp.where(collided, free.chord, 1.0)

@@ -305,7 +305,8 @@ def _deposit(
         clear = jnp.exp(-jax.vmap(lambda x: depth_to_top(medium, x, column))(x))
     else:
         none, far = jnp.zeros((0, path.size)), jnp.full_like(path, FAR)
-        clear = jnp.exp(-free_flight(medium, x, v, none, far, weight > 0, plan.march_steps).total)
+        steps, reverse = plan.march_steps, setting.reverse
+        clear = jnp.exp(-free_flight(medium, x, v, none, far, weight > 0, steps, reverse=reverse).total)
     drawn = iter(draw.behind)
     for i, (s, scatterer) in enumerate(zip(setting.surfaces, plan.surfaces)):
         if not s.plate:

@@ -16,6 +16,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxlidar._one_function import one_function
 from jaxlidar._vectors import FAR, Scalar, Vec
 from jaxlidar.optics.leaf_angles import ANGLE_NODES, LeafAngles
 from jaxlidar.optics.phase import AbstractPhase
@@ -272,11 +273,13 @@ def free_flight(
     active: Bool[Array, "photons"],
     steps: int,
     box: Box | None = None,
+    *,
+    reverse: bool = True,
 ) -> Free:
     """Follow rays to their largest target, to their length `limit`, or until they leave the grid, or `box`.
 
     `steps` bounds the number of faces crossed; a batch stops earlier when all its rays have stopped. Without
-    targets, rays are followed to their end.
+    targets, rays are followed to their end. `reverse`: whether to allow differentiation in reverse.
     """
     walk = begin(medium, x, w, box)
     end = earlier(walk.leave, limit)
@@ -310,7 +313,11 @@ def free_flight(
     held = (zero - 1.0, zero, zero, zero.astype(jnp.int32))
     start = jnp.minimum(walk.enter, end)
     state = (start, jnp.zeros_like(limit), walk.voxel, active & (walk.enter < end), held)
-    distance, total, _, _, held = lax.scan(block, state, None, length=-(-steps // BLOCK))[0]
+
+    def march(state):
+        return lax.scan(block, state, None, length=-(-steps // BLOCK))[0]
+
+    distance, total, _, _, held = (march if reverse else one_function(march))(state)
     entered, left, depth, cell = held
     return Free(entered >= 0, cell, entered, left - entered, depth, distance, total)
 

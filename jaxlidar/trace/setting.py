@@ -74,6 +74,7 @@ class Setting(eqx.Module):
     - `optics`: of every letter, by wavelength, where they are applied while light is traced, because it is
       told apart by its place of entry (see `jaxlidar.trace.nodes`), or because histories would be too many;
       None where histories keep them.
+    - `reverse`: whether the trace may be differentiated in reverse, for which it is compiled otherwise.
     """
 
     beam: Beam
@@ -90,6 +91,7 @@ class Setting(eqx.Module):
     bark_law: int = eqx.field(static=True)
     sizes: Sizes = eqx.field(static=True)
     optics: Float[Array, "letters wavelengths"] | None = None
+    reverse: bool = eqx.field(static=True, default=True)
 
     @property
     def short(self) -> Histories:
@@ -135,10 +137,14 @@ def _density(law: AbstractLaw | AbstractPhase, sent: Scattering, w: Vec) -> Scal
     return law.density(sent.incident, sent.normal, w)
 
 
-def setting_of(setup: Setup) -> Setting:
-    """The setting of a setup, without wavelengths, unless optics are applied while light is traced."""
+def setting_of(setup: Setup, *, reverse: bool = True) -> Setting:
+    """The setting of a setup, without wavelengths, unless optics are applied while light is traced.
+
+    `reverse`: whether the trace may be differentiated in reverse.
+    """
     trace, bins = jax.tree.map(jnp.asarray, (setup.plan.trace, setup.plan.bins))
     setting = _set_out(_without_spectrum(setup.lidar), setup.scene, trace, bins, sizes_of(setup.plan))
+    setting = dataclasses.replace(setting, reverse=reverse)
     if trace.keeps_histories:
         return setting
     return dataclasses.replace(setting, optics=letter_values(setup.lidar, setup.scene, trace.letters))
