@@ -67,13 +67,20 @@ class Layers:
             "clearance": self.clearance,
             "density": density,
             "density_stderr": density * fits.robust_stderr["log density"][i],
-            **{f"prior_share_{n.replace(' ', '_')}": np.mean(s[i]) for n, s in fits.prior_share.items()},
-            "reduced_chi2": float(fits.reduced_chi2[i]),
-            "steps": int(fits.steps[i]),
-            "status": fits.status[i],
-            "quality": verdict.quality,
-            "reasons": "; ".join(verdict.reasons),
+            **quality_of(fits, i, verdict),
         }
+
+
+def quality_of(fits, i, verdict):
+    """What every table has of fit `i` of many whatever the scene: shares of the priors, and the verdict."""
+    return {
+        **{f"prior_share_{n.replace(' ', '_')}": np.mean(s[i]) for n, s in fits.prior_share.items()},
+        "reduced_chi2": float(fits.reduced_chi2[i]),
+        "steps": int(fits.steps[i]),
+        "status": fits.status[i],
+        "quality": verdict.quality,
+        "reasons": "; ".join(verdict.reasons),
+    }
 
 
 @contextlib.contextmanager
@@ -143,9 +150,12 @@ def draw_shot(axes, picture):
     for name, (color, style) in styles.items():
         if name in picture:
             axes.axhline(picture[name], color=color, linestyle=style, linewidth=1.0, label=name)
-    low, high = picture["ground"] - 6.0, max(picture["ground"] + 12.0, picture["canopy top"] + 4.0)
+    low, high = (
+        picture["ground"] - 6.0,
+        max(picture["ground"] + 12.0, picture.get("canopy top", picture["ground"]) + 4.0),
+    )
     axes.set_ylim(low, high)
-    axes.set_xlabel("signal (counts)", fontsize=8)
+    axes.set_xlabel("signal", fontsize=8)
     axes.set_title(picture["title"], fontsize=9)
 
 

@@ -114,13 +114,3 @@ def test_gedi_from_file_to_table(example, gedi, tmp_path, capsys):
     kinds = {path.suffix for path in tmp_path.iterdir()}
     assert kinds == {".csv", ".nc", ".png", ".sqlite"}
     assert "1 good, 0 doubtful, 0 bad" in capsys.readouterr().out
-
-
-@pytest.mark.slow
-def test_neon_from_file_to_table(example, shared, tmp_path):
-    path = shared / "neon" / "neon_harvard_250.npz"
-    rows = example("fit_neon").main([str(path), "--shots", "4", "--out", str(tmp_path)])
-    assert len(rows) == 4
-    assert {path.suffix for path in tmp_path.iterdir()} == {".csv", ".nc", ".png", ".sqlite"}
-    assert all(row["quality"] in ("good", "doubtful", "bad") for row in rows)
-    assert all(row["reasons"] for row in rows if row["quality"] != "good")

@@ -14,7 +14,10 @@ SCRIPTS = sorted(
     p.stem for p in FOLDER.glob("*.py") if not p.stem.startswith("_") and p.stem != "make_readme"
 )
 # Modules of the examples' folders, some under one name in several of them.
-OWN = ("_common", "_crown", "_recorded", "_validation", "fit_gedi", "fit_neon", "peers", "simulation_cost")
+OWN = (
+    *("_airborne", "_common", "_crown", "_recorded", "_validation", "fit_airborne", "fit_gedi"),
+    *("peers", "simulation_cost"),
+)
 
 
 @pytest.fixture

@@ -14,11 +14,12 @@ import sys
 import jax
 import numpy as np
 from _validation import COLOURS, by_what, draw_differences, finish, options, row, steps
-from fit_neon import JITTER
 
 import jaxlidar as jl
 from jaxlidar.io import read_neon
 
+# What a hard target's echo is blurred by beside its outgoing pulse, ns.
+JITTER = 1.9
 # Half a sample of 1 ns; and of the peak of the hard target's echo.
 SAMPLE, SHAPE = 0.5, 0.03
 RISES = {"rise of a simulated echo": 0.0, "rise of a simulated echo, blurred by the receiver": JITTER}
@@ -95,8 +96,8 @@ def main(argv=None):
         title="Recorded NEON returns",
         seen="""Left, how far the rise of simulated echoes lies from the product's. Middle and right, the echo
         of a hard target and what the simulated one leaves of it. Dashed lines are the bounds.""",
-        unchecked="""The canopy: its echoes have no answers here (`fit_neon.py` fits them). Strength is not
-        calibrated; the jitter was found from the same hard target.""",
+        unchecked="""The canopy: its echoes have no answers here (`fit_airborne.py` fits them). Strength is
+        not calibrated; the jitter was found from the same hard target.""",
         draw=draw,
         of_others=True,
         size=(13.0, 4.0),
