@@ -19,6 +19,7 @@ from .quality import Verdict, judge_fit, judge_fits, judge_record
 from .recorder import Recorder
 from .result import Retrieval, Step
 from .retrieval import retrieve
+from .tables import corrected_table
 from .unknowns import Unknown
 
 __all__ = [
@@ -44,6 +45,7 @@ __all__ = [
     "Unknown",
     "Verdict",
     "amplitudes",
+    "corrected_table",
     "cramer_rao",
     "echo_points",
     "files",

@@ -72,7 +72,7 @@ def amplitudes(
     if table is None:
         spread = np.full(samples.shape, float(noise))
         return Amplitudes(samples, spread if saturation is None else _left_out(spread, samples, saturation))
-    heights = _straight(np.asarray(table, float), decibels)
+    heights = straight_table(np.asarray(table, float), decibels)
     check_range("counts", samples, 0.0, heights.size - 1)
     numbers = np.arange(heights.size)
     slope = np.gradient(heights)
@@ -82,7 +82,7 @@ def amplitudes(
     return Amplitudes(values, _left_out(spread, samples, saturation))
 
 
-def _straight(table: np.ndarray, decibels: bool) -> np.ndarray:
+def straight_table(table: np.ndarray, decibels: bool) -> np.ndarray:
     """Amplitudes of all counts. **Raises:** ValueError for a table that cannot be used."""
     known = table > _MARK if decibels else np.isfinite(table)
     first = int(np.argmax(known))

@@ -22,7 +22,7 @@ from .data import Data
 from .descent import descend_within
 from .misfit import misfit_of
 from .model import Evaluation, spread_of
-from .noise import Noise, blocks
+from .noise import Noise, blocks, correlation_between
 from .priors import Priors, inside, outside
 from .recorder import Terms
 from .result import Step
@@ -186,7 +186,8 @@ class Fit:
         self.low, self.high = flat(lambda s: s.low), flat(lambda s: s.high)
         self.start = flat(lambda s: np.asarray(s.start, float)) if start is None else start
         self.prior = Priors(self.settled)
-        self.noise = Noise(data.sigma[data.used])
+        self.correlation = correlation_between(float(terms.recorder.correlation), data.used)
+        self.noise = Noise(data.sigma[data.used], None, self.correlation)
         self.count, self.history = 0, []
 
     # -- simulation ------------------------------------------------------------------------------------
@@ -213,7 +214,8 @@ class Fit:
         noise = np.broadcast_to(spread_of(received), used.shape)[used]
         pulse = self.terms.pulse_noise(p.evaluation.total, p.own)
         before = self.noise.sigma
-        self.noise = Noise(np.hypot(self.data.sigma[used], noise), blocks(pulse, used))
+        alone = np.hypot(self.data.sigma[used], noise)
+        self.noise = Noise(alone, blocks(pulse, used), self.correlation)
         return float(np.mean(np.abs(self.noise.sigma / before - 1.0)))
 
     def first(self) -> Generator[Request, Evaluation, Point]:

@@ -19,7 +19,7 @@ from jaxlidar.extend import check_integer, check_range
 _ROUNDS = 5
 _SEARCH = (np.arange(-4.0, 4.01, 0.25), np.arange(-0.3, 0.31, 0.03))
 # Of the mean information, added to that on each lag: lags that pulses do not tell apart stay small.
-_RIDGE = 1e-3
+_RIDGE = 1e-4
 
 
 def recorded_pulse(
@@ -116,7 +116,7 @@ def receiver_impulse(
         )
     check_integer("interleaved", interleaved)
     lags = np.arange(-check_integer("before", before, 0), check_integer("after", after, 0) + 1)
-    shots = [_Shot(*each, interleaved) for each in zip(pulses, echoes, noise)]
+    shots = [Echo(*each, interleaved) for each in zip(pulses, echoes, noise)]
     shape = np.where(lags == 0, 1.0, 0.0)
     for turn in range(_ROUNDS):
         rows = []
@@ -134,17 +134,18 @@ def receiver_impulse(
     return found
 
 
-class _Shot:
+class Echo:
     """A pulse and its echo, weighted, without what offsets can explain."""
 
-    def __init__(self, pulse: np.ndarray, echo: np.ndarray, noise: np.ndarray, interleaved: int):
+    def __init__(self, pulse: np.ndarray, echo: np.ndarray, noise: np.ndarray, interleaved: int = 1):
         self.size, self.zero, self.bins = 2 * (echo.size + pulse.size), int(np.argmax(pulse)), echo.size
         self.spectrum = np.fft.rfft(pulse, self.size)
         self.omega = 2.0 * np.pi * np.fft.rfftfreq(self.size)
         self.weight = np.where(np.isfinite(noise), 1.0 / noise, 0.0)
         digitiser = np.arange(echo.size)[:, None] % interleaved == np.arange(interleaved)
         self.basis = np.linalg.qr(digitiser * self.weight[:, None])[0]
-        self.echo = self._alone(np.asarray(echo, float) * self.weight)
+        self.received = np.asarray(echo, float)
+        self.echo = self._alone(self.received * self.weight)
         self.at, self.amplitude = float(np.argmax(np.where(self.weight > 0, echo, -np.inf))), 1.0
 
     def _alone(self, columns: np.ndarray) -> np.ndarray:
@@ -165,3 +166,15 @@ class _Shot:
         matched, norm = self.echo @ echoes, np.sum(echoes**2, axis=0)
         best = int(np.argmax(np.where(matched > 0, matched**2 / norm, 0.0)))
         self.at, self.amplitude = self.at + float(search[best]), float(matched[best] / norm[best])
+
+    def fitted(self, impulse: np.ndarray) -> tuple[np.ndarray, float]:
+        """(bins,) the echo by a response of an odd number of lags, zero in the middle; its background."""
+        lags = np.arange(impulse.size) - impulse.size // 2
+        for search in (_SEARCH[0], *[_SEARCH[1]] * 2):
+            self.place(lags, impulse, search)
+        turns = np.exp(-1j * self.omega[:, None] * lags) @ impulse * self.spectrum
+        shifted = turns * np.exp(-1j * self.omega * (self.at - self.zero))
+        model = np.fft.irfft(shifted, self.size)[: self.bins]
+        both = np.stack([model, np.ones_like(model)], axis=1) * self.weight[:, None]
+        amplitude, base = np.linalg.lstsq(both, self.received * self.weight, rcond=None)[0]
+        return amplitude * model, float(base)

@@ -8,15 +8,17 @@ from scipy import linalg
 
 
 class Noise(NamedTuple):
-    """Independent noise, and what is common to samples.
+    """Samples' own noise, and what is common to samples.
 
     - `alone`: (samples,) standard deviation of each sample's own noise.
     - `common`: (samples, lags) what one standard deviation of each of several other errors does to the
       samples, or None.
+    - `correlation`: (samples, samples) of the samples' own noise, or None where it is independent.
     """
 
     alone: Float[np.ndarray, " samples"]
     common: Float[np.ndarray, "samples lags"] | None = None
+    correlation: Float[np.ndarray, "samples samples"] | None = None
 
     @property
     def sigma(self) -> Float[np.ndarray, " samples"]:
@@ -28,11 +30,24 @@ class Noise(NamedTuple):
     def white(self, x: Float[np.ndarray, "samples ..."]) -> Float[np.ndarray, "samples ..."]:
         """Differences, or columns of them, made independent and of unit variance."""
         own = x / self.alone.reshape(-1, *(1,) * (x.ndim - 1))
-        if self.common is None:
+        if self.common is None and self.correlation is None:
             return own
-        shared = self.common / self.alone[:, None]
-        root = np.linalg.cholesky(np.eye(len(shared)) + shared @ shared.T)
-        return linalg.solve_triangular(root, own, lower=True)
+        total = np.eye(self.alone.size) if self.correlation is None else self.correlation
+        if self.common is not None:
+            shared = self.common / self.alone[:, None]
+            total = total + shared @ shared.T
+        return linalg.solve_triangular(np.linalg.cholesky(total), own, lower=True)
+
+
+def correlation_between(
+    neighbours: float, used: Bool[np.ndarray, "wavelengths bins"]
+) -> Float[np.ndarray, "samples samples"] | None:
+    """Correlations of the samples that are used: powers of that of neighbours, or None where that is 0."""
+    if neighbours == 0:
+        return None
+    wavelength, sample = np.nonzero(used)
+    apart = np.abs(sample[:, None] - sample)
+    return np.where(wavelength[:, None] == wavelength, neighbours**apart, 0.0)
 
 
 def blocks(

@@ -63,6 +63,8 @@ class Recorder(eqx.Module):
     - `pulse_noise`: standard deviation of the noise of the recorded pulse over its peak, independent from
       sample to sample at the record's sampling, 0 or more. `recorded_pulse` gives a pulse with such noise.
       Default 0.
+    - `correlation`: of the noise of neighbouring samples, in [0, 1); between samples n apart it is its n-th
+      power. `noise` of a fit is the standard deviation of each sample. Default 0: independent.
 
     **Raises:** ValueError for a value outside its range, bounds that are no pair low < high, an impulse with
     an even number of lags or a sum that is not above 0, and `interleaved` without `offset`.
@@ -89,6 +91,7 @@ class Recorder(eqx.Module):
     offset: Pair | None = eqx.field(static=True, default=None)
     interleaved: int = eqx.field(static=True, default=1)
     pulse_noise: Float[Array, ""] = eqx.field(converter=_scalar, default=0.0)
+    correlation: Float[Array, ""] = eqx.field(converter=_scalar, default=0.0)
 
     def __check_init__(self):
         for field, low in (("width", 0.0), ("offset", -np.inf)):
@@ -97,6 +100,7 @@ class Recorder(eqx.Module):
                 _check_bounds(field, bounds, low)
         check_integer("interleaved", self.interleaved)
         check_range("pulse_noise", self.pulse_noise, 0.0)
+        check_range("correlation", self.correlation, 0.0, 1.0, high_open=True)
         if self.interleaved > 1 and self.offset is None:
             raise ValueError(f"interleaved = {self.interleaved}, but offset = None: bounds of the offsets")
         if self.impulse is not None:

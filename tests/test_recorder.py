@@ -242,6 +242,7 @@ def test_amplitudes_of_tables_in_decibels():
         ({"interleaved": 2}, "offset = None"),
         ({"interleaved": 0, "offset": (0.0, 1.0)}, "interleaved = 0"),
         ({"impulse": [1.0, 2.0]}, "odd number"),
+        ({"correlation": 1.0}, "correlation"),
         ({"impulse": [1.0, -2.0, 1.0]}, "sum of impulse"),
         ({"pulse_noise": -0.1}, "pulse_noise = -0.1"),
     ],
@@ -272,3 +273,63 @@ def test_other_bad_input_is_refused():
             key=jax.random.key(0),
             recorder=Recorder(offset=(-1.0, 1.0)),
         )
+
+
+def test_correlated_noise_is_noise_of_the_fit():
+    """Standard errors and chi-squared are as stated; taken as independent they are not."""
+    random, pulse, rho = np.random.default_rng(11), jl.SampledPulse(LAG, POWER), 0.6
+    height = random.uniform(-0.5, 0.5, SHOTS)
+    root = np.linalg.cholesky(rho ** np.abs(np.subtract.outer(TIME, TIME)))
+    records = echoes(pulse, height) + 0.02 * random.normal(size=(SHOTS, TIME.size)) @ root.T
+    settings = {"offset": (-1.0, 1.0)}
+    fits = fits_of(records, [pulse], 0.02, Recorder(correlation=rho, **settings), height)
+    assert np.all(fits.converged)
+    for name, truth in (("height", height), ("offset", np.zeros(SHOTS))):
+        assert within((fits.values[name] - truth) / fits.stderr[name]), name
+    assert fits.reduced_chi2.mean() == pytest.approx(1.0, abs=4 * np.sqrt(2 / (TIME.size * SHOTS)))
+    without = fits_of(records, [pulse], 0.02, Recorder(**settings), height)
+    assert not within(without.values["offset"] / without.stderr["offset"])
+
+
+def shots_of_a_compressed_digitiser(random, count=60):
+    """Counts of pulses and of a slow receiver's echoes, both compressed above 110 counts, and the light."""
+    lag, tail = np.arange(-12.0, 13.0), np.array([0.1, 0.7, 0.3, -0.1, 0.02])
+    pulses, found = [], []
+    for strength in random.uniform(60.0, 190.0, count):
+        at = random.uniform(-0.5, 0.5, 2)
+        pulse = 150.0 * np.exp(-0.5 * ((lag - at[0]) / 1.7) ** 2)
+        light = np.convolve(np.exp(-0.5 * ((np.arange(-30.0, 31.0) - at[1]) / 1.7) ** 2), tail, "same")
+        pulses.append(np.round(compressed(pulse + 3.0) + 0.3 * random.normal(size=pulse.size).clip(-2, 2)))
+        own = compressed(strength * light / light.max() + 3.0)
+        found.append(np.maximum(np.round(own + 0.5 * random.normal(size=own.size)), 0.0))
+    return [np.maximum(p, 0.0) for p in pulses], found
+
+
+def compressed(light):
+    return np.where(light > 110.0, 110.0 + 0.7 * (light - 110.0), light)
+
+
+def test_a_corrected_table_undoes_what_the_table_does_not_know():
+    """Within 2 % of the light, where the table as it is is off by more than 10 %."""
+    table, more = np.arange(256.0), {"noise": 0.5, "knots": [100.0, 115.0, 130.0, 145.0, 160.0]}
+    pulses, found = shots_of_a_compressed_digitiser(np.random.default_rng(4))
+    corrected = inversion.corrected_table(table, pulses, found, **more)
+    light = np.linspace(50.0, 180.0, 50)
+    read = np.interp(compressed(light), table, corrected)
+    np.testing.assert_allclose(read, light, rtol=0.02)
+    assert np.max(np.abs(compressed(light) / light - 1.0)) > 0.1
+    assert np.all(np.diff(corrected) > 0)
+
+
+def test_bad_tables_are_refused():
+    counts = [np.arange(20.0)]
+    more = {"noise": 0.5, "knots": [10.0, 20.0]}
+    for changes, says in (
+        ({"pulses": []}, "pulses and echoes are 0 and 1"),
+        ({"knots": [20.0, 10.0]}, "knots"),
+        ({"noise": 0.0}, "noise"),
+        ({"echoes": [np.array([300.0])]}, "echoes"),
+    ):
+        given = {"pulses": counts, "echoes": counts, **more, **changes}
+        with pytest.raises(ValueError, match=says):
+            inversion.corrected_table(np.arange(256.0), **given)

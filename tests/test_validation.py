@@ -168,6 +168,18 @@ def test_recorded_shots_of_riegl(run, shared):
 
 
 @pytest.mark.slow
+def test_recorded_flat_ground(run, shared):
+    """Within a tenth of the best sum of pulses; not where noise is taken as independent."""
+    path = shared / "airborne" / "riegl.pls"
+    assert holds(run("recorded_flat", path))
+
+    def plant(module):
+        module.CORRELATED = 0.0
+
+    assert not holds(run("recorded_flat", path, planted=plant))
+
+
+@pytest.mark.slow
 def test_recorded_shots_of_lvis(run, shared):
     record = run("recorded_lvis", shared / "airborne" / "lvis_example2.pls", "--shots", "8")
     assert holds(record, "apart")

@@ -17,7 +17,7 @@ RESULTS = HERE / "results"
 # The order of the page: exact references first, then other codes, measurements and records.
 ORDER = (
     *("mpmath_plate", "prosail_leaves", "discrete_ordinates", "rami4pilps", "mitransient_crown", "mcx_crown"),
-    *("leaf_databases", "recorded_gedi", "recorded_neon", "recorded_riegl", "recorded_lvis"),
+    *("leaf_databases", "recorded_gedi", "recorded_neon", "recorded_riegl", "recorded_flat", "recorded_lvis"),
 )
 
 HEAD = """# Validation: against what it was checked, and how far off it is
