@@ -37,6 +37,7 @@ class Instrument:
     - `saturation`: counts from which on samples have no weight. Default None: the last of the file's table.
     - `interleaved`: digitisers that take samples in turn, each with its own pedestal.
     - `correlated`: so many neighbouring samples, whose noise is correlated, tell as much as one.
+    - `correlation`: of the noise of neighbouring samples, told to the fit, where `correlated` is 1.
     - `model_error`: of the model, over the largest sample: pulses are records, and canopies not uniform.
     - `pulse_noise`: whether the noise of recorded pulses is told apart from that of returns.
     - `response`: lags, in samples, before and after time zero of the receiver's response, which is estimated
@@ -53,6 +54,7 @@ class Instrument:
     saturation: float | None = None
     interleaved: int = 1
     correlated: int = 1
+    correlation: float = 0.0
     model_error: float = 0.01
     pulse_noise: bool = True
     response: tuple[int, int] | None = None
@@ -74,7 +76,7 @@ class Instrument:
 INSTRUMENTS = {
     "neon": Instrument(divergence=0.8, jitter=1.9, correlated=5, pulse_noise=False, above=25.5, below=7.5,
                        clearance=3.0, fewest=3),
-    "riegl": Instrument(altitude=550.0, count_noise=0.6, response=(4, 40), below=8.0),
+    "riegl": Instrument(altitude=550.0, count_noise=0.9, correlation=0.6, response=(4, 40), below=8.0),
     "lvis": Instrument(altitude=8000.0, divergence=2.5, saturation=215.0, interleaved=2, pulse_noise=False,
                        above=54.0, below=12.0, tallest=48.0),
     "other": Instrument(),
@@ -139,7 +141,16 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     sent.add_argument("--pulse-width", type=float, help="Gaussian pulse: full width at half maximum, ns")
     parser.add_argument("--instrument", choices=list(INSTRUMENTS), help="default: as the file says")
     settings = parser.add_argument_group("settings of the instrument; defaults are its own")
-    for name in ("altitude", "divergence", "jitter", "count_noise", "saturation", "model_error", "tallest"):
+    for name in (
+        "altitude",
+        "divergence",
+        "jitter",
+        "count_noise",
+        "saturation",
+        "correlation",
+        "model_error",
+        "tallest",
+    ):
         settings.add_argument(f"--{name.replace('_', '-')}", type=float)
     for name in ("interleaved", "correlated", "fewest"):
         settings.add_argument(f"--{name}", type=int)

@@ -166,6 +166,7 @@ def fit(
             offset=OFFSET,
             interleaved=own.interleaved,
             pulse_noise=record.pulse_noise,
+            correlation=own.correlation,
         )
         for record in records
     ]
