@@ -358,10 +358,14 @@ def response_of(flight: Flight) -> np.ndarray | None:
     length = [record.signal.sum() / pulse.sum() for record, pulse in zip(records, pulses)]
     chosen = np.argsort(length)[: TARGETS[1]]
     before, after = flight.instrument.response
+    size = max(records[i].signal.size for i in chosen)
     return inversion.receiver_impulse(
         [pulses[i] for i in chosen],
-        [records[i].signal for i in chosen],
-        noise=[records[i].noise for i in chosen],
+        [np.pad(records[i].signal, (0, size - records[i].signal.size)) for i in chosen],
+        noise=[
+            np.pad(records[i].noise, (0, size - records[i].noise.size), constant_values=np.inf)
+            for i in chosen
+        ],
         before=before,
         after=after,
         interleaved=flight.instrument.interleaved,
