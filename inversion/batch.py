@@ -27,7 +27,7 @@ from .data import at_fixed_times, data_of, noise_of, numbers
 from .fit import bounds_of, labels_of, named, smooth_names
 from .job import Job, fits, fits_by
 from .lanes import Lanes
-from .planning import batch_sizes, check_samples, plan_for
+from .planning import batch_sizes, check_samples, check_within, plan_for
 from .profiles import AbstractFitted
 from .quality import Verdict, judge_fits
 from .recorder import Recorder, check_names, settled_terms
@@ -276,7 +276,9 @@ def retrieve_many(
         plan = plan_for(
             lidars[0], scenes[0], settled[0], axis, max_orders=max_orders, photons=photons, rays=rays
         )
-    check_samples(plan, axis)
+    else:
+        check_samples(plan, axis)
+        check_within(plan, lidars[0], scenes[0], settled[0])
 
     how = (plan, solver, max_steps, starts, Lanes.of(min(lanes, len(y))))
     job = Job(range(len(y)), data, lidars, scenes, settled, extra, recorders, *how)

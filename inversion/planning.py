@@ -14,6 +14,7 @@ from jaxlidar.planning.effects import empty
 from jaxlidar.planning.ladder import rung
 from jaxlidar.planning.path_lengths import PathLengths
 from jaxlidar.planning.plan import MIN_BATCHES
+from jaxlidar.planning.plan_check import check_plan
 
 from .unknowns import Settled, put
 
@@ -117,6 +118,21 @@ def plan_for(
         full_cover=tuple(all(c) for c in zip(*(p.trace.full_cover for p in plans))),
     )
     return dataclasses.replace(first, trace=trace, bins=bins)
+
+
+def check_within(plan: Plan, lidar: Lidar, scene: Scene, settled: list[Settled]) -> None:
+    """Check that a plan that was made outside serves all `corners`.
+
+    **Raises:** ValueError where it would leave out light, or a part of the scene.
+    """
+    for number, corner in enumerate(corners(scene, settled)):
+        try:
+            check_plan(plan, lidar, corner)
+        except ValueError as error:
+            where = "at the bounds of the unknowns " if number else ""
+            raise ValueError(
+                f"{where}{error}, or for the largest one within the bounds; without plan= one is made here"
+            ) from error
 
 
 def check_samples(plan: Plan, time: Float[np.ndarray, " bins"]) -> None:

@@ -15,7 +15,7 @@ from jaxlidar.extend import check_integer, check_key, check_kind, check_kinds, c
 from .data import Data, at_fixed_times, data_of
 from .fit import Fit, Outcome, best_of, bounds_of, drive, labels_of, named, smooth_names
 from .model import Model
-from .planning import batch_sizes, check_samples, plan_for
+from .planning import batch_sizes, check_samples, check_within, plan_for
 from .recorder import Recorder, Terms, check_names
 from .result import Retrieval, Step
 from .unknowns import Place, Settled, Unknown, latin_hypercube, settle
@@ -98,9 +98,9 @@ def retrieve(
     **Returns:** a `Retrieval`.
 
     **Raises:** ValueError for inadmissible arguments, among them a start outside its bounds, samples that do
-    not fit the lidar or the plan, a plan together with photons, rays or orders, noise that is negative or
-    NaN, and a lidar so far from x = y = 0 that its place is rounded by more than a millimetre. TypeError for
-    arguments of another kind.
+    not fit the lidar or the plan, a plan that does not serve all scenes within the bounds or that is given
+    together with photons, rays or orders, noise that is negative or NaN, and a lidar so far from x = y = 0
+    that its place is rounded by more than a millimetre. TypeError for arguments of another kind.
     RuntimeError where `throw` is set and the fit does not converge.
 
     **Example:**
@@ -128,7 +128,9 @@ def retrieve(
     check_names(recorder, settled)
     if plan is None:
         plan = plan_for(lidar, scene, settled, data.time, max_orders=max_orders, photons=photons, rays=rays)
-    check_samples(plan, data.time)
+    else:
+        check_samples(plan, data.time)
+        check_within(plan, lidar, scene, settled)
     model = Model(lidar, scene, plan, settled, key)
     terms = Terms(recorder, extra, lidar, data.time.size)
     fits = fits_from(starts, key, data, settled, terms, solver, max_steps, progress)

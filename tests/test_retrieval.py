@@ -416,8 +416,12 @@ def wrong(**changes):
     return lambda: retrieve_ground(**changes)
 
 
-def unknown(where=lambda s: s.ground.height, **changes):
-    return lambda: retrieve_ground(unknowns=[Unknown(where, **{"bounds": (-1.0, 1.0), **changes})])
+def unknown(where=lambda s: s.ground.height, plan=None, **changes):
+    return lambda: retrieve_ground(unknowns=[Unknown(where, **{"bounds": (-1.0, 1.0), **changes})], plan=plan)
+
+
+# It does not reach up to 8 m.
+LOW = jl.plan(PLAIN, ground_scene(), window=(-20.0, 20.0), describe=False)
 
 
 @pytest.mark.parametrize(
@@ -445,6 +449,10 @@ def unknown(where=lambda s: s.ground.height, **changes):
         (wrong(observed=np.full((2, 41), np.nan), time=TIME), "observed = nan"),
         (wrong(lidar=LIDAR), "observed has the wavelengths"),
         (wrong(plan=jl.plan(PLAIN, ground_scene())), "they must agree"),
+        (
+            unknown(bounds=(-1.0, 8.0), plan=LOW),
+            r"at the bounds of the unknowns the plan does not fit: its rays start .* reaches to",
+        ),
         (wrong(scale=(2.0, 1.0)), "scale = .* is not low < high"),
         (wrong(unknowns=[GROUND[0], GROUND[0]]), "name = 'height' is given to 2 unknowns"),
         (

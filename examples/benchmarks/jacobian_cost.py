@@ -57,7 +57,8 @@ def main() -> None:
     )
 
     def response(geometric, optical, key):
-        return jl.trace_scene(jl.reduce(lidar, scene_at(optical, geometric, extinction), plan), key)
+        setup = jl.reduce(lidar, scene_at(optical, geometric, extinction), plan)
+        return jl.trace_scene(setup, key, reverse=False)
 
     def colour(response, optical, geometric):
         return jl.total_of(response, jl.reduce(lidar, scene_at(optical, geometric, extinction), plan))

@@ -88,8 +88,9 @@ def peers(record: dict) -> str:
     head = ["scene, pulse", "code", "s to 1 %", "CPU s to 1 %", "times ours", "s, first call", "total"]
     return page_of(
         "Seconds until a waveform is known to 1 %, beside codes that compute the same: a crown of 64³ voxels "
-        "and 15 scatterings. They do much that jaxlidar does not (meshes, any material and camera, "
-        "polarisation); they have no histories that colour one trace for all wavelengths, and no tolerance.",
+        "and 15 scatterings, the receiver as wide as what is lit, or open to everything. They do much that "
+        "jaxlidar does not (meshes, any material and camera, polarisation); they have no histories that "
+        "colour one trace for all wavelengths, and no tolerance.",
         table(head, rows),
     )
 

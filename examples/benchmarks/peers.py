@@ -8,9 +8,11 @@ out, and said to be. Each runs in a process of its own. mitransient needs an LLV
 The scene: 64^3 voxels of 10 m / 64; in a sphere of radius 3.5 m the extinction is 0.5 U(0, 2) 1/m, rounded to
 1/200 1/m because MCX numbers its media; isotropic scattering with albedo 0.9; Lambertian ground of
 reflectance 0.3. The laser lights a disc of 5 m from 1000 m; 200 samples of 1 ns; up to 15 scatterings. The
-receiver sees everything: jaxlidar's field of view is round with a soft edge, a camera's square and sharp.
-Compared are the returns of an instant pulse in samples of 1 ns, which is what the peers compute, and those of
-a pulse of 6 ns, with which the peers' histograms of 0.05 ns are convolved afterwards, at no charge.
+receiver is as wide as what is lit, as instruments have it: jaxlidar's field of view is round with a soft
+edge, mitransient's camera sees a square of the same area. As their edges differ, agreement is tested where
+the receiver sees everything. Compared are the returns of an instant pulse in samples of 1 ns, which is what
+the peers compute, and those of a pulse of 6 ns, with which the peers' histograms of 0.05 ns are convolved
+afterwards, at no charge.
 
 The error is the root mean square, over the samples above 1 % of the peak, of the standard deviation over
 repetitions over the mean; seconds to 1 % = seconds * (error / 0.01)^2. A repetition does about the work that
@@ -28,7 +30,7 @@ neither has the optics of all wavelengths from one trace, standard errors, or a 
 
 mitransient 1.3.1 leaves stretches between null collisions out of path lengths. `_peer_mitransient.py`
 corrects that, or says that it could not, when only totals can be compared. "Spot and camera" is the set-up
-that a user of a renderer begins with; its camera sees the square of 10 m x 10 m alone, so it is not tested.
+that a user of a renderer begins with, its camera sees the square of 10 m x 10 m.
 MCX books light when it leaves a voxel, by gates of 1 ns: compare its totals, its samples are that coarse.
 MCX's own way is to count photons that leave within a cone; how long that would take is computed, not
 measured, for a half angle of 10 degrees, from its rate and the Poisson statistics of equal photons.
@@ -56,8 +58,13 @@ FIRST, BLOCK = 3, 5
 CONE = 10.0
 # Rays and photons of one repetition: about 1 % of error.
 WORK = {"mitransient_samples": 2**19, "mcx_photons": 400_000}
-TARGET = {"mitransient": 15.0, "MCX-CL": 50.0}
-CASES = {"ground": "crown over ground", "alone": "crown alone"}
+CASES = {
+    "camera": "crown over ground, narrow receiver",
+    "ground": "crown over ground",
+    "alone": "crown alone",
+}
+# Of the same area as the camera's square: in mrad, from 1000 m.
+FIELD_OF_VIEW = 2 * SIZE / np.sqrt(np.pi)
 
 
 def crown() -> np.ndarray:
@@ -81,8 +88,11 @@ def ours(extinction: np.ndarray, case: str, pulse: float, repeats: int, orders: 
         leaf=extinction, voxel_size=SIZE / N, origin=(-SIZE / 2, -SIZE / 2, 0.0)
     )
     canopy = jl.Canopy(voxels, leaf=jl.Isotropic(albedo=ALBEDO))
-    scene = jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=SOIL) if case == "ground" else None)
-    lidar = jl.Lidar(divergence=LIDAR.divergence, profile="top-hat", pulse=jl.GaussianPulse(pulse))
+    scene = jl.Scene(canopy=canopy, ground=None if case == "alone" else jl.Ground(reflectance=SOIL))
+    receiver = {"field_of_view": FIELD_OF_VIEW} if case == "camera" else {}
+    lidar = jl.Lidar(
+        divergence=LIDAR.divergence, profile="top-hat", pulse=jl.GaussianPulse(pulse), **receiver
+    )
     waves, times, infos = [], [], []
     for seed in range(repeats + 1):
         start, work = time.perf_counter(), time.process_time()
@@ -207,22 +217,20 @@ def main() -> None:
             if not found.get("corrected", True):
                 notes[name] += ", path lengths not corrected: only totals are comparable"
             for (case, pulse), run in runs.items():
-                for label, key in ((name, case), (f"{name}, spot and camera", "camera")):
-                    if f"{key}_waves" in found and (key == case or case == "ground"):
-                        waves = sampled(found[f"{key}_waves"], PULSES[pulse])
-                        times, first = found[f"{key}_times"], float(found[f"{key}_first"])
-                        run[label] = {"waves": waves, "times": times, "first": first}
+                if f"{case}_waves" in found:
+                    waves = sampled(found[f"{case}_waves"], PULSES[pulse])
+                    times, first = found[f"{case}_times"], float(found[f"{case}_first"])
+                    run[name] = {"waves": waves, "times": times, "first": first}
 
     results, rows = [], []
     for (case, pulse), run in runs.items():
         mine = judge(run["jaxlidar"])
         for name, one in run.items():
             its = judge(one)
-            comparable = name in TARGET
             if name != "jaxlidar":
                 its["ratio"] = its["seconds_to_1_percent"] / mine["seconds_to_1_percent"]
                 its["cpu_ratio"] = its["cpu_seconds_to_1_percent"] / mine["cpu_seconds_to_1_percent"]
-            if comparable:
+            if name != "jaxlidar" and case != "camera":
                 its["agreement"] = agreement(run["jaxlidar"]["waves"], one["waves"])
             if name == "MCX-CL":
                 its["seconds_if_counted_computed"] = counted(one, WORK["mcx_photons"])
@@ -247,7 +255,7 @@ def main() -> None:
                     else "",
                 )
             )
-    record = {"machine": {**machine(), "load_before": load}, "notes": notes, "wanted": TARGET}
+    record = {"machine": {**machine(), "load_before": load}, "notes": notes}
     write_json(given.out / "peers.json", {**record, "work": WORK, "results": results})
     draw(runs, results, given.out / "peers.png")
     head = (
@@ -263,11 +271,7 @@ def main() -> None:
         "z: total, rms",
     )
     print_table(head, rows)
-    print(
-        "ratio: of the seconds to 1 % to jaxlidar's;",
-        ", ".join(f"{n} {r:g}" for n, r in TARGET.items()),
-        "wanted",
-    )
+    print("ratio: of the seconds to 1 % to jaxlidar's")
     print("load before:", ", ".join(f"{name} {value:.1f}" for name, value in load.items()))
     for name, note in notes.items():
         print(f"{name}: {note}")
@@ -275,7 +279,7 @@ def main() -> None:
 
 def draw(runs: dict, results: list[dict], path: Path) -> None:
     """Waveforms with bands of two standard errors of one repetition, and what 1 % costs."""
-    figure, axes = new_figure(3, (15, 4.5))
+    figure, axes = new_figure(4, (19, 4.5))
     names = list(dict.fromkeys(r["code"] for r in results))
     colour = {name: f"C{i}" for i, name in enumerate(names)}
     style = dict(zip(names, ("-", "--", "-.", ":")))
@@ -296,10 +300,11 @@ def draw(runs: dict, results: list[dict], path: Path) -> None:
     for name in names:
         own = [r for r in results if r["code"] == name]
         x = [keys[r["case"], r["pulse"]] for r in own]
-        axes[2].semilogy(x, [r["seconds_to_1_percent"] for r in own], "o", color=colour[name], label=name)
-        axes[2].semilogy(x, [r["cpu_seconds_to_1_percent"] for r in own], "x", color=colour[name])
-    axes[2].set_xticks(list(keys.values()), ["\n".join(k) for k in keys], fontsize=8)
-    axes[2].set(ylabel="seconds to 1 %: wall (o), CPU (x)", xlim=(-0.5, len(keys) - 0.5))
+        axes[3].semilogy(x, [r["seconds_to_1_percent"] for r in own], "o", color=colour[name], label=name)
+        axes[3].semilogy(x, [r["cpu_seconds_to_1_percent"] for r in own], "x", color=colour[name])
+    labels = [", ".join(key) for key in keys]
+    axes[3].set_xticks(list(keys.values()), labels, fontsize=8, rotation=30, ha="right")
+    axes[3].set(ylabel="seconds to 1 %: wall (o), CPU (x)", xlim=(-0.5, len(keys) - 0.5))
     save_figure(figure, path)
 
 
