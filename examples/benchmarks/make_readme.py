@@ -110,6 +110,21 @@ def simulation(record: dict) -> str:
     return table(["scene", "rtol", "s", "s, first call", "photons", "error reached"], rows)
 
 
+def pythons(record: dict) -> str:
+    *older, newest = record["versions"]
+    name = "Python {python}, jax {jax}".format
+    head = ["", f"{name(**newest)}: s", *(f"{name(**v)}: s, and times as long" for v in older)]
+    rows = [
+        [
+            what,
+            number(seconds),
+            *(f"{number(v['seconds'][what])}, {number(v['ratio'][what])} times" for v in older),
+        ]
+        for what, seconds in newest["seconds"].items()
+    ]
+    return page_of("The same work on several Pythons, for each has its newest JAX.", table(head, rows))
+
+
 def scaling(record: dict) -> str:
     rows = [[f"{r['n']:,} photons", number(r["seconds"]), f"{r['bytes']:,.0f}"] for r in record["photons"]]
     rows += [[f"{r['side']}³ voxels", number(r["seconds"]), f"{r['bytes']:,.0f}"] for r in record["voxels"]]
@@ -340,6 +355,7 @@ SECTIONS: dict[str, tuple[str, Callable[[dict], str]]] = {
     "peers": ("Other codes", peers),
     "effects_cost": ("What plans save", effects),
     "scaling": ("How cost grows", scaling),
+    "python_versions": ("Older Pythons", pythons),
     "first_order_march": ("The first order beside a kernel written by hand", march),
     "one_trace_all_wavelengths": ("Many wavelengths from one trace", wavelengths),
     "jacobian_cost": ("A Jacobian in eight unknowns", jacobian),

@@ -22,8 +22,10 @@ from jaxlidar.scenes.terrain import Terrain
 _ROUNDING = 1e-5
 
 
-def check_plan(plan: Plan, lidar: Lidar, scene: Scene) -> None:
+def check_plan(plan: Plan, lidar: Lidar, scene: Scene, *, whole: bool = True) -> None:
     """Refuse a plan that does not fit: one that would leave out light, or a part of the scene.
+
+    Without `whole`, light may arrive after the plan's last bin, or before its first.
 
     **Raises:** ValueError that names what does not fit, with numbers.
     """
@@ -37,7 +39,10 @@ def check_plan(plan: Plan, lidar: Lidar, scene: Scene) -> None:
                 f"the plan does not fit: it is for a map without {name}; make one for this scene"
             )
     lidar, scene = without(*about_aim(lidar, scene), plan.off)
-    for sentence in (*_kinds(plan, lidar, scene), *_times(plan, lidar, scene), *_pulse(plan, lidar)):
+    sentences = [*_kinds(plan, lidar, scene), *_reach(plan, lidar, scene), *_pulse(plan, lidar)]
+    if whole:
+        sentences += _times(plan, lidar, scene)
+    for sentence in sentences:
         raise ValueError(f"the plan does not fit: {sentence}; make one for this lidar and this scene")
 
 
@@ -79,22 +84,14 @@ def _kinds(plan: Plan, lidar: Lidar, scene: Scene) -> Iterator[str]:
             )
 
 
-def _times(plan: Plan, lidar: Lidar, scene: Scene) -> Iterator[str]:
-    """When light returns, and how far it flies."""
-    lengths, trace, bins, limits = PathLengths(lidar, scene), plan.trace, plan.bins, plan.limits
+def _reach(plan: Plan, lidar: Lidar, scene: Scene) -> Iterator[str]:
+    """How far rays and photons go."""
+    lengths, trace = PathLengths(lidar, scene), plan.trace
     top = -0.5 * lengths.first
     if top > trace.upstream:
         yield (
             f"its rays start {trace.upstream:g} m before the reference plane; the scene reaches to {top:g} m"
         )
-    first, last = lengths.first / SPEED_OF_LIGHT, lengths.last / SPEED_OF_LIGHT
-    begin, end = bins.start, trace.last / SPEED_OF_LIGHT - bins.width
-    if not limits.automatic_window:
-        # What a window leaves out is the caller's choice, for scenes no larger than the plan's.
-        begin, end = min(begin, limits.first), max(end, limits.last)
-    slack = bins.width + _ROUNDING * max(abs(begin), abs(end))
-    if first < begin - slack or last > end + slack:
-        yield f"it covers returns from {begin:.6g} to {end:.6g} ns; the scene has {first:.6g} to {last:.6g}"
     if (
         lengths.longest_chord < trace.max_step
         and lengths.first_steps(lengths.longest_chord) > trace.first_steps
@@ -113,6 +110,19 @@ def _times(plan: Plan, lidar: Lidar, scene: Scene) -> Iterator[str]:
     flight = lengths.longest_flight(longest)
     if flight > trace.max_flight * (1 + _ROUNDING):
         yield f"it follows flights over {trace.max_flight:g} m; the scene calls for {flight:g} m"
+
+
+def _times(plan: Plan, lidar: Lidar, scene: Scene) -> Iterator[str]:
+    """When light returns."""
+    lengths, trace, bins, limits = PathLengths(lidar, scene), plan.trace, plan.bins, plan.limits
+    first, last = lengths.first / SPEED_OF_LIGHT, lengths.last / SPEED_OF_LIGHT
+    begin, end = bins.start, trace.last / SPEED_OF_LIGHT - bins.width
+    if not limits.automatic_window:
+        # What a window leaves out is the caller's choice, for scenes no larger than the plan's.
+        begin, end = min(begin, limits.first), max(end, limits.last)
+    slack = bins.width + _ROUNDING * max(abs(begin), abs(end))
+    if first < begin - slack or last > end + slack:
+        yield f"it covers returns from {begin:.6g} to {end:.6g} ns; the scene has {first:.6g} to {last:.6g}"
 
 
 def _pulse(plan: Plan, lidar: Lidar) -> Iterator[str]:

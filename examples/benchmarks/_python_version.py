@@ -1,0 +1,66 @@
+"""Worker of `python_versions.py`: seconds of some work in this process, as a line of JSON."""
+
+import dataclasses
+import json
+import platform
+import time
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from _common import best, race
+from simulation_cost import LIDAR, ORDERS, WINDOW, scenes
+
+import jaxlidar as jl
+
+KEY, ROUNDS = jax.random.key(0), 9
+TRAITS = {"N": 1.8, "Cab": 40.0, "Car": 8.0, "Cant": 1.0, "Cbrown": 0.1, "Cw": 0.01, "Cm": 0.009}
+LEAVES, SPECTRUM = 200, np.arange(400.0, 2501.0)
+
+
+def main() -> None:
+    scene = scenes()["crown over ground"]
+
+    def simulation():
+        return jl.simulate(LIDAR, scene, key=KEY, rtol=0.01, max_orders=ORDERS, window=WINDOW).reflectance
+
+    begun = time.perf_counter()
+    jax.block_until_ready(simulation())
+    first_call = time.perf_counter() - begun
+
+    plan = jl.plan(LIDAR, scene, max_orders=ORDERS, window=WINDOW, describe=False)
+    single = jl.plan(LIDAR, scene, max_orders=1, window=WINDOW, n_rays=8192, describe=False)
+    few = dataclasses.replace(plan, n_rays=1)
+
+    def trace(scene, plan):
+        return jl.trace_scene(jl.reduce(LIDAR, scene, plan), KEY, reverse=False)
+
+    def raised(heights):
+        moved = eqx.tree_at(lambda s: s.ground.height, scene, heights[0])
+        return eqx.tree_at(lambda s: s.canopy.voxels.leaf, moved, scene.canopy.voxels.leaf * heights[1])
+
+    def total(heights):
+        setup = jl.reduce(LIDAR, raised(heights), plan)
+        return jl.total_of(jl.trace_scene(setup, KEY, reverse=False), setup)
+
+    traced = eqx.filter_jit(trace)
+    jacobian = jax.jit(jax.jacfwd(total))
+    leaves = jax.vmap(lambda n: jl.Prospect(**{**TRAITS, "N": n}))(jnp.linspace(1.2, 2.4, LEAVES))
+    spectra = jax.jit(lambda x: jl.prospect_spectra(x, SPECTRUM, 20))
+    found = race(
+        {
+            "simulate to 1 %": simulation,
+            f"{single.n_rays} rays, first order": lambda: traced(scene, single),
+            f"{few.n_photons} photons, higher orders": lambda: traced(scene, few),
+            "Jacobian in height and density": lambda: jacobian(jnp.array([0.0, 1.0])),
+            f"{LEAVES} leaf spectra": lambda: spectra(leaves),
+        },
+        ROUNDS,
+    )
+    seconds = {"first call": first_call, **best(found)}
+    print(json.dumps({"python": platform.python_version(), "jax": jax.__version__, "seconds": seconds}))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,67 @@
+"""The same work on several Pythons: what older versions of JAX cost.
+
+Run it as `python examples/benchmarks/python_versions.py --python PATH [--python PATH ...] [--out figures]`,
+each PATH an interpreter that has jaxlidar installed, the newest last. Every interpreter measures in processes
+of its own (`_python_version.py`), in turn, round after round, so that other work falls on all alike; the
+fastest round counts.
+
+The scene is the crown over ground of `simulation_cost.py`. "First call" is the whole call of `simulate` in a
+new process, which compiles; all else is warm.
+"""
+
+import argparse
+import json
+import subprocess
+from pathlib import Path
+
+import numpy as np
+from _common import machine, new_figure, print_table, save_figure, write_json
+
+
+def measured(python: str) -> dict:
+    """What one process of an interpreter measured."""
+    worker = Path(__file__).with_name("_python_version.py")
+    done = subprocess.run([python, str(worker)], capture_output=True, text=True)
+    if done.returncode:
+        raise SystemExit(f"{python} failed: {(done.stderr.strip() or 'no message').splitlines()[-1]}")
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="The same work on several Pythons.")
+    parser.add_argument("--python", action="append", required=True, help="interpreter; the newest last")
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--out", default="figures", type=Path, help="folder of the results")
+    given = parser.parse_args()
+    runs: list[list[dict]] = [[] for _ in given.python]
+    for _ in range(given.rounds):
+        for python, found in zip(given.python, runs):
+            found.append(measured(python))
+    versions = []
+    for found in runs:
+        seconds = {name: min(f["seconds"][name] for f in found) for name in found[0]["seconds"]}
+        versions.append({"python": found[0]["python"], "jax": found[0]["jax"], "seconds": seconds})
+    newest = versions[-1]["seconds"]
+    for version in versions:
+        version["ratio"] = {name: s / newest[name] for name, s in version["seconds"].items()}
+    write_json(given.out / "python_versions.json", {"machine": machine(), "versions": versions})
+
+    figure, axes = new_figure(size=(7, 3.5))
+    names, height = list(newest), 0.8 / len(versions)
+    for i, version in enumerate(versions):
+        label = f"Python {version['python']}, jax {version['jax']}"
+        axes.barh(np.arange(len(names)) + i * height, list(version["ratio"].values()), height, label=label)
+    axes.set_yticks(np.arange(len(names)) + 0.5 * height * (len(versions) - 1), names)
+    axes.invert_yaxis()
+    axes.set_xlabel(f"times the seconds of Python {versions[-1]['python']}")
+    axes.legend()
+    save_figure(figure, given.out / "python_versions.png")
+    head = ("", *(f"{v['python']}, s" for v in versions), *(f"{v['python']}, times" for v in versions[:-1]))
+    print_table(
+        head,
+        [(n, *(v["seconds"][n] for v in versions), *(v["ratio"][n] for v in versions[:-1])) for n in names],
+    )
+
+
+if __name__ == "__main__":
+    main()
