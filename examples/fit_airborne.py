@@ -51,6 +51,8 @@ from inversion import Recorder, Unknown, Verdict
 WAY = 0.149896229
 # Footprints from so wide on show slopes, m.
 WIDE = 5.0
+# Of slopes, degrees.
+STEEPEST = 30.0
 # A fitted ground so far from the last echo is doubtful, m; so is a single echo that is broadened by so much
 # of its pulse's standard deviation.
 APART, BROAD = 1.0, 0.5
@@ -82,11 +84,11 @@ class Kind(NamedTuple):
 def kinds_of(own: Instrument) -> tuple[Kind, Kind]:
     """Ground alone, and ground under a canopy."""
     canopy, wide = Layers(clearance=own.clearance), own.footprint > WIDE
-    slope = [Unknown("ground.slope", bounds=(0.0, 30.0), name="slope", prior=(0.0, 15.0))] if wide else []
-    sloping = 5.0 if wide else 0.0
+    slope = [Unknown("ground.slope", bounds=(0.0, STEEPEST), name="slope", prior=(0.0, 15.0))] if wide else []
+    sloping, steepest = (5.0, STEEPEST) if wide else (0.0, 0.0)
     height = {"name": "ground", "bounds": (-3.0, 3.0), "start": 0.0}
     bare, steep = (
-        jl.Scene(ground=jl.Ground(reflectance=GROUND, slope=degrees)) for degrees in (sloping, 5 * sloping)
+        jl.Scene(ground=jl.Ground(reflectance=GROUND, slope=degrees)) for degrees in (sloping, steepest)
     )
     high = eqx.tree_at(lambda s: s.ground.height, steep, 3.0)
     unknowns = [
@@ -107,7 +109,7 @@ def kinds_of(own: Instrument) -> tuple[Kind, Kind]:
         ),
     ]
     start = canopy.scene(0.3 * own.tallest, slope=sloping)
-    tall = canopy.scene(own.tallest, slope=5 * sloping)
+    tall = canopy.scene(own.tallest, ground=3.0, slope=steepest)
     return (
         Kind("ground", bare, high, [Unknown("ground.height", **height), *slope], own.below),
         Kind("ground and canopy", start, tall, unknowns, own.above, canopy),

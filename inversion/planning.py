@@ -14,7 +14,7 @@ from jaxlidar.planning.effects import empty
 from jaxlidar.planning.ladder import rung
 from jaxlidar.planning.path_lengths import PathLengths
 from jaxlidar.planning.plan import MIN_BATCHES
-from jaxlidar.planning.plan_check import check_plan
+from jaxlidar.planning.plan_check import check_reach
 
 from .unknowns import Settled, put
 
@@ -121,13 +121,13 @@ def plan_for(
 
 
 def check_within(plan: Plan, lidar: Lidar, scene: Scene, settled: list[Settled]) -> None:
-    """Check that a plan that was made outside serves all `corners`. A record may end before the light.
+    """Check that a plan that was made outside serves all `corners`; records may end before the light.
 
     **Raises:** ValueError where it would leave out light that is recorded, or a part of the scene.
     """
     for number, corner in enumerate(corners(scene, settled)):
         try:
-            check_plan(plan, lidar, corner, whole=False)
+            check_reach(plan, lidar, corner)
         except ValueError as error:
             where = "at the bounds of the unknowns " if number else ""
             raise ValueError(

@@ -1,7 +1,7 @@
 """Whether a plan that was made earlier serves a lidar and a scene."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 from jaxlidar._checks import known_number
 from jaxlidar._constants import SPEED_OF_LIGHT
@@ -22,13 +22,23 @@ from jaxlidar.scenes.terrain import Terrain
 _ROUNDING = 1e-5
 
 
-def check_plan(plan: Plan, lidar: Lidar, scene: Scene, *, whole: bool = True) -> None:
+def check_plan(plan: Plan, lidar: Lidar, scene: Scene) -> None:
     """Refuse a plan that does not fit: one that would leave out light, or a part of the scene.
-
-    Without `whole`, light may arrive after the plan's last bin, or before its first.
 
     **Raises:** ValueError that names what does not fit, with numbers.
     """
+    _check(plan, lidar, scene, (_kinds, _reach, _times, _pulse))
+
+
+def check_reach(plan: Plan, lidar: Lidar, scene: Scene) -> None:
+    """As `check_plan`, whatever the pulse, and whether or not light arrives when nothing is recorded.
+
+    **Raises:** ValueError that names what does not fit, with numbers.
+    """
+    _check(plan, lidar, scene, (_kinds, _reach))
+
+
+def _check(plan: Plan, lidar: Lidar, scene: Scene, rules: Sequence[Callable]) -> None:
     check_on_terrain(lidar, scene)
     ground = scene.ground
     if plan.limits.flat and isinstance(ground, Terrain) and ground.relief and not ground.is_plane():
@@ -39,11 +49,9 @@ def check_plan(plan: Plan, lidar: Lidar, scene: Scene, *, whole: bool = True) ->
                 f"the plan does not fit: it is for a map without {name}; make one for this scene"
             )
     lidar, scene = without(*about_aim(lidar, scene), plan.off)
-    sentences = [*_kinds(plan, lidar, scene), *_reach(plan, lidar, scene), *_pulse(plan, lidar)]
-    if whole:
-        sentences += _times(plan, lidar, scene)
-    for sentence in sentences:
-        raise ValueError(f"the plan does not fit: {sentence}; make one for this lidar and this scene")
+    for rule in rules:
+        for sentence in rule(plan, lidar, scene):
+            raise ValueError(f"the plan does not fit: {sentence}; make one for this lidar and this scene")
 
 
 def _kinds(plan: Plan, lidar: Lidar, scene: Scene) -> Iterator[str]:
@@ -125,7 +133,7 @@ def _times(plan: Plan, lidar: Lidar, scene: Scene) -> Iterator[str]:
         yield f"it covers returns from {begin:.6g} to {end:.6g} ns; the scene has {first:.6g} to {last:.6g}"
 
 
-def _pulse(plan: Plan, lidar: Lidar) -> Iterator[str]:
+def _pulse(plan: Plan, lidar: Lidar, scene: Scene) -> Iterator[str]:
     """The pulse, and how it is sampled."""
     interval = known_number(lidar.sampling_interval)
     if lidar.receiver.window == "fixed" and abs(plan.sample_interval - interval) > _ROUNDING * interval:
