@@ -27,6 +27,20 @@ def measured(python: str) -> dict:
     return json.loads(done.stdout.splitlines()[-1])
 
 
+def draw(versions: list[dict], path: Path) -> None:
+    """Seconds over those of the newest version."""
+    figure, axes = new_figure(size=(7, 3.8))
+    names, height = list(versions[-1]["seconds"]), 0.8 / len(versions)
+    for i, version in enumerate(versions):
+        label = f"Python {version['python']}, jax {version['jax']}"
+        axes.barh(np.arange(len(names)) + i * height, list(version["ratio"].values()), height, label=label)
+    axes.set_yticks(np.arange(len(names)) + 0.5 * height * (len(versions) - 1), names)
+    axes.invert_yaxis()
+    axes.set_xlabel(f"times the seconds of Python {versions[-1]['python']}")
+    figure.legend(loc="outside upper center", ncols=len(versions), frameon=False)
+    save_figure(figure, path)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description="The same work on several Pythons.")
     parser.add_argument("--python", action="append", required=True, help="interpreter; the newest last")
@@ -46,20 +60,11 @@ def main() -> None:
         version["ratio"] = {name: s / newest[name] for name, s in version["seconds"].items()}
     write_json(given.out / "python_versions.json", {"machine": machine(), "versions": versions})
 
-    figure, axes = new_figure(size=(7, 3.5))
-    names, height = list(newest), 0.8 / len(versions)
-    for i, version in enumerate(versions):
-        label = f"Python {version['python']}, jax {version['jax']}"
-        axes.barh(np.arange(len(names)) + i * height, list(version["ratio"].values()), height, label=label)
-    axes.set_yticks(np.arange(len(names)) + 0.5 * height * (len(versions) - 1), names)
-    axes.invert_yaxis()
-    axes.set_xlabel(f"times the seconds of Python {versions[-1]['python']}")
-    axes.legend()
-    save_figure(figure, given.out / "python_versions.png")
+    draw(versions, given.out / "python_versions.png")
     head = ("", *(f"{v['python']}, s" for v in versions), *(f"{v['python']}, times" for v in versions[:-1]))
     print_table(
         head,
-        [(n, *(v["seconds"][n] for v in versions), *(v["ratio"][n] for v in versions[:-1])) for n in names],
+        [(n, *(v["seconds"][n] for v in versions), *(v["ratio"][n] for v in versions[:-1])) for n in newest],
     )
 
 
