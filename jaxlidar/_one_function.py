@@ -9,7 +9,6 @@ from collections.abc import Callable
 from typing import TypeVar
 
 import jax
-from jax.experimental.xla_metadata import set_xla_metadata
 
 State = TypeVar("State")
 
@@ -24,6 +23,9 @@ def one_function(loop: Callable[[State], State]) -> Callable[[State], State]:
     """
     if jax.__version_info__ >= _UNAIDED or jax.default_backend() != "cpu":
         return loop
+    # Experimental: only where it is needed.
+    from jax.experimental.xla_metadata import set_xla_metadata
+
     compiled = jax.jit(loop)
 
     def marked(state: State) -> State:
