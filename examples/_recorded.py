@@ -150,12 +150,9 @@ def draw_shot(axes, picture):
     for name, (color, style) in styles.items():
         if name in picture:
             axes.axhline(picture[name], color=color, linestyle=style, linewidth=1.0, label=name)
-    low, high = (
-        picture["ground"] - 6.0,
-        max(picture["ground"] + 12.0, picture.get("canopy top", picture["ground"]) + 4.0),
-    )
-    axes.set_ylim(low, high)
-    axes.set_xlabel("signal", fontsize=8)
+    ground = picture["ground"]
+    axes.set_ylim(ground - 6.0, max(ground + 12.0, picture.get("canopy top", ground) + 4.0))
+    axes.set_xlabel(f"signal ({picture['unit']})", fontsize=8)
     axes.set_title(picture["title"], fontsize=9)
 
 

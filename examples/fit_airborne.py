@@ -62,7 +62,7 @@ LAGS = 80
 BROADENING, OFFSET, SCALE = (0.05, 10.0), (-0.2, 0.2), (0.0, 1e3)
 UNITS = {
     **dict.fromkeys(("ground", "ground_stderr", "last_echo", "canopy_top", "canopy_top_stderr"), "m"),
-    **dict.fromkeys(("clearance",), "m"),
+    "clearance": "m",
     **dict.fromkeys(("easting", "northing"), "as in the file"),
     **dict.fromkeys(("longitude", "latitude", "slope", "slope_stderr"), "degrees"),
     **dict.fromkeys(("broadening", "broadening_stderr"), "ns"),
@@ -262,6 +262,7 @@ def row_of(kind: Kind, record: Record, echoes: np.ndarray, found: Fitted, i: int
         "ground": ground,
         "reference": float(echoes[-1]),
         "chi2": row["reduced_chi2"],
+        "unit": "amplitude",
         **top,
     }
     return row, picture
@@ -281,18 +282,24 @@ def fit_shots(shots: Sequence, flight: Flight, stem: Path | None = None, progres
     for record, all_echoes in zip(records, echoes_of(records, impulse)):
         echoes = all_echoes[all_echoes - all_echoes[-1:] < own.above]
         if len(echoes) == 1 or len(echoes) >= own.fewest:
-            batches[kinds[len(echoes) > 1].name].append((record, echoes))
+            more = all_echoes.size - echoes.size
+            said = (
+                [f"above what is fitted, {own.above:g} m over the last echo: {above} more"] if above else []
+            )
+            batches[kinds[len(echoes) > 1].name].append((record, echoes, said))
         else:
             reason = "ground and canopy cannot be told apart" if len(echoes) else "nothing above the noise"
             rows.append(bad_row(f"{len(echoes)} echoes: {reason}", **known_of(record.shot, echoes)))
     for kind in kinds:
         if not batches[kind.name]:
             continue
-        chosen, echoes = zip(*batches[kind.name])
+        chosen, echoes, said = zip(*batches[kind.name])
         name = kind.name.replace(" ", "_")
         path = None if stem is None else stem.with_name(f"{stem.name}.{name}.sqlite")
         found = fit(kind, chosen, echoes, own, impulse, path, progress)
         for i, verdict in enumerate(inversion.judge_fits(found.fits, about=["ground"])):
+            if said[i]:
+                verdict &= Verdict("doubtful", tuple(said[i]))
             row, picture = row_of(kind, chosen[i], echoes[i], found, i, verdict)
             rows.append(row)
             pictures.append(picture)

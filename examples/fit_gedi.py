@@ -253,6 +253,7 @@ def fit_shots(shots, path=None, progress=None):
                 "ground": row["ground"],
                 "canopy top": row["canopy_top"],
                 "chi2": row["reduced_chi2"],
+                "unit": "counts",
             }
         )
     return rows, pictures

@@ -27,7 +27,7 @@ from .data import at_fixed_times, data_of, noise_of, numbers
 from .fit import bounds_of, labels_of, named, smooth_names
 from .job import Job, fits, fits_by
 from .lanes import Lanes
-from .planning import batch_sizes, check_samples, check_within, plan_for
+from .planning import batch_sizes, plan_within
 from .profiles import AbstractFitted
 from .quality import Verdict, judge_fits
 from .recorder import Recorder, check_names, settled_terms
@@ -272,13 +272,8 @@ def retrieve_many(
         "max_steps": max_steps,
         "starts": starts,
     }
-    if plan is None:
-        plan = plan_for(
-            lidars[0], scenes[0], settled[0], axis, max_orders=max_orders, photons=photons, rays=rays
-        )
-    else:
-        check_samples(plan, axis)
-        check_within(plan, lidars[0], scenes[0], settled[0])
+    sizes = {"max_orders": max_orders, "photons": photons, "rays": rays}
+    plan = plan_within(plan, lidars[0], scenes[0], settled[0], axis, **sizes)
 
     how = (plan, solver, max_steps, starts, Lanes.of(min(lanes, len(y))))
     job = Job(range(len(y)), data, lidars, scenes, settled, extra, recorders, *how)

@@ -13,14 +13,16 @@ from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from jaxlidar import Lidar, Plan, Scene, Waveform
 from jaxlidar import plan as make_plan
-from jaxlidar.extend import check_key, check_kinds, check_range
+from jaxlidar.extend import check_key, check_kind, check_kinds, check_range
+from jaxlidar.planning.plan_check import check_reach
 
 from .data import at_fixed_times, data_of, noise_of, numbers, time_axis
 from .fit import labels_of, named
 from .model import Model
-from .planning import batch_sizes, check_samples, plan_for
+from .planning import batch_sizes, check_samples, plan_for, plan_within
 from .priors import Priors, known_priors
-from .retrieval import check_progress, check_solution, retrieve, scale_of
+from .recorder import Recorder, check_names
+from .retrieval import check_progress, check_solution, check_solver, retrieve, retrieve_with, scale_of
 from .uncertainty import correlation_of, errors_of
 from .unknowns import Unknown, put, settle
 
@@ -133,6 +135,8 @@ def cramer_rao(
             plan = make_plan(lidar, scene, max_orders=max_orders, n_photons=photons, n_rays=rays)
         else:
             plan = plan_for(lidar, scene, settled, axis, max_orders=max_orders, photons=photons, rays=rays)
+    else:
+        check_reach(plan, lidar, scene)
     if axis is not None:
         check_samples(plan, axis)
     sigma = noise_of(noise, (lidar.wavelength.size, plan.n_samples))
@@ -266,7 +270,7 @@ def profile_likelihood(
     given = inspect.signature(retrieve).bind(observed, lidar, scene, unknowns, noise=noise, key=key, **more)
     given.apply_defaults()
     own = given.arguments
-    check_solution(own["solver"], own["max_steps"], own["starts"])
+    solution = check_solution(own["solver"], own["max_steps"], own["starts"])
     check_progress(progress)
     check_key(key)
     lidar = at_fixed_times(lidar)
@@ -287,21 +291,15 @@ def profile_likelihood(
         raise ValueError(f"values has the shape {points.shape}; admissible are two or more, increasing")
     check_range("values", points, float(held.low), float(held.high))
     others = [u for u, s in zip(unknowns, settled) if s is not held]
-    if own["scale"] is not None:
-        scale_of(own["scale"], settled)
+    recorder = own["recorder"]
+    check_solver(own["solver"], settled)
+    check_kind("recorder", recorder, Recorder | None, "a Recorder, or None")
+    check_names(recorder, settled)
+    extra = [] if own["scale"] is None else [scale_of(own["scale"], settled)]
     data = data_of(observed, time, noise, own["noise_floor"], lidar)
-    if plan is None:
-        plan = plan_for(
-            lidar,
-            scene,
-            settled,
-            data.time,
-            max_orders=own["max_orders"],
-            photons=photons,
-            rays=rays,
-        )
-    # The plan has them now.
-    more = {name: value for name, value in more.items() if name not in ("n_photons", "n_rays", "max_orders")}
+    sizes = {"max_orders": own["max_orders"], "photons": photons, "rays": rays}
+    plan = plan_within(plan, lidar, scene, settled, data.time, **sizes)
+    how = (recorder, *solution, None, own["throw"])
     middle = int(np.argmin(np.abs(points - float(held.start))))
     found: dict[int, Any] = {}
     for order in (range(middle, points.size), range(middle - 1, -1, -1)):
@@ -311,20 +309,10 @@ def profile_likelihood(
             here = put(
                 scene, (held.place,), (jnp.asarray(points[i], held.start.dtype).reshape(held.start.shape),)
             )
-            begun = (
-                others if last is None else [_from(u, s, last) for u, s in zip(others, settle(others, scene))]
-            )
-            last = retrieve(
-                data.observed,
-                lidar,
-                here,
-                begun,
-                noise=data.sigma,
-                key=key,
-                time=data.time,
-                plan=plan,
-                **more,
-            )
+            begun = settle(others, here)
+            if last is not None:
+                begun = settle([_from(u, s, last) for u, s in zip(others, begun)], here)
+            last = retrieve_with(plan, data, lidar, here, begun, extra, key, *how)
             found[i] = last
             if progress is not None:
                 progress(i)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -120,12 +121,26 @@ def plan_for(
     return dataclasses.replace(first, trace=trace, bins=bins)
 
 
-def check_within(plan: Plan, lidar: Lidar, scene: Scene, settled: list[Settled]) -> None:
-    """Check that a plan that was made outside serves all `corners`; records may end before the light.
+def plan_within(
+    plan: Plan | None,
+    lidar: Lidar,
+    scene: Scene,
+    settled: list[Settled],
+    time: Float[np.ndarray, " bins"],
+    **sizes: Any,
+) -> Plan:
+    """A plan that was given, checked for the samples and for all `corners`; or else one of `plan_for`.
 
-    **Raises:** ValueError where it would leave out light that is recorded, or a part of the scene.
+    A given plan may end before the light does: what comes then is not recorded.
+
+    **Raises:** ValueError where a plan would leave out light that is recorded, or a part of the scene, and as
+    `plan_for`.
     """
-    for number, corner in enumerate(corners(scene, settled)):
+    given = plan is not None
+    if plan is None:
+        plan = plan_for(lidar, scene, settled, time, **sizes)
+    check_samples(plan, time)
+    for number, corner in enumerate(corners(scene, settled) if given else ()):
         try:
             check_reach(plan, lidar, corner)
         except ValueError as error:
@@ -133,6 +148,7 @@ def check_within(plan: Plan, lidar: Lidar, scene: Scene, settled: list[Settled])
             raise ValueError(
                 f"{where}{error}, or for the largest one within the bounds; without plan= one is made here"
             ) from error
+    return plan
 
 
 def check_samples(plan: Plan, time: Float[np.ndarray, " bins"]) -> None:

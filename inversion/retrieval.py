@@ -15,7 +15,7 @@ from jaxlidar.extend import check_integer, check_key, check_kind, check_kinds, c
 from .data import Data, at_fixed_times, data_of
 from .fit import Fit, Outcome, best_of, bounds_of, drive, labels_of, named, smooth_names
 from .model import Model
-from .planning import batch_sizes, check_samples, check_within, plan_for
+from .planning import batch_sizes, plan_within
 from .recorder import Recorder, Terms, check_names
 from .result import Retrieval, Step
 from .unknowns import Place, Settled, Unknown, latin_hypercube, settle
@@ -124,13 +124,30 @@ def retrieve(
     settled = settle(unknowns, scene)
     check_solver(solver, settled)
     check_kind("recorder", recorder, Recorder | None, "a Recorder, or None")
-    extra = [] if scale is None else [scale_of(scale, settled)]
     check_names(recorder, settled)
-    if plan is None:
-        plan = plan_for(lidar, scene, settled, data.time, max_orders=max_orders, photons=photons, rays=rays)
-    else:
-        check_samples(plan, data.time)
-        check_within(plan, lidar, scene, settled)
+    extra = [] if scale is None else [scale_of(scale, settled)]
+    sizes = {"max_orders": max_orders, "photons": photons, "rays": rays}
+    plan = plan_within(plan, lidar, scene, settled, data.time, **sizes)
+    how = (recorder, solver, max_steps, starts, progress, throw)
+    return retrieve_with(plan, data, lidar, scene, settled, extra, key, *how)
+
+
+def retrieve_with(
+    plan: Plan,
+    data: Data,
+    lidar: Lidar,
+    scene: Scene,
+    settled: list[Settled],
+    extra: list[Settled],
+    key: PRNGKeyArray,
+    recorder: Recorder | None,
+    solver: Any,
+    max_steps: int,
+    starts: int,
+    progress: Callable[[Step], None] | None,
+    throw: bool,
+) -> Retrieval:
+    """`retrieve` with what it has made of its arguments."""
     model = Model(lidar, scene, plan, settled, key)
     terms = Terms(recorder, extra, lidar, data.time.size)
     fits = fits_from(starts, key, data, settled, terms, solver, max_steps, progress)

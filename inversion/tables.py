@@ -15,10 +15,13 @@ import numpy as np
 from jaxtyping import ArrayLike, Float, Shaped
 
 from jaxlidar.extend import check_range
+from jaxlidar.io.pedestal import above_pedestal
 
 from .counts import straight_table
 from .impulse import Echo, receiver_impulse
 
+# First samples of a pulse, which its pedestal is the median of.
+_QUIET = 5
 # Rounds of correction and response, which converge together.
 _ROUNDS = 12
 # Of the mean information on a knot, that the correction is one.
@@ -58,7 +61,7 @@ def corrected_table(
     **Returns:** (counts,) amplitudes, not in decibels, increasing, for `amplitudes`.
 
     **Raises:** ValueError where there are not as many pulses and echoes, or none, for knots that do not
-    increase, and as `amplitudes`.
+    increase, for a pulse without a sample above its pedestal, and as `amplitudes`.
 
     **Example:** counts of a digitiser that is compressed above, and a table that does not know.
 
@@ -89,7 +92,8 @@ def corrected_table(
     for _ in range(_ROUNDS):
         now = plain * np.interp(counts, at, gain)
         slope = np.gradient(now)
-        sent = [_above_pedestal(np.interp(p, counts, now)) for p in pulses]
+        power = [np.interp(p, counts, now) for p in pulses]
+        sent = [above_pedestal(p, float(np.median(p[:_QUIET])), "pulses") for p in power]
         light = [np.interp(e, counts, now) for e in echoes]
         spread = [noise * np.maximum(np.interp(e, counts, slope), 1e-9) for e in echoes]
         response = receiver_impulse(sent, light, noise=spread, before=before, after=after)
@@ -107,13 +111,3 @@ def corrected_table(
         gain[1:] = np.linalg.solve(information + ridge * np.eye(at.size - 1), left + ridge)
     rise = np.diff(plain * np.interp(counts, at, gain))
     return plain[0] + np.append(0.0, np.cumsum(np.maximum(rise, _LEAST_RISE * np.diff(plain))))
-
-
-def _above_pedestal(power: np.ndarray) -> np.ndarray:
-    """The pulse from where it leaves its pedestal, the median of five samples, to where it returns there."""
-    power = power - np.median(power[:5])
-    peak = int(np.argmax(power))
-    low, high = np.flatnonzero(power[:peak] <= 0), np.flatnonzero(power[peak:] <= 0)
-    power[: low[-1] + 1 if low.size else 0] = 0.0
-    power[peak + high[0] if high.size else power.size :] = 0.0
-    return power

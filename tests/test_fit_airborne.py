@@ -2,7 +2,9 @@
 
 import argparse
 import csv
+import dataclasses
 import importlib
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -187,6 +189,11 @@ def test_echoes_say_what_is_fitted(example, tmp_path, monkeypatch, capsys):
     with (tmp_path / "out" / "small.csv").open(newline="") as file:
         assert [row["scene"] for row in csv.DictReader(file)] == ["ground", "ground and canopy", "", "ground"]
     assert "2 good, 1 doubtful, 1 bad" in capsys.readouterr().out
+    low = dataclasses.replace(module.Instrument(), above=3.0)
+    monkeypatch.setitem(sys.modules["_airborne"].INSTRUMENTS, "other", low)
+    row = module.main([*arguments[:-1], str(tmp_path / "low")])[1]
+    assert (row["scene"], row["echoes"], row["quality"]) == ("ground", 1, "doubtful")
+    assert row["reasons"] == "above what is fitted, 3 m over the last echo: 1 more"
 
 
 @pytest.mark.slow

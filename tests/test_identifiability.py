@@ -155,3 +155,20 @@ def test_bad_input_is_refused(target):
     found = profile(target, "height", [0.08, 0.12])
     with pytest.raises(ValueError, match="level = 1 is outside"):
         found.interval(1.0)
+
+
+def test_plans_that_leave_out_light_are_refused():
+    low, ground = jl.Scene(ground=jl.Ground()), jl.Scene(ground=jl.Ground(height=8.0))
+    lidar, time = jl.Lidar(), np.arange(-80.0, 81.0)
+    plan = jl.plan(lidar, low, window=(time[0], time[-1]), describe=False)
+    height = inversion.Unknown("ground.height", bounds=(-1.0, 9.0), name="height")
+    bright = inversion.Unknown("ground.reflectance", bounds=(0.0, 1.0), name="bright")
+    given = {"noise": 0.01, "key": KEY, "time": time, "plan": plan}
+    with pytest.raises(ValueError, match="the plan does not fit: its rays start"):
+        inversion.cramer_rao(lidar, ground, [height], **given)
+    with pytest.raises(
+        ValueError, match="at the bounds of the unknowns the plan does not fit: its rays start"
+    ):
+        inversion.profile_likelihood(
+            np.zeros((1, time.size)), lidar, low, [height, bright], "bright", [0.2, 0.4], **given
+        )

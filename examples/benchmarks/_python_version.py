@@ -1,6 +1,7 @@
 """Worker of `python_versions.py`: seconds of some work in this process, as a line of JSON."""
 
 import dataclasses
+import functools
 import json
 import platform
 import time
@@ -33,19 +34,20 @@ def main() -> None:
     single = jl.plan(LIDAR, scene, max_orders=1, window=WINDOW, n_rays=8192, describe=False)
     few = dataclasses.replace(plan, n_rays=1)
 
-    def trace(scene, plan):
-        return jl.trace_scene(jl.reduce(LIDAR, scene, plan), KEY, reverse=False)
+    def trace(scene, plan, reverse=False):
+        return jl.trace_scene(jl.reduce(LIDAR, scene, plan), KEY, reverse=reverse)
 
     def raised(heights):
         moved = eqx.tree_at(lambda s: s.ground.height, scene, heights[0])
         return eqx.tree_at(lambda s: s.canopy.voxels.leaf, moved, scene.canopy.voxels.leaf * heights[1])
 
-    def total(heights):
+    def total(heights, reverse=False):
         setup = jl.reduce(LIDAR, raised(heights), plan)
-        return jl.total_of(jl.trace_scene(setup, KEY, reverse=False), setup)
+        return jl.total_of(jl.trace_scene(setup, KEY, reverse=reverse), setup)
 
     traced = eqx.filter_jit(trace)
-    jacobian = jax.jit(jax.jacfwd(total))
+    jacobian, either = (jax.jit(jax.jacfwd(functools.partial(total, reverse=r))) for r in (False, True))
+    heights = jnp.array([0.0, 1.0])
     leaves = jax.vmap(lambda n: jl.Prospect(**{**TRAITS, "N": n}))(jnp.linspace(1.2, 2.4, LEAVES))
     spectra = jax.jit(lambda x: jl.prospect_spectra(x, SPECTRUM, 20))
     found = race(
@@ -53,7 +55,9 @@ def main() -> None:
             "simulate to 1 %": simulation,
             f"{single.n_rays} rays, first order": lambda: traced(scene, single),
             f"{few.n_photons} photons, higher orders": lambda: traced(scene, few),
-            "Jacobian in height and density": lambda: jacobian(jnp.array([0.0, 1.0])),
+            "the same, reverse=True": lambda: traced(scene, few, True),
+            "Jacobian in height and density": lambda: jacobian(heights),
+            "Jacobian, reverse=True": lambda: either(heights),
             f"{LEAVES} leaf spectra": lambda: spectra(leaves),
         },
         ROUNDS,

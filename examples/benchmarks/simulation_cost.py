@@ -45,7 +45,9 @@ def split(scene: jl.Scene, rounds: int) -> dict[str, float]:
     key = jax.random.key(0)
 
     def traced(plan):
-        return eqx.filter_jit(lambda scene, key: jl.trace_scene(jl.reduce(LIDAR, scene, plan), key))
+        return eqx.filter_jit(
+            lambda scene, key: jl.trace_scene(jl.reduce(LIDAR, scene, plan), key, reverse=False)
+        )
 
     all_orders, first, higher = traced(plan), traced(single), traced(few)
     colour = eqx.filter_jit(lambda response, scene: jl.total_of(response, jl.reduce(LIDAR, scene, plan)))

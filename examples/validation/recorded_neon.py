@@ -18,8 +18,11 @@ from _validation import COLOURS, by_what, draw_differences, finish, options, row
 import jaxlidar as jl
 from jaxlidar.io import read_neon
 
-# What a hard target's echo is blurred by beside its outgoing pulse, ns.
-JITTER = 1.9
+# isort: split
+# `_validation` has put its folder on the path.
+from _airborne import INSTRUMENTS
+
+JITTER = INSTRUMENTS["neon"].jitter
 # Half a sample of 1 ns; and of the peak of the hard target's echo.
 SAMPLE, SHAPE = 0.5, 0.03
 RISES = {"rise of a simulated echo": 0.0, "rise of a simulated echo, blurred by the receiver": JITTER}
