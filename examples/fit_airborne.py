@@ -282,10 +282,10 @@ def fit_shots(shots: Sequence, flight: Flight, stem: Path | None = None, progres
     for record, all_echoes in zip(records, echoes_of(records, impulse)):
         echoes = all_echoes[all_echoes - all_echoes[-1:] < own.above]
         if len(echoes) == 1 or len(echoes) >= own.fewest:
-            more = all_echoes.size - echoes.size
-            said = (
-                [f"above what is fitted, {own.above:g} m over the last echo: {above} more"] if above else []
-            )
+            said = Verdict("good", ())
+            if more := all_echoes.size - echoes.size:
+                reason = f"above what is fitted, {own.above:g} m over the last echo: {more} more"
+                said = Verdict("doubtful", (reason,))
             batches[kinds[len(echoes) > 1].name].append((record, echoes, said))
         else:
             reason = "ground and canopy cannot be told apart" if len(echoes) else "nothing above the noise"
@@ -298,9 +298,7 @@ def fit_shots(shots: Sequence, flight: Flight, stem: Path | None = None, progres
         path = None if stem is None else stem.with_name(f"{stem.name}.{name}.sqlite")
         found = fit(kind, chosen, echoes, own, impulse, path, progress)
         for i, verdict in enumerate(inversion.judge_fits(found.fits, about=["ground"])):
-            if said[i]:
-                verdict &= Verdict("doubtful", tuple(said[i]))
-            row, picture = row_of(kind, chosen[i], echoes[i], found, i, verdict)
+            row, picture = row_of(kind, chosen[i], echoes[i], found, i, verdict & said[i])
             rows.append(row)
             pictures.append(picture)
     return sorted(rows, key=lambda row: row["shot_number"]), pictures

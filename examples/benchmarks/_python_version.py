@@ -14,6 +14,7 @@ from _common import best, race
 from simulation_cost import LIDAR, ORDERS, WINDOW, scenes
 
 import jaxlidar as jl
+from jaxlidar.extend import ONE_CORE
 
 KEY, ROUNDS = jax.random.key(0), 9
 TRAITS = {"N": 1.8, "Cab": 40.0, "Car": 8.0, "Cant": 1.0, "Cbrown": 0.1, "Cw": 0.01, "Cm": 0.009}
@@ -45,8 +46,11 @@ def main() -> None:
         setup = jl.reduce(LIDAR, raised(heights), plan)
         return jl.total_of(jl.trace_scene(setup, KEY, reverse=reverse), setup)
 
-    traced = eqx.filter_jit(trace)
-    jacobian, either = (jax.jit(jax.jacfwd(functools.partial(total, reverse=r))) for r in (False, True))
+    # As `simulate` compiles its batches.
+    traced = eqx.filter_jit(trace, **ONE_CORE)
+    jacobian, either = (
+        jax.jit(jax.jacfwd(functools.partial(total, reverse=r)), **ONE_CORE) for r in (False, True)
+    )
     heights = jnp.array([0.0, 1.0])
     leaves = jax.vmap(lambda n: jl.Prospect(**{**TRAITS, "N": n}))(jnp.linspace(1.2, 2.4, LEAVES))
     spectra = jax.jit(lambda x: jl.prospect_spectra(x, SPECTRUM, 20))

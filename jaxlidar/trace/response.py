@@ -78,7 +78,7 @@ def trace_scene(setup: Setup, key: PRNGKeyArray, *, reverse: bool = True) -> Res
     - `setup`: a `Setup` made by `jaxlidar.reduce`.
     - `key`: a JAX random key.
     - `reverse`: whether the function may be differentiated in reverse, as by `jax.grad`. Without, higher
-      orders take a third of the time with JAX before 0.12. Default True.
+      orders are faster with JAX before 0.12. Default True.
 
     **Returns:** a `Response`, for `jaxlidar.waveform_of`.
 
