@@ -174,7 +174,8 @@ def draw_page(pictures, pairs, path):
         for axes in row[len(group) :]:
             axes.set_axis_off()
         row[0].set_ylabel(f"{name} fits\nelevation (m)")
-    handles = grid[0, 0].get_legend_handles_labels()
+    # Ground alone has no canopy top: not every axes has all lines.
+    named = {name: line for axes in grid.flat for line, name in zip(*axes.get_legend_handles_labels())}
     for axes, (name, (reference, found)) in zip(grid[-1] if pairs else (), pairs.items()):
         both = np.concatenate([reference, found])
         ends = np.nanmin(both), np.nanmax(both)
@@ -183,7 +184,7 @@ def draw_page(pictures, pairs, path):
         axes.set(xlabel=f"{name}, reference", ylabel=f"{name}, fit")
     for axes in grid[-1][len(pairs) :] if pairs else ():
         axes.set_axis_off()
-    figure.legend(*handles, loc="outside upper center", ncols=5, frameon=False)
+    figure.legend(named.values(), named.keys(), loc="outside upper center", ncols=5, frameon=False)
     with atomic_write(path) as draft:
         figure.savefig(draft, format="png", dpi=110)
     plt.close(figure)
