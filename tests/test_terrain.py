@@ -88,6 +88,22 @@ def test_rays_meet_the_surface_where_bisection_finds_it(from_surface):
     assert np.median(np.abs(found - expected)[met]) < 1e-5
 
 
+def test_rays_that_are_many_meet_what_each_meets_by_itself():
+    # The longest of many are followed apart from the others.
+    random = np.random.default_rng(3)
+    start = np.c_[random.uniform(1, 19, 600), random.uniform(1, 15, 600), random.uniform(-1, 4, 600)]
+    way = random.normal(size=(600, 3)) * (1.0, 1.0, 0.1)
+    way /= np.linalg.norm(way, axis=1)[:, None]
+    shape = hills(origin=(0.0, 0.0)).shape
+
+    def distance(start, way):
+        return np.asarray(shape.distance(*(vec(jnp.asarray(a.T, float)) for a in (start, way))))
+
+    few = [distance(start[n : n + 50], way[n : n + 50]) for n in range(0, 600, 50)]
+    assert 100 < np.sum(np.concatenate(few) < 1e29) < 550
+    np.testing.assert_array_equal(distance(start, way), np.concatenate(few))
+
+
 def test_a_ray_from_below_passes_and_one_beside_misses():
     shape = hills().shape
     assert isinstance(shape, HeightField)

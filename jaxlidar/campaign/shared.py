@@ -22,10 +22,11 @@ from jaxlidar.campaign.records import BatchMoments, Record, record_of_shot
 from jaxlidar.campaign.tiles import Tile
 from jaxlidar.planning.plan import MIN_BATCHES
 from jaxlidar.planning.setup import Setup
-from jaxlidar.trace.colouring import Recording, Shares, balance_of, components, recording_of, shares_of
+from jaxlidar.trace.colouring import Recording, Shares, balance_of, components, recording_of, shares_of, total
 from jaxlidar.trace.footprint import parallel_beam
 from jaxlidar.trace.node_response import trace_nodes, without_histories
 from jaxlidar.trace.nodes import Nodes
+from jaxlidar.trace.response import Response
 from jaxlidar.trace.setting import Setting, aimed, setting_of
 
 # Batches of one tile at most: a tolerance that is out of reach ends here.
@@ -53,16 +54,15 @@ def ready_for(setup: Setup, spacing: float) -> Ready:
 
 
 class Sums(NamedTuple):
-    """Of nodes, in one batch: what errors are wanted of, and samples by line.
+    """Of nodes, in one batch: what errors are wanted of, and the responses.
 
-    - `total`: (nodes, wavelengths, samples), all lines together. - `fates`: `jaxlidar.trace.colouring.Shares`
-      of each, as a dict.
-    - `lines`: (nodes, lines, wavelengths, samples): materials, then order one.
+    - `total`: (nodes, wavelengths, samples), all materials together. - `fates`:
+      `jaxlidar.trace.colouring.Shares` of each, as a dict.
     """
 
     total: Any
     fates: Any
-    lines: Any
+    response: Response
 
 
 class Part(NamedTuple):
@@ -92,14 +92,22 @@ class _Batches(NamedTuple):
 
 def _of_nodes(setting: Setting, nodes: Nodes, recording: Recording, key: PRNGKeyArray) -> Sums:
     """One batch."""
+
+    def of_one(response: Response) -> tuple[Array, dict[str, Array]]:
+        together = response
+        if response.higher is not None:
+            # Optics have been applied to both: one pulse serves.
+            together = dataclasses.replace(response, first=response.first + response.higher, higher=None)
+        return total(together, recording), shares_of(response, recording)._asdict()
+
     response = trace_nodes(setting, nodes, key)
+    return Sums(*jax.vmap(of_one)(response), response)
 
-    def of_one(response: Any) -> Sums:
-        parts, fates = components(response, recording), shares_of(response, recording)._asdict()
-        lines = jnp.stack([*(parts[name] for name in recording.materials), parts["first"]])
-        return Sums(parts["first"] + parts["higher"], fates, lines)
 
-    return jax.vmap(of_one)(response)
+def _lines(response: Response, recording: Recording) -> Float[Array, "lines wavelengths samples"]:
+    """Samples by material, then those of order one."""
+    parts = components(response, recording)
+    return jnp.stack([*(parts[name] for name in recording.materials), parts["first"]])
 
 
 def _batches(
@@ -119,13 +127,15 @@ def _batches(
     def batch(n: Array) -> Sums:
         return _of_nodes(setting, nodes, recording, jax.random.fold_in(key, first + n))
 
-    def step(n: Array, state: tuple[BatchMoments, Array]) -> tuple[BatchMoments, Array]:
-        (moments, lines), found, number = state, batch(n), n + 1.0
-        return moments.add((found.total, found.fates), number), lines + (found.lines - lines) / number
+    def step(n: Array, state: tuple[BatchMoments, Response]) -> tuple[BatchMoments, Response]:
+        (moments, mean), found, number = state, batch(n), n + 1.0
+        mean = jax.tree.map(lambda m, v: m + (v - m) / number, mean, found.response)
+        return moments.add((found.total, found.fates), number), mean
 
     zero: Sums = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(batch, first))
     none = (zero.total, zero.fates)
-    return jax.lax.fori_loop(0, count, step, (BatchMoments(none, none), zero.lines))
+    moments, mean = jax.lax.fori_loop(0, count, step, (BatchMoments(none, none), zero.response))
+    return moments, jax.vmap(lambda response: _lines(response, recording))(mean)
 
 
 _several = Program(_batches, **ONE_CORE)

@@ -19,9 +19,9 @@ _PARALLEL, _GRID = 0.5, 0.2
 _COARSE = 0.5
 # Coefficients below this share of the tolerance, of the largest, do not count.
 _FAINT = 0.01
-# A shot of its own has so many times the photons in a batch: here batches are many and small. Rays of order
-# one, which cost little, are as many.
-_FEWER = 4.0
+# A shot of its own has so many times the photons in a batch, and the rays: here batches are many and small.
+# Rays cost about as much as photons, and so few of them have a small part in the error.
+_FEWER, _FEWER_RAYS = 4.0, 2.0
 # Sharing pays where so many footprints overlap in the mean, and shots are so many.
 _OVERLAP, _FEWEST = 1.3, 4
 
@@ -76,7 +76,7 @@ def _tiles(found: Patches, nodes: Lit, setup: Setup) -> list[Tile]:
     plan = setup.plan
     whole = float(nodes.light.sum()) * nodes.overlap / len(found.first)
     photons = plan.n_photons / _FEWER / whole if plan.orders > 1 else 0.0
-    return tiles(found, nodes, photons, plan.n_rays / whole)
+    return tiles(found, nodes, photons, plan.n_rays / _FEWER_RAYS / whole)
 
 
 def why_apart(survey: Survey, setup: Setup, rtol: float) -> str | None:

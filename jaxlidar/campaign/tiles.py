@@ -82,7 +82,7 @@ def lit(found: Patches, faint: float) -> Lit:
 
 def tiles(found: Patches, nodes: Lit, photons: float, rays: float) -> list[Tile]:
     """All tiles, of one size. `photons`, `rays`: of a fully lit node in a batch; photons may be 0."""
-    most_light = max(_MOST_PHOTONS / max(photons, 4 * rays), 1.0)
+    most_light = max(_MOST_PHOTONS / max(photons, 16 * rays), 1.0)
     groups = _halved(nodes, np.arange(len(nodes.light)), most_light)
     most = rung(max(len(group) for group in groups), 4)
     light = max(float(nodes.light[group].sum()) for group in groups)

@@ -37,6 +37,8 @@ _POWER = 3
 BLOCK = 1 << _POWER
 # In units of the precision and of its coordinates, how far under the surface a ray may start.
 _ROUNDING = 10
+# Of so many rays and more, the last go on by themselves when no more are left than one in so many.
+_MANY, _LONG = 128, 8
 # Rays that close in on the surface by less than this per m have the derivative of those that do by this.
 _GRAZING = 1e-4
 
@@ -51,6 +53,26 @@ class _Ray(eqx.Module):
     running: Bool[Array, "*s"]
     met: Float[Array, "*s"]
     count: Int[Array, ""]
+
+
+class _Way(eqx.Module):
+    """The line of a ray over the cells.
+
+    - `z`, `climb`: its height, m, and the change of it per m. - `place`, `rate`: the same among cells.
+    - `gap`, `offset`: it leaves cell number v along an axis at the distance `gap * v + offset`, m; `ahead`:
+      whether to larger numbers. - `leave`: distance at which it has left all cells that it may meet, m.
+    - `slack`: how far rounding may put it under the surface, m.
+    """
+
+    z: Float[Array, "*s"]
+    climb: Float[Array, "*s"]
+    place: tuple[Float[Array, "*s"], ...]
+    rate: tuple[Float[Array, "*s"], ...]
+    gap: tuple[Float[Array, "*s"], ...]
+    offset: tuple[Float[Array, "*s"], ...]
+    ahead: tuple[Bool[Array, "*s"], ...]
+    leave: Float[Array, "*s"]
+    slack: Float[Array, "*s"]
 
 
 @final
@@ -108,11 +130,32 @@ class HeightField(AbstractShape):
 
     def _march(self, x: Vec, w: Vec) -> Scalar:
         """Distance to the first point where a ray falls through the surface; without derivatives."""
-        field, cells, tops = self.heights, self.heights.cells, self.tops
+        shape = x[0].shape
+        way, ray = self._enter(*(vec(a.reshape(-1) for a in v) for v in (x, w)))
+        most = MOST_CELLS if self.heights.periodic else sum(self.heights.cells) + 2
+        if ray.at.size >= _MANY:
+            few = ray.at.size // _LONG
+            ray = self._follow(way, ray, most, few)
+            # All rays of a loop wait for the longest, which takes many times the steps of most: the last
+            # ones go on by themselves.
+            some = jnp.sum(ray.running)
+            turn = jnp.where(ray.running, jnp.cumsum(ray.running) - 1, few)
+            number = jnp.arange(ray.at.size, dtype=jnp.int32)
+            last = jnp.zeros(few, jnp.int32).at[turn].set(number, mode="drop")
+            own, part = jax.tree.map(lambda a: a[last] if a.ndim else a, (way, ray))
+            part = eqx.tree_at(lambda r: r.running, part, number[:few] < some)
+            met = self._follow(own, part, most).met
+            met = ray.met.at[jnp.where(number[:few] < some, last, number.size)].set(met, mode="drop")
+        else:
+            met = self._follow(way, ray, most).met
+        return met.reshape(shape)
+
+    def _enter(self, x: Vec, w: Vec) -> tuple[_Way, _Ray]:
+        """Rays where they come to cells over which they may meet the surface."""
+        field = self.heights
         place = field.place(x)
         rate = [w[k] / field.spacing[k] for k in range(2)]
-        size = self.high - self.low + field.spacing[0] + field.spacing[1] + sum(jnp.abs(c) for c in x)
-        slack = _ROUNDING * float(jnp.finfo(x[2].dtype).eps) * size
+        slack = self._slack(x)
         enter, leave = _between(x[2], w[2], self.low - slack, self.high + slack)
         if not field.periodic:
             for k in range(2):
@@ -120,60 +163,76 @@ class HeightField(AbstractShape):
                 enter, leave = jnp.maximum(enter, near), jnp.minimum(leave, far)
         running = enter < leave
         enter = jnp.where(running, enter, 0.0)
-        gap, offset, step, onward = [], [], [], []
+        gap, offset, ahead = [], [], []
         for k in range(2):
-            flat, ahead = jnp.abs(rate[k]) < 1e-12, rate[k] > 0
+            flat = jnp.abs(rate[k]) < 1e-12
+            ahead.append(rate[k] > 0)
             inverse = 1.0 / jnp.where(flat, 1.0, rate[k])
             gap.append(jnp.where(flat, 0.0, inverse))
-            offset.append(jnp.where(flat, FAR, (jnp.where(ahead, 1.0, 0.0) - place[k]) * inverse))
-            step.append(jnp.where(ahead, 1, -1))
-            onward.append(ahead)
+            offset.append(jnp.where(flat, FAR, (jnp.where(ahead[k], 1.0, 0.0) - place[k]) * inverse))
+        way = _Way(
+            x[2], w[2], tuple(place), tuple(rate), tuple(gap), tuple(offset), tuple(ahead), leave, slack
+        )
+        start = field.cell((place[0] + rate[0] * enter, place[1] + rate[1] * enter))
+        above = self._rise(way, enter, start)[2] > -slack
+        far = jnp.full_like(enter, FAR)
+        return way, _Ray(enter, *start, above, running, far, jnp.zeros((), jnp.int32))
 
-        def ends(
-            number: Int[Array, "*s"], k: int
-        ) -> tuple[Int[Array, "*s"], Int[Array, "*s"], Int[Array, "*s"]]:
-            """Number of the block of a cell, and the first and the last of its cells."""
-            place = number + field.number[k]
-            place = place % cells[k] if field.periodic else place
-            block = place >> _POWER
-            first = number - (place - block * BLOCK)
-            last = number + (jnp.minimum((block + 1) * BLOCK, cells[k]) - 1 - place)
-            return block, first, last
+    def _slack(self, x: Vec) -> Scalar:
+        """How far rounding may put a ray under the surface, m."""
+        field = self.heights
+        size = self.high - self.low + field.spacing[0] + field.spacing[1] + sum(jnp.abs(c) for c in x)
+        return _ROUNDING * float(jnp.finfo(x[2].dtype).eps) * size
 
-        def across(ray: _Ray) -> tuple[Bool[Array, "*s"], Scalar, tuple[Int[Array, "*s"], Int[Array, "*s"]]]:
-            """Whether a ray stays above its block, where it leaves it, and the cell that it comes to."""
-            blocks = [ends(number, k) for k, number in enumerate((ray.i, ray.j))]
-            top = tops.at[blocks[0][0], blocks[1][0]].get(mode="promise_in_bounds")
-            edges = [jnp.where(onward[k], last, first) for k, (_, first, last) in enumerate(blocks)]
-            faces = [gap[k] * edges[k] + offset[k] for k in range(2)]
-            out = jnp.minimum(jnp.minimum(faces[0], faces[1]), leave)
-            out = jnp.maximum(out, ray.at)
-            least = x[2] + jnp.minimum(w[2] * ray.at, w[2] * out)
-            first = faces[0] <= faces[1]
-            to = []
-            for k, crossed in enumerate((first, ~first)):
-                _, low, high = blocks[k]
-                inside = jnp.floor(place[k] + rate[k] * out).astype(jnp.int32)
-                to.append(jnp.where(crossed, edges[k] + step[k], jnp.clip(inside, low, high)))
-            return ray.above & (least > top + slack), out, (to[0], to[1])
+    def _block(self, number: Int[Array, "*s"], k: int) -> tuple[Int[Array, "*s"], ...]:
+        """Number of the block of a cell along an axis, and the first and the last of its cells."""
+        field = self.heights
+        place = number + field.number[k]
+        place = place % field.cells[k] if field.periodic else place
+        block = place >> _POWER
+        first = number - (place - block * BLOCK)
+        last = number + (jnp.minimum((block + 1) * BLOCK, field.cells[k]) - 1 - place)
+        return block, first, last
 
-        def rise(at: Scalar, cell: Cell) -> tuple[Scalar, Scalar, Scalar]:
-            """Coefficients of the height above the surface, from the distance `at` on: of u^2, u and 1."""
-            one, a, b, c = field.corners(cell)
-            px, py = (place[k] + rate[k] * at - cell[k] for k in range(2))
-            height = x[2] + w[2] * at - (one + a * px + (b + c * px) * py)
-            return -c * rate[0] * rate[1], w[2] - (a + c * py) * rate[0] - (b + c * px) * rate[1], height
+    def _across(self, way: _Way, ray: _Ray) -> tuple[Bool[Array, "*s"], Scalar, tuple[Int[Array, "*s"], ...]]:
+        """Whether a ray stays above its block, where it leaves it, and the cell that it comes to."""
+        blocks = [self._block(number, k) for k, number in enumerate((ray.i, ray.j))]
+        top = self.tops.at[blocks[0][0], blocks[1][0]].get(mode="promise_in_bounds")
+        edges = [jnp.where(way.ahead[k], last, first) for k, (_, first, last) in enumerate(blocks)]
+        faces = [way.gap[k] * edges[k] + way.offset[k] for k in range(2)]
+        out = jnp.minimum(jnp.minimum(faces[0], faces[1]), way.leave)
+        out = jnp.maximum(out, ray.at)
+        least = way.z + jnp.minimum(way.climb * ray.at, way.climb * out)
+        first = faces[0] <= faces[1]
+        to = []
+        for k, crossed in enumerate((first, ~first)):
+            _, low, high = blocks[k]
+            inside = jnp.floor(way.place[k] + way.rate[k] * out).astype(jnp.int32)
+            step = jnp.where(way.ahead[k], 1, -1)
+            to.append(jnp.where(crossed, edges[k] + step, jnp.clip(inside, low, high)))
+        return ray.above & (least > top + way.slack), out, (to[0], to[1])
+
+    def _rise(self, way: _Way, at: Scalar, cell: Cell) -> tuple[Scalar, Scalar, Scalar]:
+        """Coefficients of the height above the surface, from the distance `at` on: of u^2, u and 1."""
+        one, a, b, c = self.heights.corners(cell)
+        rate = way.rate
+        px, py = (way.place[k] + rate[k] * at - cell[k] for k in range(2))
+        height = way.z + way.climb * at - (one + a * px + (b + c * px) * py)
+        return -c * rate[0] * rate[1], way.climb - (a + c * py) * rate[0] - (b + c * px) * rate[1], height
+
+    def _follow(self, way: _Way, ray: _Ray, most: int, few: int = 0) -> _Ray:
+        """Rays after `most` cells or blocks, or when no more than a few have not stopped."""
 
         def going(ray: _Ray) -> Bool[Array, ""]:
-            return jnp.any(ray.running) & (ray.count < most)
+            return (jnp.sum(ray.running) > few) & (ray.count < most)
 
         def advance(ray: _Ray) -> _Ray:
             # Compilers would compute what is shared again for every part of the ray.
-            clear, out, (east, north) = lax.optimization_barrier(across(ray))
-            faces = [gap[k] * number + offset[k] for k, number in enumerate((ray.i, ray.j))]
-            until = jnp.maximum(ray.at, jnp.minimum(jnp.minimum(faces[0], faces[1]), leave))
+            clear, out, (east, north) = lax.optimization_barrier(self._across(way, ray))
+            faces = [way.gap[k] * number + way.offset[k] for k, number in enumerate((ray.i, ray.j))]
+            until = jnp.maximum(ray.at, jnp.minimum(jnp.minimum(faces[0], faces[1]), way.leave))
             length = until - ray.at
-            a, b, c = lax.optimization_barrier(rise(ray.at, (ray.i, ray.j)))
+            a, b, c = lax.optimization_barrier(self._rise(way, ray.at, (ray.i, ray.j)))
             c = jnp.where(ray.above, jnp.maximum(c, 0.0), c)
             end = (a * length + b) * length + c
             root, real = _falling_root(a, b, c)
@@ -182,19 +241,15 @@ class HeightField(AbstractShape):
             hit, root, until, end = lax.optimization_barrier((hit, root, until, end))
             met = jnp.where(hit, ray.at + jnp.clip(root, 0.0, length), ray.met)
             until = jnp.where(clear, out, until)
-            go = ray.running & ~hit & (until < leave)
+            go = ray.running & ~hit & (until < way.leave)
             first = faces[0] <= faces[1]
+            step = [jnp.where(a, 1, -1) for a in way.ahead]
             i = jnp.where(clear, east, ray.i + jnp.where(first, step[0], 0))
             j = jnp.where(clear, north, ray.j + jnp.where(first, 0, step[1]))
             i, j = jnp.where(go, i, ray.i), jnp.where(go, j, ray.j)
             return _Ray(until, i, j, clear | (end >= 0), go, met, ray.count + 1)
 
-        start = field.cell((place[0] + rate[0] * enter, place[1] + rate[1] * enter))
-        above = rise(enter, start)[2] > -slack
-        most = MOST_CELLS if field.periodic else sum(cells) + 2
-        far = jnp.full_like(enter, FAR)
-        first = _Ray(enter, *start, above, running, far, jnp.zeros((), jnp.int32))
-        return lax.while_loop(going, advance, first).met
+        return lax.while_loop(going, advance, ray)
 
     def beneath(
         self, points: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]

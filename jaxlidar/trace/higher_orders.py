@@ -42,8 +42,6 @@ from jaxlidar.trace.reparametrise import (
 from jaxlidar.trace.setting import Setting, unscattered
 
 CHUNK = 256
-# The same where light falls on a large scene: a chunk waits for its longest flight.
-FEW = 64
 # Chunks that are traced together, order by order. Each group has its own sum: single precision loses small
 # deposits on a large sum.
 GROUP = 32
@@ -80,7 +78,7 @@ def higher_orders(setting: Setting, key: PRNGKeyArray, nodes: Nodes | None = Non
         numbers, places = Independent(draw_key, dimensions), Independent(footprint_key, 2)
     else:
         numbers, places = lattices(draw_key, plan.order_steps, dimensions), None
-    size = min(CHUNK if nodes is None else FEW, photons)
+    size = min(CHUNK, photons)
     chunks = -(-photons // size)
     groups = -(-chunks * size // (GROUP * CHUNK))
     each = -(-chunks // groups)
@@ -120,18 +118,28 @@ def higher_orders(setting: Setting, key: PRNGKeyArray, nodes: Nodes | None = Non
         lane = number * (each * size) + jnp.arange(each * size, dtype=jnp.uint32)
 
         def one_order(carry, n):
-            def chunk(tally, part):
-                lane, photons = part
-
-                def go(photons, tally):
-                    return _one_order(setting, photons, tally, Draw.of(numbers(lane, n), plates), n)
-
-                # Living photons come first, so that whole chunks of dead ones are skipped.
-                photons, tally = lax.cond(jnp.any(photons.alive), go, lambda *c: c, photons, tally)
-                return tally, photons
-
             lanes, photons, tally = carry
-            tally, photons = lax.scan(chunk, tally, (lanes, photons))
+
+            def flown(lane, photons, tally):
+                return _one_order(setting, photons, tally, Draw.of(numbers(lane, n), plates), n)
+
+            def chunk(tally, part):
+                lane, own = part
+                own, tally = lax.cond(jnp.any(own.alive), flown, lambda _, *c: c, lane, own, tally)
+                return tally, own
+
+            def next_chunk(number, state):
+                photons, tally = state
+                lane, own = (jax.tree.map(lambda a: a[number], of) for of in (lanes, photons))
+                own, tally = flown(lane, own, tally)
+                return jax.tree.map(lambda a, b: a.at[number].set(b), photons, own), tally
+
+            # Living photons come first: the chunks of dead ones are skipped, or not even looked at.
+            if setting.reverse:
+                tally, photons = lax.scan(chunk, tally, (lanes, photons))
+            else:
+                living = jnp.sum(jnp.any(photons.alive, axis=1))
+                photons, tally = lax.fori_loop(0, living, next_chunk, (photons, tally))
             lanes, photons = _alive_first(lanes, photons)
             return lanes, photons, tally
 
