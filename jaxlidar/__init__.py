@@ -56,6 +56,7 @@ from jaxlidar.plants.voxelise import crop, voxelise, voxelise_points
 from jaxlidar.scenes.atmosphere import Atmosphere
 from jaxlidar.scenes.canopy import Canopy
 from jaxlidar.scenes.scene import Scene
+from jaxlidar.scenes.scene_parts import SceneParts
 from jaxlidar.scenes.shapes import AbstractShape, Plane
 from jaxlidar.scenes.surfaces import AbstractGround, AbstractSheet, AbstractSurface, Ground, Plate
 from jaxlidar.scenes.terrain import Terrain
@@ -119,6 +120,7 @@ __all__ = [
     "Rule",
     "SampledPulse",
     "Scene",
+    "SceneParts",
     "Setup",
     "Specular",
     "Spectrum",

@@ -1,8 +1,6 @@
 """`simulate_many`: the waveforms of all shots of a survey."""
 
-import dataclasses
 import functools
-import math
 import os
 import time
 import warnings
@@ -12,32 +10,29 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import numpy as np
 from jaxtyping import PRNGKeyArray
 
-from jaxlidar._checks import check_flag, check_integer, check_key, check_kind, is_traced, known_array
+from jaxlidar._checks import check_flag, check_integer, check_key, check_kind, is_traced
 from jaxlidar._fingerprint import fingerprint
 from jaxlidar._workers import Task, outcomes
 from jaxlidar.campaign.coverage import OffMapWarning, ground_heights, off_map, said_of
 from jaxlidar.campaign.gathering import Kept, in_memory, on_disk
+from jaxlidar.campaign.prepare import prepared
 from jaxlidar.campaign.progress import Pace, SurveyProgress
-from jaxlidar.campaign.sharing import sharing
+from jaxlidar.campaign.squares import BySquares
 from jaxlidar.campaign.waveforms import Waveforms
-from jaxlidar.campaign.ways import AbstractWay, OneByOne, SharedLight
+from jaxlidar.campaign.ways import AbstractWay
 from jaxlidar.campaign.with_truth import WithTruth
 from jaxlidar.instrument.survey import Survey
 from jaxlidar.io.case import Case, case_text
 from jaxlidar.io.parts import Parts, refuse_another
-from jaxlidar.planning.local_origin import about_aim
-from jaxlidar.planning.plan import DEFAULT_RTOL, Plan
-from jaxlidar.planning.plan import plan as make_plan
-from jaxlidar.planning.setup import reduce
 from jaxlidar.scenes.scene import Scene, check_kinds
+from jaxlidar.scenes.scene_parts import SceneParts
 
 
 def simulate_many(
     survey: Survey,
-    scene: Scene,
+    scene: Scene | SceneParts,
     *,
     key: PRNGKeyArray,
     rtol: float | None = None,
@@ -70,7 +65,7 @@ def simulate_many(
     **Arguments:**
 
     - `survey`: a `Survey`.
-    - `scene`: a `Scene`.
+    - `scene`: a `Scene`; or `SceneParts`, for one that is larger than memory.
     - `key`: a JAX random key. The same key gives the same waveforms.
     - `rtol`: relative error at which a shot is done, in (0, 1). Default None: 0.01.
     - `max_orders`: number of scatterings followed, at least 1. Default None: from `rtol` and the largest
@@ -113,7 +108,8 @@ def simulate_many(
     [5.0, 0.63, -3.75] 0.40
     """
     check_kind("survey", survey, Survey, "a Survey, as in Survey(lidar, position=...)")
-    check_kinds(survey.lidar, scene)
+    if not isinstance(scene, SceneParts):
+        check_kinds(survey.lidar, scene)
     check_key(key)
     check_kind("path", path, str | os.PathLike | None, "a path, or None")
     check_kind("executor", executor, Executor | None, "a concurrent.futures.Executor, or None")
@@ -132,11 +128,17 @@ def simulate_many(
             "admissible is 'fixed'"
         )
     started = time.perf_counter()
-    way = _prepared(survey, scene, rtol, max_orders, shared)
-    if truth:
-        way = WithTruth(way.setup, way.survey, way.rtol, way)
-    beside = off_map(way.survey, way.setup.scene)
-    heights = ground_heights(way.survey, way.setup.scene, way.setup.plan.trace.upstream)
+    if isinstance(scene, SceneParts):
+        if truth:
+            raise ValueError("truth = True, but the scene is in parts; admissible is False")
+        way = BySquares.of(survey, scene, rtol, max_orders, shared)
+        beside, heights = way.beside, way.heights
+    else:
+        way = prepared(survey, scene, rtol, max_orders, shared)
+        if truth:
+            way = WithTruth(way.setup, way.survey, way.rtol, way)
+        beside = off_map(way.survey, way.setup.scene)
+        heights = ground_heights(way.survey, way.setup.scene, way.setup.plan.trace.upstream)
     if (said := said_of(beside)) is not None:
         warnings.warn(said, OffMapWarning, stacklevel=2)
     known: dict[str, Any] = {"position": survey.position, "zenith": survey.zenith, "azimuth": survey.azimuth}
@@ -144,7 +146,8 @@ def simulate_many(
     outcomes_of = functools.partial(outcomes, executor=executor, devices=devices)
     if path is None:
         return in_memory(way, known, _traced(way, key, outcomes_of, progress, {}), started)
-    parts = {"survey": survey, "scene": scene, "key": key, "rtol": way.rtol, "max_orders": max_orders}
+    content = (scene, way.digests) if isinstance(way, BySquares) else scene
+    parts = {"survey": survey, "scene": content, "key": key, "rtol": way.rtol, "max_orders": max_orders}
     parts |= {"shared": way.described()["shared"], "truth": bool(truth)}
     problem = fingerprint(parts)
     if Path(path).exists():
@@ -152,7 +155,7 @@ def simulate_many(
         refuse_another(Path(path), many.info.get("problem", {}), problem)
         return many
     given = {"rtol": rtol, "max_orders": max_orders, "shared": shared, "truth": truth}
-    case = _case(survey, scene, key, given)
+    case = None if isinstance(scene, SceneParts) else _case(survey, scene, key, given)
     kept = Parts(path, problem)
     results = _traced(way, key, outcomes_of, progress, Kept(kept, way.kind_of))
     many = on_disk(way, known, results, started, path, problem, case)
@@ -184,39 +187,6 @@ def _devices(mesh: jax.sharding.Mesh, executor: Executor | None) -> list[Any]:
             "are devices of this process; for several processes give an executor"
         )
     return devices
-
-
-def _prepared(
-    survey: Survey, scene: Scene, rtol: float | None, max_orders: int | None, shared: bool | None
-) -> AbstractWay:
-    plan = make_plan(survey, scene, rtol=rtol, max_orders=max_orders, describe=False)
-    rtol = DEFAULT_RTOL if rtol is None else float(rtol)
-    plan = dataclasses.replace(
-        plan, n_rays=_rays(plan, survey, scene, rtol), n_photons=_power_of_two(0.8 / rtol**2, 256, 8192)
-    )
-    middle = survey.middle
-    setup = reduce(middle, scene, plan)
-    lidar, _ = about_aim(middle, scene)
-    # A scene that cannot be moved keeps its coordinates, and the lidar its place.
-    moved = survey.about(known_array(middle.position) - known_array(lidar.position))
-    light = sharing(moved, setup, rtol, shared)
-    if light is None:
-        return OneByOne(setup, moved, rtol)
-    return SharedLight(setup, moved, rtol, light)
-
-
-def _rays(plan: Plan, survey: Survey, scene: Scene, rtol: float) -> int:
-    """Rays of a footprint per batch: enough for the tolerance, and not many for each column of voxels."""
-    most = 10.0 / rtol
-    if scene.canopy is not None:
-        edge = float(np.min(known_array(scene.canopy.voxels.voxel_size)[:2]))
-        columns = (1.0 + 2.0 * float(np.max(survey.footprint_radius)) / edge) ** 2
-        most = min(most, 32.0 * columns)
-    return min(_power_of_two(most, 64, 4096), plan.n_rays)
-
-
-def _power_of_two(x: float, low: int, high: int) -> int:
-    return int(min(max(2 ** math.ceil(math.log2(x)), low), high))
 
 
 def _traced(
