@@ -106,6 +106,8 @@ ORDER = {
         "shared",
         "sharing",
         "ways",
+        "prepare",
+        "squares",
         "truths",
         "with_truth",
         "waveforms",
