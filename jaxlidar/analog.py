@@ -196,10 +196,10 @@ def _setting(lidar: Lidar, scene: Scene, plan: Plan) -> Setting:
         )
     transmittance = straight_transmittance(setup)
     if transmittance is None:
-        return setting_of(setup, reverse=False)
+        return setting_of(setup, derivatives="none")
     if transmittance.size > 1:
         raise ValueError(f"wavelength has {transmittance.size} values; 1 if transmission is straight")
-    return setting_of(setup, reverse=False).thinned(transmittance[0])
+    return setting_of(setup, derivatives="none").thinned(transmittance[0])
 
 
 def _start(setting: Setting, size: int, key: PRNGKeyArray) -> Photons:

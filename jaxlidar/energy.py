@@ -187,7 +187,7 @@ def _endless(setup: Setup) -> Setup:
 def _trace(setup: Setup, key: PRNGKeyArray, parallel: bool, max_orders: int) -> Fates:
     source = from_the_sky if parallel else from_beam
     optics, transmittance = optics_of(setup), straight_transmittance(setup)
-    setting = setting_of(setup, reverse=False)
+    setting = setting_of(setup, derivatives="none")
     if transmittance is None:
         return follow(setting, optics, key, BATCH, source, max_orders)
     # Where leaves transmit straight on, every wavelength has an extinction of its own.

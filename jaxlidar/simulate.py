@@ -186,7 +186,7 @@ def _prepared(setup: Setup, key: PRNGKeyArray) -> _Ready:
     own_traces = transmittance is not None or not setup.plan.trace.keeps_histories
     traced = any(is_traced(x) for x in jax.tree.leaves((setup, key)))
     recording = recording_of(setup) if own_traces or traced else recording_with_room(setup)
-    return _Ready(setup, setting_of(setup, reverse=traced), transmittance, recording)
+    return _Ready(setup, setting_of(setup, derivatives="all" if traced else "none"), transmittance, recording)
 
 
 class _Goal(NamedTuple):

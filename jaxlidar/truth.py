@@ -29,9 +29,10 @@ from jaxlidar.planning.trace_plan import Bins
 from jaxlidar.scenes.scene import Scene, check_kinds
 from jaxlidar.trace.colouring import Recording, components, height_of, recording_of, recording_with_room
 from jaxlidar.trace.deposit import first_bin, scatter_rows
-from jaxlidar.trace.first_order import Sent, march_rays, sent_rays, stretch_pieces
+from jaxlidar.trace.first_order import Sent, march_rays, sent_rays
 from jaxlidar.trace.response import footprint_of, trace_setting
 from jaxlidar.trace.setting import Setting, setting_of, straight_transmittance
+from jaxlidar.trace.stretches import stretch_pieces
 
 # Share of the beam that is intercepted above `Truth.top_height`.
 TOP = 0.01

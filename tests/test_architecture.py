@@ -90,6 +90,7 @@ ORDER = {
         "fates",
         "reparametrise",
         "mirror",
+        "stretches",
         "first_order",
         "higher_orders",
         "response",

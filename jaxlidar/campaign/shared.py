@@ -50,7 +50,7 @@ def ready_for(setup: Setup, spacing: float) -> Ready:
     """What all tiles over a grid of that spacing have in common."""
     recording = recording_of(setup)
     without_air = dataclasses.replace(without_histories(recording), air=None)
-    return Ready(setting_of(setup, reverse=False), without_air, recording.air, spacing)
+    return Ready(setting_of(setup, derivatives="none"), without_air, recording.air, spacing)
 
 
 class Sums(NamedTuple):

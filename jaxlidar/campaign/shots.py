@@ -123,7 +123,7 @@ def _zeros(shapes: Any) -> Any:
 
 def _several(setup: Setup, aims: Aim, key: PRNGKeyArray, rtol: Array) -> Record:
     """Some shots, one after the other."""
-    setting = setting_of(setup, reverse=False)
+    setting = setting_of(setup, derivatives="none")
     return jax.lax.map(lambda aim: _one(setting, setup, aim, key, rtol), aims)
 
 

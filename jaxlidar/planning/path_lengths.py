@@ -8,12 +8,16 @@ from jaxlidar._checks import known_array, known_number
 from jaxlidar._vectors import FAR
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.instrument.survey import Survey
+from jaxlidar.planning.ladder import rung
 from jaxlidar.planning.rims import rims_of
+from jaxlidar.planning.trace_plan import KERNEL
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.surfaces import AbstractSheet
 
 # Voxels along one flight at most: a batch waits for its longest flight.
 MOST_VOXELS = 16_384
+# Fine bins of a stretch at most, and bins that it may spread to beside its own.
+_LONGEST, _MARGINS = 64, 3
 
 
 class PathLengths:
@@ -109,3 +113,17 @@ class PathLengths:
     def voxels_along(self, flight: float) -> int:
         """Bound on the voxels of a periodic canopy that a flight of some length, m, crosses."""
         return int(self.shape[2] + sum(math.ceil(flight / s) for s in self.size[:2])) + 3
+
+
+def stretch(chord: float, bin_length: float, max_step: float | None) -> tuple[float, int]:
+    """Longest stretch, m, of order one, and bins that it spans with its margins.
+
+    `chord` is the longest piece within one voxel. Where nothing is asked for, the row is on the ladder, and
+    the stretch somewhat longer than the chord, so that one plan serves other directions, too.
+    """
+    if max_step is not None:
+        step = min(max_step, chord)
+        return step, max(math.ceil(step / bin_length - 1e-6) + _MARGINS, KERNEL)
+    bins = min(math.ceil(1.02 * chord / bin_length), _LONGEST)
+    row = max(rung(bins + _MARGINS, 4), KERNEL)
+    return (row - _MARGINS) * bin_length, row

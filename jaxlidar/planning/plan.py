@@ -18,7 +18,7 @@ from jaxlidar.planning.local_origin import about_aim
 from jaxlidar.planning.memory import check_memory, in_words, keeps_histories, memory_limit, predicted
 from jaxlidar.planning.orders import degree_of, order_steps, orders_of, tail_of
 from jaxlidar.planning.parallel_light import parallel_light
-from jaxlidar.planning.path_lengths import PathLengths
+from jaxlidar.planning.path_lengths import PathLengths, stretch
 from jaxlidar.planning.rims import check_on_terrain
 from jaxlidar.planning.scatterers import largest_albedo, lobe_probability, scene_optics, spell
 from jaxlidar.planning.trace_plan import KERNEL, Bins, TracePlan
@@ -174,7 +174,7 @@ def plan(
     - `max_orders`: number of scatterings followed, at least 1. Default None: from `rtol` and the largest
       albedo.
     - `max_step`: longest stretch, m, that the first order takes at once; positive. The result does not depend
-      on it. Default None: four fine bins.
+      on it. Default None: what lies within one voxel, or 64 fine bins.
     - `n_photons`: photons per batch, at least 1. Default 8192.
     - `n_rays`: rays of the footprint per batch, at least 1; without effect over planes alone, where a
       quadrature rule takes their place. Default None: 4096 with one order or a fixed footprint, else 1024.
@@ -249,9 +249,7 @@ def plan(
     bins, samples = _time(lidar, scene, geometry, tail if orders > 1 else 0.0, window, bin_width)
     airy = _with_air(bins, lidar, samples)
     metres = 0.5 * SPEED_OF_LIGHT * bins.width
-    step = geometry.longest_chord if max_step is None else min(max_step, geometry.longest_chord)
-    step = min(step, 4 * metres) if max_step is None else step
-    row = max(math.ceil(step / metres - 1e-6) + 1 + 2, KERNEL)
+    step, row = stretch(geometry.longest_chord, metres, max_step)
     last = SPEED_OF_LIGHT * (bins.start + bins.width * bins.count)
     bins = dataclasses.replace(bins, row=row, count=rung(bins.count, 4))
     first_steps = geometry.first_steps(step)

@@ -20,77 +20,19 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxlidar._constants import SPEED_OF_LIGHT
-from jaxlidar._vectors import FAR, Scalar, Vec, along, scale, vec
+from jaxlidar._vectors import FAR, Scalar, Vec, along, scale
 from jaxlidar.optics.facets import FACET_BACKSCATTER
 from jaxlidar.optics.laws import AbstractMirror
-from jaxlidar.planning.trace_plan import Bins, TracePlan
-from jaxlidar.trace.deposit import first_bin, instant_row, scatter_rows, smooth_row
+from jaxlidar.planning.trace_plan import TracePlan
+from jaxlidar.trace.deposit import instant_row, scatter_rows, smooth_row
 from jaxlidar.trace.histories import Histories
-from jaxlidar.trace.march import Medium, advance, begin, cell_of, earlier, later
+from jaxlidar.trace.march import Medium
 from jaxlidar.trace.reparametrise import footprint_rays, rays_to_terrain, sees_terrain
 from jaxlidar.trace.setting import Setting
+from jaxlidar.trace.stretches import Stretches, in_blocks, march_ray, mean_decay, stretch_pieces
 from jaxlidar.trace.surfaces import Surface
 
 CHUNK = 512
-
-
-class Stretches(eqx.Module):
-    """Pieces of one ray between faces: start, length (m), depth at its start, voxel, extinction (1/m)."""
-
-    start: Float[Array, "*steps"]
-    length: Float[Array, "*steps"]
-    depth: Float[Array, "*steps"]
-    cell: Int[Array, "*steps"]
-    extinction: Float[Array, "*steps"]
-
-
-def mean_decay(x: Scalar) -> Scalar:
-    """(1 - exp(-x)) / x for x >= 0, with its derivative; accurate down to and at zero."""
-    return _decay(x)[1]
-
-
-def _decay(x: Scalar) -> tuple[Scalar, Scalar]:
-    """exp(-x) and (1 - exp(-x)) / x, the latter for small x as exp(-x/2) sinh(x/2) / (x/2)."""
-    small = x < 1.0
-    square = 0.25 * x * x
-    series = jnp.ones_like(x)
-    # Terms to the last digit at 1.
-    for n in range(3 if jnp.finfo(x.dtype).bits == 32 else 7, 0, -1):
-        series = 1.0 + square * (1.0 / (2 * n * (2 * n + 1))) * series
-    half = jnp.exp(-0.5 * x)
-    passing = half * half
-    return passing, jnp.where(small, half * series, (1.0 - passing) / jnp.where(small, 1.0, x))
-
-
-def march_ray(
-    medium: Medium, x: Vec, w: Vec, end: Scalar, stops: list[Scalar], steps: int, max_step: Scalar
-) -> tuple[Stretches, list[Scalar], Scalar]:
-    """All stretches of one ray up to `end`, and the optical depth at each of `stops` and at its end."""
-    walk = begin(medium, x, w)
-    end = earlier(end, walk.leave)
-
-    def step(state, _):
-        distance, depth, voxel, at_stops = state
-        faces = lax.optimization_barrier(walk.faces(voxel))
-        face = earlier(earlier(faces[0], faces[1]), faces[2])
-        to = earlier(end, earlier(face, distance + max_step))
-        for stop in stops:
-            # Plates lie between stretches, not within one.
-            to = jnp.where(stop > distance, earlier(to, stop), to)
-        cell = cell_of(medium, voxel)
-        k = medium.extinction(cell, w)
-        to, cell, k = lax.optimization_barrier((later(distance, to), cell, k))
-        length = to - distance
-        at_stops = [
-            a + k * (later(distance, earlier(stop, to)) - distance) for a, stop in zip(at_stops, stops)
-        ]
-        moved = advance(walk, voxel, faces, (to >= face) & (to < end))
-        return (to, depth + k * length, moved, at_stops), Stretches(distance, length, depth, cell, k)
-
-    zero = jnp.zeros_like(end)
-    state = (jnp.minimum(walk.enter, end), zero, walk.voxel, [zero] * len(stops))
-    (_, total, _, at_stops), stretches = lax.scan(step, state, None, length=steps)
-    return stretches, at_stops, total
 
 
 class Passage:
@@ -216,6 +158,26 @@ def first_order(
     successor = table.successor
     materials = len(plan.materials)
 
+    def deposited(tally, stretch, light):
+        """A tally with what stretches add to it; `light` is that of the ray of each."""
+        assert medium is not None
+        (response, arrived), (sent, visible) = tally, light
+        k, way, before = stretch.extinction, sent.w, sent.met
+        low = bins.position(2.0 * (sent.excess + stretch.start) / SPEED_OF_LIGHT)
+        first, pieces = stretch_pieces(bins, low, stretch, kappa)
+        passing = jnp.exp(-stretch.depth) * mean_decay(k * stretch.length) * stretch.length
+        middle = stretch.start + 0.5 * stretch.length
+        for m, part in _parts(medium, plan, stretch, way) if mirror is None else ():
+            value = part.extinction * (part.backscatter * visible)
+            for history, share in both_ways.terms(table, int(successor[0, part.letter]), middle, before):
+                slot = jnp.broadcast_to(m * count + history, first.shape)
+                row = jnp.moveaxis(pieces, 0, -1) * (value * share)[..., None]
+                response = scatter_rows(response, slot, first, row)
+            for history, share in out_way.terms(table, 0, middle, before):
+                weight = part.extinction * passing * share * sent.energy
+                arrived = _add(arrived, m * count + history, weight)
+        return response, arrived
+
     def rays(across, energy):
         x, w, excess, energy, met, stop = sent = sent_rays(setting, across, energy)
         visible = energy * beam.in_view(along(x, w, jnp.minimum(stop, plan.upstream)))
@@ -227,24 +189,16 @@ def first_order(
         if medium is not None:
             stretch, at_stops, total = march_rays(setting, sent)
 
-            def along_rays(a):
-                return jnp.broadcast_to(a, stretch.start.shape)
+            tally, light = (response, arrived), (sent, visible)
+            if setting.reverse:
 
-            way, before = vec(along_rays(a) for a in w), [along_rays(m) for m in met]
-            k, power = stretch.extinction, along_rays(energy)
-            low = bins.position(2.0 * (along_rays(excess) + stretch.start) / SPEED_OF_LIGHT)
-            first, pieces = stretch_pieces(bins, low, stretch, kappa)
-            passing = jnp.exp(-stretch.depth) * mean_decay(k * stretch.length) * stretch.length
-            middle = stretch.start + 0.5 * stretch.length
-            for m, part in _parts(medium, plan, stretch, way) if mirror is None else ():
-                value = part.extinction * (part.backscatter * along_rays(visible))
-                for history, share in both_ways.terms(table, int(successor[0, part.letter]), middle, before):
-                    slot = jnp.broadcast_to(m * count + history, first.shape)
-                    row = jnp.moveaxis(pieces, 0, -1) * (value * share)[..., None]
-                    response = scatter_rows(response, slot, first, row)
-                for history, share in out_way.terms(table, 0, middle, before):
-                    weight = part.extinction * passing * share * power
-                    arrived = _add(arrived, m * count + history, weight)
+                def step(tally, stretch):
+                    return deposited(tally, stretch, light), None
+
+                response, arrived = lax.scan(step, tally, stretch)[0]
+            else:
+                there = stretch.extinction > 0.0 if setting.derivatives == "none" else None
+                response, arrived = in_blocks(deposited, tally, stretch, light, there)
             # Smoothing is linear, so only the sum is smoothed. All that collides is scattered.
             response, scattered = smooth_row(response, bins.kernel)[:, 1:-1], arrived
 
@@ -298,32 +252,6 @@ def first_order(
         response, *fate = lax.scan(add, zero, padded)[0]
     weights, outside = bins.trimmed(response.reshape(materials, count, bins.padded))
     return FirstOrder(weights, outside, *fate)
-
-
-def stretch_pieces(
-    bins: Bins, low: Float[Array, "steps rays"], stretch: Stretches, kappa: float
-) -> tuple[Int[Array, "steps rays"], Float[Array, "pieces steps rays"]]:
-    """First bin of each stretch, and the integrals of exp(-kappa tau) ds over its pieces, bin by bin.
-
-    `low` is the position of the start of each stretch on the axis of bins.
-    """
-    metres = 0.5 * SPEED_OF_LIGHT * bins.width
-    high = low + stretch.length / metres
-    number = jnp.round(lax.stop_gradient(low))
-    # Rows of an even length are added faster; a piece beyond the end is zero.
-    count = bins.row - 2 + bins.row % 2
-
-    def piece(carry, j):
-        clear, start = carry
-        end = jnp.clip(number + (j + 0.5), low, high)
-        length = (end - start) * metres
-        passing, mean = _decay(kappa * stretch.extinction * length)
-        return (clear * passing, end), clear * mean * length
-
-    # A scan computes each piece once; unrolled, compilers recompute them for every element.
-    start = (jnp.exp(-kappa * stretch.depth), low)
-    _, pieces = lax.scan(piece, start, jnp.arange(count, dtype=low.dtype))
-    return first_bin(bins, number, count), pieces
 
 
 def _together(slot: Int[Array, "*s"] | int, weight: Float[Array, "*s"]):

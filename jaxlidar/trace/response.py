@@ -99,7 +99,9 @@ def trace_scene(setup: Setup, key: PRNGKeyArray, *, reverse: bool = True) -> Res
     check_kind("setup", setup, Setup, "a Setup, as in reduce(lidar, scene, plan)")
     check_key(key)
     check_flag("reverse", reverse)
-    return trace_setting(setting_of(setup, reverse=reverse), straight_transmittance(setup), key)
+    return trace_setting(
+        setting_of(setup, derivatives="all" if reverse else "forward"), straight_transmittance(setup), key
+    )
 
 
 def trace_setting(

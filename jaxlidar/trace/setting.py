@@ -1,7 +1,7 @@
 """The scene as the tracer sees it: beam, voxels, surfaces and laws, relative to the aim point."""
 
 import dataclasses
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -26,6 +26,8 @@ from jaxlidar.trace.surfaces import Surface, surfaces_of
 
 # Number of the law by which facets, diffusely transmitting plates and most surfaces send light on: the first.
 COSINE_LAW = 0
+
+Derivatives = Literal["all", "forward", "none"]
 
 
 class Sizes(NamedTuple):
@@ -74,7 +76,8 @@ class Setting(eqx.Module):
     - `optics`: of every letter, by wavelength, where they are applied while light is traced, because it is
       told apart by its place of entry (see `jaxlidar.trace.nodes`), or because histories would be too many;
       None where histories keep them.
-    - `reverse`: whether the trace may be differentiated in reverse, for which it is compiled otherwise.
+    - `derivatives`: those that the trace may be asked for, "all", those "forward" or "none": the fewer, the
+      faster.
     """
 
     beam: Beam
@@ -91,7 +94,12 @@ class Setting(eqx.Module):
     bark_law: int = eqx.field(static=True)
     sizes: Sizes = eqx.field(static=True)
     optics: Float[Array, "letters wavelengths"] | None = None
-    reverse: bool = eqx.field(static=True, default=True)
+    derivatives: Derivatives = eqx.field(static=True, default="all")
+
+    @property
+    def reverse(self) -> bool:
+        """Whether derivatives are taken in reverse, too."""
+        return self.derivatives == "all"
 
     @property
     def short(self) -> Histories:
@@ -137,14 +145,11 @@ def _density(law: AbstractLaw | AbstractPhase, sent: Scattering, w: Vec) -> Scal
     return law.density(sent.incident, sent.normal, w)
 
 
-def setting_of(setup: Setup, *, reverse: bool = True) -> Setting:
-    """The setting of a setup, without wavelengths, unless optics are applied while light is traced.
-
-    `reverse`: whether the trace may be differentiated in reverse.
-    """
+def setting_of(setup: Setup, *, derivatives: Derivatives = "all") -> Setting:
+    """The setting of a setup, without wavelengths, unless optics are applied while light is traced."""
     trace, bins = jax.tree.map(jnp.asarray, (setup.plan.trace, setup.plan.bins))
     setting = _set_out(_without_spectrum(setup.lidar), setup.scene, trace, bins, sizes_of(setup.plan))
-    setting = dataclasses.replace(setting, reverse=reverse)
+    setting = dataclasses.replace(setting, derivatives=derivatives)
     if trace.keeps_histories:
         return setting
     return dataclasses.replace(setting, optics=letter_values(setup.lidar, setup.scene, trace.letters))
