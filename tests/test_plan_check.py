@@ -50,7 +50,7 @@ def lidar(**changes):
 MISFITS = {
     "ground below": (LIDAR, ground(height=-60.0), r"covers returns .* the scene has .* to 400"),
     "canopy above": (LIDAR, canopy(base=2.0), "rays start 6.301 m .*; the scene reaches to 8 m"),
-    "smaller voxels": (LIDAR, canopy(size=0.25), "voxels along a flight; the scene may have"),
+    "smaller voxels": (LIDAR, canopy(size=0.25), "stretches of a ray; the scene may have"),
     "brighter leaves": (LIDAR, canopy(leaf=jl.LeafOptics(0.5, 0.49)), "orders, for albedos up to 0.7"),
     "hot spot": (LIDAR, canopy(hotspot=True), "has hotspot = False"),
     "no ground": (LIDAR, dataclasses.replace(SCENE, ground=None), r"has leaf, ground; the scene has leaf"),

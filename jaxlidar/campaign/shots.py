@@ -1,10 +1,14 @@
 """Shot by shot: one compiled program traces any shots of a survey, each until its tolerance is met.
 
+Shots of one order have eight batches whose lattices of rays are made denser, for their errors fall faster
+with the number of rays than with that of batches; the others have ever more batches.
+
 What the voxel map costs (its layout, the optical depth above every voxel) is computed once for many shots.
 So no shot needs a window of the map, and none costs more over a larger map: light is followed as far as it
 goes, and only the voxels that it meets are read.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -21,11 +25,14 @@ from jaxlidar.instrument.survey import Survey
 from jaxlidar.planning.plan import MIN_BATCHES, Plan
 from jaxlidar.planning.setup import Setup
 from jaxlidar.trace.colouring import Recording, balance, components, recording_of
-from jaxlidar.trace.response import trace_setting
+from jaxlidar.trace.footprint import Slice
+from jaxlidar.trace.response import Response, follows, trace_only_first, trace_setting
 from jaxlidar.trace.setting import Setting, aimed, setting_of, straight_transmittance
 
-# Batches of one shot at most: a tolerance that is out of reach ends here.
+# Batches of one shot, or parts of each of its lattices, at most: a tolerance that is out of reach ends here.
 MOST_BATCHES = 1024
+# Errors of lattices fall with this power of the number of rays, at the edges of crowns.
+_ORDER = 0.75
 
 
 class Aim(NamedTuple):
@@ -71,6 +78,57 @@ def _batch(
     return components(response, recording), balance(response, recording)
 
 
+@eqx.filter_jit
+def _part(setting: Setting, transmittance: Array | None, key: PRNGKeyArray, part: Slice) -> Response:
+    return trace_only_first(setting, transmittance, key, part)
+
+
+def _in_parts(
+    setting: Setting, transmittance: Array | None, recording: Recording, key: PRNGKeyArray, parts: Array
+) -> tuple[Any, Any]:
+    """Components and balance of one batch, whose lattice has so many parts."""
+
+    def add(number: Array, whole: Response) -> Response:
+        part = _part(setting, transmittance, key, Slice(number, parts))
+        return jax.tree.map(jnp.add, whole, part)
+
+    zero = _zeros(jax.eval_shape(_part, setting, transmittance, key, Slice(parts, parts)))
+    whole = jax.lax.fori_loop(0, parts, add, zero)
+    response = jax.tree.map(lambda a: a / parts, whole)
+    return components(response, recording), balance(response, recording)
+
+
+class _Found(NamedTuple):
+    """What batches found: how many, their mean, and the moments of what standard errors are wanted of."""
+
+    count: Array
+    mean: Any
+    moments: BatchMoments
+
+    @staticmethod
+    def none(like: Any) -> "_Found":
+        zero = _zeros(like)
+        return _Found(jnp.zeros((), jnp.int32), zero, BatchMoments(_spread_of(zero), _spread_of(zero)))
+
+    def add(self, found: Any) -> "_Found":
+        """With one more batch."""
+        count = self.count + 1
+        number = count.astype(float)
+        mean = jax.tree.map(lambda m, v: m + (v - m) / number, self.mean, found)
+        return _Found(count, mean, self.moments.add(_spread_of(found), number))
+
+    @property
+    def error(self) -> Array:
+        """Relative error of the waveform."""
+        return relative_error(self.moments.mean[0], self.moments.stderr(self.count.astype(float))[0], jnp)
+
+
+def _spread_of(found: Any) -> tuple[Any, Any]:
+    """The quantities whose standard errors are wanted."""
+    parts, shares = found
+    return parts["first"] + parts["higher"], shares.ledger
+
+
 def _one(setting: Setting, setup: Setup, aim: Aim, key: PRNGKeyArray, rtol: Array) -> Record:
     """One shot, batch after batch."""
     by = jnp.asarray(aim.position) - setup.lidar.position
@@ -81,40 +139,52 @@ def _one(setting: Setting, setup: Setup, aim: Aim, key: PRNGKeyArray, rtol: Arra
     def batch(n: Array) -> Any:
         return _batch(setting, transmittance, recording, jax.random.fold_in(key, n))
 
-    def spread_of(parts: Any, shares: Any) -> tuple[Any, Any]:
-        """The quantities whose standard errors are wanted."""
-        return parts["first"] + parts["higher"], shares.ledger
+    def in_parts(n: Array, parts: Array) -> Any:
+        return _in_parts(setting, transmittance, recording, jax.random.fold_in(key, n), parts)
 
     if not setup.plan.is_random:
         parts, shares = batch(jnp.zeros((), jnp.int32))
-        exact, of_shares = jax.tree.map(jnp.zeros_like, spread_of(parts, shares))
+        exact, of_shares = jax.tree.map(jnp.zeros_like, _spread_of((parts, shares)))
         none = jnp.zeros(()), jnp.zeros((), jnp.int32)
         return record_of_shot(recording, parts, shares, exact, of_shares, *none)
 
-    def error(moments: BatchMoments, count: Array) -> Array:
-        return relative_error(moments.mean[0], moments.stderr(count)[0], jnp)
+    nothing = _Found.none(jax.eval_shape(batch, jnp.zeros((), jnp.int32)))
+    if follows(setting):
+        found = _more_batches(batch, nothing, rtol)
+    else:
+        found = _denser_lattices(in_parts, nothing, rtol)
+    stderr, of_shares = found.moments.stderr(found.count.astype(float))
+    parts, shares = found.mean
+    photons = found.count * photons_of(setup.plan)
+    return record_of_shot(recording, parts, shares, stderr, of_shares, found.error, photons)
 
-    def going(state: Any) -> Array:
-        count, _, moments = state
+
+def _more_batches(batch: Callable[[Array], Any], nothing: _Found, rtol: Array) -> _Found:
+    """Batch after batch, until the error is below the tolerance."""
+
+    def going(found: _Found) -> Array:
         # Looked at after every fourth batch: who stops at the first good moment is wrong more often.
-        wanted = (count < MIN_BATCHES) | (count % 4 != 0) | (error(moments, count.astype(float)) > rtol)
-        return wanted & (count < MOST_BATCHES)
+        wanted = (found.count < MIN_BATCHES) | (found.count % 4 != 0) | (found.error > rtol)
+        return wanted & (found.count < MOST_BATCHES)
 
-    def step(state: Any) -> Any:
-        count, mean, moments = state
-        found, count = batch(count), count + 1
-        number = count.astype(float)
-        mean = jax.tree.map(lambda m, v: m + (v - m) / number, mean, found)
-        return count, mean, moments.add(spread_of(*found), number)
+    return jax.lax.while_loop(going, lambda found: found.add(batch(found.count)), nothing)
 
-    zero: Any = _zeros(jax.eval_shape(batch, jnp.zeros((), jnp.int32)))
-    start = BatchMoments(spread_of(*zero), spread_of(*zero))
-    count, found, moments = jax.lax.while_loop(going, step, (jnp.zeros((), jnp.int32), zero, start))
-    number = count.astype(float)
-    photons = count * photons_of(setup.plan)
-    stderr, of_shares = moments.stderr(number)
-    parts, shares = found
-    return record_of_shot(recording, parts, shares, stderr, of_shares, error(moments, number), photons)
+
+def _denser_lattices(batch: Callable[[Array, Array], Any], nothing: _Found, rtol: Array) -> _Found:
+    """Eight batches, again with lattices of as many more parts as the error calls for, until it is met."""
+
+    def going(state: tuple[Array, _Found]) -> Array:
+        parts, found = state
+        return (found.count == 0) | ((found.error > rtol) & (parts < MOST_BATCHES))
+
+    def denser(state: tuple[Array, _Found]) -> tuple[Array, _Found]:
+        parts, found = state
+        wanted = jnp.clip(1.2 * (found.error / rtol) ** (1.0 / _ORDER), 2.0, 32.0)
+        more = jnp.ceil(parts * jnp.where(found.count > 0, wanted, 1.0)).astype(jnp.int32)
+        parts = jnp.minimum(more, MOST_BATCHES)
+        return parts, jax.lax.fori_loop(0, MIN_BATCHES, lambda n, f: f.add(batch(n, parts)), nothing)
+
+    return jax.lax.while_loop(going, denser, (jnp.ones((), jnp.int32), nothing))[1]
 
 
 def _zeros(shapes: Any) -> Any:

@@ -5,12 +5,13 @@ of that point: no number grows with the altitude, so single precision is enough 
 """
 
 import dataclasses
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from jaxlidar._vectors import FAR, Scalar, Vec, add, dot, from_frame, normalise, scale, vec
 from jaxlidar.instrument.field_of_view import seen
@@ -126,13 +127,30 @@ def across_beam(beam: Beam, share: Scalar, turn: Scalar) -> tuple[Scalar, Scalar
     return disc(beam.radius * jnp.sqrt(-0.5 * jnp.log1p(-share) if beam.gaussian else share), turn)
 
 
+class Slice(NamedTuple):
+    """Which part of a footprint's rays: number `number`, from 0, of `count` parts of one size."""
+
+    number: Int[Array, ""]
+    count: Int[Array, ""]
+
+
 def lattice(
-    beam: Beam, count: int, shift: Float[Array, "2"]
+    beam: Beam, count: int, shift: Float[Array, "2"], part: Slice | None = None
 ) -> tuple[tuple[Scalar, Scalar], Float[Array, "rays"]]:
-    """A Fibonacci disc of `count` rays of equal energy; `shift` in [0, 1) moves it along both coordinates."""
+    """A Fibonacci disc of `count` rays of equal energy; `shift` in [0, 1) moves it along both coordinates.
+
+    With `part`, the disc has `count` rays in each of its parts, and that part carries all energy: the mean of
+    all parts is what the disc gives.
+    """
     i = jnp.arange(count)
-    u = (i + shift[0]) / count
-    turn = jnp.asarray((np.arange(count) * GOLDEN) % 1.0, u.dtype) + shift[1]
+    if part is None:
+        u = (i + shift[0]) / count
+        turn = jnp.asarray((np.arange(count) * GOLDEN) % 1.0, u.dtype) + shift[1]
+    else:
+        i = i + part.number * count
+        u = (i + shift[0]) / (count * part.count)
+        # Whole numbers overflow as turns do, and lose nothing where there are many rays.
+        turn = (i.astype(jnp.uint32) * np.uint32(round(GOLDEN * 2**32))).astype(u.dtype) * 2.0**-32 + shift[1]
     return across_beam(beam, u, turn), jnp.full((count,), 1.0 / count, u.dtype)
 
 

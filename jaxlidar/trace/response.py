@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from jaxlidar._checks import briefly, check_flag, check_key, check_kind
 from jaxlidar.planning.setup import Setup
 from jaxlidar.trace.first_order import FirstOrder, first_order
-from jaxlidar.trace.footprint import lattice, product_rule, scattered
+from jaxlidar.trace.footprint import Slice, lattice, product_rule, scattered
 from jaxlidar.trace.higher_orders import HigherOrders, higher_orders
 from jaxlidar.trace.mirror import mirror_rays
 from jaxlidar.trace.setting import Setting, setting_of, straight_transmittance
@@ -110,7 +110,21 @@ def trace_setting(
     """The response of one batch. `transmittance`: see `straight_transmittance`."""
     if follows(setting):
         return joined(trace_first(setting, transmittance, key), trace_higher(setting, transmittance, key))
-    return _for_each(lambda setting: only_first(setting, *_first(setting, key)), setting, transmittance)
+    return trace_only_first(setting, transmittance, key)
+
+
+def trace_only_first(
+    setting: Setting,
+    transmittance: Float[Array, "wavelengths"] | None,
+    key: PRNGKeyArray,
+    part: Slice | None = None,
+) -> Response:
+    """The response of one batch of a setting that has one order; or of a part of its rays (see `lattice`)."""
+
+    def trace(setting: Setting) -> Response:
+        return only_first(setting, *_first(setting, key, part))
+
+    return _for_each(trace, setting, transmittance)
 
 
 def follows(setting: Setting) -> bool:
@@ -192,9 +206,11 @@ def _keys(setting: Setting, key: PRNGKeyArray) -> tuple[PRNGKeyArray, PRNGKeyArr
     return shift, photons
 
 
-def _first(setting: Setting, key: PRNGKeyArray) -> tuple[FirstOrder, Float[Array, "materials short bins"]]:
+def _first(
+    setting: Setting, key: PRNGKeyArray, part: Slice | None = None
+) -> tuple[FirstOrder, Float[Array, "materials short bins"]]:
     """Order one, and its weights together with what mirrors return; none where the order is drawn."""
-    across, energy = footprint_of(setting, _keys(setting, key)[0])
+    across, energy = footprint_of(setting, _keys(setting, key)[0], part)
     first = first_order(setting, across, energy)
     weights = jnp.zeros_like(first.weights) if setting.plan.drawn_first else first.weights
     for i, is_mirror in enumerate(setting.plan.mirrors):
@@ -205,16 +221,16 @@ def _first(setting: Setting, key: PRNGKeyArray) -> tuple[FirstOrder, Float[Array
 
 
 def footprint_of(
-    setting: Setting, key: PRNGKeyArray
+    setting: Setting, key: PRNGKeyArray, part: Slice | None = None
 ) -> tuple[tuple[Float[Array, "rays"], Float[Array, "rays"]], Float[Array, "rays"]]:
     """Places of the footprint's rays across the beam, and their shares of its energy."""
     beam, sizes = setting.beam, setting.sizes
     if sizes.smooth:
         return product_rule(beam)
     if setting.plan.independent:
-        return scattered(beam, sizes.rays, key)
+        return scattered(beam, sizes.rays, key if part is None else jax.random.fold_in(key, part.number))
     shift = jax.random.uniform(key, (2,)) if sizes.shifted else jnp.asarray([0.5, 0.0])
-    return lattice(beam, sizes.rays, shift)
+    return lattice(beam, sizes.rays, shift, part)
 
 
 def only_first(

@@ -1,0 +1,67 @@
+"""Shots of one order: lattices that are made denser until the tolerance is met."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxlidar as jl
+from jaxlidar.trace.footprint import Slice, beam_of, lattice
+
+KEY = jax.random.key(5)
+LIDAR = jl.Lidar(altitude=1000.0, divergence=3.0, pulse=jl.GaussianPulse(fwhm=4.0))
+
+
+def edge(thickness: float = 3.0) -> jl.Scene:
+    """A crown whose edge every shot sees."""
+    density = np.zeros((20, 20, 6))
+    density[10:, :, 6 - round(thickness) :] = 0.8
+    canopy = jl.Canopy(jl.VoxelMap.from_lad(density, voxel_size=1.0), leaf=jl.Prospect())
+    return jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=0.3))
+
+
+def shots(count: int = 8) -> jl.Survey:
+    """Across the edge, at x = 10."""
+    return jl.Survey(LIDAR, np.stack([10.0 + np.linspace(-1.6, 1.6, count), np.full(count, 10.0)], axis=1))
+
+
+def test_parts_of_a_lattice_are_that_lattice(precision):
+    beam, shift = beam_of(LIDAR), jnp.asarray([0.3, 0.8])
+    (x, y), energy = lattice(beam, 24 * 5, shift)
+    parts = [lattice(beam, 24, shift, Slice(jnp.asarray(n), jnp.asarray(5))) for n in range(5)]
+    close = {"atol": 2e-5 if precision == "float32" else 1e-6}
+    np.testing.assert_allclose(x, np.concatenate([p[0][0] for p in parts]), **close)
+    np.testing.assert_allclose(y, np.concatenate([p[0][1] for p in parts]), **close)
+    np.testing.assert_allclose(energy, np.concatenate([p[1] for p in parts]) / 5, rtol=1e-6)
+    # Far out in a dense lattice, turns are still those of the golden ratio.
+    far = lattice(beam, 64, shift, Slice(jnp.asarray(1000), jnp.asarray(1024)))[0]
+    number = 64_000 + np.arange(64)
+    turn = 2 * np.pi * ((number * (np.sqrt(5.0) - 1) / 2) % 1.0 + 0.8)
+    angle = np.angle(np.exp(1j * (np.arctan2(far[1], far[0]) - turn)))
+    assert np.abs(angle).max() < 1e-4
+
+
+def test_every_shot_is_as_precise_as_asked_and_as_it_says():
+    survey, scene, rtol = shots(), edge(), 0.01
+    many = jl.simulate_many(survey, scene, key=KEY, max_orders=1, rtol=rtol, shared=False)
+    assert np.all(many.error <= rtol)
+    plan = jl.plan(survey, scene, max_orders=1, n_rays=1 << 14, describe=False)
+    exact = [jl.simulate(own, scene, key=KEY, plan=plan).reflectance for own in survey]
+
+    def chi_squared(found: jl.Waveforms) -> np.ndarray:
+        """Of each shot, per sample."""
+        mean, stderr = np.asarray(found.reflectance), np.asarray(found.stderr)
+        seen = mean > 0.01 * mean.max(axis=-1, keepdims=True)
+        error = np.where(seen, np.maximum(stderr, 2e-4 * mean), 1.0)
+        square = np.where(seen, ((mean - np.asarray(exact)) / error) ** 2, 0.0)
+        return square.sum(axis=(1, 2)) / seen.sum(axis=(1, 2))
+
+    # Samples of a shot err together: each shot counts about once.
+    assert 0.05 < chi_squared(many).mean() < 2.5
+    # Planted: a crown thinner by a layer.
+    wrong = jl.simulate_many(survey, edge(2.0), key=KEY, max_orders=1, rtol=rtol, shared=False)
+    assert chi_squared(wrong).mean() > 100.0
+
+
+def test_a_tolerance_out_of_reach_is_said():
+    many = jl.simulate_many(shots(1), edge(), key=KEY, max_orders=1, rtol=1e-6, shared=False)
+    assert 1e-6 < float(many.error[0]) < 1e-3
