@@ -19,7 +19,7 @@ from jaxlidar.trace.march import Medium, advance, begin, cell_of, earlier, later
 Tally = TypeVar("Tally")
 
 # Stretches that are added at once.
-BLOCK = 1024
+BLOCK = 256
 
 
 class Stretches(eqx.Module):
