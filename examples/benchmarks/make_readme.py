@@ -289,7 +289,8 @@ def campaign(record: dict) -> str:
         ),
         f"On paper: tiles do not depend on one another, so a square kilometre to {rough} takes "
         f"{number(hours)} core hours, and a country of 100,000 km2 {number(hours * 1e5 / 24 / 1e4)} days of "
-        "10,000 cores. Waveforms are written as they come; a map must fit into memory, 4 bytes a voxel.",
+        "10,000 cores. Waveforms are written as they come; of a map, 4 bytes a voxel, only the "
+        "parts that are traced (`SceneParts`) need fit into memory.",
     )
 
 

@@ -21,7 +21,8 @@ def instant_row(
     bins: Bins, time: Float[Array, "*s"], value: Float[Array, "*s"]
 ) -> tuple[Int[Array, "*s"], Float[Array, "*s kernel"]]:
     """First bin (counting the margin) and weights of a return at one instant."""
-    position = bins.position(time)
+    # Fused into the row, both would be computed again for each of its bins.
+    position, value = lax.optimization_barrier((bins.position(time), value))
     lowest = jnp.round(lax.stop_gradient(position) - 0.5 * (bins.kernel - 1))
     r = position - lowest
     match bins.kernel:

@@ -171,7 +171,9 @@ def first_order(
             value = part.extinction * (part.backscatter * visible)
             for history, share in both_ways.terms(table, int(successor[0, part.letter]), middle, before):
                 slot = jnp.broadcast_to(m * count + history, first.shape)
-                row = jnp.moveaxis(pieces, 0, -1) * (value * share)[..., None]
+                # Fused, what the pieces are multiplied by would be computed again for each, out of order.
+                row = lax.optimization_barrier(pieces * lax.optimization_barrier(value * share)[None])
+                row = jnp.moveaxis(row, 0, -1)
                 response = scatter_rows(response, slot, first, row)
             for history, share in out_way.terms(table, 0, middle, before):
                 weight = part.extinction * passing * share * sent.energy

@@ -348,6 +348,7 @@ def _deposit(
         factor = jnp.where(letter >= 0, factor, 0.0)
         for slot, tint in label.grown(setting, letter).slots():
             slot = hit.material * tally.weights.shape[1] + slot
-            left = factor if tint is None else factor * tint
+            # Fused into the rows, it would be computed again for each of their bins.
+            left = lax.optimization_barrier(factor if tint is None else factor * tint)
             response = scatter_rows(response, slot, first, row * left[:, None])
     return eqx.tree_at(lambda t: t.weights, tally, response.reshape(tally.weights.shape))

@@ -6,7 +6,6 @@ from typing import Any, TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
@@ -122,11 +121,11 @@ def in_blocks(
     shape = stretch.start.shape
     before_end = (stretch.start < stretch.start[-1:]) | (stretch.length > 0.0)
     there = before_end if there is None else before_end & there
-    # Sums along rays as a product with a triangle: processors sum up slowly. Whole numbers stay exact.
-    triangle, ones = np.tril(np.ones((shape[0], shape[0]), np.float32)), there.astype(jnp.float32)
-    along_ray = jnp.dot(triangle, ones, precision=lax.Precision.HIGHEST).astype(jnp.int32)
-    upto = jnp.cumsum(along_ray[-1])
-    place = jnp.where(there, along_ray + (upto - along_ray[-1])[None] - 1, there.size)
+    one, none = there.astype(jnp.int32), jnp.zeros(shape[1], jnp.int32)
+    number_of, before = lax.scan(lambda n, more: (n + more, n), none, one)
+    upto = jnp.cumsum(number_of)
+    first = jnp.concatenate([jnp.zeros(1, jnp.int32), upto[:-1]])
+    place = jnp.where(there, first[None] + before, there.size)
     number = jnp.arange(there.size, dtype=jnp.int32)
     chosen = jnp.zeros((there.size + BLOCK,), jnp.int32).at[place.reshape(-1)].set(number, mode="drop")
 
