@@ -34,6 +34,16 @@ def canopy(**changes):
     return dataclasses.replace(SCENE, canopy=stand(**({"sides": "periodic"} | changes)))
 
 
+def narrower(width):
+    """The scene with voxels that are as high as they were."""
+    assert SCENE.canopy is not None
+    voxels = SCENE.canopy.voxels
+    size = np.array([width, width, voxels.voxel_size[2]])
+    return dataclasses.replace(
+        SCENE, canopy=dataclasses.replace(SCENE.canopy, voxels=dataclasses.replace(voxels, voxel_size=size))
+    )
+
+
 def ground(**changes):
     return dataclasses.replace(SCENE, ground=jl.Ground(**({"reflectance": 0.3} | changes)))
 
@@ -51,6 +61,7 @@ MISFITS = {
     "ground below": (LIDAR, ground(height=-60.0), r"covers returns .* the scene has .* to 400"),
     "canopy above": (LIDAR, canopy(base=2.0), "rays start 6.301 m .*; the scene reaches to 8 m"),
     "smaller voxels": (LIDAR, canopy(size=0.25), "stretches of a ray; the scene may have"),
+    "narrower voxels": (LIDAR, narrower(0.1), "voxels along a flight; the scene may have"),
     "brighter leaves": (LIDAR, canopy(leaf=jl.LeafOptics(0.5, 0.49)), "orders, for albedos up to 0.7"),
     "hot spot": (LIDAR, canopy(hotspot=True), "has hotspot = False"),
     "no ground": (LIDAR, dataclasses.replace(SCENE, ground=None), r"has leaf, ground; the scene has leaf"),
