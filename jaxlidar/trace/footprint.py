@@ -130,27 +130,27 @@ def across_beam(beam: Beam, share: Scalar, turn: Scalar) -> tuple[Scalar, Scalar
 class Slice(NamedTuple):
     """Which part of a footprint's rays: number `number`, from 0, of `count` parts of one size."""
 
-    number: Int[Array, ""]
-    count: Int[Array, ""]
+    number: Int[Array, ""] | int = 0
+    count: Int[Array, ""] | int = 1
+
+
+# All rays are one part.
+WHOLE = Slice()
 
 
 def lattice(
-    beam: Beam, count: int, shift: Float[Array, "2"], part: Slice | None = None
+    beam: Beam, count: int, shift: Float[Array, "2"], part: Slice = WHOLE
 ) -> tuple[tuple[Scalar, Scalar], Float[Array, "rays"]]:
-    """A Fibonacci disc of `count` rays of equal energy; `shift` in [0, 1) moves it along both coordinates.
+    """A Fibonacci disc of rays of equal energy; `shift` in [0, 1) moves it along both coordinates.
 
-    With `part`, the disc has `count` rays in each of its parts, and that part carries all energy: the mean of
-    all parts is what the disc gives.
+    It has `count` rays in each of its parts. Those of `part` carry all energy, so that the mean of all parts
+    is what the disc gives.
     """
-    i = jnp.arange(count)
-    if part is None:
-        u = (i + shift[0]) / count
-        turn = jnp.asarray((np.arange(count) * GOLDEN) % 1.0, u.dtype) + shift[1]
-    else:
-        i = i + part.number * count
-        u = (i + shift[0]) / (count * part.count)
-        # Whole numbers overflow as turns do, and lose nothing where there are many rays.
-        turn = (i.astype(jnp.uint32) * np.uint32(round(GOLDEN * 2**32))).astype(u.dtype) * 2.0**-32 + shift[1]
+    before = jnp.asarray(part.number * count)
+    u = (before + jnp.arange(count) + shift[0]) / (count * part.count)
+    # Whole numbers overflow as turns do, and lose nothing where there are many rays.
+    turned = (before.astype(jnp.uint32) * np.uint32(round(GOLDEN * 2**32))).astype(u.dtype) * 2.0**-32
+    turn = jnp.asarray((np.arange(count) * GOLDEN) % 1.0, u.dtype) + turned + shift[1]
     return across_beam(beam, u, turn), jnp.full((count,), 1.0 / count, u.dtype)
 
 

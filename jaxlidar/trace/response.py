@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from jaxlidar._checks import briefly, check_flag, check_key, check_kind
 from jaxlidar.planning.setup import Setup
 from jaxlidar.trace.first_order import FirstOrder, first_order
-from jaxlidar.trace.footprint import Slice, lattice, product_rule, scattered
+from jaxlidar.trace.footprint import WHOLE, Slice, lattice, product_rule, scattered
 from jaxlidar.trace.higher_orders import HigherOrders, higher_orders
 from jaxlidar.trace.mirror import mirror_rays
 from jaxlidar.trace.setting import Setting, setting_of, straight_transmittance
@@ -117,7 +117,7 @@ def trace_only_first(
     setting: Setting,
     transmittance: Float[Array, "wavelengths"] | None,
     key: PRNGKeyArray,
-    part: Slice | None = None,
+    part: Slice = WHOLE,
 ) -> Response:
     """The response of one batch of a setting that has one order; or of a part of its rays (see `lattice`)."""
 
@@ -207,7 +207,7 @@ def _keys(setting: Setting, key: PRNGKeyArray) -> tuple[PRNGKeyArray, PRNGKeyArr
 
 
 def _first(
-    setting: Setting, key: PRNGKeyArray, part: Slice | None = None
+    setting: Setting, key: PRNGKeyArray, part: Slice = WHOLE
 ) -> tuple[FirstOrder, Float[Array, "materials short bins"]]:
     """Order one, and its weights together with what mirrors return; none where the order is drawn."""
     across, energy = footprint_of(setting, _keys(setting, key)[0], part)
@@ -221,14 +221,15 @@ def _first(
 
 
 def footprint_of(
-    setting: Setting, key: PRNGKeyArray, part: Slice | None = None
+    setting: Setting, key: PRNGKeyArray, part: Slice = WHOLE
 ) -> tuple[tuple[Float[Array, "rays"], Float[Array, "rays"]], Float[Array, "rays"]]:
     """Places of the footprint's rays across the beam, and their shares of its energy."""
     beam, sizes = setting.beam, setting.sizes
     if sizes.smooth:
         return product_rule(beam)
     if setting.plan.independent:
-        return scattered(beam, sizes.rays, key if part is None else jax.random.fold_in(key, part.number))
+        assert part is WHOLE, "independent rays have no parts"
+        return scattered(beam, sizes.rays, key)
     shift = jax.random.uniform(key, (2,)) if sizes.shifted else jnp.asarray([0.5, 0.0])
     return lattice(beam, sizes.rays, shift, part)
 
