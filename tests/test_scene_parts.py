@@ -1,5 +1,6 @@
 """Scenes in parts: the same waveforms as of the whole, from rectangles of one size."""
 
+import functools
 from concurrent.futures import ThreadPoolExecutor
 
 import jax
@@ -155,6 +156,23 @@ def test_millions_of_metres_lose_nothing_and_bare_parts_have_all_materials():
     np.testing.assert_allclose(total, 1.0, atol=1e-5)
 
 
+def test_the_truth_is_that_of_the_whole(tmp_path):
+    """In memory and from a file; bare parts have nothing of leaf, and shots are in the survey's order."""
+    density = DENSITY.copy()
+    density[:26, :26] = 0.0
+    forest, how = Forest(density=density), {"max_orders": 1, "truth": True}
+    whole, found = (simulated(scene, **how) for scene in (forest.whole(), parts(forest)))
+    filed = simulated(parts(forest), path=tmp_path / "many.nc", **how)
+    for mine in (found.truth, filed.truth):
+        assert set(mine.returns) == set(whole.truth.returns) == {"leaf", "ground"}
+        for name, expected in vars(whole.truth).items():
+            compare = functools.partial(np.testing.assert_allclose, rtol=1e-5, atol=2e-5)
+            jax.tree.map(compare, getattr(mine, name), expected)
+    assert float(found.truth.returns["leaf"][0].max()) == 0.0 < float(found.truth.returns["leaf"][3].max())
+    assert float(found[3].truth.surface_height["ground"]) == pytest.approx(0.0, abs=1e-6)
+    assert simulated(parts(forest), max_orders=1).truth is None
+
+
 def test_bad_input_is_refused_before_any_work():
     with pytest.raises(TypeError, match="part"):
         jl.SceneParts(3, z=(0, 1))  # pyright: ignore[reportArgumentType]
@@ -169,7 +187,5 @@ def test_bad_input_is_refused_before_any_work():
         simulated(jl.SceneParts(lambda low, high: None, z=(0, 1)))  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match=r"voxels from 0 m to 6 m; admissible is z = \(0.0, 5.0\)"):
         simulated(jl.SceneParts(Forest(), z=(0, 5)))
-    with pytest.raises(ValueError, match="truth = True"):
-        simulated(parts(Forest()), truth=True)
     with pytest.raises(TypeError, match="Scene"):
         jl.simulate(jl.Lidar(), parts(Forest()), key=jax.random.key(0))  # pyright: ignore[reportArgumentType]

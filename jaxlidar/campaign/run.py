@@ -129,9 +129,7 @@ def simulate_many(
         )
     started = time.perf_counter()
     if isinstance(scene, SceneParts):
-        if truth:
-            raise ValueError("truth = True, but the scene is in parts; admissible is False")
-        way = BySquares.of(survey, scene, rtol, max_orders, shared)
+        way = BySquares.of(survey, scene, rtol, max_orders, shared, truth)
         beside, heights = way.beside, way.heights
     else:
         way = prepared(survey, scene, rtol, max_orders, shared)

@@ -14,7 +14,9 @@ from jaxlidar._workers import Task, done, task
 from jaxlidar.campaign.coverage import ground_heights, off_map
 from jaxlidar.campaign.prepare import prepared
 from jaxlidar.campaign.records import Record
+from jaxlidar.campaign.truths import Truths
 from jaxlidar.campaign.ways import AbstractWay
+from jaxlidar.campaign.with_truth import WithTruth
 from jaxlidar.instrument.survey import Survey
 from jaxlidar.scenes.scene import check_kinds
 from jaxlidar.scenes.scene_parts import SceneParts
@@ -36,12 +38,13 @@ class Square(NamedTuple):
 
 
 class Asked(NamedTuple):
-    """How the shots of all squares are traced; `window`: first and last sample time, ns."""
+    """How the shots of all squares are traced; `window`: first and last sample time, ns; `truth`: too."""
 
     rtol: float | None
     orders: int
     shared: bool | None
     window: tuple[float, float]
+    truth: bool
 
 
 def squares_of(survey: Survey, scene: SceneParts, margin: float = 0.0) -> list[Square]:
@@ -82,9 +85,9 @@ def some_of(survey: Survey, shots: Int[np.ndarray, " shots"]) -> Survey:
 
 @dataclasses.dataclass(frozen=True)
 class BySquares(AbstractWay):
-    """A task for each square, which asks for its part of the scene.
+    """A task for each square, which asks for its part of the scene; then one for the truth of each, if asked.
 
-    - `setup`: of the first square. - `squares`: with their margins. - `materials`: of all parts.
+    - `setup`: of the first square. - `squares`: with their margins. - `materials`, `surfaces`: of all parts.
     - `beside`, `heights`: of every shot, see `Waveforms.off_map` and `Waveforms.ground_height`.
     - `digests`: of all parts. - `margin`, `all_light`: m, of the parts and of all light.
     """
@@ -93,6 +96,7 @@ class BySquares(AbstractWay):
     squares: list[Square]
     asked: Asked
     materials: tuple[str, ...]
+    surfaces: tuple[str, ...]
     beside: Float[np.ndarray, " shots"]
     heights: Float[np.ndarray, " shots"]
     digests: list[str]
@@ -102,7 +106,12 @@ class BySquares(AbstractWay):
 
     @staticmethod
     def of(
-        survey: Survey, scene: SceneParts, rtol: float | None, max_orders: int | None, shared: bool | None
+        survey: Survey,
+        scene: SceneParts,
+        rtol: float | None,
+        max_orders: int | None,
+        shared: bool | None,
+        truth: bool,
     ) -> "BySquares":
         """Looks at all parts, one after the other: first for what is recorded, then with their margins.
 
@@ -117,7 +126,7 @@ class BySquares(AbstractWay):
             ends.append(plan.sample_start + plan.sample_interval * (plan.n_samples - 1))
             lasts.append(float(plan.trace.last))
             orders.append(plan.orders)
-        asked = Asked(rtol, max(orders), shared, (min(begins), max(ends)))
+        asked = Asked(rtol, max(orders), shared, (min(begins), max(ends)), truth)
         # The window is as long for all: so are the paths, by what it grows.
         grown = max(asked.window[1] - end for end in ends) * SPEED_OF_LIGHT
         whole = all_light(survey, max(lasts) + grown, scene.z[1])
@@ -126,6 +135,7 @@ class BySquares(AbstractWay):
         squares = squares_of(survey, scene, margin)
         beside, heights, digests, shares = np.zeros(len(survey)), np.zeros(len(survey)), [], []
         materials: dict[str, None] = {}
+        surfaces: dict[str, None] = {}
         first = None
         for square in squares:
             way = _way(survey, scene, square, rtol, asked.orders, shared, asked.window)
@@ -134,29 +144,33 @@ class BySquares(AbstractWay):
             beside[square.shots] = off_map(*place)
             heights[square.shots] = ground_heights(*place, way.setup.plan.trace.upstream)
             digests.append(digest_of(scene.between(square.low, square.high)))
-            materials |= dict.fromkeys(way.setup.plan.trace.materials)
+            trace = way.setup.plan.trace
+            materials |= dict.fromkeys(trace.materials)
+            surfaces |= dict.fromkeys(trace.materials[s.material] for s in trace.surfaces)
             shares.append(bool(way.described()["shared"]))
         assert first is not None
-        known = tuple(materials), beside, heights, digests, margin, whole if asked.orders > 1 else 0.0
-        return BySquares(first.setup, survey, first.rtol, scene, squares, asked, *known, all(shares))
+        known = tuple(materials), tuple(surfaces), beside, heights, digests, margin
+        light = whole if asked.orders > 1 else 0.0
+        return BySquares(first.setup, survey, first.rtol, scene, squares, asked, *known, light, all(shares))
 
     def tasks(self, key: PRNGKeyArray) -> list[Task]:
-        return [
-            task(number, trace_square, (self.survey, self.scene, square, number, self.asked), key)
-            for number, square in enumerate(self.squares)
-        ]
+        given = [(self.survey, self.scene, square, n, self.asked) for n, square in enumerate(self.squares)]
+        found = [task(n, trace_square, one, key) for n, one in enumerate(given)]
+        if self.asked.truth:
+            found += [task(n, truth_of_square, one, key) for n, one in enumerate(given, len(given))]
+        return found
 
     @property
     def count(self) -> int:
-        return len(self.squares)
+        return len(self.squares) * (2 if self.asked.truth else 1)
 
     @property
     def slices(self) -> list[slice]:
         many = len(self.survey)
         return [slice(first, min(first + _TOGETHER, many)) for first in range(0, many, _TOGETHER)]
 
-    def kind_of(self, number: int) -> type[Record]:
-        return Record
+    def kind_of(self, number: int) -> type[Record | Truths]:
+        return Record if number < len(self.squares) else Truths
 
     def records(self, results: Mapping[int, Any]) -> Iterator[tuple[slice, Record]]:
         number, turn = (np.empty(len(self.survey), int) for _ in range(2))
@@ -167,7 +181,7 @@ class BySquares(AbstractWay):
             parts, order = [], []
             for n in np.unique(number[shots]):
                 record = kept.pop(int(n), None)
-                record = self._whole(results[int(n)]) if record is None else record
+                record = self._whole(int(n), results) if record is None else record
                 kept[int(n)] = record
                 own = np.flatnonzero(number[shots] == n)
                 order.append(own)
@@ -177,17 +191,28 @@ class BySquares(AbstractWay):
             back = np.argsort(np.concatenate(order), kind="stable")
             yield shots, jax.tree.map(lambda *a, b=back: np.concatenate(a)[b], *parts)
 
-    def _whole(self, record: Record) -> Record:
-        """A record with all materials: of those that its part has not, nothing returns."""
-        some = next(iter(record.components.values()))
-        lines = {m: record.components.get(m, np.zeros_like(some)) for m in self.materials}
-        rest = {name: a for name, a in record.components.items() if name not in self.materials}
+    def _whole(self, number: int, results: Mapping[int, Any]) -> Record:
+        """The record of a square with all materials: of those that its part has not, nothing returns."""
+        record: Record = results[number]
         ledgers = []
         for ledger in (record.ledger, record.ledger_stderr):
             none = np.zeros_like(ledger["escaped"])
             absorbed = [f"absorbed by {m}" for m in self.materials]
             ledgers.append({**dict.fromkeys(absorbed, none), **ledger})
-        return record._replace(components={**lines, **rest}, ledger=ledgers[0], ledger_stderr=ledgers[1])
+        truth = None
+        if self.asked.truth:
+            known: Truths = results[number + len(self.squares)]
+            none, nowhere = np.zeros_like(record.reflectance), np.full(len(known.top_height), np.nan)
+            truth = dataclasses.replace(
+                known,
+                returns=_with_all(known.returns, self.materials, none),
+                surface_height=_with_all(known.surface_height, self.surfaces, nowhere),
+                surface_spread=_with_all(known.surface_spread, self.surfaces, nowhere),
+            )
+        components = _with_all(record.components, self.materials, np.zeros_like(record.reflectance))
+        return record._replace(
+            components=components, ledger=ledgers[0], ledger_stderr=ledgers[1], truth=truth
+        )
 
     def described(self) -> dict[str, Any]:
         return {
@@ -217,16 +242,39 @@ def _way(
         raise ValueError(f"{corners}, shots {square.shots[:5].tolist()}: {error}") from error
 
 
+def _with_all(some: dict[str, np.ndarray], names: tuple[str, ...], none: np.ndarray) -> dict[str, Any]:
+    """Items of all names, in their order, then the rest; `none` in place of those that are not there."""
+    return {**dict.fromkeys(names, none), **some}
+
+
 def trace_square(
     survey: Survey, scene: SceneParts, square: Square, number: int, asked: Asked, key: PRNGKeyArray
 ) -> Record:
     """The records of the shots of a square."""
     way = _way(survey, scene, square, asked.rtol, asked.orders, asked.shared, asked.window)
+    results = _done(way.tasks(jax.random.fold_in(key, number)))
+    each = [record for _, record in way.records(results)]
+    return jax.tree.map(lambda *a: np.concatenate(a), *each)
+
+
+def truth_of_square(
+    survey: Survey, scene: SceneParts, square: Square, number: int, asked: Asked, key: PRNGKeyArray
+) -> Truths:
+    """The truth of the shots of a square; nothing is drawn."""
+    way = _way(survey, scene, square, asked.rtol, asked.orders, asked.shared, asked.window)
+    tasks = WithTruth(way.setup, way.survey, way.rtol, way).tasks(key)[way.count :]
+    each = [known for _, known in sorted(_done(tasks).items())]
+    known: Truths = jax.tree.map(lambda *a: np.concatenate(a), *each)
+    # The last chunk is as large as the others.
+    return jax.tree.map(lambda a: a[: len(square.shots)], known)
+
+
+def _done(tasks: list[Task]) -> dict[int, Any]:
+    """The results of tasks, one after the other."""
     results = {}
-    for one in way.tasks(jax.random.fold_in(key, number)):
+    for one in tasks:
         outcome = done(one)
         if outcome.error is not None:
             raise outcome.error
         results[one.number] = outcome.arrays
-    each = [record for _, record in way.records(results)]
-    return jax.tree.map(lambda *a: np.concatenate(a), *each)
+    return results

@@ -16,8 +16,8 @@ from jaxlidar.scenes.scene import Scene
 class SceneParts:
     """A scene larger than memory: a function gives the part of it that some footprints need.
 
-    `simulate_many` groups shots by squares and asks for the part of one square at a time, once to look at it
-    and once to trace it (several at a time where several workers trace).
+    `simulate_many` groups shots by squares and asks for the part of one square at a time: to look at it,
+    to trace it, and for the truth, where that is asked for (several at a time where several workers trace).
 
     **Arguments:**
 
