@@ -2,7 +2,7 @@
 
 Optical unknowns do not change the response: their columns are a small matrix product with the traced
 response. Geometric unknowns need tangents pushed through the trace, all of them in one pass that shares what
-does not depend on them. Where no unknown is geometric, photons are traced once.
+does not depend on them, or as many as memory allows. Where no unknown is geometric, photons are traced once.
 
 All evaluations use the same random keys, so that the waveform is a smooth function of the unknowns. An
 evaluation averages batches of photons, each with its own key; their spread is the simulation's own noise.
@@ -22,6 +22,7 @@ from jaxlidar import Lidar, Plan, Response, Scene, Setup, Waveform, reduce, tota
 from jaxlidar.extend import ONE_CORE, concrete, side_by_side
 from jaxlidar.planning.plan import MIN_BATCHES
 
+from .columns import columns_at_once
 from .unknowns import Place, Settled, put
 
 Values = tuple[Array, ...]
@@ -30,12 +31,16 @@ ROUNDING = 1e-3
 
 
 class Problem(eqx.Module):
-    """Inputs of a simulation, except the values of the unknowns."""
+    """Inputs of a simulation, except the values of the unknowns.
+
+    `at_once`: geometric columns of the Jacobian that are pushed through the trace together.
+    """
 
     lidar: Lidar
     scene: Scene
     plan: Plan = eqx.field(static=True)
     places: tuple[Place, ...] = eqx.field(static=True)
+    at_once: int = eqx.field(static=True)
 
     def at(self, values: Values) -> Setup:
         """The setup with these values."""
@@ -70,10 +75,20 @@ def _batch(
     if not flat.size:
         value, response = total(flat)
         return response, value, jnp.zeros((0, *value.shape), value.dtype)
-    # The response without its tangents is the same in all directions, hence not batched.
-    push = jax.vmap(lambda t: jax.jvp(total, (flat,), (t,), has_aux=True), out_axes=(None, 0, None))
-    value, columns, response = push(jnp.eye(flat.size, dtype=flat.dtype))
-    return response, value, columns
+    directions, size = jnp.eye(flat.size, dtype=flat.dtype), problem.at_once
+    if size == flat.size:
+        # The response without its tangents is the same in all directions, hence not batched.
+        push = jax.vmap(lambda t: jax.jvp(total, (flat,), (t,), has_aux=True), out_axes=(None, 0, None))
+        value, columns, response = push(directions)
+        return response, value, columns
+
+    def some(directions: Array) -> Array:
+        return jax.vmap(lambda t: jax.jvp(lambda x: total(x)[0], (flat,), (t,))[1])(directions)
+
+    value, response = total(flat)
+    groups = jnp.pad(directions, ((0, -flat.size % size), (0, 0))).reshape(-1, size, flat.size)
+    columns = jax.lax.map(some, groups).reshape(-1, *value.shape)
+    return response, value, columns[: flat.size]
 
 
 _compiled_batch = eqx.filter_jit(_batch, **ONE_CORE)
@@ -163,7 +178,11 @@ class Model:
         if not plan.trace.keeps_histories:
             # Optics are applied while light is traced.
             places = [place._replace(geometric=True) for place in places]
-        self.problem = Problem(lidar, scene, plan, tuple(places))
+        moving = sum(s.start.size for s, place in zip(settled, places) if place.geometric)
+        straight = scene.canopy is not None and scene.canopy.is_straight
+        traces = lidar.wavelength.size if straight or not plan.trace.keeps_histories else 1
+        at_once = columns_at_once(plan, traces, moving)
+        self.problem = Problem(lidar, scene, plan, tuple(places), at_once)
         self.shapes = [s.start.shape for s in settled]
         self.dtypes = [s.start.dtype for s in settled]
         self.sizes = [s.start.size for s in settled]

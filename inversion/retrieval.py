@@ -71,8 +71,9 @@ def retrieve(
     - `time`: (bins,) ns, needed where `observed` is an array. Times must lie the lidar's sampling interval
       apart. Default None: those of the `Waveform`.
     - `plan`: what to simulate (`jaxlidar.plan`, with the window of `observed`, valid throughout the bounds),
-      with the photons and rays of one of eight batches. Default None: planned for the start and the corners
-      of the bounds.
+      with the photons and rays of one of eight batches. Derivatives are computed in groups where all at once
+      would take more memory than its `max_memory`. Default None: planned for the start and the corners of
+      the bounds.
     - `n_photons`: photons of one simulation, all eight batches together, at least 8. Default None: 65536, or
       what `plan` has.
     - `n_rays`: rays of the footprint of one simulation, all eight batches together, at least 8. Default None:
@@ -99,8 +100,9 @@ def retrieve(
 
     **Raises:** ValueError for inadmissible arguments, among them a start outside its bounds, samples that do
     not fit the lidar or the plan, a plan that does not serve all scenes within the bounds or that is given
-    together with photons, rays or orders, noise that is negative or NaN, and a lidar so far from x = y = 0
-    that its place is rounded by more than a millimetre. TypeError for arguments of another kind.
+    together with photons, rays or orders, derivatives that would take more than `max_memory` one at a time,
+    noise that is negative or NaN, and a lidar so far from x = y = 0 that its place is rounded by more than a
+    millimetre. TypeError for arguments of another kind.
     RuntimeError where `throw` is set and the fit does not converge.
 
     **Example:**

@@ -1,10 +1,12 @@
 """What does not fit into memory is refused with numbers; long records need no matrix."""
 
 import dataclasses
+import os
 import subprocess
 import sys
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from helpers import slab, slow_unless
 
 import inversion
 import jaxlidar as jl
+from inversion.columns import columns_at_once, jacobian_bytes
 from inversion.model import Model
 from inversion.unknowns import settle
 from jaxlidar.planning import memory, sampling
@@ -166,7 +169,56 @@ def test_the_band_is_the_matrix(pulse, window, monkeypatch):
     assert not np.allclose(wrong(fine), expected, atol=1e-6 * float(np.max(expected)))
 
 
-MEASURED = """
+def layers_scaled(scene, share):
+    return eqx.tree_at(
+        lambda s: s.canopy.voxels.leaf, scene, replace_fn=lambda leaf: leaf * share[None, None]
+    )
+
+
+def layered(orders, layers=4, end=100.0, most=None, **given):
+    """A model whose unknowns are leaf by layer, and height and reflectance of the ground; and its start."""
+    voxels = slab(0.4, 0.05, shape=(1, 1, layers))
+    scene = jl.Scene(canopy=jl.Canopy(voxels, leaf=LEAF, bark=0.3), ground=GROUND)
+    given = {"n_photons": 256, "n_rays": 64, **given}
+    plan = jl.plan(TWO, scene, max_orders=orders, window=(-81.0, end), describe=False, **given)
+    plan = dataclasses.replace(plan, limits=plan.limits._replace(max_memory=most))
+    share = {"bounds": (0.5, 2.0), "start": np.ones(layers), "apply": layers_scaled, "name": "layers"}
+    settled = settle(
+        [
+            inversion.Unknown(**share),
+            inversion.Unknown("ground.height", bounds=(-1.0, 1.0)),
+            inversion.Unknown("ground.reflectance", bounds=(0.1, 1.0)),
+        ],
+        scene,
+    )
+    return Model(TWO, scene, plan, settled, KEY), np.concatenate([np.ravel(s.start) for s in settled])
+
+
+def test_columns_of_a_jacobian_are_computed_in_groups_where_memory_is_short():
+    """The same columns, the last group filled up; refused where there is no room for one."""
+    whole, start = layered(1)
+    expected = whole(start)
+    limits = [jacobian_bytes(whole.problem.plan, 1, n) * 1.0001e-9 for n in (2, 1)]
+    model, _ = layered(1, most=limits[0])
+    assert (whole.problem.at_once, model.problem.at_once, expected.jacobian.shape[-1]) == (5, 2, 6)
+    found = model(start)
+    np.testing.assert_allclose(found.jacobian, expected.jacobian, rtol=1e-3, atol=1e-5)
+    np.testing.assert_allclose(found.total, expected.total, rtol=1e-5, atol=1e-8)
+    assert np.abs(found.jacobian).max(axis=(0, 1)).min() > 1e-5
+    assert layered(1, most=limits[1])[0].problem.at_once == 1
+    with pytest.raises(ValueError, match=r"one at a time; admissible is max_memory = .* GB of the plan"):
+        layered(1, most=0.5 * limits[1])
+
+
+def test_groups_are_about_as_large():
+    plan = layered(4)[0].problem.plan
+    for columns, room, expected in ((0, 1, 0), (7, 7, 7), (7, 6, 4), (7, 3, 3), (20, 9, 7)):
+        most = jacobian_bytes(plan, 1, room) * 1.0001e-9
+        limited = dataclasses.replace(plan, limits=plan.limits._replace(max_memory=most))
+        assert columns_at_once(limited, 1, columns) == expected
+
+
+WATCHED = """
 import sys, threading, time
 import jax, numpy as np
 import jaxlidar as jl
@@ -174,6 +226,25 @@ import jaxlidar as jl
 def resident():
     return int(open("/proc/self/statm").read().split()[1]) * 4096
 
+def watched(run):
+    "Bytes that a call takes at its peak, more than before."
+    base, peak, done = resident(), 0, False
+
+    def watch():
+        nonlocal peak
+        while not done:
+            peak = max(peak, resident())
+            time.sleep(0.005)
+
+    watcher = threading.Thread(target=watch)
+    watcher.start()
+    run()
+    done = True
+    watcher.join()
+    return peak - base
+"""
+
+SIMULATED = """
 orders, end, bark = int(sys.argv[1]), float(sys.argv[2]), float(sys.argv[3])
 voxels = jl.VoxelMap.from_extinction(
     leaf=np.full((2, 2, 4), 0.2), bark=np.full((2, 2, 4), bark), voxel_size=2.0, origin=(-2.0, -2.0, 0.0)
@@ -184,21 +255,27 @@ lidar = jl.Lidar(wavelength=np.linspace(500.0, 1600.0, 9))
 given = {"window": (-81.0, end), "max_memory": 15.0}
 jl.simulate(lidar, scene, key=jax.random.key(0), max_orders=2, n_photons=8192, **given)
 plan = jl.plan(lidar, scene, max_orders=orders, **given)
-base, peak, done = resident(), 0, False
-
-def watch():
-    global peak
-    while not done:
-        peak = max(peak, resident())
-        time.sleep(0.005)
-
-watcher = threading.Thread(target=watch)
-watcher.start()
-jl.simulate(lidar, scene, key=jax.random.key(0), plan=plan, n_photons=65536)
-done = True
-watcher.join()
-print(plan.memory, peak - base)
+given = {"key": jax.random.key(0), "plan": plan, "n_photons": 65536}
+print(plan.memory, watched(lambda: jl.simulate(lidar, scene, **given)))
 """
+
+EVALUATED = """
+from inversion.columns import jacobian_bytes
+from test_memory import layered
+
+orders, layers, end = int(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3])
+model, start = layered(orders, layers, end, most=15.0, n_photons=2048)
+model(start)
+assert model.problem.at_once == layers + 1
+print(jacobian_bytes(model.problem.plan, 1, layers + 1), watched(lambda: model(start)))
+"""
+
+
+def predicted_and_measured(program, *given):
+    command = [sys.executable, "-c", WATCHED + program, *map(str, given)]
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
+    done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT, env=environment)
+    return tuple(map(float, done.stdout.split()))
 
 
 @pytest.mark.slow
@@ -206,7 +283,14 @@ print(plan.memory, peak - base)
 @pytest.mark.parametrize(("orders", "end", "bark"), [(9, 500.0, 0.05), (13, 800.0, 0.05)])
 def test_memory_is_as_predicted(orders, end, bark):
     """To 30 %."""
-    command = [sys.executable, "-c", MEASURED, str(orders), str(end), str(bark)]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT)
-    predicted, measured = map(float, done.stdout.split())
+    predicted, measured = predicted_and_measured(SIMULATED, orders, end, bark)
+    assert measured == pytest.approx(predicted, rel=0.3)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="resident memory is read as on Linux")
+@pytest.mark.parametrize(("orders", "layers", "end"), [(9, 3, 800.0), (9, 12, 300.0)])
+def test_memory_of_a_jacobian_is_as_predicted(orders, layers, end):
+    """To 30 %."""
+    predicted, measured = predicted_and_measured(EVALUATED, orders, layers, end)
     assert measured == pytest.approx(predicted, rel=0.3)

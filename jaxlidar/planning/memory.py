@@ -24,6 +24,15 @@ def machine_memory() -> float:
         return 8e9
 
 
+def response_bytes(trace: TracePlan, bins: Bins, degree: int, first_degree: int, traces: int) -> float:
+    """Bytes of a response of `traces` traces, with histories of these degrees."""
+    item = jnp.zeros(()).dtype.itemsize
+    letters, materials = len(trace.letters), len(trace.materials)
+    full = math.comb(degree + letters, letters) if trace.order_steps > 1 or trace.drawn_first else 0
+    short = math.comb(first_degree + letters, letters)
+    return float(item * traces * materials * (full + short) * bins.padded)
+
+
 def predicted(
     trace: TracePlan, bins: Bins, degree: int, first_degree: int, samples: int, pulse: int, traces: int
 ) -> float:
@@ -33,12 +42,8 @@ def predicted(
     that the pulse spans. - `traces`: of a response; one for each wavelength where leaves transmit straight
     on.
     """
-    item = jnp.zeros(()).dtype.itemsize
-    letters, materials = len(trace.letters), len(trace.materials)
-    full = math.comb(degree + letters, letters) if trace.order_steps > 1 or trace.drawn_first else 0
-    short = math.comb(first_degree + letters, letters)
-    response = item * traces * materials * (full + short) * bins.padded
-    matrix = item * min(bins.count * samples, max(DENSE, pulse))
+    response = response_bytes(trace, bins, degree, first_degree, traces)
+    matrix = jnp.zeros(()).dtype.itemsize * min(bins.count * samples, max(DENSE, pulse))
     return response * (_COPIES * (os.cpu_count() or 1) + 1) + 2 * matrix + _COMPILING
 
 

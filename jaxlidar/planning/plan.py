@@ -39,7 +39,8 @@ class Limits(NamedTuple):
     - `finest`: scale (ns) of the finest feature of the pulse.
     - `automatic_orders`, `automatic_window`: whether the plan chose them. - `most_orders`: how many there is
       room for. - `flat`: whether terrain was found to be a plane.
-    - `empty`: which of "leaf" and "bark" were found to be zero everywhere.
+    - `empty`: which of "leaf" and "bark" were found to be zero everywhere. - `max_memory`: as
+      it was given.
     """
 
     first: float
@@ -51,6 +52,7 @@ class Limits(NamedTuple):
     most_orders: int
     flat: bool
     empty: tuple[str, ...]
+    max_memory: float | None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -332,6 +334,7 @@ def plan(
             most,
             flat,
             nothing,
+            max_memory,
         ),
         memory=memory,
         effects=rows,
