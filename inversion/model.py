@@ -179,9 +179,7 @@ class Model:
             # Optics are applied while light is traced.
             places = [place._replace(geometric=True) for place in places]
         moving = sum(s.start.size for s, place in zip(settled, places) if place.geometric)
-        straight = scene.canopy is not None and scene.canopy.is_straight
-        traces = lidar.wavelength.size if straight or not plan.trace.keeps_histories else 1
-        at_once = columns_at_once(plan, traces, moving)
+        at_once = columns_at_once(plan, scene, lidar.wavelength.size, moving)
         self.problem = Problem(lidar, scene, plan, tuple(places), at_once)
         self.shapes = [s.start.shape for s in settled]
         self.dtypes = [s.start.dtype for s in settled]

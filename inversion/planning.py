@@ -13,7 +13,6 @@ from jaxlidar import plan as make_plan
 from jaxlidar.extend import check_integer, check_kind
 from jaxlidar.planning.effects import empty
 from jaxlidar.planning.ladder import rung
-from jaxlidar.planning.orders import degree_of
 from jaxlidar.planning.path_lengths import PathLengths
 from jaxlidar.planning.plan import MIN_BATCHES
 from jaxlidar.planning.plan_check import check_reach
@@ -119,9 +118,7 @@ def plan_for(
         march_steps=rung(max(e.march_steps(last + upstream) for e in extents)),
         full_cover=tuple(all(c) for c in zip(*(p.trace.full_cover for p in plans))),
     )
-    # Histories beyond the last order would be kept for every column of the Jacobian.
-    degree = degree_of(first.orders, len(scene.plates)) if trace.keeps_histories else first.degree
-    return dataclasses.replace(first, trace=trace, bins=bins, degree=degree)
+    return dataclasses.replace(first, trace=trace, bins=bins)
 
 
 def plan_within(

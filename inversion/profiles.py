@@ -20,8 +20,8 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy import special
 
-from jaxlidar import Plane, Scene
-from jaxlidar.extend import check_kind, check_range
+from jaxlidar import Plane, Scene, VoxelMap
+from jaxlidar.extend import check_kind, check_range, concrete
 
 
 def put_profile(scene: Scene, density: Float[Array, " layers"]) -> Scene:
@@ -35,13 +35,13 @@ def put_profile(scene: Scene, density: Float[Array, " layers"]) -> Scene:
     **Arguments:**
 
     - `scene`: with a canopy whose voxel map has leaf and reaches from the lowest ground to the highest
-      plants: what lies outside of it is left out. With a plane as ground, or none: then layers begin at z =
-      0.
+      plants. With a plane as ground, or none: then layers begin at z = 0.
     - `density`: (layers,) leaf area density in m2/m3, from the lowest layer up.
 
     **Returns:** a `Scene`.
 
-    **Raises:** ValueError for a scene without leaf or with a ground that is no plane.
+    **Raises:** ValueError for a scene without leaf or with a ground that is no plane, and for plants that
+    reach out of the voxel map; of values that a JAX transformation is tracing, these are left out.
 
     **Example:** two layers of 2 m on a slope that falls to the east.
 
@@ -78,7 +78,29 @@ def put_profile(scene: Scene, density: Float[Array, " layers"]) -> Scene:
         return layers[jnp.clip(number.astype(int) + 1, 0, layers.size - 1)]
 
     leaf = 0.5 * ((1.0 - share) * at(first) + share * at(first + 1.0))
+    _refuse_plants_outside(voxels, layers, ground, leaf)
     return eqx.tree_at(lambda s: s.canopy.voxels.leaf, scene, leaf)
+
+
+def _refuse_plants_outside(
+    voxels: VoxelMap,
+    layers: Float[Array, "padded"],
+    ground: Float[Array, "nx ny"],
+    leaf: Float[Array, "x y z"],
+) -> None:
+    known = [concrete(a) for a in (layers, ground, leaf, voxels.voxel_size)]
+    if any(a is None for a in known):
+        return
+    density, feet, held, size = (np.asarray(a, float) for a in known)
+    there = np.flatnonzero(density[1:-1])
+    if np.all(2.0 * held.sum(axis=-1) >= 0.999 * density.sum()) or not there.size:
+        return
+    low, high = feet.min() + size[2] * there[0], feet.max() + size[2] * (there[-1] + 1)
+    bottom = float(voxels.origin[2])
+    raise ValueError(
+        f"density has plants from {low:g} m to {high:g} m, but the voxel map reaches from {bottom:g} m to "
+        f"{bottom + size[2] * held.shape[2]:g} m; admissible is a map that holds all of them"
+    )
 
 
 class AveragingKernel(NamedTuple):

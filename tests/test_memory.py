@@ -194,11 +194,17 @@ def layered(orders, layers=4, end=100.0, most=None, **given):
     return Model(TWO, scene, plan, settled, KEY), np.concatenate([np.ravel(s.start) for s in settled])
 
 
+def room_for(model, columns):
+    """GB that so many columns at once need."""
+    problem = model.problem
+    return 1.0001e-9 * jacobian_bytes(problem.plan, problem.scene, TWO.wavelength.size, columns)
+
+
 def test_columns_of_a_jacobian_are_computed_in_groups_where_memory_is_short():
     """The same columns, the last group filled up; refused where there is no room for one."""
     whole, start = layered(1)
     expected = whole(start)
-    limits = [jacobian_bytes(whole.problem.plan, 1, n) * 1.0001e-9 for n in (2, 1)]
+    limits = [room_for(whole, n) for n in (2, 1)]
     model, _ = layered(1, most=limits[0])
     assert (whole.problem.at_once, model.problem.at_once, expected.jacobian.shape[-1]) == (5, 2, 6)
     found = model(start)
@@ -211,11 +217,12 @@ def test_columns_of_a_jacobian_are_computed_in_groups_where_memory_is_short():
 
 
 def test_groups_are_about_as_large():
-    plan = layered(4)[0].problem.plan
+    model = layered(4)[0]
+    plan, scene = model.problem.plan, model.problem.scene
     for columns, room, expected in ((0, 1, 0), (7, 7, 7), (7, 6, 4), (7, 3, 3), (20, 9, 7)):
-        most = jacobian_bytes(plan, 1, room) * 1.0001e-9
-        limited = dataclasses.replace(plan, limits=plan.limits._replace(max_memory=most))
-        assert columns_at_once(limited, 1, columns) == expected
+        limits = plan.limits._replace(max_memory=room_for(model, room))
+        limited = dataclasses.replace(plan, limits=limits)
+        assert columns_at_once(limited, scene, TWO.wavelength.size, columns) == expected
 
 
 WATCHED = """
@@ -260,14 +267,13 @@ print(plan.memory, watched(lambda: jl.simulate(lidar, scene, **given)))
 """
 
 EVALUATED = """
-from inversion.columns import jacobian_bytes
-from test_memory import layered
+from test_memory import layered, room_for
 
 orders, layers, end = int(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3])
 model, start = layered(orders, layers, end, most=15.0, n_photons=2048)
 model(start)
 assert model.problem.at_once == layers + 1
-print(jacobian_bytes(model.problem.plan, 1, layers + 1), watched(lambda: model(start)))
+print(1e9 * room_for(model, layers + 1), watched(lambda: model(start)))
 """
 
 

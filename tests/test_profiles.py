@@ -264,6 +264,12 @@ def test_layers_lie_on_the_ground():
     scene = stand(density)
     with pytest.raises(ValueError, match="no canopy with leaf"):
         inversion.put_profile(jl.Scene(ground=scene.ground), jnp.ones(2))
+    with pytest.raises(ValueError, match="from 0 m to 8 m, but the voxel map reaches from 0 m to 6 m"):
+        inversion.put_profile(scene, jnp.ones(4))
+    # Below the map, too; empty layers may reach out of it.
+    with pytest.raises(ValueError, match=r"from -6\.\d+ m to"):
+        stand(density, slope=20.0, columns=8, below=1)
+    inversion.put_profile(scene, jnp.array([0.1, 0.2, 0.0, 0.0]))
 
 
 def stand_at(slope):
@@ -306,8 +312,8 @@ TRUTH = np.array([0.05, 0.2, 0.1, 0.3, 0.35, 0.1])
 def stands(n, seed=0):
     """Noisy waveforms of a stand at two wavelengths, its noise, and how to fit them."""
     lidar = jl.Lidar(wavelength=(905.0, 1064.0), pulse=jl.GaussianPulse(6.0), divergence=1e-3, altitude=4e5)
-    start = stand(np.full(6, 0.2), ground=np.array([0.3, 0.3]))
-    truth = stand(TRUTH, ground=np.array([0.25, 0.35]))
+    start = stand(np.full(6, 0.2), ground=np.array([0.3, 0.3]), below=1)
+    truth = stand(TRUTH, ground=np.array([0.25, 0.35]), below=1)
     plan = jl.plan(lidar, start, max_orders=1, window=(-100.0, 30.0), n_rays=1)
     wave = jl.simulate(lidar, truth, key=jax.random.key(2), plan=plan)
     sigma = float(np.max(wave.reflectance)) / 100.0

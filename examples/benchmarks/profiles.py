@@ -42,7 +42,8 @@ RAYS, ORDERS = 512, 4
 def stand(density, slope=0.0, height=0.0, soil=SOIL, leaf=LEAF, columns=48) -> jl.Scene:
     """Layers above a slope, 48 m across; level ground needs one column."""
     level = columns == 1
-    below = 2 if level else 12
+    # Room for the lowest and the steepest ground within the bounds.
+    below = 4 if level else 20
     size = (48.0 / columns, 60.0, THICK)
     voxels = jl.VoxelMap.from_lad(
         np.full((columns, 1, LAYERS + 2 * below), 0.1),
