@@ -79,9 +79,9 @@ def write_json(path: Path, record: Mapping[str, object]) -> None:
         draft.write_text(json.dumps(record, indent=2) + "\n")
 
 
-def new_figure(columns: int = 1, size: tuple[float, float] = (6, 4)):
+def new_figure(columns: int = 1, size: tuple[float, float] = (6, 4), rows: int = 1):
     """A figure and its axes."""
-    return plt.subplots(ncols=columns, figsize=size, layout="constrained")
+    return plt.subplots(rows, columns, figsize=size, layout="constrained")
 
 
 def save_figure(figure, path: Path) -> None:

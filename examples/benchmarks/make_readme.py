@@ -359,7 +359,7 @@ SECTIONS: dict[str, tuple[str, Callable[[dict], str]]] = {
     "python_versions": ("Older Pythons", pythons),
     "first_order_march": ("The first order beside a kernel written by hand", march),
     "one_trace_all_wavelengths": ("Many wavelengths from one trace", wavelengths),
-    "jacobian_cost": ("A Jacobian in eight unknowns", jacobian),
+    "jacobian_cost": ("Jacobians of a waveform", jacobian),
     "fit_speed": ("Fits beside scipy", fits),
     "retrieval_coverage": ("How good retrievals are, and how good they say they are", coverage),
     "profiles": ("Vertical profiles beside the closed form", profiles),

@@ -279,7 +279,8 @@ def main() -> None:
 
 def draw(runs: dict, results: list[dict], path: Path) -> None:
     """Waveforms with bands of two standard errors of one repetition, and what 1 % costs."""
-    figure, axes = new_figure(4, (19, 4.5))
+    figure, grid = new_figure(2, (11, 7.5), rows=2)
+    axes = grid.flat
     names = list(dict.fromkeys(r["code"] for r in results))
     colour = {name: f"C{i}" for i, name in enumerate(names)}
     style = dict(zip(names, ("-", "--", "-.", ":")))
@@ -294,17 +295,18 @@ def draw(runs: dict, results: list[dict], path: Path) -> None:
             yscale="log", ylim=(1e-6, 0.1), xlim=(-75, 105), xlabel="time (ns)", title=f"{CASES[case]}, 6 ns"
         )
         ax.legend()
-    axes[0].set_ylabel("apparent reflectance per ns")
-    places = {key: n for n, key in enumerate(runs)}
-    keys = {(CASES[case], pulse): n for (case, pulse), n in places.items()}
+    for ax in (axes[0], axes[2]):
+        ax.set_ylabel("apparent reflectance per ns")
+    keys = {(CASES[case], pulse): n for n, (case, pulse) in enumerate(runs)}
     for name in names:
         own = [r for r in results if r["code"] == name]
-        x = [keys[r["case"], r["pulse"]] for r in own]
-        axes[3].semilogy(x, [r["seconds_to_1_percent"] for r in own], "o", color=colour[name], label=name)
-        axes[3].semilogy(x, [r["cpu_seconds_to_1_percent"] for r in own], "x", color=colour[name])
-    labels = [", ".join(key) for key in keys]
-    axes[3].set_xticks(list(keys.values()), labels, fontsize=8, rotation=30, ha="right")
-    axes[3].set(ylabel="seconds to 1 %: wall (o), CPU (x)", xlim=(-0.5, len(keys) - 0.5))
+        y = [keys[r["case"], r["pulse"]] for r in own]
+        for marker, quantity, label in (("o", "seconds", name), ("x", "cpu_seconds", None)):
+            values = [r[f"{quantity}_to_1_percent"] for r in own]
+            axes[3].semilogx(values, y, marker, color=colour[name], label=label)
+    axes[3].set_yticks(list(keys.values()), [", ".join(key) for key in keys], fontsize=8)
+    axes[3].invert_yaxis()
+    axes[3].set(xlabel="seconds to 1 %: wall (o), CPU (x)", title="what 1 % costs")
     save_figure(figure, path)
 
 

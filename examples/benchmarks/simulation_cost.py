@@ -14,6 +14,8 @@ import numpy as np
 from _common import best, machine, new_figure, options, print_table, race, save_figure, seconds, write_json
 
 import jaxlidar as jl
+from jaxlidar.trace.response import trace_setting
+from jaxlidar.trace.setting import setting_of
 
 TOLERANCES = (0.1, 0.03, 0.01)
 N, SIZE, ORDERS = 64, 10.0, 15
@@ -40,14 +42,16 @@ def scenes() -> dict[str, jl.Scene]:
 def split(scene: jl.Scene, rounds: int) -> dict[str, float]:
     """Seconds of the parts of one batch with the default sizes."""
     plan = jl.plan(LIDAR, scene, max_orders=ORDERS, window=WINDOW)
-    single = jl.plan(LIDAR, scene, max_orders=1, window=WINDOW)
+    single = jl.plan(LIDAR, scene, max_orders=1, window=WINDOW, n_rays=plan.n_rays)
     few = dataclasses.replace(plan, n_rays=1)
     key = jax.random.key(0)
 
     def traced(plan):
-        return eqx.filter_jit(
-            lambda scene, key: jl.trace_scene(jl.reduce(LIDAR, scene, plan), key, reverse=False)
-        )
+        # Without derivatives, as `simulate` does.
+        def trace(scene, key):
+            return trace_setting(setting_of(jl.reduce(LIDAR, scene, plan), derivatives="none"), None, key)
+
+        return eqx.filter_jit(trace)
 
     all_orders, first, higher = traced(plan), traced(single), traced(few)
     colour = eqx.filter_jit(lambda response, scene: jl.total_of(response, jl.reduce(LIDAR, scene, plan)))
