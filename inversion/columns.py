@@ -6,7 +6,6 @@ import jax.numpy as jnp
 
 from jaxlidar import Plan, Scene
 from jaxlidar.planning.memory import in_words, memory_limit, response_bytes
-from jaxlidar.planning.orders import degree_of
 from jaxlidar.planning.plan import MIN_BATCHES
 
 # Tangents of a response that are alive at once, for each column: the sum of photons, and the result.
@@ -22,9 +21,8 @@ def jacobian_bytes(plan: Plan, scene: Scene, wavelengths: int, columns: int) -> 
     """
     cores = min(os.cpu_count() or 1, MIN_BATCHES)
     keeps, straight = plan.trace.keeps_histories, scene.canopy is not None and scene.canopy.is_straight
-    degree = degree_of(plan.orders, len(scene.plates)) if keeps else 0
     traces = wavelengths if straight or not keeps else 1
-    response = response_bytes(plan.trace, plan.bins, degree, plan.first_degree, traces)
+    response = response_bytes(plan.trace, plan.bins, plan.least_degree, plan.first_degree, traces)
     light = plan.n_photons + min(plan.n_rays, _RAYS) * plan.trace.first_steps
     each = _COPIES * response + _NUMBERS * light * jnp.zeros(()).dtype.itemsize
     return (MIN_BATCHES + 1) * response + cores * (response + columns * each)

@@ -1,6 +1,7 @@
 """What does not fit into memory is refused with numbers; long records need no matrix."""
 
 import dataclasses
+import math
 import os
 import subprocess
 import sys
@@ -214,6 +215,20 @@ def test_columns_of_a_jacobian_are_computed_in_groups_where_memory_is_short():
     assert layered(1, most=limits[1])[0].problem.at_once == 1
     with pytest.raises(ValueError, match=r"one at a time; admissible is max_memory = .* GB of the plan"):
         layered(1, most=0.5 * limits[1])
+
+
+def test_derivatives_have_no_histories_beyond_the_last_order():
+    """A plan has room for more, which programs without derivatives share."""
+    scene = jl.Scene(canopy=jl.Canopy(slab(0.4), leaf=LEAF), ground=GROUND)
+    given = {"n_photons": 16, "window": (-81.0, 50.0), "describe": False}
+    plan = jl.plan(TWO, scene, max_orders=9, **given)
+    letters = len(plan.trace.letters)
+    assert 9 == plan.least_degree < plan.degree
+    setup = jl.reduce(TWO, scene, plan)
+    shapes = jax.eval_shape(lambda key: jl.trace_scene(setup, key, reverse=False), KEY)
+    assert shapes.higher.shape[2] == math.comb(9 + letters, letters)
+    # Every flight, and the way back, may pass the plate.
+    assert jl.plan(TWO, jl.Scene(ground=GROUND, plates=plates(1)), max_orders=2, **given).least_degree == 5
 
 
 def test_groups_are_about_as_large():

@@ -38,7 +38,10 @@ class Square(NamedTuple):
 
 
 class Asked(NamedTuple):
-    """How the shots of all squares are traced; `window`: first and last sample time, ns; `truth`: too."""
+    """How the shots of all squares are traced; `window`: first and last sample time, ns.
+
+    `truth`: whether the truth of shots is asked for, too.
+    """
 
     rtol: float | None
     orders: int

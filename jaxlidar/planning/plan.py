@@ -39,8 +39,8 @@ class Limits(NamedTuple):
     - `finest`: scale (ns) of the finest feature of the pulse.
     - `automatic_orders`, `automatic_window`: whether the plan chose them. - `most_orders`: how many there is
       room for. - `flat`: whether terrain was found to be a plane.
-    - `empty`: which of "leaf" and "bark" were found to be zero everywhere. - `max_memory`: as
-      it was given.
+    - `empty`: which of "leaf" and "bark" were found to be zero everywhere.
+    - `max_memory`: as it was given.
     """
 
     first: float
@@ -115,6 +115,12 @@ class Plan:
     def orders(self) -> int:
         """Number of scatterings that are followed."""
         return int(self.trace.orders)
+
+    @property
+    def least_degree(self) -> int:
+        """Longest history of the orders that are followed; `degree` has room for more of them."""
+        plates = len(self.trace.surfaces) - self.trace.has_ground
+        return degree_of(self.orders, plates) if self.trace.keeps_histories else 0
 
     @property
     def is_random(self) -> bool:

@@ -13,7 +13,6 @@ from jaxlidar._programs import Program
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.planning.effects import can_light_itself
 from jaxlidar.planning.ladder import rung
-from jaxlidar.planning.orders import degree_of
 from jaxlidar.planning.sampling import Sampling, sampling_of
 from jaxlidar.planning.scatterers import letter_values
 from jaxlidar.planning.setup import Setup
@@ -88,9 +87,7 @@ def optics_of(setup: Setup) -> Float[Array, "letters wavelengths"]:
 
 def recording_of(setup: Setup) -> Recording:
     """The recording of a setup, for its sizes as they are."""
-    plan = setup.plan
-    degree = degree_of(plan.orders, len(setup.scene.plates)) if plan.trace.keeps_histories else 0
-    return _recording(setup, plan.n_samples, degree)
+    return _recording(setup, setup.plan.n_samples, setup.plan.least_degree)
 
 
 def recording_with_room(setup: Setup) -> Recording:

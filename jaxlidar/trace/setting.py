@@ -13,7 +13,6 @@ from jaxlidar._vectors import Scalar, Vec, vec
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.optics.laws import AbstractLaw, Lambertian
 from jaxlidar.optics.phase import AbstractPhase
-from jaxlidar.planning.orders import degree_of
 from jaxlidar.planning.plan import Plan
 from jaxlidar.planning.scatterers import letter_values
 from jaxlidar.planning.setup import Setup
@@ -150,9 +149,9 @@ def setting_of(setup: Setup, *, derivatives: Derivatives = "all") -> Setting:
     """The setting of a setup, without wavelengths, unless optics are applied while light is traced."""
     trace, bins = jax.tree.map(jnp.asarray, (setup.plan.trace, setup.plan.bins))
     sizes = sizes_of(setup.plan)
-    if derivatives != "none" and trace.keeps_histories:
+    if derivatives != "none":
         # Every derivative has histories of its own: none beyond the last order.
-        sizes = sizes._replace(degree=degree_of(setup.plan.orders, len(setup.scene.plates)))
+        sizes = sizes._replace(degree=setup.plan.least_degree)
     setting = _set_out(_without_spectrum(setup.lidar), setup.scene, trace, bins, sizes)
     setting = dataclasses.replace(setting, derivatives=derivatives)
     if trace.keeps_histories:
