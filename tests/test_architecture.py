@@ -82,6 +82,7 @@ ORDER = {
         "random_numbers",
         "march",
         "photons",
+        "viewing",
         "setting",
         "labels",
         "nodes",
@@ -96,6 +97,7 @@ ORDER = {
         "response",
         "colouring",
         "node_response",
+        "viewed_response",
     ],
     "campaign": [
         "progress",
@@ -103,6 +105,7 @@ ORDER = {
         "coverage",
         "irradiance",
         "tiles",
+        "views",
         "shots",
         "shared",
         "sharing",

@@ -83,6 +83,22 @@ def top_hats(count):
     return nadir(count, profile="top-hat")
 
 
+def limited(count):
+    """A field of view as wide as the footprints, which have an edge."""
+    return nadir(count, profile="top-hat", field_of_view=0.5)
+
+
+def leaning(count, **changes):
+    """The same direction for all, from so far that rays are parallel."""
+    survey = nadir(count, **changes)
+    return jl.Survey(survey.lidar, survey.position, 20.0, 30.0)
+
+
+def leaning_and_limited(count):
+    """In one direction, with a field of view narrower than the beam."""
+    return leaning(count, field_of_view=0.4)
+
+
 @pytest.mark.parametrize("shots", [6, pytest.param(50, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     ("kind", "shared"),
@@ -90,6 +106,9 @@ def top_hats(count):
         (nadir, True),
         pytest.param(nadir, False, marks=pytest.mark.slow),
         pytest.param(top_hats, True, marks=pytest.mark.slow),
+        pytest.param(limited, True, marks=pytest.mark.slow),
+        pytest.param(leaning, True, marks=pytest.mark.slow),
+        (leaning_and_limited, True),
         pytest.param(scan, False, marks=pytest.mark.slow),
     ],
 )

@@ -2,10 +2,23 @@
 
 import numpy as np
 import pytest
-from test_campaign import FAST, KEY, Dying, Stopped, agree, deviations, lidar, nadir, one_by_one, same, stand
+from test_campaign import (
+    FAST,
+    KEY,
+    Dying,
+    Stopped,
+    agree,
+    deviations,
+    leaning,
+    lidar,
+    nadir,
+    one_by_one,
+    same,
+    stand,
+)
 
 import jaxlidar as jl
-from jaxlidar.campaign.irradiance import misplaced, patches
+from jaxlidar.campaign.irradiance import Section, misplaced, patches, section_of
 
 
 def ridges():
@@ -15,9 +28,10 @@ def ridges():
 
 
 @pytest.mark.slow
-def test_shared_light_over_terrain_below_plates_and_air():
+@pytest.mark.parametrize("kind", [nadir, leaning], ids=["by node", "by shot"])
+def test_shared_light_over_terrain_below_plates_and_air(kind):
     """All that photons can meet, at two wavelengths, and where all light goes."""
-    survey = nadir(4, wavelength=(532.0, 1064.0))
+    survey = kind(4, wavelength=(532.0, 1064.0))
     leaf = jl.LeafOptics(np.array([0.1, 0.45]), np.array([0.1, 0.25]))
     plate = jl.Plate(16.0, 0.2, 0.5, coverage=0.5)
     canopy = jl.Canopy(stand().canopy.voxels, leaf=leaf)
@@ -39,14 +53,16 @@ def test_shared_light_over_terrain_below_plates_and_air():
 
 
 def test_footprints_are_splines():
-    for gaussian, largest in ((True, 2e-4), (False, 0.03)):
-        errors = [misplaced(np.array([0.3, -0.2]), 1.0, spacing, gaussian) for spacing in (1.0, 0.35)]
+    axis = (0.3, 0.4, -(0.75**0.5))
+    beams = [Section(1.0, gaussian, *way) for gaussian in (True, False) for way in ((), (axis,))]
+    for beam, largest in zip(beams, (2e-4, 2e-4, 0.03, 0.03)):
+        errors = [misplaced(np.array([0.3, -0.2]), beam, spacing) for spacing in (1.0, 0.35)]
         assert errors[1] < largest < errors[0]
     survey = nadir(8)
     found = patches(survey, 0.01)
     assert np.allclose(found.coefficients.sum(axis=(1, 2)), 1.0, atol=1e-5)
     # What they put elsewhere is known by place.
-    off = [misplaced(p, float(survey.footprint_radius[0]), found.spacing, True) for p in survey.position]
+    off = [misplaced(p, section_of(survey), found.spacing) for p in survey.position]
     assert np.allclose(np.sqrt((found.astray**2).sum(axis=(1, 2))), off, rtol=1e-4)
     # Their means are where the beams aim.
     number = np.arange(found.coefficients.shape[1])
@@ -70,8 +86,7 @@ STRAIGHT = {"transmission": "straight"}
 @pytest.mark.parametrize(
     ("survey", "scene", "reason"),
     [
-        (jl.Survey(lidar(), [(0, 0)] * 2, 10.0), stand(), "zenith = 10, and light is shared straight down"),
-        (nadir(2, field_of_view=0.4), stand(), "the lidar has a field of view"),
+        (jl.Survey(lidar(), [(0, 0)] * 2, [0.0, 10.0]), stand(), "shots have more than one direction"),
         (nadir(2, altitude=100.0), stand(), "light that is not parallel changes up to .* %"),
         (nadir(2), stand(ground=MIRROR), "a surface is a mirror"),
         (nadir(2), stand(**STRAIGHT), "transmission = 'straight'"),
@@ -81,6 +96,12 @@ STRAIGHT = {"transmission": "straight"}
 def test_light_that_cannot_be_shared(survey, scene, reason):
     with pytest.raises(ValueError, match=f"shared = True, but .*{reason}"):
         jl.simulate_many(survey, scene, key=KEY, rtol=0.05, shared=True)
+
+
+@pytest.mark.parametrize("survey", [nadir(2, field_of_view=0.4), leaning(2)])
+def test_shots_that_lean_or_have_a_field_of_view_do_not_share_order_one(survey):
+    with pytest.raises(ValueError, match="shared = True, but one order is followed"):
+        jl.simulate_many(survey, stand(), key=KEY, rtol=0.05, max_orders=1, shared=True)
 
 
 @pytest.mark.slow
@@ -114,8 +135,11 @@ def test_plans_of_surveys_bound_what_parallel_light_changes():
         effect.name: effect for effect in jl.plan(nadir(3, altitude=4e5, divergence=0.025), stand()).effects
     }
     assert far["spreading of rays"].bound < row.bound / 10
-    leaning = jl.plan(jl.Survey(lidar(), [(0, 0)] * 2, 10.0), stand())
-    assert "spreading of rays" not in {effect.name for effect in leaning.effects}
+    limited = jl.plan(nadir(3, field_of_view=0.5), stand())
+    wider = {effect.name: effect for effect in limited.effects}["spreading of rays"].bound
+    assert row.bound + 1.9 * 13.0 / 2e4 < wider < 0.01
+    spread = jl.plan(jl.Survey(lidar(), [(0, 0)] * 2, [0.0, 10.0]), stand())
+    assert "spreading of rays" not in {effect.name for effect in spread.effects}
 
 
 def test_a_grid_that_is_too_coarse_is_no_answer():

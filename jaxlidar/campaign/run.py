@@ -48,11 +48,13 @@ def simulate_many(
 
     One program is compiled for all of them, in one of two ways:
 
-    - Shots that look straight down share light where their footprints overlap. Parallel light falls on all
-      that they cover, is traced once, and is told apart by where it entered; every footprint is a weighted
-      sum. What light that is not parallel would change is bounded (`info["parallel light"]`), and the grid on
-      which light is told apart is part of the standard errors. These are those of each shot: errors of
-      neighbours are correlated.
+    - Shots of one direction share light where their footprints overlap. Parallel light falls on all that they
+      cover and is traced once. Straight down, without a field of view, it is told apart by where it entered:
+      every footprint is a weighted sum, and the grid on which light is told apart is part of the standard
+      errors. Otherwise every shot has its part of each path, exactly: by its own beam where the path enters,
+      and its own field of view where it ends. That takes longer, and order one is each shot's own. What
+      light that is not parallel would change is bounded (`info["parallel light"]`). Standard errors are those
+      of each shot: errors of neighbours are correlated.
     - All others are traced one by one. A shot costs the same over a map of any size: what the map itself
       costs is computed once for many shots. Its waveform does not depend on the other shots.
 

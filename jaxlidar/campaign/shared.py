@@ -20,14 +20,26 @@ from jaxlidar._statistics import relative_error, widening
 from jaxlidar._threads import ONE_CORE
 from jaxlidar.campaign.records import BatchMoments, Record, record_of_shot
 from jaxlidar.campaign.tiles import Tile
+from jaxlidar.campaign.views import Views
 from jaxlidar.planning.plan import MIN_BATCHES
 from jaxlidar.planning.setup import Setup
-from jaxlidar.trace.colouring import Recording, Shares, balance_of, components, recording_of, shares_of, total
+from jaxlidar.trace.colouring import (
+    Recording,
+    Shares,
+    balance_of,
+    components,
+    recording_of,
+    samples_of,
+    shares_of,
+    total,
+)
 from jaxlidar.trace.footprint import parallel_beam
 from jaxlidar.trace.node_response import trace_nodes, without_histories
 from jaxlidar.trace.nodes import Nodes
 from jaxlidar.trace.response import Response
 from jaxlidar.trace.setting import Setting, aimed, setting_of
+from jaxlidar.trace.viewed_response import order_one, trace_viewed
+from jaxlidar.trace.viewing import Viewing
 
 # Batches of one tile at most: a tolerance that is out of reach ends here.
 MOST_BATCHES = 1024
@@ -35,26 +47,40 @@ MOST_BATCHES = 1024
 TOGETHER = 256
 # Footprints of which a tile has less than this share are not waited for.
 _SMALL = 1e-3
+# Ends of a flight, and fewest rays of a batch, where each shot has its own part of paths.
+_VIEWED_ENDS, _FEWEST_RAYS = 2, 64
+# Share of the squared error that order one may have where it is traced for each shot alone.
+_OF_ORDER_ONE = 0.25
 
 
 class Ready(NamedTuple):
-    """What tiles have in common. `recording` is without histories, and without what the `air` returns."""
+    """What tiles have in common. `recording` is without histories, and without what the `air` returns.
+
+    `views`: how shots see what they share; None where they see all of it, straight down.
+    """
 
     setting: Setting
     recording: Recording
     air: Any
     spacing: float
+    views: Views | None
 
 
-def ready_for(setup: Setup, spacing: float) -> Ready:
+def ready_for(setup: Setup, spacing: float, views: Views | None) -> Ready:
     """What all tiles over a grid of that spacing have in common."""
     recording = recording_of(setup)
     without_air = dataclasses.replace(without_histories(recording), air=None)
-    return Ready(setting_of(setup, derivatives="none"), without_air, recording.air, spacing)
+    if views is not None:
+        trace = setup.plan.trace
+        # Each end of a flight costs a deposit for every shot that may see it.
+        trace = dataclasses.replace(trace, last=trace.last + views.slack, ends=min(trace.ends, _VIEWED_ENDS))
+        plan = dataclasses.replace(setup.plan, trace=trace, n_rays=max(setup.plan.n_rays // 4, _FEWEST_RAYS))
+        setup = dataclasses.replace(setup, plan=plan)
+    return Ready(setting_of(setup, derivatives="none"), without_air, recording.air, spacing, views)
 
 
 class Sums(NamedTuple):
-    """Of nodes, in one batch: what errors are wanted of, and the responses.
+    """Of nodes, or of shots that see what is shared, in one batch: what errors are wanted of, and responses.
 
     - `total`: (nodes, wavelengths, samples), all materials together. - `fates`:
       `jaxlidar.trace.colouring.Shares` of each, as a dict.
@@ -100,7 +126,10 @@ def _of_nodes(setting: Setting, nodes: Nodes, recording: Recording, key: PRNGKey
             together = dataclasses.replace(response, first=response.first + response.higher, higher=None)
         return total(together, recording), shares_of(response, recording)._asdict()
 
-    response = trace_nodes(setting, nodes, key)
+    if setting.viewing is None:
+        response = trace_nodes(setting, nodes, key)
+    else:
+        response = trace_viewed(setting, recording.lidar, nodes, key)
     return Sums(*jax.vmap(of_one)(response), response)
 
 
@@ -114,15 +143,14 @@ def _batches(
     setting: Setting,
     recording: Recording,
     nodes: Nodes,
+    viewing: Viewing | None,
     aim: Float[Array, "2"],
     key: PRNGKeyArray,
     first: Int[Array, ""],
     count: Int[Array, ""],
 ) -> tuple[BatchMoments, Array]:
     """Moments of `count` batches from number `first` on, and their mean lines."""
-    lidar = recording.lidar
-    setting = aimed(setting, lidar, aim - lidar.position)
-    setting = dataclasses.replace(setting, beam=parallel_beam(lidar), optics=recording.optics)
+    setting = _over(setting, recording, viewing, aim)
 
     def batch(n: Array) -> Sums:
         return _of_nodes(setting, nodes, recording, jax.random.fold_in(key, first + n))
@@ -141,6 +169,61 @@ def _batches(
 _several = Program(_batches, **ONE_CORE)
 
 
+def _over(setting: Setting, recording: Recording, viewing: Viewing | None, aim: Float[Array, "2"]) -> Setting:
+    """The setting of a tile: parallel light, and optics."""
+    lidar = recording.lidar
+    setting = aimed(setting, lidar, aim - lidar.position)
+    beam = parallel_beam(lidar)
+    return dataclasses.replace(setting, beam=beam, optics=recording.optics, viewing=viewing)
+
+
+def _orders_one(
+    setting: Setting, recording: Recording, viewing: Viewing, aim: Float[Array, "2"], key: PRNGKeyArray
+) -> Float[Array, "shots wavelengths samples"]:
+    """Samples of order one, from few rays, of all shots of a tile."""
+    setting = _over(setting, recording, viewing, aim)
+    first = order_one(setting, recording.lidar, jnp.arange(viewing.shots - 1), key)
+    return jax.vmap(lambda w: samples_of(jnp.sum(w, axis=1), recording.short, recording))(first.weights)
+
+
+_rough = Program(_orders_one, **ONE_CORE)
+
+
+class _Wanted(NamedTuple):
+    """What the error of a tile is measured by, for the shots that are waited for.
+
+    - `part`: as what is traced is summed. - `share`: of their light. - `may_err`: of their squared error.
+    - `elsewhere`: samples of order one that count here and are traced elsewhere, or the other way round.
+    """
+
+    part: Float[np.ndarray, "shots nodes"]
+    share: Float[np.ndarray, " shots"]
+    may_err: Float[np.ndarray, " shots"]
+    elsewhere: Float[np.ndarray, "shots wavelengths samples"] | float
+
+    def worst(self, found: _Batches) -> float:
+        """The largest relative error, by what may be."""
+        mean = np.maximum(_summed(self.part, found.moments.mean[0]) + self.elsewhere, 0.0)
+        error = np.sqrt(_variance(self.part, found.moments.squares[0], found.count))
+        ratio = relative_error(mean, error) * self.share / np.sqrt(self.may_err)
+        return float(np.max(ratio, initial=0.0))
+
+
+def _wanted(
+    ready: Ready, tile: Tile, part: Float[np.ndarray, "shots nodes"], viewing: Viewing | None, key: Array
+) -> _Wanted:
+    share = tile.part.sum(axis=1)
+    waited = share > _SMALL
+    share, home = share[waited], tile.home[waited]
+    if viewing is None:
+        return _Wanted(part[waited], share, share, 0.0)
+    first = _rough(ready.setting, ready.recording, viewing, jnp.asarray(tile.aim, float), key)
+    # Order one belongs to one tile, but counts by share.
+    elsewhere = (share - home)[:, None, None] * np.asarray(first)[: len(tile.shots)][waited]
+    may_err = _OF_ORDER_ONE * home + (1.0 - _OF_ORDER_ONE) * share
+    return _Wanted(part[waited], share, may_err, elsewhere)
+
+
 def trace_tile(ready: Ready, tile: Tile, number: int, rtol: float, key: PRNGKeyArray) -> Part:
     """What a tile adds to its shots, traced until its error is below the tolerance for all of them.
 
@@ -156,34 +239,37 @@ def trace_tile(ready: Ready, tile: Tile, number: int, rtol: float, key: PRNGKeyA
             for a, k in zip(of, (jnp.int32, jnp.int32, float))
         ),
     )
-    key = jax.random.fold_in(key, number)
+    key, views, viewing, part = jax.random.fold_in(key, number), ready.views, None, tile.part
+    if views is not None:
+        viewing = views.at(tile, ready.spacing)
+        # What is traced is the shots' already.
+        part = np.eye(len(tile.shots), views.shots, dtype=np.float32)
 
     def more(first: int, count: int) -> _Batches:
         sizes = jnp.asarray(first, jnp.int32), jnp.asarray(count, jnp.int32)
         aim = jnp.asarray(tile.aim, float)
-        given = (ready.setting, ready.recording, nodes, aim, key, *sizes)
+        given = (ready.setting, ready.recording, nodes, viewing, aim, key, *sizes)
         return _Batches(count, *jax.tree.map(np.asarray, _several(*given)))
 
-    share = tile.part.sum(axis=1)
-    waited = share > _SMALL
+    wanted = _wanted(ready, tile, part, viewing, key)
     found = more(0, MIN_BATCHES)
     while found.count < MOST_BATCHES:
-        mean = _summed(tile.part[waited], found.moments.mean[0])
-        error = np.sqrt(_variance(tile.part[waited], found.moments.squares[0], found.count))
-        worst = float(np.max(relative_error(mean, error) * np.sqrt(share[waited]), initial=0.0)) / rtol
+        worst = wanted.worst(found) / rtol
         if worst <= 1.0:
             break
-        wanted = int(np.ceil(1.05 * found.count * min(worst, 3.0) ** 2))
-        found = found.joined(more(found.count, min(max(wanted - found.count, 2), MOST_BATCHES - found.count)))
+        # Of few batches, the worst of many errors is too large: no long steps.
+        count = int(np.ceil(1.05 * found.count * min(worst, 1.4) ** 2))
+        found = found.joined(more(found.count, min(max(count - found.count, 2), MOST_BATCHES - found.count)))
     lit = np.abs(tile.part) > 0
     per_node = np.bincount(tile.photons.node, minlength=tile.part.shape[1])
-    variance, fates_variance = (_variance(tile.part, a, found.count) for a in found.moments.squares)
-    # Light that is put elsewhere about a node is an error as large as what the node returns of it.
-    variance = variance + _summed(tile.astray**2, found.moments.mean[0] ** 2)
+    variance, fates_variance = (_variance(part, a, found.count) for a in found.moments.squares)
+    if views is None:
+        # Light that is put elsewhere about a node is an error as large as what the node returns of it.
+        variance = variance + _summed(tile.astray**2, found.moments.mean[0] ** 2)
     return Part(
         tile.shots,
-        _summed(tile.part, found.lines),
-        _summed(tile.part, found.moments.mean[1]),
+        _summed(part, found.lines),
+        _summed(part, found.moments.mean[1]),
         variance,
         fates_variance,
         (lit @ per_node) * found.count,

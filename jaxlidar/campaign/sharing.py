@@ -8,9 +8,10 @@ from jaxlidar._checks import known_number
 from jaxlidar._summary import percent
 from jaxlidar.campaign.irradiance import Patches, patches
 from jaxlidar.campaign.tiles import Lit, Tile, lit, tiles
+from jaxlidar.campaign.views import Views
 from jaxlidar.instrument.survey import Survey
 from jaxlidar.optics.laws import AbstractMirror
-from jaxlidar.planning.parallel_light import parallel_light
+from jaxlidar.planning.parallel_light import one_direction, parallel_light
 from jaxlidar.planning.setup import Setup
 
 # Shares of the tolerance that parallel light and the grid of nodes may take.
@@ -22,6 +23,8 @@ _FAINT = 0.01
 # A shot of its own has so many times the photons in a batch, and the rays: here batches are many and small.
 # Rays cost about as much as photons, and so few of them have a small part in the error.
 _FEWER, _FEWER_RAYS = 4.0, 2.0
+# Where shots see light each in its own way, a batch costs something for each of them.
+_FEWER_VIEWED = 1.0
 # Sharing pays where so many footprints overlap in the mean, and shots are so many.
 _OVERLAP, _FEWEST = 1.3, 4
 
@@ -30,11 +33,13 @@ class Sharing(NamedTuple):
     """Tiles of nodes that take the place of shots.
 
     - `spacing`: of the nodes, m.
+    - `views`: how shots see the light of others; None where they see all of it, straight down.
     - `parallel`: bound on what parallel light changes, see `jaxlidar.planning.parallel_light`.
     """
 
     tiles: list[Tile]
     spacing: float
+    views: Views | None
     parallel: float
 
 
@@ -65,27 +70,34 @@ def sharing(survey: Survey, setup: Setup, rtol: float, asked: bool | None) -> Sh
     nodes = lit(found, _FAINT * rtol)
     if asked is None and nodes.overlap < _OVERLAP:
         return None
-    return Sharing(_tiles(found, nodes, setup), found.spacing, _parallel(survey, setup))
+    of_nodes = _tiles(found, nodes, setup, _FEWER_VIEWED if _has_views(survey) else _FEWER)
+    views = Views.of(survey, of_nodes, found.spacing) if _has_views(survey) else None
+    return Sharing(of_nodes, found.spacing, views, _parallel(survey, setup))
+
+
+def _has_views(survey: Survey) -> bool:
+    """Whether shots see light each in its own way."""
+    return survey.lidar.field_of_view is not None or bool(np.any(survey.zenith > 0))
 
 
 def _parallel(survey: Survey, setup: Setup) -> float:
     return parallel_light(survey, setup.plan.trace.upstream, setup.plan.limits.last)
 
 
-def _tiles(found: Patches, nodes: Lit, setup: Setup) -> list[Tile]:
+def _tiles(found: Patches, nodes: Lit, setup: Setup, fewer: float) -> list[Tile]:
     plan = setup.plan
     whole = float(nodes.light.sum()) * nodes.overlap / len(found.first)
-    photons = plan.n_photons / _FEWER / whole if plan.orders > 1 else 0.0
+    photons = plan.n_photons / fewer / whole if plan.orders > 1 else 0.0
     return tiles(found, nodes, photons, plan.n_rays / _FEWER_RAYS / whole)
 
 
 def why_apart(survey: Survey, setup: Setup, rtol: float) -> str | None:
     """Why the shots of a survey cannot share light; None where they can."""
     canopy, lidar = setup.scene.canopy, setup.lidar
-    if np.any(survey.zenith > 0):
-        return f"zenith = {float(survey.zenith.max()):g}, and light is shared straight down alone"
-    if lidar.field_of_view is not None:
-        return "the lidar has a field of view, which is another for every footprint"
+    if not one_direction(survey):
+        return "shots have more than one direction"
+    if _has_views(survey) and setup.plan.orders == 1:
+        return "one order is followed, which shots that lean or have a field of view do not share"
     if not setup.plan.is_random:
         return "nothing is random"
     if known_number(lidar.divergence) == 0:

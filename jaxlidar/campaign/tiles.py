@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxlidar.campaign.irradiance import Patches
 from jaxlidar.planning.ladder import rung
@@ -28,6 +28,7 @@ class Tile(NamedTuple):
     - `photons`, `rays`: node, turn and share of each, as in `jaxlidar.trace.nodes.Nodes`.
     - `shots`: numbers of the footprints that have part in it. - `part`: (shots, nodes) coefficients.
     - `astray`: (shots, nodes) energy that is put elsewhere about the nodes.
+    - `home`: (shots,) whether the node next to the middle of the footprint is in it.
     """
 
     aim: Float[np.ndarray, "2"]
@@ -37,6 +38,7 @@ class Tile(NamedTuple):
     shots: Int[np.ndarray, " shots"]
     part: Float[np.ndarray, "shots nodes"]
     astray: Float[np.ndarray, "shots nodes"]
+    home: Bool[np.ndarray, " shots"]
 
 
 class Lit(NamedTuple):
@@ -120,6 +122,7 @@ def _tile(found: Patches, nodes: Lit, group: Int[np.ndarray, " nodes"], most: in
         shots=shots,
         part=np.pad(part, ((0, 0), (0, spare))),
         astray=np.pad(astray, ((0, 0), (0, spare))),
+        home=_home(found, shots, number),
     )
 
 
@@ -134,6 +137,14 @@ def _shared_out(light: Float[np.ndarray, " nodes"], things: int) -> SharedOut:
     node = np.repeat(np.arange(len(light)), count)
     turn = np.arange(things) - np.repeat(np.cumsum(count) - count, count)
     return SharedOut(node, turn, 1.0 / count[node])
+
+
+def _home(
+    found: Patches, shots: Int[np.ndarray, " shots"], number: Int[np.ndarray, "nodes 2"]
+) -> Bool[np.ndarray, " shots"]:
+    """Whether the middle nodes of patches are among the nodes."""
+    middle = found.first[shots] + found.coefficients.shape[1] // 2
+    return np.any(np.all(middle[:, None, :] == number[None, :, :], axis=2), axis=1)
 
 
 def _parts(

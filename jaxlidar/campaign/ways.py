@@ -105,7 +105,7 @@ class SharedLight(AbstractWay):
     @functools.cached_property
     def ready(self) -> Ready:
         """What all tiles have in common."""
-        return ready_for(self.setup, self.sharing.spacing)
+        return ready_for(self.setup, self.sharing.spacing, self.sharing.views)
 
     def tasks(self, key: PRNGKeyArray) -> list[Task]:
         return [

@@ -2,17 +2,20 @@
 
 import math
 
+import numpy as np
+
 from jaxlidar._checks import known_number
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar.instrument.survey import Survey
 
 
 def parallel_light(survey: Survey, upstream: float, last: float) -> float:
-    """Bound on the share of samples that parallel light changes, for shots that look straight down.
+    """Bound on the share of samples that parallel light changes, for shots of one direction.
 
-    At the height h above the reference plane a footprint of the radius w is narrower by the share h / R. A
-    Gaussian so changed has 2 / e of that share elsewhere on either side, 1.5 h / R in all. Light at the rim
-    arrives later than the mean, which is kept, by w^2 / (2 R), and inclined by w / R.
+    At the height h above the reference plane, along the beam, a footprint of the radius w is narrower by the
+    share h / R. A Gaussian so changed has 2 / e of that share elsewhere on either side, 1.5 h / R in all. The
+    area of a field of view changes by 2 h / R. Light at the rim arrives later than the mean, which is kept,
+    by w^2 / (2 R), and inclined by w / R.
 
     **Arguments:** `upstream`: where rays start, m above the reference plane. `last`: time of the last return
     of order one, ns.
@@ -23,4 +26,10 @@ def parallel_light(survey: Survey, upstream: float, last: float) -> float:
     interval = known_number(lidar.sampling_interval) / math.sqrt(12.0)
     lasts = math.hypot(known_number(lidar.pulse.std), known_number(lidar.jitter), interval)
     late = 0.5 * radius**2 / distance / SPEED_OF_LIGHT / lasts
-    return min(1.5 * height / distance + late + radius / distance, 1.0)
+    narrower = 1.5 if lidar.field_of_view is None else 3.5
+    return min(narrower * height / distance + late + radius / distance, 1.0)
+
+
+def one_direction(survey: Survey) -> bool:
+    """Whether all beams are parallel."""
+    return bool(np.ptp(survey.direction, axis=0).max() < 1e-9)

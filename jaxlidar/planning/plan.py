@@ -17,7 +17,7 @@ from jaxlidar.planning.ladder import rung
 from jaxlidar.planning.local_origin import about_aim
 from jaxlidar.planning.memory import check_memory, in_words, keeps_histories, memory_limit, predicted
 from jaxlidar.planning.orders import degree_of, order_steps, orders_of, tail_of
-from jaxlidar.planning.parallel_light import parallel_light
+from jaxlidar.planning.parallel_light import one_direction, parallel_light
 from jaxlidar.planning.path_lengths import PathLengths, stretch
 from jaxlidar.planning.rims import check_on_terrain
 from jaxlidar.planning.scatterers import largest_albedo, lobe_probability, scene_optics, spell
@@ -308,7 +308,7 @@ def plan(
     rows = ()
     if describe:
         rows = effect_table(*whole, off, chosen, airy, geometry.upstream, whole_first=window is None)
-        if survey is not None and geometry.vertical:
+        if survey is not None and one_direction(survey):
             bound = parallel_light(survey, geometry.upstream, geometry.last / SPEED_OF_LIGHT)
             reason = "neglected where footprints share light"
             rows += (Effect("spreading of rays", False, reason, bound, "samples"),)

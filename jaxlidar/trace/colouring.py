@@ -171,7 +171,7 @@ def colour(
     return jnp.einsum("hw,w...hc->...wc", table.monomials(optics), weights)
 
 
-def _seen(
+def samples_of(
     weights: Float[Array, "traces *rest histories bins"], table: Histories, recording: Recording
 ) -> Float[Array, "*rest wavelengths samples"]:
     """Samples by wavelength of weights by history and fine bin: optics, atmosphere, pulse."""
@@ -193,16 +193,16 @@ def total(response: Response, recording: Recording) -> Float[Array, "wavelengths
     found = jnp.zeros(())
     for table, part in zip((recording.short, recording.table), (response.first, response.higher)):
         if part is not None:
-            found = found + _seen(jnp.sum(part, axis=1), table, recording)
+            found = found + samples_of(jnp.sum(part, axis=1), table, recording)
     return recording.admissible * (found if recording.air is None else found + recording.air)
 
 
 def components(response: Response, recording: Recording) -> dict[str, Float[Array, "wavelengths samples"]]:
     """Apparent reflectance per sample, by material of the last scattering and by order."""
-    first = _seen(response.first, recording.short, recording)
+    first = samples_of(response.first, recording.short, recording)
     higher = jnp.zeros_like(first)
     if response.higher is not None:
-        higher = _seen(response.higher, recording.table, recording)
+        higher = samples_of(response.higher, recording.table, recording)
     lines = jnp.concatenate([first + higher, jnp.sum(first, 0)[None], jnp.sum(higher, 0)[None]])
     found = dict(zip([*recording.materials, "first", "higher"], recording.admissible * lines))
     if recording.air is not None:

@@ -51,11 +51,11 @@ class HigherOrders(eqx.Module):
     """Response of orders two and above, and the fate of all light (see `jaxlidar.trace.response`).
 
     The last axis but bins is that of histories; or, where optics are applied, of wavelengths, with `Nodes` of
-    nodes and wavelengths.
+    nodes and wavelengths; `weights` and `outside` of shots and wavelengths, where shots see it (`Viewing`).
     """
 
-    weights: Float[Array, "materials labels bins"]
-    outside: Float[Array, "materials labels"]
+    weights: Float[Array, "materials seen bins"]
+    outside: Float[Array, "materials seen"]
     arrived: Float[Array, "materials labels"]
     left: Float[Array, "materials labels"]
     escaped: Float[Array, "labels"]
@@ -85,6 +85,7 @@ def higher_orders(setting: Setting, key: PRNGKeyArray, nodes: Nodes | None = Non
     materials = len(plan.materials)
     colours = 0 if setting.optics is None else setting.optics.shape[1]
     count = setting.table.count if not colours else colours * (1 if nodes is None else len(nodes.place))
+    seen = count if setting.viewing is None else colours * setting.viewing.shots
     terrain = sees_terrain(setting)
 
     def begin(lane):
@@ -156,8 +157,8 @@ def higher_orders(setting: Setting, key: PRNGKeyArray, nodes: Nodes | None = Non
         return jax.tree.map(jnp.add, total, tally), None
 
     zero = HigherOrders(
-        jnp.zeros((materials, count, bins.padded)),
-        jnp.zeros((materials, count)),
+        jnp.zeros((materials, seen, bins.padded)),
+        jnp.zeros((materials, seen)),
         jnp.zeros((materials, count)),
         jnp.zeros((materials, count)),
         jnp.zeros((count,)),
@@ -251,7 +252,16 @@ def _one_order(setting: Setting, p: Photons, tally: HigherOrders, draw: Draw, or
     weight = weight * hit.ratio * hit.onward
     tally = _leave(tally, hit.material, label, weight)
     onward = Photons(
-        x, hit.w, p.path + flown, weight, label.number, hit.on, hit.sent, flight.event, label.tints
+        x,
+        hit.w,
+        p.path + flown,
+        weight,
+        label.number,
+        hit.on,
+        hit.sent,
+        flight.event,
+        label.tints,
+        label.entry,
     )
     return onward, tally
 
@@ -343,12 +353,19 @@ def _deposit(
     pairs = [(hit.reflected, reflected)]
     if transmitted is not None:
         pairs.append((hit.transmitted, transmitted))
+    shots, material = None, hit.material
+    if setting.viewing is not None:
+        assert label.entry is not None
+        # One row for each shot that may see it.
+        shots, part, later = lax.optimization_barrier(setting.viewing.parts(beam.axis, label.entry, x))
+        time, value, material = time[:, None] + later, value[:, None] * part, material[:, None]
     first, row = lax.optimization_barrier(instant_row(setting.bins, time, value))
     for letter, factor in pairs:
         factor = jnp.where(letter >= 0, factor, 0.0)
-        for slot, tint in label.grown(setting, letter).slots():
-            slot = hit.material * tally.weights.shape[1] + slot
+        for slot, tint in label.grown(setting, letter).slots(shots):
+            slot = material * tally.weights.shape[1] + slot
             # Fused into the rows, it would be computed again for each of their bins.
             left = lax.optimization_barrier(factor if tint is None else factor * tint)
-            response = scatter_rows(response, slot, first, row * left[:, None])
+            left = left.reshape(left.shape + (1,) * (row.ndim - 1))
+            response = scatter_rows(response, slot, first, row * left)
     return eqx.tree_at(lambda t: t.weights, tally, response.reshape(tally.weights.shape))

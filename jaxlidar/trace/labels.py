@@ -5,6 +5,8 @@ at which light entered the scene, histories times places would be too many: ther
 scattering, for each wavelength.
 """
 
+from collections.abc import Iterable
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -19,26 +21,28 @@ class Label(eqx.Module):
 
     - `number`: of the history, or of the place of entry.
     - `tints`: for each wavelength, what optics have left of the weight; () where histories keep optics.
+    - `entry`: where light entered, x and y, m from the aim point; None where no shots share it.
     """
 
     number: Int[Array, "*photons"]
     tints: tuple[Float[Array, "*photons"], ...]
+    entry: tuple[Float[Array, "*photons"], Float[Array, "*photons"]] | None = None
 
     @staticmethod
     def of(p: Photons) -> "Label":
         """The label of photons."""
-        return Label(p.history, p.tints)
+        return Label(p.history, p.tints, p.entry)
 
     def grown(self, setting: Setting, letter: Int[Array, "*photons"] | int) -> "Label":
         """The label after one more scattering; unchanged where the letter is -1."""
         if setting.optics is None:
-            return Label(setting.grow(self.number, letter), ())
+            return Label(setting.grow(self.number, letter), (), self.entry)
         if isinstance(letter, int):
             if letter < 0:
                 return self
-            return Label(self.number, tuple(t * o for t, o in zip(self.tints, setting.optics[letter])))
+            return self._tinted(setting.optics[letter])
         left = [jnp.where(letter >= 0, o[jnp.maximum(letter, 0)], 1.0) for o in setting.optics.T]
-        return Label(self.number, tuple(t * o for t, o in zip(self.tints, left)))
+        return self._tinted(left)
 
     def grown_where(
         self, where: Bool[Array, "*photons"], setting: Setting, letter: Int[Array, "*photons"] | int
@@ -46,14 +50,22 @@ class Label(eqx.Module):
         """The label after one more scattering where `where` holds."""
         after = self.grown(setting, letter)
         number = self.number if setting.optics is not None else jnp.where(where, after.number, self.number)
-        return Label(number, tuple(jnp.where(where, a, t) for a, t in zip(after.tints, self.tints)))
+        tints = tuple(jnp.where(where, a, t) for a, t in zip(after.tints, self.tints))
+        return Label(number, tints, self.entry)
 
-    def slots(self) -> list[tuple[Int[Array, "*photons"], Scalar | None]]:
-        """Where deposits are booked, and, if optics are applied, what these leave: for every wavelength."""
+    def _tinted(self, optics: Iterable[Array]) -> "Label":
+        return Label(self.number, tuple(t * o for t, o in zip(self.tints, optics)), self.entry)
+
+    def slots(self, number: Int[Array, "..."] | None = None) -> list[tuple[Array, Scalar | None]]:
+        """Where deposits are booked, and, if optics are applied, what these leave: for every wavelength.
+
+        `number`: of what they are booked under in place of the label's own.
+        """
+        number = self.number if number is None else number
         if not self.tints:
-            return [(self.number, None)]
+            return [(number, None)]
         many = len(self.tints)
-        return [(self.number * many + k, tint) for k, tint in enumerate(self.tints)]
+        return [(number * many + k, tint) for k, tint in enumerate(self.tints)]
 
 
 def book(

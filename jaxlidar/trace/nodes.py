@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt32
 
-from jaxlidar._vectors import Scalar, along
+from jaxlidar._vectors import Scalar, along, dot
 from jaxlidar.trace.photons import Photons
 from jaxlidar.trace.random_numbers import lattices
 from jaxlidar.trace.setting import Setting, unscattered
@@ -70,16 +70,19 @@ class Nodes(eqx.Module):
         point, w, excess = setting.beam.ray(across)
         up = jnp.asarray(-setting.plan.upstream, excess.dtype)
         inside = (lane < self.photons) & (share > 0)
+        # Times of light that shots see are relative to where it enters.
+        later = 0.0 if setting.viewing is None else 2.0 * dot(point, w)
         return number, Photons(
             along(point, w, up),
             w,
-            excess + up,
+            excess + up - later,
             jnp.where(inside, share, 0.0),
             node,
             jnp.full(lane.shape, -1, jnp.int32),
             unscattered(excess),
             inside,
             tuple(jnp.ones_like(excess) for _ in range(setting.optics.shape[1])),
+            None if setting.viewing is None else across,
         )
 
     def rays(self, key: PRNGKeyArray) -> tuple[Float[Array, "groups rays"], Float[Array, "groups rays"]]:

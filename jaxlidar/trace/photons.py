@@ -25,7 +25,7 @@ class Scattering(eqx.Module):
 class Photons(eqx.Module):
     """The state of a chunk of photons. `on` is the surface from which a photon starts, or -1.
 
-    `history` and `tints`: see `jaxlidar.trace.labels`.
+    `history`, `tints` and `entry`: see `jaxlidar.trace.labels`.
     """
 
     x: Vec
@@ -37,6 +37,7 @@ class Photons(eqx.Module):
     sent: Scattering
     alive: Bool[Array, "photons"]
     tints: tuple[Float[Array, "photons"], ...] = ()
+    entry: tuple[Float[Array, "photons"], Float[Array, "photons"]] | None = None
 
 
 class Hit(eqx.Module):

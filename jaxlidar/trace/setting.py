@@ -23,6 +23,7 @@ from jaxlidar.trace.histories import Histories, histories
 from jaxlidar.trace.march import Box, Medium, columns, medium_of, occupied
 from jaxlidar.trace.photons import Photons, Scattering
 from jaxlidar.trace.surfaces import Surface, surfaces_of
+from jaxlidar.trace.viewing import Viewing
 
 # Number of the law by which facets, diffusely transmitting plates and most surfaces send light on: the first.
 COSINE_LAW = 0
@@ -76,6 +77,7 @@ class Setting(eqx.Module):
     - `optics`: of every letter, by wavelength, where they are applied while light is traced, because it is
       told apart by its place of entry (see `jaxlidar.trace.nodes`), or because histories would be too many;
       None where histories keep them.
+    - `viewing`: shots that share light and see parts of it; None where there is one, or no shots.
     - `derivatives`: those that the trace may be asked for, "all", those "forward" or "none": the fewer, the
       faster.
     """
@@ -94,6 +96,7 @@ class Setting(eqx.Module):
     bark_law: int = eqx.field(static=True)
     sizes: Sizes = eqx.field(static=True)
     optics: Float[Array, "letters wavelengths"] | None = None
+    viewing: Viewing | None = None
     derivatives: Derivatives = eqx.field(static=True, default="all")
 
     @property
