@@ -321,7 +321,7 @@ def draw_figure(rows: list[dict], path) -> None:
     ends = (3e-3, 0.3)
     axes[0].plot(ends, ends, color="0.5", lw=1)
     axes[0].set(xlim=ends, ylim=ends, xlabel="closed form, error in m2/m3", ylabel="fit, error in m2/m3")
-    axes[0].legend(frameon=False)
+    axes[0].legend(loc="lower right", frameon=False, handletextpad=0.2)
     for ax, slope in zip(axes[1:], SLOPES):
         row = next(r for r in rows if r["slope"] == slope and r["ratio"] == 30.0)
         truth, fit, closed = map(np.array, row["profile"])
