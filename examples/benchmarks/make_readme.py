@@ -254,15 +254,17 @@ def campaign(record: dict) -> str:
     hours = 100 * largest["seconds"] / hectares * record["machine"]["cores"] / 3600
     return page_of(
         f"Trees of {side} m x {side} m at voxels of 1 m over rolling terrain. Footprints of 25 m from orbit, "
-        "all orders, to 1 %: with light that they share; traced one by one by one program; and by a call of "
-        "`simulate` for each. Shots of a scanner, 0.3 m wide, at first order, to 2 %: by one program, and by "
-        "a call for each.",
+        "all orders: with light that they share; traced one by one by one program; and by a call of "
+        "`simulate` for each. The same with a field of view as wide as the footprints, and off nadir. Shots of a "
+        "scanner, 0.3 m wide, at first order: by one program, and by a call for each. The tolerance is that of "
+        "every single shot.",
         table(
-            ("way", "shots", "ms a shot", "error, median"),
+            ("way", "shots", "tolerance", "ms a shot", "error, median"),
             [
                 (
                     name,
                     number(r["shots"], 4),
+                    f"{number(100 * r['tolerance'])} %",
                     number(r["ms per shot"]),
                     f"{number(100 * r['error, median'])} %",
                 )

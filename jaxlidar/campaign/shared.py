@@ -47,8 +47,10 @@ MOST_BATCHES = 1024
 TOGETHER = 256
 # Footprints of which a tile has less than this share are not waited for.
 _SMALL = 1e-3
-# Ends of a flight, and fewest rays of a batch, where each shot has its own part of paths.
-_VIEWED_ENDS, _FEWEST_RAYS = 2, 64
+# Ends of a flight at most: where optics are applied, and for each shot that may see them, they cost more.
+_ENDS = 2
+# Fewest rays of a batch of a shot's own.
+_FEWEST_RAYS = 64
 # Share of the squared error that order one may have where it is traced for each shot alone.
 _OF_ORDER_ONE = 0.25
 
@@ -70,12 +72,12 @@ def ready_for(setup: Setup, spacing: float, views: Views | None) -> Ready:
     """What all tiles over a grid of that spacing have in common."""
     recording = recording_of(setup)
     without_air = dataclasses.replace(without_histories(recording), air=None)
+    plan = setup.plan
+    trace = dataclasses.replace(plan.trace, ends=min(plan.trace.ends, _ENDS))
     if views is not None:
-        trace = setup.plan.trace
-        # Each end of a flight costs a deposit for every shot that may see it.
-        trace = dataclasses.replace(trace, last=trace.last + views.slack, ends=min(trace.ends, _VIEWED_ENDS))
-        plan = dataclasses.replace(setup.plan, trace=trace, n_rays=max(setup.plan.n_rays // 4, _FEWEST_RAYS))
-        setup = dataclasses.replace(setup, plan=plan)
+        trace = dataclasses.replace(trace, last=trace.last + views.slack)
+        plan = dataclasses.replace(plan, n_rays=max(plan.n_rays // 4, _FEWEST_RAYS))
+    setup = dataclasses.replace(setup, plan=dataclasses.replace(plan, trace=trace))
     return Ready(setting_of(setup, derivatives="none"), without_air, recording.air, spacing, views)
 
 
