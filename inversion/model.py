@@ -179,7 +179,7 @@ class Model:
             # Optics are applied while light is traced.
             places = [place._replace(geometric=True) for place in places]
         moving = sum(s.start.size for s, place in zip(settled, places) if place.geometric)
-        at_once = columns_at_once(plan, scene, lidar.wavelength.size, moving)
+        at_once = columns_at_once(plan, moving)
         self.problem = Problem(lidar, scene, plan, tuple(places), at_once)
         self.shapes = [s.start.shape for s in settled]
         self.dtypes = [s.start.dtype for s in settled]

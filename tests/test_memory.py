@@ -15,7 +15,7 @@ from helpers import slab, slow_unless
 
 import inversion
 import jaxlidar as jl
-from inversion.columns import columns_at_once, jacobian_bytes
+from inversion.columns import columns_at_once
 from inversion.model import Model
 from inversion.unknowns import settle
 from jaxlidar.planning import memory, sampling
@@ -116,7 +116,9 @@ def test_the_limit_is_the_users():
     scene = jl.Scene(canopy=jl.Canopy(slab(1.0), leaf=jl.LeafOptics(0.4, 0.4)), ground=GROUND)
     plan = jl.plan(jl.Lidar(), scene, describe=False)
     assert 1e5 < plan.memory < 1e9
-    assert str(plan).splitlines()[-1] == f"about {in_words(plan.memory)} of memory"
+    one, two = (plan.jacobian_memory(n) for n in (1, 2))
+    more = f"a Jacobian in one geometric unknown {in_words(one)}, in each more {in_words(two - one)}"
+    assert str(plan).splitlines()[-1] == f"about {in_words(plan.memory)} of memory; {more}"
     with pytest.raises(ValueError, match=r"admissible is max_memory = 0\.001 GB"):
         jl.simulate(jl.Lidar(), scene, key=KEY, max_memory=0.001)
     for bad in (0.0, -1.0, np.nan):
@@ -197,8 +199,7 @@ def layered(orders, layers=4, end=100.0, most=None, **given):
 
 def room_for(model, columns):
     """GB that so many columns at once need."""
-    problem = model.problem
-    return 1.0001e-9 * jacobian_bytes(problem.plan, problem.scene, TWO.wavelength.size, columns)
+    return 1.0001e-9 * model.problem.plan.jacobian_memory(columns)
 
 
 def test_columns_of_a_jacobian_are_computed_in_groups_where_memory_is_short():
@@ -233,11 +234,11 @@ def test_derivatives_have_no_histories_beyond_the_last_order():
 
 def test_groups_are_about_as_large():
     model = layered(4)[0]
-    plan, scene = model.problem.plan, model.problem.scene
+    plan = model.problem.plan
     for columns, room, expected in ((0, 1, 0), (7, 7, 7), (7, 6, 4), (7, 3, 3), (20, 9, 7)):
         limits = plan.limits._replace(max_memory=room_for(model, room))
         limited = dataclasses.replace(plan, limits=limits)
-        assert columns_at_once(limited, scene, TWO.wavelength.size, columns) == expected
+        assert columns_at_once(limited, columns) == expected
 
 
 WATCHED = """

@@ -255,9 +255,9 @@ def campaign(record: dict) -> str:
     return page_of(
         f"Trees of {side} m x {side} m at voxels of 1 m over rolling terrain. Footprints of 25 m from orbit, "
         "all orders: with light that they share; traced one by one by one program; and by a call of "
-        "`simulate` for each. The same with a field of view as wide as the footprints, and off nadir. Shots of a "
-        "scanner, 0.3 m wide, at first order: by one program, and by a call for each. The tolerance is that of "
-        "every single shot.",
+        "`simulate` for each. The same with a field of view as wide as the footprints, and off nadir. Shots "
+        "of a scanner, 0.3 m wide, at first order: by one program, and by a call for each. The tolerance is "
+        "that of every single shot.",
         table(
             ("way", "shots", "tolerance", "ms a shot", "error, median"),
             [

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
+from scipy import sparse
 
 from jaxlidar._programs import Program
 from jaxlidar._statistics import relative_error, widening
@@ -41,6 +42,8 @@ from jaxlidar.trace.setting import Setting, aimed, setting_of
 from jaxlidar.trace.viewed_response import order_one, trace_viewed
 from jaxlidar.trace.viewing import Viewing
 
+# Coefficients of shots at what is traced, (shots, nodes): a NumPy array, or a sparse one.
+Mixing = Any
 # Batches of one tile at most: a tolerance that is out of reach ends here.
 MOST_BATCHES = 1024
 # Shots that are finished together.
@@ -198,7 +201,7 @@ class _Wanted(NamedTuple):
     - `elsewhere`: samples of order one that count here and are traced elsewhere, or the other way round.
     """
 
-    part: Float[np.ndarray, "shots nodes"]
+    part: Mixing
     share: Float[np.ndarray, " shots"]
     may_err: Float[np.ndarray, " shots"]
     elsewhere: Float[np.ndarray, "shots wavelengths samples"] | float
@@ -211,9 +214,7 @@ class _Wanted(NamedTuple):
         return float(np.max(ratio, initial=0.0))
 
 
-def _wanted(
-    ready: Ready, tile: Tile, part: Float[np.ndarray, "shots nodes"], viewing: Viewing | None, key: Array
-) -> _Wanted:
+def _wanted(ready: Ready, tile: Tile, part: Mixing, viewing: Viewing | None, key: Array) -> _Wanted:
     share = tile.part.sum(axis=1)
     waited = share > _SMALL
     share, home = share[waited], tile.home[waited]
@@ -245,7 +246,8 @@ def trace_tile(ready: Ready, tile: Tile, number: int, rtol: float, key: PRNGKeyA
     if views is not None:
         viewing = views.at(tile, ready.spacing)
         # What is traced is the shots' already.
-        part = np.eye(len(tile.shots), views.shots, dtype=np.float32)
+        one = np.ones(len(tile.shots), np.float32)
+        part = sparse.csr_array(sparse.dia_array((one, 0), (one.size, views.shots)))
 
     def more(first: int, count: int) -> _Batches:
         sizes = jnp.asarray(first, jnp.int32), jnp.asarray(count, jnp.int32)
@@ -327,18 +329,18 @@ def _finish_all(recording: Recording, air: Array | None, *arrays: Any) -> Record
 _finished = Program(_finish_all)
 
 
-def _summed(part: Float[np.ndarray, "shots nodes"], values: Any) -> Any:
+def _summed(part: Mixing, values: Any) -> Any:
     """Sums over nodes, with the coefficients of every shot, of a tree of arrays."""
 
     def one(a: np.ndarray) -> np.ndarray:
-        return (part @ a.reshape(len(a), -1)).reshape(len(part), *a.shape[1:])
+        return (part @ a.reshape(len(a), -1)).reshape(part.shape[0], *a.shape[1:])
 
     return jax.tree.map(one, values)
 
 
-def _variance(part: Float[np.ndarray, "shots nodes"], squares: Any, count: int) -> Any:
+def _variance(part: Mixing, squares: Any, count: int) -> Any:
     """Variances of the means of batches, summed over nodes; widened for few batches of few nodes."""
     weight = part * part
-    nodes = weight.sum(axis=1) ** 2 / np.maximum((weight**2).sum(axis=1), 1e-30)
+    nodes = weight.sum(axis=1) ** 2 / np.maximum((weight * weight).sum(axis=1), 1e-30)
     wide = widening(1.0 + (count - 1.0) * np.maximum(nodes, 1.0)) ** 2 / (count * (count - 1.0))
     return _summed((weight * wide[:, None]).astype(part.dtype), squares)

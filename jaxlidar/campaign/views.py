@@ -1,11 +1,12 @@
 """What shots see of the light that they share, for each tile."""
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
+from scipy import spatial
 
 from jaxlidar._checks import known_number
 from jaxlidar.campaign.irradiance import Section, section_of
@@ -18,6 +19,15 @@ from jaxlidar.trace.viewing import Viewing
 _FIELD = 1.2
 # Cells along the reach of a shot.
 _CELLS = 12
+
+
+class _Cells(NamedTuple):
+    """Corner and edge of a tile's cells, m from its aim point, how many, and who may see what is there."""
+
+    low: Float[np.ndarray, "2"]
+    edge: float
+    shape: tuple[int, int]
+    near: Any
 
 
 class Views(NamedTuple):
@@ -49,9 +59,10 @@ class Views(NamedTuple):
             rung(max(int(tile.home.sum()) for tile in tiles), 4),
             (0, 0, 0),
         )
-        counts = [found._near(tile, spacing)[2].sum(axis=2) for tile in tiles]
-        nx, ny = (rung(max(c.shape[k] for c in counts), 4) for k in range(2))
-        return found._replace(cells=(nx, ny, rung(max(int(c.max()) for c in counts), 8)))
+        cells = [found._cells(tile, spacing) for tile in tiles]
+        nx, ny = (rung(max(c.shape[k] for c in cells), 4) for k in range(2))
+        most = max(len(shots) for c in cells for shots in c.near)
+        return found._replace(cells=(nx, ny, rung(most, 8)))
 
     @property
     def reach(self) -> float:
@@ -70,10 +81,14 @@ class Views(NamedTuple):
         x, y, z = self.beam.axis
         return 2.0 * self.beam.reach * math.hypot(x, y) / -z
 
-    def _near(
-        self, tile: Tile, spacing: float
-    ) -> tuple[Float[np.ndarray, "2"], float, Bool[np.ndarray, "nx ny shots"]]:
-        """Corner and edge of a tile's cells, m from its aim point, and which shots may see what is there."""
+    def _across(self, place: Float[np.ndarray, "places 2"]) -> Float[np.ndarray, "places 2"]:
+        """Places of the reference plane, seen along the beams, m."""
+        x, y, z = self.beam.axis
+        turn = np.array([[x, -y], [y, x]]) / math.hypot(x, y) if self.beam.leans else np.eye(2)
+        return place @ turn * np.array([-z, 1.0])
+
+    def _cells(self, tile: Tile, spacing: float) -> _Cells:
+        """The cells of a tile, and which shots may see what is there."""
         place = self.position[tile.shots] - tile.aim
         edge = self.reach / _CELLS
         if self.by_end:
@@ -82,19 +97,18 @@ class Views(NamedTuple):
             about, more = tile.place, 2.0 * spacing
         low, high = about.min(axis=0) - more, about.max(axis=0) + more
         x, y = (low[k] + edge * (np.arange(math.ceil((high[k] - low[k]) / edge)) + 0.5) for k in range(2))
-        off = [x[:, None, None] - place[:, 0], y[None, :, None] - place[:, 1]]
-        along = off[0] * self.beam.axis[0] + off[1] * self.beam.axis[1]
-        square = off[0] ** 2 + off[1] ** 2 - along**2
-        return low, edge, square <= (self.reach + edge * math.sqrt(0.5)) ** 2
+        middle = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
+        tree, far = spatial.KDTree(self._across(place)), self.reach + edge * math.sqrt(0.5)
+        near = tree.query_ball_point(self._across(middle), far, return_sorted=True)
+        return _Cells(low, edge, (len(x), len(y)), near)
 
     def at(self, tile: Tile, spacing: float) -> Viewing:
         """What the shots of a tile see."""
-        low, edge, near = self._near(tile, spacing)
-        none = self.shots
+        low, edge, (nx, ny), near = self._cells(tile, spacing)
+        none, most = self.shots, self.cells[2]
+        rows = [[*shots, *[none] * (most - len(shots))] for shots in near]
         candidates = np.full(self.cells, none, np.int32)
-        i, j, shot = np.nonzero(near)
-        turn = np.cumsum(near, axis=2)[i, j, shot] - 1
-        candidates[i, j, turn] = shot
+        candidates[:nx, :ny] = np.array(rows, np.int32).reshape(nx, ny, most)
         place = np.full((self.shots + 1, 2), 1e6)
         place[: len(tile.shots)] = self.position[tile.shots] - tile.aim
         part = np.zeros((self.shots + 1, tile.part.shape[1]), np.float32)

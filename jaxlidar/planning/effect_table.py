@@ -2,7 +2,7 @@
 
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import jax
 
@@ -138,3 +138,14 @@ def _reasons(lidar: Lidar, scene: Scene) -> dict[str, str]:
     if air is not None and air.lidar_ratio is None:
         reasons["atmospheric backscatter"] = "no lidar ratio"
     return reasons
+
+
+def table_lines(effects: Sequence[Effect]) -> list[str]:
+    """The lines of a table of effects, with a head."""
+    rows = [("effect", "simulated", "changes at most", "why")]
+    for e in effects:
+        bound = "nothing" if e.bound == 0 else f"{percent(e.bound)} of {e.measure}"
+        rows.append((e.name, "yes" if e.simulated else "no", bound, e.reason))
+    widths = [max(len(r[i]) for r in rows) for i in range(3)]
+    lines = ["  ".join([*(c.ljust(w) for c, w in zip(r, widths)), r[3]]).rstrip() for r in rows]
+    return [lines[0], "-" * max(map(len, lines)), *lines[1:]]

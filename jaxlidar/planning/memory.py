@@ -9,6 +9,11 @@ from jaxlidar.planning.trace_plan import DENSE, Bins, TracePlan
 
 # Copies of a batch's response that are alive at once: sums of photons, of groups, and the result.
 _COPIES = 3
+# Tangents of a response that are alive at once, for each column of a Jacobian: the sum of photons, and the
+# result.
+_TANGENTS = 2
+# Tangents of a photon, and of a stretch of a ray, that are alive at once; rays that are marched at once.
+_NUMBERS, _RAYS = 4, 512
 # Bytes that compiling takes.
 _COMPILING = 150e6
 # Bytes of a response from which on optics may be applied while light is traced, and for how many wavelengths.
@@ -54,6 +59,30 @@ def keeps_histories(kept: float, applied: float, limit: float, wavelengths: int)
     `applied` bytes, and wavelengths, whose deposits are then made one by one, are few.
     """
     return kept <= min(limit, LARGE) or applied >= kept or wavelengths > FEW
+
+
+def jacobian_bytes(
+    trace: TracePlan,
+    bins: Bins,
+    degree: int,
+    first_degree: int,
+    traces: int,
+    light: tuple[int, int],
+    batches: int,
+    columns: int,
+) -> float:
+    """Bytes of an evaluation of so many columns of a geometric Jacobian at once, beside what compiling takes.
+
+    The responses of all batches are kept for the optical columns; batches run on all cores.
+
+    **Arguments:** as `predicted`, and `light`: photons and rays of a batch.
+    """
+    cores = min(os.cpu_count() or 1, batches)
+    response = response_bytes(trace, bins, degree, first_degree, traces)
+    photons, rays = light
+    moving = photons + min(rays, _RAYS) * trace.first_steps
+    each = _TANGENTS * response + _NUMBERS * moving * jnp.zeros(()).dtype.itemsize
+    return (batches + 1) * response + cores * (response + columns * each)
 
 
 def in_words(size: float) -> str:

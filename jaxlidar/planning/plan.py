@@ -7,15 +7,21 @@ from typing import NamedTuple
 
 from jaxlidar._checks import check_choice, check_integer, check_range, known_array, known_number
 from jaxlidar._constants import SPEED_OF_LIGHT
-from jaxlidar._summary import percent
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.instrument.survey import Survey
 from jaxlidar.optics.laws import AbstractMirror
-from jaxlidar.planning.effect_table import effect_table
+from jaxlidar.planning.effect_table import effect_table, table_lines
 from jaxlidar.planning.effects import Effect, empty, flattened, only_planes, present, switched_off, without
 from jaxlidar.planning.ladder import rung
 from jaxlidar.planning.local_origin import about_aim
-from jaxlidar.planning.memory import check_memory, in_words, keeps_histories, memory_limit, predicted
+from jaxlidar.planning.memory import (
+    check_memory,
+    in_words,
+    jacobian_bytes,
+    keeps_histories,
+    memory_limit,
+    predicted,
+)
 from jaxlidar.planning.orders import degree_of, order_steps, orders_of, tail_of
 from jaxlidar.planning.parallel_light import one_direction, parallel_light
 from jaxlidar.planning.path_lengths import PathLengths, stretch
@@ -73,6 +79,7 @@ class Plan:
     - `random_footprint`: whether each batch shifts the rays at random.
     - `degree`, `first_degree`: most scatterings and passages through plates on a path, of all orders and of
       order one.
+    - `traces`: of a response: one for each wavelength, where it matters while light is traced.
     - `reach`: times (ns) between which the pulse's energy lies.
     - `off`: names of the effects that are switched off.
     - `rtol`: relative accuracy aimed at.
@@ -101,6 +108,7 @@ class Plan:
     random_footprint: bool
     degree: int
     first_degree: int
+    traces: int
     reach: tuple[float, float]
     # Names of the effects that are switched off.
     off: tuple[str, ...]
@@ -122,6 +130,11 @@ class Plan:
         plates = len(self.trace.surfaces) - self.trace.has_ground
         return degree_of(self.orders, plates) if self.trace.keeps_histories else 0
 
+    def jacobian_memory(self, columns: int) -> float:
+        """Bytes that derivatives in so many geometric unknowns at once take, beside what compiling takes."""
+        sizes = self.least_degree, self.first_degree, self.traces, (self.n_photons, self.n_rays)
+        return jacobian_bytes(self.trace, self.bins, *sizes, MIN_BATCHES, columns)
+
     @property
     def is_random(self) -> bool:
         """Whether anything is drawn at random."""
@@ -130,13 +143,7 @@ class Plan:
         return self.random_footprint and not self.smooth_footprint
 
     def __str__(self) -> str:
-        rows = [("effect", "simulated", "changes at most", "why")]
-        for e in self.effects:
-            bound = "nothing" if e.bound == 0 else f"{percent(e.bound)} of {e.measure}"
-            rows.append((e.name, "yes" if e.simulated else "no", bound, e.reason))
-        widths = [max(len(r[i]) for r in rows) for i in range(3)]
-        lines = ["  ".join([*(c.ljust(w) for c, w in zip(r, widths)), r[3]]).rstrip() for r in rows]
-        lines.insert(1, "-" * max(map(len, lines)))
+        lines = table_lines(self.effects)
         sizes = (
             f"{self.n_samples} samples of {self.sample_interval:g} ns from {self.sample_start:g} ns, "
             f"{self.bins.count} fine bins of {self.bins.width:.3g} ns"
@@ -147,7 +154,10 @@ class Plan:
             sizes += f", {self.n_photons} photons a batch, {self.orders} orders"
         if not self.trace.keeps_histories:
             sizes += ", optics applied while light is traced"
-        return "\n".join([*lines, sizes, f"about {in_words(self.memory)} of memory"])
+        one, two = (self.jacobian_memory(n) for n in (1, 2))
+        memory = f"about {in_words(self.memory)} of memory; a Jacobian in one geometric unknown "
+        memory += f"{in_words(one)}, in each more {in_words(two - one)}"
+        return "\n".join([*lines, sizes, memory])
 
 
 def plan(
@@ -326,6 +336,7 @@ def plan(
         random_footprint=footprint == "random" and "divergence" not in off,
         degree=degree,
         first_degree=first_degree,
+        traces=wavelengths if straight or not keeps else 1,
         reach=reach,
         off=off,
         rtol=rtol,
