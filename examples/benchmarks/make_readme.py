@@ -272,7 +272,8 @@ def campaign(record: dict) -> str:
             ],
         ),
         f"Sharing light is {number(faster)} times faster than calls, one program for a scan "
-        f"{number(faster_scan)} times. The process took at most {number(record['peak GB'])} GB.",
+        f"{number(faster_scan)} times. All of this in one process took at most "
+        f"{number(record['peak GB'])} GB.",
         f"More footprints over the same trees, to {rough}, cost little more:",
         table(
             ("footprints", "s", "ms each"),

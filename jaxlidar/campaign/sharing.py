@@ -23,10 +23,11 @@ _FAINT = 0.01
 # A shot of its own has so many times the photons in a batch, and the rays: here batches are many and small.
 # Rays cost about as much as photons, and so few of them have a small part in the error.
 _FEWER, _FEWER_RAYS = 4.0, 2.0
-# Where shots see light each in its own way, a batch costs something for each of them.
-_FEWER_VIEWED = 1.0
 # Sharing pays where so many footprints overlap in the mean, and shots are so many.
 _OVERLAP, _FEWEST = 1.3, 4
+# Where shots see light each in its own way, batches cost something for each of them, photons cost more, and
+# the grid serves only what becomes of the light.
+_FEWER_VIEWED, _OVERLAP_VIEWED, _FATES = 1.0, 2.0, 0.01
 
 
 class Sharing(NamedTuple):
@@ -59,8 +60,9 @@ def sharing(survey: Survey, setup: Setup, rtol: float, asked: bool | None) -> Sh
         return None
     if asked is None and len(survey) < _FEWEST:
         return None
-    found = patches(survey, _GRID * rtol)
-    if found.misplaced > _COARSE * rtol:
+    viewed = _has_views(survey)
+    found = patches(survey, max(_GRID * rtol, _FATES) if viewed else _GRID * rtol)
+    if not viewed and found.misplaced > _COARSE * rtol:
         if asked:
             raise ValueError(
                 f"shared = True, but the finest grid misplaces {percent(found.misplaced)} of the light, at "
@@ -68,10 +70,10 @@ def sharing(survey: Survey, setup: Setup, rtol: float, asked: bool | None) -> Sh
             )
         return None
     nodes = lit(found, _FAINT * rtol)
-    if asked is None and nodes.overlap < _OVERLAP:
+    if asked is None and nodes.overlap < (_OVERLAP_VIEWED if viewed else _OVERLAP):
         return None
-    of_nodes = _tiles(found, nodes, setup, _FEWER_VIEWED if _has_views(survey) else _FEWER)
-    views = Views.of(survey, of_nodes, found.spacing) if _has_views(survey) else None
+    of_nodes = _tiles(found, nodes, setup, _FEWER_VIEWED if viewed else _FEWER)
+    views = Views.of(survey, of_nodes, found.spacing) if viewed else None
     return Sharing(of_nodes, found.spacing, views, _parallel(survey, setup))
 
 
