@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, PRNGKeyArray
 
 from jaxlidar._checks import check_flag, check_integer, check_key, check_range, is_traced
 from jaxlidar._programs import Program
@@ -23,7 +23,7 @@ from jaxlidar.planning.plan import plan as make_plan
 from jaxlidar.planning.plan_check import check_plan
 from jaxlidar.planning.setup import Setup, reduce
 from jaxlidar.scenes.scene import Scene, check_kinds
-from jaxlidar.trace.colouring import Balance, Recording, balance, recording_of, recording_with_room, total
+from jaxlidar.trace.colouring import Balance, Recording, recording_of, recording_with_room, total_and_balance
 from jaxlidar.trace.response import (
     Response,
     follows,
@@ -173,20 +173,25 @@ def simulate(
 
 
 class _Ready(NamedTuple):
-    """A setup as the compiled programs take it. `transmittance`: see `straight_transmittance`."""
+    """A setup as the compiled programs take it: `recording` of means, `brief` of batches for errors."""
 
     setup: Setup
     setting: Setting
     transmittance: Array | None
     recording: Recording
+    brief: Recording
 
 
 def _prepared(setup: Setup, key: PRNGKeyArray) -> _Ready:
     transmittance = straight_transmittance(setup)
     own_traces = transmittance is not None or not setup.plan.trace.keeps_histories
     traced = any(is_traced(x) for x in jax.tree.leaves((setup, key)))
-    recording = recording_of(setup) if own_traces or traced else recording_with_room(setup)
-    return _Ready(setup, setting_of(setup, derivatives="all" if traced else "none"), transmittance, recording)
+    setting = setting_of(setup, derivatives="all" if traced else "none")
+    if own_traces or traced:
+        recording = recording_of(setup)
+        return _Ready(setup, setting, transmittance, recording, recording)
+    recording = recording_with_room(setup)
+    return _Ready(setup, setting, transmittance, recording, recording.abridged())
 
 
 class _Goal(NamedTuple):
@@ -291,10 +296,6 @@ class LateLightWarning(UserWarning):
     """
 
 
-def _results(response: Response, recording: Recording) -> tuple[Float[Array, "wavelengths samples"], Balance]:
-    return total(response, recording), balance(response, recording)
-
-
 def _over(whole: Any, count: Array) -> Any:
     return jax.tree.map(lambda a: a / count, whole)
 
@@ -307,7 +308,7 @@ _compiled_trace = Program(trace_setting)
 _compiled_batch = Program(trace_setting, **ONE_CORE)
 _compiled_first = Program(trace_first, **ONE_CORE)
 _compiled_higher = Program(trace_higher, **ONE_CORE)
-_compiled_results = Program(_results, **ONE_CORE)
+_compiled_results = Program(total_and_balance, **ONE_CORE)
 _compiled_waveform = Program(recorded)
 _shared_out = Program(_over)
 _add = Program(_sum)
@@ -318,7 +319,7 @@ def _trace_within(ready: _Ready, key: PRNGKeyArray) -> _Traced:
 
     def batch(key: PRNGKeyArray) -> tuple[Response, Array, Balance]:
         response = trace_setting(ready.setting, ready.transmittance, key)
-        return response, *_results(response, ready.recording)
+        return response, *total_and_balance(response, ready.recording)
 
     responses, totals, balances = jax.lax.map(batch, jax.random.split(key, MIN_BATCHES))
 
@@ -342,8 +343,8 @@ def _begin_to_compile(ready: _Ready, key: PRNGKeyArray) -> None:
         response = joined(_compiled_first.begin(*arguments), higher)
     else:
         response = _compiled_batch.begin(*arguments)
-    for program in (_compiled_results, _compiled_waveform):
-        program.begin(response, ready.recording)
+    _compiled_results.begin(response, ready.brief)
+    _compiled_waveform.begin(response, ready.recording)
     _add.begin(response, response)
 
 
@@ -359,7 +360,6 @@ def _trace_batches(
     whole: Any = None
     waves, shares, neglected = Moments(), Moments(), Moments()
     wanted, stopped, error = MIN_BATCHES, "tolerance met", math.inf
-
     arguments = (ready.setting, ready.transmittance)
 
     def batch(key: PRNGKeyArray) -> Response:
@@ -369,7 +369,7 @@ def _trace_batches(
 
     def one(n: int) -> tuple[Response, Array, Balance]:
         response = batch(jax.random.fold_in(key, n))
-        return response, *_compiled_results(response, ready.recording)
+        return response, *_compiled_results(response, ready.brief)
 
     _begin_to_compile(ready, key)
     with side_by_side() as run:

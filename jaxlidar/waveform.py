@@ -32,7 +32,8 @@ class Waveform(eqx.Module):
       atmosphere; its sum over bins is that of the target.
     - `energy`: (wavelengths, bins) J that the detector registers per sample.
     - `stderr`: (wavelengths, bins) one standard error of `reflectance`; zero where nothing was random. The
-      expected value lies within two of them in 95 % of cases.
+      expected value lies within two of them in 95 % of cases. For more than 16 wavelengths they are computed
+      at few that stand for all, to three digits of the wavelength's largest.
     - `components`: dict of arrays like `reflectance`: by material of the last scattering ("ground", "leaf",
       "bark", "plate", "air"), and by order ("first", "higher").
     - `neglected`: (wavelengths,) apparent reflectance that orders beyond the last could still add.

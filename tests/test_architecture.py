@@ -95,6 +95,7 @@ ORDER = {
         "first_order",
         "higher_orders",
         "response",
+        "few_wavelengths",
         "colouring",
         "node_response",
         "viewed_response",

@@ -17,6 +17,7 @@ from jaxlidar.planning.sampling import Sampling, sampling_of
 from jaxlidar.planning.scatterers import letter_values
 from jaxlidar.planning.setup import Setup
 from jaxlidar.scenes.atmosphere import Atmosphere
+from jaxlidar.trace.few_wavelengths import FewWavelengths, few_of
 from jaxlidar.trace.histories import Histories, histories
 from jaxlidar.trace.response import Response
 
@@ -31,7 +32,8 @@ class Recording(eqx.Module):
     - `time`: of the samples, ns. - `clear`: two-way transmittance of the atmosphere in fine bins, and `air`:
       its own return in samples; None where there is none. - `admissible`: see `Setup`.
     - `materials`: their names. - `first_degree`, `degree`: of histories. - `one_order`: whether no more were
-      followed. - `again`: whether light that is scattered can meet the scene again.
+      followed. - `again`: whether light that is scattered can meet the scene again. - `few`: wavelengths that
+      stand for all, if any do.
     """
 
     optics: Float[Array, "letters wavelengths"]
@@ -46,6 +48,7 @@ class Recording(eqx.Module):
     degree: int = eqx.field(static=True)
     one_order: bool = eqx.field(static=True)
     again: bool = eqx.field(static=True)
+    few: FewWavelengths | None = None
 
     @property
     def short(self) -> Histories:
@@ -56,6 +59,29 @@ class Recording(eqx.Module):
     def table(self) -> Histories:
         """Histories of all orders."""
         return histories(len(self.optics), self.degree)
+
+    def abridged(self) -> "Recording":
+        """The same recording by few wavelengths, where they are many: for errors."""
+        if self.lidar.wavelength.size <= _MANY:
+            return self
+        return dataclasses.replace(self, few=few_of(self.optics, max(self.first_degree, self.degree)))
+
+    @property
+    def coloured(self) -> int:
+        """Number of wavelengths at which histories are summed."""
+        return self.optics.shape[1] if self.few is None else self.few.chosen.size
+
+    def colour(
+        self, weights: Float[Array, "traces *rest histories columns"], table: Histories
+    ) -> Float[Array, "*rest coloured columns"]:
+        """Sums over histories, at all wavelengths or the few that stand for them."""
+        return colour(weights, table, self.optics if self.few is None else self.optics[:, self.few.chosen])
+
+    def spread(
+        self, found: Float[Array, "*rest coloured columns"]
+    ) -> Float[Array, "*rest wavelengths columns"]:
+        """What was coloured, at all wavelengths."""
+        return found if self.few is None else self.few.spread(found)
 
     def with_room(self, wavelengths: int) -> "Recording":
         """The same recording with copies of the last wavelength, so that there are `wavelengths`."""
@@ -175,17 +201,17 @@ def samples_of(
     weights: Float[Array, "traces *rest histories bins"], table: Histories, recording: Recording
 ) -> Float[Array, "*rest wavelengths samples"]:
     """Samples by wavelength of weights by history and fine bin: optics, atmosphere, pulse."""
-    sampling, optics, clear = recording.sampling, recording.optics, recording.clear
+    sampling, clear = recording.sampling, recording.clear
     weights = weights[..., : table.count, :]
-    count, wavelengths = table.count, optics.shape[1]
+    if clear is not None:
+        fine = recording.spread(recording.colour(weights, table))
+        return sampling(fine * clear.reshape((1,) * (fine.ndim - 2) + clear.shape))
+    count, wavelengths = table.count, recording.coloured
     pulse_last = (wavelengths * (count + sampling.samples)) * sampling.bins
     pulse_first = (count * (sampling.bins + wavelengths)) * sampling.samples
-    if clear is None and len(weights) == 1 and pulse_first < pulse_last:
-        return colour(sampling(weights), table, optics)
-    fine = colour(weights, table, optics)
-    if clear is not None:
-        fine = fine * clear.reshape((1,) * (fine.ndim - 2) + clear.shape)
-    return sampling(fine)
+    if len(weights) == 1 and pulse_first < pulse_last:
+        return recording.spread(recording.colour(sampling(weights), table))
+    return recording.spread(sampling(recording.colour(weights, table)))
 
 
 def total(response: Response, recording: Recording) -> Float[Array, "wavelengths samples"]:
@@ -236,11 +262,11 @@ class Shares(NamedTuple):
 
 def shares_of(response: Response, recording: Recording) -> Shares:
     """The sums of a response. A material absorbs what arrived there less what left."""
-    values, short = recording.optics, recording.short
+    short = recording.short
     table = short if response.higher is None else recording.table
 
     def shares(weights: Array, table: Histories = table) -> Array:
-        return colour(weights[..., None], table, values)[..., 0]
+        return recording.spread(recording.colour(weights[..., None], table))[..., 0]
 
     whole = shares(jnp.sum(response.first, axis=(1, 3)), short)
     lost = shares(jnp.sum(response.first_outside, axis=1), short)
@@ -279,3 +305,10 @@ def balance_of(sums: Shares, recording: Recording) -> Balance:
     per_energy = whole / jnp.maximum(ledger["escaped"], 1e-6)
     unfollowed = jnp.zeros_like(whole) if recording.one_order else ledger["unfollowed"]
     return Balance(ledger, unfollowed * jnp.clip(per_energy, 1.0, 4.0), sums.lost)
+
+
+def total_and_balance(
+    response: Response, recording: Recording
+) -> tuple[Float[Array, "wavelengths samples"], Balance]:
+    """What standard errors are known of: see `total` and `balance`."""
+    return total(response, recording), balance(response, recording)

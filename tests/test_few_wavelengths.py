@@ -1,0 +1,113 @@
+"""Few wavelengths stand for many: polynomials in the optics, and standard errors of spectra."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxlidar as jl
+from jaxlidar.trace.colouring import balance, recording_of, total
+from jaxlidar.trace.few_wavelengths import few_of
+from jaxlidar.trace.histories import histories
+
+WAVELENGTH = np.arange(400.0, 2501.0)
+LEAF = jl.Prospect(N=1.5, Cab=40.0, Car=8.0, Cant=0.0, Cbrown=0.0, Cw=0.01, Cm=0.009)
+
+
+def optics(wavelength=WAVELENGTH) -> np.ndarray:
+    """Leaf reflectance and transmittance, bark, and a soil with a band of water."""
+    soil = 0.1 + 0.3 * (wavelength - 400) / 2100 - 0.05 * np.exp(-(((wavelength - 1900) / 60) ** 2))
+    return np.stack([*(np.asarray(x) for x in LEAF(jnp.asarray(wavelength))), np.full_like(soil, 0.4), soil])
+
+
+def worst(few, values, degree) -> float:
+    """What of any monomial is missed, of the largest that is not one at the same wavelength."""
+    exact = np.prod(values[None] ** histories(len(values), degree).exponents[:, :, None], axis=1)
+    found = exact[:, np.asarray(few.chosen)] @ np.asarray(few.shares, float)
+    return float(np.max(np.abs(found - exact) / np.max(exact[1:], axis=0)))
+
+
+def test_every_product_of_optics_follows_from_few():
+    values = optics()
+    few = few_of(jnp.asarray(values), 10)
+    assert few is not None
+    assert few.chosen.size < 64
+    assert worst(few, values, 10) < 1e-4
+    # Wavelengths chosen for one scattering do not serve ten.
+    short = few_of(jnp.asarray(values), 1)
+    assert short is not None
+    assert worst(short, values, 1) < 1e-4
+    assert worst(short, values, 10) > 1e-2
+
+
+def test_unlike_wavelengths_have_none_that_stand_for_them():
+    assert few_of(jnp.asarray(np.random.default_rng(0).uniform(size=(8, 200))), 10) is None
+
+
+def test_one_value_at_all_wavelengths_needs_one():
+    few = few_of(jnp.full((2, 40), 0.5), 4)
+    assert few is not None
+    assert np.count_nonzero(np.any(few.shares, axis=1)) == 1
+    np.testing.assert_allclose(few.shares[0], 1.0, rtol=1e-5)
+
+
+def test_another_leaf_has_as_many():
+    """Programs are compiled for their number."""
+    sizes = set()
+    for depth in (0.2, 0.3, 0.4):
+        values = optics()
+        values[2] = depth
+        few = few_of(jnp.asarray(values), 10)
+        assert few is not None
+        sizes.add(few.chosen.size)
+    assert len(sizes) == 1
+
+
+@pytest.mark.parametrize("air", [None, jl.Atmosphere(visibility=5.0)])
+def test_a_batch_by_few_wavelengths_is_the_batch(air):
+    """Samples and ledger, with an atmosphere whose transmittance differs between wavelengths too."""
+    wavelength = WAVELENGTH[::10]
+    lidar = jl.Lidar(wavelength=wavelength, divergence=4.0)
+    voxels = jl.VoxelMap.from_lad(
+        np.full((1, 1, 4), 0.4), voxel_size=(4.0, 4.0, 1.0), origin=(-2.0, -2.0, 0.0)
+    )
+    scene = jl.Scene(
+        canopy=jl.Canopy(voxels, leaf=LEAF),
+        ground=jl.Ground(reflectance=optics(wavelength)[-1]),
+        atmosphere=air,
+    )
+    setup = jl.reduce(lidar, scene, jl.plan(lidar, scene, max_orders=4, n_photons=1024))
+    response, exact = jl.trace_scene(setup, jax.random.key(0)), recording_of(setup)
+    brief = exact.abridged()
+    assert brief.few is not None
+    assert brief.few.chosen.size < len(wavelength) / 4
+    whole = total(response, exact)
+    np.testing.assert_allclose(total(response, brief), whole, atol=1e-4 * float(whole.max()))
+    for name, share in balance(response, exact).ledger.items():
+        np.testing.assert_allclose(balance(response, brief).ledger[name], share, atol=1e-4)
+    # Standard errors need three digits at every wavelength: shares of a neighbour would not do.
+    wrong = dataclasses.replace(brief.few, shares=jnp.roll(brief.few.shares, 1, axis=1))
+    found = total(response, dataclasses.replace(brief, few=wrong))
+    assert not np.allclose(found, whole, atol=1e-4 * float(whole.max()))
+
+
+def test_errors_of_a_spectrum_are_those_of_its_wavelengths():
+    """One wavelength of many has the standard error that it has by itself, from the same photons."""
+    scene = jl.Scene(
+        plates=[jl.Plate(5.0, 0.3, 0.4, coverage=0.5)], ground=jl.Ground(reflectance=optics()[-1][::20])
+    )
+    many = jl.Lidar(wavelength=WAVELENGTH[::20], divergence=2.0)
+    how = {"key": jax.random.key(1), "n_photons": 8192, "max_orders": 5}
+    spectrum = jl.simulate(many, scene, **how)
+    for i in (3, 70):
+        ground = jl.Ground(reflectance=float(scene.ground.reflectance[i]))
+        alone = jl.simulate(
+            jl.Lidar(wavelength=WAVELENGTH[20 * i], divergence=2.0),
+            dataclasses.replace(scene, ground=ground),
+            **how,
+        )
+        largest = float(alone.stderr.max())
+        np.testing.assert_allclose(spectrum.stderr[i], alone.stderr[0], rtol=1e-3, atol=1e-3 * largest)
+        np.testing.assert_allclose(spectrum.reflectance[i], alone.reflectance[0], rtol=1e-5, atol=1e-7)
