@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import prosail
 import pytest
-from helpers import slow_unless
+from helpers import NARROW, slow_unless
 from scipy.optimize import least_squares
 
 import jaxlidar as jl
@@ -37,6 +37,7 @@ def spectra(traits, bands=BANDS):
     return (np.array(s) for s in jl.prospect_spectra(leaves, bands))
 
 
+@NARROW
 def test_traits_without_noise(precision):
     truth = random_traits(45)
     fit = invert_leaves(BANDS, *spectra(truth))

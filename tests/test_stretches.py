@@ -44,7 +44,7 @@ def scenes() -> dict[str, jl.Scene]:
 LIDAR = jl.Lidar(altitude=500.0, divergence=6.0, zenith=12.0, pulse=jl.GaussianPulse(fwhm=4.0))
 
 
-@pytest.mark.parametrize("kind", slow_unless(["bark", "plate"], scenes()))
+@pytest.mark.parametrize("kind", slow_unless(["bark"], scenes()))
 def test_what_is_left_out_adds_nothing(kind: str):
     scene = scenes()[kind]
     setup = jl.reduce(LIDAR, scene, jl.plan(LIDAR, scene, max_orders=1, n_rays=700, describe=False))
