@@ -65,7 +65,9 @@ def test_another_leaf_has_as_many():
     assert len(sizes) == 1
 
 
-@pytest.mark.parametrize("air", [None, jl.Atmosphere(visibility=5.0)])
+@pytest.mark.parametrize(
+    "air", [None, pytest.param(jl.Atmosphere(visibility=5.0), marks=pytest.mark.slow)], ids=["clear", "hazy"]
+)
 def test_a_batch_by_few_wavelengths_is_the_batch(air):
     """Samples and ledger, with an atmosphere whose transmittance differs between wavelengths too."""
     wavelength = WAVELENGTH[::10]
