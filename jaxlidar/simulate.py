@@ -187,11 +187,10 @@ def _prepared(setup: Setup, key: PRNGKeyArray) -> _Ready:
     own_traces = transmittance is not None or not setup.plan.trace.keeps_histories
     traced = any(is_traced(x) for x in jax.tree.leaves((setup, key)))
     setting = setting_of(setup, derivatives="all" if traced else "none")
-    if own_traces or traced:
-        recording = recording_of(setup)
-        return _Ready(setup, setting, transmittance, recording, recording)
-    recording = recording_with_room(setup)
-    return _Ready(setup, setting, transmittance, recording, recording.abridged())
+    exact = own_traces or traced
+    recording = recording_of(setup) if exact else recording_with_room(setup)
+    brief = recording if exact or not setup.plan.is_random else recording.abridged()
+    return _Ready(setup, setting, transmittance, recording, brief)
 
 
 class _Goal(NamedTuple):
