@@ -10,7 +10,7 @@ import jaxlidar as jl
 from jaxlidar._statistics import widening
 
 LIDAR = jl.Lidar(wavelength=1064.0)
-SEEDS = 100
+SEEDS = 200
 
 
 def clumps():
