@@ -1,6 +1,7 @@
 """From response to samples: optics of every history, the atmosphere, the pulse, and where the energy went."""
 
 import dataclasses
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import equinox as eqx
@@ -265,22 +266,22 @@ def shares_of(response: Response, recording: Recording) -> Shares:
     short = recording.short
     table = short if response.higher is None else recording.table
 
-    def shares(weights: Array, table: Histories = table) -> Array:
-        return recording.spread(recording.colour(weights[..., None], table))[..., 0]
+    def shares(rows: list[Array], table: Histories) -> Iterator[Array]:
+        """What rows of (traces, histories) sum up to, all in one product."""
+        found = recording.spread(recording.colour(jnp.stack(rows, axis=-1), table))
+        return iter(jnp.moveaxis(found, -1, 0))
 
-    whole = shares(jnp.sum(response.first, axis=(1, 3)), short)
-    lost = shares(jnp.sum(response.first_outside, axis=1), short)
+    absorbed = response.arrived - response.left
+    materials = [absorbed[:, m] for m in range(absorbed.shape[1])]
+    of_short = [jnp.sum(response.first, axis=(1, 3)), jnp.sum(response.first_outside, axis=1)]
+    of_all = [response.escaped, response.late, response.remaining, *materials]
     if response.higher is not None and response.higher_outside is not None:
-        whole = whole + shares(jnp.sum(response.higher, axis=(1, 3)))
-        lost = lost + shares(jnp.sum(response.higher_outside, axis=1))
-    return Shares(
-        whole,
-        lost,
-        shares(response.arrived - response.left),
-        shares(response.escaped),
-        shares(response.late),
-        shares(response.remaining),
-    )
+        of_all += [jnp.sum(response.higher, axis=(1, 3)), jnp.sum(response.higher_outside, axis=1)]
+    whole, lost = shares(of_short, short)
+    escaped, late, remaining, *others = shares(of_all, table)
+    if len(others) > len(materials):
+        whole, lost = whole + others[-2], lost + others[-1]
+    return Shares(whole, lost, jnp.stack(others[: len(materials)]), escaped, late, remaining)
 
 
 def balance(response: Response, recording: Recording) -> Balance:

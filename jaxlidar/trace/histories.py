@@ -46,12 +46,12 @@ class Histories:
 
         Powers are repeated products: exact, with finite derivatives, at zero too.
         """
+        powers, square = jnp.ones((1, *optics.shape), optics.dtype), optics[None]
+        while len(powers) <= self.degree:
+            powers, square = jnp.concatenate([powers, powers * square]), square * square
         product = jnp.ones((self.count, optics.shape[1]), optics.dtype)
         for letter in range(self.letters):
-            powers = [jnp.ones_like(optics[letter])]
-            for _ in range(self.degree):
-                powers.append(powers[-1] * optics[letter])
-            product = product * jnp.stack(powers)[self.exponents[:, letter]]
+            product = product * powers[self.exponents[:, letter], letter]
         return product
 
 
