@@ -1,7 +1,6 @@
 """From response to samples: optics of every history, the atmosphere, the pulse, and where the energy went."""
 
 import dataclasses
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import equinox as eqx
@@ -266,22 +265,24 @@ def shares_of(response: Response, recording: Recording) -> Shares:
     short = recording.short
     table = short if response.higher is None else recording.table
 
-    def shares(rows: list[Array], table: Histories) -> Iterator[Array]:
+    def shares(rows: list[Array], table: Histories) -> Array:
         """What rows of (traces, histories) sum up to, all in one product."""
         found = recording.spread(recording.colour(jnp.stack(rows, axis=-1), table))
-        return iter(jnp.moveaxis(found, -1, 0))
+        return jnp.moveaxis(found, -1, 0)
 
-    absorbed = response.arrived - response.left
-    materials = [absorbed[:, m] for m in range(absorbed.shape[1])]
-    of_short = [jnp.sum(response.first, axis=(1, 3)), jnp.sum(response.first_outside, axis=1)]
-    of_all = [response.escaped, response.late, response.remaining, *materials]
+    whole, lost = shares(
+        [jnp.sum(response.first, axis=(1, 3)), jnp.sum(response.first_outside, axis=1)], short
+    )
+    of_all = [response.escaped, response.late, response.remaining]
     if response.higher is not None and response.higher_outside is not None:
         of_all += [jnp.sum(response.higher, axis=(1, 3)), jnp.sum(response.higher_outside, axis=1)]
-    whole, lost = shares(of_short, short)
-    escaped, late, remaining, *others = shares(of_all, table)
-    if len(others) > len(materials):
-        whole, lost = whole + others[-2], lost + others[-1]
-    return Shares(whole, lost, jnp.stack(others[: len(materials)]), escaped, late, remaining)
+    fates = len(of_all)
+    absorbed = response.arrived - response.left
+    materials = [absorbed[:, m] for m in range(absorbed.shape[1])]
+    found = shares([*of_all, *materials], table)
+    if fates > 3:
+        whole, lost = whole + found[3], lost + found[4]
+    return Shares(whole, lost, found[fates:], found[0], found[1], found[2])
 
 
 def balance(response: Response, recording: Recording) -> Balance:

@@ -31,7 +31,7 @@ from jaxlidar.trace.labels import Label, book
 from jaxlidar.trace.march import depth_to_top, free_flight
 from jaxlidar.trace.nodes import Nodes
 from jaxlidar.trace.photons import THROUGH, Hit, Photons, ratio_of, stop
-from jaxlidar.trace.random_numbers import Draw, Independent, lattices
+from jaxlidar.trace.random_numbers import Draw, Independent, lattices, to_unit, words
 from jaxlidar.trace.reparametrise import (
     footprint_rays,
     moves_landings,
@@ -70,14 +70,17 @@ def higher_orders(setting: Setting, key: PRNGKeyArray, nodes: Nodes | None = Non
     """
     beam, medium, plan, bins = setting.beam, setting.medium, setting.plan, setting.bins
     photons = setting.sizes.photons if nodes is None else nodes.photons
-    footprint_key, draw_key = jax.random.split(key)
     plates = sum(s.plate for s in setting.surfaces)
     dimensions = Draw.dimensions(plates)
-    shift = jax.random.uniform(footprint_key, (2,))
+    # Words before these shift the footprint of order one.
+    drawn = words(key, 4 + 2 * plan.order_steps * dimensions)[2:]
+    shift, places = to_unit(drawn[:2]), None
+    numbers = lattices(drawn[2:], plan.order_steps, dimensions)
+    footprint_key = key
+    if plan.independent or nodes is not None:
+        footprint_key, key = jax.random.split(key)
     if plan.independent:
-        numbers, places = Independent(draw_key, dimensions), Independent(footprint_key, 2)
-    else:
-        numbers, places = lattices(draw_key, plan.order_steps, dimensions), None
+        numbers, places = Independent(key, dimensions), Independent(footprint_key, 2)
     size = min(CHUNK, photons)
     chunks = -(-photons // size)
     groups = -(-chunks * size // (GROUP * CHUNK))

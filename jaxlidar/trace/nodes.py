@@ -8,14 +8,13 @@ Photons of two nodes are independent, so that variances of sums over nodes are s
 """
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt32
 
 from jaxlidar._vectors import Scalar, along, dot
 from jaxlidar.trace.photons import Photons
-from jaxlidar.trace.random_numbers import lattices
+from jaxlidar.trace.random_numbers import lattices, words
 from jaxlidar.trace.setting import Setting, unscattered
 
 # Rays of order one that are traced together.
@@ -94,10 +93,10 @@ class Nodes(eqx.Module):
         self, node: Int[Array, "*s"], turn: Int[Array, "*s"], key: PRNGKeyArray
     ) -> tuple[UInt32[Array, "*s"], tuple[Scalar, Scalar]]:
         """Numbers, which of two nodes differ at random, and places of entry, one lattice for each node."""
-        far, near = jax.random.split(key)
-        stride = jax.random.bits(far, (), jnp.uint32) | jnp.uint32(1)
+        drawn = words(key, 5)
+        stride = drawn[0] | jnp.uint32(1)
         number = turn.astype(jnp.uint32) + node.astype(jnp.uint32) * stride
         shares, places = (jnp.asarray(a, float) for a in (_SHARES / _SHARES[-1], _PLACES))
-        off = [jnp.interp(u, shares, places) for u in lattices(near, 1, 2)(number, jnp.asarray(0))]
+        off = [jnp.interp(u, shares, places) for u in lattices(drawn[1:], 1, 2)(number, jnp.asarray(0))]
         x, y = (self.place[node, k] + self.spacing * off[k] for k in range(2))
         return number, (x, y)

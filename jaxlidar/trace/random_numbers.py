@@ -57,7 +57,7 @@ class Lattices(eqx.Module):
     def __call__(self, photon: UInt32[Array, "*photons"], order: Array) -> list[Float[Array, "*photons"]]:
         """One array for each dimension."""
         return [
-            _to_unit(photon * self.step[order, d] + self.shift[order, d]) for d in range(self.step.shape[1])
+            to_unit(photon * self.step[order, d] + self.shift[order, d]) for d in range(self.step.shape[1])
         ]
 
 
@@ -70,21 +70,29 @@ class Independent(eqx.Module):
     def __call__(self, photon: UInt32[Array, "photons"], order: Array) -> list[Float[Array, "photons"]]:
         """One array for each dimension. Photons come in blocks, each known by its first photon."""
         key = jax.random.fold_in(jax.random.fold_in(self.key, order), photon[0])
-        return list(_to_unit(jax.random.bits(key, (self.dims, photon.size), jnp.uint32)))
+        return list(to_unit(jax.random.bits(key, (self.dims, photon.size), jnp.uint32)))
 
 
-def lattices(key: PRNGKeyArray, orders: int, dims: int) -> Lattices:
-    """Lattices for `orders` collisions of `dims` numbers each."""
-    a, b = jax.random.split(key)
-    step = jax.random.bits(a, (orders, dims), jnp.uint32) | jnp.uint32(1)
-    shift = jax.random.bits(b, (orders, dims), jnp.uint32)
+def words(key: PRNGKeyArray, count: int) -> UInt32[Array, "count"]:
+    """The first random words of a key; those of a smaller count are the first of them.
+
+    All that a program draws it takes from one call, for compiling each generator takes a while.
+    """
+    return jax.random.bits(key, (count,), jnp.uint32)
+
+
+def lattices(drawn: UInt32[Array, "words"], orders: int, dims: int) -> Lattices:
+    """Lattices for `orders` collisions of `dims` numbers each, from two random words for each number."""
+    drawn = drawn.reshape(orders, 2, dims)
+    step, shift = drawn[:, 0] | jnp.uint32(1), drawn[:, 1]
     root = np.roots([1.0, *[0.0] * (dims - 1), -1.0, -1.0])
     ratio = float(np.real(root[np.argmax(np.real(root))]))
     golden = np.floor(2.0**32 * ((1.0 / ratio ** np.arange(1, dims + 1)) % 1.0)).astype(np.uint32)
     return Lattices(step.at[0].set(jnp.asarray(golden)), shift)
 
 
-def _to_unit(bits: UInt32[Array, "*s"]) -> Float[Array, "*s"]:
+def to_unit(bits: UInt32[Array, "*s"]) -> Float[Array, "*s"]:
+    """Uniform numbers in (0, 1) from random words."""
     if jnp.finfo(jnp.zeros(()).dtype).bits == 64:
         return (bits.astype(float) + 0.5) * 2.0**-32
     return ((bits >> 9).astype(float) + 0.5) * 2.0**-23

@@ -21,6 +21,7 @@ from jaxlidar.trace.first_order import FirstOrder, first_order
 from jaxlidar.trace.footprint import WHOLE, Slice, lattice, product_rule, scattered
 from jaxlidar.trace.higher_orders import HigherOrders, higher_orders
 from jaxlidar.trace.mirror import mirror_rays
+from jaxlidar.trace.random_numbers import to_unit, words
 from jaxlidar.trace.setting import Setting, setting_of, straight_transmittance
 
 Traced = TypeVar("Traced")
@@ -199,8 +200,11 @@ def _for_each(
 
 
 def _keys(setting: Setting, key: PRNGKeyArray) -> tuple[PRNGKeyArray, PRNGKeyArray]:
-    """Keys of the footprint and of photons; what is not random is compiled without random numbers."""
-    if not setting.sizes.random:
+    """Keys of the footprint and of photons.
+
+    Photons leave out the words with which the footprint is shifted: one key serves both.
+    """
+    if not setting.plan.independent:
         return key, key
     shift, photons = jax.random.split(key)
     return shift, photons
@@ -230,7 +234,7 @@ def footprint_of(
     if setting.plan.independent:
         assert part is WHOLE, "independent rays have no parts"
         return scattered(beam, sizes.rays, key)
-    shift = jax.random.uniform(key, (2,)) if sizes.shifted else jnp.asarray([0.5, 0.0])
+    shift = to_unit(words(key, 2)) if sizes.shifted else jnp.asarray([0.5, 0.0])
     return lattice(beam, sizes.rays, shift, part)
 
 
