@@ -205,7 +205,7 @@ def invert_leaves(
             raise ValueError(f"{field} = {value} is outside the admissible range [1, inf) of integers")
     x = np.asarray(wavelengths, float)
     groups = [(group, *bands_of(x, span, group)) for span, group in domains_of(domain, names).items()]
-    dtype = jnp.zeros(()).dtype
+    dtype = jnp.result_type(float)
     absorption, face = material(leaf, x)
     absorption, face = absorption.astype(dtype), jax.tree.map(lambda a: jnp.asarray(a, dtype), face)
     sigma = jnp.broadcast_to(jnp.asarray(sigma, dtype), observed.shape)

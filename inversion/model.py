@@ -158,7 +158,7 @@ def check_place(lidar: Lidar) -> None:
 
     **Raises:** ValueError with the rounding.
     """
-    place, kind = concrete(lidar.position), jnp.zeros(()).dtype
+    place, kind = concrete(lidar.position), jnp.result_type(float)
     if place is None:
         return
     rounding = float(np.max(np.spacing(np.abs(place).astype(kind))))

@@ -45,7 +45,7 @@ def portable(key: PRNGKeyArray) -> tuple[np.ndarray, str | None]:
 
 def task(number: int, function: Callable[..., Any], arguments: tuple[Any, ...], key: PRNGKeyArray) -> Task:
     """The chunk of work `function(*arguments, key)`, in JAX's present precision."""
-    return Task(number, function, arguments, portable(key), jnp.zeros(()).dtype.itemsize == 8)
+    return Task(number, function, arguments, portable(key), jnp.result_type(float).itemsize == 8)
 
 
 def done(task: Task) -> Outcome:

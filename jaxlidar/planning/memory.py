@@ -31,7 +31,7 @@ def machine_memory() -> float:
 
 def response_bytes(trace: TracePlan, bins: Bins, degree: int, first_degree: int, traces: int) -> float:
     """Bytes of a response of `traces` traces, with histories of these degrees."""
-    item = jnp.zeros(()).dtype.itemsize
+    item = jnp.result_type(float).itemsize
     letters, materials = len(trace.letters), len(trace.materials)
     full = math.comb(degree + letters, letters) if trace.order_steps > 1 or trace.drawn_first else 0
     short = math.comb(first_degree + letters, letters)
@@ -48,7 +48,7 @@ def predicted(
     on.
     """
     response = response_bytes(trace, bins, degree, first_degree, traces)
-    matrix = jnp.zeros(()).dtype.itemsize * min(bins.count * samples, max(DENSE, pulse))
+    matrix = jnp.result_type(float).itemsize * min(bins.count * samples, max(DENSE, pulse))
     return response * (_COPIES * (os.cpu_count() or 1) + 1) + 2 * matrix + _COMPILING
 
 
@@ -81,7 +81,7 @@ def jacobian_bytes(
     response = response_bytes(trace, bins, degree, first_degree, traces)
     photons, rays = light
     moving = photons + min(rays, _RAYS) * trace.first_steps
-    each = _TANGENTS * response + _NUMBERS * moving * jnp.zeros(()).dtype.itemsize
+    each = _TANGENTS * response + _NUMBERS * moving * jnp.result_type(float).itemsize
     return (batches + 1) * response + cores * (response + columns * each)
 
 

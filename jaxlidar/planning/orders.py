@@ -57,13 +57,15 @@ def order_steps(orders: int, plates: int, letters: int) -> int:
 
 def mean_depth(canopy: Canopy) -> float:
     """Optical depth of the canopy straight down, the mean over its columns that hold anything."""
-    extinction = np.zeros(canopy.voxels.shape)
+    extinction = np.zeros(canopy.voxels.shape[:2])
     for part in (canopy.voxels.leaf, canopy.voxels.bark):
-        known = None if part is None else concrete(part)
-        if part is not None and known is None:
+        if part is None:
+            continue
+        known = concrete(part)
+        if known is None:
             return math.inf
-        extinction = extinction if known is None else extinction + known
-    columns = extinction.sum(axis=2) * known_number(canopy.voxels.voxel_size[2])
+        extinction += known.sum(axis=2, dtype=float)
+    columns = extinction * known_number(canopy.voxels.voxel_size[2])
     there = columns[columns > 0]
     return float(there.mean()) if there.size else 0.0
 

@@ -314,7 +314,7 @@ def plan(
     degree = degree if keeps else 0
     memory = memory_of(orders, keeps)
     check_memory(memory, limit)
-    most = max(n for n in range(orders, max(chosen.most, orders) + 1) if memory_of(n, keeps) <= limit)
+    most = next(n for n in range(max(chosen.most, orders), orders - 1, -1) if memory_of(n, keeps) <= limit)
     rows = ()
     if describe:
         rows = effect_table(*whole, off, chosen, airy, geometry.upstream, whole_first=window is None)

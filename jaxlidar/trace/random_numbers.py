@@ -93,6 +93,6 @@ def lattices(drawn: UInt32[Array, "words"], orders: int, dims: int) -> Lattices:
 
 def to_unit(bits: UInt32[Array, "*s"]) -> Float[Array, "*s"]:
     """Uniform numbers in (0, 1) from random words."""
-    if jnp.finfo(jnp.zeros(()).dtype).bits == 64:
+    if jnp.finfo(jnp.result_type(float)).bits == 64:
         return (bits.astype(float) + 0.5) * 2.0**-32
     return ((bits >> 9).astype(float) + 0.5) * 2.0**-23
