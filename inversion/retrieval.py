@@ -13,11 +13,12 @@ from jaxlidar import Lidar, Plan, Scene, Waveform
 from jaxlidar.extend import check_integer, check_key, check_kind, check_kinds, check_range
 
 from .data import Data, at_fixed_times, data_of
-from .fit import Fit, Outcome, best_of, bounds_of, drive, labels_of, named, smooth_names
+from .fit import Fit, Outcome, bounds_of, drive, labels_of, named, smooth_names
 from .model import Model
 from .planning import batch_sizes, plan_within
 from .recorder import Recorder, Terms, check_names
 from .result import Retrieval, Step
+from .starts import best_of
 from .unknowns import Place, Settled, Unknown, latin_hypercube, settle
 
 SOLVER = optx.LevenbergMarquardt(rtol=1e-3, atol=1e-3)
