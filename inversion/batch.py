@@ -74,7 +74,7 @@ class Retrievals(AbstractFitted):
     - `strength`: by name, (footprints,). `bounds`: by name, (2, ...), those of all footprints.
     - `reduced_chi2`, `second_minimum`, `independent_samples`: (footprints,).
     - `converged`: (footprints,) whether the fit ended at a minimum.
-    - `steps`: (footprints,) waveforms simulated, each with its Jacobian.
+    - `steps`: (footprints,) waveforms simulated, with few photons or all, each with its Jacobian.
     - `fitted`: (footprints, wavelengths, bins) apparent reflectance, without the scale.
     - `status`: a sentence for each footprint on how its fit ended.
     - `labels`: names of the rows of `covariance`.

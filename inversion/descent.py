@@ -74,7 +74,7 @@ def descend_within(
                 return best, True, fit.ended("converged")
             if rejected > stalled[-1][0]:
                 return best, False, fit.ended("failed: no step improves the fit")
-            if fit.count >= fit.max_steps:
+            if fit.spent:
                 return best, False, fit.ended("not converged: stopped at max_steps")
             trial = yield from fit.at(outside(values + share * step, fit.low, fit.high))
             fit.count += 1

@@ -5,6 +5,10 @@ of the simulation; a prior adds one residual per value. With fixed random number
 except for small jumps, and its derivatives are unbiased estimates of the derivatives of its expectation. Near
 the minimum the two disagree by a fraction of a standard error and no step improves the fit: it ends there.
 
+Simulations come in batches of photons. Where photons are traced at every step, a fit descends with few of the
+batches as far as they can tell, and goes on from there with all. What it ends with, and all that is said of
+it, comes from all batches.
+
 A fit is a generator: it yields the values at which it needs a simulation, and is sent the result. The same
 code serves one fit and many at once.
 """
@@ -33,6 +37,8 @@ from .unknowns import Settled
 _SMALL_STEP = 0.05
 # It has also converged after (so many rejected steps, if the step is below so many standard errors).
 _STALLED = ((1, 0.3), (3, 0.6), (8, 1.0))
+# The same with few batches, which tell no more: it goes on with all of them.
+_SMALL_STEP_OF_FEW, _STALLED_OF_FEW = 1.0, ((1, 2.0), (3, 5.0))
 # Largest change of a free parameter in one step: far out the bijection is flat, and a fit would be stuck.
 _LONGEST_STEP = 2.0
 # At the solution the weights are renewed if those of the start differ by more than this, in the mean.
@@ -63,10 +69,15 @@ def _advance(solver: Any, y: Array, args: Any, state: Any) -> Any:
 
 
 class Request(NamedTuple):
-    """Values at which a fit needs a simulation, and whether it needs the batches one by one."""
+    """Values at which a fit needs a simulation.
+
+    - `spread`: whether it needs the batches one by one.
+    - `few`: whether few of the batches will do.
+    """
 
     values: np.ndarray
     spread: bool
+    few: bool
 
 
 class Outcome(NamedTuple):
@@ -113,47 +124,6 @@ def drive(fitting: Fitting, simulate: Callable[[Request], Evaluation]) -> Outcom
         return end.value
 
 
-def best_of(fits: "Sequence[Fit]") -> Fitting:
-    """Run fits from several starts, one after the other, and select the converged one of the lowest cost.
-
-    **Returns:** its outcome, with the steps of all fits.
-    """
-    outcomes = []
-    for fit in fits:
-        outcomes.append((yield from fit.run()))
-    best = min(outcomes, key=lambda o: (not o.converged, not np.isfinite(o.cost), o.cost))
-    if len(fits) == 1:
-        return best
-    second, robust = among(best, [o for o in outcomes if o.converged and o is not best])
-    near = sum(o.converged and o.cost < best.cost + 1.0 for o in outcomes)
-    return best._replace(
-        steps=sum(o.steps for o in outcomes),
-        history=tuple(h for o in outcomes for h in o.history),
-        status=f"{best.status}; {near} of {len(fits)} starts ended there",
-        second_minimum=second,
-        robust_stderr=robust,
-    )
-
-
-def among(best: Outcome, others: Sequence[Outcome]) -> tuple[float, np.ndarray]:
-    """How much likelier the best end is than the next, and standard errors with the spread over ends.
-
-    Ends are alike within two standard errors of all unknowns. Chi-squared counts correlated samples by what
-    they tell, and in units of the best fit's; an end weighs exp(-rise / 2).
-    """
-    telling = (
-        best.independent_samples / max(np.count_nonzero(best.residuals), 1) / max(best.reduced_chi2, 1.0)
-    )
-    second, variance, weight = np.inf, np.zeros_like(best.values), 1.0
-    for other in others:
-        rise, away = max(other.cost - best.cost, 0.0) * telling, other.values - best.values
-        if np.any(np.abs(away) > 2.0 * best.robust_stderr):
-            second = min(second, rise)
-        variance += np.exp(-0.5 * rise) * away**2
-        weight += np.exp(-0.5 * rise)
-    return float(second), np.hypot(best.robust_stderr, np.sqrt(variance / weight))
-
-
 class Point:
     """One simulation: the values, its result, and the residuals with their Jacobian in natural units."""
 
@@ -189,12 +159,13 @@ class Fit:
         self.correlation = correlation_between(float(terms.recorder.correlation), data.used)
         self.noise = Noise(data.sigma[data.used], None, self.correlation)
         self.count, self.history = 0, []
+        self.few = max_steps > 1
 
     # -- simulation ------------------------------------------------------------------------------------
 
     def at(self, z: np.ndarray, *, spread: bool = False) -> Generator[Request, Evaluation, Point]:
         values = inside(z, self.low, self.high)[0]
-        evaluation = yield Request(values[: values.size - self.terms.count], spread)
+        evaluation = yield Request(values[: values.size - self.terms.count], spread, self.few)
         return Point(self, z, evaluation)
 
     def own(self, values: np.ndarray) -> np.ndarray:
@@ -237,6 +208,12 @@ class Fit:
                 best, False, "failed: at the starting values the simulated waveform is not finite"
             )
         self.reweigh(best)
+        # Where photons are traced once, or in one batch, all come at once.
+        self.few = best.evaluation.few
+        if self.few:
+            best = yield from self.approach(best)
+            if not best.finite:
+                return self.result(best, False, self.ended("failed: the simulated waveform is not finite"))
         best, converged, status = yield from self.settle_down(best)
         if converged and best.evaluation.batches is None:
             best = yield from self.at(best.z, spread=True)
@@ -246,12 +223,22 @@ class Fit:
                 best = yield from self.at(best.z, spread=True)
         return self.result(best, converged, status)
 
+    def approach(self, best: Point) -> Generator[Request, Evaluation, Point]:
+        """Descend as far as few of the batches can tell, and simulate there with all of them."""
+        best, _, _ = yield from self.settle_down(best)
+        self.few = False
+        best = yield from self.at(best.z, spread=True)
+        self.count += 1
+        if best.finite:
+            self.reweigh(best)
+        return best
+
     def settle_down(self, best: Point) -> Generator[Request, Evaluation, tuple[Point, bool, str]]:
         """Descend, with strengths of smoothness priors by the data: each is that of the fit with it."""
         for _ in range(_MOST_STRENGTHS):
             way = self.descend(best)
             if self.prior.blocks:
-                way = descend_within(self, best, _SMALL_STEP, _STALLED)
+                way = descend_within(self, best, *self.small)
             best, converged, status = yield from way
             if not converged or not self.prior.by_the_data:
                 return best, converged, status
@@ -282,17 +269,28 @@ class Fit:
             else:
                 rejected += 1
             self.report(trial, accepted)
-            stalled = any(rejected >= n and remaining < limit for n, limit in _STALLED)
-            if bool(done) or remaining < _SMALL_STEP or stalled:
+            small, limits = self.small
+            stalled = any(rejected >= n and remaining < limit for n, limit in limits)
+            if bool(done) or remaining < small or stalled:
                 return best, True, self.ended("converged")
             if not bool(sound):
                 return best, False, self.ended("failed: the equations for the next step could not be solved")
-            if self.count >= self.max_steps:
+            if self.spent:
                 return best, False, self.ended("not converged: stopped at max_steps")
             ahead = jnp.clip(state.y_eval - y, -_LONGEST_STEP, _LONGEST_STEP)
             state = eqx.tree_at(lambda s: s.y_eval, state, y + ahead)
             trial = yield from self.at(np.asarray(state.y_eval, float))
             self.count += 1
+
+    @property
+    def small(self) -> tuple[float, tuple[tuple[int, float], ...]]:
+        """The length of a step at which a descent ends, and those at which it does after rejected steps."""
+        return (_SMALL_STEP_OF_FEW, _STALLED_OF_FEW) if self.few else (_SMALL_STEP, _STALLED)
+
+    @property
+    def spent(self) -> bool:
+        """Whether no simulation is left; half of them are for all batches."""
+        return self.count >= (self.max_steps // 2 if self.few else self.max_steps)
 
     def free(self, p: Point, r: np.ndarray, jacobian: np.ndarray) -> np.ndarray:
         """Which unknowns are free: not at a bound beyond which the fit would be better."""

@@ -16,10 +16,11 @@ from jaxlidar.extend import outcomes, task
 
 from .checkpoint import Row, row_of
 from .data import Data
-from .fit import Fitting, Request, best_of
+from .fit import Fitting, Request
 from .lanes import Lanes, Simulator
 from .recorder import Recorder, Terms
 from .retrieval import fits_from
+from .starts import best_of
 from .unknowns import Settled
 
 # Fits that a worker does in turn in one lane, before it gives back what it has.

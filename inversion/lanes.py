@@ -1,6 +1,7 @@
 """Simulation of many scenes at once: the requests of several fits in one compiled call.
 
-The call has a fixed number of lanes, one for each fit that runs, and threads that share them.
+The call has a fixed number of lanes, one for each fit that runs, and threads that share them. How many
+batches of photons a lane traces is data: few or all, or none where it is idle, by one compiled program.
 """
 
 import dataclasses
@@ -55,17 +56,24 @@ class Simulator:
         self.lanes, self.lidars, self.scenes = lanes, lidars, scenes
 
     def __call__(self, requests: dict[int, Request]) -> dict[int, Evaluation]:
-        numbers = list(requests)
-        groups = [numbers[i : i + self.lanes.each] for i in range(0, len(numbers), self.lanes.each)]
+        # Dealt to the threads by their work.
+        numbers = sorted(requests, key=lambda i: self._batches(requests[i]))
+        threads = min(self.lanes.threads, len(numbers))
+        groups = [numbers[i::threads] for i in range(threads)]
         found: dict[int, Evaluation] = {}
         with side_by_side(self.lanes.threads) as run:
             for more in run(lambda group: self._group(group, requests), groups):
                 found |= more
         return found
 
+    def _batches(self, request: Request) -> int:
+        return self.model.few if request.few else len(self.model.keys)
+
     def _group(self, group: list[int], requests: dict[int, Request]) -> dict[int, Evaluation]:
-        # The compiled call has a fixed number of lanes: idle ones repeat the last.
-        padded = [*group, *[group[-1]] * (self.lanes.each - len(group))]
+        # The compiled call has a fixed number of lanes: idle ones trace nothing.
+        idle = self.lanes.each - len(group)
+        padded = [*group, *[group[-1]] * idle]
+        counts = [*(self._batches(requests[i]) for i in group), *[0] * idle]
         values = jax.tree.map(
             lambda *a: jnp.stack(a), *(self.model.values(requests[i].values) for i in padded)
         )
@@ -73,14 +81,15 @@ class Simulator:
         model = self.model
         problem = dataclasses.replace(model.problem, lidar=lidar, scene=scene)
         own = Own(len(self.lidars) > 1, len(self.scenes) > 1)
-        out = _simulate(problem, values, jnp.stack(model.keys), own)
+        out = _simulate(problem, values, jnp.stack(model.keys), jnp.array(counts), own)
         total, columns, batches = (np.asarray(a, float) for a in out)
         return {
             i: Evaluation(
                 total[n],
                 np.moveaxis(columns[n][model.order], 0, -1),
                 None,
-                batches[n] if model.problem.plan.is_random else None,
+                batches[n][: counts[n]] if model.problem.plan.is_random else None,
+                counts[n] < len(model.keys),
             )
             for n, i in enumerate(group)
         }
@@ -101,21 +110,23 @@ class Own(NamedTuple):
 
 
 @eqx.filter_jit(**ONE_CORE)
-def _simulate(problem: Problem, values: Any, keys: Array, own: Own) -> tuple[Array, Array, Array]:
+def _simulate(
+    problem: Problem, values: Any, keys: Array, counts: Array, own: Own
+) -> tuple[Array, Array, Array]:
     lidar, fixed_lidar = eqx.partition(problem.lidar, eqx.is_array)
     scene, fixed_scene = eqx.partition(problem.scene, eqx.is_array)
 
-    def one(lidar: Lidar, scene: Scene, values: Any) -> tuple[Array, Array, Array]:
+    def one(lidar: Lidar, scene: Scene, values: Any, count: Array) -> tuple[Array, Array, Array]:
         lidar, scene = eqx.combine(lidar, fixed_lidar), eqx.combine(scene, fixed_scene)
-        return evaluate(dataclasses.replace(problem, lidar=lidar, scene=scene), values, keys)
+        return evaluate(dataclasses.replace(problem, lidar=lidar, scene=scene), values, keys, count)
 
     if problem.plan.orders == 1:
-        axes = (0 if own.lidar else None, 0 if own.scene else None, 0)
-        return jax.vmap(one, in_axes=axes)(lidar, scene, values)
+        axes = (0 if own.lidar else None, 0 if own.scene else None, 0, 0)
+        return jax.vmap(one, in_axes=axes)(lidar, scene, values, counts)
 
     # Batched with vmap, every lane would be traced until the photons of the slowest have ended.
     def in_turn(each: tuple) -> tuple[Array, Array, Array]:
-        return one(each[0] if own.lidar else lidar, each[1] if own.scene else scene, each[2])
+        return one(each[0] if own.lidar else lidar, each[1] if own.scene else scene, *each[2:])
 
-    mapped = (lidar if own.lidar else None, scene if own.scene else None, values)
+    mapped = (lidar if own.lidar else None, scene if own.scene else None, values, counts)
     return jax.lax.map(in_turn, mapped)

@@ -6,6 +6,7 @@ does not depend on them, or as many as memory allows. Where no unknown is geomet
 
 All evaluations use the same random keys, so that the waveform is a smooth function of the unknowns. An
 evaluation averages batches of photons, each with its own key; their spread is the simulation's own noise.
+Few of the batches are an evaluation as well, of more noise, for fits that are far from their end.
 """
 
 from collections.abc import Callable, Sequence
@@ -16,7 +17,7 @@ import jax
 import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from jaxlidar import Lidar, Plan, Response, Scene, Setup, Waveform, reduce, total_of, trace_scene, waveform_of
 from jaxlidar.extend import ONE_CORE, concrete, side_by_side
@@ -26,6 +27,8 @@ from .columns import columns_at_once
 from .unknowns import Place, Settled, put
 
 Values = tuple[Array, ...]
+# So many batches are few: a quarter of the work of all, and their difference still tells the noise.
+FEW_BATCHES = 2
 # Rounding of coordinates, m, with which fits are still admissible.
 ROUNDING = 1e-3
 
@@ -122,7 +125,7 @@ def _mean(responses: list[Any]) -> Any:
 
 
 def evaluate(
-    problem: Problem, values: Values, keys: Array
+    problem: Problem, values: Values, keys: Array, count: Int[Array, ""]
 ) -> tuple[
     Float[Array, "wavelengths bins"],
     Float[Array, "columns wavelengths bins"],
@@ -130,12 +133,23 @@ def evaluate(
 ]:
     """Total, derivatives (geometric columns, then optical ones) and batches of one scene, in one function.
 
-    Pure, to be batched over scenes; `keys` has one random key for each batch of photons.
+    Pure, to be batched over scenes; `keys` has one random key for each batch of photons. Only the first
+    `count` batches are traced: the others are zero.
     """
-    responses, totals, columns = jax.lax.map(lambda key: _batch(problem, values, key), keys)
-    response = jax.tree.map(lambda a: jnp.mean(a, axis=0), responses)
+    batch = jax.jit(lambda key: _batch(problem, values, key))
+
+    def add(n: Array, sums: Any) -> Any:
+        response, total, columns = batch(keys[n])
+        summed, totals = sums
+        return jax.tree.map(jnp.add, summed, (response, columns)), totals.at[n].set(total)
+
+    shapes = jax.eval_shape(batch, keys[0])
+    response, total, columns = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), shapes)
+    none = (response, columns), jnp.zeros((len(keys), *total.shape), total.dtype)
+    sums, totals = jax.lax.fori_loop(0, count, add, none)
+    response, columns = jax.tree.map(lambda a: a / jnp.maximum(count, 1), sums)
     total, more = _colour(problem, values, response)
-    return total, jnp.concatenate([jnp.mean(columns, axis=0), more]), totals
+    return total, jnp.concatenate([columns, more]), totals
 
 
 class Evaluation(NamedTuple):
@@ -145,12 +159,14 @@ class Evaluation(NamedTuple):
     - `jacobian`: (wavelengths, bins, columns), columns in the order of the flattened unknowns.
     - `response`: mean of the batches' responses, or None where many scenes are simulated together.
     - `batches`: (batches, wavelengths, bins) the total of each, or None where it was not asked for.
+    - `few`: whether these are few of the batches. Default False: they are all.
     """
 
     total: np.ndarray
     jacobian: np.ndarray
     response: Response | None
     batches: np.ndarray | None
+    few: bool = False
 
 
 def check_place(lidar: Lidar) -> None:
@@ -185,8 +201,9 @@ class Model:
         self.dtypes = [s.start.dtype for s in settled]
         self.sizes = [s.start.size for s in settled]
         self.keys = [jax.random.fold_in(key, n) for n in range(MIN_BATCHES if plan.is_random else 1)]
+        self.few = min(FEW_BATCHES, len(self.keys))
         self.traces = any(p.geometric for p in self.problem.places)
-        self._kept: tuple[Any, list[Any]] | None = None
+        self._kept: tuple[np.ndarray, list[Any]] | None = None
         owner = np.repeat(np.arange(len(self.sizes)), self.sizes)
         geometric = np.array([p.geometric for p in self.problem.places], bool)[owner]
         self.order = np.argsort(np.concatenate([np.flatnonzero(geometric), np.flatnonzero(~geometric)]))
@@ -200,35 +217,49 @@ class Model:
         """The scene with these values."""
         return put(self.problem.scene, self.problem.places, self.values(flat))
 
-    def __call__(self, flat: Float[np.ndarray, " columns"], *, spread: bool = False) -> Evaluation:
-        """Simulate at the values `flat`; with `spread`, give the batches one by one as well."""
-        values = self.values(flat)
-        batches, columns = None, None
-        if self.traces or self._kept is None:
-            traced = self._trace(values)
-            responses = [t[0] for t in traced]
-            response = _mean(responses)
-            batches = np.stack([np.asarray(t[1], float) for t in traced])
-            columns = np.mean([np.asarray(t[2], float) for t in traced], axis=0)
-            if not self.traces:
-                self._kept = response, responses
-        else:
-            response, responses = self._kept
-            if spread:
-                batches = np.stack(
-                    [np.asarray(_colour(self.problem, values, r)[0], float) for r in responses]
-                )
-        total, more = _colour(self.problem, values, response)
-        more = np.asarray(more, float)
-        columns = np.concatenate([more[:0] if columns is None else columns, more])[self.order]
-        return Evaluation(np.asarray(total, float), np.moveaxis(columns, 0, -1), response, batches)
+    def __call__(
+        self, flat: Float[np.ndarray, " columns"], *, spread: bool = False, few: bool = False
+    ) -> Evaluation:
+        """Simulate at the values `flat`.
 
-    def _trace(self, values: Values) -> list[Any]:
+        **Arguments:**
+
+        - `spread`: whether the batches are needed one by one. Default False.
+        - `few`: whether few of the batches will do; where none is traced again, all are given. Default False.
+        """
+        values = self.values(flat)
+        fresh = self.traces or self._kept is None
+        traced = self._trace(flat, self.few if few and self.traces else len(self.keys))
+        responses = [t[0] for t in traced]
+        response, batches = _mean(responses), None
+        total, more = _colour(self.problem, values, response)
+        columns = np.asarray(more, float)
+        if fresh:
+            batches = np.stack([np.asarray(t[1], float) for t in traced])
+            geometric = np.mean([np.asarray(t[2], float) for t in traced], axis=0)
+            columns = np.concatenate([geometric, columns])
+        elif spread:
+            batches = np.stack([np.asarray(_colour(self.problem, values, r)[0], float) for r in responses])
+        jacobian = np.moveaxis(columns[self.order], 0, -1)
+        few = len(traced) < len(self.keys)
+        return Evaluation(np.asarray(total, float), jacobian, response, batches, few)
+
+    def _trace(self, flat: Float[np.ndarray, " columns"], number: int) -> list[Any]:
+        """The first batches, so many. Those of the last call are kept where they serve again."""
+        kept = []
+        if self._kept is not None and (not self.traces or np.array_equal(self._kept[0], flat)):
+            kept = self._kept[1]
+        values = self.values(flat)
+
         def one(key):
             return _compiled_batch(self.problem, values, key)
 
         with side_by_side() as run:
-            return list(run(one, self.keys))
+            traced = [*kept[:number], *run(one, self.keys[len(kept) : number])]
+        # With all of them, a fit goes on to other values.
+        again = not self.traces or number < len(self.keys)
+        self._kept = (np.array(flat), traced) if again else None
+        return traced
 
     def waveform(
         self, flat: Float[np.ndarray, " columns"], evaluation: Evaluation, stderr: np.ndarray

@@ -19,7 +19,10 @@ from .quality import Verdict, judge_fit
 
 @dataclasses.dataclass(frozen=True)
 class Step:
-    """One step of a fit, as `retrieve` passes it to `progress`.
+    """One step of a fit, as `retrieve` passes it to `progress`: values that were tried in a simulation.
+
+    The first steps of a fit may trace few of the photons, the last ones trace all. Chi-squared, which counts
+    the simulation's own noise, may rise between the two.
 
     - `number`: from 1 on.
     - `reduced_chi2`: reduced chi-squared at the values tried.
@@ -77,8 +80,8 @@ class Retrieval(AbstractFitted):
     - `bounds`: (2, ...) lower and upper bounds of each unknown.
     - `converged`: whether the fit ended at a minimum.
     - `status`: how the fit ended, in a sentence.
-    - `steps`: waveforms simulated, each with its Jacobian.
-    - `history`: reduced chi-squared of every step.
+    - `steps`: waveforms simulated, with few photons or all, each with its Jacobian.
+    - `history`: reduced chi-squared of every step; see `Step`.
     - `labels`: names of the flattened unknowns.
 
     **Example:**

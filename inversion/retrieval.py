@@ -13,11 +13,12 @@ from jaxlidar import Lidar, Plan, Scene, Waveform
 from jaxlidar.extend import check_integer, check_key, check_kind, check_kinds, check_range
 
 from .data import Data, at_fixed_times, data_of
-from .fit import Fit, Outcome, best_of, bounds_of, drive, labels_of, named, smooth_names
+from .fit import Fit, Outcome, bounds_of, drive, labels_of, named, smooth_names
 from .model import Model
 from .planning import batch_sizes, plan_within
 from .recorder import Recorder, Terms, check_names
 from .result import Retrieval, Step
+from .starts import best_of
 from .unknowns import Place, Settled, Unknown, latin_hypercube, settle
 
 SOLVER = optx.LevenbergMarquardt(rtol=1e-3, atol=1e-3)
@@ -51,7 +52,11 @@ def retrieve(
     truth, else the fit may end in another echo. `starts` fits from several starting points.
 
     All simulations of a fit use the same random numbers, so that the waveform is a smooth function of the
-    unknowns. The remaining noise of the simulation is estimated from its batches. It lowers the weight of the
+    unknowns. Where photons are traced at every step, a fit begins with a quarter of them, two of eight
+    batches, and goes on with all once a step is below one standard error. It converges with all:
+    values, errors and chi-squared come from them.
+
+    The remaining noise of the simulation is estimated from its batches. It lowers the weight of the
     samples that it affects and is part of the standard errors. `Retrieval.simulation_error` gives that part;
     more photons lower it. Unknowns that act through optics alone (leaf traits, reflectances, the atmosphere)
     cost next to nothing; if all unknowns are such, photons are traced once. Fits with equal shapes, plans and
@@ -82,7 +87,8 @@ def retrieve(
     - `solver`: a Gauss-Newton method of optimistix. Default: Levenberg-Marquardt. A fit also ends where a
       Gauss-Newton step would be below 0.05 standard errors, or where small steps no longer improve it. With
       a `Smooth` prior, only the default is admissible: steps are then solved within the bounds.
-    - `max_steps`: most simulations, each with its Jacobian, from each start. Default 50.
+    - `max_steps`: most simulations, each with its Jacobian, from each start; no more than half of them are
+      with few photons. Default 50.
     - `starts`: number of starting points; the best fit is returned. The first is the scene's own, the others
       are a Latin hypercube over the bounds. Default 1.
     - `scale`: (low, high), bounds of a further unknown, "scale", which multiplies the simulated reflectance,
@@ -92,7 +98,7 @@ def retrieve(
       and the noise of the recorded pulse. Default None: nothing.
     - `noise_floor`: share of each wavelength's largest observed value, 0 to 1, that replaces any smaller
       `noise`: standard errors of a simulation are zero where no photon came. Default 1e-3.
-    - `progress`: called with a `Step` after every step; for instance `print`.
+    - `progress`: called with a `Step` after every simulation, with few photons or all; for instance `print`.
     - `throw`: whether to raise RuntimeError where the fit does not converge. Default False: only
       `Retrieval.status` says so.
 
@@ -153,7 +159,7 @@ def retrieve_with(
     model = Model(lidar, scene, plan, settled, key)
     terms = Terms(recorder, extra, lidar, data.time.size)
     fits = fits_from(starts, key, data, settled, terms, solver, max_steps, progress)
-    outcome = drive(best_of(fits), lambda request: model(request.values, spread=request.spread))
+    outcome = drive(best_of(fits), lambda q: model(q.values, spread=q.spread, few=q.few))
     if throw and not outcome.converged:
         raise RuntimeError(outcome.status)
     return retrieval_of(outcome, model, [*settled, *terms.settled], terms.count)
