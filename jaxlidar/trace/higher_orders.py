@@ -113,7 +113,7 @@ def higher_orders(setting: Setting, key: PRNGKeyArray, nodes: Nodes | None = Non
             jnp.where(inside, share / photons, 0.0),
             jnp.zeros(lane.shape, jnp.int32),
             jnp.full(lane.shape, -1, jnp.int32),
-            unscattered(excess),
+            setting.kept(unscattered(excess)),
             inside,
             tuple(jnp.ones_like(excess) for _ in range(colours)),
         )
@@ -261,7 +261,7 @@ def _one_order(setting: Setting, p: Photons, tally: HigherOrders, draw: Draw, or
         weight,
         label.number,
         hit.on,
-        hit.sent,
+        setting.kept(hit.sent),
         flight.event,
         label.tints,
         label.entry,

@@ -78,7 +78,7 @@ class Nodes(eqx.Module):
             jnp.where(inside, share, 0.0),
             node,
             jnp.full(lane.shape, -1, jnp.int32),
-            unscattered(excess),
+            setting.kept(unscattered(excess)),
             inside,
             tuple(jnp.ones_like(excess) for _ in range(setting.optics.shape[1])),
             None if setting.viewing is None else across,

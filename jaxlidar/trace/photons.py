@@ -25,6 +25,7 @@ class Scattering(eqx.Module):
 class Photons(eqx.Module):
     """The state of a chunk of photons. `on` is the surface from which a photon starts, or -1.
 
+    `sent` is None where no derivatives are asked for, which alone need it.
     `history`, `tints` and `entry`: see `jaxlidar.trace.labels`.
     """
 
@@ -34,7 +35,7 @@ class Photons(eqx.Module):
     weight: Float[Array, "photons"]
     history: Int[Array, "photons"]
     on: Int[Array, "photons"]
-    sent: Scattering
+    sent: Scattering | None
     alive: Bool[Array, "photons"]
     tints: tuple[Float[Array, "photons"], ...] = ()
     entry: tuple[Float[Array, "photons"], Float[Array, "photons"]] | None = None

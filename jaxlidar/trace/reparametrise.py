@@ -44,6 +44,7 @@ def rays_to_surfaces(
     """
     grids = _grids(setting)
     size, origin = grids[0]
+    assert p.sent is not None
     heading &= p.alive
     reach = jnp.where(heading, limit, 1.0)
     direct = along(p.x, p.w, reach)
@@ -95,8 +96,8 @@ Grid = tuple[Float[Array, "2"], Float[Array, "2"]]
 
 
 def moves_landings(setting: Setting) -> bool:
-    """Whether what landing points meet jumps from place to place, so that rays are to move with geometry."""
-    return bool(setting.surfaces) and bool(_grids(setting))
+    """Whether rays are to move with geometry: for derivatives, where what they land on jumps by place."""
+    return setting.derivatives != "none" and bool(setting.surfaces) and bool(_grids(setting))
 
 
 def _grids(setting: Setting) -> list[Grid]:

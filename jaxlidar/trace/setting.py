@@ -134,6 +134,10 @@ class Setting(eqx.Module):
         grown = self.successor[history, jnp.maximum(letter, 0)]
         return jnp.where(letter >= 0, grown, history)
 
+    def kept(self, sent: Scattering) -> Scattering | None:
+        """How photons are sent on, where derivatives ask for it."""
+        return None if self.derivatives == "none" else sent
+
     def density(self, sent: Scattering, w: Vec) -> Scalar:
         """Probability per steradian with which photons would have been sent along `w`; at least 1e-6."""
         density = _density(self.laws[0], sent, w)
