@@ -222,14 +222,10 @@ def _wrapped(number: Int[Array, "*s"], count: Int[Array, ""]) -> Int[Array, "*s"
 
 
 def advance(
-    walk: Walk, voxel: tuple[Int[Array, "*s"], ...], faces: tuple[Scalar, ...], go: Bool[Array, "*s"]
+    walk: Walk, voxel: tuple[Int[Array, "*s"], ...], faces: tuple[Scalar, ...], to: Scalar
 ) -> tuple[Int[Array, "*s"], ...]:
-    """The voxel behind the nearest face if `go`; through an edge or a corner, one face at a time."""
-    tx, ty, tz = faces
-    x = (tx <= ty) & (tx <= tz)
-    y = ~x & (ty <= tz)
-    z = ~x & ~y
-    return tuple(v + jnp.where(go & cross, s, 0) for v, s, cross in zip(voxel, walk.step, (x, y, z)))
+    """The voxel behind the faces that are met by the distance `to`; through an edge or a corner, several."""
+    return tuple(v + jnp.where(face <= to, s, 0) for v, s, face in zip(voxel, walk.step, faces))
 
 
 def occupied(medium: Medium) -> Box:
@@ -300,7 +296,8 @@ def free_flight(
         go = running & (more <= most) & (to < end)
         here, go = lax.optimization_barrier((here, go))
         held = tuple(jnp.where(here, wide(a), b) for a, b in zip((distance, to, depth, cell), held))
-        moved = advance(walk, voxel, faces, go)
+        # Where the ray has stopped, the voxel does not matter.
+        moved = advance(walk, voxel, faces, to)
         return (jnp.where(running, to, distance), jnp.where(running, more, depth), moved, go, held), None
 
     def block(state, _):

@@ -71,7 +71,7 @@ def march_ray(
         at_stops = [
             a + k * (later(distance, earlier(stop, to)) - distance) for a, stop in zip(at_stops, stops)
         ]
-        moved = advance(walk, voxel, faces, (to >= face) & (to < end))
+        moved = advance(walk, voxel, faces, to)
         return (to, depth + k * length, moved, at_stops), Stretches(distance, length, depth, cell, k)
 
     zero = jnp.zeros_like(end)
