@@ -230,13 +230,14 @@ def _planned(lidar: Lidar, scene: Scene, plan: Plan | None, goal: _Goal, plannin
 
 
 class _Traced(NamedTuple):
-    """The mean response, standard errors of its waveform and ledger (None: nothing is random), and what it
-    took.
+    """The sum of the responses of `batches`, standard errors of its waveform and ledger (None: nothing is
+    random), and what it took.
 
     `beyond`: share that orders beyond the last may add, where nothing else was short of the goal; else 0.
     """
 
     response: Response
+    batches: int
     stderr: Array | None
     ledger_stderr: dict[str, Array] | None
     info: dict[str, Any]
@@ -250,7 +251,7 @@ def _trace_until(
         started = time.perf_counter()
         response = jax.block_until_ready(_compiled_trace(ready.setting, ready.transmittance, key))
         info = {"photons": 0, "batches": 1, "error": 0.0, "stopped": "nothing is random"}
-        return _Traced(response, None, None, {**info, "seconds": time.perf_counter() - started})
+        return _Traced(response, 1, None, None, {**info, "seconds": time.perf_counter() - started})
     if any(is_traced(x) for x in jax.tree.leaves((ready.setup, key))):
         return _trace_within(ready, key)
     return _trace_batches(ready, key, goal, progress)
@@ -259,7 +260,7 @@ def _trace_until(
 def _recorded(ready: _Ready, traced: _Traced) -> Waveform:
     """The waveform of a response, on the digitiser's bins."""
     plan, lidar = ready.setup.plan, ready.setup.lidar
-    wave = _compiled_waveform(traced.response, ready.recording)
+    wave = _compiled_waveform(traced.response, jnp.asarray(float(traced.batches)), ready.recording)
     wave = trimmed(wave, lidar.wavelength.size, plan.n_samples)
     errors = {"stderr": traced.stderr, "ledger_stderr": traced.ledger_stderr}
     known = {name: value for name, value in errors.items() if value is not None}
@@ -295,8 +296,9 @@ class LateLightWarning(UserWarning):
     """
 
 
-def _over(whole: Any, count: Array) -> Any:
-    return jax.tree.map(lambda a: a / count, whole)
+def _waveform(whole: Response, batches: Array, recording: Recording) -> Waveform:
+    """The waveform of the mean of so many responses."""
+    return recorded(jax.tree.map(lambda a: a / batches, whole), recording)
 
 
 def _sum(a: Any, b: Any) -> Any:
@@ -308,8 +310,7 @@ _compiled_batch = Program(trace_setting, **ONE_CORE)
 _compiled_first = Program(trace_first, **ONE_CORE)
 _compiled_higher = Program(trace_higher, **ONE_CORE)
 _compiled_results = Program(total_and_balance, **ONE_CORE)
-_compiled_waveform = Program(recorded)
-_shared_out = Program(_over)
+_compiled_waveform = Program(_waveform)
 _add = Program(_sum)
 
 
@@ -326,8 +327,8 @@ def _trace_within(ready: _Ready, key: PRNGKeyArray) -> _Traced:
         spread = jnp.var(jax.lax.stop_gradient(each), axis=0)
         return widening(MIN_BATCHES) * jnp.sqrt(spread / (MIN_BATCHES - 1))
 
-    mean = jax.tree.map(lambda a: jnp.mean(a, axis=0), responses)
-    return _Traced(mean, stderr(totals), jax.tree.map(stderr, balances.ledger), {})
+    whole = jax.tree.map(lambda a: jnp.sum(a, axis=0), responses)
+    return _Traced(whole, MIN_BATCHES, stderr(totals), jax.tree.map(stderr, balances.ledger), {})
 
 
 def _begin_to_compile(ready: _Ready, key: PRNGKeyArray) -> None:
@@ -343,7 +344,7 @@ def _begin_to_compile(ready: _Ready, key: PRNGKeyArray) -> None:
     else:
         response = _compiled_batch.begin(*arguments)
     _compiled_results.begin(response, ready.brief)
-    _compiled_waveform.begin(response, ready.recording)
+    _compiled_waveform.begin(response, jnp.asarray(1.0), ready.recording)
     _add.begin(response, response)
 
 
@@ -414,6 +415,6 @@ def _trace_batches(
         "error": error,
         "stopped": stopped,
     }
-    mean = _shared_out(whole, jnp.asarray(float(waves.count)))
+    assert whole is not None
     ledger_stderr = {name: jnp.asarray(row) for name, row in zip(names, shares.stderr)}
-    return _Traced(mean, jnp.asarray(waves.stderr), ledger_stderr, info, beyond)
+    return _Traced(whole, waves.count, jnp.asarray(waves.stderr), ledger_stderr, info, beyond)

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxtyping import Array, PRNGKeyArray
@@ -72,7 +73,8 @@ def one_batch(setup: jl.Setup, key: PRNGKeyArray) -> jl.Waveform:
     """The waveform of a single batch, by the programs that `simulate` compiles."""
     ready = _prepared(setup, key)
     program = _compiled_batch if setup.plan.is_random else _compiled_trace
-    wave = _compiled_waveform(program(ready.setting, ready.transmittance, key), ready.recording)
+    response = program(ready.setting, ready.transmittance, key)
+    wave = _compiled_waveform(response, jnp.asarray(1.0), ready.recording)
     return trimmed(wave, setup.lidar.wavelength.size, setup.plan.n_samples)
 
 
