@@ -3,6 +3,16 @@
 from jaxlidar import Plan
 from jaxlidar.planning.memory import in_words, memory_limit
 
+# Columns that move one voxel, up to which scores take less time than tangents.
+MOST_SCORED = 4
+# Tables of columns and voxels that scores take, and the bytes of a number.
+_TABLES, _NUMBER = 8, 8
+
+
+def scores_fit(plan: Plan, columns: int, cells: int) -> bool:
+    """Whether the tables of scores, of so many columns and voxels, fit into a plan's memory."""
+    return _TABLES * _NUMBER * columns * cells <= memory_limit(plan.limits.max_memory)
+
 
 def columns_at_once(plan: Plan, columns: int) -> int:
     """The number of columns that are pushed through the trace at once; groups of them are about as large.

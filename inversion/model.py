@@ -2,13 +2,15 @@
 
 Optical unknowns do not change the response: their columns are a small matrix product with the traced
 response. Geometric unknowns need tangents pushed through the trace, all of them in one pass that shares what
-does not depend on them, or as many as memory allows. Where no unknown is geometric, photons are traced once.
+does not depend on them, or as many as memory allows; or, where all of them change extinction alone, no
+tangents but scores of paths. Where no unknown is geometric, photons are traced once.
 
 All evaluations use the same random keys, so that the waveform is a smooth function of the unknowns. An
 evaluation averages batches of photons, each with its own key; their spread is the simulation's own noise.
 Few of the batches are an evaluation as well, of more noise, for fits that are far from their end.
 """
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -22,8 +24,9 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from jaxlidar import Lidar, Plan, Response, Scene, Setup, Waveform, reduce, total_of, trace_scene, waveform_of
 from jaxlidar.extend import ONE_CORE, concrete, side_by_side
 from jaxlidar.planning.plan import MIN_BATCHES
+from jaxlidar.trace.extinction import can_be_scored, most_columns, slopes_of, total_and_columns
 
-from .columns import columns_at_once
+from .columns import MOST_SCORED, columns_at_once, scores_fit
 from .unknowns import Place, Settled, put
 
 Values = tuple[Array, ...]
@@ -36,7 +39,8 @@ ROUNDING = 1e-3
 class Problem(eqx.Module):
     """Inputs of a simulation, except the values of the unknowns.
 
-    `at_once`: geometric columns of the Jacobian that are pushed through the trace together.
+    `at_once`: geometric columns of the Jacobian that are pushed through the trace together. `most`: columns
+    that move one voxel at most, where all of them change extinction alone and are scored; else 0.
     """
 
     lidar: Lidar
@@ -44,6 +48,7 @@ class Problem(eqx.Module):
     plan: Plan = eqx.field(static=True)
     places: tuple[Place, ...] = eqx.field(static=True)
     at_once: int = eqx.field(static=True)
+    most: int = eqx.field(static=True, default=0)
 
     def at(self, values: Values) -> Setup:
         """The setup with these values."""
@@ -69,6 +74,8 @@ def _batch(
 ) -> tuple[Response, Float[Array, "wavelengths bins"], Float[Array, "columns wavelengths bins"]]:
     """Response and total of one batch, and the total's derivatives in the geometric unknowns."""
     flat, setup_at = problem.moving(values, geometric=True)
+    if problem.most:
+        return total_and_columns(setup_at, flat, key, problem.most)
 
     def total(flat: Array) -> tuple[Array, Response]:
         setup = setup_at(flat)
@@ -95,6 +102,27 @@ def _batch(
 
 
 _compiled_batch = eqx.filter_jit(_batch, **ONE_CORE)
+
+
+@eqx.filter_jit
+def _most_columns(problem: Problem, values: Values) -> Array:
+    flat, setup_at = problem.moving(values, geometric=True)
+    return most_columns(slopes_of(setup_at, flat))
+
+
+def _scored(problem: Problem, values: Values) -> int:
+    """The most columns that move one voxel, where the geometric ones are best scored; else 0."""
+    geometric = [(p.extinction, v.size) for p, v in zip(problem.places, values) if p.geometric]
+    if not geometric or not all(extinction for extinction, _ in geometric):
+        return 0
+    canopy, columns = problem.scene.canopy, sum(size for _, size in geometric)
+    if canopy is None or not can_be_scored(problem.at(values)):
+        return 0
+    cells = int(np.prod(canopy.voxels.shape))
+    if not scores_fit(problem.plan, columns, cells):
+        return 0
+    most = 1 if columns == 1 else int(_most_columns(problem, values))
+    return most if 1 <= most <= MOST_SCORED else 0
 
 
 @eqx.filter_jit
@@ -195,8 +223,10 @@ class Model:
             # Optics are applied while light is traced.
             places = [place._replace(geometric=True) for place in places]
         moving = sum(s.start.size for s, place in zip(settled, places) if place.geometric)
-        at_once = columns_at_once(plan, moving)
-        self.problem = Problem(lidar, scene, plan, tuple(places), at_once)
+        problem = Problem(lidar, scene, plan, tuple(places), 0)
+        most = _scored(problem, tuple(s.start for s in settled))
+        at_once = 0 if most else columns_at_once(plan, moving)
+        self.problem = dataclasses.replace(problem, at_once=at_once, most=most)
         self.shapes = [s.start.shape for s in settled]
         self.dtypes = [s.start.dtype for s in settled]
         self.sizes = [s.start.size for s in settled]

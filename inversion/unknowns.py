@@ -21,6 +21,8 @@ from .priors import LogNormal, Smooth
 
 # (mean, standard deviation), or a prior with a name.
 Prior = tuple[Float[Array, "..."], Float[Array, "..."]] | LogNormal | Smooth
+# Arrays of the scene that are extinction coefficients.
+_EXTINCTION = (".canopy.voxels.leaf", ".canopy.voxels.bark")
 # Least distance of a starting value from a bound, as a share of the bounds' width.
 MARGIN = 0.01
 
@@ -128,11 +130,13 @@ class Place(NamedTuple):
 
     - `leaf`: number of the scene's leaf that it replaces, or None where `apply` sets it.
     - `geometric`: whether a change of the value may change the paths of light.
+    - `extinction`: whether it changes them by extinction alone.
     """
 
     leaf: int | None
     apply: Callable[[Scene, Array], Scene] | None
     geometric: bool
+    extinction: bool = False
 
 
 class Settled(NamedTuple):
@@ -203,7 +207,7 @@ def _settle_one(u: Unknown, scene: Scene, optical: frozenset[int]) -> Settled:
         pair = (u.prior.median, u.prior.spread) if isinstance(u.prior, LogNormal) else u.prior
         mean, std = (np.asarray(_broadcast(name, "prior", p, start.shape), float) for p in pair)
         prior = np.log(mean) if log_prior else mean, std
-    place = Place(number, u.apply, not touched <= optical)
+    place = Place(number, u.apply, not touched <= optical, touched <= extinction_leaves(scene))
     return start_from(Settled(name, place, start, low, high, prior, log_prior, smooth), start)
 
 
@@ -295,6 +299,12 @@ def optical_leaves(scene: Scene) -> frozenset[int]:
 
     leaves = jax.tree_util.tree_leaves_with_path(scene)
     return frozenset(i for i, (path, _) in enumerate(leaves) if acts_later(path))
+
+
+def extinction_leaves(scene: Scene) -> frozenset[int]:
+    """Numbers of the scene's leaves that are extinction coefficients."""
+    paths = [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(scene)]
+    return frozenset(i for i, path in enumerate(paths) if path in _EXTINCTION)
 
 
 def put(scene: Scene, places: tuple[Place, ...], values: tuple[Array, ...]) -> Scene:
