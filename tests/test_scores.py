@@ -100,7 +100,7 @@ def differences(setup_at, start, most):
     )
 
 
-# The others differ from these in what is tested by itself.
+# By default; all others take a minute.
 QUICK = ("leaf over ground", "plate", "off nadir, field of view")
 
 
