@@ -275,10 +275,10 @@ def first_order(
 
         response, *fate = lax.scan(add, zero, padded)[0]
     weights, outside = bins.trimmed(response.reshape(materials, count, bins.padded))
-    *fate, scored = fate
+    arrived, scattered, escaped, scored = fate
     if scored is not None:
         scored = scored[:, :, bins.row :][:, :, : bins.count]
-    return FirstOrder(weights, outside, *fate, scored)
+    return FirstOrder(weights, outside, arrived, scattered, escaped, scored)
 
 
 def _together(slot: Int[Array, "*s"] | int, weight: Float[Array, "*s"]):

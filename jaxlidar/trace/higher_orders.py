@@ -403,6 +403,7 @@ def _deposit(
             left = left.reshape(left.shape + (1,) * (row.ndim - 1))
             response = scatter_rows(response, slot, first, row * left)
     if score is not None:
+        assert tally.scored is not None
         tally = eqx.tree_at(
             lambda t: t.scored, tally, scored(setting, tally.scored, first, row, score, pairs, label)
         )

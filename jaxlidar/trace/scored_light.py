@@ -130,8 +130,8 @@ def rows_of_stretches(
     medium, scores, bins = setting.medium, setting.scores, setting.bins
     assert medium is not None
     assert scores is not None
-    assert stretch.moved is not None
     stretch, low, extinction, value, share = stop((stretch, low, extinction, value, medium.leaf_share(w)))
+    assert stretch.moved is not None
 
     def pieces_at(k):
         return stretch_pieces(bins, low, dataclasses.replace(stretch, extinction=k), kappa)[1]

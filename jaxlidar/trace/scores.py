@@ -55,7 +55,10 @@ class Scores(eqx.Module):
             parts.append(_at(self.leaf, cell, leaf_share))
         if self.bark is not None:
             parts.append(_at(self.bark, cell, None))
-        return [sum(slopes[1:], slopes[0]) for slopes in zip(*parts)]
+        together = parts[0]
+        for more in parts[1:]:
+            together = [a + b for a, b in zip(together, more)]
+        return together
 
     def alone(self, is_leaf: bool) -> "Scores | None":
         """The scores of leaf, or of bark, alone; None where it is not moved."""
