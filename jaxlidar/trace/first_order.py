@@ -252,7 +252,7 @@ def first_order(
         shape = (materials, count)
         if scored is not None:
             scored = scored.reshape(*shape, *scored.shape[1:])
-        return response, arrived.reshape(shape), scattered.reshape(shape), escaped, scored
+        return response, scored, (arrived.reshape(shape), scattered.reshape(shape), escaped)
 
     n = energy.shape[0]
     fill = -n % CHUNK
@@ -262,23 +262,22 @@ def first_order(
         return rays((x, y), e)
 
     if n <= CHUNK:
-        response, *fate = rays(across, energy)
+        response, scored, fate = rays(across, energy)
     elif medium is None:
         # Without a march all chunks fit into the memory at once, and no loop is compiled.
         each = jax.vmap(chunk)(*padded)
-        response, *fate = jax.tree.map(lambda a: jnp.sum(a, axis=0), each)
+        response, scored, fate = jax.tree.map(lambda a: jnp.sum(a, axis=0), each)
     else:
         zero = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(rays, across, energy))
 
         def add(total, part):
             return jax.tree.map(jnp.add, total, chunk(*part)), None
 
-        response, *fate = lax.scan(add, zero, padded)[0]
+        response, scored, fate = lax.scan(add, zero, padded)[0]
     weights, outside = bins.trimmed(response.reshape(materials, count, bins.padded))
-    arrived, scattered, escaped, scored = fate
     if scored is not None:
         scored = scored[:, :, bins.row :][:, :, : bins.count]
-    return FirstOrder(weights, outside, arrived, scattered, escaped, scored)
+    return FirstOrder(weights, outside, *fate, scored)
 
 
 def _together(slot: Int[Array, "*s"] | int, weight: Float[Array, "*s"]):
