@@ -277,7 +277,8 @@ def first_order(
     weights, outside = bins.trimmed(response.reshape(materials, count, bins.padded))
     if scored is not None:
         scored = scored[:, :, bins.row :][:, :, : bins.count]
-    return FirstOrder(weights, outside, *fate, scored)
+    arrived, scattered, escaped = fate
+    return FirstOrder(weights, outside, arrived, scattered, escaped, scored)
 
 
 def _together(slot: Int[Array, "*s"] | int, weight: Float[Array, "*s"]):
