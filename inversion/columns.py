@@ -3,8 +3,8 @@
 from jaxlidar import Plan
 from jaxlidar.planning.memory import in_words, memory_limit
 
-# Columns that move one voxel, up to which scores take less time than tangents.
-MOST_SCORED = 4
+# Columns up to which scores are known to take less time than tangents.
+MOST_SCORED = 32
 # Tables of columns and voxels that scores take, and the bytes of a number.
 _TABLES, _NUMBER = 8, 8
 

@@ -24,7 +24,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from jaxlidar import Lidar, Plan, Response, Scene, Setup, Waveform, reduce, total_of, trace_scene, waveform_of
 from jaxlidar.extend import ONE_CORE, concrete, side_by_side
 from jaxlidar.planning.plan import MIN_BATCHES
-from jaxlidar.trace.extinction import can_be_scored, most_columns, slopes_of, total_and_columns
+from jaxlidar.trace.extinction import can_be_scored, total_and_columns
 
 from .columns import MOST_SCORED, columns_at_once, scores_fit
 from .unknowns import Place, Settled, put
@@ -104,14 +104,11 @@ def _batch(
 _compiled_batch = eqx.filter_jit(_batch, **ONE_CORE)
 
 
-@eqx.filter_jit
-def _most_columns(problem: Problem, values: Values) -> Array:
-    flat, setup_at = problem.moving(values, geometric=True)
-    return most_columns(slopes_of(setup_at, flat))
-
-
 def _scored(problem: Problem, values: Values) -> int:
-    """The most columns that move one voxel, where the geometric ones are best scored; else 0."""
+    """How many columns may move one voxel, where the geometric ones are best scored; else 0.
+
+    All may: which do can change with the values.
+    """
     geometric = [(p.extinction, v.size) for p, v in zip(problem.places, values) if p.geometric]
     if not geometric or not all(extinction for extinction, _ in geometric):
         return 0
@@ -119,10 +116,7 @@ def _scored(problem: Problem, values: Values) -> int:
     if canopy is None or not can_be_scored(problem.at(values)):
         return 0
     cells = int(np.prod(canopy.voxels.shape))
-    if not scores_fit(problem.plan, columns, cells):
-        return 0
-    most = 1 if columns == 1 else int(_most_columns(problem, values))
-    return most if 1 <= most <= MOST_SCORED else 0
+    return columns if columns <= MOST_SCORED and scores_fit(problem.plan, columns, cells) else 0
 
 
 @eqx.filter_jit

@@ -174,7 +174,7 @@ def test_fits_score_what_changes_extinction_alone(monkeypatch):
         return model.problem.most, model(np.concatenate([np.ravel(s.start) for s in settled]).astype(float))
 
     most, alone = evaluated([area])
-    assert most == 1
+    assert most == 3
     assert evaluated([area, height])[0] == 0
     monkeypatch.setattr(inversion.model, "MOST_SCORED", 0)
     none, tangents = evaluated([area])
