@@ -104,7 +104,7 @@ def main() -> None:
         return push(jnp.eye(LAYERS))
 
     def scored_columns(optical, geometric, key):
-        return total_and_columns(lambda s: grown(optical, geometric, s), jnp.ones(LAYERS), key, 1)[1:]
+        return total_and_columns(lambda s: grown(optical, geometric, s), jnp.ones(LAYERS), key, LAYERS)[1:]
 
     keys = list(jax.random.split(jax.random.key(0), MIN_BATCHES))
     pool = ThreadPoolExecutor(os.cpu_count() or 1)
