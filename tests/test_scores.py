@@ -73,9 +73,8 @@ def build(case: Case, x: jax.Array) -> jl.Scene:
     else:
         voxels = jl.VoxelMap.from_extinction(leaf=leaf, bark=bark if case.bark else None, **place)
     optics = jl.LeafOptics(reflectance=0.4, transmittance=0.3)
-    own = {"bark": 0.3} if case.bark else {}
     return jl.Scene(
-        canopy=jl.Canopy(voxels, leaf=optics, hotspot=case.hotspot, **own),
+        canopy=jl.Canopy(voxels, leaf=optics, hotspot=case.hotspot, bark=0.3),
         plates=(jl.Plate(height=0.7, reflectance=0.3, coverage=0.5),) * case.plates,
         ground=jl.Ground(height=0.2, reflectance=0.5, slope=case.slope, aspect=30.0),
     )
@@ -110,8 +109,8 @@ def both_ways(case: Case):
     def by_scores(x):
         setup = setup_at(x)
         setting, optics = setting_of(setup, derivatives="forward"), optics_of(setup)
-        slopes = jax.vmap(lambda t: jax.jvp(extinction, (x,), (t,))[1])(directions)
-        setting = dataclasses.replace(setting, scores=scores_of(setting, *slopes, optics, case.most))
+        leaf, bark = jax.vmap(lambda t: jax.jvp(extinction, (x,), (t,))[1])(directions)
+        setting = dataclasses.replace(setting, scores=scores_of(setting, leaf, bark, optics, case.most))
         response, fine = trace_scored(setting, optics, key)
         return jl.total_of(response, setup), columns_in_samples(fine, recording_of(setup))
 
