@@ -3,7 +3,7 @@
 This is exact (`jaxlidar.trace.scores`), and takes less than half of the time for a column, where
 
 - histories keep optics apart, and no leaf transmits straight on, so that one trace serves all wavelengths;
-- wavelengths and columns are few, so that all can be added up for every collision.
+- wavelengths and columns are few, so that all can be added up for every collision; off nadir, two or more.
 
 Elsewhere such unknowns are treated like any others that move light.
 """
@@ -54,7 +54,9 @@ def sorted_places(
         return tuple(places), 0, 0.0
     # A plan may leave the canopy out.
     canopy, wavelengths = reduce(lidar, scene, plan).scene.canopy, lidar.wavelength.size
-    if canopy is not None and not canopy.is_straight and columns <= COLUMNS and wavelengths <= WAVELENGTHS:
+    # Off nadir a second march, of the way back, takes as long as the tangents of one column.
+    pays = (1 if plan.trace.vertical else 2) <= columns <= COLUMNS and wavelengths <= WAVELENGTHS
+    if canopy is not None and not canopy.is_straight and pays:
         cells = int(np.prod(canopy.voxels.shape))
         sizes = (plan.n_photons, plan.n_rays), cells, columns, wavelengths
         room = scored_bytes(plan.trace, plan.bins, *sizes)

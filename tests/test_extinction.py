@@ -95,10 +95,13 @@ def test_what_changes_optics_or_places_as_well_is_geometric():
 
 
 def test_where_scores_do_not_serve_columns_are_pushed():
-    """Leaves that transmit straight on, many wavelengths, little memory."""
+    """Leaves that transmit straight on, many wavelengths, one column off nadir, little memory."""
     assert kinds(model_of(scene_with(transmission="straight"), [FACTOR])[0]) == ["geometric"]
     many = jl.Lidar(wavelength=np.linspace(500.0, 900.0, 17))
     assert kinds(model_of(scene_with(), [FACTOR], many, orders=1)[0]) == ["geometric"]
+    slant = jl.Lidar(zenith=10.0)
+    assert kinds(model_of(scene_with(), [FACTOR], slant)[0]) == ["geometric"]
+    assert kinds(model_of(scene_with(), [LAYER_SHARES], slant)[0]) == ["extinction"]
     settled = settle([LAYER_SHARES], scene_with())
     plan = model_of(scene_with(), [LAYER_SHARES])[0].problem.plan
     room = extinction.sorted_places(LIDAR, scene_with(), plan, settled)[2]
