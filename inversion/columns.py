@@ -4,12 +4,14 @@ from jaxlidar import Plan
 from jaxlidar.planning.memory import in_words, memory_limit
 
 
-def columns_at_once(plan: Plan, columns: int) -> int:
+def columns_at_once(plan: Plan, columns: int, beside: float = 0.0) -> int:
     """The number of columns that are pushed through the trace at once; groups of them are about as large.
+
+    `beside`: bytes that the other columns take.
 
     **Raises:** ValueError where one column alone takes more memory than the plan may.
     """
-    most, limit = columns, memory_limit(plan.limits.max_memory)
+    most, limit = columns, memory_limit(plan.limits.max_memory) - beside
     while most > 1 and plan.jacobian_memory(most) > limit:
         most -= 1
     if columns and (size := plan.jacobian_memory(most)) > limit:

@@ -4,9 +4,10 @@ Run it as `python examples/benchmarks/jacobian_cost.py [--out figures] [--photon
 
 Four unknowns are optical (Cab, Cw, N of the leaf, reflectance of the ground), four geometric (height and
 slope of the ground, size of the voxels, leaf area). "structured" pushes only the geometric tangents
-through the trace, together, and gets the optical columns from the traced response, as `inversion.retrieve`
-does; "jacfwd" pushes all eight through everything. "20 layers" pushes the leaf area of 20 layers of the
-crown. Eight batches, one thread per core, warm.
+through the trace, together, and gets the optical columns from the traced response; "jacfwd" pushes all
+eight through everything. "20 layers" is the leaf area of 20 layers of the crown, as `inversion.retrieve`
+computes it: they change extinction alone, and are scored while photons are traced. "20 layers, jvp" pushes
+them through the trace. Eight batches, one thread per core, warm.
 """
 
 import os
@@ -18,7 +19,10 @@ import jax.numpy as jnp
 import numpy as np
 from _common import best, machine, new_figure, options, print_table, race, save_figure, write_json
 
+import inversion
 import jaxlidar as jl
+from inversion.model import Model
+from inversion.unknowns import settle
 from jaxlidar.planning.plan import MIN_BATCHES
 
 N, SIZE, ORDERS, LAYERS = 32, 10.0, 10, 20
@@ -98,6 +102,14 @@ def main() -> None:
         push = jax.vmap(lambda t: jax.jvp(total, (jnp.ones(LAYERS),), (t,)), out_axes=(None, -1))
         return push(jnp.eye(LAYERS))
 
+    def grow(scene, shares):
+        grown = extinction * shares[layer][None, None]
+        return eqx.tree_at(lambda s: s.canopy.voxels.leaf, scene, grown)
+
+    unknown = inversion.Unknown(apply=grow, name="layers", bounds=(0.1, 4.0), start=jnp.ones(LAYERS))
+    scene = scene_at(*START, extinction)
+    model = Model(lidar, scene, plan, settle([unknown], scene), jax.random.key(0))
+
     keys = list(jax.random.split(jax.random.key(0), MIN_BATCHES))
     pool = ThreadPoolExecutor(os.cpu_count() or 1)
 
@@ -111,7 +123,8 @@ def main() -> None:
         "4 geometric": over_batches(geometric_columns),
         "all 8, structured": over_batches(structured),
         "all 8, jacfwd": over_batches(plain),
-        f"{LAYERS} layers": over_batches(layer_columns),
+        f"{LAYERS} layers": lambda: model(np.ones(LAYERS)),
+        f"{LAYERS} layers, jvp": over_batches(layer_columns),
     }
     times = race(contestants, given.rounds)
     fastest = best(times)

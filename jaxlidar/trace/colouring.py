@@ -223,6 +223,15 @@ def total(response: Response, recording: Recording) -> Float[Array, "wavelengths
     return recording.admissible * (found if recording.air is None else found + recording.air)
 
 
+def columns_in_samples(
+    fine: Float[Array, "columns wavelengths bins"], recording: Recording
+) -> Float[Array, "columns wavelengths samples"]:
+    """Derivatives of `total` from those of what returns in fine bins, as the trace scores them."""
+    if recording.clear is not None:
+        fine = fine * recording.clear[None]
+    return recording.admissible * recording.sampling(fine)
+
+
 def components(response: Response, recording: Recording) -> dict[str, Float[Array, "wavelengths samples"]]:
     """Apparent reflectance per sample, by material of the last scattering and by order."""
     first = samples_of(response.first, recording.short, recording)

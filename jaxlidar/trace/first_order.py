@@ -28,6 +28,8 @@ from jaxlidar.trace.deposit import instant_row, scatter_rows, smooth_row
 from jaxlidar.trace.histories import Histories
 from jaxlidar.trace.march import Medium
 from jaxlidar.trace.reparametrise import footprint_rays, rays_to_terrain, sees_terrain
+from jaxlidar.trace.scored_light import rows_of_stretches, scatter_columns, with_scores
+from jaxlidar.trace.scores import rows_of
 from jaxlidar.trace.setting import Setting
 from jaxlidar.trace.stretches import Stretches, in_blocks, march_ray, mean_decay, stretch_pieces
 from jaxlidar.trace.surfaces import Surface
@@ -85,7 +87,8 @@ class Passage:
 class FirstOrder(eqx.Module):
     """Deterministic first-order response, and the fate of the light that it describes.
 
-    `scattered`: how much of the light that arrived is scattered at all, per unit optics.
+    `scattered`: how much of the light that arrived is scattered at all, per unit optics. `scored`:
+    derivatives of the weights, where scores are asked for.
     """
 
     weights: Float[Array, "materials histories bins"]
@@ -93,6 +96,7 @@ class FirstOrder(eqx.Module):
     arrived: Float[Array, "materials histories"]
     scattered: Float[Array, "materials histories"]
     escaped: Float[Array, "histories"]
+    scored: Float[Array, "materials histories bins columns"] | None = None
 
 
 class Sent(NamedTuple):
@@ -152,16 +156,16 @@ def first_order(
     """
     beam, medium, surfaces = setting.beam, setting.medium, setting.surfaces
     plan, table, bins = setting.plan, setting.short, setting.bins
-    count = table.count
+    count, leaf = table.count, -1 if plan.leaf is None else plan.leaf.material
     out_way, both_ways = Passage(surfaces, plan, 1), Passage(surfaces, plan, 2)
     kappa = 1.0 if plan.hotspot else 2.0
     successor = table.successor
-    materials = len(plan.materials)
+    materials, scores = len(plan.materials), setting.scores
 
     def deposited(tally, stretch, light):
         """A tally with what stretches add to it; `light` is that of the ray of each."""
         assert medium is not None
-        (response, arrived), (sent, visible) = tally, light
+        (response, arrived, scored), (sent, visible) = tally, light
         k, way, before = stretch.extinction, sent.w, sent.met
         low = bins.position(2.0 * (sent.excess + stretch.start) / SPEED_OF_LIGHT)
         first, pieces = stretch_pieces(bins, low, stretch, kappa)
@@ -175,10 +179,15 @@ def first_order(
                 row = lax.optimization_barrier(pieces * lax.optimization_barrier(value * share)[None])
                 row = jnp.moveaxis(row, 0, -1)
                 response = scatter_rows(response, slot, first, row)
+                if scores is not None:
+                    assert scored is not None
+                    given = part.extinction, part.backscatter * visible * share
+                    rows = rows_of_stretches(setting, m == leaf, way, low, stretch, kappa, *given)
+                    scored = scatter_columns(scored, slot, first, rows)
             for history, share in out_way.terms(table, 0, middle, before):
                 weight = part.extinction * passing * share * sent.energy
                 arrived = _add(arrived, m * count + history, weight)
-        return response, arrived
+        return response, arrived, scored
 
     def rays(across, energy):
         x, w, excess, energy, met, stop = sent = sent_rays(setting, across, energy)
@@ -187,22 +196,30 @@ def first_order(
         arrived = jnp.zeros((materials * count,), energy.dtype)
         scattered, escaped = arrived, jnp.zeros((count,), energy.dtype)
         at_stops, total = [jnp.zeros_like(energy) for _ in met], jnp.zeros_like(energy)
+        scored, moved = None, []
+        if scores is not None:
+            scored = jnp.zeros((materials * count, bins.padded, scores.count), energy.dtype)
 
         if medium is not None:
             stretch, at_stops, total = march_rays(setting, sent)
+            if scores is not None:
+                stretch, moved = with_scores(setting, stretch, w, met)
 
-            tally, light = (response, arrived), (sent, visible)
+            tally, light = (response, arrived, scored), (sent, visible)
             if setting.reverse:
 
                 def step(tally, stretch):
                     return deposited(tally, stretch, light), None
 
-                response, arrived = lax.scan(step, tally, stretch)[0]
+                response, arrived, scored = lax.scan(step, tally, stretch)[0]
             else:
                 there = stretch.extinction > 0.0 if setting.derivatives == "none" else None
-                response, arrived = in_blocks(deposited, tally, stretch, light, there)
+                response, arrived, scored = in_blocks(deposited, tally, stretch, light, there)
             # Smoothing is linear, so only the sum is smoothed. All that collides is scattered.
             response, scattered = smooth_row(response, bins.kernel)[:, 1:-1], arrived
+            if scored is not None:
+                smooth = smooth_row(jnp.swapaxes(scored, 1, 2), bins.kernel)[..., 1:-1]
+                scored = jnp.swapaxes(smooth, 1, 2)
 
         for i, (s, scatterer) in enumerate(zip(surfaces, plan.surfaces)):
             if mirror is not None and i != mirror:
@@ -225,12 +242,17 @@ def first_order(
             for history, share in both_ways.terms(table, int(successor[0, scatterer.reflected]), met[i], met):
                 slot = jnp.broadcast_to(scatterer.material * count + history, first.shape)
                 response = scatter_rows(response, slot, first, row * share[:, None])
+                if scored is not None:
+                    rows = rows_of(lax.stop_gradient(row * share[:, None]), -kappa * moved[i])
+                    scored = scatter_columns(scored, slot, first, rows)
 
         gone = jnp.where(stop < FAR, 0.0, energy * jnp.exp(-total))
         for history, share in out_way.terms(table, 0, stop, met):
             escaped = _add(escaped, history, gone * share)
         shape = (materials, count)
-        return response, arrived.reshape(shape), scattered.reshape(shape), escaped
+        if scored is not None:
+            scored = scored[:, bins.row : bins.row + bins.count].reshape(*shape, bins.count, -1)
+        return response, (arrived.reshape(shape), scattered.reshape(shape), escaped), scored
 
     n = energy.shape[0]
     fill = -n % CHUNK
@@ -240,20 +262,21 @@ def first_order(
         return rays((x, y), e)
 
     if n <= CHUNK:
-        response, *fate = rays(across, energy)
+        response, fate, scored = rays(across, energy)
     elif medium is None:
         # Without a march all chunks fit into the memory at once, and no loop is compiled.
         each = jax.vmap(chunk)(*padded)
-        response, *fate = jax.tree.map(lambda a: jnp.sum(a, axis=0), each)
+        response, fate, scored = jax.tree.map(lambda a: jnp.sum(a, axis=0), each)
     else:
         zero = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(rays, across, energy))
 
         def add(total, part):
             return jax.tree.map(jnp.add, total, chunk(*part)), None
 
-        response, *fate = lax.scan(add, zero, padded)[0]
+        response, fate, scored = lax.scan(add, zero, padded)[0]
     weights, outside = bins.trimmed(response.reshape(materials, count, bins.padded))
-    return FirstOrder(weights, outside, *fate)
+    arrived, scattered, escaped = fate
+    return FirstOrder(weights, outside, arrived, scattered, escaped, scored)
 
 
 def _together(slot: Int[Array, "*s"] | int, weight: Float[Array, "*s"]):

@@ -20,6 +20,7 @@ class Flight(eqx.Module):
     - `cell`: the last voxel.
     - `distance`: flown, m.
     - `density`: ratio of the density of that distance.
+    - `moved`: derivatives of the optical depth flown, where scores are asked for.
     """
 
     collided: Bool[Array, "*photons"]
@@ -29,6 +30,7 @@ class Flight(eqx.Module):
     cell: Int[Array, "*photons"]
     distance: Float[Array, "*photons"]
     density: Float[Array, "*photons"]
+    moved: Float[Array, "ends columns photons"] | None = None
 
     @property
     def event(self) -> Bool[Array, "*photons"]:
@@ -56,12 +58,13 @@ def fly(
     if setting.medium is None:
         collided = in_medium = jnp.zeros(u.shape, bool)
         distance, density = wide(reach), jnp.ones_like(u)
-        cell = jnp.zeros(u.shape, jnp.int32)
+        cell, moved = jnp.zeros(u.shape, jnp.int32), None
     else:
         medium, target = setting.medium, -jnp.log(u)
         steps, box = setting.plan.march_steps, setting.occupied
-        free = free_flight(medium, p.x, p.w, target, reach, p.alive, steps, box, reverse=setting.reverse)
-        collided, cell = free.collided, free.cell
+        how = {"reverse": setting.reverse, "scores": setting.scores}
+        free = free_flight(medium, p.x, p.w, target, reach, p.alive, steps, box, **how)
+        collided, cell, moved = free.collided, free.cell, free.moved
         k = jnp.where(collided, jax.vmap(medium.extinction, (0, None))(cell, p.w), 1.0)
         chord = jnp.where(collided, free.chord, 1.0)
         part = jnp.clip((target - free.depth) / jnp.maximum(k * chord, 1e-30), 0.0, 1.0)
@@ -76,7 +79,7 @@ def fly(
     collided = alive & collided
     nothing = alive & ~collided & ~landed
     late = nothing & (wide(limit < FAR) | in_medium)
-    return Flight(collided, landed, late, nothing & ~late, cell, distance, density)
+    return Flight(collided, landed, late, nothing & ~late, cell, distance, density, moved)
 
 
 def events_of(setting: Setting, met: list[Scalar], outcomes: list) -> list[Scalar]:

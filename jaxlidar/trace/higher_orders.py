@@ -13,6 +13,7 @@ so the derivative of an expected value is the expected value of the derivative. 
 the extinction coefficient is exactly zero, and the derivative with respect to it is zero here.
 """
 
+import dataclasses
 import functools
 
 import equinox as eqx
@@ -39,6 +40,7 @@ from jaxlidar.trace.reparametrise import (
     rays_to_terrain,
     sees_terrain,
 )
+from jaxlidar.trace.scored_light import gains, rise, scored
 from jaxlidar.trace.setting import Setting, unscattered
 
 CHUNK = 256
@@ -52,6 +54,7 @@ class HigherOrders(eqx.Module):
 
     The last axis but bins is that of histories; or, where optics are applied, of wavelengths, with `Nodes` of
     nodes and wavelengths; `weights` and `outside` of shots and wavelengths, where shots see it (`Viewing`).
+    `scored`: derivatives of what returns, where scores are asked for.
     """
 
     weights: Float[Array, "materials seen bins"]
@@ -61,6 +64,7 @@ class HigherOrders(eqx.Module):
     escaped: Float[Array, "labels"]
     late: Float[Array, "labels"]
     remaining: Float[Array, "labels"]
+    scored: Float[Array, "bins columns wavelengths"] | None = None
 
 
 def higher_orders(setting: Setting, key: PRNGKeyArray, nodes: Nodes | None = None) -> HigherOrders:
@@ -85,7 +89,7 @@ def higher_orders(setting: Setting, key: PRNGKeyArray, nodes: Nodes | None = Non
     chunks = -(-photons // size)
     groups = -(-chunks * size // (GROUP * CHUNK))
     each = -(-chunks // groups)
-    materials = len(plan.materials)
+    materials, scores = len(plan.materials), setting.scores
     colours = 0 if setting.optics is None else setting.optics.shape[1]
     count = setting.table.count if not colours else colours * (1 if nodes is None else len(nodes.place))
     seen = count if setting.viewing is None else colours * setting.viewing.shots
@@ -116,6 +120,7 @@ def higher_orders(setting: Setting, key: PRNGKeyArray, nodes: Nodes | None = Non
             setting.kept(unscattered(excess)),
             inside,
             tuple(jnp.ones_like(excess) for _ in range(colours)),
+            score=None if scores is None else jnp.zeros((*lane.shape, scores.count)),
         )
 
     def group(total, number):
@@ -152,7 +157,7 @@ def higher_orders(setting: Setting, key: PRNGKeyArray, nodes: Nodes | None = Non
             return lax.cond(n < plan.orders, one_order, lambda carry, _: carry, carry, n), None
 
         lane, photons = begin(lane)
-        rows = jax.tree.map(lambda a: a.reshape(each, size), (lane, photons))
+        rows = jax.tree.map(lambda a: a.reshape(each, size, *a.shape[1:]), (lane, photons))
         (_, last, tally), _ = lax.scan(order, (*rows, zero), jnp.arange(plan.order_steps))
         over = jnp.where(last.alive, last.weight, 0.0)
         remaining = book(tally.remaining, (), Label.of(last), over)
@@ -167,8 +172,11 @@ def higher_orders(setting: Setting, key: PRNGKeyArray, nodes: Nodes | None = Non
         jnp.zeros((count,)),
         jnp.zeros((count,)),
         jnp.zeros((count,)),
+        None if scores is None else jnp.zeros((bins.padded, scores.count, scores.left.shape[1])),
     )
     tallies, _ = lax.scan(group, zero, jnp.arange(groups, dtype=jnp.uint32))
+    if tallies.scored is not None:
+        tallies = eqx.tree_at(lambda t: t.scored, tallies, tallies.scored[bins.row : bins.row + bins.count])
     return eqx.tree_at(lambda t: (t.weights, t.outside), tallies, bins.trimmed(tallies.weights))
 
 
@@ -178,7 +186,9 @@ def _alive_first(lanes: Array, photons: Photons) -> tuple[Array, Photons]:
     number = jnp.arange(alive.size)
     place = jnp.where(alive, jnp.cumsum(alive) - 1, alive.size)
     source = jnp.zeros_like(number).at[place].set(number, mode="drop")
-    lanes, photons = jax.tree.map(lambda a: a.reshape(-1)[source].reshape(a.shape), (lanes, photons))
+    lanes, photons = jax.tree.map(
+        lambda a: a.reshape(-1, *a.shape[2:])[source].reshape(a.shape), (lanes, photons)
+    )
     alive = (number < jnp.sum(alive)).reshape(photons.alive.shape)
     return lanes, eqx.tree_at(lambda p: p.alive, photons, alive)
 
@@ -201,7 +211,8 @@ def _one_order(setting: Setting, p: Photons, tally: HigherOrders, draw: Draw, or
     p, draw, flights, events, limit = lax.optimization_barrier((p, draw, flights, events, limit))
 
     def pick(a: Array) -> Array:
-        return jnp.take_along_axis(a, chosen.astype(jnp.int32)[None], 0, mode="promise_in_bounds")[0]
+        own = chosen.astype(jnp.int32).reshape((1,) * (a.ndim - 1) + chosen.shape)
+        return jnp.take_along_axis(a, own, 0, mode="promise_in_bounds")[0]
 
     # Plates that were passed on the way. Histories do not depend on the order; what arrives at a plate does.
     weight, label = wide(p.weight) * flights.density, jax.tree.map(wide, Label.of(p))
@@ -254,6 +265,10 @@ def _one_order(setting: Setting, p: Photons, tally: HigherOrders, draw: Draw, or
     label = label.grown(setting, hit.letter)
     weight = weight * hit.ratio * hit.onward
     tally = _leave(tally, hit.material, label, weight)
+    score = None
+    if p.score is not None:
+        assert flight.moved is not None
+        score = p.score - flight.moved.T + gains(setting, flight.cell, flight.collided, hit)
     onward = Photons(
         x,
         hit.w,
@@ -265,6 +280,7 @@ def _one_order(setting: Setting, p: Photons, tally: HigherOrders, draw: Draw, or
         flight.event,
         label.tints,
         label.entry,
+        score,
     )
     return onward, tally
 
@@ -281,7 +297,12 @@ def _return(
     tally: HigherOrders,
 ) -> HigherOrders:
     """Deposit the expected return of every end of the flights, each its share."""
-    ends = setting.plan.ends
+    ends, score = setting.plan.ends, None
+    if p.score is not None:
+        assert flights.moved is not None
+        score = p.score[None] - jnp.swapaxes(flights.moved, 1, 2)
+        score = score.reshape(-1, score.shape[-1])
+    p, flights = dataclasses.replace(p, score=None), dataclasses.replace(flights, moved=None)
 
     def flat(tree):
         return jax.tree.map(lambda a: jnp.broadcast_to(a, (ends, a.shape[-1])).reshape(-1), tree)
@@ -292,7 +313,9 @@ def _return(
     landed = flights.landed_on(events, limit)
     hit = collide(setting, x, p.w, flights.cell, flights.collided, landed, draw)
     value = jnp.where(flights.event, flat(weight), 0.0) * hit.ratio / ends
-    given = lax.optimization_barrier((p.w, x, p.path + flown, value, label, hit, draw))
+    if score is not None:
+        score = score + gains(setting, flights.cell, flights.collided, hit)
+    given = lax.optimization_barrier((p.w, x, p.path + flown, value, label, hit, draw, score))
     return _deposit(setting, tally, *given)
 
 
@@ -314,6 +337,7 @@ def _deposit(
     label: Label,
     hit: Hit,
     draw: Draw,
+    score: Float[Array, "photons columns"] | None,
 ) -> HigherOrders:
     """Deposit the expected return of each collision."""
     beam, plan, medium = setting.beam, setting.plan, setting.medium
@@ -324,10 +348,17 @@ def _deposit(
     elif setting.column is not None:
         column = setting.column
         clear = jnp.exp(-jax.vmap(lambda x: depth_to_top(medium, x, column))(x))
+        if score is not None:
+            score = score - rise(setting, medium, x)
     else:
         none, far = jnp.zeros((0, path.size)), jnp.full_like(path, FAR)
         steps, reverse = plan.march_steps, setting.reverse
-        clear = jnp.exp(-free_flight(medium, x, v, none, far, weight > 0, steps, reverse=reverse).total)
+        how = {"reverse": reverse, "scores": setting.scores}
+        back = free_flight(medium, x, v, none, far, weight > 0, steps, **how)
+        clear = jnp.exp(-back.total)
+        if score is not None:
+            assert back.moved is not None
+            score = score - back.moved[0].T
     drawn = iter(draw.behind)
     for i, (s, scatterer) in enumerate(zip(setting.surfaces, plan.surfaces)):
         if not s.plate:
@@ -371,4 +402,8 @@ def _deposit(
             left = lax.optimization_barrier(factor if tint is None else factor * tint)
             left = left.reshape(left.shape + (1,) * (row.ndim - 1))
             response = scatter_rows(response, slot, first, row * left)
+    if score is not None:
+        assert tally.scored is not None
+        returned = scored(setting, tally.scored, first, row, score, pairs, label)
+        tally = eqx.tree_at(lambda t: t.scored, tally, returned)
     return eqx.tree_at(lambda t: t.weights, tally, response.reshape(tally.weights.shape))

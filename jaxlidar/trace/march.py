@@ -22,6 +22,7 @@ from jaxlidar.optics.leaf_angles import ANGLE_NODES, LeafAngles
 from jaxlidar.optics.phase import AbstractPhase
 from jaxlidar.planning.ladder import rung
 from jaxlidar.scenes.canopy import Canopy
+from jaxlidar.trace.scores import Scores
 
 # Voxels of a map that is laid out without room to spare.
 LARGE = 1 << 17
@@ -86,6 +87,10 @@ class Medium(eqx.Module):
         if self.bark is None:
             return self.leaf_at(cell, w)
         return self.leaf_at(cell, w) + self.bark_at(cell)
+
+    def leaf_share(self, w: Vec) -> Scalar | None:
+        """Extinction along `w` per unit of `leaf`; None where it is one."""
+        return None if self.angles is None else 2.0 * self.angles.projection_at(w)
 
     def thinned(self, share: Float[Array, ""]) -> "Medium":
         """The medium with a share of the leaf's extinction."""
@@ -249,6 +254,8 @@ class Free(eqx.Module):
     - `depth`: optical depth at `entered`.
     - `distance`, `total`: length, m, and optical depth of the whole flight; without meaning after the last
       target.
+    - `moved`: derivatives of the optical depth up to each target, or up to the end of the flight if there are
+      none; None without scores.
     """
 
     collided: Bool[Array, "targets photons"]
@@ -258,6 +265,7 @@ class Free(eqx.Module):
     depth: Float[Array, "targets photons"]
     distance: Float[Array, "photons"]
     total: Float[Array, "photons"]
+    moved: Float[Array, "ends columns photons"] | None = None
 
 
 def free_flight(
@@ -271,11 +279,13 @@ def free_flight(
     box: Box | None = None,
     *,
     reverse: bool = True,
+    scores: Scores | None = None,
 ) -> Free:
     """Follow rays to their largest target, to their length `limit`, or until they leave the grid, or `box`.
 
     `steps` bounds the number of faces crossed; a batch stops earlier when all its rays have stopped. Without
     targets, rays are followed to their end. `reverse`: whether to allow differentiation in reverse.
+    `scores`: of which the derivatives of optical depths are asked for.
     """
     walk = begin(medium, x, w, box)
     end = earlier(walk.leave, limit)
@@ -285,20 +295,30 @@ def free_flight(
     def wide(a: Array) -> Array:
         return jnp.broadcast_to(a, targets.shape)
 
+    share = None if scores is None else lax.stop_gradient(medium.leaf_share(w))
+
     def step(state, _):
-        distance, depth, voxel, running, held = state
+        distance, depth, voxel, running, held, moved = state
         faces = lax.optimization_barrier(walk.faces(voxel))
         to = later(distance, earlier(end, earlier(earlier(faces[0], faces[1]), faces[2])))
         cell = cell_of(medium, voxel)
-        more = depth + medium.extinction(cell, w) * (to - distance)
+        k = medium.extinction(cell, w)
+        more = depth + k * (to - distance)
         to, more, cell = lax.optimization_barrier((to, more, cell))
         here = wide(running) & (wide(depth) <= targets) & (targets < wide(more))
         go = running & (more <= most) & (to < end)
         here, go = lax.optimization_barrier((here, go))
         held = tuple(jnp.where(here, wide(a), b) for a, b in zip((distance, to, depth, cell), held))
+        if scores is not None:
+            length = jnp.where(running, to - distance, 0.0)[None]
+            if len(targets):
+                upto = (targets - wide(depth)) / wide(jnp.maximum(k, 1e-30))
+                length = jnp.clip(upto, 0.0, wide(length[0]))
+            moved = scores.add(moved, cell, lax.stop_gradient(length), share)
         # Where the ray has stopped, the voxel does not matter.
-        moved = advance(walk, voxel, faces, to)
-        return (jnp.where(running, to, distance), jnp.where(running, more, depth), moved, go, held), None
+        ahead = advance(walk, voxel, faces, to)
+        state = jnp.where(running, to, distance), jnp.where(running, more, depth), ahead, go, held, moved
+        return state, None
 
     def block(state, _):
         def go(state):
@@ -309,18 +329,21 @@ def free_flight(
     zero = jnp.zeros_like(targets)
     held = (zero - 1.0, zero, zero, zero.astype(jnp.int32))
     start = jnp.minimum(walk.enter, end)
-    state = (start, jnp.zeros_like(limit), walk.voxel, active & (walk.enter < end), held)
+    moved = None
+    if scores is not None:
+        moved = jnp.zeros((max(len(targets), 1), scores.count, *limit.shape), limit.dtype)
+    state = (start, jnp.zeros_like(limit), walk.voxel, active & (walk.enter < end), held, moved)
 
     def march(state):
         return lax.scan(block, state, None, length=-(-steps // BLOCK))[0]
 
-    distance, total, _, _, held = (march if reverse else one_function(march))(state)
+    distance, total, _, _, held, moved = (march if reverse else one_function(march))(state)
     entered, left, depth, cell = held
-    return Free(entered >= 0, cell, entered, left - entered, depth, distance, total)
+    return Free(entered >= 0, cell, entered, left - entered, depth, distance, total, moved)
 
 
-def depth_to_top(medium: Medium, x: Vec, column: Float[Array, "cells"]) -> Scalar:
-    """Optical depth from `x` straight up; `column` is the depth above each voxel's upper face."""
+def straight_up(medium: Medium, x: Vec) -> tuple[Int[Array, "..."], Scalar, Bool[Array, "..."]]:
+    """The voxel at or straight above `x`, the share of its height above `x`, and whether there is one."""
     voxel = []
     place = []
     for k in range(3):
@@ -332,8 +355,14 @@ def depth_to_top(medium: Medium, x: Vec, column: Float[Array, "cells"]) -> Scala
     if not medium.periodic:
         inside &= (voxel[0] >= 0) & (voxel[0] < nx) & (voxel[1] >= 0) & (voxel[1] < ny)
     cell = cell_of(medium, tuple(voxel))
-    up = (jnp.zeros_like(x[0]), jnp.zeros_like(x[0]), jnp.ones_like(x[0]))
     above = jnp.clip(jnp.clip(voxel[2], 0, nz - 1) + 1 - jnp.maximum(place[2], 0.0), 0.0, 1.0)
+    return cell, above, inside
+
+
+def depth_to_top(medium: Medium, x: Vec, column: Float[Array, "cells"]) -> Scalar:
+    """Optical depth from `x` straight up; `column` is the depth above each voxel's upper face."""
+    cell, above, inside = straight_up(medium, x)
+    up = (jnp.zeros_like(x[0]), jnp.zeros_like(x[0]), jnp.ones_like(x[0]))
     depth = _pick(column, cell) + medium.extinction(cell, up) * above * medium.size[2]
     return jnp.where(inside, depth, 0.0)
 

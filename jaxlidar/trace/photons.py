@@ -26,7 +26,7 @@ class Photons(eqx.Module):
     """The state of a chunk of photons. `on` is the surface from which a photon starts, or -1.
 
     `sent` is None where no derivatives are asked for, which alone need it.
-    `history`, `tints` and `entry`: see `jaxlidar.trace.labels`.
+    `history`, `tints` and `entry`: see `jaxlidar.trace.labels`. `score`: see `jaxlidar.trace.scores`.
     """
 
     x: Vec
@@ -39,6 +39,7 @@ class Photons(eqx.Module):
     alive: Bool[Array, "photons"]
     tints: tuple[Float[Array, "photons"], ...] = ()
     entry: tuple[Float[Array, "photons"], Float[Array, "photons"]] | None = None
+    score: Float[Array, "photons columns"] | None = None
 
 
 class Hit(eqx.Module):

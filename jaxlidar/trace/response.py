@@ -114,6 +114,25 @@ def trace_setting(
     return trace_only_first(setting, transmittance, key)
 
 
+def trace_scored(
+    setting: Setting, optics: Float[Array, "letters wavelengths"], key: PRNGKeyArray
+) -> tuple[Response, Float[Array, "columns wavelengths bins"]]:
+    """The response of one batch, and what its `scores` make of it at these optics, in fine bins.
+
+    For plans that keep histories, and leaves that do not transmit straight on.
+    """
+    first, weights = _first(setting, key)
+    assert first.scored is not None
+    fine = jnp.einsum("hw,mhbc->bcw", setting.short.monomials(optics), first.scored)
+    if not follows(setting):
+        return only_first(setting, first, weights), jnp.moveaxis(fine, 0, 2)
+    higher = higher_orders(setting, _keys(setting, key)[1])
+    assert higher.scored is not None
+    fine = fine + higher.scored
+    own = jax.tree.map(lambda a: a[None], eqx.tree_at(lambda h: h.scored, higher, None))
+    return joined(First(weights[None], first.outside[None]), own), jnp.moveaxis(fine, 0, 2)
+
+
 def trace_only_first(
     setting: Setting,
     transmittance: Float[Array, "wavelengths"] | None,
@@ -216,12 +235,15 @@ def _first(
     """Order one, and its weights together with what mirrors return; none where the order is drawn."""
     across, energy = footprint_of(setting, _keys(setting, key)[0], part)
     first = first_order(setting, across, energy)
-    weights = jnp.zeros_like(first.weights) if setting.plan.drawn_first else first.weights
+    weights, scored = first.weights, first.scored
+    if setting.plan.drawn_first:
+        weights, scored = jax.tree.map(jnp.zeros_like, (weights, scored))
     for i, is_mirror in enumerate(setting.plan.mirrors):
         if is_mirror and setting.sizes.specular:
             rays = mirror_rays(setting.beam, setting.surfaces[i])
-            weights = weights + first_order(setting, *rays, mirror=i).weights
-    return first, weights
+            mirrored = first_order(setting, *rays, mirror=i)
+            weights, scored = jax.tree.map(jnp.add, (weights, scored), (mirrored.weights, mirrored.scored))
+    return eqx.tree_at(lambda f: f.scored, first, scored, is_leaf=lambda a: a is None), weights
 
 
 def footprint_of(

@@ -22,6 +22,7 @@ from jaxlidar.trace.footprint import Beam, beam_of
 from jaxlidar.trace.histories import Histories, histories
 from jaxlidar.trace.march import Box, Medium, columns, medium_of, occupied
 from jaxlidar.trace.photons import Photons, Scattering
+from jaxlidar.trace.scores import Scores
 from jaxlidar.trace.surfaces import Surface, surfaces_of
 from jaxlidar.trace.viewing import Viewing
 
@@ -80,6 +81,7 @@ class Setting(eqx.Module):
     - `viewing`: shots that share light and see parts of it; None where there is one, or no shots.
     - `derivatives`: those that the trace may be asked for, "all", those "forward" or "none": the fewer, the
       faster.
+    - `scores`: derivatives of extinction, where those of the waveform by them are asked for.
     """
 
     beam: Beam
@@ -98,6 +100,7 @@ class Setting(eqx.Module):
     optics: Float[Array, "letters wavelengths"] | None = None
     viewing: Viewing | None = None
     derivatives: Derivatives = eqx.field(static=True, default="all")
+    scores: Scores | None = None
 
     @property
     def reverse(self) -> bool:

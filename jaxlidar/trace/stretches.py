@@ -22,13 +22,17 @@ BLOCK = 256
 
 
 class Stretches(eqx.Module):
-    """Pieces of one ray between faces: start, length (m), depth at its start, voxel, extinction (1/m)."""
+    """Pieces of one ray between faces: start, length (m), depth at its start, voxel, extinction (1/m).
+
+    `moved`: derivatives of that depth, where scores are asked for.
+    """
 
     start: Float[Array, "*steps"]
     length: Float[Array, "*steps"]
     depth: Float[Array, "*steps"]
     cell: Int[Array, "*steps"]
     extinction: Float[Array, "*steps"]
+    moved: Float[Array, "*steps columns"] | None = None
 
 
 def mean_decay(x: Scalar) -> Scalar:
@@ -131,7 +135,7 @@ def in_blocks(
 
     def block(n, tally):
         own = lax.dynamic_slice(chosen, (n * BLOCK,), (BLOCK,))
-        its = jax.tree.map(lambda a: a.reshape(-1)[own], stretch)
+        its = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[own], stretch)
         # What fills up the last block has no length.
         last = n * BLOCK + jnp.arange(BLOCK) < upto[-1]
         its = eqx.tree_at(lambda s: s.length, its, jnp.where(last, its.length, 0.0))
