@@ -38,6 +38,10 @@ class Case(NamedTuple):
     angles: str | None = None
     orders: int = 4
     hotspot: bool = False
+    sides: str = "open"
+    field_of_view: float | None = None
+    phase: bool = False
+    air: bool = False
 
 
 CASES = {
@@ -51,6 +55,10 @@ MORE = {
     "layers, plate": Case("layers", 1, plates=1, zenith=12.0, orders=3),
     "layers, leaf angles": Case("layers", 1, angles="planophile", zenith=12.0),
     "layers, hot spot": Case("layers", 1, hotspot=True),
+    "layers, periodic": Case("layers", 1, sides="periodic", slope=10.0),
+    "layers, field of view": Case("layers", 1, zenith=12.0, field_of_view=2.0),
+    "layers, phase function": Case("layers", 1, phase=True, slope=10.0),
+    "layers, air": Case("layers", 1, air=True),
     "layers, one order": Case("layers", 1, bark=True, zenith=12.0, orders=1),
 }
 START = {"layers": jnp.ones(8), "overlapping": jnp.ones(9), "factor": jnp.ones(1), "group": jnp.ones(2)}
@@ -73,8 +81,10 @@ def build(case: Case, x: jax.Array) -> jl.Scene:
     else:
         voxels = jl.VoxelMap.from_extinction(leaf=leaf, bark=bark if case.bark else None, **place)
     optics = jl.LeafOptics(reflectance=0.4, transmittance=0.3)
+    leaves = jl.HenyeyGreenstein(albedo=0.8, g=0.3) if case.phase else optics
     return jl.Scene(
-        canopy=jl.Canopy(voxels, leaf=optics, hotspot=case.hotspot, bark=0.3),
+        canopy=jl.Canopy(voxels, leaf=leaves, hotspot=case.hotspot, bark=0.3, sides=case.sides),
+        atmosphere=jl.Atmosphere() if case.air else None,
         plates=(jl.Plate(height=0.7, reflectance=0.3, coverage=0.5),) * case.plates,
         ground=jl.Ground(height=0.2, reflectance=0.5, slope=case.slope, aspect=30.0),
     )
@@ -83,8 +93,9 @@ def build(case: Case, x: jax.Array) -> jl.Scene:
 def both_ways(case: Case):
     """Total and derivatives by tangents, and by scores."""
     # Of the precision that is on.
-    start = jnp.asarray(np.asarray(START[case.unknowns]), jnp.zeros(()).dtype)
-    lidar = jl.Lidar(divergence=2.0, wavelength=(532.0, 1064.0), zenith=case.zenith, azimuth=0.0)
+    start = jnp.asarray(np.asarray(START[case.unknowns]), jnp.result_type(float))
+    seen = {"zenith": case.zenith, "azimuth": 0.0, "field_of_view": case.field_of_view}
+    lidar = jl.Lidar(divergence=2.0, wavelength=(532.0, 1064.0), **seen)
     sizes = {"max_orders": case.orders, "n_photons": 512, "n_rays": 128, "window": (-60.0, 80.0)}
     plan = jl.plan(lidar, build(case, start), **sizes)
     key, directions = jax.random.key(3), jnp.eye(start.size, dtype=start.dtype)

@@ -97,7 +97,7 @@ def scored_bytes(
     moving = photons + min(rays, _RAYS) * trace.first_steps
     each = _COPIES * rows + _TANGENTS * columns * moving
     tables = 4 * columns * cells
-    return float(jnp.zeros(()).dtype.itemsize * ((os.cpu_count() or 1) * each + tables))
+    return float(jnp.result_type(float).itemsize * ((os.cpu_count() or 1) * each + tables))
 
 
 def in_words(size: float) -> str:
