@@ -1,16 +1,15 @@
 """The simulated waveform and its Jacobian, with each unknown's column computed in the cheapest way.
 
 Optical unknowns do not change the response: their columns are a small matrix product with the traced
-response. Geometric unknowns need tangents pushed through the trace, all of them in one pass that shares what
-does not depend on them, or as many as memory allows; or, where all of them change extinction alone, no
-tangents but scores of paths. Where no unknown is geometric, photons are traced once.
+response. Unknowns that change extinction alone are scored while photons are traced (`inversion.extinction`).
+Geometric unknowns need tangents pushed through the trace, all of them in one pass that shares what does not
+depend on them, or as many as memory allows. Where all unknowns are optical, photons are traced once.
 
 All evaluations use the same random keys, so that the waveform is a smooth function of the unknowns. An
 evaluation averages batches of photons, each with its own key; their spread is the simulation's own noise.
 Few of the batches are an evaluation as well, of more noise, for fits that are far from their end.
 """
 
-import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -24,10 +23,11 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from jaxlidar import Lidar, Plan, Response, Scene, Setup, Waveform, reduce, total_of, trace_scene, waveform_of
 from jaxlidar.extend import ONE_CORE, concrete, side_by_side
 from jaxlidar.planning.plan import MIN_BATCHES
-from jaxlidar.trace.extinction import can_be_scored, total_and_columns
+from jaxlidar.trace.scores import Scores
 
-from .columns import MOST_SCORED, columns_at_once, scores_fit
-from .unknowns import Place, Settled, put
+from .columns import columns_at_once
+from .extinction import scores_at, sorted_places, traced_with
+from .unknowns import Kind, Place, Settled, put
 
 Values = tuple[Array, ...]
 # So many batches are few: a quarter of the work of all, and their difference still tells the noise.
@@ -39,8 +39,8 @@ ROUNDING = 1e-3
 class Problem(eqx.Module):
     """Inputs of a simulation, except the values of the unknowns.
 
-    `at_once`: geometric columns of the Jacobian that are pushed through the trace together. `most`: columns
-    that move one voxel at most, where all of them change extinction alone and are scored; else 0.
+    `at_once`: geometric columns of the Jacobian that are pushed through the trace together. `most`: unknowns
+    that move the extinction of one voxel, if scored.
     """
 
     lidar: Lidar
@@ -54,12 +54,12 @@ class Problem(eqx.Module):
         """The setup with these values."""
         return reduce(self.lidar, put(self.scene, self.places, values), self.plan)
 
-    def moving(self, values: Values, *, geometric: bool) -> tuple[Array, Callable[[Array], Setup]]:
-        """The values of the geometric (or optical) unknowns as one vector, and the setup as its function.
+    def moving(self, values: Values, kind: Kind) -> tuple[Array, Callable[[Array], Setup]]:
+        """The values of the unknowns of a kind as one vector, and the setup as its function.
 
         The other unknowns keep their values.
         """
-        numbers = [i for i, place in enumerate(self.places) if place.geometric == geometric]
+        numbers = [i for i, place in enumerate(self.places) if place.kind == kind]
         flat, restore = jax.flatten_util.ravel_pytree([values[i] for i in numbers])
 
         def setup(flat: Array) -> Setup:
@@ -69,54 +69,54 @@ class Problem(eqx.Module):
         return flat, setup
 
 
+def _scores(problem: Problem, values: Values) -> Scores | None:
+    """Scores of the unknowns that change extinction alone, which all batches share."""
+    flat, setup_at = problem.moving(values, "extinction")
+    return scores_at(setup_at, flat, problem.most)
+
+
 def _batch(
-    problem: Problem, values: Values, key: PRNGKeyArray
+    problem: Problem, values: Values, key: PRNGKeyArray, scores: Scores | None
 ) -> tuple[Response, Float[Array, "wavelengths bins"], Float[Array, "columns wavelengths bins"]]:
-    """Response and total of one batch, and the total's derivatives in the geometric unknowns."""
-    flat, setup_at = problem.moving(values, geometric=True)
-    if problem.most:
-        return total_and_columns(setup_at, flat, key, problem.most)
+    """Response and total of one batch, and its derivatives in geometric unknowns, then in extinction."""
+    flat, setup_at = problem.moving(values, "geometric")
 
-    def total(flat: Array) -> tuple[Array, Response]:
+    def total(flat: Array) -> tuple[Array, tuple[Response, Array | None]]:
         setup = setup_at(flat)
-        response = trace_scene(setup, key, reverse=False)
-        return total_of(response, setup), response
+        if scores is None:
+            response, scored = trace_scene(setup, key, reverse=False), None
+        else:
+            response, scored = traced_with(setup, scores, key)
+        return total_of(response, setup), (response, scored)
 
+    value, columns, (response, scored) = _pushed(total, flat, problem.at_once)
+    return response, value, columns if scored is None else jnp.concatenate([columns, scored])
+
+
+def _pushed(
+    total: Callable[[Array], tuple[Array, Any]], flat: Float[Array, "columns"], size: int
+) -> tuple[Array, Array, Any]:
+    """A function's value, its derivatives, `size` of them at once, and what it gives beside."""
     if not flat.size:
-        value, response = total(flat)
-        return response, value, jnp.zeros((0, *value.shape), value.dtype)
-    directions, size = jnp.eye(flat.size, dtype=flat.dtype), problem.at_once
+        value, beside = total(flat)
+        return value, jnp.zeros((0, *value.shape), value.dtype), beside
+    directions = jnp.eye(flat.size, dtype=flat.dtype)
     if size == flat.size:
-        # The response without its tangents is the same in all directions, hence not batched.
+        # What is beside, without its tangents is the same in all directions, hence not batched.
         push = jax.vmap(lambda t: jax.jvp(total, (flat,), (t,), has_aux=True), out_axes=(None, 0, None))
-        value, columns, response = push(directions)
-        return response, value, columns
+        return push(directions)
 
     def some(directions: Array) -> Array:
         return jax.vmap(lambda t: jax.jvp(lambda x: total(x)[0], (flat,), (t,))[1])(directions)
 
-    value, response = total(flat)
+    value, beside = total(flat)
     groups = jnp.pad(directions, ((0, -flat.size % size), (0, 0))).reshape(-1, size, flat.size)
     columns = jax.lax.map(some, groups).reshape(-1, *value.shape)
-    return response, value, columns[: flat.size]
+    return value, columns[: flat.size], beside
 
 
 _compiled_batch = eqx.filter_jit(_batch, **ONE_CORE)
-
-
-def _scored(problem: Problem, values: Values) -> int:
-    """How many columns may move one voxel, where the geometric ones are best scored; else 0.
-
-    All may: which do can change with the values.
-    """
-    geometric = [(p.extinction, v.size) for p, v in zip(problem.places, values) if p.geometric]
-    if not geometric or not all(extinction for extinction, _ in geometric):
-        return 0
-    canopy, columns = problem.scene.canopy, sum(size for _, size in geometric)
-    if canopy is None or not can_be_scored(problem.at(values)):
-        return 0
-    cells = int(np.prod(canopy.voxels.shape))
-    return columns if columns <= MOST_SCORED and scores_fit(problem.plan, columns, cells) else 0
+_compiled_scores = eqx.filter_jit(_scores)
 
 
 @eqx.filter_jit
@@ -124,7 +124,7 @@ def _colour(
     problem: Problem, values: Values, response: Response
 ) -> tuple[Float[Array, "wavelengths bins"], Float[Array, "columns wavelengths bins"]]:
     """Total of a response, and its derivatives in the optical unknowns."""
-    flat, setup_at = problem.moving(values, geometric=False)
+    flat, setup_at = problem.moving(values, "optical")
 
     def total(flat: Array) -> Array:
         return total_of(response, setup_at(flat))
@@ -153,12 +153,14 @@ def evaluate(
     Float[Array, "columns wavelengths bins"],
     Float[Array, "batches wavelengths bins"],
 ]:
-    """Total, derivatives (geometric columns, then optical ones) and batches of one scene, in one function.
+    """Total, derivatives and batches of one scene, in one function.
 
-    Pure, to be batched over scenes; `keys` has one random key for each batch of photons. Only the first
-    `count` batches are traced: the others are zero.
+    Columns are the geometric ones, then those in extinction, then the optical ones. The function is pure, to
+    be batched over scenes; `keys` has one random key for each batch of photons. Only the first `count`
+    batches are traced: the others are zero.
     """
-    batch = jax.jit(lambda key: _batch(problem, values, key))
+    scores = _scores(problem, values)
+    batch = jax.jit(lambda key: _batch(problem, values, key, scores))
 
     def add(n: Array, sums: Any) -> Any:
         response, total, columns = batch(keys[n])
@@ -212,25 +214,21 @@ class Model:
 
     def __init__(self, lidar: Lidar, scene: Scene, plan: Plan, settled: Sequence[Settled], key: PRNGKeyArray):
         check_place(lidar)
-        places = [s.place for s in settled]
-        if not plan.trace.keeps_histories:
-            # Optics are applied while light is traced.
-            places = [place._replace(geometric=True) for place in places]
-        moving = sum(s.start.size for s, place in zip(settled, places) if place.geometric)
-        problem = Problem(lidar, scene, plan, tuple(places), 0)
-        most = _scored(problem, tuple(s.start for s in settled))
-        at_once = 0 if most else columns_at_once(plan, moving)
-        self.problem = dataclasses.replace(problem, at_once=at_once, most=most)
+        places, most, beside = sorted_places(lidar, scene, plan, settled)
+        moving = sum(s.start.size for s, place in zip(settled, places) if place.kind == "geometric")
+        at_once = columns_at_once(plan, moving, beside)
+        self.problem = Problem(lidar, scene, plan, places, at_once, most)
         self.shapes = [s.start.shape for s in settled]
         self.dtypes = [s.start.dtype for s in settled]
         self.sizes = [s.start.size for s in settled]
         self.keys = [jax.random.fold_in(key, n) for n in range(MIN_BATCHES if plan.is_random else 1)]
         self.few = min(FEW_BATCHES, len(self.keys))
-        self.traces = any(p.geometric for p in self.problem.places)
+        self.traces = any(p.traced for p in self.problem.places)
         self._kept: tuple[np.ndarray, list[Any]] | None = None
         owner = np.repeat(np.arange(len(self.sizes)), self.sizes)
-        geometric = np.array([p.geometric for p in self.problem.places], bool)[owner]
-        self.order = np.argsort(np.concatenate([np.flatnonzero(geometric), np.flatnonzero(~geometric)]))
+        kinds = np.array([p.kind for p in self.problem.places])[owner]
+        found = [np.flatnonzero(kinds == kind) for kind in ("geometric", "extinction", "optical")]
+        self.order = np.argsort(np.concatenate(found))
 
     def values(self, flat: Float[np.ndarray, " columns"]) -> Values:
         """The unknowns' values from one vector."""
@@ -274,9 +272,10 @@ class Model:
         if self._kept is not None and (not self.traces or np.array_equal(self._kept[0], flat)):
             kept = self._kept[1]
         values = self.values(flat)
+        scores = _compiled_scores(self.problem, values) if self.problem.most else None
 
         def one(key):
-            return _compiled_batch(self.problem, values, key)
+            return _compiled_batch(self.problem, values, key, scores)
 
         with side_by_side() as run:
             traced = [*kept[:number], *run(one, self.keys[len(kept) : number])]

@@ -51,7 +51,7 @@ def corners(scene: Scene, settled: list[Settled]) -> list[Scene]:
     All combinations for up to four unknowns; for more, each alone and all together. An array is at its low or
     its high bounds as a whole.
     """
-    moving = [i for i, s in enumerate(settled) if s.place.geometric]
+    moving = [i for i, s in enumerate(settled) if s.place.traced]
     if len(moving) <= _ALL_CORNERS:
         sides = [dict(zip(moving, c)) for c in itertools.product("lh", repeat=len(moving))] if moving else []
     else:

@@ -238,7 +238,7 @@ class Terms:
 
 def settled_terms(recorder: Recorder) -> list[Settled]:
     """The unknowns of a recorder. Their starts are set after the first simulation, but for the width's."""
-    nowhere, found = Place(None, None, False), []
+    nowhere, found = Place(None, None, "optical"), []
     shapes = {
         _WIDTH: (recorder.width, ()),
         _OFFSET: (recorder.offset, () if recorder.interleaved == 1 else (recorder.interleaved,)),

@@ -246,4 +246,4 @@ def scale_of(bounds: Any, settled: list[Settled]) -> Settled:
         raise ValueError("name = 'scale' is taken by the scale; the unknown needs another one")
     # Its start is set after the first simulation.
     start = jnp.asarray(0.5 * (low + high))
-    return Settled("scale", Place(None, None, False), start, np.asarray(low), np.asarray(high), None)
+    return Settled("scale", Place(None, None, "optical"), start, np.asarray(low), np.asarray(high), None)

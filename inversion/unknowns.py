@@ -6,7 +6,7 @@ solver in z never reaches the bounds.
 
 import difflib
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, final
+from typing import Any, Literal, NamedTuple, final
 
 import equinox as eqx
 import jax
@@ -21,8 +21,6 @@ from .priors import LogNormal, Smooth
 
 # (mean, standard deviation), or a prior with a name.
 Prior = tuple[Float[Array, "..."], Float[Array, "..."]] | LogNormal | Smooth
-# Arrays of the scene that are extinction coefficients.
-_EXTINCTION = (".canopy.voxels.leaf", ".canopy.voxels.bark")
 # Least distance of a starting value from a bound, as a share of the bounds' width.
 MARGIN = 0.01
 
@@ -125,18 +123,25 @@ class Unknown(eqx.Module):
             check_range(f"{called}: prior standard deviation", self.prior[1], 0.0, low_open=True)
 
 
+Kind = Literal["optical", "extinction", "geometric"]
+
+
 class Place(NamedTuple):
     """How a value enters the scene: hashable, and equal for equal unknowns.
 
     - `leaf`: number of the scene's leaf that it replaces, or None where `apply` sets it.
-    - `geometric`: whether a change of the value may change the paths of light.
-    - `extinction`: whether it changes them by extinction alone.
+    - `kind`: what a change of the value changes: "optical", only what is left of light; "extinction", the
+      weights of paths of light; "geometric", the paths.
     """
 
     leaf: int | None
     apply: Callable[[Scene, Array], Scene] | None
-    geometric: bool
-    extinction: bool = False
+    kind: Kind
+
+    @property
+    def traced(self) -> bool:
+        """Whether the response depends on the value."""
+        return self.kind != "optical"
 
 
 class Settled(NamedTuple):
@@ -163,8 +168,11 @@ def settle(unknowns: Sequence[Unknown], scene: Scene) -> list[Settled]:
         check_kind(f"unknowns[{i}]", unknown, Unknown, "an Unknown")
     if len(unknowns) == 0:
         raise ValueError("unknowns is empty; admissible is one unknown or more")
-    optical = optical_leaves(scene)
-    found = [_settle_one(u, scene, optical) for u in unknowns]
+    kinds: list[tuple[Kind, frozenset[int]]] = [
+        ("optical", optical_leaves(scene)),
+        ("extinction", extinction_leaves(scene)),
+    ]
+    found = [_settle_one(u, scene, kinds) for u in unknowns]
     names = [f.name for f in found]
     for name in names:
         if names.count(name) > 1:
@@ -176,7 +184,7 @@ def settle(unknowns: Sequence[Unknown], scene: Scene) -> list[Settled]:
     return found
 
 
-def _settle_one(u: Unknown, scene: Scene, optical: frozenset[int]) -> Settled:
+def _settle_one(u: Unknown, scene: Scene, kinds: list[tuple[Kind, frozenset[int]]]) -> Settled:
     number, name, start = None, u.name, u.start
     if u.where is None:
         touched = _touched(u, scene)
@@ -207,7 +215,8 @@ def _settle_one(u: Unknown, scene: Scene, optical: frozenset[int]) -> Settled:
         pair = (u.prior.median, u.prior.spread) if isinstance(u.prior, LogNormal) else u.prior
         mean, std = (np.asarray(_broadcast(name, "prior", p, start.shape), float) for p in pair)
         prior = np.log(mean) if log_prior else mean, std
-    place = Place(number, u.apply, not touched <= optical, touched <= extinction_leaves(scene))
+    those: list[Kind] = [kind for kind, leaves in kinds if touched <= leaves]
+    place = Place(number, u.apply, those[0] if those else "geometric")
     return start_from(Settled(name, place, start, low, high, prior, log_prior, smooth), start)
 
 
@@ -302,9 +311,11 @@ def optical_leaves(scene: Scene) -> frozenset[int]:
 
 
 def extinction_leaves(scene: Scene) -> frozenset[int]:
-    """Numbers of the scene's leaves that are extinction coefficients."""
-    paths = [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(scene)]
-    return frozenset(i for i, path in enumerate(paths) if path in _EXTINCTION)
+    """Numbers of the scene's leaves that change the extinction of leaf or bark, and nothing else."""
+    leaves = jax.tree_util.tree_leaves_with_path(scene)
+    paths = [[getattr(key, "name", None) for key in path] for path, _ in leaves]
+    ours = (["canopy", "voxels", "leaf"], ["canopy", "voxels", "bark"])
+    return frozenset(i for i, path in enumerate(paths) if path in ours)
 
 
 def put(scene: Scene, places: tuple[Place, ...], values: tuple[Array, ...]) -> Scene:

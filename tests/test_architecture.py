@@ -99,7 +99,6 @@ ORDER = {
         "response",
         "few_wavelengths",
         "colouring",
-        "extinction",
         "node_response",
         "viewed_response",
     ],

@@ -173,8 +173,12 @@ def test_the_band_is_the_matrix(pulse, window, monkeypatch):
 
 
 def layers_scaled(scene, share):
+    """Geometric, for the place of the map is among what it sets."""
+    voxels = scene.canopy.voxels
     return eqx.tree_at(
-        lambda s: s.canopy.voxels.leaf, scene, replace_fn=lambda leaf: leaf * share[None, None]
+        lambda s: (s.canopy.voxels.leaf, s.canopy.voxels.voxel_size),
+        scene,
+        (voxels.leaf * share[None, None], 1.0 * voxels.voxel_size),
     )
 
 

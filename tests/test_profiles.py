@@ -32,10 +32,9 @@ CENTRE = 1.0
 def settled_of(smooth, low=-9.0, high=11.0):
     """A profile, and a number beside it."""
     start = jnp.full(LAYERS, CENTRE)
-    wide = Settled("x", Place(None, None, True), start, np.full(LAYERS, low), np.full(LAYERS, high), None)
-    number = Settled(
-        "b", Place(None, None, True), jnp.asarray(0.0), np.asarray(-50.0), np.asarray(50.0), None
-    )
+    place = Place(None, None, "geometric")
+    wide = Settled("x", place, start, np.full(LAYERS, low), np.full(LAYERS, high), None)
+    number = Settled("b", place, jnp.asarray(0.0), np.asarray(-50.0), np.asarray(50.0), None)
     return [wide._replace(smooth=smooth), number]
 
 

@@ -158,8 +158,8 @@ def test_the_tracer_does_not_look_at_optical_leaves():
     assert not optical_leaves(jl.Scene(ground=terrain))
     # Leaves that transmit straight on scale extinction.
     straight = canopy_scene(transmission="straight")
-    assert [s.place.geometric for s in settle(UNKNOWNS, straight)] == [True, True, False, True, True]
-    assert [s.place.geometric for s in settle(UNKNOWNS, canopy_scene())] == [False, True, False, True, False]
+    assert [s.place.traced for s in settle(UNKNOWNS, straight)] == [True, True, False, True, True]
+    assert [s.place.traced for s in settle(UNKNOWNS, canopy_scene())] == [False, True, False, True, False]
 
 
 @pytest.mark.slow

@@ -85,6 +85,21 @@ def jacobian_bytes(
     return (batches + 1) * response + cores * (response + columns * each)
 
 
+def scored_bytes(
+    trace: TracePlan, bins: Bins, light: tuple[int, int], cells: int, columns: int, wavelengths: int
+) -> float:
+    """Bytes that derivatives in so many unknowns which change extinction alone take on all cores.
+
+    **Arguments:** `light`: photons and rays of a batch. - `cells`: voxels.
+    """
+    photons, rays = light
+    rows = columns * wavelengths * bins.padded
+    moving = photons + min(rays, _RAYS) * trace.first_steps
+    each = _COPIES * rows + _TANGENTS * columns * moving
+    tables = 4 * columns * cells
+    return float(jnp.result_type(float).itemsize * ((os.cpu_count() or 1) * each + tables))
+
+
 def in_words(size: float) -> str:
     """Bytes, MB or GB, to two digits."""
     for unit, one in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):

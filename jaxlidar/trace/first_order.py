@@ -251,8 +251,8 @@ def first_order(
             escaped = _add(escaped, history, gone * share)
         shape = (materials, count)
         if scored is not None:
-            scored = scored.reshape(*shape, *scored.shape[1:])
-        return response, scored, (arrived.reshape(shape), scattered.reshape(shape), escaped)
+            scored = scored[:, bins.row : bins.row + bins.count].reshape(*shape, bins.count, -1)
+        return response, (arrived.reshape(shape), scattered.reshape(shape), escaped), scored
 
     n = energy.shape[0]
     fill = -n % CHUNK
@@ -262,21 +262,19 @@ def first_order(
         return rays((x, y), e)
 
     if n <= CHUNK:
-        response, scored, fate = rays(across, energy)
+        response, fate, scored = rays(across, energy)
     elif medium is None:
         # Without a march all chunks fit into the memory at once, and no loop is compiled.
         each = jax.vmap(chunk)(*padded)
-        response, scored, fate = jax.tree.map(lambda a: jnp.sum(a, axis=0), each)
+        response, fate, scored = jax.tree.map(lambda a: jnp.sum(a, axis=0), each)
     else:
         zero = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(rays, across, energy))
 
         def add(total, part):
             return jax.tree.map(jnp.add, total, chunk(*part)), None
 
-        response, scored, fate = lax.scan(add, zero, padded)[0]
+        response, fate, scored = lax.scan(add, zero, padded)[0]
     weights, outside = bins.trimmed(response.reshape(materials, count, bins.padded))
-    if scored is not None:
-        scored = scored[:, :, bins.row :][:, :, : bins.count]
     arrived, scattered, escaped = fate
     return FirstOrder(weights, outside, arrived, scattered, escaped, scored)
 

@@ -176,7 +176,7 @@ def higher_orders(setting: Setting, key: PRNGKeyArray, nodes: Nodes | None = Non
     )
     tallies, _ = lax.scan(group, zero, jnp.arange(groups, dtype=jnp.uint32))
     if tallies.scored is not None:
-        tallies = eqx.tree_at(lambda t: t.scored, tallies, tallies.scored[bins.row :][: bins.count])
+        tallies = eqx.tree_at(lambda t: t.scored, tallies, tallies.scored[bins.row : bins.row + bins.count])
     return eqx.tree_at(lambda t: (t.weights, t.outside), tallies, bins.trimmed(tallies.weights))
 
 
@@ -404,7 +404,6 @@ def _deposit(
             response = scatter_rows(response, slot, first, row * left)
     if score is not None:
         assert tally.scored is not None
-        tally = eqx.tree_at(
-            lambda t: t.scored, tally, scored(setting, tally.scored, first, row, score, pairs, label)
-        )
+        returned = scored(setting, tally.scored, first, row, score, pairs, label)
+        tally = eqx.tree_at(lambda t: t.scored, tally, returned)
     return eqx.tree_at(lambda t: t.weights, tally, response.reshape(tally.weights.shape))

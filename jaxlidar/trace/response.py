@@ -119,7 +119,7 @@ def trace_scored(
 ) -> tuple[Response, Float[Array, "columns wavelengths bins"]]:
     """The response of one batch, and what its `scores` make of it at these optics, in fine bins.
 
-    For settings that keep histories and have no transmittance straight on (`jaxlidar.trace.extinction`).
+    For plans that keep histories, and leaves that do not transmit straight on.
     """
     first, weights = _first(setting, key)
     assert first.scored is not None

@@ -122,16 +122,18 @@ def rows_of_stretches(
 ) -> Float[Array, "stretches pieces columns"]:
     """Derivatives of what leaf, or bark, of that extinction returns from stretches, bin by bin.
 
-    With the integral I of exp(-kappa tau) over a piece, whose derivative at a fixed depth of its start is
-    dI/dk, and the derivatives D of that depth, they are `value` times
+    With the integral I of exp(-kappa tau) over a piece, its derivative dI/dk at a fixed depth of the start,
+    and the derivatives D of that depth, they are `value` times
 
         extinction dI/dk dk  +  I (d extinction - kappa extinction D).
     """
     medium, scores, bins = setting.medium, setting.scores, setting.bins
     assert medium is not None
     assert scores is not None
-    stretch, low, extinction, value, share = stop((stretch, low, extinction, value, medium.leaf_share(w)))
-    assert stretch.moved is not None
+    before = stretch.moved
+    assert before is not None
+    stretch, low, extinction, value = stop((stretch, low, extinction, value))
+    share = stop(medium.leaf_share(w))
 
     def pieces_at(k):
         return stretch_pieces(bins, low, dataclasses.replace(stretch, extinction=k), kappa)[1]
@@ -145,7 +147,7 @@ def rows_of_stretches(
         own = jnp.zeros_like(slope)
     else:
         own = scores.spread(columns, own.slopes(stretch.cell, share), axis=-1)
-    inner = value[:, None] * (own - (kappa * extinction)[:, None] * stretch.moved)
+    inner = value[:, None] * (own - (kappa * extinction)[:, None] * before)
     return rows_of(pieces.T, inner) + rows_of(steeper.T, (value * extinction)[:, None] * slope)
 
 

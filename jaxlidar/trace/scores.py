@@ -37,11 +37,11 @@ class Scores(eqx.Module):
     count: int = eqx.field(static=True)
 
     @property
-    def cells(self) -> int:
-        """Number of voxels."""
+    def most(self) -> int:
+        """The most columns that one voxel is moved by."""
         table = self.leaf if self.leaf is not None else self.bark
         assert table is not None
-        return table.shape[1]
+        return table.shape[0]
 
     def slopes(
         self, cell: Int[Array, "*s"], leaf_share: Float[Array, "*s"] | None = None
@@ -50,15 +50,11 @@ class Scores(eqx.Module):
 
         `leaf_share`: extinction per unit of `Medium.leaf` in the direction of flight; None for one.
         """
-        parts = []
-        if self.leaf is not None:
-            parts.append(_at(self.leaf, cell, leaf_share))
-        if self.bark is not None:
-            parts.append(_at(self.bark, cell, None))
-        together = parts[0]
-        for more in parts[1:]:
-            together = [a + b for a, b in zip(together, more)]
-        return together
+        bark = [] if self.bark is None else _at(self.bark, cell, None)
+        if self.leaf is None:
+            return bark
+        leaf = _at(self.leaf, cell, leaf_share)
+        return [a + b for a, b in zip(leaf, bark)] if bark else leaf
 
     def alone(self, is_leaf: bool) -> "Scores | None":
         """The scores of leaf, or of bark, alone; None where it is not moved."""
@@ -67,14 +63,14 @@ class Scores(eqx.Module):
             return None
         return dataclasses.replace(self, bark=None) if is_leaf else dataclasses.replace(self, leaf=None)
 
-    def columns_of(self, cell: Int[Array, "*s"]) -> list[Int[Array, "*s"] | int]:
-        """The columns of the slopes of voxels."""
+    def columns_of(self, cell: Int[Array, "*s"]) -> list[Int[Array, "*s"]]:
+        """The columns of the slopes of voxels; empty where these are all columns in turn."""
         if self.number is None:
-            return list(range(self.count))
+            return []
         return [row.at[cell].get(mode="promise_in_bounds") for row in self.number]
 
     def spread(
-        self, columns: list[Int[Array, "*s"] | int], values: list[Float[Array, "*s"]], axis: int = 0
+        self, columns: list[Int[Array, "*s"]], values: list[Float[Array, "*s"]], axis: int = 0
     ) -> Float[Array, "..."]:
         """Values of some columns among all of them, which become the axis `axis`."""
         if self.number is None:
@@ -82,12 +78,11 @@ class Scores(eqx.Module):
         shape = [1] * (values[0].ndim + 1)
         shape[axis] = self.count
         names = jnp.arange(self.count, dtype=jnp.int32).reshape(shape)
-        found = jnp.zeros(())
-        for own, value in zip(columns, values):
-            own, value = jnp.expand_dims(own, axis), jnp.expand_dims(value, axis)
-            more = jnp.where(own == names, value, 0.0)
-            found = more if found.ndim == 0 else found + more
-        return found
+        pairs = ((jnp.expand_dims(a, axis), jnp.expand_dims(b, axis)) for a, b in zip(columns, values))
+        first, *rest = (jnp.where(own == names, value, 0.0) for own, value in pairs)
+        for more in rest:
+            first = first + more
+        return first
 
     def add(
         self,
@@ -104,7 +99,7 @@ class Scores(eqx.Module):
         names = jnp.arange(self.count, dtype=jnp.int32)[None, :, None]
         for own, slope in zip(columns, slopes):
             more = (slope[None] * length)[:, None]
-            moved = moved + jnp.where(jnp.asarray(own)[None, None] == names, more, 0.0)
+            moved = moved + jnp.where(own[None, None] == names, more, 0.0)
         return moved
 
     def gains(
@@ -127,13 +122,6 @@ class Scores(eqx.Module):
             inverse = jnp.where(there, 1.0 / jnp.where(there, k, 1.0), 0.0)
             values = [v + slope * inverse for v, slope in zip(values, _at(table, cell, None))]
         return self.spread(self.columns_of(cell), values, axis=-1)
-
-    @property
-    def most(self) -> int:
-        """The most columns that one voxel is moved by."""
-        table = self.leaf if self.leaf is not None else self.bark
-        assert table is not None
-        return table.shape[0]
 
 
 def _at(
