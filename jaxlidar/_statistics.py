@@ -1,13 +1,18 @@
 """Means of batches and their standard errors."""
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float
+
+from jaxlidar._programs import Program
 
 # Samples below this share of the peak do not count in the error of a waveform.
 COUNTS = 0.01
+# So many batches are spread to all wavelengths by one call: of the fewest that are traced.
+ROWS = 8
 
 
 def widening(batches: Any) -> Any:
@@ -56,9 +61,85 @@ class Moments:
         return widening(self.count) * spread / math.sqrt(self.count)
 
 
-def errors_of(moments: Moments) -> tuple[float, float]:
-    """Relative error of a waveform (see `jaxlidar.simulate`), and its largest standard error."""
-    return float(relative_error(moments.mean, moments.stderr)), float(np.max(moments.stderr))
+class Spectra(NamedTuple):
+    """Mean and standard error of a waveform at all wavelengths; its relative error (see `jaxlidar.simulate`)
+    and its largest standard error.
+    """
+
+    mean: Any
+    stderr: Any
+    relative: Any
+    largest: Any
+
+
+class WaveformMoments(Moments):
+    """Moments of the first wavelengths and samples of waveforms."""
+
+    def __init__(self, wavelengths: int, samples: int):
+        super().__init__()
+        self._size = (wavelengths, samples)
+
+    def add(self, value: Float[ArrayLike, "more_wavelengths more_samples"]) -> None:
+        """Take one more batch in."""
+        wavelengths, samples = self._size
+        super().add(np.asarray(value)[:wavelengths, :samples])
+
+    def spectra(self) -> Spectra:
+        """What is known so far, for two batches and more."""
+        stderr = self.stderr
+        return Spectra(self.mean, stderr, float(relative_error(self.mean, stderr)), float(np.max(stderr)))
+
+
+class FewMoments:
+    """Moments of waveforms of which few wavelengths are known, and `shares` that spread them to all others.
+
+    Sums of squares over batches are those of rows that follow from the batches' one by one. These are linear
+    in the batches, and so are spread as they are.
+    """
+
+    def __init__(self, shares: Float[ArrayLike, "few wavelengths"]):
+        self.count, self._shares = 0, jnp.asarray(shares)
+        self._mean = np.zeros(())
+        self._rows: list[np.ndarray] = []
+        self._squares: Any = None
+
+    def add(self, value: Float[ArrayLike, "few samples"]) -> None:
+        """Take one more batch in (Welford 1962)."""
+        self.count += 1
+        off = np.asarray(value, float) - self._mean
+        self._mean = self._mean + off / self.count
+        self._rows.append(off * math.sqrt((self.count - 1) / self.count))
+
+    def spectra(self) -> Spectra:
+        """What is known so far, for two batches and more."""
+        while self._rows:
+            rows = np.stack(self._rows[:ROWS])
+            rows = jnp.asarray(np.pad(rows, ((0, ROWS - len(rows)), (0, 0), (0, 0))), self._shares.dtype)
+            found = _compiled_squares(rows, self._shares, self._squares)
+            self._squares, self._rows = found, self._rows[ROWS:]
+        scale = widening(self.count) ** 2 / (self.count * (self.count - 1.0))
+        mean = jnp.asarray(self._mean, self._shares.dtype)
+        found = _compiled_spectra(mean, self._shares, self._squares, jnp.asarray(scale, mean.dtype))
+        return Spectra(found.mean, found.stderr, float(found.relative), float(found.largest))
+
+
+def _spread_squares(
+    rows: Float[Array, "rows few samples"],
+    shares: Float[Array, "few wavelengths"],
+    squares: Float[Array, "wavelengths samples"] | None,
+) -> Float[Array, "wavelengths samples"]:
+    """Squares of rows at all wavelengths, added up."""
+    found = jnp.sum(jnp.einsum("fw,rfs->rws", shares, rows) ** 2, axis=0)
+    return found if squares is None else squares + found
+
+
+def _spectra(mean: Array, shares: Array, squares: Array, scale: Array) -> Spectra:
+    mean, stderr = shares.T @ mean, jnp.sqrt(scale * squares)
+    return Spectra(mean, stderr, relative_error(mean, stderr, jnp), jnp.max(stderr))
+
+
+_compiled_squares = Program(_spread_squares)
+_compiled_spectra = Program(_spectra)
 
 
 def relative_error(mean: Any, stderr: Any, xp: Any = np) -> Any:

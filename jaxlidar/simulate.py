@@ -14,7 +14,7 @@ from jaxtyping import Array, PRNGKeyArray
 
 from jaxlidar._checks import check_flag, check_integer, check_key, check_range, is_traced
 from jaxlidar._programs import Program
-from jaxlidar._statistics import Moments, batches_needed, errors_of, widening
+from jaxlidar._statistics import Moments, batches_needed, widening
 from jaxlidar._summary import NOTABLE, late_share, percent
 from jaxlidar._threads import ONE_CORE, side_by_side
 from jaxlidar.instrument.lidar import Lidar
@@ -358,8 +358,8 @@ def _trace_batches(
     many = ready.setup.lidar.wavelength.size
     counted = plan.n_photons if plan.orders > 1 or plan.trace.drawn_first else 0
     whole: Any = None
-    waves, shares, neglected = Moments(), Moments(), Moments()
-    wanted, stopped, error = MIN_BATCHES, "tolerance met", math.inf
+    waves, shares, neglected = ready.brief.moments(many, plan.n_samples), Moments(), Moments()
+    wanted, stopped = MIN_BATCHES, "tolerance met"
     arguments = (ready.setting, ready.transmittance)
 
     def batch(key: PRNGKeyArray) -> Response:
@@ -377,44 +377,43 @@ def _trace_batches(
             while True:
                 for response, mean, shared in run(one, range(waves.count, wanted)):
                     whole = response if whole is None else _add(whole, response)
-                    waves.add(np.asarray(mean)[:many, : plan.n_samples])
+                    waves.add(mean)
                     shares.add(np.stack([np.asarray(a)[:many] for a in shared.ledger.values()]))
                     neglected.add(np.asarray(shared.neglected)[:many])
                     names = list(shared.ledger)
                 done, seconds = waves.count, time.perf_counter() - started
-                error, worst = errors_of(waves)
+                known = waves.spectra()
                 if progress is not None:
-                    progress(Progress(done, done * counted, seconds, error, None if fixed else rtol))
+                    progress(Progress(done, done * counted, seconds, known.relative, None if fixed else rtol))
                 if fixed is not None and done >= fixed:
                     stopped = "photons traced"
                     break
-                if fixed is None and (error <= rtol or worst <= goal.atol):
+                if fixed is None and (known.relative <= rtol or known.largest <= goal.atol):
                     break
                 if seconds >= goal.max_seconds:
                     stopped = "time spent"
                     break
                 # Rounds are short, so that time and interrupts are looked at in between.
-                wanted = min(fixed, 4 * done) if fixed is not None else batches_needed(done, error, rtol)
+                wanted = min(fixed, 4 * done) if fixed else batches_needed(done, known.relative, rtol)
                 if math.isfinite(goal.max_seconds):
                     affordable = done * goal.max_seconds / max(seconds, 1e-9)
                     wanted = max(min(wanted, int(affordable)), done + 1)
         except KeyboardInterrupt:
             if waves.count < MIN_BATCHES:
                 raise
-            error, _ = errors_of(waves)
-            stopped = "interrupted"
+            known, stopped = waves.spectra(), "interrupted"
     beyond = 0.0
     if stopped == "tolerance met" and plan.limits.automatic_orders:
-        share = float(np.max(neglected.mean / np.maximum(waves.mean.sum(axis=1), 1e-30), initial=0.0))
+        share = float(np.max(neglected.mean / np.maximum(np.sum(known.mean, axis=1), 1e-30), initial=0.0))
         if share > rtol and float(np.max(neglected.mean, initial=0.0)) > goal.atol:
             beyond, stopped = share, f"orders beyond {plan.orders} may add {percent(share)}"
     info = {
         "photons": waves.count * counted,
         "batches": waves.count,
         "seconds": time.perf_counter() - started,
-        "error": error,
+        "error": known.relative,
         "stopped": stopped,
     }
     assert whole is not None
     ledger_stderr = {name: jnp.asarray(row) for name, row in zip(names, shares.stderr)}
-    return _Traced(whole, waves.count, jnp.asarray(waves.stderr), ledger_stderr, info, beyond)
+    return _Traced(whole, waves.count, jnp.asarray(known.stderr), ledger_stderr, info, beyond)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import jaxlidar as jl
+from jaxlidar._statistics import FewMoments, WaveformMoments
 from jaxlidar.trace.colouring import balance, recording_of, total
 from jaxlidar.trace.few_wavelengths import few_of
 from jaxlidar.trace.histories import histories
@@ -113,3 +114,22 @@ def test_errors_of_a_spectrum_are_those_of_its_wavelengths():
         largest = float(alone.stderr.max())
         np.testing.assert_allclose(spectrum.stderr[i], alone.stderr[0], rtol=1e-3, atol=1e-3 * largest)
         np.testing.assert_allclose(spectrum.reflectance[i], alone.reflectance[0], rtol=1e-5, atol=1e-7)
+
+
+def test_moments_of_few_wavelengths_are_those_of_all():
+    """Over rounds of any size: what is kept of few, spread, is what batches at all wavelengths have."""
+    random = np.random.default_rng(0)
+    shares = random.uniform(-1.0, 1.0, (5, 40))
+    short, whole = FewMoments(jnp.asarray(shares, jnp.float32)), WaveformMoments(40, 7)
+    for batches in (8, 3, 21):
+        for _ in range(batches):
+            few = 2.0 + random.uniform(size=(5, 7))
+            short.add(few)
+            whole.add(np.pad(shares.T @ few, ((0, 2), (0, 1))))
+        mine, each = short.spectra(), whole.spectra()
+        assert short.count == whole.count
+        for name in ("mean", "stderr"):
+            expected = getattr(each, name)
+            np.testing.assert_allclose(getattr(mine, name), expected, atol=3e-6 * np.abs(expected).max())
+        assert mine.relative == pytest.approx(each.relative, rel=1e-3)
+        assert mine.largest == pytest.approx(each.largest, rel=1e-5)

@@ -1,6 +1,7 @@
 """From response to samples: optics of every history, the atmosphere, the pulse, and where the energy went."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -10,6 +11,7 @@ from jaxtyping import Array, Float
 
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._programs import Program
+from jaxlidar._statistics import FewMoments, WaveformMoments
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.planning.effects import can_light_itself
 from jaxlidar.planning.ladder import rung
@@ -65,6 +67,17 @@ class Recording(eqx.Module):
         if self.lidar.wavelength.size <= _MANY:
             return self
         return dataclasses.replace(self, few=few_of(self.optics, max(self.first_degree, self.degree)))
+
+    @property
+    def unspread(self) -> FewWavelengths | None:
+        """Few wavelengths from which samples follow. None without such, and where air makes them unlike."""
+        return self.few if self.clear is None else None
+
+    def moments(self, wavelengths: int, samples: int) -> WaveformMoments | FewMoments:
+        """Room for the moments of what `total_and_balance` returns, without what is there to spare."""
+        if self.unspread is None:
+            return WaveformMoments(wavelengths, samples)
+        return FewMoments(np.asarray(self.unspread.shares)[:, :wavelengths])
 
     @property
     def coloured(self) -> int:
@@ -201,25 +214,36 @@ def samples_of(
     weights: Float[Array, "traces *rest histories bins"], table: Histories, recording: Recording
 ) -> Float[Array, "*rest wavelengths samples"]:
     """Samples by wavelength of weights by history and fine bin: optics, atmosphere, pulse."""
-    sampling, clear = recording.sampling, recording.clear
-    weights = weights[..., : table.count, :]
-    if clear is not None:
-        fine = recording.spread(recording.colour(weights, table))
-        return sampling(fine * clear.reshape((1,) * (fine.ndim - 2) + clear.shape))
+    clear = recording.clear
+    if clear is None:
+        return recording.spread(_without_air(weights, table, recording))
+    fine = recording.spread(recording.colour(weights, table))
+    return recording.sampling(fine * clear.reshape((1,) * (fine.ndim - 2) + clear.shape))
+
+
+def _without_air(
+    weights: Float[Array, "traces *rest histories bins"], table: Histories, recording: Recording
+) -> Float[Array, "*rest coloured samples"]:
+    """Samples without atmosphere, at all wavelengths or the few that stand for them."""
+    sampling, weights = recording.sampling, weights[..., : table.count, :]
     count, wavelengths = table.count, recording.coloured
     pulse_last = (wavelengths * (count + sampling.samples)) * sampling.bins
     pulse_first = (count * (sampling.bins + wavelengths)) * sampling.samples
     if len(weights) == 1 and pulse_first < pulse_last:
-        return recording.spread(recording.colour(sampling(weights), table))
-    return recording.spread(sampling(recording.colour(weights, table)))
+        return recording.colour(sampling(weights), table)
+    return sampling(recording.colour(weights, table))
 
 
 def total(response: Response, recording: Recording) -> Float[Array, "wavelengths samples"]:
     """Apparent reflectance per sample, all components together."""
+    return _total(response, recording, samples_of)
+
+
+def _total(response: Response, recording: Recording, samples: Callable[..., Array]) -> Array:
     found = jnp.zeros(())
     for table, part in zip((recording.short, recording.table), (response.first, response.higher)):
         if part is not None:
-            found = found + samples_of(jnp.sum(part, axis=1), table, recording)
+            found = found + samples(jnp.sum(part, axis=1), table, recording)
     return recording.admissible * (found if recording.air is None else found + recording.air)
 
 
@@ -320,6 +344,10 @@ def balance_of(sums: Shares, recording: Recording) -> Balance:
 
 def total_and_balance(
     response: Response, recording: Recording
-) -> tuple[Float[Array, "wavelengths samples"], Balance]:
-    """What standard errors are known of: see `total` and `balance`."""
-    return total(response, recording), balance(response, recording)
+) -> tuple[Float[Array, "kept samples"], Balance]:
+    """What standard errors are known of: see `total` and `balance`.
+
+    Samples are at the few wavelengths of `Recording.unspread` where there are such.
+    """
+    samples = samples_of if recording.unspread is None else _without_air
+    return _total(response, recording, samples), balance(response, recording)

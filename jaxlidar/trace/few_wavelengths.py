@@ -5,13 +5,12 @@ it is at 2,101 wavelengths follows from some thirty (an interpolative decomposit
 Martinsson and Rokhlin 2005, SIAM J. Sci. Comput. 26, 1389).
 """
 
-from typing import Any, final
+from typing import final
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
-from scipy.linalg.interpolative import interp_decomp, reconstruct_interp_matrix
 
 # Polynomials that are tried, and what may be left of the largest at any wavelength.
 _TRIED, _LEFT = 64, 1e-5
@@ -42,15 +41,45 @@ def few_of(optics: Float[Array, "letters wavelengths"], degree: int) -> FewWavel
     """
     values, random = np.asarray(optics, float), np.random.default_rng(0)
     # Powers of random sums span all polynomials, and are numbers of one size.
-    sums = random.uniform(-1, 1, (_TRIED, len(values))) @ values + random.uniform(-1, 1, (_TRIED, 1))
-    tried = sums ** random.integers(1, degree + 1, (_TRIED, 1))
+    weights, constant = random.uniform(-1, 1, (_TRIED, len(values))), random.uniform(-1, 1, (_TRIED, 1))
+    sums = np.einsum("tl,lw->tw", weights, values) + constant
+    tried, degrees = sums.copy(), random.integers(1, degree + 1, _TRIED)
+    for reached in range(2, degree + 1):
+        tried[degrees >= reached] *= sums[degrees >= reached]
     tried /= np.max(np.abs(tried), axis=1, keepdims=True)
-    size = np.linalg.norm(tried, axis=0)
-    found: Any = interp_decomp(tried / size, _LEFT, rand=False)
-    count, order, rest = found
+    size = np.sqrt(np.sum(tried**2, axis=0))
+    order, rows = _pivots(tried / size)
+    count = len(order)
     room = -(-count // _STEP) * _STEP
     if count == _TRIED or room >= values.shape[1]:
         return None
-    shares = np.zeros((room, values.shape[1]))
-    shares[:count] = reconstruct_interp_matrix(order, rest) * (size / size[order[:count], None])
-    return FewWavelengths(jnp.asarray(order[:room]), jnp.asarray(shares, optics.dtype))
+    shares, chosen = np.zeros((room, values.shape[1])), np.zeros(room, int)
+    chosen[:count] = order
+    # What the chosen add to all is R^-1 of their columns times R, from the last row up.
+    for n in reversed(range(count)):
+        later = np.einsum("c,cw->w", rows[n, order[n + 1 :]], shares[n + 1 : count])
+        shares[n] = (rows[n] - later) / rows[n, order[n]]
+    shares[:count] *= size / size[order, None]
+    return FewWavelengths(jnp.asarray(chosen), jnp.asarray(shares, optics.dtype))
+
+
+def _pivots(
+    columns: Float[np.ndarray, "tried wavelengths"],
+) -> tuple[list[int], Float[np.ndarray, "few wavelengths"]]:
+    """The columns of which all others are made, and the rows of R of their QR decomposition.
+
+    NumPy's own is not taken: threads of its BLAS wait busily for 0.1 s after a call, on the cores that trace.
+    """
+    left, order = np.sum(columns**2, axis=0), list[int]()
+    axes, rows = np.zeros((len(columns), len(columns))), list[np.ndarray]()
+    enough = _LEFT**2 * np.max(left)
+    while len(order) < len(columns) and np.max(left) > enough:
+        order.append(int(np.argmax(left)))
+        axis = columns[:, order[-1]]
+        # Twice is enough (Giraud, Langou and Rozloznik 2005, Comput. Math. Appl. 50, 1069).
+        for _ in range(2):
+            axis = axis - np.einsum("nt,n->t", axes, np.einsum("nt,t->n", axes, axis))
+        axes[len(order) - 1] = axis = axis / np.sqrt(np.sum(axis**2))
+        rows.append(np.einsum("t,tw->w", axis, columns))
+        left = left - rows[-1] ** 2
+    return order, np.array(rows)
