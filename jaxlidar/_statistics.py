@@ -62,11 +62,13 @@ class Moments:
 
 
 class Spectra(NamedTuple):
-    """Mean and standard error of a waveform at all wavelengths; its relative error (see `jaxlidar.simulate`)
-    and its largest standard error.
+    """What is known of a waveform at all wavelengths.
+
+    - `whole`: its mean, all samples together. - `stderr`: of every sample. - `relative`: its relative error
+      (see `jaxlidar.simulate`). - `largest`: its largest standard error.
     """
 
-    mean: Any
+    whole: Any
     stderr: Any
     relative: Any
     largest: Any
@@ -86,8 +88,8 @@ class WaveformMoments(Moments):
 
     def spectra(self) -> Spectra:
         """What is known so far, for two batches and more."""
-        stderr = self.stderr
-        return Spectra(self.mean, stderr, float(relative_error(self.mean, stderr)), float(np.max(stderr)))
+        mean, stderr = self.mean, self.stderr
+        return Spectra(mean.sum(axis=1), stderr, float(relative_error(mean, stderr)), float(np.max(stderr)))
 
 
 class FewMoments:
@@ -112,15 +114,20 @@ class FewMoments:
 
     def spectra(self) -> Spectra:
         """What is known so far, for two batches and more."""
-        while self._rows:
-            rows = np.stack(self._rows[:ROWS])
-            rows = jnp.asarray(np.pad(rows, ((0, ROWS - len(rows)), (0, 0), (0, 0))), self._shares.dtype)
-            found = _compiled_squares(rows, self._shares, self._squares)
+        while len(self._rows) > ROWS:
+            found = _compiled_squares(self._next(), self._shares, self._squares)
             self._squares, self._rows = found, self._rows[ROWS:]
         scale = widening(self.count) ** 2 / (self.count * (self.count - 1.0))
-        mean = jnp.asarray(self._mean, self._shares.dtype)
-        found = _compiled_spectra(mean, self._shares, self._squares, jnp.asarray(scale, mean.dtype))
-        return Spectra(found.mean, found.stderr, float(found.relative), float(found.largest))
+        mean, scale = (jnp.asarray(a, self._shares.dtype) for a in (self._mean, scale))
+        found, squares = _compiled_spectra(mean, self._next(), self._shares, self._squares, scale)
+        self._squares, self._rows = squares, []
+        return found._replace(relative=float(found.relative), largest=float(found.largest))
+
+    def _next(self) -> Float[Array, "rows few samples"]:
+        """The next rows that are not among the squares yet, or zeros in their place."""
+        rows = np.zeros((ROWS, *self._mean.shape))
+        rows[: min(len(self._rows), ROWS)] = self._rows[:ROWS]
+        return jnp.asarray(rows, self._shares.dtype)
 
 
 def _spread_squares(
@@ -129,13 +136,25 @@ def _spread_squares(
     squares: Float[Array, "wavelengths samples"] | None,
 ) -> Float[Array, "wavelengths samples"]:
     """Squares of rows at all wavelengths, added up."""
-    found = jnp.sum(jnp.einsum("fw,rfs->rws", shares, rows) ** 2, axis=0)
-    return found if squares is None else squares + found
+    # One by one: all rows at once are too many numbers for a cache.
+    found = jnp.zeros(()) if squares is None else squares
+    for row in rows:
+        found = found + (shares.T @ row) ** 2
+    return found
 
 
-def _spectra(mean: Array, shares: Array, squares: Array, scale: Array) -> Spectra:
+def _spectra(
+    mean: Float[Array, "few samples"],
+    rows: Float[Array, "rows few samples"],
+    shares: Float[Array, "few wavelengths"],
+    squares: Float[Array, "wavelengths samples"] | None,
+    scale: Float[Array, ""],
+) -> tuple[Spectra, Float[Array, "wavelengths samples"]]:
+    """What is known with so many rows more, and the squares with these."""
+    squares = _spread_squares(rows, shares, squares)
     mean, stderr = shares.T @ mean, jnp.sqrt(scale * squares)
-    return Spectra(mean, stderr, relative_error(mean, stderr, jnp), jnp.max(stderr))
+    known = Spectra(jnp.sum(mean, axis=1), stderr, relative_error(mean, stderr, jnp), jnp.max(stderr))
+    return known, squares
 
 
 _compiled_squares = Program(_spread_squares)

@@ -404,7 +404,7 @@ def _trace_batches(
             known, stopped = waves.spectra(), "interrupted"
     beyond = 0.0
     if stopped == "tolerance met" and plan.limits.automatic_orders:
-        share = float(np.max(neglected.mean / np.maximum(np.sum(known.mean, axis=1), 1e-30), initial=0.0))
+        share = float(np.max(neglected.mean / np.maximum(known.whole, 1e-30), initial=0.0))
         if share > rtol and float(np.max(neglected.mean, initial=0.0)) > goal.atol:
             beyond, stopped = share, f"orders beyond {plan.orders} may add {percent(share)}"
     info = {

@@ -258,12 +258,16 @@ def columns_in_samples(
 
 def components(response: Response, recording: Recording) -> dict[str, Float[Array, "wavelengths samples"]]:
     """Apparent reflectance per sample, by material of the last scattering and by order."""
-    first = samples_of(response.first, recording.short, recording)
-    higher = jnp.zeros_like(first)
+    nothing = jnp.zeros((recording.lidar.wavelength.size, recording.sampling.samples), response.first.dtype)
+    # Material by material: together, spectra would be put in another order in memory.
+    numbers = range(len(recording.materials))
+    first = [samples_of(response.first[:, m], recording.short, recording) for m in numbers]
+    higher = [nothing for _ in numbers]
     if response.higher is not None:
-        higher = samples_of(response.higher, recording.table, recording)
-    lines = jnp.concatenate([first + higher, jnp.sum(first, 0)[None], jnp.sum(higher, 0)[None]])
-    found = dict(zip([*recording.materials, "first", "higher"], recording.admissible * lines))
+        higher = [samples_of(response.higher[:, m], recording.table, recording) for m in numbers]
+    found = {name: recording.admissible * (f + h) for name, f, h in zip(recording.materials, first, higher)}
+    for name, lines in (("first", first), ("higher", higher)):
+        found[name] = recording.admissible * sum(lines, start=nothing)
     if recording.air is not None:
         found["air"] = recording.air
         found["first"] = found["first"] + recording.air
