@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from jaxlidar import extend, io
 from jaxlidar._checks import UnitWarning
 from jaxlidar._constants import SPEED_OF_LIGHT
+from jaxlidar._progress import Progress
 from jaxlidar._workers import LostWorkersWarning
 from jaxlidar.analog import AnalogReturns, analog_returns, photon_paths
 from jaxlidar.campaign.coverage import OffMapWarning
@@ -61,7 +62,7 @@ from jaxlidar.scenes.shapes import AbstractShape, Plane
 from jaxlidar.scenes.surfaces import AbstractGround, AbstractSheet, AbstractSurface, Ground, Plate
 from jaxlidar.scenes.terrain import Terrain
 from jaxlidar.scenes.voxels import VoxelMap
-from jaxlidar.simulate import LateLightWarning, Progress, simulate
+from jaxlidar.simulate import LateLightWarning, simulate
 from jaxlidar.trace.response import Response, trace_scene
 from jaxlidar.truth import Truth, truth_of
 from jaxlidar.waveform import Waveform, total_of, waveform_of

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxlidar._checks import briefly, check_choice, check_integer, check_key, check_range, known_number
 from jaxlidar._programs import Program
+from jaxlidar._progress import Progress
 from jaxlidar._statistics import Moments, batches_needed
 from jaxlidar._threads import ONE_CORE, side_by_side
 from jaxlidar.instrument.lidar import Lidar
@@ -22,7 +23,6 @@ from jaxlidar.planning.plan import MIN_BATCHES
 from jaxlidar.planning.plan import plan as make_plan
 from jaxlidar.planning.setup import Setup, reduce
 from jaxlidar.scenes.scene import Scene, check_kinds
-from jaxlidar.simulate import Progress
 from jaxlidar.trace.colouring import optics_of
 from jaxlidar.trace.fates import Fates, follow, from_beam, from_the_sky
 from jaxlidar.trace.setting import setting_of, straight_transmittance

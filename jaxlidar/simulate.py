@@ -14,6 +14,7 @@ from jaxtyping import Array, PRNGKeyArray
 
 from jaxlidar._checks import check_flag, check_integer, check_key, check_range, is_traced
 from jaxlidar._programs import Program
+from jaxlidar._progress import Progress
 from jaxlidar._statistics import Moments, batches_needed, widening
 from jaxlidar._summary import NOTABLE, late_share, percent
 from jaxlidar._threads import ONE_CORE, side_by_side
@@ -32,45 +33,12 @@ from jaxlidar.trace.response import (
     trace_higher,
     trace_setting,
 )
-from jaxlidar.trace.setting import Setting, setting_of, straight_transmittance
+from jaxlidar.trace.setting import Setting, setting_ahead, setting_of, straight_transmittance
 from jaxlidar.truth import truth_of_setup
 from jaxlidar.waveform import Waveform, open_at_first_return, recorded, trimmed
 
 # Photons of one batch at most: a batch cannot be interrupted.
 LARGEST_BATCH = 65_536
-
-
-@dataclasses.dataclass(frozen=True)
-class Progress:
-    """How far a simulation has come; `simulate` and `energy_budget` give it to their argument `progress`.
-
-    Printed, it is one line of text.
-
-    - `batches`: batches traced so far.
-    - `photons`: photons traced so far.
-    - `seconds`: time spent so far.
-    - `error`: relative error so far: of the waveform, as `simulate` defines it, or of the emitted energy.
-    - `rtol`: relative error aimed at, or None where the number of photons is given.
-
-    **Example:**
-
-    >>> import jaxlidar as jl
-    >>> print(jl.Progress(batches=8, photons=65536, seconds=1.5, error=0.004, rtol=0.01))
-    8 batches, 65536 photons, 1.5 s, relative error 0.004 (aim 0.01)
-    """
-
-    batches: int
-    photons: int
-    seconds: float
-    error: float
-    rtol: float | None
-
-    def __str__(self) -> str:
-        goal = "" if self.rtol is None else f" (aim {self.rtol:.2g})"
-        return (
-            f"{self.batches} batches, {self.photons} photons, {self.seconds:.1f} s, "
-            f"relative error {self.error:.2g}{goal}"
-        )
 
 
 def simulate(
@@ -186,10 +154,15 @@ def _prepared(setup: Setup, key: PRNGKeyArray) -> _Ready:
     transmittance = straight_transmittance(setup)
     own_traces = transmittance is not None or not setup.plan.trace.keeps_histories
     traced = any(is_traced(x) for x in jax.tree.leaves((setup, key)))
-    setting = setting_of(setup, derivatives="all" if traced else "none")
+    in_batches = setup.plan.is_random and not traced
+    ahead = setting_ahead(setup) if in_batches else None
     exact = own_traces or traced
     recording = recording_of(setup) if exact else recording_with_room(setup)
-    brief = recording if exact or not setup.plan.is_random else recording.abridged()
+    brief = recording if exact or not in_batches else recording.abridged()
+    if ahead is not None:
+        # After small programs, which would wait for these to be compiled.
+        _begin_to_compile(_Ready(setup, ahead, transmittance, recording, brief), key)
+    setting = setting_of(setup, derivatives="all" if traced else "none")
     return _Ready(setup, setting, transmittance, recording, brief)
 
 

@@ -9,9 +9,9 @@ from typing import Any
 
 import click
 
+from jaxlidar._progress import Progress
 from jaxlidar.io import atomic_write
 from jaxlidar.io.zarr_groups import is_zarr
-from jaxlidar.simulate import Progress
 
 CASE = click.argument("case", type=click.Path(dir_okay=False, path_type=Path), metavar="CASE.toml")
 PLOT = click.option(

@@ -212,8 +212,12 @@ class Prospect(eqx.Module):
         return plate_model(self._k(absorption), self.N, face)
 
     def _k(self, absorption: Array) -> Array:
-        contents = jnp.stack([getattr(self, name) for name in TRAITS[self.version]])
-        return jnp.tensordot(contents, absorption, 1, precision=jax.lax.Precision.HIGHEST) / self.N
+        return _absorbed([getattr(self, name) for name in TRAITS[self.version]], absorption, self.N)
+
+
+@jax.jit
+def _absorbed(contents: list[Array], absorption: Array, N: Array) -> Array:
+    return jnp.tensordot(jnp.stack(contents), absorption, 1, precision=jax.lax.Precision.HIGHEST) / N
 
 
 def _scalar(name: str, value: ArrayLike) -> Float[Array, ""]:

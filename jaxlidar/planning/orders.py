@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxlidar._checks import concrete, known_array, known_number
+from jaxlidar._checks import concrete, known_array
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar.planning.effects import can_light_itself
 from jaxlidar.planning.ladder import rung
@@ -65,7 +65,7 @@ def mean_depth(canopy: Canopy) -> float:
         if known is None:
             return math.inf
         extinction += known.sum(axis=2, dtype=float)
-    columns = extinction * known_number(canopy.voxels.voxel_size[2])
+    columns = extinction * known_array(canopy.voxels.voxel_size)[2]
     there = columns[columns > 0]
     return float(there.mean()) if there.size else 0.0
 

@@ -106,8 +106,9 @@ def largest_albedo(optics: list[Optics]) -> float:
     """Largest R + T of any scatterer and wavelength; 1 where its value is being traced."""
     albedos = [0.0]
     for o in optics:
-        total = concrete(o.reflectance if o.transmittance is None else o.reflectance + o.transmittance)
-        albedos.append(1.0 if total is None else float(np.max(total)))
+        given = [a for a in (o.reflectance, o.transmittance) if a is not None]
+        known = [share for share in map(concrete, given) if share is not None]
+        albedos.append(float(np.max(sum(known))) if len(known) == len(given) else 1.0)
     return max(albedos)
 
 

@@ -7,8 +7,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter, PercentFormatter
 
+from jaxlidar._progress import Progress
 from jaxlidar.plot.style import BEAM, COLOURS, OTHER, TOTAL, WAVELENGTH_COLOURS, axes_or_new
-from jaxlidar.simulate import Progress
 from jaxlidar.waveform import Waveform
 
 # Fates that are no material's, each with a hatch, so that grey tells them apart.

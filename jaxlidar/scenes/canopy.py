@@ -132,7 +132,9 @@ class Canopy(eqx.Module):
         r, t = optics
         check_range("leaf reflectance", r, 0.0, 1.0 + 1e-6)
         check_range("leaf transmittance", t, 0.0, 1.0 + 1e-6)
-        check_range("leaf reflectance + transmittance", r + t, 0.0, 1.0 + 1e-5)
+        known = (concrete(r), concrete(t))
+        if known[0] is not None and known[1] is not None:
+            check_range("leaf reflectance + transmittance", known[0] + known[1], 0.0, 1.0 + 1e-5)
         names = ("leaf reflectance", "leaf transmittance")
         r, t = (reflectance_at(value, wavelength, name) for value, name in zip((r, t), names))
         return r, t

@@ -98,15 +98,13 @@ class AbstractShape(eqx.Module):
 
 
 @jax.jit
-def _tilted(slope: Float[Array, ""], aspect: Float[Array, ""]) -> Float[Array, "3"]:
-    """Upper unit normal. Compiled, for it is asked for often."""
+def _tilted(
+    slope: Float[Array, ""], aspect: Float[Array, ""], place: Float[Array, "2"], height: Float[Array, ""]
+) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+    """Upper unit normal and a point. Compiled, for they are asked for often."""
     s, a = jnp.deg2rad(slope), jnp.deg2rad(aspect)
-    return jnp.stack([jnp.sin(s) * jnp.sin(a), jnp.sin(s) * jnp.cos(a), jnp.cos(s)])
-
-
-@jax.jit
-def _above(place: Float[Array, "2"], height: Float[Array, ""]) -> Float[Array, "3"]:
-    return jnp.stack([place[0], place[1], height])
+    upward = jnp.stack([jnp.sin(s) * jnp.sin(a), jnp.sin(s) * jnp.cos(a), jnp.cos(s)])
+    return upward, jnp.stack([place[0], place[1], height])
 
 
 @final
@@ -146,8 +144,8 @@ class Plane(AbstractShape):
         **Returns:** a `Plane`.
         """
         height = as_scalar(height, "height")
-        upward = _tilted(as_scalar(slope, "slope"), as_scalar(aspect, "aspect"))
-        return Plane(upward, _above(jnp.asarray(position, height.dtype), height))
+        place = jnp.asarray(position, height.dtype)
+        return Plane(*_tilted(as_scalar(slope, "slope"), as_scalar(aspect, "aspect"), place, height))
 
     @property
     def lights_itself(self) -> bool:

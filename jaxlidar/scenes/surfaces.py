@@ -349,4 +349,8 @@ def _moved(surface: Planar, by: Float[np.ndarray, "2"]) -> Planar:
     fall = np.tan(np.deg2rad(slope)) * np.stack([np.sin(np.deg2rad(aspect)), np.cos(np.deg2rad(aspect))])
     rise, known = fall @ place, concrete(surface.height)
     height = surface.height + rise if known is None else known + rise
-    return eqx.tree_at(lambda s: (s.height, s.position), surface, (jnp.asarray(height, float), jnp.zeros(2)))
+    return eqx.tree_at(
+        lambda s: (s.height, s.position),
+        surface,
+        (jnp.asarray(height, float), jnp.asarray(np.zeros(2), float)),
+    )

@@ -157,16 +157,36 @@ def _density(law: AbstractLaw | AbstractPhase, sent: Scattering, w: Vec) -> Scal
 
 def setting_of(setup: Setup, *, derivatives: Derivatives = "all") -> Setting:
     """The setting of a setup, without wavelengths, unless optics are applied while light is traced."""
+    return _completed(_set_out(*_arranged(setup, derivatives)), setup, derivatives)
+
+
+def setting_ahead(setup: Setup) -> Setting | None:
+    """A setting without derivatives, of shapes, where the program that makes it has yet to be compiled.
+
+    It begins to be, and what takes the setting can be compiled beside it. None where it is compiled.
+    """
+    arguments = _arranged(setup, "none")
+    if _set_out.is_compiled(*arguments):
+        return None
+    return _completed(_set_out.begin(*arguments), setup, "none")
+
+
+def _arranged(setup: Setup, derivatives: Derivatives) -> tuple[Lidar, Scene, TracePlan, Bins, Sizes]:
+    """The arguments of `_arrange`."""
     trace, bins = jax.tree.map(jnp.asarray, (setup.plan.trace, setup.plan.bins))
     sizes = sizes_of(setup.plan)
     if derivatives != "none":
         # Every derivative has histories of its own: none beyond the last order.
         sizes = sizes._replace(degree=setup.plan.least_degree)
-    setting = _set_out(_without_spectrum(setup.lidar), setup.scene, trace, bins, sizes)
-    setting = dataclasses.replace(setting, derivatives=derivatives)
-    if trace.keeps_histories:
-        return setting
-    return dataclasses.replace(setting, optics=letter_values(setup.lidar, setup.scene, trace.letters))
+    return _without_spectrum(setup.lidar), setup.scene, trace, bins, sizes
+
+
+def _completed(setting: Setting, setup: Setup, derivatives: Derivatives) -> Setting:
+    letters = setup.plan.trace.letters
+    if not setup.plan.trace.keeps_histories:
+        optics = letter_values(setup.lidar, setup.scene, letters)
+        setting = eqx.tree_at(lambda s: s.optics, setting, optics, is_leaf=lambda x: x is None)
+    return setting if derivatives == "none" else dataclasses.replace(setting, derivatives=derivatives)
 
 
 def straight_transmittance(setup: Setup) -> Float[Array, "wavelengths"] | None:
@@ -222,6 +242,7 @@ def _arrange(
         leaf_law=leaf_law,
         bark_law=bark_law,
         sizes=sizes,
+        derivatives="none",
     )
 
 
