@@ -85,6 +85,7 @@ ORDER = {
         "photons",
         "viewing",
         "setting",
+        "ordering",
         "labels",
         "nodes",
         "collisions",

@@ -83,7 +83,7 @@ def plate_model(k: Float[ArrayLike, "..."], N: Float[ArrayLike, "..."], surface:
     >>> print(f"R {R:.3f}, T {T:.3f}, A {A:.3f}")
     R 0.287, T 0.305, A 0.409
     """
-    return _values_of(k, N, surface, _bounces(k, N, surface))
+    return _values_of(*_arrays(k, N, surface))
 
 
 def plate_model_slopes(
@@ -100,44 +100,44 @@ def plate_model_slopes(
     **Returns:** reflectance, transmittance and absorptance; their derivatives in `k`; their derivatives in
     `N`.
     """
-    return _slopes_of(k, N, surface, _bounces(k, N, surface))
+    return _slopes_of(*_arrays(k, N, surface))
 
 
-def _bounces(k: Any, N: Any, surface: LeafSurface) -> DoubleSingle | None:
-    """In single precision, kappa = (r12 + r21)/t21 in double-single."""
+def _arrays(k: Any, N: Any, surface: LeafSurface) -> tuple[_Reals, _Reals, LeafSurface, DoubleSingle | None]:
+    """Arrays of one type, and in single precision kappa = (r12 + r21)/t21 in double-single."""
     dtype = jnp.result_type(k, N, float)
-    if dtype != jnp.float32:
-        return None
-    if any(isinstance(x, jax.Array) for x in surface):
-        r12, r21, t21 = (jnp.asarray(x, dtype) for x in (surface.r12, surface.r21, surface.t21))
-        total = pair.plus(pair.split(r21), pair.split(r12))
-        return pair.over(total, pair.split(t21), 1 / t21)
-    return pair.constant((np.asarray(surface.r12, float) + surface.r21) / surface.t21)
+    k, N, *face = (jnp.asarray(x, dtype) for x in (k, N, *surface))
+    face, bounces = LeafSurface(*face), None
+    if dtype == jnp.float32:
+        if any(isinstance(x, jax.Array) for x in surface):
+            total = pair.plus(pair.split(face.r21), pair.split(face.r12))
+            bounces = pair.over(total, pair.split(face.t21), 1 / face.t21)
+        else:
+            bounces = pair.constant((np.asarray(surface.r12, float) + surface.r21) / surface.t21)
+    return k, N, face, bounces
 
 
 # Compiled whole: by itself, every operation of it would be a program to compile.
 @jax.jit
-def _values_of(k: Any, N: Any, surface: LeafSurface, bounces: DoubleSingle | None) -> Triple:
-    k, N, face, bounces = _alike(k, N, surface, bounces)
+def _values_of(k: _Reals, N: _Reals, face: LeafSurface, bounces: DoubleSingle | None) -> Triple:
+    k, N, face, bounces = _alike(k, N, face, bounces)
     return _leaf(k, N - 1, face, bounces)
 
 
 @jax.jit
 def _slopes_of(
-    k: Any, N: Any, surface: LeafSurface, bounces: DoubleSingle | None
+    k: _Reals, N: _Reals, face: LeafSurface, bounces: DoubleSingle | None
 ) -> tuple[Triple, Triple, Triple]:
-    k, N, face, bounces = _alike(k, N, surface, bounces)
+    k, N, face, bounces = _alike(k, N, face, bounces)
     return _everything(k, N - 1, face, bounces)
 
 
 def _alike(
-    k: Any, N: Any, surface: LeafSurface, bounces: DoubleSingle | None
+    k: _Reals, N: _Reals, face: LeafSurface, bounces: DoubleSingle | None
 ) -> tuple[_Reals, _Reals, LeafSurface, DoubleSingle | None]:
-    """Arrays of one shape and type."""
-    dtype = jnp.result_type(k, N, float)
-    arrays = (k, N, *surface, *(bounces or ()))
-    k, N, *face = jnp.broadcast_arrays(*(jnp.asarray(x, dtype) for x in arrays))
-    return k, N, LeafSurface(*face[:6]), bounces and DoubleSingle(*face[6:])
+    """Arrays of one shape."""
+    k, N, *rest = jnp.broadcast_arrays(k, N, *face, *(bounces or ()))
+    return k, N, LeafSurface(*rest[:6]), bounces and DoubleSingle(*rest[6:])
 
 
 class _State(NamedTuple):

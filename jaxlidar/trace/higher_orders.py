@@ -31,6 +31,7 @@ from jaxlidar.trace.footprint import GOLDEN, across_beam
 from jaxlidar.trace.labels import Label, book
 from jaxlidar.trace.march import depth_to_top, free_flight
 from jaxlidar.trace.nodes import Nodes
+from jaxlidar.trace.ordering import in_order
 from jaxlidar.trace.photons import THROUGH, Hit, Photons, ratio_of, stop
 from jaxlidar.trace.random_numbers import Draw, Independent, lattices, to_unit, words
 from jaxlidar.trace.reparametrise import (
@@ -127,38 +128,44 @@ def higher_orders(setting: Setting, key: PRNGKeyArray, nodes: Nodes | None = Non
         lane = number * (each * size) + jnp.arange(each * size, dtype=jnp.uint32)
 
         def one_order(carry, n):
-            lanes, photons, tally = carry
+            photons, tally = carry
+            source, living = in_order(setting, photons[1])
+            flat = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), photons)
 
-            def flown(lane, photons, tally):
-                return _one_order(setting, photons, tally, Draw.of(numbers(lane, n), plates), n)
+            def taken(number):
+                place = source[number]
+                lane, own = jax.tree.map(lambda a: a.at[place].get(mode="promise_in_bounds"), flat)
+                alive = number * size + jnp.arange(size) < living
+                return lax.optimization_barrier((lane, eqx.tree_at(lambda p: p.alive, own, alive)))
 
-            def chunk(tally, part):
-                lane, own = part
-                own, tally = lax.cond(jnp.any(own.alive), flown, lambda _, *c: c, lane, own, tally)
+            def flown(lane, own, tally):
+                own, tally = _one_order(setting, own, tally, Draw.of(numbers(lane, n), plates), n)
+                return (lane, own), tally
+
+            def chunk(tally, number):
+                lane, own = taken(number)
+                own, tally = lax.cond(jnp.any(own.alive), flown, lambda *c: (c[:2], c[2]), lane, own, tally)
                 return tally, own
 
             def next_chunk(number, state):
                 photons, tally = state
-                lane, own = (jax.tree.map(lambda a: a[number], of) for of in (lanes, photons))
+                lane, own = taken(number)
                 own, tally = flown(lane, own, tally)
                 return jax.tree.map(lambda a, b: a.at[number].set(b), photons, own), tally
 
-            # Living photons come first: the chunks of dead ones are skipped, or not even looked at.
+            # Chunks of dead photons are skipped, or not even looked at.
             if setting.reverse:
-                tally, photons = lax.scan(chunk, tally, (lanes, photons))
-            else:
-                living = jnp.sum(jnp.any(photons.alive, axis=1))
-                photons, tally = lax.fori_loop(0, living, next_chunk, (photons, tally))
-            lanes, photons = _alive_first(lanes, photons)
-            return lanes, photons, tally
+                tally, photons = lax.scan(chunk, tally, jnp.arange(each))
+                return photons, tally
+            left = eqx.tree_at(lambda p: p[1].alive, photons, jnp.zeros_like(photons[1].alive))
+            return lax.fori_loop(0, -(-living // size), next_chunk, (left, tally))
 
         def order(carry, n):
             # The loop is as long as the ladder of sizes has it.
             return lax.cond(n < plan.orders, one_order, lambda carry, _: carry, carry, n), None
 
-        lane, photons = begin(lane)
-        rows = jax.tree.map(lambda a: a.reshape(each, size, *a.shape[1:]), (lane, photons))
-        (_, last, tally), _ = lax.scan(order, (*rows, zero), jnp.arange(plan.order_steps))
+        rows = jax.tree.map(lambda a: a.reshape(each, size, *a.shape[1:]), begin(lane))
+        ((_, last), tally), _ = lax.scan(order, (rows, zero), jnp.arange(plan.order_steps))
         over = jnp.where(last.alive, last.weight, 0.0)
         remaining = book(tally.remaining, (), Label.of(last), over)
         tally = eqx.tree_at(lambda t: t.remaining, tally, remaining)
@@ -178,19 +185,6 @@ def higher_orders(setting: Setting, key: PRNGKeyArray, nodes: Nodes | None = Non
     if tallies.scored is not None:
         tallies = eqx.tree_at(lambda t: t.scored, tallies, tallies.scored[bins.row : bins.row + bins.count])
     return eqx.tree_at(lambda t: (t.weights, t.outside), tallies, bins.trimmed(tallies.weights))
-
-
-def _alive_first(lanes: Array, photons: Photons) -> tuple[Array, Photons]:
-    """Bring the living photons to the front, in their order; all others are dead copies of the first."""
-    alive = photons.alive.reshape(-1)
-    number = jnp.arange(alive.size)
-    place = jnp.where(alive, jnp.cumsum(alive) - 1, alive.size)
-    source = jnp.zeros_like(number).at[place].set(number, mode="drop")
-    lanes, photons = jax.tree.map(
-        lambda a: a.reshape(-1, *a.shape[2:])[source].reshape(a.shape), (lanes, photons)
-    )
-    alive = (number < jnp.sum(alive)).reshape(photons.alive.shape)
-    return lanes, eqx.tree_at(lambda p: p.alive, photons, alive)
 
 
 def _one_order(setting: Setting, p: Photons, tally: HigherOrders, draw: Draw, order: Int[Array, ""]):

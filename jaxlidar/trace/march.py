@@ -27,7 +27,7 @@ from jaxlidar.trace.scores import Scores
 # Voxels of a map that is laid out without room to spare.
 LARGE = 1 << 17
 # Steps between two checks whether any ray of the batch still moves.
-BLOCK = 16
+BLOCK = 8
 
 
 class AngleTables(eqx.Module):
