@@ -26,6 +26,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxlidar.extend import once
 from jaxlidar.optics.leaf_surface import LeafSurface
 from jaxlidar.optics.plate_model import plate_model_slopes
 
@@ -131,7 +132,7 @@ def _errors(
         k = dot("i,ij->j", x[1:], absorption) / x[0]
         values, in_k, in_N = (jnp.stack(v[:2]) for v in plate_model_slopes(k, x[0], face))
         # Without the barrier the compiler would compute them again for every sum below.
-        values, in_k, in_N = lax.optimization_barrier((values, in_k, in_N))
+        values, in_k, in_N = once((values, in_k, in_N))
         in_N = in_N - in_k * k[None] / x[0]
         rest = absorption[:, None] * in_k[None] / x[0]
         return values, jnp.concatenate([in_N[None], rest]), in_k * k[None]

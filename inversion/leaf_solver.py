@@ -26,6 +26,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
+from jaxlidar.extend import once
 from jaxlidar.optics.leaf_surface import LeafSurface
 from jaxlidar.optics.plate_model import plate_model_slopes
 
@@ -123,7 +124,7 @@ def _fit(
         k = jnp.dot(x[1:], absorption, precision=lax.Precision.HIGHEST) / x[0]
         values, in_k, in_N = (jnp.stack(v[:2]) for v in plate_model_slopes(k, x[0], face))
         # Without the barrier the compiler would compute them again for every sum below.
-        values, in_k, in_N = lax.optimization_barrier((values, in_k, in_N))
+        values, in_k, in_N = once((values, in_k, in_N))
         off = values - observed
         residual, s = off * weight, in_k * weight / x[0]
         n = in_N * weight - s * k[None]

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxlidar import _expint
+from jaxlidar._one_function import once
 
 _Single = Float[Array, "..."]
 
@@ -214,7 +215,7 @@ def refined(
     Given are 1 - v and, by the name of `v`, exp(k) v for k >= 1, v itself below.
     """
     scale, inverse = _expint.helpers(k)
-    thin, excess = w < 0.3, jax.lax.optimization_barrier(_excess(k, scale, inverse, w, v, bounces))
+    thin, excess = w < 0.3, once(_excess(k, scale, inverse, w, v, bounces))
     log_part = minus_log_of(v, w, thin, excess)
     change = v * excess
     v = scale * (v + change)

@@ -1,19 +1,25 @@
-"""Loops that the processor's compiler makes one function of.
+"""What older compilers have to be told: which loops are one function, and which values to compute once.
 
 XLA runs a program on a processor as a list of small kernels. In a loop whose arrays fit into the processor's
 cache, handing on from kernel to kernel takes longer than computing. Newer versions compile such loops as one
-function by themselves; older ones have to be told.
+function by themselves. Older ones also drop optimisation barriers, and compute what several results share
+again for each of them.
 """
 
 from collections.abc import Callable
 from typing import TypeVar
 
 import jax
+from jax import lax
 
 State = TypeVar("State")
 
-# From this version on, XLA finds the loops itself.
+# From this version on, XLA finds the loops itself, and keeps barriers.
 _UNAIDED = (0, 12)
+
+
+def _is_aided() -> bool:
+    return jax.__version_info__ < _UNAIDED and jax.default_backend() == "cpu"
 
 
 def one_function(loop: Callable[[State], State]) -> Callable[[State], State]:
@@ -21,7 +27,7 @@ def one_function(loop: Callable[[State], State]) -> Callable[[State], State]:
 
     It may not scatter. So it cannot be differentiated in reverse, which makes scatters of gathers.
     """
-    if jax.__version_info__ >= _UNAIDED or jax.default_backend() != "cpu":
+    if not _is_aided():
         return loop
     # Experimental: only where it is needed.
     from jax.experimental.xla_metadata import set_xla_metadata
@@ -34,3 +40,14 @@ def one_function(loop: Callable[[State], State]) -> Callable[[State], State]:
             return compiled(state)
 
     return marked
+
+
+def once(values: State) -> State:
+    """The same values, computed once for all that use them."""
+    if not _is_aided():
+        return lax.optimization_barrier(values)
+    from jax.experimental.xla_metadata import set_xla_metadata
+
+    # A function that is called is a barrier.
+    with set_xla_metadata(inlineable="false"):
+        return jax.jit(lax.optimization_barrier)(values)

@@ -12,6 +12,7 @@ For laws, pulses and elements of your own, and for packages on top such as `inve
 - `check_kinds` refuses what is no lidar or no scene.
 - `briefly` lets `help` show a class's arguments without their types.
 - `fingerprint` tells whether all that a result depends on is as it was.
+- `once` has values computed once for all that use them, whatever the compiler.
 - `side_by_side` runs compiled programs on as many threads as there are cores; compile them with `ONE_CORE`.
 - `outcomes` does tasks that `task` makes, here or by the workers of an executor.
 """
@@ -29,6 +30,7 @@ from jaxlidar._checks import (
     concrete,
 )
 from jaxlidar._fingerprint import fingerprint
+from jaxlidar._one_function import once
 from jaxlidar._ranges import Range, check_ranges, inadmissible, reasons
 from jaxlidar._threads import ONE_CORE, side_by_side
 from jaxlidar._vectors import (
@@ -74,6 +76,7 @@ __all__ = [
     "from_frame",
     "inadmissible",
     "normalise",
+    "once",
     "outcomes",
     "polar",
     "reasons",

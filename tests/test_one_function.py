@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxlidar as jl
-from jaxlidar._one_function import one_function
+from jaxlidar._one_function import once, one_function
 from jaxlidar.trace.march import free_flight, medium_of
 
 KEY = jax.random.key(0)
@@ -71,3 +71,30 @@ def test_a_scene_can_be_traced_for_forward_derivatives_alone():
     np.testing.assert_allclose(*totals, rtol=1e-4, atol=1e-6)
     with pytest.raises(TypeError, match="reverse"):
         jl.trace_scene(setup, KEY, reverse="no")
+
+
+def shared(x, hold):
+    """Two results of one value, laid out so that one loop cannot give both."""
+    y = hold(jnp.abs(x) * x + x)
+    return y[::-1] + 1.0, jnp.sum(y.reshape(8, -1), axis=0), jnp.cumsum(y)
+
+
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="kernels of processors")
+def test_values_are_computed_once():
+    """Told to; untold, older compilers compute them again for each result."""
+
+    def count(hold):
+        return jax.jit(lambda x: shared(x, hold)).lower(jnp.ones(4096)).compile().as_text().count(" abs(")
+
+    assert count(once) == 1
+    assert jax.__version_info__ >= (0, 12) or count(lambda y: y) > 1
+
+
+def test_values_computed_once_have_their_derivatives():
+    x = jnp.linspace(0.5, 2.0, 16)
+    plain, held = (
+        lambda x, h=h: jnp.sum(jnp.stack([jnp.sum(a) for a in shared(x, h)])) for h in (lambda y: y, once)
+    )
+    np.testing.assert_allclose(held(x), plain(x), rtol=1e-6)
+    np.testing.assert_allclose(jax.grad(held)(x), jax.grad(plain)(x), rtol=1e-5)
+    np.testing.assert_allclose(jax.jacfwd(held)(x), jax.jacfwd(plain)(x), rtol=1e-5)

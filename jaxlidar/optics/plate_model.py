@@ -40,6 +40,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from jaxlidar import _double_single as pair
 from jaxlidar import _expint
 from jaxlidar._double_single import DoubleSingle
+from jaxlidar._one_function import once
 from jaxlidar.optics.leaf_surface import LeafSurface
 
 _Reals = Float[Array, "..."]
@@ -166,7 +167,7 @@ class _State(NamedTuple):
 
 def _state(k: _Reals, M: _Reals, face: LeafSurface, bounces: DoubleSingle | None) -> _State:
     # The barriers keep the compiler from computing these again for every output (twice as fast on the CPU).
-    tau, omega = jax.lax.optimization_barrier((_expint.tau(k), _expint.omega(k)))
+    tau, omega = once((_expint.tau(k), _expint.omega(k)))
     q, p = face.t21 + face.r21 * omega, 1 + face.r21 * tau
     inside = face.t21 * tau / (q * p)
     t, Ta = face.t12 * inside, face.t_alpha * inside
@@ -186,7 +187,7 @@ def _state(k: _Reals, M: _Reals, face: LeafSurface, bounces: DoubleSingle | None
         exact, fine = pair.refined(*jax.lax.stop_gradient((k, w, scaled, bounces)))
         w = w + (exact[0] - jax.lax.stop_gradient(w))
         v = v + (exact[1] - jax.lax.stop_gradient(v))
-    beta, V, Z = jax.lax.optimization_barrier(_decay(w, jax.lax.stop_gradient(v), M, fine))
+    beta, V, Z = once(_decay(w, jax.lax.stop_gradient(v), M, fine))
     W = jnp.where(clear, M, Z * (1 + V) / (jnp.where(clear, 1.0, w) * (1 + v)))
     D = s * g * W + 1 + V * V
     return _State(tau, t, r, A, Ta, Ra, Aa, q, p, y, s, g, v, w, beta, V, Z, W, D)

@@ -42,6 +42,7 @@ from jaxlidar._checks import (
     concrete,
     warn_units,
 )
+from jaxlidar._one_function import once
 from jaxlidar._ranges import Range, check_ranges
 from jaxlidar.optics.coefficients import TRAITS, Coefficients, shipped
 from jaxlidar.optics.leaf_surface import LeafSurface, leaf_surface
@@ -339,7 +340,7 @@ def prospect_jacobian(
         k = leaf._k(absorption)
         (R, T, _), (R_k, T_k, _), (R_N, T_N, _) = plate_model_slopes(k, leaf.N, face)
         # Else the compiler would compute them again for every trait.
-        R, T, R_k, T_k, R_N, T_N = jax.lax.optimization_barrier((R, T, R_k, T_k, R_N, T_N))
+        R, T, R_k, T_k, R_N, T_N = once((R, T, R_k, T_k, R_N, T_N))
         thinner = k / leaf.N
         slopes = {"N": (R_N - R_k * thinner, T_N - T_k * thinner)}
         R_k, T_k = R_k / leaf.N, T_k / leaf.N

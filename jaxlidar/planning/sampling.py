@@ -9,6 +9,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from jaxlidar._one_function import once
 from jaxlidar._programs import Program
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.instrument.pulse import AbstractPulse
@@ -35,7 +36,7 @@ class Sampling(eqx.Module):
         """Share of a return in fine bin i that each sample receives."""
         samples, bins = np.arange(self.samples)[None, :], np.arange(self.bins)[:, None]
         # Fused into the gather, the pulse would be computed again for every element.
-        return lax.optimization_barrier(self.share)[samples * self.per_sample - bins - self.first]
+        return once(self.share)[samples * self.per_sample - bins - self.first]
 
     def __call__(self, fine: Float[Array, "*s bins"]) -> Float[Array, "*s samples"]:
         """Samples of returns in fine bins."""

@@ -26,6 +26,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxlidar._checks import known_array
+from jaxlidar._one_function import once
 from jaxlidar._vectors import FAR, Scalar, Vec, along, dot, normalise, vec
 from jaxlidar.scenes.raster import Cell, Raster
 from jaxlidar.scenes.shapes import AbstractShape
@@ -111,7 +112,7 @@ class HeightField(AbstractShape):
     def tangent(self, x: Vec) -> tuple[Vec, Scalar]:
         height, (east, north) = self.heights.with_slope(x)
         # Compilers would look it up again for every result that depends on it.
-        normal, height = lax.optimization_barrier((normalise((-east, -north, jnp.ones_like(east))), height))
+        normal, height = once((normalise((-east, -north, jnp.ones_like(east))), height))
         return normal, dot(normal, (x[0], x[1], height))
 
     def distance(self, x: Vec, w: Vec) -> Scalar:
@@ -228,17 +229,17 @@ class HeightField(AbstractShape):
 
         def advance(ray: _Ray) -> _Ray:
             # Compilers would compute what is shared again for every part of the ray.
-            clear, out, (east, north) = lax.optimization_barrier(self._across(way, ray))
+            clear, out, (east, north) = once(self._across(way, ray))
             faces = [way.gap[k] * number + way.offset[k] for k, number in enumerate((ray.i, ray.j))]
             until = jnp.maximum(ray.at, jnp.minimum(jnp.minimum(faces[0], faces[1]), way.leave))
             length = until - ray.at
-            a, b, c = lax.optimization_barrier(self._rise(way, ray.at, (ray.i, ray.j)))
+            a, b, c = once(self._rise(way, ray.at, (ray.i, ray.j)))
             c = jnp.where(ray.above, jnp.maximum(c, 0.0), c)
             end = (a * length + b) * length + c
             root, real = _falling_root(a, b, c)
             through = (c >= 0) & (end < 0)
             hit = ray.running & ~clear & (through | (real & (root >= 0) & (root <= length)))
-            hit, root, until, end = lax.optimization_barrier((hit, root, until, end))
+            hit, root, until, end = once((hit, root, until, end))
             met = jnp.where(hit, ray.at + jnp.clip(root, 0.0, length), ray.met)
             until = jnp.where(clear, out, until)
             go = ray.running & ~hit & (until < way.leave)

@@ -9,7 +9,7 @@ from jaxlidar.optics.facets import facet_normal, facet_reflection, facet_transmi
 from jaxlidar.optics.phase import AbstractPhase
 from jaxlidar.planning.trace_plan import Scatterer
 from jaxlidar.trace.march import Medium
-from jaxlidar.trace.photons import Hit, Scattering, merge, ratio_of, stop
+from jaxlidar.trace.photons import Hit, Met, Scattering, merge, ratio_of, stop
 from jaxlidar.trace.random_numbers import Draw
 from jaxlidar.trace.setting import COSINE_LAW, Setting
 from jaxlidar.trace.surfaces import Surface
@@ -175,7 +175,13 @@ def _leaf_normal(medium: Medium, w: Vec, u: Scalar, v: Scalar) -> tuple[Vec, Sca
     return normal, jnp.abs(cosine) / medium.angles.projection_at(w) * ratio_of(p[number])
 
 
-def view_factors(setting: Setting, x: Vec, w: Vec, v: Vec, hit: Hit) -> tuple[Scalar, Scalar | None]:
+def shown(setting: Setting, hit: Hit) -> Met:
+    """What of a collision `view_factors` asks for."""
+    turned = setting.medium is not None and setting.medium.angles is not None
+    return Met(hit.material, hit.on, hit.reflected, hit.transmitted, hit.normal if turned else None)
+
+
+def view_factors(setting: Setting, x: Vec, w: Vec, v: Vec, hit: Met) -> tuple[Scalar, Scalar | None]:
     """View factors towards `v` of light that collides at `x`, flying along `w`.
 
     They are apparent reflectance per unit reflectance, and per unit transmittance (None if nothing
@@ -194,6 +200,7 @@ def view_factors(setting: Setting, x: Vec, w: Vec, v: Vec, hit: Hit) -> tuple[Sc
             if medium.leaf_phase is not None:
                 lit = far = medium.leaf_phase.view_factor(w, v)
             elif medium.angles is not None:
+                assert hit.normal is not None
                 turned = dot(hit.normal, v)
                 lit, far = jnp.maximum(turned, 0.0), jnp.maximum(-turned, 0.0)
             reflected, transmitted = jnp.where(here, lit, reflected), jnp.where(here, far, transmitted)

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from jaxlidar._one_function import once
 from jaxlidar.planning.trace_plan import Bins
 
 
@@ -22,7 +23,7 @@ def instant_row(
 ) -> tuple[Int[Array, "*s"], Float[Array, "*s kernel"]]:
     """First bin (counting the margin) and weights of a return at one instant."""
     # Fused into the row, both would be computed again for each of its bins.
-    position, value = lax.optimization_barrier((bins.position(time), value))
+    position, value = once((bins.position(time), value))
     lowest = jnp.round(lax.stop_gradient(position) - 0.5 * (bins.kernel - 1))
     r = position - lowest
     match bins.kernel:

@@ -20,6 +20,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxlidar._constants import SPEED_OF_LIGHT
+from jaxlidar._one_function import once
 from jaxlidar._vectors import FAR, Scalar, Vec, along, scale
 from jaxlidar.optics.facets import FACET_BACKSCATTER
 from jaxlidar.optics.laws import AbstractMirror
@@ -176,7 +177,7 @@ def first_order(
             for history, share in both_ways.terms(table, int(successor[0, part.letter]), middle, before):
                 slot = jnp.broadcast_to(m * count + history, first.shape)
                 # Fused, what the pieces are multiplied by would be computed again for each, out of order.
-                row = lax.optimization_barrier(pieces * lax.optimization_barrier(value * share)[None])
+                row = once(pieces * once(value * share)[None])
                 row = jnp.moveaxis(row, 0, -1)
                 response = scatter_rows(response, slot, first, row)
                 if scores is not None:

@@ -23,8 +23,9 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from jaxlidar._constants import SPEED_OF_LIGHT
+from jaxlidar._one_function import once
 from jaxlidar._vectors import FAR, Scalar, Vec, along
-from jaxlidar.trace.collisions import collide, view_factors
+from jaxlidar.trace.collisions import collide, shown, view_factors
 from jaxlidar.trace.deposit import instant_row, scatter_rows
 from jaxlidar.trace.flight import Flight, events_of, fly, nearest, plates_ahead
 from jaxlidar.trace.footprint import GOLDEN, across_beam
@@ -32,7 +33,7 @@ from jaxlidar.trace.labels import Label, book
 from jaxlidar.trace.march import depth_to_top, free_flight
 from jaxlidar.trace.nodes import Nodes
 from jaxlidar.trace.ordering import in_order
-from jaxlidar.trace.photons import THROUGH, Hit, Photons, ratio_of, stop
+from jaxlidar.trace.photons import THROUGH, Met, Photons, ratio_of, stop
 from jaxlidar.trace.random_numbers import Draw, Independent, lattices, to_unit, words
 from jaxlidar.trace.reparametrise import (
     footprint_rays,
@@ -136,7 +137,7 @@ def higher_orders(setting: Setting, key: PRNGKeyArray, nodes: Nodes | None = Non
                 place = source[number]
                 lane, own = jax.tree.map(lambda a: a.at[place].get(mode="promise_in_bounds"), flat)
                 alive = number * size + jnp.arange(size) < living
-                return lax.optimization_barrier((lane, eqx.tree_at(lambda p: p.alive, own, alive)))
+                return once((lane, eqx.tree_at(lambda p: p.alive, own, alive)))
 
             def flown(lane, own, tally):
                 own, tally = _one_order(setting, own, tally, Draw.of(numbers(lane, n), plates), n)
@@ -202,7 +203,7 @@ def _one_order(setting: Setting, p: Photons, tally: HigherOrders, draw: Draw, or
     strata = jnp.stack([(i + (draw.flight * ends - chosen)) / ends for i in range(ends)])
     wide = functools.partial(jnp.broadcast_to, shape=strata.shape)
     flights = fly(setting, p, limit, budget, jnp.maximum(strata, 1e-9))
-    p, draw, flights, events, limit = lax.optimization_barrier((p, draw, flights, events, limit))
+    p, draw, flights, events, limit = once((p, draw, flights, events, limit))
 
     def pick(a: Array) -> Array:
         own = chosen.astype(jnp.int32).reshape((1,) * (a.ndim - 1) + chosen.shape)
@@ -309,7 +310,8 @@ def _return(
     value = jnp.where(flights.event, flat(weight), 0.0) * hit.ratio / ends
     if score is not None:
         score = score + gains(setting, flights.cell, flights.collided, hit)
-    given = lax.optimization_barrier((p.w, x, p.path + flown, value, label, hit, draw, score))
+    # What is not asked for would be computed as well.
+    given = once((p.w, x, p.path + flown, value, label, shown(setting, hit), draw.behind, score))
     return _deposit(setting, tally, *given)
 
 
@@ -329,8 +331,8 @@ def _deposit(
     path: Scalar,
     weight: Scalar,
     label: Label,
-    hit: Hit,
-    draw: Draw,
+    hit: Met,
+    behind: tuple[Scalar, ...],
     score: Float[Array, "photons columns"] | None,
 ) -> HigherOrders:
     """Deposit the expected return of each collision."""
@@ -353,7 +355,7 @@ def _deposit(
         if score is not None:
             assert back.moved is not None
             score = score - back.moved[0].T
-    drawn = iter(draw.behind)
+    drawn = iter(behind)
     for i, (s, scatterer) in enumerate(zip(setting.surfaces, plan.surfaces)):
         if not s.plate:
             if s.shape.lights_itself and not beam.parallel:
@@ -385,15 +387,15 @@ def _deposit(
     if setting.viewing is not None:
         assert label.entry is not None
         # One row for each shot that may see it.
-        shots, part, later = lax.optimization_barrier(setting.viewing.parts(beam.axis, label.entry, x))
+        shots, part, later = once(setting.viewing.parts(beam.axis, label.entry, x))
         time, value, material = time[:, None] + later, value[:, None] * part, material[:, None]
-    first, row = lax.optimization_barrier(instant_row(setting.bins, time, value))
+    first, row = once(instant_row(setting.bins, time, value))
     for letter, factor in pairs:
         factor = jnp.where(letter >= 0, factor, 0.0)
         for slot, tint in label.grown(setting, letter).slots(shots):
             slot = material * tally.weights.shape[1] + slot
             # Fused into the rows, it would be computed again for each of their bins.
-            left = lax.optimization_barrier(factor if tint is None else factor * tint)
+            left = once(factor if tint is None else factor * tint)
             left = left.reshape(left.shape + (1,) * (row.ndim - 1))
             response = scatter_rows(response, slot, first, row * left)
     if score is not None:

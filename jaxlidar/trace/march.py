@@ -4,8 +4,8 @@ Nothing is sampled on the way: within a voxel the extinction coefficient is cons
 known at every face and linear between them. Distances to faces are computed from integer face numbers, never
 accumulated. A batch of photons stops as soon as the last of them has stopped.
 
-Values that several results of a step share are held by `lax.optimization_barrier`; the CPU compiler would
-otherwise compute them again for each result.
+Values that several results of a step share are computed once: the compiler for processors would otherwise
+compute them again for each result.
 """
 
 import dataclasses
@@ -16,7 +16,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxlidar._one_function import one_function
+from jaxlidar._one_function import once, one_function
 from jaxlidar._vectors import FAR, Scalar, Vec
 from jaxlidar.optics.leaf_angles import ANGLE_NODES, LeafAngles
 from jaxlidar.optics.phase import AbstractPhase
@@ -104,7 +104,7 @@ def _together(leaf: Array | None, bark: Array | None) -> Array | None:
 
 
 def _pick(table: Float[Array, "cells"], cell: Int[Array, "*s"]) -> Scalar:
-    return table.at[cell].get(mode="promise_in_bounds")
+    return table.at[cell].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
 def medium_of(canopy: Canopy, aim: Float[Array, "3"]) -> Medium:
@@ -164,14 +164,19 @@ class Walk(eqx.Module):
         return tuple(gap * v + offset for gap, offset, v in zip(self.gap, self.offset, voxel))
 
 
+def choose(condition: Bool[Array, "*s"], a: Array, b: Array) -> Array:
+    """`jnp.where`, where shapes are alike without its being a function: older compilers would not fuse it."""
+    return lax.select(condition, a, b) if jnp.shape(a) == jnp.shape(b) else jnp.where(condition, a, b)
+
+
 def earlier(a: Scalar, b: Scalar) -> Scalar:
     """The smaller of two numbers. Of equal ones the first, where `minimum` has half of both derivatives."""
-    return jnp.where(b < a, b, a)
+    return choose(b < a, b, a)
 
 
 def later(a: Scalar, b: Scalar) -> Scalar:
     """The larger of two numbers; of equal ones the first."""
-    return jnp.where(b > a, b, a)
+    return choose(b > a, b, a)
 
 
 def begin(medium: Medium, x: Vec, w: Vec, box: Box | None = None) -> Walk:
@@ -215,9 +220,13 @@ def cell_of(medium: Medium, voxel: tuple[Int[Array, "*s"], ...]) -> Int[Array, "
     if medium.periodic:
         i, j = _wrapped(voxel[0], nx), _wrapped(voxel[1], ny)
     else:
-        i, j = jnp.clip(voxel[0], 0, nx - 1), jnp.clip(voxel[1], 0, ny - 1)
+        i, j = _within(voxel[0], nx), _within(voxel[1], ny)
     _, along_y, along_z = medium.shape
-    return (i * along_y + j) * along_z + jnp.clip(voxel[2], 0, nz - 1)
+    return (i * along_y + j) * along_z + _within(voxel[2], nz)
+
+
+def _within(number: Int[Array, "*s"], count: Int[Array, ""]) -> Int[Array, "*s"]:
+    return lax.clamp(jnp.int32(0), number, count - 1)
 
 
 def _wrapped(number: Int[Array, "*s"], count: Int[Array, ""]) -> Int[Array, "*s"]:
@@ -230,7 +239,7 @@ def advance(
     walk: Walk, voxel: tuple[Int[Array, "*s"], ...], faces: tuple[Scalar, ...], to: Scalar
 ) -> tuple[Int[Array, "*s"], ...]:
     """The voxel behind the faces that are met by the distance `to`; through an edge or a corner, several."""
-    return tuple(v + jnp.where(face <= to, s, 0) for v, s, face in zip(voxel, walk.step, faces))
+    return tuple(v + choose(face <= to, s, jnp.zeros_like(s)) for v, s, face in zip(voxel, walk.step, faces))
 
 
 def occupied(medium: Medium) -> Box:
@@ -290,7 +299,7 @@ def free_flight(
     walk = begin(medium, x, w, box)
     end = earlier(walk.leave, limit)
     most = jnp.max(targets, axis=0) if len(targets) else jnp.full_like(limit, jnp.inf)
-    walk, end, targets, most = lax.optimization_barrier((walk, end, targets, most))
+    walk, end, targets, most = once((walk, end, targets, most))
 
     def wide(a: Array) -> Array:
         return jnp.broadcast_to(a, targets.shape)
@@ -299,16 +308,16 @@ def free_flight(
 
     def step(state, _):
         distance, depth, voxel, running, held, moved = state
-        faces = lax.optimization_barrier(walk.faces(voxel))
+        faces = once(walk.faces(voxel))
         to = later(distance, earlier(end, earlier(earlier(faces[0], faces[1]), faces[2])))
         cell = cell_of(medium, voxel)
         k = medium.extinction(cell, w)
-        more = depth + k * (to - distance)
-        to, more, cell = lax.optimization_barrier((to, more, cell))
+        to, cell = once((to, cell))
+        more = once(depth + k * (to - distance))
         here = wide(running) & (wide(depth) <= targets) & (targets < wide(more))
         go = running & (more <= most) & (to < end)
-        here, go = lax.optimization_barrier((here, go))
-        held = tuple(jnp.where(here, wide(a), b) for a, b in zip((distance, to, depth, cell), held))
+        here, go = once((here, go))
+        kept = tuple(choose(here, wide(a), b) for a, b in zip((distance, to, depth, cell), held))
         if scores is not None:
             length = jnp.where(running, to - distance, 0.0)[None]
             if len(targets):
@@ -317,7 +326,7 @@ def free_flight(
             moved = scores.add(moved, cell, lax.stop_gradient(length), share)
         # Where the ray has stopped, the voxel does not matter.
         ahead = advance(walk, voxel, faces, to)
-        state = jnp.where(running, to, distance), jnp.where(running, more, depth), ahead, go, held, moved
+        state = choose(running, to, distance), choose(running, more, depth), ahead, go, kept, moved
         return state, None
 
     def block(state, _):

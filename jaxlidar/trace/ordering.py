@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Int
 
+from jaxlidar._one_function import once
 from jaxlidar.trace.march import begin
 from jaxlidar.trace.photons import Photons
 from jaxlidar.trace.setting import Setting
@@ -24,9 +25,9 @@ def in_order(setting: Setting, photons: Photons) -> tuple[Int[Array, "chunks siz
     Zeros follow. It is a counting sort: within chunks by a running count of every class.
     """
     alive = photons.alive
-    own = lax.optimization_barrier(jnp.where(alive, _classes(setting, photons), CLASSES))
+    own = once(jnp.where(alive, _classes(setting, photons), CLASSES))
     ones = jnp.where(alive, 1 << (_BITS * own), 0)
-    running = lax.optimization_barrier(jnp.cumsum(ones, axis=1))
+    running = once(jnp.cumsum(ones, axis=1))
 
     def count(packed: Int[Array, "*s"], number: int) -> Int[Array, "*s"]:
         return (packed >> (_BITS * number)) & ((1 << _BITS) - 1)
@@ -36,7 +37,7 @@ def in_order(setting: Setting, photons: Photons) -> tuple[Int[Array, "chunks siz
     place = jnp.full(alive.shape, alive.size)
     for c in range(CLASSES):
         place = jnp.where(own == c, before[c][:, None] + count(running, c) - 1, place)
-    number, place = jnp.arange(alive.size), lax.optimization_barrier(place.reshape(-1))
+    number, place = jnp.arange(alive.size), once(place.reshape(-1))
     source = jnp.zeros_like(number).at[place].set(number, mode="drop")
     return source.reshape(alive.shape), jnp.sum(each)
 

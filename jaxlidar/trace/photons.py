@@ -66,6 +66,19 @@ class Hit(eqx.Module):
     sent: Scattering
 
 
+class Met(eqx.Module):
+    """What of a collision decides how it is seen. `normal` is None where that does not.
+
+    Else see `Hit`.
+    """
+
+    material: Int[Array, "photons"]
+    on: Int[Array, "photons"]
+    reflected: Int[Array, "photons"]
+    transmitted: Int[Array, "photons"]
+    normal: Vec | None
+
+
 def merge(where: Bool[Array, "photons"], a: Hit, b: Hit) -> Hit:
     """`a` where `where` holds, else `b`."""
     return jax.tree.map(lambda p, q: jnp.where(where, p, q), a, b)

@@ -13,8 +13,9 @@ import dataclasses
 
 import equinox as eqx
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Bool, Float, Int
+
+from jaxlidar._one_function import once
 
 
 class Scores(eqx.Module):
@@ -93,7 +94,7 @@ class Scores(eqx.Module):
     ) -> Float[Array, "ends columns photons"]:
         """Derivatives of optical depths after one more step, of which `length` lies before each end."""
         slopes, columns = self.slopes(cell, leaf_share), self.columns_of(cell)
-        slopes, length = lax.optimization_barrier((slopes, length))
+        slopes, length = once((slopes, length))
         if self.number is None:
             return moved + jnp.stack(slopes)[None] * length[:, None]
         names = jnp.arange(self.count, dtype=jnp.int32)[None, :, None]
@@ -166,4 +167,4 @@ def rows_of(
 ) -> Float[Array, "rows bins columns"]:
     """Rows of bins, each with all columns."""
     # Fused into the rows, it would be computed again for each of their bins.
-    return kernel[:, :, None] * lax.optimization_barrier(inner)[:, None, :]
+    return kernel[:, :, None] * once(inner)[:, None, :]

@@ -10,6 +10,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxlidar._constants import SPEED_OF_LIGHT
+from jaxlidar._one_function import once
 from jaxlidar._vectors import Scalar, Vec
 from jaxlidar.planning.trace_plan import Bins
 from jaxlidar.trace.deposit import first_bin
@@ -62,7 +63,7 @@ def march_ray(
 
     def step(state, _):
         distance, depth, voxel, at_stops = state
-        faces = lax.optimization_barrier(walk.faces(voxel))
+        faces = once(walk.faces(voxel))
         face = earlier(earlier(faces[0], faces[1]), faces[2])
         to = earlier(end, earlier(face, distance + max_step))
         for stop in stops:
@@ -70,7 +71,7 @@ def march_ray(
             to = jnp.where(stop > distance, earlier(to, stop), to)
         cell = cell_of(medium, voxel)
         k = medium.extinction(cell, w)
-        to, cell, k = lax.optimization_barrier((later(distance, to), cell, k))
+        to, cell, k = once((later(distance, to), cell, k))
         length = to - distance
         at_stops = [
             a + k * (later(distance, earlier(stop, to)) - distance) for a, stop in zip(at_stops, stops)
