@@ -110,23 +110,23 @@ class FewMoments:
         self.count += 1
         off = np.asarray(value, float) - self._mean
         self._mean = self._mean + off / self.count
+        if len(self._rows) == ROWS:
+            self._squares, self._rows = _compiled_squares(self._waiting(), self._shares, self._squares), []
         self._rows.append(off * math.sqrt((self.count - 1) / self.count))
 
     def spectra(self) -> Spectra:
         """What is known so far, for two batches and more."""
-        while len(self._rows) > ROWS:
-            found = _compiled_squares(self._next(), self._shares, self._squares)
-            self._squares, self._rows = found, self._rows[ROWS:]
         scale = widening(self.count) ** 2 / (self.count * (self.count - 1.0))
         mean, scale = (jnp.asarray(a, self._shares.dtype) for a in (self._mean, scale))
-        found, squares = _compiled_spectra(mean, self._next(), self._shares, self._squares, scale)
+        found, squares = _compiled_spectra(mean, self._waiting(), self._shares, self._squares, scale)
         self._squares, self._rows = squares, []
         return found._replace(relative=float(found.relative), largest=float(found.largest))
 
-    def _next(self) -> Float[Array, "rows few samples"]:
-        """The next rows that are not among the squares yet, or zeros in their place."""
+    def _waiting(self) -> Float[Array, "rows few samples"]:
+        """The rows that are not among the squares yet, and zeros."""
         rows = np.zeros((ROWS, *self._mean.shape))
-        rows[: min(len(self._rows), ROWS)] = self._rows[:ROWS]
+        for row, own in zip(rows, self._rows):
+            row[:] = own
         return jnp.asarray(rows, self._shares.dtype)
 
 
