@@ -124,10 +124,8 @@ class FewMoments:
 
     def _waiting(self) -> Float[Array, "rows few samples"]:
         """The rows that are not among the squares yet, and zeros."""
-        rows = np.zeros((ROWS, *self._mean.shape))
-        for row, own in zip(rows, self._rows):
-            row[:] = own
-        return jnp.asarray(rows, self._shares.dtype)
+        zeros = [np.zeros_like(self._mean)] * (ROWS - len(self._rows))
+        return jnp.asarray(np.stack([*self._rows, *zeros]), self._shares.dtype)
 
 
 def _spread_squares(
