@@ -22,32 +22,30 @@ def _is_aided() -> bool:
     return jax.__version_info__ < _UNAIDED and jax.default_backend() == "cpu"
 
 
+def _apart(function: Callable[[State], State], **marks: str) -> Callable[[State], State]:
+    """`function`, which the compiler calls, and does not make part of what calls it."""
+    # Experimental: only where it is needed.
+    from jax.experimental.xla_metadata import set_xla_metadata
+
+    compiled = jax.jit(function)
+
+    def marked(values: State) -> State:
+        # XLA's own marks. A version that does not know them compiles the function as ever.
+        with set_xla_metadata(inlineable="false", **marks):
+            return compiled(values)
+
+    return marked
+
+
 def one_function(loop: Callable[[State], State]) -> Callable[[State], State]:
     """`loop`, compiled as one function on processors; elsewhere as it is.
 
     It may not scatter. So it cannot be differentiated in reverse, which makes scatters of gathers.
     """
-    if not _is_aided():
-        return loop
-    # Experimental: only where it is needed.
-    from jax.experimental.xla_metadata import set_xla_metadata
-
-    compiled = jax.jit(loop)
-
-    def marked(state: State) -> State:
-        # XLA's own marks. A version that does not know them compiles the loop as ever.
-        with set_xla_metadata(inlineable="false", xla_cpu_small_call="true"):
-            return compiled(state)
-
-    return marked
+    return _apart(loop, xla_cpu_small_call="true") if _is_aided() else loop
 
 
 def once(values: State) -> State:
     """The same values, computed once for all that use them."""
-    if not _is_aided():
-        return lax.optimization_barrier(values)
-    from jax.experimental.xla_metadata import set_xla_metadata
-
     # A function that is called is a barrier.
-    with set_xla_metadata(inlineable="false"):
-        return jax.jit(lax.optimization_barrier)(values)
+    return _apart(lax.optimization_barrier)(values) if _is_aided() else lax.optimization_barrier(values)

@@ -1,4 +1,4 @@
-"""Loops compiled as one function: the same values and forward derivatives, and fewer kernels."""
+"""Loops compiled as one function, values computed once: same values and derivatives, and fewer kernels."""
 
 import jax
 import jax.numpy as jnp

@@ -1,6 +1,5 @@
 """Shots that share light: agreement where much is in the way, where they can and where it pays, refusals."""
 
-import jax
 import numpy as np
 import pytest
 from test_campaign import (
@@ -38,7 +37,7 @@ def test_shared_light_over_terrain_below_plates_and_air(kind):
     canopy = jl.Canopy(stand().canopy.voxels, leaf=leaf)
     scene = jl.Scene(canopy, (plate,), ridges(), jl.Atmosphere(lidar_ratio=40.0))
     how = {"rtol": 0.1, "max_orders": 2}
-    many = jl.simulate_many(survey, scene, key=jax.random.fold_in(KEY, 3), **how, shared=True)
+    many = jl.simulate_many(survey, scene, key=KEY, **how, shared=True)
     waves = one_by_one(survey, scene, **how)
     # Both wavelengths have the same photons, and are not independent.
     assert agree(deviations(many, waves, slice(1, 2)))
@@ -47,14 +46,15 @@ def test_shared_light_over_terrain_below_plates_and_air(kind):
         mine = many.components[name].sum(axis=2)
         each = np.stack([w.components[name].sum(axis=1) for w in waves])
         assert np.allclose(mine, each, rtol=0.15, atol=2e-3), name
-    # Over all shots together: what ends after the window is a few photons, which single shots may not meet.
     for name, errors in many.ledger_stderr.items():
-        one = np.mean([w.ledger[name] for w in waves], axis=0)
-        own = np.mean([w.ledger_stderr[name] for w in waves], axis=0)
-        spread = np.hypot(errors.mean(axis=0), own) + 1e-5
-        found = many.ledger[name].mean(axis=0)
-        assert np.all(np.abs(found - one) < 4.0 * spread), name
-        assert name != "absorbed by ground" or np.all(np.abs(1.2 * found - one) > 4.0 * spread)
+        one = np.stack([w.ledger[name] for w in waves])
+        own = np.stack([w.ledger_stderr[name] for w in waves])
+        assert np.all(np.abs(many.ledger[name] - one) < 5.0 * np.hypot(errors, own) + 1e-4), name
+        # Over all shots together, whose photons are partly the same; a fifth too much is told.
+        spread = 4.0 * np.hypot(errors.mean(axis=0), own.mean(axis=0)) + 1e-5
+        found, expected = many.ledger[name].mean(axis=0), one.mean(axis=0)
+        assert np.all(np.abs(found - expected) < spread), name
+        assert name != "absorbed by ground" or np.all(np.abs(1.2 * found - expected) > spread)
 
 
 def test_footprints_are_splines():

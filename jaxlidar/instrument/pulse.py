@@ -168,7 +168,7 @@ class GaussianPulse(AbstractPulse):
         return self.std
 
     def support(self, jitter: ArrayLike = 0.0) -> tuple[float, float]:
-        reach = _GAUSSIAN_REACH * math.hypot(float(self.fwhm) / _FWHM_PER_SIGMA, float(as_scalar(jitter)))
+        reach = _GAUSSIAN_REACH * math.hypot(float(self.std), float(as_scalar(jitter)))
         return -reach, reach
 
 
@@ -272,7 +272,7 @@ class ExponentiallyModifiedGaussianPulse(AbstractPulse):
 
     def support(self, jitter: ArrayLike = 0.0) -> tuple[float, float]:
         decay = float(self.decay)
-        reach = _GAUSSIAN_REACH * math.hypot(float(self.fwhm) / _FWHM_PER_SIGMA, float(as_scalar(jitter)))
+        reach = _GAUSSIAN_REACH * math.hypot(float(self.std), float(as_scalar(jitter)))
         return -decay - reach, -decay + reach + _EXPONENTIAL_REACH * decay
 
 

@@ -349,8 +349,5 @@ def _moved(surface: Planar, by: Float[np.ndarray, "2"]) -> Planar:
     fall = np.tan(np.deg2rad(slope)) * np.stack([np.sin(np.deg2rad(aspect)), np.cos(np.deg2rad(aspect))])
     rise, known = fall @ place, concrete(surface.height)
     height = surface.height + rise if known is None else known + rise
-    return eqx.tree_at(
-        lambda s: (s.height, s.position),
-        surface,
-        (jnp.asarray(height, float), jnp.asarray(np.zeros(2), float)),
-    )
+    here = (jnp.asarray(height, float), jnp.asarray(np.zeros_like(place), float))
+    return eqx.tree_at(lambda s: (s.height, s.position), surface, here)

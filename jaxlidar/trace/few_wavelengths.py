@@ -68,7 +68,7 @@ def _pivots(
 ) -> tuple[list[int], Float[np.ndarray, "few wavelengths"]]:
     """The columns of which all others are made, and the rows of R of their QR decomposition.
 
-    NumPy's own is not taken: threads of its BLAS wait busily for 0.1 s after a call, on the cores that trace.
+    SciPy's own is not taken: threads of its BLAS wait busily after a call, on the cores that trace.
     """
     left, order = np.sum(columns**2, axis=0), list[int]()
     axes, rows = np.zeros((len(columns), len(columns))), list[np.ndarray]()

@@ -50,5 +50,5 @@ def _classes(setting: Setting, photons: Photons) -> Int[Array, "chunks size"]:
     x, w = lax.stop_gradient((photons.x, photons.w))
     walk = begin(medium, x, w, setting.occupied)
     across = sum(jnp.abs(w[k]) / medium.size[k] for k in range(3))
-    faces = lax.stop_gradient((walk.leave - walk.enter) * across)
+    faces = (walk.leave - walk.enter) * across
     return (faces > 0).astype(jnp.int32) + (faces > SHORT)
