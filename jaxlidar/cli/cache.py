@@ -13,7 +13,7 @@ import platformdirs
 from jax.experimental.compilation_cache import compilation_cache
 
 # Programs that compile faster are not worth a file.
-SECONDS = 0.3
+SECONDS = 0.05
 
 
 def cache_folder() -> Path:
