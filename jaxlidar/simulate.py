@@ -304,21 +304,42 @@ def _trace_within(ready: _Ready, key: PRNGKeyArray) -> _Traced:
     return _Traced(whole, MIN_BATCHES, stderr(totals), jax.tree.map(stderr, balances.ledger), {})
 
 
+def _fixed(ready: _Ready) -> dict[str, Any]:
+    """What all batches have in common."""
+    return {"setting": ready.setting, "transmittance": ready.transmittance}
+
+
 def _begin_to_compile(ready: _Ready, key: PRNGKeyArray) -> None:
     """All that batches need, side by side; what takes longest first."""
-    arguments = (ready.setting, ready.transmittance, key)
+    arguments = _fixed(ready) | {"key": key}
     longest = _compiled_higher if follows(ready.setting) else _compiled_batch
-    if longest.is_compiled(*arguments):
+    if longest.is_compiled(**arguments):
         # What else may be new compiles fast: looking for it would cost every call.
         return
     if follows(ready.setting):
-        higher = _compiled_higher.begin(*arguments)
-        response = joined(_compiled_first.begin(*arguments), higher)
+        higher = _compiled_higher.begin(**arguments)
+        response = joined(_compiled_first.begin(**arguments), higher)
     else:
-        response = _compiled_batch.begin(*arguments)
-    _compiled_results.begin(response, ready.brief)
+        response = _compiled_batch.begin(**arguments)
+    _compiled_results.begin(response=response, recording=ready.brief)
     _compiled_waveform.begin(response, jnp.asarray(1.0), ready.recording)
     _add.begin(response, response)
+
+
+def _batch_of(ready: _Ready, key: PRNGKeyArray) -> Callable[[int], tuple[Response, Array, Balance]]:
+    """The function that traces batch `n`: its response and what errors are known of."""
+    if follows(ready.setting):
+        first, higher = _compiled_first.given(**_fixed(ready)), _compiled_higher.given(**_fixed(ready))
+    else:
+        first, higher = _compiled_batch.given(**_fixed(ready)), None
+    results = _compiled_results.given(recording=ready.brief)
+
+    def one(n: int) -> tuple[Response, Array, Balance]:
+        own = jax.random.fold_in(key, n)
+        response = first(key=own) if higher is None else joined(first(key=own), higher(key=own))
+        return response, *results(response=response)
+
+    return one
 
 
 def _trace_batches(
@@ -333,16 +354,7 @@ def _trace_batches(
     whole: Any = None
     waves, shares, neglected = ready.brief.moments(many, plan.n_samples), Moments(), Moments()
     wanted, stopped = MIN_BATCHES, "tolerance met"
-    arguments = (ready.setting, ready.transmittance)
-
-    def batch(key: PRNGKeyArray) -> Response:
-        if not follows(ready.setting):
-            return _compiled_batch(*arguments, key)
-        return joined(_compiled_first(*arguments, key), _compiled_higher(*arguments, key))
-
-    def one(n: int) -> tuple[Response, Array, Balance]:
-        response = batch(jax.random.fold_in(key, n))
-        return response, *_compiled_results(response, ready.brief)
+    one = _batch_of(ready, key)
 
     _begin_to_compile(ready, key)
     with side_by_side() as run:

@@ -53,6 +53,21 @@ def test_the_oldest_programs_are_forgotten():
     assert counted.times == 5
 
 
+def test_arguments_given_once_share_the_program():
+    counted = Counted()
+    program = Program(counted)
+    program.begin(x=jnp.arange(3.0), scale=jnp.array(2.0))
+    for kept, other in (("scale", "x"), ("x", "scale")):
+        arguments = {"x": jnp.arange(3.0), "scale": jnp.array(2.0)}
+        bound = program.given(**{kept: arguments[kept]})
+        for factor in (1.0, 3.0):
+            found = bound(**{other: factor * arguments[other]})
+            np.testing.assert_array_equal(found["twice"], factor * np.array([0.0, 4.0, 8.0]))
+    assert (counted.times, len(program.versions)) == (1, 1)
+    slope = jax.grad(lambda scale: program.given(x=jnp.arange(3.0))(scale=scale)["twice"].sum())
+    assert float(slope(2.0)) == 6.0
+
+
 def test_threads_wait_for_one_compilation():
     counted = Counted()
     program = Program(counted)
