@@ -201,3 +201,14 @@ def test_every_effect_has_a_line_in_the_table():
         assert row.reason in line
         assert 0 <= row.bound <= 1
     assert "switched off" in next(text for text in lines if text.startswith("bark"))
+
+
+@pytest.mark.parametrize(
+    ("fwhm", "jitter", "rays"), [(0.0, 0.0, 2048), (2.0, 0.0, 2048), (2.0, 1.0, 1024), (6.0, 0.0, 1024)]
+)
+def test_short_pulses_take_more_rays(fwhm, jitter, rays):
+    scene = jl.Scene(plates=[jl.Plate(5.0, 0.4, 0.4)], ground=jl.Ground())
+    lidar = jl.Lidar(pulse=jl.GaussianPulse(fwhm), jitter=jitter)
+    assert jl.plan(lidar, scene).n_rays == rays
+    assert jl.plan(lidar, scene, n_rays=64).n_rays == 64
+    assert jl.plan(lidar, scene, max_orders=1).n_rays == 4096

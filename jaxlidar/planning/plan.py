@@ -195,7 +195,8 @@ def plan(
       on it. Default None: what lies within one voxel, or 64 fine bins.
     - `n_photons`: photons per batch, at least 1. Default 8192.
     - `n_rays`: rays of the footprint per batch, at least 1; without effect over planes alone, where a
-      quadrature rule takes their place. Default None: 4096 with one order or a fixed footprint, else 1024.
+      quadrature rule takes their place. Default None: 4096 with one order or a fixed footprint; else 2048
+      where the pulse's finest feature, with its jitter, is shorter than a sampling interval; else 1024.
     - `window`: (first, last) sample time, ns. Default None: covers the scene, and multiple scattering until
       little of it is left, or 300 ns at most.
     - `bin_width`: width of the fine bins, ns, positive; reduced to a whole fraction of the sampling interval.
@@ -261,8 +262,11 @@ def plan(
     def steps_of(orders: int) -> int:
         return order_steps(orders, plates, len(letters.letters))
 
+    finest = math.hypot(known_number(lidar.pulse.finest), known_number(lidar.jitter))
     if n_rays is None:
-        n_rays = 4096 if orders == 1 or footprint == "fixed" else 1024
+        # The shorter the pulse, the fewer rays a sample is made of.
+        short = finest < known_number(lidar.sampling_interval)
+        n_rays = 4096 if orders == 1 or footprint == "fixed" else 2048 if short else 1024
     tail = tail_of(scene, optics, geometry.first / SPEED_OF_LIGHT, geometry.last / SPEED_OF_LIGHT)
     bins, samples = _time(lidar, scene, geometry, tail if orders > 1 else 0.0, window, bin_width)
     airy = _with_air(bins, lidar, samples)
@@ -345,7 +349,7 @@ def plan(
             geometry.first / SPEED_OF_LIGHT,
             geometry.last / SPEED_OF_LIGHT,
             largest_albedo(optics),
-            math.hypot(known_number(lidar.pulse.finest), known_number(lidar.jitter)),
+            finest,
             max_orders is None,
             window is None,
             most,
