@@ -180,11 +180,14 @@ def bias_of(found: Run, reference: Run) -> float:
     return float(np.sqrt(excess)) if excess > noise else 0.0
 
 
-def order_of(knob: np.ndarray, error: np.ndarray, floor: float = 1e-6) -> float:
-    """Slope of the logarithm of the error over that of the knob, above what single precision leaves."""
+def order_of(knob: np.ndarray, error: np.ndarray, floor: float = 1e-6) -> float | None:
+    """Slope of the logarithm of the error over that of the knob, above what single precision leaves.
+
+    None where fewer than two errors are above that.
+    """
     tell = np.asarray(error) > floor
     if tell.sum() < 2:
-        return float("nan")
+        return None
     return float(np.polyfit(np.log(np.asarray(knob)[tell]), np.log(np.asarray(error)[tell]), 1)[0])
 
 
@@ -273,7 +276,8 @@ def random_knobs(name: str, case: Case, batches: int, photons: int) -> dict:
     }
     for key, points in record["curves"].items():
         slope = order_of([p["seconds"] for p in points], [p["error"] for p in points])
-        print(f"{name}, {key}: {points[-1]['error']:.2g} in {points[-1]['seconds']:.3g} s, slope {slope:.2f}")
+        falls = "within single precision" if slope is None else f"slope {slope:.2f}"
+        print(f"{name}, {key}: {points[-1]['error']:.2g} in {points[-1]['seconds']:.3g} s, {falls}")
     orders = []
     for n in (1, 2, 3, 4, 6, 8, 12):
         if n < case.orders:

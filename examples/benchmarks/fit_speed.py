@@ -1,6 +1,6 @@
 """Fits of the same targets by `inversion.retrieve` and by `scipy.optimize.least_squares`.
 
-Run it as `python examples/benchmarks/fit_speed.py [--out figures] [--targets 4] [--photons 65536]`.
+Run it as `python examples/benchmarks/fit_speed.py [--out figures] [--targets 12] [--photons 65536]`.
 
 Scene and unknowns are those of `retrieval_coverage.py`: seven unknowns, of which three are geometric, three
 wavelengths, four orders. Both look at the same compiled simulation with the same random numbers, both start
@@ -31,7 +31,7 @@ OPTICAL = ("Cab", "Cw", "N", "ground brightness")
 
 
 def main() -> None:
-    given = options("Speed of fits.", targets=4, photons=65536)
+    given = options("Speed of fits.", targets=12, photons=65536)
     plan = plan_of(given.photons // MIN_BATCHES)
     key = jax.random.key(3)
     pool = ThreadPoolExecutor(os.cpu_count() or 1)

@@ -48,7 +48,8 @@ def accuracy(record: dict) -> str:
         rows.append([name, *map(cell, ours), ", ".join(ratios) + " times longer"])
     targets = [f"{100 * t:g} %" for t in record["targets"]]
     orders = [
-        [key, "no effect" if v["order"] is None else number(v["order"])] for key, v in record["knobs"].items()
+        [key, "within single precision" if v["order"] is None else number(v["order"])]
+        for key, v in record["knobs"].items()
     ]
     return page_of(
         "Seconds until the error (root mean square over samples above 1 % of the peak, relative, at 1064 nm) "
