@@ -9,8 +9,8 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
+import numpy as np
 
 from jaxlidar._checks import is_traced
 
@@ -21,8 +21,8 @@ MOST = 16
 class Program:
     """A function of pytrees, compiled once for each structure, shape and type of its arguments.
 
-    As `equinox.filter_jit`, arrays are traced and all else is static; but at most `most` compiled versions
-    are kept. Within a JAX transformation the function is called as it is.
+    As with `equinox.filter_jit`, arrays are traced and all else is static; but NumPy's are arrays, too, and
+    at most `most` compiled versions are kept. Within a JAX transformation the function is called as it is.
     """
 
     def __init__(self, function: Callable, *, most: int = MOST, **options: Any):
@@ -125,7 +125,7 @@ def _call(function: Callable, kinds: dict[str | int, _Kind], arrays: Iterable[An
 
 
 def _is_shape(x: Any) -> bool:
-    return eqx.is_array(x) or isinstance(x, jax.ShapeDtypeStruct)
+    return isinstance(x, (jax.Array, np.ndarray, jax.ShapeDtypeStruct))
 
 
 class _Version:

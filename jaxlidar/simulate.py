@@ -17,23 +17,17 @@ from jaxlidar._programs import Program
 from jaxlidar._progress import Progress
 from jaxlidar._statistics import Moments, batches_needed, widening
 from jaxlidar._summary import NOTABLE, late_share, percent
-from jaxlidar._threads import ONE_CORE, side_by_side
+from jaxlidar._threads import side_by_side
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.planning.plan import MIN_BATCHES, Plan
 from jaxlidar.planning.plan import plan as make_plan
 from jaxlidar.planning.plan_check import check_plan
 from jaxlidar.planning.setup import Setup, reduce
 from jaxlidar.scenes.scene import Scene, check_kinds
+from jaxlidar.trace.batches import Ready, add, batch_of, begin_to_compile, compiled_trace
 from jaxlidar.trace.colouring import Balance, Recording, recording_of, recording_with_room, total_and_balance
-from jaxlidar.trace.response import (
-    Response,
-    follows,
-    joined,
-    trace_first,
-    trace_higher,
-    trace_setting,
-)
-from jaxlidar.trace.setting import Setting, setting_ahead, setting_of, straight_transmittance
+from jaxlidar.trace.response import Response, trace_setting
+from jaxlidar.trace.setting import setting_ahead, setting_of, straight_transmittance
 from jaxlidar.truth import truth_of_setup
 from jaxlidar.waveform import Waveform, open_at_first_return, recorded, trimmed
 
@@ -140,30 +134,20 @@ def simulate(
     return dataclasses.replace(wave, truth=truth_of_setup(ready.setup)) if truth else wave
 
 
-class _Ready(NamedTuple):
-    """A setup as the compiled programs take it: `recording` of means, `brief` of batches for errors."""
-
-    setup: Setup
-    setting: Setting
-    transmittance: Array | None
-    recording: Recording
-    brief: Recording
-
-
-def _prepared(setup: Setup, key: PRNGKeyArray) -> _Ready:
+def _prepared(setup: Setup, key: PRNGKeyArray) -> Ready:
     transmittance = straight_transmittance(setup)
     own_traces = transmittance is not None or not setup.plan.trace.keeps_histories
     traced = any(is_traced(x) for x in jax.tree.leaves((setup, key)))
     in_batches = setup.plan.is_random and not traced
-    ahead = setting_ahead(setup) if in_batches else None
+    ahead, make = setting_ahead(setup) if in_batches else (None, None)
     exact = own_traces or traced
     recording = recording_of(setup) if exact else recording_with_room(setup)
     brief = recording if exact or not in_batches else recording.abridged()
     if ahead is not None:
         # After small programs, which would wait for these to be compiled.
-        _begin_to_compile(_Ready(setup, ahead, transmittance, recording, brief), key)
-    setting = setting_of(setup, derivatives="all" if traced else "none")
-    return _Ready(setup, setting, transmittance, recording, brief)
+        _begin_to_compile(Ready(setup, ahead, transmittance, recording, brief), key)
+    setting = make() if make else setting_of(setup, derivatives="all" if traced else "none")
+    return Ready(setup, setting, transmittance, recording, brief)
 
 
 class _Goal(NamedTuple):
@@ -218,11 +202,11 @@ class _Traced(NamedTuple):
 
 
 def _trace_until(
-    ready: _Ready, key: PRNGKeyArray, goal: _Goal, progress: Callable[[Progress], None] | None
+    ready: Ready, key: PRNGKeyArray, goal: _Goal, progress: Callable[[Progress], None] | None
 ) -> _Traced:
     if not ready.setup.plan.is_random:
         started = time.perf_counter()
-        response = jax.block_until_ready(_compiled_trace(ready.setting, ready.transmittance, key))
+        response = jax.block_until_ready(compiled_trace(ready.setting, ready.transmittance, key))
         info = {"photons": 0, "batches": 1, "error": 0.0, "stopped": "nothing is random"}
         return _Traced(response, 1, None, None, {**info, "seconds": time.perf_counter() - started})
     if any(is_traced(x) for x in jax.tree.leaves((ready.setup, key))):
@@ -230,7 +214,7 @@ def _trace_until(
     return _trace_batches(ready, key, goal, progress)
 
 
-def _recorded(ready: _Ready, traced: _Traced) -> Waveform:
+def _recorded(ready: Ready, traced: _Traced) -> Waveform:
     """The waveform of a response, on the digitiser's bins."""
     plan, lidar = ready.setup.plan, ready.setup.lidar
     wave = _compiled_waveform(traced.response, jnp.asarray(float(traced.batches)), ready.recording)
@@ -274,20 +258,17 @@ def _waveform(whole: Response, batches: Array, recording: Recording) -> Waveform
     return recorded(jax.tree.map(lambda a: a / batches, whole), recording)
 
 
-def _sum(a: Any, b: Any) -> Any:
-    return jax.tree.map(jnp.add, a, b)
-
-
-_compiled_trace = Program(trace_setting)
-_compiled_batch = Program(trace_setting, **ONE_CORE)
-_compiled_first = Program(trace_first, **ONE_CORE)
-_compiled_higher = Program(trace_higher, **ONE_CORE)
-_compiled_results = Program(total_and_balance, **ONE_CORE)
 _compiled_waveform = Program(_waveform)
-_add = Program(_sum)
 
 
-def _trace_within(ready: _Ready, key: PRNGKeyArray) -> _Traced:
+def _begin_to_compile(ready: Ready, key: PRNGKeyArray) -> None:
+    """All that batches and the mean of them need, side by side."""
+    response = begin_to_compile(ready, key)
+    if response is not None:
+        _compiled_waveform.begin(response, jnp.asarray(1.0), ready.recording)
+
+
+def _trace_within(ready: Ready, key: PRNGKeyArray) -> _Traced:
     """A fixed number of batches, within a JAX transformation."""
 
     def batch(key: PRNGKeyArray) -> tuple[Response, Array, Balance]:
@@ -304,46 +285,8 @@ def _trace_within(ready: _Ready, key: PRNGKeyArray) -> _Traced:
     return _Traced(whole, MIN_BATCHES, stderr(totals), jax.tree.map(stderr, balances.ledger), {})
 
 
-def _fixed(ready: _Ready) -> dict[str, Any]:
-    """What all batches have in common."""
-    return {"setting": ready.setting, "transmittance": ready.transmittance}
-
-
-def _begin_to_compile(ready: _Ready, key: PRNGKeyArray) -> None:
-    """All that batches need, side by side; what takes longest first."""
-    arguments = _fixed(ready) | {"key": key}
-    longest = _compiled_higher if follows(ready.setting) else _compiled_batch
-    if longest.is_compiled(**arguments):
-        # What else may be new compiles fast: looking for it would cost every call.
-        return
-    if follows(ready.setting):
-        higher = _compiled_higher.begin(**arguments)
-        response = joined(_compiled_first.begin(**arguments), higher)
-    else:
-        response = _compiled_batch.begin(**arguments)
-    _compiled_results.begin(response=response, recording=ready.brief)
-    _compiled_waveform.begin(response, jnp.asarray(1.0), ready.recording)
-    _add.begin(response, response)
-
-
-def _batch_of(ready: _Ready, key: PRNGKeyArray) -> Callable[[int], tuple[Response, Array, Balance]]:
-    """The function that traces batch `n`: its response and what errors are known of."""
-    if follows(ready.setting):
-        first, higher = _compiled_first.given(**_fixed(ready)), _compiled_higher.given(**_fixed(ready))
-    else:
-        first, higher = _compiled_batch.given(**_fixed(ready)), None
-    results = _compiled_results.given(recording=ready.brief)
-
-    def one(n: int) -> tuple[Response, Array, Balance]:
-        own = jax.random.fold_in(key, n)
-        response = first(key=own) if higher is None else joined(first(key=own), higher(key=own))
-        return response, *results(response=response)
-
-    return one
-
-
 def _trace_batches(
-    ready: _Ready, key: PRNGKeyArray, goal: _Goal, progress: Callable[[Progress], None] | None
+    ready: Ready, key: PRNGKeyArray, goal: _Goal, progress: Callable[[Progress], None] | None
 ) -> _Traced:
     """Batches on all cores, round after round, until the goal is reached."""
     started, plan = time.perf_counter(), ready.setup.plan
@@ -354,18 +297,18 @@ def _trace_batches(
     whole: Any = None
     waves, shares, neglected = ready.brief.moments(many, plan.n_samples), Moments(), Moments()
     wanted, stopped = MIN_BATCHES, "tolerance met"
-    one = _batch_of(ready, key)
+    batch = batch_of(ready, key)
 
     _begin_to_compile(ready, key)
     with side_by_side() as run:
         try:
             while True:
-                for response, mean, shared in run(one, range(waves.count, wanted)):
-                    whole = response if whole is None else _add(whole, response)
-                    waves.add(mean)
-                    shares.add(np.stack([np.asarray(a)[:many] for a in shared.ledger.values()]))
-                    neglected.add(np.asarray(shared.neglected)[:many])
-                    names = list(shared.ledger)
+                for response, one in run(batch, range(waves.count, wanted)):
+                    whole = response if whole is None else add(whole, response)
+                    waves.add(one.total)
+                    shares.add(np.asarray(one.ledger)[:, :many])
+                    neglected.add(np.asarray(one.neglected)[:many])
+                    names = one.names
                 done, seconds = waves.count, time.perf_counter() - started
                 known = waves.spectra()
                 if progress is not None:

@@ -11,7 +11,8 @@ from jaxtyping import Array, PRNGKeyArray
 
 import jaxlidar as jl
 from jaxlidar.extend import side_by_side
-from jaxlidar.simulate import _compiled_batch, _compiled_trace, _compiled_waveform, _prepared
+from jaxlidar.simulate import _compiled_waveform, _prepared
+from jaxlidar.trace.batches import compiled_batch, compiled_trace
 from jaxlidar.waveform import trimmed
 
 
@@ -72,8 +73,11 @@ def agrees(value: Any, stderr: Any, expected: Any, *, bound: Any = 0.0, sigmas: 
 def one_batch(setup: jl.Setup, key: PRNGKeyArray) -> jl.Waveform:
     """The waveform of a single batch, by the programs that `simulate` compiles."""
     ready = _prepared(setup, key)
-    program = _compiled_batch if setup.plan.is_random else _compiled_trace
-    response = program(ready.setting, ready.transmittance, key)
+    if setup.plan.is_random:
+        common = {"setting": ready.setting, "transmittance": ready.transmittance}
+        response = compiled_batch(**common, key=key, number=np.array(0, np.uint32))
+    else:
+        response = compiled_trace(ready.setting, ready.transmittance, key)
     wave = _compiled_waveform(response, jnp.asarray(1.0), ready.recording)
     return trimmed(wave, setup.lidar.wavelength.size, setup.plan.n_samples)
 

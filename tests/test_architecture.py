@@ -100,6 +100,7 @@ ORDER = {
         "response",
         "few_wavelengths",
         "colouring",
+        "batches",
         "node_response",
         "viewed_response",
     ],

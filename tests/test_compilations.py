@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 import jaxlidar as jl
+from jaxlidar._programs import Program
 from jaxlidar.planning.ladder import rung
+from jaxlidar.trace import batches
 
 # The package's name `simulate` is the function.
 simulation = importlib.import_module("jaxlidar.simulate")
@@ -53,11 +55,13 @@ CHANGES = {
 @pytest.fixture(scope="module")
 def compiled():
     """Counts the versions of the programs, after a first simulation."""
-    programs = [getattr(simulation, f"_compiled_{name}") for name in ("batch", "results", "waveform")]
+    programs = {p for m in (batches, simulation) for p in vars(m).values() if isinstance(p, Program)}
     for program in programs:
         program.versions.clear()
     simulate()
-    return lambda: [len(program.versions) for program in programs]
+    # First order, higher orders, what is known of errors, the sum of two batches, and the waveform.
+    assert sorted(len(program.versions) for program in programs) == [0, 0, 1, 1, 1, 1, 1]
+    return lambda: {program.__name__: len(program.versions) for program in programs}
 
 
 @pytest.mark.parametrize("name", CHANGES)
@@ -73,7 +77,7 @@ def test_a_new_effect_does_compile(compiled):
     """The counting can fail: the trace of a beam at nadir is another program."""
     before = compiled()
     simulate(zenith=0.0)
-    assert compiled()[0] == before[0] + 1
+    assert compiled()["trace_higher"] == before["trace_higher"] + 1
 
 
 @pytest.mark.slow

@@ -289,7 +289,7 @@ def plan(
         hotspot=scene.canopy is not None and scene.canopy.hotspot,
         vertical=geometry.vertical,
         upstream=geometry.upstream,
-        first_steps=rung(first_steps, 8 if first_steps <= 128 else 16),
+        first_steps=rung(first_steps, 4 if first_steps <= 128 else 16),
         march_steps=rung(geometry.march_steps(last + geometry.upstream)),
         max_step=step,
         max_flight=geometry.longest_flight(last + geometry.upstream),

@@ -1,6 +1,7 @@
 """The scene as the tracer sees it: beam, voxels, surfaces and laws, relative to the aim point."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 import equinox as eqx
@@ -160,15 +161,17 @@ def setting_of(setup: Setup, *, derivatives: Derivatives = "all") -> Setting:
     return _completed(_set_out(*_arranged(setup, derivatives)), setup, derivatives)
 
 
-def setting_ahead(setup: Setup) -> Setting | None:
-    """A setting without derivatives, of shapes, where the program that makes it has yet to be compiled.
+def setting_ahead(setup: Setup) -> tuple[Setting | None, Callable[[], Setting]]:
+    """A setting without derivatives, of shapes, and the function that makes it of numbers.
 
-    It begins to be, and what takes the setting can be compiled beside it. None where it is compiled.
+    The shapes are there where the program that makes the numbers has yet to be compiled. It begins to be, and
+    what takes the setting can be compiled beside it. None where it is compiled.
     """
     arguments = _arranged(setup, "none")
-    if _set_out.is_compiled(*arguments):
-        return None
-    return _completed(_set_out.begin(*arguments), setup, "none")
+    ahead = None
+    if not _set_out.is_compiled(*arguments):
+        ahead = _completed(_set_out.begin(*arguments), setup, "none")
+    return ahead, lambda: _completed(_set_out(*arguments), setup, "none")
 
 
 def _arranged(setup: Setup, derivatives: Derivatives) -> tuple[Lidar, Scene, TracePlan, Bins, Sizes]:
