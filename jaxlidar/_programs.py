@@ -21,8 +21,8 @@ MOST = 16
 class Program:
     """A function of pytrees, compiled once for each structure, shape and type of its arguments.
 
-    As with `equinox.filter_jit`, arrays are traced and all else is static; but NumPy's are arrays, too, and
-    at most `most` compiled versions are kept. Within a JAX transformation the function is called as it is.
+    As with `equinox.filter_jit`, arrays (NumPy's among them) are traced and all else is static. At most
+    `most` compiled versions are kept. Within a JAX transformation the function is called as it is.
     """
 
     def __init__(self, function: Callable, *, most: int = MOST, **options: Any):
@@ -37,8 +37,8 @@ class Program:
     def given(self, **kept: Any) -> Callable:
         """The program with these arguments given; it takes the others by name.
 
-        They are looked through once, for many calls: an equinox module of thirty arrays takes longer to look
-        through than a short program to run, and only one thread at a time can.
+        They are taken apart once, for many calls. For an equinox module of thirty arrays that takes longer
+        than a short program runs, and Python lets only one thread at a time do it.
         """
         known = _parts((), kept)
         return lambda **others: self._run(dict(sorted({**known, **_parts((), others)}.items())))
@@ -125,7 +125,7 @@ def _call(function: Callable, kinds: dict[str | int, _Kind], arrays: Iterable[An
 
 
 def _is_shape(x: Any) -> bool:
-    return isinstance(x, (jax.Array, np.ndarray, jax.ShapeDtypeStruct))
+    return isinstance(x, (jax.Array, np.ndarray, np.generic, jax.ShapeDtypeStruct))
 
 
 class _Version:

@@ -40,10 +40,11 @@ def test_one_program_for_each_structure_shape_and_type():
     assert counted.times == 5
     assert float(program(jnp.arange(3.0), scale=3.0)["twice"][1]) == 6.0
     assert counted.times == 6
-    # NumPy's arrays are arrays.
+    # NumPy's arrays and scalars are arrays.
     for scale in (4.0, 5.0):
-        found = program(jnp.arange(3.0), scale=np.array(scale, np.float32))
-        assert float(found["twice"][1]) == 2 * scale
+        for kind in (np.float32, lambda x: np.array(x, np.float32)):
+            found = program(jnp.arange(3.0), scale=kind(scale))
+            assert float(found["twice"][1]) == 2 * scale
     assert counted.times == 7
 
 
