@@ -62,6 +62,7 @@ ORDER = {
         "rims",
         "parallel_light",
         "path_lengths",
+        "record_times",
         "scatterers",
         "effects",
         "orders",

@@ -204,11 +204,22 @@ def test_every_effect_has_a_line_in_the_table():
 
 
 @pytest.mark.parametrize(
-    ("fwhm", "jitter", "rays"), [(0.0, 0.0, 2048), (2.0, 0.0, 2048), (2.0, 1.0, 1024), (6.0, 0.0, 1024)]
+    ("pulse", "jitter", "rays"),
+    [
+        (jl.GaussianPulse(0.0), 0.0, 2048),
+        (jl.GaussianPulse(2.0), 0.0, 2048),
+        (jl.GaussianPulse(2.0), 1.0, 1024),
+        (jl.GaussianPulse(6.0), 0.0, 1024),
+        # Its power jumps: its finest feature is 0.
+        (jl.RectangularPulse(2.0), 0.0, 2048),
+        (jl.RectangularPulse(6.0), 0.0, 1024),
+    ],
+    ids=str,
 )
-def test_short_pulses_take_more_rays(fwhm, jitter, rays):
+def test_short_pulses_take_more_rays(pulse, jitter, rays):
     scene = jl.Scene(plates=[jl.Plate(5.0, 0.4, 0.4)], ground=jl.Ground())
-    lidar = jl.Lidar(pulse=jl.GaussianPulse(fwhm), jitter=jitter)
+    lidar = jl.Lidar(pulse=pulse, jitter=jitter)
     assert jl.plan(lidar, scene).n_rays == rays
     assert jl.plan(lidar, scene, n_rays=64).n_rays == 64
     assert jl.plan(lidar, scene, max_orders=1).n_rays == 4096
+    assert jl.plan(lidar, scene, footprint="fixed").n_rays == 4096

@@ -25,9 +25,10 @@ from jaxlidar.planning.memory import (
 from jaxlidar.planning.orders import degree_of, order_steps, orders_of, tail_of
 from jaxlidar.planning.parallel_light import one_direction, parallel_light
 from jaxlidar.planning.path_lengths import PathLengths, stretch
+from jaxlidar.planning.record_times import fine_bin, times_of, with_air
 from jaxlidar.planning.rims import check_on_terrain
 from jaxlidar.planning.scatterers import largest_albedo, lobe_probability, scene_optics, spell
-from jaxlidar.planning.trace_plan import KERNEL, Bins, TracePlan
+from jaxlidar.planning.trace_plan import Bins, TracePlan
 from jaxlidar.scenes.scene import Scene, check_kinds
 from jaxlidar.scenes.surfaces import AbstractSheet
 
@@ -196,7 +197,7 @@ def plan(
     - `n_photons`: photons per batch, at least 1. Default 8192.
     - `n_rays`: rays of the footprint per batch, at least 1; without effect over planes alone, where a
       quadrature rule takes their place. Default None: 4096 with one order or a fixed footprint; else 2048
-      where the pulse's finest feature, with its jitter, is shorter than a sampling interval; else 1024.
+      where the pulse's standard deviation, with its jitter, is below a sampling interval; else 1024.
     - `window`: (first, last) sample time, ns. Default None: covers the scene, and multiple scattering until
       little of it is left, or 300 ns at most.
     - `bin_width`: width of the fine bins, ns, positive; reduced to a whole fraction of the sampling interval.
@@ -262,18 +263,23 @@ def plan(
     def steps_of(orders: int) -> int:
         return order_steps(orders, plates, len(letters.letters))
 
-    finest = math.hypot(known_number(lidar.pulse.finest), known_number(lidar.jitter))
+    jitter = known_number(lidar.jitter)
+    finest = math.hypot(known_number(lidar.pulse.finest), jitter)
+    duration = math.hypot(known_number(lidar.pulse.std), jitter)
     if n_rays is None:
         # The shorter the pulse, the fewer rays a sample is made of.
-        short = finest < known_number(lidar.sampling_interval)
+        short = duration < known_number(lidar.sampling_interval)
         n_rays = 4096 if orders == 1 or footprint == "fixed" else 2048 if short else 1024
     tail = tail_of(scene, optics, geometry.first / SPEED_OF_LIGHT, geometry.last / SPEED_OF_LIGHT)
-    bins, samples = _time(lidar, scene, geometry, tail if orders > 1 else 0.0, window, bin_width)
-    airy = _with_air(bins, lidar, samples)
+    target = fine_bin(known_number(lidar.sampling_interval), finest, duration, bin_width)
+    bins, samples = times_of(lidar, scene, geometry, tail if orders > 1 else 0.0, window, target)
+    airy = with_air(bins, lidar, samples)
     metres = 0.5 * SPEED_OF_LIGHT * bins.width
     step, row = stretch(geometry.longest_chord, metres, max_step)
     last = SPEED_OF_LIGHT * (bins.start + bins.width * bins.count)
     bins = dataclasses.replace(bins, row=row, count=rung(bins.count, 4))
+    # Rays march through room that they do not need: rungs are a quarter apart at most where steps are few, a
+    # sixteenth where they are many.
     first_steps = geometry.first_steps(step)
     trace = TracePlan(
         materials=letters.materials,
@@ -303,7 +309,7 @@ def plan(
         independent=False,
     )
     degree, first_degree = degree_of(steps_of(orders), plates), 1 + 2 * plates
-    reach = lidar.pulse.support(known_number(lidar.jitter))
+    reach = lidar.pulse.support(jitter)
     spanned = math.ceil((reach[1] - reach[0] + samples[1]) / bins.width) + 5
     limit = memory_limit(max_memory)
     straight = scene.canopy is not None and scene.canopy.is_straight
@@ -360,59 +366,3 @@ def plan(
         memory=memory,
         effects=rows,
     )
-
-
-def _time(
-    lidar: Lidar,
-    scene: Scene,
-    geometry: PathLengths,
-    tail: float,
-    window: tuple[float, float] | None,
-    bin_width: float | None,
-) -> tuple[Bins, tuple[float, float, int, int]]:
-    interval = known_number(lidar.sampling_interval)
-    jitter = known_number(lidar.jitter)
-    low, high = lidar.pulse.support(jitter)
-    lasts = math.hypot(known_number(lidar.pulse.std), jitter) > 0
-    finest = math.hypot(known_number(lidar.pulse.finest), jitter)
-    if bin_width is None:
-        target = min(interval, max(0.25 * finest, 0.05 * interval) if lasts else 0.5 * interval)
-    else:
-        if not 0 < bin_width < math.inf:
-            raise ValueError(f"bin_width = {bin_width:g} is outside the admissible range (0, inf)")
-        target = bin_width
-    per_sample = max(math.ceil(interval / target - 1e-6), 1)
-    width = interval / per_sample
-    if lidar.receiver.window == "first return":
-        # Sampled finely here; the digitiser's own bins are laid when the first return is known.
-        interval, per_sample = width, 1
-    first, last = geometry.first / SPEED_OF_LIGHT, geometry.last / SPEED_OF_LIGHT
-    last += tail
-    if window is None:
-        begin = math.floor((first + low) / interval) * interval
-        samples = math.ceil((last + high - begin) / interval) + 1
-    else:
-        begin, end = map(float, window)
-        if not (math.isfinite(begin) and begin < end < math.inf):
-            raise ValueError(f"window = {window} is not (first, last) with first < last, in ns")
-        # An interval in single precision is off by its rounding.
-        samples = math.floor((end - begin) / interval * (1 + 1e-6) + 1e-6) + 1
-        # Returns that the pulse can carry into the window.
-        first = max(first, begin - interval - high)
-        last = max(begin + samples * interval - low, first + width)
-    if scene.atmosphere is not None and scene.atmosphere.lidar_ratio is not None:
-        # The air returns light from the start.
-        first = min(first, begin - interval - high)
-    edge = begin - 0.5 * interval
-    lead = math.ceil((edge - first) / width) + 3
-    count = lead + math.ceil((last - edge) / width) + 3
-    start = edge + width * (0.5 - lead)
-    return Bins(start, width, max(count, 1), row=KERNEL), (begin, interval, samples, per_sample)
-
-
-def _with_air(bins: Bins, lidar: Lidar, samples: tuple[float, float, int, int]) -> Bins:
-    """Bins that reach back to where the air's own return would begin, whether it is simulated or not."""
-    _, high = lidar.pulse.support(known_number(lidar.jitter))
-    missing = math.ceil((bins.start - (samples[0] - samples[1] - high)) / bins.width) + 3
-    more = max(missing, 0)
-    return dataclasses.replace(bins, start=bins.start - more * bins.width, count=bins.count + more)
