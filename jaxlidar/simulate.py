@@ -24,7 +24,7 @@ from jaxlidar.planning.plan import plan as make_plan
 from jaxlidar.planning.plan_check import check_plan
 from jaxlidar.planning.setup import Setup, reduce
 from jaxlidar.scenes.scene import Scene, check_kinds
-from jaxlidar.trace.batches import Ready, add, batch_of, begin_to_compile, compiled_trace
+from jaxlidar.trace.batches import Ready, add_responses, batch_of, begin_to_compile_batches, compiled_trace
 from jaxlidar.trace.colouring import Balance, Recording, recording_of, recording_with_room, total_and_balance
 from jaxlidar.trace.response import Response, trace_setting
 from jaxlidar.trace.setting import setting_ahead, setting_of, straight_transmittance
@@ -263,7 +263,7 @@ _compiled_waveform = Program(_waveform)
 
 def _begin_to_compile(ready: Ready, key: PRNGKeyArray) -> None:
     """All that batches and the mean of them need, side by side."""
-    response = begin_to_compile(ready, key)
+    response = begin_to_compile_batches(ready, key)
     if response is not None:
         _compiled_waveform.begin(response, jnp.asarray(1.0), ready.recording)
 
@@ -303,12 +303,12 @@ def _trace_batches(
     with side_by_side() as run:
         try:
             while True:
-                for response, one in run(batch, range(waves.count, wanted)):
-                    whole = response if whole is None else add(whole, response)
-                    waves.add(one.total)
-                    shares.add(np.asarray(one.ledger)[:, :many])
-                    neglected.add(np.asarray(one.neglected)[:many])
-                    names = one.names
+                for response, its in run(batch, range(waves.count, wanted)):
+                    whole = response if whole is None else add_responses(whole, response)
+                    waves.add(its.total)
+                    shares.add(np.asarray(its.ledger)[:, :many])
+                    neglected.add(np.asarray(its.neglected)[:many])
+                    names = its.names
                 done, seconds = waves.count, time.perf_counter() - started
                 known = waves.spectra()
                 if progress is not None:

@@ -12,7 +12,7 @@ from jaxtyping import Array, PRNGKeyArray
 import jaxlidar as jl
 from jaxlidar.extend import side_by_side
 from jaxlidar.simulate import _compiled_waveform, _prepared
-from jaxlidar.trace.batches import compiled_batch, compiled_trace
+from jaxlidar.trace.batches import batch_of, compiled_trace
 from jaxlidar.waveform import trimmed
 
 
@@ -74,8 +74,7 @@ def one_batch(setup: jl.Setup, key: PRNGKeyArray) -> jl.Waveform:
     """The waveform of a single batch, by the programs that `simulate` compiles."""
     ready = _prepared(setup, key)
     if setup.plan.is_random:
-        common = {"setting": ready.setting, "transmittance": ready.transmittance}
-        response = compiled_batch(**common, key=key, number=np.array(0, np.uint32))
+        response, _ = batch_of(ready, key)(0)
     else:
         response = compiled_trace(ready.setting, ready.transmittance, key)
     wave = _compiled_waveform(response, jnp.asarray(1.0), ready.recording)

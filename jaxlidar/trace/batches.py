@@ -1,6 +1,5 @@
 """Batches of photons: the programs that trace them, and what each tells of errors."""
 
-import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -55,12 +54,12 @@ def _sum(a: Any, b: Any) -> Any:
 def _numbered(trace: Callable) -> Callable:
     """`trace`, with the key of batch `number`."""
 
-    @functools.wraps(trace)
     def batch(
         setting: Setting, transmittance: Array | None, key: PRNGKeyArray, number: UInt32[Array, ""]
     ) -> Any:
         return trace(setting, transmittance, jax.random.fold_in(key, number))
 
+    batch.__name__ = f"batch_of_{trace.__name__}"
     return batch
 
 
@@ -69,7 +68,7 @@ compiled_batch = Program(_numbered(trace_setting), **ONE_CORE)
 _compiled_first = Program(_numbered(trace_first), **ONE_CORE)
 _compiled_higher = Program(_numbered(trace_higher), **ONE_CORE)
 _compiled_known = Program(_known_of, **ONE_CORE)
-add = Program(_sum)
+add_responses = Program(_sum)
 
 
 def _common(ready: Ready, key: PRNGKeyArray) -> dict[str, Any]:
@@ -77,10 +76,10 @@ def _common(ready: Ready, key: PRNGKeyArray) -> dict[str, Any]:
     return {"setting": ready.setting, "transmittance": ready.transmittance, "key": key}
 
 
-def begin_to_compile(ready: Ready, key: PRNGKeyArray) -> Response | None:
+def begin_to_compile_batches(ready: Ready, key: PRNGKeyArray) -> Response | None:
     """All that batches need, side by side; what takes longest first.
 
-    **Returns:** the shapes of a response; None where nothing has to be compiled.
+    **Returns:** the shapes of a response; None where the program that takes longest is compiled already.
     """
     arguments = _common(ready, key) | {"number": np.array(0, np.uint32)}
     longest = _compiled_higher if follows(ready.setting) else compiled_batch
@@ -93,7 +92,7 @@ def begin_to_compile(ready: Ready, key: PRNGKeyArray) -> Response | None:
     else:
         response = compiled_batch.begin(**arguments)
     _compiled_known.begin(response=response, recording=ready.brief)
-    add.begin(response, response)
+    add_responses.begin(response, response)
     return response
 
 
@@ -106,11 +105,11 @@ def batch_of(ready: Ready, key: PRNGKeyArray) -> Callable[[int], tuple[Response,
         first = compiled_batch.given(**common)
     known = _compiled_known.given(recording=ready.brief)
 
-    def one(n: int) -> tuple[Response, Known]:
+    def traced(n: int) -> tuple[Response, Known]:
         number = np.array(n, np.uint32)
         response = first(number=number)
         if higher is not None:
             response = joined(response, higher(number=number))
         return response, known(response=response)
 
-    return one
+    return traced
