@@ -16,6 +16,7 @@ order, or on the ground, where no other error hides theirs, against the finest o
 import dataclasses
 import os
 import time
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import equinox as eqx
@@ -180,14 +181,16 @@ def bias_of(found: Run, reference: Run) -> float:
     return float(np.sqrt(excess)) if excess > noise else 0.0
 
 
-def order_of(knob: np.ndarray, error: np.ndarray, floor: float = 1e-6) -> float | None:
-    """Slope of the logarithm of the error over that of the knob, above what single precision leaves.
+def order_of(knob: Sequence[float], error: Sequence[float], floor: float = 1e-6) -> float | str:
+    """Slope of the logarithm of the error over that of the knob; in words why there is none.
 
-    None where fewer than two errors are above that.
+    Errors below `floor` are what single precision leaves.
     """
     tell = np.asarray(error) > floor
-    if tell.sum() < 2:
-        return None
+    if not tell.any():
+        return "within single precision"
+    if tell.sum() == 1:
+        return "one error alone is above single precision"
     return float(np.polyfit(np.log(np.asarray(knob)[tell]), np.log(np.asarray(error)[tell]), 1)[0])
 
 
@@ -276,7 +279,7 @@ def random_knobs(name: str, case: Case, batches: int, photons: int) -> dict:
     }
     for key, points in record["curves"].items():
         slope = order_of([p["seconds"] for p in points], [p["error"] for p in points])
-        falls = "within single precision" if slope is None else f"slope {slope:.2f}"
+        falls = slope if isinstance(slope, str) else f"slope {slope:.2f}"
         print(f"{name}, {key}: {points[-1]['error']:.2g} in {points[-1]['seconds']:.3g} s, {falls}")
     orders = []
     for n in (1, 2, 3, 4, 6, 8, 12):

@@ -101,7 +101,8 @@ def main() -> None:
         }
         rows.append((case, np.median(times["ours"]), np.median(times["scipy"]), ratio, max(gaps), min(gaps)))
     print_table(("unknowns", "ours, s", "scipy, s", "ratio", "chi2, ours - scipy, most", "least"), rows)
-    write_json(given.out / "fit_speed.json", {"machine": machine(), "photons": given.photons, "fits": record})
+    written = {"machine": machine(), "photons": given.photons, "targets": given.targets, "fits": record}
+    write_json(given.out / "fit_speed.json", written)
     draw(record, given.out / "fit_speed.png")
 
 

@@ -48,7 +48,7 @@ def accuracy(record: dict) -> str:
         rows.append([name, *map(cell, ours), ", ".join(ratios) + " times longer"])
     targets = [f"{100 * t:g} %" for t in record["targets"]]
     orders = [
-        [key, "within single precision" if v["order"] is None else number(v["order"])]
+        [key, v["order"] if isinstance(v["order"], str) else number(v["order"])]
         for key, v in record["knobs"].items()
     ]
     return page_of(
@@ -68,7 +68,7 @@ def changes(record: dict) -> str:
     return page_of(
         "Seconds of a call of `simulate` with three wavelengths after one thing was changed, and of the same "
         "call again. Sizes go up a short ladder, and numbers are arguments of compiled programs: most "
-        "changes compile nothing of the trace (`trace_setting`).",
+        "changes compile nothing of the trace (`batch_of_trace_first`, `batch_of_trace_higher`).",
         table(["change", "s", "s, again", "compiled, beside single operations"], rows),
     )
 
@@ -182,7 +182,8 @@ def fits(record: dict) -> str:
         for case, r in record["fits"].items()
     ]
     return page_of(
-        f"The same simulation of {record['photons']:,} photons under both, to the same chi-squared.",
+        f"The same simulation of {record['photons']:,} photons under both, to the same chi-squared."
+        f" Medians of {record['targets']} targets.",
         table(["unknowns", "retrieve, s", "scipy, s", "times faster"], rows),
     )
 
