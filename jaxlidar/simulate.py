@@ -24,7 +24,14 @@ from jaxlidar.planning.plan import plan as make_plan
 from jaxlidar.planning.plan_check import check_plan
 from jaxlidar.planning.setup import Setup, reduce
 from jaxlidar.scenes.scene import Scene, check_kinds
-from jaxlidar.trace.batches import Ready, add_responses, batch_of, begin_to_compile_batches, compiled_trace
+from jaxlidar.trace.batches import (
+    Ready,
+    add_responses,
+    batch_of,
+    begin_to_compile_sums,
+    begin_to_compile_traces,
+    compiled_trace,
+)
 from jaxlidar.trace.colouring import Balance, Recording, recording_of, recording_with_room, total_and_balance
 from jaxlidar.trace.response import Response, trace_setting
 from jaxlidar.trace.setting import setting_ahead, setting_of, straight_transmittance
@@ -138,16 +145,21 @@ def _prepared(setup: Setup, key: PRNGKeyArray) -> Ready:
     transmittance = straight_transmittance(setup)
     own_traces = transmittance is not None or not setup.plan.trace.keeps_histories
     traced = any(is_traced(x) for x in jax.tree.leaves((setup, key)))
-    in_batches = setup.plan.is_random and not traced
-    ahead, make = setting_ahead(setup) if in_batches else (None, None)
     exact = own_traces or traced
-    recording = recording_of(setup) if exact else recording_with_room(setup)
-    brief = recording if exact or not in_batches else recording.abridged()
-    if ahead is not None:
-        # After small programs, which would wait for these to be compiled.
-        _begin_to_compile(Ready(setup, ahead, transmittance, recording, brief), key)
-    setting = make() if make else setting_of(setup, derivatives="all" if traced else "none")
-    return Ready(setup, setting, transmittance, recording, brief)
+    record = recording_of if exact else recording_with_room
+    if traced or not setup.plan.is_random:
+        setting = setting_of(setup, derivatives="all" if traced else "none")
+        recording = record(setup)
+        return Ready(setup, setting, transmittance, recording, recording)
+    # What takes longest begins to be compiled; numbers are made beside it.
+    ahead, make = setting_ahead(setup)
+    response = begin_to_compile_traces(ahead, transmittance, key)
+    recording = record(setup)
+    brief = recording if exact else recording.abridged()
+    if response is not None:
+        _compiled_waveform.begin(response, jnp.asarray(1.0), recording)
+        begin_to_compile_sums(response, brief)
+    return Ready(setup, make(), transmittance, recording, brief)
 
 
 class _Goal(NamedTuple):
@@ -261,13 +273,6 @@ def _waveform(whole: Response, batches: Array, recording: Recording) -> Waveform
 _compiled_waveform = Program(_waveform)
 
 
-def _begin_to_compile(ready: Ready, key: PRNGKeyArray) -> None:
-    """All that batches and the mean of them need, side by side."""
-    response = begin_to_compile_batches(ready, key)
-    if response is not None:
-        _compiled_waveform.begin(response, jnp.asarray(1.0), ready.recording)
-
-
 def _trace_within(ready: Ready, key: PRNGKeyArray) -> _Traced:
     """A fixed number of batches, within a JAX transformation."""
 
@@ -298,8 +303,6 @@ def _trace_batches(
     waves, shares, neglected = ready.brief.moments(many, plan.n_samples), Moments(), Moments()
     wanted, stopped = MIN_BATCHES, "tolerance met"
     batch = batch_of(ready, key)
-
-    _begin_to_compile(ready, key)
     with side_by_side() as run:
         try:
             while True:

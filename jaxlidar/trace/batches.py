@@ -71,34 +71,38 @@ _compiled_known = Program(_known_of, **ONE_CORE)
 add_responses = Program(_sum)
 
 
-def _common(ready: Ready, key: PRNGKeyArray) -> dict[str, Any]:
+def _arguments(setting: Setting, transmittance: Array | None, key: PRNGKeyArray) -> dict[str, Any]:
     """What all batches take."""
-    return {"setting": ready.setting, "transmittance": ready.transmittance, "key": key}
+    return {"setting": setting, "transmittance": transmittance, "key": key}
 
 
-def begin_to_compile_batches(ready: Ready, key: PRNGKeyArray) -> Response | None:
-    """All that batches need, side by side; what takes longest first.
+def begin_to_compile_traces(
+    setting: Setting, transmittance: Array | None, key: PRNGKeyArray
+) -> Response | None:
+    """What traces batches, side by side; what takes longest first.
 
     **Returns:** the shapes of a response; None where the program that takes longest is compiled already.
     """
-    arguments = _common(ready, key) | {"number": np.array(0, np.uint32)}
-    longest = _compiled_higher if follows(ready.setting) else compiled_batch
+    arguments = _arguments(setting, transmittance, key) | {"number": np.array(0, np.uint32)}
+    longest = _compiled_higher if follows(setting) else compiled_batch
     if longest.is_compiled(**arguments):
         # What else may be new compiles fast: looking for it would cost every call.
         return None
-    if follows(ready.setting):
+    if follows(setting):
         higher = _compiled_higher.begin(**arguments)
-        response = joined(_compiled_first.begin(**arguments), higher)
-    else:
-        response = compiled_batch.begin(**arguments)
-    _compiled_known.begin(response=response, recording=ready.brief)
+        return joined(_compiled_first.begin(**arguments), higher)
+    return compiled_batch.begin(**arguments)
+
+
+def begin_to_compile_sums(response: Response, brief: Recording) -> None:
+    """What becomes of a batch: what is known of its errors, and the sum of two."""
+    _compiled_known.begin(response=response, recording=brief)
     add_responses.begin(response, response)
-    return response
 
 
 def batch_of(ready: Ready, key: PRNGKeyArray) -> Callable[[int], tuple[Response, Known]]:
     """The function that traces batch `n`: its response and what errors are known of."""
-    common, higher = _common(ready, key), None
+    common, higher = _arguments(ready.setting, ready.transmittance, key), None
     if follows(ready.setting):
         first, higher = _compiled_first.given(**common), _compiled_higher.given(**common)
     else:

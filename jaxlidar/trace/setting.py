@@ -161,16 +161,17 @@ def setting_of(setup: Setup, *, derivatives: Derivatives = "all") -> Setting:
     return _completed(_set_out(*_arranged(setup, derivatives)), setup, derivatives)
 
 
-def setting_ahead(setup: Setup) -> tuple[Setting | None, Callable[[], Setting]]:
-    """A setting without derivatives, of shapes, and the function that makes it of numbers.
+def setting_ahead(setup: Setup) -> tuple[Setting, Callable[[], Setting]]:
+    """A setting without derivatives, maybe of shapes alone, and the function that gives it with its numbers.
 
-    The shapes are there where the program that makes the numbers has yet to be compiled. It begins to be, and
-    what takes the setting can be compiled beside it. None where it is compiled.
+    It has shapes alone where the program that makes the numbers has yet to be compiled. That begins, and what
+    takes the setting can be compiled beside it.
     """
     arguments = _arranged(setup, "none")
-    ahead = None
-    if not _set_out.is_compiled(*arguments):
-        ahead = _completed(_set_out.begin(*arguments), setup, "none")
+    if _set_out.is_compiled(*arguments):
+        setting = _completed(_set_out(*arguments), setup, "none")
+        return setting, lambda: setting
+    ahead = _completed(_set_out.begin(*arguments), setup, "none")
     return ahead, lambda: _completed(_set_out(*arguments), setup, "none")
 
 
