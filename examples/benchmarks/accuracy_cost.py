@@ -328,7 +328,7 @@ def draw(record: dict, path) -> None:
         analog = [("analog", found["curves"]["analog"])]
         lines(ax, analog, "seconds", skip=len(COLOURS) - 1)
         lines(ax, [c for c in found["curves"].items() if c[0] != "analog"], "seconds")
-        ax.set(title=name, xlabel="seconds", xlim=(1e-4, 20.0), ylim=(5e-5, 1.0))
+        ax.set(title=name, xlabel="seconds", xlim=(3e-5, 20.0), ylim=(5e-5, 1.0))
     axes[0, 1].legend(loc="lower left")
     orders = [(n, found["orders"]) for n, found in record["scenes"].items() if "orders" in found]
     lines(axes[1, 0], orders, "value", scales="semilogy")

@@ -54,7 +54,7 @@ def main() -> None:
     figure, axes = new_figure()
     axes.semilogx([int(n) for n in fastest], list(fastest.values()), "o-")
     axes.axhline(1.15 * fastest["1"], color="black", linestyle="--", label="1.15 times one wavelength")
-    axes.set(xlabel="wavelengths", ylabel="seconds", ylim=(0, None))
+    axes.set(xlabel="wavelengths", ylabel="seconds", ylim=(0, 1.35 * fastest["1"]))
     axes.set_title(f"simulate: {given.photons} photons, {ORDERS} orders")
     axes.legend()
     save_figure(figure, given.out / "one_trace_all_wavelengths.png")
