@@ -125,7 +125,7 @@ def _call(function: Callable, kinds: dict[str | int, _Kind], arrays: Iterable[An
 
 
 def _is_shape(x: Any) -> bool:
-    return isinstance(x, (jax.Array, np.ndarray, np.generic, jax.ShapeDtypeStruct))
+    return isinstance(x, (jax.Array, np.ndarray, np.number, jax.ShapeDtypeStruct))
 
 
 class _Version:
