@@ -1,5 +1,6 @@
 """Shared by the tests: slabs, lidars that record a whole waveform as one sample, batches and z-tests."""
 
+import dataclasses
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -68,6 +69,11 @@ def agrees(value: Any, stderr: Any, expected: Any, *, bound: Any = 0.0, sigmas: 
     """
     off, margin = np.asarray(value, float) - np.asarray(expected, float), sigmas * np.asarray(stderr, float)
     return bool(np.all(off <= margin) and np.all(off >= -margin - np.asarray(bound, float)))
+
+
+def applied(plan: jl.Plan) -> jl.Plan:
+    """The plan where optics are applied while light is traced."""
+    return dataclasses.replace(plan, trace=dataclasses.replace(plan.trace, keeps_histories=False), degree=0)
 
 
 def one_batch(setup: jl.Setup, key: PRNGKeyArray) -> jl.Waveform:

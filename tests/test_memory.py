@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import numpy as np
 import pytest
-from helpers import slab, slow_unless
+from helpers import applied, slab, slow_unless
 
 import inversion
 import jaxlidar as jl
@@ -37,11 +37,6 @@ def test_many_plates_are_refused_before_anything_is_allocated():
     lidar = jl.Lidar(wavelength=np.linspace(500.0, 1600.0, memory.FEW + 1))
     with pytest.raises(ValueError, match=r"would take about .* GB of memory; .* at most 8 wavelengths"):
         jl.plan(lidar, scene, max_orders=12, describe=False)
-
-
-def applied(plan):
-    """The plan where optics are applied while light is traced."""
-    return dataclasses.replace(plan, trace=dataclasses.replace(plan.trace, keeps_histories=False), degree=0)
 
 
 TWO = jl.Lidar(wavelength=(532.0, 1064.0))
