@@ -90,8 +90,8 @@ def simulate(
       Default None: made here.
     - `max_orders`, `max_step`, `n_rays`, `window`, `bin_width`, `footprint`, `effects`, `max_memory`: see
       `jaxlidar.plan`. Default None: as there.
-    - `max_seconds`: stop after this time in s, however large the error; positive. At least eight batches are
-      traced. Default inf.
+    - `max_seconds`: stop after this time in s, planning and compilation included, however large the error;
+      positive. At least eight batches are traced. Default inf.
     - `truth`: whether to add what the beam meets in the scene, as labels for algorithms: `Waveform.truth`.
       Default False.
     - `progress`: a function called with a `Progress` after every round of batches; for instance `print`.
@@ -111,6 +111,7 @@ def simulate(
     >>> print(f"{float(wave.reflectance.sum()):.4f}")
     0.4000
     """
+    started = time.perf_counter()
     check_kinds(lidar, scene)
     check_key(key)
     check_flag("truth", truth)
@@ -128,15 +129,15 @@ def simulate(
     given = plan
     plan = _planned(lidar, scene, given, goal, planning)
     ready = _prepared(reduce(lidar, scene, plan), key)
-    traced = _trace_until(ready, key, goal, progress)
-    spent = traced.info.get("seconds", 0.0)
+    traced = _trace_until(ready, key, goal, progress, started)
+    spent = time.perf_counter() - started
     if given is None and traced.beyond > 0 and plan.orders < plan.limits.most_orders and spent < max_seconds:
         # Orders beyond the last matter: follow as many as there is room for.
         planning["max_orders"] = plan.limits.most_orders
         plan = _planned(lidar, scene, None, goal, planning)
         plan = dataclasses.replace(plan, limits=plan.limits._replace(automatic_orders=True))
         ready = _prepared(reduce(lidar, scene, plan), key)
-        traced = _trace_until(ready, key, goal._replace(max_seconds=max_seconds - spent), progress)
+        traced = _trace_until(ready, key, goal, progress, started)
     wave = _recorded(ready, traced)
     return dataclasses.replace(wave, truth=truth_of_setup(ready.setup)) if truth else wave
 
@@ -214,16 +215,19 @@ class _Traced(NamedTuple):
 
 
 def _trace_until(
-    ready: Ready, key: PRNGKeyArray, goal: _Goal, progress: Callable[[Progress], None] | None
+    ready: Ready,
+    key: PRNGKeyArray,
+    goal: _Goal,
+    progress: Callable[[Progress], None] | None,
+    started: float,
 ) -> _Traced:
     if not ready.setup.plan.is_random:
-        started = time.perf_counter()
         response = jax.block_until_ready(compiled_trace(ready.setting, ready.transmittance, key))
         info = {"photons": 0, "batches": 1, "error": 0.0, "stopped": "nothing is random"}
         return _Traced(response, 1, None, None, {**info, "seconds": time.perf_counter() - started})
     if any(is_traced(x) for x in jax.tree.leaves((ready.setup, key))):
         return _trace_within(ready, key)
-    return _trace_batches(ready, key, goal, progress)
+    return _trace_batches(ready, key, goal, progress, started)
 
 
 def _recorded(ready: Ready, traced: _Traced) -> Waveform:
@@ -291,10 +295,14 @@ def _trace_within(ready: Ready, key: PRNGKeyArray) -> _Traced:
 
 
 def _trace_batches(
-    ready: Ready, key: PRNGKeyArray, goal: _Goal, progress: Callable[[Progress], None] | None
+    ready: Ready,
+    key: PRNGKeyArray,
+    goal: _Goal,
+    progress: Callable[[Progress], None] | None,
+    started: float,
 ) -> _Traced:
     """Batches on all cores, round after round, until the goal is reached."""
-    started, plan = time.perf_counter(), ready.setup.plan
+    begun, plan = time.perf_counter(), ready.setup.plan
     rtol = plan.rtol if goal.rtol is None else goal.rtol
     fixed = None if goal.n_photons is None else max(MIN_BATCHES, -(-goal.n_photons // plan.n_photons))
     many = ready.setup.lidar.wavelength.size
@@ -327,8 +335,8 @@ def _trace_batches(
                 # Rounds are short, so that time and interrupts are looked at in between.
                 wanted = min(fixed, 4 * done) if fixed else batches_needed(done, known.relative, rtol)
                 if math.isfinite(goal.max_seconds):
-                    affordable = done * goal.max_seconds / max(seconds, 1e-9)
-                    wanted = max(min(wanted, int(affordable)), done + 1)
+                    pace = done / max(time.perf_counter() - begun, 1e-9)
+                    wanted = max(min(wanted, done + int(pace * (goal.max_seconds - seconds))), done + 1)
         except KeyboardInterrupt:
             if waves.count < MIN_BATCHES:
                 raise

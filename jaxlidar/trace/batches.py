@@ -95,7 +95,7 @@ def begin_to_compile_traces(
 
 
 def begin_to_compile_sums(response: Response, brief: Recording) -> None:
-    """What becomes of a batch: what is known of its errors, and the sum of two."""
+    """What takes the response of a batch: what is known of its errors, and the sum of two."""
     _compiled_known.begin(response=response, recording=brief)
     add_responses.begin(response, response)
 
