@@ -3,11 +3,11 @@
 Run it as `python examples/benchmarks/fit_speed.py [--out figures] [--targets 12] [--photons 65536]`.
 
 Scene and unknowns are those of `retrieval_coverage.py`: seven unknowns, of which three are geometric, three
-wavelengths, four orders. Both look at the same compiled simulation with the same random numbers, both start
-from the middle of the bounds and both must reach the same chi-squared, to 0.5. scipy has no derivatives but
-finite differences, each of which is a simulation; ours traces the tangents of the geometric unknowns
-together and gets those of the optical ones from the traced response. The second case has only the four
-optical unknowns: ours then traces once."""
+wavelengths, four orders. Both look at the same compiled simulation with the same random numbers and start
+from the middle of the bounds; how many end at the same chi-squared, to 0.5, is in the record. scipy has no
+derivatives but finite differences, each of which is a simulation; ours traces the tangents of the geometric
+unknowns together and gets those of the optical ones from the traced response. The second case has only the
+four optical unknowns: ours then traces once."""
 
 import os
 import time
