@@ -1,5 +1,7 @@
 """What a record cuts off is said: light on its way when it ends, and orders beyond the last."""
 
+import importlib
+import time
 import warnings
 
 import jax
@@ -11,6 +13,8 @@ import jaxlidar as jl
 from jaxlidar.planning import orders
 from jaxlidar.simulate import LateLightWarning
 
+# The package's name `simulate` is the function.
+simulation = importlib.import_module("jaxlidar.simulate")
 KEY = jax.random.key(5)
 BRIGHT = jl.Scene(plates=(jl.Plate(80.0, 0.4, 0.5),), ground=jl.Ground(reflectance=0.9))
 LIDAR = jl.Lidar()
@@ -135,3 +139,22 @@ def test_the_ledger_has_standard_errors():
 def test_light_is_accounted_for():
     wave = jl.simulate(LIDAR, dense(0.95, 4.0, 0.5), key=KEY, n_photons=20_000)
     np.testing.assert_allclose(sum(np.asarray(v) for v in wave.ledger.values()), 1.0, atol=2e-3)
+
+
+def test_time_for_planning_counts(monkeypatch):
+    """Eight batches take less than `max_seconds`: without the plan's own time, more would be traced."""
+    make = simulation.make_plan
+
+    def slow_plan(*given, **more):
+        time.sleep(1.0)
+        return make(*given, **more)
+
+    given = {"key": KEY, "rtol": 1e-6, "max_orders": 2, "window": (-90.0, 60.0)}
+    # What is to be compiled is compiled before.
+    jl.simulate(LIDAR, dense(0.3), **given, max_seconds=1e-6)
+    alone = jl.simulate(LIDAR, dense(0.3), **given, max_seconds=1.0)
+    assert alone.info["batches"] > 8
+    monkeypatch.setattr(simulation, "make_plan", slow_plan)
+    late = jl.simulate(LIDAR, dense(0.3), **given, max_seconds=1.0)
+    assert (late.info["batches"], late.info["stopped"]) == (8, "time spent")
+    assert late.info["seconds"] > 1.0
