@@ -168,11 +168,14 @@ def setting_ahead(setup: Setup) -> tuple[Setting, Callable[[], Setting]]:
     takes the setting can be compiled beside it.
     """
     arguments = _arranged(setup, "none")
+
+    def made() -> Setting:
+        return _completed(_set_out(*arguments), setup, "none")
+
     if _set_out.is_compiled(*arguments):
-        setting = _completed(_set_out(*arguments), setup, "none")
+        setting = made()
         return setting, lambda: setting
-    ahead = _completed(_set_out.begin(*arguments), setup, "none")
-    return ahead, lambda: _completed(_set_out(*arguments), setup, "none")
+    return _completed(_set_out.begin(*arguments), setup, "none"), made
 
 
 def _arranged(setup: Setup, derivatives: Derivatives) -> tuple[Lidar, Scene, TracePlan, Bins, Sizes]:
