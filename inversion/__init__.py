@@ -1,26 +1,32 @@
 """Retrieval of scene properties from waveforms: fits with standard errors, and tools that need no model."""
 
-from . import files
-from .batch import Progress, Retrievals, retrieve_many
-from .counts import Amplitudes, amplitudes
-from .cover import GroundAndCanopy, gap_probability, ground_and_canopy, plant_area_index, plant_area_profile
-from .decomposition import Echoes, gaussian_decomposition
-from .deconvolution import richardson_lucy, wiener
-from .gedi import GediMetrics, GediSettings, gedi_metrics, gedi_settings
-from .heights import SignalEnds, find_ground, relative_heights, signal_ends
-from .identifiability import CramerRao, Profile, cramer_rao, profile_likelihood
-from .impulse import receiver_impulse, recorded_pulse
-from .leaves import LeafFit, invert_leaves
-from .photons import PhotonHeights, photon_ground_and_canopy
-from .points import EchoPoints, echo_points
-from .priors import LogNormal, Smooth
-from .profiles import AveragingKernel, put_profile
-from .quality import Verdict, judge_fit, judge_fits, judge_record
-from .recorder import Recorder
-from .result import Retrieval, Step
-from .retrieval import retrieve
-from .tables import corrected_table
-from .unknowns import Unknown
+from inversion import files
+from inversion.fit.batch import Progress, Retrievals, retrieve_many
+from inversion.fit.identifiability import CramerRao, Profile, cramer_rao, profile_likelihood
+from inversion.fit.priors import LogNormal, Smooth
+from inversion.fit.profiles import AveragingKernel, put_profile
+from inversion.fit.quality import Verdict, judge_fit, judge_fits, judge_record
+from inversion.fit.result import Retrieval, Step
+from inversion.fit.retrieval import retrieve
+from inversion.fit.unknowns import Unknown
+from inversion.leaf.leaves import LeafFit, invert_leaves
+from inversion.metrics.cover import (
+    GroundAndCanopy,
+    gap_probability,
+    ground_and_canopy,
+    plant_area_index,
+    plant_area_profile,
+)
+from inversion.metrics.decomposition import Echoes, gaussian_decomposition
+from inversion.metrics.deconvolution import richardson_lucy, wiener
+from inversion.metrics.gedi import GediMetrics, GediSettings, gedi_metrics, gedi_settings
+from inversion.metrics.heights import SignalEnds, find_ground, relative_heights, signal_ends
+from inversion.metrics.photons import PhotonHeights, photon_ground_and_canopy
+from inversion.metrics.points import EchoPoints, echo_points
+from inversion.receiver.counts import Amplitudes, amplitudes
+from inversion.receiver.impulse import receiver_impulse, recorded_pulse
+from inversion.receiver.recorder import Recorder
+from inversion.receiver.tables import corrected_table
 
 __all__ = [
     "Amplitudes",

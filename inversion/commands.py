@@ -11,11 +11,10 @@ import jax
 import numpy as np
 
 import jaxlidar as jl
+from inversion import demo as demonstration
+from inversion.fit.retrieval import retrieve as fit_waveform
+from inversion.fit.unknowns import Unknown
 from jaxlidar.cli.shared import ResultPath
-
-from . import demo as demonstration
-from .retrieval import retrieve as fit_waveform
-from .unknowns import Unknown
 
 
 @click.command()

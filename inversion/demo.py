@@ -16,12 +16,11 @@ from matplotlib.figure import Figure
 
 import jaxlidar as jl
 import jaxlidar.plot
+from inversion.fit.result import Retrieval
+from inversion.fit.retrieval import retrieve
+from inversion.fit.unknowns import Unknown, put, settle
 from jaxlidar.io import atomic_write
 from jaxlidar.plants.demo import HEIGHT, LEAF_AREA, WAVELENGTHS, demo_lidar, demo_scene
-
-from .result import Retrieval
-from .retrieval import retrieve
-from .unknowns import Unknown, put, settle
 
 # Standard deviation of the added noise: a share of each sample, and a floor relative to the peak.
 NOISE_SHARE, NOISE_FLOOR = 0.03, 0.01

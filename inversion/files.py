@@ -1,9 +1,8 @@
 """Retrievals as netCDF files: what `jaxlidar.io.save` and `jaxlidar.open` must know of them."""
 
+from inversion.fit.batch import Retrievals
+from inversion.fit.result import Retrieval
 from jaxlidar.io import keep_as_netcdf
-
-from .batch import Retrievals
-from .result import Retrieval
 
 _OWN = "units of the unknown"
 _QUANTITIES = {

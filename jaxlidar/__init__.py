@@ -16,11 +16,6 @@ from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._progress import Progress
 from jaxlidar._workers import LostWorkersWarning
 from jaxlidar.analog import AnalogReturns, analog_returns, photon_paths
-from jaxlidar.campaign.coverage import OffMapWarning
-from jaxlidar.campaign.progress import SurveyProgress
-from jaxlidar.campaign.run import simulate_many
-from jaxlidar.campaign.truths import Truths
-from jaxlidar.campaign.waveforms import Waveforms
 from jaxlidar.energy import EnergyBudget, energy_budget
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.instrument.photon_counter import PhotonCounter, PhotonEvents
@@ -63,6 +58,11 @@ from jaxlidar.scenes.surfaces import AbstractGround, AbstractSheet, AbstractSurf
 from jaxlidar.scenes.terrain import Terrain
 from jaxlidar.scenes.voxels import VoxelMap
 from jaxlidar.simulate import LateLightWarning, simulate
+from jaxlidar.survey.coverage import OffMapWarning
+from jaxlidar.survey.progress import SurveyProgress
+from jaxlidar.survey.run import simulate_many
+from jaxlidar.survey.truths import Truths
+from jaxlidar.survey.waveforms import Waveforms
 from jaxlidar.trace.response import Response, trace_scene
 from jaxlidar.truth import Truth, truth_of
 from jaxlidar.waveform import Waveform, total_of, waveform_of

@@ -3,9 +3,9 @@
 import jax
 import numpy as np
 import pytest
-from helpers import agrees, slab, slow_unless
 
 import jaxlidar as jl
+from tests.helpers import agrees, slab, slow_unless
 
 LIDAR = jl.Lidar(altitude=1000.0, divergence=1.0)
 CONE = 8.0

@@ -32,7 +32,7 @@ ROOMS = [
     "energy",
     "analog",
     "io",
-    "campaign",
+    "survey",
     "plot",
     "cli",
 ]
@@ -105,7 +105,7 @@ ORDER = {
         "node_response",
         "viewed_response",
     ],
-    "campaign": [
+    "survey": [
         "progress",
         "records",
         "coverage",

@@ -9,9 +9,9 @@ import csv
 import jax
 import numpy as np
 import pytest
-from helpers import slab, slow_unless
 
 import jaxlidar as jl
+from tests.helpers import slab, slow_unless
 
 KEY = jax.random.key(3)
 PLATE = jl.Plate(height=2.0, reflectance=(0.5, 0.1), transmittance=(0.3, 0.6))

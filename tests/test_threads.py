@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import slow_unless
 
 import jaxlidar as jl
 from jaxlidar._threads import side_by_side
+from tests.helpers import slow_unless
 
 
 @pytest.mark.skipif(os.cpu_count() == 1, reason="one core has one thread")

@@ -13,10 +13,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import NARROW, slow_unless
 from scipy.stats import norm
 
 import jaxlidar as jl
+from tests.helpers import NARROW, slow_unless
 
 KEY = jax.random.key(3)
 HIGH = {"altitude": 4e5, "pulse": jl.GaussianPulse(fwhm=6.0)}

@@ -24,7 +24,7 @@ from retrieval_coverage import LIDAR, NOISE, RANGES, plan_of, scene_of, unknowns
 
 import inversion
 import jaxlidar as jl
-from inversion.unknowns import put, settle
+from inversion.fit.unknowns import put, settle
 from jaxlidar.planning.plan import MIN_BATCHES
 
 OPTICAL = ("Cab", "Cw", "N", "ground brightness")

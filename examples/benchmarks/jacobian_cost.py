@@ -21,8 +21,8 @@ from _common import best, machine, new_figure, options, print_table, race, save_
 
 import inversion
 import jaxlidar as jl
-from inversion.model import Model
-from inversion.unknowns import settle
+from inversion.fit.model import Model
+from inversion.fit.unknowns import settle
 from jaxlidar.planning.plan import MIN_BATCHES
 
 N, SIZE, ORDERS, LAYERS = 32, 10.0, 10, 20

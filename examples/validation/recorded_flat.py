@@ -20,10 +20,10 @@ from scipy.optimize import nnls
 
 import inversion
 import jaxlidar as jl
-from inversion.counts import straight_table
-from inversion.noise import Noise, correlation_between
-from inversion.recorder import Terms
-from inversion.retrieval import scale_of
+from inversion.fit.noise import Noise, correlation_between
+from inversion.fit.retrieval import scale_of
+from inversion.receiver.counts import straight_table
+from inversion.receiver.recorder import Terms
 from jaxlidar.io import read_pulsewaves
 from jaxlidar.io.pedestal import above_pedestal
 

@@ -1,0 +1,1 @@
+"""Fits: scene properties from waveforms by nonlinear least squares, with standard errors."""

@@ -1,0 +1,1 @@
+"""Retrieval of leaf traits from reflectance and transmittance spectra."""

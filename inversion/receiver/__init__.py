@@ -1,0 +1,1 @@
+"""The receiver's part in a record: impulse response, digitiser tables, offsets."""

@@ -1,0 +1,220 @@
+"""The waveforms of all shots of a survey."""
+
+import operator
+import os
+import tempfile
+from pathlib import Path
+from typing import Any, final
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxlidar._checks import briefly
+from jaxlidar._constants import SPEED_OF_LIGHT
+from jaxlidar._summary import NOTABLE, percent
+from jaxlidar.io import netcdf
+from jaxlidar.io.case import Case
+from jaxlidar.io.rows import CHECKSUMS
+from jaxlidar.survey.truths import Truths
+from jaxlidar.waveform import Waveform
+
+
+@final
+@briefly
+class Waveforms(eqx.Module):
+    """The waveforms of all shots of a survey, on one time axis. `waves[i]` is the `Waveform` of shot i.
+
+    - `time`: (bins,) ns, centres of the samples, after the two-way travel time of each shot's aim point.
+    - `wavelength`: (wavelengths,) nm.
+    - `reflectance`, `stderr`, `energy`, `recorded`: (shots, wavelengths, bins), and
+    - `components`, dict of the same shape: as those of `Waveform`.
+    - `neglected`, `lost`: (shots, wavelengths), `ledger`, `ledger_stderr`, dicts of the same shape: as those
+      of `Waveform`.
+    - `position`: (shots, 2) m, `zenith`, `azimuth`: (shots,) degrees, as those of `Survey`.
+    - `ground_height`: (shots,) m, height of the ground where the beam axis meets it: the truth; NaN where
+      there is none.
+    - `off_map`: (shots,) share of the light that falls beside the voxel map.
+    - `error`: (shots,) relative error, as `simulate` defines it. `photons`: (shots,) traced.
+    - `truth`: a `Truths`, what each beam meets in the scene; None where it was not asked for.
+    - `info`: dict of "rtol", "orders" followed, "seconds" spent, whether light was "shared", then also the
+      spacing in m of the "grid" on which it was told apart, and a bound on the share of samples that
+      "parallel light" changes; and, where there is a file, "problem": digests of all that the waveforms
+      depend on.
+
+    **Example:**
+
+    >>> import jax, jaxlidar as jl
+    >>> survey = jl.Survey.grid(jl.Lidar(), low=(0, 0), high=(20, 10), spacing=10.0)
+    >>> scene = jl.Scene(ground=jl.Ground(reflectance=0.4, slope=10.0, aspect=90.0))
+    >>> many = jl.simulate_many(survey, scene, key=jax.random.key(0))
+    >>> print(many.reflectance.shape[:2], many.ground_height.round(2).tolist())
+    (6, 1) [0.0, -1.76, -3.53, 0.0, -1.76, -3.53]
+    >>> print(f"{float(many[2].reflectance.sum()):.3f}")
+    0.394
+    >>> print(str(many).splitlines()[1])
+      1064 nm: apparent reflectance 0.394 to 0.394, median 0.394
+    """
+
+    time: Float[np.ndarray, " bins"]
+    wavelength: Float[np.ndarray, " wavelengths"]
+    reflectance: Float[np.ndarray, "shots wavelengths bins"]
+    stderr: Float[np.ndarray, "shots wavelengths bins"]
+    energy: Float[np.ndarray, "shots wavelengths bins"]
+    recorded: Float[np.ndarray, "shots wavelengths bins"]
+    components: dict[str, Float[np.ndarray, "shots wavelengths bins"]]
+    neglected: Float[np.ndarray, "shots wavelengths"]
+    lost: Float[np.ndarray, "shots wavelengths"]
+    ledger: dict[str, Float[np.ndarray, "shots wavelengths"]]
+    ledger_stderr: dict[str, Float[np.ndarray, "shots wavelengths"]]
+    position: Float[np.ndarray, "shots 2"]
+    zenith: Float[np.ndarray, " shots"]
+    azimuth: Float[np.ndarray, " shots"]
+    ground_height: Float[np.ndarray, " shots"]
+    off_map: Float[np.ndarray, " shots"]
+    error: Float[np.ndarray, " shots"]
+    photons: Int[np.ndarray, " shots"]
+    info: dict[str, Any] = eqx.field(static=True)
+    truth: Truths | None = None
+
+    @property
+    def first_order_share(self) -> Float[np.ndarray, "shots wavelengths"]:
+        """Share of `reflectance` that was scattered once, (shots, wavelengths); 1 where nothing returns."""
+        first, whole = (np.sum(a, axis=2) for a in (self.components["first"], self.reflectance))
+        return np.where(whole > 0, first / np.where(whole > 0, whole, 1.0), 1.0).astype(whole.dtype)
+
+    def __len__(self) -> int:
+        return len(self.position)
+
+    def __str__(self) -> str:
+        interval = self.time[1] - self.time[0] if self.time.size > 1 else 0.0
+        samples = f"{self.time.size} samples of {interval:.3g} ns from {self.time[0]:.6g} ns"
+        lines = [f"{len(self)} waveforms of {samples}"]
+        for w, sums in zip(self.wavelength, self.reflectance.sum(axis=2).T):
+            low, middle, high = np.quantile(sums, (0.0, 0.5, 1.0))
+            lines.append(f"  {w:g} nm: apparent reflectance {low:.3g} to {high:.3g}, median {middle:.3g}")
+        if (beside := int(np.sum(self.off_map >= NOTABLE))) > 0:
+            lines.append(f"  {beside} lie partly beside the voxel map")
+        light = "which share light, " if self.info.get("shared") else ""
+        lines.append(
+            f"  {light}{self.info.get('seconds', 0.0):.2g} s, relative errors up to {self.error.max():.2g}"
+        )
+        return "\n".join(lines)
+
+    def __iter__(self):
+        return (self[i] for i in range(len(self)))
+
+    def __getitem__(self, shot: int) -> Waveform:
+        n, i = len(self), operator.index(shot)
+        if not -n <= i < n:
+            raise IndexError(f"shot {i}: there are {n}; admissible are -{n} to {n - 1}")
+
+        def own(named: dict) -> dict:
+            return {name: jnp.asarray(a[i]) for name, a in named.items()}
+
+        height = -0.5 * SPEED_OF_LIGHT * self.time * np.cos(np.deg2rad(self.zenith[i]))
+        axes = jnp.asarray(self.time), jnp.asarray(height, self.time.dtype)
+        return Waveform(
+            time=axes[0],
+            height=axes[1],
+            reflectance=jnp.asarray(self.reflectance[i]),
+            energy=jnp.asarray(self.energy[i]),
+            stderr=jnp.asarray(self.stderr[i]),
+            components=own(self.components),
+            neglected=jnp.asarray(self.neglected[i]),
+            ledger=own(self.ledger),
+            ledger_stderr=own(self.ledger_stderr),
+            lost=jnp.asarray(self.lost[i]),
+            recorded=jnp.asarray(self.recorded[i]),
+            wavelength=jnp.asarray(self.wavelength),
+            info=self._info(i),
+            truth=None if self.truth is None else self.truth.of_shot(i, *axes),
+        )
+
+    def _info(self, i: int) -> dict[str, Any]:
+        return {"photons": int(self.photons[i]), "error": float(self.error[i]), "stopped": self._stopped(i)}
+
+    def _stopped(self, i: int) -> str:
+        whole = np.maximum(self.reflectance[i].sum(axis=-1), 1e-30)
+        beyond = float(np.max(self.neglected[i] / whole))
+        if self.error[i] > self.info["rtol"]:
+            return "batches spent"
+        if self.info["orders"] > 1 and beyond > self.info["rtol"]:
+            return f"orders beyond {self.info['orders']} may add {percent(beyond)}"
+        return "tolerance met"
+
+    def to_xarray(self) -> Any:
+        """The waveforms as an `xarray.Dataset` over shots, wavelengths and times, with units.
+
+        **Returns:** an `xarray.Dataset`.
+
+        **Raises:** ImportError where xarray or h5netcdf is not installed.
+        """
+        import xarray
+
+        with tempfile.TemporaryDirectory() as folder:
+            self.save(path := Path(folder) / "waveforms.nc")
+            how: dict[str, Any] = {"engine": "h5netcdf", "decode_timedelta": False}
+            found = xarray.load_dataset(path, **how)
+            if self.truth is None:
+                return found
+            return found.merge(xarray.load_dataset(path, group="truth", **how).drop_vars(CHECKSUMS))
+
+    def save(self, path: str | os.PathLike[str], case: Case | None = None) -> None:
+        """Write the waveforms as a netCDF file, which `Waveforms.open` and `jaxlidar.open` read.
+
+        **Arguments:**
+
+        - `path`: the file to write. It appears when it is whole.
+        - `case`: the `jaxlidar.io.Case` of the survey that was simulated, so that `jaxlidar.repeat` can do it
+          again. Default None: not kept.
+
+        **Raises:** what `jaxlidar.io.save` raises.
+        """
+        netcdf.save(self, path, case)
+
+    @staticmethod
+    def open(path: str | os.PathLike[str]) -> "Waveforms":
+        """The waveforms of a netCDF file that `save` or `simulate_many` wrote, with the same bits.
+
+        **Arguments:** `path`: the file.
+
+        **Returns:** a `Waveforms`.
+
+        **Raises:** what `jaxlidar.open` raises; ValueError, naming the file, for one of another kind.
+        """
+        found = netcdf.open(path)
+        if not isinstance(found, Waveforms):
+            raise ValueError(f"{path}: it holds a {type(found).__name__}, not Waveforms")
+        return found
+
+
+netcdf.keep_as_netcdf(
+    Waveforms,
+    "simulated lidar waveforms of a survey",
+    {
+        "time": ("ns", "time of arrival after the two-way travel time of the aim point"),
+        "wavelength": ("nm", "wavelength of the lidar"),
+        "reflectance": ("1", "apparent reflectance per sample"),
+        "stderr": ("1", "standard error of the apparent reflectance"),
+        "energy": ("J", "energy that the detector registers per sample"),
+        "recorded": ("J", "energy that the receiver records per sample, without noise"),
+        "components": ("1", "apparent reflectance per sample by material and by order of scattering"),
+        "neglected": ("1", "apparent reflectance that orders beyond the last could add"),
+        "lost": ("1", "apparent reflectance that arrives before or after all fine bins of the plan"),
+        "ledger": ("1", "share of the emitted energy by fate, before the atmosphere"),
+        "ledger_stderr": ("1", "standard error of the share of the emitted energy"),
+        "position": ("m", "x and y where the beam axis meets the reference plane"),
+        "zenith": ("degree", "angle between the beam and the vertical"),
+        "azimuth": ("degree", "direction in which the beam travels, clockwise from north"),
+        "ground_height": ("m", "height of the ground where the beam axis meets it"),
+        "off_map": ("1", "share of the light that falls beside the voxel map"),
+        "error": ("1", "relative error of the waveform"),
+        "photons": ("1", "photons traced"),
+    },
+    dimensions={"shots": "shot", "bins": "time", "wavelengths": "wavelength", "2": "axis"},
+    items={"components": "component", "ledger": "fate", "ledger_stderr": "fate"},
+    coordinates={"zenith": "shot", "azimuth": "shot"},
+    rows="shots",
+)

@@ -1,0 +1,88 @@
+"""The command's `info` and `convert`: what they say of files, and what they make of them."""
+
+import contextlib
+import re
+
+import numpy as np
+import pytest
+
+import jaxlidar as jl
+from jaxlidar import cli
+from tests.io import test_gedi as test_io
+from tests.io import test_las_waveforms, test_neon, test_pulsewaves
+
+
+@pytest.fixture(autouse=True)
+def no_programs(monkeypatch):
+    monkeypatch.setattr("jaxlidar.cli.group.kept_programs", contextlib.nullcontext)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "says"),
+    [
+        ("a.csv", "400,0.1\n2400,0.4\n", "spectrum 'a' of 2 samples from 400 to 2400 nm"),
+        ("a.toml", "[scene.ground]\nslope = 5", "scene: Scene("),
+        (
+            "a.asc",
+            "ncols 3\nnrows 2\nxllcorner 0\nyllcorner 0\ncellsize 10\n1.5 2 3\n4 5 6\n",
+            "terrain of 3 x 2 nodes, 10 x 10 m apart\nheights 1.50 to 6.00 m, no coordinate reference system",
+        ),
+        (
+            "a.obj",
+            "v 0 0 0\nv 2 0 1\nv 0 1 0\nusemtl leaf\nf 1 2 3\nf 1 1 2\n",
+            "1 triangles: x 0.00 to 2.00 m, y 0.00 to 1.00 m, z 0.00 to 1.00 m\nleaf: 1.118 m2\n"
+            "1 triangles left out: without an area",
+        ),
+        (
+            "a.vox",
+            "VOXEL SPACE\n#min_corner:(0,0,0)\n#max_corner:(1,1,2)\n#split:(1,1,2)\n"
+            "i j k PadBVTotal\n0 0 0 NaN\n0 0 1 1.5\n",
+            "1 x 1 x 2 voxels of 1 x 1 x 1 m from (0, 0, 0) m\nleaf: 1.5 m2\n1 voxels without a density",
+        ),
+    ],
+)
+def test_info_reads_what_there_is(name, text, says, tmp_path, capsys):
+    (tmp_path / name).write_text(text)
+    assert cli.main(["info", str(tmp_path / name)]) == 0
+    assert capsys.readouterr().out.startswith(says)
+    if name == "a.vox":
+        assert cli.main(["convert", str(tmp_path / name), str(tmp_path / "b.toml")]) == 0
+        assert "taken as empty: 1 voxels without a density" in capsys.readouterr().err
+        assert jl.io.read_case(tmp_path / "b.toml").scene.canopy.voxels.shape == (1, 1, 2)
+
+
+def test_info_of_recorded_waveforms(tmp_path, capsys):
+    for path, content in zip(("a.pls", "a.wvs"), test_pulsewaves.small_files()):
+        (tmp_path / path).write_bytes(content)
+    test_las_waveforms.small_files(tmp_path)
+    test_neon.write_small(tmp_path / "a.npz")
+    test_io.write_small(tmp_path / "a.h5")
+    for name, says in {
+        "a.pls": r"3 airborne shots, GPS times 400000\.0+ to 400002\.0+ s\nscanner a scanner, 1064\.0 nm\n"
+        r"5 to 5 samples of 1 ns in up to 2 segments, with outgoing pulses\nzenith 8\.6 to 8\.6 degrees",
+        "small.las": r"7 points: x .*\n4 airborne shots, .*\n10 to 40 samples of 1 ns in up to 2 segments, ",
+        "a.npz": r"3 airborne shots\n50 to 65 samples of 1 ns in up to 2 segments, with outgoing pulses\n",
+        "a.h5": r"\d+ GEDI shots of BEAM\d+.*\nlatitude ",
+    }.items():
+        assert cli.main(["info", str(tmp_path / name)]) == 0
+        out = capsys.readouterr().out
+        assert re.match(says, out), out
+
+
+def test_airborne_waveforms_become_packets(shared, tmp_path, capsys):
+    source, target = shared / "airborne" / "lvis_example2.pls", tmp_path / "b.las"
+    assert cli.main(["convert", str(source), str(target)]) == 0
+    assert "left out: outgoing pulses" in capsys.readouterr().err
+    sent, back = jl.io.read_pulsewaves(source), jl.io.read_las_waveforms(target)
+    assert len(back) == len(sent) > 0
+    for own, other in zip(sent[:100], back[:100]):
+        assert np.array_equal(own.waveform, other.waveform)
+        assert np.allclose(own.elevation, other.elevation, atol=2e-3)
+
+
+def test_what_packets_cannot_hold_is_refused(tmp_path, capsys):
+    for path, content in zip(("a.pls", "a.wvs"), test_pulsewaves.small_files()):
+        (tmp_path / path).write_bytes(content)
+    assert cli.main(["convert", str(tmp_path / "a.pls"), str(tmp_path / "b.las")]) == 1
+    assert "shot 1: segments of the channels [0, 1]" in capsys.readouterr().err
+    assert not (tmp_path / "b.las").exists()

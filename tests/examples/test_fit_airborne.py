@@ -1,0 +1,234 @@
+"""`examples/fit_airborne.py`: every format gives the same records, what it refuses, and fits of them."""
+
+import argparse
+import csv
+import dataclasses
+import importlib
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import inversion
+from jaxlidar.io import AirborneShot, Segment, write_las_waveforms
+from tests.io import test_neon, test_pulsewaves
+
+WAY = np.array([0.0, 0.0, -0.149896229])
+GROUND, ANCHOR = 290.0, 300.0
+FWHM = 4.0
+NONE = {"pulse": None, "pulses": None, "pulse_width": None, "instrument": None}
+
+
+@pytest.fixture(scope="module")
+def example():
+    """A module of the folder of examples, by name."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(Path(__file__).resolve().parents[2] / "examples"))
+        yield importlib.import_module
+
+
+def echo(places, broadening=0.0, size=120):
+    """Counts of hard targets: Gaussians of the pulse's width about those samples, above a pedestal."""
+    sigma = np.hypot(FWHM / 2.3548, broadening)
+    samples = sum(a * np.exp(-0.5 * ((np.arange(size) - t) / sigma) ** 2) for t, a in places)
+    noise = np.random.default_rng(size + len(places)).normal(size=size)
+    return np.round(np.maximum(20.0 + samples + 0.7 * noise, 0.0)).astype(np.uint16)
+
+
+def las_of(folder, *samples):
+    """A LAS file of shots straight down."""
+    place = {"anchor": np.array([5e5, 4e6, ANCHOR]), "direction": WAY}
+    shots = [
+        AirborneShot(i, **place, returning=(Segment(counts, 0.0),), gps_time=10.0 + i)
+        for i, counts in enumerate(samples)
+    ]
+    write_las_waveforms(folder / "small.las", shots)
+    return folder / "small.las"
+
+
+def written(folder):
+    """A small file of every format, and the options that it needs."""
+    small = dict(zip((".pls", ".wvs"), test_pulsewaves.small_files()))
+    for suffix, content in small.items():
+        (folder / f"small{suffix}").write_bytes(content)
+    return {
+        test_neon.write_small(folder / "small.npz"): {},
+        folder / "small.pls": {},
+        las_of(folder, echo([(60, 100)]), echo([(30, 50), (60, 100)])): {"pulse_width": FWHM},
+    }
+
+
+def test_every_format_gives_the_same_records(example, tmp_path):
+    airborne = example("_airborne")
+    for path, given in written(tmp_path).items():
+        flight = airborne.read_flight(path, argparse.Namespace(**{**NONE, **given}))
+        # The counts of the small PulseWaves file are not those that its table has.
+        flight = flight._replace(tables={})
+        records = airborne.records_of(flight.shots[:], flight)
+        assert len(records) >= 2
+        for record, shot in zip(records, flight.shots):
+            assert record.signal.shape == record.noise.shape == record.elevation.shape == shot.time.shape
+            assert record.signal.max() == pytest.approx(1.0)
+            np.testing.assert_array_equal(np.isfinite(record.noise), shot.recorded)
+            np.testing.assert_allclose(record.elevation, shot.elevation)
+            assert record.lidar.sampling_interval == shot.sampling_interval
+            zero = shot.pulse_time[np.argmax(shot.pulse_power)] if shot.outgoing else 0.0
+            assert np.argmax(record.pulse(30)) == pytest.approx(30 + zero / shot.sampling_interval, abs=1)
+            assert record.saturated == 0
+
+
+def test_saturated_samples_have_no_weight(example, tmp_path):
+    airborne, counts = example("_airborne"), np.minimum(echo([(60, 200)]), 150)
+    path = las_of(tmp_path, counts)
+    given = argparse.Namespace(**{**NONE, "pulse_width": FWHM, "saturation": 150.0})
+    flight = airborne.read_flight(path, given)
+    (record,) = airborne.records_of(flight.shots[:], flight)
+    assert record.saturated == np.sum(counts == 150) > 2
+    np.testing.assert_array_equal(np.isinf(record.noise), counts == 150)
+    np.testing.assert_array_equal(record.signal[counts == 150], 0.0)
+
+
+def test_interleaved_digitisers_have_their_own_pedestals(example, tmp_path):
+    airborne, counts = example("_airborne"), echo([(60, 100)])
+    path = las_of(tmp_path, counts + 10 * (np.arange(counts.size) % 2).astype(np.uint16))
+    given = argparse.Namespace(**{**NONE, "pulse_width": FWHM, "interleaved": 2})
+    flight = airborne.read_flight(path, given)
+    (record,) = airborne.records_of(flight.shots[:], flight)
+    assert np.abs(record.signal[np.r_[:45, 75:120]]).max() < 0.04
+
+
+def test_a_pulse_is_read_from_a_table(example, tmp_path):
+    airborne, path = example("_airborne"), las_of(tmp_path, echo([(60, 100)]))
+    (tmp_path / "pulse.csv").write_text("-4,0\n-1,3\n0,4\n6,0\n")
+    flight = airborne.read_flight(path, argparse.Namespace(**{**NONE, "pulse": tmp_path / "pulse.csv"}))
+    (record,) = airborne.records_of(flight.shots[:], flight)
+    np.testing.assert_array_equal(record.lidar.pulse.time, [-4.0, -1.0, 0.0, 6.0])
+
+
+def test_pulses_of_the_same_shots_are_found_by_time(example, tmp_path):
+    (tmp_path / "a").mkdir()
+    airborne, path = example("_airborne"), las_of(tmp_path / "a", echo([(60, 100)]))
+    pulses = next(p for p in written(tmp_path) if p.suffix == ".pls")
+    with pytest.raises(ValueError, match=r"small\.pls: it has no pulse at the GPS times"):
+        airborne.read_flight(path, argparse.Namespace(**{**NONE, "pulses": pulses}))
+
+
+REFUSED = {
+    "suffix": (["small.csv"], r"small\.csv: its suffix is '\.csv'; admissible are \.npz, \.pls, \.las"),
+    "missing": (["none.pls"], r"none\.pls"),
+    "damaged": (["damaged.pls"], r"damaged\.pls: header"),
+    "no waves": (["alone.pls"], r"alone\.wvs"),
+    "no pulse": (["small.las"], r"small\.las: shots have no outgoing pulse; give one with --pulse, "),
+    "width": (["small.las", "--pulse-width", "-1"], r"--pulse-width = -1; admissible is \(0, inf\) ns"),
+    "table": (["small.las", "--pulse", "bad.txt"], r"bad\.txt: 3 columns; admissible are two"),
+    "negative": (["small.las", "--pulse", "negative.txt"], r"negative\.txt: power"),
+    "own pulses": (["small.npz", "--pulse-width", "4"], r"small\.npz: shots have their own outgoing pulses"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_refused(example, tmp_path, monkeypatch, case):
+    arguments, message = REFUSED[case]
+    monkeypatch.chdir(tmp_path)
+    pls = next(p for p in written(tmp_path) if p.suffix == ".pls").read_bytes()
+    for name, content in {
+        "small.csv": b"",
+        "damaged.pls": pls[:100],
+        "alone.pls": pls,
+        "bad.txt": b"0 1 2\n1 2 3\n",
+        "negative.txt": b"0 1\n1 -2\n",
+    }.items():
+        Path(name).write_bytes(content)
+    with pytest.raises(SystemExit, match=message):
+        example("fit_airborne").main(arguments)
+
+
+def test_echoes_say_what_is_fitted(example, tmp_path, monkeypatch, capsys):
+    """One echo: ground; two: ground and canopy; none: a row with the reason."""
+    module = example("fit_airborne")
+    fitted = []
+
+    def fit(kind, records, echoes, own, impulse, path, progress):
+        fitted.append((kind.name, [record.shot.index for record in records]))
+        time, n = np.arange(-60.0, 30.0), len(records)
+        values = {"ground": np.zeros(n), "scale": np.ones(n)}
+        if kind.canopy:
+            values |= {"canopy height": np.full(n, 5.0), "log density": np.zeros((n, 10))}
+        else:
+            values |= {"receiver width": np.where(np.array([r.shot.index for r in records]) == 3, 3.0, 0.1)}
+        fits = argparse.Namespace(
+            values=values,
+            robust_stderr={name: np.full_like(v, 0.1) for name, v in values.items()},
+            prior_share={},
+            reduced_chi2=np.ones(n),
+            steps=np.ones(n, int),
+            status=("converged",) * n,
+            fitted=np.zeros((n, 1, time.size)),
+        )
+        windows = [module.window(r, e[-1], time) for r, e in zip(records, echoes)]
+        recorder = inversion.Recorder(width=(0.1, 5.0))
+        return module.Fitted(fits, windows, [recorder] * n)
+
+    monkeypatch.setattr(module, "fit", fit)
+    good = inversion.Verdict("good", ())
+    monkeypatch.setattr(inversion, "judge_fits", lambda fits, about: (good,) * len(fits.status))
+    quiet = np.full(120, 20, np.uint16)
+    records = echo([(60, 100)]), echo([(30, 50), (60, 100)]), quiet, echo([(60, 100)], broadening=3.0)
+    arguments = [str(las_of(tmp_path, *records)), "--pulse-width", str(FWHM), "--out", str(tmp_path / "out")]
+    rows = module.main(arguments)
+    assert fitted == [("ground", [0, 3]), ("ground and canopy", [1])]
+    assert [row["echoes"] for row in rows] == [1, 2, 0, 1]
+    assert [row["quality"] for row in rows] == ["good", "good", "bad", "doubtful"]
+    assert rows[2]["reasons"] == "no sample above the pedestal has weight"
+    assert rows[3]["reasons"] == "broader by 3.0 ns than an echo of flat hard ground"
+    assert rows[0]["ground"] == pytest.approx(ANCHOR + 60 * WAY[2], abs=0.08)
+    assert rows[1]["canopy_top"] - rows[1]["ground"] == pytest.approx(5.0)
+    assert {p.name for p in (tmp_path / "out").iterdir()} == {"small.csv", "small.nc", "small.png"}
+    with (tmp_path / "out" / "small.csv").open(newline="") as file:
+        assert [row["scene"] for row in csv.DictReader(file)] == ["ground", "ground and canopy", "", "ground"]
+    assert "2 good, 1 doubtful, 1 bad" in capsys.readouterr().out
+    low = dataclasses.replace(module.Instrument(), above=3.0)
+    monkeypatch.setitem(sys.modules["_airborne"].INSTRUMENTS, "other", low)
+    row = module.main([*arguments[:-1], str(tmp_path / "low")])[1]
+    assert (row["scene"], row["echoes"], row["quality"]) == ("ground", 1, "doubtful")
+    assert row["reasons"] == "above what is fitted, 3 m over the last echo: 1 more"
+
+
+@pytest.mark.slow
+def test_planted_ground_is_found(example, tmp_path):
+    """Single echoes, one of which is broadened: within four standard errors, and what broadened it."""
+    places = 60 + np.random.default_rng(5).uniform(-0.5, 0.5, 6)
+    records = [echo([(t, 150)], broadening=2.0 * (i == 5)) for i, t in enumerate(places)]
+    arguments = [str(las_of(tmp_path, *records)), "--pulse-width", str(FWHM), "--out", str(tmp_path / "out")]
+    rows = example("fit_airborne").main([*arguments, "--altitude", "500", "--model-error", "0"])
+    z = [(row["ground"] - (ANCHOR + t * WAY[2])) / row["ground_stderr"] for row, t in zip(rows, places)]
+    assert np.all(np.abs(z) < 4)
+    assert all(row["ground_stderr"] < 0.02 for row in rows)
+    assert rows[5]["broadening"] == pytest.approx(2.0, abs=4 * rows[5]["broadening_stderr"])
+    assert all(row["reasons"].startswith("broader") == (i == 5) for i, row in enumerate(rows))
+
+
+CASES = {
+    "neon": (["neon/neon_harvard_250.npz", "--shots", "4"], 4),
+    "riegl": (["airborne/riegl.pls", "--every", "300"], 8),
+    "las": (["airborne/riegl.las", "--every", "600", "--pulses", "airborne/riegl.pls"], 4),
+    "lvis": (["airborne/lvis_example2.pls", "--every", "250"], 4),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", CASES)
+def test_from_file_to_table(example, shared, tmp_path, case):
+    arguments, count = CASES[case]
+    arguments = [str(shared / a) if "/" in a else a for a in arguments]
+    rows = example("fit_airborne").main([*arguments, "--out", str(tmp_path)])
+    again = example("fit_airborne").main([*arguments, "--out", str(tmp_path)])
+    assert len(rows) == count
+    assert [row.get("ground") for row in rows] == [row.get("ground") for row in again]
+    assert {path.suffix for path in tmp_path.iterdir()} == {".csv", ".nc", ".png", ".sqlite"}
+    assert all(row["quality"] in ("good", "doubtful", "bad") for row in rows)
+    assert all(row["reasons"] for row in rows if row["quality"] != "good")
+    found = [row for row in rows if "ground" in row]
+    assert len(found) >= count / 2
+    assert np.median([abs(row["ground"] - row["last_echo"]) for row in found]) < 0.5

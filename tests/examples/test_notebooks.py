@@ -1,0 +1,82 @@
+"""The notebooks: their code runs, they are stored with their results, and tell of no machine."""
+
+import importlib.util
+import json
+import re
+from pathlib import Path
+
+import matplotlib
+import matplotlib.pyplot as plt
+import pytest
+
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+FOLDER = EXAMPLES / "notebooks"
+NAMES = sorted(p.stem for p in FOLDER.glob("*.ipynb"))
+
+
+def all_cells(name):
+    return json.loads((FOLDER / f"{name}.ipynb").read_text())["cells"]
+
+
+def cells(name):
+    return [c for c in all_cells(name) if c["cell_type"] == "code"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_results_are_stored(name):
+    found = cells(name)
+    outputs = [o for c in found for o in c["outputs"]]
+    assert [c["execution_count"] for c in found] == list(range(1, len(found) + 1))
+    assert any("image/png" in o.get("data", {}) for o in outputs)
+    assert not any(o["output_type"] == "error" or o.get("name") == "stderr" for o in outputs)
+    assert not re.search(r"/(home|root|tmp|work|Users)/", (FOLDER / f"{name}.ipynb").read_text())
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_notebooks_are_short_and_say_what_to_change(name):
+    found = all_cells(name)
+    assert len(found) <= 25
+    assert (FOLDER / f"{name}.ipynb").stat().st_size < 400_000
+    assert "".join(found[0]["source"]).startswith("# ")
+    assert "## What to change" in "".join(found[-1]["source"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NAMES)
+def test_code_runs(name, monkeypatch):
+    monkeypatch.delenv("GEDI_L1B", raising=False)
+    before = matplotlib.get_backend()
+    matplotlib.use("agg")
+    scope = {"__name__": "__main__"}
+    try:
+        with matplotlib.rc_context():
+            for cell in cells(name):
+                exec("".join(cell["source"]), scope)
+        assert plt.get_fignums()
+    finally:
+        plt.close("all")
+        matplotlib.use(before)
+
+
+def test_there_are_notebooks():
+    assert NAMES == [
+        "first_waveform",
+        "ground_under_trees",
+        "hectare",
+        "leaf_traits",
+        "peak_detectors",
+        "recorded_shots",
+    ]
+
+
+def test_the_gallery_shows_what_the_notebooks_show():
+    where = importlib.util.spec_from_file_location("gallery", EXAMPLES / "figures" / "gallery.py")
+    gallery = importlib.util.module_from_spec(where)
+    where.loader.exec_module(gallery)
+    page = (EXAMPLES / "README.md").read_text()
+    for name in NAMES:
+        assert (gallery.GALLERY / f"{name}.png").read_bytes() == gallery.picture(name), name
+        assert f"(figures/gallery/{name}.png)" in page
+        assert f"(notebooks/{name}.ipynb)" in page
+    for path in re.findall(r"!\[[^]]*\]\(([^)]+)\)", page):
+        assert (EXAMPLES / path).stat().st_size < 62_000, path

@@ -1,0 +1,186 @@
+"""The scripts of `examples/validation` run end to end, and their page is made from their records."""
+
+import importlib.util
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+FOLDER = Path(__file__).resolve().parents[2] / "examples" / "validation"
+SCRIPTS = sorted(
+    p.stem for p in FOLDER.glob("*.py") if not p.stem.startswith("_") and p.stem != "make_readme"
+)
+# Modules of the examples' folders, some under one name in several of them.
+OWN = (
+    *("_airborne", "_common", "_crown", "_recorded", "_validation", "fit_airborne", "fit_gedi"),
+    *("peers", "simulation_cost"),
+)
+
+
+@pytest.fixture
+def run(monkeypatch, tmp_path):
+    """Runs a script as `python examples/validation/name.py` would, and gives its record."""
+    monkeypatch.syspath_prepend(str(FOLDER))
+    for name in OWN:
+        monkeypatch.delitem(sys.modules, name, raising=False)
+
+    def load(name):
+        spec = importlib.util.spec_from_file_location(f"validation_{name}", FOLDER / f"{name}.py")
+        assert spec is not None
+        assert spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        return module
+
+    def call(name, *arguments, planted=None):
+        module = load(name)
+        if planted is not None:
+            planted(module)
+        record = module.main([*map(str, arguments), "--out", str(tmp_path), "--quiet"])
+        written = json.loads((tmp_path / f"{name}.json").read_text())
+        assert written["summary"] == json.loads(json.dumps(record["summary"]))
+        assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+        assert record["rows"]
+        return record
+
+    yield call
+    for name in OWN:
+        sys.modules.pop(name, None)
+
+
+def over_error(record, word=""):
+    """Differences over their errors, of comparisons that have a word in their name or case."""
+    found = np.array([row["over error"] for row in record["rows"] if word in row["what"] + row["case"]])
+    assert found.size
+    return found
+
+
+def holds(record, word=""):
+    """Whether all are within their bounds, or four standard errors."""
+    most = [1.0 if "bound" in row else 4.0 for row in record["rows"] if word in row["what"] + row["case"]]
+    return bool(np.all(np.abs(over_error(record, word)) <= most))
+
+
+def test_the_page_is_made_from_the_records():
+    code = "import make_readme; print(make_readme.page(), end='')"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=FOLDER, check=True
+    )
+    assert done.stdout == (FOLDER / "README.md").read_text()
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_every_script_has_its_record_and_its_picture(name):
+    text = (FOLDER / "results" / f"{name}.json").read_text()
+    record, page = json.loads(text), (FOLDER / "README.md").read_text()
+    assert record["script"] == name
+    assert "/" not in json.dumps(record["summary"]).replace("/cm2", "")
+    assert f"](results/{name}.png)" in page
+    assert (FOLDER / "results" / f"{name}.png").stat().st_size < 300_000
+    # Values of data that others own are not kept, but for the one furthest off.
+    assert ("rows" in record) is not any(word in name for word in ("rami", "leaf", "recorded"))
+    for row in record["summary"]:
+        assert row["difference"] == pytest.approx(row["here"] - row["there"])
+        error = row["standard error"] if "standard error" in row else row["bound"]
+        assert row["over error"] == pytest.approx(row["difference"] / error)
+
+
+def test_elementary_functions(run, capsys):
+    assert holds(run("mpmath_plate", "--points", "8"))
+    assert capsys.readouterr() == ("", "")
+
+    def plant(module):
+        exact = module.LAYER["2 E3(k)"]
+        module.LAYER["2 E3(k)"] = lambda k: exact(k) * (1 + 1e-5)
+
+    wrong = run("mpmath_plate", "--points", "8", planted=plant)
+    assert not holds(wrong, "2 E3(k)")
+    assert holds(wrong, "leaf")
+
+
+@pytest.mark.slow
+def test_leaves_by_prosail(run):
+    assert holds(run("prosail_leaves", "--leaves", "10"))
+
+
+@pytest.mark.slow
+def test_slabs(run):
+    assert holds(run("discrete_ordinates", "--slabs", "5", "--rtol", "0.003"))
+
+    def plant(module):
+        tau, _, ground, orders = module.SLABS["1, isotropic 0.9, 0.2"]
+        del module.SLABS["1, isotropic 0.9, 0.2"]
+        module.SLABS = {"wrong": (tau, module.jl.Isotropic(albedo=0.9), ground, orders)}
+        solved = module.solved
+        module.solved = lambda tau, *given: solved(1.05 * tau, *given)
+
+    wrong = run("discrete_ordinates", "--slabs", "1", "--rtol", "0.003", planted=plant)
+    assert not holds(wrong, "reflectance factor")
+
+
+@pytest.mark.slow
+def test_open_forests(run, shared):
+    """Within 0.01; where light comes in flat, also two standard deviations of one arrangement of crowns."""
+    record = run("rami4pilps", shared / "reference" / "rami4pilps.csv", "--arrangements", "2")
+    assert len(record["rows"]) == 162
+    for row in record["rows"]:
+        most = 0.01 + (2 * row["arrangements_apart"] if row["zenith"] == 83 else 0.0)
+        assert abs(row["difference"]) < most, row
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "package"), [("mitransient_crown", "mitransient"), ("mcx_crown", "pmcxcl")])
+def test_other_codes(run, name, package):
+    pytest.importorskip(package)
+    record = run(name, "--repeats", "8")
+    assert np.sqrt(np.mean(over_error(record) ** 2)) < 2.5
+
+
+@pytest.mark.slow
+def test_measured_leaves(run, shared):
+    paths = [shared / "leaves" / name for name in ("angers_half.npz", "lopex_half.npz")]
+    record = run("leaf_databases", *paths)
+    for trait in ("Cw", "Cm"):
+        assert np.mean(np.abs(over_error(record, trait)) < 2) > 0.95
+
+
+@pytest.mark.slow
+def test_recorded_shots_of_gedi(run, shared):
+    (path,) = (shared / "gedi").glob("GEDI01_B_*.h5")
+    assert holds(run("recorded_gedi", path, shared / "gedi" / "level2_answers_60_shots.npz", "--shots", "10"))
+
+
+@pytest.mark.slow
+def test_recorded_returns_of_neon(run, shared):
+    assert holds(run("recorded_neon", shared / "neon" / "neon_harvard_250.npz", "--shots", "20"))
+
+
+@pytest.mark.slow
+def test_recorded_shots_of_riegl(run, shared):
+    record = run("recorded_riegl", *(shared / "airborne" / f"riegl.{kind}" for kind in ("las", "pls")))
+    assert holds(record, "anchor")
+    assert holds(record, "as many")
+    # Where two echoes overlap, the scanner's software put its points otherwise.
+    assert np.mean(np.abs(over_error(record, "echo,")) <= 1) > 0.95
+
+
+@pytest.mark.slow
+def test_recorded_flat_ground(run, shared):
+    """Within a tenth of the best sum of pulses; not where noise is taken as independent."""
+    path = shared / "airborne" / "riegl.pls"
+    assert holds(run("recorded_flat", path))
+
+    def plant(module):
+        module.CORRELATED = 0.0
+
+    assert not holds(run("recorded_flat", path, planted=plant))
+
+
+@pytest.mark.slow
+def test_recorded_shots_of_lvis(run, shared):
+    record = run("recorded_lvis", shared / "airborne" / "lvis_example2.pls", "--shots", "8")
+    assert holds(record, "apart")
+    assert np.median(np.abs(over_error(record, "rms"))) < 1

@@ -1,0 +1,203 @@
+"""Detection, noise and digitisation: every field has its effect; noise has its statistics."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxlidar._constants import PLANCK_TIMES_LIGHT
+from jaxlidar.instrument.receiver import Receiver, first_return_window, record
+from tests.helpers import NARROW
+
+WAVELENGTH = np.array([532.0, 1064.0])
+PHOTON = PLANCK_TIMES_LIGHT / WAVELENGTH
+Z_LIMIT = 4.5  # one false alarm in 150,000
+
+
+def z_scores(counts, expected):
+    """How far the mean and the variance of draws (draws, ...) lie from a Poisson variable's, in
+    standard errors."""
+    n = counts.shape[0]
+    mean = (counts.mean(0) - expected) / np.sqrt(expected / n)
+    # The variance of a sample variance: (mu4 - s^4) / n, mu4 = m + 3 m^2.
+    variance = (counts.var(0, ddof=1) - expected) / np.sqrt((expected + 2 * expected**2) / n)
+    return np.abs(mean).max(), np.abs(variance).max()
+
+
+def draws(energy, receiver, n, seed=0):
+    keys = jax.random.split(jax.random.key(seed), n)
+    return np.asarray(jax.vmap(lambda k: record(energy, WAVELENGTH, receiver, key=k))(keys), np.float64)
+
+
+def test_a_photon_carries_h_c_over_wavelength():
+    np.testing.assert_allclose(PLANCK_TIMES_LIGHT / 1064.0, 1.8669e-19, rtol=1e-4)
+
+
+def test_the_default_changes_nothing_without_a_key(precision):
+    energy = jnp.array([[0.0, 1e-17, 3e-12], [1e-30, 1e-18, 1.0]])
+    np.testing.assert_array_equal(record(energy, WAVELENGTH, Receiver()), energy)
+
+
+@NARROW
+def test_shot_noise_is_poisson(precision):
+    """Means below the sampler's change of method at 10, above it, and where the normal takes over."""
+    photons = np.array([[0.3, 4.0, 40.0, 900.0, 3e6], [2.0, 12.0, 150.0, 5e4, 2e9]])
+    got = draws(jnp.asarray(photons * PHOTON[:, None]), Receiver(), 4000) / PHOTON[:, None]
+    mean, variance = z_scores(got, photons)
+    assert mean < Z_LIMIT
+    assert variance < Z_LIMIT
+    small = photons < 1e4
+    np.testing.assert_allclose(got[:, small], np.round(got[:, small]), atol=2e-3)
+
+
+def test_planted_wrong_noise_is_rejected():
+    photons = np.array([[4.0, 40.0], [12.0, 150.0]])
+    energy = jnp.asarray(photons * PHOTON[:, None])
+    got = draws(energy, Receiver(), 4000) / PHOTON[:, None]
+    assert z_scores(got, 1.03 * photons)[0] > Z_LIMIT
+    swapped = draws(energy, Receiver(), 4000) / PHOTON[::-1, None]  # the photon energies exchanged
+    assert z_scores(swapped, photons * PHOTON[:, None] / PHOTON[::-1, None])[1] > Z_LIMIT
+
+
+@NARROW
+def test_background_is_recorded_and_is_noisy(precision):
+    receiver = Receiver(background=20 * PHOTON[1])
+    energy = jnp.zeros((2, 3))
+    np.testing.assert_allclose(record(energy, WAVELENGTH, receiver), 20 * PHOTON[1], rtol=1e-6)
+    got = draws(energy, receiver, 3000) / PHOTON[:, None]
+    assert max(z_scores(got, np.broadcast_to([[10.0], [20.0]], (2, 3)))) < Z_LIMIT
+
+
+def test_photon_noise_can_be_left_out_and_electronic_noise_is_normal(precision):
+    quiet = Receiver(photon_noise=False)
+    energy = jnp.full((2, 4), 1e-17)
+    np.testing.assert_array_equal(record(energy, WAVELENGTH, quiet, key=jax.random.key(1)), energy)
+    got = draws(energy, Receiver(photon_noise=False, electronic_noise=3e-18), 4000)
+    z = (got - 1e-17) / 3e-18
+    assert np.abs(z.mean(0)).max() * np.sqrt(4000) < Z_LIMIT
+    assert np.abs(z.var(0) - 1).max() * np.sqrt(4000 / 2) < Z_LIMIT
+    assert np.abs(np.mean(z**4) - 3) * np.sqrt(8 * 4000 / 96) < Z_LIMIT
+
+
+def test_energies_below_detection_are_lost(precision):
+    energy = jnp.array([[1e-18, 2e-18, 3e-18]])
+    got = record(energy, 1064.0, Receiver(detection_threshold=2e-18))
+    np.testing.assert_allclose(got, [[0.0, 2e-18, 3e-18]], rtol=1e-6)
+    noisy = Receiver(photon_noise=False, electronic_noise=1e-18)
+    assert draws(jnp.zeros((2, 50)), noisy, 2).min() < 0  # at no threshold nothing is lost
+
+
+def test_saturation_clips(precision):
+    got = record(jnp.array([[1.0, 5.0]]), 1064.0, Receiver(saturation=2.0))
+    np.testing.assert_array_equal(got, [[1.0, 2.0]])
+
+
+def test_quantisation_is_to_the_nearest_level_and_transparent_to_derivatives(precision):
+    receiver = Receiver(saturation=7.0, bits=3)
+    energy = jnp.array([[0.4, 0.6, 3.2, 6.9, 9.0]])
+    np.testing.assert_array_equal(record(energy, 1064.0, receiver), [[0.0, 1.0, 3.0, 7.0, 7.0]])
+    slope = jax.grad(lambda e: jnp.sum(record(e, 1064.0, receiver)))(energy)
+    np.testing.assert_array_equal(slope, [[1.0, 1.0, 1.0, 1.0, 0.0]])
+    noisy = Receiver(saturation=7.0, bits=3, photon_noise=False, electronic_noise=2.0)
+    levels = draws(jnp.zeros((2, 50)), noisy, 2)
+    assert set(np.unique(levels)) <= set(np.arange(8.0))
+
+
+def test_derivative_through_a_realisation_is_finite():
+    receiver = Receiver(background=1e-18, electronic_noise=1e-18)
+    energy = jnp.array([[0.0, 1e-17, 1e-10]])
+    slope = jax.grad(lambda e: jnp.sum(record(e, 1064.0, receiver, key=jax.random.key(0))))(energy)
+    assert np.all(np.isfinite(slope))
+
+
+def test_leading_axes_pass_through():
+    energy = jnp.ones((3, 2, 5)) * 1e-16
+    assert record(energy, WAVELENGTH, Receiver(bits=8, saturation=1e-15), key=jax.random.key(0)).shape == (
+        3,
+        2,
+        5,
+    )
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"detection_threshold": -1.0}, "detection_threshold = -1"),
+        ({"saturation": 0.0}, r"saturation = 0 .*\(0, inf\)"),
+        ({"bits": 0, "saturation": 1.0}, r"bits = 0 .*\[1, 24\]"),
+        ({"bits": 25, "saturation": 1.0}, "bits = 25"),
+        ({"bits": 8}, "bits = 8 needs a saturation"),
+        ({"background": np.nan}, "background = nan"),
+        ({"electronic_noise": -1e-20}, "electronic_noise = -1e-20"),
+        ({"window": "last return"}, "window = 'last return' is none of 'fixed', 'first return'"),
+    ],
+)
+def test_inadmissible_input_is_refused(fields, message):
+    with pytest.raises(ValueError, match=message):
+        Receiver(**fields)
+
+
+def fine_record():
+    time = np.arange(-5.0, 35.0, 0.1) + 0.05
+    echo = lambda centre: np.exp(-0.5 * ((time - centre) / 0.4) ** 2) * (np.abs(time - centre) < 2)  # noqa: E731
+    return time, np.stack([echo(3.3) + 2 * echo(14.1), 0.5 * echo(14.1)])
+
+
+@pytest.mark.parametrize("interval", [0.1, 1.0, 2.5, 0.73, 0.03, 100.0])
+def test_first_return_window_conserves_energy_and_opens_at_the_first_return(interval, precision):
+    time, energy = fine_record()
+    new_time, new = map(np.asarray, first_return_window(time, jnp.asarray(energy), interval))
+    assert new.shape == (2, new_time.size)
+    np.testing.assert_allclose(new.sum(-1), energy.sum(-1), rtol=1e-5)
+    opening = time[np.argmax(energy[0] > 0)] - 0.05
+    np.testing.assert_allclose(new_time[0] - interval / 2, opening, atol=1e-5)
+    np.testing.assert_allclose(np.diff(new_time), interval, rtol=1e-3)
+    centroid = (energy * time).sum(-1) / energy.sum(-1)
+    np.testing.assert_allclose((new * new_time).sum(-1) / new.sum(-1), centroid, atol=0.5 * interval + 1e-4)
+    if interval == 1.0:
+        first = round((opening + 5.0) / 0.1)
+        by_hand = energy[:, first : first + 10].sum(-1)
+        np.testing.assert_allclose(new[:, 0], by_hand, rtol=1e-4)
+
+
+def test_first_return_window_has_a_threshold():
+    time, energy = fine_record()
+    new_time, new = first_return_window(time, jnp.asarray(energy), 1.0, threshold=1.5)
+    opening = time[np.argmax(energy[0] > 1.5)] - 0.05
+    np.testing.assert_allclose(new_time[0] - 0.5, opening, atol=1e-5)
+    assert np.all(np.asarray(new.sum(-1)) < energy.sum(-1))
+    np.testing.assert_allclose(first_return_window(time, jnp.zeros((1, 400)), 1.0)[0][0], -4.5, atol=1e-5)
+
+
+def test_first_return_window_raises_a_peak_that_fixed_bins_split():
+    """The paper's artefact: an echo of one bin's length at every position against fixed bins."""
+    time = np.arange(0.0, 20.0, 0.1) + 0.05
+    peaks = []
+    for start in np.arange(5.0, 6.0, 0.1):
+        energy = np.where((time > start) & (time < start + 1.0), 0.1, 0.0)[None]
+        fixed = energy.reshape(1, 20, 10).sum(-1).max()
+        opened = float(first_return_window(time, jnp.asarray(energy), 1.0)[1].max())
+        np.testing.assert_allclose(opened, 1.0, rtol=1e-5)
+        peaks.append(fixed)
+    assert np.mean(peaks) < 0.8
+
+
+def test_first_return_window_is_differentiable_under_jit():
+    time, energy = fine_record()
+    total = jax.jit(jax.grad(lambda e: jnp.sum(first_return_window(time, e, 0.7)[1])))
+    first = int(np.argmax(energy[0] > 0))
+    np.testing.assert_allclose(total(jnp.asarray(energy))[:, first:], 1.0, rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("time", "interval", "message"),
+    [
+        (np.arange(4.0), 0.0, "interval = 0"),
+        (np.array([0.0, 1.0, 3.0, 4.0]), 1.0, "time has a step of 2"),
+        (np.array([3.0, 2.0, 1.0, 0.0]), 1.0, "time has a step of -1"),
+        (np.arange(3.0), 1.0, r"time has shape \(3,\)"),
+    ],
+)
+def test_first_return_window_refuses(time, interval, message):
+    with pytest.raises(ValueError, match=message):
+        first_return_window(time, jnp.ones((1, 4)), interval)

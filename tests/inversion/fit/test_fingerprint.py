@@ -1,0 +1,305 @@
+"""Checkpoints: a file goes on with its own problem alone, and another is told by what differs."""
+
+import dataclasses
+import importlib
+import shutil
+import sys
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+import scipy.special
+
+import inversion
+import jaxlidar as jl
+from inversion import LogNormal, Unknown
+from jaxlidar._fingerprint import digest_of
+from jaxlidar.optics.coefficients import Coefficients, shipped
+
+TIME = np.arange(-60.0, 21.0)
+VOXELS = jl.VoxelMap.from_lad(np.full((1, 1, 3), 0.3), voxel_size=(9.0, 9.0, 1.0), origin=(-4.5, -4.5, 2.0))
+SCENE = jl.Scene(
+    canopy=jl.Canopy(VOXELS, leaf=jl.Prospect(), sides="periodic"), ground=jl.Ground(reflectance=0.3)
+)
+LIDAR = jl.Lidar(wavelength=(532.0, 1064.0))
+# What `brightened` depends on beside its own code.
+GAIN = 1.0
+
+
+def brightened(scene, value):
+    return eqx.tree_at(lambda s: s.ground.reflectance, scene, GAIN * value)
+
+
+def brightened_otherwise(scene, value):
+    return eqx.tree_at(lambda s: s.ground.reflectance, scene, GAIN * value**2)
+
+
+def brightening(gain):
+    return lambda scene, value: eqx.tree_at(lambda s: s.ground.reflectance, scene, gain * value)
+
+
+def unknowns(height=None, apply=brightened):
+    """The unknowns of the problem, with other fields of the height, and another function, where given."""
+    return [
+        Unknown(**({"where": "ground.height", "bounds": (-2.0, 2.0), "name": "height"} | (height or {}))),
+        Unknown(apply=apply, bounds=(0.0, 1.0), name="brightness", start=0.3),
+        Unknown("canopy.leaf.Cab", bounds=(5.0, 100.0), prior=(40.0, 10.0), name="Cab"),
+    ]
+
+
+PROBLEM = {
+    "observed": np.ones((2, 2, TIME.size)),
+    "lidar": LIDAR,
+    "scene": SCENE,
+    "unknowns": unknowns(),
+    "noise": 0.1,
+    "time": TIME,
+    "key": jax.random.key(0),
+    "n_photons": 512,
+    "n_rays": 64,
+    "max_orders": 2,
+}
+
+
+class SimulationBegunError(Exception):
+    """The file was taken, and the work began."""
+
+
+def begin(**problem):
+    """Run a problem up to its first simulation; whether it came so far."""
+
+    def simulator(*_):
+        raise SimulationBegunError
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("inversion.fit.job.Simulator", simulator)
+        try:
+            inversion.retrieve_many(**problem)
+        except SimulationBegunError:
+            return True
+
+
+@pytest.fixture(scope="module")
+def begun(tmp_path_factory):
+    """A file of the problem, without fits."""
+    path = tmp_path_factory.mktemp("begun") / "fits.sqlite"
+    assert begin(**PROBLEM, path=path)
+    return path
+
+
+@pytest.fixture
+def begins(begun, tmp_path):
+    """Goes on with the problem, changed in some arguments, in a copy of the file."""
+    path = shutil.copy(begun, tmp_path)
+    return lambda **changes: begin(**PROBLEM | {"path": path} | changes)
+
+
+def lidar(**changes):
+    return {"lidar": dataclasses.replace(LIDAR, **changes)}
+
+
+def canopy(**changes):
+    return {"scene": dataclasses.replace(SCENE, canopy=dataclasses.replace(SCENE.canopy, **changes))}
+
+
+def ground(**changes):
+    return {"scene": dataclasses.replace(SCENE, ground=dataclasses.replace(SCENE.ground, **changes))}
+
+
+def height(**changes):
+    return {"unknowns": unknowns(height=changes)}
+
+
+def other_plan():
+    return jl.plan(LIDAR, SCENE, max_orders=2, n_photons=64, n_rays=8, window=(-60.0, 20.0), bin_width=0.25)
+
+
+CHANGES = [
+    ("observed", {"observed": np.where(np.arange(TIME.size) == 7, 1.001, PROBLEM["observed"])}),
+    ("observed", {"observed": np.ones((3, 2, TIME.size))}),
+    ("noise", {"noise": 0.101}),
+    ("time", {"time": TIME + 0.25}),
+    ("noise_floor", {"noise_floor": 0.01}),
+    ("lidar", lidar(pulse=jl.GaussianPulse(fwhm=6.001))),
+    ("lidar", lidar(pulse=jl.SampledPulse(time=np.arange(-9.0, 10.0), power=np.hanning(19)))),
+    ("lidar", lidar(altitude=1001.0)),
+    ("lidar", lidar(wavelength=np.array([532.0, 1065.0]))),
+    ("lidar", lidar(profile="top-hat")),
+    ("lidar", lidar(receiver=jl.Receiver(photon_noise=False))),
+    ("lidar", {"lidar": [LIDAR, dataclasses.replace(LIDAR, altitude=900.0)]}),
+    ("scene", ground(slope=5.0)),
+    ("scene", ground(reflectance=0.31)),
+    ("scene", canopy(hotspot=True)),
+    ("scene", canopy(leaf=jl.Prospect(version="5"))),
+    ("scene", ground(law=jl.EqualAngle())),
+    ("unknowns", {"unknowns": unknowns()[::-1]}),
+    ("unknowns", {"unknowns": unknowns()[:2]}),
+    ("unknowns", height(name="z")),
+    ("place of 'height'", height(where="ground.slope", bounds=(-2.0, 2.0))),
+    ("bounds of 'height'", height(bounds=(-2.0, 2.1))),
+    ("prior of 'height'", height(prior=(0.0, 1.0))),
+    ("start of 'height'", height(start=0.1)),
+    ("start of 'height'", {"start": {"height": np.array([0.0, 0.1])}}),
+    ("place of 'brightness'", {"unknowns": unknowns(apply=brightened_otherwise)}),
+    ("place of 'brightness'", {"unknowns": unknowns(apply=brightening(1.0))}),
+    ("scale", {"scale": (0.5, 2.0)}),
+    ("key", {"key": jax.random.key(1)}),
+    ("key", {"key": jax.random.key(0, impl="rbg")}),
+    ("solver", {"solver": optx.LevenbergMarquardt(rtol=1e-4, atol=1e-3)}),
+    ("solver", {"solver": optx.GaussNewton(rtol=1e-3, atol=1e-3)}),
+    ("max_steps", {"max_steps": 49}),
+    ("starts", {"starts": 2}),
+    ("n_photons", {"n_photons": 1024}),
+    ("n_rays", {"n_rays": 128}),
+    ("max_orders", {"max_orders": 3}),
+    ("plan", {"plan": other_plan(), "n_photons": None, "n_rays": None, "max_orders": None}),
+]
+
+
+@pytest.mark.parametrize(("part", "change"), CHANGES)
+def test_another_problem_is_refused_and_what_differs_is_named(begins, tmp_path, part, change):
+    before = (tmp_path / "fits.sqlite").read_bytes()
+    with pytest.raises(ValueError, match=rf"fits\.sqlite keeps fits of another problem; .*: .*\b{part}"):
+        begins(**change)
+    assert (tmp_path / "fits.sqlite").read_bytes() == before
+
+
+def test_only_what_differs_is_named(begins):
+    with pytest.raises(ValueError, match=r"what differs: bounds of 'height', key$"):
+        begins(key=jax.random.key(1), **height(bounds=(-3.0, 2.0)))
+
+
+def test_the_kind_of_prior_and_the_scale_count(begins, tmp_path):
+    path = tmp_path / "prior.sqlite"
+    normal = {"bounds": (0.0, 2.0), "start": 1.0, "prior": (1.0, 0.5)}
+    assert begins(path=path, scale=(0.5, 2.0), **height(**normal))
+    with pytest.raises(ValueError, match=r"what differs: prior of 'height'$"):
+        begins(path=path, scale=(0.5, 2.0), **height(**normal | {"prior": LogNormal(1.0, 0.5)}))
+    with pytest.raises(ValueError, match=r"what differs: scale$"):
+        begins(path=path, scale=(0.5, 2.1), **height(**normal))
+
+
+def test_coefficients_of_leaves_count(begins, tmp_path):
+    path, table = tmp_path / "leaf.sqlite", shipped("PC")
+
+    def leaf(factor):
+        absorption = table.absorption * np.where(np.arange(len(table.wavelength)) == 700, factor, 1.0)
+        coefficients = Coefficients(table.wavelength, table.index, absorption, table.traits)
+        return canopy(leaf=jl.Prospect(version="PRO", coefficients=coefficients))
+
+    assert begins(path=path, **leaf(1.001))
+    assert begins(path=path, **leaf(1.001))
+    with pytest.raises(ValueError, match=r"what differs: scene$"):
+        begins(path=path, **leaf(1.002))
+
+
+def test_functions_are_told_by_what_they_use(begins, tmp_path, monkeypatch):
+    path = tmp_path / "closure.sqlite"
+    assert begins(path=path, unknowns=unknowns(apply=brightening(2.0)))
+    assert begins(path=path, unknowns=unknowns(apply=brightening(2.0)))
+    with pytest.raises(ValueError, match=r"what differs: place of 'brightness'$"):
+        begins(path=path, unknowns=unknowns(apply=brightening(3.0)))
+    monkeypatch.setitem(globals(), "GAIN", 2.0)
+    with pytest.raises(ValueError, match=r"what differs: place of 'brightness'$"):
+        begins()
+    with (tmp_path / "open").open("w") as file:
+        said = "place of 'brightness' cannot be compared .*: the content of a TextIOWrapper is not known"
+        with pytest.raises(TypeError, match=said):
+            begins(unknowns=unknowns(apply=lambda s, value: brightened(s, value * file.writable())))
+
+
+def test_releases_and_settings_count(begins, monkeypatch):
+    with jax.enable_x64(True), pytest.raises(ValueError, match=r"what differs: .*jax_enable_x64"):
+        begins()
+    monkeypatch.setattr("importlib.metadata.version", lambda name: "0.0.1" if name == "jax" else "1.0")
+    with pytest.raises(ValueError, match=r"what differs: .*\bversion of jax\b"):
+        begins()
+
+
+def test_what_changes_no_result_is_accepted(begins):
+    assert begins()
+    assert begins(lanes=1)
+    assert begins(progress=print)
+    assert begins(noise=np.full((2, 2, TIME.size), 0.1), time=TIME.tolist(), starts=1.0)
+    assert begins(unknowns=unknowns(height={"where": lambda s: s.ground.height}))
+    assert begins(**lidar(receiver=jl.Receiver(window="first return")))
+    assert begins(scene=jax.tree.map(lambda a: a.copy(), SCENE))
+    # The same number in each of eight batches.
+    assert begins(n_photons=513)
+
+
+class Law(eqx.Module):
+    """One of its own."""
+
+    strength: jax.Array = eqx.field(converter=jnp.asarray)
+    LIMIT = 2.0
+
+    def __call__(self, x):
+        return self.deeper(x) * self.LIMIT
+
+    def deeper(self, x):
+        return Law(self.strength) if x is None else GAIN * x
+
+
+def test_laws_of_ones_own_are_told_by_their_code(monkeypatch):
+    first = digest_of(Law(1.0))
+    assert digest_of(Law(1.0)) == first
+    changed = [digest_of(Law(2.0))]
+    monkeypatch.setattr(Law, "LIMIT", 3.0)
+    changed.append(digest_of(Law(1.0)))
+    monkeypatch.undo()
+    monkeypatch.setitem(globals(), "GAIN", 2.0)
+    changed.append(digest_of(Law(1.0)))
+    monkeypatch.undo()
+    monkeypatch.setattr(Law, "deeper", lambda self, x: x)
+    changed.append(digest_of(Law(1.0)))
+    monkeypatch.undo()
+    assert digest_of(Law(1.0)) == first
+    assert len({first, *changed}) == 5
+
+
+def squared(derivative):
+    """A function with a rule of one's own for its derivative."""
+
+    @eqx.filter_custom_jvp
+    def f(x):
+        return x**2
+
+    @f.def_jvp
+    def rule(primals, tangents):
+        return primals[0] ** 2, derivative * primals[0] * tangents[0]
+
+    return f
+
+
+def test_rules_for_derivatives_count():
+    assert digest_of(squared(2.0)) == digest_of(squared(2.0)) != digest_of(squared(2.1))
+
+
+def test_modules_of_ones_own_are_told_by_their_file(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    digests = []
+    for line in ("double = lambda x: 2 * x", "double = lambda x: 2 * x", "double = lambda x: 3 * x"):
+        (tmp_path / "my_helpers.py").write_text(line)
+        importlib.invalidate_caches()
+        monkeypatch.delitem(sys.modules, "my_helpers", raising=False)
+        digests.append(digest_of(importlib.import_module("my_helpers")))
+    assert digests[0] == digests[1] != digests[2]
+
+
+def test_what_packages_define_is_told_by_name():
+    for x in (
+        np.exp,
+        jnp.exp,
+        jnp.add,
+        np.linalg.norm,
+        jax.nn.relu,
+        optx.max_norm,
+        eqx.nn.MLP,
+        scipy.special.expit,
+    ):
+        assert digest_of(x) == digest_of(x)
+    assert digest_of(np.exp) != digest_of(np.sin)

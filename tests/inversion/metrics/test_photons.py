@@ -1,0 +1,139 @@
+"""Ground and canopy from photon events, against the scene that they were drawn of."""
+
+from types import SimpleNamespace
+
+import jax
+import numpy as np
+import pytest
+
+import inversion
+import jaxlidar as jl
+from inversion.metrics import photons
+from jaxlidar._constants import PLANCK_TIMES_LIGHT
+
+BASE, TOP = 5.0, 15.0  # m above ground: an even canopy
+SHOTS = 286
+DISTANCE = 0.7 * np.arange(SHOTS)
+
+
+def track(slope, ground=2.0, canopy=2.0):
+    """What `record` needs of waveforms along 200 m, with so many photons of each per pulse."""
+    height = np.arange(60.0, -30.0, -0.1)
+    above = height - 3.0 - np.tan(np.deg2rad(slope)) * (DISTANCE[:, None] - 100.0)
+    echo = np.exp(-0.5 * (above / 0.15) ** 2)
+    layer = ((above > BASE) & (above < TOP)).astype(float)
+    photons = sum(n * part / part.sum(axis=1, keepdims=True) for n, part in ((ground, echo), (canopy, layer)))
+    return SimpleNamespace(
+        time=-2.0 * height / jl.SPEED_OF_LIGHT,
+        wavelength=np.array([532.0]),
+        energy=photons[:, None] * PLANCK_TIMES_LIGHT / 532.0,
+        zenith=np.zeros(SHOTS),
+    )
+
+
+def events_of(wave, rate, seed=0):
+    counter = jl.PhotonCounter(background_rate=rate, window=(-1000.0, 1000.0))
+    return jl.record(wave, receiver=counter, mode="photons", key=jax.random.key(seed))
+
+
+def errors(slope, rate, **given):
+    """Errors of ground and of canopy, over segments and draws, and the purity and recall of signal."""
+    ground, canopy, told = [], [], []
+    wave = track(slope)
+    for seed in range(4):
+        events = events_of(wave, rate, seed)
+        found = inversion.photon_ground_and_canopy(events, DISTANCE, **given)
+        ground.append(found.ground - 3.0 - np.tan(np.deg2rad(slope)) * (found.distance - 100.0))
+        canopy.append(found.canopy - (BASE + 0.98 * (TOP - BASE)))
+        told.append((events.signal[found.label > 0].mean(), (found.label > 0)[events.signal].mean()))
+    return np.concatenate(ground), np.concatenate(canopy), np.mean(told, axis=0)
+
+
+def rms(x):
+    return np.sqrt(np.mean(x**2))
+
+
+@pytest.mark.parametrize("slope", [0.0, 15.0])
+@pytest.mark.parametrize("rate", [1e5, 1e6, 5e6])
+def test_ground_and_canopy_are_found_by_night_and_by_day(slope, rate):
+    ground, canopy, (purity, recall) = errors(slope, rate)
+    assert abs(ground.mean()) < 0.05
+    assert rms(ground) < 0.15
+    assert abs(canopy.mean()) < 0.5
+    assert rms(canopy) < 1.0
+    assert purity > 0.8
+    assert recall > 0.95
+
+
+def test_without_telling_noise_the_canopy_is_missed(monkeypatch):
+    monkeypatch.setattr(photons, "_neighbours", lambda x, z: np.full(x.size, np.inf))
+    _, canopy, (purity, _) = errors(0.0, 5e6)
+    assert not np.any(np.abs(canopy) < 5.0)
+    assert purity < 0.6
+
+
+def test_the_background_is_found_in_the_record():
+    for rate in (1e5, 1e6, 5e6):
+        events = events_of(track(10.0), rate)
+        told, found = (
+            inversion.photon_ground_and_canopy(events, DISTANCE, background_rate=r).label > 0
+            for r in (rate, None)
+        )
+        assert np.mean(told == found) > 0.97
+    none = inversion.photon_ground_and_canopy(events, DISTANCE, background_rate=0.0)
+    assert (none.label[~events.signal] > 0).mean() > 0.7
+
+
+def test_too_few_photons_are_nan():
+    bare = inversion.photon_ground_and_canopy(events_of(track(0.0, canopy=0.0), 1e5), DISTANCE)
+    assert np.all(np.abs(bare.ground - 3.0) < 0.1)
+    assert np.all(np.isnan(bare.canopy))
+    assert set(bare.label) <= {0, 1, 3}
+    dark = events_of(track(0.0, 0.0, 0.0), 0.0)
+    noise = events_of(track(0.0, 0.0, 0.0), 2e6)
+    for events in (dark, noise):
+        found = inversion.photon_ground_and_canopy(events, DISTANCE)
+        assert np.isnan(found.ground).mean() > 0.8
+        assert found.label.shape == (len(events),)
+    # A gap of half the track has no ground, and leaves the other half alone.
+    wave = track(0.0)
+    wave.energy[SHOTS // 2 :] = 0.0
+    half = inversion.photon_ground_and_canopy(events_of(wave, 1e5), DISTANCE)
+    assert np.all(np.abs(half.ground[:4] - 3.0) < 0.2)
+    assert np.all(np.isnan(half.ground[6:]))
+    assert np.all(np.isnan(half.slope) == np.isnan(half.ground))
+
+
+def test_segments_and_percentiles():
+    events = events_of(track(0.0), 1e5)
+    coarse = inversion.photon_ground_and_canopy(events, DISTANCE, segment=100.0, percentile=50.0)
+    np.testing.assert_allclose(coarse.distance, [50.0, 150.0])
+    np.testing.assert_allclose(coarse.canopy, 10.0, atol=0.7)
+    again = inversion.photon_ground_and_canopy(events, DISTANCE, segment=100.0, percentile=50.0)
+    assert all(np.array_equal(a, b) for a, b in zip(coarse, again))
+
+
+def test_percentiles_are_those_of_numpy():
+    random = np.random.default_rng(0)
+    z, number = random.normal(size=200), random.integers(0, 7, 200)
+    got = photons._percentiles(z, number, 9, 98.0, 2)
+    for i in range(7):
+        np.testing.assert_allclose(got[i], np.percentile(z[number == i], 98.0))
+    assert np.all(np.isnan(got[7:]))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"distance": DISTANCE[1:]}, r"distance has shape \(285,\); admissible is one for each of the 286"),
+        ({"distance": np.zeros(SHOTS)}, "which do not all lie at one place"),
+        ({"segment": 0.0}, r"segment = 0 .*\(0, inf\)"),
+        ({"percentile": 101.0}, r"percentile = 101 .*\[0, 100\]"),
+        ({"background_rate": -1.0}, "background_rate = -1"),
+        ({"least": 1}, "least = 1"),
+    ],
+)
+def test_inadmissible_arguments_are_refused(arguments, message):
+    events = events_of(track(0.0), 0.0)
+    with pytest.raises(ValueError, match=message):
+        inversion.photon_ground_and_canopy(events, **{"distance": DISTANCE, **arguments})

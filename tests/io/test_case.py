@@ -1,0 +1,388 @@
+"""Cases as TOML: the round trip is exact for every class; what makes no sense is refused with its place."""
+
+import dataclasses
+import inspect
+import shutil
+import tomllib
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jaxtyping import Array, Float
+
+import jaxlidar as jl
+from jaxlidar.io.kinds import UNITS, UNITS_OF, arguments_of, kinds
+from jaxlidar.optics.coefficients import shipped
+
+SCENES = sorted((Path(__file__).resolve().parents[2] / "examples" / "scenes").glob("*.toml"))
+RANDOM = np.random.default_rng(0)
+SPECTRUM = jl.Spectrum([400.0, 1000.1, 2400.0], [0.1, 1 / 3, 0.4], name="none", scale=0.7)
+MAP = jl.VoxelMap(RANDOM.random((2, 3, 4)), RANDOM.random((2, 3, 4)) / 9, (0.1, 0.2, 1 / 3), (-0.1, 1e-9, 3))
+ANGLED = jl.VoxelMap.from_lad(RANDOM.random((1, 1, 2)), voxel_size=0.7, leaf_angles="planophile")
+
+
+def with_ground(**fields):
+    return jl.Scene(ground=jl.Ground(**fields))
+
+
+def with_leaf(leaf, **fields):
+    return jl.Scene(canopy=jl.Canopy(ANGLED, leaf=leaf, **fields))
+
+
+def pro():
+    table = shipped("PC")
+    return jl.Prospect(N=1.7, Cp=1 / 900, Cc=0.005, version="PRO", coefficients=table)
+
+
+# One or more of every class, none at its defaults.
+PARTS = {
+    "Lidar": jl.Lidar(
+        wavelength=(532.1, 1064.0), altitude=1 / 3e-4, energy=(1e-3, 2e-4), position=(0.1, -0.0), zenith=7.7,
+        profile="top-hat", field_of_view=0.7, efficiency=0.3, jitter=0.123456789, azimuth=-1e-8,
+    ),
+    "Receiver": jl.Lidar(receiver=jl.Receiver(1e-17, 3e-15, 8, 1e-18, False, 2e-18, "first return")),
+    "GaussianPulse": jl.Lidar(pulse=jl.GaussianPulse(fwhm=0.1 + 0.2)),
+    "RectangularPulse": jl.Lidar(pulse=jl.RectangularPulse(length=1e-3 / 7)),
+    "ExponentiallyModifiedGaussianPulse": jl.Lidar(pulse=jl.ExponentiallyModifiedGaussianPulse(1.1, 2 / 3)),
+    "SampledPulse": jl.Lidar(pulse=jl.SampledPulse([0.0, 0.3, 1.0], [1.0, 1 / 7, 0.0])),
+    "SampledPulse, long": jl.Lidar(pulse=jl.SampledPulse(np.arange(200.0) / 7, RANDOM.random(200))),
+    "Scene": jl.Scene(),
+    "Ground": with_ground(height=1 / 3, reflectance=(0.1, 0.2), slope=89.9, aspect=-720.1),
+    "Plate": jl.Scene(plates=[jl.Plate(1.1, 0.2, 0.3), jl.Plate(2.2, [0.1], 0.0, 0.5, 1.0, 2.0, "diffuse")]),
+    "Terrain": jl.Scene(ground=jl.Terrain(
+        RANDOM.random((3, 2)), (0.7, 1 / 3), (4e6 / 7, 1e-9), RANDOM.random((3, 2)), sides="periodic",
+        relief=False,
+    )),
+    "Survey": jl.Survey(
+        jl.Lidar(altitude=1 / 3e-4), 6e5 + RANDOM.random((40, 2)), RANDOM.random(40), 1 / 3
+    ),
+    "EqualAngle": with_ground(law=jl.EqualAngle()),
+    "Lambertian": jl.Scene(plates=(jl.Plate(1.0, 0.1, law=jl.Lambertian()),)),
+    "Specular": with_ground(law=jl.Specular(roughness=0.0123)),
+    "Atmosphere": jl.Scene(atmosphere=jl.Atmosphere(None, False, "kruse", 8000.1, 1200.2, 50.5, -1.0)),
+    "Spectrum": with_ground(reflectance=SPECTRUM),
+    "Spectrum, long": with_ground(reflectance=jl.spectrum("soil-medium")),
+    "Canopy": jl.Scene(canopy=jl.Canopy(MAP, jl.LeafOptics(0.4), SPECTRUM, "straight", True, "periodic")),
+    "VoxelMap": jl.Scene(canopy=jl.Canopy(MAP, jl.LeafOptics(0.4), 0.1)),
+    "LeafAngles": with_leaf(jl.LeafOptics(0.4, 0.3)),
+    "LeafOptics": with_leaf(jl.LeafOptics((0.4, 0.3), (0.1, 1 / 3))),
+    "Isotropic": with_leaf(jl.Isotropic((0.9, 1.0))),
+    "HenyeyGreenstein": with_leaf(jl.LeafOptics(0.1), bark=jl.HenyeyGreenstein(0.9, 1 / 3)),
+    "Prospect": with_leaf(jl.Prospect(N=1.1, Cab=1 / 3, version="5", alpha=39.123456789)),
+    "Coefficients": with_leaf(pro()),
+}  # fmt: skip
+
+
+def case_of(part, **more):
+    kinds = {jl.Lidar: "lidar", jl.Survey: "survey", jl.Scene: "scene"}
+    return jl.io.Case(**{kinds[type(part)]: part}, **more)
+
+
+def round_trip(case, tmp_path):
+    jl.io.write_case(tmp_path / "a.toml", case)
+    # Wherever the two files lie.
+    (tmp_path / "moved").mkdir()
+    for file in tmp_path.glob("a.*"):
+        shutil.move(file, tmp_path / "moved")
+    return jl.io.read_case(tmp_path / "moved" / "a.toml")
+
+
+def bits(tree):
+    return [
+        (np.asarray(leaf).dtype, np.shape(leaf), np.asarray(leaf).tobytes()) for leaf in jax.tree.leaves(tree)
+    ]
+
+
+def same(got, sent):
+    """Equal to the bit, static fields included."""
+    return jax.tree.structure(got) == jax.tree.structure(sent) and bits(got) == bits(sent)
+
+
+@pytest.mark.parametrize("x64", [False, True], ids=["float32", "float64"])
+@pytest.mark.parametrize("name", PARTS)
+def test_every_class_comes_back_to_the_bit(name, x64, tmp_path):
+    with jax.enable_x64(x64):
+        # Places are NumPy's, in double precision, as they are.
+        sent = jax.tree.map(
+            lambda x: jnp.asarray(x, float) / 1.0 if isinstance(x, jax.Array) else x, PARTS[name]
+        )
+        if x64:
+            sent = jax.tree.map(lambda x: x * (1 - 2**-50), sent)
+        back = round_trip(case_of(sent), tmp_path)
+        case = case_of(sent)
+        assert same((back.lidar, back.survey, back.scene), (case.lidar, case.survey, case.scene))
+
+
+def test_one_bit_is_noticed():
+    nearly = with_ground(height=np.nextafter(np.float32(1 / 3), np.float32(1)), reflectance=(0.1, 0.2))
+    assert not same(nearly, with_ground(height=1 / 3, reflectance=(0.1, 0.2)))
+
+
+def test_every_class_is_tried():
+    classes = {name for name, kind in kinds().items() if isinstance(kind, type)}
+    of_plants = {"Habit", "Branching"}
+    # Patterns of scans are no part of the survey that they make.
+    scans = {"Oscillating", "RotatingPolygon", "Conical"}
+    assert classes - of_plants - scans - {"Plane"} == {name.partition(",")[0] for name in PARTS}
+
+
+def numbers_of(kind):
+    for name, argument in arguments_of(kind).items():
+        said = str(argument.annotation)
+        if any(word in said for word in ("Float", "float", "ArrayLike", "Reflectance")):
+            yield name
+
+
+def test_every_quantity_has_a_unit_or_is_a_pure_number():
+    pure = {"N", "Cbrown", "albedo", "bits", "coverage", "efficiency", "g", "leaf", "bark", "probability"}
+    pure |= {"reflectance", "transmittance", "scale", "power", "index", "absorption", "leaf_angles", "fill"}
+    pure |= {"rtol", "atol", "n_photons", "n_rays", "lad", "upward", "foot", "a", "b"}
+    pure |= {"density", "shares", "size", "share", "exponent", "length_exponent", "bole", "twig", "beams"}
+    for name, kind in kinds().items():
+        for argument in numbers_of(kind):
+            known = argument in UNITS or (kind, argument) in UNITS_OF
+            assert known or argument in pure, f"{name}.{argument}"
+
+
+def test_a_case_comes_back_with_its_key_and_arguments(tmp_path):
+    arguments = {"rtol": 0.1, "effects": {"divergence": False}, "window": (-10.0, 1 / 3), "max_orders": 3}
+    sent = jl.io.Case(PARTS["Lidar"], PARTS["Canopy"], jax.random.split(jax.random.key(7))[1], arguments)
+    back = round_trip(sent, tmp_path)
+    assert dict(back.arguments) == arguments
+    assert back.key.dtype == sent.key.dtype
+    assert np.array_equal(jax.random.key_data(back.key), jax.random.key_data(sent.key))
+
+
+def test_keys_of_the_old_style_and_of_other_generators(tmp_path):
+    for number, key in enumerate((jax.random.PRNGKey(5), jax.random.key(3, impl="rbg"))):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        back = round_trip(jl.io.Case(key=key), folder).key
+        assert back.dtype == key.dtype
+        assert np.array_equal(jax.random.uniform(back), jax.random.uniform(key))
+
+
+@pytest.mark.parametrize("path", SCENES, ids=lambda p: p.stem)
+def test_the_shipped_cases_are_whole(path, tmp_path):
+    text = path.read_text()
+    if "voxelise" in text:
+        # Coarser trees, for speed.
+        (tmp_path / path.name).write_text(text.replace("voxel_size = 0.25", "voxel_size = 2.0"))
+        path = tmp_path / path.name
+    case = jl.io.read_case(path)
+    assert case.key is not None
+    plan = jl.plan(case.lidar, case.scene, max_orders=case.arguments.get("max_orders"), describe=False)
+    assert plan.n_samples > 1
+
+
+def test_a_case_simulates(tmp_path):
+    wave = jl.io.read_case(SCENES[[p.stem for p in SCENES].index("leaf_plate")]).simulate()
+    assert np.allclose(wave.reflectance.sum(axis=1), [0.36, 0.66, 0.57], rtol=1e-4)
+    with pytest.raises(ValueError, match="no lidar and no key"):
+        jl.io.Case(scene=jl.Scene()).simulate()
+
+
+def test_the_page_has_a_case_that_can_be_read(tmp_path):
+    page = (Path(jl.io.__file__).parent / "README.md").read_text()
+    (block,) = [part.partition("```")[0] for part in page.split("```toml\n")[1:]]
+    (tmp_path / "a.toml").write_text(block)
+    np.savez(tmp_path / "plot.npz", lad=np.full((2, 2, 3), 0.5))
+    case = jl.io.read_case(tmp_path / "a.toml")
+    assert case.scene.canopy.voxels.shape == (2, 2, 3)
+    assert isinstance(case.scene.ground.law, jl.EqualAngle)
+    assert set(tomllib.loads(block)) == {"lidar", "scene", "simulate"}
+    listed = page.partition("| functions |")[2]
+    functions = {name for name, kind in kinds().items() if not isinstance(kind, type)}
+    assert all(f"`{name}`" in listed for name in functions)
+
+
+class OwnLaw(jl.AbstractLaw):
+    k: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=1.0)
+
+    def view_factor(self, incident, normal, view, half_angle):
+        raise NotImplementedError
+
+    albedo = sample = density = largest_view_factor = view_factor
+
+
+class Lambertian(OwnLaw):
+    """Of the same name as one that jaxlidar has."""
+
+
+def own_leaf(wavelength):
+    return 0.4 + 0 * wavelength, 0.3 + 0 * wavelength
+
+
+@pytest.mark.parametrize(
+    ("scene", "says"),
+    [
+        (with_ground(law=OwnLaw()), "scene.ground.law is an OwnLaw, a class of your own: a file cannot hold"),
+        (with_ground(law=Lambertian()), "scene.ground.law is a Lambertian, a class of your own"),
+        (with_leaf(own_leaf), "scene.canopy.leaf is a function: a file cannot hold the code"),
+    ],
+)
+def test_what_is_ones_own_is_refused(scene, says, tmp_path):
+    with pytest.raises(TypeError, match=says):
+        jl.io.write_case(tmp_path / "a.toml", jl.io.Case(scene=scene))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("[scen.ground]", "scen is not known; the nearest is scene$"),
+        ("[lidar]\naltitud = 3", r"lidar.altitud is not known; the nearest is altitude"),
+        ("[lidar]\nwavelenght = 3", r"lidar.wavelenght is not known; the nearest is wavelength"),
+        ("[scene.ground]\nkind = 'Grund'", "scene.ground.kind = 'Grund' is no kind; the nearest is Ground"),
+        (
+            "[scene.ground]\nlaw = 'Lambertain'",
+            "scene.ground.law = 'Lambertain' is no kind; the nearest are Lam",
+        ),
+        ("[scene.ground]\nslope = 95", r"scene.ground: slope = 95 is outside the admissible range \[0, 90\)"),
+        (
+            "[scene.ground]\nslope = {kind = 'Lidar'}",
+            r"a.toml: scene.ground: ",
+        ),
+        ("[scene.ground]\nslope = 'steep'", "scene.ground.slope = 'steep' is no kind"),
+        ("[[scene.plates]]\nheight = 1", "scene.plates.0: reflectance of Plate is missing"),
+        ("[lidar.pulse]\nfwhm = 1", "lidar.pulse: kind is missing"),
+        ("[scene]\nkind = 'Lidar'", r"a.toml: "),
+        ("scene = 3", r"a.toml: "),
+        ("lidar = [", r"no TOML: Invalid value \(at"),
+        ("[simulate]\nrtoll = 3", "simulate.rtoll is not known; the nearest are rtol, atol"),
+        ("[simulate]\nplan = 3", "simulate.plan is not known"),
+        ("[simulate]\nseed = -1", r"simulate.seed = -1 is outside the admissible range \[0, 2147483647\]"),
+        ("[simulate]\nseed = 1\nkey = [0, 1]", "both seed and key"),
+        ("[simulate]\nkey = [0, -1]", r"simulate.key = \[0, -1\] is no row of whole numbers"),
+        ("[simulate]\nkey = [0, 1, 2]\nkey_kind = 'threefry2x32'", "is no key of the kind 'threefry2x32'"),
+        ("[simulate]\nkey = [0, 1]\nkey_kind = 'dice'", "is no key of the kind 'dice'"),
+        ("[lidar]\nwavelength = {array = 'a'}", "array = 'a' has no file"),
+        ("[lidar]\nwavelength = {file = 'b.npz', array = 'a'}", "b.npz: no such file"),
+        ("[lidar]\nwavelength = {file = 'b.npz', aray = 'a'}", "kind is missing"),
+        (
+            "[scene.ground]\nreflectance = {kind = 'spectrum', name = 'sol'}",
+            "name = 'sol' is no bundled spectrum",
+        ),
+        (
+            "[scene.ground]\nreflectance = {kind = 'read_spectrum_csv', path = 'no.csv'}",
+            "no.csv: no such file",
+        ),
+    ],
+)
+def test_what_makes_no_sense_is_refused_with_its_place(text, says, tmp_path):
+    path = tmp_path / "a.toml"
+    path.write_text(text)
+    with pytest.raises((ValueError, TypeError, FileNotFoundError), match=says) as refused:
+        jl.io.read_case(path)
+    assert str(tmp_path) in str(refused.value)
+
+
+def test_files_lie_relative_to_the_case(tmp_path, monkeypatch):
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / "soil.csv").write_text("400,0.1\n2400,0.4\n")
+    lines = ["VOXEL SPACE", "#min_corner:(0,0,0)", "#max_corner:(1,1,2)", "#split:(1,1,2)"]
+    lines += ["i j k PadBVTotal", "0 0 0 NaN", "0 0 1 1.5"]
+    (tmp_path / "data" / "plot.vox").write_text("\n".join(lines))
+    text = """
+    [scene.canopy]
+    leaf = {kind = "LeafOptics", reflectance = 0.4}
+    voxels = {kind = "read_vox", path = "data/plot.vox", fill = 0.0}
+    [scene.ground]
+    reflectance = {kind = "read_spectrum_csv", path = "data/soil.csv"}
+    """
+    (tmp_path / "a.toml").write_text(text)
+    monkeypatch.chdir("/")
+    scene = jl.io.read_case(tmp_path / "a.toml").scene
+    assert scene.canopy.voxels.leaf.tolist() == [[[0.0, 0.75]]]
+    assert scene.ground.reflectance.name == "soil"
+    (tmp_path / "a.toml").write_text(text.replace(", fill = 0.0", ""))
+    with pytest.raises(ValueError, match=r"1 without a density.*give fill"):
+        jl.io.read_case(tmp_path / "a.toml")
+
+
+def test_terrain_is_read_from_its_file_and_kept_in_numbers(tmp_path):
+    head = "ncols 2\nnrows 2\nxllcorner 600000\nyllcorner 5200000\ncellsize 10\n"
+    (tmp_path / "hill.asc").write_text(head + "7 8\n5 6\n")
+    (tmp_path / "a.toml").write_text(
+        "[scene.ground]\nkind = 'read_dem'\npath = 'hill.asc'\nreflectance = 0.2"
+    )
+    scene = jl.io.read_case(tmp_path / "a.toml").scene
+    assert scene.ground.heights.tolist() == [[5.0, 7.0], [6.0, 8.0]]
+    assert scene.ground.origin.tolist() == [600005.0, 5200005.0]
+    jl.io.write_case(tmp_path / "b.toml", jl.io.Case(scene=scene))
+    assert "# m" in next(x for x in (tmp_path / "b.toml").read_text().splitlines() if x.startswith("heights"))
+    assert eqx.tree_equal(jl.io.read_case(tmp_path / "b.toml").scene, scene)
+
+
+SURVEY = """
+[lidar]
+altitude = 500
+[survey]
+kind = "Survey.scan"
+pattern = {kind = "Conical", half_angle = 20.0, frequency = 40.0}
+start = [0, 0]
+end = [0, 10]
+speed = 50.0
+pulse_rate = 25.0
+[scene.ground]
+[simulate]
+seed = 0
+max_orders = 1
+"""
+
+
+def test_surveys_are_told_by_a_few_numbers(tmp_path):
+    (tmp_path / "a.toml").write_text(SURVEY)
+    case = jl.io.read_case(tmp_path / "a.toml")
+    line = {"start": (0, 0), "end": (0, 10), "speed": 50.0, "pulse_rate": 25.0}
+    scan = jl.Conical(half_angle=20.0, frequency=40.0)
+    assert same(case.survey, jl.Survey.scan(jl.Lidar(altitude=500.0), scan, **line))
+    many = case.simulate(path=tmp_path / "many.nc")
+    assert many.reflectance.shape[:2] == (6, 1)
+    assert len(jl.open(tmp_path / "many.nc")) == 6
+    with pytest.raises(ValueError, match=r"arguments\.atol is not known; the nearest"):
+        jl.io.Case(survey=case.survey, arguments={"atol": 0.1})
+    with pytest.raises(ValueError, match="the case has no scene and no key"):
+        jl.io.Case(survey=case.survey).simulate()
+    with pytest.raises(ValueError, match="without a survey"):
+        jl.io.Case(jl.Lidar(), case.scene, case.key).simulate(path=tmp_path / "one.nc")
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
+    path = tmp_path / "a.toml"
+    jl.io.write_case(path, jl.io.Case(jl.Lidar()))
+    old = path.read_text()
+
+    def full(self, *args, **kwargs):
+        raise OSError("full")
+
+    monkeypatch.setattr(Path, "write_text", full)
+    with pytest.raises(OSError, match="full"):
+        jl.io.write_case(path, jl.io.Case(jl.Lidar(altitude=1.0)))
+    monkeypatch.undo()
+    assert path.read_text() == old
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_inadmissible_cases_are_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"does not end in .toml"):
+        jl.io.write_case(tmp_path / "a.txt", jl.io.Case())
+    with pytest.raises(TypeError, match="lidar"):
+        jl.io.Case(jl.Scene())
+    with pytest.raises(ValueError, match=r"arguments.rtoll is not known; the nearest are rtol"):
+        jl.io.Case(arguments={"rtoll": 1})
+    with pytest.raises(TypeError, match="that JAX is tracing; a file can hold known numbers alone"):
+        jax.jit(lambda h: jl.io.write_case(tmp_path / "a.toml", jl.io.Case(scene=with_ground(height=h))))(1.0)
+
+
+def test_fields_are_written_with_their_units(tmp_path):
+    jl.io.write_case(tmp_path / "a.toml", jl.io.Case(jl.Lidar(), with_ground(slope=5.0)))
+    text = (tmp_path / "a.toml").read_text()
+    for line in ("wavelength = [1064.0] # nm", "divergence = 0.3 # mrad", "slope = 5.0 # degrees"):
+        assert line in text.splitlines()
+    fields = {f.name for f in dataclasses.fields(jl.Lidar)} - {"field_of_view"}
+    assert fields <= set(tomllib.loads(text)["lidar"])
+    assert set(inspect.signature(jl.Ground).parameters) <= set(tomllib.loads(text)["scene"]["ground"])

@@ -1,0 +1,374 @@
+"""Voxel maps, point clouds and tree models from files: recorded ones, and damaged ones refused by place."""
+
+import struct
+import sys
+
+import laspy
+import numpy as np
+import pytest
+
+from jaxlidar.io import read_las, read_qsm, read_vox
+from jaxlidar.optics.coefficients import load_coefficients
+from tests.fuzz.fuzz_kinds import small_cloud
+
+VOX = """VOXEL SPACE
+#min_corner: (0.0, 1.0, -0.5)
+#max_corner:(1.0, 3.0, 1.0)
+#split:(2, 2, 1)
+#lad_type:{angles}
+i j k ground_distance nbSampling PadBVTotal attenuation_FPL_unbiasedMLE
+0 0 0 0.5 10 1.5 0.7
+0 1 0 0.5 0 9.0 9.0
+1 0 0 -0.5 10 0.25 0.1
+1 1 0 0.5 10 NaN NaN
+"""
+
+
+@pytest.fixture
+def written(tmp_path):
+    """Writes a text file and gives its path."""
+
+    def write(text, name="map.txt"):
+        path = tmp_path / name
+        path.write_text(text)
+        return path
+
+    return write
+
+
+def vox(angles="Spherical"):
+    return VOX.format(angles=angles).replace("#min_corner: ", "#min_corner:")
+
+
+def test_a_vox_file(written):
+    voxels, dropped = read_vox(written(vox()))
+    assert dropped == {"not sampled": 1, "without a density": 1, "below the ground": 1}
+    np.testing.assert_allclose(voxels.leaf[:, :, 0], [[0.75, 0.0], [0.0, 0.0]])
+    np.testing.assert_allclose(voxels.voxel_size, [0.5, 1.0, 1.5])
+    np.testing.assert_allclose(voxels.origin, [0.0, 1.0, -0.5])
+    assert voxels.bark is None
+    assert voxels.leaf_angles is None
+
+
+def test_another_column_and_what_unsampled_voxels_hold(written):
+    voxels, _ = read_vox(written(vox()), density="attenuation_FPL_unbiasedMLE", fill=0.4)
+    np.testing.assert_allclose(voxels.leaf[:, :, 0], [[0.7, 0.2], [0.0, 0.2]], rtol=1e-6)
+    bark, _ = read_vox(written(vox()), name="bark")
+    assert bark.leaf is None
+    assert float(bark.bark[0, 0, 0]) == 0.75
+
+
+def test_leaf_angles_of_a_vox_file(written):
+    voxels, _ = read_vox(written(vox("Planophile")))
+    assert voxels.leaf_angles is not None
+
+
+def test_the_recorded_vox_file(shared):
+    path = shared / "voxels" / "amapvox_tls_sample.vox"
+    voxels, dropped = read_vox(path)
+    assert voxels.shape == (7, 6, 10)
+    assert sum(dropped.values()) == 0
+    rows = np.loadtxt(path, skiprows=13)
+    column = path.read_text().splitlines()[12].split().index("PadBVTotal")
+    assert 2 * float(voxels.leaf.sum()) == pytest.approx(rows[:, column].sum(), rel=1e-5)
+    i, j, k = rows[100, :3].astype(int)
+    assert 2 * float(voxels.leaf[i, j, k]) == pytest.approx(rows[100, column], rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (("VOXEL SPACE", "VOXELS"), r"map.txt: line 1: 'VOXEL SPACE' is missing"),
+        (("#split:(2, 2, 1)\n", ""), "the header has no #split"),
+        (("#split:(2, 2, 1)", "#split:(2, 2.5, 1)"), "line 4: split = .* no whole numbers"),
+        (("(1.0, 3.0, 1.0)", "(1.0, 0.5, 1.0)"), "line 3: max_corner"),
+        (("(1.0, 3.0, 1.0)", "(1.0, x, 1.0)"), "line 3: max_corner = 'x' is no number"),
+        (("PadBVTotal", "density"), "line 10: density = NaN|voxel"),
+        (("0 0 0 0.5 10 1.5 0.7", "0 0 0 0.5 10 1.5"), "line 7: 6 values; the header names 7"),
+        (("0 0 0 0.5 10 1.5 0.7", "0 0 0 0.5 10 -1.5 0.7"), r"line 7: PadBVTotal = -1.5 .*\[0, inf\)"),
+        (("0 0 0 0.5 10 1.5 0.7", "0 0 0 0.5 10 much 0.7"), "line 7: PadBVTotal = 'much' is no number"),
+        (("0 1 0 0.5", "0 2 0 0.5"), r"line 8: voxel \(0, 2, 0\) lies outside the grid \(2, 2, 1\)"),
+        (("0 1 0 0.5", "0 0 0 0.5"), r"line 8: voxel \(0, 0, 0\) is given a second time"),
+        (("1 1 0 0.5 10 NaN NaN\n", ""), "1 of 4 voxels are missing"),
+        (("Spherical", "Wild"), "line 5: .*Wild|line 5: .*wild"),
+        (
+            ("#split:(2, 2, 1)", "#split:(9999, 9999, 9999)"),
+            "line 10: 999700029995 of 999700029999 voxels are",
+        ),
+        (("#split:(2, 2, 1)", "#split:(inf, 2, 1)"), r"line 4: split = \(inf, 2, 1\) lies beyond 1e\+09"),
+        (("i j k ground_distance", "i j k i"), "line 6: 2 times the column i; there are i, j, k, i"),
+        (("(1.0, 3.0, 1.0)", "(1.0, 1e39, 1.0)"), r"line 3: max_corner = .* lies beyond 1e\+09"),
+        (("(1.0, 3.0, 1.0)", "(1e-50, 3.0, 1.0)"), "line 3: max_corner does not lie beyond min_corner"),
+        (("#split:(2, 2, 1)", "#split:(2, 2, 1)\n#split:(4, 1, 1)"), "line 5: #split was given in line 4"),
+        (("0 1 0 0.5", "0 1.7 0 0.5"), "line 8: j = '1.7' is no whole number"),
+        (("0 1 0 0.5", "0 inf 0 0.5"), "line 8: j = 'inf' is no whole number"),
+        (
+            ("0 0 0 0.5 10 1.5 0.7", "0 0 0 0.5 10 1e39 0.7"),
+            r"line 7: PadBVTotal = 1e\+39 .* of single precision",
+        ),
+    ],
+)
+def test_damaged_vox_files(written, change, says):
+    text = vox().replace(*change)
+    density = "nothing" if change[0] == "PadBVTotal" else None
+    if density:
+        says = "line 6: no column nothing; there are i, j, k"
+    with pytest.raises(ValueError, match=says):
+        read_vox(written(text), density=density)
+
+
+def test_other_names_of_plant_area_are_refused(written):
+    with pytest.raises(ValueError, match="name = 'wood' is none of 'leaf', 'bark'"):
+        read_vox(written(vox()), name="wood")
+    with pytest.raises(ValueError, match=r"fill = -1 .*\[0, inf\)"):
+        read_vox(written(vox()), fill=-1.0)
+
+
+QSM = """ID, parentID, startX, startY, startZ, endX, endY, endZ, radius, branchOrder
+5,-1,0,0,0,0,0,1,0.1,0
+9,7,0,0,1,0,1,2,0.05,1
+7,5,0,0,1,0,0,1,0.08,0
+8,5,0,0,1,1,0,2,0.06,1
+"""
+
+
+def test_a_tree_model(written):
+    tree, dropped = read_qsm(written(QSM))
+    assert dropped == {"without a length": 1}
+    assert len(tree.start) == 3
+    # A cylinder without length leaves its child to its parent.
+    np.testing.assert_array_equal(np.sort(tree.parent), [-1, 0, 0])
+    assert tree.height == 2.0
+    assert tree.trunk_diameter == pytest.approx(0.2)
+    assert tree.wood_volume == pytest.approx(np.pi * (0.01 + np.sqrt(2) * (0.05**2 + 0.06**2)))
+    assert len(tree.bud_position) == 0
+    small, _ = read_qsm(written(QSM.replace(",", ";")), scale=0.01)
+    assert small.height == pytest.approx(0.02)
+
+
+def test_the_recorded_tree_model(shared):
+    path = shared / "voxels" / "tree_qsm.csv"
+    tree, dropped = read_qsm(path)
+    table = np.genfromtxt(path, delimiter=",", skip_header=1)
+    assert len(tree.start) + dropped["without a length"] == len(table)
+    assert tree.wood_volume == pytest.approx(np.sum(np.pi * table[:, 8] ** 2 * table[:, 9]), rel=1e-3)
+    assert np.all(tree.parent < np.arange(len(tree.parent)))
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (("radius", "thickness"), "line 1: no column radius"),
+        (("branchOrder", "radius"), "line 1: 2 times the column radius"),
+        (("8,5,0,0,1,1,0,2,0.06,1", "8,5,0,0,1,1,0,2,0.06"), "line 5: 9 values; the header names 10"),
+        (("8,5,0,0,1,1", "8,5,0,zero,1,1"), "line 5: starty = 'zero' is no number"),
+        (("0.06,1", "-0.06,1"), r"line 5: radius = -0.06 m is outside \(0, inf\)"),
+        (("0.06,1", "nan,1"), "line 5: radius is not finite"),
+        (("8,5,0", "9,5,0"), "line 5: ID 9 was given in line 3"),
+        (("8,5,0", "8,6,0"), "line 5: parent 6 is not in the file"),
+        (("8,5,0", "8,8,0"), "line 5: the cylinder is its own ancestor"),
+        (("8,5,0", "-1,5,0"), r"line 5: ID -1 is outside \[0, inf\)"),
+        (("8,5,0", "8.5,5,0"), "line 5: id = '8.5' is no whole number"),
+        (("8,5,0", "8,1e300,0"), "line 5: parent = '1e300' is no whole number"),
+        (("8,5,0", "8,5,-2e9"), r"line 5: startx = -2e\+09 m lies beyond 1e\+09 m"),
+        (("0.06,1", "0.06,-1"), r"line 5: order = -1 is outside \[0, inf\)"),
+        (("8,5,0", '8,"5,0'), "line 5: not a row of a table"),
+        (("8,5,0", "8," + "5" * 200_000 + ",0"), "line 5: not a row of a table .*limit"),
+        (("8,5,0", "8," + "5" * 1000 + ",0"), r"line 5: parent = '5{37}\.\.\.' is no whole number"),
+    ],
+)
+def test_damaged_tree_models(written, change, says):
+    with pytest.raises(ValueError, match=says):
+        read_qsm(written(QSM.replace(*change)))
+    with pytest.raises(ValueError, match="line 1: there is no cylinder in the file"):
+        read_qsm(written(QSM.splitlines()[0]))
+
+
+def test_a_long_chain_without_lengths(written):
+    """Each of many cylinders stands on a chain of as many that have no length; time grows with their number
+    alone."""
+    rows = [QSM.splitlines()[0], "0,-1,0,0,0,0,0,1,1,0"]
+    rows += [f"{i},{i - 1},0,0,1,0,0,1,1,0" for i in range(1, 2_000)]
+    rows += [f"{i},1999,0,0,1,0,0,2,1,0" for i in range(2_000, 4_000)]
+    tree, dropped = read_qsm(written("\n".join(rows)))
+    assert dropped == {"without a length": 1_999}
+    np.testing.assert_array_equal(tree.parent, [-1, *[0] * 2_000])
+
+
+def test_a_tree_model_in_quotes(written):
+    quoted = QSM.replace("parentID", '"parent_ID"').replace("8,5,", '"8","5",')
+    assert len(read_qsm(written("\ufeff" + quoted)).tree.start) == 3
+    with pytest.raises(ValueError, match=r"scale = 0 .*\(0, inf\)"):
+        read_qsm(written(QSM), scale=0.0)
+
+
+def test_coefficients_that_single_precision_does_not_hold(written):
+    header = "lambda nrefrac SAC_CHL SAC_CAR SAC_ANT SAC_BROWN SAC_EWT SAC_PROT SAC_CBC\n"
+    row = "1 1.4 0 0 0 0 0 0 0\n2 1.4 1e39 0 0 0 0 0 0\n"
+    with pytest.raises(ValueError, match=r"map\.txt, line 3: SAC_CHL = '1e39' is no number in .*\[0, inf\)"):
+        load_coefficients(written(header + row))
+
+
+@pytest.fixture
+def cloud(tmp_path):
+    """A LAS file of five points, of which one is noise and one is withheld."""
+    las = laspy.create(point_format=6, file_version="1.4")
+    las.header.scales = [0.001] * 3
+    las.x, las.y, las.z = np.arange(15.0).reshape(3, 5)
+    las.classification = np.array([2, 5, 7, 4, 5])
+    las.withheld = np.array([0, 0, 0, 1, 0])
+    las.return_number = np.array([1, 1, 1, 2, 2])
+    las.intensity = np.arange(5) * 10
+    path = tmp_path / "cloud.las"
+    las.write(path)
+    return path
+
+
+def test_a_point_cloud(cloud):
+    points = read_las(cloud, scale=0.5)
+    assert points.dropped == {"noise": 1, "withheld": 1}
+    np.testing.assert_allclose(points.position, [[0, 2.5, 5], [0.5, 3, 5.5], [2, 4.5, 7]])
+    np.testing.assert_array_equal(points.classification, [2, 5, 5])
+    np.testing.assert_array_equal(points.return_number, [1, 1, 2])
+    np.testing.assert_array_equal(points.intensity, [0.0, 10.0, 40.0])
+
+
+def test_the_recorded_point_cloud(shared):
+    points = read_las(shared / "voxels" / "tree_point_cloud.las")
+    assert len(points.position) == 20198
+    assert points.dropped == {"noise": 0, "withheld": 0}
+    assert np.ptp(points.position[:, 2]) == pytest.approx(21.97, abs=0.01)
+
+
+def test_damaged_point_clouds(cloud, tmp_path):
+    whole = cloud.read_bytes()
+    for name, content in (("empty", b""), ("text", b"not a cloud" * 100), ("short", whole[:-40])):
+        path = tmp_path / f"{name}.las"
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=f"{name}.las"):
+            read_las(path)
+
+
+@pytest.mark.parametrize(
+    ("at", "kind", "value", "says"),
+    [
+        (96, "<I", 2**32 - 1, "header: it is 375 bytes long and points begin at 4294967295: a file of"),
+        (94, "<H", 20, "header: it is 20 bytes long"),
+        (100, "<I", 2**32 - 1, "header: 4294967295 variable length records, but there is room for 0"),
+        (104, "<B", 77, "header: point format 77"),
+        (105, "<H", 29, "header: point format 6, records of 29 bytes"),
+        (25, "<B", 9, r"header: version 1\.9 is none of LAS 1\.0 to 1\.5"),
+        (131, "<d", 0.0, r"header: scale of x = 0 is outside the range \(1e-09, 1000\.0\)"),
+        (139, "<d", np.nan, "header: scale of y = nan"),
+        (155, "<d", np.inf, "header: offset of x = inf is not finite"),
+        (155, "<d", 1e12, r"record 0: coordinates \[1000000000000\.0, .* lie beyond 1e\+09 m"),
+        (243, "<I", 100, "header: 100 extended records from 0 on do not fit"),
+        (247, "<Q", 10**8, "record 5: the file ends, but its header names 100000000 points"),
+        (247, "<Q", 2**63, "record 5: the file ends, but its header names 9223372036854775808 points"),
+        (247, "<Q", 0, "header: the file holds no points"),
+        (104, "<B", 6 + 128, "header: points are compressed, but no record 22204 says how"),
+    ],
+)
+def test_headers_of_point_clouds_that_make_no_sense(cloud, at, kind, value, says):
+    content = bytearray(cloud.read_bytes())
+    struct.pack_into(kind, content, at, value)
+    cloud.write_bytes(content)
+    with pytest.raises(ValueError, match=r"cloud\.las: (" + says + ")"):
+        read_las(cloud)
+
+
+@pytest.fixture
+def packed(tmp_path):
+    """Writes a LAZ file of so many points in a point format and gives its path and where points begin."""
+    pytest.importorskip("lazrs")
+
+    def write(point_format=6, points=60):
+        path = tmp_path / "cloud.laz"
+        path.write_bytes(small_cloud(True, point_format, points))
+        return path, struct.unpack_from("<I", path.read_bytes(), 96)[0]
+
+    return write
+
+
+@pytest.mark.parametrize(
+    ("point_format", "points"), [*((n, 60) for n in range(11)), (3, 120_000), (6, 120_000)]
+)
+def test_a_packed_point_cloud(packed, tmp_path, point_format, points):
+    path, _ = packed(point_format, points)
+    (tmp_path / "cloud.las").write_bytes(small_cloud(False, point_format, points))
+    for one, other in zip(read_las(path)[:5], read_las(tmp_path / "cloud.las")[:5]):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("point_format", [3, 6])
+def test_a_packed_point_cloud_that_is_cut_short(packed, point_format):
+    path, start = packed(point_format)
+    whole = path.read_bytes()
+    for size in (0, 100, 400, start - 1, start, start + 7, start + 20, start + 60, len(whole) - 250):
+        path.write_bytes(whole[:size])
+        with pytest.raises(ValueError, match=r"cloud\.laz: \w"):
+            read_las(path)
+
+
+def test_packed_point_clouds_that_declare_too_much(packed):
+    path, start = packed()
+    whole = path.read_bytes()
+    (table,) = struct.unpack_from("<q", whole, start)
+    record = whole.index(b"laszip encoded") + 52
+    for at, kind, value, says in (
+        (247, "<Q", 10**8, "header: 100000000 points: 3400000000 bytes are declared in a file of"),
+        (247, "<Q", 61_000, "chunk table: its 1 chunks do not add up to 61000 points"),
+        (start, "<q", 2**40, "chunk table: 1099511627776 is no place after"),
+        (table + 4, "<I", 2**32 - 1, "chunk table: 4294967295 chunks in"),
+        (table + 8, "<I", 2**32 - 1, "chunk table: its entries are damaged"),
+        (table + 8, "<I", 0, "chunk table: its 1 chunks do not add up to .* bytes"),
+        (start + 8 + 34 + 4, "<I", 2**32 - 1, "chunk 0: its layers do not fit into its"),
+        (start + 8 + 34 + 4 + 4 * 13, "<I", 2**32 - 1, "chunk 0: layer 0 is damaged"),
+        (record, "<H", 2, "record of the compression: compressor 2"),
+        (record + 12, "<I", 0, "record of the compression: compressor 3 with 0 points per chunk"),
+        (record + 34, "<H", 6, r"record of the compression: items \[\(6, 30\)"),
+        (record + 32, "<H", 60_000, "record of the compression: 46 bytes cannot name 60000 items"),
+    ):
+        content = bytearray(whole)
+        struct.pack_into(kind, content, at, value)
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=rf"cloud\.laz: {says}"):
+            read_las(path)
+
+
+def test_bytes_on_which_the_decompressor_would_run_out_of_stack(packed):
+    path, start = packed(1, 500)
+    content = bytearray(path.read_bytes())
+    content[start + 100 : -40] = b"\xff" * len(content[start + 100 : -40])
+    path.write_bytes(content)
+    with pytest.raises(
+        ValueError, match=r"cloud\.laz: chunk 0: the stream is damaged: bytes of 255 in a row"
+    ):
+        read_las(path)
+
+
+def test_without_lazrs(packed, monkeypatch):
+    path, _ = packed()
+    monkeypatch.setitem(sys.modules, "lazrs", None)
+    with pytest.raises(ImportError, match=r"needs lazrs: .*jaxlidar\[io\]"):
+        read_las(path)
+
+
+@pytest.mark.parametrize("read", [read_las, read_qsm, read_vox])
+def test_files_that_are_not_there(read, tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"nothing\.txt: no such file"):
+        read(tmp_path / "nothing.txt")
+
+
+@pytest.mark.parametrize("read", [read_qsm, read_vox])
+def test_files_that_are_no_text(read, tmp_path):
+    path = tmp_path / "binary"
+    path.write_bytes(b"\n\n" + bytes(range(128, 256)))
+    with pytest.raises(ValueError, match="binary: not a text file: line 3: "):
+        read(path)
+
+
+def test_without_laspy(cloud, monkeypatch):
+    monkeypatch.setitem(sys.modules, "laspy", None)
+    with pytest.raises(ImportError, match=r"jaxlidar\[io\]"):
+        read_las(cloud)

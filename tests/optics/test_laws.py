@@ -1,0 +1,276 @@
+"""Laws of reflection and phase functions: those that are built in, and Minnaert's, added in a file of its
+own.
+
+Samples are tested against densities (chi-squared over cells of equal solid angle), densities against view
+factors, both for conservation and reciprocity, and returns against the closed form
+
+    sum of apparent reflectance = R (k + 1) / 2 cos^(2 k - 1)(slope)
+
+of Minnaert's law; its derivatives against differences of converged means.
+"""
+
+import importlib.util
+from pathlib import Path
+from typing import final
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.stats import chi2 as chi2_distribution
+
+import jaxlidar as jl
+from jaxlidar.extend import dot, vec
+from tests.helpers import WHOLE, agrees, batch_mean, slow_unless, whole_lidar
+
+ROOT = Path(__file__).resolve().parents[2]
+spec = importlib.util.spec_from_file_location("minnaert", ROOT / "examples" / "minnaert.py")
+module = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(module)
+Minnaert = module.Minnaert
+
+UP = (0.0, 0.0, 1.0)
+TILTED = tuple(np.array([0.3, -0.2, 1.0]) / np.linalg.norm([0.3, -0.2, 1.0]))
+LAWS = {
+    "Lambertian": jl.Lambertian(),
+    "equal-angle": jl.EqualAngle(),
+    "Minnaert 1.5": Minnaert(k=1.5),
+    "Minnaert 4": Minnaert(k=4.0),
+}
+PHASES = {
+    "isotropic": jl.Isotropic(albedo=0.5),
+    "forward": jl.HenyeyGreenstein(albedo=0.5, g=0.7),
+    "backward": jl.HenyeyGreenstein(albedo=0.5, g=-0.4),
+    "nearly isotropic": jl.HenyeyGreenstein(albedo=0.5, g=1e-3),
+}
+
+
+def direction(zenith, azimuth):
+    z, a = np.deg2rad(zenith), np.deg2rad(azimuth)
+    return np.array([np.sin(z) * np.cos(a), np.sin(z) * np.sin(a), -np.cos(z)])
+
+
+def arrays(vector, like):
+    return vec(jnp.full(like.shape, c, like.dtype) for c in vector)
+
+
+def sphere(polar=400, azimuth=200):
+    """Directions and their solid angles: Gauss-Legendre in the cosine, even in azimuth."""
+    x, weight = np.polynomial.legendre.leggauss(polar)
+    turn = (np.arange(azimuth) + 0.5) * (2 * np.pi / azimuth)
+    c, a = (m.ravel() for m in np.meshgrid(x, turn, indexing="ij"))
+    s = np.sqrt(1 - c * c)
+    return vec(jnp.asarray(v) for v in (s * np.cos(a), s * np.sin(a), c)), np.repeat(weight, azimuth) * (
+        2 * np.pi / azimuth
+    )
+
+
+def density_of(thing, incident, normal, out):
+    if isinstance(thing, jl.AbstractPhase):
+        return thing.density(incident, out)
+    return thing.density(incident, normal, out)
+
+
+def drawn_by(thing, incident, normal, u, v):
+    if isinstance(thing, jl.AbstractPhase):
+        return thing.sample(incident, u, v)
+    return thing.sample(incident, normal, u, v)
+
+
+def cells(out):
+    """Number of the cell, 24 in height and 12 in azimuth, of equal solid angle."""
+    x, y, z = (np.asarray(c, float) for c in out)
+    height = np.clip(((z + 1) * 12).astype(int), 0, 23)
+    turn = ((np.arctan2(y, x) / (2 * np.pi)) % 1.0 * 12).astype(int) % 12
+    return 12 * height + turn
+
+
+def p_value(sampler, density, normal=TILTED, samples=200_000, seed=7):
+    """Of the hypothesis that what `sampler` draws has the density of `density`."""
+    u, v = jax.random.uniform(jax.random.key(seed), (2, samples), minval=1e-7)
+    incident = arrays(direction(35.0, 20.0), u)
+    drawn = drawn_by(sampler, incident, arrays(normal, u), u, v)
+    # Cells are crossed by the horizon: integrate finely.
+    out, weight = sphere(1440, 720)
+    like = out[0]
+    p = np.asarray(density_of(density, arrays(direction(35.0, 20.0), like), arrays(normal, like), out), float)
+    expected = samples * np.bincount(cells(out), p * weight, 288)
+    found = np.bincount(cells(drawn), minlength=288)
+    # Cells that expect little are counted together.
+    rare = expected < 20
+    expected = np.append(expected[~rare], expected[rare].sum())
+    found = np.append(found[~rare], found[rare].sum())
+    expected, found = expected[expected > 1], found[expected > 1]
+    statistic = np.sum((found - expected) ** 2 / expected)
+    return chi2_distribution.sf(statistic, len(expected) - 1)
+
+
+@pytest.mark.parametrize("name", [*LAWS, *PHASES])
+def test_samples_have_the_density(name):
+    thing = (LAWS | PHASES)[name]
+    assert p_value(thing, thing) > 1e-3
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong"),
+    [("Minnaert 1.5", jl.Lambertian()), ("forward", jl.HenyeyGreenstein(albedo=0.5, g=0.68))],
+)
+def test_a_wrong_density_is_noticed(name, wrong):
+    assert p_value((LAWS | PHASES)[name], wrong) < 1e-6
+
+
+@pytest.mark.parametrize("name", [*LAWS, *PHASES])
+@pytest.mark.parametrize("zenith", [0.0, 50.0, 80.0])
+def test_laws_conserve_energy_and_agree_with_themselves(name, zenith):
+    thing = (LAWS | PHASES)[name]
+    out, weight = sphere()
+    incident, normal = arrays(direction(zenith, 40.0), out[0]), arrays(UP, out[0])
+    density = np.asarray(density_of(thing, incident, normal, out), float)
+    # The equal-angle density is singular at the normal, and softened there.
+    assert np.sum(density * weight) == pytest.approx(1.0, abs=5e-3 if name == "equal-angle" else 1e-4)
+    if isinstance(thing, jl.AbstractPhase):
+        seen, albedo, most = thing.view_factor(incident, out), 1.0, thing.largest_view_factor()
+    else:
+        albedo = np.asarray(thing.albedo(incident, normal), float)
+        assert np.all((albedo >= 0) & (albedo <= 1))
+        # A wider aperture softens what is seen of the equal-angle singularity.
+        half_angle = 2e-4
+        seen = thing.view_factor(incident, normal, out, jnp.asarray(half_angle))
+        most = thing.largest_view_factor(half_angle)
+    seen = np.asarray(seen, float)
+    np.testing.assert_allclose(seen, np.pi * albedo * density, rtol=2e-3, atol=1e-6)
+    assert np.max(seen) <= most * (1 + 1e-5)
+
+
+def test_minnaert_is_reciprocal_and_equal_angle_is_not():
+    rng = np.random.default_rng(3)
+    a, b = rng.normal(size=(2, 3, 1000))
+    a, b = (np.stack([*v[:2], np.abs(v[2])]) / np.linalg.norm(v, axis=0) for v in (a, b))
+    up = arrays(UP, jnp.zeros(1000))
+
+    def exchanged(law):
+        def brdf(towards, out):
+            incident, out = (vec(jnp.asarray(v)) for v in (-towards, out))
+            return np.asarray(law.view_factor(incident, up, out, jnp.asarray(1e-3)) / dot(up, out), float)
+
+        return np.max(np.abs(brdf(a, b) / brdf(b, a) - 1))
+
+    assert exchanged(Minnaert(k=2.5)) < 1e-4
+    assert exchanged(jl.EqualAngle()) > 0.1
+
+
+@pytest.mark.parametrize("slope", [0.0, 30.0])
+def test_first_return_of_minnaert(slope):
+    scene = jl.Scene(ground=jl.Ground(reflectance=0.4, slope=slope, law=Minnaert(k=1.7)))
+    lidar = whole_lidar()
+    wave = jl.simulate(lidar, scene, key=jax.random.key(0), **WHOLE)
+    cosine = np.cos(np.deg2rad(slope))
+    assert float(wave.reflectance.sum()) == pytest.approx(0.4 * 1.35 * cosine**2.4, rel=1e-4)
+    # What the law does not scatter is absorbed.
+    assert float(wave.ledger["absorbed by ground"][0]) == pytest.approx(1 - 0.4 * cosine**0.7, rel=1e-4)
+    assert float(sum(wave.ledger.values())[0]) == pytest.approx(1.0, abs=1e-5)
+
+
+def below_plate(p, law=Minnaert):
+    """Sloping ground below a half-open plate that scatters diffusely: light reaches it from all sides."""
+    plate = jl.Plate(height=4.0, reflectance=0.4, transmittance=0.5, coverage=0.6, transmission="diffuse")
+    ground = jl.Ground(reflectance=0.9, slope=p["slope"], aspect=20.0, law=law(k=p["k"]))
+    return jl.Scene(plates=(plate,), ground=ground)
+
+
+START = {"slope": jnp.asarray(20.0), "k": jnp.asarray(1.6)}
+LIDAR = whole_lidar()
+
+
+@pytest.mark.slow
+def test_the_ledger_of_all_orders_adds_up():
+    wave = jl.simulate(LIDAR, below_plate(START), key=jax.random.key(1), n_photons=65536, **WHOLE)
+    assert float(sum(wave.ledger.values())[0]) == pytest.approx(1.0, abs=1e-4)
+
+
+def derivatives(law, name, step):
+    """By automatic differentiation and as a central difference: means of batches, with standard errors."""
+    plan = jl.plan(LIDAR, below_plate(START, law), max_orders=4, n_photons=65536, n_rays=512, **WHOLE)
+
+    def measure(value, key):
+        setup = jl.reduce(LIDAR, below_plate(START | {name: value}, law), plan)
+        return jl.waveform_of(jl.trace_scene(setup, key), setup).components["higher"].sum()
+
+    both = jax.jit(lambda v, k: jax.jvp(lambda v: measure(v, k), (v,), (jnp.ones_like(v),))[1])
+    value = jax.jit(measure)
+    exact = np.array([both(START[name], k) for k in jax.random.split(jax.random.key(3), 12)])
+    keys = jax.random.split(jax.random.key(4), 24)
+    sides = [np.array([value(START[name] + s, k) for k in keys]) for s in (-step, step)]
+    # The same keys on both sides: their noise nearly cancels.
+    slopes = (sides[1] - sides[0]) / (2 * step)
+    return exact.mean() - slopes.mean(), np.hypot(*(a.std(ddof=1) / np.sqrt(len(a)) for a in (exact, slopes)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "step"), slow_unless([("slope", 1.0)], [("k", 0.05), ("slope", 1.0)]))
+def test_derivatives_of_a_law_of_ones_own(name, step):
+    off, stderr = derivatives(Minnaert, name, step)
+    assert abs(off) < 4 * stderr
+
+
+@final
+class Forgetful(jl.AbstractLaw):
+    """Minnaert's law with a density that does not know its exponent."""
+
+    k: jax.Array
+
+    def view_factor(self, incident, normal, view, half_angle):
+        return Minnaert(self.k).view_factor(incident, normal, view, half_angle)
+
+    def albedo(self, incident, normal):
+        return Minnaert(self.k).albedo(incident, normal)
+
+    def sample(self, incident, normal, u, v):
+        return Minnaert(self.k).sample(incident, normal, u, v)
+
+    def density(self, incident, normal, out):
+        return jl.Lambertian().density(incident, normal, out)
+
+    def largest_view_factor(self, half_angle):
+        return Minnaert(self.k).largest_view_factor(half_angle)
+
+
+@pytest.mark.slow
+def test_a_density_that_is_wrong_spoils_derivatives_visibly():
+    off, stderr = derivatives(Forgetful, "k", 0.05)
+    assert abs(off) > 6 * stderr
+
+
+def returned(wave):
+    return wave.reflectance.sum(axis=1)
+
+
+def test_scattering_between_surfaces_follows_the_law():
+    """Two orders: light that a white, diffusely transmitting plate spreads evenly, then Minnaert's ground.
+
+    The plate (R 0, T 1, opaque) sends all light down by the cosine law; the ground reflects the share 2/(k +
+    1) of it, and of what it sends up the plate transmits all, by the cosine law again: the sum is R times
+    2/(k + 1).
+    """
+    plate = jl.Plate(height=4.0, reflectance=0.0, transmittance=1.0, transmission="diffuse")
+    scene = jl.Scene(plates=(plate,), ground=jl.Ground(reflectance=0.5, law=Minnaert(k=2.0)))
+    plan = jl.plan(LIDAR, scene, max_orders=3, n_photons=16384, n_rays=64, **WHOLE)
+    mean, stderr = batch_mean(LIDAR, scene, plan, seed=2, count=16, quantity=returned)
+    assert agrees(mean, stderr, 0.5 * 2 / 3, bound=1e-3, sigmas=4.0)
+    assert not agrees(mean, stderr, 0.5, bound=1e-3, sigmas=4.0)
+
+
+BAD = [
+    (lambda: jl.HenyeyGreenstein(albedo=1.2), r"albedo = 1.2 is outside the admissible range \[0, 1\]"),
+    (
+        lambda: jl.HenyeyGreenstein(albedo=0.5, g=1.0),
+        r"g = 1 is outside the admissible range \[-0.95, 0.95\]",
+    ),
+    (lambda: jl.Specular(roughness=-0.1), r"roughness = -0.1 is outside the admissible range \[0, 0.5\]"),
+]
+
+
+@pytest.mark.parametrize(("make", "message"), BAD)
+def test_bad_input(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()

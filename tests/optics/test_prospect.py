@@ -1,0 +1,296 @@
+"""PROSPECT against prosail, against the published lidar simulator's Table 4, and its refusals."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import prosail
+import pytest
+from scipy.optimize import brentq
+
+from jaxlidar.optics.coefficients import TRAITS, load_coefficients, shipped
+from jaxlidar.optics.leaf_surface import leaf_surface
+from jaxlidar.optics.plate_model import plate_model
+from jaxlidar.optics.prospect import Prospect, prospect_jacobian, prospect_spectra
+from tests.helpers import slow_unless
+
+WAVELENGTHS = np.arange(400.0, 2501.0)
+LASERS = np.array([532.0, 1064.0, 1550.0])
+# Table 4 of the simulator's paper, percent: reflectance, transmittance, absorptance.
+TABLE_4 = np.array([[36.0, 8.0, 56.0], [66.0, 30.0, 4.0], [57.0, 27.0, 16.0]])
+LEAVES = (
+    {"N": 1.5, "Cab": 40.0, "Car": 8.0, "Cbrown": 0.0, "Cw": 0.01, "Cm": 0.009},
+    {"N": 1.0, "Cab": 5.0, "Car": 1.0, "Cbrown": 0.4, "Cw": 0.002, "Cm": 0.002},
+    {"N": 2.7, "Cab": 90.0, "Car": 20.0, "Cbrown": 0.1, "Cw": 0.04, "Cm": 0.02},
+)
+
+
+def lowered(leaf):
+    """The names that prosail gives the traits."""
+    return {name.lower(): value for name, value in leaf.items()}
+
+
+@pytest.mark.parametrize("leaf", LEAVES)
+@pytest.mark.parametrize("version", ["5", "D"])
+def test_against_prosail(leaf, version, precision):
+    ant = {"Cant": 3.0} if version == "D" else {}
+    _, R, T = prosail.run_prospect(
+        **lowered(leaf), ant=ant.get("Cant", 0.0), prospect_version=version, alpha=40.0
+    )
+    got = Prospect(**leaf, **ant, version=version)(WAVELENGTHS)
+    assert got[0].dtype == precision
+    np.testing.assert_allclose(got[0], R, atol=1e-5)
+    np.testing.assert_allclose(got[1], T, atol=1e-5)
+
+
+def test_against_prosail_at_another_incidence():
+    _, R, T = prosail.run_prospect(**lowered(LEAVES[0]), alpha=59.0)
+    got = Prospect(**LEAVES[0], alpha=59.0)(WAVELENGTHS)
+    np.testing.assert_allclose(got, (R, T), atol=1e-5)
+
+
+def optics_of_total(K, face):
+    return [float(x) for x in plate_model(K / 3.4, 3.4, face)]
+
+
+def test_table_4_from_its_absorptances():
+    """With D's refractive index, N = 3.4 and the absorption solved from A, R and T round to the table's."""
+    table = shipped("D")
+    with jax.enable_x64(True):
+        for wavelength, expected, about in zip(LASERS, TABLE_4, (0.2756, 0.0098, 0.0487)):
+            n = float(np.interp(wavelength, table.wavelength, table.index))
+
+            face, target = leaf_surface(n, 40.0), expected[2] / 100
+            optics = partial(optics_of_total, face=face)
+            K = brentq(lambda K, optics=optics, target=target: optics(K)[2] - target, 1e-6, 5.0)
+            assert abs(K / about - 1) < 0.005
+            np.testing.assert_array_equal(np.round(100 * np.array(optics(K))), expected)
+
+
+def test_paper_leaf(precision):
+    leaf = Prospect.paper()
+    R, T = leaf(LASERS)
+    got = 100 * np.stack([R, T, leaf.absorptance(LASERS)], axis=1)
+    assert np.sqrt(np.mean((got - TABLE_4) ** 2)) < 0.3
+
+
+def test_between_tabulated_wavelengths_coefficients_are_interpolated():
+    with jax.enable_x64(True):
+        table, leaf = shipped("D"), Prospect()
+        n = np.mean(table.index[[150, 151]])
+        K = np.mean(table.absorption[:, [150, 151]], axis=1) @ [40.0, 8.0, 0.0, 0.0, 0.01, 0.009]
+        R, T, A = plate_model(K / 1.5, 1.5, leaf_surface(n))
+        np.testing.assert_allclose(leaf(550.5), (R, T), rtol=1e-14)
+        np.testing.assert_allclose(leaf.absorptance(550.5), A, rtol=1e-14)
+        assert leaf(550.5)[0].shape == ()
+
+
+@pytest.mark.parametrize("version", slow_unless(["D"], ["D", "PC", "4", "5"]))
+def test_every_trait_is_differentiable(version, precision):
+    leaf = Prospect(N=1.7, version=version)
+    slopes, reverse = (jax.jit(kind(lambda leaf: leaf(LASERS)))(leaf) for kind in (jax.jacfwd, jax.jacrev))
+    unit = float(np.finfo(precision).eps)
+    given = {name: float(getattr(leaf, name)) for name in ("N", *TRAITS[version])}
+    for name in given:
+        step = 1e-6 * max(given[name], 0.01)
+        with jax.enable_x64(True):
+            base, up = (
+                np.asarray(Prospect(**{**given, name: given[name] + s}, version=version)(LASERS))
+                for s in (0, step)
+            )
+        for output, (forward, backward) in enumerate(zip(slopes, reverse)):
+            forward, backward = getattr(forward, name), getattr(backward, name)
+            np.testing.assert_allclose(forward, backward, rtol=50 * unit, atol=unit)
+            np.testing.assert_allclose(forward, (up - base)[output] / step, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("trait", ["Cant", "Cbrown"])
+def test_gradient_at_a_trait_of_zero(trait):
+    slope = jax.grad(lambda c: jnp.sum(Prospect(**{trait: c})(LASERS)[0]))(0.0)
+    assert np.isfinite(slope)
+    assert slope < 0
+
+
+def test_no_pigment_no_water_no_matter():
+    """A leaf that absorbs nothing: gradients stay finite and R + T = 1."""
+    names = TRAITS["D"]
+    leaf = Prospect(1.0, *np.zeros(6))
+    R, T = leaf(WAVELENGTHS)
+    np.testing.assert_allclose(R + T, 1.0, rtol=1e-6)
+    np.testing.assert_array_equal(leaf.absorptance(WAVELENGTHS), 0)
+    slopes = jax.grad(lambda leaf: jnp.sum(leaf(WAVELENGTHS)[0] - 2 * leaf(WAVELENGTHS)[1]))(leaf)
+    assert all(np.isfinite(getattr(slopes, name)) for name in ("N", *names))
+
+
+def test_new_values_compile_nothing():
+    traces = []
+
+    @jax.jit
+    def reflectance(leaf):
+        traces.append(1)
+        return leaf(LASERS)[0]
+
+    values = [reflectance(Prospect(Cab=c, N=n)) for c, n in ((10.0, 1.2), (40.0, 1.5), (70, 2))]
+    assert len(traces) == 1
+    assert values[0][0] > values[1][0]
+
+
+@pytest.mark.slow
+def test_traced_wavelengths(precision):
+    leaf = Prospect()
+    np.testing.assert_allclose(
+        jax.jit(lambda w: leaf(w))(LASERS), leaf(LASERS), rtol=20 * float(np.finfo(precision).eps)
+    )
+    rise = leaf(1551.0)[0] - leaf(1550.0)[0]
+    np.testing.assert_allclose(jax.grad(lambda w: leaf(w)[0])(1550.5), rise, rtol=1e-3)
+    assert np.isnan(jax.jit(lambda w: leaf(w))(jnp.array([399.0]))[0][0])
+
+
+def many(n):
+    rng = np.random.default_rng(1)
+    values = [c * rng.uniform(0.7, 1.3, n) for c in (2.0, 40.0, 8.0, 1.0, 0.1, 0.01, 0.009)]
+    return jax.vmap(lambda *traits: Prospect(*traits))(*map(jnp.asarray, values))
+
+
+@pytest.mark.slow
+def test_batches(precision):
+    leaves, some = many(7), np.array([450.0, 700.5, 1550.0])
+    R, T = jax.jit(lambda leaves: prospect_spectra(leaves, some, batch_size=3))(leaves)
+    (R_too, T_too), slopes = jax.jit(lambda leaves: prospect_jacobian(leaves, some, batch_size=3))(leaves)
+    tolerance = 20 * float(np.finfo(precision).eps)
+    np.testing.assert_allclose((R_too, T_too), (R, T), rtol=tolerance)
+    assert set(slopes) == {"N", *TRAITS["D"]}
+    each = jax.jit(jax.jacfwd(lambda leaf: leaf(some)))
+    for i in range(7):
+        leaf = jax.tree.map(lambda x, i=i: x[i], leaves)
+        np.testing.assert_allclose((R[i], T[i]), leaf(some), rtol=tolerance)
+        for output, expected in enumerate(each(leaf)):
+            for name, columns in slopes.items():
+                np.testing.assert_allclose(
+                    columns[output][i], getattr(expected, name), rtol=5 * tolerance, atol=tolerance
+                )
+
+
+def test_pro(shared, precision):
+    table = load_coefficients(shared / "prospect" / "dataSpec_PRO.txt")
+    own = shipped("D")
+    np.testing.assert_array_equal(table.wavelength, own.wavelength)
+    np.testing.assert_array_equal(table.index, own.index)
+    np.testing.assert_array_equal(table.absorption[:5], own.absorption[:5])
+    leaf = Prospect(Cp=0.0, Cc=0.0, version="PRO", coefficients=table)
+    np.testing.assert_array_equal(leaf(WAVELENGTHS), Prospect(Cm=0.0)(WAVELENGTHS))
+    darker = Prospect(version="PRO", coefficients=table)
+    assert np.all(darker.absorptance(WAVELENGTHS) >= leaf.absorptance(WAVELENGTHS))
+    # Read again it is the same table: nothing compiles anew.
+    again = load_coefficients(str(shared / "prospect" / "dataSpec_PRO.txt"))
+    assert again == table
+    assert hash(again) == hash(table)
+    with pytest.raises(ValueError, match=r"Cm = 0.009 .*'PRO'.*only 0 is admissible"):
+        Prospect(Cm=0.009, version="PRO", coefficients=table)
+    with pytest.raises(ValueError, match="coefficients"):
+        Prospect(coefficients=table)
+
+
+HEADER = "lambda nrefrac SAC_CHL SAC_CAR SAC_ANT SAC_BROWN SAC_EWT SAC_LMA SAC_PROT SAC_CBC\n"
+ROWS = "400 1.5 1 2 3 4 5 6 7 8\n401 1.4 1 2 3 4 5 6 7 8\n"
+
+
+def test_reader(tmp_path):
+    path = tmp_path / "table.txt"
+    path.write_text(HEADER + "\n" + ROWS)
+    table = load_coefficients(path)
+    np.testing.assert_array_equal(table.absorption[:, 0], [1, 2, 3, 4, 5, 7, 8])
+    assert "400..401 nm" in repr(table)
+    leaf = Prospect(version="PRO", coefficients=table)
+    assert leaf(400.5)[0] > 0
+    with pytest.raises(ValueError, match=r"wavelengths = 532 .*\[400, 401\]"):
+        leaf(532.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "line 1: the file is empty"),
+        (HEADER.replace("SAC_CBC", "") + ROWS, "line 1: the header lacks SAC_CBC"),
+        (HEADER + ROWS + "402 1.4 1 2\n", "line 4: 4 columns"),
+        (HEADER + ROWS.replace("1.4", "oops"), "line 3: nrefrac = 'oops'"),
+        (HEADER + ROWS.replace("1.4", "nan"), "line 3: nrefrac = 'nan'"),
+        (HEADER + ROWS.replace("1.4", "0.4"), "line 3: nrefrac = 0.4"),
+        (HEADER + ROWS.replace("401 1.4 1", "401 1.4 -1"), "line 3: SAC_CHL = '-1'"),
+        (HEADER + ROWS.replace("401", "400"), "line 3: the wavelength 400 nm does not increase"),
+        (HEADER + ROWS[: ROWS.index("401")], "line 2: the table ends after 1 rows"),
+    ],
+)
+def test_damaged_file(tmp_path, text, message):
+    path = tmp_path / "damaged.txt"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=f"damaged.txt, {message}"):
+        load_coefficients(path)
+
+
+def test_missing_file(tmp_path):
+    with pytest.raises(FileNotFoundError):
+        load_coefficients(tmp_path / "nothing.txt")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"N": 0.9}, r"N = 0.9 .*\[1, inf"),
+        ({"N": np.nan}, "N = nan"),
+        ({"Cab": -1.0}, r"Cab = -1 .*\[0, inf"),
+        ({"Cw": np.inf}, "Cw = inf"),
+        ({"Cm": np.nan}, "Cm = nan"),
+        ({"Cab": np.array([1.0, 2.0])}, r"Cab has shape \(2,\)"),
+        ({"alpha": 91.0}, r"alpha = 91 .*\[0, 90\]"),
+        ({"alpha": -1.0}, "alpha = -1"),
+        ({"alpha": np.nan}, "alpha = nan"),
+        ({"version": "6"}, "version = '6' is none of '4', '5', 'D', 'PC', 'PRO'"),
+        ({"version": "4", "Car": 8.0}, "Car = 8.0 is no trait of version '4'"),
+        ({"version": "5", "Cant": 1.0}, "Cant = 1.0 is no trait of version '5'"),
+        ({"Cp": 0.001}, "Cp = 0.001 is no trait of version 'D'"),
+        ({"version": "PC", "Cm": 0.009}, "Cm = 0.009 is no trait of version 'PC'"),
+        ({"version": "PRO"}, "coefficients = None with version 'PRO'"),
+    ],
+)
+def test_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        Prospect(**arguments)
+
+
+def test_traits_of_other_versions_may_be_zero():
+    leaf = Prospect(version="4", Car=0.0, Cant=0, Cbrown=None)
+    np.testing.assert_array_equal(leaf(LASERS), Prospect(version="4")(LASERS))
+
+
+@pytest.mark.parametrize("wavelengths", [399.9, 2500.1, np.array([500.0, np.nan]), np.array([1.064])])
+def test_wavelengths_refused(wavelengths):
+    with pytest.raises(ValueError, match=r"wavelengths = .*\[400, 2500\]"):
+        Prospect()(wavelengths)
+
+
+def test_batch_size_refused():
+    with pytest.raises(ValueError, match="batch_size = 0"):
+        prospect_spectra(many(2), LASERS, batch_size=0)
+
+
+@pytest.mark.parametrize("version", ["4", "5", "D", "PC"])
+def test_shipped_tables(version):
+    table = shipped(version)
+    assert table.absorption.shape == (len(TRAITS[version]), 2101)
+    np.testing.assert_array_equal(table.wavelength, WAVELENGTHS)
+    assert table.index.min() > 1.2
+    assert table.index.max() < 1.6
+    assert np.all(table.absorption >= 0)
+    assert np.all(table.absorption.max(axis=1) > 0)
+
+
+@pytest.mark.parametrize(("version", "name"), [("D", "prospectd"), ("5", "prospect5")])
+def test_shipped_tables_equal_prosail(version, name):
+    table, theirs = shipped(version), getattr(prosail.spectral_lib, name)
+    columns = {"Cab": "kab", "Car": "kcar", "Cant": "kant", "Cbrown": "kbrown", "Cw": "kw", "Cm": "km"}
+    for trait, column in zip(TRAITS[version], table.absorption):
+        # Its version 5 is stored in single precision.
+        np.testing.assert_allclose(column, getattr(theirs, columns[trait]), rtol=1e-7)
+    np.testing.assert_allclose(table.index, theirs.nr, rtol=1e-7)

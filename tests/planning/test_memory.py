@@ -1,0 +1,317 @@
+"""What does not fit into memory is refused with numbers; long records need no matrix."""
+
+import dataclasses
+import math
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+
+import inversion
+import jaxlidar as jl
+from inversion.fit.columns import columns_at_once
+from inversion.fit.model import Model
+from inversion.fit.unknowns import settle
+from jaxlidar.planning import memory, sampling
+from jaxlidar.planning.memory import check_memory, in_words, memory_limit
+from jaxlidar.planning.sampling import sampling_of
+from tests.helpers import applied, slab, slow_unless
+
+ROOT = Path(__file__).resolve().parents[2]
+KEY = jax.random.key(2)
+GROUND = jl.Ground(reflectance=0.3)
+
+
+def plates(count):
+    return tuple(jl.Plate(1.0 + i, 0.3, 0.3) for i in range(count))
+
+
+def test_many_plates_are_refused_before_anything_is_allocated():
+    canopy = jl.Canopy(slab(1.0), leaf=jl.LeafOptics(0.4, 0.4))
+    scene = jl.Scene(canopy=canopy, plates=plates(4), ground=GROUND)
+    lidar = jl.Lidar(wavelength=np.linspace(500.0, 1600.0, memory.FEW + 1))
+    with pytest.raises(ValueError, match=r"would take about .* GB of memory; .* at most 8 wavelengths"):
+        jl.plan(lidar, scene, max_orders=12, describe=False)
+
+
+TWO = jl.Lidar(wavelength=(532.0, 1064.0))
+LEAF = jl.LeafOptics(0.3, 0.2)
+SCENES = {
+    "leaf and bark over ground": {"ground": GROUND, "canopy": {"bark": 0.4}},
+    "straight": {"ground": GROUND, "canopy": {"transmission": "straight"}},
+    "plates over ground": {
+        "ground": GROUND,
+        "plates": (jl.Plate(6.0, 0.3, 0.2, coverage=0.6),),
+        "canopy": {},
+    },
+}
+
+
+@pytest.mark.parametrize("name", slow_unless(["leaf and bark over ground"], SCENES))
+def test_optics_applied_while_light_is_traced_give_the_same(name):
+    """The same photons, and so the same waveform, errors and ledger, to rounding."""
+    given = dict(SCENES[name])
+    bark = [0.1] if "bark" in given["canopy"] else []
+    leaf = jl.Prospect(Cab=40.0) if "straight" not in name else LEAF
+    canopy = jl.Canopy(slab(0.5, *bark), leaf=leaf, **given.pop("canopy"))
+    scene = jl.Scene(canopy=canopy, **given)
+    plan = jl.plan(TWO, scene, max_orders=4, describe=False)
+    assert plan.trace.keeps_histories
+    a, b = (jl.simulate(TWO, scene, key=KEY, plan=p, n_photons=2048) for p in (plan, applied(plan)))
+    for found in ("reflectance", "stderr", "neglected"):
+        np.testing.assert_allclose(getattr(b, found), getattr(a, found), rtol=2e-4, atol=1e-7)
+    assert a.ledger.keys() == b.ledger.keys()
+    for name, share in a.ledger.items():
+        np.testing.assert_allclose(b.ledger[name], share, rtol=2e-4, atol=1e-6)
+    for name, part in a.components.items():
+        np.testing.assert_allclose(b.components[name], part, rtol=2e-4, atol=1e-7)
+
+
+@pytest.mark.slow
+def test_derivatives_where_optics_are_applied_while_light_is_traced():
+    """In an optical and in a geometric value."""
+
+    def total(plan, x):
+        canopy = jl.Canopy(slab(0.5), leaf=jl.LeafOptics(x[0], 0.2))
+        scene = jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=0.3, height=x[1]))
+        setup = jl.reduce(TWO, scene, plan)
+        return jl.total_of(jl.trace_scene(setup, KEY), setup)
+
+    scene = jl.Scene(canopy=jl.Canopy(slab(0.5), leaf=LEAF), ground=GROUND)
+    plan = jl.plan(TWO, scene, max_orders=4, n_photons=2048, window=(-100.0, 60.0), describe=False)
+    x = jax.numpy.array([0.3, 0.1])
+    a, b = (jax.jit(jax.jacfwd(lambda x, p=p: total(p, x)))(x) for p in (plan, applied(plan)))
+    assert np.max(np.abs(a)) > 1e-3
+    np.testing.assert_allclose(b, a, rtol=2e-3, atol=1e-5 * np.max(np.abs(a)))
+
+
+def test_when_optics_are_applied_while_light_is_traced():
+    """Where histories take much more memory, and wavelengths are few; fits then trace for every optics."""
+    scene = jl.Scene(canopy=jl.Canopy(slab(1.0), leaf=jl.LeafOptics(0.5, 0.5)), ground=jl.Ground(0.0, 1.0))
+    long = {"max_orders": 300, "window": (-81.0, 3000.0), "describe": False}
+    plan = jl.plan(jl.Lidar(), scene, **long)
+    assert not plan.trace.keeps_histories
+    assert plan.memory < 1e9
+    assert "optics applied while light is traced" in str(plan)
+    assert jl.plan(jl.Lidar(), scene, describe=False, max_orders=10).trace.keeps_histories
+    unknown = inversion.Unknown("ground.reflectance", bounds=(0.1, 1.0))
+    settled = settle([unknown], scene)
+    for given, traces in ((plan, True), (jl.plan(jl.Lidar(), scene, describe=False, max_orders=3), False)):
+        assert Model(jl.Lidar(), scene, given, settled, KEY).traces == traces
+    with pytest.raises(ValueError, match="300 orders, too many to keep histories"):
+        jl.analog_returns(jl.Lidar(), scene, plan, key=KEY, n_photons=10)
+
+
+def test_the_limit_is_the_users():
+    scene = jl.Scene(canopy=jl.Canopy(slab(1.0), leaf=jl.LeafOptics(0.4, 0.4)), ground=GROUND)
+    plan = jl.plan(jl.Lidar(), scene, describe=False)
+    assert 1e5 < plan.memory < 1e9
+    one, two = (plan.jacobian_memory(n) for n in (1, 2))
+    more = f"a Jacobian in one geometric unknown {in_words(one)}, in each more {in_words(two - one)}"
+    assert str(plan).splitlines()[-1] == f"about {in_words(plan.memory)} of memory; {more}"
+    with pytest.raises(ValueError, match=r"admissible is max_memory = 0\.001 GB"):
+        jl.simulate(jl.Lidar(), scene, key=KEY, max_memory=0.001)
+    for bad in (0.0, -1.0, np.nan):
+        with pytest.raises(ValueError, match="max_memory"):
+            jl.plan(jl.Lidar(), scene, max_memory=bad)
+
+
+def test_sizes_in_words():
+    assert [in_words(x) for x in (20.0, 2.34e4, 5.6e6, 1.234e10)] == ["20 bytes", "23 kB", "5.6 MB", "12 GB"]
+    check_memory(0.9e9, memory_limit(1.0))
+    assert memory.machine_memory() > 1e8
+
+
+def test_a_grazing_beam_over_a_slope_takes_no_matrix():
+    """At 85 degrees the footprint is long: 19 GB as a matrix."""
+    lidar = jl.Lidar(zenith=85.0, divergence=3.0)
+    scene = jl.Scene(ground=jl.Ground(reflectance=0.4), plates=(jl.Plate(20.0, 0.2, 0.1),))
+    plan = jl.plan(lidar, scene, max_orders=1, describe=False)
+    assert plan.bins.count * plan.n_samples > sampling.DENSE
+    assert plan.memory < 1e9
+    wave = jl.simulate(lidar, scene, key=KEY, plan=plan)
+    whole = float(wave.reflectance.sum())
+    assert np.isfinite(np.asarray(wave.reflectance)).all()
+    # Plate 0.2 and, through it and back, the ground: 0.1^2 of 0.4; both are seen at 85 degrees.
+    cosine = np.cos(np.deg2rad(85.0))
+    assert whole == pytest.approx((0.2 + 0.4 * 0.1**2) * cosine, rel=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("pulse", "window"),
+    [
+        (jl.GaussianPulse(6.0), None),
+        (jl.RectangularPulse(3.0), (-100.0, 3.0)),
+        (jl.SampledPulse([-2.0, 0.0, 9.0], [0.0, 1.0, 0.0]), (7.0, 60.0)),
+    ],
+)
+def test_the_band_is_the_matrix(pulse, window, monkeypatch):
+    lidar = jl.Lidar(pulse=pulse)
+    plan = jl.plan(lidar, jl.Scene(plates=plates(1), ground=GROUND), window=window, describe=False)
+    fine = jax.random.uniform(KEY, (2, plan.bins.count))
+    dense = jax.jit(lambda: sampling_of(lidar, plan))()
+    assert dense.dense
+    expected = dense(fine)
+    monkeypatch.setattr(sampling, "DENSE", 1)
+    band = jax.jit(lambda: sampling_of(lidar, plan))()
+    assert not band.dense
+    assert band.share.size <= dense.share.size
+    np.testing.assert_allclose(band(fine), expected, atol=1e-6 * float(np.max(expected)))
+    # The same test rejects a band that is a bin off.
+    wrong = dataclasses.replace(band, first=band.first + 1)
+    assert not np.allclose(wrong(fine), expected, atol=1e-6 * float(np.max(expected)))
+
+
+def layers_scaled(scene, share):
+    """Geometric, for the place of the map is among what it sets."""
+    voxels = scene.canopy.voxels
+    return eqx.tree_at(
+        lambda s: (s.canopy.voxels.leaf, s.canopy.voxels.voxel_size),
+        scene,
+        (voxels.leaf * share[None, None], 1.0 * voxels.voxel_size),
+    )
+
+
+def layered(orders, layers=4, end=100.0, most=None, **given):
+    """A model whose unknowns are leaf by layer, and height and reflectance of the ground; and its start."""
+    voxels = slab(0.4, 0.05, shape=(1, 1, layers))
+    scene = jl.Scene(canopy=jl.Canopy(voxels, leaf=LEAF, bark=0.3), ground=GROUND)
+    given = {"n_photons": 256, "n_rays": 64, **given}
+    plan = jl.plan(TWO, scene, max_orders=orders, window=(-81.0, end), describe=False, **given)
+    plan = dataclasses.replace(plan, limits=plan.limits._replace(max_memory=most))
+    share = {"bounds": (0.5, 2.0), "start": np.ones(layers), "apply": layers_scaled, "name": "layers"}
+    settled = settle(
+        [
+            inversion.Unknown(**share),
+            inversion.Unknown("ground.height", bounds=(-1.0, 1.0)),
+            inversion.Unknown("ground.reflectance", bounds=(0.1, 1.0)),
+        ],
+        scene,
+    )
+    return Model(TWO, scene, plan, settled, KEY), np.concatenate([np.ravel(s.start) for s in settled])
+
+
+def room_for(model, columns):
+    """GB that so many columns at once need."""
+    return 1.0001e-9 * model.problem.plan.jacobian_memory(columns)
+
+
+def test_columns_of_a_jacobian_are_computed_in_groups_where_memory_is_short():
+    """The same columns, the last group filled up; refused where there is no room for one."""
+    whole, start = layered(1)
+    expected = whole(start)
+    limits = [room_for(whole, n) for n in (2, 1)]
+    model, _ = layered(1, most=limits[0])
+    assert (whole.problem.at_once, model.problem.at_once, expected.jacobian.shape[-1]) == (5, 2, 6)
+    found = model(start)
+    np.testing.assert_allclose(found.jacobian, expected.jacobian, rtol=1e-3, atol=1e-5)
+    np.testing.assert_allclose(found.total, expected.total, rtol=1e-5, atol=1e-8)
+    assert np.abs(found.jacobian).max(axis=(0, 1)).min() > 1e-5
+    assert layered(1, most=limits[1])[0].problem.at_once == 1
+    with pytest.raises(ValueError, match=r"one at a time; admissible is max_memory = .* GB of the plan"):
+        layered(1, most=0.5 * limits[1])
+
+
+def test_derivatives_have_no_histories_beyond_the_last_order():
+    """A plan has room for more, which programs without derivatives share."""
+    scene = jl.Scene(canopy=jl.Canopy(slab(0.4), leaf=LEAF), ground=GROUND)
+    given = {"n_photons": 16, "window": (-81.0, 50.0), "describe": False}
+    plan = jl.plan(TWO, scene, max_orders=9, **given)
+    letters = len(plan.trace.letters)
+    assert 9 == plan.least_degree < plan.degree
+    setup = jl.reduce(TWO, scene, plan)
+    shapes = jax.eval_shape(lambda key: jl.trace_scene(setup, key, reverse=False), KEY)
+    assert shapes.higher.shape[2] == math.comb(9 + letters, letters)
+    # Every flight, and the way back, may pass the plate.
+    assert jl.plan(TWO, jl.Scene(ground=GROUND, plates=plates(1)), max_orders=2, **given).least_degree == 5
+
+
+def test_groups_are_about_as_large():
+    model = layered(4)[0]
+    plan = model.problem.plan
+    for columns, room, expected in ((0, 1, 0), (7, 7, 7), (7, 6, 4), (7, 3, 3), (20, 9, 7)):
+        limits = plan.limits._replace(max_memory=room_for(model, room))
+        limited = dataclasses.replace(plan, limits=limits)
+        assert columns_at_once(limited, columns) == expected
+
+
+WATCHED = """
+import sys, threading, time
+import jax, numpy as np
+import jaxlidar as jl
+
+def resident():
+    return int(open("/proc/self/statm").read().split()[1]) * 4096
+
+def watched(run):
+    "Bytes that a call takes at its peak, more than before."
+    base, peak, done = resident(), 0, False
+
+    def watch():
+        nonlocal peak
+        while not done:
+            peak = max(peak, resident())
+            time.sleep(0.005)
+
+    watcher = threading.Thread(target=watch)
+    watcher.start()
+    run()
+    done = True
+    watcher.join()
+    return peak - base
+"""
+
+SIMULATED = """
+orders, end, bark = int(sys.argv[1]), float(sys.argv[2]), float(sys.argv[3])
+voxels = jl.VoxelMap.from_extinction(
+    leaf=np.full((2, 2, 4), 0.2), bark=np.full((2, 2, 4), bark), voxel_size=2.0, origin=(-2.0, -2.0, 0.0)
+)
+canopy = jl.Canopy(voxels, leaf=jl.LeafOptics(0.4, 0.3), bark=0.3)
+scene = jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=0.3))
+lidar = jl.Lidar(wavelength=np.linspace(500.0, 1600.0, 9))
+given = {"window": (-81.0, end), "max_memory": 15.0}
+jl.simulate(lidar, scene, key=jax.random.key(0), max_orders=2, n_photons=8192, **given)
+plan = jl.plan(lidar, scene, max_orders=orders, **given)
+given = {"key": jax.random.key(0), "plan": plan, "n_photons": 65536}
+print(plan.memory, watched(lambda: jl.simulate(lidar, scene, **given)))
+"""
+
+EVALUATED = """
+from tests.planning.test_memory import layered, room_for
+
+orders, layers, end = int(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3])
+model, start = layered(orders, layers, end, most=15.0, n_photons=2048)
+model(start)
+assert model.problem.at_once == layers + 1
+print(1e9 * room_for(model, layers + 1), watched(lambda: model(start)))
+"""
+
+
+def predicted_and_measured(program, *given):
+    command = [sys.executable, "-c", WATCHED + program, *map(str, given)]
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
+    done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT, env=environment)
+    return tuple(map(float, done.stdout.split()))
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="resident memory is read as on Linux")
+@pytest.mark.parametrize(("orders", "end", "bark"), [(9, 500.0, 0.05), (13, 800.0, 0.05)])
+def test_memory_is_as_predicted(orders, end, bark):
+    """To 30 %."""
+    predicted, measured = predicted_and_measured(SIMULATED, orders, end, bark)
+    assert measured == pytest.approx(predicted, rel=0.3)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="resident memory is read as on Linux")
+@pytest.mark.parametrize(("orders", "layers", "end"), [(9, 3, 800.0), (9, 12, 300.0)])
+def test_memory_of_a_jacobian_is_as_predicted(orders, layers, end):
+    """To 30 %."""
+    predicted, measured = predicted_and_measured(EVALUATED, orders, layers, end)
+    assert measured == pytest.approx(predicted, rel=0.3)

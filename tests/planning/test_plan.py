@@ -1,0 +1,225 @@
+"""Only the effects a scene calls for: what is off is not compiled, and every choice can be overridden."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+
+import jaxlidar as jl
+from jaxlidar.planning.effects import NAMES, without
+from tests.helpers import slab
+
+GROUND = jl.Ground(reflectance=0.3)
+PLATE = jl.Plate(height=3.0, reflectance=0.4, transmittance=0.3, coverage=0.5)
+LEAF = jl.LeafOptics(reflectance=0.1, transmittance=0.05)
+LEAVES = jl.Canopy(slab(0.8), leaf=LEAF)
+TREES = jl.Canopy(slab(0.8, 0.1), leaf=LEAF, bark=0.3)
+HAZE = jl.Atmosphere(visibility=10.0, lidar_ratio=30.0)
+SIZES = {"n_photons": 512, "n_rays": 256, "window": (-100.0, 50.0)}
+LOOPS = ("scan[", "while[", "cond[")
+RANDOM = ("random_", "threefry")
+
+
+def traced(lidar, scene, plan):
+    """The trace as text, as it is compiled; the lidar's arrays are in it as far as they are used."""
+
+    setup = jl.reduce(lidar, scene, plan)
+
+    def run(scene, key):
+        return jl.trace_scene(dataclasses.replace(setup, scene=scene), key)
+
+    return str(eqx.filter_make_jaxpr(run)(setup.scene, jax.random.key(0))[0])
+
+
+def planned(lidar, scene, **settings):
+    return jl.plan(lidar, scene, **(SIZES | settings))
+
+
+def effect(plan, name):
+    return next(e for e in plan.effects if e.name == name)
+
+
+# What is off is not compiled.
+
+
+@pytest.mark.parametrize("slope", [0.0, 10.0])
+def test_ground_alone_has_no_loop_and_nothing_random(slope):
+    lidar, scene = jl.Lidar(), jl.Scene(ground=jl.Ground(slope=slope))
+    text = traced(lidar, scene, planned(lidar, scene))
+    assert not any(word in text for word in LOOPS + RANDOM)
+
+
+def test_ground_alone_with_all_that_a_lidar_may_have_has_no_loop_either():
+    lidar = jl.Lidar(field_of_view=1.0, jitter=0.5)
+    scene = jl.Scene(ground=GROUND, atmosphere=jl.Atmosphere(lidar_ratio=40.0))
+    plan = planned(lidar, scene)
+
+    def run(lidar, scene, key):
+        setup = jl.reduce(lidar, scene, plan)
+        return jl.waveform_of(jl.trace_scene(setup, key), setup).reflectance
+
+    text = str(eqx.filter_make_jaxpr(run)(lidar, scene, jax.random.key(0))[0])
+    assert not any(word in text for word in LOOPS + RANDOM)
+
+
+def test_one_order_draws_nothing_but_the_shift_of_the_footprint():
+    scene = jl.Scene(canopy=LEAVES, ground=GROUND)
+    off = {"multiple scattering": False}
+    fixed = traced(jl.Lidar(), scene, planned(jl.Lidar(), scene, effects=off, footprint="fixed"))
+    assert not any(word in fixed for word in RANDOM)
+    assert traced(jl.Lidar(), scene, planned(jl.Lidar(), scene, effects=off)).count("random_bits[") == 1
+    assert traced(jl.Lidar(), scene, planned(jl.Lidar(), scene)).count("random_bits[") > 1
+
+
+def test_a_beam_without_width_is_one_ray_that_is_not_random():
+    scene = jl.Scene(canopy=LEAVES, ground=GROUND)
+    plan = planned(jl.Lidar(), scene, max_orders=1, effects={"divergence": False})
+    assert plan.n_rays == 1
+    assert not plan.is_random
+    assert not any(word in traced(jl.Lidar(), scene, plan) for word in RANDOM)
+
+
+def test_what_is_not_there_has_no_letter():
+    with_bark, bare = jl.Scene(canopy=TREES, ground=GROUND), jl.Scene(canopy=LEAVES, ground=GROUND)
+    plans = [
+        planned(jl.Lidar(), with_bark),
+        planned(jl.Lidar(), bare, max_orders=3),
+        planned(jl.Lidar(), with_bark, max_orders=3, effects={"bark": False}),
+    ]
+    assert "bark.R" in plans[0].trace.letters
+    assert plans[1].trace.letters == plans[2].trace.letters == ("leaf.R", "leaf.T", "ground.R")
+    assert traced(jl.Lidar(), bare, plans[1]) == traced(jl.Lidar(), bare, plans[2])
+    weights = jax.eval_shape(
+        lambda key: jl.trace_scene(jl.reduce(jl.Lidar(), with_bark, plans[2]), key), jax.random.key(0)
+    )
+    assert weights.first.shape[:3] == (1, 2, 4)
+
+
+@pytest.mark.parametrize("canopy", [None, TREES])
+def test_the_trace_never_sees_a_wavelength(canopy):
+    scene = jl.Scene(canopy=canopy, plates=() if canopy else (PLATE,), ground=GROUND)
+    one, three = jl.Lidar(), jl.Lidar(wavelength=(532.0, 1064.0, 1550.0))
+    plan = planned(one, scene, max_orders=3)
+    assert traced(one, scene, plan) == traced(three, scene, plan)
+
+
+# Choices.
+
+
+def test_switching_off_is_the_scene_without():
+    scene = jl.Scene(canopy=TREES, plates=(PLATE,), ground=jl.Ground(slope=5.0), atmosphere=HAZE)
+    lidar = jl.Lidar(field_of_view=1.0, jitter=0.5)
+
+    def less(**changes):
+        return dataclasses.replace(scene, **changes)
+
+    expected = {
+        "bark": (lidar, less(canopy=LEAVES)),
+        "leaf": (lidar, less(canopy=jl.Canopy(slab(bark=0.1), bark=0.3))),
+        "plates": (lidar, less(plates=())),
+        "ground": (lidar, less(ground=None)),
+        "slope spread": (lidar, less(ground=jl.Ground())),
+        "atmospheric extinction": (lidar, less(atmosphere=None)),
+        "atmospheric backscatter": (lidar, less(atmosphere=jl.Atmosphere(visibility=10.0))),
+        "jitter": (jl.Lidar(field_of_view=1.0), scene),
+        "field of view": (jl.Lidar(jitter=0.5), scene),
+        "divergence": (jl.Lidar(field_of_view=1.0, jitter=0.5, divergence=0.0), scene),
+        "specular return": (lidar, scene),
+    }
+    for name, pair in expected.items():
+        assert eqx.tree_equal(without(lidar, scene, (name,)), pair), name
+
+
+def test_without_twice_is_without_once():
+    scene = jl.Scene(TREES, (PLATE,), jl.Ground(slope=20.0, height=1.0, aspect=50.0), HAZE)
+    lidar = jl.Lidar(zenith=10.0, position=(2.0, 3.0), field_of_view=1.0, jitter=0.1)
+    once = without(lidar, scene, NAMES)
+    assert eqx.tree_equal(once[1], jl.Scene())
+    assert once[0].field_of_view is None
+    off = ("slope spread", "leaf")
+    level = without(lidar, scene, off)
+    again = without(*level, off)
+    assert all(np.allclose(a, b, rtol=1e-5) for a, b in zip(*map(jax.tree.leaves, (level, again))))
+
+
+def test_simulate_passes_choices_on():
+    scene = jl.Scene(canopy=TREES, ground=jl.Ground(slope=10.0))
+    off = {
+        "multiple scattering": False,
+        "slope spread": False,
+        "divergence": False,
+        "leaf": False,
+        "bark": True,
+    }
+    wave = jl.simulate(jl.Lidar(), scene, key=jax.random.key(0), effects=off)
+    assert wave.info["photons"] == 0
+    assert set(wave.components) == {"bark", "ground", "first", "higher"}
+    expected = 0.3 * np.exp(-0.2) + 0.3 * 2 / 3 * (1 - np.exp(-0.2)) / 2
+    assert float(wave.reflectance.sum()) == pytest.approx(expected, rel=1e-4)
+
+
+BAD = {
+    "unknown": ({"thunder": False}, "'thunder' is none of 'leaf', 'bark'"),
+    "absent": ({"bark": True}, r"effects\['bark'\] = True, but it is not in the scene.*'ground'"),
+    "one plane": ({"multiple scattering": True}, "not in the scene"),
+    "ground": ({"ground": False, "slope spread": True}, "'ground' = False; admissible with it is True"),
+    "air": (
+        {"atmospheric extinction": False, "atmospheric backscatter": True},
+        "'atmospheric extinction' = False; admissible with it is True",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_choices_that_cannot_be_are_refused(case):
+    effects, message = BAD[case]
+    scene = jl.Scene(ground=jl.Ground(slope=5.0), atmosphere=HAZE)
+    with pytest.raises(ValueError, match=message):
+        jl.plan(jl.Lidar(), scene, effects=effects)
+    with pytest.raises(ValueError, match=message):
+        jl.simulate(jl.Lidar(), scene, key=jax.random.key(0), effects=effects)
+
+
+@pytest.mark.parametrize(("on", "orders"), [(True, 1), (False, 3)])
+def test_orders_asked_for_agree_with_the_choice(on, orders):
+    scene = jl.Scene(canopy=LEAVES)
+    with pytest.raises(ValueError, match=f"= {on}, but max_orders = {orders}; they must agree"):
+        jl.plan(jl.Lidar(), scene, max_orders=orders, effects={"multiple scattering": on})
+
+
+def test_every_effect_has_a_line_in_the_table():
+    scene = jl.Scene(canopy=TREES, ground=GROUND, atmosphere=jl.Atmosphere())
+    plan = jl.plan(jl.Lidar(), scene, effects={"bark": False})
+    lines = str(plan).splitlines()
+    assert max(map(len, lines)) <= 110
+    for name in (*NAMES, f"orders beyond {plan.orders}", "scattering within the atmosphere"):
+        (line,) = (text for text in lines if text.startswith(name + " "))
+        row = effect(plan, name)
+        assert line.split()[len(name.split())] == ("yes" if row.simulated else "no")
+        assert row.reason in line
+        assert 0 <= row.bound <= 1
+    assert "switched off" in next(text for text in lines if text.startswith("bark"))
+
+
+@pytest.mark.parametrize(
+    ("pulse", "jitter", "rays"),
+    [
+        (jl.GaussianPulse(0.0), 0.0, 2048),
+        (jl.GaussianPulse(2.0), 0.0, 2048),
+        (jl.GaussianPulse(2.0), 1.0, 1024),
+        (jl.GaussianPulse(6.0), 0.0, 1024),
+        # Its power jumps: its finest feature is 0.
+        (jl.RectangularPulse(2.0), 0.0, 2048),
+        (jl.RectangularPulse(6.0), 0.0, 1024),
+    ],
+    ids=str,
+)
+def test_short_pulses_take_more_rays(pulse, jitter, rays):
+    scene = jl.Scene(plates=[jl.Plate(5.0, 0.4, 0.4)], ground=jl.Ground())
+    lidar = jl.Lidar(pulse=pulse, jitter=jitter)
+    assert jl.plan(lidar, scene).n_rays == rays
+    assert jl.plan(lidar, scene, n_rays=64).n_rays == 64
+    assert jl.plan(lidar, scene, max_orders=1).n_rays == 4096
+    assert jl.plan(lidar, scene, footprint="fixed").n_rays == 4096

@@ -1,0 +1,61 @@
+"""Is the error that a simulation reports its error? Over many seeds, each stopped at its tolerance."""
+
+import jax
+import numpy as np
+import pytest
+import scipy.stats
+
+import jaxlidar as jl
+from jaxlidar._statistics import widening
+from tests.helpers import slab
+
+LIDAR = jl.Lidar(wavelength=1064.0)
+SEEDS = 200
+
+
+def clumps():
+    lad = np.where(np.random.default_rng(0).random((12, 12, 10)) < 0.3, 1.5, 0.0)
+    return jl.VoxelMap.from_lad(lad, voxel_size=(1.0, 1.0, 1.0), origin=(-6.0, -6.0, 1.0))
+
+
+LEAF = jl.LeafOptics(reflectance=0.45, transmittance=0.4)
+PLATE = jl.Plate(height=3.0, reflectance=0.4, transmittance=0.3, coverage=0.5, transmission="diffuse")
+GROUND = jl.Ground(reflectance=0.4)
+# With a tolerance that calls for about eight batches, and for more.
+CASES = {
+    "plate, few batches": (jl.Scene(plates=(PLATE,), ground=GROUND), 0.04),
+    "plate": (jl.Scene(plates=(PLATE,), ground=GROUND), 0.01),
+    "stand": (jl.Scene(canopy=jl.Canopy(slab(2.0), leaf=LEAF, sides="periodic"), ground=GROUND), 0.03),
+    "clumps": (jl.Scene(canopy=jl.Canopy(clumps(), leaf=LEAF), ground=GROUND), 0.03),
+}
+
+
+@pytest.mark.parametrize(
+    "case", [pytest.param(c, marks=() if c == "plate, few batches" else pytest.mark.slow) for c in CASES]
+)
+def test_the_truth_lies_within_two_reported_errors(case):
+    scene, rtol = CASES[case]
+    plan = jl.plan(LIDAR, scene, max_orders=4, n_photons=1024, n_rays=256, window=(-80.0, 60.0))
+    many = jl.simulate(LIDAR, scene, key=jax.random.key(10**6), plan=plan, rtol=rtol / 10)
+    truth = np.asarray(many.reflectance, float)
+    seen = truth > 0.01 * truth.max()
+    inside, plain, batches = [], [], []
+    for seed in range(SEEDS):
+        wave = jl.simulate(LIDAR, scene, key=jax.random.key(seed), plan=plan, rtol=rtol)
+        error, off = np.asarray(wave.stderr, float), np.abs(np.asarray(wave.reflectance, float) - truth)
+        # Where the deterministic first order is all, only rounding is left.
+        tell = seen & (error > 1e-5 * truth)
+        inside.append(np.mean((off < 2 * error)[tell]))
+        plain.append(np.mean((off < 2 * error / widening(wave.info["batches"]))[tell]))
+        batches.append(wave.info["batches"])
+        assert wave.info["error"] <= rtol
+    assert 0.93 <= np.mean(inside) <= 0.975
+    if max(batches) <= 9:
+        # What would be reported without regard for how few batches there are.
+        assert np.mean(plain) < 0.93
+
+
+@pytest.mark.parametrize("batches", [8, 9, 16, 64, 1000])
+def test_widening_is_students(batches):
+    exact = scipy.stats.t.ppf(scipy.stats.norm.cdf(2.0), batches - 1) / 2.0
+    assert widening(batches) == pytest.approx(exact, rel=1e-3)

@@ -1,0 +1,127 @@
+"""Surfaces of one's own: a disc, written as a user would, beside closed forms.
+
+Layout: a horizontal disc of radius a in the axis of a top-hat beam of radius b > a, over black ground. Its
+first order returns R a^2 / b^2; opaque, over white ground, it returns that and leaves 1 - a^2 / b^2 to the
+ground.
+"""
+
+from typing import final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import pytest
+from jaxtyping import Array, Float
+
+import jaxlidar as jl
+from jaxlidar.extend import Vec, as_array, as_scalar
+from tests.helpers import WHOLE, agrees, batch_mean, whole_lidar
+
+
+@final
+class Round(jl.AbstractShape):
+    """A horizontal disc."""
+
+    centre: Float[Array, "3"]
+    radius: Float[Array, ""]
+
+    @property
+    def lights_itself(self):
+        return False
+
+    def moved(self, by):
+        return Round(self.centre + by, self.radius)
+
+    def distance(self, x: Vec, w: Vec):
+        up = jnp.asarray([0.0, 0.0, 1.0])
+        s = jl.Plane(up, self.centre).distance(x, w)
+        away = (x[0] + s * w[0] - self.centre[0]) ** 2 + (x[1] + s * w[1] - self.centre[1]) ** 2
+        return jnp.where(away < self.radius**2, s, 1e30)
+
+    def tangent(self, x: Vec):
+        zero = jnp.zeros_like(self.radius)
+        return (zero, zero, zero + 1.0), self.centre[2]
+
+    def crossing(self, points, directions):
+        height = float(self.centre[2]) - points[:, 2]
+        return height / directions[:, 2], directions[:, 2]
+
+
+@final
+class Disc(jl.AbstractSheet):
+    """A horizontal disc that reflects and transmits."""
+
+    height: Float[Array, ""] = eqx.field(converter=as_scalar)
+    radius: Float[Array, ""] = eqx.field(converter=as_scalar)
+    reflectance: Array = eqx.field(converter=as_array)
+    transmittance: Array = eqx.field(converter=as_array, default=0.0)
+    coverage: Float[Array, ""] = eqx.field(converter=as_scalar, default=1.0)
+    transmission: str = eqx.field(static=True, default="straight")
+    law: jl.AbstractLaw = jl.Lambertian()
+
+    @property
+    def name(self):
+        return "disc"
+
+    @property
+    def shape(self):
+        zero = jnp.zeros_like(self.height)
+        return Round(jnp.stack([zero, zero, self.height]), self.radius)
+
+
+# 20 m across, from 400 km.
+LIDAR = whole_lidar(profile="top-hat", divergence=0.05)
+
+
+def sums(wave):
+    return {name: wave.components[name].sum() for name in ("disc", "ground", "higher")}
+
+
+def scene(ground, **disc):
+    return jl.Scene(plates=(Disc(5.0, 4.0, **disc),), ground=jl.Ground(reflectance=ground))
+
+
+@pytest.mark.parametrize(("reflectance", "transmittance"), [(0.6, 0.0), (0.5, 0.4)])
+def test_first_order_of_a_disc(reflectance, transmittance):
+    what = scene(1.0, reflectance=reflectance, transmittance=transmittance)
+    plan = jl.plan(LIDAR, what, max_orders=1, n_rays=4096, **WHOLE)
+    mean, stderr = batch_mean(LIDAR, what, plan, seed=0, count=16, quantity=sums)
+    share = (4.0 / 10.0) ** 2
+    assert agrees(mean["disc"], stderr["disc"], reflectance * share, sigmas=4.0)
+    assert agrees(mean["ground"], stderr["ground"], 1 - share + share * transmittance**2, sigmas=4.0)
+    assert not agrees(mean["disc"], stderr["disc"], 1.02 * reflectance * share, sigmas=4.0)
+
+
+def test_a_disc_in_the_ledger_and_in_the_plan():
+    what = scene(0.7, reflectance=0.5, transmittance=0.3)
+    wave = jl.simulate(LIDAR, what, key=jax.random.key(0), n_photons=65536, max_orders=8, **WHOLE)
+    assert float(sum(wave.ledger.values())[0]) == pytest.approx(1.0, abs=1e-4)
+    assert set(wave.components) == {"ground", "disc", "first", "higher"}
+    # No bound but the one that always holds is known for such a shape.
+    table = {e.name: e for e in jl.plan(LIDAR, what).effects}
+    assert table["plates"].bound == 1.0
+
+
+def test_surfaces_of_a_name_are_numbered():
+    plate = jl.Plate(height=1.0, reflectance=0.2)
+    other = jl.Plate(height=2.0, reflectance=0.2)
+    what = jl.Scene(plates=(plate, Disc(5.0, 4.0, reflectance=0.5), other), ground=jl.Ground())
+    materials = jl.plan(LIDAR, what, max_orders=1, describe=False).trace.materials
+    assert materials == ("ground", "plate 1", "disc", "plate 2")
+
+
+@pytest.mark.slow
+def test_derivative_in_the_height_of_a_disc():
+    """The mean time of its echo: 2 / c per metre."""
+    lidar = jl.Lidar(divergence=0.1, pulse=jl.GaussianPulse(fwhm=4.0))
+    what = jl.Scene(plates=(Disc(5.0, 4.0, reflectance=0.5),))
+    plan = jl.plan(lidar, what, max_orders=1, window=(-80.0, 20.0), footprint="fixed")
+
+    def mean_time(height):
+        disc = eqx.tree_at(lambda s: s.plates[0].height, what, height)
+        setup = jl.reduce(lidar, disc, plan)
+        wave = jl.waveform_of(jl.trace_scene(setup, jax.random.key(0)), setup)
+        return jnp.sum(wave.reflectance[0] * wave.time) / jnp.sum(wave.reflectance[0])
+
+    slope = float(jax.grad(mean_time)(jnp.asarray(5.0)))
+    assert slope == pytest.approx(-2 / jl.SPEED_OF_LIGHT, rel=1e-3)

@@ -1,0 +1,370 @@
+"""What the hard cases measure: families of simulations of one structure, compiled once for all their cases.
+
+A family has its usual numbers and a function that makes its measure: from a dict of scalars to a vector.
+Plans are made within, for the precision in use, and hold for all numbers of the family.
+"""
+
+import functools
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxlidar as jl
+from tests.helpers import WHOLE, whole_lidar
+from tests.stability import hard_answers as answers
+from tests.stability import hard_parts
+
+KEY = jax.random.key(24)
+DOUBLE, BOTH = ("float64",), ("float32", "float64")
+
+
+@dataclass(frozen=True)
+class Family:
+    """Simulations of one structure.
+
+    `make()` gives the measure, `answer` its closed form (see `hard_answers`). `bounds`, `slopes`: errors of
+    values and of derivatives admitted in single and double precision, relative to the largest output.
+    `slow`: precisions that are left to -m slow.
+    """
+
+    usual: Mapping[str, float]
+    make: Callable[[], Callable[[dict], Any]]
+    answer: Callable[[Any], list]
+    bounds: tuple[float, float]
+    slopes: tuple[float, float]
+    slow: tuple[str, ...] = ()
+
+
+def simulation(build, usual, outputs, **settings):
+    """A measure: a scene and its lidar out of numbers, by one trace; `widest` are the numbers of the plan."""
+    widest = usual | settings.pop("widest", {})
+    plan = jl.plan(*build({k: jnp.asarray(v, float) for k, v in widest.items()}), **settings)
+
+    def measure(p):
+        setup = jl.reduce(*build(p), plan)
+        return outputs(setup, jl.trace_scene(setup, KEY))
+
+    return measure
+
+
+def samples(setup, response):
+    return jl.total_of(response, setup)[0]
+
+
+def summed(setup, response):
+    return jnp.sum(samples(setup, response))[None]
+
+
+def parts(*names):
+    """Sums of components, or of all shares of energy."""
+
+    def outputs(setup, response):
+        wave = jl.waveform_of(response, setup)
+        absorbed = [v[0] for k, v in wave.ledger.items() if k.startswith("absorbed")]
+        sums = {
+            "shares": sum(wave.ledger.values())[0],
+            "absorbed": sum(absorbed),
+            "all": wave.reflectance.sum(),
+        }
+        return jnp.stack([sums[n] if n in sums else wave.components[n].sum() for n in names])
+
+    return outputs
+
+
+# -- ground ------------------------------------------------------------------------------------------------
+
+OVER_GROUND = {
+    "rho": 0.3,
+    "height": 0.0,
+    "slope": 0.0,
+    "zenith": 0.0,
+    "altitude": 1000.0,
+    "divergence": 0.3,
+    "aperture": 0.2,
+    "fwhm": 6.0,
+    "jitter": 0.0,
+    "fov": 100.0,
+}
+
+
+def over_ground(p, interval=1.0):
+    lidar = jl.Lidar(
+        pulse=jl.GaussianPulse(fwhm=p["fwhm"]),
+        jitter=p["jitter"],
+        altitude=p["altitude"],
+        divergence=p["divergence"],
+        aperture=p["aperture"],
+        zenith=p["zenith"],
+        field_of_view=p["fov"],
+        sampling_interval=interval,
+    )
+    # It falls away from the sensor's side: zenith and slope are in one plane.
+    return lidar, jl.Scene(
+        ground=jl.Ground(reflectance=p["rho"], height=p["height"], slope=p["slope"], aspect=180.0)
+    )
+
+
+def ground_family(interval, half, bounds, slopes, slow=()):
+    times = np.arange(-half, half + interval / 2, interval)
+
+    def make():
+        build = functools.partial(over_ground, interval=interval)
+        return simulation(build, OVER_GROUND, samples, window=(-half, half), widest={"height": 10.0})
+
+    def answer(n):
+        # As the plan has them, counted from the first.
+        exact = [answers.mpf(str(interval)) * i - answers.mpf(str(half)) for i in range(times.size)]
+        return answers.ground(n, exact)
+
+    return Family(OVER_GROUND, make, answer, bounds, slopes, slow)
+
+
+def short_pulse():
+    def build(p):
+        lidar = jl.Lidar(pulse=jl.RectangularPulse(length=p["length"]), jitter=p["jitter"], divergence=0.0)
+        return lidar, jl.Scene(ground=jl.Ground(reflectance=p["rho"], height=p["height"]))
+
+    # Not the plan's own bins: they follow the pulse's length, which the cases change.
+    return simulation(build, SHORT_PULSE, samples, window=(-20.0, 20.0), bin_width=0.25)
+
+
+SHORT_PULSE = {"rho": 0.3, "height": 0.0, "length": 4.0, "jitter": 0.0}
+
+
+def law_family(law, answer, bounds, slopes, slow=()):
+    usual = OVER_LAW | ({"roughness": 0.0} if law is jl.Specular else {})
+
+    def make():
+        def build(p):
+            lidar = jl.Lidar(altitude=p["altitude"], divergence=p["divergence"], aperture=p["aperture"])
+            kind = jl.Specular(roughness=p["roughness"]) if law is jl.Specular else law()
+            return lidar, jl.Scene(ground=jl.Ground(reflectance=p["rho"], slope=p["slope"], law=kind))
+
+        def outputs(setup, response):
+            alpha = setup.lidar.aperture_half_angle
+            # Reflectances are in the thousands; a mirror's is by share of the pulse.
+            return summed(setup, response) * (alpha**2 if law is jl.Specular else alpha)
+
+        return simulation(build, usual, outputs, window=(-30.0, 30.0), widest={"slope": 80.0})
+
+    return Family(usual, make, answer, bounds, slopes, slow)
+
+
+OVER_LAW = {"rho": 0.6, "slope": 0.0, "altitude": 1000.0, "divergence": 0.0, "aperture": 0.2}
+
+# One sample of 1000 ns about time zero.
+CENTRED = {"window": (0.0, 1.0), "bin_width": 2.0}
+
+# -- canopies, first order ---------------------------------------------------------------------------------
+
+SLAB = {
+    "leaf": 0.3,
+    "bark": 0.1,
+    "low": 0.5,
+    "middle": 1.0,
+    "high": 1.5,
+    "R": 0.4,
+    "T": 0.3,
+    "bark_R": 0.5,
+    "rho": 0.45,
+    "height": 0.0,
+    "slope": 0.0,
+    "zenith": 0.0,
+    "azimuth": 0.0,
+    "x": 0.3,
+    "y": 0.4,
+    "altitude": 4e5,
+    "divergence": 1e-3,
+}
+
+
+def slab_family(hotspot, slow=()):
+    def build(p):
+        layers = p["leaf"] * jnp.stack([p["low"], p["middle"], p["high"]])
+        voxels = jl.VoxelMap.from_extinction(
+            leaf=jnp.broadcast_to(layers, (2, 2, 3)),
+            bark=jnp.broadcast_to(p["bark"], (2, 2, 3)),
+            voxel_size=1.0,
+            origin=(-1.0, -1.0, 1.0),
+        )
+        leaf = jl.LeafOptics(reflectance=p["R"], transmittance=p["T"])
+        canopy = jl.Canopy(voxels, leaf=leaf, bark=p["bark_R"], hotspot=hotspot, sides="periodic")
+        lidar = whole_lidar(
+            altitude=p["altitude"],
+            divergence=p["divergence"],
+            zenith=p["zenith"],
+            azimuth=p["azimuth"],
+            position=jnp.stack([p["x"], p["y"]]),
+        )
+        # The slope rises along x alone, so that the height beneath the lidar is that at x = 0 and any y.
+        ground = jl.Ground(reflectance=p["rho"], height=p["height"], slope=p["slope"], aspect=90.0)
+        return lidar, jl.Scene(canopy=canopy, ground=ground)
+
+    def make():
+        outputs = parts("leaf", "bark", "ground", "shares")
+        more = {"max_orders": 1, "n_rays": 32, "footprint": "fixed", "max_step": 1.0, **CENTRED}
+        return simulation(build, SLAB, outputs, widest={"zenith": 85.0}, **more)
+
+    answer = functools.partial(answers.slab, kappa=1 if hotspot else 2)
+    return Family(SLAB, make, answer, (1e-5, 1e-8), (2e-4, 1e-6), slow)
+
+
+ONE_VOXEL = {"tau": 1.0, "size": 1.0, "R": 0.4, "rho": 0.45}
+
+
+def one_voxel_family(edge, interval):
+    """One cubic voxel of the edge `edge` (times `size`), standing on the ground."""
+
+    def build(p):
+        size = edge * p["size"]
+        voxels = jl.VoxelMap.from_extinction(
+            leaf=jnp.broadcast_to(p["tau"] / edge, (1, 1, 1)),
+            voxel_size=jnp.broadcast_to(size, (3,)),
+            origin=jnp.stack([-0.4 * size, -0.4 * size, jnp.zeros_like(size)]),
+        )
+        canopy = jl.Canopy(voxels, leaf=jl.LeafOptics(reflectance=p["R"], transmittance=0.0))
+        lidar = whole_lidar(sampling_interval=interval, divergence=0.0)
+        return lidar, jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=p["rho"]))
+
+    def make():
+        window = (-0.4 * interval, -0.399 * interval)
+        more = {"max_orders": 1, "n_rays": 1, "footprint": "fixed", "bin_width": 2e-3 * interval}
+        return simulation(build, ONE_VOXEL, summed, window=window, **more)
+
+    return Family(ONE_VOXEL, make, answers.one_voxel, (1e-5, 1e-9), (1e-4, 1e-9), DOUBLE)
+
+
+# -- all orders --------------------------------------------------------------------------------------------
+
+CROWN = {
+    "p_leaf": 0.3,
+    "p_bark": 0.1,
+    "R": 0.4,
+    "T": 0.3,
+    "bark_R": 0.3,
+    "rho": 0.5,
+    "height": 0.0,
+    "slope": 0.0,
+    "x": 0.5,
+    "y": 0.5,
+    "altitude": 1000.0,
+    "divergence": 1.0,
+    "fov": 100.0,
+}
+
+
+def crown():
+    def build(p):
+        voxels = jl.VoxelMap.from_probability(
+            leaf=jnp.broadcast_to(p["p_leaf"], (2, 2, 3)),
+            bark=jnp.broadcast_to(p["p_bark"], (2, 2, 3)),
+            voxel_size=1.0,
+            origin=(-1.0, -1.0, 1.0),
+        )
+        leaf = jl.LeafOptics(reflectance=p["R"], transmittance=p["T"])
+        lidar = jl.Lidar(
+            altitude=p["altitude"],
+            divergence=p["divergence"],
+            field_of_view=p["fov"],
+            position=jnp.stack([p["x"], p["y"]]),
+        )
+        ground = jl.Ground(reflectance=p["rho"], height=p["height"], slope=p["slope"], aspect=90.0)
+        return lidar, jl.Scene(canopy=jl.Canopy(voxels, leaf=leaf, bark=p["bark_R"]), ground=ground)
+
+    more = {"max_orders": 3, "n_photons": 64, "n_rays": 32, "window": (-45.0, 45.0), "bin_width": 1.0}
+    return simulation(build, CROWN, parts("shares", "all"), widest={"height": 4.5, "slope": 80.0}, **more)
+
+
+MANY_ORDERS = {"tau": 1.0, "albedo": 1.0, "rho": 1.0}
+
+
+def many_orders():
+    def build(p):
+        voxels = jl.VoxelMap.from_extinction(
+            leaf=jnp.broadcast_to(p["tau"] / 3.0, (1, 1, 3)), voxel_size=1.0, origin=(-0.5, -0.5, 0.0)
+        )
+        canopy = jl.Canopy(voxels, leaf=jl.Isotropic(albedo=p["albedo"]), sides="periodic")
+        return whole_lidar(), jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=p["rho"]))
+
+    more = {"max_orders": 40, "n_photons": 64, "n_rays": 4, **WHOLE}
+    return simulation(build, MANY_ORDERS, parts("shares", "absorbed"), **more)
+
+
+PLATE = {"R": 0.4, "T": 0.5, "coverage": 1.0, "height": 1e-3, "rho": 0.6}
+PLATE_ORDERS = 5
+
+
+def plate_over_ground():
+    def build(p):
+        plate = jl.Plate(height=p["height"], reflectance=p["R"], transmittance=p["T"], coverage=p["coverage"])
+        return whole_lidar(), jl.Scene(plates=(plate,), ground=jl.Ground(reflectance=p["rho"]))
+
+    more = {
+        "max_orders": PLATE_ORDERS,
+        "n_photons": 16384,
+        "widest": {"coverage": 0.5, "height": 12.0},
+        **WHOLE,
+    }
+    return simulation(build, PLATE, summed, **more)
+
+
+def chord_family(periodic):
+    make = functools.partial(hard_parts.chord, periodic)
+    answer = functools.partial(answers.chord, shape=hard_parts.CHORD_SHAPE, periodic=periodic)
+    return Family(hard_parts.CHORD, make, answer, (2e-6, 1e-13), (2e-6, 1e-13))
+
+
+FAMILIES = {
+    # Of the derivative in time, samples of 1 ns have an error of second order in the fine bin of 0.5 ns.
+    "ground": ground_family(1.0, 60.0, (2e-4, 2e-4), (1e-2, 1e-2)),
+    "ground, 0.1 ns": ground_family(0.1, 12.0, (1e-4, 1e-5), (1e-3, 1e-4), DOUBLE),
+    "short pulse": Family(
+        SHORT_PULSE,
+        short_pulse,
+        lambda n: answers.rectangle(n, [answers.mpf(t) for t in range(-20, 21)]),
+        (2e-5, 1e-9),
+        (1e-4, 1e-9),
+        DOUBLE,
+    ),
+    "equal-angle": law_family(jl.EqualAngle, answers.equal_angle, (1e-5, 1e-9), (1e-4, 1e-9), DOUBLE),
+    "mirror": law_family(jl.Specular, answers.mirror, (1e-5, 1e-6), (1e-4, 1e-4), DOUBLE),
+    "slab": slab_family(hotspot=False, slow=DOUBLE),
+    "slab, hot spot": slab_family(hotspot=True, slow=BOTH),
+    "one voxel of 1 mm": one_voxel_family(1e-3, 1000.0),
+    "one voxel of 1 km": one_voxel_family(1e3, 20000.0),
+    "crown": Family(CROWN, crown, answers.crown, (1e-5, 1e-9), (1e-4, 1e-9), slow=BOTH),
+    "40 orders": Family(MANY_ORDERS, many_orders, answers.many_orders, (1e-5, 1e-9), (1e-4, 1e-9), slow=BOTH),
+    # The second and third terms of the series are from photons.
+    "plate": Family(
+        PLATE,
+        plate_over_ground,
+        functools.partial(answers.plate_over_ground, orders=PLATE_ORDERS),
+        (2e-3, 2e-3),
+        (1e-2, 1e-2),
+        BOTH,
+    ),
+    "probability": Family(
+        hard_parts.PROBABILITY, hard_parts.probability, answers.probability, (1e-6, 1e-14), (1e-6, 1e-14)
+    ),
+    "chord": chord_family(periodic=False),
+    "endless chord": chord_family(periodic=True),
+    "leaf": Family(
+        hard_parts.LEAF,
+        hard_parts.leaf,
+        lambda n: answers.leaf(n, hard_parts.LEAF_WAVELENGTHS),
+        (1e-6, 1e-13),
+        (1e-6, 1e-13),
+    ),
+    "air": Family(hard_parts.AIR, hard_parts.air, answers.air, (1e-6, 1e-13), (1e-5, 1e-12)),
+    "pulses": Family(
+        hard_parts.PULSES,
+        hard_parts.pulses,
+        lambda n: answers.pulses(n, [answers.mpf(t) for t in hard_parts.PULSE_TIMES]),
+        (1e-6, 1e-13),
+        (1e-6, 1e-13),
+    ),
+}
