@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxlidar._checks import briefly, check_choice, check_integer, check_key, check_range, known_number
+from jaxlidar._checks import briefly, check_choice, check_integer, check_key, check_range, concrete_number
 from jaxlidar._programs import Program
 from jaxlidar._progress import Progress
 from jaxlidar._statistics import Moments, batches_needed
@@ -178,7 +178,7 @@ def _endless(setup: Setup) -> Setup:
     if canopy is None or canopy.sides == "open":
         return setup
     lengths = PathLengths(setup.lidar, setup.scene)
-    height = known_number(canopy.voxels.voxel_size[2]) * canopy.voxels.shape[2]
+    height = concrete_number(canopy.voxels.voxel_size[2]) * canopy.voxels.shape[2]
     flight = min(REACH * height, lengths.longest_march)
     trace = dataclasses.replace(trace, max_flight=flight, march_steps=lengths.voxels_along(flight))
     return dataclasses.replace(setup, plan=dataclasses.replace(setup.plan, trace=trace))

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 
 import jax
 
-from jaxlidar._checks import is_traced, known_number
+from jaxlidar._checks import concrete_number, is_traced
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._summary import percent
 from jaxlidar.instrument.field_of_view import EDGE
@@ -115,23 +115,23 @@ def _rules(bounds: Bounds, bins: Bins, upstream: float) -> dict[str, Callable[[]
 
 def _reasons(lidar: Lidar, scene: Scene) -> dict[str, str]:
     """Why effects are simulated, with their size, where more can be said than that they are in the scene."""
-    radius = known_number(lidar.footprint_radius)
-    slope = known_number(scene.ground.slope) if isinstance(scene.ground, Ground) else 0.0
+    radius = concrete_number(lidar.footprint_radius)
+    slope = concrete_number(scene.ground.slope) if isinstance(scene.ground, Ground) else 0.0
     spread = radius * math.tan(math.radians(slope)) / SPEED_OF_LIGHT
     view = lidar.field_of_view
     air = scene.atmosphere
     hotspot = scene.canopy is not None and scene.canopy.hotspot
     reasons = {
         "slope spread": f"{slope:g} degrees: {spread:.2g} ns (standard deviation)",
-        "divergence": f"{known_number(lidar.divergence):g} mrad: a footprint of radius {radius:.3g} m",
+        "divergence": f"{concrete_number(lidar.divergence):g} mrad: a footprint of radius {radius:.3g} m",
         "field of view": f"a soft edge of {percent(EDGE)}"
         if view is None or is_traced(view)
-        else f"{known_number(view):g} mrad, with a soft edge of {percent(EDGE)}",
+        else f"{concrete_number(view):g} mrad, with a soft edge of {percent(EDGE)}",
         "hot spot": "back through the same gap: exp(-tau)"
         if hotspot
         else "ways are independent: exp(-2 tau)",
         "atmospheric backscatter": "above the scene",
-        "jitter": f"{known_number(lidar.jitter):g} ns",
+        "jitter": f"{concrete_number(lidar.jitter):g} ns",
     }
     if scene.canopy is None:
         reasons["hot spot"] = "not in the scene"

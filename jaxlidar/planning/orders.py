@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxlidar._checks import concrete, known_array
+from jaxlidar._checks import concrete, concrete_array
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar.planning.effects import can_light_itself
 from jaxlidar.planning.ladder import rung
@@ -65,7 +65,7 @@ def mean_depth(canopy: Canopy) -> float:
         if known is None:
             return math.inf
         extinction += known.sum(axis=2, dtype=float)
-    columns = extinction * known_array(canopy.voxels.voxel_size)[2]
+    columns = extinction * concrete_array(canopy.voxels.voxel_size)[2]
     there = columns[columns > 0]
     return float(there.mean()) if there.size else 0.0
 
@@ -129,7 +129,7 @@ def tail_of(scene: Scene, optics: list[Optics], first: float, last: float) -> fl
     step = 0.5 * (last - first)
     if scene.canopy is not None:
         depth = mean_depth(scene.canopy)
-        size, shape = known_array(scene.canopy.voxels.voxel_size), scene.canopy.voxels.shape
+        size, shape = concrete_array(scene.canopy.voxels.voxel_size), scene.canopy.voxels.shape
         height = float(size[2]) * shape[2]
         step = height / max(depth, 0.5) / SPEED_OF_LIGHT if math.isfinite(depth) else step
     if again >= 1:

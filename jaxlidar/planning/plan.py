@@ -5,7 +5,7 @@ import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from jaxlidar._checks import check_choice, check_integer, check_range, known_array, known_number
+from jaxlidar._checks import check_choice, check_integer, check_range, concrete_array, concrete_number
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.instrument.survey import Survey
@@ -242,7 +242,7 @@ def plan(
         check_range("max_memory", max_memory, 0.0, low_open=True)
     check_choice("footprint", footprint, ("random", "fixed"))
     check_on_terrain(lidar if survey is None else survey, scene)
-    survey = None if survey is None else survey.about(known_array(lidar.position))
+    survey = None if survey is None else survey.about(concrete_array(lidar.position))
     lidar, given = about_aim(lidar, scene)
     nothing = empty(given, effects)
     given = without(lidar, given, nothing)[1]
@@ -263,15 +263,15 @@ def plan(
     def steps_of(orders: int) -> int:
         return order_steps(orders, plates, len(letters.letters))
 
-    jitter = known_number(lidar.jitter)
-    finest = math.hypot(known_number(lidar.pulse.finest), jitter)
-    duration = math.hypot(known_number(lidar.pulse.std), jitter)
+    jitter = concrete_number(lidar.jitter)
+    finest = math.hypot(concrete_number(lidar.pulse.finest), jitter)
+    duration = math.hypot(concrete_number(lidar.pulse.std), jitter)
     if n_rays is None:
         # The shorter the pulse, the fewer rays a sample is made of.
-        short = duration < known_number(lidar.sampling_interval)
+        short = duration < concrete_number(lidar.sampling_interval)
         n_rays = 4096 if orders == 1 or footprint == "fixed" else 2048 if short else 1024
     tail = tail_of(scene, optics, geometry.first / SPEED_OF_LIGHT, geometry.last / SPEED_OF_LIGHT)
-    target = fine_bin(known_number(lidar.sampling_interval), finest, duration, bin_width)
+    target = fine_bin(concrete_number(lidar.sampling_interval), finest, duration, bin_width)
     bins, samples = times_of(lidar, scene, geometry, tail if orders > 1 else 0.0, window, target)
     airy = with_air(bins, lidar, samples)
     metres = 0.5 * SPEED_OF_LIGHT * bins.width
@@ -288,7 +288,7 @@ def plan(
         bark=letters.bark,
         surfaces=letters.surfaces,
         full_cover=tuple(
-            not isinstance(s, AbstractSheet) or known_number(s.coverage) == 1.0 for s in scene.surfaces
+            not isinstance(s, AbstractSheet) or concrete_number(s.coverage) == 1.0 for s in scene.surfaces
         ),
         mirrors=tuple(isinstance(s.law, AbstractMirror) for s in scene.surfaces),
         has_ground=scene.ground is not None,

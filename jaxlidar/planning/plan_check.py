@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Iterator, Sequence
 
-from jaxlidar._checks import known_number
+from jaxlidar._checks import concrete_number
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.optics.laws import AbstractMirror
@@ -71,15 +71,15 @@ def _kinds(plan: Plan, lidar: Lidar, scene: Scene) -> Iterator[str]:
     unknown = ", ".join(sorted(set(trace.letters) - known))
     if unknown:
         yield f"it has {unknown}; what the scene transmits is not scattered"
-    cover = [isinstance(s, AbstractSheet) and known_number(s.coverage) < 1 for s in scene.surfaces]
+    cover = [isinstance(s, AbstractSheet) and concrete_number(s.coverage) < 1 for s in scene.surfaces]
     if any(full and partial for full, partial in zip(trace.full_cover, cover)):
         yield "it has plates that cover everything; the scene's have gaps"
     if trace.mirrors != tuple(isinstance(s.law, AbstractMirror) for s in scene.surfaces):
         yield "its surfaces and the scene's differ in which are mirrors"
     if trace.hotspot != (scene.canopy is not None and scene.canopy.hotspot):
         yield f"it has hotspot = {trace.hotspot}; the canopy has not"
-    if trace.vertical and known_number(lidar.zenith) != 0:
-        yield f"it is for a beam at nadir; zenith = {known_number(lidar.zenith):g} degrees"
+    if trace.vertical and concrete_number(lidar.zenith) != 0:
+        yield f"it is for a beam at nadir; zenith = {concrete_number(lidar.zenith):g} degrees"
     if plan.smooth_footprint and not only_planes(scene):
         yield "it is for planes; the scene has more"
     albedo, limits = largest_albedo(optics), plan.limits
@@ -135,11 +135,11 @@ def _times(plan: Plan, lidar: Lidar, scene: Scene) -> Iterator[str]:
 
 def _pulse(plan: Plan, lidar: Lidar, scene: Scene) -> Iterator[str]:
     """The pulse, and how it is sampled."""
-    interval = known_number(lidar.sampling_interval)
+    interval = concrete_number(lidar.sampling_interval)
     if lidar.receiver.window == "fixed" and abs(plan.sample_interval - interval) > _ROUNDING * interval:
         yield f"it has samples of {plan.sample_interval:g} ns; sampling_interval = {interval:g} ns"
-    jitter = known_number(lidar.jitter)
-    finest = math.hypot(known_number(lidar.pulse.finest), jitter)
+    jitter = concrete_number(lidar.jitter)
+    finest = math.hypot(concrete_number(lidar.pulse.finest), jitter)
     if finest < plan.limits.finest * (1 - _ROUNDING):
         yield (
             f"its fine bins suit pulses with features of {plan.limits.finest:.3g} ns; the lidar's pulse has "

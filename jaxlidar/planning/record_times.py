@@ -3,7 +3,7 @@
 import dataclasses
 import math
 
-from jaxlidar._checks import known_number
+from jaxlidar._checks import concrete_number
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.planning.path_lengths import PathLengths
@@ -32,8 +32,8 @@ def times_of(
 
     `tail` is how long, ns, light scattered many times comes after the last of first order.
     """
-    interval = known_number(lidar.sampling_interval)
-    low, high = lidar.pulse.support(known_number(lidar.jitter))
+    interval = concrete_number(lidar.sampling_interval)
+    low, high = lidar.pulse.support(concrete_number(lidar.jitter))
     per_sample = max(math.ceil(interval / target - 1e-6), 1)
     width = interval / per_sample
     if lidar.receiver.window == "first return":
@@ -65,7 +65,7 @@ def times_of(
 
 def with_air(bins: Bins, lidar: Lidar, samples: tuple[float, float, int, int]) -> Bins:
     """Bins that reach back to where the air's own return would begin, whether it is simulated or not."""
-    _, high = lidar.pulse.support(known_number(lidar.jitter))
+    _, high = lidar.pulse.support(concrete_number(lidar.jitter))
     missing = math.ceil((bins.start - (samples[0] - samples[1] - high)) / bins.width) + 3
     more = max(missing, 0)
     return dataclasses.replace(bins, start=bins.start - more * bins.width, count=bins.count + more)
