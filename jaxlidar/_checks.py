@@ -5,13 +5,12 @@ is admissible but absurd, as in another unit, is a `UnitWarning`. Tracers pass: 
 nothing can be said of values.
 """
 
-import inspect
 import sys
 import warnings
 from collections.abc import Callable, Sequence
 from numbers import Real
 from types import FrameType, UnionType
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +18,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
-Class = TypeVar("Class", bound=type)
+from jaxlidar._signatures import briefly  # noqa: F401
 
 # -- conversions -------------------------------------------------------------------------------------------
 
@@ -389,17 +388,3 @@ def warn_unit(field: str, x: object) -> None:
 
 def _package(frame: FrameType) -> str:
     return frame.f_globals.get("__name__", "").split(".")[0]
-
-
-# -- help --------------------------------------------------------------------------------------------------
-
-
-def briefly(cls: Class) -> Class:
-    """Let `help` show a class's arguments with their defaults alone.
-
-    Types of arrays, written out, would push the description, which says what is admissible, out of sight.
-    """
-    signature = inspect.signature(cls.__init__)
-    bare = [p.replace(annotation=p.empty) for p in signature.parameters.values()]
-    cls.__init__.__signature__ = inspect.Signature(bare)  # pyright: ignore[reportAttributeAccessIssue]
-    return cls

@@ -10,7 +10,8 @@ For laws, pulses and elements of your own, and for packages on top such as `inve
 - ranges: a class states them by field, `ranges = {"slope": Range(0.0, 90.0)}`; its constructor calls
   `check_ranges`, and `inadmissible` finds values outside them where JAX is tracing, `reasons` says which.
 - `check_kinds` refuses what is no lidar or no scene.
-- `briefly` lets `help` show a class's arguments without their types.
+- `briefly` shortens the signature that `help` shows of a function or a class, `shorten_signatures` those of a
+  package.
 - `fingerprint` tells whether all that a result depends on is as it was.
 - `once` has values computed once for all that use them, whatever the compiler.
 - `side_by_side` runs compiled programs on as many threads as there are cores; compile them with `ONE_CORE`.
@@ -20,7 +21,6 @@ For laws, pulses and elements of your own, and for packages on top such as `inve
 from jaxlidar._checks import (
     as_array,
     as_scalar,
-    briefly,
     check_choice,
     check_integer,
     check_key,
@@ -32,6 +32,7 @@ from jaxlidar._checks import (
 from jaxlidar._fingerprint import fingerprint
 from jaxlidar._one_function import once
 from jaxlidar._ranges import Range, check_ranges, inadmissible, reasons
+from jaxlidar._signatures import briefly, shorten_signatures
 from jaxlidar._threads import ONE_CORE, side_by_side
 from jaxlidar._vectors import (
     Scalar,
@@ -81,7 +82,10 @@ __all__ = [
     "polar",
     "reasons",
     "scale",
+    "shorten_signatures",
     "side_by_side",
     "task",
     "vec",
 ]
+
+shorten_signatures(globals(), converters=("as_array", "as_scalar"))
