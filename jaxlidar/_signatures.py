@@ -69,16 +69,7 @@ def briefly(exported: Exported) -> Exported:
     >>> print(inspect.signature(total))
     (power: Float[ArrayLike, "bins"]) -> Array
     """
-    if not isinstance(exported, type):
-        _shorten(exported)
-        return exported
-    for name in vars(exported):
-        if name in ("__init__", "__new__"):
-            _shorten(getattr(exported, name), show_types=False)
-        elif not name.startswith("_") or name == "__call__":
-            member = getattr(exported, name)
-            if inspect.isroutine(member):
-                _shorten(member)
+    _shorten_class(exported) if isinstance(exported, type) else _shorten(exported)
     return exported
 
 
@@ -94,9 +85,18 @@ def shorten_signatures(namespace: Mapping[str, Any], *, converters: Collection[s
     for name in namespace["__all__"]:
         exported = namespace.get(name)
         # Aliases of types, such as `Vec`, can be called but have no signature.
-        has_signature = callable(exported) and typing.get_origin(exported) is None
-        if has_signature and name not in converters:
+        if callable(exported) and typing.get_origin(exported) is None and name not in converters:
             briefly(exported)
+
+
+def _shorten_class(cls: type) -> None:
+    # Members that the class defines itself: those of its bases belong to other public classes.
+    for name in vars(cls):
+        member = getattr(cls, name)
+        if name in ("__init__", "__new__"):
+            _shorten(member, show_types=False)
+        elif (not name.startswith("_") or name == "__call__") and inspect.isroutine(member):
+            _shorten(member)
 
 
 def _shorten(function: Any, *, show_types: bool = True) -> None:
