@@ -69,7 +69,11 @@ def briefly(exported: Exported) -> Exported:
     >>> print(inspect.signature(total))
     (power: Float[ArrayLike, "bins"]) -> Array
     """
-    _shorten_class(exported) if isinstance(exported, type) else _shorten(exported)
+    target: Any = exported
+    if isinstance(target, type):
+        _shorten_class(target)
+    else:
+        _shorten(target)
     return exported
 
 
