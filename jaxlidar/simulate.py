@@ -16,7 +16,7 @@ from jaxlidar._checks import check_flag, check_integer, check_key, check_range, 
 from jaxlidar._programs import Program
 from jaxlidar._progress import Progress
 from jaxlidar._statistics import Moments, batches_needed, widening
-from jaxlidar._summary import NOTABLE, late_share, percent
+from jaxlidar._summary import NOTABLE_FRACTION, late_fraction, percent
 from jaxlidar._threads import side_by_side
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.planning.plan import MIN_BATCHES, Plan
@@ -240,11 +240,11 @@ def _recorded(ready: Ready, traced: _Traced) -> Waveform:
     wave = dataclasses.replace(wave, info=traced.info, **known)
     if is_traced(wave.energy):
         return wave
-    if plan.limits.automatic_window and late_share(wave) >= NOTABLE:
+    if plan.limits.automatic_window and late_fraction(wave) >= NOTABLE_FRACTION:
         end = plan.sample_start + plan.sample_interval * plan.n_samples
         warnings.warn(
-            f"{percent(late_share(wave))} of the light is still on its way when the record ends at {end:.4g} "
-            "ns: give window=, or see Waveform.ledger",
+            f"{percent(late_fraction(wave))} of the light is still on its way when the record ends at "
+            f"{end:.4g} ns: give window=, or see Waveform.ledger",
             LateLightWarning,
             stacklevel=3,
         )
