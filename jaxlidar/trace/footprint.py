@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from jaxlidar._vectors import FAR, Scalar, Vec, add, dot, from_frame, normalise, scale, vec
-from jaxlidar.instrument.field_of_view import seen
+from jaxlidar.instrument.field_of_view import visible_fraction
 from jaxlidar.instrument.lidar import Lidar
 
 GOLDEN = (np.sqrt(5.0) - 1) / 2
@@ -85,7 +85,7 @@ class Beam(eqx.Module):
         # The field widens with distance from the sensor.
         edge = self.view_radius * (1.0 + along / self.slant_range)
         off = jnp.sqrt(jnp.maximum(off2, 1e-12 * edge * edge))
-        return seen(off / edge)
+        return visible_fraction(off / edge)
 
     def irradiance(self, across: tuple[Scalar, Scalar]) -> Scalar:
         """Share of the pulse's energy per m2 across the beam."""

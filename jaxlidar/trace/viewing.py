@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._vectors import Scalar, Vec
-from jaxlidar.instrument.field_of_view import seen
+from jaxlidar.instrument.field_of_view import visible_fraction
 
 Plane = tuple[Scalar, Scalar]
 
@@ -61,7 +61,7 @@ class Viewing(eqx.Module):
         part = self._irradiance(square) * (self.area * -axis[2])
         if self.view_radius is not None:
             _, square = _across(axis, (end[0][:, None] - px, end[1][:, None] - py))
-            part = part * seen(jnp.sqrt(square) / self.view_radius)
+            part = part * visible_fraction(jnp.sqrt(square) / self.view_radius)
         return shots, part, 2.0 / SPEED_OF_LIGHT * along
 
     def _near(self, at: Plane) -> Int[Array, "photons most"]:
