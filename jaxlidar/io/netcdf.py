@@ -19,8 +19,8 @@ from jaxlidar.io.case import read_case as read_case_text
 from jaxlidar.io.gedi_beam import refusing
 from jaxlidar.io.layouts import LAYOUTS, keep_as_netcdf, layout_of
 from jaxlidar.io.zarr_groups import ZarrGroup, is_zarr, opened
+from jaxlidar.spectral.waveform import Waveform
 from jaxlidar.truth import Truth
-from jaxlidar.waveform import Waveform
 
 CONVENTIONS = "CF-1.11"
 # The layout of the files. A reader refuses those that are newer.
@@ -314,14 +314,14 @@ keep_as_netcdf(
         "stderr": ("1", "standard error of the apparent reflectance"),
         "components": ("1", "apparent reflectance per sample by material and by order of scattering"),
         "neglected": ("1", "apparent reflectance that orders beyond the last could add"),
-        "ledger": ("1", "share of the emitted energy by fate, before the atmosphere"),
-        "ledger_stderr": ("1", "standard error of the share of the emitted energy"),
+        "energy_budget": ("1", "share of the emitted energy by fate, before the atmosphere"),
+        "energy_budget_stderr": ("1", "standard error of the share of the emitted energy"),
         "lost": ("1", "apparent reflectance that arrives before or after all fine bins of the plan"),
         "recorded": ("J", "energy that the receiver records per sample, without noise"),
         "wavelength": ("nm", "wavelength of the lidar"),
     },
     dimensions={"bins": "time", "wavelengths": "wavelength"},
-    items={"components": "component", "ledger": "fate", "ledger_stderr": "fate"},
+    items={"components": "component", "energy_budget": "fate", "energy_budget_stderr": "fate"},
     coordinates={"height": "time"},
 )
 
