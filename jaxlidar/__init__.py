@@ -14,6 +14,7 @@ from jaxlidar import extend, io
 from jaxlidar._checks import UnitWarning
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._progress import Progress
+from jaxlidar._registry import register_public_objects, waveform_html
 from jaxlidar._workers import LostWorkersWarning
 from jaxlidar.analog import AnalogReturns, analog_returns, photon_paths
 from jaxlidar.energy import EnergyBudget, energy_budget
@@ -176,8 +177,19 @@ __all__ = [
 ]
 
 
+# Tables of TOML files (`jaxlidar.io.read_case`) name classes as they are exported here.
+register_public_objects({name: globals()[name] for name in __all__ if name != "plot"})
+
+
+# matplotlib takes a while to import: only for those who draw.
+@waveform_html.register
+def _waveform_html(wave: Waveform) -> str:
+    from jaxlidar.plot.html import waveform_html
+
+    return waveform_html(wave)
+
+
 def __getattr__(name: str) -> Any:
-    # matplotlib takes a while to import: only for those who draw.
     if name == "plot":
         return importlib.import_module("jaxlidar.plot")
     raise AttributeError(f"module 'jaxlidar' has no attribute {name!r}")

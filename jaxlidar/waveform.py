@@ -1,7 +1,6 @@
 """From response to waveform: optics, atmosphere, pulse, sampling and energy."""
 
 import dataclasses
-import importlib
 import os
 from typing import Any, final
 
@@ -12,6 +11,7 @@ from jaxtyping import Array, Float
 
 from jaxlidar._checks import briefly, check_range, is_traced
 from jaxlidar._constants import SPEED_OF_LIGHT
+from jaxlidar._registry import save_result, waveform_html
 from jaxlidar._summary import summary
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.instrument.receiver import first_return_window, record
@@ -105,8 +105,7 @@ class Waveform(eqx.Module):
 
         **Raises:** what `jaxlidar.io.save` raises.
         """
-        # Files lie above the core, which asks for them by name.
-        importlib.import_module("jaxlidar.io.netcdf").save(self, path, case)
+        save_result(self, path, case)
 
     def __str__(self) -> str:
         if any(is_traced(x) for x in (self.time, self.reflectance)):
@@ -117,7 +116,7 @@ class Waveform(eqx.Module):
         """What notebooks show: the summary and a small figure."""
         if any(is_traced(x) for x in (self.time, self.reflectance)):
             return None
-        return importlib.import_module("jaxlidar.plot.html").waveform_html(self)
+        return waveform_html(self)
 
 
 def total_of(response: Response, setup: Setup) -> Float[Array, "wavelengths samples"]:

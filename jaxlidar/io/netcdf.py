@@ -13,6 +13,7 @@ import jax
 import numpy as np
 
 from jaxlidar._files import atomic_write
+from jaxlidar._registry import save_result
 from jaxlidar.instrument.photon_counter import PhotonEvents
 from jaxlidar.io.case import Case
 from jaxlidar.io.case import read_case as read_case_text
@@ -32,6 +33,7 @@ ZARR = "zarr.json"
 NOT_REPEATABLE = ("time spent", "interrupted")
 
 
+@save_result.register
 def save(result: Any, path: str | os.PathLike[str], case: Case | None = None) -> None:
     """Write a `Waveform`, or another result, as netCDF or Zarr: with units, names, and where it comes from.
 

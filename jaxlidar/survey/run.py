@@ -14,6 +14,7 @@ from jaxtyping import PRNGKeyArray
 
 from jaxlidar._checks import check_flag, check_integer, check_key, check_kind, is_traced
 from jaxlidar._fingerprint import fingerprint
+from jaxlidar._registry import simulate_survey
 from jaxlidar._workers import Task, outcomes
 from jaxlidar.instrument.survey import Survey
 from jaxlidar.io.case import Case, case_text
@@ -30,6 +31,7 @@ from jaxlidar.survey.ways import AbstractWay
 from jaxlidar.survey.with_truth import WithTruth
 
 
+@simulate_survey.register
 def simulate_many(
     survey: Survey,
     scene: Scene | SceneParts,
