@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from jaxlidar import extend, io
 from jaxlidar._checks import UnitWarning
 from jaxlidar._constants import SPEED_OF_LIGHT
+from jaxlidar._deprecated import renamed
 from jaxlidar._progress import Progress
 from jaxlidar._registry import register_public_objects, waveform_html
 from jaxlidar._workers import LostWorkersWarning
@@ -30,7 +31,7 @@ from jaxlidar.instrument.pulse import (
 from jaxlidar.instrument.receiver import Receiver, first_return_window, record
 from jaxlidar.instrument.scan import AbstractScan, Conical, Oscillating, RotatingPolygon
 from jaxlidar.instrument.survey import Survey
-from jaxlidar.io.netcdf import open, repeat
+from jaxlidar.io.netcdf import open, rerun
 from jaxlidar.optics.coefficients import load_coefficients
 from jaxlidar.optics.laws import AbstractLaw, AbstractMirror, EqualAngle, Lambertian, Specular
 from jaxlidar.optics.leaf import LeafOptics
@@ -159,7 +160,7 @@ __all__ = [
     "read_spectrum_csv",
     "record",
     "reduce",
-    "repeat",
+    "rerun",
     "shrub",
     "simulate",
     "simulate_many",
@@ -177,6 +178,9 @@ __all__ = [
 ]
 
 
+# Old public names, with the new one of each; using them warns.
+_RENAMED = {"repeat": "rerun"}
+
 # Tables of TOML files (`jaxlidar.io.read_case`) name classes as they are exported here.
 register_public_objects({name: globals()[name] for name in __all__ if name != "plot"})
 
@@ -192,4 +196,6 @@ def _waveform_html(wave: Waveform) -> str:
 def __getattr__(name: str) -> Any:
     if name == "plot":
         return importlib.import_module("jaxlidar.plot")
+    if name in _RENAMED:
+        return renamed(f"jaxlidar.{name}", f"jaxlidar.{_RENAMED[name]}", globals()[_RENAMED[name]])
     raise AttributeError(f"module 'jaxlidar' has no attribute {name!r}")

@@ -100,7 +100,7 @@ class Waveform(eqx.Module):
         **Arguments:**
 
         - `path`: the file to write.
-        - `case`: the `jaxlidar.io.Case` that was simulated, so that `jaxlidar.repeat` can do it again.
+        - `case`: the `jaxlidar.io.Case` that was simulated, so that `jaxlidar.rerun` can do it again.
           Default None: not kept.
 
         **Raises:** what `jaxlidar.io.save` raises.

@@ -75,7 +75,7 @@ def simulate_many(
     - `max_orders`: number of scatterings followed, at least 1. Default None: from `rtol` and the largest
       albedo.
     - `path`: a netCDF file, or a Zarr store (".zarr"), for the waveforms, which appears when all are done,
-      with its case, so that `jaxlidar.repeat` can do them again. Until then the folder "PATH.parts" keeps the
+      with its case, so that `jaxlidar.rerun` can do them again. Until then the folder "PATH.parts" keeps the
       shots that are done; the same call goes on with them, also after it was killed. Where the file is there
       already, it is read. Only some shots are in memory at a time, also of a netCDF file that is returned:
       see `jaxlidar.open`. Default None: no file.
