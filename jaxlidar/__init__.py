@@ -15,6 +15,7 @@ from jaxlidar._checks import UnitWarning
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._deprecated import renamed
 from jaxlidar._progress import Progress
+from jaxlidar._registry import register_public_objects, waveform_html
 from jaxlidar._workers import LostWorkersWarning
 from jaxlidar.analog import AnalogReturns, analog_returns, photon_paths
 from jaxlidar.energy import EnergyBudget, energy_budget
@@ -30,7 +31,7 @@ from jaxlidar.instrument.pulse import (
 from jaxlidar.instrument.receiver import Receiver, first_return_window, record
 from jaxlidar.instrument.scan import AbstractScan, Conical, Oscillating, RotatingPolygon
 from jaxlidar.instrument.survey import Survey
-from jaxlidar.io.netcdf import open, repeat
+from jaxlidar.io.netcdf import open, rerun
 from jaxlidar.optics.coefficients import load_coefficients
 from jaxlidar.optics.laws import AbstractLaw, AbstractMirror, EqualAngle, Lambertian, Specular
 from jaxlidar.optics.leaf import LeafOptics
@@ -159,7 +160,7 @@ __all__ = [
     "prospect_spectra",
     "read_spectrum_csv",
     "record",
-    "repeat",
+    "rerun",
     "shrub",
     "simulate",
     "simulate_many",
@@ -180,12 +181,23 @@ __all__ = [
 # Names of version 0.2 by their new names; they go with version 0.4.
 _RENAMED = {
     "reduce": "make_setup",
+    "repeat": "rerun",
     "total_of": "total_reflectance",
 }
 
+# Tables of TOML files (`jaxlidar.io.read_case`) name classes as they are exported here.
+register_public_objects({name: globals()[name] for name in __all__ if name != "plot"})
+
+
+# matplotlib takes a while to import: only for those who draw.
+@waveform_html.register
+def _waveform_html(wave: Waveform) -> str:
+    from jaxlidar.plot.html import waveform_html
+
+    return waveform_html(wave)
+
 
 def __getattr__(name: str) -> Any:
-    # matplotlib takes a while to import: only for those who draw.
     if name == "plot":
         return importlib.import_module("jaxlidar.plot")
     return renamed(name, _RENAMED, globals(), __name__)

@@ -5,7 +5,7 @@ import pytest
 
 import jaxlidar as jl
 
-NAMES = {"reduce": "make_setup", "total_of": "total_reflectance"}
+NAMES = {"reduce": "make_setup", "repeat": "rerun", "total_of": "total_reflectance"}
 
 
 @pytest.mark.parametrize("old", NAMES)

@@ -8,7 +8,6 @@ with the emitted energy E_t, the efficiency eta and the area A_r of the aperture
 """
 
 import dataclasses
-import importlib
 import os
 from typing import Any, final
 
@@ -20,6 +19,7 @@ from jaxtyping import Array, Float
 from jaxlidar._checks import briefly, check_range, is_traced
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._deprecated import renamed_property
+from jaxlidar._registry import save_result, waveform_html
 from jaxlidar._summary import summary
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.instrument.receiver import first_return_window, record
@@ -123,13 +123,12 @@ class Waveform(eqx.Module):
         **Arguments:**
 
         - `path`: the file to write.
-        - `case`: the `jaxlidar.io.Case` that was simulated, so that `jaxlidar.repeat` can do it again.
+        - `case`: the `jaxlidar.io.Case` that was simulated, so that `jaxlidar.rerun` can do it again.
           Default None: not kept.
 
         **Raises:** what `jaxlidar.io.save` raises.
         """
-        # Files lie above the core, which asks for them by name.
-        importlib.import_module("jaxlidar.io.netcdf").save(self, path, case)
+        save_result(self, path, case)
 
     def __str__(self) -> str:
         if any(is_traced(x) for x in (self.time, self.reflectance)):
@@ -140,7 +139,7 @@ class Waveform(eqx.Module):
         """What notebooks show: the summary and a small figure."""
         if any(is_traced(x) for x in (self.time, self.reflectance)):
             return None
-        return importlib.import_module("jaxlidar.plot.html").waveform_html(self)
+        return waveform_html(self)
 
 
 def total_reflectance(response: Response, setup: Setup) -> Float[Array, "wavelengths samples"]:

@@ -171,7 +171,7 @@ class Waveforms(eqx.Module):
         **Arguments:**
 
         - `path`: the file to write. It appears when it is whole.
-        - `case`: the `jaxlidar.io.Case` of the survey that was simulated, so that `jaxlidar.repeat` can do it
+        - `case`: the `jaxlidar.io.Case` of the survey that was simulated, so that `jaxlidar.rerun` can do it
           again. Default None: not kept.
 
         **Raises:** what `jaxlidar.io.save` raises.
