@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxlidar._checks import briefly, check_choice, check_integer, check_key, check_range, known_number
+from jaxlidar._checks import briefly, check_choice, check_integer, check_key, check_range, concrete_number
 from jaxlidar._programs import Program
 from jaxlidar._progress import Progress
 from jaxlidar._statistics import Moments, batches_needed
@@ -182,7 +182,7 @@ def _with_longest_flights(setup: Setup) -> Setup:
     if canopy is None or canopy.sides == "open":
         return setup
     lengths = PathLengths(setup.lidar, setup.scene)
-    height = known_number(canopy.voxels.voxel_size[2]) * canopy.voxels.shape[2]
+    height = concrete_number(canopy.voxels.voxel_size[2]) * canopy.voxels.shape[2]
     max_flight = min(MAX_FLIGHT_HEIGHTS * height, lengths.longest_march)
     plan = plan.with_limits(max_flight=max_flight).with_config(max_faces=lengths.voxels_along(max_flight))
     return dataclasses.replace(setup, plan=plan)

@@ -26,7 +26,7 @@ from jaxlidar._checks import (
     check_number,
     check_range,
     check_shape,
-    known_number,
+    concrete_number,
 )
 from jaxlidar._files import atomic_write
 from jaxlidar.instrument.lidar import Lidar
@@ -154,7 +154,7 @@ def write_gedi_l1b(
     if key is not None:
         check_key(key)
     per_joule = gain / _energy_per_reflectance(survey)
-    background = known_number(survey.lidar.receiver.background)
+    background = concrete_number(survey.lidar.receiver.background)
     sent, reference = _sent(survey.lidar)
     columns = {
         "shot_number": _numbers(shot_number, beams),

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 
 import jax
 
-from jaxlidar._checks import is_traced, known_number
+from jaxlidar._checks import concrete_number, is_traced
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._summary import percent
 from jaxlidar.instrument.field_of_view import EDGE
@@ -120,23 +120,23 @@ def _bound_functions(bounds: Bounds, bins: TimeBins, start_distance: float) -> d
 
 def _sized_reasons(lidar: Lidar, scene: Scene) -> dict[str, str]:
     """Return reasons that state the size of an effect, for those that have one."""
-    radius = known_number(lidar.footprint_radius)
-    slope = known_number(scene.ground.slope) if isinstance(scene.ground, Ground) else 0.0
+    radius = concrete_number(lidar.footprint_radius)
+    slope = concrete_number(scene.ground.slope) if isinstance(scene.ground, Ground) else 0.0
     spread = radius * math.tan(math.radians(slope)) / SPEED_OF_LIGHT
     view = lidar.field_of_view
     air = scene.atmosphere
     hotspot = scene.canopy is not None and scene.canopy.hotspot
     reasons = {
         "slope spread": f"{slope:g} degrees: {spread:.2g} ns (standard deviation)",
-        "divergence": f"{known_number(lidar.divergence):g} mrad: a footprint of radius {radius:.3g} m",
+        "divergence": f"{concrete_number(lidar.divergence):g} mrad: a footprint of radius {radius:.3g} m",
         "field of view": f"a soft edge of {percent(EDGE)}"
         if view is None or is_traced(view)
-        else f"{known_number(view):g} mrad, with a soft edge of {percent(EDGE)}",
+        else f"{concrete_number(view):g} mrad, with a soft edge of {percent(EDGE)}",
         "hot spot": "back through the same gap: exp(-tau)"
         if hotspot
         else "paths in and out are independent: exp(-2 tau)",
         "atmospheric backscatter": "above the scene",
-        "jitter": f"{known_number(lidar.jitter):g} ns",
+        "jitter": f"{concrete_number(lidar.jitter):g} ns",
     }
     if scene.canopy is None:
         reasons["hot spot"] = "not in the scene"

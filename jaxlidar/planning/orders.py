@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxlidar._checks import concrete, known_array
+from jaxlidar._checks import concrete, concrete_array
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar.planning.channels import MaterialOptics, largest_albedo
 from jaxlidar.planning.effects import can_light_itself
@@ -78,7 +78,7 @@ def mean_depth(canopy: Canopy) -> float:
         if values is None:
             return math.inf
         extinction += values.sum(axis=2, dtype=float)
-    columns = extinction * known_array(canopy.voxels.voxel_size)[2]
+    columns = extinction * concrete_array(canopy.voxels.voxel_size)[2]
     occupied = columns[columns > 0]
     return float(occupied.mean()) if occupied.size else 0.0
 
@@ -146,7 +146,7 @@ def multiple_scattering_tail(
     time_between = 0.5 * (last_return - first_return)
     if scene.canopy is not None:
         depth = mean_depth(scene.canopy)
-        size, shape = known_array(scene.canopy.voxels.voxel_size), scene.canopy.voxels.shape
+        size, shape = concrete_array(scene.canopy.voxels.voxel_size), scene.canopy.voxels.shape
         height = float(size[2]) * shape[2]
         time_between = height / max(depth, 0.5) / SPEED_OF_LIGHT if math.isfinite(depth) else time_between
     if fraction >= 1:

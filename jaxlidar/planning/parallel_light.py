@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from jaxlidar._checks import known_number
+from jaxlidar._checks import concrete_number
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar.instrument.survey import Survey
 
@@ -23,8 +23,8 @@ def parallel_light(survey: Survey, start_distance: float, last: float) -> float:
     lidar = survey.lidar
     distance, radius = float(survey.slant_range.min()), float(survey.footprint_radius.max())
     height = max(abs(start_distance), 0.5 * SPEED_OF_LIGHT * abs(last))
-    interval = known_number(lidar.sampling_interval) / math.sqrt(12.0)
-    lasts = math.hypot(known_number(lidar.pulse.std), known_number(lidar.jitter), interval)
+    interval = concrete_number(lidar.sampling_interval) / math.sqrt(12.0)
+    lasts = math.hypot(concrete_number(lidar.pulse.std), concrete_number(lidar.jitter), interval)
     late = 0.5 * radius**2 / distance / SPEED_OF_LIGHT / lasts
     narrower = 1.5 if lidar.field_of_view is None else 3.5
     return min(narrower * height / distance + late + radius / distance, 1.0)

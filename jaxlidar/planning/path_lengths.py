@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from jaxlidar._checks import known_array, known_number
+from jaxlidar._checks import concrete_array, concrete_number
 from jaxlidar._vectors import FAR
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.instrument.survey import Survey
@@ -50,8 +50,8 @@ class PathLengths:
                 crossings.append(crossed[met])
         if scene.canopy is not None:
             v = scene.canopy.voxels
-            self.size, self.shape = known_array(v.voxel_size), np.array(v.shape)
-            low = known_array(v.origin)[2]
+            self.size, self.shape = concrete_array(v.voxel_size), np.array(v.shape)
+            low = concrete_array(v.origin)[2]
             for z in (low, low + self.size[2] * self.shape[2]):
                 crossings.append((z - points[:, 2]) / self.rays[:, 2])
         distances = np.concatenate(crossings) if crossings else np.zeros(1)
@@ -61,7 +61,7 @@ class PathLengths:
         self.start_distance = 0.05 * (farthest - nearest) + 1e-3 - nearest
         lowest = float(np.min(slant))
         if self.start_distance >= lowest:
-            altitude = known_number(lidar.altitude)
+            altitude = concrete_number(lidar.altitude)
             raise ValueError(
                 f"altitude = {altitude:g} m: the scene reaches up to the sensor; "
                 f"admissible is more than {altitude + self.start_distance - lowest:g} m"

@@ -5,7 +5,7 @@ import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from jaxlidar._checks import check_choice, check_integer, check_range, known_array, known_number
+from jaxlidar._checks import check_choice, check_integer, check_range, concrete_array, concrete_number
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.instrument.survey import Survey
@@ -260,7 +260,7 @@ def plan(
         check_range("max_memory", max_memory, 0.0, low_open=True)
     check_choice("footprint", footprint, ("random", "fixed"))
     check_on_terrain(lidar if survey is None else survey, scene)
-    survey = None if survey is None else survey.about(known_array(lidar.position))
+    survey = None if survey is None else survey.about(concrete_array(lidar.position))
     lidar, scene = about_aim(lidar, scene)
     # 1. Effects: leaf or bark that is zero everywhere and relief of flat terrain are off, then what the user
     # switches off. The table compares with everything else in place.
@@ -284,9 +284,9 @@ def plan(
     orders = order_choice.count
     steps = order_steps(orders, n_plates, n_channels)
     # 3. Time: fine bins from the pulse's features, samples from the window.
-    jitter, interval = known_number(lidar.jitter), known_number(lidar.sampling_interval)
-    pulse_feature = math.hypot(known_number(lidar.pulse.finest), jitter)
-    pulse_duration = math.hypot(known_number(lidar.pulse.std), jitter)
+    jitter, interval = concrete_number(lidar.jitter), concrete_number(lidar.sampling_interval)
+    pulse_feature = math.hypot(concrete_number(lidar.pulse.finest), jitter)
+    pulse_duration = math.hypot(concrete_number(lidar.pulse.std), jitter)
     first_return, last_return = geometry.first / SPEED_OF_LIGHT, geometry.last / SPEED_OF_LIGHT
     tail = multiple_scattering_tail(scene, optics, first_return, last_return) if orders > 1 else 0.0
     target_width = fine_bin(interval, pulse_feature, pulse_duration, bin_width)
@@ -313,7 +313,7 @@ def plan(
         bark=scatterers.bark,
         surfaces=scatterers.surfaces,
         covers_fully=tuple(
-            not isinstance(s, AbstractSheet) or known_number(s.coverage) == 1.0 for s in scene.surfaces
+            not isinstance(s, AbstractSheet) or concrete_number(s.coverage) == 1.0 for s in scene.surfaces
         ),
         mirrors=tuple(isinstance(s.law, AbstractMirror) for s in scene.surfaces),
         has_ground=scene.ground is not None,

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Iterator, Sequence
 
-from jaxlidar._checks import known_number
+from jaxlidar._checks import concrete_number
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.optics.laws import AbstractMirror
@@ -78,15 +78,15 @@ def _misfit_materials(plan: Plan, lidar: Lidar, scene: Scene) -> Iterator[str]:
     impossible = ", ".join(sorted(set(config.channels) - possible))
     if impossible:
         yield f"it has {impossible}; what the scene transmits is not scattered"
-    has_gaps = [isinstance(s, AbstractSheet) and known_number(s.coverage) < 1 for s in scene.surfaces]
+    has_gaps = [isinstance(s, AbstractSheet) and concrete_number(s.coverage) < 1 for s in scene.surfaces]
     if any(full and partial for full, partial in zip(config.covers_fully, has_gaps)):
         yield "it has plates that cover everything; the scene's have gaps"
     if config.mirrors != tuple(isinstance(s.law, AbstractMirror) for s in scene.surfaces):
         yield "its surfaces and the scene's differ in which are mirrors"
     if config.hotspot != (scene.canopy is not None and scene.canopy.hotspot):
         yield f"it has hotspot = {config.hotspot}; the canopy has not"
-    if config.vertical and known_number(lidar.zenith) != 0:
-        yield f"it is for a beam at nadir; zenith = {known_number(lidar.zenith):g} degrees"
+    if config.vertical and concrete_number(lidar.zenith) != 0:
+        yield f"it is for a beam at nadir; zenith = {concrete_number(lidar.zenith):g} degrees"
     if config.smooth_footprint and not only_planes(scene):
         yield "it is for planes; the scene has more"
     albedo = largest_albedo(optics)
@@ -141,11 +141,12 @@ def _misfit_times(plan: Plan, lidar: Lidar, scene: Scene) -> Iterator[str]:
 
 def _misfit_pulse(plan: Plan, lidar: Lidar, scene: Scene) -> Iterator[str]:
     """Yield misfits in the pulse, and in its sampling."""
-    interval = known_number(lidar.sampling_interval)
+    interval = concrete_number(lidar.sampling_interval)
     if lidar.receiver.window == "fixed" and abs(plan.sample_interval - interval) > _ROUNDING * interval:
         yield f"it has samples of {plan.sample_interval:g} ns; sampling_interval = {interval:g} ns"
-    jitter = known_number(lidar.jitter)
-    feature, planned_feature = math.hypot(known_number(lidar.pulse.finest), jitter), plan.scope.pulse_feature
+    jitter = concrete_number(lidar.jitter)
+    feature = math.hypot(concrete_number(lidar.pulse.finest), jitter)
+    planned_feature = plan.scope.pulse_feature
     if feature < planned_feature * (1 - _ROUNDING):
         yield (
             f"its fine bins suit pulses with features of {planned_feature:.3g} ns; the lidar's pulse has "

@@ -4,7 +4,7 @@ import dataclasses
 import math
 from typing import NamedTuple
 
-from jaxlidar._checks import known_number
+from jaxlidar._checks import concrete_number
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.planning.config import KERNEL_BINS, TimeBins
@@ -42,8 +42,8 @@ def times_of(
 
     `tail` is the time, ns, during which multiple scattering is recorded after the last return of first order.
     """
-    interval = known_number(lidar.sampling_interval)
-    low, high = lidar.pulse.support(known_number(lidar.jitter))
+    interval = concrete_number(lidar.sampling_interval)
+    low, high = lidar.pulse.support(concrete_number(lidar.jitter))
     bins_per_sample = max(math.ceil(interval / target - 1e-6), 1)
     width = interval / bins_per_sample
     if lidar.receiver.window == "first return":
@@ -76,7 +76,7 @@ def times_of(
 
 def with_air(bins: TimeBins, lidar: Lidar, samples: SampleTimes) -> TimeBins:
     """Extend bins back to where the air's own return would begin, whether it is simulated or not."""
-    _, high = lidar.pulse.support(known_number(lidar.jitter))
+    _, high = lidar.pulse.support(concrete_number(lidar.jitter))
     missing = math.ceil((bins.start - (samples.start - samples.interval - high)) / bins.width) + 3
     added = max(missing, 0)
     return dataclasses.replace(bins, start=bins.start - added * bins.width, count=bins.count + added)

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from jaxlidar._checks import known_array
+from jaxlidar._checks import concrete_array
 from jaxlidar.instrument.survey import Survey
 from jaxlidar.planning.local_origin import about_aim
 from jaxlidar.planning.plan import DEFAULT_RTOL, Plan
@@ -36,7 +36,7 @@ def prepared(
     setup = make_setup(middle, scene, plan)
     lidar, _ = about_aim(middle, scene)
     # A scene that cannot be moved keeps its coordinates, and the lidar its place.
-    moved = survey.about(known_array(middle.position) - known_array(lidar.position))
+    moved = survey.about(concrete_array(middle.position) - concrete_array(lidar.position))
     light = sharing(moved, setup, rtol, shared)
     if light is None:
         return OneByOne(setup, moved, rtol)
@@ -47,7 +47,7 @@ def _rays(plan: Plan, survey: Survey, scene: Scene, rtol: float) -> int:
     """Rays of a footprint per batch: enough for the tolerance, and not many for each column of voxels."""
     most = 10.0 / rtol
     if scene.canopy is not None:
-        edge = float(np.min(known_array(scene.canopy.voxels.voxel_size)[:2]))
+        edge = float(np.min(concrete_array(scene.canopy.voxels.voxel_size)[:2]))
         columns = (1.0 + 2.0 * float(np.max(survey.footprint_radius)) / edge) ** 2
         most = min(most, 32.0 * columns)
     return min(_power_of_two(most, 64, 4096), plan.n_rays)

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy import spatial
 
-from jaxlidar._checks import known_number
+from jaxlidar._checks import concrete_number
 from jaxlidar.instrument.survey import Survey
 from jaxlidar.planning.size_buckets import size_bucket
 from jaxlidar.survey.irradiance import Section, section_of
@@ -50,7 +50,7 @@ class Views(NamedTuple):
         """The views of a survey whose shots have one direction."""
         lidar, slant = survey.lidar, float(survey.slant_range[0])
         field = lidar.field_of_view
-        field = None if field is None else 0.5e-3 * known_number(field) * slant
+        field = None if field is None else 0.5e-3 * concrete_number(field) * slant
         found = Views(
             section_of(survey),
             survey.position,
