@@ -16,7 +16,7 @@ def percent(fraction: float) -> str:
 
 def late_fraction(wave: Any) -> float:
     """Return the largest fraction, of all wavelengths, of light that is in flight when the record ends."""
-    return float(np.max(np.asarray(wave.ledger["after the window"]), initial=0.0))
+    return float(np.max(np.asarray(wave.energy_budget["after the window"]), initial=0.0))
 
 
 def truncated_fraction(wave: Any) -> float:
@@ -37,7 +37,7 @@ def summary(wave: Any) -> str:
         "apparent reflectance": [f"{r:.4g}" for r in total[:n_columns]],
         **{
             f"{name} (% of the light)": [f"{100 * float(f):.3g}" for f in np.asarray(fractions)[:n_columns]]
-            for name, fractions in wave.ledger.items()
+            for name, fractions in wave.energy_budget.items()
             # Fates that would be printed as 0.00 % are left out.
             if name != "returned" and np.max(np.asarray(fractions)) >= 5e-5
         },

@@ -25,7 +25,6 @@ Sources: Neumann et al. (2019), Remote Sens. Environ. 233, 111325, and Martino e
 arrivals between dead times.
 """
 
-import importlib
 import os
 from collections.abc import Iterator
 from typing import Any, ClassVar, NamedTuple, final
@@ -48,6 +47,7 @@ from jaxlidar._checks import (
 )
 from jaxlidar._constants import PLANCK_TIMES_LIGHT, SPEED_OF_LIGHT
 from jaxlidar._ranges import FRACTION, Range, check_ranges
+from jaxlidar._registry import save_result
 
 # More events would exceed the memory; more arrivals could not be counted exactly in double precision.
 _MAX_EVENTS = 1e8
@@ -182,8 +182,7 @@ class PhotonEvents(eqx.Module):
 
         **Raises:** what `jaxlidar.io.save` raises.
         """
-        # Files lie above the core, which asks for them by name.
-        importlib.import_module("jaxlidar.io.netcdf").save(self, path)
+        save_result(self, path)
 
 
 class _PixelRate(NamedTuple):

@@ -34,7 +34,7 @@ from jaxlidar.instrument.survey import Survey
 from jaxlidar.io.checks import MOST_COUNTS
 from jaxlidar.io.gedi_places import geolocation, reference_system
 from jaxlidar.io.netcdf import version
-from jaxlidar.waveform import Waveform, received
+from jaxlidar.spectral.waveform import Waveform, energy_per_reflectance
 
 # The beams' groups: the number of the laser's channel, and whether the laser's full power is in the beam.
 BEAMS = {
@@ -283,7 +283,7 @@ def _energy_per_reflectance(survey: Survey) -> np.ndarray:
     """J of a sample per apparent reflectance of it, at the reference plane, (shots,)."""
     plane = jnp.zeros(1)
     upright = dataclasses.replace(survey.lidar, zenith=0.0)
-    return float(received(upright, plane)[0, 0]) * np.cos(np.deg2rad(survey.zenith)) ** 2
+    return float(energy_per_reflectance(upright, plane)[0, 0]) * np.cos(np.deg2rad(survey.zenith)) ** 2
 
 
 def _numbers(given: Any, beams: np.ndarray) -> np.ndarray:

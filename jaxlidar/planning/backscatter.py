@@ -35,11 +35,13 @@ def footprint_rays(lidar: Lidar) -> tuple[Rays, PerRay]:
 
 
 @eqx.filter_jit
-def _view_factor(law: AbstractLaw | AbstractPhase, incident: Vec, normal: Vec, half_angle: Array) -> Array:
+def _intensity_factor(
+    law: AbstractLaw | AbstractPhase, incident: Vec, normal: Vec, half_angle: Array
+) -> Array:
     back = scale(incident, jnp.asarray(-1.0))
     if isinstance(law, AbstractPhase):
-        return law.view_factor(incident, back)
-    return law.view_factor(incident, normal, back, half_angle)
+        return law.intensity_factor(incident, back)
+    return law.intensity_factor(incident, normal, back, half_angle)
 
 
 def backscatter(
@@ -56,5 +58,5 @@ def backscatter(
     # In double precision: bounds are ratios of sums of these.
     with jax.enable_x64(True):
         incident, upward = (vec(jnp.asarray(a)) for a in (rays.T, lit.T))
-        found = np.asarray(_view_factor(law, incident, upward, jnp.asarray(half_angle)), float)
+        found = np.asarray(_intensity_factor(law, incident, upward, jnp.asarray(half_angle)), float)
     return np.where(below & (not two_sided), 0.0, found)

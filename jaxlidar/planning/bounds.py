@@ -19,8 +19,8 @@ from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.optics.facets import FACET_BACKSCATTER
 from jaxlidar.optics.laws import AbstractMirror
 from jaxlidar.planning.backscatter import PerRay, Rays, backscatter, footprint_rays
-from jaxlidar.planning.scatterers import scene_optics
-from jaxlidar.planning.trace_plan import Bins
+from jaxlidar.planning.channels import scene_optics
+from jaxlidar.planning.config import TimeBins
 from jaxlidar.scenes.canopy import Canopy
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.surfaces import AbstractSheet, AbstractSurface
@@ -78,11 +78,11 @@ class Bounds:
         """Largest view factor of what a material scatters, for any two directions."""
         canopy = self.scene.canopy
         if name not in ("leaf", "bark"):
-            return self.surface[name].law.largest_view_factor(self.half_angle)
+            return self.surface[name].law.largest_intensity_factor(self.half_angle)
         assert canopy is not None
         phase = canopy.leaf_phase if name == "leaf" else canopy.bark_phase
         if phase is not None:
-            return phase.largest_view_factor()
+            return phase.largest_intensity_factor()
         # Spherically oriented facets are brightest straight back.
         return 1.0 if name == "leaf" and canopy.voxels.leaf_angles is not None else FACET_BACKSCATTER
 
@@ -283,9 +283,8 @@ class Bounds:
     def _lowest(self, canopy: Canopy) -> PerRay:
         """Distance along rays to the bottom of the lowest layer that is not empty."""
         empty = np.argmax(self._layers(canopy) > 0)
-        bottom = (
-            concrete_array(canopy.voxels.origin)[2] + concrete_number(canopy.voxels.voxel_size[2]) * empty
-        )
+        layer = concrete_number(canopy.voxels.voxel_size[2])
+        bottom = concrete_array(canopy.voxels.origin)[2] + layer * empty
         return (bottom - concrete_number(self.lidar.altitude)) / self.rays[:, 2]
 
     def _change(
@@ -367,17 +366,14 @@ class Bounds:
     def _depth(self, canopy: Canopy, name: str | None = None) -> float:
         """Largest optical depth along any ray."""
         steepest = float(np.min(np.abs(self.rays[:, 2])))
-        return (
-            float(np.sum(self._layers(canopy, name)))
-            * concrete_number(canopy.voxels.voxel_size[2])
-            / steepest
-        )
+        layer = concrete_number(canopy.voxels.voxel_size[2])
+        return float(np.sum(self._layers(canopy, name))) * layer / steepest
 
-    def extinction(self, bins: Bins, upstream: float) -> float:
+    def extinction(self, bins: TimeBins, start_distance: float) -> float:
         """Extinction, two-way, to the last bin; without it the air's own return is left out too."""
-        return max(self.lost(bins), self.backscatter(bins, upstream))
+        return max(self.lost(bins), self.backscatter(bins, start_distance))
 
-    def lost(self, bins: Bins) -> float:
+    def lost(self, bins: TimeBins) -> float:
         """Share that the air takes of the light with the longest way."""
         air = self.scene.atmosphere
         if air is None:
@@ -385,19 +381,19 @@ class Bounds:
         depth = air.two_way_transmittance(self.lidar.wavelength, self._heights(bins)[-1], *self._where())
         return 1.0 - float(np.min(concrete_array(depth)))
 
-    def backscatter(self, bins: Bins, upstream: float) -> float:
+    def backscatter(self, bins: TimeBins, start_distance: float) -> float:
         """The air's own return within the bins, relative to it and the least return of the scene."""
         air = self.scene.atmosphere
         if air is None or air.lidar_ratio is None:
             return 0.0
         heights = self._heights(bins)
         per_metre = concrete_array(air.backscatter(self.lidar.wavelength, heights, *self._where()))
-        above = heights > upstream * abs(self.axis[2])
+        above = heights > start_distance * abs(self.axis[2])
         own = np.sum(np.where(above, per_metre, 0.0), axis=1) * 0.5 * SPEED_OF_LIGHT * bins.width
         rest = self._returns()[0] * self._through() ** 2 * (1.0 - self.outside) * (1.0 - self.lost(bins))
         return _worst(_share(own, rest))
 
-    def _heights(self, bins: Bins) -> np.ndarray:
+    def _heights(self, bins: TimeBins) -> np.ndarray:
         time = bins.start + bins.width * np.arange(bins.count)
         highest = 0.999 * concrete_number(self.lidar.altitude)
         return np.minimum(-0.5 * SPEED_OF_LIGHT * time * abs(self.axis[2]), highest)

@@ -6,7 +6,7 @@ shown and nothing is saved. The package, and matplotlib with it, is imported whe
 
 from jaxlidar._signatures import shorten_signatures
 from jaxlidar.plot.fits import fit, residuals
-from jaxlidar.plot.light import accuracy, ledger
+from jaxlidar.plot.light import accuracy, energy_budget
 from jaxlidar.plot.photon_events import photons
 from jaxlidar.plot.scenes import scene
 from jaxlidar.plot.spectra import spectrum
@@ -18,7 +18,7 @@ __all__ = [
     "accuracy",
     "fit",
     "leaf_on_and_off",
-    "ledger",
+    "energy_budget",
     "photons",
     "residuals",
     "scene",

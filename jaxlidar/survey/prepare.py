@@ -1,6 +1,5 @@
 """The way in which the shots of a survey are traced over one scene."""
 
-import dataclasses
 import math
 
 import numpy as np
@@ -10,7 +9,7 @@ from jaxlidar.instrument.survey import Survey
 from jaxlidar.planning.local_origin import about_aim
 from jaxlidar.planning.plan import DEFAULT_RTOL, Plan
 from jaxlidar.planning.plan import plan as make_plan
-from jaxlidar.planning.setup import reduce
+from jaxlidar.planning.setup import make_setup
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.survey.sharing import sharing
 from jaxlidar.survey.ways import AbstractWay, OneByOne, SharedLight
@@ -30,11 +29,11 @@ def prepared(
     """
     plan = make_plan(survey, scene, rtol=rtol, max_orders=max_orders, window=window, describe=False)
     rtol = DEFAULT_RTOL if rtol is None else float(rtol)
-    plan = dataclasses.replace(
-        plan, n_rays=_rays(plan, survey, scene, rtol), n_photons=_power_of_two(0.8 / rtol**2, 256, 8192)
+    plan = plan.with_config(
+        n_rays=_rays(plan, survey, scene, rtol), n_photons=_power_of_two(0.8 / rtol**2, 256, 8192)
     )
     middle = survey.middle
-    setup = reduce(middle, scene, plan)
+    setup = make_setup(middle, scene, plan)
     lidar, _ = about_aim(middle, scene)
     # A scene that cannot be moved keeps its coordinates, and the lidar its place.
     moved = survey.about(concrete_array(middle.position) - concrete_array(lidar.position))

@@ -83,7 +83,7 @@ def _has_views(survey: Survey) -> bool:
 
 
 def _parallel(survey: Survey, setup: Setup) -> float:
-    return parallel_light(survey, setup.plan.trace.upstream, setup.plan.limits.last)
+    return parallel_light(survey, setup.plan.limits.start_distance, setup.plan.scope.last_return)
 
 
 def _tiles(found: Patches, nodes: Lit, setup: Setup, fewer: float) -> list[Tile]:
