@@ -38,8 +38,8 @@ def footprint_rays(lidar: Lidar) -> tuple[Rays, PerRay]:
 def _view_factor(law: AbstractLaw | AbstractPhase, incident: Vec, normal: Vec, half_angle: Array) -> Array:
     back = scale(incident, jnp.asarray(-1.0))
     if isinstance(law, AbstractPhase):
-        return law.view_factor(incident, back)
-    return law.view_factor(incident, normal, back, half_angle)
+        return law.intensity_factor(incident, back)
+    return law.intensity_factor(incident, normal, back, half_angle)
 
 
 def backscatter(
@@ -49,7 +49,7 @@ def backscatter(
     half_angle: float = 0.0,
     two_sided: bool = False,
 ) -> PerRay:
-    """View factors of rays for light scattered straight back; zero from below, unless `two_sided`."""
+    """Intensity factors of rays for light scattered straight back; zero from below, unless `two_sided`."""
     normal = np.zeros(3) if normal is None else normal
     below = rays @ normal > 0
     lit = np.where(below & two_sided, -1.0, 1.0)[:, None] * normal

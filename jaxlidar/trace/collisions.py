@@ -182,7 +182,7 @@ def shown(setting: Setting, hit: Hit) -> Met:
 
 
 def view_factors(setting: Setting, x: Vec, w: Vec, v: Vec, hit: Met) -> tuple[Scalar, Scalar | None]:
-    """View factors towards `v` of light that collides at `x`, flying along `w`.
+    """Intensity factors towards `v` of light that collides at `x`, flying along `w`.
 
     They are apparent reflectance per unit reflectance, and per unit transmittance (None if nothing
     transmits).
@@ -198,7 +198,7 @@ def view_factors(setting: Setting, x: Vec, w: Vec, v: Vec, hit: Met) -> tuple[Sc
             here = (hit.on < 0) & (hit.material == plan.leaf.material)
             lit, far = front, back
             if medium.leaf_phase is not None:
-                lit = far = medium.leaf_phase.view_factor(w, v)
+                lit = far = medium.leaf_phase.intensity_factor(w, v)
             elif medium.angles is not None:
                 assert hit.normal is not None
                 turned = dot(hit.normal, v)
@@ -206,12 +206,12 @@ def view_factors(setting: Setting, x: Vec, w: Vec, v: Vec, hit: Met) -> tuple[Sc
             reflected, transmitted = jnp.where(here, lit, reflected), jnp.where(here, far, transmitted)
         if plan.bark is not None:
             here = (hit.on < 0) & (hit.material == plan.bark.material)
-            bark = front if medium.bark_phase is None else medium.bark_phase.view_factor(w, v)
+            bark = front if medium.bark_phase is None else medium.bark_phase.intensity_factor(w, v)
             reflected = jnp.where(here, bark, reflected)
     for i, s in enumerate(setting.surfaces):
         here, normal = hit.on == i, s.lit_normal(x, w)
         turned = dot(normal, v)
-        factor = s.by_place(x, s.law.view_factor(w, normal, v, setting.beam.half_angle))
+        factor = s.by_place(x, s.law.intensity_factor(w, normal, v, setting.beam.half_angle))
         reflected = jnp.where(here, jnp.where(turned > 0, factor, 0.0), reflected)
         transmitted = jnp.where(here, jnp.maximum(-turned, 0.0), transmitted)
     return reflected, transmitted if any(transmits) else None

@@ -5,8 +5,8 @@ from the sensor, the return from a stretch of the ray is
 
     f_m * integral of k_m exp(-kappa tau(s)) ds,    kappa = 2, or 1 with the hot spot,
 
-integrated exactly over every piece of the ray that lies within one voxel and one time bin. f_m is the view
-factor for backscatter (`jaxlidar.optics.facets`, `jaxlidar.optics.phase`).
+integrated exactly over every piece of the ray that lies within one voxel and one time bin. f_m is the
+intensity factor for backscatter (`jaxlidar.optics.facets`, `jaxlidar.optics.phase`).
 """
 
 import itertools
@@ -237,7 +237,7 @@ def first_order(
                 continue
             seen = s.by_place(at, beam.in_view(at))
             if mirror is None:
-                seen = s.law.view_factor(w, normal, back, beam.half_angle) * seen
+                seen = s.law.intensity_factor(w, normal, back, beam.half_angle) * seen
             time = 2.0 * (excess + jnp.minimum(met[i], 1e9)) / SPEED_OF_LIGHT
             first, row = instant_row(bins, time, hit * seen * jnp.exp(-kappa * at_stops[i]))
             for history, share in both_ways.terms(table, int(successor[0, scatterer.reflected]), met[i], met):
@@ -293,7 +293,7 @@ def _add(
 
 
 class Part(eqx.Module):
-    """One material of the medium on a ray: its extinction, view factor for backscatter, and letter."""
+    """One material of the medium on a ray: its extinction, intensity factor for backscatter, and letter."""
 
     extinction: Float[Array, "..."]
     backscatter: Float[Array, "..."] | float
@@ -307,7 +307,7 @@ def _parts(medium: Medium, plan: TracePlan, stretch: Stretches, w: Vec) -> Itera
         k = stretch.extinction if medium.bark is None else medium.leaf_at(stretch.cell, w)
         factor = FACET_BACKSCATTER
         if medium.leaf_phase is not None:
-            factor = medium.leaf_phase.view_factor(w, back)
+            factor = medium.leaf_phase.intensity_factor(w, back)
         elif medium.angles is not None:
             factor = medium.angles.square_at(w) / medium.angles.projection_at(w)
         yield plan.leaf.material, Part(k, factor, plan.leaf.reflected)
@@ -315,5 +315,5 @@ def _parts(medium: Medium, plan: TracePlan, stretch: Stretches, w: Vec) -> Itera
         k = stretch.extinction if medium.leaf is None else medium.bark_at(stretch.cell)
         factor = FACET_BACKSCATTER
         if medium.bark_phase is not None:
-            factor = medium.bark_phase.view_factor(w, back)
+            factor = medium.bark_phase.intensity_factor(w, back)
         yield plan.bark.material, Part(k, factor, plan.bark.reflected)

@@ -59,7 +59,7 @@ def scored(
 ) -> Float[Array, "bins columns wavelengths"]:
     """Derivatives of what returns, with those of more photons.
 
-    `pairs`: letters with which light returns, and view factors; `row`: what returns but for these.
+    `pairs`: letters with which light returns, and intensity factors; `row`: what returns but for these.
     """
     scores = setting.scores
     assert scores is not None

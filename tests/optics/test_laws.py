@@ -1,8 +1,8 @@
 """Laws of reflection and phase functions: those that are built in, and Minnaert's, added in a file of its
 own.
 
-Samples are tested against densities (chi-squared over cells of equal solid angle), densities against view
-factors, both for conservation and reciprocity, and returns against the closed form
+Samples are tested against densities (chi-squared over cells of equal solid angle), densities against
+intensity factors, both for conservation and reciprocity, and returns against the closed form
 
     sum of apparent reflectance = R (k + 1) / 2 cos^(2 k - 1)(slope)
 
@@ -129,14 +129,14 @@ def test_laws_conserve_energy_and_agree_with_themselves(name, zenith):
     # The equal-angle density is singular at the normal, and softened there.
     assert np.sum(density * weight) == pytest.approx(1.0, abs=5e-3 if name == "equal-angle" else 1e-4)
     if isinstance(thing, jl.AbstractPhase):
-        seen, albedo, most = thing.view_factor(incident, out), 1.0, thing.largest_view_factor()
+        seen, albedo, most = thing.intensity_factor(incident, out), 1.0, thing.largest_intensity_factor()
     else:
         albedo = np.asarray(thing.albedo(incident, normal), float)
         assert np.all((albedo >= 0) & (albedo <= 1))
         # A wider aperture softens what is seen of the equal-angle singularity.
         half_angle = 2e-4
-        seen = thing.view_factor(incident, normal, out, jnp.asarray(half_angle))
-        most = thing.largest_view_factor(half_angle)
+        seen = thing.intensity_factor(incident, normal, out, jnp.asarray(half_angle))
+        most = thing.largest_intensity_factor(half_angle)
     seen = np.asarray(seen, float)
     np.testing.assert_allclose(seen, np.pi * albedo * density, rtol=2e-3, atol=1e-6)
     assert np.max(seen) <= most * (1 + 1e-5)
@@ -151,7 +151,8 @@ def test_minnaert_is_reciprocal_and_equal_angle_is_not():
     def exchanged(law):
         def brdf(towards, out):
             incident, out = (vec(jnp.asarray(v)) for v in (-towards, out))
-            return np.asarray(law.view_factor(incident, up, out, jnp.asarray(1e-3)) / dot(up, out), float)
+            intensity = law.intensity_factor(incident, up, out, jnp.asarray(1e-3))
+            return np.asarray(intensity / dot(up, out), float)
 
         return np.max(np.abs(brdf(a, b) / brdf(b, a) - 1))
 
@@ -219,8 +220,8 @@ class Forgetful(jl.AbstractLaw):
 
     k: jax.Array
 
-    def view_factor(self, incident, normal, view, half_angle):
-        return Minnaert(self.k).view_factor(incident, normal, view, half_angle)
+    def intensity_factor(self, incident, normal, view, half_angle):
+        return Minnaert(self.k).intensity_factor(incident, normal, view, half_angle)
 
     def albedo(self, incident, normal):
         return Minnaert(self.k).albedo(incident, normal)
@@ -231,8 +232,8 @@ class Forgetful(jl.AbstractLaw):
     def density(self, incident, normal, out):
         return jl.Lambertian().density(incident, normal, out)
 
-    def largest_view_factor(self, half_angle):
-        return Minnaert(self.k).largest_view_factor(half_angle)
+    def largest_intensity_factor(self, half_angle):
+        return Minnaert(self.k).largest_intensity_factor(half_angle)
 
 
 @pytest.mark.slow
