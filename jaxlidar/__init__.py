@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from jaxlidar import extend, io
 from jaxlidar._checks import UnitWarning
 from jaxlidar._constants import SPEED_OF_LIGHT
+from jaxlidar._deprecated import RENAMED, warn_renamed
 from jaxlidar._progress import Progress
 from jaxlidar._workers import LostWorkersWarning
 from jaxlidar.analog import AnalogReturns, analog_returns, photon_paths
@@ -38,17 +39,17 @@ from jaxlidar.optics.leaf_surface import LeafSurface, leaf_surface
 from jaxlidar.optics.phase import AbstractPhase, HenyeyGreenstein, Isotropic
 from jaxlidar.optics.plate_model import plate_model
 from jaxlidar.optics.prospect import Prospect, prospect_jacobian, prospect_spectra
-from jaxlidar.optics.spectra import Spectrum, read_spectrum_csv, spectra, spectrum
+from jaxlidar.optics.spectra import Spectrum, read_spectrum_csv, spectrum, spectrum_names
 from jaxlidar.planning.effects import Effect
 from jaxlidar.planning.plan import Plan, plan
 from jaxlidar.planning.setup import Setup, reduce
 from jaxlidar.plants.forest import forest
-from jaxlidar.plants.habits import Branching, Habit, broadleaf, conifer, grow, shrub, spreading
-from jaxlidar.plants.lsystem import LSystem, Module, Rule, Word
+from jaxlidar.plants.habits import Branching, Habit, broadleaf, conifer, grow, shrub, spreading_tree
+from jaxlidar.plants.lsystem import LSystem, Rule, Symbol, Word
 from jaxlidar.plants.meshes import Mesh, voxelise_mesh
 from jaxlidar.plants.tree import Tree
 from jaxlidar.plants.turtle import turtle
-from jaxlidar.plants.voxelise import crop, voxelise, voxelise_points
+from jaxlidar.plants.voxelise import trim_empty_layers, voxelise, voxelise_points
 from jaxlidar.scenes.atmosphere import Atmosphere
 from jaxlidar.scenes.canopy import Canopy
 from jaxlidar.scenes.scene import Scene
@@ -104,7 +105,6 @@ __all__ = [
     "Lidar",
     "LostWorkersWarning",
     "Mesh",
-    "Module",
     "OffMapWarning",
     "Oscillating",
     "PhotonCounter",
@@ -127,6 +127,7 @@ __all__ = [
     "Spectrum",
     "Survey",
     "SurveyProgress",
+    "Symbol",
     "Terrain",
     "Tree",
     "Truth",
@@ -139,7 +140,6 @@ __all__ = [
     "analog_returns",
     "broadleaf",
     "conifer",
-    "crop",
     "energy_budget",
     "extend",
     "first_return_window",
@@ -162,11 +162,12 @@ __all__ = [
     "shrub",
     "simulate",
     "simulate_many",
-    "spectra",
     "spectrum",
-    "spreading",
+    "spectrum_names",
+    "spreading_tree",
     "total_of",
     "trace_scene",
+    "trim_empty_layers",
     "truth_of",
     "turtle",
     "voxelise",
@@ -180,4 +181,7 @@ def __getattr__(name: str) -> Any:
     # matplotlib takes a while to import: only for those who draw.
     if name == "plot":
         return importlib.import_module("jaxlidar.plot")
+    if name in RENAMED:
+        warn_renamed(f"jaxlidar.{name}", f"jaxlidar.{RENAMED[name]}")
+        return globals()[RENAMED[name]]
     raise AttributeError(f"module 'jaxlidar' has no attribute {name!r}")

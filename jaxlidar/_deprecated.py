@@ -5,7 +5,12 @@ import warnings
 from typing import Any
 
 # Old names of what `jaxlidar` exports, and of kinds in case files, with their new names.
-RENAMED: dict[str, str] = {}
+RENAMED = {
+    "Module": "Symbol",
+    "crop": "trim_empty_layers",
+    "spectra": "spectrum_names",
+    "spreading": "spreading_tree",
+}
 # The same for methods of laws of reflection and phase functions.
 RENAMED_METHODS = {
     "view_factor": "intensity_factor",

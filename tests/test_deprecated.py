@@ -77,3 +77,22 @@ def test_a_phase_function_that_defines_methods_under_their_old_names_works():
     phase = Even(jnp.array(0.5))
     assert phase.intensity_factor(DOWN, UP) == phase.largest_intensity_factor() == 0.25
     assert phase.density(DOWN, UP) == pytest.approx(0.25 / jnp.pi)
+
+
+@pytest.mark.parametrize(
+    ("kind", "voxels"),
+    [
+        ("spreading", 'kind = "voxelise"\nvoxel_size = 2.0\ntrees = {kind = "grow", habit = "spreading"}'),
+        (
+            "crop",
+            'kind = "crop"\nvoxels = {kind = "voxelise", voxel_size = 2.0, trees = {kind = "grow", '
+            'habit = {kind = "shrub", stems = 1}}}',
+        ),
+    ],
+)
+def test_a_case_file_with_the_old_name_of_a_kind_is_read(kind, voxels, tmp_path):
+    path = tmp_path / "case.toml"
+    path.write_text(f'[scene.canopy]\nleaf = "Prospect"\nbark = 0.3\n[scene.canopy.voxels]\n{voxels}\n')
+    with pytest.warns(DeprecationWarning, match=f"kind = '{kind}' is renamed: use kind = '{RENAMED[kind]}'"):
+        case = jl.io.read_case(path)
+    assert case.scene.canopy.voxels.bark.size >= 1
