@@ -12,7 +12,7 @@ import numpy as np
 
 import inversion
 import jaxlidar as jl
-from inversion.receiver.counts import Amplitudes
+from inversion.receiver.digitiser import Amplitudes
 from jaxlidar.io import AirborneShot, Segment, read_las_waveforms, read_neon, read_pulsewaves
 from jaxlidar.io.pedestal import above_pedestal
 
