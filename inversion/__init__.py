@@ -26,6 +26,7 @@ from inversion.metrics.points import EchoPoints, echo_points
 from inversion.receiver.digitiser import Amplitudes, amplitudes, corrected_table
 from inversion.receiver.impulse import receiver_impulse, recorded_pulse
 from inversion.receiver.recorder import Recorder
+from jaxlidar.extend import shorten_signatures
 
 __all__ = [
     "Amplitudes",
@@ -78,3 +79,10 @@ __all__ = [
     "signal_ends",
     "wiener",
 ]
+
+shorten_signatures(globals())
+
+
+def __dir__() -> list[str]:
+    # Public names alone, without the modules and helpers that the imports leave here.
+    return sorted(__all__)
