@@ -19,10 +19,10 @@ ROOT = Path(__file__).resolve().parents[1]
 # fmt: off
 VAGUE_WORDS = {
     "found", "own", "owns", "known", "given", "part", "parts", "whole", "there", "here", "kept", "keep",
-    "both", "its", "it", "more", "less", "many", "much", "some", "few", "other", "others", "rest", "left", "beside",
-    "besides", "asked", "wanted", "going", "done", "begun", "spent", "said", "told", "brief", "abridged",
-    "settled", "settle", "taken", "got", "way", "ways", "thing", "things", "all", "each", "every", "one",
-    "ones", "so", "far", "again", "ready",
+    "both", "its", "it", "more", "less", "many", "much", "some", "few", "other", "others", "rest", "left",
+    "beside", "besides", "asked", "wanted", "going", "done", "begun", "spent", "said", "told", "brief",
+    "abridged", "settled", "settle", "taken", "got", "way", "ways", "thing", "things", "all", "each",
+    "every", "one", "ones", "so", "far", "again", "ready",
 }
 # fmt: on
 QUESTION_WORD = re.compile(r"(What|Whether|How|Where|Which|Why|So|Who|When)\b")
