@@ -11,7 +11,7 @@ import jaxlidar as jl
 from jaxlidar.trace import batches
 from jaxlidar.trace.colouring import total_and_balance
 from jaxlidar.trace.response import trace_setting
-from tests.helpers import applied
+from tests.helpers import with_applied_optics
 
 # The package's name `simulate` is the function.
 simulation = importlib.import_module("jaxlidar.simulate")
@@ -33,7 +33,7 @@ def same(plan):
 
 @pytest.mark.parametrize(
     ("orders", "transmission", "change"),
-    [(1, "diffuse", same), (2, "diffuse", same), (2, "straight", same), (2, "diffuse", applied)],
+    [(1, "diffuse", same), (2, "diffuse", same), (2, "straight", same), (2, "diffuse", with_applied_optics)],
     ids=["one order", "two orders", "straight", "optics applied"],
 )
 def test_a_batch_is_the_trace_of_its_key(orders, transmission, change):
