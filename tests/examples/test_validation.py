@@ -114,8 +114,8 @@ def test_slabs(run):
         tau, _, ground, orders = module.SLABS["1, isotropic 0.9, 0.2"]
         del module.SLABS["1, isotropic 0.9, 0.2"]
         module.SLABS = {"wrong": (tau, module.jl.Isotropic(albedo=0.9), ground, orders)}
-        solved = module.solved
-        module.solved = lambda tau, *arguments: solved(1.05 * tau, *arguments)
+        solve = module.solve
+        module.solve = lambda tau, *arguments: solve(1.05 * tau, *arguments)
 
     wrong = run("discrete_ordinates", "--slabs", "1", "--rtol", "0.003", planted=plant)
     assert not holds(wrong, "reflectance factor")
