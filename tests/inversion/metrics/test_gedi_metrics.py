@@ -21,9 +21,8 @@ RECORD = "GEDI01_B_2019108080338_O01964_T05337_02_003_01_sub.h5"
 def recorded():
     """Shots of which the product's answers are known, in their order, and the answers."""
     pytest.importorskip("h5py")
-    from tests.conftest import SHARED
-
     from jaxlidar.io import read_gedi_l1b
+    from tests.conftest import SHARED
 
     if not (SHARED / "gedi" / RECORD).is_file():
         pytest.skip("the recorded GEDI file is not beside this checkout")
