@@ -105,15 +105,15 @@ def concrete(x: object) -> np.ndarray | None:
         return None
 
 
-def known_number(x: object) -> float:
+def concrete_number(x: object) -> float:
     """A concrete number.
 
     **Raises:** ValueError where `x` is being traced by a JAX transformation.
     """
-    return float(known_array(x))
+    return float(concrete_array(x))
 
 
-def known_array(x: object) -> np.ndarray:
+def concrete_array(x: object) -> np.ndarray:
     """A concrete array, in double precision.
 
     **Raises:** ValueError where `x` is being traced by a JAX transformation.

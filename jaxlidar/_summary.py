@@ -15,7 +15,7 @@ def percent(share: float) -> str:
 
 def late_share(wave: Any) -> float:
     """Largest share, of all wavelengths, of light that is on its way when the record ends."""
-    return float(np.max(np.asarray(wave.ledger["after the window"]), initial=0.0))
+    return float(np.max(np.asarray(wave.energy_budget["after the window"]), initial=0.0))
 
 
 def beyond_share(wave: Any) -> float:
@@ -36,7 +36,7 @@ def summary(wave: Any) -> str:
         "apparent reflectance": [f"{r:.4g}" for r in total[:shown]],
         **{
             f"{name} (% of the light)": [f"{100 * float(s):.3g}" for s in np.asarray(share)[:shown]]
-            for name, share in wave.ledger.items()
+            for name, share in wave.energy_budget.items()
             if name != "returned" and np.max(np.asarray(share)) >= 5e-5
         },
     }

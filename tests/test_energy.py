@@ -96,7 +96,7 @@ def test_a_budget_agrees_with_that_of_a_waveform():
         jl.Lidar(divergence=1.0), scene, key=KEY, n_photons=65536, max_orders=6, window=(-60.0, 400.0)
     )
     for material in ("leaf", "ground"):
-        difference = float(wave.ledger[f"absorbed by {material}"][0] - budget.absorbed[material][0])
+        difference = float(wave.energy_budget[f"absorbed by {material}"][0] - budget.absorbed[material][0])
         assert abs(difference) < 5 * float(budget.stderr[material][0]) + 2e-3
 
 

@@ -54,7 +54,7 @@ def test_waiting_tasks_are_dropped_after_an_error():
 @pytest.mark.parametrize("double", slow_unless([True], [False, True]))
 def test_simulate_keeps_the_precision(double, monkeypatch):
     expected = "float64" if double else "float32"
-    batches, dtypes = sys.modules["jaxlidar.trace.batches"], []
+    batches, dtypes = sys.modules["jaxlidar.sampling.batch_programs"], []
     original_joined = batches.joined
 
     def watched_joined(*args):

@@ -25,13 +25,9 @@ import numpy as np
 from _common import machine, options, plt, print_table, save_figure, write_json
 
 import jaxlidar as jl
-from jaxlidar.planning.alternatives import with_alternatives
-from jaxlidar.planning.sampling import sampling_of
 
 LIDAR = jl.Lidar(wavelength=1064.0, divergence=5.0)
 CONE = 10.0
-# Settings that change the estimator, not the plan.
-ALTERNATIVES = ("first_order", "points", "kernel", "ends")
 TARGETS = (0.1, 0.01, 0.001)
 LEAF = jl.LeafOptics(reflectance=0.45, transmittance=0.45)
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
@@ -48,9 +44,8 @@ class AccuracyCase:
 
     def plan(self, **settings) -> jl.Plan:
         """Return a plan, by default with all orders and otherwise as `jaxlidar.plan` chooses."""
-        alternatives = {name: settings.pop(name) for name in ALTERNATIVES if name in settings}
         defaults = {"max_orders": self.orders, "window": self.window}
-        return with_alternatives(jl.plan(LIDAR, self.scene, **(defaults | settings)), **alternatives)
+        return jl.plan(LIDAR, self.scene, **(defaults | settings))
 
 
 def tree_scene(voxel_size: float) -> jl.Scene:
@@ -100,8 +95,8 @@ def run_batches(
         scene = case.scene if not x64 else jax.tree.map(lambda a: a.astype(float), case.scene)
 
         def batch(scene, key):
-            setup = jl.reduce(LIDAR, scene, plan)
-            return jl.total_of(jl.trace_scene(setup, key), setup)[0]
+            setup = jl.make_setup(LIDAR, scene, plan)
+            return jl.total_reflectance(jl.trace_scene(setup, key), setup)[0]
 
         keys = [jax.random.key(seed + i) for i in range(batches if plan.is_random else 5)]
         start = time.perf_counter()
@@ -124,9 +119,13 @@ def run_batches(
 def run_analog(case: AccuracyCase, photons: int, groups: int) -> BatchRun:
     """Return waveforms of groups of analog photons; a group counts as a batch."""
     plan = case.plan(bin_width=0.5)
-    instant_plan = dataclasses.replace(plan, bins=dataclasses.replace(plan.bins, kernel=0))
-    kernel = np.asarray(sampling_of(LIDAR, instant_plan).matrix(), float)
     edges = plan.bins.start + plan.bins.width * (np.arange(plan.bins.count + 1) - 0.5)
+    # The fraction of a return in the middle of each fine bin that each sample receives.
+    samples = plan.sample_start + plan.sample_interval * np.arange(plan.n_samples)
+    offset = samples[None, :] - 0.5 * (edges[1:] + edges[:-1])[:, None]
+    half = 0.5 * plan.sample_interval
+    upper, lower = (np.asarray(LIDAR.pulse.cumulative(offset + s, 0.0), float) for s in (half, -half))
+    kernel = upper - lower
 
     def group(number):
         returns = jl.analog_returns(
@@ -230,22 +229,17 @@ def deterministic(all_cases: dict[str, AccuracyCase]) -> dict[str, dict]:
     knobs = {}
     ground, stand, tree = (all_cases[n] for n in ("ground", "dense stand", "tree"))
     finest = run_batches(ground, 1, ground.plan(bin_width=1 / 64), x64=True).mean
-    for kernel in (1, 2, 3):
-        knobs[f"fine bin (ns), kernel {kernel}"] = sweep(
-            f"fine bin (ns), kernel of {kernel}",
-            (1.0, 0.5, 0.25, 0.125),
-            lambda v, k=kernel: (ground, ground.plan(bin_width=v, kernel=k), True),
-            finest,
-        )
+    knobs["fine bin (ns)"] = sweep(
+        "fine bin (ns)", (1.0, 0.5, 0.25, 0.125), lambda v: (ground, ground.plan(bin_width=v), True), finest
+    )
     single = {"max_orders": 1, "footprint": "fixed"}
     fine_rays = run_batches(tree, 1, tree.plan(**single, n_rays=131072)).mean
-    for points in ("lattice", "independent"):
-        knobs[f"rays, {points}"] = sweep(
-            f"rays, {points}",
-            (64, 256, 1024, 4096, 16384),
-            lambda v, p=points: (tree, tree.plan(**single | {"points": p}, n_rays=v), False),
-            fine_rays,
-        )
+    knobs["rays"] = sweep(
+        "rays",
+        (64, 256, 1024, 4096, 16384),
+        lambda v: (tree, tree.plan(**single, n_rays=v), False),
+        fine_rays,
+    )
     fine_steps = run_batches(stand, 1, stand.plan(**single, n_rays=64, max_step=0.03), x64=True).mean
     knobs["step (m)"] = sweep(
         "step (m)",
@@ -268,17 +262,13 @@ def deterministic(all_cases: dict[str, AccuracyCase]) -> dict[str, dict]:
 
 
 def random_knobs(name: str, case: AccuracyCase, batches: int, photons: int) -> dict:
-    """Return errors and times of the default, the alternatives, fewer orders and the analog estimator."""
+    """Return errors and times of the default, one deposit a flight, fewer orders and analog photons."""
     size = {"n_photons": photons, "n_rays": 1024}
-    variants = {
-        "default": {},
-        "independent numbers": {"points": "independent"},
-        "drawn first order": {"first_order": "drawn"},
-        "one end a flight": {"ends": 1},
-    }
+    plan = case.plan(**size)
+    plans = {"default": plan, "one deposit a flight": plan.with_config(deposits_per_flight=1)}
     long = run_batches(case, 8 * batches, case.plan(**size, bin_width=0.25), seed=10**6)
     reference = long.mean
-    runs = {key: run_batches(case, batches, case.plan(**size, **v)) for key, v in variants.items()}
+    runs = {key: run_batches(case, batches, variant) for key, variant in plans.items()}
     analog = run_analog(case, 16 * photons, batches)
     record = {
         "reference_error": batch_spread(long, reference) / np.sqrt(len(long.waves)),
@@ -348,24 +338,21 @@ def draw_record(record: dict, path) -> None:
     axes[2, 0].set(xlabel="orders kept", ylabel="bytes of a batch")
     axes[2, 0].legend()
     knobs = {key: results["points"] for key, results in record["knobs"].items()}
-    places = {
-        "fine": axes[1, 1],
+    panels = {
+        "fine bin (ns)": axes[1, 1],
         "rays": axes[1, 2],
-        "step": axes[1, 3],
-        "voxel": axes[2, 1],
+        "step (m)": axes[1, 3],
+        "voxel (m)": axes[2, 1],
         "bits": axes[2, 2],
     }
-    for start, ax in places.items():
-        curves = [(key.split(", ")[-1], points) for key, points in knobs.items() if key.startswith(start)]
-        plot_curves(ax, curves, "value")
-        ax.set(xlabel=next(k for k in knobs if k.startswith(start)).split(", ")[0])
-        ax.set_xticks([p["value"] for p in curves[0][1]], [f"{p['value']:g}" for p in curves[0][1]])
+    for key, ax in panels.items():
+        plot_curves(ax, [(key, knobs[key])], "value")
+        ax.set(xlabel=key)
+        ax.set_xticks([p["value"] for p in knobs[key]], [f"{p['value']:g}" for p in knobs[key]])
         ax.minorticks_off()
-        if len(curves) > 1:
-            ax.legend()
     axes[1, 3].set_ylim(1e-8, 1e-4)
     axes[2, 1].set_ylim(0.05, 1.0)
-    chosen = ("rays, lattice", "step (m)", "voxel (m)", "fine bin (ns), kernel 3")
+    chosen = ("rays", "step (m)", "voxel (m)", "fine bin (ns)")
     plot_curves(axes[2, 3], [(key, knobs[key]) for key in chosen], "seconds")
     axes[2, 3].set(xlabel="seconds", ylim=(1e-7, 1e3))
     axes[2, 3].legend(loc="upper left")

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 
+from jaxlidar._registry import public_objects
 from jaxlidar.instrument.pulse import SampledPulse
 from jaxlidar.instrument.survey import Survey
 from jaxlidar.io.dem import DemRead, read_dem
@@ -138,12 +139,9 @@ class Argument(NamedTuple):
 @functools.cache
 def kinds() -> Mapping[str, Callable[..., Any]]:
     """All kinds by name: exported classes of scenes, lidars and optics, and functions that make them."""
-    import jaxlidar
-
-    exported = {name: vars(jaxlidar).get(name) for name in jaxlidar.__all__}
     classes = {
         name: value
-        for name, value in exported.items()
+        for name, value in public_objects.items()
         if isinstance(value, type)
         and issubclass(value, eqx.Module)
         and value.__module__.startswith(ROOMS)

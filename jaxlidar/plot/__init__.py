@@ -5,7 +5,7 @@ shown and nothing is saved. The package, and matplotlib with it, is imported whe
 """
 
 from jaxlidar.plot.fits import fit, residuals
-from jaxlidar.plot.light import accuracy, ledger
+from jaxlidar.plot.light import accuracy, energy_budget
 from jaxlidar.plot.photon_events import photons
 from jaxlidar.plot.scenes import scene
 from jaxlidar.plot.spectra import spectrum
@@ -17,7 +17,7 @@ __all__ = [
     "accuracy",
     "fit",
     "leaf_on_and_off",
-    "ledger",
+    "energy_budget",
     "photons",
     "residuals",
     "scene",

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxlidar as jl
-from jaxlidar.trace.march import free_flight, medium_of
+from jaxlidar.trace.voxel_traversal import make_medium, march_to_depths
 from tests.helpers import SINGLE_SAMPLE, single_sample_lidar
 from tests.stability import hard_answers as answers
 
@@ -51,14 +51,14 @@ def simulation(build, usual, outputs, **settings):
     plan = jl.plan(*build({k: jnp.asarray(v, float) for k, v in widest.items()}), **settings)
 
     def measure(p):
-        setup = jl.reduce(*build(p), plan)
+        setup = jl.make_setup(*build(p), plan)
         return outputs(setup, jl.trace_scene(setup, KEY))
 
     return measure
 
 
 def sample_values(setup, response):
-    return jl.total_of(response, setup)[0]
+    return jl.total_reflectance(response, setup)[0]
 
 
 def sample_sum(setup, response):
@@ -70,9 +70,9 @@ def component_sums(*names):
 
     def outputs(setup, response):
         wave = jl.waveform_of(response, setup)
-        absorbed = [v[0] for k, v in wave.ledger.items() if k.startswith("absorbed")]
+        absorbed = [v[0] for k, v in wave.energy_budget.items() if k.startswith("absorbed")]
         sums = {
-            "shares": sum(wave.ledger.values())[0],
+            "shares": sum(wave.energy_budget.values())[0],
             "absorbed": sum(absorbed),
             "all": wave.reflectance.sum(),
         }
@@ -358,10 +358,10 @@ def measure_chord(periodic):
         voxels = jl.VoxelMap.from_extinction(leaf=k, voxel_size=1.0)
         leaf = jl.LeafOptics(reflectance=0.5, transmittance=0.3)
         canopy = jl.Canopy(voxels, leaf=leaf, sides="periodic" if periodic else "open")
-        medium = medium_of(canopy, jnp.zeros(3))
+        medium = make_medium(canopy, jnp.zeros(3))
         x, w = (tuple(p[n][None] for n in names) for names in ("xyz", "uvw"))
         none, active = jnp.zeros((0, 1)), jnp.ones((1,), bool)
-        return free_flight(medium, x, w, none, p["limit"][None], active, 512).total
+        return march_to_depths(medium, x, w, none, p["limit"][None], active, 512).total_depth
 
     return measure
 

@@ -144,8 +144,8 @@ def test_waveforms_are_right_to_their_error_or_the_user_is_warned():
         wave, is_warned = simulated(lidar, scene, rtol=RTOL)
         for name, component in {**wave.components, "all": wave.reflectance}.items():
             assert float(np.min(component)) >= -1e-6 * float(np.max(wave.reflectance)), name
-        total = np.sum([np.asarray(v) for v in wave.ledger.values()], axis=0)
-        slack = 5 * float(np.sqrt(sum(float(e[0]) ** 2 for e in wave.ledger_stderr.values()))) + 1e-4
+        total = np.sum([np.asarray(v) for v in wave.energy_budget.values()], axis=0)
+        slack = 5 * float(np.sqrt(sum(float(e[0]) ** 2 for e in wave.energy_budget_stderr.values()))) + 1e-4
         np.testing.assert_allclose(total, 1.0, atol=slack)
         if not is_warned:
             plan = jl.plan(lidar, scene, rtol=RTOL, describe=False)

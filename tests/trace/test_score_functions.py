@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 
 import jaxlidar as jl
+from jaxlidar.spectral.apply_optics import derivatives_to_samples, make_waveform_model, setup_optics
 from jaxlidar.trace import higher_orders
-from jaxlidar.trace.colouring import columns_in_samples, optics_of, recording_of
-from jaxlidar.trace.response import trace_scored
-from jaxlidar.trace.scored_light import scores_of
-from jaxlidar.trace.setting import setting_of
+from jaxlidar.trace.device_scene import build_device_scene
+from jaxlidar.trace.response import trace_with_scores
+from jaxlidar.trace.score_functions import make_slopes
 
 RANDOM = np.random.default_rng(5)
 LEAF, BARK = RANDOM.uniform(0, 1, (6, 5, 8)), RANDOM.uniform(0, 0.3, (6, 5, 8))
@@ -101,29 +101,30 @@ def both_ways(case: Case):
     key, directions = jax.random.key(3), jnp.eye(start.size, dtype=start.dtype)
 
     def setup_at(x):
-        return jl.reduce(lidar, build(case, x), plan)
+        return jl.make_setup(lidar, build(case, x), plan)
 
     def total(x):
         setup = setup_at(x)
-        return jl.total_of(jl.trace_scene(setup, key, reverse=False), setup)
+        return jl.total_reflectance(jl.trace_scene(setup, key, reverse=False), setup)
 
     @jax.jit
     def by_tangents(x):
         return jax.vmap(lambda t: jax.jvp(total, (x,), (t,)), out_axes=(None, 0))(directions)
 
     def extinction(x):
-        medium = setting_of(setup_at(x), derivatives="forward").medium
+        medium = build_device_scene(setup_at(x), derivatives="forward").medium
         assert medium is not None
         return medium.leaf, medium.bark
 
     @jax.jit
     def by_scores(x):
         setup = setup_at(x)
-        setting, optics = setting_of(setup, derivatives="forward"), optics_of(setup)
+        device_scene, optics = build_device_scene(setup, derivatives="forward"), setup_optics(setup)
         leaf, bark = jax.vmap(lambda t: jax.jvp(extinction, (x,), (t,))[1])(directions)
-        setting = dataclasses.replace(setting, scores=scores_of(setting, leaf, bark, optics, case.most))
-        response, fine = trace_scored(setting, optics, key)
-        return jl.total_of(response, setup), columns_in_samples(fine, recording_of(setup))
+        slopes = make_slopes(device_scene, leaf, bark, optics, case.most)
+        device_scene = dataclasses.replace(device_scene, slopes=slopes)
+        response, fine = trace_with_scores(device_scene, optics, key)
+        return jl.total_reflectance(response, setup), derivatives_to_samples(fine, make_waveform_model(setup))
 
     return by_tangents(start), by_scores(start)
 
@@ -150,7 +151,7 @@ def test_more_scores_are_tangents(name, precision):
     assert difference(MORE[name]) < TOLERANCE[precision]
 
 
-@pytest.mark.parametrize("left_out", ["rise", "gains"])
+@pytest.mark.parametrize("left_out", ["vertical_depth_slopes", "collision_score"])
 def test_a_wrong_score_is_rejected(left_out, monkeypatch):
     """Without the way back to the sensor, or without what collisions add."""
     right = getattr(higher_orders, left_out)

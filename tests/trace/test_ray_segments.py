@@ -1,4 +1,4 @@
-"""Order one, summed stretch by stretch, in blocks of those that count, and in blocks without empty ones."""
+"""First order, deposited segment by segment, in blocks of all segments, and in blocks without empty ones."""
 
 import dataclasses
 
@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import jaxlidar as jl
-from jaxlidar.trace import stretches
-from jaxlidar.trace.response import trace_setting
-from jaxlidar.trace.setting import setting_of
+from jaxlidar.trace import ray_segments
+from jaxlidar.trace.device_scene import build_device_scene
+from jaxlidar.trace.response import trace_device_scene
 from tests.helpers import slow_unless
 
 KEY = jax.random.key(3)
@@ -47,11 +47,11 @@ LIDAR = jl.Lidar(altitude=500.0, divergence=6.0, zenith=12.0, pulse=jl.GaussianP
 @pytest.mark.parametrize("kind", slow_unless(["bark"], scenes()))
 def test_what_is_left_out_adds_nothing(kind: str):
     scene = scenes()[kind]
-    setup = jl.reduce(LIDAR, scene, jl.plan(LIDAR, scene, max_orders=1, n_rays=700, describe=False))
+    setup = jl.make_setup(LIDAR, scene, jl.plan(LIDAR, scene, max_orders=1, n_rays=700, describe=False))
 
     def traced(derivatives):
-        setting = setting_of(setup, derivatives=derivatives)
-        return eqx.filter_jit(trace_setting)(setting, None, KEY)
+        device_scene = build_device_scene(setup, derivatives=derivatives)
+        return eqx.filter_jit(trace_device_scene)(device_scene, KEY)
 
     whole, ahead, plain = traced("all"), traced("forward"), traced("none")
     assert float(whole.first.sum()) > 0.05
@@ -61,14 +61,14 @@ def test_what_is_left_out_adds_nothing(kind: str):
 
 
 @pytest.mark.parametrize("block", [64, 1024])
-def test_blocks_hold_every_stretch_once(block: int, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(stretches, "BLOCK", block)
+def test_blocks_hold_every_segment_once(block: int, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(ray_segments, "SEGMENTS_AT_ONCE", block)
     random = np.random.default_rng(0)
     length = np.where(random.uniform(size=(11, 60)) < 0.5, 0.0, random.uniform(size=(11, 60)))
     start = np.concatenate([np.zeros((1, 60)), np.cumsum(length, axis=0)[:-1]])
     cell = np.arange(start.size).reshape(start.shape)
     extinction = np.where(random.uniform(size=start.shape) < 0.5, 0.0, 1.0)
-    given = stretches.Stretches(*(jnp.asarray(a) for a in (start, length, start, cell, extinction)))
+    segments = ray_segments.RaySegments(*(jnp.asarray(a) for a in (start, length, start, cell, extinction)))
 
     def add(tally, its, ray):
         there = its.length > 0
@@ -76,9 +76,11 @@ def test_blocks_hold_every_stretch_once(block: int, monkeypatch: pytest.MonkeyPa
 
     tally, ray = jnp.zeros(start.size), jnp.arange(60.0)
     own = 1.0 + np.broadcast_to(np.arange(60.0), start.shape)
-    found = stretches.in_blocks(add, tally, given, ray, None).reshape(start.shape)
+    found = ray_segments.add_in_blocks(add, tally, segments, ray, None).reshape(start.shape)
     np.testing.assert_array_equal(found, np.where(length > 0, own, 0.0))
-    found = stretches.in_blocks(add, tally, given, ray, given.extinction > 0).reshape(start.shape)
+    found = ray_segments.add_in_blocks(add, tally, segments, ray, segments.extinction > 0).reshape(
+        start.shape
+    )
     np.testing.assert_array_equal(found, np.where((length > 0) & (extinction > 0), own, 0.0))
 
 
@@ -93,8 +95,8 @@ def test_empty_voxels_have_their_derivatives():
         def total(filled, reverse=False):
             thicker = scene.canopy.voxels.leaf + filled * empty
             moved = eqx.tree_at(lambda s: s.canopy.voxels.leaf, scene, thicker)
-            setup = jl.reduce(LIDAR, moved, plan)
-            return jl.total_of(jl.trace_scene(setup, KEY, reverse=reverse), setup)[0]
+            setup = jl.make_setup(LIDAR, moved, plan)
+            return jl.total_reflectance(jl.trace_scene(setup, KEY, reverse=reverse), setup)[0]
 
         ahead = jax.jit(jax.jacfwd(total))(0.0)
         step = 1e-5
@@ -106,7 +108,7 @@ def test_empty_voxels_have_their_derivatives():
         np.testing.assert_allclose(back, jnp.vdot(weight, ahead), rtol=1e-9)
 
 
-def test_the_result_does_not_depend_on_the_longest_stretch():
+def test_the_result_does_not_depend_on_the_longest_segment():
     scene = scenes()["leaves"]
     waves = [jl.simulate(LIDAR, scene, key=KEY, max_orders=1, max_step=step) for step in (None, 0.11, 5.0)]
     for wave in waves[1:]:

@@ -1,7 +1,13 @@
-"""From response to waveform: optics, atmosphere, pulse, sampling and energy."""
+"""`Waveform`: apparent reflectance and received energy by wavelength and sample.
+
+A sample of apparent reflectance r, from the range d, has the energy
+
+    E = E_t eta A_r / (pi d^2) r,
+
+with the emitted energy E_t, the efficiency eta and the area A_r of the aperture.
+"""
 
 import dataclasses
-import importlib
 import os
 from typing import Any, final
 
@@ -12,11 +18,20 @@ from jaxtyping import Array, Float
 
 from jaxlidar._checks import briefly, check_range, is_traced
 from jaxlidar._constants import SPEED_OF_LIGHT
+from jaxlidar._deprecated import renamed_property
+from jaxlidar._registry import save_result, waveform_html
 from jaxlidar._summary import summary
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.instrument.receiver import first_return_window, record
 from jaxlidar.planning.setup import Setup
-from jaxlidar.trace.colouring import Recording, balance, components, height_of, recording_of, total
+from jaxlidar.spectral.apply_optics import (
+    WaveformModel,
+    budget_terms,
+    component_samples,
+    height_of,
+    make_waveform_model,
+    total_samples,
+)
 from jaxlidar.trace.response import Response
 from jaxlidar.truth import Truth
 
@@ -33,13 +48,15 @@ class Waveform(eqx.Module):
     - `energy`: (wavelengths, bins) J that the detector registers per sample.
     - `stderr`: (wavelengths, bins) one standard error of `reflectance`; zero where nothing was random. The
       expected value lies within two of them in 95 % of cases. For more than 16 wavelengths they are computed
-      at few that stand for all, to three digits of the wavelength's largest.
+      at pivot wavelengths and interpolated, to three digits of the wavelength's largest.
     - `components`: dict of arrays like `reflectance`: by material of the last scattering ("ground", "leaf",
       "bark", "plate", "air"), and by order ("first", "higher").
     - `neglected`: (wavelengths,) apparent reflectance that orders beyond the last could still add.
-    - `ledger`: dict of (wavelengths,) shares of the emitted energy, before the atmosphere: "returned" into
-      the aperture, "escaped", "absorbed by ...", "after the window", "unfollowed" beyond the last order.
-    - `ledger_stderr`: dict like `ledger`, one standard error each; zero where nothing was random.
+    - `energy_budget`: dict of (wavelengths,) fractions of the emitted energy, before the atmosphere:
+      "returned" into the aperture, "escaped", "absorbed by ...", "after the window", "unfollowed" beyond the
+      last order.
+    - `energy_budget_stderr`: dict like `energy_budget`, one standard error each; zero where nothing was
+      random.
     - `lost`: (wavelengths,) apparent reflectance that arrives before or after all fine bins of the plan: late
       multiple scattering, or, where the geometry was traced by a JAX transformation, what a plan does not
       cover.
@@ -57,7 +74,7 @@ class Waveform(eqx.Module):
     >>> wave = jl.simulate(jl.Lidar(), scene, key=jax.random.key(0))
     >>> print(sorted(wave.components), wave.info["stopped"])
     ['first', 'ground', 'higher'] nothing is random
-    >>> print(f"{float(wave.ledger['absorbed by ground'][0]):.2f}")
+    >>> print(f"{float(wave.energy_budget['absorbed by ground'][0]):.2f}")
     0.60
     """
 
@@ -68,31 +85,37 @@ class Waveform(eqx.Module):
     stderr: Float[Array, "wavelengths bins"]
     components: dict[str, Float[Array, "wavelengths bins"]]
     neglected: Float[Array, "wavelengths"]
-    ledger: dict[str, Float[Array, "wavelengths"]]
-    ledger_stderr: dict[str, Float[Array, "wavelengths"]]
+    energy_budget: dict[str, Float[Array, "wavelengths"]]
+    energy_budget_stderr: dict[str, Float[Array, "wavelengths"]]
     lost: Float[Array, "wavelengths"]
     recorded: Float[Array, "wavelengths bins"]
     wavelength: Float[Array, "wavelengths"]
     info: dict = eqx.field(static=True)
     truth: Truth | None = None
 
+    ledger = renamed_property("ledger", "energy_budget")
+    ledger_stderr = renamed_property("ledger_stderr", "energy_budget_stderr")
+
     @property
     def first_order_share(self) -> Float[Array, "wavelengths"]:
-        """Share of `reflectance` that was scattered once, (wavelengths,); 1 where nothing returns."""
-        first, whole = (jnp.sum(a, axis=1) for a in (self.components["first"], self.reflectance))
-        return jnp.where(whole > 0, first / jnp.where(whole > 0, whole, 1.0), 1.0)
+        """Fraction of `reflectance` that was scattered once, (wavelengths,); 1 where nothing returns."""
+        first, total = (jnp.sum(a, axis=1) for a in (self.components["first"], self.reflectance))
+        return jnp.where(total > 0, first / jnp.where(total > 0, total, 1.0), 1.0)
 
     def nan_where_lost(self, share: float = 0.01) -> "Waveform":
-        """The same waveform, NaN at wavelengths that lost more than a share of their reflectance.
+        """Return the same waveform, NaN at wavelengths that lost more than a fraction of their reflectance.
 
         For use within JAX transformations, where a plan that does not fit cannot be refused.
 
-        **Arguments:** `share`: of `lost` in the sum of `reflectance` and `lost`, above 0. Default 0.01.
+        **Arguments:** `share`: fraction of `lost` in the sum of `reflectance` and `lost`, above 0. Default
+        0.01.
         """
         check_range("share", share, 0.0, low_open=True)
-        whole = jnp.sum(self.reflectance, axis=1) + self.lost
-        good = self.lost <= share * whole
-        return dataclasses.replace(self, reflectance=jnp.where(good[:, None], self.reflectance, jnp.nan))
+        total = jnp.sum(self.reflectance, axis=1) + self.lost
+        is_covered = self.lost <= share * total
+        return dataclasses.replace(
+            self, reflectance=jnp.where(is_covered[:, None], self.reflectance, jnp.nan)
+        )
 
     def save(self, path: str | os.PathLike[str], case: Any = None) -> None:
         """Write the waveform as a netCDF file, which `jaxlidar.open` reads.
@@ -100,13 +123,12 @@ class Waveform(eqx.Module):
         **Arguments:**
 
         - `path`: the file to write.
-        - `case`: the `jaxlidar.io.Case` that was simulated, so that `jaxlidar.repeat` can do it again.
+        - `case`: the `jaxlidar.io.Case` that was simulated, so that `jaxlidar.rerun` can do it again.
           Default None: not kept.
 
         **Raises:** what `jaxlidar.io.save` raises.
         """
-        # Files lie above the core, which asks for them by name.
-        importlib.import_module("jaxlidar.io.netcdf").save(self, path, case)
+        save_result(self, path, case)
 
     def __str__(self) -> str:
         if any(is_traced(x) for x in (self.time, self.reflectance)):
@@ -117,13 +139,13 @@ class Waveform(eqx.Module):
         """What notebooks show: the summary and a small figure."""
         if any(is_traced(x) for x in (self.time, self.reflectance)):
             return None
-        return importlib.import_module("jaxlidar.plot.html").waveform_html(self)
+        return waveform_html(self)
 
 
-def total_of(response: Response, setup: Setup) -> Float[Array, "wavelengths samples"]:
-    """Apparent reflectance per sample, all components together.
+def total_reflectance(response: Response, setup: Setup) -> Float[Array, "wavelengths samples"]:
+    """Return the apparent reflectance per sample, all components together.
 
-    This is `Waveform.reflectance` on the plan's samples, without the components, energy and ledger of
+    This is `Waveform.reflectance` on the plan's samples, without the components, energy and energy budget of
     `waveform_of`.
 
     **Arguments:**
@@ -139,13 +161,13 @@ def total_of(response: Response, setup: Setup) -> Float[Array, "wavelengths samp
     >>> import jax
     >>> import jaxlidar as jl
     >>> lidar, scene = jl.Lidar(), jl.Scene(ground=jl.Ground(reflectance=0.4))
-    >>> setup = jl.reduce(lidar, scene, jl.plan(lidar, scene))
+    >>> setup = jl.make_setup(lidar, scene, jl.plan(lidar, scene))
     >>> response = eqx.filter_jit(jl.trace_scene)(setup, jax.random.key(0))
-    >>> total = eqx.filter_jit(jl.total_of)(response, setup)
+    >>> total = eqx.filter_jit(jl.total_reflectance)(response, setup)
     >>> print(f"{float(total.sum()):.3f}")
     0.400
     """
-    return total(response, recording_of(setup))
+    return total_samples(response, make_waveform_model(setup))
 
 
 def waveform_of(
@@ -153,10 +175,10 @@ def waveform_of(
     setup: Setup,
     *,
     stderr: Float[Array, "wavelengths bins"] | None = None,
-    ledger_stderr: dict[str, Float[Array, "wavelengths"]] | None = None,
+    energy_budget_stderr: dict[str, Float[Array, "wavelengths"]] | None = None,
     info: dict | None = None,
 ) -> Waveform:
-    """The waveform of a response: with the optics, atmosphere, pulse, sampling and energy of a setup.
+    """Make the waveform of a response, with the optics, atmosphere, pulse, sampling and energy of a setup.
 
     The optics may differ from those at tracing: one response serves all reflectances and transmittances.
 
@@ -165,7 +187,7 @@ def waveform_of(
     - `response`: a `Response` of `jaxlidar.trace_scene`, or the mean of several.
     - `setup`: the `Setup` that it was traced with; its optics may differ.
     - `stderr`: (wavelengths, samples) standard error of the reflectance, from batches. Default None: zero.
-    - `ledger_stderr`: standard errors of the ledger, from batches. Default None: zero.
+    - `energy_budget_stderr`: standard errors of the energy budget, from batches. Default None: zero.
     - `info`: dict for `Waveform.info`. Default None: empty.
 
     **Returns:** a `Waveform` on the plan's samples.
@@ -176,34 +198,34 @@ def waveform_of(
     >>> import jax
     >>> import jaxlidar as jl
     >>> lidar, scenes = jl.Lidar(), [jl.Scene(ground=jl.Ground(reflectance=r)) for r in (0.2, 0.8)]
-    >>> dark, bright = (jl.reduce(lidar, scene, jl.plan(lidar, scenes[0])) for scene in scenes)
+    >>> dark, bright = (jl.make_setup(lidar, scene, jl.plan(lidar, scenes[0])) for scene in scenes)
     >>> response = eqx.filter_jit(jl.trace_scene)(dark, jax.random.key(0))
     >>> wave = eqx.filter_jit(jl.waveform_of)(response, bright)
     >>> print(f"{float(wave.reflectance.sum()):.3f}")
     0.800
     """
-    wave = recorded(response, recording_of(setup))
-    given = {"stderr": stderr, "ledger_stderr": ledger_stderr, "info": info}
-    return dataclasses.replace(wave, **{name: value for name, value in given.items() if value is not None})
+    wave = waveform_of_model(response, make_waveform_model(setup))
+    fields = {"stderr": stderr, "energy_budget_stderr": energy_budget_stderr, "info": info}
+    return dataclasses.replace(wave, **{name: value for name, value in fields.items() if value is not None})
 
 
-def recorded(response: Response, recording: Recording) -> Waveform:
-    """The waveform of a response, without standard errors."""
-    lidar, time = recording.lidar, recording.time
-    parts = components(response, recording)
-    reflectance = parts["first"] + parts["higher"]
-    ledger, neglected, lost = balance(response, recording)
-    energy = reflectance * received(lidar, time)
+def waveform_of_model(response: Response, model: WaveformModel) -> Waveform:
+    """Make the waveform of a response, without standard errors."""
+    lidar, time = model.lidar, model.time
+    components = component_samples(response, model)
+    reflectance = components["first"] + components["higher"]
+    energy_budget, neglected, lost = budget_terms(response, model)
+    energy = reflectance * energy_per_reflectance(lidar, time)
     return Waveform(
         time=time,
         height=height_of(lidar, time),
         reflectance=reflectance,
         energy=energy,
         stderr=jnp.zeros_like(reflectance),
-        components=parts,
+        components=components,
         neglected=neglected,
-        ledger=ledger,
-        ledger_stderr=jax.tree.map(jnp.zeros_like, ledger),
+        energy_budget=energy_budget,
+        energy_budget_stderr=jax.tree.map(jnp.zeros_like, energy_budget),
         lost=lost,
         recorded=record(energy, lidar.wavelength, lidar.receiver),
         wavelength=lidar.wavelength,
@@ -211,27 +233,28 @@ def recorded(response: Response, recording: Recording) -> Waveform:
     )
 
 
-def trimmed(wave: Waveform, wavelengths: int, samples: int) -> Waveform:
-    """The first wavelengths and samples of a waveform."""
-    if wave.reflectance.shape == (wavelengths, samples):
+def remove_padding(wave: Waveform, n_wavelengths: int, n_samples: int) -> Waveform:
+    """Return the first wavelengths and samples of a waveform."""
+    if wave.reflectance.shape == (n_wavelengths, n_samples):
         return wave
+    # On the host: slices are not worth a compilation.
+    padded = jax.device_get(wave)
+    sizes = (n_wavelengths, n_samples)
+    trimmed = jax.tree.map(lambda a: a[tuple(slice(n) for n in sizes[: a.ndim])], padded)
+    axes = (padded.time[:n_samples], padded.height[:n_samples])
+    return jax.device_put(eqx.tree_at(lambda w: (w.time, w.height), trimmed, axes))
 
-    # Slices are not worth a compilation.
-    known = jax.device_get(wave)
-    cut = jax.tree.map(lambda a: a[tuple(slice(n) for n in (wavelengths, samples)[: a.ndim])], known)
-    times = (known.time[:samples], known.height[:samples])
-    return jax.device_put(eqx.tree_at(lambda w: (w.time, w.height), cut, times))
 
-
-def received(lidar: Lidar, time: Float[Array, "bins"]) -> Float[Array, "wavelengths bins"]:
-    """J per apparent reflectance, E_t eta A_r / (pi R^2): a Lambertian target that fills the footprint."""
-    slant = lidar.range_to_reference + 0.5 * SPEED_OF_LIGHT * time
-    share = lidar.aperture_area / (jnp.pi * jnp.maximum(slant, 1e-3) ** 2)
-    return jnp.outer(lidar.energy_per_wavelength * lidar.efficiency_per_wavelength, share)
+def energy_per_reflectance(lidar: Lidar, time: Float[Array, "bins"]) -> Float[Array, "wavelengths bins"]:
+    """Return the energy, J, per apparent reflectance at the range of each sample."""
+    distance = lidar.range_to_reference + 0.5 * SPEED_OF_LIGHT * time
+    # A window may begin before the pulse is sent.
+    solid_angle = lidar.aperture_area / (jnp.pi * jnp.maximum(distance, 1e-3) ** 2)
+    return jnp.outer(lidar.energy_per_wavelength * lidar.efficiency_per_wavelength, solid_angle)
 
 
 def open_at_first_return(wave: Waveform, lidar: Lidar) -> Waveform:
-    """The finely sampled waveform on the bins of the digitiser, which start at the first return.
+    """Resample a finely sampled waveform to the bins of the digitiser, which start at the first return.
 
     See `jaxlidar.first_return_window` for the artefact that this makes. The first return is the first sample
     above the receiver's detection threshold and above a thousandth of the peak. Standard errors of the fine
@@ -239,12 +262,12 @@ def open_at_first_return(wave: Waveform, lidar: Lidar) -> Waveform:
     """
     energy = wave.energy
     threshold = jnp.maximum(lidar.receiver.detection_threshold, 1e-3 * jnp.max(energy))
-    opened = jnp.cumsum(jnp.any(energy > threshold, axis=0)) > 0
+    is_open = jnp.cumsum(jnp.any(energy > threshold, axis=0)) > 0
     arrays = [wave.reflectance, energy, wave.stderr, *wave.components.values()]
-    kept = jnp.stack([jnp.where(opened[None, :], a, 0.0) for a in arrays])
-    # Only the energy opens the window: the other channels are zero before it does.
+    # The energy alone opens the window: all arrays are zero before it does.
+    opened = jnp.stack([jnp.where(is_open[None, :], a, 0.0) for a in arrays])
     interval = float(lidar.sampling_interval)
-    time, rows = first_return_window(wave.time, kept, interval, jnp.minimum(threshold, 0.0))
+    time, rows = first_return_window(wave.time, opened, interval, jnp.minimum(threshold, 0.0))
     return dataclasses.replace(
         wave,
         time=time,

@@ -9,8 +9,8 @@ import pytest
 
 import jaxlidar as jl
 from jaxlidar._statistics import FewMoments, WaveformMoments
-from jaxlidar.trace.colouring import balance, recording_of, total
-from jaxlidar.trace.few_wavelengths import few_of
+from jaxlidar.spectral.apply_optics import budget_terms, make_waveform_model, total_samples
+from jaxlidar.spectral.pivot_wavelengths import find_pivots
 from jaxlidar.trace.histories import histories
 
 WAVELENGTH = np.arange(400.0, 2501.0)
@@ -26,32 +26,32 @@ def optics(wavelength=WAVELENGTH) -> np.ndarray:
 def worst(few, values, degree) -> float:
     """What of any monomial is missed, of the largest that is not one at the same wavelength."""
     exact = np.prod(values[None] ** histories(len(values), degree).exponents[:, :, None], axis=1)
-    found = exact[:, np.asarray(few.chosen)] @ np.asarray(few.shares, float)
+    found = exact[:, np.asarray(few.indices)] @ np.asarray(few.coefficients, float)
     return float(np.max(np.abs(found - exact) / np.max(exact[1:], axis=0)))
 
 
 def test_every_product_of_optics_follows_from_few():
     values = optics()
-    few = few_of(jnp.asarray(values), 10)
+    few = find_pivots(jnp.asarray(values), 10)
     assert few is not None
-    assert few.chosen.size < 64
+    assert few.indices.size < 64
     assert worst(few, values, 10) < 1e-4
     # Wavelengths chosen for one scattering do not serve ten.
-    short = few_of(jnp.asarray(values), 1)
+    short = find_pivots(jnp.asarray(values), 1)
     assert short is not None
     assert worst(short, values, 1) < 1e-4
     assert worst(short, values, 10) > 1e-2
 
 
 def test_unlike_wavelengths_have_none_that_stand_for_them():
-    assert few_of(jnp.asarray(np.random.default_rng(0).uniform(size=(8, 200))), 10) is None
+    assert find_pivots(jnp.asarray(np.random.default_rng(0).uniform(size=(8, 200))), 10) is None
 
 
 def test_one_value_at_all_wavelengths_needs_one():
-    few = few_of(jnp.full((2, 40), 0.5), 4)
+    few = find_pivots(jnp.full((2, 40), 0.5), 4)
     assert few is not None
-    assert np.count_nonzero(np.any(few.shares, axis=1)) == 1
-    np.testing.assert_allclose(few.shares[0], 1.0, rtol=1e-5)
+    assert np.count_nonzero(np.any(few.coefficients, axis=1)) == 1
+    np.testing.assert_allclose(few.coefficients[0], 1.0, rtol=1e-5)
 
 
 def test_another_leaf_has_as_many():
@@ -60,9 +60,9 @@ def test_another_leaf_has_as_many():
     for depth in (0.2, 0.3, 0.4):
         values = optics()
         values[2] = depth
-        few = few_of(jnp.asarray(values), 10)
+        few = find_pivots(jnp.asarray(values), 10)
         assert few is not None
-        sizes.add(few.chosen.size)
+        sizes.add(few.indices.size)
     assert len(sizes) == 1
 
 
@@ -70,7 +70,7 @@ def test_another_leaf_has_as_many():
     "air", [None, pytest.param(jl.Atmosphere(visibility=5.0), marks=pytest.mark.slow)], ids=["clear", "hazy"]
 )
 def test_a_batch_by_few_wavelengths_is_the_batch(air):
-    """Samples and ledger, with an atmosphere whose transmittance differs between wavelengths too."""
+    """Samples and energy budget, with an atmosphere whose transmittance differs between wavelengths too."""
     wavelength = WAVELENGTH[::10]
     lidar = jl.Lidar(wavelength=wavelength, divergence=4.0)
     voxels = jl.VoxelMap.from_lad(
@@ -81,18 +81,18 @@ def test_a_batch_by_few_wavelengths_is_the_batch(air):
         ground=jl.Ground(reflectance=optics(wavelength)[-1]),
         atmosphere=air,
     )
-    setup = jl.reduce(lidar, scene, jl.plan(lidar, scene, max_orders=4, n_photons=1024))
-    response, exact = jl.trace_scene(setup, jax.random.key(0)), recording_of(setup)
-    brief = exact.abridged()
-    assert brief.few is not None
-    assert brief.few.chosen.size < len(wavelength) / 4
-    whole = total(response, exact)
-    np.testing.assert_allclose(total(response, brief), whole, atol=1e-4 * float(whole.max()))
-    for name, share in balance(response, exact).ledger.items():
-        np.testing.assert_allclose(balance(response, brief).ledger[name], share, atol=1e-4)
+    setup = jl.make_setup(lidar, scene, jl.plan(lidar, scene, max_orders=4, n_photons=1024))
+    response, exact = jl.trace_scene(setup, jax.random.key(0)), make_waveform_model(setup)
+    brief = exact.at_pivots()
+    assert brief.pivots is not None
+    assert brief.pivots.indices.size < len(wavelength) / 4
+    whole = total_samples(response, exact)
+    np.testing.assert_allclose(total_samples(response, brief), whole, atol=1e-4 * float(whole.max()))
+    for name, share in budget_terms(response, exact).energy_budget.items():
+        np.testing.assert_allclose(budget_terms(response, brief).energy_budget[name], share, atol=1e-4)
     # Standard errors need three digits at every wavelength: shares of a neighbour would not do.
-    wrong = dataclasses.replace(brief.few, shares=jnp.roll(brief.few.shares, 1, axis=1))
-    found = total(response, dataclasses.replace(brief, few=wrong))
+    wrong = dataclasses.replace(brief.pivots, coefficients=jnp.roll(brief.pivots.coefficients, 1, axis=1))
+    found = total_samples(response, dataclasses.replace(brief, pivots=wrong))
     assert not np.allclose(found, whole, atol=1e-4 * float(whole.max()))
 
 
