@@ -27,6 +27,7 @@ from inversion.receiver.counts import Amplitudes, amplitudes
 from inversion.receiver.impulse import receiver_impulse, recorded_pulse
 from inversion.receiver.recorder import Recorder
 from inversion.receiver.tables import corrected_table
+from jaxlidar.extend import shorten_signatures
 
 __all__ = [
     "Amplitudes",
@@ -79,3 +80,10 @@ __all__ = [
     "signal_ends",
     "wiener",
 ]
+
+shorten_signatures(globals())
+
+
+def __dir__() -> list[str]:
+    # Public names alone, without the modules and helpers that the imports leave here.
+    return sorted(__all__)

@@ -16,6 +16,7 @@ from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._deprecated import renamed
 from jaxlidar._progress import Progress
 from jaxlidar._registry import register_public_objects, waveform_html
+from jaxlidar._signatures import shorten_signatures
 from jaxlidar._workers import LostWorkersWarning
 from jaxlidar.analog import AnalogReturns, analog_returns, photon_paths
 from jaxlidar.energy import EnergyBudget, energy_budget
@@ -176,6 +177,13 @@ __all__ = [
     "voxelise_points",
     "waveform_of",
 ]
+
+shorten_signatures(globals())
+
+
+def __dir__() -> list[str]:
+    # Public names alone, without the modules and helpers that the imports leave here.
+    return sorted(__all__)
 
 
 # Names of version 0.2 by their new names; they go with version 0.4.

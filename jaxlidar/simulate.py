@@ -15,7 +15,7 @@ from jaxtyping import Array, PRNGKeyArray
 from jaxlidar._checks import check_flag, check_integer, check_key, check_range, is_traced
 from jaxlidar._progress import Progress
 from jaxlidar._statistics import Moments, batches_needed, widening
-from jaxlidar._summary import NOTABLE, late_share, percent
+from jaxlidar._summary import NOTABLE_FRACTION, late_fraction, percent
 from jaxlidar._threads import side_by_side
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.planning.plan import MIN_BATCHES, Plan
@@ -214,11 +214,11 @@ def _make_waveform(tracer: BatchTracer, result: _Traced) -> Waveform:
     wave = dataclasses.replace(wave, info=result.info, **errors)
     if is_traced(wave.energy):
         return wave
-    if plan.scope.automatic_window and late_share(wave) >= NOTABLE:
+    if plan.scope.automatic_window and late_fraction(wave) >= NOTABLE_FRACTION:
         end = plan.sample_start + plan.sample_interval * plan.n_samples
         warnings.warn(
-            f"{percent(late_share(wave))} of the light is still on its way when the record ends at {end:.4g} "
-            "ns: give window=, or see Waveform.energy_budget",
+            f"{percent(late_fraction(wave))} of the light is still on its way when the record ends at "
+            f"{end:.4g} ns: give window=, or see Waveform.energy_budget",
             LateLightWarning,
             stacklevel=3,
         )

@@ -154,16 +154,17 @@ def kinds() -> Mapping[str, Callable[..., Any]]:
 @functools.cache
 def arguments_of(maker: Callable[..., Any]) -> Mapping[str, Argument]:
     """The arguments of a class or function by name, in their order."""
-    # Constructors show no annotations; those of their fields serve.
+    # Signatures are shortened for display; the annotations of fields and functions are the real ones.
     own = dataclasses.fields(maker) if isinstance(maker, type) and dataclasses.is_dataclass(maker) else ()
     fields = {f.name: f for f in own}
+    annotations = inspect.get_annotations(maker.__init__ if isinstance(maker, type) else maker)
     found = {}
     for name, parameter in inspect.signature(maker).parameters.items():
         if parameter.kind is parameter.VAR_KEYWORD:
             # Of habits by name: changes of what they have.
             return arguments_of(Habit)
         stored = STORED.get((maker, name), name)  # pyright: ignore[reportArgumentType, reportCallIssue]
-        annotation = fields[stored].type if stored in fields else parameter.annotation
+        annotation = fields[stored].type if stored in fields else annotations.get(name, Any)
         unit = UNITS_OF.get((maker, name), UNITS.get(name, ""))  # pyright: ignore[reportArgumentType, reportCallIssue]
         found[name] = Argument(annotation, parameter.default is parameter.empty, unit, stored)
     return found

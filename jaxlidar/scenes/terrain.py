@@ -22,7 +22,7 @@ from jaxlidar._checks import (
     concrete_array,
     coordinates,
 )
-from jaxlidar._ranges import SHARE, Range, check_ranges
+from jaxlidar._ranges import FRACTION, Range, check_ranges
 from jaxlidar._vectors import normalise
 from jaxlidar.optics.laws import AbstractLaw, AbstractMirror, Lambertian
 from jaxlidar.optics.spectra import Spectrum
@@ -107,7 +107,7 @@ class Terrain(AbstractGround):
         "heights": Range(),
         "spacing": Range(0.0, low_open=True),
         "origin": Range(),
-        "reflectance": SHARE,
+        "reflectance": FRACTION,
     }
 
     def __check_init__(self):

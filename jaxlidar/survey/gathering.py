@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxlidar._summary import NOTABLE, percent
+from jaxlidar._summary import NOTABLE_FRACTION, percent
 from jaxlidar.io.case import Case
 from jaxlidar.io.netcdf import by_rows
 from jaxlidar.io.parts import Parts
@@ -98,7 +98,7 @@ def _waveforms(way: AbstractWay, fields: dict[str, Any], started: float, **info:
 
 def _say_what_is_late(way: AbstractWay, late: float) -> None:
     plan = way.setup.plan
-    if late >= NOTABLE:
+    if late >= NOTABLE_FRACTION:
         end = plan.sample_start + plan.sample_interval * plan.n_samples
         warnings.warn(
             f"{percent(late)} of the light of a shot is still on its way when the record ends at "

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from jaxlidar._checks import briefly
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._deprecated import renamed_property
-from jaxlidar._summary import NOTABLE, percent
+from jaxlidar._summary import NOTABLE_FRACTION, percent
 from jaxlidar.io import netcdf
 from jaxlidar.io.case import Case
 from jaxlidar.io.rows import CHECKSUMS
@@ -98,7 +98,7 @@ class Waveforms(eqx.Module):
         for w, sums in zip(self.wavelength, self.reflectance.sum(axis=2).T):
             low, middle, high = np.quantile(sums, (0.0, 0.5, 1.0))
             lines.append(f"  {w:g} nm: apparent reflectance {low:.3g} to {high:.3g}, median {middle:.3g}")
-        if (beside := int(np.sum(self.off_map >= NOTABLE))) > 0:
+        if (beside := int(np.sum(self.off_map >= NOTABLE_FRACTION))) > 0:
             lines.append(f"  {beside} lie partly beside the voxel map")
         light = "which share light, " if self.info.get("shared") else ""
         lines.append(
