@@ -20,7 +20,7 @@ from inversion.fit.unknowns import settle
 from jaxlidar.planning import memory
 from jaxlidar.planning.memory import check_memory, in_words, memory_limit
 from jaxlidar.spectral.pulse_convolution import pulse_convolution
-from tests.helpers import applied, slab, slow_unless
+from tests.helpers import slab, slow_unless, with_applied_optics
 
 ROOT = Path(__file__).resolve().parents[2]
 KEY = jax.random.key(2)
@@ -62,7 +62,9 @@ def test_optics_applied_while_light_is_traced_give_the_same(name):
     scene = jl.Scene(canopy=canopy, **given)
     plan = jl.plan(TWO, scene, max_orders=4, describe=False)
     assert plan.config.keeps_histories
-    a, b = (jl.simulate(TWO, scene, key=KEY, plan=p, n_photons=2048) for p in (plan, applied(plan)))
+    a, b = (
+        jl.simulate(TWO, scene, key=KEY, plan=p, n_photons=2048) for p in (plan, with_applied_optics(plan))
+    )
     for found in ("reflectance", "stderr", "neglected"):
         np.testing.assert_allclose(getattr(b, found), getattr(a, found), rtol=2e-4, atol=1e-7)
     assert a.energy_budget.keys() == b.energy_budget.keys()
@@ -85,7 +87,7 @@ def test_derivatives_where_optics_are_applied_while_light_is_traced():
     scene = jl.Scene(canopy=jl.Canopy(slab(0.5), leaf=LEAF), ground=GROUND)
     plan = jl.plan(TWO, scene, max_orders=4, n_photons=2048, window=(-100.0, 60.0), describe=False)
     x = jax.numpy.array([0.3, 0.1])
-    a, b = (jax.jit(jax.jacfwd(lambda x, p=p: total(p, x)))(x) for p in (plan, applied(plan)))
+    a, b = (jax.jit(jax.jacfwd(lambda x, p=p: total(p, x)))(x) for p in (plan, with_applied_optics(plan)))
     assert np.max(np.abs(a)) > 1e-3
     np.testing.assert_allclose(b, a, rtol=2e-3, atol=1e-5 * np.max(np.abs(a)))
 

@@ -9,7 +9,7 @@ import jaxlidar as jl
 from jaxlidar.sampling import batch_programs
 from jaxlidar.spectral.apply_optics import samples_and_budget
 from jaxlidar.trace.response import trace_device_scene
-from tests.helpers import applied
+from tests.helpers import with_applied_optics
 
 KEY = jax.random.key(7)
 LIDAR = jl.Lidar(divergence=2.0, wavelength=(532.0, 1064.0))
@@ -29,7 +29,7 @@ def same(plan):
 
 @pytest.mark.parametrize(
     ("orders", "transmission", "change"),
-    [(1, "diffuse", same), (2, "diffuse", same), (2, "straight", same), (2, "diffuse", applied)],
+    [(1, "diffuse", same), (2, "diffuse", same), (2, "straight", same), (2, "diffuse", with_applied_optics)],
     ids=["one order", "two orders", "straight", "optics applied"],
 )
 def test_a_batch_is_the_trace_of_its_key(orders, transmission, change):

@@ -9,7 +9,7 @@ import pytest
 import jaxlidar as jl
 from jaxlidar.planning.config import KERNEL_BINS, KERNEL_VARIANCE, TimeBins
 from jaxlidar.trace.deposit import bspline_row, smooth_bins
-from tests.helpers import WHOLE, agrees, batch_mean, slab, slow_unless, whole_lidar
+from tests.helpers import SINGLE_SAMPLE, agrees, batch_mean, single_sample_lidar, slab, slow_unless
 
 LIDAR = jl.Lidar(divergence=2.0, sampling_interval=5.0)
 SCENE = jl.Scene(
@@ -57,8 +57,8 @@ def test_what_one_plate_scatters_down_returns_from_the_next(transmission):
     lower = jl.Plate(height=2.0, reflectance=0.4, transmittance=0.3, coverage=0.7, transmission=transmission)
     scene = jl.Scene(plates=(upper, lower))
     # All lie far below a lidar 400 km up, whose light is vertical.
-    lidar = whole_lidar()
-    plan = jl.plan(lidar, scene, max_orders=2, n_photons=4096, **WHOLE)
+    lidar = single_sample_lidar()
+    plan = jl.plan(lidar, scene, max_orders=2, n_photons=4096, **SINGLE_SAMPLE)
     mean, stderr = batch_mean(lidar, scene, plan, seed=0, count=32, quantity=second)
     one_way = 0.5 * 0.5 * 0.7 * 0.4 * 0.5
     assert agrees(mean, stderr, 2 * one_way)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import jaxlidar as jl
-from tests.helpers import WHOLE, agrees, batch_mean, slab, slow_unless, whole_lidar
+from tests.helpers import SINGLE_SAMPLE, agrees, batch_mean, single_sample_lidar, slab, slow_unless
 
 KEY = jax.random.key(31)
 SHAPE, EDGE = (6, 6, 8), 1.0
@@ -137,7 +137,7 @@ def sums(wave):
     return wave.components["first"].sum(axis=1), wave.components["higher"].sum(axis=1)
 
 
-BATCHES = {"max_orders": 4, "n_photons": 2048, "n_rays": 512, **WHOLE}
+BATCHES = {"max_orders": 4, "n_photons": 2048, "n_rays": 512, **SINGLE_SAMPLE}
 
 
 @pytest.fixture(scope="module")
@@ -148,7 +148,7 @@ def totals():
 def expectation(**changes):
     """First and higher orders of the whole waveform, and their standard errors, at three wavelengths."""
     lidar, scene = build(**changes)
-    far = whole_lidar(
+    far = single_sample_lidar(
         wavelength=lidar.wavelength, divergence=0.01, zenith=20.0, azimuth=lidar.azimuth, aperture=80.0
     )
     return batch_mean(far, scene, jl.plan(far, scene, **BATCHES), seed=5, quantity=sums)

@@ -22,7 +22,7 @@ import pytest
 
 import jaxlidar as jl
 from jaxlidar import SPEED_OF_LIGHT
-from tests.helpers import WHOLE, agrees, slow_unless, whole_lidar
+from tests.helpers import SINGLE_SAMPLE, agrees, single_sample_lidar, slow_unless
 
 KEY = jax.random.key(21)
 R, T, RHO = 0.3, 0.5, 0.6
@@ -66,12 +66,12 @@ def all_orders(coverage=1.0, denominator=None, passing=None):
 @pytest.mark.parametrize("coverage", slow_unless([0.6], [0.6, 1.0]))
 def test_all_orders(transmission, coverage):
     wave = jl.simulate(
-        whole_lidar(),
+        single_sample_lidar(),
         scene(coverage, transmission),
         key=KEY,
         max_orders=8 if transmission == "straight" else 10,
         n_photons=16_384,
-        **(WHOLE | {"bin_width": 10.0}),
+        **(SINGLE_SAMPLE | {"bin_width": 10.0}),
     )
     found = (float(wave.reflectance[0, 0]), float(wave.stderr[0, 0]))
     assert found[1] < 0.005 * found[0]
@@ -133,8 +133,8 @@ def test_what_lies_in_one_plane_is_refused_and_is_nan_where_it_is_traced():
     def scene(height):
         return jl.Scene(plates=(jl.Plate(height, R),), ground=jl.Ground())
 
-    lidar = whole_lidar()
-    plan = jl.plan(lidar, scene(1.0), max_orders=1, **WHOLE)
+    lidar = single_sample_lidar()
+    plan = jl.plan(lidar, scene(1.0), max_orders=1, **SINGLE_SAMPLE)
     seen = jax.jit(lambda h: jl.simulate(lidar, scene(h), key=KEY, plan=plan).reflectance.sum())
     assert np.isfinite(seen(0.001))
     assert np.isnan(seen(0.0))

@@ -19,11 +19,11 @@ import numpy as np
 import pytest
 
 import jaxlidar as jl
-from tests.helpers import WHOLE, batch_mean, slow_unless, whole_lidar
+from tests.helpers import SINGLE_SAMPLE, batch_mean, single_sample_lidar, slow_unless
 
 ROOT = Path(__file__).resolve().parents[2]
 THICKNESS = 10.0
-FAR = whole_lidar()
+FAR = single_sample_lidar()
 
 
 def returned(wave):
@@ -38,7 +38,7 @@ def total(tau, leaf, ground, orders, photons, seed=0):
     scene = jl.Scene(
         canopy=jl.Canopy(voxels, leaf=leaf, sides="periodic"), ground=jl.Ground(reflectance=ground)
     )
-    plan = jl.plan(FAR, scene, max_orders=orders, n_photons=photons // 32, n_rays=256, **WHOLE)
+    plan = jl.plan(FAR, scene, max_orders=orders, n_photons=photons // 32, n_rays=256, **SINGLE_SAMPLE)
     (value, neglected), (stderr, _) = batch_mean(FAR, scene, plan, seed=seed, quantity=returned)
     return float(value), float(stderr), float(neglected)
 
