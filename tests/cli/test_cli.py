@@ -28,7 +28,7 @@ def as_installed(monkeypatch):
     """The commands of `inversion` as an installed package adds them; compiled programs are not kept."""
     points = [metadata.EntryPoint(n, f"inversion.commands:{n}", cli.COMMANDS) for n in ("demo", "retrieve")]
     monkeypatch.setattr(metadata, "entry_points", lambda group: points if group == cli.COMMANDS else [])
-    monkeypatch.setattr("jaxlidar.cli.group.kept_programs", contextlib.nullcontext)
+    monkeypatch.setattr("jaxlidar.cli.group.compilation_cache", contextlib.nullcontext)
 
 
 def test_help_names_every_command_and_shows_examples(capsys):
@@ -164,7 +164,7 @@ def test_compiled_programs_are_kept_unless_refused(tmp_path):
     code = (
         "import sys, jax; from jaxlidar.cli import cache, main; before = dict(jax.config.values);"
         # A fast machine compiles all of the command's programs in less than is worth a file.
-        "cache.SECONDS = 0.0;"
+        "cache.MIN_COMPILE_TIME = 0.0;"
         "print(main(sys.argv[1:]), jax.config.values == before)"
     )
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(tmp_path)}
