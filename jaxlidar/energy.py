@@ -1,10 +1,9 @@
 """Energy budgets: what a scene absorbs, returns to the sky and lets through to the ground, at any time."""
 
 import dataclasses
-import math
 import time
-from collections.abc import Callable
-from typing import final
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, final
 
 import equinox as eqx
 import jax
@@ -15,13 +14,21 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from jaxlidar._checks import briefly, check_choice, check_integer, check_key, check_range, known_number
 from jaxlidar._programs import Program
 from jaxlidar._progress import Progress
-from jaxlidar._statistics import Moments, batches_needed
 from jaxlidar._threads import ONE_CORE, side_by_side
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.planning.path_lengths import PathLengths
 from jaxlidar.planning.plan import MIN_BATCHES
 from jaxlidar.planning.plan import plan as make_plan
 from jaxlidar.planning.setup import Setup, reduce
+from jaxlidar.sampling.adaptive import (
+    BATCH_STEPS,
+    AbstractEstimate,
+    EstimateErrors,
+    HasErrors,
+    StoppingRule,
+    sample_until,
+)
+from jaxlidar.sampling.moments import RunningMoments
 from jaxlidar.scenes.scene import Scene, check_kinds
 from jaxlidar.trace.colouring import optics_of
 from jaxlidar.trace.fates import Fates, follow, from_beam, from_the_sky
@@ -122,44 +129,30 @@ def energy_budget(
     if illumination == "parallel" and (scene.canopy is None or scene.canopy.sides != "periodic"):
         raise ValueError("illumination = 'parallel'; that is admissible where the canopy has periodic sides")
     setup = _endless(reduce(lidar, scene, make_plan(lidar, scene, max_orders=1, describe=False)))
-    started = time.perf_counter()
-    moments = Moments()
-    wanted, stopped, error, n = MIN_BATCHES, "tolerance met", math.inf, lidar.wavelength.size
+    start_time = time.perf_counter()
 
-    def one(number: int) -> Fates:
+    def trace_batch(number: int) -> Fates:
         return _compiled(setup, jax.random.fold_in(key, number), illumination == "parallel", max_orders)
 
     with side_by_side() as run:
-        try:
-            while True:
-                for fates in run(one, range(moments.count, wanted)):
-                    moments.add(
-                        np.concatenate([np.asarray(a).reshape(-1, n) for a in jax.tree.leaves(fates)])
-                    )
-                error, done = float(np.max(moments.stderr, initial=0.0)), moments.count
-                photons, seconds = done * BATCH, time.perf_counter() - started
-                if progress is not None:
-                    progress(Progress(done, photons, seconds, error, rtol))
-                if error <= rtol:
-                    break
-                if photons >= max_photons:
-                    stopped = "photons traced"
-                    break
-                wanted = min(batches_needed(done, error, rtol), max(-(-max_photons // BATCH), done + 1))
-        except KeyboardInterrupt:
-            if moments.count < MIN_BATCHES:
-                raise
-            error, stopped = float(np.max(moments.stderr, initial=0.0)), "interrupted"
+        estimate = _BudgetEstimate(lambda numbers: run(trace_batch, numbers))
+
+        def report(errors: HasErrors) -> None:
+            if progress is not None:
+                batches, seconds = estimate.n_batches, time.perf_counter() - start_time
+                progress(Progress(batches, batches * BATCH, seconds, errors.relative, rtol))
+
+        stop = StoppingRule(rtol, min_size=MIN_BATCHES, max_size=-(-max_photons // BATCH))
+        reason, errors = sample_until(estimate, stop, BATCH_STEPS, report=report, keeps_interrupted=True)
     info = {
-        "photons": moments.count * BATCH,
-        "batches": moments.count,
-        "seconds": time.perf_counter() - started,
-        "error": error,
-        "stopped": stopped,
+        "photons": estimate.n_batches * BATCH,
+        "batches": estimate.n_batches,
+        "seconds": time.perf_counter() - start_time,
+        "error": errors.relative,
+        "stopped": reason.value,
     }
     names = setup.plan.trace.materials
-    rows = [*names, "returned", "below", "transmitted", "unfollowed"]
-    mean, stderr = (dict(zip(rows, map(jnp.asarray, a))) for a in (moments.mean, moments.stderr))
+    mean, stderr = (_named(fates, names) for fates in (estimate.moments.mean, estimate.moments.stderr))
     return EnergyBudget(
         absorbed={name: mean[name] for name in names},
         returned=mean["returned"],
@@ -170,6 +163,42 @@ def energy_budget(
         wavelength=lidar.wavelength,
         info=info,
     )
+
+
+class _BudgetEstimate(AbstractEstimate):
+    """Moments of the absorption and escape of batches of photons.
+
+    `trace`: traces the batches with the given numbers.
+    """
+
+    def __init__(self, trace: Callable[[range], Iterable[Fates]]):
+        self.trace = trace
+        self.moments: Any = None
+
+    @property
+    def n_batches(self) -> int:
+        """Number of batches."""
+        return 0 if self.moments is None else self.moments.count
+
+    def add_batches(self, numbers: range) -> None:
+        """Trace batches and add them."""
+        for fates in self.trace(numbers):
+            moments = RunningMoments.on_host(fates) if self.moments is None else self.moments
+            self.moments = moments.update(fates)
+
+    def errors(self) -> EstimateErrors:
+        """Return the largest standard error: it is relative to the emitted energy, which is one."""
+        return EstimateErrors(
+            max(float(np.max(a, initial=0.0)) for a in jax.tree.leaves(self.moments.stderr))
+        )
+
+
+def _named(fates: Any, materials: Sequence[str]) -> dict[str, Float[Array, "wavelengths"]]:
+    """Return the rows of absorption and escape by name."""
+    rows = dict(zip(materials, fates.absorbed))
+    rows |= {"returned": fates.up, "below": fates.down}
+    rows |= {"transmitted": fates.on_ground, "unfollowed": fates.unfollowed}
+    return {name: jnp.asarray(row) for name, row in rows.items()}
 
 
 def _endless(setup: Setup) -> Setup:

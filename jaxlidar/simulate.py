@@ -4,7 +4,7 @@ import dataclasses
 import math
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -15,7 +15,6 @@ from jaxtyping import Array, PRNGKeyArray
 from jaxlidar._checks import check_flag, check_integer, check_key, check_range, is_traced
 from jaxlidar._programs import Program
 from jaxlidar._progress import Progress
-from jaxlidar._statistics import Moments, batches_needed, widening
 from jaxlidar._summary import NOTABLE, late_share, percent
 from jaxlidar._threads import side_by_side
 from jaxlidar.instrument.lidar import Lidar
@@ -23,8 +22,20 @@ from jaxlidar.planning.plan import MIN_BATCHES, Plan
 from jaxlidar.planning.plan import plan as make_plan
 from jaxlidar.planning.plan_check import check_plan
 from jaxlidar.planning.setup import Setup, reduce
+from jaxlidar.sampling.adaptive import (
+    BATCH_STEPS,
+    AbstractEstimate,
+    HasErrors,
+    StoppingRule,
+    StopReason,
+    sample_until,
+)
+from jaxlidar.sampling.errors import student_widening
+from jaxlidar.sampling.moments import RunningMoments
+from jaxlidar.sampling.waveform_moments import WaveformErrors
 from jaxlidar.scenes.scene import Scene, check_kinds
 from jaxlidar.trace.batches import (
+    Known,
     Ready,
     add_responses,
     batch_of,
@@ -288,10 +299,55 @@ def _trace_within(ready: Ready, key: PRNGKeyArray) -> _Traced:
 
     def stderr(each: Array) -> Array:
         spread = jnp.var(jax.lax.stop_gradient(each), axis=0)
-        return widening(MIN_BATCHES) * jnp.sqrt(spread / (MIN_BATCHES - 1))
+        return student_widening(MIN_BATCHES) * jnp.sqrt(spread / (MIN_BATCHES - 1))
 
     whole = jax.tree.map(lambda a: jnp.sum(a, axis=0), responses)
     return _Traced(whole, MIN_BATCHES, stderr(totals), jax.tree.map(stderr, balances.ledger), {})
+
+
+class _WaveformEstimate(AbstractEstimate):
+    """Sum of the responses of batches, and the moments of what they return.
+
+    - `trace`: traces the batches with the given numbers. - `wavelengths`, `samples`: those of the waveform;
+      batches are padded to larger shapes.
+    - `response_sum`: sum of responses. - `waveforms`: moments of waveforms. - `budgets`: moments of energy
+      budgets, and the mean of the neglected fractions. - `names`: of the rows of energy budgets.
+    """
+
+    def __init__(
+        self,
+        trace: Callable[[range], Iterable[tuple[Response, Known]]],
+        recording: Recording,
+        wavelengths: int,
+        samples: int,
+    ):
+        self.trace, self.wavelengths = trace, wavelengths
+        self.waveforms = recording.moments(wavelengths, samples)
+        self.response_sum: Any = None
+        self.budgets: Any = None
+        self.names: tuple[str, ...] = ()
+
+    @property
+    def n_batches(self) -> int:
+        """Number of batches."""
+        return self.waveforms.count
+
+    def add_batches(self, numbers: range) -> None:
+        """Trace batches and add them."""
+        for response, batch in self.trace(numbers):
+            first = self.response_sum is None
+            self.response_sum = response if first else add_responses(self.response_sum, response)
+            budget = np.asarray(batch.ledger)[:, : self.wavelengths]
+            neglected = np.asarray(batch.neglected)[: self.wavelengths]
+            budgets = RunningMoments.on_host(budget, neglected) if first else self.budgets
+            self.budgets = budgets.update(budget, neglected)
+            self.names = batch.names
+            # Last: its count is the estimate's, also after an interrupt.
+            self.waveforms.add(batch.total)
+
+    def errors(self) -> WaveformErrors:
+        """Return the errors of the waveform."""
+        return self.waveforms.errors()
 
 
 def _trace_batches(
@@ -301,58 +357,52 @@ def _trace_batches(
     progress: Callable[[Progress], None] | None,
     started: float,
 ) -> _Traced:
-    """Batches on all cores, round after round, until the goal is reached."""
-    begun, plan = time.perf_counter(), ready.setup.plan
+    """Trace batches on all cores, round after round, until the goal is reached."""
+    plan = ready.setup.plan
     rtol = plan.rtol if goal.rtol is None else goal.rtol
-    fixed = None if goal.n_photons is None else max(MIN_BATCHES, -(-goal.n_photons // plan.n_photons))
-    many = ready.setup.lidar.wavelength.size
-    counted = plan.n_photons if plan.orders > 1 or plan.trace.drawn_first else 0
-    whole: Any = None
-    waves, shares, neglected = ready.brief.moments(many, plan.n_samples), Moments(), Moments()
-    wanted, stopped = MIN_BATCHES, "tolerance met"
+    if goal.n_photons is None:
+        stop = StoppingRule(rtol, goal.atol, MIN_BATCHES)
+    else:
+        stop = StoppingRule(None, 0.0, MIN_BATCHES, max(MIN_BATCHES, -(-goal.n_photons // plan.n_photons)))
+    photons_per_batch = plan.n_photons if plan.orders > 1 or plan.trace.drawn_first else 0
     batch = batch_of(ready, key)
     with side_by_side() as run:
-        try:
-            while True:
-                for response, its in run(batch, range(waves.count, wanted)):
-                    whole = response if whole is None else add_responses(whole, response)
-                    waves.add(its.total)
-                    shares.add(np.asarray(its.ledger)[:, :many])
-                    neglected.add(np.asarray(its.neglected)[:many])
-                    names = its.names
-                done, seconds = waves.count, time.perf_counter() - started
-                known = waves.spectra()
-                if progress is not None:
-                    progress(Progress(done, done * counted, seconds, known.relative, None if fixed else rtol))
-                if fixed is not None and done >= fixed:
-                    stopped = "photons traced"
-                    break
-                if fixed is None and (known.relative <= rtol or known.largest <= goal.atol):
-                    break
-                if seconds >= goal.max_seconds:
-                    stopped = "time spent"
-                    break
-                # Rounds are short, so that time and interrupts are looked at in between.
-                wanted = min(fixed, 4 * done) if fixed else batches_needed(done, known.relative, rtol)
-                if math.isfinite(goal.max_seconds):
-                    pace = done / max(time.perf_counter() - begun, 1e-9)
-                    wanted = max(min(wanted, done + int(pace * (goal.max_seconds - seconds))), done + 1)
-        except KeyboardInterrupt:
-            if waves.count < MIN_BATCHES:
-                raise
-            known, stopped = waves.spectra(), "interrupted"
-    beyond = 0.0
-    if stopped == "tolerance met" and plan.limits.automatic_orders:
-        share = float(np.max(neglected.mean / np.maximum(known.whole, 1e-30), initial=0.0))
-        if share > rtol and float(np.max(neglected.mean, initial=0.0)) > goal.atol:
-            beyond, stopped = share, f"orders beyond {plan.orders} may add {percent(share)}"
+        estimate = _WaveformEstimate(
+            lambda numbers: run(batch, numbers),
+            ready.brief,
+            ready.setup.lidar.wavelength.size,
+            plan.n_samples,
+        )
+
+        def report(errors: HasErrors) -> None:
+            if progress is not None:
+                batches, seconds = estimate.n_batches, time.perf_counter() - started
+                progress(Progress(batches, batches * photons_per_batch, seconds, errors.relative, stop.rtol))
+
+        reason, errors = sample_until(
+            estimate,
+            stop,
+            BATCH_STEPS,
+            max_seconds=goal.max_seconds,
+            start_time=started,
+            report=report,
+            keeps_interrupted=True,
+        )
+    assert isinstance(errors, WaveformErrors)
+    stopped, beyond = reason.value, 0.0
+    if reason is StopReason.TOLERANCE_MET and plan.limits.automatic_orders:
+        neglected = estimate.budgets.mean_only
+        fraction = float(np.max(neglected / np.maximum(errors.total, 1e-30), initial=0.0))
+        if fraction > rtol and float(np.max(neglected, initial=0.0)) > goal.atol:
+            beyond, stopped = fraction, f"orders beyond {plan.orders} may add {percent(fraction)}"
     info = {
-        "photons": waves.count * counted,
-        "batches": waves.count,
+        "photons": estimate.n_batches * photons_per_batch,
+        "batches": estimate.n_batches,
         "seconds": time.perf_counter() - started,
-        "error": known.relative,
+        "error": errors.relative,
         "stopped": stopped,
     }
-    assert whole is not None
-    ledger_stderr = {name: jnp.asarray(row) for name, row in zip(names, shares.stderr)}
-    return _Traced(whole, waves.count, jnp.asarray(known.stderr), ledger_stderr, info, beyond)
+    ledger_stderr = {name: jnp.asarray(row) for name, row in zip(estimate.names, estimate.budgets.stderr)}
+    return _Traced(
+        estimate.response_sum, estimate.n_batches, jnp.asarray(errors.stderr), ledger_stderr, info, beyond
+    )

@@ -20,6 +20,7 @@ import jaxlidar
 ROOT = Path(__file__).resolve().parents[1]
 # Rooms of jaxlidar, from the ground up: a module imports from its own room and from those before it.
 ROOMS = [
+    "sampling",
     "optics",
     "instrument",
     "scenes",
@@ -40,6 +41,7 @@ ROOMS = [
 HELPERS = {path.stem for path in (ROOT / "jaxlidar").glob("_*.py")} - {"__init__"}
 # Within rooms, files in the order in which they use one another; those not named use none of the others.
 ORDER = {
+    "sampling": ["errors", "moments", "waveform_moments", "adaptive"],
     "optics": ["coefficients", "leaf_surface", "plate_model", "spectra", "prospect"],
     "instrument": ["pulse_integrals", "pulse", "photon_counter", "receiver", "lidar", "scan", "survey"],
     "scenes": [

@@ -7,7 +7,7 @@ their squares.
 """
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import jax
@@ -17,11 +17,13 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from scipy import sparse
 
 from jaxlidar._programs import Program
-from jaxlidar._statistics import relative_error, widening
 from jaxlidar._threads import ONE_CORE
 from jaxlidar.planning.plan import MIN_BATCHES
 from jaxlidar.planning.setup import Setup
-from jaxlidar.survey.records import BatchMoments, Record, record_of_shot
+from jaxlidar.sampling.adaptive import AbstractEstimate, EstimateErrors, StepRule, StoppingRule, sample_until
+from jaxlidar.sampling.errors import relative_error, student_widening
+from jaxlidar.sampling.moments import RunningMoments
+from jaxlidar.survey.records import Record, record_of_shot
 from jaxlidar.survey.tiles import Tile
 from jaxlidar.survey.views import Views
 from jaxlidar.trace.colouring import (
@@ -54,6 +56,8 @@ _SMALL = 1e-3
 _ENDS = 2
 # Fewest rays of a batch of a shot's own.
 _FEWEST_RAYS = 64
+# Of few batches, the worst error of many shots is too large: no long steps.
+_STEPS = StepRule(safety=1.05, max_growth=1.05 * 1.4**2, min_step=2)
 # Tiles aim a little below the tolerance: where some are brighter than others, errors add up to a little more.
 _AIM = 0.97
 # Share of the squared error that order one may have where it is traced for each shot alone.
@@ -109,20 +113,6 @@ class Part(NamedTuple):
     photons: Int[np.ndarray, " shots"]
 
 
-class _Batches(NamedTuple):
-    """So many batches: moments of `total` and `fates`, and the mean of `lines`."""
-
-    count: int
-    moments: BatchMoments
-    lines: Any
-
-    def joined(self, other: "_Batches") -> "_Batches":
-        """Both together."""
-        whole = self.count + other.count
-        lines = self.lines + other.count / whole * (other.lines - self.lines)
-        return _Batches(whole, self.moments.joined(self.count, other.moments, other.count), lines)
-
-
 def _of_nodes(setting: Setting, nodes: Nodes, recording: Recording, key: PRNGKeyArray) -> Sums:
     """One batch."""
 
@@ -155,22 +145,22 @@ def _batches(
     key: PRNGKeyArray,
     first: Int[Array, ""],
     count: Int[Array, ""],
-) -> tuple[BatchMoments, Array]:
-    """Moments of `count` batches from number `first` on, and their mean lines."""
+) -> RunningMoments:
+    """Moments of `total` and `fates` of `count` batches from number `first` on, and their mean lines."""
     setting = _over(setting, recording, viewing, aim)
 
     def batch(n: Array) -> Sums:
         return _of_nodes(setting, nodes, recording, jax.random.fold_in(key, first + n))
 
-    def step(n: Array, state: tuple[BatchMoments, Response]) -> tuple[BatchMoments, Response]:
-        (moments, mean), found, number = state, batch(n), n + 1.0
-        mean = jax.tree.map(lambda m, v: m + (v - m) / number, mean, found.response)
-        return moments.add((found.total, found.fates), number), mean
+    def add(n: Array, moments: RunningMoments) -> RunningMoments:
+        sums = batch(n)
+        return moments.update((sums.total, sums.fates), sums.response)
 
-    zero: Sums = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(batch, first))
-    none = (zero.total, zero.fates)
-    moments, mean = jax.lax.fori_loop(0, count, step, (BatchMoments(none, none), zero.response))
-    return moments, jax.vmap(lambda response: _lines(response, recording))(mean)
+    shapes: Sums = jax.eval_shape(batch, first)
+    empty = RunningMoments.compiled((shapes.total, shapes.fates), shapes.response)
+    moments = jax.lax.fori_loop(0, count, add, empty)
+    lines = jax.vmap(lambda response: _lines(response, recording))(moments.mean_only)
+    return moments._replace(mean_only=lines)
 
 
 _several = Program(_batches, **ONE_CORE)
@@ -208,10 +198,10 @@ class _Wanted(NamedTuple):
     may_err: Float[np.ndarray, " shots"]
     elsewhere: Float[np.ndarray, "shots wavelengths samples"] | float
 
-    def worst(self, found: _Batches) -> float:
+    def worst(self, moments: RunningMoments) -> float:
         """The largest relative error, by what may be."""
-        mean = np.maximum(_summed(self.part, found.moments.mean[0]) + self.elsewhere, 0.0)
-        error = np.sqrt(_variance(self.part, found.moments.squares[0], found.count))
+        mean = np.maximum(_summed(self.part, moments.mean[0]) + self.elsewhere, 0.0)
+        error = np.sqrt(_variance(self.part, moments.squares[0], moments.count))
         ratio = relative_error(mean, error) * self.share / np.sqrt(self.may_err)
         return float(np.max(ratio, initial=0.0))
 
@@ -227,6 +217,28 @@ def _wanted(ready: Ready, tile: Tile, part: Mixing, viewing: Viewing | None, key
     elsewhere = (share - home)[:, None, None] * np.asarray(first)[: len(tile.shots)][waited]
     may_err = _OF_ORDER_ONE * home + (1.0 - _OF_ORDER_ONE) * share
     return _Wanted(part[waited], share, may_err, elsewhere)
+
+
+class _TileEstimate(AbstractEstimate):
+    """Moments of the batches of a tile, on the host."""
+
+    def __init__(self, trace: Callable[[range], RunningMoments], wanted: _Wanted):
+        self.trace, self.wanted = trace, wanted
+        self.moments: Any = None
+
+    @property
+    def n_batches(self) -> int:
+        """Number of batches."""
+        return 0 if self.moments is None else self.moments.count
+
+    def add_batches(self, numbers: range) -> None:
+        """Trace batches and add them."""
+        moments = self.trace(numbers)
+        self.moments = moments if self.moments is None else self.moments.merge(moments)
+
+    def errors(self) -> EstimateErrors:
+        """Return the largest relative error of the shots."""
+        return EstimateErrors(self.wanted.worst(self.moments))
 
 
 def trace_tile(ready: Ready, tile: Tile, number: int, rtol: float, key: PRNGKeyArray) -> Part:
@@ -251,31 +263,27 @@ def trace_tile(ready: Ready, tile: Tile, number: int, rtol: float, key: PRNGKeyA
         one = np.ones(len(tile.shots), np.float32)
         part = sparse.csr_array(sparse.dia_array((one, 0), (one.size, views.shots)))
 
-    def more(first: int, count: int) -> _Batches:
-        sizes = jnp.asarray(first, jnp.int32), jnp.asarray(count, jnp.int32)
+    def trace(numbers: range) -> RunningMoments:
+        sizes = jnp.asarray(numbers.start, jnp.int32), jnp.asarray(len(numbers), jnp.int32)
         aim = jnp.asarray(tile.aim, float)
         given = (ready.setting, ready.recording, nodes, viewing, aim, key, *sizes)
-        return _Batches(count, *jax.tree.map(np.asarray, _several(*given)))
+        moments = jax.tree.map(np.asarray, _several(*given))
+        return moments._replace(count=int(moments.count))
 
-    wanted = _wanted(ready, tile, part, viewing, key)
-    found = more(0, MIN_BATCHES)
-    while found.count < MOST_BATCHES:
-        worst = wanted.worst(found) / (_AIM * rtol)
-        if worst <= 1.0:
-            break
-        # Of few batches, the worst of many errors is too large: no long steps.
-        count = int(np.ceil(1.05 * found.count * min(worst, 1.4) ** 2))
-        found = found.joined(more(found.count, min(max(count - found.count, 2), MOST_BATCHES - found.count)))
+    estimate = _TileEstimate(trace, _wanted(ready, tile, part, viewing, key))
+    stop = StoppingRule(_AIM * rtol, min_size=MIN_BATCHES, max_size=MOST_BATCHES)
+    sample_until(estimate, stop, _STEPS)
+    found = estimate.moments
     lit = np.abs(tile.part) > 0
     per_node = np.bincount(tile.photons.node, minlength=tile.part.shape[1])
-    variance, fates_variance = (_variance(part, a, found.count) for a in found.moments.squares)
+    variance, fates_variance = (_variance(part, a, found.count) for a in found.squares)
     if views is None:
         # Light that is put elsewhere about a node is an error as large as what the node returns of it.
-        variance = variance + _summed(tile.astray**2, found.moments.mean[0] ** 2)
+        variance = variance + _summed(tile.astray**2, found.mean[0] ** 2)
     return Part(
         tile.shots,
-        _summed(part, found.lines),
-        _summed(part, found.moments.mean[1]),
+        _summed(part, found.mean_only),
+        _summed(part, found.mean[1]),
         variance,
         fates_variance,
         (lit @ per_node) * found.count,
@@ -319,7 +327,7 @@ def _finish(
     # What returns is taken from one of the others, which keeps its error.
     held = {"escaped": "escaped", "after the window": "late", "unfollowed": "remaining"}
     ledger_stderr = errors.ledger | {name: fates_stderr[fate] for name, fate in held.items()}
-    error = relative_error(total, stderr, jnp)
+    error = relative_error(total, stderr)
     photons = jnp.zeros((), jnp.int32)
     return record_of_shot(recording, parts, balance, stderr, ledger_stderr, error, photons)
 
@@ -344,5 +352,5 @@ def _variance(part: Mixing, squares: Any, count: int) -> Any:
     """Variances of the means of batches, summed over nodes; widened for few batches of few nodes."""
     weight = part * part
     nodes = weight.sum(axis=1) ** 2 / np.maximum((weight * weight).sum(axis=1), 1e-30)
-    wide = widening(1.0 + (count - 1.0) * np.maximum(nodes, 1.0)) ** 2 / (count * (count - 1.0))
+    wide = student_widening(1.0 + (count - 1.0) * np.maximum(nodes, 1.0)) ** 2 / (count * (count - 1.0))
     return _summed((weight * wide[:, None]).astype(part.dtype), squares)

@@ -18,12 +18,14 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from jaxlidar._programs import Program
-from jaxlidar._statistics import relative_error
 from jaxlidar._threads import ONE_CORE
 from jaxlidar.instrument.survey import Survey
 from jaxlidar.planning.plan import MIN_BATCHES, Plan
 from jaxlidar.planning.setup import Setup
-from jaxlidar.survey.records import BatchMoments, Record, record_of_shot
+from jaxlidar.sampling.adaptive import StepRule, StoppingRule, sample_until_compiled
+from jaxlidar.sampling.errors import relative_error
+from jaxlidar.sampling.moments import RunningMoments
+from jaxlidar.survey.records import Record, record_of_shot
 from jaxlidar.trace.colouring import Recording, balance, components, recording_of
 from jaxlidar.trace.footprint import Slice
 from jaxlidar.trace.response import Response, follows, trace_only_first, trace_setting
@@ -31,9 +33,12 @@ from jaxlidar.trace.setting import Setting, aimed, setting_of, straight_transmit
 
 # Batches of one shot, or parts of each of its lattices, at most: a tolerance that is out of reach ends here.
 MOST_BATCHES = 1024
+# Batches of a shot follow one another, so that steps could be as small as one. The error is looked at after
+# every fourth: an estimate that stops at the first moment at which it seems precise is wrong more often.
+_EVERY_FOURTH = StepRule(max_growth=1.0, min_step=4)
 # Errors of randomised lattices in the plane fall with this power of the number of points where the integrand
 # jumps, as at the edges of crowns (He and Wang 2015, SIAM J. Numer. Anal. 53, 2488).
-_ORDER = 0.75
+_DENSER = StepRule(order=0.75, safety=1.2, min_growth=2.0, max_growth=32.0)
 
 
 class Aim(NamedTuple):
@@ -95,31 +100,6 @@ def _batch(
     return components(response, recording), balance(response, recording)
 
 
-class _Found(NamedTuple):
-    """What batches found: how many, their mean, and the moments of what standard errors are wanted of."""
-
-    count: Array
-    mean: Any
-    moments: BatchMoments
-
-    @staticmethod
-    def none(like: Any) -> "_Found":
-        zero = _zeros(like)
-        return _Found(jnp.zeros((), jnp.int32), zero, BatchMoments(_spread_of(zero), _spread_of(zero)))
-
-    def add(self, found: Any) -> "_Found":
-        """With one more batch."""
-        count = self.count + 1
-        number = count.astype(float)
-        mean = jax.tree.map(lambda m, v: m + (v - m) / number, self.mean, found)
-        return _Found(count, mean, self.moments.add(_spread_of(found), number))
-
-    @property
-    def error(self) -> Array:
-        """Relative error of the waveform."""
-        return relative_error(self.moments.mean[0], self.moments.stderr(self.count.astype(float))[0], jnp)
-
-
 def _spread_of(found: Any) -> tuple[Any, Any]:
     """The quantities whose standard errors are wanted."""
     parts, shares = found
@@ -143,41 +123,56 @@ def _one(setting: Setting, setup: Setup, aim: Aim, key: PRNGKeyArray, rtol: Arra
         none = jnp.zeros(()), jnp.zeros((), jnp.int32)
         return record_of_shot(recording, parts, shares, exact, of_shares, *none)
 
-    until = _more_batches if follows(setting) else _denser_lattices
-    found = until(batch, _Found.none(jax.eval_shape(batch, *start)), rtol)
-    stderr, of_shares = found.moments.stderr(found.count.astype(float))
-    parts, shares = found.mean
-    photons = found.count * photons_of(setup.plan)
-    return record_of_shot(recording, parts, shares, stderr, of_shares, found.error, photons)
+    refine = _add_batches if follows(setting) else _densify_lattices
+    estimate = refine(batch, jax.eval_shape(batch, *start), rtol)
+    stderr, of_shares = estimate.stderr
+    parts, shares = estimate.mean_only
+    photons = estimate.count * photons_of(setup.plan)
+    error = _error_of(estimate)
+    return record_of_shot(recording, parts, shares, stderr, of_shares, error, photons)
 
 
-def _more_batches(batch: Callable[[Array, Array], Any], nothing: _Found, rtol: Array) -> _Found:
-    """Batch after batch, until the error is below the tolerance."""
-
-    def going(found: _Found) -> Array:
-        # Looked at after every fourth batch: who stops at the first good moment is wrong more often.
-        wanted = (found.count < MIN_BATCHES) | (found.count % 4 != 0) | (found.error > rtol)
-        return wanted & (found.count < MOST_BATCHES)
-
-    whole = jnp.ones((), jnp.int32)
-    return jax.lax.while_loop(going, lambda found: found.add(batch(found.count, whole)), nothing)
+def _error_of(estimate: RunningMoments) -> Array:
+    """Return the relative error of a waveform."""
+    return relative_error(estimate.mean[0], estimate.stderr[0])
 
 
-def _denser_lattices(batch: Callable[[Array, Array], Any], nothing: _Found, rtol: Array) -> _Found:
-    """Eight batches, again with lattices of as many more parts as the error calls for, until it is met."""
+def _empty(shapes: Any) -> RunningMoments:
+    """Return moments of no batch."""
+    return RunningMoments.compiled(_spread_of(_zeros(shapes)), shapes)
 
-    def going(state: tuple[Array, _Found]) -> Array:
-        parts, found = state
-        return (found.count == 0) | ((found.error > rtol) & (parts < MOST_BATCHES))
 
-    def denser(state: tuple[Array, _Found]) -> tuple[Array, _Found]:
-        parts, found = state
-        wanted = jnp.clip(1.2 * (found.error / rtol) ** (1.0 / _ORDER), 2.0, 32.0)
-        more = jnp.ceil(parts * jnp.where(found.count > 0, wanted, 1.0)).astype(jnp.int32)
-        parts = jnp.minimum(more, MOST_BATCHES)
-        return parts, jax.lax.fori_loop(0, MIN_BATCHES, lambda n, f: f.add(batch(n, parts)), nothing)
+def _add_batches(batch: Callable[[Array, Array], Any], shapes: Any, rtol: Array) -> RunningMoments:
+    """Trace batch after batch until the error is below the tolerance."""
+    undivided = jnp.ones((), jnp.int32)
 
-    return jax.lax.while_loop(going, denser, (jnp.ones((), jnp.int32), nothing))[1]
+    def add(n: Array, estimate: RunningMoments) -> RunningMoments:
+        result = batch(n, undivided)
+        return estimate.update(_spread_of(result), result)
+
+    def refine(estimate: RunningMoments, size: Array, following: Array) -> RunningMoments:
+        return jax.lax.fori_loop(size, following, add, estimate)
+
+    stop = StoppingRule(rtol, min_size=MIN_BATCHES, max_size=MOST_BATCHES)
+    return sample_until_compiled(refine, _empty(shapes), _error_of, stop, _EVERY_FOURTH)
+
+
+def _densify_lattices(batch: Callable[[Array, Array], Any], shapes: Any, rtol: Array) -> RunningMoments:
+    """Trace eight batches, again with lattices of more parts until the error is below the tolerance.
+
+    Batches of coarser lattices are dropped: the error of denser ones falls faster than that of more batches.
+    """
+    empty = _empty(shapes)
+
+    def refine(_: RunningMoments, size: Array, following: Array) -> RunningMoments:
+        def add(n: Array, estimate: RunningMoments) -> RunningMoments:
+            result = batch(n, following)
+            return estimate.update(_spread_of(result), result)
+
+        return jax.lax.fori_loop(0, MIN_BATCHES, add, empty)
+
+    stop = StoppingRule(rtol, min_size=1, max_size=MOST_BATCHES)
+    return sample_until_compiled(refine, empty, _error_of, stop, _DENSER)
 
 
 def _zeros(shapes: Any) -> Any:

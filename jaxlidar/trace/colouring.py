@@ -11,13 +11,13 @@ from jaxtyping import Array, Float
 
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._programs import Program
-from jaxlidar._statistics import FewMoments, WaveformMoments
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.planning.effects import can_light_itself
 from jaxlidar.planning.ladder import rung
 from jaxlidar.planning.sampling import Sampling, sampling_of
 from jaxlidar.planning.scatterers import letter_values
 from jaxlidar.planning.setup import Setup
+from jaxlidar.sampling.waveform_moments import PivotMoments, WaveformMoments
 from jaxlidar.scenes.atmosphere import Atmosphere
 from jaxlidar.trace.few_wavelengths import FewWavelengths, few_of
 from jaxlidar.trace.histories import Histories, histories
@@ -73,11 +73,11 @@ class Recording(eqx.Module):
         """Few wavelengths from which samples follow. None without such, and where air makes them unlike."""
         return self.few if self.clear is None else None
 
-    def moments(self, wavelengths: int, samples: int) -> WaveformMoments | FewMoments:
+    def moments(self, wavelengths: int, samples: int) -> WaveformMoments | PivotMoments:
         """Room for the moments of what `total_and_balance` returns, without what is there to spare."""
         if self.unspread is None:
             return WaveformMoments(wavelengths, samples)
-        return FewMoments(np.asarray(self.unspread.shares)[:, :wavelengths])
+        return PivotMoments(np.asarray(self.unspread.shares)[:, :wavelengths])
 
     @property
     def coloured(self) -> int:

@@ -6,7 +6,7 @@ import pytest
 import scipy.stats
 
 import jaxlidar as jl
-from jaxlidar._statistics import widening
+from jaxlidar.sampling.errors import student_widening
 from tests.helpers import slab
 
 LIDAR = jl.Lidar(wavelength=1064.0)
@@ -46,7 +46,7 @@ def test_the_truth_lies_within_two_reported_errors(case):
         # Where the deterministic first order is all, only rounding is left.
         tell = seen & (error > 1e-5 * truth)
         inside.append(np.mean((off < 2 * error)[tell]))
-        plain.append(np.mean((off < 2 * error / widening(wave.info["batches"]))[tell]))
+        plain.append(np.mean((off < 2 * error / student_widening(wave.info["batches"]))[tell]))
         batches.append(wave.info["batches"])
         assert wave.info["error"] <= rtol
     assert 0.93 <= np.mean(inside) <= 0.975
@@ -58,4 +58,4 @@ def test_the_truth_lies_within_two_reported_errors(case):
 @pytest.mark.parametrize("batches", [8, 9, 16, 64, 1000])
 def test_widening_is_students(batches):
     exact = scipy.stats.t.ppf(scipy.stats.norm.cdf(2.0), batches - 1) / 2.0
-    assert widening(batches) == pytest.approx(exact, rel=1e-3)
+    assert student_widening(batches) == pytest.approx(exact, rel=1e-3)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxlidar as jl
-from jaxlidar._statistics import FewMoments, WaveformMoments
+from jaxlidar.sampling.waveform_moments import PivotMoments, WaveformMoments
 from jaxlidar.trace.colouring import balance, recording_of, total
 from jaxlidar.trace.few_wavelengths import few_of
 from jaxlidar.trace.histories import histories
@@ -120,17 +120,17 @@ def test_moments_of_few_wavelengths_are_those_of_all():
     """Over rounds of any size: what is kept of few, spread, is what batches at all wavelengths have."""
     random = np.random.default_rng(0)
     shares = random.uniform(-1.0, 1.0, (5, 40))
-    short, whole = FewMoments(jnp.asarray(shares, jnp.float32)), WaveformMoments(40, 7)
+    short, whole = PivotMoments(jnp.asarray(shares, jnp.float32)), WaveformMoments(40, 7)
     for batches in (8, 3, 21):
         for _ in range(batches):
             few = 2.0 + random.uniform(size=(5, 7))
             short.add(few)
             whole.add(np.pad(shares.T @ few, ((0, 2), (0, 1))))
-        mine, each = short.spectra(), whole.spectra()
+        mine, each = short.errors(), whole.errors()
         # Asked again, as after an interrupt, they are the same.
-        np.testing.assert_array_equal(mine.stderr, short.spectra().stderr)
+        np.testing.assert_array_equal(mine.stderr, short.errors().stderr)
         assert short.count == whole.count
-        for name in ("whole", "stderr"):
+        for name in ("total", "stderr"):
             expected = getattr(each, name)
             np.testing.assert_allclose(getattr(mine, name), expected, atol=3e-6 * np.abs(expected).max())
         assert mine.relative == pytest.approx(each.relative, rel=1e-3)

@@ -1,0 +1,1 @@
+"""Monte Carlo estimates from independent batches: running moments, standard errors, and when to stop."""
