@@ -114,7 +114,7 @@ class Case:
             raise ValueError(f"the case has no {' and no '.join(missing)}: nothing can be simulated")
         if self.survey is not None:
             # Campaigns lie above the files, which ask for them by name.
-            many = importlib.import_module("jaxlidar.survey.run").simulate_many
+            many = importlib.import_module("jaxlidar.survey.simulate_many").simulate_many
             given = {"key": self.key, "path": path, "progress": progress, **self.arguments}
             return many(self.survey, self.scene, **given)
         if path is not None:

@@ -79,10 +79,10 @@ class RunningMoments(NamedTuple):
             jax.tree.map(lambda m, v: _update_mean(m, v, count), self.mean_only, mean_only),
         )
 
-    def merge(self, other: "RunningMoments") -> "RunningMoments":
+    def merge(self, second: "RunningMoments") -> "RunningMoments":
         """Return the moments of the batches of both."""
-        count = self.count + other.count
-        fraction = other.count * (1.0 / count)
+        count = self.count + second.count
+        fraction = second.count * (1.0 / count)
 
         def mean(a: Any, b: Any) -> Any:
             return a + fraction * (b - a)
@@ -92,9 +92,9 @@ class RunningMoments(NamedTuple):
 
         return RunningMoments(
             count,
-            jax.tree.map(mean, self.mean, other.mean),
-            jax.tree.map(squares, self.squares, other.squares, self.mean, other.mean),
-            jax.tree.map(mean, self.mean_only, other.mean_only),
+            jax.tree.map(mean, self.mean, second.mean),
+            jax.tree.map(squares, self.squares, second.squares, self.mean, second.mean),
+            jax.tree.map(mean, self.mean_only, second.mean_only),
         )
 
     @property

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxlidar as jl
-from jaxlidar.survey.squares import all_light, squares_of
+from jaxlidar.survey.tiled_scene import lossless_margin, tiles_of
 
 SIDE, TALL = 48, 6
 LEAF = jl.LeafOptics(0.5, 0.45)
@@ -94,11 +94,11 @@ def test_a_margin_as_wide_as_all_light_loses_none_and_a_small_one_does():
     assert np.mean(off(narrow, whole)) > 1.5
 
 
-def test_rectangles_have_one_size_and_hold_all_light():
+def test_rectangles_have_one_size_and_hold_lossless_margin():
     for zenith in (0.0, 30.0):
         shots, scene = survey(zenith=zenith), parts(Forest())
         for margin in (0.0, 7.0):
-            squares = squares_of(shots, scene, margin)
+            squares = tiles_of(shots, scene, margin)
             assert sorted(np.concatenate([s.shots for s in squares])) == list(range(len(shots)))
             sizes = np.array([s.high - s.low for s in squares])
             np.testing.assert_allclose(sizes, sizes[0, 0])
@@ -117,7 +117,7 @@ def test_light_that_goes_farther_comes_back_too_late():
     for zenith in (0.0, 20.0, 50.0):
         shots = survey(zenith=zenith)
         w, last, top = shots.direction[0], 60.0, 10.0
-        far = all_light(shots, last, top)
+        far = lossless_margin(shots, last, top)
         z = random.uniform(0, top, (20_000, 2))
         turn, apart = random.uniform(0, 2 * np.pi, 20_000), far * random.uniform(0.5, 1.5, 20_000)
         first = z[:, :1] / w[2] * w

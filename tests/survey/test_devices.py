@@ -22,7 +22,7 @@ import sys
 import jax
 
 import jaxlidar as jl
-from jaxlidar.survey import shared, ways
+from jaxlidar.survey import per_shot, shared_illumination
 from tests.survey.test_simulate_many import KEY, stand
 from tests.survey.test_devices import SURVEYS
 
@@ -39,7 +39,8 @@ def noting(program):
     return noted
 
 
-ways.several, shared._several = noting(ways.several), noting(shared._several)
+per_shot.compiled_shots = noting(per_shot.compiled_shots)
+shared_illumination.compiled_group_moments = noting(shared_illumination.compiled_group_moments)
 for name, (survey, how, busy) in SURVEYS.items():
     used.clear()
     many = jl.simulate_many(survey, stand(), key=KEY, mesh=mesh, **how)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import jaxlidar as jl
-from jaxlidar.survey.irradiance import Section, misplaced, patches, section_of
+from jaxlidar.survey.footprint_splines import BeamSection, fit_footprints, section_of, spline_error
 from tests.survey.test_simulate_many import (
     FAST,
     KEY,
@@ -59,21 +59,21 @@ def test_shared_light_over_terrain_below_plates_and_air(kind):
 
 def test_footprints_are_splines():
     axis = (0.3, 0.4, -(0.75**0.5))
-    beams = [Section(1.0, gaussian, *way) for gaussian in (True, False) for way in ((), (axis,))]
+    beams = [BeamSection(1.0, gaussian, *way) for gaussian in (True, False) for way in ((), (axis,))]
     for beam, largest in zip(beams, (2e-4, 2e-4, 0.03, 0.03)):
-        errors = [misplaced(np.array([0.3, -0.2]), beam, spacing) for spacing in (1.0, 0.35)]
+        errors = [spline_error(np.array([0.3, -0.2]), beam, spacing) for spacing in (1.0, 0.35)]
         assert errors[1] < largest < errors[0]
     survey = nadir(8)
-    found = patches(survey, 0.01)
+    found = fit_footprints(survey, 0.01)
     assert np.allclose(found.coefficients.sum(axis=(1, 2)), 1.0, atol=1e-5)
     # What they put elsewhere is known by place.
-    off = [misplaced(p, section_of(survey), found.spacing) for p in survey.position]
-    assert np.allclose(np.sqrt((found.astray**2).sum(axis=(1, 2))), off, rtol=1e-4)
+    off = [spline_error(p, section_of(survey), found.spacing) for p in survey.position]
+    assert np.allclose(np.sqrt((found.misplaced_energy**2).sum(axis=(1, 2))), off, rtol=1e-4)
     # Their means are where the beams aim.
     number = np.arange(found.coefficients.shape[1])
     for axis in (0, 1):
         along = found.coefficients.sum(axis=2 - axis)
-        mean = found.spacing * (found.first[:, axis] + (along * number).sum(axis=1))
+        mean = found.spacing * (found.first_node[:, axis] + (along * number).sum(axis=1))
         assert np.allclose(mean, survey.position[:, axis], atol=1e-2)
 
 

@@ -381,8 +381,8 @@ NADIR = nadir(2)
     ],
 )
 def test_what_is_refused_before_any_work(given, error, said, monkeypatch):
-    from jaxlidar.survey import run
+    from jaxlidar.survey import simulate_many
 
-    monkeypatch.setattr(run, "outcomes", lambda *_: pytest.fail("work was done"))
+    monkeypatch.setattr(simulate_many, "outcomes", lambda *_: pytest.fail("work was done"))
     with pytest.raises(error, match=said):
         jl.simulate_many(**({"survey": NADIR, "scene": stand(), "key": KEY} | given))
