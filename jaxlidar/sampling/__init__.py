@@ -1,1 +1,1 @@
-"""Monte Carlo estimates from independent batches: running moments, standard errors, and when to stop."""
+"""Batches of photons: compiled programs that trace them, running moments, and when to stop."""

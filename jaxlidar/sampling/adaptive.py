@@ -198,6 +198,7 @@ def sample_until(
                 target = step.next_size(batches, errors.relative, stop.rtol)
             target = int(stop.limited(target))
             if math.isfinite(max_seconds):
+                # At the rate so far, compilation included: the first rounds err on the short side.
                 rate = batches / max(time.perf_counter() - sampling_start, 1e-9)
                 in_time = batches + int(rate * (max_seconds - elapsed))
                 target = max(min(target, in_time), batches + 1)
@@ -225,6 +226,7 @@ def sample_until_compiled(
     - `stop`, `step`: the rules.
     """
 
+    # Before the first round the error is not a number, in any comparison False: the size decides.
     def continues(state: tuple[jax.Array, Estimate]) -> jax.Array:
         size, estimate = state
         exceeds = stop.exceeds(EstimateErrors(relative_error(estimate)))
@@ -233,6 +235,7 @@ def sample_until_compiled(
     def next_round(state: tuple[jax.Array, Estimate]) -> tuple[jax.Array, Estimate]:
         size, estimate = state
         following = stop.limited(step.next_size(size, relative_error(estimate), stop.rtol))
+        # Both branches of `where` are computed; the first round has no error to predict from.
         following = jnp.where(size < stop.min_size, stop.min_size, following)
         return following, refine(estimate, size, following)
 

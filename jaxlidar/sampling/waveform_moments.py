@@ -18,6 +18,7 @@ from jaxtyping import Array, ArrayLike, Float
 from jaxlidar._programs import Program
 from jaxlidar.sampling.errors import relative_error, student_widening
 from jaxlidar.sampling.moments import RunningMoments, scaled_deviation
+from jaxlidar.spectral.apply_optics import WaveformModel
 
 # Batches that one call interpolates to all wavelengths: as many as the fewest that are traced.
 BLOCK = 8
@@ -78,6 +79,7 @@ class PivotMoments:
         if self._pivot_means is None:
             self._pivot_means = RunningMoments.on_host((), waveform)
         means = self._pivot_means
+        # Blocks of one size: one compiled program adds their squares.
         if len(self._deviations) == BLOCK:
             self._squares = _compiled_add_squares(self._block(), self._interpolation, self._squares)
             self._deviations = []
@@ -96,6 +98,7 @@ class PivotMoments:
         scale = student_widening(count) ** 2 / (count * (count - 1.0))
         mean, scale = (jnp.asarray(a, dtype) for a in (self._pivot_means.mean_only, scale))
         errors, squares = _compiled_errors(mean, self._block(), self._interpolation, self._squares, scale)
+        # The block is among the squares now: to ask again, as after an interrupt, adds nothing twice.
         self._squares, self._deviations = squares, []
         return errors._replace(relative=float(errors.relative), largest=float(errors.largest))
 
@@ -104,6 +107,16 @@ class PivotMoments:
         assert self._pivot_means is not None
         padding = [np.zeros_like(self._pivot_means.mean_only)] * (BLOCK - len(self._deviations))
         return jnp.asarray(np.stack([*self._deviations, *padding]), self._interpolation.dtype)
+
+
+def make_waveform_moments(
+    model: WaveformModel, n_wavelengths: int, n_samples: int
+) -> WaveformMoments | PivotMoments:
+    """Return moments of no batch, for what `samples_and_budget` of a model returns, without its padding."""
+    pivots = model.sample_pivots
+    if pivots is None:
+        return WaveformMoments(n_wavelengths, n_samples)
+    return PivotMoments(np.asarray(pivots.coefficients)[:, :n_wavelengths])
 
 
 def _add_squares(

@@ -1,11 +1,10 @@
 """The choice of strategy, per shot or shared illumination, for the shots of a survey over one scene."""
 
-import dataclasses
 import math
 
 import numpy as np
 
-from jaxlidar._checks import known_array, known_number
+from jaxlidar._checks import concrete_array, concrete_number
 from jaxlidar._summary import percent
 from jaxlidar.instrument.survey import Survey
 from jaxlidar.optics.laws import AbstractMirror
@@ -13,14 +12,14 @@ from jaxlidar.planning.local_origin import about_aim
 from jaxlidar.planning.parallel_light import one_direction, parallel_light
 from jaxlidar.planning.plan import DEFAULT_RTOL, Plan
 from jaxlidar.planning.plan import plan as make_plan
-from jaxlidar.planning.setup import Setup, reduce
+from jaxlidar.planning.setup import Setup, make_setup
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.survey.footprint_splines import FootprintSplines, fit_footprints
 from jaxlidar.survey.node_groups import IlluminatedNodes, NodeGroup, illuminated_nodes, make_groups
 from jaxlidar.survey.per_shot import PerShotStrategy
 from jaxlidar.survey.shared_illumination import SharedIlluminationStrategy
-from jaxlidar.survey.shot_views import ShotViews
 from jaxlidar.survey.strategy import AbstractStrategy
+from jaxlidar.survey.view_geometry import ViewGeometry
 
 # Fractions of the tolerance that parallel light may take, and the grid of nodes; the finest grid may take
 # more.
@@ -61,13 +60,14 @@ def choose_strategy(
     # Eight batches then have 6.4 / rtol^2 photons: a sample with a sixth of the light has the relative error
     # rtol.
     n_photons = _power_of_two(0.8 / rtol**2, *_PHOTONS)
-    plan = dataclasses.replace(plan, n_rays=_rays_of_batch(plan, survey, scene, rtol), n_photons=n_photons)
+    plan = plan.with_config(n_rays=_rays_of_batch(plan, survey, scene, rtol), n_photons=n_photons)
+    # The setup is that of one shot in the middle of the survey, with the largest zenith angle.
     middle = survey.middle
-    setup = reduce(middle, scene, plan)
+    setup = make_setup(middle, scene, plan)
     # Coordinates are relative to the survey's middle, where single precision is fine. A scene that cannot be
     # moved keeps its coordinates, and the lidar its position.
     lidar, _ = about_aim(middle, scene)
-    relative_survey = survey.about(known_array(middle.position) - known_array(lidar.position))
+    relative_survey = survey.about(concrete_array(middle.position) - concrete_array(lidar.position))
     strategy = _shared_illumination(relative_survey, setup, rtol, shared)
     return PerShotStrategy(setup, relative_survey, rtol) if strategy is None else strategy
 
@@ -79,7 +79,7 @@ def _rays_of_batch(plan: Plan, survey: Survey, scene: Scene, rtol: float) -> int
     """
     rays = 10.0 / rtol
     if scene.canopy is not None:
-        edge = float(np.min(known_array(scene.canopy.voxels.voxel_size)[:2]))
+        edge = float(np.min(concrete_array(scene.canopy.voxels.voxel_size)[:2]))
         columns = (1.0 + 2.0 * float(np.max(survey.footprint_radius)) / edge) ** 2
         rays = min(rays, 32.0 * columns)
     return min(_power_of_two(rays, *_RAYS), plan.n_rays)
@@ -128,9 +128,9 @@ def _shared_illumination(
         return None
     fewer_photons = _FEWER_PHOTONS_BY_SHOT if by_shot else _FEWER_PHOTONS
     groups = _groups(splines, nodes, setup, fewer_photons)
-    views = ShotViews.of(survey, groups, splines.spacing) if by_shot else None
+    view_geometry = ViewGeometry.of(survey, groups, splines.spacing) if by_shot else None
     bound = _parallel_light_bound(survey, setup)
-    return SharedIlluminationStrategy(setup, survey, rtol, groups, splines.spacing, views, bound)
+    return SharedIlluminationStrategy(setup, survey, rtol, groups, splines.spacing, view_geometry, bound)
 
 
 def _is_by_shot(survey: Survey) -> bool:
@@ -139,7 +139,7 @@ def _is_by_shot(survey: Survey) -> bool:
 
 
 def _parallel_light_bound(survey: Survey, setup: Setup) -> float:
-    return parallel_light(survey, setup.plan.trace.upstream, setup.plan.limits.last)
+    return parallel_light(survey, setup.plan.limits.start_distance, setup.plan.scope.last_return)
 
 
 def _groups(
@@ -161,10 +161,13 @@ def reason_against_sharing(survey: Survey, setup: Setup, rtol: float) -> str | N
         return "one order is followed, which shots that lean or have a field of view do not share"
     if not setup.plan.is_random:
         return "nothing is random"
-    if known_number(lidar.divergence) == 0:
+    if concrete_number(lidar.divergence) == 0:
         return "the beam has no width"
+    # Where leaves transmit straight on, extinction depends on wavelength: photons cannot be shared among
+    # wavelengths.
     if canopy is not None and canopy.is_straight:
         return "transmission = 'straight': light of every wavelength goes its own way"
+    # A mirror returns the image of the beam, which depends on the spreading that parallel light lacks.
     if any(isinstance(s.law, AbstractMirror) for s in setup.scene.surfaces):
         return "a surface is a mirror"
     bound = _parallel_light_bound(survey, setup)

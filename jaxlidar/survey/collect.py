@@ -11,16 +11,16 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxlidar._summary import NOTABLE, percent
+from jaxlidar._summary import NOTABLE_FRACTION, percent
 from jaxlidar.io.case import Case
 from jaxlidar.io.netcdf import by_rows
 from jaxlidar.io.parts import Parts
 from jaxlidar.io.rows import blank
 from jaxlidar.simulate import LateLightWarning
+from jaxlidar.spectral.apply_optics import make_waveform_model
 from jaxlidar.survey.results import ShotResults
 from jaxlidar.survey.strategy import AbstractStrategy
 from jaxlidar.survey.waveforms import Waveforms
-from jaxlidar.trace.colouring import recording_of
 
 
 class StoredResults(MutableMapping[int, Any]):
@@ -59,7 +59,7 @@ def waveforms_in_memory(
     """Return all waveforms. `survey_fields`: the fields of `Waveforms` that are known before any tracing."""
     blocks = [results for _, results in strategy.shot_results(task_results)]
     results: ShotResults = jax.tree.map(lambda *a: np.concatenate(a), *blocks)
-    _warn_of_late_light(strategy, float(np.max(results.ledger["after the window"], initial=0.0)))
+    _warn_of_late_light(strategy, float(np.max(results.energy_budget["after the window"], initial=0.0)))
     return _waveforms(strategy, {**survey_fields, **results._asdict()}, start_time)
 
 
@@ -85,7 +85,7 @@ def waveforms_on_disk(
         for shots, results in itertools.chain([first], blocks):
             fields = {name: a[shots] for name, a in survey_fields.items()}
             rows.add(shots, {**fields, **results._asdict()})
-            largest_late = max(largest_late, float(np.max(results.ledger["after the window"])))
+            largest_late = max(largest_late, float(np.max(results.energy_budget["after the window"])))
     _warn_of_late_light(strategy, largest_late)
     return Waveforms.open(path)
 
@@ -94,7 +94,7 @@ def _waveforms(
     strategy: AbstractStrategy, fields: dict[str, Any], start_time: float, **info: Any
 ) -> Waveforms:
     return Waveforms(
-        time=np.asarray(recording_of(strategy.setup).time),
+        time=np.asarray(make_waveform_model(strategy.setup).time),
         wavelength=np.asarray(strategy.setup.lidar.wavelength),
         **fields,
         info={
@@ -110,11 +110,11 @@ def _waveforms(
 def _warn_of_late_light(strategy: AbstractStrategy, late_fraction: float) -> None:
     """Warn if a notable fraction of the light of a shot arrives after the record."""
     plan = strategy.setup.plan
-    if late_fraction >= NOTABLE:
+    if late_fraction >= NOTABLE_FRACTION:
         end = plan.sample_start + plan.sample_interval * plan.n_samples
         warnings.warn(
             f"{percent(late_fraction)} of the light of a shot is still on its way when the record ends at "
-            f"{end:.4g} ns: see Waveforms.ledger",
+            f"{end:.4g} ns: see Waveforms.energy_budget",
             LateLightWarning,
             # The caller of `simulate_many`: above this function, its caller, and `simulate_many` itself.
             stacklevel=4,

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxlidar._summary import NOTABLE, percent
+from jaxlidar._summary import NOTABLE_FRACTION, percent
 from jaxlidar._vectors import FAR, vec
 from jaxlidar.instrument.survey import Survey
 from jaxlidar.scenes.scene import Scene
@@ -46,6 +46,8 @@ def ground_heights(survey: Survey, scene: Scene, upstream: float) -> Float[np.nd
     """
     if scene.ground is None:
         return np.full(len(survey), np.nan)
+    # From where rays start, above the scene: a ray that starts on the reference plane would miss ground above
+    # it.
     start = np.pad(survey.position, ((0, 0), (0, 1))) - upstream * survey.direction
     x, w = (vec(jnp.asarray(a, float).T) for a in (start, survey.direction))
     shape = scene.ground.shape
@@ -99,7 +101,7 @@ def off_map(survey: Survey, scene: Scene) -> Float[np.ndarray, " shots"]:
 
 def off_map_message(fractions: Float[np.ndarray, " shots"]) -> str | None:
     """Return a sentence on the footprints that lie partly beside the map, or None where there are none."""
-    shots = np.flatnonzero(fractions >= NOTABLE)
+    shots = np.flatnonzero(fractions >= NOTABLE_FRACTION)
     if shots.size == 0:
         return None
     worst = shots[np.argsort(-fractions[shots], kind="stable")][:3]

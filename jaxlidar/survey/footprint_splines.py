@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxlidar.instrument.survey import Survey
-from jaxlidar.trace.nodes import spline
+from jaxlidar.trace.entry_nodes import cubic_bspline
 
 # Radius within which a Gaussian beam is followed, over its 1/e^2 radius; 4e-6 of its energy lies beyond.
 GAUSSIAN_EXTENT = 2.5
@@ -82,6 +82,8 @@ class FootprintSplines(NamedTuple):
 
 def fit_footprints(survey: Survey, tolerance: float) -> FootprintSplines:
     """Fit footprints of one direction on the coarsest grid whose error is below `tolerance`."""
+    # Footprints of one direction differ in their position relative to the grid alone: some eight tell the
+    # error.
     beam, sample = section_of(survey), survey.position[:: max(len(survey) // 8, 1)]
     spacing = beam.radius
     for candidate in _SPACINGS:
@@ -138,6 +140,7 @@ def _fit(
     first_node = np.floor((position - extent) / spacing).astype(int) - 2
     nodes = int(np.ceil(2.0 * extent / spacing)) + 6
     inverse = np.linalg.pinv(_basis(nodes))
+    # In single precision: millions of footprints have some hundred coefficients each.
     coefficients = np.empty((len(position), nodes, nodes), np.float32)
     for start in range(0, len(position), _BLOCK):
         block = slice(start, start + _BLOCK)
@@ -152,6 +155,7 @@ def _fit(
         else:
             fitted = inverse @ _irradiance(x, y, beam) @ inverse.T
         coefficients[block] = fitted * spacing**2
+    # Least squares keep the energy only nearly.
     coefficients /= coefficients.sum(axis=(1, 2), keepdims=True)
     return first_node, coefficients
 
@@ -165,7 +169,7 @@ def _points(
 
 def _basis(nodes: int) -> Float[np.ndarray, "points nodes"]:
     """Return the spline of every node at the points of a footprint."""
-    return spline(_points_in_spacings(nodes)[:, None] - np.arange(nodes))
+    return cubic_bspline(_points_in_spacings(nodes)[:, None] - np.arange(nodes))
 
 
 def _points_in_spacings(nodes: int) -> Float[np.ndarray, " points"]:

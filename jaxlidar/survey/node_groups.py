@@ -11,9 +11,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxlidar.planning.ladder import rung
+from jaxlidar.planning.size_buckets import size_bucket
 from jaxlidar.survey.footprint_splines import FootprintSplines
-from jaxlidar.trace.nodes import RAYS
+from jaxlidar.trace.entry_nodes import RAYS_PER_GROUP
 
 # Largest number of nodes of a group, and of photons of a batch if a group has several nodes: a batch cannot
 # be interrupted.
@@ -23,12 +23,12 @@ _MAX_NODES, _MAX_PHOTONS = 512, 32_768
 class NodeAllocation(NamedTuple):
     """Photons, or groups of rays, allocated to nodes.
 
-    - `node`: of each. - `number`: of each within its node. - `fraction`: of the node's light that each
+    - `node`: of each. - `rank`: number of each within its node. - `fraction`: of the node's light that each
       carries.
     """
 
     node: Int[np.ndarray, " photons"]
-    number: Int[np.ndarray, " photons"]
+    rank: Int[np.ndarray, " photons"]
     fraction: Float[np.ndarray, " photons"]
 
 
@@ -36,7 +36,7 @@ class NodeGroup(NamedTuple):
     """Nodes that are traced together.
 
     - `aim`: (2,) position of the middle, m. - `node_position`: (nodes, 2) from there, m.
-    - `photons`, `rays`: allocated to the nodes, as in `jaxlidar.trace.nodes.Nodes`.
+    - `photons`, `rays`: allocated to the nodes, as in `jaxlidar.trace.entry_nodes.EntryNodes`.
     - `shots`: numbers of the footprints with a coefficient in the group.
     - `coefficients`, `misplaced_energy`: (shots, nodes), as in `FootprintSplines`.
     - `has_centre`: (shots,) whether the node next to the footprint's centre is in the group: it is in one
@@ -82,6 +82,7 @@ def illuminated_nodes(splines: FootprintSplines, threshold: float) -> Illuminate
         first_node = splines.first_node[start : start + 1024] - lowest
         light = np.abs(splines.coefficients[start : start + 1024]).reshape(len(first_node), -1) / largest
         x, y = (first_node[:, k, None] + offsets for k in range(2))
+        # One integer for each node of the rectangle around all footprints.
         key = (x[:, :, None] * span[1] + y[:, None, :]).reshape(len(first_node), -1)
         counts = light > threshold
         total_light += float(light.sum())
@@ -113,11 +114,11 @@ def make_groups(
     # The limit is on photons, or on a sixteenth as many rays where few photons or none are traced.
     largest_light = max(_MAX_PHOTONS / max(photons, 16 * rays), 1.0)
     members = _halve(nodes, np.arange(len(nodes.light)), largest_light)
-    size = rung(max(len(group) for group in members), 4)
+    size = size_bucket(max(len(group) for group in members), 4)
     light = max(float(nodes.light[group].sum()) for group in members)
     n_photons, n_ray_groups = (
-        rung(max(int(np.ceil(light * per_light)), size), 4) if per_light else 0
-        for per_light in (photons, rays / RAYS)
+        size_bucket(max(int(np.ceil(light * per_light)), size), 4) if per_light else 0
+        for per_light in (photons, rays / RAYS_PER_GROUP)
     )
     return [_make_group(splines, nodes, group, size, n_photons, n_ray_groups) for group in members]
 
@@ -134,6 +135,7 @@ def _halve(
     order = np.argsort(index[:, axis], kind="stable")
     # Equal light on both sides, or equal numbers where the number of nodes is what is too large.
     cumulative = np.cumsum(light[order]) if light.sum() > largest_light else np.arange(1.0, len(group) + 1)
+    # Neither half is empty, also where one node has more than half of the light.
     cut = int(np.clip(np.searchsorted(cumulative, 0.5 * cumulative[-1]), 1, len(group) - 1))
     halves = group[order[:cut]], group[order[cut:]]
     return [quarter for half in halves for quarter in _halve(nodes, half, largest_light)]
@@ -150,6 +152,7 @@ def _make_group(
     """Return a group filled up to `size` nodes with copies of its first node that get no photons."""
     index, padding = nodes.index[group], size - len(group)
     middle = np.round(0.5 * (index.min(axis=0) + index.max(axis=0)))
+    # Photons and rays refer to nodes by number, and none to the copies.
     padded_index = np.concatenate([index, np.repeat(index[:1], padding, axis=0)])
     ray_groups = _allocate(nodes.light[group], n_ray_groups)
     shots, coefficients, misplaced = _footprints_of(splines, index)
@@ -157,8 +160,10 @@ def _make_group(
         aim=middle * splines.spacing,
         node_position=(padded_index - middle) * splines.spacing,
         photons=_allocate(nodes.light[group], n_photons),
-        # Rays come in groups of RAYS, of which the number of the first is known.
-        rays=NodeAllocation(ray_groups.node, RAYS * ray_groups.number, ray_groups.fraction / RAYS),
+        # Rays come in groups of RAYS_PER_GROUP, of which the number of the first is known.
+        rays=NodeAllocation(
+            ray_groups.node, RAYS_PER_GROUP * ray_groups.rank, ray_groups.fraction / RAYS_PER_GROUP
+        ),
         shots=shots,
         coefficients=np.pad(coefficients, ((0, 0), (0, padding))),
         misplaced_energy=np.pad(misplaced, ((0, 0), (0, padding))),
@@ -176,8 +181,8 @@ def _allocate(light: Float[np.ndarray, " nodes"], total: int) -> NodeAllocation:
     unallocated = total - count.sum()
     count[np.argsort(-light, kind="stable")[:unallocated]] += 1
     node = np.repeat(np.arange(len(light)), count)
-    number = np.arange(total) - np.repeat(np.cumsum(count) - count, count)
-    return NodeAllocation(node, number, 1.0 / count[node])
+    rank = np.arange(total) - np.repeat(np.cumsum(count) - count, count)
+    return NodeAllocation(node, rank, 1.0 / count[node])
 
 
 def _have_centre(
@@ -193,6 +198,8 @@ def _footprints_of(
 ) -> tuple[Int[np.ndarray, " shots"], Float[np.ndarray, "shots nodes"], Float[np.ndarray, "shots nodes"]]:
     """Return the shots that use the nodes, their coefficients, and the energy that they misplace there."""
     width = splines.coefficients.shape[1]
+    # First the shots whose patch of nodes overlaps the group's bounding rectangle, then those with a
+    # coefficient in it.
     low, high = index.min(axis=0), index.max(axis=0)
     shots = np.flatnonzero(np.all((splines.first_node <= high) & (splines.first_node + width > low), axis=1))
     offset = index[None, :, :] - splines.first_node[shots, None, :]

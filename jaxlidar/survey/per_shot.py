@@ -30,17 +30,23 @@ from jaxlidar._programs import Program
 from jaxlidar._threads import ONE_CORE
 from jaxlidar._workers import WorkUnit, task
 from jaxlidar.instrument.survey import Survey
-from jaxlidar.planning.plan import MIN_BATCHES, Plan
+from jaxlidar.planning.plan import MIN_BATCHES
 from jaxlidar.planning.setup import Setup
 from jaxlidar.sampling.adaptive import StepRule, StoppingRule, sample_until_compiled
 from jaxlidar.sampling.errors import relative_error
 from jaxlidar.sampling.moments import RunningMoments
+from jaxlidar.spectral.apply_optics import (
+    BudgetTerms,
+    WaveformModel,
+    budget_terms,
+    component_samples,
+    make_waveform_model,
+)
 from jaxlidar.survey.results import ShotErrors, ShotResults, make_shot_results
 from jaxlidar.survey.strategy import AbstractStrategy, slices_of_shots
-from jaxlidar.trace.colouring import Balance, Recording, balance, components, recording_of
-from jaxlidar.trace.footprint import Slice
-from jaxlidar.trace.response import Response, follows, trace_only_first, trace_setting
-from jaxlidar.trace.setting import Setting, aimed, setting_of, straight_transmittance
+from jaxlidar.trace.device_scene import DeviceScene, aim_at, build_device_scene
+from jaxlidar.trace.footprint import RaySlice
+from jaxlidar.trace.response import Response, trace_device_scene, trace_first_only
 
 # Largest number of shots of a chunk, of first order alone and of more: a chunk cannot be interrupted.
 _CHUNK_FIRST_ORDER, _CHUNK_HIGHER_ORDERS = 128, 16
@@ -80,6 +86,7 @@ def shot_geometry(survey: Survey, first: int, count: int) -> ShotGeometry:
 
 def setup_of_shot(setup: Setup, shot: ShotGeometry) -> Setup:
     """Return the setup with the lidar aimed at one shot."""
+    # `tree_at` sets nested fields without the constructors' checks, which traced values cannot have.
     return eqx.tree_at(
         lambda s: (s.lidar.position, s.lidar.zenith, s.lidar.azimuth),
         setup,
@@ -122,6 +129,7 @@ class PerShotStrategy(AbstractStrategy):
 
     def shot_results(self, task_results: Mapping[int, Any]) -> Iterator[tuple[slice, ShotResults]]:
         for number, shots in enumerate(self.shot_slices):
+            # Without the copies that fill up the last chunk.
             count = shots.stop - shots.start
             yield shots, jax.tree.map(lambda a, n=count: a[:n], task_results[number])
 
@@ -138,44 +146,41 @@ class ShotBatch(NamedTuple):
     """Samples by component, and the energy budget, of one batch of a shot."""
 
     components: dict[str, Float[Array, "wavelengths samples"]]
-    balance: Balance
+    budget: BudgetTerms
 
 
 def _with_errors(batch: ShotBatch) -> tuple[Array, dict[str, Array]]:
     """Return the quantities whose standard errors are reported: the waveform and the energy budget."""
-    return batch.components["first"] + batch.components["higher"], batch.balance.ledger
+    return batch.components["first"] + batch.components["higher"], batch.budget.energy_budget
 
 
 # Its shapes are needed as well as its values: within `filter_jit`, JAX evaluates the function once for both.
 @eqx.filter_jit
-def _trace_lattice_part(
-    setting: Setting, transmittance: Array | None, key: PRNGKeyArray, lattice_part: Slice
-) -> Response:
+def _trace_lattice_part(scene: DeviceScene, key: PRNGKeyArray, ray_slice: RaySlice) -> Response:
     """Return the response of a part of the rays of a lattice."""
-    return trace_only_first(setting, transmittance, key, lattice_part)
+    return trace_first_only(scene, key, ray_slice)
 
 
 @eqx.filter_jit
-def _trace_batch(
-    setting: Setting, transmittance: Array | None, recording: Recording, key: PRNGKeyArray, n_parts: Array
-) -> ShotBatch:
+def _trace_batch(scene: DeviceScene, model: WaveformModel, key: PRNGKeyArray, n_parts: Array) -> ShotBatch:
     """Trace one batch. `n_parts`: number of parts of its lattice, where only the first order is traced."""
-    if follows(setting):
-        response = trace_setting(setting, transmittance, key)
+    if scene.config.follows_higher_orders:
+        response = trace_device_scene(scene, key)
     else:
 
         def add_part(number: Array, response_sum: Response) -> Response:
-            response = _trace_lattice_part(setting, transmittance, key, Slice(number, n_parts))
+            response = _trace_lattice_part(scene, key, RaySlice(number, n_parts))
             return jax.tree.map(jnp.add, response_sum, response)
 
-        shapes = jax.eval_shape(_trace_lattice_part, setting, transmittance, key, Slice(n_parts, n_parts))
+        shapes = jax.eval_shape(_trace_lattice_part, scene, key, RaySlice(n_parts, n_parts))
         response_sum = jax.lax.fori_loop(0, n_parts, add_part, _zeros(shapes))
+        # Every part has the energy of the complete beam: the lattice is their mean.
         response = jax.tree.map(lambda a: a / n_parts, response_sum)
-    return ShotBatch(components(response, recording), balance(response, recording))
+    return ShotBatch(component_samples(response, model), budget_terms(response, model))
 
 
 def _trace_shot(
-    setting: Setting, setup: Setup, shot: ShotGeometry, key: PRNGKeyArray, rtol: Array
+    scene: DeviceScene, setup: Setup, shot: ShotGeometry, key: PRNGKeyArray, rtol: Array
 ) -> ShotResults:
     """Trace one shot until its tolerance is met.
 
@@ -186,32 +191,26 @@ def _trace_shot(
     offset = jnp.asarray(shot.position) - setup.lidar.position
     # The key follows from the shot's number: its waveform does not depend on chunks or workers.
     setup, key = setup_of_shot(setup, shot), jax.random.fold_in(key, shot.number)
-    setting, recording = aimed(setting, setup.lidar, offset), recording_of(setup)
-    transmittance = straight_transmittance(setup)
+    scene, model = aim_at(scene, setup.lidar, offset), make_waveform_model(setup)
 
     def trace_batch(number: Array, n_parts: Array) -> ShotBatch:
         batch_key = jax.random.fold_in(key, number)
-        return _trace_batch(setting, transmittance, recording, batch_key, n_parts)
+        return _trace_batch(scene, model, batch_key, n_parts)
 
     first, undivided = jnp.zeros((), jnp.int32), jnp.ones((), jnp.int32)
     if not setup.plan.is_random:
         batch = trace_batch(first, undivided)
-        waveform, ledger = jax.tree.map(jnp.zeros_like, _with_errors(batch))
-        errors = ShotErrors(waveform, ledger, jnp.zeros(()))
-        return make_shot_results(recording, batch.components, batch.balance, errors, first)
+        waveform, energy_budget = jax.tree.map(jnp.zeros_like, _with_errors(batch))
+        errors = ShotErrors(waveform, energy_budget, jnp.zeros(()))
+        return make_shot_results(model, batch.components, batch.budget, errors, first)
 
-    refine = _add_batches if follows(setting) else _densify_lattices
+    refine = _add_batches if scene.config.follows_higher_orders else _densify_lattices
     estimate = refine(trace_batch, jax.eval_shape(trace_batch, first, undivided), rtol)
     mean: ShotBatch = estimate.mean_only
-    waveform_stderr, ledger_stderr = estimate.stderr
-    errors = ShotErrors(waveform_stderr, ledger_stderr, _relative_error(estimate))
-    photons = estimate.count * photons_of_batch(setup.plan)
-    return make_shot_results(recording, mean.components, mean.balance, errors, photons)
-
-
-def photons_of_batch(plan: Plan) -> int:
-    """Return the number of photons of a batch; rays on lattices do not count as photons."""
-    return plan.n_photons if plan.orders > 1 or plan.trace.drawn_first else 0
+    waveform_stderr, energy_budget_stderr = estimate.stderr
+    errors = ShotErrors(waveform_stderr, energy_budget_stderr, _relative_error(estimate))
+    photons = estimate.count * setup.plan.photons_traced
+    return make_shot_results(model, mean.components, mean.budget, errors, photons)
 
 
 def _relative_error(estimate: RunningMoments) -> Array:
@@ -264,8 +263,10 @@ def _zeros(shapes: Any) -> Any:
 
 def _trace_shots(setup: Setup, shots: ShotGeometry, key: PRNGKeyArray, rtol: Array) -> ShotResults:
     """Trace shots one after the other over one device scene."""
-    setting = setting_of(setup, derivatives="none")
-    return jax.lax.map(lambda shot: _trace_shot(setting, setup, shot, key, rtol), shots)
+    scene = build_device_scene(setup, derivatives="none")
+    # Not `vmap`: the loops of all shots together would run until the slowest of them has met its tolerance,
+    # and their arrays would not fit into a processor's cache.
+    return jax.lax.map(lambda shot: _trace_shot(scene, setup, shot, key, rtol), shots)
 
 
 compiled_shots = Program(_trace_shots, **ONE_CORE)

@@ -5,8 +5,8 @@ from typing import Any, NamedTuple
 from jaxtyping import Array, Float
 
 from jaxlidar.instrument.receiver import record
-from jaxlidar.trace.colouring import Balance, Recording
-from jaxlidar.waveform import received
+from jaxlidar.spectral.apply_optics import BudgetTerms, WaveformModel
+from jaxlidar.spectral.waveform import energy_per_reflectance
 
 
 class ShotResults(NamedTuple):
@@ -19,8 +19,8 @@ class ShotResults(NamedTuple):
     components: Any
     neglected: Any
     lost: Any
-    ledger: Any
-    ledger_stderr: Any
+    energy_budget: Any
+    energy_budget_stderr: Any
     error: Any
     photons: Any
     truth: Any = None
@@ -30,14 +30,14 @@ class ShotErrors(NamedTuple):
     """Errors of one shot: standard errors of its waveform and its energy budget, and the relative error."""
 
     waveform: Float[Array, "wavelengths samples"]
-    ledger: dict[str, Float[Array, "wavelengths"]]
+    energy_budget: dict[str, Float[Array, "wavelengths"]]
     relative: Array
 
 
 def make_shot_results(
-    recording: Recording,
+    model: WaveformModel,
     components: dict[str, Float[Array, "wavelengths samples"]],
-    balance: Balance,
+    budget: BudgetTerms,
     errors: ShotErrors,
     photons: Array,
 ) -> ShotResults:
@@ -45,18 +45,18 @@ def make_shot_results(
 
     `photons`: number of photons traced.
     """
-    lidar, reflectance = recording.lidar, components["first"] + components["higher"]
-    energy = reflectance * received(lidar, recording.time)
+    lidar, reflectance = model.lidar, components["first"] + components["higher"]
+    energy = reflectance * energy_per_reflectance(lidar, model.time)
     return ShotResults(
         reflectance=reflectance,
         stderr=errors.waveform,
         energy=energy,
         recorded=record(energy, lidar.wavelength, lidar.receiver),
         components=components,
-        neglected=balance.neglected,
-        lost=balance.lost,
-        ledger=balance.ledger,
-        ledger_stderr=errors.ledger,
+        neglected=budget.neglected,
+        lost=budget.lost,
+        energy_budget=budget.energy_budget,
+        energy_budget_stderr=errors.energy_budget,
         error=errors.relative,
         photons=photons,
     )

@@ -11,8 +11,8 @@ to the sample of f at t, where V_f(b) is the fraction of the light from b that t
 estimator is unbiased for every f, from one set of paths; standard errors are those of each shot, and
 neighbours are correlated.
 
-Light enters about the nodes n of a grid with the spacing d, with the density of a B-spline each; together p =
-1 / d^2.
+Light enters about the nodes n of a grid with the spacing d, with the density of a B-spline each; together
+p = 1 / d^2.
 
 - *By node.* Straight down and without a field of view, V_f = 1 and I_f is a sum of the splines with
   coefficients c_fn (`jaxlidar.survey.footprint_splines`). Responses are kept by node. Photons of two nodes
@@ -22,13 +22,13 @@ Light enters about the nodes n of a grid with the spacing d, with the density of
 
   where the last term is the error of the grid: the energy m_fn that the spline misplaces about the node.
 - *By shot.* Otherwise I_f(a) / p(a) V_f(b) = d^2 I_f(a) V_f(b) is computed for each path and each shot that
-  may see it (`jaxlidar.survey.shot_views`), without any error of the grid. Responses are kept by shot. The
-  first order, which has few rays that would be seen by one shot each, is traced for each shot alone. Absorbed
-  energy is taken by node.
+  may see it (`jaxlidar.survey.view_geometry`), without any error of the grid. Responses are kept by shot. The
+  first order is traced for each shot alone: a lattice of its own rays has less variance than rays that it
+  shares. Absorbed and escaped energy is tallied by node: it is seen by no receiver.
 
 Nodes are traced in groups (`jaxlidar.survey.node_groups`), which are the tasks. If a group has the fraction s
-of f's light, its own relative error may be r / sqrt(s): squared errors of all groups, s^2 (r / sqrt(s))^2 = s
-r^2 each, then add up to r^2. The number of batches of a group is the one that its worst shot needs.
+of f's light, its own relative error may be r / sqrt(s): squared errors of all groups, each
+s^2 (r / sqrt(s))^2 = s r^2, then add up to r^2. A group has as many batches as its worst shot needs.
 """
 
 import dataclasses
@@ -50,27 +50,26 @@ from jaxlidar.planning.setup import Setup
 from jaxlidar.sampling.adaptive import AbstractEstimate, EstimateErrors, StepRule, StoppingRule, sample_until
 from jaxlidar.sampling.errors import relative_error, student_widening
 from jaxlidar.sampling.moments import RunningMoments
+from jaxlidar.spectral.apply_optics import (
+    ResponseSums,
+    WaveformModel,
+    budget_of_sums,
+    component_samples,
+    make_waveform_model,
+    response_samples,
+    sum_response,
+    total_samples,
+)
 from jaxlidar.survey.node_groups import NodeAllocation, NodeGroup
 from jaxlidar.survey.results import ShotErrors, ShotResults, make_shot_results
-from jaxlidar.survey.shot_views import ShotViews
 from jaxlidar.survey.strategy import AbstractStrategy, slices_of_shots
-from jaxlidar.trace.colouring import (
-    Recording,
-    Shares,
-    balance_of,
-    components,
-    recording_of,
-    samples_of,
-    shares_of,
-    total,
-)
+from jaxlidar.survey.view_geometry import ViewGeometry
+from jaxlidar.trace.device_scene import DeviceScene, aim_at, build_device_scene
+from jaxlidar.trace.entry_nodes import EntryNodes
 from jaxlidar.trace.footprint import parallel_beam
-from jaxlidar.trace.node_response import trace_nodes, without_histories
-from jaxlidar.trace.nodes import Nodes
 from jaxlidar.trace.response import Response
-from jaxlidar.trace.setting import Setting, aimed, setting_of
-from jaxlidar.trace.viewed_response import order_one, trace_viewed
-from jaxlidar.trace.viewing import Viewing
+from jaxlidar.trace.shared_illumination import trace_first_of_shots, trace_nodes, trace_shots
+from jaxlidar.trace.shot_views import ShotViews
 
 # Coefficients of shots at nodes, or at shots, (shots, traced): a NumPy array, or a sparse one of SciPy.
 ShotCoefficients = Any
@@ -82,7 +81,7 @@ SHOTS_PER_BLOCK = 256
 _NEGLIGIBLE_FRACTION = 1e-3
 # Largest number of deposits along a flight. Where optics are applied, and for each shot that may see them,
 # deposits cost more than elsewhere.
-_MAX_ENDS = 2
+_MAX_DEPOSITS = 2
 # Smallest number of rays of a batch of a shot's own first order.
 _MIN_RAYS = 64
 # The worst error of many shots, from few batches, is overestimated: steps are short.
@@ -96,22 +95,23 @@ _FIRST_ORDER_VARIANCE = 0.25
 
 @dataclasses.dataclass(frozen=True)
 class SharedIlluminationStrategy(AbstractStrategy):
-    """Shots are sums over nodes, or parts of all paths, of groups of nodes; a task is a group.
+    """A shot is a sum over nodes, or over the paths that it sees; a task traces a group of nodes.
 
     - `groups`: of nodes. - `spacing`: of nodes, m.
-    - `views`: how shots see shared light; None where they see all of it, straight down.
+    - `view_geometry`: how shots see shared light; None where they see all of it, straight down.
     - `parallel_light_bound`: bound on the fraction of samples that parallel light changes.
     """
 
     groups: list[NodeGroup]
     spacing: float
-    views: ShotViews | None
+    view_geometry: ViewGeometry | None
     parallel_light_bound: float
 
     @functools.cached_property
     def context(self) -> "GroupContext":
         """Inputs that all groups have in common."""
-        return make_group_context(self.setup, self.spacing, self.views)
+        # One object for all tasks of this process: its device scene is built once.
+        return make_group_context(self.setup, self.spacing, self.view_geometry)
 
     def tasks(self, key: PRNGKeyArray) -> list[WorkUnit]:
         return [
@@ -152,38 +152,40 @@ class SharedIlluminationStrategy(AbstractStrategy):
 class GroupContext(NamedTuple):
     """Inputs that all groups of nodes have in common.
 
-    - `setting`: of the survey's middle. - `recording`: without histories, for optics are applied while light
+    - `scene`: of the survey's middle. - `model`: without histories, for optics are applied while light
       is traced, and without what the `air` returns, which is added once.
-    - `spacing`: of nodes, m. - `views`: as in `SharedIlluminationStrategy`.
+    - `spacing`: of nodes, m. - `view_geometry`: as in `SharedIlluminationStrategy`.
     """
 
-    setting: Setting
-    recording: Recording
+    scene: DeviceScene
+    model: WaveformModel
     air: Any
     spacing: float
-    views: ShotViews | None
+    view_geometry: ViewGeometry | None
 
 
-def make_group_context(setup: Setup, spacing: float, views: ShotViews | None) -> GroupContext:
+def make_group_context(setup: Setup, spacing: float, view_geometry: ViewGeometry | None) -> GroupContext:
     """Return the common inputs of groups over a grid of that spacing."""
-    recording = recording_of(setup)
-    without_air = dataclasses.replace(without_histories(recording), air=None)
+    model = make_waveform_model(setup)
+    # The air's own return is not random and has no share in the light of nodes: `_complete_shot` adds it
+    # once.
+    without_air = dataclasses.replace(model.for_applied_optics(), air_return=None)
     plan = setup.plan
-    trace = dataclasses.replace(plan.trace, ends=min(plan.trace.ends, _MAX_ENDS))
-    if views is not None:
-        # Paths are timed from their own entry: for a shot beside it, they may end later than for that entry.
-        trace = dataclasses.replace(trace, last=trace.last + views.extra_path)
-        plan = dataclasses.replace(plan, n_rays=max(plan.n_rays // 4, _MIN_RAYS))
-    setup = dataclasses.replace(setup, plan=dataclasses.replace(plan, trace=trace))
-    setting = setting_of(setup, derivatives="none")
-    return GroupContext(setting, without_air, recording.air, spacing, views)
+    plan = plan.with_config(deposits_per_flight=min(plan.config.deposits_per_flight, _MAX_DEPOSITS))
+    if view_geometry is not None:
+        # Paths are timed from their own entry. For a shot whose axis is beside it, an oblique path may be
+        # later.
+        plan = plan.with_limits(max_path=plan.limits.max_path + view_geometry.extra_path)
+        plan = plan.with_config(n_rays=max(plan.n_rays // 4, _MIN_RAYS))
+    scene = build_device_scene(dataclasses.replace(setup, plan=plan), derivatives="none")
+    return GroupContext(scene, without_air, model.air_return, spacing, view_geometry)
 
 
 class GroupLight(NamedTuple):
-    """The light of a group: its nodes, the shots that view it (None: by node), and the aim point, m."""
+    """The light of a group: its nodes, the views of its shots (None: by node), and the aim point, m."""
 
-    nodes: Nodes
-    viewing: Viewing | None
+    nodes: EntryNodes
+    shot_views: ShotViews | None
     aim: Float[Array, "2"]
 
 
@@ -191,7 +193,7 @@ class BatchSums(NamedTuple):
     """Results of one batch, by node or by shot.
 
     - `waveform`: (nodes, wavelengths, samples), all materials together. - `energy`: sums of
-      `jaxlidar.trace.colouring.Shares`, by name. - `response`: their responses.
+      `jaxlidar.spectral.apply_optics.ResponseSums`, by name. - `response`: their responses.
     """
 
     waveform: Any
@@ -215,7 +217,7 @@ class GroupContribution(NamedTuple):
     photons: Int[np.ndarray, " shots"]
 
 
-def _trace_batch(setting: Setting, nodes: Nodes, recording: Recording, key: PRNGKeyArray) -> BatchSums:
+def _trace_batch(scene: DeviceScene, nodes: EntryNodes, model: WaveformModel, key: PRNGKeyArray) -> BatchSums:
     """Trace one batch."""
 
     def sums(response: Response) -> tuple[Array, dict[str, Array]]:
@@ -224,24 +226,24 @@ def _trace_batch(setting: Setting, nodes: Nodes, recording: Recording, key: PRNG
             # With optics applied, both orders have one history: one convolution with the pulse serves their
             # sum.
             all_orders = dataclasses.replace(response, first=response.first + response.higher, higher=None)
-        return total(all_orders, recording), shares_of(response, recording)._asdict()
+        return total_samples(all_orders, model), sum_response(response, model)._asdict()
 
-    if setting.viewing is None:
-        response = trace_nodes(setting, nodes, key)
+    if scene.shot_views is None:
+        response = trace_nodes(scene, nodes, key)
     else:
-        response = trace_viewed(setting, recording.lidar, nodes, key)
+        response = trace_shots(scene, model.lidar, nodes, key)
     return BatchSums(*jax.vmap(sums)(response), response)
 
 
-def _lines(response: Response, recording: Recording) -> Float[Array, "lines wavelengths samples"]:
+def _lines(response: Response, model: WaveformModel) -> Float[Array, "lines wavelengths samples"]:
     """Return samples by material, then those of the first order."""
-    by_component = components(response, recording)
-    return jnp.stack([*(by_component[name] for name in recording.materials), by_component["first"]])
+    by_component = component_samples(response, model)
+    return jnp.stack([*(by_component[name] for name in model.materials), by_component["first"]])
 
 
 def _group_moments(
-    setting: Setting,
-    recording: Recording,
+    scene: DeviceScene,
+    model: WaveformModel,
     light: GroupLight,
     key: PRNGKeyArray,
     first: Int[Array, ""],
@@ -251,10 +253,10 @@ def _group_moments(
 
     Returns the moments of their waveforms and energies; `mean_only` are their mean lines.
     """
-    setting = _group_setting(setting, recording, light)
+    scene = _group_scene(scene, model, light)
 
     def trace_batch(number: Array) -> BatchSums:
-        return _trace_batch(setting, light.nodes, recording, jax.random.fold_in(key, first + number))
+        return _trace_batch(scene, light.nodes, model, jax.random.fold_in(key, first + number))
 
     def add_batch(number: Array, moments: RunningMoments) -> RunningMoments:
         batch = trace_batch(number)
@@ -263,31 +265,32 @@ def _group_moments(
     shapes: BatchSums = jax.eval_shape(trace_batch, first)
     empty = RunningMoments.compiled((shapes.waveform, shapes.energy), shapes.response)
     moments = jax.lax.fori_loop(0, count, add_batch, empty)
-    # Lines are linear in the response: those of its mean are their mean, made once.
-    lines = jax.vmap(lambda response: _lines(response, recording))(moments.mean_only)
+    # Waveforms by material are linear in the response: those of its mean are their mean, made once.
+    lines = jax.vmap(lambda response: _lines(response, model))(moments.mean_only)
     return moments._replace(mean_only=lines)
 
 
 compiled_group_moments = Program(_group_moments, **ONE_CORE)
 
 
-def _group_setting(setting: Setting, recording: Recording, light: GroupLight) -> Setting:
-    """Return the setting of a group: at its aim point, with parallel light, and with optics."""
-    lidar = recording.lidar
-    setting = aimed(setting, lidar, light.aim - lidar.position)
+def _group_scene(scene: DeviceScene, model: WaveformModel, light: GroupLight) -> DeviceScene:
+    """Return the device scene of a group: at its aim point, with parallel light, and with optics."""
+    lidar = model.lidar
+    scene = aim_at(scene, lidar, light.aim - lidar.position)
     beam = parallel_beam(lidar)
-    return dataclasses.replace(setting, beam=beam, optics=recording.optics, viewing=light.viewing)
+    return dataclasses.replace(scene, beam=beam, optics=model.optics, shot_views=light.shot_views)
 
 
 def _first_order_samples(
-    setting: Setting, recording: Recording, light: GroupLight, key: PRNGKeyArray
+    scene: DeviceScene, model: WaveformModel, light: GroupLight, key: PRNGKeyArray
 ) -> Float[Array, "shots wavelengths samples"]:
     """Return samples of the first order, from few rays, of all shots of a group."""
-    setting = _group_setting(setting, recording, light)
-    viewing = setting.viewing
-    assert viewing is not None
-    first = order_one(setting, recording.lidar, jnp.arange(viewing.shots - 1), key)
-    return jax.vmap(lambda w: samples_of(jnp.sum(w, axis=1), recording.short, recording))(first.weights)
+    scene = _group_scene(scene, model, light)
+    assert light.shot_views is not None
+    # The last shot is a dummy.
+    shots = jnp.arange(light.shot_views.n_shots - 1)
+    weights = trace_first_of_shots(scene, model.lidar, shots, key).weights
+    return jax.vmap(lambda w: response_samples(jnp.sum(w, axis=1), model.first_histories, model))(weights)
 
 
 _compiled_first_order_samples = Program(_first_order_samples, **ONE_CORE)
@@ -328,9 +331,9 @@ def _error_target(
     fraction = group.coefficients.sum(axis=1)
     counts = fraction > _NEGLIGIBLE_FRACTION
     fraction, has_centre = fraction[counts], group.has_centre[counts]
-    if light.viewing is None:
+    if light.shot_views is None:
         return ErrorTarget(coefficients[counts], fraction, fraction, 0.0)
-    first = _compiled_first_order_samples(context.setting, context.recording, light, key)
+    first = _compiled_first_order_samples(context.scene, context.model, light, key)
     # A shot's first order is traced, all of it, in the group that has its centre.
     excess = (fraction - has_centre)[:, None, None] * np.asarray(first)[: len(group.shots)][counts]
     variance = _FIRST_ORDER_VARIANCE * has_centre + (1.0 - _FIRST_ORDER_VARIANCE) * fraction
@@ -369,20 +372,22 @@ def trace_group(
     3. Add batches until none has a larger one.
     4. Sum over nodes to means and variances of shots, and add the error of the grid.
     """
-    key, viewing, coefficients = jax.random.fold_in(key, number), None, group.coefficients
-    if context.views is not None:
-        viewing = context.views.viewing(group, context.spacing)
+    key, shot_views, coefficients = jax.random.fold_in(key, number), None, group.coefficients
+    if context.view_geometry is not None:
+        shot_views = context.view_geometry.views_of_group(group, context.spacing)
         # Responses are those of shots: the sum over what is traced picks each shot's own row, without the
         # padding.
         unit_diagonal = np.ones(len(group.shots), np.float32)
-        shape = (len(group.shots), context.views.max_shots)
+        shape = (len(group.shots), context.view_geometry.max_shots)
         diagonal = sparse.dia_array((unit_diagonal, 0), shape)
         coefficients = sparse.csr_array(diagonal)
-    light = GroupLight(_nodes(group, context.spacing), viewing, jnp.asarray(group.aim, float))
+    light = GroupLight(_nodes(group, context.spacing), shot_views, jnp.asarray(group.aim, float))
 
     def trace(numbers: range) -> RunningMoments:
         first, count = jnp.asarray(numbers.start, jnp.int32), jnp.asarray(len(numbers), jnp.int32)
-        moments = compiled_group_moments(context.setting, context.recording, light, key, first, count)
+        moments = compiled_group_moments(context.scene, context.model, light, key, first, count)
+        # Sums over nodes are made on the host: their shapes differ between groups, and would be compiled
+        # each.
         moments = jax.tree.map(np.asarray, moments)
         return moments._replace(count=int(moments.count))
 
@@ -392,9 +397,10 @@ def trace_group(
 
     moments: RunningMoments = estimate.moments
     variance, energy_variance = (_variance_of_sums(coefficients, a, moments.count) for a in moments.squares)
-    if context.views is None:
+    if context.view_geometry is None:
         # Light at the wrong place about a node is an error as large as what the node returns of it.
         variance = variance + _sum_over_traced(group.misplaced_energy**2, moments.mean[0] ** 2)
+    # A shot counts the photons of all nodes that it uses, which other shots may count too.
     illuminated = np.abs(group.coefficients) > 0
     photons_per_node = np.bincount(group.photons.node, minlength=group.coefficients.shape[1])
     return GroupContribution(
@@ -407,17 +413,17 @@ def trace_group(
     )
 
 
-def _nodes(group: NodeGroup, spacing: float) -> Nodes:
+def _nodes(group: NodeGroup, spacing: float) -> EntryNodes:
     """Return the nodes of a group, with their photons and rays, as arrays of JAX's present precision."""
 
     def arrays(allocation: NodeAllocation) -> tuple[Array, Array, Array]:
         return (
             jnp.asarray(allocation.node, jnp.int32),
-            jnp.asarray(allocation.number, jnp.int32),
+            jnp.asarray(allocation.rank, jnp.int32),
             jnp.asarray(allocation.fraction, float),
         )
 
-    return Nodes(
+    return EntryNodes(
         jnp.asarray(group.node_position, float),
         jnp.asarray(spacing, float),
         *arrays(group.photons),
@@ -444,9 +450,10 @@ def sum_contributions(
         arrays = contribution._asdict()
         rows = arrays.pop("shots")[mine] - shots.start
         if sums is None:
-            # Always as many shots: one compiled program completes all blocks.
+            # Always as many shots, so that one compiled program completes all blocks; in double precision.
             sums = jax.tree.map(lambda a: np.zeros((SHOTS_PER_BLOCK, *a.shape[1:])), arrays)
         jax.tree.map(lambda s, a, r=rows, m=mine: np.add.at(s, r, a[m]), sums, arrays)
+    # Variances of groups add up, since their photons are independent.
     of_shots = ShotSums(
         lines=sums["lines"],
         energy=sums["energy"],
@@ -454,33 +461,36 @@ def sum_contributions(
         energy_stderr=jax.tree.map(np.sqrt, sums["energy_variance"]),
     )
     of_shots, count = jax.tree.map(lambda a: jnp.asarray(a, float), of_shots), shots.stop - shots.start
-    padded = _compiled_complete(context.recording, context.air, of_shots)
+    padded = _compiled_complete(context.model, context.air, of_shots)
     results: ShotResults = jax.tree.map(lambda a: np.asarray(a)[:count], padded)
     return results._replace(photons=sums["photons"][:count].astype(int))
 
 
 def _complete_shot(
-    recording: Recording, air: Float[Array, "wavelengths samples"] | None, sums: ShotSums
+    model: WaveformModel, air: Float[Array, "wavelengths samples"] | None, sums: ShotSums
 ) -> ShotResults:
     """Return the results of one shot. `air`: what the air itself returns, order one."""
-    by_component = dict(zip(recording.materials, sums.lines))
+    by_component = dict(zip(model.materials, sums.lines))
     reflectance, first = jnp.sum(sums.lines[:-1], axis=0), sums.lines[-1]
     by_component |= {"first": first, "higher": reflectance - first}
     if air is not None:
         by_component |= {"air": air, "first": first + air}
         reflectance = reflectance + air
-    balance, errors = (
-        balance_of(Shares(**energy), recording) for energy in (sums.energy, sums.energy_stderr)
+    budget, errors = (
+        budget_of_sums(ResponseSums(**energy), model) for energy in (sums.energy, sums.energy_stderr)
     )
-    # The budget takes returned light off one of these fates; their errors are those before.
+    # `budget_of_sums` takes the returned light off one of these fates. That is no rule for errors: their own
+    # stay.
     fates = {"escaped": "escaped", "after the window": "late", "unfollowed": "remaining"}
-    ledger_stderr = errors.ledger | {name: sums.energy_stderr[fate] for name, fate in fates.items()}
-    shot_errors = ShotErrors(sums.stderr, ledger_stderr, relative_error(reflectance, sums.stderr))
-    return make_shot_results(recording, by_component, balance, shot_errors, jnp.zeros((), jnp.int32))
+    energy_budget_stderr = errors.energy_budget | {
+        name: sums.energy_stderr[fate] for name, fate in fates.items()
+    }
+    shot_errors = ShotErrors(sums.stderr, energy_budget_stderr, relative_error(reflectance, sums.stderr))
+    return make_shot_results(model, by_component, budget, shot_errors, jnp.zeros((), jnp.int32))
 
 
-def _complete_shots(recording: Recording, air: Array | None, sums: ShotSums) -> ShotResults:
-    return jax.vmap(lambda shot: _complete_shot(recording, air, shot))(sums)
+def _complete_shots(model: WaveformModel, air: Array | None, sums: ShotSums) -> ShotResults:
+    return jax.vmap(lambda shot: _complete_shot(model, air, shot))(sums)
 
 
 _compiled_complete = Program(_complete_shots)

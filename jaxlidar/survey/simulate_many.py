@@ -22,6 +22,7 @@ from jaxtyping import PRNGKeyArray
 
 from jaxlidar._checks import check_flag, check_integer, check_key, check_kind, is_traced
 from jaxlidar._fingerprint import fingerprint
+from jaxlidar._registry import simulate_survey
 from jaxlidar._workers import WorkUnit, outcomes
 from jaxlidar.instrument.survey import Survey
 from jaxlidar.io.case import Case, case_text
@@ -38,6 +39,7 @@ from jaxlidar.survey.truths import StrategyWithTruth
 from jaxlidar.survey.waveforms import Waveforms
 
 
+@simulate_survey.register
 def simulate_many(
     survey: Survey,
     scene: Scene | SceneParts,
@@ -82,7 +84,7 @@ def simulate_many(
     - `max_orders`: number of scatterings followed, at least 1. Default None: from `rtol` and the largest
       albedo.
     - `path`: a netCDF file, or a Zarr store (".zarr"), for the waveforms. It appears when all are traced,
-      with its case, so that `jaxlidar.repeat` can simulate them again. Until then the folder "PATH.parts" has
+      with its case, so that `jaxlidar.rerun` can simulate them again. Until then the folder "PATH.parts" has
       the results so far; the same call continues with them, also after it was killed. If the file exists
       already, it is read. Only a few shots are in memory at a time, also of a netCDF file that is returned:
       see `jaxlidar.open`. Default None: no file.
@@ -131,8 +133,10 @@ def simulate_many(
     check_flag("truth", truth)
     if max_orders is not None:
         max_orders = check_integer("max_orders", max_orders)
+    # Shots are traced until their tolerance is met: loops of unknown length have no reverse derivatives.
     if any(is_traced(x) for x in jax.tree.leaves((survey, scene, key))):
         raise TypeError("simulate_many is not for JAX transformations: use simulate, with plan= made outside")
+    # Waveforms share one time axis, in memory and in files.
     if survey.lidar.receiver.window != "fixed":
         raise ValueError(
             f"receiver window = {survey.lidar.receiver.window!r} gives every shot a time axis of its own; "
@@ -148,7 +152,7 @@ def simulate_many(
             strategy = StrategyWithTruth.around(strategy)
         setup = strategy.setup
         off_map_fractions = off_map(strategy.survey, setup.scene)
-        heights = ground_heights(strategy.survey, setup.scene, setup.plan.trace.upstream)
+        heights = ground_heights(strategy.survey, setup.scene, setup.plan.limits.start_distance)
     if (message := off_map_message(off_map_fractions)) is not None:
         warnings.warn(message, OffMapWarning, stacklevel=2)
     survey_fields: dict[str, Any] = {
@@ -177,6 +181,7 @@ def simulate_many(
             "truth": bool(truth),
         }
     )
+    # A complete file stands for the call that made it.
     if Path(path).exists():
         waveforms = Waveforms.open(path)
         refuse_another(Path(path), waveforms.info.get("problem", {}), problem)
@@ -228,6 +233,7 @@ def _trace(
     """Run the tasks without a result yet, and return the results of all tasks by number."""
     tasks, shots = strategy.tasks(key), len(strategy.survey)
     n_done = len(task_results)
+    # Shots are counted in proportion to tasks: with shared illumination no task has shots of its own.
     clock = ProgressClock(shots, shots * n_done // len(tasks))
     for unit, result in run_tasks([t for t in tasks if t.number not in task_results]):
         task_results[unit.number] = result

@@ -77,9 +77,11 @@ def tiles_of(survey: Survey, scene: SceneParts, margin: float = 0.0) -> list[Sce
     radius = radius * (_GAUSSIAN_EXTENT if survey.lidar.profile == "gaussian" else 1.0)
     radius = (radius / cosine * (1.0 + largest_height / survey.slant_range))[:, None]
     ends = np.stack([survey.position + z * (direction[:, :2] / direction[:, 2:]) for z in scene.z])
+    # A shot belongs to the tile of the middle of its beam axis between the scene's lowest and highest points.
     corner = scene.tile * np.floor(ends.mean(axis=0) / scene.tile)
     overhang = np.maximum(corner - ends.min(axis=0), ends.max(axis=0) - corner - scene.tile) + radius
     step = scene.tile / _STEPS
+    # Multiples of a step: the corners of rectangles depend on the survey in steps only.
     extension = step * np.ceil(max(float(overhang.max()) + margin, 0.0) / step)
     corners, tile_of_shot = np.unique(corner, axis=0, return_inverse=True)
     shots = [np.flatnonzero(tile_of_shot.reshape(-1) == n) for n in range(len(corners))]
@@ -148,7 +150,7 @@ class TiledSceneStrategy(AbstractStrategy):
             plan = _strategy_of(survey, scene, tile, rtol, max_orders, shared, None).setup.plan
             starts.append(plan.sample_start)
             ends.append(plan.sample_start + plan.sample_interval * (plan.n_samples - 1))
-            longest_paths.append(float(plan.trace.last))
+            longest_paths.append(float(plan.limits.max_path))
             orders.append(plan.orders)
         options = TileOptions(rtol, max(orders), shared, (min(starts), max(ends)), truth)
 
@@ -168,12 +170,13 @@ class TiledSceneStrategy(AbstractStrategy):
         for tile in tiles:
             strategy = _strategy_of(survey, scene, tile, rtol, options.orders, shared, options.window)
             first_strategy = strategy if first_strategy is None else first_strategy
-            scene_part, trace = strategy.setup.scene, strategy.setup.plan.trace
+            scene_part, plan = strategy.setup.scene, strategy.setup.plan
             beside_map[tile.shots] = off_map(strategy.survey, scene_part)
-            heights[tile.shots] = ground_heights(strategy.survey, scene_part, trace.upstream)
+            heights[tile.shots] = ground_heights(strategy.survey, scene_part, plan.limits.start_distance)
+            # Of the part as it is given: the strategy's has been moved to the survey's origin.
             digests.append(digest_of(scene.between(tile.low, tile.high)))
-            materials |= dict.fromkeys(trace.materials)
-            surfaces |= dict.fromkeys(trace.materials[s.material] for s in trace.surfaces)
+            materials |= dict.fromkeys(plan.config.materials)
+            surfaces |= dict.fromkeys(plan.config.materials[s.material] for s in plan.config.surfaces)
             shared_by_tile.append(bool(strategy.info()["shared"]))
         assert first_strategy is not None
         return TiledSceneStrategy(
@@ -238,15 +241,16 @@ class TiledSceneStrategy(AbstractStrategy):
                 results_by_tile.append(jax.tree.map(lambda a, r=rows: a[r], results))
                 while len(cache) > _CACHED_TILES:
                     del cache[next(iter(cache))]
+            # Back from the order of tiles to that of shots.
             order = np.argsort(np.concatenate(positions), kind="stable")
             yield shots, jax.tree.map(lambda *a, o=order: np.concatenate(a)[o], *results_by_tile)
 
     def _results_of_tile(self, number: int, task_results: Mapping[int, Any]) -> ShotResults:
         """Return the results of a tile, with zeros for the materials that its part of the scene lacks."""
         results: ShotResults = task_results[number]
-        ledger, ledger_stderr = (
+        energy_budget, energy_budget_stderr = (
             _in_order_of_names(a, [f"absorbed by {m}" for m in self.materials], np.zeros_like(a["escaped"]))
-            for a in (results.ledger, results.ledger_stderr)
+            for a in (results.energy_budget, results.energy_budget_stderr)
         )
         nothing = np.zeros_like(results.reflectance)
         truth = None
@@ -261,8 +265,8 @@ class TiledSceneStrategy(AbstractStrategy):
             )
         return results._replace(
             components=_in_order_of_names(results.components, self.materials, nothing),
-            ledger=ledger,
-            ledger_stderr=ledger_stderr,
+            energy_budget=energy_budget,
+            energy_budget_stderr=energy_budget_stderr,
             truth=truth,
         )
 

@@ -16,12 +16,12 @@ from jaxlidar._threads import ONE_CORE
 from jaxlidar._workers import WorkUnit, task
 from jaxlidar.io.netcdf import TRUTH, keep_as_netcdf
 from jaxlidar.planning.setup import Setup
+from jaxlidar.spectral.apply_optics import make_waveform_model
 from jaxlidar.survey.per_shot import ShotGeometry, setup_of_shot, shot_geometry
 from jaxlidar.survey.results import ShotResults
 from jaxlidar.survey.strategy import AbstractStrategy
-from jaxlidar.trace.colouring import recording_of
-from jaxlidar.trace.setting import Setting, aimed, setting_of, straight_transmittance
-from jaxlidar.truth import Truth, labels, of_first_order
+from jaxlidar.trace.device_scene import DeviceScene, aim_at, build_device_scene
+from jaxlidar.truth import Truth, compute_labels, first_order_setup
 
 
 @final
@@ -126,23 +126,24 @@ class StrategyWithTruth(AbstractStrategy):
 
 def truths_of_chunk(setup: Setup, shots: ShotGeometry, key: PRNGKeyArray) -> Truths:
     """Return the truth of a chunk of shots; no random numbers are drawn."""
-    fields = _compiled_truths(of_first_order(setup), shots.as_arrays())
+    # Labels are those of the first order with a fixed key: `key` is unused, as every task has one.
+    fields = _compiled_truths(first_order_setup(setup), shots.as_arrays())
     return Truths(**jax.tree.map(np.asarray, fields))
 
 
-def _truth_of_shot(setting: Setting, setup: Setup, shot: ShotGeometry) -> dict[str, Any]:
+def _truth_of_shot(scene: DeviceScene, setup: Setup, shot: ShotGeometry) -> dict[str, Any]:
     """Return the fields of `Truths` for one shot."""
     offset = jnp.asarray(shot.position) - setup.lidar.position
     setup = setup_of_shot(setup, shot)
-    setting = aimed(setting, setup.lidar, offset)
-    truth = vars(labels(setting, straight_transmittance(setup), recording_of(setup)))
+    scene = aim_at(scene, setup.lidar, offset)
+    truth = vars(compute_labels(scene, make_waveform_model(setup)))
     return {field.name: truth[field.name] for field in dataclasses.fields(Truths)}
 
 
 def _truths_of_shots(setup: Setup, shots: ShotGeometry) -> dict[str, Any]:
     """Return the fields of `Truths` for shots one after the other, over one device scene."""
-    setting = setting_of(setup)
-    return jax.lax.map(lambda shot: _truth_of_shot(setting, setup, shot), shots)
+    scene = build_device_scene(setup)
+    return jax.lax.map(lambda shot: _truth_of_shot(scene, setup, shot), shots)
 
 
 _compiled_truths = Program(_truths_of_shots, **ONE_CORE)
