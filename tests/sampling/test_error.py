@@ -6,7 +6,7 @@ import pytest
 import scipy.stats
 
 import jaxlidar as jl
-from jaxlidar._statistics import widening
+from jaxlidar.sampling.errors import student_widening
 from tests.helpers import slab, slow_unless
 
 LIDAR = jl.Lidar(wavelength=1064.0)
@@ -48,7 +48,9 @@ def test_the_truth_lies_within_two_reported_errors(case):
         # Samples of the deterministic first order have only rounding errors.
         has_noise = bright & (error > 1e-5 * truth)
         inside.append(np.mean((difference < 2 * error)[has_noise]))
-        inside_unwidened.append(np.mean((difference < 2 * error / widening(wave.info["batches"]))[has_noise]))
+        inside_unwidened.append(
+            np.mean((difference < 2 * error / student_widening(wave.info["batches"]))[has_noise])
+        )
         batches.append(wave.info["batches"])
         assert wave.info["error"] <= rtol
     assert 0.93 <= np.mean(inside) <= 0.975
@@ -62,4 +64,4 @@ def test_the_truth_lies_within_two_reported_errors(case):
 @pytest.mark.parametrize("batches", [8, 9, 16, 64, 1000])
 def test_widening_is_students(batches):
     exact = scipy.stats.t.ppf(scipy.stats.norm.cdf(2.0), batches - 1) / 2.0
-    assert widening(batches) == pytest.approx(exact, rel=1e-3)
+    assert student_widening(batches) == pytest.approx(exact, rel=1e-3)
