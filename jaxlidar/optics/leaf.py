@@ -1,4 +1,4 @@
-"""Leaves (or other scatterers) of known reflectance and transmittance, in the form of a leaf model."""
+"""Leaf optics given as numbers, with the interface of a leaf model."""
 
 from collections.abc import Sequence
 from typing import ClassVar, final
