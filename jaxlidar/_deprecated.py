@@ -8,23 +8,43 @@ from typing import Any
 RENAMED = {
     "Module": "Symbol",
     "crop": "trim_empty_layers",
+    "reduce": "make_setup",
+    "repeat": "rerun",
     "spectra": "spectrum_names",
     "spreading": "spreading_tree",
+    "total_of": "total_reflectance",
 }
 # The same for methods of laws of reflection and phase functions.
 RENAMED_METHODS = {
     "view_factor": "intensity_factor",
     "largest_view_factor": "largest_intensity_factor",
 }
+# Packages whose frames lie between a warning and the user's line: type checks and metaclasses add some.
+_INTERNAL = ("jaxlidar", "inversion", "jaxtyping", "beartype", "equinox", "abc")
 
 
-def warn_renamed(old: str, new: str, stacklevel: int = 1) -> None:
-    """Warn that `old` is now called `new`.
+def warn_renamed(old: str, new: str) -> None:
+    """Warn, at the user's line, that `old` is now called `new`.
 
-    `stacklevel` counts frames from the function that calls this one (0) to the line that used the old name.
+    Python shows the warning by default only where it points at the user's own line.
     """
+    frame, level = sys._getframe(1), 2
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").split(".")[0] in _INTERNAL:
+        frame, level = frame.f_back, level + 1
     message = f"{old} is renamed: use {new}; the old name goes with the next version"
-    warnings.warn(message, DeprecationWarning, stacklevel + 2)
+    warnings.warn(message, DeprecationWarning, stacklevel=level)
+
+
+def renamed_property(old: str, new: str) -> property:
+    """Return a property under an old name, which warns and gives the attribute under its new name."""
+
+    def get(self: Any) -> Any:
+        kind = type(self).__name__
+        warn_renamed(f"{kind}.{old}", f"{kind}.{new}")
+        return getattr(self, new)
+
+    get.__doc__ = f"Return `{new}`; deprecated."
+    return property(get)
 
 
 class RenamedMethods:
@@ -35,7 +55,7 @@ class RenamedMethods:
         for old, new in RENAMED_METHODS.items():
             defined = vars(cls)
             if old in defined and new not in defined:
-                warn_renamed(f"{cls.__name__}.{old}", f"{cls.__name__}.{new}", _frames_up_to(cls.__module__))
+                warn_renamed(f"{cls.__name__}.{old}", f"{cls.__name__}.{new}")
                 setattr(cls, new, defined[old])
 
     def view_factor(self, *directions: Any) -> Any:
@@ -47,17 +67,6 @@ class RenamedMethods:
         return self._renamed("largest_view_factor")(*half_angle)
 
     def _renamed(self, old: str) -> Any:
-        warn_renamed(f"{type(self).__name__}.{old}", RENAMED_METHODS[old], stacklevel=2)
-        return getattr(self, RENAMED_METHODS[old])
-
-
-def _frames_up_to(module: str) -> int:
-    """Number of frames between the caller and the nearest frame of a module.
-
-    Equinox's metaclass runs between a class statement and `__init_subclass__`, in a number of frames that
-    depends on its version. Python shows the warning by default only where it points at the user's own line.
-    """
-    frame, depth = sys._getframe(1), 0
-    while frame is not None and frame.f_globals.get("__name__") != module:
-        frame, depth = frame.f_back, depth + 1
-    return depth
+        kind, new = type(self).__name__, RENAMED_METHODS[old]
+        warn_renamed(f"{kind}.{old}", f"{kind}.{new}")
+        return getattr(self, new)

@@ -1,5 +1,6 @@
 """Old names of what was renamed: for one version they give the same and warn."""
 
+import jax
 import jax.numpy as jnp
 import pytest
 
@@ -18,11 +19,27 @@ def test_a_renamed_public_name_gives_the_new_one_and_warns(old):
     assert old not in jl.__all__
 
 
+@pytest.mark.parametrize("old", ["ledger", "ledger_stderr"])
+def test_a_renamed_attribute_of_a_waveform_warns(old):
+    new = old.replace("ledger", "energy_budget")
+    wave = jl.simulate(jl.Lidar(), jl.Scene(ground=jl.Ground()), key=jax.random.key(0))
+    with pytest.warns(
+        DeprecationWarning, match=rf"Waveform\.{old} is renamed: use Waveform\.{new}"
+    ) as caught:
+        assert getattr(wave, old) is getattr(wave, new)
+    assert caught[0].filename == __file__
+
+
+def test_a_name_that_never_was_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="no attribute 'ledgers'"):
+        _ = jl.ledgers
+
+
 def test_methods_of_laws_and_phase_functions_answer_to_their_old_names():
     law, phase = jl.Lambertian(), jl.Isotropic(albedo=0.5)
-    with pytest.warns(DeprecationWarning, match=r"Lambertian\.view_factor .*use intensity_factor"):
+    with pytest.warns(DeprecationWarning, match=r"Lambertian\.view_factor .*use Lambertian.intensity_factor"):
         assert law.view_factor(DOWN, UP, UP, HALF_ANGLE) == law.intensity_factor(DOWN, UP, UP, HALF_ANGLE)
-    with pytest.warns(DeprecationWarning, match="use largest_intensity_factor"):
+    with pytest.warns(DeprecationWarning, match="use Lambertian.largest_intensity_factor"):
         assert law.largest_view_factor(1e-4) == 1.0
     with pytest.warns(DeprecationWarning, match=r"Isotropic\.view_factor"):
         assert phase.view_factor(DOWN, UP) == 0.25

@@ -139,7 +139,7 @@ class AbstractMirror(AbstractLaw):
 
     The lobe may be narrower than the angle between neighbouring rays of a footprint. The first return is
     therefore not computed from `intensity_factor`: it is integrated over beam, lobe and aperture, with a
-    Gaussian lobe of the standard deviation `roughness` (`jaxlidar.trace.mirror`).
+    Gaussian lobe of the standard deviation `roughness` (`jaxlidar.trace.mirror_return`).
 
     A mirror of your own is one class in one file: derive it from this, and give the five methods of
     `AbstractLaw` and the field
@@ -239,7 +239,7 @@ def _square_of_sine(normal: Vec, out: Vec) -> Scalar:
 class Specular(AbstractMirror):
     """Specular reflection: a mirror of slightly tilted facets, with a Gaussian lobe about its direction.
 
-    The first return is exact for any roughness (see `jaxlidar.trace.mirror`). Paths of two or more
+    The first return is exact for any roughness (see `jaxlidar.trace.mirror_return`). Paths of two or more
     scatterings that end at the mirror reach the receiver only within its lobe. They are unbiased, but so rare
     below a roughness of about 0.01 rad that few photons show one. The derivative of such paths with respect
     to the mirror's slope leaves out the rotation of the lobe.

@@ -25,7 +25,7 @@ from jaxtyping import Array, Float
 
 from jaxlidar._checks import array, briefly, scalar
 from jaxlidar._deprecated import RenamedMethods
-from jaxlidar._ranges import SHARE, Range, check_ranges
+from jaxlidar._ranges import FRACTION, Range, check_ranges
 from jaxlidar._vectors import Scalar, Vec, dot, from_frame, polar
 
 # Pi times the density 1/(4 pi) of isotropic scattering.
@@ -133,7 +133,7 @@ class Isotropic(AbstractPhase):
 
     albedo: Float[Array, "..."] = eqx.field(converter=array("albedo"))
 
-    ranges: ClassVar = {"albedo": SHARE}
+    ranges: ClassVar = {"albedo": FRACTION}
 
     def __check_init__(self):
         _check_phase(self)
@@ -179,7 +179,7 @@ class HenyeyGreenstein(AbstractPhase):
     albedo: Float[Array, "..."] = eqx.field(converter=array("albedo"))
     g: Float[Array, ""] = eqx.field(converter=scalar("g"), default=0.0)
 
-    ranges: ClassVar = {"albedo": SHARE, "g": Range(-0.95, 0.95)}
+    ranges: ClassVar = {"albedo": FRACTION, "g": Range(-0.95, 0.95)}
 
     def __check_init__(self):
         _check_phase(self)

@@ -28,7 +28,7 @@ def as_installed(monkeypatch):
     """The commands of `inversion` as an installed package adds them; compiled programs are not kept."""
     points = [metadata.EntryPoint(n, f"inversion.commands:{n}", cli.COMMANDS) for n in ("demo", "retrieve")]
     monkeypatch.setattr(metadata, "entry_points", lambda group: points if group == cli.COMMANDS else [])
-    monkeypatch.setattr("jaxlidar.cli.group.kept_programs", contextlib.nullcontext)
+    monkeypatch.setattr("jaxlidar.cli.group.compilation_cache", contextlib.nullcontext)
 
 
 def test_help_names_every_command_and_shows_examples(capsys):
@@ -51,7 +51,7 @@ def test_simulate_writes_what_was_simulated_and_how(tmp_path, capsys, suffix):
     assert "Waveform of" in printed
     assert float(jl.open(out).reflectance.sum()) == pytest.approx(0.5, rel=1e-4)
     assert plot.read_bytes().startswith(b"\x89PNG")
-    assert np.array_equal(jl.repeat(out).reflectance, jl.open(out).reflectance)
+    assert np.array_equal(jl.rerun(out).reflectance, jl.open(out).reflectance)
     # What there is, other commands read.
     assert cli.main(["info", str(out)]) == 0
     assert capsys.readouterr().out == f"{jl.open(out)}\n"
@@ -94,7 +94,7 @@ def test_a_survey_is_simulated_shot_by_shot(tmp_path, capsys, suffix):
     # The file has its case.
     assert cli.main(["convert", str(out), str(tmp_path / "b.toml")]) == 0
     assert len(jl.io.read_case(tmp_path / "b.toml").survey) == 3
-    assert np.array_equal(jl.repeat(out).reflectance, jl.open(out).reflectance)
+    assert np.array_equal(jl.rerun(out).reflectance, jl.open(out).reflectance)
 
 
 def test_an_interrupted_simulation_is_kept(tmp_path, capsys, monkeypatch):
@@ -164,7 +164,7 @@ def test_compiled_programs_are_kept_unless_refused(tmp_path):
     code = (
         "import sys, jax; from jaxlidar.cli import cache, main; before = dict(jax.config.values);"
         # A fast machine compiles all of the command's programs in less than is worth a file.
-        "cache.SECONDS = 0.0;"
+        "cache.MIN_COMPILE_TIME = 0.0;"
         "print(main(sys.argv[1:]), jax.config.values == before)"
     )
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(tmp_path)}

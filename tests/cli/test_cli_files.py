@@ -14,7 +14,7 @@ from tests.io import test_las_waveforms, test_neon, test_pulsewaves
 
 @pytest.fixture(autouse=True)
 def no_programs(monkeypatch):
-    monkeypatch.setattr("jaxlidar.cli.group.kept_programs", contextlib.nullcontext)
+    monkeypatch.setattr("jaxlidar.cli.group.compilation_cache", contextlib.nullcontext)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,167 @@
+"""Warnings of truncated light: light that arrives after the record, and orders beyond the last."""
+
+import importlib
+import time
+import warnings
+
+import jax
+import numpy as np
+import pytest
+
+import jaxlidar as jl
+from jaxlidar.planning import orders
+from jaxlidar.simulate import LateLightWarning
+from tests.helpers import slab
+
+# The package's name `simulate` is the function.
+simulation = importlib.import_module("jaxlidar.simulate")
+KEY = jax.random.key(5)
+BRIGHT = jl.Scene(plates=(jl.Plate(80.0, 0.4, 0.5),), ground=jl.Ground(reflectance=0.9))
+LIDAR = jl.Lidar()
+
+
+def dense(albedo, depth=10.0, reflectance=None):
+    leaf = jl.LeafOptics(0.5 * albedo, 0.5 * albedo)
+    canopy = jl.Canopy(slab(depth, thickness=10.0), leaf=leaf, sides="periodic")
+    ground = None if reflectance is None else jl.Ground(reflectance=reflectance)
+    return jl.Scene(canopy=canopy, ground=ground)
+
+
+def late(wave):
+    return float(np.max(wave.energy_budget["after the window"]))
+
+
+def test_a_window_of_the_plan_warns_and_one_of_the_user_does_not():
+    with pytest.warns(LateLightWarning, match=r"% of the light is still on its way .* give window="):
+        wave = jl.simulate(LIDAR, BRIGHT, key=KEY, n_photons=20_000, max_orders=4)
+    assert late(wave) > 0.01
+    assert "of the light is still on its way when the record ends" in str(wave)
+    end = float(wave.time[-1])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        user_window = jl.simulate(
+            LIDAR, BRIGHT, key=KEY, n_photons=20_000, max_orders=4, window=(-600.0, end)
+        )
+    assert late(user_window) > 0.01
+    assert "of the light is still on its way when the record ends" in str(user_window)
+
+
+@pytest.mark.slow
+def test_little_light_after_the_record_does_not_warn():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        wave = jl.simulate(LIDAR, dense(0.3, 2.0, 0.1), key=KEY, n_photons=20_000)
+    assert late(wave) < 0.01
+    assert "still on its way" not in str(wave)
+
+
+@pytest.mark.slow
+def test_the_chosen_window_takes_in_bright_dense_stands():
+    """Less than 1 % of the light from a stand of depth 6 and albedo 0.95 arrives after the record."""
+    wave = jl.simulate(LIDAR, dense(0.95, 6.0, 0.3), key=KEY, n_photons=40_000)
+    assert late(wave) < 0.01
+
+
+def test_the_table_of_effects_has_a_row_for_light_after_the_record():
+    dark_plan, bright_plan = (jl.plan(LIDAR, dense(a, 10.0)) for a in (0.3, 0.98))
+    (dark_row,) = (effect for effect in dark_plan.effects if effect.name == "after the window")
+    (bright_row,) = (effect for effect in bright_plan.effects if effect.name == "after the window")
+    assert dark_row.bound < bright_row.bound
+    # A window of the user may leave out all light.
+    narrow_plan = jl.plan(LIDAR, dense(0.3, 10.0), window=(-90.0, -80.0))
+    assert next(effect.bound for effect in narrow_plan.effects if effect.name == "after the window") == 1.0
+    assert "window" in str(bright_plan)
+
+
+@pytest.mark.slow
+def test_tolerance_is_met_only_if_the_neglected_orders_are_below_it():
+    scene = dense(1.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", LateLightWarning)
+        wave = jl.simulate(LIDAR, scene, key=KEY, rtol=0.03)
+    share = float(np.max(wave.neglected / wave.reflectance.sum(axis=1)))
+    assert share > 0.03
+    assert wave.info["stopped"].startswith("orders beyond ")
+    assert "orders beyond the last may add" in str(wave)
+    # The estimate of the plan is no smaller than that of the photons.
+    assert jl.plan(LIDAR, scene, rtol=0.03, describe=False).likely_beyond >= float(
+        wave.energy_budget["unfollowed"][0]
+    ) - 3 * float(wave.energy_budget_stderr["unfollowed"][0])
+
+
+@pytest.mark.slow
+def test_more_orders_are_followed_where_too_few_were_planned(monkeypatch):
+    """The plan is patched to expect little further scattering: two orders, of six that memory admits."""
+    monkeypatch.setattr(orders, "scattered_again", lambda scene, optics: 1e-3)
+    monkeypatch.setattr(orders, "MAX_HISTORIES", 60)
+    calls = []
+    settings = {
+        "key": KEY,
+        "rtol": 0.05,
+        "window": (-90.0, 60.0),
+        "progress": lambda _: calls.append(len(calls)),
+    }
+    wave = jl.simulate(LIDAR, dense(0.9, 3.0), **settings)
+    orders_followed = jl.plan(LIDAR, dense(0.9, 3.0), window=(-90.0, 60.0), describe=False).limits.most_orders
+    assert orders_followed > 2
+    assert wave.info["stopped"].startswith(f"orders beyond {orders_followed} may add")
+
+    # Limits of time and memory hold for both attempts together.
+    def interrupt(_):
+        raise KeyboardInterrupt
+
+    early = jl.simulate(LIDAR, dense(0.9, 3.0), **settings | {"progress": interrupt})
+    assert early.info["stopped"] == "interrupted"
+    short = jl.simulate(LIDAR, dense(0.9, 3.0), **settings, max_seconds=1e-6)
+    assert short.info["stopped"].startswith("orders beyond 2 may add")
+    three = jl.plan(LIDAR, dense(0.9, 3.0), window=(-90.0, 60.0), max_orders=3, describe=False)
+    tight = jl.simulate(LIDAR, dense(0.9, 3.0), **settings, max_memory=1.0001 * three.memory / 1e9)
+    assert tight.info["stopped"].startswith("orders beyond 3 may add")
+
+
+def test_orders_of_the_user_are_not_extended():
+    wave = jl.simulate(LIDAR, dense(0.8, 3.0), key=KEY, max_orders=2, rtol=0.05)
+    assert wave.info["stopped"] == "tolerance met"
+    assert float(wave.neglected[0]) > 0
+
+
+@pytest.mark.slow
+def test_the_ledger_has_standard_errors():
+    """The scatter of forty simulations agrees with their errors; errors three times wrong are rejected."""
+    scene, n = dense(0.8, 3.0, 0.3), 40
+    plan = jl.plan(LIDAR, scene, describe=False)
+    waves = [jl.simulate(LIDAR, scene, key=k, plan=plan, n_photons=4_000) for k in jax.random.split(KEY, n)]
+    for name in ("escaped", "absorbed by leaf", "absorbed by ground", "after the window"):
+        values = np.array([float(w.energy_budget[name][0]) for w in waves])
+        errors = np.array([float(w.energy_budget_stderr[name][0]) for w in waves])
+        # Errors are widened for eight batches.
+        ratio = values.std(ddof=1) / errors.mean()
+        assert 0.6 < ratio < 1.4, name
+        assert not any(0.6 < wrong < 1.4 for wrong in (ratio / 3, 3 * ratio)), name
+    flat = jl.simulate(LIDAR, jl.Scene(ground=jl.Ground()), key=KEY)
+    assert all(float(e[0]) == 0 for e in flat.energy_budget_stderr.values())
+
+
+@pytest.mark.slow
+def test_light_is_accounted_for():
+    wave = jl.simulate(LIDAR, dense(0.95, 4.0, 0.5), key=KEY, n_photons=20_000)
+    np.testing.assert_allclose(sum(np.asarray(v) for v in wave.energy_budget.values()), 1.0, atol=2e-3)
+
+
+def test_time_for_planning_counts(monkeypatch):
+    """Eight batches take less than `max_seconds`: if planning did not count, more would be traced."""
+    make = simulation.make_plan
+
+    def slow_plan(*arguments, **keywords):
+        time.sleep(1.0)
+        return make(*arguments, **keywords)
+
+    settings = {"key": KEY, "rtol": 1e-6, "max_orders": 2, "window": (-90.0, 60.0)}
+    # Compile everything before.
+    jl.simulate(LIDAR, dense(0.3), **settings, max_seconds=1e-6)
+    fast = jl.simulate(LIDAR, dense(0.3), **settings, max_seconds=1.0)
+    assert fast.info["batches"] > 8
+    monkeypatch.setattr(simulation, "make_plan", slow_plan)
+    slow = jl.simulate(LIDAR, dense(0.3), **settings, max_seconds=1.0)
+    assert (slow.info["batches"], slow.info["stopped"]) == (8, "time spent")
+    assert slow.info["seconds"] > 1.0
