@@ -9,11 +9,13 @@ from jaxlidar.cli import COMMANDS, version
 from jaxlidar.cli.cache import compilation_cache
 from jaxlidar.cli.files import convert, info
 from jaxlidar.cli.optics import prospect, spectra
+from jaxlidar.cli.reference import reference
 from jaxlidar.cli.simulation import plan, simulate
 from jaxlidar.cli.trees import tree
 
 BUILT_IN_COMMANDS: dict[str, click.Command] = {
-    str(command.name): command for command in (simulate, plan, tree, prospect, spectra, info, convert)
+    str(command.name): command
+    for command in (simulate, plan, tree, prospect, spectra, info, convert, reference)
 }
 
 
