@@ -138,8 +138,8 @@ def negate(a: DoubleSingle) -> DoubleSingle:
     return DoubleSingle(-a.head, -a.tail)
 
 
-# The sums below take their head from the rounded sum, and their tail from what the head lacks. The terms are
-# ordered so that each difference is of close numbers, and hence exact.
+# Sums and products below take their head from the rounded result, and their tail from the difference between
+# the terms and the head. Terms are subtracted in an order in which each difference is exact.
 
 
 def add_singles(c: float | _Single, x: _Single) -> DoubleSingle:

@@ -19,7 +19,7 @@ to -1 at infinity,
 Qn lies between 1 and 1.22, since En is close to its lower bound exp(-k) / (k + n) (Abramowitz and Stegun
 5.1.19). The Pn and Qn are replaced by polynomials, which were computed by interpolation at Chebyshev nodes in
 60-digit arithmetic. P2 and Po are written in powers of 1 - k and Pt in those of 3/4 - k, about where they are
-small. The break at k = 1 is where ln k changes sign, hence no subtraction loses more than a bit or two.
+small. The break at k = 1 is where ln k changes sign; so no subtraction loses more than a bit or two.
 
 *Errors.* Largest relative error of the polynomials themselves, and their numbers of terms:
 

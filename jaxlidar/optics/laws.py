@@ -246,7 +246,7 @@ class Specular(AbstractMirror):
     - `roughness`: standard deviation of the reflected direction about the mirror direction along each of two
       perpendicular axes, rad, in [0, 0.5]; 0 is a perfect mirror. Default 0.
 
-    **Raises:** ValueError for a roughness outside its range; TypeError for what is no number.
+    **Raises:** ValueError for a roughness outside its range; TypeError for arguments that are no numbers.
 
     **Example:** straight back, a lobe of 0.1 rad is 1 / (2 * 0.1^2) times as bright as a Lambertian surface.
 

@@ -51,7 +51,7 @@ class LeafAngles(eqx.Module):
       negative and not all zero; need not sum to one, for it is normalised where it is used.
 
     **Raises:** ValueError for another shape, for negative or non-finite values, and where all are zero;
-    TypeError for what is no number.
+    TypeError for arguments that are no numbers.
 
     **Example:** G of a canopy of mostly horizontal leaves, seen from above.
 

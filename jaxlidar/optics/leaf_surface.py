@@ -70,7 +70,7 @@ def leaf_surface(n: ArrayLike, alpha: float | int = 40.0) -> LeafSurface:
     **Returns:** a `LeafSurface` of arrays shaped as `n`: JAX arrays where `n` is one, else NumPy arrays of
     float64.
 
-    **Raises:** ValueError for values outside these ranges; TypeError for what is no number.
+    **Raises:** ValueError for values outside these ranges; TypeError for arguments that are no numbers.
 
     **Source:** Stern (1964), Appl. Opt. 3, 111; Allen (1973), J. Opt. Soc. Am. 63, 664.
 

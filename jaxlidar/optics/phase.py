@@ -117,8 +117,8 @@ class Isotropic(AbstractPhase):
 
     - `albedo`: single scattering albedo, one number or one per wavelength, in [0, 1].
 
-    **Raises:** ValueError for an albedo outside its range or of more than one dimension; TypeError for what
-    is no number.
+    **Raises:** ValueError for an albedo outside its range or of more than one dimension; TypeError for
+    arguments that are no numbers.
 
     **Example:** a canopy of isotropic scatterers at two wavelengths.
 
@@ -158,7 +158,7 @@ class HenyeyGreenstein(AbstractPhase):
       forward. Default 0.
 
     **Raises:** ValueError for values outside their ranges and for an albedo of more than one dimension;
-    TypeError for what is no number.
+    TypeError for arguments that are no numbers.
 
     **Source:** Henyey and Greenstein (1941), Astrophys. J. 93, 70.
 

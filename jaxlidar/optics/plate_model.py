@@ -128,7 +128,7 @@ def _arrays(k: Any, N: Any, surface: LeafSurface) -> tuple[_Reals, _Reals, LeafS
     return k, N, face, kappa
 
 
-# Compiled whole: by itself, every operation of it would be a program to compile.
+# Compiled as one program: called outside of `jit`, every operation would be compiled by itself.
 @jax.jit
 def _values_of(k: _Reals, N: _Reals, face: LeafSurface, kappa: DoubleSingle | None) -> Triple:
     k, N, face, kappa = _broadcast(k, N, face, kappa)
@@ -271,7 +271,7 @@ def _values(x: _PileState) -> Triple:
 
 
 def _leaf_jvp(primals, tangents):
-    # Symbolic zeros: a derivative in N alone does not compute those in k and in the surface.
+    # Symbolic zeros tell which derivatives are not asked for. Those in the surface then cost nothing.
     k, M, face, kappa = primals
     dk, dM, dface, _ = tangents
     values, in_k, in_M = _values_and_slopes(k, M, face, kappa)
@@ -368,7 +368,7 @@ def _slopes_k(x: _PileState, k: _Reals, M: _Reals, face: LeafSurface) -> Triple:
     Rs, Ts, _ = _pile(x)
     inverse = 1 / (1 - Rs * r)
     downward = x.Ta * inverse
-    # All contributions to either are negative; the absorptance takes what they lose.
+    # All contributions to dR and dT are negative: no digits are lost. The absorptance gains what they lose.
     dR = rho * x.Ta * (log_t + log_tau) + downward * (
         Rs * t * log_t + inverse * (t * dRs + Rs * Rs * t * dr) + Rs * dt
     )

@@ -101,8 +101,8 @@ class Prospect(eqx.Module):
     **Raises:** ValueError, naming field, value and admissible range: for a trait that is negative, not finite
     or not a single number, for a trait other than 0 that the version does not have (hence `Cm` with "PC" and
     "PRO"), for N below 1, alpha outside [0, 90], an unknown version, and `coefficients` that are missing or
-    not admissible. TypeError for what is no number. Traced values are not checked. A content so large that
-    another unit is likely, such as a `Cw` in micrometres, gives a `UnitWarning`.
+    not admissible. TypeError for arguments that are no numbers. Traced values are not checked. A content so
+    large that another unit is likely, such as a `Cw` in micrometres, gives a `UnitWarning`.
 
     **Source:** Jacquemoud and Baret (1990), Remote Sens. Environ. 34, 75, and those of the versions.
 

@@ -166,7 +166,7 @@ def spectrum_names(kind: str | None = None) -> dict[str, str]:
 
     **Returns:** a dict from name to kind.
 
-    **Raises:** ValueError for an unknown kind; TypeError for what is no name.
+    **Raises:** ValueError for an unknown kind; TypeError for a kind that is no string.
 
     **Example:**
 
@@ -191,7 +191,8 @@ def spectrum(name: str) -> Spectrum:
 
     **Returns:** a `Spectrum`.
 
-    **Raises:** ValueError for an unknown name; it lists similar names. TypeError for what is no name.
+    **Raises:** ValueError for an unknown name; it lists similar names. TypeError for a name that is no
+    string.
 
     **Example:**
 

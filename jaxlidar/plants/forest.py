@@ -52,7 +52,7 @@ def forest(
     **Returns:** a list of `Tree`, in the order of placement. The position of a tree is its `base`.
 
     **Raises:** ValueError for arguments outside the ranges above, and if so many trees cannot be placed at
-    that distance; TypeError for what is no `Habit`. Random placement fills at most about
+    that distance; TypeError for an object that is no `Habit`. Random placement fills at most about
     0.7 / minimum_distance^2 stems per m2.
 
     **Example:**

@@ -59,7 +59,7 @@ class Branching:
       of an internode, 0 or more. Thicker wood bends less, by the fourth root of its diameter. Default 7.
     - `tropism`: upward bend of a horizontal piece, degrees; negative is downward. Default 2.
 
-    **Raises:** ValueError for values outside the ranges above; TypeError for what is no number.
+    **Raises:** ValueError for values outside the ranges above; TypeError for arguments that are no numbers.
 
     **Example:**
 
@@ -314,7 +314,8 @@ def grow(habit: Habit | None = None, *, seed: int | np.random.Generator = 0) -> 
 
     **Returns:** a `Tree`.
 
-    **Raises:** ValueError if the wood of the habit does not grow upward; TypeError for what is no `Habit`.
+    **Raises:** ValueError if the wood of the habit does not grow upward; TypeError for an object that is no
+    `Habit`.
 
     **Example:**
 

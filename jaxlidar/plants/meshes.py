@@ -147,7 +147,7 @@ def voxelise_mesh(
 
     **Raises:** ValueError for inadmissible arguments, a material that the mesh does not have or that is both
     leaf and bark, triangles that have no area in all, and a mesh that reaches out of a given grid; TypeError
-    for what is no `Mesh`.
+    for an object that is no `Mesh`.
 
     **Source:** Cauchy (1841).
 

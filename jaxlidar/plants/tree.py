@@ -30,7 +30,7 @@ class Tree:
 
     **Raises:** ValueError for arrays of other shapes, values that are not finite, radii that are not
     positive, negative orders, directions that are not unit vectors, and parents that do not come before their
-    children; TypeError for what is no NumPy array, and for parents and orders that are no integers.
+    children; TypeError for fields that are no NumPy arrays, and for parents and orders that are no integers.
 
     **Example:**
 
@@ -88,7 +88,7 @@ class Tree:
 
         **Returns:** a `Tree` with the stems of all.
 
-        **Raises:** ValueError if there is no tree; TypeError for what is no `Tree`.
+        **Raises:** ValueError if there is no tree; TypeError for an object that is no `Tree`.
         """
         check_kind("trees", trees, Iterable, "several Tree, as in [tree, other]")
         trees = tuple(trees)

@@ -87,7 +87,8 @@ def voxelise(
     **Returns:** a `VoxelMap`.
 
     **Raises:** ValueError for inadmissible arguments, for trees with neither wood nor clumps, for trees that
-    reach out of a given grid, and for more material than the grid can hold; TypeError for what is no `Tree`.
+    reach out of a given grid, and for more material than the grid can hold; TypeError for an object that is
+    no `Tree`.
 
     **Source:** Cauchy (1841); for the meaning of a voxel's probabilities, `VoxelMap.from_probability`.
 
@@ -179,7 +180,7 @@ def voxelise_points(
     check_number("wood_probability", wood_probability, 0.0, 1.0)
     min_points = check_integer("min_points", min_points)
     on_wood = np.zeros(len(points), bool) if is_wood is None else np.asarray(is_wood)
-    # Numbers may be classes, such as those of a LAS file, of which many are true.
+    # Numbers are refused: they may be classes, as in a LAS file, and nearly all would count as true.
     if on_wood.dtype != bool:
         raise TypeError(f"is_wood is {kind_of(is_wood)}; admissible is an array of booleans, one a point")
     check_shape("is_wood", on_wood, (len(points),))
@@ -210,7 +211,7 @@ def trim_empty_layers(voxels: VoxelMap) -> VoxelMap:
 
     **Returns:** a `VoxelMap` of the same voxels, smaller, with `origin` moved to its new corner.
 
-    **Raises:** TypeError for what is no `VoxelMap`.
+    **Raises:** TypeError for an object that is no `VoxelMap`.
 
     **Example:**
 
