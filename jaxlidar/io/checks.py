@@ -1,7 +1,8 @@
 """Checks that the readers share: files that are there, sizes that files may claim, and columns of tables."""
 
+import contextlib
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from jaxlidar._constants import SPEED_OF_LIGHT
@@ -16,6 +17,18 @@ LARGEST_WHOLE = 2**53
 # From sample to sample of a recorded waveform, m along the beam: 1 ns. One part in a hundred leaves room for
 # air.
 STEP, STEP_TOLERANCE = SPEED_OF_LIGHT / 2, 0.01
+
+# What HDF5, h5netcdf, zarr and xarray raise for damaged files.
+_DAMAGED = (OSError, RuntimeError, ValueError, KeyError, TypeError, AttributeError, OverflowError)
+
+
+@contextlib.contextmanager
+def refuse_damage(refusal: str) -> Iterator[None]:
+    """Raise a ValueError that begins with `refusal` in place of what libraries raise for damaged files."""
+    try:
+        yield
+    except _DAMAGED as error:
+        raise ValueError(f"{refusal} ({error})") from error
 
 
 def existing(path: str | os.PathLike[str]) -> Path:

@@ -30,8 +30,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxlidar.io.checks import STEP, STEP_TOLERANCE, existing
-from jaxlidar.io.gedi_beam import Beam, refusing
+from jaxlidar.io.checks import STEP, STEP_TOLERANCE, existing, refuse_damage
+from jaxlidar.io.gedi_beam import Beam
 from jaxlidar.io.pedestal import above_pedestal
 
 # Equal samples in a row that noise does not make.
@@ -151,7 +151,7 @@ def read_gedi_l1b(
         raise ImportError('reading HDF5 needs h5py: pip install "jaxlidar[io]"') from error
     path = existing(path)
     with contextlib.ExitStack() as stack:
-        with refusing(f"{path}: not a readable HDF5 file"):
+        with refuse_damage(f"{path}: not a readable HDF5 file"):
             file = stack.enter_context(h5py.File(path, "r"))
             names = [name for name in map(str, file) if name.startswith("BEAM")]
         if not names:

@@ -1,15 +1,14 @@
 """The group of one beam in a GEDI L1B file: its datasets, checked against the file before they are read."""
 
-import contextlib
 import functools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from jaxlidar.io.checks import FARTHEST, MOST_COUNTS, check_unpacked
+from jaxlidar.io.checks import FARTHEST, MOST_COUNTS, check_unpacked, refuse_damage
 
 # Per-shot datasets of a beam's group, and what a GediShot makes of them.
 _PER_SHOT = (
@@ -30,17 +29,6 @@ _PER_SHOT = (
 )
 # Flags that a GediShot keeps; subsets may have left them out.
 FLAGS = {"degrade": "geolocation/degrade", "stale_return": "stale_return_flag"}
-# What h5py raises for damaged files.
-_DAMAGED = (OSError, RuntimeError, ValueError, KeyError, TypeError, AttributeError, OverflowError)
-
-
-@contextlib.contextmanager
-def refusing(what: str) -> Iterator[None]:
-    """Turns what h5py raises for damaged files into a ValueError that begins with `what`."""
-    try:
-        yield
-    except _DAMAGED as error:
-        raise ValueError(f"{what} ({error})") from error
 
 
 class Beam:
@@ -89,7 +77,7 @@ class Beam:
         runs = np.split(np.array(shots), np.flatnonzero(np.diff(shots) > 1) + 1)
         for run in (run.tolist() for run in runs):
             first, end = int(start[run[0]]), int(start[run[-1]] + count[run[-1]])
-            with refusing(f"{self.at(field, run[0])}: damaged"):
+            with refuse_damage(f"{self.at(field, run[0])}: damaged"):
                 together = node[first:end]
             for i in run:
                 if count[i] < 2:
@@ -126,7 +114,7 @@ class Beam:
     def _flags(self) -> dict[str, np.ndarray]:
         found = {}
         for name, field in FLAGS.items():
-            with refusing(f"{self.at(field)}: damaged"):
+            with refuse_damage(f"{self.at(field)}: damaged"):
                 absent = f"{self.name}/{field}" not in self.file
             if absent:
                 continue
@@ -171,7 +159,7 @@ class Beam:
 
     def _dataset(self, field: str) -> Any:
         """A dataset of numbers in one dimension, all of which are stored in the file."""
-        with refusing(f"{self.at(field)}: damaged"):
+        with refuse_damage(f"{self.at(field)}: damaged"):
             node = self.file.get(f"{self.name}/{field}")
             shape, kind = getattr(node, "shape", None), getattr(getattr(node, "dtype", None), "kind", None)
         if shape is None or kind is None:
@@ -180,7 +168,7 @@ class Beam:
             raise ValueError(f"{self.at(field)}: type {node.dtype} where numbers belong")
         if len(shape) != 1:
             raise ValueError(f"{self.at(field)}: shape {shape}, where one dimension belongs")
-        with refusing(f"{self.at(field)}: damaged"):
+        with refuse_damage(f"{self.at(field)}: damaged"):
             elsewhere = node.is_virtual or node.external
             (chunk,) = node.chunks or shape
             pieces = math.ceil(shape[0] / chunk) if chunk else 0
@@ -196,5 +184,5 @@ class Beam:
 
     def _read(self, field: str) -> np.ndarray:
         node = self._dataset(field)
-        with refusing(f"{self.at(field)}: damaged"):
+        with refuse_damage(f"{self.at(field)}: damaged"):
             return node[:]

@@ -29,11 +29,11 @@ from jaxlidar._checks import (
     known_number,
 )
 from jaxlidar._files import atomic_write
+from jaxlidar._fingerprint import version_of
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.instrument.survey import Survey
 from jaxlidar.io.checks import MOST_COUNTS
 from jaxlidar.io.gedi_places import geolocation, reference_system
-from jaxlidar.io.netcdf import version
 from jaxlidar.waveform import Waveform, received
 
 # The beams' groups: the number of the laser's channel, and whether the laser's full power is in the beam.
@@ -337,7 +337,7 @@ def _describe(file: Any, name: str) -> None:
     said = {
         "abstract": "Simulated waveforms in the layout of the GEDI L1B product; no measurements.",
         "creationDate": f"{datetime.datetime.now(datetime.UTC):%Y-%m-%dT%H:%M:%S.%fZ}",
-        "credit": f"jaxlidar {version('jaxlidar')}",
+        "credit": f"jaxlidar {version_of('jaxlidar')}",
         "fileName": name,
         "shortName": "GEDI_L1B",
     }

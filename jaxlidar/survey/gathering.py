@@ -15,7 +15,7 @@ from jaxlidar._summary import NOTABLE, percent
 from jaxlidar.io.case import Case
 from jaxlidar.io.netcdf import by_rows
 from jaxlidar.io.parts import Parts
-from jaxlidar.io.rows import blank
+from jaxlidar.io.rows import unwritten_rows
 from jaxlidar.simulate import LateLightWarning
 from jaxlidar.survey.records import Record
 from jaxlidar.survey.waveforms import Waveforms
@@ -72,7 +72,7 @@ def on_disk(
     """All waveforms, written to a file, with their case if there is one, and opened."""
     each, late = way.records(results), 0.0
     first = next(each)
-    empty = jax.tree.map(lambda a: blank(len(way.survey), a), first[1]._asdict())
+    empty = jax.tree.map(lambda a: unwritten_rows(len(way.survey), a), first[1]._asdict())
     with by_rows(_waveforms(way, {**known, **empty}, started, problem=problem), path, case) as rows:
         for shots, record in itertools.chain([first], each):
             rows.add(shots, {**{name: a[shots] for name, a in known.items()}, **record._asdict()})

@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxlidar._checks import briefly
-from jaxlidar.io.netcdf import TRUTH, keep_as_netcdf
+from jaxlidar.io.datasets import keep_as_netcdf
+from jaxlidar.io.netcdf import TRUTH_QUANTITIES
 from jaxlidar.truth import Truth
 
 
@@ -56,7 +57,7 @@ class Truths(eqx.Module):
 keep_as_netcdf(
     Truths,
     "truth of the shots of a survey",
-    TRUTH,
+    TRUTH_QUANTITIES,
     dimensions={"shots": "shot", "bins": "time", "wavelengths": "wavelength"},
     items={"returns": "material", "surface_height": "surface", "surface_spread": "surface"},
     rows="shots",

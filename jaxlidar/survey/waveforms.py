@@ -2,8 +2,6 @@
 
 import operator
 import os
-import tempfile
-from pathlib import Path
 from typing import Any, final
 
 import equinox as eqx
@@ -16,7 +14,7 @@ from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._summary import NOTABLE, percent
 from jaxlidar.io import netcdf
 from jaxlidar.io.case import Case
-from jaxlidar.io.rows import CHECKSUMS
+from jaxlidar.io.datasets import datasets_of, keep_as_netcdf
 from jaxlidar.survey.truths import Truths
 from jaxlidar.waveform import Waveform
 
@@ -149,17 +147,10 @@ class Waveforms(eqx.Module):
 
         **Returns:** an `xarray.Dataset`.
 
-        **Raises:** ImportError where xarray or h5netcdf is not installed.
+        **Raises:** ImportError where xarray is not installed.
         """
-        import xarray
-
-        with tempfile.TemporaryDirectory() as folder:
-            self.save(path := Path(folder) / "waveforms.nc")
-            how: dict[str, Any] = {"engine": "h5netcdf", "decode_timedelta": False}
-            found = xarray.load_dataset(path, **how)
-            if self.truth is None:
-                return found
-            return found.merge(xarray.load_dataset(path, group="truth", **how).drop_vars(CHECKSUMS))
+        datasets = datasets_of(self)
+        return datasets["/"].merge(datasets["/truth"]) if self.truth is not None else datasets["/"]
 
     def save(self, path: str | os.PathLike[str], case: Case | None = None) -> None:
         """Write the waveforms as a netCDF file, which `Waveforms.open` and `jaxlidar.open` read.
@@ -190,7 +181,7 @@ class Waveforms(eqx.Module):
         return found
 
 
-netcdf.keep_as_netcdf(
+keep_as_netcdf(
     Waveforms,
     "simulated lidar waveforms of a survey",
     {

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 import inversion
 import jaxlidar as jl
-from jaxlidar.io import layouts
+from jaxlidar.io import datasets
 
 h5py = pytest.importorskip("h5py")
 
@@ -171,7 +171,7 @@ def test_xarray_opens_it_with_coordinates_and_units(wave, case, tmp_path):
 
 def test_every_quantity_of_a_known_class_has_units():
 
-    for layout in layouts.LAYOUTS.values():
+    for layout in datasets.LAYOUTS.values():
         if layout.kind.__module__.startswith(("jaxlidar", "inversion")):
             names = {f.name for f in dataclasses.fields(layout.kind) if not f.metadata.get("static")}
             assert names - {"scene", "waveform", "truth"} == set(layout.quantities)
@@ -237,10 +237,10 @@ def test_a_class_of_another_package_is_found_by_its_entry_point(tmp_path, monkey
     with pytest.raises(TypeError, match="result is of the class Heights; admissible are"):
         jl.io.save(Heights(np.ones(2)), tmp_path / "a.nc")
     # Forgotten again when the test ends.
-    monkeypatch.setitem(layouts.LAYOUTS, "Heights", None)
+    monkeypatch.setitem(datasets.LAYOUTS, "Heights", None)
     jl.io.keep_as_netcdf(Heights, "heights", {"top": ("m", "height")})
     jl.io.save(Heights(np.array([1.0, 2.0])), tmp_path / "a.nc")
-    layout = layouts.LAYOUTS.pop("Heights")
+    layout = datasets.LAYOUTS.pop("Heights")
     with pytest.raises(ValueError, match=r"a.nc: it holds a Heights, which is not known here"):
         jl.open(tmp_path / "a.nc")
 
@@ -248,9 +248,10 @@ def test_a_class_of_another_package_is_found_by_its_entry_point(tmp_path, monkey
         name = "Heights"
 
         def load(self):
-            layouts.LAYOUTS["Heights"] = layout
+            datasets.LAYOUTS["Heights"] = layout
 
-    monkeypatch.setattr(metadata, "entry_points", lambda group: [Point()] if group == layouts.FILES else [])
+    points = {datasets.ENTRY_POINTS: [Point()]}
+    monkeypatch.setattr(metadata, "entry_points", lambda group: points.get(group, []))
     assert jl.open(tmp_path / "a.nc").top.tolist() == [1.0, 2.0]
 
 
