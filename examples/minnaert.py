@@ -1,7 +1,14 @@
-"""A scattering law of one's own: Minnaert's, in one class. Run it as `python examples/minnaert.py`.
+"""A new scattering law, Minnaert's, in one class. Run it as `python examples/minnaert.py`.
 
 M. Minnaert (1941), Astrophys. J. 93, 403, described the moon's radiance by a power of the cosines of
-incidence and of view; a rough surface that darkens towards the limb has k above one.
+incidence and of view. With mu0 the cosine of incidence and mu that of the outgoing direction,
+
+    BRDF = R (k + 1) / (2 pi) (mu0 mu)^(k - 1),
+    albedo(mu0) = R mu0^(k - 1),    density of directions = (k + 1) / (2 pi) mu^k per sr.
+
+A surface that darkens towards the limb has k above one; k = 1 is Lambertian. Directions are sampled by the
+inverse of their distribution, mu = (1 - u)^(1 / (k + 1)). Cosines of at least 1e-6 keep derivatives of the
+powers finite at grazing angles.
 """
 
 from typing import final
@@ -28,7 +35,7 @@ class Minnaert(jl.AbstractLaw):
     def __check_init__(self):
         check_range("k", self.k, 1.0, 10.0)
 
-    def view_factor(self, incident: Vec, normal: Vec, view: Vec, half_angle: Scalar) -> Scalar:
+    def intensity_factor(self, incident: Vec, normal: Vec, view: Vec, half_angle: Scalar) -> Scalar:
         return np.pi * self.albedo(incident, normal) * self.density(incident, normal, view)
 
     def albedo(self, incident: Vec, normal: Vec) -> Scalar:
@@ -42,12 +49,12 @@ class Minnaert(jl.AbstractLaw):
         power = jnp.maximum(cosine, 1e-6) ** self.k
         return jnp.where(cosine > 0, (self.k + 1.0) / (2 * np.pi) * power, 0.0)
 
-    def largest_view_factor(self, half_angle: float) -> float:
+    def largest_intensity_factor(self, half_angle: float) -> float:
         return 0.5 * (float(self.k) + 1.0)
 
 
 def main() -> None:
-    """Returns of ground at several slopes, Lambertian and with limb darkening."""
+    """Print the returns of ground at several slopes, Lambertian and with limb darkening."""
     for slope in (0.0, 20.0, 40.0):
         sums = []
         for law in (jl.Lambertian(), Minnaert(k=1.5)):

@@ -1,7 +1,7 @@
 """A differentiable simulator of full-waveform lidar in JAX.
 
 `simulate` gives the waveform of a `Lidar` over a `Scene`. Its steps can also be taken one by one: `plan`,
-`reduce`, `trace_scene`, `waveform_of`.
+`make_setup`, `trace_scene`, `waveform_of`.
 
 Readers of files are in `jaxlidar.io`, figures in `jaxlidar.plot`, and what extensions build on in
 `jaxlidar.extend`. Retrieval of scene properties from waveforms is in the package `inversion`.
@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Any
 from jaxlidar import extend, io
 from jaxlidar._checks import UnitWarning
 from jaxlidar._constants import SPEED_OF_LIGHT
-from jaxlidar._deprecated import renamed
+from jaxlidar._deprecated import RENAMED, warn_renamed
 from jaxlidar._progress import Progress
 from jaxlidar._registry import register_public_objects, waveform_html
+from jaxlidar._signatures import shorten_signatures
 from jaxlidar._workers import LostWorkersWarning
 from jaxlidar.analog import AnalogReturns, analog_returns, photon_paths
 from jaxlidar.energy import EnergyBudget, energy_budget
@@ -40,17 +41,17 @@ from jaxlidar.optics.leaf_surface import LeafSurface, leaf_surface
 from jaxlidar.optics.phase import AbstractPhase, HenyeyGreenstein, Isotropic
 from jaxlidar.optics.plate_model import plate_model
 from jaxlidar.optics.prospect import Prospect, prospect_jacobian, prospect_spectra
-from jaxlidar.optics.spectra import Spectrum, read_spectrum_csv, spectra, spectrum
+from jaxlidar.optics.spectra import Spectrum, read_spectrum_csv, spectrum, spectrum_names
 from jaxlidar.planning.effects import Effect
 from jaxlidar.planning.plan import Plan, plan
-from jaxlidar.planning.setup import Setup, reduce
+from jaxlidar.planning.setup import Setup, make_setup
 from jaxlidar.plants.forest import forest
-from jaxlidar.plants.habits import Branching, Habit, broadleaf, conifer, grow, shrub, spreading
-from jaxlidar.plants.lsystem import LSystem, Module, Rule, Word
+from jaxlidar.plants.habits import Branching, Habit, broadleaf, conifer, grow, shrub, spreading_tree
+from jaxlidar.plants.lsystem import LSystem, Rule, Symbol, Word
 from jaxlidar.plants.meshes import Mesh, voxelise_mesh
 from jaxlidar.plants.tree import Tree
 from jaxlidar.plants.turtle import turtle
-from jaxlidar.plants.voxelise import crop, voxelise, voxelise_points
+from jaxlidar.plants.voxelise import trim_empty_layers, voxelise, voxelise_points
 from jaxlidar.scenes.atmosphere import Atmosphere
 from jaxlidar.scenes.canopy import Canopy
 from jaxlidar.scenes.scene import Scene
@@ -60,6 +61,7 @@ from jaxlidar.scenes.surfaces import AbstractGround, AbstractSheet, AbstractSurf
 from jaxlidar.scenes.terrain import Terrain
 from jaxlidar.scenes.voxels import VoxelMap
 from jaxlidar.simulate import LateLightWarning, simulate
+from jaxlidar.spectral.waveform import Waveform, total_reflectance, waveform_of
 from jaxlidar.survey.coverage import OffMapWarning
 from jaxlidar.survey.progress import SurveyProgress
 from jaxlidar.survey.run import simulate_many
@@ -67,7 +69,6 @@ from jaxlidar.survey.truths import Truths
 from jaxlidar.survey.waveforms import Waveforms
 from jaxlidar.trace.response import Response, trace_scene
 from jaxlidar.truth import Truth, truth_of
-from jaxlidar.waveform import Waveform, total_of, waveform_of
 
 if TYPE_CHECKING:
     from jaxlidar import plot
@@ -106,7 +107,6 @@ __all__ = [
     "Lidar",
     "LostWorkersWarning",
     "Mesh",
-    "Module",
     "OffMapWarning",
     "Oscillating",
     "PhotonCounter",
@@ -129,6 +129,7 @@ __all__ = [
     "Spectrum",
     "Survey",
     "SurveyProgress",
+    "Symbol",
     "Terrain",
     "Tree",
     "Truth",
@@ -141,7 +142,6 @@ __all__ = [
     "analog_returns",
     "broadleaf",
     "conifer",
-    "crop",
     "energy_budget",
     "extend",
     "first_return_window",
@@ -150,6 +150,7 @@ __all__ = [
     "io",
     "leaf_surface",
     "load_coefficients",
+    "make_setup",
     "open",
     "photon_paths",
     "plan",
@@ -159,16 +160,16 @@ __all__ = [
     "prospect_spectra",
     "read_spectrum_csv",
     "record",
-    "reduce",
     "rerun",
     "shrub",
     "simulate",
     "simulate_many",
-    "spectra",
     "spectrum",
-    "spreading",
-    "total_of",
+    "spectrum_names",
+    "spreading_tree",
+    "total_reflectance",
     "trace_scene",
+    "trim_empty_layers",
     "truth_of",
     "turtle",
     "voxelise",
@@ -177,9 +178,13 @@ __all__ = [
     "waveform_of",
 ]
 
+shorten_signatures(globals())
 
-# Old public names, with the new one of each; using them warns.
-_RENAMED = {"repeat": "rerun"}
+
+def __dir__() -> list[str]:
+    # Public names alone, without the modules and helpers that the imports leave here.
+    return sorted(__all__)
+
 
 # Tables of TOML files (`jaxlidar.io.read_case`) name classes as they are exported here.
 register_public_objects({name: globals()[name] for name in __all__ if name != "plot"})
@@ -196,6 +201,7 @@ def _waveform_html(wave: Waveform) -> str:
 def __getattr__(name: str) -> Any:
     if name == "plot":
         return importlib.import_module("jaxlidar.plot")
-    if name in _RENAMED:
-        return renamed(f"jaxlidar.{name}", f"jaxlidar.{_RENAMED[name]}", globals()[_RENAMED[name]])
+    if name in RENAMED:
+        warn_renamed(f"jaxlidar.{name}", f"jaxlidar.{RENAMED[name]}")
+        return globals()[RENAMED[name]]
     raise AttributeError(f"module 'jaxlidar' has no attribute {name!r}")

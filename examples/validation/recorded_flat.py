@@ -22,8 +22,8 @@ import inversion
 import jaxlidar as jl
 from inversion.fit.noise import Noise, correlation_between
 from inversion.fit.retrieval import scale_of
-from inversion.receiver.counts import straight_table
-from inversion.receiver.recorder import Terms
+from inversion.receiver.digitiser import amplitude_table
+from inversion.receiver.recorder import RecorderModel
 from jaxlidar.io import read_pulsewaves
 from jaxlidar.io.pedestal import above_pedestal
 
@@ -133,7 +133,7 @@ def best_sum(shot, columns, model, noise, random):
 def main(argv=None):
     given = options(__doc__, argv, "pls", shots=30)
     record = read_pulsewaves(given.pls)
-    raw = straight_table(np.asarray(record.tables[1], float), True)
+    raw = amplitude_table(np.asarray(record.tables[1], float), True)
     strong = [
         Shot(shot, raw)
         for shot in record
@@ -159,7 +159,7 @@ def main(argv=None):
         model = recorders[i].recorded(fits.fitted[i, 0], own)
         signal, sigma = shot.window()
         used = np.isfinite(sigma)
-        terms = Terms(recorders[i], [scale_of(SCALE, [])], lidars[i], TIME.size)
+        terms = RecorderModel(recorders[i], [scale_of(SCALE, [])], lidars[i], TIME.size)
         flat = np.concatenate([np.ravel(own[name]) for name in ("receiver width", "offset", "scale")])
         common = terms.pulse_noise(fits.fitted[i], flat)
         noise = Noise(sigma[used], common[0][used], correlation_between(CORRELATED, used[None]))

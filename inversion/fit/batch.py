@@ -28,7 +28,7 @@ from inversion.fit.quality import Verdict, judge_fits
 from inversion.fit.retrieval import SOLVER, check_progress, check_solution, check_solver, scale_of
 from inversion.fit.solver import bounds_of, labels_of, named, smooth_names
 from inversion.fit.unknowns import Settled, Unknown, settle, start_from
-from inversion.receiver.recorder import Recorder, check_names, settled_terms
+from inversion.receiver.recorder import Recorder, check_names, recorder_unknowns
 from jaxlidar import Lidar, Plan, Scene
 from jaxlidar.extend import briefly, check_integer, check_key, check_kind, fingerprint
 from jaxlidar.io import save
@@ -245,7 +245,7 @@ def retrieve_many(
         [None] if recorder is None else _one_each("recorder", recorder, Recorder, len(y))
     )
     check_names(recorders[0], settled[0])
-    terms = [] if recorders[0] is None else settled_terms(recorders[0])
+    terms = [] if recorders[0] is None else recorder_unknowns(recorders[0])
     names = [*settled[0], *terms, *extra]
     parts = {
         "observed": y,

@@ -11,7 +11,7 @@ def columns_at_once(plan: Plan, columns: int, beside: float = 0.0) -> int:
 
     **Raises:** ValueError where one column alone takes more memory than the plan may.
     """
-    most, limit = columns, memory_limit(plan.limits.max_memory) - beside
+    most, limit = columns, memory_limit(plan.scope.max_memory) - beside
     while most > 1 and plan.jacobian_memory(most) > limit:
         most -= 1
     if columns and (size := plan.jacobian_memory(most)) > limit:

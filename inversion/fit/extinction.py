@@ -1,6 +1,6 @@
 """Unknowns that change extinction alone: their columns are scored, and not pushed through the trace.
 
-This is exact (`jaxlidar.trace.scores`), and takes less than half of the time for a column, where
+This is exact (`jaxlidar.trace.score_functions`), and takes less than half of the time for a column, where
 
 - histories keep optics apart, and no leaf transmits straight on, so that one trace serves all wavelengths;
 - wavelengths and columns are few, so that all can be added up for every collision; off nadir, two or more.
@@ -19,13 +19,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from inversion.fit.unknowns import Place, Settled, put
-from jaxlidar import Lidar, Plan, Response, Scene, Setup, reduce
+from jaxlidar import Lidar, Plan, Response, Scene, Setup, make_setup
 from jaxlidar.planning.memory import memory_limit, scored_bytes
-from jaxlidar.trace.colouring import columns_in_samples, optics_of, recording_of
-from jaxlidar.trace.response import trace_scored
-from jaxlidar.trace.scored_light import scores_of
-from jaxlidar.trace.scores import Scores
-from jaxlidar.trace.setting import setting_of
+from jaxlidar.spectral.apply_optics import derivatives_to_samples, make_waveform_model, setup_optics
+from jaxlidar.trace.device_scene import build_device_scene
+from jaxlidar.trace.extinction_slopes import ExtinctionSlopes
+from jaxlidar.trace.response import trace_with_scores
+from jaxlidar.trace.score_functions import make_slopes
 
 # The most columns and wavelengths. All are added up for every collision.
 COLUMNS, WAVELENGTHS = 64, 16
@@ -44,7 +44,7 @@ def sorted_places(
     Those that change extinction are scored where this module says so, and else are geometric.
     """
     places = [s.place for s in settled]
-    if not plan.trace.keeps_histories:
+    if not plan.config.keeps_histories:
         # Optics are applied while light is traced.
         return tuple(place._replace(kind="geometric") for place in places), 0, 0.0
     own = [i for i, place in enumerate(places) if place.kind == "extinction"]
@@ -52,14 +52,13 @@ def sorted_places(
     if columns == 0:
         return tuple(places), 0, 0.0
     # A plan may leave the canopy out.
-    canopy, wavelengths = reduce(lidar, scene, plan).scene.canopy, lidar.wavelength.size
+    canopy, wavelengths = make_setup(lidar, scene, plan).scene.canopy, lidar.wavelength.size
     # Off nadir a second march, of the way back, takes as long as the tangents of one column.
-    pays = (1 if plan.trace.vertical else 2) <= columns <= COLUMNS and wavelengths <= WAVELENGTHS
+    pays = (1 if plan.config.vertical else 2) <= columns <= COLUMNS and wavelengths <= WAVELENGTHS
     if canopy is not None and not canopy.is_straight and pays:
         cells = int(np.prod(canopy.voxels.shape))
-        sizes = (plan.n_photons, plan.n_rays), cells, columns, wavelengths
-        room = scored_bytes(plan.trace, plan.bins, *sizes)
-        if room <= 0.5 * memory_limit(plan.limits.max_memory):
+        room = scored_bytes(plan.config, plan.bins, cells=cells, columns=columns, wavelengths=wavelengths)
+        if room <= 0.5 * memory_limit(plan.scope.max_memory):
             return tuple(places), _most(scene, settled, own), room
     as_geometric = {i: places[i]._replace(kind="geometric") for i in own}
     return tuple(as_geometric.get(i, place) for i, place in enumerate(places)), 0, 0.0
@@ -108,26 +107,30 @@ def _moved(
     return jnp.any(jnp.stack(tables) != 0, axis=0)
 
 
-def scores_at(setup_at: Callable[[Array], Setup], flat: Float[Array, "columns"], most: int) -> Scores | None:
+def scores_at(
+    setup_at: Callable[[Array], Setup], flat: Float[Array, "columns"], most: int
+) -> ExtinctionSlopes | None:
     """Scores of the unknowns in `flat`, of which `setup_at` makes the setup; None where there are none."""
     if not flat.size:
         return None
 
     def tables(flat: Array) -> tuple[Array | None, Array | None]:
-        medium = setting_of(setup_at(flat), derivatives="forward").medium
+        medium = build_device_scene(setup_at(flat), derivatives="forward").medium
         assert medium is not None
         return medium.leaf, medium.bark
 
     push = jax.vmap(lambda t: jax.jvp(tables, (flat,), (t,))[1])
     leaf, bark = push(jnp.eye(flat.size, dtype=flat.dtype))
     setup = setup_at(flat)
-    return scores_of(setting_of(setup, derivatives="forward"), leaf, bark, optics_of(setup), most)
+    return make_slopes(
+        build_device_scene(setup, derivatives="forward"), leaf, bark, setup_optics(setup), most
+    )
 
 
 def traced_with(
-    setup: Setup, scores: Scores, key: PRNGKeyArray
+    setup: Setup, slopes: ExtinctionSlopes, key: PRNGKeyArray
 ) -> tuple[Response, Float[Array, "columns wavelengths samples"]]:
     """The response of one batch, and the derivatives of its total by what is scored."""
-    setting = dataclasses.replace(setting_of(setup, derivatives="forward"), scores=scores)
-    response, fine = trace_scored(setting, optics_of(setup), key)
-    return response, columns_in_samples(fine, recording_of(setup))
+    device_scene = dataclasses.replace(build_device_scene(setup, derivatives="forward"), slopes=slopes)
+    response, fine = trace_with_scores(device_scene, setup_optics(setup), key)
+    return response, derivatives_to_samples(fine, make_waveform_model(setup))

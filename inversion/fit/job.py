@@ -18,7 +18,7 @@ from inversion.fit.retrieval import fits_from
 from inversion.fit.solver import Fitting, Request
 from inversion.fit.starts import best_of
 from inversion.fit.unknowns import Settled
-from inversion.receiver.recorder import Recorder, Terms
+from inversion.receiver.recorder import Recorder, RecorderModel
 from jaxlidar import Lidar, Plan, Scene
 from jaxlidar.extend import outcomes, task
 
@@ -71,7 +71,7 @@ def fits(job: Job, key: PRNGKeyArray, todo: Sequence[int]) -> Iterator[tuple[int
     def fitting(i: int) -> Fitting:
         own, data = job.settled[i % len(job.settled)], job.data[i]
         lidar, recorder = job.lidars[i % len(job.lidars)], job.recorders[i % len(job.recorders)]
-        terms = Terms(recorder, job.scale, lidar, data.time.size)
+        terms = RecorderModel(recorder, job.scale, lidar, data.time.size)
         own_key, more = jax.random.fold_in(key, job.numbers[i]), (job.solver, job.max_steps, None)
         return best_of(fits_from(job.starts, own_key, data, own, terms, *more))
 

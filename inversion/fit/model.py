@@ -23,10 +23,21 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from inversion.fit.columns import columns_at_once
 from inversion.fit.extinction import scores_at, sorted_places, traced_with
 from inversion.fit.unknowns import Kind, Place, Settled, put
-from jaxlidar import Lidar, Plan, Response, Scene, Setup, Waveform, reduce, total_of, trace_scene, waveform_of
+from jaxlidar import (
+    Lidar,
+    Plan,
+    Response,
+    Scene,
+    Setup,
+    Waveform,
+    make_setup,
+    total_reflectance,
+    trace_scene,
+    waveform_of,
+)
 from jaxlidar.extend import ONE_CORE, concrete, side_by_side
 from jaxlidar.planning.plan import MIN_BATCHES
-from jaxlidar.trace.scores import Scores
+from jaxlidar.trace.extinction_slopes import ExtinctionSlopes
 
 Values = tuple[Array, ...]
 # So many batches are few: a quarter of the work of all, and their difference still tells the noise.
@@ -51,7 +62,7 @@ class Problem(eqx.Module):
 
     def at(self, values: Values) -> Setup:
         """The setup with these values."""
-        return reduce(self.lidar, put(self.scene, self.places, values), self.plan)
+        return make_setup(self.lidar, put(self.scene, self.places, values), self.plan)
 
     def moving(self, values: Values, kind: Kind) -> tuple[Array, Callable[[Array], Setup]]:
         """The values of the unknowns of a kind as one vector, and the setup as its function.
@@ -68,14 +79,14 @@ class Problem(eqx.Module):
         return flat, setup
 
 
-def _scores(problem: Problem, values: Values) -> Scores | None:
+def _scores(problem: Problem, values: Values) -> ExtinctionSlopes | None:
     """Scores of the unknowns that change extinction alone, which all batches share."""
     flat, setup_at = problem.moving(values, "extinction")
     return scores_at(setup_at, flat, problem.most)
 
 
 def _batch(
-    problem: Problem, values: Values, key: PRNGKeyArray, scores: Scores | None
+    problem: Problem, values: Values, key: PRNGKeyArray, scores: ExtinctionSlopes | None
 ) -> tuple[Response, Float[Array, "wavelengths bins"], Float[Array, "columns wavelengths bins"]]:
     """Response and total of one batch, and its derivatives in geometric unknowns, then in extinction."""
     flat, setup_at = problem.moving(values, "geometric")
@@ -86,7 +97,7 @@ def _batch(
             response, scored = trace_scene(setup, key, reverse=False), None
         else:
             response, scored = traced_with(setup, scores, key)
-        return total_of(response, setup), (response, scored)
+        return total_reflectance(response, setup), (response, scored)
 
     value, columns, (response, scored) = _pushed(total, flat, problem.at_once)
     return response, value, columns if scored is None else jnp.concatenate([columns, scored])
@@ -126,7 +137,7 @@ def _colour(
     flat, setup_at = problem.moving(values, "optical")
 
     def total(flat: Array) -> Array:
-        return total_of(response, setup_at(flat))
+        return total_reflectance(response, setup_at(flat))
 
     if not flat.size:
         value = total(flat)

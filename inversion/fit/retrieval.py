@@ -16,7 +16,7 @@ from inversion.fit.result import Retrieval, Step
 from inversion.fit.solver import Fit, Outcome, bounds_of, drive, labels_of, named, smooth_names
 from inversion.fit.starts import best_of
 from inversion.fit.unknowns import Place, Settled, Unknown, latin_hypercube, settle
-from inversion.receiver.recorder import Recorder, Terms, check_names
+from inversion.receiver.recorder import Recorder, RecorderModel, check_names
 from jaxlidar import Lidar, Plan, Scene, Waveform
 from jaxlidar.extend import check_integer, check_key, check_kind, check_kinds, check_range
 
@@ -156,12 +156,12 @@ def retrieve_with(
 ) -> Retrieval:
     """`retrieve` with what it has made of its arguments."""
     model = Model(lidar, scene, plan, settled, key)
-    terms = Terms(recorder, extra, lidar, data.time.size)
+    terms = RecorderModel(recorder, extra, lidar, data.time.size)
     fits = fits_from(starts, key, data, settled, terms, solver, max_steps, progress)
     outcome = drive(best_of(fits), lambda q: model(q.values, spread=q.spread, few=q.few))
     if throw and not outcome.converged:
         raise RuntimeError(outcome.status)
-    return retrieval_of(outcome, model, [*settled, *terms.settled], terms.count)
+    return retrieval_of(outcome, model, [*settled, *terms.unknowns], terms.count)
 
 
 def check_solution(solver: Any, max_steps: float, starts: float) -> tuple[Any, int, int]:
@@ -188,11 +188,11 @@ def check_progress(progress: object) -> None:
 
 
 def fits_from(
-    starts: int, key: PRNGKeyArray, data: Data, settled: list[Settled], terms: Terms, *more: Any
+    starts: int, key: PRNGKeyArray, data: Data, settled: list[Settled], terms: RecorderModel, *more: Any
 ) -> list[Fit]:
     """One fit from the unknowns' own start, and further ones from a Latin hypercube over their bounds."""
     places = (
-        latin_hypercube([*settled, *terms.settled], starts - 1, jax.random.fold_in(key, 1))
+        latin_hypercube([*settled, *terms.unknowns], starts - 1, jax.random.fold_in(key, 1))
         if starts > 1
         else []
     )

@@ -31,7 +31,7 @@ from inversion.fit.priors import Priors, inside, outside
 from inversion.fit.result import Step
 from inversion.fit.uncertainty import Errors, correlation_of, decrement, errors_of
 from inversion.fit.unknowns import Settled
-from inversion.receiver.recorder import Terms
+from inversion.receiver.recorder import RecorderModel
 
 # A fit has converged when a Gauss-Newton step would move it by less than this many standard errors.
 _SMALL_STEP = 0.05
@@ -144,13 +144,13 @@ class Fit:
         self,
         data: Data,
         settled: list[Settled],
-        terms: Terms,
+        terms: RecorderModel,
         solver: Any,
         max_steps: int,
         progress: Callable[[Step], None] | None,
         start: np.ndarray | None = None,
     ):
-        self.data, self.settled, self.terms = data, [*settled, *terms.settled], terms
+        self.data, self.settled, self.terms = data, [*settled, *terms.unknowns], terms
         self.solver, self.max_steps, self.progress = solver, max_steps, progress
         flat = lambda pick: np.concatenate([np.ravel(pick(s)) for s in self.settled])  # noqa: E731
         self.low, self.high = flat(lambda s: s.low), flat(lambda s: s.high)
@@ -193,7 +193,7 @@ class Fit:
         z = outside(self.start, self.low, self.high)
         p = yield from self.at(z, spread=True)
         if self.terms.count and p.finite:
-            best = self.terms.best(p.own, p.evaluation.total, self.data.observed, self.data.sigma)
+            best = self.terms.fit_linear(p.own, p.evaluation.total, self.data.observed, self.data.sigma)
             start = np.append(self.start[: self.start.size - self.terms.count], best)
             p = Point(self, outside(start, self.low, self.high), p.evaluation)
         return p

@@ -42,7 +42,7 @@ from jaxlidar._checks import (
     scalar,
 )
 from jaxlidar._constants import PLANCK_TIMES_LIGHT, SPEED_OF_LIGHT
-from jaxlidar._ranges import SHARE, Range, check_ranges
+from jaxlidar._ranges import FRACTION, Range, check_ranges
 from jaxlidar._registry import save_result
 
 # Beyond so many events, memory would end before the draws do; beyond so many arrivals, counts of them would
@@ -104,7 +104,7 @@ class PhotonCounter(eqx.Module):
 
     ranges: ClassVar = {
         "dead_time": Range(0.0),
-        "detection_probability": SHARE,
+        "detection_probability": FRACTION,
         "background_rate": Range(0.0),
         "jitter": Range(0.0),
         "window": Range(),

@@ -127,9 +127,9 @@ class Case:
 def _arguments() -> Mapping[str, Argument]:
     """The arguments of `simulate` that are kept."""
     return {
-        name: Argument(parameter.annotation, False, UNITS.get(name, ""), name)
-        for name, parameter in inspect.signature(simulate).parameters.items()
-        if name not in _NOT_KEPT
+        name: Argument(annotation, False, UNITS.get(name, ""), name)
+        for name, annotation in inspect.get_annotations(simulate).items()
+        if name not in (*_NOT_KEPT, "return")
     }
 
 

@@ -38,7 +38,7 @@ from jaxlidar.io.case import Case, case_of, case_text
 from jaxlidar.io.checks import refuse_damage
 from jaxlidar.io.kinds import is_tuple
 from jaxlidar.io.rows import CHECKSUMS, RowVariables, check_rows, unwritten_rows
-from jaxlidar.io.stores import Store
+from jaxlidar.io.stores import FORMAT, Store
 from jaxlidar.io.tables import nearest
 from jaxlidar.scenes.scene import Scene
 
@@ -46,8 +46,8 @@ from jaxlidar.scenes.scene import Scene
 ENTRY_POINTS = "jaxlidar.files"
 # Classes of fields that are written as the TOML text of a case, and the field of the case.
 _CASE_FIELDS: dict[Any, str] = {Scene: "scene", Lidar: "lidar"}
-# Attributes of a group: the name of the class, and checksums of texts.
-KIND, _TEXT_DIGEST, _NAME_DIGEST = "jaxlidar_kind", "text_sha256", "names_sha256"
+# Attributes of a group: the name of the class, and the checksum of its texts.
+KIND, _TEXT_DIGEST = "jaxlidar_kind", "text_sha256"
 
 
 class ResultLayout(NamedTuple):
@@ -59,6 +59,7 @@ class ResultLayout(NamedTuple):
     dimensions: Mapping[str, str]
     items: Mapping[str, str]
     coordinates: Mapping[str, str]
+    former_names: Mapping[str, str]
     rows: str | None
 
     @property
@@ -89,6 +90,7 @@ def keep_as_netcdf(
     dimensions: Mapping[str, str] | None = None,
     items: Mapping[str, str] | None = None,
     coordinates: Mapping[str, str] | None = None,
+    former_names: Mapping[str, str] | None = None,
     rows: str | None = None,
 ) -> None:
     """Let `save` and `open` know a class of results, an `equinox.Module` whose fields are annotated.
@@ -106,6 +108,8 @@ def keep_as_netcdf(
     - `items`: names of the dimensions of the keys of dicts, by field. Default None: "FIELD_item".
     - `coordinates`: further fields that are coordinates, each with the dimension that it lies along. Default
       None: none.
+    - `former_names`: names of fields in files that were written before the fields were renamed, by their
+      names now. Default None: none was renamed.
     - `rows`: a dimension of the annotations that is the first of some fields. Their values are written and
       checked some rows at a time, and not read into memory. Default None: none.
 
@@ -125,7 +129,14 @@ def keep_as_netcdf(
     array([12.5, 20. ])
     """
     LAYOUTS[kind.__name__] = ResultLayout(
-        kind, title, quantities, dimensions or {}, items or {}, coordinates or {}, rows
+        kind,
+        title,
+        quantities,
+        dimensions or {},
+        items or {},
+        coordinates or {},
+        former_names or {},
+        rows,
     )
 
 
@@ -140,8 +151,8 @@ def layout_of(name: str, path: Path) -> ResultLayout:
                 point.load()
     if name not in LAYOUTS:
         raise ValueError(
-            f"{path}: it holds a {name}, which is not known here ({nearest(name, LAYOUTS)}): import the package "
-            "that has it first"
+            f"{path}: it holds a {name}, which is not known here ({nearest(name, LAYOUTS)}): import the "
+            "package that has it first"
         )
     return LAYOUTS[name]
 
@@ -209,7 +220,7 @@ def datasets_of(result: Any, group: str = "/", *, row_values: bool = True) -> di
         else:
             raise TypeError(f"{name} is of the class {type(value).__name__}, which no file can hold")
     dataset = xarray.Dataset(builder.variables, attrs=builder.attributes).set_coords(list(layout.coordinates))
-    dataset.attrs |= _text_digests(dataset, layout)
+    dataset.attrs[_TEXT_DIGEST] = _text_digest(dataset, layout)
     return {group: dataset, **{path: inner for path, inner in inner_datasets.items() if inner is not None}}
 
 
@@ -298,29 +309,11 @@ def _json_value(value: Any) -> Any:
     raise TypeError(f"a {type(value).__name__} is nothing that a file can hold")
 
 
-def _text_digests(dataset: Any, layout: ResultLayout) -> dict[str, str]:
-    """Checksums of the texts of a Dataset, by attribute: netCDF has checksums for numbers alone.
+def _text_digest(dataset: Any, layout: ResultLayout, *, with_names: bool = True) -> str:
+    """Checksum of the texts of a Dataset: netCDF has checksums for numbers alone.
 
-    One is of the static fields and the keys in attributes, the other of the coordinates of texts.
+    The texts are the static fields, the keys in attributes, and, if `with_names`, the coordinates of texts.
     """
-    items, names = _items_and_names(dataset)
-    static = _static_attributes(dataset, layout)
-    return {_TEXT_DIGEST: _digest([items, [], static]), _NAME_DIGEST: _digest(names)}
-
-
-def _are_texts_intact(dataset: Any, layout: ResultLayout) -> bool:
-    """Return True if the texts of a Dataset have the checksums that it was written with."""
-    items, names = _items_and_names(dataset)
-    digests, written = _text_digests(dataset, layout), dataset.attrs
-    # Version 0.2.0 wrote one checksum; that of Zarr stores has the coordinates of texts, that of netCDF not.
-    with_names = _digest([items, names, _static_attributes(dataset, layout)])
-    return written.get(_TEXT_DIGEST) in (digests[_TEXT_DIGEST], with_names) and (
-        _NAME_DIGEST not in written or written[_NAME_DIGEST] == digests[_NAME_DIGEST]
-    )
-
-
-def _items_and_names(dataset: Any) -> tuple[list[tuple[str, str]], list[tuple[str, list[str]]]]:
-    """Return the keys that are attributes of variables, and the coordinates of texts, each by variable."""
     variables = sorted(dataset.variables.items())
     items = [(name, variable.attrs["item"]) for name, variable in variables if "item" in variable.attrs]
     names = [
@@ -328,15 +321,9 @@ def _items_and_names(dataset: Any) -> tuple[list[tuple[str, str]], list[tuple[st
         for name, variable in variables
         if variable.dtype.kind in "OUT" and variable.ndim == 1
     ]
-    return items, names
-
-
-def _static_attributes(dataset: Any, layout: ResultLayout) -> list[tuple[str, str]]:
-    names = [field.name for field in dataclasses.fields(layout.kind) if field.metadata.get("static")]
-    return [(name, str(dataset.attrs[name])) for name in names if name in dataset.attrs]
-
-
-def _digest(texts: Any) -> str:
+    static = [field.name for field in dataclasses.fields(layout.kind) if field.metadata.get("static")]
+    attributes = [(name, str(dataset.attrs[name])) for name in static if name in dataset.attrs]
+    texts = [items, names if with_names else [], attributes]
     return hashlib.sha256(json.dumps(texts).encode()).hexdigest()
 
 
@@ -375,7 +362,11 @@ class _GroupReader:
         layout = layout_of(self._attribute(KIND), self.path)
         place = f"{self.path}: {self.group}"
         with refuse_damage(f"{place}: damaged"):
-            is_intact = _are_texts_intact(self.dataset, layout)
+            digests = {_text_digest(self.dataset, layout)}
+            if self.stored.dataset("/").attrs.get(FORMAT) == 1:
+                # The checksum in netCDF files of the first format does not include names.
+                digests.add(_text_digest(self.dataset, layout, with_names=False))
+            is_intact = self.dataset.attrs.get(_TEXT_DIGEST) in digests
         if not is_intact:
             raise ValueError(f"{place}: damaged (the checksum of its texts is another)")
         fields = {field.name: self._field(layout, field) for field in dataclasses.fields(layout.kind)}
@@ -390,6 +381,9 @@ class _GroupReader:
     def _field(self, layout: ResultLayout, field: Any) -> Any:
         name, annotation = field.name, field.type
         has_rows = name in layout.row_variables.names
+        keys_name, former_name = layout.items_of(name), layout.former_names.get(name, name)
+        if name not in self.dataset.variables and former_name in self.dataset.variables:
+            name = former_name
         if field.metadata.get("static"):
             return self._static(name, annotation)
         if _array_dimensions(annotation) is not None:
@@ -397,7 +391,7 @@ class _GroupReader:
         if (item_annotation := _item_annotation(annotation)) is not None:
             if "..." in (_array_dimensions(item_annotation) or []):
                 return self._arrays_of_any_shape(name, item_annotation)
-            keys = self._texts(layout.items_of(name))
+            keys = self._texts(keys_name)
             arrays = self._array(name, item_annotation, has_rows)
             if len(arrays) != len(keys):
                 raise ValueError(f"{self._place(name)}: {len(arrays)} rows for {len(keys)} names")

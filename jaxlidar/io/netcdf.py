@@ -28,13 +28,22 @@ from jaxlidar.io.datasets import (
     result_of,
 )
 from jaxlidar.io.rows import BLOCK, CHECKSUMS, RowWriter
-from jaxlidar.io.stores import NetcdfFile, Store, ZarrStore, check_replaceable, is_result_file, is_zarr
+from jaxlidar.io.stores import (
+    FORMAT,
+    NetcdfFile,
+    Store,
+    ZarrStore,
+    check_replaceable,
+    is_result_file,
+    is_zarr,
+)
+from jaxlidar.spectral.waveform import Waveform
 from jaxlidar.truth import Truth
-from jaxlidar.waveform import Waveform
 
 CONVENTIONS = "CF-1.11"
-# Number of the layout of files; version 0.2.0 wrote the first. A reader refuses newer ones.
-FORMAT = 1
+# Number of the format of files. A reader refuses newer ones. Version 0.2.0 wrote format 1: a waveform's
+# `energy_budget` is its `ledger`, and the checksum of texts in netCDF files does not include names.
+FORMAT_NUMBER = 2
 # Reasons why a simulation stopped that depend on more than its arguments.
 _NOT_REPEATABLE = ("time spent", "interrupted")
 
@@ -143,7 +152,7 @@ def _file_attributes() -> dict[str, Any]:
         "Conventions": CONVENTIONS,
         "source": f"jaxlidar {version_of('jaxlidar')}",
         "history": f"{now}: written by jaxlidar.io.save",
-        "jaxlidar_format": FORMAT,
+        FORMAT: FORMAT_NUMBER,
         "versions": json.dumps({p: version_of(p) for p in ("jaxlidar", "jax", "jaxlib", "numpy")}),
         "platform": jax.default_backend(),
         "precision": _precision(),
@@ -202,10 +211,10 @@ def _open_file(path: str | os.PathLike[str]) -> Iterator[Store]:
         attributes = _root_attributes(file)
         if KIND not in attributes:
             raise ValueError(f"{path}: no attribute {KIND}: jaxlidar.io.save did not write it")
-        written = attributes.get("jaxlidar_format")
-        if not isinstance(written, int | np.integer) or not 1 <= written <= FORMAT:
+        written = attributes.get(FORMAT)
+        if not isinstance(written, int | np.integer) or not 1 <= written <= FORMAT_NUMBER:
             raise ValueError(
-                f"{path}: jaxlidar_format = {written} is outside [1, {FORMAT}]: a newer jaxlidar's?"
+                f"{path}: {FORMAT} = {written} is outside [1, {FORMAT_NUMBER}]: a newer jaxlidar's?"
             )
         yield file
 
@@ -326,15 +335,16 @@ keep_as_netcdf(
         "stderr": ("1", "standard error of the apparent reflectance"),
         "components": ("1", "apparent reflectance per sample by material and by order of scattering"),
         "neglected": ("1", "apparent reflectance that orders beyond the last could add"),
-        "ledger": ("1", "share of the emitted energy by fate, before the atmosphere"),
-        "ledger_stderr": ("1", "standard error of the share of the emitted energy"),
+        "energy_budget": ("1", "share of the emitted energy by fate, before the atmosphere"),
+        "energy_budget_stderr": ("1", "standard error of the share of the emitted energy"),
         "lost": ("1", "apparent reflectance that arrives before or after all fine bins of the plan"),
         "recorded": ("J", "energy that the receiver records per sample, without noise"),
         "wavelength": ("nm", "wavelength of the lidar"),
     },
     dimensions={"bins": "time", "wavelengths": "wavelength"},
-    items={"components": "component", "ledger": "fate", "ledger_stderr": "fate"},
+    items={"components": "component", "energy_budget": "fate", "energy_budget_stderr": "fate"},
     coordinates={"height": "time"},
+    former_names={"energy_budget": "ledger", "energy_budget_stderr": "ledger_stderr"},
 )
 
 keep_as_netcdf(

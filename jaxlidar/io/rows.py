@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-CHECKSUMS = "row_crc32"
+# The variable with the checksums of rows, and the attribute with the checksum of a variable without rows.
+CHECKSUMS, CHECKSUM = "row_crc32", "crc32"
 # Rows that are compared at once, and rows of a chunk where a file has chunks.
 BLOCK = 256
 
@@ -82,6 +83,12 @@ class RowWriter:
         if not np.all(self._written):
             raise ValueError(f"{np.sum(~self._written)} of {self.count} rows are missing")
         self._checksums[...] = self._sums
+        self._checksums.attrs[CHECKSUM] = checksum_of(self._sums)
+
+
+def checksum_of(array: np.ndarray) -> int:
+    """Return the CRC-32 of the bytes of an array."""
+    return zlib.crc32(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
 
 
 def check_rows(place: str, checksums: np.ndarray, fields: Mapping[str, Any]) -> None:

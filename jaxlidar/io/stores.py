@@ -6,8 +6,9 @@ Two things are done here because xarray does not do them:
   writes a netCDF variable in one call, from an array in memory or from one of dask.
 - Rows of netCDF files are mapped (`numpy.memmap`), so that a file that is read may be larger than memory.
 
-All numbers have checksums: HDF5's (Fletcher's) or Zarr's (CRC-32C) of each chunk. Rows in netCDF files lie in
-one piece, so that they can be mapped; HDF5 has no checksum for them, `jaxlidar.io.rows` has.
+Numbers have two kinds of checksums. Those of HDF5 (Fletcher's) or Zarr (CRC-32C), for each chunk, let any
+program notice damage of values. The attribute `crc32` of a variable is of all its values, so that chunks are
+noticed, too, that a damaged index of the file no longer names. Each row has one of its own.
 """
 
 import contextlib
@@ -19,8 +20,10 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from jaxlidar.io.checks import refuse_damage
-from jaxlidar.io.rows import BLOCK, RowVariables
+from jaxlidar.io.rows import BLOCK, CHECKSUM, RowVariables, checksum_of
 
+# The attribute of the root with the number of the format.
+FORMAT = "jaxlidar_format"
 _ZARR_SUFFIX = ".zarr"
 # The file that makes a folder a Zarr store of version 3.
 _ZARR_ROOT = "zarr.json"
@@ -100,7 +103,7 @@ class NetcdfFile:
         """
         h5netcdf = cls.import_packages()
         for group, dataset in datasets.items():
-            written = _without_rows(dataset, rows.get(group))
+            written = _dataset_to_write(dataset, rows.get(group))
             encoding = {}
             for name, variable in written.variables.items():
                 # xarray would give floats a fill value, and no number here stands for a missing one.
@@ -153,8 +156,8 @@ class NetcdfFile:
         return self._datasets[group]
 
     def values(self, group: str, name: str) -> np.ndarray:
-        """Read the values of a variable."""
-        return self.dataset(group).variables[name].values
+        """Read the values of a variable. **Raises:** ValueError where their checksum is another."""
+        return _checked_values(self, group, name)
 
     def row_values(self, group: str, name: str) -> np.ndarray:
         """Map the values of a variable where they lie in one piece of the file; otherwise read them."""
@@ -162,7 +165,7 @@ class NetcdfFile:
         dataset = getattr(self.variable(group, name), "_h5ds", None)
         offset = None if dataset is None or not dataset.size else dataset.id.get_offset()
         if dataset is None or offset is None or not dataset.dtype.isnative:
-            return self.values(group, name)
+            return self.dataset(group).variables[name].values
         return np.memmap(self.path, dataset.dtype, "r", offset, dataset.shape)
 
 
@@ -217,7 +220,7 @@ class ZarrStore:
         # Texts of any length, also where there is none: zarr has no stable type for numpy's "U".
         texts = np.dtype("O", metadata={"vlen": str})
         for group, dataset in datasets.items():
-            written = _without_rows(dataset, rows.get(group))
+            written = _dataset_to_write(dataset, rows.get(group))
             names = [name for name, variable in written.variables.items() if variable.dtype.kind == "U"]
             written = written.assign_coords(
                 {name: (written[name].dims, written[name].values.astype(texts)) for name in names}
@@ -277,24 +280,48 @@ class ZarrStore:
         return self._datasets[group]
 
     def values(self, group: str, name: str) -> np.ndarray:
-        """Read the values of a variable. **Raises:** ValueError where a chunk is missing."""
-        array = self._group[f"{group}/{name}".strip("/")]
-        # Zarr reads a chunk that is missing as zeros.
-        if missing := array.nchunks - array.nchunks_initialized:
-            raise ValueError(f"{missing} chunks are missing")
-        return self.dataset(group).variables[name].values
+        """Read the values of a variable.
+
+        **Raises:** ValueError where a chunk is missing, or the checksum is another.
+        """
+        self._check_chunks(group, name)
+        return _checked_values(self, group, name)
 
     def row_values(self, group: str, name: str) -> np.ndarray:
-        """Read the values of a variable: those of chunks cannot be mapped."""
-        return self.values(group, name)
+        """Read the values of a variable with rows: those of chunks cannot be mapped."""
+        self._check_chunks(group, name)
+        return self.dataset(group).variables[name].values
+
+    def _check_chunks(self, group: str, name: str) -> None:
+        """Refuse a variable with missing chunks, which Zarr would read as zeros."""
+        array = self._group[f"{group}/{name}".strip("/")]
+        if missing := array.nchunks - array.nchunks_initialized:
+            raise ValueError(f"{missing} chunks are missing")
 
 
 # Both have the same methods.
 Store: TypeAlias = NetcdfFile | ZarrStore
 
 
-def _without_rows(dataset: Any, rows: RowVariables | None) -> Any:
-    return dataset if rows is None else dataset.drop_vars(rows.names)
+def _dataset_to_write(dataset: Any, rows: RowVariables | None) -> Any:
+    """Return a Dataset without the variables with rows, and with checksums of the others."""
+    written = dataset.copy() if rows is None else dataset.drop_vars(rows.names)
+    for variable in written.variables.values():
+        if variable.dtype.kind != "U":
+            variable.attrs[CHECKSUM] = checksum_of(variable.values)
+    return written
+
+
+def _checked_values(store: Store, group: str, name: str) -> np.ndarray:
+    """Read the values of a variable. **Raises:** ValueError where its checksum is another."""
+    variable = store.dataset(group).variables[name]
+    values = variable.values
+    # The first format has no such checksums, and no file has them for texts.
+    if values.dtype.kind not in "OUT" and store.dataset("/").attrs.get(FORMAT) != 1:
+        checksum = variable.attrs[CHECKSUM]
+        if checksum_of(values) != checksum:
+            raise ValueError("its checksum is another")
+    return values
 
 
 def _row_attributes(dataset: Any, name: str) -> dict[str, Any]:

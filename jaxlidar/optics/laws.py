@@ -1,8 +1,8 @@
 """Laws of reflection: how a surface distributes the light that it reflects over directions.
 
-Everything is normalised by reflectance, which the tracer does not need. The *view factor* of a law is its
-apparent reflectance per unit reflectance: pi times the energy per steradian that it sends towards the
-receiver.
+Everything is normalised by reflectance, which the tracer does not need. The *intensity factor* of a law is pi
+times the radiant intensity towards the view per incident flux and unit reflectance, averaged over the
+receiver's aperture: pi times BRDF times the cosine of the view angle.
 
     Lambertian      cos(theta)
     equal-angle     1 / (pi sqrt(sin^2(theta) + alpha^2 / 4)),  alpha the half-angle of the aperture
@@ -23,11 +23,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxlidar._checks import briefly, scalar
+from jaxlidar._deprecated import RenamedMethods
 from jaxlidar._ranges import Range, check_ranges
 from jaxlidar._vectors import Scalar, Vec, about, cross, dot, from_frame, polar, vec
 
 
-class AbstractLaw(eqx.Module):
+class AbstractLaw(RenamedMethods, eqx.Module):
     """A law of reflection: how a surface distributes the light that it reflects over directions.
 
     A law of your own is one class in one file: derive it from this, give its five methods, and pass it as
@@ -40,10 +41,10 @@ class AbstractLaw(eqx.Module):
 
     A law is consistent if, for an aperture that shrinks to nothing,
 
-        view_factor = pi * albedo * density,
+        intensity_factor = pi * albedo * density,
 
-    and light that `sample` draws has that density. It is reciprocal if view_factor / |cosine of out| stays
-    the same when incident and out are exchanged.
+    and light that `sample` draws has that density. It is reciprocal if the BRDF, proportional to
+    intensity_factor / |cosine of out|, stays the same when incident and out are exchanged.
 
     **Example:** straight back from a horizontal surface.
 
@@ -51,14 +52,17 @@ class AbstractLaw(eqx.Module):
     >>> import jax.numpy as jnp
     >>> from jaxlidar.extend import vec
     >>> down, up = vec(jnp.array([0.0, 0.0, -1.0])), vec(jnp.array([0.0, 0.0, 1.0]))
-    >>> view_factor = jl.Lambertian().view_factor(down, up, up, jnp.array(1e-4))
-    >>> print(f"{view_factor:.1f}, density {jl.Lambertian().density(down, up, up):.4f} per sr")
+    >>> intensity_factor = jl.Lambertian().intensity_factor(down, up, up, jnp.array(1e-4))
+    >>> print(f"{intensity_factor:.1f}, density {jl.Lambertian().density(down, up, up):.4f} per sr")
     1.0, density 0.3183 per sr
     """
 
     @abc.abstractmethod
-    def view_factor(self, incident: Vec, normal: Vec, view: Vec, half_angle: Scalar) -> Scalar:
-        """Apparent reflectance per unit reflectance towards `view`, averaged over the receiver's aperture.
+    def intensity_factor(self, incident: Vec, normal: Vec, view: Vec, half_angle: Scalar) -> Scalar:
+        """Pi times BRDF times the cosine of the view angle, per unit reflectance, averaged over the aperture.
+
+        This is pi times the radiant intensity towards `view` per incident flux. The apparent reflectance of a
+        surface is its reflectance times this.
 
         **Arguments:**
 
@@ -106,8 +110,8 @@ class AbstractLaw(eqx.Module):
         """
 
     @abc.abstractmethod
-    def largest_view_factor(self, half_angle: float) -> float:
-        """An upper bound on the view factor over all directions, for the plan.
+    def largest_intensity_factor(self, half_angle: float) -> float:
+        """An upper bound on the intensity factor over all directions, for the plan.
 
         **Arguments:**
 
@@ -121,8 +125,8 @@ class AbstractMirror(AbstractLaw):
     """A law of reflection with a lobe about the mirror direction that may be very narrow.
 
     The lobe may be narrower than the angle between neighbouring rays of a footprint. The first return is
-    therefore not computed from `view_factor`: it is integrated over beam, lobe and aperture, with a Gaussian
-    lobe of the standard deviation `roughness` (`jaxlidar.trace.mirror`).
+    therefore not computed from `intensity_factor`: it is integrated over beam, lobe and aperture, with a
+    Gaussian lobe of the standard deviation `roughness` (`jaxlidar.trace.mirror_return`).
 
     A mirror of your own is one class in one file: derive it from this, and give the five methods of
     `AbstractLaw` and the field
@@ -130,11 +134,11 @@ class AbstractMirror(AbstractLaw):
     - `roughness`: standard deviation of the reflected direction about the mirror direction along each of two
       perpendicular axes, rad.
 
-    **Example:** the view factor of a perfect mirror has no bound.
+    **Example:** the intensity factor of a perfect mirror has no bound.
 
     >>> import jaxlidar as jl
     >>> mirror = jl.Specular(roughness=0.0)
-    >>> isinstance(mirror, jl.AbstractMirror), mirror.largest_view_factor(1e-4)
+    >>> isinstance(mirror, jl.AbstractMirror), mirror.largest_intensity_factor(1e-4)
     (True, inf)
     """
 
@@ -153,11 +157,11 @@ class Lambertian(AbstractLaw):
     >>> from jaxlidar.extend import polar
     >>> up, view = (polar(jnp.cos(jnp.deg2rad(a)), jnp.array(0.0)) for a in (0.0, 60.0))
     >>> down = tuple(-x for x in up)
-    >>> print(f"{jl.Lambertian().view_factor(down, up, view, jnp.array(1e-4)):.3f}")
+    >>> print(f"{jl.Lambertian().intensity_factor(down, up, view, jnp.array(1e-4)):.3f}")
     0.500
     """
 
-    def view_factor(self, incident: Vec, normal: Vec, view: Vec, half_angle: Scalar) -> Scalar:
+    def intensity_factor(self, incident: Vec, normal: Vec, view: Vec, half_angle: Scalar) -> Scalar:
         return jnp.maximum(dot(normal, view), 0.0)
 
     def albedo(self, incident: Vec, normal: Vec) -> Scalar:
@@ -169,7 +173,7 @@ class Lambertian(AbstractLaw):
     def density(self, incident: Vec, normal: Vec, out: Vec) -> Scalar:
         return jnp.maximum(dot(normal, out), 0.0) / np.pi
 
-    def largest_view_factor(self, half_angle: float) -> float:
+    def largest_intensity_factor(self, half_angle: float) -> float:
         return 1.0
 
 
@@ -178,8 +182,8 @@ class Lambertian(AbstractLaw):
 class EqualAngle(AbstractLaw):
     """Reflection with a polar angle uniform in [0, 90] degrees: the paper's "every angle equally likely".
 
-    The angle is measured from the surface normal. The density 1/(pi^2 sin theta) is singular there; the view
-    factor is its average over the receiver's aperture.
+    The angle is measured from the surface normal. The density 1/(pi^2 sin theta) is singular there; the
+    intensity factor is its average over the receiver's aperture.
 
     **Example:** the apparent reflectance of ground, per unit reflectance, seen at 60 degrees from its normal.
 
@@ -188,11 +192,11 @@ class EqualAngle(AbstractLaw):
     >>> from jaxlidar.extend import polar
     >>> up, view = (polar(jnp.cos(jnp.deg2rad(a)), jnp.array(0.0)) for a in (0.0, 60.0))
     >>> down = tuple(-x for x in up)
-    >>> print(f"{jl.EqualAngle().view_factor(down, up, view, jnp.array(1e-4)):.3f}")
+    >>> print(f"{jl.EqualAngle().intensity_factor(down, up, view, jnp.array(1e-4)):.3f}")
     0.368
     """
 
-    def view_factor(self, incident: Vec, normal: Vec, view: Vec, half_angle: Scalar) -> Scalar:
+    def intensity_factor(self, incident: Vec, normal: Vec, view: Vec, half_angle: Scalar) -> Scalar:
         sine = jnp.sqrt(_square_of_sine(normal, view) + half_angle**2 / 4)
         return jnp.where(dot(normal, view) > 0, 1.0 / (np.pi * sine), 0.0)
 
@@ -207,7 +211,7 @@ class EqualAngle(AbstractLaw):
         sine = jnp.sqrt(jnp.maximum(_square_of_sine(normal, out), 1e-6))
         return jnp.where(dot(normal, out) > 0, 1.0 / (np.pi**2 * sine), 0.0)
 
-    def largest_view_factor(self, half_angle: float) -> float:
+    def largest_intensity_factor(self, half_angle: float) -> float:
         return 2.0 / (np.pi * half_angle)
 
 
@@ -222,7 +226,7 @@ def _square_of_sine(normal: Vec, out: Vec) -> Scalar:
 class Specular(AbstractMirror):
     """Specular reflection: a mirror of slightly tilted facets, with a Gaussian lobe about its direction.
 
-    The first return is exact for any roughness (see `jaxlidar.trace.mirror`). Paths of two or more
+    The first return is exact for any roughness (see `jaxlidar.trace.mirror_return`). Paths of two or more
     scatterings that end at the mirror reach the receiver only within its lobe. They are unbiased, but so rare
     below a roughness of about 0.01 rad that few photons show one. The derivative of such paths with respect
     to the mirror's slope leaves out the rotation of the lobe.
@@ -240,7 +244,7 @@ class Specular(AbstractMirror):
     >>> import jax.numpy as jnp
     >>> from jaxlidar.extend import vec
     >>> down, up = vec(jnp.array([0.0, 0.0, -1.0])), vec(jnp.array([0.0, 0.0, 1.0]))
-    >>> print(f"{jl.Specular(roughness=0.1).view_factor(down, up, up, jnp.array(1e-4)):.1f}")
+    >>> print(f"{jl.Specular(roughness=0.1).intensity_factor(down, up, up, jnp.array(1e-4)):.1f}")
     50.0
     """
 
@@ -251,7 +255,7 @@ class Specular(AbstractMirror):
     def __check_init__(self):
         check_ranges(self)
 
-    def view_factor(self, incident: Vec, normal: Vec, view: Vec, half_angle: Scalar) -> Scalar:
+    def intensity_factor(self, incident: Vec, normal: Vec, view: Vec, half_angle: Scalar) -> Scalar:
         mirror = _mirror(incident, normal)
         # The receiver's own disc blurs the lobe; alpha^2 / 4 is the variance of a disc along an axis.
         variance = self.roughness**2 + half_angle**2 / 4
@@ -272,7 +276,7 @@ class Specular(AbstractMirror):
         # Taken as constant: the lobe's own derivative grows without bound as it becomes narrow.
         return jnp.ones_like(out[0])
 
-    def largest_view_factor(self, half_angle: float) -> float:
+    def largest_intensity_factor(self, half_angle: float) -> float:
         return np.inf
 
 

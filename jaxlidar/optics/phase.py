@@ -1,7 +1,7 @@
 """Phase functions: how a volume scatters, in place of the facets of leaves or bark.
 
-The *view factor* of a phase function is pi times its density per steradian: apparent reflectance per unit
-single scattering albedo. With beta the scattering angle,
+The *intensity factor* of a phase function is pi times its density per steradian, as for laws of reflection:
+pi times the radiant intensity towards the view per unit of scattered flux. With beta the scattering angle,
 
     isotropic            1 / 4
     Henyey-Greenstein    (1 - g^2) / (4 (1 + g^2 - 2 g cos beta)^(3/2))
@@ -19,19 +19,20 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxlidar._checks import array, briefly, scalar
-from jaxlidar._ranges import SHARE, Range, check_ranges
+from jaxlidar._deprecated import RenamedMethods
+from jaxlidar._ranges import FRACTION, Range, check_ranges
 from jaxlidar._vectors import Scalar, Vec, dot, from_frame, polar
 
 # Of isotropic scattering.
-ISOTROPIC_VIEW_FACTOR = 0.25
+ISOTROPIC_INTENSITY_FACTOR = 0.25
 
 
-class AbstractPhase(eqx.Module):
+class AbstractPhase(RenamedMethods, eqx.Module):
     """A phase function with its single scattering albedo: how a volume scatters light.
 
     A phase function of your own is one class in one file: derive it from this, give its three methods
-    (`view_factor`, `sample`, `largest_view_factor`) and the field below, and pass it as `leaf=` or `bark=` of
-    a `Canopy`.
+    (`intensity_factor`, `sample`, `largest_intensity_factor`) and the field below, and pass it as `leaf=` or
+    `bark=` of a `Canopy`.
 
     - `albedo`: single scattering albedo, one number or one per wavelength, in [0, 1].
 
@@ -40,7 +41,7 @@ class AbstractPhase(eqx.Module):
 
     Directions are unit vectors of travel, given as (x, y, z) tuples of arrays of one shape. Methods are pure,
     written with `jax.numpy` (see `jaxlidar.extend`), and differentiable in directions and fields. A phase
-    function is normalised: the integral of view_factor / pi over all directions is one.
+    function is normalised: the integral of intensity_factor / pi over all directions is one.
 
     **Example:** probability per steradian of isotropic scattering, 1 / (4 pi).
 
@@ -55,7 +56,7 @@ class AbstractPhase(eqx.Module):
     albedo: eqx.AbstractVar[Float[Array, "..."]]
 
     @abc.abstractmethod
-    def view_factor(self, incident: Vec, view: Vec) -> Scalar:
+    def intensity_factor(self, incident: Vec, view: Vec) -> Scalar:
         """Pi times the probability per steradian of scattering from `incident` into `view`.
 
         **Arguments:**
@@ -78,8 +79,8 @@ class AbstractPhase(eqx.Module):
         """
 
     @abc.abstractmethod
-    def largest_view_factor(self) -> float:
-        """An upper bound on the view factor over all directions, for the plan.
+    def largest_intensity_factor(self) -> float:
+        """An upper bound on the intensity factor over all directions, for the plan.
 
         **Returns:** a number; infinite where there is no bound.
         """
@@ -93,7 +94,7 @@ class AbstractPhase(eqx.Module):
 
         **Returns:** an array shaped as the components of `incident`.
         """
-        return self.view_factor(incident, out) / np.pi
+        return self.intensity_factor(incident, out) / np.pi
 
 
 def _check(phase: AbstractPhase) -> None:
@@ -127,19 +128,19 @@ class Isotropic(AbstractPhase):
 
     albedo: Float[Array, "..."] = eqx.field(converter=array("albedo"))
 
-    ranges: ClassVar = {"albedo": SHARE}
+    ranges: ClassVar = {"albedo": FRACTION}
 
     def __check_init__(self):
         _check(self)
 
-    def view_factor(self, incident: Vec, view: Vec) -> Scalar:
-        return jnp.full_like(incident[0], ISOTROPIC_VIEW_FACTOR)
+    def intensity_factor(self, incident: Vec, view: Vec) -> Scalar:
+        return jnp.full_like(incident[0], ISOTROPIC_INTENSITY_FACTOR)
 
     def sample(self, incident: Vec, u: Scalar, v: Scalar) -> Vec:
         return polar(1.0 - 2.0 * u, 2 * np.pi * v)
 
-    def largest_view_factor(self) -> float:
-        return ISOTROPIC_VIEW_FACTOR
+    def largest_intensity_factor(self) -> float:
+        return ISOTROPIC_INTENSITY_FACTOR
 
 
 @final
@@ -158,31 +159,32 @@ class HenyeyGreenstein(AbstractPhase):
 
     **Source:** Henyey and Greenstein (1941), Astrophys. J. 93, 70.
 
-    **Example:** view factors of forward scattering and of backscatter.
+    **Example:** intensity factors of forward scattering and of backscatter.
 
     >>> import jaxlidar as jl
     >>> import jax.numpy as jnp
     >>> from jaxlidar.extend import vec
     >>> down, up = vec(jnp.array([0.0, 0.0, -1.0])), vec(jnp.array([0.0, 0.0, 1.0]))
     >>> phase = jl.HenyeyGreenstein(albedo=0.9, g=0.5)
-    >>> print(f"{phase.view_factor(down, down):.3f} forward, {phase.view_factor(down, up):.3f} back")
+    >>> forward, back = phase.intensity_factor(down, down), phase.intensity_factor(down, up)
+    >>> print(f"{forward:.3f} forward, {back:.3f} back")
     1.500 forward, 0.056 back
     """
 
     albedo: Float[Array, "..."] = eqx.field(converter=array("albedo"))
     g: Float[Array, ""] = eqx.field(converter=scalar("g"), default=0.0)
 
-    ranges: ClassVar = {"albedo": SHARE, "g": Range(-0.95, 0.95)}
+    ranges: ClassVar = {"albedo": FRACTION, "g": Range(-0.95, 0.95)}
 
     def __check_init__(self):
         _check(self)
 
-    def view_factor(self, incident: Vec, view: Vec) -> Scalar:
+    def intensity_factor(self, incident: Vec, view: Vec) -> Scalar:
         g = self.g
         cosine = jnp.clip(dot(incident, view), -1.0, 1.0)
         # 1 + g^2 - 2 g cos without cancellation for lobes ahead.
         across = (1.0 - g) ** 2 + 2.0 * g * (1.0 - cosine)
-        return ISOTROPIC_VIEW_FACTOR * (1.0 - g * g) / (across * jnp.sqrt(across))
+        return ISOTROPIC_INTENSITY_FACTOR * (1.0 - g * g) / (across * jnp.sqrt(across))
 
     def sample(self, incident: Vec, u: Scalar, v: Scalar) -> Vec:
         # The inverse of the distribution function, as a form without a quotient by g.
@@ -190,6 +192,6 @@ class HenyeyGreenstein(AbstractPhase):
         cosine = (s * (1.0 + g * g) + 0.5 * g * (s * s * (1.0 + g * g) + 3.0 - g * g)) / (1.0 + g * s) ** 2
         return from_frame(incident, polar(jnp.clip(cosine, -1.0, 1.0), 2 * np.pi * v))
 
-    def largest_view_factor(self) -> float:
+    def largest_intensity_factor(self) -> float:
         g = abs(float(self.g))
-        return ISOTROPIC_VIEW_FACTOR * (1.0 + g) / (1.0 - g) ** 2
+        return ISOTROPIC_INTENSITY_FACTOR * (1.0 + g) / (1.0 - g) ** 2

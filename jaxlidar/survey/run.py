@@ -140,7 +140,7 @@ def simulate_many(
         if truth:
             way = WithTruth(way.setup, way.survey, way.rtol, way)
         beside = off_map(way.survey, way.setup.scene)
-        heights = ground_heights(way.survey, way.setup.scene, way.setup.plan.trace.upstream)
+        heights = ground_heights(way.survey, way.setup.scene, way.setup.plan.limits.start_distance)
     if (said := said_of(beside)) is not None:
         warnings.warn(said, OffMapWarning, stacklevel=2)
     known: dict[str, Any] = {"position": survey.position, "zenith": survey.zenith, "azimuth": survey.azimuth}
