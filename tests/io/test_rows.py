@@ -189,7 +189,8 @@ def test_a_waveform_as_zarr(tmp_path):
     assert found.info == wave.info
     assert np.array_equal(jl.rerun(path).reflectance, wave.reflectance)
     xarray = pytest.importorskip("xarray")
-    data = xarray.open_zarr(path, consolidated=False, decode_timedelta=False)
+    # Without a warning: the store has consolidated metadata.
+    data = xarray.open_zarr(path, decode_timedelta=False)
     assert data.reflectance.dims == ("wavelength", "time")
     assert data.energy.attrs["units"] == "J"
     assert Path(path).is_dir()
