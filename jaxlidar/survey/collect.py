@@ -15,7 +15,7 @@ from jaxlidar._summary import NOTABLE_FRACTION, percent
 from jaxlidar.io.case import Case
 from jaxlidar.io.netcdf import by_rows
 from jaxlidar.io.parts import Parts
-from jaxlidar.io.rows import blank
+from jaxlidar.io.rows import unwritten_rows
 from jaxlidar.simulate import LateLightWarning
 from jaxlidar.spectral.apply_optics import make_waveform_model
 from jaxlidar.survey.results import ShotResults
@@ -79,7 +79,7 @@ def waveforms_on_disk(
     blocks, largest_late = strategy.shot_results(task_results), 0.0
     first = next(blocks)
     # The file is laid out before its rows are known: from the shapes of the first block.
-    empty = jax.tree.map(lambda a: blank(len(strategy.survey), a), first[1]._asdict())
+    empty = jax.tree.map(lambda a: unwritten_rows(len(strategy.survey), a), first[1]._asdict())
     layout = _waveforms(strategy, {**survey_fields, **empty}, start_time, problem=problem)
     with by_rows(layout, path, case) as rows:
         for shots, results in itertools.chain([first], blocks):

@@ -14,7 +14,8 @@ from jaxlidar._checks import briefly
 from jaxlidar._programs import Program
 from jaxlidar._threads import ONE_CORE
 from jaxlidar._workers import WorkUnit, task
-from jaxlidar.io.netcdf import TRUTH, keep_as_netcdf
+from jaxlidar.io.datasets import keep_as_netcdf
+from jaxlidar.io.netcdf import TRUTH_QUANTITIES
 from jaxlidar.planning.setup import Setup
 from jaxlidar.spectral.apply_optics import make_waveform_model
 from jaxlidar.survey.per_shot import ShotGeometry, setup_of_shot, shot_geometry
@@ -69,7 +70,7 @@ class Truths(eqx.Module):
 keep_as_netcdf(
     Truths,
     "truth of the shots of a survey",
-    TRUTH,
+    TRUTH_QUANTITIES,
     dimensions={"shots": "shot", "bins": "time", "wavelengths": "wavelength"},
     items={"returns": "material", "surface_height": "surface", "surface_spread": "surface"},
     rows="shots",

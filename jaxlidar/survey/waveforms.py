@@ -2,8 +2,6 @@
 
 import operator
 import os
-import tempfile
-from pathlib import Path
 from typing import Any, final
 
 import equinox as eqx
@@ -17,7 +15,7 @@ from jaxlidar._deprecated import renamed_property
 from jaxlidar._summary import NOTABLE_FRACTION, percent
 from jaxlidar.io import netcdf
 from jaxlidar.io.case import Case
-from jaxlidar.io.rows import CHECKSUMS
+from jaxlidar.io.datasets import datasets_of, keep_as_netcdf
 from jaxlidar.spectral.waveform import Waveform
 from jaxlidar.survey.truths import Truths
 
@@ -155,17 +153,10 @@ class Waveforms(eqx.Module):
 
         **Returns:** an `xarray.Dataset`.
 
-        **Raises:** ImportError where xarray or h5netcdf is not installed.
+        **Raises:** ImportError where xarray is not installed.
         """
-        import xarray
-
-        with tempfile.TemporaryDirectory() as folder:
-            self.save(path := Path(folder) / "waveforms.nc")
-            how: dict[str, Any] = {"engine": "h5netcdf", "decode_timedelta": False}
-            found = xarray.load_dataset(path, **how)
-            if self.truth is None:
-                return found
-            return found.merge(xarray.load_dataset(path, group="truth", **how).drop_vars(CHECKSUMS))
+        datasets = datasets_of(self)
+        return datasets["/"].merge(datasets["/truth"]) if self.truth is not None else datasets["/"]
 
     def save(self, path: str | os.PathLike[str], case: Case | None = None) -> None:
         """Write the waveforms as a netCDF file, which `Waveforms.open` and `jaxlidar.open` read.
@@ -196,7 +187,7 @@ class Waveforms(eqx.Module):
         return found
 
 
-netcdf.keep_as_netcdf(
+keep_as_netcdf(
     Waveforms,
     "simulated lidar waveforms of a survey",
     {
@@ -222,5 +213,6 @@ netcdf.keep_as_netcdf(
     dimensions={"shots": "shot", "bins": "time", "wavelengths": "wavelength", "2": "axis"},
     items={"components": "component", "energy_budget": "fate", "energy_budget_stderr": "fate"},
     coordinates={"zenith": "shot", "azimuth": "shot"},
+    former_names={"energy_budget": "ledger", "energy_budget_stderr": "ledger_stderr"},
     rows="shots",
 )
