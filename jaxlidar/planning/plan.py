@@ -13,7 +13,15 @@ from jaxlidar.optics.laws import AbstractMirror
 from jaxlidar.planning.channels import largest_albedo, number_channels, reflection_probability, scene_optics
 from jaxlidar.planning.config import PathLimits, TimeBins, TraceConfig
 from jaxlidar.planning.effect_table import effect_table, table_lines
-from jaxlidar.planning.effects import Effect, empty, flattened, only_planes, present, switched_off, without
+from jaxlidar.planning.effects import (
+    Effect,
+    consists_of_planes,
+    find_empty_materials,
+    present_effects,
+    replace_plane_terrain,
+    switched_off_effects,
+    without_effects,
+)
 from jaxlidar.planning.local_origin import about_aim
 from jaxlidar.planning.memory import (
     check_memory,
@@ -264,15 +272,15 @@ def plan(
     lidar, scene = about_aim(lidar, scene)
     # 1. Effects: leaf or bark that is zero everywhere and relief of flat terrain are off, then what the user
     # switches off. The table compares with everything else in place.
-    empty_materials = empty(scene, effects)
-    scene = without(lidar, scene, empty_materials)[1]
-    with_relief, scene = scene, flattened(scene, effects)
+    empty_materials = find_empty_materials(scene, effects)
+    scene = without_effects(lidar, scene, empty_materials)[1]
+    with_relief, scene = scene, replace_plane_terrain(scene, effects)
     flat_terrain = scene is not with_relief
     complete_scene = scene
-    off = switched_off(effects, present(lidar, scene), max_orders)
+    off = switched_off_effects(effects, present_effects(lidar, scene), max_orders)
     off = (*off, *(("relief",) if flat_terrain else ()), *empty_materials)
     complete_lidar = lidar
-    lidar, scene = without(lidar, scene, off)
+    lidar, scene = without_effects(lidar, scene, off)
     # 2. Orders of scattering, from the optics.
     geometry = PathLengths(lidar, scene, survey)
     optics = scene_optics(lidar, scene)
@@ -331,7 +339,7 @@ def plan(
         # A beam without width is one ray.
         n_rays=int(n_rays) if wide_beam else 1,
         n_photons=int(n_photons),
-        smooth_footprint=only_planes(scene) and wide_beam,
+        smooth_footprint=consists_of_planes(scene) and wide_beam,
         random_footprint=footprint == "random" and wide_beam,
     )
     limits = PathLimits(

@@ -8,7 +8,7 @@ from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.optics.laws import AbstractMirror
 from jaxlidar.planning.channels import largest_albedo, number_channels, scene_optics
-from jaxlidar.planning.effects import empty, only_planes, without
+from jaxlidar.planning.effects import consists_of_planes, find_empty_materials, without_effects
 from jaxlidar.planning.local_origin import about_aim
 from jaxlidar.planning.orders import choose_orders
 from jaxlidar.planning.path_lengths import PathLengths
@@ -44,11 +44,11 @@ def _check(plan: Plan, lidar: Lidar, scene: Scene, checks: Sequence[Callable]) -
     if plan.scope.flat_terrain and isinstance(ground, Terrain) and ground.relief and not ground.is_plane():
         raise ValueError("the plan does not fit: it takes the terrain for a plane; make one for this terrain")
     for name in plan.scope.empty_materials:
-        if name not in empty(scene):
+        if name not in find_empty_materials(scene):
             raise ValueError(
                 f"the plan does not fit: it is for a map without {name}; make one for this scene"
             )
-    lidar, scene = without(*about_aim(lidar, scene), plan.off)
+    lidar, scene = without_effects(*about_aim(lidar, scene), plan.off)
     for check in checks:
         for misfit in check(plan, lidar, scene):
             raise ValueError(f"the plan does not fit: {misfit}; make one for this lidar and this scene")
@@ -87,7 +87,7 @@ def _misfit_materials(plan: Plan, lidar: Lidar, scene: Scene) -> Iterator[str]:
         yield f"it has hotspot = {config.hotspot}; the canopy has not"
     if config.vertical and concrete_number(lidar.zenith) != 0:
         yield f"it is for a beam at nadir; zenith = {concrete_number(lidar.zenith):g} degrees"
-    if config.smooth_footprint and not only_planes(scene):
+    if config.smooth_footprint and not consists_of_planes(scene):
         yield "it is for planes; the scene has more"
     albedo = largest_albedo(optics)
     if scope.automatic_orders and albedo > scope.albedo + 1e-3:
