@@ -104,23 +104,23 @@ def _bound_functions(bounds: Bounds, bins: TimeBins, start_distance: float) -> d
         return bounds.slope_spread(Bounds(*level, bounds.orders))
 
     return {
-        "leaf": lambda: bounds.part("leaf"),
-        "bark": lambda: bounds.part("bark"),
+        "leaf": lambda: bounds.canopy_material("leaf"),
+        "bark": lambda: bounds.canopy_material("bark"),
         "plates": bounds.plates,
         "ground": bounds.ground,
         "slope spread": slope_spread,
-        "multiple scattering": lambda: bounds.beyond(1),
-        f"orders beyond {bounds.orders}": lambda: bounds.beyond(bounds.orders),
+        "multiple scattering": lambda: bounds.orders_beyond(1),
+        f"orders beyond {bounds.orders}": lambda: bounds.orders_beyond(bounds.orders),
         # A mirror's return may exceed all others by far.
         "specular return": lambda: 1.0,
         "divergence": bounds.divergence,
         "field of view": bounds.field_of_view,
         "hot spot": bounds.hot_spot,
         "atmospheric extinction": lambda: bounds.extinction(bins, start_distance),
-        "atmospheric backscatter": lambda: bounds.backscatter(bins, start_distance),
+        "atmospheric backscatter": lambda: bounds.air_backscatter(bins, start_distance),
         "jitter": bounds.jitter,
         # What the air scatters to the receiver beyond first order is at most what was lost.
-        "scattering within the atmosphere": lambda: bounds.lost(bins),
+        "scattering within the atmosphere": lambda: bounds.air_loss(bins),
     }
 
 
