@@ -17,8 +17,7 @@ import pytest
 
 import inversion
 import jaxlidar as jl
-from jaxlidar._checks import check_integer, check_key
-from jaxlidar.scenes.scene import check_kinds
+from jaxlidar.extend import check_integer, check_key, check_kinds
 
 ROOT = Path(__file__).resolve().parents[1]
 

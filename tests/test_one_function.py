@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import jaxlidar as jl
-from jaxlidar._one_function import once, one_function
+from jaxlidar._one_function import one_function
+from jaxlidar.extend import once
 from jaxlidar.trace.voxel_traversal import make_medium, march_to_depths
 
 KEY = jax.random.key(0)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import jaxlidar as jl
-from jaxlidar._threads import side_by_side
+from jaxlidar.extend import side_by_side
 from tests.helpers import slow_unless
 
 

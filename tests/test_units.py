@@ -10,7 +10,8 @@ import pytest
 
 import inversion
 import jaxlidar as jl
-from jaxlidar._checks import MAGNITUDES, UnitWarning
+from jaxlidar import UnitWarning
+from jaxlidar._checks import MAGNITUDES
 
 UNKNOWN = inversion.Unknown(lambda s: s.ground.reflectance, bounds=(0.0, 1.0))
 CUBE = np.full((1, 1, 1), 0.5)

@@ -86,9 +86,9 @@ def draw(names: dict, seconds: float):
 
 
 def main() -> None:
-    """Run the second example as it is printed and save its picture."""
+    """Run the survey of the front page as it is printed and save its picture."""
     page = (FOLDER.parents[1] / "README.md").read_text()
-    code = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)[1]
+    code = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)[3]
     names: dict = {}
     start = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import jaxlidar as jl
-from jaxlidar._ranges import SUM_OF_FRACTIONS, Range, is_outside, reasons
-from jaxlidar.extend import inadmissible
+from jaxlidar._ranges import SUM_OF_FRACTIONS, is_outside
+from jaxlidar.extend import Range, inadmissible, reasons
 
 CUBE = np.full((2, 2, 2), 0.5)
 CONSTRUCTORS = {
