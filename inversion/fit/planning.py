@@ -115,7 +115,7 @@ def plan_for(
         max_flight=max(e.longest_flight(longest) for e in extents),
     ).with_config(
         max_ray_segments=max(p.config.max_ray_segments for p in plans),
-        max_faces=size_bucket(max(e.march_steps(longest) for e in extents)),
+        max_faces=size_bucket(max(e.max_faces(longest) for e in extents)),
         covers_fully=tuple(all(c) for c in zip(*(p.config.covers_fully for p in plans))),
     )
     return dataclasses.replace(plan, bins=bins)

@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxlidar._checks import concrete_array
 from jaxlidar.instrument.survey import Survey
-from jaxlidar.planning.local_origin import about_aim
+from jaxlidar.planning.local_origin import move_aim_to_origin
 from jaxlidar.planning.plan import DEFAULT_RTOL, Plan
 from jaxlidar.planning.plan import plan as make_plan
 from jaxlidar.planning.setup import make_setup
@@ -34,7 +34,7 @@ def prepared(
     )
     middle = survey.middle
     setup = make_setup(middle, scene, plan)
-    lidar, _ = about_aim(middle, scene)
+    lidar, _ = move_aim_to_origin(middle, scene)
     # A scene that cannot be moved keeps its coordinates, and the lidar its place.
     moved = survey.about(concrete_array(middle.position) - concrete_array(lidar.position))
     light = sharing(moved, setup, rtol, shared)

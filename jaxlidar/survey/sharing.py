@@ -8,7 +8,7 @@ from jaxlidar._checks import concrete_number
 from jaxlidar._summary import percent
 from jaxlidar.instrument.survey import Survey
 from jaxlidar.optics.laws import AbstractMirror
-from jaxlidar.planning.parallel_light import one_direction, parallel_light
+from jaxlidar.planning.parallel_light import beams_are_parallel, parallel_light_bound
 from jaxlidar.planning.setup import Setup
 from jaxlidar.survey.irradiance import Patches, patches
 from jaxlidar.survey.tiles import Lit, Tile, lit, tiles
@@ -83,7 +83,7 @@ def _has_views(survey: Survey) -> bool:
 
 
 def _parallel(survey: Survey, setup: Setup) -> float:
-    return parallel_light(survey, setup.plan.limits.start_distance, setup.plan.scope.last_return)
+    return parallel_light_bound(survey, setup.plan.limits.start_distance, setup.plan.scope.last_return)
 
 
 def _tiles(found: Patches, nodes: Lit, setup: Setup, fewer: float) -> list[Tile]:
@@ -96,7 +96,7 @@ def _tiles(found: Patches, nodes: Lit, setup: Setup, fewer: float) -> list[Tile]
 def why_apart(survey: Survey, setup: Setup, rtol: float) -> str | None:
     """Why the shots of a survey cannot share light; None where they can."""
     canopy, lidar = setup.scene.canopy, setup.lidar
-    if not one_direction(survey):
+    if not beams_are_parallel(survey):
         return "shots have more than one direction"
     if _has_views(survey) and setup.plan.orders == 1:
         return "one order is followed, which shots that lean or have a field of view do not share"
