@@ -12,7 +12,7 @@ from inversion.fit.unknowns import Settled, put
 from jaxlidar import Lidar, Plan, Scene
 from jaxlidar import plan as make_plan
 from jaxlidar.extend import check_integer, check_kind
-from jaxlidar.planning.effects import empty
+from jaxlidar.planning.effects import find_empty_materials
 from jaxlidar.planning.path_lengths import PathLengths
 from jaxlidar.planning.plan import MIN_BATCHES
 from jaxlidar.planning.plan_check import check_reach
@@ -86,7 +86,7 @@ def plan_for(
     scenes = corners(scene, settled)
     common = {"window": window, "n_photons": photons, "n_rays": rays, "describe": False}
     # What is zero at the start may be more elsewhere.
-    common["effects"] = dict.fromkeys(empty(scenes[0]), True)
+    common["effects"] = dict.fromkeys(find_empty_materials(scenes[0]), True)
     first = make_plan(lidar, scenes[0], max_orders=max_orders, **common)
     common.update(max_orders=first.orders, bin_width=first.bins.width)
     if scene.canopy is not None:
@@ -115,7 +115,7 @@ def plan_for(
         max_flight=max(e.longest_flight(longest) for e in extents),
     ).with_config(
         max_ray_segments=max(p.config.max_ray_segments for p in plans),
-        max_faces=size_bucket(max(e.march_steps(longest) for e in extents)),
+        max_faces=size_bucket(max(e.max_faces(longest) for e in extents)),
         covers_fully=tuple(all(c) for c in zip(*(p.config.covers_fully for p in plans))),
     )
     return dataclasses.replace(plan, bins=bins)

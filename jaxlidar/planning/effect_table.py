@@ -13,7 +13,13 @@ from jaxlidar.instrument.field_of_view import EDGE_WIDTH
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.planning.bounds import Bounds
 from jaxlidar.planning.config import TimeBins
-from jaxlidar.planning.effects import NAMES, Effect, planes, present, without
+from jaxlidar.planning.effects import (
+    EFFECT_NAMES,
+    Effect,
+    present_effects,
+    surfaces_are_planes,
+    without_effects,
+)
 from jaxlidar.planning.orders import OrderChoice
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.surfaces import Ground
@@ -39,27 +45,27 @@ def effect_table(
     - `records_all_of_order_one`: True if the window was chosen so that no light of order one is cut off.
     """
     orders = order_choice.count
-    has, planned = present(lidar, scene), present(*without(lidar, scene, off))
-    reasons = dict.fromkeys(NAMES, "in the scene") | {"multiple scattering": order_choice.reason}
+    has, planned = present_effects(lidar, scene), present_effects(*without_effects(lidar, scene, off))
+    reasons = dict.fromkeys(EFFECT_NAMES, "in the scene") | {"multiple scattering": order_choice.reason}
     reasons |= _sized_reasons(lidar, scene)
     # Bounds need values, which are unknown while they are being traced, and hold for planes only.
-    bounded = not any(is_traced(x) for x in jax.tree.leaves((lidar, scene))) and planes(scene)
+    bounded = not any(is_traced(x) for x in jax.tree.leaves((lidar, scene))) and surfaces_are_planes(scene)
 
     @functools.cache
     def bound_functions(off: tuple[str, ...]) -> dict[str, Callable[[], float]]:
-        return _bound_functions(Bounds(*without(lidar, scene, off), orders), bins, start_distance)
+        return _bound_functions(Bounds(*without_effects(lidar, scene, off), orders), bins, start_distance)
 
     def bound(name: str, off: tuple[str, ...]) -> float:
         """Bound on the change without `name`, where `off` is left out, too; 1 if none is known."""
-        remaining = without(lidar, scene, off)
+        remaining = without_effects(lidar, scene, off)
         # A canopy without the hot spot can have it switched on: its bound is of interest too.
-        has_effect = present(*remaining) | {"hot spot": remaining[1].canopy is not None}
+        has_effect = present_effects(*remaining) | {"hot spot": remaining[1].canopy is not None}
         if not has_effect.get(name, True):
             return 0.0
         return bound_functions(off)[name]() if bounded else 1.0
 
     rows = []
-    for name in NAMES:
+    for name in EFFECT_NAMES:
         on = planned[name] and name not in off and (name != "multiple scattering" or orders > 1)
         reason, also_off = reasons[name], off
         if name in off:
@@ -80,7 +86,7 @@ def effect_table(
             late = bound("multiple scattering", off) if records_all_of_order_one else 1.0
             reason = "light on its way at the end of the record"
             rows.append(Effect("after the window", False, reason, late, "sum"))
-    if without(lidar, scene, off)[1].atmosphere is not None:
+    if without_effects(lidar, scene, off)[1].atmosphere is not None:
         name = "scattering within the atmosphere"
         rows.append(Effect(name, False, "beyond first order", bound(name, off), "sum"))
     return tuple(rows)
@@ -94,27 +100,27 @@ def _bound_functions(bounds: Bounds, bins: TimeBins, start_distance: float) -> d
     """Return, for every effect, the function that computes its bound."""
 
     def slope_spread() -> float:
-        level = without(bounds.lidar, bounds.scene, ("slope spread",))
+        level = without_effects(bounds.lidar, bounds.scene, ("slope spread",))
         return bounds.slope_spread(Bounds(*level, bounds.orders))
 
     return {
-        "leaf": lambda: bounds.part("leaf"),
-        "bark": lambda: bounds.part("bark"),
+        "leaf": lambda: bounds.canopy_material("leaf"),
+        "bark": lambda: bounds.canopy_material("bark"),
         "plates": bounds.plates,
         "ground": bounds.ground,
         "slope spread": slope_spread,
-        "multiple scattering": lambda: bounds.beyond(1),
-        f"orders beyond {bounds.orders}": lambda: bounds.beyond(bounds.orders),
+        "multiple scattering": lambda: bounds.orders_beyond(1),
+        f"orders beyond {bounds.orders}": lambda: bounds.orders_beyond(bounds.orders),
         # A mirror's return may exceed all others by far.
         "specular return": lambda: 1.0,
         "divergence": bounds.divergence,
         "field of view": bounds.field_of_view,
         "hot spot": bounds.hot_spot,
         "atmospheric extinction": lambda: bounds.extinction(bins, start_distance),
-        "atmospheric backscatter": lambda: bounds.backscatter(bins, start_distance),
+        "atmospheric backscatter": lambda: bounds.air_backscatter(bins, start_distance),
         "jitter": bounds.jitter,
         # What the air scatters to the receiver beyond first order is at most what was lost.
-        "scattering within the atmosphere": lambda: bounds.lost(bins),
+        "scattering within the atmosphere": lambda: bounds.air_loss(bins),
     }
 
 

@@ -1,4 +1,9 @@
-"""The effects that a plan lists, and the removal of those that are switched off from a lidar and a scene."""
+"""The effects that a plan lists, and the removal of those that are switched off from a lidar and a scene.
+
+An effect is a material ("leaf"), a property ("hot spot") or a process ("multiple scattering") that can be
+left out of a simulation. Most are left out by simulating another lidar or scene, in which the effect is
+absent, so that the tracer needs no switches.
+"""
 
 import dataclasses
 from collections.abc import Mapping
@@ -14,8 +19,8 @@ from jaxlidar.scenes.shapes import Plane
 from jaxlidar.scenes.surfaces import AbstractGround, Ground
 from jaxlidar.scenes.terrain import Terrain
 
-# In the order of the table; each can be switched.
-NAMES = (
+# In the order of the table. Each can be switched off.
+EFFECT_NAMES = (
     "leaf",
     "bark",
     "plates",
@@ -38,7 +43,7 @@ class Effect:
     """One row of a plan's table: an effect, whether it is simulated, why, and a bound on what it changes.
 
     - `name`: of the effect, as in the first column of the printed plan.
-    - `simulated`: whether it is simulated.
+    - `simulated`: True if it is simulated.
     - `reason`: why, in words.
     - `bound`: the most that leaving the effect out changes, in terms of `measure`, in [0, 1]: for the worst
       wavelength, everything else as planned, over a window that covers the scene. For an effect that is
@@ -46,7 +51,8 @@ class Effect:
       simple.
     - `measure`: how waveforms with and without the effect are compared. "sum": difference of the sums over
       all samples, relative to the larger sum. "samples": sum of the absolute differences of samples, relative
-      to both sums together; where the sums are equal, the share of the energy that is found in other samples.
+      to the sum of the two sums; where these are equal, the fraction of the energy that moves between
+      samples.
 
     **Example:**
 
@@ -64,39 +70,47 @@ class Effect:
     measure: str
 
 
-def only_planes(scene: Scene) -> bool:
-    """Whether the scene consists of infinite planes alone, each of them the same throughout."""
-    return scene.canopy is None and planes(scene)
+def consists_of_planes(scene: Scene) -> bool:
+    """Return True if the scene has no canopy and all its surfaces are infinite, uniform planes."""
+    return scene.canopy is None and surfaces_are_planes(scene)
 
 
-def planes(scene: Scene) -> bool:
-    """Whether all surfaces of the scene are infinite planes, each of them the same throughout."""
+def surfaces_are_planes(scene: Scene) -> bool:
+    """Return True if all surfaces of the scene are infinite planes with the same optics everywhere."""
     return all(isinstance(s.shape, Plane) and s.pattern is None for s in scene.surfaces)
 
 
-def is_flat(ground: AbstractGround | None) -> bool:
-    """Whether the ground is terrain whose heights, which must be known, lie in a plane."""
+def is_plane_terrain(ground: AbstractGround | None) -> bool:
+    """Return True if the ground is terrain whose heights, which must be concrete, lie in a plane."""
     return isinstance(ground, Terrain) and ground.relief and ground.is_plane()
 
 
-def flattened(scene: Scene, effects: Mapping[str, bool] | None) -> Scene:
-    """The scene with flat terrain as a plane, unless `effects` asks for relief."""
-    if not is_flat(scene.ground) or (effects or {}).get("relief") is True:
+def replace_plane_terrain(scene: Scene, effects: Mapping[str, bool] | None) -> Scene:
+    """Return the scene with terrain that lies in a plane as a plane, unless `effects` asks for relief."""
+    # A plane is met in closed form; the search for a ray's first crossing of a height field is not needed.
+    if not is_plane_terrain(scene.ground) or (effects or {}).get("relief") is True:
         return scene
     return without_relief(scene)
 
 
-def empty(scene: Scene, effects: Mapping[str, bool] | None = None) -> tuple[str, ...]:
-    """Which of "leaf" and "bark" are known to be zero everywhere, but for those that `effects` asks for."""
+def find_empty_materials(scene: Scene, effects: Mapping[str, bool] | None = None) -> tuple[str, ...]:
+    """Return those of "leaf" and "bark" whose extinction is zero everywhere, unless `effects` asks for them.
+
+    A map that a JAX transformation traces never counts as empty: it may have derivatives where it is zero.
+    """
     if scene.canopy is None:
         return ()
-    known = {name: concrete(getattr(scene.canopy.voxels, name)) for name in ("leaf", "bark")}
-    asked = effects or {}
-    return tuple(n for n, a in known.items() if a is not None and not a.any() and asked.get(n) is not True)
+    effects = effects or {}
+    empty = []
+    for name in ("leaf", "bark"):
+        extinction = concrete(getattr(scene.canopy.voxels, name))
+        if extinction is not None and not extinction.any() and effects.get(name) is not True:
+            empty.append(name)
+    return tuple(empty)
 
 
 def without_relief(scene: Scene) -> Scene:
-    """The scene with its terrain, if there is any, as a plane."""
+    """Return the scene with its terrain, if it has one, as a plane."""
     ground = scene.ground
     if not isinstance(ground, Terrain) or not ground.relief:
         return scene
@@ -104,13 +118,13 @@ def without_relief(scene: Scene) -> Scene:
 
 
 def can_light_itself(scene: Scene) -> bool:
-    """Whether light that is scattered in the scene can meet the scene again; that of one plane cannot."""
+    """Return True if scattered light can meet the scene again; that of a single plane cannot."""
     surfaces = scene.surfaces
     return scene.canopy is not None or len(surfaces) > 1 or any(s.shape.lights_itself for s in surfaces)
 
 
-def present(lidar: Lidar, scene: Scene) -> dict[str, bool]:
-    """Whether a lidar and a scene have each effect of `NAMES`."""
+def present_effects(lidar: Lidar, scene: Scene) -> dict[str, bool]:
+    """Return, for each effect of `EFFECT_NAMES`, True if the lidar and the scene have it."""
     canopy, air, ground = scene.canopy, scene.atmosphere, scene.ground
     return {
         "leaf": canopy is not None and canopy.voxels.leaf is not None,
@@ -130,49 +144,57 @@ def present(lidar: Lidar, scene: Scene) -> dict[str, bool]:
     }
 
 
-def switched_off(
-    effects: Mapping[str, bool] | None, has: Mapping[str, bool], max_orders: int | None
+def switched_off_effects(
+    effects: Mapping[str, bool] | None, present: Mapping[str, bool], max_orders: int | None
 ) -> tuple[str, ...]:
-    """Names of the effects that the lidar and the scene have and that `effects` switches off.
+    """Return the names of the effects that are present and that `effects` switches off.
+
+    **Arguments:**
+
+    - `effects`: the user's switches, by name.
+    - `present`: for each effect, True if the lidar and the scene have it (`present_effects`).
+    - `max_orders`: the user's number of orders of scattering, or None.
 
     **Raises:** ValueError for names or values that are inadmissible, and where `effects` switches on what is
     not in the scene or contradicts itself or `max_orders`.
     """
     effects = effects or {}
     for name, value in effects.items():
-        if name not in NAMES:
-            raise ValueError(f"effects: {name!r} is none of {', '.join(map(repr, NAMES))}")
+        if name not in EFFECT_NAMES:
+            raise ValueError(f"effects: {name!r} is none of {', '.join(map(repr, EFFECT_NAMES))}")
         if value is not True and value is not False:
             raise ValueError(f"effects[{name!r}] = {value!r}; admissible is True or False")
-        if value and not has[name]:
-            there = ", ".join(repr(n) for n in NAMES if has[n]) or "none"
+        if value and not present[name]:
+            available = ", ".join(repr(n) for n in EFFECT_NAMES if present[n]) or "none"
             raise ValueError(
-                f"effects[{name!r}] = True, but it is not in the scene; admissible to switch on: {there}"
+                f"effects[{name!r}] = True, but it is not in the scene; admissible to switch on: {available}"
             )
     orders = effects.get("multiple scattering")
     if max_orders is not None and orders is not None and orders != (max_orders > 1):
         raise ValueError(
             f"effects['multiple scattering'] = {orders}, but max_orders = {max_orders}; they must agree"
         )
-    off = tuple(name for name in NAMES if has[name] and effects.get(name) is False)
-    for name, needs in (
+    off = tuple(name for name in EFFECT_NAMES if present[name] and effects.get(name) is False)
+    # An effect cannot be asked for without what it is an effect of. With several names, any of them will do.
+    for name, carriers in (
         ("atmospheric backscatter", ("atmospheric extinction",)),
         ("relief", ("ground",)),
         ("slope spread", ("ground",)),
         ("hot spot", ("leaf", "bark")),
     ):
-        needed = [n for n in needs if has[n]]
-        if effects.get(name) and all(n in off for n in needed):
+        present_carriers = [n for n in carriers if present[n]]
+        if effects.get(name) and all(n in off for n in present_carriers):
             raise ValueError(
-                f"effects[{name!r}] = True, but {' and '.join(map(repr, needed))} = False; "
+                f"effects[{name!r}] = True, but {' and '.join(map(repr, present_carriers))} = False; "
                 "admissible with it is True"
             )
     return off
 
 
-def without(lidar: Lidar, scene: Scene, off: tuple[str, ...]) -> tuple[Lidar, Scene]:
-    """The lidar and the scene without the effects named in `off`. Applied twice, it changes nothing more.
+def without_effects(lidar: Lidar, scene: Scene, off: tuple[str, ...]) -> tuple[Lidar, Scene]:
+    """Return the lidar and the scene without the effects named in `off`.
 
+    Applied twice, it changes nothing more.
     Without its extinction the air is removed, and its backscatter with it. "multiple scattering" and
     "specular return" belong neither to the lidar nor to the scene: the plan's orders and the tracer leave
     them out.
@@ -187,11 +209,11 @@ def without(lidar: Lidar, scene: Scene, off: tuple[str, ...]) -> tuple[Lidar, Sc
         lidar = dataclasses.replace(lidar, jitter=jnp.zeros_like(lidar.jitter))
     canopy, ground, air = scene.canopy, scene.ground, scene.atmosphere
     if canopy is not None:
-        canopy = _thinned(canopy, off)
+        canopy = _canopy_without_effects(canopy, off)
     if "relief" in off:
         ground = without_relief(scene).ground
     if isinstance(ground, Ground) and "slope spread" in off:
-        ground = _levelled(ground, lidar)
+        ground = _level_ground(ground, lidar)
     if air is not None and "atmospheric backscatter" in off:
         air = dataclasses.replace(air, lidar_ratio=None)
     return lidar, Scene(
@@ -202,7 +224,8 @@ def without(lidar: Lidar, scene: Scene, off: tuple[str, ...]) -> tuple[Lidar, Sc
     )
 
 
-def _thinned(canopy: Canopy, off: tuple[str, ...]) -> Canopy | None:
+def _canopy_without_effects(canopy: Canopy, off: tuple[str, ...]) -> Canopy | None:
+    """Return the canopy without its effects in `off`; None if neither leaf nor bark remains."""
     leaf = None if "leaf" in off else canopy.voxels.leaf
     bark = None if "bark" in off else canopy.voxels.bark
     if leaf is None and bark is None:
@@ -221,11 +244,20 @@ def _thinned(canopy: Canopy, off: tuple[str, ...]) -> Canopy | None:
     )
 
 
-def _levelled(ground: Ground, lidar: Lidar) -> Ground:
-    """Level ground through the point where the beam axis meets the slope, if it does."""
+def _level_ground(ground: Ground, lidar: Lidar) -> Ground:
+    """Return level ground through the point where the beam axis meets the sloping plane.
+
+    With the plane's upward normal n, its height h at the origin, the aim point p and the axis d, the axis
+    p + t d meets the plane n . x = n_z h at t = (n_z h - n . p) / (n . d), where its height is t d_z. Without
+    the slope the delay of the axis is then unchanged, and the waveforms differ by the spread alone.
+    """
     normal, axis = ground.shape.upward, lidar.direction
-    rise = normal[2] * ground.height - jnp.sum(normal[:2] * lidar.position)
-    towards = jnp.sum(normal * axis)
-    met = towards < -1e-6
-    height = jnp.where(met, rise / jnp.where(met, towards, -1.0) * axis[2], ground.height)
+    # The aim point lies in the reference plane, z = 0.
+    normal_distance = normal[2] * ground.height - jnp.sum(normal[:2] * lidar.position)
+    normal_cosine = jnp.sum(normal * axis)
+    # A beam that runs along the slope, or comes from beneath, does not meet it: the height stays. The divisor
+    # is replaced there so that derivatives stay finite.
+    meets = normal_cosine < -1e-6
+    axis_height = normal_distance / jnp.where(meets, normal_cosine, -1.0) * axis[2]
+    height = jnp.where(meets, axis_height, ground.height)
     return dataclasses.replace(ground, height=height, slope=jnp.zeros_like(ground.slope))

@@ -1,4 +1,8 @@
-"""Coordinates about the aim point, so that places millions of metres out lose nothing in single precision."""
+"""Coordinates about the aim point, so that map coordinates lose nothing in single precision.
+
+Single precision resolves coordinates of a few million metres to half a metre only. So the aim point is
+subtracted from all positions in double precision, before anything goes to the device.
+"""
 
 import dataclasses
 
@@ -12,30 +16,33 @@ from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.scenes.scene import Scene
 
 
-def about_aim(lidar: Lidar, scene: Scene) -> tuple[Lidar, Scene]:
-    """The same lidar and scene, moved so that the lidar aims at x = y = 0.
+def move_aim_to_origin(lidar: Lidar, scene: Scene) -> tuple[Lidar, Scene]:
+    """Return the same lidar and scene, moved so that the lidar aims at x = y = 0.
 
     Differences are taken in double precision, and what is returned has JAX's default precision. Where the
-    position of the lidar is traced by a JAX transformation, or a surface cannot be moved, all stays where it
-    is.
+    position of the lidar is traced by a JAX transformation, or a surface cannot be moved, nothing is moved.
     """
-    place = concrete(lidar.position)
-    if place is None:
+    aim = concrete(lidar.position)
+    if aim is None:
         return lidar, scene
-    moved = [surface.moved(-place) for surface in scene.surfaces]
-    stays = not place.any() or any(surface is None for surface in moved)
-    here = place if stays else np.zeros(2)
-    lidar = eqx.tree_at(lambda a: a.position, lidar, jnp.asarray(here, float))
+    # `moved` returns None for surfaces that cannot be moved.
+    moved = [surface.moved(-aim) for surface in scene.surfaces]
+    stays = not aim.any() or any(surface is None for surface in moved)
+    new_aim = aim if stays else np.zeros(2)
+    lidar = eqx.tree_at(lambda a: a.position, lidar, jnp.asarray(new_aim, float))
     surfaces = tuple(scene.surfaces if stays else moved)
-    grounds = len(surfaces) - len(scene.plates)
+    # `surfaces` has the ground first, if there is one, then the plates.
+    n_grounds = len(surfaces) - len(scene.plates)
     canopy = scene.canopy
     if canopy is not None:
-        by = np.append(place - here, 0.0)
-        canopy = eqx.tree_at(lambda c: c.voxels.origin, canopy, _difference(canopy.voxels.origin, by))
-    ground = surfaces[0] if grounds else None
-    return lidar, dataclasses.replace(scene, canopy=canopy, plates=surfaces[grounds:], ground=ground)
+        shift = np.append(aim - new_aim, 0.0)
+        origin = _subtract_in_double(canopy.voxels.origin, shift)
+        canopy = eqx.tree_at(lambda c: c.voxels.origin, canopy, origin)
+    ground = surfaces[0] if n_grounds else None
+    return lidar, dataclasses.replace(scene, canopy=canopy, plates=surfaces[n_grounds:], ground=ground)
 
 
-def _difference(a: Array | np.ndarray, b: np.ndarray) -> Array:
-    known = concrete(a)
-    return jnp.asarray(a, float) - b if known is None else jnp.asarray(known - b, float)
+def _subtract_in_double(a: Array | np.ndarray, b: np.ndarray) -> Array:
+    """Return a - b in JAX's default precision, subtracted in double precision unless `a` is traced."""
+    value = concrete(a)
+    return jnp.asarray(a, float) - b if value is None else jnp.asarray(value - b, float)

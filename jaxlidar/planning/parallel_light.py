@@ -1,4 +1,4 @@
-"""What parallel light in place of a beam's own would change: footprints that share light take it for such."""
+"""The error of parallel light: footprints that share photons take their diverging beams for parallel ones."""
 
 import math
 
@@ -9,27 +9,40 @@ from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar.instrument.survey import Survey
 
 
-def parallel_light(survey: Survey, start_distance: float, last: float) -> float:
-    """Bound on the share of samples that parallel light changes, for shots of one direction.
+def parallel_light_bound(survey: Survey, start_distance: float, last_return: float) -> float:
+    """Return a bound on the fraction of samples that parallel light changes, for shots of one direction.
 
-    At the height h above the reference plane, along the beam, a footprint of the radius w is narrower by the
-    share h / R. A Gaussian so changed has 2 / e of that share elsewhere on either side, 1.5 h / R in all. The
-    area of a field of view changes by 2 h / R. Light at the rim arrives later than the mean, which is kept,
-    by w^2 / (2 R), and inclined by w / R.
+    Let R be the distance of the reference plane, w the radius of the footprint there, and h the largest
+    distance of the scene from that plane, along the beam. Relative to parallel light,
 
-    **Arguments:** `start_distance`: distance, m, before the reference plane at which rays start. `last`: time
-    of the last return of order one, ns.
+    1. at h the footprint is narrower by the fraction h / R. A Gaussian that is narrower by a fraction e has
+       2 e / exp(1) of its energy elsewhere; with both sides of the plane that is 1.5 h / R;
+    2. the area of a field of view changes by 2 h / R;
+    3. light at the rim arrives later than the mean, which is kept, by w^2 / (2 R); this counts relative to
+       the standard deviation of a sample in time, from pulse, jitter and sampling interval;
+    4. light at the rim is inclined by w / R.
+
+    The bound is the sum of these, at most 1.
+
+    **Arguments:**
+
+    - `survey`: shots of one direction (`beams_are_parallel`).
+    - `start_distance`: distance, m, before the reference plane at which rays start.
+    - `last_return`: time of the last return of order one, ns.
     """
     lidar = survey.lidar
     distance, radius = float(survey.slant_range.min()), float(survey.footprint_radius.max())
-    height = max(abs(start_distance), 0.5 * SPEED_OF_LIGHT * abs(last))
-    interval = concrete_number(lidar.sampling_interval) / math.sqrt(12.0)
-    lasts = math.hypot(concrete_number(lidar.pulse.std), concrete_number(lidar.jitter), interval)
-    late = 0.5 * radius**2 / distance / SPEED_OF_LIGHT / lasts
-    narrower = 1.5 if lidar.field_of_view is None else 3.5
-    return min(narrower * height / distance + late + radius / distance, 1.0)
+    height = max(abs(start_distance), 0.5 * SPEED_OF_LIGHT * abs(last_return))
+    # Standard deviation of a uniform distribution over one interval.
+    sampling_std = concrete_number(lidar.sampling_interval) / math.sqrt(12.0)
+    sample_std = math.hypot(concrete_number(lidar.pulse.std), concrete_number(lidar.jitter), sampling_std)
+    delay = 0.5 * radius**2 / distance / SPEED_OF_LIGHT / sample_std
+    # Terms 1 and 2, in units of h / R.
+    narrowing = 1.5 if lidar.field_of_view is None else 3.5
+    return min(narrowing * height / distance + delay + radius / distance, 1.0)
 
 
-def one_direction(survey: Survey) -> bool:
-    """Whether all beams are parallel."""
+def beams_are_parallel(survey: Survey) -> bool:
+    """Return True if all shots have the same direction."""
+    # The rounding of double precision.
     return bool(np.ptp(survey.direction, axis=0).max() < 1e-9)

@@ -1,25 +1,72 @@
-"""Extent of a scene along the beam, from which the bounds of all loops are set before tracing."""
+"""Path lengths from the rim of the footprint to the bounds of a scene, from which loops get their lengths.
+
+Surfaces and the canopy's map are met along lines around the beam: its axis, and a circle of lines a few
+footprint radii out. All but a negligible fraction of the light lies between these lines.
+"""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxlidar._checks import concrete_array, concrete_number
 from jaxlidar._vectors import FAR
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.instrument.survey import Survey
 from jaxlidar.planning.config import KERNEL_BINS
-from jaxlidar.planning.rims import rims_of
 from jaxlidar.planning.size_buckets import size_bucket
+from jaxlidar.scenes.height_field import HeightField
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.surfaces import AbstractSheet
+from jaxlidar.scenes.terrain import Terrain
 
 # A flight crosses at most so many voxels, because a batch waits for its longest flight.
 MAX_VOXELS = 16_384
-# Fine bins of a ray segment at most.
+# Fine bins of a ray segment at most: all deposits are spread over as many bins as the longest needs.
 _MAX_SEGMENT_BINS = 64
-# Bins that a segment touches beside those of its length: partial bins at both ends, and the smoothing kernel.
+# Bins that a segment touches besides those of its length: partial bins at both ends, and the kernel's.
 _SEGMENT_MARGIN = 3
+# Points of the rim of a footprint; those where footprints are many, and how many that is.
+_RIM_POINTS, _COARSE_RIM_POINTS, _MANY_FOOTPRINTS = 32, 8, 1000
+# Footprint radii out to the rim. Outside of 2.5 is 4e-6 of a Gaussian beam, outside of 2 is 3e-4.
+_PATH_RADII, _TERRAIN_RADII = 2.5, 2.0
+
+
+class FootprintRims(NamedTuple):
+    """Lines along the axis of each beam, first, and around it.
+
+    - `aim`: aim points, m. - `points`: where the lines cross the plane through the aim point across the
+      beam, relative to it, m. - `rays`: unit vectors from the sensor to these points, `distance` m away.
+    - `slant_range`: distance of the aim point from the sensor, m.
+    """
+
+    aim: Float[np.ndarray, "shots lines 3"]
+    points: Float[np.ndarray, "shots lines 3"]
+    rays: Float[np.ndarray, "shots lines 3"]
+    distance: Float[np.ndarray, "shots lines"]
+    slant_range: Float[np.ndarray, "shots lines"]
+
+
+def footprint_rims(survey: Survey, n_radii: float) -> FootprintRims:
+    """Return the axes of all beams, and lines around them `n_radii` footprint radii out."""
+    n_points = _RIM_POINTS if len(survey) <= _MANY_FOOTPRINTS else _COARSE_RIM_POINTS
+    # A coarse polygon is laid about the rim instead of into it, so that it encloses the rim.
+    polygon_inradius = 1.0 if n_points == _RIM_POINTS else np.cos(np.pi / n_points)
+    radius = n_radii * survey.footprint_radius / polygon_inradius
+    axis, slant_range = survey.direction, survey.slant_range
+    # Any direction across the axis; of x and y that which is not nearly along it.
+    across = np.cross(axis, np.where(np.abs(axis[:, :1]) < 0.7, [[1.0, 0, 0]], [[0, 1.0, 0]]))
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    third = np.cross(axis, across)
+    angle = np.linspace(0, 2 * np.pi, n_points + 1)[:, None]
+    circle = np.cos(angle) * across[:, None] + np.sin(angle) * third[:, None]
+    points = np.pad(radius[:, None, None] * circle, ((0, 0), (1, 0), (0, 0)))
+    rays = (axis * slant_range[:, None])[:, None] + points
+    distance = np.linalg.norm(rays, axis=2)
+    aim = np.broadcast_to(np.pad(survey.position, ((0, 0), (0, 1)))[:, None], points.shape)
+    slant_range = np.broadcast_to(slant_range[:, None], distance.shape)
+    return FootprintRims(aim, points, rays / distance[..., None], distance, slant_range)
 
 
 class PathLengths:
@@ -27,8 +74,8 @@ class PathLengths:
 
     Those of a survey are bounds for all of its shots.
 
-    - `first`, `last`: two-way path, m, of the first and the last return of order one, relative to that of the
-      aim point.
+    - `first_path`, `last_path`: two-way path, m, of the first and the last return of order one, relative to
+      that of the aim point.
     - `start_distance`: distance before the reference plane, m, at which all rays start.
     - `vertical`: True if all beams are at nadir.
 
@@ -39,12 +86,15 @@ class PathLengths:
         self.scene = scene
         shots = Survey.of(lidar) if survey is None else survey
         self.vertical = not np.any(shots.zenith)
-        # 2.5 footprint radii hold all but 4e-6 of a Gaussian beam.
-        aim, points, self.rays, distance, slant = (a.reshape(-1, *a.shape[2:]) for a in rims_of(shots, 2.5))
+        # Lines of all shots alike.
+        aim, points, self.rays, distance, slant_range = (
+            array.reshape(-1, *array.shape[2:]) for array in footprint_rims(shots, _PATH_RADII)
+        )
         # Distances from the reference plane at which rays meet surfaces, and the map's bottom and top.
         crossings = []
         for s in scene.surfaces:
             crossed, towards = s.shape.crossing(points + aim, self.rays)
+            # Sheets are met from both sides, the ground only from above.
             met = np.abs(towards) > 1e-6 if isinstance(s, AbstractSheet) else towards < -1e-6
             if met.any():
                 crossings.append(crossed[met])
@@ -56,10 +106,12 @@ class PathLengths:
                 crossings.append((z - points[:, 2]) / self.rays[:, 2])
         distances = np.concatenate(crossings) if crossings else np.zeros(1)
         nearest, farthest = float(distances.min()), float(distances.max())
-        self.first = 2.0 * nearest
-        self.last = 2.0 * (farthest + float(np.max(distance - slant)))
+        self.first_path = 2.0 * nearest
+        # Rays at the rim are longer than the axis, from which paths are counted.
+        self.last_path = 2.0 * (farthest + float(np.max(distance - slant_range)))
+        # A twentieth of the extent before the first surface: the plan also serves scenes a little higher.
         self.start_distance = 0.05 * (farthest - nearest) + 1e-3 - nearest
-        lowest = float(np.min(slant))
+        lowest = float(np.min(slant_range))
         if self.start_distance >= lowest:
             altitude = concrete_number(lidar.altitude)
             raise ValueError(
@@ -72,34 +124,43 @@ class PathLengths:
         """Longest chord, m, of a footprint ray within one voxel."""
         if self.scene.canopy is None:
             return 1e-3
-        steep = float(np.abs(self.rays[:, 2]).min())
-        return float(min(np.linalg.norm(self.size), self.size[2] / steep)) * (1 + 1e-5)
+        # A chord ends at the voxel's diagonal, or where the most inclined ray leaves the layer. The relative
+        # slack covers the rounding of single precision.
+        least_cosine = float(np.abs(self.rays[:, 2]).min())
+        return float(min(np.linalg.norm(self.size), self.size[2] / least_cosine)) * (1 + 1e-5)
 
-    def first_steps(self, step: float) -> int:
-        """Return a bound on the number of segments of a footprint ray, none longer than `step` m."""
+    def max_ray_segments(self, max_segment: float) -> int:
+        """Return a bound on the number of segments of a footprint ray, none longer than `max_segment` m.
+
+        A segment ends where the ray leaves a layer, crosses a side face, has the greatest length, or meets a
+        surface. Side faces are as many as columns that the ray passes over the height of the map.
+        """
         if self.scene.canopy is None:
             return 0
-        steep = np.abs(self.rays[:, 2]).min()
+        least_cosine = np.abs(self.rays[:, 2]).min()
         height = self.size[2] * self.shape[2]
-        sideways = np.ceil(np.abs(self.rays[:, :2]).max(0) / steep * height / self.size[:2]) + 1
+        columns = np.ceil(np.abs(self.rays[:, :2]).max(0) / least_cosine * height / self.size[:2]) + 1
         if self.scene.canopy.sides == "open":
-            sideways = np.minimum(sideways, self.shape[:2])
-        divided = 0 if step >= self.longest_chord else math.ceil(height / steep / step)
-        return int(self.shape[2] + sideways.sum() + divided + len(self.scene.surfaces) + 2)
+            # Rays that leave an open map do not come back.
+            columns = np.minimum(columns, self.shape[:2])
+        divided = 0 if max_segment >= self.longest_chord else math.ceil(height / least_cosine / max_segment)
+        return int(self.shape[2] + columns.sum() + divided + len(self.scene.surfaces) + 2)
 
-    def longest_flight(self, longest: float) -> float:
+    def longest_flight(self, path: float) -> float:
         """Return the length, m, up to which flights are followed.
 
-        It includes all flights whose light returns within `longest` m of the first return. Within a periodic
+        It includes all flights whose light returns within `path` m of the first return. Within a periodic
         canopy light could fly on almost for ever: under a beam of more than 64 degrees the length is
-        at most ten times the sum of `longest` and the height of the canopy, and no flight crosses more than
+        at most ten times the sum of `path` and the height of the canopy, and no flight crosses more than
         `MAX_VOXELS` voxels.
         """
         if self.scene.canopy is None or self.scene.canopy.sides == "open":
             return FAR
-        # A flight of s m within the canopy lengthens the path by at least s (1 - sin) - height cos.
-        height, cos = self.size[2] * self.shape[2], float(np.abs(self.rays[:, 2]).min())
-        flight = (longest + height * cos) / max(1.0 - math.sqrt(1.0 - cos * cos), 0.1)
+        # Let theta be the beam's zenith angle. A flight of s m within the canopy, up by at most its height,
+        # comes closer to the sensor by at most s sin(theta) + height cos(theta). So it lengthens the path by
+        # at least s (1 - sin(theta)) - height cos(theta).
+        height, cosine = self.size[2] * self.shape[2], float(np.abs(self.rays[:, 2]).min())
+        flight = (path + height * cosine) / max(1.0 - math.sqrt(1.0 - cosine * cosine), 0.1)
         return float(min(flight, self.longest_march))
 
     @property
@@ -107,16 +168,17 @@ class PathLengths:
         """Length, m, of the longest flight through a periodic canopy that crosses at most `MAX_VOXELS`."""
         return float(max(MAX_VOXELS - self.shape[2], 1) / np.sum(1.0 / self.size[:2]))
 
-    def march_steps(self, longest: float) -> int:
-        """Return a bound on the number of voxels that a flight of `longest_flight` crosses."""
+    def max_faces(self, path: float) -> int:
+        """Return a bound on the number of voxel faces that a flight of `longest_flight(path)` crosses."""
         if self.scene.canopy is None:
             return 0
         if self.scene.canopy.sides == "open":
             return int(self.shape.sum()) + 3
-        return self.voxels_along(self.longest_flight(longest))
+        return self.voxels_along(self.longest_flight(path))
 
     def voxels_along(self, flight: float) -> int:
         """Return a bound on the voxels of a periodic canopy that a flight of that length, m, crosses."""
+        # A flight crosses each layer once. Three more, one for each axis, as it starts within a voxel.
         return int(self.shape[2] + sum(math.ceil(flight / s) for s in self.size[:2])) + 3
 
 
@@ -127,9 +189,51 @@ def longest_segment(chord: float, bin_length: float, max_step: float | None) -> 
     is a size bucket, and segments may be somewhat longer than the chord, so that one plan serves other
     directions, too.
     """
+    # The slack of 1e-6 keeps a whole number of bins from being rounded up; 2 % are for other directions.
     if max_step is not None:
         segment = min(max_step, chord)
         return segment, max(math.ceil(segment / bin_length - 1e-6) + _SEGMENT_MARGIN, KERNEL_BINS)
     bins = min(math.ceil(1.02 * chord / bin_length), _MAX_SEGMENT_BINS)
     span = max(size_bucket(bins + _SEGMENT_MARGIN, 4), KERNEL_BINS)
     return (span - _SEGMENT_MARGIN) * bin_length, span
+
+
+def check_footprints_on_terrain(shots: Lidar | Survey, scene: Scene) -> None:
+    """Refuse footprints that lie partly off open terrain. 3e-4 of a Gaussian beam may lie off it.
+
+    **Raises:** ValueError with the shot and both extents.
+    """
+    ground = scene.ground
+    if not (isinstance(ground, Terrain) and ground.relief and ground.sides == "open"):
+        return
+    survey = shots if isinstance(shots, Survey) else Survey.of(shots)
+    origin, end, heights = concrete_array(ground.origin), ground.end, concrete_array(ground.heights)
+    rims = footprint_rims(survey, _TERRAIN_RADII if survey.lidar.profile == "gaussian" else 1.0)
+    # Rays that do not go down meet no ground: a tiny slope puts them far off the terrain.
+    downward = np.minimum(rims.rays[..., 2:], -1e-9)
+    ends = [
+        rims.points + rims.rays * (z - rims.points[..., 2:]) / downward
+        for z in (heights.min(), heights.max())
+    ]
+    # First, for all shots at once: between the terrain's extreme heights all rays meet the ground. Only shots
+    # whose extent crosses the border are looked at closely, with the heights beneath them.
+    low, high = (f(np.concatenate(ends, axis=1)[..., :2], axis=1) + survey.position for f in (np.min, np.max))
+    for i in np.flatnonzero(np.any((low < origin) | (high > end), axis=1)):
+        position = survey.position[i]
+        # Coordinates about the aim point, as those of the rim.
+        shape = ground.moved(-position).shape
+        assert isinstance(shape, HeightField)
+        box, lowest, highest = shape.height_bounds_below(rims.points[i], rims.rays[i])
+        box = box + position
+        if np.all(box[0] >= origin) and np.all(box[1] <= end):
+            continue
+        footprint = "the footprint" if len(survey) == 1 else f"the footprint of shot {i} of {len(survey)}"
+        extents = (
+            f"{axis} = {a:.2f} to {b:.2f} m"
+            for span in (box, (origin, end))
+            for axis, a, b in zip("xy", *span)
+        )
+        raise ValueError(
+            "{} lies off the terrain: between heights of {:.6g} and {:.6g} m it takes in {} and {}; the "
+            "terrain has {} and {}".format(footprint, lowest, highest, *extents)
+        )

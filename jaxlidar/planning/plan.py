@@ -13,8 +13,16 @@ from jaxlidar.optics.laws import AbstractMirror
 from jaxlidar.planning.channels import largest_albedo, number_channels, reflection_probability, scene_optics
 from jaxlidar.planning.config import PathLimits, TimeBins, TraceConfig
 from jaxlidar.planning.effect_table import effect_table, table_lines
-from jaxlidar.planning.effects import Effect, empty, flattened, only_planes, present, switched_off, without
-from jaxlidar.planning.local_origin import about_aim
+from jaxlidar.planning.effects import (
+    Effect,
+    consists_of_planes,
+    find_empty_materials,
+    present_effects,
+    replace_plane_terrain,
+    switched_off_effects,
+    without_effects,
+)
+from jaxlidar.planning.local_origin import move_aim_to_origin
 from jaxlidar.planning.memory import (
     check_memory,
     in_words,
@@ -24,10 +32,9 @@ from jaxlidar.planning.memory import (
     simulation_bytes,
 )
 from jaxlidar.planning.orders import choose_orders, max_degree, multiple_scattering_tail, order_steps
-from jaxlidar.planning.parallel_light import one_direction, parallel_light
-from jaxlidar.planning.path_lengths import PathLengths, longest_segment
+from jaxlidar.planning.parallel_light import beams_are_parallel, parallel_light_bound
+from jaxlidar.planning.path_lengths import PathLengths, check_footprints_on_terrain, longest_segment
 from jaxlidar.planning.record_times import fine_bin, times_of, with_air
-from jaxlidar.planning.rims import check_on_terrain
 from jaxlidar.planning.size_buckets import size_bucket
 from jaxlidar.scenes.scene import Scene, check_kinds
 from jaxlidar.scenes.surfaces import AbstractSheet
@@ -259,22 +266,22 @@ def plan(
     if max_memory is not None:
         check_range("max_memory", max_memory, 0.0, low_open=True)
     check_choice("footprint", footprint, ("random", "fixed"))
-    check_on_terrain(lidar if survey is None else survey, scene)
+    check_footprints_on_terrain(lidar if survey is None else survey, scene)
     survey = None if survey is None else survey.about(concrete_array(lidar.position))
-    lidar, scene = about_aim(lidar, scene)
+    lidar, scene = move_aim_to_origin(lidar, scene)
     # 1. Effects: leaf or bark that is zero everywhere and relief of flat terrain are off, then what the user
     # switches off. The table compares with everything else in place.
-    empty_materials = empty(scene, effects)
-    scene = without(lidar, scene, empty_materials)[1]
-    with_relief, scene = scene, flattened(scene, effects)
+    empty_materials = find_empty_materials(scene, effects)
+    scene = without_effects(lidar, scene, empty_materials)[1]
+    with_relief, scene = scene, replace_plane_terrain(scene, effects)
     flat_terrain = scene is not with_relief
     complete_scene = scene
-    off = switched_off(effects, present(lidar, scene), max_orders)
+    off = switched_off_effects(effects, present_effects(lidar, scene), max_orders)
     off = (*off, *(("relief",) if flat_terrain else ()), *empty_materials)
     complete_lidar = lidar
-    lidar, scene = without(lidar, scene, off)
+    lidar, scene = without_effects(lidar, scene, off)
     # 2. Orders of scattering, from the optics.
-    geometry = PathLengths(lidar, scene, survey)
+    path_lengths = PathLengths(lidar, scene, survey)
     optics = scene_optics(lidar, scene)
     scatterers = number_channels(optics)
     n_channels, n_plates = len(scatterers.channels), len(scene.plates)
@@ -287,13 +294,14 @@ def plan(
     jitter, interval = concrete_number(lidar.jitter), concrete_number(lidar.sampling_interval)
     pulse_feature = math.hypot(concrete_number(lidar.pulse.finest), jitter)
     pulse_duration = math.hypot(concrete_number(lidar.pulse.std), jitter)
-    first_return, last_return = geometry.first / SPEED_OF_LIGHT, geometry.last / SPEED_OF_LIGHT
+    first_return = path_lengths.first_path / SPEED_OF_LIGHT
+    last_return = path_lengths.last_path / SPEED_OF_LIGHT
     tail = multiple_scattering_tail(scene, optics, first_return, last_return) if orders > 1 else 0.0
     target_width = fine_bin(interval, pulse_feature, pulse_duration, bin_width)
-    bins, samples = times_of(lidar, scene, geometry, tail, window, target_width)
+    bins, samples = times_of(lidar, scene, path_lengths, tail, window, target_width)
     bins_with_air = with_air(bins, lidar, samples)
     bin_length = 0.5 * SPEED_OF_LIGHT * bins.width
-    max_segment, max_span = longest_segment(geometry.longest_chord, bin_length, max_step)
+    max_segment, max_span = longest_segment(path_lengths.longest_chord, bin_length, max_step)
     max_path = SPEED_OF_LIGHT * (bins.start + bins.width * bins.count)
     bins = dataclasses.replace(bins, max_span=max_span, count=size_bucket(bins.count, 4))
     pulse_support = lidar.pulse.support(jitter)
@@ -304,7 +312,7 @@ def plan(
         n_rays = 4096 if orders == 1 or footprint == "fixed" else 2048 if short_pulse else 1024
     # Rays march through steps that they do not need: buckets are at most a quarter apart where steps are few,
     # a sixteenth where they are many.
-    ray_segments = geometry.first_steps(max_segment)
+    ray_segments = path_lengths.max_ray_segments(max_segment)
     wide_beam = "divergence" not in off
     config = TraceConfig(
         materials=scatterers.materials,
@@ -318,10 +326,10 @@ def plan(
         mirrors=tuple(isinstance(s.law, AbstractMirror) for s in scene.surfaces),
         has_ground=scene.ground is not None,
         hotspot=scene.canopy is not None and scene.canopy.hotspot,
-        vertical=geometry.vertical,
+        vertical=path_lengths.vertical,
         returns_specular="specular return" not in off,
         max_ray_segments=size_bucket(ray_segments, 4 if ray_segments <= 128 else 16),
-        max_faces=size_bucket(geometry.march_steps(max_path + geometry.start_distance)),
+        max_faces=size_bucket(path_lengths.max_faces(max_path + path_lengths.start_distance)),
         order_steps=steps,
         # Without a canopy all deposit points of a flight would be on the same surface.
         deposits_per_flight=1 if scene.canopy is None else DEPOSITS_PER_FLIGHT,
@@ -331,13 +339,13 @@ def plan(
         # A beam without width is one ray.
         n_rays=int(n_rays) if wide_beam else 1,
         n_photons=int(n_photons),
-        smooth_footprint=only_planes(scene) and wide_beam,
+        smooth_footprint=consists_of_planes(scene) and wide_beam,
         random_footprint=footprint == "random" and wide_beam,
     )
     limits = PathLimits(
-        start_distance=geometry.start_distance,
+        start_distance=path_lengths.start_distance,
         max_segment=max_segment,
-        max_flight=geometry.longest_flight(max_path + geometry.start_distance),
+        max_flight=path_lengths.longest_flight(max_path + path_lengths.start_distance),
         max_path=max_path,
         reflection_probability=reflection_probability(optics),
         orders=orders,
@@ -376,11 +384,11 @@ def plan(
             off,
             order_choice,
             bins_with_air,
-            geometry.start_distance,
+            path_lengths.start_distance,
             records_all_of_order_one=window is None,
         )
-        if survey is not None and one_direction(survey):
-            bound = parallel_light(survey, geometry.start_distance, last_return)
+        if survey is not None and beams_are_parallel(survey):
+            bound = parallel_light_bound(survey, path_lengths.start_distance, last_return)
             reason = "neglected where footprints share light"
             table += (Effect("spreading of rays", False, reason, bound, "samples"),)
     return Plan(

@@ -8,12 +8,11 @@ from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.optics.laws import AbstractMirror
 from jaxlidar.planning.channels import largest_albedo, number_channels, scene_optics
-from jaxlidar.planning.effects import empty, only_planes, without
-from jaxlidar.planning.local_origin import about_aim
+from jaxlidar.planning.effects import consists_of_planes, find_empty_materials, without_effects
+from jaxlidar.planning.local_origin import move_aim_to_origin
 from jaxlidar.planning.orders import choose_orders
-from jaxlidar.planning.path_lengths import PathLengths
+from jaxlidar.planning.path_lengths import PathLengths, check_footprints_on_terrain
 from jaxlidar.planning.plan import Plan
-from jaxlidar.planning.rims import check_on_terrain
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.surfaces import AbstractSheet
 from jaxlidar.scenes.terrain import Terrain
@@ -39,16 +38,16 @@ def check_reach(plan: Plan, lidar: Lidar, scene: Scene) -> None:
 
 
 def _check(plan: Plan, lidar: Lidar, scene: Scene, checks: Sequence[Callable]) -> None:
-    check_on_terrain(lidar, scene)
+    check_footprints_on_terrain(lidar, scene)
     ground = scene.ground
     if plan.scope.flat_terrain and isinstance(ground, Terrain) and ground.relief and not ground.is_plane():
         raise ValueError("the plan does not fit: it takes the terrain for a plane; make one for this terrain")
     for name in plan.scope.empty_materials:
-        if name not in empty(scene):
+        if name not in find_empty_materials(scene):
             raise ValueError(
                 f"the plan does not fit: it is for a map without {name}; make one for this scene"
             )
-    lidar, scene = without(*about_aim(lidar, scene), plan.off)
+    lidar, scene = without_effects(*move_aim_to_origin(lidar, scene), plan.off)
     for check in checks:
         for misfit in check(plan, lidar, scene):
             raise ValueError(f"the plan does not fit: {misfit}; make one for this lidar and this scene")
@@ -87,7 +86,7 @@ def _misfit_materials(plan: Plan, lidar: Lidar, scene: Scene) -> Iterator[str]:
         yield f"it has hotspot = {config.hotspot}; the canopy has not"
     if config.vertical and concrete_number(lidar.zenith) != 0:
         yield f"it is for a beam at nadir; zenith = {concrete_number(lidar.zenith):g} degrees"
-    if config.smooth_footprint and not only_planes(scene):
+    if config.smooth_footprint and not consists_of_planes(scene):
         yield "it is for planes; the scene has more"
     albedo = largest_albedo(optics)
     if scope.automatic_orders and albedo > scope.albedo + 1e-3:
@@ -102,7 +101,7 @@ def _misfit_materials(plan: Plan, lidar: Lidar, scene: Scene) -> Iterator[str]:
 def _misfit_lengths(plan: Plan, lidar: Lidar, scene: Scene) -> Iterator[str]:
     """Yield misfits in the lengths of paths, and in the numbers of loop steps that they need."""
     lengths, config, limits = PathLengths(lidar, scene), plan.config, plan.limits
-    top = -0.5 * lengths.first
+    top = -0.5 * lengths.first_path
     if top > limits.start_distance:
         yield (
             f"its rays start {limits.start_distance:g} m before the reference plane; the scene reaches to "
@@ -111,12 +110,12 @@ def _misfit_lengths(plan: Plan, lidar: Lidar, scene: Scene) -> Iterator[str]:
     # A plan's segments may be longer than any chord of this scene: then the chords decide, unless the plan's
     # own length, which cuts them no shorter, needs fewer steps.
     segment, chord = limits.max_segment, lengths.longest_chord
-    if chord < segment and lengths.first_steps(chord) > config.max_ray_segments:
+    if chord < segment and lengths.max_ray_segments(chord) > config.max_ray_segments:
         segment = chord
     longest = limits.max_path + limits.start_distance
     counts = {
-        "segments of a ray": (lengths.first_steps(segment), config.max_ray_segments),
-        "voxels along a flight": (lengths.march_steps(longest), config.max_faces),
+        "segments of a ray": (lengths.max_ray_segments(segment), config.max_ray_segments),
+        "voxels along a flight": (lengths.max_faces(longest), config.max_faces),
     }
     for name, (needed, planned) in counts.items():
         if needed > planned:
@@ -129,7 +128,7 @@ def _misfit_lengths(plan: Plan, lidar: Lidar, scene: Scene) -> Iterator[str]:
 def _misfit_times(plan: Plan, lidar: Lidar, scene: Scene) -> Iterator[str]:
     """Yield misfits in the times at which light returns."""
     lengths, bins, scope = PathLengths(lidar, scene), plan.bins, plan.scope
-    first, last = lengths.first / SPEED_OF_LIGHT, lengths.last / SPEED_OF_LIGHT
+    first, last = lengths.first_path / SPEED_OF_LIGHT, lengths.last_path / SPEED_OF_LIGHT
     begin, end = bins.start, plan.limits.max_path / SPEED_OF_LIGHT - bins.width
     if not scope.automatic_window:
         # What a window leaves out is the caller's choice, for scenes no larger than the plan's.

@@ -33,7 +33,7 @@ def fine_bin(interval: float, pulse_feature: float, duration: float, bin_width: 
 def times_of(
     lidar: Lidar,
     scene: Scene,
-    geometry: PathLengths,
+    path_lengths: PathLengths,
     tail: float,
     window: tuple[float, float] | None,
     target: float,
@@ -49,7 +49,7 @@ def times_of(
     if lidar.receiver.window == "first return":
         # Sampled finely here; the digitiser's own bins are laid when the first return is known.
         interval, bins_per_sample = width, 1
-    first, last = geometry.first / SPEED_OF_LIGHT, geometry.last / SPEED_OF_LIGHT
+    first, last = path_lengths.first_path / SPEED_OF_LIGHT, path_lengths.last_path / SPEED_OF_LIGHT
     last += tail
     if window is None:
         begin = math.floor((first + low) / interval) * interval

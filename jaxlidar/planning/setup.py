@@ -10,8 +10,8 @@ from jaxtyping import Array, Float
 from jaxlidar._checks import briefly, check_kind, is_traced
 from jaxlidar._ranges import inadmissible
 from jaxlidar.instrument.lidar import Lidar
-from jaxlidar.planning.effects import without
-from jaxlidar.planning.local_origin import about_aim
+from jaxlidar.planning.effects import without_effects
+from jaxlidar.planning.local_origin import move_aim_to_origin
 from jaxlidar.planning.plan import Plan
 from jaxlidar.scenes.scene import Scene, check_kinds
 from jaxlidar.scenes.terrain import Terrain
@@ -87,4 +87,4 @@ def make_setup(lidar: Lidar, scene: Scene, plan: Plan) -> Setup:
     admissible = jnp.ones(())
     if any(is_traced(x) for x in jax.tree.leaves((lidar, scene))):
         admissible = jnp.where(inadmissible((lidar, scene)), jnp.nan, admissible)
-    return Setup(*without(*about_aim(lidar, scene), plan.off), plan, admissible)
+    return Setup(*without_effects(*move_aim_to_origin(lidar, scene), plan.off), plan, admissible)

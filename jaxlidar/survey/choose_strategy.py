@@ -8,8 +8,8 @@ from jaxlidar._checks import concrete_array, concrete_number
 from jaxlidar._summary import percent
 from jaxlidar.instrument.survey import Survey
 from jaxlidar.optics.laws import AbstractMirror
-from jaxlidar.planning.local_origin import about_aim
-from jaxlidar.planning.parallel_light import one_direction, parallel_light
+from jaxlidar.planning.local_origin import move_aim_to_origin
+from jaxlidar.planning.parallel_light import beams_are_parallel, parallel_light_bound
 from jaxlidar.planning.plan import DEFAULT_RTOL, Plan
 from jaxlidar.planning.plan import plan as make_plan
 from jaxlidar.planning.setup import Setup, make_setup
@@ -66,7 +66,7 @@ def choose_strategy(
     setup = make_setup(middle, scene, plan)
     # Coordinates are relative to the survey's middle, where single precision is fine. A scene that cannot be
     # moved keeps its coordinates, and the lidar its position.
-    lidar, _ = about_aim(middle, scene)
+    lidar, _ = move_aim_to_origin(middle, scene)
     relative_survey = survey.about(concrete_array(middle.position) - concrete_array(lidar.position))
     strategy = _shared_illumination(relative_survey, setup, rtol, shared)
     return PerShotStrategy(setup, relative_survey, rtol) if strategy is None else strategy
@@ -139,7 +139,7 @@ def _is_by_shot(survey: Survey) -> bool:
 
 
 def _parallel_light_bound(survey: Survey, setup: Setup) -> float:
-    return parallel_light(survey, setup.plan.limits.start_distance, setup.plan.scope.last_return)
+    return parallel_light_bound(survey, setup.plan.limits.start_distance, setup.plan.scope.last_return)
 
 
 def _groups(
@@ -155,7 +155,7 @@ def _groups(
 def reason_against_sharing(survey: Survey, setup: Setup, rtol: float) -> str | None:
     """Return the reason why the shots of a survey cannot share light; None where they can."""
     canopy, lidar = setup.scene.canopy, setup.lidar
-    if not one_direction(survey):
+    if not beams_are_parallel(survey):
         return "shots have more than one direction"
     if _is_by_shot(survey) and setup.plan.orders == 1:
         return "one order is followed, which shots that lean or have a field of view do not share"

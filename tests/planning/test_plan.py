@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxlidar as jl
-from jaxlidar.planning.effects import NAMES, without
+from jaxlidar.planning.effects import EFFECT_NAMES, without_effects
 from tests.helpers import slab
 
 GROUND = jl.Ground(reflectance=0.3)
@@ -129,18 +129,18 @@ def test_switching_off_is_the_scene_without():
         "specular return": (lidar, scene),
     }
     for name, pair in expected.items():
-        assert eqx.tree_equal(without(lidar, scene, (name,)), pair), name
+        assert eqx.tree_equal(without_effects(lidar, scene, (name,)), pair), name
 
 
 def test_without_twice_is_without_once():
     scene = jl.Scene(TREES, (PLATE,), jl.Ground(slope=20.0, height=1.0, aspect=50.0), HAZE)
     lidar = jl.Lidar(zenith=10.0, position=(2.0, 3.0), field_of_view=1.0, jitter=0.1)
-    once = without(lidar, scene, NAMES)
+    once = without_effects(lidar, scene, EFFECT_NAMES)
     assert eqx.tree_equal(once[1], jl.Scene())
     assert once[0].field_of_view is None
     off = ("slope spread", "leaf")
-    first_pass = without(lidar, scene, off)
-    twice = without(*first_pass, off)
+    first_pass = without_effects(lidar, scene, off)
+    twice = without_effects(*first_pass, off)
     assert all(
         np.allclose(a, b, rtol=1e-5) for a, b in zip(*map(jax.tree.leaves, (first_pass, twice)), strict=True)
     )
@@ -196,7 +196,7 @@ def test_every_effect_has_a_line_in_the_table():
     plan = jl.plan(jl.Lidar(), scene, effects={"bark": False})
     lines = str(plan).splitlines()
     assert max(map(len, lines)) <= 110
-    for name in (*NAMES, f"orders beyond {plan.orders}", "scattering within the atmosphere"):
+    for name in (*EFFECT_NAMES, f"orders beyond {plan.orders}", "scattering within the atmosphere"):
         (line,) = (text for text in lines if text.startswith(name + " "))
         row = effect(plan, name)
         assert line.split()[len(name.split())] == ("yes" if row.simulated else "no")
