@@ -57,6 +57,7 @@ def waveforms_in_memory(
     start_time: float,
 ) -> Waveforms:
     """Return all waveforms. `survey_fields`: the fields of `Waveforms` that are known before any tracing."""
+    # Blocks come in the order of shots.
     blocks = [results for _, results in strategy.shot_results(task_results)]
     results: ShotResults = jax.tree.map(lambda *a: np.concatenate(a), *blocks)
     _warn_of_late_light(strategy, float(np.max(results.energy_budget["after the window"], initial=0.0)))
@@ -130,6 +131,7 @@ def _as_arrays(result: Any) -> dict[str, np.ndarray]:
     arrays, fields = {}, vars(result) if dataclasses.is_dataclass(result) else result._asdict()
     for field, value in fields.items():
         if isinstance(value, dict):
+            # Files of arrays know no dicts: without a name of its own, an empty one would be lost.
             items = {f"{field}/{item}": array for item, array in value.items()}
             arrays |= items or {f"{field}/": np.empty(0)}
         elif value is not None:
