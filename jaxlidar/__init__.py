@@ -121,7 +121,7 @@ from jaxlidar.simulate import LateLightWarning, simulate
 from jaxlidar.spectral.waveform import Waveform, total_reflectance, waveform_of
 from jaxlidar.survey.coverage import OffMapWarning
 from jaxlidar.survey.progress import SurveyProgress
-from jaxlidar.survey.run import simulate_many
+from jaxlidar.survey.simulate_many import simulate_many
 from jaxlidar.survey.truths import Truths
 from jaxlidar.survey.waveforms import Waveforms
 from jaxlidar.trace.response import Response, trace_scene

@@ -46,6 +46,15 @@ def test_examples_run_as_printed(path, number, tmp_path, monkeypatch):
         assert np.all(np.isfinite(np.asarray(names["wave"].reflectance)))
 
 
+@pytest.mark.parametrize("path", PAGES, ids=page_name)
+def test_printed_output_is_that_of_the_example_above_it(path, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    pairs = r"^```python\n((?:(?!^```).)*)^```\n\n```text\n(.*?)^```"
+    for code, printed in re.findall(pairs, path.read_text(), re.MULTILINE | re.DOTALL):
+        exec(compile(code, page_name(path), "exec"), {})
+        assert [line.rstrip() for line in capsys.readouterr().out.splitlines()] == printed.splitlines()
+
+
 def anchor(heading):
     """Return the anchor of a heading, as renderers of Markdown make it."""
     return re.sub(r"[^\w\- ]", "", heading.strip().lower()).replace(" ", "-")

@@ -42,6 +42,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from jaxlidar._checks import (
     as_scalar,
+    briefly,
     check_choice,
     check_integer,
     check_kind,
@@ -73,6 +74,7 @@ _Batch = Float[Array, "leaves *wavelengths"]
 
 
 @final
+@briefly
 class Prospect(eqx.Module):
     """A leaf by the PROSPECT model: `R, T = leaf(wavelengths)` are its reflectance and transmittance.
 

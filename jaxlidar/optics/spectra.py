@@ -32,6 +32,7 @@ from jaxtyping import Array, ArrayLike, Float
 from jaxlidar._checks import (
     array,
     as_array,
+    briefly,
     check_choice,
     check_kind,
     check_range,
@@ -46,6 +47,7 @@ _LARGEST_SINGLE = float(np.finfo(np.float32).max)
 
 
 @final
+@briefly
 class Spectrum(eqx.Module):
     """A reflectance spectrum, linear between its samples: `spectrum(wavelength)` is the reflectance.
 
