@@ -247,7 +247,7 @@ def test_the_waveforms_of_a_survey(survey, monkeypatch, tmp_path):
     assert np.array_equal(again.time, got.time)
     assert not np.array_equal(other.time[:9], got.time[:9])
     # A few shots at a time draw other numbers of the same kind.
-    monkeypatch.setattr(photon_counter, "_BLOCK", 16 * 50 * 2 * 150)
+    monkeypatch.setattr(photon_counter, "_BLOCK_SIZE", 16 * 50 * 2 * 150)
     parts = events_of(survey, 50, dead_time=0.0)
     assert set(parts.shot) == set(range(SHOTS))
     assert abs(len(parts) - mean.sum()) < Z_LIMIT * np.sqrt(mean.sum())

@@ -7,7 +7,7 @@ import pytest
 
 from jaxlidar._constants import PLANCK_TIMES_LIGHT
 from jaxlidar.instrument.receiver import Receiver, first_return_window, record
-from tests.helpers import NARROW
+from tests.helpers import BY_PRECISION
 
 WAVELENGTH = np.array([532.0, 1064.0])
 PHOTON = PLANCK_TIMES_LIGHT / WAVELENGTH
@@ -38,7 +38,7 @@ def test_the_default_changes_nothing_without_a_key(precision):
     np.testing.assert_array_equal(record(energy, WAVELENGTH, Receiver()), energy)
 
 
-@NARROW
+@BY_PRECISION
 def test_shot_noise_is_poisson(precision):
     """Means below the sampler's change of method at 10, above it, and where the normal takes over."""
     photons = np.array([[0.3, 4.0, 40.0, 900.0, 3e6], [2.0, 12.0, 150.0, 5e4, 2e9]])
@@ -59,7 +59,7 @@ def test_planted_wrong_noise_is_rejected():
     assert z_scores(swapped, photons * PHOTON[:, None] / PHOTON[::-1, None])[1] > Z_LIMIT
 
 
-@NARROW
+@BY_PRECISION
 def test_background_is_recorded_and_is_noisy(precision):
     receiver = Receiver(background=20 * PHOTON[1])
     energy = jnp.zeros((2, 3))

@@ -8,7 +8,7 @@ from scipy import stats
 
 import jaxlidar as jl
 
-HABITS = {"broadleaf": jl.broadleaf, "conifer": jl.conifer, "spreading": jl.spreading, "shrub": jl.shrub}
+HABITS = {"broadleaf": jl.broadleaf, "conifer": jl.conifer, "spreading": jl.spreading_tree, "shrub": jl.shrub}
 SEEDS = (0, 1, 2, 11)
 
 
@@ -150,7 +150,7 @@ def test_leaf_off_keeps_the_wood(individuals):
 
 def test_no_leaves_grow_in_the_ground():
     hanging = jl.Branching(angle=90.0, tropism=-25.0)
-    tree = jl.grow(jl.spreading(branches=hanging, height=3.0), seed=0)
+    tree = jl.grow(jl.spreading_tree(branches=hanging, height=3.0), seed=0)
     assert tree.end[:, 2].min() < 0
     assert tree.bud_position[:, 2].min() >= 0.03
     assert len(tree.bud_position) == len(tree.bud_direction) == len(tree.bud_radius) > 0
@@ -215,7 +215,7 @@ def test_a_forest_keeps_its_distances_and_density():
     gap = np.linalg.norm(place[:, None] - place[None], axis=2)[np.triu_indices(90, 1)]
     assert 2.5 <= gap.min() < 3.0
     again = jl.forest(jl.shrub(shoots=0), density=600.0, area=(50.0, 30.0), minimum_distance=2.5, seed=4)
-    assert all(np.array_equal(a.end, b.end) for a, b in zip(trees, again))
+    assert all(np.array_equal(a.end, b.end) for a, b in zip(trees, again, strict=True))
 
 
 def test_without_a_distance_places_are_even():

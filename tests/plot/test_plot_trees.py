@@ -40,7 +40,7 @@ def test_widths_are_to_scale(shrub, axes):
     plot_trees.tree(shrub, axes, elevation=0.0)
     drawn = named(axes)
     widths = np.asarray(drawn["bark"].get_linewidth())
-    thick = widths > plot_trees.THINNEST
+    thick = widths > plot_trees.MIN_LINEWIDTH
     scale = widths[thick] / (shrub.radius_start + shrub.radius_end)[thick]
     assert np.allclose(scale, scale[0])
     # A point is 1/72 inch; the axes are 5 inches of which the shrub takes a good part.

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from jaxlidar.scenes.atmosphere import Atmosphere, aerosol_extinction, rayleigh_optical_depth
-from tests.helpers import NARROW
+from tests.helpers import BY_PRECISION
 
 WAVELENGTHS = np.array([355.0, 532.0, 1064.0, 1550.0])
 
@@ -144,7 +144,7 @@ def test_backscatter_value():
     assert float(air.backscatter(532.0, 100.0, 100.0)) == pytest.approx(expected, rel=1e-5)
 
 
-@NARROW
+@BY_PRECISION
 def test_derivatives(precision):
     air = Atmosphere(visibility=15.0, lidar_ratio=50.0, base_height=200.0)
     heights = jnp.linspace(0.0, 30.0, 4)

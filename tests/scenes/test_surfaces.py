@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 import jaxlidar as jl
 from jaxlidar.extend import Vec, as_array, as_scalar
-from tests.helpers import WHOLE, agrees, batch_mean, whole_lidar
+from tests.helpers import SINGLE_SAMPLE, agrees, batch_mean, single_sample_lidar
 
 
 @final
@@ -70,7 +70,7 @@ class Disc(jl.AbstractSheet):
 
 
 # 20 m across, from 400 km.
-LIDAR = whole_lidar(profile="top-hat", divergence=0.05)
+LIDAR = single_sample_lidar(profile="top-hat", divergence=0.05)
 
 
 def sums(wave):
@@ -84,7 +84,7 @@ def scene(ground, **disc):
 @pytest.mark.parametrize(("reflectance", "transmittance"), [(0.6, 0.0), (0.5, 0.4)])
 def test_first_order_of_a_disc(reflectance, transmittance):
     what = scene(1.0, reflectance=reflectance, transmittance=transmittance)
-    plan = jl.plan(LIDAR, what, max_orders=1, n_rays=4096, **WHOLE)
+    plan = jl.plan(LIDAR, what, max_orders=1, n_rays=4096, **SINGLE_SAMPLE)
     mean, stderr = batch_mean(LIDAR, what, plan, seed=0, count=16, quantity=sums)
     share = (4.0 / 10.0) ** 2
     assert agrees(mean["disc"], stderr["disc"], reflectance * share, sigmas=4.0)
@@ -94,7 +94,7 @@ def test_first_order_of_a_disc(reflectance, transmittance):
 
 def test_a_disc_in_the_ledger_and_in_the_plan():
     what = scene(0.7, reflectance=0.5, transmittance=0.3)
-    wave = jl.simulate(LIDAR, what, key=jax.random.key(0), n_photons=65536, max_orders=8, **WHOLE)
+    wave = jl.simulate(LIDAR, what, key=jax.random.key(0), n_photons=65536, max_orders=8, **SINGLE_SAMPLE)
     assert float(sum(wave.energy_budget.values())[0]) == pytest.approx(1.0, abs=1e-4)
     assert set(wave.components) == {"ground", "disc", "first", "higher"}
     # No bound but the one that always holds is known for such a shape.

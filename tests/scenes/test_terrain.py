@@ -21,7 +21,7 @@ import pytest
 import jaxlidar as jl
 from jaxlidar.extend import vec
 from jaxlidar.scenes.height_field import HeightField
-from tests.helpers import WHOLE, agrees, batch_mean, whole_lidar
+from tests.helpers import SINGLE_SAMPLE, agrees, batch_mean, single_sample_lidar
 
 KEY = jax.random.key(3)
 X, Y = np.meshgrid(np.arange(21.0), np.arange(17.0), indexing="ij")
@@ -184,7 +184,7 @@ def test_a_valley_lights_itself():
         side = 1000.0
         valley = jl.Terrain([[side] * 2, [0.0] * 2, [side] * 2], (side, 2 * side), (-side, -side), 0.8)
         with pytest.warns(jl.UnitWarning):
-            lidar = whole_lidar(position=(1e-4, 0.0), divergence=5e-9, sampling_interval=2e4)
+            lidar = single_sample_lidar(position=(1e-4, 0.0), divergence=5e-9, sampling_interval=2e4)
         scene = jl.Scene(ground=valley)
         plan = jl.plan(lidar, scene, max_orders=12, window=(8000.0, 8001.0), bin_width=20.0)
         (total, absorbed), (e1, e2) = batch_mean(lidar, scene, plan, seed=0, count=16, quantity=energies)
@@ -208,10 +208,10 @@ def test_no_light_leaks_through_white_terrain():
 
 def test_a_raster_of_reflectance():
     """Of a plane with rho = a + b x: the mean over the footprint."""
-    lidar, level = whole_lidar(divergence=0.005), np.zeros_like(HILLS)
+    lidar, level = single_sample_lidar(divergence=0.005), np.zeros_like(HILLS)
     ramp = jl.Scene(ground=hills(heights=level, reflectance=0.3 + 0.02 * (X - 10.0)))
     off = dataclasses.replace(lidar, position=(2.5, 0.0))
-    plan = jl.plan(off, ramp, **WHOLE)
+    plan = jl.plan(off, ramp, **SINGLE_SAMPLE)
     assert plan.orders == 1
     assert not plan.config.smooth_footprint
     wave = jl.simulate(off, ramp, key=KEY, plan=plan)
@@ -221,9 +221,11 @@ def test_a_raster_of_reflectance():
 
 @pytest.mark.slow
 def test_a_raster_of_equal_numbers_is_one_number():
-    lidar = whole_lidar(divergence=0.005)
+    lidar = single_sample_lidar(divergence=0.005)
     number, raster = (jl.Scene(ground=hills(reflectance=rho)) for rho in (0.4, np.full_like(HILLS, 0.4)))
-    plans = [jl.plan(lidar, scene, max_orders=3, n_photons=1024, **WHOLE) for scene in (number, raster)]
+    plans = [
+        jl.plan(lidar, scene, max_orders=3, n_photons=1024, **SINGLE_SAMPLE) for scene in (number, raster)
+    ]
     one, other = (
         batch_mean(lidar, scene, plan, seed=0, count=2, quantity=energies)[0]
         for scene, plan in zip((number, raster), plans)
@@ -360,8 +362,8 @@ def test_a_slope_hides_what_lies_behind_it():
     """Looked at from the west, 60 degrees from the zenith, an eastern slope of 45 degrees is dark."""
     ridge = np.maximum(0.0, 6.0 - np.abs(X - 10.0))
     scene = jl.Scene(ground=hills(heights=ridge, reflectance=0.9))
-    lidar = whole_lidar(zenith=60.0, azimuth=90.0, altitude=1e3, position=(5.0, 0.0), divergence=0.5)
-    plan = jl.plan(lidar, scene, max_orders=2, n_photons=2048, n_rays=64, **WHOLE)
+    lidar = single_sample_lidar(zenith=60.0, azimuth=90.0, altitude=1e3, position=(5.0, 0.0), divergence=0.5)
+    plan = jl.plan(lidar, scene, max_orders=2, n_photons=2048, n_rays=64, **SINGLE_SAMPLE)
     setup = jl.make_setup(lidar, scene, plan)
     from jaxlidar.trace.device_scene import build_device_scene
 
