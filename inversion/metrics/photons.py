@@ -212,8 +212,8 @@ def _fit_ground(
             np.bincount(number, weight * a, n_segments)
             for a in (np.ones_like(x), x, x * x, residual, x * residual)
         )
-        # One is added to the sum of w x^2: a prior that the slope does not change, of the weight of a photon 1 m
-        # from the middle. It fixes the slope of segments in which x hardly varies.
+        # One is added to the sum of w x^2: a prior that the slope does not change, of the weight of a photon
+        # 1 m from the middle. It fixes the slope of segments in which x hardly varies.
         determinant = w * wxx - wx**2 + w
         w = np.maximum(w, 1e-300)
         slope_change = (w * wxr - wx * wr) / np.maximum(determinant, 1e-300)
