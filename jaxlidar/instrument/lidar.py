@@ -5,10 +5,11 @@ phi in which light travels, the unit vector of the beam is
 
     w = (sin(theta) sin(phi), sin(theta) cos(phi), -cos(theta)).
 
-The beam axis meets the reference plane at p = (x, y, 0), `position`. At the altitude H the slant range is R =
-H / cos(theta), the sensor stands at p - R w, and the footprint, perpendicular to the beam, has the radius R
-gamma / 2 for the full divergence gamma. Time zero of every waveform is the two-way travel time 2 R / c to p,
-not the emission: at the altitude of a satellite, absolute times in single precision would be off by 0.1 ns.
+The beam axis meets the reference plane at p = (x, y, 0), `position`. At the altitude H the slant range is
+R = H / cos(theta), the sensor stands at p - R w, and the footprint, perpendicular to the beam, has the radius
+R gamma / 2 for the full divergence gamma. Time zero of every waveform is the two-way travel time 2 R / c to
+p, not the emission: at the altitude of a satellite, absolute times in single precision would be off by
+0.1 ns.
 """
 
 import math

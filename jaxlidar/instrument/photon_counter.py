@@ -1,14 +1,14 @@
 r"""The photon counter: single events in place of a waveform, as spaceborne photon counters record them.
 
-The light of one pulse falls evenly on the pixels of the detector. What triggers a pixel is a Poisson process
-of rate
+The light of one pulse is spread evenly over the pixels of the detector. The photons and dark counts that
+trigger a pixel are a Poisson process of rate
 
 .. math:: \lambda(t) = \frac{p\, E'(t)}{(h c / \text{wavelength})\, n} + \frac{b}{n}
 
 for the detected power E', the detection probability p, the background rate b and n pixels. An event makes its
-pixel blind for the dead time, and what arrives meanwhile does not lengthen it (a non-paralysable dead time).
-A Poisson process has no memory. From the end t of a dead time on, the next event is therefore at the time t'
-where the integrated rate
+pixel blind for the dead time, which photons that arrive meanwhile do not lengthen (a non-paralysable dead
+time). A Poisson process has no memory. From the end t of a dead time on, the next event is therefore at the
+time t' where the integrated rate
 
 .. math:: \Lambda(t, t') = \int_t^{t'} \lambda(u)\, du
 
@@ -243,9 +243,10 @@ class _Draws(NamedTuple):
 def count_photons(wave: Any, counter: Any, key: Array | None, pulses: int) -> PhotonEvents:
     """Draw the events of `jaxlidar.record(wave, mode="photons")`.
 
-    1. Convert energies to the expected number of photons per pixel and sample, and sum them up to
-    `_PixelRate`. 2. Draw the events of all pixels and pulses (`_draw_events`), some shots at a time. 3. Add
-    jitter, sort by shot, pulse and time, and recover shot, pulse, pixel and wavelength from the channel.
+    1. Convert energies to the expected number of photons per pixel and sample, and integrate them.
+    2. Draw the events of all pixels and pulses (`_draw_events`), a block of shots at a time.
+    3. Add jitter, sort by shot, pulse and time, and recover shot, pulse, pixel and wavelength from the
+       channel.
     """
     check_kind("receiver", counter, PhotonCounter, "a PhotonCounter where mode = 'photons'")
     pulses = check_integer("pulses", pulses)

@@ -5,8 +5,8 @@ A digitiser records energy per bin, so a simulation needs the running integral o
     F(t) = integral from -inf to t of (p * g_j)(u) du,
 
 where p is the pulse and g_j a Gaussian of standard deviation j (the timing jitter). The energy of an echo in
-a bin is a difference of two values of F. With Phi the normal distribution function, phi its density and s^2 =
-sigma^2 + j^2:
+a bin is a difference of two values of F. With Phi the normal distribution function, phi its density and
+s^2 = sigma^2 + j^2:
 
 - Gaussian of standard deviation sigma: F = Phi(t/s).
 - Linear segment of length L, mean power m and half rise d, centred on zero (a rectangle has d = 0, a sampled
@@ -17,10 +17,10 @@ sigma^2 + j^2:
   E and O are written as the integrals without jitter plus terms that decay away from the ends of the segment,
   so that no large terms cancel there. Where L <= 2 j these decaying terms do cancel, and Gauss-Legendre
   quadrature with 10 nodes is used, which is exact to rounding.
-- Exponentially modified Gaussian with the mean life tau (Grushka 1972, Anal. Chem. 44, 1733): F = Phi(z) -
-  phi(z) M(s/tau - z), with z = t/s measured from the Gaussian's centre and the Mills ratio M(x) = (1 -
-  Phi(x))/phi(x). For large x, M is Laplace's continued fraction: nothing overflows, and tau = 0 is the
-  Gaussian.
+- Exponentially modified Gaussian with the mean life tau (Grushka 1972, Anal. Chem. 44, 1733):
+  F = Phi(z) - phi(z) M(s/tau - z), with z = t/s measured from the Gaussian's centre and the Mills ratio
+  M(x) = (1 - Phi(x))/phi(x). For large x, M is Laplace's continued fraction, which does not overflow, and
+  tau = 0 gives the Gaussian.
 
 Every formula and its derivatives stay finite at zero width and zero jitter, where F is a unit step of value
 1/2 at the step.

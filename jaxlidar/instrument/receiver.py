@@ -62,7 +62,7 @@ class Receiver(eqx.Module):
     - `bits`: resolution of the digitiser, an integer in [1, 24], over the range [0, `saturation`]; it needs a
       saturation. Default None: not quantised.
     - `background`: J per sample, not negative, added to every sample (sunlight, dark current). Default 0.
-    - `photon_noise`: whether a noisy record has the shot noise of signal and background. Default True.
+    - `photon_noise`: True if a noisy record has the shot noise of signal and background. Default True.
     - `electronic_noise`: standard deviation of additive normal noise in J per sample, not negative. Default
       0.
     - `window`: "fixed": samples at fixed instants; "first return": the sampling bins start at the first

@@ -1,8 +1,8 @@
 """Scan patterns: the direction of an airborne scanner's beam as a function of time.
 
 Directions (f, r, d) are unit vectors in the frame of a level platform: forward, to the right and down. Over
-flat ground at the height h below the platform, the beam meets the ground h f / d ahead of the platform and h
-r / d to its right. With the half angle alpha, the frequency or line rate nu and the time t:
+flat ground at the height h below the platform, the beam meets the ground h f / d ahead of the platform and
+h r / d to its right. With the half angle alpha, the frequency or line rate nu and the time t:
 
 - oscillating mirror: across the track at the angle alpha sin(2 pi nu t) from the vertical, or at a triangle
   wave of the same limits;

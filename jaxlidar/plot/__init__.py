@@ -6,7 +6,7 @@ saves the figure. The package, and matplotlib with it, is imported when it is fi
 
 from typing import Any
 
-from jaxlidar._deprecated import renamed
+from jaxlidar._deprecated import warn_renamed
 from jaxlidar._signatures import shorten_signatures
 from jaxlidar.plot.fits import fit, residuals
 from jaxlidar.plot.light import accuracy, energy_budget
@@ -39,4 +39,7 @@ def __dir__() -> list[str]:
 
 
 def __getattr__(name: str) -> Any:
-    return renamed(name, {"ledger": "energy_budget"}, globals(), __name__)
+    if name == "ledger":
+        warn_renamed("jaxlidar.plot.ledger", "jaxlidar.plot.energy_budget")
+        return energy_budget
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,9 +1,9 @@
 """The canopy: a voxel map with the optical properties of its leaf and bark.
 
 Leaf is a medium of flat scatterers with the reflectance R and the transmittance T. With diffuse transmission
-the single scattering albedo is R + T. With straight transmission light of the weight T goes on unchanged,
-which is the same as if it had met no leaf: the extinction is multiplied by 1 - T, exactly, and the albedo of
-the collisions that are left is R / (1 - T).
+the single scattering albedo is R + T. With straight transmission the fraction T of the light goes on as if it
+had met no leaf. This is exactly an extinction that is smaller by the factor 1 - T, with the albedo R / (1 -
+T).
 """
 
 from collections.abc import Callable

@@ -13,12 +13,13 @@ and the ray falls through the surface at the root of negative derivative, f' = -
 whatever the sign of a; neither form subtracts numbers of nearly equal size. Light that starts on the surface
 rises from it, so that its starting point is no such root. The algorithm for all rays at once is:
 
-1. Enter the grid: advance each ray to where it is over the grid and below the highest node. 2. In each step
-of a loop, cross a whole block of 8 x 8 cells if the ray stays above the highest node of the block (maximum
-mipmaps, here with a single level; Tevs, Ihrke and Seidel 2008, Symposium on Interactive 3D Graphics and
-Games). Otherwise cross one cell: stop at a falling root within it, or go on to the next cell (Amanatides and
-Woo 1987). 3. Whether a ray is above the surface is carried from cell to cell. Rounding at a shared edge then
-cannot let it slip through: a ray that was above and is below at the end of a cell has met the surface in it.
+1. Enter the grid: advance each ray to where it is over the grid and below the highest node.
+2. In each step of a loop, cross a block of 8 x 8 cells if the ray stays above the highest node of the block
+   (maximum mipmaps, here with a single level; Tevs, Ihrke and Seidel 2008, Symposium on Interactive 3D
+   Graphics and Games). Otherwise cross one cell: stop at a falling root within it, or go on to the next cell
+   (Amanatides and Woo 1987, Eurographics).
+3. Carry from cell to cell if the ray is above the surface. Rounding at a shared edge then cannot let it slip
+   through: a ray that was above and is below at the end of a cell has met the surface in it.
 
 Derivatives do not pass through the loop. The distance s solves f(s, theta) = 0, so by implicit
 differentiation ds/dtheta = -(df/dtheta) / (df/ds).

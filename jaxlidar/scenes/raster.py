@@ -1,8 +1,8 @@
 """Rasters: values at the nodes of a regular horizontal grid, bilinear in between.
 
 A point (x, y) has the grid coordinates (x - x0) / dx and (y - y0) / dy, with the spacing (dx, dy) and one
-node, the origin node, at (x0, y0). Within the cell between the nodes 00 (south-west), 10 (south-east), 01
-(north-west) and 11, with X and Y from 0 to 1,
+node, the origin node, at (x0, y0). Within a cell, X and Y run from 0 to 1. With the values h00, h10, h01 and
+h11 at its south-west, south-east, north-west and north-east nodes,
 
     h = h00 + (h10 - h00) X + (h01 - h00) Y + (h11 - h10 - h01 + h00) X Y.
 """

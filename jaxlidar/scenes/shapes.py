@@ -4,8 +4,11 @@ A plane with the upper unit normal n through the point q is met by the ray x + s
 
     s = n . (q - x) / (n . w).
 
-With the slope sigma and the aspect a, the compass direction in which the plane falls, n = (sin(sigma) sin(a),
-sin(sigma) cos(a), cos(sigma)). `jaxlidar.scenes.height_field` has the shape of terrain.
+With the slope sigma and the aspect a, the compass direction in which the plane falls,
+
+    n = (sin(sigma) sin(a), sin(sigma) cos(a), cos(sigma)).
+
+`jaxlidar.scenes.height_field` has the shape of terrain.
 """
 
 import abc

@@ -262,7 +262,7 @@ class VoxelMap(eqx.Module):
         fraction = jnp.asarray(lift - base - whole_layers, float)[:, :, None]
         more_layers = int(np.ceil((lift - base).max()))
         # 3. Layer k of the lifted map takes from the layers k - whole_layers and k - whole_layers - 1 of the
-        # map,    which is padded with empty layers.
+        #    map, which is padded with empty layers.
         source = np.arange(nz + more_layers) - whole_layers[:, :, None] + more_layers + 1
 
         def lifted(k: Float[Array, "nx ny nz"] | None) -> Float[Array, "nx ny _"] | None:
