@@ -176,7 +176,7 @@ class RecorderModel:
     """Forward model of a recorder in a fit: its unknowns, the record and its derivatives, and its noise.
 
     The unknowns of the recorder follow those of the scene in every vector of the fit. Their values are
-    (width, offsets, scale), of which any may be missing.
+    (width, offsets, scale), without those that the recorder does not have.
 
     - `unknowns`: the recorder's unknowns.
 
