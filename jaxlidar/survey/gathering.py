@@ -14,8 +14,8 @@ import numpy as np
 from jaxlidar._summary import NOTABLE_FRACTION, percent
 from jaxlidar.io.case import Case
 from jaxlidar.io.netcdf import by_rows
-from jaxlidar.io.parts import Parts
 from jaxlidar.io.rows import unwritten_rows
+from jaxlidar.io.task_files import TaskFiles
 from jaxlidar.simulate import LateLightWarning
 from jaxlidar.spectral.apply_optics import make_waveform_model
 from jaxlidar.survey.records import Record
@@ -26,9 +26,9 @@ from jaxlidar.survey.ways import AbstractWay
 class Kept(MutableMapping[int, Any]):
     """Results of tasks in files, by number; `kind_of` gives the class of each."""
 
-    def __init__(self, parts: Parts, kind_of: Callable[[int], Any]):
+    def __init__(self, parts: TaskFiles, kind_of: Callable[[int], Any]):
         self.parts, self.kind_of = parts, kind_of
-        self.numbers = parts.done()
+        self.numbers = parts.numbers()
 
     def __len__(self) -> int:
         return len(self.numbers)

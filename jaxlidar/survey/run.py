@@ -18,7 +18,7 @@ from jaxlidar._registry import simulate_survey
 from jaxlidar._workers import Task, outcomes
 from jaxlidar.instrument.survey import Survey
 from jaxlidar.io.case import Case, case_text
-from jaxlidar.io.parts import Parts, refuse_another
+from jaxlidar.io.task_files import TaskFiles, refuse_other_problem
 from jaxlidar.scenes.scene import Scene, check_kinds
 from jaxlidar.scenes.scene_parts import SceneParts
 from jaxlidar.survey.coverage import OffMapWarning, ground_heights, off_map, said_of
@@ -154,11 +154,11 @@ def simulate_many(
     problem = fingerprint(parts)
     if Path(path).exists():
         many = Waveforms.open(path)
-        refuse_another(Path(path), many.info.get("problem", {}), problem)
+        refuse_other_problem(Path(path), many.info.get("problem", {}), problem)
         return many
     given = {"rtol": rtol, "max_orders": max_orders, "shared": shared, "truth": truth}
     case = None if isinstance(scene, SceneParts) else _case(survey, scene, key, given)
-    kept = Parts(path, problem)
+    kept = TaskFiles(path, problem)
     results = _traced(way, key, outcomes_of, progress, Kept(kept, way.kind_of))
     many = on_disk(way, known, results, started, path, problem, case)
     kept.remove()
