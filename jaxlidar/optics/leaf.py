@@ -1,4 +1,4 @@
-"""Leaves (or other scatterers) of known reflectance and transmittance, in the form of a leaf model."""
+"""Leaf optics given as numbers, with the interface of a leaf model."""
 
 from collections.abc import Sequence
 from typing import ClassVar, final
@@ -25,7 +25,7 @@ class LeafOptics(eqx.Module):
 
     **Raises:** ValueError, naming the field, its value and the admissible range, for values outside their
     range, for a sum above 1, for more than one dimension, and for different numbers of values; TypeError for
-    what is no number. Inside a JAX transformation values cannot be checked.
+    arguments that are no numbers. Inside a JAX transformation values cannot be checked.
 
     **Example:**
 

@@ -45,7 +45,7 @@ def sent(rng=None):
 
 
 @pytest.mark.slow
-def test_ground_is_covered_where_the_model_is_wrong(capsys):
+def test_ground_is_covered_where_the_model_is_wrong():
     """Of 200 records made with another pulse, other leaf angles and another slope, two robust standard errors
     cover the ground in 92 to 98 %; two plain ones in less.
     """
@@ -83,8 +83,6 @@ def test_ground_is_covered_where_the_model_is_wrong(capsys):
     )
     off = np.abs(found.values["ground"])
     robust, plain = (np.mean(off <= 2.0 * e["ground"]) for e in (found.robust_stderr, found.stderr))
-    with capsys.disabled():
-        print(f"\nground within 2 s.e.: robust {robust:.3f}, plain {plain:.3f}")
     assert np.mean(found.converged) > 0.95
-    assert 0.92 <= robust <= 0.98
+    assert 0.92 <= robust <= 0.98, f"fraction within 2 standard errors {robust:.3f}, plain ones {plain:.3f}"
     assert plain < 0.92

@@ -68,7 +68,7 @@ def unknowns():
 
 def test_unknowns_can_be_pickled():
     back = pickle.loads(pickle.dumps(unknowns()))
-    for got, sent in zip(back, unknowns()):
+    for got, sent in zip(back, unknowns(), strict=True):
         assert (got.where, got.name) == (sent.where, sent.name)
         assert jax.tree.structure(got) == jax.tree.structure(sent)
         assert jax.tree.all(jax.tree.map(np.array_equal, got, sent))

@@ -22,7 +22,7 @@ from inversion.fit.retrieval import SOLVER
 from inversion.fit.solver import Fit, drive
 from inversion.fit.unknowns import Place, Settled
 from inversion.receiver.recorder import RecorderModel
-from tests.helpers import NARROW
+from tests.helpers import BY_PRECISION
 
 LAYERS, SAMPLES, STRENGTH = 12, 40, 0.3
 SMOOTH = Smooth(3.0, strength=STRENGTH)
@@ -326,7 +326,7 @@ def stands(n, seed=0):
     return np.asarray(wave.reflectance) + noise, lidar, start, unknowns, common
 
 
-@NARROW
+@BY_PRECISION
 def test_a_profile_from_two_wavelengths(precision, tmp_path):
     observed, lidar, start, unknowns, common = stands(3)
     fit = inversion.retrieve(observed[0], lidar, start, unknowns, **common)

@@ -18,7 +18,7 @@ from inversion.fit.priors import inside, outside
 from inversion.fit.uncertainty import errors_of
 from inversion.fit.unknowns import optical_leaves, settle
 from jaxlidar.planning.plan import MIN_BATCHES
-from tests.helpers import NARROW
+from tests.helpers import BY_PRECISION
 
 LIDAR = jl.Lidar(
     wavelength=(532.0, 1064.0, 1550.0), altitude=500.0, divergence=8.0, pulse=jl.GaussianPulse(fwhm=4.0)
@@ -221,7 +221,7 @@ def retrieve_ground(observed=None, unknowns=GROUND, noise=1e-3, scene=None, lida
     return inversion.retrieve(observed, lidar, scene, unknowns, noise=noise, key=jax.random.key(0), **more)
 
 
-@NARROW
+@BY_PRECISION
 def test_errors_are_as_large_as_stated(precision):
     """Over realisations of the noise, deviations over standard errors have variance 1, chi2 has mean 1."""
     wave, rng = ground_wave(), np.random.default_rng(0)
