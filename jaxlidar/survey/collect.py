@@ -14,8 +14,8 @@ import numpy as np
 from jaxlidar._summary import NOTABLE_FRACTION, percent
 from jaxlidar.io.case import Case
 from jaxlidar.io.netcdf import by_rows
-from jaxlidar.io.parts import Parts
 from jaxlidar.io.rows import unwritten_rows
+from jaxlidar.io.task_files import TaskFiles
 from jaxlidar.simulate import LateLightWarning
 from jaxlidar.spectral.apply_optics import make_waveform_model
 from jaxlidar.survey.results import ShotResults
@@ -26,9 +26,9 @@ from jaxlidar.survey.waveforms import Waveforms
 class StoredResults(MutableMapping[int, Any]):
     """Results of tasks in files, by number; `result_class` returns the class of each."""
 
-    def __init__(self, result_files: Parts, result_class: Callable[[int], Any]):
+    def __init__(self, result_files: TaskFiles, result_class: Callable[[int], Any]):
         self.result_files, self.result_class = result_files, result_class
-        self.numbers = result_files.done()
+        self.numbers = result_files.numbers()
 
     def __len__(self) -> int:
         return len(self.numbers)

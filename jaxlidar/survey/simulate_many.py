@@ -26,7 +26,7 @@ from jaxlidar._registry import simulate_survey
 from jaxlidar._workers import WorkUnit, outcomes
 from jaxlidar.instrument.survey import Survey
 from jaxlidar.io.case import Case, case_text
-from jaxlidar.io.parts import Parts, refuse_another
+from jaxlidar.io.task_files import TaskFiles, refuse_other_problem
 from jaxlidar.scenes.scene import Scene, check_kinds
 from jaxlidar.scenes.scene_parts import SceneParts
 from jaxlidar.survey.choose_strategy import choose_strategy
@@ -184,11 +184,11 @@ def simulate_many(
     # A complete file stands for the call that made it.
     if Path(path).exists():
         waveforms = Waveforms.open(path)
-        refuse_another(Path(path), waveforms.info.get("problem", {}), problem)
+        refuse_other_problem(Path(path), waveforms.info.get("problem", {}), problem)
         return waveforms
     arguments = {"rtol": rtol, "max_orders": max_orders, "shared": shared, "truth": truth}
     case = None if isinstance(scene, SceneParts) else _case(survey, scene, key, arguments)
-    result_files = Parts(path, problem)
+    result_files = TaskFiles(path, problem)
     stored_results = StoredResults(result_files, strategy.result_class)
     task_results = _trace(strategy, key, run_tasks, progress, stored_results)
     waveforms = waveforms_on_disk(strategy, survey_fields, task_results, start_time, path, problem, case)

@@ -1,7 +1,8 @@
-"""A long run's results, part by part: a folder beside the file that they will make.
+"""Results of the tasks of a long run, in a folder beside the file that they will become.
 
-Every part appears whole or not at all. A run that was killed leaves the parts that it had done, and the same
-run goes on with them. They belong to one problem, which is told by digests of all that the results depend on.
+Every file appears complete or not at all. A run that was killed leaves the results of its finished tasks, and
+the same run continues with them. The folder belongs to one problem, which is known by digests of everything
+that the results depend on (`jaxlidar._fingerprint`).
 """
 
 import json
@@ -15,37 +16,40 @@ import numpy as np
 
 from jaxlidar._files import atomic_write
 
-_PROBLEM = "problem.json"
+_PROBLEM_FILE = "problem.json"
 
 
-class Parts:
-    """The parts that are done, by number, in the folder "NAME.parts" beside the file `path`."""
+class TaskFiles:
+    """Arrays of finished tasks by number, in the folder "NAME.parts" beside the file `path`.
+
+    **Raises:** ValueError where the folder belongs to another problem, or holds other files.
+    """
 
     def __init__(self, path: str | os.PathLike[str], problem: Mapping[str, str]):
         path = Path(path)
         self.folder = path.with_name(path.name + ".parts")
         self.folder.mkdir(parents=True, exist_ok=True)
-        told = self.folder / _PROBLEM
-        if told.exists():
+        problem_path = self.folder / _PROBLEM_FILE
+        if problem_path.exists():
             try:
-                before = json.loads(told.read_text())
+                stored_problem = json.loads(problem_path.read_text())
             except ValueError as error:
-                raise ValueError(f"{told}: damaged: {error}") from error
-            refuse_another(self.folder, before, problem)
+                raise ValueError(f"{problem_path}: damaged: {error}") from error
+            refuse_other_problem(self.folder, stored_problem, problem)
         elif any(not p.name.startswith(".") for p in self.folder.iterdir()):
             raise ValueError(
                 f"{self.folder}: it holds other things than the parts of a run; nothing is overwritten"
             )
         else:
-            with atomic_write(told) as draft:
+            with atomic_write(problem_path) as draft:
                 draft.write_text(json.dumps(dict(problem), indent=1))
 
-    def done(self) -> set[int]:
-        """Numbers of the parts that are there."""
+    def numbers(self) -> set[int]:
+        """Return the numbers of finished tasks."""
         return {int(p.stem) for p in self.folder.glob("[0-9]*.npz")}
 
     def add(self, number: int, arrays: Mapping[str, np.ndarray]) -> None:
-        """Keep a part."""
+        """Write the arrays of a task."""
         with atomic_write(self.folder / f"{number:06d}.npz") as draft, draft.open("wb") as file:
             np.savez(file, **dict(arrays))  # pyright: ignore[reportArgumentType]
 
@@ -58,16 +62,16 @@ class Parts:
             raise ValueError(f"{path}: damaged: {error}; without this file its part is done again") from error
 
     def remove(self) -> None:
-        """Remove the folder, when the file that the parts make is there."""
+        """Remove the folder, after the file that the results become is written."""
         shutil.rmtree(self.folder)
 
 
-def refuse_another(path: Path, before: Mapping[str, str], now: Mapping[str, str]) -> None:
-    """Refuse results of another problem.
+def refuse_other_problem(path: Path, stored: Mapping[str, str], current: Mapping[str, str]) -> None:
+    """Refuse results of another problem, each given by its digests.
 
-    **Raises:** ValueError that names `path` and says what differs.
+    **Raises:** ValueError that names `path` and the digests that differ.
     """
-    differing = sorted(name for name in {*before, *now} if before.get(name) != now.get(name))
+    differing = sorted(name for name in {*stored, *current} if stored.get(name) != current.get(name))
     if differing:
         raise ValueError(
             f"{path}: it holds results of another problem, which differs in {', '.join(differing)}; nothing "
