@@ -5,7 +5,7 @@ import itertools
 import os
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping, MutableMapping
+from collections.abc import Iterator, Mapping, MutableMapping
 from typing import Any
 
 import jax
@@ -13,8 +13,8 @@ import numpy as np
 
 from jaxlidar._summary import NOTABLE, percent
 from jaxlidar.io.case import Case
+from jaxlidar.io.checkpoint import Checkpoint
 from jaxlidar.io.netcdf import by_rows
-from jaxlidar.io.parts import Parts
 from jaxlidar.io.rows import blank
 from jaxlidar.simulate import LateLightWarning
 from jaxlidar.survey.records import Record
@@ -23,12 +23,18 @@ from jaxlidar.survey.ways import AbstractWay
 from jaxlidar.trace.colouring import recording_of
 
 
-class Kept(MutableMapping[int, Any]):
-    """Results of tasks in files, by number; `kind_of` gives the class of each."""
+class StoredResults(MutableMapping[int, Any]):
+    """Results of a survey's tasks by number, in a checkpoint."""
 
-    def __init__(self, parts: Parts, kind_of: Callable[[int], Any]):
-        self.parts, self.kind_of = parts, kind_of
-        self.numbers = parts.done()
+    def __init__(self, checkpoint: Checkpoint, way: AbstractWay):
+        self.checkpoint, self.way = checkpoint, way
+        # Every entry is read once here: damaged ones are traced again with the missing ones.
+        self.numbers = {number for number, _ in checkpoint.intact_entries(self._decode)}
+
+    def _decode(self, number: int, arrays: Mapping[str, np.ndarray]) -> Any:
+        if not 0 <= number < self.way.count:
+            raise ValueError(f"its number is outside the admissible range [0, {self.way.count - 1}]")
+        return _from_arrays(self.way.kind_of(number), arrays)
 
     def __len__(self) -> int:
         return len(self.numbers)
@@ -40,14 +46,14 @@ class Kept(MutableMapping[int, Any]):
         return number in self.numbers
 
     def __getitem__(self, number: int) -> Any:
-        return _from_arrays(self.kind_of(number), self.parts[number])
+        return _from_arrays(self.way.kind_of(number), self.checkpoint.read(number))
 
     def __setitem__(self, number: int, result: Any) -> None:
-        self.parts.add(number, _as_arrays(result))
+        self.checkpoint.add(number, _as_arrays(result))
         self.numbers.add(number)
 
     def __delitem__(self, number: int) -> None:
-        raise TypeError("what is done is kept")
+        raise TypeError("results in a checkpoint are not deleted")
 
 
 def in_memory(

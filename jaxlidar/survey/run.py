@@ -17,11 +17,11 @@ from jaxlidar._fingerprint import fingerprint
 from jaxlidar._workers import Task, outcomes
 from jaxlidar.instrument.survey import Survey
 from jaxlidar.io.case import Case, case_text
-from jaxlidar.io.parts import Parts, refuse_another
+from jaxlidar.io.checkpoint import check_same_problem, open_checkpoint
 from jaxlidar.scenes.scene import Scene, check_kinds
 from jaxlidar.scenes.scene_parts import SceneParts
 from jaxlidar.survey.coverage import OffMapWarning, ground_heights, off_map, said_of
-from jaxlidar.survey.gathering import Kept, in_memory, on_disk
+from jaxlidar.survey.gathering import StoredResults, in_memory, on_disk
 from jaxlidar.survey.prepare import prepared
 from jaxlidar.survey.progress import Pace, SurveyProgress
 from jaxlidar.survey.squares import BySquares
@@ -73,10 +73,10 @@ def simulate_many(
     - `max_orders`: number of scatterings followed, at least 1. Default None: from `rtol` and the largest
       albedo.
     - `path`: a netCDF file, or a Zarr store (".zarr"), for the waveforms, which appears when all are done,
-      with its case, so that `jaxlidar.repeat` can do them again. Until then the folder "PATH.parts" keeps the
-      shots that are done; the same call goes on with them, also after it was killed. Where the file is there
-      already, it is read. Only some shots are in memory at a time, also of a netCDF file that is returned:
-      see `jaxlidar.open`. Default None: no file.
+      with its case, so that `jaxlidar.repeat` can do them again. Until then the file "PATH.parts" (of SQLite)
+      keeps the shots that are done; the same call goes on with them, also after it was killed. One run at a
+      time can use it. Where the file is there already, it is read. Only some shots are in memory at a time,
+      also of a netCDF file that is returned: see `jaxlidar.open`. Default None: no file.
     - `executor`: a `concurrent.futures.Executor`, whose workers trace chunks of shots: a process pool (with
       the start method "spawn" or "forkserver"), that of a Dask client (`client.get_executor()`; the extra
       `cluster` installs Dask), of mpi4py. A chunk whose worker dies gets a second try. Default None: this
@@ -98,7 +98,8 @@ def simulate_many(
     **Raises:** TypeError for things of another kind. ValueError, before any work, for inadmissible arguments,
     a scene that reaches up to the sensor, shots that do not meet the ground, a receiver whose window opens at
     the first return, shots that shall share light and cannot, and a `path` with results of another problem,
-    of which it says what differs. RuntimeError where the workers of a chunk die twice.
+    of which it says what differs. OSError for a `path` that another run uses, or that cannot be written.
+    RuntimeError where the workers of a chunk die twice.
 
     **Example:**
 
@@ -152,14 +153,15 @@ def simulate_many(
     problem = fingerprint(parts)
     if Path(path).exists():
         many = Waveforms.open(path)
-        refuse_another(Path(path), many.info.get("problem", {}), problem)
+        check_same_problem(path, many.info.get("problem", {}), problem)
         return many
     given = {"rtol": rtol, "max_orders": max_orders, "shared": shared, "truth": truth}
     case = None if isinstance(scene, SceneParts) else _case(survey, scene, key, given)
-    kept = Parts(path, problem)
-    results = _traced(way, key, outcomes_of, progress, Kept(kept, way.kind_of))
-    many = on_disk(way, known, results, started, path, problem, case)
-    kept.remove()
+    path = Path(path)
+    with open_checkpoint(path.with_name(path.name + ".parts"), problem) as checkpoint:
+        results = _traced(way, key, outcomes_of, progress, StoredResults(checkpoint, way))
+        many = on_disk(way, known, results, started, path, problem, case)
+        checkpoint.remove()
     return many
 
 
