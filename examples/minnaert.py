@@ -28,7 +28,7 @@ class Minnaert(jl.AbstractLaw):
     def __check_init__(self):
         check_range("k", self.k, 1.0, 10.0)
 
-    def view_factor(self, incident: Vec, normal: Vec, view: Vec, half_angle: Scalar) -> Scalar:
+    def intensity_factor(self, incident: Vec, normal: Vec, view: Vec, half_angle: Scalar) -> Scalar:
         return np.pi * self.albedo(incident, normal) * self.density(incident, normal, view)
 
     def albedo(self, incident: Vec, normal: Vec) -> Scalar:
@@ -42,7 +42,7 @@ class Minnaert(jl.AbstractLaw):
         power = jnp.maximum(cosine, 1e-6) ** self.k
         return jnp.where(cosine > 0, (self.k + 1.0) / (2 * np.pi) * power, 0.0)
 
-    def largest_view_factor(self, half_angle: float) -> float:
+    def largest_intensity_factor(self, half_angle: float) -> float:
         return 0.5 * (float(self.k) + 1.0)
 
 

@@ -1,13 +1,14 @@
 """Retrieval of scene properties from waveforms: fits with standard errors, and tools that need no model."""
 
 from inversion import files
-from inversion.fit.batch import Progress, Retrievals, retrieve_many
+from inversion.fit.fit_record import Step
 from inversion.fit.identifiability import CramerRao, Profile, cramer_rao, profile_likelihood
 from inversion.fit.priors import LogNormal, Smooth
 from inversion.fit.profiles import AveragingKernel, put_profile
 from inversion.fit.quality import Verdict, judge_fit, judge_fits, judge_record
-from inversion.fit.result import Retrieval, Step
+from inversion.fit.result import Retrieval, Retrievals
 from inversion.fit.retrieval import retrieve
+from inversion.fit.retrieval_many import Progress, retrieve_many
 from inversion.fit.unknowns import Unknown
 from inversion.leaf.leaves import LeafFit, invert_leaves
 from inversion.metrics.cover import (
@@ -27,6 +28,7 @@ from inversion.receiver.counts import Amplitudes, amplitudes
 from inversion.receiver.impulse import receiver_impulse, recorded_pulse
 from inversion.receiver.recorder import Recorder
 from inversion.receiver.tables import corrected_table
+from jaxlidar.extend import shorten_signatures
 
 __all__ = [
     "Amplitudes",
@@ -79,3 +81,10 @@ __all__ = [
     "signal_ends",
     "wiener",
 ]
+
+shorten_signatures(globals())
+
+
+def __dir__() -> list[str]:
+    # Public names alone, without the modules and helpers that the imports leave here.
+    return sorted(__all__)

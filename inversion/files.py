@@ -1,7 +1,6 @@
 """Retrievals as netCDF files: what `jaxlidar.io.save` and `jaxlidar.open` must know of them."""
 
-from inversion.fit.batch import Retrievals
-from inversion.fit.result import Retrieval
+from inversion.fit.result import Retrieval, Retrievals
 from jaxlidar.io import keep_as_netcdf
 
 _OWN = "units of the unknown"

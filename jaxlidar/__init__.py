@@ -1,7 +1,7 @@
 """A differentiable simulator of full-waveform lidar in JAX.
 
 `simulate` gives the waveform of a `Lidar` over a `Scene`. Its steps can also be taken one by one: `plan`,
-`reduce`, `trace_scene`, `waveform_of`.
+`make_setup`, `trace_scene`, `waveform_of`.
 
 Readers of files are in `jaxlidar.io`, figures in `jaxlidar.plot`, and what extensions build on in
 `jaxlidar.extend`. Retrieval of scene properties from waveforms is in the package `inversion`.
@@ -13,7 +13,10 @@ from typing import TYPE_CHECKING, Any
 from jaxlidar import extend, io
 from jaxlidar._checks import UnitWarning
 from jaxlidar._constants import SPEED_OF_LIGHT
+from jaxlidar._deprecated import renamed
 from jaxlidar._progress import Progress
+from jaxlidar._registry import register_public_objects, waveform_html
+from jaxlidar._signatures import shorten_signatures
 from jaxlidar._workers import LostWorkersWarning
 from jaxlidar.analog import AnalogReturns, analog_returns, photon_paths
 from jaxlidar.energy import EnergyBudget, energy_budget
@@ -29,7 +32,7 @@ from jaxlidar.instrument.pulse import (
 from jaxlidar.instrument.receiver import Receiver, first_return_window, record
 from jaxlidar.instrument.scan import AbstractScan, Conical, Oscillating, RotatingPolygon
 from jaxlidar.instrument.survey import Survey
-from jaxlidar.io.netcdf import open, repeat
+from jaxlidar.io.netcdf import open, rerun
 from jaxlidar.optics.coefficients import load_coefficients
 from jaxlidar.optics.laws import AbstractLaw, AbstractMirror, EqualAngle, Lambertian, Specular
 from jaxlidar.optics.leaf import LeafOptics
@@ -41,7 +44,7 @@ from jaxlidar.optics.prospect import Prospect, prospect_jacobian, prospect_spect
 from jaxlidar.optics.spectra import Spectrum, read_spectrum_csv, spectra, spectrum
 from jaxlidar.planning.effects import Effect
 from jaxlidar.planning.plan import Plan, plan
-from jaxlidar.planning.setup import Setup, reduce
+from jaxlidar.planning.setup import Setup, make_setup
 from jaxlidar.plants.forest import forest
 from jaxlidar.plants.habits import Branching, Habit, broadleaf, conifer, grow, shrub, spreading
 from jaxlidar.plants.lsystem import LSystem, Module, Rule, Word
@@ -58,6 +61,7 @@ from jaxlidar.scenes.surfaces import AbstractGround, AbstractSheet, AbstractSurf
 from jaxlidar.scenes.terrain import Terrain
 from jaxlidar.scenes.voxels import VoxelMap
 from jaxlidar.simulate import LateLightWarning, simulate
+from jaxlidar.spectral.waveform import Waveform, total_reflectance, waveform_of
 from jaxlidar.survey.coverage import OffMapWarning
 from jaxlidar.survey.progress import SurveyProgress
 from jaxlidar.survey.run import simulate_many
@@ -65,7 +69,6 @@ from jaxlidar.survey.truths import Truths
 from jaxlidar.survey.waveforms import Waveforms
 from jaxlidar.trace.response import Response, trace_scene
 from jaxlidar.truth import Truth, truth_of
-from jaxlidar.waveform import Waveform, total_of, waveform_of
 
 if TYPE_CHECKING:
     from jaxlidar import plot
@@ -148,6 +151,7 @@ __all__ = [
     "io",
     "leaf_surface",
     "load_coefficients",
+    "make_setup",
     "open",
     "photon_paths",
     "plan",
@@ -157,15 +161,14 @@ __all__ = [
     "prospect_spectra",
     "read_spectrum_csv",
     "record",
-    "reduce",
-    "repeat",
+    "rerun",
     "shrub",
     "simulate",
     "simulate_many",
     "spectra",
     "spectrum",
     "spreading",
-    "total_of",
+    "total_reflectance",
     "trace_scene",
     "truth_of",
     "turtle",
@@ -175,9 +178,34 @@ __all__ = [
     "waveform_of",
 ]
 
+shorten_signatures(globals())
+
+
+def __dir__() -> list[str]:
+    # Public names alone, without the modules and helpers that the imports leave here.
+    return sorted(__all__)
+
+
+# Names of version 0.2 by their new names; they go with version 0.4.
+_RENAMED = {
+    "reduce": "make_setup",
+    "repeat": "rerun",
+    "total_of": "total_reflectance",
+}
+
+# Tables of TOML files (`jaxlidar.io.read_case`) name classes as they are exported here.
+register_public_objects({name: globals()[name] for name in __all__ if name != "plot"})
+
+
+# matplotlib takes a while to import: only for those who draw.
+@waveform_html.register
+def _waveform_html(wave: Waveform) -> str:
+    from jaxlidar.plot.html import waveform_html
+
+    return waveform_html(wave)
+
 
 def __getattr__(name: str) -> Any:
-    # matplotlib takes a while to import: only for those who draw.
     if name == "plot":
         return importlib.import_module("jaxlidar.plot")
-    raise AttributeError(f"module 'jaxlidar' has no attribute {name!r}")
+    return renamed(name, _RENAMED, globals(), __name__)

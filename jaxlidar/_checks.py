@@ -1,17 +1,16 @@
-"""Checks and conversions at construction: what is inadmissible is refused by name, value and range.
+"""Checks and conversions of arguments. Errors name the field, its value and the admissible range.
 
-A value outside its range, or of another shape, is a ValueError; a thing of another kind is a TypeError. What
-is admissible but absurd, as in another unit, is a `UnitWarning`. Tracers pass: inside a JAX transformation
-nothing can be said of values.
+A value outside its range or of the wrong shape raises ValueError; an object of the wrong type raises
+TypeError. A value that is admissible but implausible, as if given in another unit, gives a `UnitWarning`.
+Tracers pass every check of values: inside a JAX transformation values are not known.
 """
 
-import inspect
 import sys
 import warnings
 from collections.abc import Callable, Sequence
 from numbers import Real
 from types import FrameType, UnionType
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,13 +18,13 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
-Class = TypeVar("Class", bound=type)
+from jaxlidar._signatures import briefly  # noqa: F401
 
 # -- conversions -------------------------------------------------------------------------------------------
 
 
 def as_scalar(x: ArrayLike, field: str = "value") -> Float[Array, ""]:
-    """A floating-point JAX scalar, in JAX's default precision; `field` names it in error messages."""
+    """Convert to a floating-point JAX scalar in the default precision; `field` names it in error messages."""
     a = as_array(x, field)
     if a.size != 1:
         raise ValueError(f"{field} has shape {a.shape}; admissible is one number")
@@ -33,12 +32,12 @@ def as_scalar(x: ArrayLike, field: str = "value") -> Float[Array, ""]:
 
 
 def as_optional_scalar(x: ArrayLike | None, field: str = "value") -> Float[Array, ""] | None:
-    """A floating-point JAX scalar, or None for None."""
+    """Convert to a floating-point JAX scalar; None stays None."""
     return None if x is None else as_scalar(x, field)
 
 
 def as_array(x: ArrayLike | Sequence, field: str = "value") -> Float[Array, "..."]:
-    """A floating-point JAX array, in JAX's default precision (a JAX float array is kept as it is)."""
+    """Convert to a floating-point JAX array in the default precision; a JAX float array is not changed."""
     if isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jnp.floating):
         return x
     check_numbers(field, x)
@@ -46,7 +45,7 @@ def as_array(x: ArrayLike | Sequence, field: str = "value") -> Float[Array, "...
 
 
 def scalar(field: str) -> Callable[[ArrayLike], Float[Array, ""]]:
-    """The converter of a field that is one number: `as_scalar`, with the field's name."""
+    """Make the converter of a field that is one number: `as_scalar` with the field's name."""
 
     def convert(x: ArrayLike) -> Float[Array, ""]:
         return as_scalar(x, field)
@@ -55,7 +54,7 @@ def scalar(field: str) -> Callable[[ArrayLike], Float[Array, ""]]:
 
 
 def optional_scalar(field: str) -> Callable[[ArrayLike | None], Float[Array, ""] | None]:
-    """The converter of a field that is one number or None."""
+    """Make the converter of a field that is one number or None."""
 
     def convert(x: ArrayLike | None) -> Float[Array, ""] | None:
         return as_optional_scalar(x, field)
@@ -64,7 +63,7 @@ def optional_scalar(field: str) -> Callable[[ArrayLike | None], Float[Array, ""]
 
 
 def array(field: str) -> Callable[[ArrayLike | Sequence], Float[Array, "..."]]:
-    """The converter of a field that is an array of numbers: `as_array`, with the field's name."""
+    """Make the converter of a field that is an array of numbers: `as_array` with the field's name."""
 
     def convert(x: ArrayLike | Sequence) -> Float[Array, "..."]:
         return as_array(x, field)
@@ -73,30 +72,31 @@ def array(field: str) -> Callable[[ArrayLike | Sequence], Float[Array, "..."]]:
 
 
 def coordinates(field: str, size: int) -> Callable[[Any], Array | np.ndarray]:
-    """The converter of a field that is a place, m: numbers are kept in double precision, outside of JAX.
+    """Make the converter of a field that is a position in m: a NumPy array of float64 unless it is traced.
 
-    So places millions of metres from the origin keep their digits until they are told relative to another.
+    Map coordinates are millions of metres, which single precision resolves to 0.5 m only. They are kept in
+    double precision, outside of JAX, until they are taken relative to a local origin.
     """
 
     def convert(x: Any) -> Array | np.ndarray:
-        known = concrete(x)
-        a = as_array(x, field) if known is None else known
+        value = concrete(x)
+        a = as_array(x, field) if value is None else value
         check_shape(field, a, (), (size,))
-        return (jnp if known is None else np).broadcast_to(a, (size,))
+        return (jnp if value is None else np).broadcast_to(a, (size,))
 
     return convert
 
 
-# -- what is known -----------------------------------------------------------------------------------------
+# -- concrete and traced values ----------------------------------------------------------------------------
 
 
 def is_traced(x: object) -> bool:
-    """Whether a JAX transformation is running over `x`, so that its value is not known."""
+    """Return True if a JAX transformation is tracing `x`, so that its value is not known."""
     return isinstance(x, Tracer)
 
 
 def concrete(x: object) -> np.ndarray | None:
-    """`x` as a NumPy array, or None where it is a tracer or no array: those cannot be checked."""
+    """Convert `x` to a NumPy array of float64; None if it is traced or not numeric, and cannot be checked."""
     if is_traced(x) or not _is_numeric(x):
         return None
     try:
@@ -105,16 +105,16 @@ def concrete(x: object) -> np.ndarray | None:
         return None
 
 
-def known_number(x: object) -> float:
-    """A concrete number.
+def concrete_number(x: object) -> float:
+    """Convert a number whose value is known to a float.
 
     **Raises:** ValueError where `x` is being traced by a JAX transformation.
     """
-    return float(known_array(x))
+    return float(concrete_array(x))
 
 
-def known_array(x: object) -> np.ndarray:
-    """A concrete array, in double precision.
+def concrete_array(x: object) -> np.ndarray:
+    """Convert an array whose values are known to a NumPy array of float64.
 
     **Raises:** ValueError where `x` is being traced by a JAX transformation.
     """
@@ -128,7 +128,7 @@ def known_array(x: object) -> np.ndarray:
 
 
 def _is_numeric(x: object) -> bool:
-    """Whether `x` is a real number, or an array or nested sequence of them, known or traced."""
+    """Return True if `x` is a real number, or an array or nested sequence of them, concrete or traced."""
     dtype = getattr(x, "dtype", None)
     if isinstance(dtype, np.dtype):
         return any(jnp.issubdtype(dtype, kind) for kind in (jnp.floating, jnp.integer, jnp.bool_))
@@ -151,7 +151,7 @@ def check_range(
 ) -> None:
     """Refuse `x` unless every element is a number (not NaN) between `low` and `high`.
 
-    Infinite values are refused as well. Tracers pass: inside a transformation nothing can be said.
+    Infinite values are refused as well. Tracers pass: their values are not known.
 
     **Raises:** `ValueError` naming `field`, the first offending value and the admissible range; `TypeError`
     where `x` is neither a number nor an array of numbers.
@@ -160,24 +160,26 @@ def check_range(
     values = concrete(x)
     if values is None:
         return
-    ok = np.isfinite(values)
-    ok &= (values > low) if low_open else (values >= low)
-    ok &= (values < high) if high_open else (values <= high)
-    if not np.all(ok):
-        left = "(" if low_open or low == -np.inf else "["
-        right = ")" if high_open or high == np.inf else "]"
-        bad = float(values[~ok].flat[0])
-        raise ValueError(f"{field} = {bad:g} is outside the admissible range {left}{low:g}, {high:g}{right}")
+    in_range = np.isfinite(values)
+    in_range &= (values > low) if low_open else (values >= low)
+    in_range &= (values < high) if high_open else (values <= high)
+    if not np.all(in_range):
+        opening = "(" if low_open or low == -np.inf else "["
+        closing = ")" if high_open or high == np.inf else "]"
+        first_outside = float(values[~in_range].flat[0])
+        raise ValueError(
+            f"{field} = {first_outside:g} is outside the admissible range {opening}{low:g}, {high:g}{closing}"
+        )
 
 
 def check_number(field: str, x: Any, low: float = -np.inf, high: float = np.inf, **limits: bool) -> None:
-    """Refuse `x` unless it is one number in a range, which is stated as for `check_range`."""
+    """Refuse `x` unless it is one number in a range, given as for `check_range`."""
     check_range(field, x, low, high, **limits)
     check_shape(field, x, ())
 
 
 def check_shape(field: str, x: Any, *shapes: tuple[int, ...]) -> None:
-    """Refuse `x`, known or traced, unless it has one of the shapes.
+    """Refuse `x`, concrete or traced, unless it has one of the shapes.
 
     **Raises:** `ValueError` naming `field`, its shape and the admissible ones.
     """
@@ -187,33 +189,33 @@ def check_shape(field: str, x: Any, *shapes: tuple[int, ...]) -> None:
 
 
 def check_integer(field: str, x: Any, low: int = 1, high: float = np.inf) -> int:
-    """A whole number from `low` to `high`, as an int.
+    """Convert a whole number from `low` to `high` to an int.
 
-    **Raises:** `ValueError` naming `field`, the value and the admissible range; `TypeError` where `x` is no
-    known number.
+    **Raises:** `ValueError` naming `field`, the value and the admissible range; `TypeError` where `x` is not
+    one concrete number.
     """
     value = concrete(x)
     if value is None or value.ndim:
         raise TypeError(f"{field} is {kind_of(x)}; admissible is an integer of at least {low}")
     if not np.isfinite(value) or value != np.floor(value) or not low <= value <= high:
-        right = ")" if high == np.inf else "]"
-        raise ValueError(f"{field} = {x} is outside the admissible range [{low}, {high}{right} of integers")
+        closing = ")" if high == np.inf else "]"
+        raise ValueError(f"{field} = {x} is outside the admissible range [{low}, {high}{closing} of integers")
     return int(x)
 
 
 def check_choice(field: str, x: object, choices: tuple[str, ...]) -> None:
-    """Refuse a name that is not among `choices`, and what is no name."""
-    named = ", ".join(map(repr, choices))
-    check_kind(field, x, str, f"one of {named}")
+    """Refuse a string that is not among `choices`, and an object that is not a string."""
+    names = ", ".join(map(repr, choices))
+    check_kind(field, x, str, f"one of {names}")
     if x not in choices:
-        raise ValueError(f"{field} = {x!r} is none of {named}")
+        raise ValueError(f"{field} = {x!r} is none of {names}")
 
 
-# -- kinds -------------------------------------------------------------------------------------------------
+# -- types -------------------------------------------------------------------------------------------------
 
 
 def kind_of(x: object) -> str:
-    """What kind of thing `x` is, with its article, for messages: a Plate, the class Plate, an array, None."""
+    """Describe the type of `x` with its article, for messages: a Plate, the class Plate, an array, None."""
     if x is None:
         return "None"
     if isinstance(x, type):
@@ -225,23 +227,23 @@ def kind_of(x: object) -> str:
 
 
 def check_kind(field: str, x: object, kind: type | UnionType, admissible: str) -> None:
-    """Refuse a thing of another kind.
+    """Refuse an object of another type than `kind`.
 
-    **Raises:** `TypeError` naming `field`, the kind of `x` and what is admissible.
+    **Raises:** `TypeError` naming `field`, the type of `x` and what is admissible.
     """
     if not isinstance(x, kind):
         raise TypeError(f"{field} is {kind_of(x)}; admissible is {admissible}")
 
 
 def check_flag(field: str, x: object) -> None:
-    """Refuse what is neither True nor False."""
+    """Refuse an object that is neither True nor False."""
     check_kind(field, x, bool | np.bool_, "True or False")
 
 
 def check_numbers(field: str, x: object, admissible: str = "real numbers") -> None:
-    """Refuse what is neither a real number nor an array or nested sequence of such, known or traced.
+    """Refuse `x` unless it is a real number, or an array or nested sequence of them, concrete or traced.
 
-    **Raises:** `TypeError` naming `field`, the kind of `x` and what is admissible; `ValueError` for a nested
+    **Raises:** `TypeError` naming `field`, the type of `x` and what is admissible; `ValueError` for a nested
     sequence with rows of different lengths.
     """
     if not _is_numeric(x):
@@ -251,32 +253,32 @@ def check_numbers(field: str, x: object, admissible: str = "real numbers") -> No
 
 
 def _is_ragged(x: object) -> bool:
-    """Whether a nested sequence has rows of different lengths."""
+    """Return True if a nested sequence has rows of different lengths."""
     if not isinstance(x, Sequence):
         return False
     return any(map(_is_ragged, x)) or len({_shape(a) for a in x}) > 1
 
 
 def _shape(x: Any) -> tuple[int, ...]:
-    """The shape of a number, an array or a nested sequence that is not ragged."""
+    """Return the shape of a number, an array or a nested sequence that is not ragged."""
     if not isinstance(x, Sequence):
         return np.shape(x)
     return (len(x), *(_shape(x[0]) if len(x) else ()))
 
 
 def check_key(key: Any) -> None:
-    """Refuse what is no single JAX random key, of the new or the old style; a traced key passes.
+    """Refuse an object that is not one JAX random key, typed or raw; a traced key passes.
 
     **Raises:** `TypeError` where `key` is something else, `ValueError` where it is several keys.
     """
     dtype = getattr(key, "dtype", None)
-    new = dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key)
-    if not new and dtype != np.uint32:
+    is_typed = dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key)
+    if not is_typed and dtype != np.uint32:
         raise TypeError(
             f"key is {kind_of(key)}; admissible is a JAX random key, as jax.random.key(0) makes it"
         )
-    # A key of the old style is a row of unsigned integers.
-    if key.ndim != (0 if new else 1):
+    # A raw key, as of `jax.random.PRNGKey`, is a row of unsigned integers.
+    if key.ndim != (0 if is_typed else 1):
         raise ValueError(f"key has shape {key.shape}: several keys; admissible is one JAX random key")
 
 
@@ -284,30 +286,33 @@ def check_key(key: Any) -> None:
 
 
 class UnitWarning(UserWarning):
-    """The warning of a value that is admissible but absurd, as one given in another unit is.
+    """Warning of a value that is admissible but implausible, as if it were given in another unit.
 
     **Example:** a divergence of 0.3 mrad, given in rad.
 
     >>> import warnings
     >>> import jaxlidar as jl
-    >>> with warnings.catch_warnings(record=True) as found:
+    >>> with warnings.catch_warnings(record=True) as caught:
     ...     warnings.simplefilter("always")
     ...     lidar = jl.Lidar(divergence=3e-4)
-    >>> print(found[0].message)
+    >>> print(caught[0].message)
     divergence = 0.0003 mrad is absurdly small. Is it given in rad? 0.0003 rad is 0.3 mrad
     """
 
 
 class Magnitude(NamedTuple):
-    """The unit of a field, between which values anyone could mean it, and units that it is confused with.
+    """The unit of a field, the range of plausible values, and units that it is confused with.
 
-    `others` gives, for another unit, how many of the field's it is; the likelier ones come first.
+    - `unit`: of the field.
+    - `low`, `high`: limits of the plausible values, in that unit.
+    - `confused_units`: for each unit that is given by mistake, its size in units of the field; the likelier
+      ones come first.
     """
 
     unit: str
     low: float
     high: float
-    others: dict[str, float]
+    confused_units: dict[str, float]
 
 
 # The ranges are far wider than those of any instrument, leaf or map.
@@ -347,59 +352,48 @@ MAGNITUDES = {
     "trunk_diameter": Magnitude("m", 0.0, 20.0, {"cm": 1e-2, "mm": 1e-3}),
 }
 
-_OURS = ("jaxlidar", "inversion")
-_WITHIN = (*_OURS, "equinox", "jaxtyping", "beartype", "dataclasses")
+_PROJECT_PACKAGES = ("jaxlidar", "inversion")
+# Packages between a user's line that constructs an object and the check of its fields.
+_INTERNAL_PACKAGES = (*_PROJECT_PACKAGES, "equinox", "jaxtyping", "beartype", "dataclasses")
 
 
-def warn_units(made: object) -> None:
-    """`warn_unit` of every field of what is being made that `MAGNITUDES` has."""
+def warn_units(module: object) -> None:
+    """Apply `warn_unit` to every field of a module under construction that `MAGNITUDES` lists."""
     for field in MAGNITUDES:
-        if hasattr(made, field):
-            warn_unit(field, getattr(made, field))
+        if hasattr(module, field):
+            warn_unit(field, getattr(module, field))
 
 
 def warn_unit(field: str, x: object) -> None:
-    """Warn where a value of `x` is so far from what its field means that another unit is likely.
+    """Warn if a value of `x` is so far from the plausible values of its field that another unit is likely.
 
-    Zero, where it is admissible, means what it says; tracers pass. `MAGNITUDES` has what is warned of.
+    Zero, where it is admissible, gives no warning, and tracers pass. `MAGNITUDES` lists the plausible values.
 
-    **Warns:** `UnitWarning`, at the line of the user's that led here, with the unit that is likely.
+    **Warns:** `UnitWarning`, at the user's line that led to this call, with the likely unit.
     """
-    unit, low, high, others = MAGNITUDES[field]
+    unit, low, high, confused_units = MAGNITUDES[field]
     values = concrete(x)
     if values is None:
         return
-    odd = values[(values != 0) & ((values < low) | (values > high))]
-    if odd.size == 0:
+    implausible = values[(values != 0) & ((values < low) | (values > high))]
+    if implausible.size == 0:
         return
-    value = float(odd.flat[0])
-    meant = [(other, value * factor) for other, factor in others.items() if low <= value * factor <= high]
-    size = "small" if value < low else "large"
-    hint = f"Is it given in {meant[0][0]}? {value:g} {meant[0][0]} is {meant[0][1]:g} {unit}" if meant else ""
-    message = f"{field} = {value:g} {unit} is absurdly {size}. {hint or 'Check its unit'}"
-    # At the first line outside of the library and of what it is built on.
+    value = float(implausible.flat[0])
+    size, hint = "small" if value < low else "large", "Check its unit"
+    for likely_unit, factor in confused_units.items():
+        if low <= value * factor <= high:
+            hint = f"Is it given in {likely_unit}? {value:g} {likely_unit} is {value * factor:g} {unit}"
+            break
+    message = f"{field} = {value:g} {unit} is absurdly {size}. {hint}"
+    # The warning points to the innermost line outside of the project and of the packages that call it back.
     frame, level = sys._getframe(), 1
-    while frame.f_back is not None and _package(frame) in _WITHIN:
-        if _package(frame) == "dataclasses" and _package(frame.f_back) in _OURS:
-            # A changed copy that the library makes: the user's own was warned of.
+    while frame.f_back is not None and _top_package(frame) in _INTERNAL_PACKAGES:
+        if _top_package(frame) == "dataclasses" and _top_package(frame.f_back) in _PROJECT_PACKAGES:
+            # `dataclasses.replace` within the project copies an object that the user was warned of already.
             return
         frame, level = frame.f_back, level + 1
     warnings.warn(message, UnitWarning, stacklevel=level)
 
 
-def _package(frame: FrameType) -> str:
+def _top_package(frame: FrameType) -> str:
     return frame.f_globals.get("__name__", "").split(".")[0]
-
-
-# -- help --------------------------------------------------------------------------------------------------
-
-
-def briefly(cls: Class) -> Class:
-    """Let `help` show a class's arguments with their defaults alone.
-
-    Types of arrays, written out, would push the description, which says what is admissible, out of sight.
-    """
-    signature = inspect.signature(cls.__init__)
-    bare = [p.replace(annotation=p.empty) for p in signature.parameters.values()]
-    cls.__init__.__signature__ = inspect.Signature(bare)  # pyright: ignore[reportAttributeAccessIssue]
-    return cls

@@ -1,19 +1,19 @@
-"""`Progress`: how far a simulation has come."""
+"""Progress of a simulation, as it is reported to the argument `progress`."""
 
 import dataclasses
 
 
 @dataclasses.dataclass(frozen=True)
 class Progress:
-    """How far a simulation has come; `simulate` and `energy_budget` give it to their argument `progress`.
+    """Progress of a simulation: `simulate` and `energy_budget` call their argument `progress` with it.
 
     Printed, it is one line of text.
 
-    - `batches`: batches traced so far.
-    - `photons`: photons traced so far.
-    - `seconds`: time spent so far.
-    - `error`: relative error so far: of the waveform, as `simulate` defines it, or of the emitted energy.
-    - `rtol`: relative error aimed at, or None where the number of photons is given.
+    - `batches`: number of batches traced until now.
+    - `photons`: number of photons traced until now.
+    - `seconds`: time elapsed.
+    - `error`: current relative error: of the waveform, as `simulate` defines it, or of the emitted energy.
+    - `rtol`: target of the relative error, or None where the number of photons is given.
 
     **Example:**
 
@@ -29,8 +29,8 @@ class Progress:
     rtol: float | None
 
     def __str__(self) -> str:
-        goal = "" if self.rtol is None else f" (aim {self.rtol:.2g})"
+        target = "" if self.rtol is None else f" (aim {self.rtol:.2g})"
         return (
             f"{self.batches} batches, {self.photons} photons, {self.seconds:.1f} s, "
-            f"relative error {self.error:.2g}{goal}"
+            f"relative error {self.error:.2g}{target}"
         )

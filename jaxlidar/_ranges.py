@@ -1,10 +1,10 @@
 """Admissible ranges, stated once for each class.
 
-Constructors refuse what lies outside where it is known; `inadmissible` finds it where JAX is tracing.
+Constructors refuse concrete values outside their range; `inadmissible` detects traced ones.
 
-A class states its ranges in the mapping `ranges`, by field. A name may also be a sum of fields, as in
-"reflectance + transmittance", or a product. None, and what is a module itself, such as a `Spectrum` in the
-place of numbers, is passed over: a module states its own ranges.
+A class states its ranges in the mapping `ranges`, by field. A key may also be a sum of fields, as in
+"reflectance + transmittance", or a product. A field that is None, or a module such as a `Spectrum` in the
+place of numbers, is skipped: a module states its own ranges.
 """
 
 import dataclasses
@@ -20,16 +20,20 @@ from jaxtyping import Array, Bool
 
 from jaxlidar._checks import as_array, check_range
 
-# In units of the precision, what rounding may move a value beyond a limit that belongs to its range.
+# Tolerance at a closed limit, in units of the floating-point precision: a value at the limit, such as a sum
+# of reflectance and transmittance that is 1, may exceed it by rounding.
 _ROUNDING = 8
 
 
 class Range(NamedTuple):
-    """An admissible range of finite numbers, with its limits or without them.
+    """An admissible range of finite numbers, with closed or open limits.
 
-    `mirrored`: a traced value may also be negative, and means the same to the other side, as angles from the
-    vertical do: fits and differences pass through zero. `increasing`: each number is also larger than the one
-    before; of what is known, constructors see to it.
+    - `low`, `high`: limits.
+    - `low_open`, `high_open`: True if the limit itself is not admissible.
+    - `mirrored`: True if a traced value may also be negative and then means the same in the opposite
+      direction, as angles from the vertical do. Fits and finite differences pass through zero.
+    - `increasing`: True if each number must be larger than the one before. This is checked for traced values
+      only; constructors check concrete ones and name them in their errors.
 
     **Example:** the ranges of a module of your own.
 
@@ -54,14 +58,14 @@ class Range(NamedTuple):
     increasing: bool = False
 
 
-# A reflectance, a transmittance, a probability.
-SHARE = Range(0.0, 1.0)
-# What exceeds 1 by the rounding of measured or single-precision values passes.
-SUM_OF_SHARES = Range(0.0, 1.0 + 1e-6)
+# Of a reflectance, a transmittance, a probability.
+FRACTION = Range(0.0, 1.0)
+# Of reflectance + transmittance, which rounding of measured or single-precision values may lift above 1.
+SUM_OF_FRACTIONS = Range(0.0, 1.0 + 1e-6)
 
 
 def check_ranges(module: Any) -> None:
-    """Refuse a module with a known value outside the range that its class states in `ranges`.
+    """Refuse a module with a concrete value outside the range that its class states in `ranges`.
 
     **Raises:** `ValueError` naming the field, the first offending value and the admissible range.
     """
@@ -71,17 +75,17 @@ def check_ranges(module: Any) -> None:
 
 
 def inadmissible(tree: Any) -> Bool[Array, ""]:
-    """Whether any value in a module lies outside the range that its class states, or is not finite.
+    """Return True if any value in a module lies outside the range that its class states, or is not finite.
 
-    For use within JAX transformations, where a traced value cannot be refused: multiply a result by
-    `jnp.where(inadmissible(scene), jnp.nan, 1.0)`. Values at a limit may have crossed it by rounding.
+    Use it within JAX transformations, where a traced value cannot be refused: multiply a result by
+    `jnp.where(inadmissible(scene), jnp.nan, 1.0)`. A value may lie beyond a limit by rounding.
 
     **Arguments:**
 
     - `tree`: a module, such as a `Lidar` or a `Scene`, or tuples, lists and dicts of them; within `jax.vmap`
       where its arrays have a leading axis.
 
-    **Returns:** one truth value, known or traced.
+    **Returns:** one truth value, concrete or traced.
 
     **Example:**
 
@@ -94,22 +98,23 @@ def inadmissible(tree: Any) -> Bool[Array, ""]:
 
 
 def reasons(tree: Any) -> dict[str, Bool[Array, ""]]:
-    """Whether values lie outside their range, by their place, as in "ground.slope" or "plates[0].coverage".
+    """Tell for each value with a stated range whether it lies outside of it.
 
     **Arguments:** `tree`: as for `inadmissible`.
 
-    **Returns:** a dict of truth values, known or traced.
+    **Returns:** a dict of truth values, concrete or traced, by path, as "ground.slope" or
+    "plates[0].coverage".
     """
-    found = {}
-    for place, module in _modules("", tree):
+    outside = {}
+    for path, module in _modules("", tree):
         for name, admissible in getattr(module, "ranges", {}).items():
             if (value := _value(module, name)) is not None:
-                found[f"{place}.{name}" if place else name] = outside(value, admissible)
-    return found
+                outside[f"{path}.{name}" if path else name] = is_outside(value, admissible)
+    return outside
 
 
-def outside(x: Any, admissible: Range) -> Bool[Array, ""]:
-    """Whether any element of `x` is not finite, out of order, or outside a range by more than rounding."""
+def is_outside(x: Any, admissible: Range) -> Bool[Array, ""]:
+    """Return True if an element of `x` is not finite, out of order, or out of range by more than rounding."""
     x, (low, high, low_open, high_open, mirrored, increasing) = as_array(x), admissible
     in_order = jnp.all(jnp.diff(x) > 0) if increasing and x.ndim else True
     x = jnp.abs(x) if mirrored else x
@@ -127,25 +132,25 @@ def _openness(admissible: Range) -> dict[str, bool]:
 
 
 def _value(module: Any, name: str) -> Any:
-    """A field, or a sum or product of fields; None where one of them is no numbers."""
+    """Evaluate a field, or a sum or product of fields; None if one of them is None or a module."""
     for sign, combine in ((" + ", operator.add), (" * ", operator.mul)):
         if sign in name:
-            parts = [_value(module, part) for part in name.split(sign)]
-            return None if any(part is None for part in parts) else functools.reduce(combine, parts)
+            operands = [_value(module, operand) for operand in name.split(sign)]
+            return None if any(x is None for x in operands) else functools.reduce(combine, operands)
     value = getattr(module, name)
     return None if isinstance(value, eqx.Module) else value
 
 
-def _modules(place: str, x: Any) -> Iterator[tuple[str, eqx.Module]]:
-    """All modules in a tree, with their places in it."""
+def _modules(path: str, x: Any) -> Iterator[tuple[str, eqx.Module]]:
+    """Iterate over all modules in a tree, each with its path in the tree."""
     if isinstance(x, eqx.Module):
-        yield place, x
+        yield path, x
         for field in dataclasses.fields(x):
-            dot = f"{place}." if place else ""
+            dot = f"{path}." if path else ""
             yield from _modules(dot + field.name, getattr(x, field.name, None))
     elif isinstance(x, Mapping):
-        for key, part in x.items():
-            yield from _modules(f"{place}[{key!r}]", part)
+        for key, item in x.items():
+            yield from _modules(f"{path}[{key!r}]", item)
     elif isinstance(x, list | tuple):
-        for i, part in enumerate(x):
-            yield from _modules(f"{place}[{i}]", part)
+        for i, item in enumerate(x):
+            yield from _modules(f"{path}[{i}]", item)

@@ -1,57 +1,61 @@
-"""What a waveform says of itself when it is printed."""
+"""Text of a printed waveform."""
 
 from typing import Any
 
 import numpy as np
 
-# From this share of the emitted light on, what the record misses is worth a word.
-NOTABLE = 0.01
+# Light that a record misses is reported from this fraction of the emitted light on.
+NOTABLE_FRACTION = 0.01
 
 
-def percent(share: float) -> str:
-    """A share in percent, to two digits, also of 100."""
-    return f"{float(f'{100 * share:.2g}'):g} %"
+def percent(fraction: float) -> str:
+    """Format a fraction in percent with two significant digits."""
+    # Rounded as text first, as "g" alone writes 100 as 1e+02.
+    return f"{float(f'{100 * fraction:.2g}'):g} %"
 
 
-def late_share(wave: Any) -> float:
-    """Largest share, of all wavelengths, of light that is on its way when the record ends."""
-    return float(np.max(np.asarray(wave.ledger["after the window"]), initial=0.0))
+def late_fraction(wave: Any) -> float:
+    """Return the largest fraction, of all wavelengths, of light that is in flight when the record ends."""
+    return float(np.max(np.asarray(wave.energy_budget["after the window"]), initial=0.0))
 
 
-def beyond_share(wave: Any) -> float:
-    """Largest share, of all wavelengths, that orders beyond the last may add to the waveform."""
-    whole = np.asarray(wave.reflectance).sum(axis=1)
-    return float(np.max(np.asarray(wave.neglected) / np.maximum(whole, 1e-30), initial=0.0))
+def truncated_fraction(wave: Any) -> float:
+    """Return the largest bound, of all wavelengths, on what untraced orders may add to the waveform."""
+    total = np.asarray(wave.reflectance).sum(axis=1)
+    return float(np.max(np.asarray(wave.neglected) / np.maximum(total, 1e-30), initial=0.0))
 
 
 def summary(wave: Any) -> str:
-    """A few lines: what was simulated, what became of the light, how well it is known."""
+    """Describe a waveform in a few lines: its samples, energy budget and accuracy."""
     wavelengths, total = np.asarray(wave.wavelength, float), np.asarray(wave.reflectance).sum(axis=1)
-    shown = min(len(wavelengths), 4)
+    n_columns = min(len(wavelengths), 4)
     time = np.asarray(wave.time, float)
     interval = time[1] - time[0] if time.size > 1 else 0.0
-    head = f"Waveform of {time.size} samples of {interval:.3g} ns from {time[0]:.6g} ns"
+    title = f"Waveform of {time.size} samples of {interval:.3g} ns from {time[0]:.6g} ns"
     rows = {
-        "wavelength (nm)": [f"{w:g}" for w in wavelengths[:shown]],
-        "apparent reflectance": [f"{r:.4g}" for r in total[:shown]],
+        "wavelength (nm)": [f"{w:g}" for w in wavelengths[:n_columns]],
+        "apparent reflectance": [f"{r:.4g}" for r in total[:n_columns]],
         **{
-            f"{name} (% of the light)": [f"{100 * float(s):.3g}" for s in np.asarray(share)[:shown]]
-            for name, share in wave.ledger.items()
-            if name != "returned" and np.max(np.asarray(share)) >= 5e-5
+            f"{name} (% of the light)": [f"{100 * float(f):.3g}" for f in np.asarray(fractions)[:n_columns]]
+            for name, fractions in wave.energy_budget.items()
+            # Fates that would be printed as 0.00 % are left out.
+            if name != "returned" and np.max(np.asarray(fractions)) >= 5e-5
         },
     }
-    if shown < len(wavelengths):
+    if n_columns < len(wavelengths):
         for cells in rows.values():
             cells.append("...")
     width = max(map(len, rows))
     lines = [
-        head,
+        title,
         *(f"  {name.ljust(width)}  " + "  ".join(c.rjust(8) for c in cells) for name, cells in rows.items()),
     ]
-    if late_share(wave) >= NOTABLE:
-        lines.append(f"  {percent(late_share(wave))} of the light is still on its way when the record ends")
-    if beyond_share(wave) >= NOTABLE:
-        lines.append(f"  orders beyond the last may add {percent(beyond_share(wave))}")
+    if late_fraction(wave) >= NOTABLE_FRACTION:
+        lines.append(
+            f"  {percent(late_fraction(wave))} of the light is still on its way when the record ends"
+        )
+    if truncated_fraction(wave) >= NOTABLE_FRACTION:
+        lines.append(f"  orders beyond the last may add {percent(truncated_fraction(wave))}")
     info = wave.info
     if info:
         lines.append(

@@ -1,4 +1,8 @@
-"""Vectors as tuples of three arrays: structure-of-arrays keeps the photon loops vectorised."""
+"""Vectors as tuples of three arrays.
+
+This structure of arrays keeps the loops over photons vectorised; an array of shape (photons, 3) does not: as
+the state of a scan over photons it measured 3 to 10 times slower on a CPU.
+"""
 
 from collections.abc import Iterable
 
@@ -9,19 +13,22 @@ from jaxtyping import Array, Float
 
 Scalar = Float[Array, "..."]
 Vec = tuple[Scalar, Scalar, Scalar]
-# Distance, m, of what is never met.
+# Distance in m that stands for "no intersection". Finite, so that its products with zero are zero.
 FAR = 1e30
 
 
 def vec(a: Float[Array, "3"] | Iterable[Scalar]) -> Vec:
-    """The three components of an array, or three given one after the other."""
+    """Split an array of shape (3, ...), or any three arrays, into the components of a vector."""
     x, y, z = a
     return x, y, z
 
 
 @jax.custom_jvp
 def with_derivative_of(value: Scalar, other: Scalar) -> Scalar:
-    """`value`, which varies as `other` does. What only `other` needs is not computed without derivatives."""
+    """Return `value` with the derivative of `other`.
+
+    Where no derivatives are taken, `other` is not used and the compiler drops its computation.
+    """
     return value
 
 
@@ -31,7 +38,7 @@ def _(primals, tangents):
 
 
 def dot(a: Vec, b: Vec) -> Scalar:
-    """Inner product."""
+    """Inner product of two vectors."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
@@ -41,12 +48,12 @@ def scale(a: Vec, s: Scalar) -> Vec:
 
 
 def add(a: Vec, b: Vec) -> Vec:
-    """Sum."""
+    """Sum of two vectors."""
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
 def along(origin: Vec, direction: Vec, distance: Scalar) -> Vec:
-    """The point at `distance` from `origin`."""
+    """Point at `distance` from `origin` along the unit vector `direction`."""
     return add(origin, scale(direction, distance))
 
 
@@ -58,7 +65,8 @@ def normalise(a: Vec) -> Vec:
 def _frame(axis: Vec) -> tuple[Vec, Vec]:
     """Two unit vectors perpendicular to the unit vector `axis` and to each other.
 
-    The frame is the branch-free one of Duff et al. (2017), smooth but at axis z = 0 where it turns.
+    The frame is the branch-free one of Duff et al. (2017), J. Comput. Graph. Tech. 6(1), 1. It is smooth
+    except at z = 0 of the axis, where it flips.
     """
     sign = jnp.where(axis[2] >= 0, 1.0, -1.0)
     a = -1.0 / (sign + axis[2])
@@ -68,19 +76,19 @@ def _frame(axis: Vec) -> tuple[Vec, Vec]:
 
 
 def from_frame(axis: Vec, local: Vec) -> Vec:
-    """Turn `local`, given in a frame whose third axis is the unit vector `axis`, into world coordinates."""
+    """Transform `local` from the frame whose third axis is the unit vector `axis` to world coordinates."""
     first, second = _frame(axis)
     return add(add(scale(first, local[0]), scale(second, local[1])), scale(axis, local[2]))
 
 
 def to_frame(axis: Vec, world: Vec) -> Vec:
-    """The inverse of `from_frame`."""
+    """Transform `world` to the frame whose third axis is the unit vector `axis`: inverse of `from_frame`."""
     first, second = _frame(axis)
     return dot(first, world), dot(second, world), dot(axis, world)
 
 
 def cross(a: Vec, b: Vec) -> Vec:
-    """Vector product."""
+    """Vector product of two vectors."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
@@ -91,5 +99,10 @@ def polar(cosine: Scalar, azimuth: Scalar) -> Vec:
 
 
 def about(normal: Vec, u: Scalar, v: Scalar) -> Vec:
-    """A direction drawn by the cosine law about `normal`, with two uniform numbers."""
+    """Draw a direction by the cosine law about the unit vector `normal`.
+
+    The density is cos(theta) / pi: cos(theta) = sqrt(1 - u), azimuth = 2 pi v.
+
+    **Arguments:** `normal`: unit vector; `u`, `v`: uniform random numbers in [0, 1).
+    """
     return from_frame(normal, polar(jnp.sqrt(1.0 - u), 2 * np.pi * v))

@@ -18,17 +18,17 @@ from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._vectors import FAR, along, dot
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.planning.plan import Plan
-from jaxlidar.planning.setup import reduce
+from jaxlidar.planning.setup import make_setup
 from jaxlidar.scenes.scene import Scene, check_kinds
-from jaxlidar.trace.collisions import collide
-from jaxlidar.trace.colouring import optics_of
-from jaxlidar.trace.flight import events_of, fly, nearest, plates_ahead
+from jaxlidar.spectral.apply_optics import setup_optics
+from jaxlidar.trace.collisions import sample_collision
+from jaxlidar.trace.device_scene import DeviceScene, build_device_scene, not_scattered
+from jaxlidar.trace.flight import meet_surfaces, sample_flights
 from jaxlidar.trace.footprint import across_beam
-from jaxlidar.trace.photons import THROUGH, Photons
-from jaxlidar.trace.random_numbers import Draw
-from jaxlidar.trace.setting import Setting, setting_of, straight_transmittance, unscattered
+from jaxlidar.trace.photons import TRANSMITTED, Photons
+from jaxlidar.trace.random_numbers import PhotonDraws
 
-CHUNK = 512
+PHOTONS_PER_CHUNK = 512
 
 
 @final
@@ -64,7 +64,7 @@ def analog_returns(
     n_photons: int,
     cone: float = 10.0,
 ) -> AnalogReturns:
-    """Times and weights of photons that leave the scene within a cone about the direction to the sensor.
+    """Trace photons that leave the scene within a cone about the direction to the sensor.
 
     Photons are followed one by one, with independent random numbers. At 1000 m an aperture of 0.2 m would see
     one photon in 10^8, so the cone stands in for it, here as in the paper. The estimate is that of
@@ -83,7 +83,7 @@ def analog_returns(
     **Returns:** an `AnalogReturns`.
 
     **Raises:** ValueError for values outside their ranges; for a canopy with the hot spot, because photons
-    that fly back on their own take ways independent of their ways in; for several wavelengths where leaves
+    that fly back on their own take paths independent of their paths in; for several wavelengths where leaves
     transmit straight on; and for a plan of so many orders that it keeps no histories.
 
     **Source:** section 1.4 of the paper.
@@ -102,29 +102,29 @@ def analog_returns(
     check_key(key)
     check_range("cone", cone, 0.0, 90.0, low_open=True)
     check_integer("n_photons", n_photons)
-    setting = _setting(lidar, scene, plan)
-    monomials = setting.table.monomials(optics_of(reduce(lidar, scene, plan)))
-    size = min(CHUNK, n_photons)
+    device_scene = _build_scene(lidar, scene, plan)
+    monomials = device_scene.histories.monomials(setup_optics(make_setup(lidar, scene, plan)))
+    chunk_size = min(PHOTONS_PER_CHUNK, n_photons)
 
     def chunk(key: PRNGKeyArray) -> tuple[Array, Array]:
         start_key, key = jax.random.split(key)
-        start = _start(setting, size, start_key)
+        start = _send_photons(device_scene, chunk_size, start_key)
 
-        def order(carry, n):
-            def go(carry):
-                onward, arrived = _one_flight(setting, carry[0], jax.random.fold_in(key, n), cone)
-                return onward, jax.tree.map(
-                    lambda a, b: jnp.where(arrived.value > 0, a, b), arrived, carry[1]
-                )
+        def order_step(carry, order):
+            def trace(carry):
+                p, arrivals = carry
+                onward, arrived = _trace_flight(device_scene, p, jax.random.fold_in(key, order), cone)
+                arrivals = jax.tree.map(lambda a, b: jnp.where(arrived.value > 0, a, b), arrived, arrivals)
+                return onward, arrivals
 
-            return lax.cond(jnp.any(carry[0].alive), go, lambda c: c, carry), None
+            return lax.cond(jnp.any(carry[0].alive), trace, lambda c: c, carry), None
 
-        none = _Arrival(jnp.zeros((size,)), jnp.zeros((size,)), start.history)
+        no_arrivals = _Arrivals(jnp.zeros((chunk_size,)), jnp.zeros((chunk_size,)), start.history)
         # One flight more than scatterings, to leave the scene.
-        (_, arrived), _ = lax.scan(order, (start, none), jnp.arange(plan.orders + 1))
-        return arrived.time, monomials[arrived.history].T * arrived.value[None, :]
+        (_, arrivals), _ = lax.scan(order_step, (start, no_arrivals), jnp.arange(plan.orders + 1))
+        return arrivals.time, monomials[arrivals.history].T * arrivals.value[None, :]
 
-    time, weight = lax.map(chunk, jax.random.split(key, -(-n_photons // size)))
+    time, weight = lax.map(chunk, jax.random.split(key, -(-n_photons // chunk_size)))
     weight = jnp.moveaxis(weight, 1, 0)
     return AnalogReturns(time.reshape(-1)[:n_photons], weight.reshape(weight.shape[0], -1)[:, :n_photons])
 
@@ -133,7 +133,7 @@ def analog_returns(
 def photon_paths(
     lidar: Lidar, scene: Scene, plan: Plan, *, key: PRNGKeyArray, n_photons: int, leaving: float = 5.0
 ) -> Float[Array, "photons points 3"]:
-    """Points along the paths of photons, for drawings: where they are sent, collide and leave the scene.
+    """Trace points along the paths of photons, for drawings.
 
     **Arguments:**
 
@@ -142,11 +142,11 @@ def photon_paths(
     - `plan`: a `Plan` made by `jaxlidar.plan`; its window and orders bound what is followed.
     - `key`: a JAX random key.
     - `n_photons`: number of photons, at least 1.
-    - `leaving`: length of the way out of the scene that is given, m. Default 5.
+    - `leaving`: length, m, over which photons that leave the scene are followed. Default 5.
 
     **Returns:** (photons, points, 3) x, y, z in m, with two points more than the plan has orders: the start
-    above the scene, the collisions, and the end of the way out. The points that remain are again the last
-    collision.
+    above the scene, the collisions, and the end of the path out of the scene. Remaining points repeat the
+    last collision.
 
     **Raises:** ValueError as for `analog_returns`.
 
@@ -162,22 +162,22 @@ def photon_paths(
     check_kinds(lidar, scene)
     check_key(key)
     check_integer("n_photons", n_photons)
-    setting = _setting(lidar, scene, plan)
+    device_scene = _build_scene(lidar, scene, plan)
     start_key, key = jax.random.split(key)
-    start = _start(setting, n_photons, start_key)
+    start = _send_photons(device_scene, n_photons, start_key)
 
-    def order(p, n):
-        onward, _ = _one_flight(setting, p, jax.random.fold_in(key, n), 90.0)
+    def order_step(p, order):
+        onward, _ = _trace_flight(device_scene, p, jax.random.fold_in(key, order), 90.0)
         out = along(p.x, p.w, jnp.where(p.alive & ~onward.alive, leaving, 0.0))
         return onward, jnp.stack([jnp.where(onward.alive, a, b) for a, b in zip(onward.x, out)], axis=-1)
 
-    _, points = lax.scan(order, start, jnp.arange(plan.orders + 1))
+    _, points = lax.scan(order_step, start, jnp.arange(plan.orders + 1))
     points = jnp.concatenate([jnp.stack(start.x, axis=-1)[None], points])
     aim = jnp.concatenate([lidar.position, jnp.zeros_like(lidar.position[:1])])
     return jnp.moveaxis(points, 0, 1) + aim[None, None, :]
 
 
-class _Arrival(eqx.Module):
+class _Arrivals(eqx.Module):
     """Photons at the sensor; `value` is zero for those that do not arrive."""
 
     time: Float[Array, "photons"]
@@ -185,80 +185,95 @@ class _Arrival(eqx.Module):
     history: Int[Array, "photons"]
 
 
-def _setting(lidar: Lidar, scene: Scene, plan: Plan) -> Setting:
-    setup = reduce(lidar, scene, plan)
+def _build_scene(lidar: Lidar, scene: Scene, plan: Plan) -> DeviceScene:
+    """Build the device scene, and refuse scenes that the analog estimator cannot simulate."""
+    setup = make_setup(lidar, scene, plan)
     canopy = setup.scene.canopy
     if canopy is not None and canopy.hotspot:
-        raise ValueError("hotspot = True; admissible is False: the way back is independent of the way in")
-    if not plan.trace.keeps_histories:
+        raise ValueError(
+            "hotspot = True; admissible is False: the return path is independent of the path of incidence"
+        )
+    if not plan.config.keeps_histories:
         raise ValueError(
             f"plan has {plan.orders} orders, too many to keep histories; follow fewer (max_orders=)"
         )
-    transmittance = straight_transmittance(setup)
+    device_scene = build_device_scene(setup, derivatives="none")
+    transmittance = device_scene.straight_transmittance
     if transmittance is None:
-        return setting_of(setup, derivatives="none")
+        return device_scene
     if transmittance.size > 1:
         raise ValueError(f"wavelength has {transmittance.size} values; 1 if transmission is straight")
-    return setting_of(setup, derivatives="none").thinned(transmittance[0])
+    return device_scene.with_leaf_transmittance(transmittance[0])
 
 
-def _start(setting: Setting, size: int, key: PRNGKeyArray) -> Photons:
+def _send_photons(scene: DeviceScene, count: int, key: PRNGKeyArray) -> Photons:
+    """Send photons from the sensor, at independent positions across the beam."""
     radius_key, turn_key = jax.random.split(key)
-    share, turn = jax.random.uniform(radius_key, (size,)), jax.random.uniform(turn_key, (size,))
-    point, w, excess = setting.beam.ray(across_beam(setting.beam, share, turn))
-    up = jnp.asarray(-setting.plan.upstream, excess.dtype)
-    none = jnp.zeros((size,), jnp.int32)
+    fraction, turn = jax.random.uniform(radius_key, (count,)), jax.random.uniform(turn_key, (count,))
+    point, w, excess = scene.beam.ray(across_beam(scene.beam, fraction, turn))
+    to_start = jnp.asarray(-scene.limits.start_distance, excess.dtype)
+    zero_history = jnp.zeros((count,), jnp.int32)
     return Photons(
-        along(point, w, up),
-        w,
-        excess + up,
-        jnp.ones_like(excess),
-        none,
-        none - 1,
-        unscattered(excess),
-        none == 0,
+        x=along(point, w, to_start),
+        w=w,
+        path=excess + to_start,
+        weight=jnp.ones_like(excess),
+        history=zero_history,
+        surface=zero_history - 1,
+        last_scattering=not_scattered(excess),
+        alive=zero_history == 0,
     )
 
 
-def _one_flight(setting: Setting, p: Photons, key: PRNGKeyArray, cone: float) -> tuple[Photons, _Arrival]:
-    """Fly; arrive, if the flight leads out of the scene to the sensor; otherwise collide and scatter."""
-    beam, plan = setting.beam, setting.plan
-    plates = sum(s.plate for s in setting.surfaces)
+def _trace_flight(
+    scene: DeviceScene, p: Photons, key: PRNGKeyArray, cone: float
+) -> tuple[Photons, _Arrivals]:
+    """Trace one flight of each photon.
+
+    1. Find the surfaces ahead, and sample the flight.
+    2. Apply the plates that it passes to the weight and the history.
+    3. A photon that leaves the scene within `cone` degrees of the sensor arrives there.
+    4. Other photons collide and scatter.
+    """
+    beam, config = scene.beam, scene.config
     tiny = jnp.finfo(p.weight.dtype).tiny
-    shape = (Draw.dimensions(plates, back=False), p.weight.size)
-    draw = Draw.of(list(jax.random.uniform(key, shape, p.weight.dtype, tiny)), plates)
-    met, outcomes, _ = plates_ahead(setting, p, draw.ahead)
-    events = events_of(setting, met, outcomes)
-    limit = nearest(p, events)
-    flights = fly(setting, p, limit, setting.budget(p), draw.flight[None])
+    shape = (PhotonDraws.dimensions(scene.n_plates, return_path=False), p.weight.size)
+    uniform = jax.random.uniform(key, shape, p.weight.dtype, tiny)
+    draws = PhotonDraws.from_numbers(list(uniform), scene.n_plates)
+    encounters = meet_surfaces(scene, p, draws.plates_ahead)
+    max_length = scene.longest_flight(p)
+    flights = sample_flights(scene, p, encounters.nearest_stop, max_length, draws.flight[None])
     flight = jax.tree.map(lambda a: a[0], flights)
-    weight, letters = p.weight, p.history
-    for i, (s, d, o) in enumerate(zip(setting.surfaces, met, outcomes)):
-        if s.plate:
-            through = p.alive & (o == THROUGH) & (d < FAR) & ((d < flight.distance) | ~flight.event)
-            letters = jnp.where(through, setting.grow(letters, plan.surfaces[i].transmitted), letters)
-            weight = jnp.where(through, weight / (1.0 - plan.lobe), weight)
+    weight, history = p.weight, p.history
+    for i, surface in enumerate(scene.surfaces):
+        if surface.is_plate:
+            distance, outcome = encounters.distances[i], encounters.outcomes[i]
+            passed = (distance < FAR) & ((distance < flight.distance) | ~flight.has_hit)
+            transmitted = p.alive & (outcome == TRANSMITTED) & passed
+            after = scene.history_after(history, config.surfaces[i].transmission)
+            history = jnp.where(transmitted, after, history)
+            weight = jnp.where(transmitted, weight / (1.0 - scene.limits.reflection_probability), weight)
 
     out = beam.excess(p.x)
-    back = flight.escaped & (dot(p.w, beam.view(p.x)) > jnp.cos(jnp.deg2rad(cone)))
-    # So that a level Lambertian surface returns its reflectance.
-    share = weight * beam.in_view(p.x) / jnp.sin(jnp.deg2rad(cone)) ** 2
-    arrived = _Arrival((p.path + out) / SPEED_OF_LIGHT, jnp.where(back, share, 0.0), letters)
+    in_cone = dot(p.w, beam.view(p.x)) > jnp.cos(jnp.deg2rad(cone))
+    # Divided by the cone's projected solid angle over pi: a level Lambertian surface returns its reflectance.
+    value = weight * beam.in_view(p.x) / jnp.sin(jnp.deg2rad(cone)) ** 2
+    value = jnp.where(flight.escaped & in_cone, value, 0.0)
+    arrived = _Arrivals((p.path + out) / SPEED_OF_LIGHT, value, history)
 
-    event = flight.event
-    flown = jnp.where(event, flight.distance, 0.0)
+    has_hit = flight.has_hit
+    flown = jnp.where(has_hit, flight.distance, 0.0)
     x = along(p.x, p.w, flown)
-    landed = flight.landed_on(events, limit)
-    hit = collide(setting, x, p.w, flight.cell, flight.collided, landed, draw)
-    letters = setting.grow(letters, hit.letter)
+    landed = flight.landed_on(encounters)
+    collision = sample_collision(scene, x, p.w, flight.cell, flight.collided, landed, draws)
     onward = Photons(
-        x,
-        hit.w,
-        p.path + flown,
-        jnp.where(event, weight * hit.ratio * hit.onward, 0.0),
-        letters,
-        hit.on,
-        hit.sent,
-        event,
+        x=x,
+        w=collision.w,
+        path=p.path + flown,
+        weight=jnp.where(has_hit, weight * collision.ratio * collision.onward_weight, 0.0),
+        history=scene.history_after(history, collision.channel),
+        surface=collision.surface,
+        last_scattering=collision.last_scattering,
+        alive=has_hit,
     )
     return onward, arrived

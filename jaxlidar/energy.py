@@ -1,4 +1,4 @@
-"""Energy budgets: what a scene absorbs, returns to the sky and lets through to the ground, at any time."""
+"""Energy budgets: light that a scene absorbs, returns to the sky and transmits to the ground, at any time."""
 
 import dataclasses
 import math
@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxlidar._checks import briefly, check_choice, check_integer, check_key, check_range, known_number
+from jaxlidar._checks import briefly, check_choice, check_integer, check_key, check_range, concrete_number
 from jaxlidar._programs import Program
 from jaxlidar._progress import Progress
 from jaxlidar._statistics import Moments, batches_needed
@@ -21,24 +21,24 @@ from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.planning.path_lengths import PathLengths
 from jaxlidar.planning.plan import MIN_BATCHES
 from jaxlidar.planning.plan import plan as make_plan
-from jaxlidar.planning.setup import Setup, reduce
+from jaxlidar.planning.setup import Setup, make_setup
 from jaxlidar.scenes.scene import Scene, check_kinds
-from jaxlidar.trace.colouring import optics_of
-from jaxlidar.trace.fates import Fates, follow, from_beam, from_the_sky
-from jaxlidar.trace.setting import setting_of, straight_transmittance
+from jaxlidar.spectral.apply_optics import setup_optics
+from jaxlidar.trace.absorption import EnergyFractions, from_beam, from_the_sky, trace_to_end
+from jaxlidar.trace.device_scene import build_device_scene
 
-# Photons of a batch.
-BATCH = 8192
-# Heights of the canopy over which a flight is followed at most where the canopy has no sides.
-REACH = 300.0
+PHOTONS_PER_BATCH = 8192
+# A flight through a canopy with periodic sides is followed over at most so many heights of the canopy.
+MAX_FLIGHT_HEIGHTS = 300.0
 
 
 @final
 @briefly
 class EnergyBudget(eqx.Module):
-    """Shares of the emitted energy, (wavelengths,) each.
+    """Fractions of the emitted energy, (wavelengths,) each.
 
-    - `absorbed`: by material, as in `Waveform.ledger`. - `returned`: to the sky, in whatever direction.
+    - `absorbed`: by material, as in `Waveform.energy_budget`. - `returned`: to the sky, in whatever
+      direction.
     - `transmitted`: arrived at the ground, every time light did: ground that reflects sees more than one
       pass.
     - `below`: left downward, where there is no ground. - `unfollowed`: not followed to its end.
@@ -46,7 +46,7 @@ class EnergyBudget(eqx.Module):
       "unfollowed".
     - `wavelength`: nm. - `info`: photons, batches, seconds, largest standard error and why it stopped.
 
-    What is absorbed, returned, below and unfollowed adds up to one.
+    The fractions that are absorbed, returned, below and unfollowed add up to one.
 
     **Example:**
 
@@ -78,30 +78,30 @@ def energy_budget(
     max_photons: int = 100_000_000,
     progress: Callable[[Progress], None] | None = None,
 ) -> EnergyBudget:
-    """What a scene absorbs, returns to the sky and lets through, of light that is followed to its end.
+    """Compute the energy that a scene absorbs, returns to the sky and transmits to the ground.
 
-    Unlike `Waveform.ledger` it knows no window and no last order: photons carry their energy, and end where
-    they are absorbed or leave. The atmosphere, the receiver and the pulse do not count.
+    Unlike `Waveform.energy_budget` it has no window and no last order: photons carry their energy, and end
+    where they are absorbed or leave. The atmosphere, the receiver and the pulse do not count.
 
     **Arguments:**
 
     - `lidar`: its beam, or its direction, sends the light; at its wavelengths.
-    - `scene`: a `Scene`; its atmosphere is passed over.
+    - `scene`: a `Scene`; its atmosphere is ignored.
     - `key`: a JAX random key: the same key gives the same budget.
-    - `rtol`: stop when the largest standard error of any share is below this share of the emitted energy, in
-      (0, 1). Default 0.002.
+    - `rtol`: stop when the largest standard error of any fraction is below this fraction of the emitted
+      energy, in (0, 1). Default 0.002.
     - `illumination`: "beam" (default), or "parallel": light from the beam's direction over one period of a
       canopy with periodic sides.
-    - `max_orders`: scatterings followed, at least 1; what is left then is `unfollowed`. Default 10,000.
+    - `max_orders`: scatterings followed, at least 1; light that remains then is `unfollowed`. Default 10,000.
     - `max_photons`: stop after so many, at least 1, whatever the error. Default 100,000,000.
     - `progress`: a function called with a `Progress` after every round; for instance `print`. Default None.
 
-    An interrupt (Ctrl-C) after eight batches ends it with what is done.
+    An interrupt (Ctrl-C) after eight batches ends it with the batches that are done.
 
     **Returns:** an `EnergyBudget`.
 
     **Raises:** ValueError for values outside their ranges, and for parallel light where the canopy has open
-    sides; TypeError for things of another kind; KeyboardInterrupt where it is interrupted before eight
+    sides; TypeError for arguments of another kind; KeyboardInterrupt where it is interrupted before eight
     batches.
 
     **Example:**
@@ -121,23 +121,25 @@ def energy_budget(
     max_photons = check_integer("max_photons", max_photons)
     if illumination == "parallel" and (scene.canopy is None or scene.canopy.sides != "periodic"):
         raise ValueError("illumination = 'parallel'; that is admissible where the canopy has periodic sides")
-    setup = _endless(reduce(lidar, scene, make_plan(lidar, scene, max_orders=1, describe=False)))
+    setup = _with_longest_flights(
+        make_setup(lidar, scene, make_plan(lidar, scene, max_orders=1, describe=False))
+    )
     started = time.perf_counter()
     moments = Moments()
     wanted, stopped, error, n = MIN_BATCHES, "tolerance met", math.inf, lidar.wavelength.size
 
-    def one(number: int) -> Fates:
-        return _compiled(setup, jax.random.fold_in(key, number), illumination == "parallel", max_orders)
+    def trace_batch(number: int) -> EnergyFractions:
+        return _compiled_trace(setup, jax.random.fold_in(key, number), illumination == "parallel", max_orders)
 
     with side_by_side() as run:
         try:
             while True:
-                for fates in run(one, range(moments.count, wanted)):
+                for fractions in run(trace_batch, range(moments.count, wanted)):
                     moments.add(
-                        np.concatenate([np.asarray(a).reshape(-1, n) for a in jax.tree.leaves(fates)])
+                        np.concatenate([np.asarray(a).reshape(-1, n) for a in jax.tree.leaves(fractions)])
                     )
                 error, done = float(np.max(moments.stderr, initial=0.0)), moments.count
-                photons, seconds = done * BATCH, time.perf_counter() - started
+                photons, seconds = done * PHOTONS_PER_BATCH, time.perf_counter() - started
                 if progress is not None:
                     progress(Progress(done, photons, seconds, error, rtol))
                 if error <= rtol:
@@ -145,19 +147,21 @@ def energy_budget(
                 if photons >= max_photons:
                     stopped = "photons traced"
                     break
-                wanted = min(batches_needed(done, error, rtol), max(-(-max_photons // BATCH), done + 1))
+                wanted = min(
+                    batches_needed(done, error, rtol), max(-(-max_photons // PHOTONS_PER_BATCH), done + 1)
+                )
         except KeyboardInterrupt:
             if moments.count < MIN_BATCHES:
                 raise
             error, stopped = float(np.max(moments.stderr, initial=0.0)), "interrupted"
     info = {
-        "photons": moments.count * BATCH,
+        "photons": moments.count * PHOTONS_PER_BATCH,
         "batches": moments.count,
         "seconds": time.perf_counter() - started,
         "error": error,
         "stopped": stopped,
     }
-    names = setup.plan.trace.materials
+    names = setup.plan.config.materials
     rows = [*names, "returned", "below", "transmitted", "unfollowed"]
     mean, stderr = (dict(zip(rows, map(jnp.asarray, a))) for a in (moments.mean, moments.stderr))
     return EnergyBudget(
@@ -172,33 +176,39 @@ def energy_budget(
     )
 
 
-def _endless(setup: Setup) -> Setup:
-    """With flights that are followed as far as it takes, whatever the record's window is."""
-    canopy, trace = setup.scene.canopy, setup.plan.trace
+def _with_longest_flights(setup: Setup) -> Setup:
+    """Follow flights as far as they may go, whatever the record's window is."""
+    canopy, plan = setup.scene.canopy, setup.plan
     if canopy is None or canopy.sides == "open":
         return setup
     lengths = PathLengths(setup.lidar, setup.scene)
-    height = known_number(canopy.voxels.voxel_size[2]) * canopy.voxels.shape[2]
-    flight = min(REACH * height, lengths.longest_march)
-    trace = dataclasses.replace(trace, max_flight=flight, march_steps=lengths.voxels_along(flight))
-    return dataclasses.replace(setup, plan=dataclasses.replace(setup.plan, trace=trace))
+    height = concrete_number(canopy.voxels.voxel_size[2]) * canopy.voxels.shape[2]
+    max_flight = min(MAX_FLIGHT_HEIGHTS * height, lengths.longest_march)
+    plan = plan.with_limits(max_flight=max_flight).with_config(max_faces=lengths.voxels_along(max_flight))
+    return dataclasses.replace(setup, plan=plan)
 
 
-def _trace(setup: Setup, key: PRNGKeyArray, parallel: bool, max_orders: int) -> Fates:
+def _trace(setup: Setup, key: PRNGKeyArray, parallel: bool, max_orders: int) -> EnergyFractions:
+    """Trace one batch; where leaves transmit straight on, once for each wavelength."""
     source = from_the_sky if parallel else from_beam
-    optics, transmittance = optics_of(setup), straight_transmittance(setup)
-    setting = setting_of(setup, derivatives="none")
-    if transmittance is None:
-        return follow(setting, optics, key, BATCH, source, max_orders)
-    # Where leaves transmit straight on, every wavelength has an extinction of its own.
+    optics = setup_optics(setup)
+    scene = build_device_scene(setup, derivatives="none")
+    if scene.straight_transmittance is None:
+        return trace_to_end(scene, optics, key, PHOTONS_PER_BATCH, source, max_orders)
 
-    def one(given: tuple[Array, Array]) -> Fates:
-        t, own = given
-        return follow(setting.thinned(t), own[:, None], key, BATCH, source, max_orders)
+    def trace_wavelength(of_wavelength: tuple[Array, Array]) -> EnergyFractions:
+        transmittance, optics = of_wavelength
+        wavelength_scene = scene.with_leaf_transmittance(transmittance)
+        return trace_to_end(wavelength_scene, optics[:, None], key, PHOTONS_PER_BATCH, source, max_orders)
 
-    each = jax.lax.map(one, (transmittance, optics.T))
-    absorbed = jnp.moveaxis(each.absorbed[..., 0], 0, 1)
-    return Fates(absorbed, *(a[:, 0] for a in (each.up, each.down, each.on_ground, each.unfollowed)))
+    spectra = jax.lax.map(trace_wavelength, (scene.straight_transmittance, optics.T))
+    return EnergyFractions(
+        absorbed=jnp.moveaxis(spectra.absorbed[..., 0], 0, 1),
+        up=spectra.up[:, 0],
+        down=spectra.down[:, 0],
+        on_ground=spectra.on_ground[:, 0],
+        unfollowed=spectra.unfollowed[:, 0],
+    )
 
 
-_compiled = Program(_trace, **ONE_CORE)
+_compiled_trace = Program(_trace, **ONE_CORE)

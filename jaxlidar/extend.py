@@ -1,26 +1,28 @@
-"""What code that builds on jaxlidar may use: checks at construction, vectors, threads.
+"""Building blocks for extensions of jaxlidar: checks of arguments, vectors, threads.
 
-For laws, pulses and elements of your own, and for packages on top such as `inversion`:
+For laws, pulses and surfaces of your own, and for packages on top such as `inversion`:
 
 - fields: `as_array`, `as_scalar` convert them; `check_range`, `check_integer`, `check_choice` refuse values,
-  `check_kind`, `check_numbers`, `check_key` things of another kind; `concrete` tells known values from those
-  that a JAX transformation is tracing.
+  `check_kind`, `check_numbers`, `check_key` objects of another type; `concrete` returns the value of an
+  array, or None where a JAX transformation is tracing it.
 - directions: a `Vec` is a tuple of three arrays, x, y and z; `dot`, `scale`, `add`, `normalise`; `polar` and
   `from_frame` make directions about an axis, `about` draws one by the cosine law.
 - ranges: a class states them by field, `ranges = {"slope": Range(0.0, 90.0)}`; its constructor calls
-  `check_ranges`, and `inadmissible` finds values outside them where JAX is tracing, `reasons` says which.
-- `check_kinds` refuses what is no lidar or no scene.
-- `briefly` lets `help` show a class's arguments without their types.
-- `fingerprint` tells whether all that a result depends on is as it was.
-- `once` has values computed once for all that use them, whatever the compiler.
+  `check_ranges`; where JAX is tracing, `inadmissible` detects values outside of them and `reasons` tells
+  which.
+- `check_kinds` refuses objects that are not a lidar and a scene.
+- `briefly` shortens the signature that `help` shows of a function or a class, `shorten_signatures` those of a
+  package.
+- `fingerprint` is a hash of everything that a result depends on, to compare with that of a stored result.
+- `once` is an optimisation barrier: the compiler computes its arguments once, instead of again in each
+  expression that uses them.
 - `side_by_side` runs compiled programs on as many threads as there are cores; compile them with `ONE_CORE`.
-- `outcomes` does tasks that `task` makes, here or by the workers of an executor.
+- `outcomes` runs the tasks that `task` makes, in this process or by the workers of an executor.
 """
 
 from jaxlidar._checks import (
     as_array,
     as_scalar,
-    briefly,
     check_choice,
     check_integer,
     check_key,
@@ -32,6 +34,7 @@ from jaxlidar._checks import (
 from jaxlidar._fingerprint import fingerprint
 from jaxlidar._one_function import once
 from jaxlidar._ranges import Range, check_ranges, inadmissible, reasons
+from jaxlidar._signatures import briefly, shorten_signatures
 from jaxlidar._threads import ONE_CORE, side_by_side
 from jaxlidar._vectors import (
     Scalar,
@@ -81,7 +84,10 @@ __all__ = [
     "polar",
     "reasons",
     "scale",
+    "shorten_signatures",
     "side_by_side",
     "task",
     "vec",
 ]
+
+shorten_signatures(globals(), converters=("as_array", "as_scalar"))

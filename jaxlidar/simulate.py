@@ -1,4 +1,4 @@
-"""`simulate`: make the plan, trace batches of photons until the tolerance is met, and record the waveform."""
+"""`simulate`: make the plan, trace batches of photons until the tolerance is met, and make the waveform."""
 
 import dataclasses
 import math
@@ -13,33 +13,24 @@ import numpy as np
 from jaxtyping import Array, PRNGKeyArray
 
 from jaxlidar._checks import check_flag, check_integer, check_key, check_range, is_traced
-from jaxlidar._programs import Program
 from jaxlidar._progress import Progress
 from jaxlidar._statistics import Moments, batches_needed, widening
-from jaxlidar._summary import NOTABLE, late_share, percent
+from jaxlidar._summary import NOTABLE_FRACTION, late_fraction, percent
 from jaxlidar._threads import side_by_side
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.planning.plan import MIN_BATCHES, Plan
 from jaxlidar.planning.plan import plan as make_plan
 from jaxlidar.planning.plan_check import check_plan
-from jaxlidar.planning.setup import Setup, reduce
+from jaxlidar.planning.setup import make_setup
+from jaxlidar.sampling.batch_programs import BatchTracer, make_batch_tracer
 from jaxlidar.scenes.scene import Scene, check_kinds
-from jaxlidar.trace.batches import (
-    Ready,
-    add_responses,
-    batch_of,
-    begin_to_compile_sums,
-    begin_to_compile_traces,
-    compiled_trace,
-)
-from jaxlidar.trace.colouring import Balance, Recording, recording_of, recording_with_room, total_and_balance
-from jaxlidar.trace.response import Response, trace_setting
-from jaxlidar.trace.setting import setting_ahead, setting_of, straight_transmittance
+from jaxlidar.spectral.apply_optics import BudgetTerms, samples_and_budget
+from jaxlidar.spectral.waveform import Waveform, open_at_first_return
+from jaxlidar.trace.response import Response, trace_device_scene
 from jaxlidar.truth import truth_of_setup
-from jaxlidar.waveform import Waveform, open_at_first_return, recorded, trimmed
 
-# Photons of one batch at most: a batch cannot be interrupted.
-LARGEST_BATCH = 65_536
+# A batch has at most so many photons, because it cannot be interrupted.
+MAX_BATCH_PHOTONS = 65_536
 
 
 def simulate(
@@ -63,7 +54,7 @@ def simulate(
     truth: bool = False,
     progress: Callable[[Progress], None] | None = None,
 ) -> Waveform:
-    """The waveform that `lidar` records of `scene`.
+    """Simulate the waveform that `lidar` records of `scene`.
 
     Batches of photons are traced until the error is below the tolerance. The error is the root mean square,
     over the samples above 1 % of the peak, of standard error over reflectance, for the worst wavelength.
@@ -74,7 +65,7 @@ def simulate(
     Within a JAX transformation (grad, jacfwd, vmap over scenes) eight batches are traced, whatever the error.
     Where geometry is transformed, the plan must be made outside and passed as `plan`.
 
-    An interrupt (Ctrl-C) after eight batches ends the simulation with what is done.
+    An interrupt (Ctrl-C) after eight batches ends the simulation with the batches that are done.
 
     **Arguments:**
 
@@ -92,7 +83,7 @@ def simulate(
       `jaxlidar.plan`. Default None: as there.
     - `max_seconds`: stop after this time in s, planning and compilation included, however large the error;
       positive. At least eight batches are traced. Default inf.
-    - `truth`: whether to add what the beam meets in the scene, as labels for algorithms: `Waveform.truth`.
+    - `truth`: True to add what the beam meets in the scene, as labels for algorithms: `Waveform.truth`.
       Default False.
     - `progress`: a function called with a `Progress` after every round of batches; for instance `print`.
       Default None.
@@ -111,7 +102,7 @@ def simulate(
     >>> print(f"{float(wave.reflectance.sum()):.4f}")
     0.4000
     """
-    started = time.perf_counter()
+    start_time = time.perf_counter()
     check_kinds(lidar, scene)
     check_key(key)
     check_flag("truth", truth)
@@ -125,42 +116,22 @@ def simulate(
         "effects": effects,
         "max_memory": max_memory,
     }
-    goal = _goal(rtol, atol, n_photons, max_seconds)
-    given = plan
-    plan = _planned(lidar, scene, given, goal, planning)
-    ready = _prepared(reduce(lidar, scene, plan), key)
-    traced = _trace_until(ready, key, goal, progress, started)
-    spent = time.perf_counter() - started
-    if given is None and traced.beyond > 0 and plan.orders < plan.limits.most_orders and spent < max_seconds:
+    goal = _make_goal(rtol, atol, n_photons, max_seconds)
+    given_plan = plan
+    plan = _check_or_make_plan(lidar, scene, given_plan, goal, planning)
+    tracer = make_batch_tracer(make_setup(lidar, scene, plan), key)
+    result = _trace(tracer, key, goal, progress, start_time)
+    can_follow_more = given_plan is None and plan.orders < plan.scope.max_orders
+    has_time = time.perf_counter() - start_time < max_seconds
+    if result.neglected_fraction > 0 and can_follow_more and has_time:
         # Orders beyond the last matter: follow as many as there is room for.
-        planning["max_orders"] = plan.limits.most_orders
-        plan = _planned(lidar, scene, None, goal, planning)
-        plan = dataclasses.replace(plan, limits=plan.limits._replace(automatic_orders=True))
-        ready = _prepared(reduce(lidar, scene, plan), key)
-        traced = _trace_until(ready, key, goal, progress, started)
-    wave = _recorded(ready, traced)
-    return dataclasses.replace(wave, truth=truth_of_setup(ready.setup)) if truth else wave
-
-
-def _prepared(setup: Setup, key: PRNGKeyArray) -> Ready:
-    transmittance = straight_transmittance(setup)
-    own_traces = transmittance is not None or not setup.plan.trace.keeps_histories
-    traced = any(is_traced(x) for x in jax.tree.leaves((setup, key)))
-    exact = own_traces or traced
-    record = recording_of if exact else recording_with_room
-    if traced or not setup.plan.is_random:
-        setting = setting_of(setup, derivatives="all" if traced else "none")
-        recording = record(setup)
-        return Ready(setup, setting, transmittance, recording, recording)
-    # What takes longest begins to be compiled; numbers are made beside it.
-    ahead, make = setting_ahead(setup)
-    response = begin_to_compile_traces(ahead, transmittance, key)
-    recording = record(setup)
-    brief = recording if exact else recording.abridged()
-    if response is not None:
-        _compiled_waveform.begin(response, jnp.asarray(1.0), recording)
-        begin_to_compile_sums(response, brief)
-    return Ready(setup, make(), transmittance, recording, brief)
+        planning["max_orders"] = plan.scope.max_orders
+        plan = _check_or_make_plan(lidar, scene, None, goal, planning)
+        plan = dataclasses.replace(plan, scope=plan.scope._replace(automatic_orders=True))
+        tracer = make_batch_tracer(make_setup(lidar, scene, plan), key)
+        result = _trace(tracer, key, goal, progress, start_time)
+    wave = _make_waveform(tracer, result)
+    return dataclasses.replace(wave, truth=truth_of_setup(tracer.setup)) if truth else wave
 
 
 class _Goal(NamedTuple):
@@ -172,7 +143,7 @@ class _Goal(NamedTuple):
     max_seconds: float
 
 
-def _goal(rtol: float | None, atol: float, n_photons: int | None, max_seconds: float) -> _Goal:
+def _make_goal(rtol: float | None, atol: float, n_photons: int | None, max_seconds: float) -> _Goal:
     for name, value in (("rtol", rtol), ("max_seconds", max_seconds)):
         if value is not None and not value > 0:
             raise ValueError(f"{name} = {value:g} is outside the admissible range (0, inf)")
@@ -182,69 +153,72 @@ def _goal(rtol: float | None, atol: float, n_photons: int | None, max_seconds: f
     return _Goal(rtol, atol, n_photons, max_seconds)
 
 
-def _planned(lidar: Lidar, scene: Scene, plan: Plan | None, goal: _Goal, planning: dict[str, Any]) -> Plan:
-    """The plan that was given, checked; or else one made here."""
-    given = {name: value for name, value in planning.items() if value is not None}
+def _check_or_make_plan(
+    lidar: Lidar, scene: Scene, plan: Plan | None, goal: _Goal, planning: dict[str, Any]
+) -> Plan:
+    """Check the plan that was given, or else make one; with the batch size that the goal asks for."""
+    arguments = {name: value for name, value in planning.items() if value is not None}
     if plan is None:
-        plan = make_plan(lidar, scene, rtol=goal.rtol, describe=False, **given)
-    elif given:
+        plan = make_plan(lidar, scene, rtol=goal.rtol, describe=False, **arguments)
+    elif arguments:
         raise ValueError(
-            f"plan is given together with {', '.join(given)}; admissible is either: make the plan with them"
+            f"plan is given together with {', '.join(arguments)}; admissible is either: make the plan "
+            "with them"
         )
     elif not any(is_traced(x) for x in jax.tree.leaves((lidar, scene))):
         check_plan(plan, lidar, scene)
     if goal.n_photons is None:
         return plan
-    # In eight batches, or in more of a size that leaves time to look up.
-    return dataclasses.replace(plan, n_photons=min(max(goal.n_photons // MIN_BATCHES, 1), LARGEST_BATCH))
+    # In eight batches, or in more of a size that leaves time for interrupts.
+    return plan.with_config(n_photons=min(max(goal.n_photons // MIN_BATCHES, 1), MAX_BATCH_PHOTONS))
 
 
 class _Traced(NamedTuple):
-    """The sum of the responses of `batches`, standard errors of its waveform and ledger (None: nothing is
-    random), and what it took.
+    """The sum of the responses of some batches, standard errors, and `info`.
 
-    `beyond`: share that orders beyond the last may add, where nothing else was short of the goal; else 0.
+    Standard errors are None where nothing is random. `neglected_fraction`: fraction that orders beyond the
+    last may add, where nothing else was short of the goal; else 0.
     """
 
     response: Response
     batches: int
     stderr: Array | None
-    ledger_stderr: dict[str, Array] | None
+    energy_budget_stderr: dict[str, Array] | None
     info: dict[str, Any]
-    beyond: float = 0.0
+    neglected_fraction: float = 0.0
 
 
-def _trace_until(
-    ready: Ready,
+def _trace(
+    tracer: BatchTracer,
     key: PRNGKeyArray,
     goal: _Goal,
     progress: Callable[[Progress], None] | None,
-    started: float,
+    start_time: float,
 ) -> _Traced:
-    if not ready.setup.plan.is_random:
-        response = jax.block_until_ready(compiled_trace(ready.setting, ready.transmittance, key))
+    """Trace once if nothing is random, a fixed number of batches if transformed, or until the goal."""
+    if not tracer.setup.plan.is_random:
+        response = jax.block_until_ready(tracer.trace(key))
         info = {"photons": 0, "batches": 1, "error": 0.0, "stopped": "nothing is random"}
-        return _Traced(response, 1, None, None, {**info, "seconds": time.perf_counter() - started})
-    if any(is_traced(x) for x in jax.tree.leaves((ready.setup, key))):
-        return _trace_within(ready, key)
-    return _trace_batches(ready, key, goal, progress, started)
+        return _Traced(response, 1, None, None, {**info, "seconds": time.perf_counter() - start_time})
+    if any(is_traced(x) for x in jax.tree.leaves((tracer.setup, key))):
+        return _trace_transformed(tracer, key)
+    return _trace_batches(tracer, key, goal, progress, start_time)
 
 
-def _recorded(ready: Ready, traced: _Traced) -> Waveform:
-    """The waveform of a response, on the digitiser's bins."""
-    plan, lidar = ready.setup.plan, ready.setup.lidar
-    wave = _compiled_waveform(traced.response, jnp.asarray(float(traced.batches)), ready.recording)
-    wave = trimmed(wave, lidar.wavelength.size, plan.n_samples)
-    errors = {"stderr": traced.stderr, "ledger_stderr": traced.ledger_stderr}
-    known = {name: value for name, value in errors.items() if value is not None}
-    wave = dataclasses.replace(wave, info=traced.info, **known)
+def _make_waveform(tracer: BatchTracer, result: _Traced) -> Waveform:
+    """Make the waveform of traced batches, on the digitiser's bins; warn where it misses much light."""
+    plan, lidar = tracer.setup.plan, tracer.setup.lidar
+    wave = tracer.waveform(result.response, result.batches)
+    errors = {"stderr": result.stderr, "energy_budget_stderr": result.energy_budget_stderr}
+    errors = {name: value for name, value in errors.items() if value is not None}
+    wave = dataclasses.replace(wave, info=result.info, **errors)
     if is_traced(wave.energy):
         return wave
-    if plan.limits.automatic_window and late_share(wave) >= NOTABLE:
+    if plan.scope.automatic_window and late_fraction(wave) >= NOTABLE_FRACTION:
         end = plan.sample_start + plan.sample_interval * plan.n_samples
         warnings.warn(
-            f"{percent(late_share(wave))} of the light is still on its way when the record ends at {end:.4g} "
-            "ns: give window=, or see Waveform.ledger",
+            f"{percent(late_fraction(wave))} of the light is still on its way when the record ends at "
+            f"{end:.4g} ns: give window=, or see Waveform.energy_budget",
             LateLightWarning,
             stacklevel=3,
         )
@@ -261,66 +235,59 @@ class LateLightWarning(UserWarning):
     >>> import warnings
     >>> import jax, jaxlidar as jl
     >>> scene = jl.Scene(plates=[jl.Plate(80.0, 0.4, 0.5)], ground=jl.Ground(reflectance=0.9))
-    >>> with warnings.catch_warnings(record=True) as found:
+    >>> with warnings.catch_warnings(record=True) as caught:
     ...     warnings.simplefilter("always")
     ...     wave = jl.simulate(jl.Lidar(), scene, key=jax.random.key(0), n_photons=10000)
-    >>> found[0].category.__name__
+    >>> caught[0].category.__name__
     'LateLightWarning'
     """
 
 
-def _waveform(whole: Response, batches: Array, recording: Recording) -> Waveform:
-    """The waveform of the mean of so many responses."""
-    return recorded(jax.tree.map(lambda a: a / batches, whole), recording)
+def _trace_transformed(tracer: BatchTracer, key: PRNGKeyArray) -> _Traced:
+    """Trace a fixed number of batches, within a JAX transformation."""
 
+    def trace_batch(key: PRNGKeyArray) -> tuple[Response, Array, BudgetTerms]:
+        response = trace_device_scene(tracer.scene, key)
+        return response, *samples_and_budget(response, tracer.model)
 
-_compiled_waveform = Program(_waveform)
+    responses, samples, terms = jax.lax.map(trace_batch, jax.random.split(key, MIN_BATCHES))
 
+    def stderr(values: Array) -> Array:
+        # Standard errors have no derivatives: they would be those of the noise.
+        variance = jnp.var(jax.lax.stop_gradient(values), axis=0)
+        return widening(MIN_BATCHES) * jnp.sqrt(variance / (MIN_BATCHES - 1))
 
-def _trace_within(ready: Ready, key: PRNGKeyArray) -> _Traced:
-    """A fixed number of batches, within a JAX transformation."""
-
-    def batch(key: PRNGKeyArray) -> tuple[Response, Array, Balance]:
-        response = trace_setting(ready.setting, ready.transmittance, key)
-        return response, *total_and_balance(response, ready.recording)
-
-    responses, totals, balances = jax.lax.map(batch, jax.random.split(key, MIN_BATCHES))
-
-    def stderr(each: Array) -> Array:
-        spread = jnp.var(jax.lax.stop_gradient(each), axis=0)
-        return widening(MIN_BATCHES) * jnp.sqrt(spread / (MIN_BATCHES - 1))
-
-    whole = jax.tree.map(lambda a: jnp.sum(a, axis=0), responses)
-    return _Traced(whole, MIN_BATCHES, stderr(totals), jax.tree.map(stderr, balances.ledger), {})
+    total = jax.tree.map(lambda a: jnp.sum(a, axis=0), responses)
+    return _Traced(total, MIN_BATCHES, stderr(samples), jax.tree.map(stderr, terms.energy_budget), {})
 
 
 def _trace_batches(
-    ready: Ready,
+    tracer: BatchTracer,
     key: PRNGKeyArray,
     goal: _Goal,
     progress: Callable[[Progress], None] | None,
-    started: float,
+    start_time: float,
 ) -> _Traced:
-    """Batches on all cores, round after round, until the goal is reached."""
-    begun, plan = time.perf_counter(), ready.setup.plan
+    """Trace batches on all cores, round after round, until the goal is reached."""
+    begun, plan = time.perf_counter(), tracer.setup.plan
     rtol = plan.rtol if goal.rtol is None else goal.rtol
     fixed = None if goal.n_photons is None else max(MIN_BATCHES, -(-goal.n_photons // plan.n_photons))
-    many = ready.setup.lidar.wavelength.size
-    counted = plan.n_photons if plan.orders > 1 or plan.trace.drawn_first else 0
+    many = tracer.setup.lidar.wavelength.size
+    counted = plan.photons_traced
     whole: Any = None
-    waves, shares, neglected = ready.brief.moments(many, plan.n_samples), Moments(), Moments()
+    waves, shares, neglected = tracer.error_model.moments(many, plan.n_samples), Moments(), Moments()
     wanted, stopped = MIN_BATCHES, "tolerance met"
-    batch = batch_of(ready, key)
+    batch = tracer.batch_function(key)
     with side_by_side() as run:
         try:
             while True:
                 for response, its in run(batch, range(waves.count, wanted)):
-                    whole = response if whole is None else add_responses(whole, response)
-                    waves.add(its.total)
-                    shares.add(np.asarray(its.ledger)[:, :many])
+                    whole = tracer.add(whole, response)
+                    waves.add(its.samples)
+                    shares.add(np.asarray(its.budget)[:, :many])
                     neglected.add(np.asarray(its.neglected)[:many])
-                    names = its.names
-                done, seconds = waves.count, time.perf_counter() - started
+                    names = its.budget_names
+                done, seconds = waves.count, time.perf_counter() - start_time
                 known = waves.spectra()
                 if progress is not None:
                     progress(Progress(done, done * counted, seconds, known.relative, None if fixed else rtol))
@@ -341,18 +308,18 @@ def _trace_batches(
             if waves.count < MIN_BATCHES:
                 raise
             known, stopped = waves.spectra(), "interrupted"
-    beyond = 0.0
-    if stopped == "tolerance met" and plan.limits.automatic_orders:
+    neglected_fraction = 0.0
+    if stopped == "tolerance met" and plan.scope.automatic_orders:
         share = float(np.max(neglected.mean / np.maximum(known.whole, 1e-30), initial=0.0))
         if share > rtol and float(np.max(neglected.mean, initial=0.0)) > goal.atol:
-            beyond, stopped = share, f"orders beyond {plan.orders} may add {percent(share)}"
+            neglected_fraction, stopped = share, f"orders beyond {plan.orders} may add {percent(share)}"
     info = {
         "photons": waves.count * counted,
         "batches": waves.count,
-        "seconds": time.perf_counter() - started,
+        "seconds": time.perf_counter() - start_time,
         "error": known.relative,
         "stopped": stopped,
     }
     assert whole is not None
-    ledger_stderr = {name: jnp.asarray(row) for name, row in zip(names, shares.stderr)}
-    return _Traced(whole, waves.count, jnp.asarray(known.stderr), ledger_stderr, info, beyond)
+    budget_stderr = {name: jnp.asarray(row) for name, row in zip(names, shares.stderr)}
+    return _Traced(whole, waves.count, jnp.asarray(known.stderr), budget_stderr, info, neglected_fraction)

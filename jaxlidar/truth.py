@@ -1,9 +1,13 @@
-"""Truth for those who make algorithms: what a beam meets in a scene, as labels for its waveform.
+"""Truth of a waveform: gaps, areas and heights along the beam, as labels for those who develop algorithms.
 
 Nothing is random, and nothing is smoothed by the pulse. The rays of the footprint are marched as those of
-order one are, from face to face; what they meet within each sample is integrated exactly. The gap probability
-is the mean over rays, weighted by their energy, of exp(-tau) times what plates leave open, tau being the
-optical depth.
+order one are, from face to face, and integrated exactly over each sample. The gap probability up to the range
+r is
+
+    P(r) = mean over rays, weighted by their energy, of  exp(-tau(r)) * product over plates before r of (1 -
+    coverage),
+
+with tau the optical depth.
 """
 
 import dataclasses
@@ -21,23 +25,29 @@ from jaxlidar._programs import Program
 from jaxlidar._vectors import FAR, Scalar
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.instrument.pulse import RectangularPulse
+from jaxlidar.planning.config import TimeBins
 from jaxlidar.planning.plan import Plan
 from jaxlidar.planning.plan import plan as make_plan
 from jaxlidar.planning.plan_check import check_plan
-from jaxlidar.planning.setup import Setup, reduce
-from jaxlidar.planning.trace_plan import Bins
+from jaxlidar.planning.setup import Setup, make_setup
 from jaxlidar.scenes.scene import Scene, check_kinds
-from jaxlidar.trace.colouring import Recording, components, height_of, recording_of, recording_with_room
-from jaxlidar.trace.deposit import first_bin, scatter_rows
-from jaxlidar.trace.first_order import Sent, march_rays, sent_rays
-from jaxlidar.trace.response import footprint_of, trace_setting
-from jaxlidar.trace.setting import Setting, setting_of, straight_transmittance
-from jaxlidar.trace.stretches import stretch_pieces
+from jaxlidar.spectral.apply_optics import (
+    WaveformModel,
+    component_samples,
+    height_of,
+    make_padded_waveform_model,
+    make_waveform_model,
+)
+from jaxlidar.trace.deposit import add_rows, padded_index
+from jaxlidar.trace.device_scene import DeviceScene, build_device_scene
+from jaxlidar.trace.first_order import FootprintRays, march_rays, send_rays
+from jaxlidar.trace.ray_segments import integrate_over_bins
+from jaxlidar.trace.response import footprint_rays, trace_device_scene
 
-# Share of the beam that is intercepted above `Truth.top_height`.
-TOP = 0.01
-# Rays that are followed at once, and the fewest of a beam that has a width.
-_CHUNK = 512
+# Fraction of the beam that is intercepted above `Truth.top_height`.
+TOP_INTERCEPTION = 0.01
+# Rays that are marched at once, and the fewest of a beam that has a width.
+_RAYS_AT_ONCE = 512
 
 
 @final
@@ -125,203 +135,220 @@ def truth_of(lidar: Lidar, scene: Scene, *, plan: Plan | None = None) -> Truth:
         plan = make_plan(lidar, scene, describe=False)
     elif not any(is_traced(x) for x in jax.tree.leaves((lidar, scene))):
         check_plan(plan, lidar, scene)
-    return truth_of_setup(reduce(lidar, scene, plan))
+    return truth_of_setup(make_setup(lidar, scene, plan))
 
 
 def truth_of_setup(setup: Setup) -> Truth:
-    """The truth of a lidar and a scene as they are simulated."""
-    setup, plan = of_first_order(setup), setup.plan
-    transmittance = straight_transmittance(setup)
-    traced = any(is_traced(x) for x in jax.tree.leaves(setup))
-    exact = traced or transmittance is not None
-    recording = recording_of(setup) if exact else recording_with_room(setup)
-    found = _compiled(setting_of(setup), transmittance, recording)
-    if exact:
-        return found
-    # There is room for more samples and wavelengths than asked for.
+    """Compute the truth of a lidar and a scene as they are simulated."""
+    setup, plan = first_order_setup(setup), setup.plan
+    is_transformed = any(is_traced(x) for x in jax.tree.leaves(setup))
+    scene = build_device_scene(setup)
+    exact_sizes = is_transformed or scene.straight_transmittance is not None
+    model = make_waveform_model(setup) if exact_sizes else make_padded_waveform_model(setup)
+    truth = _compiled_labels(scene, model)
+    if exact_sizes:
+        return truth
+    # The model has room for more samples and wavelengths than the plan.
     sizes = (setup.lidar.wavelength.size, plan.n_samples)
-    known = jax.device_get(found)
-    return jax.tree.map(lambda a: jnp.asarray(a[tuple(map(slice, sizes[2 - a.ndim :]))]), known)
+    padded = jax.device_get(truth)
+    return jax.tree.map(lambda a: jnp.asarray(a[tuple(map(slice, sizes[2 - a.ndim :]))]), padded)
 
 
-def of_first_order(setup: Setup) -> Setup:
-    """The setup for light that is scattered once, of a pulse without duration; nothing is random."""
+def first_order_setup(setup: Setup) -> Setup:
+    """Return the setup for light that is scattered once, of a pulse without duration; nothing is random."""
     plan, lidar = setup.plan, setup.lidar
-    trace = dataclasses.replace(
-        plan.trace, orders=1, order_steps=1, drawn_first=False, independent=False, keeps_histories=True
-    )
+    config = plan.config
     # Labels shall be no less accurate than waveforms of many batches.
-    rays = plan.n_rays if plan.n_rays == 1 else max(plan.n_rays, _CHUNK)
-    same = {"random_footprint": False, "degree": plan.first_degree}
-    plan = dataclasses.replace(plan, trace=trace, n_rays=rays, **same)
+    n_rays = config.n_rays if config.n_rays == 1 else max(config.n_rays, _RAYS_AT_ONCE)
+    plan = plan.with_limits(orders=1).with_config(
+        order_steps=1,
+        keeps_histories=True,
+        n_rays=n_rays,
+        random_footprint=False,
+        degree=config.first_degree,
+    )
     instant = RectangularPulse(length=0.0), jnp.zeros_like(lidar.jitter)
     lidar = eqx.tree_at(lambda v: (v.pulse, v.jitter), lidar, instant)
     return dataclasses.replace(setup, lidar=lidar, plan=plan)
 
 
-def labels(
-    setting: Setting, transmittance: Float[Array, "wavelengths"] | None, recording: Recording
-) -> Truth:
-    """The truth of a setting and a recording of `of_first_order`, to be compiled."""
-    lidar, time, plan = recording.lidar, recording.time, setting.plan
+def compute_labels(scene: DeviceScene, model: WaveformModel) -> Truth:
+    """Compute the truth of a device scene and a waveform model of `first_order_setup`; to be compiled.
+
+    1. Trace order one, for the returns of every material.
+    2. March the rays of the footprint, and add up by sample: intercepted energy, areas of leaf and bark.
+    3. Gap probability is the energy that is not intercepted yet; plant area and heights follow from the sums.
+    """
+    lidar, time = model.lidar, model.time
     # Nothing is drawn.
     key = jax.random.key(0)
-    returns = components(trace_setting(setting, transmittance, key), recording)
-    height, samples = height_of(lidar, time), _samples(setting, recording)
-    axis, (across, energy) = _on_axis(setting), footprint_of(setting, key)
-    sums = _summed(setting, samples, across, energy, axis)
-    # What is traced out of its range makes all labels NaN.
-    sums = jax.tree.map(lambda a: recording.admissible * a, sums)
-    met = jnp.cumsum(sums.rows[0])[samples.row - 1 : samples.row + samples.count]
-    gap = jnp.maximum(jnp.sum(energy) - met, 0.0)
-    metres = 0.5 * SPEED_OF_LIGHT * samples.width
-    inside, before = sums.rows[1:, samples.row :], jnp.sum(sums.rows[1:, : samples.row])
+    returns = component_samples(trace_device_scene(scene, key), model)
+    height, samples = height_of(lidar, time), _sample_bins(scene, model)
+    axis_heights, (across, energy) = _heights_on_axis(scene), footprint_rays(scene, key)
+    sums = _sum_rays(scene, samples, across, energy, axis_heights)
+    # A traced value outside its range makes all labels NaN.
+    sums = jax.tree.map(lambda a: model.admissible * a, sums)
+    intercepted = jnp.cumsum(sums.rows[0])[samples.max_span - 1 : samples.max_span + samples.count]
+    gap = jnp.maximum(jnp.sum(energy) - intercepted, 0.0)
+    sample_length = 0.5 * SPEED_OF_LIGHT * samples.width
+    inside = sums.rows[1:, samples.max_span :]
+    before = jnp.sum(sums.rows[1:, : samples.max_span])
     leaf, bark = inside[:, : samples.count]
-    upright = jnp.cos(jnp.deg2rad(lidar.zenith))
-    names = [plan.materials[s.material] for s in plan.surfaces]
-    mean, spread = _moments(sums)
+    cos_zenith = jnp.cos(jnp.deg2rad(lidar.zenith))
+    edges = height[0] + cos_zenith * sample_length * (0.5 - np.arange(gap.size))
+    names = [scene.config.materials[s.material] for s in scene.config.surfaces]
+    mean_height, height_std = _height_moments(sums)
     return Truth(
         time=time,
         height=height,
         returns={name: a for name, a in returns.items() if name not in ("first", "higher")},
         gap_probability=gap[1:],
-        leaf_area_density=leaf / metres,
-        bark_area_density=bark / metres,
-        plant_area_index=upright * (before + jnp.cumsum(leaf + bark)),
-        top_height=_where_gap_is(1.0 - TOP, gap, height[0] + upright * metres * (0.5 - np.arange(gap.size))),
-        surface_height=dict(zip(names, axis + mean)),
-        surface_spread=dict(zip(names, spread)),
+        leaf_area_density=leaf / sample_length,
+        bark_area_density=bark / sample_length,
+        plant_area_index=cos_zenith * (before + jnp.cumsum(leaf + bark)),
+        top_height=_height_of_gap(1.0 - TOP_INTERCEPTION, gap, edges),
+        surface_height=dict(zip(names, axis_heights + mean_height)),
+        surface_spread=dict(zip(names, height_std)),
     )
 
 
-_compiled = Program(labels)
+_compiled_labels = Program(compute_labels)
 
 
-def _samples(setting: Setting, recording: Recording) -> Bins:
-    """The samples as bins of time, without a kernel."""
-    fine, across = setting.bins, recording.sampling.per_sample
-    # A stretch spans this many fine bins at most.
-    longest = fine.row - 2
-    row = -(-longest // across) + 3
-    samples = Bins(0.0, 1.0, recording.time.size, row, kernel=1)
-    return eqx.tree_at(lambda b: (b.start, b.width), samples, (recording.time[0], fine.width * across))
+def _sample_bins(scene: DeviceScene, model: WaveformModel) -> TimeBins:
+    """Return the samples as time bins."""
+    fine, bins_per_sample = scene.bins, model.convolution.bins_per_sample
+    # A ray segment spans at most so many fine bins.
+    longest = fine.max_span - 2
+    max_span = -(-longest // bins_per_sample) + 3
+    samples = TimeBins(0.0, 1.0, model.time.size, max_span)
+    return eqx.tree_at(lambda b: (b.start, b.width), samples, (model.time[0], fine.width * bins_per_sample))
 
 
-class _Sums(NamedTuple):
+class _RaySums(NamedTuple):
     """Sums over rays, weighted by their energy.
 
     - `rows`: by sample, with margins: the energy that is intercepted, the area (m) of leaf, and of bark.
-    - `meets`, `height`, `square`: of each surface, the energy that meets it, and that times its height above
-      where the axis meets it, and times the height's square.
+    - `met`, `height`, `squared_height`: of each surface, the energy that meets it, and that times its height
+      above where the axis meets it, and times the height's square.
     """
 
     rows: Float[Array, "3 padded"]
-    meets: Float[Array, "surfaces"]
+    met: Float[Array, "surfaces"]
     height: Float[Array, "surfaces"]
-    square: Float[Array, "surfaces"]
+    squared_height: Float[Array, "surfaces"]
 
 
-def _summed(
-    setting: Setting,
-    samples: Bins,
+def _sum_rays(
+    scene: DeviceScene,
+    samples: TimeBins,
     across: tuple[Float[Array, "rays"], Float[Array, "rays"]],
     energy: Float[Array, "rays"],
-    axis: Float[Array, "surfaces"],
-) -> _Sums:
-    """Sums over all rays, some at a time."""
+    axis_heights: Float[Array, "surfaces"],
+) -> _RaySums:
+    """Sum over all rays, `_RAYS_AT_ONCE` at a time."""
 
-    def some(x: Array, y: Array, e: Array) -> _Sums:
-        sent = sent_rays(setting, (x, y), e)
-        return _Sums(_intercepted(setting, samples, sent), *_heights(sent, axis))
+    def sum_chunk(x: Array, y: Array, e: Array) -> _RaySums:
+        rays = send_rays(scene, (x, y), e)
+        return _RaySums(_sum_interception(scene, samples, rays), *_sum_heights(rays, axis_heights))
 
-    given = (*across, energy)
-    if energy.size <= _CHUNK:
-        return some(*given)
-    chunks = [jnp.pad(a, (0, -energy.size % _CHUNK)).reshape(-1, _CHUNK) for a in given]
-    zero = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(some, *given))
+    arrays = (*across, energy)
+    if energy.size <= _RAYS_AT_ONCE:
+        return sum_chunk(*arrays)
+    chunks = [jnp.pad(a, (0, -energy.size % _RAYS_AT_ONCE)).reshape(-1, _RAYS_AT_ONCE) for a in arrays]
+    zero = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(sum_chunk, *arrays))
 
-    def add(total: _Sums, chunk: list[Array]) -> tuple[_Sums, None]:
-        return jax.tree.map(jnp.add, total, some(*chunk)), None
+    def add(total: _RaySums, chunk: list[Array]) -> tuple[_RaySums, None]:
+        return jax.tree.map(jnp.add, total, sum_chunk(*chunk)), None
 
     return jax.lax.scan(add, zero, chunks)[0]
 
 
-def _intercepted(setting: Setting, samples: Bins, sent: Sent) -> Float[Array, "3 padded"]:
-    """What leaf, bark and plates intercept of rays, and the area of leaf and of bark, by sample."""
-    medium, rows = setting.medium, jnp.zeros((3, samples.padded), sent.energy.dtype)
+def _sum_interception(scene: DeviceScene, samples: TimeBins, rays: FootprintRays) -> Float[Array, "3 padded"]:
+    """Sum, by sample, the energy that leaf, bark and plates intercept, and the area of leaf and of bark."""
+    medium, rows = scene.medium, jnp.zeros((3, samples.padded), rays.energy.dtype)
     plates = [
-        (surface.coverage, jnp.where(met <= sent.stop, met, FAR))
-        for surface, met in zip(setting.surfaces, sent.met)
-        if surface.plate
+        (surface.coverage, jnp.where(distance <= rays.end, distance, FAR))
+        for surface, distance in zip(scene.surfaces, rays.surface_distances)
+        if surface.is_plate
     ]
 
-    def clear(at: Scalar) -> Scalar:
-        """What plates let pass to a distance along each ray, the last axis."""
-        passing = jnp.ones_like(at)
-        for coverage, met in plates:
-            passing = passing * jnp.where(jnp.broadcast_to(met, at.shape) < at, 1.0 - coverage, 1.0)
+    def plate_gap(distance: Scalar) -> Scalar:
+        """Fraction that plates let pass up to a distance along each ray, the last axis."""
+        passing = jnp.ones_like(distance)
+        for coverage, plate_distance in plates:
+            is_behind = jnp.broadcast_to(plate_distance, distance.shape) < distance
+            passing = passing * jnp.where(is_behind, 1.0 - coverage, 1.0)
         return passing
 
-    def position(at: Scalar) -> Scalar:
-        return samples.position(2.0 * (jnp.broadcast_to(sent.excess, at.shape) + at) / SPEED_OF_LIGHT)
+    def sample_position(distance: Scalar) -> Scalar:
+        path = jnp.broadcast_to(rays.excess, distance.shape) + distance
+        return samples.position(2.0 * path / SPEED_OF_LIGHT)
 
-    depths = [jnp.zeros_like(sent.energy) for _ in sent.met]
+    depths = [jnp.zeros_like(rays.energy) for _ in rays.surface_distances]
     if medium is not None:
-        stretch, depths, _ = march_rays(setting, sent)
-        low, energy = position(stretch.start), jnp.broadcast_to(sent.energy, stretch.start.shape)
-        arriving = energy * clear(stretch.start + 0.5 * stretch.length) * stretch.extinction
-        first, passing = stretch_pieces(samples, low, stretch, 1.0)
-        _, lengths = stretch_pieces(samples, low, stretch, 0.0)
+        segments, depths, _ = march_rays(scene, rays)
+        position = sample_position(segments.start)
+        energy = jnp.broadcast_to(rays.energy, segments.start.shape)
+        arriving = energy * plate_gap(segments.start + 0.5 * segments.length) * segments.extinction
+        first_bin, passing = integrate_over_bins(samples, position, segments, 1.0)
+        # With kappa = 0 the integrals are lengths.
+        _, lengths = integrate_over_bins(samples, position, segments, 0.0)
         deposits = [(0, passing * arriving[None])]
-        for number, table in enumerate((medium.leaf, medium.bark), 1):
+        for row, table in enumerate((medium.leaf, medium.bark), 1):
             if table is not None:
                 # Extinction is half of the area density where facets have no preferred direction.
-                deposits.append((number, lengths * (2.0 * energy * table[stretch.cell])[None]))
-        for number, pieces in deposits:
-            rows = scatter_rows(rows, jnp.full_like(first, number), first, jnp.moveaxis(pieces, 0, -1))
-    depths = [d for d, surface in zip(depths, setting.surfaces) if surface.plate]
-    for (coverage, met), depth in zip(plates, depths):
-        there = met < FAR
-        stopped = jnp.where(there, sent.energy * coverage * clear(met) * jnp.exp(-depth), 0.0)
-        nearest = jnp.round(position(jnp.where(there, met, 0.0)))
-        rows = rows.at[0, first_bin(samples, nearest, 1)].add(stopped)
+                deposits.append((row, lengths * (2.0 * energy * table[segments.cell])[None]))
+        for row, pieces in deposits:
+            rows = add_rows(rows, jnp.full_like(first_bin, row), first_bin, jnp.moveaxis(pieces, 0, -1))
+    plate_depths = [d for d, surface in zip(depths, scene.surfaces) if surface.is_plate]
+    for (coverage, distance), depth in zip(plates, plate_depths):
+        is_met = distance < FAR
+        stopped = jnp.where(is_met, rays.energy * coverage * plate_gap(distance) * jnp.exp(-depth), 0.0)
+        nearest = jnp.round(sample_position(jnp.where(is_met, distance, 0.0)))
+        rows = rows.at[0, padded_index(samples, nearest, 1)].add(stopped)
     return rows
 
 
-def _on_axis(setting: Setting) -> Float[Array, "surfaces"]:
+def _heights_on_axis(scene: DeviceScene) -> Float[Array, "surfaces"]:
     """Heights at which the beam's axis meets the surfaces; 0 where it does not."""
-    zero = jnp.zeros((1,), setting.beam.radius.dtype)
-    x, w, _, _, met, _ = sent_rays(setting, (zero, zero), zero + 1.0)
-    return jnp.concatenate([jnp.where(m < FAR, x[2] + m * w[2], 0.0) for m in met]) if met else zero[:0]
+    zero = jnp.zeros((1,), scene.beam.radius.dtype)
+    axis = send_rays(scene, (zero, zero), zero + 1.0)
+    heights = [jnp.where(d < FAR, axis.x[2] + d * axis.w[2], 0.0) for d in axis.surface_distances]
+    return jnp.concatenate(heights) if heights else zero[:0]
 
 
-def _heights(sent: Sent, axis: Float[Array, "surfaces"]) -> list[Float[Array, "surfaces"]]:
-    """Moments of heights at which rays meet surfaces: the last three of `_Sums`."""
+def _sum_heights(
+    rays: FootprintRays, axis_heights: Float[Array, "surfaces"]
+) -> list[Float[Array, "surfaces"]]:
+    """Sum moments of the heights at which rays meet surfaces: the last three fields of `_RaySums`."""
     moments: list[list[Array]] = [[], [], []]
-    for met, middle in zip(sent.met, axis):
-        there = (met < FAR) & (met <= sent.stop)
-        z = jnp.where(there, sent.x[2] + met * sent.w[2] - middle, 0.0)
-        hit = jnp.where(there, sent.energy, 0.0)
-        for found, value in zip(moments, (hit, hit * z, hit * z * z)):
-            found.append(jnp.sum(value))
-    return [jnp.stack(found) if found else sent.energy[:0] for found in moments]
+    for distance, axis_height in zip(rays.surface_distances, axis_heights):
+        is_met = (distance < FAR) & (distance <= rays.end)
+        # Relative to the axis: squares of heights above sea level would lose the spread in rounding.
+        z = jnp.where(is_met, rays.x[2] + distance * rays.w[2] - axis_height, 0.0)
+        met_energy = jnp.where(is_met, rays.energy, 0.0)
+        for sums, value in zip(moments, (met_energy, met_energy * z, met_energy * z * z)):
+            sums.append(jnp.sum(value))
+    return [jnp.stack(sums) if sums else rays.energy[:0] for sums in moments]
 
 
-def _moments(sums: _Sums) -> tuple[Float[Array, "surfaces"], Float[Array, "surfaces"]]:
-    """Mean heights of surfaces, and standard deviations; NaN of what is not met."""
-    there = sums.meets > 0
-    whole = jnp.where(there, sums.meets, 1.0)
-    mean = sums.height / whole
-    variance = sums.square / whole - mean * mean
-    spread = jnp.where(variance > 0, jnp.sqrt(jnp.where(variance > 0, variance, 1.0)), 0.0)
-    return jnp.where(there, mean, np.nan), jnp.where(there, spread, np.nan)
+def _height_moments(sums: _RaySums) -> tuple[Float[Array, "surfaces"], Float[Array, "surfaces"]]:
+    """Mean heights of surfaces, and standard deviations; NaN for surfaces that are not met."""
+    is_met = sums.met > 0
+    energy = jnp.where(is_met, sums.met, 1.0)
+    mean = sums.height / energy
+    variance = sums.squared_height / energy - mean * mean
+    # The root of zero has no derivative.
+    std = jnp.where(variance > 0, jnp.sqrt(jnp.where(variance > 0, variance, 1.0)), 0.0)
+    return jnp.where(is_met, mean, np.nan), jnp.where(is_met, std, np.nan)
 
 
-def _where_gap_is(gap: float, gaps: Float[Array, "edges"], heights: Float[Array, "edges"]) -> Scalar:
-    """Height at which a gap probability that falls from edge to edge is `gap`; NaN where it stays above."""
-    below = jnp.sum(gaps >= gap)
-    last = jnp.clip(below, 1, gaps.size - 1)
+def _height_of_gap(gap: float, gaps: Float[Array, "edges"], heights: Float[Array, "edges"]) -> Scalar:
+    """Interpolate the height at which the gap probability falls to `gap`; NaN if it never does."""
+    n_above = jnp.sum(gaps >= gap)
+    last = jnp.clip(n_above, 1, gaps.size - 1)
     high, low = gaps[last - 1], gaps[last]
-    share = (high - gap) / jnp.where(high > low, high - low, 1.0)
-    height = heights[last - 1] + jnp.clip(share, 0.0, 1.0) * (heights[last] - heights[last - 1])
-    return jnp.where((below > 0) & (below < gaps.size), height, np.nan)
+    fraction = (high - gap) / jnp.where(high > low, high - low, 1.0)
+    height = heights[last - 1] + jnp.clip(fraction, 0.0, 1.0) * (heights[last] - heights[last - 1])
+    return jnp.where((n_above > 0) & (n_above < gaps.size), height, np.nan)

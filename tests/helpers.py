@@ -1,20 +1,16 @@
 """Shared by the tests: slabs, lidars that record a whole waveform as one sample, batches and z-tests."""
 
-import dataclasses
 from collections.abc import Callable, Iterable
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxtyping import Array, PRNGKeyArray
 
 import jaxlidar as jl
 from jaxlidar.extend import side_by_side
-from jaxlidar.simulate import _compiled_waveform, _prepared
-from jaxlidar.trace.batches import batch_of, compiled_trace
-from jaxlidar.waveform import trimmed
+from jaxlidar.sampling.batch_programs import make_batch_tracer
 
 
 def slow_unless(chosen: Iterable, names: Iterable) -> list:
@@ -73,24 +69,20 @@ def agrees(value: Any, stderr: Any, expected: Any, *, bound: Any = 0.0, sigmas: 
 
 def applied(plan: jl.Plan) -> jl.Plan:
     """The plan where optics are applied while light is traced."""
-    return dataclasses.replace(plan, trace=dataclasses.replace(plan.trace, keeps_histories=False), degree=0)
+    return plan.with_config(keeps_histories=False, degree=0)
 
 
 def one_batch(setup: jl.Setup, key: PRNGKeyArray) -> jl.Waveform:
     """The waveform of a single batch, by the programs that `simulate` compiles."""
-    ready = _prepared(setup, key)
-    if setup.plan.is_random:
-        response, _ = batch_of(ready, key)(0)
-    else:
-        response = compiled_trace(ready.setting, ready.transmittance, key)
-    wave = _compiled_waveform(response, jnp.asarray(1.0), ready.recording)
-    return trimmed(wave, setup.lidar.wavelength.size, setup.plan.n_samples)
+    tracer = make_batch_tracer(setup, key)
+    response = tracer.batch_function(key)(0)[0] if setup.plan.is_random else tracer.trace(key)
+    return tracer.waveform(response, 1)
 
 
 def first_wave(lidar: jl.Lidar, scene: jl.Scene, plan: jl.Plan) -> jl.Waveform:
     """One trace, for what is not random."""
     assert not plan.is_random
-    return one_batch(jl.reduce(lidar, scene, plan), jax.random.key(0))
+    return one_batch(jl.make_setup(lidar, scene, plan), jax.random.key(0))
 
 
 def batch_mean(
@@ -103,7 +95,7 @@ def batch_mean(
     quantity: Callable[[jl.Waveform], Any],
 ) -> tuple[Any, Any]:
     """Mean and standard error, over batches, of any quantity of a waveform (an array or a tree)."""
-    setup = jl.reduce(lidar, scene, plan)
+    setup = jl.make_setup(lidar, scene, plan)
     with side_by_side() as run:
         waves = run(lambda key: one_batch(setup, key), jax.random.split(jax.random.key(seed), count))
         found = [quantity(jax.tree.map(np.asarray, wave)) for wave in waves]

@@ -238,4 +238,4 @@ def test_rows_of_a_vmapped_product_are_right():
 def test_shapes_and_types_are_checked_in_tests():
     """Whoever imports the package before conftest's hook is in place switches the checks off."""
     with pytest.raises(jaxtyping.TypeCheckError):
-        jaxlidar.waveform.height_of(jaxlidar.Lidar(), jnp.zeros((2, 2)))
+        jaxlidar.spectral.apply_optics.height_of(jaxlidar.Lidar(), jnp.zeros((2, 2)))

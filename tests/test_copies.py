@@ -63,7 +63,7 @@ MADE = {
     "jaxlidar.Rule": jl.Rule("A", grown),
     "jaxlidar.SampledPulse": jl.SampledPulse([0.0, 1.0, 2.0], [0.0, 1.0, 0.0]),
     "jaxlidar.Scene": SCENE,
-    "jaxlidar.Setup": jl.reduce(LIDAR, SCENE, jl.plan(LIDAR, SCENE)),
+    "jaxlidar.Setup": jl.make_setup(LIDAR, SCENE, jl.plan(LIDAR, SCENE)),
     "jaxlidar.Specular": jl.Specular(0.1),
     "jaxlidar.Spectrum": jl.spectrum("bark-oak"),
     "jaxlidar.Tree": jl.grow(jl.shrub()),

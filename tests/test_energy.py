@@ -96,7 +96,7 @@ def test_a_beam_and_its_ledger_agree():
         jl.Lidar(divergence=1.0), scene, key=KEY, n_photons=65536, max_orders=6, window=(-60.0, 400.0)
     )
     for material in ("leaf", "ground"):
-        off = float(wave.ledger[f"absorbed by {material}"][0] - budget.absorbed[material][0])
+        off = float(wave.energy_budget[f"absorbed by {material}"][0] - budget.absorbed[material][0])
         assert abs(off) < 5 * float(budget.stderr[material][0]) + 2e-3
 
 

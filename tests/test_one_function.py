@@ -7,7 +7,7 @@ import pytest
 
 import jaxlidar as jl
 from jaxlidar._one_function import once, one_function
-from jaxlidar.trace.march import free_flight, medium_of
+from jaxlidar.trace.voxel_traversal import make_medium, march_to_depths
 
 KEY = jax.random.key(0)
 
@@ -15,13 +15,13 @@ KEY = jax.random.key(0)
 def flight(extinction, *, reverse):
     """Total depth and ends of 64 rays from the middle of a map."""
     voxels = jl.VoxelMap.from_extinction(leaf=extinction, voxel_size=1.0, origin=(-2.0, -2.0, 0.0))
-    medium = medium_of(jl.Canopy(voxels, leaf=jl.LeafOptics(0.4, 0.4)), jnp.zeros(3))
+    medium = make_medium(jl.Canopy(voxels, leaf=jl.LeafOptics(0.4, 0.4)), jnp.zeros(3))
     w = jax.random.normal(KEY, (3, 64))
     w = tuple(w / jnp.linalg.norm(w, axis=0, keepdims=True))
     x = tuple(jnp.full(64, v) for v in (0.1, 0.2, 2.3))
     depths = jnp.linspace(0.1, 2.0, 64)[None]
     far, on = jnp.full(64, 1e6), jnp.ones(64, bool)
-    return free_flight(medium, x, w, depths, far, on, 32, reverse=reverse)
+    return march_to_depths(medium, x, w, depths, far, on, 32, reverse=reverse)
 
 
 @pytest.fixture
@@ -36,7 +36,7 @@ def test_a_flight_is_the_same(extinction):
 
 def test_derivatives_are_the_same(extinction):
     def depth(k, reverse):
-        return jnp.sum(flight(k, reverse=reverse).total)
+        return jnp.sum(flight(k, reverse=reverse).total_depth)
 
     forward = jax.jit(jax.jacfwd(lambda k: depth(k, False)))(extinction)
     backward = jax.jit(jax.grad(lambda k: depth(k, True)))(extinction)
@@ -63,11 +63,11 @@ def test_a_scene_can_be_traced_for_forward_derivatives_alone():
     )
     canopy = jl.Canopy(voxels, leaf=jl.LeafOptics(0.4, 0.4))
     scene = jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=0.3))
-    setup = jl.reduce(lidar, scene, jl.plan(lidar, scene, max_orders=3, n_photons=256))
+    setup = jl.make_setup(lidar, scene, jl.plan(lidar, scene, max_orders=3, n_photons=256))
     totals = []
     for reverse in (True, False):
         response = jax.jit(lambda key, r=reverse: jl.trace_scene(setup, key, reverse=r))(KEY)
-        totals.append(jl.total_of(response, setup))
+        totals.append(jl.total_reflectance(response, setup))
     np.testing.assert_allclose(*totals, rtol=1e-4, atol=1e-6)
     with pytest.raises(TypeError, match="reverse"):
         jl.trace_scene(setup, KEY, reverse="no")

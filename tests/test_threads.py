@@ -54,7 +54,7 @@ def test_what_waits_is_dropped_after_an_error():
 @pytest.mark.parametrize("double", slow_unless([True], [False, True]))
 def test_simulate_keeps_the_precision(double, monkeypatch):
     kind = "float64" if double else "float32"
-    module, kinds = sys.modules["jaxlidar.trace.batches"], []
+    module, kinds = sys.modules["jaxlidar.sampling.batch_programs"], []
     joined = module.joined
 
     def watched(*args):

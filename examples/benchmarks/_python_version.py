@@ -1,6 +1,5 @@
 """Worker of `python_versions.py`: seconds of some work in this process, as a line of JSON."""
 
-import dataclasses
 import functools
 import json
 import platform
@@ -33,18 +32,18 @@ def main() -> None:
 
     plan = jl.plan(LIDAR, scene, max_orders=ORDERS, window=WINDOW, describe=False)
     single = jl.plan(LIDAR, scene, max_orders=1, window=WINDOW, n_rays=8192, describe=False)
-    few = dataclasses.replace(plan, n_rays=1)
+    few = plan.with_config(n_rays=1)
 
     def trace(scene, plan, reverse=False):
-        return jl.trace_scene(jl.reduce(LIDAR, scene, plan), KEY, reverse=reverse)
+        return jl.trace_scene(jl.make_setup(LIDAR, scene, plan), KEY, reverse=reverse)
 
     def raised(heights):
         moved = eqx.tree_at(lambda s: s.ground.height, scene, heights[0])
         return eqx.tree_at(lambda s: s.canopy.voxels.leaf, moved, scene.canopy.voxels.leaf * heights[1])
 
     def total(heights, reverse=False):
-        setup = jl.reduce(LIDAR, raised(heights), plan)
-        return jl.total_of(jl.trace_scene(setup, KEY, reverse=reverse), setup)
+        setup = jl.make_setup(LIDAR, raised(heights), plan)
+        return jl.total_reflectance(jl.trace_scene(setup, KEY, reverse=reverse), setup)
 
     # As `simulate` compiles its batches.
     traced = eqx.filter_jit(trace, **ONE_CORE)

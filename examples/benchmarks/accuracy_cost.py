@@ -23,10 +23,10 @@ import equinox as eqx
 import jax
 import numpy as np
 from _common import machine, options, plt, print_table, save_figure, write_json
+from jaxlidar.planning.alternatives import with_alternatives
 
 import jaxlidar as jl
-from jaxlidar.planning.alternatives import with_alternatives
-from jaxlidar.planning.sampling import sampling_of
+from jaxlidar.spectral.pulse_convolution import pulse_convolution
 
 LIDAR = jl.Lidar(wavelength=1064.0, divergence=5.0)
 CONE = 10.0
@@ -98,8 +98,8 @@ def run(case: Case, batches: int, plan: jl.Plan, seed: int = 0, x64: bool = Fals
         scene = case.scene if not x64 else jax.tree.map(lambda a: a.astype(float), case.scene)
 
         def batch(scene, key):
-            setup = jl.reduce(LIDAR, scene, plan)
-            return jl.total_of(jl.trace_scene(setup, key), setup)[0]
+            setup = jl.make_setup(LIDAR, scene, plan)
+            return jl.total_reflectance(jl.trace_scene(setup, key), setup)[0]
 
         keys = [jax.random.key(seed + i) for i in range(batches if plan.is_random else 5)]
         begun = time.perf_counter()
@@ -123,7 +123,7 @@ def run_analog(case: Case, photons: int, groups: int) -> Run:
     """Waveforms of groups of analog photons; a group counts as a batch."""
     plan = case.plan(bin_width=0.5)
     whole = dataclasses.replace(plan, bins=dataclasses.replace(plan.bins, kernel=0))
-    kernel = np.asarray(sampling_of(LIDAR, whole).matrix(), float)
+    kernel = np.asarray(pulse_convolution(LIDAR, whole).matrix(), float)
     edges = plan.bins.start + plan.bins.width * (np.arange(plan.bins.count + 1) - 0.5)
 
     def group(number):

@@ -34,7 +34,7 @@ CHANGES = {
     "chlorophyll": {"Cab": 50.0},
 }
 # Compilations that take less are of single operations.
-NOTABLE = 0.1
+NOTABLE_FRACTION = 0.1
 
 
 class Compilations(logging.Handler):
@@ -97,7 +97,7 @@ def main() -> None:
             start = time.perf_counter()
             simulate(**change)
             times.append(time.perf_counter() - start)
-        large = [what for what, took in heard.found if took > NOTABLE]
+        large = [what for what, took in heard.found if took > NOTABLE_FRACTION]
         results.append({"change": name, "seconds": times[0], "warm": times[1], "compiled": large})
     write_json(given.out / "everyday_changes.json", {"machine": machine(), "changes": results})
 

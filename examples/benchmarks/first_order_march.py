@@ -27,7 +27,7 @@ import jaxlidar as jl
 from jaxlidar import SPEED_OF_LIGHT
 from jaxlidar.extend import along
 from jaxlidar.trace.first_order import FACET_BACKSCATTER
-from jaxlidar.trace.footprint import beam_of, lattice
+from jaxlidar.trace.footprint import fibonacci_disc, make_beam
 
 BATCHES = 4
 SHAPE, EDGE = (64, 64, 128), 0.25
@@ -149,16 +149,16 @@ def march(x, w, excess, energy, k, size, origin, start, width, count, row, max_s
 
 def by_hand(lidar: jl.Lidar, scene: jl.Scene, plan: jl.Plan, threads: int):
     """The kernel with the rays and voxels that jaxlidar would take."""
-    beam = beam_of(lidar)
-    across, energy = lattice(beam, plan.n_rays, jnp.asarray([0.5, 0.0]))
+    beam = make_beam(lidar)
+    across, energy = fibonacci_disc(beam, plan.n_rays, jnp.asarray([0.5, 0.0]))
     point, w, excess = beam.ray(across)
-    x = along(point, w, jnp.asarray(-plan.trace.upstream))
+    x = along(point, w, jnp.asarray(-plan.limits.start_distance))
     x, w = (np.stack([np.broadcast_to(c, energy.shape) for c in v], axis=-1) for v in (x, w))
     voxels, bins = scene.canopy.voxels, plan.bins
     arguments = (
-        *(x, w, np.asarray(excess) - f4(plan.trace.upstream), np.asarray(energy)),
+        *(x, w, np.asarray(excess) - f4(plan.limits.start_distance), np.asarray(energy)),
         *(np.asarray(voxels.leaf), np.asarray(voxels.voxel_size), np.asarray(voxels.origin)),
-        *(f4(bins.start), f4(bins.width), bins.count, bins.row, f4(plan.trace.max_step)),
+        *(f4(bins.start), f4(bins.width), bins.count, bins.max_span, f4(plan.limits.max_segment)),
         *(f4(GROUND), f4(FACET_BACKSCATTER)),
     )
     return lambda: march(*arguments, threads)
@@ -172,7 +172,7 @@ def main() -> None:
     plan = jl.plan(lidar, scene, max_orders=1, footprint="fixed", n_rays=given.rays)
 
     trace = eqx.filter_jit(
-        lambda lidar, scene, key: jl.trace_scene(jl.reduce(lidar, scene, plan), key).first[0]
+        lambda lidar, scene, key: jl.trace_scene(jl.make_setup(lidar, scene, plan), key).first[0]
     )
     keys = list(jax.random.split(jax.random.key(0), BATCHES))
     pool = ThreadPoolExecutor(cores)
@@ -206,7 +206,7 @@ def main() -> None:
         "rays_per_batch": given.rays,
         "batches": BATCHES,
         "fine_bin_ns": plan.bins.width,
-        "stretches_per_ray_at_most": plan.trace.first_steps,
+        "stretches_per_ray_at_most": plan.config.max_ray_segments,
         "rays_per_second": rates,
         "rays_per_second_median": medians,
         "jaxlidar_over_numba": {
@@ -223,7 +223,9 @@ def main() -> None:
     axes.set(xlabel="million rays per second", title="Order one through 64 x 64 x 128 voxels")
     save_figure(figure, given.out / "first_order_march.png")
 
-    rows = [(n, rates[n] * 1e-6, medians[n] * 1e-6, 1e9 / rates[n] / plan.trace.first_steps) for n in names]
+    rows = [
+        (n, rates[n] * 1e-6, medians[n] * 1e-6, 1e9 / rates[n] / plan.config.max_ray_segments) for n in names
+    ]
     print_table(("", "Mrays/s, best", "median", "ns a step"), rows)
     ratio = record["jaxlidar_over_numba"]
     print(f"jaxlidar over numba: {ratio['all cores']:.2f} on all cores (wanted: at least 1),", end=" ")

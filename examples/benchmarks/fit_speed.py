@@ -124,8 +124,8 @@ def draw(record: dict, path: Path) -> None:
 
 @eqx.filter_jit
 def _simulated(scene, plan, places, values, key):
-    setup = jl.reduce(LIDAR, put(scene, places, values), plan)
-    return jl.total_of(jl.trace_scene(setup, key, reverse=False), setup)
+    setup = jl.make_setup(LIDAR, put(scene, places, values), plan)
+    return jl.total_reflectance(jl.trace_scene(setup, key, reverse=False), setup)
 
 
 if __name__ == "__main__":

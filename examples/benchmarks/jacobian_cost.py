@@ -65,11 +65,13 @@ def main() -> None:
     )
 
     def response(geometric, optical, key):
-        setup = jl.reduce(lidar, scene_at(optical, geometric, extinction), plan)
+        setup = jl.make_setup(lidar, scene_at(optical, geometric, extinction), plan)
         return jl.trace_scene(setup, key, reverse=False)
 
     def colour(response, optical, geometric):
-        return jl.total_of(response, jl.reduce(lidar, scene_at(optical, geometric, extinction), plan))
+        return jl.total_reflectance(
+            response, jl.make_setup(lidar, scene_at(optical, geometric, extinction), plan)
+        )
 
     def simulate(optical, geometric, key):
         return colour(response(geometric, optical, key), optical, geometric)
@@ -96,8 +98,8 @@ def main() -> None:
     def layer_columns(optical, geometric, key):
         def total(shares):
             grown = extinction * shares[layer][None, None]
-            setup = jl.reduce(lidar, scene_at(optical, geometric, grown), plan)
-            return jl.total_of(jl.trace_scene(setup, key, reverse=False), setup)
+            setup = jl.make_setup(lidar, scene_at(optical, geometric, grown), plan)
+            return jl.total_reflectance(jl.trace_scene(setup, key, reverse=False), setup)
 
         push = jax.vmap(lambda t: jax.jvp(total, (jnp.ones(LAYERS),), (t,)), out_axes=(None, -1))
         return push(jnp.eye(LAYERS))

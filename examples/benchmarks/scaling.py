@@ -42,8 +42,8 @@ def cost(scene: jl.Scene, photons: int, rays: int) -> tuple[float, int, float]:
     )
 
     def batch(scene, key):
-        setup = jl.reduce(LIDAR, scene, plan)
-        return jl.total_of(jl.trace_scene(setup, key, reverse=False), setup)
+        setup = jl.make_setup(LIDAR, scene, plan)
+        return jl.total_reflectance(jl.trace_scene(setup, key, reverse=False), setup)
 
     key = jax.random.key(0)
     compiled = eqx.filter_jit(batch).lower(scene, key).compile()

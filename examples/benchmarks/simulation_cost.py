@@ -5,7 +5,6 @@ each compiles and is given apart; the others are warm, the fastest counts. For t
 batch is split into order one, the higher orders and colouring.
 """
 
-import dataclasses
 import time
 
 import equinox as eqx
@@ -14,8 +13,8 @@ import numpy as np
 from _common import best, machine, new_figure, options, print_table, race, save_figure, seconds, write_json
 
 import jaxlidar as jl
-from jaxlidar.trace.response import trace_setting
-from jaxlidar.trace.setting import setting_of
+from jaxlidar.trace.device_scene import build_device_scene
+from jaxlidar.trace.response import trace_device_scene
 
 TOLERANCES = (0.1, 0.03, 0.01)
 N, SIZE, ORDERS = 64, 10.0, 15
@@ -43,18 +42,22 @@ def split(scene: jl.Scene, rounds: int) -> dict[str, float]:
     """Seconds of the parts of one batch with the default sizes."""
     plan = jl.plan(LIDAR, scene, max_orders=ORDERS, window=WINDOW)
     single = jl.plan(LIDAR, scene, max_orders=1, window=WINDOW, n_rays=plan.n_rays)
-    few = dataclasses.replace(plan, n_rays=1)
+    few = plan.with_config(n_rays=1)
     key = jax.random.key(0)
 
     def traced(plan):
         # Without derivatives, as `simulate` does.
         def trace(scene, key):
-            return trace_setting(setting_of(jl.reduce(LIDAR, scene, plan), derivatives="none"), None, key)
+            return trace_device_scene(
+                build_device_scene(jl.make_setup(LIDAR, scene, plan), derivatives="none"), None, key
+            )
 
         return eqx.filter_jit(trace)
 
     all_orders, first, higher = traced(plan), traced(single), traced(few)
-    colour = eqx.filter_jit(lambda response, scene: jl.total_of(response, jl.reduce(LIDAR, scene, plan)))
+    colour = eqx.filter_jit(
+        lambda response, scene: jl.total_reflectance(response, jl.make_setup(LIDAR, scene, plan))
+    )
     response = all_orders(scene, key)
     return best(
         race(

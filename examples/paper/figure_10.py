@@ -20,7 +20,7 @@ def main(argv=None) -> dict[str, float]:
     wave = jl.simulate(lidar, jl.Scene(plates=(plate,)), key=jax.random.key(0))
     returned = np.asarray(wave.reflectance, float).sum(axis=1)
     # Of all light, what neither came from the plate nor stayed in it went through.
-    through = 1.0 - np.asarray(wave.ledger["absorbed by plate"], float) - returned
+    through = 1.0 - np.asarray(wave.energy_budget["absorbed by plate"], float) - returned
     found = {
         "largest difference of reflectance": float(np.max(np.abs(returned - r))),
         "largest difference of transmittance": float(np.max(np.abs(through - t))),

@@ -66,13 +66,13 @@ def main(argv=None) -> dict[str, float]:
     # One trace for both pulses: the default of 6 ns, and one that tells the echoes apart.
     plan = jl.plan(short, scene, max_orders=8, window=(-20.0, 30.0), bin_width=0.1)
     keys = jax.random.split(jax.random.key(2), 2 if given.small else 16)
-    one = jax.jit(lambda key: jl.trace_scene(jl.reduce(short, scene, plan), key))
+    one = jax.jit(lambda key: jl.trace_scene(jl.make_setup(short, scene, plan), key))
     traced = [one(key) for key in keys]
     response = jax.tree.map(lambda *a: sum(a) / len(a), *traced)
     figure, axes = new_figure(2, width=5.0, sharey=True)
     for ax, fwhm in zip(axes, (6.0, 2.0)):
         lidar = jl.Lidar(wavelength=WAVELENGTH, pulse=jl.GaussianPulse(fwhm=fwhm), sampling_interval=0.1)
-        wave = jl.waveform_of(response, jl.reduce(lidar, scene, plan))
+        wave = jl.waveform_of(response, jl.make_setup(lidar, scene, plan))
         for height in (HEIGHT, 0.0):
             ax.axhline(height, color="0.8", linewidth=0.8, zorder=0)
         for i, w in enumerate(WAVELENGTH):

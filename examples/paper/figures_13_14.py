@@ -35,12 +35,12 @@ def main(argv=None) -> dict[str, float]:
         lidar_of(1.0), scene, max_orders=4 if given.small else 12, window=WINDOW, bin_width=INTERVAL
     )
     keys = jax.random.split(jax.random.key(0), 2 if given.small else 16)
-    one = jax.jit(lambda key: jl.trace_scene(jl.reduce(lidar_of(1.0), scene, plan), key))
+    one = jax.jit(lambda key: jl.trace_scene(jl.make_setup(lidar_of(1.0), scene, plan), key))
     traced = [one(key) for key in keys]
     response = jax.tree.map(lambda *a: sum(a) / len(a), *traced)
 
     def recorded(length: float) -> np.ndarray:
-        setup = jl.reduce(lidar_of(length), scene, plan)
+        setup = jl.make_setup(lidar_of(length), scene, plan)
         return np.asarray(jl.waveform_of(response, setup).reflectance[0], float)
 
     def resolved(length: float) -> bool:

@@ -49,7 +49,7 @@ class Step:
         return f"step {self.number}: chi2 = {self.reduced_chi2:.4g}{rejection}; {values}"
 
 
-def short_text(value: np.ndarray | float) -> str:
+def short_text(value: Any) -> str:
     """Return a number or array in four digits, long arrays abridged."""
     return np.array2string(np.asarray(value), precision=4, threshold=8, edgeitems=3)
 
@@ -118,7 +118,8 @@ class FitRecord:
         """
         if arrays.keys() != FitRecord.axes().keys():
             raise ValueError(f"it has {', '.join(arrays)}; admissible are {', '.join(FitRecord.axes())}")
-        return FitRecord(**{name: a if a.ndim else a.item() for name, a in arrays.items()})
+        quantities: dict[str, Any] = {name: a if a.ndim else a.item() for name, a in arrays.items()}
+        return FitRecord(**quantities)
 
     def check(self, sizes: RecordSizes) -> None:
         """Check a record that was read from a file.

@@ -5,7 +5,8 @@ applied to response(x). A column dw/dx_k of the Jacobian is computed
 
 - for an *optical* unknown from the derivative of the optics: a small matrix product with the response;
 - for an unknown that changes *extinction* only, from the score function of the traced paths, d log(path
-  probability) / d x_k (likelihood-ratio method, `jaxlidar.trace.scores`), if that is possible and pays;
+  probability) / d x_k (likelihood-ratio method, `jaxlidar.trace.score_functions`), if that is possible and
+  pays;
 - for any other, *geometric* unknown as a tangent (forward-mode derivative) pushed through the trace; all
   tangents share one pass, or as many as memory allows.
 
@@ -38,15 +39,26 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from inversion.fit.unknowns import BoundUnknown, Dependence, Setter, set_values
-from jaxlidar import Lidar, Plan, Response, Scene, Setup, Waveform, reduce, total_of, trace_scene, waveform_of
+from jaxlidar import (
+    Lidar,
+    Plan,
+    Response,
+    Scene,
+    Setup,
+    Waveform,
+    make_setup,
+    total_reflectance,
+    trace_scene,
+    waveform_of,
+)
 from jaxlidar.extend import ONE_CORE, concrete, side_by_side
 from jaxlidar.planning.memory import in_words, memory_limit, scored_bytes
 from jaxlidar.planning.plan import MIN_BATCHES
-from jaxlidar.trace.colouring import columns_in_samples, optics_of, recording_of
-from jaxlidar.trace.response import trace_scored
-from jaxlidar.trace.scored_light import scores_of
-from jaxlidar.trace.scores import Scores
-from jaxlidar.trace.setting import setting_of
+from jaxlidar.spectral.apply_optics import derivatives_to_samples, make_waveform_model, setup_optics
+from jaxlidar.trace.device_scene import build_device_scene
+from jaxlidar.trace.extinction_slopes import ExtinctionSlopes
+from jaxlidar.trace.response import trace_with_scores
+from jaxlidar.trace.score_functions import make_slopes
 
 Values = tuple[Array, ...]
 # Batches of a pilot evaluation: a quarter of the work of all, and the least that shows its own noise.
@@ -83,23 +95,22 @@ def choose_jacobian_methods(
         setter._replace(dependence="geometric") if setter.dependence == "extinction" else setter
         for setter in setters
     )
-    if not plan.trace.keeps_histories:
+    if not plan.config.keeps_histories:
         # Optics are applied while light is traced: even optical unknowns change the trace.
         return JacobianMethods(tuple(s._replace(dependence="geometric") for s in setters), 0, 0.0)
     columns = sum(u.start.size for u in unknowns if u.setter.dependence == "extinction")
     if columns == 0:
         return JacobianMethods(setters, 0, 0.0)
     # The setup's scene: a plan may leave the canopy out.
-    canopy, wavelengths = reduce(lidar, scene, plan).scene.canopy, lidar.wavelength.size
+    canopy, wavelengths = make_setup(lidar, scene, plan).scene.canopy, lidar.wavelength.size
     # Off nadir the return path is marched as well, which takes as long as the tangent of one column.
-    min_columns = 1 if plan.trace.vertical else 2
+    min_columns = 1 if plan.config.vertical else 2
     pays = min_columns <= columns <= MAX_SCORED_COLUMNS and wavelengths <= MAX_SCORED_WAVELENGTHS
     if canopy is None or canopy.is_straight or not pays:
         return JacobianMethods(as_tangents, 0, 0.0)
     n_voxels = int(np.prod(canopy.voxels.shape))
-    light = (plan.n_photons, plan.n_rays)
-    size = scored_bytes(plan.trace, plan.bins, light, n_voxels, columns, wavelengths)
-    if size > 0.5 * memory_limit(plan.limits.max_memory):
+    size = scored_bytes(plan.config, plan.bins, cells=n_voxels, columns=columns, wavelengths=wavelengths)
+    if size > 0.5 * memory_limit(plan.scope.max_memory):
         return JacobianMethods(as_tangents, 0, 0.0)
     return JacobianMethods(setters, max_columns_per_voxel(scene, unknowns), size)
 
@@ -159,7 +170,7 @@ def tangents_per_pass(plan: Plan, columns: int, reserved: float = 0.0) -> int:
 
     **Raises:** ValueError if a single column takes more memory than the plan may.
     """
-    fitting, limit = columns, memory_limit(plan.limits.max_memory) - reserved
+    fitting, limit = columns, memory_limit(plan.scope.max_memory) - reserved
     while fitting > 1 and plan.jacobian_memory(fitting) > limit:
         fitting -= 1
     if columns and (size := plan.jacobian_memory(fitting)) > limit:
@@ -191,7 +202,7 @@ class ForwardModel(eqx.Module):
 
     def setup(self, values: Values) -> Setup:
         """Return the setup with these values."""
-        return reduce(self.lidar, set_values(self.scene, self.setters, values), self.plan)
+        return make_setup(self.lidar, set_values(self.scene, self.setters, values), self.plan)
 
     def as_function_of(
         self, dependence: Dependence, values: Values
@@ -210,46 +221,46 @@ class ForwardModel(eqx.Module):
         return flat, setup_at
 
 
-def _extinction_scores(model: ForwardModel, values: Values) -> Scores | None:
-    """Return the scores of the unknowns that change extinction only; all batches share them."""
+def _extinction_slopes(model: ForwardModel, values: Values) -> ExtinctionSlopes | None:
+    """Return the derivatives of extinction by the unknowns that change it only; all batches share them."""
     flat, setup_at = model.as_function_of("extinction", values)
     if not flat.size:
         return None
 
     def extinction(flat: Array) -> tuple[Array | None, Array | None]:
-        medium = setting_of(setup_at(flat), derivatives="forward").medium
+        medium = build_device_scene(setup_at(flat), derivatives="forward").medium
         assert medium is not None
         return medium.leaf, medium.bark
 
     derivatives = jax.vmap(lambda tangent: jax.jvp(extinction, (flat,), (tangent,))[1])
     leaf, bark = derivatives(jnp.eye(flat.size, dtype=flat.dtype))
     setup = setup_at(flat)
-    setting = setting_of(setup, derivatives="forward")
-    return scores_of(setting, leaf, bark, optics_of(setup), model.columns_per_voxel)
+    device_scene = build_device_scene(setup, derivatives="forward")
+    return make_slopes(device_scene, leaf, bark, setup_optics(setup), model.columns_per_voxel)
 
 
-def _trace_with_scores(
-    setup: Setup, scores: Scores, key: PRNGKeyArray
+def _trace_with_slopes(
+    setup: Setup, slopes: ExtinctionSlopes, key: PRNGKeyArray
 ) -> tuple[Response, Float[Array, "columns wavelengths samples"]]:
     """Trace one batch. Return its response, and the derivatives of its total by scores."""
-    setting = dataclasses.replace(setting_of(setup, derivatives="forward"), scores=scores)
-    response, fine_columns = trace_scored(setting, optics_of(setup), key)
-    return response, columns_in_samples(fine_columns, recording_of(setup))
+    device_scene = dataclasses.replace(build_device_scene(setup, derivatives="forward"), slopes=slopes)
+    response, fine_columns = trace_with_scores(device_scene, setup_optics(setup), key)
+    return response, derivatives_to_samples(fine_columns, make_waveform_model(setup))
 
 
 def _trace_batch(
-    model: ForwardModel, values: Values, key: PRNGKeyArray, scores: Scores | None
+    model: ForwardModel, values: Values, key: PRNGKeyArray, slopes: ExtinctionSlopes | None
 ) -> tuple[Response, Float[Array, "wavelengths bins"], Float[Array, "columns wavelengths bins"]]:
     """Trace one batch. Return its response, total, and derivatives: geometric ones, then by extinction."""
     flat, setup_at = model.as_function_of("geometric", values)
 
     def simulate(flat: Array) -> tuple[Array, tuple[Response, Array | None]]:
         setup = setup_at(flat)
-        if scores is None:
+        if slopes is None:
             response, score_columns = trace_scene(setup, key, reverse=False), None
         else:
-            response, score_columns = _trace_with_scores(setup, scores, key)
-        return total_of(response, setup), (response, score_columns)
+            response, score_columns = _trace_with_slopes(setup, slopes, key)
+        return total_reflectance(response, setup), (response, score_columns)
 
     total, columns, (response, score_columns) = _value_and_tangents(simulate, flat, model.tangents_per_pass)
     if score_columns is not None:
@@ -285,7 +296,7 @@ def _value_and_tangents(
 
 
 _compiled_trace_batch = eqx.filter_jit(_trace_batch, **ONE_CORE)
-_compiled_scores = eqx.filter_jit(_extinction_scores)
+_compiled_slopes = eqx.filter_jit(_extinction_slopes)
 
 
 @eqx.filter_jit
@@ -296,7 +307,7 @@ def _apply_optics(
     flat, setup_at = model.as_function_of("optical", values)
 
     def total(flat: Array) -> Array:
-        return total_of(response, setup_at(flat))
+        return total_reflectance(response, setup_at(flat))
 
     if not flat.size:
         value = total(flat)
@@ -328,9 +339,9 @@ def evaluate_scene(
     for each batch of photons. Only the first `n_batches` are traced; the rows of the others are zero. As
     their number is data, one compiled program serves pilot evaluations and full ones.
     """
-    scores = _extinction_scores(model, values)
+    slopes = _extinction_slopes(model, values)
     # Under jit the batch is traced by JAX once for shapes and loop alike.
-    trace_batch = jax.jit(lambda key: _trace_batch(model, values, key, scores))
+    trace_batch = jax.jit(lambda key: _trace_batch(model, values, key, slopes))
 
     def add_batch(n: Array, sums: Any) -> Any:
         response, total, columns = trace_batch(keys[n])
@@ -377,8 +388,8 @@ def check_position(lidar: Lidar) -> None:
     rounding = float(np.max(np.spacing(np.abs(position).astype(dtype))))
     if rounding > MAX_ROUNDING:
         raise ValueError(
-            f"position = {position.tolist()} m is rounded by {rounding:.1g} m in {dtype}; admissible for fits "
-            f"is {MAX_ROUNDING:g} m: give lidar and scene relative to a nearby origin, or enable double "
+            f"position = {position.tolist()} m is rounded by {rounding:.1g} m in {dtype}; admissible for "
+            f"fits is {MAX_ROUNDING:g} m: give lidar and scene relative to a nearby origin, or enable double "
             "precision"
         )
 
@@ -454,10 +465,10 @@ class Model:
         if self._cache is not None and (not self.retraces or np.array_equal(self._cache[0], flat)):
             reused = self._cache[1]
         values = self.values(flat)
-        scores = _compiled_scores(self.forward, values) if self.forward.columns_per_voxel else None
+        slopes = _compiled_slopes(self.forward, values) if self.forward.columns_per_voxel else None
 
         def trace_batch(key):
-            return _compiled_trace_batch(self.forward, values, key, scores)
+            return _compiled_trace_batch(self.forward, values, key, slopes)
 
         with side_by_side() as run:
             traced = [*reused[:n_batches], *run(trace_batch, self.keys[len(reused) : n_batches])]

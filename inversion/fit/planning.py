@@ -18,10 +18,10 @@ from jaxlidar import Lidar, Plan, Scene
 from jaxlidar import plan as make_plan
 from jaxlidar.extend import check_integer, check_kind
 from jaxlidar.planning.effects import empty
-from jaxlidar.planning.ladder import rung
 from jaxlidar.planning.path_lengths import PathLengths
 from jaxlidar.planning.plan import MIN_BATCHES
 from jaxlidar.planning.plan_check import check_reach
+from jaxlidar.planning.size_buckets import size_bucket
 
 # Up to this many geometric unknowns, every corner of the bounds is examined: 2^4 of them.
 _MAX_UNKNOWNS_FOR_ALL_CORNERS = 4
@@ -116,7 +116,7 @@ def plan_for_bounds(
     first = make_plan(lidar, scenes[0], max_orders=sizes.max_orders, **common)
     common.update(max_orders=first.orders, bin_width=first.bins.width)
     if scene.canopy is not None:
-        common.update(max_step=first.trace.max_step)
+        common.update(max_step=first.limits.max_segment)
     plans = [first]
     for corner in scenes[1:]:
         try:
@@ -129,21 +129,22 @@ def plan_for_bounds(
         first.bins,
         start=start,
         count=round((end - start) / first.bins.width),
-        row=max(p.bins.row for p in plans),
+        max_span=max(p.bins.max_span for p in plans),
     )
-    upstream = max(p.trace.upstream for p in plans)
-    last = max(p.trace.last for p in plans)
+    start_distance = max(p.limits.start_distance for p in plans)
+    max_path = max(p.limits.max_path for p in plans)
     path_lengths = [PathLengths(lidar, s) for s in scenes]
-    trace = dataclasses.replace(
-        first.trace,
-        upstream=upstream,
-        last=last,
-        max_flight=max(p.longest_flight(last + upstream) for p in path_lengths),
-        first_steps=max(p.trace.first_steps for p in plans),
-        march_steps=rung(max(p.march_steps(last + upstream) for p in path_lengths)),
-        full_cover=tuple(all(c) for c in zip(*(p.trace.full_cover for p in plans))),
+    longest = max_path + start_distance
+    plan = first.with_limits(
+        start_distance=start_distance,
+        max_path=max_path,
+        max_flight=max(p.longest_flight(longest) for p in path_lengths),
+    ).with_config(
+        max_ray_segments=max(p.config.max_ray_segments for p in plans),
+        max_faces=size_bucket(max(p.march_steps(longest) for p in path_lengths)),
+        covers_fully=tuple(all(c) for c in zip(*(p.config.covers_fully for p in plans))),
     )
-    return dataclasses.replace(first, trace=trace, bins=bins)
+    return dataclasses.replace(plan, bins=bins)
 
 
 def checked_plan(

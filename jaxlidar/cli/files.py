@@ -33,7 +33,7 @@ from jaxlidar.optics.spectra import read_spectrum_csv
 from jaxlidar.scenes.canopy import Canopy
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.voxels import VoxelMap
-from jaxlidar.waveform import Waveform
+from jaxlidar.spectral.waveform import Waveform
 
 FILE = ResultPath(exists=True)
 

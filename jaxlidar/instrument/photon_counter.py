@@ -20,7 +20,6 @@ Sources: Neumann et al. (2019), Remote Sens. Environ. 233, 111325, and Martino e
 arrivals between dead times.
 """
 
-import importlib
 import os
 from collections.abc import Iterator
 from typing import Any, ClassVar, NamedTuple, final
@@ -43,7 +42,8 @@ from jaxlidar._checks import (
     scalar,
 )
 from jaxlidar._constants import PLANCK_TIMES_LIGHT, SPEED_OF_LIGHT
-from jaxlidar._ranges import SHARE, Range, check_ranges
+from jaxlidar._ranges import FRACTION, Range, check_ranges
+from jaxlidar._registry import save_result
 
 # Beyond so many events, memory would end before the draws do; beyond so many arrivals, counts of them would
 # have rounding errors.
@@ -104,7 +104,7 @@ class PhotonCounter(eqx.Module):
 
     ranges: ClassVar = {
         "dead_time": Range(0.0),
-        "detection_probability": SHARE,
+        "detection_probability": FRACTION,
         "background_rate": Range(0.0),
         "jitter": Range(0.0),
         "window": Range(),
@@ -179,8 +179,7 @@ class PhotonEvents(eqx.Module):
 
         **Raises:** what `jaxlidar.io.save` raises.
         """
-        # Files lie above the core, which asks for them by name.
-        importlib.import_module("jaxlidar.io.netcdf").save(self, path)
+        save_result(self, path)
 
 
 class _Light(NamedTuple):

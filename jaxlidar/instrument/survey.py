@@ -18,8 +18,8 @@ from jaxlidar._checks import (
     check_numbers,
     check_range,
     concrete,
-    known_array,
-    known_number,
+    concrete_array,
+    concrete_number,
 )
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.instrument.scan import STEEPEST, AbstractScan
@@ -101,8 +101,8 @@ class Survey(eqx.Module):
     @staticmethod
     def of(lidar: Lidar) -> "Survey":
         """The survey of one shot: that of a lidar with its own place and direction."""
-        zenith, azimuth = known_number(lidar.zenith), known_number(lidar.azimuth)
-        return Survey(lidar, known_array(lidar.position)[None], zenith, azimuth)
+        zenith, azimuth = concrete_number(lidar.zenith), concrete_number(lidar.azimuth)
+        return Survey(lidar, concrete_array(lidar.position)[None], zenith, azimuth)
 
     @property
     def middle(self) -> Lidar:
@@ -126,7 +126,7 @@ class Survey(eqx.Module):
     @property
     def slant_range(self) -> Float[np.ndarray, " shots"]:
         """Distances (shots,) in m from the sensor to the reference plane, along the beam axes."""
-        return known_number(self.lidar.altitude) / np.cos(np.deg2rad(self.zenith))
+        return concrete_number(self.lidar.altitude) / np.cos(np.deg2rad(self.zenith))
 
     @property
     def sensor(self) -> Float[np.ndarray, "shots 3"]:
@@ -137,7 +137,7 @@ class Survey(eqx.Module):
     @property
     def footprint_radius(self) -> Float[np.ndarray, " shots"]:
         """Radii (shots,) in m of the beams at the reference plane, as `Lidar.footprint_radius`."""
-        return self.slant_range * known_number(self.lidar.divergence) * 0.5e-3
+        return self.slant_range * concrete_number(self.lidar.divergence) * 0.5e-3
 
     @staticmethod
     def grid(lidar: Lidar, low: Any, high: Any, spacing: Any) -> "Survey":

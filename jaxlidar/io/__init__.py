@@ -1,6 +1,7 @@
 """Readers of recorded waveforms, voxel maps, points, tree models, meshes and terrain; writers of results."""
 
 from jaxlidar._files import atomic_write
+from jaxlidar._signatures import shorten_signatures
 from jaxlidar.io.airborne import AirborneShot, Returns, Scanner, Segment
 from jaxlidar.io.airborne_shots import AirborneShots, ShotStack, stack_shots
 from jaxlidar.io.case import Case, write_case
@@ -54,3 +55,5 @@ __all__ = [
     "write_las_waveforms",
     "write_raster",
 ]
+
+shorten_signatures(globals())

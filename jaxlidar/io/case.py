@@ -16,7 +16,6 @@
 
 import dataclasses
 import functools
-import importlib
 import inspect
 import os
 from collections.abc import Callable, Mapping
@@ -29,6 +28,7 @@ from jaxtyping import PRNGKeyArray
 
 from jaxlidar._checks import check_integer, check_key, check_kind
 from jaxlidar._files import atomic_write
+from jaxlidar._registry import simulate_survey
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.instrument.survey import Survey
 from jaxlidar.io.kinds import UNITS, Argument
@@ -113,10 +113,8 @@ class Case:
         if self.scene is None or self.key is None or missing:
             raise ValueError(f"the case has no {' and no '.join(missing)}: nothing can be simulated")
         if self.survey is not None:
-            # Campaigns lie above the files, which ask for them by name.
-            many = importlib.import_module("jaxlidar.survey.run").simulate_many
             given = {"key": self.key, "path": path, "progress": progress, **self.arguments}
-            return many(self.survey, self.scene, **given)
+            return simulate_survey(self.survey, self.scene, **given)
         if path is not None:
             raise ValueError(
                 f"path = {os.fspath(path)!r} is given without a survey; use save on the waveform"
@@ -129,9 +127,9 @@ class Case:
 def _arguments() -> Mapping[str, Argument]:
     """The arguments of `simulate` that are kept."""
     return {
-        name: Argument(parameter.annotation, False, UNITS.get(name, ""), name)
-        for name, parameter in inspect.signature(simulate).parameters.items()
-        if name not in _NOT_KEPT
+        name: Argument(annotation, False, UNITS.get(name, ""), name)
+        for name, annotation in inspect.get_annotations(simulate).items()
+        if name not in (*_NOT_KEPT, "return")
     }
 
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxlidar._checks import check_kind, check_number, known_number
+from jaxlidar._checks import check_kind, check_number, concrete_number
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar.instrument.survey import Survey
 
@@ -53,7 +53,7 @@ def geolocation(
     the reference plane in m.
     """
     zenith, azimuth = np.deg2rad(survey.zenith), np.deg2rad(survey.azimuth)
-    altitude = known_number(survey.lidar.altitude)
+    altitude = concrete_number(survey.lidar.altitude)
     # Heights above the reference plane, as those of `Waveform.height`.
     drop = 0.5 * SPEED_OF_LIGHT * np.cos(zenith)
     heights = {"bin0": -drop * first, "lastbin": -drop * (first + count - 1)}

@@ -26,7 +26,7 @@ from jaxlidar._checks import (
     check_number,
     check_range,
     check_shape,
-    known_number,
+    concrete_number,
 )
 from jaxlidar._files import atomic_write
 from jaxlidar.instrument.lidar import Lidar
@@ -34,7 +34,7 @@ from jaxlidar.instrument.survey import Survey
 from jaxlidar.io.checks import MOST_COUNTS
 from jaxlidar.io.gedi_places import geolocation, reference_system
 from jaxlidar.io.netcdf import version
-from jaxlidar.waveform import Waveform, received
+from jaxlidar.spectral.waveform import Waveform, energy_per_reflectance
 
 # The beams' groups: the number of the laser's channel, and whether the laser's full power is in the beam.
 BEAMS = {
@@ -154,7 +154,7 @@ def write_gedi_l1b(
     if key is not None:
         check_key(key)
     per_joule = gain / _energy_per_reflectance(survey)
-    background = known_number(survey.lidar.receiver.background)
+    background = concrete_number(survey.lidar.receiver.background)
     sent, reference = _sent(survey.lidar)
     columns = {
         "shot_number": _numbers(shot_number, beams),
@@ -283,7 +283,7 @@ def _energy_per_reflectance(survey: Survey) -> np.ndarray:
     """J of a sample per apparent reflectance of it, at the reference plane, (shots,)."""
     plane = jnp.zeros(1)
     upright = dataclasses.replace(survey.lidar, zenith=0.0)
-    return float(received(upright, plane)[0, 0]) * np.cos(np.deg2rad(survey.zenith)) ** 2
+    return float(energy_per_reflectance(upright, plane)[0, 0]) * np.cos(np.deg2rad(survey.zenith)) ** 2
 
 
 def _numbers(given: Any, beams: np.ndarray) -> np.ndarray:

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 
+from jaxlidar._registry import public_objects
 from jaxlidar.instrument.pulse import SampledPulse
 from jaxlidar.instrument.survey import Survey
 from jaxlidar.io.dem import DemRead, read_dem
@@ -138,12 +139,9 @@ class Argument(NamedTuple):
 @functools.cache
 def kinds() -> Mapping[str, Callable[..., Any]]:
     """All kinds by name: exported classes of scenes, lidars and optics, and functions that make them."""
-    import jaxlidar
-
-    exported = {name: vars(jaxlidar).get(name) for name in jaxlidar.__all__}
     classes = {
         name: value
-        for name, value in exported.items()
+        for name, value in public_objects.items()
         if isinstance(value, type)
         and issubclass(value, eqx.Module)
         and value.__module__.startswith(ROOMS)
@@ -156,16 +154,17 @@ def kinds() -> Mapping[str, Callable[..., Any]]:
 @functools.cache
 def arguments_of(maker: Callable[..., Any]) -> Mapping[str, Argument]:
     """The arguments of a class or function by name, in their order."""
-    # Constructors show no annotations; those of their fields serve.
+    # Signatures are shortened for display; the annotations of fields and functions are the real ones.
     own = dataclasses.fields(maker) if isinstance(maker, type) and dataclasses.is_dataclass(maker) else ()
     fields = {f.name: f for f in own}
+    annotations = inspect.get_annotations(maker.__init__ if isinstance(maker, type) else maker)
     found = {}
     for name, parameter in inspect.signature(maker).parameters.items():
         if parameter.kind is parameter.VAR_KEYWORD:
             # Of habits by name: changes of what they have.
             return arguments_of(Habit)
         stored = STORED.get((maker, name), name)  # pyright: ignore[reportArgumentType, reportCallIssue]
-        annotation = fields[stored].type if stored in fields else parameter.annotation
+        annotation = fields[stored].type if stored in fields else annotations.get(name, Any)
         unit = UNITS_OF.get((maker, name), UNITS.get(name, ""))  # pyright: ignore[reportArgumentType, reportCallIssue]
         found[name] = Argument(annotation, parameter.default is parameter.empty, unit, stored)
     return found

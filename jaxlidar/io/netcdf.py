@@ -1,4 +1,4 @@
-"""Results as netCDF-4 files or Zarr stores, by the CF conventions, and back: `save`, `open`, `repeat`."""
+"""Results as netCDF-4 files or Zarr stores, by the CF conventions, and back: `save`, `open`, `rerun`."""
 
 import contextlib
 import datetime
@@ -13,14 +13,15 @@ import jax
 import numpy as np
 
 from jaxlidar._files import atomic_write
+from jaxlidar._registry import save_result
 from jaxlidar.instrument.photon_counter import PhotonEvents
 from jaxlidar.io.case import Case
 from jaxlidar.io.case import read_case as read_case_text
 from jaxlidar.io.gedi_beam import refusing
 from jaxlidar.io.layouts import LAYOUTS, keep_as_netcdf, layout_of
 from jaxlidar.io.zarr_groups import ZarrGroup, is_zarr, opened
+from jaxlidar.spectral.waveform import Waveform
 from jaxlidar.truth import Truth
-from jaxlidar.waveform import Waveform
 
 CONVENTIONS = "CF-1.11"
 # The layout of the files. A reader refuses those that are newer.
@@ -32,6 +33,7 @@ ZARR = "zarr.json"
 NOT_REPEATABLE = ("time spent", "interrupted")
 
 
+@save_result.register
 def save(result: Any, path: str | os.PathLike[str], case: Case | None = None) -> None:
     """Write a `Waveform`, or another result, as netCDF or Zarr: with units, names, and where it comes from.
 
@@ -44,7 +46,7 @@ def save(result: Any, path: str | os.PathLike[str], case: Case | None = None) ->
       `inversion.Retrieval` and `inversion.Retrievals`.
     - `path`: the file to write, or the folder of a Zarr store, whose name ends in ".zarr".
     - `case`: the `Case` that a waveform, or those of a survey, were simulated from, kept with them so that
-      `jaxlidar.repeat` can simulate them again. Default None: not kept.
+      `jaxlidar.rerun` can simulate them again. Default None: not kept.
 
     **Returns:** nothing.
 
@@ -263,7 +265,7 @@ def read_case(path: str | os.PathLike[str]) -> Case:
     return _with_file(path, lambda path, file: Reader(path, layout_of).case(file, "case", ""))
 
 
-def repeat(path: str | os.PathLike[str], progress: Callable[[Any], None] | None = None) -> Any:
+def rerun(path: str | os.PathLike[str], progress: Callable[[Any], None] | None = None) -> Any:
     """Simulate again the waveform of a file that was saved with its case, or the waveforms of a survey.
 
     On the same machine, with the same versions (the attribute `versions`), the waveform is the same bit for
@@ -287,7 +289,7 @@ def repeat(path: str | os.PathLike[str], progress: Callable[[Any], None] | None 
     >>> case = jl.io.Case(jl.Lidar(), jl.Scene(ground=jl.Ground()), jax.random.key(0))
     >>> path = pathlib.Path(tempfile.mkdtemp()) / "flat.nc"
     >>> case.simulate().save(path, case)
-    >>> bool((jl.repeat(path).reflectance == jl.open(path).reflectance).all())
+    >>> bool((jl.rerun(path).reflectance == jl.open(path).reflectance).all())
     True
     """
     case, wave = read_case(path), open(path)
@@ -314,14 +316,14 @@ keep_as_netcdf(
         "stderr": ("1", "standard error of the apparent reflectance"),
         "components": ("1", "apparent reflectance per sample by material and by order of scattering"),
         "neglected": ("1", "apparent reflectance that orders beyond the last could add"),
-        "ledger": ("1", "share of the emitted energy by fate, before the atmosphere"),
-        "ledger_stderr": ("1", "standard error of the share of the emitted energy"),
+        "energy_budget": ("1", "share of the emitted energy by fate, before the atmosphere"),
+        "energy_budget_stderr": ("1", "standard error of the share of the emitted energy"),
         "lost": ("1", "apparent reflectance that arrives before or after all fine bins of the plan"),
         "recorded": ("J", "energy that the receiver records per sample, without noise"),
         "wavelength": ("nm", "wavelength of the lidar"),
     },
     dimensions={"bins": "time", "wavelengths": "wavelength"},
-    items={"components": "component", "ledger": "fate", "ledger_stderr": "fate"},
+    items={"components": "component", "energy_budget": "fate", "energy_budget_stderr": "fate"},
     coordinates={"height": "time"},
 )
 

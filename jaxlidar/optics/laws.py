@@ -40,10 +40,10 @@ class AbstractLaw(eqx.Module):
 
     A law is consistent if, for an aperture that shrinks to nothing,
 
-        view_factor = pi * albedo * density,
+        intensity_factor = pi * albedo * density,
 
-    and light that `sample` draws has that density. It is reciprocal if view_factor / |cosine of out| stays
-    the same when incident and out are exchanged.
+    and light that `sample` draws has that density. It is reciprocal if intensity_factor / |cosine of out|
+    stays the same when incident and out are exchanged.
 
     **Example:** straight back from a horizontal surface.
 
@@ -51,13 +51,13 @@ class AbstractLaw(eqx.Module):
     >>> import jax.numpy as jnp
     >>> from jaxlidar.extend import vec
     >>> down, up = vec(jnp.array([0.0, 0.0, -1.0])), vec(jnp.array([0.0, 0.0, 1.0]))
-    >>> view_factor = jl.Lambertian().view_factor(down, up, up, jnp.array(1e-4))
-    >>> print(f"{view_factor:.1f}, density {jl.Lambertian().density(down, up, up):.4f} per sr")
+    >>> intensity_factor = jl.Lambertian().intensity_factor(down, up, up, jnp.array(1e-4))
+    >>> print(f"{intensity_factor:.1f}, density {jl.Lambertian().density(down, up, up):.4f} per sr")
     1.0, density 0.3183 per sr
     """
 
     @abc.abstractmethod
-    def view_factor(self, incident: Vec, normal: Vec, view: Vec, half_angle: Scalar) -> Scalar:
+    def intensity_factor(self, incident: Vec, normal: Vec, view: Vec, half_angle: Scalar) -> Scalar:
         """Apparent reflectance per unit reflectance towards `view`, averaged over the receiver's aperture.
 
         **Arguments:**
@@ -106,7 +106,7 @@ class AbstractLaw(eqx.Module):
         """
 
     @abc.abstractmethod
-    def largest_view_factor(self, half_angle: float) -> float:
+    def largest_intensity_factor(self, half_angle: float) -> float:
         """An upper bound on the view factor over all directions, for the plan.
 
         **Arguments:**
@@ -121,8 +121,8 @@ class AbstractMirror(AbstractLaw):
     """A law of reflection with a lobe about the mirror direction that may be very narrow.
 
     The lobe may be narrower than the angle between neighbouring rays of a footprint. The first return is
-    therefore not computed from `view_factor`: it is integrated over beam, lobe and aperture, with a Gaussian
-    lobe of the standard deviation `roughness` (`jaxlidar.trace.mirror`).
+    therefore not computed from `intensity_factor`: it is integrated over beam, lobe and aperture, with a
+    Gaussian lobe of the standard deviation `roughness` (`jaxlidar.trace.mirror_return`).
 
     A mirror of your own is one class in one file: derive it from this, and give the five methods of
     `AbstractLaw` and the field
@@ -134,7 +134,7 @@ class AbstractMirror(AbstractLaw):
 
     >>> import jaxlidar as jl
     >>> mirror = jl.Specular(roughness=0.0)
-    >>> isinstance(mirror, jl.AbstractMirror), mirror.largest_view_factor(1e-4)
+    >>> isinstance(mirror, jl.AbstractMirror), mirror.largest_intensity_factor(1e-4)
     (True, inf)
     """
 
@@ -153,11 +153,11 @@ class Lambertian(AbstractLaw):
     >>> from jaxlidar.extend import polar
     >>> up, view = (polar(jnp.cos(jnp.deg2rad(a)), jnp.array(0.0)) for a in (0.0, 60.0))
     >>> down = tuple(-x for x in up)
-    >>> print(f"{jl.Lambertian().view_factor(down, up, view, jnp.array(1e-4)):.3f}")
+    >>> print(f"{jl.Lambertian().intensity_factor(down, up, view, jnp.array(1e-4)):.3f}")
     0.500
     """
 
-    def view_factor(self, incident: Vec, normal: Vec, view: Vec, half_angle: Scalar) -> Scalar:
+    def intensity_factor(self, incident: Vec, normal: Vec, view: Vec, half_angle: Scalar) -> Scalar:
         return jnp.maximum(dot(normal, view), 0.0)
 
     def albedo(self, incident: Vec, normal: Vec) -> Scalar:
@@ -169,7 +169,7 @@ class Lambertian(AbstractLaw):
     def density(self, incident: Vec, normal: Vec, out: Vec) -> Scalar:
         return jnp.maximum(dot(normal, out), 0.0) / np.pi
 
-    def largest_view_factor(self, half_angle: float) -> float:
+    def largest_intensity_factor(self, half_angle: float) -> float:
         return 1.0
 
 
@@ -188,11 +188,11 @@ class EqualAngle(AbstractLaw):
     >>> from jaxlidar.extend import polar
     >>> up, view = (polar(jnp.cos(jnp.deg2rad(a)), jnp.array(0.0)) for a in (0.0, 60.0))
     >>> down = tuple(-x for x in up)
-    >>> print(f"{jl.EqualAngle().view_factor(down, up, view, jnp.array(1e-4)):.3f}")
+    >>> print(f"{jl.EqualAngle().intensity_factor(down, up, view, jnp.array(1e-4)):.3f}")
     0.368
     """
 
-    def view_factor(self, incident: Vec, normal: Vec, view: Vec, half_angle: Scalar) -> Scalar:
+    def intensity_factor(self, incident: Vec, normal: Vec, view: Vec, half_angle: Scalar) -> Scalar:
         sine = jnp.sqrt(_square_of_sine(normal, view) + half_angle**2 / 4)
         return jnp.where(dot(normal, view) > 0, 1.0 / (np.pi * sine), 0.0)
 
@@ -207,7 +207,7 @@ class EqualAngle(AbstractLaw):
         sine = jnp.sqrt(jnp.maximum(_square_of_sine(normal, out), 1e-6))
         return jnp.where(dot(normal, out) > 0, 1.0 / (np.pi**2 * sine), 0.0)
 
-    def largest_view_factor(self, half_angle: float) -> float:
+    def largest_intensity_factor(self, half_angle: float) -> float:
         return 2.0 / (np.pi * half_angle)
 
 
@@ -222,7 +222,7 @@ def _square_of_sine(normal: Vec, out: Vec) -> Scalar:
 class Specular(AbstractMirror):
     """Specular reflection: a mirror of slightly tilted facets, with a Gaussian lobe about its direction.
 
-    The first return is exact for any roughness (see `jaxlidar.trace.mirror`). Paths of two or more
+    The first return is exact for any roughness (see `jaxlidar.trace.mirror_return`). Paths of two or more
     scatterings that end at the mirror reach the receiver only within its lobe. They are unbiased, but so rare
     below a roughness of about 0.01 rad that few photons show one. The derivative of such paths with respect
     to the mirror's slope leaves out the rotation of the lobe.
@@ -240,7 +240,7 @@ class Specular(AbstractMirror):
     >>> import jax.numpy as jnp
     >>> from jaxlidar.extend import vec
     >>> down, up = vec(jnp.array([0.0, 0.0, -1.0])), vec(jnp.array([0.0, 0.0, 1.0]))
-    >>> print(f"{jl.Specular(roughness=0.1).view_factor(down, up, up, jnp.array(1e-4)):.1f}")
+    >>> print(f"{jl.Specular(roughness=0.1).intensity_factor(down, up, up, jnp.array(1e-4)):.1f}")
     50.0
     """
 
@@ -251,7 +251,7 @@ class Specular(AbstractMirror):
     def __check_init__(self):
         check_ranges(self)
 
-    def view_factor(self, incident: Vec, normal: Vec, view: Vec, half_angle: Scalar) -> Scalar:
+    def intensity_factor(self, incident: Vec, normal: Vec, view: Vec, half_angle: Scalar) -> Scalar:
         mirror = _mirror(incident, normal)
         # The receiver's own disc blurs the lobe; alpha^2 / 4 is the variance of a disc along an axis.
         variance = self.roughness**2 + half_angle**2 / 4
@@ -272,7 +272,7 @@ class Specular(AbstractMirror):
         # Taken as constant: the lobe's own derivative grows without bound as it becomes narrow.
         return jnp.ones_like(out[0])
 
-    def largest_view_factor(self, half_angle: float) -> float:
+    def largest_intensity_factor(self, half_angle: float) -> float:
         return np.inf
 
 

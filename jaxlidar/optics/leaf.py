@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxlidar._checks import array, briefly
-from jaxlidar._ranges import SHARE, SUM_OF_SHARES, check_ranges
+from jaxlidar._ranges import FRACTION, SUM_OF_FRACTIONS, check_ranges
 
 
 @final
@@ -39,9 +39,9 @@ class LeafOptics(eqx.Module):
     transmittance: Float[Array, "*wavelengths"] = eqx.field(converter=array("transmittance"), default=0.0)
 
     ranges: ClassVar = {
-        "reflectance": SHARE,
-        "transmittance": SHARE,
-        "reflectance + transmittance": SUM_OF_SHARES,
+        "reflectance": FRACTION,
+        "transmittance": FRACTION,
+        "reflectance + transmittance": SUM_OF_FRACTIONS,
     }
 
     def __check_init__(self):

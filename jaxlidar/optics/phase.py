@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxlidar._checks import array, briefly, scalar
-from jaxlidar._ranges import SHARE, Range, check_ranges
+from jaxlidar._ranges import FRACTION, Range, check_ranges
 from jaxlidar._vectors import Scalar, Vec, dot, from_frame, polar
 
 # Of isotropic scattering.
@@ -30,8 +30,8 @@ class AbstractPhase(eqx.Module):
     """A phase function with its single scattering albedo: how a volume scatters light.
 
     A phase function of your own is one class in one file: derive it from this, give its three methods
-    (`view_factor`, `sample`, `largest_view_factor`) and the field below, and pass it as `leaf=` or `bark=` of
-    a `Canopy`.
+    (`intensity_factor`, `sample`, `largest_intensity_factor`) and the field below, and pass it as `leaf=` or
+    `bark=` of a `Canopy`.
 
     - `albedo`: single scattering albedo, one number or one per wavelength, in [0, 1].
 
@@ -40,7 +40,7 @@ class AbstractPhase(eqx.Module):
 
     Directions are unit vectors of travel, given as (x, y, z) tuples of arrays of one shape. Methods are pure,
     written with `jax.numpy` (see `jaxlidar.extend`), and differentiable in directions and fields. A phase
-    function is normalised: the integral of view_factor / pi over all directions is one.
+    function is normalised: the integral of intensity_factor / pi over all directions is one.
 
     **Example:** probability per steradian of isotropic scattering, 1 / (4 pi).
 
@@ -55,7 +55,7 @@ class AbstractPhase(eqx.Module):
     albedo: eqx.AbstractVar[Float[Array, "..."]]
 
     @abc.abstractmethod
-    def view_factor(self, incident: Vec, view: Vec) -> Scalar:
+    def intensity_factor(self, incident: Vec, view: Vec) -> Scalar:
         """Pi times the probability per steradian of scattering from `incident` into `view`.
 
         **Arguments:**
@@ -78,7 +78,7 @@ class AbstractPhase(eqx.Module):
         """
 
     @abc.abstractmethod
-    def largest_view_factor(self) -> float:
+    def largest_intensity_factor(self) -> float:
         """An upper bound on the view factor over all directions, for the plan.
 
         **Returns:** a number; infinite where there is no bound.
@@ -93,7 +93,7 @@ class AbstractPhase(eqx.Module):
 
         **Returns:** an array shaped as the components of `incident`.
         """
-        return self.view_factor(incident, out) / np.pi
+        return self.intensity_factor(incident, out) / np.pi
 
 
 def _check(phase: AbstractPhase) -> None:
@@ -127,18 +127,18 @@ class Isotropic(AbstractPhase):
 
     albedo: Float[Array, "..."] = eqx.field(converter=array("albedo"))
 
-    ranges: ClassVar = {"albedo": SHARE}
+    ranges: ClassVar = {"albedo": FRACTION}
 
     def __check_init__(self):
         _check(self)
 
-    def view_factor(self, incident: Vec, view: Vec) -> Scalar:
+    def intensity_factor(self, incident: Vec, view: Vec) -> Scalar:
         return jnp.full_like(incident[0], ISOTROPIC_VIEW_FACTOR)
 
     def sample(self, incident: Vec, u: Scalar, v: Scalar) -> Vec:
         return polar(1.0 - 2.0 * u, 2 * np.pi * v)
 
-    def largest_view_factor(self) -> float:
+    def largest_intensity_factor(self) -> float:
         return ISOTROPIC_VIEW_FACTOR
 
 
@@ -165,19 +165,20 @@ class HenyeyGreenstein(AbstractPhase):
     >>> from jaxlidar.extend import vec
     >>> down, up = vec(jnp.array([0.0, 0.0, -1.0])), vec(jnp.array([0.0, 0.0, 1.0]))
     >>> phase = jl.HenyeyGreenstein(albedo=0.9, g=0.5)
-    >>> print(f"{phase.view_factor(down, down):.3f} forward, {phase.view_factor(down, up):.3f} back")
+    >>> forward, back = phase.intensity_factor(down, down), phase.intensity_factor(down, up)
+    >>> print(f"{forward:.3f} forward, {back:.3f} back")
     1.500 forward, 0.056 back
     """
 
     albedo: Float[Array, "..."] = eqx.field(converter=array("albedo"))
     g: Float[Array, ""] = eqx.field(converter=scalar("g"), default=0.0)
 
-    ranges: ClassVar = {"albedo": SHARE, "g": Range(-0.95, 0.95)}
+    ranges: ClassVar = {"albedo": FRACTION, "g": Range(-0.95, 0.95)}
 
     def __check_init__(self):
         _check(self)
 
-    def view_factor(self, incident: Vec, view: Vec) -> Scalar:
+    def intensity_factor(self, incident: Vec, view: Vec) -> Scalar:
         g = self.g
         cosine = jnp.clip(dot(incident, view), -1.0, 1.0)
         # 1 + g^2 - 2 g cos without cancellation for lobes ahead.
@@ -190,6 +191,6 @@ class HenyeyGreenstein(AbstractPhase):
         cosine = (s * (1.0 + g * g) + 0.5 * g * (s * s * (1.0 + g * g) + 3.0 - g * g)) / (1.0 + g * s) ** 2
         return from_frame(incident, polar(jnp.clip(cosine, -1.0, 1.0), 2 * np.pi * v))
 
-    def largest_view_factor(self) -> float:
+    def largest_intensity_factor(self) -> float:
         g = abs(float(self.g))
         return ISOTROPIC_VIEW_FACTOR * (1.0 + g) / (1.0 - g) ** 2

@@ -40,7 +40,7 @@ from jaxlidar._checks import (
     scalar,
     warn_units,
 )
-from jaxlidar._ranges import SHARE, SUM_OF_SHARES, Range, check_ranges
+from jaxlidar._ranges import FRACTION, SUM_OF_FRACTIONS, Range, check_ranges
 
 # nm: the largest number that is finite in single precision.
 _LONGEST = float(np.finfo(np.float32).max)
@@ -79,9 +79,9 @@ class Spectrum(eqx.Module):
 
     ranges: ClassVar = {
         "wavelength": Range(0.0, low_open=True, increasing=True),
-        "reflectance": SHARE,
+        "reflectance": FRACTION,
         "scale": Range(0.0),
-        "scale * reflectance": SUM_OF_SHARES,
+        "scale * reflectance": SUM_OF_FRACTIONS,
     }
 
     def __check_init__(self):

@@ -12,15 +12,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxlidar._checks import known_array, known_number
+from jaxlidar._checks import concrete_array, concrete_number
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._vectors import vec
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.optics.facets import FACET_BACKSCATTER
 from jaxlidar.optics.laws import AbstractMirror
 from jaxlidar.planning.backscatter import PerRay, Rays, backscatter, footprint_rays
-from jaxlidar.planning.scatterers import scene_optics
-from jaxlidar.planning.trace_plan import Bins
+from jaxlidar.planning.channels import scene_optics
+from jaxlidar.planning.config import TimeBins
 from jaxlidar.scenes.canopy import Canopy
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.surfaces import AbstractSheet, AbstractSurface
@@ -37,17 +37,17 @@ class Bounds:
 
     def __init__(self, lidar: Lidar, scene: Scene, orders: int):
         self.lidar, self.scene, self.orders = lidar, scene, orders
-        self.slant = known_number(lidar.range_to_reference)
-        self.half_angle = known_number(lidar.aperture_half_angle)
-        self.axis = known_array(lidar.direction)
+        self.slant = concrete_number(lidar.range_to_reference)
+        self.half_angle = concrete_number(lidar.aperture_half_angle)
+        self.axis = concrete_array(lidar.direction)
         self.rays, self.seen = footprint_rays(lidar)
         self.outside = 1.0 - float(np.mean(self.seen))
         optics = scene_optics(lidar, scene)
         zero = np.zeros(lidar.wavelength.size)
         self.optics = {
             o.name: (
-                known_array(o.reflectance),
-                zero if o.transmittance is None else known_array(o.transmittance),
+                concrete_array(o.reflectance),
+                zero if o.transmittance is None else concrete_array(o.transmittance),
             )
             for o in optics
         }
@@ -69,7 +69,7 @@ class Bounds:
             factor = backscatter(phase, self.rays)
             return float(factor.min()), float(factor.max())
         if name == "leaf" and canopy.voxels.leaf_angles is not None:
-            mean, square = (known_array(t) for t in canopy.voxels.leaf_angles.tables())
+            mean, square = (concrete_array(t) for t in canopy.voxels.leaf_angles.tables())
             found = np.interp(np.abs(self.rays[:, 2]), np.linspace(0, 1, mean.size), square / mean)
             return float(found.min()), float(found.max())
         return FACET_BACKSCATTER, FACET_BACKSCATTER
@@ -78,11 +78,11 @@ class Bounds:
         """Largest view factor of what a material scatters, for any two directions."""
         canopy = self.scene.canopy
         if name not in ("leaf", "bark"):
-            return self.surface[name].law.largest_view_factor(self.half_angle)
+            return self.surface[name].law.largest_intensity_factor(self.half_angle)
         assert canopy is not None
         phase = canopy.leaf_phase if name == "leaf" else canopy.bark_phase
         if phase is not None:
-            return phase.largest_view_factor()
+            return phase.largest_intensity_factor()
         # Spherically oriented facets are brightest straight back.
         return 1.0 if name == "leaf" and canopy.voxels.leaf_angles is not None else FACET_BACKSCATTER
 
@@ -91,13 +91,13 @@ class Bounds:
         if isinstance(surface.law, AbstractMirror):
             return None
         normal, _ = surface.shape.tangent(vec(jnp.zeros(3)))
-        upward = np.stack([known_array(n) for n in normal])
+        upward = np.stack([concrete_array(n) for n in normal])
         return backscatter(surface.law, rays, upward, self.half_angle, isinstance(surface, AbstractSheet))
 
     def _sheet(self, name: str) -> tuple[Values, Values, Values]:
         """Shares of all light, whether it meets the plate or not: reflected, scattered, passed straight."""
         plate, (r, t) = self.sheets[name], self.optics[name]
-        cover, straight = known_number(plate.coverage), plate.transmission == "straight"
+        cover, straight = concrete_number(plate.coverage), plate.transmission == "straight"
         return cover * r, cover * (r if straight else r + t), 1 - cover + cover * t * straight
 
     def _returns(self, leave_out: str | None = None) -> tuple[Values, Values]:
@@ -283,8 +283,9 @@ class Bounds:
     def _lowest(self, canopy: Canopy) -> PerRay:
         """Distance along rays to the bottom of the lowest layer that is not empty."""
         empty = np.argmax(self._layers(canopy) > 0)
-        bottom = known_array(canopy.voxels.origin)[2] + known_number(canopy.voxels.voxel_size[2]) * empty
-        return (bottom - known_number(self.lidar.altitude)) / self.rays[:, 2]
+        layer = concrete_number(canopy.voxels.voxel_size[2])
+        bottom = concrete_array(canopy.voxels.origin)[2] + layer * empty
+        return (bottom - concrete_number(self.lidar.altitude)) / self.rays[:, 2]
 
     def _change(
         self,
@@ -312,23 +313,23 @@ class Bounds:
         return float(np.sum(change) / max(np.sum(both), 1e-30))
 
     def _distance(self, surface: AbstractSurface, rays: Rays) -> PerRay:
-        sensor = np.append(known_array(self.lidar.position), 0.0) - self.slant * self.axis
+        sensor = np.append(concrete_array(self.lidar.position), 0.0) - self.slant * self.axis
         return surface.shape.crossing(np.broadcast_to(sensor, rays.shape), rays)[0]
 
     def _steepness(self) -> float:
         """Half the total variation of the pulse's power, 1/ns; with a single peak this is the peak."""
-        low, high = self.lidar.pulse.support(known_number(self.lidar.jitter))
+        low, high = self.lidar.pulse.support(concrete_number(self.lidar.jitter))
         if not high > low:
             return np.inf
-        power = np.diff(self._passed(low, high, known_number(self.lidar.jitter))) * _CELLS / (high - low)
+        power = np.diff(self._passed(low, high, concrete_number(self.lidar.jitter))) * _CELLS / (high - low)
         return 0.5 * float(np.sum(np.abs(np.diff(power, prepend=0.0, append=0.0))))
 
     def _passed(self, low: float, high: float, jitter: float) -> np.ndarray:
-        return known_array(self.lidar.pulse.cumulative(np.linspace(low, high, _CELLS + 1), jitter))
+        return concrete_array(self.lidar.pulse.cumulative(np.linspace(low, high, _CELLS + 1), jitter))
 
     def jitter(self) -> float:
         """Jitter: one return's pulse with it and without it; sums of pulses differ by no larger share."""
-        jitter = known_number(self.lidar.jitter)
+        jitter = concrete_number(self.lidar.jitter)
         low, high = self.lidar.pulse.support(jitter)
         with_, plain = (np.diff(self._passed(low, high, j)) for j in (jitter, 0.0))
         return min(0.5 * float(np.sum(np.abs(with_ - plain))), 1.0)
@@ -354,7 +355,7 @@ class Bounds:
         """Extinction, 1/m, of the densest voxel of every layer."""
         v = canopy.voxels
         parts = [
-            known_array(k)
+            concrete_array(k)
             for n, k in (("leaf", v.leaf), ("bark", v.bark))
             if k is not None and name in (None, n)
         ]
@@ -365,41 +366,40 @@ class Bounds:
     def _depth(self, canopy: Canopy, name: str | None = None) -> float:
         """Largest optical depth along any ray."""
         steepest = float(np.min(np.abs(self.rays[:, 2])))
-        return (
-            float(np.sum(self._layers(canopy, name))) * known_number(canopy.voxels.voxel_size[2]) / steepest
-        )
+        layer = concrete_number(canopy.voxels.voxel_size[2])
+        return float(np.sum(self._layers(canopy, name))) * layer / steepest
 
-    def extinction(self, bins: Bins, upstream: float) -> float:
+    def extinction(self, bins: TimeBins, start_distance: float) -> float:
         """Extinction, two-way, to the last bin; without it the air's own return is left out too."""
-        return max(self.lost(bins), self.backscatter(bins, upstream))
+        return max(self.lost(bins), self.backscatter(bins, start_distance))
 
-    def lost(self, bins: Bins) -> float:
+    def lost(self, bins: TimeBins) -> float:
         """Share that the air takes of the light with the longest way."""
         air = self.scene.atmosphere
         if air is None:
             return 0.0
         depth = air.two_way_transmittance(self.lidar.wavelength, self._heights(bins)[-1], *self._where())
-        return 1.0 - float(np.min(known_array(depth)))
+        return 1.0 - float(np.min(concrete_array(depth)))
 
-    def backscatter(self, bins: Bins, upstream: float) -> float:
+    def backscatter(self, bins: TimeBins, start_distance: float) -> float:
         """The air's own return within the bins, relative to it and the least return of the scene."""
         air = self.scene.atmosphere
         if air is None or air.lidar_ratio is None:
             return 0.0
         heights = self._heights(bins)
-        per_metre = known_array(air.backscatter(self.lidar.wavelength, heights, *self._where()))
-        above = heights > upstream * abs(self.axis[2])
+        per_metre = concrete_array(air.backscatter(self.lidar.wavelength, heights, *self._where()))
+        above = heights > start_distance * abs(self.axis[2])
         own = np.sum(np.where(above, per_metre, 0.0), axis=1) * 0.5 * SPEED_OF_LIGHT * bins.width
         rest = self._returns()[0] * self._through() ** 2 * (1.0 - self.outside) * (1.0 - self.lost(bins))
         return _worst(_share(own, rest))
 
-    def _heights(self, bins: Bins) -> np.ndarray:
+    def _heights(self, bins: TimeBins) -> np.ndarray:
         time = bins.start + bins.width * np.arange(bins.count)
-        highest = 0.999 * known_number(self.lidar.altitude)
+        highest = 0.999 * concrete_number(self.lidar.altitude)
         return np.minimum(-0.5 * SPEED_OF_LIGHT * time * abs(self.axis[2]), highest)
 
     def _where(self) -> tuple[float, float]:
-        return known_number(self.lidar.altitude), known_number(self.lidar.zenith)
+        return concrete_number(self.lidar.altitude), concrete_number(self.lidar.zenith)
 
 
 def _share(part: Values, rest: Values) -> Values:

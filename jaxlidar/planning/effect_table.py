@@ -1,4 +1,4 @@
-"""The table of effects that a plan shows: what is simulated, why, and what leaving it out changes at most."""
+"""The table of effects that a plan shows: each effect, whether it is simulated, why, and its bound."""
 
 import functools
 import math
@@ -6,15 +6,15 @@ from collections.abc import Callable, Sequence
 
 import jax
 
-from jaxlidar._checks import is_traced, known_number
+from jaxlidar._checks import concrete_number, is_traced
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._summary import percent
 from jaxlidar.instrument.field_of_view import EDGE
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.planning.bounds import Bounds
+from jaxlidar.planning.config import TimeBins
 from jaxlidar.planning.effects import NAMES, Effect, planes, present, without
-from jaxlidar.planning.orders import Orders
-from jaxlidar.planning.trace_plan import Bins
+from jaxlidar.planning.orders import OrderChoice
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.surfaces import Ground
 
@@ -23,56 +23,61 @@ def effect_table(
     lidar: Lidar,
     scene: Scene,
     off: tuple[str, ...],
-    chosen: Orders,
-    bins: Bins,
-    upstream: float,
-    whole_first: bool,
+    order_choice: OrderChoice,
+    bins: TimeBins,
+    start_distance: float,
+    records_all_of_order_one: bool,
 ) -> tuple[Effect, ...]:
-    """A row for every effect.
+    """Return a row for every effect.
 
-    `chosen`: how many orders are followed, and why. `whole_first`: whether the record takes in all of order
-    one.
+    **Arguments:**
+
+    - `lidar`, `scene`: with all their effects. `off`: names of those that are switched off.
+    - `order_choice`: number of orders followed, and why.
+    - `bins`: fine time bins, back to where the air's own return begins.
+    - `start_distance`: distance, m, before the reference plane at which rays start.
+    - `records_all_of_order_one`: True if the window was chosen so that no light of order one is cut off.
     """
-    orders = chosen.count
+    orders = order_choice.count
     has, planned = present(lidar, scene), present(*without(lidar, scene, off))
-    reasons = (
-        dict.fromkeys(NAMES, "in the scene") | {"multiple scattering": chosen.why} | _reasons(lidar, scene)
-    )
-    # Values that are being traced are unknown, and bounds hold for planes only.
-    known = not any(is_traced(x) for x in jax.tree.leaves((lidar, scene)))
-    known = known and planes(scene)
+    reasons = dict.fromkeys(NAMES, "in the scene") | {"multiple scattering": order_choice.reason}
+    reasons |= _sized_reasons(lidar, scene)
+    # Bounds need values, which are unknown while they are being traced, and hold for planes only.
+    bounded = not any(is_traced(x) for x in jax.tree.leaves((lidar, scene))) and planes(scene)
 
     @functools.cache
-    def rules(off: tuple[str, ...]) -> dict[str, Callable[[], float]]:
-        return _rules(Bounds(*without(lidar, scene, off), orders), bins, upstream)
+    def bound_functions(off: tuple[str, ...]) -> dict[str, Callable[[], float]]:
+        return _bound_functions(Bounds(*without(lidar, scene, off), orders), bins, start_distance)
 
     def bound(name: str, off: tuple[str, ...]) -> float:
-        pair = without(lidar, scene, off)
-        there = present(*pair) | {"hot spot": pair[1].canopy is not None}
-        if not known or not there.get(name, True):
-            return float(there.get(name, True))
-        return rules(off)[name]()
+        """Bound on the change without `name`, where `off` is left out, too; 1 if none is known."""
+        remaining = without(lidar, scene, off)
+        # A canopy without the hot spot can have it switched on: its bound is of interest too.
+        has_effect = present(*remaining) | {"hot spot": remaining[1].canopy is not None}
+        if not has_effect.get(name, True):
+            return 0.0
+        return bound_functions(off)[name]() if bounded else 1.0
 
     rows = []
     for name in NAMES:
         on = planned[name] and name not in off and (name != "multiple scattering" or orders > 1)
-        reason, others = reasons[name], off
+        reason, also_off = reasons[name], off
         if name in off:
-            # What switching it on again would change.
-            unlike = "the terrain is a plane" if name == "relief" else "zero everywhere"
-            reason = "switched off" if has[name] else unlike
-            others = tuple(n for n in off if n != name)
+            # The bound says what switching it on again would change.
+            absent = "the terrain is a plane" if name == "relief" else "zero everywhere"
+            reason = "switched off" if has[name] else absent
+            also_off = tuple(n for n in off if n != name)
         elif not has[name] and name not in ("multiple scattering", "hot spot"):
             reason = "not in the scene"
         elif has[name] and not planned[name] and name != "multiple scattering":
             reason = "gone with what is switched off"
-        rows.append(Effect(name, on, reason, bound(name, others), _measure(name)))
+        rows.append(Effect(name, on, reason, bound(name, also_off), _measure(name)))
         if on and name == "multiple scattering":
             name = f"orders beyond {orders}"
-            most = bound(name, off)
-            likely = min(chosen.beyond, most)
-            rows.append(Effect(name, False, f"likely below {percent(likely)}", most, "sum"))
-            late = bound("multiple scattering", off) if whole_first else 1.0
+            upper_bound = bound(name, off)
+            likely = min(order_choice.beyond, upper_bound)
+            rows.append(Effect(name, False, f"likely below {percent(likely)}", upper_bound, "sum"))
+            late = bound("multiple scattering", off) if records_all_of_order_one else 1.0
             reason = "light on its way at the end of the record"
             rows.append(Effect("after the window", False, reason, late, "sum"))
     if without(lidar, scene, off)[1].atmosphere is not None:
@@ -85,8 +90,8 @@ def _measure(name: str) -> str:
     return "samples" if name in ("slope spread", "divergence", "jitter") else "sum"
 
 
-def _rules(bounds: Bounds, bins: Bins, upstream: float) -> dict[str, Callable[[], float]]:
-    """For every effect, the function that computes its bound."""
+def _bound_functions(bounds: Bounds, bins: TimeBins, start_distance: float) -> dict[str, Callable[[], float]]:
+    """Return, for every effect, the function that computes its bound."""
 
     def slope_spread() -> float:
         level = without(bounds.lidar, bounds.scene, ("slope spread",))
@@ -105,33 +110,33 @@ def _rules(bounds: Bounds, bins: Bins, upstream: float) -> dict[str, Callable[[]
         "divergence": bounds.divergence,
         "field of view": bounds.field_of_view,
         "hot spot": bounds.hot_spot,
-        "atmospheric extinction": lambda: bounds.extinction(bins, upstream),
-        "atmospheric backscatter": lambda: bounds.backscatter(bins, upstream),
+        "atmospheric extinction": lambda: bounds.extinction(bins, start_distance),
+        "atmospheric backscatter": lambda: bounds.backscatter(bins, start_distance),
         "jitter": bounds.jitter,
         # What the air scatters to the receiver beyond first order is at most what was lost.
         "scattering within the atmosphere": lambda: bounds.lost(bins),
     }
 
 
-def _reasons(lidar: Lidar, scene: Scene) -> dict[str, str]:
-    """Why effects are simulated, with their size, where more can be said than that they are in the scene."""
-    radius = known_number(lidar.footprint_radius)
-    slope = known_number(scene.ground.slope) if isinstance(scene.ground, Ground) else 0.0
+def _sized_reasons(lidar: Lidar, scene: Scene) -> dict[str, str]:
+    """Return reasons that state the size of an effect, for those that have one."""
+    radius = concrete_number(lidar.footprint_radius)
+    slope = concrete_number(scene.ground.slope) if isinstance(scene.ground, Ground) else 0.0
     spread = radius * math.tan(math.radians(slope)) / SPEED_OF_LIGHT
     view = lidar.field_of_view
     air = scene.atmosphere
     hotspot = scene.canopy is not None and scene.canopy.hotspot
     reasons = {
         "slope spread": f"{slope:g} degrees: {spread:.2g} ns (standard deviation)",
-        "divergence": f"{known_number(lidar.divergence):g} mrad: a footprint of radius {radius:.3g} m",
+        "divergence": f"{concrete_number(lidar.divergence):g} mrad: a footprint of radius {radius:.3g} m",
         "field of view": f"a soft edge of {percent(EDGE)}"
         if view is None or is_traced(view)
-        else f"{known_number(view):g} mrad, with a soft edge of {percent(EDGE)}",
+        else f"{concrete_number(view):g} mrad, with a soft edge of {percent(EDGE)}",
         "hot spot": "back through the same gap: exp(-tau)"
         if hotspot
-        else "ways are independent: exp(-2 tau)",
+        else "paths in and out are independent: exp(-2 tau)",
         "atmospheric backscatter": "above the scene",
-        "jitter": f"{known_number(lidar.jitter):g} ns",
+        "jitter": f"{concrete_number(lidar.jitter):g} ns",
     }
     if scene.canopy is None:
         reasons["hot spot"] = "not in the scene"
@@ -141,7 +146,7 @@ def _reasons(lidar: Lidar, scene: Scene) -> dict[str, str]:
 
 
 def table_lines(effects: Sequence[Effect]) -> list[str]:
-    """The lines of a table of effects, with a head."""
+    """Return the lines of a table of effects, with a head."""
     rows = [("effect", "simulated", "changes at most", "why")]
     for e in effects:
         bound = "nothing" if e.bound == 0 else f"{percent(e.bound)} of {e.measure}"

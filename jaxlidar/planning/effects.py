@@ -5,7 +5,7 @@ from collections.abc import Mapping
 
 import jax.numpy as jnp
 
-from jaxlidar._checks import concrete, known_number
+from jaxlidar._checks import concrete, concrete_number
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.optics.laws import AbstractMirror
 from jaxlidar.scenes.canopy import Canopy
@@ -118,15 +118,15 @@ def present(lidar: Lidar, scene: Scene) -> dict[str, bool]:
         "plates": bool(scene.plates),
         "ground": scene.ground is not None,
         "relief": isinstance(ground, Terrain) and ground.relief,
-        "slope spread": isinstance(ground, Ground) and known_number(ground.slope) > 0,
+        "slope spread": isinstance(ground, Ground) and concrete_number(ground.slope) > 0,
         "multiple scattering": can_light_itself(scene),
         "specular return": any(isinstance(s.law, AbstractMirror) for s in scene.surfaces),
-        "divergence": known_number(lidar.divergence) > 0,
+        "divergence": concrete_number(lidar.divergence) > 0,
         "field of view": lidar.field_of_view is not None,
         "hot spot": canopy is not None and canopy.hotspot,
         "atmospheric extinction": air is not None,
         "atmospheric backscatter": air is not None and air.lidar_ratio is not None,
-        "jitter": known_number(lidar.jitter) > 0,
+        "jitter": concrete_number(lidar.jitter) > 0,
     }
 
 

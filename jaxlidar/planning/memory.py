@@ -1,120 +1,132 @@
-"""Memory that a simulation takes, predicted before anything is allocated."""
+"""Memory that a simulation takes, predicted before anything is allocated.
+
+A response has traces x materials x histories x bins numbers, with C(degree + channels, channels) histories of
+at most `degree` scatterings. Batches run on all cores at once, each with its own response, so that
+
+    bytes = response * (3 cores + 1) + 2 * pulse matrix + compilation.
+"""
 
 import math
 import os
 
 import jax.numpy as jnp
 
-from jaxlidar.planning.trace_plan import DENSE, Bins, TracePlan
+from jaxlidar.planning.config import TimeBins, TraceConfig
 
 # Copies of a batch's response that are alive at once: sums of photons, of groups, and the result.
-_COPIES = 3
+_RESPONSE_COPIES = 3
 # Tangents of a response that are alive at once, for each column of a Jacobian: the sum of photons, and the
 # result.
-_TANGENTS = 2
-# Tangents of a photon, and of a stretch of a ray, that are alive at once; rays that are marched at once.
-_NUMBERS, _RAYS = 4, 512
+_RESPONSE_TANGENTS = 2
+# Tangents of a photon, and of a ray segment, that are alive at once.
+_STATE_TANGENTS = 4
+# Footprint rays that are marched at once.
+_RAYS_AT_ONCE = 512
 # Bytes that compiling takes.
-_COMPILING = 150e6
-# Bytes of a response from which on optics may be applied while light is traced, and for how many wavelengths.
-LARGE = 1e9
-FEW = 8
+_COMPILATION = 150e6
+# Optics may be applied while light is traced where a response with histories takes more bytes than this ...
+LARGE_RESPONSE = 1e9
+# ... for at most so many wavelengths, whose deposits are then made one by one.
+MAX_APPLIED_WAVELENGTHS = 8
+# The pulse is a dense matrix of fine bins and samples up to so many elements; beyond, it is a band.
+MAX_DENSE_PULSE = 1 << 22
 
 
 def machine_memory() -> float:
-    """Bytes of memory of this machine; 8 GB where that cannot be known."""
+    """Return the bytes of memory of this machine; 8 GB where the system does not tell."""
     try:
         return float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
     except (AttributeError, OSError, ValueError):
         return 8e9
 
 
-def response_bytes(trace: TracePlan, bins: Bins, degree: int, first_degree: int, traces: int) -> float:
-    """Bytes of a response of `traces` traces, with histories of these degrees."""
-    item = jnp.result_type(float).itemsize
-    letters, materials = len(trace.letters), len(trace.materials)
-    full = math.comb(degree + letters, letters) if trace.order_steps > 1 or trace.drawn_first else 0
-    short = math.comb(first_degree + letters, letters)
-    return float(item * traces * materials * (full + short) * bins.padded)
+def response_bytes(config: TraceConfig, bins: TimeBins, *, degree: int, n_traces: int) -> float:
+    """Return the bytes of a response of `n_traces` traces, with histories of up to `degree` scatterings."""
+    n_channels, n_materials = len(config.channels), len(config.materials)
+    higher = math.comb(degree + n_channels, n_channels) if config.follows_higher_orders else 0
+    first_degree = config.first_degree
+    first = math.comb(first_degree + n_channels, n_channels)
+    return float(_item() * n_traces * n_materials * (higher + first) * bins.padded)
 
 
-def predicted(
-    trace: TracePlan, bins: Bins, degree: int, first_degree: int, samples: int, pulse: int, traces: int
+def simulation_bytes(
+    config: TraceConfig, bins: TimeBins, *, degree: int, n_samples: int, pulse_bins: int, n_traces: int
 ) -> float:
-    """Bytes of the responses of all batches that run at once, their sum, the pulse, and of compiling.
+    """Return the bytes of all responses that are alive at once, of the pulse, and of compiling.
 
-    **Arguments:** `degree`, `first_degree`: of histories. - `samples`: of the record. - `pulse`: fine bins
-    that the pulse spans. - `traces`: of a response; one for each wavelength where leaves transmit straight
-    on.
+    **Arguments:**
+
+    - `config`, `bins`: of a plan.
+    - `degree`: largest number of scatterings in a history.
+    - `n_samples`: samples of the waveform.
+    - `pulse_bins`: fine bins that the pulse spans.
+    - `n_traces`: traces of a response; one for each wavelength where leaves transmit straight on.
     """
-    response = response_bytes(trace, bins, degree, first_degree, traces)
-    matrix = jnp.result_type(float).itemsize * min(bins.count * samples, max(DENSE, pulse))
-    return response * (_COPIES * (os.cpu_count() or 1) + 1) + 2 * matrix + _COMPILING
+    response = response_bytes(config, bins, degree=degree, n_traces=n_traces)
+    pulse = _item() * min(bins.count * n_samples, max(MAX_DENSE_PULSE, pulse_bins))
+    return response * (_RESPONSE_COPIES * (os.cpu_count() or 1) + 1) + 2 * pulse + _COMPILATION
 
 
-def keeps_histories(kept: float, applied: float, limit: float, wavelengths: int) -> bool:
-    """Whether histories keep optics apart, so that one trace serves all wavelengths and all optics.
+def keeps_histories(with_histories: float, applied: float, limit: float, wavelengths: int) -> bool:
+    """Return True if the response shall keep scattering histories, so that one trace serves all optics.
 
-    Optics are applied while light is traced where histories take far more memory, `kept` in place of
-    `applied` bytes, and wavelengths, whose deposits are then made one by one, are few.
+    Otherwise optics are applied while light is traced. That is done where histories take far more memory,
+    `with_histories` in place of `applied` bytes, and wavelengths, whose deposits are then made one by one,
+    are few.
     """
-    return kept <= min(limit, LARGE) or applied >= kept or wavelengths > FEW
+    affordable = with_histories <= min(limit, LARGE_RESPONSE)
+    return affordable or applied >= with_histories or wavelengths > MAX_APPLIED_WAVELENGTHS
 
 
 def jacobian_bytes(
-    trace: TracePlan,
-    bins: Bins,
-    degree: int,
-    first_degree: int,
-    traces: int,
-    light: tuple[int, int],
-    batches: int,
-    columns: int,
+    config: TraceConfig, bins: TimeBins, *, degree: int, n_traces: int, batches: int, columns: int
 ) -> float:
-    """Bytes of an evaluation of so many columns of a geometric Jacobian at once, beside what compiling takes.
+    """Return the bytes of a geometric Jacobian with so many columns at once, without compilation.
 
-    The responses of all batches are kept for the optical columns; batches run on all cores.
-
-    **Arguments:** as `predicted`, and `light`: photons and rays of a batch.
+    The responses of all batches are kept for the columns of optical unknowns; batches run on all cores.
     """
     cores = min(os.cpu_count() or 1, batches)
-    response = response_bytes(trace, bins, degree, first_degree, traces)
-    photons, rays = light
-    moving = photons + min(rays, _RAYS) * trace.first_steps
-    each = _TANGENTS * response + _NUMBERS * moving * jnp.result_type(float).itemsize
-    return (batches + 1) * response + cores * (response + columns * each)
+    response = response_bytes(config, bins, degree=degree, n_traces=n_traces)
+    tangents = _RESPONSE_TANGENTS * response + _STATE_TANGENTS * _states(config) * _item()
+    return (batches + 1) * response + cores * (response + columns * tangents)
 
 
-def scored_bytes(
-    trace: TracePlan, bins: Bins, light: tuple[int, int], cells: int, columns: int, wavelengths: int
-) -> float:
-    """Bytes that derivatives in so many unknowns which change extinction alone take on all cores.
+def scored_bytes(config: TraceConfig, bins: TimeBins, *, cells: int, columns: int, wavelengths: int) -> float:
+    """Return the bytes of score functions for so many columns, on all cores.
 
-    **Arguments:** `light`: photons and rays of a batch. - `cells`: voxels.
+    **Arguments:** `cells`: voxels of the map. `columns`: unknowns that change extinction alone.
     """
-    photons, rays = light
     rows = columns * wavelengths * bins.padded
-    moving = photons + min(rays, _RAYS) * trace.first_steps
-    each = _COPIES * rows + _TANGENTS * columns * moving
-    tables = 4 * columns * cells
-    return float(jnp.result_type(float).itemsize * ((os.cpu_count() or 1) * each + tables))
+    per_core = _RESPONSE_COPIES * rows + _RESPONSE_TANGENTS * columns * _states(config)
+    slopes = 4 * columns * cells
+    return float(_item() * ((os.cpu_count() or 1) * per_core + slopes))
+
+
+def _item() -> int:
+    """Bytes of a number in JAX's present precision."""
+    return jnp.result_type(float).itemsize
+
+
+def _states(config: TraceConfig) -> int:
+    """Photons and ray segments that are alive at once."""
+    return config.n_photons + min(config.n_rays, _RAYS_AT_ONCE) * config.max_ray_segments
 
 
 def in_words(size: float) -> str:
-    """Bytes, MB or GB, to two digits."""
-    for unit, one in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
-        if size >= one:
-            return f"{float(f'{size / one:.2g}'):g} {unit}"
+    """Format a number of bytes as GB, MB or kB, to two digits."""
+    for unit, factor in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
+        if size >= factor:
+            return f"{float(f'{size / factor:.2g}'):g} {unit}"
     return f"{size:.0f} bytes"
 
 
-def memory_limit(most: float | None) -> float:
-    """Bytes that a simulation may take: `most` GB, or a quarter of the machine's memory."""
-    return 0.25 * machine_memory() if most is None else most * 1e9
+def memory_limit(max_memory: float | None) -> float:
+    """Return the bytes that a simulation may take: `max_memory` GB, or a quarter of the machine's memory."""
+    return 0.25 * machine_memory() if max_memory is None else max_memory * 1e9
 
 
 def check_memory(size: float, limit: float) -> None:
-    """Refuse what does not fit.
+    """Refuse a simulation that does not fit.
 
     **Raises:** ValueError with the numbers, and what to change.
     """
@@ -122,5 +134,6 @@ def check_memory(size: float, limit: float) -> None:
         raise ValueError(
             f"the simulation would take about {in_words(size)} of memory; admissible is max_memory = "
             f"{limit / 1e9:.3g} GB: follow fewer orders (max_orders=), record a shorter window (window=), "
-            f"use wider fine bins (bin_width=), have fewer plates or materials, or at most {FEW} wavelengths"
+            f"use wider fine bins (bin_width=), have fewer plates or materials, or at most "
+            f"{MAX_APPLIED_WAVELENGTHS} wavelengths"
         )

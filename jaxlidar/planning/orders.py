@@ -1,138 +1,155 @@
-"""How many orders of scattering to follow, and for how long, with estimates of what they leave out."""
+"""Number of orders of scattering to follow, and for how long, with estimates of what they leave out.
+
+Let q be the fraction of scattered light that is scattered again. The light of order n is about q^n, so that
+orders up to 1 + ln(rtol / 10) / ln q leave a tenth of the tolerance. In a slab of optical depth tau and
+albedo w, q tends to the decay per scattering of the slowest diffusion mode,
+
+    q = w (1 - (pi^2 / 3) / (tau + 1.42)^2),
+
+where 1.42 = 2 x 0.71 are the two extrapolation lengths (Case and Zweifel 1967).
+"""
 
 import math
 from typing import NamedTuple
 
 import numpy as np
 
-from jaxlidar._checks import concrete, known_array
+from jaxlidar._checks import concrete, concrete_array
 from jaxlidar._constants import SPEED_OF_LIGHT
+from jaxlidar.planning.channels import MaterialOptics, largest_albedo
 from jaxlidar.planning.effects import can_light_itself
-from jaxlidar.planning.ladder import rung
-from jaxlidar.planning.scatterers import Optics, largest_albedo
+from jaxlidar.planning.size_buckets import size_bucket
 from jaxlidar.scenes.canopy import Canopy
 from jaxlidar.scenes.scene import Scene
 
 # Orders are followed while their histories are not more than this (16 orders of four letters, 29 of three).
 MAX_HISTORIES = 5000
 MAX_ORDERS = 100
-# There is room for no more than this where the user does not ask for it.
-MOST_ROOM = 7000
-# The share of scattered light that is scattered again is taken to be at least this, times the albedo.
-AGAIN = 0.8
+# The loop over orders is rounded up to a size bucket only while its histories are not more than this.
+MAX_BUCKETED_HISTORIES = 7000
+# The fraction of scattered light that is scattered again is taken to be at least this, times the albedo.
+MIN_REPEATED_FRACTION = 0.8
 # Multiple scattering is recorded this long after the last first-order return, ns, at least and at most.
 TAIL = (10.0, 300.0)
-# The record ends when an estimated share of the light is left that is smaller than this.
-LATE = 0.003
+# The record ends when the estimated fraction of light that is still in the scene falls below this.
+LATE_FRACTION = 0.003
 
 
-class Orders(NamedTuple):
-    """How many scatterings are followed.
+class OrderChoice(NamedTuple):
+    """The number of scatterings that are followed.
 
-    - `count`: of them. - `why`: in words. - `beyond`: estimated share of the light of all others.
-    - `again`: estimated share of scattered light that is scattered again.
-    - `most`: how many could be followed.
+    - `count`: the number. - `reason`: in words. - `beyond`: estimated fraction of the light in all later
+      orders.
+    - `max_orders`: largest number for which the table of histories stays small enough.
     """
 
     count: int
-    why: str
+    reason: str
     beyond: float
-    again: float
-    most: int
+    max_orders: int
 
 
-def degree_of(orders: int, plates: int) -> int:
-    """Longest history: every flight, and the way back, may pass every plate."""
-    return orders + (orders + 1) * plates
+def max_degree(orders: int, n_plates: int) -> int:
+    """Return the largest degree of a history: every flight, and the return path, may pass every plate."""
+    return orders + (orders + 1) * n_plates
 
 
-def order_steps(orders: int, plates: int, letters: int) -> int:
-    """Length of the loop over orders: up the ladder, where the table of histories stays small.
+def order_steps(orders: int, n_plates: int, n_channels: int) -> int:
+    """Return the length of the loop over orders: a size bucket, where the table of histories stays small.
 
-    Many orders have few photons: there the steps of the ladder are long.
+    Few photons survive to high orders, so that steps beyond the last order cost little: buckets are wide
+    there.
     """
-    steps = rung(orders, 2 if orders <= 16 else 1)
-    return steps if math.comb(degree_of(steps, plates) + letters, letters) <= MOST_ROOM else orders
+    steps = size_bucket(orders, 2 if orders <= 16 else 1)
+    histories = math.comb(max_degree(steps, n_plates) + n_channels, n_channels)
+    return steps if histories <= MAX_BUCKETED_HISTORIES else orders
 
 
 def mean_depth(canopy: Canopy) -> float:
-    """Optical depth of the canopy straight down, the mean over its columns that hold anything."""
+    """Return the vertical optical depth of the canopy, the mean over its columns that are not empty.
+
+    Infinite where extinction is being traced.
+    """
     extinction = np.zeros(canopy.voxels.shape[:2])
-    for part in (canopy.voxels.leaf, canopy.voxels.bark):
-        if part is None:
+    for table in (canopy.voxels.leaf, canopy.voxels.bark):
+        if table is None:
             continue
-        known = concrete(part)
-        if known is None:
+        values = concrete(table)
+        if values is None:
             return math.inf
-        extinction += known.sum(axis=2, dtype=float)
-    columns = extinction * known_array(canopy.voxels.voxel_size)[2]
-    there = columns[columns > 0]
-    return float(there.mean()) if there.size else 0.0
+        extinction += values.sum(axis=2, dtype=float)
+    columns = extinction * concrete_array(canopy.voxels.voxel_size)[2]
+    occupied = columns[columns > 0]
+    return float(occupied.mean()) if occupied.size else 0.0
 
 
-def scattered_again(scene: Scene, optics: list[Optics]) -> float:
-    """Estimated share of scattered light that is scattered again: albedo times the chance of meeting more.
+def repeated_fraction(scene: Scene, optics: list[MaterialOptics]) -> float:
+    """Estimate the fraction q of scattered light that is scattered again (see the module).
 
-    That chance is 1 - (pi^2 / 3) / (depth + 1.42)^2 in a slab of the optical depth of the canopy, the decay
-    of its slowest mode in the diffusion approximation; ground that reflects makes the slab deeper. Between
-    two surfaces it is the root of the product of their reflectances. It is never taken to be less than 0.8
-    times the largest albedo.
+    Ground that reflects makes the slab of the canopy deeper. Between two surfaces q is the root of the
+    product of their reflectances. It is never taken to be less than 0.8 times the largest albedo.
     """
     albedo = largest_albedo(optics)
-    again = AGAIN * albedo
+    fraction = MIN_REPEATED_FRACTION * albedo
     if scene.canopy is not None:
-        ground = 0.0 if scene.ground is None else _largest(optics, "ground")
+        ground = 0.0 if scene.ground is None else _largest_reflectance(optics, "ground")
         depth = mean_depth(scene.canopy) * (1.0 + ground)
+        # Diffusion describes thin slabs badly; there the floor stands.
         if depth > 1.0:
-            again = max(again, albedo * (1.0 - math.pi**2 / 3 / (depth + 1.42) ** 2))
-    bright = sorted(
-        (_largest(optics, o.name) for o in optics if o.name not in ("leaf", "bark")), reverse=True
-    )
-    if len(bright) > 1:
-        again = max(again, math.sqrt(bright[0] * bright[1]))
-    return min(again, 1.0)
+            fraction = max(fraction, albedo * (1.0 - math.pi**2 / 3 / (depth + 1.42) ** 2))
+    surfaces = [o.name for o in optics if o.name not in ("leaf", "bark")]
+    reflectances = sorted((_largest_reflectance(optics, name) for name in surfaces), reverse=True)
+    if len(reflectances) > 1:
+        fraction = max(fraction, math.sqrt(reflectances[0] * reflectances[1]))
+    return min(fraction, 1.0)
 
 
-def _largest(optics: list[Optics], name: str) -> float:
+def _largest_reflectance(optics: list[MaterialOptics], name: str) -> float:
     (reflectance,) = (concrete(o.reflectance) for o in optics if o.name == name)
     return 1.0 if reflectance is None else float(np.max(reflectance))
 
 
-def orders_of(
-    scene: Scene, optics: list[Optics], letters: int, rtol: float, max_orders: int | None
-) -> Orders:
-    """How many orders to follow, why, and what the others are likely to have."""
+def choose_orders(
+    scene: Scene, optics: list[MaterialOptics], n_channels: int, rtol: float, max_orders: int | None
+) -> OrderChoice:
+    """Choose the number of orders to follow: `max_orders`, or as many as `rtol` needs and histories allow."""
     if not can_light_itself(scene):
-        return Orders(1, "one plane cannot light itself", 0.0, 0.0, 1)
-    plates, again, albedo = len(scene.plates), scattered_again(scene, optics), largest_albedo(optics)
-    most = 2
-    while most < MAX_ORDERS and math.comb(degree_of(most + 1, plates) + letters, letters) <= MAX_HISTORIES:
-        most += 1
-    wanted = most
-    if again < 1:
-        wanted = 1 + math.ceil(math.log(rtol / 10) / math.log(max(again, 1e-6)))
-    count = min(max(wanted, 2), most) if max_orders is None else int(max_orders)
+        return OrderChoice(1, "one plane cannot light itself", 0.0, 1)
+    n_plates, fraction, albedo = len(scene.plates), repeated_fraction(scene, optics), largest_albedo(optics)
+    affordable = 2
+    while affordable < MAX_ORDERS:
+        histories = math.comb(max_degree(affordable + 1, n_plates) + n_channels, n_channels)
+        if histories > MAX_HISTORIES:
+            break
+        affordable += 1
+    needed = affordable
+    if fraction < 1:
+        needed = 1 + math.ceil(math.log(rtol / 10) / math.log(max(fraction, 1e-6)))
+    count = min(max(needed, 2), affordable) if max_orders is None else int(max_orders)
     if count == 1:
-        return Orders(1, "one order is asked for", 0.0, again, most)
-    why = f"orders 2 to {count}; largest albedo {albedo:.2f}"
-    return Orders(count, why, again**count, again, most)
+        return OrderChoice(1, "one order is asked for", 0.0, affordable)
+    reason = f"orders 2 to {count}; largest albedo {albedo:.2f}"
+    return OrderChoice(count, reason, fraction**count, affordable)
 
 
-def tail_of(scene: Scene, optics: list[Optics], first: float, last: float) -> float:
-    """How long after the last first-order return, ns, multiple scattering is worth recording.
+def multiple_scattering_tail(
+    scene: Scene, optics: list[MaterialOptics], first_return: float, last_return: float
+) -> float:
+    """Estimate for how long, ns, after the last first-order return multiple scattering is worth recording.
 
-    Light goes from scattering to scattering in the time that it takes to fly a mean free path in the canopy,
-    or the height between first and last return; what is left falls by the share that is scattered again.
+    From one scattering to the next light takes the time of a mean free path in the canopy, or of the height
+    between first and last return. The light that is still in the scene falls by the repeated fraction each
+    time.
     """
-    usual = min(max(3 * (last - first), TAIL[0]), 60.0)
-    again = scattered_again(scene, optics)
-    step = 0.5 * (last - first)
+    usual_tail = min(max(3 * (last_return - first_return), TAIL[0]), 60.0)
+    fraction = repeated_fraction(scene, optics)
+    time_between = 0.5 * (last_return - first_return)
     if scene.canopy is not None:
         depth = mean_depth(scene.canopy)
-        size, shape = known_array(scene.canopy.voxels.voxel_size), scene.canopy.voxels.shape
+        size, shape = concrete_array(scene.canopy.voxels.voxel_size), scene.canopy.voxels.shape
         height = float(size[2]) * shape[2]
-        step = height / max(depth, 0.5) / SPEED_OF_LIGHT if math.isfinite(depth) else step
-    if again >= 1:
+        time_between = height / max(depth, 0.5) / SPEED_OF_LIGHT if math.isfinite(depth) else time_between
+    if fraction >= 1:
         return TAIL[1]
-    scatterings = math.log(LATE) / math.log(max(again, 1e-6))
-    return min(max(usual, scatterings * step), TAIL[1])
+    scatterings = math.log(LATE_FRACTION) / math.log(max(fraction, 1e-6))
+    return min(max(usual_tail, scatterings * time_between), TAIL[1])

@@ -4,12 +4,12 @@ import math
 
 import numpy as np
 
-from jaxlidar._checks import known_number
+from jaxlidar._checks import concrete_number
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar.instrument.survey import Survey
 
 
-def parallel_light(survey: Survey, upstream: float, last: float) -> float:
+def parallel_light(survey: Survey, start_distance: float, last: float) -> float:
     """Bound on the share of samples that parallel light changes, for shots of one direction.
 
     At the height h above the reference plane, along the beam, a footprint of the radius w is narrower by the
@@ -17,14 +17,14 @@ def parallel_light(survey: Survey, upstream: float, last: float) -> float:
     area of a field of view changes by 2 h / R. Light at the rim arrives later than the mean, which is kept,
     by w^2 / (2 R), and inclined by w / R.
 
-    **Arguments:** `upstream`: where rays start, m above the reference plane. `last`: time of the last return
-    of order one, ns.
+    **Arguments:** `start_distance`: distance, m, before the reference plane at which rays start. `last`: time
+    of the last return of order one, ns.
     """
     lidar = survey.lidar
     distance, radius = float(survey.slant_range.min()), float(survey.footprint_radius.max())
-    height = max(abs(upstream), 0.5 * SPEED_OF_LIGHT * abs(last))
-    interval = known_number(lidar.sampling_interval) / math.sqrt(12.0)
-    lasts = math.hypot(known_number(lidar.pulse.std), known_number(lidar.jitter), interval)
+    height = max(abs(start_distance), 0.5 * SPEED_OF_LIGHT * abs(last))
+    interval = concrete_number(lidar.sampling_interval) / math.sqrt(12.0)
+    lasts = math.hypot(concrete_number(lidar.pulse.std), concrete_number(lidar.jitter), interval)
     late = 0.5 * radius**2 / distance / SPEED_OF_LIGHT / lasts
     narrower = 1.5 if lidar.field_of_view is None else 3.5
     return min(narrower * height / distance + late + radius / distance, 1.0)

@@ -3,16 +3,17 @@
 import dataclasses
 import math
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from jaxlidar._checks import check_choice, check_integer, check_range, known_array, known_number
+from jaxlidar._checks import check_choice, check_integer, check_range, concrete_array, concrete_number
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.instrument.survey import Survey
 from jaxlidar.optics.laws import AbstractMirror
+from jaxlidar.planning.channels import largest_albedo, number_channels, reflection_probability, scene_optics
+from jaxlidar.planning.config import PathLimits, TimeBins, TraceConfig
 from jaxlidar.planning.effect_table import effect_table, table_lines
 from jaxlidar.planning.effects import Effect, empty, flattened, only_planes, present, switched_off, without
-from jaxlidar.planning.ladder import rung
 from jaxlidar.planning.local_origin import about_aim
 from jaxlidar.planning.memory import (
     check_memory,
@@ -20,45 +21,46 @@ from jaxlidar.planning.memory import (
     jacobian_bytes,
     keeps_histories,
     memory_limit,
-    predicted,
+    simulation_bytes,
 )
-from jaxlidar.planning.orders import degree_of, order_steps, orders_of, tail_of
+from jaxlidar.planning.orders import choose_orders, max_degree, multiple_scattering_tail, order_steps
 from jaxlidar.planning.parallel_light import one_direction, parallel_light
-from jaxlidar.planning.path_lengths import PathLengths, stretch
+from jaxlidar.planning.path_lengths import PathLengths, longest_segment
 from jaxlidar.planning.record_times import fine_bin, times_of, with_air
 from jaxlidar.planning.rims import check_on_terrain
-from jaxlidar.planning.scatterers import largest_albedo, lobe_probability, scene_optics, spell
-from jaxlidar.planning.trace_plan import Bins, TracePlan
+from jaxlidar.planning.size_buckets import size_bucket
 from jaxlidar.scenes.scene import Scene, check_kinds
 from jaxlidar.scenes.surfaces import AbstractSheet
 
 DEFAULT_RTOL = 0.01
 # Fewer batches give no trustworthy standard error.
 MIN_BATCHES = 8
-# Points of each flight through a canopy from which light returns.
-ENDS = 4
+# Points of each flight through a canopy from which light returns to the sensor.
+DEPOSITS_PER_FLIGHT = 4
 
 
-class Limits(NamedTuple):
-    """What a plan was made for.
+class PlanScope(NamedTuple):
+    """The lidars and scenes that a plan was made for; `check_plan` compares others with it.
 
-    - `first`, `last`: times (ns) of the first and the last return of order one. - `albedo`: the largest.
-    - `finest`: scale (ns) of the finest feature of the pulse.
-    - `automatic_orders`, `automatic_window`: whether the plan chose them. - `most_orders`: how many there is
-      room for. - `flat`: whether terrain was found to be a plane.
-    - `empty`: which of "leaf" and "bark" were found to be zero everywhere.
-    - `max_memory`: as it was given.
+    - `first_return`, `last_return`: times, ns, of the first and the last return of order one.
+    - `albedo`: largest reflectance + transmittance of any material and wavelength.
+    - `pulse_feature`: scale, ns, of the finest feature of the pulse.
+    - `automatic_orders`, `automatic_window`: True if the plan chose the orders, and the window.
+    - `max_orders`: largest number of orders that memory has room for.
+    - `flat_terrain`: True if the terrain was found to be a plane, and is simulated as one.
+    - `empty_materials`: which of "leaf" and "bark" were found to be zero everywhere, and left out.
+    - `max_memory`: the user's limit in GB, or None.
     """
 
-    first: float
-    last: float
+    first_return: float
+    last_return: float
     albedo: float
-    finest: float
+    pulse_feature: float
     automatic_orders: bool
     automatic_window: bool
-    most_orders: int
-    flat: bool
-    empty: tuple[str, ...]
+    max_orders: int
+    flat_terrain: bool
+    empty_materials: tuple[str, ...]
     max_memory: float | None
 
 
@@ -69,23 +71,18 @@ class Plan:
     Plans are made by `jaxlidar.plan`. Printed, a plan is a table of effects, followed by a line of sizes. It
     is static: what a plan leaves out is never compiled.
 
-    - `trace`: what the tracer must know: scatterers, lengths, sizes of loops.
+    - `config`: the static configuration of the tracer: scatterers, switches, sizes of loops and batches.
+    - `limits`: lengths that bound rays and photons, and the number of orders.
     - `bins`: the fine time bins, into which returns are sorted.
     - `sample_start`, `sample_interval`: time of the first sample, and the interval between samples, ns.
     - `n_samples`: number of samples.
-    - `per_sample`: fine bins per sample.
-    - `n_rays`: rays of the footprint, which carry the first order.
-    - `n_photons`: photons per batch, which carry the higher orders.
-    - `smooth_footprint`: whether a quadrature rule takes the place of the rays, as it does over planes.
-    - `random_footprint`: whether each batch shifts the rays at random.
-    - `degree`, `first_degree`: most scatterings and passages through plates on a path, of all orders and of
-      order one.
-    - `traces`: of a response: one for each wavelength, where it matters while light is traced.
-    - `reach`: times (ns) between which the pulse's energy lies.
+    - `bins_per_sample`: number of fine bins per sample.
+    - `n_traces`: number of traces in a response: one for each wavelength, where the trace depends on it.
+    - `pulse_support`: times (ns) between which the pulse's energy lies.
     - `off`: names of the effects that are switched off.
     - `rtol`: relative accuracy aimed at.
-    - `likely_beyond`: estimated share of the light of orders beyond the last.
-    - `limits`: what the plan was made for, and a lidar and a scene that use it must keep to.
+    - `likely_beyond`: estimated fraction of the light in orders beyond the last.
+    - `scope`: the lidars and scenes that the plan serves.
     - `memory`: bytes that a simulation is predicted to take.
     - `effects`: the table, an `Effect` for every row; empty where it was not asked for.
 
@@ -97,51 +94,72 @@ class Plan:
     31 samples of 1 ns from -15 ns, 7 fine bins of 0.5 ns
     """
 
-    trace: TracePlan
-    bins: Bins
+    config: TraceConfig
+    limits: PathLimits
+    bins: TimeBins
     sample_start: float
     sample_interval: float
     n_samples: int
-    per_sample: int
-    n_rays: int
-    n_photons: int
-    smooth_footprint: bool
-    random_footprint: bool
-    degree: int
-    first_degree: int
-    traces: int
-    reach: tuple[float, float]
-    # Names of the effects that are switched off.
+    bins_per_sample: int
+    n_traces: int
+    pulse_support: tuple[float, float]
     off: tuple[str, ...]
-    # Compiled programs depend on none of these.
+    # Compiled programs depend on none of the following.
     rtol: float = dataclasses.field(compare=False)
     likely_beyond: float = dataclasses.field(compare=False)
-    limits: Limits = dataclasses.field(compare=False)
+    scope: PlanScope = dataclasses.field(compare=False)
     memory: float = dataclasses.field(compare=False)
     effects: tuple[Effect, ...] = dataclasses.field(compare=False)
 
     @property
     def orders(self) -> int:
         """Number of scatterings that are followed."""
-        return int(self.trace.orders)
+        return int(self.limits.orders)
 
     @property
-    def least_degree(self) -> int:
-        """Longest history of the orders that are followed; `degree` has room for more of them."""
-        plates = len(self.trace.surfaces) - self.trace.has_ground
-        return degree_of(self.orders, plates) if self.trace.keeps_histories else 0
+    def n_rays(self) -> int:
+        """Rays of the footprint in a batch; they carry the first order."""
+        return self.config.n_rays
 
-    def jacobian_memory(self, columns: int) -> float:
-        """Bytes that derivatives in so many geometric unknowns at once take, beside what compiling takes."""
-        sizes = self.least_degree, self.first_degree, self.traces, (self.n_photons, self.n_rays)
-        return jacobian_bytes(self.trace, self.bins, *sizes, MIN_BATCHES, columns)
+    @property
+    def n_photons(self) -> int:
+        """Photons in a batch; they carry the higher orders."""
+        return self.config.n_photons
+
+    @property
+    def photons_traced(self) -> int:
+        """Photons that a batch traces: none where only one order is followed."""
+        return self.n_photons if self.orders > 1 else 0
+
+    @property
+    def degree(self) -> int:
+        """Longest history of the orders that are followed; `config.degree` has room for longer ones."""
+        n_plates = len(self.config.surfaces) - self.config.has_ground
+        return max_degree(self.orders, n_plates) if self.config.keeps_histories else 0
 
     @property
     def is_random(self) -> bool:
-        """Whether anything is drawn at random."""
-        if self.trace.order_steps > 1 or self.trace.drawn_first:
-            return True
-        return self.random_footprint and not self.smooth_footprint
+        """True if anything is drawn at random."""
+        return self.config.is_random
+
+    def with_config(self, **changes: Any) -> "Plan":
+        """Return the plan with other values in its static configuration."""
+        return dataclasses.replace(self, config=dataclasses.replace(self.config, **changes))
+
+    def with_limits(self, **changes: Any) -> "Plan":
+        """Return the plan with other path limits."""
+        return dataclasses.replace(self, limits=dataclasses.replace(self.limits, **changes))
+
+    def jacobian_memory(self, columns: int) -> float:
+        """Return the bytes of derivatives in `columns` geometric unknowns, without compilation."""
+        return jacobian_bytes(
+            self.config,
+            self.bins,
+            degree=self.degree,
+            n_traces=self.n_traces,
+            batches=MIN_BATCHES,
+            columns=columns,
+        )
 
     def __str__(self) -> str:
         lines = table_lines(self.effects)
@@ -149,11 +167,11 @@ class Plan:
             f"{self.n_samples} samples of {self.sample_interval:g} ns from {self.sample_start:g} ns, "
             f"{self.bins.count} fine bins of {self.bins.width:.3g} ns"
         )
-        if not self.smooth_footprint and self.n_rays > 1:
+        if not self.config.smooth_footprint and self.n_rays > 1:
             sizes += f", {self.n_rays} rays"
         if self.orders > 1:
             sizes += f", {self.n_photons} photons a batch, {self.orders} orders"
-        if not self.trace.keeps_histories:
+        if not self.config.keeps_histories:
             sizes += ", optics applied while light is traced"
         one, two = (self.jacobian_memory(n) for n in (1, 2))
         memory = f"about {in_words(self.memory)} of memory; a Jacobian in one geometric unknown "
@@ -242,127 +260,154 @@ def plan(
         check_range("max_memory", max_memory, 0.0, low_open=True)
     check_choice("footprint", footprint, ("random", "fixed"))
     check_on_terrain(lidar if survey is None else survey, scene)
-    survey = None if survey is None else survey.about(known_array(lidar.position))
-    lidar, given = about_aim(lidar, scene)
-    nothing = empty(given, effects)
-    given = without(lidar, given, nothing)[1]
-    scene = flattened(given, effects)
-    whole = lidar, scene
+    survey = None if survey is None else survey.about(concrete_array(lidar.position))
+    lidar, scene = about_aim(lidar, scene)
+    # 1. Effects: leaf or bark that is zero everywhere and relief of flat terrain are off, then what the user
+    # switches off. The table compares with everything else in place.
+    empty_materials = empty(scene, effects)
+    scene = without(lidar, scene, empty_materials)[1]
+    with_relief, scene = scene, flattened(scene, effects)
+    flat_terrain = scene is not with_relief
+    complete_scene = scene
     off = switched_off(effects, present(lidar, scene), max_orders)
-    flat = scene is not given
-    off = (*off, *(("relief",) if flat else ()), *nothing)
+    off = (*off, *(("relief",) if flat_terrain else ()), *empty_materials)
+    complete_lidar = lidar
     lidar, scene = without(lidar, scene, off)
+    # 2. Orders of scattering, from the optics.
     geometry = PathLengths(lidar, scene, survey)
     optics = scene_optics(lidar, scene)
-    letters = spell(optics)
-    if "multiple scattering" in off:
-        max_orders = 1
-    chosen = orders_of(scene, optics, len(letters.letters), rtol, max_orders)
-    orders, plates = chosen.count, len(scene.plates)
-
-    def steps_of(orders: int) -> int:
-        return order_steps(orders, plates, len(letters.letters))
-
-    jitter = known_number(lidar.jitter)
-    finest = math.hypot(known_number(lidar.pulse.finest), jitter)
-    duration = math.hypot(known_number(lidar.pulse.std), jitter)
+    scatterers = number_channels(optics)
+    n_channels, n_plates = len(scatterers.channels), len(scene.plates)
+    order_choice = choose_orders(
+        scene, optics, n_channels, rtol, 1 if "multiple scattering" in off else max_orders
+    )
+    orders = order_choice.count
+    steps = order_steps(orders, n_plates, n_channels)
+    # 3. Time: fine bins from the pulse's features, samples from the window.
+    jitter, interval = concrete_number(lidar.jitter), concrete_number(lidar.sampling_interval)
+    pulse_feature = math.hypot(concrete_number(lidar.pulse.finest), jitter)
+    pulse_duration = math.hypot(concrete_number(lidar.pulse.std), jitter)
+    first_return, last_return = geometry.first / SPEED_OF_LIGHT, geometry.last / SPEED_OF_LIGHT
+    tail = multiple_scattering_tail(scene, optics, first_return, last_return) if orders > 1 else 0.0
+    target_width = fine_bin(interval, pulse_feature, pulse_duration, bin_width)
+    bins, samples = times_of(lidar, scene, geometry, tail, window, target_width)
+    bins_with_air = with_air(bins, lidar, samples)
+    bin_length = 0.5 * SPEED_OF_LIGHT * bins.width
+    max_segment, max_span = longest_segment(geometry.longest_chord, bin_length, max_step)
+    max_path = SPEED_OF_LIGHT * (bins.start + bins.width * bins.count)
+    bins = dataclasses.replace(bins, max_span=max_span, count=size_bucket(bins.count, 4))
+    pulse_support = lidar.pulse.support(jitter)
+    # 4. Sizes of loops and batches.
     if n_rays is None:
         # The shorter the pulse, the fewer rays a sample is made of.
-        short = duration < known_number(lidar.sampling_interval)
-        n_rays = 4096 if orders == 1 or footprint == "fixed" else 2048 if short else 1024
-    tail = tail_of(scene, optics, geometry.first / SPEED_OF_LIGHT, geometry.last / SPEED_OF_LIGHT)
-    target = fine_bin(known_number(lidar.sampling_interval), finest, duration, bin_width)
-    bins, samples = times_of(lidar, scene, geometry, tail if orders > 1 else 0.0, window, target)
-    airy = with_air(bins, lidar, samples)
-    metres = 0.5 * SPEED_OF_LIGHT * bins.width
-    step, row = stretch(geometry.longest_chord, metres, max_step)
-    last = SPEED_OF_LIGHT * (bins.start + bins.width * bins.count)
-    bins = dataclasses.replace(bins, row=row, count=rung(bins.count, 4))
-    # Rays march through room that they do not need: rungs are a quarter apart at most where steps are few, a
-    # sixteenth where they are many.
-    first_steps = geometry.first_steps(step)
-    trace = TracePlan(
-        materials=letters.materials,
-        letters=letters.letters,
-        leaf=letters.leaf,
-        bark=letters.bark,
-        surfaces=letters.surfaces,
-        full_cover=tuple(
-            not isinstance(s, AbstractSheet) or known_number(s.coverage) == 1.0 for s in scene.surfaces
+        short_pulse = pulse_duration < interval
+        n_rays = 4096 if orders == 1 or footprint == "fixed" else 2048 if short_pulse else 1024
+    # Rays march through steps that they do not need: buckets are at most a quarter apart where steps are few,
+    # a sixteenth where they are many.
+    ray_segments = geometry.first_steps(max_segment)
+    wide_beam = "divergence" not in off
+    config = TraceConfig(
+        materials=scatterers.materials,
+        channels=scatterers.channels,
+        leaf=scatterers.leaf,
+        bark=scatterers.bark,
+        surfaces=scatterers.surfaces,
+        covers_fully=tuple(
+            not isinstance(s, AbstractSheet) or concrete_number(s.coverage) == 1.0 for s in scene.surfaces
         ),
         mirrors=tuple(isinstance(s.law, AbstractMirror) for s in scene.surfaces),
         has_ground=scene.ground is not None,
         hotspot=scene.canopy is not None and scene.canopy.hotspot,
         vertical=geometry.vertical,
-        upstream=geometry.upstream,
-        first_steps=rung(first_steps, 4 if first_steps <= 128 else 16),
-        march_steps=rung(geometry.march_steps(last + geometry.upstream)),
-        max_step=step,
-        max_flight=geometry.longest_flight(last + geometry.upstream),
-        last=last,
-        lobe=lobe_probability(optics),
-        orders=orders,
-        order_steps=steps_of(orders),
-        # Without a canopy all ends of a flight are on the same surface.
-        ends=1 if scene.canopy is None else ENDS,
-        drawn_first=False,
-        independent=False,
+        returns_specular="specular return" not in off,
+        max_ray_segments=size_bucket(ray_segments, 4 if ray_segments <= 128 else 16),
+        max_faces=size_bucket(geometry.march_steps(max_path + geometry.start_distance)),
+        order_steps=steps,
+        # Without a canopy all deposit points of a flight would be on the same surface.
+        deposits_per_flight=1 if scene.canopy is None else DEPOSITS_PER_FLIGHT,
+        degree=max_degree(steps, n_plates),
+        first_degree=1 + 2 * n_plates,
+        keeps_histories=True,
+        # A beam without width is one ray.
+        n_rays=int(n_rays) if wide_beam else 1,
+        n_photons=int(n_photons),
+        smooth_footprint=only_planes(scene) and wide_beam,
+        random_footprint=footprint == "random" and wide_beam,
     )
-    degree, first_degree = degree_of(steps_of(orders), plates), 1 + 2 * plates
-    reach = lidar.pulse.support(jitter)
-    spanned = math.ceil((reach[1] - reach[0] + samples[1]) / bins.width) + 5
-    limit = memory_limit(max_memory)
+    limits = PathLimits(
+        start_distance=geometry.start_distance,
+        max_segment=max_segment,
+        max_flight=geometry.longest_flight(max_path + geometry.start_distance),
+        max_path=max_path,
+        reflection_probability=reflection_probability(optics),
+        orders=orders,
+    )
+    # 5. Memory decides between histories and applied optics, and how many orders there is room for.
     straight = scene.canopy is not None and scene.canopy.is_straight
     wavelengths = lidar.wavelength.size
+    pulse_bins = math.ceil((pulse_support[1] - pulse_support[0] + samples.interval) / bins.width) + 5
+
+    def n_traces(keeps: bool) -> int:
+        return wavelengths if straight or not keeps else 1
 
     def memory_of(orders: int, keeps: bool) -> float:
-        most, traces = degree_of(steps_of(orders), plates), wavelengths if straight or not keeps else 1
-        return predicted(trace, bins, most if keeps else 0, first_degree, samples[2], spanned, traces)
+        degree = max_degree(order_steps(orders, n_plates, n_channels), n_plates) if keeps else 0
+        return simulation_bytes(
+            config,
+            bins,
+            degree=degree,
+            n_samples=samples.count,
+            pulse_bins=pulse_bins,
+            n_traces=n_traces(keeps),
+        )
 
+    limit = memory_limit(max_memory)
     keeps = keeps_histories(memory_of(orders, True), memory_of(orders, False), limit, wavelengths)
-    trace = dataclasses.replace(trace, keeps_histories=keeps)
-    degree = degree if keeps else 0
+    if not keeps:
+        config = dataclasses.replace(config, keeps_histories=False, degree=0)
     memory = memory_of(orders, keeps)
     check_memory(memory, limit)
-    most = next(n for n in range(max(chosen.most, orders), orders - 1, -1) if memory_of(n, keeps) <= limit)
-    rows = ()
+    possible_orders = range(max(order_choice.max_orders, orders), orders - 1, -1)
+    table = ()
     if describe:
-        rows = effect_table(*whole, off, chosen, airy, geometry.upstream, whole_first=window is None)
+        table = effect_table(
+            complete_lidar,
+            complete_scene,
+            off,
+            order_choice,
+            bins_with_air,
+            geometry.start_distance,
+            records_all_of_order_one=window is None,
+        )
         if survey is not None and one_direction(survey):
-            bound = parallel_light(survey, geometry.upstream, geometry.last / SPEED_OF_LIGHT)
+            bound = parallel_light(survey, geometry.start_distance, last_return)
             reason = "neglected where footprints share light"
-            rows += (Effect("spreading of rays", False, reason, bound, "samples"),)
+            table += (Effect("spreading of rays", False, reason, bound, "samples"),)
     return Plan(
-        trace=trace,
+        config=config,
+        limits=limits,
         bins=bins,
-        sample_start=samples[0],
-        sample_interval=samples[1],
-        n_samples=samples[2],
-        per_sample=samples[3],
-        # A beam without width is one ray.
-        n_rays=1 if "divergence" in off else int(n_rays),
-        n_photons=int(n_photons),
-        smooth_footprint=only_planes(scene) and "divergence" not in off,
-        random_footprint=footprint == "random" and "divergence" not in off,
-        degree=degree,
-        first_degree=first_degree,
-        traces=wavelengths if straight or not keeps else 1,
-        reach=reach,
+        sample_start=samples.start,
+        sample_interval=samples.interval,
+        n_samples=samples.count,
+        bins_per_sample=samples.bins_per_sample,
+        n_traces=n_traces(keeps),
+        pulse_support=pulse_support,
         off=off,
         rtol=rtol,
-        likely_beyond=chosen.beyond,
-        limits=Limits(
-            geometry.first / SPEED_OF_LIGHT,
-            geometry.last / SPEED_OF_LIGHT,
-            largest_albedo(optics),
-            finest,
-            max_orders is None,
-            window is None,
-            most,
-            flat,
-            nothing,
-            max_memory,
+        likely_beyond=order_choice.beyond,
+        scope=PlanScope(
+            first_return=first_return,
+            last_return=last_return,
+            albedo=largest_albedo(optics),
+            pulse_feature=pulse_feature,
+            automatic_orders=max_orders is None and "multiple scattering" not in off,
+            automatic_window=window is None,
+            max_orders=next(n for n in possible_orders if memory_of(n, keeps) <= limit),
+            flat_terrain=flat_terrain,
+            empty_materials=empty_materials,
+            max_memory=max_memory,
         ),
         memory=memory,
-        effects=rows,
+        effects=table,
     )

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxlidar._checks import known_array
+from jaxlidar._checks import concrete_array
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.instrument.survey import Survey
 from jaxlidar.scenes.height_field import HeightField
@@ -59,7 +59,7 @@ def check_on_terrain(shots: Lidar | Survey, scene: Scene) -> None:
     if not (isinstance(ground, Terrain) and ground.relief and ground.sides == "open"):
         return
     survey = shots if isinstance(shots, Survey) else Survey.of(shots)
-    origin, end, heights = known_array(ground.origin), ground.end, known_array(ground.heights)
+    origin, end, heights = concrete_array(ground.origin), ground.end, concrete_array(ground.heights)
     rims = rims_of(survey, 2.0 if survey.lidar.profile == "gaussian" else 1.0)
     steep = np.minimum(rims.rays[..., 2:], -1e-9)
     ends = [

@@ -1,4 +1,4 @@
-"""A lidar and a scene as a plan simulates them."""
+"""`Setup`: a lidar and a scene without the effects that a plan leaves out."""
 
 from typing import final
 
@@ -20,9 +20,10 @@ from jaxlidar.scenes.terrain import Terrain
 @final
 @briefly
 class Setup(eqx.Module):
-    """A lidar and a scene without what a plan leaves out, and the plan: all that tracing and recording need.
+    """A lidar and a scene without the effects that a plan leaves out, and the plan.
 
-    Setups are made by `reduce`. The plan is static; lidar and scene can be traced and differentiated.
+    A setup is the input of `trace_scene` and `waveform_of`; `make_setup` makes one. The plan is static; lidar
+    and scene can be traced and differentiated.
 
     - `lidar`: a `Lidar`.
     - `scene`: a `Scene`.
@@ -33,7 +34,7 @@ class Setup(eqx.Module):
 
     >>> import jaxlidar as jl
     >>> lidar, scene = jl.Lidar(jitter=1.0), jl.Scene(ground=jl.Ground())
-    >>> setup = jl.reduce(lidar, scene, jl.plan(lidar, scene, effects={"jitter": False}))
+    >>> setup = jl.make_setup(lidar, scene, jl.plan(lidar, scene, effects={"jitter": False}))
     >>> print(float(setup.lidar.jitter), setup.plan.off)
     0.0 ('jitter',)
     """
@@ -44,8 +45,8 @@ class Setup(eqx.Module):
     admissible: Float[Array, ""]
 
 
-def reduce(lidar: Lidar, scene: Scene, plan: Plan) -> Setup:
-    """The lidar and the scene without what a plan leaves out, with coordinates about the aim point.
+def make_setup(lidar: Lidar, scene: Scene, plan: Plan) -> Setup:
+    """Make the setup of a lidar and a scene: without the effects that a plan leaves out, about the aim point.
 
     **Arguments:**
 
@@ -58,26 +59,26 @@ def reduce(lidar: Lidar, scene: Scene, plan: Plan) -> Setup:
 
     **Returns:** a `Setup`.
 
-    **Raises:** TypeError for things of another kind; ValueError for heights of terrain that are being traced
-    with a plan for a plane, and for leaf or bark with one for a map that has none.
+    **Raises:** TypeError for arguments of another kind; ValueError where heights of terrain are being traced
+    with a plan for a plane, or leaf or bark with a plan for a map that has none.
 
     **Example:**
 
     >>> import jaxlidar as jl
     >>> lidar, scene = jl.Lidar(), jl.Scene(ground=jl.Ground(slope=10.0))
     >>> plan = jl.plan(lidar, scene, effects={"slope spread": False})
-    >>> float(jl.reduce(lidar, scene, plan).scene.ground.slope)
+    >>> float(jl.make_setup(lidar, scene, plan).scene.ground.slope)
     0.0
     """
     check_kinds(lidar, scene)
     check_kind("plan", plan, Plan, "a Plan that jaxlidar.plan made")
     ground = scene.ground
-    if plan.limits.flat and isinstance(ground, Terrain) and is_traced(ground.heights):
+    if plan.scope.flat_terrain and isinstance(ground, Terrain) and is_traced(ground.heights):
         raise ValueError(
             "the plan takes the terrain for a plane, but its heights are being traced by a JAX "
             'transformation; make the plan with effects={"relief": True}'
         )
-    for name in plan.limits.empty:
+    for name in plan.scope.empty_materials:
         if scene.canopy is not None and is_traced(getattr(scene.canopy.voxels, name)):
             raise ValueError(
                 f"the plan is for a map whose {name} is zero everywhere, but {name} is being traced by a JAX "

@@ -4,8 +4,9 @@ Every function draws on the axes that it is given, or on those of a new figure, 
 shown and nothing is saved. The package, and matplotlib with it, is imported when it is first used.
 """
 
+from jaxlidar._signatures import shorten_signatures
 from jaxlidar.plot.fits import fit, residuals
-from jaxlidar.plot.light import accuracy, ledger
+from jaxlidar.plot.light import accuracy, energy_budget
 from jaxlidar.plot.photon_events import photons
 from jaxlidar.plot.scenes import scene
 from jaxlidar.plot.spectra import spectrum
@@ -17,7 +18,7 @@ __all__ = [
     "accuracy",
     "fit",
     "leaf_on_and_off",
-    "ledger",
+    "energy_budget",
     "photons",
     "residuals",
     "scene",
@@ -26,3 +27,9 @@ __all__ = [
     "tree",
     "waveform",
 ]
+
+shorten_signatures(globals())
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

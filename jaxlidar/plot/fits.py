@@ -8,7 +8,7 @@ from jaxtyping import ArrayLike
 from matplotlib.axes import Axes
 
 from jaxlidar.plot.style import TOTAL, WAVELENGTH_COLOURS, axes_or_new, frame_height, wavelengths_of
-from jaxlidar.waveform import Waveform
+from jaxlidar.spectral.waveform import Waveform
 
 
 def residuals(

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from jaxlidar.plot.fits import residuals
 from jaxlidar.plot.waveforms import waveform
-from jaxlidar.waveform import Waveform
+from jaxlidar.spectral.waveform import Waveform
 
 RESOLUTION = 80
 

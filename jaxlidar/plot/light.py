@@ -9,7 +9,7 @@ from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter, PercentFo
 
 from jaxlidar._progress import Progress
 from jaxlidar.plot.style import BEAM, COLOURS, OTHER, TOTAL, WAVELENGTH_COLOURS, axes_or_new
-from jaxlidar.waveform import Waveform
+from jaxlidar.spectral.waveform import Waveform
 
 # Fates that are no material's, each with a hatch, so that grey tells them apart.
 FATES = {
@@ -22,7 +22,7 @@ FATES = {
 LEAST = 5e-4
 
 
-def ledger(wave: Waveform, ax: Axes | None = None, *, legend: bool = True) -> Axes:
+def energy_budget(wave: Waveform, ax: Axes | None = None, *, legend: bool = True) -> Axes:
     """Axes with what became of the emitted light: a bar for each wavelength, in percent.
 
     **Arguments:**
@@ -39,16 +39,16 @@ def ledger(wave: Waveform, ax: Axes | None = None, *, legend: bool = True) -> Ax
     >>> import jaxlidar.plot
     >>> from matplotlib.figure import Figure
     >>> wave = jl.simulate(jl.Lidar(), jl.Scene(ground=jl.Ground()), key=jax.random.key(0))
-    >>> ax = jaxlidar.plot.ledger(wave, Figure().subplots())
+    >>> ax = jaxlidar.plot.energy_budget(wave, Figure().subplots())
     >>> print([text.get_text() for text in ax.get_legend().get_texts()])
     ['absorbed by ground', 'escaped']
     """
     names = [f"{w:g} nm" for w in np.asarray(wave.wavelength, float)]
     ax = axes_or_new(ax, (5.0, 0.9 + 0.4 * len(names)))
-    absorbed = [name for name in wave.ledger if name.startswith("absorbed by ")]
+    absorbed = [name for name in wave.energy_budget if name.startswith("absorbed by ")]
     left, spare = np.zeros(len(names)), list(WAVELENGTH_COLOURS)
-    for name in [*absorbed, *(fate for fate in FATES if fate in wave.ledger)]:
-        share = 100.0 * np.asarray(wave.ledger[name], float)
+    for name in [*absorbed, *(fate for fate in FATES if fate in wave.energy_budget)]:
+        share = 100.0 * np.asarray(wave.energy_budget[name], float)
         if share.max(initial=0.0) < 100 * LEAST:
             continue
         material = name.removeprefix("absorbed by ")

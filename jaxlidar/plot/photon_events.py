@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import ArrayLike
 from matplotlib.axes import Axes
 
-from jaxlidar._checks import check_kind, check_range, check_shape, known_array
+from jaxlidar._checks import check_kind, check_range, check_shape, concrete_array
 from jaxlidar.instrument.photon_counter import PhotonEvents
 from jaxlidar.plot.style import COLOURS, OTHER, TOTAL, axes_or_new
 
@@ -61,12 +61,12 @@ def photons(
     if distance is not None:
         check_range("distance", distance)
         check_shape("distance", distance, place.shape)
-        place = known_array(distance)
+        place = concrete_array(distance)
     numbers = np.where(events.signal, 3, 0)
     if label is not None:
         check_range("label", label, 0, 3)
         check_shape("label", label, numbers.shape)
-        numbers = known_array(label)
+        numbers = concrete_array(label)
     ax = axes_or_new(ax, (6.4, 3.2))
     look = {"marker": "o", "markersize": 1.5, "markeredgewidth": 0, "linestyle": "none", **style}
     for number, (name, colour) in _CLASSES.items():

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 
-from jaxlidar.waveform import Waveform
+from jaxlidar.spectral.waveform import Waveform
 
 COLOURS = {"leaf": "#009E73", "bark": "#8C510A", "ground": "#E69F00", "plate": "#56B4E9"}
 OTHER = "#999999"

@@ -14,7 +14,7 @@ from jaxlidar.plot.style import (
     frame_height,
     wavelengths_of,
 )
-from jaxlidar.waveform import Waveform
+from jaxlidar.spectral.waveform import Waveform
 
 
 def waveform(

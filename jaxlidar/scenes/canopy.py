@@ -17,7 +17,7 @@ from jaxlidar._checks import (
     concrete,
     kind_of,
 )
-from jaxlidar._ranges import SHARE
+from jaxlidar._ranges import FRACTION
 from jaxlidar.optics.phase import AbstractPhase
 from jaxlidar.optics.spectra import Spectrum, reflectance_at
 from jaxlidar.scenes.surfaces import Reflectance, check_reflectance, reflectance_field
@@ -70,7 +70,7 @@ class Canopy(eqx.Module):
     hotspot: bool = eqx.field(static=True, default=False)
     sides: str = eqx.field(static=True, default="open")
 
-    ranges: ClassVar = {"bark": SHARE}
+    ranges: ClassVar = {"bark": FRACTION}
 
     def __check_init__(self):
         check_kind("voxels", self.voxels, VoxelMap, "a VoxelMap")

@@ -25,7 +25,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxlidar._checks import known_array
+from jaxlidar._checks import concrete_array
 from jaxlidar._one_function import once
 from jaxlidar._vectors import FAR, Scalar, Vec, along, dot, normalise, vec
 from jaxlidar.scenes.raster import Cell, Raster
@@ -260,8 +260,8 @@ class HeightField(AbstractShape):
         **Returns:** (2, 2) the least and the largest x and y, m, that rays may have where they meet the
         surface, and the least and the largest height, m, in between.
         """
-        heights, spacing = known_array(self.heights.values), known_array(self.heights.spacing)
-        origin = known_array(self.heights.origin) - known_array(self.heights.number) * spacing
+        heights, spacing = concrete_array(self.heights.values), concrete_array(self.heights.spacing)
+        origin = concrete_array(self.heights.origin) - concrete_array(self.heights.number) * spacing
         steep = np.minimum(directions[:, 2], -1e-9)
         low, high, box = heights.min(), heights.max(), np.zeros((2, 2))
         # The beam between the bounds lies within a box, within which there may be closer bounds.

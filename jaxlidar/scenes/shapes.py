@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxlidar._checks import as_scalar, known_array
+from jaxlidar._checks import as_scalar, concrete_array
 from jaxlidar._vectors import FAR, Scalar, Vec, dot, vec
 
 # Rays whose direction has a cosine with the normal below this never meet the plane.
@@ -166,7 +166,7 @@ class Plane(AbstractShape):
     def crossing(
         self, points: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]
     ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-        normal, foot = known_array(self.upward), known_array(self.foot)
+        normal, foot = concrete_array(self.upward), concrete_array(self.foot)
         towards = directions @ normal
         return _crossing(normal @ foot - points @ normal, towards, np), towards
 

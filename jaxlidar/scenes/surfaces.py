@@ -20,7 +20,7 @@ from jaxlidar._checks import (
     coordinates,
     scalar,
 )
-from jaxlidar._ranges import SHARE, SUM_OF_SHARES, Range, check_ranges
+from jaxlidar._ranges import FRACTION, SUM_OF_FRACTIONS, Range, check_ranges
 from jaxlidar.optics.laws import AbstractLaw, Lambertian
 from jaxlidar.optics.spectra import Spectrum
 from jaxlidar.scenes.raster import Raster
@@ -56,7 +56,7 @@ def check_reflectance(field: str, x: Any) -> None:
     """
     if isinstance(x, Spectrum):
         return
-    check_range(field, x, *SHARE[:2])
+    check_range(field, x, *FRACTION[:2])
     if x.ndim > 1 or x.size == 0:
         raise ValueError(
             f"{field} has shape {x.shape}; admissible is one number, one per wavelength, or a Spectrum"
@@ -83,7 +83,7 @@ def check_sum(field: str, reflectance: Any, transmittance: Any) -> None:
     r, t = (_known(x, at, among_spectra=bool(tables)) for x in both)
     if r is None or t is None:
         return
-    check_range(field, r + t, *SUM_OF_SHARES[:2])
+    check_range(field, r + t, *SUM_OF_FRACTIONS[:2])
 
 
 def _known(x: Any, at: np.ndarray, *, among_spectra: bool) -> np.ndarray | None:
@@ -241,7 +241,7 @@ class Ground(AbstractGround):
         converter=coordinates("position", 2), default=(0.0, 0.0)
     )
 
-    ranges: ClassVar = _PLACED | {"reflectance": SHARE}
+    ranges: ClassVar = _PLACED | {"reflectance": FRACTION}
 
     def __check_init__(self):
         check_kind("law", self.law, AbstractLaw, "a law of reflection, such as Lambertian()")
@@ -308,10 +308,10 @@ class Plate(AbstractSheet):
     )
 
     ranges: ClassVar = _PLACED | {
-        "reflectance": SHARE,
-        "transmittance": SHARE,
-        "reflectance + transmittance": SUM_OF_SHARES,
-        "coverage": SHARE,
+        "reflectance": FRACTION,
+        "transmittance": FRACTION,
+        "reflectance + transmittance": SUM_OF_FRACTIONS,
+        "coverage": FRACTION,
     }
 
     def __check_init__(self):

@@ -19,10 +19,10 @@ from jaxlidar._checks import (
     check_range,
     check_shape,
     concrete,
+    concrete_array,
     coordinates,
-    known_array,
 )
-from jaxlidar._ranges import SHARE, Range, check_ranges
+from jaxlidar._ranges import FRACTION, Range, check_ranges
 from jaxlidar._vectors import normalise
 from jaxlidar.optics.laws import AbstractLaw, AbstractMirror, Lambertian
 from jaxlidar.optics.spectra import Spectrum
@@ -107,7 +107,7 @@ class Terrain(AbstractGround):
         "heights": Range(),
         "spacing": Range(0.0, low_open=True),
         "origin": Range(),
-        "reflectance": SHARE,
+        "reflectance": FRACTION,
     }
 
     def __check_init__(self):
@@ -170,7 +170,7 @@ class Terrain(AbstractGround):
     def end(self) -> Float[np.ndarray, "2"]:
         """(2,) place of the outermost north-east node, or of the first that is a repetition, m."""
         cells = np.asarray(self.heights.shape) - (self.sides == "open")
-        return known_array(self.origin) + known_array(self.spacing) * cells
+        return concrete_array(self.origin) + concrete_array(self.spacing) * cells
 
     def height_at(self, x: ArrayLike, y: ArrayLike) -> Float[Array, "..."]:
         """Height of the terrain, or of its plane of best fit without relief.
@@ -201,7 +201,7 @@ class Terrain(AbstractGround):
 
     def is_plane(self) -> bool:
         """Whether all heights, which must be known, lie in one plane; where the sides are periodic, level."""
-        heights, spacing = known_array(self.heights), known_array(self.spacing)
+        heights, spacing = concrete_array(self.heights), concrete_array(self.spacing)
         slope, mean = self._best_fit(heights, spacing)
         x, y = (d * n for d, n in zip(spacing, _from_middle(heights.shape)))
         apart = np.abs(heights - mean - slope[0] * x[:, None] - slope[1] * y)
@@ -213,9 +213,9 @@ class Terrain(AbstractGround):
         varies = self._raster_of_reflectance is not None
         if varies or concrete(self.heights) is None or concrete(self.origin) is None:
             return dataclasses.replace(self, relief=False)
-        heights, spacing = known_array(self.heights), known_array(self.spacing)
+        heights, spacing = concrete_array(self.heights), concrete_array(self.spacing)
         (east, north), mean = self._best_fit(heights, spacing)
-        x, y = known_array(self.origin) + 0.5 * spacing * (np.asarray(heights.shape) - 1.0)
+        x, y = concrete_array(self.origin) + 0.5 * spacing * (np.asarray(heights.shape) - 1.0)
         slope = np.rad2deg(np.arctan(np.hypot(east, north)))
         aspect = np.rad2deg(np.arctan2(-east, -north)) if slope > 0 else 0.0
         # Told at x = y = 0: near the beam, once the scene is told relative to it.

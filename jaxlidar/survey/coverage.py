@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxlidar._summary import NOTABLE, percent
+from jaxlidar._summary import NOTABLE_FRACTION, percent
 from jaxlidar._vectors import FAR, vec
 from jaxlidar.instrument.survey import Survey
 from jaxlidar.scenes.scene import Scene
@@ -93,7 +93,7 @@ def off_map(survey: Survey, scene: Scene) -> Float[np.ndarray, " shots"]:
 
 def said_of(beside: Float[np.ndarray, " shots"]) -> str | None:
     """A sentence on the footprints that lie partly beside the map, or None where there are none."""
-    there = np.flatnonzero(beside >= NOTABLE)
+    there = np.flatnonzero(beside >= NOTABLE_FRACTION)
     if there.size == 0:
         return None
     worst = there[np.argsort(-beside[there], kind="stable")][:3]

@@ -11,16 +11,16 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxlidar._summary import NOTABLE, percent
+from jaxlidar._summary import NOTABLE_FRACTION, percent
 from jaxlidar.io.case import Case
 from jaxlidar.io.checkpoint import Checkpoint
 from jaxlidar.io.netcdf import by_rows
 from jaxlidar.io.rows import blank
 from jaxlidar.simulate import LateLightWarning
+from jaxlidar.spectral.apply_optics import make_waveform_model
 from jaxlidar.survey.records import Record
 from jaxlidar.survey.waveforms import Waveforms
 from jaxlidar.survey.ways import AbstractWay
-from jaxlidar.trace.colouring import recording_of
 
 
 class StoredResults(MutableMapping[int, Any]):
@@ -62,7 +62,7 @@ def in_memory(
     """All waveforms. `known` has the fields that are known before any tracing."""
     each = [record for _, record in way.records(results)]
     record: Record = jax.tree.map(lambda *some: np.concatenate(some), *each)
-    _say_what_is_late(way, float(np.max(record.ledger["after the window"], initial=0.0)))
+    _say_what_is_late(way, float(np.max(record.energy_budget["after the window"], initial=0.0)))
     return _waveforms(way, {**known, **record._asdict()}, started)
 
 
@@ -82,14 +82,14 @@ def on_disk(
     with by_rows(_waveforms(way, {**known, **empty}, started, problem=problem), path, case) as rows:
         for shots, record in itertools.chain([first], each):
             rows.add(shots, {**{name: a[shots] for name, a in known.items()}, **record._asdict()})
-            late = max(late, float(np.max(record.ledger["after the window"])))
+            late = max(late, float(np.max(record.energy_budget["after the window"])))
     _say_what_is_late(way, late)
     return Waveforms.open(path)
 
 
 def _waveforms(way: AbstractWay, fields: dict[str, Any], started: float, **info: Any) -> Waveforms:
     return Waveforms(
-        time=np.asarray(recording_of(way.setup).time),
+        time=np.asarray(make_waveform_model(way.setup).time),
         wavelength=np.asarray(way.setup.lidar.wavelength),
         **fields,
         info={
@@ -104,11 +104,11 @@ def _waveforms(way: AbstractWay, fields: dict[str, Any], started: float, **info:
 
 def _say_what_is_late(way: AbstractWay, late: float) -> None:
     plan = way.setup.plan
-    if late >= NOTABLE:
+    if late >= NOTABLE_FRACTION:
         end = plan.sample_start + plan.sample_interval * plan.n_samples
         warnings.warn(
             f"{percent(late)} of the light of a shot is still on its way when the record ends at "
-            f"{end:.4g} ns: see Waveforms.ledger",
+            f"{end:.4g} ns: see Waveforms.energy_budget",
             LateLightWarning,
             stacklevel=4,
         )

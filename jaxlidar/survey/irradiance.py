@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxlidar.instrument.survey import Survey
-from jaxlidar.trace.nodes import spline
+from jaxlidar.trace.entry_nodes import cubic_bspline
 
 # How far a Gaussian beam is followed, in units of its radius; 4e-6 of its energy lies beyond.
 REACH = 2.5
@@ -144,7 +144,7 @@ def _points(
 def _basis(nodes: int) -> Float[np.ndarray, "points nodes"]:
     """The spline of every node at the points of a patch."""
     within = (np.arange((nodes - 1) * _FINE) + 0.5) / _FINE
-    return spline(within[:, None] - np.arange(nodes))
+    return cubic_bspline(within[:, None] - np.arange(nodes))
 
 
 def _irradiance(

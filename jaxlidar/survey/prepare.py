@@ -1,16 +1,15 @@
 """The way in which the shots of a survey are traced over one scene."""
 
-import dataclasses
 import math
 
 import numpy as np
 
-from jaxlidar._checks import known_array
+from jaxlidar._checks import concrete_array
 from jaxlidar.instrument.survey import Survey
 from jaxlidar.planning.local_origin import about_aim
 from jaxlidar.planning.plan import DEFAULT_RTOL, Plan
 from jaxlidar.planning.plan import plan as make_plan
-from jaxlidar.planning.setup import reduce
+from jaxlidar.planning.setup import make_setup
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.survey.sharing import sharing
 from jaxlidar.survey.ways import AbstractWay, OneByOne, SharedLight
@@ -30,14 +29,14 @@ def prepared(
     """
     plan = make_plan(survey, scene, rtol=rtol, max_orders=max_orders, window=window, describe=False)
     rtol = DEFAULT_RTOL if rtol is None else float(rtol)
-    plan = dataclasses.replace(
-        plan, n_rays=_rays(plan, survey, scene, rtol), n_photons=_power_of_two(0.8 / rtol**2, 256, 8192)
+    plan = plan.with_config(
+        n_rays=_rays(plan, survey, scene, rtol), n_photons=_power_of_two(0.8 / rtol**2, 256, 8192)
     )
     middle = survey.middle
-    setup = reduce(middle, scene, plan)
+    setup = make_setup(middle, scene, plan)
     lidar, _ = about_aim(middle, scene)
     # A scene that cannot be moved keeps its coordinates, and the lidar its place.
-    moved = survey.about(known_array(middle.position) - known_array(lidar.position))
+    moved = survey.about(concrete_array(middle.position) - concrete_array(lidar.position))
     light = sharing(moved, setup, rtol, shared)
     if light is None:
         return OneByOne(setup, moved, rtol)
@@ -48,7 +47,7 @@ def _rays(plan: Plan, survey: Survey, scene: Scene, rtol: float) -> int:
     """Rays of a footprint per batch: enough for the tolerance, and not many for each column of voxels."""
     most = 10.0 / rtol
     if scene.canopy is not None:
-        edge = float(np.min(known_array(scene.canopy.voxels.voxel_size)[:2]))
+        edge = float(np.min(concrete_array(scene.canopy.voxels.voxel_size)[:2]))
         columns = (1.0 + 2.0 * float(np.max(survey.footprint_radius)) / edge) ** 2
         most = min(most, 32.0 * columns)
     return min(_power_of_two(most, 64, 4096), plan.n_rays)

@@ -8,8 +8,8 @@ from jaxtyping import Array, Float
 
 from jaxlidar._statistics import widening
 from jaxlidar.instrument.receiver import record
-from jaxlidar.trace.colouring import Balance, Recording
-from jaxlidar.waveform import received
+from jaxlidar.spectral.apply_optics import BudgetTerms, WaveformModel
+from jaxlidar.spectral.waveform import energy_per_reflectance
 
 
 class Record(NamedTuple):
@@ -22,35 +22,35 @@ class Record(NamedTuple):
     components: Any
     neglected: Any
     lost: Any
-    ledger: Any
-    ledger_stderr: Any
+    energy_budget: Any
+    energy_budget_stderr: Any
     error: Any
     photons: Any
     truth: Any = None
 
 
 def record_of_shot(
-    recording: Recording,
+    model: WaveformModel,
     components: dict[str, Float[Array, "wavelengths samples"]],
-    balance: Balance,
+    terms: BudgetTerms,
     stderr: Float[Array, "wavelengths samples"],
-    ledger_stderr: dict[str, Float[Array, "wavelengths"]],
+    energy_budget_stderr: dict[str, Float[Array, "wavelengths"]],
     error: Array,
     photons: Array,
 ) -> Record:
     """The record of one shot, of which the components, the balance and their errors are known."""
-    lidar, total = recording.lidar, components["first"] + components["higher"]
-    energy = total * received(lidar, recording.time)
+    lidar, total = model.lidar, components["first"] + components["higher"]
+    energy = total * energy_per_reflectance(lidar, model.time)
     return Record(
         reflectance=total,
         stderr=stderr,
         energy=energy,
         recorded=record(energy, lidar.wavelength, lidar.receiver),
         components=components,
-        neglected=balance.neglected,
-        lost=balance.lost,
-        ledger=balance.ledger,
-        ledger_stderr=ledger_stderr,
+        neglected=terms.neglected,
+        lost=terms.lost,
+        energy_budget=terms.energy_budget,
+        energy_budget_stderr=energy_budget_stderr,
         error=error,
         photons=photons,
     )

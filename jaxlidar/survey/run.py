@@ -14,6 +14,7 @@ from jaxtyping import PRNGKeyArray
 
 from jaxlidar._checks import check_flag, check_integer, check_key, check_kind, is_traced
 from jaxlidar._fingerprint import fingerprint
+from jaxlidar._registry import simulate_survey
 from jaxlidar._workers import Task, outcomes
 from jaxlidar.instrument.survey import Survey
 from jaxlidar.io.case import Case, case_text
@@ -30,6 +31,7 @@ from jaxlidar.survey.ways import AbstractWay
 from jaxlidar.survey.with_truth import WithTruth
 
 
+@simulate_survey.register
 def simulate_many(
     survey: Survey,
     scene: Scene | SceneParts,
@@ -73,7 +75,7 @@ def simulate_many(
     - `max_orders`: number of scatterings followed, at least 1. Default None: from `rtol` and the largest
       albedo.
     - `path`: a netCDF file, or a Zarr store (".zarr"), for the waveforms, which appears when all are done,
-      with its case, so that `jaxlidar.repeat` can do them again. Until then the file "PATH.parts" (of SQLite)
+      with its case, so that `jaxlidar.rerun` can do them again. Until then the file "PATH.parts" (of SQLite)
       keeps the shots that are done; the same call goes on with them, also after it was killed. One run at a
       time can use it. Where the file is there already, it is read. Only some shots are in memory at a time,
       also of a netCDF file that is returned: see `jaxlidar.open`. Default None: no file.
@@ -139,7 +141,7 @@ def simulate_many(
         if truth:
             way = WithTruth(way.setup, way.survey, way.rtol, way)
         beside = off_map(way.survey, way.setup.scene)
-        heights = ground_heights(way.survey, way.setup.scene, way.setup.plan.trace.upstream)
+        heights = ground_heights(way.survey, way.setup.scene, way.setup.plan.limits.start_distance)
     if (said := said_of(beside)) is not None:
         warnings.warn(said, OffMapWarning, stacklevel=2)
     known: dict[str, Any] = {"position": survey.position, "zenith": survey.zenith, "azimuth": survey.azimuth}

@@ -1,9 +1,9 @@
 """Shots that share light: the scene is traced once, and every footprint is a weighted sum over nodes.
 
 What returns is linear in what is sent. Parallel light falls on all of the scene that footprints cover, about
-the nodes of a grid (`jaxlidar.trace.nodes`), and is told apart by its node. A footprint's waveform is the sum
-of those of the nodes, with the coefficients of its irradiance; its variance is the sum of variances, with
-their squares.
+the nodes of a grid (`jaxlidar.trace.entry_nodes`), and is told apart by its node. A footprint's waveform is
+the sum of those of the nodes, with the coefficients of its irradiance; its variance is the sum of variances,
+with their squares.
 """
 
 import dataclasses
@@ -21,26 +21,25 @@ from jaxlidar._statistics import relative_error, widening
 from jaxlidar._threads import ONE_CORE
 from jaxlidar.planning.plan import MIN_BATCHES
 from jaxlidar.planning.setup import Setup
+from jaxlidar.spectral.apply_optics import (
+    ResponseSums,
+    WaveformModel,
+    budget_of_sums,
+    component_samples,
+    make_waveform_model,
+    response_samples,
+    sum_response,
+    total_samples,
+)
 from jaxlidar.survey.records import BatchMoments, Record, record_of_shot
 from jaxlidar.survey.tiles import Tile
 from jaxlidar.survey.views import Views
-from jaxlidar.trace.colouring import (
-    Recording,
-    Shares,
-    balance_of,
-    components,
-    recording_of,
-    samples_of,
-    shares_of,
-    total,
-)
+from jaxlidar.trace.device_scene import DeviceScene, aim_at, build_device_scene
+from jaxlidar.trace.entry_nodes import EntryNodes
 from jaxlidar.trace.footprint import parallel_beam
-from jaxlidar.trace.node_response import trace_nodes, without_histories
-from jaxlidar.trace.nodes import Nodes
 from jaxlidar.trace.response import Response
-from jaxlidar.trace.setting import Setting, aimed, setting_of
-from jaxlidar.trace.viewed_response import order_one, trace_viewed
-from jaxlidar.trace.viewing import Viewing
+from jaxlidar.trace.shared_illumination import trace_first_of_shots, trace_nodes, trace_shots
+from jaxlidar.trace.shot_views import ShotViews
 
 # Coefficients of shots at what is traced, (shots, nodes): a NumPy array, or a sparse one.
 Mixing = Any
@@ -66,8 +65,8 @@ class Ready(NamedTuple):
     `views`: how shots see what they share; None where they see all of it, straight down.
     """
 
-    setting: Setting
-    recording: Recording
+    setting: DeviceScene
+    recording: WaveformModel
     air: Any
     spacing: float
     views: Views | None
@@ -75,22 +74,24 @@ class Ready(NamedTuple):
 
 def ready_for(setup: Setup, spacing: float, views: Views | None) -> Ready:
     """What all tiles over a grid of that spacing have in common."""
-    recording = recording_of(setup)
-    without_air = dataclasses.replace(without_histories(recording), air=None)
+    recording = make_waveform_model(setup)
+    without_air = dataclasses.replace(recording.for_applied_optics(), air_return=None)
     plan = setup.plan
-    trace = dataclasses.replace(plan.trace, ends=min(plan.trace.ends, _ENDS))
+    plan = plan.with_config(deposits_per_flight=min(plan.config.deposits_per_flight, _ENDS))
     if views is not None:
-        trace = dataclasses.replace(trace, last=trace.last + views.slack)
-        plan = dataclasses.replace(plan, n_rays=max(plan.n_rays // 4, _FEWEST_RAYS))
-    setup = dataclasses.replace(setup, plan=dataclasses.replace(plan, trace=trace))
-    return Ready(setting_of(setup, derivatives="none"), without_air, recording.air, spacing, views)
+        plan = plan.with_limits(max_path=plan.limits.max_path + views.slack)
+        plan = plan.with_config(n_rays=max(plan.n_rays // 4, _FEWEST_RAYS))
+    setup = dataclasses.replace(setup, plan=plan)
+    return Ready(
+        build_device_scene(setup, derivatives="none"), without_air, recording.air_return, spacing, views
+    )
 
 
 class Sums(NamedTuple):
     """Of nodes, or of shots that see what is shared, in one batch: what errors are wanted of, and responses.
 
     - `total`: (nodes, wavelengths, samples), all materials together. - `fates`:
-      `jaxlidar.trace.colouring.Shares` of each, as a dict.
+      `jaxlidar.spectral.apply_optics.ResponseSums` of each, as a dict.
     """
 
     total: Any
@@ -123,7 +124,7 @@ class _Batches(NamedTuple):
         return _Batches(whole, self.moments.joined(self.count, other.moments, other.count), lines)
 
 
-def _of_nodes(setting: Setting, nodes: Nodes, recording: Recording, key: PRNGKeyArray) -> Sums:
+def _of_nodes(setting: DeviceScene, nodes: EntryNodes, recording: WaveformModel, key: PRNGKeyArray) -> Sums:
     """One batch."""
 
     def of_one(response: Response) -> tuple[Array, dict[str, Array]]:
@@ -131,26 +132,26 @@ def _of_nodes(setting: Setting, nodes: Nodes, recording: Recording, key: PRNGKey
         if response.higher is not None:
             # Optics have been applied to both: one pulse serves.
             together = dataclasses.replace(response, first=response.first + response.higher, higher=None)
-        return total(together, recording), shares_of(response, recording)._asdict()
+        return total_samples(together, recording), sum_response(response, recording)._asdict()
 
-    if setting.viewing is None:
+    if setting.shot_views is None:
         response = trace_nodes(setting, nodes, key)
     else:
-        response = trace_viewed(setting, recording.lidar, nodes, key)
+        response = trace_shots(setting, recording.lidar, nodes, key)
     return Sums(*jax.vmap(of_one)(response), response)
 
 
-def _lines(response: Response, recording: Recording) -> Float[Array, "lines wavelengths samples"]:
+def _lines(response: Response, recording: WaveformModel) -> Float[Array, "lines wavelengths samples"]:
     """Samples by material, then those of order one."""
-    parts = components(response, recording)
+    parts = component_samples(response, recording)
     return jnp.stack([*(parts[name] for name in recording.materials), parts["first"]])
 
 
 def _batches(
-    setting: Setting,
-    recording: Recording,
-    nodes: Nodes,
-    viewing: Viewing | None,
+    setting: DeviceScene,
+    recording: WaveformModel,
+    nodes: EntryNodes,
+    viewing: ShotViews | None,
     aim: Float[Array, "2"],
     key: PRNGKeyArray,
     first: Int[Array, ""],
@@ -176,21 +177,29 @@ def _batches(
 _several = Program(_batches, **ONE_CORE)
 
 
-def _over(setting: Setting, recording: Recording, viewing: Viewing | None, aim: Float[Array, "2"]) -> Setting:
+def _over(
+    setting: DeviceScene, recording: WaveformModel, viewing: ShotViews | None, aim: Float[Array, "2"]
+) -> DeviceScene:
     """The setting of a tile: parallel light, and optics."""
     lidar = recording.lidar
-    setting = aimed(setting, lidar, aim - lidar.position)
+    setting = aim_at(setting, lidar, aim - lidar.position)
     beam = parallel_beam(lidar)
-    return dataclasses.replace(setting, beam=beam, optics=recording.optics, viewing=viewing)
+    return dataclasses.replace(setting, beam=beam, optics=recording.optics, shot_views=viewing)
 
 
 def _orders_one(
-    setting: Setting, recording: Recording, viewing: Viewing, aim: Float[Array, "2"], key: PRNGKeyArray
+    setting: DeviceScene,
+    recording: WaveformModel,
+    viewing: ShotViews,
+    aim: Float[Array, "2"],
+    key: PRNGKeyArray,
 ) -> Float[Array, "shots wavelengths samples"]:
     """Samples of order one, from few rays, of all shots of a tile."""
     setting = _over(setting, recording, viewing, aim)
-    first = order_one(setting, recording.lidar, jnp.arange(viewing.shots - 1), key)
-    return jax.vmap(lambda w: samples_of(jnp.sum(w, axis=1), recording.short, recording))(first.weights)
+    first = trace_first_of_shots(setting, recording.lidar, jnp.arange(viewing.n_shots - 1), key)
+    return jax.vmap(lambda w: response_samples(jnp.sum(w, axis=1), recording.first_histories, recording))(
+        first.weights
+    )
 
 
 _rough = Program(_orders_one, **ONE_CORE)
@@ -216,7 +225,7 @@ class _Wanted(NamedTuple):
         return float(np.max(ratio, initial=0.0))
 
 
-def _wanted(ready: Ready, tile: Tile, part: Mixing, viewing: Viewing | None, key: Array) -> _Wanted:
+def _wanted(ready: Ready, tile: Tile, part: Mixing, viewing: ShotViews | None, key: Array) -> _Wanted:
     share = tile.part.sum(axis=1)
     waited = share > _SMALL
     share, home = share[waited], tile.home[waited]
@@ -235,7 +244,7 @@ def trace_tile(ready: Ready, tile: Tile, number: int, rtol: float, key: PRNGKeyA
     A tile that has the share s of a footprint's light may be off by rtol / sqrt(s): then all tiles together
     are off by rtol.
     """
-    nodes = Nodes(
+    nodes = EntryNodes(
         jnp.asarray(tile.place, float),
         jnp.asarray(ready.spacing, float),
         *(
@@ -301,7 +310,7 @@ def record_of(ready: Ready, parts: Iterable[Part], shots: slice) -> Record:
 
 
 def _finish(
-    recording: Recording,
+    recording: WaveformModel,
     air: Float[Array, "wavelengths samples"] | None,
     lines: Float[Array, "lines wavelengths samples"],
     fates: dict[str, Float[Array, "*rows wavelengths"]],
@@ -315,16 +324,16 @@ def _finish(
     if air is not None:
         parts |= {"air": air, "first": first + air}
         total = total + air
-    balance, errors = (balance_of(Shares(**f), recording) for f in (fates, fates_stderr))
+    balance, errors = (budget_of_sums(ResponseSums(**f), recording) for f in (fates, fates_stderr))
     # What returns is taken from one of the others, which keeps its error.
     held = {"escaped": "escaped", "after the window": "late", "unfollowed": "remaining"}
-    ledger_stderr = errors.ledger | {name: fates_stderr[fate] for name, fate in held.items()}
+    energy_budget_stderr = errors.energy_budget | {name: fates_stderr[fate] for name, fate in held.items()}
     error = relative_error(total, stderr, jnp)
     photons = jnp.zeros((), jnp.int32)
-    return record_of_shot(recording, parts, balance, stderr, ledger_stderr, error, photons)
+    return record_of_shot(recording, parts, balance, stderr, energy_budget_stderr, error, photons)
 
 
-def _finish_all(recording: Recording, air: Array | None, *arrays: Any) -> Record:
+def _finish_all(recording: WaveformModel, air: Array | None, *arrays: Any) -> Record:
     return jax.vmap(lambda *own: _finish(recording, air, *own))(*arrays)
 
 

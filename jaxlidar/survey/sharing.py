@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxlidar._checks import known_number
+from jaxlidar._checks import concrete_number
 from jaxlidar._summary import percent
 from jaxlidar.instrument.survey import Survey
 from jaxlidar.optics.laws import AbstractMirror
@@ -83,7 +83,7 @@ def _has_views(survey: Survey) -> bool:
 
 
 def _parallel(survey: Survey, setup: Setup) -> float:
-    return parallel_light(survey, setup.plan.trace.upstream, setup.plan.limits.last)
+    return parallel_light(survey, setup.plan.limits.start_distance, setup.plan.scope.last_return)
 
 
 def _tiles(found: Patches, nodes: Lit, setup: Setup, fewer: float) -> list[Tile]:
@@ -102,7 +102,7 @@ def why_apart(survey: Survey, setup: Setup, rtol: float) -> str | None:
         return "one order is followed, which shots that lean or have a field of view do not share"
     if not setup.plan.is_random:
         return "nothing is random"
-    if known_number(lidar.divergence) == 0:
+    if concrete_number(lidar.divergence) == 0:
         return "the beam has no width"
     if canopy is not None and canopy.is_straight:
         return "transmission = 'straight': light of every wavelength goes its own way"

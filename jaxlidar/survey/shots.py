@@ -21,13 +21,13 @@ from jaxlidar._programs import Program
 from jaxlidar._statistics import relative_error
 from jaxlidar._threads import ONE_CORE
 from jaxlidar.instrument.survey import Survey
-from jaxlidar.planning.plan import MIN_BATCHES, Plan
+from jaxlidar.planning.plan import MIN_BATCHES
 from jaxlidar.planning.setup import Setup
+from jaxlidar.spectral.apply_optics import WaveformModel, budget_terms, component_samples, make_waveform_model
 from jaxlidar.survey.records import BatchMoments, Record, record_of_shot
-from jaxlidar.trace.colouring import Recording, balance, components, recording_of
-from jaxlidar.trace.footprint import Slice
-from jaxlidar.trace.response import Response, follows, trace_only_first, trace_setting
-from jaxlidar.trace.setting import Setting, aimed, setting_of, straight_transmittance
+from jaxlidar.trace.device_scene import DeviceScene, aim_at, build_device_scene
+from jaxlidar.trace.footprint import RaySlice
+from jaxlidar.trace.response import Response, trace_device_scene, trace_first_only
 
 # Batches of one shot, or parts of each of its lattices, at most: a tolerance that is out of reach ends here.
 MOST_BATCHES = 1024
@@ -65,34 +65,27 @@ def aimed_at(setup: Setup, aim: Aim) -> Setup:
     )
 
 
-def photons_of(plan: Plan) -> int:
-    """Photons of a batch."""
-    return plan.n_photons if plan.orders > 1 or plan.trace.drawn_first else 0
-
-
 @eqx.filter_jit
-def _part(setting: Setting, transmittance: Array | None, key: PRNGKeyArray, part: Slice) -> Response:
+def _part(scene: DeviceScene, key: PRNGKeyArray, ray_slice: RaySlice) -> Response:
     """The response of a part of the rays. It is traced once, although its shapes are asked for as well."""
-    return trace_only_first(setting, transmittance, key, part)
+    return trace_first_only(scene, key, ray_slice)
 
 
 @eqx.filter_jit
-def _batch(
-    setting: Setting, transmittance: Array | None, recording: Recording, key: PRNGKeyArray, parts: Array
-) -> tuple[Any, Any]:
+def _batch(scene: DeviceScene, model: WaveformModel, key: PRNGKeyArray, parts: Array) -> tuple[Any, Any]:
     """Components and balance of one batch, whose lattice has so many parts where there is one order."""
-    if follows(setting):
-        response = trace_setting(setting, transmittance, key)
+    if scene.config.follows_higher_orders:
+        response = trace_device_scene(scene, key)
     else:
 
         def add(number: Array, whole: Response) -> Response:
-            part = _part(setting, transmittance, key, Slice(number, parts))
+            part = _part(scene, key, RaySlice(number, parts))
             return jax.tree.map(jnp.add, whole, part)
 
-        zero = _zeros(jax.eval_shape(_part, setting, transmittance, key, Slice(parts, parts)))
+        zero = _zeros(jax.eval_shape(_part, scene, key, RaySlice(parts, parts)))
         whole = jax.lax.fori_loop(0, parts, add, zero)
         response = jax.tree.map(lambda a: a / parts, whole)
-    return components(response, recording), balance(response, recording)
+    return component_samples(response, model), budget_terms(response, model)
 
 
 class _Found(NamedTuple):
@@ -123,32 +116,31 @@ class _Found(NamedTuple):
 def _spread_of(found: Any) -> tuple[Any, Any]:
     """The quantities whose standard errors are wanted."""
     parts, shares = found
-    return parts["first"] + parts["higher"], shares.ledger
+    return parts["first"] + parts["higher"], shares.energy_budget
 
 
-def _one(setting: Setting, setup: Setup, aim: Aim, key: PRNGKeyArray, rtol: Array) -> Record:
+def _one(scene: DeviceScene, setup: Setup, aim: Aim, key: PRNGKeyArray, rtol: Array) -> Record:
     """One shot, batch after batch."""
     by = jnp.asarray(aim.position) - setup.lidar.position
     setup, key = aimed_at(setup, aim), jax.random.fold_in(key, aim.number)
-    setting, recording = aimed(setting, setup.lidar, by), recording_of(setup)
-    transmittance = straight_transmittance(setup)
+    scene, model = aim_at(scene, setup.lidar, by), make_waveform_model(setup)
 
     def batch(n: Array, parts: Array) -> Any:
-        return _batch(setting, transmittance, recording, jax.random.fold_in(key, n), parts)
+        return _batch(scene, model, jax.random.fold_in(key, n), parts)
 
     start = jnp.zeros((), jnp.int32), jnp.ones((), jnp.int32)
     if not setup.plan.is_random:
         parts, shares = batch(*start)
         exact, of_shares = jax.tree.map(jnp.zeros_like, _spread_of((parts, shares)))
         none = jnp.zeros(()), jnp.zeros((), jnp.int32)
-        return record_of_shot(recording, parts, shares, exact, of_shares, *none)
+        return record_of_shot(model, parts, shares, exact, of_shares, *none)
 
-    until = _more_batches if follows(setting) else _denser_lattices
+    until = _more_batches if scene.config.follows_higher_orders else _denser_lattices
     found = until(batch, _Found.none(jax.eval_shape(batch, *start)), rtol)
     stderr, of_shares = found.moments.stderr(found.count.astype(float))
     parts, shares = found.mean
-    photons = found.count * photons_of(setup.plan)
-    return record_of_shot(recording, parts, shares, stderr, of_shares, found.error, photons)
+    photons = found.count * setup.plan.photons_traced
+    return record_of_shot(model, parts, shares, stderr, of_shares, found.error, photons)
 
 
 def _more_batches(batch: Callable[[Array, Array], Any], nothing: _Found, rtol: Array) -> _Found:
@@ -186,8 +178,8 @@ def _zeros(shapes: Any) -> Any:
 
 def _several(setup: Setup, aims: Aim, key: PRNGKeyArray, rtol: Array) -> Record:
     """Some shots, one after the other."""
-    setting = setting_of(setup, derivatives="none")
-    return jax.lax.map(lambda aim: _one(setting, setup, aim, key, rtol), aims)
+    scene = build_device_scene(setup, derivatives="none")
+    return jax.lax.map(lambda aim: _one(scene, setup, aim, key, rtol), aims)
 
 
 several = Program(_several, **ONE_CORE)

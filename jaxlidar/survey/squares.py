@@ -127,7 +127,7 @@ class BySquares(AbstractWay):
             plan = way.setup.plan
             begins.append(plan.sample_start)
             ends.append(plan.sample_start + plan.sample_interval * (plan.n_samples - 1))
-            lasts.append(float(plan.trace.last))
+            lasts.append(float(plan.limits.max_path))
             orders.append(plan.orders)
         asked = Asked(rtol, max(orders), shared, (min(begins), max(ends)), truth)
         # The window is as long for all: so are the paths, by what it grows.
@@ -145,11 +145,11 @@ class BySquares(AbstractWay):
             first = way if first is None else first
             place = way.survey, way.setup.scene
             beside[square.shots] = off_map(*place)
-            heights[square.shots] = ground_heights(*place, way.setup.plan.trace.upstream)
+            heights[square.shots] = ground_heights(*place, way.setup.plan.limits.start_distance)
             digests.append(digest_of(scene.between(square.low, square.high)))
-            trace = way.setup.plan.trace
-            materials |= dict.fromkeys(trace.materials)
-            surfaces |= dict.fromkeys(trace.materials[s.material] for s in trace.surfaces)
+            config = way.setup.plan.config
+            materials |= dict.fromkeys(config.materials)
+            surfaces |= dict.fromkeys(config.materials[s.material] for s in config.surfaces)
             shares.append(bool(way.described()["shared"]))
         assert first is not None
         known = tuple(materials), tuple(surfaces), beside, heights, digests, margin
@@ -198,10 +198,10 @@ class BySquares(AbstractWay):
         """The record of a square with all materials: of those that its part has not, nothing returns."""
         record: Record = results[number]
         ledgers = []
-        for ledger in (record.ledger, record.ledger_stderr):
-            none = np.zeros_like(ledger["escaped"])
+        for energy_budget in (record.energy_budget, record.energy_budget_stderr):
+            none = np.zeros_like(energy_budget["escaped"])
             absorbed = [f"absorbed by {m}" for m in self.materials]
-            ledgers.append({**dict.fromkeys(absorbed, none), **ledger})
+            ledgers.append({**dict.fromkeys(absorbed, none), **energy_budget})
         truth = None
         if self.asked.truth:
             known: Truths = results[number + len(self.squares)]
@@ -214,7 +214,7 @@ class BySquares(AbstractWay):
             )
         components = _with_all(record.components, self.materials, np.zeros_like(record.reflectance))
         return record._replace(
-            components=components, ledger=ledgers[0], ledger_stderr=ledgers[1], truth=truth
+            components=components, energy_budget=ledgers[0], energy_budget_stderr=ledgers[1], truth=truth
         )
 
     def described(self) -> dict[str, Any]:

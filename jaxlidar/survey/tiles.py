@@ -5,9 +5,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxlidar.planning.ladder import rung
+from jaxlidar.planning.size_buckets import size_bucket
 from jaxlidar.survey.irradiance import Patches
-from jaxlidar.trace.nodes import RAYS
+from jaxlidar.trace.entry_nodes import RAYS_PER_GROUP
 
 # Nodes of a tile at most, and photons of a batch if a tile has several nodes: a batch cannot be interrupted.
 _MOST_NODES, _MOST_PHOTONS = 512, 32_768
@@ -25,7 +25,7 @@ class Tile(NamedTuple):
     """Nodes that are traced together.
 
     - `aim`: (2,) place of the middle, m. - `place`: (nodes, 2) of the nodes from there, m.
-    - `photons`, `rays`: node, turn and share of each, as in `jaxlidar.trace.nodes.Nodes`.
+    - `photons`, `rays`: node, turn and share of each, as in `jaxlidar.trace.entry_nodes.EntryNodes`.
     - `shots`: numbers of the footprints that have part in it. - `part`: (shots, nodes) coefficients.
     - `astray`: (shots, nodes) energy that is put elsewhere about the nodes.
     - `home`: (shots,) whether the node next to the middle of the footprint is in it.
@@ -86,9 +86,12 @@ def tiles(found: Patches, nodes: Lit, photons: float, rays: float) -> list[Tile]
     """All tiles, of one size. `photons`, `rays`: of a fully lit node in a batch; photons may be 0."""
     most_light = max(_MOST_PHOTONS / max(photons, 16 * rays), 1.0)
     groups = _halved(nodes, np.arange(len(nodes.light)), most_light)
-    most = rung(max(len(group) for group in groups), 4)
+    most = size_bucket(max(len(group) for group in groups), 4)
     light = max(float(nodes.light[group].sum()) for group in groups)
-    counts = [rung(max(int(np.ceil(light * n)), most), 4) if n else 0 for n in (photons, rays / RAYS)]
+    counts = [
+        size_bucket(max(int(np.ceil(light * n)), most), 4) if n else 0
+        for n in (photons, rays / RAYS_PER_GROUP)
+    ]
     return [_tile(found, nodes, group, most, counts) for group in groups]
 
 
@@ -118,7 +121,7 @@ def _tile(found: Patches, nodes: Lit, group: Int[np.ndarray, " nodes"], most: in
         aim=middle * found.spacing,
         place=place * found.spacing,
         photons=photons,
-        rays=SharedOut(groups.node, RAYS * groups.turn, groups.share / RAYS),
+        rays=SharedOut(groups.node, RAYS_PER_GROUP * groups.turn, groups.share / RAYS_PER_GROUP),
         shots=shots,
         part=np.pad(part, ((0, 0), (0, spare))),
         astray=np.pad(astray, ((0, 0), (0, spare))),

@@ -8,12 +8,12 @@ import numpy as np
 from jaxtyping import Float
 from scipy import spatial
 
-from jaxlidar._checks import known_number
+from jaxlidar._checks import concrete_number
 from jaxlidar.instrument.survey import Survey
-from jaxlidar.planning.ladder import rung
+from jaxlidar.planning.size_buckets import size_bucket
 from jaxlidar.survey.irradiance import Section, section_of
 from jaxlidar.survey.tiles import Tile
-from jaxlidar.trace.viewing import Viewing
+from jaxlidar.trace.shot_views import ShotViews
 
 # A field of view is followed so far, in units of its radius; of what lies beyond it sees 5e-5.
 _FIELD = 1.2
@@ -35,7 +35,7 @@ class Views(NamedTuple):
 
     - `beam`: of all shots. - `position`: of the shots, m. - `view_radius`: of fields of view, m across it.
     - `shots`, `own`: at most in a tile, and those whose order one is traced there.
-    - `cells`: (nx, ny, most), as in `Viewing`.
+    - `cells`: (nx, ny, most), as in `ShotViews`.
     """
 
     beam: Section
@@ -50,19 +50,19 @@ class Views(NamedTuple):
         """The views of a survey whose shots have one direction."""
         lidar, slant = survey.lidar, float(survey.slant_range[0])
         field = lidar.field_of_view
-        field = None if field is None else 0.5e-3 * known_number(field) * slant
+        field = None if field is None else 0.5e-3 * concrete_number(field) * slant
         found = Views(
             section_of(survey),
             survey.position,
             field,
-            rung(max(len(tile.shots) for tile in tiles), 4),
-            rung(max(int(tile.home.sum()) for tile in tiles), 4),
+            size_bucket(max(len(tile.shots) for tile in tiles), 4),
+            size_bucket(max(int(tile.home.sum()) for tile in tiles), 4),
             (0, 0, 0),
         )
         cells = [found._cells(tile, spacing) for tile in tiles]
-        nx, ny = (rung(max(c.shape[k] for c in cells), 4) for k in range(2))
+        nx, ny = (size_bucket(max(c.shape[k] for c in cells), 4) for k in range(2))
         most = max(len(shots) for c in cells for shots in c.near)
-        return found._replace(cells=(nx, ny, rung(most, 8)))
+        return found._replace(cells=(nx, ny, size_bucket(most, 8)))
 
     @property
     def reach(self) -> float:
@@ -102,7 +102,7 @@ class Views(NamedTuple):
         near = tree.query_ball_point(self._across(middle), far, return_sorted=True)
         return _Cells(low, edge, (len(x), len(y)), near)
 
-    def at(self, tile: Tile, spacing: float) -> Viewing:
+    def at(self, tile: Tile, spacing: float) -> ShotViews:
         """What the shots of a tile see."""
         low, edge, (nx, ny), near = self._cells(tile, spacing)
         none, most = self.shots, self.cells[2]
@@ -115,7 +115,7 @@ class Views(NamedTuple):
         part[: len(tile.shots)] = tile.part
         own = np.full(self.own, none, np.int32)
         own[: int(tile.home.sum())] = np.flatnonzero(tile.home)
-        return Viewing(
+        return ShotViews(
             jnp.asarray(place, float),
             jnp.asarray(self.beam.radius, float),
             None if self.view_radius is None else jnp.asarray(self.view_radius, float),

@@ -13,12 +13,13 @@ from jaxtyping import Float, Int
 
 from jaxlidar._checks import briefly
 from jaxlidar._constants import SPEED_OF_LIGHT
-from jaxlidar._summary import NOTABLE, percent
+from jaxlidar._deprecated import renamed_property
+from jaxlidar._summary import NOTABLE_FRACTION, percent
 from jaxlidar.io import netcdf
 from jaxlidar.io.case import Case
 from jaxlidar.io.rows import CHECKSUMS
+from jaxlidar.spectral.waveform import Waveform
 from jaxlidar.survey.truths import Truths
-from jaxlidar.waveform import Waveform
 
 
 @final
@@ -30,8 +31,8 @@ class Waveforms(eqx.Module):
     - `wavelength`: (wavelengths,) nm.
     - `reflectance`, `stderr`, `energy`, `recorded`: (shots, wavelengths, bins), and
     - `components`, dict of the same shape: as those of `Waveform`.
-    - `neglected`, `lost`: (shots, wavelengths), `ledger`, `ledger_stderr`, dicts of the same shape: as those
-      of `Waveform`.
+    - `neglected`, `lost`: (shots, wavelengths), `energy_budget`, `energy_budget_stderr`, dicts of the same
+      shape: as those of `Waveform`.
     - `position`: (shots, 2) m, `zenith`, `azimuth`: (shots,) degrees, as those of `Survey`.
     - `ground_height`: (shots,) m, height of the ground where the beam axis meets it: the truth; NaN where
       there is none.
@@ -66,8 +67,8 @@ class Waveforms(eqx.Module):
     components: dict[str, Float[np.ndarray, "shots wavelengths bins"]]
     neglected: Float[np.ndarray, "shots wavelengths"]
     lost: Float[np.ndarray, "shots wavelengths"]
-    ledger: dict[str, Float[np.ndarray, "shots wavelengths"]]
-    ledger_stderr: dict[str, Float[np.ndarray, "shots wavelengths"]]
+    energy_budget: dict[str, Float[np.ndarray, "shots wavelengths"]]
+    energy_budget_stderr: dict[str, Float[np.ndarray, "shots wavelengths"]]
     position: Float[np.ndarray, "shots 2"]
     zenith: Float[np.ndarray, " shots"]
     azimuth: Float[np.ndarray, " shots"]
@@ -77,6 +78,9 @@ class Waveforms(eqx.Module):
     photons: Int[np.ndarray, " shots"]
     info: dict[str, Any] = eqx.field(static=True)
     truth: Truths | None = None
+
+    ledger = renamed_property("ledger", "energy_budget")
+    ledger_stderr = renamed_property("ledger_stderr", "energy_budget_stderr")
 
     @property
     def first_order_share(self) -> Float[np.ndarray, "shots wavelengths"]:
@@ -94,7 +98,7 @@ class Waveforms(eqx.Module):
         for w, sums in zip(self.wavelength, self.reflectance.sum(axis=2).T):
             low, middle, high = np.quantile(sums, (0.0, 0.5, 1.0))
             lines.append(f"  {w:g} nm: apparent reflectance {low:.3g} to {high:.3g}, median {middle:.3g}")
-        if (beside := int(np.sum(self.off_map >= NOTABLE))) > 0:
+        if (beside := int(np.sum(self.off_map >= NOTABLE_FRACTION))) > 0:
             lines.append(f"  {beside} lie partly beside the voxel map")
         light = "which share light, " if self.info.get("shared") else ""
         lines.append(
@@ -123,8 +127,8 @@ class Waveforms(eqx.Module):
             stderr=jnp.asarray(self.stderr[i]),
             components=own(self.components),
             neglected=jnp.asarray(self.neglected[i]),
-            ledger=own(self.ledger),
-            ledger_stderr=own(self.ledger_stderr),
+            energy_budget=own(self.energy_budget),
+            energy_budget_stderr=own(self.energy_budget_stderr),
             lost=jnp.asarray(self.lost[i]),
             recorded=jnp.asarray(self.recorded[i]),
             wavelength=jnp.asarray(self.wavelength),
@@ -167,7 +171,7 @@ class Waveforms(eqx.Module):
         **Arguments:**
 
         - `path`: the file to write. It appears when it is whole.
-        - `case`: the `jaxlidar.io.Case` of the survey that was simulated, so that `jaxlidar.repeat` can do it
+        - `case`: the `jaxlidar.io.Case` of the survey that was simulated, so that `jaxlidar.rerun` can do it
           again. Default None: not kept.
 
         **Raises:** what `jaxlidar.io.save` raises.
@@ -203,8 +207,8 @@ netcdf.keep_as_netcdf(
         "components": ("1", "apparent reflectance per sample by material and by order of scattering"),
         "neglected": ("1", "apparent reflectance that orders beyond the last could add"),
         "lost": ("1", "apparent reflectance that arrives before or after all fine bins of the plan"),
-        "ledger": ("1", "share of the emitted energy by fate, before the atmosphere"),
-        "ledger_stderr": ("1", "standard error of the share of the emitted energy"),
+        "energy_budget": ("1", "share of the emitted energy by fate, before the atmosphere"),
+        "energy_budget_stderr": ("1", "standard error of the share of the emitted energy"),
         "position": ("m", "x and y where the beam axis meets the reference plane"),
         "zenith": ("degree", "angle between the beam and the vertical"),
         "azimuth": ("degree", "direction in which the beam travels, clockwise from north"),
@@ -214,7 +218,7 @@ netcdf.keep_as_netcdf(
         "photons": ("1", "photons traced"),
     },
     dimensions={"shots": "shot", "bins": "time", "wavelengths": "wavelength", "2": "axis"},
-    items={"components": "component", "ledger": "fate", "ledger_stderr": "fate"},
+    items={"components": "component", "energy_budget": "fate", "energy_budget_stderr": "fate"},
     coordinates={"zenith": "shot", "azimuth": "shot"},
     rows="shots",
 )

@@ -13,13 +13,13 @@ from jaxlidar._programs import Program
 from jaxlidar._threads import ONE_CORE
 from jaxlidar._workers import Task, task
 from jaxlidar.planning.setup import Setup
+from jaxlidar.spectral.apply_optics import make_waveform_model
 from jaxlidar.survey.records import Record
 from jaxlidar.survey.shots import Aim, aimed_at, aims_of
 from jaxlidar.survey.truths import Truths
 from jaxlidar.survey.ways import AbstractWay
-from jaxlidar.trace.colouring import recording_of
-from jaxlidar.trace.setting import Setting, aimed, setting_of, straight_transmittance
-from jaxlidar.truth import labels, of_first_order
+from jaxlidar.trace.device_scene import DeviceScene, aim_at, build_device_scene
+from jaxlidar.truth import compute_labels, first_order_setup
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,22 +57,22 @@ class WithTruth(AbstractWay):
 
 def truths_of_chunk(setup: Setup, aims: Aim, key: PRNGKeyArray) -> Truths:
     """The truth of a chunk of shots; nothing is drawn."""
-    known = _several(of_first_order(setup), aims.as_arrays())
+    known = _several(first_order_setup(setup), aims.as_arrays())
     return Truths(**jax.tree.map(np.asarray, known))
 
 
-def _one(setting: Setting, setup: Setup, aim: Aim) -> dict[str, Any]:
+def _one(scene: DeviceScene, setup: Setup, aim: Aim) -> dict[str, Any]:
     by = jnp.asarray(aim.position) - setup.lidar.position
     setup = aimed_at(setup, aim)
-    setting = aimed(setting, setup.lidar, by)
-    known = vars(labels(setting, straight_transmittance(setup), recording_of(setup)))
+    scene = aim_at(scene, setup.lidar, by)
+    known = vars(compute_labels(scene, make_waveform_model(setup)))
     return {f.name: known[f.name] for f in dataclasses.fields(Truths)}
 
 
 def _of_shots(setup: Setup, aims: Aim) -> dict[str, Any]:
     """Some shots, one after the other."""
-    setting = setting_of(setup)
-    return jax.lax.map(lambda aim: _one(setting, setup, aim), aims)
+    scene = build_device_scene(setup)
+    return jax.lax.map(lambda aim: _one(scene, setup, aim), aims)
 
 
 _several = Program(_of_shots, **ONE_CORE)

@@ -1,4 +1,22 @@
-"""Collisions: what is hit, in which direction it scatters, and how much of that the receiver sees."""
+r"""Collisions: the material that is hit, the direction onward, and the brightness towards the sensor.
+
+A collision at extinction k = k_leaf + k_bark is with leaf with the probability k_leaf / k. A leaf or bark
+facet has a normal n with density proportional to g(n) |w.n| (of spherically oriented facets that is a cosine
+law about -w); it reflects by the cosine law into the lit side and transmits by it into the other. In place of
+facets a phase function may scatter. A surface reflects by its own law, or transmits diffusely by the cosine
+law.
+
+Reflection or transmission is chosen with a fixed probability q that does not depend on wavelength; going on,
+the weight is divided by q or 1 - q. Optics (R, T) are not part of the weight: they belong to the history.
+
+Light that returns from a collision is not sampled but deposited as its expectation. Per unit reflectance or
+transmittance, as apparent reflectance, it is the intensity factor
+
+    pi x BRDF x cos(view)  of a surface,   pi x p(w -> v)  of a volume with the phase function p (1/sr),
+
+times the transmittance of the return path. The attached ratios of the densities by which facets and
+directions were drawn keep derivatives unbiased (`jaxlidar.trace.photons`).
+"""
 
 import jax
 import jax.numpy as jnp
@@ -7,211 +25,256 @@ from jaxtyping import Array, Bool, Int
 from jaxlidar._vectors import Scalar, Vec, about, along, dot, polar, scale, vec
 from jaxlidar.optics.facets import facet_normal, facet_reflection, facet_transmission
 from jaxlidar.optics.phase import AbstractPhase
-from jaxlidar.planning.trace_plan import Scatterer
-from jaxlidar.trace.march import Medium
-from jaxlidar.trace.photons import Hit, Met, Scattering, merge, ratio_of, stop
-from jaxlidar.trace.random_numbers import Draw
-from jaxlidar.trace.setting import COSINE_LAW, Setting
-from jaxlidar.trace.surfaces import Surface
+from jaxlidar.planning.config import Scatterer
+from jaxlidar.trace.device_scene import COSINE_LAW, DeviceScene
+from jaxlidar.trace.photons import (
+    Collision,
+    LastScattering,
+    VisibleCollision,
+    attached_ratio,
+    detach,
+    select_collision,
+)
+from jaxlidar.trace.random_numbers import PhotonDraws
+from jaxlidar.trace.surfaces import TracedSurface
+from jaxlidar.trace.voxel_traversal import Medium
 
 
-def collide(
-    setting: Setting,
+def sample_collision(
+    scene: DeviceScene,
     x: Vec,
     w: Vec,
     cell: Int[Array, "photons"],
     collided: Bool[Array, "photons"],
     landed: list[Bool[Array, "photons"]],
-    draw: Draw,
-) -> Hit:
-    """What photons that fly along `w` hit at `x`, and how and in which direction it scatters.
+    draws: PhotonDraws,
+) -> Collision:
+    """Sample what photons that fly along `w` hit at `x`, and how and in which direction it scatters.
 
-    - `cell`: the voxel.
-    - `collided`: whether they collide in the voxel.
-    - `landed`: for each surface, whether they land on it.
+    **Arguments:**
+
+    - `cell`: the voxel. `collided`: True for photons that collide in the voxel.
+    - `landed`: for each surface, True for photons that land on it.
+    - `draws`: uniform numbers.
     """
     one = jnp.ones_like(w[0])
     none = jnp.full(one.shape, -1, jnp.int32)
-    nowhere = Scattering(jnp.zeros_like(none), w, w)
-    hit = Hit(jnp.zeros_like(none), none, one, one, w, none, none, none, w, nowhere)
-    if setting.medium is not None:
-        hit = merge(collided, _in_medium(setting, setting.medium, w, cell, draw), hit)
-    for i, surface in enumerate(setting.surfaces):
-        hit = merge(landed[i], _on_surface(setting, surface, i, x, w, draw), hit)
-    return hit
+    not_scattered = LastScattering(jnp.zeros_like(none), w, w)
+    # What photons that hit nothing have; their weight is zero.
+    collision = Collision(jnp.zeros_like(none), none, one, one, w, none, none, none, w, not_scattered)
+    if scene.medium is not None:
+        collision = select_collision(collided, _in_medium(scene, scene.medium, w, cell, draws), collision)
+    for i, surface in enumerate(scene.surfaces):
+        collision = select_collision(landed[i], _on_surface(scene, surface, i, x, w, draws), collision)
+    return collision
 
 
-def _on_surface(setting: Setting, surface: Surface, number: int, x: Vec, w: Vec, draw: Draw) -> Hit:
-    lobe, scatterer, law = setting.plan.lobe, setting.plan.surfaces[number], surface.law
+def _on_surface(
+    scene: DeviceScene, surface: TracedSurface, number: int, x: Vec, w: Vec, draws: PhotonDraws
+) -> Collision:
+    """Sample scattering by a surface: reflection by its law, or diffuse transmission by the cosine law."""
+    q, scatterer, law = scene.limits.reflection_probability, scene.config.surfaces[number], surface.law
     normal = surface.lit_normal(x, w)
-    incident, upright = jax.tree.map(stop, (w, normal))
-    out = jax.tree.map(stop, law.sample(incident, upright, *draw.direction))
-    ratio = jnp.ones_like(draw.choice)
-    onward = surface.by_place(x, law.albedo(w, normal)) * ratio_of(law.density(w, normal, out))
+    held_w, held_normal = jax.tree.map(detach, (w, normal))
+    out = jax.tree.map(detach, law.sample(held_w, held_normal, *draws.direction))
+    ratio = jnp.ones_like(draws.choice)
+    onward_weight = surface.at_position(x, law.albedo(w, normal)) * attached_ratio(
+        law.density(w, normal, out)
+    )
     none = jnp.full(ratio.shape, -1, jnp.int32)
-    sent_by, facing = jnp.full_like(none, setting.surface_laws[number]), upright
-    letter = jnp.full_like(none, scatterer.reflected)
-    diffuse = scatterer.transmitted >= 0 and not surface.straight
-    if diffuse:
-        through = draw.choice >= lobe
-        below = scale(upright, jnp.asarray(-1.0))
-        far = about(below, *draw.direction)
-        out, facing = _either(through, far, out), _either(through, below, facing)
-        sent_by = jnp.where(through, COSINE_LAW, sent_by)
-        onward = jnp.where(through, ratio_of(-dot(normal, far)) / (1.0 - lobe), onward / lobe)
-        letter = jnp.where(through, scatterer.transmitted, letter)
-    elif scatterer.transmitted >= 0:
-        # Whether it is reflected or passes was drawn on the way.
-        ratio = ratio / lobe
-    return Hit(
+    law_number, facing = jnp.full_like(none, scene.surface_laws[number]), held_normal
+    channel = jnp.full_like(none, scatterer.reflection)
+    transmits_diffusely = scatterer.transmission >= 0 and not surface.straight
+    if transmits_diffusely:
+        through = draws.choice >= q
+        below = scale(held_normal, jnp.asarray(-1.0))
+        transmitted = about(below, *draws.direction)
+        out, facing = _select(through, transmitted, out), _select(through, below, facing)
+        law_number = jnp.where(through, COSINE_LAW, law_number)
+        transmitted_weight = attached_ratio(-dot(normal, transmitted)) / (1.0 - q)
+        onward_weight = jnp.where(through, transmitted_weight, onward_weight / q)
+        channel = jnp.where(through, scatterer.transmission, channel)
+    elif scatterer.transmission >= 0:
+        # Straight transmission: that the photon stops here, to be reflected, was drawn on the way
+        # (`meet_surfaces`).
+        ratio = ratio / q
+    return Collision(
         material=jnp.full_like(none, scatterer.material),
-        letter=letter,
+        channel=channel,
         ratio=ratio,
-        onward=onward,
-        w=jax.tree.map(stop, out),
-        on=jnp.full_like(none, number),
-        reflected=jnp.full_like(none, scatterer.reflected),
-        transmitted=jnp.full_like(none, scatterer.transmitted if diffuse else -1),
+        onward_weight=onward_weight,
+        w=jax.tree.map(detach, out),
+        surface=jnp.full_like(none, number),
+        reflection=jnp.full_like(none, scatterer.reflection),
+        transmission=jnp.full_like(none, scatterer.transmission if transmits_diffusely else -1),
         normal=normal,
-        sent=Scattering(sent_by, incident, facing),
+        last_scattering=LastScattering(law_number, held_w, facing),
     )
 
 
-def _in_medium(setting: Setting, medium: Medium, w: Vec, cell: Int[Array, "photons"], draw: Draw) -> Hit:
-    leaf, bark = setting.plan.leaf, setting.plan.bark
+def _in_medium(
+    scene: DeviceScene, medium: Medium, w: Vec, cell: Int[Array, "photons"], draws: PhotonDraws
+) -> Collision:
+    """Sample scattering within a voxel: by leaf or by bark, in proportion to their extinction."""
+    leaf, bark = scene.config.leaf, scene.config.bark
     if bark is None:
         assert leaf is not None
-        return _on_leaf(setting, medium, leaf, w, medium.leaf_at(cell, w), draw.choice, draw)
-    bark_k = medium.bark_at(cell)
-    on_bark = _on_bark(setting, medium, bark, w, bark_k, draw)
+        return _on_leaf(scene, medium, leaf, w, medium.leaf_extinction(cell, w), draws.choice, draws)
+    bark_k = medium.bark_extinction(cell)
+    on_bark = _on_bark(scene, medium, bark, w, bark_k, draws)
     if leaf is None:
         return on_bark
-    leaf_k = medium.leaf_at(cell, w)
+    leaf_k = medium.leaf_extinction(cell, w)
     p = leaf_k / jnp.maximum(leaf_k + bark_k, 1e-30)
-    # Rescaled, the number that chose leaf also chooses the lobe.
-    share = draw.choice / jnp.maximum(p, 1e-30)
-    return merge(draw.choice < p, _on_leaf(setting, medium, leaf, w, leaf_k, share, draw), on_bark)
+    # Rescaled to (0, 1), the number that chose leaf also chooses between reflection and transmission.
+    choice = draws.choice / jnp.maximum(p, 1e-30)
+    on_leaf = _on_leaf(scene, medium, leaf, w, leaf_k, choice, draws)
+    return select_collision(draws.choice < p, on_leaf, on_bark)
 
 
 def _on_leaf(
-    setting: Setting, medium: Medium, leaf: Scatterer, w: Vec, k: Scalar, share: Scalar, draw: Draw
-) -> Hit:
+    scene: DeviceScene, medium: Medium, leaf: Scatterer, w: Vec, k: Scalar, choice: Scalar, draws: PhotonDraws
+) -> Collision:
+    """Sample scattering by leaf: by a bi-Lambertian facet, or by a phase function."""
     if medium.leaf_phase is not None:
-        return _in_volume(medium.leaf_phase, setting.leaf_law, leaf, w, k, draw)
-    ratio, onward, lobe = ratio_of(k), jnp.ones_like(k), setting.plan.lobe
-    letter = jnp.full(k.shape, leaf.reflected, jnp.int32)
-    if medium.angles is None:
-        normal = facet_normal(w, *draw.normal)
+        return _by_phase(medium.leaf_phase, scene.leaf_law, leaf, w, k, draws)
+    ratio, onward_weight, q = attached_ratio(k), jnp.ones_like(k), scene.limits.reflection_probability
+    channel = jnp.full(k.shape, leaf.reflection, jnp.int32)
+    if medium.angle_tables is None:
+        normal = facet_normal(w, *draws.normal)
     else:
-        normal, more = _leaf_normal(medium, w, *draw.normal)
-        ratio = ratio * more
-    out, facing = about(normal, *draw.direction), normal
-    if leaf.transmitted >= 0:
-        through = share >= lobe
-        facing = _either(through, scale(normal, jnp.asarray(-1.0)), normal)
+        normal, normal_weight = _leaf_normal(medium, w, *draws.normal)
+        ratio = ratio * normal_weight
+    out, facing = about(normal, *draws.direction), normal
+    if leaf.transmission >= 0:
+        through = choice >= q
+        facing = _select(through, scale(normal, jnp.asarray(-1.0)), normal)
+        # Transmission is reflection mirrored in the facet.
         out = along(out, normal, jnp.where(through, -2.0 * dot(out, normal), 0.0))
-        letter = jnp.where(through, leaf.transmitted, letter)
-        onward = jnp.where(through, 1.0 / (1.0 - lobe), 1.0 / lobe)
-    return _within(leaf, letter, ratio, onward, COSINE_LAW, w, out, normal, facing)
+        channel = jnp.where(through, leaf.transmission, channel)
+        onward_weight = jnp.where(through, 1.0 / (1.0 - q), 1.0 / q)
+    return _voxel_collision(leaf, channel, ratio, onward_weight, COSINE_LAW, w, out, normal, facing)
 
 
-def _on_bark(setting: Setting, medium: Medium, bark: Scatterer, w: Vec, k: Scalar, draw: Draw) -> Hit:
+def _on_bark(
+    scene: DeviceScene, medium: Medium, bark: Scatterer, w: Vec, k: Scalar, draws: PhotonDraws
+) -> Collision:
+    """Sample scattering by bark: an opaque facet of random orientation, or a phase function."""
     if medium.bark_phase is not None:
-        return _in_volume(medium.bark_phase, setting.bark_law, bark, w, k, draw)
-    letter, one = jnp.full(k.shape, bark.reflected, jnp.int32), jnp.ones_like(k)
-    normal = facet_normal(w, *draw.normal)
-    out = about(normal, *draw.direction)
-    return _within(bark, letter, ratio_of(k), one, COSINE_LAW, w, out, normal, normal)
+        return _by_phase(medium.bark_phase, scene.bark_law, bark, w, k, draws)
+    channel, one = jnp.full(k.shape, bark.reflection, jnp.int32), jnp.ones_like(k)
+    normal = facet_normal(w, *draws.normal)
+    out = about(normal, *draws.direction)
+    return _voxel_collision(bark, channel, attached_ratio(k), one, COSINE_LAW, w, out, normal, normal)
 
 
-def _in_volume(phase: AbstractPhase, number: int, scatterer: Scatterer, w: Vec, k: Scalar, draw: Draw) -> Hit:
-    letter = jnp.full(k.shape, scatterer.reflected, jnp.int32)
-    out = jax.tree.map(stop, phase.sample(jax.tree.map(stop, w), *draw.direction))
-    onward = ratio_of(phase.density(w, out))
-    return _within(scatterer, letter, ratio_of(k), onward, number, w, out, w, w)
+def _by_phase(
+    phase: AbstractPhase, number: int, scatterer: Scatterer, w: Vec, k: Scalar, draws: PhotonDraws
+) -> Collision:
+    """Sample scattering by a phase function."""
+    channel = jnp.full(k.shape, scatterer.reflection, jnp.int32)
+    out = jax.tree.map(detach, phase.sample(jax.tree.map(detach, w), *draws.direction))
+    onward_weight = attached_ratio(phase.density(w, out))
+    return _voxel_collision(scatterer, channel, attached_ratio(k), onward_weight, number, w, out, w, w)
 
 
-def _within(
+def _voxel_collision(
     scatterer: Scatterer,
-    letter: Int[Array, "photons"],
+    channel: Int[Array, "photons"],
     ratio: Scalar,
-    onward: Scalar,
+    onward_weight: Scalar,
     law: int,
     incident: Vec,
     out: Vec,
     normal: Vec,
     facing: Vec,
-) -> Hit:
-    """A collision within a voxel, scattered about the normal `facing` by the law of that number."""
-    incident, out, normal, facing = jax.tree.map(stop, (incident, out, normal, facing))
-    return Hit(
-        material=jnp.full_like(letter, scatterer.material),
-        letter=letter,
+) -> Collision:
+    """Assemble a collision within a voxel, scattered about the normal `facing` by the law of that number."""
+    incident, out, normal, facing = jax.tree.map(detach, (incident, out, normal, facing))
+    return Collision(
+        material=jnp.full_like(channel, scatterer.material),
+        channel=channel,
         ratio=ratio,
-        onward=onward,
+        onward_weight=onward_weight,
         w=out,
-        on=jnp.full_like(letter, -1),
-        reflected=jnp.full_like(letter, scatterer.reflected),
-        transmitted=jnp.full_like(letter, scatterer.transmitted),
+        surface=jnp.full_like(channel, -1),
+        reflection=jnp.full_like(channel, scatterer.reflection),
+        transmission=jnp.full_like(channel, scatterer.transmission),
         normal=normal,
-        sent=Scattering(jnp.full_like(letter, law), incident, facing),
+        last_scattering=LastScattering(jnp.full_like(channel, law), incident, facing),
     )
 
 
-def _either(where: Bool[Array, "photons"], a: Vec, b: Vec) -> Vec:
+def _select(where: Bool[Array, "photons"], a: Vec, b: Vec) -> Vec:
     return vec(jnp.where(where, p, q) for p, q in zip(a, b))
 
 
 def _leaf_normal(medium: Medium, w: Vec, u: Scalar, v: Scalar) -> tuple[Vec, Scalar]:
-    """A normal on the lit side from the leaf angle distribution, and |normal . w| / G(w)."""
+    """Sample a normal on the lit side from the leaf angle distribution, with its weight |n.w| / G(w).
+
+    The normal is drawn from g(n), not from g(n) |n.w|: the weight makes up for the difference.
+    """
     assert medium.leaf_angles is not None
-    assert medium.angles is not None
+    assert medium.angle_tables is not None
     p = medium.leaf_angles.normalised()
-    number = jnp.sum(jnp.cumsum(stop(p))[None, :-1] < u[:, None], axis=1)
+    number = jnp.sum(jnp.cumsum(detach(p))[None, :-1] < u[:, None], axis=1)
     theta = (number + 0.5) * (0.5 * jnp.pi / p.size)
     normal = polar(jnp.cos(theta), 2 * jnp.pi * v)
     cosine = dot(normal, w)
-    normal = _either(cosine > 0, scale(normal, jnp.asarray(-1.0)), normal)
-    return normal, jnp.abs(cosine) / medium.angles.projection_at(w) * ratio_of(p[number])
+    normal = _select(cosine > 0, scale(normal, jnp.asarray(-1.0)), normal)
+    return normal, jnp.abs(cosine) / medium.angle_tables.projection_at(w) * attached_ratio(p[number])
 
 
-def shown(setting: Setting, hit: Hit) -> Met:
-    """What of a collision `view_factors` asks for."""
-    turned = setting.medium is not None and setting.medium.angles is not None
-    return Met(hit.material, hit.on, hit.reflected, hit.transmitted, hit.normal if turned else None)
+def visible_collision(scene: DeviceScene, collision: Collision) -> VisibleCollision:
+    """Return the part of a collision that `intensity_factors` asks for; the compiler then drops all else."""
+    needs_normal = scene.medium is not None and scene.medium.angle_tables is not None
+    return VisibleCollision(
+        collision.material,
+        collision.surface,
+        collision.reflection,
+        collision.transmission,
+        collision.normal if needs_normal else None,
+    )
 
 
-def view_factors(setting: Setting, x: Vec, w: Vec, v: Vec, hit: Met) -> tuple[Scalar, Scalar | None]:
-    """View factors towards `v` of light that collides at `x`, flying along `w`.
+def intensity_factors(
+    scene: DeviceScene, x: Vec, w: Vec, v: Vec, collision: VisibleCollision
+) -> tuple[Scalar, Scalar | None]:
+    """Return the intensity factors towards `v` of light that collides at `x`, flying along `w`.
 
     They are apparent reflectance per unit reflectance, and per unit transmittance (None if nothing
     transmits).
     """
-    plan, medium = setting.plan, setting.medium
+    config, medium = scene.config, scene.medium
     reflected, transmitted = jnp.zeros_like(w[0]), jnp.zeros_like(w[0])
-    transmits = [s.transmitted >= 0 and not p.straight for s, p in zip(plan.surfaces, setting.surfaces)]
+    transmits = [s.transmission >= 0 and not p.straight for s, p in zip(config.surfaces, scene.surfaces)]
     if medium is not None:
-        angle = dot(w, v)
-        front, back = facet_reflection(angle), facet_transmission(angle)
-        if plan.leaf is not None:
-            transmits.append(plan.leaf.transmitted >= 0)
-            here = (hit.on < 0) & (hit.material == plan.leaf.material)
-            lit, far = front, back
+        cos_scattering = dot(w, v)
+        # The means over the normals of spherically oriented facets, so that the sampled normal does not
+        # matter.
+        front, back = facet_reflection(cos_scattering), facet_transmission(cos_scattering)
+        in_voxel = collision.surface < 0
+        if config.leaf is not None:
+            transmits.append(config.leaf.transmission >= 0)
+            on_leaf = in_voxel & (collision.material == config.leaf.material)
+            lit, unlit = front, back
             if medium.leaf_phase is not None:
-                lit = far = medium.leaf_phase.view_factor(w, v)
-            elif medium.angles is not None:
-                assert hit.normal is not None
-                turned = dot(hit.normal, v)
-                lit, far = jnp.maximum(turned, 0.0), jnp.maximum(-turned, 0.0)
-            reflected, transmitted = jnp.where(here, lit, reflected), jnp.where(here, far, transmitted)
-        if plan.bark is not None:
-            here = (hit.on < 0) & (hit.material == plan.bark.material)
-            bark = front if medium.bark_phase is None else medium.bark_phase.view_factor(w, v)
-            reflected = jnp.where(here, bark, reflected)
-    for i, s in enumerate(setting.surfaces):
-        here, normal = hit.on == i, s.lit_normal(x, w)
-        turned = dot(normal, v)
-        factor = s.by_place(x, s.law.view_factor(w, normal, v, setting.beam.half_angle))
-        reflected = jnp.where(here, jnp.where(turned > 0, factor, 0.0), reflected)
-        transmitted = jnp.where(here, jnp.maximum(-turned, 0.0), transmitted)
+                lit = unlit = medium.leaf_phase.intensity_factor(w, v)
+            elif medium.angle_tables is not None:
+                assert collision.normal is not None
+                cosine = dot(collision.normal, v)
+                lit, unlit = jnp.maximum(cosine, 0.0), jnp.maximum(-cosine, 0.0)
+            reflected = jnp.where(on_leaf, lit, reflected)
+            transmitted = jnp.where(on_leaf, unlit, transmitted)
+        if config.bark is not None:
+            on_bark = in_voxel & (collision.material == config.bark.material)
+            bark = front if medium.bark_phase is None else medium.bark_phase.intensity_factor(w, v)
+            reflected = jnp.where(on_bark, bark, reflected)
+    for i, surface in enumerate(scene.surfaces):
+        on_surface, normal = collision.surface == i, surface.lit_normal(x, w)
+        cosine = dot(normal, v)
+        factor = surface.law.intensity_factor(w, normal, v, scene.beam.half_angle)
+        factor = surface.at_position(x, factor)
+        reflected = jnp.where(on_surface, jnp.where(cosine > 0, factor, 0.0), reflected)
+        transmitted = jnp.where(on_surface, jnp.maximum(-cosine, 0.0), transmitted)
     return reflected, transmitted if any(transmits) else None

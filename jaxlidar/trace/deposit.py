@@ -1,13 +1,14 @@
-"""Soft time binning: deposits of energy into fine bins, smooth in time and exactly conserving.
+r"""Soft time binning: deposits of returned light into fine bins, smooth in time and exactly conserving.
 
-A return at an instant is spread over three bins by the quadratic B-spline. Its weights sum to one, its second
-moment, 1/4 bin^2, does not depend on where in the bin the instant falls, and its derivative with respect to
-time is continuous. A return that extends over a stretch of the ray is integrated bin by bin and smoothed by
-(1, 10, 1)/12, which gives it the same second moment. That common second moment is taken out again when the
-pulse is applied (`jaxlidar.waveform`).
+A return at the time t (in bins) is spread over three bins by the quadratic B-spline B,
 
-For comparison the kernel may have two bins (linear; cloud in cell) or one (the nearest bin, whose derivative
-with respect to time is zero); its second moment is then n/12 bin^2 in the mean.
+    weight of bin n = B(t - n),   B(x) = 3/4 - x^2 for |x| < 1/2,  (3/2 - |x|)^2 / 2 for 1/2 < |x| < 3/2.
+
+The weights sum to one, their second moment, 1/4 bin^2, does not depend on where in the bin t falls, and their
+derivative with respect to t is continuous. A return that extends over a ray segment is integrated exactly
+over each bin (a box of second moment 1/12) and smoothed by (1, 10, 1)/12 (second moment 1/6), which gives it
+the same second moment of 1/4 in all. That common second moment is taken out again when the pulse is applied
+(`jaxlidar.spectral.pulse_convolution`).
 """
 
 import jax.numpy as jnp
@@ -15,66 +16,64 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxlidar._one_function import once
-from jaxlidar.planning.trace_plan import Bins
+from jaxlidar.planning.config import KERNEL_BINS, TimeBins
 
 
-def instant_row(
-    bins: Bins, time: Float[Array, "*s"], value: Float[Array, "*s"]
+def bspline_row(
+    bins: TimeBins, time: Float[Array, "*s"], value: Float[Array, "*s"]
 ) -> tuple[Int[Array, "*s"], Float[Array, "*s kernel"]]:
-    """First bin (counting the margin) and weights of a return at one instant."""
-    # Fused into the row, both would be computed again for each of its bins.
+    """Spread returns `value` at the instants `time`, ns, over three bins each.
+
+    **Returns:** index of the first bin, counting the margin, and the values in three bins from there on.
+    """
+    # Optimisation barrier: fused into the row, both would be computed again for each of its bins.
     position, value = once((bins.position(time), value))
-    lowest = jnp.round(lax.stop_gradient(position) - 0.5 * (bins.kernel - 1))
-    r = position - lowest
-    match bins.kernel:
-        case 1:
-            row = [jnp.ones_like(r)]
-        case 2:
-            row = [1.0 - r, r]
-        case _:
-            r = r - 1.0
-            row = [0.5 * (0.5 - r) ** 2, 0.75 - r * r, 0.5 * (0.5 + r) ** 2]
-    return _first(bins, lowest, bins.kernel), jnp.stack(row, axis=-1) * value[..., None]
+    lowest = jnp.round(lax.stop_gradient(position) - 0.5 * (KERNEL_BINS - 1))
+    # Offset from the middle bin, in [-1/2, 1/2].
+    r = position - lowest - 1.0
+    weights = [0.5 * (0.5 - r) ** 2, 0.75 - r * r, 0.5 * (0.5 + r) ** 2]
+    return padded_index(bins, lowest, KERNEL_BINS), jnp.stack(weights, axis=-1) * value[..., None]
 
 
-def smooth_row(row: Float[Array, "*s n"], kernel: int) -> Float[Array, "*s n+2"]:
-    """Bin integrals, whose own second moment is 1/12 bin^2, smoothed to the second moment of the kernel."""
-    zero = jnp.zeros_like(row[..., :1])
-    side = (kernel - 1) / 24
+def smooth_bins(integrals: Float[Array, "*s n"]) -> Float[Array, "*s n+2"]:
+    """Smooth integrals over bins by (1, 10, 1)/12, so that their second moment is that of the B-spline."""
+    zero = jnp.zeros_like(integrals[..., :1])
+    side = (KERNEL_BINS - 1) / 24
     return (
-        side * jnp.concatenate([row, zero, zero], -1)
-        + (1.0 - 2.0 * side) * jnp.concatenate([zero, row, zero], -1)
-        + side * jnp.concatenate([zero, zero, row], -1)
+        side * jnp.concatenate([integrals, zero, zero], -1)
+        + (1.0 - 2.0 * side) * jnp.concatenate([zero, integrals, zero], -1)
+        + side * jnp.concatenate([zero, zero, integrals], -1)
     )
 
 
-def _first(bins: Bins, first: Float[Array, "*s"], length: int) -> Int[Array, "*s"]:
-    start = jnp.clip(first + bins.row, 0, bins.padded - length)
+def padded_index(bins: TimeBins, number: Float[Array, "*s"], length: int) -> Int[Array, "*s"]:
+    """Return the index, counting the margin, of bin `number`, from which a row of `length` bins starts."""
+    start = jnp.clip(number + bins.max_span, 0, bins.padded - length)
     return start.astype(jnp.int32)
 
 
-def first_bin(bins: Bins, first: Float[Array, "*s"], length: int) -> Int[Array, "*s"]:
-    """Index, counting the margin, of bin number `first`, where a row of `length` bins starts."""
-    return _first(bins, first, length)
+def add_rows(
+    tally: Float[Array, "rows padded"],
+    row: Int[Array, "*s"],
+    first_bin: Int[Array, "*s"],
+    values: Float[Array, "*s n"],
+) -> Float[Array, "rows padded"]:
+    """Add runs of n contiguous bins to rows of a tally.
 
-
-def scatter_rows(
-    into: Float[Array, "slots padded"],
-    slot: Int[Array, "*s"],
-    first: Int[Array, "*s"],
-    rows: Float[Array, "*s n"],
-) -> Float[Array, "slots padded"]:
-    """Add rows of contiguous bins. One windowed scatter costs about as much as adding one element."""
-    slots, padded = into.shape
-    index = (slot * padded + first).reshape(-1, 1)
+    One windowed scatter costs about as much as adding one element, so that a deposit over many bins is one
+    update.
+    """
+    n_rows, padded = tally.shape
+    index = (row * padded + first_bin).reshape(-1, 1)
     numbers = lax.ScatterDimensionNumbers(
         update_window_dims=(1,), inserted_window_dims=(), scatter_dims_to_operand_dims=(0,)
     )
     flat = lax.scatter_add(
-        into.reshape(-1),
+        tally.reshape(-1),
         index,
-        rows.reshape(index.shape[0], rows.shape[-1]),
+        values.reshape(index.shape[0], values.shape[-1]),
         numbers,
+        # `padded_index` keeps runs within the row.
         mode=lax.GatherScatterMode.PROMISE_IN_BOUNDS,
     )
-    return flat.reshape(slots, padded)
+    return flat.reshape(n_rows, padded)

@@ -1,12 +1,14 @@
 r"""First order: every ray of the footprint is marched through the scene, and its expected return deposited.
 
 Nothing is random. With extinction coefficients k_m of the materials m, their sum k, and the optical depth tau
-from the sensor, the return from a stretch of the ray is
+from the sensor, the return from a segment of the ray is
 
-    f_m * integral of k_m exp(-kappa tau(s)) ds,    kappa = 2, or 1 with the hot spot,
+    V_m * integral of k_m exp(-kappa tau(s)) ds,    kappa = 2, or 1 with the hot spot,
 
-integrated exactly over every piece of the ray that lies within one voxel and one time bin. f_m is the view
-factor for backscatter (`jaxlidar.optics.facets`, `jaxlidar.optics.phase`).
+integrated exactly over every piece of the ray that lies within one voxel and one time bin. V_m is the
+intensity factor for backscatter (`jaxlidar.optics.facets`, `jaxlidar.optics.phase`). A surface at the
+distance d returns V exp(-kappa tau(d)) at one instant. Plates in the path multiply by their transmittance
+once on the way in and once on the way out.
 """
 
 import itertools
@@ -24,72 +26,85 @@ from jaxlidar._one_function import once
 from jaxlidar._vectors import FAR, Scalar, Vec, along, scale
 from jaxlidar.optics.facets import FACET_BACKSCATTER
 from jaxlidar.optics.laws import AbstractMirror
-from jaxlidar.planning.trace_plan import TracePlan
-from jaxlidar.trace.deposit import instant_row, scatter_rows, smooth_row
+from jaxlidar.planning.config import TraceConfig
+from jaxlidar.trace.deposit import add_rows, bspline_row, smooth_bins
+from jaxlidar.trace.device_scene import DeviceScene
+from jaxlidar.trace.extinction_slopes import outer_rows
 from jaxlidar.trace.histories import Histories
-from jaxlidar.trace.march import Medium
-from jaxlidar.trace.reparametrise import footprint_rays, rays_to_terrain, sees_terrain
-from jaxlidar.trace.scored_light import rows_of_stretches, scatter_columns, with_scores
-from jaxlidar.trace.scores import rows_of
-from jaxlidar.trace.setting import Setting
-from jaxlidar.trace.stretches import Stretches, in_blocks, march_ray, mean_decay, stretch_pieces
-from jaxlidar.trace.surfaces import Surface
+from jaxlidar.trace.ray_segments import (
+    RaySegments,
+    add_in_blocks,
+    integrate_over_bins,
+    march_ray,
+    mean_decay,
+)
+from jaxlidar.trace.reparametrisation import moves_with_terrain, rays_with_columns, rays_with_terrain
+from jaxlidar.trace.score_functions import add_column_rows, segment_derivatives, with_depth_slopes
+from jaxlidar.trace.surfaces import TracedSurface
+from jaxlidar.trace.voxel_traversal import Medium
 
-CHUNK = 512
+# Rays that are marched at once, so that their segments stay in the processor's cache.
+RAYS_AT_ONCE = 512
 
 
-class Passage:
-    """Transmission of light by the plates it passes `ways` times, as exponents and their weights.
+class PlateTransmission:
+    """Transmission of first-order light by the plates in its path, as exponents and their weights.
 
-    A fully covering plate multiplies by T each time; a partial one by (1 - c) + c T, which is expanded so
-    that each term is a monomial in T.
+    A plate that covers everything multiplies by T each time; one with the coverage c by (1 - c) + c T. For
+    the `passages` = 1 (in) or 2 (in and out) that is expanded, so that each term is a monomial in T:
+
+        ((1 - c) + c T)^2 = (1 - c)^2 + 2 c (1 - c) T + c^2 T^2.
     """
 
-    def __init__(self, surfaces: tuple[Surface, ...], plan: TracePlan, ways: int):
-        self.plates = [(i, s, plan.surfaces[i].transmitted) for i, s in enumerate(surfaces) if s.plate]
-        choices = []
-        for i, s, letter in self.plates:
-            c = s.coverage
-            # A plate without a letter for transmittance is opaque.
-            straight = s.straight and letter >= 0
-            if plan.full_cover[i]:
-                options = [(ways, jnp.ones_like(c) if straight else jnp.zeros_like(c))]
+    def __init__(self, surfaces: tuple[TracedSurface, ...], config: TraceConfig, passages: int):
+        self.plates = [(i, s, config.surfaces[i].transmission) for i, s in enumerate(surfaces) if s.is_plate]
+        terms_by_plate = []
+        for i, surface, channel in self.plates:
+            c = surface.coverage
+            # A plate without a channel for transmittance is opaque.
+            straight = surface.straight and channel >= 0
+            if config.covers_fully[i]:
+                terms = [(passages, jnp.ones_like(c) if straight else jnp.zeros_like(c))]
             elif straight:
-                terms = {1: [1 - c, c], 2: [(1 - c) ** 2, 2 * c * (1 - c), c**2]}[ways]
-                options = list(enumerate(terms))
+                weights = {1: [1 - c, c], 2: [(1 - c) ** 2, 2 * c * (1 - c), c**2]}[passages]
+                terms = list(enumerate(weights))
             else:
-                options = [(0, (1 - c) ** ways)]
-            # Where the plate is not in the way, the first option alone stands, with weight one.
-            choices.append([(*option, float(n == 0)) for n, option in enumerate(options)])
-        self.combinations = list(itertools.product(*choices))
+                terms = [(0, (1 - c) ** passages)]
+            # Where the plate is not in the path, the first term alone counts, with the weight one.
+            terms_by_plate.append([(*term, float(n == 0)) for n, term in enumerate(terms)])
+        self.combinations = list(itertools.product(*terms_by_plate))
 
-    def terms(self, table: Histories, base: int, s: Scalar, met: list[Scalar]):
-        """Pairs of history and weight for light that scatters at distance `s` into history `base`.
+    def terms(
+        self, table: Histories, history: int, distance: Scalar, surface_distances: list[Scalar]
+    ) -> Iterator[tuple[Int[Array, "..."] | int, Scalar]]:
+        """Yield pairs of history and weight of light that scatters at `distance` into `history`.
 
-        The history is an array, or a number where there are no plates.
+        The history is an array, or an integer where there are no plates.
         """
         if not self.plates:
-            yield base, jnp.ones_like(s)
+            yield history, jnp.ones_like(distance)
             return
-        successor = jnp.asarray(table.successor)
+        next_history = jnp.asarray(table.next_history)
         for combination in self.combinations:
-            number = jnp.full(s.shape, base, jnp.int32)
-            weight = jnp.ones_like(s)
-            for (i, _, letter), (exponent, value, absent) in zip(self.plates, combination):
-                above = met[i] < s
-                grown = number
-                for _ in range(exponent if letter >= 0 else 0):
-                    grown = successor[grown, letter]
-                number = jnp.where(above, grown, number)
-                weight = weight * jnp.where(above, value, absent)
+            number = jnp.full(distance.shape, history, jnp.int32)
+            weight = jnp.ones_like(distance)
+            for (i, _, channel), (exponent, value, if_absent) in zip(self.plates, combination):
+                in_path = surface_distances[i] < distance
+                after = number
+                for _ in range(exponent if channel >= 0 else 0):
+                    after = next_history[after, channel]
+                number = jnp.where(in_path, after, number)
+                weight = weight * jnp.where(in_path, value, if_absent)
             yield number, weight
 
 
 class FirstOrder(eqx.Module):
-    """Deterministic first-order response, and the fate of the light that it describes.
+    """The deterministic first-order response, and the energy budget of the light that it describes.
 
-    `scattered`: how much of the light that arrived is scattered at all, per unit optics. `scored`:
-    derivatives of the weights, where scores are asked for.
+    - `weights`, `outside`: apparent reflectance per unit optics, within the bins and outside of them.
+    - `arrived`, `escaped`: energy that reached each material, and that left the scene unscattered.
+    - `scattered`: the part of `arrived` that is scattered at all, per unit optics (a law's albedo).
+    - `weight_slopes`: derivatives of the weights, where scores are asked for; else None.
     """
 
     weights: Float[Array, "materials histories bins"]
@@ -97,223 +112,273 @@ class FirstOrder(eqx.Module):
     arrived: Float[Array, "materials histories"]
     scattered: Float[Array, "materials histories"]
     escaped: Float[Array, "histories"]
-    scored: Float[Array, "materials histories bins columns"] | None = None
+    weight_slopes: Float[Array, "materials histories bins columns"] | None = None
 
 
-class Sent(NamedTuple):
-    """Rays of the footprint: where they start above the scene, their directions, and what they meet.
+class FootprintRays(NamedTuple):
+    """Rays of the footprint: where they start above the scene, their directions, and the surfaces they meet.
 
-    - `x`, `w`: start and direction. - `excess`: way from the sensor to the start, m, less the slant range.
-    - `energy`: share of the pulse's. - `met`: distance to each surface, m; `stop`: to the ground.
+    - `x`, `w`: start and direction. - `excess`: path from the sensor to the start, m, less the slant range.
+    - `energy`: fraction of the pulse's. - `surface_distances`: to each surface, m; `end`: to the ground.
     """
 
     x: Vec
     w: Vec
     excess: Scalar
     energy: Scalar
-    met: list[Scalar]
-    stop: Scalar
+    surface_distances: list[Scalar]
+    end: Scalar
 
 
-def sent_rays(setting: Setting, across: tuple[Scalar, Scalar], energy: Scalar) -> Sent:
-    """The rays through `across`, which carry the shares `energy`."""
-    beam, plan = setting.beam, setting.plan
-    across, share = footprint_rays(beam, setting.medium, across)
-    energy = energy * share
-    if sees_terrain(setting):
-        across, share = rays_to_terrain(setting, across)
-        energy = energy * share
+def send_rays(scene: DeviceScene, across: tuple[Scalar, Scalar], energy: Scalar) -> FootprintRays:
+    """Send rays through the points `across` the beam, which carry the fractions `energy`."""
+    beam, config = scene.beam, scene.config
+    # These change derivatives alone: rays move with the geometry.
+    across, ratio = rays_with_columns(beam, scene.medium, across)
+    energy = energy * ratio
+    if moves_with_terrain(scene):
+        across, ratio = rays_with_terrain(scene, across)
+        energy = energy * ratio
     point, w, excess = beam.ray(across)
-    x = along(point, w, jnp.asarray(-plan.upstream, energy.dtype))
-    met = [s.distance(x, w) for s in setting.surfaces]
-    stop = met[0] if plan.has_ground else jnp.full_like(energy, FAR)
-    return Sent(x, w, excess - plan.upstream, energy, met, stop)
+    start_distance = scene.limits.start_distance
+    x = along(point, w, jnp.asarray(-start_distance, energy.dtype))
+    distances = [s.distance(x, w) for s in scene.surfaces]
+    end = distances[0] if config.has_ground else jnp.full_like(energy, FAR)
+    return FootprintRays(x, w, excess - start_distance, energy, distances, end)
 
 
-def march_rays(setting: Setting, sent: Sent) -> tuple[Stretches, list[Scalar], Scalar]:
-    """As `march_ray`, for all rays, up to the ground; `stops` are the surfaces.
+def march_rays(scene: DeviceScene, rays: FootprintRays) -> tuple[RaySegments, list[Scalar], Scalar]:
+    """Cut all rays into segments up to the ground; as `march_ray`, with the surfaces as stops.
 
-    Stretches stay along the first axis, where the march leaves them: transposing costs as much.
+    Segments lie along the first axis, where the march leaves them: transposing costs as much as marching.
     """
-    plan, medium = setting.plan, setting.medium
+    medium = scene.medium
     assert medium is not None
-    step = jnp.asarray(plan.max_step, sent.energy.dtype)
+    max_segment = jnp.asarray(scene.limits.max_segment, rays.energy.dtype)
     march = jax.vmap(march_ray, (None, 0, 0, 0, 0, None, None), (1, 0, 0))
-    return march(medium, sent.x, sent.w, sent.stop, sent.met, plan.first_steps, step)
+    max_segments = scene.config.max_ray_segments
+    return march(medium, rays.x, rays.w, rays.end, rays.surface_distances, max_segments, max_segment)
+
+
+class _FirstOrderTally(NamedTuple):
+    """Sums over rays while they are deposited; entries are materials times histories.
+
+    `returned`: by entry and padded bin. `arrived`: by entry. `slopes`: derivatives of `returned`, or None.
+    """
+
+    returned: Float[Array, "entries padded"]
+    arrived: Float[Array, "entries"]
+    slopes: Float[Array, "entries padded columns"] | None
 
 
 def first_order(
-    setting: Setting,
+    scene: DeviceScene,
     across: tuple[Float[Array, "rays"], Float[Array, "rays"]],
     energy: Float[Array, "rays"],
     *,
     mirror: int | None = None,
 ) -> FirstOrder:
-    """Response of order one.
+    """Compute the response of order one.
 
-    `across` and `energy` give the place of each ray across the beam and its share of energy. With `mirror`,
-    the rays carry what that surface returns of them (see `jaxlidar.trace.mirror`), and nothing else is
-    deposited.
+    `across` and `energy` give the position of each ray across the beam and its fraction of energy. With
+    `mirror`, the rays carry what that surface returns of them (see `jaxlidar.trace.mirror_return`), and
+    nothing else is deposited.
+
+    For each chunk of rays:
+
+    1. Send the rays, and march them through the voxels into segments.
+    2. Deposit the return of every segment and material, bin by bin, and the energy that arrives there.
+    3. Smooth the sum over bins: smoothing is linear, so that only the sum is smoothed.
+    4. Deposit the return of every surface at an instant, and the energy that arrives there.
+    5. What is left of rays that meet no ground escapes.
     """
-    beam, medium, surfaces = setting.beam, setting.medium, setting.surfaces
-    plan, table, bins = setting.plan, setting.short, setting.bins
-    count, leaf = table.count, -1 if plan.leaf is None else plan.leaf.material
-    out_way, both_ways = Passage(surfaces, plan, 1), Passage(surfaces, plan, 2)
-    kappa = 1.0 if plan.hotspot else 2.0
-    successor = table.successor
-    materials, scores = len(plan.materials), setting.scores
+    beam, medium, surfaces = scene.beam, scene.medium, scene.surfaces
+    config, table, bins = scene.config, scene.first_histories, scene.bins
+    n_histories, leaf_material = table.count, -1 if config.leaf is None else config.leaf.material
+    one_passage = PlateTransmission(surfaces, config, 1)
+    two_passages = PlateTransmission(surfaces, config, 2)
+    kappa = 1.0 if config.hotspot else 2.0
+    next_history = table.next_history
+    n_materials, slopes = len(config.materials), scene.slopes
 
-    def deposited(tally, stretch, light):
-        """A tally with what stretches add to it; `light` is that of the ray of each."""
+    def add_segments(tally, segments, per_ray):
+        """Add segments to a `_FirstOrderTally`; `per_ray`: the ray of each, and its seen energy."""
         assert medium is not None
-        (response, arrived, scored), (sent, visible) = tally, light
-        k, way, before = stretch.extinction, sent.w, sent.met
-        low = bins.position(2.0 * (sent.excess + stretch.start) / SPEED_OF_LIGHT)
-        first, pieces = stretch_pieces(bins, low, stretch, kappa)
-        passing = jnp.exp(-stretch.depth) * mean_decay(k * stretch.length) * stretch.length
-        middle = stretch.start + 0.5 * stretch.length
-        for m, part in _parts(medium, plan, stretch, way) if mirror is None else ():
-            value = part.extinction * (part.backscatter * visible)
-            for history, share in both_ways.terms(table, int(successor[0, part.letter]), middle, before):
-                slot = jnp.broadcast_to(m * count + history, first.shape)
-                # Fused, what the pieces are multiplied by would be computed again for each, out of order.
-                row = once(pieces * once(value * share)[None])
+        (returned, arrived, return_slopes), (rays, seen_energy) = tally, per_ray
+        k, w, distances = segments.extinction, rays.w, rays.surface_distances
+        start_position = bins.position(2.0 * (rays.excess + segments.start) / SPEED_OF_LIGHT)
+        first_bin, pieces = integrate_over_bins(bins, start_position, segments, kappa)
+        # Integral of exp(-tau) ds over the segment: what arrives is attenuated once.
+        passing = jnp.exp(-segments.depth) * mean_decay(k * segments.length) * segments.length
+        middle = segments.start + 0.5 * segments.length
+        materials = _medium_materials(medium, config, segments, w)
+        for m, material in materials if mirror is None else ():
+            value = material.extinction * (material.intensity_factor * seen_energy)
+            scattered_history = int(next_history[0, material.channel])
+            for history, factor in two_passages.terms(table, scattered_history, middle, distances):
+                entry = jnp.broadcast_to(m * n_histories + history, first_bin.shape)
+                # Optimisation barriers: fused, the factor would be computed again for each piece, out of
+                # order.
+                row = once(pieces * once(value * factor)[None])
                 row = jnp.moveaxis(row, 0, -1)
-                response = scatter_rows(response, slot, first, row)
-                if scores is not None:
-                    assert scored is not None
-                    given = part.extinction, part.backscatter * visible * share
-                    rows = rows_of_stretches(setting, m == leaf, way, low, stretch, kappa, *given)
-                    scored = scatter_columns(scored, slot, first, rows)
-            for history, share in out_way.terms(table, 0, middle, before):
-                weight = part.extinction * passing * share * sent.energy
-                arrived = _add(arrived, m * count + history, weight)
-        return response, arrived, scored
+                returned = add_rows(returned, entry, first_bin, row)
+                if slopes is not None:
+                    assert return_slopes is not None
+                    rows = segment_derivatives(
+                        scene,
+                        m == leaf_material,
+                        w,
+                        start_position,
+                        segments,
+                        kappa,
+                        material.extinction,
+                        material.intensity_factor * seen_energy * factor,
+                    )
+                    return_slopes = add_column_rows(return_slopes, entry, first_bin, rows)
+            for history, factor in one_passage.terms(table, 0, middle, distances):
+                weight = material.extinction * passing * factor * rays.energy
+                arrived = _add(arrived, m * n_histories + history, weight)
+        return _FirstOrderTally(returned, arrived, return_slopes)
 
-    def rays(across, energy):
-        x, w, excess, energy, met, stop = sent = sent_rays(setting, across, energy)
-        visible = energy * beam.in_view(along(x, w, jnp.minimum(stop, plan.upstream)))
-        response = jnp.zeros((materials * count, bins.padded), energy.dtype)
-        arrived = jnp.zeros((materials * count,), energy.dtype)
-        scattered, escaped = arrived, jnp.zeros((count,), energy.dtype)
-        at_stops, total = [jnp.zeros_like(energy) for _ in met], jnp.zeros_like(energy)
-        scored, moved = None, []
-        if scores is not None:
-            scored = jnp.zeros((materials * count, bins.padded, scores.count), energy.dtype)
+    def trace_chunk(across, energy):
+        rays = send_rays(scene, across, energy)
+        x, w, excess, energy, distances, end = rays
+        # What the receiver sees of a ray, at the ground or at the reference plane: beams are narrow in angle.
+        seen_energy = energy * beam.in_view(along(x, w, jnp.minimum(end, scene.limits.start_distance)))
+        returned = jnp.zeros((n_materials * n_histories, bins.padded), energy.dtype)
+        arrived = jnp.zeros((n_materials * n_histories,), energy.dtype)
+        scattered, escaped = arrived, jnp.zeros((n_histories,), energy.dtype)
+        depth_at_surfaces, total_depth = [jnp.zeros_like(energy) for _ in distances], jnp.zeros_like(energy)
+        return_slopes, slopes_at_surfaces = None, []
+        if slopes is not None:
+            return_slopes = jnp.zeros((n_materials * n_histories, bins.padded, slopes.count), energy.dtype)
 
         if medium is not None:
-            stretch, at_stops, total = march_rays(setting, sent)
-            if scores is not None:
-                stretch, moved = with_scores(setting, stretch, w, met)
+            segments, depth_at_surfaces, total_depth = march_rays(scene, rays)
+            if slopes is not None:
+                segments, slopes_at_surfaces = with_depth_slopes(scene, segments, w, distances)
 
-            tally, light = (response, arrived, scored), (sent, visible)
-            if setting.reverse:
+            tally, per_ray = _FirstOrderTally(returned, arrived, return_slopes), (rays, seen_energy)
+            if scene.reverse:
 
-                def step(tally, stretch):
-                    return deposited(tally, stretch, light), None
+                def step(tally, segments):
+                    return add_segments(tally, segments, per_ray), None
 
-                response, arrived, scored = lax.scan(step, tally, stretch)[0]
+                # Blocks are a loop of unknown length, which has no reverse derivative.
+                returned, arrived, return_slopes = lax.scan(step, tally, segments)[0]
             else:
-                there = stretch.extinction > 0.0 if setting.derivatives == "none" else None
-                response, arrived, scored = in_blocks(deposited, tally, stretch, light, there)
-            # Smoothing is linear, so only the sum is smoothed. All that collides is scattered.
-            response, scattered = smooth_row(response, bins.kernel)[:, 1:-1], arrived
-            if scored is not None:
-                smooth = smooth_row(jnp.swapaxes(scored, 1, 2), bins.kernel)[..., 1:-1]
-                scored = jnp.swapaxes(smooth, 1, 2)
+                # Segments of zero extinction return nothing, but have derivatives.
+                counts = segments.extinction > 0.0 if scene.derivatives == "none" else None
+                returned, arrived, return_slopes = add_in_blocks(
+                    add_segments, tally, segments, per_ray, counts
+                )
+            # All that collides in the medium is scattered.
+            returned, scattered = smooth_bins(returned)[:, 1:-1], arrived
+            if return_slopes is not None:
+                smooth = smooth_bins(jnp.swapaxes(return_slopes, 1, 2))[..., 1:-1]
+                return_slopes = jnp.swapaxes(smooth, 1, 2)
 
-        for i, (s, scatterer) in enumerate(zip(surfaces, plan.surfaces)):
+        for i, (surface, scatterer) in enumerate(zip(surfaces, config.surfaces)):
             if mirror is not None and i != mirror:
                 continue
-            hit = jnp.where((met[i] <= stop) & (met[i] < FAR), s.coverage * energy, 0.0)
-            at = along(x, w, jnp.where(met[i] < FAR, met[i], 0.0))
-            normal, back = s.lit_normal(at, w), scale(w, jnp.asarray(-1.0))
-            for history, share in out_way.terms(table, 0, met[i], met):
-                weight = hit * jnp.exp(-at_stops[i]) * share
-                slot = scatterer.material * count + history
-                arrived = _add(arrived, slot, weight)
-                scattered = _add(scattered, slot, weight * s.by_place(at, s.law.albedo(w, normal)))
-            if mirror is None and isinstance(s.law, AbstractMirror):
+            is_met = distances[i] < FAR
+            hit_energy = jnp.where((distances[i] <= end) & is_met, surface.coverage * energy, 0.0)
+            point = along(x, w, jnp.where(is_met, distances[i], 0.0))
+            normal, back = surface.lit_normal(point, w), scale(w, jnp.asarray(-1.0))
+            for history, factor in one_passage.terms(table, 0, distances[i], distances):
+                weight = hit_energy * jnp.exp(-depth_at_surfaces[i]) * factor
+                entry = scatterer.material * n_histories + history
+                arrived = _add(arrived, entry, weight)
+                albedo = surface.at_position(point, surface.law.albedo(w, normal))
+                scattered = _add(scattered, entry, weight * albedo)
+            if mirror is None and isinstance(surface.law, AbstractMirror):
                 continue
-            seen = s.by_place(at, beam.in_view(at))
+            seen = surface.at_position(point, beam.in_view(point))
             if mirror is None:
-                seen = s.law.view_factor(w, normal, back, beam.half_angle) * seen
-            time = 2.0 * (excess + jnp.minimum(met[i], 1e9)) / SPEED_OF_LIGHT
-            first, row = instant_row(bins, time, hit * seen * jnp.exp(-kappa * at_stops[i]))
-            for history, share in both_ways.terms(table, int(successor[0, scatterer.reflected]), met[i], met):
-                slot = jnp.broadcast_to(scatterer.material * count + history, first.shape)
-                response = scatter_rows(response, slot, first, row * share[:, None])
-                if scored is not None:
-                    rows = rows_of(lax.stop_gradient(row * share[:, None]), -kappa * moved[i])
-                    scored = scatter_columns(scored, slot, first, rows)
+                seen = surface.law.intensity_factor(w, normal, back, beam.half_angle) * seen
+            # FAR would overflow when it is converted to bins.
+            time = 2.0 * (excess + jnp.minimum(distances[i], 1e9)) / SPEED_OF_LIGHT
+            first_bin, row = bspline_row(
+                bins, time, hit_energy * seen * jnp.exp(-kappa * depth_at_surfaces[i])
+            )
+            reflected_history = int(next_history[0, scatterer.reflection])
+            for history, factor in two_passages.terms(table, reflected_history, distances[i], distances):
+                entry = jnp.broadcast_to(scatterer.material * n_histories + history, first_bin.shape)
+                returned = add_rows(returned, entry, first_bin, row * factor[:, None])
+                if return_slopes is not None:
+                    values = lax.stop_gradient(row * factor[:, None])
+                    rows = outer_rows(values, -kappa * slopes_at_surfaces[i])
+                    return_slopes = add_column_rows(return_slopes, entry, first_bin, rows)
 
-        gone = jnp.where(stop < FAR, 0.0, energy * jnp.exp(-total))
-        for history, share in out_way.terms(table, 0, stop, met):
-            escaped = _add(escaped, history, gone * share)
-        shape = (materials, count)
-        if scored is not None:
-            scored = scored[:, bins.row : bins.row + bins.count].reshape(*shape, bins.count, -1)
-        return response, (arrived.reshape(shape), scattered.reshape(shape), escaped), scored
+        unscattered = jnp.where(end < FAR, 0.0, energy * jnp.exp(-total_depth))
+        for history, factor in one_passage.terms(table, 0, end, distances):
+            escaped = _add(escaped, history, unscattered * factor)
+        shape = (n_materials, n_histories)
+        if return_slopes is not None:
+            return_slopes = return_slopes[:, bins.max_span : bins.max_span + bins.count]
+            return_slopes = return_slopes.reshape(*shape, bins.count, -1)
+        return returned, (arrived.reshape(shape), scattered.reshape(shape), escaped), return_slopes
 
-    n = energy.shape[0]
-    fill = -n % CHUNK
-    padded = [jnp.pad(a, (0, fill)).reshape(-1, CHUNK) for a in (*across, energy)]
+    n_rays = energy.shape[0]
+    fill = -n_rays % RAYS_AT_ONCE
+    padded = [jnp.pad(a, (0, fill)).reshape(-1, RAYS_AT_ONCE) for a in (*across, energy)]
 
     def chunk(x, y, e):
-        return rays((x, y), e)
+        return trace_chunk((x, y), e)
 
-    if n <= CHUNK:
-        response, fate, scored = rays(across, energy)
+    if n_rays <= RAYS_AT_ONCE:
+        returned, budget, weight_slopes = trace_chunk(across, energy)
     elif medium is None:
         # Without a march all chunks fit into the memory at once, and no loop is compiled.
-        each = jax.vmap(chunk)(*padded)
-        response, fate, scored = jax.tree.map(lambda a: jnp.sum(a, axis=0), each)
+        chunks = jax.vmap(chunk)(*padded)
+        returned, budget, weight_slopes = jax.tree.map(lambda a: jnp.sum(a, axis=0), chunks)
     else:
-        zero = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(rays, across, energy))
+        shapes = jax.eval_shape(trace_chunk, across, energy)
+        zero = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), shapes)
 
-        def add(total, part):
-            return jax.tree.map(jnp.add, total, chunk(*part)), None
+        def add(total, rays):
+            return jax.tree.map(jnp.add, total, chunk(*rays)), None
 
-        response, fate, scored = lax.scan(add, zero, padded)[0]
-    weights, outside = bins.trimmed(response.reshape(materials, count, bins.padded))
-    arrived, scattered, escaped = fate
-    return FirstOrder(weights, outside, arrived, scattered, escaped, scored)
-
-
-def _together(slot: Int[Array, "*s"] | int, weight: Float[Array, "*s"]):
-    """Slots and weights to add; one sum where all rays have the same slot."""
-    return (slot, jnp.sum(weight)) if isinstance(slot, int) else (slot, weight)
+        returned, budget, weight_slopes = lax.scan(add, zero, padded)[0]
+    weights, outside = bins.trim(returned.reshape(n_materials, n_histories, bins.padded))
+    arrived, scattered, escaped = budget
+    return FirstOrder(weights, outside, arrived, scattered, escaped, weight_slopes)
 
 
 def _add(
-    into: Float[Array, "slots"], slot: Int[Array, "*s"] | int, weight: Float[Array, "*s"]
-) -> Float[Array, "slots"]:
-    slot, weight = _together(slot, weight)
-    return into.at[slot].add(weight)
+    tally: Float[Array, "entries"], entry: Int[Array, "*s"] | int, weight: Float[Array, "*s"]
+) -> Float[Array, "entries"]:
+    """Add weights to entries; as one sum where all rays have the same entry."""
+    weight = jnp.sum(weight) if isinstance(entry, int) else weight
+    return tally.at[entry].add(weight)
 
 
-class Part(eqx.Module):
-    """One material of the medium on a ray: its extinction, view factor for backscatter, and letter."""
+class MediumMaterial(eqx.Module):
+    """A material along rays: extinction, 1/m, intensity factor for backscatter, and channel."""
 
     extinction: Float[Array, "..."]
-    backscatter: Float[Array, "..."] | float
-    letter: int = eqx.field(static=True)
+    intensity_factor: Float[Array, "..."] | float
+    channel: int = eqx.field(static=True)
 
 
-def _parts(medium: Medium, plan: TracePlan, stretch: Stretches, w: Vec) -> Iterator[tuple[int, Part]]:
-    """Number of each material of the medium, and what it returns from stretches of rays along `w`."""
+def _medium_materials(
+    medium: Medium, config: TraceConfig, segments: RaySegments, w: Vec
+) -> Iterator[tuple[int, MediumMaterial]]:
+    """Yield the number of each material of the medium, and its properties along segments."""
     back = scale(w, jnp.asarray(-1.0))
-    if medium.leaf is not None and plan.leaf is not None:
-        k = stretch.extinction if medium.bark is None else medium.leaf_at(stretch.cell, w)
+    if medium.leaf is not None and config.leaf is not None:
+        # Without the other material, the segment's extinction is this material's: no second look-up.
+        k = segments.extinction if medium.bark is None else medium.leaf_extinction(segments.cell, w)
         factor = FACET_BACKSCATTER
         if medium.leaf_phase is not None:
-            factor = medium.leaf_phase.view_factor(w, back)
-        elif medium.angles is not None:
-            factor = medium.angles.square_at(w) / medium.angles.projection_at(w)
-        yield plan.leaf.material, Part(k, factor, plan.leaf.reflected)
-    if medium.bark is not None and plan.bark is not None:
-        k = stretch.extinction if medium.leaf is None else medium.bark_at(stretch.cell)
+            factor = medium.leaf_phase.intensity_factor(w, back)
+        elif medium.angle_tables is not None:
+            # Mean of |n.w| |n.back| over facets that are hit, with density g(n) |n.w| / G.
+            factor = medium.angle_tables.squared_cosine_at(w) / medium.angle_tables.projection_at(w)
+        yield config.leaf.material, MediumMaterial(k, factor, config.leaf.reflection)
+    if medium.bark is not None and config.bark is not None:
+        k = segments.extinction if medium.leaf is None else medium.bark_extinction(segments.cell)
         factor = FACET_BACKSCATTER
         if medium.bark_phase is not None:
-            factor = medium.bark_phase.view_factor(w, back)
-        yield plan.bark.material, Part(k, factor, plan.bark.reflected)
+            factor = medium.bark_phase.intensity_factor(w, back)
+        yield config.bark.material, MediumMaterial(k, factor, config.bark.reflection)

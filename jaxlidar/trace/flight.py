@@ -1,4 +1,19 @@
-"""Flights: what a photon meets next, and how far it flies."""
+"""Flights: how far a photon flies, and what ends its flight.
+
+A flight ends at the nearest of: a collision in the medium, at the optical depth
+
+    tau = -ln u,   u uniform in (0, 1);
+
+a surface that stops the photon (the ground; a plate unless the photon passes a gap, or is transmitted
+straight on); the length beyond which its light could not be recorded any more; or it leaves the scene.
+
+Derivatives: the collision point is held at a fixed fraction of its chord through the voxel (detached), so
+that it moves with voxel sizes and heights, and the weight carries the attached ratio of its density
+
+    p(s) ds = k exp(-tau) ds  ->  (k and exp(-tau) and the chord, each over its detached value).
+
+The factor k is attached where the collision's material is known (`jaxlidar.trace.collisions`).
+"""
 
 import functools
 
@@ -8,19 +23,19 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxlidar._vectors import FAR, Scalar, with_derivative_of
-from jaxlidar.trace.march import free_flight
-from jaxlidar.trace.photons import EVENT, GAP, THROUGH, Photons, ratio_of, stop
-from jaxlidar.trace.setting import Setting
+from jaxlidar.trace.device_scene import DeviceScene
+from jaxlidar.trace.photons import GAP, SCATTERED, TRANSMITTED, Photons, attached_ratio, detach
+from jaxlidar.trace.voxel_traversal import march_to_depths
 
 
 class Flight(eqx.Module):
-    """How flights end: in the medium, on a surface, after the window, or never.
+    """The ends of flights: in the medium, on a surface, after the record, or never.
 
-    - `collided`, `landed`, `late`, `escaped`: which of these.
-    - `cell`: the last voxel.
-    - `distance`: flown, m.
-    - `density`: ratio of the density of that distance.
-    - `moved`: derivatives of the optical depth flown, where scores are asked for.
+    - `collided`, `landed`, `late`, `escaped`: which of these, all False for photons that are not alive.
+    - `cell`: the voxel of a collision.
+    - `distance`: length flown, m.
+    - `ratio`: attached ratio of the density of that distance.
+    - `depth_slopes`: derivatives of the optical depth flown, where scores are asked for; else None.
     """
 
     collided: Bool[Array, "*photons"]
@@ -29,92 +44,121 @@ class Flight(eqx.Module):
     escaped: Bool[Array, "*photons"]
     cell: Int[Array, "*photons"]
     distance: Float[Array, "*photons"]
-    density: Float[Array, "*photons"]
-    moved: Float[Array, "ends columns photons"] | None = None
+    ratio: Float[Array, "*photons"]
+    depth_slopes: Float[Array, "ends columns photons"] | None = None
 
     @property
-    def event(self) -> Bool[Array, "*photons"]:
-        """Whether anything was hit."""
+    def has_hit(self) -> Bool[Array, "*photons"]:
+        """True if anything was hit."""
         return self.collided | self.landed
 
-    def landed_on(self, events: list[Scalar], limit: Scalar) -> list[Bool[Array, "*photons"]]:
-        """For each surface, whether the flight ends on it."""
-        return [self.landed & (event <= limit) for event in events]
+    def landed_on(self, encounters: "SurfaceEncounters") -> list[Bool[Array, "*photons"]]:
+        """For each surface, True if the flight ends on it."""
+        return [self.landed & (stop <= encounters.nearest_stop) for stop in encounters.stops]
 
 
-def fly(
-    setting: Setting,
-    p: Photons,
-    limit: Float[Array, "photons"],
-    budget: Float[Array, "photons"],
-    u: Float[Array, "ends photons"],
-) -> Flight:
-    """Let photons fly to collisions at the optical depths -log(u), to a surface at `limit`, or on.
+class SurfaceEncounters(eqx.Module):
+    """The surfaces ahead of photons, and what will happen there.
 
-    `budget` is the length in m that is left of the window. A flight has one end for each number in `u`.
+    - `distances`: to each surface, m; FAR where it is not met.
+    - `outcomes`: for each plate GAP, SCATTERED or TRANSMITTED; None for the ground.
+    - `ratios`: for each plate, attached ratio of that outcome; None for the ground.
+    - `stops`: distance to each surface if the photon will stop there, else FAR.
+    - `nearest_stop`: distance to the nearest surface at which the photon stops.
     """
-    reach = jnp.minimum(limit, budget)
-    wide = functools.partial(jnp.broadcast_to, shape=u.shape)
-    if setting.medium is None:
-        collided = in_medium = jnp.zeros(u.shape, bool)
-        distance, density = wide(reach), jnp.ones_like(u)
-        cell, moved = jnp.zeros(u.shape, jnp.int32), None
-    else:
-        medium, target = setting.medium, -jnp.log(u)
-        steps, box = setting.plan.march_steps, setting.occupied
-        how = {"reverse": setting.reverse, "scores": setting.scores}
-        free = free_flight(medium, p.x, p.w, target, reach, p.alive, steps, box, **how)
-        collided, cell, moved = free.collided, free.cell, free.moved
-        k = jnp.where(collided, jax.vmap(medium.extinction, (0, None))(cell, p.w), 1.0)
-        chord = jnp.where(collided, free.chord, 1.0)
-        part = jnp.clip((target - free.depth) / jnp.maximum(k * chord, 1e-30), 0.0, 1.0)
-        part = stop(jnp.where(collided, part, 0.0))
-        depth = jnp.where(collided, free.depth + part * k * chord, wide(free.total))
-        distance = jnp.where(collided, free.entered + part * chord, wide(reach))
-        density = jnp.exp(stop(depth) - depth) * chord / stop(chord)
-        density = with_derivative_of(jnp.ones_like(density), density)
-        in_medium = ~collided & wide(free.distance >= budget)
-    alive = wide(p.alive)
-    landed = alive & ~collided & wide(limit < budget)
-    collided = alive & collided
-    nothing = alive & ~collided & ~landed
-    late = nothing & (wide(limit < FAR) | in_medium)
-    return Flight(collided, landed, late, nothing & ~late, cell, distance, density, moved)
+
+    distances: list[Scalar]
+    outcomes: list[Int[Array, "*photons"] | None]
+    ratios: list[Scalar | None]
+    stops: list[Scalar]
+    nearest_stop: Scalar
 
 
-def events_of(setting: Setting, met: list[Scalar], outcomes: list) -> list[Scalar]:
-    """Distance to each surface if the photon will stop there, else FAR."""
-    return [
-        d if not s.plate else jnp.where(o == EVENT, d, FAR)
-        for d, s, o in zip(met, setting.surfaces, outcomes)
-    ]
+def meet_surfaces(scene: DeviceScene, p: Photons, draws: tuple[Scalar, ...]) -> SurfaceEncounters:
+    """Find the surfaces ahead of photons, and sample the outcome at each plate.
 
-
-def nearest(p: Photons, events: list[Scalar]) -> Scalar:
-    """Distance to the nearest surface at which the photon stops."""
-    limit = jnp.full_like(p.weight, FAR)
-    for d in events:
-        limit = jnp.minimum(limit, d)
-    return limit
-
-
-def plates_ahead(setting: Setting, p: Photons, ahead: tuple[Scalar, ...]):
-    """Distance to each surface, what will happen at each plate, and the density ratio of that outcome."""
-    met, outcomes, ratios = [], [], []
-    drawn = iter(ahead)
-    for i, s in enumerate(setting.surfaces):
-        distance = s.distance(p.x, p.w)
-        met.append(distance if s.shape.lights_itself else jnp.where(p.on == i, FAR, distance))
-        if not s.plate:
+    `draws`: one uniform number for each plate.
+    """
+    distances, outcomes, ratios, stops = [], [], [], []
+    remaining_draws = iter(draws)
+    for i, surface in enumerate(scene.surfaces):
+        distance = surface.distance(p.x, p.w)
+        if not surface.shape.lights_itself:
+            # A photon starts on this surface within rounding, and would meet it at once.
+            distance = jnp.where(p.surface == i, FAR, distance)
+        distances.append(distance)
+        if not surface.is_plate:
             outcomes.append(None)
             ratios.append(None)
+            stops.append(distance)
             continue
-        v, c = next(drawn), jnp.broadcast_to(s.coverage, p.weight.shape)
-        hit = v < c
-        outcome = jnp.where(hit, EVENT, GAP)
-        if s.straight and setting.plan.surfaces[i].transmitted >= 0:
-            # The lobe is chosen with the number that decided that the plate was hit.
-            outcome = jnp.where(hit & (v >= c * setting.plan.lobe), THROUGH, outcome)
+        u, coverage = next(remaining_draws), jnp.broadcast_to(surface.coverage, p.weight.shape)
+        is_hit = u < coverage
+        outcome = jnp.where(is_hit, SCATTERED, GAP)
+        if surface.straight and scene.config.surfaces[i].transmission >= 0:
+            # The number that decided that the plate was hit decides between reflection and transmission, too.
+            transmitted = is_hit & (u >= coverage * scene.limits.reflection_probability)
+            outcome = jnp.where(transmitted, TRANSMITTED, outcome)
         outcomes.append(outcome)
-        ratios.append(ratio_of(jnp.where(hit, c, 1.0 - c)))
-    return met, outcomes, ratios
+        ratios.append(attached_ratio(jnp.where(is_hit, coverage, 1.0 - coverage)))
+        stops.append(jnp.where(outcome == SCATTERED, distance, FAR))
+    nearest_stop = jnp.full_like(p.weight, FAR)
+    for stop in stops:
+        nearest_stop = jnp.minimum(nearest_stop, stop)
+    return SurfaceEncounters(distances, outcomes, ratios, stops, nearest_stop)
+
+
+def sample_flights(
+    scene: DeviceScene,
+    p: Photons,
+    nearest_stop: Float[Array, "photons"],
+    max_length: Float[Array, "photons"],
+    u: Float[Array, "ends photons"],
+) -> Flight:
+    """Let photons fly to collisions at the optical depths -ln(u), to a surface at `nearest_stop`, or on.
+
+    A flight has one end for each number in `u`; `max_length`, m, is how far it can be recorded. The steps:
+
+    1. March to the target depths, at most to the nearest stop or to `max_length`.
+    2. Place each collision within its voxel, where the depth is linear, at a detached fraction of the chord.
+    3. Attach the ratio of its density: exp(-tau) times the chord.
+    4. Sort out what ended the flight.
+    """
+    max_distance = jnp.minimum(nearest_stop, max_length)
+    to_ends = functools.partial(jnp.broadcast_to, shape=u.shape)
+    if scene.medium is None:
+        collided = stopped_in_medium = jnp.zeros(u.shape, bool)
+        distance, ratio = to_ends(max_distance), jnp.ones_like(u)
+        cell, depth_slopes = jnp.zeros(u.shape, jnp.int32), None
+    else:
+        medium, target = scene.medium, -jnp.log(u)
+        crossing = march_to_depths(
+            medium,
+            p.x,
+            p.w,
+            target,
+            max_distance,
+            p.alive,
+            scene.config.max_faces,
+            scene.occupied_box,
+            reverse=scene.reverse,
+            slopes=scene.slopes,
+        )
+        collided, cell, depth_slopes = crossing.crossed, crossing.cell, crossing.depth_slopes
+        k = jnp.where(collided, jax.vmap(medium.extinction, (0, None))(cell, p.w), 1.0)
+        chord = jnp.where(collided, crossing.chord, 1.0)
+        # Guards against 0/0 where a voxel is empty or the chord zero.
+        fraction = jnp.clip((target - crossing.depth) / jnp.maximum(k * chord, 1e-30), 0.0, 1.0)
+        fraction = detach(jnp.where(collided, fraction, 0.0))
+        depth = jnp.where(collided, crossing.depth + fraction * k * chord, to_ends(crossing.total_depth))
+        distance = jnp.where(collided, crossing.entered + fraction * chord, to_ends(max_distance))
+        ratio = jnp.exp(detach(depth) - depth) * chord / detach(chord)
+        ratio = with_derivative_of(jnp.ones_like(ratio), ratio)
+        stopped_in_medium = ~collided & to_ends(crossing.distance >= max_length)
+    alive = to_ends(p.alive)
+    landed = alive & ~collided & to_ends(nearest_stop < max_length)
+    collided = alive & collided
+    hits_nothing = alive & ~collided & ~landed
+    # Beyond `max_length` there is a surface, or still medium: its light comes after the record.
+    late = hits_nothing & (to_ends(nearest_stop < FAR) | stopped_in_medium)
+    return Flight(collided, landed, late, hits_nothing & ~late, cell, distance, ratio, depth_slopes)

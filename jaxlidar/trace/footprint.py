@@ -1,17 +1,24 @@
 """The cross-section of the beam as a set of rays, and the geometry between rays and sensor.
 
-Positions are relative to where the beam axis meets the reference plane, and path lengths to the slant range
-of that point: no number grows with the altitude, so single precision is enough at 400 km.
+Positions are relative to the aim point, where the beam axis a meets the reference plane, and path lengths to
+the slant range R of that point: no number grows with the altitude, so that single precision is enough at 400
+km. The distance of a point x from the sensor at -R a is |x + R a| = R + excess(x), computed without
+cancellation as
+
+    excess = q / (1 + sqrt(1 + q / R)),   q = 2 x.a + |x|^2 / R.
+
+Rays carry equal energies. Of a Gaussian beam with the radius w (at 1/e^2) the circle of radius r encloses the
+share 1 - exp(-2 r^2 / w^2); of a top-hat r^2 / w^2. Rays lie on a Fibonacci disc: shares of equal steps,
+directions that turn by the golden angle.
 """
 
 import dataclasses
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Int
 
 from jaxlidar._vectors import FAR, Scalar, Vec, add, dot, from_frame, normalise, scale, vec
 from jaxlidar.instrument.field_of_view import seen
@@ -23,7 +30,12 @@ GOLDEN = (np.sqrt(5.0) - 1) / 2
 class Beam(eqx.Module):
     """Axis, slant range and receiver of a lidar, as the tracer needs them.
 
-    `parallel`: whether all rays are parallel to the axis, and the receiver is as far away as it is wide.
+    - `axis`: direction of the beam. `slant_range`: from the sensor to the aim point, m.
+    - `radius`: of the footprint at 1/e^2 or of the top-hat, m across the beam at the aim point.
+    - `half_angle`: that the aperture subtends at the aim point, rad.
+    - `view_radius`: of the field of view at the aim point, m across the beam; None where everything is seen.
+    - `gaussian`: True for a Gaussian profile. `parallel`: True if all rays are parallel to the axis, as for
+      light that shots share; the receiver then sees all of the scene.
     """
 
     axis: Vec
@@ -50,7 +62,8 @@ class Beam(eqx.Module):
     def excess(self, point: Vec) -> Scalar:
         """Distance from the sensor minus the slant range, m, computed without cancellation."""
         if self.parallel:
-            # The front of a beam is curved: light of the footprint comes later by this in the mean.
+            # A beam's wave front is curved: its light arrives later by w^2 / (4 R) in the mean over the
+            # footprint.
             return dot(point, self.axis) + 0.25 * self.radius**2 / self.slant_range
         r = self.slant_range
         x = 2.0 * dot(point, self.axis) + dot(point, point) / r
@@ -62,33 +75,35 @@ class Beam(eqx.Module):
             return vec(jnp.broadcast_to(-c, point[0].shape) for c in self.axis)
         return normalise(add(scale(self.axis, -self.slant_range), scale(point, jnp.asarray(-1.0))))
 
-    def budget(self, x: Vec, w: Vec, left: Scalar) -> Scalar:
-        """How far, m, light may fly from `x` along `w` and be back at the sensor within `left` m.
+    def longest_flight(self, x: Vec, w: Vec, max_path: Scalar) -> Scalar:
+        """Return how far, m, light may fly from `x` along `w` so that it can be back within `max_path` m.
 
-        `left` is relative to the slant range. The way back begins on an ellipsoid about `x` and the sensor.
+        `max_path` is the length of flight and return path, less the slant range. The points from which light
+        returns in time form an ellipsoid with foci `x` and the sensor; the flight may reach its surface.
         """
         r, out = self.slant_range, self.excess(x)
         if self.parallel:
-            # Near zero only for light that is on its way back, which may fly on.
-            flight = (left - out) / jnp.maximum(1.0 + dot(self.axis, w), 1e-9)
-            return jnp.where(left < out, 0.0, jnp.minimum(flight, FAR))
-        divisor = r * (1.0 + dot(self.axis, w)) + left + dot(x, w)
-        flight = 0.5 * (left - out) * (2.0 * r + left + out) / jnp.where(divisor > 0, divisor, 1.0)
-        return jnp.where(left < out, 0.0, jnp.where(divisor > 0, jnp.minimum(flight, FAR), FAR))
+            # The divisor is near zero only for light that flies back to the sensor, which may fly on.
+            flight = (max_path - out) / jnp.maximum(1.0 + dot(self.axis, w), 1e-9)
+            return jnp.where(max_path < out, 0.0, jnp.minimum(flight, FAR))
+        divisor = r * (1.0 + dot(self.axis, w)) + max_path + dot(x, w)
+        flight = 0.5 * (max_path - out) * (2.0 * r + max_path + out) / jnp.where(divisor > 0, divisor, 1.0)
+        return jnp.where(max_path < out, 0.0, jnp.where(divisor > 0, jnp.minimum(flight, FAR), FAR))
 
     def in_view(self, point: Vec) -> Scalar:
-        """Share of the light from `point` that the receiver sees, 0..1: its field of view has a soft edge."""
+        """Fraction of the light from `point` that the receiver sees; the field of view has a soft edge."""
         if self.view_radius is None:
             return jnp.ones_like(point[0])
-        along = dot(point, self.axis)
-        off2 = dot(point, point) - along * along
+        beyond_aim = dot(point, self.axis)
+        off_axis2 = dot(point, point) - beyond_aim * beyond_aim
         # The field widens with distance from the sensor.
-        edge = self.view_radius * (1.0 + along / self.slant_range)
-        off = jnp.sqrt(jnp.maximum(off2, 1e-12 * edge * edge))
-        return seen(off / edge)
+        edge = self.view_radius * (1.0 + beyond_aim / self.slant_range)
+        # The floor keeps the derivative of the root finite on the axis.
+        off_axis = jnp.sqrt(jnp.maximum(off_axis2, 1e-12 * edge * edge))
+        return seen(off_axis / edge)
 
     def irradiance(self, across: tuple[Scalar, Scalar]) -> Scalar:
-        """Share of the pulse's energy per m2 across the beam."""
+        """Fraction of the pulse's energy per m2 across the beam, at x and y across it, m."""
         r2 = across[0] ** 2 + across[1] ** 2
         w2 = jnp.maximum(self.radius, 1e-6) ** 2
         if self.gaussian:
@@ -96,8 +111,8 @@ class Beam(eqx.Module):
         return jnp.where(r2 <= w2, 1.0 / (np.pi * w2), 0.0)
 
 
-def beam_of(lidar: Lidar) -> Beam:
-    """The beam of a lidar."""
+def make_beam(lidar: Lidar) -> Beam:
+    """Make the beam of a lidar."""
     slant = lidar.range_to_reference
     view = None if lidar.field_of_view is None else slant * lidar.field_of_view * 0.5e-3
     return Beam(
@@ -111,65 +126,60 @@ def beam_of(lidar: Lidar) -> Beam:
 
 
 def parallel_beam(lidar: Lidar) -> Beam:
-    """Parallel light from where the lidar is. Rays may be anywhere across it; all of the scene is seen."""
-    beam = beam_of(lidar)
+    """Make a beam of parallel light in the lidar's direction, for a receiver that sees everything."""
+    beam = make_beam(lidar)
     return dataclasses.replace(beam, view_radius=None, gaussian=False, parallel=True)
 
 
 def disc(radius: Scalar, turn: Scalar) -> tuple[Scalar, Scalar]:
-    """Coordinates of the point at `radius` in the direction `turn`, in turns."""
+    """Return x and y of the point at `radius` in the direction `turn`, in turns."""
     return radius * jnp.cos(2 * np.pi * turn), radius * jnp.sin(2 * np.pi * turn)
 
 
-def across_beam(beam: Beam, share: Scalar, turn: Scalar) -> tuple[Scalar, Scalar]:
-    """The point, m, in the direction `turn`, whose radius encloses the share `share` of the energy."""
-    share = jnp.clip(share, 0.0, 1.0 - 1e-7)
-    return disc(beam.radius * jnp.sqrt(-0.5 * jnp.log1p(-share) if beam.gaussian else share), turn)
+def across_beam(beam: Beam, energy_fraction: Scalar, turn: Scalar) -> tuple[Scalar, Scalar]:
+    """Return the point across the beam, m, whose circle encloses `energy_fraction`."""
+    enclosed = jnp.clip(energy_fraction, 0.0, 1.0 - 1e-7)
+    return disc(beam.radius * jnp.sqrt(-0.5 * jnp.log1p(-enclosed) if beam.gaussian else enclosed), turn)
 
 
-class Slice(NamedTuple):
-    """Which part of a footprint's rays: number `number`, from 0, of `count` parts of one size."""
+class RaySlice(NamedTuple):
+    """A slice of a footprint's rays: number `number`, from 0, of `count` slices of one size."""
 
     number: Int[Array, ""] | int = 0
     count: Int[Array, ""] | int = 1
 
 
-# All rays are one part.
-WHOLE = Slice()
+ALL_RAYS = RaySlice()
 
 
-def lattice(
-    beam: Beam, count: int, shift: Float[Array, "2"], part: Slice = WHOLE
+def fibonacci_disc(
+    beam: Beam, count: int, shift: Float[Array, "2"], ray_slice: RaySlice = ALL_RAYS
 ) -> tuple[tuple[Scalar, Scalar], Float[Array, "rays"]]:
-    """A Fibonacci disc of rays of equal energy; `shift` in [0, 1) moves it along both coordinates.
+    """Return a Fibonacci disc of rays of equal energy; `shift` in [0, 1) moves it along both coordinates.
 
-    It has `count` rays in each of its parts. Those of `part` carry all energy, so that the mean of all parts
-    is what the disc gives.
+    The disc has `count` rays in each of its slices. Those of `ray_slice` carry all energy, so that the mean
+    over slices is the result of the whole disc.
+
+    **Returns:** x and y across the beam, m, and fractions of the energy.
     """
-    before = jnp.asarray(part.number * count)
-    u = (before + jnp.arange(count) + shift[0]) / (count * part.count)
-    # Whole numbers overflow as turns do, and lose nothing where there are many rays.
+    before = jnp.asarray(ray_slice.number * count)
+    u = (before + jnp.arange(count) + shift[0]) / (count * ray_slice.count)
+    # Integers overflow as turns do, and lose no digits where there are many rays.
     turned = (before.astype(jnp.uint32) * np.uint32(round(GOLDEN * 2**32))).astype(u.dtype) * 2.0**-32
     turn = jnp.asarray((np.arange(count) * GOLDEN) % 1.0, u.dtype) + turned + shift[1]
-    return across_beam(beam, u, turn), jnp.full((count,), 1.0 / count, u.dtype)
-
-
-def scattered(
-    beam: Beam, count: int, key: PRNGKeyArray
-) -> tuple[tuple[Scalar, Scalar], Float[Array, "rays"]]:
-    """`count` rays of equal energy at independent places."""
-    u, turn = jax.random.uniform(key, (2, count))
     return across_beam(beam, u, turn), jnp.full((count,), 1.0 / count, u.dtype)
 
 
 def product_rule(
     beam: Beam, radial: int = 12, angular: int = 32
 ) -> tuple[tuple[Scalar, Scalar], Float[Array, "rays"]]:
-    """Gauss rule in radius times equal steps in azimuth: spectrally accurate where the integrand is smooth.
+    """Return a Gauss rule in radius times equal steps in azimuth: spectrally accurate for smooth integrands.
 
     It is Gauss-Laguerre in 2 r^2 / w^2 for the Gaussian beam, and Gauss-Legendre in r^2 for the top-hat. At
-    the edge of a field of view the integrand is not smooth: there, pieces of a Gauss-Legendre rule in r end
+    the edge of a field of view the integrand is not smooth: there, panels of a Gauss-Legendre rule in r end
     at the edge.
+
+    **Returns:** as `fibonacci_disc`.
     """
     if beam.view_radius is not None:
         r, weight = _rule_with_edge(beam, beam.view_radius)
@@ -187,7 +197,7 @@ def product_rule(
 def _rule_with_edge(
     beam: Beam, edge: Float[Array, ""], order: int = 16
 ) -> tuple[Float[Array, "radii"], Float[Array, "radii"]]:
-    """Radii and shares of the energy: Gauss-Legendre in r on pieces that resolve a soft edge of 2 %."""
+    """Return radii and energy fractions: Gauss-Legendre panels that resolve a soft edge of 2 %."""
     # In units of the beam's radius; beyond four of them a Gaussian beam has 1e-14 of its energy.
     end = jnp.asarray(4.0 if beam.gaussian else 1.0, edge.dtype)
     at = edge / jnp.maximum(beam.radius, 1e-9)

@@ -1,405 +1,558 @@
-r"""Orders two and above: photons collide, scatter, and deposit the expected return of every collision.
+r"""Orders two and above: photons fly, collide, deposit the expected return of every collision, and scatter.
 
-Photons carry no energy, only the geometric weight of their path and the number of its history. Each order
-draws a collision: the optical depth to it, the material, the direction onward. From there the photon deposits
-the probability of returning (pi times the density of scattering towards the sensor, times the transmittance
-of the way there). It does so from several points of the flight, `plan.ends`, one in each stratum of the
-probability of getting there, and goes on from one of them.
+Photons carry no energy, only the geometric weight of their path and the number of its scattering history.
+Each order samples a collision: the optical depth to it, the material, the direction onward. From there the
+photon deposits, for every channel by which light may return (next-event estimation),
 
-Derivatives: what is drawn is held fixed (directions, materials, and the place of a collision as a fraction of
-the ray's chord through its voxel), and the density with which it was drawn stays in the weight as p /
-stop_gradient(p). Voxel sizes, heights and extinction move positions, path lengths and densities continuously,
-so the derivative of an expected value is the expected value of the derivative. Photons never collide where
-the extinction coefficient is exactly zero, and the derivative with respect to it is zero here.
+    weight * V(w -> v) * exp(-tau(x -> sensor)) * (fraction that the receiver sees),
+
+with V the intensity factor towards the sensor (`jaxlidar.trace.collisions`), at the time of the whole path.
+It does so from `deposits_per_flight` points of the flight, one in each stratum of the probability of getting
+there, each with an equal share of the weight, and goes on from one of them.
+
+Photons are grouped in chunks, which stay in the processor's cache, and chunks in groups. All chunks of a
+group are traced order by order, with living photons compacted before each order
+(`jaxlidar.trace.compaction`).
+
+Derivatives: decisions are detached, their densities attached (`jaxlidar.trace.photons`). Directions,
+materials, and the fraction of a chord at which a collision lies are held fixed; voxel sizes, heights and
+extinction move positions, path lengths and densities continuously, so that the expected value of the
+derivative is the derivative of the expected value. Photons never collide where the extinction coefficient is
+exactly zero, and the derivative with respect to it is zero here.
 """
 
 import dataclasses
 import functools
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt32
 
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._one_function import once
 from jaxlidar._vectors import FAR, Scalar, Vec, along
-from jaxlidar.trace.collisions import collide, shown, view_factors
-from jaxlidar.trace.deposit import instant_row, scatter_rows
-from jaxlidar.trace.flight import Flight, events_of, fly, nearest, plates_ahead
+from jaxlidar.trace.collisions import intensity_factors, sample_collision, visible_collision
+from jaxlidar.trace.compaction import compact
+from jaxlidar.trace.deposit import add_rows, bspline_row
+from jaxlidar.trace.device_scene import DeviceScene, not_scattered
+from jaxlidar.trace.entry_nodes import EntryNodes
+from jaxlidar.trace.flight import Flight, SurfaceEncounters, meet_surfaces, sample_flights
 from jaxlidar.trace.footprint import GOLDEN, across_beam
-from jaxlidar.trace.labels import Label, book
-from jaxlidar.trace.march import depth_to_top, free_flight
-from jaxlidar.trace.nodes import Nodes
-from jaxlidar.trace.ordering import in_order
-from jaxlidar.trace.photons import THROUGH, Met, Photons, ratio_of, stop
-from jaxlidar.trace.random_numbers import Draw, Independent, lattices, to_unit, words
-from jaxlidar.trace.reparametrise import (
-    footprint_rays,
+from jaxlidar.trace.photons import TRANSMITTED, Photons, VisibleCollision, attached_ratio, detach
+from jaxlidar.trace.random_numbers import PhotonDraws, random_words, shifted_lattices, to_unit
+from jaxlidar.trace.reparametrisation import (
+    landings_with_grids,
     moves_landings,
-    rays_to_surfaces,
-    rays_to_terrain,
-    sees_terrain,
+    moves_with_terrain,
+    rays_with_columns,
+    rays_with_terrain,
 )
-from jaxlidar.trace.scored_light import gains, rise, scored
-from jaxlidar.trace.setting import Setting, unscattered
+from jaxlidar.trace.score_functions import add_scored_returns, collision_score, vertical_depth_slopes
+from jaxlidar.trace.tally_index import TallyIndex, add_to_tally
+from jaxlidar.trace.voxel_traversal import depth_to_top, march_to_depths
 
-CHUNK = 256
+# Photons that are traced together, so that their state stays in the processor's cache.
+PHOTONS_PER_CHUNK = 256
 # Chunks that are traced together, order by order. Each group has its own sum: single precision loses small
 # deposits on a large sum.
-GROUP = 32
+CHUNKS_PER_GROUP = 32
 
 
-class HigherOrders(eqx.Module):
-    """Response of orders two and above, and the fate of all light (see `jaxlidar.trace.response`).
+class HigherOrderTally(eqx.Module):
+    """Response of orders two and above, and the energy budget of all light (see `jaxlidar.trace.response`).
 
-    The last axis but bins is that of histories; or, where optics are applied, of wavelengths, with `Nodes` of
-    nodes and wavelengths; `weights` and `outside` of shots and wavelengths, where shots see it (`Viewing`).
-    `scored`: derivatives of what returns, where scores are asked for.
+    The axis `entries` is that of histories; or, where optics are applied, of wavelengths, with `EntryNodes`
+    of nodes and wavelengths; that of `weights` and `outside` is of shots and wavelengths with `ShotViews`.
+
+    - `weights`, `outside`: returns within the bins and outside of them; with both margins while photons are
+      traced.
+    - `arrived`, `left`: weight that reached each material, and that went on from it.
+    - `escaped`, `late`, `remaining`: weight that left the scene, that could not be recorded any more, and
+      that had scatterings left when the last order was reached.
+    - `weight_slopes`: derivatives of the returns, where scores are asked for; else None.
     """
 
     weights: Float[Array, "materials seen bins"]
     outside: Float[Array, "materials seen"]
-    arrived: Float[Array, "materials labels"]
-    left: Float[Array, "materials labels"]
-    escaped: Float[Array, "labels"]
-    late: Float[Array, "labels"]
-    remaining: Float[Array, "labels"]
-    scored: Float[Array, "bins columns wavelengths"] | None = None
+    arrived: Float[Array, "materials entries"]
+    left: Float[Array, "materials entries"]
+    escaped: Float[Array, "entries"]
+    late: Float[Array, "entries"]
+    remaining: Float[Array, "entries"]
+    weight_slopes: Float[Array, "bins columns wavelengths"] | None = None
+
+    def with_arrival(self, material: Array | int, index: TallyIndex, weight: Scalar) -> "HigherOrderTally":
+        """Return the tally with weight that reached a material."""
+        arrived = add_to_tally(self.arrived, (material,), index, weight)
+        return eqx.tree_at(lambda t: t.arrived, self, arrived)
+
+    def with_departure(self, material: Array | int, index: TallyIndex, weight: Scalar) -> "HigherOrderTally":
+        """Return the tally with weight that went on from a material."""
+        left = add_to_tally(self.left, (material,), index, weight)
+        return eqx.tree_at(lambda t: t.left, self, left)
 
 
-def higher_orders(setting: Setting, key: PRNGKeyArray, nodes: Nodes | None = None) -> HigherOrders:
-    """Trace a batch of photons through up to `plan.orders` scatterings; sums are means per photon.
+def trace_higher_orders(
+    scene: DeviceScene, key: PRNGKeyArray, nodes: EntryNodes | None = None
+) -> HigherOrderTally:
+    """Trace a batch of photons through up to `limits.orders` scatterings; sums are means per photon.
 
-    With `nodes`, light enters about these and is booked under them: sums are means per photon of a node.
+    With `nodes`, light enters about these and is tallied by node: sums are means per photon of a node.
+
+    1. Draw the random words of the batch: shifts of lattices for every order and dimension.
+    2. For each group of chunks: send photons from the sensor.
+    3. For each order: compact living photons, and trace chunk after chunk through `_trace_order`.
+    4. Tally the weight of photons that still live after the last order.
     """
-    beam, medium, plan, bins = setting.beam, setting.medium, setting.plan, setting.bins
-    photons = setting.sizes.photons if nodes is None else nodes.photons
-    plates = sum(s.plate for s in setting.surfaces)
-    dimensions = Draw.dimensions(plates)
-    # Words before these shift the footprint of order one.
-    drawn = words(key, 4 + 2 * plan.order_steps * dimensions)[2:]
-    shift, places = to_unit(drawn[:2]), None
-    numbers = lattices(drawn[2:], plan.order_steps, dimensions)
-    footprint_key = key
-    if plan.independent or nodes is not None:
-        footprint_key, key = jax.random.split(key)
-    if plan.independent:
-        numbers, places = Independent(key, dimensions), Independent(footprint_key, 2)
-    size = min(CHUNK, photons)
-    chunks = -(-photons // size)
-    groups = -(-chunks * size // (GROUP * CHUNK))
-    each = -(-chunks // groups)
-    materials, scores = len(plan.materials), setting.scores
-    colours = 0 if setting.optics is None else setting.optics.shape[1]
-    count = setting.table.count if not colours else colours * (1 if nodes is None else len(nodes.place))
-    seen = count if setting.viewing is None else colours * setting.viewing.shots
-    terrain = sees_terrain(setting)
+    config, bins, slopes = scene.config, scene.bins, scene.slopes
+    n_photons = config.n_photons if nodes is None else nodes.n_photons
+    dimensions = PhotonDraws.dimensions(scene.n_plates)
+    # The first two words shift the footprint of order one (`jaxlidar.trace.response`), from the same key.
+    words = random_words(key, 4 + 2 * config.order_steps * dimensions)[2:]
+    footprint_shift = to_unit(words[:2])
+    lattices = shifted_lattices(words[2:], config.order_steps, dimensions)
+    node_key = None if nodes is None else jax.random.split(key)[0]
+    chunk_size = min(PHOTONS_PER_CHUNK, n_photons)
+    n_chunks = -(-n_photons // chunk_size)
+    n_groups = -(-n_chunks * chunk_size // (CHUNKS_PER_GROUP * PHOTONS_PER_CHUNK))
+    chunks_per_group = -(-n_chunks // n_groups)
 
-    def begin(lane):
+    def send(lane: UInt32[Array, "photons"]) -> tuple[UInt32[Array, "photons"], Photons]:
         if nodes is not None:
-            return nodes.start(setting, lane, footprint_key)
-        if places is None:
-            share = (lane.astype(float) + shift[0]) / photons
-            turn = (lane * jnp.uint32(GOLDEN * 2**32)).astype(float) * 2.0**-32 + shift[1]
-        else:
-            share, turn = places(lane, jnp.asarray(plan.order_steps))
-        inside = lane < photons
-        across, share = footprint_rays(beam, medium, across_beam(beam, share, turn))
-        if terrain:
-            across, more = rays_to_terrain(setting, across)
-            share = share * more
-        point, w, excess = beam.ray(across)
-        up = jnp.asarray(-plan.upstream, excess.dtype)
-        return lane, Photons(
-            along(point, w, up),
-            w,
-            excess + up,
-            jnp.where(inside, share / photons, 0.0),
-            jnp.zeros(lane.shape, jnp.int32),
-            jnp.full(lane.shape, -1, jnp.int32),
-            setting.kept(unscattered(excess)),
-            inside,
-            tuple(jnp.ones_like(excess) for _ in range(colours)),
-            score=None if scores is None else jnp.zeros((*lane.shape, scores.count)),
-        )
+            assert node_key is not None
+            return nodes.send_photons(scene, lane, node_key)
+        return lane, _send_photons(scene, lane, footprint_shift)
 
-    def group(total, number):
-        lane = number * (each * size) + jnp.arange(each * size, dtype=jnp.uint32)
+    def trace_group(total: HigherOrderTally, group: UInt32[Array, ""]):
+        first = group * (chunks_per_group * chunk_size)
+        lane = first + jnp.arange(chunks_per_group * chunk_size, dtype=jnp.uint32)
 
-        def one_order(carry, n):
+        def one_order(carry, order):
             photons, tally = carry
-            source, living = in_order(setting, photons[1])
+            source, n_living = compact(scene, photons[1])
             flat = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), photons)
 
-            def taken(number):
-                place = source[number]
-                lane, own = jax.tree.map(lambda a: a.at[place].get(mode="promise_in_bounds"), flat)
-                alive = number * size + jnp.arange(size) < living
-                return once((lane, eqx.tree_at(lambda p: p.alive, own, alive)))
+            def gather(chunk):
+                number = source[chunk]
+                lane, p = jax.tree.map(lambda a: a.at[number].get(mode="promise_in_bounds"), flat)
+                alive = chunk * chunk_size + jnp.arange(chunk_size) < n_living
+                return once((lane, eqx.tree_at(lambda p: p.alive, p, alive)))
 
-            def flown(lane, own, tally):
-                own, tally = _one_order(setting, own, tally, Draw.of(numbers(lane, n), plates), n)
-                return (lane, own), tally
+            def trace(lane, p, tally):
+                draws = PhotonDraws.from_numbers(lattices(lane, order), scene.n_plates)
+                p, tally = _trace_order(scene, p, tally, draws, order)
+                return (lane, p), tally
 
-            def chunk(tally, number):
-                lane, own = taken(number)
-                own, tally = lax.cond(jnp.any(own.alive), flown, lambda *c: (c[:2], c[2]), lane, own, tally)
-                return tally, own
+            def scanned_chunk(tally, chunk):
+                lane, p = gather(chunk)
+                p, tally = lax.cond(jnp.any(p.alive), trace, lambda *c: (c[:2], c[2]), lane, p, tally)
+                return tally, p
 
-            def next_chunk(number, state):
+            def looped_chunk(chunk, state):
                 photons, tally = state
-                lane, own = taken(number)
-                own, tally = flown(lane, own, tally)
-                return jax.tree.map(lambda a, b: a.at[number].set(b), photons, own), tally
+                p, tally = trace(*gather(chunk), tally)
+                return jax.tree.map(lambda a, b: a.at[chunk].set(b), photons, p), tally
 
-            # Chunks of dead photons are skipped, or not even looked at.
-            if setting.reverse:
-                tally, photons = lax.scan(chunk, tally, jnp.arange(each))
+            if scene.reverse:
+                # Chunks of dead photons are skipped. The loop has a static length, as reverse mode needs.
+                tally, photons = lax.scan(scanned_chunk, tally, jnp.arange(chunks_per_group))
                 return photons, tally
-            left = eqx.tree_at(lambda p: p[1].alive, photons, jnp.zeros_like(photons[1].alive))
-            return lax.fori_loop(0, -(-living // size), next_chunk, (left, tally))
+            # Chunks of dead photons are not even looked at.
+            all_dead = eqx.tree_at(lambda p: p[1].alive, photons, jnp.zeros_like(photons[1].alive))
+            n_living_chunks = -(-n_living // chunk_size)
+            return lax.fori_loop(0, n_living_chunks, looped_chunk, (all_dead, tally))
 
-        def order(carry, n):
-            # The loop is as long as the ladder of sizes has it.
-            return lax.cond(n < plan.orders, one_order, lambda carry, _: carry, carry, n), None
+        def order_step(carry, order):
+            # The loop is as long as its size bucket; orders beyond the plan's are passed over.
+            return lax.cond(order < scene.limits.orders, one_order, lambda c, _: c, carry, order), None
 
-        rows = jax.tree.map(lambda a: a.reshape(each, size, *a.shape[1:]), begin(lane))
-        ((_, last), tally), _ = lax.scan(order, (rows, zero), jnp.arange(plan.order_steps))
-        over = jnp.where(last.alive, last.weight, 0.0)
-        remaining = book(tally.remaining, (), Label.of(last), over)
+        shape = (chunks_per_group, chunk_size)
+        photons = jax.tree.map(lambda a: a.reshape(*shape, *a.shape[1:]), send(lane))
+        orders = jnp.arange(config.order_steps)
+        ((_, p), tally), _ = lax.scan(order_step, (photons, empty), orders)
+        weight = jnp.where(p.alive, p.weight, 0.0)
+        remaining = add_to_tally(tally.remaining, (), TallyIndex.of(p), weight)
         tally = eqx.tree_at(lambda t: t.remaining, tally, remaining)
         return jax.tree.map(jnp.add, total, tally), None
 
-    zero = HigherOrders(
-        jnp.zeros((materials, seen, bins.padded)),
-        jnp.zeros((materials, seen)),
-        jnp.zeros((materials, count)),
-        jnp.zeros((materials, count)),
-        jnp.zeros((count,)),
-        jnp.zeros((count,)),
-        jnp.zeros((count,)),
-        None if scores is None else jnp.zeros((bins.padded, scores.count, scores.left.shape[1])),
-    )
-    tallies, _ = lax.scan(group, zero, jnp.arange(groups, dtype=jnp.uint32))
-    if tallies.scored is not None:
-        tallies = eqx.tree_at(lambda t: t.scored, tallies, tallies.scored[bins.row : bins.row + bins.count])
-    return eqx.tree_at(lambda t: (t.weights, t.outside), tallies, bins.trimmed(tallies.weights))
+    empty = _empty_tally(scene, nodes)
+    tally, _ = lax.scan(trace_group, empty, jnp.arange(n_groups, dtype=jnp.uint32))
+    if slopes is not None:
+        assert tally.weight_slopes is not None
+        inside = tally.weight_slopes[bins.max_span : bins.max_span + bins.count]
+        tally = eqx.tree_at(lambda t: t.weight_slopes, tally, inside)
+    return eqx.tree_at(lambda t: (t.weights, t.outside), tally, bins.trim(tally.weights))
 
 
-def _one_order(setting: Setting, p: Photons, tally: HigherOrders, draw: Draw, order: Int[Array, ""]):
-    """Fly, collide, deposit, scatter."""
-    plan, ends = setting.plan, setting.plan.ends
-    met, outcomes, ratio = plates_ahead(setting, p, draw.ahead)
-    events = events_of(setting, met, outcomes)
-    limit = nearest(p, events)
-    budget = stop(setting.budget(p))
-    if moves_landings(setting):
-        w, limit, turned = rays_to_surfaces(setting, p, limit, events, (order > 0) & (limit < budget))
-        p = eqx.tree_at(lambda p: (p.w, p.weight), p, (w, p.weight * turned))
-    # One number says in which stratum the photon goes on, and where in each stratum the points are.
-    chosen = jnp.minimum(jnp.floor(draw.flight * ends), ends - 1)
-    strata = jnp.stack([(i + (draw.flight * ends - chosen)) / ends for i in range(ends)])
-    wide = functools.partial(jnp.broadcast_to, shape=strata.shape)
-    flights = fly(setting, p, limit, budget, jnp.maximum(strata, 1e-9))
-    p, draw, flights, events, limit = once((p, draw, flights, events, limit))
-
-    def pick(a: Array) -> Array:
-        own = chosen.astype(jnp.int32).reshape((1,) * (a.ndim - 1) + chosen.shape)
-        return jnp.take_along_axis(a, own, 0, mode="promise_in_bounds")[0]
-
-    # Plates that were passed on the way. Histories do not depend on the order; what arrives at a plate does.
-    weight, label = wide(p.weight) * flights.density, jax.tree.map(wide, Label.of(p))
-    passes: dict[int, Bool[Array, "ends photons"]] = {}
-    for i, (s, d, o) in enumerate(zip(setting.surfaces, met, outcomes)):
-        if not s.plate:
-            continue
-        own = wide(events[i]) <= flights.distance
-        passed = wide(p.alive & (d < FAR)) & ((wide(d) < flights.distance) | ~flights.event) & ~own
-        weight = weight * jnp.where(passed | (flights.landed & own), wide(ratio[i]), 1.0)
-        passes[i] = passed & wide(o == THROUGH)
-    before = pick(weight), jax.tree.map(pick, label)
-    for i, through in passes.items():
-        scatterer, here = plan.surfaces[i], pick(through)
-        gone, arrived = before
-        for j, other in passes.items():
-            if j != i:
-                nearer = here & pick(other) & (met[j] < met[i])
-                gone = jnp.where(nearer, gone / (1.0 - plan.lobe), gone)
-                arrived = arrived.grown_where(nearer, setting, plan.surfaces[j].transmitted)
-        gone = jnp.where(here, gone, 0.0)
-        tally = _arrive(tally, scatterer.material, arrived, gone)
-        onward = arrived.grown(setting, scatterer.transmitted)
-        tally = _leave(tally, scatterer.material, onward, gone / (1.0 - plan.lobe))
-        label = label.grown_where(through, setting, scatterer.transmitted)
-        weight = jnp.where(through, weight / (1.0 - plan.lobe), weight)
-
-    if plan.drawn_first:
-        tally = _return(setting, p, flights, events, limit, weight, label, draw, tally)
+def _empty_tally(scene: DeviceScene, nodes: EntryNodes | None) -> HigherOrderTally:
+    """Return a tally of zeros; its bins have both margins."""
+    n_wavelengths = 0 if scene.optics is None else scene.optics.shape[1]
+    if scene.optics is None:
+        n_entries = scene.histories.count
     else:
-        # The first order is deterministic and has been deposited.
-        given = (setting, p, flights, events, limit, weight, label, draw)
-        tally = lax.cond(order > 0, lambda t: _return(*given, t), lambda t: t, tally)
-
-    flight, weight, label = jax.tree.map(pick, (flights, weight, label))
-    tally = eqx.tree_at(
-        lambda t: (t.escaped, t.late),
-        tally,
-        (
-            book(tally.escaped, (), label, jnp.where(flight.escaped, weight, 0.0)),
-            book(tally.late, (), label, jnp.where(flight.late, weight, 0.0)),
-        ),
+        n_entries = n_wavelengths * (1 if nodes is None else len(nodes.position))
+    n_seen = n_entries if scene.shot_views is None else n_wavelengths * scene.shot_views.n_shots
+    n_materials, bins, slopes = len(scene.config.materials), scene.bins, scene.slopes
+    return HigherOrderTally(
+        weights=jnp.zeros((n_materials, n_seen, bins.padded)),
+        outside=jnp.zeros((n_materials, n_seen)),
+        arrived=jnp.zeros((n_materials, n_entries)),
+        left=jnp.zeros((n_materials, n_entries)),
+        escaped=jnp.zeros((n_entries,)),
+        late=jnp.zeros((n_entries,)),
+        remaining=jnp.zeros((n_entries,)),
+        weight_slopes=None
+        if slopes is None
+        else jnp.zeros((bins.padded, slopes.count, slopes.history_optics.shape[1])),
     )
-    flown = jnp.where(flight.event, flight.distance, 0.0)
+
+
+def _send_photons(scene: DeviceScene, lane: UInt32[Array, "photons"], shift: Float[Array, "2"]) -> Photons:
+    """Send photons from the sensor, on a Fibonacci disc over the footprint that `shift` moves at random."""
+    n_photons, slopes = scene.config.n_photons, scene.slopes
+    n_wavelengths = 0 if scene.optics is None else scene.optics.shape[1]
+    fraction = (lane.astype(float) + shift[0]) / n_photons
+    # Turns by the golden angle, in 32-bit integers: floats would lose the fraction of large numbers.
+    turn = (lane * jnp.uint32(GOLDEN * 2**32)).astype(float) * 2.0**-32 + shift[1]
+    # Lanes beyond the last photon fill up chunks.
+    is_real = lane < n_photons
+    across, energy = rays_with_columns(scene.beam, scene.medium, across_beam(scene.beam, fraction, turn))
+    if moves_with_terrain(scene):
+        across, ratio = rays_with_terrain(scene, across)
+        energy = energy * ratio
+    point, w, excess = scene.beam.ray(across)
+    to_start = jnp.asarray(-scene.limits.start_distance, excess.dtype)
+    return Photons(
+        x=along(point, w, to_start),
+        w=w,
+        path=excess + to_start,
+        weight=jnp.where(is_real, energy / n_photons, 0.0),
+        history=jnp.zeros(lane.shape, jnp.int32),
+        surface=jnp.full(lane.shape, -1, jnp.int32),
+        last_scattering=scene.if_differentiated(not_scattered(excess)),
+        alive=is_real,
+        optical_weights=tuple(jnp.ones_like(excess) for _ in range(n_wavelengths)),
+        score=None if slopes is None else jnp.zeros((*lane.shape, slopes.count)),
+    )
+
+
+def _trace_order(
+    scene: DeviceScene, p: Photons, tally: HigherOrderTally, draws: PhotonDraws, order: Int[Array, ""]
+) -> tuple[Photons, HigherOrderTally]:
+    """Trace a chunk of photons through one order of scattering: fly, collide, deposit, scatter.
+
+    1. Find the surfaces ahead, and sample which plates will stop the photon or let it pass. 2. Sample the
+    ends of the flight, one in each stratum of the probability of collision; one of them is where the
+       photon goes on from.
+    3. Apply the plates that the flight passes to weights and histories.
+    4. Deposit the return of every end, except at order one, which `jaxlidar.trace.first_order` deposits.
+    5. Tally light that escapes or would come after the record.
+    6. Sample the collision at the selected end, tally what arrives and what goes on, and update the photon.
+    """
+    ends = scene.config.deposits_per_flight
+    encounters = meet_surfaces(scene, p, draws.plates_ahead)
+    max_length = detach(scene.longest_flight(p))
+    if moves_landings(scene):
+        heading = (order > 0) & (encounters.nearest_stop < max_length)
+        w, nearest_stop, ratio = landings_with_grids(scene, p, encounters, heading)
+        encounters = eqx.tree_at(lambda e: e.nearest_stop, encounters, nearest_stop)
+        p = eqx.tree_at(lambda p: (p.w, p.weight), p, (w, p.weight * ratio))
+    # One number u says in which stratum the photon goes on, floor(u n), and where in each stratum its end
+    # lies, the remainder: the ends (i + remainder) / n are stratified, and the selected one is u itself.
+    selected = jnp.minimum(jnp.floor(draws.flight * ends), ends - 1)
+    strata = jnp.stack([(i + (draws.flight * ends - selected)) / ends for i in range(ends)])
+    # The logarithm of zero would be an infinite depth.
+    u = jnp.maximum(strata, 1e-9)
+    flights = sample_flights(scene, p, encounters.nearest_stop, max_length, u)
+    # Optimisation barrier: flights serve several results, each of which would compute the march again.
+    stops = (encounters.stops, encounters.nearest_stop)
+    p, draws, flights, stops = once((p, draws, flights, stops))
+    encounters = dataclasses.replace(encounters, stops=stops[0], nearest_stop=stops[1])
+
+    def select_end(a: Array) -> Array:
+        number = selected.astype(jnp.int32).reshape((1,) * (a.ndim - 1) + selected.shape)
+        return jnp.take_along_axis(a, number, 0, mode="promise_in_bounds")[0]
+
+    to_ends = functools.partial(jnp.broadcast_to, shape=strata.shape)
+    weight, index = to_ends(p.weight) * flights.ratio, jax.tree.map(to_ends, TallyIndex.of(p))
+    weight, index, tally = _pass_plates(scene, p, flights, encounters, weight, index, select_end, tally)
+
+    # The first order is deterministic and has been deposited.
+    tally = lax.cond(
+        order > 0,
+        lambda t: _deposit_flights(scene, p, flights, encounters, weight, index, draws, t),
+        lambda t: t,
+        tally,
+    )
+
+    flight, weight, index = jax.tree.map(select_end, (flights, weight, index))
+    escaped = add_to_tally(tally.escaped, (), index, jnp.where(flight.escaped, weight, 0.0))
+    late = add_to_tally(tally.late, (), index, jnp.where(flight.late, weight, 0.0))
+    tally = eqx.tree_at(lambda t: (t.escaped, t.late), tally, (escaped, late))
+
+    flown = jnp.where(flight.has_hit, flight.distance, 0.0)
     x = along(p.x, p.w, flown)
-    landed = flight.landed_on(events, limit)
-    hit = collide(setting, x, p.w, flight.cell, flight.collided, landed, draw)
-    weight = jnp.where(flight.event, weight, 0.0)
-    tally = _arrive(tally, hit.material, label, weight)
-    label = label.grown(setting, hit.letter)
-    weight = weight * hit.ratio * hit.onward
-    tally = _leave(tally, hit.material, label, weight)
+    landed = flight.landed_on(encounters)
+    collision = sample_collision(scene, x, p.w, flight.cell, flight.collided, landed, draws)
+    weight = jnp.where(flight.has_hit, weight, 0.0)
+    tally = tally.with_arrival(collision.material, index, weight)
+    index = index.after(scene, collision.channel)
+    weight = weight * collision.ratio * collision.onward_weight
+    tally = tally.with_departure(collision.material, index, weight)
     score = None
     if p.score is not None:
-        assert flight.moved is not None
-        score = p.score - flight.moved.T + gains(setting, flight.cell, flight.collided, hit)
+        assert flight.depth_slopes is not None
+        gain = collision_score(scene, flight.cell, flight.collided, collision)
+        score = p.score - flight.depth_slopes.T + gain
     onward = Photons(
-        x,
-        hit.w,
-        p.path + flown,
-        weight,
-        label.number,
-        hit.on,
-        setting.kept(hit.sent),
-        flight.event,
-        label.tints,
-        label.entry,
-        score,
+        x=x,
+        w=collision.w,
+        path=p.path + flown,
+        weight=weight,
+        history=index.number,
+        surface=collision.surface,
+        last_scattering=scene.if_differentiated(collision.last_scattering),
+        alive=flight.has_hit,
+        optical_weights=index.optical_weights,
+        entry=index.entry,
+        score=score,
     )
     return onward, tally
 
 
-def _return(
-    setting: Setting,
+def _pass_plates(
+    scene: DeviceScene,
     p: Photons,
     flights: Flight,
-    events: list[Scalar],
-    limit: Scalar,
+    encounters: SurfaceEncounters,
     weight: Float[Array, "ends photons"],
-    label: Label,
-    draw: Draw,
-    tally: HigherOrders,
-) -> HigherOrders:
-    """Deposit the expected return of every end of the flights, each its share."""
-    ends, score = setting.plan.ends, None
-    if p.score is not None:
-        assert flights.moved is not None
-        score = p.score[None] - jnp.swapaxes(flights.moved, 1, 2)
-        score = score.reshape(-1, score.shape[-1])
-    p, flights = dataclasses.replace(p, score=None), dataclasses.replace(flights, moved=None)
+    index: TallyIndex,
+    select_end: Callable[[Array], Array],
+    tally: HigherOrderTally,
+) -> tuple[Float[Array, "ends photons"], TallyIndex, HigherOrderTally]:
+    """Apply the plates that flights pass, by a gap or straight through, to weights and histories.
 
-    def flat(tree):
+    1. Every plate that was passed, or is landed on, multiplies the weight by the ratio of its sampled
+    outcome. 2. Transmission divides the weight by its probability, and adds the plate's channel to the
+    history. 3. For the energy budget, weight arrives at a plate with the history that it has there. The
+    product of optics does
+       not depend on the order of plates, but what arrives at each does: plates that lie nearer come first.
+    """
+    config, limits = scene.config, scene.limits
+    to_ends = functools.partial(jnp.broadcast_to, shape=weight.shape)
+    transmits: dict[int, Bool[Array, "ends photons"]] = {}
+    for i, surface in enumerate(scene.surfaces):
+        if not surface.is_plate:
+            continue
+        distance, outcome = encounters.distances[i], encounters.outcomes[i]
+        is_stop = to_ends(encounters.stops[i]) <= flights.distance
+        is_ahead = to_ends(p.alive & (distance < FAR))
+        passed = is_ahead & ((to_ends(distance) < flights.distance) | ~flights.has_hit) & ~is_stop
+        ratio = encounters.ratios[i]
+        assert ratio is not None
+        weight = weight * jnp.where(passed | (flights.landed & is_stop), to_ends(ratio), 1.0)
+        transmits[i] = passed & to_ends(outcome == TRANSMITTED)
+    selected_weight, selected_index = select_end(weight), jax.tree.map(select_end, index)
+    transmission_probability = 1.0 - limits.reflection_probability
+    for i, transmitted in transmits.items():
+        scatterer, is_transmitted = config.surfaces[i], select_end(transmitted)
+        arriving_weight, arriving_index = selected_weight, selected_index
+        for j, other in transmits.items():
+            if j != i:
+                is_nearer = encounters.distances[j] < encounters.distances[i]
+                before = is_transmitted & select_end(other) & is_nearer
+                arriving_weight = jnp.where(
+                    before, arriving_weight / transmission_probability, arriving_weight
+                )
+                arriving_index = arriving_index.after_where(before, scene, config.surfaces[j].transmission)
+        arriving_weight = jnp.where(is_transmitted, arriving_weight, 0.0)
+        tally = tally.with_arrival(scatterer.material, arriving_index, arriving_weight)
+        onward = arriving_index.after(scene, scatterer.transmission)
+        tally = tally.with_departure(scatterer.material, onward, arriving_weight / transmission_probability)
+        index = index.after_where(transmitted, scene, scatterer.transmission)
+        weight = jnp.where(transmitted, weight / transmission_probability, weight)
+    return weight, index, tally
+
+
+def _deposit_flights(
+    scene: DeviceScene,
+    p: Photons,
+    flights: Flight,
+    encounters: SurfaceEncounters,
+    weight: Float[Array, "ends photons"],
+    index: TallyIndex,
+    draws: PhotonDraws,
+    tally: HigherOrderTally,
+) -> HigherOrderTally:
+    """Deposit the expected return of every end of the flights, each with an equal share of the weight.
+
+    All ends are flattened into one axis of photons, so that one program serves them.
+    """
+    ends, score = scene.config.deposits_per_flight, None
+    if p.score is not None:
+        assert flights.depth_slopes is not None
+        score = p.score[None] - jnp.swapaxes(flights.depth_slopes, 1, 2)
+        score = score.reshape(-1, score.shape[-1])
+    # Scores have an axis of columns, and were flattened above.
+    p, flights = dataclasses.replace(p, score=None), dataclasses.replace(flights, depth_slopes=None)
+
+    def flatten(tree):
         return jax.tree.map(lambda a: jnp.broadcast_to(a, (ends, a.shape[-1])).reshape(-1), tree)
 
-    p, flights, events, limit, draw, label = flat((p, flights, events, limit, draw, label))
-    flown = jnp.where(flights.event, flights.distance, 0.0)
+    p, flights, encounters, draws, index = flatten((p, flights, encounters, draws, index))
+    flown = jnp.where(flights.has_hit, flights.distance, 0.0)
     x = along(p.x, p.w, flown)
-    landed = flights.landed_on(events, limit)
-    hit = collide(setting, x, p.w, flights.cell, flights.collided, landed, draw)
-    value = jnp.where(flights.event, flat(weight), 0.0) * hit.ratio / ends
+    landed = flights.landed_on(encounters)
+    collision = sample_collision(scene, x, p.w, flights.cell, flights.collided, landed, draws)
+    value = jnp.where(flights.has_hit, flatten(weight), 0.0) * collision.ratio / ends
     if score is not None:
-        score = score + gains(setting, flights.cell, flights.collided, hit)
-    # What is not asked for would be computed as well.
-    given = once((p.w, x, p.path + flown, value, label, shown(setting, hit), draw.behind, score))
-    return _deposit(setting, tally, *given)
+        score = score + collision_score(scene, flights.cell, flights.collided, collision)
+    # Optimisation barrier: of the collision only what is visible passes, so that directions onward are not
+    # computed.
+    deposits = once(
+        (
+            p.w,
+            x,
+            p.path + flown,
+            value,
+            index,
+            visible_collision(scene, collision),
+            draws.plates_behind,
+            score,
+        )
+    )
+    return _deposit_collisions(scene, tally, *deposits)
 
 
-def _arrive(tally: HigherOrders, material: Array | int, label: Label, weight: Scalar) -> HigherOrders:
-    return eqx.tree_at(lambda t: t.arrived, tally, book(tally.arrived, (material,), label, weight))
-
-
-def _leave(tally: HigherOrders, material: Array | int, label: Label, weight: Scalar) -> HigherOrders:
-    return eqx.tree_at(lambda t: t.left, tally, book(tally.left, (material,), label, weight))
-
-
-def _deposit(
-    setting: Setting,
-    tally: HigherOrders,
+def _deposit_collisions(
+    scene: DeviceScene,
+    tally: HigherOrderTally,
     w: Vec,
     x: Vec,
     path: Scalar,
     weight: Scalar,
-    label: Label,
-    hit: Met,
-    behind: tuple[Scalar, ...],
+    index: TallyIndex,
+    collision: VisibleCollision,
+    plate_draws: tuple[Scalar, ...],
     score: Float[Array, "photons columns"] | None,
-) -> HigherOrders:
-    """Deposit the expected return of each collision."""
-    beam, plan, medium = setting.beam, setting.plan, setting.medium
+) -> HigherOrderTally:
+    """Deposit the expected return of collisions at `x`, of light that flew along `w`.
+
+    1. Intensity factors towards the sensor.
+    2. Transmittance of the return path: voxels, ground that hides its own slopes, and plates.
+    3. Time of arrival, and the value at the range for which that time stands.
+    4. Spread over time bins, add to the tally: for each channel by which light returns, shot, and wavelength.
+    """
+    beam, bins = scene.beam, scene.bins
     v = beam.view(x)
-    reflected, transmitted = view_factors(setting, x, w, v, hit)
-    if medium is None:
-        clear = jnp.ones_like(path)
-    elif setting.column is not None:
-        column = setting.column
-        clear = jnp.exp(-jax.vmap(lambda x: depth_to_top(medium, x, column))(x))
-        if score is not None:
-            score = score - rise(setting, medium, x)
-    else:
-        none, far = jnp.zeros((0, path.size)), jnp.full_like(path, FAR)
-        steps, reverse = plan.march_steps, setting.reverse
-        how = {"reverse": reverse, "scores": setting.scores}
-        back = free_flight(medium, x, v, none, far, weight > 0, steps, **how)
-        clear = jnp.exp(-back.total)
-        if score is not None:
-            assert back.moved is not None
-            score = score - back.moved[0].T
-    drawn = iter(behind)
-    for i, (s, scatterer) in enumerate(zip(setting.surfaces, plan.surfaces)):
-        if not s.plate:
-            if s.shape.lights_itself and not beam.parallel:
-                # A ground may hide its own slopes, and what stands on them, from the sensor.
-                clear = jnp.where(s.distance(x, v) < FAR, 0.0, clear)
-            continue
-        covered = next(drawn) < s.coverage
-        crossed = s.distance(x, v) < FAR
-        if not s.shape.lights_itself:
-            crossed &= hit.on != i
-        c = jnp.broadcast_to(s.coverage, path.shape)
-        ratio = ratio_of(jnp.where(covered, c, 1.0 - c))
-        if s.straight:
-            label = label.grown_where(crossed & covered, setting, scatterer.transmitted)
-            through = ratio if scatterer.transmitted >= 0 else jnp.where(covered, 0.0, ratio)
-        else:
-            through = jnp.where(covered, 0.0, ratio)
-        clear = clear * jnp.where(crossed, through, 1.0)
+    reflected, transmitted = intensity_factors(scene, x, w, v, collision)
+    transmittance, score = _return_transmittance(scene, x, v, weight, score)
+    transmittance, index = _return_through_surfaces(scene, x, v, collision, plate_draws, transmittance, index)
     out = beam.excess(x)
     time = (path + out) / SPEED_OF_LIGHT
     # Apparent reflectance refers to the range that the time of arrival stands for.
-    spread = ((beam.slant_range + 0.5 * (path + out)) / (beam.slant_range + out)) ** 2
-    value = weight * clear * spread * beam.in_view(x)
-    response = tally.weights.reshape(-1, setting.bins.padded)
-    pairs = [(hit.reflected, reflected)]
+    range_factor = ((beam.slant_range + 0.5 * (path + out)) / (beam.slant_range + out)) ** 2
+    value = weight * transmittance * range_factor * beam.in_view(x)
+    channel_factors = [(collision.reflection, reflected)]
     if transmitted is not None:
-        pairs.append((hit.transmitted, transmitted))
-    shots, material = None, hit.material
-    if setting.viewing is not None:
-        assert label.entry is not None
-        # One row for each shot that may see it.
-        shots, part, later = once(setting.viewing.parts(beam.axis, label.entry, x))
-        time, value, material = time[:, None] + later, value[:, None] * part, material[:, None]
-    first, row = once(instant_row(setting.bins, time, value))
-    for letter, factor in pairs:
-        factor = jnp.where(letter >= 0, factor, 0.0)
-        for slot, tint in label.grown(setting, letter).slots(shots):
-            slot = material * tally.weights.shape[1] + slot
-            # Fused into the rows, it would be computed again for each of their bins.
-            left = once(factor if tint is None else factor * tint)
-            left = left.reshape(left.shape + (1,) * (row.ndim - 1))
-            response = scatter_rows(response, slot, first, row * left)
+        channel_factors.append((collision.transmission, transmitted))
+    shots, material = None, collision.material
+    if scene.shot_views is not None:
+        assert index.entry is not None
+        # One row for each shot that may see the path.
+        shots, seen, delay = once(scene.shot_views.seen_by_shots(beam.axis, index.entry, x))
+        time, value, material = time[:, None] + delay, value[:, None] * seen, material[:, None]
+    first_bin, row = once(bspline_row(bins, time, value))
+    n_entries = tally.weights.shape[1]
+    weights = tally.weights.reshape(-1, bins.padded)
+    for channel, factor in channel_factors:
+        factor = jnp.where(channel >= 0, factor, 0.0)
+        for entry, optical_weight in index.after(scene, channel).entries(shots):
+            # Optimisation barrier: fused into the rows, the factor would be computed again for each bin.
+            scaled = once(factor if optical_weight is None else factor * optical_weight)
+            scaled = scaled.reshape(scaled.shape + (1,) * (row.ndim - 1))
+            weights = add_rows(weights, material * n_entries + entry, first_bin, row * scaled)
     if score is not None:
-        assert tally.scored is not None
-        returned = scored(setting, tally.scored, first, row, score, pairs, label)
-        tally = eqx.tree_at(lambda t: t.scored, tally, returned)
-    return eqx.tree_at(lambda t: t.weights, tally, response.reshape(tally.weights.shape))
+        assert tally.weight_slopes is not None
+        weight_slopes = add_scored_returns(
+            scene, tally.weight_slopes, first_bin, row, score, channel_factors, index
+        )
+        tally = eqx.tree_at(lambda t: t.weight_slopes, tally, weight_slopes)
+    return eqx.tree_at(lambda t: t.weights, tally, weights.reshape(tally.weights.shape))
+
+
+def _return_transmittance(
+    scene: DeviceScene,
+    x: Vec,
+    v: Vec,
+    weight: Scalar,
+    score: Float[Array, "photons columns"] | None,
+) -> tuple[Scalar, Float[Array, "photons columns"] | None]:
+    """Return exp(-tau) of the voxels from `x` to the sensor along `v`, and scores less the derivative of tau.
+
+    At nadir tau is looked up in the column above the point; otherwise rays are marched to the sensor.
+    """
+    medium = scene.medium
+    if medium is None:
+        return jnp.ones_like(weight), score
+    if scene.depth_above is not None:
+        depth_above = scene.depth_above
+        transmittance = jnp.exp(-jax.vmap(lambda x: depth_to_top(medium, x, depth_above))(x))
+        if score is not None:
+            score = score - vertical_depth_slopes(scene, medium, x)
+        return transmittance, score
+    no_targets, to_end = jnp.zeros((0, weight.size)), jnp.full_like(weight, FAR)
+    return_path = march_to_depths(
+        medium,
+        x,
+        v,
+        no_targets,
+        to_end,
+        weight > 0,
+        scene.config.max_faces,
+        reverse=scene.reverse,
+        slopes=scene.slopes,
+    )
+    if score is not None:
+        assert return_path.depth_slopes is not None
+        score = score - return_path.depth_slopes[0].T
+    return jnp.exp(-return_path.total_depth), score
+
+
+def _return_through_surfaces(
+    scene: DeviceScene,
+    x: Vec,
+    v: Vec,
+    collision: VisibleCollision,
+    plate_draws: tuple[Scalar, ...],
+    transmittance: Scalar,
+    index: TallyIndex,
+) -> tuple[Scalar, TallyIndex]:
+    """Apply the surfaces between `x` and the sensor to the transmittance and the history of the return path.
+
+    A partial plate is sampled, gap or material, so that each photon has one history. Ground hides the points
+    below its own slopes; parallel light (shared illumination) is seen straight down, where nothing is hidden.
+    """
+    draws = iter(plate_draws)
+    for i, (surface, scatterer) in enumerate(zip(scene.surfaces, scene.config.surfaces)):
+        if not surface.is_plate:
+            if surface.shape.lights_itself and not scene.beam.parallel:
+                transmittance = jnp.where(surface.distance(x, v) < FAR, 0.0, transmittance)
+            continue
+        is_covered = next(draws) < surface.coverage
+        is_crossed = surface.distance(x, v) < FAR
+        if not surface.shape.lights_itself:
+            # Light that starts on the plate does not meet it again.
+            is_crossed &= collision.surface != i
+        coverage = jnp.broadcast_to(surface.coverage, transmittance.shape)
+        ratio = attached_ratio(jnp.where(is_covered, coverage, 1.0 - coverage))
+        if surface.straight:
+            index = index.after_where(is_crossed & is_covered, scene, scatterer.transmission)
+            factor = ratio if scatterer.transmission >= 0 else jnp.where(is_covered, 0.0, ratio)
+        else:
+            factor = jnp.where(is_covered, 0.0, ratio)
+        transmittance = transmittance * jnp.where(is_crossed, factor, 1.0)
+    return transmittance, index

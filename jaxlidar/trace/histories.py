@@ -1,8 +1,12 @@
-"""Scattering histories: how often each letter (leaf.R, leaf.T, ground.R, ...) occurred on a path.
+"""Scattering histories: how often each scatterer channel (leaf.R, leaf.T, ground.R, ...) occurred on a path.
 
-The product of reflectances does not depend on the order of the scatterings, so a history is a tuple of
-exponents. All of total degree up to the longest path are numbered by degree: the histories of short paths
-come first. There are C(degree + letters, letters) of them.
+The product of reflectances and transmittances does not depend on the order of scatterings, so that a history
+is a tuple of exponents (n_1, ..., n_c), and its optical weight the monomial
+
+    prod over channels s of  optics_s ** n_s.
+
+All histories with n_1 + ... + n_c <= degree are numbered by their total degree: those of short paths come
+first. There are C(degree + c, c) of them.
 """
 
 import dataclasses
@@ -16,15 +20,15 @@ from jaxtyping import Array, Float
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Histories:
-    """The table of histories of up to `degree` scatterings of `letters` kinds.
+    """The table of histories of up to `degree` scatterings by a number of channels.
 
-    - `exponents`: (histories, letters), the degree not decreasing along the first axis.
-    - `successor`: (histories, letters), the history after one more scattering of a letter; where that
-      would exceed the degree, the history itself.
+    - `exponents`: (histories, channels), the degree not decreasing along the first axis.
+    - `next_history`: (histories, channels), number of the history after one more scattering by a channel;
+      where that would exceed the degree, the history itself.
     """
 
     exponents: np.ndarray
-    successor: np.ndarray
+    next_history: np.ndarray
 
     @property
     def count(self) -> int:
@@ -32,45 +36,48 @@ class Histories:
         return len(self.exponents)
 
     @property
-    def letters(self) -> int:
-        """Number of letters."""
+    def n_channels(self) -> int:
+        """Number of scatterer channels."""
         return self.exponents.shape[1]
 
     @property
     def degree(self) -> int:
         """Largest number of scatterings."""
-        return int(self.exponents[-1].sum()) if self.letters else 0
+        return int(self.exponents[-1].sum()) if self.n_channels else 0
 
-    def monomials(self, optics: Float[Array, "letters wavelengths"]) -> Float[Array, "histories wavelengths"]:
-        """Product over the letters of optics to the power of the history's exponents.
+    def monomials(
+        self, optics: Float[Array, "channels wavelengths"]
+    ) -> Float[Array, "histories wavelengths"]:
+        """Return the product over channels of optics to the power of each history's exponents.
 
-        Powers are repeated products: exact, with finite derivatives, at zero too.
+        Powers are repeated products: exact, with finite derivatives at zero too, where `**` has NaN.
         """
         powers, square = jnp.ones((1, *optics.shape), optics.dtype), optics[None]
+        # Doubling: powers 0 .. n - 1 times the n-th power are powers n .. 2 n - 1.
         while len(powers) <= self.degree:
             powers, square = jnp.concatenate([powers, powers * square]), square * square
         product = jnp.ones((self.count, optics.shape[1]), optics.dtype)
-        for letter in range(self.letters):
-            product = product * powers[self.exponents[:, letter], letter]
+        for channel in range(self.n_channels):
+            product = product * powers[self.exponents[:, channel], channel]
         return product
 
 
 @functools.cache
-def histories(letters: int, degree: int) -> Histories:
-    """All histories of at most `degree` scatterings, numbered by degree."""
+def histories(n_channels: int, degree: int) -> Histories:
+    """Return all histories of at most `degree` scatterings, numbered by degree."""
     rows: list[list[int]] = []
     for total in range(degree + 1):
-        # Stars and bars: `letters - 1` bars divide `total` stars.
-        for bars in itertools.combinations(range(total + letters - 1), max(letters - 1, 0)):
-            edges = (-1, *bars, total + letters - 1)
+        # Stars and bars: `n_channels - 1` bars divide `total` stars.
+        for bars in itertools.combinations(range(total + n_channels - 1), max(n_channels - 1, 0)):
+            edges = (-1, *bars, total + n_channels - 1)
             rows.append([b - a - 1 for a, b in itertools.pairwise(edges)])
-    if letters == 0:
+    if n_channels == 0:
         rows = [[]]
-    exponents = np.array(rows, dtype=np.int32).reshape(len(rows), letters)
+    exponents = np.array(rows, dtype=np.int32).reshape(len(rows), n_channels)
     number = {tuple(row): i for i, row in enumerate(exponents.tolist())}
-    successor = np.empty_like(exponents)
+    next_history = np.empty_like(exponents)
     for i, row in enumerate(exponents.tolist()):
-        for k in range(letters):
+        for k in range(n_channels):
             grown = (*row[:k], row[k] + 1, *row[k + 1 :])
-            successor[i, k] = number.get(grown, i)
-    return Histories(exponents, successor)
+            next_history[i, k] = number.get(grown, i)
+    return Histories(exponents, next_history)

@@ -1,4 +1,14 @@
-"""The state of photons, and of their collisions."""
+"""The state of photons and of their collisions, and attached likelihood ratios.
+
+Derivatives use detached sampling with attached weights: random decisions are drawn from a density p whose
+derivative is not followed, and the weight is multiplied by
+
+    p / detach(p),
+
+which is one, but has the derivative of ln p. The expected value of the derivative of the weight is then the
+derivative of the expected value (the score-function or likelihood-ratio estimator; Zeltner et al. 2021, ACM
+Trans. Graph. 40, 78).
+"""
 
 import equinox as eqx
 import jax
@@ -8,14 +18,18 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxlidar._vectors import Scalar, Vec, with_derivative_of
 
-stop = lax.stop_gradient
+detach = lax.stop_gradient
 
-# What happens to a photon at a plate in its way.
-GAP, EVENT, THROUGH = 0, 1, 2
+# Outcomes of a photon's encounter with a plate in its path: it flies through a gap, is scattered, or is
+# transmitted straight on.
+GAP, SCATTERED, TRANSMITTED = 0, 1, 2
 
 
-class Scattering(eqx.Module):
-    """How photons were sent on: by which of the setting's laws, from which direction, about which normal."""
+class LastScattering(eqx.Module):
+    """The law that sent a photon on, its incident direction and its normal; derivatives alone need it.
+
+    `law` is a number among those of the device scene.
+    """
 
     law: Int[Array, "photons"]
     incident: Vec
@@ -23,10 +37,19 @@ class Scattering(eqx.Module):
 
 
 class Photons(eqx.Module):
-    """The state of a chunk of photons. `on` is the surface from which a photon starts, or -1.
+    """The state of a chunk of photons.
 
-    `sent` is None where no derivatives are asked for, which alone need it.
-    `history`, `tints` and `entry`: see `jaxlidar.trace.labels`. `score`: see `jaxlidar.trace.scores`.
+    - `x`, `w`: position, m from the aim point, and direction.
+    - `path`: path length since the sensor, m, less the range of the reference plane.
+    - `weight`: geometric weight of the path.
+    - `history`: number of the scattering history; or of the entry node (see `jaxlidar.trace.tally_index`).
+    - `surface`: number of the surface from which the photon starts, or -1.
+    - `last_scattering`: None where no derivatives are taken.
+    - `alive`: False for photons that were recorded to their end.
+    - `optical_weights`: for each wavelength, the product of optics along the path, where optics are applied
+      while light is traced; otherwise empty.
+    - `entry`: x and y of where light entered the scene, m, where shots share it; otherwise None.
+    - `score`: derivatives of the log path probability (see `jaxlidar.trace.score_functions`), or None.
     """
 
     x: Vec
@@ -34,58 +57,63 @@ class Photons(eqx.Module):
     path: Float[Array, "photons"]
     weight: Float[Array, "photons"]
     history: Int[Array, "photons"]
-    on: Int[Array, "photons"]
-    sent: Scattering | None
+    surface: Int[Array, "photons"]
+    last_scattering: LastScattering | None
     alive: Bool[Array, "photons"]
-    tints: tuple[Float[Array, "photons"], ...] = ()
+    optical_weights: tuple[Float[Array, "photons"], ...] = ()
     entry: tuple[Float[Array, "photons"], Float[Array, "photons"]] | None = None
     score: Float[Array, "photons columns"] | None = None
 
 
-class Hit(eqx.Module):
-    """A collision.
+class Collision(eqx.Module):
+    """A collision of each photon, and how it scatters.
 
-    - `material`, `letter`: what was hit, and the letter that was drawn.
-    - `ratio`: density ratio of the collision.
-    - `onward`: weight ratio of going on along `w`.
-    - `on`: the surface, or -1.
-    - `reflected`, `transmitted`: letters of what returns from here, or -1.
-    - `normal`: of the facet or of the lit side.
-    - `sent`: how the photon goes on.
+    - `material`: number of the material that was hit.
+    - `channel`: scatterer channel by which the photon goes on.
+    - `ratio`: attached likelihood ratio of the collision.
+    - `onward_weight`: factor of the weight of going on along `w`.
+    - `w`: direction onward.
+    - `surface`: number of the surface that was hit, or -1 within a voxel.
+    - `reflection`, `transmission`: channels of light that returns to the sensor from here, or -1.
+    - `normal`: normal of the facet, or of the lit side of the surface.
+    - `last_scattering`: how the photon was sent on.
     """
 
     material: Int[Array, "photons"]
-    letter: Int[Array, "photons"]
+    channel: Int[Array, "photons"]
     ratio: Float[Array, "photons"]
-    onward: Float[Array, "photons"]
+    onward_weight: Float[Array, "photons"]
     w: Vec
-    on: Int[Array, "photons"]
-    reflected: Int[Array, "photons"]
-    transmitted: Int[Array, "photons"]
+    surface: Int[Array, "photons"]
+    reflection: Int[Array, "photons"]
+    transmission: Int[Array, "photons"]
     normal: Vec
-    sent: Scattering
+    last_scattering: LastScattering
 
 
-class Met(eqx.Module):
-    """What of a collision decides how it is seen. `normal` is None where that does not.
+class VisibleCollision(eqx.Module):
+    """The part of a `Collision` on which its brightness towards the sensor depends.
 
-    Else see `Hit`.
+    `normal` is None where facets have no preferred direction, so that it does not matter.
     """
 
     material: Int[Array, "photons"]
-    on: Int[Array, "photons"]
-    reflected: Int[Array, "photons"]
-    transmitted: Int[Array, "photons"]
+    surface: Int[Array, "photons"]
+    reflection: Int[Array, "photons"]
+    transmission: Int[Array, "photons"]
     normal: Vec | None
 
 
-def merge(where: Bool[Array, "photons"], a: Hit, b: Hit) -> Hit:
-    """`a` where `where` holds, else `b`."""
+def select_collision(where: Bool[Array, "photons"], a: Collision, b: Collision) -> Collision:
+    """Return `a` where `where` holds, else `b`."""
     return jax.tree.map(lambda p, q: jnp.where(where, p, q), a, b)
 
 
-def ratio_of(density: Scalar) -> Scalar:
-    """One, with the relative derivative of a density; no derivative where the density is zero."""
-    held = stop(density)
+def attached_ratio(density: Scalar) -> Scalar:
+    """Return density / detach(density): one, with the derivative of the logarithm of a density.
+
+    Without derivative where the density is zero: such outcomes are never drawn.
+    """
+    held = detach(density)
     safe = jnp.where(held == 0, 1.0, held)
     return with_derivative_of(jnp.ones_like(held), jnp.where(held == 0, 1.0, density / safe))

@@ -1,11 +1,17 @@
-"""Random numbers for photons: randomly shifted lattices, one per order and dimension, or independent ones.
+"""Random numbers for photons: randomly shifted lattices, one for each order and dimension.
 
-Photon i takes frac(z i + s) in each dimension, in 32-bit integer arithmetic. The shift s is random, so every
-number is uniform and every estimate unbiased, whatever z is. For the first collision z belongs to a lattice
-of low discrepancy (Roberts's generalised golden ratio); later it is random, which makes any two photons
-independent. This costs two integer operations where a counter-based generator costs fifty. Photons of one
-batch are not independent: standard errors come from batches with independent keys. Independent numbers serve
-for comparison.
+Photon i takes the uniform number
+
+    u = frac(z i + s)
+
+in each dimension, in 32-bit integer arithmetic. The shift s is random, so that every number is uniform and
+every estimate unbiased, whatever z is. For the first collision the z of all dimensions form a lattice of low
+discrepancy (Roberts's generalised golden ratio: z_d = phi^-d with phi the root of x^(d+1) = x + 1); later z
+is random, which makes any two photons independent. This costs two integer operations, where a counter-based
+generator costs fifty.
+
+Photons of one batch are not independent of one another: standard errors come from batches with independent
+keys (randomised quasi-Monte Carlo; L'Ecuyer and Lemieux 2000, Manage. Sci. 46, 1214).
 """
 
 from collections.abc import Sequence
@@ -19,80 +25,73 @@ from jaxtyping import Array, Float, PRNGKeyArray, UInt32
 Uniform = Float[Array, "..."]
 
 
-class Draw(eqx.Module):
+class PhotonDraws(eqx.Module):
     """The uniform numbers of one order of a photon's path, by what they decide.
 
-    - `flight`: where the flight ends.
-    - `choice`: which material is hit, and whether light is reflected.
-    - `normal`: of the facet that is hit.
-    - `direction`: onward.
-    - `ahead`, `behind`: for each plate, whether light meets it on its way, and on the way back to the sensor.
+    - `flight`: the optical depth at which the flight ends.
+    - `choice`: the material that is hit, and reflection or transmission.
+    - `normal`: the normal of the facet that is hit.
+    - `direction`: the direction onward.
+    - `plates_ahead`, `plates_behind`: for each plate, whether the flight, and the return path to the sensor,
+      meets the plate or one of its gaps.
     """
 
     flight: Uniform
     choice: Uniform
     normal: tuple[Uniform, Uniform]
     direction: tuple[Uniform, Uniform]
-    ahead: tuple[Uniform, ...]
-    behind: tuple[Uniform, ...]
+    plates_ahead: tuple[Uniform, ...]
+    plates_behind: tuple[Uniform, ...]
 
     @staticmethod
-    def of(numbers: Sequence[Uniform], plates: int) -> "Draw":
-        """A `Draw` from six numbers and two, or one, for each plate."""
-        a, b, c, d, e, f, *rest = numbers
-        return Draw(a, b, (c, d), (e, f), tuple(rest[:plates]), tuple(rest[plates:]))
+    def from_numbers(numbers: Sequence[Uniform], n_plates: int) -> "PhotonDraws":
+        """Sort six numbers, and two or one for each plate, by what they decide."""
+        flight, choice, n1, n2, d1, d2, *plates = numbers
+        return PhotonDraws(
+            flight, choice, (n1, n2), (d1, d2), tuple(plates[:n_plates]), tuple(plates[n_plates:])
+        )
 
     @staticmethod
-    def dimensions(plates: int, *, back: bool = True) -> int:
-        """How many numbers an order takes. `back`: whether light returns from every collision."""
-        return 6 + plates * (2 if back else 1)
+    def dimensions(n_plates: int, *, return_path: bool = True) -> int:
+        """Return how many numbers an order takes, with or without a return path to the sensor."""
+        return 6 + n_plates * (2 if return_path else 1)
 
 
 class Lattices(eqx.Module):
-    """Uniform numbers in (0, 1) for each photon, order and dimension, from shifted lattices."""
+    """Uniform numbers in (0, 1) for each photon, order and dimension: frac(`step` * photon + `shift`)."""
 
     step: UInt32[Array, "orders dims"]
     shift: UInt32[Array, "orders dims"]
 
     def __call__(self, photon: UInt32[Array, "*photons"], order: Array) -> list[Float[Array, "*photons"]]:
-        """One array for each dimension."""
+        """Return one array for each dimension."""
         return [
             to_unit(photon * self.step[order, d] + self.shift[order, d]) for d in range(self.step.shape[1])
         ]
 
 
-class Independent(eqx.Module):
-    """Independent uniform numbers in (0, 1) for each photon, order and dimension."""
+def random_words(key: PRNGKeyArray, count: int) -> UInt32[Array, "count"]:
+    """Return the first random words of a key; those of a smaller count are the first of them.
 
-    key: PRNGKeyArray
-    dims: int = eqx.field(static=True)
-
-    def __call__(self, photon: UInt32[Array, "photons"], order: Array) -> list[Float[Array, "photons"]]:
-        """One array for each dimension. Photons come in blocks, each known by its first photon."""
-        key = jax.random.fold_in(jax.random.fold_in(self.key, order), photon[0])
-        return list(to_unit(jax.random.bits(key, (self.dims, photon.size), jnp.uint32)))
-
-
-def words(key: PRNGKeyArray, count: int) -> UInt32[Array, "count"]:
-    """The first random words of a key; those of a smaller count are the first of them.
-
-    All that a program draws it takes from one call, for compiling each generator takes a while.
+    A program draws everything from one call, because compiling each generator takes a while.
     """
     return jax.random.bits(key, (count,), jnp.uint32)
 
 
-def lattices(drawn: UInt32[Array, "words"], orders: int, dims: int) -> Lattices:
-    """Lattices for `orders` collisions of `dims` numbers each, from two random words for each number."""
-    drawn = drawn.reshape(orders, 2, dims)
-    step, shift = drawn[:, 0] | jnp.uint32(1), drawn[:, 1]
-    root = np.roots([1.0, *[0.0] * (dims - 1), -1.0, -1.0])
-    ratio = float(np.real(root[np.argmax(np.real(root))]))
-    golden = np.floor(2.0**32 * ((1.0 / ratio ** np.arange(1, dims + 1)) % 1.0)).astype(np.uint32)
+def shifted_lattices(words: UInt32[Array, "words"], orders: int, dims: int) -> Lattices:
+    """Return lattices of `dims` dimensions for `orders` collisions, from two random words for each number."""
+    words = words.reshape(orders, 2, dims)
+    # Odd steps: photons then take each of the 2^32 values of a dimension before one repeats.
+    step, shift = words[:, 0] | jnp.uint32(1), words[:, 1]
+    roots = np.roots([1.0, *[0.0] * (dims - 1), -1.0, -1.0])
+    phi = float(np.real(roots[np.argmax(np.real(roots))]))
+    golden = np.floor(2.0**32 * ((1.0 / phi ** np.arange(1, dims + 1)) % 1.0)).astype(np.uint32)
     return Lattices(step.at[0].set(jnp.asarray(golden)), shift)
 
 
 def to_unit(bits: UInt32[Array, "*s"]) -> Float[Array, "*s"]:
-    """Uniform numbers in (0, 1) from random words."""
+    """Convert random words to uniform numbers in the open interval (0, 1)."""
     if jnp.finfo(jnp.result_type(float)).bits == 64:
         return (bits.astype(float) + 0.5) * 2.0**-32
+    # 23 bits: with the half added, single precision rounds none of them to 0 or 1.
     return ((bits >> 9).astype(float) + 0.5) * 2.0**-23

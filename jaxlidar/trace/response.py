@@ -1,7 +1,7 @@
 """The response of a scene to a pulse without duration: geometry is traced once, for any optics.
 
     received[wavelength, bin] = sum over histories h of
-        response[bin, h] * prod over letters s of optics_s[wavelength] ** exponent[h, s]
+        response[bin, h] * prod over channels s of optics_s[wavelength] ** exponent[h, s]
 
 This is known in biomedical optics as white Monte Carlo (Alerstam et al. 2008).
 """
@@ -17,12 +17,12 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxlidar._checks import briefly, check_flag, check_key, check_kind
 from jaxlidar.planning.setup import Setup
+from jaxlidar.trace.device_scene import DeviceScene, build_device_scene
 from jaxlidar.trace.first_order import FirstOrder, first_order
-from jaxlidar.trace.footprint import WHOLE, Slice, lattice, product_rule, scattered
-from jaxlidar.trace.higher_orders import HigherOrders, higher_orders
-from jaxlidar.trace.mirror import mirror_rays
-from jaxlidar.trace.random_numbers import to_unit, words
-from jaxlidar.trace.setting import Setting, setting_of, straight_transmittance
+from jaxlidar.trace.footprint import ALL_RAYS, RaySlice, fibonacci_disc, product_rule
+from jaxlidar.trace.higher_orders import HigherOrderTally, trace_higher_orders
+from jaxlidar.trace.mirror_return import mirror_rays
+from jaxlidar.trace.random_numbers import random_words, to_unit
 
 Traced = TypeVar("Traced")
 
@@ -40,7 +40,7 @@ class Response(eqx.Module):
     - `first`: (traces, materials, first histories, bins) order one, apparent reflectance per unit optics.
     - `higher`: (traces, materials, histories, bins) orders two and above, or None where they were not traced.
     - `first_outside`: (traces, materials, first histories), `higher_outside`: (traces, materials, histories)
-      what arrives before the first bin or after the last.
+      returns before the first bin or after the last.
     - `arrived`, `left`: (traces, materials, histories) weight that reached each material, and that went on.
     - `escaped`, `late`, `remaining`: (traces, histories) weight that left the scene, that outlasted the
       window, and that had scatterings left when the last order was reached.
@@ -51,7 +51,7 @@ class Response(eqx.Module):
     >>> import jax
     >>> import jaxlidar as jl
     >>> lidar, scene = jl.Lidar(), jl.Scene(ground=jl.Ground(reflectance=0.4))
-    >>> setup = jl.reduce(lidar, scene, jl.plan(lidar, scene))
+    >>> setup = jl.make_setup(lidar, scene, jl.plan(lidar, scene))
     >>> response = eqx.filter_jit(jl.trace_scene)(setup, jax.random.key(0))
     >>> print(response.first.shape[:2], f"{float(response.first.sum()):.3f}")
     (1, 1) 1.000
@@ -69,21 +69,21 @@ class Response(eqx.Module):
 
 
 def trace_scene(setup: Setup, key: PRNGKeyArray, *, reverse: bool = True) -> Response:
-    """The response of one batch: the deterministic first order, and photons for the higher ones.
+    """Trace the response of one batch: the deterministic first order, and photons for the higher ones.
 
     A batch has `plan.n_photons` photons. The function is pure, to be compiled, batched and differentiated.
     Wavelengths enter only where leaves transmit straight on.
 
     **Arguments:**
 
-    - `setup`: a `Setup` made by `jaxlidar.reduce`.
+    - `setup`: a `Setup` made by `jaxlidar.make_setup`.
     - `key`: a JAX random key.
-    - `reverse`: whether the function may be differentiated in reverse, as by `jax.grad`. Without, higher
+    - `reverse`: True if the function may be differentiated in reverse, as by `jax.grad`. Without, higher
       orders are faster with JAX before 0.12. Default True.
 
     **Returns:** a `Response`, for `jaxlidar.waveform_of`.
 
-    **Raises:** TypeError for things of another kind.
+    **Raises:** TypeError for arguments of another kind.
 
     **Example:**
 
@@ -91,68 +91,56 @@ def trace_scene(setup: Setup, key: PRNGKeyArray, *, reverse: bool = True) -> Res
     >>> import jax
     >>> import jaxlidar as jl
     >>> lidar, scene = jl.Lidar(), jl.Scene(ground=jl.Ground(reflectance=0.4))
-    >>> setup = jl.reduce(lidar, scene, jl.plan(lidar, scene))
+    >>> setup = jl.make_setup(lidar, scene, jl.plan(lidar, scene))
     >>> response = eqx.filter_jit(jl.trace_scene)(setup, jax.random.key(0))
     >>> wave = eqx.filter_jit(jl.waveform_of)(response, setup)
     >>> print(f"{float(wave.reflectance.sum()):.4f}")
     0.4000
     """
-    check_kind("setup", setup, Setup, "a Setup, as in reduce(lidar, scene, plan)")
+    check_kind("setup", setup, Setup, "a Setup, as in make_setup(lidar, scene, plan)")
     check_key(key)
     check_flag("reverse", reverse)
-    return trace_setting(
-        setting_of(setup, derivatives="all" if reverse else "forward"), straight_transmittance(setup), key
-    )
+    scene = build_device_scene(setup, derivatives="all" if reverse else "forward")
+    return trace_device_scene(scene, key)
 
 
-def trace_setting(
-    setting: Setting, transmittance: Float[Array, "wavelengths"] | None, key: PRNGKeyArray
-) -> Response:
-    """The response of one batch. `transmittance`: see `straight_transmittance`."""
-    if follows(setting):
-        return joined(trace_first(setting, transmittance, key), trace_higher(setting, transmittance, key))
-    return trace_only_first(setting, transmittance, key)
+def trace_device_scene(scene: DeviceScene, key: PRNGKeyArray) -> Response:
+    """Trace the response of one batch."""
+    if scene.config.follows_higher_orders:
+        return join_orders(trace_first(scene, key), trace_higher(scene, key))
+    return trace_first_only(scene, key)
 
 
-def trace_scored(
-    setting: Setting, optics: Float[Array, "letters wavelengths"], key: PRNGKeyArray
+def trace_with_scores(
+    scene: DeviceScene, optics: Float[Array, "channels wavelengths"], key: PRNGKeyArray
 ) -> tuple[Response, Float[Array, "columns wavelengths bins"]]:
-    """The response of one batch, and what its `scores` make of it at these optics, in fine bins.
+    """Trace the response of one batch, and its derivatives by the columns of `scene.slopes` at these optics.
 
-    For plans that keep histories, and leaves that do not transmit straight on.
+    For plans that keep histories, and leaves that do not transmit straight on. Derivatives are in fine bins.
     """
-    first, weights = _first(setting, key)
-    assert first.scored is not None
-    fine = jnp.einsum("hw,mhbc->bcw", setting.short.monomials(optics), first.scored)
-    if not follows(setting):
-        return only_first(setting, first, weights), jnp.moveaxis(fine, 0, 2)
-    higher = higher_orders(setting, _keys(setting, key)[1])
-    assert higher.scored is not None
-    fine = fine + higher.scored
-    own = jax.tree.map(lambda a: a[None], eqx.tree_at(lambda h: h.scored, higher, None))
-    return joined(First(weights[None], first.outside[None]), own), jnp.moveaxis(fine, 0, 2)
+    first, weights = _first(scene, key)
+    assert first.weight_slopes is not None
+    derivatives = jnp.einsum("hw,mhbc->bcw", scene.first_histories.monomials(optics), first.weight_slopes)
+    if not scene.config.follows_higher_orders:
+        return first_order_response(scene, first, weights), jnp.moveaxis(derivatives, 0, 2)
+    higher = trace_higher_orders(scene, key)
+    assert higher.weight_slopes is not None
+    derivatives = derivatives + higher.weight_slopes
+    response = jax.tree.map(lambda a: a[None], dataclasses.replace(higher, weight_slopes=None))
+    first_response = FirstOrderResponse(weights[None], first.outside[None])
+    return join_orders(first_response, response), jnp.moveaxis(derivatives, 0, 2)
 
 
-def trace_only_first(
-    setting: Setting,
-    transmittance: Float[Array, "wavelengths"] | None,
-    key: PRNGKeyArray,
-    part: Slice = WHOLE,
-) -> Response:
-    """The response of one batch of a setting that has one order; or of a part of its rays (see `lattice`)."""
+def trace_first_only(scene: DeviceScene, key: PRNGKeyArray, ray_slice: RaySlice = ALL_RAYS) -> Response:
+    """Trace the response of one batch of a scene that has one order; or of a slice of its rays."""
 
-    def trace(setting: Setting) -> Response:
-        return only_first(setting, *_first(setting, key, part))
+    def trace(scene: DeviceScene) -> Response:
+        return first_order_response(scene, *_first(scene, key, ray_slice))
 
-    return _for_each(trace, setting, transmittance)
+    return _for_each_trace(trace, scene)
 
 
-def follows(setting: Setting) -> bool:
-    """Whether light is followed beyond its first scattering."""
-    return setting.plan.order_steps >= 2 or setting.plan.drawn_first
-
-
-class First(eqx.Module):
+class FirstOrderResponse(eqx.Module):
     """Order one of a response that has more: `first` and `first_outside` of `Response`."""
 
     weights: Float[Array, "traces materials short bins"]
@@ -160,129 +148,142 @@ class First(eqx.Module):
 
 
 # First and higher orders share nothing, so that they can be compiled side by side.
-def trace_first(
-    setting: Setting, transmittance: Float[Array, "wavelengths"] | None, key: PRNGKeyArray
-) -> First:
-    """Order one of a batch."""
+def trace_first(scene: DeviceScene, key: PRNGKeyArray) -> FirstOrderResponse:
+    """Trace order one of a batch."""
 
-    def trace(setting: Setting) -> First:
-        first, weights = _first(setting, key)
-        if setting.optics is None:
-            return First(weights[None], first.outside[None])
-        monomials = setting.short.monomials(setting.optics)
-        coloured = (jnp.einsum("hw,mh...->wm...", monomials, a) for a in (weights, first.outside))
-        return First(*(jnp.expand_dims(a, 2) for a in coloured))
+    def trace(scene: DeviceScene) -> FirstOrderResponse:
+        first, weights = _first(scene, key)
+        if scene.optics is None:
+            return FirstOrderResponse(weights[None], first.outside[None])
+        # With optics applied there is one trace per wavelength, with one history.
+        monomials = scene.first_histories.monomials(scene.optics)
+        by_wavelength = (jnp.einsum("hw,mh...->wm...", monomials, a) for a in (weights, first.outside))
+        return FirstOrderResponse(*(jnp.expand_dims(a, 2) for a in by_wavelength))
 
-    return _for_each(trace, setting, transmittance)
+    return _for_each_trace(trace, scene)
 
 
-def trace_higher(
-    setting: Setting, transmittance: Float[Array, "wavelengths"] | None, key: PRNGKeyArray
-) -> HigherOrders:
-    """Orders two and above of a batch, and the fate of all light."""
+def trace_higher(scene: DeviceScene, key: PRNGKeyArray) -> HigherOrderTally:
+    """Trace orders two and above of a batch, and the energy budget of all light."""
 
-    def trace(setting: Setting) -> HigherOrders:
-        found = higher_orders(setting, _keys(setting, key)[1])
-        if setting.optics is None:
-            return jax.tree.map(lambda a: a[None], found)
+    def trace(scene: DeviceScene) -> HigherOrderTally:
+        # The same key as for the footprint: photons leave out the words with which that is shifted.
+        tally = trace_higher_orders(scene, key)
+        if scene.optics is None:
+            return jax.tree.map(lambda a: a[None], tally)
         # Wavelengths, in place of histories, become traces with one history each.
-        return jax.tree.map(lambda a: _as_traces(a, min(a.ndim - 1, 1)), found)
+        return jax.tree.map(lambda a: _axis_to_traces(a, min(a.ndim - 1, 1)), tally)
 
-    return _for_each(trace, setting, transmittance)
-
-
-def _as_traces(a: Array, wavelengths: int) -> Array:
-    """With the axis of wavelengths in front, and one history in its place."""
-    return jnp.expand_dims(jnp.moveaxis(a, wavelengths, 0), wavelengths + 1)
+    return _for_each_trace(trace, scene)
 
 
-def joined(first: First, higher: HigherOrders) -> Response:
-    """The response of all orders."""
-    fate = (higher.arrived, higher.left, higher.escaped, higher.late, higher.remaining)
-    return Response(first.weights, higher.weights, first.outside, higher.outside, *fate)
+def _axis_to_traces(a: Array, wavelength_axis: int) -> Array:
+    """Move the axis of wavelengths to the front, and put one history in its place."""
+    return jnp.expand_dims(jnp.moveaxis(a, wavelength_axis, 0), wavelength_axis + 1)
 
 
-def _for_each(
-    trace: Callable[[Setting], Traced], setting: Setting, transmittance: Float[Array, "wavelengths"] | None
-) -> Traced:
-    """One trace for all wavelengths, or one for each transmittance, along the first axis."""
-    if transmittance is None:
-        return trace(setting)
+def join_orders(first: FirstOrderResponse, higher: HigherOrderTally) -> Response:
+    """Make the response of all orders."""
+    return Response(
+        first=first.weights,
+        higher=higher.weights,
+        first_outside=first.outside,
+        higher_outside=higher.outside,
+        arrived=higher.arrived,
+        left=higher.left,
+        escaped=higher.escaped,
+        late=higher.late,
+        remaining=higher.remaining,
+    )
 
-    def one(given: tuple[Array, Array | None]) -> Traced:
-        t, optics = given
-        own = None if optics is None else optics[:, None]
-        return trace(dataclasses.replace(setting.thinned(t), optics=own))
 
-    each = jax.lax.map(one, (transmittance, None if setting.optics is None else setting.optics.T))
-    return jax.tree.map(lambda a: a[:, 0], each)
+def _for_each_trace(trace: Callable[[DeviceScene], Traced], scene: DeviceScene) -> Traced:
+    """Trace once for all wavelengths; or, where leaves transmit straight on, once for each transmittance.
 
-
-def _keys(setting: Setting, key: PRNGKeyArray) -> tuple[PRNGKeyArray, PRNGKeyArray]:
-    """Keys of the footprint and of photons.
-
-    Photons leave out the words with which the footprint is shifted: one key serves both.
+    Traces lie along the first axis.
     """
-    if not setting.plan.independent:
-        return key, key
-    shift, photons = jax.random.split(key)
-    return shift, photons
+    if scene.straight_transmittance is None:
+        return trace(scene)
+
+    def trace_wavelength(of_wavelength: tuple[Array, Array | None]) -> Traced:
+        transmittance, optics = of_wavelength
+        optics = None if optics is None else optics[:, None]
+        return trace(dataclasses.replace(scene.with_leaf_transmittance(transmittance), optics=optics))
+
+    optics = None if scene.optics is None else scene.optics.T
+    traces = jax.lax.map(trace_wavelength, (scene.straight_transmittance, optics))
+    return jax.tree.map(lambda a: a[:, 0], traces)
 
 
 def _first(
-    setting: Setting, key: PRNGKeyArray, part: Slice = WHOLE
+    scene: DeviceScene, key: PRNGKeyArray, ray_slice: RaySlice = ALL_RAYS
 ) -> tuple[FirstOrder, Float[Array, "materials short bins"]]:
-    """Order one, and its weights together with what mirrors return; none where the order is drawn."""
-    across, energy = footprint_of(setting, _keys(setting, key)[0], part)
-    first = first_order(setting, across, energy)
-    weights, scored = first.weights, first.scored
-    if setting.plan.drawn_first:
-        weights, scored = jax.tree.map(jnp.zeros_like, (weights, scored))
-    for i, is_mirror in enumerate(setting.plan.mirrors):
-        if is_mirror and setting.sizes.specular:
-            rays = mirror_rays(setting.beam, setting.surfaces[i])
-            mirrored = first_order(setting, *rays, mirror=i)
-            weights, scored = jax.tree.map(jnp.add, (weights, scored), (mirrored.weights, mirrored.scored))
-    return eqx.tree_at(lambda f: f.scored, first, scored, is_leaf=lambda a: a is None), weights
+    """Trace order one; also return its weights together with the returns of mirrors."""
+    across, energy = footprint_rays(scene, key, ray_slice)
+    first = first_order(scene, across, energy)
+    weights, slopes = first.weights, first.weight_slopes
+    for i, is_mirror in enumerate(scene.config.mirrors):
+        if is_mirror and scene.config.returns_specular:
+            rays = mirror_rays(scene.beam, scene.surfaces[i])
+            mirrored = first_order(scene, *rays, mirror=i)
+            weights, slopes = jax.tree.map(
+                jnp.add, (weights, slopes), (mirrored.weights, mirrored.weight_slopes)
+            )
+    return dataclasses.replace(first, weight_slopes=slopes), weights
 
 
-def footprint_of(
-    setting: Setting, key: PRNGKeyArray, part: Slice = WHOLE
+def footprint_rays(
+    scene: DeviceScene, key: PRNGKeyArray, ray_slice: RaySlice = ALL_RAYS
 ) -> tuple[tuple[Float[Array, "rays"], Float[Array, "rays"]], Float[Array, "rays"]]:
-    """Places of the footprint's rays across the beam, and their shares of its energy."""
-    beam, sizes = setting.beam, setting.sizes
-    if sizes.smooth:
-        return product_rule(beam)
-    if setting.plan.independent:
-        assert part is WHOLE, "independent rays have no parts"
-        return scattered(beam, sizes.rays, key)
-    shift = to_unit(words(key, 2)) if sizes.shifted else jnp.asarray([0.5, 0.0])
-    return lattice(beam, sizes.rays, shift, part)
+    """Return the positions of the footprint's rays across the beam, and their fractions of its energy."""
+    if scene.config.smooth_footprint:
+        return product_rule(scene.beam)
+    random = scene.config.random_footprint
+    shift = to_unit(random_words(key, 2)) if random else jnp.asarray([0.5, 0.0])
+    return fibonacci_disc(scene.beam, scene.config.n_rays, shift, ray_slice)
 
 
-def only_first(
-    setting: Setting, first: FirstOrder, weights: Float[Array, "materials short bins"]
+def first_order_response(
+    scene: DeviceScene, first: FirstOrder, weights: Float[Array, "materials short bins"]
 ) -> Response:
-    """The response where nothing is followed beyond the first scattering: what is scattered remains."""
-    plan, table = setting.plan, setting.short
+    """Make the response where nothing is followed beyond the first scattering.
+
+    Light that is scattered remains unfollowed; but what one plane alone scatters escapes, as nothing is in
+    its path.
+    """
+    config, table = scene.config, scene.first_histories
     left = jnp.zeros_like(first.arrived)
     remaining = jnp.zeros_like(first.escaped)
-    scatterers = [(s, False) for s in (plan.leaf, plan.bark) if s is not None]
-    scatterers += [(s, surface.straight) for s, surface in zip(plan.surfaces, setting.surfaces)]
-    for s, passes in scatterers:
-        for letter, share in ((s.reflected, first.scattered), (s.transmitted, first.arrived)):
-            if letter < 0:
+    scatterers = [(s, False) for s in (config.leaf, config.bark) if s is not None]
+    scatterers += [(s, surface.straight) for s, surface in zip(config.surfaces, scene.surfaces)]
+    for scatterer, is_straight in scatterers:
+        for channel, energy in (
+            (scatterer.reflection, first.scattered),
+            (scatterer.transmission, first.arrived),
+        ):
+            if channel < 0:
                 continue
-            after = table.successor[:, letter]
-            grown = jnp.where(after != jnp.arange(table.count), share[s.material], 0.0)
-            left = left.at[s.material, after].add(grown)
-            # What goes straight through a plate was followed to what lies behind it.
-            if not (passes and letter == s.transmitted):
-                remaining = remaining.at[after].add(grown)
+            after = table.next_history[:, channel]
+            # Histories of the largest degree, which have no successor, are not scattered again.
+            scattered = jnp.where(after != jnp.arange(table.count), energy[scatterer.material], 0.0)
+            left = left.at[scatterer.material, after].add(scattered)
+            # Light that goes straight through a plate was followed to what lies behind it.
+            if not (is_straight and channel == scatterer.transmission):
+                remaining = remaining.at[after].add(scattered)
     escaped, late = first.escaped, jnp.zeros_like(remaining)
-    lights_itself = any(surface.shape.lights_itself for surface in setting.surfaces)
-    if len(scatterers) == 1 and not (plan.leaf or plan.bark or lights_itself):
-        # Nothing is in the way of what one plane scatters.
+    lights_itself = any(surface.shape.lights_itself for surface in scene.surfaces)
+    if len(scatterers) == 1 and not (config.leaf or config.bark or lights_itself):
         escaped, remaining = escaped + remaining, late
-    fate = (first.arrived, left, escaped, late, remaining)
-    return Response(weights[None], None, first.outside[None], None, *(a[None] for a in fate))
+    budget = (first.arrived, left, escaped, late, remaining)
+    arrived, left, escaped, late, remaining = (a[None] for a in budget)
+    return Response(
+        first=weights[None],
+        higher=None,
+        first_outside=first.outside[None],
+        higher_outside=None,
+        arrived=arrived,
+        left=left,
+        escaped=escaped,
+        late=late,
+        remaining=remaining,
+    )

@@ -1,4 +1,9 @@
-"""Ground and plates as the tracer sees them: surfaces that rays meet or pass."""
+"""Ground and plates in tracer coordinates: surfaces that rays meet or pass.
+
+A ray x + s w meets a surface at the smallest s > 0 on its shape. Ground is opaque, is met from above only,
+and ends the ray; a plate is met from both sides, and lets rays through its gaps or straight through its
+material.
+"""
 
 import dataclasses
 
@@ -14,27 +19,32 @@ from jaxlidar.scenes.shapes import AbstractShape
 from jaxlidar.scenes.surfaces import AbstractSheet, AbstractSurface
 
 
-class Surface(eqx.Module):
-    """One surface, with its shape relative to the aim point."""
+class TracedSurface(eqx.Module):
+    """A surface, with its shape relative to the aim point.
+
+    - `coverage`: fraction of a plate that is not gap; 1 for ground.
+    - `law`: law of reflection.
+    - `pattern`: factor of the reflectance by position, or None where it is the same everywhere.
+    - `is_plate`: True for plates, False for the ground.
+    - `straight`: True if the plate transmits light straight on.
+    """
 
     shape: AbstractShape
     coverage: Float[Array, ""]
     law: AbstractLaw
-    # What the reflectance is multiplied by at each place, if it varies.
     pattern: Raster | None
-    # Whether rays may pass: a plate lets some through, the ground does not.
-    plate: bool = eqx.field(static=True)
+    is_plate: bool = eqx.field(static=True)
     straight: bool = eqx.field(static=True)
 
-    def moved(self, by: Float[Array, "3"]) -> "Surface":
-        """The same surface, moved."""
+    def moved(self, by: Float[Array, "3"]) -> "TracedSurface":
+        """Return the same surface, moved."""
         pattern = None if self.pattern is None else self.pattern.moved(by[:2])
         return dataclasses.replace(self, shape=self.shape.moved(by), pattern=pattern)
 
     def distance(self, x: Vec, w: Vec) -> Scalar:
-        """Distance from `x` along `w` to the surface; FAR if behind, missed, or met from under the ground."""
+        """Distance from `x` along `w`; FAR if the surface is behind, missed, or met from under the ground."""
         s = self.shape.distance(x, w)
-        if self.plate:
+        if self.is_plate:
             return s
         normal, _ = self.shape.tangent(along(x, w, jnp.where(s < FAR, s, 0.0)))
         return jnp.where(dot(normal, w) < 0, s, FAR)
@@ -45,20 +55,20 @@ class Surface(eqx.Module):
         sign = jnp.where(dot(normal, w) > 0, -1.0, 1.0)
         return scale(normal, sign)
 
-    def by_place(self, x: Vec, value: Scalar) -> Scalar:
-        """What is reflected at the point `x`, where `value` is reflected at the brightest place."""
+    def at_position(self, x: Vec, value: Scalar) -> Scalar:
+        """Scale `value`, which holds where the pattern is brightest, to the point `x`."""
         return value if self.pattern is None else value * self.pattern.value(x)
 
 
-def surfaces_of(scene: Scene, aim: Float[Array, "3"]) -> tuple[Surface, ...]:
-    """The surfaces of a scene, ground first, then plates, relative to the aim point."""
+def traced_surfaces(scene: Scene, aim: Float[Array, "3"]) -> tuple[TracedSurface, ...]:
+    """Return the surfaces of a scene, ground first, then plates, relative to the aim point."""
     one = jnp.ones_like(aim[0])
 
-    def surface(s: AbstractSurface) -> Surface:
-        here = Surface(s.shape, one, s.law, s.pattern, False, False)
-        if isinstance(s, AbstractSheet):
-            straight = s.transmission == "straight"
-            here = dataclasses.replace(here, coverage=s.coverage, plate=True, straight=straight)
-        return here.moved(-aim)
+    def traced(surface: AbstractSurface) -> TracedSurface:
+        result = TracedSurface(surface.shape, one, surface.law, surface.pattern, False, False)
+        if isinstance(surface, AbstractSheet):
+            straight = surface.transmission == "straight"
+            result = dataclasses.replace(result, coverage=surface.coverage, is_plate=True, straight=straight)
+        return result.moved(-aim)
 
-    return tuple(surface(s) for s in scene.surfaces)
+    return tuple(traced(surface) for surface in scene.surfaces)

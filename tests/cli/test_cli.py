@@ -51,7 +51,7 @@ def test_simulate_writes_what_was_simulated_and_how(tmp_path, capsys, suffix):
     assert "Waveform of" in printed
     assert float(jl.open(out).reflectance.sum()) == pytest.approx(0.5, rel=1e-4)
     assert plot.read_bytes().startswith(b"\x89PNG")
-    assert np.array_equal(jl.repeat(out).reflectance, jl.open(out).reflectance)
+    assert np.array_equal(jl.rerun(out).reflectance, jl.open(out).reflectance)
     # What there is, other commands read.
     assert cli.main(["info", str(out)]) == 0
     assert capsys.readouterr().out == f"{jl.open(out)}\n"
@@ -94,7 +94,7 @@ def test_a_survey_is_simulated_shot_by_shot(tmp_path, capsys, suffix):
     # The file has its case.
     assert cli.main(["convert", str(out), str(tmp_path / "b.toml")]) == 0
     assert len(jl.io.read_case(tmp_path / "b.toml").survey) == 3
-    assert np.array_equal(jl.repeat(out).reflectance, jl.open(out).reflectance)
+    assert np.array_equal(jl.rerun(out).reflectance, jl.open(out).reflectance)
 
 
 def test_an_interrupted_simulation_is_kept(tmp_path, capsys, monkeypatch):

@@ -10,7 +10,7 @@ from jaxlidar.extend import along
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.instrument.pulse import GaussianPulse, RectangularPulse
 from jaxlidar.instrument.receiver import Receiver
-from jaxlidar.trace.footprint import beam_of
+from jaxlidar.trace.footprint import make_beam
 
 
 def test_without_arguments_it_is_table_1(precision):
@@ -126,7 +126,7 @@ def test_light_that_flies_its_whole_budget_is_back_in_time():
     """From points about an oblique beam, in random directions: at the end, the path is used up."""
     rng = np.random.default_rng(0)
     with jax.enable_x64(True):
-        beam = beam_of(Lidar(altitude=800.0, zenith=35.0, azimuth=20.0))
+        beam = make_beam(Lidar(altitude=800.0, zenith=35.0, azimuth=20.0))
         x = tuple(jnp.asarray(v) for v in rng.uniform(-30.0, 30.0, (3, 200)))
         w = rng.normal(size=(3, 200))
         w = tuple(jnp.asarray(v) for v in w / np.linalg.norm(w, axis=0))

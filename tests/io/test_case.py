@@ -202,10 +202,10 @@ def test_the_page_has_a_case_that_can_be_read(tmp_path):
 class OwnLaw(jl.AbstractLaw):
     k: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=1.0)
 
-    def view_factor(self, incident, normal, view, half_angle):
+    def intensity_factor(self, incident, normal, view, half_angle):
         raise NotImplementedError
 
-    albedo = sample = density = largest_view_factor = view_factor
+    albedo = sample = density = largest_intensity_factor = intensity_factor
 
 
 class Lambertian(OwnLaw):

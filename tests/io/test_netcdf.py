@@ -126,7 +126,7 @@ def test_methods_save_as_well(wave, fit, fits, tmp_path):
 def test_a_run_is_repeated_bit_for_bit(wave, case, tmp_path):
     path = tmp_path / "a.nc"
     wave.save(path, case)
-    again = jl.repeat(path)
+    again = jl.rerun(path)
     assert jax.tree.all(jax.tree.map(np.array_equal, again, with_info(wave, again.info)))
     other = jl.io.Case(case.lidar, case.scene, jax.random.key(4), case.arguments).simulate()
     assert not np.array_equal(other.reflectance, wave.reflectance)
@@ -143,13 +143,13 @@ def test_what_cannot_be_repeated_is_refused(wave, case, tmp_path):
     path = tmp_path / "a.nc"
     wave.save(path)
     with pytest.raises(ValueError, match=r"a.nc: /case: no such attribute: it was saved without its case"):
-        jl.repeat(path)
+        jl.rerun(path)
     with_info(wave, {**wave.info, "stopped": "interrupted"}).save(path, case)
     with pytest.raises(ValueError, match=r"a.nc: the run ended early \(interrupted\)"):
-        jl.repeat(path)
+        jl.rerun(path)
     wave.save(path, case)
     with jax.enable_x64(True), pytest.raises(ValueError, match="simulated in float32; JAX is configured for"):
-        jl.repeat(path)
+        jl.rerun(path)
     with pytest.raises(ValueError, match=r"case has a lidar of .* not the case that it was simulated from"):
         wave.save(path, jl.io.Case(jl.Lidar()))
 

@@ -187,7 +187,7 @@ def test_a_waveform_as_zarr(tmp_path):
         np.array_equal(a, b) for a, b in zip(jax.tree.leaves(wave), jax.tree.leaves(found), strict=True)
     )
     assert found.info == wave.info
-    assert np.array_equal(jl.repeat(path).reflectance, wave.reflectance)
+    assert np.array_equal(jl.rerun(path).reflectance, wave.reflectance)
     xarray = pytest.importorskip("xarray")
     data = xarray.open_zarr(path, consolidated=False, decode_timedelta=False)
     assert data.reflectance.dims == ("wavelength", "time")

@@ -29,7 +29,7 @@ def same(a, b):
 def test_a_file_that_is_written_shot_by_shot_is_repeated_bit_for_bit(many, tmp_path, suffix):
     path = tmp_path / f"many{suffix}"
     jl.simulate_many(SURVEY, SCENE, key=KEY, **HOW, path=path)
-    again = jl.repeat(path)
+    again = jl.rerun(path)
     assert same(again, many)
     assert same(again, jl.open(path))
     kept = jl.io.read_case(path)
@@ -43,12 +43,12 @@ def test_waveforms_are_saved_with_their_case(many, tmp_path):
     path = tmp_path / "many.nc"
     case = jl.io.Case(survey=SURVEY, scene=SCENE, key=KEY, arguments=HOW)
     many.save(path, case)
-    assert same(jl.repeat(path), many)
+    assert same(jl.rerun(path), many)
     many.save(path)
     with pytest.raises(
         ValueError, match=r"many\.nc: /case: no such attribute: it was saved without its case"
     ):
-        jl.repeat(path)
+        jl.rerun(path)
     elsewhere = dataclasses.replace(case, survey=SURVEY.about(np.ones(2)))
     for wrong, says in (
         (elsewhere, "the shots of the case have another position"),
@@ -80,7 +80,7 @@ def test_a_case_that_no_file_can_hold_is_not_kept(tmp_path):
     many = jl.simulate_many(survey, jl.Scene(ground=jl.Ground()), key=KEY, path=path)
     assert same(jl.open(path), many)
     with pytest.raises(ValueError, match="it was saved without its case"):
-        jl.repeat(path)
+        jl.rerun(path)
 
 
 def test_arguments_of_surveys_alone_are_refused_elsewhere():

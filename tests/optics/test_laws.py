@@ -129,14 +129,14 @@ def test_laws_conserve_energy_and_agree_with_themselves(name, zenith):
     # The equal-angle density is singular at the normal, and softened there.
     assert np.sum(density * weight) == pytest.approx(1.0, abs=5e-3 if name == "equal-angle" else 1e-4)
     if isinstance(thing, jl.AbstractPhase):
-        seen, albedo, most = thing.view_factor(incident, out), 1.0, thing.largest_view_factor()
+        seen, albedo, most = thing.intensity_factor(incident, out), 1.0, thing.largest_intensity_factor()
     else:
         albedo = np.asarray(thing.albedo(incident, normal), float)
         assert np.all((albedo >= 0) & (albedo <= 1))
         # A wider aperture softens what is seen of the equal-angle singularity.
         half_angle = 2e-4
-        seen = thing.view_factor(incident, normal, out, jnp.asarray(half_angle))
-        most = thing.largest_view_factor(half_angle)
+        seen = thing.intensity_factor(incident, normal, out, jnp.asarray(half_angle))
+        most = thing.largest_intensity_factor(half_angle)
     seen = np.asarray(seen, float)
     np.testing.assert_allclose(seen, np.pi * albedo * density, rtol=2e-3, atol=1e-6)
     assert np.max(seen) <= most * (1 + 1e-5)
@@ -151,7 +151,9 @@ def test_minnaert_is_reciprocal_and_equal_angle_is_not():
     def exchanged(law):
         def brdf(towards, out):
             incident, out = (vec(jnp.asarray(v)) for v in (-towards, out))
-            return np.asarray(law.view_factor(incident, up, out, jnp.asarray(1e-3)) / dot(up, out), float)
+            return np.asarray(
+                law.intensity_factor(incident, up, out, jnp.asarray(1e-3)) / dot(up, out), float
+            )
 
         return np.max(np.abs(brdf(a, b) / brdf(b, a) - 1))
 
@@ -167,8 +169,10 @@ def test_first_return_of_minnaert(slope):
     cosine = np.cos(np.deg2rad(slope))
     assert float(wave.reflectance.sum()) == pytest.approx(0.4 * 1.35 * cosine**2.4, rel=1e-4)
     # What the law does not scatter is absorbed.
-    assert float(wave.ledger["absorbed by ground"][0]) == pytest.approx(1 - 0.4 * cosine**0.7, rel=1e-4)
-    assert float(sum(wave.ledger.values())[0]) == pytest.approx(1.0, abs=1e-5)
+    assert float(wave.energy_budget["absorbed by ground"][0]) == pytest.approx(
+        1 - 0.4 * cosine**0.7, rel=1e-4
+    )
+    assert float(sum(wave.energy_budget.values())[0]) == pytest.approx(1.0, abs=1e-5)
 
 
 def below_plate(p, law=Minnaert):
@@ -185,7 +189,7 @@ LIDAR = whole_lidar()
 @pytest.mark.slow
 def test_the_ledger_of_all_orders_adds_up():
     wave = jl.simulate(LIDAR, below_plate(START), key=jax.random.key(1), n_photons=65536, **WHOLE)
-    assert float(sum(wave.ledger.values())[0]) == pytest.approx(1.0, abs=1e-4)
+    assert float(sum(wave.energy_budget.values())[0]) == pytest.approx(1.0, abs=1e-4)
 
 
 def derivatives(law, name, step):
@@ -193,7 +197,7 @@ def derivatives(law, name, step):
     plan = jl.plan(LIDAR, below_plate(START, law), max_orders=4, n_photons=65536, n_rays=512, **WHOLE)
 
     def measure(value, key):
-        setup = jl.reduce(LIDAR, below_plate(START | {name: value}, law), plan)
+        setup = jl.make_setup(LIDAR, below_plate(START | {name: value}, law), plan)
         return jl.waveform_of(jl.trace_scene(setup, key), setup).components["higher"].sum()
 
     both = jax.jit(lambda v, k: jax.jvp(lambda v: measure(v, k), (v,), (jnp.ones_like(v),))[1])
@@ -219,8 +223,8 @@ class Forgetful(jl.AbstractLaw):
 
     k: jax.Array
 
-    def view_factor(self, incident, normal, view, half_angle):
-        return Minnaert(self.k).view_factor(incident, normal, view, half_angle)
+    def intensity_factor(self, incident, normal, view, half_angle):
+        return Minnaert(self.k).intensity_factor(incident, normal, view, half_angle)
 
     def albedo(self, incident, normal):
         return Minnaert(self.k).albedo(incident, normal)
@@ -231,8 +235,8 @@ class Forgetful(jl.AbstractLaw):
     def density(self, incident, normal, out):
         return jl.Lambertian().density(incident, normal, out)
 
-    def largest_view_factor(self, half_angle):
-        return Minnaert(self.k).largest_view_factor(half_angle)
+    def largest_intensity_factor(self, half_angle):
+        return Minnaert(self.k).largest_intensity_factor(half_angle)
 
 
 @pytest.mark.slow

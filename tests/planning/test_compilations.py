@@ -1,9 +1,7 @@
 """Programs are compiled for the sizes of a short ladder: everyday changes of a scene compile nothing anew.
 
-What sets the scene out is not counted: it is short, and compiled for the sizes as they are.
+The program that builds the device scene is not counted: it is short, and compiled for the sizes as they are.
 """
-
-import importlib
 
 import jax
 import jax.numpy as jnp
@@ -12,11 +10,9 @@ import pytest
 
 import jaxlidar as jl
 from jaxlidar._programs import Program
-from jaxlidar.planning.ladder import rung
-from jaxlidar.trace import batches
+from jaxlidar.planning.size_buckets import size_bucket
+from jaxlidar.sampling import batch_programs
 
-# The package's name `simulate` is the function.
-simulation = importlib.import_module("jaxlidar.simulate")
 KEY = jax.random.key(0)
 SHAPE = (8, 8, 18)
 
@@ -58,9 +54,8 @@ CHANGES = {
 @pytest.fixture(scope="module")
 def compiled():
     """Counts the versions of the programs, after a first simulation."""
-    programs = {
-        name: p for m in (batches, simulation) for name, p in vars(m).items() if isinstance(p, Program)
-    }
+    programs = {name: p for name, p in vars(batch_programs).items() if isinstance(p, Program)}
+    del programs["compiled_geometry"]
     for program in programs.values():
         program.versions.clear()
 
@@ -68,8 +63,8 @@ def compiled():
         return {name: len(program.versions) for name, program in programs.items()}
 
     simulate()
-    used = {"_compiled_first", "_compiled_higher", "_compiled_known", "add_responses", "_compiled_waveform"}
-    unused = {"compiled_trace", "compiled_batch"}
+    used = {f"_compiled_{name}" for name in ("first", "higher", "estimate", "sum", "waveform")}
+    unused = {"_compiled_trace", "_compiled_batch"}
     assert count() == dict.fromkeys(used, 1) | dict.fromkeys(unused, 0)
     return count
 
@@ -104,9 +99,11 @@ def test_room_changes_no_value():
     given = {"key": KEY, "n_photons": 20_000, "max_orders": 5, "window": (-60.0, 30.0)}
     wave = jl.simulate(lidar, scene, **given)
     # Within a transformation nothing is rounded up but what the plan has.
-    setup = jl.reduce(lidar, scene, jl.plan(lidar, scene, max_orders=5, window=(-60.0, 30.0), n_photons=2500))
-    assert setup.plan.trace.order_steps == 6
-    total = jax.jit(lambda key: jl.total_of(jl.trace_scene(setup, key), setup))
+    setup = jl.make_setup(
+        lidar, scene, jl.plan(lidar, scene, max_orders=5, window=(-60.0, 30.0), n_photons=2500)
+    )
+    assert setup.plan.config.order_steps == 6
+    total = jax.jit(lambda key: jl.total_reflectance(jl.trace_scene(setup, key), setup))
     totals = [np.asarray(total(jax.random.fold_in(KEY, n))) for n in range(8)]
     np.testing.assert_allclose(wave.reflectance, np.mean(totals, axis=0), rtol=1e-4, atol=1e-7)
     assert wave.reflectance.shape == (3, setup.plan.n_samples)
@@ -116,11 +113,11 @@ def test_room_changes_no_value():
 @pytest.mark.parametrize("steps", [1, 2, 4, 8, 16])
 def test_the_ladder(steps):
     sizes = np.arange(1, 3000)
-    rungs = np.array([rung(int(n), steps) for n in sizes])
+    rungs = np.array([size_bucket(int(n), steps) for n in sizes])
     assert np.all(rungs >= sizes)
     assert np.all(rungs <= np.maximum(np.ceil(sizes * (1 + 1.0 / steps)), 2))
     assert np.all(np.diff(rungs) >= 0)
-    assert np.all([rung(int(n), steps) == n for n in rungs])
+    assert np.all([size_bucket(int(n), steps) == n for n in rungs])
     assert len(np.unique(rungs)) <= 12 * steps + 2
 
 

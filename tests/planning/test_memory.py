@@ -17,9 +17,9 @@ import jaxlidar as jl
 from inversion.fit.columns import columns_at_once
 from inversion.fit.model import Model
 from inversion.fit.unknowns import settle
-from jaxlidar.planning import memory, sampling
+from jaxlidar.planning import memory
 from jaxlidar.planning.memory import check_memory, in_words, memory_limit
-from jaxlidar.planning.sampling import sampling_of
+from jaxlidar.spectral.pulse_convolution import pulse_convolution
 from tests.helpers import applied, slab, slow_unless
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -34,7 +34,7 @@ def plates(count):
 def test_many_plates_are_refused_before_anything_is_allocated():
     canopy = jl.Canopy(slab(1.0), leaf=jl.LeafOptics(0.4, 0.4))
     scene = jl.Scene(canopy=canopy, plates=plates(4), ground=GROUND)
-    lidar = jl.Lidar(wavelength=np.linspace(500.0, 1600.0, memory.FEW + 1))
+    lidar = jl.Lidar(wavelength=np.linspace(500.0, 1600.0, memory.MAX_APPLIED_WAVELENGTHS + 1))
     with pytest.raises(ValueError, match=r"would take about .* GB of memory; .* at most 8 wavelengths"):
         jl.plan(lidar, scene, max_orders=12, describe=False)
 
@@ -54,20 +54,20 @@ SCENES = {
 
 @pytest.mark.parametrize("name", slow_unless(["leaf and bark over ground"], SCENES))
 def test_optics_applied_while_light_is_traced_give_the_same(name):
-    """The same photons, and so the same waveform, errors and ledger, to rounding."""
+    """The same photons, and so the same waveform, errors and energy_budget, to rounding."""
     given = dict(SCENES[name])
     bark = [0.1] if "bark" in given["canopy"] else []
     leaf = jl.Prospect(Cab=40.0) if "straight" not in name else LEAF
     canopy = jl.Canopy(slab(0.5, *bark), leaf=leaf, **given.pop("canopy"))
     scene = jl.Scene(canopy=canopy, **given)
     plan = jl.plan(TWO, scene, max_orders=4, describe=False)
-    assert plan.trace.keeps_histories
+    assert plan.config.keeps_histories
     a, b = (jl.simulate(TWO, scene, key=KEY, plan=p, n_photons=2048) for p in (plan, applied(plan)))
     for found in ("reflectance", "stderr", "neglected"):
         np.testing.assert_allclose(getattr(b, found), getattr(a, found), rtol=2e-4, atol=1e-7)
-    assert a.ledger.keys() == b.ledger.keys()
-    for name, share in a.ledger.items():
-        np.testing.assert_allclose(b.ledger[name], share, rtol=2e-4, atol=1e-6)
+    assert a.energy_budget.keys() == b.energy_budget.keys()
+    for name, share in a.energy_budget.items():
+        np.testing.assert_allclose(b.energy_budget[name], share, rtol=2e-4, atol=1e-6)
     for name, part in a.components.items():
         np.testing.assert_allclose(b.components[name], part, rtol=2e-4, atol=1e-7)
 
@@ -79,8 +79,8 @@ def test_derivatives_where_optics_are_applied_while_light_is_traced():
     def total(plan, x):
         canopy = jl.Canopy(slab(0.5), leaf=jl.LeafOptics(x[0], 0.2))
         scene = jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=0.3, height=x[1]))
-        setup = jl.reduce(TWO, scene, plan)
-        return jl.total_of(jl.trace_scene(setup, KEY), setup)
+        setup = jl.make_setup(TWO, scene, plan)
+        return jl.total_reflectance(jl.trace_scene(setup, KEY), setup)
 
     scene = jl.Scene(canopy=jl.Canopy(slab(0.5), leaf=LEAF), ground=GROUND)
     plan = jl.plan(TWO, scene, max_orders=4, n_photons=2048, window=(-100.0, 60.0), describe=False)
@@ -95,10 +95,10 @@ def test_when_optics_are_applied_while_light_is_traced():
     scene = jl.Scene(canopy=jl.Canopy(slab(1.0), leaf=jl.LeafOptics(0.5, 0.5)), ground=jl.Ground(0.0, 1.0))
     long = {"max_orders": 300, "window": (-81.0, 3000.0), "describe": False}
     plan = jl.plan(jl.Lidar(), scene, **long)
-    assert not plan.trace.keeps_histories
+    assert not plan.config.keeps_histories
     assert plan.memory < 1e9
     assert "optics applied while light is traced" in str(plan)
-    assert jl.plan(jl.Lidar(), scene, describe=False, max_orders=10).trace.keeps_histories
+    assert jl.plan(jl.Lidar(), scene, describe=False, max_orders=10).config.keeps_histories
     unknown = inversion.Unknown("ground.reflectance", bounds=(0.1, 1.0))
     settled = settle([unknown], scene)
     for given, traces in ((plan, True), (jl.plan(jl.Lidar(), scene, describe=False, max_orders=3), False)):
@@ -132,7 +132,7 @@ def test_a_grazing_beam_over_a_slope_takes_no_matrix():
     lidar = jl.Lidar(zenith=85.0, divergence=3.0)
     scene = jl.Scene(ground=jl.Ground(reflectance=0.4), plates=(jl.Plate(20.0, 0.2, 0.1),))
     plan = jl.plan(lidar, scene, max_orders=1, describe=False)
-    assert plan.bins.count * plan.n_samples > sampling.DENSE
+    assert plan.bins.count * plan.n_samples > memory.MAX_DENSE_PULSE
     assert plan.memory < 1e9
     wave = jl.simulate(lidar, scene, key=KEY, plan=plan)
     whole = float(wave.reflectance.sum())
@@ -154,16 +154,16 @@ def test_the_band_is_the_matrix(pulse, window, monkeypatch):
     lidar = jl.Lidar(pulse=pulse)
     plan = jl.plan(lidar, jl.Scene(plates=plates(1), ground=GROUND), window=window, describe=False)
     fine = jax.random.uniform(KEY, (2, plan.bins.count))
-    dense = jax.jit(lambda: sampling_of(lidar, plan))()
-    assert dense.dense
+    dense = jax.jit(lambda: pulse_convolution(lidar, plan))()
+    assert dense.is_dense
     expected = dense(fine)
-    monkeypatch.setattr(sampling, "DENSE", 1)
-    band = jax.jit(lambda: sampling_of(lidar, plan))()
-    assert not band.dense
-    assert band.share.size <= dense.share.size
+    monkeypatch.setattr("jaxlidar.spectral.pulse_convolution.MAX_DENSE_PULSE", 1)
+    band = jax.jit(lambda: pulse_convolution(lidar, plan))()
+    assert not band.is_dense
+    assert band.fractions.size <= dense.fractions.size
     np.testing.assert_allclose(band(fine), expected, atol=1e-6 * float(np.max(expected)))
     # The same test rejects a band that is a bin off.
-    wrong = dataclasses.replace(band, first=band.first + 1)
+    wrong = dataclasses.replace(band, first_offset=band.first_offset + 1)
     assert not np.allclose(wrong(fine), expected, atol=1e-6 * float(np.max(expected)))
 
 
@@ -183,7 +183,7 @@ def layered(orders, layers=4, end=100.0, most=None, **given):
     scene = jl.Scene(canopy=jl.Canopy(voxels, leaf=LEAF, bark=0.3), ground=GROUND)
     given = {"n_photons": 256, "n_rays": 64, **given}
     plan = jl.plan(TWO, scene, max_orders=orders, window=(-81.0, end), describe=False, **given)
-    plan = dataclasses.replace(plan, limits=plan.limits._replace(max_memory=most))
+    plan = dataclasses.replace(plan, scope=plan.scope._replace(max_memory=most))
     share = {"bounds": (0.5, 2.0), "start": np.ones(layers), "apply": layers_scaled, "name": "layers"}
     settled = settle(
         [
@@ -222,21 +222,21 @@ def test_derivatives_have_no_histories_beyond_the_last_order():
     scene = jl.Scene(canopy=jl.Canopy(slab(0.4), leaf=LEAF), ground=GROUND)
     given = {"n_photons": 16, "window": (-81.0, 50.0), "describe": False}
     plan = jl.plan(TWO, scene, max_orders=9, **given)
-    letters = len(plan.trace.letters)
-    assert 9 == plan.least_degree < plan.degree
-    setup = jl.reduce(TWO, scene, plan)
+    letters = len(plan.config.channels)
+    assert 9 == plan.config.degree < plan.config.degree
+    setup = jl.make_setup(TWO, scene, plan)
     shapes = jax.eval_shape(lambda key: jl.trace_scene(setup, key, reverse=False), KEY)
     assert shapes.higher.shape[2] == math.comb(9 + letters, letters)
     # Every flight, and the way back, may pass the plate.
-    assert jl.plan(TWO, jl.Scene(ground=GROUND, plates=plates(1)), max_orders=2, **given).least_degree == 5
+    assert jl.plan(TWO, jl.Scene(ground=GROUND, plates=plates(1)), max_orders=2, **given).degree == 5
 
 
 def test_groups_are_about_as_large():
     model = layered(4)[0]
     plan = model.problem.plan
     for columns, room, expected in ((0, 1, 0), (7, 7, 7), (7, 6, 4), (7, 3, 3), (20, 9, 7)):
-        limits = plan.limits._replace(max_memory=room_for(model, room))
-        limited = dataclasses.replace(plan, limits=limits)
+        scope = plan.scope._replace(max_memory=room_for(model, room))
+        limited = dataclasses.replace(plan, scope=scope)
         assert columns_at_once(limited, columns) == expected
 
 

@@ -25,7 +25,7 @@ RANDOM = ("random_", "threefry")
 def traced(lidar, scene, plan):
     """The trace as text, as it is compiled; the lidar's arrays are in it as far as they are used."""
 
-    setup = jl.reduce(lidar, scene, plan)
+    setup = jl.make_setup(lidar, scene, plan)
 
     def run(scene, key):
         return jl.trace_scene(dataclasses.replace(setup, scene=scene), key)
@@ -57,7 +57,7 @@ def test_ground_alone_with_all_that_a_lidar_may_have_has_no_loop_either():
     plan = planned(lidar, scene)
 
     def run(lidar, scene, key):
-        setup = jl.reduce(lidar, scene, plan)
+        setup = jl.make_setup(lidar, scene, plan)
         return jl.waveform_of(jl.trace_scene(setup, key), setup).reflectance
 
     text = str(eqx.filter_make_jaxpr(run)(lidar, scene, jax.random.key(0))[0])
@@ -88,11 +88,11 @@ def test_what_is_not_there_has_no_letter():
         planned(jl.Lidar(), bare, max_orders=3),
         planned(jl.Lidar(), with_bark, max_orders=3, effects={"bark": False}),
     ]
-    assert "bark.R" in plans[0].trace.letters
-    assert plans[1].trace.letters == plans[2].trace.letters == ("leaf.R", "leaf.T", "ground.R")
+    assert "bark.R" in plans[0].config.channels
+    assert plans[1].config.channels == plans[2].config.channels == ("leaf.R", "leaf.T", "ground.R")
     assert traced(jl.Lidar(), bare, plans[1]) == traced(jl.Lidar(), bare, plans[2])
     weights = jax.eval_shape(
-        lambda key: jl.trace_scene(jl.reduce(jl.Lidar(), with_bark, plans[2]), key), jax.random.key(0)
+        lambda key: jl.trace_scene(jl.make_setup(jl.Lidar(), with_bark, plans[2]), key), jax.random.key(0)
     )
     assert weights.first.shape[:3] == (1, 2, 4)
 

@@ -60,7 +60,7 @@ def lidar(**changes):
 MISFITS = {
     "ground below": (LIDAR, ground(height=-60.0), r"covers returns .* the scene has .* to 400"),
     "canopy above": (LIDAR, canopy(base=2.0), "rays start 6.301 m .*; the scene reaches to 8 m"),
-    "smaller voxels": (LIDAR, canopy(size=0.25), "stretches of a ray; the scene may have"),
+    "smaller voxels": (LIDAR, canopy(size=0.25), "segments of a ray; the scene may have"),
     "narrower voxels": (LIDAR, narrower(0.1), "voxels along a flight; the scene may have"),
     "brighter leaves": (LIDAR, canopy(leaf=jl.LeafOptics(0.5, 0.49)), "orders, for albedos up to 0.7"),
     "hot spot": (LIDAR, canopy(hotspot=True), "has hotspot = False"),
@@ -155,9 +155,9 @@ def test_what_leaves_the_bins_under_a_transformation_is_lost_and_said():
 
     found = waves(jnp.array([0.0, -1.0, -20.0]))
     np.testing.assert_allclose(found.lost[:, 0], [0.0, 0.4, 0.4], atol=1e-5)
-    for name, share in found.ledger.items():
+    for name, share in found.energy_budget.items():
         assert np.isfinite(share).all(), name
-    np.testing.assert_allclose(sum(found.ledger.values()), 1.0, atol=1e-5)
+    np.testing.assert_allclose(sum(found.energy_budget.values()), 1.0, atol=1e-5)
     marked = jax.vmap(lambda wave: wave.nan_where_lost())(found)
     assert np.isnan(marked.reflectance).all(axis=(1, 2)).tolist() == [False, True, True]
     np.testing.assert_array_equal(marked.reflectance[0], found.reflectance[0])
@@ -175,16 +175,16 @@ def test_what_is_zero_everywhere_is_not_in_the_scene():
     none, little = with_bark(0.0), with_bark(1e-3)
     plan = jl.plan(LIDAR, none)
     assert {row.name: row.reason for row in plan.effects}["bark"] == "zero everywhere"
-    assert plan.trace.letters == ("leaf.R", "leaf.T", "ground.R")
-    assert jl.reduce(LIDAR, none, plan).scene.canopy.voxels.bark is None
+    assert plan.config.channels == ("leaf.R", "leaf.T", "ground.R")
+    assert jl.make_setup(LIDAR, none, plan).scene.canopy.voxels.bark is None
     asked = jl.plan(LIDAR, none, effects={"bark": True}, describe=False)
-    assert "bark.R" in asked.trace.letters
+    assert "bark.R" in asked.config.channels
     assert "bark" not in asked.off
     check_plan(asked, LIDAR, little)
     with pytest.raises(ValueError, match="for a map without bark"):
         check_plan(plan, LIDAR, little)
     with pytest.raises(ValueError, match=r'make the plan with effects={"bark": True}'):
-        eqx.filter_eval_shape(lambda scene: jl.reduce(LIDAR, scene, plan).admissible, none)
+        eqx.filter_eval_shape(lambda scene: jl.make_setup(LIDAR, scene, plan).admissible, none)
 
 
 def test_a_map_of_zeros_is_no_canopy():

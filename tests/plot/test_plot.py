@@ -175,7 +175,7 @@ def test_inadmissible_input_is_refused(wave, call, says):
 
 
 def test_ledger_adds_up_and_names_what_is_seen(wave, axes):
-    assert plot.ledger(wave, axes) is axes
+    assert plot.energy_budget(wave, axes) is axes
     assert [t.get_text() for t in axes.get_yticklabels()] == ["532 nm", "1064 nm", "1550 nm"]
     ends = np.zeros(3)
     for bar in axes.patches:
@@ -183,7 +183,7 @@ def test_ledger_adds_up_and_names_what_is_seen(wave, axes):
         ends[row] = max(ends[row], bar.get_x() + bar.get_width())
     assert np.allclose(ends, 100.0, atol=0.2)
     bars = {bar.get_label(): [part.get_width() for part in bar] for bar in axes.containers}
-    assert np.allclose(bars["absorbed by leaf"], 100 * np.asarray(wave.ledger["absorbed by leaf"]))
+    assert np.allclose(bars["absorbed by leaf"], 100 * np.asarray(wave.energy_budget["absorbed by leaf"]))
 
 
 def test_accuracy_has_the_error_and_the_aim(wave, axes):

@@ -28,7 +28,7 @@ def dense(albedo, depth=10.0, reflectance=None):
 
 
 def late(wave):
-    return float(np.max(wave.ledger["after the window"]))
+    return float(np.max(wave.energy_budget["after the window"]))
 
 
 def test_a_window_that_the_plan_chose_warns_and_one_of_ones_own_does_not():
@@ -83,8 +83,8 @@ def test_tolerance_is_met_only_if_the_neglected_orders_are_below_it():
     assert "orders beyond the last may add" in str(wave)
     # The plan's own estimate is no smaller than what the photons say.
     assert jl.plan(LIDAR, scene, rtol=0.03, describe=False).likely_beyond >= float(
-        wave.ledger["unfollowed"][0]
-    ) - 3 * float(wave.ledger_stderr["unfollowed"][0])
+        wave.energy_budget["unfollowed"][0]
+    ) - 3 * float(wave.energy_budget_stderr["unfollowed"][0])
 
 
 @pytest.mark.slow
@@ -125,20 +125,20 @@ def test_the_ledger_has_standard_errors():
     plan = jl.plan(LIDAR, scene, describe=False)
     waves = [jl.simulate(LIDAR, scene, key=k, plan=plan, n_photons=4_000) for k in jax.random.split(KEY, n)]
     for name in ("escaped", "absorbed by leaf", "absorbed by ground", "after the window"):
-        values = np.array([float(w.ledger[name][0]) for w in waves])
-        errors = np.array([float(w.ledger_stderr[name][0]) for w in waves])
+        values = np.array([float(w.energy_budget[name][0]) for w in waves])
+        errors = np.array([float(w.energy_budget_stderr[name][0]) for w in waves])
         # Errors are widened for eight batches.
         ratio = values.std(ddof=1) / errors.mean()
         assert 0.6 < ratio < 1.4, name
         assert not any(0.6 < wrong < 1.4 for wrong in (ratio / 3, 3 * ratio)), name
     flat = jl.simulate(LIDAR, jl.Scene(ground=jl.Ground()), key=KEY)
-    assert all(float(e[0]) == 0 for e in flat.ledger_stderr.values())
+    assert all(float(e[0]) == 0 for e in flat.energy_budget_stderr.values())
 
 
 @pytest.mark.slow
 def test_light_is_accounted_for():
     wave = jl.simulate(LIDAR, dense(0.95, 4.0, 0.5), key=KEY, n_photons=20_000)
-    np.testing.assert_allclose(sum(np.asarray(v) for v in wave.ledger.values()), 1.0, atol=2e-3)
+    np.testing.assert_allclose(sum(np.asarray(v) for v in wave.energy_budget.values()), 1.0, atol=2e-3)
 
 
 def test_time_for_planning_counts(monkeypatch):

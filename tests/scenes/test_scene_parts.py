@@ -161,7 +161,7 @@ def test_millions_of_metres_lose_nothing_and_bare_parts_have_all_materials():
     np.testing.assert_allclose(a.reflectance, b.reflectance, atol=1e-6)
     for leaf in (a.components["leaf"], a.truth.returns["leaf"]):
         assert float(leaf[0].max()) == 0.0 < float(leaf[5].max())
-    total = sum(v[0] for v in a.ledger.values())
+    total = sum(v[0] for v in a.energy_budget.values())
     np.testing.assert_allclose(total, 1.0, atol=1e-5)
 
 

@@ -95,7 +95,7 @@ def test_first_order_of_a_disc(reflectance, transmittance):
 def test_a_disc_in_the_ledger_and_in_the_plan():
     what = scene(0.7, reflectance=0.5, transmittance=0.3)
     wave = jl.simulate(LIDAR, what, key=jax.random.key(0), n_photons=65536, max_orders=8, **WHOLE)
-    assert float(sum(wave.ledger.values())[0]) == pytest.approx(1.0, abs=1e-4)
+    assert float(sum(wave.energy_budget.values())[0]) == pytest.approx(1.0, abs=1e-4)
     assert set(wave.components) == {"ground", "disc", "first", "higher"}
     # No bound but the one that always holds is known for such a shape.
     table = {e.name: e for e in jl.plan(LIDAR, what).effects}
@@ -106,7 +106,7 @@ def test_surfaces_of_a_name_are_numbered():
     plate = jl.Plate(height=1.0, reflectance=0.2)
     other = jl.Plate(height=2.0, reflectance=0.2)
     what = jl.Scene(plates=(plate, Disc(5.0, 4.0, reflectance=0.5), other), ground=jl.Ground())
-    materials = jl.plan(LIDAR, what, max_orders=1, describe=False).trace.materials
+    materials = jl.plan(LIDAR, what, max_orders=1, describe=False).config.materials
     assert materials == ("ground", "plate 1", "disc", "plate 2")
 
 
@@ -119,7 +119,7 @@ def test_derivative_in_the_height_of_a_disc():
 
     def mean_time(height):
         disc = eqx.tree_at(lambda s: s.plates[0].height, what, height)
-        setup = jl.reduce(lidar, disc, plan)
+        setup = jl.make_setup(lidar, disc, plan)
         wave = jl.waveform_of(jl.trace_scene(setup, jax.random.key(0)), setup)
         return jnp.sum(wave.reflectance[0] * wave.time) / jnp.sum(wave.reflectance[0])
 

@@ -137,7 +137,7 @@ def test_a_plane_traced_as_heights():
     """Every ray sees the same slope, and the mean height is that of the axis."""
     flat = jl.Scene(ground=jl.Terrain(SLOPE * X, 1.0, (-10.0, -8.0), 0.4))
     plan = jl.plan(WIDE, flat, effects={"relief": True}, max_orders=1)
-    assert not plan.smooth_footprint
+    assert not plan.config.smooth_footprint
     mean, stderr = batch_mean(WIDE, flat, plan, seed=1, count=8, quantity=moments)
     assert mean[0] == pytest.approx(0.4 * np.cos(np.deg2rad(15.0)), rel=1e-4)
     spread = 2.0 * 0.5 * SLOPE / jl.SPEED_OF_LIGHT
@@ -171,7 +171,7 @@ def test_a_roof():
 
 
 def energies(wave):
-    return wave.reflectance.sum(), wave.ledger["absorbed by ground"][0]
+    return wave.reflectance.sum(), wave.energy_budget["absorbed by ground"][0]
 
 
 @pytest.mark.slow
@@ -213,10 +213,10 @@ def test_a_raster_of_reflectance():
     off = dataclasses.replace(lidar, position=(2.5, 0.0))
     plan = jl.plan(off, ramp, **WHOLE)
     assert plan.orders == 1
-    assert not plan.smooth_footprint
+    assert not plan.config.smooth_footprint
     wave = jl.simulate(off, ramp, key=KEY, plan=plan)
     assert float(wave.reflectance.sum()) == pytest.approx(0.35, rel=1e-3)
-    assert float(wave.ledger["absorbed by ground"][0]) == pytest.approx(0.65, rel=1e-3)
+    assert float(wave.energy_budget["absorbed by ground"][0]) == pytest.approx(0.65, rel=1e-3)
 
 
 @pytest.mark.slow
@@ -269,8 +269,8 @@ def test_derivatives_with_respect_to_heights(zenith, orders, photons, keys, heig
     plan = jl.plan(lidar, build(start), max_orders=orders, window=(-60.0, 60.0), **size)
 
     def measure(p, key):
-        setup = jl.reduce(lidar, build(p), plan)
-        total = jl.total_of(jl.trace_scene(setup, key), setup)[0]
+        setup = jl.make_setup(lidar, build(p), plan)
+        total = jl.total_reflectance(jl.trace_scene(setup, key), setup)[0]
         time = jnp.arange(plan.n_samples) / 50.0
         return jnp.stack([jnp.sum(total), jnp.sum(total * time)])
 
@@ -296,10 +296,10 @@ def test_the_gradient_is_that_of_the_jacobian():
     plan = jl.plan(jl.Lidar(divergence=2.0), scene, max_orders=2, n_photons=256, n_rays=64)
 
     def brightness(heights):
-        setup = jl.reduce(
+        setup = jl.make_setup(
             jl.Lidar(divergence=2.0), eqx.tree_at(lambda s: s.ground.heights, scene, heights), plan
         )
-        total = jl.total_of(jl.trace_scene(setup, KEY), setup)[0]
+        total = jl.total_reflectance(jl.trace_scene(setup, KEY), setup)[0]
         return jnp.sum(total * jnp.arange(total.size))
 
     way = jnp.asarray(np.cos(X * Y))
@@ -323,7 +323,7 @@ def test_millions_of_metres_away_nothing_changes():
         lidar = jl.Lidar(divergence=3.0, position=(east + 0.3, north - 0.2))
         scene = jl.Scene(canopy=canopy, ground=terrain)
         plan = jl.plan(lidar, scene, max_orders=2)
-        return jl.reduce(lidar, scene, plan), plan
+        return jl.make_setup(lidar, scene, plan), plan
 
     (here, plan), (there, other) = setup(0.0, 0.0), setup(512_345.0, 5_212_345.0)
     assert plan == other
@@ -362,14 +362,14 @@ def test_a_slope_hides_what_lies_behind_it():
     scene = jl.Scene(ground=hills(heights=ridge, reflectance=0.9))
     lidar = whole_lidar(zenith=60.0, azimuth=90.0, altitude=1e3, position=(5.0, 0.0), divergence=0.5)
     plan = jl.plan(lidar, scene, max_orders=2, n_photons=2048, n_rays=64, **WHOLE)
-    setup = jl.reduce(lidar, scene, plan)
-    from jaxlidar.trace.setting import setting_of
+    setup = jl.make_setup(lidar, scene, plan)
+    from jaxlidar.trace.device_scene import build_device_scene
 
-    setting = setting_of(setup)
-    shape = setting.surfaces[0].shape
+    device_scene = build_device_scene(setup)
+    shape = device_scene.surfaces[0].shape
     # From the eastern foot and from the western, relative to the aim point.
     x = vec(jnp.asarray([[3.0, 0.0, 1.0], [-4.0, 0.0, 0.0]]).T)
-    assert (np.asarray(shape.distance(x, setting.beam.view(x))) < 1e29).tolist() == [True, False]
+    assert (np.asarray(shape.distance(x, device_scene.beam.view(x))) < 1e29).tolist() == [True, False]
 
 
 # -- refusals ----------------------------------------------------------------------------------------------
@@ -424,7 +424,7 @@ def test_a_plan_for_a_plane_serves_no_relief():
 
     def brightness(heights):
         scene = jl.Scene(ground=hills(heights=heights))
-        return jl.reduce(jl.Lidar(), scene, plan).scene.ground.slope
+        return jl.make_setup(jl.Lidar(), scene, plan).scene.ground.slope
 
     with pytest.raises(ValueError, match="make the plan with effects="):
         jax.grad(brightness)(level.ground.heights)

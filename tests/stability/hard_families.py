@@ -45,14 +45,14 @@ def simulation(build, usual, outputs, **settings):
     plan = jl.plan(*build({k: jnp.asarray(v, float) for k, v in widest.items()}), **settings)
 
     def measure(p):
-        setup = jl.reduce(*build(p), plan)
+        setup = jl.make_setup(*build(p), plan)
         return outputs(setup, jl.trace_scene(setup, KEY))
 
     return measure
 
 
 def samples(setup, response):
-    return jl.total_of(response, setup)[0]
+    return jl.total_reflectance(response, setup)[0]
 
 
 def summed(setup, response):
@@ -64,9 +64,9 @@ def parts(*names):
 
     def outputs(setup, response):
         wave = jl.waveform_of(response, setup)
-        absorbed = [v[0] for k, v in wave.ledger.items() if k.startswith("absorbed")]
+        absorbed = [v[0] for k, v in wave.energy_budget.items() if k.startswith("absorbed")]
         sums = {
-            "shares": sum(wave.ledger.values())[0],
+            "shares": sum(wave.energy_budget.values())[0],
             "absorbed": sum(absorbed),
             "all": wave.reflectance.sum(),
         }

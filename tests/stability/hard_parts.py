@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxlidar as jl
-from jaxlidar.trace.march import free_flight, medium_of
+from jaxlidar.trace.voxel_traversal import make_medium, march_to_depths
 
 PROBABILITY = {"p_leaf": 0.3, "p_bark": 0.1, "edge": 0.5}
 
@@ -41,10 +41,10 @@ def chord(periodic):
         voxels = jl.VoxelMap.from_extinction(leaf=k, voxel_size=1.0)
         leaf = jl.LeafOptics(reflectance=0.5, transmittance=0.3)
         canopy = jl.Canopy(voxels, leaf=leaf, sides="periodic" if periodic else "open")
-        medium = medium_of(canopy, jnp.zeros(3))
+        medium = make_medium(canopy, jnp.zeros(3))
         x, w = (tuple(p[n][None] for n in names) for names in ("xyz", "uvw"))
         none, active = jnp.zeros((0, 1)), jnp.ones((1,), bool)
-        return free_flight(medium, x, w, none, p["limit"][None], active, 512).total
+        return march_to_depths(medium, x, w, none, p["limit"][None], active, 512).total_depth
 
     return measure
 

@@ -25,9 +25,9 @@ def evaluate(lidar, scene, plan, key, mode):
 
     def simulated(numbers):
         beam, target = eqx.combine(numbers, rest)
-        setup = jl.reduce(beam, target, plan)
+        setup = jl.make_setup(beam, target, plan)
         wave = jl.waveform_of(jl.trace_scene(setup, key), setup)
-        other = (wave.components, wave.neglected, wave.ledger, wave.time, wave.height)
+        other = (wave.components, wave.neglected, wave.energy_budget, wave.time, wave.height)
         return (wave.reflectance, wave.energy / 1e-12), other
 
     if mode == "forward":
@@ -150,7 +150,7 @@ def test_a_scene_with_nothing_in_it(precision):
     lidar = jl.Lidar()
     wave = jl.simulate(lidar, jl.Scene(), key=jax.random.key(0))
     np.testing.assert_array_equal(wave.reflectance, 0.0)
-    np.testing.assert_allclose(wave.ledger["escaped"], 1.0, rtol=1e-5)
+    np.testing.assert_allclose(wave.energy_budget["escaped"], 1.0, rtol=1e-5)
     check(lidar, jl.Scene(), jl.plan(lidar, jl.Scene()), ("forward", "reverse"))
 
 

@@ -141,7 +141,7 @@ def test_batches_of_one_photon():
     wave = jl.simulate(lidar, scene, key=KEY, plan=plan, n_photons=1)
     assert wave.info["photons"] == 8
     assert all(np.all(np.isfinite(a)) for a in jax.tree.leaves(wave))
-    np.testing.assert_allclose(sum(wave.ledger.values()), 1.0, atol=2e-6)
+    np.testing.assert_allclose(sum(wave.energy_budget.values()), 1.0, atol=2e-6)
 
 
 @pytest.mark.slow
@@ -149,12 +149,12 @@ def test_a_batch_of_ten_million_photons():
     """Each carries a ten-millionth, less than single precision tells apart at one half."""
     lidar, scene = whole_lidar(), over_ground(jl.LeafOptics(reflectance=0.0, transmittance=0.0))
     plan = jl.plan(lidar, scene, max_orders=2, n_photons=10_000_000, n_rays=64, **WHOLE)
-    setup = jl.reduce(lidar, scene, plan)
+    setup = jl.make_setup(lidar, scene, plan)
     wave = one_batch(setup, KEY)
-    np.testing.assert_allclose(sum(wave.ledger.values()), 1.0, atol=2e-4)
+    np.testing.assert_allclose(sum(wave.energy_budget.values()), 1.0, atol=2e-4)
     # A slab of optical depth 0.9; ground of reflectance 0.4.
     passed = np.exp(-0.9)
-    arrived = wave.ledger["absorbed by ground"] / 0.6
+    arrived = wave.energy_budget["absorbed by ground"] / 0.6
     np.testing.assert_allclose(arrived, passed, rtol=5e-4)
 
 

@@ -112,7 +112,7 @@ def compiled(precision):
 
     def simulated(p):
         lidar, scene = build(p)
-        setup = jl.reduce(lidar, scene, plan)
+        setup = jl.make_setup(lidar, scene, plan)
         return jl.waveform_of(jl.trace_scene(setup, KEY), setup)
 
     return jax.jit(simulated, compiler_options={"xla_backend_optimization_level": 0})
@@ -143,9 +143,9 @@ def test_finite_and_not_negative_and_no_more_than_was_emitted(precision, p):
     for name, part in {**wave.components, "all": wave.reflectance}.items():
         assert float(np.min(part)) >= -slack, name
     assert np.sum(wave.energy) <= 1e-3
-    np.testing.assert_allclose(np.sum(list(wave.ledger.values()), axis=0), 1.0, atol=2e-5)
+    np.testing.assert_allclose(np.sum(list(wave.energy_budget.values()), axis=0), 1.0, atol=2e-5)
     for name in ("returned", "escaped", "after the window", "unfollowed"):
-        assert float(wave.ledger[name][0]) >= -1e-6, name
+        assert float(wave.energy_budget[name][0]) >= -1e-6, name
 
 
 @usually(max_examples=20)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxlidar as jl
-from jaxlidar._ranges import SUM_OF_SHARES, Range, outside, reasons
+from jaxlidar._ranges import SUM_OF_FRACTIONS, Range, is_outside, reasons
 from jaxlidar.extend import inadmissible
 
 CUBE = np.full((2, 2, 2), 0.5)
@@ -136,10 +136,10 @@ def test_rounding_at_a_limit_is_admissible(precision):
         x = jnp.asarray(limit, precision)
         eps = float(jnp.finfo(precision).eps)
         for step in (-1, 1):
-            assert not outside(x + step * eps * max(limit, 1.0), Range(limit, limit))
-        assert not outside(x, admissible)
-    assert outside(jnp.asarray(1.0 + 1e-4, precision), SUM_OF_SHARES)
-    assert outside(jnp.asarray(0.0, precision), Range(0.0, low_open=True))
+            assert not is_outside(x + step * eps * max(limit, 1.0), Range(limit, limit))
+        assert not is_outside(x, admissible)
+    assert is_outside(jnp.asarray(1.0 + 1e-4, precision), SUM_OF_FRACTIONS)
+    assert is_outside(jnp.asarray(0.0, precision), Range(0.0, low_open=True))
 
 
 def test_what_has_no_ranges_is_admissible():

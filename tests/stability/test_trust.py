@@ -141,8 +141,8 @@ def test_right_to_its_error_or_something_is_said(case):
     wave, said = simulated(lidar, scene, rtol=RTOL)
     for name, part in {**wave.components, "all": wave.reflectance}.items():
         assert float(np.min(part)) >= -1e-6 * float(np.max(wave.reflectance)), name
-    total = np.sum([np.asarray(v) for v in wave.ledger.values()], axis=0)
-    slack = 5 * float(np.sqrt(sum(float(e[0]) ** 2 for e in wave.ledger_stderr.values()))) + 1e-4
+    total = np.sum([np.asarray(v) for v in wave.energy_budget.values()], axis=0)
+    slack = 5 * float(np.sqrt(sum(float(e[0]) ** 2 for e in wave.energy_budget_stderr.values()))) + 1e-4
     np.testing.assert_allclose(total, 1.0, atol=slack)
     if said:
         return

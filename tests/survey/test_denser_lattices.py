@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxlidar as jl
-from jaxlidar.trace.footprint import Slice, beam_of, lattice
+from jaxlidar.trace.footprint import RaySlice, fibonacci_disc, make_beam
 
 KEY = jax.random.key(5)
 LIDAR = jl.Lidar(altitude=1000.0, divergence=3.0, pulse=jl.GaussianPulse(fwhm=4.0))
@@ -25,15 +25,15 @@ def shots(count: int = 8) -> jl.Survey:
 
 
 def test_parts_of_a_lattice_are_that_lattice(precision):
-    beam, shift = beam_of(LIDAR), jnp.asarray([0.3, 0.8])
-    (x, y), energy = lattice(beam, 24 * 5, shift)
-    parts = [lattice(beam, 24, shift, Slice(jnp.asarray(n), jnp.asarray(5))) for n in range(5)]
+    beam, shift = make_beam(LIDAR), jnp.asarray([0.3, 0.8])
+    (x, y), energy = fibonacci_disc(beam, 24 * 5, shift)
+    parts = [fibonacci_disc(beam, 24, shift, RaySlice(jnp.asarray(n), jnp.asarray(5))) for n in range(5)]
     close = {"atol": 2e-5 if precision == "float32" else 1e-6}
     np.testing.assert_allclose(x, np.concatenate([p[0][0] for p in parts]), **close)
     np.testing.assert_allclose(y, np.concatenate([p[0][1] for p in parts]), **close)
     np.testing.assert_allclose(energy, np.concatenate([p[1] for p in parts]) / 5, rtol=1e-6)
     # Far out in a dense lattice, turns are still those of the golden ratio.
-    far = lattice(beam, 64, shift, Slice(jnp.asarray(1000), jnp.asarray(1024)))[0]
+    far = fibonacci_disc(beam, 64, shift, RaySlice(jnp.asarray(1000), jnp.asarray(1024)))[0]
     number = 64_000 + np.arange(64)
     turn = 2 * np.pi * ((number * (np.sqrt(5.0) - 1) / 2) % 1.0 + 0.8)
     angle = np.angle(np.exp(1j * (np.arctan2(far[1], far[0]) - turn)))

@@ -41,18 +41,18 @@ def test_shared_light_over_terrain_below_plates_and_air(kind):
     waves = one_by_one(survey, scene, **how)
     # Both wavelengths have the same photons, and are not independent.
     assert agree(deviations(many, waves, slice(1, 2)))
-    assert np.allclose(sum(many.ledger.values()), 1.0, atol=1e-3)
+    assert np.allclose(sum(many.energy_budget.values()), 1.0, atol=1e-3)
     for name in waves[0].components:
         mine = many.components[name].sum(axis=2)
         each = np.stack([w.components[name].sum(axis=1) for w in waves])
         assert np.allclose(mine, each, rtol=0.15, atol=2e-3), name
-    for name, errors in many.ledger_stderr.items():
-        one = np.stack([w.ledger[name] for w in waves])
-        own = np.stack([w.ledger_stderr[name] for w in waves])
-        assert np.all(np.abs(many.ledger[name] - one) < 5.0 * np.hypot(errors, own) + 1e-4), name
+    for name, errors in many.energy_budget_stderr.items():
+        one = np.stack([w.energy_budget[name] for w in waves])
+        own = np.stack([w.energy_budget_stderr[name] for w in waves])
+        assert np.all(np.abs(many.energy_budget[name] - one) < 5.0 * np.hypot(errors, own) + 1e-4), name
         # Over all shots together, whose photons are partly the same; a fifth too much is told.
         spread = 4.0 * np.hypot(errors.mean(axis=0), own.mean(axis=0)) + 1e-5
-        found, expected = many.ledger[name].mean(axis=0), one.mean(axis=0)
+        found, expected = many.energy_budget[name].mean(axis=0), one.mean(axis=0)
         assert np.all(np.abs(found - expected) < spread), name
         assert name != "absorbed by ground" or np.all(np.abs(1.2 * found - expected) > spread)
 

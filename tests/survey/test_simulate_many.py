@@ -144,8 +144,10 @@ def test_what_is_not_random_is_the_same_as_one_by_one():
             assert np.allclose(getattr(wave, name), getattr(alone, name), rtol=2e-4, atol=1e-9), name
         for part in alone.components:
             assert np.allclose(wave.components[part], alone.components[part], rtol=2e-4, atol=1e-9), part
-        for part in alone.ledger:
-            assert np.allclose(wave.ledger[part], alone.ledger[part], rtol=2e-4, atol=1e-9), part
+        for part in alone.energy_budget:
+            assert np.allclose(wave.energy_budget[part], alone.energy_budget[part], rtol=2e-4, atol=1e-9), (
+                part
+            )
 
 
 @pytest.mark.slow
@@ -319,7 +321,7 @@ def test_a_dataset_has_units_and_all_waveforms():
     assert data.sizes["shot"] == 16
     assert data.energy.attrs["units"] == "J"
     assert np.array_equal(data.components.sel(component="ground"), many.components["ground"])
-    assert np.array_equal(data.ledger.sel(fate="escaped"), many.ledger["escaped"])
+    assert np.array_equal(data.energy_budget.sel(fate="escaped"), many.energy_budget["escaped"])
     wave = many[-1]
     assert isinstance(wave, jl.Waveform)
     assert np.array_equal(wave.reflectance, many.reflectance[15])

@@ -51,13 +51,13 @@ def test_shares_add_up(name):
     what, zenith = CASES[name]
     lidar = jl.Lidar(wavelength=(532.0, 1064.0), zenith=zenith, divergence=2.0)
     wave = jl.simulate(lidar, what, key=jax.random.key(4), n_photons=4096, max_orders=4, n_rays=512)
-    total = sum(wave.ledger.values())
+    total = sum(wave.energy_budget.values())
     assert np.allclose(total, 1.0, atol=1e-5)
-    assert all(bool(jnp.all(share > -0.02)) for share in wave.ledger.values())
+    assert all(bool(jnp.all(share > -0.02)) for share in wave.energy_budget.values())
     if name == "nothing absorbs":
-        absorbed = sum(v for k, v in wave.ledger.items() if k.startswith("absorbed"))
+        absorbed = sum(v for k, v in wave.energy_budget.items() if k.startswith("absorbed"))
         assert np.allclose(absorbed, 0.0, atol=0.01)
-        assert float(wave.ledger["unfollowed"][0]) > 0.1
+        assert float(wave.energy_budget["unfollowed"][0]) > 0.1
 
 
 @pytest.mark.parametrize("name", ["absorbing", "plate"])
@@ -66,7 +66,7 @@ def test_shares_of_a_single_order_add_up(name):
     wave = jl.simulate(
         jl.Lidar(divergence=2.0), what, key=jax.random.key(0), max_orders=1, n_rays=512, footprint="fixed"
     )
-    assert np.allclose(sum(wave.ledger.values()), 1.0, atol=1e-5)
+    assert np.allclose(sum(wave.energy_budget.values()), 1.0, atol=1e-5)
 
 
 @pytest.mark.slow
@@ -75,6 +75,6 @@ def test_small_deposits_on_large_sums():
     lidar, what = jl.Lidar(divergence=2.0), scene()
     plan = jl.plan(lidar, what, max_orders=3, n_photons=300_000, n_rays=512)
     key = jax.random.key(0)
-    setup = jl.reduce(lidar, what, plan)
+    setup = jl.make_setup(lidar, what, plan)
     wave = one_batch(setup, key)
-    np.testing.assert_allclose(sum(wave.ledger.values()), 1.0, atol=2e-4)
+    np.testing.assert_allclose(sum(wave.energy_budget.values()), 1.0, atol=2e-4)

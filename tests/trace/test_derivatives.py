@@ -80,8 +80,8 @@ def estimates(request):
 
     def measure(p, key):
         scene = build(p)
-        setup = jl.reduce(lidar, scene, plan)
-        return jl.total_of(jl.trace_scene(setup, key), setup)[0] @ moments
+        setup = jl.make_setup(lidar, scene, plan)
+        return jl.total_reflectance(jl.trace_scene(setup, key), setup)[0] @ moments
 
     value, jacobian = jax.jit(measure), jax.jit(jax.jacfwd(measure))
     keys = jax.random.split(jax.random.key(11), KEYS)
@@ -141,8 +141,8 @@ def test_forward_and_reverse_agree():
 
     def measure(p):
         scene = build(p)
-        setup = jl.reduce(lidar, scene, plan)
-        return jnp.sum(jl.total_of(jl.trace_scene(setup, key), setup) ** 2)
+        setup = jl.make_setup(lidar, scene, plan)
+        return jnp.sum(jl.total_reflectance(jl.trace_scene(setup, key), setup) ** 2)
 
     gradient = eqx.filter_jit(jax.grad(measure))(start)
     tangent = {name: jnp.asarray(0.5 + 0.1 * i) for i, name in enumerate(start)}

@@ -6,9 +6,6 @@ depend on a photon's number alone, so that changes which leave its path alone ar
 tolerance 1e-4 of the peak, for the rounding of distances. Others are compared by a z-test.
 """
 
-import dataclasses
-import sys
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -74,15 +71,15 @@ def alike(found, wanted, rtol=1e-4):
 
 
 def traced(lidar, scene, plan, key):
-    setup = jl.reduce(lidar, scene, plan)
+    setup = jl.make_setup(lidar, scene, plan)
     return jl.waveform_of(jl.trace_scene(setup, key), setup).reflectance
 
 
 @pytest.mark.slow
 def test_chunks_do_not_matter(plain, monkeypatch):
     plan, wave = plain
-    for name, size in (("higher_orders", 96), ("first_order", 100)):
-        monkeypatch.setattr(sys.modules[f"jaxlidar.trace.{name}"], "CHUNK", size)
+    monkeypatch.setattr("jaxlidar.trace.higher_orders.PHOTONS_PER_CHUNK", 96)
+    monkeypatch.setattr("jaxlidar.trace.first_order.RAYS_AT_ONCE", 100)
     # Two functions, so that each is compiled with its own sizes.
     again = eqx.filter_jit(lambda *given: traced(*given))
     lidar, scene = build()
@@ -118,8 +115,8 @@ def test_empty_voxels_around_the_crown_change_nothing(plain):
     larger = jl.plan(lidar, scene, n_photons=512, **SIZES)
     found = jl.simulate(lidar, scene, key=KEY, plan=larger, n_photons=4096)
     alike(found.reflectance, wave.reflectance)
-    for name, share in found.ledger.items():
-        np.testing.assert_allclose(share, wave.ledger[name], atol=1e-4, err_msg=name)
+    for name, share in found.energy_budget.items():
+        np.testing.assert_allclose(share, wave.energy_budget[name], atol=1e-4, err_msg=name)
 
 
 def test_a_lower_scene_shifts_the_time(plain):
@@ -202,4 +199,4 @@ def test_the_plan_is_a_value():
     first, second = (jl.plan(lidar, scene, n_photons=512, **SIZES) for _ in range(2))
     assert first == second
     assert hash(first) == hash(second)
-    assert first != dataclasses.replace(first, n_photons=513)
+    assert first != first.with_config(n_photons=513)

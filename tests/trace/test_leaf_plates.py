@@ -39,7 +39,7 @@ def test_a_plate_alone_returns_its_reflectance():
     wave = jl.simulate(jl.Lidar(), scene(coverage=0.7, ground=False), key=KEY)
     np.testing.assert_allclose(float(wave.reflectance.sum()), 0.7 * R, rtol=1e-4)
     np.testing.assert_array_equal(wave.stderr, 0.0)
-    np.testing.assert_allclose(wave.ledger["absorbed by plate"], 0.7 * (1 - R - T), rtol=1e-4)
+    np.testing.assert_allclose(wave.energy_budget["absorbed by plate"], 0.7 * (1 - R - T), rtol=1e-4)
 
 
 @pytest.mark.parametrize("transmission", ["straight", "diffuse"])

@@ -107,8 +107,8 @@ def test_where_scores_do_not_serve_columns_are_pushed():
     room = extinction.sorted_places(LIDAR, scene_with(), plan, settled)[2]
     assert room > 0
     for share, kind in ((2.1, "extinction"), (1.9, "geometric")):
-        limits = plan.limits._replace(max_memory=1e-9 * share * room)
-        limited = dataclasses.replace(plan, limits=limits)
+        scope = plan.scope._replace(max_memory=1e-9 * share * room)
+        limited = dataclasses.replace(plan, scope=scope)
         places, _, _ = extinction.sorted_places(LIDAR, scene_with(), limited, settled)
         assert [place.kind for place in places] == [kind]
 

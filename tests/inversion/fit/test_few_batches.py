@@ -1,11 +1,11 @@
 """Fits that begin with few batches of photons: they end where fits with all batches do, and trace less."""
 
-import inversion.fit.model
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import inversion.fit.model
 import jaxlidar as jl
 from inversion.fit.data import Data
 from inversion.fit.lanes import Lanes, Simulator

@@ -115,7 +115,7 @@ def test_canopy_and_ground_at_three_wavelengths(target, monkeypatch):
         raise AssertionError("the trace was compiled again")
 
     monkeypatch.setattr("inversion.fit.model.trace_scene", traced)
-    monkeypatch.setattr("inversion.fit.model.total_of", traced)
+    monkeypatch.setattr("inversion.fit.model.total_reflectance", traced)
     fresh = [dataclasses.replace(u) for u in UNKNOWNS]
     again = retrieve_canopy(target, 1, start_scene(Cab=50.0), fresh)
     assert_recovered(again, TRUTH)
@@ -151,7 +151,7 @@ def test_the_tracer_does_not_look_at_optical_leaves():
     optical = optical_leaves(scene)
     leaves, structure = jax.tree.flatten(scene)
     blind = jax.tree.unflatten(structure, [None if i in optical else x for i, x in enumerate(leaves)])
-    eqx.filter_eval_shape(jl.trace_scene, jl.reduce(LIDAR, blind, plan), jax.random.key(0))
+    eqx.filter_eval_shape(jl.trace_scene, jl.make_setup(LIDAR, blind, plan), jax.random.key(0))
     assert len(optical) == len(
         jax.tree.leaves([scene.canopy.leaf, 0.4, scene.ground.reflectance, scene.atmosphere, 0.3, 0.2])
     )
@@ -184,8 +184,8 @@ def test_jacobian_is_that_of_the_simulation():
                 leaf_area(scene, area),
                 (Cab, Cw, height, jnp.stack([first, second])),
             )
-            setup = jl.reduce(lidar, here, plan)
-            return jl.total_of(jl.trace_scene(setup, jax.random.key(0)), setup)
+            setup = jl.make_setup(lidar, here, plan)
+            return jl.total_reflectance(jl.trace_scene(setup, jax.random.key(0)), setup)
 
         for i in range(at.size):
             step = 1e-4 * at[i] * np.eye(at.size)[i]
@@ -366,11 +366,11 @@ def test_the_plan_serves_the_corners_of_the_bounds():
     scenes = corners(scene, settled)
     assert len(scenes) == 17
     for corner in scenes:
-        own = jl.plan(LIDAR, corner, max_orders=2, window=(-260.0, 59.0), max_step=plan.trace.max_step)
-        assert own.trace.upstream <= plan.trace.upstream
-        assert own.trace.last <= plan.trace.last
-        assert own.trace.first_steps <= plan.trace.first_steps
-        assert own.trace.march_steps <= plan.trace.march_steps
+        own = jl.plan(LIDAR, corner, max_orders=2, window=(-260.0, 59.0), max_step=plan.limits.max_segment)
+        assert own.limits.start_distance <= plan.limits.start_distance
+        assert own.limits.max_path <= plan.limits.max_path
+        assert own.config.max_ray_segments <= plan.config.max_ray_segments
+        assert own.config.max_faces <= plan.config.max_faces
         assert own.bins.width == plan.bins.width
         assert own.bins.row <= plan.bins.row
         assert own.bins.start >= plan.bins.start - 1e-6

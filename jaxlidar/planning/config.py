@@ -1,0 +1,150 @@
+"""The two halves of what the tracer needs of a plan: a static configuration, and numbers that are traced.
+
+Compiled programs depend on everything in a `TraceConfig`: names, switches, sizes of loops and arrays. The
+numbers in `PathLimits` and `TimeBins` are arguments of these programs, so that another height or window
+compiles nothing. A `Plan` holds all three with Python numbers; a `jaxlidar.trace.device_scene.DeviceScene`
+holds the latter two with JAX arrays.
+"""
+
+import dataclasses
+from typing import NamedTuple, final
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+# Fine bins over which a return at an instant is spread: the quadratic B-spline.
+KERNEL_BINS = 3
+# Second moment of that B-spline, in squared bins.
+KERNEL_VARIANCE = KERNEL_BINS / 12
+
+
+@final
+class TimeBins(eqx.Module):
+    """Fine time bins, with margins at both ends that collect what falls outside.
+
+    - `start`: centre of the first bin, ns.
+    - `width`: width of a bin, ns.
+    - `count`: number of bins within the window.
+    - `max_span`: largest number of bins that one deposit spans; also the width of each margin.
+    """
+
+    start: float
+    width: float
+    count: int = eqx.field(static=True)
+    max_span: int = eqx.field(static=True)
+
+    @property
+    def padded(self) -> int:
+        """Number of bins with both margins."""
+        return self.count + 2 * self.max_span
+
+    def position(self, time: Float[Array, "*s"]) -> Float[Array, "*s"]:
+        """Time in units of bins, clipped to the margins; integers are centres of bins."""
+        return jnp.clip((time - self.start) / self.width, -self.max_span, self.count + self.max_span)
+
+    def trim(self, padded: Float[Array, "*s padded"]) -> tuple[Float[Array, "*s bins"], Float[Array, "*s"]]:
+        """Split an array over padded bins into the bins within the window, and the sum over both margins."""
+        first, last = self.max_span, self.max_span + self.count
+        inside = padded[..., first:last]
+        before, after = padded[..., :first], padded[..., last:]
+        return inside, jnp.sum(before, axis=-1) + jnp.sum(after, axis=-1)
+
+
+class Scatterer(NamedTuple):
+    """Indices of a material, and of its channels of reflection and transmission.
+
+    A channel is -1 where the material has none (opaque materials have no transmission).
+    """
+
+    material: int
+    reflection: int
+    transmission: int
+
+
+@final
+class PathLimits(eqx.Module):
+    """Bounds on the paths of rays and photons: floats in a plan, arrays in a device scene.
+
+    - `start_distance`: distance, m, before the reference plane at which all rays start, along the beam.
+    - `max_segment`: longest segment, m, of a footprint ray that is deposited at once.
+    - `max_flight`: longest flight, m, between two scatterings.
+    - `max_path`: longest path to the sensor, m, that is still recorded; relative to twice the range of the
+      reference plane.
+    - `reflection_probability`: probability of sampling reflection, rather than transmission, where a material
+      does both. It does not depend on wavelength, so that histories stay monomials in the optics.
+    - `orders`: number of scatterings that are followed.
+    """
+
+    start_distance: float
+    max_segment: float
+    max_flight: float
+    max_path: float
+    reflection_probability: float
+    orders: int
+
+
+@dataclasses.dataclass(frozen=True)
+class TraceConfig:
+    """Static configuration of the tracer: compiled programs depend on all of it. Part of a `jaxlidar.Plan`.
+
+    What the scene consists of:
+
+    - `materials`, `channels`: names of materials ("leaf", "ground"), and of scatterer channels: one for what
+      each material reflects ("leaf.R") and one for what it transmits ("leaf.T").
+    - `leaf`, `bark`, `surfaces`: the scatterers; of the surfaces the ground comes first, then plates.
+    - `covers_fully`, `mirrors`: for each surface, True if no ray slips through, and True if it is a mirror.
+    - `has_ground`, `hotspot`: True if there is a ground, and if the canopy has the hot spot.
+    - `vertical`: True if the beam is at nadir.
+    - `returns_specular`: True if mirrors return light to the sensor.
+
+    Sizes of loops and arrays:
+
+    - `max_ray_segments`: bound on the segments of a footprint ray (first order).
+    - `max_faces`: bound on the voxel faces that a flight crosses.
+    - `order_steps`: length of the loop over orders of scattering; at least `PathLimits.orders`.
+    - `deposits_per_flight`: points of each flight from which light returns to the sensor.
+    - `degree`, `first_degree`: largest number of scatterings and passages through plates in a history, for
+      all orders and for order one.
+    - `keeps_histories`: True if the response keeps scattering histories; otherwise optics are applied while
+      light is traced.
+    - `n_rays`, `n_photons`: rays and photons of a batch.
+
+    The footprint:
+
+    - `smooth_footprint`: True if a quadrature rule takes the place of the rays, as over planes.
+    - `random_footprint`: True if each batch shifts the rays at random.
+    """
+
+    materials: tuple[str, ...]
+    channels: tuple[str, ...]
+    leaf: Scatterer | None
+    bark: Scatterer | None
+    surfaces: tuple[Scatterer, ...]
+    covers_fully: tuple[bool, ...]
+    mirrors: tuple[bool, ...]
+    has_ground: bool
+    hotspot: bool
+    vertical: bool
+    returns_specular: bool
+    max_ray_segments: int
+    max_faces: int
+    order_steps: int
+    deposits_per_flight: int
+    degree: int
+    first_degree: int
+    keeps_histories: bool
+    n_rays: int
+    n_photons: int
+    smooth_footprint: bool
+    random_footprint: bool
+
+    @property
+    def follows_higher_orders(self) -> bool:
+        """True if light is followed beyond its first scattering."""
+        return self.order_steps >= 2
+
+    @property
+    def is_random(self) -> bool:
+        """True if anything is drawn at random."""
+        return self.follows_higher_orders or (self.random_footprint and not self.smooth_footprint)

@@ -1,0 +1,1 @@
+"""From response to waveform: optics of every history, atmosphere, pulse and samples."""

@@ -1,0 +1,396 @@
+r"""From response to samples: optics of every history, the atmosphere, the pulse, and the energy budget.
+
+    samples[w, s] = sum over fine bins b of  pulse[b, s] * T_air[w, b] *
+                    sum over histories h of  response[b, h] * prod_c optics[c, w] ** exponent[h, c]
+
+Both sums are matrix products. The energy budget applies the same optics to the weights that arrived at each
+material, went on from it, escaped, came after the record, or remained unfollowed.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxlidar._constants import SPEED_OF_LIGHT
+from jaxlidar._programs import Program
+from jaxlidar._statistics import FewMoments, WaveformMoments
+from jaxlidar.instrument.lidar import Lidar
+from jaxlidar.planning.channels import channel_optics
+from jaxlidar.planning.effects import can_light_itself
+from jaxlidar.planning.setup import Setup
+from jaxlidar.planning.size_buckets import size_bucket
+from jaxlidar.scenes.atmosphere import Atmosphere
+from jaxlidar.spectral.pivot_wavelengths import PivotWavelengths, find_pivots
+from jaxlidar.spectral.pulse_convolution import PulseConvolution, pulse_convolution
+from jaxlidar.trace.histories import Histories, histories
+from jaxlidar.trace.response import Response
+
+# Programs have room for at least so many wavelengths.
+MIN_WAVELENGTHS = 4
+# More wavelengths than this are a spectrum: standard errors are computed at pivot wavelengths.
+MAX_EXACT_WAVELENGTHS = 16
+
+
+class WaveformModel(eqx.Module):
+    """The map from a response to samples, made by `make_waveform_model`.
+
+    Programs are compiled for its sizes alone.
+
+    - `optics`: reflectance or transmittance of every channel.
+    - `convolution`: pulse and digitiser. `time`: of the samples, ns.
+    - `transmittance`: two-way, of the atmosphere, in fine bins. `air_return`: its own return, in samples.
+      None where there is no atmosphere, or no return from it.
+    - `admissible`: see `Setup`.
+    - `lidar`: the lidar, with its spectrum.
+    - `materials`: their names. `first_degree`, `degree`: of histories.
+    - `one_order`: True if one order is followed. `can_scatter_again`: True if scattered light can meet the
+      scene.
+    - `pivots`: wavelengths at which histories are summed, and interpolated to all; None: at all.
+    """
+
+    optics: Float[Array, "channels wavelengths"]
+    convolution: PulseConvolution
+    time: Float[Array, "samples"]
+    transmittance: Float[Array, "wavelengths fine"] | None
+    air_return: Float[Array, "wavelengths samples"] | None
+    admissible: Float[Array, ""]
+    lidar: Lidar
+    materials: tuple[str, ...] = eqx.field(static=True)
+    first_degree: int = eqx.field(static=True)
+    degree: int = eqx.field(static=True)
+    one_order: bool = eqx.field(static=True)
+    can_scatter_again: bool = eqx.field(static=True)
+    pivots: PivotWavelengths | None = None
+
+    @property
+    def first_histories(self) -> Histories:
+        """Histories of order one."""
+        return histories(len(self.optics), self.first_degree)
+
+    @property
+    def histories(self) -> Histories:
+        """Histories of all orders."""
+        return histories(len(self.optics), self.degree)
+
+    def at_pivots(self) -> "WaveformModel":
+        """Return the model at pivot wavelengths, where wavelengths are many: for standard errors."""
+        if self.lidar.wavelength.size <= MAX_EXACT_WAVELENGTHS:
+            return self
+        return dataclasses.replace(self, pivots=find_pivots(self.optics, max(self.first_degree, self.degree)))
+
+    def for_applied_optics(self) -> "WaveformModel":
+        """Return the model of responses to which optics have been applied while light was traced."""
+        return dataclasses.replace(self, first_degree=0, degree=0)
+
+    @property
+    def sample_pivots(self) -> PivotWavelengths | None:
+        """Pivots from which samples follow; None under an atmosphere, which is no such polynomial."""
+        return self.pivots if self.transmittance is None else None
+
+    def moments(self, n_wavelengths: int, n_samples: int) -> WaveformMoments | FewMoments:
+        """Return empty moments of the samples of `samples_and_budget`, without padding."""
+        if self.sample_pivots is None:
+            return WaveformMoments(n_wavelengths, n_samples)
+        return FewMoments(np.asarray(self.sample_pivots.coefficients)[:, :n_wavelengths])
+
+    @property
+    def n_summed_wavelengths(self) -> int:
+        """Number of wavelengths at which histories are summed."""
+        return self.optics.shape[1] if self.pivots is None else self.pivots.indices.size
+
+    def sum_histories(
+        self, weights: Float[Array, "traces *rest histories columns"], table: Histories
+    ) -> Float[Array, "*rest summed columns"]:
+        """Sum weights with their optics over histories, at all wavelengths or at the pivots."""
+        optics = self.optics if self.pivots is None else self.optics[:, self.pivots.indices]
+        return apply_optics(weights, table, optics)
+
+    def interpolate(
+        self, sums: Float[Array, "*rest summed columns"]
+    ) -> Float[Array, "*rest wavelengths columns"]:
+        """Return the results of `sum_histories` at all wavelengths."""
+        return sums if self.pivots is None else self.pivots.interpolate(sums)
+
+    def padded_to(self, n_wavelengths: int) -> "WaveformModel":
+        """Return the model with copies of the last wavelength, so that there are `n_wavelengths`."""
+        missing = n_wavelengths - self.lidar.wavelength.size
+        if missing <= 0:
+            return self
+
+        def pad(a: Array, axis: int = 0) -> Array:
+            # One number that serves all wavelengths stays one.
+            if a.ndim == 0 or a.shape[axis] == 1 < n_wavelengths - missing:
+                return a
+            last = np.repeat(np.take(np.asarray(a), [-1], axis), missing, axis)
+            return jnp.asarray(np.concatenate([a, last], axis))
+
+        lidar = self.lidar
+        spectrum = (pad(lidar.wavelength), pad(lidar.energy), pad(lidar.efficiency))
+        return dataclasses.replace(
+            self,
+            optics=pad(self.optics, 1),
+            transmittance=None if self.transmittance is None else pad(self.transmittance),
+            air_return=None if self.air_return is None else pad(self.air_return),
+            lidar=eqx.tree_at(lambda v: (v.wavelength, v.energy, v.efficiency), lidar, spectrum),
+        )
+
+
+def setup_optics(setup: Setup) -> Float[Array, "channels wavelengths"]:
+    """Return the reflectance or transmittance of every channel of the plan, by wavelength."""
+    return channel_optics(setup.lidar, setup.scene, setup.plan.config.channels)
+
+
+def make_waveform_model(setup: Setup) -> WaveformModel:
+    """Make the waveform model of a setup, with its sizes as they are."""
+    return _make_model(setup, setup.plan.n_samples, setup.plan.degree)
+
+
+def make_padded_waveform_model(setup: Setup) -> WaveformModel:
+    """Make the waveform model of a setup, with sizes and wavelengths rounded up to size buckets.
+
+    Of a spectrum only the wavelengths are: applying optics takes longer there than compiling it again.
+    """
+    plan, n_wavelengths = setup.plan, setup.lidar.wavelength.size
+    if n_wavelengths > MAX_EXACT_WAVELENGTHS:
+        return make_waveform_model(setup).padded_to(size_bucket(n_wavelengths, 16))
+    model = _make_model(setup, size_bucket(plan.n_samples, 1), plan.config.degree)
+    return model.padded_to(max(size_bucket(n_wavelengths), MIN_WAVELENGTHS))
+
+
+def _make_model(setup: Setup, n_samples: int, degree: int) -> WaveformModel:
+    lidar, plan, atmosphere = setup.lidar, setup.plan, setup.scene.atmosphere
+    convolution = pulse_convolution(lidar, plan, n_samples)
+    transmittance = air_return = None
+    if atmosphere is not None:
+        bins = plan.bins
+        fine_time = jnp.asarray(bins.start + bins.width * np.arange(bins.count))
+        start_distance, bin_width = (jnp.asarray(a) for a in (plan.limits.start_distance, bins.width))
+        transmittance, air_return = _compiled_atmosphere(
+            atmosphere, lidar, fine_time, start_distance, bin_width
+        )
+        air_return = None if air_return is None else convolution(air_return)
+    return WaveformModel(
+        optics=setup_optics(setup),
+        convolution=convolution,
+        time=jnp.asarray(plan.sample_start + plan.sample_interval * np.arange(n_samples)),
+        transmittance=transmittance,
+        air_return=air_return,
+        admissible=setup.admissible,
+        lidar=lidar,
+        materials=plan.config.materials,
+        first_degree=plan.config.first_degree if plan.config.keeps_histories else 0,
+        degree=degree,
+        one_order=plan.orders == 1,
+        can_scatter_again=can_light_itself(setup.scene),
+    )
+
+
+def _apply_atmosphere(
+    atmosphere: Atmosphere,
+    lidar: Lidar,
+    time: Float[Array, "fine"],
+    start_distance: Float[Array, ""],
+    bin_width: Float[Array, ""],
+) -> tuple[Float[Array, "wavelengths fine"], Float[Array, "wavelengths fine"] | None]:
+    """Return the two-way transmittance in fine bins, and the air's own return where a lidar ratio is given.
+
+    The latter is single scattering, from above all of the scene.
+    """
+    # Not quite up to the sensor, where the range is zero.
+    heights = jnp.minimum(height_of(lidar, time), 0.999 * lidar.altitude)
+    transmittance = atmosphere.two_way_transmittance(lidar.wavelength, heights, lidar.altitude, lidar.zenith)
+    if atmosphere.lidar_ratio is None:
+        return transmittance, None
+    per_metre = atmosphere.backscatter(lidar.wavelength, heights, lidar.altitude, lidar.zenith)
+    top = start_distance * jnp.cos(jnp.deg2rad(lidar.zenith))
+    bin_length = 0.5 * SPEED_OF_LIGHT * bin_width
+    return transmittance, jnp.where((heights > top)[None, :], per_metre * bin_length, 0.0)
+
+
+_compiled_atmosphere = Program(_apply_atmosphere)
+
+
+def height_of(lidar: Lidar, time: Float[Array, "bins"]) -> Float[Array, "bins"]:
+    """Height above the reference plane (m) from which order one arrives at `time` (ns)."""
+    return -0.5 * SPEED_OF_LIGHT * time * jnp.cos(jnp.deg2rad(lidar.zenith))
+
+
+def apply_optics(
+    weights: Float[Array, "traces *rest histories columns"],
+    table: Histories,
+    optics: Float[Array, "channels wavelengths"],
+) -> Float[Array, "*rest wavelengths columns"]:
+    """Sum weights times the product of optics over histories, by wavelength: a matrix product.
+
+    Histories beyond the table have no weight.
+    """
+    weights = weights[..., : table.count, :]
+    if len(weights) == 1:
+        return jnp.einsum("hw,...hc->...wc", table.monomials(optics), weights[0])
+    # Each trace has one wavelength.
+    return jnp.einsum("hw,w...hc->...wc", table.monomials(optics), weights)
+
+
+def response_samples(
+    weights: Float[Array, "traces *rest histories bins"], table: Histories, model: WaveformModel
+) -> Float[Array, "*rest wavelengths samples"]:
+    """Return samples by wavelength of weights by history and fine bin: optics, atmosphere, pulse."""
+    transmittance = model.transmittance
+    if transmittance is None:
+        return model.interpolate(_samples_without_air(weights, table, model))
+    fine = model.interpolate(model.sum_histories(weights, table))
+    return model.convolution(fine * transmittance.reshape((1,) * (fine.ndim - 2) + transmittance.shape))
+
+
+def _samples_without_air(
+    weights: Float[Array, "traces *rest histories bins"], table: Histories, model: WaveformModel
+) -> Float[Array, "*rest summed samples"]:
+    """Return samples without atmosphere, at all wavelengths or at the pivots.
+
+    Pulse and optics commute: the order with fewer operations is taken.
+    """
+    convolution, weights = model.convolution, weights[..., : table.count, :]
+    n_histories, n_wavelengths = table.count, model.n_summed_wavelengths
+    cost_optics_first = n_wavelengths * (n_histories + convolution.n_samples) * convolution.n_bins
+    cost_pulse_first = n_histories * (convolution.n_bins + n_wavelengths) * convolution.n_samples
+    if len(weights) == 1 and cost_pulse_first < cost_optics_first:
+        return model.sum_histories(convolution(weights), table)
+    return convolution(model.sum_histories(weights, table))
+
+
+def total_samples(response: Response, model: WaveformModel) -> Float[Array, "wavelengths samples"]:
+    """Return the apparent reflectance per sample, all components together."""
+    return _sum_orders(response, model, response_samples)
+
+
+def _sum_orders(
+    response: Response, model: WaveformModel, to_samples: Callable[[Array, Histories, WaveformModel], Array]
+) -> Array:
+    total = jnp.zeros(())
+    tables = (model.first_histories, model.histories)
+    for table, weights in zip(tables, (response.first, response.higher)):
+        if weights is not None:
+            total = total + to_samples(jnp.sum(weights, axis=1), table, model)
+    return model.admissible * (total if model.air_return is None else total + model.air_return)
+
+
+def derivatives_to_samples(
+    fine: Float[Array, "columns wavelengths bins"], model: WaveformModel
+) -> Float[Array, "columns wavelengths samples"]:
+    """Return derivatives of `total_samples` from those in fine bins (see `jaxlidar.trace.response`)."""
+    if model.transmittance is not None:
+        fine = fine * model.transmittance[None]
+    return model.admissible * model.convolution(fine)
+
+
+def component_samples(
+    response: Response, model: WaveformModel
+) -> dict[str, Float[Array, "wavelengths samples"]]:
+    """Return the apparent reflectance per sample, by material of the last scattering and by order."""
+    shape = (model.lidar.wavelength.size, model.convolution.n_samples)
+    zero = jnp.zeros(shape, response.first.dtype)
+    # Material by material: together, spectra would be transposed in memory.
+    numbers = range(len(model.materials))
+    first = [response_samples(response.first[:, m], model.first_histories, model) for m in numbers]
+    higher = [zero for _ in numbers]
+    if response.higher is not None:
+        higher = [response_samples(response.higher[:, m], model.histories, model) for m in numbers]
+    components = {name: model.admissible * (f + h) for name, f, h in zip(model.materials, first, higher)}
+    for name, samples in (("first", first), ("higher", higher)):
+        components[name] = model.admissible * sum(samples, start=zero)
+    if model.air_return is not None:
+        components["air"] = model.air_return
+        components["first"] = components["first"] + model.air_return
+    return components
+
+
+class BudgetTerms(NamedTuple):
+    """Fractions of the emitted energy by fate, and light that is not in the record, (wavelengths,) each.
+
+    See `Waveform`.
+    """
+
+    energy_budget: dict[str, Float[Array, "wavelengths"]]
+    neglected: Float[Array, "wavelengths"]
+    lost: Float[Array, "wavelengths"]
+
+
+class ResponseSums(NamedTuple):
+    """Sums of a response with optics applied, (wavelengths,) each.
+
+    - `returned`, `lost`: apparent reflectance within all fine bins, and before and after them.
+    - `absorbed`: by each material; (materials, wavelengths). - `escaped`, `late`, `remaining`: energy.
+    """
+
+    returned: Float[Array, "wavelengths"]
+    lost: Float[Array, "wavelengths"]
+    absorbed: Float[Array, "materials wavelengths"]
+    escaped: Float[Array, "wavelengths"]
+    late: Float[Array, "wavelengths"]
+    remaining: Float[Array, "wavelengths"]
+
+
+def sum_response(response: Response, model: WaveformModel) -> ResponseSums:
+    """Sum a response over bins. A material absorbs the energy that arrived there less that which left."""
+    first_table = model.first_histories
+    table = first_table if response.higher is None else model.histories
+
+    def sums(rows: list[Array], table: Histories) -> Array:
+        """Sum rows of (traces, histories) with their optics, all in one product."""
+        products = model.interpolate(model.sum_histories(jnp.stack(rows, axis=-1), table))
+        return jnp.moveaxis(products, -1, 0)
+
+    first_rows = [jnp.sum(response.first, axis=(1, 3)), jnp.sum(response.first_outside, axis=1)]
+    returned, lost = sums(first_rows, first_table)
+    rows = [response.escaped, response.late, response.remaining]
+    if response.higher is not None and response.higher_outside is not None:
+        rows += [jnp.sum(response.higher, axis=(1, 3)), jnp.sum(response.higher_outside, axis=1)]
+    n_rows = len(rows)
+    absorbed = response.arrived - response.left
+    materials = [absorbed[:, m] for m in range(absorbed.shape[1])]
+    totals = sums([*rows, *materials], table)
+    if n_rows > 3:
+        returned, lost = returned + totals[3], lost + totals[4]
+    return ResponseSums(returned, lost, totals[n_rows:], totals[0], totals[1], totals[2])
+
+
+def budget_terms(response: Response, model: WaveformModel) -> BudgetTerms:
+    """Return the energy budget of a response."""
+    return budget_of_sums(sum_response(response, model), model)
+
+
+def budget_of_sums(sums: ResponseSums, model: WaveformModel) -> BudgetTerms:
+    """Return the energy budget from the sums of a response."""
+    lidar = model.lidar
+    budget = {
+        "escaped": sums.escaped,
+        **{f"absorbed by {name}": sums.absorbed[i] for i, name in enumerate(model.materials)},
+        "after the window": sums.late,
+        "unfollowed": sums.remaining,
+    }
+    # Apparent reflectance is energy per pi steradian of the aperture.
+    returned = sums.returned * lidar.aperture_area / (jnp.pi * lidar.range_to_reference**2)
+    # Light that returns is part of that which escaped or, where only one order was followed, would have.
+    source = "unfollowed" if model.one_order and model.can_scatter_again else "escaped"
+    returned = jnp.minimum(returned, budget[source])
+    budget = {"returned": returned, **budget, source: budget[source] - returned}
+    # Unfollowed light is taken to return as much per energy as the light that escaped, within a factor of 4.
+    return_per_energy = sums.returned / jnp.maximum(budget["escaped"], 1e-6)
+    unfollowed = jnp.zeros_like(sums.returned) if model.one_order else budget["unfollowed"]
+    return BudgetTerms(budget, unfollowed * jnp.clip(return_per_energy, 1.0, 4.0), sums.lost)
+
+
+def samples_and_budget(
+    response: Response, model: WaveformModel
+) -> tuple[Float[Array, "summed samples"], BudgetTerms]:
+    """Return the quantities of a batch whose standard errors are estimated.
+
+    Samples are at the pivots of `WaveformModel.sample_pivots`, where there are any.
+    """
+    to_samples = response_samples if model.sample_pivots is None else _samples_without_air
+    return _sum_orders(response, model, to_samples), budget_terms(response, model)

@@ -1,0 +1,280 @@
+"""`Waveform`: apparent reflectance and received energy by wavelength and sample.
+
+A sample of apparent reflectance r, from the range d, has the energy
+
+    E = E_t eta A_r / (pi d^2) r,
+
+with the emitted energy E_t, the efficiency eta and the area A_r of the aperture.
+"""
+
+import dataclasses
+import os
+from typing import Any, final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxlidar._checks import briefly, check_range, is_traced
+from jaxlidar._constants import SPEED_OF_LIGHT
+from jaxlidar._deprecated import renamed_property
+from jaxlidar._registry import save_result, waveform_html
+from jaxlidar._summary import summary
+from jaxlidar.instrument.lidar import Lidar
+from jaxlidar.instrument.receiver import first_return_window, record
+from jaxlidar.planning.setup import Setup
+from jaxlidar.spectral.apply_optics import (
+    WaveformModel,
+    budget_terms,
+    component_samples,
+    height_of,
+    make_waveform_model,
+    total_samples,
+)
+from jaxlidar.trace.response import Response
+from jaxlidar.truth import Truth
+
+
+@final
+@briefly
+class Waveform(eqx.Module):
+    """A simulated waveform: apparent reflectance and received energy by wavelength and sample.
+
+    - `time`: (bins,) ns, centres of the samples. Zero is the two-way travel time of the reference plane.
+    - `height`: (bins,) m, the height from which light of order one arrives at that time.
+    - `reflectance`: (wavelengths, bins) apparent reflectance per sample, with the transmittance of the
+      atmosphere; its sum over bins is that of the target.
+    - `energy`: (wavelengths, bins) J that the detector registers per sample.
+    - `stderr`: (wavelengths, bins) one standard error of `reflectance`; zero where nothing was random. The
+      expected value lies within two of them in 95 % of cases. For more than 16 wavelengths they are computed
+      at pivot wavelengths and interpolated, to three digits of the wavelength's largest.
+    - `components`: dict of arrays like `reflectance`: by material of the last scattering ("ground", "leaf",
+      "bark", "plate", "air"), and by order ("first", "higher").
+    - `neglected`: (wavelengths,) apparent reflectance that orders beyond the last could still add.
+    - `energy_budget`: dict of (wavelengths,) fractions of the emitted energy, before the atmosphere:
+      "returned" into the aperture, "escaped", "absorbed by ...", "after the window", "unfollowed" beyond the
+      last order.
+    - `energy_budget_stderr`: dict like `energy_budget`, one standard error each; zero where nothing was
+      random.
+    - `lost`: (wavelengths,) apparent reflectance that arrives before or after all fine bins of the plan: late
+      multiple scattering, or, where the geometry was traced by a JAX transformation, what a plan does not
+      cover.
+    - `recorded`: (wavelengths, bins) J that the receiver records of `energy`, without noise: background
+      added, saturated, cut at the detection threshold, quantised. `jaxlidar.record` draws noise as well.
+    - `wavelength`: (wavelengths,) nm, the lidar's.
+    - `info`: dict: "photons", "batches", "seconds" spent, "error" reached, and why the simulation "stopped".
+    - `truth`: a `Truth`, what the beam meets in the scene; None where it was not asked for.
+
+    **Example:**
+
+    >>> import jax
+    >>> import jaxlidar as jl
+    >>> scene = jl.Scene(ground=jl.Ground(reflectance=0.4))
+    >>> wave = jl.simulate(jl.Lidar(), scene, key=jax.random.key(0))
+    >>> print(sorted(wave.components), wave.info["stopped"])
+    ['first', 'ground', 'higher'] nothing is random
+    >>> print(f"{float(wave.energy_budget['absorbed by ground'][0]):.2f}")
+    0.60
+    """
+
+    time: Float[Array, "bins"]
+    height: Float[Array, "bins"]
+    reflectance: Float[Array, "wavelengths bins"]
+    energy: Float[Array, "wavelengths bins"]
+    stderr: Float[Array, "wavelengths bins"]
+    components: dict[str, Float[Array, "wavelengths bins"]]
+    neglected: Float[Array, "wavelengths"]
+    energy_budget: dict[str, Float[Array, "wavelengths"]]
+    energy_budget_stderr: dict[str, Float[Array, "wavelengths"]]
+    lost: Float[Array, "wavelengths"]
+    recorded: Float[Array, "wavelengths bins"]
+    wavelength: Float[Array, "wavelengths"]
+    info: dict = eqx.field(static=True)
+    truth: Truth | None = None
+
+    ledger = renamed_property("ledger", "energy_budget")
+    ledger_stderr = renamed_property("ledger_stderr", "energy_budget_stderr")
+
+    @property
+    def first_order_share(self) -> Float[Array, "wavelengths"]:
+        """Fraction of `reflectance` that was scattered once, (wavelengths,); 1 where nothing returns."""
+        first, total = (jnp.sum(a, axis=1) for a in (self.components["first"], self.reflectance))
+        return jnp.where(total > 0, first / jnp.where(total > 0, total, 1.0), 1.0)
+
+    def nan_where_lost(self, share: float = 0.01) -> "Waveform":
+        """Return the same waveform, NaN at wavelengths that lost more than a fraction of their reflectance.
+
+        For use within JAX transformations, where a plan that does not fit cannot be refused.
+
+        **Arguments:** `share`: fraction of `lost` in the sum of `reflectance` and `lost`, above 0. Default
+        0.01.
+        """
+        check_range("share", share, 0.0, low_open=True)
+        total = jnp.sum(self.reflectance, axis=1) + self.lost
+        is_covered = self.lost <= share * total
+        return dataclasses.replace(
+            self, reflectance=jnp.where(is_covered[:, None], self.reflectance, jnp.nan)
+        )
+
+    def save(self, path: str | os.PathLike[str], case: Any = None) -> None:
+        """Write the waveform as a netCDF file, which `jaxlidar.open` reads.
+
+        **Arguments:**
+
+        - `path`: the file to write.
+        - `case`: the `jaxlidar.io.Case` that was simulated, so that `jaxlidar.rerun` can do it again.
+          Default None: not kept.
+
+        **Raises:** what `jaxlidar.io.save` raises.
+        """
+        save_result(self, path, case)
+
+    def __str__(self) -> str:
+        if any(is_traced(x) for x in (self.time, self.reflectance)):
+            return repr(self)
+        return summary(self)
+
+    def _repr_html_(self) -> str | None:
+        """What notebooks show: the summary and a small figure."""
+        if any(is_traced(x) for x in (self.time, self.reflectance)):
+            return None
+        return waveform_html(self)
+
+
+def total_reflectance(response: Response, setup: Setup) -> Float[Array, "wavelengths samples"]:
+    """Return the apparent reflectance per sample, all components together.
+
+    This is `Waveform.reflectance` on the plan's samples, without the components, energy and energy budget of
+    `waveform_of`.
+
+    **Arguments:**
+
+    - `response`: a `Response` of `jaxlidar.trace_scene`, or the mean of several.
+    - `setup`: the `Setup` that it was traced with; its optics may differ.
+
+    **Returns:** (wavelengths, samples) apparent reflectance.
+
+    **Example:**
+
+    >>> import equinox as eqx
+    >>> import jax
+    >>> import jaxlidar as jl
+    >>> lidar, scene = jl.Lidar(), jl.Scene(ground=jl.Ground(reflectance=0.4))
+    >>> setup = jl.make_setup(lidar, scene, jl.plan(lidar, scene))
+    >>> response = eqx.filter_jit(jl.trace_scene)(setup, jax.random.key(0))
+    >>> total = eqx.filter_jit(jl.total_reflectance)(response, setup)
+    >>> print(f"{float(total.sum()):.3f}")
+    0.400
+    """
+    return total_samples(response, make_waveform_model(setup))
+
+
+def waveform_of(
+    response: Response,
+    setup: Setup,
+    *,
+    stderr: Float[Array, "wavelengths bins"] | None = None,
+    energy_budget_stderr: dict[str, Float[Array, "wavelengths"]] | None = None,
+    info: dict | None = None,
+) -> Waveform:
+    """Make the waveform of a response, with the optics, atmosphere, pulse, sampling and energy of a setup.
+
+    The optics may differ from those at tracing: one response serves all reflectances and transmittances.
+
+    **Arguments:**
+
+    - `response`: a `Response` of `jaxlidar.trace_scene`, or the mean of several.
+    - `setup`: the `Setup` that it was traced with; its optics may differ.
+    - `stderr`: (wavelengths, samples) standard error of the reflectance, from batches. Default None: zero.
+    - `energy_budget_stderr`: standard errors of the energy budget, from batches. Default None: zero.
+    - `info`: dict for `Waveform.info`. Default None: empty.
+
+    **Returns:** a `Waveform` on the plan's samples.
+
+    **Example:**
+
+    >>> import equinox as eqx
+    >>> import jax
+    >>> import jaxlidar as jl
+    >>> lidar, scenes = jl.Lidar(), [jl.Scene(ground=jl.Ground(reflectance=r)) for r in (0.2, 0.8)]
+    >>> dark, bright = (jl.make_setup(lidar, scene, jl.plan(lidar, scenes[0])) for scene in scenes)
+    >>> response = eqx.filter_jit(jl.trace_scene)(dark, jax.random.key(0))
+    >>> wave = eqx.filter_jit(jl.waveform_of)(response, bright)
+    >>> print(f"{float(wave.reflectance.sum()):.3f}")
+    0.800
+    """
+    wave = waveform_of_model(response, make_waveform_model(setup))
+    fields = {"stderr": stderr, "energy_budget_stderr": energy_budget_stderr, "info": info}
+    return dataclasses.replace(wave, **{name: value for name, value in fields.items() if value is not None})
+
+
+def waveform_of_model(response: Response, model: WaveformModel) -> Waveform:
+    """Make the waveform of a response, without standard errors."""
+    lidar, time = model.lidar, model.time
+    components = component_samples(response, model)
+    reflectance = components["first"] + components["higher"]
+    energy_budget, neglected, lost = budget_terms(response, model)
+    energy = reflectance * energy_per_reflectance(lidar, time)
+    return Waveform(
+        time=time,
+        height=height_of(lidar, time),
+        reflectance=reflectance,
+        energy=energy,
+        stderr=jnp.zeros_like(reflectance),
+        components=components,
+        neglected=neglected,
+        energy_budget=energy_budget,
+        energy_budget_stderr=jax.tree.map(jnp.zeros_like, energy_budget),
+        lost=lost,
+        recorded=record(energy, lidar.wavelength, lidar.receiver),
+        wavelength=lidar.wavelength,
+        info={},
+    )
+
+
+def remove_padding(wave: Waveform, n_wavelengths: int, n_samples: int) -> Waveform:
+    """Return the first wavelengths and samples of a waveform."""
+    if wave.reflectance.shape == (n_wavelengths, n_samples):
+        return wave
+    # On the host: slices are not worth a compilation.
+    padded = jax.device_get(wave)
+    sizes = (n_wavelengths, n_samples)
+    trimmed = jax.tree.map(lambda a: a[tuple(slice(n) for n in sizes[: a.ndim])], padded)
+    axes = (padded.time[:n_samples], padded.height[:n_samples])
+    return jax.device_put(eqx.tree_at(lambda w: (w.time, w.height), trimmed, axes))
+
+
+def energy_per_reflectance(lidar: Lidar, time: Float[Array, "bins"]) -> Float[Array, "wavelengths bins"]:
+    """Return the energy, J, per apparent reflectance at the range of each sample."""
+    distance = lidar.range_to_reference + 0.5 * SPEED_OF_LIGHT * time
+    # A window may begin before the pulse is sent.
+    solid_angle = lidar.aperture_area / (jnp.pi * jnp.maximum(distance, 1e-3) ** 2)
+    return jnp.outer(lidar.energy_per_wavelength * lidar.efficiency_per_wavelength, solid_angle)
+
+
+def open_at_first_return(wave: Waveform, lidar: Lidar) -> Waveform:
+    """Resample a finely sampled waveform to the bins of the digitiser, which start at the first return.
+
+    See `jaxlidar.first_return_window` for the artefact that this makes. The first return is the first sample
+    above the receiver's detection threshold and above a thousandth of the peak. Standard errors of the fine
+    samples are added up as if fully correlated.
+    """
+    energy = wave.energy
+    threshold = jnp.maximum(lidar.receiver.detection_threshold, 1e-3 * jnp.max(energy))
+    is_open = jnp.cumsum(jnp.any(energy > threshold, axis=0)) > 0
+    arrays = [wave.reflectance, energy, wave.stderr, *wave.components.values()]
+    # The energy alone opens the window: all arrays are zero before it does.
+    opened = jnp.stack([jnp.where(is_open[None, :], a, 0.0) for a in arrays])
+    interval = float(lidar.sampling_interval)
+    time, rows = first_return_window(wave.time, opened, interval, jnp.minimum(threshold, 0.0))
+    return dataclasses.replace(
+        wave,
+        time=time,
+        height=height_of(lidar, time),
+        reflectance=rows[0],
+        energy=rows[1],
+        stderr=rows[2],
+        components=dict(zip(wave.components, rows[3:])),
+        recorded=record(rows[1], wave.wavelength, lidar.receiver),
+    )

@@ -1,0 +1,224 @@
+"""Absorption and escape: light that is followed to its end, without time and without a last order.
+
+Photons carry their energy at every wavelength; optics are applied at every scattering. A collision of energy
+E with a material (R, T) absorbs E (1 - R a - T), tallied as its expectation, with a the albedo of the law;
+the photon goes on with the rest. Photons below the fraction f of the emitted energy survive with the
+probability E / f, with the energy f (Russian roulette), which keeps all expectations.
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from jaxlidar._vectors import FAR, Vec, along, vec
+from jaxlidar.planning.config import Scatterer
+from jaxlidar.scenes.height_field import HeightField
+from jaxlidar.trace.collisions import sample_collision
+from jaxlidar.trace.device_scene import DeviceScene, not_scattered
+from jaxlidar.trace.flight import SurfaceEncounters, meet_surfaces, sample_flights
+from jaxlidar.trace.footprint import across_beam
+from jaxlidar.trace.photons import TRANSMITTED, Photons
+from jaxlidar.trace.random_numbers import PhotonDraws
+
+# Below this fraction of the emitted energy a photon may be ended.
+_ROULETTE_ENERGY = 0.05
+
+
+class EnergyFractions(eqx.Module):
+    """Fractions of the emitted energy by fate, the mean of photons.
+
+    - `absorbed`: by each material. - `up`, `down`: left the scene upward, or downward where there is no
+      ground.
+    - `on_ground`: arrived at the ground, every time it did. - `unfollowed`: flew farther than flights are
+      followed, or was not at its end when the last order was reached.
+    """
+
+    absorbed: Float[Array, "materials wavelengths"]
+    up: Float[Array, "wavelengths"]
+    down: Float[Array, "wavelengths"]
+    on_ground: Float[Array, "wavelengths"]
+    unfollowed: Float[Array, "wavelengths"]
+
+
+class _PhotonLoop(eqx.Module):
+    """State of the loop over orders: photons, their energy, sums so far, and the number of the order."""
+
+    photons: Photons
+    energy: Float[Array, "photons wavelengths"]
+    fractions: EnergyFractions
+    order: Int[Array, ""]
+
+
+def from_beam(scene: DeviceScene, key: PRNGKeyArray, count: int) -> tuple[Vec, Vec]:
+    """Sample starts above the scene and directions of light of the beam."""
+    fraction, turn = jax.random.uniform(key, (2, count))
+    point, w, _ = scene.beam.ray(across_beam(scene.beam, fraction, turn))
+    return along(point, w, jnp.asarray(-scene.limits.start_distance, fraction.dtype)), w
+
+
+def from_the_sky(scene: DeviceScene, key: PRNGKeyArray, count: int) -> tuple[Vec, Vec]:
+    """Sample parallel light over one period of the voxel map, from its top or above all terrain."""
+    medium = scene.medium
+    assert medium is not None
+    u, v = jax.random.uniform(key, (2, count))
+    low, high = medium.origin, medium.origin + medium.size * medium.counts
+    x, y = (low[k] + s * (high[k] - low[k]) for k, s in enumerate((u, v)))
+    top = jnp.full_like(u, high[2])
+    for surface in scene.surfaces:
+        if isinstance(surface.shape, HeightField):
+            top = jnp.maximum(top, surface.shape.high)
+    return (x, y, top), vec(jnp.broadcast_to(c, u.shape) for c in scene.beam.axis)
+
+
+def trace_to_end(
+    scene: DeviceScene,
+    optics: Float[Array, "channels wavelengths"],
+    key: PRNGKeyArray,
+    count: int,
+    source: Callable[[DeviceScene, PRNGKeyArray, int], tuple[Vec, Vec]],
+    max_orders: int,
+) -> EnergyFractions:
+    """Trace `count` photons of a source to their ends, at most through `max_orders` scatterings.
+
+    `optics`: reflectance or transmittance of every channel.
+    """
+    start_key, key = jax.random.split(key)
+    x, w = source(scene, start_key, count)
+    zero_history = jnp.zeros((count,), jnp.int32)
+    zero, one = jnp.zeros_like(x[0]), jnp.ones_like(x[0])
+    photons = Photons(
+        x=x,
+        w=w,
+        path=zero,
+        weight=one,
+        history=zero_history,
+        surface=zero_history - 1,
+        last_scattering=not_scattered(zero),
+        alive=zero_history == 0,
+    )
+    n_wavelengths = optics.shape[1]
+    nothing = jnp.zeros((n_wavelengths,), optics.dtype)
+    absorbed = jnp.zeros((len(scene.config.materials), n_wavelengths), optics.dtype)
+    fractions = EnergyFractions(absorbed, nothing, nothing, nothing, nothing)
+    energy = jnp.ones((count, n_wavelengths), optics.dtype)
+    start = _PhotonLoop(photons, energy, fractions, jnp.zeros((), jnp.int32))
+
+    def continue_(loop: _PhotonLoop) -> Bool[Array, ""]:
+        return jnp.any(loop.photons.alive) & (loop.order < max_orders)
+
+    def step(loop: _PhotonLoop) -> _PhotonLoop:
+        return _trace_order(scene, optics, loop, jax.random.fold_in(key, loop.order))
+
+    end = jax.lax.while_loop(continue_, step, start)
+    remaining = jnp.sum(jnp.where(end.photons.alive[:, None], end.energy, 0.0), axis=0)
+    unfollowed = end.fractions.unfollowed + remaining
+    fractions = eqx.tree_at(lambda f: f.unfollowed, end.fractions, unfollowed)
+    return jax.tree.map(lambda a: a / count, fractions)
+
+
+def _trace_order(scene: DeviceScene, optics: Array, loop: _PhotonLoop, key: PRNGKeyArray) -> _PhotonLoop:
+    """Trace photons through one order of scattering.
+
+    1. Find the surfaces ahead, and sample the flight.
+    2. Apply the plates that transmit light straight on, and tally what they absorb.
+    3. Tally light that escapes, or flies farther than flights are followed.
+    4. Sample the collision, and tally what its material absorbs.
+    5. Multiply the energy by the optics of the sampled channel; end faint photons by Russian roulette.
+    """
+    config, p, energy, fractions = scene.config, loop.photons, loop.energy, loop.fractions
+    tiny = jnp.finfo(energy.dtype).tiny
+    draw_key, roulette_key = jax.random.split(key)
+    shape = (PhotonDraws.dimensions(scene.n_plates, return_path=False), p.weight.size)
+    uniform = jax.random.uniform(draw_key, shape, p.weight.dtype, tiny)
+    draws = PhotonDraws.from_numbers(list(uniform), scene.n_plates)
+    encounters = meet_surfaces(scene, p, draws.plates_ahead)
+    max_length = jnp.full_like(encounters.nearest_stop, scene.limits.max_flight)
+    flights = sample_flights(scene, p, encounters.nearest_stop, max_length, draws.flight[None])
+    flight = jax.tree.map(lambda a: a[0], flights)
+
+    def optics_at(channel: int) -> Float[Array, "1 wavelengths"]:
+        return optics[channel : channel + 1] if channel >= 0 else jnp.zeros_like(optics[:1])
+
+    def absorbed_of(scatterer: Scatterer, arriving: Array, albedo: Array) -> Array:
+        """Energy of that which arrives that is absorbed; `albedo`: of the law."""
+        reflected = optics_at(scatterer.reflection) * albedo[:, None]
+        return jnp.sum(arriving * (1.0 - reflected - optics_at(scatterer.transmission)), axis=0)
+
+    full_albedo = jnp.ones_like(p.weight)
+    absorbed = fractions.absorbed
+    energy_before = energy
+    for i, surface in enumerate(scene.surfaces):
+        distance, outcome = encounters.distances[i], encounters.outcomes[i]
+        if not surface.is_plate or outcome is None:
+            continue
+        scatterer = config.surfaces[i]
+        is_passed = (distance < flight.distance) | ~flight.has_hit
+        transmitted = p.alive & (distance < FAR) & is_passed & (outcome == TRANSMITTED)
+        arriving = _arriving_energy(scene, optics, energy_before, encounters, i)
+        arriving = jnp.where(transmitted[:, None], arriving, 0.0)
+        absorbed = absorbed.at[scatterer.material].add(absorbed_of(scatterer, arriving, full_albedo))
+        factor = optics_at(scatterer.transmission) / (1.0 - scene.limits.reflection_probability)
+        energy = jnp.where(transmitted[:, None], energy * factor, energy)
+
+    escaped = jnp.where(flight.escaped[:, None], energy, 0.0)
+    upward = (p.w[2] > 0)[:, None]
+    late = jnp.where(flight.late[:, None], energy, 0.0)
+    x = along(p.x, p.w, jnp.where(flight.has_hit, flight.distance, 0.0))
+    landed = flight.landed_on(encounters)
+    collision = sample_collision(scene, x, p.w, flight.cell, flight.collided, landed, draws)
+    energy = jnp.where(flight.has_hit[:, None], energy, 0.0)
+    for scatterer in (config.leaf, config.bark):
+        if scatterer is not None:
+            on_material = flight.collided & (collision.material == scatterer.material)
+            arriving = jnp.where(on_material[:, None], energy, 0.0)
+            absorbed = absorbed.at[scatterer.material].add(absorbed_of(scatterer, arriving, full_albedo))
+    on_ground = fractions.on_ground
+    for surface, on_surface, scatterer in zip(scene.surfaces, landed, config.surfaces):
+        arriving = jnp.where(on_surface[:, None], energy, 0.0)
+        albedo = surface.at_position(x, surface.law.albedo(p.w, surface.lit_normal(x, p.w)))
+        absorbed = absorbed.at[scatterer.material].add(absorbed_of(scatterer, arriving, albedo))
+        if not surface.is_plate:
+            on_ground = on_ground + jnp.sum(arriving, axis=0)
+
+    channel = jnp.maximum(collision.channel, 0)
+    energy = energy * optics[channel] * (collision.ratio * collision.onward_weight)[:, None]
+    alive = flight.has_hit & (jnp.max(energy, axis=1) > 0)
+    survival = jnp.minimum(jnp.max(energy, axis=1) / _ROULETTE_ENERGY, 1.0)
+    survives = alive & (jax.random.uniform(roulette_key, survival.shape, survival.dtype) < survival)
+    energy = jnp.where(survives[:, None], energy / jnp.where(survives, survival, 1.0)[:, None], 0.0)
+    photons = Photons(
+        x=x,
+        w=collision.w,
+        path=p.path,
+        weight=p.weight,
+        history=p.history,
+        surface=collision.surface,
+        last_scattering=collision.last_scattering,
+        alive=survives,
+    )
+    fractions = EnergyFractions(
+        absorbed=absorbed,
+        up=fractions.up + jnp.sum(jnp.where(upward, escaped, 0.0), axis=0),
+        down=fractions.down + jnp.sum(jnp.where(upward, 0.0, escaped), axis=0),
+        on_ground=on_ground,
+        unfollowed=fractions.unfollowed + jnp.sum(late, axis=0),
+    )
+    return _PhotonLoop(photons, energy, fractions, loop.order + 1)
+
+
+def _arriving_energy(
+    scene: DeviceScene, optics: Array, energy: Array, encounters: SurfaceEncounters, number: int
+) -> Array:
+    """Return the energy that arrives at a plate: after transmission by those that lie nearer."""
+    for j, surface in enumerate(scene.surfaces):
+        scatterer, outcome = scene.config.surfaces[j], encounters.outcomes[j]
+        if j == number or not surface.is_plate or scatterer.transmission < 0:
+            continue
+        is_nearer = encounters.distances[j] < encounters.distances[number]
+        transmitted = is_nearer & (outcome == TRANSMITTED)
+        factor = optics[scatterer.transmission][None, :] / (1.0 - scene.limits.reflection_probability)
+        energy = jnp.where(transmitted[:, None], energy * factor, energy)
+    return energy

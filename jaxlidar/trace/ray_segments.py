@@ -1,0 +1,180 @@
+r"""Segments of footprint rays between voxel faces, and the light that returns from them, bin by bin.
+
+Within a segment from s0 to s1 the extinction k is constant, and the optical depth before it is tau0. The
+first-order return of a piece [a, b] of it, per unit of k and of intensity factor, is
+
+    integral over s in [a, b] of exp(-kappa tau(s)) ds = exp(-kappa tau(a)) (b - a) D(kappa k (b - a)),
+
+    D(x) = (1 - exp(-x)) / x,
+
+with kappa = 2 for independent paths in and out, or 1 with the hot spot. Segments are cut at the edges of time
+bins, so that every piece belongs to one bin.
+"""
+
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxlidar._constants import SPEED_OF_LIGHT
+from jaxlidar._one_function import once
+from jaxlidar._vectors import Scalar, Vec
+from jaxlidar.planning.config import TimeBins
+from jaxlidar.trace.deposit import padded_index
+from jaxlidar.trace.voxel_traversal import Medium, cell_index, enter_grid, maximum, minimum, step_voxel
+
+Tally = TypeVar("Tally")
+
+# Segments that are deposited at once.
+SEGMENTS_AT_ONCE = 256
+
+
+class RaySegments(eqx.Module):
+    """Segments of a ray between faces.
+
+    - `start`, `length`: distance from the start of the ray, and length, m.
+    - `depth`: optical depth before the segment. `cell`: the voxel. `extinction`: 1/m.
+    - `depth_slopes`: derivatives of that depth, where scores are asked for; else None.
+    """
+
+    start: Float[Array, "*steps"]
+    length: Float[Array, "*steps"]
+    depth: Float[Array, "*steps"]
+    cell: Int[Array, "*steps"]
+    extinction: Float[Array, "*steps"]
+    depth_slopes: Float[Array, "*steps columns"] | None = None
+
+
+def mean_decay(x: Scalar) -> Scalar:
+    """(1 - exp(-x)) / x for x >= 0, with its derivative; accurate down to and at zero."""
+    return _decay(x)[1]
+
+
+def _decay(x: Scalar) -> tuple[Scalar, Scalar]:
+    """exp(-x) and (1 - exp(-x)) / x, the latter for small x as exp(-x/2) sinh(x/2) / (x/2), by its series."""
+    small = x < 1.0
+    square = 0.25 * x * x
+    series = jnp.ones_like(x)
+    # So many terms are exact to the last digit at x = 1.
+    for n in range(3 if jnp.finfo(x.dtype).bits == 32 else 7, 0, -1):
+        series = 1.0 + square * (1.0 / (2 * n * (2 * n + 1))) * series
+    half = jnp.exp(-0.5 * x)
+    passing = half * half
+    return passing, jnp.where(small, half * series, (1.0 - passing) / jnp.where(small, 1.0, x))
+
+
+def march_ray(
+    medium: Medium,
+    x: Vec,
+    w: Vec,
+    end: Scalar,
+    stops: list[Scalar],
+    max_segments: int,
+    max_length: Scalar,
+) -> tuple[RaySegments, list[Scalar], Scalar]:
+    """Cut one ray into segments up to `end`, none longer than `max_length`.
+
+    **Returns:** the segments; the optical depth at each of `stops`, which are distances along the ray; and
+    that at its end. Segments after the end have no length.
+    """
+    ray = enter_grid(medium, x, w)
+    end = minimum(end, ray.leave)
+
+    def step(state, _):
+        distance, depth, voxel, depth_at_stops = state
+        faces = once(ray.face_distances(voxel))
+        face = minimum(minimum(faces[0], faces[1]), faces[2])
+        to = minimum(end, minimum(face, distance + max_length))
+        for stop in stops:
+            # Plates lie between segments, not within one: what they shade begins with the next segment.
+            to = jnp.where(stop > distance, minimum(to, stop), to)
+        cell = cell_index(medium, voxel)
+        k = medium.extinction(cell, w)
+        to, cell, k = once((maximum(distance, to), cell, k))
+        length = to - distance
+        depth_at_stops = [
+            d + k * (maximum(distance, minimum(stop, to)) - distance)
+            for d, stop in zip(depth_at_stops, stops)
+        ]
+        next_voxel = step_voxel(ray, voxel, faces, to)
+        segment = RaySegments(distance, length, depth, cell, k)
+        return (to, depth + k * length, next_voxel, depth_at_stops), segment
+
+    zero = jnp.zeros_like(end)
+    state = (jnp.minimum(ray.enter, end), zero, ray.voxel, [zero] * len(stops))
+    (_, total_depth, _, depth_at_stops), segments = lax.scan(step, state, None, length=max_segments)
+    return segments, depth_at_stops, total_depth
+
+
+def integrate_over_bins(
+    bins: TimeBins, start_position: Float[Array, "*s"], segments: RaySegments, kappa: float
+) -> tuple[Int[Array, "*s"], Float[Array, "pieces *s"]]:
+    """Integrate exp(-kappa tau) ds over the pieces of each segment, bin by bin.
+
+    **Arguments:** `start_position`: of the start of each segment on the axis of bins.
+
+    **Returns:** index of the first bin, counting the margin, and the integrals, m, from there on.
+    """
+    bin_length = 0.5 * SPEED_OF_LIGHT * bins.width
+    end_position = start_position + segments.length / bin_length
+    first_number = jnp.round(lax.stop_gradient(start_position))
+    # Rows of an even length are added faster; a piece beyond the end is zero.
+    count = bins.max_span - 2 + bins.max_span % 2
+
+    def piece(carry, j):
+        transmittance, start = carry
+        end = jnp.clip(first_number + (j + 0.5), start_position, end_position)
+        length = (end - start) * bin_length
+        passing, mean = _decay(kappa * segments.extinction * length)
+        return (transmittance * passing, end), transmittance * mean * length
+
+    # A scan computes each piece once; unrolled, compilers compute them again for every element.
+    state = (jnp.exp(-kappa * segments.depth), start_position)
+    _, pieces = lax.scan(piece, state, jnp.arange(count, dtype=start_position.dtype))
+    return padded_index(bins, first_number, count), pieces
+
+
+def add_in_blocks(
+    add: Callable[[Tally, RaySegments, Any], Tally],
+    tally: Tally,
+    segments: RaySegments,
+    per_ray: Any,
+    counts: Bool[Array, "steps rays"] | None,
+) -> Tally:
+    """Add segments to a tally by `add`, in blocks of those that count, and have not ended.
+
+    **Arguments:**
+
+    - `add`: returns the tally with some segments added; its last argument is `per_ray` at the ray of each.
+    - `per_ray`: arrays with one row for each ray.
+    - `counts`: False for segments that return nothing. None: all count.
+
+    Blocks stay within the processor's cache, and most voxels of a forest are empty.
+    """
+    shape = segments.start.shape
+    not_ended = (segments.start < segments.start[-1:]) | (segments.length > 0.0)
+    counts = not_ended if counts is None else not_ended & counts
+    # Number the segments that count, ray by ray: `position` of each among them.
+    one, none = counts.astype(jnp.int32), jnp.zeros(shape[1], jnp.int32)
+    per_ray_count, rank = lax.scan(lambda n, is_counted: (n + is_counted, n), none, one)
+    upto = jnp.cumsum(per_ray_count)
+    first = jnp.concatenate([jnp.zeros(1, jnp.int32), upto[:-1]])
+    position = jnp.where(counts, first[None] + rank, counts.size)
+    number = jnp.arange(counts.size, dtype=jnp.int32)
+    selected = jnp.zeros((counts.size + SEGMENTS_AT_ONCE,), jnp.int32)
+    selected = selected.at[position.reshape(-1)].set(number, mode="drop")
+
+    def block(n, tally):
+        numbers = lax.dynamic_slice(selected, (n * SEGMENTS_AT_ONCE,), (SEGMENTS_AT_ONCE,))
+        in_block = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[numbers], segments)
+        # Segments that fill up the last block get no length.
+        is_real = n * SEGMENTS_AT_ONCE + jnp.arange(SEGMENTS_AT_ONCE) < upto[-1]
+        in_block = eqx.tree_at(lambda s: s.length, in_block, jnp.where(is_real, in_block.length, 0.0))
+        return add(tally, in_block, jax.tree.map(lambda a: a[numbers % shape[1]], per_ray))
+
+    n_blocks = (upto[-1] + (SEGMENTS_AT_ONCE - 1)) // SEGMENTS_AT_ONCE
+    return lax.fori_loop(0, n_blocks, block, tally)

@@ -1,0 +1,151 @@
+r"""Shared illumination, part three: responses of nodes, or of shots, from one trace.
+
+What returns is linear in what is sent. A photon that enters at a with the density p(a) and returns the weight
+w
+
+    contributes  w I_f(a) / p(a) * V_f(b)  to the footprint f
+
+(`jaxlidar.trace.shot_views`). Straight down, without a field of view, V_f = 1, and I_f is nearly a sum of
+B-splines: then the response is tallied by node, and footprints are summed afterwards (`trace_nodes`).
+Otherwise every deposit is added to the shots that see it (`trace_shots`).
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from jaxlidar.instrument.lidar import Lidar
+from jaxlidar.trace.device_scene import DeviceScene, aim_at
+from jaxlidar.trace.entry_nodes import EntryNodes
+from jaxlidar.trace.first_order import FirstOrder, first_order
+from jaxlidar.trace.higher_orders import trace_higher_orders
+from jaxlidar.trace.histories import Histories
+from jaxlidar.trace.response import FirstOrderResponse, Response, first_order_response, trace_first
+
+
+def trace_nodes(scene: DeviceScene, nodes: EntryNodes, key: PRNGKeyArray) -> Response:
+    """Trace the response of one batch to light about every node; leading axis: nodes.
+
+    `scene` has parallel light, and optics. Each wavelength is a trace of its own, with one history, for which
+    optics are 1.
+    """
+    assert scene.optics is not None
+    ray_key, photon_key = jax.random.split(key)
+    n_nodes = len(nodes.position)
+
+    def trace_group(
+        x: Float[Array, "rays"], y: Float[Array, "rays"], fraction: Float[Array, ""]
+    ) -> FirstOrder:
+        return first_order(scene, (x, y), jnp.broadcast_to(fraction, x.shape))
+
+    groups = jax.vmap(trace_group)(*nodes.ray_entries(ray_key), nodes.group_fraction)
+    first = jax.tree.map(lambda a: jax.ops.segment_sum(a, nodes.group_node, n_nodes), groups)
+    if not scene.config.follows_higher_orders:
+        response = jax.vmap(lambda f: first_order_response(scene, f, f.weights))(first)
+        return _apply_optics_to_first(response, scene)
+    table, optics = scene.first_histories, scene.optics
+    n_wavelengths = optics.shape[1]
+    higher = trace_higher_orders(scene, photon_key, nodes)
+
+    def by_node(a: Array) -> Array:
+        """Split entries into nodes and wavelengths, as leading axes."""
+        axis = a.ndim - (2 if a.ndim == 3 else 1)
+        a = a.reshape(*a.shape[:axis], n_nodes, n_wavelengths, *a.shape[axis + 1 :])
+        return jnp.moveaxis(a, (axis, axis + 1), (0, 1))
+
+    return Response(
+        first=_apply_optics(first.weights, table, optics),
+        higher=jnp.expand_dims(by_node(higher.weights), 3),
+        first_outside=_apply_optics(first.outside[..., None], table, optics)[..., 0],
+        higher_outside=by_node(higher.outside)[..., None],
+        arrived=by_node(higher.arrived)[..., None],
+        left=by_node(higher.left)[..., None],
+        escaped=by_node(higher.escaped)[..., None],
+        late=by_node(higher.late)[..., None],
+        remaining=by_node(higher.remaining)[..., None],
+    )
+
+
+def _apply_optics(
+    weights: Float[Array, "nodes *rows histories columns"],
+    table: Histories,
+    optics: Float[Array, "channels wavelengths"],
+) -> Float[Array, "nodes wavelengths *rows 1 columns"]:
+    """Sum weights over histories with optics; wavelengths become the second axis."""
+    by_wavelength = jnp.einsum("hw,...hc->...wc", table.monomials(optics), weights)
+    return jnp.expand_dims(jnp.moveaxis(by_wavelength, -2, 1), -2)
+
+
+def _apply_optics_to_first(response: Response, scene: DeviceScene) -> Response:
+    """Apply optics to a response of order one alone, which has one trace."""
+    assert scene.optics is not None
+    table, optics = scene.first_histories, scene.optics
+
+    def apply(a: Array) -> Array:
+        return _apply_optics(a[:, 0, ..., None], table, optics)[..., 0]
+
+    return Response(
+        first=_apply_optics(response.first[:, 0], table, optics),
+        higher=None,
+        first_outside=apply(response.first_outside),
+        higher_outside=None,
+        arrived=apply(response.arrived),
+        left=apply(response.left),
+        escaped=apply(response.escaped),
+        late=apply(response.late),
+        remaining=apply(response.remaining),
+    )
+
+
+def trace_shots(scene: DeviceScene, lidar: Lidar, nodes: EntryNodes, key: PRNGKeyArray) -> Response:
+    """Trace the response of one batch to light about nodes, as each shot sees it; leading axis: shots.
+
+    `scene` has `shot_views`. Order one of its `first_order_shots` is traced from rays of their own.
+    """
+    views, optics = scene.shot_views, scene.optics
+    assert views is not None
+    assert optics is not None
+    ray_key, photon_key = jax.random.split(key)
+    higher = trace_higher_orders(scene, photon_key, nodes)
+    n_shots, n_wavelengths = views.n_shots, optics.shape[1]
+
+    def to_all_shots(a: Array) -> Array:
+        return jnp.zeros((n_shots, *a.shape[1:]), a.dtype).at[views.first_order_shots].set(a)
+
+    def by_shot(a: Array) -> Array:
+        return jnp.moveaxis(a.reshape(len(a), n_shots, n_wavelengths, *a.shape[2:]), (1, 2), (0, 1))
+
+    def from_nodes(a: Array) -> Array:
+        by_node = a.reshape(*a.shape[:-1], -1, n_wavelengths)
+        return jnp.einsum("sn,...nw->sw...", views.node_coefficients, by_node)[..., None]
+
+    first = jax.tree.map(to_all_shots, trace_first_of_shots(scene, lidar, views.first_order_shots, ray_key))
+    response = Response(
+        first=first.weights,
+        higher=jnp.expand_dims(by_shot(higher.weights), 3),
+        first_outside=first.outside,
+        higher_outside=by_shot(higher.outside)[..., None],
+        arrived=from_nodes(higher.arrived),
+        left=from_nodes(higher.left),
+        escaped=from_nodes(higher.escaped),
+        late=from_nodes(higher.late),
+        remaining=from_nodes(higher.remaining),
+    )
+    # The last is the dummy shot.
+    return jax.tree.map(lambda a: a[:-1], response)
+
+
+def trace_first_of_shots(
+    scene: DeviceScene, lidar: Lidar, shots: Int[Array, "shots"], key: PRNGKeyArray
+) -> FirstOrderResponse:
+    """Trace order one of shots of `scene.shot_views`, one after the other, each from rays of its own beam."""
+    views = scene.shot_views
+    assert views is not None
+
+    def trace_shot(number: Array) -> FirstOrderResponse:
+        shot_scene = aim_at(dataclasses.replace(scene, shot_views=None), lidar, views.position[number])
+        return trace_first(shot_scene, jax.random.fold_in(key, number))
+
+    return jax.lax.map(trace_shot, shots)
