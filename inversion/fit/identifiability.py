@@ -255,7 +255,7 @@ def profile_likelihood(
     time: ArrayLike | Sequence | None = None,
     plan: Plan | None = None,
     progress: Callable[[int], None] | None = None,
-    **more: Any,
+    **retrieve_options: Any,
 ) -> Profile:
     """Profile likelihood of one unknown: all others are fitted at each of several fixed values of it.
 
@@ -271,7 +271,7 @@ def profile_likelihood(
       before the others.
     - `values`: (points,) values of that unknown, two or more, increasing, within its bounds.
     - `progress`: called with the index of each value when its fit has ended.
-    - `more`: further arguments of `retrieve`, for all fits.
+    - `retrieve_options`: further arguments of `retrieve`, for all fits.
 
     **Returns:** a `Profile`.
 
@@ -294,7 +294,7 @@ def profile_likelihood(
     """
     # Arguments that `retrieve` does not have are found before the work.
     arguments = inspect.signature(retrieve).bind(
-        observed, lidar, scene, unknowns, noise=noise, key=key, **more
+        observed, lidar, scene, unknowns, noise=noise, key=key, **retrieve_options
     )
     arguments.apply_defaults()
     options = arguments.arguments

@@ -50,7 +50,7 @@ _NARROWER_ECHO_FACTOR = 1.5
 
 
 class Verdict(NamedTuple):
-    """How far a fit can be trusted.
+    """Trustworthiness of a fit.
 
     - `quality`: "good", "doubtful" or "bad".
     - `reasons`: a sentence for each check that failed, the gravest first; empty for a good fit.
@@ -66,9 +66,9 @@ class Verdict(NamedTuple):
     quality: str
     reasons: tuple[str, ...]
 
-    def __and__(self, other: "Verdict") -> "Verdict":
+    def __and__(self, verdict: "Verdict") -> "Verdict":
         """Return the worse of two, with the reasons of both."""
-        worse, better = sorted((self, other), key=lambda v: -_QUALITIES.index(v.quality))
+        worse, better = sorted((self, verdict), key=lambda v: -_QUALITIES.index(v.quality))
         return Verdict(worse.quality, (*worse.reasons, *better.reasons))
 
 

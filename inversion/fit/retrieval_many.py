@@ -189,7 +189,7 @@ def retrieve_many(
     of_recorder = [] if recorders[0] is None else recorder_unknowns(recorders[0])
     all_unknowns = [*bound[0], *of_recorder, *scale_unknowns]
     # Everything on which the results depend, by names that an error message shows.
-    parts = {
+    problem_parts = {
         "observed": y,
         "noise": sigma,
         "time": sample_times,
@@ -228,7 +228,8 @@ def retrieve_many(
         wavelengths=n_wavelengths,
         bins=n_bins,
     )
-    with open_checkpoint(path, fingerprint(parts)) if path else contextlib.nullcontext() as checkpoint:
+    no_checkpoint = contextlib.nullcontext()
+    with no_checkpoint if path is None else open_checkpoint(path, fingerprint(problem_parts)) as checkpoint:
         finished = FinishedFits(checkpoint, n_footprints, record_sizes)
         missing = [i for i in range(n_footprints) if i not in finished.records]
         fits = (
@@ -245,13 +246,13 @@ def retrieve_many(
 
 def _parts_of_unknowns(unknowns: list[list[BoundUnknown]]) -> dict[str, Any]:
     """Return what fits depend on of the unknowns: that of the first footprint, and the starts of all."""
-    parts: dict[str, Any] = {"unknowns": [u.name for u in unknowns[0]]}
+    dependencies: dict[str, Any] = {"unknowns": [u.name for u in unknowns[0]]}
     for u, *in_other_footprints in zip(*unknowns):
-        parts[f"where or apply of {u.name!r}"] = u.setter
-        parts[f"bounds of {u.name!r}"] = u.low, u.high
-        parts[f"prior of {u.name!r}"] = (u.prior, u.is_log_prior) if u.smooth is None else u.smooth
-        parts[f"start of {u.name!r}"] = [u.start, *(other.start for other in in_other_footprints)]
-    return parts
+        dependencies[f"where or apply of {u.name!r}"] = u.setter
+        dependencies[f"bounds of {u.name!r}"] = u.low, u.high
+        dependencies[f"prior of {u.name!r}"] = (u.prior, u.is_log_prior) if u.smooth is None else u.smooth
+        dependencies[f"start of {u.name!r}"] = [u.start, *(v.start for v in in_other_footprints)]
+    return dependencies
 
 
 def _with_starts(

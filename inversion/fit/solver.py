@@ -162,10 +162,10 @@ def _initial_state(solver: Any, y: Array, args: Any) -> Any:
 
 @eqx.filter_jit
 def _advance(solver: Any, y: Array, args: Any, state: Any) -> Any:
-    """Return the accepted point, the state with the next trial, True if done, and True if successful."""
+    """Return the accepted point, the state with the next trial, and flags: terminated, successful."""
     y, state, _ = solver.step(_linear_model, y, args, {}, state, frozenset())
-    done, result = solver.terminate(_linear_model, y, args, {}, state, frozenset())
-    return y, state, done, result == optx.RESULTS.successful
+    terminated, result = solver.terminate(_linear_model, y, args, {}, state, frozenset())
+    return y, state, terminated, result == optx.RESULTS.successful
 
 
 # -- bounded Gauss-Newton step
@@ -392,7 +392,7 @@ class LeastSquaresFit:
             args = tuple(jnp.asarray(a, y.dtype) for a in (trial.z, residual, jacobian))
             if state is None:
                 state = _initial_state(self.settings.solver, y, args)
-            y, state, done, successful = _advance(self.settings.solver, y, args, state)
+            y, state, terminated, successful = _advance(self.settings.solver, y, args, state)
             # An accepted trial is the solver's new point, bit by bit.
             accepted = bool(jnp.all(y == args[0])) and trial.is_finite
             if accepted:
@@ -401,7 +401,7 @@ class LeastSquaresFit:
             else:
                 n_rejected += 1
             self._report(trial, accepted)
-            if bool(done) or self._has_converged(decrement, n_rejected):
+            if bool(terminated) or self._has_converged(decrement, n_rejected):
                 return best, True, self._status("converged")
             if not bool(successful):
                 status = "failed: the equations for the next step could not be solved"
@@ -646,8 +646,8 @@ def multistart(fits: Sequence[LeastSquaresFit]) -> FitGenerator:
     best = min(completed, key=rank)
     if len(fits) == 1:
         return best
-    others = [fit for fit in completed if fit.record.converged and fit is not best]
-    second_minimum, robust_stderr = compare_minima(best, others)
+    other_minima = [fit for fit in completed if fit.record.converged and fit is not best]
+    second_minimum, robust_stderr = compare_minima(best, other_minima)
     n_same = sum(f.record.converged and f.details.cost < best.details.cost + 1.0 for f in completed)
     record = dataclasses.replace(
         best.record,
@@ -660,7 +660,7 @@ def multistart(fits: Sequence[LeastSquaresFit]) -> FitGenerator:
     return CompletedFit(record, dataclasses.replace(best.details, history=history))
 
 
-def compare_minima(best: CompletedFit, others: Sequence[CompletedFit]) -> tuple[float, np.ndarray]:
+def compare_minima(best: CompletedFit, other_minima: Sequence[CompletedFit]) -> tuple[float, np.ndarray]:
     """Return the rise in chi-squared to the second minimum, and standard errors with the spread over minima.
 
     Minima are the same within two standard errors of all unknowns. Chi-squared counts correlated samples by
@@ -671,9 +671,9 @@ def compare_minima(best: CompletedFit, others: Sequence[CompletedFit]) -> tuple[
     n_samples = max(np.count_nonzero(best.details.residuals), 1)
     scale = record.independent_samples / n_samples / max(record.reduced_chi2, 1.0)
     second_minimum, variance, weight = np.inf, np.zeros_like(record.values), 1.0
-    for other in others:
-        rise = max(other.details.cost - best.details.cost, 0.0) * scale
-        distance = other.record.values - record.values
+    for minimum in other_minima:
+        rise = max(minimum.details.cost - best.details.cost, 0.0) * scale
+        distance = minimum.record.values - record.values
         if np.any(np.abs(distance) > 2.0 * record.robust_stderr):
             second_minimum = min(second_minimum, rise)
         variance += np.exp(-0.5 * rise) * distance**2

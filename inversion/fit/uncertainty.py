@@ -116,13 +116,14 @@ def estimate_covariance(
         prior_information > 0, prior_information + np.diag(data_information), 1.0
     )
     # Pseudo-inverse, for a unit diagonal so that units of unknowns do not matter.
-    kept = np.flatnonzero(~undetermined)
-    norm = np.sqrt(np.diag(information)[kept])
-    eigenvalue, eigenvector = np.linalg.eigh(information[np.ix_(kept, kept)] / np.outer(norm, norm))
+    candidates = np.flatnonzero(~undetermined)
+    block = np.ix_(candidates, candidates)
+    norm = np.sqrt(np.diag(information)[candidates])
+    eigenvalue, eigenvector = np.linalg.eigh(information[block] / np.outer(norm, norm))
     determined = eigenvalue > _MIN_EIGENVALUE
-    undetermined[kept] |= np.any(eigenvector[:, ~determined] ** 2 > _MIN_COMPONENT, axis=1)
+    undetermined[candidates] |= np.any(eigenvector[:, ~determined] ** 2 > _MIN_COMPONENT, axis=1)
     inverse = np.zeros((n, n))
-    inverse[np.ix_(kept, kept)] = (
+    inverse[block] = (
         (eigenvector[:, determined] / eigenvalue[determined])
         @ eigenvector[:, determined].T
         / np.outer(norm, norm)
