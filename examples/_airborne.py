@@ -1,4 +1,4 @@
-"""Airborne records of any format as one kind: read by suffix, each with its pulse, amplitudes and noise."""
+"""Airborne records of any format in one form: read by suffix, each with its pulse, amplitudes and noise."""
 
 import argparse
 import dataclasses
@@ -12,39 +12,43 @@ import numpy as np
 
 import inversion
 import jaxlidar as jl
-from inversion.receiver.counts import Amplitudes
+from inversion.receiver.digitiser import Amplitudes
 from jaxlidar.io import AirborneShot, Segment, read_las_waveforms, read_neon, read_pulsewaves
 from jaxlidar.io.pedestal import above_pedestal
 
+# Readers by the suffix of a file.
 SUFFIXES = {".npz": read_neon, ".pls": read_pulsewaves, ".las": read_las_waveforms}
-# Of the first segment, the part that precedes the return, and its fewest samples; fewest of a pulse.
-QUIET, FEWEST_QUIET, QUIET_PULSE = 7, 8, 5
-# Hard targets that a receiver's response is estimated from: fewest, most, and of how many shots.
-TARGETS, AMONG = (10, 60), 1000
-# Errors of pulses, over their peaks, where echoes are told apart.
+# Samples before the return, from which pedestals are taken: one in so many of the first segment, at least so
+# many, and so many of a pulse.
+QUIET_DIVISOR, FEWEST_QUIET, QUIET_PULSE = 7, 8, 5
+# Hard targets that a receiver's response is estimated from: fewest and most, and shots that are searched.
+FEWEST_TARGETS, MOST_TARGETS, SEARCHED_SHOTS = 10, 60, 1000
+# Errors of pulses, over their peaks, in the decomposition into echoes.
 PULSE_ERROR = 0.02
+# RIEGL's tables are in decibels, and mark counts without an amplitude by entries below this.
+NO_AMPLITUDE = -1000.0
 # Full width at half maximum of a Gaussian over its standard deviation.
 FWHM = 2.0 * np.sqrt(2.0 * np.log(2.0))
 
 
 @dataclasses.dataclass(frozen=True)
 class Instrument:
-    """How an instrument records, and over what it flies. Options of the command line replace single values.
+    """Settings of an instrument and of its targets. Options of the command line replace single values.
 
-    - `altitude`: m. `divergence`: full angle at 1/e^2, mrad. `jitter`: what echoes are blurred by beside
-      their pulse, ns.
-    - `count_noise`: standard deviation of counts. Default None: of what precedes the file's returns.
+    - `altitude`: m. `divergence`: full angle at 1/e^2, mrad. `jitter`: standard deviation in ns of the
+      blurring of echoes beside that of their pulse.
+    - `count_noise`: standard deviation of counts. Default None: that of the samples before the return.
     - `saturation`: counts from which on samples have no weight. Default None: the last of the file's table.
     - `interleaved`: digitisers that take samples in turn, each with its own pedestal.
-    - `correlated`: so many neighbouring samples, whose noise is correlated, tell as much as one.
-    - `correlation`: of the noise of neighbouring samples, told to the fit, where `correlated` is 1.
+    - `correlated`: number of neighbouring samples, of correlated noise, with the information of one.
+    - `correlation`: of the noise of neighbouring samples in the model of the fit, if `correlated` is 1.
     - `model_error`: of the model, over the largest sample: pulses are records, and canopies not uniform.
-    - `pulse_noise`: whether the noise of recorded pulses is told apart from that of returns.
+    - `pulse_noise`: True if the fit models the noise of recorded pulses.
     - `response`: lags, in samples, before and after time zero of the receiver's response, which is estimated
-      from the file's hard targets. Default None: none.
-    - `above`, `below`: m about the last echo that are fitted. `tallest`: of canopies, m. `clearance`: of the
-      lowest plants from the ground, m.
-    - `fewest`: echoes that tell ground from canopy.
+      from the file's hard targets. Default None: no response.
+    - `above`, `below`: range of the fit above and below the last echo, m. `tallest`: height of the tallest
+      canopies, m. `clearance`: height of the lowest plants above the ground, m.
+    - `fewest`: fewest echoes that separate ground from canopy.
     """
 
     altitude: float = 1000.0
@@ -83,12 +87,12 @@ INSTRUMENTS = {
 }  # fmt: skip
 
 
-class Record(NamedTuple):
-    """A shot as it is fitted: amplitudes above the pedestals, in the samples of its clock.
+class AirborneRecord(NamedTuple):
+    """A shot in the form that is fitted: amplitudes above the pedestals, in the samples of its clock.
 
-    - `shot`: of the channel that was taken.
-    - `signal`, `noise`: (samples,) over the largest sample; noise is infinite where nothing was recorded and
-      where samples are saturated. `quiet`: noise without a signal. `peak`: the largest sample.
+    - `shot`: with the segments of one channel.
+    - `signal`, `noise`: (samples,) over the largest sample; noise is infinite for samples that were not
+      recorded or are saturated. `quiet`: noise without a signal. `peak`: the largest sample.
     - `lidar`: with the shot's pulse and direction. `pulse_noise`: of the pulse, over its peak.
     - `saturated`: number of samples without weight.
     """
@@ -104,14 +108,14 @@ class Record(NamedTuple):
 
     @property
     def elevation(self) -> np.ndarray:
-        """Of the samples, m."""
+        """Elevation of the samples, m."""
         return self.shot.elevation * self.shot.metres[2]
 
     def pulse(self, lags: int, impulse: np.ndarray | None = None) -> np.ndarray:
-        """(2 lags + 1,) what a hard target returns, with time zero in the middle, of peak one."""
+        """(2 lags + 1,) echo of a hard target, with time zero in the middle, of peak one."""
         edges = self.shot.sampling_interval * (np.arange(-lags, lags + 2) - 0.5)
-        shares = np.diff(np.asarray(_cumulative(self.lidar, edges), float))
-        received = shares if impulse is None else np.convolve(shares, impulse, "same")
+        fractions = np.diff(np.asarray(_cumulative(self.lidar, edges), float))
+        received = fractions if impulse is None else np.convolve(fractions, impulse, "same")
         return received / received.max()
 
 
@@ -121,8 +125,12 @@ def _cumulative(lidar: jl.Lidar, time: np.ndarray) -> jax.Array:
     return lidar.pulse.cumulative(time, lidar.jitter)
 
 
-class Flight(NamedTuple):
-    """The shots of a file, amplitudes by table, what recorded them, and the Gaussian pulse sent, if any."""
+class FlightLine(NamedTuple):
+    """The shots of a file and their instrument.
+
+    - `tables`: amplitudes of counts, by the number of the table.
+    - `pulse`: time and power of the outgoing pulse of all shots, for files that have none.
+    """
 
     shots: Sequence[AirborneShot]
     tables: dict[int, np.ndarray]
@@ -134,11 +142,17 @@ class Flight(NamedTuple):
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """The options that say what recorded a file, and what was sent."""
-    sent = parser.add_mutually_exclusive_group()
-    sent.add_argument("--pulse", type=Path, help="outgoing pulse: a table of two columns, time in ns, power")
-    sent.add_argument("--pulses", type=Path, help="outgoing pulses of the same shots (.pls), by GPS time")
-    sent.add_argument("--pulse-width", type=float, help="Gaussian pulse: full width at half maximum, ns")
+    """Add the options of the instrument and of the outgoing pulse."""
+    pulse_options = parser.add_mutually_exclusive_group()
+    pulse_options.add_argument(
+        "--pulse", type=Path, help="outgoing pulse: a table of two columns, time in ns, power"
+    )
+    pulse_options.add_argument(
+        "--pulses", type=Path, help="outgoing pulses of the same shots (.pls), by GPS time"
+    )
+    pulse_options.add_argument(
+        "--pulse-width", type=float, help="Gaussian pulse: full width at half maximum, ns"
+    )
     parser.add_argument("--instrument", choices=list(INSTRUMENTS), help="default: as the file says")
     settings = parser.add_argument_group("settings of the instrument; defaults are its own")
     for name in (
@@ -156,46 +170,55 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         settings.add_argument(f"--{name}", type=int)
 
 
-def read_flight(path: Path, given: argparse.Namespace) -> Flight:
-    """The shots of a file of any format that `SUFFIXES` has.
+def read_flight(path: Path, options: argparse.Namespace) -> FlightLine:
+    """Read the shots of a file of any format in `SUFFIXES`.
 
-    **Raises:** ValueError, naming the file, for another suffix, for shots without an outgoing pulse where
-    none is given, and for those that have their own where one is given; and as the readers do.
+    **Raises:** ValueError, naming the file, for another suffix, for shots without an outgoing pulse if the
+    options have none, for shots with one if the options have one, and as the readers do.
     """
     read = SUFFIXES.get(path.suffix.lower())
     if read is None:
         raise ValueError(f"{path}: its suffix is {path.suffix!r}; admissible are {', '.join(SUFFIXES)}")
-    found = read(path)
-    shots, tables = (found.shots, {}) if read is read_neon else (found, found.tables)
-    flight = Flight(shots, tables, instrument_of(shots[0], given, neon=read is read_neon))
-    ways = {"--pulse": given.pulse, "--pulses": given.pulses, "--pulse-width": given.pulse_width}
-    used = next((name for name, value in ways.items() if value is not None), None)
+    is_neon = read is read_neon
+    content = read(path)
+    # NEON's amplitudes are linear in counts: its files have no tables.
+    shots, tables = (content.shots, {}) if is_neon else (content, content.tables)
+    flight = FlightLine(shots, tables, instrument_of(shots[0], options, neon=is_neon))
+    pulse_options = {
+        "--pulse": options.pulse,
+        "--pulses": options.pulses,
+        "--pulse-width": options.pulse_width,
+    }
+    used = next((name for name, value in pulse_options.items() if value is not None), None)
     if shots[0].outgoing:
         if used:
             raise ValueError(f"{path}: shots have their own outgoing pulses; {used} is for files without")
         return flight
     if used is None:
-        raise ValueError(f"{path}: shots have no outgoing pulse; give one with {', '.join(ways)}")
-    if given.pulses is not None:
-        flight = with_pulses_of(flight, given.pulses)
-        return flight._replace(instrument=instrument_of(flight[0], given))
-    return flight._replace(pulse=gaussian(given.pulse_width) if given.pulse is None else table(given.pulse))
+        raise ValueError(f"{path}: shots have no outgoing pulse; give one with {', '.join(pulse_options)}")
+    if options.pulses is not None:
+        flight = with_pulses_of(flight, options.pulses)
+        # The PulseWaves file names the scanner, which LAS does not.
+        return flight._replace(instrument=instrument_of(flight[0], options))
+    pulse = gaussian_pulse(options.pulse_width) if options.pulse is None else read_pulse_table(options.pulse)
+    return flight._replace(pulse=pulse)
 
 
-def instrument_of(shot: AirborneShot, given: argparse.Namespace, neon: bool = False) -> Instrument:
-    """The settings for a shot's scanner, with those of the command line."""
-    name = "neon" if neon else given.instrument
-    if given.instrument is not None:
-        name = given.instrument
+def instrument_of(shot: AirborneShot, options: argparse.Namespace, neon: bool = False) -> Instrument:
+    """Settings of a shot's scanner, with single values from the command line."""
+    name = "neon" if neon else options.instrument
+    if options.instrument is not None:
+        name = options.instrument
     elif not neon:
-        said = "" if shot.scanner is None else shot.scanner.instrument
-        name = "lvis" if "LVIS" in said else "riegl" if said.startswith(("Q", "VQ", "LMS")) else "other"
-    changes = {f.name: getattr(given, f.name, None) for f in dataclasses.fields(Instrument)}
+        # PulseWaves names scanners by model, such as RIEGL's Q680i, VQ-480 and LMS-Q780.
+        model = "" if shot.scanner is None else shot.scanner.instrument
+        name = "lvis" if "LVIS" in model else "riegl" if model.startswith(("Q", "VQ", "LMS")) else "other"
+    changes = {f.name: getattr(options, f.name, None) for f in dataclasses.fields(Instrument)}
     return dataclasses.replace(INSTRUMENTS[name], **{k: v for k, v in changes.items() if v is not None})
 
 
-def gaussian(width: float) -> tuple[np.ndarray, np.ndarray]:
-    """Times and power of a Gaussian pulse of that full width at half maximum, ns."""
+def gaussian_pulse(width: float) -> tuple[np.ndarray, np.ndarray]:
+    """Time, ns, and power of a Gaussian pulse of a full width at half maximum, ns."""
     if not (np.isfinite(width) and width > 0):
         raise ValueError(f"--pulse-width = {width:g}; admissible is (0, inf) ns")
     sigma = width / FWHM
@@ -203,160 +226,178 @@ def gaussian(width: float) -> tuple[np.ndarray, np.ndarray]:
     return time, np.exp(-0.5 * (time / sigma) ** 2)
 
 
-def table(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Times and power of a pulse in a text file. **Raises:** ValueError naming it."""
+def read_pulse_table(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Read time, ns, and power of a pulse from a text file. **Raises:** ValueError naming the file."""
     try:
         rows = np.loadtxt(path, ndmin=2, delimiter="," if "," in path.read_text() else None)
         if rows.ndim != 2 or rows.shape[1] != 2:
             raise ValueError(f"{rows.shape[-1]} columns; admissible are two, time in ns and power")
+        # Its checks are those of a pulse.
         jl.SampledPulse(*rows.T)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     return rows[:, 0], rows[:, 1]
 
 
-def with_pulses_of(flight: Flight, path: Path) -> Flight:
-    """The shots with outgoing pulses, and tables of the same samples, of a PulseWaves file."""
-    others = read_pulsewaves(path)
-    by_time = {round(1e6 * time): number for number, time in enumerate(others.gps_time)}
-    found = []
+def with_pulses_of(flight: FlightLine, path: Path) -> FlightLine:
+    """Add the outgoing pulses of the same shots, and the tables of the same samples, of a PulseWaves file."""
+    pulses = read_pulsewaves(path)
+    # Shots are the same if their GPS times agree to a microsecond.
+    number_by_time = {round(1e6 * time): number for number, time in enumerate(pulses.gps_time)}
+    shots = []
     for shot in flight.shots:
-        number = by_time.get(round(1e6 * (shot.gps_time or 0.0)))
-        if number is None:
-            found.append(shot)
-            continue
-        other = others[number]
-        own = tuple(_with_table(segment, other.returning) for segment in shot.returning)
-        changes = {"outgoing": other.outgoing, "pulse_zero": other.pulse_zero, "scanner": other.scanner}
-        found.append(dataclasses.replace(shot, returning=own, pedestal=other.pedestal, **changes))
-    if not any(shot.outgoing for shot in found):
+        number = number_by_time.get(round(1e6 * (shot.gps_time or 0.0)))
+        if number is not None:
+            pulse = pulses[number]
+            shot = dataclasses.replace(
+                shot,
+                returning=tuple(_with_table(segment, pulse.returning) for segment in shot.returning),
+                pedestal=pulse.pedestal,
+                outgoing=pulse.outgoing,
+                pulse_zero=pulse.pulse_zero,
+                scanner=pulse.scanner,
+            )
+        shots.append(shot)
+    if not any(shot.outgoing for shot in shots):
         raise ValueError(f"{path}: it has no pulse at the GPS times of {flight[0].index} and later shots")
-    return flight._replace(shots=found, tables=others.tables)
+    return flight._replace(shots=shots, tables=pulses.tables)
 
 
-def _with_table(segment: Segment, others: Sequence[Segment]) -> Segment:
-    same = (o.table for o in others if np.array_equal(o.samples, segment.samples))
-    return segment._replace(table=next(same, segment.table))
+def _with_table(segment: Segment, candidates: Sequence[Segment]) -> Segment:
+    """Segment with the table of the candidate that has the same samples."""
+    tables = (c.table for c in candidates if np.array_equal(c.samples, segment.samples))
+    return segment._replace(table=next(tables, segment.table))
 
 
-def records_of(shots: Sequence[AirborneShot], flight: Flight) -> list[Record | ValueError]:
-    """Shots as they are fitted, or why a shot cannot be."""
+def records_of(shots: Sequence[AirborneShot], flight: FlightLine) -> list[AirborneRecord | ValueError]:
+    """Records of shots, or the error of a shot that cannot be fitted."""
+    # Pulses of one length: fits with pulses of different shapes would compile separately.
     lags = max((s.outgoing[0].samples.size for s in shots if s.outgoing), default=0)
-    found: list[Record | ValueError] = []
+    records: list[AirborneRecord | ValueError] = []
     for shot in shots:
         try:
-            found.append(record_of(shot, flight, lags))
+            records.append(record_of(shot, flight, lags))
         except ValueError as error:
-            found.append(error)
-    return found
+            records.append(error)
+    return records
 
 
-def record_of(shot: AirborneShot, flight: Flight, lags: int) -> Record:
-    """A shot as it is fitted; its pulse has so many samples.
+def record_of(shot: AirborneShot, flight: FlightLine, lags: int) -> AirborneRecord:
+    """Record of a shot, with a pulse of `lags` samples.
 
-    **Raises:** ValueError where it has no pulse, or no sample above the pedestal that has weight.
+    1. Take the first channel without saturated samples, or else the first.
+    2. Convert counts to amplitudes, and subtract the pedestals of the digitisers.
+    3. Divide by the largest sample, and add the error of the model to the noise.
+
+    **Raises:** ValueError for a shot without a pulse, or without a sample above the pedestal that has weight.
     """
-    own = flight.instrument
+    instrument = flight.instrument
     channels = list(dict.fromkeys(segment.channel for segment in shot.returning))
-    clear = [c for c in channels if not _saturated(shot.of_channel(c), flight)]
-    shot = shot.of_channel((clear or channels)[0])
-    counts = own.count_noise or max(shot.noise_std, 0.5)
+    unsaturated = [c for c in channels if not _count_saturated(shot.of_channel(c), flight)]
+    shot = shot.of_channel((unsaturated or channels)[0])
+    # Rounding to whole counts alone has a standard deviation of 0.3.
+    count_noise = instrument.count_noise or max(shot.noise_std, 0.5)
     segments = sorted(
         (s for s in shot.returning if s.channel == shot.returning[0].channel), key=lambda s: s.start
     )
-    parts = [_amplitudes(segment, flight, counts) for segment in segments]
+    amplitudes = [_amplitudes(segment, flight, count_noise) for segment in segments]
     signal, noise = np.zeros(shot.recorded.size), np.full(shot.recorded.size, np.inf)
-    signal[shot.recorded] = np.concatenate([part.values for part in parts])
-    noise[shot.recorded] = np.concatenate([part.noise for part in parts])
-    quiet = max(FEWEST_QUIET * own.interleaved, parts[0].values.size // QUIET)
-    signal -= _pedestals(parts[0].values[:quiet], own.interleaved, signal.size)
-    used = np.isfinite(noise)
-    peak = float(np.max(signal, initial=0.0, where=used))
+    signal[shot.recorded] = np.concatenate([a.values for a in amplitudes])
+    noise[shot.recorded] = np.concatenate([a.noise for a in amplitudes])
+    first_values = amplitudes[0].values
+    n_quiet = max(FEWEST_QUIET * instrument.interleaved, first_values.size // QUIET_DIVISOR)
+    signal -= _pedestals(first_values[:n_quiet], instrument.interleaved, signal.size)
+    is_used = np.isfinite(noise)
+    peak = float(np.max(signal, initial=0.0, where=is_used))
     if not peak > 0:
         raise ValueError("no sample above the pedestal has weight")
-    pulse, pulse_noise = _pulse(shot, flight, counts, lags)
+    pulse, pulse_noise = _pulse(shot, flight, count_noise, lags)
     lidar = jl.Lidar(
-        altitude=own.altitude,
-        divergence=own.divergence,
-        jitter=own.jitter,
+        altitude=instrument.altitude,
+        divergence=instrument.divergence,
+        jitter=instrument.jitter,
         zenith=shot.zenith,
         azimuth=shot.azimuth,
         sampling_interval=shot.sampling_interval,
         pulse=pulse,
     )
-    return Record(
-        shot,
-        np.where(used, signal / peak, 0.0),
-        np.sqrt(own.correlated) * np.hypot(noise / peak, own.model_error),
-        float(np.min(noise)) / peak,
-        peak,
-        lidar,
-        pulse_noise,
-        _saturated(shot, flight),
+    return AirborneRecord(
+        shot=shot,
+        signal=np.where(is_used, signal / peak, 0.0),
+        noise=np.sqrt(instrument.correlated) * np.hypot(noise / peak, instrument.model_error),
+        quiet=float(np.min(noise)) / peak,
+        peak=peak,
+        lidar=lidar,
+        pulse_noise=pulse_noise,
+        saturated=_count_saturated(shot, flight),
     )
 
 
-def _saturation(segment: Segment, flight: Flight) -> float:
-    known, most = flight.tables.get(segment.table), flight.instrument.saturation
-    return min(np.inf if known is None else known.size - 1, np.inf if most is None else most)
+def _saturation(segment: Segment, flight: FlightLine) -> float:
+    """Counts from which on samples of a segment are saturated."""
+    table, limit = flight.tables.get(segment.table), flight.instrument.saturation
+    return min(np.inf if table is None else table.size - 1, np.inf if limit is None else limit)
 
 
-def _saturated(shot: AirborneShot, flight: Flight) -> int:
-    own = (s for s in shot.returning if s.channel == shot.returning[0].channel)
-    return int(sum(np.sum(s.samples >= _saturation(s, flight)) for s in own))
+def _count_saturated(shot: AirborneShot, flight: FlightLine) -> int:
+    """Number of saturated samples in the first channel of a shot."""
+    segments = (s for s in shot.returning if s.channel == shot.returning[0].channel)
+    return int(sum(np.sum(s.samples >= _saturation(s, flight)) for s in segments))
 
 
-def _amplitudes(segment: Segment, flight: Flight, noise: float) -> Amplitudes:
-    """Of a segment's samples: by its table, or their values."""
-    known, most = flight.tables.get(segment.table), _saturation(segment, flight)
-    if known is None:
-        return Amplitudes(segment.values, np.where(segment.samples >= most, np.inf, noise * segment.gain))
-    # Those of RIEGL are in decibels, and mark counts without an amplitude.
-    decibels = bool(known[0] < -1000.0)
-    return inversion.amplitudes(segment.samples, known, noise=noise, decibels=decibels, saturation=most)
+def _amplitudes(segment: Segment, flight: FlightLine, noise: float) -> Amplitudes:
+    """Amplitudes of a segment's samples, by its table or, without one, its gain."""
+    table, limit = flight.tables.get(segment.table), _saturation(segment, flight)
+    if table is None:
+        return Amplitudes(segment.values, np.where(segment.samples >= limit, np.inf, noise * segment.gain))
+    decibels = bool(table[0] < NO_AMPLITUDE)
+    return inversion.amplitudes(segment.samples, table, noise=noise, decibels=decibels, saturation=limit)
 
 
 def _pedestals(quiet: np.ndarray, interleaved: int, size: int) -> np.ndarray:
-    """Of each sample, from the mean of what its digitiser recorded first."""
+    """Pedestal of each sample: the mean of the first samples of its digitiser."""
     return np.resize([np.mean(quiet[i::interleaved]) for i in range(interleaved)], size)
 
 
-def _pulse(shot: AirborneShot, flight: Flight, noise: float, lags: int) -> tuple[jl.SampledPulse, float]:
-    """The outgoing pulse, and its noise over its peak."""
+def _pulse(shot: AirborneShot, flight: FlightLine, noise: float, lags: int) -> tuple[jl.SampledPulse, float]:
+    """Outgoing pulse of a shot, and its noise over its peak; `noise` is that of counts."""
     if flight.pulse is not None:
         return jl.SampledPulse(*flight.pulse), 0.0
     if not shot.outgoing:
         raise ValueError("no outgoing pulse was recorded")
-    segment, own = shot.outgoing[0], flight.instrument
-    values, spread = _amplitudes(segment, flight, noise)
-    if not np.all(np.isfinite(spread)):
+    segment, instrument = shot.outgoing[0], flight.instrument
+    values, sigma = _amplitudes(segment, flight, noise)
+    if not np.all(np.isfinite(sigma)):
         raise ValueError("the outgoing pulse is saturated")
-    pedestals = _pedestals(values[: QUIET_PULSE * own.interleaved], own.interleaved, values.size)
+    n_digitisers = instrument.interleaved
+    pedestals = _pedestals(values[: QUIET_PULSE * n_digitisers], n_digitisers, values.size)
     power = above_pedestal(values - pedestals, 0.0, "outgoing")
     zero = segment.time[np.argmax(power)] if shot.pulse_zero is None else shot.pulse_zero
     time = segment.start - zero + segment.step * np.arange(lags)
     pulse = inversion.recorded_pulse(time, np.pad(power, (0, lags - power.size)))
-    lit = power > 0.2 * power.max()
-    return pulse, float(np.median(spread[lit]) / power.max()) if own.pulse_noise else 0.0
+    is_bright = power > 0.2 * power.max()
+    return pulse, float(np.median(sigma[is_bright]) / power.max()) if instrument.pulse_noise else 0.0
 
 
-def response_of(flight: Flight) -> np.ndarray | None:
-    """The receiver's response, from the narrowest single echoes among the stronger half of a file's shots.
+def response_of(flight: FlightLine) -> np.ndarray | None:
+    """Receiver's response, from the narrowest single echoes among the stronger half of a file's shots.
 
-    None where the instrument asks for none, or there are too few such echoes.
+    Such echoes are of hard flat targets. None for an instrument without a response, and for too few echoes.
     """
     if flight.instrument.response is None:
         return None
-    shots = [s for s in flight.shots[:: -(-len(flight.shots) // AMONG)] if len(s.returning) == 1]
-    records = [r for r in records_of(shots, flight) if isinstance(r, Record) and not r.saturated]
-    if len(records) < 2 * TARGETS[0]:
+    stride = -(-len(flight.shots) // SEARCHED_SHOTS)
+    shots = [shot for shot in flight.shots[::stride] if len(shot.returning) == 1]
+    records = [r for r in records_of(shots, flight) if isinstance(r, AirborneRecord) and not r.saturated]
+    if len(records) < 2 * FEWEST_TARGETS:
         return None
-    strong = np.median([record.peak for record in records])
-    records = [record for record in records if record.peak >= strong]
+    median_peak = np.median([record.peak for record in records])
+    records = [record for record in records if record.peak >= median_peak]
     lags = max(r.shot.outgoing[0].samples.size if r.shot.outgoing else r.signal.size for r in records)
     pulses = [record.pulse(lags) for record in records]
-    length = [record.signal.sum() / pulse.sum() for record, pulse in zip(records, pulses)]
-    chosen = np.argsort(length)[: TARGETS[1]]
+    # Both have a peak of one: the ratio of their sums is the width of the echo over that of the pulse.
+    width = [record.signal.sum() / pulse.sum() for record, pulse in zip(records, pulses)]
+    chosen = np.argsort(width)[:MOST_TARGETS]
     before, after = flight.instrument.response
     size = max(records[i].signal.size for i in chosen)
     return inversion.receiver_impulse(
@@ -372,21 +413,20 @@ def response_of(flight: Flight) -> np.ndarray | None:
     )
 
 
-def echoes_of(records: Sequence[Record], impulse: np.ndarray | None) -> list[np.ndarray]:
-    """Elevations of the echoes of every record, from above, m: of copies of its pulse."""
+def echoes_of(records: Sequence[AirborneRecord], impulse: np.ndarray | None) -> list[np.ndarray]:
+    """Elevations of the echoes of every record, from the top down, m, as copies of its pulse."""
     size, step = max(record.signal.size for record in records), records[0].shot.sampling_interval
     signal, noise = np.zeros((len(records), size)), np.full((len(records), size), np.inf)
     for i, record in enumerate(records):
         signal[i, : record.signal.size], noise[i, : record.signal.size] = record.signal, record.noise
-    reach = max(abs(end) for r in records for end in r.lidar.pulse.support(r.lidar.jitter)) / step
-    lags = int(np.ceil(reach)) + (0 if impulse is None else impulse.size // 2)
+    half_length = max(abs(end) for r in records for end in r.lidar.pulse.support(r.lidar.jitter)) / step
+    lags = int(np.ceil(half_length)) + (0 if impulse is None else impulse.size // 2)
     pulses = np.stack([record.pulse(lags, impulse) for record in records])
-    found = inversion.gaussian_decomposition(
+    echoes = inversion.gaussian_decomposition(
         step * np.arange(size), signal, noise=noise, pulse=pulses, pulse_error=PULSE_ERROR
     )
-    count, times = np.asarray(found.count), np.asarray(found.time, float)
-    numbers = [np.arange(record.signal.size) for record in records]
+    count, times = np.asarray(echoes.count), np.asarray(echoes.time, float)
     return [
-        np.interp(time[:n] / step, number, record.elevation)
-        for time, n, number, record in zip(times, count, numbers, records)
+        np.interp(time[:n] / step, np.arange(record.signal.size), record.elevation)
+        for time, n, record in zip(times, count, records)
     ]

@@ -1,4 +1,4 @@
-"""What the fits of recorded waveforms share: a layered canopy, tables of results, a page of pictures."""
+"""Common to the fits of recorded waveforms: a layered canopy, tables of results, a page of pictures."""
 
 import contextlib
 import csv
@@ -16,12 +16,13 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 LAYERS = 10
-# Spherically oriented leaves return two thirds of their reflectance: rho_v = 0.30, over rho_g as 0.6 / 0.4.
+# Spherically oriented leaves return two thirds of their reflectance: rho_v = 0.30. Over the ground's 0.20
+# that is the ratio of GEDI's level 2B algorithm, 0.6 / 0.4.
 LEAF, GROUND = jl.LeafOptics(reflectance=0.45, transmittance=0.40), 0.20
 QUALITIES = ("good", "doubtful", "bad")
 
 
-class Layers:
+class LayeredCanopy:
     """A horizontally uniform canopy: ten layers of equal thickness from a clearance above the ground up.
 
     Its methods put unknowns into a scene, as `inversion.Unknown(apply=...)` needs them.
@@ -31,23 +32,24 @@ class Layers:
         self.clearance = clearance
 
     def put_ground(self, scene, height):
-        """Move the ground, and the canopy above it."""
+        """Move the ground to a height in m, and the canopy with it."""
         moved = jnp.asarray(scene.canopy.voxels.origin).at[2].set(height + self.clearance)
         return eqx.tree_at(lambda s: (s.ground.height, s.canopy.voxels.origin), scene, (height, moved))
 
     def put_height(self, scene, height):
-        """Stretch the canopy: `height` is its top above the ground."""
+        """Stretch the canopy to a top at `height` in m above the ground."""
         step = (height - self.clearance) / LAYERS
         size = jnp.asarray(scene.canopy.voxels.voxel_size).at[2].set(step)
         return eqx.tree_at(lambda s: s.canopy.voxels.voxel_size, scene, size)
 
     def put_density(self, scene, log_density):
-        """Logarithm of the layers' plant area density in m2/m3, from below."""
+        """Set the layers' plant area density, from below, by its logarithm in m2/m3."""
+        # Extinction is G times the density, with G = 0.5 for spherically oriented leaves.
         extinction = 0.5 * jnp.exp(log_density).reshape(1, 1, LAYERS)
         return eqx.tree_at(lambda s: s.canopy.voxels.leaf, scene, extinction)
 
     def scene(self, height, ground=0.0, slope=5.0):
-        """Bare of any shot: heights in m above the reference, slope in degrees."""
+        """Scene to start a fit from: heights in m above the reference, slope in degrees."""
         voxels = jl.VoxelMap.from_lad(
             np.full((1, 1, LAYERS), 0.05),
             voxel_size=(50.0, 50.0, (height - self.clearance) / LAYERS),
@@ -59,7 +61,7 @@ class Layers:
         )
 
     def columns(self, fits, i, verdict):
-        """What every table has of fit `i` of many: plant area, shares of the priors, and the verdict."""
+        """Columns of fit `i` of a batch: plant area, fractions of the priors, and the verdict."""
         height, log_density = float(fits.values["canopy height"][i]), fits.values["log density"][i]
         density = np.exp(log_density)
         return {
@@ -72,7 +74,7 @@ class Layers:
 
 
 def quality_of(fits, i, verdict):
-    """What every table has of fit `i` of many whatever the scene: shares of the priors, and the verdict."""
+    """Columns of fit `i` of a batch for any scene: fractions of the priors, and the verdict."""
     return {
         **{f"prior_share_{n.replace(' ', '_')}": np.mean(s[i]) for n, s in fits.prior_share.items()},
         "reduced_chi2": float(fits.reduced_chi2[i]),
@@ -85,7 +87,7 @@ def quality_of(fits, i, verdict):
 
 @contextlib.contextmanager
 def progress_bar():
-    """A function that shows how many fits have ended; silent where the standard error is no terminal."""
+    """Provide a function that shows how many fits have ended; silent if the standard error is no terminal."""
     with tqdm(unit=" fits", disable=None, leave=False) as bar:
 
         def show(progress):
@@ -95,55 +97,57 @@ def progress_bar():
         yield show
 
 
-def bad_row(reason, **known):
-    """The row of a shot that was not fitted."""
-    return {**known, "quality": "bad", "reasons": str(reason)}
+def bad_row(reason, **columns):
+    """Row of a shot that was not fitted, with its columns that do not come from a fit."""
+    return {**columns, "quality": "bad", "reasons": str(reason)}
 
 
 def columns_of(rows):
-    """The rows' values by name, as arrays with the shots first; NaN or "" where a row has none."""
-    found = {}
+    """Values of rows by name, as arrays with the shots first; NaN or "" for rows without the name."""
+    columns = {}
+    # Rows differ in their names; columns come in the order in which they first occur.
     for name in dict.fromkeys(name for row in rows for name in row):
         sample = next(np.asarray(row[name]) for row in rows if name in row)
-        text = sample.dtype.kind == "U"
-        empty = "" if text else np.full(sample.shape, np.nan)
+        is_text = sample.dtype.kind == "U"
+        empty = "" if is_text else np.full(sample.shape, np.nan)
         values = [row.get(name, empty) for row in rows]
-        found[name] = np.array(values, dtype=object if text else None)
-    return found
+        columns[name] = np.array(values, dtype=object if is_text else None)
+    return columns
 
 
 def write_tables(rows, stem, units):
-    """One row a shot: as CSV, and as netCDF with the `units` of the columns.
+    """Write one row a shot as CSV, and as netCDF with the `units` of the columns.
 
     **Returns:** the two paths.
     """
     import xarray
 
     columns = columns_of(rows)
+    # A vector becomes several columns of the CSV file, with numbers.
     flat = {}
     for name, values in columns.items():
-        parts = values.reshape(len(rows), -1).T
-        flat |= {name if values.ndim == 1 else f"{name}_{i}": part for i, part in enumerate(parts)}
+        elements = values.reshape(len(rows), -1).T
+        flat |= {name if values.ndim == 1 else f"{name}_{i}": e for i, e in enumerate(elements)}
     table, dataset = (stem.with_name(f"{stem.name}.{kind}") for kind in ("csv", "nc"))
     with atomic_write(table) as draft, draft.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(flat)
         writer.writerows(zip(*flat.values()))
-    sets = {
+    variables = {
         name: (
-            ("shot", *(f"{name}_number" for _ in v.shape[1:])),
-            v,
+            ("shot", *(f"{name}_number" for _ in values.shape[1:])),
+            values,
             {"units": units[name]} if name in units else {},
         )
-        for name, v in columns.items()
+        for name, values in columns.items()
     }
     with atomic_write(dataset) as draft:
-        xarray.Dataset(sets).to_netcdf(draft, engine="h5netcdf")
+        xarray.Dataset(variables).to_netcdf(draft, engine="h5netcdf")
     return table, dataset
 
 
 def draw_shot(axes, picture):
-    """Record and fit against elevation, with what was found."""
+    """Draw record and fit against elevation, with lines at the fitted heights."""
     axes.plot(picture["signal"], picture["elevation"], ".", color="0.6", markersize=3, label="recorded")
     axes.plot(picture["fitted"], picture["elevation"], color="black", linewidth=1.2, label="fit")
     styles = {"ground": ("#d55e00", "-"), "canopy top": ("#009e73", "--"), "reference": ("#0072b2", ":")}
@@ -157,7 +161,7 @@ def draw_shot(axes, picture):
 
 
 def draw_page(pictures, pairs, path):
-    """The best, middle and worst fits, by reduced chi-squared, and scatter plots.
+    """Draw the best, middle and worst fits, by reduced chi-squared, and scatter plots.
 
     `pictures` are in any order, with "chi2"; `pairs` maps a quantity to two arrays, the reference's first.
     """
@@ -175,16 +179,16 @@ def draw_page(pictures, pairs, path):
             axes.set_axis_off()
         row[0].set_ylabel(f"{name} fits\nelevation (m)")
     # Ground alone has no canopy top: not every axes has all lines.
-    named = {name: line for axes in grid.flat for line, name in zip(*axes.get_legend_handles_labels())}
-    for axes, (name, (reference, found)) in zip(grid[-1] if pairs else (), pairs.items()):
-        both = np.concatenate([reference, found])
-        ends = np.nanmin(both), np.nanmax(both)
+    lines = {name: line for axes in grid.flat for line, name in zip(*axes.get_legend_handles_labels())}
+    for axes, (name, (reference, fitted)) in zip(grid[-1] if pairs else (), pairs.items()):
+        values = np.concatenate([reference, fitted])
+        ends = np.nanmin(values), np.nanmax(values)
         axes.plot(ends, ends, color="0.7", linewidth=0.8)
-        axes.plot(reference, found, "o", color="#009e73", markersize=3)
+        axes.plot(reference, fitted, "o", color="#009e73", markersize=3)
         axes.set(xlabel=f"{name}, reference", ylabel=f"{name}, fit")
     for axes in grid[-1][len(pairs) :] if pairs else ():
         axes.set_axis_off()
-    figure.legend(named.values(), named.keys(), loc="outside upper center", ncols=5, frameon=False)
+    figure.legend(lines.values(), lines.keys(), loc="outside upper center", ncols=5, frameon=False)
     with atomic_write(path) as draft:
         figure.savefig(draft, format="png", dpi=110)
     plt.close(figure)

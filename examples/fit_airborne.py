@@ -5,20 +5,20 @@
 FILE is what NEON publishes (.npz, `jaxlidar.io.read_neon`), PulseWaves (.pls, as RIEGL and LVIS data are
 published in) or LAS with wave packets (.las). LAS has no outgoing pulses: give one as a table (`--pulse`), as
 a Gaussian (`--pulse-width`), or those of the same shots in a PulseWaves file (`--pulses`). Every K-th shot,
-or so many of the longest, are fitted in one batch for each kind of scene, which goes on where it was
-interrupted. A CSV and a netCDF file get one row a shot, and a page the pictures of the best, median and worst
-fits. A shot that cannot be fitted has a row with the reason.
+or a number of the longest, are fitted in one batch for each kind of scene, which resumes where it was
+interrupted. The script writes one row a shot to a CSV and a netCDF file, and a page with pictures of the
+best, median and worst fits. A shot that cannot be fitted has a row with the reason.
 
-A return of several echoes is fitted by ground and the canopy of `fit_gedi.py`. Found are the elevations of
-ground and top, and every layer's plant area density; its gain, and the baseline of every digitiser. Where
-footprints are wide, the slope is found too. A return of one echo is fitted by ground alone: its elevation,
-and by how much its echo is broader than that of flat hard ground, or the slope. Nothing says that it is
-ground and no crown; where it is much broader, or the fit poor, the row says so.
+A return of several echoes is fitted by ground and the canopy of `fit_gedi.py`. The unknowns are the
+elevations of ground and top, every layer's plant area density, the gain, and the baseline of every
+digitiser; with wide footprints the slope too. A return of one echo is fitted by ground alone: its elevation,
+and by how much its echo is broader than that of flat hard ground, or the slope. The record does not show
+that it is ground and not a crown; the row says so if it is much broader, or the fit poor.
 
 Counts become amplitudes by the file's tables. Saturated samples have no weight. A RIEGL receiver's response
-is estimated from the narrowest single echoes of the file. No answers are known here: the ground stands beside
-the last echo that copies of the pulse find. They differ where something returns light within a pulse's length
-of the ground, and where the ground is hardly seen.
+is estimated from the narrowest single echoes of the file. No true ground is known: rows give the fitted
+ground beside the last echo of the decomposition into copies of the pulse. The two differ if a target returns
+light within a pulse's length of the ground, or if the ground is faint.
 """
 
 import argparse
@@ -30,12 +30,21 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import numpy as np
-from _airborne import Flight, Instrument, Record, add_options, echoes_of, read_flight, records_of, response_of
+from _airborne import (
+    AirborneRecord,
+    FlightLine,
+    Instrument,
+    add_options,
+    echoes_of,
+    read_flight,
+    records_of,
+    response_of,
+)
 from _recorded import (
     GROUND,
     LAYERS,
     QUALITIES,
-    Layers,
+    LayeredCanopy,
     bad_row,
     draw_page,
     progress_bar,
@@ -47,18 +56,18 @@ import inversion
 import jaxlidar as jl
 from inversion import Recorder, Unknown, Verdict
 
-# m of height for 1 ns.
-WAY = 0.149896229
-# Footprints from so wide on show slopes, m.
-WIDE = 5.0
-# Of slopes, degrees.
+# m of height for 1 ns of two-way travel.
+METRES_PER_NS = 0.149896229
+# Slopes broaden the echoes of footprints wider than this, m.
+WIDE_FOOTPRINT = 5.0
+# Steepest slope, degrees.
 STEEPEST = 30.0
-# A fitted ground so far from the last echo is doubtful, m; so is a single echo that is broadened by so much
-# of its pulse's standard deviation.
-APART, BROAD = 1.0, 0.5
-# Samples of a pulse before and after its time zero, where records are judged.
+# A fitted ground further than this from the last echo is doubtful, m; so is a single echo broadened by more
+# than this fraction of its pulse's standard deviation.
+DOUBTFUL_DISTANCE, DOUBTFUL_BROADENING = 1.0, 0.5
+# Samples of a pulse before and after its time zero, in verdicts on records.
 LAGS = 80
-# Bounds: of what broadens a single echo, ns, of offsets and of the gain, over the record's peak.
+# Bounds of the broadening of a single echo, ns, and of offsets and gain, over the record's peak.
 BROADENING, OFFSET, SCALE = (0.05, 10.0), (-0.2, 0.2), (0.0, 1e3)
 UNITS = {
     **dict.fromkeys(("ground", "ground_stderr", "last_echo", "canopy_top", "canopy_top_stderr"), "m"),
@@ -70,36 +79,42 @@ UNITS = {
 }
 
 
-class Kind(NamedTuple):
-    """A kind of scene: where fits start, its largest one, unknowns, and m fitted above the last echo."""
+class SceneKind(NamedTuple):
+    """A kind of scene: ground alone, or ground under a canopy.
+
+    - `scene`: where fits start. `largest`: with all unknowns at their largest, for the common plan.
+    - `above`: range of the fit above the last echo, m.
+    """
 
     name: str
     scene: jl.Scene
     largest: jl.Scene
     unknowns: list[Unknown]
     above: float
-    canopy: Layers | None = None
+    canopy: LayeredCanopy | None = None
 
 
-def kinds_of(own: Instrument) -> tuple[Kind, Kind]:
+def scene_kinds_of(instrument: Instrument) -> tuple[SceneKind, SceneKind]:
     """Ground alone, and ground under a canopy."""
-    canopy, wide = Layers(clearance=own.clearance), own.footprint > WIDE
-    slope = [Unknown("ground.slope", bounds=(0.0, STEEPEST), name="slope", prior=(0.0, 15.0))] if wide else []
-    sloping, steepest = (5.0, STEEPEST) if wide else (0.0, 0.0)
-    height = {"name": "ground", "bounds": (-3.0, 3.0), "start": 0.0}
+    canopy, is_wide = LayeredCanopy(clearance=instrument.clearance), instrument.footprint > WIDE_FOOTPRINT
+    slope = Unknown("ground.slope", bounds=(0.0, STEEPEST), name="slope", prior=(0.0, 15.0))
+    slope_unknowns = [slope] if is_wide else []
+    start_slope, largest_slope = (5.0, STEEPEST) if is_wide else (0.0, 0.0)
+    ground = {"name": "ground", "bounds": (-3.0, 3.0), "start": 0.0}
     bare, steep = (
-        jl.Scene(ground=jl.Ground(reflectance=GROUND, slope=degrees)) for degrees in (sloping, steepest)
+        jl.Scene(ground=jl.Ground(reflectance=GROUND, slope=degrees))
+        for degrees in (start_slope, largest_slope)
     )
-    high = eqx.tree_at(lambda s: s.ground.height, steep, 3.0)
-    unknowns = [
-        Unknown(prior=(0.0, 1.0), apply=canopy.put_ground, **height),
+    largest_bare = eqx.tree_at(lambda s: s.ground.height, steep, 3.0)
+    canopy_unknowns = [
+        Unknown(prior=(0.0, 1.0), apply=canopy.put_ground, **ground),
         Unknown(
             name="canopy height",
-            bounds=(own.clearance + 0.5, own.tallest),
-            start=0.3 * own.tallest,
+            bounds=(instrument.clearance + 0.5, instrument.tallest),
+            start=0.3 * instrument.tallest,
             apply=canopy.put_height,
         ),
-        *slope,
+        *slope_unknowns,
         Unknown(
             name="log density",
             bounds=(np.log(1e-4), np.log(10.0)),
@@ -108,16 +123,20 @@ def kinds_of(own: Instrument) -> tuple[Kind, Kind]:
             apply=canopy.put_density,
         ),
     ]
-    start = canopy.scene(0.3 * own.tallest, slope=sloping)
-    tall = canopy.scene(own.tallest, ground=3.0, slope=steepest)
+    start = canopy.scene(0.3 * instrument.tallest, slope=start_slope)
+    largest = canopy.scene(instrument.tallest, ground=3.0, slope=largest_slope)
+    bare_unknowns = [Unknown("ground.height", **ground), *slope_unknowns]
     return (
-        Kind("ground", bare, high, [Unknown("ground.height", **height), *slope], own.below),
-        Kind("ground and canopy", start, tall, unknowns, own.above, canopy),
+        SceneKind("ground", bare, largest_bare, bare_unknowns, instrument.below),
+        SceneKind("ground and canopy", start, largest, canopy_unknowns, instrument.above, canopy),
     )
 
 
-class Window(NamedTuple):
-    """What is fitted of a record: signal and noise at common times, and the elevation of time zero, m."""
+class FitWindow(NamedTuple):
+    """Window of a record that is fitted: signal, noise and elevation at times common to all shots.
+
+    `reference`: elevation of time zero, m.
+    """
 
     signal: np.ndarray
     noise: np.ndarray
@@ -125,54 +144,62 @@ class Window(NamedTuple):
     reference: float
 
 
-class Fitted(NamedTuple):
-    """The retrievals of one kind of scene, what was fitted, and by which recorder, shot by shot."""
+class FittedBatch(NamedTuple):
+    """Retrievals of one kind of scene, with the window and the recorder of every shot."""
 
     fits: inversion.Retrievals
-    windows: list[Window]
+    windows: list[FitWindow]
     recorders: list[Recorder]
 
 
-def window(record: Record, last: float, time: np.ndarray) -> Window:
-    """A record about the sample nearest to its last echo; without weight outside."""
-    middle = int(np.argmin(np.abs(record.elevation - last)))
+def window_of(record: AirborneRecord, last_echo: float, time: np.ndarray) -> FitWindow:
+    """Window of a record about the sample nearest to its last echo; times outside it have no weight."""
+    middle = int(np.argmin(np.abs(record.elevation - last_echo)))
     number = middle + np.round(time / record.shot.sampling_interval).astype(int)
     inside = (number >= 0) & (number < record.signal.size)
-    at = np.clip(number, 0, record.signal.size - 1)
-    signal, noise = np.where(inside, record.signal[at], 0.0), np.where(inside, record.noise[at], np.inf)
+    number = np.clip(number, 0, record.signal.size - 1)
+    signal = np.where(inside, record.signal[number], 0.0)
+    noise = np.where(inside, record.noise[number], np.inf)
     reference = float(record.elevation[middle])
-    per_ns = record.shot.direction[2] * record.shot.metres[2]
-    return Window(signal, noise, reference + per_ns * time, reference)
+    metres_per_ns = record.shot.direction[2] * record.shot.metres[2]
+    return FitWindow(signal, noise, reference + metres_per_ns * time, reference)
 
 
 def fit(
-    kind: Kind,
-    records: Sequence[Record],
+    kind: SceneKind,
+    records: Sequence[AirborneRecord],
     echoes: Sequence[np.ndarray],
-    own: Instrument,
+    instrument: Instrument,
     impulse: np.ndarray | None,
     path: Path | None = None,
     progress: Callable | None = None,
-) -> Fitted:
-    """Fit records in one batch, kept in `path`."""
+) -> FittedBatch:
+    """Fit records to one kind of scene in one batch, with its checkpoint in `path`.
+
+    `echoes`: elevations of the echoes of every record, m. `impulse`: the receiver's response.
+    """
     step = records[0].shot.sampling_interval
-    above, below = (round(metres / (WAY * step)) for metres in (kind.above, own.below))
+    above, below = (round(metres / (METRES_PER_NS * step)) for metres in (kind.above, instrument.below))
     time = step * np.arange(-above, below + 1)
-    windows = [window(record, e[-1], time) for record, e in zip(records, echoes)]
+    windows = [window_of(record, e[-1], time) for record, e in zip(records, echoes)]
     lidars = [record.lidar for record in records]
-    broadening = BROADENING if kind.canopy is None and own.footprint <= WIDE else None
+    # Under a canopy the layers broaden the echo, in wide footprints the slope.
+    is_wide = instrument.footprint > WIDE_FOOTPRINT
+    broadening = BROADENING if kind.canopy is None and not is_wide else None
     recorders = [
         Recorder(
             width=broadening,
             impulse=impulse,
             offset=OFFSET,
-            interleaved=own.interleaved,
+            interleaved=instrument.interleaved,
             pulse_noise=record.pulse_noise,
-            correlation=own.correlation,
+            correlation=instrument.correlation,
         )
         for record in records
     ]
-    height = [np.clip(e[0] - e[-1] + 1.0, own.clearance + 1.0, own.tallest - 2.0) for e in echoes]
+    # The canopy starts a metre above its first echo.
+    lowest, highest = instrument.clearance + 1.0, instrument.tallest - 2.0
+    height = [np.clip(e[0] - e[-1] + 1.0, lowest, highest) for e in echoes]
     fits = inversion.retrieve_many(
         np.stack([w.signal for w in windows])[:, None],
         lidars,
@@ -187,7 +214,7 @@ def fit(
             max_orders=1,
             window=(time[0], time[-1]),
             bin_width=step,
-            n_rays=64 if own.footprint > WIDE else 16,
+            n_rays=64 if is_wide else 16,
             footprint="fixed",
         ),
         start={} if kind.canopy is None else {"canopy height": np.array(height)},
@@ -198,10 +225,11 @@ def fit(
         path=path,
         progress=progress,
     )
-    return Fitted(fits, windows, recorders)
+    return FittedBatch(fits, windows, recorders)
 
 
-def known_of(shot, echoes=()):
+def identity_of(shot, echoes=()):
+    """Columns of a shot that do not come from a fit."""
     east, north, _ = shot.position[-1]
     names = ("longitude", "latitude") if shot.is_geographic else ("easting", "northing")
     time = {} if shot.gps_time is None else {"gps_time": shot.gps_time}
@@ -209,58 +237,72 @@ def known_of(shot, echoes=()):
 
 
 def verdict_of(
-    record: Record, impulse: np.ndarray | None, verdict: Verdict, off: float, broadening: float
+    record: AirborneRecord,
+    impulse: np.ndarray | None,
+    verdict: Verdict,
+    ground_offset: float,
+    broadening: float,
 ) -> Verdict:
-    """A fit's verdict with that of the record, and what the ground and a single echo tell."""
+    """Combine the verdict on a fit with those on the record, the ground and the width of a single echo.
+
+    `ground_offset`: of the fitted ground from the last echo, m. `broadening`: of a single echo, ns.
+    """
     if record.saturated:
         verdict &= Verdict("doubtful", (f"saturated: {record.saturated} samples have no weight",))
     elif record.shot.recorded.all():
-        own = {"noise": record.quiet, "pulse": record.pulse(LAGS, impulse)}
-        verdict &= inversion.judge_record(record.signal, **own)
-    if abs(off) > APART:
-        verdict &= Verdict("doubtful", (f"ground {off:+.2f} m from the last echo",))
-    if broadening > BROAD * float(record.lidar.pulse.std):
+        pulse = record.pulse(LAGS, impulse)
+        verdict &= inversion.judge_record(record.signal, noise=record.quiet, pulse=pulse)
+    if abs(ground_offset) > DOUBTFUL_DISTANCE:
+        verdict &= Verdict("doubtful", (f"ground {ground_offset:+.2f} m from the last echo",))
+    if broadening > DOUBTFUL_BROADENING * float(record.lidar.pulse.std):
         reason = f"broader by {broadening:.1f} ns than an echo of flat hard ground"
         verdict &= Verdict("doubtful", (reason,))
     return verdict
 
 
-def row_of(kind: Kind, record: Record, echoes: np.ndarray, found: Fitted, i: int, verdict: Verdict):
-    """The row of a shot, and its picture."""
-    values, error = found.fits.values, found.fits.robust_stderr
-    place, own = found.windows[i], {name: value[i] for name, value in values.items()}
-    ground, ground_stderr = place.reference + float(own["ground"]), float(error["ground"][i])
-    off = ground - float(echoes[-1])
+def row_of(
+    kind: SceneKind,
+    record: AirborneRecord,
+    echoes: np.ndarray,
+    batch: FittedBatch,
+    i: int,
+    verdict: Verdict,
+):
+    """Row of a shot, fit `i` of a batch, and its picture."""
+    window, recorder = batch.windows[i], batch.recorders[i]
+    values = {name: value[i] for name, value in batch.fits.values.items()}
+    stderr = {name: value[i] for name, value in batch.fits.robust_stderr.items()}
+    ground, ground_stderr = window.reference + float(values["ground"]), float(stderr["ground"])
+    last_echo = float(echoes[-1])
     row = {
-        **known_of(record.shot, echoes),
+        **identity_of(record.shot, echoes),
         "scene": kind.name,
         "saturated": record.saturated,
         "ground": ground,
         "ground_stderr": ground_stderr,
-        "last_echo": float(echoes[-1]),
+        "last_echo": last_echo,
     }
     for name, column in (("slope", "slope"), ("receiver width", "broadening")):
-        if name in own:
-            row |= {column: float(own[name]), f"{column}_stderr": float(error[name][i])}
-    impulse = found.recorders[i].impulse
-    verdict = verdict_of(record, impulse, verdict, off, row.get("broadening", 0.0))
+        if name in values:
+            row |= {column: float(values[name]), f"{column}_stderr": float(stderr[name])}
+    broadening = row.get("broadening", 0.0)
+    verdict = verdict_of(record, recorder.impulse, verdict, ground - last_echo, broadening)
     top = {}
     if kind.canopy is None:
-        row |= quality_of(found.fits, i, verdict)
+        row |= quality_of(batch.fits, i, verdict)
     else:
-        row["canopy_top"] = ground + float(own["canopy height"])
-        row["canopy_top_stderr"] = float(np.hypot(error["canopy height"][i], ground_stderr))
-        row |= kind.canopy.columns(found.fits, i, verdict)
+        row["canopy_top"] = ground + float(values["canopy height"])
+        row["canopy_top_stderr"] = float(np.hypot(stderr["canopy height"], ground_stderr))
+        row |= kind.canopy.columns(batch.fits, i, verdict)
         top = {"canopy top": row["canopy_top"]}
-    step = record.shot.sampling_interval
-    fitted = found.recorders[i].recorded(found.fits.fitted[i, 0], own, step=step)
+    fitted = recorder.recorded(batch.fits.fitted[i, 0], values, step=record.shot.sampling_interval)
     picture = {
         "title": f"shot {record.shot.index}\n{row['quality']}, chi2 {row['reduced_chi2']:.2g}",
-        "elevation": place.elevation,
-        "signal": record.peak * np.where(np.isfinite(place.noise), place.signal, np.nan),
+        "elevation": window.elevation,
+        "signal": record.peak * np.where(np.isfinite(window.noise), window.signal, np.nan),
         "fitted": record.peak * fitted,
         "ground": ground,
-        "reference": float(echoes[-1]),
+        "reference": last_echo,
         "chi2": row["reduced_chi2"],
         "unit": "amplitude",
         **top,
@@ -268,37 +310,49 @@ def row_of(kind: Kind, record: Record, echoes: np.ndarray, found: Fitted, i: int
     return row, picture
 
 
-def fit_shots(shots: Sequence, flight: Flight, stem: Path | None = None, progress: Callable | None = None):
-    """Fit shots. **Returns:** a row for each, and pictures of those that were fitted."""
-    own, rows, pictures = flight.instrument, [], []
-    tried = records_of(shots, flight)
-    rows += [bad_row(why, **known_of(s)) for s, why in zip(shots, tried) if isinstance(why, ValueError)]
-    records = [record for record in tried if isinstance(record, Record)]
+def fit_shots(
+    shots: Sequence, flight: FlightLine, stem: Path | None = None, progress: Callable | None = None
+):
+    """Fit shots, in one batch for each kind of scene.
+
+    1. Records of the shots; those that cannot be fitted become rows with the reason.
+    2. Receiver's response, and echoes of every record. Their number chooses the kind of scene.
+    3. Fit, verdicts, rows and pictures.
+
+    **Returns:** a row for each shot, and pictures of those that were fitted.
+    """
+    instrument, rows, pictures = flight.instrument, [], []
+    results = records_of(shots, flight)
+    for shot, result in zip(shots, results):
+        if isinstance(result, ValueError):
+            rows.append(bad_row(result, **identity_of(shot)))
+    records = [result for result in results if isinstance(result, AirborneRecord)]
     if not records:
         return rows, pictures
     impulse = response_of(flight)
-    kinds = kinds_of(own)
+    kinds = scene_kinds_of(instrument)
     batches = {kind.name: [] for kind in kinds}
     for record, all_echoes in zip(records, echoes_of(records, impulse)):
-        echoes = all_echoes[all_echoes - all_echoes[-1:] < own.above]
-        if len(echoes) == 1 or len(echoes) >= own.fewest:
-            said = Verdict("good", ())
-            if more := all_echoes.size - echoes.size:
-                reason = f"above what is fitted, {own.above:g} m over the last echo: {more} more"
-                said = Verdict("doubtful", (reason,))
-            batches[kinds[len(echoes) > 1].name].append((record, echoes, said))
+        echoes = all_echoes[all_echoes - all_echoes[-1:] < instrument.above]
+        if len(echoes) == 1 or len(echoes) >= instrument.fewest:
+            verdict = Verdict("good", ())
+            if n_above := all_echoes.size - echoes.size:
+                reason = f"above what is fitted, {instrument.above:g} m over the last echo: {n_above} more"
+                verdict = Verdict("doubtful", (reason,))
+            batches[kinds[len(echoes) > 1].name].append((record, echoes, verdict))
         else:
-            reason = "ground and canopy cannot be told apart" if len(echoes) else "nothing above the noise"
-            rows.append(bad_row(f"{len(echoes)} echoes: {reason}", **known_of(record.shot, echoes)))
+            reason = "ground and canopy cannot be separated" if len(echoes) else "nothing above the noise"
+            rows.append(bad_row(f"{len(echoes)} echoes: {reason}", **identity_of(record.shot, echoes)))
     for kind in kinds:
         if not batches[kind.name]:
             continue
-        chosen, echoes, said = zip(*batches[kind.name])
+        kind_records, echoes, record_verdicts = zip(*batches[kind.name])
         name = kind.name.replace(" ", "_")
         path = None if stem is None else stem.with_name(f"{stem.name}.{name}.sqlite")
-        found = fit(kind, chosen, echoes, own, impulse, path, progress)
-        for i, verdict in enumerate(inversion.judge_fits(found.fits, about=["ground"])):
-            row, picture = row_of(kind, chosen[i], echoes[i], found, i, verdict & said[i])
+        batch = fit(kind, kind_records, echoes, instrument, impulse, path, progress)
+        for i, verdict in enumerate(inversion.judge_fits(batch.fits, about=["ground"])):
+            verdict &= record_verdicts[i]
+            row, picture = row_of(kind, kind_records[i], echoes[i], batch, i, verdict)
             rows.append(row)
             pictures.append(picture)
     return sorted(rows, key=lambda row: row["shot_number"]), pictures
@@ -308,7 +362,7 @@ def main(argv=None):
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("file", type=Path, help="recorded returns (.npz, .pls, .las)")
     parser.add_argument("--every", type=int, default=1, help="take every K-th shot; default: all")
-    parser.add_argument("--shots", type=int, help="how many of the longest returns to fit; default: all")
+    parser.add_argument("--shots", type=int, help="number of the longest returns to fit; default: all")
     parser.add_argument("--out", type=Path, default=Path("figures"), help="folder for tables and pictures")
     add_options(parser)
     options = parser.parse_args(argv)
@@ -327,8 +381,8 @@ def main(argv=None):
     if pictures:
         written.append(stem.with_name(f"{stem.name}.png"))
         draw_page(pictures, {}, written[-1])
-        off = np.array([row["ground"] - row["last_echo"] for row in rows if "ground" in row])
-        print(f"ground less last echo: median {np.median(off):.2f} m, spread {np.std(off):.2f} m")
+        offset = np.array([row["ground"] - row["last_echo"] for row in rows if "ground" in row])
+        print(f"ground less last echo: median {np.median(offset):.2f} m, spread {np.std(offset):.2f} m")
     print(", ".join(f"{sum(r['quality'] == q for r in rows)} {q}" for q in QUALITIES))
     print("written:", *written)
     return rows

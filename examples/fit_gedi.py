@@ -2,27 +2,27 @@
 
     python examples/fit_gedi.py GEDI01_B_....h5 [--shot N] [--answers answers.npz] [--out figures]
 
-All shots of a file are fitted in one batch, which goes on where it was interrupted. A CSV and a netCDF file
-get one row a shot, and a page the pictures of the best, median and worst fits, against the product's answers
-where they are given. A shot that cannot be fitted has a row with the reason.
+All shots of a file are fitted in one batch, which resumes where it was interrupted. The script writes one row
+a shot to a CSV and a netCDF file, and a page with pictures of the best, median and worst fits, beside the
+product's values if they are given. A shot that cannot be fitted has a row with the reason.
 
-The canopy is horizontally uniform: ten layers of equal thickness from 1 m above the ground to the top. Found
-are the elevations of ground and top, the slope (which stands for all that widens the ground's echo), the
-plant area density of every layer, and one factor for the receiver's unknown gain. Reflectances are fixed, in
-the ratio of the level-2B algorithm, rho_v / rho_g = 0.6 / 0.4. First order only, with the hot spot.
+The canopy is horizontally uniform: ten layers of equal thickness from 1 m above the ground to the top. The
+unknowns are the elevations of ground and top, the slope (which stands for all that widens the ground's echo),
+the plant area density of every layer, and one factor for the receiver's unknown gain. Reflectances are fixed,
+in the ratio of the level-2B algorithm, rho_v / rho_g = 0.6 / 0.4. First order only, with the hot spot.
 
-Plants within a pulse's length of the ground merge with its echo, and waveforms alone leave open which is
-which. So the ground starts at the mode that `inversion.find_ground` gives, with a prior of 0.1 m about it,
-and the difference between the two is part of its standard error. Where GEDI's own rule gives another ground,
-the fit starts from both. `prior_share_...` says what the priors tell. For the same reason `pai` and `cover`
-are not the layers' but those of the energy split at the matched mode (`inversion.ground_and_canopy`), which
-are nearer to the product's; the layers' sum is `pai_layers`. Relative heights are the fitted waveform's, read
-by the product's rules (`inversion.gedi_metrics`).
+Plants within a pulse's length of the ground merge with its echo, and waveforms alone do not separate the two.
+So the ground starts at the mode of `inversion.find_ground`, with a prior of 0.1 m about it, and its
+standard error includes the difference between the two. If GEDI's own rule gives another ground, the fit
+starts from both. `prior_share_...` is the fraction of the information that the priors give. For the same
+reason `pai` and `cover` are not those of the layers but of the energy split at the matched mode
+(`inversion.ground_and_canopy`), which are nearer to the product's; the layers' sum is `pai_layers`. Relative
+heights are the fitted waveform's, read by the product's rules (`inversion.gedi_metrics`).
 
-Of 60 shots of a savanna, 44 come out as good and none as bad. The ground is within 0.07 m of the product's in
-the median and within 0.43 m in all good ones, and two standard errors (0.13 m each, in the median) cover it
-in all of them. RH98 ranks with the product's to 0.98, `pai` to 0.85 (0.82 where it is above 0.1),
-`pai_layers` to 0.46, and the canopy's fitted top, which the layers' prior blurs, to 0.63.
+Of 60 shots of a savanna, 44 are rated good and none bad. The ground is within 0.07 m of the product's in the
+median and within 0.43 m in all good ones, and two standard errors (0.13 m each, in the median) cover it in
+all of them. Rank correlations with the product are 0.98 for RH98, 0.85 for `pai` (0.82 for plant area above
+0.1), 0.46 for `pai_layers`, and 0.63 for the canopy's fitted top, which the layers' prior blurs.
 """
 
 import argparse
@@ -35,7 +35,7 @@ import numpy as np
 from _recorded import (
     LAYERS,
     QUALITIES,
-    Layers,
+    LayeredCanopy,
     bad_row,
     columns_of,
     draw_page,
@@ -49,24 +49,24 @@ import jaxlidar as jl
 from inversion import Unknown, Verdict
 from jaxlidar.io import read_gedi_l1b
 
-CANOPY = Layers(clearance=1.0)
+CANOPY = LayeredCanopy(clearance=1.0)
 ALTITUDE, FOOTPRINT = 400e3, 25.0
 # Samples above and below the reference: of 1 ns, or 0.15 m.
 ABOVE, BELOW = 280, 80
 # Records are smoothed as by a Gaussian of this standard deviation, ns; the transmitted pulse is not.
 SMOOTHING = 1.7
-# Noise is correlated over five neighbouring samples, which then tell as much as one.
+# Noise is correlated over five neighbouring samples: together they have the information of one.
 CORRELATED = 5
-# The receiver has a tail that the transmitted pulse does not show: nothing is fitted beyond so many samples
-# below the ground's mode.
+# The receiver has a tail that the transmitted pulse does not show: samples further than this below the
+# ground's mode are not fitted.
 TAIL = 14
 # Relative error of the model: the pulse is itself a record, and no canopy is uniform.
 MODEL_ERROR = 0.01
-# Grounds further apart are two to start from, m. Two fits whose reduced chi-squared differ by less than a
-# factor leave the ground open.
-AMBIGUOUS, ALIKE = 0.5, 2.0
-# A fitted ground so far from the matched mode is doubtful, m.
-APART = 0.5
+# Two estimates of the ground further apart than this are both tried, m. If the reduced chi-squared of the two
+# fits differ by less than a factor, the ground is ambiguous.
+AMBIGUOUS, CHI2_FACTOR = 0.5, 2.0
+# A fitted ground further than this from the matched mode is doubtful, m.
+DOUBTFUL = 0.5
 RH = (25, 50, 75, 95, 98, 100)
 UNITS = {
     **dict.fromkeys(("latitude", "longitude"), "degrees"),
@@ -78,13 +78,13 @@ UNITS = {
 
 
 def lidar_of(pulse):
-    """GEDI with a pulse. Its footprint is 25 m wide at 1/e^2."""
+    """GEDI with the transmitted pulse of a shot. The footprint is 25 m wide at 1/e^2."""
     divergence = FOOTPRINT / ALTITUDE * 1e3
     return jl.Lidar(altitude=ALTITUDE, divergence=divergence, aperture=0.8, pulse=pulse, jitter=SMOOTHING)
 
 
 def common_plan():
-    """One plan for all shots, so that they compile once: for the longest pulse and the largest scene."""
+    """Plan of all shots, so that they compile once: for the longest pulse and the largest scene."""
     return jl.plan(
         lidar_of(jl.GaussianPulse(fwhm=40.0)),
         CANOPY.scene(50.0, -6.0, 25.0),
@@ -110,18 +110,24 @@ UNKNOWNS = [
 ]
 
 
-class Prepared:
-    """A shot about a ground to start from: share of the signal in each sample, and its noise."""
+class PreparedShot:
+    """A shot about an estimate of the ground: fraction of the signal in each sample, and its noise.
+
+    - `reference`: elevation of the sample nearest to the ground, m, which is height zero of the fit.
+    - `elevation`, `signal`, `noise`: of the samples, from the top down; noise is infinite for samples that
+      are not fitted.
+    - `total`: sum of the signal in counts, by which signal and noise are divided.
+    - `height`: of the canopy over the ground, m, to start from.
+    """
 
     def __init__(self, shot, ground):
         self.shot, self.middle = shot, int(np.argmin(np.abs(shot.elevation - ground)))
-        # From the sample nearest to the ground, which is the reference.
         number = self.middle + np.arange(-ABOVE, BELOW + 1)
         inside = (number >= 0) & (number < shot.waveform.size)
         step = (shot.elevation[0] - shot.elevation[-1]) / (shot.waveform.size - 1)
         self.reference = float(shot.elevation[self.middle])
         self.elevation = self.reference - step * np.arange(-ABOVE, BELOW + 1)
-        # Above the canopy there is noise alone, if the record has so much.
+        # Samples above the canopy are noise alone; a record that begins lower has the product's values.
         quiet = shot.waveform[: max(self.middle - ABOVE, 0)]
         mean, std = (np.mean(quiet), np.std(quiet)) if quiet.size >= 50 else (shot.noise_mean, shot.noise_std)
         signal = np.where(inside, shot.waveform[np.clip(number, 0, shot.waveform.size - 1)] - mean, 0.0)
@@ -131,31 +137,38 @@ class Prepared:
             raise ValueError("no signal about the ground")
         self.signal = signal / self.total
         self.noise = np.where(inside & (number <= self.middle + TAIL), noise / self.total, np.inf)
-        lit = np.flatnonzero(signal > 3.0 * shot.noise_std)
-        top = self.elevation[lit[0]] - self.reference - 2.0 if lit.size else 0.0
+        # The echo of the top begins about 2 m above it.
+        bright = np.flatnonzero(signal > 3.0 * shot.noise_std)
+        top = self.elevation[bright[0]] - self.reference - 2.0 if bright.size else 0.0
         self.height = float(np.clip(top, 2.0, 38.0))
 
 
 def pulse_of(shot):
-    """The transmitted pulse at whole ns from its time zero."""
+    """Transmitted pulse at whole ns from its time zero."""
     return np.interp(np.arange(-64.0, 65.0), shot.pulse_time, shot.pulse_power, left=0.0, right=0.0)
 
 
-def first_look(shot):
-    """Verdict on the record and, where there is a signal, the grounds to start from."""
+def judge_and_find_ground(shot):
+    """Verdict on the record, and the grounds to start from.
+
+    **Raises:** ValueError for a record without ground, with the reasons.
+    """
     pulse = pulse_of(shot)
     verdict = inversion.judge_record(
         shot.signal, noise=shot.noise_std, pulse=pulse, degrade=shot.degrade, stale_return=shot.stale_return
     )
-    found = float(inversion.find_ground(shot.elevation, shot.signal, pulse=pulse, noise=shot.noise_std))
-    if not np.isfinite(found):
+    ground = float(inversion.find_ground(shot.elevation, shot.signal, pulse=pulse, noise=shot.noise_std))
+    if not np.isfinite(ground):
         raise ValueError("; ".join(("no ground above the noise", *verdict.reasons)))
     mode = float(inversion.gedi_metrics([shot]).elev_lowestmode[0])
-    return verdict, [found, mode] if abs(mode - found) > AMBIGUOUS else [found]
+    return verdict, [ground, mode] if abs(mode - ground) > AMBIGUOUS else [ground]
 
 
 def fit(prepared, path=None, progress=None):
-    """Fit what was prepared, in one batch, kept in `path`. **Returns:** an `inversion.Retrievals`."""
+    """Fit prepared shots in one batch, with its checkpoint in `path`.
+
+    **Returns:** an `inversion.Retrievals`.
+    """
     pulses = [jl.SampledPulse(time=p.shot.pulse_time, power=p.shot.pulse_power) for p in prepared]
     return inversion.retrieve_many(
         np.stack([p.signal for p in prepared])[:, None],
@@ -168,7 +181,7 @@ def fit(prepared, path=None, progress=None):
         plan=common_plan(),
         start={"canopy height": np.array([p.height for p in prepared])},
         max_steps=100,
-        # A share of the signal over an apparent reflectance.
+        # A fraction of the signal over an apparent reflectance.
         scale=(0.0, 20.0),
         path=path,
         progress=progress,
@@ -176,23 +189,26 @@ def fit(prepared, path=None, progress=None):
 
 
 def row_of(prepared, fits, i, matched, verdict):
-    """The row of a shot, and its fitted waveform in counts."""
+    """Row of a shot, and its fitted waveform in counts.
+
+    `i`: number of the fit. `matched`: elevation of the matched mode, m.
+    """
     shot, values, error = prepared.shot, fits.values, fits.robust_stderr
     height = float(values["canopy height"][i])
     offset = float(values["ground"][i])
     ground = prepared.reference + offset
     ground_stderr = float(np.hypot(error["ground"][i], ground - matched))
-    if abs(ground - matched) > APART:
+    if abs(ground - matched) > DOUBTFUL:
         verdict &= Verdict("doubtful", (f"ground {ground - matched:+.2f} m from the matched mode",))
     fitted = float(values["scale"][i]) * fits.fitted[i, 0] * prepared.total
-    read = types.SimpleNamespace(
+    fitted_shot = types.SimpleNamespace(
         elevation=prepared.elevation, waveform=fitted, noise_mean=0.0, noise_std=shot.noise_std
     )
-    metrics = inversion.gedi_metrics([read])
-    # The split, and with the ground one standard error lower and higher.
-    sides = matched + ground_stderr * np.array([0.0, -1.0, 1.0])
+    metrics = inversion.gedi_metrics([fitted_shot])
+    # Errors of the split: half the difference between grounds one standard error lower and higher.
+    grounds = matched + ground_stderr * np.array([0.0, -1.0, 1.0])
     split = inversion.ground_and_canopy(
-        shot.elevation, shot.signal, pulse=pulse_of(shot), noise=shot.noise_std, ground=sides
+        shot.elevation, shot.signal, pulse=pulse_of(shot), noise=shot.noise_std, ground=grounds
     )
     gap = np.clip(np.asarray(split.gap, float), 1e-3, 1.0)
     area = np.asarray(inversion.plant_area_index(gap), float)
@@ -216,39 +232,47 @@ def row_of(prepared, fits, i, matched, verdict):
 
 
 def fit_shots(shots, path=None, progress=None):
-    """Fit shots. **Returns:** a row for each, and pictures of those that were fitted."""
-    looks, prepared, rows, pictures = [], [], [], []
+    """Fit shots, some from two grounds, all in one batch.
+
+    **Arguments:** `shots`: of a file; a shot that could not be read is its row.
+
+    **Returns:** a row for each shot, and pictures of those that were fitted.
+    """
+    # Of each shot: the verdict on its record, its grounds and their numbers in the batch; or the error.
+    preparations, prepared, rows, pictures = [], [], [], []
     for shot in shots:
         try:
             if isinstance(shot, dict):
                 raise ValueError(shot["reasons"])
-            verdict, grounds = first_look(shot)
-            own = [Prepared(shot, ground) for ground in grounds]
-            looks.append((verdict, grounds, range(len(prepared), len(prepared) + len(own))))
-            prepared += own
+            verdict, grounds = judge_and_find_ground(shot)
+            candidates = [PreparedShot(shot, ground) for ground in grounds]
+            numbers = range(len(prepared), len(prepared) + len(candidates))
+            preparations.append((verdict, grounds, numbers))
+            prepared += candidates
         except ValueError as error:
-            looks.append(error)
+            preparations.append(error)
     fits = fit(prepared, path, progress) if prepared else None
     verdicts = inversion.judge_fits(fits, about=["ground"]) if fits else ()
-    for shot, look in zip(shots, looks):
-        if isinstance(look, ValueError):
-            known = shot if isinstance(shot, dict) else known_of(shot)
-            rows.append({**known, **bad_row(look)})
+    for shot, preparation in zip(shots, preparations):
+        if isinstance(preparation, ValueError):
+            columns = shot if isinstance(shot, dict) else identity_of(shot)
+            rows.append({**columns, **bad_row(preparation)})
             continue
-        record, grounds, places = look
-        first, *others = sorted(places, key=lambda i: (not fits.converged[i], fits.reduced_chi2[i]))
-        verdict = record & verdicts[first]
-        for i in others:
-            if fits.reduced_chi2[i] < ALIKE * fits.reduced_chi2[first]:
-                at = f"ground at {grounds[i - places[0]]:.1f} m fits nearly as well"
-                verdict &= Verdict("doubtful", (f"second minimum: {at}",))
-        row, fitted = row_of(prepared[first], fits, first, grounds[first - places[0]], verdict)
-        rows.append({**known_of(shot), **row})
+        record_verdict, grounds, numbers = preparation
+        # The better fit counts; one that did not converge only if none did.
+        best, *alternatives = sorted(numbers, key=lambda i: (not fits.converged[i], fits.reduced_chi2[i]))
+        verdict = record_verdict & verdicts[best]
+        for i in alternatives:
+            if fits.reduced_chi2[i] < CHI2_FACTOR * fits.reduced_chi2[best]:
+                reason = f"ground at {grounds[i - numbers[0]]:.1f} m fits nearly as well"
+                verdict &= Verdict("doubtful", (f"second minimum: {reason}",))
+        row, fitted = row_of(prepared[best], fits, best, grounds[best - numbers[0]], verdict)
+        rows.append({**identity_of(shot), **row})
         pictures.append(
             {
                 "title": f"shot {shot.shot_number}\n{row['quality']}, chi2 {row['reduced_chi2']:.2g}",
-                "elevation": prepared[first].elevation,
-                "signal": prepared[first].signal * prepared[first].total,
+                "elevation": prepared[best].elevation,
+                "signal": prepared[best].signal * prepared[best].total,
                 "fitted": fitted,
                 "ground": row["ground"],
                 "canopy top": row["canopy_top"],
@@ -259,7 +283,8 @@ def fit_shots(shots, path=None, progress=None):
     return rows, pictures
 
 
-def known_of(shot):
+def identity_of(shot):
+    """Columns of a shot that do not come from a fit."""
     return {
         "shot_number": int(shot.shot_number),
         "beam": shot.beam,
@@ -269,20 +294,21 @@ def known_of(shot):
 
 
 def read(path, shot=None):
-    """All shots of a file, or one. A shot that cannot be read is its row, with the reason."""
+    """Read all shots of a file, or one. A shot that cannot be read becomes its row, with the reason."""
     if shot is not None:
         return read_gedi_l1b(path, shot)
     try:
         return read_gedi_l1b(path)
     except ValueError:
+        # One damaged shot fails the file: read shot by shot.
         import h5py
 
         with h5py.File(path) as file:
             numbers = [(b, int(n)) for b in file if b.startswith("BEAM") for n in file[b]["shot_number"][:]]
-        return [_read_one(path, i, *known) for i, known in enumerate(numbers)]
+        return [_read_shot(path, i, beam, number) for i, (beam, number) in enumerate(numbers)]
 
 
-def _read_one(path, index, beam, number):
+def _read_shot(path, index, beam, number):
     try:
         return read_gedi_l1b(path, index)[0]
     except ValueError as error:
@@ -290,40 +316,42 @@ def _read_one(path, index, beam, number):
 
 
 def compare(rows, answers):
-    """Print how far the rows are from the product's answers. **Returns:** numbers, and pairs to draw."""
-    place = {int(n): i for i, n in enumerate(answers["shot"])}
-    shared = [row for row in rows if row["shot_number"] in place and "ground" in row]
+    """Print the differences of rows from the product's values. **Returns:** numbers, and pairs to draw."""
+    index = {int(n): i for i, n in enumerate(answers["shot"])}
+    shared = [row for row in rows if row["shot_number"] in index and "ground" in row]
     if len(shared) < 2:
         return {}, {}
-    at = np.array([place[row["shot_number"]] for row in shared])
-    found = columns_of(shared)
-    off = found["ground"] - answers["elev_lowestmode"][at]
-    good, leafy = found["quality"] == "good", answers["pai"][at] > 0.1
+    order = np.array([index[row["shot_number"]] for row in shared])
+    product = {name: answers[name][order] for name in ("elev_lowestmode", "pai", "rh")}
+    fitted = columns_of(shared)
+    difference = fitted["ground"] - product["elev_lowestmode"]
+    is_good, is_leafy = fitted["quality"] == "good", product["pai"] > 0.1
 
     def rank_correlation(a, b):
         return float(stats.spearmanr(a, b).statistic)
 
-    covered = np.abs(off) <= 2.0 * found["ground_stderr"]
-    area, rh98 = answers["pai"][at], answers["rh"][at, 98]
+    is_covered = np.abs(difference) <= 2.0 * fitted["ground_stderr"]
+    area, rh98 = product["pai"], product["rh"][:, 98]
+    largest = float(np.max(np.abs(difference[is_good]), initial=0.0))
     numbers = {
         "shots": len(shared),
-        "good": int(good.sum()),
-        "ground, median difference (m)": float(np.median(np.abs(off))),
-        "ground, largest difference of good shots (m)": float(np.max(np.abs(off[good]), initial=0.0)),
-        "ground within 2 s.e., good shots": float(np.mean(covered[good])) if good.any() else np.nan,
-        "ground, median s.e. (m)": float(np.median(found["ground_stderr"])),
-        "rank of pai": rank_correlation(found["pai"], area),
-        "rank of pai above 0.1": rank_correlation(found["pai"][leafy], area[leafy]),
-        "rank of pai, of layers": rank_correlation(found["pai_layers"], area),
-        "rank of RH98": rank_correlation(found["rh98"], rh98),
-        "rank of canopy top": rank_correlation(found["canopy_top"] - found["ground"], rh98),
+        "good": int(is_good.sum()),
+        "ground, median difference (m)": float(np.median(np.abs(difference))),
+        "ground, largest difference of good shots (m)": largest,
+        "ground within 2 s.e., good shots": float(np.mean(is_covered[is_good])) if is_good.any() else np.nan,
+        "ground, median s.e. (m)": float(np.median(fitted["ground_stderr"])),
+        "rank of pai": rank_correlation(fitted["pai"], area),
+        "rank of pai above 0.1": rank_correlation(fitted["pai"][is_leafy], area[is_leafy]),
+        "rank of pai, of layers": rank_correlation(fitted["pai_layers"], area),
+        "rank of RH98": rank_correlation(fitted["rh98"], rh98),
+        "rank of canopy top": rank_correlation(fitted["canopy_top"] - fitted["ground"], rh98),
     }
     for name, value in numbers.items():
         print(f"{name:48} {value:.3g}")
     pairs = {
-        "ground (m)": (answers["elev_lowestmode"][at], found["ground"]),
-        "RH98 (m)": (rh98, found["rh98"]),
-        "PAI": (area, found["pai"]),
+        "ground (m)": (product["elev_lowestmode"], fitted["ground"]),
+        "RH98 (m)": (rh98, fitted["rh98"]),
+        "PAI": (area, fitted["pai"]),
     }
     return numbers, pairs
 
@@ -332,7 +360,7 @@ def main(argv=None):
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("file", type=Path, help="a GEDI L1B file (HDF5)")
     parser.add_argument("--shot", type=int, help="one shot: index in the file, or shot number")
-    parser.add_argument("--answers", type=Path, help="npz with the product's answers, by shot number")
+    parser.add_argument("--answers", type=Path, help="npz with the product's values, by shot number")
     parser.add_argument("--out", type=Path, default=Path("figures"), help="folder for tables and pictures")
     options = parser.parse_args(argv)
     try:

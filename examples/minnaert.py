@@ -1,7 +1,14 @@
-"""A scattering law of one's own: Minnaert's, in one class. Run it as `python examples/minnaert.py`.
+"""A new scattering law, Minnaert's, in one class. Run it as `python examples/minnaert.py`.
 
 M. Minnaert (1941), Astrophys. J. 93, 403, described the moon's radiance by a power of the cosines of
-incidence and of view; a rough surface that darkens towards the limb has k above one.
+incidence and of view. With mu0 the cosine of incidence and mu that of the outgoing direction,
+
+    BRDF = R (k + 1) / (2 pi) (mu0 mu)^(k - 1),
+    albedo(mu0) = R mu0^(k - 1),    density of directions = (k + 1) / (2 pi) mu^k per sr.
+
+A surface that darkens towards the limb has k above one; k = 1 is Lambertian. Directions are sampled by the
+inverse of their distribution, mu = (1 - u)^(1 / (k + 1)). Cosines of at least 1e-6 keep derivatives of the
+powers finite at grazing angles.
 """
 
 from typing import final
@@ -47,7 +54,7 @@ class Minnaert(jl.AbstractLaw):
 
 
 def main() -> None:
-    """Returns of ground at several slopes, Lambertian and with limb darkening."""
+    """Print the returns of ground at several slopes, Lambertian and with limb darkening."""
     for slope in (0.0, 20.0, 40.0):
         sums = []
         for law in (jl.Lambertian(), Minnaert(k=1.5)):

@@ -24,10 +24,9 @@ from inversion.metrics.gedi import GediMetrics, GediSettings, gedi_metrics, gedi
 from inversion.metrics.heights import SignalEnds, find_ground, relative_heights, signal_ends
 from inversion.metrics.photons import PhotonHeights, photon_ground_and_canopy
 from inversion.metrics.points import EchoPoints, echo_points
-from inversion.receiver.counts import Amplitudes, amplitudes
+from inversion.receiver.digitiser import Amplitudes, amplitudes, corrected_table
 from inversion.receiver.impulse import receiver_impulse, recorded_pulse
 from inversion.receiver.recorder import Recorder
-from inversion.receiver.tables import corrected_table
 from jaxlidar.extend import shorten_signatures
 
 __all__ = [

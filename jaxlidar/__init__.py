@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from jaxlidar import extend, io
 from jaxlidar._checks import UnitWarning
 from jaxlidar._constants import SPEED_OF_LIGHT
-from jaxlidar._deprecated import renamed
+from jaxlidar._deprecated import RENAMED, warn_renamed
 from jaxlidar._progress import Progress
 from jaxlidar._registry import register_public_objects, waveform_html
 from jaxlidar._signatures import shorten_signatures
@@ -41,17 +41,17 @@ from jaxlidar.optics.leaf_surface import LeafSurface, leaf_surface
 from jaxlidar.optics.phase import AbstractPhase, HenyeyGreenstein, Isotropic
 from jaxlidar.optics.plate_model import plate_model
 from jaxlidar.optics.prospect import Prospect, prospect_jacobian, prospect_spectra
-from jaxlidar.optics.spectra import Spectrum, read_spectrum_csv, spectra, spectrum
+from jaxlidar.optics.spectra import Spectrum, read_spectrum_csv, spectrum, spectrum_names
 from jaxlidar.planning.effects import Effect
 from jaxlidar.planning.plan import Plan, plan
 from jaxlidar.planning.setup import Setup, make_setup
 from jaxlidar.plants.forest import forest
-from jaxlidar.plants.habits import Branching, Habit, broadleaf, conifer, grow, shrub, spreading
-from jaxlidar.plants.lsystem import LSystem, Module, Rule, Word
+from jaxlidar.plants.habits import Branching, Habit, broadleaf, conifer, grow, shrub, spreading_tree
+from jaxlidar.plants.lsystem import LSystem, Rule, Symbol, Word
 from jaxlidar.plants.meshes import Mesh, voxelise_mesh
 from jaxlidar.plants.tree import Tree
 from jaxlidar.plants.turtle import turtle
-from jaxlidar.plants.voxelise import crop, voxelise, voxelise_points
+from jaxlidar.plants.voxelise import trim_empty_layers, voxelise, voxelise_points
 from jaxlidar.scenes.atmosphere import Atmosphere
 from jaxlidar.scenes.canopy import Canopy
 from jaxlidar.scenes.scene import Scene
@@ -107,7 +107,6 @@ __all__ = [
     "Lidar",
     "LostWorkersWarning",
     "Mesh",
-    "Module",
     "OffMapWarning",
     "Oscillating",
     "PhotonCounter",
@@ -130,6 +129,7 @@ __all__ = [
     "Spectrum",
     "Survey",
     "SurveyProgress",
+    "Symbol",
     "Terrain",
     "Tree",
     "Truth",
@@ -142,7 +142,6 @@ __all__ = [
     "analog_returns",
     "broadleaf",
     "conifer",
-    "crop",
     "energy_budget",
     "extend",
     "first_return_window",
@@ -165,11 +164,12 @@ __all__ = [
     "shrub",
     "simulate",
     "simulate_many",
-    "spectra",
     "spectrum",
-    "spreading",
+    "spectrum_names",
+    "spreading_tree",
     "total_reflectance",
     "trace_scene",
+    "trim_empty_layers",
     "truth_of",
     "turtle",
     "voxelise",
@@ -186,13 +186,6 @@ def __dir__() -> list[str]:
     return sorted(__all__)
 
 
-# Names of version 0.2 by their new names; they go with version 0.4.
-_RENAMED = {
-    "reduce": "make_setup",
-    "repeat": "rerun",
-    "total_of": "total_reflectance",
-}
-
 # Tables of TOML files (`jaxlidar.io.read_case`) name classes as they are exported here.
 register_public_objects({name: globals()[name] for name in __all__ if name != "plot"})
 
@@ -208,4 +201,7 @@ def _waveform_html(wave: Waveform) -> str:
 def __getattr__(name: str) -> Any:
     if name == "plot":
         return importlib.import_module("jaxlidar.plot")
-    return renamed(name, _RENAMED, globals(), __name__)
+    if name in RENAMED:
+        warn_renamed(f"jaxlidar.{name}", f"jaxlidar.{RENAMED[name]}")
+        return globals()[RENAMED[name]]
+    raise AttributeError(f"module 'jaxlidar' has no attribute {name!r}")

@@ -51,7 +51,7 @@ MADE = {
     "jaxlidar.LeafOptics": jl.LeafOptics(0.4, 0.3),
     "jaxlidar.LeafSurface": jl.leaf_surface(1.4),
     "jaxlidar.Lidar": LIDAR,
-    "jaxlidar.Module": jl.Module("A", (1.0,)),
+    "jaxlidar.Symbol": jl.Symbol("A", (1.0,)),
     "jaxlidar.Plan": jl.plan(LIDAR, SCENE),
     "jaxlidar.Effect": jl.plan(LIDAR, SCENE).effects[0],
     "jaxlidar.Plane": SCENE.ground.shape,

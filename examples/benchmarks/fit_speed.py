@@ -24,7 +24,7 @@ from retrieval_coverage import LIDAR, NOISE, RANGES, plan_of, scene_of, unknowns
 
 import inversion
 import jaxlidar as jl
-from inversion.fit.unknowns import put, settle
+from inversion.fit.unknowns import bind_unknowns, set_values
 from jaxlidar.planning.plan import MIN_BATCHES
 
 OPTICAL = ("Cab", "Cw", "N", "ground brightness")
@@ -60,21 +60,21 @@ def main() -> None:
             )
             ours = time.perf_counter() - begun
 
-            settled = settle(sought, base)
-            places = tuple(s.place for s in settled)
+            bound = bind_unknowns(sought, base)
+            setters = tuple(u.setter for u in bound)
             keys = [jax.random.fold_in(key, n) for n in range(MIN_BATCHES)]
 
-            def residuals(x, base=base, places=places, keys=keys, observed=observed, sigma=sigma):
+            def residuals(x, base=base, setters=setters, keys=keys, observed=observed, sigma=sigma):
                 values = tuple(jax.numpy.asarray(v, jax.numpy.zeros(()).dtype) for v in x)
-                parts = pool.map(lambda k: _simulated(base, plan, places, values, k), keys)
+                parts = pool.map(lambda k: _simulated(base, plan, setters, values, k), keys)
                 return ((np.mean([np.asarray(p, float) for p in parts], axis=0) - observed) / sigma).ravel()
 
-            low, high = (np.array([float(getattr(s, f)) for s in settled]) for f in ("low", "high"))
+            low, high = (np.array([float(getattr(s, f)) for s in bound]) for f in ("low", "high"))
             residuals(low + 0.5 * (high - low))
             begun = time.perf_counter()
             theirs = scipy.optimize.least_squares(
                 residuals,
-                [float(s.start) for s in settled],
+                [float(s.start) for s in bound],
                 bounds=(low, high),
                 x_scale=high - low,
                 # Above the rounding of single precision.
@@ -86,12 +86,12 @@ def main() -> None:
             seconds = time.perf_counter() - begun
             if number == 0:
                 continue
-            mine = np.sum(residuals([float(fit.values[s.name]) for s in settled]) ** 2)
+            mine = np.sum(residuals([float(fit.values[s.name]) for s in bound]) ** 2)
             gaps.append(float(mine - 2 * theirs.cost))
             times["ours"].append(ours)
             times["scipy"].append(seconds)
             counts["ours"].append(fit.steps)
-            counts["scipy"].append(int(theirs.nfev + theirs.njev * len(settled)))
+            counts["scipy"].append(int(theirs.nfev + theirs.njev * len(bound)))
         ratio = float(np.median(np.array(times["scipy"]) / np.array(times["ours"])))
         record[case] = {
             "seconds": times,
@@ -123,8 +123,8 @@ def draw(record: dict, path: Path) -> None:
 
 
 @eqx.filter_jit
-def _simulated(scene, plan, places, values, key):
-    setup = jl.make_setup(LIDAR, put(scene, places, values), plan)
+def _simulated(scene, plan, setters, values, key):
+    setup = jl.make_setup(LIDAR, set_values(scene, setters, values), plan)
     return jl.total_reflectance(jl.trace_scene(setup, key, reverse=False), setup)
 
 

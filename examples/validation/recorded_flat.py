@@ -20,10 +20,10 @@ from scipy.optimize import nnls
 
 import inversion
 import jaxlidar as jl
-from inversion.fit.noise import Noise, correlation_between
-from inversion.fit.retrieval import scale_of
-from inversion.receiver.counts import straight_table
-from inversion.receiver.recorder import Terms
+from inversion.fit.data import SampleNoise, neighbour_correlation
+from inversion.fit.retrieval import scale_unknown
+from inversion.receiver.digitiser import amplitude_table
+from inversion.receiver.recorder import RecorderModel
 from jaxlidar.io import read_pulsewaves
 from jaxlidar.io.pedestal import above_pedestal
 
@@ -115,17 +115,17 @@ def best_sum(shot, columns, model, noise, random):
     """Chi-squared of the best sum, and its mean for records that are the model and noise."""
     signal, sigma = shot.window()
     used = np.isfinite(sigma)
-    base = np.linalg.qr(noise.white(np.ones((used.sum(), 1))))[0]
-    parts = noise.white(columns[used])
+    base = np.linalg.qr(noise.whiten(np.ones((used.sum(), 1))))[0]
+    parts = noise.whiten(columns[used])
     parts = parts - base @ (base.T @ parts)
     parts = parts / np.maximum(np.linalg.norm(parts, axis=0), 1e-9)
 
     def left(record):
-        white = noise.white(record)
+        white = noise.whiten(record)
         return nnls(parts, white - base @ (base.T @ white), maxiter=20000)[1] ** 2
 
     # What whitens records makes noise of numbers, turned round.
-    colour = np.linalg.inv(noise.white(np.eye(used.sum())))
+    colour = np.linalg.inv(noise.whiten(np.eye(used.sum())))
     drawn = [left(model[used] + colour @ random.normal(size=used.sum())) for _ in range(DRAWS)]
     return left(signal[used]), float(np.mean(drawn))
 
@@ -133,7 +133,7 @@ def best_sum(shot, columns, model, noise, random):
 def main(argv=None):
     given = options(__doc__, argv, "pls", shots=30)
     record = read_pulsewaves(given.pls)
-    raw = straight_table(np.asarray(record.tables[1], float), True)
+    raw = amplitude_table(np.asarray(record.tables[1], float), True)
     strong = [
         Shot(shot, raw)
         for shot in record
@@ -159,10 +159,10 @@ def main(argv=None):
         model = recorders[i].recorded(fits.fitted[i, 0], own)
         signal, sigma = shot.window()
         used = np.isfinite(sigma)
-        terms = Terms(recorders[i], [scale_of(SCALE, [])], lidars[i], TIME.size)
+        terms = RecorderModel(recorders[i], [scale_unknown(SCALE, [])], lidars[i], TIME.size)
         flat = np.concatenate([np.ravel(own[name]) for name in ("receiver width", "offset", "scale")])
         common = terms.pulse_noise(fits.fitted[i], flat)
-        noise = Noise(sigma[used], common[0][used], correlation_between(CORRELATED, used[None]))
+        noise = SampleNoise(sigma[used], common[0][used], neighbour_correlation(CORRELATED, used[None]))
         sums.append(best_sum(shot, columns_of(lidars[i], recorders[i]), model, noise, random))
         residuals.append(np.where(used, signal - model, np.nan) / np.nanmax(model))
     best, expected = np.sum(sums, axis=0)

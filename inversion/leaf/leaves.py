@@ -1,4 +1,10 @@
-"""Retrieval of leaf traits from reflectance and transmittance: inversion of PROSPECT for many leaves."""
+"""Retrieval of leaf traits from reflectance and transmittance: inversion of PROSPECT for many leaves.
+
+1. Every leaf is fitted to all its bands by weighted least squares (`solver.py`).
+2. Traits with a spectral domain of their own are fitted again to its bands, with the others fixed. PROSPECT's
+   errors then affect them less, because in these bands few other constituents absorb (Feret et al. 2019).
+3. Standard errors include PROSPECT's own error, correlated over wavelengths (`errors.py`).
+"""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, final
@@ -9,15 +15,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from inversion.leaf.leaf_domains import bands_of, domains_of
-from inversion.leaf.leaf_errors import Stage, inverse_root, trait_errors
-from inversion.leaf.leaf_solver import State, Task, fit_all
+from inversion.leaf.errors import LinearisedFit, inverse_root, trait_errors
+from inversion.leaf.solver import LeafFitState, LeafProblem, fit_leaves
 from jaxlidar import Prospect
 from jaxlidar.extend import check_range
 from jaxlidar.optics.coefficients import TRAITS
 from jaxlidar.optics.leaf_surface import LeafSurface
 from jaxlidar.optics.prospect import material
 
+# Default bounds of N and contents, in the units of `Prospect`; the lower ones are the least admissible.
 _BOUNDS = {
     "N": (1.0, 5.0),
     "Cab": (0.0, 150.0),
@@ -29,12 +35,28 @@ _BOUNDS = {
     "Cp": (0.0, 0.02),
     "Cc": (0.0, 0.1),
 }
+# Domains "recommended", nm: Feret et al. (2019), Remote Sens. Environ. 231, 110959 (Cw, Cm); Feret et al.
+# (2021), 252, 112173 (Cp, Cc); Spafford et al. (2021), 252, 112176 (Cab, Car). Other traits have none.
+_RECOMMENDED_DOMAINS = {
+    "Cab": ((700.0, 720.0),),
+    "Car": ((520.0, 560.0),),
+    "Cw": ((1700.0, 2400.0),),
+    "Cm": ((1700.0, 2400.0),),
+}
+# Fraction of an interval of a domain that the bands must span.
+_LEAST_SPAN = 0.5
+# Spectra outside of this range are no fractions (per cent, say).
+_SPECTRUM_RANGE = (-1.0, 2.0)
 STATUS = (
     "converged",
     "not converged: stopped at max_steps",
     "not converged: no step improves the fit",
     "not fitted: no sample to fit, values are those of the start",
 )
+
+
+# Wavelength intervals of a domain, (low, high) in nm.
+Intervals = tuple[tuple[float, float], ...]
 
 
 @final
@@ -45,18 +67,18 @@ class LeafFit(eqx.Module):
     summary.
 
     - `traits`: by name, (leaves,) best values.
-    - `stderr`: by name, (leaves,) one standard error, of noise and PROSPECT's own error; infinite where the
-      spectra do not constrain the trait. That of a trait on a bound is computed as if there were no bound.
-    - `at_bound`: by name, (leaves,) whether the value lies on one of its bounds.
+    - `stderr`: by name, (leaves,) one standard error, of noise and PROSPECT's own error; infinite for a trait
+      that the spectra do not constrain. That of a trait on a bound is computed as if there were no bound.
+    - `at_bound`: by name, (leaves,) True if the value lies on one of its bounds.
     - `domain`: by name, (intervals, 2) first and last wavelength, nm, of the bands that gave the trait.
     - `leaves`: the fitted leaves, for `prospect_spectra`: a `Prospect` whose traits have shape (leaves,).
-    - `rmse`: (leaves,) root mean square of the residuals of all samples used, of both spectra; zero where
-      there are none. This and the next two are of the fit to all bands.
+    - `rmse`: (leaves,) root mean square of the residuals of all samples used, of both spectra; zero for a
+      leaf without samples. This and the next two are of the fit to all bands.
     - `reduced_chi2`: (leaves,) sum of squared residuals over their variances, divided by the number of
-      samples less that of unknowns. One by construction where no noise was given.
-    - `n_steps`: (leaves,) points tried with all bands, each one PROSPECT with its Jacobian. Two is usual:
-      spectra of many bands are first fitted to a part of them, and those points are not counted.
-    - `status`: (leaves,) how the fit ended, index of a sentence of `inversion.leaf.leaves.STATUS`; 0 is
+      samples less that of unknowns. One by construction if no noise was given.
+    - `n_steps`: (leaves,) points tried with all bands, each one PROSPECT with its Jacobian. Two is usual: if
+      there are many bands, a preliminary fit takes some of them only, and its points are not counted.
+    - `status`: (leaves,) outcome of the fit, index of a sentence of `inversion.leaf.leaves.STATUS`; 0 is
       convergence.
 
     **Example:**
@@ -82,11 +104,11 @@ class LeafFit(eqx.Module):
 
     @property
     def converged(self) -> Bool[Array, " leaves"]:
-        """Whether the fit ended at a minimum, for each leaf."""
+        """True for each leaf whose fit ended at a minimum."""
         return self.status == 0
 
     def sentence(self, leaf: int) -> str:
-        """How the fit of one leaf ended, in a sentence that names traits not determined or at a bound.
+        """Describe the outcome of one leaf's fit in a sentence, with traits not determined or at a bound.
 
         **Arguments:**
 
@@ -97,18 +119,18 @@ class LeafFit(eqx.Module):
         text = f"{STATUS[int(self.status[leaf])]} after {int(self.n_steps[leaf])} steps"
         notes = {
             "not determined": [name for name, e in self.stderr.items() if not np.isfinite(e[leaf])],
-            "at a bound": [name for name, held in self.at_bound.items() if held[leaf]],
+            "at a bound": [name for name, at_bound in self.at_bound.items() if at_bound[leaf]],
         }
         return "; ".join([text, *(f"{note}: {', '.join(names)}" for note, names in notes.items() if names)])
 
     def __str__(self) -> str:
         count = np.bincount(np.asarray(self.status), minlength=len(STATUS))
-        ends = [f"{n} {text}" for n, text in zip(count, STATUS) if n]
+        outcomes = [f"{n} {text}" for n, text in zip(count, STATUS) if n]
         rows = [
             f"{name.ljust(6)}  median {np.median(value):.4g} +- {np.median(self.stderr[name]):.2g}"
             for name, value in self.traits.items()
         ]
-        return "\n".join([*rows, f"rmse, median {np.median(self.rmse):.2g}; leaves: {', '.join(ends)}"])
+        return "\n".join([*rows, f"rmse, median {np.median(self.rmse):.2g}; leaves: {', '.join(outcomes)}"])
 
 
 def invert_leaves(
@@ -126,15 +148,15 @@ def invert_leaves(
 ) -> LeafFit:
     """Retrieve leaf traits from directional-hemispherical reflectance and transmittance, by PROSPECT.
 
-    Every leaf is fitted on its own. Missing samples are left out. A leaf that has no sample or does not
-    converge is marked so in its status and does not affect the others. Results are in JAX's default
-    precision. Equal shapes compile once (a few seconds).
+    Every leaf is fitted on its own. Missing samples are left out. The status of a leaf says if it has no
+    sample or does not converge; other leaves are not affected. Results are in JAX's default precision. Equal
+    shapes compile once (a few seconds).
 
-    Standard errors hold PROSPECT's own error too, correlated over wavelengths; its size and length follow
-    from the residuals of each leaf. They do not hold what residuals do not show, such as an absorption
-    coefficient that is wrong by the same factor everywhere.
+    Standard errors include PROSPECT's own error, correlated over wavelengths; its size and length follow from
+    the residuals of each leaf. They miss errors that residuals do not show, such as an absorption coefficient
+    that is wrong by the same factor everywhere.
 
-    Root mean squared errors on the measured leaves of two databases, and how many of them lie within two
+    Root mean squared errors on the measured leaves of two databases, and the fraction of values within two
     standard errors:
 
     | | Cab, ug/cm2 | Car, ug/cm2 | Cw, cm | Cm, g/cm2 |
@@ -151,19 +173,19 @@ def invert_leaves(
     **Arguments:**
 
     - `wavelengths`: (wavelengths,) nm, in any order, within PROSPECT's 400 to 2500.
-    - `reflectance`, `transmittance`: (leaves, wavelengths) fractions, or (wavelengths,) of one leaf; NaN
-      where a sample is missing. One of the two may be None, but without transmittance the data hardly
-      constrain N apart from the other traits.
+    - `reflectance`, `transmittance`: (leaves, wavelengths) fractions, or (wavelengths,) of one leaf; NaN for
+      missing samples. One of the two may be None, but without transmittance the data hardly separate N from
+      the other traits.
     - `unknowns`: names out of "N" and the traits of the version. Default None: all of them.
     - `leaf`: a `Prospect` that gives the version, alpha and coefficients, the starting values of the unknowns
       and the fixed values of the other traits; its traits are scalars or of shape (leaves,). Default None:
       that of `Prospect()`.
     - `bounds`: (low, high) by name. Default None: N 1 to 5; Cab 0 to 150, Car and Cant 0 to 50 ug/cm2; Cbrown
       0 to 5; Cw 0 to 0.1 cm; Cm and Cc 0 to 0.1, Cp 0 to 0.02 g/cm2. Those given replace these by name.
-    - `domain`: the bands that each trait comes from: (low, high) in nm by name, or several such pairs, or
+    - `domain`: the bands that each trait is fitted to: (low, high) in nm by name, or several such pairs, or
       "recommended": Cab 700 to 720, Car 520 to 560, Cw and Cm 1700 to 2400. All bands are fitted first.
-      Traits of equal domains are then fitted together to their bands, with N if both spectra are given; the
-      others keep their values. Traits without a domain come from all bands. Default None: all do.
+      Traits of equal domains are then fitted together to their bands, with N if both spectra are given; other
+      traits keep their values. Traits without a domain come from all bands. Default None: all traits do.
     - `noise`: one standard deviation, above 0, of all samples, or an array that broadcasts to
       (leaves, 2, wavelengths), the middle axis reflectance and transmittance. Infinity leaves a sample out.
       PROSPECT's own error comes on top. Default None: unknown and the same for all samples.
@@ -176,12 +198,12 @@ def invert_leaves(
     say), of shapes that differ or do not fit the wavelengths, or both None; wavelengths outside the table;
     noise that is not above 0; unknowns or bounds that the version does not have, or given twice; bounds that
     do not increase or admit N below 1 or negative contents; a start outside its bounds; a domain that is no
-    pair of wavelengths, of no unknown, or of which the wavelengths do not span half; `max_steps` or `chunk`
-    below 1.
+    pair of wavelengths, belongs to no unknown, or is not half spanned by the wavelengths; `max_steps` or
+    `chunk` below 1.
 
     **Source:** Jacquemoud et al. (1996), Remote Sens. Environ. 56, 194; Feret et al. (2017), 193, 204;
     domains of Feret et al. (2019), 231, 110959 and Spafford et al. (2021), 252, 112176, who fit other
-    traits along with Cab and Car and fix the rest at common values; errors as in `inversion.leaf_errors`.
+    traits along with Cab and Car and fix the rest at common values; errors as in `inversion.leaf.errors`.
 
     **Example:**
 
@@ -195,94 +217,131 @@ def invert_leaves(
     Cab 50.0 ug/cm2, Cw 0.012 cm
     """
     leaf = Prospect() if leaf is None else leaf
-    known = ("N", *TRAITS[leaf.version])
-    names = known if unknowns is None else tuple(unknowns)
-    observed, sigma = _data(wavelengths, reflectance, transmittance, noise)
-    start, low, high = _limits(leaf, known, names, bounds or {}, len(observed))
+    trait_names = ("N", *TRAITS[leaf.version])
+    unknown_names = trait_names if unknowns is None else tuple(unknowns)
+    observed, sigma = _check_spectra(wavelengths, reflectance, transmittance, noise)
+    start, low, high = _start_and_bounds(leaf, trait_names, unknown_names, bounds or {}, len(observed))
     for field, value in (("max_steps", max_steps), ("chunk", chunk)):
         if value != int(value) or value < 1:
             raise ValueError(f"{field} = {value} is outside the admissible range [1, inf) of integers")
     x = np.asarray(wavelengths, float)
-    groups = [(group, *bands_of(x, span, group)) for span, group in domains_of(domain, names).items()]
+    domains = [
+        (names, *_bands_in(x, intervals, names))
+        for intervals, names in _names_by_domain(domain, unknown_names).items()
+    ]
     dtype = jnp.result_type(float)
-    absorption, face = material(leaf, x)
-    absorption, face = absorption.astype(dtype), jax.tree.map(lambda a: jnp.asarray(a, dtype), face)
+    # Tables at the wavelengths of the spectra, and the solver's precision.
+    absorption, surface = material(leaf, x)
+    absorption, surface = absorption.astype(dtype), jax.tree.map(lambda a: jnp.asarray(a, dtype), surface)
     sigma = jnp.broadcast_to(jnp.asarray(sigma, dtype), observed.shape)
     start, low, high = (jnp.asarray(a, dtype) for a in (start, low, high))
-    task = Task(start, low, high, jnp.asarray(observed, dtype), sigma)
+    problem = LeafProblem(start, low, high, jnp.asarray(observed, dtype), sigma)
 
-    def fit(task: Task, free: Sequence[str], bands: np.ndarray) -> tuple[State, Stage, np.ndarray]:
-        """The fit of some traits, the others fixed, to some bands, and which traits it leaves open."""
-        fixed = np.array([name not in free for name in known])
-        end = fit_all(
-            task._replace(
-                low=jnp.where(fixed[None], task.start, task.low),
-                high=jnp.where(fixed[None], task.start, task.high),
-                observed=task.observed[..., bands],
-                sigma=task.sigma[..., bands],
+    def fit_bands(
+        problem: LeafProblem, free_names: Sequence[str], bands: np.ndarray
+    ) -> tuple[LeafFitState, LinearisedFit, np.ndarray]:
+        """Fit some traits, the others fixed, to some bands; True for traits that are not determined."""
+        is_fixed = np.array([name not in free_names for name in trait_names])
+        state = fit_leaves(
+            problem._replace(
+                low=jnp.where(is_fixed[None], problem.start, problem.low),
+                high=jnp.where(is_fixed[None], problem.start, problem.high),
+                observed=problem.observed[..., bands],
+                sigma=problem.sigma[..., bands],
             ),
             absorption[:, bands],
-            LeafSurface(*(a[bands] for a in face)),
-            len(free),
+            LeafSurface(*(a[bands] for a in surface)),
+            # Arguments that are traced: other values do not compile again.
+            len(free_names),
             int(max_steps),
             int(chunk),
         )
-        normal = np.asarray(end.best.normal, float)
-        root, lost = inverse_root(normal * np.outer(~fixed, ~fixed))
-        root = root * ~fixed[:, None]
-        link = root @ root.transpose(0, 2, 1) @ (normal * fixed)
-        used = jnp.broadcast_to(jnp.asarray(bands, dtype), (len(normal), x.size))
-        return end, Stage(end.best.x, jnp.asarray(root, dtype), jnp.asarray(link, dtype), used), lost
+        normal = np.asarray(state.best.normal, float)
+        root, is_lost = inverse_root(normal * np.outer(~is_fixed, ~is_fixed))
+        root = root * ~is_fixed[:, None]
+        # Implicit differentiation of J'Wr = 0: dx_free = -(J'WJ)^-1 J'WJ_fixed dx_fixed.
+        link = root @ root.transpose(0, 2, 1) @ (normal * is_fixed)
+        used_bands = jnp.broadcast_to(jnp.asarray(bands, dtype), (len(normal), x.size))
+        linearised = LinearisedFit(
+            state.best.x, jnp.asarray(root, dtype), jnp.asarray(link, dtype), used_bands
+        )
+        return state, linearised, is_lost
 
-    end, stage, lost = fit(task, names, np.ones(x.size, bool))
-    stages, ends = [stage._replace(link=jnp.zeros_like(stage.link))], [end]
-    of, best = np.zeros(len(known), int), end.best.x
-    domains = {name: np.array([[x.min(), x.max()]]) for name in names}
-    both = reflectance is not None and transmittance is not None
-    for group, bands, span in groups:
-        # Of one spectrum alone, the bands of a domain do not tell N apart from the traits.
-        free = [n for n in names if n in group or (n == "N" and both)]
-        other, stage, open_ = fit(task._replace(start=end.best.x), free, bands)
-        mine = np.array([name in group for name in known])
-        of[mine] = len(stages)
-        best, lost = jnp.where(mine[None], other.best.x, best), np.where(mine, open_, lost)
-        domains |= dict.fromkeys(group, span)
-        stages, ends = [*stages, stage], [*ends, other]
+    # All bands, for all unknowns.
+    all_bands, linearised, is_lost = fit_bands(problem, unknown_names, np.ones(x.size, bool))
+    linearised_fits, states = [linearised._replace(link=jnp.zeros_like(linearised.link))], [all_bands]
+    fit_of_trait, best = np.zeros(len(trait_names), int), all_bands.best.x
+    band_limits = {name: np.array([[x.min(), x.max()]]) for name in unknown_names}
+
+    # Each domain, for its traits. One spectrum alone does not separate N from them in so few bands.
+    has_both_spectra = reflectance is not None and transmittance is not None
+    for names, bands, limits in domains:
+        free_names = [n for n in unknown_names if n in names or (n == "N" and has_both_spectra)]
+        state, linearised, is_lost_here = fit_bands(
+            problem._replace(start=all_bands.best.x), free_names, bands
+        )
+        is_of_domain = np.array([name in names for name in trait_names])
+        fit_of_trait[is_of_domain] = len(linearised_fits)
+        # N comes from all bands, also where it was free.
+        best = jnp.where(is_of_domain[None], state.best.x, best)
+        is_lost = np.where(is_of_domain, is_lost_here, is_lost)
+        band_limits |= dict.fromkeys(names, limits)
+        linearised_fits, states = [*linearised_fits, linearised], [*states, state]
+
     errors = trait_errors(
-        x, task.observed, sigma, absorption, face, stages, of, noise is not None, int(chunk)
+        x,
+        problem.observed,
+        sigma,
+        absorption,
+        surface,
+        linearised_fits,
+        fit_of_trait,
+        noise is not None,
+        int(chunk),
     )
-    errors = jnp.where(lost | (errors > task.high - task.low), jnp.inf, errors)
-    samples = np.count_nonzero(~np.isnan(observed) & np.isfinite(sigma), axis=(1, 2))
-    reduced = end.best.chi2 / np.maximum(samples - len(names), 1)
-    done = jnp.stack([e.done for e in ends])
-    tried = jnp.stack([e.steps for e in ends])
-    stopped = jnp.where(jnp.any(~done & (tried >= max_steps), axis=0), 1, 2)
-    found, error = (dict(zip(known, a.T)) for a in (best, errors))
-    at_bound = dict(zip(known, ((best <= task.low) | (best >= task.high)).T))
-    # Traits that the version does not have are zero.
-    shown = {name: found.get(name, jnp.zeros_like(reduced)) for name in _BOUNDS}
+    # An error beyond the width of the bounds says no more than they do.
+    errors = jnp.where(is_lost | (errors > problem.high - problem.low), jnp.inf, errors)
+    n_samples = np.count_nonzero(~np.isnan(observed) & np.isfinite(sigma), axis=(1, 2))
+    reduced_chi2 = all_bands.best.chi2 / np.maximum(n_samples - len(unknown_names), 1)
+    at_bound = dict(zip(trait_names, ((best <= problem.low) | (best >= problem.high)).T))
+    values, stderr = dict(zip(trait_names, best.T)), dict(zip(trait_names, errors.T))
+    # A `Prospect` has all traits; those that the version does not have are zero.
+    all_values = [values.get(name, jnp.zeros_like(reduced_chi2)) for name in _BOUNDS]
     return LeafFit(
-        traits={name: found[name] for name in names},
-        stderr={name: error[name] for name in names},
-        at_bound={name: at_bound[name] for name in names},
-        domain={name: jnp.asarray(domains[name], dtype) for name in names},
-        leaves=eqx.tree_at(lambda p: [getattr(p, n) for n in _BOUNDS], leaf, list(shown.values())),
-        rmse=jnp.sqrt(end.best.square / np.maximum(samples, 1)),
-        reduced_chi2=jnp.ones_like(reduced) if noise is None else reduced,
-        n_steps=end.steps,
-        status=jnp.where(samples == 0, 3, jnp.where(jnp.all(done, axis=0), 0, stopped)),
+        traits={name: values[name] for name in unknown_names},
+        stderr={name: stderr[name] for name in unknown_names},
+        at_bound={name: at_bound[name] for name in unknown_names},
+        domain={name: jnp.asarray(band_limits[name], dtype) for name in unknown_names},
+        leaves=eqx.tree_at(lambda p: [getattr(p, name) for name in _BOUNDS], leaf, all_values),
+        rmse=jnp.sqrt(all_bands.best.sum_of_squares / np.maximum(n_samples, 1)),
+        reduced_chi2=jnp.ones_like(reduced_chi2) if noise is None else reduced_chi2,
+        n_steps=all_bands.n_steps,
+        status=_status(states, n_samples, max_steps),
     )
 
 
-def _data(
+def _status(
+    states: Sequence[LeafFitState], n_samples: Int[np.ndarray, " leaves"], max_steps: int
+) -> Int[Array, " leaves"]:
+    """Index into `STATUS` of each leaf: converged if all its fits have."""
+    converged = jnp.stack([state.converged for state in states])
+    tried = jnp.stack([state.n_steps for state in states])
+    not_converged = jnp.where(jnp.any(~converged & (tried >= max_steps), axis=0), 1, 2)
+    return jnp.where(n_samples == 0, 3, jnp.where(jnp.all(converged, axis=0), 0, not_converged))
+
+
+def _check_spectra(
     wavelengths: Any, reflectance: Any, transmittance: Any, noise: Any
 ) -> tuple[Float[np.ndarray, "leaves 2 wavelengths"], Float[np.ndarray, "_ _ _"]]:
-    """Spectra, NaN where there is no sample, and standard deviations that broadcast to them."""
+    """Return spectra, NaN for missing samples, and standard deviations that broadcast to them.
+
+    **Raises:** ValueError for shapes that do not match and for values outside of their ranges.
+    """
     x = np.asarray(wavelengths, float)
     if x.ndim != 1 or x.size == 0:
         raise ValueError(f"wavelengths has the shape {x.shape}; admissible is (wavelengths,), one or more")
-    given = {"reflectance": reflectance, "transmittance": transmittance}
-    spectra = {name: np.atleast_2d(np.asarray(s, float)) for name, s in given.items() if s is not None}
+    arguments = {"reflectance": reflectance, "transmittance": transmittance}
+    spectra = {name: np.atleast_2d(np.asarray(s, float)) for name, s in arguments.items() if s is not None}
     if not spectra:
         raise ValueError(
             "reflectance = None and transmittance = None; admissible is an array for one or both"
@@ -294,8 +353,8 @@ def _data(
                 f"{name} has the shape {s.shape}; admissible is (leaves, wavelengths), one leaf or more, "
                 f"here {shape}"
             )
-        check_range(name, s[~np.isnan(s)], -1.0, 2.0)
-    observed = np.stack([spectra.get(name, np.full(shape, np.nan)) for name in given], axis=1)
+        check_range(name, s[~np.isnan(s)], *_SPECTRUM_RANGE)
+    observed = np.stack([spectra.get(name, np.full(shape, np.nan)) for name in arguments], axis=1)
     sigma = np.asarray(1.0 if noise is None else noise, float)
     try:
         np.broadcast_to(sigma, observed.shape)
@@ -309,26 +368,35 @@ def _data(
     return observed, sigma[(None,) * (3 - sigma.ndim)]
 
 
-def _limits(
-    leaf: Prospect, known: tuple[str, ...], names: tuple[str, ...], bounds: Mapping[str, Any], count: int
+def _start_and_bounds(
+    leaf: Prospect,
+    trait_names: tuple[str, ...],
+    unknown_names: tuple[str, ...],
+    bounds: Mapping[str, Any],
+    n_leaves: int,
 ) -> list[Float[np.ndarray, "leaves traits"]]:
-    """Start, lower and upper bounds of N and all traits; traits that are not unknowns have equal bounds."""
-    admissible = ", ".join(known)
-    for i, name in enumerate(names):
-        if name not in known or name in names[:i]:
-            raise ValueError(f"unknowns = {names}: {name!r} is given twice or is none of {admissible}")
-    if not names:
+    """Return start, lower and upper bounds of N and all contents; equal bounds fix those not unknown.
+
+    **Raises:** ValueError for names that the version does not have, and for inadmissible bounds and starts.
+    """
+    admissible = ", ".join(trait_names)
+    for i, name in enumerate(unknown_names):
+        if name not in trait_names or name in unknown_names[:i]:
+            raise ValueError(
+                f"unknowns = {unknown_names}: {name!r} is given twice or is none of {admissible}"
+            )
+    if not unknown_names:
         raise ValueError(f"unknowns is empty; admissible is one or more of {admissible}")
     for name in bounds:
-        if name not in names:
-            raise ValueError(f"bounds: {name!r} is none of the unknowns {', '.join(names)}")
+        if name not in unknown_names:
+            raise ValueError(f"bounds: {name!r} is none of the unknowns {', '.join(unknown_names)}")
     columns = []
-    for name in known:
+    for name in trait_names:
         value = np.asarray(getattr(leaf, name), float)
-        if value.shape not in ((), (count,)):
-            raise ValueError(f"leaf: {name} has the shape {value.shape}; admissible is () or ({count},)")
+        if value.shape not in ((), (n_leaves,)):
+            raise ValueError(f"leaf: {name} has the shape {value.shape}; admissible is () or ({n_leaves},)")
         low = high = value
-        if name in names:
+        if name in unknown_names:
             try:
                 low, high = (float(b) for b in bounds.get(name, _BOUNDS[name]))
             except (TypeError, ValueError):
@@ -336,5 +404,64 @@ def _limits(
             check_range(f"bounds: lower of {name}", low, _BOUNDS[name][0])
             check_range(f"bounds: upper of {name}", high, low, low_open=True)
             check_range(f"leaf: the start of {name}", value, low, high)
-        columns.append([np.broadcast_to(a, count) for a in (value, low, high)])
+        columns.append([np.broadcast_to(a, n_leaves) for a in (value, low, high)])
     return list(np.stack(columns, axis=2))
+
+
+def _names_by_domain(
+    domain: str | Mapping[str, Any] | None, unknown_names: Sequence[str]
+) -> dict[Intervals, tuple[str, ...]]:
+    """Return the unknowns of every domain, by its intervals, without those that have none.
+
+    **Raises:** ValueError for a domain of no unknown, or one that is not a pair or several pairs.
+    """
+    if domain is None:
+        return {}
+    if isinstance(domain, str):
+        if domain != "recommended":
+            raise ValueError(f"domain = {domain!r} is none of None, 'recommended' and a mapping")
+        domain_of = {n: _RECOMMENDED_DOMAINS[n] for n in unknown_names if n in _RECOMMENDED_DOMAINS}
+    else:
+        domain_of = {name: _intervals(name, value) for name, value in domain.items()}
+    groups: dict[Intervals, tuple[str, ...]] = {}
+    for name, intervals in domain_of.items():
+        if name not in unknown_names:
+            raise ValueError(f"domain: {name!r} is none of the unknowns {', '.join(unknown_names)}")
+        groups[intervals] = (*groups.get(intervals, ()), name)
+    return groups
+
+
+def _intervals(name: str, value: Any) -> Intervals:
+    """Return a pair (low, high), or several, as a tuple of pairs. **Raises:** ValueError for other values."""
+    try:
+        pairs = np.atleast_1d(np.asarray(value, float))
+        pairs = pairs.reshape(1, 2) if pairs.shape == (2,) else pairs
+    except (TypeError, ValueError):
+        pairs = np.empty((0, 2))
+    if pairs.shape != (len(pairs), 2) or len(pairs) == 0 or not np.all(pairs[:, 0] <= pairs[:, 1]):
+        raise ValueError(
+            f"domain: {name} = {value!r} is neither a pair (low, high), nm, low <= high, nor several of them"
+        )
+    return tuple((low, high) for low, high in pairs.tolist())
+
+
+def _bands_in(
+    wavelengths: Float[np.ndarray, " wavelengths"], intervals: Intervals, names: Sequence[str]
+) -> tuple[Bool[np.ndarray, " wavelengths"], Float[np.ndarray, "intervals 2"]]:
+    """Return True for wavelengths in the intervals, and the first and last wavelength in each interval.
+
+    **Raises:** ValueError for an interval that is not half spanned, with the names of its traits.
+    """
+    in_domain, limits = np.zeros(wavelengths.size, bool), []
+    for low, high in intervals:
+        in_interval = (wavelengths >= low) & (wavelengths <= high)
+        inside = wavelengths[in_interval]
+        if inside.size == 0 or np.ptp(inside) < _LEAST_SPAN * (high - low):
+            raise ValueError(
+                f"wavelengths {np.min(wavelengths):g} to {np.max(wavelengths):g} nm do not span half of "
+                f"{low:g} to {high:g} nm, the domain of {', '.join(names)}: give these bands, another domain "
+                "or other unknowns"
+            )
+        in_domain |= in_interval
+        limits.append((inside.min(), inside.max()))
+    return in_domain, np.array(limits)

@@ -1,33 +1,51 @@
-"""Ground and canopy in a record's energy, gap probability and plant area, without a model of the scene.
+r"""Energy of ground and canopy in a record, gap probability and plant area, without a model of the scene.
 
-`gap_probability` and `plant_area_index` are formulas; `ground_and_canopy` splits a record, and
-`plant_area_profile` makes layers of it. All are differentiable.
+**Split.** The record between the ends of its signal is E(z1, z2), the energy from heights z1 to z2. Nothing
+but ground returns light below the mode m of the ground's echo. With phi the fraction of the pulse's energy
+that follows the pulse's own mode,
+
+    E_ground = E(bottom, m) / phi,    E_canopy = E(bottom, top) - E_ground
+
+(Drake et al. 2002, whose symmetric echo has phi = 1/2).
+
+**Gap probability** down to z, with Rv(z) the canopy's energy from above z (Ni-Meister et al. 2001):
+
+    P(z) = 1 - Rv(z) / (Rv + Rg rho_v / rho_g),    Rv = E_canopy, Rg = E_ground.
+
+**Plant area** by Beer's law, with G the projection function, Omega the clumping index and theta the zenith
+angle of the beam:
+
+    PAI(z) = -ln P(z) cos(theta) / (G Omega),    density of a layer = -d PAI / dz.
+
+All functions are differentiable.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from inversion.metrics.heights import SignalEnds, find_ground, record, signal_ends
-from inversion.metrics.pulses import METRES_PER_NS, Pulse, pulse_samples, response, steps_of
-from inversion.metrics.records import over_shots
+from inversion.metrics.heights import SignalEnds, find_ground, signal_ends
+from inversion.metrics.records import Pulse, over_shots, pad_record, sample_pulse_at_heights, smooth_pulse
 from jaxlidar.extend import as_array, check_range, concrete
+
+# Least fraction of a pulse after its mode, and least energy of an echo's lower half, that are divided by.
+_LEAST_LATE_FRACTION, _LEAST_HALF = 1e-3, 1e-30
 
 Samples = Float[Array, " bins"]
 
 
 class GroundAndCanopy(NamedTuple):
-    """A record's energy, split, of one record, (), or several, (shots,). NaN where no ground was found.
+    """Energy of ground and canopy in one record, (), or several, (shots,). NaN in records without ground.
 
     - `height`: of the ground in m.
     - `ground`, `canopy`: energy in units of the record, summed over samples.
     - `gap`: gap probability in the direction of the beam.
 
-    **Example:** plant area where the ground was found.
+    **Example:** plant area of two records.
 
     >>> import inversion, numpy as np
     >>> split = inversion.GroundAndCanopy(*np.array([[2.0, 3.0], [50.0, 80.0], [25.0, 0.0], [0.75, 0.5]]))
@@ -51,18 +69,16 @@ def ground_and_canopy(
     noise: Float[ArrayLike, "..."] | None = None,
     reflectance_ratio: float = 1.5,
 ) -> GroundAndCanopy:
-    """Energy of ground and canopy by the ground's lower half, which no canopy reaches, and the gap
-    probability.
+    """Split a record's energy into ground and canopy, and return the gap probability.
 
-    What returns after the mode of the ground's echo is the ground's alone. That energy over the share of the
-    pulse that comes after its own mode is the ground's; what is left of the signal is the canopy's. Slopes
-    and roughness that widen the echo evenly change little. Differentiable in `power`.
+    Light that returns after the mode of the ground's echo is the ground's alone. Its energy over the fraction
+    of the pulse that follows the pulse's own mode is the ground's; the rest of the signal is the canopy's.
+    Slope and roughness that widen the echo evenly change little. Differentiable in `power`.
 
     **Arguments:**
 
     - `height`, `power`, `pulse`, `noise`: as for `signal_ends`.
-    - `ground`: height of the ground in m, () or (shots,): where the pulse's time zero lies. Default:
-      `find_ground`'s.
+    - `ground`: height of the ground in m, () or (shots,), at the echo's time zero. Default: `find_ground`'s.
     - `ends`: of the signal in m. Default: those of `signal_ends`.
     - `reflectance_ratio`: rho_v / rho_g, above 0. Default 1.5, GEDI's.
 
@@ -92,35 +108,48 @@ def ground_and_canopy(
     if ends is None:
         ends = signal_ends(height, power, pulse=pulse, noise=noise)
     top, bottom = (as_array(end) for end in ends)
-    z, y, count = record(height, power)
-    lags = pulse_samples(pulse, steps_of(height, METRES_PER_NS))
-    base = as_array(ground)
-    below, above = _below_and_above(z, y, count, lags, base, top, bottom)
-    canopy = jnp.maximum(above - below, 0.0)
-    total = canopy + below * reflectance_ratio
-    gap = 1.0 - canopy / jnp.where(total > 0, total, 1.0)
-    return GroundAndCanopy(base, below, canopy, jnp.where(total > 0, gap, jnp.nan))
+    ground_height = as_array(ground)
+    ground_energy, signal_energy = _split_energy(
+        **pad_record(height, power)._asdict(),
+        pulse=sample_pulse_at_heights(pulse, height),
+        ground=ground_height,
+        top=top,
+        bottom=bottom,
+    )
+    canopy_energy = jnp.maximum(signal_energy - ground_energy, 0.0)
+    # The energy that the footprint would return if all of it were as bright as plants.
+    total = canopy_energy + ground_energy * reflectance_ratio
+    gap = 1.0 - canopy_energy / jnp.where(total > 0, total, 1.0)
+    return GroundAndCanopy(ground_height, ground_energy, canopy_energy, jnp.where(total > 0, gap, jnp.nan))
 
 
-@over_shots(1, 1, 0, 1, 0, 0, 0)
-def _below_and_above(z, y, count, pulse, ground, top, bottom):
-    """Energy of the ground, at most all, and all energy between the signal's ends."""
-    step = z[0] - z[1]
-    real = jnp.arange(y.size) < count
+@over_shots(height=1, power=1, n_samples=0, pulse=1, ground=0, top=0, bottom=0)
+def _split_energy(height, power, n_samples, pulse, ground, top, bottom):
+    """Energy of the ground, at most that of the signal, and energy of the signal, of one padded record.
+
+    1. Energy of the signal, between its ends.
+    2. Energy below the mode of the ground's echo, which lies `mode` samples after its time zero.
+    3. Fraction of the pulse's energy after its mode, each sample spread evenly over its step.
+    """
+    step = height[0] - height[1]
+    is_recorded = jnp.arange(power.size) < n_samples
 
     def above(level):
-        """Energy that returns from above a height, of samples as wide as a step."""
-        share = jnp.clip((z + 0.5 * step - level) / step, 0.0, 1.0)
-        return jnp.sum(jnp.where(real, y * share, 0.0))
+        """Energy from above a height, with each sample spread evenly over its step."""
+        fraction = jnp.clip((height + 0.5 * step - level) / step, 0.0, 1.0)
+        return jnp.sum(jnp.where(is_recorded, power * fraction, 0.0))
 
-    total = above(bottom) - above(top)
-    mode = response(pulse).mode
-    late = above(bottom) - above(ground - mode * step)
+    signal_energy = above(bottom) - above(top)
+    # Of the smoothed pulse, as `find_ground` reads the smoothed record.
+    mode = smooth_pulse(pulse).mode
+    late_energy = above(bottom) - above(ground - mode * step)
     lag = jnp.arange(pulse.size) - pulse.size // 2
-    after = jnp.sum(pulse * jnp.clip(lag + 0.5 - mode, 0.0, 1.0)) / jnp.sum(pulse)
-    energy = jnp.maximum(late, 0.0) / jnp.maximum(after, 1e-3)
-    missing = jnp.isnan(ground) | jnp.isnan(top)
-    return jnp.where(missing, jnp.nan, jnp.minimum(energy, total)), jnp.where(missing, jnp.nan, total)
+    late_fraction = jnp.sum(pulse * jnp.clip(lag + 0.5 - mode, 0.0, 1.0)) / jnp.sum(pulse)
+    # A pulse that ends at its mode says nothing of the energy before it.
+    ground_energy = jnp.maximum(late_energy, 0.0) / jnp.maximum(late_fraction, _LEAST_LATE_FRACTION)
+    is_missing = jnp.isnan(ground) | jnp.isnan(top)
+    ground_energy = jnp.minimum(ground_energy, signal_energy)
+    return jnp.where(is_missing, jnp.nan, ground_energy), jnp.where(is_missing, jnp.nan, signal_energy)
 
 
 def gap_probability(
@@ -129,7 +158,7 @@ def gap_probability(
     *,
     reflectance_ratio: float = 1.5,
 ) -> Samples:
-    """Gap probability from above the canopy down to each sample, in the direction of the beam.
+    """Return the gap probability from above the canopy down to each sample, in the direction of the beam.
 
     P(z) = 1 - Rv(z) / (Rv + Rg rho_v / rho_g), with Rv(z) the energy that the canopy returned from above z.
 
@@ -154,15 +183,16 @@ def gap_probability(
     ['0.86', '0.57', '0.43']
     """
     check_range("reflectance_ratio", reflectance_ratio, 0.0, low_open=True)
-    above = jnp.cumsum(as_array(canopy))
-    total = above[-1] + as_array(ground) * reflectance_ratio
-    return 1.0 - above / jnp.where(total > 0, total, 1.0)
+    canopy_above = jnp.cumsum(as_array(canopy))
+    total = canopy_above[-1] + as_array(ground) * reflectance_ratio
+    # Nothing returned, nothing intercepted: the gap probability of an empty record is one.
+    return 1.0 - canopy_above / jnp.where(total > 0, total, 1.0)
 
 
 def plant_area_index(
     gap: Float[ArrayLike, "*s"], *, zenith: float = 0.0, projection: float = 0.5, clumping: float = 1.0
 ) -> Float[Array, "*s"]:
-    """Plant area index above each level from the gap probability there: -ln(P) cos(zenith) / (G Omega).
+    """Return the plant area index above each level from its gap probability: -ln(P) cos(zenith) / (G Omega).
 
     **Arguments:**
 
@@ -183,10 +213,15 @@ def plant_area_index(
     1.39
     """
     check_range("gap", gap, 0.0, 1.0, low_open=True)
+    _check_canopy_structure(zenith, projection, clumping)
+    return -jnp.log(as_array(gap)) * jnp.cos(jnp.deg2rad(zenith)) / (projection * clumping)
+
+
+def _check_canopy_structure(zenith: Any, projection: Any, clumping: Any) -> None:
+    """Check the arguments that turn optical depth into plant area. **Raises:** ValueError."""
     check_range("zenith", zenith, 0.0, 90.0, high_open=True)
     check_range("projection", projection, 0.0, 1.0, low_open=True)
     check_range("clumping", clumping, 0.0, low_open=True)
-    return -jnp.log(as_array(gap)) * jnp.cos(jnp.deg2rad(zenith)) / (projection * clumping)
 
 
 def plant_area_profile(
@@ -204,23 +239,23 @@ def plant_area_profile(
     clumping: float = 1.0,
     smallest_gap: float = 1e-3,
 ) -> Float[Array, "... layers"]:
-    """Plant area density of layers by the closed-form gap inversion, as GEDI's level 2B has it.
+    """Return the plant area density of layers by the closed-form gap inversion of GEDI's level 2B.
 
-    The ground's energy is that of `ground_and_canopy`; its echo is taken as even about its mode, of the shape
-    that its lower half shows, and subtracted. What is left, cumulated from the top, gives the gap
-    probability at the edges of the layers, and its logarithm's differences the plant area. Noise is not
-    smoothed: densities may be negative. The pulse is not taken out: layers thinner than it share their
-    plants. Differentiable in `power`.
+    The ground's energy is that of `ground_and_canopy`. Its echo is taken as symmetric about its mode, with
+    the shape of its lower half, and subtracted. The rest, cumulated from the top, gives the gap probability
+    at the edges of the layers; differences of its logarithm give the plant area. Noise is not smoothed:
+    densities may be negative. The pulse is not deconvolved: layers thinner than it mix their plants.
+    Differentiable in `power`.
 
     **Arguments:**
 
     - `height`, `power`, `pulse`, `ground`, `ends`, `noise`, `reflectance_ratio`: as for `ground_and_canopy`.
     - `edges`: (edges,) heights of the layers' edges above the ground in m, increasing, at least two.
     - `zenith`, `projection`, `clumping`: as for `plant_area_index`.
-    - `smallest_gap`: gap probabilities below it are taken for it, in (0, 1). Default 1e-3.
+    - `smallest_gap`: lower limit of gap probabilities, in (0, 1). Default 1e-3.
 
-    **Returns:** (layers,) or (shots, layers) m2 of plant area per m3, from the lowest layer up. NaN where no
-    ground was found.
+    **Returns:** (layers,) or (shots, layers) m2 of plant area per m3, from the lowest layer up. NaN in
+    records without ground.
 
     **Raises:** ValueError for inadmissible arguments.
 
@@ -237,53 +272,71 @@ def plant_area_profile(
     >>> pulse = np.exp(-0.5 * (np.arange(-9.0, 10.0) / 3.0) ** 2)
     >>> power = np.convolve(power, pulse / pulse.sum(), mode="same")
     >>> edges = [2.0, 6.0, 10.0, 14.0]
-    >>> given = {"edges": edges, "pulse": pulse, "reflectance_ratio": 1.0}
-    >>> density = inversion.plant_area_profile(height, power, **given)
+    >>> options = {"edges": edges, "pulse": pulse, "reflectance_ratio": 1.0}
+    >>> density = inversion.plant_area_profile(height, power, **options)
     >>> [f"{float(d):.1f}" for d in 2.0 * density]
     ['0.2', '0.5', '0.3']
     """
     check_range("smallest_gap", smallest_gap, 0.0, 1.0, low_open=True, high_open=True)
-    levels = as_array(edges, "edges")
-    known = concrete(levels)
-    if levels.ndim != 1 or levels.size < 2 or (known is not None and not np.all(np.diff(known) > 0)):
+    edge_heights = as_array(edges, "edges")
+    # Inside a JAX transformation that traces the edges, their order cannot be checked.
+    edge_values = concrete(edge_heights)
+    if (
+        edge_heights.ndim != 1
+        or edge_heights.size < 2
+        or (edge_values is not None and not np.all(np.diff(edge_values) > 0))
+    ):
         raise ValueError(f"edges = {edges}; admissible are two heights or more, increasing")
     if ends is None:
         ends = signal_ends(height, power, pulse=pulse, noise=noise)
     split = ground_and_canopy(
         height, power, pulse=pulse, ground=ground, ends=ends, noise=noise, reflectance_ratio=reflectance_ratio
     )
-    z, y, count = record(height, power)
-    lags = pulse_samples(pulse, steps_of(height, METRES_PER_NS))
+    top, bottom = (as_array(end) for end in ends)
     total = split.canopy + split.ground * reflectance_ratio
-    above = _canopy_above(z, y, count, lags, split.height, split.ground, *map(as_array, ends), levels)
-    above = jnp.clip(above, 0.0, split.canopy[..., None])
-    gap = 1.0 - above / jnp.where(total > 0, total, 1.0)[..., None]
+    canopy_above = _canopy_energy_above(
+        **pad_record(height, power)._asdict(),
+        pulse=sample_pulse_at_heights(pulse, height),
+        ground=split.height,
+        ground_energy=split.ground,
+        top=top,
+        bottom=bottom,
+        levels=edge_heights,
+    )
+    # Noise, and levels above the signal's top, make it negative or larger than all of the canopy's.
+    canopy_above = jnp.clip(canopy_above, 0.0, split.canopy[..., None])
+    gap = 1.0 - canopy_above / jnp.where(total > 0, total, 1.0)[..., None]
     gap = jnp.where((total > 0)[..., None], jnp.maximum(gap, smallest_gap), jnp.nan)
-    depth = jnp.diff(jnp.log(gap), axis=-1) / jnp.diff(levels)[(None,) * (gap.ndim - 1)]
-    check_range("zenith", zenith, 0.0, 90.0, high_open=True)
-    check_range("projection", projection, 0.0, 1.0, low_open=True)
-    check_range("clumping", clumping, 0.0, low_open=True)
-    return depth * jnp.cos(jnp.deg2rad(zenith)) / (projection * clumping)
+    # ln P grows with height, so the extinction of each layer is its difference over the thickness.
+    thickness = jnp.diff(edge_heights)[(None,) * (gap.ndim - 1)]
+    extinction = jnp.diff(jnp.log(gap), axis=-1) / thickness
+    _check_canopy_structure(zenith, projection, clumping)
+    return extinction * jnp.cos(jnp.deg2rad(zenith)) / (projection * clumping)
 
 
-@over_shots(1, 1, 0, 1, 0, 0, 0, 0, 1)
-def _canopy_above(z, y, count, pulse, ground, energy, top, bottom, levels):
-    """The canopy's energy from above heights over the ground: all of it, less the ground's even echo."""
-    step = z[0] - z[1]
-    real = jnp.arange(y.size) < count
-    mode = ground - response(pulse).mode * step
+@over_shots(height=1, power=1, n_samples=0, pulse=1, ground=0, ground_energy=0, top=0, bottom=0, levels=1)
+def _canopy_energy_above(height, power, n_samples, pulse, ground, ground_energy, top, bottom, levels):
+    """Energy of the canopy from above levels over the ground, of one padded record.
+
+    It is all energy from above a level, less that of the ground's echo. The upper half of a symmetric echo
+    has, from above a height r over its mode m, as much energy as the lower half has from below m - r:
+
+        E_canopy(z) = E(z, top) - E_ground / 2 * E(bottom, m - r) / E(bottom, m),    r = z - m.
+    """
+    step = height[0] - height[1]
+    is_recorded = jnp.arange(power.size) < n_samples
+    mode = ground - smooth_pulse(pulse).mode * step
 
     def between(low, high):
-        share = jnp.clip((z + 0.5 * step - low) / step, 0.0, 1.0)
-        share = share - jnp.clip((z + 0.5 * step - high) / step, 0.0, 1.0)
-        return jnp.sum(jnp.where(real, y * share, 0.0))
+        fraction = jnp.clip((height + 0.5 * step - low) / step, 0.0, 1.0)
+        fraction = fraction - jnp.clip((height + 0.5 * step - high) / step, 0.0, 1.0)
+        return jnp.sum(jnp.where(is_recorded, power * fraction, 0.0))
 
-    half = jnp.maximum(between(bottom, mode), 1e-30)
+    lower_half = jnp.maximum(between(bottom, mode), _LEAST_HALF)
 
-    def one(level):
-        # Of the ground's upper half, as much comes from above a level as, mirrored, of the lower half.
+    def canopy_above(level):
         rise = jnp.maximum(ground + level - mode, 0.0)
-        share = jnp.clip(between(bottom, mode - rise) / half, 0.0, 1.0)
-        return between(ground + level, top) - 0.5 * energy * share
+        fraction = jnp.clip(between(bottom, mode - rise) / lower_half, 0.0, 1.0)
+        return between(ground + level, top) - 0.5 * ground_energy * fraction
 
-    return jax.vmap(one)(levels)
+    return jax.vmap(canopy_above)(levels)

@@ -1,30 +1,49 @@
 r"""Decomposition of records into echoes: Gaussians, or copies of a recorded pulse.
 
-Echoes are added one at a time where the residual, filtered by the pulse, is largest, and all are fitted again
-by Levenberg-Marquardt. The number of echoes is that with the lowest chi^2 + penalty, where an echo of m
-parameters costs (Gaussians, m = 3)
+A record is modelled as a sum of K echoes, y(t) = sum_k f(t; a_k, t_k, s_k) + noise, of amplitude a, time t
+and width s (Hofton et al. 2000; Wagner et al. 2006):
 
-    m ln(bins),        copies of a pulse, m = 2 or 3:   (m + 1) ln(bins),
+    Gaussians            f = a exp(-(t - t_k)^2 / 2 s_k^2),
+    copies of a pulse p  f = a p(t - t_k),
+    broadened copies     f = a (p * g_s)(t - t_k),    g_s the Gaussian of width s and unit area.
 
-the Bayesian information criterion, and for copies one more, as the place of an echo is searched for among all
-bins.
+**Algorithm.** Echoes are added one at a time:
 
-Copies of a pulse are shifted, and broadened by Gaussians, in the Fourier domain, which is exact for a pulse
-that its sampling resolves. A recorded pulse has errors of its own. They are counted as noise of `pulse_error`
-times the amplitude that the energy within a pulse's length would have as one echo; so the rest that an
-imperfect pulse leaves of a strong echo is not taken for weak ones.
+1. Matched filter of the residual r with weights w = 1 / sigma. An echo of shape p about bin i lowers chi^2 by
+   (sum w^2 r p_i)^2 / sum w^2 p_i^2; the new echo starts where that is largest.
+2. All echoes are fitted again, by Levenberg-Marquardt.
+3. The number of echoes is that with the lowest chi^2 + cost; the search ends after two echoes in a row that
+   have not lowered it. An echo of m parameters costs
 
-Free parameters are smooth bijections of what they stand for, so that no echo leaves the record: its place
-lies between the first and the last sample that count, and its height, broadened, between zero and the highest
-that the record supports, one standard deviation above a sample. Noise in proportion to the signal has next
-to no weight where the signal is strong: without the bounds, echoes grow there beyond any sample.
+       Gaussians, m = 3:          m ln(bins),
+       copies, m = 2 or 3:        (m + 1) ln(bins),
 
-Derivatives are those for the number of echoes found.
+   the Bayesian information criterion (Schwarz 1978), and for copies one ln(bins) more, because the time of an
+   echo is searched for among all bins (Zhang and Siegmund 2007).
+
+Copies are shifted and broadened in the Fourier domain, which is exact for a pulse that its sampling resolves.
+
+**Errors of the pulse.** A recorded pulse is itself a noisy record. Its errors count as noise of `pulse_error`
+times the amplitude of a single echo with the energy found within a pulse's length,
+
+    sigma_i^2 + pulse_error^2 sum_j y_j^2 / sum p^2,    j within a pulse's length of i.
+
+So the residual that an imperfect pulse leaves of a strong echo is not taken for weak echoes.
+
+**Bounds.** Parameters are smooth bijections (logistic) of free ones, so that no echo leaves the record: its
+time lies between the first and the last sample with weight, and its height, broadened, between zero and the
+highest that the record supports, one standard deviation above a sample. Noise in proportion to the signal
+has next to no weight where the signal is strong; without bounds, echoes grow there beyond any sample.
+
+Derivatives are those at the number of echoes found.
+
+**Source:** Hofton et al. (2000), IEEE Trans. Geosci. Remote Sens. 38, 1989; Wagner et al. (2006), ISPRS J.
+Photogramm. 60, 100; Schwarz (1978), Ann. Stat. 6, 461; Zhang and Siegmund (2007), Biometrics 63, 22.
 """
 
 from collections.abc import Callable
 from functools import lru_cache, partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -32,31 +51,31 @@ import optimistix as optx
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from inversion.metrics.pulses import Pulse, pulse_samples, steps_of
-from inversion.metrics.records import ladder, over_shots, pad
+from inversion.metrics.records import Pulse, over_shots, pad_to, sample_pulse, sampling_step, size_bucket
 from jaxlidar.extend import as_array, check_integer, check_range
 
 _SOLVER = optx.LevenbergMarquardt(rtol=1e-3, atol=1e-3)
-_STEPS = 40
+_MAX_STEPS = 40
 # Echoes are added until so many in a row have not lowered the criterion.
 _PATIENCE = 2
-# Least and largest width of a Gaussian echo, and of what broadens a copy, in widths of the pulse.
-_WIDTHS = {"gaussian": (0.5, 8.0), "copies": (0.5, 8.0), "broadened": (0.1, 8.0)}
-# ... from which their fits start, and how much an echo costs, in ln(bins).
-_START = {"gaussian": 1.0, "copies": 1.0, "broadened": 0.4}
+# Bounds of the width of a Gaussian echo, and of the Gaussian that broadens a copy, in widths of the pulse.
+_WIDTH_BOUNDS = {"gaussian": (0.5, 8.0), "copies": (0.5, 8.0), "broadened": (0.1, 8.0)}
+# The width that fits start from, in widths of the pulse, and the cost of an echo, in ln(bins).
+_START_WIDTH = {"gaussian": 1.0, "copies": 1.0, "broadened": 0.4}
 _COST = {"gaussian": 3, "copies": 3, "broadened": 4}
-# An echo is at most so many standard deviations above the record; fits start at this share from bounds.
-_ABOVE, _MARGIN = 1.0, 0.01
-# Noise below this share of the largest sample counts as much: so finely models are computed.
+# An echo is at most so many standard deviations above the record.
+_EXCESS = 1.0
+# Fits start at least this fraction of the bounds' width away from them: the logistic function is flat there.
+_MARGIN = 0.01
+# Least noise over the largest sample: models are computed to that precision.
 _ROUNDING = 1e-4
 
-Free = Float[Array, "echoes 3"]
-On = Bool[Array, " echoes"]
+FreeParameters = Float[Array, "echoes 3"]
+IsActive = Bool[Array, " echoes"]
 
 
 class Echoes(NamedTuple):
-    """Echoes of a record, in order of time; entries beyond `count` are zero. Several records have a dimension
-    before.
+    """Echoes of a record, in order of time; entries beyond `count` are zero. Several records add a dimension.
 
     - `amplitude`: (echoes,) height of the peak, in units of the record; of a copy, before it is broadened.
     - `time`: (echoes,) time of the peak in ns; of a copy, of the pulse's time zero.
@@ -65,7 +84,7 @@ class Echoes(NamedTuple):
     - `count`: number of echoes.
     - `model`: (bins,) the sum of the echoes.
     - `chi2`: sum of squared residuals over the noise.
-    - `criterion`: `chi2` and the cost of all echoes.
+    - `criterion`: `chi2` plus the cost of all echoes.
 
     **Example:**
 
@@ -98,25 +117,25 @@ def gaussian_decomposition(
     pulse_error: float = 0.01,
     max_echoes: int = 6,
 ) -> Echoes:
-    """Echoes of a record, Gaussians or copies of a recorded pulse, their number by a penalised criterion.
+    """Decompose a record into Gaussians or copies of a recorded pulse, their number by a penalised criterion.
 
     System pulses are no Gaussians: where the pulse was recorded, give it, or a hard target will have two
-    echoes or more. Records are padded to a ladder of sizes (64, 96, 128, 192, ... bins); each is compiled
-    once, for each number of records. No echo is negative, none lies outside the record, and none is higher
-    than the record by one standard deviation of its noise. Where a record begins or ends within an echo,
-    what is seen of it is an echo at that end.
+    echoes or more. Records are padded to size buckets (64, 96, 128, 192, ... bins); each is compiled once,
+    for each number of records. No echo is negative, none lies outside the record, and none exceeds the
+    record by more than one standard deviation of its noise. An echo that the record cuts off is an echo at
+    that end.
 
     **Arguments:**
 
     - `time`: (bins,) ns, increasing in equal steps.
     - `power`: (bins,) record in any unit, background removed; or (shots, bins).
-    - `noise`: standard deviation of `power`, above 0: one number, or of the shape of `power`. Where it is
-      infinite, samples do not count. Below 1e-4 of the largest sample it counts as that.
+    - `noise`: standard deviation of `power`, above 0: one number, or of the shape of `power`. Samples of
+      infinite noise have no weight. 1e-4 of the largest sample is added in quadrature.
     - `width`: for Gaussian echoes: standard deviation of the pulse in ns, above 0. Widths of echoes start
       from it and end between half of it and eight times it.
     - `pulse`: for copies: a recorded pulse, or the system's impulse, at the record's sampling, (lags,), an
       odd number of samples with time zero in the middle, or (shots, lags); or a `jaxlidar` pulse.
-    - `broaden`: whether copies may be broadened by Gaussians, where that lowers the criterion. Default True.
+    - `broaden`: True if copies may be broadened by Gaussians, where that lowers the criterion. Default True.
     - `pulse_error`: standard deviation of the errors of `pulse` over its peak, 0 or more. Default 0.01.
     - `max_echoes`: most echoes, at least 1. Default 6.
 
@@ -124,8 +143,9 @@ def gaussian_decomposition(
 
     **Raises:** ValueError for inadmissible arguments, and unless either `width` or `pulse` is given.
 
-    **Source:** Wagner et al. (2006), ISPRS J. Photogramm. 60, 100; Schwarz (1978), Ann. Stat. 6, 461; Zhang
-    and Siegmund (2007), Biometrics 63, 22 (places found by search).
+    **Source:** Hofton et al. (2000), IEEE Trans. Geosci. Remote Sens. 38, 1989; Wagner et al. (2006), ISPRS
+    J. Photogramm. 60, 100; Schwarz (1978), Ann. Stat. 6, 461; Zhang and Siegmund (2007), Biometrics 63, 22
+    (times found by search).
 
     **Example:**
 
@@ -137,7 +157,7 @@ def gaussian_decomposition(
     ['20.0', '40.0']
     """
     t, y, sigma = as_array(time), as_array(power), as_array(noise)
-    most = check_integer("max_echoes", max_echoes)
+    max_echoes = check_integer("max_echoes", max_echoes)
     if t.ndim != 1 or y.ndim < 1 or t.shape != y.shape[-1:] or t.size < 2:
         raise ValueError(
             f"time and power have the shapes {t.shape} and {y.shape}; admissible is (bins,) and (..., bins), "
@@ -151,223 +171,324 @@ def gaussian_decomposition(
     check_range("power", power)
     check_range("steps of time", jnp.diff(t), 0.0, low_open=True)
     check_range("pulse_error", pulse_error, 0.0)
-    size = ladder(t.size)
-    weight = jnp.broadcast_to(1.0 / sigma, y.shape)
-    arrays = pad(y, size), pad(weight, size), t[1] - t[0]
+    size = size_bucket(t.size)
+    # Padding has no weight: it does not count as recorded.
+    weight = pad_to(jnp.broadcast_to(1.0 / sigma, y.shape), size)
+    arrays = {"power": pad_to(y, size), "weight": weight, "step": t[1] - t[0]}
     if pulse is None:
         assert width is not None
         check_range("width", width, 0.0, low_open=True)
-        found = _program("gaussian", most)(*arrays, jnp.ones(1), as_array(width), jnp.zeros(()))
+        arrays |= {"pulse": jnp.ones(1), "width": as_array(width), "pulse_error": jnp.zeros(())}
+        echoes = _compiled_decomposition("gaussian", max_echoes)(**arrays)
     else:
-        lags, error = pulse_samples(pulse, steps_of(time)), as_array(pulse_error)
-        found = _program("copies", most)(*arrays, lags, jnp.ones(()), error)
+        lags, error = sample_pulse(pulse, sampling_step(time)), as_array(pulse_error)
+        arrays |= {"pulse": lags, "width": jnp.ones(()), "pulse_error": error}
+        echoes = _compiled_decomposition("copies", max_echoes)(**arrays)
         if broaden:
-            other = _program("broadened", most)(*arrays, lags, jnp.ones(()), error)
-            better = other.criterion < found.criterion
-            found = jax.tree.map(partial(_choose, better), other, found)
-    placed = jnp.where(found.amplitude > 0, t[0] + found.time, 0.0)
-    return found._replace(time=placed, model=found.model[..., : t.size])
+            # For each record the one or the other: a width that does not pay for itself is zero.
+            broadened = _compiled_decomposition("broadened", max_echoes)(**arrays)
+            is_better = broadened.criterion < echoes.criterion
+            echoes = jax.tree.map(partial(_select, is_better), broadened, echoes)
+    # The program counts time from the first sample; empty entries stay zero.
+    absolute_time = jnp.where(echoes.amplitude > 0, t[0] + echoes.time, 0.0)
+    return echoes._replace(time=absolute_time, model=echoes.model[..., : t.size])
 
 
-def _choose(where: Array, a: Array, b: Array) -> Array:
-    return jnp.where(where.reshape(where.shape + (1,) * (a.ndim - where.ndim)), a, b)
+def _select(condition: Array, a: Array, b: Array) -> Array:
+    """Choose between arrays that have more dimensions, after those of the condition."""
+    return jnp.where(condition.reshape(condition.shape + (1,) * (a.ndim - condition.ndim)), a, b)
 
 
 @lru_cache
-def _program(kind: str, most: int) -> Callable[..., Echoes]:
-    """The compiled decomposition into one kind of echoes."""
+def _compiled_decomposition(kind: str, max_echoes: int) -> Callable[..., Echoes]:
+    """Return the compiled decomposition into echoes of one kind, at most `max_echoes` of them."""
 
-    def decompose(*arguments: Array) -> Echoes:
-        return _decompose(kind, most, *arguments)
+    def decompose(**arguments: Array) -> Echoes:
+        return _decompose(kind, max_echoes, **arguments)
 
     decompose.__name__ = "_decompose"
-    return over_shots(1, 1, 0, 1, 0, 0, in_turn=True)(decompose)
+    # Shot by shot: the solver takes a number of steps that differs between shots.
+    compiled = over_shots(power=1, weight=1, step=0, pulse=1, width=0, pulse_error=0, sequential=True)
+    return compiled(decompose)
 
 
-class _Shapes(NamedTuple):
-    """How echoes of a kind look: their sum, and amplitude and place of the best new one."""
+# -- shapes of echoes ----------------------------------------------------------------------------------
+
+
+class _EchoShape(NamedTuple):
+    """Model of one kind of echo. Times and widths are in samples.
+
+    - `width`: standard deviation of the pulse, or of the Gaussian of its peak and area.
+    - `model`: of amplitudes, centres and widths, (echoes,) each: the sum of the echoes, (bins,).
+    - `matched_filter`: of a residual r and weights w, (bins,) each: sum w^2 r p_i and sum w^2 p_i^2 with the
+      pulse p_i about each bin i. Their ratio is the best amplitude of one echo there.
+    """
 
     width: Array
     model: Callable[[Array, Array, Array], Array]
-    seed: Callable[[Array, Array], tuple[Array, Array]]
+    matched_filter: Callable[[Array, Array], tuple[Array, Array]]
 
 
-class _State(NamedTuple):
-    """A fit with some echoes."""
+def _gaussian_shape(size: int, pulse_width: Array) -> _EchoShape:
+    """Gaussians on `size` bins, for a pulse of that standard deviation in samples."""
+    number = jnp.arange(size, dtype=pulse_width.dtype)
+    # Of an odd number of samples, so that its middle is one.
+    kernel = jnp.exp(-0.5 * ((number[: size - 1] - (size // 2 - 1)) / pulse_width) ** 2)
 
-    p: Free
-    on: On
+    def model(amplitude, centre, width):
+        distance = (number[None, :] - centre[:, None]) / width[:, None]
+        return jnp.sum(amplitude[:, None] * jnp.exp(-0.5 * distance * distance), axis=0)
+
+    def matched_filter(residual, weight):
+        matched = jnp.convolve(residual * weight**2, kernel, mode="same")
+        return matched, jnp.convolve(weight**2, kernel**2, mode="same")
+
+    return _EchoShape(pulse_width, model, matched_filter)
+
+
+def _copy_shape(size: int, pulse: Array) -> _EchoShape:
+    """Copies of a pulse on `size` bins, shifted and broadened in the Fourier domain."""
+    # Long enough that a copy at either end does not wrap around.
+    padded = size_bucket(size + pulse.size)
+    time_zero = pulse.size // 2
+    from_zero = jnp.roll(jnp.pad(pulse, (0, padded - pulse.size)), -time_zero)
+    spectrum, square_spectrum = jnp.fft.rfft(from_zero), jnp.fft.rfft(from_zero**2)
+    omega = 2.0 * jnp.pi * jnp.fft.rfftfreq(padded).astype(pulse.dtype)
+
+    def model(amplitude, centre, width):
+        # A shift by c and a Gaussian of width s multiply the spectrum by exp(-i omega c - (omega s)^2 / 2).
+        damping = -0.5 * (omega[None, :] * width[:, None]) ** 2
+        factor = jnp.exp(lax.complex(damping, -omega[None, :] * centre[:, None]))
+        return jnp.fft.irfft(spectrum * jnp.sum(amplitude[:, None] * factor, axis=0), padded)[:size]
+
+    def correlate(samples, pulse_spectrum):
+        return jnp.fft.irfft(jnp.fft.rfft(samples, padded) * jnp.conj(pulse_spectrum), padded)[:size]
+
+    def matched_filter(residual, weight):
+        return correlate(residual * weight**2, spectrum), correlate(weight**2, square_spectrum)
+
+    return _EchoShape(jnp.sum(pulse) / jnp.sqrt(2.0 * jnp.pi), model, matched_filter)
+
+
+def _weight_with_pulse_error(y: Array, weight: Array, pulse: Array, pulse_error: Array) -> Array:
+    """Lower the weights of samples by the errors of the pulse near them (see the module's docstring)."""
+    size = size_bucket(y.size + pulse.size)
+    half, energy = pulse.size // 2, jnp.where(weight > 0, y * y, 0.0)
+    box = jnp.ones(pulse.size, y.dtype)
+    # Moving sum of the energy over a pulse's length; rounding of the transforms can make it negative.
+    near = jnp.fft.irfft(jnp.fft.rfft(energy, size) * jnp.fft.rfft(box, size), size)
+    square_amplitude = jnp.maximum(near[half : half + y.size], 0.0) / jnp.sum(pulse**2)
+    return weight / jnp.sqrt(1.0 + (weight * pulse_error) ** 2 * square_amplitude)
+
+
+# -- parameters of echoes ------------------------------------------------------------------------------
+
+
+class _Parameterisation(NamedTuple):
+    """Bijections from free parameters z, of order one, to amplitude, centre and width of echoes.
+
+    With l the logistic function, w the pulse's width and [first, first + length] the samples with weight:
+
+        height = highest l(z_0),    centre = first + length l(4 w z_1 / length),
+        width = w exp(log_low + (log_high - log_low) l(z_2)).
+
+    In the middle of the record one unit of z_1 is a width of the pulse. The height of a broadened copy is its
+    peak after broadening, and its amplitude that before, larger by sqrt(1 + (width / w)^2).
+    """
+
+    kind: str
+    pulse_width: Array
+    highest: Array
+    first: Array
+    length: Array
+    log_low: Array
+    log_high: Array
+
+    @property
+    def stretch(self) -> Array:
+        """Factor of the free parameter of the centre."""
+        return 4.0 * self.pulse_width / self.length
+
+    def unpack(self, free: FreeParameters) -> tuple[Array, Array, Array]:
+        """Amplitudes, centres and widths, in samples."""
+        width = jnp.exp(self.log_low + (self.log_high - self.log_low) * jax.nn.sigmoid(free[:, 2]))
+        width = width * self.pulse_width
+        amplitude = self.highest * jax.nn.sigmoid(free[:, 0])
+        centre = self.first + self.length * jax.nn.sigmoid(self.stretch * free[:, 1])
+        if self.kind == "broadened":
+            amplitude *= jnp.hypot(1.0, width / self.pulse_width)
+        return amplitude, centre, jnp.zeros_like(width) if self.kind == "copies" else width
+
+    def start(self, amplitude: Array, centre: Array) -> Float[Array, "3"]:
+        """Free parameters of a new echo."""
+        log_width = jnp.log(_START_WIDTH[self.kind])
+        return jnp.stack(
+            [
+                _logit(amplitude / self.highest),
+                _logit((centre - self.first) / self.length) / self.stretch,
+                _logit((log_width - self.log_low) / (self.log_high - self.log_low)),
+            ]
+        )
+
+    def restart_limits(self) -> Float[Array, "1 3"]:
+        """Largest magnitudes of free parameters from which a fit starts again."""
+        largest = _logit(jnp.ones(3, self.highest.dtype))[None, :]
+        return largest * jnp.stack([0.5, 1.0 / self.stretch, 1.0])[None, :]
+
+
+def _logit(fraction: Array) -> Array:
+    """Inverse of the logistic function, at a margin from 0 and 1."""
+    fraction = jnp.clip(fraction, _MARGIN, 1.0 - _MARGIN)
+    return jnp.log(fraction) - jnp.log1p(-fraction)
+
+
+def _parameterisation(
+    kind: str, shape: _EchoShape, y: Array, weight: Array, is_used: Array
+) -> _Parameterisation:
+    """Bounds of the echoes of a record, from its samples with weight (`is_used`)."""
+    first, last = jnp.argmax(is_used), y.size - 1 - jnp.argmax(is_used[::-1])
+    # A Gaussian of width s with its peak midway between two samples is higher than both by exp(1 / (8 s^2)).
+    narrowest = shape.width * (_WIDTH_BOUNDS[kind][0] if kind == "gaussian" else 1.0)
+    between_samples = jnp.exp(0.125 / jnp.maximum(narrowest, 0.5) ** 2)
+    supported = jnp.where(is_used, y + _EXCESS / jnp.where(is_used, weight, 1.0), 0.0)
+    highest = jnp.maximum(between_samples * jnp.max(supported), jnp.finfo(y.dtype).tiny)
+    log_low, log_high = (jnp.log(jnp.asarray(bound, y.dtype)) for bound in _WIDTH_BOUNDS[kind])
+    length = jnp.maximum(last - first, 1).astype(y.dtype)
+    return _Parameterisation(kind, shape.width, highest, first, length, log_low, log_high)
+
+
+# -- fit -----------------------------------------------------------------------------------------------
+
+
+class _EchoFit(NamedTuple):
+    """A fit of some echoes: free parameters, echoes that are in use, chi-squared, and with their cost."""
+
+    free: FreeParameters
+    is_active: IsActive
     chi2: Array
     criterion: Array
 
 
-def _gaussians(size: int, width: Array) -> _Shapes:
-    place = jnp.arange(size, dtype=width.dtype)
-    # Of an odd number of samples, so that its middle is one.
-    kernel = jnp.exp(-0.5 * ((place[: size - 1] - (size // 2 - 1)) / width) ** 2)
-
-    def model(a, centre, wide):
-        away = (place[None, :] - centre[:, None]) / wide[:, None]
-        return jnp.sum(a[:, None] * jnp.exp(-0.5 * away * away), axis=0)
-
-    def seed(left, weight):
-        matched = jnp.convolve(left * weight**2, kernel, mode="same")
-        return matched, jnp.convolve(weight**2, kernel**2, mode="same")
-
-    return _Shapes(width, model, seed)
-
-
-def _copies(size: int, pulse: Array) -> _Shapes:
-    padded = ladder(size + pulse.size)
-    half = pulse.size // 2
-    first = jnp.roll(jnp.pad(pulse, (0, padded - pulse.size)), -half)
-    spectrum, square = jnp.fft.rfft(first), jnp.fft.rfft(first**2)
-    omega = 2.0 * jnp.pi * jnp.fft.rfftfreq(padded).astype(pulse.dtype)
-
-    def model(a, centre, wide):
-        damping = -0.5 * (omega[None, :] * wide[:, None]) ** 2
-        turns = jnp.exp(lax.complex(damping, -omega[None, :] * centre[:, None]))
-        return jnp.fft.irfft(spectrum * jnp.sum(a[:, None] * turns, axis=0), padded)[:size]
-
-    def correlate(samples, with_spectrum):
-        return jnp.fft.irfft(jnp.fft.rfft(samples, padded) * jnp.conj(with_spectrum), padded)[:size]
-
-    def seed(left, weight):
-        return correlate(left * weight**2, spectrum), correlate(weight**2, square)
-
-    return _Shapes(jnp.sum(pulse) / jnp.sqrt(2.0 * jnp.pi), model, seed)
-
-
-def _with_pulse_error(y: Array, weight: Array, pulse: Array, error: Array) -> Array:
-    """Weights of samples whose noise holds the pulse's errors too."""
-    size = ladder(y.size + pulse.size)
-    half, energy = pulse.size // 2, jnp.where(weight > 0, y * y, 0.0)
-    near = jnp.fft.irfft(jnp.fft.rfft(energy, size) * jnp.fft.rfft(jnp.ones(pulse.size, y.dtype), size), size)
-    amplitude2 = jnp.maximum(near[half : half + y.size], 0.0) / jnp.sum(pulse**2)
-    return weight / jnp.sqrt(1.0 + (weight * error) ** 2 * amplitude2)
-
-
 def _decompose(
-    kind: str, most: int, y: Array, weight: Array, step: Array, pulse: Array, width: Array, error: Array
+    kind: str,
+    max_echoes: int,
+    power: Array,
+    weight: Array,
+    step: Array,
+    pulse: Array,
+    width: Array,
+    pulse_error: Array,
 ) -> Echoes:
+    """Decompose one padded record; `weight` is the inverse noise, zero where a sample does not count.
+
+    1. Shape of echoes; weights with the errors of the pulse and of rounding; bounds.
+    2. Greedy search: add an echo at the maximum of the matched filter, fit all again, remember the fit with
+       the lowest criterion.
+    3. Sort the echoes of that fit by time, and compute their standard errors.
+    """
     if kind == "gaussian":
-        shapes = _gaussians(y.size, width / step)
+        shape = _gaussian_shape(power.size, width / step)
     else:
-        shapes, weight = _copies(y.size, pulse), _with_pulse_error(y, weight, pulse, error)
-    used = weight > 0
-    count, first, last = jnp.sum(used), jnp.argmax(used), y.size - 1 - jnp.argmax(used[::-1])
-    log_n = jnp.log(jnp.maximum(count, 2).astype(y.dtype))
-    y = jnp.where(used, y, 0.0)
+        shape = _copy_shape(power.size, pulse)
+        weight = _weight_with_pulse_error(power, weight, pulse, pulse_error)
+    is_used = weight > 0
+    log_bins = jnp.log(jnp.maximum(jnp.sum(is_used), 2).astype(power.dtype))
+    y = jnp.where(is_used, power, 0.0)
     scale = jnp.maximum(jnp.max(jnp.abs(y)), jnp.finfo(y.dtype).tiny)
-    weight = jnp.where(used, weight / jnp.sqrt(1.0 + (_ROUNDING * scale * weight) ** 2), 0.0)
-    # A peak between two samples is higher than both.
-    narrow = shapes.width * (_WIDTHS[kind][0] if kind == "gaussian" else 1.0)
-    between = jnp.exp(0.125 / jnp.maximum(narrow, 0.5) ** 2)
-    highest = between * jnp.max(jnp.where(used, y + _ABOVE / jnp.where(used, weight, 1.0), 0.0))
-    highest = jnp.maximum(highest, jnp.finfo(y.dtype).tiny)
-    low, high = (jnp.log(jnp.asarray(end, y.dtype)) for end in _WIDTHS[kind])
-    own = _free((jnp.log(_START[kind]) - low) / (high - low))
-    length = jnp.maximum(last - first, 1).astype(y.dtype)
-    # In the middle of the record one unit is a width.
-    stretch = 4.0 * shapes.width / length
-    far = _free(jnp.ones(3, y.dtype))[None, :] * jnp.stack([0.5, 1.0 / stretch, 1.0])[None, :]
+    weight = jnp.where(is_used, weight / jnp.sqrt(1.0 + (_ROUNDING * scale * weight) ** 2), 0.0)
+    parameters = _parameterisation(kind, shape, y, weight, is_used)
 
-    def unpack(p: Free) -> tuple[Array, Array, Array]:
-        """Amplitude, place and width, in samples, out of free parameters of order one."""
-        wide = jnp.exp(low + (high - low) * jax.nn.sigmoid(p[:, 2])) * shapes.width
-        height, centre = highest * jax.nn.sigmoid(p[:, 0]), first + length * jax.nn.sigmoid(stretch * p[:, 1])
-        if kind == "broadened":
-            height *= jnp.hypot(1.0, wide / shapes.width)
-        return height, centre, jnp.zeros_like(wide) if kind == "copies" else wide
+    def model(free: FreeParameters, is_active: IsActive) -> Array:
+        amplitude, centre, width = parameters.unpack(free)
+        return shape.model(jnp.where(is_active, amplitude, 0.0), centre, width)
 
-    def model(p: Free, on: On) -> Array:
-        a, centre, wide = unpack(p)
-        return shapes.model(jnp.where(on, a, 0.0), centre, wide)
+    def residual(free: FreeParameters, is_active: IsActive) -> Array:
+        return (model(free, is_active) - y) * weight
 
-    def residual(p: Free, on: On) -> Array:
-        return (model(p, on) - y) * weight
-
-    def errors(a: Array, centre: Array, wide: Array, on: On) -> Array:
-        """(echoes, 3) standard errors of amplitude, place and width, in samples."""
-        unit = jnp.stack([highest, shapes.width, shapes.width])
-
-        def scaled(q: Free) -> Array:
-            a, centre, wide = (q * unit[None, :]).T
-            return shapes.model(jnp.where(on, a, 0.0), centre, wide) * weight
-
-        return (
-            _errors(scaled, jnp.stack([a, centre, wide], axis=1) / unit[None, :], on, kind == "copies")
-            * unit[None, :]
-        )
-
-    none = jnp.sum((y * weight) ** 2)
-    nothing = _State(jnp.zeros((most, 3), y.dtype), jnp.zeros(most, bool), none, none)
-
-    def add(state: _State, k: Array) -> _State:
-        p, on = state.p, state.on
-        matched, norm = shapes.seed(y - model(p, on), weight)
+    def add_echo(fit: _EchoFit, k: Array) -> _EchoFit:
+        """Add echo `k` at the maximum of the matched filter, and fit all echoes again."""
+        matched, norm = shape.matched_filter(y - model(fit.free, fit.is_active), weight)
         norm = jnp.maximum(norm, jnp.finfo(y.dtype).tiny)
-        best = jnp.argmax(jnp.where(used, matched / jnp.sqrt(norm), -jnp.inf))
-        begin = [_free(matched[best] / norm[best] / highest), _free((best - first) / length) / stretch, own]
-        # Far out the bijections are flat: what an echo fewer had pushed there would stay.
-        p = jnp.clip(p, -far, far).at[k].set(jnp.stack(begin))
-        on = on.at[k].set(True)
-        fitted = optx.least_squares(residual, _SOLVER, p, args=on, max_steps=_STEPS, throw=False).value
-        p = jnp.where(jnp.all(jnp.isfinite(fitted)), fitted, p)
-        chi2 = jnp.sum(residual(p, on) ** 2)
-        return _State(p, on, chi2, chi2 + _COST[kind] * (k + 1) * log_n)
+        best = jnp.argmax(jnp.where(is_used, matched / jnp.sqrt(norm), -jnp.inf))
+        # Far out the bijections are flat: without the limit, parameters that the fit with one echo less has
+        # pushed there would not move any more.
+        limits = parameters.restart_limits()
+        start = jnp.clip(fit.free, -limits, limits)
+        start = start.at[k].set(parameters.start(matched[best] / norm[best], best))
+        is_active = fit.is_active.at[k].set(True)
+        fitted = optx.least_squares(
+            residual, _SOLVER, start, args=is_active, max_steps=_MAX_STEPS, throw=False
+        ).value
+        # A fit that fails leaves the echoes where they started; the criterion then tells its worth.
+        free = jnp.where(jnp.all(jnp.isfinite(fitted)), fitted, start)
+        chi2 = jnp.sum(residual(free, is_active) ** 2)
+        return _EchoFit(free, is_active, chi2, chi2 + _COST[kind] * (k + 1) * log_bins)
 
-    def step_on(carry: tuple[_State, _State, Array], k: Array) -> tuple[tuple[_State, _State, Array], None]:
-        last, best, failed = carry
-        last = lax.cond(
-            failed < _PATIENCE,
-            add,
-            lambda state, _: state._replace(criterion=jnp.full((), jnp.inf, y.dtype)),
-            last,
-            k,
-        )
-        better = last.criterion < best.criterion
-        best = jax.tree.map(partial(_choose, better), last, best)
-        return (last, best, jnp.where(better, 0, failed + 1)), None
+    def give_up(fit: _EchoFit, k: Array) -> _EchoFit:
+        return fit._replace(criterion=jnp.full((), jnp.inf, y.dtype))
 
-    carry = (nothing, nothing, jnp.zeros((), int))
-    (_, found, _), _ = lax.scan(step_on, carry, jnp.arange(most))
-    p, on = found.p, found.on
-    order = jnp.argsort(jnp.where(on, p[:, 1], jnp.inf))
-    p, on = p[order], on[order]
-    a, centre, wide = unpack(p)
+    def search(
+        carry: tuple[_EchoFit, _EchoFit, Array], k: Array
+    ) -> tuple[tuple[_EchoFit, _EchoFit, Array], None]:
+        latest, best, n_failures = carry
+        latest = lax.cond(n_failures < _PATIENCE, add_echo, give_up, latest, k)
+        is_better = latest.criterion < best.criterion
+        best = jax.tree.map(partial(_select, is_better), latest, best)
+        return (latest, best, jnp.where(is_better, 0, n_failures + 1)), None
+
+    chi2_without = jnp.sum((y * weight) ** 2)
+    empty = _EchoFit(
+        jnp.zeros((max_echoes, 3), y.dtype), jnp.zeros(max_echoes, bool), chi2_without, chi2_without
+    )
+    carry = (empty, empty, jnp.zeros((), int))
+    (_, best, _), _ = lax.scan(search, carry, jnp.arange(max_echoes))
+
+    order = jnp.argsort(jnp.where(best.is_active, best.free[:, 1], jnp.inf))
+    free, is_active = best.free[order], best.is_active[order]
+    amplitude, centre, width = parameters.unpack(free)
+    stderr = _standard_errors(
+        shape, parameters, jnp.stack([amplitude, centre, width], axis=1), is_active, weight
+    )
+    per_sample = jnp.stack([jnp.ones((), y.dtype), step, step])[None, :]
     return Echoes(
-        amplitude=jnp.where(on, a, 0.0),
-        time=jnp.where(on, centre * step, 0.0),
-        width=jnp.where(on, wide * step, 0.0),
-        stderr=jnp.where(on[:, None], errors(a, centre, wide, on) * _units(step, y.dtype), 0.0),
-        count=jnp.sum(on),
-        model=model(p, on),
-        chi2=found.chi2,
-        criterion=found.criterion,
+        amplitude=jnp.where(is_active, amplitude, 0.0),
+        time=jnp.where(is_active, centre * step, 0.0),
+        width=jnp.where(is_active, width * step, 0.0),
+        stderr=jnp.where(is_active[:, None], stderr * per_sample, 0.0),
+        count=jnp.sum(is_active),
+        model=model(free, is_active),
+        chi2=best.chi2,
+        criterion=best.criterion,
     )
 
 
-def _units(step: Array, kind: Any) -> Array:
-    return jnp.stack([jnp.ones((), kind), step, step])[None, :]
+def _standard_errors(
+    shape: _EchoShape,
+    parameters: _Parameterisation,
+    values: Float[Array, "echoes 3"],
+    is_active: IsActive,
+    weight: Array,
+) -> Float[Array, "echoes 3"]:
+    """Standard errors of amplitude, centre and width, in samples: roots of the diagonal of (J'J)^-1.
 
+    J is the Jacobian of the whitened model with respect to the parameters themselves, not the free ones,
+    whose bijections are flat near the bounds. Its columns are scaled to unit length before inversion.
+    """
+    unit = jnp.stack([parameters.highest, parameters.pulse_width, parameters.pulse_width])[None, :]
 
-def _errors(whitened: Callable, q: Free, on: On, without_width: bool) -> Array:
-    """(echoes, 3) standard errors of the parameters of a whitened model."""
-    columns = jax.jacfwd(whitened)(q).reshape(-1, q.size)
-    # Parameters that do nothing have no column; one on their diagonal keeps the inverse.
-    free = jnp.asarray([1.0, 1.0, 0.0 if without_width else 1.0], q.dtype)
-    idle = 1.0 - jnp.where(on, 1.0, 0.0)[:, None] * free[None, :]
+    def whitened_model(scaled: Float[Array, "echoes 3"]) -> Array:
+        amplitude, centre, width = (scaled * unit).T
+        return shape.model(jnp.where(is_active, amplitude, 0.0), centre, width) * weight
+
+    scaled = values / unit
+    columns = jax.jacfwd(whitened_model)(scaled).reshape(-1, scaled.size)
+    # Parameters without effect have no column; one on their diagonal keeps the normal matrix regular.
+    has_effect = jnp.asarray([1.0, 1.0, 0.0 if parameters.kind == "copies" else 1.0], scaled.dtype)
+    idle = 1.0 - jnp.where(is_active, 1.0, 0.0)[:, None] * has_effect[None, :]
     columns = columns * (1.0 - idle.reshape(1, -1))
-    size = jnp.sqrt(jnp.sum(columns**2, axis=0))
-    size = jnp.where(size > 0, size, 1.0)
-    columns = columns / size[None, :]
+    norm = jnp.sqrt(jnp.sum(columns**2, axis=0))
+    norm = jnp.where(norm > 0, norm, 1.0)
+    columns = columns / norm[None, :]
     variance = jnp.diagonal(jnp.linalg.pinv(columns.T @ columns + jnp.diag(idle.reshape(-1))))
-    errors = (jnp.sqrt(jnp.maximum(variance, 0.0)) / size).reshape(-1, 3)
-    return jnp.where(idle > 0, 0.0, errors)
-
-
-def _free(share: Array) -> Array:
-    """The free parameter of a share of what bounds leave, at a margin from them."""
-    share = jnp.clip(share, _MARGIN, 1.0 - _MARGIN)
-    return jnp.log(share) - jnp.log1p(-share)
+    errors = (jnp.sqrt(jnp.maximum(variance, 0.0)) / norm).reshape(-1, 3)
+    return jnp.where(idle > 0, 0.0, errors) * unit

@@ -1,6 +1,21 @@
-"""Deconvolution of waveforms: the transmitted pulse is taken out.
+r"""Deconvolution of waveforms: removal of the transmitted pulse.
 
-All functions take single waveforms, (bins,), can be batched with `jax.vmap`, and are differentiable.
+A waveform is y = h * x + noise, with h the pulse of unit sum and x the target's response.
+
+**Richardson-Lucy** maximises the likelihood of y under Poisson noise, with x >= 0, by the iteration
+
+    x <- x / s [h~ * (y / (h * x))],    h~(i) = h(-i),    s = h~ * 1,
+
+from an even start. s is one but near the ends of the record, where part of what a bin returns is not
+recorded (Richardson 1972; Lucy 1974).
+
+**Wiener** minimises the mean square error of a linear estimate for stationary signal and noise. In the
+Fourier domain, with n the ratio of the power spectra of noise and signal,
+
+    X = Y H* / (|H|^2 + n)
+
+(Wiener 1949). All functions take single waveforms, (bins,), can be batched with `jax.vmap`, and are
+differentiable.
 """
 
 from functools import partial
@@ -12,17 +27,20 @@ from jaxtyping import Array, ArrayLike, Float
 
 from jaxlidar.extend import as_array, check_integer, check_range
 
+# Least model of a sample that one is divided by, over the largest sample of the waveform; least such sample.
+_LEAST_MODEL, _LEAST_PEAK = 1e-6, 1e-30
+
 Samples = Float[Array, " bins"]
 
 
 def richardson_lucy(
     power: Float[ArrayLike, " bins"], pulse: Float[ArrayLike, " lags"], *, iterations: int = 50
 ) -> Samples:
-    """Richardson-Lucy deconvolution of a waveform: it conserves energy and is never negative.
+    """Deconvolve a waveform by Richardson-Lucy, which conserves energy and is never negative.
 
     **Arguments:**
 
-    - `power`: (bins,) waveform, background removed. Negative samples, which noise makes, count as zero.
+    - `power`: (bins,) waveform, background removed. Negative samples, due to noise, count as zero.
     - `pulse`: (lags,) transmitted pulse at the waveform's sampling, an odd number of samples with time zero
       in the middle, not negative; its scale does not matter.
     - `iterations`: 1 or more. More of them resolve more and amplify noise. Default 50.
@@ -43,28 +61,27 @@ def richardson_lucy(
     >>> print(f"peak {power[30]:.2f} to {float(sharp[30]):.2f}, energy {float(sharp.sum()):.2f}")
     peak 0.13 to 0.38, energy 1.00
     """
-    times = check_integer("iterations", iterations)
+    iterations = check_integer("iterations", iterations)
     check_range("pulse", pulse, 0.0)
-    return _richardson_lucy(jnp.maximum(as_array(power), 0.0), _kernel(pulse), times)
+    return _richardson_lucy(jnp.maximum(as_array(power), 0.0), _unit_pulse(pulse), iterations)
 
 
 @partial(jax.jit, static_argnames="iterations")
 def _richardson_lucy(y: Samples, h: Float[Array, " lags"], iterations: int) -> Samples:
-    tiny = 1e-6 * jnp.maximum(jnp.max(y), 1e-30)
-    # Share of each bin's energy that is recorded: less at the ends.
-    seen = jnp.convolve(jnp.ones_like(y), h[::-1], mode="same")
+    least = _LEAST_MODEL * jnp.maximum(jnp.max(y), _LEAST_PEAK)
+    recorded_fraction = jnp.convolve(jnp.ones_like(y), h[::-1], mode="same")
 
-    def better(x: Samples, _: None) -> tuple[Samples, None]:
-        ratio = y / jnp.maximum(jnp.convolve(x, h, mode="same"), tiny)
-        return x * jnp.convolve(ratio, h[::-1], mode="same") / seen, None
+    def iterate(x: Samples, _: None) -> tuple[Samples, None]:
+        ratio = y / jnp.maximum(jnp.convolve(x, h, mode="same"), least)
+        return x * jnp.convolve(ratio, h[::-1], mode="same") / recorded_fraction, None
 
-    return lax.scan(better, jnp.full_like(y, jnp.mean(y)), None, length=iterations)[0]
+    return lax.scan(iterate, jnp.full_like(y, jnp.mean(y)), None, length=iterations)[0]
 
 
 def wiener(
     power: Float[ArrayLike, " bins"], pulse: Float[ArrayLike, " lags"], *, noise_to_signal: float
 ) -> Samples:
-    """Deconvolution of a waveform by a Wiener filter.
+    """Deconvolve a waveform by a Wiener filter.
 
     **Arguments:**
 
@@ -89,16 +106,18 @@ def wiener(
     peak 0.13 to 0.32
     """
     check_range("noise_to_signal", noise_to_signal, 0.0, low_open=True)
-    y, h = as_array(power), _kernel(pulse)
-    n = y.size + h.size - 1
-    spectrum = jnp.fft.rfft(h, n)
+    y, h = as_array(power), _unit_pulse(pulse)
+    # Of the full convolution of record and pulse: the transforms do not wrap around.
+    size = y.size + h.size - 1
+    spectrum = jnp.fft.rfft(h, size)
     gain = jnp.conj(spectrum) / (jnp.abs(spectrum) ** 2 + noise_to_signal)
-    # The pulse begins half its length before its time zero.
-    begun = jnp.pad(y, ((h.size - 1) // 2, (h.size - 1) // 2))
-    return jnp.fft.irfft(jnp.fft.rfft(begun) * gain, n)[: y.size]
+    # The first lag of the pulse lies half its length before time zero, and so does the padded record's start.
+    padded = jnp.pad(y, ((h.size - 1) // 2, (h.size - 1) // 2))
+    return jnp.fft.irfft(jnp.fft.rfft(padded) * gain, size)[: y.size]
 
 
-def _kernel(pulse: Float[ArrayLike, " lags"]) -> Float[Array, " lags"]:
+def _unit_pulse(pulse: Float[ArrayLike, " lags"]) -> Float[Array, " lags"]:
+    """Check a pulse and scale it to unit sum. **Raises:** ValueError for an even number of lags."""
     h = as_array(pulse)
     check_range("pulse", pulse)
     if h.ndim != 1 or h.size % 2 == 0:

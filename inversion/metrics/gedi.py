@@ -1,24 +1,26 @@
-"""GEDI's level 2A metrics from its level 1B records, computed as the product computes them.
+r"""GEDI's level 2A metrics from its level 1B records, by the rules of the product.
 
-The record less its mean noise is smoothed by a Gaussian; the signal begins at the highest and ends at the
-lowest two samples in a row above a threshold; modes are maxima of the record smoothed by another Gaussian,
-above the threshold of the signal's end; relative heights are those below which shares of the smoothed energy
-between the two ends lie, above the lowest mode. Thresholds are in standard deviations of the noise that the
-product gives.
+1. Subtract the mean noise, and smooth the record y by two Gaussians: one for ends and energy, w, and one for
+   modes, m.
+2. The signal begins at the highest two samples in a row of w above the front threshold, and ends at the
+   lowest two above the back threshold. Thresholds are in the product's standard deviations of the noise.
+3. Modes are maxima of m above the back threshold; the lowest one is taken for the ground.
+4. The relative height RH_q is the height above the lowest mode below which the fraction q / 100 of the energy
+   sum w between the two ends lies.
 
-The theoretical basis document does not say all. The rest was found from what the product answers for recorded
-shots:
+The theoretical basis document (Hofton and Blair 2019) leaves details open. These reproduce the product's
+values for recorded shots:
 
-- The work is done at a quarter of a bin (0.0375 m): samples in between are interpolated, and elevations are
-  those of quarter bins.
-- Smoothing widths are standard deviations in bins, and the Gaussian is cut where it ends: here at 2.5 of
-  them, less its value there.
-- A relative height is that of the last quarter bin from below whose energy, with all below it, is less than
-  the share.
+- The work is done at a quarter of a bin (0.0375 m): samples in between are interpolated linearly, and
+  elevations are those of quarter bins.
+- Smoothing widths are standard deviations in bins. The Gaussian is cut at 2.5 standard deviations, and its
+  value there is subtracted.
+- A relative height is that of the last quarter bin, from below, up to which the energy is less than the
+  fraction.
 
-With group 1, of which the answers are known for 60 shots, elevations and relative heights then differ by 0.02
-m (one standard deviation). What is left is the kernel's end. The product's later choice among several modes
-of one group ("algorithm 10") is not made here.
+With setting group 1, for which the product's values of 60 shots are at hand, elevations and relative heights
+then differ by 0.02 m (one standard deviation), which the end of the kernel explains. The product's later
+choice among several modes of one group ("algorithm 10") is not reproduced.
 """
 
 from collections.abc import Sequence
@@ -30,14 +32,14 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from inversion.metrics.records import ladder
+from inversion.metrics.records import size_bucket
 from jaxlidar.extend import check_range
 
-# Parts of a bin, where a Gaussian is cut (in standard deviations), and shots computed at a time.
-_PARTS, _CUT, _CHUNK = 4, 2.5, 64
-# Half of the longest kernel of the published settings.
-_REACH = 65
-_LEVELS = np.arange(101) / 100
+# Subdivisions of a bin, where a Gaussian is cut (in standard deviations), and shots computed at a time.
+_SUBDIVISIONS, _CUT, _CHUNK = 4, 2.5, 64
+# Half the lags of the longest kernel of the published settings.
+_HALF_LAGS = 65
+_RH_FRACTIONS = np.arange(101) / 100
 
 
 class GediSettings(NamedTuple):
@@ -73,12 +75,12 @@ _GROUPS = {
 
 
 def gedi_settings(group: int) -> GediSettings:
-    """The settings of one of GEDI's six algorithm setting groups.
+    """Return the settings of one of GEDI's six algorithm setting groups.
 
     **Arguments:**
 
-    - `group`: 1 to 6. Group 1 is what the product selects in most places; group 5, with the lowest threshold,
-      finds the ground under dense canopies, and takes noise for it elsewhere.
+    - `group`: 1 to 6. The product selects group 1 in most places; group 5, with the lowest threshold, finds
+      the ground under dense canopies, and takes noise for ground elsewhere.
 
     **Returns:** a `GediSettings`.
 
@@ -125,14 +127,14 @@ class GediMetrics(NamedTuple):
 
 
 def gedi_metrics(shots: Sequence[Any], settings: GediSettings | None = None) -> GediMetrics:
-    """GEDI's lowest mode, highest return and relative heights, as level 2A computes them.
+    """Compute GEDI's lowest mode, highest return and relative heights, by the rules of level 2A.
 
-    Shots may differ in length. They are computed in batches, and compiled once for each of a ladder of sizes.
+    Shots may differ in length. They are computed in batches of equal size buckets, each compiled once.
 
     **Arguments:**
 
-    - `shots`: what `jaxlidar.io.read_gedi_l1b` gives, or anything with `elevation`, `waveform`, `noise_mean`
-      and `noise_std` as there.
+    - `shots`: those of `jaxlidar.io.read_gedi_l1b`, or objects with the same `elevation`, `waveform`,
+      `noise_mean` and `noise_std`.
     - `settings`: see `gedi_settings`. Default: those of group 1.
 
     **Returns:** a `GediMetrics`.
@@ -150,48 +152,59 @@ def gedi_metrics(shots: Sequence[Any], settings: GediSettings | None = None) -> 
     >>> metrics = inversion.gedi_metrics(shots, inversion.gedi_settings(1))  # doctest: +SKIP
     >>> rh98 = metrics.rh[:, 98]  # doctest: +SKIP
     """
-    chosen = gedi_settings(1) if settings is None else GediSettings(*settings)
-    for name, value in chosen._asdict().items():
+    settings = gedi_settings(1) if settings is None else GediSettings(*settings)
+    for name, value in settings._asdict().items():
         check_range(name, value, 0.0, low_open=True)
-    kernels = [_kernel(width) for width in chosen[:2]]
+    kernels = [_smoothing_kernel(settings.smoothing), _smoothing_kernel(settings.mode_smoothing)]
     # Of one size for all published settings, so that they share a program.
-    reach = max(_REACH, *(kernel.size // 2 for kernel in kernels))
-    kernels = jnp.asarray(np.stack([np.pad(kernel, reach - kernel.size // 2) for kernel in kernels]), float)
-    thresholds = jnp.asarray(chosen[2:], float)
-    counts = np.array([np.size(shot.waveform) for shot in shots], int)
+    half_lags = max(_HALF_LAGS, *(kernel.size // 2 for kernel in kernels))
+    kernels = np.stack([np.pad(kernel, half_lags - kernel.size // 2) for kernel in kernels])
+    kernels = jnp.asarray(kernels, float)
+    thresholds = jnp.asarray((settings.front_threshold, settings.back_threshold), float)
+    n_samples = np.array([np.size(shot.waveform) for shot in shots], int)
     top, step = np.empty((2, len(shots)))
-    rows = np.zeros((5 + _LEVELS.size, len(shots)))
-    sizes = np.array([ladder(int(count)) for count in counts])
+    features = {name: np.zeros(len(shots)) for name in _RecordFeatures._fields if name != "rh"}
+    rh_position = np.zeros((len(shots), _RH_FRACTIONS.size))
+    sizes = np.array([size_bucket(int(count)) for count in n_samples])
     for size in np.unique(sizes):
         (members,) = np.nonzero(sizes == size)
         for first in range(0, members.size, _CHUNK):
             chunk = members[first : first + _CHUNK]
+            # Chunks are filled up to one size, so that all share a program; the filling is records of zeros.
             records = np.zeros((_CHUNK, size))
             noise, count = np.ones(_CHUNK), np.full(_CHUNK, 3)
             for row, i in enumerate(chunk):
                 shot = shots[i]
-                records[row, : counts[i]] = _record(shot)
-                noise[row], count[row] = shot.noise_std, counts[i]
+                records[row, : n_samples[i]] = _record_above_noise(shot)
+                noise[row], count[row] = shot.noise_std, n_samples[i]
                 top[i] = shot.elevation[0]
-                step[i] = (shot.elevation[0] - shot.elevation[-1]) / (counts[i] - 1)
-            arrays = jnp.asarray(records, float), jnp.asarray(count), jnp.asarray(noise, float)
-            found = _metrics(*arrays, kernels, thresholds)
-            for place, values in enumerate(found[:5]):
-                rows[place, chunk] = np.asarray(values)[: chunk.size]
-            rows[5:, chunk] = np.asarray(found[5])[: chunk.size].T
-    part = step / _PARTS
-    lit, mode = rows[0] > 0, (rows[0] > 0) & (rows[1] > 0)
-    lowest = np.where(mode, top - part * rows[4], np.nan)
+                step[i] = (shot.elevation[0] - shot.elevation[-1]) / (n_samples[i] - 1)
+            computed = _record_features(
+                jnp.asarray(records, float),
+                jnp.asarray(count),
+                jnp.asarray(noise, float),
+                kernels,
+                thresholds,
+            )
+            for name, values in features.items():
+                values[chunk] = np.asarray(getattr(computed, name))[: chunk.size]
+            rh_position[chunk] = np.asarray(computed.rh)[: chunk.size]
+    # Positions count quarter bins downwards from the first sample.
+    spacing = step / _SUBDIVISIONS
+    has_signal = features["has_signal"] > 0
+    has_mode = has_signal & (features["n_modes"] > 0)
+    rh = spacing[:, None] * (features["lowest_mode"][:, None] - rh_position)
     return GediMetrics(
-        elev_lowestmode=lowest,
-        elev_highestreturn=np.where(lit, top - part * rows[2], np.nan),
-        elev_lowestreturn=np.where(lit, top - part * rows[3], np.nan),
-        rh=np.where(mode, part * (rows[4] - rows[5:]), np.nan).T,
-        num_detectedmodes=rows[1].astype(int),
+        elev_lowestmode=np.where(has_mode, top - spacing * features["lowest_mode"], np.nan),
+        elev_highestreturn=np.where(has_signal, top - spacing * features["first"], np.nan),
+        elev_lowestreturn=np.where(has_signal, top - spacing * features["last"], np.nan),
+        rh=np.where(has_mode[:, None], rh, np.nan),
+        num_detectedmodes=features["n_modes"].astype(int),
     )
 
 
-def _record(shot: Any) -> np.ndarray:
+def _record_above_noise(shot: Any) -> np.ndarray:
+    """Record of a shot less its mean noise. **Raises:** ValueError for shapes or values that do not serve."""
     record = np.asarray(shot.waveform, float)
     if record.ndim != 1 or record.size < 3 or np.shape(shot.elevation) != record.shape:
         raise ValueError(
@@ -203,47 +216,76 @@ def _record(shot: Any) -> np.ndarray:
     return record - shot.noise_mean
 
 
-def _kernel(width: float) -> np.ndarray:
-    """A Gaussian at parts of a bin, cut and brought to zero at its ends."""
-    sigma = width * _PARTS
-    reach = max(1, int(np.ceil(_CUT * sigma)))
-    lags = np.arange(-reach, reach + 1)
+def _smoothing_kernel(width: float) -> np.ndarray:
+    """Gaussian at quarter bins, of unit sum, cut and brought to zero at its ends."""
+    sigma = width * _SUBDIVISIONS
+    half = max(1, int(np.ceil(_CUT * sigma)))
+    lags = np.arange(-half, half + 1)
     kernel = np.maximum(np.exp(-0.5 * (lags / sigma) ** 2) - np.exp(-0.5 * _CUT**2), 0.0)
     return kernel / kernel.sum()
 
 
+class _RecordFeatures(NamedTuple):
+    """Features of records, (shots, ...); positions in quarter bins from the first sample downwards.
+
+    - `has_signal`: True if the record has a beginning and, below it, an end.
+    - `n_modes`: number of modes.
+    - `first`, `last`: positions of the signal's beginning and end.
+    - `lowest_mode`: position of the lowest mode.
+    - `rh`: (shots, 101) positions below which 0, 1, ... 100 % of the energy lie.
+    """
+
+    has_signal: Array
+    n_modes: Array
+    first: Array
+    last: Array
+    lowest_mode: Array
+    rh: Array
+
+
 @jax.jit
-def _metrics(
+def _record_features(
     records: Float[Array, "shots bins"],
-    count: Int[Array, " shots"],
+    n_samples: Int[Array, " shots"],
     noise: Float[Array, " shots"],
     kernels: Float[Array, "2 lags"],
     thresholds: Float[Array, "2"],
-) -> tuple[Array, ...]:
-    """Whether there is a signal, the number of modes, and places in parts of a bin, of several records."""
-    size = records.shape[1] * _PARTS
+) -> _RecordFeatures:
+    """Features of several records; the steps are those of the module's docstring."""
+    size = records.shape[1] * _SUBDIVISIONS
     half = kernels.shape[1] // 2
-    padded = ladder(size + kernels.shape[1])
-    spectra = jnp.fft.rfft(kernels, padded)
+    # Long enough that the convolution does not wrap around.
+    padded = size_bucket(size + kernels.shape[1])
+    kernel_spectra = jnp.fft.rfft(kernels, padded)
 
-    def one(record, count, noise):
-        place = jnp.arange(size)
-        real = place <= (count - 1) * _PARTS
-        fine = jnp.where(real, jnp.interp(place / _PARTS, jnp.arange(record.size), record), 0.0)
-        smooth = jnp.fft.irfft(jnp.fft.rfft(fine, padded)[None, :] * spectra, padded)[:, half : half + size]
-        wave, modes = jnp.where(real[None, :], smooth, 0.0)
+    def features_of(record, n_samples, noise):
+        position = jnp.arange(size)
+        # Nothing is extrapolated beyond the last sample.
+        is_recorded = position <= (n_samples - 1) * _SUBDIVISIONS
+        fine = jnp.interp(position / _SUBDIVISIONS, jnp.arange(record.size), record)
+        fine = jnp.where(is_recorded, fine, 0.0)
+        spectra = jnp.fft.rfft(fine, padded)[None, :] * kernel_spectra
+        smooth = jnp.fft.irfft(spectra, padded)[:, half : half + size]
+        wave, mode_wave = jnp.where(is_recorded[None, :], smooth, 0.0)
         front, back = (threshold * noise for threshold in thresholds)
-        pair = jnp.minimum(wave[:-1], wave[1:])
-        begins, ends = pair > front, pair > back
-        first, last = jnp.argmax(begins), size - 1 - jnp.argmax(ends[::-1])
-        lit = jnp.any(begins) & jnp.any(ends) & (first < last)
-        mode = (modes[1:-1] > modes[:-2]) & (modes[1:-1] >= modes[2:]) & (modes[1:-1] > back)
-        lowest = size - 2 - jnp.argmax(mode[::-1])
-        within = (place >= first) & (place <= last)
-        below = jnp.cumsum(jnp.where(within, wave, 0.0)[::-1])
-        share = lax.cummax(below) / jnp.maximum(below[-1], jnp.finfo(wave.dtype).tiny)
-        less = jnp.searchsorted(share, jnp.asarray(_LEVELS, share.dtype))
-        heights = jnp.minimum(size - less, last).at[-1].set(first)
-        return lit, jnp.sum(mode), first, last, lowest, heights
 
-    return jax.vmap(one)(records, count, noise)
+        two_in_a_row = jnp.minimum(wave[:-1], wave[1:])
+        is_above_front, is_above_back = two_in_a_row > front, two_in_a_row > back
+        # The end is the lower of its two samples.
+        first, last = jnp.argmax(is_above_front), size - 1 - jnp.argmax(is_above_back[::-1])
+        has_signal = jnp.any(is_above_front) & jnp.any(is_above_back) & (first < last)
+
+        inner = mode_wave[1:-1]
+        is_mode = (inner > mode_wave[:-2]) & (inner >= mode_wave[2:]) & (inner > back)
+        lowest_mode = size - 2 - jnp.argmax(is_mode[::-1])
+
+        is_signal = (position >= first) & (position <= last)
+        energy_below = jnp.cumsum(jnp.where(is_signal, wave, 0.0)[::-1])
+        # Noise must not make the cumulated energy fall: the search needs it sorted.
+        fraction = lax.cummax(energy_below) / jnp.maximum(energy_below[-1], jnp.finfo(wave.dtype).tiny)
+        n_below = jnp.searchsorted(fraction, jnp.asarray(_RH_FRACTIONS, fraction.dtype))
+        # All energy lies below the beginning of the signal, whatever rounding makes of the last fraction.
+        rh = jnp.minimum(size - n_below, last).at[-1].set(first)
+        return _RecordFeatures(has_signal, jnp.sum(is_mode), first, last, lowest_mode, rh)
+
+    return jax.vmap(features_of)(records, n_samples, noise)

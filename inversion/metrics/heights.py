@@ -1,16 +1,31 @@
-r"""Where a record's signal begins and ends, its relative heights, and its ground, without a model of the
-scene.
+r"""Ends of a record's signal, relative heights and ground, without a model of the scene.
 
 All functions take one record, (bins,), or several of one length, (shots, bins), heights decreasing. Records
-are padded to a ladder of sizes (64, 96, 128, 192, ... bins): each size is compiled once.
+are padded to size buckets (64, 96, 128, 192, ... bins): each size is compiled once.
 
-With a `pulse`, records are smoothed first, by the Gaussian of the pulse's peak and area: a matched filter for
-a Gaussian pulse, and one without side lobes for any other. What the smoothing makes of the pulse itself says
-where the echo's mode lies from its time zero, and what tail comes after it. Thresholds count standard
-deviations of the noise before smoothing, as GEDI's do: a background that drifts is smoothed by little. Where
-no noise is given, it is the root mean square of the samples within three of it, from a start at the median of
-those below zero: noise of any correlation, and what the background that was removed is wrong by. A record
-without negative samples has none.
+**Smoothing.** With a `pulse`, records are smoothed first by the Gaussian of the pulse's peak and area
+(`records.py`).
+
+**Noise.** Thresholds count standard deviations of the noise before smoothing, as GEDI's do: smoothing hardly
+reduces a background that drifts. Where no noise is given, it is estimated by sigma clipping. The signal is
+positive, so samples below zero are noise alone; for normal noise the median of their magnitude is 0.6745
+sigma. From there, five times,
+
+    sigma^2 = mean of y_i^2 over all samples with |y_i| <= 3 sigma.
+
+The mean square counts noise of any correlation, and the error of the background that was removed. A record
+without negative samples has no noise.
+
+**Signal.** Its ends are where the smoothed record first and last exceeds `threshold` sigma (Hofton and Blair
+2019).
+
+**Ground.** The lowest mode of the smoothed record that is not an artefact of an echo above it. A mode of
+value s_i at bin i counts where
+
+    s_i > max(5 sigma, 0.01 max_j s_j) + max_k s_k T(i - k),
+
+over the modes k above it, with s the smoothed record and T the tail of a smoothed echo (`SmoothedPulse`), or
+3 % over the pulse's length if that is more: receivers have tails that the transmitted pulse does not show.
 """
 
 from collections.abc import Sequence
@@ -20,31 +35,40 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, ArrayLike, Float
 
-from inversion.metrics.pulses import METRES_PER_NS, Pulse, pulse_samples, response, steps_of, vertex
-from inversion.metrics.records import ladder, over_shots, pad
+from inversion.metrics.records import (
+    Pulse,
+    over_shots,
+    pad_record,
+    sample_pulse_at_heights,
+    size_bucket,
+    smooth_pulse,
+    vertex_offset,
+)
 from jaxlidar.extend import as_array, check_range
 
 # Median of the absolute value of a normal variable of unit variance.
-_MEDIAN = 0.6745
-# Least mode, in standard deviations of the noise, and over the strongest of the record.
-_MODE = 5.0
-_FAINTEST = 0.01
-# So many of the strongest modes may hide others in their tails.
+_NORMAL_MEDIAN = 0.6745
+# Sigma clipping: samples beyond so many standard deviations are signal; number of iterations.
+_CLIP, _CLIP_ITERATIONS = 3.0, 5
+# Least height of a mode: in standard deviations of the noise, and over the largest sample.
+_MODE_THRESHOLD = 5.0
+_MODE_FRACTION = 0.01
+# Number of strongest modes whose tails are compared with lower modes: `top_k` needs a fixed number.
 _MODES = 32
-# Tail of the receiver, which a transmitted pulse does not show: at most so much of an echo, over the pulse's
-# length. (GEDI: 0.005 to 0.026 of the ground's echo, 70 to 135 ns after it.)
-_RECEIVER = 0.03
+# Largest tail of the receiver over the peak of an echo, within a pulse's length. (GEDI: 0.005 to 0.026 of the
+# ground's echo, 70 to 135 ns after it.)
+_RECEIVER_TAIL = 0.03
 
 Levels = Float[ArrayLike, " levels"] | Sequence[float]
 
 
 class SignalEnds(NamedTuple):
-    """Heights in m, (...,), between which a record holds signal; NaN where there is none.
+    """Heights in m, (...,), of the highest and the lowest return; NaN in records without signal.
 
     - `top`: of the highest return.
     - `bottom`: of the lowest.
 
-    **Example:** relative heights between ends that are known.
+    **Example:** relative heights between ends known from elsewhere.
 
     >>> import inversion, numpy as np
     >>> height = np.arange(20.0, -5.0, -0.5)
@@ -65,11 +89,9 @@ def signal_ends(
     pulse: Pulse | None = None,
     threshold: float = 6.0,
 ) -> SignalEnds:
-    """Heights of the highest and of the lowest return: where the smoothed record first and last exceeds a
-    threshold.
+    """Return the heights at which the smoothed record first and last exceeds a threshold.
 
-    Between samples, it is where a straight line crosses the threshold. The heights are differentiable in
-    `power`.
+    Between samples the record is taken as a straight line. The heights are differentiable in `power`.
 
     **Arguments:**
 
@@ -77,7 +99,7 @@ def signal_ends(
     - `power`: (bins,) record, background removed; or (shots, bins).
     - `noise`: standard deviation of a sample of `power`, one number or (shots,). Default: from the record's
       quiet samples.
-    - `pulse`: what the record is smoothed by: a recorded pulse at the record's sampling, (lags,), an odd
+    - `pulse`: gives the width of the smoothing: a recorded pulse at the record's sampling, (lags,), an odd
       number of samples with time zero in the middle, or (shots, lags); or a `jaxlidar` pulse, for light that
       goes straight down. Default: not smoothed.
     - `threshold`: in standard deviations of `noise`, 0 or more. Default 6.
@@ -99,9 +121,13 @@ def signal_ends(
     15.2 m to 0.8 m
     """
     check_range("threshold", threshold, 0.0)
-    z, y, count = record(height, power)
-    sigma = _noise(noise)
-    return _signal_ends(z, y, count, _lags(pulse, height), sigma, as_array(threshold))
+    top, bottom = _signal_ends(
+        **pad_record(height, power)._asdict(),
+        noise=_optional_noise(noise),
+        pulse=sample_pulse_at_heights(pulse, height),
+        threshold=as_array(threshold),
+    )
+    return SignalEnds(top, bottom)
 
 
 def relative_heights(
@@ -115,7 +141,7 @@ def relative_heights(
     pulse: Pulse | None = None,
     threshold: float = 6.0,
 ) -> Float[Array, "... levels"]:
-    """Relative heights (RH metrics): heights above ground below which given percentages of the energy return.
+    """Return relative heights (RH metrics): heights above ground below which percentages of the energy lie.
 
     Only energy between the ends of the signal counts: over a long record the noise would weigh as much as a
     canopy. Differentiable in `power`.
@@ -147,8 +173,13 @@ def relative_heights(
     if ends is None:
         ends = signal_ends(height, power, noise=noise, pulse=pulse, threshold=threshold)
     top, bottom = (as_array(end) for end in ends)
-    z, y, count = record(height, power)
-    return _relative_heights(z, y, count, top, bottom, as_array(levels) / 100.0, as_array(ground))
+    return _relative_heights(
+        **pad_record(height, power)._asdict(),
+        top=top,
+        bottom=bottom,
+        fractions=as_array(levels) / 100.0,
+        ground=as_array(ground),
+    )
 
 
 def find_ground(
@@ -159,13 +190,13 @@ def find_ground(
     noise: Float[ArrayLike, "..."] | None = None,
     threshold: Float[ArrayLike, "..."] | None = None,
 ) -> Float[Array, "..."]:
-    """Height of the ground, taken as the lowest mode that no other echo explains.
+    """Return the height of the ground: the lowest mode that no echo above it explains.
 
-    Modes are local maxima of the record, smoothed by the pulse. A mode counts where it exceeds the threshold
-    and, with a pulse, a hundredth of the strongest mode, both beyond what the tail of any mode above it can
-    put there: the envelope of what smoothing makes of the pulse, and 3 % over the pulse's length for the tail
-    of a receiver. So ripples of a tail are no ground. Between samples, the height is the vertex of the
-    parabola through the maximum and its two neighbours.
+    Modes are local maxima of the smoothed record. A mode counts where it exceeds the threshold and, with a
+    pulse, a hundredth of the largest sample. To both is added the most that the tail of a mode above it can
+    put there: the envelope of the smoothed pulse, or 3 % over the pulse's length for the tail of a receiver.
+    So ripples of a tail are not taken for ground. Between samples, the height is the vertex of the parabola
+    through the maximum and its two neighbours.
 
     **Arguments:**
 
@@ -186,120 +217,124 @@ def find_ground(
     >>> print(f"{float(inversion.find_ground(height, power)):.1f} m")
     1.6 m
     """
-    z, y, count = record(height, power)
-    sigma = _noise(noise)
+    record = pad_record(height, power)
+    sigma = _optional_noise(noise)
     if threshold is not None:
         check_range("threshold", threshold)
-    least = jnp.full((), jnp.nan, y.dtype) if threshold is None else as_array(threshold)
-    return _find_ground(z, y, count, _lags(pulse, height), sigma, least)
+    # NaN asks the compiled program for the default, so that both cases share it.
+    least = jnp.full((), jnp.nan, record.power.dtype) if threshold is None else as_array(threshold)
+    lags = sample_pulse_at_heights(pulse, height)
+    return _find_ground(**record._asdict(), noise=sigma, pulse=lags, threshold=least)
 
 
-def record(height: ArrayLike, power: ArrayLike) -> tuple[Array, Array, Array]:
-    """Heights and samples, padded to the ladder, and the number of samples."""
-    z, y = as_array(height, "height"), as_array(power, "power")
-    if y.ndim < 1 or z.ndim < 1 or z.shape[-1] != y.shape[-1] or y.shape[-1] < 3:
-        raise ValueError(
-            f"height and power have the shapes {z.shape} and {y.shape}; admissible is (..., bins) for both, "
-            "three or more"
-        )
-    check_range("height", height)
-    check_range("power", power)
-    check_range("steps of height", -jnp.diff(z), 0.0, low_open=True)
-    size = ladder(y.shape[-1])
-    return pad(z, size), pad(y, size), jnp.asarray(y.shape[-1])
-
-
-def _noise(noise: ArrayLike | None) -> Array:
-    """The noise; NaN stands for one to be found."""
+def _optional_noise(noise: ArrayLike | None) -> Array:
+    """Return the noise, or NaN, which asks the compiled programs to estimate it."""
     if noise is None:
         return jnp.full((), jnp.nan)
     check_range("noise", noise, 0.0)
     return as_array(noise)
 
 
-def _lags(pulse: Pulse | None, height: ArrayLike) -> Array:
-    return pulse_samples(pulse, steps_of(height, METRES_PER_NS))
-
-
-def _smoothed(y: Array, kernel: Array) -> Array:
+def _smooth(y: Array, kernel: Array) -> Array:
+    """Convolve a record with a kernel of an odd number of lags, zero in the middle, by Fourier transforms."""
     if kernel.size == 1:
         return y
-    size, half = ladder(y.size + kernel.size), kernel.size // 2
+    # Long enough that the convolution does not wrap around.
+    size, half = size_bucket(y.size + kernel.size), kernel.size // 2
     return jnp.fft.irfft(jnp.fft.rfft(y, size) * jnp.fft.rfft(kernel, size), size)[half : half + y.size]
 
 
-def _spread(y: Array, sigma: Array, real: Array) -> Array:
-    """The noise given, or found from what lies below zero."""
-    below = jnp.nanmedian(jnp.where(real & (y < 0), -y, jnp.nan)) / _MEDIAN
+def _noise_level(y: Array, noise: Array, is_recorded: Array) -> Array:
+    """Return the standard deviation of the noise: as given or, where it is NaN, by sigma clipping."""
+    start = jnp.nanmedian(jnp.where(is_recorded & (y < 0), -y, jnp.nan)) / _NORMAL_MEDIAN
 
-    def again(found: Array, _: None) -> tuple[Array, None]:
-        quiet = real & (jnp.abs(y) <= 3.0 * found)
-        square = jnp.sum(jnp.where(quiet, y * y, 0.0)) / jnp.maximum(jnp.sum(quiet), 1)
-        return jnp.sqrt(jnp.where(square > 0, square, 0.0)), None
+    def clip(sigma: Array, _: None) -> tuple[Array, None]:
+        is_quiet = is_recorded & (jnp.abs(y) <= _CLIP * sigma)
+        variance = jnp.sum(jnp.where(is_quiet, y * y, 0.0)) / jnp.maximum(jnp.sum(is_quiet), 1)
+        return jnp.sqrt(jnp.where(variance > 0, variance, 0.0)), None
 
-    found, _ = lax.scan(again, jnp.where(jnp.isnan(below), 0.0, below), None, length=5)
-    return jnp.where(jnp.isnan(sigma), lax.stop_gradient(found), sigma)
+    start = jnp.where(jnp.isnan(start), 0.0, start)
+    estimate, _ = lax.scan(clip, start, None, length=_CLIP_ITERATIONS)
+    # Derivatives are taken at a fixed threshold: that of the estimate jumps with every sample clipped.
+    return jnp.where(jnp.isnan(noise), lax.stop_gradient(estimate), noise)
 
 
-@over_shots(1, 1, 0, 1, 0, 0)
-def _ends(z, y, count, pulse, sigma, threshold):
-    number = jnp.arange(y.size)
-    real = number < count
-    smooth = _smoothed(y, response(pulse).kernel)
-    level = threshold * _spread(y, sigma, real)
-    above = real & (smooth > level)
-    first, last = jnp.argmax(above), y.size - 1 - jnp.argmax(above[::-1])
+@over_shots(height=1, power=1, n_samples=0, pulse=1, noise=0, threshold=0)
+def _signal_ends(height, power, n_samples, pulse, noise, threshold):
+    """Heights of the first and last crossing of the threshold in one padded record.
+
+    1. Smooth; find the first and the last sample above the level.
+    2. Interpolate between that sample and the one outside of it.
+    """
+    is_recorded = jnp.arange(power.size) < n_samples
+    smooth = _smooth(power, smooth_pulse(pulse).kernel)
+    level = threshold * _noise_level(power, noise, is_recorded)
+    is_above = is_recorded & (smooth > level)
+    first, last = jnp.argmax(is_above), power.size - 1 - jnp.argmax(is_above[::-1])
 
     def crossing(inside, outside):
         rise = smooth[inside] - smooth[outside]
-        share = jnp.where(rise > 0, (smooth[inside] - level) / jnp.where(rise > 0, rise, 1.0), 0.0)
-        return z[inside] + jnp.clip(share, 0.0, 1.0) * (z[outside] - z[inside])
+        fraction = jnp.where(rise > 0, (smooth[inside] - level) / jnp.where(rise > 0, rise, 1.0), 0.0)
+        return height[inside] + jnp.clip(fraction, 0.0, 1.0) * (height[outside] - height[inside])
 
-    some = jnp.any(above)
+    has_signal = jnp.any(is_above)
     top = crossing(first, jnp.maximum(first - 1, 0))
-    bottom = crossing(last, jnp.minimum(last + 1, count - 1))
-    return jnp.where(some, top, jnp.nan), jnp.where(some, bottom, jnp.nan)
+    bottom = crossing(last, jnp.minimum(last + 1, n_samples - 1))
+    return jnp.where(has_signal, top, jnp.nan), jnp.where(has_signal, bottom, jnp.nan)
 
 
-def _signal_ends(*arguments: Array) -> SignalEnds:
-    return SignalEnds(*_ends(*arguments))
+@over_shots(height=1, power=1, n_samples=0, top=0, bottom=0, fractions=1, ground=0)
+def _relative_heights(height, power, n_samples, top, bottom, fractions, ground):
+    """Heights above the ground below which fractions of the energy lie, of one padded record.
 
-
-@over_shots(1, 1, 0, 0, 0, 1, 0)
-def _relative_heights(z, y, count, top, bottom, shares, ground):
-    # From below; what is not of the record comes first, and weighs nothing.
-    z, y, real = z[::-1], y[::-1], jnp.arange(y.size)[::-1] < count
+    1. Turn the record over, from below; its padding then comes first and has no weight.
+    2. Weight each sample by the fraction of its bin that lies between the ends of the signal.
+    3. Cumulate to the edges of bins, and invert by linear interpolation.
+    """
+    z, y, is_recorded = height[::-1], power[::-1], jnp.arange(power.size)[::-1] < n_samples
     step = jnp.abs(z[-1] - z[-2])
     half = 0.5 * step
-    upper, lower = jnp.minimum(z + half, top), jnp.maximum(z - half, bottom)
-    within = jnp.where(real, jnp.maximum(upper - lower, 0.0) / step, 0.0)
-    # At the edges of samples. Noise must not make the energy fall.
-    energy = lax.cummax(jnp.concatenate([jnp.zeros(1, y.dtype), jnp.cumsum(y * within)]))
+    bin_top, bin_bottom = jnp.minimum(z + half, top), jnp.maximum(z - half, bottom)
+    overlap = jnp.where(is_recorded, jnp.maximum(bin_top - bin_bottom, 0.0) / step, 0.0)
+    # Interpolation needs energies that do not fall, as they do where noise makes samples negative.
+    energy = lax.cummax(jnp.concatenate([jnp.zeros(1, y.dtype), jnp.cumsum(y * overlap)]))
     edges = jnp.clip(jnp.concatenate([z[:1] - half, z + half]), bottom, top)
-    edges = jnp.where(jnp.concatenate([real[:1], real]), edges, bottom)
-    share = energy / jnp.maximum(energy[-1], jnp.finfo(y.dtype).tiny)
-    heights = jnp.interp(shares, share, edges)
-    # Where the energy stands still, none and all of it are at the ends.
-    heights = jnp.where(shares <= 0, bottom, jnp.where(shares >= 1, top, heights))
+    edges = jnp.where(jnp.concatenate([is_recorded[:1], is_recorded]), edges, bottom)
+    cumulative = energy / jnp.maximum(energy[-1], jnp.finfo(y.dtype).tiny)
+    heights = jnp.interp(fractions, cumulative, edges)
+    # Where the energy does not rise, interpolation could answer with any height of the plateau.
+    heights = jnp.where(fractions <= 0, bottom, jnp.where(fractions >= 1, top, heights))
     return jnp.where(energy[-1] > 0, heights, jnp.nan) - ground
 
 
-@over_shots(1, 1, 0, 1, 0, 0)
-def _find_ground(z, y, count, pulse, sigma, threshold):
-    number = jnp.arange(y.size)
-    real = number < count
-    echo = response(pulse)
-    smooth = jnp.where(real, _smoothed(y, echo.kernel), 0.0)
-    least = jnp.where(jnp.isnan(threshold), _MODE * _spread(y, sigma, real), threshold)
-    least = jnp.maximum(least, _FAINTEST * jnp.max(smooth) * (pulse.size > 1))
+@over_shots(height=1, power=1, n_samples=0, pulse=1, noise=0, threshold=0)
+def _find_ground(height, power, n_samples, pulse, noise, threshold):
+    """Height of the lowest mode that no tail explains, in one padded record.
+
+    1. Smooth, and set the least height of a mode from threshold, noise and largest sample.
+    2. Find the modes: local maxima above it.
+    3. Drop those that the tail of one of the strongest modes above them can reach.
+    4. Interpolate the lowest mode that remains, and go back from the mode of a smoothed echo to the pulse's
+       time zero.
+    """
+    number = jnp.arange(power.size)
+    is_recorded = number < n_samples
+    echo = smooth_pulse(pulse)
+    smooth = jnp.where(is_recorded, _smooth(power, echo.kernel), 0.0)
+    sigma = _noise_level(power, noise, is_recorded)
+    least = jnp.where(jnp.isnan(threshold), _MODE_THRESHOLD * sigma, threshold)
+    least = jnp.maximum(least, _MODE_FRACTION * jnp.max(smooth) * (pulse.size > 1))
     inner = smooth[1:-1]
-    peak = (inner > smooth[:-2]) & (inner >= smooth[2:]) & (inner > least) & real[2:]
+    # A plateau of two equal samples is one mode: it exceeds the sample before, not the one after.
+    is_mode = (inner > smooth[:-2]) & (inner >= smooth[2:]) & (inner > least) & is_recorded[2:]
     if pulse.size > 1:
-        tail = jnp.maximum(echo.tail[: pulse.size], _RECEIVER).at[0].set(0.0)
-        strength, place = lax.top_k(jnp.where(peak, inner, 0.0), _MODES)
-        away = number[: y.size - 2, None] - place[None, :]
-        reach = jnp.where((away > 0) & (away < tail.size), tail[jnp.clip(away, 0, tail.size - 1)], 0.0)
-        peak &= inner > least + jnp.max(reach * strength[None, :], axis=1)
-    last = y.size - 2 - jnp.argmax(peak[::-1])
-    found = z[last] - (z[0] - z[1]) * (vertex(smooth, last) - echo.mode)
-    return jnp.where(jnp.any(peak), found, jnp.nan)
+        # A mode does not hide itself: the tail is zero at no distance.
+        tail = jnp.maximum(echo.tail[: pulse.size], _RECEIVER_TAIL).at[0].set(0.0)
+        strength, position = lax.top_k(jnp.where(is_mode, inner, 0.0), _MODES)
+        distance = number[: power.size - 2, None] - position[None, :]
+        tail_here = tail[jnp.clip(distance, 0, tail.size - 1)]
+        tail_here = jnp.where((distance > 0) & (distance < tail.size), tail_here, 0.0)
+        is_mode &= inner > least + jnp.max(tail_here * strength[None, :], axis=1)
+    lowest = power.size - 2 - jnp.argmax(is_mode[::-1])
+    ground = height[lowest] - (height[0] - height[1]) * (vertex_offset(smooth, lowest) - echo.mode)
+    return jnp.where(jnp.any(is_mode), ground, jnp.nan)

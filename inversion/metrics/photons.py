@@ -1,18 +1,20 @@
 """Ground and canopy in the events of a photon counter, without a model of the scene.
 
-Three steps, each a simple published one:
+1. **Noise.** Signal is dense. The neighbours of a photon are those within an ellipse that is wider than high
+   (Zhang and Kerekes 2015). By background alone their number is Poisson distributed, with the mean of the
+   ellipse's area times the density of background. A photon is signal where that number or more occur in less
+   than one case of a thousand (compare DRAGANN, Neuenschwander and Pitts 2019).
+2. **Ground.** In each segment of the track it is a straight line, fitted to the signal by iteratively
+   reweighted least squares with weights that fall off quickly above the line and slowly below it,
 
-1. Noise is told by density: by the number of neighbours of each photon, as DRAGANN does (Neuenschwander and
-   Pitts 2019), within an ellipse that is wider than high (Zhang and Kerekes 2015). A photon is signal where
-   background alone would give as many in one case of a thousand, by the Poisson distribution.
-2. The ground of a segment of the track is a straight line, fitted with weights that fall off quickly above it
-   and slowly below, so that it sinks through the canopy (Kraus and Pfeifer 1998); at the end, a fit of what
-   lies within a metre.
-3. The canopy's height is a percentile, ATL08's 98th, of the heights above that line of what lies two metres
+       w(r) = 1 / (1 + (r / s)^4),    s = 1 m for r > 0, 5 m for r < 0,
+
+   so that the line sinks through the canopy (Kraus and Pfeifer 1998); at the end, by photons within a metre.
+3. **Canopy.** Its height is a percentile, ATL08's 98th, of the heights above that line of signal two metres
    above it and more (Neuenschwander and Pitts 2019).
 
-Sources: Kraus and Pfeifer (1998), ISPRS J. Photogramm. 53, 193; Neuenschwander and Pitts (2019), Remote Sens.
-Environ. 221, 247; Zhang and Kerekes (2015), IEEE Geosci. Remote Sens. Lett. 12, 726.
+**Source:** Kraus and Pfeifer (1998), ISPRS J. Photogramm. 53, 193; Neuenschwander and Pitts (2019), Remote
+Sens. Environ. 221, 247; Zhang and Kerekes (2015), IEEE Geosci. Remote Sens. Lett. 12, 726.
 """
 
 from typing import NamedTuple
@@ -26,19 +28,23 @@ from jaxlidar.extend import check_integer, check_kind, check_range
 
 # Half-axes of the ellipse in m: along the track, in height.
 _ALONG, _HIGH = 10.0, 3.0
-# How often background alone may seem to be signal, and the fewest neighbours of signal.
-_FALSE_ALARM, _NEIGHBOURS = 1e-3, 3
-# Height in m of the cells in which background is counted, and from how many standard deviations above their
-# mean on they hold signal.
-_CELL, _CLIP = 5.0, 3.0
+# Probability that background alone passes for signal, and the fewest neighbours of signal.
+_FALSE_ALARM, _FEWEST_NEIGHBOURS = 1e-3, 3
+# Height in m of the cells in which background is counted. Cells this many standard deviations above the mean
+# hold signal.
+_CELL_HEIGHT, _CLIP, _CLIP_ITERATIONS = 5.0, 3.0, 30
 # Residuals in m at which weights are a half, above the ground (Kraus and Pfeifer's) and below.
-_ABOVE, _BELOW = 1.0, 5.0
-# Ground lies within, canopy beyond so many metres of the line.
-_GROUND, _CANOPY = 1.0, 2.0
+_HALF_WEIGHT_ABOVE, _HALF_WEIGHT_BELOW = 1.0, 5.0
+# Iterations of the fit, the first ones with those weights. It starts from this percentile of the heights.
+_ITERATIONS, _WEIGHTED_ITERATIONS, _START_PERCENTILE = 40, 30, 10.0
+# Ground lies within so many metres of the line, canopy at least so many above it.
+_GROUND_RANGE, _CANOPY_CLEARANCE = 1.0, 2.0
+# Labels of photons.
+_NOISE, _GROUND, _CANOPY, _OTHER_SIGNAL = 0, 1, 2, 3
 
 
 class PhotonHeights(NamedTuple):
-    """Ground and canopy of the segments of a track; NaN where there were too few photons.
+    """Ground and canopy of the segments of a track; NaN in segments with too few photons.
 
     - `distance`: (segments,) m along the track, of the middle of each segment.
     - `ground`: (segments,) m, height of the ground there.
@@ -47,12 +53,12 @@ class PhotonHeights(NamedTuple):
     - `label`: (events,) 0 for noise, 1 for ground, 2 for canopy, and 3 for signal that is neither: between
       the two, below the ground, or in a segment without ground.
 
-    **Example:** the share of the photons that were taken for canopy.
+    **Example:** the fraction of the photons that were taken for canopy.
 
     >>> import inversion, numpy as np
-    >>> one = np.array([10.0])
-    >>> found = inversion.PhotonHeights(one, one, one, one, label=np.array([0, 1, 2, 2]))
-    >>> print(np.mean(found.label == 2))
+    >>> segment = np.array([10.0])
+    >>> heights = inversion.PhotonHeights(segment, segment, segment, segment, label=np.array([0, 1, 2, 2]))
+    >>> print(np.mean(heights.label == 2))
     0.5
     """
 
@@ -72,25 +78,25 @@ def photon_ground_and_canopy(
     background_rate: float | None = None,
     least: int = 5,
 ) -> PhotonHeights:
-    """Ground and canopy height along a track of photon events, by the density of photons.
+    """Return ground and canopy height along a track of photon events, by the density of photons.
 
-    It knows neither pulse nor dead time: where echoes are strong, both heights have the bias of first
+    The method uses neither pulse nor dead time: where echoes are strong, both heights have the bias of first
     photons. The few photons of a thin top are lost with the noise, so canopies read low by a metre or so
-    under sunlight. Light is taken to come straight down.
+    under sunlight. Light is taken to travel straight down.
 
     **Arguments:**
 
     - `events`: `PhotonEvents` of a track, as `jaxlidar.record` draws them of `Waveforms`.
-    - `distance`: (shots,) m along the track of each shot; they span more than nothing.
+    - `distance`: (shots,) m along the track of each shot, not all equal.
     - `segment`: length in m over which the ground is a line, positive. Default 20.
     - `percentile`: of the heights of canopy photons that is the canopy's, in [0, 100]. Default 98.
-    - `background_rate`: events per second of background, not negative. Default None: found in the record,
-      which then must be mostly background: see `PhotonCounter.window`.
-    - `least`: photons that a ground, or a canopy, has at least, an integer of at least 2. Default 5.
+    - `background_rate`: events per second of background, not negative. Default None: estimated from the
+      record, which then must be mostly background: see `PhotonCounter.window`.
+    - `least`: fewest photons of a ground, or a canopy, an integer of at least 2. Default 5.
 
     **Returns:** a `PhotonHeights`.
 
-    **Raises:** ValueError for inadmissible arguments, TypeError for things of another kind.
+    **Raises:** ValueError for inadmissible arguments, TypeError for `events` of another kind.
 
     **Source:** Neuenschwander and Pitts (2019), Remote Sens. Environ. 221, 247, for noise and canopy; Kraus
     and Pfeifer (1998), ISPRS J. Photogramm. 53, 193, for the ground.
@@ -103,8 +109,8 @@ def photon_ground_and_canopy(
     >>> many = jl.simulate_many(survey, jl.Scene(ground=jl.Ground(height=3.0)), key=jax.random.key(0))
     >>> sun = jl.PhotonCounter(background_rate=2e6, window=(-300.0, 300.0))
     >>> events = jl.record(many, receiver=sun, mode="photons", key=jax.random.key(1))
-    >>> found = inversion.photon_ground_and_canopy(events, survey.position[:, 0])
-    >>> print(f"{np.mean(found.ground):.1f} m, {np.isfinite(found.canopy).sum()} segments with canopy")
+    >>> heights = inversion.photon_ground_and_canopy(events, survey.position[:, 0])
+    >>> print(f"{np.mean(heights.ground):.1f} m, {np.isfinite(heights.canopy).sum()} segments with canopy")
     3.0 m, 0 segments with canopy
     """
     check_kind("events", events, PhotonEvents, "PhotonEvents")
@@ -118,92 +124,120 @@ def photon_ground_and_canopy(
             f"distance has shape {along.shape}; admissible is one for each of the {len(events.lost)} shots "
             "of events, which do not all lie at one place"
         )
-    start = along.min()
-    segments = int(np.ceil(np.ptp(along) / segment * (1 - 1e-9)))
-    middle = start + segment * (np.arange(segments) + 0.5)
+    start, length = along.min(), np.ptp(along)
+    # A track of a whole number of segments has no further one by rounding.
+    n_segments = int(np.ceil(length / segment * (1 - 1e-9)))
+    middle = start + segment * (np.arange(n_segments) + 0.5)
     x, z = along[events.shot], events.height
-    number = np.clip(((x - start) / segment).astype(int), 0, segments - 1)
+    number = np.clip(((x - start) / segment).astype(int), 0, n_segments - 1)
     if background_rate is None:
-        density = _background(x - start, z, np.ptp(along), events.window)
+        density = _background_density(x - start, z, length, events.window)
     else:
         check_range("background_rate", background_rate, 0.0)
-        per_metre = 1e-9 * background_rate * 2.0 / SPEED_OF_LIGHT
-        density = per_metre * len(along) * events.pulses / np.ptp(along)
+        rate_per_metre = 1e-9 * background_rate * 2.0 / SPEED_OF_LIGHT
+        density = rate_per_metre * len(along) * events.pulses / length
 
-    is_signal = _neighbours(x, z) >= _fewest(density)
-    local = x - middle[number]
-    ground, slope = _lines(local[is_signal], z[is_signal], number[is_signal], segments)
-    above = z - ground[number] - slope[number] * local
-    near = is_signal & (np.abs(above) <= _GROUND)
-    enough = np.bincount(number[near], minlength=segments) >= least
-    ground, slope = np.where(enough, ground, np.nan), np.where(enough, slope, np.nan)
-    high = is_signal & (above >= _CANOPY) & enough[number]
-    label = np.select([near & enough[number], high, is_signal], [1, 2, 3], 0)
+    is_signal = _count_neighbours(x, z) >= _fewest_neighbours(density)
+    # Lines pass through the middle of their segments, where height and slope are least correlated.
+    x_local = x - middle[number]
+    ground, slope = _fit_ground(x_local[is_signal], z[is_signal], number[is_signal], n_segments)
+    above = z - ground[number] - slope[number] * x_local
+    is_near = is_signal & (np.abs(above) <= _GROUND_RANGE)
+    has_ground = np.bincount(number[is_near], minlength=n_segments) >= least
+    ground, slope = np.where(has_ground, ground, np.nan), np.where(has_ground, slope, np.nan)
+    is_canopy = is_signal & (above >= _CANOPY_CLEARANCE) & has_ground[number]
+    label = np.select(
+        [is_near & has_ground[number], is_canopy, is_signal], [_GROUND, _CANOPY, _OTHER_SIGNAL], _NOISE
+    )
     return PhotonHeights(
         distance=middle,
         ground=ground,
         slope=slope,
-        canopy=_percentiles(above[high], number[high], segments, percentile, least),
+        canopy=_percentiles(above[is_canopy], number[is_canopy], n_segments, percentile, least),
         label=label,
     )
 
 
-def _background(x: np.ndarray, z: np.ndarray, length: float, window: np.ndarray) -> float:
-    """Events of background per square metre of track and height: the mean of cells that are not too full."""
+def _background_density(x: np.ndarray, z: np.ndarray, length: float, window: np.ndarray) -> float:
+    """Background events per square metre of track and height: the mean of cells without signal.
+
+    Sigma clipping of the counts n of cells, Poisson distributed: from the mean m of all cells, the mean of
+    those with n <= m + 3 sqrt(m), again and again.
+    """
     low, high = window.min(), window.max()
-    shape = [max(1, round(size / _CELL)) for size in (4.0 * length / _ALONG, high - low)]
+    shape = [max(1, round(size / _CELL_HEIGHT)) for size in (4.0 * length / _ALONG, high - low)]
     counts, _, _ = np.histogram2d(x, z, bins=shape, range=[[0.0, length], [low, high]])
     mean = counts.mean()
-    for _ in range(30):
+    for _ in range(_CLIP_ITERATIONS):
         mean = counts[counts <= mean + _CLIP * np.sqrt(mean)].mean()
     return float(mean * counts.size / (length * (high - low)))
 
 
-def _fewest(density: float) -> float:
-    """The number of neighbours from which on a photon is signal."""
+def _fewest_neighbours(density: float) -> float:
+    """Fewest neighbours of signal, by the Poisson distribution of those of background."""
     expected = np.pi * _ALONG * _HIGH * density
-    return max(float(stats.poisson.isf(_FALSE_ALARM, expected)) + 1.0, _NEIGHBOURS)
+    return max(float(stats.poisson.isf(_FALSE_ALARM, expected)) + 1.0, _FEWEST_NEIGHBOURS)
 
 
-def _neighbours(x: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """How many others lie within the ellipse around each photon."""
+def _count_neighbours(x: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """Number of other photons within the ellipse around each photon."""
     if x.size == 0:
         return np.zeros(0)
     scaled = np.stack([x / _ALONG, z / _HIGH], axis=1)
     return spatial.KDTree(scaled).query_ball_point(scaled, 1.0, return_length=True) - 1
 
 
-def _lines(x: np.ndarray, z: np.ndarray, number: np.ndarray, segments: int) -> tuple[np.ndarray, np.ndarray]:
-    """Height at x = 0 and slope of the ground of each segment; of any kind where there are no photons."""
-    height, slope = _percentiles(z, number, segments, 10.0, 1), np.zeros(segments)
+def _fit_ground(
+    x: np.ndarray, z: np.ndarray, number: np.ndarray, n_segments: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Height at x = 0 and slope of the ground in each segment; arbitrary in segments without photons.
+
+    Weighted least squares of z = height + slope x, all segments at once, each iteration on the residuals of
+    the last one:
+
+    1. Start from a low percentile of the heights, without slope.
+    2. Weights: first those that sink through the canopy, at the end one for photons near the line.
+    3. Solve the 2 x 2 normal equations of each segment for corrections of height and slope.
+    """
+    height, slope = _percentiles(z, number, n_segments, _START_PERCENTILE, 1), np.zeros(n_segments)
     height = np.nan_to_num(height)
-    for step in range(40):
-        above = z - height[number] - slope[number] * x
-        if step < 30:
-            weight = 1.0 / (1.0 + (above / np.where(above > 0, _ABOVE, _BELOW)) ** 4)
+    for iteration in range(_ITERATIONS):
+        residual = z - height[number] - slope[number] * x
+        if iteration < _WEIGHTED_ITERATIONS:
+            half_weight = np.where(residual > 0, _HALF_WEIGHT_ABOVE, _HALF_WEIGHT_BELOW)
+            weight = 1.0 / (1.0 + (residual / half_weight) ** 4)
         else:
-            weight = (np.abs(above) <= _GROUND).astype(float)
-        total, wx, wxx, wr, wxr = (
-            np.bincount(number, weight * a, segments) for a in (np.ones_like(x), x, x * x, above, x * above)
+            weight = (np.abs(residual) <= _GROUND_RANGE).astype(float)
+        w, wx, wxx, wr, wxr = (
+            np.bincount(number, weight * a, n_segments)
+            for a in (np.ones_like(x), x, x * x, residual, x * residual)
         )
-        # As much as a photon a metre away says that the slope stays: it is known where x hardly varies.
-        spread = total * wxx - wx**2 + total
-        total = np.maximum(total, 1e-300)
-        turn = (total * wxr - wx * wr) / np.maximum(spread, 1e-300)
-        slope = slope + turn
-        height = height + (wr - turn * wx) / total
+        # The last term acts like a photon a metre away that says that the slope stays: it fixes the slope of
+        # segments in which x hardly varies.
+        determinant = w * wxx - wx**2 + w
+        w = np.maximum(w, 1e-300)
+        slope_change = (w * wxr - wx * wr) / np.maximum(determinant, 1e-300)
+        slope = slope + slope_change
+        height = height + (wr - slope_change * wx) / w
     return height, slope
 
 
-def _percentiles(z: np.ndarray, number: np.ndarray, segments: int, q: float, least: int) -> np.ndarray:
-    """A percentile of each segment, between neighbours by a straight line; NaN where there are too few."""
+def _percentiles(
+    z: np.ndarray, number: np.ndarray, n_segments: int, percentile: float, least: int
+) -> np.ndarray:
+    """Percentile of the values of each segment, as `numpy.percentile`; NaN for fewer than `least` values.
+
+    All values are sorted once, by segment and size; a segment's percentile then lies at a position known from
+    its count.
+    """
     order = np.lexsort((z, number))
-    count = np.bincount(number, minlength=segments)
-    some = np.flatnonzero(count >= least)
-    place = (np.cumsum(count) - count)[some] + 0.01 * q * (count[some] - 1)
-    low = np.floor(place).astype(int)
+    count = np.bincount(number, minlength=n_segments)
+    filled = np.flatnonzero(count >= least)
+    first = (np.cumsum(count) - count)[filled]
+    position = first + 0.01 * percentile * (count[filled] - 1)
+    low = np.floor(position).astype(int)
     high = np.minimum(low + 1, max(z.size - 1, 0))
     z = z[order]
-    found = np.full(segments, np.nan)
-    found[some] = z[low] + (place - low) * (z[high] - z[low])
-    return found
+    percentiles = np.full(n_segments, np.nan)
+    percentiles[filled] = z[low] + (position - low) * (z[high] - z[low])
+    return percentiles

@@ -9,8 +9,7 @@ from jaxlidar.cli.shared import PLOT, new_axes, out, save_figure
 from jaxlidar.io import atomic_write
 from jaxlidar.optics.coefficients import TRAITS
 from jaxlidar.optics.prospect import Prospect
-from jaxlidar.optics.spectra import spectra as listed
-from jaxlidar.optics.spectra import spectrum
+from jaxlidar.optics.spectra import spectrum, spectrum_names
 
 WAVELENGTHS = (532.0, 1064.0, 1550.0)
 # Without PRO, whose coefficients are its authors' file.
@@ -70,16 +69,16 @@ def spectra(kind: str | None, plot: Path | None) -> None:
       jaxlidar spectra
       jaxlidar spectra soil --plot soils.png
     """
-    names = listed(kind)
-    width = max(map(len, names))
+    kind_of_name = spectrum_names(kind)
+    width = max(map(len, kind_of_name))
     click.echo(f"{'name':{width}}  {'kind':6}  " + "  ".join(f"{w:4.0f} nm" for w in WAVELENGTHS))
-    for name, own in names.items():
+    for name, material in kind_of_name.items():
         values = "  ".join(f"{float(r):7.2f}" for r in spectrum(name)(np.array(WAVELENGTHS)))
-        click.echo(f"{name:{width}}  {own:6}  {values}")
+        click.echo(f"{name:{width}}  {material:6}  {values}")
     if plot is not None:
         from jaxlidar.plot import spectrum as draw
 
         axes = new_axes(5.0, 3.0)
-        for name in names:
+        for name in kind_of_name:
             draw(spectrum(name), axes)
         save_figure(axes, plot)

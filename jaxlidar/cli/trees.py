@@ -8,13 +8,13 @@ from jaxlidar.cli.shared import PLOT, new_axes, out, save_figure
 from jaxlidar.io import Case, write_case
 from jaxlidar.optics.prospect import Prospect
 from jaxlidar.optics.spectra import spectrum
-from jaxlidar.plants.habits import broadleaf, conifer, grow, shrub, spreading
+from jaxlidar.plants.habits import broadleaf, conifer, grow, shrub, spreading_tree
 from jaxlidar.plants.voxelise import voxelise
 from jaxlidar.scenes.canopy import Canopy
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.surfaces import Ground
 
-HABITS = {"broadleaf": broadleaf, "conifer": conifer, "shrub": shrub, "spreading": spreading}
+HABITS = {"broadleaf": broadleaf, "conifer": conifer, "shrub": shrub, "spreading": spreading_tree}
 POSITIVE = click.FloatRange(0, min_open=True)
 
 

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 
+from jaxlidar._deprecated import RENAMED, warn_renamed
 from jaxlidar._registry import public_objects
 from jaxlidar.instrument.pulse import SampledPulse
 from jaxlidar.instrument.survey import Survey
@@ -21,9 +22,9 @@ from jaxlidar.optics.leaf_angles import LeafAngles
 from jaxlidar.optics.prospect import Prospect
 from jaxlidar.optics.spectra import read_spectrum_csv, spectrum
 from jaxlidar.plants.forest import forest
-from jaxlidar.plants.habits import Branching, Habit, broadleaf, conifer, grow, shrub, spreading
+from jaxlidar.plants.habits import Branching, Habit, broadleaf, conifer, grow, shrub, spreading_tree
 from jaxlidar.plants.meshes import voxelise_mesh
-from jaxlidar.plants.voxelise import crop, voxelise
+from jaxlidar.plants.voxelise import trim_empty_layers, voxelise
 from jaxlidar.scenes.surfaces import AbstractGround, AbstractSheet, Ground, Plate
 from jaxlidar.scenes.voxels import VoxelMap
 
@@ -33,7 +34,8 @@ ROOMS = ("jaxlidar.optics.", "jaxlidar.instrument.", "jaxlidar.scenes.")
 RECORDS = ("PhotonCounter", "PhotonEvents")
 # Other ways to make a part of a scene.
 MAKERS: tuple[Callable[..., Any], ...] = (
-    *(Branching, Habit, broadleaf, conifer, shrub, spreading, grow, forest, voxelise, voxelise_mesh, crop),
+    *(Branching, Habit, broadleaf, conifer, shrub, spreading_tree, grow, forest),
+    *(voxelise, voxelise_mesh, trim_empty_layers),
     *(VoxelMap.from_lad, VoxelMap.from_extinction, VoxelMap.from_probability),
     *(Survey.grid, Survey.track, Survey.scan),
     *(LeafAngles.named, LeafAngles.beta, Prospect.paper),
@@ -149,6 +151,14 @@ def kinds() -> Mapping[str, Callable[..., Any]]:
         and name not in RECORDS
     }
     return {**classes, **{maker.__qualname__: maker for maker in MAKERS}}
+
+
+def current_kind(name: str) -> str:
+    """Return the present name of a kind; where `name` is one from before a renaming, warn."""
+    if name in kinds() or RENAMED.get(name) not in kinds():
+        return name
+    warn_renamed(f"kind = {name!r}", f"kind = {RENAMED[name]!r}")
+    return RENAMED[name]
 
 
 @functools.cache

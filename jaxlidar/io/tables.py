@@ -18,6 +18,7 @@ from jaxlidar.io.kinds import (
     Argument,
     arguments_of,
     choices,
+    current_kind,
     is_text,
     is_tuple,
     item_of,
@@ -102,6 +103,7 @@ def value_of(table: Any, argument: Argument, place: str, arrays: Arrays, folder:
     if isinstance(table, str) and not is_text(annotation):
         if table == NOTHING:
             return None
+        table = current_kind(table)
         if table in kinds():
             return _call(kinds()[table], {}, place, arrays, folder)
         raise ValueError(f"{place} = {table!r} is no kind; {nearest(table, kinds())}")
@@ -125,6 +127,7 @@ def value_of(table: Any, argument: Argument, place: str, arrays: Arrays, folder:
             raise ValueError(f"{place}: kind is missing: which class it is, or which function makes it")
         return _call(maker, table, place, arrays, folder)
     kind = table["kind"]
+    kind = current_kind(kind) if isinstance(kind, str) else kind
     if not isinstance(kind, str) or kind not in kinds():
         raise ValueError(f"{place}.kind = {kind!r} is no kind; {nearest(str(kind), kinds())}")
     given = {key: part for key, part in table.items() if key != "kind"}

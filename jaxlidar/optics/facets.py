@@ -1,9 +1,9 @@
 """Facets: flat Lambertian pieces of leaf or bark that light meets in a voxel.
 
 Spherically oriented facets scatter by Ross's phase function (Ross 1981, eq. II.3.8; Shultis and Myneni 1988).
-Its reflected part, per unit projected area, is the *view factor* 2/(3 pi) (sin b - b cos b), with b the angle
-between incident and view direction. A view factor is an apparent reflectance per unit reflectance: pi times
-the density per steradian.
+Its reflected part, per unit projected area, is the *intensity factor* 2/(3 pi) (sin b - b cos b), with b the
+angle between incident and view direction. An intensity factor is pi times the radiant intensity towards the
+view per unit of scattered flux, that is pi times the density per steradian.
 """
 
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ FACET_BACKSCATTER = 2.0 / 3.0
 
 
 def facet_reflection(cos_angle: Scalar) -> Scalar:
-    """View factor of reflection by spherically oriented facets.
+    """Intensity factor of reflection by spherically oriented facets.
 
     **Arguments:**
 
@@ -31,7 +31,7 @@ def facet_reflection(cos_angle: Scalar) -> Scalar:
 
 
 def facet_transmission(cos_angle: Scalar) -> Scalar:
-    """View factor of diffuse transmission by spherically oriented facets.
+    """Intensity factor of diffuse transmission by spherically oriented facets.
 
     **Arguments:**
 

@@ -1,8 +1,8 @@
 """Laws of reflection: how a surface distributes the light that it reflects over directions.
 
-Everything is normalised by reflectance, which the tracer does not need. The *view factor* of a law is its
-apparent reflectance per unit reflectance: pi times the energy per steradian that it sends towards the
-receiver.
+Everything is normalised by reflectance, which the tracer does not need. The *intensity factor* of a law is pi
+times the radiant intensity towards the view per incident flux and unit reflectance, averaged over the
+receiver's aperture: pi times BRDF times the cosine of the view angle.
 
     Lambertian      cos(theta)
     equal-angle     1 / (pi sqrt(sin^2(theta) + alpha^2 / 4)),  alpha the half-angle of the aperture
@@ -23,11 +23,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxlidar._checks import briefly, scalar
+from jaxlidar._deprecated import RenamedMethods
 from jaxlidar._ranges import Range, check_ranges
 from jaxlidar._vectors import Scalar, Vec, about, cross, dot, from_frame, polar, vec
 
 
-class AbstractLaw(eqx.Module):
+class AbstractLaw(RenamedMethods, eqx.Module):
     """A law of reflection: how a surface distributes the light that it reflects over directions.
 
     A law of your own is one class in one file: derive it from this, give its five methods, and pass it as
@@ -42,8 +43,8 @@ class AbstractLaw(eqx.Module):
 
         intensity_factor = pi * albedo * density,
 
-    and light that `sample` draws has that density. It is reciprocal if intensity_factor / |cosine of out|
-    stays the same when incident and out are exchanged.
+    and light that `sample` draws has that density. It is reciprocal if the BRDF, proportional to
+    intensity_factor / |cosine of out|, stays the same when incident and out are exchanged.
 
     **Example:** straight back from a horizontal surface.
 
@@ -58,7 +59,10 @@ class AbstractLaw(eqx.Module):
 
     @abc.abstractmethod
     def intensity_factor(self, incident: Vec, normal: Vec, view: Vec, half_angle: Scalar) -> Scalar:
-        """Apparent reflectance per unit reflectance towards `view`, averaged over the receiver's aperture.
+        """Pi times BRDF times the cosine of the view angle, per unit reflectance, averaged over the aperture.
+
+        This is pi times the radiant intensity towards `view` per incident flux. The apparent reflectance of a
+        surface is its reflectance times this.
 
         **Arguments:**
 
@@ -107,7 +111,7 @@ class AbstractLaw(eqx.Module):
 
     @abc.abstractmethod
     def largest_intensity_factor(self, half_angle: float) -> float:
-        """An upper bound on the view factor over all directions, for the plan.
+        """An upper bound on the intensity factor over all directions, for the plan.
 
         **Arguments:**
 
@@ -130,7 +134,7 @@ class AbstractMirror(AbstractLaw):
     - `roughness`: standard deviation of the reflected direction about the mirror direction along each of two
       perpendicular axes, rad.
 
-    **Example:** the view factor of a perfect mirror has no bound.
+    **Example:** the intensity factor of a perfect mirror has no bound.
 
     >>> import jaxlidar as jl
     >>> mirror = jl.Specular(roughness=0.0)
@@ -178,8 +182,8 @@ class Lambertian(AbstractLaw):
 class EqualAngle(AbstractLaw):
     """Reflection with a polar angle uniform in [0, 90] degrees: the paper's "every angle equally likely".
 
-    The angle is measured from the surface normal. The density 1/(pi^2 sin theta) is singular there; the view
-    factor is its average over the receiver's aperture.
+    The angle is measured from the surface normal. The density 1/(pi^2 sin theta) is singular there; the
+    intensity factor is its average over the receiver's aperture.
 
     **Example:** the apparent reflectance of ground, per unit reflectance, seen at 60 degrees from its normal.
 

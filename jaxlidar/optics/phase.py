@@ -1,7 +1,7 @@
 """Phase functions: how a volume scatters, in place of the facets of leaves or bark.
 
-The *view factor* of a phase function is pi times its density per steradian: apparent reflectance per unit
-single scattering albedo. With beta the scattering angle,
+The *intensity factor* of a phase function is pi times its density per steradian, as for laws of reflection:
+pi times the radiant intensity towards the view per unit of scattered flux. With beta the scattering angle,
 
     isotropic            1 / 4
     Henyey-Greenstein    (1 - g^2) / (4 (1 + g^2 - 2 g cos beta)^(3/2))
@@ -19,14 +19,15 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxlidar._checks import array, briefly, scalar
+from jaxlidar._deprecated import RenamedMethods
 from jaxlidar._ranges import FRACTION, Range, check_ranges
 from jaxlidar._vectors import Scalar, Vec, dot, from_frame, polar
 
 # Of isotropic scattering.
-ISOTROPIC_VIEW_FACTOR = 0.25
+ISOTROPIC_INTENSITY_FACTOR = 0.25
 
 
-class AbstractPhase(eqx.Module):
+class AbstractPhase(RenamedMethods, eqx.Module):
     """A phase function with its single scattering albedo: how a volume scatters light.
 
     A phase function of your own is one class in one file: derive it from this, give its three methods
@@ -79,7 +80,7 @@ class AbstractPhase(eqx.Module):
 
     @abc.abstractmethod
     def largest_intensity_factor(self) -> float:
-        """An upper bound on the view factor over all directions, for the plan.
+        """An upper bound on the intensity factor over all directions, for the plan.
 
         **Returns:** a number; infinite where there is no bound.
         """
@@ -133,13 +134,13 @@ class Isotropic(AbstractPhase):
         _check(self)
 
     def intensity_factor(self, incident: Vec, view: Vec) -> Scalar:
-        return jnp.full_like(incident[0], ISOTROPIC_VIEW_FACTOR)
+        return jnp.full_like(incident[0], ISOTROPIC_INTENSITY_FACTOR)
 
     def sample(self, incident: Vec, u: Scalar, v: Scalar) -> Vec:
         return polar(1.0 - 2.0 * u, 2 * np.pi * v)
 
     def largest_intensity_factor(self) -> float:
-        return ISOTROPIC_VIEW_FACTOR
+        return ISOTROPIC_INTENSITY_FACTOR
 
 
 @final
@@ -158,7 +159,7 @@ class HenyeyGreenstein(AbstractPhase):
 
     **Source:** Henyey and Greenstein (1941), Astrophys. J. 93, 70.
 
-    **Example:** view factors of forward scattering and of backscatter.
+    **Example:** intensity factors of forward scattering and of backscatter.
 
     >>> import jaxlidar as jl
     >>> import jax.numpy as jnp
@@ -183,7 +184,7 @@ class HenyeyGreenstein(AbstractPhase):
         cosine = jnp.clip(dot(incident, view), -1.0, 1.0)
         # 1 + g^2 - 2 g cos without cancellation for lobes ahead.
         across = (1.0 - g) ** 2 + 2.0 * g * (1.0 - cosine)
-        return ISOTROPIC_VIEW_FACTOR * (1.0 - g * g) / (across * jnp.sqrt(across))
+        return ISOTROPIC_INTENSITY_FACTOR * (1.0 - g * g) / (across * jnp.sqrt(across))
 
     def sample(self, incident: Vec, u: Scalar, v: Scalar) -> Vec:
         # The inverse of the distribution function, as a form without a quotient by g.
@@ -193,4 +194,4 @@ class HenyeyGreenstein(AbstractPhase):
 
     def largest_intensity_factor(self) -> float:
         g = abs(float(self.g))
-        return ISOTROPIC_VIEW_FACTOR * (1.0 + g) / (1.0 - g) ** 2
+        return ISOTROPIC_INTENSITY_FACTOR * (1.0 + g) / (1.0 - g) ** 2

@@ -1,6 +1,6 @@
 """Reflectance spectra of bark, wood, litter, soil and more: measured ones that are bundled, or your own.
 
-    jl.spectra("bark")                     names of the bundled ones, of one kind or of all
+    jl.spectrum_names("bark")              names of the bundled ones, of one kind or of all
     jl.spectrum("bark-birch")(1064.0)      a spectrum is a function of the wavelength in nm
     jl.read_spectrum_csv("my_soil.csv")
 
@@ -159,7 +159,7 @@ def _library() -> dict[str, np.ndarray]:
         return {key: arrays[key] for key in arrays.files}
 
 
-def spectra(kind: str | None = None) -> dict[str, str]:
+def spectrum_names(kind: str | None = None) -> dict[str, str]:
     """Names of the bundled reflectance spectra, each with its kind.
 
     **Arguments:**
@@ -173,7 +173,7 @@ def spectra(kind: str | None = None) -> dict[str, str]:
     **Example:**
 
     >>> import jaxlidar as jl
-    >>> sorted(jl.spectra("built"))
+    >>> sorted(jl.spectrum_names("built"))
     ['asphalt', 'concrete', 'gravel']
     """
     library = _library()
@@ -189,7 +189,7 @@ def spectrum(name: str) -> Spectrum:
 
     **Arguments:**
 
-    - `name`: one of the names that `spectra` lists.
+    - `name`: one of the names that `spectrum_names` lists.
 
     **Returns:** a `Spectrum`.
 
@@ -204,7 +204,7 @@ def spectrum(name: str) -> Spectrum:
     ['0.33', '0.51']
     """
     library = _library()
-    check_kind("name", name, str, "a name that jaxlidar.spectra lists")
+    check_kind("name", name, str, "a name that jaxlidar.spectrum_names lists")
     names = library["name"].tolist()
     if name not in names:
         close = difflib.get_close_matches(name, names, n=5, cutoff=0.4) or sorted(
@@ -213,7 +213,7 @@ def spectrum(name: str) -> Spectrum:
         close += [n for n in names if name.lower() in n.split("-") and n not in close]
         raise ValueError(
             f"name = {name!r} is no bundled spectrum; close to it are {', '.join(map(repr, close))}; "
-            "jaxlidar.spectra() lists all"
+            "jaxlidar.spectrum_names() lists all"
         )
     return Spectrum(library["wavelength"], library["reflectance"][names.index(name)], name)
 

@@ -51,7 +51,7 @@ def backscatter(
     half_angle: float = 0.0,
     two_sided: bool = False,
 ) -> PerRay:
-    """View factors of rays for light scattered straight back; zero from below, unless `two_sided`."""
+    """Intensity factors of rays for light scattered straight back; zero from below, unless `two_sided`."""
     normal = np.zeros(3) if normal is None else normal
     below = rays @ normal > 0
     lit = np.where(below & two_sided, -1.0, 1.0)[:, None] * normal

@@ -2,8 +2,8 @@
 
 Within a canopy the return of order one is the integral of k R v exp(-kappa tau), with kappa 2 or, with the
 hot spot, 1. So what one ray returns is a weighted mean of R v / kappa of leaf and bark and R v of the ground,
-with weights that add up to one; R is the reflectance and v the view factor for backscatter. What holds for
-every ray holds for the footprint: a ratio of sums lies between the least and the largest ratio.
+with weights that add up to one; R is the reflectance and v the intensity factor of backscatter. What holds
+for every ray holds for the footprint: a ratio of sums lies between the least and the largest ratio.
 
 The transmittance of the air within the depth of the scene is taken to be the same with and without an effect.
 """
@@ -28,7 +28,7 @@ from jaxlidar.scenes.surfaces import AbstractSheet, AbstractSurface
 Values = Float[np.ndarray, "wavelengths"]
 # Cells of the pulse; more would add up the rounding of single precision.
 _CELLS = 400
-# A mirror's view factor is as large as its lobe is narrow.
+# A mirror's intensity factor is as large as its lobe is narrow.
 _MIRROR = 1e30
 
 
@@ -58,7 +58,7 @@ class Bounds:
     # What materials do.
 
     def _factors(self, name: str) -> tuple[float, float]:
-        """Least and largest view factor for backscatter, of all rays."""
+        """Least and largest intensity factor for backscatter, of all rays."""
         canopy = self.scene.canopy
         if name not in ("leaf", "bark"):
             factor = self._facing(self.surface[name], self.rays)
@@ -75,7 +75,7 @@ class Bounds:
         return FACET_BACKSCATTER, FACET_BACKSCATTER
 
     def _brightest(self, name: str) -> float:
-        """Largest view factor of what a material scatters, for any two directions."""
+        """Largest intensity factor of what a material scatters, for any two directions."""
         canopy = self.scene.canopy
         if name not in ("leaf", "bark"):
             return self.surface[name].law.largest_intensity_factor(self.half_angle)
@@ -87,7 +87,7 @@ class Bounds:
         return 1.0 if name == "leaf" and canopy.voxels.leaf_angles is not None else FACET_BACKSCATTER
 
     def _facing(self, surface: AbstractSurface, rays: Rays) -> PerRay | None:
-        """View factors of rays for backscatter, zero from under the ground; None for a mirror."""
+        """Intensity factors of rays for backscatter, zero from under the ground; None for a mirror."""
         if isinstance(surface.law, AbstractMirror):
             return None
         normal, _ = surface.shape.tangent(vec(jnp.zeros(3)))
@@ -130,7 +130,7 @@ class Bounds:
 
         What is scattered n + 1 times is at most s times what is scattered n times. s is the largest share
         that a ray scatters of its energy, also after passing plates; between two planes, what one of them
-        scatters meets the other. All of it returns with the largest view factor at most.
+        scatters meets the other. All of it returns with the largest intensity factor at most.
         """
         if self.scene.canopy is None and len(self.scene.surfaces) <= 1:
             return 0.0
@@ -252,7 +252,7 @@ class Bounds:
         return bool(np.all(above > 0) and np.all(above < below))
 
     def slope_spread(self, level: "Bounds") -> float:
-        """Slope: delay and view factor of every ray, compared with those on the level ground of `level`."""
+        """Slope: delay and intensity factor of every ray, compared with those on level ground (`level`)."""
         one, other, canopy = self.scene.ground, level.scene.ground, self.scene.canopy
         assert one is not None
         assert other is not None
@@ -267,7 +267,7 @@ class Bounds:
         return max(self._with_orders(change), level._with_orders(change))
 
     def divergence(self) -> float:
-        """Width of the beam: delay, view factor and share seen of every ray, beside those of the axis."""
+        """Width of the beam: delay, intensity factor and share seen of every ray, beside the axis's."""
         if self.scene.canopy is not None or not self._ordered():
             return 1.0
         axis, seen = np.broadcast_to(self.axis, self.rays.shape), np.ones_like(self.seen)

@@ -356,7 +356,7 @@ def conifer(**changes: Any) -> Habit:
     return Habit(**(vars(habit) | changes))
 
 
-def spreading(**changes: Any) -> Habit:
+def spreading_tree(**changes: Any) -> Habit:
     """The habit of a spreading broadleaved tree, 10 m tall and mostly wider, such as an old oak in a field.
 
     **Arguments:**
@@ -370,7 +370,7 @@ def spreading(**changes: Any) -> Habit:
     **Example:**
 
     >>> import jaxlidar as jl
-    >>> tree = jl.grow(jl.spreading(smallest_diameter=0.1))
+    >>> tree = jl.grow(jl.spreading_tree(smallest_diameter=0.1))
     >>> print(f"{tree.height:.1f} m tall, {tree.trunk_diameter:.1f} m thick")
     10.0 m tall, 0.7 m thick
     """

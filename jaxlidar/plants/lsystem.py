@@ -1,14 +1,19 @@
-"""L-systems: words of modules, and rules that rewrite all modules of a word at once.
+"""Parametric, stochastic L-systems: words of symbols, and rules that rewrite all symbols of a word at once.
 
-A module is a symbol with parameters, a word is a sequence of modules, and a rule replaces a module by a word
-(Prusinkiewicz and Lindenmayer 1990, The Algorithmic Beauty of Plants, chapter 1). Rules are parametric (they
-compute with the parameters of the module), conditional, and stochastic (among the rules that apply, one is
-chosen by weight). They are context-free: they do not look at neighbouring modules. `jaxlidar.turtle` turns a
-word into geometry.
+A *symbol* is a letter with parameters, A(t_1, ..., t_p), a *word* is a sequence of symbols, and a *rule*
+replaces a symbol, its predecessor, by a word, its successor:
 
-All modules of one symbol are rewritten together. A rule therefore receives arrays with one element per
-module: write NumPy expressions, and write different cases as rules with conditions. An example is in
-`jaxlidar.LSystem`.
+    A(t_1, ..., t_p) : condition(t) -> successor(t)    with probability weight(t) / sum of weights
+
+(Prusinkiewicz and Lindenmayer 1990, The Algorithmic Beauty of Plants, chapter 1; there a letter with
+parameters is a "module", section 1.10). One step of rewriting replaces every symbol of the word at the same
+time. Symbols to which no rule applies stay, and among several rules that apply one is drawn, independently
+for every symbol (section 1.7). Rules are context-free: they do not look at neighbouring symbols.
+`jaxlidar.turtle` turns a word into geometry.
+
+All symbols of one letter are rewritten by one call of the rule, for a tree has a million of them. A rule
+therefore receives arrays with one element per symbol: write NumPy expressions, and write different cases as
+rules with conditions. An example is in `jaxlidar.LSystem`.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -20,22 +25,22 @@ from jaxtyping import Float, Int, UInt32
 
 from jaxlidar._checks import check_flag, check_integer, check_kind, check_number, kind_of
 
-# A run of plain symbols, or one symbol with its numbers (in a rule's successor: arrays).
+# A run of letters without parameters, or one letter with its parameters (in a rule's successor: arrays).
 Item = str | tuple[Any, ...]
 
 
-class Module(NamedTuple):
-    """One module of a word: a symbol with its parameters.
+class Symbol(NamedTuple):
+    """One symbol of a word: a letter with its parameters.
 
     **Arguments:**
 
-    - `symbol`: one character.
+    - `symbol`: the letter, one character.
     - `parameters`: a tuple of numbers. Default ().
 
     **Example:**
 
     >>> import jaxlidar as jl
-    >>> print(jl.Module("F", (2.0, 0.1)))
+    >>> print(jl.Symbol("F", (2.0, 0.1)))
     F(2,0.1)
     """
 
@@ -49,15 +54,15 @@ class Module(NamedTuple):
 @final
 @dataclass(frozen=True, eq=False)
 class Word:
-    """A word of an L-system: a sequence of n modules, stored as arrays.
+    """A word of an L-system: a sequence of n symbols, stored as arrays.
 
-    `Word.of` makes one. Iterating over a word gives each `Module`.
+    `Word.of` makes one. Iterating over a word gives each `Symbol`.
 
     **Arguments:**
 
-    - `codes`: (n,) Unicode code points of the symbols.
-    - `arity`: (n,) number of parameters of each module.
-    - `parameters`: (n, p) parameters; NaN beyond the arity of a module.
+    - `codes`: (n,) Unicode code points of the letters.
+    - `arity`: (n,) number of parameters of each symbol.
+    - `parameters`: (n, p) parameters; NaN beyond the arity of a symbol.
 
     **Example:**
 
@@ -73,16 +78,16 @@ class Word:
 
     @staticmethod
     def of(items: str | Iterable[Item]) -> "Word":
-        """Make a word of symbols and parameters.
+        """Make a word of letters and parameters.
 
         **Arguments:**
 
-        - `items`: a string of symbols without parameters, or a sequence of such strings and of tuples
-          (symbol, parameter, ...).
+        - `items`: a string of letters without parameters, or a sequence of such strings and of tuples
+          (letter, parameter, ...).
 
         **Returns:** a `Word`.
 
-        **Raises:** ValueError for symbols that are not one character and parameters that are not finite;
+        **Raises:** ValueError for letters that are not one character and parameters that are not finite;
         TypeError for what is no sequence.
         """
         check_kind("items", items, Iterable, "a string, or a sequence of strings and tuples")
@@ -92,24 +97,24 @@ class Word:
     def __len__(self) -> int:
         return self.codes.size
 
-    def __iter__(self) -> Iterator[Module]:
+    def __iter__(self) -> Iterator[Symbol]:
         rows = zip(self.codes.tolist(), self.arity.tolist(), self.parameters.tolist())
-        return (Module(chr(code), tuple(row[:count])) for code, count, row in rows)
+        return (Symbol(chr(code), tuple(row[:count])) for code, count, row in rows)
 
     def __str__(self) -> str:
         return "".join(map(str, self))
 
     @property
     def alphabet(self) -> str:
-        """The different symbols of the word, sorted, as one string."""
+        """The different letters of the word, sorted, as one string."""
         return "".join(map(chr, np.unique(self.codes).tolist()))
 
     def where(self, symbol: str) -> Int[np.ndarray, " k"]:
-        """Indices of all modules with one symbol.
+        """Indices of all symbols with one letter.
 
         **Arguments:**
 
-        - `symbol`: one character.
+        - `symbol`: the letter, one character.
 
         **Returns:** (k,) indices from 0, ascending.
         """
@@ -119,26 +124,26 @@ class Word:
 @final
 @dataclass(frozen=True)
 class Rule:
-    """A production rule of an L-system: what replaces a module.
+    """A production rule of an L-system: the word that replaces a symbol.
 
-    Functions of a rule receive the parameters of the modules as separate (k,) arrays, one element for each
-    of the k modules.
+    Functions of a rule receive the parameters of the symbols as separate (k,) arrays, one element for each
+    of the k symbols.
 
     **Arguments:**
 
-    - `symbol`: the symbol of the module that is replaced (the predecessor), one character.
-    - `produce`: function of the parameters that returns the successor: a string of symbols without
-      parameters, or a sequence of such strings and of tuples (symbol, parameter, ...). Parameters are numbers
-      or (k,) arrays. An empty sequence removes the module.
-    - `condition`: function of the parameters that returns (k,) booleans: where the rule applies. Default
+    - `symbol`: the letter that is replaced (the predecessor), one character.
+    - `produce`: function of the parameters that returns the successor: a string of letters without
+      parameters, or a sequence of such strings and of tuples (letter, parameter, ...). Parameters are numbers
+      or (k,) arrays. An empty sequence removes the symbol.
+    - `condition`: function of the parameters that returns (k,) booleans, true where the rule applies. Default
       None: everywhere.
-    - `weight`: among the rules that apply to a module, one is chosen with a probability proportional to its
+    - `weight`: among the rules that apply to a symbol, one is chosen with a probability proportional to its
       weight. A positive number, or a function of the parameters that returns (k,) weights, 0 or more.
       Default 1.
-    - `random`: whether `produce` draws random numbers. It then receives a `numpy.random.Generator` as the
+    - `random`: True if `produce` draws random numbers. It then receives a `numpy.random.Generator` as the
       keyword argument `rng`. Default False.
 
-    **Raises:** ValueError for a symbol that is not one character and a weight that is not positive; TypeError
+    **Raises:** ValueError for a letter that is not one character and a weight that is not positive; TypeError
     for a successor, condition or weight of another kind.
 
     **Example:**
@@ -166,11 +171,11 @@ class Rule:
         check_flag("random", self.random)
 
     def weights(self, parameters: Float[np.ndarray, "p k"]) -> Float[np.ndarray, " k"]:
-        """Weight of the rule for each module; zero where the condition does not hold.
+        """Weight of the rule for each symbol; zero where the condition does not hold.
 
         **Arguments:**
 
-        - `parameters`: (p, k) the p parameters of k modules.
+        - `parameters`: (p, k) the p parameters of k symbols.
 
         **Returns:** (k,) weights.
 
@@ -179,9 +184,10 @@ class Rule:
         weight = self.weight(*parameters) if callable(self.weight) else self.weight
         weights = np.broadcast_to(np.asarray(weight, dtype=float), parameters.shape[1:])
         if not np.all(np.isfinite(weights) & (weights >= 0)):
-            bad = weights[~(np.isfinite(weights) & (weights >= 0))][0]
+            inadmissible = weights[~(np.isfinite(weights) & (weights >= 0))][0]
             raise ValueError(
-                f"weight of a rule for {self.symbol!r} = {bad:g} is outside the admissible range [0, inf)"
+                f"weight of a rule for {self.symbol!r} = {inadmissible:g} is outside the admissible range "
+                "[0, inf)"
             )
         return weights if self.condition is None else np.where(self.condition(*parameters), weights, 0.0)
 
@@ -191,12 +197,12 @@ class Rule:
 class LSystem:
     """An L-system: an axiom, which is the word to start from, and production rules.
 
-    A module to which no rule applies stays as it is.
+    A symbol to which no rule applies stays as it is.
 
     **Arguments:**
 
-    - `axiom`: a `Word`, or symbols and parameters in the form that `Word.of` takes.
-    - `rules`: a sequence of `Rule`, for any number of symbols, in any order.
+    - `axiom`: a `Word`, or letters and parameters in the form that `Word.of` takes.
+    - `rules`: a sequence of `Rule`, for any number of letters, in any order.
 
     **Raises:** TypeError for rules of another kind.
 
@@ -231,20 +237,20 @@ class LSystem:
         max_modules: int = 10_000_000,
         max_steps: int = 10_000,
     ) -> Word:
-        """The word after a number of rewriting steps; by default, the word to which no rule applies any more.
+        """Rewrite the axiom a number of times; by default, until no rule applies any more.
 
         **Arguments:**
 
         - `steps`: number of steps, 0 or more. Default None: until no rule applies.
         - `seed`: random seed of stochastic rules, or a NumPy generator. Default 0.
-        - `max_modules`: largest admissible length of the word. Default 10,000,000.
+        - `max_modules`: largest admissible length of the word, in symbols. Default 10,000,000.
         - `max_steps`: largest admissible number of steps where `steps` is None. Default 10,000.
 
         **Returns:** a `Word`.
 
         **Raises:** ValueError for `steps` that are negative or no integer, words longer than `max_modules`,
         words to which rules still apply after `max_steps`, rules whose successors are malformed or not
-        finite, rules with inadmissible weights, and symbols that occur with different numbers of parameters.
+        finite, rules with inadmissible weights, and letters that occur with different numbers of parameters.
         """
         if steps is not None:
             steps = check_integer("steps", steps, 0)
@@ -253,10 +259,10 @@ class LSystem:
         rng = np.random.default_rng(seed)
         word = self.axiom if isinstance(self.axiom, Word) else Word.of(self.axiom)
         for _ in range(max_steps if steps is None else steps):
-            after = self._step(word, rng, max_modules)
-            if after is None:
+            next_word = self._step(word, rng, max_modules)
+            if next_word is None:
                 return word
-            word = after
+            word = next_word
         if steps is None:
             raise ValueError(
                 f"max_steps = {max_steps}: rules still apply to the word after so many rewritings"
@@ -264,86 +270,96 @@ class LSystem:
         return word
 
     def _step(self, word: Word, rng: np.random.Generator, max_modules: int) -> Word | None:
-        """The next word; None where no rule applies."""
-        made = []
+        """Rewrite every symbol once; None where no rule applies.
+
+        1. For each letter with rules: draw the rule that replaces each of its symbols, and let each rule
+           produce the successors of all its symbols in one call.
+        2. Compute the length of the next word, and the index at which each successor begins.
+        3. Copy the symbols that stay, and the successors, to these indices.
+        """
+        # Per rule: indices of the symbols replaced; codes, arities and parameters of their successors.
+        productions = []
         lengths = np.ones(len(word), dtype=int)
-        kept = np.ones(len(word), dtype=bool)
+        stays = np.ones(len(word), dtype=bool)
         for symbol, rules in self._by_symbol.items():
-            at = word.where(symbol)
-            if at.size == 0:
+            predecessors = word.where(symbol)
+            if predecessors.size == 0:
                 continue
-            arity = np.unique(word.arity[at])
+            arity = np.unique(word.arity[predecessors])
             if arity.size > 1:
                 raise ValueError(f"{symbol!r} occurs with {arity[0]} and with {arity[1]} parameters")
-            parameters = word.parameters[at, : arity[0]].T
-            choice = _choose(np.stack([rule.weights(parameters) for rule in rules]), rng)
+            parameters = word.parameters[predecessors, : arity[0]].T
+            chosen_rule = _choose(np.stack([rule.weights(parameters) for rule in rules]), rng)
             for number, rule in enumerate(rules):
-                chosen = np.flatnonzero(choice == number)
-                if chosen.size == 0:
+                selected = np.flatnonzero(chosen_rule == number)
+                if selected.size == 0:
                     continue
-                drawn = {"rng": rng} if rule.random else {}
-                items = rule.produce(*parameters[:, chosen], **drawn)
-                successor = _successor(items, chosen.size, f"a successor of {symbol!r}")
-                made.append((at[chosen], *successor))
-                lengths[at[chosen]] = successor[0].size
-                kept[at[chosen]] = False
-        if not made:
+                generator = {"rng": rng} if rule.random else {}
+                items = rule.produce(*parameters[:, selected], **generator)
+                successor = _successor(items, selected.size, f"a successor of {symbol!r}")
+                productions.append((predecessors[selected], *successor))
+                lengths[predecessors[selected]] = successor[0].size
+                stays[predecessors[selected]] = False
+        if not productions:
             return None
+
         ends = np.cumsum(lengths)
         total = int(ends[-1])
         if total > max_modules:
-            raise ValueError(f"max_modules = {max_modules}: the word would have {total} modules")
+            raise ValueError(f"max_modules = {max_modules}: the word would have {total} symbols")
         first = ends - lengths
-        width = max([word.parameters.shape[1], *(parameters.shape[2] for *_, parameters in made)])
-        after = Word(np.empty(total, np.uint32), np.empty(total, int), np.full((total, width), np.nan))
-        for at, codes, arity, parameters in (
-            (
-                np.flatnonzero(kept),
-                word.codes[kept, None],
-                word.arity[kept, None],
-                word.parameters[kept, None],
-            ),
-            *made,
-        ):
-            to = first[at][:, None] + np.arange(codes.shape[-1])
-            after.codes[to] = codes
-            after.arity[to] = arity
-            after.parameters[to, : parameters.shape[2]] = parameters
-        return after
+        width = max([word.parameters.shape[1], *(parameters.shape[2] for *_, parameters in productions)])
+        next_word = Word(np.empty(total, np.uint32), np.empty(total, int), np.full((total, width), np.nan))
+
+        # Symbols that stay are words of length one.
+        unchanged = (
+            np.flatnonzero(stays),
+            word.codes[stays, None],
+            word.arity[stays, None],
+            word.parameters[stays, None],
+        )
+        for predecessors, codes, arity, parameters in (unchanged, *productions):
+            index = first[predecessors][:, None] + np.arange(codes.shape[-1])
+            next_word.codes[index] = codes
+            next_word.arity[index] = arity
+            next_word.parameters[index, : parameters.shape[2]] = parameters
+        return next_word
 
 
 def _choose(weights: Float[np.ndarray, "rules k"], rng: np.random.Generator) -> Int[np.ndarray, " k"]:
-    """For each module, the index of the rule that replaces it; -1 where none applies."""
-    upper = np.cumsum(weights, axis=0)
-    none = upper[-1] <= 0
+    """Draw the index of the rule that replaces each symbol; -1 where none applies."""
+    cumulative = np.cumsum(weights, axis=0)
+    inapplicable = cumulative[-1] <= 0
+    # Without a choice no random number is drawn: deterministic letters leave the others' numbers as they are.
     if np.all(np.count_nonzero(weights, axis=0) <= 1):
-        return np.where(none, -1, np.argmax(weights > 0, axis=0))
-    # Below the total, so that a rule of zero weight is never reached.
-    mark = rng.uniform(size=none.size) * upper[-1]
-    return np.where(none, -1, np.argmax(upper > mark, axis=0))
+        return np.where(inapplicable, -1, np.argmax(weights > 0, axis=0))
+    # Inverse of the distribution function. `uniform` is below 1 and the comparison strict, so that a rule of
+    # zero weight is never chosen.
+    threshold = rng.uniform(size=inapplicable.size) * cumulative[-1]
+    return np.where(inapplicable, -1, np.argmax(cumulative > threshold, axis=0))
 
 
 def _successor(
     items: str | Iterable[Item], count: int, name: str
 ) -> tuple[UInt32[np.ndarray, " m"], Int[np.ndarray, " m"], Float[np.ndarray, "{count} m p"]]:
-    """Codes, arities and parameters of `count` words of the same symbols."""
-    modules: list[tuple[Any, ...]] = []
+    """Codes, arities and parameters of `count` words of the same m letters; `name` is for error messages."""
+    symbols: list[tuple[Any, ...]] = []
     for item in (items,) if isinstance(items, str) else items:
-        modules += [(symbol,) for symbol in item] if isinstance(item, str) else [item]
-    width = max((len(module) - 1 for module in modules), default=0)
-    parameters = np.full((count, len(modules), width), np.nan)
-    for i, (symbol, *values) in enumerate(modules):
-        _check_symbol(symbol, f"symbol in {name}")
+        symbols += [(letter,) for letter in item] if isinstance(item, str) else [item]
+    width = max((len(symbol) - 1 for symbol in symbols), default=0)
+    parameters = np.full((count, len(symbols), width), np.nan)
+    for i, (letter, *values) in enumerate(symbols):
+        _check_symbol(letter, f"symbol in {name}")
         for j, value in enumerate(values):
             parameters[:, i, j] = value
             if not np.all(np.isfinite(parameters[:, i, j])):
-                bad = parameters[~np.isfinite(parameters[:, i, j]), i, j][0]
+                inadmissible = parameters[~np.isfinite(parameters[:, i, j]), i, j][0]
                 raise ValueError(
-                    f"parameter {j + 1} of {symbol!r} in {name} = {bad:g}"
+                    f"parameter {j + 1} of {letter!r} in {name} = {inadmissible:g}"
                     " is outside the admissible range (-inf, inf)"
                 )
-    codes = np.array([ord(symbol) for symbol, *_ in modules], dtype=np.uint32)
-    return codes, np.array([len(module) - 1 for module in modules], dtype=int), parameters
+    codes = np.array([ord(letter) for letter, *_ in symbols], dtype=np.uint32)
+    return codes, np.array([len(symbol) - 1 for symbol in symbols], dtype=int), parameters
 
 
 def _check_symbol(symbol: Any, name: str) -> None:

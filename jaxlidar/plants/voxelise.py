@@ -183,7 +183,7 @@ def voxelise_points(
     return VoxelMap.from_lad(density, bark=bark, voxel_size=size, origin=grid.low)
 
 
-def crop(voxels: VoxelMap) -> VoxelMap:
+def trim_empty_layers(voxels: VoxelMap) -> VoxelMap:
     """The voxel map without the empty layers at its sides. One voxel remains if all are empty.
 
     **Arguments:**
@@ -199,7 +199,7 @@ def crop(voxels: VoxelMap) -> VoxelMap:
     >>> import numpy as np, jaxlidar as jl
     >>> density = np.zeros((6, 6, 6))
     >>> density[2:4, 1:4, 3] = 1.0
-    >>> smaller = jl.crop(jl.VoxelMap.from_lad(density, voxel_size=0.5))
+    >>> smaller = jl.trim_empty_layers(jl.VoxelMap.from_lad(density, voxel_size=0.5))
     >>> print(smaller.shape, smaller.origin.tolist())
     (2, 3, 1) [1.0, 0.5, 1.5]
     """

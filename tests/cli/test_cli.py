@@ -234,13 +234,13 @@ def test_spectra_are_listed_with_reflectances(capsys):
     assert cli.main(["spectra", "soil"]) == 0
     head, *rows = capsys.readouterr().out.splitlines()
     assert head.split() == ["name", "kind", "532", "nm", "1064", "nm", "1550", "nm"]
-    assert [row.split()[0] for row in rows] == list(jl.spectra("soil"))
+    assert [row.split()[0] for row in rows] == list(jl.spectrum_names("soil"))
     assert rows[2].split()[-2] == f"{float(jl.spectrum('soil-medium')(1064.0)):.2f}"
 
 
 def test_all_spectra_are_listed_without_a_kind(capsys):
     assert cli.main(["spectra"]) == 0
-    assert len(capsys.readouterr().out.splitlines()) == 1 + len(jl.spectra())
+    assert len(capsys.readouterr().out.splitlines()) == 1 + len(jl.spectrum_names())
 
 
 def test_version_is_the_installed_one(capsys):

@@ -166,9 +166,9 @@ def test_echoes_say_what_is_fitted(example, tmp_path, monkeypatch, capsys):
             status=("converged",) * n,
             fitted=np.zeros((n, 1, time.size)),
         )
-        windows = [module.window(r, e[-1], time) for r, e in zip(records, echoes)]
+        windows = [module.window_of(r, e[-1], time) for r, e in zip(records, echoes)]
         recorder = inversion.Recorder(width=(0.1, 5.0))
-        return module.Fitted(fits, windows, [recorder] * n)
+        return module.FittedBatch(fits, windows, [recorder] * n)
 
     monkeypatch.setattr(module, "fit", fit)
     good = inversion.Verdict("good", ())

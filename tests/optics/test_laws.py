@@ -1,8 +1,8 @@
 """Laws of reflection and phase functions: those that are built in, and Minnaert's, added in a file of its
 own.
 
-Samples are tested against densities (chi-squared over cells of equal solid angle), densities against view
-factors, both for conservation and reciprocity, and returns against the closed form
+Samples are tested against densities (chi-squared over cells of equal solid angle), densities against
+intensity factors, both for conservation and reciprocity, and returns against the closed form
 
     sum of apparent reflectance = R (k + 1) / 2 cos^(2 k - 1)(slope)
 
@@ -151,9 +151,8 @@ def test_minnaert_is_reciprocal_and_equal_angle_is_not():
     def exchanged(law):
         def brdf(towards, out):
             incident, out = (vec(jnp.asarray(v)) for v in (-towards, out))
-            return np.asarray(
-                law.intensity_factor(incident, up, out, jnp.asarray(1e-3)) / dot(up, out), float
-            )
+            intensity = law.intensity_factor(incident, up, out, jnp.asarray(1e-3))
+            return np.asarray(intensity / dot(up, out), float)
 
         return np.max(np.abs(brdf(a, b) / brdf(b, a) - 1))
 

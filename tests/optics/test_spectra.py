@@ -8,14 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxlidar.optics.spectra import Spectrum, read_spectrum_csv, reflectance_at, spectra, spectrum
+from jaxlidar.optics.spectra import Spectrum, read_spectrum_csv, reflectance_at, spectrum, spectrum_names
 
 LASERS = np.array([532.0, 1064.0, 1550.0])
 WAVELENGTH, REFLECTANCE = np.array([400.0, 500.0, 900.0]), np.array([0.1, 0.3, 0.2])
 
 
 def test_library():
-    listed = spectra()
+    listed = spectrum_names()
     assert len(listed) >= 36
     assert set(listed.values()) == {"bark", "wood", "litter", "char", "soil", "built"}
     for name in listed:
@@ -32,7 +32,7 @@ def test_library():
 
 
 def test_materials_look_as_they_should():
-    for name in spectra("bark"):
+    for name in spectrum_names("bark"):
         green, infrared = spectrum(name)(LASERS)[:2]
         assert 0.04 < green < 0.4
         assert 1.5 < infrared / green < 10
@@ -42,10 +42,10 @@ def test_materials_look_as_they_should():
 
 
 def test_listing_by_kind():
-    assert set(spectra("soil").values()) == {"soil"}
-    assert "bark-birch" in spectra("bark")
+    assert set(spectrum_names("soil").values()) == {"soil"}
+    assert "bark-birch" in spectrum_names("bark")
     with pytest.raises(ValueError, match="kind = 'water' is none of 'bark'"):
-        spectra("water")
+        spectrum_names("water")
 
 
 @pytest.mark.parametrize(
@@ -54,7 +54,7 @@ def test_listing_by_kind():
         ("bark-brich", "bark-birch"),
         ("oak", "bark-oak"),
         ("soil_medium", "soil-medium"),
-        ("zzz", "jaxlidar.spectra"),
+        ("zzz", "jaxlidar.spectrum_names"),
     ],
 )
 def test_unknown_name(wrong, close):

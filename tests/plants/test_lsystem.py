@@ -15,21 +15,21 @@ def test_algae_grow_by_fibonacci_numbers():
     assert [len(system.rewrite(n)) for n in range(12)] == [1, 2, 3, 5, 8, 13, 21, 34, 55, 89, 144, 233]
 
 
-def test_a_module_may_vanish():
+def test_a_symbol_may_vanish():
     system = jl.LSystem("AXA", [jl.Rule("X", lambda: "")])
     assert str(system.rewrite()) == "AA"
     assert len(jl.LSystem("X", system.rules).rewrite()) == 0
 
 
-def test_words_hold_modules():
+def test_words_hold_symbols():
     word = jl.Word.of(["AB", ("F", 1, 2.5), "[", "]"])
     assert str(word) == "ABF(1,2.5)[]"
-    assert list(word)[1:3] == [jl.Module("B"), jl.Module("F", (1.0, 2.5))]
+    assert list(word)[1:3] == [jl.Symbol("B"), jl.Symbol("F", (1.0, 2.5))]
     assert word.alphabet == "ABF[]"
     assert word.where("F").tolist() == [2]
 
 
-def test_parametric_rules_rewrite_each_module_by_its_numbers():
+def test_parametric_rules_rewrite_each_symbol_by_its_parameters():
     # The example of The Algorithmic Beauty of Plants, section 1.10.
     rules = [
         jl.Rule("A", lambda x, y: [("A", 2 * x, x + y)], condition=lambda x, y: y <= 3),

@@ -8,7 +8,7 @@ from scipy import stats
 
 import jaxlidar as jl
 
-HABITS = {"broadleaf": jl.broadleaf, "conifer": jl.conifer, "spreading": jl.spreading, "shrub": jl.shrub}
+HABITS = {"broadleaf": jl.broadleaf, "conifer": jl.conifer, "spreading": jl.spreading_tree, "shrub": jl.shrub}
 SEEDS = (0, 1, 2, 11)
 
 
@@ -150,7 +150,7 @@ def test_leaf_off_keeps_the_wood(individuals):
 
 def test_no_leaves_grow_in_the_ground():
     hanging = jl.Branching(angle=90.0, tropism=-25.0)
-    tree = jl.grow(jl.spreading(branches=hanging, height=3.0), seed=0)
+    tree = jl.grow(jl.spreading_tree(branches=hanging, height=3.0), seed=0)
     assert tree.end[:, 2].min() < 0
     assert tree.bud_position[:, 2].min() >= 0.03
     assert len(tree.bud_position) == len(tree.bud_direction) == len(tree.bud_radius) > 0

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import jaxlidar as jl
-from jaxlidar import Tree, crop, voxelise, voxelise_points
+from jaxlidar import Tree, trim_empty_layers, voxelise, voxelise_points
 
 NOTHING = np.zeros((0, 3))
 
@@ -165,11 +165,11 @@ def test_cropping_takes_off_what_is_empty():
     voxels = jl.VoxelMap.from_extinction(
         leaf=k, bark=0 * k, voxel_size=(1.0, 2.0, 3.0), origin=(10.0, 0.0, -3.0)
     )
-    small = crop(voxels)
+    small = trim_empty_layers(voxels)
     assert small.shape == (3, 1, 3)
     np.testing.assert_allclose(small.origin, [11.0, 4.0, 6.0])
     np.testing.assert_allclose(small.leaf, k[1:4, 2:3, 3:6])
-    assert crop(jl.VoxelMap.from_extinction(leaf=0 * k, voxel_size=1.0)).shape == (1, 1, 1)
+    assert trim_empty_layers(jl.VoxelMap.from_extinction(leaf=0 * k, voxel_size=1.0)).shape == (1, 1, 1)
 
 
 def test_points_share_the_leaf_area():

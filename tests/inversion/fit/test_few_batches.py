@@ -14,7 +14,7 @@ from inversion.fit.planning import plan_for
 from inversion.fit.retrieval import SOLVER
 from inversion.fit.solver import Fit, Request, drive
 from inversion.fit.unknowns import Place, Settled, settle
-from inversion.receiver.recorder import Terms
+from inversion.receiver.recorder import RecorderModel
 from jaxlidar.planning.plan import MIN_BATCHES
 from tests.inversion.fit.test_retrieval import LIDAR, UNKNOWNS, retrieve_canopy, start_scene, target  # noqa: F401
 
@@ -66,7 +66,7 @@ def fitted(simulation, seed, max_steps=50, progress=None):
         for i, (low, high) in enumerate(zip(LOW, HIGH))
     ]
     data = Data(TIME, observed, np.full(observed.shape, SIGMA))
-    terms = Terms(None, [], jl.Lidar(), TIME.size)
+    terms = RecorderModel(None, [], jl.Lidar(), TIME.size)
     return drive(Fit(data, settled, terms, SOLVER, max_steps, progress).run(), simulation)
 
 

@@ -21,7 +21,7 @@ from inversion.fit.profiles import averaging_kernel_of, band_of
 from inversion.fit.retrieval import SOLVER
 from inversion.fit.solver import Fit, drive
 from inversion.fit.unknowns import Place, Settled
-from inversion.receiver.recorder import Terms
+from inversion.receiver.recorder import RecorderModel
 from tests.helpers import NARROW
 
 LAYERS, SAMPLES, STRENGTH = 12, 40, 0.3
@@ -49,7 +49,7 @@ def fitted(observed, smooth, **bounds):
     """The fit of a record with noise of one, with the fields that bands and kernels need."""
     matrix, settled = instrument(), settled_of(smooth, **bounds)
     data = Data(np.arange(SAMPLES, dtype=float), observed[None], np.ones((1, SAMPLES)))
-    fit = Fit(data, settled, Terms(None, [], jl.Lidar(), SAMPLES), SOLVER, 50, None)
+    fit = Fit(data, settled, RecorderModel(None, [], jl.Lidar(), SAMPLES), SOLVER, 50, None)
     out = drive(fit.run(), lambda q: Evaluation((matrix @ q.values)[None], matrix[None], None, None))
     split = lambda a: {"x": a[..., :LAYERS], "b": a[..., LAYERS]}  # noqa: E731
     own = {f: split(getattr(out, f)) for f in ("values", "stderr", "robust_stderr", "prior_share")}

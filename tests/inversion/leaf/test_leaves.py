@@ -1,4 +1,4 @@
-"""Traits out of leaf spectra: of leaves that PROSPECT made, and of measured ones with known chemistry."""
+"""Traits from leaf spectra: of leaves simulated by PROSPECT, and of measured leaves with their chemistry."""
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +22,7 @@ RANGES = {
     "Cw": (0.006, 0.03),
     "Cm": (0.003, 0.015),
 }
+# Without the pigments of autumn leaves.
 GREEN = ("N", "Cab", "Car", "Cw", "Cm")
 NOISE = 0.005
 
@@ -49,14 +50,14 @@ def test_traits_without_noise(precision):
 
 
 @pytest.fixture(scope="module")
-def noisy():
+def noisy_leaves():
     """Truth, and reflectance and transmittance with noise, of 200 leaves."""
     truth, random = random_traits(200), np.random.default_rng(1)
     return truth, [s + NOISE * random.normal(size=s.shape) for s in spectra(truth)]
 
 
 def errors_are_as_stated(fit, truth):
-    """z-test of mean and variance over the leaves; each bound is four standard errors wide."""
+    """z-test of mean and variance over the leaves: True if both are within four standard errors."""
     z = np.stack([(fit.traits[n] - truth[n]) / fit.stderr[n] for n in fit.traits])
     n = z.shape[1]
     mean, variance = z.mean(axis=1), z.var(axis=1)
@@ -64,35 +65,36 @@ def errors_are_as_stated(fit, truth):
 
 
 @pytest.mark.parametrize("noise", [NOISE, None])
-def test_errors_are_as_stated(noisy, noise):
-    truth, data = noisy
+def test_errors_are_as_stated(noisy_leaves, noise):
+    truth, data = noisy_leaves
     fit = invert_leaves(BANDS, *data, noise=noise)
     assert errors_are_as_stated(fit, truth)
+    # Negative control: a bias of half a standard error.
     wrong = truth | {"Cw": truth["Cw"] + 0.5 * np.asarray(fit.stderr["Cw"])}
     assert not errors_are_as_stated(fit, wrong)
     if noise is None:
         np.testing.assert_array_equal(fit.reduced_chi2, 1.0)
     else:
         # The mean of chi-squared over f degrees of freedom has a variance of 2/f for each leaf.
-        freedom = 2 * BANDS.size - len(truth)
-        assert abs(float(jnp.mean(fit.reduced_chi2)) - 1) < 4 * np.sqrt(2 / freedom / 200)
+        degrees_of_freedom = 2 * BANDS.size - len(truth)
+        assert abs(float(jnp.mean(fit.reduced_chi2)) - 1) < 4 * np.sqrt(2 / degrees_of_freedom / 200)
     np.testing.assert_allclose(jnp.mean(fit.rmse), NOISE, rtol=0.02)
 
 
-def test_errors_of_unequal_noise(noisy):
-    truth, (R, T) = noisy
-    more = np.random.default_rng(2).normal(size=T.shape)
+def test_errors_of_unequal_noise(noisy_leaves):
+    truth, (R, T) = noisy_leaves
+    added_noise = np.random.default_rng(2).normal(size=T.shape)
     fit = invert_leaves(
-        BANDS, R, T + 0.02 * more, noise=np.hypot(NOISE, [[0.0], [0.02]]) + np.zeros(BANDS.size)
+        BANDS, R, T + 0.02 * added_noise, noise=np.hypot(NOISE, [[0.0], [0.02]]) + np.zeros(BANDS.size)
     )
     assert errors_are_as_stated(fit, truth)
-    assert not errors_are_as_stated(invert_leaves(BANDS, R, T + 0.02 * more, noise=NOISE), truth)
+    assert not errors_are_as_stated(invert_leaves(BANDS, R, T + 0.02 * added_noise, noise=NOISE), truth)
 
 
-def test_fixed_traits_keep_their_values_leaf_by_leaf(noisy):
-    truth, data = noisy
-    known = {name: jnp.asarray(truth[name]) for name in ("Cant", "Cbrown")}
-    leaf = jax.vmap(lambda t: jl.Prospect(**t))(known)
+def test_fixed_traits_keep_their_values_leaf_by_leaf(noisy_leaves):
+    truth, data = noisy_leaves
+    fixed_traits = {name: jnp.asarray(truth[name]) for name in ("Cant", "Cbrown")}
+    leaf = jax.vmap(lambda t: jl.Prospect(**t))(fixed_traits)
     fit = invert_leaves(BANDS, *data, unknowns=GREEN, leaf=leaf, noise=NOISE)
     assert tuple(fit.traits) == GREEN
     np.testing.assert_allclose(fit.leaves.Cant, truth["Cant"], rtol=1e-6)
@@ -100,57 +102,59 @@ def test_fixed_traits_keep_their_values_leaf_by_leaf(noisy):
 
 
 @pytest.mark.slow
-def test_a_missing_sample_is_left_out(noisy):
-    _, (R, T) = noisy
-    holes = R[:30].copy()
-    holes[:, 50] = np.nan
-    keep = np.arange(BANDS.size) != 50
+def test_a_missing_sample_is_left_out(noisy_leaves):
+    """NaN, infinite noise and a record without the band are the same."""
+    _, (R, T) = noisy_leaves
+    with_nan = R[:30].copy()
+    with_nan[:, 50] = np.nan
+    is_recorded = np.arange(BANDS.size) != 50
     sigma = np.full((2, BANDS.size), NOISE)
     sigma[0, 50] = np.inf
-    nan = invert_leaves(BANDS, holes, T[:30], noise=NOISE)
-    infinite = invert_leaves(BANDS, R[:30], T[:30], noise=sigma)
-    band = invert_leaves(BANDS[keep], R[:30, keep], T[:30, keep], noise=NOISE)
-    gone = invert_leaves(BANDS, holes, np.where(keep, T[:30], np.nan), noise=NOISE)
-    for name, value in nan.traits.items():
-        np.testing.assert_allclose(value, infinite.traits[name], rtol=1e-5)
-        np.testing.assert_allclose(gone.traits[name], band.traits[name], rtol=2e-3, atol=1e-6)
-        # The model error is told from means of neighbouring bands, which begin elsewhere.
-        np.testing.assert_allclose(gone.stderr[name], band.stderr[name], rtol=0.1)
+    nan_in_R = invert_leaves(BANDS, with_nan, T[:30], noise=NOISE)
+    infinite_noise = invert_leaves(BANDS, R[:30], T[:30], noise=sigma)
+    without_band = invert_leaves(BANDS[is_recorded], R[:30, is_recorded], T[:30, is_recorded], noise=NOISE)
+    nan_in_both = invert_leaves(BANDS, with_nan, np.where(is_recorded, T[:30], np.nan), noise=NOISE)
+    for name, value in nan_in_R.traits.items():
+        np.testing.assert_allclose(value, infinite_noise.traits[name], rtol=1e-5)
+        np.testing.assert_allclose(nan_in_both.traits[name], without_band.traits[name], rtol=2e-3, atol=1e-6)
+        # The model error is estimated from means of neighbouring bands, which are other bands without one.
+        np.testing.assert_allclose(nan_in_both.stderr[name], without_band.stderr[name], rtol=0.1)
 
 
-def test_a_hopeless_leaf_spoils_no_other(noisy):
-    _, data = noisy
+def test_a_leaf_that_fails_does_not_affect_others(noisy_leaves):
+    _, data = noisy_leaves
     R, T = (s[:30].copy() for s in data)
     before = invert_leaves(BANDS, R, T, noise=NOISE)
     R[7], T[7] = np.nan, np.nan
     R[8], T[8] = 2.0, -1.0
     after = invert_leaves(BANDS, R, T, noise=NOISE)
-    others = np.setdiff1d(np.arange(30), [7, 8])
+    unchanged = np.setdiff1d(np.arange(30), [7, 8])
     assert int(after.status[7]) == STATUS.index("not fitted: no sample to fit, values are those of the start")
     assert "not determined: N, Cab" in after.sentence(7)
     assert float(after.traits["Cab"][7]) == 40.0
     assert "at a bound" in after.sentence(8)
-    assert np.all(np.asarray(after.converged)[others])
+    assert np.all(np.asarray(after.converged)[unchanged])
     for name, value in before.traits.items():
-        np.testing.assert_allclose(after.traits[name][others], value[others], rtol=1e-5)
+        np.testing.assert_allclose(after.traits[name][unchanged], value[unchanged], rtol=1e-5)
     assert not any(np.any(np.isnan(a)) for a in jax.tree.leaves(after))
 
 
 @pytest.mark.slow
-def test_what_the_spectra_do_not_say_has_no_error(noisy):
-    _, (R, _) = noisy
-    # Only visible bands, where water does not absorb, and two bands for seven unknowns.
+def test_traits_that_are_not_determined_have_infinite_errors(noisy_leaves):
+    _, (R, _) = noisy_leaves
+    # Water does not absorb in visible bands.
     visible = BANDS < 700
     fit = invert_leaves(BANDS[visible], R[:5, visible], noise=NOISE)
     assert np.all(np.isinf(fit.stderr["Cw"]))
-    few = invert_leaves(BANDS[[20, 60]], R[:5, [20, 60]])
-    assert np.all(np.isinf(few.stderr["Cab"]))
-    assert not any(np.any(np.isnan(a)) for a in jax.tree.leaves((fit, few)))
+    # Seven unknowns from two bands.
+    of_two_bands = invert_leaves(BANDS[[20, 60]], R[:5, [20, 60]])
+    assert np.all(np.isinf(of_two_bands.stderr["Cab"]))
+    assert not any(np.any(np.isnan(a)) for a in jax.tree.leaves((fit, of_two_bands)))
 
 
 @pytest.mark.slow
-def test_steps_run_out(noisy):
-    _, data = noisy
+def test_steps_run_out(noisy_leaves):
+    _, data = noisy_leaves
     fit = invert_leaves(BANDS, *(s[0] for s in data), max_steps=1)
     assert fit.sentence(0).startswith("not converged: stopped at max_steps after 1 step")
     assert "1 not converged" in str(fit)
@@ -166,9 +170,9 @@ def test_other_versions(version):
 
 
 @pytest.mark.slow
-def test_domains(noisy):
-    """Each trait from its own bands: changes of all others leave it as it is, and the answer says so."""
-    _, (R, T) = noisy
+def test_domains(noisy_leaves):
+    """Each trait is the one of a fit to its own bands alone, with the other traits fixed."""
+    _, (R, T) = noisy_leaves
     R, T = R[:30], T[:30]
     fit = invert_leaves(BANDS, R, T, domain="recommended")
     assert {name: d.tolist() for name, d in fit.domain.items()} == {
@@ -178,22 +182,22 @@ def test_domains(noisy):
         "Cw": [[1700.0, 2400.0]],
         "Cm": [[1700.0, 2400.0]],
     }
-    whole = invert_leaves(BANDS, R, T)
-    np.testing.assert_array_equal(fit.traits["N"], whole.traits["N"])
+    all_bands = invert_leaves(BANDS, R, T)
+    np.testing.assert_array_equal(fit.traits["N"], all_bands.traits["N"])
     bands = (BANDS >= 1700) & (BANDS <= 2400)
     alone = invert_leaves(
-        BANDS[bands], R[:, bands], T[:, bands], unknowns=("N", "Cw", "Cm"), leaf=whole.leaves
+        BANDS[bands], R[:, bands], T[:, bands], unknowns=("N", "Cw", "Cm"), leaf=all_bands.leaves
     )
     for name in ("Cw", "Cm"):
         np.testing.assert_allclose(fit.traits[name], alone.traits[name], rtol=1e-3)
-        assert not np.allclose(fit.traits[name], whole.traits[name], rtol=1e-3)
+        assert not np.allclose(fit.traits[name], all_bands.traits[name], rtol=1e-3)
     several = invert_leaves(BANDS, R, T, domain={"Cm": ((1700.0, 1800.0), (2205.0, 2400.0))})
     np.testing.assert_array_equal(several.domain["Cm"], [[1700.0, 1800.0], [2210.0, 2400.0]])
 
 
 @pytest.mark.slow
-def test_domains_that_lack_bands(noisy):
-    _, (R, T) = noisy
+def test_domains_that_lack_bands(noisy_leaves):
+    _, (R, T) = noisy_leaves
     short = BANDS <= 1600
     with pytest.raises(ValueError, match=r"400 to 1600 nm do not span half of 1700 to 2400 nm, .* Cw, Cm"):
         invert_leaves(BANDS[short], R[:5, short], T[:5, short], domain="recommended")
@@ -201,59 +205,67 @@ def test_domains_that_lack_bands(noisy):
         BANDS[short], R[:5, short], T[:5, short], unknowns=("N", "Cab", "Car"), domain="recommended"
     )
     assert fit.domain["Cab"].tolist() == [[700.0, 720.0]]
-    holes = R[:5].copy(), T[:5].copy()
-    for s in holes:
+    with_nan = R[:5].copy(), T[:5].copy()
+    for s in with_nan:
         s[2, BANDS > 1600] = np.nan
-    fit = invert_leaves(BANDS, *holes, domain="recommended")
+    fit = invert_leaves(BANDS, *with_nan, domain="recommended")
     assert np.isinf(fit.stderr["Cm"]).tolist() == [False, False, True, False, False]
     assert "not determined: Cw, Cm" in fit.sentence(2)
     assert not any(np.any(np.isnan(a)) for a in jax.tree.leaves(fit))
 
 
-def with_model_error(truth, share=0.06, constant=0.003, length=250.0, seed=3):
-    """Spectra whose absorption is off by a share, and their scattering by a constant, smoothly."""
+def with_model_error(truth, fraction=0.06, constant=0.003, length=250.0, seed=3):
+    """Spectra with errors of absorption, by a fraction, and of scattering, by a constant.
+
+    Both are Gaussian processes over wavelength, with exponential correlation of that length in nm.
+    """
     R, T = spectra(truth)
-    more = {n: v * (1.001 if n != "N" else 1.0) for n, v in truth.items()}
-    slope = np.stack([m - s for m, s in zip(spectra(more), (R, T))], axis=1) / 0.001
+    # All contents by the same factor: the derivative with respect to ln k.
+    raised = {n: v * (1.001 if n != "N" else 1.0) for n, v in truth.items()}
+    derivative = np.stack([m - s for m, s in zip(spectra(raised), (R, T))], axis=1) / 0.001
     root = np.linalg.cholesky(np.exp(-np.abs(BANDS[:, None] - BANDS) / length))
-    drawn = np.random.default_rng(seed).normal(size=(4, *R.shape)) @ root.T
-    return [s + share * slope[:, i] * drawn[i] + constant * drawn[2 + i] for i, s in enumerate((R, T))]
+    process = np.random.default_rng(seed).normal(size=(4, *R.shape)) @ root.T
+    return [
+        s + fraction * derivative[:, i] * process[i] + constant * process[2 + i] for i, s in enumerate((R, T))
+    ]
 
 
-def covered(fit, truth):
+def coverage(fit, truth):
+    """By trait, the fraction of leaves within two standard errors of the truth."""
     return {n: float(np.mean(np.abs(fit.traits[n] - truth[n]) < 2 * fit.stderr[n])) for n in fit.traits}
 
 
 @pytest.mark.parametrize("domain", slow_unless([None], [None, "recommended"]))
-def test_errors_cover_model_errors(noisy, domain):
+def test_errors_cover_model_errors(noisy_leaves, domain):
     """2 standard errors cover 95.4 %; of 200 leaves the mean within 92 to 98, no trait below 88."""
-    truth, _ = noisy
+    truth, _ = noisy_leaves
     random = np.random.default_rng(4)
     data = [s + 0.002 * random.normal(size=s.shape) for s in with_model_error(truth)]
     fit = invert_leaves(BANDS, *data, domain=domain)
 
-    def honest(cover):
-        return 0.92 <= np.mean(list(cover.values())) <= 0.98 and min(cover.values()) >= 0.88
+    def is_honest(fractions):
+        return 0.92 <= np.mean(list(fractions.values())) <= 0.98 and min(fractions.values()) >= 0.88
 
-    cover = covered(fit, truth)
-    assert honest(cover), cover
+    fractions = coverage(fit, truth)
+    assert is_honest(fractions), fractions
     if domain is None:
-        # As if samples were independent: the curvature of the fit, scaled by the residuals.
+        # Negative control, as if samples were independent: the curvature of the fit, scaled by the residuals.
         x = jnp.stack([jnp.asarray(truth[n]) for n in RANGES], axis=1)
-        slopes = jax.lax.map(
+        jacobian = jax.lax.map(
             jax.jacfwd(lambda x: jnp.stack(jl.Prospect(**dict(zip(RANGES, x)))(BANDS))), x, batch_size=20
         )
-        slopes = np.asarray(slopes, float).reshape(200, -1, len(RANGES))
-        spread = np.linalg.inv(slopes.transpose(0, 2, 1) @ slopes) * np.asarray(fit.rmse)[:, None, None] ** 2
-        errors = np.sqrt(np.diagonal(spread, axis1=1, axis2=2))
-        white = {
+        jacobian = np.asarray(jacobian, float).reshape(200, -1, len(RANGES))
+        normal = jacobian.transpose(0, 2, 1) @ jacobian
+        covariance = np.linalg.inv(normal) * np.asarray(fit.rmse)[:, None, None] ** 2
+        errors = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+        fractions = {
             n: float(np.mean(np.abs(fit.traits[n] - truth[n]) < 2 * errors[:, i]))
             for i, n in enumerate(RANGES)
         }
-        assert not honest(white), white
+        assert not is_honest(fractions), fractions
 
 
-ONE = np.full((2, BANDS.size), 0.4)
+SPECTRA = np.full((2, BANDS.size), 0.4)
 
 
 @pytest.mark.parametrize(
@@ -262,10 +274,10 @@ ONE = np.full((2, BANDS.size), 0.4)
         ({"wavelengths": BANDS[:5]}, r"reflectance has the shape \(2, 211\); .*\(2, 5\)"),
         ({"wavelengths": BANDS - 100.0}, r"wavelengths = 300 is outside .*\[400, 2500\]"),
         ({"wavelengths": 500.0}, r"wavelengths has the shape \(\)"),
-        ({"reflectance": 100 * ONE}, r"reflectance = 40 is outside .*\[-1, 2\]"),
-        ({"reflectance": np.where(BANDS > 500, ONE, np.inf)}, "reflectance = inf"),
-        ({"transmittance": ONE[:1]}, r"transmittance has the shape \(1, 211\)"),
-        ({"reflectance": ONE[:0], "transmittance": None}, r"reflectance has the shape \(0, 211\)"),
+        ({"reflectance": 100 * SPECTRA}, r"reflectance = 40 is outside .*\[-1, 2\]"),
+        ({"reflectance": np.where(BANDS > 500, SPECTRA, np.inf)}, "reflectance = inf"),
+        ({"transmittance": SPECTRA[:1]}, r"transmittance has the shape \(1, 211\)"),
+        ({"reflectance": SPECTRA[:0], "transmittance": None}, r"reflectance has the shape \(0, 211\)"),
         ({"reflectance": None, "transmittance": None}, "reflectance = None and transmittance = None"),
         ({"unknowns": ("N", "Cp")}, "'Cp' .* N, Cab, Car, Cant, Cbrown, Cw, Cm"),
         ({"unknowns": ("N", "N")}, "'N' is given twice"),
@@ -295,13 +307,14 @@ ONE = np.full((2, BANDS.size), 0.4)
     ],
 )
 def test_bad_input(changes, message):
-    given = {"wavelengths": BANDS, "reflectance": ONE, "transmittance": ONE} | changes
+    arguments = {"wavelengths": BANDS, "reflectance": SPECTRA, "transmittance": SPECTRA} | changes
     with pytest.raises(ValueError, match=message):
-        invert_leaves(given.pop("wavelengths"), given.pop("reflectance"), given.pop("transmittance"), **given)
+        invert_leaves(**arguments)
 
 
 # -- measured leaves -----------------------------------------------------------------------------------
 
+# Columns of the databases, by trait.
 CHEMISTRY = {
     "Cab": "leaf_chltot_per_area",
     "Car": "leaf_cartot_per_area",
@@ -316,7 +329,7 @@ def measured(shared, name):
 
 
 def error_of(fit, record):
-    """Root mean squared errors, ug/cm2, cm and g/cm2, of the leaves whose chemistry is known."""
+    """Root mean squared errors, ug/cm2, cm and g/cm2, over leaves with measured chemistry."""
     return {
         name: float(np.sqrt(np.nanmean((np.asarray(fit.traits[name]) - record[column]) ** 2)))
         for name, column in CHEMISTRY.items()
@@ -324,7 +337,7 @@ def error_of(fit, record):
 
 
 def test_measured_leaves_of_angers(shared):
-    """As PROSPECT-D with scipy on all ANGERS leaves, and 5 %; here on every second one."""
+    """Errors are at most 5 % above those of PROSPECT-D with scipy on all ANGERS leaves; here every second."""
     record = measured(shared, "angers_half.npz")
     fit = invert_leaves(record["wavelength_nm"], record["R"], record["T"])
     assert bool(jnp.all(fit.converged))
@@ -332,16 +345,17 @@ def test_measured_leaves_of_angers(shared):
     for name, reference in {"Cab": 6.65, "Car": 2.67, "Cw": 0.00212, "Cm": 0.00261}.items():
         assert error[name] < 1.05 * reference, name
     green = error_of(invert_leaves(record["wavelength_nm"], record["R"], record["T"], unknowns=GREEN), record)
-    # As the docstring says.
+    # The figures of the docstring of `invert_leaves`.
     assert [round(e[n], 1) for n in ("Cab", "Car") for e in (green, error)] == [4.9, 6.6, 3.7, 2.7]
 
 
+# Largest root mean squared error, and least fraction of leaves within two standard errors, by trait.
 RECOMMENDED = {
     "angers_half.npz": (
         {"Cab": 5.0, "Car": 2.3, "Cw": 0.00145, "Cm": 0.00096},
         {"Cab": 0.85, "Car": 0.85, "Cw": 0.9, "Cm": 0.9},
     ),
-    # On these leaves both pigments are too high, by more than the spectra show.
+    # On these leaves both pigments are overestimated by more than the spectra show.
     "lopex_half.npz": (
         {"Cab": 11.0, "Car": 2.7, "Cw": 0.0008, "Cm": 0.00135},
         {"Cab": 0.6, "Car": 0.6, "Cw": 0.9, "Cm": 0.9},
@@ -352,14 +366,15 @@ RECOMMENDED = {
 @pytest.mark.slow
 @pytest.mark.parametrize("name", slow_unless(["angers_half.npz"], list(RECOMMENDED)))
 def test_measured_leaves_in_recommended_domains(shared, name):
-    record, (most, least) = measured(shared, name), RECOMMENDED[name]
+    record, (largest_error, least_coverage) = measured(shared, name), RECOMMENDED[name]
     fit = invert_leaves(record["wavelength_nm"], record["R"], record["T"], domain="recommended")
     assert bool(jnp.all(fit.converged))
     for trait, column in CHEMISTRY.items():
-        assert error_of(fit, record)[trait] < most[trait], trait
-        known = ~np.isnan(record[column])
-        off = np.abs(np.asarray(fit.traits[trait]) - record[column])[known]
-        assert np.mean(off < 2 * np.asarray(fit.stderr[trait])[known]) >= least[trait], trait
+        assert error_of(fit, record)[trait] < largest_error[trait], trait
+        is_measured = ~np.isnan(record[column])
+        error = np.abs(np.asarray(fit.traits[trait]) - record[column])[is_measured]
+        is_covered = error < 2 * np.asarray(fit.stderr[trait])[is_measured]
+        assert np.mean(is_covered) >= least_coverage[trait], trait
 
 
 @pytest.mark.slow
@@ -367,8 +382,8 @@ def test_measured_leaves_of_lopex(shared):
     record = measured(shared, "lopex_half.npz")
     fit = invert_leaves(record["wavelength_nm"], record["R"], record["T"])
     assert bool(jnp.all(fit.converged))
-    for name, most in {"Cab": 9.0, "Car": 3.0, "Cw": 0.0011, "Cm": 0.0023}.items():
-        assert error_of(fit, record)[name] < most, name
+    for name, largest in {"Cab": 9.0, "Car": 3.0, "Cw": 0.0011, "Cm": 0.0023}.items():
+        assert error_of(fit, record)[name] < largest, name
 
 
 def test_against_scipy_with_prosail(shared):
@@ -381,8 +396,8 @@ def test_against_scipy_with_prosail(shared):
     def residual(x, r, t):
         content = dict(zip(("n", "cab", "car", "ant", "cbrown", "cw", "cm"), x))
         _, model_r, model_t = prosail.run_prospect(**content)
-        off = np.concatenate([model_r[:2051:step] - r, model_t[:2051:step] - t])
-        return np.where(np.isnan(off), 0.0, off)
+        difference = np.concatenate([model_r[:2051:step] - r, model_t[:2051:step] - t])
+        return np.where(np.isnan(difference), 0.0, difference)
 
     low, high = [1.0, *6 * [0.0]], [5.0, 150.0, 50.0, 50.0, 5.0, 0.1, 0.1]
     for i, data in enumerate(zip(R, T)):

@@ -1,4 +1,4 @@
-"""From records to echoes to points in a file, and back."""
+"""Echoes of records as points, written to a LAS file and read again."""
 
 import laspy
 import numpy as np
@@ -7,15 +7,17 @@ import pytest
 import inversion
 from jaxlidar.io import AirborneShot, Segment, read_las, stack_shots, write_las
 
-WAY = np.array([0.03, -0.02, -0.1455])
+# m per ns of two-way travel.
+DIRECTION = np.array([0.03, -0.02, -0.1455])
 
 
 def recorded(index, anchor, start, *echoes, size=90):
-    """A shot with Gaussian echoes of 2 ns at times on its clock."""
+    """Shot with Gaussian echoes, (amplitude, time), 2 ns wide, at times on its clock."""
     time = start + np.arange(size)
     samples = np.full(size, 12.0) + sum(a * np.exp(-0.5 * ((time - t) / 2.0) ** 2) for a, t in echoes)
-    own = {"anchor": np.array(anchor), "direction": WAY, "noise_mean": 12.0, "noise_std": 0.5}
-    return AirborneShot(index, **own, returning=(Segment(samples, start),), gps_time=4e5 + index)
+    beam = {"anchor": np.array(anchor), "direction": DIRECTION}
+    noise = {"noise_mean": 12.0, "noise_std": 0.5}
+    return AirborneShot(index, **beam, **noise, returning=(Segment(samples, start),), gps_time=4e5 + index)
 
 
 @pytest.fixture(scope="module")
@@ -37,9 +39,9 @@ def points(shots):
     return inversion.echo_points(shots, echoes)
 
 
-def test_echoes_lie_where_they_were_put(shots, points):
+def test_points_lie_at_the_planted_echoes(shots, points):
     times = [(0, 730.0), (0, 751.5), (2, 12.25)]
-    expected = [shots[i].anchor + t * WAY for i, t in times]
+    expected = [shots[i].anchor + t * DIRECTION for i, t in times]
     np.testing.assert_allclose(points.position, expected, rtol=0, atol=2e-3)
     np.testing.assert_allclose(points.intensity, [80, 40, 150], rtol=1e-2)
     np.testing.assert_array_equal(points.return_number, [1, 2, 1])

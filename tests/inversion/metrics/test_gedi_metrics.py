@@ -1,4 +1,4 @@
-"""GEDI's level 2A metrics and the tools without a model, against the product's answers for recorded shots."""
+"""GEDI's level 2A metrics and the tools without a model, against the product's values for recorded shots."""
 
 import types
 
@@ -13,25 +13,25 @@ from inversion import (
     plant_area_index,
     relative_heights,
 )
+from tests.conftest import SHARED
 
 RECORD = "GEDI01_B_2019108080338_O01964_T05337_02_003_01_sub.h5"
 
 
 @pytest.fixture(scope="module")
 def recorded():
-    """Shots of which the product's answers are known, in their order, and the answers."""
+    """Shots with values of the level 2 products, and those values in the same order."""
     pytest.importorskip("h5py")
-    from conftest import SHARED
 
     from jaxlidar.io import read_gedi_l1b
 
     if not (SHARED / "gedi" / RECORD).is_file():
         pytest.skip("the recorded GEDI file is not beside this checkout")
-    answers = np.load(SHARED / "gedi" / "level2_answers_60_shots.npz")
-    return read_gedi_l1b(SHARED / "gedi" / RECORD, answers["shot"]), answers
+    product = np.load(SHARED / "gedi" / "level2_answers_60_shots.npz")
+    return read_gedi_l1b(SHARED / "gedi" / RECORD, product["shot"]), product
 
 
-def test_settings_are_the_documents():
+def test_settings_are_those_of_the_basis_document():
     assert gedi_settings(1) == (6.5, 6.5, 3.0, 6.0)
     assert [gedi_settings(group).back_threshold for group in range(1, 7)] == [6.0, 3.0, 6.0, 6.0, 2.0, 4.0]
     assert [gedi_settings(group).front_threshold for group in range(1, 7)] == [3.0, 3.0, 3.0, 6.0, 3.0, 3.0]
@@ -40,75 +40,79 @@ def test_settings_are_the_documents():
             gedi_settings(group)
 
 
-def test_metrics_are_the_products(recorded):
-    """All elevations and all 101 relative heights of all shots within 0.1 m; another group's are not."""
+def test_metrics_are_those_of_the_product(recorded):
+    """All elevations and all 101 relative heights of all shots agree within 0.1 m; another group's do not."""
     shots, product = recorded
-    found = gedi_metrics(shots)
-    np.testing.assert_allclose(found.elev_lowestmode, product["elev_lowestmode"], atol=0.06, rtol=0)
-    np.testing.assert_allclose(found.elev_highestreturn, product["elev_highest"], atol=0.06, rtol=0)
-    np.testing.assert_allclose(found.rh, product["rh"], atol=0.1, rtol=0)
-    np.testing.assert_array_equal(found.num_detectedmodes, product["nmodes"])
-    other = gedi_metrics(shots, gedi_settings(4))
-    assert np.mean(np.abs(other.elev_highestreturn - product["elev_highest"]) < 0.15) < 0.2
+    metrics = gedi_metrics(shots)
+    np.testing.assert_allclose(metrics.elev_lowestmode, product["elev_lowestmode"], atol=0.06, rtol=0)
+    np.testing.assert_allclose(metrics.elev_highestreturn, product["elev_highest"], atol=0.06, rtol=0)
+    np.testing.assert_allclose(metrics.rh, product["rh"], atol=0.1, rtol=0)
+    np.testing.assert_array_equal(metrics.num_detectedmodes, product["nmodes"])
+    of_group_4 = gedi_metrics(shots, gedi_settings(4))
+    assert np.mean(np.abs(of_group_4.elev_highestreturn - product["elev_highest"]) < 0.15) < 0.2
 
 
 def stacked(shots):
-    """Heights below the first bin, records and pulses of one length, and the elevation of the first bin."""
+    """Heights over the first bin, records and pulses, of one length, and the elevation of the first bin."""
     size = max(shot.time.size for shot in shots)
     lag = np.arange(-64.0, 65.0)
-    first = np.array([shot.elevation[0] for shot in shots])
+    top = np.array([shot.elevation[0] for shot in shots])
     step = np.array([(shot.elevation[0] - shot.elevation[-1]) / (shot.time.size - 1) for shot in shots])
     power = np.stack([np.pad(shot.signal, (0, size - shot.time.size)) for shot in shots])
     pulse = np.stack([np.interp(lag, s.pulse_time, s.pulse_power, left=0, right=0) for s in shots])
-    return -step[:, None] * np.arange(size), power, pulse, first
+    return -step[:, None] * np.arange(size), power, pulse, top
 
 
-def rank(a, b):
+def rank_correlation(a, b):
+    """Spearman's, of values without ties."""
     return np.corrcoef(np.argsort(np.argsort(a)), np.argsort(np.argsort(b)))[0, 1]
 
 
 def test_tools_without_a_model_agree_with_the_product(recorded):
-    """With nothing but the record and its pulse."""
+    """From nothing but the record and its pulse."""
     shots, product = recorded
-    height, power, pulse, first = stacked(shots)
+    height, power, pulse, top = stacked(shots)
     ground = np.asarray(find_ground(height, power, pulse=pulse))
-    off = ground + first - product["elev_lowestmode"]
-    assert np.mean(np.abs(off) < 0.15) >= 0.95
-    assert np.max(np.abs(off)) < 0.3
+    difference = ground + top - product["elev_lowestmode"]
+    # A bin is 0.15 m.
+    assert np.mean(np.abs(difference) < 0.15) >= 0.95
+    assert np.max(np.abs(difference)) < 0.3
     rh98 = np.asarray(relative_heights(height, power, ground=ground, levels=(98.0,)))[:, 0]
-    assert rank(rh98, product["rh"][:, 98]) > 0.97
+    assert rank_correlation(rh98, product["rh"][:, 98]) > 0.97
     split = ground_and_canopy(height, power, pulse=pulse)
-    assert rank(plant_area_index(split.gap), product["pai"]) > 0.82
+    assert rank_correlation(plant_area_index(split.gap), product["pai"]) > 0.82
 
 
-def made(elevation, record):
+def made_up_shot(elevation, record):
+    """Shot with the attributes that the metrics read."""
     return types.SimpleNamespace(elevation=elevation, waveform=record, noise_mean=200.0, noise_std=3.0)
 
 
 def test_shots_of_all_lengths_in_their_order():
-    """Two sizes of the ladder, more shots than are computed at a time, and one of noise alone."""
-    places = np.linspace(90.0, 110.0, 70)
+    """Two size buckets, more shots than are computed at a time, and one of noise alone."""
+    ground = np.linspace(90.0, 110.0, 70)
     shots = []
-    for i, place in enumerate(places):
+    for i, ground_elevation in enumerate(ground):
         elevation = 130.0 - 0.15 * np.arange(380 if i % 2 else 300)
         amplitude = 0.0 if i == 7 else 300.0
-        shots.append(made(elevation, 200.0 + amplitude * np.exp(-0.5 * ((elevation - place) / 0.9) ** 2)))
-    found = gedi_metrics(shots)
-    assert np.isnan(found.elev_lowestmode[7])
-    assert np.all(np.isnan(found.rh[7]))
-    assert found.num_detectedmodes[7] == 0
-    others = np.arange(70) != 7
-    np.testing.assert_allclose(found.elev_lowestmode[others], places[others], atol=0.03)
-    assert np.all(found.num_detectedmodes[others] == 1)
-    assert found.rh.shape == (70, 101)
+        echo = amplitude * np.exp(-0.5 * ((elevation - ground_elevation) / 0.9) ** 2)
+        shots.append(made_up_shot(elevation, 200.0 + echo))
+    metrics = gedi_metrics(shots)
+    assert np.isnan(metrics.elev_lowestmode[7])
+    assert np.all(np.isnan(metrics.rh[7]))
+    assert metrics.num_detectedmodes[7] == 0
+    has_echo = np.arange(70) != 7
+    np.testing.assert_allclose(metrics.elev_lowestmode[has_echo], ground[has_echo], atol=0.03)
+    assert np.all(metrics.num_detectedmodes[has_echo] == 1)
+    assert metrics.rh.shape == (70, 101)
     assert gedi_metrics([]).rh.shape == (0, 101)
 
 
 def test_bad_input_is_refused():
     elevation = 130.0 - 0.15 * np.arange(300)
     with pytest.raises(ValueError, match="waveform = nan"):
-        gedi_metrics([made(elevation, elevation * np.nan)])
+        gedi_metrics([made_up_shot(elevation, elevation * np.nan)])
     with pytest.raises(ValueError, match="waveform and elevation have the shapes"):
-        gedi_metrics([made(elevation[1:], elevation)])
+        gedi_metrics([made_up_shot(elevation[1:], elevation)])
     with pytest.raises(ValueError, match="smoothing = 0"):
-        gedi_metrics([made(elevation, elevation)], gedi_settings(1)._replace(smoothing=0.0))
+        gedi_metrics([made_up_shot(elevation, elevation)], gedi_settings(1)._replace(smoothing=0.0))

@@ -1,4 +1,4 @@
-"""Ends of the signal, relative heights, ground and canopy of records made of known parts."""
+"""Ends of the signal, relative heights, ground and canopy of synthetic records, whose echoes are known."""
 
 import jax
 import jax.numpy as jnp
@@ -13,17 +13,17 @@ LAG = np.arange(-60.0, 61.0)
 
 
 def system_pulse():
-    """Skewed, with a second bump of 15 % in its tail, time zero at its mode."""
+    """Skewed pulse with a second bump of 15 % in its tail, time zero at its mode."""
     skewed = np.where(LAG < 0, np.exp(-0.5 * (LAG / 4.0) ** 2), np.exp(-0.5 * (LAG / 6.5) ** 2))
     return skewed + 0.15 * np.exp(-0.5 * ((LAG - 30.0) / 4.0) ** 2)
 
 
-def echoes(*parts, pulse=None):
-    """Copies of the pulse, of the given amplitudes, at heights."""
+def echoes(*targets, pulse=None):
+    """Record of copies of the pulse, with the amplitude and height of each target."""
     pulse = system_pulse() if pulse is None else pulse
     delay = (HEIGHT[0] - HEIGHT) / 0.15
     record = np.zeros(HEIGHT.size)
-    for amplitude, height in parts:
+    for amplitude, height in targets:
         record += amplitude * np.interp(delay - (HEIGHT[0] - height) / 0.15, LAG, pulse, left=0.0, right=0.0)
     return record
 
@@ -33,7 +33,7 @@ def noisy(record, sigma, seed):
 
 
 def test_ends_of_a_box():
-    """A straight line from sample to sample crosses the threshold; nothing else is found."""
+    """A straight line from sample to sample crosses the threshold; an empty record has no ends."""
     power = np.where((HEIGHT < 20.0) & (HEIGHT > 0.0), 10.0, 0.0)
     top, bottom = signal_ends(HEIGHT, power, noise=1.0, threshold=5.0)
     inside = np.flatnonzero(power)
@@ -42,8 +42,8 @@ def test_ends_of_a_box():
     assert all(np.isnan(end) for end in signal_ends(HEIGHT, 0 * power, noise=1.0))
 
 
-def test_ends_are_found_without_knowing_the_noise():
-    """Of 200 noisy records none begins in the noise, be the background wrong by half a deviation."""
+def test_ends_with_an_estimate_of_the_noise():
+    """Of 200 noisy records none begins in the noise, even if the background is off by half a deviation."""
     power = np.stack([noisy(echoes((80.0, 18.0), (150.0, 2.0)), 2.0, seed) for seed in range(200)])
     for offset in (0.0, 1.0):
         ends = signal_ends(HEIGHT, power + offset, pulse=system_pulse())
@@ -52,27 +52,28 @@ def test_ends_are_found_without_knowing_the_noise():
 
 
 def test_noise_beyond_the_signal_does_not_move_relative_heights():
-    """Over the whole of a long record the noise moves RH98 by metres; between the ends it does not."""
+    """Over all of a long record the noise moves RH98 by metres; between the signal's ends it does not."""
     clean = echoes((60.0, 15.0), (100.0, 0.0))
     power = np.stack([noisy(clean, 3.0, seed) for seed in range(50)])
-    found = np.asarray(relative_heights(HEIGHT, power, levels=(50.0, 98.0)))
-    whole = np.asarray(relative_heights(HEIGHT, np.maximum(power, 0), levels=(98.0,), ends=(40.0, -20.0)))
-    true = np.asarray(relative_heights(HEIGHT, clean, levels=(50.0, 98.0)))
-    assert np.max(np.abs(found - true)) < 0.4
-    assert np.min(np.abs(whole[:, 0] - true[1])) > 1.0
+    between_ends = np.asarray(relative_heights(HEIGHT, power, levels=(50.0, 98.0)))
+    ends = (40.0, -20.0)
+    over_record = np.asarray(relative_heights(HEIGHT, np.maximum(power, 0), levels=(98.0,), ends=ends))
+    truth = np.asarray(relative_heights(HEIGHT, clean, levels=(50.0, 98.0)))
+    assert np.max(np.abs(between_ends - truth)) < 0.4
+    assert np.min(np.abs(over_record[:, 0] - truth[1])) > 1.0
 
 
 def test_ripples_of_the_pulses_tail_are_no_ground():
-    """A hard target is found where it is; its second bump, four metres below, only without the pulse."""
+    """Ground is the hard target; its second bump, four metres below, is ground only without the pulse."""
     power = np.stack([noisy(echoes((100.0, 3.03)), 1.0, seed) for seed in range(100)])
-    found = np.asarray(find_ground(HEIGHT, power, pulse=system_pulse(), noise=1.0))
-    assert np.max(np.abs(found - 3.03)) < 0.1
+    ground = np.asarray(find_ground(HEIGHT, power, pulse=system_pulse(), noise=1.0))
+    assert np.max(np.abs(ground - 3.03)) < 0.1
     smooth = np.stack([np.convolve(row, np.hanning(9) / 4.0, mode="same") for row in power])
     assert np.max(np.asarray(find_ground(HEIGHT, smooth, noise=1.0))) < 0.0
 
 
 def test_a_mode_beyond_the_tail_is_ground():
-    """Where the tail's bump lies, an echo is told from it; one below the noise's threshold is not."""
+    """At the bump of a tail, an echo well above it is ground, and one below the threshold is not."""
     bump = 3.03 - 30 * 0.15
     strong, weak = echoes((100.0, 3.03), (30.0, bump)), echoes((100.0, 3.03), (2.0, bump))
     assert float(find_ground(HEIGHT, strong, pulse=system_pulse(), noise=0.5)) == pytest.approx(bump, abs=0.2)
@@ -89,40 +90,41 @@ def test_the_pulse_may_be_one_of_jaxlidars_and_its_zero_anywhere():
 
 
 def test_records_of_all_lengths_up_to_a_size_compile_once(caplog):
-    def everything(bins):
-        # A number of records that no other test has, so that the first is heard whatever ran before.
+    def all_metrics(bins):
+        # A number of records that no other test has: whatever ran before, the first call compiles.
         power = np.tile(echoes((60.0, 34.0), (100.0, 30.0))[:bins], (11, 1))
         split = ground_and_canopy(HEIGHT[:bins], power, pulse=system_pulse(), noise=1.0)
         heights = relative_heights(HEIGHT[:bins], power, noise=1.0)
         return np.concatenate([np.stack(split, axis=-1), heights], axis=-1)
 
     with jax.log_compiles():
-        first = everything(150)
-        assert any("_find_ground" in said for said in caplog.messages)
+        first = all_metrics(150)
+        assert any("_find_ground" in message for message in caplog.messages)
         caplog.clear()
-        second = everything(185)
-        assert not [said for said in caplog.messages if "_ground" in said or "_below" in said]
+        second = all_metrics(185)
+        programs = ("_find_ground", "_split_energy")
+        assert not [message for message in caplog.messages if any(name in message for name in programs)]
     np.testing.assert_allclose(second, first, rtol=1e-3)
 
 
-@pytest.mark.parametrize("share", [0.1, 0.3, 0.6])
-def test_the_ground_is_split_from_the_canopy(share, precision):
-    """An even canopy from 4 to 16 m, a ground widened by its slope: its share comes back."""
-    canopy = [(share / 80, 4.0 + 0.15 * i) for i in range(80)]
-    slope = [((1 - share) * w, 0.15 * k) for k, w in zip(range(-6, 7), np.hanning(15)[1:-1] / 7.0)]
+@pytest.mark.parametrize("fraction", [0.1, 0.3, 0.6])
+def test_the_ground_is_split_from_the_canopy(fraction, precision):
+    """An even canopy from 4 to 16 m over ground widened by its slope: its fraction is retrieved."""
+    canopy = [(fraction / 80, 4.0 + 0.15 * i) for i in range(80)]
+    slope = [((1 - fraction) * w, 0.15 * k) for k, w in zip(range(-6, 7), np.hanning(15)[1:-1] / 7.0)]
     split = ground_and_canopy(HEIGHT, 1e3 * echoes(*canopy, *slope), pulse=system_pulse())
     total = 1e3 * system_pulse().sum()
     assert float(split.height) == pytest.approx(0.0, abs=0.1)
-    assert float(split.canopy) / total == pytest.approx(share, abs=0.03)
-    assert float(split.ground) / total == pytest.approx(1 - share, abs=0.03)
-    known = share / (share + 1.5 * (1 - share))
-    assert float(plant_area_index(split.gap)) == pytest.approx(-2 * np.log(1 - known), rel=0.2)
+    assert float(split.canopy) / total == pytest.approx(fraction, abs=0.03)
+    assert float(split.ground) / total == pytest.approx(1 - fraction, abs=0.03)
+    cover = fraction / (fraction + 1.5 * (1 - fraction))
+    assert float(plant_area_index(split.gap)) == pytest.approx(-2 * np.log(1 - cover), rel=0.2)
 
 
 def test_derivatives_are_those_of_differences():
     with jax.enable_x64(True):
         power = jnp.asarray(noisy(echoes((60.0, 15.0), (100.0, 0.0)), 1.0, 3))
-        along = jnp.sin(jnp.arange(power.size))
+        direction = jnp.sin(jnp.arange(power.size))
 
         @jax.jit
         def values(y):
@@ -130,13 +132,13 @@ def test_derivatives_are_those_of_differences():
             heights = relative_heights(HEIGHT, y, noise=1.0, levels=(25.0, 60.0, 98.0))
             return jnp.concatenate([heights, jnp.stack([split.height, split.gap])])
 
-        _, slope = jax.jvp(values, (power,), (along,))
-        difference = (values(power + 1e-6 * along) - values(power - 1e-6 * along)) / 2e-6
-        np.testing.assert_allclose(slope, difference, rtol=1e-5, atol=1e-8)
+        _, derivative = jax.jvp(values, (power,), (direction,))
+        difference = (values(power + 1e-6 * direction) - values(power - 1e-6 * direction)) / 2e-6
+        np.testing.assert_allclose(derivative, difference, rtol=1e-5, atol=1e-8)
 
 
 @pytest.mark.parametrize(
-    ("call", "says"),
+    ("call", "message"),
     [
         (lambda: signal_ends(HEIGHT[::-1], HEIGHT), "steps of height"),
         (lambda: signal_ends(HEIGHT, HEIGHT * np.nan), "power = nan"),
@@ -151,6 +153,6 @@ def test_derivatives_are_those_of_differences():
         ),
     ],
 )
-def test_bad_input_is_refused(call, says):
-    with pytest.raises(ValueError, match=says):
+def test_bad_input_is_refused(call, message):
+    with pytest.raises(ValueError, match=message):
         call()

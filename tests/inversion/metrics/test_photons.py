@@ -1,4 +1,4 @@
-"""Ground and canopy from photon events, against the scene that they were drawn of."""
+"""Ground and canopy from photon events, against the scene that the events are drawn from."""
 
 from types import SimpleNamespace
 
@@ -11,18 +11,25 @@ import jaxlidar as jl
 from inversion.metrics import photons
 from jaxlidar._constants import PLANCK_TIMES_LIGHT
 
-BASE, TOP = 5.0, 15.0  # m above ground: an even canopy
+# An even canopy, m above ground.
+BASE, TOP = 5.0, 15.0
+# Height of the ground at the middle of the track, 100 m from its start, m.
+GROUND = 3.0
 SHOTS = 286
 DISTANCE = 0.7 * np.arange(SHOTS)
 
 
 def track(slope, ground=2.0, canopy=2.0):
-    """What `record` needs of waveforms along 200 m, with so many photons of each per pulse."""
+    """Waveforms along 200 m, as far as `record` reads them, of sloping ground and a canopy.
+
+    `slope`: degrees. `ground`, `canopy`: mean number of photons of each per pulse.
+    """
     height = np.arange(60.0, -30.0, -0.1)
-    above = height - 3.0 - np.tan(np.deg2rad(slope)) * (DISTANCE[:, None] - 100.0)
+    above = height - GROUND - np.tan(np.deg2rad(slope)) * (DISTANCE[:, None] - 100.0)
     echo = np.exp(-0.5 * (above / 0.15) ** 2)
     layer = ((above > BASE) & (above < TOP)).astype(float)
-    photons = sum(n * part / part.sum(axis=1, keepdims=True) for n, part in ((ground, echo), (canopy, layer)))
+    targets = ((ground, echo), (canopy, layer))
+    photons = sum(n * shape / shape.sum(axis=1, keepdims=True) for n, shape in targets)
     return SimpleNamespace(
         time=-2.0 * height / jl.SPEED_OF_LIGHT,
         wavelength=np.array([532.0]),
@@ -36,17 +43,18 @@ def events_of(wave, rate, seed=0):
     return jl.record(wave, receiver=counter, mode="photons", key=jax.random.key(seed))
 
 
-def errors(slope, rate, **given):
+def errors(slope, rate):
     """Errors of ground and of canopy, over segments and draws, and the purity and recall of signal."""
-    ground, canopy, told = [], [], []
+    ground, canopy, classification = [], [], []
     wave = track(slope)
     for seed in range(4):
         events = events_of(wave, rate, seed)
-        found = inversion.photon_ground_and_canopy(events, DISTANCE, **given)
-        ground.append(found.ground - 3.0 - np.tan(np.deg2rad(slope)) * (found.distance - 100.0))
-        canopy.append(found.canopy - (BASE + 0.98 * (TOP - BASE)))
-        told.append((events.signal[found.label > 0].mean(), (found.label > 0)[events.signal].mean()))
-    return np.concatenate(ground), np.concatenate(canopy), np.mean(told, axis=0)
+        heights = inversion.photon_ground_and_canopy(events, DISTANCE)
+        ground.append(heights.ground - GROUND - np.tan(np.deg2rad(slope)) * (heights.distance - 100.0))
+        canopy.append(heights.canopy - (BASE + 0.98 * (TOP - BASE)))
+        is_signal = heights.label > 0
+        classification.append((events.signal[is_signal].mean(), is_signal[events.signal].mean()))
+    return np.concatenate(ground), np.concatenate(canopy), np.mean(classification, axis=0)
 
 
 def rms(x):
@@ -65,41 +73,43 @@ def test_ground_and_canopy_are_found_by_night_and_by_day(slope, rate):
     assert recall > 0.95
 
 
-def test_without_telling_noise_the_canopy_is_missed(monkeypatch):
-    monkeypatch.setattr(photons, "_neighbours", lambda x, z: np.full(x.size, np.inf))
+def test_without_the_noise_filter_the_canopy_is_missed(monkeypatch):
+    """Negative control: if all photons pass for signal, background by day is taken for canopy."""
+    monkeypatch.setattr(photons, "_count_neighbours", lambda x, z: np.full(x.size, np.inf))
     _, canopy, (purity, _) = errors(0.0, 5e6)
     assert not np.any(np.abs(canopy) < 5.0)
     assert purity < 0.6
 
 
-def test_the_background_is_found_in_the_record():
+def test_the_background_is_estimated_from_the_record():
     for rate in (1e5, 1e6, 5e6):
         events = events_of(track(10.0), rate)
-        told, found = (
+        with_true_rate, with_estimate = (
             inversion.photon_ground_and_canopy(events, DISTANCE, background_rate=r).label > 0
             for r in (rate, None)
         )
-        assert np.mean(told == found) > 0.97
-    none = inversion.photon_ground_and_canopy(events, DISTANCE, background_rate=0.0)
-    assert (none.label[~events.signal] > 0).mean() > 0.7
+        assert np.mean(with_true_rate == with_estimate) > 0.97
+    # Negative control: a wrong rate lets the noise pass.
+    without_background = inversion.photon_ground_and_canopy(events, DISTANCE, background_rate=0.0)
+    assert (without_background.label[~events.signal] > 0).mean() > 0.7
 
 
 def test_too_few_photons_are_nan():
     bare = inversion.photon_ground_and_canopy(events_of(track(0.0, canopy=0.0), 1e5), DISTANCE)
-    assert np.all(np.abs(bare.ground - 3.0) < 0.1)
+    assert np.all(np.abs(bare.ground - GROUND) < 0.1)
     assert np.all(np.isnan(bare.canopy))
     assert set(bare.label) <= {0, 1, 3}
     dark = events_of(track(0.0, 0.0, 0.0), 0.0)
     noise = events_of(track(0.0, 0.0, 0.0), 2e6)
     for events in (dark, noise):
-        found = inversion.photon_ground_and_canopy(events, DISTANCE)
-        assert np.isnan(found.ground).mean() > 0.8
-        assert found.label.shape == (len(events),)
-    # A gap of half the track has no ground, and leaves the other half alone.
+        heights = inversion.photon_ground_and_canopy(events, DISTANCE)
+        assert np.isnan(heights.ground).mean() > 0.8
+        assert heights.label.shape == (len(events),)
+    # Half of the track without photons has no ground, and does not affect the other half.
     wave = track(0.0)
     wave.energy[SHOTS // 2 :] = 0.0
     half = inversion.photon_ground_and_canopy(events_of(wave, 1e5), DISTANCE)
-    assert np.all(np.abs(half.ground[:4] - 3.0) < 0.2)
+    assert np.all(np.abs(half.ground[:4] - GROUND) < 0.2)
     assert np.all(np.isnan(half.ground[6:]))
     assert np.all(np.isnan(half.slope) == np.isnan(half.ground))
 
@@ -109,17 +119,17 @@ def test_segments_and_percentiles():
     coarse = inversion.photon_ground_and_canopy(events, DISTANCE, segment=100.0, percentile=50.0)
     np.testing.assert_allclose(coarse.distance, [50.0, 150.0])
     np.testing.assert_allclose(coarse.canopy, 10.0, atol=0.7)
-    again = inversion.photon_ground_and_canopy(events, DISTANCE, segment=100.0, percentile=50.0)
-    assert all(np.array_equal(a, b) for a, b in zip(coarse, again))
+    repeated = inversion.photon_ground_and_canopy(events, DISTANCE, segment=100.0, percentile=50.0)
+    assert all(np.array_equal(a, b) for a, b in zip(coarse, repeated))
 
 
 def test_percentiles_are_those_of_numpy():
     random = np.random.default_rng(0)
     z, number = random.normal(size=200), random.integers(0, 7, 200)
-    got = photons._percentiles(z, number, 9, 98.0, 2)
+    percentiles = photons._percentiles(z, number, 9, 98.0, 2)
     for i in range(7):
-        np.testing.assert_allclose(got[i], np.percentile(z[number == i], 98.0))
-    assert np.all(np.isnan(got[7:]))
+        np.testing.assert_allclose(percentiles[i], np.percentile(z[number == i], 98.0))
+    assert np.all(np.isnan(percentiles[7:]))
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""What recorders add to waveforms, planted and found again: offsets, smoothing, noise of a pulse."""
+"""Recorders in fits: planted offsets, smoothing and noise of a pulse are retrieved, with errors as stated."""
 
 import jax
 import numpy as np
@@ -7,8 +7,8 @@ import pytest
 import inversion
 import jaxlidar as jl
 from inversion import Recorder, Unknown
-from inversion.fit.retrieval import scale_of
-from inversion.receiver.recorder import Terms
+from inversion.fit.retrieval import scale_unknown
+from inversion.receiver.recorder import RecorderModel
 
 TIME = np.arange(-40.0, 61.0)
 HEIGHT = Unknown("ground.height", bounds=(-2.0, 2.0), name="height")
@@ -18,8 +18,8 @@ LAG = np.arange(-15.0, 26.0)
 POWER = np.where(LAG < 0, np.exp(-0.5 * (LAG / 2.0) ** 2), np.exp(-0.5 * (LAG / 3.5) ** 2))
 
 
-def shape(pulse, jitter=0.0):
-    """A lidar's plan, for the highest ground: flat ground is a few rays."""
+def plan_of(pulse, jitter=0.0):
+    """Plan of a lidar for the highest ground. Flat ground needs few rays."""
     lidar = jl.Lidar(pulse=pulse, jitter=jitter)
     highest = jl.Scene(ground=jl.Ground(height=2.0, reflectance=0.5))
     return jl.plan(
@@ -28,20 +28,19 @@ def shape(pulse, jitter=0.0):
 
 
 def echoes(pulse, heights, jitter=0.0):
-    """Clean records of flat ground, of peak one or nearly."""
-    shares = np.diff(np.asarray(pulse.cumulative(np.append(TIME - 0.5, TIME[-1] + 0.5), jitter)))
+    """Records of flat ground at heights, without noise, of a peak of about one."""
+    fractions = np.diff(np.asarray(pulse.cumulative(np.append(TIME - 0.5, TIME[-1] + 0.5), jitter)))
     clean = []
     for height in heights:
         edges = np.append(TIME - 0.5, TIME[-1] + 0.5) + height / 0.149896229
         clean.append(np.diff(np.asarray(pulse.cumulative(edges, jitter))))
-    return np.stack(clean) / shares.max()
+    return np.stack(clean) / fractions.max()
 
 
-def fits_of(records, pulses, noise, recorder, near=None, **more):
-    """Fits that start near the heights, as echoes tell them."""
+def fits_of(records, pulses, noise, recorder, near=0.0, path=None):
+    """Fits of records that start 0.05 m above the heights `near`."""
     lidars = [jl.Lidar(pulse=pulse) for pulse in pulses]
-    more["start"] = {"height": np.broadcast_to(0.0 if near is None else near, len(records)) + 0.05}
-    settings = {"scale": (0.01, 1e3), "key": jax.random.key(0), "time": TIME, "plan": shape(pulses[0])}
+    settings = {"scale": (0.01, 1e3), "key": jax.random.key(0), "time": TIME, "plan": plan_of(pulses[0])}
     return inversion.retrieve_many(
         records[:, None],
         lidars if len(lidars) > 1 else lidars[0],
@@ -49,13 +48,14 @@ def fits_of(records, pulses, noise, recorder, near=None, **more):
         [HEIGHT],
         noise=noise,
         recorder=recorder,
+        start={"height": np.broadcast_to(near, len(records)) + 0.05},
+        path=path,
         **settings,
-        **more,
     )
 
 
-def within(z, sigmas=4.5):
-    """Whether numbers have mean 0 and variance 1."""
+def is_standard_normal(z, sigmas=4.5):
+    """True if numbers have mean 0 and variance 1, up to their standard errors."""
     n = z.size
     return abs(z.mean()) < sigmas / np.sqrt(n) and abs(z.var() - 1.0) < sigmas * np.sqrt(2.0 / n)
 
@@ -79,10 +79,10 @@ def test_offsets_and_width_are_found_with_errors_as_stated(interleaved):
     assert np.all(fits.converged)
     truths = {"height": height, "receiver width": np.full(SHOTS, 1.5), "offset": offsets}
     for name, truth in truths.items():
-        assert within(((fits.values[name] - truth) / fits.stderr[name]).ravel()), name
+        assert is_standard_normal(((fits.values[name] - truth) / fits.stderr[name]).ravel()), name
     spread = np.sqrt(2.0 / (TIME.size - 5) / SHOTS)
     assert abs(fits.reduced_chi2.mean() - 1.0) < 4.5 * spread
-    # One baseline for both digitisers is refused by the same measure, and so is none.
+    # Negative controls: one baseline for both digitisers, and none.
     for wrong in (Recorder(width=(0.2, 5.0), offset=(-1.0, 1.0)), Recorder(width=(0.2, 5.0))):
         assert fits_of(records, [pulse], 0.01, wrong, height).reduced_chi2.mean() > 1.0 + 45 * spread
     record = recorder.recorded(fits.fitted[0, 0], {name: v[0] for name, v in fits.values.items()})
@@ -91,12 +91,12 @@ def test_offsets_and_width_are_found_with_errors_as_stated(interleaved):
 
 
 def test_an_impulse_is_a_width_of_its_own_shape(interleaved):
-    """The same receiver, given as an impulse: nothing is left for a width."""
+    """The same receiver, given as an impulse instead of a width."""
     records, pulse, height, _ = interleaved
     lag = np.arange(-8.0, 9.0)
     recorder = Recorder(impulse=np.exp(-0.5 * (lag / 1.5) ** 2), offset=(-1.0, 1.0), interleaved=2)
     fits = fits_of(records, [pulse], 0.01, recorder, height)
-    assert within((fits.values["height"] - height) / fits.stderr["height"])
+    assert is_standard_normal((fits.values["height"] - height) / fits.stderr["height"])
     assert abs(fits.reduced_chi2.mean() - 1.0) < 4.5 * np.sqrt(2.0 / (TIME.size - 4) / SHOTS)
 
 
@@ -104,8 +104,10 @@ def test_an_impulse_is_a_width_of_its_own_shape(interleaved):
     "jitter", [0.0, pytest.param(1.5, marks=pytest.mark.slow)], ids=["fast", "slow receiver"]
 )
 def test_noise_of_the_recorded_pulse_is_noise_of_the_fit(jitter):
-    """Of hard ground, seen by a fast receiver, which repeats the pulse's noise, and a slow one, which smooths
-    it: reduced chi-squared is one, and height and scale have the errors stated."""
+    """A fast receiver repeats the noise of the pulse in the echo of hard ground; a slow one smooths it.
+
+    In both, reduced chi-squared is one, and the height has the error stated.
+    """
     random = np.random.default_rng(11)
     lag = np.arange(-12.0, 13.0)
     fine = jl.SampledPulse(lag, np.cos(np.pi * lag / 24.0) ** 2)
@@ -119,44 +121,53 @@ def test_noise_of_the_recorded_pulse_is_noise_of_the_fit(jitter):
     response = np.exp(-0.5 * (np.arange(-8.0, 9.0) / jitter) ** 2) if jitter else None
     fits = fits_of(records, pulses, 0.002, Recorder(impulse=response, pulse_noise=0.005), height)
     assert np.all(fits.converged)
-    assert within((fits.values["height"] - height) / fits.stderr["height"])
+    assert is_standard_normal((fits.values["height"] - height) / fits.stderr["height"])
     spread = np.sqrt(2.0 / (TIME.size - 2) / SHOTS)
     assert abs(fits.reduced_chi2.mean() - 1.0) < 4.5 * spread
+    # Negative control: without the noise of the pulse, both are wrong.
     without = fits_of(records, pulses, 0.002, Recorder(impulse=response), height)
     assert without.reduced_chi2.mean() > fits.reduced_chi2.mean() + 3 * spread
-    assert not within((without.values["height"] - height) / without.stderr["height"])
+    assert not is_standard_normal((without.values["height"] - height) / without.stderr["height"])
 
 
 def test_derivatives_are_those_of_differences():
+    """In every unknown of the recorder, and through the simulated waveform."""
     random = np.random.default_rng(0)
     recorder = Recorder(width=(0.2, 5.0), impulse=[0.2, 1.0, -0.1], offset=(-1.0, 1.0), interleaved=3)
-    terms = Terms(recorder, [scale_of((0.1, 10.0), [])], jl.Lidar(), 50)
-    own = np.array([1.3, 0.1, -0.2, 0.05, 2.0])
-    total, slope = random.normal(size=(2, 50)), random.normal(size=(2, 50, 1))
-    found = terms(total, slope, own).jacobian
+    model = RecorderModel(recorder, [scale_unknown((0.1, 10.0), [])], jl.Lidar(), 50)
+    # Width, three offsets and scale.
+    values = np.array([1.3, 0.1, -0.2, 0.05, 2.0])
+    total, scene_jacobian = random.normal(size=(2, 50)), random.normal(size=(2, 50, 1))
+    jacobian = model(total, scene_jacobian, values).jacobian
     step = 1e-5
-    for i in range(own.size):
-        ahead, behind = (own + sign * step * np.eye(own.size)[i] for sign in (1.0, -1.0))
-        difference = (terms(total, slope, ahead).total - terms(total, slope, behind).total) / (2.0 * step)
-        np.testing.assert_allclose(found[..., 1 + i], difference, atol=1e-8)
-    ahead, behind = (terms(total + sign * step * slope[..., 0], slope, own).total for sign in (1.0, -1.0))
-    np.testing.assert_allclose(found[..., 0], (ahead - behind) / (2.0 * step), atol=1e-8)
+    for i in range(values.size):
+        plus, minus = (
+            model(total, scene_jacobian, values + sign * step * np.eye(values.size)[i]).total
+            for sign in (1.0, -1.0)
+        )
+        np.testing.assert_allclose(jacobian[..., 1 + i], (plus - minus) / (2.0 * step), atol=1e-8)
+    plus, minus = (
+        model(total + sign * step * scene_jacobian[..., 0], scene_jacobian, values).total
+        for sign in (1.0, -1.0)
+    )
+    np.testing.assert_allclose(jacobian[..., 0], (plus - minus) / (2.0 * step), atol=1e-8)
 
 
-def test_light_smoothed_out_of_the_window_does_not_come_back():
+def test_light_smoothed_out_of_the_record_does_not_come_back():
+    """The convolution of the response does not wrap around."""
     total = np.zeros((1, 40))
     total[0, -1] = 1.0
-    terms = Terms(Recorder(width=(0.1, 9.0)), [], jl.Lidar(), 40)
-    assert np.all(np.abs(terms(total, np.zeros((1, 40, 0)), np.array([3.0])).total[0, :20]) < 1e-6)
+    model = RecorderModel(Recorder(width=(0.1, 9.0)), [], jl.Lidar(), 40)
+    assert np.all(np.abs(model(total, np.zeros((1, 40, 0)), np.array([3.0])).total[0, :20]) < 1e-6)
 
 
 @pytest.mark.slow
-def test_one_fit_is_as_of_many(interleaved):
+def test_one_fit_is_that_of_a_batch(interleaved):
     records, pulse, height, _ = interleaved
     recorder = Recorder(width=(0.2, 5.0), offset=(-1.0, 1.0), interleaved=2, pulse_noise=0.005)
-    many = fits_of(records[:1], [pulse], 0.01, recorder, height[0])
-    settings = {"time": TIME, "plan": shape(pulse), "key": jax.random.fold_in(jax.random.key(0), 0)}
-    one = inversion.retrieve(
+    batch = fits_of(records[:1], [pulse], 0.01, recorder, height[0])
+    settings = {"time": TIME, "plan": plan_of(pulse), "key": jax.random.fold_in(jax.random.key(0), 0)}
+    single = inversion.retrieve(
         records[0],
         jl.Lidar(pulse=pulse),
         jl.Scene(ground=jl.Ground(height=float(height[0]) + 0.05, reflectance=0.5)),
@@ -166,75 +177,76 @@ def test_one_fit_is_as_of_many(interleaved):
         recorder=recorder,
         **settings,
     )
-    for name, value in one.values.items():
-        np.testing.assert_allclose(many.values[name][0], value, rtol=1e-3, atol=1e-4)
+    for name, value in single.values.items():
+        np.testing.assert_allclose(batch.values[name][0], value, rtol=1e-3, atol=1e-4)
 
 
-def test_checkpoints_know_their_recorder(interleaved, tmp_path):
+def test_checkpoints_refuse_another_recorder(interleaved, tmp_path):
     records, pulse, *_ = interleaved
     path = tmp_path / "fits.sqlite"
     recorder = Recorder(offset=(-1.0, 1.0))
     first = fits_of(records[:2], [pulse], 0.01, recorder, path=path)
-    again = fits_of(records[:2], [pulse], 0.01, recorder, path=path)
-    np.testing.assert_array_equal(first.values["offset"], again.values["offset"])
+    repeated = fits_of(records[:2], [pulse], 0.01, recorder, path=path)
+    np.testing.assert_array_equal(first.values["offset"], repeated.values["offset"])
     with pytest.raises(ValueError, match="recorder"):
         fits_of(records[:2], [pulse], 0.01, Recorder(offset=(-1.0, 1.0), pulse_noise=0.1), path=path)
 
 
-def test_a_receiver_is_found_from_hard_targets():
-    """A response with an undershoot, from noisy echoes at random places."""
+def test_a_response_is_estimated_from_hard_targets():
+    """A response with an undershoot, from noisy echoes at random positions between samples."""
     random = np.random.default_rng(2)
-    true = np.array([0.3, 0.1, 0.3, -0.1, 0.0, 0.4])
-    places = 20.0 + random.uniform(0.0, 1.0, 40)
-    wide = np.arange(-3.0, 3.0)
+    true_response, true_lags = np.array([0.3, 0.1, 0.3, -0.1, 0.0, 0.4]), np.arange(-3.0, 3.0)
     records = []
-    for place in places:
-        parts = [
-            w * np.exp(-0.5 * ((np.arange(70.0) - place - lag) / 1.7) ** 2) for lag, w in zip(wide, true)
+    for position in 20.0 + random.uniform(0.0, 1.0, 40):
+        delayed_pulses = [
+            weight * np.exp(-0.5 * ((np.arange(70.0) - position - lag) / 1.7) ** 2)
+            for lag, weight in zip(true_lags, true_response)
         ]
-        records.append(sum(parts) + 0.3 + 0.003 * random.normal(size=70))
+        records.append(sum(delayed_pulses) + 0.3 + 0.003 * random.normal(size=70))
     pulse = np.exp(-0.5 * (np.arange(-9.0, 10.0) / 1.7) ** 2)
     noise = [np.full(70, 0.003)] * 40
-    found = inversion.receiver_impulse([pulse] * 40, records, noise=noise, before=4, after=4)
-    assert found.shape == (9,)
-    assert found.sum() == pytest.approx(1.0)
-    # Pulses smooth the response; so smoothed, the two agree but for a delay, and one pulse alone does not.
-    sample, one = np.arange(27.0), np.convolve(pulse, np.append(true, [0.0, 0.0, 0.0]))
+    response = inversion.receiver_impulse([pulse] * 40, records, noise=noise, before=4, after=4)
+    assert response.shape == (9,)
+    assert response.sum() == pytest.approx(1.0)
+    # The pulse smooths the response: compared are echoes. A common delay is not determined.
+    sample, true_echo = np.arange(27.0), np.convolve(pulse, np.append(true_response, [0.0, 0.0, 0.0]))
 
-    def away(response):
+    def largest_difference(response):
         echo = np.convolve(pulse, response)
         delays = np.arange(-2.0, 2.0, 0.02)
-        return min(np.max(np.abs(np.interp(sample - d, sample, one) - echo)) for d in delays)
+        return min(np.max(np.abs(np.interp(sample - d, sample, true_echo) - echo)) for d in delays)
 
-    assert away(found) < 0.06
-    assert away(np.eye(9)[4]) > 0.1
+    assert largest_difference(response) < 0.06
+    # Negative control: a receiver that repeats the pulse.
+    assert largest_difference(np.eye(9)[4]) > 0.1
 
 
-def test_a_recorded_pulse_is_recorded_as_it_was():
+def test_a_recorded_pulse_is_simulated_as_it_was_recorded():
+    """Samples of the pulse, as means over bins, are those of the record."""
     time = np.arange(-8.0, 9.0)
     power = np.exp(-0.5 * (time / 1.7) ** 2)
     edges = np.append(time - 0.5, time[-1] + 0.5)
 
-    def away(pulse):
-        shares = np.diff(np.asarray(pulse.cumulative(edges)))
-        return np.max(np.abs(shares / shares.sum() * power.sum() - power))
+    def largest_difference(pulse):
+        fractions = np.diff(np.asarray(pulse.cumulative(edges)))
+        return np.max(np.abs(fractions / fractions.sum() * power.sum() - power))
 
-    assert away(inversion.recorded_pulse(time, power)) < 1e-3
-    # What sampling does a second time.
-    assert away(jl.SampledPulse(time, power)) > 0.03
+    assert largest_difference(inversion.recorded_pulse(time, power)) < 1e-3
+    # Negative control: samples taken for the pulse are smoothed by sampling a second time.
+    assert largest_difference(jl.SampledPulse(time, power)) > 0.03
 
 
 def test_amplitudes_of_tables_in_decibels():
-    """A straight line from a pedestal of two counts, in decibels: noise about the pedestal keeps its mean."""
+    """A linear table from a pedestal of two counts, in decibels: noise about the pedestal keeps its mean."""
     decibels = np.where(np.arange(100) < 4, -2e37, 10 * np.log10(np.maximum(np.arange(100) - 2, 1) / 7))
-    found = inversion.amplitudes(np.array([0, 2, 9, 99]), decibels, noise=0.7, decibels=True)
-    np.testing.assert_allclose(found.values, [-2 / 7, 0.0, 1.0, 97 / 7], atol=1e-9)
-    np.testing.assert_allclose(found.noise, [0.1, 0.1, 0.1, np.inf])
+    converted = inversion.amplitudes(np.array([0, 2, 9, 99]), decibels, noise=0.7, decibels=True)
+    np.testing.assert_allclose(converted.values, [-2 / 7, 0.0, 1.0, 97 / 7], atol=1e-9)
+    np.testing.assert_allclose(converted.noise, [0.1, 0.1, 0.1, np.inf])
     assert inversion.amplitudes(np.array([3, 9]), noise=1.0, saturation=9).noise.tolist() == [1.0, np.inf]
 
 
 @pytest.mark.parametrize(
-    ("settings", "says"),
+    ("settings", "message"),
     [
         ({"width": (-1.0, 2.0)}, "width"),
         ({"width": (2.0, 1.0)}, "not low < high"),
@@ -247,8 +259,8 @@ def test_amplitudes_of_tables_in_decibels():
         ({"pulse_noise": -0.1}, "pulse_noise = -0.1"),
     ],
 )
-def test_bad_recorders_are_refused(settings, says):
-    with pytest.raises(ValueError, match=says):
+def test_bad_recorders_are_refused(settings, message):
+    with pytest.raises(ValueError, match=message):
         Recorder(**settings)
 
 
@@ -261,13 +273,13 @@ def test_other_bad_input_is_refused():
         inversion.receiver_impulse([], [], noise=[])
     with pytest.raises(ValueError, match="uneven steps"):
         inversion.recorded_pulse([0.0, 1.0, 3.0], [0.0, 1.0, 0.0])
-    taken = Unknown("ground.height", bounds=(-2.0, 2.0), name="offset")
+    offset = Unknown("ground.height", bounds=(-2.0, 2.0), name="offset")
     with pytest.raises(ValueError, match="taken by the recorder"):
         inversion.retrieve(
             np.zeros(TIME.size),
             jl.Lidar(),
             START,
-            [taken],
+            [offset],
             noise=1.0,
             time=TIME,
             key=jax.random.key(0),
@@ -276,7 +288,7 @@ def test_other_bad_input_is_refused():
 
 
 def test_correlated_noise_is_noise_of_the_fit():
-    """Standard errors and chi-squared are as stated; taken as independent they are not."""
+    """Standard errors and chi-squared are as stated; with noise taken as independent they are not."""
     random, pulse, rho = np.random.default_rng(11), jl.SampledPulse(LAG, POWER), 0.6
     height = random.uniform(-0.5, 0.5, SHOTS)
     root = np.linalg.cholesky(rho ** np.abs(np.subtract.outer(TIME, TIME)))
@@ -285,35 +297,38 @@ def test_correlated_noise_is_noise_of_the_fit():
     fits = fits_of(records, [pulse], 0.02, Recorder(correlation=rho, **settings), height)
     assert np.all(fits.converged)
     for name, truth in (("height", height), ("offset", np.zeros(SHOTS))):
-        assert within((fits.values[name] - truth) / fits.stderr[name]), name
+        assert is_standard_normal((fits.values[name] - truth) / fits.stderr[name]), name
     assert fits.reduced_chi2.mean() == pytest.approx(1.0, abs=4 * np.sqrt(2 / (TIME.size * SHOTS)))
     without = fits_of(records, [pulse], 0.02, Recorder(**settings), height)
-    assert not within(without.values["offset"] / without.stderr["offset"])
+    assert not is_standard_normal(without.values["offset"] / without.stderr["offset"])
 
 
 def shots_of_a_compressed_digitiser(random, count=60):
-    """Counts of pulses and of a slow receiver's echoes, both compressed above 110 counts, and the light."""
-    lag, tail = np.arange(-12.0, 13.0), np.array([0.1, 0.7, 0.3, -0.1, 0.02])
-    pulses, found = [], []
+    """Counts of pulses and of a slow receiver's echoes, both compressed above 110 counts."""
+    lag, response = np.arange(-12.0, 13.0), np.array([0.1, 0.7, 0.3, -0.1, 0.02])
+    pulses, echoes = [], []
     for strength in random.uniform(60.0, 190.0, count):
-        at = random.uniform(-0.5, 0.5, 2)
-        pulse = 150.0 * np.exp(-0.5 * ((lag - at[0]) / 1.7) ** 2)
-        light = np.convolve(np.exp(-0.5 * ((np.arange(-30.0, 31.0) - at[1]) / 1.7) ** 2), tail, "same")
+        # Times of pulse and echo between samples.
+        pulse_time, echo_time = random.uniform(-0.5, 0.5, 2)
+        pulse = 150.0 * np.exp(-0.5 * ((lag - pulse_time) / 1.7) ** 2)
+        light = np.exp(-0.5 * ((np.arange(-30.0, 31.0) - echo_time) / 1.7) ** 2)
+        light = np.convolve(light, response, "same")
         pulses.append(np.round(compressed(pulse + 3.0) + 0.3 * random.normal(size=pulse.size).clip(-2, 2)))
-        own = compressed(strength * light / light.max() + 3.0)
-        found.append(np.maximum(np.round(own + 0.5 * random.normal(size=own.size)), 0.0))
-    return [np.maximum(p, 0.0) for p in pulses], found
+        echo = compressed(strength * light / light.max() + 3.0)
+        echoes.append(np.maximum(np.round(echo + 0.5 * random.normal(size=echo.size)), 0.0))
+    return [np.maximum(p, 0.0) for p in pulses], echoes
 
 
 def compressed(light):
+    """Counts of light above 110 rise by 0.7 only."""
     return np.where(light > 110.0, 110.0 + 0.7 * (light - 110.0), light)
 
 
-def test_a_corrected_table_undoes_what_the_table_does_not_know():
-    """Within 2 % of the light, where the table as it is is off by more than 10 %."""
-    table, more = np.arange(256.0), {"noise": 0.5, "knots": [100.0, 115.0, 130.0, 145.0, 160.0]}
-    pulses, found = shots_of_a_compressed_digitiser(np.random.default_rng(4))
-    corrected = inversion.corrected_table(table, pulses, found, **more)
+def test_a_corrected_table_undoes_the_compression():
+    """Amplitudes are within 2 % of the light; by the uncorrected table they are off by more than 10 %."""
+    table, options = np.arange(256.0), {"noise": 0.5, "knots": [100.0, 115.0, 130.0, 145.0, 160.0]}
+    pulses, echoes = shots_of_a_compressed_digitiser(np.random.default_rng(4))
+    corrected = inversion.corrected_table(table, pulses, echoes, **options)
     light = np.linspace(50.0, 180.0, 50)
     read = np.interp(compressed(light), table, corrected)
     np.testing.assert_allclose(read, light, rtol=0.02)
@@ -323,13 +338,13 @@ def test_a_corrected_table_undoes_what_the_table_does_not_know():
 
 def test_bad_tables_are_refused():
     counts = [np.arange(20.0)]
-    more = {"noise": 0.5, "knots": [10.0, 20.0]}
-    for changes, says in (
+    options = {"noise": 0.5, "knots": [10.0, 20.0]}
+    for changes, message in (
         ({"pulses": []}, "pulses and echoes are 0 and 1"),
         ({"knots": [20.0, 10.0]}, "knots"),
         ({"noise": 0.0}, "noise"),
         ({"echoes": [np.array([300.0])]}, "echoes"),
     ):
-        given = {"pulses": counts, "echoes": counts, **more, **changes}
-        with pytest.raises(ValueError, match=says):
-            inversion.corrected_table(np.arange(256.0), **given)
+        arguments = {"pulses": counts, "echoes": counts, **options, **changes}
+        with pytest.raises(ValueError, match=message):
+            inversion.corrected_table(np.arange(256.0), **arguments)
