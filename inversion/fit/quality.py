@@ -27,7 +27,7 @@ The thresholds hold for any instrument; the checks of a record need several samp
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import ArrayLike, Float
@@ -72,6 +72,7 @@ class Verdict(NamedTuple):
         return Verdict(worse.quality, (*worse.reasons, *better.reasons))
 
 
+@runtime_checkable
 class JudgedFit(Protocol):
     """The quantities of a fit (`Retrieval`), or of many (`Retrievals`), on which a verdict depends."""
 
