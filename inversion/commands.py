@@ -36,6 +36,7 @@ from jaxlidar.cli.shared import ResultPath
 @click.option("--voxel-size", type=click.FloatRange(0, 1, min_open=True), default=0.25, hidden=True)
 def demo(out: Path, seed: int, rtol: float, quiet: bool, voxel_size: float) -> None:
     """Simulate a tree's waveform, retrieve leaf, crown and ground from a noisy one, and draw both."""
+    # click's ranges let NaN pass.
     if math.isnan(rtol):
         raise click.BadParameter("nan is not in the range 0<x<1.", param_hint="--rtol")
     # Before the work: a folder that cannot be written ends the command at once.
@@ -50,6 +51,7 @@ def _parse_unknowns(ctx: Any, parameter: Any, texts: tuple[str, ...]) -> list[Un
     """Return the unknowns of texts PATH:LOW:HIGH."""
     unknowns = []
     for text in texts:
+        # Paths hold no colon: the rest are the bounds.
         path, *bounds = text.split(":")
         try:
             low, high = map(float, bounds)
@@ -102,9 +104,11 @@ def retrieve(
         raise click.UsageError(f"{observed} holds a {type(wave).__name__}, not a waveform")
     if case.scene is None:
         raise click.UsageError(f"{start} has no scene")
+    # Standard errors are zero in bins that no photon reached: any above zero will do.
     sigma: Any = np.asarray(wave.stderr) if noise is None else noise
     if noise is None and not np.any(sigma > 0):
         raise click.UsageError(f"{observed} has no standard errors: give --noise")
+    # Steps are for a person who watches, not for a log file.
     log = demonstration.ProgressLog(sys.stderr if sys.stderr.isatty() and not quiet else None)
     fit = fit_waveform(
         wave,
@@ -125,6 +129,7 @@ def retrieve(
 
         axes = Figure(figsize=(6.0, 4.2), layout="constrained").subplots(1, 2, sharey=True)
         jl.plot.fit(fit.waveform, wave.reflectance, sigma, axes)
+        # The draft has another suffix: the format is that of the final name.
         with jl.io.atomic_write(plot) as draft:
             axes[0].get_figure().savefig(draft, format=plot.suffix.lstrip(".") or "png", dpi=150)
         click.echo(f"figure: {plot}")

@@ -51,6 +51,7 @@ def _with_height(scene: jl.Scene, height: Array) -> jl.Scene:
     """Stretch the tree upward from z = 0 to a height, m, with the same leaf and bark area."""
     stretch = height / HEIGHT
     fields = lambda s: [s.canopy.voxels.leaf, s.canopy.voxels.bark, s.canopy.voxels.voxel_size]  # noqa: E731
+    # Extinction times height is constant.
     leaf, bark, size = fields(scene)
     return eqx.tree_at(fields, scene, [leaf / stretch, bark / stretch, size.at[2].multiply(stretch)])
 
@@ -111,6 +112,7 @@ def run(out: Path, *, seed: int, rtol: float, voxel_size: float, log: Callable[[
     wave = jl.simulate(
         lidar, scene, key=jax.random.fold_in(key, 0), plan=plan, rtol=rtol, progress=lambda p: log(f"  {p}")
     )
+    # An interrupted simulation returns what it has; the demo ends instead.
     if wave.info["stopped"] == "interrupted":
         raise KeyboardInterrupt
     path = out / "waveform.png"
@@ -176,6 +178,7 @@ def retrieval_figure(
     observed: jl.Waveform, noise: Float[np.ndarray, "wavelengths bins"], start: jl.Waveform, fit: Retrieval
 ) -> Figure:
     """Draw data, start, fit and residuals of the fit, for each wavelength."""
+    # A pair of axes for each wavelength: waveforms, and residuals.
     figure = Figure(figsize=(7.4, 4.6), layout="constrained")
     ratios = (1.5, 1.0) * len(WAVELENGTHS)
     axes = figure.subplots(1, 2 * len(WAVELENGTHS), sharey=True, width_ratios=ratios)
@@ -190,6 +193,7 @@ def retrieval_figure(
         jaxlidar.plot.residuals(
             fit.waveform, np.asarray(observed.reflectance), noise, residual_axes, wavelength=wavelength
         )
+        # One legend for the figure, in place of one for each pair of axes.
         legend = ax.get_legend()
         if legend is not None:
             legend.remove()

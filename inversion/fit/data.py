@@ -56,6 +56,7 @@ class SampleNoise(NamedTuple):
 
     def whiten(self, x: Float[np.ndarray, "samples ..."]) -> Float[np.ndarray, "samples ..."]:
         """Return differences, or columns of them, made independent and of unit variance."""
+        # Rows are samples; x may have any number of columns.
         scaled = x / self.sigma_independent.reshape(-1, *(1,) * (x.ndim - 1))
         if self.shared_errors is None and self.correlation is None:
             return scaled
@@ -89,12 +90,14 @@ def shared_errors_of_samples(
     """Return the shared errors of the fitted samples; those of different wavelengths are independent."""
     if errors is None:
         return None
+    # Errors of one wavelength are zero at the samples of the others.
     return np.asarray(linalg.block_diag(*(e[fitted] for e, fitted in zip(errors, is_fitted))))
 
 
 def with_fixed_window(lidar: Lidar) -> Lidar:
     """Return the lidar with a fixed recording window: the samples of a record lie at known times."""
     check_kind("lidar", lidar, Lidar, "a Lidar")
+    # A window that opens at the first return would move with the scene during a fit.
     return dataclasses.replace(lidar, receiver=dataclasses.replace(lidar.receiver, window="fixed"))
 
 
@@ -117,12 +120,14 @@ def as_observed(
         raise ValueError("time = None, but observed is an array: its sample times are needed")
     t = as_sample_times(time, lidar)
     y = as_numbers("observed", observed)
+    # The axis of a single wavelength may be left out.
     if y.ndim == 1:
         y = y[None, :]
     shape = (lidar.wavelength.size, t.size)
     if y.shape != shape:
         raise ValueError(f"observed has the shape {y.shape}; admissible is (wavelengths, bins) = {shape}")
     sigma = as_noise(noise, shape)
+    # Written so that NaN is refused.
     if not np.all(sigma >= 0):
         inadmissible = sigma[~(sigma >= 0)].flat[0]
         raise ValueError(f"noise = {inadmissible:g} is outside the admissible range [0, inf]")
@@ -139,6 +144,7 @@ def as_observed(
             f"noise = 0 with noise_floor = {noise_floor:g} and a largest observed value of "
             f"{float(peak.min()):g}; admissible is a noise above 0"
         )
+    # Samples that are left out may be NaN, which a weight of zero would not remove.
     return ObservedWaveform(t, np.where(is_fitted, y, 0.0), sigma)
 
 
@@ -146,6 +152,7 @@ def as_noise(noise: object, shape: tuple[int, ...]) -> np.ndarray:
     """Return standard deviations of this shape. **Raises:** ValueError for one that does not broadcast."""
     sigma = as_numbers("noise", noise)
     try:
+        # A copy: a broadcast array cannot be written.
         return np.broadcast_to(sigma, shape).copy()
     except ValueError:
         raise ValueError(f"noise has the shape {sigma.shape}, which does not broadcast to {shape}") from None

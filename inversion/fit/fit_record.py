@@ -85,6 +85,7 @@ class FitRecord:
     - `fitted`: simulated apparent reflectance at the estimates, without the recorder's terms.
     """
 
+    # Estimates.
     values: np.ndarray = dataclasses.field(metadata=_axes("unknowns"))
     stderr: np.ndarray = dataclasses.field(metadata=_axes("unknowns"))
     robust_stderr: np.ndarray = dataclasses.field(metadata=_axes("unknowns"))
@@ -92,10 +93,12 @@ class FitRecord:
     at_bound: np.ndarray = dataclasses.field(metadata=_axes("unknowns", kind="b"))
     covariance: np.ndarray = dataclasses.field(metadata=_axes("unknowns unknowns"))
     averaging: np.ndarray = dataclasses.field(metadata=_axes("unknowns unknowns"))
+    # Evidence.
     reduced_chi2: float = dataclasses.field(metadata=_axes())
     independent_samples: float = dataclasses.field(metadata=_axes())
     second_minimum: float = dataclasses.field(metadata=_axes())
     strength: np.ndarray = dataclasses.field(metadata=_axes("smooth_priors"))
+    # End of the fit.
     converged: bool = dataclasses.field(metadata=_axes(kind="b"))
     status: str = dataclasses.field(metadata=_axes(kind="U"))
     steps: int = dataclasses.field(metadata=_axes(kind="i"))
@@ -118,6 +121,7 @@ class FitRecord:
         """
         if arrays.keys() != FitRecord.axes().keys():
             raise ValueError(f"it has {', '.join(arrays)}; admissible are {', '.join(FitRecord.axes())}")
+        # Scalars were stored as arrays without axes.
         quantities: dict[str, Any] = {name: a if a.ndim else a.item() for name, a in arrays.items()}
         return FitRecord(**quantities)
 
@@ -126,6 +130,7 @@ class FitRecord:
 
         **Raises:** ValueError for quantities of another kind or shape, and for numbers that no fit gives.
         """
+        # A file with intact checksums may still hold entries that another program wrote.
         for field in dataclasses.fields(self):
             array, kind = np.asarray(getattr(self, field.name)), field.metadata["kind"]
             shape = tuple(getattr(sizes, axis) for axis in field.metadata["axes"])

@@ -155,6 +155,7 @@ def cramer_rao(
     bound_unknowns = bind_unknowns(unknowns, scene)
     priors = fixed_priors(bound_unknowns)
     sample_times = None if time is None else as_sample_times(time, lidar)
+    # Derivatives are needed at the scene only: without sample times, its own plan serves.
     if plan is not None:
         check_reach(plan, lidar, scene)
     elif sample_times is not None:
@@ -168,6 +169,7 @@ def cramer_rao(
     if not np.all(sigma > 0):
         raise ValueError(f"noise = {np.min(sigma):g} is outside the admissible range (0, inf]")
     start = flat_start(bound_unknowns)
+    # All batches: the Jacobian's noise enters the bound.
     evaluation = Model(lidar, scene, plan, bound_unknowns, key)(start)
     jacobian = (evaluation.jacobian / sigma[..., None]).reshape(-1, start.size)
     prior_jacobian = priors(start)[1]
@@ -229,10 +231,12 @@ class Profile(eqx.Module):
         **Raises:** ValueError for a `level` outside (0, 1).
         """
         check_range("level", level, 0.0, 1.0, low_open=True, high_open=True)
+        # Chi-squared of one degree of freedom is the square of a normal number.
         limit = float(jax.scipy.special.ndtri(0.5 * (1.0 + level)))
         root, best = np.sqrt(self.chi2), int(np.argmin(self.chi2))
 
         def end(points: range) -> float:
+            # Outwards from the minimum to the first crossing: a second minimum further out does not count.
             for inner, outer in itertools.pairwise(points):
                 if root[outer] > limit:
                     fraction = (limit - root[inner]) / (root[outer] - root[inner])
@@ -319,6 +323,7 @@ def profile_likelihood(
         # Both directions start from the fit in the middle; None for the first one of all.
         neighbour = fits.get(middle)
         for i in outwards:
+            # First of all values: the `apply` of other unknowns may depend on it.
             value = jnp.asarray(points[i], fixed.start.dtype).reshape(fixed.start.shape)
             scene_at_point = set_values(scene, (fixed.setter,), (value,))
             # Bound again: they may depend on the scene.
@@ -331,6 +336,7 @@ def profile_likelihood(
             fits[i] = neighbour
             if progress is not None:
                 progress(i)
+    # From the order in which fits ran to that of the values.
     ordered = [fits[i] for i in range(points.size)]
     chi2 = np.array([_chi2(f, problem.unknowns, priors, name, p) for f, p in zip(ordered, points)])
     return Profile(
@@ -357,6 +363,7 @@ def _fixed_unknown(name: str, unknowns: Sequence[BoundUnknown]) -> BoundUnknown:
 
 def _started_from(unknown: Unknown, bound: BoundUnknown, fit: Retrieval) -> Unknown:
     """Return the unknown with the estimate of a fit as its start."""
+    # Results in single precision may be rounded to beyond a bound.
     value = np.clip(np.asarray(fit.values[bound.name], float), bound.low, bound.high)
     start = jnp.asarray(value, bound.start.dtype)
     return eqx.tree_at(lambda u: u.start, unknown, start, is_leaf=lambda x: x is None)
@@ -366,6 +373,7 @@ def _chi2(
     fit: Retrieval, unknowns: Sequence[BoundUnknown], priors: PriorResiduals, name: str, value: float
 ) -> float:
     """Return chi-squared of a fit with the unknown `name` fixed at `value`, the priors of all included."""
+    # Residuals are those of the data. The prior of the fixed unknown counts as well.
     flat = np.concatenate(
         [[value] if u.name == name else np.ravel(np.asarray(fit.values[u.name], float)) for u in unknowns]
     )

@@ -253,6 +253,7 @@ def _trace_batch(
 ) -> tuple[Response, Float[Array, "wavelengths bins"], Float[Array, "columns wavelengths bins"]]:
     """Trace one batch. Return its response, total, and derivatives: geometric ones, then by extinction."""
     flat, setup_at = model.as_function_of("geometric", values)
+    # Optical columns are left out: they are computed later from the mean response of all batches.
 
     def simulate(flat: Array) -> tuple[Array, tuple[Response, Array | None]]:
         setup = setup_at(flat)
@@ -410,6 +411,8 @@ class Model:
         self.shapes = [u.start.shape for u in unknowns]
         self.dtypes = [u.start.dtype for u in unknowns]
         self.sizes = [u.start.size for u in unknowns]
+        # Pilot batches are the first ones: a full evaluation at the same values reuses them. Without random
+        # numbers one batch is exact.
         self.keys = [jax.random.fold_in(key, n) for n in range(MIN_BATCHES if plan.is_random else 1)]
         self.n_pilot = min(PILOT_BATCHES, len(self.keys))
         self.retraces = any(setter.changes_response for setter in methods.setters)
@@ -444,9 +447,11 @@ class Model:
         is_new_trace = self.retraces or self._cache is None
         traced = self._trace(flat, self.n_pilot if pilot and self.retraces else len(self.keys))
         responses = [t[0] for t in traced]
+        # The waveform is linear in the response: optics are applied once, to the mean.
         response, batches = _mean_response(responses), None
         total, optical_columns = _apply_optics(self.forward, values, response)
         columns = np.asarray(optical_columns, float)
+        # The batches of a new trace have been evaluated at these values already.
         if is_new_trace:
             batches = np.stack([np.asarray(t[1], float) for t in traced])
             traced_columns = np.mean([np.asarray(t[2], float) for t in traced], axis=0)

@@ -123,6 +123,7 @@ def plan_for_bounds(
             plans.append(make_plan(lidar, corner, **common))
         except ValueError as error:
             raise ValueError(f"at the bounds of the unknowns the scene is inadmissible: {error}") from error
+    # All plans share the bin width, so that the union of their bins is a whole number of bins.
     start = min(p.bins.start for p in plans)
     end = max(p.bins.start + p.bins.width * p.bins.count for p in plans)
     bins = dataclasses.replace(
@@ -134,6 +135,7 @@ def plan_for_bounds(
     start_distance = max(p.limits.start_distance for p in plans)
     max_path = max(p.limits.max_path for p in plans)
     path_lengths = [PathLengths(lidar, s) for s in scenes]
+    # Rays start above the scene: the distance down to it is part of the path.
     longest = max_path + start_distance
     plan = first.with_limits(
         start_distance=start_distance,
@@ -141,6 +143,7 @@ def plan_for_bounds(
         max_flight=max(p.longest_flight(longest) for p in path_lengths),
     ).with_config(
         max_ray_segments=max(p.config.max_ray_segments for p in plans),
+        # A bucket of sizes, so that fits of similar scenes share a compiled program.
         max_faces=size_bucket(max(p.march_steps(longest) for p in path_lengths)),
         covers_fully=tuple(all(c) for c in zip(*(p.config.covers_fully for p in plans))),
     )
@@ -167,6 +170,7 @@ def checked_plan(
         check_samples(plan, time)
         return plan
     check_samples(plan, time)
+    # The first scene is the start itself.
     for number, corner in enumerate(corner_scenes(scene, unknowns)):
         try:
             check_reach(plan, lidar, corner)
@@ -181,6 +185,7 @@ def checked_plan(
 def check_samples(plan: Plan, time: Float[np.ndarray, " bins"]) -> None:
     """Check that the samples of a plan are at `time`. **Raises:** ValueError if they are not."""
     check_kind("plan", plan, Plan, "a Plan")
+    # As for sample times: rounding of single precision is allowed.
     tolerance = 1e-3 * plan.sample_interval + 4e-7 * float(np.max(np.abs(time)))
     expected = plan.sample_start + plan.sample_interval * np.arange(plan.n_samples)
     if time.size != plan.n_samples or np.max(np.abs(expected - time)) > tolerance:

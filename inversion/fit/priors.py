@@ -110,6 +110,7 @@ class Smooth(eqx.Module):
 
         **Returns:** (layers, layers).
         """
+        # In correlation lengths.
         position = np.arange(layers) * float(self.spacing) / float(self.scale)
         distance = np.sqrt(3.0) * np.abs(np.subtract.outer(position, position))
         return (1.0 + distance) * np.exp(-distance)

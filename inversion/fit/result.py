@@ -69,6 +69,7 @@ class Retrieval(AbstractPosterior):
     (True, ('ground.height',), '0.500 m')
     """
 
+    # By name, in the shape of the unknown.
     values: dict[str, Float[Array, "..."]]
     stderr: dict[str, Float[Array, "..."]]
     robust_stderr: dict[str, Float[Array, "..."]]
@@ -227,6 +228,7 @@ def retrieval_of(
     quantities = _named_quantities(fit.record.to_arrays(), unknowns)
     # The waveform takes its place.
     del quantities["fitted"]
+    # Static fields of the result: plain Python values.
     end_of_fit = {name: quantities.pop(name) for name in ("converged", "status", "steps")}
     quantities |= {
         "simulation_error": split_by_name(fit.details.simulation_error, unknowns),
@@ -234,6 +236,7 @@ def retrieval_of(
         "residuals": fit.details.residuals,
         "bounds": bounds_by_name(unknowns),
     }
+    # JAX's precision, as for the scene and the waveform.
     return Retrieval(
         **jax.tree.map(jnp.asarray, quantities),
         **end_of_fit,
@@ -266,9 +269,11 @@ def _named_quantities(quantities: Mapping[str, Any], unknowns: Sequence[BoundUnk
     named = {}
     for name, axes in FitRecord.axes().items():
         quantity = quantities[name]
+        # Matrices stay over all unknowns, in the order of the labels.
         if axes == ("unknowns",):
             named[name] = split_by_name(quantity, unknowns)
         elif axes == ("smooth_priors",):
+            # One strength for each name; the last axis is theirs, a leading one that of the footprints.
             named[name] = dict(zip(smooth_names(unknowns), np.moveaxis(quantity, -1, 0)))
         else:
             named[name] = quantity

@@ -150,6 +150,7 @@ def retrieve(
     check_key(key)
     check_progress(progress)
     sizes = trace_sizes(n_photons, n_rays, max_orders, plan)
+    # Everything that is quickly checked comes before the plan.
     problem = checked_problem(
         observed,
         lidar,
@@ -193,6 +194,7 @@ def checked_problem(
     check_solver_for(bound_unknowns, settings)
     check_kind("recorder", recorder, Recorder | None, "a Recorder, or None")
     check_names(recorder, bound_unknowns)
+    # A list of none or one, as the recorder appends it to its own unknowns.
     scale_unknowns = [] if scale is None else [scale_unknown(scale, bound_unknowns)]
     return FitProblem(observation, lidar, scene, bound_unknowns, scale_unknowns, recorder, settings)
 
@@ -214,8 +216,10 @@ def solve_problem(
         return model(request.values, with_batches=request.with_batches, pilot=request.pilot)
 
     fit = run_fit(multistart(fits), simulate)
+    # Failure is a status of the result; it is raised only here, on request.
     if throw and not fit.record.converged:
         raise RuntimeError(fit.record.status)
+    # The recorder's unknowns come last, and are none of the scene's.
     scene_values = fit.record.values[: fit.record.values.size - recorder.count]
     waveform = model.waveform(scene_values, fit.details.evaluation, fit.details.waveform_stderr)
     all_unknowns = [*problem.unknowns, *recorder.unknowns]
@@ -231,6 +235,7 @@ def solver_settings(solver: Any, max_steps: float, starts: float) -> SolverSetti
 
 def check_solver_for(unknowns: Sequence[BoundUnknown], settings: SolverSettings) -> None:
     """Refuse other solvers for profiles, whose steps are solved within the bounds. **Raises:** ValueError."""
+    # The bounded Gauss-Newton method takes no settings of a solver.
     names = [unknown.name for unknown in unknowns if unknown.smooth is not None]
     if names and settings.solver != DEFAULT_SOLVER:
         raise ValueError(
@@ -254,6 +259,7 @@ def scale_unknown(bounds: Any, unknowns: Sequence[BoundUnknown]) -> BoundUnknown
     check_range("scale", [low, high], 0.0)
     if not low < high:
         raise ValueError(f"scale = {bounds!r} is not low < high")
+    # Results are keyed by name.
     if any(u.name == "scale" for u in unknowns):
         raise ValueError("name = 'scale' is taken by the scale; the unknown needs another one")
     # The first simulation gives it a better start (`RecorderModel.fit_linear`).

@@ -172,6 +172,8 @@ def retrieve_many(
     lanes = check_integer("lanes", lanes)
     settings = solver_settings(solver, max_steps, starts)
     sizes = trace_sizes(n_photons, n_rays, max_orders, plan)
+    # Lists of one for all footprints, or of one for each. One for all is never repeated, so that arrays are
+    # neither stacked nor sent to workers more often than needed.
     lidars = [with_fixed_window(a) for a in _one_or_each("lidar", lidar, Lidar, n_footprints)]
     scenes = _one_or_each("scene", scene, Scene, n_footprints)
     bound = [bind_unknowns(unknowns, s) for s in scenes]
@@ -187,6 +189,7 @@ def retrieve_many(
     )
     check_names(recorders[0], bound[0])
     of_recorder = [] if recorders[0] is None else recorder_unknowns(recorders[0])
+    # Names, shapes and bounds are those of all footprints.
     all_unknowns = [*bound[0], *of_recorder, *scale_unknowns]
     # Everything on which the results depend, by names that an error message shows.
     problem_parts = {
@@ -209,6 +212,7 @@ def retrieve_many(
         "max_steps": settings.max_steps,
         "starts": settings.starts,
     }
+    # One plan, and one compiled program, serve all.
     plan = checked_plan(plan, lidars[0], scenes[0], bound[0], sample_times, sizes)
     problem = ManyFits(
         numbers=range(n_footprints),
@@ -247,6 +251,7 @@ def retrieve_many(
 def _parts_of_unknowns(unknowns: list[list[BoundUnknown]]) -> dict[str, Any]:
     """Return what fits depend on of the unknowns: that of the first footprint, and the starts of all."""
     dependencies: dict[str, Any] = {"unknowns": [u.name for u in unknowns[0]]}
+    # Bounds, priors and setters are those of the first footprint; starts may differ.
     for u, *in_other_footprints in zip(*unknowns):
         dependencies[f"where or apply of {u.name!r}"] = u.setter
         dependencies[f"bounds of {u.name!r}"] = u.low, u.high
@@ -269,6 +274,7 @@ def _with_starts(
         shape = (n_footprints, *shapes[name])
         if starts[name].shape != shape:
             raise ValueError(f"start of {name!r} has the shape {starts[name].shape}; admissible is {shape}")
+    # Without starts of their own, footprints share their unknowns.
     if not starts:
         return unknowns
     return [
@@ -324,6 +330,7 @@ class FinishedFits:
 
     def add(self, number: int, record: FitRecord) -> None:
         """Add a fit, and store it. A first failure to store warns; all fits are in memory anyway."""
+        # In memory first: results are returned whatever happens to the file.
         self.records[number] = record
         if self._checkpoint is None:
             return
@@ -422,6 +429,7 @@ def run_fits(problem: ManyFits, key: PRNGKeyArray, indices: Sequence[int]) -> It
     # The photons of all footprints have the same key, as those of a single fit: results do not depend on the
     # chunk.
     simulate = LockstepModel(problem, key)
+    # The fits that run at present, with the request that each waits for.
     waiting, running = list(indices), dict[int, tuple[FitGenerator, EvaluationRequest]]()
     while waiting or running:
         while waiting and len(running) < problem.groups.n_fits:
@@ -431,6 +439,7 @@ def run_fits(problem: ManyFits, key: PRNGKeyArray, indices: Sequence[int]) -> It
         for i, evaluation in simulate({i: request for i, (_, request) in running.items()}).items():
             fit = running[i][0]
             try:
+                # The fit goes on to its next request, or ends.
                 running[i] = fit, fit.send(evaluation)
             except StopIteration as end:
                 del running[i]
@@ -443,6 +452,7 @@ def run_fits_by_workers(
     """Fit the footprints as `run_fits`, in chunks by the workers of an executor."""
     size = _GROUPS_PER_CHUNK * problem.groups.fits_per_thread
     chunks = [indices[i : i + size] for i in range(0, len(indices), size)]
+    # Arrays and names instead of records: a task's result is a tree of arrays.
     tasks = [task(n, _fit_chunk, (problem.subset(chunk),), key) for n, chunk in enumerate(chunks)]
     for completed, records in outcomes(tasks, executor):
         for i, arrays in zip(chunks[completed.number], records):
@@ -467,6 +477,7 @@ class LockstepModel:
         """Evaluate the requests of fits, by the index of their footprint."""
         # Sorted by work and dealt in turn: each thread gets as many pilot evaluations as the others.
         indices = sorted(requests, key=lambda i: self._n_batches(requests[i]))
+        # Near the end there may be fewer fits than threads.
         n_threads = min(self.groups.n_threads, len(indices))
         groups = [indices[i::n_threads] for i in range(n_threads)]
         evaluations: dict[int, Evaluation] = {}
@@ -490,7 +501,9 @@ class LockstepModel:
         forward = dataclasses.replace(
             model.forward, lidar=_stacked(self.lidars, members), scene=_stacked(self.scenes, members)
         )
+        # Static: another combination compiles another program.
         has_axis = HasFootprintAxis(len(self.lidars) > 1, len(self.scenes) > 1)
+        # Results of idle members are dropped.
         arrays = _evaluate_in_lockstep(forward, values, jnp.stack(model.keys), jnp.array(n_batches), has_axis)
         total, columns, batches = (np.asarray(a, float) for a in arrays)
         return {
@@ -509,6 +522,7 @@ def _stacked(objects: list[Any], members: list[int]) -> Any:
     """Return one object for all, or the members' objects with their arrays stacked."""
     if len(objects) == 1:
         return objects[0]
+    # Fields that are no arrays are equal (`_one_or_each`).
     dynamic, static = zip(*(eqx.partition(objects[i], eqx.is_array) for i in members))
     return eqx.combine(jax.tree.map(lambda *a: jnp.stack(a), *dynamic), static[0])
 
@@ -533,6 +547,7 @@ def _evaluate_in_lockstep(
         member = dataclasses.replace(forward, lidar=lidar, scene=scene)
         return evaluate_scene(member, values, keys, n_batches)
 
+    # At first order there are no photons, and all members take equally long.
     if forward.plan.orders == 1:
         axes = (0 if has_axis.lidar else None, 0 if has_axis.scene else None, 0, 0)
         return jax.vmap(evaluate, in_axes=axes)(lidar, scene, values, n_batches)

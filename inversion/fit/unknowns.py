@@ -206,6 +206,7 @@ def bind_unknowns(unknowns: Sequence[Unknown], scene: Scene) -> list[BoundUnknow
     for name in names:
         if names.count(name) > 1:
             raise ValueError(f"name = {name!r} is given to {names.count(name)} unknowns; each needs its own")
+    # Two values for one array: the second would overwrite the first.
     indices = [u.setter.leaf_index for u in bound if u.setter.leaf_index is not None]
     for u in bound:
         if u.setter.leaf_index is not None and indices.count(u.setter.leaf_index) > 1:
@@ -223,6 +224,7 @@ def _bind(
         leaf_index, path = _locate(u.where, scene, u.name)
         changed_arrays = frozenset([leaf_index])
         name = path if name is None else name
+        # Integers have no derivative.
         scene_value = jax.tree.leaves(scene)[leaf_index]
         if not eqx.is_inexact_array(scene_value):
             raise ValueError(
@@ -248,6 +250,7 @@ def _bind(
         mean_and_std = (u.prior.median, u.prior.spread) if isinstance(u.prior, LogNormal) else u.prior
         mean, std = (np.asarray(_broadcast(name, "prior", p, start.shape), float) for p in mean_and_std)
         prior = np.log(mean) if is_log_prior else mean, std
+    # The first kind that covers all changed arrays; a mixture is geometric.
     matches: list[Dependence] = [kind for kind, arrays in arrays_by_dependence if changed_arrays <= arrays]
     setter = Setter(leaf_index, u.apply, matches[0] if matches else "geometric")
     return with_start(BoundUnknown(name, setter, start, low, high, prior, is_log_prior, smooth), start)
@@ -259,6 +262,7 @@ def with_start(unknown: BoundUnknown, start: Array) -> BoundUnknown:
     **Raises:** ValueError for a start outside the bounds.
     """
     value, low, high = np.asarray(start, float), unknown.low, unknown.high
+    # Written so that NaN counts as outside.
     is_outside = ~((value >= low) & (value <= high))
     if np.any(is_outside):
         raise ValueError(
@@ -286,6 +290,7 @@ def _locate(where: str | Callable, scene: Scene, name: str | None) -> tuple[int,
     if isinstance(where, str):
         if where in paths:
             return paths.index(where), where
+        # A cutoff of 0: some suggestion is better than none.
         nearest = difflib.get_close_matches(where, paths, n=3, cutoff=0.0)
         raise ValueError(
             f"{label}: where = {where!r} is no array of this scene; the nearest are "
@@ -367,6 +372,7 @@ def set_values(scene: Scene, setters: tuple[Setter, ...], values: tuple[Array, .
             scene = setter.apply(scene, value)
         else:
             assert setter.leaf_index is not None
+            # Flattened for each value: an earlier `apply` may have replaced arrays.
             leaves, structure = jax.tree.flatten(scene)
             leaves[setter.leaf_index] = value
             scene = jax.tree.unflatten(structure, leaves)
