@@ -1,4 +1,4 @@
-"""Every test runs with rank promotion refused; shapes and types of the packages are checked at run time."""
+"""Set-up of all tests: rank promotion is refused; shapes and types of the packages are checked."""
 
 from pathlib import Path
 
@@ -9,7 +9,7 @@ from jaxtyping import install_import_hook
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
-# An int serves where a float is asked for, as PEP 484 says.
+# beartype refuses an int for a float unless told of the numeric tower of PEP 484.
 CHECKER = "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))"
 
 with install_import_hook(["jaxlidar", "inversion"], CHECKER):
@@ -23,8 +23,8 @@ MAPPINGS = 40_000
 
 
 @pytest.fixture(autouse=True)
-def room_to_compile():
-    """Forget compiled programs before there are too many for one process."""
+def limit_compiled_programs():
+    """Drop compiled programs before their memory mappings are too many for one process."""
     yield
     maps = Path("/proc/self/maps")
     if maps.exists() and maps.read_bytes().count(b"\n") > MAPPINGS:
@@ -34,7 +34,7 @@ def room_to_compile():
 
 @pytest.fixture
 def shared():
-    """The folder of records and reference results that lies beside the checkout, where there is one."""
+    """Folder of records and reference results beside the checkout; tests that need it are skipped without."""
     if not SHARED.is_dir():
         pytest.skip("the folder of reference data is not beside this checkout")
     return SHARED
@@ -42,6 +42,6 @@ def shared():
 
 @pytest.fixture(params=["float32", "float64"])
 def precision(request):
-    """Runs the test in single and in double precision; gives the name of the floating-point type."""
+    """Run the test in single and in double precision; the name of the floating-point type."""
     with jax.enable_x64(request.param == "float64"):
         yield request.param

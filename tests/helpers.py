@@ -1,4 +1,4 @@
-"""Shared by the tests: slabs, lidars that record a whole waveform as one sample, batches and z-tests."""
+"""Helpers of the tests: slabs, lidars that record a whole waveform as one sample, batches and z-tests."""
 
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -14,28 +14,33 @@ from jaxlidar.sampling.batch_programs import make_batch_tracer
 
 
 def slow_unless(chosen: Iterable, names: Iterable) -> list:
-    """Parameters of a test, tuples of several, of which those that are not chosen are left to `-m slow`."""
+    """Return parameters of a test, of which those that are not `chosen` run with `-m slow` only.
+
+    A tuple among `names` is the parameters of several arguments.
+    """
     chosen = list(chosen)
 
-    def one(x: Any) -> Any:
-        values = x if isinstance(x, tuple) else (x,)
-        return pytest.param(*values, marks=() if x in chosen else pytest.mark.slow)
+    def parameter(case: Any) -> Any:
+        values = case if isinstance(case, tuple) else (case,)
+        return pytest.param(*values, marks=() if case in chosen else pytest.mark.slow)
 
-    return [one(x) for x in names]
-
-
-# Double precision is left to `-m slow`.
-NARROW = pytest.mark.parametrize("precision", slow_unless(["float32"], ["float32", "float64"]), indirect=True)
-
-# One sample of 1000 ns centred on 400 ns takes in everything that arrives from -100 to 900 ns.
-WHOLE = {"window": (400.0, 401.0), "bin_width": 2.0}
+    return [parameter(case) for case in names]
 
 
-def whole_lidar(**changes: Any) -> jl.Lidar:
-    """A lidar 400 km up, of narrow beam, that records one sample of 1000 ns (see `WHOLE`).
+# Runs a test in single precision, and with `-m slow` in double precision as well.
+BY_PRECISION = pytest.mark.parametrize(
+    "precision", slow_unless(["float32"], ["float32", "float64"]), indirect=True
+)
 
-    The sum of a waveform then has a standard error of its own, where those of its samples would have to be
-    added with their correlations. From this height every way back to the sensor is vertical.
+# Settings of a plan: one sample of 1000 ns centred on 400 ns, which takes in all light from -100 to 900 ns.
+SINGLE_SAMPLE = {"window": (400.0, 401.0), "bin_width": 2.0}
+
+
+def single_sample_lidar(**changes: Any) -> jl.Lidar:
+    """Return a lidar 400 km up, of narrow beam, that records one sample of 1000 ns (see `SINGLE_SAMPLE`).
+
+    The sum of a waveform then has a standard error of its own; those of several samples would have to be
+    added with their correlations. From this height every return path to the sensor is vertical.
     """
     return jl.Lidar(**({"altitude": 4e5, "divergence": 1e-3, "sampling_interval": 1000.0} | changes))
 
@@ -49,7 +54,7 @@ def slab(
     shape: tuple[int, int, int] = (1, 1, 4),
     origin: tuple[float, float, float] = (-20.0, -20.0, 0.0),
 ) -> jl.VoxelMap:
-    """A homogeneous slab of vertical optical depths `leaf` and `bark` (None: not there) on z = 0."""
+    """Return a homogeneous slab of vertical optical depths `leaf` and `bark` (None: absent) on z = 0."""
     size = (width / shape[0], width / shape[1], thickness / shape[2])
 
     def fill(depth: float | None) -> np.ndarray | None:
@@ -59,28 +64,31 @@ def slab(
 
 
 def agrees(value: Any, stderr: Any, expected: Any, *, bound: Any = 0.0, sigmas: float = 3.0) -> bool:
-    """z-test: whether all of `value` lie within `sigmas` standard errors of `expected`.
+    """z-test: True if all of `value` lie within `sigmas` standard errors of `expected`.
 
-    `bound` is what the expected value may exceed the simulated one by: the orders that were neglected.
+    `bound` is the amount by which the expected value may exceed the simulated one: the neglected orders.
     """
-    off, margin = np.asarray(value, float) - np.asarray(expected, float), sigmas * np.asarray(stderr, float)
-    return bool(np.all(off <= margin) and np.all(off >= -margin - np.asarray(bound, float)))
+    difference, margin = (
+        np.asarray(value, float) - np.asarray(expected, float),
+        sigmas * np.asarray(stderr, float),
+    )
+    return bool(np.all(difference <= margin) and np.all(difference >= -margin - np.asarray(bound, float)))
 
 
-def applied(plan: jl.Plan) -> jl.Plan:
-    """The plan where optics are applied while light is traced."""
+def with_applied_optics(plan: jl.Plan) -> jl.Plan:
+    """Return the plan with optics applied while light is traced, in place of after it."""
     return plan.with_config(keeps_histories=False, degree=0)
 
 
 def one_batch(setup: jl.Setup, key: PRNGKeyArray) -> jl.Waveform:
-    """The waveform of a single batch, by the programs that `simulate` compiles."""
+    """Return the waveform of a single batch, by the programs that `simulate` compiles."""
     tracer = make_batch_tracer(setup, key)
     response = tracer.batch_function(key)(0)[0] if setup.plan.is_random else tracer.trace(key)
     return tracer.waveform(response, 1)
 
 
 def first_wave(lidar: jl.Lidar, scene: jl.Scene, plan: jl.Plan) -> jl.Waveform:
-    """One trace, for what is not random."""
+    """Return the waveform of a plan that has nothing random, by one trace."""
     assert not plan.is_random
     return one_batch(jl.make_setup(lidar, scene, plan), jax.random.key(0))
 
@@ -94,15 +102,15 @@ def batch_mean(
     count: int = 32,
     quantity: Callable[[jl.Waveform], Any],
 ) -> tuple[Any, Any]:
-    """Mean and standard error, over batches, of any quantity of a waveform (an array or a tree)."""
+    """Return mean and standard error, over batches, of a quantity of waveforms (an array or a tree)."""
     setup = jl.make_setup(lidar, scene, plan)
     with side_by_side() as run:
         waves = run(lambda key: one_batch(setup, key), jax.random.split(jax.random.key(seed), count))
-        found = [quantity(jax.tree.map(np.asarray, wave)) for wave in waves]
+        quantities = [quantity(jax.tree.map(np.asarray, wave)) for wave in waves]
 
-    def gather(*each: Array) -> np.ndarray:
-        return np.stack([np.asarray(e, float) for e in each])
+    def stack(*batches: Array) -> np.ndarray:
+        return np.stack([np.asarray(batch, float) for batch in batches])
 
-    table = jax.tree.map(gather, *found)
+    table = jax.tree.map(stack, *quantities)
     mean = jax.tree.map(lambda t: t.mean(axis=0), table)
     return mean, jax.tree.map(lambda t: t.std(axis=0, ddof=1) / np.sqrt(count), table)

@@ -1,4 +1,4 @@
-"""The estimator that the paper describes, against the closed form and against `simulate`."""
+"""The analog estimator of the paper, against the closed form and against `simulate`."""
 
 import jax
 import numpy as np
@@ -11,18 +11,18 @@ LIDAR = jl.Lidar(altitude=1000.0, divergence=1.0)
 CONE = 8.0
 
 
-def total(lidar, scene, photons, *, seed=0, cone=CONE, **planned):
-    """Mean and standard error of the apparent reflectance, by independent photons."""
+def total(lidar, scene, n_photons, *, seed=0, cone=CONE, **planned):
+    """Return mean and standard error of the apparent reflectance, by independent photons."""
     plan = jl.plan(lidar, scene, **planned)
-    returns = jl.analog_returns(lidar, scene, plan, key=jax.random.key(seed), n_photons=photons, cone=cone)
+    returns = jl.analog_returns(lidar, scene, plan, key=jax.random.key(seed), n_photons=n_photons, cone=cone)
     weight = np.asarray(returns.weight, float)
     assert np.all(np.isfinite(weight))
     assert np.all(np.isfinite(returns.time))
-    return weight.mean(axis=1), weight.std(axis=1, ddof=1) / np.sqrt(photons)
+    return weight.mean(axis=1), weight.std(axis=1, ddof=1) / np.sqrt(n_photons)
 
 
 @pytest.mark.parametrize("angles", slow_unless([], ["planophile", "erectophile"]))
-def test_leaves_of_given_angles_agree_with_simulate(angles):
+def test_leaf_angles_agree_with_simulate(angles):
     voxels = jl.VoxelMap.from_lad(
         np.full((1, 1, 4), 0.2), voxel_size=(50, 50, 2.5), origin=(-25, -25, 0), leaf_angles=angles
     )
@@ -41,12 +41,12 @@ def test_a_level_lambertian_ground_returns_its_reflectance():
     assert not agrees(value, stderr, 0.6)
 
 
-def test_returns_arrive_when_light_does():
+def test_returns_arrive_at_the_two_way_travel_time():
     scene = jl.Scene(ground=jl.Ground(height=-3.0, reflectance=0.5))
     plan = jl.plan(LIDAR, scene)
     returns = jl.analog_returns(LIDAR, scene, plan, key=jax.random.key(0), n_photons=2000)
-    there = np.asarray(returns.weight[0]) > 0
-    assert np.allclose(np.asarray(returns.time)[there], 2 * 3.0 / 0.299792458, atol=0.01)
+    returned = np.asarray(returns.weight[0]) > 0
+    assert np.allclose(np.asarray(returns.time)[returned], 2 * 3.0 / 0.299792458, atol=0.01)
 
 
 @pytest.mark.slow
@@ -58,7 +58,7 @@ def test_a_plate_over_ground_agrees_with_simulate():
     wave = jl.simulate(lidar, scene, key=jax.random.key(1), rtol=0.003, max_orders=8)
     expected = np.sum(wave.reflectance, axis=1)
     assert agrees(value, stderr, expected)
-    # The plate alone.
+    # The same test rejects the plate without the ground.
     assert not agrees(value, stderr, [0.36, 0.66])
 
 
@@ -70,7 +70,7 @@ def test_a_slab_agrees_with_simulate(transmission):
     value, stderr = total(LIDAR, scene, 150_000, max_orders=8)
     wave = jl.simulate(LIDAR, scene, key=jax.random.key(1), rtol=0.01, max_orders=8)
     expected = float(np.sum(wave.reflectance))
-    # The hot-spot-free way back varies over the cone by a per cent at most.
+    # `simulate` takes the return path along the beam; over the cone, its transmittance varies by 1 % at most.
     assert agrees(value, stderr + 0.003 * expected, expected)
     assert not agrees(value, stderr + 0.003 * expected, float(np.sum(wave.components["first"])))
 

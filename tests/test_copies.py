@@ -15,12 +15,12 @@ import pytest
 import inversion
 import jaxlidar as jl
 
-PLACES = (jl, jl.io, inversion)
+NAMESPACES = (jl, jl.io, inversion)
 CLASSES = {
-    f"{place.__name__}.{name}": thing
-    for place in PLACES
-    for name in place.__all__
-    if inspect.isclass(thing := vars(place).get(name)) and not inspect.isabstract(thing)
+    f"{namespace.__name__}.{name}": value
+    for namespace in NAMESPACES
+    for name in namespace.__all__
+    if inspect.isclass(value := vars(namespace).get(name)) and not inspect.isabstract(value)
 }
 LIDAR, SCENE = jl.Lidar(), jl.Scene(ground=jl.Ground(reflectance=jl.spectrum("soil-medium")))
 VOXELS = jl.VoxelMap.from_lad(np.ones((1, 1, 2)), voxel_size=1.0, leaf_angles="planophile")
@@ -30,8 +30,8 @@ def grown(length):
     return ["A"]
 
 
-# Those that take what is not an array; others are made of nothing but arrays.
-MADE = {
+# Instances of classes that hold more than arrays; the other classes are filled by `filled_with_arrays`.
+INSTANCES = {
     "jaxlidar.Atmosphere": jl.Atmosphere(),
     "jaxlidar.Branching": jl.Branching(),
     "jaxlidar.Canopy": jl.Canopy(VOXELS, leaf=jl.Prospect(), bark=0.3),
@@ -79,18 +79,18 @@ MADE = {
 }
 
 
-def bare(kind):
-    """A record of arrays, without its checks: pickling looks at nothing else."""
+def filled_with_arrays(kind):
+    """Return an instance whose fields are arrays, without its checks: pickling needs no valid values."""
     if issubclass(kind, tuple):
         return kind._make(np.full(2, i + 0.5) for i in range(len(kind._fields)))
-    thing = object.__new__(kind)
+    record = object.__new__(kind)
     for i, field in enumerate(dataclasses.fields(kind)):
-        object.__setattr__(thing, field.name, jax.numpy.full(2, i + 0.5))
-    return thing
+        object.__setattr__(record, field.name, jax.numpy.full(2, i + 0.5))
+    return record
 
 
 def content(x):
-    """All that an object is made of, to compare."""
+    """Return nested plain values that are equal if and only if two objects have equal content."""
     if isinstance(x, jax.Array) and jax.numpy.issubdtype(x.dtype, jax.dtypes.prng_key):
         return "key", np.asarray(jax.random.key_data(x)).tobytes()
     if isinstance(x, jax.Array | np.ndarray):
@@ -108,14 +108,14 @@ def content(x):
 
 @pytest.mark.parametrize("name", CLASSES)
 def test_it_can_be_pickled_and_copied(name):
-    thing = MADE.get(name)
-    sent = bare(CLASSES[name]) if thing is None else thing
+    instance = INSTANCES.get(name)
+    sent = filled_with_arrays(CLASSES[name]) if instance is None else instance
     assert type(sent) is CLASSES[name]
     for back in (pickle.loads(pickle.dumps(sent)), copy.copy(sent), copy.deepcopy(sent)):
         assert content(back) == content(sent)
 
 
-def test_another_content_is_noticed():
+def test_different_content_is_noticed():
     assert content(jl.Plate(1.0, 0.3)) != content(jl.Plate(1.0, 0.3000001))
     assert content(jl.io.Case(LIDAR)) != content(jl.io.Case(jl.Lidar(zenith=1.0)))
 
@@ -124,18 +124,18 @@ def test_another_content_is_noticed():
 def fit():
     wave = jl.simulate(LIDAR, jl.Scene(ground=jl.Ground()), key=jax.random.key(0))
     values = {"<height>": jax.numpy.asarray(0.5)}
-    matrix, more = jax.numpy.ones((1, 1)), {"steps": 3, "history": (1.0,), "labels": ("<height>",)}
+    matrix, details = jax.numpy.ones((1, 1)), {"steps": 3, "history": (1.0,), "labels": ("<height>",)}
     return inversion.Retrieval(
         values, values, values, values, {"<height>": values["<height>"] > 1.0}, values, matrix, matrix, SCENE,
         wave, 0.5 + 0 * wave.reflectance, matrix[0, 0], matrix[0, 0], matrix[0, 0], matrix, {},
         {"<height>": jax.numpy.array([0.0, 1.0])},
-        converged=True, status="done", **more,
+        converged=True, status="done", **details,
     )  # fmt: skip
 
 
 def pictures(page):
-    found = re.findall(r'<img [^>]*src="data:image/png;base64,([^"]+)"', page)
-    return [base64.b64decode(data) for data in found]
+    encoded = re.findall(r'<img [^>]*src="data:image/png;base64,([^"]+)"', page)
+    return [base64.b64decode(data) for data in encoded]
 
 
 def test_notebooks_show_a_waveform_with_its_figure(fit):
@@ -154,23 +154,28 @@ def test_notebooks_show_a_fit_with_its_residuals(fit):
     assert "reduced chi2" in str(fit)
 
 
-def test_what_is_traced_shows_no_figure(fit):
-    found = []
+def test_a_traced_waveform_shows_no_figure(fit):
+    pages = []
     dynamic, static = eqx.partition(fit.waveform, eqx.is_array)
-    jax.make_jaxpr(lambda d: found.append(eqx.combine(d, static)._repr_html_()))(dynamic)
-    assert found == [None]
+    jax.make_jaxpr(lambda d: pages.append(eqx.combine(d, static)._repr_html_()))(dynamic)
+    assert pages == [None]
 
 
-@pytest.mark.parametrize("copied", [lambda x: pickle.loads(pickle.dumps(x)), copy.copy, copy.deepcopy])
-@pytest.mark.parametrize("make", [jax.random.key, jax.random.PRNGKey, lambda n: None])
+COPIES = [lambda x: pickle.loads(pickle.dumps(x)), copy.copy, copy.deepcopy]
+
+
+@pytest.mark.parametrize("copied", COPIES)
+@pytest.mark.parametrize("make", [jax.random.key, jax.random.PRNGKey])
 def test_keys_of_copied_cases_draw_the_same(copied, make):
-    """Poisson numbers too, for which generators are told apart by identity; here and with other keys."""
+    """JAX compares generators by identity where it draws Poisson numbers: a copy must keep the generator."""
     key = make(3)
     back = copied(jl.io.Case(key=key)).key
-    if key is None:
-        assert back is None
-        return
-    for again, other in ((back, key), (jax.random.split(back)[1], jax.random.split(key)[1])):
+    for copied_key, original_key in ((back, key), (jax.random.split(back)[1], jax.random.split(key)[1])):
         np.testing.assert_array_equal(
-            jax.random.poisson(again, 2.0, (9,)), jax.random.poisson(other, 2.0, (9,))
+            jax.random.poisson(copied_key, 2.0, (9,)), jax.random.poisson(original_key, 2.0, (9,))
         )
+
+
+@pytest.mark.parametrize("copied", COPIES)
+def test_copied_cases_without_a_key_have_none(copied):
+    assert copied(jl.io.Case(key=None)).key is None

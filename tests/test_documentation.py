@@ -1,4 +1,4 @@
-"""Public names are documented: what they return and raise, their real defaults, and an example that runs.
+"""Public names are documented: results, errors, actual defaults, and an example that runs.
 
 The examples themselves are doctests, which pytest collects from the packages.
 """
@@ -21,30 +21,34 @@ import jaxlidar.extend
 import jaxlidar.io
 import jaxlidar.plot
 
-PLACES = (jaxlidar, jaxlidar.io, jaxlidar.plot, inversion)
-PUBLIC = {f"{place.__name__}.{name}": getattr(place, name) for place in PLACES for name in place.__all__}
-CALLABLE = {name: thing for name, thing in PUBLIC.items() if callable(thing)}
-FUNCTIONS = {name: thing for name, thing in CALLABLE.items() if not inspect.isclass(thing)}
+NAMESPACES = (jaxlidar, jaxlidar.io, jaxlidar.plot, inversion)
+PUBLIC = {
+    f"{module.__name__}.{name}": getattr(module, name) for module in NAMESPACES for name in module.__all__
+}
+CALLABLE = {name: value for name, value in PUBLIC.items() if callable(value)}
+FUNCTIONS = {name: value for name, value in CALLABLE.items() if not inspect.isclass(value)}
 
 
-def doc_of(thing):
-    return inspect.cleandoc(thing.__doc__ or "")
+def docstring_of(value):
+    return inspect.cleandoc(value.__doc__ or "")
 
 
-def own_source(thing):
-    """Of a function, or of what runs when a class is made."""
-    thing = inspect.unwrap(getattr(thing, "__wrapped__", thing))
-    if not inspect.isclass(thing):
-        return inspect.getsource(thing)
-    made = [vars(thing)[n] for n in ("__init__", "__check_init__", "__post_init__") if n in vars(thing)]
-    own = (m for m in made if inspect.isfunction(inspect.unwrap(m)))
-    return "".join(inspect.getsource(m) for m in own if "equinox" not in (m.__module__ or ""))
+def executed_source(value):
+    """Source of a function; of a class, that of the methods of its own that run at construction."""
+    value = inspect.unwrap(getattr(value, "__wrapped__", value))
+    if not inspect.isclass(value):
+        return inspect.getsource(value)
+    initialisers = [
+        vars(value)[n] for n in ("__init__", "__check_init__", "__post_init__") if n in vars(value)
+    ]
+    functions = (m for m in initialisers if inspect.isfunction(inspect.unwrap(m)))
+    return "".join(inspect.getsource(m) for m in functions if "equinox" not in (m.__module__ or ""))
 
 
-def raises(thing):
-    """Whether its own lines raise or check."""
+def checks_or_raises(value):
+    """True if the source of a function or class itself has a `raise` or calls a `check_...` function."""
     try:
-        tree = ast.parse(textwrap.dedent(own_source(thing)) or "pass")
+        tree = ast.parse(textwrap.dedent(executed_source(value)) or "pass")
     except (OSError, TypeError, IndentationError, SyntaxError):
         return False
     for node in ast.walk(tree):
@@ -60,19 +64,19 @@ def raises(thing):
 
 
 @pytest.mark.parametrize("name", CALLABLE)
-def test_it_is_explained(name):
-    text = doc_of(CALLABLE[name])
+def test_docstrings_explain_and_have_an_example(name):
+    text = docstring_of(CALLABLE[name])
     first = text.split("\n\n")[0]
     assert first.rstrip().endswith((".", ":")), "begins with a sentence"
     assert ">>>" in text, "has an example"
     assert "**Example:**" in text
-    if raises(CALLABLE[name]):
+    if checks_or_raises(CALLABLE[name]):
         assert "**Raises:**" in text, "says what it raises"
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_a_function_says_what_it_returns(name):
-    text = doc_of(FUNCTIONS[name])
+    text = docstring_of(FUNCTIONS[name])
     assert "**Returns:**" in text
     arguments = inspect.signature(FUNCTIONS[name]).parameters
     for argument in arguments:
@@ -125,57 +129,74 @@ STATED = re.compile(r"[Dd]efaults? (?:is |are )?(`[^`]+`|\"[^\"]*\"|\([^)]*\)|[-
 
 
 def stated_defaults(text):
-    """Arguments and what is said of their defaults."""
-    for names, said in BULLET.findall(text):
-        found = STATED.search(said)
-        if found:
+    """Yield arguments and the text of the defaults that the docstring states."""
+    for names, description in BULLET.findall(text):
+        default = STATED.search(description)
+        if default:
             for name in re.findall(r"`(\w+)`", names):
-                yield name, found.group(1).strip("`")
+                yield name, default.group(1).strip("`")
 
 
-def real_default(thing, name):
-    parameter = inspect.signature(thing).parameters.get(name)
+def actual_default(value, name):
+    parameter = inspect.signature(value).parameters.get(name)
     if parameter is None or parameter.default is inspect.Parameter.empty:
         return inspect.Parameter.empty
     default = parameter.default
-    if (inspect.isclass(thing) and issubclass(thing, eqx.Module)) or hasattr(thing, "__dataclass_fields__"):
-        field = thing.__dataclass_fields__.get(name)
+    if (inspect.isclass(value) and issubclass(value, eqx.Module)) or hasattr(value, "__dataclass_fields__"):
+        field = value.__dataclass_fields__.get(name)
         factory = getattr(field, "default_factory", None)
         if callable(factory):
             return factory()
     return default
 
 
-def same(said, real):
-    """Whether a default is the one stated, where what is stated is a value."""
+def equals_stated(stated, actual):
+    """True if a default has the value that the docstring states; None if the text is no value."""
     scope = {"inf": np.inf, "infinity": np.inf, **{n: getattr(jaxlidar, n) for n in jaxlidar.__all__}}
     words = {"zero": 0, "one": 1, "two": 2, "three": 3, "four": 4, "eight": 8, "none": None, "north": None}
-    text = said.replace(",", "") if re.fullmatch(r"[\d,]+", said) else said
+    text = stated.replace(",", "") if re.fullmatch(r"[\d,]+", stated) else stated
     try:
-        value = words[text] if text in words else eval(text, scope)
+        stated_value = words[text] if text in words else eval(text, scope)
     except (NameError, SyntaxError, TypeError):
         return None
-    if isinstance(value, eqx.Module) or isinstance(real, eqx.Module):
-        return jax.tree.structure(value) == jax.tree.structure(real) and bool(eqx.tree_equal(value, real))
-    if value is None or real is None or isinstance(value, str | bool) or isinstance(real, str | bool):
-        return value == real
+    if isinstance(stated_value, eqx.Module) or isinstance(actual, eqx.Module):
+        return jax.tree.structure(stated_value) == jax.tree.structure(actual) and bool(
+            eqx.tree_equal(stated_value, actual)
+        )
+    if (
+        stated_value is None
+        or actual is None
+        or isinstance(stated_value, str | bool)
+        or isinstance(actual, str | bool)
+    ):
+        return stated_value == actual
     try:
-        return bool(np.all(np.asarray(value, float) == np.asarray(real, float)))
+        return bool(np.all(np.asarray(stated_value, float) == np.asarray(actual, float)))
     except (TypeError, ValueError):
         return None
 
 
 @pytest.mark.parametrize("name", CALLABLE)
-def test_stated_defaults_are_the_real_ones(name):
-    thing = CALLABLE[name]
-    for argument, said in stated_defaults(doc_of(thing)):
-        try:
-            real = real_default(thing, argument)
-        except (TypeError, ValueError):
-            return
-        if real is inspect.Parameter.empty:
+def test_stated_defaults_are_the_actual_ones(name):
+    value = CALLABLE[name]
+    for argument, stated in stated_defaults(docstring_of(value)):
+        actual = actual_default(value, argument)
+        if actual is inspect.Parameter.empty:
             continue
-        assert same(said, real) is not False, f"{argument}: default {said} is stated, {real!r} is real"
+        assert equals_stated(stated, actual) is not False, (
+            f"{argument}: {stated} is stated, the default is {actual!r}"
+        )
+
+
+def test_most_stated_defaults_can_be_compared():
+    """The test above passes over texts that are no values: there are few of them."""
+    comparisons = [
+        equals_stated(stated, actual_default(value, argument))
+        for value in CALLABLE.values()
+        for argument, stated in stated_defaults(docstring_of(value))
+    ]
+    assert len(comparisons) > 300
+    assert comparisons.count(None) < 0.05 * len(comparisons)
 
 
 def test_a_wrong_default_is_noticed():
@@ -187,5 +208,7 @@ def test_a_wrong_default_is_noticed():
         - `c`: a thing. Default None.
         """
 
-    found = {n: same(s, real_default(wrong, n)) for n, s in stated_defaults(doc_of(wrong))}
-    assert found == {"a": False, "b": True, "c": True}
+    agreement = {
+        n: equals_stated(s, actual_default(wrong, n)) for n, s in stated_defaults(docstring_of(wrong))
+    }
+    assert agreement == {"a": False, "b": True, "c": True}

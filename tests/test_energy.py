@@ -1,7 +1,7 @@
 """Energy budgets against closed forms and discrete ordinates; `test_validation.py` has forests.
 
 A plate (R, T) over ground of reflectance r returns R + T^2 r / (1 - R r). Slabs are lit by parallel light
-over one period of a canopy without sides. Shares are compared within four standard errors.
+over one period of a canopy without sides. Fractions are compared within four standard errors.
 """
 
 import csv
@@ -39,15 +39,15 @@ def test_a_plate_over_ground(transmission):
         "ground": (1 - r) * arrived,
         "plate": (1 - R - T) * (1 + r * arrived),
     }
-    found = {"returned": budget.returned, "transmitted": budget.transmitted, **budget.absorbed}
+    estimates = {"returned": budget.returned, "transmitted": budget.transmitted, **budget.absorbed}
     for name, value in exact.items():
-        assert close(found[name], value, budget.stderr[name]), name
-    # The same test rejects a plate that is met once only.
+        assert close(estimates[name], value, budget.stderr[name]), name
+    # The same test rejects light that meets the plate once only.
     assert not close(budget.transmitted, T, budget.stderr["transmitted"])
     np.testing.assert_allclose(total(budget), 1.0, atol=0.01)
 
 
-def test_two_plates_share_what_they_absorb():
+def test_absorption_is_split_between_two_plates():
     """Black sheets that transmit: the upper one absorbs 1 - T1 of all, the lower 1 - T2 of the rest."""
     plates = (jl.Plate(1.0, 0.0, 0.5), jl.Plate(3.0, 0.0, 0.2))
     budget = jl.energy_budget(jl.Lidar(), jl.Scene(plates=plates), key=KEY, rtol=0.005)
@@ -68,26 +68,26 @@ def test_albedo_one_returns_everything():
 @pytest.mark.parametrize("row", slow_unless([1], range(5)))
 def test_slabs_against_discrete_ordinates(shared, row):
     with (shared / "reference" / "slabs_isotropic.csv").open() as file:
-        given = {name: float(value) for name, value in list(csv.DictReader(file))[row].items()}
-    leaf = jl.Isotropic(albedo=given["omega"])
+        row_values = {name: float(value) for name, value in list(csv.DictReader(file))[row].items()}
+    leaf = jl.Isotropic(albedo=row_values["omega"])
     scene = jl.Scene(
-        canopy=jl.Canopy(slab(given["tau"]), leaf=leaf, sides="periodic"),
-        ground=jl.Ground(reflectance=given["rho_ground"]),
+        canopy=jl.Canopy(slab(row_values["tau"]), leaf=leaf, sides="periodic"),
+        ground=jl.Ground(reflectance=row_values["rho_ground"]),
     )
     budget = jl.energy_budget(jl.Lidar(), scene, key=KEY, rtol=0.001, illumination="parallel")
     exact = {
-        "returned": given["plane_albedo"],
-        "transmitted": given["Fdown_ground"],
-        "leaf": given["absorbed_medium"],
-        "ground": given["absorbed_ground"],
+        "returned": row_values["plane_albedo"],
+        "transmitted": row_values["Fdown_ground"],
+        "leaf": row_values["absorbed_medium"],
+        "ground": row_values["absorbed_ground"],
     }
-    found = {"returned": budget.returned, "transmitted": budget.transmitted, **budget.absorbed}
+    estimates = {"returned": budget.returned, "transmitted": budget.transmitted, **budget.absorbed}
     for name, value in exact.items():
-        assert close(found[name], value, budget.stderr[name]), name
+        assert close(estimates[name], value, budget.stderr[name]), name
 
 
 @pytest.mark.slow
-def test_a_beam_and_its_ledger_agree():
+def test_a_budget_agrees_with_that_of_a_waveform():
     voxels = jl.VoxelMap.from_lad(np.full((6, 6, 8), 0.6), voxel_size=0.5, origin=(-1.5, -1.5, 2.0))
     canopy = jl.Canopy(voxels, leaf=jl.LeafOptics(reflectance=0.2, transmittance=0.1))
     scene = jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=0.2))
@@ -96,8 +96,8 @@ def test_a_beam_and_its_ledger_agree():
         jl.Lidar(divergence=1.0), scene, key=KEY, n_photons=65536, max_orders=6, window=(-60.0, 400.0)
     )
     for material in ("leaf", "ground"):
-        off = float(wave.energy_budget[f"absorbed by {material}"][0] - budget.absorbed[material][0])
-        assert abs(off) < 5 * float(budget.stderr[material][0]) + 2e-3
+        difference = float(wave.energy_budget[f"absorbed by {material}"][0] - budget.absorbed[material][0])
+        assert abs(difference) < 5 * float(budget.stderr[material][0]) + 2e-3
 
 
 BAD = [
@@ -108,22 +108,22 @@ BAD = [
 ]
 
 
-@pytest.mark.parametrize(("given", "message"), BAD)
-def test_bad_input(given, message):
+@pytest.mark.parametrize(("arguments", "message"), BAD)
+def test_bad_input(arguments, message):
     with pytest.raises(ValueError, match=message):
-        jl.energy_budget(jl.Lidar(), jl.Scene(plates=(PLATE,)), key=KEY, **given)
+        jl.energy_budget(jl.Lidar(), jl.Scene(plates=(PLATE,)), key=KEY, **arguments)
 
 
-def test_an_interrupt_keeps_what_is_done():
+def test_an_interrupt_keeps_finished_batches():
     scene = jl.Scene(ground=jl.Ground(reflectance=0.4), plates=(PLATE,))
-    seen = []
+    messages = []
 
     def interrupt(progress):
-        seen.append(str(progress))
+        messages.append(str(progress))
         raise KeyboardInterrupt
 
     budget = jl.energy_budget(LIDAR, scene, key=KEY, rtol=1e-5, progress=interrupt)
     assert budget.info["stopped"] == "interrupted"
     assert budget.info["batches"] == 8
-    assert seen[0].endswith("(aim 1e-05)")
+    assert messages[0].endswith("(aim 1e-05)")
     np.testing.assert_allclose(total(budget), 1.0, atol=0.01)

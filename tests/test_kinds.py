@@ -1,6 +1,7 @@
-"""What a user sees of things of another kind or shape: one sentence, before anything compiles; and `help`.
+"""Arguments of a wrong kind or shape give one sentence before anything compiles; and the text of `help`.
 
-In tests the types of arguments are checked before: what a user sees is seen in a process of its own.
+Tests check the types of arguments before the library does (see conftest), so that the messages are read in a
+process of its own.
 """
 
 import dataclasses
@@ -16,12 +17,11 @@ import pytest
 
 import inversion
 import jaxlidar as jl
-from jaxlidar._checks import check_integer, check_key
-from jaxlidar.scenes.scene import check_kinds
+from jaxlidar.extend import check_integer, check_key, check_kinds
 
 ROOT = Path(__file__).resolve().parents[1]
 
-MADE = """
+DEFINITIONS = """
 import jax, jax.numpy as jnp, numpy as np, jaxlidar as jl
 cube, points = np.full((2, 2, 2), 0.5), np.zeros((4, 3))
 voxels = jl.VoxelMap.from_lad(cube, voxel_size=1.0)
@@ -29,7 +29,7 @@ plate, leaf, rule = jl.Plate(height=1.0, reflectance=0.2), jl.LeafOptics(0.4, 0.
 tree = jl.turtle("F")
 leaves = jax.vmap(lambda n: jl.Prospect(N=n))(jnp.ones(2))
 """
-KIND = {
+WRONG_KIND = {
     "jl.Scene(ground=0.3)": "ground is a float; admissible is a Ground or None, as in",
     "jl.Scene(plates=plate)": "plates is a Plate; admissible is a tuple, as in (plate,)",
     "jl.Scene(plates=0.5)": "plates is a float; admissible is a tuple",
@@ -79,7 +79,7 @@ KIND = {
     "jl.first_return_window(np.arange(3.0), np.ones(3), 2.0, None)": "threshold is None; admissible are",
     "jl.Tree(*[[0.0]] * 9)": "start is a list; admissible is a NumPy array",
 }
-SHAPE = {
+WRONG_SHAPE = {
     "jl.Lidar(altitude=(1.0, 2.0))": "altitude has shape (2,); admissible is one number",
     "jl.Lidar(wavelength=np.ones((2, 2)))": "wavelength has shape (2, 2); admissible is one number",
     "jl.Lidar(energy=[[1.0], [1.0, 2.0]])": "energy has rows of different lengths; admissible is a",
@@ -119,20 +119,28 @@ SHAPE = {
 }
 
 
-def test_things_of_another_kind_or_shape_are_refused_in_a_sentence():
-    code = MADE + "import json\nfound = []\nfor text in " + repr([*KIND, *SHAPE]) + ":\n"
-    code += "    try:\n        eval(text)\n        found.append(('nothing', text))\n"
-    code += "    except Exception as error:\n        found.append((type(error).__name__, str(error)))\n"
-    code += "print(json.dumps(found))"
-    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True, cwd=ROOT)
-    found = json.loads(done.stdout)
-    for (kind, said), (text, wanted) in zip(found, (KIND | SHAPE).items(), strict=True):
-        assert kind == ("TypeError" if text in KIND else "ValueError"), (text, kind, said)
-        assert said.startswith(wanted), (text, said)
-        assert "\n" not in said
+def test_wrong_kinds_and_shapes_are_refused_in_one_sentence():
+    code = DEFINITIONS + "import json\nerrors = []\nfor text in " + repr([*WRONG_KIND, *WRONG_SHAPE]) + ":\n"
+    code += "    try:\n        eval(text)\n        errors.append(('nothing', text))\n"
+    code += "    except Exception as error:\n        errors.append((type(error).__name__, str(error)))\n"
+    code += "print(json.dumps(errors))"
+    process = subprocess.run(
+        [sys.executable, "-c", code], check=True, capture_output=True, text=True, cwd=ROOT
+    )
+    errors = json.loads(process.stdout)
+    for (error, message), (expression, expected) in zip(
+        errors, (WRONG_KIND | WRONG_SHAPE).items(), strict=True
+    ):
+        assert error == ("TypeError" if expression in WRONG_KIND else "ValueError"), (
+            expression,
+            error,
+            message,
+        )
+        assert message.startswith(expected), (expression, message)
+        assert "\n" not in message
 
 
-ENTRIES = """
+CALL_ENTRY_POINTS = """
 import jax, jax.numpy as jnp, numpy as np, jaxlidar as jl, inversion
 lidar, scene, key = jl.Lidar(), jl.Scene(ground=jl.Ground()), jax.random.key(0)
 plate, plan = jl.Plate(height=1.0, reflectance=0.2), jl.plan(lidar, scene)
@@ -156,7 +164,7 @@ CALLS = {
         y, l, s, unknowns, "a", [0.0, 1.0], noise=1.0, key=k, time=t
     ),
 }
-GIVEN = {
+WRONG_ARGUMENTS = {
     "swapped": (scene, lidar, key),
     "a list of lidars": ([lidar, lidar], scene, key),
     "a list of scenes": (lidar, [scene, scene], key),
@@ -167,20 +175,20 @@ GIVEN = {
 }
 import json
 from jax import monitoring
-compiled, found = [], {}
-monitoring.register_event_duration_secs_listener(lambda name, *_, **__: compiled.append(name))
-for call, do in CALLS.items():
-    for given, arguments in GIVEN.items():
-        compiled.clear()
+events, errors = [], {}
+monitoring.register_event_duration_secs_listener(lambda name, *_, **__: events.append(name))
+for name, call in CALLS.items():
+    for case, arguments in WRONG_ARGUMENTS.items():
+        events.clear()
         try:
-            do(*arguments)
-            said = "nothing", ""
+            call(*arguments)
+            outcome = "nothing", ""
         except Exception as error:
-            said = type(error).__name__, str(error)
-        found[f"{call}: {given}"] = (*said, [name for name in compiled if "backend_compile" in name])
-print(json.dumps(found))
+            outcome = type(error).__name__, str(error)
+        errors[f"{name}: {case}"] = (*outcome, [event for event in events if "backend_compile" in event])
+print(json.dumps(errors))
 """
-SAYS = {
+MESSAGES = {
     "swapped": "lidar is a Scene",
     "a list of lidars": "lidar",
     "a list of scenes": "scene",
@@ -191,22 +199,22 @@ SAYS = {
 }
 
 
-def test_every_entry_refuses_them_before_anything_compiles():
-    done = subprocess.run(
-        [sys.executable, "-c", ENTRIES], check=True, capture_output=True, text=True, cwd=ROOT
+def test_every_entry_point_refuses_wrong_kinds_before_anything_compiles():
+    process = subprocess.run(
+        [sys.executable, "-c", CALL_ENTRY_POINTS], check=True, capture_output=True, text=True, cwd=ROOT
     )
-    found = json.loads(done.stdout)
+    errors = json.loads(process.stdout)
     # A plan needs no key, and many footprints may have a lidar or a scene each: lists of another length.
-    assert found.pop("plan: a seed")[0] == found.pop("reduce: a seed")[0] == "nothing"
+    assert errors.pop("plan: a seed")[0] == errors.pop("reduce: a seed")[0] == "nothing"
     for several in ("lidars", "scenes"):
-        kind, said, _ = found.pop(f"retrieve_many: a list of {several}")
-        assert kind == "ValueError"
-        assert said.endswith("has 2 elements; admissible is one, or 1 as observed")
-    for name, (kind, said, compiled) in found.items():
-        assert kind == "TypeError", (name, said)
-        assert said.startswith(SAYS[name.partition(": ")[2]]), (name, said)
-        assert "\n" not in said
-        assert compiled == [], name
+        error, message, _ = errors.pop(f"retrieve_many: a list of {several}")
+        assert error == "ValueError"
+        assert message.endswith("has 2 elements; admissible is one, or 1 as observed")
+    for case, (error, message, compiled) in errors.items():
+        assert error == "TypeError", (case, message)
+        assert message.startswith(MESSAGES[case.partition(": ")[2]]), (case, message)
+        assert "\n" not in message
+        assert compiled == [], case
 
 
 LIDAR, SCENE, GROUND = jl.Lidar(), jl.Scene(), jl.Ground()
@@ -231,12 +239,12 @@ LIDAR, SCENE, GROUND = jl.Lidar(), jl.Scene(), jl.Ground()
         ),
     ],
 )
-def test_a_lidar_and_a_scene_are_told_from_other_things(lidar, scene, says):
+def test_arguments_that_are_no_lidar_or_no_scene_are_refused(lidar, scene, says):
     with pytest.raises(TypeError, match=says):
         check_kinds(lidar, scene)
 
 
-def test_a_lidar_and_a_scene_pass_in_transformations():
+def test_a_traced_lidar_and_scene_are_accepted():
     @jax.jit
     def run(lidar, scene):
         check_kinds(lidar, scene)
@@ -248,18 +256,18 @@ def test_a_lidar_and_a_scene_pass_in_transformations():
 
 
 @pytest.mark.parametrize("key", [0, None, "seed", 1.5, np.zeros(2), LIDAR, jax.random.key])
-def test_what_is_no_key(key):
+def test_arguments_that_are_no_key_are_refused(key):
     with pytest.raises(TypeError, match=r"key is .*; admissible is a JAX random key, as jax.random.key\(0\)"):
         check_key(key)
 
 
-def test_several_keys():
+def test_several_keys_are_refused():
     for several in (jax.random.split(jax.random.key(0), 3), jax.random.split(jax.random.PRNGKey(0), 3)):
         with pytest.raises(ValueError, match=r"key has shape \(3,.*several keys; admissible is one"):
             check_key(several)
 
 
-def test_keys_of_both_styles_pass_known_or_traced():
+def test_keys_of_both_styles_are_accepted_concrete_or_traced():
     for make in (jax.random.key, jax.random.PRNGKey):
         key = make(0)
 
@@ -271,7 +279,7 @@ def test_keys_of_both_styles_pass_known_or_traced():
         assert jax.vmap(run)(jax.random.split(key, 3)).shape == (3,)
 
 
-def test_integers():
+def test_numbers_that_are_no_integer_are_refused():
     assert check_integer("n", np.int64(3)) == check_integer("n", 3.0) == check_integer("n", np.array(3)) == 3
     assert isinstance(check_integer("n", 3.0), int)
     for wrong in (2.5, np.nan, np.inf, 0):
@@ -286,42 +294,47 @@ def test_integers():
         jax.jit(lambda n: check_integer("n", n))(3)
 
 
-PLACES = (jl, jl.io, jl.plot, inversion)
+NAMESPACES = (jl, jl.io, jl.plot, inversion)
 PUBLIC = {
-    f"{place.__name__}.{name}": getattr(place, name)
-    for place in PLACES
-    for name in place.__all__
-    if inspect.isclass(getattr(place, name))
+    f"{module.__name__}.{name}": getattr(module, name)
+    for module in NAMESPACES
+    for name in module.__all__
+    if inspect.isclass(getattr(module, name))
 }
-FIRST = """
+FIND_SUMMARIES = """
 import inspect, json, pydoc, inversion, jaxlidar as jl
-found = {}
-for place in (jl, jl.io, jl.plot, inversion):
-    for name in place.__all__:
-        if inspect.isclass(thing := getattr(place, name)):
-            text = pydoc.render_doc(thing, renderer=pydoc.plaintext)
-            found[f"{place.__name__}.{name}"] = text.find(inspect.getdoc(thing).split("\\n")[0])
-print(json.dumps(found))
+positions = {}
+for module in (jl, jl.io, jl.plot, inversion):
+    for name in module.__all__:
+        if inspect.isclass(value := getattr(module, name)):
+            text = pydoc.render_doc(value, renderer=pydoc.plaintext)
+            positions[f"{module.__name__}.{name}"] = text.find(inspect.getdoc(value).split("\\n")[0])
+print(json.dumps(positions))
 """
 
 
-def test_help_begins_with_what_a_class_is():
-    """After its name and arguments, within ten lines; of what users make, after the bare arguments."""
-    done = subprocess.run([sys.executable, "-c", FIRST], check=True, capture_output=True, text=True, cwd=ROOT)
-    found = json.loads(done.stdout)
-    assert found.keys() == PUBLIC.keys()
-    assert {name for name, at in found.items() if not 0 <= at < 800} == set()
+def test_help_begins_with_the_summary_of_a_class():
+    """It follows name and arguments within ten lines; for classes that users construct, even sooner."""
+    process = subprocess.run(
+        [sys.executable, "-c", FIND_SUMMARIES], check=True, capture_output=True, text=True, cwd=ROOT
+    )
+    positions = json.loads(process.stdout)
+    assert positions.keys() == PUBLIC.keys()
+    assert {name for name, at in positions.items() if not 0 <= at < 800} == set()
     for cls in (jl.Lidar, jl.Scene, jl.Canopy, jl.VoxelMap, jl.Ground, jl.Plate, jl.Prospect):
-        assert found[f"jaxlidar.{cls.__name__}"] < 400
+        assert positions[f"jaxlidar.{cls.__name__}"] < 400
         assert cls.__final__
 
 
-def test_a_brief_signature_keeps_names_and_defaults():
-    found = inspect.signature(jl.Lidar).parameters
-    assert list(found) == [field.name for field in dataclasses.fields(jl.Lidar)]
-    assert (found["altitude"].default, found["position"].default) == (1000.0, (0.0, 0.0))
-    given = inspect.signature(jl.Prospect).parameters
-    assert list(given)[:2] == ["N", "Cab"]
-    assert given["Cp"].kind is inspect.Parameter.KEYWORD_ONLY
-    # What is called of a leaf are its wavelengths.
+def test_a_short_signature_keeps_names_and_defaults():
+    lidar_parameters = inspect.signature(jl.Lidar).parameters
+    assert list(lidar_parameters) == [field.name for field in dataclasses.fields(jl.Lidar)]
+    assert (lidar_parameters["altitude"].default, lidar_parameters["position"].default) == (
+        1000.0,
+        (0.0, 0.0),
+    )
+    leaf_parameters = inspect.signature(jl.Prospect).parameters
+    assert list(leaf_parameters)[:2] == ["N", "Cab"]
+    assert leaf_parameters["Cp"].kind is inspect.Parameter.KEYWORD_ONLY
+    # An instance is called with wavelengths.
     assert list(inspect.signature(jl.Prospect()).parameters) == ["wavelengths"]

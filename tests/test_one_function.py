@@ -1,4 +1,4 @@
-"""Loops compiled as one function, values computed once: same values and derivatives, and fewer kernels."""
+"""Loops compiled as one function, and values computed once: same values and derivatives, fewer kernels."""
 
 import jax
 import jax.numpy as jnp
@@ -6,22 +6,23 @@ import numpy as np
 import pytest
 
 import jaxlidar as jl
-from jaxlidar._one_function import once, one_function
+from jaxlidar._one_function import one_function
+from jaxlidar.extend import once
 from jaxlidar.trace.voxel_traversal import make_medium, march_to_depths
 
 KEY = jax.random.key(0)
 
 
 def flight(extinction, *, reverse):
-    """Total depth and ends of 64 rays from the middle of a map."""
+    """Return optical depth and end points of 64 rays from the middle of a map."""
     voxels = jl.VoxelMap.from_extinction(leaf=extinction, voxel_size=1.0, origin=(-2.0, -2.0, 0.0))
     medium = make_medium(jl.Canopy(voxels, leaf=jl.LeafOptics(0.4, 0.4)), jnp.zeros(3))
-    w = jax.random.normal(KEY, (3, 64))
-    w = tuple(w / jnp.linalg.norm(w, axis=0, keepdims=True))
-    x = tuple(jnp.full(64, v) for v in (0.1, 0.2, 2.3))
-    depths = jnp.linspace(0.1, 2.0, 64)[None]
-    far, on = jnp.full(64, 1e6), jnp.ones(64, bool)
-    return march_to_depths(medium, x, w, depths, far, on, 32, reverse=reverse)
+    direction = jax.random.normal(KEY, (3, 64))
+    direction = tuple(direction / jnp.linalg.norm(direction, axis=0, keepdims=True))
+    start = tuple(jnp.full(64, v) for v in (0.1, 0.2, 2.3))
+    targets = jnp.linspace(0.1, 2.0, 64)[None]
+    limit, active = jnp.full(64, 1e6), jnp.ones(64, bool)
+    return march_to_depths(medium, start, direction, targets, limit, active, 32, reverse=reverse)
 
 
 @pytest.fixture
@@ -29,12 +30,12 @@ def extinction():
     return jnp.asarray(np.random.default_rng(0).uniform(0, 0.6, (4, 4, 4)), jnp.zeros(()).dtype)
 
 
-def test_a_flight_is_the_same(extinction):
+def test_a_flight_in_one_function_is_the_same(extinction):
     plain, marked = (jax.jit(lambda k, r=r: flight(k, reverse=r))(extinction) for r in (True, False))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6), plain, marked)
 
 
-def test_derivatives_are_the_same(extinction):
+def test_derivatives_in_one_function_are_the_same(extinction):
     def depth(k, reverse):
         return jnp.sum(flight(k, reverse=reverse).total_depth)
 
@@ -47,7 +48,7 @@ def test_derivatives_are_the_same(extinction):
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="kernels of processors")
 def test_a_loop_becomes_one_function():
     def loop(x):
-        # Too much to be small by itself.
+        # Large enough that XLA does not inline it by itself.
         return jax.lax.fori_loop(0, 16, lambda _, x: jnp.sin(x) + 0.5 * x[::-1], x)
 
     text = jax.jit(one_function(loop)).lower(jnp.ones(4096)).compile().as_text()
@@ -81,7 +82,7 @@ def shared(x, hold):
 
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="kernels of processors")
 def test_values_are_computed_once():
-    """Told to; untold, older compilers compute them again for each result."""
+    """With the optimisation barrier `once`; without it, older compilers compute them for each result."""
 
     def count(hold):
         return jax.jit(lambda x: shared(x, hold)).lower(jnp.ones(4096)).compile().as_text().count(" abs(")

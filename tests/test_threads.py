@@ -1,4 +1,4 @@
-"""Programs side by side: results in order, JAX as the caller has set it, nothing left after an error."""
+"""Tasks in threads: results in order, JAX configured as by the caller, no task started after an error."""
 
 import os
 import sys
@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import jaxlidar as jl
-from jaxlidar._threads import side_by_side
+from jaxlidar.extend import side_by_side
 from tests.helpers import slow_unless
 
 
@@ -19,14 +19,14 @@ from tests.helpers import slow_unless
 def test_results_come_in_order_from_several_threads():
     meeting = threading.Barrier(2, timeout=30)
 
-    def one(n):
-        # Passes only if two run at once.
+    def task(n):
+        # The barrier opens only if two tasks run at the same time.
         if n < 2:
             meeting.wait()
         return jnp.asarray(n) ** 2
 
     with side_by_side(2) as run:
-        assert [int(v) for v in run(one, range(9))] == [n**2 for n in range(9)]
+        assert [int(v) for v in run(task, range(9))] == [n**2 for n in range(9)]
 
 
 @pytest.mark.parametrize("double", [False, True])
@@ -36,38 +36,38 @@ def test_precision_is_the_callers(double):
     assert kinds == {"float64" if double else "float32"}
 
 
-def test_what_waits_is_dropped_after_an_error():
-    begun = []
+def test_waiting_tasks_are_dropped_after_an_error():
+    started = []
 
-    def one(n):
-        begun.append(n)
+    def task(n):
+        started.append(n)
         if n == 0:
             raise RuntimeError("first")
         time.sleep(1.0)
 
     with pytest.raises(RuntimeError, match="first"), side_by_side(1) as run:
-        list(run(one, range(100)))
-    # One may have begun before the error was seen.
-    assert len(begun) <= 2
+        list(run(task, range(100)))
+    # A second task may have started before the error was noticed.
+    assert len(started) <= 2
 
 
 @pytest.mark.parametrize("double", slow_unless([True], [False, True]))
 def test_simulate_keeps_the_precision(double, monkeypatch):
-    kind = "float64" if double else "float32"
-    module, kinds = sys.modules["jaxlidar.sampling.batch_programs"], []
-    joined = module.joined
+    expected = "float64" if double else "float32"
+    batches, dtypes = sys.modules["jaxlidar.sampling.batch_programs"], []
+    original_joined = batches.joined
 
-    def watched(*args):
-        out = joined(*args)
+    def watched_joined(*args):
+        out = original_joined(*args)
         if not isinstance(out.first, jax.ShapeDtypeStruct):
-            kinds.append(str(out.first.dtype))
+            dtypes.append(str(out.first.dtype))
         return out
 
-    monkeypatch.setattr(module, "joined", watched)
+    monkeypatch.setattr(batches, "joined", watched_joined)
     with jax.enable_x64(double):
         voxels = jl.VoxelMap.from_lad(np.full((1, 1, 4), 0.2), voxel_size=2.0, origin=(-1.0, -1.0, 0.0))
         canopy = jl.Canopy(voxels, leaf=jl.Isotropic(albedo=0.8))
         scene = jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=0.3))
         wave = jl.simulate(jl.Lidar(), scene, key=jax.random.key(0), n_photons=256, max_orders=2, n_rays=64)
-    assert str(wave.reflectance.dtype) == str(wave.stderr.dtype) == kind
-    assert kinds == [kind] * 8
+    assert str(wave.reflectance.dtype) == str(wave.stderr.dtype) == expected
+    assert dtypes == [expected] * 8

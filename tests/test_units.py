@@ -1,4 +1,4 @@
-"""What is admissible but absurd, as in another unit, is warned of, with the unit that is likely."""
+"""Warnings of values that are admissible but absurd, as if in another unit, with the unit that is likely."""
 
 import dataclasses
 import warnings
@@ -10,7 +10,8 @@ import pytest
 
 import inversion
 import jaxlidar as jl
-from jaxlidar._checks import MAGNITUDES, UnitWarning
+from jaxlidar import UnitWarning
+from jaxlidar._checks import MAGNITUDES
 
 UNKNOWN = inversion.Unknown(lambda s: s.ground.reflectance, bounds=(0.0, 1.0))
 CUBE = np.full((1, 1, 1), 0.5)
@@ -49,19 +50,19 @@ ABSURD = {
 
 @pytest.mark.parametrize("name", list(ABSURD))
 def test_absurd_values_are_warned_of_at_the_users_line(name):
-    make, given, hint = ABSURD[name]
-    with pytest.warns(UnitWarning, match=hint) as found:
+    make, stated, hint = ABSURD[name]
+    with pytest.warns(UnitWarning, match=hint) as warning_list:
         make()
-    assert len(found) == 1
-    number, unit = given.split()
-    value, _, rest = str(found[0].message).partition(" = ")[2].partition(" ")
+    assert len(warning_list) == 1
+    number, unit = stated.split()
+    value, _, remainder = str(warning_list[0].message).partition(" = ")[2].partition(" ")
     assert float(value) == pytest.approx(float(number), rel=1e-5)
-    assert rest.startswith(f"{unit} is absurdly")
-    assert found[0].filename == __file__
+    assert remainder.startswith(f"{unit} is absurdly")
+    assert warning_list[0].filename == __file__
 
 
-def test_plausible_values_are_not():
-    """Zero means what it says, and instruments from a bench to an orbit pass."""
+def test_plausible_values_are_not_warned_of():
+    """Zero is no absurd value, and instruments from a bench to an orbit are admitted."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         jl.Lidar(altitude=5.0, divergence=0.0, jitter=0.0, aperture=0.01, energy=1e-12, wavelength=355.0)
@@ -72,10 +73,10 @@ def test_plausible_values_are_not():
 
 
 def test_one_value_is_warned_of_once():
-    """Copies that the library makes, and those that JAX makes, say nothing more; a user's own change does."""
-    with pytest.warns(UnitWarning, match="divergence") as found:
+    """Copies by the library and by JAX do not warn again; a change by the user does."""
+    with pytest.warns(UnitWarning, match="divergence") as warning_list:
         lidar = jl.Lidar(divergence=3e-4)
-    assert len(found) == 1
+    assert len(warning_list) == 1
     scene, key = jl.Scene(ground=jl.Ground(slope=10.0)), jax.random.key(0)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -83,20 +84,20 @@ def test_one_value_is_warned_of_once():
         jl.simulate(lidar, scene, key=key, plan=plan)
         jax.tree.map(lambda a: a, lidar)
         inversion.cramer_rao(lidar, scene, [UNKNOWN], noise=0.01, key=key)
-    with pytest.warns(UnitWarning, match="divergence") as found:
+    with pytest.warns(UnitWarning, match="divergence") as warning_list:
         dataclasses.replace(lidar, altitude=500.0)
-    assert [w.filename for w in found] == [__file__]
+    assert [w.filename for w in warning_list] == [__file__]
 
 
-def test_traced_values_pass():
-    made = jax.jit(lambda d: jl.Lidar(divergence=d).divergence)
-    assert float(made(3e-4)) == pytest.approx(3e-4)
+def test_traced_values_are_not_warned_of():
+    divergence_of = jax.jit(lambda d: jl.Lidar(divergence=d).divergence)
+    assert float(divergence_of(3e-4)) == pytest.approx(3e-4)
     traits = jnp.asarray([50.0, 100.0])
     assert jax.vmap(lambda c: jl.Prospect(Cw=c))(traits).Cw.shape == (2,)
 
 
-def test_other_units_are_other():
-    for unit, low, high, others in MAGNITUDES.values():
+def test_likely_units_differ_from_the_unit():
+    for unit, low, high, factors in MAGNITUDES.values():
         assert 0 <= low < high
-        assert unit not in others
-        assert all(factor > 0 and factor != 1 for factor in others.values())
+        assert unit not in factors
+        assert all(factor > 0 and factor != 1 for factor in factors.values())

@@ -1,4 +1,4 @@
-"""What the benchmarks share: the record of the machine, timing side by side, atomic file writes."""
+"""Shared by the benchmarks: record of the machine, timing in turns, tables and atomic file writes."""
 
 import argparse
 import json
@@ -18,7 +18,7 @@ import matplotlib.pyplot as plt
 
 
 def options(description: str, **defaults: int) -> argparse.Namespace:
-    """The command line: `--out` for the folder, and one whole number for each of `defaults`."""
+    """Parse the command line: `--out` for the folder, and an integer option for each of `defaults`."""
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("--out", default="figures", type=Path, help="folder of the results")
     for name, value in defaults.items():
@@ -27,7 +27,7 @@ def options(description: str, **defaults: int) -> argparse.Namespace:
 
 
 def machine() -> dict[str, object]:
-    """What the times depend on."""
+    """Return the hardware and software that times depend on."""
     return {
         "processor": _processor(),
         "cores": os.cpu_count(),
@@ -48,16 +48,17 @@ def _processor() -> str:
 
 
 def seconds(function: Callable, *arguments) -> float:
-    """Wall time of one call, until its results are there."""
+    """Return the wall time of one call, until its results are computed."""
     start = time.perf_counter()
     jax.block_until_ready(function(*arguments))
     return time.perf_counter() - start
 
 
 def race(contestants: Mapping[str, Callable[[], object]], rounds: int) -> dict[str, list[float]]:
-    """Times of all contestants, in turn, round after round, so that other work falls on all alike.
+    """Return the times of all contestants by rounds.
 
-    Each runs once before, to compile.
+    Contestants take turns, so that other load of the machine slows all of them alike. Each runs once before,
+    to compile.
     """
     for run in contestants.values():
         jax.block_until_ready(run())
@@ -69,7 +70,7 @@ def race(contestants: Mapping[str, Callable[[], object]], rounds: int) -> dict[s
 
 
 def best(times: Mapping[str, list[float]]) -> dict[str, float]:
-    """The fastest round of each."""
+    """Return the time of the fastest round of each."""
     return {name: min(values) for name, values in times.items()}
 
 
@@ -80,7 +81,7 @@ def write_json(path: Path, record: Mapping[str, object]) -> None:
 
 
 def new_figure(columns: int = 1, size: tuple[float, float] = (6, 4), rows: int = 1):
-    """A figure and its axes."""
+    """Return a figure and its axes."""
     return plt.subplots(rows, columns, figsize=size, layout="constrained")
 
 

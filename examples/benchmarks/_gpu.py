@@ -1,4 +1,4 @@
-"""What the tracer would be on a GPU: text of the page of benchmarks. A design; nothing of it was measured."""
+"""Design of the tracer on a GPU: text of the page of benchmarks. Nothing of it was measured."""
 
 # Lines of the table are as long as they need to be.
 # ruff: noqa: E501

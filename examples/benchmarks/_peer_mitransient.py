@@ -1,13 +1,13 @@
 """Worker of `peers.py`: the same scene rendered by Mitsuba 3 with mitransient.
 
-Laser and receiver stand at one point. Their roles are exchanged, which light paths allow: the sensor sends
-its rays over the laser's disc, uniformly, and a point emitter stands for the receiver, which sees everything.
-No ray is then wasted, and every scattering is connected with the receiver. `"camera"` is the set-up that
-a user of a renderer would begin with: a spot and a camera that looks at the square of 10 m x 10 m.
+Laser and receiver are at one point. Their roles are exchanged, by reciprocity: the sensor sends its rays
+uniformly over the disc of the laser, and a point emitter stands for the receiver, which sees everything. No
+ray is then wasted, and every scattering is connected with the receiver. `"camera"` is the set-up that a user
+of a renderer would begin with: a spot and a camera that looks at the square of 10 m x 10 m.
 
 `transient_prbvolpath` of mitransient 1.3.1 adds a flight to the length of a path only where it ends in a real
-collision, not the stretches between null collisions. The line that adds is found and corrected here in
-a temporary copy; where it is not found, the plug-in is used as it is and `corrected` is false.
+collision, not the segments between null collisions. The line that adds them is corrected here in a temporary
+copy; if the line does not exist, the plug-in is used as it is and `corrected` is false.
 """
 
 import importlib.util
@@ -20,13 +20,13 @@ from pathlib import Path
 
 import numpy as np
 
-PLUGIN, FIXED = "transient_prbvolpath", "transient_prbvolpath_all_stretches"
-ADDED = "dr.select(act_medium_scatter, mei.t"
-LIGHT = 0.299792458  # m/ns
+PLUGIN, CORRECTED_PLUGIN = "transient_prbvolpath", "transient_prbvolpath_all_stretches"
+LENGTH_LINE = "dr.select(act_medium_scatter, mei.t"
+SPEED_OF_LIGHT = 0.299792458  # m/ns
 
 
 def load():
-    """Mitsuba with a variant for the CPU, and mitransient's plug-ins."""
+    """Import Mitsuba with a variant for the CPU, and the plug-ins of mitransient."""
     llvm = Path(sys.prefix, "lib", "libLLVM.so.19.1")
     if "DRJIT_LIBLLVM_PATH" not in os.environ and llvm.exists():
         os.environ["DRJIT_LIBLLVM_PATH"] = str(llvm)
@@ -35,22 +35,24 @@ def load():
     mi.set_variant("llvm_ad_mono")
     import drjit as dr
 
-    # Dr.Jit counts the thread that calls, but lets it wait: by default one core is idle.
+    # Dr.Jit counts the calling thread, which only waits: by default one core is idle.
     dr.set_thread_count((os.cpu_count() or 1) + 1)
     import mitransient
 
     return mi, mitransient
 
 
-def correct() -> bool:
-    """Register the plug-in under another name with the stretches between null collisions added up."""
+def register_corrected_plugin() -> bool:
+    """Register a plug-in that counts segments between null collisions; return False if that fails."""
     from mitransient.integrators import transient_prbvolpath as module
 
     source = inspect.getsource(module)
-    if source.count(ADDED) != 1:
+    if source.count(LENGTH_LINE) != 1:
         return False
-    source = source.replace(ADDED, "dr.select(act_medium_scatter | act_null_scatter, mei.t")
-    source = source.replace(f"'{PLUGIN}'", f"'{FIXED}'").replace(f'"{PLUGIN}"', f'"{FIXED}"')
+    source = source.replace(LENGTH_LINE, "dr.select(act_medium_scatter | act_null_scatter, mei.t")
+    source = source.replace(f"'{PLUGIN}'", f"'{CORRECTED_PLUGIN}'").replace(
+        f'"{PLUGIN}"', f'"{CORRECTED_PLUGIN}"'
+    )
     path = Path(tempfile.mkdtemp(), "corrected.py")
     path.write_text(source)
     # Dr.Jit reads the source of what it compiles, so the copy must be a file; it imports its neighbours.
@@ -60,10 +62,10 @@ def correct() -> bool:
 
 
 def register_beam(mi, altitude: float, radius: float) -> None:
-    """A sensor whose rays leave one point and are uniform over a disc on the reference plane."""
+    """Register a sensor whose rays leave one point and are uniform over a disc on the reference plane."""
     import drjit as dr
 
-    class Beam(mi.Sensor):
+    class DiscBeam(mi.Sensor):
         def sample_ray(self, time, sample1, sample2, sample3, active=True):
             across = radius * mi.warp.square_to_uniform_disk(sample2)
             down = dr.normalize(mi.Vector3f(across.x, across.y, -altitude))
@@ -73,16 +75,16 @@ def register_beam(mi, altitude: float, radius: float) -> None:
             return self.sample_ray(*arguments, **named)
 
         def to_string(self):
-            return "Beam"
+            return "DiscBeam"
 
-    mi.register_sensor("disc_beam", Beam)
+    mi.register_sensor("disc_beam", DiscBeam)
 
 
-def scene(mi, given, reflectance: float, camera: bool, plugin: str):
-    """The scene; a Lambertian target of reflectance rho that fills the footprint gives the radiance rho."""
+def scene(mi, task, reflectance: float, camera: bool, plugin: str):
+    """Return the scene; a Lambertian target of reflectance rho that fills the footprint has radiance rho."""
     move = mi.ScalarTransform4f
-    altitude, radius, size = (float(given[n]) for n in ("altitude", "radius", "size"))
-    start, width, count = (float(given[n]) for n in ("start", "fine", "count"))
+    altitude, radius, size = (float(task[n]) for n in ("altitude", "radius", "size"))
+    start, width, count = (float(task[n]) for n in ("start", "fine", "count"))
     down = move().look_at(origin=[0, 0, altitude], target=[0, 0, 0], up=[0, 1, 0])
     half = float(np.degrees(np.arctan(radius / altitude)))
     film = {
@@ -90,8 +92,8 @@ def scene(mi, given, reflectance: float, camera: bool, plugin: str):
         "width": 1,
         "height": 1,
         "temporal_bins": int(count),
-        "start_opl": 2 * altitude + start * LIGHT,
-        "bin_width_opl": width * LIGHT,
+        "start_opl": 2 * altitude + start * SPEED_OF_LIGHT,
+        "bin_width_opl": width * SPEED_OF_LIGHT,
         "rfilter": {"type": "box"},
     }
     sampler = {"type": "independent"}
@@ -99,23 +101,23 @@ def scene(mi, given, reflectance: float, camera: bool, plugin: str):
     sensor = {"type": "disc_beam", "film": film, "sampler": sampler}
     light = {"type": "point", "position": [0, 0, altitude], "intensity": power}
     if camera:
-        # The camera averages over its square, the footprint covers pi/4 of it.
+        # The camera averages over its square, of which the footprint covers pi / 4.
         square = {"type": "perspective", "fov": 2 * half, "to_world": down, "film": film}
         sensor = {**square, "sampler": sampler}
         light = {"type": "spot", "to_world": down, "cutoff_angle": half, "beam_width": 0.9999 * half}
         light["intensity"] = power * 4 / np.pi
     # Axes of a grid are z, y, x.
-    grid = np.ascontiguousarray(given["extinction"].transpose(2, 1, 0), dtype=np.float32)[..., None]
+    grid = np.ascontiguousarray(task["extinction"].transpose(2, 1, 0), dtype=np.float32)[..., None]
     box = move().translate([-size / 2, -size / 2, 0]).scale(size)
     extinction = {"type": "gridvolume", "grid": mi.VolumeGrid(grid), "to_world": box, "raw": True}
-    medium = {"type": "heterogeneous", "albedo": float(given["albedo"]), "phase": {"type": "isotropic"}}
-    # The box ends a little above the ground: two coincident surfaces are hit in any order.
+    medium = {"type": "heterogeneous", "albedo": float(task["albedo"]), "phase": {"type": "isotropic"}}
+    # The box ends a little above the ground: coincident surfaces would be hit in arbitrary order.
     gap = 1e-3 * size
     hull = move().translate([0, 0, (size + gap) / 2]).scale([size / 2, size / 2, (size - gap) / 2])
-    parts = {
+    scene_dict = {
         "type": "scene",
-        # Depth n leaves n - 1 scatterings. Paths are not thinned out at random: it gains nothing here.
-        "integrator": {"type": plugin, "max_depth": int(given["orders"]) + 1, "rr_depth": 1000},
+        # Depth n means n - 1 scatterings. No Russian roulette (rr_depth): it does not pay here.
+        "integrator": {"type": plugin, "max_depth": int(task["orders"]) + 1, "rr_depth": 1000},
         "sensor": sensor,
         "light": light,
         "box": {
@@ -127,37 +129,37 @@ def scene(mi, given, reflectance: float, camera: bool, plugin: str):
     }
     if reflectance > 0:
         soil = {"type": "diffuse", "reflectance": reflectance}
-        parts["ground"] = {"type": "rectangle", "to_world": move().scale(1000), "bsdf": soil}
-    return mi.load_dict(parts)
+        scene_dict["ground"] = {"type": "rectangle", "to_world": move().scale(1000), "bsdf": soil}
+    return mi.load_dict(scene_dict)
 
 
 def main() -> None:
-    """Render every case `repeats` times; a call's arguments and results are files of arrays."""
-    given = dict(np.load(sys.argv[1]))
+    """Render every case `repeats` times; the command line names files for the task and the results."""
+    task = dict(np.load(sys.argv[1]))
     mi, mitransient = load()
-    corrected = correct()
-    register_beam(mi, float(given["altitude"]), float(given["radius"]))
+    corrected = register_corrected_plugin()
+    register_beam(mi, float(task["altitude"]), float(task["radius"]))
     version = f"mitransient {mitransient.__version__}, Mitsuba {mi.__version__}"
     out: dict[str, object] = {"version": version, "corrected": corrected}
     # The apparent reflectance refers to the range that the time of arrival stands for.
-    time_of = given["start"] + given["fine"] * (np.arange(int(given["count"])) + 0.5)
-    range_of = (1 + 0.5 * LIGHT * time_of / given["altitude"]) ** 2
-    samples = int(given["mitransient_samples"])
+    bin_time = task["start"] + task["fine"] * (np.arange(int(task["count"])) + 0.5)
+    range_correction = (1 + 0.5 * SPEED_OF_LIGHT * bin_time / task["altitude"]) ** 2
+    samples = int(task["mitransient_samples"])
     for case, reflectance, camera in (
-        ("ground", float(given["reflectance"]), False),
+        ("ground", float(task["reflectance"]), False),
         ("alone", 0.0, False),
-        ("camera", float(given["reflectance"]), True),
+        ("camera", float(task["reflectance"]), True),
     ):
-        if case not in given.get("cases", (case,)):
+        if case not in task.get("cases", (case,)):
             continue
-        target = scene(mi, given, reflectance, camera, FIXED if corrected else PLUGIN)
+        target = scene(mi, task, reflectance, camera, CORRECTED_PLUGIN if corrected else PLUGIN)
         integrator = target.integrator()
         waves, times = [], []
-        for seed in range(int(given["repeats"]) + 1):
-            start, work = time.perf_counter(), time.process_time()
+        for seed in range(int(task["repeats"]) + 1):
+            wall_start, cpu_start = time.perf_counter(), time.process_time()
             _, image = integrator.render(target, seed=seed, spp=samples)
-            waves.append(np.array(image).ravel() * range_of)
-            times.append((time.perf_counter() - start, time.process_time() - work))
+            waves.append(np.array(image).ravel() * range_correction)
+            times.append((time.perf_counter() - wall_start, time.process_time() - cpu_start))
         out[f"{case}_waves"], out[f"{case}_times"] = np.array(waves[1:]), np.array(times[1:])
         out[f"{case}_first"] = times[0][0]
     np.savez(sys.argv[2], **out)

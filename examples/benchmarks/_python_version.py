@@ -1,4 +1,4 @@
-"""Worker of `python_versions.py`: seconds of some work in this process, as a line of JSON."""
+"""Worker of `python_versions.py`: seconds of typical calls in this process, as a line of JSON."""
 
 import functools
 import json
@@ -26,13 +26,13 @@ def main() -> None:
     def simulation():
         return jl.simulate(LIDAR, scene, key=KEY, rtol=0.01, max_orders=ORDERS, window=WINDOW).reflectance
 
-    begun = time.perf_counter()
+    start = time.perf_counter()
     jax.block_until_ready(simulation())
-    first_call = time.perf_counter() - begun
+    first_call = time.perf_counter() - start
 
     plan = jl.plan(LIDAR, scene, max_orders=ORDERS, window=WINDOW, describe=False)
-    single = jl.plan(LIDAR, scene, max_orders=1, window=WINDOW, n_rays=8192, describe=False)
-    few = plan.with_config(n_rays=1)
+    rays_only = jl.plan(LIDAR, scene, max_orders=1, window=WINDOW, n_rays=8192, describe=False)
+    photons_only = plan.with_config(n_rays=1)
 
     def trace(scene, plan, reverse=False):
         return jl.trace_scene(jl.make_setup(LIDAR, scene, plan), KEY, reverse=reverse)
@@ -45,27 +45,27 @@ def main() -> None:
         setup = jl.make_setup(LIDAR, raised(heights), plan)
         return jl.total_reflectance(jl.trace_scene(setup, KEY, reverse=reverse), setup)
 
-    # As `simulate` compiles its batches.
+    # With the options by which `simulate` compiles its batches.
     traced = eqx.filter_jit(trace, **ONE_CORE)
-    jacobian, either = (
+    jacobian, reverse_jacobian = (
         jax.jit(jax.jacfwd(functools.partial(total, reverse=r)), **ONE_CORE) for r in (False, True)
     )
     heights = jnp.array([0.0, 1.0])
     leaves = jax.vmap(lambda n: jl.Prospect(**{**TRAITS, "N": n}))(jnp.linspace(1.2, 2.4, LEAVES))
     spectra = jax.jit(lambda x: jl.prospect_spectra(x, SPECTRUM, 20))
-    found = race(
+    times = race(
         {
             "simulate to 1 %": simulation,
-            f"{single.n_rays} rays, first order": lambda: traced(scene, single),
-            f"{few.n_photons} photons, higher orders": lambda: traced(scene, few),
-            "the same, reverse=True": lambda: traced(scene, few, True),
+            f"{rays_only.n_rays} rays, first order": lambda: traced(scene, rays_only),
+            f"{photons_only.n_photons} photons, higher orders": lambda: traced(scene, photons_only),
+            "the same, reverse=True": lambda: traced(scene, photons_only, True),
             "Jacobian in height and density": lambda: jacobian(heights),
-            "Jacobian, reverse=True": lambda: either(heights),
+            "Jacobian, reverse=True": lambda: reverse_jacobian(heights),
             f"{LEAVES} leaf spectra": lambda: spectra(leaves),
         },
         ROUNDS,
     )
-    seconds = {"first call": first_call, **best(found)}
+    seconds = {"first call": first_call, **best(times)}
     print(json.dumps({"python": platform.python_version(), "jax": jax.__version__, "seconds": seconds}))
 
 

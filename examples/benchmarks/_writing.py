@@ -1,10 +1,10 @@
-"""Numbers, tables and pages of Markdown, for pages that are made from records."""
+"""Numbers, tables and paragraphs in Markdown, for pages that are made from records."""
 
 from collections.abc import Iterable, Sequence
 
 
 def number(x: float | None, digits: int = 2) -> str:
-    """To so many significant digits."""
+    """Format a number with some significant digits; an empty string for None."""
     if x is None:
         return ""
     short = f"{x:.{digits}g}"
@@ -12,11 +12,11 @@ def number(x: float | None, digits: int = 2) -> str:
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table of Markdown."""
+    """Return a table in Markdown."""
     lines = [head, ["---"] * len(head), *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def page_of(*paragraphs: str) -> str:
-    """Paragraphs and tables with empty lines between."""
+    """Join paragraphs and tables by empty lines."""
     return "\n\n".join(paragraphs)

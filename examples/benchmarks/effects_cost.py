@@ -1,17 +1,17 @@
-"""What a plan saves: the time of scenes with their own plan and with everything on.
+"""Time saved by plans: scenes with the plan of their own effects, and with all effects on.
 
 Run it as `python examples/benchmarks/effects_cost.py [--out figures] [--rounds 9] [--percent 1]`.
 
-"Everything on" is the same scene as a general simulator would trace it, with the machinery of all that is not
-there: a voxel canopy with leaf and bark, empty where the scene has none, that rays and photons march through;
-all scattering orders that its leaves call for; air that takes and returns hardly any light; a receiver that
-sees a hundred times the beam's width; a jitter of a picosecond; a slope of a thousandth of a degree; a
-footprint of random rays. Plates are not added: histories would be too many (`plan.MAX_HISTORIES`); beside the
-one of the third scene only three orders fit, and its own plan follows as few.
+"Everything on" is the same scene as a general simulator would trace it, with the code for effects that the
+scene lacks: a voxel canopy with leaf and bark, empty where the scene has none, that rays and photons
+traverse; all scattering orders that its leaves require; air that hardly absorbs or scatters; a receiver that
+sees a hundred times the width of the beam; a jitter of a picosecond; a slope of a thousandth of a degree; a
+footprint of random rays. Plates are not added: there would be too many histories; with the plate of the third
+scene only three orders fit, and the plan of the scene has as few.
 
 Both are simulated to the same tolerance, have the same window, bins and orders, and return the same light
-(asserted, to 2 %), except where the plan has one order. Times are of `simulate`, warm, in turn; the fastest
-counts. The first calls, which compile, are given apart.
+(asserted, to 2 %), except where the plan has one order. Times are those of `simulate`, warm, in turns; the
+fastest counts. The first calls, which compile, are listed separately.
 """
 
 import dataclasses
@@ -32,9 +32,9 @@ GROUND = jl.Ground(reflectance=0.3)
 
 
 def canopy(leaf: float | None, bark: float | None) -> jl.Canopy:
-    """A crown of 7 m on a trunk of 1 m, with mean extinctions in 1/m: zero is empty, None is not there."""
-    place = (np.arange(N) + 0.5) * SIZE / N
-    x, y, z = np.meshgrid(place, place, place, indexing="ij")
+    """Return a crown of 7 m on a trunk of 1 m, with mean extinctions in 1/m; zero is empty, None absent."""
+    centres = (np.arange(N) + 0.5) * SIZE / N
+    x, y, z = np.meshgrid(centres, centres, centres, indexing="ij")
     crown = (x - 5) ** 2 + (y - 5) ** 2 + (z - 6) ** 2 < 3.5**2
     trunk = ((x - 5) ** 2 + (y - 5) ** 2 < 0.25) & (z < 6)
     random = np.random.default_rng(0).uniform(0, 2, crown.shape)
@@ -48,49 +48,56 @@ def canopy(leaf: float | None, bark: float | None) -> jl.Canopy:
 
 
 def scenes() -> dict[str, tuple[jl.Lidar, jl.Scene, jl.Scene, dict[str, bool]]]:
-    """For each: lidar and scene, the scene with everything, and what its plan switches off."""
+    """Return lidars, scenes, scenes with everything on, and effects that their plans switch off."""
     plate = jl.Plate(height=5.0, reflectance=0.45, transmittance=0.45, coverage=0.7)
     slope = jl.Ground(reflectance=0.3, slope=10.0)
-    leaves, one = jl.Scene(canopy=canopy(0.4, None), ground=GROUND), {"multiple scattering": False}
+    leaves, first_order = jl.Scene(canopy=canopy(0.4, None), ground=GROUND), {"multiple scattering": False}
     tree = jl.Scene(canopy=canopy(0.4, 0.2), ground=slope, atmosphere=CLEAR)
 
-    def all_of(scene: jl.Scene, leaf: float = 0.0) -> jl.Scene:
+    def with_everything(scene: jl.Scene, leaf: float = 0.0) -> jl.Scene:
         ground = dataclasses.replace(scene.ground, slope=max(float(scene.ground.slope), 1e-3))
         return dataclasses.replace(scene, canopy=canopy(leaf, 0.0), ground=ground, atmosphere=CLEAR)
 
     flat, sloping = jl.Scene(ground=GROUND), jl.Scene(ground=slope)
     plates = jl.Scene(plates=(plate,), ground=GROUND)
     return {
-        "flat ground": (LIDAR, flat, all_of(flat), {}),
-        "sloping ground": (LIDAR, sloping, all_of(sloping), {}),
-        "plate over ground": (LIDAR, plates, all_of(plates), {}),
-        "leaves, order one": (LIDAR, leaves, all_of(leaves, 0.4), one),
-        "leaves, all orders": (LIDAR, leaves, all_of(leaves, 0.4), {}),
+        "flat ground": (LIDAR, flat, with_everything(flat), {}),
+        "sloping ground": (LIDAR, sloping, with_everything(sloping), {}),
+        "plate over ground": (LIDAR, plates, with_everything(plates), {}),
+        "leaves, order one": (LIDAR, leaves, with_everything(leaves, 0.4), first_order),
+        "leaves, all orders": (LIDAR, leaves, with_everything(leaves, 0.4), {}),
         "tree, all there is": (SEES_ALL, tree, tree, {}),
     }
 
 
 def main() -> None:
-    given = options("What plans save.", rounds=9, percent=1)
+    arguments = options("Time saved by plans.", rounds=9, percent=1)
     results, rows = [], []
-    for name, (lidar, scene, whole, off) in scenes().items():
+    for name, (lidar, scene, full_scene, off) in scenes().items():
 
         def runs(lidar, scene, plan):
             return lambda: (
                 jl.simulate(
-                    lidar, scene, key=jax.random.key(0), rtol=0.01 * given.percent, plan=plan
+                    lidar, scene, key=jax.random.key(0), rtol=0.01 * arguments.percent, plan=plan
                 ).reflectance
             )
 
-        general = jl.plan(SEES_ALL, whole, window=WINDOW)
-        orders = general.orders if scene.canopy or scene.plates else None
-        common = {"window": WINDOW, "bin_width": general.bins.width, "max_orders": None if off else orders}
-        own = jl.plan(lidar, scene, effects=off, **common)
-        contestants = {"plan": runs(lidar, scene, own), "everything": runs(SEES_ALL, whole, general)}
-        # What scenes share is compiled anew for each.
+        general_plan = jl.plan(SEES_ALL, full_scene, window=WINDOW)
+        orders = general_plan.orders if scene.canopy or scene.plates else None
+        common = {
+            "window": WINDOW,
+            "bin_width": general_plan.bins.width,
+            "max_orders": None if off else orders,
+        }
+        scene_plan = jl.plan(lidar, scene, effects=off, **common)
+        contestants = {
+            "plan": runs(lidar, scene, scene_plan),
+            "everything": runs(SEES_ALL, full_scene, general_plan),
+        }
+        # Compile programs that scenes share for each scene, for comparable first calls.
         jax.clear_caches()
         cold = {which: seconds(run) for which, run in contestants.items()}
-        times = best(race(contestants, given.rounds))
+        times = best(race(contestants, arguments.rounds))
         sums = {which: float(run().sum()) for which, run in contestants.items()}
         if not off:
             np.testing.assert_allclose(sums["plan"], sums["everything"], rtol=0.02)
@@ -102,13 +109,20 @@ def main() -> None:
                 "seconds_with_compilation": cold,
                 "ratio": ratio,
                 "reflectance": sums,
-                "orders": {"plan": own.orders, "everything": general.orders},
+                "orders": {"plan": scene_plan.orders, "everything": general_plan.orders},
             }
         )
-        followed = f"{own.orders} / {general.orders}"
-        rows.append((name, followed, 1e3 * times["plan"], 1e3 * times["everything"], ratio, *cold.values()))
-    record = {"machine": machine(), "percent": given.percent, "rounds": given.rounds, "scenes": results}
-    write_json(given.out / "effects_cost.json", record)
+        orders_text = f"{scene_plan.orders} / {general_plan.orders}"
+        rows.append(
+            (name, orders_text, 1e3 * times["plan"], 1e3 * times["everything"], ratio, *cold.values())
+        )
+    record = {
+        "machine": machine(),
+        "percent": arguments.percent,
+        "rounds": arguments.rounds,
+        "scenes": results,
+    }
+    write_json(arguments.out / "effects_cost.json", record)
 
     figure, axes = new_figure(size=(7, 4))
     places = np.arange(len(results))
@@ -126,7 +140,7 @@ def main() -> None:
     axes.set_yticks(places, [r["scene"] for r in results])
     axes.invert_yaxis()
     axes.legend(loc="lower center", bbox_to_anchor=(0.5, -0.35), ncols=2, frameon=False)
-    save_figure(figure, given.out / "effects_cost.png")
+    save_figure(figure, arguments.out / "effects_cost.png")
 
     header = (
         "scene",

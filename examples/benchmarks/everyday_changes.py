@@ -1,4 +1,4 @@
-"""What a change of a scene costs a user: the first call, and everyday changes after it.
+"""Cost of changing a scene: the first call, and calls after everyday changes.
 
 Run it as `python examples/benchmarks/everyday_changes.py [--out figures]`. Every call is timed twice; the
 second time is its work without compilation. Programs compiled are counted as XLA reports them.
@@ -33,21 +33,21 @@ CHANGES = {
     "divergence 2 to 1.5": {"divergence": 1.5},
     "chlorophyll": {"Cab": 50.0},
 }
-# Compilations that take less are of single operations.
-NOTABLE_FRACTION = 0.1
+# Seconds; shorter compilations are those of single operations.
+NOTABLE = 0.1
 
 
 class Compilations(logging.Handler):
-    """Collects what JAX says of its compilations: name and seconds."""
+    """Collects the names and seconds of compilations from the log of JAX."""
 
     def __init__(self):
         super().__init__()
-        self.found: list[tuple[str, float]] = []
+        self.compiled: list[tuple[str, float]] = []
 
     def emit(self, record: logging.LogRecord) -> None:
-        said = re.match(r"Finished XLA compilation of jit\((.*?)\) in ([\d.e-]+) sec", record.getMessage())
-        if said:
-            self.found.append((said[1], float(said[2])))
+        match = re.match(r"Finished XLA compilation of jit\((.*?)\) in ([\d.e-]+) sec", record.getMessage())
+        if match:
+            self.compiled.append((match[1], float(match[2])))
 
 
 def simulate(
@@ -64,7 +64,7 @@ def simulate(
     divergence=2.0,
     Cab=40.0,
 ) -> None:
-    """A simulation of the README's scene, with changes."""
+    """Simulate the scene of the README, with changes."""
     density = np.full(shape, 0.5)
     voxels = jl.VoxelMap.from_lad(
         density,
@@ -82,24 +82,24 @@ def simulate(
 
 
 def main() -> None:
-    given = options("What a change of a scene costs.")
+    arguments = options("Cost of changing a scene.")
     warnings.simplefilter("ignore", jl.LateLightWarning)
-    heard = Compilations()
-    log = logging.getLogger("jax")
-    log.addHandler(heard)
-    log.propagate = False
+    compilations = Compilations()
+    logger = logging.getLogger("jax")
+    logger.addHandler(compilations)
+    logger.propagate = False
     jax.config.update("jax_log_compiles", True)
     results = []
-    for name, change in CHANGES.items():
-        heard.found.clear()
+    for name, changes in CHANGES.items():
+        compilations.compiled.clear()
         times = []
         for _ in range(2):
             start = time.perf_counter()
-            simulate(**change)
+            simulate(**changes)
             times.append(time.perf_counter() - start)
-        large = [what for what, took in heard.found if took > NOTABLE_FRACTION]
-        results.append({"change": name, "seconds": times[0], "warm": times[1], "compiled": large})
-    write_json(given.out / "everyday_changes.json", {"machine": machine(), "changes": results})
+        notable = [what for what, elapsed in compilations.compiled if elapsed > NOTABLE]
+        results.append({"change": name, "seconds": times[0], "warm": times[1], "compiled": notable})
+    write_json(arguments.out / "everyday_changes.json", {"machine": machine(), "changes": results})
 
     figure, axes = new_figure(size=(7, 5))
     names = [r["change"] for r in results]
@@ -111,7 +111,7 @@ def main() -> None:
     axes.set_xticks(ticks, [f"{t:g}" for t in ticks])
     axes.minorticks_off()
     axes.legend()
-    save_figure(figure, given.out / "everyday_changes.png")
+    save_figure(figure, arguments.out / "everyday_changes.png")
     rows = [(r["change"], r["seconds"], r["warm"], ", ".join(r["compiled"])) for r in results]
     print_table(("change", "s", "s, again", "compiled"), rows)
 

@@ -1,13 +1,13 @@
-"""Order one of a crown over the ground: jaxlidar against a parallel kernel written by hand in numba.
+"""First order of a crown over the ground: jaxlidar against a parallel kernel written by hand in numba.
 
 Run it as `python examples/benchmarks/first_order_march.py [--out figures] [--rays 8192] [--rounds 30]`.
 
 Both march the same rays through the same 64 x 64 x 128 voxels from face to face, at most `max_step` at a
-time, integrate every stretch over each fine bin that it spans, smooth that by (1, 10, 1)/12, and add the
-ground through the quadratic B-spline. The kernel gets its rays ready made, takes one exponential per bin,
-skips empty voxels and runs on every core (`prange`, one histogram a thread, `fastmath`). jaxlidar is run
-as `simulate` runs it: batches of rays submitted from one thread per core. It follows histories, arrivals
-and what escapes besides, and can be differentiated.
+time, integrate every segment over each fine bin that it spans, smooth that by (1, 10, 1)/12, and add the
+ground through the quadratic B-spline. The kernel is given its rays, takes one exponential per bin, skips
+empty voxels and runs on every core (`prange`, one histogram a thread, `fastmath`). jaxlidar is run as
+`simulate` runs it: batches of rays submitted from one thread per core. It also follows histories, arrivals
+and escaped light, and can be differentiated.
 
 The two take turns, round after round; rates are those of the fastest rounds, with the medians beside them.
 """
@@ -37,7 +37,7 @@ LIGHT = f4(SPEED_OF_LIGHT)
 
 
 def crown() -> jl.Scene:
-    """An ellipsoid of 14 x 14 x 28 m with random extinction of 0.15 1/m in the mean, over the ground."""
+    """Return an ellipsoid of 14 x 14 x 28 m with random extinction, 0.15 1/m on average, over the ground."""
     place = [(np.arange(n) + 0.5) * EDGE for n in SHAPE]
     x, y, z = np.meshgrid(*place, indexing="ij")
     inside = ((x - 8) / 7) ** 2 + ((y - 8) / 7) ** 2 + ((z - 17) / 14) ** 2 < 1
@@ -49,7 +49,7 @@ def crown() -> jl.Scene:
 
 @numba.njit(parallel=True, fastmath=True)
 def march(x, w, excess, energy, k, size, origin, start, width, count, row, max_step, ground, factor, threads):
-    """First-order response (2, bins) per unit reflectance of leaf and ground."""
+    """Return the first-order response (2, bins) per unit reflectance of leaf and ground."""
     nx, ny, nz = k.shape
     rays = x.shape[0]
     padded = count + 2 * row
@@ -59,25 +59,25 @@ def march(x, w, excess, energy, k, size, origin, start, width, count, row, max_s
     for t in numba.prange(threads):
         leaf, soil = spread[t], instant[t]
         for r in range(t * rays // threads, (t + 1) * rays // threads):
-            near, far = f4(0), f4(1e30)
+            enter, leave = f4(0), f4(1e30)
             for a in range(3):
                 low = origin[a] - x[r, a]
                 high = low + size[a] * k.shape[a]
                 if abs(w[r, a]) < 1e-12:
                     if low > 0 or high < 0:
-                        far = f4(0)
+                        leave = f4(0)
                 else:
                     inverse = f4(1) / w[r, a]
-                    near = max(near, min(low * inverse, high * inverse))
-                    far = min(far, max(low * inverse, high * inverse))
+                    enter = max(enter, min(low * inverse, high * inverse))
+                    leave = min(leave, max(low * inverse, high * inverse))
             stop = (ground - x[r, 2]) / w[r, 2] if w[r, 2] < 0 else f4(1e30)
-            end = min(far, stop)
+            end = min(leave, stop)
             depth = f4(0)
-            if near < end:
-                # Truncation is the floor here, but for rounding below the first face.
-                vx = min(max(int((x[r, 0] + w[r, 0] * near - origin[0]) / size[0]), 0), nx - 1)
-                vy = min(max(int((x[r, 1] + w[r, 1] * near - origin[1]) / size[1]), 0), ny - 1)
-                vz = min(max(int((x[r, 2] + w[r, 2] * near - origin[2]) / size[2]), 0), nz - 1)
+            if enter < end:
+                # For numbers above zero, truncation is the floor; rounding below the first face is clipped.
+                vx = min(max(int((x[r, 0] + w[r, 0] * enter - origin[0]) / size[0]), 0), nx - 1)
+                vy = min(max(int((x[r, 1] + w[r, 1] * enter - origin[1]) / size[1]), 0), ny - 1)
+                vz = min(max(int((x[r, 2] + w[r, 2] * enter - origin[2]) / size[2]), 0), nz - 1)
                 sx = 1 if w[r, 0] > 0 else -1
                 sy = 1 if w[r, 1] > 0 else -1
                 sz = 1 if w[r, 2] > 0 else -1
@@ -91,28 +91,28 @@ def march(x, w, excess, energy, k, size, origin, start, width, count, row, max_s
                 if abs(w[r, 2]) >= 1e-12:
                     gz = size[2] / abs(w[r, 2])
                     tz = (origin[2] + size[2] * (vz + (sz > 0)) - x[r, 2]) / w[r, 2]
-                at = near
+                distance = enter
                 clear = energy[r] * factor * f4(0.5)
-                while at < end:
+                while distance < end:
                     face = min(tx, min(ty, tz))
-                    to = max(min(min(face, end), at + max_step), at)
+                    segment_end = max(min(min(face, end), distance + max_step), distance)
                     extinction = k[vx, vy, vz]
                     if extinction > 0:
-                        now = (f4(2) * (excess[r] + at) / LIGHT - start) / width
-                        last = now + (to - at) / metres
+                        now = (f4(2) * (excess[r] + distance) / LIGHT - start) / width
+                        last = now + (segment_end - distance) / metres
                         centre = math.floor(now + f4(0.5))
                         j = int(centre) + row
                         rate = -f4(2) * extinction * metres
                         while now < last:
                             edge = min(centre + f4(0.5), last)
-                            left = clear * math.exp(rate * (edge - now))
-                            leaf[min(max(j, 0), padded - 1)] += clear - left
-                            clear = left
+                            remaining = clear * math.exp(rate * (edge - now))
+                            leaf[min(max(j, 0), padded - 1)] += clear - remaining
+                            clear = remaining
                             now = edge
                             centre += f4(1)
                             j += 1
-                        depth += extinction * (to - at)
-                    if to >= face:
+                        depth += extinction * (segment_end - distance)
+                    if segment_end >= face:
                         if tx <= ty and tx <= tz:
                             vx += sx
                             tx += gx
@@ -128,11 +128,11 @@ def march(x, w, excess, energy, k, size, origin, start, width, count, row, max_s
                             tz += gz
                             if vz < 0 or vz >= nz:
                                 break
-                    at = to
+                    distance = segment_end
             if stop < f4(1e30):
-                place = (f4(2) * (excess[r] + stop) / LIGHT - start) / width
-                centre = math.floor(place + f4(0.5))
-                q = place - centre
+                bin_position = (f4(2) * (excess[r] + stop) / LIGHT - start) / width
+                centre = math.floor(bin_position + f4(0.5))
+                q = bin_position - centre
                 j = min(max(int(centre) + row, 1), padded - 2)
                 value = energy[r] * math.exp(-f4(2) * depth) * -w[r, 2]
                 soil[j - 1] += value * f4(0.5) * (f4(0.5) - q) ** 2
@@ -148,7 +148,7 @@ def march(x, w, excess, energy, k, size, origin, start, width, count, row, max_s
 
 
 def by_hand(lidar: jl.Lidar, scene: jl.Scene, plan: jl.Plan, threads: int):
-    """The kernel with the rays and voxels that jaxlidar would take."""
+    """Return the kernel as a function without arguments, for the rays and voxels of jaxlidar."""
     beam = make_beam(lidar)
     across, energy = fibonacci_disc(beam, plan.n_rays, jnp.asarray([0.5, 0.0]))
     point, w, excess = beam.ray(across)
@@ -165,11 +165,11 @@ def by_hand(lidar: jl.Lidar, scene: jl.Scene, plan: jl.Plan, threads: int):
 
 
 def main() -> None:
-    given = options("First-order march against numba.", rays=8192, rounds=30)
+    arguments = options("First-order march against numba.", rays=8192, rounds=30)
     cores = os.cpu_count() or 1
     numba.set_num_threads(cores)
     lidar, scene = jl.Lidar(divergence=10.0), crown()
-    plan = jl.plan(lidar, scene, max_orders=1, footprint="fixed", n_rays=given.rays)
+    plan = jl.plan(lidar, scene, max_orders=1, footprint="fixed", n_rays=arguments.rays)
 
     trace = eqx.filter_jit(
         lambda lidar, scene, key: jl.trace_scene(jl.make_setup(lidar, scene, plan), key).first[0]
@@ -180,20 +180,20 @@ def main() -> None:
     def batch(key):
         return jax.block_until_ready(trace(lidar, scene, key))
 
-    one, every = by_hand(lidar, scene, plan, 1), by_hand(lidar, scene, plan, cores)
+    single_threaded, multi_threaded = by_hand(lidar, scene, plan, 1), by_hand(lidar, scene, plan, cores)
     contestants = {
         "jaxlidar, one thread": lambda: [batch(key) for key in keys],
         f"jaxlidar, {cores} threads": lambda: list(pool.map(batch, keys)),
-        "numba, one thread": lambda: [one() for _ in keys],
-        f"numba, {cores} threads": lambda: [every() for _ in keys],
+        "numba, one thread": lambda: [single_threaded() for _ in keys],
+        f"numba, {cores} threads": lambda: [multi_threaded() for _ in keys],
     }
-    times = race(contestants, given.rounds)
+    times = race(contestants, arguments.rounds)
     fastest = best(times)
     names = list(fastest)
-    rays = BATCHES * given.rays
+    rays = BATCHES * arguments.rays
 
     ours = np.asarray(batch(keys[0])).sum(axis=1)
-    theirs = every()
+    theirs = multi_threaded()
     difference = {
         material: float(np.abs(a - b).max() / b.max())
         for material, a, b in zip(("leaf", "ground"), ours, theirs)
@@ -203,7 +203,7 @@ def main() -> None:
     record = {
         "machine": {**machine(), "numba": numba.__version__},
         "grid": SHAPE,
-        "rays_per_batch": given.rays,
+        "rays_per_batch": arguments.rays,
         "batches": BATCHES,
         "fine_bin_ns": plan.bins.width,
         "stretches_per_ray_at_most": plan.config.max_ray_segments,
@@ -216,12 +216,12 @@ def main() -> None:
         },
         "largest_difference_over_peak": difference,
     }
-    write_json(given.out / "first_order_march.json", record)
+    write_json(arguments.out / "first_order_march.json", record)
 
     figure, axes = new_figure(size=(7, 3))
     axes.barh(names[::-1], [1e-6 * rates[n] for n in names[::-1]], color=["C1", "C1", "C0", "C0"])
     axes.set(xlabel="million rays per second", title="Order one through 64 x 64 x 128 voxels")
-    save_figure(figure, given.out / "first_order_march.png")
+    save_figure(figure, arguments.out / "first_order_march.png")
 
     rows = [
         (n, rates[n] * 1e-6, medians[n] * 1e-6, 1e9 / rates[n] / plan.config.max_ray_segments) for n in names

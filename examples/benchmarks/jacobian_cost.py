@@ -6,8 +6,8 @@ Four unknowns are optical (Cab, Cw, N of the leaf, reflectance of the ground), f
 slope of the ground, size of the voxels, leaf area). "structured" pushes only the geometric tangents
 through the trace, together, and gets the optical columns from the traced response; "jacfwd" pushes all
 eight through everything. "20 layers" is the leaf area of 20 layers of the crown, as `inversion.retrieve`
-computes it: they change extinction alone, and are scored while photons are traced. "20 layers, jvp" pushes
-them through the trace. Eight batches, one thread per core, warm.
+computes it: layers change extinction alone, so that score functions of photon paths give the derivatives.
+"20 layers, jvp" pushes tangents through the trace. Eight batches, one thread per core, warm.
 """
 
 import os
@@ -46,12 +46,12 @@ def scene_at(optical, geometric, extinction) -> jl.Scene:
 
 
 def main() -> None:
-    given = options("Cost of a Jacobian.", photons=65536, rounds=5)
-    place = (np.arange(N) + 0.5) * SIZE / N
-    x, y, z = np.meshgrid(place, place, place, indexing="ij")
+    arguments = options("Cost of a Jacobian.", photons=65536, rounds=5)
+    centres = (np.arange(N) + 0.5) * SIZE / N
+    x, y, z = np.meshgrid(centres, centres, centres, indexing="ij")
     inside = sum((v - MIDDLE) ** 2 for v in (x, y, z)) < RADIUS**2
-    # Which layer each level of voxels lies in.
-    layer = np.clip((place - MIDDLE + RADIUS) / (2.0 * RADIUS) * LAYERS, 0, LAYERS - 1).astype(int)
+    # Layer of each level of voxels.
+    layer = np.clip((centres - MIDDLE + RADIUS) / (2.0 * RADIUS) * LAYERS, 0, LAYERS - 1).astype(int)
     extinction = jnp.asarray(
         np.where(inside, 0.5 * np.random.default_rng(0).uniform(0, 2, inside.shape), 0.0)
     )
@@ -60,7 +60,7 @@ def main() -> None:
         lidar,
         scene_at(*START, extinction),
         max_orders=ORDERS,
-        n_photons=given.photons // MIN_BATCHES,
+        n_photons=arguments.photons // MIN_BATCHES,
         n_rays=8192 // MIN_BATCHES,
     )
 
@@ -68,32 +68,32 @@ def main() -> None:
         setup = jl.make_setup(lidar, scene_at(optical, geometric, extinction), plan)
         return jl.trace_scene(setup, key, reverse=False)
 
-    def colour(response, optical, geometric):
+    def apply_optics(response, optical, geometric):
         return jl.total_reflectance(
             response, jl.make_setup(lidar, scene_at(optical, geometric, extinction), plan)
         )
 
     def simulate(optical, geometric, key):
-        return colour(response(geometric, optical, key), optical, geometric)
+        return apply_optics(response(geometric, optical, key), optical, geometric)
 
     def geometric_columns(optical, geometric, key):
         def total(g):
             traced = response(g, optical, key)
-            return colour(traced, optical, g), traced
+            return apply_optics(traced, optical, g), traced
 
         push = jax.vmap(lambda t: jax.jvp(total, (geometric,), (t,), has_aux=True), out_axes=(None, -1, None))
         return push(jnp.eye(geometric.size))
 
     def structured(optical, geometric, key):
         value, columns, traced = geometric_columns(optical, geometric, key)
-        return value, jax.jacfwd(lambda o: colour(traced, o, geometric))(optical), columns
+        return value, jax.jacfwd(lambda o: apply_optics(traced, o, geometric))(optical), columns
 
-    def plain(optical, geometric, key):
+    def jacfwd_all(optical, geometric, key):
         return jax.jacfwd(simulate, argnums=(0, 1))(optical, geometric, key)
 
     def optical_columns(optical, geometric, key):
         traced = response(geometric, optical, key)
-        return jax.jacfwd(lambda o: colour(traced, o, geometric))(optical)
+        return jax.jacfwd(lambda o: apply_optics(traced, o, geometric))(optical)
 
     def layer_columns(optical, geometric, key):
         def total(shares):
@@ -124,22 +124,23 @@ def main() -> None:
         "4 optical": over_batches(optical_columns),
         "4 geometric": over_batches(geometric_columns),
         "all 8, structured": over_batches(structured),
-        "all 8, jacfwd": over_batches(plain),
+        "all 8, jacfwd": over_batches(jacfwd_all),
         f"{LAYERS} layers": lambda: model(np.ones(LAYERS)),
         f"{LAYERS} layers, jvp": over_batches(layer_columns),
     }
-    times = race(contestants, given.rounds)
+    times = race(contestants, arguments.rounds)
     fastest = best(times)
     ratio = {name: t / fastest["simulation"] for name, t in fastest.items()}
 
-    _, by_colour, by_trace = contestants["all 8, structured"]()[0]
-    whole = contestants["all 8, jacfwd"]()[0]
+    _, optical_part, geometric_part = contestants["all 8, structured"]()[0]
+    jacfwd_columns = contestants["all 8, jacfwd"]()[0]
     difference = max(
-        float(jnp.max(jnp.abs(a - b)) / jnp.max(jnp.abs(b))) for a, b in zip((by_colour, by_trace), whole)
+        float(jnp.max(jnp.abs(a - b)) / jnp.max(jnp.abs(b)))
+        for a, b in zip((optical_part, geometric_part), jacfwd_columns)
     )
     record = {
         "machine": machine(),
-        "photons": given.photons,
+        "photons": arguments.photons,
         "orders": ORDERS,
         "unknowns": {"optical": OPTICAL, "geometric": GEOMETRIC},
         "seconds": fastest,
@@ -147,15 +148,15 @@ def main() -> None:
         "times_one_simulation": ratio,
         "structured_against_jacfwd": difference,
     }
-    write_json(given.out / "jacobian_cost.json", record)
+    write_json(arguments.out / "jacobian_cost.json", record)
 
     figure, axes = new_figure(size=(7, 3))
     names = list(ratio)[::-1]
     axes.barh(names, [ratio[n] for n in names])
     axes.axvline(5.0, color="black", linestyle="--", label="five simulations")
-    axes.set(xlabel="times one simulation", title=f"Jacobian, {given.photons} photons, {ORDERS} orders")
+    axes.set(xlabel="times one simulation", title=f"Jacobian, {arguments.photons} photons, {ORDERS} orders")
     axes.legend()
-    save_figure(figure, given.out / "jacobian_cost.png")
+    save_figure(figure, arguments.out / "jacobian_cost.png")
 
     medians = record["seconds_median"]
     print_table(

@@ -1,4 +1,4 @@
-"""Write README.md of this folder from the records in `results/`: no figure in it is typed by hand.
+"""Write README.md of this folder from the records in `results/`: no number in it is typed by hand.
 
 Run it as `python examples/benchmarks/make_readme.py` after a benchmark, run with `--out
 examples/benchmarks/results`, has renewed its record.
@@ -14,13 +14,13 @@ from _writing import number, page_of, table
 
 from jaxlidar.io import atomic_write
 
-HERE = Path(__file__).resolve().parent
-RESULTS = HERE / "results"
+FOLDER = Path(__file__).resolve().parent
+RESULTS = FOLDER / "results"
 
-HEAD = """# Benchmarks: what accuracy costs, and other codes beside
+HEAD = """# Benchmarks: cost of accuracy, and comparisons with other codes
 
-Each script measures one thing, writes a record (JSON) and a figure, and says in its first lines what is
-compared with what. This page is made from the records in `results/` by `make_readme.py`.
+Each script measures one thing and writes a record (JSON) and a figure; its first lines explain the
+comparison. This page is made from the records in `results/` by `make_readme.py`.
 
 ```sh
 pip install -e '.[bench]'
@@ -28,12 +28,12 @@ python examples/benchmarks/accuracy_cost.py --out examples/benchmarks/results
 python examples/benchmarks/make_readme.py
 ```
 
-Times are seconds of wall time, warm: programs are compiled before. A tilde marks what is extrapolated.
+Times are seconds of wall time, warm: programs are compiled before. A tilde marks extrapolated times.
 """
 
 
 def machine(record: dict) -> str:
-    """What a record was measured on."""
+    """Return a sentence on the machine of a record."""
     m = record["machine"]
     return f"Measured on {m['cores']} cores ({m['processor']}), Python {m['python']}, jax {m['jax']}."
 
@@ -43,8 +43,8 @@ def accuracy(record: dict) -> str:
         return "not reached" if pair[0] is None else f"{'~' if pair[1] else ''}{number(pair[0])} s"
 
     rows = []
-    for name, found in record["scenes"].items():
-        ours, analog = found["times"]["ours"], found["times"]["analog"]
+    for name, results in record["scenes"].items():
+        ours, analog = results["times"]["ours"], results["times"]["analog"]
         ratios = [number(a[0] / o[0]) for a, o in zip(analog, ours) if a[0] and o[0]]
         rows.append([name, *map(cell, ours), ", ".join(ratios) + " times longer"])
     targets = [f"{100 * t:g} %" for t in record["targets"]]
@@ -53,10 +53,10 @@ def accuracy(record: dict) -> str:
         for key, v in record["knobs"].items()
     ]
     return page_of(
-        "Seconds until the error (root mean square over samples above 1 % of the peak, relative, at 1064 nm) "
-        "is down to a target, and how much longer the paper's estimator takes, target by target.",
-        table(["scene", *targets, "the paper's estimator takes"], rows),
-        "Effect of each setting: errors of the first order against the finest of their kind.",
+        "Seconds to a target error (root mean square over samples above 1 % of the peak, relative, at 1064 "
+        "nm), and how much longer the estimator of the paper takes, target by target.",
+        table(["scene", *targets, "the estimator of the paper takes"], rows),
+        "Effect of each setting: errors of the first order against the finest value of the setting.",
         table(["setting", "error falls as the power"], orders),
     )
 
@@ -67,10 +67,11 @@ def changes(record: dict) -> str:
         for r in record["changes"]
     ]
     return page_of(
-        "Seconds of a call of `simulate` with three wavelengths after one thing was changed, and of the same "
-        "call again. Sizes go up a short ladder, and numbers are arguments of compiled programs: most "
-        "changes compile nothing of the trace (`batch_of_trace_first`, `batch_of_trace_higher`).",
-        table(["change", "s", "s, again", "compiled, beside single operations"], rows),
+        "Seconds of a call of `simulate` with three wavelengths after one change, and of the same call "
+        "repeated. Array sizes are rounded up to size buckets, and numbers are arguments of compiled "
+        "programs, so that most changes do not compile the trace (`batch_of_trace_first`, "
+        "`batch_of_trace_higher`) anew.",
+        table(["change", "s", "s, repeated", "programs compiled"], rows),
     )
 
 
@@ -87,12 +88,13 @@ def peers(record: dict) -> str:
         ]
         for r in record["results"]
     ]
-    head = ["scene, pulse", "code", "s to 1 %", "CPU s to 1 %", "times ours", "s, first call", "total"]
+    head = ["scene, pulse", "code", "s to 1 %", "CPU s to 1 %", "times jaxlidar", "s, first call", "total"]
     return page_of(
-        "Seconds until a waveform is known to 1 %, beside codes that compute the same: a crown of 64³ voxels "
-        "and 15 scatterings, the receiver as wide as what is lit, or open to everything. They do much that "
-        "jaxlidar does not (meshes, any material and camera, polarisation); they have no histories that "
-        "colour one trace for all wavelengths, and no tolerance.",
+        "Seconds to a waveform with an error of 1 %, for jaxlidar and codes that compute the same: a crown "
+        "of 64³ voxels with 15 scatterings, seen by a receiver as wide as the illuminated area, or by one "
+        "that sees everything. The other codes have features that jaxlidar lacks (meshes, any material and "
+        "camera, polarisation); they do not serve all wavelengths by one trace, and do not stop at a "
+        "tolerance.",
         table(head, rows),
     )
 
@@ -124,7 +126,9 @@ def pythons(record: dict) -> str:
         ]
         for what, seconds in newest["seconds"].items()
     ]
-    return page_of("The same work on several Pythons, for each has its newest JAX.", table(head, rows))
+    return page_of(
+        "The same work on several versions of Python, each with its newest JAX.", table(head, rows)
+    )
 
 
 def scaling(record: dict) -> str:
@@ -146,9 +150,9 @@ def effects(record: dict) -> str:
         for r in record["scenes"]
     ]
     return page_of(
-        f"To {record['percent']} %: the scene's own plan beside everything on (empty voxels, all orders, "
-        "air, field of view, jitter ...).",
-        table(["scene", "own plan, s", "everything, s", "times longer"], rows),
+        f"To {record['percent']} %: the plan of the scene, and a plan with everything on (empty voxels, all "
+        "orders, air, field of view, jitter ...).",
+        table(["scene", "plan of the scene, s", "everything on, s", "times longer"], rows),
     )
 
 
@@ -157,8 +161,8 @@ def march(record: dict) -> str:
     rows = [[name, number(1e-6 * rate)] for name, rate in record["rays_per_second"].items()]
     return page_of(
         table(["first order", "million rays a second"], rows),
-        f"Over a parallel numba kernel of the same traversal: {number(ratio['all cores'])} of its rate on "
-        f"all cores, {number(ratio['one thread'])} on one.",
+        f"The rate of jaxlidar is {number(ratio['all cores'])} times that of a parallel numba kernel for the "
+        f"same traversal on all cores, and {number(ratio['one thread'])} times on one.",
     )
 
 
@@ -185,10 +189,10 @@ def fits(record: dict) -> str:
         for case, r in record["fits"].items()
     ]
     return page_of(
-        f"The same simulation of {record['photons']:,} photons under both; medians of {record['targets']} "
-        'targets. "Same" counts the fits that end at the same chi-squared, to 0.5; "elsewhere" is how much '
-        "larger scipy's is in each of the others.",
-        table(["unknowns", "retrieve, s", "scipy, s", "times faster", "same", "elsewhere"], rows),
+        f"Both use the same simulation of {record['photons']:,} photons; medians of {record['targets']} "
+        'targets. "Same" counts the fits that end at the same chi-squared, to 0.5; "excess" lists by how '
+        "much the chi-squared of scipy is larger in each of the others.",
+        table(["unknowns", "retrieve, s", "scipy, s", "times faster", "same", "excess"], rows),
     )
 
 
@@ -205,17 +209,21 @@ def coverage(record: dict) -> str:
     ]
     head = ["unknown", "rms error", "over the Cramer-Rao bound", "within 95 % intervals", "noise-free"]
     return page_of(
-        f"{record['targets']} noisy targets (three wavelengths, 2 % of the peak) from random starts, "
-        f"{record['photons']:,} photons a batch: {100 * record['converged']:.0f} % converge, and "
-        f"{100 * record['covered']:.1f} % of the truths lie within the 95 % intervals. Noise-free: relative.",
+        f"{record['targets']} noisy targets (three wavelengths, noise of 2 % of the peak) from random "
+        f"starts, {record['photons']:,} photons a batch: {100 * record['converged']:.0f} % of the fits "
+        f"converge, and {100 * record['covered']:.1f} % of the truths lie within the 95 % intervals. The "
+        "last column is the median error without noise, relative.",
         table(head, rows),
     )
 
 
 def prospect(record: dict) -> str:
-    each = record["seconds_per_leaf"]
+    seconds_per_leaf = record["seconds_per_leaf"]
     kinds = ("prosail", "spectra", "jacobian")
-    rows = [[kind, number(1e6 * min(t for n, t in each.items() if n.startswith(kind)))] for kind in kinds]
+    rows = [
+        [kind, number(1e6 * min(t for n, t in seconds_per_leaf.items() if n.startswith(kind)))]
+        for kind in kinds
+    ]
     return page_of(
         table(["2,101 wavelengths", "us a leaf"], rows),
         f"{number(record['times_faster_than_prosail'])} times faster than looping prosail; all derivatives "
@@ -234,38 +242,40 @@ def leaves(record: dict) -> str:
             leaves,
             domain,
             *(
-                f"{number(error, 3)}, {number(100 * found['within two standard errors'][name])} %"
-                for name, error in found["rmse"].items()
+                f"{number(error, 3)}, {number(100 * errors['within two standard errors'][name])} %"
+                for name, error in errors["rmse"].items()
             ),
         ]
         for leaves, domains in record["domains"].items()
-        for domain, found in domains.items()
+        for domain, errors in domains.items()
     ]
     return page_of(
         f"{record['leaves']} measured leaves, all bands.",
         table(head, rows),
         f"{number(record['times_faster'])} times faster than scipy over prosail.",
-        "By the bands that traits come from: rms errors, share of leaves within two standard errors. Leaves "
-        "made by PROSPECT have noise and a smooth error of the model.",
+        "Root mean square errors and fractions of leaves within two standard errors, by the bands that the "
+        "fit uses. Leaves made by PROSPECT have noise and a smooth error of the model.",
         table(["leaves", "domain", *record["rmse"]["scipy"]], covered),
     )
 
 
-def campaign(record: dict) -> str:
-    ways, side = record["ways"], record["side"]
-    faster = ways["footprints, simulate"]["ms per shot"] / ways["footprints, shared"]["ms per shot"]
-    faster_scan = ways["scan, simulate"]["ms per shot"] / ways["scan, apart"]["ms per shot"]
+def surveys(record: dict) -> str:
+    strategies, side = record["ways"], record["side"]
+    faster = (
+        strategies["footprints, simulate"]["ms per shot"] / strategies["footprints, shared"]["ms per shot"]
+    )
+    faster_scan = strategies["scan, simulate"]["ms per shot"] / strategies["scan, apart"]["ms per shot"]
     largest = record["by side"][-1]
     hectares, rough = largest["side"] ** 2 / 1e4, f"{number(100 * record['rough'])} %"
     hours = 100 * largest["seconds"] / hectares * record["machine"]["cores"] / 3600
     return page_of(
-        f"Trees of {side} m x {side} m at voxels of 1 m over rolling terrain. Footprints of 25 m from orbit, "
-        "all orders: with light that they share; traced one by one by one program; and by a call of "
-        "`simulate` for each. The same with a field of view as wide as the footprints, and off nadir. Shots "
-        "of a scanner, 0.3 m wide, at first order: by one program, and by a call for each. The tolerance is "
-        "that of every single shot.",
+        f"Trees of {side} m x {side} m at voxels of 1 m over rolling terrain. Footprints of 25 m from "
+        "orbit, all orders, by three strategies: shared illumination (`shared`); shot by shot in one "
+        "program (`apart`); one call of `simulate` for each. The same with a field of view as wide as the "
+        "footprints, and off nadir. Shots of a scanner, 0.3 m wide, at first order. The tolerance is that "
+        "of every single shot.",
         table(
-            ("way", "shots", "tolerance", "ms a shot", "error, median"),
+            ("strategy", "shots", "tolerance", "ms a shot", "error, median"),
             [
                 (
                     name,
@@ -274,13 +284,13 @@ def campaign(record: dict) -> str:
                     number(r["ms per shot"]),
                     f"{number(100 * r['error, median'])} %",
                 )
-                for name, r in ways.items()
+                for name, r in strategies.items()
             ],
         ),
-        f"Sharing light is {number(faster)} times faster than calls, one program for a scan "
-        f"{number(faster_scan)} times. All of this in one process took at most "
+        f"Shared illumination is {number(faster)} times faster than single calls, one program for a scan "
+        f"{number(faster_scan)} times. One process with all of these took at most "
         f"{number(record['peak GB'])} GB.",
-        f"More footprints over the same trees, to {rough}, cost little more:",
+        f"The number of footprints over the same trees, to {rough}, hardly changes the cost:",
         table(
             ("footprints", "s", "ms each"),
             [
@@ -288,7 +298,7 @@ def campaign(record: dict) -> str:
                 for r in record["by shots"]
             ],
         ),
-        f"As many footprints per hectare over more trees, to {rough}:",
+        f"Larger areas with the same number of footprints per hectare, to {rough}:",
         table(
             ("ha", "footprints", "s"),
             [
@@ -296,15 +306,15 @@ def campaign(record: dict) -> str:
                 for r in record["by side"]
             ],
         ),
-        f"On paper: tiles do not depend on one another, so a square kilometre to {rough} takes "
-        f"{number(hours)} core hours, and a country of 100,000 km2 {number(hours * 1e5 / 24 / 1e4)} days of "
-        "10,000 cores. Waveforms are written as they come; of a map, 4 bytes a voxel, only the "
-        "parts that are traced (`SceneParts`) need fit into memory.",
+        f"Extrapolated, as tiles are independent: a square kilometre to {rough} takes {number(hours)} core "
+        f"hours, and a country of 100,000 km2 {number(hours * 1e5 / 24 / 1e4)} days of 10,000 cores. "
+        "Waveforms are written as they are computed; of a map, with 4 bytes a voxel, only the tiles in "
+        "work (`SceneParts`) need to fit into memory.",
     )
 
 
 def profiles(record: dict) -> str:
-    every, batch, scattered = record["all"], record["batch"], record["scattered"]
+    total, batch, scattered = record["all"], record["batch"], record["scattered"]
 
     def percent(x: float) -> str:
         return f"{100 * x:.0f} %"
@@ -325,9 +335,9 @@ def profiles(record: dict) -> str:
     ]
     return page_of(
         f"Profiles of {record['layers']} layers of {record['thickness']:g} m from simulated GEDI-like "
-        "waveforms, by fits with a smoothness prior and by the closed-form gap inversion of level 2B, which "
-        "is told the ground's true height and where the signal ends. Errors are root mean squares over layers"
-        f" in m2/m3, medians over {record['stands']} stands.",
+        "waveforms, by fits with a smoothness prior and by the closed-form gap inversion of level 2B, "
+        "which is given the true height of the ground and the ends of the signal. Errors are root mean "
+        f"squares over layers in m2/m3, medians over {record['stands']} stands.",
         table(
             (
                 "slope",
@@ -342,57 +352,58 @@ def profiles(record: dict) -> str:
             ),
             rows,
         ),
-        f"Of all {every['profiles']} profiles, the fit is better in {percent(every['better'])}, in the median"
-        f" by a factor of {number(every['factor'])}; in {percent(every['better_than_true_ratio'])} by "
-        f"{number(every['factor_true_ratio'])} where the closed form is told the true ratio of reflectances. "
-        f"Total plant area is off by {number(every['area_error'])} (closed form "
-        f"{number(every['area_error_closed'])}); {percent(every['converged'])} of the fits converged, after "
-        f"{number(every['steps'])} simulations, on slopes in {number(every['seconds'])} s each.",
-        f"Where light is followed through {record['orders']} scatterings, of which neither method knows, the "
+        f"Of all {total['profiles']} profiles, the fit is better in {percent(total['better'])}, in the median"
+        f" by a factor of {number(total['factor'])}; in {percent(total['better_than_true_ratio'])} by "
+        f"{number(total['factor_true_ratio'])} if the closed form is given the true ratio of reflectances. "
+        f"Total plant area is off by {number(total['area_error'])} (closed form "
+        f"{number(total['area_error_closed'])}); {percent(total['converged'])} of the fits converged, after "
+        f"{number(total['steps'])} simulations, on slopes in {number(total['seconds'])} s each.",
+        f"With {record['orders']} scatterings in the simulated records, which neither method models, the "
         f"fit is better in {percent(scattered['better'])} of {scattered['profiles']} profiles (errors "
-        f"{number(scattered['fit'])} and {number(scattered['closed'])} m2/m3), but its band has the truth in "
-        f"only {percent(scattered['covered'])} of the layers; {percent(scattered['converged'])} converged.",
+        f"{number(scattered['fit'])} and {number(scattered['closed'])} m2/m3), but its band holds the truth "
+        f"in only {percent(scattered['covered'])} of the layers; {percent(scattered['converged'])} "
+        "converged.",
         f"On level ground, {batch['profiles']} profiles in one batch take {number(batch['seconds'])} s, "
         f"{number(batch['per_profile'])} s each.",
     )
 
 
 SECTIONS: dict[str, tuple[str, Callable[[dict], str]]] = {
-    "accuracy_cost": ("What accuracy costs", accuracy),
-    "simulation_cost": ("What `simulate` costs", simulation),
-    "everyday_changes": ("What a change of a scene costs", changes),
-    "campaign": ("What thousands of footprints cost", campaign),
+    "accuracy_cost": ("Cost of accuracy", accuracy),
+    "simulation_cost": ("Cost of `simulate`", simulation),
+    "everyday_changes": ("Cost of changing a scene", changes),
+    "surveys": ("Cost of thousands of footprints", surveys),
     "peers": ("Other codes", peers),
-    "effects_cost": ("What plans save", effects),
-    "scaling": ("How cost grows", scaling),
+    "effects_cost": ("Time saved by plans", effects),
+    "scaling": ("Scaling of cost", scaling),
     "python_versions": ("Older Pythons", pythons),
-    "first_order_march": ("The first order beside a kernel written by hand", march),
+    "first_order_march": ("First order against a kernel written by hand", march),
     "one_trace_all_wavelengths": ("Many wavelengths from one trace", wavelengths),
     "jacobian_cost": ("Jacobians of a waveform", jacobian),
-    "fit_speed": ("Fits beside scipy", fits),
-    "retrieval_coverage": ("How good retrievals are, and how good they say they are", coverage),
-    "profiles": ("Vertical profiles beside the closed form", profiles),
-    "prospect_speed": ("PROSPECT beside prosail", prospect),
+    "fit_speed": ("Fits against scipy", fits),
+    "retrieval_coverage": ("Accuracy and coverage of retrievals", coverage),
+    "profiles": ("Vertical profiles against the closed form", profiles),
+    "prospect_speed": ("PROSPECT against prosail", prospect),
     "leaf_inversion": ("Traits of measured leaves", leaves),
 }
 
 
 def page() -> str:
-    """The text of README.md."""
-    parts = [HEAD]
+    """Return the text of README.md."""
+    paragraphs = [HEAD]
     for name, (title, section) in SECTIONS.items():
         path = RESULTS / f"{name}.json"
         if not path.exists():
-            parts.append(f"## {title}\n\n`{name}.py`. There is no record of it yet.\n")
+            paragraphs.append(f"## {title}\n\n`{name}.py`. There is no record of it yet.\n")
             continue
         record = json.loads(path.read_text())
-        parts.append(f"## {title}\n\n`{name}.py`. {machine(record)}\n\n{section(record)}\n")
+        paragraphs.append(f"## {title}\n\n`{name}.py`. {machine(record)}\n\n{section(record)}\n")
         if path.with_suffix(".png").exists():
-            parts.append(f"![{title}](results/{name}.png)\n")
-    parts.append(PAGE)
-    return "\n".join(parts)
+            paragraphs.append(f"![{title}](results/{name}.png)\n")
+    paragraphs.append(PAGE)
+    return "\n".join(paragraphs)
 
 
 if __name__ == "__main__":
-    with atomic_write(HERE / "README.md") as draft:
+    with atomic_write(FOLDER / "README.md") as draft:
         draft.write_text(page())

@@ -1,4 +1,4 @@
-"""One trace serves all wavelengths: 2,101 wavelengths against one, same scene and photons.
+"""One trace for all wavelengths: 2,101 wavelengths against one, same scene and photons.
 
 Run it as `python examples/benchmarks/one_trace_all_wavelengths.py [--out figures] [--photons 131072]
 [--rounds 9]`. The scene is a crown of leaf (PROSPECT) and bark over the ground, ten orders. Whole calls of
@@ -18,9 +18,9 @@ ORDERS = 10
 
 
 def crown() -> jl.Scene:
-    """Leaf and bark in an ellipsoid over bare soil."""
-    place = (np.arange(N) + 0.5) * SIZE / N
-    x, y, z = np.meshgrid(place, place, place, indexing="ij")
+    """Return leaf and bark in a sphere over bare soil."""
+    centres = (np.arange(N) + 0.5) * SIZE / N
+    x, y, z = np.meshgrid(centres, centres, centres, indexing="ij")
     inside = (x - 5) ** 2 + (y - 5) ** 2 + (z - 6) ** 2 < 3.5**2
     k = np.where(inside, 0.5 * np.random.default_rng(0).uniform(0, 2, (N, N, N)), 0.0)
     voxels = jl.VoxelMap.from_extinction(0.9 * k, 0.1 * k, voxel_size=SIZE / N, origin=(-5.0, -5.0, 0.0))
@@ -29,35 +29,35 @@ def crown() -> jl.Scene:
 
 
 def main() -> None:
-    given = options("One trace for all wavelengths.", photons=131072, rounds=9)
+    arguments = options("One trace for all wavelengths.", photons=131072, rounds=9)
     scene, key = crown(), jax.random.key(0)
 
     def simulation(wavelength):
         lidar = jl.Lidar(wavelength=wavelength, divergence=10.0, profile="top-hat")
         return lambda: (
-            jl.simulate(lidar, scene, key=key, n_photons=given.photons, max_orders=ORDERS).reflectance
+            jl.simulate(lidar, scene, key=key, n_photons=arguments.photons, max_orders=ORDERS).reflectance
         )
 
-    times = race({str(n): simulation(w) for n, w in WAVELENGTHS.items()}, given.rounds)
+    times = race({str(n): simulation(w) for n, w in WAVELENGTHS.items()}, arguments.rounds)
     fastest = best(times)
     ratio = {n: t / fastest["1"] for n, t in fastest.items()}
     record = {
         "machine": machine(),
-        "photons": given.photons,
+        "photons": arguments.photons,
         "orders": ORDERS,
         "seconds": fastest,
         "seconds_median": {n: float(np.median(t)) for n, t in times.items()},
         "times_one_wavelength": ratio,
     }
-    write_json(given.out / "one_trace_all_wavelengths.json", record)
+    write_json(arguments.out / "one_trace_all_wavelengths.json", record)
 
     figure, axes = new_figure()
     axes.semilogx([int(n) for n in fastest], list(fastest.values()), "o-")
     axes.axhline(1.15 * fastest["1"], color="black", linestyle="--", label="1.15 times one wavelength")
     axes.set(xlabel="wavelengths", ylabel="seconds", ylim=(0, 1.2 * max(fastest.values())))
-    axes.set_title(f"simulate: {given.photons} photons, {ORDERS} orders")
+    axes.set_title(f"simulate: {arguments.photons} photons, {ORDERS} orders")
     axes.legend()
-    save_figure(figure, given.out / "one_trace_all_wavelengths.png")
+    save_figure(figure, arguments.out / "one_trace_all_wavelengths.png")
 
     medians = record["seconds_median"]
     print_table(

@@ -1,39 +1,37 @@
 """jaxlidar beside Mitsuba 3 with mitransient, and MCX-CL: seconds until a waveform is known to 1 %.
 
-Run it as `python examples/benchmarks/peers.py [--out figures] [--repeats 8]` after
-`pip install -e '.[bench]'`, which brings the peers where they run on a CPU. A peer that is not there is left
-out, and said to be. Each runs in a process of its own. mitransient needs an LLVM library
-(`DRJIT_LIBLLVM_PATH`, or the one that the extra brings), pmcxcl an OpenCL runtime (see `_peer_mcx.py`).
+Run it as `python examples/benchmarks/peers.py [--out figures] [--repeats 8]` after `pip install -e
+'.[bench]'`, which brings the peers where they run on a CPU. A missing peer is left out, with a note. Each
+runs in a process of its own. mitransient needs an LLVM library (`DRJIT_LIBLLVM_PATH`, or the one that the
+extra brings), pmcxcl an OpenCL runtime (see `_peer_mcx.py`).
 
 The scene: 64^3 voxels of 10 m / 64; in a sphere of radius 3.5 m the extinction is 0.5 U(0, 2) 1/m, rounded to
 1/200 1/m because MCX numbers its media; isotropic scattering with albedo 0.9; Lambertian ground of
 reflectance 0.3. The laser lights a disc of 5 m from 1000 m; 200 samples of 1 ns; up to 15 scatterings. The
 receiver is as wide as what is lit, as instruments have it: jaxlidar's field of view is round with a soft
 edge, mitransient's camera sees a square of the same area. As their edges differ, agreement is tested where
-the receiver sees everything. Compared are the returns of an instant pulse in samples of 1 ns, which is what
-the peers compute, and those of a pulse of 6 ns, with which the peers' histograms of 0.05 ns are convolved
-afterwards, at no charge.
+the receiver sees everything. Compared are the returns of an instant pulse in samples of 1 ns, which the peers
+compute, and those of a pulse of 6 ns; the convolution of the histograms of the peers (0.05 ns) is not timed.
 
-The error is the root mean square, over the samples above 1 % of the peak, of the standard deviation over
-repetitions over the mean; seconds to 1 % = seconds * (error / 0.01)^2. A repetition does about the work that
-1 % takes. jaxlidar's is `simulate(..., rtol=0.01)` with defaults but for orders and window, so its seconds
-are real ones. The first call, which compiles, is not counted but given. CPU seconds depend less on
-what else the machine does. Agreement is tested on sums of 5 ns (jaxlidar spreads an instant over three of
-its fine bins) and on totals, in standard errors of the difference.
+The error of a sample is its standard deviation over repetitions divided by its mean; that of a waveform is
+the root mean square over the samples above 1 % of the peak. Seconds to 1 % = seconds * (error / 0.01)^2. A
+repetition has about 1 % of error. For jaxlidar it is `simulate(..., rtol=0.01)` with defaults except orders
+and window, so that its seconds need no extrapolation. The first call, which compiles, is listed separately.
+CPU seconds depend less on other load of the machine. Agreement is tested on sums of 5 ns (jaxlidar spreads an
+instant over three fine bins) and on totals, in standard errors of the difference.
 
-What the peers do and jaxlidar does not: Mitsuba takes meshes, any material, camera and emitter,
-polarisation, and images, and gives the gradient in all voxels by one backward pass; MCX has refraction,
-anisotropic phase functions, detectors in contact and maps of fluence. Both are made for GPUs; on a CPU
-they are far from home. What the peers do not: MCX has no Lambertian ground (so the crown stands alone
-for it), no limit of orders and no return to a distant receiver, which is computed here from its fluence;
-neither has the optics of all wavelengths from one trace, standard errors, or a stop at a tolerance.
+Features that only the peers have: Mitsuba takes meshes, any material, camera and emitter, polarisation, and
+images; MCX has refraction, detectors in contact and maps of fluence. Both are made for GPUs and are slower on
+a CPU. Limitations of the peers: MCX has no Lambertian ground (so that only the crown alone is compared), no
+limit of orders and no return to a distant receiver, which is computed here from its fluence; neither has the
+optics of all wavelengths from one trace, standard errors, or a stop at a tolerance.
 
-mitransient 1.3.1 leaves stretches between null collisions out of path lengths. `_peer_mitransient.py`
-corrects that, or says that it could not, when only totals can be compared. "Spot and camera" is the set-up
-that a user of a renderer begins with, its camera sees the square of 10 m x 10 m.
-MCX books light when it leaves a voxel, by gates of 1 ns: compare its totals, its samples are that coarse.
-MCX's own way is to count photons that leave within a cone; how long that would take is computed, not
-measured, for a half angle of 10 degrees, from its rate and the Poisson statistics of equal photons.
+mitransient 1.3.1 leaves segments between null collisions out of path lengths. `_peer_mitransient.py` corrects
+that; if it cannot, the record says so, and only totals can be compared. The case "camera" is the set-up that
+a user of a renderer begins with, a spot and a camera that sees the square of 10 m x 10 m. MCX deposits light
+when it leaves a voxel, by gates of 1 ns: compare its totals, as its samples are that coarse. The usual method
+of MCX is to count photons that leave within a cone; the time of that is computed, not measured, for a half
+angle of 10 degrees, from the rate of photons and the Poisson statistics of equal photons.
 """
 
 import os
@@ -54,27 +52,27 @@ FINE, SAMPLES, LEVELS = 0.05, 200, 200
 ALBEDO, SOIL = 0.9, 0.3
 PULSES = {"instant": 0.0, "6 ns": 6.0}
 # Sums of five samples, so that the ground's return lies in the middle of one.
-FIRST, BLOCK = 3, 5
+FIRST_SAMPLE, BLOCK_SIZE = 3, 5
 CONE = 10.0
-# Rays and photons of one repetition: about 1 % of error.
+# Rays and photons of one repetition, for about 1 % of error.
 WORK = {"mitransient_samples": 2**19, "mcx_photons": 400_000}
 CASES = {
     "camera": "crown over ground, narrow receiver",
     "ground": "crown over ground",
     "alone": "crown alone",
 }
-# Of the same area as the camera's square: in mrad, from 1000 m.
+# Full angle in mrad of a round view from 1000 m, of the same area as the square of the camera.
 FIELD_OF_VIEW = 2 * SIZE / np.sqrt(np.pi)
 
 
-def crown() -> np.ndarray:
-    """Extinction in 1/m."""
+def crown_extinction() -> np.ndarray:
+    """Return the extinction coefficients of the crown in 1/m."""
     k = np.asarray(scenes()["crown over ground"].canopy.voxels.leaf, dtype=float)
     return np.rint(k * LEVELS) / LEVELS
 
 
-def task(extinction: np.ndarray, repeats: int) -> dict:
-    """What the workers are given."""
+def worker_task(extinction: np.ndarray, repeats: int) -> dict:
+    """Return the arrays that a worker reads."""
     return {
         **{"extinction": extinction, "albedo": ALBEDO, "reflectance": SOIL, "orders": ORDERS, "size": SIZE},
         **{"altitude": float(LIDAR.altitude), "radius": float(LIDAR.footprint_radius), "fine": FINE},
@@ -82,8 +80,8 @@ def task(extinction: np.ndarray, repeats: int) -> dict:
     }
 
 
-def ours(extinction: np.ndarray, case: str, pulse: float, repeats: int, orders: int = ORDERS) -> dict:
-    """Repetitions of `simulate` to 1 %."""
+def run_jaxlidar(extinction: np.ndarray, case: str, pulse: float, repeats: int, orders: int = ORDERS) -> dict:
+    """Return waveforms and times of repetitions of `simulate` to 1 %."""
     voxels = jl.VoxelMap.from_extinction(
         leaf=extinction, voxel_size=SIZE / N, origin=(-SIZE / 2, -SIZE / 2, 0.0)
     )
@@ -111,31 +109,31 @@ def ours(extinction: np.ndarray, case: str, pulse: float, repeats: int, orders: 
     }
 
 
-def peer(worker: str, given: Path) -> dict[str, np.ndarray] | str:
-    """What a worker measured, or why it did not."""
+def run_peer(worker: str, task_file: Path) -> dict[str, np.ndarray] | str:
+    """Run a worker and return its arrays, or the reason of its failure."""
     with tempfile.TemporaryDirectory() as folder:
         result = Path(folder, "result.npz")
-        command = [sys.executable, str(Path(__file__).with_name(worker)), str(given), str(result)]
-        done = subprocess.run(command, capture_output=True, text=True, errors="replace")
+        command = [sys.executable, str(Path(__file__).with_name(worker)), str(task_file), str(result)]
+        process = subprocess.run(command, capture_output=True, text=True, errors="replace")
         if not result.exists():
-            lines = (done.stderr.strip() or done.stdout.strip() or "no message").splitlines()
+            lines = (process.stderr.strip() or process.stdout.strip() or "no message").splitlines()
             reason = next((line for line in lines if line.startswith("error:")), "")
-            return "; ".join(filter(None, (lines[-1], reason, f"exit status {done.returncode}")))
+            return "; ".join(filter(None, (lines[-1], reason, f"exit status {process.returncode}")))
         return dict(np.load(result))
 
 
 def sampled(fine: np.ndarray, pulse: float) -> np.ndarray:
-    """Histograms of fine bins as the digitiser's samples of returns of a Gaussian pulse."""
+    """Convolve histograms of fine bins with a Gaussian pulse and sum them to samples of 1 ns."""
     if pulse > 0:
         sigma = pulse / np.sqrt(8 * np.log(2)) / FINE
-        reach = np.arange(-int(5 * sigma), int(5 * sigma) + 1)
-        kernel = np.exp(-0.5 * (reach / sigma) ** 2)
+        offsets = np.arange(-int(5 * sigma), int(5 * sigma) + 1)
+        kernel = np.exp(-0.5 * (offsets / sigma) ** 2)
         fine = np.array([np.convolve(row, kernel / kernel.sum(), "same") for row in fine])
     return fine.reshape(len(fine), SAMPLES, -1).sum(axis=-1)
 
 
-def judge(run: dict) -> dict[str, float]:
-    """Error of one repetition, and what 1 % costs."""
+def cost_of(run: dict) -> dict[str, float]:
+    """Return the error of one repetition, and the time to 1 %."""
     mean, deviation = run["waves"].mean(axis=0), run["waves"].std(axis=0, ddof=1)
     seen = mean > 0.01 * mean.max()
     error = float(np.sqrt(np.mean((deviation[seen] / mean[seen]) ** 2)))
@@ -154,22 +152,22 @@ def judge(run: dict) -> dict[str, float]:
     }
 
 
-def counted(run: dict, photons: int) -> float:
-    """Seconds to 1 % where photons that leave within a cone are counted, at the rate of `run`."""
+def seconds_if_counted(run: dict, photons: int) -> float:
+    """Return the seconds to 1 % by counting photons that leave within a cone, at the rate of `run`."""
     mean = run["waves"].mean(axis=0)
-    # Of the light that a Lambertian target scatters, sin^2 leaves within the cone.
+    # The fraction sin^2(half angle) of Lambertian light leaves within the cone.
     share = np.sin(np.deg2rad(CONE)) ** 2 * mean[mean > 0.01 * mean.max()]
     return float(np.mean(1 / share) / 0.01**2 * np.median(run["times"][:, 0]) / photons)
 
 
 def block_sums(waves: np.ndarray) -> np.ndarray:
-    """Sums of 5 ns of waveforms, the first from sample number `FIRST` on."""
-    last = FIRST + (SAMPLES - FIRST) // BLOCK * BLOCK
-    return waves[:, FIRST:last].reshape(len(waves), -1, BLOCK).sum(axis=-1)
+    """Return sums of 5 ns of waveforms, from sample number `FIRST_SAMPLE` on."""
+    last = FIRST_SAMPLE + (SAMPLES - FIRST_SAMPLE) // BLOCK_SIZE * BLOCK_SIZE
+    return waves[:, FIRST_SAMPLE:last].reshape(len(waves), -1, BLOCK_SIZE).sum(axis=-1)
 
 
 def agreement(a: np.ndarray, b: np.ndarray) -> dict[str, float]:
-    """Differences in standard errors: of the totals, and root mean square and largest of the sums of 5 ns."""
+    """Return differences in standard errors: totals; root mean square and largest of the sums of 5 ns."""
 
     def z(x, y):
         error = np.sqrt(x.var(axis=0, ddof=1) / len(x) + y.var(axis=0, ddof=1) / len(y))
@@ -187,77 +185,79 @@ def agreement(a: np.ndarray, b: np.ndarray) -> dict[str, float]:
         "largest_z": float(np.abs(by_block).max()),
         "rms_relative": float(np.sqrt(np.mean(relative**2))),
         "blocks": int(bright.sum()),
-        # Errors estimated from few repetitions make Student's distribution of them.
+        # Student's distribution, as standard errors are estimated from few repetitions.
         "rms_z_expected": float(np.sqrt(freedom / (freedom - 2))),
     }
 
 
 def main() -> None:
-    given = options("jaxlidar beside peers.", repeats=8)
-    if given.repeats < 3:
-        raise SystemExit(f"--repeats = {given.repeats} is below 3: no standard deviation to speak of")
-    extinction = crown()
+    arguments = options("jaxlidar beside peers.", repeats=8)
+    if arguments.repeats < 3:
+        raise SystemExit(f"--repeats = {arguments.repeats} is below 3: no standard deviation to speak of")
+    extinction = crown_extinction()
 
     runs: dict[tuple[str, str], dict[str, dict]] = {}
     load = {"jaxlidar": os.getloadavg()[0]}
     for case in CASES:
         for pulse, fwhm in PULSES.items():
-            runs[case, pulse] = {"jaxlidar": ours(extinction, case, fwhm, given.repeats)}
+            runs[case, pulse] = {"jaxlidar": run_jaxlidar(extinction, case, fwhm, arguments.repeats)}
     notes: dict[str, str] = {}
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder, "given.npz")
-        np.savez(file, **task(extinction, given.repeats))
+        np.savez(file, **worker_task(extinction, arguments.repeats))
         for name, worker in (("mitransient", "_peer_mitransient.py"), ("MCX-CL", "_peer_mcx.py")):
             load[name] = os.getloadavg()[0]
-            found = peer(worker, file)
-            if isinstance(found, str):
-                notes[name] = f"left out: {found}"
+            measurements = run_peer(worker, file)
+            if isinstance(measurements, str):
+                notes[name] = f"left out: {measurements}"
                 continue
-            notes[name] = str(found["version"])
-            if not found.get("corrected", True):
+            notes[name] = str(measurements["version"])
+            if not measurements.get("corrected", True):
                 notes[name] += ", path lengths not corrected: only totals are comparable"
             for (case, pulse), run in runs.items():
-                if f"{case}_waves" in found:
-                    waves = sampled(found[f"{case}_waves"], PULSES[pulse])
-                    times, first = found[f"{case}_times"], float(found[f"{case}_first"])
+                if f"{case}_waves" in measurements:
+                    waves = sampled(measurements[f"{case}_waves"], PULSES[pulse])
+                    times, first = measurements[f"{case}_times"], float(measurements[f"{case}_first"])
                     run[name] = {"waves": waves, "times": times, "first": first}
 
     results, rows = [], []
     for (case, pulse), run in runs.items():
-        mine = judge(run["jaxlidar"])
-        for name, one in run.items():
-            its = judge(one)
+        jaxlidar_cost = cost_of(run["jaxlidar"])
+        for name, code_run in run.items():
+            cost = cost_of(code_run)
             if name != "jaxlidar":
-                its["ratio"] = its["seconds_to_1_percent"] / mine["seconds_to_1_percent"]
-                its["cpu_ratio"] = its["cpu_seconds_to_1_percent"] / mine["cpu_seconds_to_1_percent"]
-            if name != "jaxlidar" and case != "camera":
-                its["agreement"] = agreement(run["jaxlidar"]["waves"], one["waves"])
-            if name == "MCX-CL":
-                its["seconds_if_counted_computed"] = counted(one, WORK["mcx_photons"])
-                notes["counted"] = notes.get("counted", "MCX-CL counting photons, computed s to 1 %") + (
-                    f"; {pulse} {its['seconds_if_counted_computed']:.3g}"
+                cost["ratio"] = cost["seconds_to_1_percent"] / jaxlidar_cost["seconds_to_1_percent"]
+                cost["cpu_ratio"] = (
+                    cost["cpu_seconds_to_1_percent"] / jaxlidar_cost["cpu_seconds_to_1_percent"]
                 )
-            results.append({"case": CASES[case], "pulse": pulse, "code": name, **its})
-            test = its.get("agreement")
+            if name != "jaxlidar" and case != "camera":
+                cost["agreement"] = agreement(run["jaxlidar"]["waves"], code_run["waves"])
+            if name == "MCX-CL":
+                cost["seconds_if_counted_computed"] = seconds_if_counted(code_run, WORK["mcx_photons"])
+                notes["counted"] = notes.get("counted", "MCX-CL counting photons, computed s to 1 %") + (
+                    f"; {pulse} {cost['seconds_if_counted_computed']:.3g}"
+                )
+            results.append({"case": CASES[case], "pulse": pulse, "code": name, **cost})
+            test = cost.get("agreement")
             rows.append(
                 (
                     f"{CASES[case]}, {pulse}: {name}",
-                    its["seconds"],
-                    100 * its["error"],
-                    its["seconds_to_1_percent"],
-                    its["cpu_seconds_to_1_percent"],
-                    its.get("ratio", ""),
-                    its.get("cpu_ratio", ""),
-                    its["first_call_seconds"],
-                    its["total"],
+                    cost["seconds"],
+                    100 * cost["error"],
+                    cost["seconds_to_1_percent"],
+                    cost["cpu_seconds_to_1_percent"],
+                    cost.get("ratio", ""),
+                    cost.get("cpu_ratio", ""),
+                    cost["first_call_seconds"],
+                    cost["total"],
                     f"{test['total_z']:.1f}, {test['rms_z']:.2f} ({test['rms_z_expected']:.2f})"
                     if test
                     else "",
                 )
             )
     record = {"machine": {**machine(), "load_before": load}, "notes": notes}
-    write_json(given.out / "peers.json", {**record, "work": WORK, "results": results})
-    draw(runs, results, given.out / "peers.png")
+    write_json(arguments.out / "peers.json", {**record, "work": WORK, "results": results})
+    draw_record(runs, results, arguments.out / "peers.png")
     head = (
         "",
         "s",
@@ -277,8 +277,8 @@ def main() -> None:
         print(f"{name}: {note}")
 
 
-def draw(runs: dict, results: list[dict], path: Path) -> None:
-    """Waveforms with bands of two standard errors of one repetition, and what 1 % costs."""
+def draw_record(runs: dict, results: list[dict], path: Path) -> None:
+    """Draw waveforms with bands of two standard deviations of one repetition, and the time to 1 %."""
     figure, grid = new_figure(2, (11, 7.5), rows=2)
     axes = grid.flat
     names = list(dict.fromkeys(r["code"] for r in results))
@@ -299,10 +299,10 @@ def draw(runs: dict, results: list[dict], path: Path) -> None:
         ax.set_ylabel("apparent reflectance per ns")
     keys = {(CASES[case], pulse): n for n, (case, pulse) in enumerate(runs)}
     for name in names:
-        own = [r for r in results if r["code"] == name]
-        y = [keys[r["case"], r["pulse"]] for r in own]
+        code_results = [r for r in results if r["code"] == name]
+        y = [keys[r["case"], r["pulse"]] for r in code_results]
         for marker, quantity, label in (("o", "seconds", name), ("x", "cpu_seconds", None)):
-            values = [r[f"{quantity}_to_1_percent"] for r in own]
+            values = [r[f"{quantity}_to_1_percent"] for r in code_results]
             axes[3].semilogx(values, y, marker, color=colour[name], label=label)
     axes[3].set_yticks(list(keys.values()), [", ".join(key) for key in keys], fontsize=8)
     axes[3].invert_yaxis()

@@ -1,20 +1,20 @@
 """Vertical profiles: fits with a smoothness prior beside the closed-form gap inversion of GEDI's level 2B.
 
 Run it as `python examples/benchmarks/profiles.py [--out figures] [--stands 12] [--batch 1000] [--scattered
-6]`. What is fitted is kept in the folder, and not fitted again.
+6]`. Fits are stored in the folder, and not repeated by a further run.
 
 Stands of 20 layers of 1.5 m along the ground, one or two storeys, plant area 0.5 to 5, on slopes about 0, 15
 and 30 degrees, seen as GEDI sees them (25 m across, a pulse of 15.6 ns, samples of 1 ns), with normal noise
-of a 10th, 30th and 100th of the record's peak. Reflectances vary by 10 %, slopes by 2 degrees and heights of
-the ground by 0.5 m about what the fits take as priors; the fits find them along with the profile. They have
-single scattering, columns twice as wide and fewer rays than the stands.
+of a 10th, 30th and 100th of the peak. Reflectances vary by 10 %, slopes by 2 degrees and heights of the
+ground by 0.5 m about the priors of the fits; the fits estimate them together with the profile. The model of
+the fits has single scattering, columns twice as wide and fewer rays than the stands.
 
-The closed form is told much: the true height of the ground, and where the noise-free signal begins and ends;
-noise that makes densities negative is cut. It takes the ratio of reflectances from the priors' medians
-("median ratio"), as level 2B takes 1.5, or is told the true one ("true ratio"). Of `--scattered` stands for
-each slope the light is followed through four scatterings, at a ratio of 30: neither method knows of those.
+The closed form is given the true height of the ground and the ends of the noise-free signal; negative
+densities are set to zero. It takes the ratio of reflectances from the medians of the priors ("median ratio"),
+as level 2B takes 1.5, or the true ratio ("true ratio"). `--scattered` stands for each slope are simulated
+with four scatterings, at a ratio of 30; neither method models those.
 
-Timed are the fits, and a batch of profiles on level ground, where one column and few rays do.
+Timed are the fits, and a batch of profiles on level ground, where one column and few rays suffice.
 """
 
 import time
@@ -31,8 +31,8 @@ from inversion import LogNormal, Smooth, Unknown
 LIDAR = jl.Lidar(
     wavelength=1064.0, altitude=4e5, divergence=0.0625, pulse=jl.GaussianPulse(15.6), aperture=0.8
 )
-LAYERS, THICK, WINDOW = 20, 1.5, (-320.0, 120.0)
-EDGES = THICK * np.arange(LAYERS + 1)
+LAYERS, THICKNESS, WINDOW = 20, 1.5, (-320.0, 120.0)
+EDGES = THICKNESS * np.arange(LAYERS + 1)
 SLOPES, RATIOS, SCALE = (0.0, 15.0, 30.0), (10.0, 30.0, 100.0), 4.0
 LEAF, SOIL = 0.45, 0.3
 SPREAD = {"reflectance": 0.1, "slope": 2.0, "height": 0.5}
@@ -40,15 +40,15 @@ RAYS, ORDERS = 512, 4
 
 
 def stand(density, slope=0.0, height=0.0, soil=SOIL, leaf=LEAF, columns=48) -> jl.Scene:
-    """Layers above a slope, 48 m across; level ground needs one column."""
+    """Return layers above a slope, 48 m across; level ground needs one column."""
     level = columns == 1
-    # Room for the lowest and the steepest ground within the bounds.
+    # Layers below zero for the lowest and the steepest ground within the bounds.
     below = 4 if level else 20
-    size = (48.0 / columns, 60.0, THICK)
+    size = (48.0 / columns, 60.0, THICKNESS)
     voxels = jl.VoxelMap.from_lad(
         np.full((columns, 1, LAYERS + 2 * below), 0.1),
         voxel_size=size,
-        origin=(-24.0, -30.0, -below * THICK),
+        origin=(-24.0, -30.0, -below * THICKNESS),
     )
     optics = jl.LeafOptics(leaf, 0.4)
     canopy = jl.Canopy(voxels, leaf=optics, hotspot=True, sides="periodic" if level else "open")
@@ -56,9 +56,9 @@ def stand(density, slope=0.0, height=0.0, soil=SOIL, leaf=LEAF, columns=48) -> j
     return inversion.put_profile(jl.Scene(canopy=canopy, ground=ground), jnp.asarray(density, float))
 
 
-def draw(random: np.random.Generator, slope: float) -> dict:
-    """A stand: one or two storeys, and what is about it."""
-    middle, top = EDGES[:-1] + 0.5 * THICK, random.uniform(12.0, 28.0)
+def draw_stand(random: np.random.Generator, slope: float) -> dict:
+    """Draw a stand: a profile of one or two storeys, and the ground and reflectances."""
+    middle, top = EDGES[:-1] + 0.5 * THICKNESS, random.uniform(12.0, 28.0)
 
     def storey(at: float, wide: float) -> np.ndarray:
         return np.exp(-0.5 * ((middle - at * top) / (wide * top)) ** 2)
@@ -68,39 +68,47 @@ def draw(random: np.random.Generator, slope: float) -> dict:
         shape = shape + random.uniform(0.3, 1.0) * storey(random.uniform(0.1, 0.25), 0.08)
     shape = np.where(middle < top, shape, 0.0)
     return {
-        "density": random.uniform(0.5, 5.0) * shape / (shape.sum() * THICK),
+        "density": random.uniform(0.5, 5.0) * shape / (shape.sum() * THICKNESS),
         "slope": abs(random.normal(slope, SPREAD["slope"])),
         "height": random.normal(0.0, SPREAD["height"]),
         "soil": SOIL * np.exp(SPREAD["reflectance"] * random.normal()),
-        # What leaves reflect and transmit is at most all.
+        # Reflectance and transmittance (0.4) of leaves must not exceed one.
         "leaf": min(LEAF * np.exp(SPREAD["reflectance"] * random.normal()), 0.6),
     }
 
 
 def unknowns(slope: float | None) -> list[Unknown]:
-    """Ground, reflectances and profile, and the slope unless it is known to be none."""
-    grade = Unknown(
+    """Return the unknowns: ground, reflectances and profile, and the slope unless None."""
+    slope_unknown = Unknown(
         "ground.slope",
         bounds=(0.0, 45.0),
         name="slope",
         prior=(slope or 0.0, SPREAD["slope"]),
-        # At zero, a slope changes nothing at first.
+        # At zero the derivative with respect to slope vanishes.
         start=max(slope or 0.0, 3.0),
     )
-    bright = {"bounds": (0.05, 0.9)}
+    reflectance_bounds = {"bounds": (0.05, 0.9)}
     return [
         Unknown("ground.height", bounds=(-5.0, 5.0), name="height", prior=(0.0, SPREAD["height"])),
-        *([] if slope is None else [grade]),
-        Unknown("ground.reflectance", name="soil", prior=LogNormal(SOIL, SPREAD["reflectance"]), **bright),
+        *([] if slope is None else [slope_unknown]),
         Unknown(
-            "canopy.leaf.reflectance", name="leaf", prior=LogNormal(LEAF, SPREAD["reflectance"]), **bright
+            "ground.reflectance",
+            name="soil",
+            prior=LogNormal(SOIL, SPREAD["reflectance"]),
+            **reflectance_bounds,
+        ),
+        Unknown(
+            "canopy.leaf.reflectance",
+            name="leaf",
+            prior=LogNormal(LEAF, SPREAD["reflectance"]),
+            **reflectance_bounds,
         ),
         Unknown(
             apply=inversion.put_profile,
             name="plants",
             bounds=(0.0, 2.0),
             start=np.full(LAYERS, 0.1),
-            prior=Smooth(SCALE, spacing=THICK),
+            prior=Smooth(SCALE, spacing=THICKNESS),
         ),
     ]
 
@@ -108,37 +116,46 @@ def unknowns(slope: float | None) -> list[Unknown]:
 def recorded(
     stands: list[dict], orders: int, columns: int, window=WINDOW
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Waveforms without noise, their times and heights."""
-    steep = stand(np.ones(LAYERS), 38.0 if columns > 1 else 0.0, columns=columns)
+    """Return waveforms without noise, their times and heights."""
+    steepest = stand(np.ones(LAYERS), 38.0 if columns > 1 else 0.0, columns=columns)
     size = {"n_rays": 4096, "n_photons": 2**18} if columns > 1 else {"n_rays": 8, "n_photons": 8}
-    plan = jl.plan(LIDAR, steep, max_orders=orders, window=window, **size)
+    plan = jl.plan(LIDAR, steepest, max_orders=orders, window=window, **size)
     waves = []
-    for i, own in enumerate(stands):
-        scene = stand(own["density"], own["slope"], own["height"], own["soil"], own["leaf"], columns)
+    for i, stand_values in enumerate(stands):
+        scene = stand(
+            stand_values["density"],
+            stand_values["slope"],
+            stand_values["height"],
+            stand_values["soil"],
+            stand_values["leaf"],
+            columns,
+        )
         waves.append(jl.simulate(LIDAR, scene, key=jax.random.key(1000 + i), plan=plan))
     first = waves[0]
     clean = np.stack([np.asarray(w.reflectance[0], float) for w in waves])
     return clean, np.asarray(first.time), np.asarray(first.height, float)
 
 
-def closed_form(clean, observed, height, own, sigma, ratio) -> np.ndarray:
-    """The gap inversion of a record, told the ground and where the signal is."""
+def closed_form(clean, observed, height, stand_values, sigma, ratio) -> np.ndarray:
+    """Return the gap inversion of a record, given the ground and the ends of the signal."""
     lit = height[clean > 0.01 * clean.max()]
-    told = {"ground": own["height"], "ends": (lit.max(), lit.min()), "noise": sigma}
-    found = inversion.plant_area_profile(
-        height, observed, edges=EDGES, pulse=LIDAR.pulse, reflectance_ratio=ratio, **told
+    true_values = {"ground": stand_values["height"], "ends": (lit.max(), lit.min()), "noise": sigma}
+    density = inversion.plant_area_profile(
+        height, observed, edges=EDGES, pulse=LIDAR.pulse, reflectance_ratio=ratio, **true_values
     )
-    return np.maximum(np.asarray(found, float), 0.0)
+    return np.maximum(np.asarray(density, float), 0.0)
 
 
-def rms(error: np.ndarray) -> np.ndarray:
+def root_mean_square(error: np.ndarray) -> np.ndarray:
     return np.sqrt(np.mean(np.asarray(error) ** 2, axis=-1))
 
 
-def compare(given, slope: float, number: int, orders: int, ratios: tuple[float, ...]) -> list[dict]:
-    """Stands about one slope, fitted and inverted in closed form."""
+def compare_methods(
+    arguments, slope: float, number: int, orders: int, ratios: tuple[float, ...]
+) -> list[dict]:
+    """Fit stands about one slope and invert them in closed form; return one row for each."""
     random = np.random.default_rng([int(slope), orders])
-    stands = [draw(random, slope) for _ in range(number)]
+    stands = [draw_stand(random, slope) for _ in range(number)]
     clean, times, height = recorded(stands, orders, 96)
     rows = [(i, ratio) for ratio in ratios for i in range(number)]
     sigma = np.array([clean[i].max() / ratio for i, ratio in rows])
@@ -149,13 +166,13 @@ def compare(given, slope: float, number: int, orders: int, ratios: tuple[float, 
     largest = stand(np.full(LAYERS, 0.1), 45.0)
     plan = jl.plan(LIDAR, largest, max_orders=1, window=WINDOW, n_rays=RAYS // 8)
 
-    def fit(some: slice, path=None) -> inversion.Retrievals:
+    def fit(selected: slice, path=None) -> inversion.Retrievals:
         return inversion.retrieve_many(
-            observed[some, None],
+            observed[selected, None],
             LIDAR,
             start,
             unknowns(slope),
-            noise=sigma[some, None, None],
+            noise=sigma[selected, None, None],
             time=times,
             key=jax.random.key(7),
             plan=plan,
@@ -164,37 +181,37 @@ def compare(given, slope: float, number: int, orders: int, ratios: tuple[float, 
             progress=lambda p: print(f"\r{slope:g} degrees, orders {orders}: {p}", end="", flush=True),
         )
 
-    fits = fit(slice(None), given.out / f"profiles_{slope:g}_{orders}_{number}.sqlite")
-    # Some once more, which are not in the file: all is compiled once they begin.
-    few = slice(0, len(rows), number) if slope == SLOPES[1] else slice(0)
+    fits = fit(slice(None), arguments.out / f"profiles_{slope:g}_{orders}_{number}.sqlite")
+    # Repeat some fits without the file, to time them when everything is compiled.
+    repeated = slice(0, len(rows), number) if slope == SLOPES[1] else slice(0)
     seconds = 0.0
-    if len(range(*few.indices(len(rows)))) and orders == 1:
-        fit(few)
-        begun = time.perf_counter()
-        fit(few)
-        seconds = (time.perf_counter() - begun) / len(range(*few.indices(len(rows))))
+    if len(range(*repeated.indices(len(rows)))) and orders == 1:
+        fit(repeated)
+        start_time = time.perf_counter()
+        fit(repeated)
+        seconds = (time.perf_counter() - start_time) / len(range(*repeated.indices(len(rows))))
     print()
     low, high = fits.band("plants")
-    kernel = fits.averaging_kernel("plants", THICK)
-    found = []
+    kernel = fits.averaging_kernel("plants", THICKNESS)
+    results = []
     for n, (i, ratio) in enumerate(rows):
-        own, truth = stands[i], stands[i]["density"]
+        stand_values, truth = stands[i], stands[i]["density"]
         median, true = (
-            closed_form(clean[i], observed[n], height, own, sigma[n], bright)
-            for bright in (LEAF / SOIL, own["leaf"] / own["soil"])
+            closed_form(clean[i], observed[n], height, stand_values, sigma[n], bright)
+            for bright in (LEAF / SOIL, stand_values["leaf"] / stand_values["soil"])
         )
         planted = truth > 1e-3
-        found.append(
+        results.append(
             {
                 "slope": slope,
                 "ratio": ratio,
                 "orders": orders,
-                "plant area": float(truth.sum() * THICK),
-                "fit": float(rms(fits.values["plants"][n] - truth)),
-                "median ratio": float(rms(median - truth)),
-                "true ratio": float(rms(true - truth)),
-                "fitted plant area": float(fits.values["plants"][n].sum() * THICK),
-                "closed plant area": float(median.sum() * THICK),
+                "plant area": float(truth.sum() * THICKNESS),
+                "fit": float(root_mean_square(fits.values["plants"][n] - truth)),
+                "median ratio": float(root_mean_square(median - truth)),
+                "true ratio": float(root_mean_square(true - truth)),
+                "fitted plant area": float(fits.values["plants"][n].sum() * THICKNESS),
+                "closed plant area": float(median.sum() * THICKNESS),
                 "covered": float(np.mean((truth >= low[n] - 1e-3) & (truth <= high[n] + 1e-3))),
                 "degrees of freedom": float(kernel.degrees_of_freedom[n]),
                 "resolution": float(np.median(kernel.resolution[n][planted])),
@@ -204,17 +221,17 @@ def compare(given, slope: float, number: int, orders: int, ratios: tuple[float, 
                 "seconds": seconds,
             }
         )
-        found[-1]["profile"] = [
+        results[-1]["profile"] = [
             [round(float(v), 4) for v in p] for p in (truth, fits.values["plants"][n], median)
         ]
-        found[-1]["band"] = [[round(float(v), 4) for v in p] for p in (low[n], high[n])]
-    return found
+        results[-1]["band"] = [[round(float(v), 4) for v in p] for p in (low[n], high[n])]
+    return results
 
 
-def batch(number: int) -> dict:
-    """Seconds of many profiles on level ground."""
+def time_batch(number: int) -> dict:
+    """Return the seconds of many profiles on level ground."""
     random = np.random.default_rng(99)
-    stands = [draw(random, 0.0) | {"slope": 0.0} for _ in range(number)]
+    stands = [draw_stand(random, 0.0) | {"slope": 0.0} for _ in range(number)]
     window = (-240.0, 50.0)
     clean, times, _ = recorded(stands, 1, 1, window)
     sigma = clean.max(axis=1) / 30.0
@@ -222,13 +239,13 @@ def batch(number: int) -> dict:
     start = stand(np.full(LAYERS, 0.1), columns=1)
     plan = jl.plan(LIDAR, start, max_orders=1, window=window, n_rays=1)
 
-    def fit(some: slice) -> inversion.Retrievals:
+    def fit(selected: slice) -> inversion.Retrievals:
         return inversion.retrieve_many(
-            observed[some, None],
+            observed[selected, None],
             LIDAR,
             start,
             unknowns(None),
-            noise=sigma[some, None, None],
+            noise=sigma[selected, None, None],
             time=times,
             key=jax.random.key(7),
             plan=plan,
@@ -237,9 +254,9 @@ def batch(number: int) -> dict:
         )
 
     fit(slice(32))
-    begun = time.perf_counter()
+    start_time = time.perf_counter()
     fits = fit(slice(None))
-    seconds = time.perf_counter() - begun
+    seconds = time.perf_counter() - start_time
     print()
     truth = np.stack([s["density"] for s in stands])
     return {
@@ -248,12 +265,12 @@ def batch(number: int) -> dict:
         "per_profile": seconds / number,
         "converged": float(fits.converged.mean()),
         "steps": float(fits.steps.mean()),
-        "rms": float(np.mean(rms(fits.values["plants"] - truth))),
+        "rms": float(np.mean(root_mean_square(fits.values["plants"] - truth))),
     }
 
 
 def summary(rows: list[dict]) -> dict:
-    """Of some stands: how often and by how much the fit is better."""
+    """Return medians and fractions over stands, such as how often and by how much the fit is better."""
 
     def of(name: str) -> np.ndarray:
         return np.array([r[name] for r in rows])
@@ -280,11 +297,13 @@ def summary(rows: list[dict]) -> dict:
 
 
 def main() -> dict:
-    given = options("Vertical profiles.", stands=12, batch=1000, scattered=6)
-    given.out.mkdir(parents=True, exist_ok=True)
-    many = batch(given.batch)
-    rows = [r for slope in SLOPES for r in compare(given, slope, given.stands, 1, RATIOS)]
-    scattered = [r for slope in SLOPES for r in compare(given, slope, given.scattered, ORDERS, (30.0,))]
+    arguments = options("Vertical profiles.", stands=12, batch=1000, scattered=6)
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    batch_record = time_batch(arguments.batch)
+    rows = [r for slope in SLOPES for r in compare_methods(arguments, slope, arguments.stands, 1, RATIOS)]
+    scattered = [
+        r for slope in SLOPES for r in compare_methods(arguments, slope, arguments.scattered, ORDERS, (30.0,))
+    ]
     cells = [
         {"slope": s, "ratio": q, **summary([r for r in rows if (r["slope"], r["ratio"]) == (s, q)])}
         for s in SLOPES
@@ -293,30 +312,30 @@ def main() -> dict:
     record = {
         "machine": machine(),
         "layers": LAYERS,
-        "thickness": THICK,
+        "thickness": THICKNESS,
         "scale": SCALE,
-        "stands": given.stands,
+        "stands": arguments.stands,
         "all": summary(rows),
         "cells": cells,
         "scattered": summary(scattered),
         "orders": ORDERS,
-        "batch": many,
+        "batch": batch_record,
         "rows": [{k: v for k, v in r.items() if k not in ("profile", "band")} for r in rows + scattered],
     }
     names = ("slope", "ratio", "fit", "closed", "better", "better_than_true_ratio", "covered", "resolution")
     print_table(names, [tuple(c[n] for n in names) for c in cells])
     print(record["all"], record["scattered"], record["batch"], sep="\n")
-    write_json(given.out / "profiles.json", record)
-    draw_figure(rows, given.out / "profiles.png")
+    write_json(arguments.out / "profiles.json", record)
+    draw_figure(rows, arguments.out / "profiles.png")
     return record
 
 
 def draw_figure(rows: list[dict], path) -> None:
-    """Errors of both methods, and one stand for each slope."""
+    """Draw the errors of both methods, and one stand for each slope."""
     figure, axes = plt.subplots(1, 4, figsize=(12, 4), layout="constrained")
     for slope, colour in zip(SLOPES, ("#0072B2", "#009E73", "#D55E00")):
-        some = [r for r in rows if r["slope"] == slope]
-        x, y = ([r[n] for r in some] for n in ("median ratio", "fit"))
+        slope_rows = [r for r in rows if r["slope"] == slope]
+        x, y = ([r[n] for r in slope_rows] for n in ("median ratio", "fit"))
         axes[0].loglog(x, y, "o", color=colour, ms=4, alpha=0.7, label=f"{slope:g} degrees")
     ends = (3e-3, 0.3)
     axes[0].plot(ends, ends, color="0.5", lw=1)
@@ -326,7 +345,7 @@ def draw_figure(rows: list[dict], path) -> None:
         row = next(r for r in rows if r["slope"] == slope and r["ratio"] == 30.0)
         truth, fit, closed = map(np.array, row["profile"])
         low, high = map(np.array, row["band"])
-        middle = EDGES[:-1] + 0.5 * THICK
+        middle = EDGES[:-1] + 0.5 * THICKNESS
         ax.fill_betweenx(middle, low, high, color="#D55E00", alpha=0.2, lw=0, label="95 %")
         ax.stairs(truth, EDGES, orientation="horizontal", color="0.3", baseline=None, label="truth")
         ax.plot(fit, middle, color="#D55E00", label="fit")

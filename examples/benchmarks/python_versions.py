@@ -1,12 +1,12 @@
-"""The same work on several Pythons: what older versions of JAX cost.
+"""The same work on several versions of Python and JAX.
 
 Run it as `python examples/benchmarks/python_versions.py --python PATH [--python PATH ...] [--out figures]`,
-each PATH an interpreter that has jaxlidar installed, the newest last. Every interpreter measures in processes
-of its own (`_python_version.py`), in turn, round after round, so that other work falls on all alike; the
+each PATH an interpreter that has jaxlidar installed, the newest last. Interpreters take turns in processes of
+their own (`_python_version.py`), round after round, so that other load of the machine slows all alike; the
 fastest round counts.
 
 The scene is the crown over ground of `simulation_cost.py`. "First call" is the whole call of `simulate` in a
-new process, which compiles; all else is warm.
+new process, which compiles; all other times are warm.
 """
 
 import argparse
@@ -19,16 +19,16 @@ from _common import machine, new_figure, print_table, save_figure, write_json
 
 
 def measured(python: str) -> dict:
-    """What one process of an interpreter measured."""
+    """Return the measurements of one process of an interpreter."""
     worker = Path(__file__).with_name("_python_version.py")
-    done = subprocess.run([python, str(worker)], capture_output=True, text=True)
-    if done.returncode:
-        raise SystemExit(f"{python} failed: {(done.stderr.strip() or 'no message').splitlines()[-1]}")
-    return json.loads(done.stdout.splitlines()[-1])
+    process = subprocess.run([python, str(worker)], capture_output=True, text=True)
+    if process.returncode:
+        raise SystemExit(f"{python} failed: {(process.stderr.strip() or 'no message').splitlines()[-1]}")
+    return json.loads(process.stdout.splitlines()[-1])
 
 
 def draw(versions: list[dict], path: Path) -> None:
-    """Seconds over those of the newest version."""
+    """Draw the seconds over those of the newest version."""
     figure, axes = new_figure(size=(7, 3.8))
     names, height = list(versions[-1]["seconds"]), 0.8 / len(versions)
     for i, version in enumerate(versions):
@@ -46,21 +46,23 @@ def main() -> None:
     parser.add_argument("--python", action="append", required=True, help="interpreter; the newest last")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--out", default="figures", type=Path, help="folder of the results")
-    given = parser.parse_args()
-    runs: list[list[dict]] = [[] for _ in given.python]
-    for _ in range(given.rounds):
-        for python, found in zip(given.python, runs):
-            found.append(measured(python))
+    arguments = parser.parse_args()
+    runs: list[list[dict]] = [[] for _ in arguments.python]
+    for _ in range(arguments.rounds):
+        for python, measurements in zip(arguments.python, runs):
+            measurements.append(measured(python))
     versions = []
-    for found in runs:
-        seconds = {name: min(f["seconds"][name] for f in found) for name in found[0]["seconds"]}
-        versions.append({"python": found[0]["python"], "jax": found[0]["jax"], "seconds": seconds})
+    for measurements in runs:
+        seconds = {name: min(f["seconds"][name] for f in measurements) for name in measurements[0]["seconds"]}
+        versions.append(
+            {"python": measurements[0]["python"], "jax": measurements[0]["jax"], "seconds": seconds}
+        )
     newest = versions[-1]["seconds"]
     for version in versions:
         version["ratio"] = {name: s / newest[name] for name, s in version["seconds"].items()}
-    write_json(given.out / "python_versions.json", {"machine": machine(), "versions": versions})
+    write_json(arguments.out / "python_versions.json", {"machine": machine(), "versions": versions})
 
-    draw(versions, given.out / "python_versions.png")
+    draw(versions, arguments.out / "python_versions.png")
     head = ("", *(f"{v['python']}, s" for v in versions), *(f"{v['python']}, times" for v in versions[:-1]))
     print_table(
         head,

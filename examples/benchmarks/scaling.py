@@ -1,11 +1,11 @@
-"""Does cost grow as it should? Time and memory of one batch against photons, and against voxels crossed.
+"""Scaling of cost: time and memory of one batch against photons, and against voxels along a side.
 
 Run it as `python examples/benchmarks/scaling.py [--out figures] [--most 10000000] [--finest 256]`.
 
 A crown over ground, as in `simulation_cost.py`, up to four orders. Photons are traced in chunks of one size,
-so that time should grow with their number and memory not at all; a ray crosses as many voxels more as they
-are smaller, and what is kept per voxel is a few numbers. Times are warm; memory is what the compiled batch
-needs beside its arguments. Slopes are of logarithms, over the upper half of each range.
+so that time should grow with their number and memory not at all; the number of voxels along a ray grows with
+the voxels along a side, and each voxel takes a few numbers of memory. Times are warm; memory is that of the
+compiled batch besides its arguments. Slopes are those of logarithms, over the upper half of each range.
 """
 
 import time
@@ -22,7 +22,7 @@ ORDERS = 4
 
 
 def crown(n: int) -> jl.Scene:
-    """Extinction that varies over half metres, on n^3 voxels."""
+    """Return a crown whose extinction varies over half metres, on n^3 voxels."""
     place = (np.arange(n) + 0.5) * SIZE / n
     x, y, z = np.meshgrid(place, place, place, indexing="ij", sparse=True)
     inside = (x - 5) ** 2 + (y - 5) ** 2 + (z - 6) ** 2 < 3.5**2
@@ -36,7 +36,7 @@ def crown(n: int) -> jl.Scene:
 
 
 def cost(scene: jl.Scene, photons: int, rays: int) -> tuple[float, int, float]:
-    """Seconds of a batch, bytes that it needs, and what it returns."""
+    """Return seconds and bytes of a batch, and its apparent reflectance."""
     plan = jl.plan(
         LIDAR, scene, max_orders=ORDERS, window=WINDOW, n_photons=photons, n_rays=rays, describe=False
     )
@@ -47,28 +47,30 @@ def cost(scene: jl.Scene, photons: int, rays: int) -> tuple[float, int, float]:
 
     key = jax.random.key(0)
     compiled = eqx.filter_jit(batch).lower(scene, key).compile()
-    first = seconds(compiled, scene, key)
-    # What takes long needs no second measurement.
-    taken = min(seconds(compiled, scene, key) for _ in range(5)) if first < 5 else first
+    first_seconds = seconds(compiled, scene, key)
+    # Long runs need no second measurement.
+    batch_seconds = (
+        min(seconds(compiled, scene, key) for _ in range(5)) if first_seconds < 5 else first_seconds
+    )
     return (
-        taken,
+        batch_seconds,
         int(compiled.compiled.memory_analysis().temp_size_in_bytes),
         float(compiled(scene, key).sum()),
     )
 
 
 def slope(size: list[int], value: list[float]) -> float:
-    """Of the logarithms, over the upper half."""
+    """Return the slope of the logarithms over the upper half."""
     upper = len(size) // 2
     return float(np.polyfit(np.log(size[upper:]), np.log(value[upper:]), 1)[0])
 
 
 def main() -> None:
-    given = options("How cost grows.", most=10_000_000, finest=256)
-    begun = time.perf_counter()
+    arguments = options("How cost grows.", most=10_000_000, finest=256)
+    start_time = time.perf_counter()
     base = crown(64)
-    photons = [int(n) for n in 10.0 ** np.arange(4, 10) if n <= given.most]
-    sides = [n for n in (16, 32, 64, 128, 256, 512) if n <= given.finest]
+    photons = [int(n) for n in 10.0 ** np.arange(4, 10) if n <= arguments.most]
+    sides = [n for n in (16, 32, 64, 128, 256, 512) if n <= arguments.finest]
     by_photons = [cost(base, n, 256) for n in photons]
     by_voxels = [cost(crown(n), 16384, 2048) for n in sides]
     record = {
@@ -81,19 +83,19 @@ def main() -> None:
         "slope of seconds over voxels along a side": slope(sides, [c[0] for c in by_voxels]),
         "slope of bytes over photons": slope(photons, [c[1] for c in by_photons]),
     }
-    write_json(given.out / "scaling.json", record)
+    write_json(arguments.out / "scaling.json", record)
 
-    figure, (left, right) = new_figure(2, (8, 3.6))
-    for ax, size, found in ((left, photons, by_photons), (right, sides, by_voxels)):
-        ax.loglog(size, [c[0] for c in found], "o-", color="#0072B2", label="seconds")
-        ax.loglog(size, [c[1] / 1e9 for c in found], "s--", color="#D55E00", label="memory, GB")
-        ax.loglog(size, found[-1][0] * np.array(size) / size[-1], ":", color="0.5", label="in proportion")
+    figure, (photon_axes, voxel_axes) = new_figure(2, (8, 3.6))
+    for ax, size, costs in ((photon_axes, photons, by_photons), (voxel_axes, sides, by_voxels)):
+        ax.loglog(size, [c[0] for c in costs], "o-", color="#0072B2", label="seconds")
+        ax.loglog(size, [c[1] / 1e9 for c in costs], "s--", color="#D55E00", label="memory, GB")
+        ax.loglog(size, costs[-1][0] * np.array(size) / size[-1], ":", color="0.5", label="in proportion")
         ax.legend()
-    left.set(xlabel="photons of a batch", title="64³ voxels")
-    right.set(xlabel="voxels along a side", title="16,384 photons, 2,048 rays")
-    right.set_xticks(sides, [str(n) for n in sides])
-    right.minorticks_off()
-    save_figure(figure, given.out / "scaling.png")
+    photon_axes.set(xlabel="photons of a batch", title="64³ voxels")
+    voxel_axes.set(xlabel="voxels along a side", title="16,384 photons, 2,048 rays")
+    voxel_axes.set_xticks(sides, [str(n) for n in sides])
+    voxel_axes.minorticks_off()
+    save_figure(figure, arguments.out / "scaling.png")
 
     rows = [(f"{n:,} photons", *c) for n, c in zip(photons, by_photons)]
     rows += [(f"{n}^3 voxels", *c) for n, c in zip(sides, by_voxels)]
@@ -101,7 +103,7 @@ def main() -> None:
     for name in record:
         if name.startswith("slope"):
             print(f"{name}: {record[name]:.2f}")
-    print(f"done in {time.perf_counter() - begun:.0f} s")
+    print(f"done in {time.perf_counter() - start_time:.0f} s")
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
-"""What `simulate` costs at relative tolerances of 0.1, 0.03 and 0.01 on three scenes.
+"""Cost of `simulate` at relative tolerances of 0.1, 0.03 and 0.01 on three scenes.
 
-Run it as `python examples/benchmarks/simulation_cost.py [--out figures] [--rounds 3]`. The first call of
-each compiles and is given apart; the others are warm, the fastest counts. For the crown, the time of one
-batch is split into order one, the higher orders and colouring.
+Run it as `python examples/benchmarks/simulation_cost.py [--out figures] [--rounds 3]`. The first call of each
+compiles and is listed separately; the others are warm, the fastest counts. For the crown, the time of one
+batch is split into the first order, the higher orders and the application of optics.
 """
 
 import time
@@ -24,8 +24,8 @@ WINDOW = (-90.0, 109.0)
 
 
 def scenes() -> dict[str, jl.Scene]:
-    place = (np.arange(N) + 0.5) * SIZE / N
-    x, y, z = np.meshgrid(place, place, place, indexing="ij")
+    centres = (np.arange(N) + 0.5) * SIZE / N
+    x, y, z = np.meshgrid(centres, centres, centres, indexing="ij")
     inside = (x - 5) ** 2 + (y - 5) ** 2 + (z - 6) ** 2 < 3.5**2
     k = np.where(inside, 0.5 * np.random.default_rng(0).uniform(0, 2, inside.shape), 0.0)
     voxels = jl.VoxelMap.from_extinction(leaf=k, voxel_size=SIZE / N, origin=(-5.0, -5.0, 0.0))
@@ -39,10 +39,10 @@ def scenes() -> dict[str, jl.Scene]:
 
 
 def split(scene: jl.Scene, rounds: int) -> dict[str, float]:
-    """Seconds of the parts of one batch with the default sizes."""
+    """Return the seconds of the steps of one batch with the default sizes."""
     plan = jl.plan(LIDAR, scene, max_orders=ORDERS, window=WINDOW)
-    single = jl.plan(LIDAR, scene, max_orders=1, window=WINDOW, n_rays=plan.n_rays)
-    few = plan.with_config(n_rays=1)
+    rays_only = jl.plan(LIDAR, scene, max_orders=1, window=WINDOW, n_rays=plan.n_rays)
+    photons_only = plan.with_config(n_rays=1)
     key = jax.random.key(0)
 
     def traced(plan):
@@ -54,17 +54,17 @@ def split(scene: jl.Scene, rounds: int) -> dict[str, float]:
 
         return eqx.filter_jit(trace)
 
-    all_orders, first, higher = traced(plan), traced(single), traced(few)
-    colour = eqx.filter_jit(
+    all_orders, first, higher = traced(plan), traced(rays_only), traced(photons_only)
+    apply_optics = eqx.filter_jit(
         lambda response, scene: jl.total_reflectance(response, jl.make_setup(LIDAR, scene, plan))
     )
     response = all_orders(scene, key)
     return best(
         race(
             {
-                f"order one, {plan.n_rays} rays": lambda: first(scene, key),
+                f"first order, {plan.n_rays} rays": lambda: first(scene, key),
                 f"higher orders, {plan.n_photons} photons": lambda: higher(scene, key),
-                "colouring": lambda: colour(response, scene),
+                "apply optics": lambda: apply_optics(response, scene),
                 "trace": lambda: all_orders(scene, key),
             },
             rounds,
@@ -73,7 +73,7 @@ def split(scene: jl.Scene, rounds: int) -> dict[str, float]:
 
 
 def main() -> None:
-    given = options("Cost of simulations.", rounds=3)
+    arguments = options("Cost of simulations.", rounds=3)
     results, rows = [], []
     for name, scene in scenes().items():
         for rtol in TOLERANCES:
@@ -86,26 +86,35 @@ def main() -> None:
             start = time.perf_counter()
             wave = run()
             cold = time.perf_counter() - start
-            warm = min(seconds(lambda: run().reflectance) for _ in range(given.rounds))
+            warm = min(seconds(lambda: run().reflectance) for _ in range(arguments.rounds))
             info = wave.info
             results.append(
                 {**info, "scene": name, "rtol": rtol, "seconds": warm, "seconds_with_compilation": cold}
             )
             rows.append((name, rtol, warm, cold, info["photons"], info["batches"], info["error"]))
-    parts = split(scenes()["crown over ground"], 3 * given.rounds)
-    record = {"machine": machine(), "orders": ORDERS, "simulations": results, "crown_batch_seconds": parts}
-    write_json(given.out / "simulation_cost.json", record)
+    batch_seconds = split(scenes()["crown over ground"], 3 * arguments.rounds)
+    record = {
+        "machine": machine(),
+        "orders": ORDERS,
+        "simulations": results,
+        "crown_batch_seconds": batch_seconds,
+    }
+    write_json(arguments.out / "simulation_cost.json", record)
 
     figure, axes = new_figure()
     for name in scenes():
-        mine = [r for r in results if r["scene"] == name]
-        axes.loglog([r["rtol"] for r in mine], [r["seconds"] for r in mine], "o-", label=name)
+        scene_results = [r for r in results if r["scene"] == name]
+        axes.loglog(
+            [r["rtol"] for r in scene_results], [r["seconds"] for r in scene_results], "o-", label=name
+        )
     axes.set(xlabel="relative tolerance", ylabel="seconds, warm", title="simulate")
     axes.legend()
-    save_figure(figure, given.out / "simulation_cost.png")
+    save_figure(figure, arguments.out / "simulation_cost.png")
 
     print_table(("scene", "rtol", "s, warm", "s, cold", "photons", "batches", "error"), rows)
-    print("One batch of the crown:", ", ".join(f"{name} {1e3 * t:.0f} ms" for name, t in parts.items()))
+    print(
+        "One batch of the crown:", ", ".join(f"{name} {1e3 * t:.0f} ms" for name, t in batch_seconds.items())
+    )
 
 
 if __name__ == "__main__":

@@ -11,17 +11,17 @@ matplotlib.use("Agg")
 
 from jaxlidar.io import atomic_write
 
-HERE = Path(__file__).resolve().parent
+FOLDER = Path(__file__).resolve().parent
 
 
 def main() -> None:
     """Run the example as it is printed and save its picture."""
-    page = (HERE.parents[1] / "README.md").read_text()
+    page = (FOLDER.parents[1] / "README.md").read_text()
     code = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)[0]
     names: dict = {}
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
         exec(code, names)
-    with atomic_write(HERE / "example.png") as draft:
+    with atomic_write(FOLDER / "example.png") as draft:
         names["axes"].get_figure().savefig(draft, dpi=110, format="png")
 
 

@@ -22,7 +22,7 @@ from jaxlidar.io import atomic_write, read_case
 
 EXAMPLES = Path(__file__).resolve().parents[1]
 GALLERY = EXAMPLES / "figures" / "gallery"
-# Which of a notebook's pictures stands for it, from 0.
+# Number of the picture of each notebook that the gallery shows, from 0.
 CHOSEN = {
     "first_waveform": 1,
     "leaf_traits": 3,
@@ -34,15 +34,15 @@ CHOSEN = {
 
 
 def picture(notebook: str) -> bytes:
-    """The picture (PNG) that stands for a notebook."""
+    """Return the picture (PNG) of a notebook for the gallery."""
     cells = json.loads((EXAMPLES / "notebooks" / f"{notebook}.ipynb").read_text())["cells"]
     data = [output.get("data", {}) for cell in cells for output in cell.get("outputs", [])]
-    stored = [each["image/png"] for each in data if "image/png" in each]
+    stored = [formats["image/png"] for formats in data if "image/png" in formats]
     return base64.b64decode("".join(stored[CHOSEN[notebook]]))
 
 
 def scenes() -> Figure:
-    """The tree of the paper's cases, as its file says."""
+    """Draw the tree of the cases of the paper, from its file."""
     case = read_case(EXAMPLES / "scenes" / "tree.toml")
     figure, ax = plt.subplots(figsize=(4.5, 4.0), layout="constrained")
     jaxlidar.plot.scene(case.scene, case.lidar, ax)
@@ -50,7 +50,7 @@ def scenes() -> Figure:
 
 
 def paper() -> Figure:
-    """The paper's Figure 1."""
+    """Draw Figure 1 of the paper."""
     figure = plt.figure(figsize=(6.0, 3.5), layout="constrained")
     axes = [figure.add_subplot(1, 2, i, projection="3d") for i in (1, 2)]
     jaxlidar.plot.leaf_on_and_off(jl.grow(jl.broadleaf(), seed=0), axes, max_buds=2000)
@@ -58,7 +58,7 @@ def paper() -> Figure:
 
 
 def minnaert() -> Figure:
-    """What slopes return by two laws of reflection."""
+    """Draw the reflectance of slopes by two laws of reflection."""
     minnaerts = runpy.run_path(str(EXAMPLES / "minnaert.py"))["Minnaert"]
     figure, ax = plt.subplots(figsize=(4.5, 3.0), layout="constrained")
     slopes = np.arange(0.0, 75.0, 5.0)

@@ -1,8 +1,8 @@
 """Draw the hectare of README.md: run it as `python examples/figures/hectare.py`.
 
-The truth of RH98 is that of level ground below the same trees, an instant pulse and light that is scattered
-once: from every voxel comes what enters it and is not absorbed on the way, each column with the irradiance
-of the footprint there.
+The truth of RH98 is that of level ground below the same trees, an instant pulse and single scattering: each
+voxel returns the intercepted light times the two-way transmittance above it, each column weighted by the
+irradiance of the footprint.
 """
 
 import contextlib
@@ -19,35 +19,35 @@ import numpy as np
 
 from jaxlidar.io import atomic_write
 
-HERE = Path(__file__).resolve().parent
-# Spherically oriented leaves return this share of their reflectance straight back.
+FOLDER = Path(__file__).resolve().parent
+# Intensity factor of backscatter of spherically oriented leaves, per reflectance.
 SPHERICAL = 2.0 / 3.0
 
 
 def true_rh98(stand, canopy, survey, ground: float) -> np.ndarray:
-    """Heights above the ground below which 98 % of the energy returns."""
-    edge, low = (np.asarray(a, float) for a in (stand.voxel_size, stand.origin))
+    """Return the heights above the ground below which 98 % of the energy returns."""
+    voxel_size, origin = (np.asarray(a, float) for a in (stand.voxel_size, stand.origin))
     leaf, bark = (np.asarray(a, float) for a in (stand.leaf, stand.bark))
     wavelength = survey.lidar.wavelength
     green, brown = float(canopy.leaf(wavelength)[0][0]), float(canopy.bark(wavelength)[0])
-    depth = (leaf + bark) * edge[2]
+    depth = (leaf + bark) * voxel_size[2]
     above = np.cumsum(depth[:, :, ::-1], axis=2)[:, :, ::-1] - depth
     albedo = (green * leaf + brown * bark) / np.maximum(leaf + bark, 1e-30)
     returned = 0.5 * SPHERICAL * albedo * np.exp(-2.0 * above) * -np.expm1(-2.0 * depth)
-    floor = ground * np.exp(-2.0 * depth.sum(axis=2))
-    faces = low[2] + edge[2] * np.arange(leaf.shape[2] + 1)
-    x, y = (low[k] + edge[k] * (np.arange(leaf.shape[k]) + 0.5) for k in (0, 1))
-    found = []
+    ground_return = ground * np.exp(-2.0 * depth.sum(axis=2))
+    faces = origin[2] + voxel_size[2] * np.arange(leaf.shape[2] + 1)
+    x, y = (origin[k] + voxel_size[k] * (np.arange(leaf.shape[k]) + 0.5) for k in (0, 1))
+    heights = []
     for (east, north), radius in zip(survey.position, survey.footprint_radius):
         r2 = (x[:, None] - east) ** 2 + (y[None, :] - north) ** 2
         light = np.exp(-2.0 * r2 / radius**2)
-        energy = np.concatenate([[np.sum(light * floor)], np.einsum("xy,xyz->z", light, returned)])
-        found.append(np.interp(0.98, np.cumsum(energy) / energy.sum(), faces))
-    return np.array(found)
+        energy = np.concatenate([[np.sum(light * ground_return)], np.einsum("xy,xyz->z", light, returned)])
+        heights.append(np.interp(0.98, np.cumsum(energy) / energy.sum(), faces))
+    return np.array(heights)
 
 
-def drawn(names: dict, seconds: float):
-    """The figure: the stand from above, and three maps."""
+def draw(names: dict, seconds: float):
+    """Draw the figure: the stand from above, and three maps."""
     survey, hills, stand = names["survey"], names["hills"], names["stand"]
     truth = true_rh98(stand, names["canopy"], survey, float(hills.reflectance))
     figure, axes = plt.subplots(1, 4, figsize=(13.0, 3.5), layout="constrained", sharey=True)
@@ -70,13 +70,15 @@ def drawn(names: dict, seconds: float):
     (west, south), (east, north) = survey.position.min(axis=0) - half, survey.position.max(axis=0) + half
     side = np.unique(survey.position[:, 0]).size
     order = np.lexsort(survey.position.T)
-    for ax, (values, label, colours, most) in zip(axes[1:], panels):
-        known = np.asarray(values)[order].reshape(-1, side)
-        look = {} if most is None else {"vmin": -most, "vmax": most}
-        image = ax.imshow(known, origin="lower", extent=(west, east, south, north), cmap=colours, **look)
+    for ax, (values, label, colours, limit) in zip(axes[1:], panels):
+        grid_values = np.asarray(values)[order].reshape(-1, side)
+        limits = {} if limit is None else {"vmin": -limit, "vmax": limit}
+        image = ax.imshow(
+            grid_values, origin="lower", extent=(west, east, south, north), cmap=colours, **limits
+        )
         figure.colorbar(image, ax=ax, label=label, location="bottom", aspect=30)
-        if most is not None:
-            ax.set_title(f"median {np.median(known):+.2f} m, spread {np.std(known):.2f} m")
+        if limit is not None:
+            ax.set_title(f"median {np.median(grid_values):+.2f} m, spread {np.std(grid_values):.2f} m")
     axes[1].set_title(f"{len(survey)} footprints in {seconds:.0f} s")
     for ax in axes:
         ax.set(xlim=(west, east), ylim=(south, north), xlabel="x, east (m)")
@@ -84,15 +86,15 @@ def drawn(names: dict, seconds: float):
 
 
 def main() -> None:
-    """Run the second example as it is printed and save its picture."""
-    page = (HERE.parents[1] / "README.md").read_text()
-    code = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)[1]
+    """Run the survey of the front page as it is printed and save its picture."""
+    page = (FOLDER.parents[1] / "README.md").read_text()
+    code = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)[3]
     names: dict = {}
     start = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
         exec(code, names)
-    figure = drawn(names, time.perf_counter() - start)
-    with atomic_write(HERE / "hectare.png") as draft:
+    figure = draw(names, time.perf_counter() - start)
+    with atomic_write(FOLDER / "hectare.png") as draft:
         figure.savefig(draft, dpi=80, format="png")
 
 

@@ -1,4 +1,4 @@
-"""What the paper's figures share: the command line, figures one column wide, tables, pulses of photons."""
+"""Shared by the figures of the paper: command line, figures one column wide, tables, pulses of photons."""
 
 import argparse
 from collections.abc import Sequence
@@ -25,28 +25,28 @@ plt.rcParams.update(
         "lines.linewidth": 1.1,
     }
 )
-COLUMN = 3.5
-# The paper's model step: a pulse is sent in pieces so long, and returns are told apart by it.
-STEP = 0.1
-# Half-angle of the cone in which photons count as returned, degrees.
+COLUMN_WIDTH = 3.5
+# Time step of the paper, ns: a pulse is sent in pieces of this length, and returns are distinguished by it.
+PIECE = 0.1
+# Half angle of the cone in which photons count as returned, degrees.
 CONE = 20.0
 
 
 def options(description: str | None, argv: Sequence[str] | None) -> argparse.Namespace:
-    """The command line: `--out` for the folder, `--small` for a quick and coarse run."""
+    """Parse the command line: `--out` for the folder, `--small` for a quick and coarse run."""
     parser = argparse.ArgumentParser(description=(description or "").split("\n")[0])
     parser.add_argument("--out", default="figures", type=Path, help="folder of the figure (default: figures)")
     parser.add_argument("--small", action="store_true", help="a quick and coarse run")
     return parser.parse_args(argv)
 
 
-def new_figure(columns: int = 1, rows: int = 1, height: float = 2.6, width: float = COLUMN, **shared):
-    """A figure, by default one column wide, and its axes."""
+def new_figure(columns: int = 1, rows: int = 1, height: float = 2.6, width: float = COLUMN_WIDTH, **shared):
+    """Return a figure, by default one column wide, and its axes."""
     return plt.subplots(rows, columns, figsize=(width, height), layout="constrained", **shared)
 
 
 def save(figure, path: Path) -> None:
-    """Write a PNG, whole or not at all."""
+    """Write a PNG, atomically."""
     with atomic_write(path) as draft:
         figure.savefig(draft, format="png", dpi=200)
     plt.close(figure)
@@ -62,15 +62,15 @@ def table(header: Sequence[str], rows: Sequence[Sequence]) -> None:
 
 
 def peaks(power: np.ndarray, floor: float = 0.01) -> np.ndarray:
-    """Samples that are higher than both their neighbours and than `floor` of the highest."""
+    """Return samples that are higher than both their neighbours and than `floor` of the highest."""
     middle = power[1:-1]
     return 1 + np.flatnonzero((middle > power[:-2]) & (middle >= power[2:]) & (middle > floor * power.max()))
 
 
-def tree_scene(voxel_size: float, *, leaves: bool = True, **parts) -> jl.Scene:
-    """The paper's tree with the paper's leaf, 250 m2 of them, and measured bark, over measured soil.
+def tree_scene(voxel_size: float, *, leaves: bool = True, **changes) -> jl.Scene:
+    """Return the tree of the paper with 250 m2 of its leaf and measured bark, over measured soil.
 
-    `parts` replaces parts of the scene, such as the ground.
+    `changes` replaces fields of the scene, such as the ground.
     """
     tree = jl.grow(jl.broadleaf(), seed=0)
     tree = tree if leaves else tree.leafless()
@@ -80,20 +80,21 @@ def tree_scene(voxel_size: float, *, leaves: bool = True, **parts) -> jl.Scene:
         leaf=jl.Prospect.paper(),
         bark=jl.spectrum("bark-oak"),
     )
-    given = {"canopy": canopy, "ground": jl.Ground(reflectance=jl.spectrum("soil-medium"))}
-    return jl.Scene(**(given | parts))
+    scene_fields = {"canopy": canopy, "ground": jl.Ground(reflectance=jl.spectrum("soil-medium"))}
+    return jl.Scene(**(scene_fields | changes))
 
 
 def send_pulses(
     lidar: jl.Lidar, scene: jl.Scene, plan: jl.Plan, seed: int, pulses: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Times (ns) and weights of what returns, each (pulses, pieces): the paper's iterations.
+    """Return times (ns) and weights of returned photons, each of shape (pulses, pieces): iterations of the
+    paper.
 
-    A pulse is sent in pieces of 0.1 ns, one photon each, of the energy that the pulse has then; pieces of
+    A pulse is sent in pieces of 0.1 ns, one photon each, with the energy of the pulse at that time; pieces of
     less than a thousandth of the strongest are below the detection level.
     """
     low, high = lidar.pulse.support(float(lidar.jitter))
-    edges = np.arange(np.floor(low / STEP), np.ceil(high / STEP) + 1) * STEP
+    edges = np.arange(np.floor(low / PIECE), np.ceil(high / PIECE) + 1) * PIECE
     energy = np.diff(np.asarray(lidar.pulse.cumulative(jax.numpy.asarray(edges), float(lidar.jitter))))
     strong = energy > 1e-3 * energy.max()
     sent, energy = (0.5 * (edges[:-1] + edges[1:]))[strong], energy[strong]
@@ -106,16 +107,16 @@ def send_pulses(
 
 
 def unique_returns(time: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """How many different times of return there are, to 0.1 ns, after each pulse."""
-    there = weight > 0
-    step = np.round(time[there] / STEP).astype(int)
-    pulse = np.broadcast_to(np.arange(len(time))[:, None], time.shape)[there]
-    _, first = np.unique(step, return_index=True)
+    """Return the cumulative number of distinct return times, to 0.1 ns, after each pulse."""
+    returned = weight > 0
+    time_step = np.round(time[returned] / PIECE).astype(int)
+    pulse = np.broadcast_to(np.arange(len(time))[:, None], time.shape)[returned]
+    _, first = np.unique(time_step, return_index=True)
     return np.cumsum(np.bincount(pulse[first], minlength=len(time)))
 
 
-def until_stable(unique: np.ndarray, per: int, threshold: float) -> int:
-    """The first pulse after which `per` further pulses bring fewer than `threshold` new returns each."""
-    new = unique[per:] - unique[:-per]
-    calm = np.flatnonzero(new <= threshold * per)
-    return int(calm[0]) if calm.size else len(unique)
+def until_stable(unique: np.ndarray, window: int, threshold: float) -> int:
+    """Return the first pulse after which `window` pulses have fewer than `threshold` new returns each."""
+    new = unique[window:] - unique[:-window]
+    quiet = np.flatnonzero(new <= threshold * window)
+    return int(quiet[0]) if quiet.size else len(unique)

@@ -11,7 +11,7 @@ import jaxlidar.plot
 
 
 def main(argv=None) -> dict[str, float]:
-    given = options(__doc__, argv)
+    arguments = options(__doc__, argv)
     tree = jl.grow(jl.broadleaf(), seed=0)
     # Name: the paper's value and the tree's, m.
     sizes = {
@@ -27,8 +27,8 @@ def main(argv=None) -> dict[str, float]:
 
     figure = plt.figure(figsize=(7.0, 4.0), layout="constrained")
     axes = [figure.add_subplot(1, 2, i, projection="3d") for i in (1, 2)]
-    jaxlidar.plot.leaf_on_and_off(tree, axes, **({"max_buds": 2000} if given.small else {}))
-    save(figure, given.out / "paper_figure_01.png")
+    jaxlidar.plot.leaf_on_and_off(tree, axes, **({"max_buds": 2000} if arguments.small else {}))
+    save(figure, arguments.out / "paper_figure_01.png")
     return {name: value for name, (_, value) in sizes.items()}
 
 

@@ -1,6 +1,6 @@
-"""Figure 2, Tables 3 and 4: the paper's leaf by PROSPECT, and how far it is from the paper's numbers.
+"""Figure 2, Tables 3 and 4: the leaf of the paper by PROSPECT, and differences from the numbers of the paper.
 
-Version 2.01 of PROSPECT has no public coefficients; `Prospect.paper()` says what stands in for them.
+Version 2.01 of PROSPECT has no public coefficients; see `Prospect.paper()` for the replacement.
 
     python examples/paper/figure_02.py [--out figures] [--small]
 """
@@ -14,19 +14,19 @@ TABLE_4 = {532.0: (36, 8, 56), 1064.0: (66, 30, 4), 1550.0: (57, 27, 16)}
 
 
 def main(argv=None) -> dict[str, float]:
-    given = options(__doc__, argv)
+    arguments = options(__doc__, argv)
     leaf = jl.Prospect.paper()
     laser = np.array(list(TABLE_4))
     r, t = (100 * np.asarray(x, float) for x in leaf(laser))
-    mine = np.stack([r, t, 100 - r - t], axis=1)
-    off = mine - np.array(list(TABLE_4.values()))
-    rows = [(f"{w:g}", *TABLE_4[w], *mine[i], *off[i]) for i, w in enumerate(laser)]
+    simulated = np.stack([r, t, 100 - r - t], axis=1)
+    differences = simulated - np.array(list(TABLE_4.values()))
+    rows = [(f"{w:g}", *TABLE_4[w], *simulated[i], *differences[i]) for i, w in enumerate(laser)]
     names = ("R", "T", "A")
     table(("nm", *(f"paper {n}" for n in names), *names, *(f"off {n}" for n in names)), rows)
-    found = {"rms difference, percentage points": float(np.sqrt(np.mean(off**2)))}
-    print(found)
+    results = {"rms difference, percentage points": float(np.sqrt(np.mean(differences**2)))}
+    print(results)
     # The paper gives whole per cents: their rounding alone is 0.29.
-    assert found["rms difference, percentage points"] < 0.3
+    assert results["rms difference, percentage points"] < 0.3
 
     wavelength = np.arange(400.0, 2501.0)
     r, t = (np.asarray(x, float) for x in leaf(wavelength))
@@ -41,8 +41,8 @@ def main(argv=None) -> dict[str, float]:
     right = ax.twinx()
     right.set(ylim=(1, 0), ylabel="transmittance")
     ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)
-    save(figure, given.out / "paper_figure_02.png")
-    return found
+    save(figure, arguments.out / "paper_figure_02.png")
+    return results
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """The comparisons that the paper's introduction names, each as one panel.
 
 Sloped and flat ground; the tree with leaves and without; laser wavelength; shape and length of the pulse;
-angle of transmission; atmosphere; footprint size; and single shots beside what is expected of them.
+pointing angle; atmosphere; size of the footprint; and single shots with their expectation.
 
     python examples/paper/introduction.py [--out figures] [--small]
 """
@@ -19,8 +19,8 @@ WINDOW = (-125.0, 45.0)
 TREE = "tree, 1064 nm, nadir"
 
 
-class Cases:
-    """Simulates each case once, and keeps the numbers that are printed."""
+class CaseRunner:
+    """Simulates each case once, and stores the waveforms and the rows of the table."""
 
     def __init__(self, small: bool):
         self.small = small
@@ -28,11 +28,11 @@ class Cases:
         self.waves: dict[str, jl.Waveform] = {}
 
     def ground(self, name: str) -> float:
-        """Apparent reflectance that the ground adds."""
+        """Return the apparent reflectance of the ground."""
         return float(np.asarray(self.waves[name].components["ground"][0]).sum())
 
     def total(self, name: str) -> float:
-        """Apparent reflectance."""
+        """Return the apparent reflectance."""
         return float(np.asarray(self.waves[name].reflectance[0]).sum())
 
     def __call__(self, name: str, lidar: jl.Lidar, scene: jl.Scene) -> jl.Waveform:
@@ -55,11 +55,11 @@ class Cases:
 
 
 def lidar_of(wavelength: float = 1064.0, **changes) -> jl.Lidar:
-    """A footprint of 6 m, so that crown, trunk and ground are all in it."""
+    """Return a lidar with a footprint of 6 m, which holds crown, trunk and ground."""
     return jl.Lidar(**({"wavelength": wavelength, "divergence": 6.0, "field_of_view": 12.0} | changes))
 
 
-def slopes(run: Cases, ax, tree: Callable[..., jl.Scene]) -> None:
+def slopes(run: CaseRunner, ax, tree: Callable[..., jl.Scene]) -> None:
     for slope, colour in zip((0.0, 15.0, 30.0), COLOURS):
         ground = jl.Ground(reflectance=jl.spectrum("soil-medium"), slope=slope)
         wave = run(f"slope {slope:g} deg", lidar_of(), jl.Scene(ground=ground))
@@ -67,7 +67,7 @@ def slopes(run: Cases, ax, tree: Callable[..., jl.Scene]) -> None:
     ax.set(title="slope of bare ground", ylim=(-6, 6))
 
 
-def leaves(run: Cases, ax, tree: Callable[..., jl.Scene]) -> None:
+def leaves(run: CaseRunner, ax, tree: Callable[..., jl.Scene]) -> None:
     for on, colour in ((True, COLOURS[2]), (False, COLOURS[4])):
         name = "leaf-on" if on else "leaf-off"
         wave = run(TREE if on else name, lidar_of(), tree(leaves=on))
@@ -77,7 +77,7 @@ def leaves(run: Cases, ax, tree: Callable[..., jl.Scene]) -> None:
     ax.set(title="leaf-on, leaf-off")
 
 
-def wavelengths(run: Cases, ax, tree: Callable[..., jl.Scene]) -> None:
+def wavelengths(run: CaseRunner, ax, tree: Callable[..., jl.Scene]) -> None:
     for wavelength, colour in zip((532.0, 1064.0, 1550.0), COLOURS):
         wave = run(TREE if wavelength == 1064 else f"{wavelength:g} nm", lidar_of(wavelength), tree())
         ax.plot(1e3 * wave.reflectance[0], wave.height, color=colour, label=f"{wavelength:g} nm")
@@ -85,7 +85,7 @@ def wavelengths(run: Cases, ax, tree: Callable[..., jl.Scene]) -> None:
     ax.set(title="wavelength")
 
 
-def pulses(run: Cases, ax, tree: Callable[..., jl.Scene]) -> None:
+def pulses(run: CaseRunner, ax, tree: Callable[..., jl.Scene]) -> None:
     shapes = {
         "Gaussian, 2 ns": jl.GaussianPulse(fwhm=2.0),
         "Gaussian, 12 ns": jl.GaussianPulse(fwhm=12.0),
@@ -95,12 +95,12 @@ def pulses(run: Cases, ax, tree: Callable[..., jl.Scene]) -> None:
         wave = run(name, lidar_of(pulse=pulse), tree())
         ax.plot(1e3 * wave.reflectance[0], wave.height, color=colour, label=name)
     total = [run.total(name) for name in shapes]
-    # The pulse spreads the light in time; how much returns it does not change.
+    # The pulse spreads the light in time and does not change its sum.
     assert np.ptp(total) < 0.03 * np.mean(total)
     ax.set(title="pulse shape and length")
 
 
-def angles(run: Cases, ax, tree: Callable[..., jl.Scene]) -> None:
+def angles(run: CaseRunner, ax, tree: Callable[..., jl.Scene]) -> None:
     for zenith, colour in zip((0.0, 15.0, 30.0), COLOURS):
         # Aimed so that the beam's axis meets the middle of the crown.
         east = 8.0 * np.tan(np.radians(zenith))
@@ -110,7 +110,7 @@ def angles(run: Cases, ax, tree: Callable[..., jl.Scene]) -> None:
     ax.set(title="pointing angle from nadir")
 
 
-def atmospheres(run: Cases, ax, tree: Callable[..., jl.Scene]) -> None:
+def atmospheres(run: CaseRunner, ax, tree: Callable[..., jl.Scene]) -> None:
     airs = {"none": None} | {f"{v:g} km": jl.Atmosphere(visibility=v) for v in (23.0, 5.0)}
     for (name, air), colour in zip(airs.items(), COLOURS):
         wave = run("532 nm" if air is None else f"visibility {name}", lidar_of(532.0), tree(atmosphere=air))
@@ -119,7 +119,7 @@ def atmospheres(run: Cases, ax, tree: Callable[..., jl.Scene]) -> None:
     ax.set(title="visibility, at 532 nm")
 
 
-def footprints(run: Cases, ax, tree: Callable[..., jl.Scene]) -> None:
+def footprints(run: CaseRunner, ax, tree: Callable[..., jl.Scene]) -> None:
     for divergence, colour in zip((0.3, 6.0, 20.0), COLOURS):
         lidar = lidar_of(divergence=divergence, field_of_view=30.0, position=(1.0, 0.5))
         wave = run(f"footprint {divergence:g} m", lidar, tree())
@@ -129,7 +129,7 @@ def footprints(run: Cases, ax, tree: Callable[..., jl.Scene]) -> None:
     ax.set(title="footprint")
 
 
-def shots(run: Cases, ax, tree: Callable[..., jl.Scene]) -> None:
+def shots(run: CaseRunner, ax, tree: Callable[..., jl.Scene]) -> None:
     lidar = lidar_of(energy=2e-6)
     wave = run("energy 2 uJ", lidar, tree())
     full = float(np.max(wave.energy))
@@ -143,7 +143,7 @@ def shots(run: Cases, ax, tree: Callable[..., jl.Scene]) -> None:
     )
     error = recorded.std(axis=0, ddof=1) / np.sqrt(len(keys))
     step = 1.5 * full / 255
-    # Shots scatter about what is expected of them, but for the digitiser's step and samples cut off at zero.
+    # Shots scatter about their expectation, apart from the step of the digitiser and samples cut off at zero.
     bright = expected > 0.1 * full
     assert np.all(np.abs(recorded.mean(axis=0) - expected)[bright] < 4.5 * error[bright] + 0.6 * step)
     for shot, colour in zip(recorded, ("0.75", "0.45")):
@@ -153,15 +153,15 @@ def shots(run: Cases, ax, tree: Callable[..., jl.Scene]) -> None:
 
 
 def main(argv=None) -> dict[str, float]:
-    given = options(__doc__, argv)
-    run = Cases(given.small)
-    voxel = 1.0 if given.small else 0.25
-    made: dict[tuple, jl.Scene] = {}
+    arguments = options(__doc__, argv)
+    run = CaseRunner(arguments.small)
+    voxel = 1.0 if arguments.small else 0.25
+    scenes: dict[tuple, jl.Scene] = {}
 
     def tree(*, leaves: bool = True, atmosphere: jl.Atmosphere | None = None) -> jl.Scene:
-        if leaves not in made:
-            made[leaves] = tree_scene(voxel, leaves=leaves)
-        return dataclasses.replace(made[leaves], atmosphere=atmosphere)
+        if leaves not in scenes:
+            scenes[leaves] = tree_scene(voxel, leaves=leaves)
+        return dataclasses.replace(scenes[leaves], atmosphere=atmosphere)
 
     panels = (slopes, leaves, wavelengths, pulses, angles, atmospheres, footprints, shots)
     figure, axes = new_figure(4, 2, height=5.2, width=7.2)
@@ -170,13 +170,13 @@ def main(argv=None) -> dict[str, float]:
         panel(run, ax, tree)
         ax.set_xlim(left=0.0)
         ax.locator_params(axis="x", nbins=4)
-        # Between crown and ground, where there is one.
+        # Place the legend between crown and ground.
         place = 0.8 if panel is slopes else 0.42
         ax.legend(loc="center right", bbox_to_anchor=(1.0, place))
     for ax in axes[:, 0]:
         ax.set_ylabel("height (m)")
     table(("case", "sum", "of it ground", "peak"), run.rows)
-    save(figure, given.out / "paper_introduction.png")
+    save(figure, arguments.out / "paper_introduction.png")
     return {name: run.total(name) for name in run.waves}
 
 

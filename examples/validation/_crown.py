@@ -1,56 +1,89 @@
-"""The crown of `examples/benchmarks/peers.py` by jaxlidar and by another code, compared sum by sum."""
+"""The crown of `examples/benchmarks/peers.py` by jaxlidar and by another code, compared by sums of 5 ns."""
 
 import tempfile
 from pathlib import Path
 
 import numpy as np
-from _validation import COLOURS, draw_differences, finish, row, steps
-from peers import CASES, FIRST, WINDOW, block_sums, crown, ours, peer, sampled, task
+from _validation import COLOURS, comparison, draw_differences, finish, with_progress
+from peers import (
+    CASES,
+    FIRST_SAMPLE,
+    WINDOW,
+    block_sums,
+    crown_extinction,
+    run_jaxlidar,
+    run_peer,
+    sampled,
+    worker_task,
+)
 
 
 def moments(samples):
-    """Mean over repetitions, and its standard error."""
+    """Return the mean over repetitions, and its standard error."""
     return samples.mean(axis=0), samples.std(axis=0, ddof=1) / np.sqrt(len(samples))
 
 
-def rows_of(code, case, own, theirs, timing):
-    """The light returned in all, and in sums of 5 ns above 1 % of the largest.
+def rows_of(code, case, ours, theirs, timing):
+    """Yield comparisons of the total, and of sums of 5 ns above 1 % of the largest.
 
-    Where the times of the other code are uncertain by up to `timing` ns either way, so are its sums.
+    The times of the other code are uncertain by up to `timing` ns; the effect on its sums is part of their
+    error.
     """
-    at, mean = np.arange(own.shape[1]), own.mean(axis=0)
-    late, early = (np.interp(at + shift, at, mean) for shift in (-timing, timing))
-    moved = block_sums((late - early)[None])[0] / 2 / np.sqrt(3)
-    parts, others = block_sums(own), block_sums(theirs)
-    bright = parts.mean(axis=0) > 0.01 * parts.mean(axis=0).max()
-    middle = WINDOW[0] + FIRST + 2 + 5 * np.arange(bright.size)
-    (a, da), (b, db) = moments(own.sum(axis=1)), moments(theirs.sum(axis=1))
-    yield row("returned in all", code, case, a, b, stderr=np.hypot(da, db))
-    for t, *values in np.column_stack([middle, *moments(parts), *moments(others), moved])[bright]:
-        a, da, b, db, blur = values
+    sample_number, mean = np.arange(ours.shape[1]), ours.mean(axis=0)
+    late, early = (np.interp(sample_number + shift, sample_number, mean) for shift in (-timing, timing))
+    timing_error = block_sums((late - early)[None])[0] / 2 / np.sqrt(3)
+    our_sums, their_sums = block_sums(ours), block_sums(theirs)
+    bright = our_sums.mean(axis=0) > 0.01 * our_sums.mean(axis=0).max()
+    middle = WINDOW[0] + FIRST_SAMPLE + 2 + 5 * np.arange(bright.size)
+    (our_value, our_error), (their_value, their_error) = (
+        moments(ours.sum(axis=1)),
+        moments(theirs.sum(axis=1)),
+    )
+    yield comparison(
+        "returned in all", code, case, our_value, their_value, stderr=np.hypot(our_error, their_error)
+    )
+    for t, *values in np.column_stack([middle, *moments(our_sums), *moments(their_sums), timing_error])[
+        bright
+    ]:
+        our_value, our_error, their_value, their_error, timing_blur = values
         name = f"returned in 5 ns: {case}"
-        yield row(name, code, f"{t:g} ns", a, b, stderr=np.linalg.norm([da, db, blur]), time=float(t))
+        yield comparison(
+            name,
+            code,
+            f"{t:g} ns",
+            our_value,
+            their_value,
+            stderr=np.linalg.norm([our_error, their_error, timing_blur]),
+            time=float(t),
+        )
 
 
-def compare(given, name, code, worker, cases, *, orders, pulse, asked=(), timing=0.0, **told):
+def compare(
+    arguments, name, code, worker, cases, *, orders, pulse, worker_options=(), timing=0.0, **page_texts
+):
     """Run both codes, and write the record.
 
-    `cases` are names of `peers.CASES`; `asked` is what else the worker is given.
+    `cases` are names of `peers.CASES`; `worker_options` are further numbers for the worker.
     """
-    extinction = crown()
-    mine = {c: ours(extinction, c, pulse, given.repeats, orders)["waves"] for c in steps(given, cases)}
+    extinction = crown_extinction()
+    our_waves = {
+        c: run_jaxlidar(extinction, c, pulse, arguments.repeats, orders)["waves"]
+        for c in with_progress(arguments, cases)
+    }
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder, "given.npz")
-        np.savez(file, **task(extinction, given.repeats) | {"orders": orders} | dict(asked))
-        found = peer(worker, file)
-    if isinstance(found, str):
-        raise SystemExit(f"{code} does not run here: {found}")
-    if not found.get("corrected", True):
+        np.savez(
+            file, **worker_task(extinction, arguments.repeats) | {"orders": orders} | dict(worker_options)
+        )
+        measurements = run_peer(worker, file)
+    if isinstance(measurements, str):
+        raise SystemExit(f"{code} does not run here: {measurements}")
+    if not measurements.get("corrected", True):
         raise SystemExit(f"{code}: its path lengths could not be corrected (see {worker})")
     rows = []
     for case in cases:
-        theirs = sampled(found[f"{case}_waves"], pulse)
-        rows += rows_of(code, CASES[case], mine[case], theirs, timing)
+        theirs = sampled(measurements[f"{case}_waves"], pulse)
+        rows += rows_of(code, CASES[case], our_waves[case], theirs, timing)
 
     def draw(figure):
         axes = figure.subplots(2, len(cases), squeeze=False, sharex="col", height_ratios=(2, 1)).T
@@ -61,10 +94,20 @@ def compare(given, name, code, worker, cases, *, orders, pulse, asked=(), timing
                 top.semilogy(t, [r[who] for r in group], how, ms=4, mfc="none", label=label)
             top.set(title=CASES[case], ylabel="apparent reflectance in 5 ns")
             top.legend()
-            draw_differences(low, [{**r, "difference": r["difference"] / r["there"],
-                                    "standard error": r["standard error"] / r["there"]} for r in group],
-                             "time", color=COLOURS[1])  # fmt: skip
+            draw_differences(
+                low,
+                [
+                    {
+                        **r,
+                        "difference": r["difference"] / r["there"],
+                        "standard error": r["standard error"] / r["there"],
+                    }
+                    for r in group
+                ],
+                "time",
+                color=COLOURS[1],
+            )
             low.set(xlabel="time (ns)", ylabel="relative difference")
 
-    notes = {"code": str(found["version"]), "repetitions": given.repeats, "orders": orders}
-    return finish(given, name, rows, draw=draw, size=(5.0 * len(cases) + 1.0, 6.0), **told, **notes)
+    notes = {"code": str(measurements["version"]), "repetitions": arguments.repeats, "orders": orders}
+    return finish(arguments, name, rows, draw=draw, size=(5.0 * len(cases) + 1.0, 6.0), **page_texts, **notes)

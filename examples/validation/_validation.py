@@ -1,4 +1,4 @@
-"""What the scripts share: the command line, rows of differences, the record, and pictures of differences."""
+"""Shared by the scripts: the command line, rows of comparisons, the record, and figures of differences."""
 
 import argparse
 import datetime
@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 EXAMPLES = Path(__file__).resolve().parents[1]
-# Tools of the benchmarks and of the fits of recorded shots serve here too.
+# The scripts also use modules of the benchmarks and of the fits of recorded shots.
 sys.path += [folder for folder in (str(EXAMPLES / "benchmarks"), str(EXAMPLES)) if folder not in sys.path]
 
 from _common import machine, plt, print_table, save_figure, write_json  # noqa: E402
@@ -22,7 +22,7 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#1
 def options(
     description: str | None, argv: Sequence[str] | None, *files: str, **defaults: float
 ) -> argparse.Namespace:
-    """The command line: `files` that the user has, a number for each of `defaults`, `--out` and `--quiet`."""
+    """Parse the command line: paths for `files`, a number for each of `defaults`, `--out` and `--quiet`."""
     parser = argparse.ArgumentParser(description=(description or "").split("\n")[0])
     for name in files:
         several = name.endswith("...")
@@ -35,89 +35,93 @@ def options(
     return parser.parse_args(argv)
 
 
-def steps(given: argparse.Namespace, items: Sequence) -> Iterator:
-    """The items, with a bar of progress where the standard error is a terminal."""
-    yield from tqdm(items, disable=given.quiet or None, leave=False)
+def with_progress(arguments: argparse.Namespace, items: Sequence) -> Iterator:
+    """Yield the items, with a progress bar if the standard error is a terminal."""
+    yield from tqdm(items, disable=arguments.quiet or None, leave=False)
 
 
-def row(
-    what: str,
-    against: str,
+def comparison(
+    quantity: str,
+    reference_name: str,
     case: str,
-    here: float,
-    there: float,
+    value: float,
+    reference: float,
     *,
     stderr: float | None = None,
     bound: float | None = None,
     unit: str = "1",
-    **more: float | str,
+    **details: float | str,
 ) -> dict:
-    """One comparison: with the standard error of the difference, or with a bound that it must not exceed."""
+    """Return one comparison, with the standard error of the difference or a bound on it."""
     if (stderr is None) == (bound is None):
         raise ValueError("stderr and bound: admissible is one of them")
     error = stderr if bound is None else bound
-    difference = float(here) - float(there)
+    difference = float(value) - float(reference)
     return {
-        "what": what,
-        "against": against,
+        "what": quantity,
+        "against": reference_name,
         "case": case,
         "unit": unit,
-        "here": float(here),
-        "there": float(there),
+        "here": float(value),
+        "there": float(reference),
         "difference": difference,
         "standard error" if bound is None else "bound": float(error),
         "over error": difference / float(error),
-        **more,
+        **details,
     }
 
 
-def error_of(one: Mapping) -> float:
-    """The row's standard error, or its bound."""
-    return one["standard error"] if "standard error" in one else one["bound"]
+def error_of(comparison_row: Mapping) -> float:
+    """Return the standard error of a comparison, or its bound."""
+    return comparison_row["standard error"] if "standard error" in comparison_row else comparison_row["bound"]
 
 
-def by_what(rows: Sequence[dict]) -> dict[str, list[dict]]:
-    """The rows in groups, in their order."""
-    return {what: [r for r in rows if r["what"] == what] for what in dict.fromkeys(r["what"] for r in rows)}
+def by_quantity(rows: Sequence[dict]) -> dict[str, list[dict]]:
+    """Return the rows grouped by their quantity, in their order."""
+    return {
+        quantity: [r for r in rows if r["what"] == quantity]
+        for quantity in dict.fromkeys(r["what"] for r in rows)
+    }
 
 
 def summary(rows: Sequence[dict]) -> list[dict]:
-    """For each kind of comparison the row that is furthest off, in units of its error, and how all are."""
-    found = []
-    for group in by_what(rows).values():
-        over = np.abs([r["over error"] for r in group])
-        far = group[int(np.argmax(over))]
-        within = float(np.mean(over <= (1 if "bound" in far else 2)))
-        rms = float(np.sqrt(np.mean(over**2)))
-        found.append({**far, "cases": len(group), "rms over error": rms, "within": within})
-    return found
+    """Return for each quantity the row with the largest difference over its error, and statistics."""
+    worst = []
+    for group in by_quantity(rows).values():
+        ratios = np.abs([r["over error"] for r in group])
+        worst_row = group[int(np.argmax(ratios))]
+        within = float(np.mean(ratios <= (1 if "bound" in worst_row else 2)))
+        rms = float(np.sqrt(np.mean(ratios**2)))
+        worst.append({**worst_row, "cases": len(group), "rms over error": rms, "within": within})
+    return worst
 
 
-def draw_differences(ax, rows: Sequence[dict], at: str | None = None, **how) -> None:
-    """Differences with bars of two standard errors, or between lines of their bounds.
+def draw_differences(ax, rows: Sequence[dict], abscissa: str | None = None, **style) -> None:
+    """Draw differences with bars of two standard errors, or between lines of their bounds.
 
-    Drawn over the number `at` of the rows, or one beside the other with their cases named.
+    The abscissa is the value of that name in the rows; by default the rows stand side by side with their
+    cases.
     """
-    x = np.arange(len(rows)) if at is None else np.array([r[at] for r in rows])
-    off, error = np.array([r["difference"] for r in rows]), np.array([error_of(r) for r in rows])
+    x = np.arange(len(rows)) if abscissa is None else np.array([r[abscissa] for r in rows])
+    differences, error = np.array([r["difference"] for r in rows]), np.array([error_of(r) for r in rows])
     ax.axhline(0.0, color="0.6", linewidth=0.8)
     if "bound" in rows[0]:
         for side in (-error, error):
             ax.plot(x, side, color="0.6", linestyle="--", linewidth=0.8)
-        ax.plot(x, off, "o", **{"markersize": 3, **how})
+        ax.plot(x, differences, "o", **{"markersize": 3, **style})
     else:
-        ax.errorbar(x, off, 2.0 * error, fmt="o", **{"markersize": 3, "linewidth": 0.8, **how})
-    if at is None:
+        ax.errorbar(x, differences, 2.0 * error, fmt="o", **{"markersize": 3, "linewidth": 0.8, **style})
+    if abscissa is None:
         ax.set_xticks(x, [r["case"] for r in rows], rotation=40, ha="right", fontsize=7)
 
 
 def finish(
-    given: argparse.Namespace,
+    arguments: argparse.Namespace,
     name: str,
     rows: Sequence[dict],
     *,
     title: str,
-    seen: str,
+    caption: str,
     unchecked: str,
     draw: Callable,
     size: tuple[float, float] = (8.0, 4.0),
@@ -125,16 +129,15 @@ def finish(
     of_others: bool = False,
     **notes,
 ) -> dict:
-    """Write `NAME.json` and `NAME.png` and print what was found.
+    """Write `NAME.json` and `NAME.png`, print the summary, and return the record with all rows.
 
-    `seen` are two lines on what the picture shows; `unchecked` is what the reference says nothing about. Of
-    data `of_others` only the summary is written, for the rows hold their values.
-    **Returns:** the record, with all rows.
+    - `caption`: two lines on the figure. - `unchecked`: properties that the reference cannot check.
+    - `of_others`: the data belong to others, so that only the summary is written, not the rows with values.
     """
     record = {
         "title": title,
         "script": name,
-        "seen": " ".join(seen.split()),
+        "seen": " ".join(caption.split()),
         "unchecked": " ".join(unchecked.split()),
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
         "machine": machine(),
@@ -143,13 +146,13 @@ def finish(
         "summary": summary(rows),
     }
     complete = record | {"rows": list(rows)}
-    given.out.mkdir(parents=True, exist_ok=True)
-    write_json(given.out / f"{name}.json", record if of_others else complete)
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    write_json(arguments.out / f"{name}.json", record if of_others else complete)
     figure = plt.figure(figsize=size, layout="constrained")
     draw(figure)
-    save_figure(figure, given.out / f"{name}.png")
-    if not given.quiet:
-        head = (
+    save_figure(figure, arguments.out / f"{name}.png")
+    if not arguments.quiet:
+        header = (
             "what",
             "cases",
             "worst case",
@@ -162,8 +165,8 @@ def finish(
         )
         lines = []
         for r in record["summary"]:
-            found = (r["here"], r["there"], r["difference"], error_of(r), r["rms over error"], r["within"])
-            lines.append((r["what"], r["cases"], r["case"], *found))
-        print_table(head, lines)
-        print("written:", given.out / f"{name}.json", given.out / f"{name}.png")
+            values = (r["here"], r["there"], r["difference"], error_of(r), r["rms over error"], r["within"])
+            lines.append((r["what"], r["cases"], r["case"], *values))
+        print_table(header, lines)
+        print("written:", arguments.out / f"{name}.json", arguments.out / f"{name}.png")
     return complete

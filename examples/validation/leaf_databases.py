@@ -11,7 +11,7 @@ wavelengths), and `leaf_chltot_per_area`, `leaf_cartot_per_area` (ug/cm2), `leaf
 import sys
 
 import numpy as np
-from _validation import COLOURS, finish, options, row, steps
+from _validation import COLOURS, comparison, finish, options, with_progress
 
 from inversion import invert_leaves
 
@@ -24,48 +24,48 @@ CHEMISTRY = {
 
 
 def main(argv=None):
-    given = options(__doc__, argv, "paths...")
+    arguments = options(__doc__, argv, "paths...")
     rows, pictures = [], []
-    for path in steps(given, given.paths):
+    for path in with_progress(arguments, arguments.paths):
         with np.load(path) as archive:
             record = dict(archive)
         name = path.stem
         fit = invert_leaves(record["wavelength_nm"], record["R"], record["T"], domain="recommended")
         for trait, (column, unit) in CHEMISTRY.items():
-            here, error = np.asarray(fit.traits[trait], float), np.asarray(fit.stderr[trait], float)
-            known = np.flatnonzero(np.isfinite(record[column]) & np.isfinite(error))
-            for i in known:
-                values, what = (here[i], record[column][i]), f"{trait} of leaves, {name}"
-                rows.append(row(what, "chemistry", f"leaf {i}", *values, stderr=error[i], unit=unit))
-            pictures.append((name, trait, unit, rows[len(rows) - known.size :]))
+            fitted, error = np.asarray(fit.traits[trait], float), np.asarray(fit.stderr[trait], float)
+            measured_leaves = np.flatnonzero(np.isfinite(record[column]) & np.isfinite(error))
+            for i in measured_leaves:
+                values, what = (fitted[i], record[column][i]), f"{trait} of leaves, {name}"
+                rows.append(comparison(what, "chemistry", f"leaf {i}", *values, stderr=error[i], unit=unit))
+            pictures.append((name, trait, unit, rows[len(rows) - measured_leaves.size :]))
 
     def draw(figure):
-        axes = figure.subplots(len(given.paths), len(CHEMISTRY), squeeze=False)
+        axes = figure.subplots(len(arguments.paths), len(CHEMISTRY), squeeze=False)
         for ax, (name, trait, unit, group) in zip(axes.flat, pictures):
-            there, off, error = (
+            chemistry, differences, error = (
                 np.array([r[k] for r in group]) for k in ("there", "difference", "standard error")
             )
-            ax.errorbar(there, off, 2 * error, fmt="o", ms=2, lw=0.5, color=COLOURS[0])
+            ax.errorbar(chemistry, differences, 2 * error, fmt="o", ms=2, lw=0.5, color=COLOURS[0])
             ax.axhline(0.0, color="0.6", lw=0.8)
-            within = np.mean(np.abs(off) < 2 * error)
+            within = np.mean(np.abs(differences) < 2 * error)
             ax.set_title(f"{name}: {trait}, {100 * within:.0f} % within 2 s.e.", fontsize=8)
             ax.set(xlabel=f"measured ({unit})")
         for ax in axes[:, 0]:
             ax.set_ylabel("fitted less measured")
 
     return finish(
-        given,
+        arguments,
         "leaf_databases",
         rows,
         title="Measured leaves",
-        seen="""Fitted less measured chemistry, leaf by leaf, with bars of two standard errors as the fit
-        states them: they should reach zero for 95 % of the leaves. Where fewer do, PROSPECT is off by more
-        than spectra alone can tell.""",
+        caption="""Fitted less measured chemistry, leaf by leaf, with bars of two standard errors as the fit
+        states them: they should reach zero for 95 % of the leaves. Where fewer do, PROSPECT is off by
+        more than spectra alone can tell.""",
         unchecked="""Chemistry has errors of its own, which are not known and not in the bars. Coefficients of
         PROSPECT-D were calibrated with such leaves, some of these among them.""",
         draw=draw,
         of_others=True,
-        size=(13.0, 3.2 * len(given.paths)),
+        size=(13.0, 3.2 * len(arguments.paths)),
     )
 
 

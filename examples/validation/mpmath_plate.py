@@ -14,13 +14,13 @@ import jax
 import jax.numpy as jnp
 import mpmath
 import numpy as np
-from _validation import COLOURS, finish, options, row, steps
+from _validation import COLOURS, comparison, finish, options, with_progress
 
 from jaxlidar.optics.leaf_surface import leaf_surface
 from jaxlidar.optics.plate_model import plate_model
 
 DIGITS, INDEX = 60, 1.42
-# In units of rounding. Three opaque plates let exp(-30) through, whose exponent has a rounding of its own.
+# In units of rounding. Three opaque plates transmit exp(-30): rounding of the exponent counts 30 times.
 BOUND = {"float32": 8.0, "float64": 16.0}
 LAYER = {
     "2 E3(k)": lambda k: 2 * mpmath.expint(3, k),
@@ -29,7 +29,7 @@ LAYER = {
 
 
 def cone(n, alpha):
-    """Mean transmittance of a surface over a cone, by quadrature of Fresnel's formulas."""
+    """Return the mean transmittance of a surface over a cone, by quadrature of Fresnel's formulas."""
     c = mpmath.cos(mpmath.radians(alpha))
 
     def transmitted(mu):
@@ -41,7 +41,7 @@ def cone(n, alpha):
 
 
 def plates(k, N, t_alpha, t12, n):
-    """Reflectance, transmittance and absorptance by the formulas as they are printed."""
+    """Return reflectance, transmittance and absorptance by the formulas as they are printed."""
     tau, t21 = 2 * mpmath.expint(3, k), t12 / n**2
     r21 = 1 - t21
     bounce = 1 - (r21 * tau) ** 2
@@ -55,57 +55,68 @@ def plates(k, N, t_alpha, t12, n):
 
 
 def main(argv=None):
-    given = options(__doc__, argv, points=60)
-    rows, absorption = [], np.geomspace(1e-8, 10.0, given.points)
-    N = np.random.default_rng(0).uniform(1.0, 3.0, given.points)
+    arguments = options(__doc__, argv, points=60)
+    rows, absorption = [], np.geomspace(1e-8, 10.0, arguments.points)
+    N = np.random.default_rng(0).uniform(1.0, 3.0, arguments.points)
     with mpmath.workdps(DIGITS):
         index = mpmath.mpf(INDEX)
         face = cone(index, 40), cone(index, 90)
         for precision, bound in BOUND.items():
             with jax.enable_x64(precision == "float64"):
-                at, plates_of = jnp.asarray(absorption, precision), jnp.asarray(N, precision)
-                # One plate of the index of air is a layer without surfaces.
-                layer = plate_model(at, jnp.ones_like(at), leaf_surface(1.0))
+                absorptions, plates_of = jnp.asarray(absorption, precision), jnp.asarray(N, precision)
+                # One plate of refractive index 1 is a layer without surfaces.
+                layer = plate_model(absorptions, jnp.ones_like(absorptions), leaf_surface(1.0))
                 ours = dict(zip(LAYER, layer[1:]))
-                ours |= zip("RTA", plate_model(at, plates_of, leaf_surface(INDEX)))
+                ours |= zip("RTA", plate_model(absorptions, plates_of, leaf_surface(INDEX)))
             exact = []
-            for x, n in steps(given, list(zip(at, plates_of))):
+            for x, n in with_progress(arguments, list(zip(absorptions, plates_of))):
                 x, n = mpmath.mpf(float(x)), mpmath.mpf(float(n))
-                exact.append([*(there(x) for there in LAYER.values()), *plates(x, n, *face, index)])
+                exact.append([*(reference(x) for reference in LAYER.values()), *plates(x, n, *face, index)])
             unit = float(np.finfo(precision).eps)
             for (name, values), column in zip(ours.items(), zip(*exact)):
-                for x, value, there in zip(at, np.asarray(values, float), column):
+                for x, value, reference in zip(absorptions, np.asarray(values, float), column):
                     x, value = float(x), float(value)
-                    off = float((mpmath.mpf(value) - there) / there) / unit
+                    off = float((mpmath.mpf(value) - reference) / reference) / unit
                     kind = "leaf of N plates" if name in "RTA" else "exponential integrals"
                     what, case = f"{kind}, {precision}", f"{name} at k = {x:.3g}"
-                    rows.append(row(what, f"mpmath, {DIGITS} digits", case, off, 0.0, bound=bound, unit="eps",
-                                    k=x, function=name))  # fmt: skip
+                    rows.append(
+                        comparison(
+                            what,
+                            f"mpmath, {DIGITS} digits",
+                            case,
+                            off,
+                            0.0,
+                            bound=bound,
+                            unit="eps",
+                            k=x,
+                            function=name,
+                        )
+                    )
 
     def draw(figure):
         for ax, precision in zip(figure.subplots(1, 2), BOUND):
-            own = [r for r in rows if r["what"].endswith(precision)]
+            precision_rows = [r for r in rows if r["what"].endswith(precision)]
             for name, colour in zip((*LAYER, *"RTA"), COLOURS):
-                k, off = zip(*((r["k"], r["difference"]) for r in own if r["function"] == name))
+                k, off = zip(*((r["k"], r["difference"]) for r in precision_rows if r["function"] == name))
                 ax.semilogx(k, off, ".", color=colour, ms=3, label=f"leaf: {name}" if name in "RTA" else name)
             ax.set(title=precision, xlabel="absorption k", ylabel="relative error, units of rounding")
             ax.axhline(0.0, color="0.6", lw=0.8)
         ax.legend(fontsize=7)
 
     return finish(
-        given,
+        arguments,
         "mpmath_plate",
         rows,
         title="Elementary functions against 60 digits",
-        seen="""Relative errors in units of rounding (1.2e-7 in single, 2.2e-16 in double precision), from
-        leaves that absorb almost nothing to opaque ones. None grows where formulas lose digits by
+        caption="""Relative errors in units of rounding (1.2e-7 in single, 2.2e-16 in double precision),
+        from leaves that absorb almost nothing to opaque ones. None grows where formulas lose digits by
         cancellation.""",
         unchecked="""Values, not derivatives (tests check those), and one refractive index; the coefficients
         of absorption are data.""",
         draw=draw,
         size=(11.0, 4.5),
         packages=["mpmath"],
-        points=given.points,
+        points=arguments.points,
     )
 
 

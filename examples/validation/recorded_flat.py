@@ -3,19 +3,19 @@
     python examples/validation/recorded_flat.py PLS [--out figures] [--shots 30]
 
 PLS is a PulseWaves file (.pls beside .wvs). Among its strong single echoes the 120 narrowest stand for flat
-hard ground. From half of them come the corrected table of amplitudes (`corrected_table`) and the receiver's
-response (`receiver_impulse`); so many of the others are fitted by flat ground. Its reduced chi-squared is
-compared with what sums of pulses shifted by quarters of a sample, none negative, and a baseline reach at
-best. Sums adapt to noise: their chi-squared is over that of as good a fit to records that are the fitted
-ground and noise. Noise is as the quiet parts of the records have it: 0.9 counts, correlated by 0.6 from
-sample to sample, and the pulse's own.
+hard ground. Half of them serve to estimate the corrected table of amplitudes (`corrected_table`) and the
+response of the receiver (`receiver_impulse`); `--shots` of the others are fitted by flat ground. The reduced
+chi-squared is compared with that of the best sum of a baseline and non-negative pulses shifted by quarters of
+a sample. As sums adapt to noise, their chi-squared is divided by that of the best sums for synthetic records,
+the fitted ground plus noise. The noise is that of quiet samples, 0.9 counts with a correlation of 0.6 from
+sample to sample, and that of the recorded pulse.
 """
 
 import sys
 
 import jax
 import numpy as np
-from _validation import COLOURS, finish, options, row, steps
+from _validation import COLOURS, comparison, finish, options, with_progress
 from scipy.optimize import nnls
 
 import inversion
@@ -32,19 +32,19 @@ STRONG, NARROWEST = (120, 200), 120
 KNOTS = (100.0, 120.0, 140.0, 150.0, 160.0, 170.0, 180.0, 190.0, 200.0)
 AFTER, SCALE = 40, (0.0, 3e4)
 TIME = np.arange(-14.0, 41.0)
-# The fit may lie so far above the best sum; records drawn for each shot; shifts of pulses, ns.
+# Bound on the excess over the best sum; synthetic records for each shot; shift between pulses, ns.
 WITHIN, DRAWS, SHIFT = 0.1, 10, 0.25
 
 
-class Shot:
-    """A shot with one table for its pulse and its echo."""
+class FlatShot:
+    """A shot whose pulse and echo are converted by one table of amplitudes."""
 
     def __init__(self, shot, table):
         self.counts = shot.outgoing[0].samples, shot.returning[0].samples
         self.read(table)
 
     def read(self, table):
-        """Amplitudes by a table."""
+        """Convert counts to amplitudes by a table."""
         sent, echo = self.counts
         self.echo, self.noise = inversion.amplitudes(echo, table, noise=COUNTS)
         power, noise = inversion.amplitudes(sent, table, noise=COUNTS)
@@ -53,12 +53,12 @@ class Shot:
 
     @property
     def length(self):
-        """Of the echo, in lengths of the pulse."""
+        """Equivalent width of the echo, in widths of the pulse."""
         above = self.echo - np.median(self.echo[:8])
         return (above.sum() / above.max()) / (self.power.sum() / self.power.max())
 
     def window(self):
-        """Echo and noise about the largest sample."""
+        """Return echo and noise about the largest sample."""
         at = int(np.argmax(self.echo)) + TIME.astype(int)
         inside = (at >= 0) & (at < self.echo.size)
         at = np.clip(at, 0, self.echo.size - 1)
@@ -69,8 +69,8 @@ class Shot:
         return jl.Lidar(divergence=0.5, altitude=500.0, pulse=inversion.recorded_pulse(time, self.power))
 
 
-def fitted(shots, response):
-    """The fits of flat ground, their recorders and lidars."""
+def fit_flat_ground(shots, response):
+    """Return the fits of flat ground, their recorders and lidars."""
     recorders = [
         inversion.Recorder(
             impulse=response,
@@ -101,8 +101,8 @@ def fitted(shots, response):
     return fits, recorders, lidars
 
 
-def columns_of(lidar, recorder):
-    """Echoes of the pulse at all shifts, as the receiver records them."""
+def shifted_echoes(lidar, recorder):
+    """Return the recorded echoes of the pulse at all shifts, one a column."""
     fine = np.arange(TIME[0] - 60.0, TIME[-1] + 60.0, 0.05)
     energy = np.asarray(lidar.pulse.cumulative(fine), float)
     edges = np.append(TIME - 0.5, TIME[-1] + 0.5)
@@ -111,31 +111,31 @@ def columns_of(lidar, recorder):
     return recorder.recorded(echoes, {}).T
 
 
-def best_sum(shot, columns, model, noise, random):
-    """Chi-squared of the best sum, and its mean for records that are the model and noise."""
+def best_pulse_sum(shot, columns, model, noise, random):
+    """Return the chi-squared of the best sum, and its mean for synthetic records of the model plus noise."""
     signal, sigma = shot.window()
     used = np.isfinite(sigma)
-    base = np.linalg.qr(noise.whiten(np.ones((used.sum(), 1))))[0]
-    parts = noise.whiten(columns[used])
-    parts = parts - base @ (base.T @ parts)
-    parts = parts / np.maximum(np.linalg.norm(parts, axis=0), 1e-9)
+    baseline = np.linalg.qr(noise.whiten(np.ones((used.sum(), 1))))[0]
+    projected = noise.whiten(columns[used])
+    projected = projected - baseline @ (baseline.T @ projected)
+    projected = projected / np.maximum(np.linalg.norm(projected, axis=0), 1e-9)
 
-    def left(record):
+    def residual_chi2(record):
         white = noise.whiten(record)
-        return nnls(parts, white - base @ (base.T @ white), maxiter=20000)[1] ** 2
+        return nnls(projected, white - baseline @ (baseline.T @ white), maxiter=20000)[1] ** 2
 
-    # What whitens records makes noise of numbers, turned round.
-    colour = np.linalg.inv(noise.whiten(np.eye(used.sum())))
-    drawn = [left(model[used] + colour @ random.normal(size=used.sum())) for _ in range(DRAWS)]
-    return left(signal[used]), float(np.mean(drawn))
+    # The inverse of the whitening matrix correlates independent numbers like the noise.
+    unwhitening = np.linalg.inv(noise.whiten(np.eye(used.sum())))
+    drawn = [residual_chi2(model[used] + unwhitening @ random.normal(size=used.sum())) for _ in range(DRAWS)]
+    return residual_chi2(signal[used]), float(np.mean(drawn))
 
 
 def main(argv=None):
-    given = options(__doc__, argv, "pls", shots=30)
-    record = read_pulsewaves(given.pls)
+    arguments = options(__doc__, argv, "pls", shots=30)
+    record = read_pulsewaves(arguments.pls)
     raw = amplitude_table(np.asarray(record.tables[1], float), True)
     strong = [
-        Shot(shot, raw)
+        FlatShot(shot, raw)
         for shot in record
         if len(shot.returning) == 1 and STRONG[0] < shot.returning[0].samples.max() < STRONG[1]
     ]
@@ -144,49 +144,55 @@ def main(argv=None):
     table = inversion.corrected_table(raw, pulses, echoes, noise=COUNTS, knots=KNOTS, after=AFTER)
     for shot in narrow:
         shot.read(table)
-    train, others = narrow[::2], narrow[1::2]
-    shots = others[:: max(1, len(others) // given.shots)][: given.shots]
+    train, test_shots = narrow[::2], narrow[1::2]
+    shots = test_shots[:: max(1, len(test_shots) // arguments.shots)][: arguments.shots]
     response = inversion.receiver_impulse(
         [shot.power for shot in train],
         [shot.echo for shot in train],
         noise=[np.hypot(s.noise, s.pulse_noise * max(s.echo.max(), 0.0)) for s in train],
         after=AFTER,
     )
-    fits, recorders, lidars = fitted(shots, response)
+    fits, recorders, lidars = fit_flat_ground(shots, response)
     random, sums, residuals = np.random.default_rng(0), [], []
-    for i, shot in enumerate(steps(given, shots)):
-        own = {name: values[i] for name, values in fits.values.items()}
-        model = recorders[i].recorded(fits.fitted[i, 0], own)
+    for i, shot in enumerate(with_progress(arguments, shots)):
+        fit_values = {name: values[i] for name, values in fits.values.items()}
+        model = recorders[i].recorded(fits.fitted[i, 0], fit_values)
         signal, sigma = shot.window()
         used = np.isfinite(sigma)
         terms = RecorderModel(recorders[i], [scale_unknown(SCALE, [])], lidars[i], TIME.size)
-        flat = np.concatenate([np.ravel(own[name]) for name in ("receiver width", "offset", "scale")])
+        flat = np.concatenate([np.ravel(fit_values[name]) for name in ("receiver width", "offset", "scale")])
         common = terms.pulse_noise(fits.fitted[i], flat)
         noise = SampleNoise(sigma[used], common[0][used], neighbour_correlation(CORRELATED, used[None]))
-        sums.append(best_sum(shot, columns_of(lidars[i], recorders[i]), model, noise, random))
+        sums.append(best_pulse_sum(shot, shifted_echoes(lidars[i], recorders[i]), model, noise, random))
         residuals.append(np.where(used, signal - model, np.nan) / np.nanmax(model))
     best, expected = np.sum(sums, axis=0)
-    here, there = float(fits.reduced_chi2.mean()), float(best / expected)
+    fit_chi2, best_chi2 = float(fits.reduced_chi2.mean()), float(best / expected)
     what = "reduced chi-squared of flat ground"
-    rows = [row(what, "the best sum of pulses", "mean of all shots", here, there, bound=WITHIN * there)]
+    rows = [
+        comparison(
+            what, "the best sum of pulses", "mean of all shots", fit_chi2, best_chi2, bound=WITHIN * best_chi2
+        )
+    ]
 
     def draw(figure):
-        left, right = figure.subplots(1, 2)
+        table_axes, residual_axes = figure.subplots(1, 2)
         gain = table / raw
-        left.plot(np.arange(60, 201), gain[60:201], color=COLOURS[0])
-        left.set(title="corrected table over the file's", xlabel="counts")
-        right.plot(TIME, np.array(residuals).T, color="0.8", lw=0.5)
-        right.plot(TIME, np.nanmean(residuals, axis=0), color=COLOURS[1], label=f"mean of {len(shots)} shots")
-        right.set(title="recorded less fitted, over the peak", xlabel="time (ns)")
-        right.legend()
+        table_axes.plot(np.arange(60, 201), gain[60:201], color=COLOURS[0])
+        table_axes.set(title="corrected table over the file's", xlabel="counts")
+        residual_axes.plot(TIME, np.array(residuals).T, color="0.8", lw=0.5)
+        residual_axes.plot(
+            TIME, np.nanmean(residuals, axis=0), color=COLOURS[1], label=f"mean of {len(shots)} shots"
+        )
+        residual_axes.set(title="recorded less fitted, over the peak", xlabel="time (ns)")
+        residual_axes.legend()
 
     return finish(
-        given,
+        arguments,
         "recorded_flat",
         rows,
         title="Recorded RIEGL shots of flat hard ground",
-        seen="""Left, what hard targets make of the file's table of amplitudes: strong samples are less than
-        it says. Right, what the fit of flat ground leaves of records.""",
+        caption="""Left, what hard targets make of the file's table of amplitudes: strong samples are less
+        than it says. Right, what the fit of flat ground leaves of records.""",
         unchecked="""Nothing says that the narrowest echoes are of flat hard ground: some have a weak return
         before or after, which sums of pulses follow and flat ground does not.""",
         draw=draw,

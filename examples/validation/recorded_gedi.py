@@ -11,7 +11,7 @@ fits)."""
 import sys
 
 import numpy as np
-from _validation import COLOURS, by_what, finish, options, row
+from _validation import COLOURS, by_quantity, comparison, finish, options
 from fit_gedi import fit_shots, pulse_of
 
 import inversion
@@ -23,58 +23,76 @@ LEVELS = (25, 50, 75, 98, 100)
 
 
 def main(argv=None):
-    given = options(__doc__, argv, "l1b", "answers", shots=60)
-    with np.load(given.answers) as archive:
-        known = {name: archive[name][: given.shots] for name in archive.files}
-    shots = read_gedi_l1b(given.l1b, known["shot"])
+    arguments = options(__doc__, argv, "l1b", "answers", shots=60)
+    with np.load(arguments.answers) as archive:
+        products = {name: archive[name][: arguments.shots] for name in archive.files}
+    shots = read_gedi_l1b(arguments.l1b, products["shot"])
     rows = []
 
-    def add(what, i, here, there, **error):
-        rows.append(row(what, "GEDI level 2", f"shot {known['shot'][i]}", here, there, unit="m", **error))
+    def add(what, i, value, reference, **error):
+        rows.append(
+            comparison(
+                what, "GEDI level 2", f"shot {products['shot'][i]}", value, reference, unit="m", **error
+            )
+        )
 
-    metrics, lowest = inversion.gedi_metrics(shots), known["elev_lowestmode"]
+    metrics, lowest = inversion.gedi_metrics(shots), products["elev_lowestmode"]
     for i, shot in enumerate(shots):
         add("lowest mode, product's rules", i, metrics.elev_lowestmode[i], lowest[i], bound=BIN)
         add(
             "highest return, product's rules",
             i,
             metrics.elev_highestreturn[i],
-            known["elev_highest"][i],
+            products["elev_highest"][i],
             bound=BIN,
         )
         for level in LEVELS:
-            here, there = metrics.rh[i, level], known["rh"][i, level]
-            add(f"RH{level}, product's rules", i, here, there, bound=BIN)
-        found = inversion.find_ground(shot.elevation, shot.signal, pulse=pulse_of(shot), noise=shot.noise_std)
-        add("ground, matched pulse", i, found, lowest[i], bound=2 * BIN)
-    fits = fit_shots(shots)[0] if given.shots else []
+            value, reference = metrics.rh[i, level], products["rh"][i, level]
+            add(f"RH{level}, product's rules", i, value, reference, bound=BIN)
+        matched_ground = inversion.find_ground(
+            shot.elevation, shot.signal, pulse=pulse_of(shot), noise=shot.noise_std
+        )
+        add("ground, matched pulse", i, matched_ground, lowest[i], bound=2 * BIN)
+    fits = fit_shots(shots)[0] if arguments.shots else []
     for i, fit in enumerate(fits):
         if fit["quality"] == "good":
             add("ground, fitted simulation", i, fit["ground"], lowest[i], stderr=fit["ground_stderr"])
 
     def draw(figure):
-        left, right = figure.subplots(1, 2, width_ratios=(1.3, 1))
-        groups = by_what(rows)
+        box_axes, ground_axes = figure.subplots(1, 2, width_ratios=(1.3, 1))
+        groups = by_quantity(rows)
         names = [w for w in groups if "fitted" not in w]
-        left.boxplot([[r["difference"] for r in groups[w]] for w in names], whis=(0, 100),
-                     tick_labels=[w.replace(", ", ",\n") for w in names])  # fmt: skip
-        left.tick_params(axis="x", rotation=60, labelsize=7)
-        left.axhline(0.0, color="0.6", lw=0.8)
-        left.set(ylabel="difference from the product (m)", title="whole range, quartiles and median")
+        box_axes.boxplot(
+            [[r["difference"] for r in groups[w]] for w in names],
+            whis=(0, 100),
+            tick_labels=[w.replace(", ", ",\n") for w in names],
+        )
+        box_axes.tick_params(axis="x", rotation=60, labelsize=7)
+        box_axes.axhline(0.0, color="0.6", lw=0.8)
+        box_axes.set(ylabel="difference from the product (m)", title="whole range, quartiles and median")
         fitted = sorted(groups.get("ground, fitted simulation", []), key=lambda r: r["standard error"])
         error = [2 * r["standard error"] for r in fitted]
-        right.errorbar(range(len(fitted)), [r["difference"] for r in fitted], error, fmt="o", ms=3, lw=0.8,
-                       color=COLOURS[1])  # fmt: skip
-        right.axhline(0.0, color="0.6", lw=0.8)
-        right.set(title="ground of good fits, two standard errors", xlabel="shots, in order of their errors")
+        ground_axes.errorbar(
+            range(len(fitted)),
+            [r["difference"] for r in fitted],
+            error,
+            fmt="o",
+            ms=3,
+            lw=0.8,
+            color=COLOURS[1],
+        )
+        ground_axes.axhline(0.0, color="0.6", lw=0.8)
+        ground_axes.set(
+            title="ground of good fits, two standard errors", xlabel="shots, in order of their errors"
+        )
 
     return finish(
-        given,
+        arguments,
         "recorded_gedi",
         rows,
         title="Recorded GEDI shots against the products",
-        seen="""Left, differences of elevations and relative heights; the product's own rules give its numbers
-        to within a bin of 0.15 m. Right, the ground that simulations fitted to the records have.""",
+        caption="""Left, differences of elevations and relative heights; the product's own rules give its
+        numbers to within a bin of 0.15 m. Right, the ground that simulations fitted to the records have.""",
         unchecked="""The product's ground is itself read from the waveform, no survey. Plant area has no
         independent truth here. One orbit over a savanna.""",
         draw=draw,

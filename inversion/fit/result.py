@@ -16,12 +16,10 @@ from inversion.fit.quality import Verdict, judge_fit, judge_fits
 from inversion.fit.uncertainty import correlation_of
 from inversion.fit.unknowns import BoundUnknown, bounds_by_name, flat_labels, smooth_names, split_by_name
 from jaxlidar import Scene, Waveform
-from jaxlidar.extend import briefly
 from jaxlidar.io import save
 
 
 @final
-@briefly
 class Retrieval(AbstractPosterior):
     """The result of `retrieve`: values of the unknowns, their standard errors, and the fitted scene.
 
@@ -124,7 +122,6 @@ class Retrieval(AbstractPosterior):
 
 
 @final
-@briefly
 class Retrievals(AbstractPosterior):
     """The results of `retrieve_many`: one fit per footprint, in the order given.
 

@@ -1,11 +1,11 @@
-"""The command `jaxlidar`: `jaxlidar --help` lists what it can do, `jaxlidar COMMAND --help` has examples.
+"""The command `jaxlidar`: `jaxlidar --help` lists its commands, `jaxlidar COMMAND --help` has examples.
 
-Besides those of this room, every entry point of the group `jaxlidar.commands` is a command (a
-`click.Command`), so that packages that build on this one can add theirs: `demo` and `retrieve` come from the
+Besides the commands of this package, every entry point of the group `jaxlidar.commands` is a command (a
+`click.Command`), so that packages on top of this one can add theirs: `demo` and `retrieve` come from the
 package `inversion`.
 
-Exit statuses: 0 done; 1 failed (a sentence on the standard error says why); 2 wrong usage; 130 interrupted
-(what was done until then is kept where the command says so).
+Exit statuses: 0 success; 1 failure (a sentence on the standard error says why); 2 wrong usage; 130
+interrupted (results until then are saved where the command says so).
 """
 
 import os
@@ -16,11 +16,11 @@ from importlib import metadata
 from typing import Any
 
 COMMANDS = "jaxlidar.commands"
-DONE, FAILED, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130
+SUCCESS, FAILURE, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130
 
 
 def version() -> str:
-    """The installed version."""
+    """Return the installed version."""
     try:
         return metadata.version("jaxlidar")
     except metadata.PackageNotFoundError:
@@ -32,7 +32,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     **Arguments:**
 
-    - `argv`: arguments without the program's name. Default None: those of the process.
+    - `argv`: arguments without the name of the program. Default None: those of the process.
 
     **Returns:** the exit status.
 
@@ -49,27 +49,30 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _fail(f"the command needs {error.name}: pip install 'jaxlidar[cli]'")
     try:
         with warnings.catch_warnings():
-            warnings.showwarning = _warn
+            warnings.showwarning = _print_warning
+            # Not standalone: click then returns the status and raises its exceptions, which are handled here.
             status = jaxlidar.main(argv, prog_name="jaxlidar", standalone_mode=False)
+        # Within `try`, as a closed pipe may be noticed only when the output is flushed.
         sys.stdout.flush()
-        return status if isinstance(status, int) else DONE
+        return status if isinstance(status, int) else SUCCESS
     except click.ClickException as error:
         error.show()
         return error.exit_code
     except (click.Abort, KeyboardInterrupt):
         return _fail("interrupted", INTERRUPTED)
     except BrokenPipeError:
-        # The reader of the output (head, less) has closed it; keep the interpreter from flushing it again.
+        # The reader of the output (head, less) has closed it. At exit the interpreter would flush the output
+        # and fail again, so it is redirected to the null device.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return DONE
+        return SUCCESS
     except (OSError, ValueError, TypeError, ImportError) as error:
         return _fail(str(error))
 
 
-def _warn(message: Any, *args: Any, **kwargs: Any) -> None:
+def _print_warning(message: Any, *args: Any, **kwargs: Any) -> None:
     print(f"jaxlidar: warning: {message}", file=sys.stderr)
 
 
-def _fail(why: str, status: int = FAILED) -> int:
-    print(f"jaxlidar: {why}", file=sys.stderr)
+def _fail(reason: str, status: int = FAILURE) -> int:
+    print(f"jaxlidar: {reason}", file=sys.stderr)
     return status

@@ -1,4 +1,4 @@
-"""`python -m jaxlidar.cli`."""
+"""Run the command as `python -m jaxlidar.cli`."""
 
 import sys
 

@@ -1,8 +1,7 @@
-"""`jaxlidar info` and `jaxlidar convert`."""
+"""The commands `jaxlidar info` and `jaxlidar convert`."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import click
 import numpy as np
@@ -35,149 +34,154 @@ from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.voxels import VoxelMap
 from jaxlidar.spectral.waveform import Waveform
 
-FILE = ResultPath(exists=True)
+FILE_PATH = ResultPath(exists=True)
+# Number of shots of a file that are read for its description: files may be larger than memory.
+MAX_DESCRIBED_SHOTS = 1000
 
 
-def _of_case(path: Path) -> str:
+# -- info --------------------------------------------------------------------------------------------------
+
+
+def describe_case(path: Path) -> str:
     case = read_case(path)
-    return "\n".join(f"{name}: {part}" for name, part in _parts(case).items() if part is not None)
-
-
-def _parts(case: Case) -> dict[str, Any]:
     arguments = ", ".join(f"{name} = {value}" for name, value in case.arguments.items())
-    parts = {"lidar": case.lidar, "survey": case.survey, "scene": case.scene}
-    return {**parts, "simulate": arguments or None}
+    entries = {"lidar": case.lidar, "survey": case.survey, "scene": case.scene, "simulate": arguments or None}
+    return "\n".join(f"{name}: {entry}" for name, entry in entries.items() if entry is not None)
 
 
-def _of_voxels(voxels: VoxelMap, dropped: dict[str, int]) -> str:
+def describe_voxels(voxels: VoxelMap, dropped: dict[str, int]) -> str:
     size = " x ".join(f"{float(s):g}" for s in voxels.voxel_size)
     low = ", ".join(f"{float(x):g}" for x in voxels.origin)
     lines = [f"{' x '.join(map(str, voxels.shape))} voxels of {size} m from ({low}) m"]
+    volume = float(np.prod(np.asarray(voxels.voxel_size)))
     for name, extinction in (("leaf", voxels.leaf), ("bark", voxels.bark)):
         if extinction is not None:
-            area = (
-                2
-                * float(np.sum(np.asarray(extinction, float)))
-                * float(np.prod(np.asarray(voxels.voxel_size)))
-            )
+            # Extinction is stored for G = 1/2: the area density is twice as large.
+            area = 2 * float(np.sum(np.asarray(extinction, float))) * volume
             lines.append(f"{name}: {area:.4g} m2")
-    lines += [f"{count} voxels {why}" for why, count in dropped.items() if count]
-    return "\n".join(lines)
+    return _with_counts(lines, dropped, "voxels ")
 
 
-def _of_points(path: Path) -> str:
+def describe_points(path: Path) -> str:
     cloud = read_las(path)
-    low, high = cloud.position.min(axis=0), cloud.position.max(axis=0)
-    spans = ", ".join(f"{axis} {a:.2f} to {b:.2f} m" for axis, a, b in zip("xyz", low, high))
+    spans = _spans(cloud.position.min(axis=0), cloud.position.max(axis=0))
     lines = [f"{len(cloud.position):,} points: {spans}"]
-    lines += [f"{n} points left out: {why}" for why, n in cloud.dropped.items() if n]
-    if has_packets(path):
-        lines.append(_of_shots(read_las_waveforms(path)))
-    return "\n".join(lines)
+    text = _with_counts(lines, cloud.dropped, "points left out: ")
+    return "\n".join([text, describe_shots(read_las_waveforms(path))]) if has_packets(path) else text
 
 
-def _of_shots(shots: AirborneShots) -> str:
-    """Of airborne shots in a file that may be larger than memory: some evenly spread ones stand for all."""
-    some = [shots[i] for i in range(len(shots))[:: -(-len(shots) // _SOME)]]
+def describe_shots(shots: AirborneShots) -> str:
+    """Describe the airborne shots of a file by at most `MAX_DESCRIBED_SHOTS` evenly spread ones."""
+    stride = -(-len(shots) // MAX_DESCRIBED_SHOTS)
+    sample = [shots[i] for i in range(0, len(shots), stride)]
     times = shots.gps_time
     lines = [f"{len(shots):,} airborne shots, GPS times {times.min():.6f} to {times.max():.6f} s"]
-    lines += [_of_records(some), f"noise {shots.levels.noise_mean:.4g} +- {shots.levels.noise_std:.3g}"]
-    lines += [f"{n} points left out: {why}" for why, n in shots.dropped.items() if n]
-    return "\n".join(lines)
+    lines += [_describe_records(sample)]
+    lines += [f"noise {shots.levels.noise_mean:.4g} +- {shots.levels.noise_std:.3g}"]
+    return _with_counts(lines, shots.dropped, "points left out: ")
 
 
-def _of_records(shots: Sequence[AirborneShot]) -> str:
-    zenith, samples = [s.zenith for s in shots], [int(s.recorded.sum()) for s in shots]
-    ends = np.array([s.elevation[[0, -1]] for s in shots])
-    scanner, pulses = shots[0].scanner, sum(bool(s.outgoing) for s in shots)
+def _describe_records(shots: Sequence[AirborneShot]) -> str:
+    """Describe scanner, lengths of records and geometry of some shots."""
+    zenith, samples = [shot.zenith for shot in shots], [int(shot.recorded.sum()) for shot in shots]
+    ends = np.array([shot.elevation[[0, -1]] for shot in shots])
+    scanner, has_pulses = shots[0].scanner, any(shot.outgoing for shot in shots)
     lines = [] if scanner is None else [f"scanner {scanner.instrument}, {scanner.wavelength or '?'} nm"]
     lines += [
         f"{min(samples)} to {max(samples)} samples of {shots[0].sampling_interval:g} ns in up to "
-        f"{max(len(s.returning) for s in shots)} segments, {'with' if pulses else 'without'} outgoing pulses",
+        f"{max(len(shot.returning) for shot in shots)} segments, "
+        f"{'with' if has_pulses else 'without'} outgoing pulses",
         f"zenith {min(zenith):.1f} to {max(zenith):.1f} degrees, elevation {ends.min():.1f} to "
         f"{ends.max():.1f}",
     ]
     return "\n".join(lines)
 
 
-def _of_neon(path: Path) -> str:
+def describe_neon(path: Path) -> str:
     shots, _, dropped = read_neon(path)
-    lines = [f"{len(shots):,} airborne shots", _of_records(shots)]
-    return "\n".join([*lines, *(f"{n} shots left out: {why}" for why, n in dropped.items() if n)])
+    lines = [f"{len(shots):,} airborne shots", _describe_records(shots)]
+    return _with_counts(lines, dropped, "shots left out: ")
 
 
-def _of_gedi(path: Path) -> str:
+def describe_gedi(path: Path) -> str:
     shots = read_gedi_l1b(path)
-    latitude, longitude = [s.latitude for s in shots], [s.longitude for s in shots]
+    latitude, longitude = [shot.latitude for shot in shots], [shot.longitude for shot in shots]
     lines = [
-        f"{len(shots):,} GEDI shots of {', '.join(sorted({s.beam for s in shots}))}",
+        f"{len(shots):,} GEDI shots of {', '.join(sorted({shot.beam for shot in shots}))}",
         f"latitude {min(latitude):.5f} to {max(latitude):.5f}, longitude {min(longitude):.5f} to "
         f"{max(longitude):.5f} degrees",
     ]
-    flagged = sum(bool(s.degrade or s.stale_return) for s in shots)
+    flagged = sum(bool(shot.degrade or shot.stale_return) for shot in shots)
     return "\n".join([*lines, *([f"{flagged} of them flagged as degraded or stale"] if flagged else [])])
 
 
-def _of_tree(path: Path) -> str:
-    read = read_qsm(path)
-    lines = [f"tree of {len(read.tree.start):,} cylinders, {read.tree.height:.2f} m tall"]
-    return "\n".join([*lines, *(f"{n} cylinders {why}" for why, n in read.dropped.items() if n)])
+def describe_tree(path: Path) -> str:
+    tree, dropped = read_qsm(path)
+    return _with_counts(
+        [f"tree of {len(tree.start):,} cylinders, {tree.height:.2f} m tall"], dropped, "cylinders "
+    )
 
 
-def _of_mesh(path: Path) -> str:
+def describe_mesh(path: Path) -> str:
     mesh, dropped = read_obj(path)
-    low, high = mesh.corners.min(axis=(0, 1)), mesh.corners.max(axis=(0, 1))
-    spans = ", ".join(f"{axis} {a:.2f} to {b:.2f} m" for axis, a, b in zip("xyz", low, high))
-    area = np.bincount(mesh.material, mesh.area, len(mesh.materials))
+    areas = np.bincount(mesh.material, mesh.area, len(mesh.materials))
+    spans = _spans(mesh.corners.min(axis=(0, 1)), mesh.corners.max(axis=(0, 1)))
     lines = [f"{len(mesh.faces):,} triangles: {spans}"]
-    lines += [f"{name}: {own:.4g} m2" for name, own in zip(mesh.materials, area)]
-    return "\n".join([*lines, *(f"{n} triangles left out: {why}" for why, n in dropped.items() if n)])
+    lines += [f"{name}: {area:.4g} m2" for name, area in zip(mesh.materials, areas)]
+    return _with_counts(lines, dropped, "triangles left out: ")
 
 
-def _of_terrain(path: Path) -> str:
+def describe_terrain(path: Path) -> str:
     terrain, crs, filled = read_dem(path)
     heights, spacing = np.asarray(terrain.heights), np.asarray(terrain.spacing)
-    nodes, apart = " x ".join(map(str, heights.shape)), " x ".join(f"{step:g}" for step in spacing)
+    nodes, spacings = " x ".join(map(str, heights.shape)), " x ".join(f"{step:g}" for step in spacing)
     lines = [
-        f"terrain of {nodes} nodes, {apart} m apart",
+        f"terrain of {nodes} nodes, {spacings} m apart",
         f"heights {heights.min():.2f} to {heights.max():.2f} m, {crs or 'no coordinate reference system'}",
     ]
     return "\n".join([*lines, *([f"{filled} nodes without data"] if filled else [])])
 
 
-def _of_spectrum(path: Path) -> str:
-    read = read_spectrum_csv(path)
-    low, high = float(read.wavelength[0]), float(read.wavelength[-1])
-    return f"spectrum {read.name!r} of {read.wavelength.size} samples from {low:g} to {high:g} nm"
+def describe_spectrum(path: Path) -> str:
+    spectrum = read_spectrum_csv(path)
+    low, high = float(spectrum.wavelength[0]), float(spectrum.wavelength[-1])
+    return f"spectrum {spectrum.name!r} of {spectrum.wavelength.size} samples from {low:g} to {high:g} nm"
 
 
-# Shots of a file that stand for all.
-_SOME = 1000
+def _spans(low: np.ndarray, high: np.ndarray) -> str:
+    return ", ".join(f"{axis} {a:.2f} to {b:.2f} m" for axis, a, b in zip("xyz", low, high))
 
-READERS: dict[str, Callable[[Path], str]] = {
-    ".toml": _of_case,
+
+def _with_counts(lines: list[str], dropped: Mapping[str, int], items: str) -> str:
+    """Append a line for each reason for which a reader left out or changed items of a file."""
+    return "\n".join([*lines, *(f"{count} {items}{reason}" for reason, count in dropped.items() if count)])
+
+
+# By the ending of the file's name.
+DESCRIPTIONS: dict[str, Callable[[Path], str]] = {
+    ".toml": describe_case,
     ".nc": lambda path: str(open_result(path)),
     ".zarr": lambda path: str(open_result(path)),
-    ".vox": lambda path: _of_voxels(*read_vox(path)),
-    ".las": _of_points,
-    ".laz": _of_points,
-    ".pls": lambda path: _of_shots(read_pulsewaves(path)),
-    ".npz": _of_neon,
-    ".obj": _of_mesh,
-    ".h5": _of_gedi,
-    **dict.fromkeys((".tif", ".tiff", ".asc"), _of_terrain),
-    ".qsm": _of_tree,
-    ".txt": _of_tree,
-    ".csv": _of_spectrum,
+    ".vox": lambda path: describe_voxels(*read_vox(path)),
+    ".las": describe_points,
+    ".laz": describe_points,
+    ".pls": lambda path: describe_shots(read_pulsewaves(path)),
+    ".npz": describe_neon,
+    ".obj": describe_mesh,
+    ".h5": describe_gedi,
+    **dict.fromkeys((".tif", ".tiff", ".asc"), describe_terrain),
+    ".qsm": describe_tree,
+    ".txt": describe_tree,
+    ".csv": describe_spectrum,
 }
 
 
 @click.command()
-@click.argument("file", type=FILE)
+@click.argument("file", type=FILE_PATH)
 def info(file: Path) -> None:
-    """Say what is in a file, by its ending.
+    """Describe the content of a file by the ending of its name.
 
-    These are cases (.toml), results (.nc, .zarr), voxels (.vox), points (.las, .laz), airborne waveforms
+    Known are cases (.toml), results (.nc, .zarr), voxels (.vox), points (.las, .laz), airborne waveforms
     (.las with .wdp, .pls with .wvs, NEON's .npz), GEDI level 1B (.h5), tree models (.qsm, .txt), meshes
     (.obj), elevation models (.tif, .tiff, .asc) and spectra (.csv).
 
@@ -187,9 +191,12 @@ def info(file: Path) -> None:
       jaxlidar info plot.vox
     """
     suffix = file.suffix.lower()
-    if suffix not in READERS:
-        raise click.BadParameter(f"{file.name}: files end in {', '.join(READERS)}", param_hint="FILE")
-    click.echo(READERS[suffix](file))
+    if suffix not in DESCRIPTIONS:
+        raise click.BadParameter(f"{file.name}: files end in {', '.join(DESCRIPTIONS)}", param_hint="FILE")
+    click.echo(DESCRIPTIONS[suffix](file))
+
+
+# -- convert -----------------------------------------------------------------------------------------------
 
 
 def _waveform_to_csv(source: Path, target: Path) -> None:
@@ -202,7 +209,7 @@ def _waveform_to_csv(source: Path, target: Path) -> None:
             names.append(f"{name}_{wavelength:g}nm")
             columns.append(np.asarray(getattr(wave, name)[i]))
     with atomic_write(target) as draft:
-        # Nine digits are exact in single precision.
+        # Nine significant digits represent a float32 exactly.
         np.savetxt(
             draft, np.column_stack(columns), delimiter=",", header=",".join(names), comments="", fmt="%.9g"
         )
@@ -210,9 +217,10 @@ def _waveform_to_csv(source: Path, target: Path) -> None:
 
 def _voxels_to_case(source: Path, target: Path) -> None:
     voxels, dropped = read_vox(source)
-    left_out = [f"{n} voxels {why}" for why, n in dropped.items() if n]
-    if left_out:
-        click.echo(f"taken as empty: {', '.join(left_out)}", err=True)
+    empty = [f"{count} voxels {reason}" for reason, count in dropped.items() if count]
+    if empty:
+        click.echo(f"taken as empty: {', '.join(empty)}", err=True)
+    # The file has no optics.
     leaf = Prospect() if voxels.leaf is not None else None
     bark = 0.3 if voxels.bark is not None else None
     write_case(target, Case(scene=Scene(canopy=Canopy(voxels, leaf=leaf, bark=bark))))
@@ -239,10 +247,10 @@ CONVERSIONS: dict[tuple[str, str], Callable[[Path, Path], None]] = {
 
 
 @click.command()
-@click.argument("source", type=FILE)
+@click.argument("source", type=FILE_PATH)
 @click.argument("target", type=click.Path(dir_okay=False, path_type=Path))
 def convert(source: Path, target: Path) -> None:
-    """Convert a file by the endings of both names.
+    """Convert a file, by the endings of both names.
 
     \b
       .nc to .csv     samples of a waveform, as a table; .zarr too
@@ -257,7 +265,9 @@ def convert(source: Path, target: Path) -> None:
     """
     conversion = CONVERSIONS.get((source.suffix.lower(), target.suffix.lower()))
     if conversion is None:
-        known = ", ".join(f"{a} to {b}" for a, b in CONVERSIONS)
-        raise click.UsageError(f"{source.suffix or source} to {target.suffix or target} is none of {known}")
+        conversions = ", ".join(f"{a} to {b}" for a, b in CONVERSIONS)
+        raise click.UsageError(
+            f"{source.suffix or source} to {target.suffix or target} is none of {conversions}"
+        )
     conversion(source, target)
     click.echo(f"written: {target}")

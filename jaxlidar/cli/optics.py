@@ -1,18 +1,18 @@
-"""`jaxlidar prospect` and `jaxlidar spectra`."""
+"""The commands `jaxlidar prospect` and `jaxlidar spectra`."""
 
 from pathlib import Path
 
 import click
 import numpy as np
 
-from jaxlidar.cli.shared import PLOT, new_axes, out, save_figure
+from jaxlidar.cli.shared import PLOT_OPTION, new_axes, out_option, save_figure
 from jaxlidar.io import atomic_write
 from jaxlidar.optics.coefficients import TRAITS
 from jaxlidar.optics.prospect import Prospect
 from jaxlidar.optics.spectra import spectrum, spectrum_names
 
 WAVELENGTHS = (532.0, 1064.0, 1550.0)
-# Without PRO, whose coefficients are its authors' file.
+# All versions but PRO, whose coefficients are not bundled: its authors distribute them.
 VERSIONS = tuple(version for version in TRAITS if version != "PRO")
 
 
@@ -26,12 +26,12 @@ VERSIONS = tuple(version for version in TRAITS if version != "PRO")
 @click.option("--Cm", "Cm", type=float, help="Dry matter, g/cm2.  [default: 0.009]")
 @click.option("--Cp", "Cp", type=float, help="Protein, g/cm2; version PC.  [default: 0.001]")
 @click.option("--Cc", "Cc", type=float, help="Cellulose and lignin, g/cm2; version PC.  [default: 0.009]")
-@click.option("--version", type=click.Choice(VERSIONS), default="D", help="Of the coefficients.")
+@click.option("--version", type=click.Choice(VERSIONS), default="D", help="Version of the coefficients.")
 @click.option("--at", type=float, multiple=True, default=WAVELENGTHS, help="Wavelength, nm; repeat for more.")
-@out("Write the spectrum from 400 to 2500 nm as CSV.")
-@PLOT
+@out_option("Write the spectrum from 400 to 2500 nm as CSV.")
+@PLOT_OPTION
 def prospect(at: tuple[float, ...], out: Path | None, plot: Path | None, **traits: float) -> None:
-    """Reflectance and transmittance of a leaf by the PROSPECT model.
+    """Print the reflectance and transmittance of a leaf by the PROSPECT model.
 
     \b
     Examples:
@@ -51,16 +51,16 @@ def prospect(at: tuple[float, ...], out: Path | None, plot: Path | None, **trait
             np.savetxt(draft, rows, delimiter=",", header=header, comments="", fmt=("%g", "%.7g", "%.7g"))
         click.echo(f"spectrum: {out}")
     if plot is not None:
-        from jaxlidar.plot import spectrum as draw
+        from jaxlidar.plot import spectrum as draw_spectrum
 
         axes = new_axes(5.0, 3.0)
-        draw(leaf, axes)
+        draw_spectrum(leaf, axes)
         save_figure(axes, plot)
 
 
 @click.command()
 @click.argument("kind", required=False)
-@PLOT
+@PLOT_OPTION
 def spectra(kind: str | None, plot: Path | None) -> None:
     """List the bundled reflectance spectra, of one KIND (bark, wood, litter, char, soil, built) or of all.
 
@@ -76,9 +76,9 @@ def spectra(kind: str | None, plot: Path | None) -> None:
         values = "  ".join(f"{float(r):7.2f}" for r in spectrum(name)(np.array(WAVELENGTHS)))
         click.echo(f"{name:{width}}  {material:6}  {values}")
     if plot is not None:
-        from jaxlidar.plot import spectrum as draw
+        from jaxlidar.plot import spectrum as draw_spectrum
 
         axes = new_axes(5.0, 3.0)
         for name in kind_of_name:
-            draw(spectrum(name), axes)
+            draw_spectrum(spectrum(name), axes)
         save_figure(axes, plot)

@@ -1,4 +1,4 @@
-"""What commands share: arguments that are files, figures, and progress."""
+"""Arguments, options, figures and progress bars that several commands have."""
 
 import contextlib
 import math
@@ -13,15 +13,15 @@ from jaxlidar._progress import Progress
 from jaxlidar.io import atomic_write
 from jaxlidar.io.zarr_groups import is_zarr
 
-CASE = click.argument("case", type=click.Path(dir_okay=False, path_type=Path), metavar="CASE.toml")
-PLOT = click.option(
+CASE_ARGUMENT = click.argument("case", type=click.Path(dir_okay=False, path_type=Path), metavar="CASE.toml")
+PLOT_OPTION = click.option(
     "--plot", type=click.Path(dir_okay=False, path_type=Path), help="Draw a figure (.png, .pdf, .svg)."
 )
-QUIET = click.option("--quiet", is_flag=True, help="Show no progress.")
+QUIET_OPTION = click.option("--quiet", is_flag=True, help="Show no progress.")
 
 
 class ResultPath(click.Path):
-    """A path of a file; or of a folder, if its name ends as that of a Zarr store."""
+    """The path of a file, or of the folder of a Zarr store, which its name ends as."""
 
     def __init__(self, exists: bool = False):
         super().__init__(exists=exists, path_type=Path)
@@ -33,33 +33,37 @@ class ResultPath(click.Path):
         return path
 
 
-def out(help: str) -> Callable[[Any], Any]:
-    """The option `-o`."""
+def out_option(help: str) -> Callable[[Any], Any]:
+    """Make the option `-o` with the given help."""
     return click.option("-o", "--out", type=ResultPath(), help=help)
 
 
 def new_axes(width: float, height: float, **options: Any) -> Any:
-    """Axes of a figure that no window shows."""
+    """Make the axes of a figure that is not shown in a window."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height), layout="constrained").add_subplot(**options)
 
 
 def save_figure(axes: Any, path: Path) -> None:
-    """Write the figure of some axes, and say so."""
+    """Write the figure of some axes, and print its path."""
     with atomic_write(path) as draft:
         axes.get_figure().savefig(draft, format=path.suffix.lstrip(".") or "png", dpi=150)
     click.echo(f"figure: {path}")
 
 
 @contextlib.contextmanager
-def progress_of_simulation(quiet: bool) -> Iterator[Callable[[Progress], None]]:
-    """A bar on the standard error while `simulate` runs; none where that is no terminal."""
+def simulation_progress_bar(quiet: bool) -> Iterator[Callable[[Progress], None]]:
+    """Show a progress bar for `simulate` on the standard error, if that is a terminal.
+
+    **Returns:** a context with the function to pass as `progress=`.
+    """
     from tqdm import tqdm
 
     bar = tqdm(
         total=100,
         unit="%",
+        # None: disabled unless the file is a terminal.
         disable=True if quiet else None,
         file=sys.stderr,
         leave=False,
@@ -67,15 +71,14 @@ def progress_of_simulation(quiet: bool) -> Iterator[Callable[[Progress], None]]:
         desc="simulating",
     )
 
-    def show(now: Progress) -> None:
-        # The error falls with the square root of the photons.
-        share = (
-            0.0
-            if now.rtol is None or not math.isfinite(now.error)
-            else (now.rtol / max(now.error, 1e-9)) ** 2
-        )
-        bar.set_description(f"{now.photons:,} photons, error {now.error:.2g}", refresh=False)
-        bar.n = round(100 * min(share, 1.0))
+    def show(progress: Progress) -> None:
+        # The error falls with the square root of the number of photons, so the fraction of the work that is
+        # completed is the squared ratio of the target to the current error.
+        completed = 0.0
+        if progress.rtol is not None and math.isfinite(progress.error):
+            completed = (progress.rtol / max(progress.error, 1e-9)) ** 2
+        bar.set_description(f"{progress.photons:,} photons, error {progress.error:.2g}", refresh=False)
+        bar.n = round(100 * min(completed, 1.0))
         bar.refresh()
 
     with bar:
@@ -83,15 +86,18 @@ def progress_of_simulation(quiet: bool) -> Iterator[Callable[[Progress], None]]:
 
 
 @contextlib.contextmanager
-def progress_of_survey(quiet: bool, shots: int) -> Iterator[Callable[[Any], None]]:
-    """A bar on the standard error while `simulate_many` runs; none where that is no terminal."""
+def survey_progress_bar(quiet: bool, shots: int) -> Iterator[Callable[[Any], None]]:
+    """Show a progress bar for `simulate_many` on the standard error, if that is a terminal.
+
+    **Returns:** a context with the function to pass as `progress=`.
+    """
     from tqdm import tqdm
 
     disable = True if quiet else None
     bar = tqdm(total=shots, unit=" shots", disable=disable, file=sys.stderr, leave=False, desc="simulating")
 
-    def show(now: Any) -> None:
-        bar.n = now.done
+    def show(progress: Any) -> None:
+        bar.n = progress.done
         bar.refresh()
 
     with bar:

@@ -1,4 +1,4 @@
-"""`jaxlidar simulate` and `jaxlidar plan`."""
+"""The commands `jaxlidar simulate` and `jaxlidar plan`."""
 
 import dataclasses
 from pathlib import Path
@@ -6,26 +6,29 @@ from pathlib import Path
 import click
 import jax
 
-from jaxlidar.cli import DONE, INTERRUPTED
+from jaxlidar.cli import INTERRUPTED, SUCCESS
 from jaxlidar.cli.shared import (
-    CASE,
-    PLOT,
-    QUIET,
+    CASE_ARGUMENT,
+    PLOT_OPTION,
+    QUIET_OPTION,
     new_axes,
-    out,
-    progress_of_simulation,
-    progress_of_survey,
+    out_option,
     save_figure,
+    simulation_progress_bar,
+    survey_progress_bar,
 )
 from jaxlidar.io import Case, read_case
 from jaxlidar.planning.plan import plan as make_plan
 
-# Arguments of `simulate` that a plan has too.
-_OF_PLANS = ("rtol", "max_orders", "max_step", "n_rays", "window", "bin_width", "footprint", "effects")
+# Arguments of `simulate` that `jaxlidar.plan` has, too.
+_PLAN_ARGUMENTS = ("rtol", "max_orders", "max_step", "n_rays", "window", "bin_width", "footprint", "effects")
 
 
-def whole_case(path: Path, seed: int | None = None, rtol: float | None = None) -> Case:
-    """A case that can be simulated: with a lidar, by default the paper's, and a key, by default of seed 0."""
+def read_complete_case(path: Path, seed: int | None = None, rtol: float | None = None) -> Case:
+    """Read a case, and add the default lidar and the key of seed 0 if it has none.
+
+    **Raises:** UsageError for a case without a scene.
+    """
     from jaxlidar.instrument.lidar import Lidar
 
     case = read_case(path)
@@ -39,33 +42,35 @@ def whole_case(path: Path, seed: int | None = None, rtol: float | None = None) -
 
 
 @click.command()
-@CASE
-@out("Write the waveform, with its case, as netCDF, or as Zarr (.zarr).")
-@PLOT
-@click.option("--seed", type=click.IntRange(0, 2**31 - 1), help="Of the photons, in place of the file's.")
+@CASE_ARGUMENT
+@out_option("Write the waveform, with its case, as netCDF, or as Zarr (.zarr).")
+@PLOT_OPTION
+@click.option(
+    "--seed", type=click.IntRange(0, 2**31 - 1), help="Seed of the photons, in place of the file's."
+)
 @click.option("--rtol", type=click.FloatRange(0, 1, min_open=True, max_open=True), help="Relative accuracy.")
-@QUIET
+@QUIET_OPTION
 def simulate(
     case: Path, out: Path | None, plot: Path | None, seed: int | None, rtol: float | None, quiet: bool
 ) -> int:
     """Simulate the waveform of a case: a lidar and a scene in a TOML file.
 
-    Of a case with a survey, all waveforms. Ctrl-C keeps what is done: of a waveform from eight batches of
-    photons on, of a survey with -o, with which the same command goes on.
+    A case with a survey gives all of its waveforms. After Ctrl-C, a waveform of eight or more batches of
+    photons is kept. A survey with -o is continued by the same command.
 
     \b
     Examples:
       jaxlidar simulate examples/scenes/flat_ground.toml
       jaxlidar simulate tree.toml -o tree.nc --plot tree.png --rtol 0.02
     """
-    whole = whole_case(case, seed, rtol)
-    if whole.survey is not None:
-        return _survey(whole, out, plot, quiet)
-    with progress_of_simulation(quiet) as show:
-        wave = whole.simulate(show)
+    complete_case = read_complete_case(case, seed, rtol)
+    if complete_case.survey is not None:
+        return _simulate_survey(complete_case, out, plot, quiet)
+    with simulation_progress_bar(quiet) as show:
+        wave = complete_case.simulate(show)
     click.echo(str(wave))
     if out is not None:
-        wave.save(out, whole)
+        wave.save(out, complete_case)
         click.echo(f"waveform: {out}")
     if plot is not None:
         from jaxlidar.plot import waveform
@@ -73,38 +78,38 @@ def simulate(
         axes = new_axes(4.0, 4.2)
         waveform(wave, axes)
         save_figure(axes, plot)
-    return INTERRUPTED if wave.info.get("stopped") == "interrupted" else DONE
+    return INTERRUPTED if wave.info.get("stopped") == "interrupted" else SUCCESS
 
 
-def _survey(case: Case, out: Path | None, plot: Path | None, quiet: bool) -> int:
+def _simulate_survey(case: Case, out: Path | None, plot: Path | None, quiet: bool) -> int:
     assert case.survey is not None
-    with progress_of_survey(quiet, len(case.survey)) as show:
-        many = case.simulate(show, out)
-    click.echo(str(many))
+    with survey_progress_bar(quiet, len(case.survey)) as show:
+        waveforms = case.simulate(show, out)
+    click.echo(str(waveforms))
     if out is not None:
         click.echo(f"waveforms: {out}")
     if plot is not None:
         from jaxlidar.plot import survey
 
         axes = new_axes(4.6, 4.6)
-        brightness = many.reflectance.sum(axis=2)[:, 0]
+        brightness = waveforms.reflectance.sum(axis=2)[:, 0]
         survey(case.survey, case.scene, axes, values=brightness, label="apparent reflectance")
         save_figure(axes, plot)
-    return DONE
+    return SUCCESS
 
 
 @click.command()
-@CASE
+@CASE_ARGUMENT
 def plan(case: Path) -> None:
-    """Show what a simulation would follow, and what leaving it out would change.
+    """Show which effects a simulation would include, and bounds on those that it leaves out.
 
     \b
     Example:
       jaxlidar plan examples/scenes/leaf_plate_over_ground.toml
     """
-    whole = whole_case(case)
-    shots = whole.lidar if whole.survey is None else whole.survey
+    complete_case = read_complete_case(case)
+    shots = complete_case.lidar if complete_case.survey is None else complete_case.survey
     assert shots is not None
-    assert whole.scene is not None
-    given = {name: value for name, value in whole.arguments.items() if name in _OF_PLANS}
-    click.echo(str(make_plan(shots, whole.scene, **given)))
+    assert complete_case.scene is not None
+    arguments = {name: value for name, value in complete_case.arguments.items() if name in _PLAN_ARGUMENTS}
+    click.echo(str(make_plan(shots, complete_case.scene, **arguments)))

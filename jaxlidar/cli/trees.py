@@ -1,10 +1,10 @@
-"""`jaxlidar tree`."""
+"""The command `jaxlidar tree`."""
 
 from pathlib import Path
 
 import click
 
-from jaxlidar.cli.shared import PLOT, new_axes, out, save_figure
+from jaxlidar.cli.shared import PLOT_OPTION, new_axes, out_option, save_figure
 from jaxlidar.io import Case, write_case
 from jaxlidar.optics.prospect import Prospect
 from jaxlidar.optics.spectra import spectrum
@@ -20,13 +20,13 @@ POSITIVE = click.FloatRange(0, min_open=True)
 
 @click.command()
 @click.argument("habit", type=click.Choice(tuple(HABITS)), default="broadleaf")
-@click.option("--seed", type=click.IntRange(0), default=0, help="Of the tree's individual growth.")
-@click.option("--height", type=POSITIVE, help="m.  [default: the habit's]")
-@click.option("--voxel-size", type=POSITIVE, default=0.25, help="m.")
-@click.option("--leaf-area", type=POSITIVE, help="Of the whole tree, m2.  [default: that of its leaf clumps]")
-@click.option("--leafless", is_flag=True, help="Without leaves.")
-@out("Write a scene of the tree over soil as NAME.toml and NAME.npz.")
-@PLOT
+@click.option("--seed", type=click.IntRange(0), default=0, help="Seed of the random growth.")
+@click.option("--height", type=POSITIVE, help="Height, m.  [default: the habit's]")
+@click.option("--voxel-size", type=POSITIVE, default=0.25, help="Edge of the voxels, m.")
+@click.option("--leaf-area", type=POSITIVE, help="Leaf area of the tree, m2.  [default: that of its clumps]")
+@click.option("--leafless", is_flag=True, help="Grow the tree without leaves.")
+@out_option("Write a scene of the tree over soil as NAME.toml and NAME.npz.")
+@PLOT_OPTION
 def tree(
     habit: str,
     seed: int,
@@ -37,7 +37,7 @@ def tree(
     out: Path | None,
     plot: Path | None,
 ) -> None:
-    """Grow a tree by an L-system: its size, a scene of it, a picture.
+    """Grow a tree by an L-system, print its size, and write a scene or a figure of it.
 
     \b
     Examples:
@@ -55,15 +55,15 @@ def tree(
         f"segments of wood, {buds:,} leaf clumps"
     )
     if out is not None:
-        area = None if leaf_area is None or not buds else leaf_area / buds
-        voxels = voxelise(grown, voxel_size, leaf_area=area, wood="surface")
+        area_per_bud = None if leaf_area is None or not buds else leaf_area / buds
+        voxels = voxelise(grown, voxel_size, leaf_area=area_per_bud, wood="surface")
         leaf = None if voxels.leaf is None else Prospect()
         canopy = Canopy(voxels, leaf=leaf, bark=spectrum("bark-oak"))
         write_case(out, Case(scene=Scene(canopy=canopy, ground=Ground(reflectance=spectrum("soil-medium")))))
         click.echo(f"scene: {out}, {' x '.join(map(str, voxels.shape))} voxels")
     if plot is not None:
-        from jaxlidar.plot import tree as draw
+        from jaxlidar.plot import tree as draw_tree
 
         axes = new_axes(4.0, 4.5, projection="3d")
-        draw(grown, axes)
+        draw_tree(grown, axes)
         save_figure(axes, plot)

@@ -1,1 +1,1 @@
-"""The instrument: lidar, pulse, receiver."""
+"""Instruments: lidar, pulses, receivers, and surveys of many shots with their scan patterns."""

@@ -1,17 +1,23 @@
-"""The soft edge of the receiver's field of view, for the tracer (JAX) and for the plan's bounds (NumPy)."""
+"""The soft edge of the receiver's field of view, for the tracer (JAX) and for the plan's bounds (NumPy).
+
+A point at the distance r from the axis of a field of radius R contributes the fraction
+
+    1 / (1 + exp((r/R - 1) / w)),   w = 0.02,
+
+of its light. The logistic edge gives the visible fraction a derivative with respect to positions and to the
+field of view, which a sharp edge would not have.
+"""
 
 from typing import Any
 
 import jax.numpy as jnp
 
-# Width of the edge, as a share of the field's radius.
-EDGE = 0.02
+# Width w of the edge, in units of the field's radius.
+EDGE_WIDTH = 0.02
 
 
-def seen(off_axis: Any, xp: Any = jnp) -> Any:
-    """Share of the light from a point that the receiver sees, in [0, 1].
-
-    The edge is smooth, so that the share has a derivative.
+def visible_fraction(off_axis: Any, xp: Any = jnp) -> Any:
+    """Fraction of the light from a point that the receiver sees, in [0, 1].
 
     **Arguments:**
 
@@ -21,4 +27,5 @@ def seen(off_axis: Any, xp: Any = jnp) -> Any:
 
     **Returns:** an array shaped as `off_axis`.
     """
-    return 1.0 / (1.0 + xp.exp(xp.clip((off_axis - 1.0) / EDGE, -80.0, 80.0)))
+    # The exponent is clipped so that it does not overflow, and its derivative stays finite, far off the axis.
+    return 1.0 / (1.0 + xp.exp(xp.clip((off_axis - 1.0) / EDGE_WIDTH, -80.0, 80.0)))

@@ -1,19 +1,24 @@
 r"""The photon counter: single events in place of a waveform, as spaceborne photon counters record them.
 
-The light of one pulse falls evenly on the pixels of the detector. What triggers a pixel is a Poisson process
-of rate
+The light of one pulse is spread evenly over the pixels of the detector. The photons and dark counts that
+trigger a pixel are a Poisson process of rate
 
 .. math:: \lambda(t) = \frac{p\, E'(t)}{(h c / \text{wavelength})\, n} + \frac{b}{n}
 
 for the detected power E', the detection probability p, the background rate b and n pixels. An event makes its
-pixel blind for the dead time, and what arrives meanwhile does not lengthen it (a non-paralysable dead time).
-A Poisson process has no memory, so the next event after the time t at which a pixel sees again is where the
-integral of the rate from t on reaches a number drawn from the exponential distribution. So events are drawn
-without drawing what is lost, and any amount of light costs no more than the events that it leaves. How much
-was lost is drawn beside: given the events, Poisson with the integral of the rate over the dead times.
+pixel blind for the dead time, which photons that arrive meanwhile do not lengthen (a non-paralysable dead
+time). A Poisson process has no memory. From the end t of a dead time on, the next event is therefore at the
+time t' where the integrated rate
 
-Energy is uniform within a sample. The draws are exact for that, and independent from pulse to pulse. Samples
-below zero, which noise makes where footprints share light, send no photons.
+.. math:: \Lambda(t, t') = \int_t^{t'} \lambda(u)\, du
+
+reaches a number drawn from the standard exponential distribution. Signal and background are two such
+processes, and the earlier of their two next events counts. Lost photons are never drawn one by one, so that
+the cost grows with the number of recorded events, not with the amount of light. Their number is drawn
+afterwards: given the events, it is Poisson distributed with the rate integrated over the dead times.
+
+Energy is taken as uniform within a sample; for that, the draws are exact. They are independent from pulse to
+pulse. Negative samples, which arise where Monte Carlo noise exceeds the signal, send no photons.
 
 Sources: Neumann et al. (2019), Remote Sens. Environ. 233, 111325, and Martino et al. (2019), Proc. SPIE
 11151, for the receiver of ICESat-2; Gatt, Johnson and Nichols (2009), Appl. Opt. 48, 3261, for
@@ -32,7 +37,6 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxlidar._checks import (
     array,
-    briefly,
     check_integer,
     check_key,
     check_kind,
@@ -45,14 +49,13 @@ from jaxlidar._constants import PLANCK_TIMES_LIGHT, SPEED_OF_LIGHT
 from jaxlidar._ranges import FRACTION, Range, check_ranges
 from jaxlidar._registry import save_result
 
-# Beyond so many events, memory would end before the draws do; beyond so many arrivals, counts of them would
-# have rounding errors.
-_MOST_EVENTS = 1e8
-_MOST_ARRIVALS = 1e15
-# Share of a waveform's energy that noise may have put below zero.
-_BELOW_ZERO = 0.01
+# More events would exceed the memory; more arrivals could not be counted exactly in double precision.
+_MAX_EVENTS = 1e8
+_MAX_ARRIVALS = 1e15
+# Largest fraction of a waveform's energy by which noise may make samples negative.
+_MAX_NEGATIVE_FRACTION = 0.01
 # Pixels, over all pulses and wavelengths, whose events are drawn at once.
-_BLOCK = 2_000_000
+_BLOCK_SIZE = 2_000_000
 # Above this expectation a Poisson count is drawn as a normal variable (skewness below 1e-3).
 _POISSON_MAX = 1e6
 
@@ -62,28 +65,28 @@ def _window(x: Any) -> Float[Array, "..."] | None:
 
 
 @final
-@briefly
 class PhotonCounter(eqx.Module):
     """A receiver that counts photons. The default has the 16 pixels and the dead time of ATLAS' strong beams
     (ICESat-2; its weak beams have 4 pixels), detects all photons, and has no background and no jitter.
 
-    Each wavelength has a detector of its own. All pixels see when the record begins.
+    Each wavelength has a separate detector. All pixels are live when the record begins.
 
     **Arguments:**
 
-    - `pixels`: on which the light of a wavelength falls evenly, an integer of at least 1. Default 16.
+    - `pixels`: number of pixels over which the light of a wavelength is spread evenly, an integer of at least
+      1. Default 16.
     - `dead_time`: ns for which a pixel is blind after an event, not negative. Default 3.2.
-    - `detection_probability`: of a photon that the waveform's energy counts, in [0, 1], one number or one per
-      wavelength. That energy is already reduced by `Lidar.efficiency`. Default 1.
+    - `detection_probability`: probability that a photon of the waveform's energy is detected, in [0, 1], one
+      number or one per wavelength. That energy is already reduced by `Lidar.efficiency`. Default 1.
     - `background_rate`: events per second of sunlight and dark counts over all pixels, before dead time, not
       negative, one number or one per wavelength. Default 0; under sunlight ATLAS has some 10^6 to 10^7.
-    - `jitter`: standard deviation of a recorded time in ns, not negative. It is beside that of `Lidar`, which
-      the waveform holds. Default 0.
+    - `jitter`: standard deviation of a recorded time in ns, not negative. It adds to that of `Lidar`, which
+      is part of the waveform. Default 0.
     - `window`: (start, end) of the record in ns, on the waveform's time axis. Default None: as long as the
       waveform.
 
     **Raises:** ValueError for a value outside its range, and for a window that is not two increasing times;
-    TypeError for things of another kind.
+    TypeError for objects of the wrong type.
 
     **Example:**
 
@@ -116,27 +119,27 @@ class PhotonCounter(eqx.Module):
         if self.window is not None:
             if self.window.shape != (2,):
                 raise ValueError(f"window has shape {self.window.shape}; admissible is (start, end)")
-            known = concrete(self.window)
-            if known is not None and known[1] <= known[0]:
+            window = concrete(self.window)
+            if window is not None and window[1] <= window[0]:
                 raise ValueError(
-                    f"window = {tuple(known.tolist())} does not increase; admissible is start < end"
+                    f"window = {tuple(window.tolist())} does not increase; admissible is start < end"
                 )
 
 
 @final
-@briefly
 class PhotonEvents(eqx.Module):
     """Events of a photon counter, in the order of shots, pulses and times. `len(events)` is their number.
 
     - `time`: (events,) ns, on the waveform's time axis.
-    - `height`: (events,) m, the height from which light of order one arrives at that time.
+    - `height`: (events,) m, the height from which light that was scattered once arrives at that time.
     - `shot`, `pulse`: (events,) numbers, from 0, of the waveform and of the pulse within it.
     - `pixel`: (events,) number of the pixel, from 0. `wavelength`: (events,) nm.
-    - `signal`: (events,) whether light of the waveform made the event: the truth, which no instrument knows.
-    - `lost`: (shots, wavelengths) what arrived while its pixel was blind, of signal and background, over all
-      pulses.
-    - `window`: (shots, 2) m, heights between which the record lies, the lower one first. Jitter may carry
-      events beyond.
+    - `signal`: (events,) True if light of the waveform triggered the event, False for background. This is the
+      truth, which an instrument does not record.
+    - `lost`: (shots, wavelengths) number of photons of signal and background that arrived during dead times,
+      over all pulses.
+    - `window`: (shots, 2) m, heights between which the record lies, the lower one first. Jitter may move
+      events out of it.
     - `pulses`: number of pulses per shot.
 
     **Example:**
@@ -182,160 +185,203 @@ class PhotonEvents(eqx.Module):
         save_result(self, path)
 
 
-class _Light(NamedTuple):
-    """What falls on one pixel during one pulse; a row for each shot and wavelength.
+class _PixelRate(NamedTuple):
+    """The rate of photons on one pixel during one pulse; a row for each shot and wavelength.
 
-    `total` (rows, edges) is the integral of the signal's rate up to each edge of the samples, which lie
-    `step` ns apart from `first` on; `background` (rows,) is a rate in 1/ns.
+    - `integral`: (rows, edges) integral of the signal's rate from the start of the record to each edge of the
+      samples; piecewise linear in between, as energy is uniform within a sample.
+    - `background`: (rows,) rate of the background, 1/ns.
+    - `start`, `step`: time of the first edge and length of the samples, ns.
     """
 
-    total: Float[np.ndarray, "rows edges"]
+    integral: Float[np.ndarray, "rows edges"]
     background: Float[np.ndarray, " rows"]
-    first: float
+    start: float
     step: float
 
-    def until(self, row: np.ndarray, time: np.ndarray) -> np.ndarray:
-        """The integral of the signal's rate up to a time."""
-        samples = self.total.shape[1] - 1
-        place = np.clip((time - self.first) / self.step, 0.0, samples)
-        k = np.minimum(place.astype(int), samples - 1)
-        low = self.total[row, k]
-        return low + (place - k) * (self.total[row, k + 1] - low)
+    def integral_until(self, row: np.ndarray, time: np.ndarray) -> np.ndarray:
+        """Interpolate the integral of the signal's rate at given times."""
+        samples = self.integral.shape[1] - 1
+        position = np.clip((time - self.start) / self.step, 0.0, samples)
+        k = np.minimum(position.astype(int), samples - 1)
+        at_edge = self.integral[row, k]
+        return at_edge + (position - k) * (self.integral[row, k + 1] - at_edge)
 
-    def reaches(self, row: np.ndarray, goal: np.ndarray) -> np.ndarray:
-        """The time at which the integral reaches a number; infinite where it never does."""
-        time = np.full(goal.shape, np.inf)
-        (ever,) = np.nonzero(goal < self.total[row, -1])
-        row, goal = row[ever], goal[ever]
-        # The sample by bisection in each row: low is always reached, high never.
-        low, high = np.zeros(row.size, int), np.full(row.size, self.total.shape[1] - 1)
-        for _ in range(self.total.shape[1].bit_length()):
+    def time_of(self, row: np.ndarray, level: np.ndarray) -> np.ndarray:
+        """Invert `integral_until`: find the times at which it reaches given levels, infinite if never."""
+        time = np.full(level.shape, np.inf)
+        (reached,) = np.nonzero(level < self.integral[row, -1])
+        row, level = row[reached], level[reached]
+        # Bisection for the sample, all rows at once. Invariant: the integral is at most the level at the edge
+        # `low` and above it at the edge `high`.
+        low, high = np.zeros(row.size, int), np.full(row.size, self.integral.shape[1] - 1)
+        for _ in range(self.integral.shape[1].bit_length()):
             middle = (low + high) // 2
-            below = self.total[row, middle] <= goal
+            below = self.integral[row, middle] <= level
             low, high = np.where(below, middle, low), np.where(below, high, middle)
-        start = self.total[row, low]
-        time[ever] = self.first + self.step * (low + (goal - start) / (self.total[row, low + 1] - start))
+        at_edge = self.integral[row, low]
+        fraction = (level - at_edge) / (self.integral[row, low + 1] - at_edge)
+        time[reached] = self.start + self.step * (low + fraction)
         return time
 
 
+class _Draws(NamedTuple):
+    """Events that were drawn for some shots, in no order.
+
+    - `channel`: number of the pixel, counted over shots, wavelengths, pulses and pixels, the last fastest.
+    - `time`: ns, without jitter.
+    - `signal`: True for signal, False for background.
+    - `lost`: (rows,) photons lost to dead time in each row of `_PixelRate`, over all its pulses and pixels.
+    """
+
+    channel: np.ndarray
+    time: np.ndarray
+    signal: np.ndarray
+    lost: np.ndarray
+
+
 def count_photons(wave: Any, counter: Any, key: Array | None, pulses: int) -> PhotonEvents:
-    """The events of `jaxlidar.record(wave, mode="photons")`."""
+    """Draw the events of `jaxlidar.record(wave, mode="photons")`.
+
+    1. Convert energies to the expected number of photons per pixel and sample, and integrate them.
+    2. Draw the events of all pixels and pulses (`_draw_events`), a block of shots at a time.
+    3. Add jitter, sort by shot, pulse and time, and recover shot, pulse, pixel and wavelength from the
+       channel.
+    """
     check_kind("receiver", counter, PhotonCounter, "a PhotonCounter where mode = 'photons'")
     pulses = check_integer("pulses", pulses)
     check_key(key)
     assert key is not None
-    time, wavelength = _known("time", wave), _known("wavelength", wave)
-    if time.size < 2:
+    sample_time, wavelength = _concrete_field("time", wave), _concrete_field("wavelength", wave)
+    if sample_time.size < 2:
         raise ValueError("wave has one sample; admissible are two or more, which tell how long they are")
     probability = _per_wavelength("detection_probability", counter.detection_probability, wavelength)
-    rate = 1e-9 * _per_wavelength("background_rate", counter.background_rate, wavelength)
-    step = float(time[-1] - time[0]) / (time.size - 1)
-    first = float(time[0]) - 0.5 * step
+    background = 1e-9 * _per_wavelength("background_rate", counter.background_rate, wavelength)
+    step = float(sample_time[-1] - sample_time[0]) / (sample_time.size - 1)
+    first_edge = float(sample_time[0]) - 0.5 * step
     window = concrete(counter.window)
-    start, end = (first, first + step * time.size) if window is None else map(float, window)
-    per_joule = probability * wavelength / PLANCK_TIMES_LIGHT / counter.pixels
+    start, end = (first_edge, first_edge + step * sample_time.size) if window is None else map(float, window)
+    photons_per_joule = probability * wavelength / PLANCK_TIMES_LIGHT / counter.pixels
 
     random = np.random.default_rng(np.asarray(jax.random.bits(key, (8,), jnp.uint32)))
-    fall, energies = _fall(wave, time), wave.energy if wave.energy.ndim == 3 else wave.energy[None]
-    rows = counter.pixels * pulses
-    events, lost = [], []
-    for shots in _blocks(len(energies), rows * wavelength.size):
-        mean = (_admissible(energies[shots]) * per_joule[:, None]).reshape(-1, time.size)
-        total = np.concatenate([np.zeros((len(mean), 1)), np.cumsum(mean, axis=1)], axis=1)
-        light = _Light(total, np.tile(rate / counter.pixels, shots.stop - shots.start), first, step)
-        _check_amount(light, start, end, float(counter.dead_time), rows)
-        channel, *found, missed = _events(light, start, end, float(counter.dead_time), rows, random)
-        events.append((channel + shots.start * wavelength.size * rows, *found))
-        lost.append(missed.reshape(-1, wavelength.size))
+    height_per_time = _height_per_time(wave, sample_time)
+    energies = wave.energy if wave.energy.ndim == 3 else wave.energy[None]
+    pixels_per_row, rows_per_shot = counter.pixels * pulses, wavelength.size
+    blocks: list[_Draws] = []
+    for shots in _shot_blocks(len(energies), pixels_per_row * rows_per_shot):
+        photons = _nonnegative(energies[shots]) * photons_per_joule[:, None]
+        photons = photons.reshape(-1, sample_time.size)
+        integral = np.concatenate([np.zeros((len(photons), 1)), np.cumsum(photons, axis=1)], axis=1)
+        backgrounds = np.tile(background / counter.pixels, shots.stop - shots.start)
+        rate = _PixelRate(integral, backgrounds, first_edge, step)
+        _check_counts(rate, start, end, float(counter.dead_time), pixels_per_row)
+        draws = _draw_events(rate, start, end, float(counter.dead_time), pixels_per_row, random)
+        blocks.append(draws._replace(channel=draws.channel + shots.start * rows_per_shot * pixels_per_row))
 
-    channel, instant, signal = (np.concatenate(parts) for parts in zip(*events))
-    instant = instant + float(counter.jitter) * random.standard_normal(instant.size)
-    order = np.lexsort((instant, (channel // counter.pixels) % pulses, channel // (rows * wavelength.size)))
-    channel, instant, signal = channel[order], instant[order], signal[order]
-    row = channel // rows
-    shot = row // wavelength.size
+    draws = _Draws(*(np.concatenate(arrays) for arrays in zip(*blocks)))
+    time = draws.time + float(counter.jitter) * random.standard_normal(draws.time.size)
+    pulse = (draws.channel // counter.pixels) % pulses
+    shot = draws.channel // (pixels_per_row * rows_per_shot)
+    order = np.lexsort((time, pulse, shot))
+    channel, time, pulse, shot = draws.channel[order], time[order], pulse[order], shot[order]
     return PhotonEvents(
-        time=instant,
-        height=fall[shot] * instant,
+        time=time,
+        height=height_per_time[shot] * time,
         shot=shot,
-        pulse=(channel // counter.pixels) % pulses,
+        pulse=pulse,
         pixel=channel % counter.pixels,
-        wavelength=wavelength[row % wavelength.size],
-        signal=signal,
-        lost=np.concatenate(lost),
-        window=np.sort(fall[:, None] * np.array([start, end]), axis=1),
+        wavelength=wavelength[(channel // pixels_per_row) % rows_per_shot],
+        signal=draws.signal[order],
+        lost=draws.lost.reshape(-1, rows_per_shot),
+        window=np.sort(height_per_time[:, None] * np.array([start, end]), axis=1),
         pulses=pulses,
     )
 
 
-def _events(
-    light: _Light, start: float, end: float, dead_time: float, channels: int, random: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Pixel, time and origin of all events, and how much each row lost; `channels` pixels belong to a row.
+def _draw_events(
+    rate: _PixelRate,
+    start: float,
+    end: float,
+    dead_time: float,
+    pixels_per_row: int,
+    random: np.random.Generator,
+) -> _Draws:
+    """Draw all events between `start` and `end`, ns, of `pixels_per_row` pixels for each row of `rate`.
 
-    In every round, each pixel that still sees has its next event, of signal or background, or none.
+    Each round draws the next event of every pixel that is still live before `end`, until none has another
+    one.
     """
-    found, lost = [], np.zeros(len(light.total))
-    channel = np.arange(len(light.total) * channels)
-    sees = np.full(channel.size, start)
-    while True:
-        row = channel // channels
+    rounds: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    lost = np.zeros(len(rate.integral))
+    channel = np.arange(len(rate.integral) * pixels_per_row)
+    live_from = np.full(channel.size, start)
+    while channel.size:
+        row = channel // pixels_per_row
         wait = random.standard_exponential(channel.size)
-        signal = np.maximum(light.reaches(row, light.until(row, sees) + wait), sees)
+        # Rounding of the interpolation must not place an event before the pixel is live.
+        signal_time = np.maximum(rate.time_of(row, rate.integral_until(row, live_from) + wait), live_from)
         with np.errstate(divide="ignore"):
-            background = sees + random.standard_exponential(channel.size) / light.background[row]
-        time = np.minimum(signal, background)
-        some = time < end
-        channel, row, time = channel[some], row[some], time[some]
-        found.append((channel, time, (signal <= background)[some]))
-        if channel.size == 0:
-            channel, time, origin = (np.concatenate(parts) for parts in zip(*found))
-            return channel, time, origin, lost.astype(np.int64)
-        sees = time + dead_time
-        blind = np.minimum(sees, end)
-        mean = light.until(row, blind) - light.until(row, time) + light.background[row] * (blind - time)
-        lost += np.bincount(row, _poisson(np.maximum(mean, 0.0), random), len(lost))
+            background_time = live_from + random.standard_exponential(channel.size) / rate.background[row]
+        time = np.minimum(signal_time, background_time)
+        recorded = time < end
+        signal = (signal_time <= background_time)[recorded]
+        channel, row, time = channel[recorded], row[recorded], time[recorded]
+        rounds.append((channel, time, signal))
+        live_from = time + dead_time
+        blind_until = np.minimum(live_from, end)
+        expected_lost = (
+            rate.integral_until(row, blind_until)
+            - rate.integral_until(row, time)
+            + rate.background[row] * (blind_until - time)
+        )
+        lost += np.bincount(row, _poisson(np.maximum(expected_lost, 0.0), random), len(lost))
+    channel, time, signal = (np.concatenate(arrays) for arrays in zip(*rounds))
+    return _Draws(channel, time, signal, lost.astype(np.int64))
 
 
 def _poisson(mean: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    many = mean > _POISSON_MAX
-    counts = random.poisson(np.where(many, 0.0, mean)).astype(float)
-    counts[many] = np.rint(mean[many] + np.sqrt(mean[many]) * random.standard_normal(int(many.sum())))
+    """Draw Poisson counts, or their normal limit where the mean is large."""
+    use_normal = mean > _POISSON_MAX
+    counts = random.poisson(np.where(use_normal, 0.0, mean)).astype(float)
+    normal = random.standard_normal(int(use_normal.sum()))
+    counts[use_normal] = np.rint(mean[use_normal] + np.sqrt(mean[use_normal]) * normal)
     return counts
 
 
-def _check_amount(light: _Light, start: float, end: float, dead_time: float, channels: int) -> None:
-    """Refuse more light than can be counted."""
-    arrivals = light.total[:, -1] + light.background * (end - start)
-    most = (end - start) / dead_time + 1.0 if dead_time > 0 else np.inf
-    for what, count, limit in (
-        ("photons", arrivals, _MOST_ARRIVALS),
-        ("events", np.minimum(arrivals, most), _MOST_EVENTS),
+def _check_counts(rate: _PixelRate, start: float, end: float, dead_time: float, pixels_per_row: int) -> None:
+    """Refuse more arrivals or events than can be counted."""
+    arrivals = rate.integral[:, -1] + rate.background * (end - start)
+    # A pixel has at most one event in each dead time.
+    max_events = (end - start) / dead_time + 1.0 if dead_time > 0 else np.inf
+    for name, count, limit in (
+        ("photons", arrivals, _MAX_ARRIVALS),
+        ("events", np.minimum(arrivals, max_events), _MAX_EVENTS),
     ):
-        if (total := channels * float(np.sum(count))) > limit:
-            raise ValueError(f"energy and background give {total:g} {what}; admissible are up to {limit:g}")
+        if (total := pixels_per_row * float(np.sum(count))) > limit:
+            raise ValueError(f"energy and background give {total:g} {name}; admissible are up to {limit:g}")
 
 
-def _admissible(energy: Any) -> np.ndarray:
-    """Energies, zero where noise made them negative."""
+def _nonnegative(energy: Any) -> np.ndarray:
+    """Set energies that noise made negative to zero. **Raises:** ValueError where they are too many."""
     energy = np.asarray(energy, float)
     check_range("energy", energy)
-    sent = np.maximum(energy, 0.0)
-    if np.any(np.sum(sent - energy, axis=-1) > _BELOW_ZERO * np.sum(sent, axis=-1)):
+    positive = np.maximum(energy, 0.0)
+    negative_part = np.sum(positive - energy, axis=-1)
+    if np.any(negative_part > _MAX_NEGATIVE_FRACTION * np.sum(positive, axis=-1)):
         raise ValueError(
             f"energy = {energy.min():g} is too far below zero; admissible are samples that all together "
-            f"take up to {_BELOW_ZERO:.0%} from their waveform"
+            f"take up to {_MAX_NEGATIVE_FRACTION:.0%} from their waveform"
         )
-    return sent
+    return positive
 
 
-def _blocks(shots: int, channels: int) -> Iterator[slice]:
-    size = max(1, _BLOCK // channels)
+def _shot_blocks(shots: int, pixels_per_shot: int) -> Iterator[slice]:
+    size = max(1, _BLOCK_SIZE // pixels_per_shot)
     return (slice(i, min(i + size, shots)) for i in range(0, shots, size))
 
 
-def _known(field: str, wave: Any) -> np.ndarray:
-    """A field of a waveform. **Raises:** TypeError for what is no waveform, or is being traced."""
+def _concrete_field(field: str, wave: Any) -> np.ndarray:
+    """Return a field of a waveform. **Raises:** TypeError where `wave` is no waveform, or is being traced."""
     if not hasattr(wave, "energy") or (value := concrete(getattr(wave, field, None))) is None:
         raise TypeError(
             f"wave is {kind_of(wave)}; admissible where mode = 'photons' is a Waveform or Waveforms, outside "
@@ -353,9 +399,12 @@ def _per_wavelength(field: str, x: Array, wavelength: np.ndarray) -> np.ndarray:
     return np.broadcast_to(np.asarray(x, float), wavelength.shape)
 
 
-def _fall(wave: Any, time: np.ndarray) -> np.ndarray:
-    """Metres of height per ns, (shots,). `Waveforms` have directions, a `Waveform` has heights."""
+def _height_per_time(wave: Any, time: np.ndarray) -> np.ndarray:
+    """Compute dz/dt of light that was scattered once, (shots,) in m/ns.
+
+    `Waveforms` have the direction of each shot; of a `Waveform`, the latest height and time give it.
+    """
     if hasattr(wave, "zenith"):
         return -0.5 * SPEED_OF_LIGHT * np.cos(np.deg2rad(np.asarray(wave.zenith, float)))
-    far = np.argmax(np.abs(time))
-    return np.asarray(wave.height, float)[far : far + 1] / time[far]
+    farthest = np.argmax(np.abs(time))
+    return np.asarray(wave.height, float)[farthest : farthest + 1] / time[farthest]

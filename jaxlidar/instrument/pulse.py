@@ -4,20 +4,26 @@ A digitiser records energy per bin, so a simulation needs the running integral o
 
     F(t) = integral from -inf to t of (p * g_j)(u) du,
 
-where `p` is the pulse and `g_j` a Gaussian of standard deviation `j` (the timing jitter). The energy of
-an echo in a bin is a difference of two values of `F`. With Phi the normal distribution function and
-s^2 = sigma^2 + j^2,
+where p is the pulse and g_j a Gaussian of standard deviation j (the timing jitter). The energy of an echo in
+a bin is a difference of two values of F. With Phi the normal distribution function, phi its density and
+s^2 = sigma^2 + j^2:
 
-- Gaussian: F = Phi(t/s).
-- Rectangle, and each linear piece of a sampled pulse: integrated error functions, written as the
-  unblurred integral plus terms that decay, so that nothing cancels far away. Where the piece is shorter
-  than 2 j these terms do cancel, and Gauss-Legendre quadrature (exact to rounding there) is used.
-- Exponentially modified Gaussian (Grushka 1972, Anal. Chem. 44, 1733): F = Phi(z) - phi(z) M(s/tau - z),
-  with z measured from the Gaussian's centre and M the Mills ratio. For large arguments M is Laplace's
-  continued fraction: nothing overflows, and tau = 0 is the Gaussian.
+- Gaussian of standard deviation sigma: F = Phi(t/s).
+- Linear segment of length L, mean power m and half rise d, centred on zero (a rectangle has d = 0, a sampled
+  pulse is a sum of segments): F = L (m E + d O) with
 
-Every formula and its derivatives stay finite at zero width and zero jitter, where F is a unit step of
-value 1/2 at the step.
+      E = 1/2 integral over x in [-1, 1] of Phi((t - x L/2)/j),   O the same with x in the integrand.
+
+  E and O are written as the integrals without jitter plus terms that decay away from the ends of the segment,
+  so that no large terms cancel there. Where L <= 2 j these decaying terms do cancel, and Gauss-Legendre
+  quadrature with 10 nodes is used, which is exact to rounding.
+- Exponentially modified Gaussian with the mean life tau (Grushka 1972, Anal. Chem. 44, 1733):
+  F = Phi(z) - phi(z) M(s/tau - z), with z = t/s measured from the Gaussian's centre and the Mills ratio
+  M(x) = (1 - Phi(x))/phi(x). For large x, M is Laplace's continued fraction, which does not overflow, and
+  tau = 0 gives the Gaussian.
+
+Every formula and its derivatives stay finite at zero width and zero jitter, where F is a unit step of value
+1/2 at the step.
 """
 
 import abc
@@ -29,34 +35,35 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.scipy.special import erfc
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxlidar._checks import as_array, as_scalar, briefly, check_range, concrete, scalar, warn_units
+from jaxlidar._checks import as_array, as_scalar, check_range, concrete, scalar, warn_units
 from jaxlidar._ranges import Range, check_ranges
-from jaxlidar.instrument.pulse_integrals import (
-    distribution,
-    exponential_part,
-    piece,
-    quadrature_sum,
-    score,
-)
 
 _FWHM_PER_SIGMA = 2 * math.sqrt(2 * math.log(2))
-# A normal variable lies outside +-5.5 sigma with probability 3.8e-8, an exponential one beyond 16.8
-# mean lives with 5.1e-8: together below the 1e-7 that `support` promises.
-_GAUSSIAN_REACH = 5.5
-_EXPONENTIAL_REACH = 16.8
+# Extents of `support` in standard deviations and in mean lives. A normal variable lies outside +-5.5 sigma
+# with probability 3.8e-8, an exponential one beyond 16.8 mean lives with 5.1e-8: together below the 1e-7 that
+# `support` promises.
+_GAUSSIAN_EXTENT = 5.5
+_EXPONENTIAL_EXTENT = 16.8
+# Widths below this (ns) count as zero. It is a millionth of the period of light, and its inverse cube, which
+# second derivatives contain, still fits into float32.
+_NEGLIGIBLE_WIDTH = 1e-12
+# Phi and phi are 1 or 0 to the last bit beyond; clipping there keeps inf * 0 out of the derivatives.
+_Z_MAX = 40.0
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(10)
 
 
 class AbstractPulse(eqx.Module):
     """The shape of a transmitted pulse: power against time in ns, normalised to unit area.
 
-    A pulse of your own is one class in one file: derive it from this, give `cumulative`, `mean`, `std`,
-    `finest` and `support`, and pass it as `pulse=` of a `Lidar`. `power` follows from `cumulative`. Methods
-    are pure, written with `jax.numpy` (see `jaxlidar.extend`), and differentiable in time, jitter and every
-    field. Subclasses are final.
+    A pulse of your own is one class in one file: derive it from this class, define `cumulative`, `mean`,
+    `std`, `finest` and `support`, and pass it as `pulse=` of a `Lidar`. `power` follows from `cumulative`.
+    Methods are pure, written with `jax.numpy` (see `jaxlidar.extend`), and differentiable in time, jitter and
+    every field. Subclasses are final.
 
-    **Example:** the share of a pulse's energy that falls into one sample of 1 ns.
+    **Example:** the fraction of a pulse's energy that falls into one sample of 1 ns.
 
     >>> import jaxlidar as jl
     >>> pulse = jl.GaussianPulse(fwhm=6.0)
@@ -66,7 +73,7 @@ class AbstractPulse(eqx.Module):
 
     @abc.abstractmethod
     def cumulative(self, t: ArrayLike, jitter: ArrayLike = 0.0) -> Float[Array, "..."]:
-        """Share of the pulse's energy that has passed by time `t`.
+        """Fraction of the pulse's energy that has passed by time `t`.
 
         **Arguments:**
 
@@ -92,13 +99,13 @@ class AbstractPulse(eqx.Module):
     def finest(self) -> Float[Array, ""]:
         """Scale in ns of the finest feature of the pulse; zero where the power jumps.
 
-        For a Gaussian it is the standard deviation. The width of the fine bins, in which returns are
-        collected, follows it.
+        For a Gaussian it is the standard deviation. The width of the fine time bins, into which returns are
+        accumulated before the pulse is applied, is a fraction of it.
         """
 
     @abc.abstractmethod
     def support(self, jitter: ArrayLike = 0.0) -> tuple[float, float]:
-        """Times (low, high) in ns outside which less than 1e-7 of the energy lies, for the size of windows.
+        """Times (low, high) in ns outside of which less than 1e-7 of the energy lies, to size time windows.
 
         **Arguments:**
 
@@ -106,7 +113,8 @@ class AbstractPulse(eqx.Module):
 
         **Returns:** two Python numbers.
 
-        **Raises:** JAX's `ConcretizationTypeError` inside a JAX transformation: the parameters must be known.
+        **Raises:** JAX's `ConcretizationTypeError` inside a JAX transformation: the parameters must be
+        concrete.
         """
 
     def power(self, t: ArrayLike, jitter: ArrayLike = 0.0) -> Float[Array, "..."]:
@@ -125,7 +133,6 @@ class AbstractPulse(eqx.Module):
 
 
 @final
-@briefly
 class GaussianPulse(AbstractPulse):
     """A Gaussian pulse, centred on time zero.
 
@@ -153,7 +160,7 @@ class GaussianPulse(AbstractPulse):
         warn_units(self)
 
     def cumulative(self, t: ArrayLike, jitter: ArrayLike = 0.0) -> Float[Array, "..."]:
-        return distribution(score(as_array(t), quadrature_sum(self.std, as_scalar(jitter))))
+        return _normal_cdf(_z_score(as_array(t), _safe_hypot(self.std, as_scalar(jitter))))
 
     @property
     def mean(self) -> Float[Array, ""]:
@@ -168,12 +175,11 @@ class GaussianPulse(AbstractPulse):
         return self.std
 
     def support(self, jitter: ArrayLike = 0.0) -> tuple[float, float]:
-        reach = _GAUSSIAN_REACH * math.hypot(float(self.std), float(as_scalar(jitter)))
-        return -reach, reach
+        extent = _GAUSSIAN_EXTENT * math.hypot(float(self.std), float(as_scalar(jitter)))
+        return -extent, extent
 
 
 @final
-@briefly
 class RectangularPulse(AbstractPulse):
     """A pulse of constant power, centred on time zero.
 
@@ -201,7 +207,7 @@ class RectangularPulse(AbstractPulse):
         warn_units(self)
 
     def cumulative(self, t: ArrayLike, jitter: ArrayLike = 0.0) -> Float[Array, "..."]:
-        return piece(as_array(t), self.length, jnp.abs(as_scalar(jitter)))[0]
+        return _segment_integrals(as_array(t), self.length, jnp.abs(as_scalar(jitter)))[0]
 
     @property
     def mean(self) -> Float[Array, ""]:
@@ -216,12 +222,11 @@ class RectangularPulse(AbstractPulse):
         return jnp.zeros_like(self.length)
 
     def support(self, jitter: ArrayLike = 0.0) -> tuple[float, float]:
-        reach = 0.5 * float(self.length) + _GAUSSIAN_REACH * float(as_scalar(jitter))
-        return -reach, reach
+        extent = 0.5 * float(self.length) + _GAUSSIAN_EXTENT * float(as_scalar(jitter))
+        return -extent, extent
 
 
 @final
-@briefly
 class ExponentiallyModifiedGaussianPulse(AbstractPulse):
     """A Gaussian convolved with a decaying exponential: a pulse with a sharp rise and a long tail.
 
@@ -254,9 +259,9 @@ class ExponentiallyModifiedGaussianPulse(AbstractPulse):
         warn_units(self)
 
     def cumulative(self, t: ArrayLike, jitter: ArrayLike = 0.0) -> Float[Array, "..."]:
-        sigma = quadrature_sum(self.fwhm / _FWHM_PER_SIGMA, as_scalar(jitter))
+        sigma = _safe_hypot(self.fwhm / _FWHM_PER_SIGMA, as_scalar(jitter))
         from_centre = as_array(t) + self.decay
-        return distribution(score(from_centre, sigma)) - exponential_part(from_centre, sigma, self.decay)
+        return _normal_cdf(_z_score(from_centre, sigma)) - _exponential_tail(from_centre, sigma, self.decay)
 
     @property
     def mean(self) -> Float[Array, ""]:
@@ -264,7 +269,7 @@ class ExponentiallyModifiedGaussianPulse(AbstractPulse):
 
     @property
     def std(self) -> Float[Array, ""]:
-        return quadrature_sum(self.fwhm / _FWHM_PER_SIGMA, self.decay)
+        return _safe_hypot(self.fwhm / _FWHM_PER_SIGMA, self.decay)
 
     @property
     def finest(self) -> Float[Array, ""]:
@@ -272,12 +277,11 @@ class ExponentiallyModifiedGaussianPulse(AbstractPulse):
 
     def support(self, jitter: ArrayLike = 0.0) -> tuple[float, float]:
         decay = float(self.decay)
-        reach = _GAUSSIAN_REACH * math.hypot(float(self.std), float(as_scalar(jitter)))
-        return -decay - reach, -decay + reach + _EXPONENTIAL_REACH * decay
+        extent = _GAUSSIAN_EXTENT * math.hypot(float(self.std), float(as_scalar(jitter)))
+        return -decay - extent, -decay + extent + _EXPONENTIAL_EXTENT * decay
 
 
 @final
-@briefly
 class SampledPulse(AbstractPulse):
     """A recorded transmit waveform: linear between its samples, zero outside, scaled to unit area.
 
@@ -311,7 +315,8 @@ class SampledPulse(AbstractPulse):
 
     def __init__(self, time: ArrayLike | Sequence[ArrayLike], power: ArrayLike | Sequence[ArrayLike]):
         self.time = as_array(time, "time")
-        self.samples = as_array(power, "power")  # `power` names the method
+        # Not under its own name: `power` is a method of all pulses.
+        self.samples = as_array(power, "power")
 
     def __check_init__(self):
         time, power = concrete(self.time), concrete(self.samples)
@@ -320,7 +325,7 @@ class SampledPulse(AbstractPulse):
                 f"time and power have shapes {self.time.shape} and {self.samples.shape}; the admissible ones "
                 "are equal, one-dimensional, of two samples or more"
             )
-        # The user calls it power.
+        # Before check_ranges, which would call the samples by the name of the field, not of the argument.
         check_range("power", self.samples, 0.0)
         check_ranges(self)
         if time is not None and np.any(np.diff(time) <= 0):
@@ -331,21 +336,22 @@ class SampledPulse(AbstractPulse):
         if power is not None and not np.any(power > 0):
             raise ValueError("power = 0 throughout; the admissible range of its largest sample is (0, inf)")
 
-    def _pieces(self) -> tuple[Array, Array, Array, Array]:
-        """Centre, length, mean power and half rise of each linear piece, for unit area."""
+    def _segments(self) -> tuple[Array, Array, Array, Array]:
+        """Centre, length, mean power and half rise of each linear segment, scaled to unit area."""
         low, high = self.time[:-1], self.time[1:]
-        # Divided by the largest first, as powers of 1e-20 W or so would underflow on the way.
+        # The largest sample is divided out first: powers of 1e-20 W would underflow in the products. It
+        # cancels in the result, so its derivative is zero.
         power = self.samples / jax.lax.stop_gradient(jnp.max(self.samples))
         mean, rise = 0.5 * (power[1:] + power[:-1]), 0.5 * (power[1:] - power[:-1])
         area = jnp.sum(mean * (high - low))
         return 0.5 * (low + high), high - low, mean / area, rise / area
 
     def cumulative(self, t: ArrayLike, jitter: ArrayLike = 0.0) -> Float[Array, "..."]:
-        centre, length, mean, rise = self._pieces()
+        centre, length, mean, rise = self._segments()
         sigma = jnp.abs(as_scalar(jitter))
 
         def at(time):
-            even, odd = piece(time - centre, length, sigma)
+            even, odd = _segment_integrals(time - centre, length, sigma)
             return jnp.sum(length * (mean * even + rise * odd))
 
         t = as_array(t)
@@ -353,12 +359,12 @@ class SampledPulse(AbstractPulse):
 
     @property
     def mean(self) -> Float[Array, ""]:
-        centre, length, mean, rise = self._pieces()
+        centre, length, mean, rise = self._segments()
         return jnp.sum(length * (mean * centre + rise * length / 6))
 
     @property
     def std(self) -> Float[Array, ""]:
-        centre, length, mean, rise = self._pieces()
+        centre, length, mean, rise = self._segments()
         centre = centre - self.mean
         return jnp.sqrt(jnp.sum(length * (mean * (centre**2 + length**2 / 12) + rise * centre * length / 3)))
 
@@ -371,12 +377,121 @@ class SampledPulse(AbstractPulse):
         """
         slope = jnp.diff(self.samples) / jnp.diff(self.time)
         bend = jnp.max(jnp.abs(jnp.diff(slope, prepend=0.0, append=0.0)))
-        most = jnp.max(self.samples)
-        jumps = jnp.maximum(self.samples[0], self.samples[-1]) > 0.01 * most
-        return jnp.where(jumps, 0.0, jnp.minimum(most / bend, self.std))
+        peak = jnp.max(self.samples)
+        jumps = jnp.maximum(self.samples[0], self.samples[-1]) > 0.01 * peak
+        return jnp.where(jumps, 0.0, jnp.minimum(peak / bend, self.std))
 
     def support(self, jitter: ArrayLike = 0.0) -> tuple[float, float]:
-        time, lit = np.asarray(self.time, dtype=float), np.flatnonzero(np.asarray(self.samples))
-        reach = _GAUSSIAN_REACH * float(as_scalar(jitter))
-        first, last = max(lit[0] - 1, 0), min(lit[-1] + 1, time.size - 1)
-        return float(time[first]) - reach, float(time[last]) + reach
+        time, nonzero = np.asarray(self.time, dtype=float), np.flatnonzero(np.asarray(self.samples))
+        extent = _GAUSSIAN_EXTENT * float(as_scalar(jitter))
+        first, last = max(nonzero[0] - 1, 0), min(nonzero[-1] + 1, time.size - 1)
+        return float(time[first]) - extent, float(time[last]) + extent
+
+
+# -- running integrals -------------------------------------------------------------------------------------
+
+
+def _safe_hypot(a: Array, b: Array) -> Array:
+    """Compute sqrt(a^2 + b^2) with a derivative that is finite at zero."""
+    square = a * a + b * b
+    positive = square > _NEGLIGIBLE_WIDTH**2
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)
+
+
+def _z_score(t: Array, sigma: Array) -> Array:
+    """Compute t / sigma, clipped to +-40; for a sigma of zero it is +-40 with the sign of t."""
+    inside = (sigma > _NEGLIGIBLE_WIDTH) & (jnp.abs(t) < _Z_MAX * sigma)
+    ratio = jnp.where(inside, t, 0.0) / jnp.where(inside, sigma, 1.0)
+    return jnp.where(inside, ratio, _Z_MAX * jnp.sign(t))
+
+
+def _normal_pdf(z: Array) -> Array:
+    return jnp.exp(-0.5 * z * z) / math.sqrt(2 * math.pi)
+
+
+def _normal_cdf(z: Array) -> Array:
+    return 0.5 * erfc(-z / math.sqrt(2))
+
+
+def _cdf_integrals(z: Array) -> tuple[Array, Array]:
+    """Integrate Phi(z) once and twice, and subtract the same integrals of the unit step.
+
+    The first is even and vanishes at infinity. The second is odd; its integration constant cancels in
+    differences.
+    """
+    tail, density = _normal_cdf(-jnp.abs(z)), _normal_pdf(z)
+    first_integral = density - jnp.abs(z) * tail
+    second_integral = jnp.sign(z) * (0.25 - 0.5 * ((z * z + 1) * tail - jnp.abs(z) * density))
+    return first_integral, second_integral
+
+
+@jax.custom_jvp
+def _wide_segment(t: Array, length: Array, sigma: Array) -> tuple[Array, Array]:
+    """Evaluate `_segment_integrals` in closed form, for length > 2 sigma."""
+    first_high, second_high = _cdf_integrals(_z_score(t + length / 2, sigma))
+    first_low, second_low = _cdf_integrals(_z_score(t - length / 2, sigma))
+    ratio = sigma / length
+    # The integrals without jitter, in the position q within the segment.
+    q = jnp.clip(2 * t / length, -1.0, 1.0)
+    even = (1 + q) / 2 + ratio * (first_high - first_low)
+    odd = (q * q - 1) / 4 - ratio * (first_high + first_low) + 2 * ratio**2 * (second_high - second_low)
+    return even, odd
+
+
+@_wide_segment.defjvp
+def _wide_segment_jvp(primals, tangents):
+    # Written out: the integrals without jitter and the decaying terms have kinks at the ends of the segment,
+    # which automatic differentiation would take one by one, while they cancel in the sum.
+    t, length, sigma = primals
+    dt, dlength, dsigma = tangents
+    even, odd = _wide_segment(t, length, sigma)
+    high, low = _z_score(t + length / 2, sigma), _z_score(t - length / 2, sigma)
+    rise, total = _normal_cdf(high) - _normal_cdf(low), _normal_cdf(high) + _normal_cdf(low)
+    density_high, density_low = _normal_pdf(high), _normal_pdf(low)
+    deven = rise * dt + (density_high - density_low) * dsigma + (total / 2 - even) * dlength
+    dodd = (
+        (2 * even - total) * dt
+        + (2 * sigma / length * rise - density_high - density_low) * dsigma
+        - (rise / 2 + 2 * odd) * dlength
+    )
+    return (even, odd), (deven / length, dodd / length)
+
+
+def _narrow_segment(t: Array, length: Array, sigma: Array) -> tuple[Array, Array]:
+    """Evaluate `_segment_integrals` by quadrature, for length <= 2 sigma, where its error is below 1e-15."""
+    even = odd = jnp.zeros_like(t)
+    for x, weight in zip(_NODES.tolist(), _WEIGHTS.tolist()):
+        value = 0.5 * weight * _normal_cdf(_z_score(t - 0.5 * x * length, sigma))
+        even, odd = even + value, odd + x * value
+    return even, odd
+
+
+def _segment_integrals(t: Array, length: Array, sigma: Array) -> tuple[Array, Array]:
+    """Compute E and O (see the module) of a linear segment centred on zero, for the jitter `sigma`."""
+    wide = (length > 2 * sigma) & (length > _NEGLIGIBLE_WIDTH)
+    wide_even, wide_odd = _wide_segment(t, jnp.where(wide, length, 1.0), jnp.where(wide, sigma, 0.0))
+    even, odd = _narrow_segment(t, length, sigma)
+    return jnp.where(wide, wide_even, even), jnp.where(wide, wide_odd, odd)
+
+
+def _exponential_tail(t: Array, sigma: Array, decay: Array) -> Array:
+    """Compute phi(z) M(sigma/decay - z) with z = t/sigma, which an exponential tail subtracts from Phi(z)."""
+    z = _z_score(t, sigma)
+    # The argument of M times the decay, which is finite at a decay of zero.
+    scaled_argument = sigma - decay * z
+    large = (scaled_argument > 4 * decay) & (scaled_argument > _NEGLIGIBLE_WIDTH)
+    v = jnp.where(large, decay, 0.0) / jnp.where(large, scaled_argument, 1.0)
+    # Laplace's continued fraction of M(1/v), smooth at v = 0. Its tail is that of a fraction with equal
+    # terms: 16 terms then have a relative error of 3e-13.
+    fraction = 0.5 * (1 + jnp.sqrt(1 + 68 * v * v))
+    for k in range(16, 0, -1):
+        fraction = 1 + k * v * v / fraction
+    by_fraction = _normal_pdf(z) * v / fraction
+    # Where the argument of M is below 4, the formula exp(rate^2 sigma^2/2 - rate t) Phi(z - sigma rate) does
+    # not overflow: its exponent is below 8.
+    direct = ~large & (decay > _NEGLIGIBLE_WIDTH)
+    rate = 1 / jnp.where(direct, decay, 1.0)
+    width, time = jnp.where(direct, sigma, 0.0), jnp.where(direct, t, 0.0)
+    shifted = _normal_cdf(_z_score(time - width * width * rate, width))
+    by_definition = jnp.exp(rate * (0.5 * width * width * rate - time)) * shifted
+    return jnp.where(large, by_fraction, jnp.where(direct, by_definition, 0.0))

@@ -1,8 +1,15 @@
-"""The receiver: how the detector and the digitiser record the energy that arrives.
+"""The receiver: detection, noise and digitisation of the energy that arrives.
 
 `record` turns expected energies per sample into a record, with or without one realisation of the noise, or
-into the events of a `PhotonCounter`.
-`first_return_window` starts the sampling bins at the first return, as the paper does.
+into the events of a `PhotonCounter`. For the detected energy E of a sample, the background b and the photon
+energy e = h c / wavelength, a sample is
+
+    x = e Poisson((E + b) / e) + s Normal(0, 1)    (or E + b, without noise)
+    x = min(x, S)                                  saturation S
+    x = 0 where x < D                              detection threshold D
+    x = q round(x / q),  q = S / (2^B - 1)         quantisation to B bits
+
+`first_return_window` starts the sampling bins at the first return, as the paper does in its section 2.1.
 """
 
 import math
@@ -18,7 +25,6 @@ from jaxtyping import Array, ArrayLike, Float
 from jaxlidar._checks import (
     as_array,
     as_scalar,
-    briefly,
     check_choice,
     check_flag,
     check_integer,
@@ -43,7 +49,6 @@ Wavelengths: TypeAlias = ArrayLike | Sequence[ArrayLike]
 
 
 @final
-@briefly
 class Receiver(eqx.Module):
     """Detection, noise and digitisation of a waveform. The default is a perfect record.
 
@@ -52,19 +57,19 @@ class Receiver(eqx.Module):
     **Arguments:**
 
     - `detection_threshold`: J per sample, not negative; samples below it are recorded as zero. Default 0: no
-      signal is lost, and electronic noise may make a sample negative.
+      sample is set to zero, and electronic noise may make a sample negative.
     - `saturation`: J per sample, positive; larger samples are recorded as this value. Default None: no limit.
     - `bits`: resolution of the digitiser, an integer in [1, 24], over the range [0, `saturation`]; it needs a
       saturation. Default None: not quantised.
     - `background`: J per sample, not negative, added to every sample (sunlight, dark current). Default 0.
-    - `photon_noise`: whether a noisy record has the shot noise of signal and background. Default True.
+    - `photon_noise`: True if a noisy record has the shot noise of signal and background. Default True.
     - `electronic_noise`: standard deviation of additive normal noise in J per sample, not negative. Default
       0.
     - `window`: "fixed": samples at fixed instants; "first return": the sampling bins start at the first
       return, as in the paper (see `first_return_window`). Default "fixed".
 
     **Raises:** ValueError for a value outside its range, for an unknown window, and for `bits` without
-    `saturation`; TypeError for a thing of another kind.
+    `saturation`; TypeError for an object of the wrong type.
 
     **Example:** a digitiser of two bits has four levels.
 
@@ -134,10 +139,10 @@ def record(
     mode: str = "waveform",
     pulses: int = 1,
 ) -> Float[Array, "*channels wavelengths bins"] | PhotonEvents:
-    """What a receiver records of a waveform: samples, or photon events.
+    """Record a waveform with a receiver: as samples, or as photon events.
 
-    Of samples, background and noise are added; saturation, detection threshold and quantisation follow in
-    this order. How events are drawn is in `jaxlidar.instrument.photon_counter`.
+    To samples, background and noise are added; saturation, detection threshold and quantisation follow in
+    this order. `jaxlidar.instrument.photon_counter` states how events are drawn.
 
     **Arguments:**
 
@@ -147,21 +152,23 @@ def record(
       h c / wavelength. Default None: the waveform's.
     - `receiver`: the `Receiver` that records, or the `PhotonCounter` where `mode` is "photons". Default None:
       one with its defaults.
-    - `key`: a JAX random key. Photon events need one. Of samples, the result is one realisation of the noise.
-      The photons of signal and background are Poisson counts, or a normal variable where more than a million
+    - `key`: a JAX random key. Photon events need one. With a key, samples are one realisation of the noise:
+      the photons of signal and background are Poisson counts, or a normal variable where more than a million
       are expected; electronic noise is normal. Default None: the samples of the expected energies, without
       noise.
     - `mode`: "waveform" for samples or "photons" for events. Default "waveform".
-    - `pulses`: of how many pulses, each with the waveform's energy, events are drawn; an integer of at least
-      1. Default 1, which it is for samples.
+    - `pulses`: number of pulses, each with the waveform's energy, whose events are drawn; an integer of at
+      least 1. Default 1, the only admissible one for samples.
 
     **Returns:** J per sample, an array shaped as the energies; or `PhotonEvents`. Derivatives of samples pass
-    through the quantisation as if it were absent. They pass through the noise of a realisation with its draws
-    held fixed, so not through Poisson counts. Events are NumPy arrays, without derivatives.
+    through the quantisation as if it were absent (a straight-through estimate). They pass through the noise
+    of a realisation with its draws held fixed, so not through Poisson counts. Events are NumPy arrays,
+    without derivatives.
 
     **Raises:** ValueError where the energies have fewer than two axes, for wavelengths that are not positive,
     and for neither one nor one per row of the energies; for events, also where energies below zero take more
-    than 1 % from a waveform, and where there would be more than 10^8; TypeError for a thing of another kind.
+    than 1 % from a waveform, and where there would be more than 10^8; TypeError for an object of the wrong
+    type.
 
     **Example:** samples, and the events of ten pulses over the same ground.
 
@@ -179,17 +186,17 @@ def record(
     69 photon events of 1 shot with 10 pulses each: 1 of background; 8 lost to dead time
     """
     check_choice("mode", mode, ("waveform", "photons"))
-    given = hasattr(wave, "energy")
-    if given and wavelength is not None:
+    is_waveform = hasattr(wave, "energy")
+    if is_waveform and wavelength is not None:
         raise ValueError("wavelength is given, but wave is a waveform, which has its own")
     if mode == "photons":
         return count_photons(wave, PhotonCounter() if receiver is None else receiver, key, pulses)
     if pulses != 1:
         raise ValueError(f"pulses = {pulses}; admissible is 1 where mode = 'waveform'")
-    samples: Any = wave.energy if given else wave
-    light: Any = wave.wavelength if given else wavelength
-    check_numbers("wavelength", light)
-    energy, wavelength = as_array(samples, "energy"), as_array(light, "wavelength")
+    energies: Any = wave.energy if is_waveform else wave
+    wavelengths: Any = wave.wavelength if is_waveform else wavelength
+    check_numbers("wavelength", wavelengths)
+    energy, wavelength = as_array(energies, "energy"), as_array(wavelengths, "wavelength")
     receiver = Receiver() if receiver is None else receiver
     check_kind("receiver", receiver, Receiver, "a Receiver where mode = 'waveform'")
     assert isinstance(receiver, Receiver)
@@ -202,10 +209,11 @@ def record(
             f"wavelength has shape {wavelength.shape}; admissible is one number, or one for each of the "
             f"{energy.shape[-2]} wavelengths of energy"
         )
-    return _samples(energy, wavelength, receiver, key)
+    return _digitise(energy, wavelength, receiver, key)
 
 
-def _samples(energy: Array, wavelength: Array, receiver: Receiver, key: Array | None) -> Array:
+def _digitise(energy: Array, wavelength: Array, receiver: Receiver, key: Array | None) -> Array:
+    """Apply background, noise, saturation, threshold and quantisation; without noise if `key` is None."""
     expected = energy + receiver.background
     value = expected
     if key is not None:
@@ -222,21 +230,25 @@ def _samples(energy: Array, wavelength: Array, receiver: Receiver, key: Array | 
     if receiver.bits is not None and receiver.saturation is not None:
         step = receiver.saturation / (2**receiver.bits - 1)
         level = jnp.clip(jnp.round(value / step), 0, 2**receiver.bits - 1)
-        # In this order the value is the level exactly and the derivative that of `value`.
+        # A straight-through estimate. The difference is exactly zero, so that the value is the level to the
+        # bit; the derivative is that of `value`.
         value = jax.lax.stop_gradient(level * step) + (value - jax.lax.stop_gradient(value))
     return value
 
 
 def _shot_noise(energy: Array, wavelength: Array, key: Array) -> Array:
-    photon = PLANCK_TIMES_LIGHT / wavelength.astype(energy.dtype)
-    photon = jnp.broadcast_to(photon.reshape(-1, 1), energy.shape)
-    photons = energy / photon
+    """Draw the energy of a Poisson number of photons, or of its normal limit."""
+    photon_energy = PLANCK_TIMES_LIGHT / wavelength.astype(energy.dtype)
+    photon_energy = jnp.broadcast_to(photon_energy.reshape(-1, 1), energy.shape)
+    photons = energy / photon_energy
     count_key, normal_key = jax.random.split(key)
-    many = photons > _POISSON_MAX
-    counts = jax.random.poisson(count_key, jax.lax.stop_gradient(jnp.where(many, 1.0, photons)))
+    use_normal = photons > _POISSON_MAX
+    counts = jax.random.poisson(count_key, jax.lax.stop_gradient(jnp.where(use_normal, 1.0, photons)))
     normal = jax.random.normal(normal_key, energy.shape, energy.dtype)
-    large = jnp.where(many, photons, 1.0)
-    return photon * jnp.where(many, large + jnp.sqrt(large) * normal, counts.astype(energy.dtype))
+    # The square root of samples that do not use it must not reach zero: its derivative is infinite there.
+    mean = jnp.where(use_normal, photons, 1.0)
+    counts = jnp.where(use_normal, mean + jnp.sqrt(mean) * normal, counts.astype(energy.dtype))
+    return photon_energy * counts
 
 
 def first_return_window(
@@ -245,13 +257,13 @@ def first_return_window(
     interval: float,
     threshold: ArrayLike = 0.0,
 ) -> tuple[Float[Array, " samples"], Float[Array, "*channels samples"]]:
-    """A finely sampled waveform on coarser bins that start at the first return.
+    """Sample a finely resolved waveform on coarser bins that start at the first return.
 
     The paper samples in this way (its section 2.1) and notes the artefact: the position of the bins depends
     on the scene. The first echo always starts at the edge of a bin, where samples at fixed instants would
     split it over two bins. Later echoes fall where their distance from the first puts them, so that a peak
-    (the paper's ground) reads too high. Real digitisers sample at instants of their own. Use this only to
-    reproduce the paper's figures.
+    (the paper's ground) reads too high. Real digitisers sample at instants that do not depend on the scene.
+    Use this only to reproduce the paper's figures.
 
     **Arguments:**
 
@@ -286,21 +298,23 @@ def first_return_window(
     if centres.ndim != 1 or centres.size < 2 or energy.shape[-1:] != centres.shape:
         raise ValueError(f"time has shape {centres.shape}; admissible is one per bin of energy, two or more")
     step = float((centres[-1] - centres[0]) / steps.size)
-    # Times in single precision are even to their rounding only.
-    slack = 1e-4 * abs(step) + 4e-7 * float(np.max(np.abs(centres)))
-    if step <= 0 or np.max(np.abs(steps - step)) > slack:
+    # Times in single precision are evenly spaced to their rounding only.
+    tolerance = 1e-4 * abs(step) + 4e-7 * float(np.max(np.abs(centres)))
+    if step <= 0 or np.max(np.abs(steps - step)) > tolerance:
         worst = float(steps[np.argmax(np.abs(steps - step))])
         raise ValueError(
             f"time has a step of {worst:g}; admissible are even, positive steps ({step:g} on average)"
         )
 
     ratio = interval / step
+    # The tolerance keeps rounding of the ratio from adding an empty bin.
     samples = math.ceil(centres.size / ratio - 1e-6)
-    lit = jnp.any(energy.reshape(-1, centres.size) > threshold, axis=0)
-    first = jnp.argmax(lit).astype(energy.dtype)
-    # In fine bins from the opening, so that neighbours share their edges to the last bit.
+    exceeds = jnp.any(energy.reshape(-1, centres.size) > threshold, axis=0)
+    first = jnp.argmax(exceeds).astype(energy.dtype)
+    # Edges in units of fine bins from the start of the window, so that neighbours share theirs to the last
+    # bit.
     edges = jnp.asarray(ratio * np.arange(samples + 1), energy.dtype)[:, None]
-    fine = (np.arange(centres.size) - first)[None, :]
-    share = jnp.clip(jnp.minimum(edges[1:], fine + 1) - jnp.maximum(edges[:-1], fine), 0.0)
+    fine_edges = (np.arange(centres.size) - first)[None, :]
+    overlap = jnp.clip(jnp.minimum(edges[1:], fine_edges + 1) - jnp.maximum(edges[:-1], fine_edges), 0.0)
     times = centres[0] + step * (first + ratio * np.arange(samples) + 0.5 * ratio - 0.5)
-    return times, jnp.einsum("...b,sb->...s", energy, share)
+    return times, jnp.einsum("...b,sb->...s", energy, overlap)

@@ -1,8 +1,15 @@
-"""Scan patterns: in which direction an airborne scanner looks at which time.
+"""Scan patterns: the direction of an airborne scanner's beam as a function of time.
 
-Directions are told in the frame of a level platform: forward, to the right and down. Over flat ground at the
-height h below the platform, light in the direction (f, r, d) falls h f / d ahead of it and h r / d to its
-right. Patterns are those of Baltsavias (1999), ISPRS J. Photogramm. Remote Sens. 54, 199, section 4.
+Directions (f, r, d) are unit vectors in the frame of a level platform: forward, to the right and down. Over
+flat ground at the height h below the platform, the beam meets the ground h f / d ahead of the platform and
+h r / d to its right. With the half angle alpha, the frequency or line rate nu and the time t:
+
+- oscillating mirror: across the track at the angle alpha sin(2 pi nu t) from the vertical, or at a triangle
+  wave of the same limits;
+- rotating polygon: across the track at alpha (2 frac(nu t) - 1), frac being the fractional part;
+- nutating (Palmer) mirror: f = sin(alpha) cos(2 pi nu t), r = sin(alpha) sin(2 pi nu t), d = cos(alpha).
+
+Source: Baltsavias (1999), ISPRS J. Photogramm. Remote Sens. 54, 199, section 4.
 """
 
 import abc
@@ -14,21 +21,21 @@ from jaxtyping import Float
 
 from jaxlidar._checks import check_choice, check_number
 
-# Beams of a lidar are at most this far from the vertical, degrees.
-STEEPEST = 89.0
+# Largest angle between a beam and the vertical, degrees.
+MAX_ZENITH = 89.0
 
 
-def _number(x: Any) -> Any:
-    """A Python float in double precision, where `x` is one number."""
+def _as_float(x: Any) -> Any:
+    """Convert one number to a Python float (double precision); other objects are left to the checks."""
     return float(x) if np.ndim(x) == 0 and not isinstance(x, str | None) else x
 
 
 class AbstractScan(eqx.Module):
-    """The way in which a scanner moves its beam.
+    """A scan pattern: the direction of the beam of a scanner as a function of time.
 
     Derive your own pattern from this class and define `direction`.
 
-    **Example:** a beam that looks straight down, whatever the time.
+    **Example:** a profiler, whose beam always looks straight down.
 
     >>> import numpy as np
     >>> import jaxlidar as jl
@@ -42,11 +49,11 @@ class AbstractScan(eqx.Module):
 
     @abc.abstractmethod
     def direction(self, time: Float[np.ndarray, " shots"]) -> Float[np.ndarray, "shots 3"]:
-        """Unit vectors of the beam: forward, to the right and down.
+        """Unit vectors of the beam, with the components forward, to the right and down.
 
         **Arguments:** `time`: (shots,) s since the start of the line.
 
-        **Returns:** (shots, 3), the third of which is positive.
+        **Returns:** (shots, 3) directions, whose third component is positive.
         """
 
 
@@ -73,21 +80,22 @@ class Oscillating(AbstractScan):
     [[0.0, 0.0, 1.0], [0.0, 0.5, 0.866], [0.0, -0.5, 0.866]]
     """
 
-    half_angle: float = eqx.field(converter=_number)
-    frequency: float = eqx.field(converter=_number)
+    half_angle: float = eqx.field(converter=_as_float)
+    frequency: float = eqx.field(converter=_as_float)
     motion: str = eqx.field(static=True, default="sine")
 
     def __check_init__(self):
-        _check(self.half_angle, "frequency", self.frequency)
+        _check_pattern(self.half_angle, "frequency", self.frequency)
         check_choice("motion", self.motion, ("sine", "triangle"))
 
     def direction(self, time: Float[np.ndarray, " shots"]) -> Float[np.ndarray, "shots 3"]:
         cycle = np.asarray(time, float) * self.frequency
         if self.motion == "sine":
-            share = np.sin(2 * np.pi * cycle)
+            fraction = np.sin(2 * np.pi * cycle)
         else:
-            share = 1.0 - np.abs((4.0 * cycle + 1.0) % 4.0 - 2.0)
-        return _across(share * self.half_angle)
+            # A triangle wave of period 1 that starts at zero and rises.
+            fraction = 1.0 - np.abs((4.0 * cycle + 1.0) % 4.0 - 2.0)
+        return _across_track(fraction * self.half_angle)
 
 
 @final
@@ -111,15 +119,15 @@ class RotatingPolygon(AbstractScan):
     [[0.0, -0.5, 0.866], [0.0, 0.0, 1.0]]
     """
 
-    half_angle: float = eqx.field(converter=_number)
-    line_rate: float = eqx.field(converter=_number)
+    half_angle: float = eqx.field(converter=_as_float)
+    line_rate: float = eqx.field(converter=_as_float)
 
     def __check_init__(self):
-        _check(self.half_angle, "line_rate", self.line_rate)
+        _check_pattern(self.half_angle, "line_rate", self.line_rate)
 
     def direction(self, time: Float[np.ndarray, " shots"]) -> Float[np.ndarray, "shots 3"]:
-        share = 2.0 * ((np.asarray(time, float) * self.line_rate) % 1.0) - 1.0
-        return _across(share * self.half_angle)
+        fraction = 2.0 * ((np.asarray(time, float) * self.line_rate) % 1.0) - 1.0
+        return _across_track(fraction * self.half_angle)
 
 
 @final
@@ -144,11 +152,11 @@ class Conical(AbstractScan):
     [[0.5, 0.0, 0.866], [0.0, 0.5, 0.866]]
     """
 
-    half_angle: float = eqx.field(converter=_number)
-    frequency: float = eqx.field(converter=_number)
+    half_angle: float = eqx.field(converter=_as_float)
+    frequency: float = eqx.field(converter=_as_float)
 
     def __check_init__(self):
-        _check(self.half_angle, "frequency", self.frequency)
+        _check_pattern(self.half_angle, "frequency", self.frequency)
 
     def direction(self, time: Float[np.ndarray, " shots"]) -> Float[np.ndarray, "shots 3"]:
         turn = 2 * np.pi * np.asarray(time, float) * self.frequency
@@ -157,12 +165,12 @@ class Conical(AbstractScan):
         return np.stack([np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), down], axis=-1)
 
 
-def _check(half_angle: Any, field: str, rate: Any) -> None:
-    check_number("half_angle", half_angle, 0.0, STEEPEST, low_open=True)
+def _check_pattern(half_angle: Any, field: str, rate: Any) -> None:
+    check_number("half_angle", half_angle, 0.0, MAX_ZENITH, low_open=True)
     check_number(field, rate, 0.0, low_open=True)
 
 
-def _across(degrees: Float[np.ndarray, " shots"]) -> Float[np.ndarray, "shots 3"]:
-    """Directions at angles from the vertical to the right."""
+def _across_track(degrees: Float[np.ndarray, " shots"]) -> Float[np.ndarray, "shots 3"]:
+    """Compute directions at given angles from the vertical to the right."""
     angle = np.deg2rad(degrees)
     return np.stack([np.zeros_like(angle), np.sin(angle), np.cos(angle)], axis=-1)

@@ -1,4 +1,14 @@
-"""Surveys: one lidar and many shots, each with its place and direction."""
+"""Surveys: one lidar and many shots, each with its position and direction.
+
+A survey stores for each shot where the beam axis meets the reference plane z = 0, and the zenith and azimuth
+of the beam. A scanner on a platform at the position q and height H, flying along the unit vector a with the
+unit vector b to its right, whose beam has the direction (f, r, d) in the platform's frame (see `scan`), aims
+at
+
+    p = q + H (f a + r b) / d,   zenith = atan2(hypot(f, r), d),   azimuth = that of f a + r b.
+
+Positions stay in double precision, as map coordinates of millions of metres need.
+"""
 
 import dataclasses
 import math
@@ -11,7 +21,6 @@ import numpy as np
 from jaxtyping import ArrayLike, Float
 
 from jaxlidar._checks import (
-    briefly,
     check_integer,
     check_kind,
     check_number,
@@ -22,19 +31,20 @@ from jaxlidar._checks import (
     concrete_number,
 )
 from jaxlidar.instrument.lidar import Lidar
-from jaxlidar.instrument.scan import STEEPEST, AbstractScan
+from jaxlidar.instrument.scan import MAX_ZENITH, AbstractScan
 
-# Rounding of a distance over a spacing that still counts as a whole number of spacings.
-_WHOLE = 1e-6
+# A length that falls short of a multiple of the spacing by this fraction, as by rounding, counts as the
+# multiple.
+_SPACING_TOLERANCE = 1e-6
 
 
 @final
-@briefly
 class Survey(eqx.Module):
     """Many shots of one lidar: where the beam axis of each meets the reference plane, and its direction.
 
-    `Survey.grid`, `Survey.track` and `Survey.scan` make one of a few numbers. A survey has a length;
-    `survey[i]` is the `Lidar` of shot i, `survey[a:b]` a part. Places are kept in double precision.
+    `Survey.grid`, `Survey.track` and `Survey.scan` make regular surveys. `len(survey)` is the number of
+    shots, `survey[i]` the `Lidar` of shot i, and `survey[a:b]` the survey of some of them. Positions are kept
+    in double precision.
 
     **Arguments:**
 
@@ -45,8 +55,8 @@ class Survey(eqx.Module):
     - `azimuth`: compass direction in which the beam travels in degrees, one number or (shots,). Default None:
       the lidar's.
 
-    **Raises:** ValueError for arrays that are not of these shapes, no shot at all, and values outside their
-    ranges; TypeError for things of another kind.
+    **Raises:** ValueError for arrays of other shapes, no shot at all, and values outside their ranges;
+    TypeError for objects of the wrong type.
 
     **Example:**
 
@@ -70,13 +80,15 @@ class Survey(eqx.Module):
     ):
         check_kind("lidar", lidar, Lidar, "a Lidar, as in Survey(Lidar(), position=...)")
         check_range("position", position)
-        places = _known("position", position)
-        if places.ndim != 2 or places.shape[1] != 2 or len(places) == 0:
-            raise ValueError(f"position has shape {places.shape}; admissible is (shots, 2), one shot or more")
-        self.lidar, self.position = lidar, places
-        self.zenith = _per_shot("zenith", lidar.zenith if zenith is None else zenith, len(places))
-        self.azimuth = _per_shot("azimuth", lidar.azimuth if azimuth is None else azimuth, len(places))
-        check_range("zenith", self.zenith, 0.0, STEEPEST)
+        positions = _concrete("position", position)
+        if positions.ndim != 2 or positions.shape[1] != 2 or len(positions) == 0:
+            raise ValueError(
+                f"position has shape {positions.shape}; admissible is (shots, 2), one shot or more"
+            )
+        self.lidar, self.position = lidar, positions
+        self.zenith = _per_shot("zenith", lidar.zenith if zenith is None else zenith, len(positions))
+        self.azimuth = _per_shot("azimuth", lidar.azimuth if azimuth is None else azimuth, len(positions))
+        check_range("zenith", self.zenith, 0.0, MAX_ZENITH)
 
     def __len__(self) -> int:
         return len(self.position)
@@ -84,15 +96,19 @@ class Survey(eqx.Module):
     def __getitem__(self, shot: int | slice) -> "Lidar | Survey":
         if isinstance(shot, slice):
             return Survey(self.lidar, self.position[shot], self.zenith[shot], self.azimuth[shot])
-        i = self._number(shot)
-        own = {name: jnp.asarray(getattr(self, name)[i], float) for name in ("zenith", "azimuth")}
-        return dataclasses.replace(self.lidar, position=self.position[i], **own)
+        i = self._index(shot)
+        return self._lidar_at(self.position[i], i)
 
     def __iter__(self):
         return (self[i] for i in range(len(self)))
 
-    def _number(self, shot: Any) -> int:
-        """The shot of that number; negative numbers count from the end."""
+    def _lidar_at(self, position: Float[np.ndarray, "2"], shot: int) -> Lidar:
+        """Aim the lidar at a position, in the direction of a shot."""
+        angles = {name: jnp.asarray(getattr(self, name)[shot], float) for name in ("zenith", "azimuth")}
+        return dataclasses.replace(self.lidar, position=position, **angles)
+
+    def _index(self, shot: Any) -> int:
+        """Return the index of a shot from the start; negative numbers count from the end."""
         n, i = len(self), operator.index(shot)
         if not -n <= i < n:
             raise IndexError(f"shot {i}: the survey has {n}; admissible are -{n} to {n - 1}")
@@ -100,28 +116,28 @@ class Survey(eqx.Module):
 
     @staticmethod
     def of(lidar: Lidar) -> "Survey":
-        """The survey of one shot: that of a lidar with its own place and direction."""
+        """Make the survey of one shot: that of a lidar in its own position and direction."""
         zenith, azimuth = concrete_number(lidar.zenith), concrete_number(lidar.azimuth)
         return Survey(lidar, concrete_array(lidar.position)[None], zenith, azimuth)
 
     @property
     def middle(self) -> Lidar:
-        """A `Lidar` that aims at the middle of all places, at the largest zenith of the shots."""
-        place = 0.5 * (self.position.min(axis=0) + self.position.max(axis=0))
-        i = int(np.argmax(self.zenith))
-        own = {name: jnp.asarray(getattr(self, name)[i], float) for name in ("zenith", "azimuth")}
-        return dataclasses.replace(self.lidar, position=place, **own)
+        """`Lidar` that aims at the middle of all positions, in the direction of the largest zenith angle."""
+        middle = 0.5 * (self.position.min(axis=0) + self.position.max(axis=0))
+        return self._lidar_at(middle, int(np.argmax(self.zenith)))
 
-    def about(self, place: Float[np.ndarray, "2"]) -> "Survey":
-        """The same survey with places relative to `place`, (2,) in m."""
-        return Survey(self.lidar, self.position - place, self.zenith, self.azimuth)
+    def about(self, origin: Float[np.ndarray, "2"]) -> "Survey":
+        """Make the same survey with positions relative to `origin`, (2,) x and y in m."""
+        return Survey(self.lidar, self.position - origin, self.zenith, self.azimuth)
 
     @property
     def direction(self) -> Float[np.ndarray, "shots 3"]:
         """Unit vectors (shots, 3) in which the beams travel."""
         zenith, azimuth = np.deg2rad(self.zenith), np.deg2rad(self.azimuth)
-        across = np.sin(zenith)
-        return np.stack([across * np.sin(azimuth), across * np.cos(azimuth), -np.cos(zenith)], axis=-1)
+        horizontal = np.sin(zenith)
+        return np.stack(
+            [horizontal * np.sin(azimuth), horizontal * np.cos(azimuth), -np.cos(zenith)], axis=-1
+        )
 
     @property
     def slant_range(self) -> Float[np.ndarray, " shots"]:
@@ -131,8 +147,8 @@ class Survey(eqx.Module):
     @property
     def sensor(self) -> Float[np.ndarray, "shots 3"]:
         """Positions (shots, 3) of the sensor in m."""
-        foot = np.pad(self.position, ((0, 0), (0, 1)))
-        return foot - self.slant_range[:, None] * self.direction
+        aim_point = np.pad(self.position, ((0, 0), (0, 1)))
+        return aim_point - self.slant_range[:, None] * self.direction
 
     @property
     def footprint_radius(self) -> Float[np.ndarray, " shots"]:
@@ -141,18 +157,19 @@ class Survey(eqx.Module):
 
     @staticmethod
     def grid(lidar: Lidar, low: Any, high: Any, spacing: Any) -> "Survey":
-        """A survey of a regular grid of footprints, row after row from the south-west.
+        """Make a survey of a regular grid of footprints, row after row from the south-west.
 
         **Arguments:**
 
         - `lidar`: the `Lidar` of all shots.
         - `low`: (x, y) of the first footprint in m.
-        - `high`: (x, y) that no footprint lies beyond, m; not below `low`.
+        - `high`: (x, y) of the opposite corner, m, not below `low`. No footprint lies beyond it.
         - `spacing`: m between neighbours, positive, one number or (along x, along y).
 
-        **Returns:** a `Survey`; along each axis it has one footprint at `low` and all others that fit.
+        **Returns:** a `Survey`; along each axis it has one footprint at `low` and as many more as fit.
 
-        **Raises:** ValueError for values outside their ranges and other shapes; TypeError for no numbers.
+        **Raises:** ValueError for values outside their ranges and other shapes; TypeError for arguments that
+        are not numbers.
 
         **Example:**
 
@@ -161,36 +178,36 @@ class Survey(eqx.Module):
         >>> survey.position.tolist()
         [[0.0, 0.0], [10.0, 0.0], [20.0, 0.0], [0.0, 10.0], [10.0, 10.0], [20.0, 10.0]]
         """
-        first, last = _place("low", low), _place("high", high)
+        first, last = _horizontal_position("low", low), _horizontal_position("high", high)
         check_range("spacing", spacing, 0.0, low_open=True)
-        step = _known("spacing", spacing)
+        step = _concrete("spacing", spacing)
         if step.shape not in ((), (2,)):
             raise ValueError(f"spacing has shape {step.shape}; admissible is one number or (2,)")
         if np.any(last < first):
             raise ValueError(f"high = {last.tolist()} lies below low = {first.tolist()}")
         step = np.broadcast_to(step, (2,))
-        x, y = (first[k] + step[k] * np.arange(_fitting(last[k] - first[k], step[k])) for k in range(2))
+        x, y = (first[k] + step[k] * np.arange(_count_along(last[k] - first[k], step[k])) for k in range(2))
         return Survey(lidar, np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
 
     @staticmethod
     def track(
         lidar: Lidar, start: Any, end: Any, spacing: Any, *, beams: int = 1, beam_spacing: Any = 600.0
     ) -> "Survey":
-        """A survey of footprints along a line, of one beam or of several side by side, as GEDI flies them.
+        """Make a survey of footprints along a line, of one beam or of several side by side as GEDI has.
 
         **Arguments:**
 
         - `lidar`: the `Lidar` of all shots.
-        - `start`, `end`: (x, y) in m of the first footprint, and where the track ends. Of several beams, they
-          are those of their middle.
+        - `start`, `end`: (x, y) in m of the first footprint and of the end of the track. With several beams,
+          the track is their middle line.
         - `spacing`: m between footprints along the track, positive; GEDI's are 60 m.
         - `beams`: number of beams, at least 1. Default 1; GEDI has 8.
         - `beam_spacing`: m between beams across the track, positive. Default 600, GEDI's.
 
         **Returns:** a `Survey`: all footprints of the leftmost beam first, then those of the next.
 
-        **Raises:** ValueError for values outside their ranges and a line without length; TypeError for no
-        numbers.
+        **Raises:** ValueError for values outside their ranges and a line without length; TypeError for
+        arguments that are not numbers.
 
         **Example:**
 
@@ -204,16 +221,16 @@ class Survey(eqx.Module):
         check_number("spacing", spacing, 0.0, low_open=True)
         check_number("beam_spacing", beam_spacing, 0.0, low_open=True)
         count = check_integer("beams", beams)
-        along = float(spacing) * np.arange(_fitting(length, float(spacing)))
+        along = float(spacing) * np.arange(_count_along(length, float(spacing)))
         across = float(beam_spacing) * (np.arange(count) - 0.5 * (count - 1))
-        place = first + across[:, None, None] * right + along[None, :, None] * forward
-        return Survey(lidar, place.reshape(-1, 2))
+        positions = first + across[:, None, None] * right + along[None, :, None] * forward
+        return Survey(lidar, positions.reshape(-1, 2))
 
     @staticmethod
     def scan(
         lidar: Lidar, pattern: AbstractScan, start: Any, end: Any, speed: Any, pulse_rate: Any
     ) -> "Survey":
-        """A survey of the shots of a scanner on a level platform that flies along a line.
+        """Make a survey of the shots of a scanner on a level platform that flies along a line.
 
         The platform flies at the lidar's altitude above the reference plane. Zenith and azimuth follow from
         the pattern.
@@ -222,14 +239,14 @@ class Survey(eqx.Module):
 
         - `lidar`: the `Lidar` of all shots. Its own direction is not used.
         - `pattern`: an `Oscillating`, a `RotatingPolygon`, a `Conical`, or another `AbstractScan`.
-        - `start`, `end`: (x, y) in m of the platform at the first shot, and where the line ends.
+        - `start`, `end`: (x, y) in m of the platform at the first shot and at the end of the line.
         - `speed`: of the platform in m/s, positive.
         - `pulse_rate`: shots per s, positive.
 
         **Returns:** a `Survey`, its shots in the order of time.
 
         **Raises:** ValueError for values outside their ranges, a line without length, and a pattern that
-        looks more than 89 degrees from the vertical; TypeError for things of another kind.
+        looks more than 89 degrees from the vertical; TypeError for objects of the wrong type.
 
         **Example:**
 
@@ -246,24 +263,25 @@ class Survey(eqx.Module):
         first, forward, right, length = _line(start, end)
         check_number("speed", speed, 0.0, low_open=True)
         check_number("pulse_rate", pulse_rate, 0.0, low_open=True)
-        time = np.arange(_fitting(length, float(speed) / float(pulse_rate))) / float(pulse_rate)
+        time = np.arange(_count_along(length, float(speed) / float(pulse_rate))) / float(pulse_rate)
         ahead, aside, down = np.moveaxis(np.asarray(pattern.direction(time), float), -1, 0)
-        level = ahead[:, None] * forward + aside[:, None] * right
-        steep = np.hypot(ahead, aside)
-        zenith = np.rad2deg(np.arctan2(steep, down))
-        if not np.all(zenith <= STEEPEST + 1e-9):
+        horizontal = ahead[:, None] * forward + aside[:, None] * right
+        sine = np.hypot(ahead, aside)
+        zenith = np.rad2deg(np.arctan2(sine, down))
+        # A pattern at the limit may exceed it by rounding.
+        if not np.all(zenith <= MAX_ZENITH + 1e-9):
             raise ValueError(
                 f"pattern looks {float(np.max(zenith)):g} degrees from the vertical; admissible is "
-                f"[0, {STEEPEST:g}]"
+                f"[0, {MAX_ZENITH:g}]"
             )
         platform = first + (float(speed) * time)[:, None] * forward
-        place = platform + float(lidar.altitude) * level / down[:, None]
-        azimuth = np.where(steep > 0, np.rad2deg(np.arctan2(level[:, 0], level[:, 1])) % 360.0, 0.0)
-        return Survey(lidar, place, np.minimum(zenith, STEEPEST), azimuth)
+        positions = platform + float(lidar.altitude) * horizontal / down[:, None]
+        azimuth = np.where(sine > 0, np.rad2deg(np.arctan2(horizontal[:, 0], horizontal[:, 1])) % 360.0, 0.0)
+        return Survey(lidar, positions, np.minimum(zenith, MAX_ZENITH), azimuth)
 
 
-def _known(field: str, x: Any) -> np.ndarray:
-    """Numbers in double precision. **Raises:** TypeError for what JAX is tracing."""
+def _concrete(field: str, x: Any) -> np.ndarray:
+    """Convert numbers to an array of float64. **Raises:** TypeError where JAX is tracing them."""
     check_numbers(field, x)
     value = concrete(x)
     if value is None:
@@ -272,9 +290,9 @@ def _known(field: str, x: Any) -> np.ndarray:
 
 
 def _per_shot(field: str, x: Any, shots: int) -> Float[np.ndarray, " shots"]:
-    """One number for all shots, or one for each."""
+    """Convert one number for all shots, or one for each, to an array with one for each."""
     check_range(field, x)
-    value = _known(field, x)
+    value = _concrete(field, x)
     if value.shape not in ((), (shots,)):
         raise ValueError(
             f"{field} has shape {value.shape}; admissible is one number or ({shots},), as position"
@@ -282,17 +300,17 @@ def _per_shot(field: str, x: Any, shots: int) -> Float[np.ndarray, " shots"]:
     return np.broadcast_to(value, (shots,)).copy()
 
 
-def _place(field: str, x: Any) -> Float[np.ndarray, "2"]:
+def _horizontal_position(field: str, x: Any) -> Float[np.ndarray, "2"]:
     check_range(field, x)
-    value = _known(field, x)
+    value = _concrete(field, x)
     if value.shape != (2,):
         raise ValueError(f"{field} has shape {value.shape}; admissible is (2,): x and y")
     return value
 
 
 def _line(start: Any, end: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """Start, unit vectors forward and to the right, and length of a line."""
-    first, last = _place("start", start), _place("end", end)
+    """Return the start, the unit vectors forward and to the right, and the length of a line."""
+    first, last = _horizontal_position("start", start), _horizontal_position("end", end)
     length = float(np.hypot(*(last - first)))
     if not length > 0:
         raise ValueError(f"end = {last.tolist()} is start; admissible is a line with a length")
@@ -300,6 +318,6 @@ def _line(start: Any, end: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, flo
     return first, forward, np.array([forward[1], -forward[0]]), length
 
 
-def _fitting(length: float, step: float) -> int:
-    """How many places, `step` apart, lie on a length, its start among them."""
-    return math.floor(length / step * (1 + _WHOLE) + _WHOLE) + 1
+def _count_along(length: float, step: float) -> int:
+    """Count the positions that lie `step` apart on a line of a given length, including its start."""
+    return math.floor(length / step * (1 + _SPACING_TOLERANCE) + _SPACING_TOLERANCE) + 1

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxlidar._checks import briefly, scalar
+from jaxlidar._checks import scalar
 from jaxlidar._deprecated import RenamedMethods
 from jaxlidar._ranges import Range, check_ranges
 from jaxlidar._vectors import Scalar, Vec, about, cross, dot, from_frame, polar, vec
@@ -146,7 +146,6 @@ class AbstractMirror(AbstractLaw):
 
 
 @final
-@briefly
 class Lambertian(AbstractLaw):
     """Lambertian reflection: equal radiance in all directions of the lit side (intensity by the cosine law).
 
@@ -178,7 +177,6 @@ class Lambertian(AbstractLaw):
 
 
 @final
-@briefly
 class EqualAngle(AbstractLaw):
     """Reflection with a polar angle uniform in [0, 90] degrees: the paper's "every angle equally likely".
 
@@ -222,7 +220,6 @@ def _square_of_sine(normal: Vec, out: Vec) -> Scalar:
 
 
 @final
-@briefly
 class Specular(AbstractMirror):
     """Specular reflection: a mirror of slightly tilted facets, with a Gaussian lobe about its direction.
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxlidar._checks import array, as_scalar, briefly, check_choice, check_range, concrete
+from jaxlidar._checks import array, as_scalar, check_choice, check_range, concrete
 from jaxlidar._ranges import Range, check_ranges
 
 ANGLE_CELLS = 90
@@ -15,7 +15,6 @@ ANGLE_NODES = 129
 
 
 @final
-@briefly
 class LeafAngles(eqx.Module):
     """A leaf angle distribution, uniform in azimuth, as probabilities of cells of one degree of inclination.
 

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from jaxlidar._checks import concrete_array, concrete_number
 from jaxlidar._vectors import Vec, scale, vec
-from jaxlidar.instrument.field_of_view import seen
+from jaxlidar.instrument.field_of_view import visible_fraction
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.optics.laws import AbstractLaw
 from jaxlidar.optics.phase import AbstractPhase
@@ -30,7 +30,7 @@ def footprint_rays(lidar: Lidar) -> tuple[Rays, PerRay]:
     rays = (axis * slant + r[:, None, None] * circle).reshape(-1, 3)
     share = np.ones_like(r)
     if lidar.field_of_view is not None:
-        share = seen(r / (slant * concrete_number(lidar.field_of_view) * 0.5e-3), np)
+        share = visible_fraction(r / (slant * concrete_number(lidar.field_of_view) * 0.5e-3), np)
     return rays / np.linalg.norm(rays, axis=1)[:, None], np.repeat(share, turn.size)
 
 

@@ -9,7 +9,7 @@ import jax
 from jaxlidar._checks import concrete_number, is_traced
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._summary import percent
-from jaxlidar.instrument.field_of_view import EDGE
+from jaxlidar.instrument.field_of_view import EDGE_WIDTH
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.planning.bounds import Bounds
 from jaxlidar.planning.config import TimeBins
@@ -129,9 +129,9 @@ def _sized_reasons(lidar: Lidar, scene: Scene) -> dict[str, str]:
     reasons = {
         "slope spread": f"{slope:g} degrees: {spread:.2g} ns (standard deviation)",
         "divergence": f"{concrete_number(lidar.divergence):g} mrad: a footprint of radius {radius:.3g} m",
-        "field of view": f"a soft edge of {percent(EDGE)}"
+        "field of view": f"a soft edge of {percent(EDGE_WIDTH)}"
         if view is None or is_traced(view)
-        else f"{concrete_number(view):g} mrad, with a soft edge of {percent(EDGE)}",
+        else f"{concrete_number(view):g} mrad, with a soft edge of {percent(EDGE_WIDTH)}",
         "hot spot": "back through the same gap: exp(-tau)"
         if hotspot
         else "paths in and out are independent: exp(-2 tau)",

@@ -71,7 +71,7 @@ def check_on_terrain(shots: Lidar | Survey, scene: Scene) -> None:
         place = survey.position[i]
         shape = ground.moved(-place).shape
         assert isinstance(shape, HeightField)
-        box, lowest, highest = shape.beneath(rims.points[i], rims.rays[i])
+        box, lowest, highest = shape.height_bounds_below(rims.points[i], rims.rays[i])
         box = box + place
         if np.all(box[0] >= origin) and np.all(box[1] <= end):
             continue

@@ -14,7 +14,7 @@ from typing import Any, final
 
 import numpy as np
 
-from jaxlidar._checks import briefly, check_integer, check_kind, check_number, check_shape, warn_units
+from jaxlidar._checks import check_integer, check_kind, check_number, check_shape, warn_units
 from jaxlidar.plants.lsystem import Item, LSystem, Rule, Word
 from jaxlidar.plants.tree import Tree
 from jaxlidar.plants.turtle import turtle
@@ -79,7 +79,6 @@ class Branching:
 
 
 @final
-@briefly
 @dataclass(frozen=True)
 class Habit:
     """The growth habit of a tree: sizes and branching proportions from which `grow` makes individuals.

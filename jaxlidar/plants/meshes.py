@@ -13,7 +13,7 @@ from typing import final
 import numpy as np
 from jaxtyping import ArrayLike, Bool, Float, Int
 
-from jaxlidar._checks import briefly, check_kind, check_range, check_shape
+from jaxlidar._checks import check_kind, check_range, check_shape
 from jaxlidar.optics.leaf_angles import ANGLE_CELLS, LeafAngles
 from jaxlidar.plants.grid import Grid, edges
 from jaxlidar.scenes.voxels import VoxelMap
@@ -25,7 +25,6 @@ _NEAR = 1e-9
 
 
 @final
-@briefly
 @dataclass(frozen=True, eq=False, init=False)
 class Mesh:
     """A mesh of n triangles over m vertices, each triangle of one of several materials.

@@ -1,9 +1,12 @@
 """Figures: waveforms and photons with height upward, scenes from the side, surveys from above, fits, spectra.
 
-Every function draws on the axes that it is given, or on those of a new figure, and returns them; nothing is
-shown and nothing is saved. The package, and matplotlib with it, is imported when it is first used.
+Every function draws on the given axes, or on those of a new figure, and returns them; it neither shows nor
+saves the figure. The package, and matplotlib with it, is imported when it is first used.
 """
 
+from typing import Any
+
+from jaxlidar._deprecated import warn_renamed
 from jaxlidar._signatures import shorten_signatures
 from jaxlidar.plot.fits import fit, residuals
 from jaxlidar.plot.light import accuracy, energy_budget
@@ -16,9 +19,9 @@ from jaxlidar.plot.waveforms import waveform
 
 __all__ = [
     "accuracy",
+    "energy_budget",
     "fit",
     "leaf_on_and_off",
-    "energy_budget",
     "photons",
     "residuals",
     "scene",
@@ -33,3 +36,10 @@ shorten_signatures(globals())
 
 def __dir__() -> list[str]:
     return sorted(__all__)
+
+
+def __getattr__(name: str) -> Any:
+    if name == "ledger":
+        warn_renamed("jaxlidar.plot.ledger", "jaxlidar.plot.energy_budget")
+        return energy_budget
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

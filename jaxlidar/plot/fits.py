@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import ArrayLike
 from matplotlib.axes import Axes
 
-from jaxlidar.plot.style import TOTAL, WAVELENGTH_COLOURS, axes_or_new, frame_height, wavelengths_of
+from jaxlidar.plot.style import TOTAL_COLOUR, WAVELENGTH_COLOURS, limit_height, make_axes, wavelength_rows
 from jaxlidar.spectral.waveform import Waveform
 
 
@@ -21,7 +21,7 @@ def residuals(
     limit: float = 5.0,
     **style: Any,
 ) -> Axes:
-    """Axes with (observed - simulated) / noise against height, over bands of one and two standard deviations.
+    """Draw (observed - simulated) / noise against height, over bands of one and two standard deviations.
 
     **Arguments:**
 
@@ -30,9 +30,9 @@ def residuals(
     - `noise`: its standard deviation, a number or of the same shape, positive.
     - `ax`: the axes to draw on. Default None: those of a new figure.
     - `wavelength`: in nm, one of the waveform's. Default None: all.
-    - `limit`: where the axis ends, in standard deviations, positive; points beyond are drawn at the end as
+    - `limit`: end of the axis in standard deviations, positive; points beyond are drawn at the end as
       arrowheads. Default 5.
-    - `style`: of the points, as for `Axes.plot`.
+    - `style`: style of the points, as for `Axes.plot`.
 
     **Returns:** the axes.
 
@@ -49,41 +49,42 @@ def residuals(
     >>> print(f"up to {ax.get_xlim()[1]:.1f} standard deviations")
     up to 5.0 standard deviations
     """
-    data, spread = np.asarray(observed, dtype=float), np.asarray(noise, dtype=float)
+    data, sigma = np.asarray(observed, dtype=float), np.asarray(noise, dtype=float)
     shape = np.asarray(wave.reflectance).shape
     if data.shape != shape:
         raise ValueError(f"observed has shape {data.shape}; admissible is the waveform's, {shape}")
-    if spread.ndim and spread.shape != shape:
-        raise ValueError(f"noise has shape {spread.shape}; admissible is a number or the waveform's {shape}")
-    if not np.all(spread > 0):
-        raise ValueError(f"noise = {np.min(spread):g} is outside the admissible range (0, inf)")
+    if sigma.ndim and sigma.shape != shape:
+        raise ValueError(f"noise has shape {sigma.shape}; admissible is a number or the waveform's {shape}")
+    if not np.all(sigma > 0):
+        raise ValueError(f"noise = {np.min(sigma):g} is outside the admissible range (0, inf)")
     if not limit > 0:
         raise ValueError(f"limit = {limit:g} is outside the admissible range (0, inf)")
-    chosen = wavelengths_of(wave, wavelength)
-    ax = axes_or_new(ax, (2.2, 4.2))
+    rows = wavelength_rows(wave, wavelength)
+    ax = make_axes(ax, (2.2, 4.2))
     height = np.asarray(wave.height)
-    score = (data - np.asarray(wave.reflectance)) / spread
-    for width, strength in ((2.0, 0.12), (1.0, 0.15)):
-        ax.axvspan(-width, width, color=TOTAL, alpha=strength, linewidth=0)
-    ax.axvline(0.0, color=TOTAL, linewidth=0.6)
-    for number, i in enumerate(chosen):
-        colour = TOTAL if len(chosen) == 1 else WAVELENGTH_COLOURS[number % len(WAVELENGTH_COLOURS)]
-        look = {"color": colour, "marker": "o", "markersize": 2.0, "linestyle": "none", **style}
-        if len(chosen) > 1:
-            look.setdefault("label", f"{float(wave.wavelength[i]):g} nm")
-        inside = np.abs(score[i]) <= limit
-        ax.plot(score[i][inside], height[inside], **look)
+    residual = (data - np.asarray(wave.reflectance)) / sigma
+    for half_width, opacity in ((2.0, 0.12), (1.0, 0.15)):
+        ax.axvspan(-half_width, half_width, color=TOTAL_COLOUR, alpha=opacity, linewidth=0)
+    ax.axvline(0.0, color=TOTAL_COLOUR, linewidth=0.6)
+    for number, i in enumerate(rows):
+        colour = TOTAL_COLOUR if len(rows) == 1 else WAVELENGTH_COLOURS[number % len(WAVELENGTH_COLOURS)]
+        points = {"color": colour, "marker": "o", "markersize": 2.0, "linestyle": "none", **style}
+        if len(rows) > 1:
+            points.setdefault("label", f"{float(wave.wavelength[i]):g} nm")
+        inside = np.abs(residual[i]) <= limit
+        ax.plot(residual[i][inside], height[inside], **points)
         for side, marker in ((-1, "<"), (1, ">")):
-            beyond = side * score[i] > limit
+            beyond = side * residual[i] > limit
+            # A label that begins with "_" does not appear in the legend.
             ax.plot(
                 np.full(beyond.sum(), 0.97 * side * limit),
                 height[beyond],
-                **{**look, "marker": marker, "label": "_"},
+                **{**points, "marker": marker, "label": "_"},
             )
-    frame_height(ax, height, np.maximum(np.asarray(wave.reflectance), data)[chosen])
+    limit_height(ax, height, np.maximum(np.asarray(wave.reflectance), data)[rows])
     ax.set_xlim(-limit, limit)
     ax.set_xlabel("residual\n(standard deviations)")
-    if len(chosen) > 1:
+    if len(rows) > 1:
         ax.legend(
             loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False, fontsize="small", markerscale=3
         )
@@ -99,7 +100,7 @@ def fit(
     wavelength: float | None = None,
     limit: float = 5.0,
 ) -> Sequence[Axes]:
-    """Two axes with a fit: observed samples over the fitted waveform, and beside them the residuals.
+    """Draw a fit on two axes: observed samples over the fitted waveform, and beside them the residuals.
 
     **Arguments:**
 
@@ -108,11 +109,11 @@ def fit(
     - `noise`: its standard deviation, a number or of the same shape, positive.
     - `axes`: two axes to draw on. Default None: those of a new figure.
     - `wavelength`: in nm, one of the waveform's. Default None: all.
-    - `limit`: where the axis of the residuals ends, in standard deviations, positive. Default 5.
+    - `limit`: end of the axis of the residuals in standard deviations, positive. Default 5.
 
     **Returns:** the two axes.
 
-    **Raises:** ValueError for other than two axes, and what `residuals` raises.
+    **Raises:** ValueError for another number of axes than two, and as `residuals`.
 
     **Example:**
 
@@ -132,19 +133,19 @@ def fit(
     assert axes is not None
     if len(axes) != 2:
         raise ValueError(f"axes has {len(axes)} axes; admissible are 2")
-    left, right = axes
-    residuals(wave, observed, noise, right, wavelength=wavelength, limit=limit)
-    right.set_ylabel("")
-    chosen, height = wavelengths_of(wave, wavelength), np.asarray(wave.height)
+    waveform_axes, residual_axes = axes
+    residuals(wave, observed, noise, residual_axes, wavelength=wavelength, limit=limit)
+    residual_axes.set_ylabel("")
+    rows, height = wavelength_rows(wave, wavelength), np.asarray(wave.height)
     data, model = np.asarray(observed, float), np.asarray(wave.reflectance)
-    for number, i in enumerate(chosen):
-        several = len(chosen) > 1
-        colour = WAVELENGTH_COLOURS[number % len(WAVELENGTH_COLOURS)] if several else TOTAL
-        named = f", {float(wave.wavelength[i]):g} nm" if several else ""
-        look = {"marker": "o", "markersize": 2.5, "linestyle": "none", "markerfacecolor": "none"}
-        left.plot(data[i], height, color=colour, label=f"observed{named}", **look)
-        left.plot(model[i], height, color=colour, linewidth=1.0, label=f"fitted{named}")
-    frame_height(left, height, np.maximum(model, data)[chosen])
-    left.set_xlabel("apparent reflectance\nper sample")
-    left.legend(frameon=False, fontsize="small", loc="lower center", bbox_to_anchor=(0.5, 1.0))
+    for number, i in enumerate(rows):
+        is_one_of_many = len(rows) > 1
+        colour = WAVELENGTH_COLOURS[number % len(WAVELENGTH_COLOURS)] if is_one_of_many else TOTAL_COLOUR
+        suffix = f", {float(wave.wavelength[i]):g} nm" if is_one_of_many else ""
+        points = {"marker": "o", "markersize": 2.5, "linestyle": "none", "markerfacecolor": "none"}
+        waveform_axes.plot(data[i], height, color=colour, label=f"observed{suffix}", **points)
+        waveform_axes.plot(model[i], height, color=colour, linewidth=1.0, label=f"fitted{suffix}")
+    limit_height(waveform_axes, height, np.maximum(model, data)[rows])
+    waveform_axes.set_xlabel("apparent reflectance\nper sample")
+    waveform_axes.legend(frameon=False, fontsize="small", loc="lower center", bbox_to_anchor=(0.5, 1.0))
     return axes

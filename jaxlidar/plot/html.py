@@ -1,4 +1,4 @@
-"""What notebooks show of an object: its summary, and a small figure."""
+"""HTML that notebooks show of an object: its summary, and a small figure."""
 
 import base64
 import html
@@ -12,33 +12,35 @@ from jaxlidar.plot.fits import residuals
 from jaxlidar.plot.waveforms import waveform
 from jaxlidar.spectral.waveform import Waveform
 
-RESOLUTION = 80
+RESOLUTION = 80  # dots per inch
 
 
 def waveform_html(wave: Waveform) -> str:
-    """The summary of a waveform and its figure, as HTML."""
+    """Render the summary of a waveform and its figure as HTML."""
     figure = Figure(figsize=(3.0, 3.2), layout="constrained")
     axes = waveform(wave, figure.subplots())
     axes.set_xlabel(axes.get_xlabel(), loc="left")
-    return _beside(str(wave), figure)
+    return _side_by_side(str(wave), figure)
 
 
-def fit_html(summary: str, wave: Waveform, score: Any) -> str:
-    """The summary of a fit, the fitted waveform and the residuals in standard deviations, as HTML."""
+def fit_html(summary: str, wave: Waveform, residual: Any) -> str:
+    """Render the summary of a fit, the fitted waveform and residuals (in standard deviations) as HTML."""
     figure = Figure(figsize=(5.0, 3.2), layout="constrained")
-    left, right = figure.subplots(1, 2, sharey=True)
-    waveform(wave, left)
-    # Clear of the power of ten at the right end.
-    left.set_xlabel(left.get_xlabel(), loc="left")
-    # So little noise that the frame is the waveform's.
+    waveform_axes, residual_axes = figure.subplots(1, 2, sharey=True)
+    waveform(wave, waveform_axes)
+    # At the left, as the axis has its power of ten at the right end.
+    waveform_axes.set_xlabel(waveform_axes.get_xlabel(), loc="left")
+    # `residuals` takes observations and noise. With a noise this small, the observations that have the given
+    # residuals are the waveform itself, and so are the limits of the axis.
     model = np.asarray(wave.reflectance, float)
     noise = 1e-6 * max(float(np.max(model)), 1e-30)
-    residuals(wave, model + noise * np.asarray(score, float), noise, right)
-    right.set_ylabel("")
-    return _beside(summary, figure)
+    residuals(wave, model + noise * np.asarray(residual, float), noise, residual_axes)
+    residual_axes.set_ylabel("")
+    return _side_by_side(summary, figure)
 
 
-def _beside(summary: str, figure: Figure) -> str:
+def _side_by_side(summary: str, figure: Figure) -> str:
+    """Lay out a text and a figure, embedded as PNG, side by side."""
     image = io.BytesIO()
     figure.savefig(image, format="png", dpi=RESOLUTION)
     data = base64.b64encode(image.getvalue()).decode()

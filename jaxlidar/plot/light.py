@@ -1,4 +1,4 @@
-"""Figures of where the light went, and of how well a waveform is known."""
+"""Figures of the energy budget of a waveform, and of its accuracy."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -8,28 +8,35 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter, PercentFormatter
 
 from jaxlidar._progress import Progress
-from jaxlidar.plot.style import BEAM, COLOURS, OTHER, TOTAL, WAVELENGTH_COLOURS, axes_or_new
+from jaxlidar.plot.style import (
+    BEAM_COLOUR,
+    MATERIAL_COLOURS,
+    OTHER_COLOUR,
+    TOTAL_COLOUR,
+    WAVELENGTH_COLOURS,
+    make_axes,
+)
 from jaxlidar.spectral.waveform import Waveform
 
-# Fates that are no material's, each with a hatch, so that grey tells them apart.
-FATES = {
+# Colour and hatch of the entries of an energy budget other than absorption by a material.
+FATE_STYLES = {
     "escaped": ("#DDDDDD", ""),
     "after the window": ("#BBBBBB", "///"),
-    "unfollowed": (OTHER, "xxx"),
-    "returned": (TOTAL, ""),
+    "unfollowed": (OTHER_COLOUR, "xxx"),
+    "returned": (TOTAL_COLOUR, ""),
 }
-# Shares below this are not seen.
-LEAST = 5e-4
+# Smaller fractions of the emitted light are too narrow to see, and are left out.
+MIN_FRACTION = 5e-4
 
 
 def energy_budget(wave: Waveform, ax: Axes | None = None, *, legend: bool = True) -> Axes:
-    """Axes with what became of the emitted light: a bar for each wavelength, in percent.
+    """Draw the energy budget of the emitted light: a bar for each wavelength, in percent.
 
     **Arguments:**
 
     - `wave`: a `Waveform`.
     - `ax`: the axes to draw on. Default None: those of a new figure.
-    - `legend`: whether to name what is drawn. Default True.
+    - `legend`: True to add a legend. Default True.
 
     **Returns:** the axes.
 
@@ -44,40 +51,40 @@ def energy_budget(wave: Waveform, ax: Axes | None = None, *, legend: bool = True
     ['absorbed by ground', 'escaped']
     """
     names = [f"{w:g} nm" for w in np.asarray(wave.wavelength, float)]
-    ax = axes_or_new(ax, (5.0, 0.9 + 0.4 * len(names)))
+    ax = make_axes(ax, (5.0, 0.9 + 0.4 * len(names)))
     absorbed = [name for name in wave.energy_budget if name.startswith("absorbed by ")]
-    left, spare = np.zeros(len(names)), list(WAVELENGTH_COLOURS)
-    for name in [*absorbed, *(fate for fate in FATES if fate in wave.energy_budget)]:
-        share = 100.0 * np.asarray(wave.energy_budget[name], float)
-        if share.max(initial=0.0) < 100 * LEAST:
+    bar_end, spare_colours = np.zeros(len(names)), list(WAVELENGTH_COLOURS)
+    for name in [*absorbed, *(fate for fate in FATE_STYLES if fate in wave.energy_budget)]:
+        percentage = 100.0 * np.asarray(wave.energy_budget[name], float)
+        if percentage.max(initial=0.0) < 100 * MIN_FRACTION:
             continue
         material = name.removeprefix("absorbed by ")
-        colour, hatch = FATES.get(name) or (COLOURS.get(material) or spare.pop(), "")
-        look = {"color": colour, "hatch": hatch, "edgecolor": "white", "linewidth": 0.5, "label": name}
-        ax.barh(names, share, left=left, **look)
-        left = left + share
+        colour, hatch = FATE_STYLES.get(name) or (MATERIAL_COLOURS.get(material) or spare_colours.pop(), "")
+        style = {"color": colour, "hatch": hatch, "edgecolor": "white", "linewidth": 0.5, "label": name}
+        ax.barh(names, percentage, left=bar_end, **style)
+        bar_end = bar_end + percentage
     ax.set_xlim(0.0, 100.0)
     ax.invert_yaxis()
     ax.set_xlabel("share of the emitted light (%)")
     if legend:
-        place = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "ncols": 3}
-        ax.legend(frameon=False, fontsize="small", handlelength=1.2, columnspacing=1.2, **place)
+        position = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "ncols": 3}
+        ax.legend(frameon=False, fontsize="small", handlelength=1.2, columnspacing=1.2, **position)
     return ax
 
 
 def accuracy(steps: Sequence[Progress | Waveform], ax: Axes | None = None, **style: Any) -> Axes:
-    """Axes with the relative error against the number of photons, and the tolerance that was aimed at.
+    """Draw the relative error against the number of photons, and the target tolerance.
 
     **Arguments:**
 
-    - `steps`: what `simulate` gave to its argument `progress`, as in `progress=steps.append`; or waveforms of
-      several numbers of photons. At least one that traced photons.
+    - `steps`: a list of `Progress` from `simulate`, collected by `progress=steps.append`; or waveforms of
+      several numbers of photons. At least one of them has photons.
     - `ax`: the axes to draw on. Default None: those of a new figure.
-    - `style`: of the points, as for `Axes.plot`.
+    - `style`: style of the points, as for `Axes.plot`.
 
     **Returns:** the axes. A thin line falls with the square root of the photons, through the last point.
 
-    **Raises:** ValueError where there are no photons in any step.
+    **Raises:** ValueError if no step has photons.
 
     **Example:**
 
@@ -89,28 +96,30 @@ def accuracy(steps: Sequence[Progress | Waveform], ax: Axes | None = None, **sty
     >>> print(ax.get_xlabel(), ax.get_xscale())
     photons log
     """
-    found = [
-        (s.info.get("photons", 0), s.info.get("error", 0.0))
-        if isinstance(s, Waveform)
-        else (s.photons, s.error)
-        for s in steps
+    counts_and_errors = [
+        (step.info.get("photons", 0), step.info.get("error", 0.0))
+        if isinstance(step, Waveform)
+        else (step.photons, step.error)
+        for step in steps
     ]
-    points = np.array([(n, e) for n, e in found if n > 0 and 0 < e < np.inf], float).reshape(-1, 2)
+    # The first step may have no error yet, and a logarithmic axis shows neither zero nor infinity.
+    points = [(n, error) for n, error in counts_and_errors if n > 0 and 0 < error < np.inf]
+    points = np.array(points, float).reshape(-1, 2)
     if not len(points):
         raise ValueError("steps has no photons: nothing was random, or nothing was traced")
-    ax = axes_or_new(ax, (4.0, 3.0))
+    ax = make_axes(ax, (4.0, 3.0))
     photons, error = points[np.argsort(points[:, 0])].T
-    look = {"color": WAVELENGTH_COLOURS[0], "marker": "o", "markersize": 4, "linestyle": "none", **style}
+    marker = {"color": WAVELENGTH_COLOURS[0], "marker": "o", "markersize": 4, "linestyle": "none"}
     span = np.array([photons[0] / 1.5, photons[-1] * 1.5])
-    root = error[-1] * np.sqrt(photons[-1] / span)
-    ax.loglog(span, root, color=TOTAL, linewidth=0.8, label="square root of the photons")
-    ax.loglog(photons, error, **{"label": "relative error", **look})
-    aims = {s.rtol for s in steps if isinstance(s, Progress) and s.rtol is not None}
-    for aim in sorted(aims):
-        ax.axhline(aim, color=BEAM, linewidth=1.0, linestyle="--", label=f"aim {aim:g}")
-    for axis, form in ((ax.xaxis, EngFormatter(sep="")), (ax.yaxis, PercentFormatter(1.0))):
+    square_root_law = error[-1] * np.sqrt(photons[-1] / span)
+    ax.loglog(span, square_root_law, color=TOTAL_COLOUR, linewidth=0.8, label="square root of the photons")
+    ax.loglog(photons, error, **{"label": "relative error", **marker, **style})
+    targets = {step.rtol for step in steps if isinstance(step, Progress) and step.rtol is not None}
+    for rtol in sorted(targets):
+        ax.axhline(rtol, color=BEAM_COLOUR, linewidth=1.0, linestyle="--", label=f"aim {rtol:g}")
+    for axis, formatter in ((ax.xaxis, EngFormatter(sep="")), (ax.yaxis, PercentFormatter(1.0))):
         axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-        axis.set_major_formatter(form)
+        axis.set_major_formatter(formatter)
         axis.set_minor_formatter(NullFormatter())
     ax.set_xlabel("photons")
     ax.set_ylabel("relative error")

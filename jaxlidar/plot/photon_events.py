@@ -8,14 +8,14 @@ from matplotlib.axes import Axes
 
 from jaxlidar._checks import check_kind, check_range, check_shape, concrete_array
 from jaxlidar.instrument.photon_counter import PhotonEvents
-from jaxlidar.plot.style import COLOURS, OTHER, TOTAL, axes_or_new
+from jaxlidar.plot.style import MATERIAL_COLOURS, OTHER_COLOUR, TOTAL_COLOUR, make_axes
 
-# Names and colours by label.
-_CLASSES = {
-    0: ("noise", OTHER),
-    3: ("signal", TOTAL),
-    1: ("ground", COLOURS["ground"]),
-    2: ("canopy", COLOURS["leaf"]),
+# Name and colour of each label, in the order of drawing: noise lies below the others.
+_LABELS = {
+    0: ("noise", OTHER_COLOUR),
+    3: ("signal", TOTAL_COLOUR),
+    1: ("ground", MATERIAL_COLOURS["ground"]),
+    2: ("canopy", MATERIAL_COLOURS["leaf"]),
 }
 
 
@@ -27,7 +27,7 @@ def photons(
     label: ArrayLike | None = None,
     **style: Any,
 ) -> Axes:
-    """Axes with the height of each photon event against its place along the track.
+    """Draw the height of each photon event against its distance along the track.
 
     **Arguments:**
 
@@ -35,14 +35,14 @@ def photons(
     - `distance`: (shots,) m along the track of each shot. Default None: events are drawn over the numbers of
       their shots.
     - `ax`: the axes to draw on. Default None: those of a new figure.
-    - `label`: (events,) what colours them: 0 noise, 1 ground, 2 canopy, 3 other signal, as
-      `inversion.photon_ground_and_canopy` tells them. Default None: the truth, signal or noise.
-    - `style`: of the points, as for `Axes.plot`.
+    - `label`: (events,) class of each event, which colours it: 0 noise, 1 ground, 2 canopy, 3 other signal,
+      as `inversion.photon_ground_and_canopy` returns them. Default None: the truth, signal or noise.
+    - `style`: style of the points, as for `Axes.plot`.
 
     **Returns:** the axes.
 
     **Raises:** ValueError for distances or labels of another shape, and labels outside 0 to 3; TypeError for
-    things of another kind.
+    objects of the wrong type.
 
     **Example:**
 
@@ -57,22 +57,23 @@ def photons(
     ['noise', 'signal']
     """
     check_kind("events", events, PhotonEvents, "PhotonEvents")
-    place = np.arange(len(events.lost), dtype=float)
+    position = np.arange(len(events.lost), dtype=float)
     if distance is not None:
         check_range("distance", distance)
-        check_shape("distance", distance, place.shape)
-        place = concrete_array(distance)
-    numbers = np.where(events.signal, 3, 0)
+        check_shape("distance", distance, position.shape)
+        position = concrete_array(distance)
+    labels = np.where(events.signal, 3, 0)
     if label is not None:
         check_range("label", label, 0, 3)
-        check_shape("label", label, numbers.shape)
-        numbers = concrete_array(label)
-    ax = axes_or_new(ax, (6.4, 3.2))
-    look = {"marker": "o", "markersize": 1.5, "markeredgewidth": 0, "linestyle": "none", **style}
-    for number, (name, colour) in _CLASSES.items():
-        of = numbers == number
-        if np.any(of):
-            ax.plot(place[events.shot[of]], events.height[of], **{"color": colour, "label": name, **look})
+        check_shape("label", label, labels.shape)
+        labels = concrete_array(label)
+    ax = make_axes(ax, (6.4, 3.2))
+    points = {"marker": "o", "markersize": 1.5, "markeredgewidth": 0, "linestyle": "none", **style}
+    for number, (name, colour) in _LABELS.items():
+        is_labelled = labels == number
+        if np.any(is_labelled):
+            x, y = position[events.shot[is_labelled]], events.height[is_labelled]
+            ax.plot(x, y, **{"color": colour, "label": name, **points})
     ax.set_xlabel("shot" if distance is None else "distance along the track (m)")
     ax.set_ylabel("height (m)")
     if ax.lines:

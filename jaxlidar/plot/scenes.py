@@ -1,4 +1,8 @@
-"""Figures of scenes from the side."""
+"""Figures of scenes from the side.
+
+The view is horizontal, along y (or x); `across` is the horizontal axis of the figure, `depth` that along the
+view.
+"""
 
 from typing import Any
 
@@ -7,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
 
 from jaxlidar.instrument.lidar import Lidar
-from jaxlidar.plot.style import BEAM, COLOURS, axes_or_new
+from jaxlidar.plot.style import BEAM_COLOUR, MATERIAL_COLOURS, make_axes
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.surfaces import AbstractGround, AbstractSheet, AbstractSurface
 from jaxlidar.scenes.terrain import Terrain
@@ -21,10 +25,10 @@ def scene(
     along: str = "y",
     legend: bool = True,
 ) -> Axes:
-    """Axes with a scene from the side: optical depth of leaf and bark, plates, ground and the beam.
+    """Draw a scene from the side: optical depth of leaf and bark, plates, ground and the beam.
 
-    Leaf and bark are shaded by 1 - exp(-optical depth) of a horizontal view through the whole voxel map.
-    Planes and terrain are cut at the middle of the map, or of the footprint where there is no map.
+    Leaf and bark are shaded by 1 - exp(-optical depth) of a horizontal view through all of the voxel map.
+    Planes and terrain are cut at the middle of the map, or of the footprint if there is no map.
 
     **Arguments:**
 
@@ -34,7 +38,7 @@ def scene(
     - `ax`: the axes to draw on. Default None: those of a new figure.
     - `along`: the direction of view: "y" looks north, x to the right; "x" looks west, y to the right. Default
       "y".
-    - `legend`: whether to name what is drawn. Default True.
+    - `legend`: True to add a legend. Default True.
 
     **Returns:** the axes.
 
@@ -51,7 +55,7 @@ def scene(
     """
     if along not in ("x", "y"):
         raise ValueError(f"along = {along!r} is none of 'x', 'y'")
-    ax = axes_or_new(ax, (3.5, 4.2))
+    ax = make_axes(ax, (3.5, 4.2))
     across, depth = (0, 1) if along == "y" else (1, 0)
     radius = 0.0 if lidar is None else float(lidar.footprint_radius)
     centre = np.zeros(2) if lidar is None else np.asarray(lidar.position, dtype=float)
@@ -65,91 +69,95 @@ def scene(
         middle = 0.5 * (origin[depth] + end[depth])
         extent = (origin[across], end[across], origin[2], end[2])
         edge = float(voxels.voxel_size[depth])
-        entries += _voxels(ax, voxels.leaf, "leaf", depth, edge, extent)
-        entries += _voxels(ax, voxels.bark, "bark", depth, edge, extent)
+        entries += _draw_voxels(ax, voxels.leaf, "leaf", depth, edge, extent)
+        entries += _draw_voxels(ax, voxels.bark, "bark", depth, edge, extent)
     if isinstance(scene.ground, Terrain) and high <= low:
-        # Nothing but terrain: all of it.
+        # Without a canopy and a beam, the figure has the extent of the terrain.
         ends = np.stack([np.asarray(scene.ground.origin, dtype=float), scene.ground.end])
         (low, high), middle = ends[:, across], ends[:, depth].mean()
     if high <= low:
         low, high = centre[across] - 1.0, centre[across] + 1.0
     sides = np.array([low, high])
-    profile = _profile(scene.ground, sides, across, middle)
-    levels = [top] if scene.canopy is not None or not isinstance(scene.ground, Terrain) else []
+    profile = _ground_profile(scene.ground, sides, across, middle)
+    heights = [top] if scene.canopy is not None or not isinstance(scene.ground, Terrain) else []
     for surface in scene.surfaces:
-        z = profile[1] if surface is scene.ground else _cut(surface, sides, across, middle)
-        levels += z.tolist()
+        z = profile[1] if surface is scene.ground else _heights_at(surface, sides, across, middle)
+        heights += z.tolist()
         if isinstance(surface, AbstractSheet):
-            entries += ax.plot(sides, z, color=COLOURS["plate"], linewidth=2.5, label="plate")
-    bottom, top = min(levels), max(levels)
-    room = max(0.06 * (top - bottom), 0.2)
+            entries += ax.plot(sides, z, color=MATERIAL_COLOURS["plate"], linewidth=2.5, label="plate")
+    bottom, top = min(heights), max(heights)
+    margin = max(0.06 * (top - bottom), 0.2)
     if scene.ground is not None:
-        # Deep enough if the limits are widened afterwards.
-        deep = bottom - 10 * (top - bottom + room)
-        look = {"color": COLOURS["ground"], "linewidth": 0, "zorder": 3, "label": "ground"}
-        entries.append(ax.fill_between(*profile, deep, **look))
+        # The ground is filled far below the lower limit, in case that a caller widens the limits.
+        fill_bottom = bottom - 10 * (top - bottom + margin)
+        fill = {"color": MATERIAL_COLOURS["ground"], "linewidth": 0, "zorder": 3, "label": "ground"}
+        entries.append(ax.fill_between(*profile, fill_bottom, **fill))
     if lidar is not None:
-        entries += _beam(ax, lidar, across, bottom, top + 10 * room)
+        entries += _draw_beam(ax, lidar, across, bottom, top + 10 * margin)
     ax.set_xlim(low, high)
-    ax.set_ylim(bottom - room, top + room)
+    ax.set_ylim(bottom - margin, top + margin)
     ax.set_aspect("equal")
     ax.set_xlabel("x, east (m)" if along == "y" else "y, north (m)")
     ax.set_ylabel("height (m)")
     if legend and entries:
-        named = {entry.get_label(): entry for entry in entries}
-        look = {"frameon": False, "fontsize": "small", "ncols": 2, "handlelength": 1.5, "columnspacing": 1.2}
-        ax.legend(named.values(), named.keys(), loc="lower center", bbox_to_anchor=(0.5, 1.0), **look)
+        # One entry for each name: the beam has two edges, and there may be several plates.
+        by_name = {entry.get_label(): entry for entry in entries}
+        style = {"frameon": False, "fontsize": "small", "ncols": 2, "handlelength": 1.5, "columnspacing": 1.2}
+        ax.legend(by_name.values(), by_name.keys(), loc="lower center", bbox_to_anchor=(0.5, 1.0), **style)
     return ax
 
 
-def _voxels(
+def _draw_voxels(
     ax: Axes, extinction: Any, name: str, depth: int, edge: float, extent: tuple[float, float, float, float]
 ) -> list[Any]:
+    """Shade a material by its opacity along the view, and return its entry for the legend."""
     if extinction is None or not np.any(np.asarray(extinction) > 0):
         return []
-    opaque = -np.expm1(-np.asarray(extinction, dtype=float).sum(axis=depth) * edge)
-    colours = LinearSegmentedColormap.from_list(name, [COLOURS[name] + "00", COLOURS[name]])
+    opacity = -np.expm1(-np.asarray(extinction, dtype=float).sum(axis=depth) * edge)
+    colours = LinearSegmentedColormap.from_list(name, [MATERIAL_COLOURS[name] + "00", MATERIAL_COLOURS[name]])
     ax.imshow(
-        opaque.T, cmap=colours, vmin=0.0, vmax=1.0, origin="lower", extent=extent, interpolation="nearest"
+        opacity.T, cmap=colours, vmin=0.0, vmax=1.0, origin="lower", extent=extent, interpolation="nearest"
     )
-    return ax.plot([], [], "s", color=COLOURS[name], label=name)
+    return ax.plot([], [], "s", color=MATERIAL_COLOURS[name], label=name)
 
 
-def _beam(ax: Axes, lidar: Lidar, across: int, bottom: float, top: float) -> list[Any]:
-    """The beam's edges in the plane through its axis."""
+def _draw_beam(ax: Axes, lidar: Lidar, across: int, bottom: float, top: float) -> list[Any]:
+    """Draw the edges of the beam in the plane through its axis, and return their entries for the legend."""
     z = np.array([bottom, top])
     zenith, azimuth = np.deg2rad(float(lidar.zenith)), np.deg2rad(float(lidar.azimuth))
+    # Change of the horizontal position per metre of height.
     lean = -np.tan(zenith) * (np.sin(azimuth), np.cos(azimuth))[across]
     axis = float(lidar.position[across]) + lean * z
-    shrink = 1.0 - z / float(lidar.altitude)
+    # The beam widens with the distance from the sensor.
+    widening = 1.0 - z / float(lidar.altitude)
     # The footprint on a horizontal plane is longer along the direction of travel.
     stretch = np.sqrt(1.0 + lean**2)
-    half = float(lidar.footprint_radius) * shrink * stretch
-    ax.fill_betweenx(z, axis - half, axis + half, color=BEAM, alpha=0.07, linewidth=0)
+    half_width = float(lidar.footprint_radius) * widening * stretch
+    ax.fill_betweenx(z, axis - half_width, axis + half_width, color=BEAM_COLOUR, alpha=0.07, linewidth=0)
     name = "beam (1/e²)" if lidar.profile == "gaussian" else "beam"
-    look = {"color": BEAM, "linewidth": 1.0, "linestyle": (0, (4, 2)), "label": name}
-    return [line for side in (-1, 1) for line in ax.plot(axis + side * half, z, **look)]
+    style = {"color": BEAM_COLOUR, "linewidth": 1.0, "linestyle": (0, (4, 2)), "label": name}
+    return [line for side in (-1, 1) for line in ax.plot(axis + side * half_width, z, **style)]
 
 
-def _profile(
+def _ground_profile(
     ground: AbstractGround | None, sides: np.ndarray, across: int, middle: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Places and heights of the ground between two sides, as far as there is ground."""
+    """Return positions and heights of the ground between two sides, as far as the ground extends."""
     if ground is None:
         return sides, np.zeros(0)
     if not (isinstance(ground, Terrain) and ground.relief):
-        return sides, _cut(ground, sides, across, middle)
-    place, depth = np.linspace(sides[0], sides[1], 800), np.array([middle])
+        return sides, _heights_at(ground, sides, across, middle)
+    position, depth = np.linspace(sides[0], sides[1], 800), np.array([middle])
     if ground.sides == "open":
         low, high = np.asarray(ground.origin, dtype=float), ground.end
-        place = np.clip(place, low[across], high[across])
+        position = np.clip(position, low[across], high[across])
         depth = np.clip(depth, low[1 - across], high[1 - across])
-    x, y = (place, depth[0] + 0.0 * place)[:: 1 if across == 0 else -1]
-    return place, np.asarray(ground.height_at(x, y), dtype=float)
+    x, y = (position, depth[0] + 0.0 * position)[:: 1 if across == 0 else -1]
+    return position, np.asarray(ground.height_at(x, y), dtype=float)
 
 
-def _cut(surface: AbstractSurface, sides: np.ndarray, across: int, middle: float) -> np.ndarray:
-    """Heights of a surface at two places, where vertical lines meet it."""
+def _heights_at(surface: AbstractSurface, sides: np.ndarray, across: int, middle: float) -> np.ndarray:
+    """Find the heights of a surface at two positions, where vertical lines cross it."""
     points = np.full((2, 3), middle)
     points[:, across], points[:, 2] = sides, 0.0
     depth, _ = surface.shape.crossing(points, np.tile([0.0, 0.0, -1.0], (2, 1)))

@@ -9,10 +9,10 @@ from matplotlib.axes import Axes
 from jaxlidar.optics.leaf import LeafOptics
 from jaxlidar.optics.prospect import Prospect
 from jaxlidar.optics.spectra import Spectrum
-from jaxlidar.plot.style import WAVELENGTH_COLOURS, axes_or_new
+from jaxlidar.plot.style import WAVELENGTH_COLOURS, make_axes
 
-# The wavelengths of the shipped tables of leaves, nm.
-GRID = np.arange(400.0, 2501.0, 2.0)
+# Wavelengths of leaf spectra, nm: the range of the coefficients of PROSPECT.
+LEAF_WAVELENGTHS = np.arange(400.0, 2501.0, 2.0)
 
 
 def spectrum(
@@ -22,14 +22,14 @@ def spectrum(
     wavelength: ArrayLike | None = None,
     **style: Any,
 ) -> Axes:
-    """Axes with a spectrum: reflectance (solid) and, of a leaf, transmittance (dashed).
+    """Draw a spectrum: reflectance (solid) and, of a leaf, transmittance (dashed).
 
     **Arguments:**
 
     - `source`: a `Prospect`, a `LeafOptics` of one number, or a `Spectrum`.
     - `ax`: the axes to draw on. Default None: those of a new figure.
     - `wavelength`: (n,) nm, increasing. Default None: 400 to 2500 for leaves, the samples of a `Spectrum`.
-    - `style`: of the lines, as for `Axes.plot`.
+    - `style`: style of the lines, as for `Axes.plot`.
 
     **Returns:** the axes.
 
@@ -44,20 +44,20 @@ def spectrum(
     >>> print([line.get_label() for line in ax.lines])
     ['reflectance', 'transmittance']
     """
-    ax = axes_or_new(ax, (5.0, 3.0))
+    ax = make_axes(ax, (5.0, 3.0))
     colour = WAVELENGTH_COLOURS[len(ax.lines) % len(WAVELENGTH_COLOURS)]
     if isinstance(source, Spectrum):
         grid = np.asarray(source.wavelength if wavelength is None else wavelength, float)
-        look = {"color": colour, "label": source.name or "reflectance", **style}
-        ax.plot(grid, np.asarray(source(grid)), **look)
+        line = {"color": colour, "label": source.name or "reflectance", **style}
+        ax.plot(grid, np.asarray(source(grid)), **line)
     else:
-        grid = GRID if wavelength is None else np.asarray(wavelength, float)
-        for part, line, name in zip(source(grid), ("-", "--"), ("reflectance", "transmittance")):
-            look = {"color": colour, "linestyle": line, "label": name, **style}
-            ax.plot(grid, np.broadcast_to(np.asarray(part), grid.shape), **look)
+        grid = LEAF_WAVELENGTHS if wavelength is None else np.asarray(wavelength, float)
+        for values, linestyle, name in zip(source(grid), ("-", "--"), ("reflectance", "transmittance")):
+            line = {"color": colour, "linestyle": linestyle, "label": name, **style}
+            ax.plot(grid, np.broadcast_to(np.asarray(values), grid.shape), **line)
     ax.set_xlabel("wavelength (nm)")
     ax.set_ylabel("reflectance" if isinstance(source, Spectrum) else "reflectance, transmittance")
-    # Around all that was drawn so far.
+    # Around all lines of the axes: calls for several sources draw on the same axes.
     ax.set_ylim(0.0, 1.05 * max(float(np.max(np.asarray(line.get_ydata()))) for line in ax.lines))
     ax.legend(frameon=False, fontsize="small", ncols=2 if len(ax.lines) > 4 else 1)
     return ax

@@ -1,7 +1,7 @@
 """Figures of trees and forests in three dimensions, leaf-on and leaf-off.
 
-Every function draws on the `mpl_toolkits.mplot3d.Axes3D` that it is given, or on that of a new figure, and
-returns it; nothing is shown and nothing is saved.
+Every function draws on the given `mpl_toolkits.mplot3d.Axes3D`, or on that of a new figure, and returns it;
+it neither shows nor saves the figure.
 """
 
 from collections.abc import Iterable, Sequence
@@ -14,10 +14,10 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
 from jaxlidar._checks import check_range
 from jaxlidar.plants.tree import Tree
-from jaxlidar.plot.style import COLOURS
+from jaxlidar.plot.style import MATERIAL_COLOURS
 
-# Lines are not drawn thinner than this, in points: they would be too faint.
-THINNEST = 0.25
+# Width of the thinnest lines, in points: thinner ones would be too faint.
+MIN_LINEWIDTH = 0.25
 
 
 def tree(
@@ -30,7 +30,7 @@ def tree(
     elevation: float = 8.0,
     azimuth: float = 200.0,
 ) -> Axes3D:
-    """Axes with trees: branch segments as lines as wide as the wood, leaf buds as translucent points.
+    """Draw trees: branch segments as lines as wide as the wood, leaf buds as translucent points.
 
     Widths and sizes are to the scale of the axes at the time of the call.
 
@@ -38,11 +38,11 @@ def tree(
 
     - `tree`: a `Tree`, or several, such as a forest.
     - `ax`: the three-dimensional axes to draw on. Default None: those of a new figure.
-    - `leaves`: whether to draw the buds. Default True.
+    - `leaves`: True to draw the buds. Default True.
     - `alpha`: opacity of a bud, in [0, 1]. Default 0.25.
-    - `max_buds`: the most buds that are drawn, at least 1. Where there are more, about as many are drawn,
-      each larger for those left out. Default 60,000.
-    - `elevation`: of the view above the horizon, degrees. Default 8.
+    - `max_buds`: largest number of buds that are drawn, at least 1. Of more buds, about as many are drawn,
+      each enlarged to make up for those left out. Default 60,000.
+    - `elevation`: angle of the view above the horizon, degrees. Default 8.
     - `azimuth`: direction towards the viewer, degrees clockwise from north. Default 200.
 
     **Returns:** the axes.
@@ -60,27 +60,33 @@ def tree(
     """
     check_range("alpha", alpha, 0.0, 1.0)
     check_range("max_buds", max_buds, 1)
-    whole = _whole(tree)
-    if not len(whole.start):
+    joined = _joined(tree)
+    if not len(joined.start):
         raise ValueError("tree has 0 segments; at least 1 is admissible")
-    ax = _axes(ax)
-    scale = _frame(ax, whole, elevation, azimuth)
-    width = scale * (whole.radius_start + whole.radius_end)
+    ax = _make_axes(ax)
+    scale = _frame(ax, joined, elevation, azimuth)
+    width = scale * (joined.radius_start + joined.radius_end)
     lines = Line3DCollection(
-        np.stack([whole.start, whole.end], axis=1).tolist(),
-        linewidths=np.maximum(width, THINNEST).tolist(),
-        colors=COLOURS["bark"],
+        np.stack([joined.start, joined.end], axis=1).tolist(),
+        linewidths=np.maximum(width, MIN_LINEWIDTH).tolist(),
+        colors=MATERIAL_COLOURS["bark"],
         capstyle="round",
         label="bark",
     )
     ax.add_collection3d(lines)
-    if leaves and len(whole.bud_radius):
-        # Every k-th bud: their order follows the branches, so that these are spread evenly.
-        every = -(-len(whole.bud_radius) // max_buds)
-        place = whole.bud_position[::every]
-        size: Any = every * (2 * scale * whole.bud_radius[::every]) ** 2
+    if leaves and len(joined.bud_radius):
+        # Every k-th bud: buds are ordered along the branches, so that these are spread evenly. Their areas
+        # are scaled by k.
+        stride = -(-len(joined.bud_radius) // max_buds)
+        area: Any = stride * (2 * scale * joined.bud_radius[::stride]) ** 2
         ax.scatter(
-            *place.T, s=size, color=COLOURS["leaf"], alpha=alpha, linewidths=0, depthshade=False, label="leaf"
+            *joined.bud_position[::stride].T,
+            s=area,
+            color=MATERIAL_COLOURS["leaf"],
+            alpha=alpha,
+            linewidths=0,
+            depthshade=False,
+            label="leaf",
         )
     return ax
 
@@ -88,7 +94,7 @@ def tree(
 def leaf_on_and_off(
     tree: Tree | Iterable[Tree], axes: Sequence[Axes3D] | None = None, **style: Any
 ) -> tuple[Axes3D, Axes3D]:
-    """Two axes with the same trees, one with leaves and one without.
+    """Draw the same trees on two axes, with leaves and without.
 
     **Arguments:**
 
@@ -98,7 +104,7 @@ def leaf_on_and_off(
 
     **Returns:** the two axes, leaf-on first.
 
-    **Raises:** ValueError for another number of axes, and as for `tree`.
+    **Raises:** ValueError for another number of axes than two, and as `tree`.
 
     **Example:**
 
@@ -109,7 +115,7 @@ def leaf_on_and_off(
     >>> print([ax.get_title() for ax in jaxlidar.plot.leaf_on_and_off(jl.grow(jl.shrub()), axes)])
     ['leaf-on', 'leaf-off']
     """
-    whole = _whole(tree)
+    joined = _joined(tree)
     if axes is None:
         from matplotlib import pyplot
 
@@ -117,33 +123,34 @@ def leaf_on_and_off(
         axes = [figure.add_subplot(1, 2, i, projection="3d") for i in (1, 2)]
     if len(axes) != 2:
         raise ValueError(f"axes has {len(axes)} elements; admissible are 2")
-    return _titled(whole, axes[0], True, style), _titled(whole, axes[1], False, style)
+    return _draw_titled(joined, axes[0], True, style), _draw_titled(joined, axes[1], False, style)
 
 
-def _titled(whole: Tree, ax: Axes3D, leaves: bool, style: dict[str, Any]) -> Axes3D:
-    ax = tree(whole, ax, **{**style, "leaves": leaves})
+def _draw_titled(joined: Tree, ax: Axes3D, leaves: bool, style: dict[str, Any]) -> Axes3D:
+    ax = tree(joined, ax, **{**style, "leaves": leaves})
     ax.set_title("leaf-on" if leaves else "leaf-off", fontsize="medium")
     return ax
 
 
-def _whole(tree: Tree | Iterable[Tree]) -> Tree:
+def _joined(tree: Tree | Iterable[Tree]) -> Tree:
+    """Join several trees into one set of segments and buds."""
     return tree if isinstance(tree, Tree) else Tree.joined(tree)
 
 
-def _frame(ax: Axes3D, whole: Tree, elevation: float, azimuth: float) -> float:
-    """Limits in equal scale around wood and leaves, and the names of the axes; gives the points per metre."""
-    points = np.concatenate([whole.start, whole.end, whole.bud_position])
+def _frame(ax: Axes3D, joined: Tree, elevation: float, azimuth: float) -> float:
+    """Set equal scales and limits around wood and leaves, and label the axes; return the points per metre."""
+    points = np.concatenate([joined.start, joined.end, joined.bud_position])
     low, high = points.min(axis=0), points.max(axis=0)
-    low[2] = min(low[2], whole.base[2])
-    room = 0.02 * np.max(high - low)
-    # Trees stay upright and round, however narrow: east and north have the same limits' width.
-    middle, half = 0.5 * (low + high), 0.5 * np.max((high - low)[:2]) + room
+    low[2] = min(low[2], joined.base[2])
+    margin = 0.02 * np.max(high - low)
+    # East and north have limits of the same width, so that narrow trees are not stretched.
+    middle, half = 0.5 * (low + high), 0.5 * np.max((high - low)[:2]) + margin
     ax.set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half))
-    ax.set(zlim=(low[2], high[2] + room))
+    ax.set(zlim=(low[2], high[2] + margin))
     # matplotlib's azimuth is counted from the x axis, counterclockwise.
     ax.view_init(elev=elevation, azim=90.0 - azimuth)
-    sides = np.array([2 * half, 2 * half, high[2] + room - low[2]])
-    # Tall boxes would reach over the edges of the figure.
+    sides = np.array([2 * half, 2 * half, high[2] + margin - low[2]])
+    # A tall box would extend beyond the edges of the figure.
     zoom: Any = min(1.0, 0.75 * float(np.linalg.norm(sides) / sides[2]))
     ax.set_box_aspect(sides.tolist(), zoom=zoom)
     ax.set(xlabel="x, east (m)", ylabel="y, north (m)", zlabel="height (m)")
@@ -153,9 +160,9 @@ def _frame(ax: Axes3D, whole: Tree, elevation: float, azimuth: float) -> float:
 
 
 def _points_per_metre(ax: Axes3D) -> float:
-    """Points per metre at the middle of the axes, from the projection of a vertical metre."""
-    low, high = ax.get_xlim(), ax.get_ylim()
-    x, y, z = np.mean(low), np.mean(high), np.mean(ax.get_zlim())
+    """Compute the points per metre at the middle of the axes, from the projection of a vertical metre."""
+    x, y, z = (np.mean(limits) for limits in (ax.get_xlim(), ax.get_ylim(), ax.get_zlim()))
+    # The projection is that of the final aspect only after this call.
     ax.apply_aspect()
     ends = [proj3d.proj_transform(x, y, z + up, ax.get_proj())[:2] for up in (-0.5, 0.5)]
     pixels = np.diff(ax.transData.transform(ends), axis=0)
@@ -164,11 +171,12 @@ def _points_per_metre(ax: Axes3D) -> float:
     return float(np.hypot(*pixels[0])) * 72 / figure.dpi
 
 
-def _axes(ax: Axes3D | None) -> Axes3D:
+def _make_axes(ax: Axes3D | None) -> Axes3D:
+    """Return `ax`, or the axes of a new figure if it is None."""
     if ax is not None:
         return ax
     from matplotlib import pyplot
 
-    made = pyplot.figure(figsize=(5.0, 5.0), layout="constrained").add_subplot(projection="3d")
-    assert isinstance(made, Axes3D)
-    return made
+    ax = pyplot.figure(figsize=(5.0, 5.0), layout="constrained").add_subplot(projection="3d")
+    assert isinstance(ax, Axes3D)
+    return ax

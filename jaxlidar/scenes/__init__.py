@@ -1,1 +1,1 @@
-"""Scenes: canopies in voxels, surfaces, atmosphere."""
+"""Scenes: canopies in voxels, ground and plates, atmosphere."""

@@ -6,11 +6,20 @@ and Reeder 1972, for 360 ppm CO2) and F its depolarisation (King) factor,
     sigma = 24 pi^3 (n^2 - 1)^2 F / (lambda^4 N^2 (n^2 + 2)^2)
     tau_R = sigma P A / (m_a g)                                 at sea level and 45 degrees of latitude
 
-(not their fit, eq. 30, which holds to 850 nm and is 0.8 % too high at 1550 nm). The extinction of aerosol
-follows from the visibility V: 3.912/V * (lambda / 550 nm)^-q per km, with the exponent q(V) of Kruse et al.
-(1962) or of Kim et al. (2001), which differ below 6 km only. Strictly, 3.912/V is the extinction of molecules
-and aerosol together; as is customary, it is taken as that of the aerosol alone (at 550 nm and 23 km the
-molecules are 7 % of it).
+with the scattering cross-section sigma of a molecule, the number density N of standard air, the pressure P,
+Avogadro's number A, the mean molecular mass m_a and the gravity g. (Their fit, eq. 30, holds to 850 nm only
+and is 0.8 % too high at 1550 nm.) The extinction of aerosol follows from the visibility V,
+
+    k = 3.912 / V * (lambda / 550 nm)^-q                        per km for V in km,
+
+with the exponent q(V) of Kruse et al. (1962) or of Kim et al. (2001), which differ below 6 km only. Strictly,
+3.912/V is the extinction of molecules and aerosol together; as is customary, it is taken as that of the
+aerosol alone (at 550 nm and 23 km the molecules are 7 % of it).
+
+**Layers.** Both densities fall with height as exp(-z / H). The one-way optical depth along a beam at the
+zenith angle theta between a target at the height h and a sensor at the altitude a is, for each,
+
+    tau = k H exp(-h / H) (1 - exp(-(a - h) / H)) / cos(theta),   k the extinction coefficient at z = 0.
 
 **Return.** A white Lambertian target across the beam at range R sends E A_r T^2 / (pi R^2) of a pulse of
 energy E into an aperture A_r, where T^2 is the two-way transmittance. Its apparent reflectance, the internal
@@ -33,7 +42,6 @@ from jaxtyping import Array, ArrayLike, Float
 from jaxlidar._checks import (
     as_array,
     as_scalar,
-    briefly,
     check_choice,
     check_flag,
     check_range,
@@ -43,29 +51,34 @@ from jaxlidar._checks import (
 )
 from jaxlidar._ranges import Range, check_ranges
 
-# Peck and Reeder's formula is fitted to 230..1690 nm and smooth far beyond; aerosol exponents to about 2500.
-_WAVELENGTHS = (230.0, 3000.0)
+# Admissible wavelengths, nm. Peck and Reeder's formula is fitted to 230..1690 nm and smooth far beyond; the
+# exponents of aerosol hold to about 2500 nm.
+_WAVELENGTH_RANGE = (230.0, 3000.0)
+# Volume mixing ratio of carbon dioxide.
 _CO2 = 360e-6
-_DENSITY = 2.546899e19  # molecules per cm3 at 288.15 K and 1013.25 hPa
+# Molecules per cm3 at 288.15 K and 1013.25 hPa.
+_NUMBER_DENSITY = 2.546899e19
 # Molecules per cm2 above sea level: P A / (m_a g), with g at the air's centre of mass, 5517.56 m, at 45
 # degrees of latitude.
 _COLUMN = 1013250.0 * 6.0221367e23 / ((28.9595 + 15.0556 * _CO2) * 978.9158)
 _MICROMETRE4_PER_CM4 = 1e16
+# Ratio of extinction to backscatter coefficient of the Rayleigh phase function, sr.
 _MOLECULAR_LIDAR_RATIO = 8 * math.pi / 3
 
 
-def _wavelength(wavelength: ArrayLike) -> Float[Array, "..."]:
+def _checked_wavelength(wavelength: ArrayLike) -> Float[Array, "..."]:
     wavelength = as_array(wavelength, "wavelength")
-    check_range("wavelength", wavelength, *_WAVELENGTHS)
+    check_range("wavelength", wavelength, *_WAVELENGTH_RANGE)
     return wavelength
 
 
 def _outer(a: Float[Array, "..."], b: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Multiply every element of `a` by every element of `b`; the axes of `a` come first."""
     return a.reshape(a.shape + (1,) * b.ndim) * b.reshape((1,) * a.ndim + b.shape)
 
 
 def rayleigh_optical_depth(wavelength: ArrayLike) -> Float[Array, "..."]:
-    """Rayleigh optical depth of the whole atmosphere above sea level.
+    """Compute the Rayleigh optical depth of the whole atmosphere above sea level.
 
     It holds for 1013.25 hPa, a latitude of 45 degrees and 360 ppm CO2.
 
@@ -85,27 +98,30 @@ def rayleigh_optical_depth(wavelength: ArrayLike) -> Float[Array, "..."]:
     >>> print(f"{float(rayleigh_optical_depth(532.0)):.3f}")
     0.111
     """
-    micrometres = _wavelength(wavelength) * 1e-3
+    micrometres = _checked_wavelength(wavelength) * 1e-3
+    # In the notation of the source: w is the squared wavenumber in 1/micrometre^2, d = n - 1. The small
+    # difference d is computed by itself, as n would lose its digits.
     w = micrometres**-2
-    # n - 1 itself, not as a difference, which would lose digits.
     d = 1e-8 * (8060.51 + 2480990.0 / (132.274 - w) + 17455.7 / (39.32957 - w))
     d = d * (1 + 0.54 * (_CO2 - 300e-6))
+    # King factors, weighted by the per cent by volume of nitrogen, oxygen, argon (1) and carbon dioxide
+    # (1.15).
     nitrogen = 1.034 + 3.17e-4 * w
     oxygen = 1.096 + 1.385e-3 * w + 1.448e-4 * w * w
-    percent = 100 * _CO2
-    king = (78.084 * nitrogen + 20.946 * oxygen + 0.934 + 1.15 * percent) / (
-        78.084 + 20.946 + 0.934 + percent
+    co2_percent = 100 * _CO2
+    king = (78.084 * nitrogen + 20.946 * oxygen + 0.934 + 1.15 * co2_percent) / (
+        78.084 + 20.946 + 0.934 + co2_percent
     )
     lorentz = d * (2 + d) / (3 + d * (2 + d))  # (n^2 - 1) / (n^2 + 2)
-    # One factor, because the square of the density does not fit into single precision.
-    scale = _COLUMN * 24 * math.pi**3 / _DENSITY**2 * _MICROMETRE4_PER_CM4
+    # A Python float, as the square of the density does not fit into single precision.
+    scale = _COLUMN * 24 * math.pi**3 / _NUMBER_DENSITY**2 * _MICROMETRE4_PER_CM4
     return scale * (lorentz * w) ** 2 * king
 
 
 def aerosol_extinction(
     wavelength: ArrayLike, visibility: ArrayLike, model: str = "kim"
 ) -> Float[Array, "..."]:
-    """Extinction coefficient of aerosol in 1/m at the height where the visibility is measured.
+    """Compute the extinction coefficient of aerosol in 1/m at the height where the visibility is measured.
 
     Differentiable in wavelength and visibility, except at the jumps of the exponent at 50 km and (Kruse)
     6 km.
@@ -134,15 +150,14 @@ def aerosol_extinction(
     check_choice("model", model, ("kim", "kruse"))
     v = as_scalar(visibility, "visibility")
     if model == "kruse":
-        low = 0.585 * jnp.cbrt(v)
+        low_exponent = 0.585 * jnp.cbrt(v)
     else:
-        low = jnp.where(v > 1.0, 0.16 * v + 0.34, jnp.maximum(v - 0.5, 0.0))
-    exponent = jnp.where(v > 50.0, 1.6, jnp.where(v < 6.0, low, 1.3))
-    return 3.912e-3 / v * jnp.exp(-exponent * jnp.log(_wavelength(wavelength) / 550.0))
+        low_exponent = jnp.where(v > 1.0, 0.16 * v + 0.34, jnp.maximum(v - 0.5, 0.0))
+    exponent = jnp.where(v > 50.0, 1.6, jnp.where(v < 6.0, low_exponent, 1.3))
+    return 3.912e-3 / v * jnp.exp(-exponent * jnp.log(_checked_wavelength(wavelength) / 550.0))
 
 
 @final
-@briefly
 class Atmosphere(eqx.Module):
     """A clear atmosphere: molecules and aerosol whose densities fall exponentially with height.
 
@@ -152,8 +167,8 @@ class Atmosphere(eqx.Module):
     **Arguments:**
 
     - `visibility`: visibility at z = 0 in km, positive, or None: no aerosol. Default 23 ("clear").
-    - `rayleigh`: whether molecules scatter light (Rayleigh scattering). Default True.
-    - `aerosol_model`: "kim" or "kruse": how aerosol extinction depends on the wavelength for visibilities
+    - `rayleigh`: True if molecules scatter light (Rayleigh scattering). Default True.
+    - `aerosol_model`: "kim" or "kruse": the exponent of the wavelength in aerosol extinction for visibilities
       below 6 km (Kim et al. 2001, Kruse et al. 1962). Default "kim".
     - `rayleigh_scale_height`: m, positive. Default 8450: the ratio of the air column above sea level to the
       density there at 15 degrees Celsius, so that both optical depth and extinction at sea level are right.
@@ -165,8 +180,8 @@ class Atmosphere(eqx.Module):
     - `base_height`: height of the reference plane above sea level, m, -500 to 9000. It reduces the density of
       molecules only; `visibility` holds at z = 0 whatever the base height. Default 0.
 
-    **Raises:** ValueError for a value outside its range and for an unknown model; TypeError for a thing of
-    another kind. A scale height that is likely given in km gives a `UnitWarning`.
+    **Raises:** ValueError for a value outside its range and for an unknown model; TypeError for an object of
+    the wrong type. A scale height that is likely given in km gives a `UnitWarning`.
 
     **Source:** see `jaxlidar.scenes.atmosphere` for the equations.
 
@@ -206,7 +221,7 @@ class Atmosphere(eqx.Module):
         warn_units(self)
 
     def _layers(self, wavelength: ArrayLike) -> list[tuple[Array, Array, Array | float]]:
-        """For molecules and for aerosol: extinction at z = 0 in 1/m, scale height in m, lidar ratio in sr."""
+        """List extinction at z = 0 (1/m), scale height (m) and lidar ratio (sr) of molecules and aerosol."""
         layers: list[tuple[Array, Array, Array | float]] = []
         if self.rayleigh:
             height = self.rayleigh_scale_height
@@ -219,7 +234,7 @@ class Atmosphere(eqx.Module):
         return layers
 
     def extinction(self, wavelength: ArrayLike, height: ArrayLike) -> Float[Array, "..."]:
-        """Extinction coefficient of the air in 1/m.
+        """Compute the extinction coefficient of the air in 1/m.
 
         **Arguments:**
 
@@ -230,7 +245,7 @@ class Atmosphere(eqx.Module):
 
         **Raises:** ValueError for a wavelength outside its range.
         """
-        wavelength, height = _wavelength(wavelength), as_array(height, "height")
+        wavelength, height = _checked_wavelength(wavelength), as_array(height, "height")
         total = jnp.zeros(wavelength.shape + height.shape)
         for at_zero, scale, _ in self._layers(wavelength):
             total = total + _outer(at_zero, jnp.exp(-height / scale))
@@ -239,7 +254,7 @@ class Atmosphere(eqx.Module):
     def optical_depth(
         self, wavelength: ArrayLike, height: ArrayLike, altitude: ArrayLike, zenith: ArrayLike = 0.0
     ) -> Float[Array, "..."]:
-        """One-way optical depth of the air along the beam between sensor and target.
+        """Compute the one-way optical depth of the air along the beam between sensor and target.
 
         The exponentials are integrated in closed form, exact to rounding for thin and for deep layers. The
         atmosphere is plane-parallel.
@@ -255,23 +270,24 @@ class Atmosphere(eqx.Module):
 
         **Raises:** ValueError for a value outside its range.
         """
-        wavelength, height = _wavelength(wavelength), as_array(height, "height")
+        wavelength, height = _checked_wavelength(wavelength), as_array(height, "height")
         altitude, zenith = as_scalar(altitude, "altitude"), as_scalar(zenith, "zenith")
         check_range("height", height)
         check_range("altitude", altitude)
         check_range("zenith", zenith, 0.0, 89.0)
         slant = 1 / jnp.cos(jnp.deg2rad(zenith))
-        between = jnp.maximum(altitude - height, 0.0)
+        thickness = jnp.maximum(altitude - height, 0.0)
         total = jnp.zeros(wavelength.shape + height.shape)
         for at_zero, scale, _ in self._layers(wavelength):
-            column = -jnp.expm1(-between / scale) * jnp.exp(-height / scale) * scale
+            # expm1 keeps the digits of layers that are thin against the scale height.
+            column = -jnp.expm1(-thickness / scale) * jnp.exp(-height / scale) * scale
             total = total + _outer(at_zero, column)
         return total * slant
 
     def two_way_transmittance(
         self, wavelength: ArrayLike, height: ArrayLike, altitude: ArrayLike, zenith: ArrayLike = 0.0
     ) -> Float[Array, "..."]:
-        """Two-way transmittance of the air between sensor and target, in [0, 1].
+        """Compute the two-way transmittance of the air between sensor and target, in [0, 1].
 
         **Arguments:** `wavelength`, `height`, `altitude`, `zenith`: as for `optical_depth`.
 
@@ -284,11 +300,11 @@ class Atmosphere(eqx.Module):
     def backscatter(
         self, wavelength: ArrayLike, height: ArrayLike, altitude: ArrayLike, zenith: ArrayLike = 0.0
     ) -> Float[Array, "..."]:
-        """Return of the air itself: apparent reflectance per metre of range, in 1/m.
+        """Compute the return of the air itself: apparent reflectance per metre of range, in 1/m.
 
         This is pi times backscatter coefficient times two-way transmittance (see
         `jaxlidar.scenes.atmosphere`), for light scattered once. A range bin of length dr returns dr times
-        this. It is zero where `lidar_ratio` is None. For ranges other than the reference range, the caller
+        this. It is zero if `lidar_ratio` is None. For ranges other than the reference range, the caller
         applies the inverse square of range.
 
         **Arguments:** `wavelength`, `height`, `altitude`, `zenith`: as for `optical_depth`.

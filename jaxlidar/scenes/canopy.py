@@ -1,4 +1,10 @@
-"""The canopy: a voxel map with the optical properties of its leaf and bark."""
+"""The canopy: a voxel map with the optical properties of its leaf and bark.
+
+Leaf is a medium of flat scatterers with the reflectance R and the transmittance T. With diffuse transmission
+the single scattering albedo is R + T. With straight transmission the fraction T of the light goes on as if it
+had met no leaf. This is exactly an extinction that is smaller by the factor 1 - T, with the albedo R / (1 -
+T).
+"""
 
 from collections.abc import Callable
 from typing import Any, ClassVar, final
@@ -9,7 +15,6 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxlidar._checks import (
-    briefly,
     check_choice,
     check_flag,
     check_kind,
@@ -29,7 +34,6 @@ def _as_bark(x: Any) -> Any:
 
 
 @final
-@briefly
 class Canopy(eqx.Module):
     """A canopy: leaf and bark in voxels, with their optical properties.
 
@@ -37,21 +41,21 @@ class Canopy(eqx.Module):
 
     - `voxels`: a `VoxelMap`.
     - `leaf`: leaf optics: a `Prospect`, a `LeafOptics`, any function of the wavelengths in nm that returns
-      (reflectance, transmittance), or a volume scatterer such as `Isotropic`. Needed where the map has leaf.
+      (reflectance, transmittance), or a volume scatterer such as `Isotropic`. Required if the map has leaf.
       Default None.
     - `bark`: reflectance of bark: one number, one per wavelength, a `Spectrum`, or a volume scatterer. In
-      [0, 1]. Needed where the map has bark. Default None.
+      [0, 1]. Required if the map has bark. Default None.
     - `transmission`: "diffuse": transmitted light leaves the far side of the leaf by the cosine law.
       "straight" (as in the paper): it keeps its direction; extinction then depends on the wavelength.
       Default "diffuse".
     - `hotspot`: False: the attenuations on the way in and out are independent, and first-order light is
       attenuated by exp(-2 tau). True: first-order light returns through the gap by which it entered, with
       exp(-tau), as gap models assume. Default False.
-    - `sides`: "open": there is nothing beyond the map. "periodic": the map repeats without end. Default
+    - `sides`: "open": there is no canopy beyond the map. "periodic": the map repeats without end. Default
       "open".
 
     **Raises:** ValueError for missing optics, a bark reflectance outside [0, 1] and unknown choices;
-    TypeError for a thing of another kind.
+    TypeError for an object of the wrong type.
 
     **Example:**
 
@@ -74,7 +78,7 @@ class Canopy(eqx.Module):
 
     def __check_init__(self):
         check_kind("voxels", self.voxels, VoxelMap, "a VoxelMap")
-        # A class can be called too, and so can a spectrum, but neither gives reflectance and transmittance.
+        # Classes and spectra can be called, too, but do not return reflectance and transmittance.
         if isinstance(self.leaf, type | Spectrum) or not (
             callable(self.leaf) or isinstance(self.leaf, AbstractPhase | None)
         ):
@@ -104,13 +108,13 @@ class Canopy(eqx.Module):
 
     @property
     def is_straight(self) -> bool:
-        """Whether transmitted light keeps its direction; extinction then depends on the wavelength."""
+        """True if transmitted light keeps its direction; extinction then depends on the wavelength."""
         return self.leaf is not None and self.transmission == "straight"
 
     def leaf_optics(
         self, wavelength: Float[ArrayLike, "wavelengths"]
     ) -> tuple[Float[Array, "wavelengths"], Float[Array, "wavelengths"]]:
-        """Leaf reflectance and transmittance; for a volume scatterer, its albedo and zero.
+        """Evaluate leaf reflectance and transmittance; for a volume scatterer, its albedo and zero.
 
         **Arguments:**
 
@@ -119,7 +123,7 @@ class Canopy(eqx.Module):
         **Returns:** (reflectance, transmittance), each (wavelengths,).
 
         **Raises:** ValueError if one of them is outside [0, 1], or their sum exceeds 1; TypeError where the
-        leaf optics return something else than the two.
+        leaf optics do not return the two.
         """
         if isinstance(self.leaf, AbstractPhase):
             albedo = reflectance_at(self.leaf.albedo, wavelength, "leaf albedo")
@@ -132,15 +136,15 @@ class Canopy(eqx.Module):
         r, t = optics
         check_range("leaf reflectance", r, 0.0, 1.0 + 1e-6)
         check_range("leaf transmittance", t, 0.0, 1.0 + 1e-6)
-        known = (concrete(r), concrete(t))
-        if known[0] is not None and known[1] is not None:
-            check_range("leaf reflectance + transmittance", known[0] + known[1], 0.0, 1.0 + 1e-5)
+        reflectance, transmittance = concrete(r), concrete(t)
+        if reflectance is not None and transmittance is not None:
+            check_range("leaf reflectance + transmittance", reflectance + transmittance, 0.0, 1.0 + 1e-5)
         names = ("leaf reflectance", "leaf transmittance")
         r, t = (reflectance_at(value, wavelength, name) for value, name in zip((r, t), names))
         return r, t
 
     def bark_reflectance(self, wavelength: Float[ArrayLike, "wavelengths"]) -> Float[Array, "wavelengths"]:
-        """Reflectance of bark; for a volume scatterer, its albedo.
+        """Evaluate the reflectance of bark; for a volume scatterer, its albedo.
 
         **Arguments:**
 
@@ -148,8 +152,8 @@ class Canopy(eqx.Module):
 
         **Returns:** (wavelengths,) reflectance.
 
-        **Raises:** ValueError for another number of values than wavelengths, and for a wavelength outside the
-        range of a spectrum.
+        **Raises:** ValueError if the number of values is not that of the wavelengths, and for a wavelength
+        outside the range of a spectrum.
         """
         bark = self.bark.albedo if isinstance(self.bark, AbstractPhase) else self.bark
         assert bark is not None

@@ -1,19 +1,28 @@
 r"""Height fields: surfaces whose height is known at the nodes of a grid, and bilinear in between.
 
-A ray x + s w lies above the surface by z(s) - h(x(s), y(s)), which within one cell is a quadratic in s,
+A ray x + s w has the clearance f(s) = z(s) - h(x(s), y(s)) above the surface h. Within one cell the bilinear
+h makes it a quadratic,
 
-    f(u) = a u^2 + b u + c,   u from where the ray enters the cell.
+    f(u) = a u^2 + b u + c,   u the distance from the point where the ray enters the cell,
 
-Rays go from cell to cell and stop where f falls through zero. That root is the one at which the derivative is
--sqrt(b^2 - 4 a c), whatever the sign of a:
+and the ray falls through the surface at the root of negative derivative, f' = -sqrt(b^2 - 4 a c), which is
 
     u = 2 c / (sqrt(b^2 - 4 a c) - b)          for b <= 0,
     u = -(b + sqrt(b^2 - 4 a c)) / (2 a)       for b > 0,
 
-neither of which loses digits. Light that starts on the surface rises from it, so that the point where it
-starts is no such root. Whether a ray is above is carried from cell to cell, so none slips through an edge by
-rounding. A ray that stays above the highest point of a block of cells crosses the block at once (maximum
-mipmaps; Tevs, Ihrke and Seidel 2008, Symposium on Interactive 3D Graphics and Games).
+whatever the sign of a; neither form subtracts numbers of nearly equal size. Light that starts on the surface
+rises from it, so that its starting point is no such root. The algorithm for all rays at once is:
+
+1. Enter the grid: advance each ray to where it is over the grid and below the highest node.
+2. In each step of a loop, cross a block of 8 x 8 cells if the ray stays above the highest node of the block
+   (maximum mipmaps, here with a single level; Tevs, Ihrke and Seidel 2008, Symposium on Interactive 3D
+   Graphics and Games). Otherwise cross one cell: stop at a falling root within it, or go on to the next cell
+   (Amanatides and Woo 1987, Eurographics).
+3. Carry from cell to cell if the ray is above the surface. Rounding at a shared edge then cannot let it slip
+   through: a ray that was above and is below at the end of a cell has met the surface in it.
+
+Derivatives do not pass through the loop. The distance s solves f(s, theta) = 0, so by implicit
+differentiation ds/dtheta = -(df/dtheta) / (df/ds).
 """
 
 from typing import Any, final
@@ -31,74 +40,92 @@ from jaxlidar._vectors import FAR, Scalar, Vec, along, dot, normalise, vec
 from jaxlidar.scenes.raster import Cell, Raster
 from jaxlidar.scenes.shapes import AbstractShape
 
-# Cells that a ray may cross where the field repeats without end.
-MOST_CELLS = 16_384
-# Cells along each side of a block: a power of two, for processors divide integers one by one.
-_POWER = 3
-BLOCK = 1 << _POWER
-# In units of the precision and of its coordinates, how far under the surface a ray may start.
+# Largest number of steps of a ray over a field that repeats without end.
+MAX_STEPS = 16_384
+# Cells along each side of a block: a power of two, so that the block of a cell is a shift of bits, because
+# processors divide vectors of integers one by one.
+_LOG2_BLOCK_SIZE = 3
+BLOCK_SIZE = 1 << _LOG2_BLOCK_SIZE
+# Tolerance of the height of a ray, in units of the floating-point precision and of the size of its
+# coordinates.
 _ROUNDING = 10
-# Of so many rays and more, the last go on by themselves when no more are left than one in so many.
-_MANY, _LONG = 128, 8
-# Rays that close in on the surface by less than this per m have the derivative of those that do by this.
-_GRAZING = 1e-4
+# All rays of a loop wait for the longest, which takes many times the steps of most. From this number of rays
+# on, the last ones are gathered and traced alone, once only one ray in `_COMPACTION_RATIO` is active.
+_COMPACTION_MIN_RAYS = 128
+_COMPACTION_RATIO = 8
+# Smallest rate, per m, at which a ray is taken to approach the surface in derivatives: those of grazing rays
+# are bounded.
+_MIN_APPROACH_RATE = 1e-4
+# Components of directions below this, in cells per m or m per m, count as zero.
+_PARALLEL = 1e-12
 
 
-class _Ray(eqx.Module):
-    """A ray among cells: how far it has come, in which cell it is, and where it meets the surface."""
+class _Traversal(eqx.Module):
+    """State of the loop over cells.
 
-    at: Float[Array, "*s"]
+    - `distance`: along each ray, m.
+    - `i`, `j`: current cell along x and y.
+    - `above`: True if the ray is above the surface there.
+    - `active`: True if the ray has neither met the surface nor left the field.
+    - `hit_distance`: distance to the surface, m; `FAR` if it was not met.
+    - `steps`: number of steps that all rays have taken.
+    """
+
+    distance: Float[Array, "*s"]
     i: Int[Array, "*s"]
     j: Int[Array, "*s"]
     above: Bool[Array, "*s"]
-    running: Bool[Array, "*s"]
-    met: Float[Array, "*s"]
-    count: Int[Array, ""]
+    active: Bool[Array, "*s"]
+    hit_distance: Float[Array, "*s"]
+    steps: Int[Array, ""]
 
 
-class _Way(eqx.Module):
-    """The line of a ray over the cells.
+class _GridRay(eqx.Module):
+    """Constants of a ray in the loop over cells.
 
-    - `z`, `climb`: its height, m, and the change of it per m. - `place`, `rate`: the same among cells.
-    - `gap`, `offset`: it leaves cell number v along an axis at the distance `gap * v + offset`, m; `ahead`:
-      whether to larger numbers. - `leave`: distance at which it has left all cells that it may meet, m.
-    - `slack`: how far rounding may put it under the surface, m.
+    - `height`, `height_rate`: height at the distance zero, m, and its change per m.
+    - `position`, `rate`: grid coordinates along x and y at the distance zero, and their change per m.
+    - `cell_length`, `face_offset`: the ray leaves cell number v along an axis at the distance
+      `cell_length * v + face_offset`, m.
+    - `ascending`: True along an axis if the ray goes to cells of larger numbers.
+    - `exit_distance`: distance beyond which it can meet no cell any more, m.
+    - `tolerance`: by how much rounding may put it under the surface, m.
     """
 
-    z: Float[Array, "*s"]
-    climb: Float[Array, "*s"]
-    place: tuple[Float[Array, "*s"], ...]
+    height: Float[Array, "*s"]
+    height_rate: Float[Array, "*s"]
+    position: tuple[Float[Array, "*s"], ...]
     rate: tuple[Float[Array, "*s"], ...]
-    gap: tuple[Float[Array, "*s"], ...]
-    offset: tuple[Float[Array, "*s"], ...]
-    ahead: tuple[Bool[Array, "*s"], ...]
-    leave: Float[Array, "*s"]
-    slack: Float[Array, "*s"]
+    cell_length: tuple[Float[Array, "*s"], ...]
+    face_offset: tuple[Float[Array, "*s"], ...]
+    ascending: tuple[Bool[Array, "*s"], ...]
+    exit_distance: Float[Array, "*s"]
+    tolerance: Float[Array, "*s"]
 
 
 @final
 class HeightField(AbstractShape):
     """A height field over the rectangle of its nodes, or over the whole plane where it is periodic.
 
-    Rays that fall from above are stopped; those that rise from below pass. The edge has no sides.
+    Rays that fall from above are stopped; those that rise from below pass. There are no walls at the edge.
 
     **Arguments:**
 
     - `heights`: a `Raster` of heights, m.
-    - `low`, `high`: the lowest and the highest of them, m.
-    - `tops`: the highest of each block of cells, m.
+    - `lowest`, `highest`: the smallest and the largest of them, m.
+    - `block_maxima`: largest height within each block of cells, m.
     """
 
     heights: Raster
-    low: Float[Array, ""]
-    high: Float[Array, ""]
-    tops: Float[Array, "blocks_x blocks_y"]
+    lowest: Float[Array, ""]
+    highest: Float[Array, ""]
+    block_maxima: Float[Array, "blocks_x blocks_y"]
 
     @staticmethod
     def of(heights: Raster) -> "HeightField":
-        """The height field of a raster of heights in m."""
+        """Make the height field of a raster of heights in m."""
         values = heights.values
-        return HeightField(heights, jnp.min(values), jnp.max(values), _tops(heights))
+        return HeightField(heights, jnp.min(values), jnp.max(values), _block_maxima(heights))
 
     @property
     def lights_itself(self) -> bool:
@@ -107,220 +134,256 @@ class HeightField(AbstractShape):
     def moved(self, by: Float[Array, "3"]) -> "HeightField":
         heights = self.heights.moved(by[:2])
         heights = eqx.tree_at(lambda r: r.values, heights, heights.values + by[2])
-        return HeightField(heights, self.low + by[2], self.high + by[2], self.tops + by[2])
+        return HeightField(heights, self.lowest + by[2], self.highest + by[2], self.block_maxima + by[2])
 
     def tangent(self, x: Vec) -> tuple[Vec, Scalar]:
-        height, (east, north) = self.heights.with_slope(x)
-        # Compilers would look it up again for every result that depends on it.
-        normal, height = once((normalise((-east, -north, jnp.ones_like(east))), height))
+        height, (slope_x, slope_y) = self.heights.value_and_slope(x)
+        # Optimisation barrier: compilers would repeat the look-up for every result that depends on it.
+        normal, height = once((normalise((-slope_x, -slope_y, jnp.ones_like(slope_x))), height))
         return normal, dot(normal, (x[0], x[1], height))
 
     def distance(self, x: Vec, w: Vec) -> Scalar:
         x, w = (vec(jnp.broadcast_arrays(*v)) for v in (x, w))
-        fixed, start, way = jax.tree.map(lax.stop_gradient, (self, x, w))
-        found = fixed._march(start, way)
-        met = found < FAR
-        found = jnp.where(met, found, 0.0)
-        # Where the ray is above the surface by nothing: the derivative of that, not of the march.
-        point = along(x, w, found)
-        height, (east, north) = self.heights.with_slope(point)
-        falling = lax.stop_gradient(w[2] - east * w[0] - north * w[1])
-        gap = point[2] - height
-        moved = (gap - lax.stop_gradient(gap)) / jnp.minimum(falling, -_GRAZING)
-        return jnp.where(met, found - moved, FAR)
+        field, start, direction = jax.tree.map(lax.stop_gradient, (self, x, w))
+        distance = field._first_hit(start, direction)
+        hit = distance < FAR
+        distance = jnp.where(hit, distance, 0.0)
+        # Implicit differentiation at the point that was found: the correction is zero, its derivative is that
+        # of the distance at which the clearance vanishes.
+        point = along(x, w, distance)
+        height, (slope_x, slope_y) = self.heights.value_and_slope(point)
+        approach_rate = lax.stop_gradient(w[2] - slope_x * w[0] - slope_y * w[1])
+        clearance = point[2] - height
+        correction = (clearance - lax.stop_gradient(clearance)) / jnp.minimum(
+            approach_rate, -_MIN_APPROACH_RATE
+        )
+        return jnp.where(hit, distance - correction, FAR)
 
-    def _march(self, x: Vec, w: Vec) -> Scalar:
-        """Distance to the first point where a ray falls through the surface; without derivatives."""
+    def _first_hit(self, x: Vec, w: Vec) -> Scalar:
+        """Find the distance to the first point where a ray falls through the surface; without derivatives."""
         shape = x[0].shape
-        way, ray = self._enter(*(vec(a.reshape(-1) for a in v) for v in (x, w)))
-        most = MOST_CELLS if self.heights.periodic else sum(self.heights.cells) + 2
-        if ray.at.size >= _MANY:
-            few = ray.at.size // _LONG
-            ray = self._follow(way, ray, most, few)
-            # All rays of a loop wait for the longest, which takes many times the steps of most: the last
-            # ones go on by themselves.
-            some = jnp.sum(ray.running)
-            turn = jnp.where(ray.running, jnp.cumsum(ray.running) - 1, few)
-            number = jnp.arange(ray.at.size, dtype=jnp.int32)
-            last = jnp.zeros(few, jnp.int32).at[turn].set(number, mode="drop")
-            own, part = jax.tree.map(lambda a: a[last] if a.ndim else a, (way, ray))
-            part = eqx.tree_at(lambda r: r.running, part, number[:few] < some)
-            met = self._follow(own, part, most).met
-            met = ray.met.at[jnp.where(number[:few] < some, last, number.size)].set(met, mode="drop")
-        else:
-            met = self._follow(way, ray, most).met
-        return met.reshape(shape)
+        ray, state = self._enter_grid(*(vec(a.reshape(-1) for a in v) for v in (x, w)))
+        n_rays = state.distance.size
+        max_steps = MAX_STEPS if self.heights.periodic else sum(self.heights.cells) + 2
+        if n_rays < _COMPACTION_MIN_RAYS:
+            return self._traverse(ray, state, max_steps).hit_distance.reshape(shape)
+        n_last = n_rays // _COMPACTION_RATIO
+        state = self._traverse(ray, state, max_steps, stop_at=n_last)
+        # Stream compaction: the indices of the rays that are still active, `rank` of them in order, and zeros
+        # in the rest of the `n_last` lanes, which stay idle.
+        n_active = jnp.sum(state.active)
+        rank = jnp.where(state.active, jnp.cumsum(state.active) - 1, n_last)
+        index = jnp.arange(n_rays, dtype=jnp.int32)
+        last = jnp.zeros(n_last, jnp.int32).at[rank].set(index, mode="drop")
+        is_used = index[:n_last] < n_active
+        last_rays, last_state = jax.tree.map(lambda a: a[last] if a.ndim else a, (ray, state))
+        last_state = eqx.tree_at(lambda s: s.active, last_state, is_used)
+        hit_distance = self._traverse(last_rays, last_state, max_steps).hit_distance
+        destination = jnp.where(is_used, last, n_rays)
+        return state.hit_distance.at[destination].set(hit_distance, mode="drop").reshape(shape)
 
-    def _enter(self, x: Vec, w: Vec) -> tuple[_Way, _Ray]:
-        """Rays where they come to cells over which they may meet the surface."""
+    def _enter_grid(self, x: Vec, w: Vec) -> tuple[_GridRay, _Traversal]:
+        """Advance rays to the first cell over which they may meet the surface."""
         field = self.heights
-        place = field.place(x)
+        position = field.grid_coordinates(x)
         rate = [w[k] / field.spacing[k] for k in range(2)]
-        slack = self._slack(x)
-        enter, leave = _between(x[2], w[2], self.low - slack, self.high + slack)
+        tolerance = self._height_tolerance(x)
+        enter, leave = _interval_within(x[2], w[2], self.lowest - tolerance, self.highest + tolerance)
         if not field.periodic:
             for k in range(2):
-                near, far = _between(place[k], rate[k], *field.bounds[k])
-                enter, leave = jnp.maximum(enter, near), jnp.minimum(leave, far)
-        running = enter < leave
-        enter = jnp.where(running, enter, 0.0)
-        gap, offset, ahead = [], [], []
+                near, far_end = _interval_within(position[k], rate[k], *field.bounds[k])
+                enter, leave = jnp.maximum(enter, near), jnp.minimum(leave, far_end)
+        active = enter < leave
+        enter = jnp.where(active, enter, 0.0)
+        cell_length, face_offset, ascending = [], [], []
         for k in range(2):
-            flat = jnp.abs(rate[k]) < 1e-12
-            ahead.append(rate[k] > 0)
-            inverse = 1.0 / jnp.where(flat, 1.0, rate[k])
-            gap.append(jnp.where(flat, 0.0, inverse))
-            offset.append(jnp.where(flat, FAR, (jnp.where(ahead[k], 1.0, 0.0) - place[k]) * inverse))
-        way = _Way(
-            x[2], w[2], tuple(place), tuple(rate), tuple(gap), tuple(offset), tuple(ahead), leave, slack
+            parallel = jnp.abs(rate[k]) < _PARALLEL
+            ascending.append(rate[k] > 0)
+            inverse = 1.0 / jnp.where(parallel, 1.0, rate[k])
+            cell_length.append(jnp.where(parallel, 0.0, inverse))
+            offset = (jnp.where(ascending[k], 1.0, 0.0) - position[k]) * inverse
+            face_offset.append(jnp.where(parallel, FAR, offset))
+        ray = _GridRay(
+            height=x[2],
+            height_rate=w[2],
+            position=tuple(position),
+            rate=tuple(rate),
+            cell_length=tuple(cell_length),
+            face_offset=tuple(face_offset),
+            ascending=tuple(ascending),
+            exit_distance=leave,
+            tolerance=tolerance,
         )
-        start = field.cell((place[0] + rate[0] * enter, place[1] + rate[1] * enter))
-        above = self._rise(way, enter, start)[2] > -slack
-        far = jnp.full_like(enter, FAR)
-        return way, _Ray(enter, *start, above, running, far, jnp.zeros((), jnp.int32))
+        cell = field.cell_at((position[0] + rate[0] * enter, position[1] + rate[1] * enter))
+        above = self._clearance(ray, enter, cell)[2] > -tolerance
+        missed = jnp.full_like(enter, FAR)
+        return ray, _Traversal(enter, *cell, above, active, missed, jnp.zeros((), jnp.int32))
 
-    def _slack(self, x: Vec) -> Scalar:
-        """How far rounding may put a ray under the surface, m."""
+    def _height_tolerance(self, x: Vec) -> Scalar:
+        """Bound the height, m, by which rounding may put a ray under the surface."""
         field = self.heights
-        size = self.high - self.low + field.spacing[0] + field.spacing[1] + sum(jnp.abs(c) for c in x)
+        extent = self.highest - self.lowest + field.spacing[0] + field.spacing[1]
+        size = extent + sum(jnp.abs(c) for c in x)
         return _ROUNDING * float(jnp.finfo(x[2].dtype).eps) * size
 
-    def _block(self, number: Int[Array, "*s"], k: int) -> tuple[Int[Array, "*s"], ...]:
-        """Number of the block of a cell along an axis, and the first and the last of its cells."""
+    def _block_of(self, cell: Int[Array, "*s"], axis: int) -> tuple[Int[Array, "*s"], ...]:
+        """Return the block of a cell along an axis, and the first and the last cell of the block."""
         field = self.heights
-        place = number + field.number[k]
-        place = place % field.cells[k] if field.periodic else place
-        block = place >> _POWER
-        first = number - (place - block * BLOCK)
-        last = number + (jnp.minimum((block + 1) * BLOCK, field.cells[k]) - 1 - place)
+        index = cell + field.origin_node[axis]
+        index = index % field.cells[axis] if field.periodic else index
+        block = index >> _LOG2_BLOCK_SIZE
+        first = cell - (index - block * BLOCK_SIZE)
+        last = cell + (jnp.minimum((block + 1) * BLOCK_SIZE, field.cells[axis]) - 1 - index)
         return block, first, last
 
-    def _across(self, way: _Way, ray: _Ray) -> tuple[Bool[Array, "*s"], Scalar, tuple[Int[Array, "*s"], ...]]:
-        """Whether a ray stays above its block, where it leaves it, and the cell that it comes to."""
-        blocks = [self._block(number, k) for k, number in enumerate((ray.i, ray.j))]
-        top = self.tops.at[blocks[0][0], blocks[1][0]].get(mode="promise_in_bounds")
-        edges = [jnp.where(way.ahead[k], last, first) for k, (_, first, last) in enumerate(blocks)]
-        faces = [way.gap[k] * edges[k] + way.offset[k] for k in range(2)]
-        out = jnp.minimum(jnp.minimum(faces[0], faces[1]), way.leave)
-        out = jnp.maximum(out, ray.at)
-        least = way.z + jnp.minimum(way.climb * ray.at, way.climb * out)
-        first = faces[0] <= faces[1]
-        to = []
-        for k, crossed in enumerate((first, ~first)):
-            _, low, high = blocks[k]
-            inside = jnp.floor(way.place[k] + way.rate[k] * out).astype(jnp.int32)
-            step = jnp.where(way.ahead[k], 1, -1)
-            to.append(jnp.where(crossed, edges[k] + step, jnp.clip(inside, low, high)))
-        return ray.above & (least > top + way.slack), out, (to[0], to[1])
+    def _cross_block(
+        self, ray: _GridRay, state: _Traversal
+    ) -> tuple[Bool[Array, "*s"], Scalar, tuple[Int[Array, "*s"], ...]]:
+        """Follow rays through their blocks of cells.
 
-    def _rise(self, way: _Way, at: Scalar, cell: Cell) -> tuple[Scalar, Scalar, Scalar]:
-        """Coefficients of the height above the surface, from the distance `at` on: of u^2, u and 1."""
-        one, a, b, c = self.heights.corners(cell)
-        rate = way.rate
-        px, py = (way.place[k] + rate[k] * at - cell[k] for k in range(2))
-        height = way.z + way.climb * at - (one + a * px + (b + c * px) * py)
-        return -c * rate[0] * rate[1], way.climb - (a + c * py) * rate[0] - (b + c * px) * rate[1], height
+        **Returns:** True where a ray stays above the highest node of its block, the distance at which it
+        leaves the block, and the cell that it then enters.
+        """
+        blocks = [self._block_of(cell, axis) for axis, cell in enumerate((state.i, state.j))]
+        highest = self.block_maxima.at[blocks[0][0], blocks[1][0]].get(mode="promise_in_bounds")
+        edges = [jnp.where(ray.ascending[k], last, first) for k, (_, first, last) in enumerate(blocks)]
+        faces = [ray.cell_length[k] * edges[k] + ray.face_offset[k] for k in range(2)]
+        leave = jnp.minimum(jnp.minimum(faces[0], faces[1]), ray.exit_distance)
+        leave = jnp.maximum(leave, state.distance)
+        least_height = ray.height + jnp.minimum(ray.height_rate * state.distance, ray.height_rate * leave)
+        leaves_along_x = faces[0] <= faces[1]
+        next_cell = []
+        for k, crossed in enumerate((leaves_along_x, ~leaves_along_x)):
+            _, first, last = blocks[k]
+            inside = jnp.floor(ray.position[k] + ray.rate[k] * leave).astype(jnp.int32)
+            step = jnp.where(ray.ascending[k], 1, -1)
+            next_cell.append(jnp.where(crossed, edges[k] + step, jnp.clip(inside, first, last)))
+        stays_above = state.above & (least_height > highest + ray.tolerance)
+        return stays_above, leave, (next_cell[0], next_cell[1])
 
-    def _follow(self, way: _Way, ray: _Ray, most: int, few: int = 0) -> _Ray:
-        """Rays after `most` cells or blocks, or when no more than a few have not stopped."""
+    def _clearance(self, ray: _GridRay, distance: Scalar, cell: Cell) -> tuple[Scalar, Scalar, Scalar]:
+        """Return the coefficients a, b, c of the clearance within a cell, with u measured from `distance`."""
+        c0, cx, cy, cxy = self.heights.bilinear_coefficients(cell)
+        rate = ray.rate
+        x, y = (ray.position[k] + rate[k] * distance - cell[k] for k in range(2))
+        clearance = ray.height + ray.height_rate * distance - (c0 + cx * x + (cy + cxy * x) * y)
+        slope = ray.height_rate - (cx + cxy * y) * rate[0] - (cy + cxy * x) * rate[1]
+        return -cxy * rate[0] * rate[1], slope, clearance
 
-        def going(ray: _Ray) -> Bool[Array, ""]:
-            return (jnp.sum(ray.running) > few) & (ray.count < most)
+    def _traverse(self, ray: _GridRay, state: _Traversal, max_steps: int, stop_at: int = 0) -> _Traversal:
+        """Follow rays from cell to cell, for `max_steps` or until at most `stop_at` of them are active."""
 
-        def advance(ray: _Ray) -> _Ray:
-            # Compilers would compute what is shared again for every part of the ray.
-            clear, out, (east, north) = once(self._across(way, ray))
-            faces = [way.gap[k] * number + way.offset[k] for k, number in enumerate((ray.i, ray.j))]
-            until = jnp.maximum(ray.at, jnp.minimum(jnp.minimum(faces[0], faces[1]), way.leave))
-            length = until - ray.at
-            a, b, c = once(self._rise(way, ray.at, (ray.i, ray.j)))
-            c = jnp.where(ray.above, jnp.maximum(c, 0.0), c)
-            end = (a * length + b) * length + c
-            root, real = _falling_root(a, b, c)
-            through = (c >= 0) & (end < 0)
-            hit = ray.running & ~clear & (through | (real & (root >= 0) & (root <= length)))
-            hit, root, until, end = once((hit, root, until, end))
-            met = jnp.where(hit, ray.at + jnp.clip(root, 0.0, length), ray.met)
-            until = jnp.where(clear, out, until)
-            go = ray.running & ~hit & (until < way.leave)
-            first = faces[0] <= faces[1]
-            step = [jnp.where(a, 1, -1) for a in way.ahead]
-            i = jnp.where(clear, east, ray.i + jnp.where(first, step[0], 0))
-            j = jnp.where(clear, north, ray.j + jnp.where(first, 0, step[1]))
-            i, j = jnp.where(go, i, ray.i), jnp.where(go, j, ray.j)
-            return _Ray(until, i, j, clear | (end >= 0), go, met, ray.count + 1)
+        def continue_(state: _Traversal) -> Bool[Array, ""]:
+            return (jnp.sum(state.active) > stop_at) & (state.steps < max_steps)
 
-        return lax.while_loop(going, advance, ray)
+        def advance(state: _Traversal) -> _Traversal:
+            # `once` is an optimisation barrier: compilers would compute shared values again for every field
+            # of the new state.
+            stays_above, block_exit, block_next = once(self._cross_block(ray, state))
+            faces = [
+                ray.cell_length[k] * cell + ray.face_offset[k] for k, cell in enumerate((state.i, state.j))
+            ]
+            cell_exit = jnp.minimum(jnp.minimum(faces[0], faces[1]), ray.exit_distance)
+            cell_exit = jnp.maximum(state.distance, cell_exit)
+            length = cell_exit - state.distance
+            a, b, c = once(self._clearance(ray, state.distance, (state.i, state.j)))
+            # A ray that is known to be above may be below by rounding.
+            c = jnp.where(state.above, jnp.maximum(c, 0.0), c)
+            end_clearance = (a * length + b) * length + c
+            root, is_real = _falling_root(a, b, c)
+            falls_through = (c >= 0) & (end_clearance < 0)
+            has_root = is_real & (root >= 0) & (root <= length)
+            hit = state.active & ~stays_above & (falls_through | has_root)
+            hit, root, cell_exit, end_clearance = once((hit, root, cell_exit, end_clearance))
+            hit_distance = jnp.where(hit, state.distance + jnp.clip(root, 0.0, length), state.hit_distance)
+            distance = jnp.where(stays_above, block_exit, cell_exit)
+            active = state.active & ~hit & (distance < ray.exit_distance)
+            leaves_along_x = faces[0] <= faces[1]
+            step = [jnp.where(is_ascending, 1, -1) for is_ascending in ray.ascending]
+            i = jnp.where(stays_above, block_next[0], state.i + jnp.where(leaves_along_x, step[0], 0))
+            j = jnp.where(stays_above, block_next[1], state.j + jnp.where(leaves_along_x, 0, step[1]))
+            i, j = jnp.where(active, i, state.i), jnp.where(active, j, state.j)
+            above = stays_above | (end_clearance >= 0)
+            return _Traversal(distance, i, j, above, active, hit_distance, state.steps + 1)
 
-    def beneath(
+        return lax.while_loop(continue_, advance, state)
+
+    def height_bounds_below(
         self, points: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]
     ) -> tuple[Float[np.ndarray, "2 2"], float, float]:
-        """What lies beneath a beam, all of whose rays are among the given lines.
+        """Bound the surface that a beam can meet, all of whose rays lie among the given lines.
 
-        **Returns:** (2, 2) the least and the largest x and y, m, that rays may have where they meet the
-        surface, and the least and the largest height, m, in between.
+        **Returns:** (2, 2) the smallest and the largest x and y, m, at which rays may meet the surface, and
+        the smallest and the largest height, m, in between.
         """
         heights, spacing = concrete_array(self.heights.values), concrete_array(self.heights.spacing)
-        origin = concrete_array(self.heights.origin) - concrete_array(self.heights.number) * spacing
-        steep = np.minimum(directions[:, 2], -1e-9)
+        south_west = concrete_array(self.heights.origin) - concrete_array(self.heights.origin_node) * spacing
+        downward = np.minimum(directions[:, 2], -1e-9)
         low, high, box = heights.min(), heights.max(), np.zeros((2, 2))
-        # The beam between the bounds lies within a box, within which there may be closer bounds.
+        # Between two heights the lines stay within a box, within which the heights have closer bounds, and so
+        # on.
         for _ in range(4):
-            ends = [points + directions * ((z - points[:, 2]) / steep)[:, None] for z in (low, high)]
+            ends = [points + directions * ((z - points[:, 2]) / downward)[:, None] for z in (low, high)]
             box = np.stack([f(np.concatenate(ends)[:, :2], axis=0) for f in (np.min, np.max)])
-            first = np.floor((box[0] - origin) / spacing).astype(int)
-            last = np.ceil((box[1] - origin) / spacing).astype(int)
-            numbers = []
+            first = np.floor((box[0] - south_west) / spacing).astype(int)
+            last = np.ceil((box[1] - south_west) / spacing).astype(int)
+            indices = []
             for a, b, n in zip(first, last, heights.shape):
-                # The cells that the box touches; of one that repeats, no more than all.
-                along = np.arange(a, min(b, a + n) + 1)
-                numbers.append(along % n if self.heights.periodic else np.unique(np.clip(along, 0, n - 1)))
-            part = heights[np.ix_(*numbers)]
-            low, high = part.min(), part.max()
+                # The nodes of all cells that the box touches; in a periodic field, each node at most once.
+                nodes = np.arange(a, min(b, a + n) + 1)
+                indices.append(nodes % n if self.heights.periodic else np.unique(np.clip(nodes, 0, n - 1)))
+            heights_in_box = heights[np.ix_(*indices)]
+            low, high = heights_in_box.min(), heights_in_box.max()
         return box, float(low), float(high)
 
     def crossing(
         self, points: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]
     ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-        _, low, high = self.beneath(points, directions)
+        _, low, high = self.height_bounds_below(points, directions)
+        # Neighbouring lines take the extremes in turn, as the method of the base class asks for.
         level = np.where(np.arange(len(points)) % 2, low, high)
-        steep = np.minimum(directions[:, 2], -1e-9)
-        return (level - points[:, 2]) / steep, steep
+        downward = np.minimum(directions[:, 2], -1e-9)
+        return (level - points[:, 2]) / downward, downward
 
 
-def _tops(heights: Raster) -> Float[Array, "blocks_x blocks_y"]:
-    """The highest node of each block of cells, without derivatives."""
-    top = lax.stop_gradient(heights.values)
+def _block_maxima(heights: Raster) -> Float[Array, "blocks_x blocks_y"]:
+    """Find the highest node of each block of cells, without derivatives."""
+    maxima = lax.stop_gradient(heights.values)
     for axis, cells in enumerate(heights.cells):
-        ahead = (
-            jnp.roll(top, -1, axis) if heights.periodic else lax.slice_in_dim(top, 1, cells + 1, axis=axis)
-        )
-        top = jnp.maximum(lax.slice_in_dim(top, 0, cells, axis=axis), ahead)
-        room = [(0, 0), (0, 0)]
-        room[axis] = (0, -cells % BLOCK)
-        shape = list(top.shape)
-        shape[axis : axis + 1] = [-(-cells // BLOCK), BLOCK]
-        top = jnp.max(jnp.pad(top, room, constant_values=-jnp.inf).reshape(shape), axis=axis + 1)
-    return top
+        # A cell has the nodes k and k + 1 along each axis.
+        if heights.periodic:
+            next_nodes = jnp.roll(maxima, -1, axis)
+        else:
+            next_nodes = lax.slice_in_dim(maxima, 1, cells + 1, axis=axis)
+        maxima = jnp.maximum(lax.slice_in_dim(maxima, 0, cells, axis=axis), next_nodes)
+        padding = [(0, 0), (0, 0)]
+        padding[axis] = (0, -cells % BLOCK_SIZE)
+        shape = list(maxima.shape)
+        shape[axis : axis + 1] = [-(-cells // BLOCK_SIZE), BLOCK_SIZE]
+        padded = jnp.pad(maxima, padding, constant_values=-jnp.inf)
+        maxima = jnp.max(padded.reshape(shape), axis=axis + 1)
+    return maxima
 
 
-def _between(at: Scalar, rate: Scalar, low: Scalar | float, high: Scalar | float) -> tuple[Any, Any]:
-    """Between which distances, from 0 on, a coordinate lies between two bounds; never: (FAR, 0)."""
-    flat = jnp.abs(rate) < 1e-12
-    inverse = 1.0 / jnp.where(flat, 1.0, rate)
-    a, b = (low - at) * inverse, (high - at) * inverse
-    within = (low <= at) & (at <= high)
-    near = jnp.where(flat, jnp.where(within, 0.0, FAR), jnp.minimum(a, b))
-    far = jnp.where(flat, jnp.where(within, FAR, 0.0), jnp.maximum(a, b))
-    return jnp.maximum(near, 0.0), far
+def _interval_within(
+    start: Scalar, rate: Scalar, low: Scalar | float, high: Scalar | float
+) -> tuple[Any, Any]:
+    """Return the interval of s >= 0 in which start + rate s lies in [low, high]; (FAR, 0) if none."""
+    parallel = jnp.abs(rate) < _PARALLEL
+    inverse = 1.0 / jnp.where(parallel, 1.0, rate)
+    a, b = (low - start) * inverse, (high - start) * inverse
+    within = (low <= start) & (start <= high)
+    near = jnp.where(parallel, jnp.where(within, 0.0, FAR), jnp.minimum(a, b))
+    far_end = jnp.where(parallel, jnp.where(within, FAR, 0.0), jnp.maximum(a, b))
+    return jnp.maximum(near, 0.0), far_end
 
 
 def _falling_root(a: Scalar, b: Scalar, c: Scalar) -> tuple[Scalar, Bool[Array, "..."]]:
-    """Where a u^2 + b u + c falls through zero, and whether it does for any real u."""
-    square = b * b - 4.0 * a * c
-    root = jnp.sqrt(jnp.maximum(square, 0.0))
+    """Solve a u^2 + b u + c = 0 for the root of negative derivative; the flag is False if there is none."""
+    discriminant = b * b - 4.0 * a * c
+    root = jnp.sqrt(jnp.maximum(discriminant, 0.0))
     rising = b > 0
     divisor = jnp.where(rising, 2.0 * a, root - b)
-    none = divisor == 0
-    value = jnp.where(rising, -(b + root), 2.0 * c) / jnp.where(none, 1.0, divisor)
-    return jnp.where(none, FAR, value), (square >= 0) & ~none
+    no_root = divisor == 0
+    value = jnp.where(rising, -(b + root), 2.0 * c) / jnp.where(no_root, 1.0, divisor)
+    return jnp.where(no_root, FAR, value), (discriminant >= 0) & ~no_root

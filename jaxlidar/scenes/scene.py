@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxlidar._checks import briefly, check_kind, concrete, kind_of
+from jaxlidar._checks import check_kind, concrete, kind_of
 from jaxlidar._ranges import Range
 from jaxlidar._vectors import FAR
 from jaxlidar.instrument.lidar import Lidar
@@ -20,8 +20,9 @@ from jaxlidar.scenes.surfaces import AbstractGround, AbstractSheet, AbstractSurf
 from jaxlidar.scenes.terrain import Terrain
 from jaxlidar.scenes.voxels import VoxelMap
 
-# Parallel planes that are closer, m, are one and the same in single precision: which is met first is unknown.
-APART = 1e-4
+# Smallest distance, m, between parallel planes. In single precision closer ones coincide, and it is not
+# defined which of them a ray meets first.
+MIN_GAP = 1e-4
 
 
 def _as_plates(x: Any) -> Any:
@@ -29,11 +30,10 @@ def _as_plates(x: Any) -> Any:
 
 
 @final
-@briefly
 class Scene(eqx.Module):
     """A scene: the canopy, plates, ground and atmosphere that a lidar observes.
 
-    Each part is optional. A part that is None or empty takes no computing time.
+    Every element is optional. An element that is None or empty takes no computing time.
 
     **Arguments:**
 
@@ -42,9 +42,8 @@ class Scene(eqx.Module):
     - `ground`: a `Ground`, a `Terrain`, another `AbstractGround`, or None. Default None.
     - `atmosphere`: an `Atmosphere`, or None. Default None.
 
-    **Raises:** TypeError for an argument of another type; ValueError for a plate in the plane of the
-    ground or of another plate, and for a canopy with periodic sides over terrain that does not repeat as it
-    does.
+    **Raises:** TypeError for an argument of the wrong type; ValueError for a plate in the plane of the
+    ground or of another plate, and for a canopy with periodic sides over terrain of another period.
 
     **Example:**
 
@@ -60,7 +59,7 @@ class Scene(eqx.Module):
     ground: AbstractGround | None = None
     atmosphere: Atmosphere | None = None
 
-    ranges: ClassVar = {"gap": Range(APART)}
+    ranges: ClassVar = {"gap": Range(MIN_GAP)}
 
     def __check_init__(self):
         hint = ", as in Canopy(voxels, leaf=...)" if isinstance(self.canopy, VoxelMap) else ""
@@ -80,36 +79,37 @@ class Scene(eqx.Module):
             f"plates[{i}]" for i in range(len(self.plates))
         )
         for (low, high), gap in _gaps(self.surfaces):
-            if (known := concrete(gap)) is not None and known < APART:
+            if (distance := concrete(gap)) is not None and distance < MIN_GAP:
                 raise ValueError(
-                    f"{names[high]} lies {known:.1g} m from the plane of {names[low]}: which is met first is "
-                    f"unknown; admissible is {APART:g} m or more"
+                    f"{names[high]} lies {distance:.1g} m from the plane of {names[low]}: which is met first "
+                    f"is unknown; admissible is {MIN_GAP:g} m or more"
                 )
 
     @property
     def gap(self) -> Float[Array, ""] | None:
-        """The least distance, m, between parallel planes of the scene; None where there are no two."""
+        """Smallest distance, m, between parallel planes of the scene; None with fewer than two planes."""
         gaps = [gap for _, gap in _gaps(self.surfaces)]
         return jnp.min(jnp.stack(gaps)) if gaps else None
 
     @property
     def surfaces(self) -> tuple[AbstractSurface, ...]:
-        """All surfaces: the ground, if there is one, then the plates, as the tracer numbers them."""
+        """All surfaces in the order in which the tracer numbers them: the ground, if any, then the plates."""
         return (() if self.ground is None else (self.ground,)) + self.plates
 
 
 def _gaps(surfaces: tuple[AbstractSurface, ...]) -> Iterator[tuple[tuple[int, int], Float[Array, ""]]]:
-    """Numbers of any two infinite planes, and their distance, m; 1e30 where they are not parallel."""
+    """Iterate over pairs of infinite planes: their numbers and distance in m, 1e30 if not parallel."""
+    # A scene with one surface has no pairs, and need not compute its shape.
     planes = [(i, s.shape) for i, s in enumerate(surfaces)] if len(surfaces) > 1 else []
     planes = [(i, shape) for i, shape in planes if isinstance(shape, Plane)]
-    for (i, one), (j, other) in itertools.combinations(planes, 2):
-        parallel = jnp.abs(jnp.sum(one.upward * other.upward)) > 1.0 - 1e-6
-        gap = jnp.abs(jnp.sum(one.upward * (other.foot - one.foot)))
+    for (i, first), (j, second) in itertools.combinations(planes, 2):
+        parallel = jnp.abs(jnp.sum(first.upward * second.upward)) > 1.0 - 1e-6
+        gap = jnp.abs(jnp.sum(first.upward * (second.foot - first.foot)))
         yield (i, j), jnp.where(parallel, gap, FAR)
 
 
 def check_periods(canopy: Canopy, terrain: Terrain) -> None:
-    """Refuse a canopy without sides over terrain that does not repeat as it does.
+    """Refuse a canopy with periodic sides over terrain of another period.
 
     **Raises:** ValueError with both periods.
     """
@@ -120,40 +120,40 @@ def check_periods(canopy: Canopy, terrain: Terrain) -> None:
         raise ValueError(
             "the canopy has sides = 'periodic', the terrain 'open'; admissible for both is 'periodic'"
         )
-    own, other = size[:2] * canopy.voxels.shape[:2], spacing * terrain.heights.shape
-    if not np.allclose(own, other, rtol=1e-5, atol=0.0):
+    canopy_period, terrain_period = size[:2] * canopy.voxels.shape[:2], spacing * terrain.heights.shape
+    if not np.allclose(canopy_period, terrain_period, rtol=1e-5, atol=0.0):
         raise ValueError(
-            f"the canopy repeats after {own[0]:g} m and {own[1]:g} m, the terrain after {other[0]:g} m and "
-            f"{other[1]:g} m; admissible are equal periods"
+            f"the canopy repeats after {canopy_period[0]:g} m and {canopy_period[1]:g} m, the terrain after "
+            f"{terrain_period[0]:g} m and {terrain_period[1]:g} m; admissible are equal periods"
         )
 
 
 def check_kinds(lidar: Any, scene: Any) -> None:
-    """Refuse what is no lidar, or no scene, before anything is computed with it.
+    """Refuse objects that are not a lidar and a scene, before anything is computed with them.
 
     **Arguments:**
 
-    - `lidar`: what is admissible as a `Lidar`.
-    - `scene`: what is admissible as a `Scene`.
+    - `lidar`: an object that must be a `Lidar`.
+    - `scene`: an object that must be a `Scene`.
 
-    **Raises:** TypeError that says what each is, and what to do.
+    **Raises:** TypeError with the type of the object, and advice.
     """
     if isinstance(lidar, Scene) and isinstance(scene, Lidar):
         raise TypeError("lidar is a Scene and scene is a Lidar: they are swapped")
     for field, x, kind in (("lidar", lidar, Lidar), ("scene", scene, Scene)):
         name = kind.__name__
         if isinstance(x, list | tuple):
-            many = " (to fit many shots: inversion.retrieve_many)" if kind is Lidar else ""
+            advice = " (to fit many shots: inversion.retrieve_many)" if kind is Lidar else ""
             raise TypeError(
-                f"{field} is {kind_of(x)}; admissible is one {name}: simulate several in a loop{many}"
+                f"{field} is {kind_of(x)}; admissible is one {name}: simulate several in a loop{advice}"
             )
-        part = next((part for part, kinds in _PARTS.items() if isinstance(x, kinds)), None)
-        hint = f", as in Scene({part})" if kind is Scene and part else ""
+        argument = next((text for text, types in _SCENE_ARGUMENTS.items() if isinstance(x, types)), None)
+        hint = f", as in Scene({argument})" if kind is Scene and argument else ""
         check_kind(field, x, kind, f"a {name}{hint}")
 
 
-# What is given as a scene where a part of one was meant.
-_PARTS = {
+# Elements that are given in the place of a scene, by the argument of `Scene` that takes them.
+_SCENE_ARGUMENTS = {
     "canopy=canopy": Canopy,
     "canopy=Canopy(voxels, leaf=...)": VoxelMap,
     "plates=(plate,)": AbstractSheet,

@@ -1,4 +1,4 @@
-"""Scenes that are larger than memory, of which a function gives parts."""
+"""Tiled scenes: a function returns the piece of a large scene that some footprints need."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -14,28 +14,29 @@ from jaxlidar.scenes.scene import Scene
 @final
 @dataclasses.dataclass(frozen=True)
 class SceneParts:
-    """A scene larger than memory: a function gives the part of it that some footprints need.
+    """A tiled scene, which may be larger than memory: a function returns the scene within a rectangle.
 
-    `simulate_many` groups shots by squares and asks for the part of one square at a time: to look at it,
-    to trace it, and for the truth, where that is asked for (several at a time where several workers trace).
+    `simulate_many` groups shots by square tiles and loads the scene of one tile at a time (several at a time
+    if several workers trace): to plan, to trace, and for the truth, where `truth=True`.
 
     **Arguments:**
 
     - `part`: a function of (2,) `low` and `high`, x and y in m of the corners of a rectangle, that returns
-      the `Scene` there, in the coordinates of the whole: at least the rectangle, or as much of it as there
-      is. All rectangles of a survey have one size, and corners at multiples of a tenth of `tile`. It
-      may read a Zarr array, a memory-mapped file, or a window of a raster. Workers of an executor get it by
-      pickle. The same rectangle gives the same scene.
-    - `z`: (low, high), m, between which all of the scene lies. Where beams are tilted, it says how far the
-      rectangles reach.
-    - `tile`: edge of the squares in m, positive. Default 100.
-    - `margin`: how far parts reach beyond the footprints, m, 0 or more. Default None: as far as light can get
-      that still comes back before the record ends, so that nothing is lost. Of a smaller one, light that
-      scatters farther away is lost; `Waveforms.info` has "margin" and "margin of all light".
+      the `Scene` there, in the coordinates of the large scene: it covers at least the rectangle, or as much
+      of it as the large scene does. All rectangles of a survey have one size, and corners at multiples of a
+      tenth of `tile`. The function may read a Zarr array, a memory-mapped file, or a window of a raster. It
+      is pickled for the workers of an executor. It must return the same scene for the same rectangle.
+    - `z`: (low, high), m, between which all of the scene lies. With tilted beams, the extent of the
+      rectangles depends on it.
+    - `tile`: edge of the tiles in m, positive. Default 100.
+    - `margin`: distance by which the rectangles extend beyond the footprints, m, 0 or more. Default None: the
+      largest distance from which light returns before the record ends, so that no light is lost. With a
+      smaller margin, light that scatters farther away is lost; `Waveforms.info` has "margin" and "margin of
+      all light".
 
-    **Raises:** TypeError for things of another kind, ValueError for numbers outside their ranges.
+    **Raises:** TypeError for objects of the wrong type, ValueError for numbers outside their ranges.
 
-    **Example:** a forest of 10 km x 10 km, of which a part is made when it is asked for.
+    **Example:** a forest of 10 km x 10 km, of which only the tiles with shots are made.
 
     >>> import jax, numpy as np, jaxlidar as jl
     >>> def part(low, high):
@@ -72,18 +73,19 @@ class SceneParts:
             check_range("margin", self.margin, 0.0)
 
     def between(self, low: Float[np.ndarray, "2"], high: Float[np.ndarray, "2"]) -> Scene:
-        """The part of a rectangle.
+        """Load the scene within a rectangle.
 
-        **Raises:** TypeError where the function gives another thing, ValueError where it reaches out of `z`.
+        **Raises:** TypeError where the function does not return a `Scene`, ValueError where its voxels extend
+        beyond `z`.
         """
-        asked = f"part({low.tolist()}, {high.tolist()})"
+        call = f"part({low.tolist()}, {high.tolist()})"
         scene = self.part(low, high)
-        check_kind(asked, scene, Scene, "a Scene")
+        check_kind(call, scene, Scene, "a Scene")
         if scene.canopy is not None:
             voxels = scene.canopy.voxels
             bottom, top = float(voxels.origin[2]), float(voxels.top[2])
             if bottom < self.z[0] - 1e-3 or top > self.z[1] + 1e-3:
                 raise ValueError(
-                    f"{asked} has voxels from {bottom:g} m to {top:g} m; admissible is z = {self.z}"
+                    f"{call} has voxels from {bottom:g} m to {top:g} m; admissible is z = {self.z}"
                 )
         return scene

@@ -1,4 +1,15 @@
-"""Shapes of surfaces, and where rays meet them."""
+"""Shapes of surfaces, and their intersections with rays.
+
+A plane with the upper unit normal n through the point q is met by the ray x + s w at
+
+    s = n . (q - x) / (n . w).
+
+With the slope sigma and the aspect a, the compass direction in which the plane falls,
+
+    n = (sin(sigma) sin(a), sin(sigma) cos(a), cos(sigma)).
+
+`jaxlidar.scenes.height_field` has the shape of terrain.
+"""
 
 import abc
 from collections.abc import Sequence
@@ -13,7 +24,7 @@ from jaxtyping import Array, ArrayLike, Float
 from jaxlidar._checks import as_scalar, concrete_array
 from jaxlidar._vectors import FAR, Scalar, Vec, dot, vec
 
-# Rays whose direction has a cosine with the normal below this never meet the plane.
+# Rays whose cosine with the normal is smaller than this are taken as parallel and do not meet the plane.
 _PARALLEL = 1e-9
 
 
@@ -39,14 +50,14 @@ class AbstractShape(eqx.Module):
     @property
     @abc.abstractmethod
     def lights_itself(self) -> bool:
-        """Whether light that leaves the surface can meet it again.
+        """True if light that leaves the surface can meet it again.
 
-        If True, `distance` must leave out the point where the light starts.
+        `distance` must then leave out the point at which the light starts.
         """
 
     @abc.abstractmethod
     def moved(self, by: Float[Array, "3"]) -> "AbstractShape":
-        """The same shape, moved.
+        """Move the shape.
 
         **Arguments:**
 
@@ -57,7 +68,7 @@ class AbstractShape(eqx.Module):
 
     @abc.abstractmethod
     def distance(self, x: Vec, w: Vec) -> Scalar:
-        """Distance in m from a point to the first intersection along a direction.
+        """Find the distance in m from a point to the first intersection along a direction.
 
         **Arguments:**
 
@@ -69,24 +80,24 @@ class AbstractShape(eqx.Module):
 
     @abc.abstractmethod
     def tangent(self, x: Vec) -> tuple[Vec, Scalar]:
-        """The tangent plane at a point of the surface.
+        """Return the tangent plane at a point of the surface.
 
         **Arguments:**
 
         - `x`: points on the surface, m.
 
-        **Returns:** the upper unit normal, and the offset of the plane in m, which is normal . point.
+        **Returns:** the upper unit normal n, and the offset n . x of the plane in m.
         """
 
     @abc.abstractmethod
     def crossing(
         self, points: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]
     ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-        """Signed distances at which straight lines cross the surface, and the cosines of incidence there.
+        """Find the signed distances at which straight lines cross the surface, and the cosines of incidence.
 
-        Used by plans to bound the lengths of all paths, in double precision. A shape that is curved or
-        bounded gives the smallest and the largest values that any line nearby can have, at different
-        elements.
+        Plans use them, in double precision, to bound the lengths of all paths. A shape that is curved or
+        bounded returns the smallest and the largest values that any line near the given ones can have, at
+        different elements of the arrays.
 
         **Arguments:**
 
@@ -97,19 +108,19 @@ class AbstractShape(eqx.Module):
         """
 
 
+# Compiled: plans evaluate it often, and dispatching its operations one by one takes longer.
 @jax.jit
-def _tilted(
-    slope: Float[Array, ""], aspect: Float[Array, ""], place: Float[Array, "2"], height: Float[Array, ""]
+def _normal_and_point(
+    slope: Float[Array, ""], aspect: Float[Array, ""], position: Float[Array, "2"], height: Float[Array, ""]
 ) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-    """Upper unit normal and a point. Compiled, for they are asked for often."""
     s, a = jnp.deg2rad(slope), jnp.deg2rad(aspect)
     upward = jnp.stack([jnp.sin(s) * jnp.sin(a), jnp.sin(s) * jnp.cos(a), jnp.cos(s)])
-    return upward, jnp.stack([place[0], place[1], height])
+    return upward, jnp.stack([position[0], position[1], height])
 
 
 @final
 class Plane(AbstractShape):
-    """An infinite plane. `Plane.of` makes one of height, slope and aspect.
+    """An infinite plane. `Plane.of` makes it from height, slope and aspect.
 
     **Arguments:**
 
@@ -131,7 +142,7 @@ class Plane(AbstractShape):
     def of(
         height: ArrayLike, slope: ArrayLike, aspect: ArrayLike, position: ArrayLike | Sequence = (0.0, 0.0)
     ) -> "Plane":
-        """The plane of a given slope and aspect through a point.
+        """Make the plane of a given slope and aspect through a point.
 
         **Arguments:**
 
@@ -139,13 +150,13 @@ class Plane(AbstractShape):
         - `slope`: angle between the normal and the vertical, degrees.
         - `aspect`: azimuth to which the normal is tilted, degrees clockwise from north (+y). The plane falls
           in this direction.
-        - `position`: (2,) horizontal place of the point, m. Default (0, 0).
+        - `position`: (2,) horizontal position of the point, m. Default (0, 0).
 
         **Returns:** a `Plane`.
         """
         height = as_scalar(height, "height")
-        place = jnp.asarray(position, height.dtype)
-        return Plane(*_tilted(as_scalar(slope, "slope"), as_scalar(aspect, "aspect"), place, height))
+        slope, aspect = as_scalar(slope, "slope"), as_scalar(aspect, "aspect")
+        return Plane(*_normal_and_point(slope, aspect, jnp.asarray(position, height.dtype), height))
 
     @property
     def lights_itself(self) -> bool:
@@ -156,9 +167,9 @@ class Plane(AbstractShape):
 
     def distance(self, x: Vec, w: Vec) -> Scalar:
         normal, offset = self.tangent(x)
-        towards = dot(normal, w)
-        s = _crossing(offset - dot(normal, x), towards)
-        return jnp.where((jnp.abs(towards) >= _PARALLEL) & (s > 0), jnp.minimum(s, FAR), FAR)
+        cosine = dot(normal, w)
+        s = _signed_distance(offset - dot(normal, x), cosine)
+        return jnp.where((jnp.abs(cosine) >= _PARALLEL) & (s > 0), jnp.minimum(s, FAR), FAR)
 
     def tangent(self, x: Vec) -> tuple[Vec, Scalar]:
         return vec(self.upward), jnp.sum(self.upward * self.foot)
@@ -167,10 +178,10 @@ class Plane(AbstractShape):
         self, points: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]
     ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
         normal, foot = concrete_array(self.upward), concrete_array(self.foot)
-        towards = directions @ normal
-        return _crossing(normal @ foot - points @ normal, towards, np), towards
+        cosine = directions @ normal
+        return _signed_distance(normal @ foot - points @ normal, cosine, np), cosine
 
 
-def _crossing(height: Any, towards: Any, xp: Any = jnp) -> Any:
-    """Signed distance to a plane that lies `height` further along its normal; huge where parallel."""
-    return height / xp.where(xp.abs(towards) < _PARALLEL, _PARALLEL, towards)
+def _signed_distance(height: Any, cosine: Any, xp: Any = jnp) -> Any:
+    """Compute the distance to a plane that lies `height` further along its normal; huge where parallel."""
+    return height / xp.where(xp.abs(cosine) < _PARALLEL, _PARALLEL, cosine)

@@ -1,4 +1,14 @@
-"""Surfaces of a scene: the ground and the plates above it."""
+"""Surfaces of a scene: the ground and the plates above it.
+
+A surface is a shape, a reflectance rho and a scattering law; a sheet has a transmittance tau and a coverage q
+as well. Light that crosses a sheet meets material with the probability q: it is reflected with the weight
+rho, transmitted with tau and absorbed with 1 - rho - tau. With the probability 1 - q it passes.
+
+Slope sigma and aspect a (the compass direction in which a surface falls) describe a plane through the height
+h at the position (x0, y0):
+
+    z = h - tan(sigma) ((x - x0) sin(a) + (y - y0) cos(a)).
+"""
 
 import abc
 from collections.abc import Callable
@@ -11,7 +21,6 @@ from jaxtyping import Array, Float
 
 from jaxlidar._checks import (
     as_array,
-    briefly,
     check_choice,
     check_kind,
     check_numbers,
@@ -29,7 +38,8 @@ from jaxlidar.scenes.shapes import AbstractShape, Plane
 # A reflectance is one number, one number per wavelength, or a spectrum.
 Reflectance = Float[Array, ""] | Float[Array, "wavelengths"] | Spectrum
 
-_PLACED = {
+# Ranges of the fields that place a plane.
+_PLANE_RANGES = {
     "height": Range(),
     "slope": Range(0.0, 90.0, high_open=True, mirrored=True),
     "aspect": Range(),
@@ -38,7 +48,7 @@ _PLACED = {
 
 
 def reflectance_field(field: str) -> Callable[[Any], Any]:
-    """The converter of a field that is a reflectance: a `Spectrum` as it is, or numbers to an array."""
+    """Make the converter of a field that is a reflectance: a `Spectrum` stays, numbers become an array."""
 
     def convert(x: Any) -> Any:
         if isinstance(x, Spectrum):
@@ -50,7 +60,7 @@ def reflectance_field(field: str) -> Callable[[Any], Any]:
 
 
 def check_reflectance(field: str, x: Any) -> None:
-    """Raise ValueError for a reflectance outside [0, 1] or of more axes than one.
+    """Refuse a reflectance outside [0, 1] or of more axes than one.
 
     A `Spectrum` checks its own values.
     """
@@ -64,42 +74,43 @@ def check_reflectance(field: str, x: Any) -> None:
 
 
 def check_sum(field: str, reflectance: Any, transmittance: Any) -> None:
-    """Raise ValueError if R + T exceeds 1 by more than rounding, where both values are known.
+    """Refuse a reflectance and a transmittance whose sum exceeds 1 by more than rounding, if both are known.
 
-    A spectrum is compared with one number, or over the wavelengths that both have with a spectrum. Of several
-    numbers beside a spectrum nothing can be said: their wavelengths are not known.
+    Two spectra are compared over the wavelengths that both have, a spectrum and one number over those of the
+    spectrum. Several numbers beside a spectrum are not checked: their wavelengths are not known.
+
+    **Raises:** ValueError naming `field` and the sum.
     """
-    both = (reflectance, transmittance)
-    sizes = [x.size for x in both if not isinstance(x, Spectrum) and x.size != 1]
+    quantities = (reflectance, transmittance)
+    sizes = [x.size for x in quantities if not isinstance(x, Spectrum) and x.size != 1]
     if len(set(sizes)) > 1:
         raise ValueError(f"{field}: {sizes[0]} values and {sizes[1]} values; they must be one per wavelength")
-    tables = [
-        known for x in both if isinstance(x, Spectrum) and (known := concrete(x.wavelength)) is not None
-    ]
-    # Between samples a spectrum is linear: the sum is largest at a sample.
-    at = np.concatenate([*tables, []])
+    tables = [concrete(x.wavelength) for x in quantities if isinstance(x, Spectrum)]
+    tables = [table for table in tables if table is not None]
+    # Between samples a spectrum is linear: the sum is largest at a sample of one of them.
+    wavelengths = np.concatenate([*tables, []])
     for table in tables:
-        at = at[(at >= table[0]) & (at <= table[-1])]
-    r, t = (_known(x, at, among_spectra=bool(tables)) for x in both)
+        wavelengths = wavelengths[(wavelengths >= table[0]) & (wavelengths <= table[-1])]
+    r, t = (_concrete_reflectance(x, wavelengths, among_spectra=bool(tables)) for x in quantities)
     if r is None or t is None:
         return
     check_range(field, r + t, *SUM_OF_FRACTIONS[:2])
 
 
-def _known(x: Any, at: np.ndarray, *, among_spectra: bool) -> np.ndarray | None:
-    """Values of a reflectance: of a spectrum at some wavelengths, of numbers as they are. None: not known."""
+def _concrete_reflectance(x: Any, wavelengths: np.ndarray, *, among_spectra: bool) -> np.ndarray | None:
+    """Evaluate a spectrum at wavelengths, or return numbers as they are; None if they cannot be compared."""
     if isinstance(x, Spectrum):
-        parts = [concrete(part) for part in (x.wavelength, x.reflectance, x.scale)]
-        if any(part is None for part in parts):
+        arrays = [concrete(a) for a in (x.wavelength, x.reflectance, x.scale)]
+        if any(a is None for a in arrays):
             return None
-        wavelength, values, factor = map(np.asarray, parts)
-        return factor * np.interp(at, wavelength, values)
+        table, values, scale = map(np.asarray, arrays)
+        return scale * np.interp(wavelengths, table, values)
     values = concrete(x)
     return None if values is None or (among_spectra and values.size > 1) else values
 
 
 class AbstractSurface(eqx.Module):
-    """A surface that reflects light: what the tracer and plans need to know about it.
+    """A surface that reflects light: its optical properties and its shape, as the tracer and plans use them.
 
     Derive your own surface from `AbstractGround` or `AbstractSheet`.
 
@@ -131,22 +142,22 @@ class AbstractSurface(eqx.Module):
 
     @property
     def pattern(self) -> Raster | None:
-        """What the reflectance is multiplied by at each place; None where it is the same everywhere.
+        """Factor of the reflectance at each position; None if the reflectance is uniform.
 
-        It belongs to the geometry: light is traced with it.
+        It is part of the geometry, with which light is traced, and does not depend on the wavelength.
         """
         return None
 
     @property
     def brightest(self) -> Reflectance:
-        """The reflectance at the brightest place."""
+        """Reflectance at the brightest position."""
         return self.reflectance
 
     def moved(self, by: Float[np.ndarray, "2"]) -> "AbstractSurface | None":
-        """The same surface, moved horizontally; None where a surface does not define this.
+        """Move the surface horizontally; None if its class does not define this.
 
-        Scenes of surfaces that all define it lose nothing in single precision where coordinates are millions
-        of metres.
+        If all surfaces of a scene define it, the scene is moved to its local origin in double precision, and
+        coordinates of millions of metres lose no digits.
 
         **Arguments:** `by`: (2,) displacement to the east and to the north, m, in double precision.
         """
@@ -188,7 +199,7 @@ class AbstractSheet(AbstractSurface):
     - `reflectance`: one number, one per wavelength, or a `Spectrum`; in [0, 1].
     - `law`: the scattering law, an `AbstractLaw`.
     - `transmittance`: one number, one per wavelength, or a `Spectrum`; in [0, 1].
-    - `coverage`: probability that light that crosses the sheet meets material, in [0, 1].
+    - `coverage`: probability that light meets material where it crosses the sheet, in [0, 1].
     - `transmission`: "straight" (transmitted light keeps its direction) or "diffuse" (it leaves the far side
       by the cosine law).
 
@@ -206,7 +217,6 @@ class AbstractSheet(AbstractSurface):
 
 
 @final
-@briefly
 class Ground(AbstractGround):
     """The ground: an infinite opaque plane, level or sloping.
 
@@ -218,10 +228,10 @@ class Ground(AbstractGround):
     - `aspect`: horizontal direction in which the ground falls, degrees clockwise from north (+y). Default 0.
     - `law`: the scattering law: `Lambertian()`, `EqualAngle()`, `Specular(roughness=...)`, or another
       `AbstractLaw`. Default `Lambertian()`.
-    - `position`: (2,) horizontal place (x, y) in m at which the ground has its height. Default (0, 0).
+    - `position`: (2,) horizontal position (x, y) in m at which the ground has its height. Default (0, 0).
 
     **Raises:** ValueError for a reflectance outside [0, 1] or of more axes than one, a slope outside [0, 90),
-    and values that are not finite; TypeError for a thing of another kind.
+    and values that are not finite; TypeError for an object of the wrong type.
 
     **Example:**
 
@@ -241,7 +251,7 @@ class Ground(AbstractGround):
         converter=coordinates("position", 2), default=(0.0, 0.0)
     )
 
-    ranges: ClassVar = _PLACED | {"reflectance": FRACTION}
+    ranges: ClassVar = _PLANE_RANGES | {"reflectance": FRACTION}
 
     def __check_init__(self):
         check_kind("law", self.law, AbstractLaw, "a law of reflection, such as Lambertian()")
@@ -261,7 +271,6 @@ class Ground(AbstractGround):
 
 
 @final
-@briefly
 class Plate(AbstractSheet):
     """A leaf plate: an infinite sheet with a reflectance and a transmittance, the same on both sides.
 
@@ -280,12 +289,12 @@ class Plate(AbstractSheet):
     - `transmission`: "straight" (as in the paper: transmitted light keeps its direction) or "diffuse" (it
       leaves the far side by the cosine law). Default "straight".
     - `law`: the scattering law, an `AbstractLaw`. Default `Lambertian()`.
-    - `position`: (2,) horizontal place (x, y) in m at which the plate has its height. Default (0, 0).
+    - `position`: (2,) horizontal position (x, y) in m at which the plate has its height. Default (0, 0).
 
     **Raises:** ValueError for values outside the ranges above, and for an unknown `transmission`; TypeError
-    for a thing of another kind. A `Spectrum` is added to one number, or to another `Spectrum`, at all
-    wavelengths that it has, whichever of them a lidar uses. A `Spectrum` beside one number per wavelength is
-    not checked.
+    for an object of the wrong type. The sum of a `Spectrum` and one number, or another `Spectrum`, is checked
+    at all wavelengths that it has, whichever of them a lidar uses. A `Spectrum` beside one number per
+    wavelength is not checked.
 
     **Example:**
 
@@ -307,7 +316,7 @@ class Plate(AbstractSheet):
         converter=coordinates("position", 2), default=(0.0, 0.0)
     )
 
-    ranges: ClassVar = _PLACED | {
+    ranges: ClassVar = _PLANE_RANGES | {
         "reflectance": FRACTION,
         "transmittance": FRACTION,
         "reflectance + transmittance": SUM_OF_FRACTIONS,
@@ -334,20 +343,24 @@ class Plate(AbstractSheet):
         return _moved(self, by)
 
 
-Planar = TypeVar("Planar", Ground, Plate)
+PlaneSurface = TypeVar("PlaneSurface", Ground, Plate)
 
 
-def _moved(surface: Planar, by: Float[np.ndarray, "2"]) -> Planar:
-    """The surface moved; where its slope is known, what has its height is told at x = y = 0."""
-    place = concrete(surface.position)
-    if place is None:
+def _moved(surface: PlaneSurface, by: Float[np.ndarray, "2"]) -> PlaneSurface:
+    """Move a plane surface, and describe it by its height at x = y = 0 if slope and position are concrete.
+
+    In double precision, the height at the new origin takes in the slope times the distance to a position that
+    may be millions of metres away.
+    """
+    position = concrete(surface.position)
+    if position is None:
         return eqx.tree_at(lambda s: s.position, surface, surface.position + jnp.asarray(by, float))
-    place = place + by
+    position = position + by
     slope, aspect = concrete(surface.slope), concrete(surface.aspect)
     if slope is None or aspect is None:
-        return eqx.tree_at(lambda s: s.position, surface, jnp.asarray(place, float))
-    fall = np.tan(np.deg2rad(slope)) * np.stack([np.sin(np.deg2rad(aspect)), np.cos(np.deg2rad(aspect))])
-    rise, known = fall @ place, concrete(surface.height)
-    height = surface.height + rise if known is None else known + rise
-    here = (jnp.asarray(height, float), jnp.asarray(np.zeros_like(place), float))
-    return eqx.tree_at(lambda s: (s.height, s.position), surface, here)
+        return eqx.tree_at(lambda s: s.position, surface, jnp.asarray(position, float))
+    downhill = np.stack([np.sin(np.deg2rad(aspect)), np.cos(np.deg2rad(aspect))])
+    rise, height = np.tan(np.deg2rad(slope)) * downhill @ position, concrete(surface.height)
+    height_at_origin = (surface.height if height is None else height) + rise
+    fields = (jnp.asarray(height_at_origin, float), jnp.asarray(np.zeros_like(position), float))
+    return eqx.tree_at(lambda s: (s.height, s.position), surface, fields)

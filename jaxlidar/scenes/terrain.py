@@ -1,4 +1,14 @@
-"""Terrain: a ground of measured or modelled heights."""
+"""Terrain: a ground of measured or modelled heights.
+
+Heights h_ij are given at the nodes of a regular grid and are bilinear in between (`jaxlidar.scenes.raster`);
+rays are intersected with them as `jaxlidar.scenes.height_field` describes. Without relief the ground is the
+plane of best fit, which minimises the sum of (h_ij - mean - e X_i - n Y_j)^2. With X and Y measured from the
+middle of the grid, where their means are zero, the normal equations are diagonal:
+
+    mean = <h>,   e = <h X> / <X^2>,   n = <h Y> / <Y^2>.
+
+A periodic terrain has e = n = 0.
+"""
 
 import dataclasses
 from collections.abc import Callable
@@ -12,7 +22,6 @@ from jaxtyping import Array, ArrayLike, Float
 from jaxlidar._checks import (
     array,
     as_array,
-    briefly,
     check_choice,
     check_flag,
     check_kind,
@@ -37,13 +46,14 @@ from jaxlidar.scenes.surfaces import (
     reflectance_field,
 )
 
-# Heights that depart from a plane by less than this share of the spacing, and than rounding, are a plane's.
-_LEVEL = 1e-5
+# Heights are taken as a plane if they deviate from it by less than this fraction of the spacing, plus this
+# fraction of the largest height for rounding.
+_PLANE_TOLERANCE = 1e-5
 _ROUNDING = 4 * float(np.finfo(np.float32).eps)
 
 
 def _pair(field: str) -> Callable[[Any], Float[Array, "2"]]:
-    """The converter of a field that is two numbers, or one that stands for both."""
+    """Make the converter of a field that is two numbers, or one number for both."""
 
     def convert(x: Any) -> Float[Array, "2"]:
         a = as_array(x, field)
@@ -54,33 +64,34 @@ def _pair(field: str) -> Callable[[Any], Float[Array, "2"]]:
 
 
 @final
-@briefly
 class Terrain(AbstractGround):
     """Terrain: an opaque ground whose height is given at the nodes of a grid, and bilinear in between.
 
-    It takes the place of `Ground` in a `Scene`. Light that one slope scatters can meet another, and what
-    slopes hide from the sensor is not seen. Heights that lie in a plane are traced as a plane, without end;
-    for derivatives with respect to such heights the plan is made with effects={"relief": True}. Derivatives
-    of higher orders leave out how slopes come to hide one another as heights change.
+    It takes the place of `Ground` in a `Scene`. Light that one slope scatters can meet another slope, and
+    slopes hide other slopes from the sensor. Heights that lie in a plane are traced as an infinite plane; for
+    derivatives with respect to such heights, make the plan with effects={"relief": True}. In scattering of
+    order two and above, derivatives with respect to heights leave out that slopes begin or cease to hide one
+    another.
 
     **Arguments:**
 
     - `heights`: (nx, ny) heights of the nodes, m, x east along the first axis and y north along the second;
       at least 2 x 2.
     - `spacing`: (2,) distances between nodes along x and y, m, positive; or one number for both.
-    - `origin`: (2,) place (x, y) of the south-west node, m. It is kept in double precision. Default (0, 0).
+    - `origin`: (2,) position (x, y) of the south-west node, m. It is kept in double precision. Default (0,
+      0).
     - `reflectance`: one number, one per wavelength, a `Spectrum`, or a raster: (nx, ny) values at the nodes,
       bilinear in between, for all wavelengths. In [0, 1]. Default 0.3.
     - `law`: the scattering law: `Lambertian()`, `EqualAngle()` or another `AbstractLaw`, but no mirror.
       Default `Lambertian()`.
-    - `sides`: "open": there is nothing beyond the outermost nodes, and footprints must lie within them.
-      "periodic": the terrain repeats without end, node nx being node 0 again; below a canopy whose sides are
-      periodic, with the same period. Default "open".
+    - `sides`: "open": there is no ground beyond the outermost nodes, and footprints must lie within them.
+      "periodic": the terrain repeats without end, node nx being node 0 again; a canopy with periodic sides
+      above it must have the same period. Default "open".
     - `relief`: False for the plane of best fit in place of the heights. Default True.
 
     **Raises:** ValueError for fewer nodes than 2 x 2, a spacing that is not positive, a reflectance outside
     [0, 1], a raster of another shape than the heights, values that are not finite, and a mirror; TypeError
-    for a thing of another kind.
+    for an object of the wrong type.
 
     **Example:** the waveform of a ridge, met at its top.
 
@@ -123,7 +134,7 @@ class Terrain(AbstractGround):
                 f"heights has shape {self.heights.shape}; admissible is (nx, ny), each at least 2"
             )
         check_ranges(self)
-        raster = self._raster_of_reflectance
+        raster = self._reflectance_at_nodes
         if raster is None:
             check_reflectance("reflectance", self.reflectance)
         elif raster.shape != self.heights.shape:
@@ -133,7 +144,7 @@ class Terrain(AbstractGround):
             )
 
     @property
-    def _raster_of_reflectance(self) -> Float[Array, "nx ny"] | None:
+    def _reflectance_at_nodes(self) -> Float[Array, "nx ny"] | None:
         """The reflectance if it is given by node, otherwise None."""
         reflectance = self.reflectance
         return None if isinstance(reflectance, Spectrum) or reflectance.ndim != 2 else reflectance
@@ -151,66 +162,70 @@ class Terrain(AbstractGround):
 
     @property
     def pattern(self) -> Raster | None:
-        if (raster := self._raster_of_reflectance) is None:
+        if (raster := self._reflectance_at_nodes) is None:
             return None
         largest = jnp.max(raster)
         return self._raster(raster / jnp.where(largest > 0, largest, 1.0))
 
     @property
     def brightest(self) -> Reflectance:
-        raster = self._raster_of_reflectance
+        raster = self._reflectance_at_nodes
         return self.reflectance if raster is None else jnp.max(raster)
 
     def moved(self, by: Float[np.ndarray, "2"]) -> "Terrain":
-        place = concrete(self.origin)
-        origin = self.origin + jnp.asarray(by, float) if place is None else jnp.asarray(place + by, float)
+        origin = concrete(self.origin)
+        # The sum in double precision, if possible.
+        origin = self.origin + jnp.asarray(by, float) if origin is None else jnp.asarray(origin + by, float)
         return eqx.tree_at(lambda s: s.origin, self, origin)
 
     @property
     def end(self) -> Float[np.ndarray, "2"]:
-        """(2,) place of the outermost north-east node, or of the first that is a repetition, m."""
+        """(2,) position of the north-east node, m; in a periodic terrain, of the repetition of node 0."""
         cells = np.asarray(self.heights.shape) - (self.sides == "open")
         return concrete_array(self.origin) + concrete_array(self.spacing) * cells
 
     def height_at(self, x: ArrayLike, y: ArrayLike) -> Float[Array, "..."]:
-        """Height of the terrain, or of its plane of best fit without relief.
+        """Interpolate the height of the terrain, or of its plane of best fit without relief.
 
         **Arguments:**
 
-        - `x`, `y`: places, m, of one shape. They are taken relative to the origin in double precision where
-          both are known.
+        - `x`, `y`: positions, m, of one shape. They are taken relative to the origin, in double precision
+          where both are concrete.
 
         **Returns:** heights, m, shaped as `x` and `y`.
 
-        **Raises:** ValueError for places off the terrain, where its sides are open.
+        **Raises:** ValueError for positions off a terrain with open sides.
         """
-        known, origin = [concrete(v) for v in (x, y)], concrete(self.origin)
-        if origin is None or known[0] is None or known[1] is None:
-            here, east, north = self, jnp.asarray(x), jnp.asarray(y)
+        values, origin = [concrete(v) for v in (x, y)], concrete(self.origin)
+        if origin is None or values[0] is None or values[1] is None:
+            terrain, east, north = self, jnp.asarray(x), jnp.asarray(y)
         else:
-            here = eqx.tree_at(lambda s: s.origin, self, jnp.zeros(2))
-            east, north = (jnp.asarray(v - o, float) for v, o in zip(known, origin))
+            terrain = eqx.tree_at(lambda s: s.origin, self, jnp.zeros(2))
+            east, north = (jnp.asarray(v - o, float) for v, o in zip(values, origin))
             if self.sides == "open" and self.relief:
-                for axis, v, low, high in zip("xy", known, origin, self.end):
+                for axis, v, low, high in zip("xy", values, origin, self.end):
                     check_range(axis, v, low, high)
-        shape = here.shape
+        shape = terrain.shape
         if isinstance(shape, HeightField):
             return shape.heights.value((east, north))
         normal, offset = shape.tangent((east, north, jnp.zeros_like(east)))
         return (offset - normal[0] * east - normal[1] * north) / normal[2]
 
     def is_plane(self) -> bool:
-        """Whether all heights, which must be known, lie in one plane; where the sides are periodic, level."""
+        """Return True if all heights lie in one plane, which must be level where the sides are periodic.
+
+        **Raises:** ValueError where JAX is tracing the heights.
+        """
         heights, spacing = concrete_array(self.heights), concrete_array(self.spacing)
         slope, mean = self._best_fit(heights, spacing)
-        x, y = (d * n for d, n in zip(spacing, _from_middle(heights.shape)))
-        apart = np.abs(heights - mean - slope[0] * x[:, None] - slope[1] * y)
-        slack = _LEVEL * float(spacing.min()) + _ROUNDING * float(np.abs(heights).max())
-        return bool(apart.max() <= slack)
+        x, y = (d * n for d, n in zip(spacing, _nodes_from_middle(heights.shape)))
+        deviation = np.abs(heights - mean - slope[0] * x[:, None] - slope[1] * y)
+        tolerance = _PLANE_TOLERANCE * float(spacing.min()) + _ROUNDING * float(np.abs(heights).max())
+        return bool(deviation.max() <= tolerance)
 
     def without_relief(self) -> "Ground | Terrain":
-        """The plane of best fit: a `Ground`, unless heights are being traced or the reflectance varies."""
-        varies = self._raster_of_reflectance is not None
+        """Make the plane of best fit: a `Ground`, unless heights are traced or the reflectance varies."""
+        varies = self._reflectance_at_nodes is not None
         if varies or concrete(self.heights) is None or concrete(self.origin) is None:
             return dataclasses.replace(self, relief=False)
         heights, spacing = concrete_array(self.heights), concrete_array(self.spacing)
@@ -218,7 +233,7 @@ class Terrain(AbstractGround):
         x, y = concrete_array(self.origin) + 0.5 * spacing * (np.asarray(heights.shape) - 1.0)
         slope = np.rad2deg(np.arctan(np.hypot(east, north)))
         aspect = np.rad2deg(np.arctan2(-east, -north)) if slope > 0 else 0.0
-        # Told at x = y = 0: near the beam, once the scene is told relative to it.
+        # The height at x = y = 0, which is near the beam once the scene has been moved to the local origin.
         return Ground(
             height=mean - east * x - north * y,
             reflectance=self.reflectance,
@@ -235,16 +250,16 @@ class Terrain(AbstractGround):
         return Plane(jnp.stack(upward), jnp.append(middle, mean))
 
     def _best_fit(self, heights: Any, spacing: Any) -> tuple[tuple[Any, Any], Any]:
-        """Rise per m to the east and to the north, and mean height, of the plane of least squares."""
+        """Fit a plane by least squares: its rise per m to the east and to the north, and its mean height."""
         mean = heights.mean()
         if self.sides == "periodic":
             return (0.0 * mean, 0.0 * mean), mean
-        x, y = _from_middle(heights.shape)
+        x, y = _nodes_from_middle(heights.shape)
         east = (heights * x[:, None]).mean() / (x * x).mean() / spacing[0]
         return (east, (heights * y[None, :]).mean() / (y * y).mean() / spacing[1]), mean
 
 
-def _from_middle(shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers of nodes along x and y, from the middle."""
+def _nodes_from_middle(shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the positions of nodes along x and y, in units of the spacing, from the middle."""
     nx, ny = shape
     return np.arange(nx) - 0.5 * (nx - 1), np.arange(ny) - 0.5 * (ny - 1)

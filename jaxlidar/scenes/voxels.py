@@ -1,4 +1,12 @@
-"""Voxel maps: extinction coefficients of leaf and bark on a regular grid."""
+"""Voxel maps: extinction coefficients of leaf and bark on a regular grid.
+
+Within a voxel the material is a turbid medium: a path of length l passes with the probability exp(-sigma l).
+The extinction coefficient sigma (1/m) follows from
+
+- the leaf area density, LAD (m2/m3): sigma = G(direction) LAD, with the projection function G of the leaf
+  angles (1/2 for spherical ones). Maps store sigma for G = 1/2;
+- the probability p that a ray which crosses one voxel edge d meets material: sigma = -ln(1 - p) / d.
+"""
 
 from collections.abc import Callable, Sequence
 from typing import ClassVar, final
@@ -10,7 +18,6 @@ from jaxtyping import Array, ArrayLike, Float
 
 from jaxlidar._checks import (
     as_array,
-    briefly,
     check_kind,
     check_range,
     check_shape,
@@ -31,7 +38,7 @@ Numbers = ArrayLike | Sequence
 
 
 def _triple(field: str) -> Callable[[Numbers], Float[Array, "3"]]:
-    """The converter of a field that is three numbers, or one that stands for all three."""
+    """Make the converter of a field that is three numbers, or one number for all three."""
 
     def convert(x: Numbers) -> Float[Array, "3"]:
         a = as_array(x, field)
@@ -42,7 +49,7 @@ def _triple(field: str) -> Callable[[Numbers], Float[Array, "3"]]:
 
 
 def _volume(field: str) -> Callable[[Numbers | None], Float[Array, "..."] | None]:
-    """The converter of a field that is an array of numbers or None."""
+    """Make the converter of a field that is an array of numbers or None."""
 
     def convert(x: Numbers | None) -> Float[Array, "..."] | None:
         return None if x is None else as_array(x, field)
@@ -51,26 +58,26 @@ def _volume(field: str) -> Callable[[Numbers | None], Float[Array, "..."] | None
 
 
 @final
-@briefly
 class VoxelMap(eqx.Module):
     """A voxel map: extinction coefficients of leaf and bark in a box of equal voxels, x east, y north, z up.
 
-    It is made by `VoxelMap.from_lad`, `VoxelMap.from_probability` or `VoxelMap.from_extinction`. Within a
-    voxel the material is spread evenly as a turbid medium. The interception of a ray depends on the length of
-    its path through the voxel only.
+    Make it by `VoxelMap.from_lad`, `VoxelMap.from_probability` or `VoxelMap.from_extinction`. Within a voxel
+    the material is spread evenly as a turbid medium: the interception of a ray depends only on the length of
+    its path through the voxel.
 
     **Arguments:**
 
     - `leaf`: (nx, ny, nz) extinction coefficient of leaf in 1/m for the projection function G = 1/2, that
       is half the leaf area density, 0 or more; or None: no leaf.
-    - `bark`: (nx, ny, nz) the same for bark, whose facets are taken as spherically oriented; or None.
+    - `bark`: (nx, ny, nz) extinction coefficient of bark in 1/m, 0 or more, the same in all directions, as of
+      spherically oriented facets; or None: no bark.
     - `voxel_size`: (3,) voxel edges in m, positive; or one number for cubes.
     - `origin`: (3,) lower south-west corner in m.
     - `leaf_angles`: distribution of leaf inclination, a `LeafAngles`, or None: spherical. Default None.
 
     **Raises:** ValueError for extinction that is negative or not finite, sizes that are not positive, leaf
     and bark of different shapes, an edge or origin that is neither one number nor three, and a map with
-    neither leaf nor bark; TypeError for a thing of another kind. Edges so far from those of any map that
+    neither leaf nor bark; TypeError for an object of the wrong type. Edges so far from those of any map that
     another unit is likely give a `UnitWarning`.
 
     **Example:**
@@ -81,7 +88,7 @@ class VoxelMap(eqx.Module):
     (4, 4, 10) [2.0, 2.0, 23.0] 0.25 per m
     """
 
-    # Their shapes are compared below, so that the error can name both.
+    # The shapes are not part of the types: the constructor compares them, and its error names both.
     leaf: Float[Array, "..."] | None = eqx.field(converter=_volume("leaf"))
     bark: Float[Array, "..."] | None = eqx.field(converter=_volume("bark"))
     voxel_size: Float[Array, "3"] = eqx.field(converter=_triple("voxel_size"))
@@ -113,9 +120,9 @@ class VoxelMap(eqx.Module):
     @property
     def shape(self) -> tuple[int, int, int]:
         """Numbers of voxels along x, y and z."""
-        some = self.leaf if self.leaf is not None else self.bark
-        assert some is not None
-        nx, ny, nz = some.shape
+        extinction = self.leaf if self.leaf is not None else self.bark
+        assert extinction is not None
+        nx, ny, nz = extinction.shape
         return nx, ny, nz
 
     @property
@@ -131,7 +138,7 @@ class VoxelMap(eqx.Module):
         voxel_size: Numbers,
         origin: Numbers = (0.0, 0.0, 0.0),
     ) -> "VoxelMap":
-        """Make a voxel map of extinction coefficients that are the same for every direction.
+        """Make a voxel map of extinction coefficients that are the same in every direction.
 
         **Arguments:**
 
@@ -141,7 +148,7 @@ class VoxelMap(eqx.Module):
 
         **Returns:** a `VoxelMap`.
 
-        **Raises:** ValueError for what `VoxelMap` does not admit.
+        **Raises:** ValueError for arguments that `VoxelMap` does not admit.
         """
         return VoxelMap(leaf, bark, voxel_size, origin)
 
@@ -153,7 +160,7 @@ class VoxelMap(eqx.Module):
         voxel_size: Numbers,
         origin: Numbers = (0.0, 0.0, 0.0),
     ) -> "VoxelMap":
-        """Make a voxel map of the probabilities p that a ray crossing one voxel edge meets leaf, or bark.
+        """Make a voxel map of the probabilities p that a ray that crosses one voxel edge meets leaf, or bark.
 
         The extinction coefficient is -log1p(-p)/edge. Where voxels are not cubes, the edge is the vertical
         one. A solid trunk, p = 1, is admissible: it has an optical depth of 40 per edge, and its derivative
@@ -167,7 +174,8 @@ class VoxelMap(eqx.Module):
 
         **Returns:** a `VoxelMap`.
 
-        **Raises:** ValueError for a probability outside [0, 1], and for what `VoxelMap` does not admit.
+        **Raises:** ValueError for a probability outside [0, 1], and for arguments that `VoxelMap` does not
+        admit.
         """
         size = _triple("voxel_size")(voxel_size)
         check_range("voxel_size", size, 0.0, low_open=True)
@@ -177,8 +185,9 @@ class VoxelMap(eqx.Module):
                 return None
             check_range(name, p, 0.0, 1.0)
             p = as_array(p, name)
-            open_ = p < 1.0
-            depth = jnp.where(open_, -jnp.log1p(-jnp.where(open_, p, 0.0)), SOLID_OPTICAL_DEPTH)
+            is_open = p < 1.0
+            # The inner `where` keeps log(0), whose derivative is infinite, out of the solid voxels.
+            depth = jnp.where(is_open, -jnp.log1p(-jnp.where(is_open, p, 0.0)), SOLID_OPTICAL_DEPTH)
             return depth / size[2]
 
         return VoxelMap(extinction("leaf", leaf), extinction("bark", bark), size, origin)
@@ -192,7 +201,7 @@ class VoxelMap(eqx.Module):
         leaf_angles: str | LeafAngles = "spherical",
         bark: Numbers | None = None,
     ) -> "VoxelMap":
-        """Make a voxel map of leaf area density (LAD). The extinction coefficient is G(direction) * LAD.
+        """Make a voxel map of leaf area density (LAD); the extinction coefficient is G(direction) * LAD.
 
         **Arguments:**
 
@@ -205,7 +214,8 @@ class VoxelMap(eqx.Module):
 
         **Returns:** a `VoxelMap`.
 
-        **Raises:** ValueError for a negative density, an unknown name, and what `VoxelMap` does not admit.
+        **Raises:** ValueError for a negative density, an unknown name, and arguments that `VoxelMap` does not
+        admit.
         """
         check_range("lad", lad, 0.0)
         check_kind("leaf_angles", leaf_angles, str | LeafAngles, "a name or a LeafAngles")
@@ -214,20 +224,20 @@ class VoxelMap(eqx.Module):
         return VoxelMap(0.5 * as_array(lad, "lad"), bark, voxel_size, origin, None if spherical else angles)
 
     def above(self, terrain: Terrain) -> "VoxelMap":
-        """The same map above a terrain, where its z is height above the ground.
+        """Lift the map onto a terrain, if its z is height above the ground.
 
-        Every column is lifted by the mean height of the terrain below it. What a voxel holds is shared
-        between the two voxels that it then lies in, so that the optical depth of each column stays as it is.
-        Below a slope, the lowest voxels of a column lie partly in the ground.
+        Every column is lifted by the mean height of the terrain below it. The extinction of a voxel is
+        divided between the two voxels in which it then lies, so that the optical depth of each column does
+        not change. On a slope, the lowest voxels of a column lie partly in the ground.
 
         **Arguments:**
 
-        - `terrain`: a `Terrain` below all columns; its heights must be known.
+        - `terrain`: a `Terrain` below all columns; its heights must be concrete.
 
         **Returns:** a `VoxelMap` with more layers, as many as the terrain rises by.
 
         **Raises:** ValueError for a map that lies partly off the terrain, and within a JAX transformation;
-        TypeError for what is no `Terrain`.
+        TypeError where `terrain` is not a `Terrain`.
 
         **Example:**
 
@@ -241,29 +251,32 @@ class VoxelMap(eqx.Module):
         size, origin, heights = (concrete(a) for a in (self.voxel_size, self.origin, terrain.heights))
         if size is None or origin is None or heights is None:
             raise ValueError("a JAX transformation is tracing the map or the terrain: lift the map outside")
-        (nx, ny, nz), within = self.shape, (np.arange(3) + 0.5) / 3
-        x, y = (o + d * np.add.outer(np.arange(n), within) for o, d, n in zip(origin, size, (nx, ny)))
-        at = np.broadcast_arrays(x[:, :, None, None], y[None, None])
-        lift = np.asarray(terrain.height_at(*at), float).mean(axis=(1, 3)) / size[2]
+        # 1. Mean height of the terrain below each column, at 3 x 3 points, in units of layers.
+        (nx, ny, nz), in_voxel = self.shape, (np.arange(3) + 0.5) / 3
+        x, y = (o + d * np.add.outer(np.arange(n), in_voxel) for o, d, n in zip(origin, size, (nx, ny)))
+        points = np.broadcast_arrays(x[:, :, None, None], y[None, None])
+        lift = np.asarray(terrain.height_at(*points), float).mean(axis=(1, 3)) / size[2]
+        # 2. Split it into whole layers and a fraction, counted from the lowest column.
         base = np.floor(lift.min())
-        whole = np.floor(lift - base).astype(int)
-        part = jnp.asarray(lift - base - whole, float)[:, :, None]
-        layers = int(np.ceil((lift - base).max()))
-        # Layer k takes from layers k - whole and k - whole - 1 of the map, which is empty beyond its own.
-        source = np.arange(nz + layers) - whole[:, :, None] + layers + 1
+        whole_layers = np.floor(lift - base).astype(int)
+        fraction = jnp.asarray(lift - base - whole_layers, float)[:, :, None]
+        more_layers = int(np.ceil((lift - base).max()))
+        # 3. Layer k of the lifted map takes from the layers k - whole_layers and k - whole_layers - 1 of the
+        #    map, which is padded with empty layers.
+        source = np.arange(nz + more_layers) - whole_layers[:, :, None] + more_layers + 1
 
         def lifted(k: Float[Array, "nx ny nz"] | None) -> Float[Array, "nx ny _"] | None:
             if k is None:
                 return None
-            k = jnp.pad(k, ((0, 0), (0, 0), (layers + 1, layers)))
+            k = jnp.pad(k, ((0, 0), (0, 0), (more_layers + 1, more_layers)))
             upper, lower = (jnp.take_along_axis(k, jnp.asarray(s), axis=2) for s in (source, source - 1))
-            return (1.0 - part) * upper + part * lower
+            return (1.0 - fraction) * upper + fraction * lower
 
-        place = origin + np.array([0.0, 0.0, base * size[2]])
-        return VoxelMap(lifted(self.leaf), lifted(self.bark), self.voxel_size, place, self.leaf_angles)
+        corner = origin + np.array([0.0, 0.0, base * size[2]])
+        return VoxelMap(lifted(self.leaf), lifted(self.bark), self.voxel_size, corner, self.leaf_angles)
 
     def mean_extinction(self) -> Float[np.ndarray, "nx ny nz"]:
-        """Extinction coefficient of leaf (at G = 1/2) and bark together.
+        """Sum the extinction coefficients of leaf (at G = 1/2) and bark.
 
         **Returns:** (nx, ny, nz) NumPy array in 1/m.
         """

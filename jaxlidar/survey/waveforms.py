@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxlidar._checks import briefly
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._deprecated import renamed_property
 from jaxlidar._summary import NOTABLE_FRACTION, percent
@@ -23,7 +22,6 @@ from jaxlidar.survey.truths import Truths
 
 
 @final
-@briefly
 class Waveforms(eqx.Module):
     """The waveforms of all shots of a survey, on one time axis. `waves[i]` is the `Waveform` of shot i.
 

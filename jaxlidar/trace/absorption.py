@@ -69,7 +69,7 @@ def from_the_sky(scene: DeviceScene, key: PRNGKeyArray, count: int) -> tuple[Vec
     top = jnp.full_like(u, high[2])
     for surface in scene.surfaces:
         if isinstance(surface.shape, HeightField):
-            top = jnp.maximum(top, surface.shape.high)
+            top = jnp.maximum(top, surface.shape.highest)
     return (x, y, top), vec(jnp.broadcast_to(c, u.shape) for c in scene.beam.axis)
 
 

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxlidar._vectors import FAR, Scalar, Vec, add, dot, from_frame, normalise, scale, vec
-from jaxlidar.instrument.field_of_view import seen
+from jaxlidar.instrument.field_of_view import visible_fraction
 from jaxlidar.instrument.lidar import Lidar
 
 GOLDEN = (np.sqrt(5.0) - 1) / 2
@@ -100,7 +100,7 @@ class Beam(eqx.Module):
         edge = self.view_radius * (1.0 + beyond_aim / self.slant_range)
         # The floor keeps the derivative of the root finite on the axis.
         off_axis = jnp.sqrt(jnp.maximum(off_axis2, 1e-12 * edge * edge))
-        return seen(off_axis / edge)
+        return visible_fraction(off_axis / edge)
 
     def irradiance(self, across: tuple[Scalar, Scalar]) -> Scalar:
         """Fraction of the pulse's energy per m2 across the beam, at x and y across it, m."""

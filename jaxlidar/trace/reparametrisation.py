@@ -178,8 +178,10 @@ def rays_with_terrain(
     held = along(start, w, jnp.where(is_met, distance, start_distance))
     # The same places among the cells, at the heights that the terrain has there.
     field = shape.heights
-    x, y = (field.origin[k] + field.spacing[k] * detach(at) for k, at in enumerate(field.place(held)))
-    height, (slope_x, slope_y) = field.with_slope((x, y))
+    x, y = (
+        field.origin[k] + field.spacing[k] * detach(at) for k, at in enumerate(field.grid_coordinates(held))
+    )
+    height, (slope_x, slope_y) = field.value_and_slope((x, y))
     in_beam = to_frame(beam.axis, (x, y, height))
     # Central projection from the sensor onto the plane of `across`.
     magnification = beam.slant_range / (beam.slant_range + in_beam[2])

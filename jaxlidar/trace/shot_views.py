@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._vectors import Scalar, Vec
-from jaxlidar.instrument.field_of_view import seen
+from jaxlidar.instrument.field_of_view import visible_fraction
 
 PlanePoint = tuple[Scalar, Scalar]
 
@@ -77,7 +77,7 @@ class ShotViews(eqx.Module):
             _, squared_distance = _beam_coordinates(
                 axis, (end[0][:, None] - shot_x, end[1][:, None] - shot_y)
             )
-            fraction = fraction * seen(jnp.sqrt(squared_distance) / self.view_radius)
+            fraction = fraction * visible_fraction(jnp.sqrt(squared_distance) / self.view_radius)
         return shots, fraction, 2.0 / SPEED_OF_LIGHT * advance
 
     def _candidates_at(self, point: PlanePoint) -> Int[Array, "photons candidates"]:

@@ -1,4 +1,4 @@
-"""The command: what it prints, what it writes, and how it ends."""
+"""The command: its output, its files and its exit statuses."""
 
 import contextlib
 import os
@@ -25,10 +25,10 @@ SCENES = ROOT / "examples" / "scenes"
 
 @pytest.fixture(autouse=True)
 def as_installed(monkeypatch):
-    """The commands of `inversion` as an installed package adds them; compiled programs are not kept."""
+    """Add the commands of `inversion` as an installed package does, without a cache of compiled programs."""
     points = [metadata.EntryPoint(n, f"inversion.commands:{n}", cli.COMMANDS) for n in ("demo", "retrieve")]
     monkeypatch.setattr(metadata, "entry_points", lambda group: points if group == cli.COMMANDS else [])
-    monkeypatch.setattr("jaxlidar.cli.group.kept_programs", contextlib.nullcontext)
+    monkeypatch.setattr("jaxlidar.cli.group.compilation_cache", contextlib.nullcontext)
 
 
 def test_help_names_every_command_and_shows_examples(capsys):
@@ -42,17 +42,17 @@ def test_help_names_every_command_and_shows_examples(capsys):
 
 
 @pytest.mark.parametrize("suffix", slow_unless([".nc"], [".nc", ".zarr"]))
-def test_simulate_writes_what_was_simulated_and_how(tmp_path, capsys, suffix):
+def test_simulate_writes_the_waveform_and_its_case(tmp_path, capsys, suffix):
     out, plot = tmp_path / f"a{suffix}", tmp_path / "a.png"
     case = SCENES / "flat_ground.toml"
     assert cli.main(["simulate", str(case), "-o", str(out), "--plot", str(plot)]) == 0
-    printed, said = capsys.readouterr()
-    assert said == ""
-    assert "Waveform of" in printed
+    output, errors = capsys.readouterr()
+    assert errors == ""
+    assert "Waveform of" in output
     assert float(jl.open(out).reflectance.sum()) == pytest.approx(0.5, rel=1e-4)
     assert plot.read_bytes().startswith(b"\x89PNG")
     assert np.array_equal(jl.rerun(out).reflectance, jl.open(out).reflectance)
-    # What there is, other commands read.
+    # The other commands read the file.
     assert cli.main(["info", str(out)]) == 0
     assert capsys.readouterr().out == f"{jl.open(out)}\n"
     assert cli.main(["convert", str(out), str(tmp_path / "a.csv")]) == 0
@@ -81,7 +81,7 @@ def test_a_survey_is_simulated_shot_by_shot(tmp_path, capsys, suffix):
     assert cli.main(["simulate", str(case), "-o", str(out), "--plot", str(plot)]) == 0
     assert capsys.readouterr().out.startswith("3 waveforms of ")
     assert len(jl.open(out)) == 3
-    # The same call finds it done.
+    # The same call finds the survey completed.
     assert cli.main(["simulate", str(case), "-o", str(out)]) == 0
     assert capsys.readouterr().out.startswith("3 waveforms of ")
     assert plot.read_bytes().startswith(b"\x89PNG")
@@ -91,17 +91,17 @@ def test_a_survey_is_simulated_shot_by_shot(tmp_path, capsys, suffix):
     assert "survey: Survey(" in capsys.readouterr().out
     assert cli.main(["plan", str(case)]) == 0
     assert "slope spread" in capsys.readouterr().out
-    # The file has its case.
+    # The file includes its case.
     assert cli.main(["convert", str(out), str(tmp_path / "b.toml")]) == 0
     assert len(jl.io.read_case(tmp_path / "b.toml").survey) == 3
     assert np.array_equal(jl.rerun(out).reflectance, jl.open(out).reflectance)
 
 
-def test_an_interrupted_simulation_is_kept(tmp_path, capsys, monkeypatch):
-    real = jl.simulate
+def test_an_interrupted_simulation_is_saved(tmp_path, capsys, monkeypatch):
+    simulate = jl.simulate
 
     def interrupted(*args, **kwargs):
-        wave = real(*args, **{**kwargs, "max_orders": 1})
+        wave = simulate(*args, **{**kwargs, "max_orders": 1})
         wave.info["stopped"] = "interrupted"
         return wave
 
@@ -148,8 +148,8 @@ def test_retrieve_finds_the_ground(tmp_path, capsys):
     jl.simulate(jl.Lidar(), scene, key=jax.random.key(0)).save(tmp_path / "wave.nc")
     (tmp_path / "start.toml").write_text("[scene.ground]")
     argv = ["retrieve", str(tmp_path / "wave.nc"), str(tmp_path / "start.toml"), "--noise", "0.001"]
-    more = ["-o", str(tmp_path / "fit.nc"), "--plot", str(tmp_path / "fit.png")]
-    assert cli.main([*argv, "--unknown", "ground.height:-2:2", *more]) == 0
+    files = ["-o", str(tmp_path / "fit.nc"), "--plot", str(tmp_path / "fit.png")]
+    assert cli.main([*argv, "--unknown", "ground.height:-2:2", *files]) == 0
     assert "ground.height  0.5 +-" in capsys.readouterr().out
     assert float(jl.open(tmp_path / "fit.nc").values["ground.height"]) == pytest.approx(0.5, abs=1e-3)
     assert (tmp_path / "fit.png").exists()
@@ -159,32 +159,32 @@ def test_retrieve_finds_the_ground(tmp_path, capsys):
     assert "has no standard errors: give --noise" in capsys.readouterr().err
 
 
-def test_compiled_programs_are_kept_unless_refused(tmp_path):
-    """In a folder of the user's cache, and JAX is configured as before when the command has ended."""
+def test_compiled_programs_are_stored_unless_refused(tmp_path):
+    """In the user's cache folder; when the command has ended, JAX has its previous configuration."""
     code = (
         "import sys, jax; from jaxlidar.cli import cache, main; before = dict(jax.config.values);"
-        # A fast machine compiles all of the command's programs in less than is worth a file.
-        "cache.SECONDS = 0.0;"
+        # A fast machine compiles all programs of the command in less than the minimum time.
+        "cache.MIN_COMPILE_TIME = 0.0;"
         "print(main(sys.argv[1:]), jax.config.values == before)"
     )
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(tmp_path)}
     environment.pop("JAX_COMPILATION_CACHE_DIR", None)
 
-    def kept(*argv):
+    def stored_programs(*argv):
         command = [sys.executable, "-c", code, *argv, "prospect", "--N", "1.5"]
-        done = subprocess.run(command, env=environment, capture_output=True, text=True)
-        # What reads programs has nothing to say.
-        assert done.stderr == ""
-        assert done.stdout.splitlines()[-1] == "0 True"
+        process = subprocess.run(command, env=environment, capture_output=True, text=True)
+        # Reading programs from the cache gives no warnings.
+        assert process.stderr == ""
+        assert process.stdout.splitlines()[-1] == "0 True"
         return {path.name for path in tmp_path.rglob("*-cache")}
 
-    assert not kept("--no-cache")
-    programs = kept()
+    assert not stored_programs("--no-cache")
+    programs = stored_programs()
     assert programs or sys.platform != "linux"
-    assert kept() == programs
+    assert stored_programs() == programs
 
 
-def test_a_command_that_cannot_be_loaded_says_so(monkeypatch, capsys):
+def test_a_command_that_cannot_be_loaded_reports_the_reason(monkeypatch, capsys):
     points = [
         metadata.EntryPoint("gone", "inversion.nowhere:gone", cli.COMMANDS),
         metadata.EntryPoint("number", "math:pi", cli.COMMANDS),
@@ -198,14 +198,14 @@ def test_a_command_that_cannot_be_loaded_says_so(monkeypatch, capsys):
     assert "math:pi is no click.Command" in capsys.readouterr().err
 
 
-def test_without_its_libraries_the_command_says_what_to_install(monkeypatch, capsys):
+def test_without_its_libraries_the_command_names_the_extra_to_install(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "click", None)
     assert cli.main(["spectra"]) == 1
     assert capsys.readouterr().err == "jaxlidar: the command needs click: pip install 'jaxlidar[cli]'\n"
 
 
 @pytest.mark.parametrize(
-    ("argv", "status", "says"),
+    ("argv", "status", "message"),
     [
         (["simulate", "nowhere.toml"], 1, "nowhere.toml: no such file"),
         (["plan", "BAD"], 1, "BAD: scen is not known; the nearest is scene"),
@@ -215,14 +215,14 @@ def test_without_its_libraries_the_command_says_what_to_install(monkeypatch, cap
         (["prospect", "--N", "0.5"], 1, "N = 0.5 is outside the admissible range [1, inf)"),
     ],
 )
-def test_what_makes_no_sense_is_refused_in_a_sentence(argv, status, says, tmp_path, capsys):
+def test_inadmissible_arguments_are_refused_in_a_sentence(argv, status, message, tmp_path, capsys):
     for name, text in (("BAD", "[scen]"), ("EMPTY", ""), ("OTHER", "")):
         path = tmp_path / f"{name}{'.xyz' if name == 'OTHER' else '.toml'}"
         path.write_text(text)
         argv = [str(path) if a == name else a for a in argv]
-        says = says.replace(f"{name}", str(path))
+        message = message.replace(f"{name}", str(path))
     assert cli.main(argv) == status
-    assert says in " ".join(capsys.readouterr().err.split())
+    assert message in " ".join(capsys.readouterr().err.split())
 
 
 def test_figures_are_written_by_their_ending(tmp_path):
@@ -262,7 +262,7 @@ def test_an_unknown_kind_is_refused_in_a_sentence(capsys):
 
 
 @pytest.mark.parametrize(
-    ("option", "value", "says"),
+    ("option", "value", "message"),
     [
         ("--rtol", "0", "0 is not in the range 0<x<1."),
         ("--rtol", "nan", "nan is not in the range 0<x<1."),
@@ -270,9 +270,9 @@ def test_an_unknown_kind_is_refused_in_a_sentence(capsys):
         ("--voxel-size", "2", "2.0 is not in the range 0<x<=1."),
     ],
 )
-def test_demo_refuses_inadmissible_options(tmp_path, capsys, option, value, says):
+def test_demo_refuses_inadmissible_options(tmp_path, capsys, option, value, message):
     assert cli.main(["demo", "--out", str(tmp_path / "new"), option, value]) == 2
-    assert says.replace("0 is", "0.0 is" if option == "--rtol" else "0 is") in capsys.readouterr().err
+    assert message.replace("0 is", "0.0 is" if option == "--rtol" else "0 is") in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
 
 
@@ -302,44 +302,44 @@ def test_demo_retrieves_the_truth_and_writes_figures(monkeypatch, tmp_path, caps
     monkeypatch.setattr(inversion.demo, "FIT_RAYS", 1024)
     out = tmp_path / "new" / "folder"
     assert cli.main(["demo", "--out", str(out), "--voxel-size", "1", "--rtol", "0.03", "--quiet"]) == 0
-    printed, said = capsys.readouterr()
-    assert said == ""
+    output, errors = capsys.readouterr()
+    assert errors == ""
     assert sorted(p.name for p in out.iterdir()) == ["retrieval.png", "waveform.png"]
     for path in out.iterdir():
-        assert str(path) in printed
+        assert str(path) in output
         assert path.read_bytes().startswith(b"\x89PNG")
         assert path.stat().st_size < 150_000
-    rows = printed.split("std. error  unit\n")[1].split("reduced")[0].splitlines()
+    rows = output.split("std. error  unit\n")[1].split("reduced")[0].splitlines()
     assert len(rows) == 7
     for row in rows:
         true, start, estimate, error = map(float, re.findall(r"(?<= )-?[\d.]+(?:e-?\d+)?(?= |$)", row)[:4])
         assert abs(estimate - true) < 0.3 * abs(start - true), row
         assert abs(estimate - true) < 4.5 * error, row
-    assert "; converged" in printed
+    assert "; converged" in output
 
 
-def test_figures_are_renamed_when_whole(tmp_path):
-    class Failing(Figure):
+def test_a_figure_that_cannot_be_written_leaves_no_file(tmp_path):
+    class FailingFigure(Figure):
         def savefig(self, path, **kwargs):
             path.write_bytes(b"half")
             raise OSError("full")
 
     with pytest.raises(OSError, match="full"):
-        inversion.demo.save(Failing(), tmp_path / "a.png")
+        inversion.demo.save(FailingFigure(), tmp_path / "a.png")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_reading_only_the_first_lines_is_no_failure(tmp_path):
+def test_a_closed_pipe_is_no_failure(tmp_path):
     code = "import sys; from jaxlidar.cli import main; sys.exit(main(['spectra']))"
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
     environment["XDG_CACHE_HOME"] = str(tmp_path)
     command = f"{shlex.quote(sys.executable)} -c {shlex.quote(code)} | head -n 1"
-    ended = subprocess.run(command, shell=True, env=environment, capture_output=True, text=True)
-    assert ended.stderr == ""
-    assert ended.stdout.startswith("name")
+    process = subprocess.run(command, shell=True, env=environment, capture_output=True, text=True)
+    assert process.stderr == ""
+    assert process.stdout.startswith("name")
 
 
-def test_the_demo_tree_has_the_size_that_is_said():
+def test_the_demo_tree_has_its_stated_size():
     from jaxlidar.plants.demo import HEIGHT, LEAF_AREA, demo_scene
 
     voxels = demo_scene(0.25).canopy.voxels

@@ -1,4 +1,4 @@
-"""The command's `info` and `convert`: what they say of files, and what they make of them."""
+"""The commands `info` and `convert`: descriptions of files, and conversions."""
 
 import contextlib
 import re
@@ -13,12 +13,12 @@ from tests.io import test_las_waveforms, test_neon, test_pulsewaves
 
 
 @pytest.fixture(autouse=True)
-def no_programs(monkeypatch):
-    monkeypatch.setattr("jaxlidar.cli.group.kept_programs", contextlib.nullcontext)
+def no_compilation_cache(monkeypatch):
+    monkeypatch.setattr("jaxlidar.cli.group.compilation_cache", contextlib.nullcontext)
 
 
 @pytest.mark.parametrize(
-    ("name", "text", "says"),
+    ("name", "text", "description"),
     [
         ("a.csv", "400,0.1\n2400,0.4\n", "spectrum 'a' of 2 samples from 400 to 2400 nm"),
         ("a.toml", "[scene.ground]\nslope = 5", "scene: Scene("),
@@ -41,10 +41,10 @@ def no_programs(monkeypatch):
         ),
     ],
 )
-def test_info_reads_what_there_is(name, text, says, tmp_path, capsys):
+def test_info_describes_text_files(name, text, description, tmp_path, capsys):
     (tmp_path / name).write_text(text)
     assert cli.main(["info", str(tmp_path / name)]) == 0
-    assert capsys.readouterr().out.startswith(says)
+    assert capsys.readouterr().out.startswith(description)
     if name == "a.vox":
         assert cli.main(["convert", str(tmp_path / name), str(tmp_path / "b.toml")]) == 0
         assert "taken as empty: 1 voxels without a density" in capsys.readouterr().err
@@ -57,7 +57,7 @@ def test_info_of_recorded_waveforms(tmp_path, capsys):
     test_las_waveforms.small_files(tmp_path)
     test_neon.write_small(tmp_path / "a.npz")
     test_io.write_small(tmp_path / "a.h5")
-    for name, says in {
+    for name, description in {
         "a.pls": r"3 airborne shots, GPS times 400000\.0+ to 400002\.0+ s\nscanner a scanner, 1064\.0 nm\n"
         r"5 to 5 samples of 1 ns in up to 2 segments, with outgoing pulses\nzenith 8\.6 to 8\.6 degrees",
         "small.las": r"7 points: x .*\n4 airborne shots, .*\n10 to 40 samples of 1 ns in up to 2 segments, ",
@@ -66,21 +66,21 @@ def test_info_of_recorded_waveforms(tmp_path, capsys):
     }.items():
         assert cli.main(["info", str(tmp_path / name)]) == 0
         out = capsys.readouterr().out
-        assert re.match(says, out), out
+        assert re.match(description, out), out
 
 
 def test_airborne_waveforms_become_packets(shared, tmp_path, capsys):
     source, target = shared / "airborne" / "lvis_example2.pls", tmp_path / "b.las"
     assert cli.main(["convert", str(source), str(target)]) == 0
     assert "left out: outgoing pulses" in capsys.readouterr().err
-    sent, back = jl.io.read_pulsewaves(source), jl.io.read_las_waveforms(target)
-    assert len(back) == len(sent) > 0
-    for own, other in zip(sent[:100], back[:100]):
-        assert np.array_equal(own.waveform, other.waveform)
-        assert np.allclose(own.elevation, other.elevation, atol=2e-3)
+    original, converted = jl.io.read_pulsewaves(source), jl.io.read_las_waveforms(target)
+    assert len(converted) == len(original) > 0
+    for before, after in zip(original[:100], converted[:100]):
+        assert np.array_equal(before.waveform, after.waveform)
+        assert np.allclose(before.elevation, after.elevation, atol=2e-3)
 
 
-def test_what_packets_cannot_hold_is_refused(tmp_path, capsys):
+def test_shots_that_packets_cannot_hold_are_refused(tmp_path, capsys):
     for path, content in zip(("a.pls", "a.wvs"), test_pulsewaves.small_files()):
         (tmp_path / path).write_bytes(content)
     assert cli.main(["convert", str(tmp_path / "a.pls"), str(tmp_path / "b.las")]) == 1

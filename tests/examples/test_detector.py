@@ -10,7 +10,7 @@ PATH = Path(__file__).resolve().parents[2] / "examples" / "detector.py"
 
 
 @pytest.mark.slow
-def test_it_learns_where_the_ground_is(tmp_path, capsys):
+def test_the_detector_learns_the_height_of_the_ground(tmp_path, capsys):
     spec = importlib.util.spec_from_file_location("detector", PATH)
     assert spec is not None
     assert spec.loader is not None

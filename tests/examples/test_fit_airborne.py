@@ -1,4 +1,4 @@
-"""`examples/fit_airborne.py`: every format gives the same records, what it refuses, and fits of them."""
+"""`examples/fit_airborne.py`: records of every format, refused arguments, and fits."""
 
 import argparse
 import csv
@@ -14,33 +14,33 @@ import inversion
 from jaxlidar.io import AirborneShot, Segment, write_las_waveforms
 from tests.io import test_neon, test_pulsewaves
 
-WAY = np.array([0.0, 0.0, -0.149896229])
+HALF_PATH = np.array([0.0, 0.0, -0.149896229])
 GROUND, ANCHOR = 290.0, 300.0
 FWHM = 4.0
-NONE = {"pulse": None, "pulses": None, "pulse_width": None, "instrument": None}
+NO_OPTIONS = {"pulse": None, "pulses": None, "pulse_width": None, "instrument": None}
 
 
 @pytest.fixture(scope="module")
 def example():
-    """A module of the folder of examples, by name."""
+    """Return a function that imports a module of the folder of examples by name."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(Path(__file__).resolve().parents[2] / "examples"))
         yield importlib.import_module
 
 
-def echo(places, broadening=0.0, size=120):
-    """Counts of hard targets: Gaussians of the pulse's width about those samples, above a pedestal."""
+def echo(positions, broadening=0.0, size=120):
+    """Return counts of hard targets: Gaussians as wide as the pulse at (sample, height), above a pedestal."""
     sigma = np.hypot(FWHM / 2.3548, broadening)
-    samples = sum(a * np.exp(-0.5 * ((np.arange(size) - t) / sigma) ** 2) for t, a in places)
-    noise = np.random.default_rng(size + len(places)).normal(size=size)
+    samples = sum(a * np.exp(-0.5 * ((np.arange(size) - t) / sigma) ** 2) for t, a in positions)
+    noise = np.random.default_rng(size + len(positions)).normal(size=size)
     return np.round(np.maximum(20.0 + samples + 0.7 * noise, 0.0)).astype(np.uint16)
 
 
 def las_of(folder, *samples):
-    """A LAS file of shots straight down."""
-    place = {"anchor": np.array([5e5, 4e6, ANCHOR]), "direction": WAY}
+    """Write a LAS file of shots straight down."""
+    geometry = {"anchor": np.array([5e5, 4e6, ANCHOR]), "direction": HALF_PATH}
     shots = [
-        AirborneShot(i, **place, returning=(Segment(counts, 0.0),), gps_time=10.0 + i)
+        AirborneShot(i, **geometry, returning=(Segment(counts, 0.0),), gps_time=10.0 + i)
         for i, counts in enumerate(samples)
     ]
     write_las_waveforms(folder / "small.las", shots)
@@ -48,7 +48,7 @@ def las_of(folder, *samples):
 
 
 def written(folder):
-    """A small file of every format, and the options that it needs."""
+    """Write a small file of every format; return the options that each needs."""
     small = dict(zip((".pls", ".wvs"), test_pulsewaves.small_files()))
     for suffix, content in small.items():
         (folder / f"small{suffix}").write_bytes(content)
@@ -61,13 +61,13 @@ def written(folder):
 
 def test_every_format_gives_the_same_records(example, tmp_path):
     airborne = example("_airborne")
-    for path, given in written(tmp_path).items():
-        flight = airborne.read_flight(path, argparse.Namespace(**{**NONE, **given}))
+    for path, options in written(tmp_path).items():
+        flight = airborne.read_flight(path, argparse.Namespace(**{**NO_OPTIONS, **options}))
         # The counts of the small PulseWaves file are not those that its table has.
         flight = flight._replace(tables={})
         records = airborne.records_of(flight.shots[:], flight)
         assert len(records) >= 2
-        for record, shot in zip(records, flight.shots):
+        for record, shot in zip(records, flight.shots, strict=True):
             assert record.signal.shape == record.noise.shape == record.elevation.shape == shot.time.shape
             assert record.signal.max() == pytest.approx(1.0)
             np.testing.assert_array_equal(np.isfinite(record.noise), shot.recorded)
@@ -81,8 +81,8 @@ def test_every_format_gives_the_same_records(example, tmp_path):
 def test_saturated_samples_have_no_weight(example, tmp_path):
     airborne, counts = example("_airborne"), np.minimum(echo([(60, 200)]), 150)
     path = las_of(tmp_path, counts)
-    given = argparse.Namespace(**{**NONE, "pulse_width": FWHM, "saturation": 150.0})
-    flight = airborne.read_flight(path, given)
+    options = argparse.Namespace(**{**NO_OPTIONS, "pulse_width": FWHM, "saturation": 150.0})
+    flight = airborne.read_flight(path, options)
     (record,) = airborne.records_of(flight.shots[:], flight)
     assert record.saturated == np.sum(counts == 150) > 2
     np.testing.assert_array_equal(np.isinf(record.noise), counts == 150)
@@ -92,8 +92,8 @@ def test_saturated_samples_have_no_weight(example, tmp_path):
 def test_interleaved_digitisers_have_their_own_pedestals(example, tmp_path):
     airborne, counts = example("_airborne"), echo([(60, 100)])
     path = las_of(tmp_path, counts + 10 * (np.arange(counts.size) % 2).astype(np.uint16))
-    given = argparse.Namespace(**{**NONE, "pulse_width": FWHM, "interleaved": 2})
-    flight = airborne.read_flight(path, given)
+    options = argparse.Namespace(**{**NO_OPTIONS, "pulse_width": FWHM, "interleaved": 2})
+    flight = airborne.read_flight(path, options)
     (record,) = airborne.records_of(flight.shots[:], flight)
     assert np.abs(record.signal[np.r_[:45, 75:120]]).max() < 0.04
 
@@ -101,7 +101,7 @@ def test_interleaved_digitisers_have_their_own_pedestals(example, tmp_path):
 def test_a_pulse_is_read_from_a_table(example, tmp_path):
     airborne, path = example("_airborne"), las_of(tmp_path, echo([(60, 100)]))
     (tmp_path / "pulse.csv").write_text("-4,0\n-1,3\n0,4\n6,0\n")
-    flight = airborne.read_flight(path, argparse.Namespace(**{**NONE, "pulse": tmp_path / "pulse.csv"}))
+    flight = airborne.read_flight(path, argparse.Namespace(**{**NO_OPTIONS, "pulse": tmp_path / "pulse.csv"}))
     (record,) = airborne.records_of(flight.shots[:], flight)
     np.testing.assert_array_equal(record.lidar.pulse.time, [-4.0, -1.0, 0.0, 6.0])
 
@@ -111,7 +111,7 @@ def test_pulses_of_the_same_shots_are_found_by_time(example, tmp_path):
     airborne, path = example("_airborne"), las_of(tmp_path / "a", echo([(60, 100)]))
     pulses = next(p for p in written(tmp_path) if p.suffix == ".pls")
     with pytest.raises(ValueError, match=r"small\.pls: it has no pulse at the GPS times"):
-        airborne.read_flight(path, argparse.Namespace(**{**NONE, "pulses": pulses}))
+        airborne.read_flight(path, argparse.Namespace(**{**NO_OPTIONS, "pulses": pulses}))
 
 
 REFUSED = {
@@ -144,12 +144,12 @@ def test_refused(example, tmp_path, monkeypatch, case):
         example("fit_airborne").main(arguments)
 
 
-def test_echoes_say_what_is_fitted(example, tmp_path, monkeypatch, capsys):
+def test_echoes_decide_which_scene_is_fitted(example, tmp_path, monkeypatch, capsys):
     """One echo: ground; two: ground and canopy; none: a row with the reason."""
     module = example("fit_airborne")
     fitted = []
 
-    def fit(kind, records, echoes, own, impulse, path, progress):
+    def fit(kind, records, echoes, instrument, impulse, path, progress):
         fitted.append((kind.name, [record.shot.index for record in records]))
         time, n = np.arange(-60.0, 30.0), len(records)
         values = {"ground": np.zeros(n), "scale": np.ones(n)}
@@ -182,7 +182,7 @@ def test_echoes_say_what_is_fitted(example, tmp_path, monkeypatch, capsys):
     assert [row["quality"] for row in rows] == ["good", "good", "bad", "doubtful"]
     assert rows[2]["reasons"] == "no sample above the pedestal has weight"
     assert rows[3]["reasons"] == "broader by 3.0 ns than an echo of flat hard ground"
-    assert rows[0]["ground"] == pytest.approx(ANCHOR + 60 * WAY[2], abs=0.08)
+    assert rows[0]["ground"] == pytest.approx(ANCHOR + 60 * HALF_PATH[2], abs=0.08)
     assert rows[1]["canopy_top"] - rows[1]["ground"] == pytest.approx(5.0)
     assert {p.name for p in (tmp_path / "out").iterdir()} == {"small.csv", "small.nc", "small.png"}
     with (tmp_path / "out" / "small.csv").open(newline="") as file:
@@ -198,11 +198,14 @@ def test_echoes_say_what_is_fitted(example, tmp_path, monkeypatch, capsys):
 @pytest.mark.slow
 def test_planted_ground_is_found(example, tmp_path):
     """Single echoes, one of which is broadened: within four standard errors, and what broadened it."""
-    places = 60 + np.random.default_rng(5).uniform(-0.5, 0.5, 6)
-    records = [echo([(t, 150)], broadening=2.0 * (i == 5)) for i, t in enumerate(places)]
+    positions = 60 + np.random.default_rng(5).uniform(-0.5, 0.5, 6)
+    records = [echo([(t, 150)], broadening=2.0 * (i == 5)) for i, t in enumerate(positions)]
     arguments = [str(las_of(tmp_path, *records)), "--pulse-width", str(FWHM), "--out", str(tmp_path / "out")]
     rows = example("fit_airborne").main([*arguments, "--altitude", "500", "--model-error", "0"])
-    z = [(row["ground"] - (ANCHOR + t * WAY[2])) / row["ground_stderr"] for row, t in zip(rows, places)]
+    z = [
+        (row["ground"] - (ANCHOR + t * HALF_PATH[2])) / row["ground_stderr"]
+        for row, t in zip(rows, positions)
+    ]
     assert np.all(np.abs(z) < 4)
     assert all(row["ground_stderr"] < 0.02 for row in rows)
     assert rows[5]["broadening"] == pytest.approx(2.0, abs=4 * rows[5]["broadening_stderr"])
@@ -223,12 +226,12 @@ def test_from_file_to_table(example, shared, tmp_path, case):
     arguments, count = CASES[case]
     arguments = [str(shared / a) if "/" in a else a for a in arguments]
     rows = example("fit_airborne").main([*arguments, "--out", str(tmp_path)])
-    again = example("fit_airborne").main([*arguments, "--out", str(tmp_path)])
+    repeated_rows = example("fit_airborne").main([*arguments, "--out", str(tmp_path)])
     assert len(rows) == count
-    assert [row.get("ground") for row in rows] == [row.get("ground") for row in again]
+    assert [row.get("ground") for row in rows] == [row.get("ground") for row in repeated_rows]
     assert {path.suffix for path in tmp_path.iterdir()} == {".csv", ".nc", ".png", ".sqlite"}
     assert all(row["quality"] in ("good", "doubtful", "bad") for row in rows)
     assert all(row["reasons"] for row in rows if row["quality"] != "good")
-    found = [row for row in rows if "ground" in row]
-    assert len(found) >= count / 2
-    assert np.median([abs(row["ground"] - row["last_echo"]) for row in found]) < 0.5
+    fitted_rows = [row for row in rows if "ground" in row]
+    assert len(fitted_rows) >= count / 2
+    assert np.median([abs(row["ground"] - row["last_echo"]) for row in fitted_rows]) < 0.5

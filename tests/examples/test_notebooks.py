@@ -1,4 +1,4 @@
-"""The notebooks: their code runs, they are stored with their results, and tell of no machine."""
+"""The notebooks: their code runs, and they are stored with results and without paths of a machine."""
 
 import importlib.util
 import json
@@ -24,9 +24,9 @@ def cells(name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_results_are_stored(name):
-    found = cells(name)
-    outputs = [o for c in found for o in c["outputs"]]
-    assert [c["execution_count"] for c in found] == list(range(1, len(found) + 1))
+    code_cells = cells(name)
+    outputs = [o for c in code_cells for o in c["outputs"]]
+    assert [c["execution_count"] for c in code_cells] == list(range(1, len(code_cells) + 1))
     assert any("image/png" in o.get("data", {}) for o in outputs)
     assert not any(o["output_type"] == "error" or o.get("name") == "stderr" for o in outputs)
     assert not re.search(r"/(home|root|tmp|work|Users)/", (FOLDER / f"{name}.ipynb").read_text())
@@ -34,11 +34,11 @@ def test_results_are_stored(name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_notebooks_are_short_and_say_what_to_change(name):
-    found = all_cells(name)
-    assert len(found) <= 25
+    notebook_cells = all_cells(name)
+    assert len(notebook_cells) <= 25
     assert (FOLDER / f"{name}.ipynb").stat().st_size < 400_000
-    assert "".join(found[0]["source"]).startswith("# ")
-    assert "## What to change" in "".join(found[-1]["source"])
+    assert "".join(notebook_cells[0]["source"]).startswith("# ")
+    assert "## What to change" in "".join(notebook_cells[-1]["source"])
 
 
 @pytest.mark.slow
@@ -69,10 +69,10 @@ def test_there_are_notebooks():
     ]
 
 
-def test_the_gallery_shows_what_the_notebooks_show():
-    where = importlib.util.spec_from_file_location("gallery", EXAMPLES / "figures" / "gallery.py")
-    gallery = importlib.util.module_from_spec(where)
-    where.loader.exec_module(gallery)
+def test_the_gallery_has_the_pictures_of_the_notebooks():
+    spec = importlib.util.spec_from_file_location("gallery", EXAMPLES / "figures" / "gallery.py")
+    gallery = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(gallery)
     page = (EXAMPLES / "README.md").read_text()
     for name in NAMES:
         assert (gallery.GALLERY / f"{name}.png").read_bytes() == gallery.picture(name), name

@@ -1,4 +1,4 @@
-"""The examples that fit recorded shots: from file to table, and damaged shots that must not be good."""
+"""The example that fits GEDI shots: from file to table, and damaged shots that must not be judged good."""
 
 import csv
 import dataclasses
@@ -18,7 +18,7 @@ SHOTS = (19640119100108615, 19641102700108384)
 
 @pytest.fixture(scope="module")
 def example():
-    """A module of the folder of examples, by name."""
+    """Return a function that imports a module of the folder of examples by name."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(Path(__file__).resolve().parents[2] / "examples"))
         yield importlib.import_module
@@ -31,7 +31,7 @@ def gedi(shared):
 
 
 def noise_only(number):
-    """A record of 700 bins without a signal."""
+    """Return a record of 700 bins without a signal."""
     lag = np.arange(-20.0, 21.0)
     return GediShot(
         beam="BEAM0000",
@@ -51,9 +51,9 @@ def noise_only(number):
     )
 
 
-def test_what_cannot_be_fitted_has_a_row_with_its_reason(example, tmp_path):
-    unread = {"shot_number": 2, "beam": "BEAM0001", "quality": "bad", "reasons": "no pulse"}
-    rows, pictures = example("fit_gedi").fit_shots([noise_only(1), unread])
+def test_shots_that_cannot_be_fitted_have_a_row_with_the_reason(example, tmp_path):
+    unreadable = {"shot_number": 2, "beam": "BEAM0001", "quality": "bad", "reasons": "no pulse"}
+    rows, pictures = example("fit_gedi").fit_shots([noise_only(1), unreadable])
     assert pictures == []
     assert [row["quality"] for row in rows] == ["bad", "bad"]
     assert rows[0]["reasons"].startswith("no ground above the noise")
@@ -61,9 +61,9 @@ def test_what_cannot_be_fitted_has_a_row_with_its_reason(example, tmp_path):
     paths = example("_recorded").write_tables(rows, tmp_path / "v1.2 of a file", {"latitude": "degrees"})
     assert [path.name for path in paths] == ["v1.2 of a file.csv", "v1.2 of a file.nc"]
     with paths[0].open(newline="") as file:
-        read = list(csv.DictReader(file))
-    assert [row["shot_number"] for row in read] == ["1", "2"]
-    assert [row["latitude"] for row in read] == ["-10.0", "nan"]
+        table_rows = list(csv.DictReader(file))
+    assert [row["shot_number"] for row in table_rows] == ["1", "2"]
+    assert [row["latitude"] for row in table_rows] == ["-10.0", "nan"]
     xarray = pytest.importorskip("xarray")
     with xarray.open_dataset(paths[1], engine="h5netcdf") as table:
         assert table["reasons"].values.tolist() == [row["reasons"] for row in rows]
@@ -78,7 +78,7 @@ def test_vectors_are_columns(example):
 
 
 def damaged(shot):
-    """Copies of a shot, each with one kind of damage."""
+    """Yield kinds of damage and the changed fields of a shot."""
     record, mean, number = shot.waveform, shot.noise_mean, np.arange(shot.waveform.size)
     peak, signal = int(np.argmax(record)), shot.signal
     end = slice(0, peak + 6)
@@ -94,9 +94,11 @@ def damaged(shot):
 @pytest.mark.slow
 def test_damaged_shots_are_not_good(example, gedi):
     """Two good shots, and six damaged copies of each."""
-    whole = jl.io.read_gedi_l1b(gedi, SHOTS)
-    copies = [(name, dataclasses.replace(shot, **change)) for shot in whole for name, change in damaged(shot)]
-    rows, _ = example("fit_gedi").fit_shots([*whole, *(shot for _, shot in copies)])
+    intact = jl.io.read_gedi_l1b(gedi, SHOTS)
+    copies = [
+        (name, dataclasses.replace(shot, **change)) for shot in intact for name, change in damaged(shot)
+    ]
+    rows, _ = example("fit_gedi").fit_shots([*intact, *(shot for _, shot in copies)])
     assert [row["quality"] for row in rows[:2]] == ["good", "good"]
     assert [name for (name, _), row in zip(copies, rows[2:]) if row["quality"] == "good"] == []
     assert all(row["reasons"] for row in rows[2:])
@@ -107,9 +109,9 @@ def test_gedi_from_file_to_table(example, gedi, tmp_path, capsys):
     """One shot, twice: the second time from the checkpoint, with the same row."""
     arguments = [str(gedi), "--shot", str(SHOTS[0]), "--out", str(tmp_path)]
     (row,), _ = example("fit_gedi").main(arguments)
-    (again,), _ = example("fit_gedi").main(arguments)
+    (repeated_row,), _ = example("fit_gedi").main(arguments)
     assert row["quality"] == "good"
-    assert row["ground"] == again["ground"] == pytest.approx(797.9, abs=0.5)
+    assert row["ground"] == repeated_row["ground"] == pytest.approx(797.9, abs=0.5)
     assert row["shot_number"] == SHOTS[0]
     kinds = {path.suffix for path in tmp_path.iterdir()}
     assert kinds == {".csv", ".nc", ".png", ".sqlite"}

@@ -13,8 +13,8 @@ FOLDER = Path(__file__).resolve().parents[2] / "examples" / "validation"
 SCRIPTS = sorted(
     p.stem for p in FOLDER.glob("*.py") if not p.stem.startswith("_") and p.stem != "make_readme"
 )
-# Modules of the examples' folders, some under one name in several of them.
-OWN = (
+# Modules in the folders of examples: a name may stand for several files, so imports must not be kept.
+EXAMPLE_MODULES = (
     *("_airborne", "_common", "_crown", "_recorded", "_validation", "fit_airborne", "fit_gedi"),
     *("peers", "simulation_cost"),
 )
@@ -22,9 +22,9 @@ OWN = (
 
 @pytest.fixture
 def run(monkeypatch, tmp_path):
-    """Runs a script as `python examples/validation/name.py` would, and gives its record."""
+    """Return a function that runs a script as from the command line and returns its record."""
     monkeypatch.syspath_prepend(str(FOLDER))
-    for name in OWN:
+    for name in EXAMPLE_MODULES:
         monkeypatch.delitem(sys.modules, name, raising=False)
 
     def load(name):
@@ -47,29 +47,29 @@ def run(monkeypatch, tmp_path):
         return record
 
     yield call
-    for name in OWN:
+    for name in EXAMPLE_MODULES:
         sys.modules.pop(name, None)
 
 
 def over_error(record, word=""):
-    """Differences over their errors, of comparisons that have a word in their name or case."""
-    found = np.array([row["over error"] for row in record["rows"] if word in row["what"] + row["case"]])
-    assert found.size
-    return found
+    """Return differences over their errors, of comparisons with a word in their name or case."""
+    ratios = np.array([row["over error"] for row in record["rows"] if word in row["what"] + row["case"]])
+    assert ratios.size
+    return ratios
 
 
 def holds(record, word=""):
-    """Whether all are within their bounds, or four standard errors."""
+    """True if all comparisons are within their bounds, or four standard errors."""
     most = [1.0 if "bound" in row else 4.0 for row in record["rows"] if word in row["what"] + row["case"]]
     return bool(np.all(np.abs(over_error(record, word)) <= most))
 
 
 def test_the_page_is_made_from_the_records():
     code = "import make_readme; print(make_readme.page(), end='')"
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, cwd=FOLDER, check=True
     )
-    assert done.stdout == (FOLDER / "README.md").read_text()
+    assert process.stdout == (FOLDER / "README.md").read_text()
 
 
 @pytest.mark.parametrize("name", SCRIPTS)
@@ -80,7 +80,7 @@ def test_every_script_has_its_record_and_its_picture(name):
     assert "/" not in json.dumps(record["summary"]).replace("/cm2", "")
     assert f"](results/{name}.png)" in page
     assert (FOLDER / "results" / f"{name}.png").stat().st_size < 300_000
-    # Values of data that others own are not kept, but for the one furthest off.
+    # Records with data of other owners hold no values but those of the largest difference.
     assert ("rows" in record) is not any(word in name for word in ("rami", "leaf", "recorded"))
     for row in record["summary"]:
         assert row["difference"] == pytest.approx(row["here"] - row["there"])
@@ -114,8 +114,8 @@ def test_slabs(run):
         tau, _, ground, orders = module.SLABS["1, isotropic 0.9, 0.2"]
         del module.SLABS["1, isotropic 0.9, 0.2"]
         module.SLABS = {"wrong": (tau, module.jl.Isotropic(albedo=0.9), ground, orders)}
-        solved = module.solved
-        module.solved = lambda tau, *given: solved(1.05 * tau, *given)
+        solve = module.solve
+        module.solve = lambda tau, *arguments: solve(1.05 * tau, *arguments)
 
     wrong = run("discrete_ordinates", "--slabs", "1", "--rtol", "0.003", planted=plant)
     assert not holds(wrong, "reflectance factor")
@@ -163,7 +163,7 @@ def test_recorded_shots_of_riegl(run, shared):
     record = run("recorded_riegl", *(shared / "airborne" / f"riegl.{kind}" for kind in ("las", "pls")))
     assert holds(record, "anchor")
     assert holds(record, "as many")
-    # Where two echoes overlap, the scanner's software put its points otherwise.
+    # Where two echoes overlap, the software of the scanner places points differently.
     assert np.mean(np.abs(over_error(record, "echo,")) <= 1) > 0.95
 
 

@@ -1,4 +1,4 @@
-"""The lidar's defaults, conventions and refusals."""
+"""The lidar: defaults, conventions of axes and angles, and inadmissible arguments."""
 
 import equinox as eqx
 import jax
@@ -63,7 +63,7 @@ def test_azimuth_is_the_compass_direction_of_travel(azimuth, east, north, precis
     np.testing.assert_allclose(lidar.direction, [east / 2, north / 2, -(0.75**0.5)], atol=1e-6)
     slant = 400.0 / 0.75**0.5
     np.testing.assert_allclose(lidar.range_to_reference, slant, rtol=1e-6)
-    # A beam that travels east comes from a sensor in the west, at the altitude asked for.
+    # A beam that travels east comes from a sensor in the west, at the given altitude.
     np.testing.assert_allclose(
         lidar.sensor, [10 - slant * east / 2, 20 - slant * north / 2, 400.0], rtol=1e-5
     )
@@ -122,18 +122,22 @@ def test_inadmissible_input_is_refused(fields, message):
         Lidar(**fields)
 
 
-def test_light_that_flies_its_whole_budget_is_back_in_time():
-    """From points about an oblique beam, in random directions: at the end, the path is used up."""
+def test_the_longest_flight_returns_at_the_end_of_the_record():
+    """From points around an oblique beam, in random directions: flight and return use up the path length.
+
+    `longest_flight` is the distance after which the return path ends exactly with the record, and zero for
+    points from which no light returns in time.
+    """
     rng = np.random.default_rng(0)
     with jax.enable_x64(True):
         beam = make_beam(Lidar(altitude=800.0, zenith=35.0, azimuth=20.0))
         x = tuple(jnp.asarray(v) for v in rng.uniform(-30.0, 30.0, (3, 200)))
         w = rng.normal(size=(3, 200))
         w = tuple(jnp.asarray(v) for v in w / np.linalg.norm(w, axis=0))
-        left = jnp.asarray(rng.uniform(-50.0, 100.0, 200))
-        flight = beam.budget(x, w, left)
-        back = np.asarray(flight + beam.excess(along(x, w, flight)))
-        possible = np.asarray(beam.excess(x) < left)
+        max_path = jnp.asarray(rng.uniform(-50.0, 100.0, 200))
+        flight = beam.longest_flight(x, w, max_path)
+        path = np.asarray(flight + beam.excess(along(x, w, flight)))
+        possible = np.asarray(beam.excess(x) < max_path)
     assert 50 < possible.sum() < 200
-    np.testing.assert_allclose(back[possible], left[possible], atol=1e-6)
+    np.testing.assert_allclose(path[possible], max_path[possible], atol=1e-6)
     assert np.all(np.asarray(flight)[~possible] == 0.0)

@@ -1,4 +1,13 @@
-"""The photon counter: events against closed forms of Poisson processes and their dead time."""
+"""The photon counter: events against closed forms of Poisson processes and their dead time.
+
+With the rate lambda(t) of a pixel and its integral Lambda(t):
+
+- one event at most: it has the density lambda exp(-Lambda), and its mean is early (first-photon bias);
+- a constant rate n and the dead time tau: the mean rate of events is n / (1 + n tau);
+- recorded and lost photons together are a Poisson process again.
+
+Means are tested by z-scores, distributions by Kolmogorov-Smirnov and chi-squared tests. The keys are fixed.
+"""
 
 import dataclasses
 import functools
@@ -26,7 +35,7 @@ def some_wave(wavelength):
 
 
 def wave_of(photons, time, wavelength=(GREEN,)):
-    """A `Waveform` with so many expected photons per sample, (wavelengths, bins)."""
+    """Make a `Waveform` with the given expected number of photons per sample, (wavelengths, bins)."""
     energy = np.atleast_2d(photons) * PLANCK_TIMES_LIGHT / np.asarray(wavelength)[:, None]
     return dataclasses.replace(
         some_wave(wavelength),
@@ -37,7 +46,7 @@ def wave_of(photons, time, wavelength=(GREEN,)):
 
 
 def echo(photons):
-    """A Gaussian echo at zero, finely sampled."""
+    """Make a finely sampled Gaussian echo at time zero."""
     edges = np.linspace(-20.0, 20.0, 1601)
     return wave_of(photons * np.diff(stats.norm.cdf(edges, scale=SIGMA)), 0.5 * (edges[1:] + edges[:-1]))
 
@@ -58,7 +67,7 @@ def z_of_mean(values, expected):
 
 @pytest.fixture(scope="module")
 def survey():
-    """Two wavelengths over flat ground at 2 m, from ever further off nadir."""
+    """Simulate two wavelengths over flat ground at 2 m, from nadir to 40 degrees."""
     lidar = jl.Lidar(wavelength=(GREEN, 1064.0), energy=1e-9)
     shots = jl.Survey(lidar, np.zeros((SHOTS, 2)), np.linspace(0.0, 40.0, SHOTS))
     scene = jl.Scene(ground=jl.Ground(height=2.0, reflectance=(0.2, 0.4)))
@@ -70,13 +79,13 @@ def counts_of(events):
 
 
 def dispersion(counts):
-    """Two-sided probability of the index of dispersion of Poisson counts."""
+    """Compute the two-sided p-value of the index of dispersion of Poisson counts."""
     chi2 = (len(counts) - 1) * counts.var(ddof=1) / counts.mean()
     return 2 * min(stats.chi2.cdf(chi2, len(counts) - 1), stats.chi2.sf(chi2, len(counts) - 1))
 
 
 def first_photon_mean(photons):
-    """The mean of the density lambda(t) exp(-Lambda(t)), in ns, given that there is a photon."""
+    """Integrate the mean of the density lambda(t) exp(-Lambda(t)), in ns, given that there is a photon."""
 
     def density(x):
         return x * photons * stats.norm.pdf(x) * np.exp(-photons * stats.norm.cdf(x))
@@ -91,69 +100,69 @@ def first_photon_mean(photons):
 def test_first_photon_bias_is_that_of_the_closed_form(photons):
     """One pixel that sees one photon of a pulse: the echo reads early by up to twice its width."""
     bias = first_photon_mean(photons)
-    got = events_of(echo(photons), 400_000, pixels=1, dead_time=1e4)
-    assert abs(got.time.mean() / bias - 1) < 0.01
-    assert z_of_mean(got.time, bias) < Z_LIMIT
-    np.testing.assert_allclose(len(got) / 400_000, -np.expm1(-photons), atol=Z_LIMIT * 0.5 / np.sqrt(4e5))
-    first = got.time[:20_000]
-    share = lambda t: np.expm1(-photons * stats.norm.cdf(t, scale=SIGMA)) / np.expm1(-photons)  # noqa: E731
-    assert stats.kstest(first, share).pvalue > P_LIMIT
+    events = events_of(echo(photons), 400_000, pixels=1, dead_time=1e4)
+    assert abs(events.time.mean() / bias - 1) < 0.01
+    assert z_of_mean(events.time, bias) < Z_LIMIT
+    np.testing.assert_allclose(len(events) / 400_000, -np.expm1(-photons), atol=Z_LIMIT * 0.5 / np.sqrt(4e5))
+    first = events.time[:20_000]
+    cdf = lambda t: np.expm1(-photons * stats.norm.cdf(t, scale=SIGMA)) / np.expm1(-photons)  # noqa: E731
+    assert stats.kstest(first, cdf).pvalue > P_LIMIT
 
 
 def test_an_echo_without_dead_time_is_rejected_as_first_photons():
-    got = events_of(echo(8.0), 10_000, pixels=1, dead_time=0.0)
-    assert z_of_mean(got.time, first_photon_mean(8.0)) > Z_LIMIT
-    assert z_of_mean(got.time, 0.0) < Z_LIMIT
-    assert stats.kstest(got.time, stats.norm(scale=SIGMA).cdf).pvalue > P_LIMIT
+    events = events_of(echo(8.0), 10_000, pixels=1, dead_time=0.0)
+    assert z_of_mean(events.time, first_photon_mean(8.0)) > Z_LIMIT
+    assert z_of_mean(events.time, 0.0) < Z_LIMIT
+    assert stats.kstest(events.time, stats.norm(scale=SIGMA).cdf).pvalue > P_LIMIT
 
 
 def test_the_first_of_many_pixels_has_the_same_bias_and_each_pixel_its_own():
     photons, pulses, pixels = 8.0, 20_000, 16
-    got = events_of(echo(photons), pulses, pixels=pixels, dead_time=1e4)
-    _, first = np.unique(got.pulse, return_index=True)
-    assert z_of_mean(got.time[first], first_photon_mean(photons)) < Z_LIMIT
-    assert z_of_mean(got.time, first_photon_mean(photons / pixels)) < Z_LIMIT
-    # Every pixel sees one photon at most.
-    seen = -np.expm1(-photons / pixels)
-    assert z_of_mean(counts_of(got), pixels * seen) < Z_LIMIT
-    assert stats.chisquare(np.bincount(got.pixel, minlength=pixels)).pvalue > P_LIMIT
-    np.testing.assert_allclose(counts_of(got).var(), pixels * seen * (1 - seen), rtol=0.05)
-    assert np.unique(got.pulse * pixels + got.pixel).size == len(got)
+    events = events_of(echo(photons), pulses, pixels=pixels, dead_time=1e4)
+    _, first = np.unique(events.pulse, return_index=True)
+    assert z_of_mean(events.time[first], first_photon_mean(photons)) < Z_LIMIT
+    assert z_of_mean(events.time, first_photon_mean(photons / pixels)) < Z_LIMIT
+    # Every pixel records one photon at most: counts are binomial.
+    probability = -np.expm1(-photons / pixels)
+    assert z_of_mean(counts_of(events), pixels * probability) < Z_LIMIT
+    assert stats.chisquare(np.bincount(events.pixel, minlength=pixels)).pvalue > P_LIMIT
+    np.testing.assert_allclose(counts_of(events).var(), pixels * probability * (1 - probability), rtol=0.05)
+    assert np.unique(events.pulse * pixels + events.pixel).size == len(events)
 
 
 @pytest.mark.parametrize("dead_time", [3.2, 40.0])
 def test_dead_time_reduces_a_constant_rate(dead_time):
-    """n / (1 + n tau) per pixel, and the next term of renewal theory, for the pixels see at the start."""
+    """n / (1 + n tau) per pixel, and the next term of renewal theory, as all pixels are live at the start."""
     pixels, rate, window, pulses = 4, 2e8, 20_000.0, 200
     n = 1e-9 * rate / pixels
     interval = dead_time + 1 / n
     expected = (window - 1 / n) / interval + 0.5 * (1 / (n * interval) ** 2 + 1)
-    got = events_of(
+    events = events_of(
         dark(), pulses, pixels=pixels, dead_time=dead_time, background_rate=rate, window=(0.0, window)
     )
     np.testing.assert_allclose(expected, window * n / (1 + n * dead_time), rtol=1e-2)
-    assert z_of_mean(counts_of(got), pixels * expected) < Z_LIMIT
-    assert z_of_mean(counts_of(got), pixels * window * n) > Z_LIMIT
-    order = np.lexsort((got.time, got.pixel, got.pulse))
-    channel = (got.pulse * pixels + got.pixel)[order]
-    gaps = np.diff(got.time[order])[np.diff(channel) == 0]
+    assert z_of_mean(counts_of(events), pixels * expected) < Z_LIMIT
+    assert z_of_mean(counts_of(events), pixels * window * n) > Z_LIMIT
+    order = np.lexsort((events.time, events.pixel, events.pulse))
+    channel = (events.pulse * pixels + events.pixel)[order]
+    gaps = np.diff(events.time[order])[np.diff(channel) == 0]
     assert gaps.min() >= dead_time - 1e-6
     assert stats.kstest(gaps[:20_000] - dead_time, stats.expon(scale=1 / n).cdf).pvalue > P_LIMIT
 
 
-def test_what_was_lost_and_what_was_recorded_add_up_to_what_arrived(survey):
-    """Their sum is a Poisson count over many shots; what was recorded is not."""
+def test_lost_and_recorded_photons_add_up_to_the_arrivals(survey):
+    """Over many shots, the sum is a Poisson count; the recorded photons are not."""
     photons = 20.0
     scale = photons * PLANCK_TIMES_LIGHT / survey.wavelength / survey.energy.sum(axis=2)
     bright = dataclasses.replace(survey, energy=survey.energy * scale[:, :, None])
     window = (float(survey.time[0]) - 50.0, float(survey.time[-1]) + 50.0)
-    got = events_of(bright, 1, pixels=2, dead_time=5.0, background_rate=1e8, window=window)
+    events = events_of(bright, 1, pixels=2, dead_time=5.0, background_rate=1e8, window=window)
     for i, wavelength in enumerate(survey.wavelength):
-        kept = np.bincount(got.shot[got.wavelength == wavelength], minlength=SHOTS)
-        arrived = kept + got.lost[:, i]
+        recorded = np.bincount(events.shot[events.wavelength == wavelength], minlength=SHOTS)
+        arrived = recorded + events.lost[:, i]
         assert z_of_mean(arrived, photons + 0.1 * (window[1] - window[0])) < Z_LIMIT
         assert dispersion(arrived) > P_LIMIT
-        assert dispersion(kept) < P_LIMIT
+        assert dispersion(recorded) < P_LIMIT
 
 
 # -- background, jitter, probability ------------------------------------------------------------------------
@@ -161,12 +170,12 @@ def test_what_was_lost_and_what_was_recorded_add_up_to_what_arrived(survey):
 
 def test_background_is_poisson():
     fields = {"dead_time": 0.0, "background_rate": 5e6, "window": (-300.0, 700.0)}
-    got = events_of(dark(), 20_000, **fields)
-    counts = counts_of(got)
-    assert not got.signal.any()
+    events = events_of(dark(), 20_000, **fields)
+    counts = counts_of(events)
+    assert not events.signal.any()
     assert z_of_mean(counts, 5.0) < Z_LIMIT
     assert dispersion(counts) > P_LIMIT
-    assert stats.kstest(got.time[:20_000], stats.uniform(-300.0, 1000.0).cdf).pvalue > P_LIMIT
+    assert stats.kstest(events.time[:20_000], stats.uniform(-300.0, 1000.0).cdf).pvalue > P_LIMIT
     # Within a long record, gaps are exponential.
     long = events_of(dark(), 1, **{**fields, "window": (0.0, 4e6)})
     assert stats.kstest(np.diff(long.time), stats.expon(scale=200.0).cdf).pvalue > P_LIMIT
@@ -189,23 +198,23 @@ def test_detection_probability_scales_the_mean_of_each_wavelength(precision):
     time = np.arange(6.0)
     photons = np.array([[0.0, 4.0, 0.0, 1.0, 0.0, 0.0], [2.0, 0.0, 0.0, 0.0, 0.0, 2.0]])
     wave = wave_of(photons, time, (GREEN, 1064.0))
-    got = events_of(wave, 20_000, dead_time=0.0, detection_probability=(0.2, 0.6))
-    assert got.signal.all()
+    events = events_of(wave, 20_000, dead_time=0.0, detection_probability=(0.2, 0.6))
+    assert events.signal.all()
     for wavelength, row, probability in zip((GREEN, 1064.0), photons, (0.2, 0.6)):
-        mine = got.wavelength == wavelength
-        sample = np.floor(got.time[mine] + 0.5).astype(int)
-        found = np.bincount(sample, minlength=6)
+        of_wavelength = events.wavelength == wavelength
+        sample = np.floor(events.time[of_wavelength] + 0.5).astype(int)
+        counts = np.bincount(sample, minlength=6)
         expected = 20_000 * probability * row
-        assert np.all(np.abs(found - expected) <= Z_LIMIT * np.sqrt(expected))
+        assert np.all(np.abs(counts - expected) <= Z_LIMIT * np.sqrt(expected))
     # Uniform within the samples.
-    assert stats.kstest((got.time[:20_000] + 0.5) % 1.0, "uniform").pvalue > P_LIMIT
-    np.testing.assert_allclose(got.height, -0.5 * jl.SPEED_OF_LIGHT * got.time, rtol=1e-6)
+    assert stats.kstest((events.time[:20_000] + 0.5) % 1.0, "uniform").pvalue > P_LIMIT
+    np.testing.assert_allclose(events.height, -0.5 * jl.SPEED_OF_LIGHT * events.time, rtol=1e-6)
 
 
 def test_samples_that_noise_put_below_zero_send_nothing():
-    got = events_of(wave_of([0.0, 4.0, -0.03, 0.0], np.arange(4.0)), 5000, dead_time=0.0)
-    assert np.all(np.abs(got.time - 1.0) <= 0.5)
-    assert z_of_mean(counts_of(got), 4.0) < Z_LIMIT
+    events = events_of(wave_of([0.0, 4.0, -0.03, 0.0], np.arange(4.0)), 5000, dead_time=0.0)
+    assert np.all(np.abs(events.time - 1.0) <= 0.5)
+    assert z_of_mean(counts_of(events), 4.0) < Z_LIMIT
 
 
 # -- structure ---------------------------------------------------------------------------------------------
@@ -217,12 +226,12 @@ def test_no_light_and_too_much(precision, tmp_path):
     assert str(none).startswith("0 photon events of 1 shot with 10 pulses")
     none.save(tmp_path / "none.nc")
     assert len(jl.open(tmp_path / "none.nc")) == 0
-    # A sample that would blind any detector: a pixel has an event each dead time, and all else is lost.
+    # A flood of light: each pixel has an event in each dead time, and all other photons are lost.
     flood = wave_of([0.0, 1e12, 1e12, 1e12, 1e12, 0.0, 0.0], np.arange(7.0))
-    got = events_of(flood, 3, pixels=2, dead_time=3.2)
-    assert len(got) == 2 * 2 * 3
-    assert np.allclose(np.sort(got.time)[[0, -1]], [0.5, 3.7], atol=1e-6)
-    np.testing.assert_allclose(got.lost.sum(), 3 * 4e12, rtol=1e-5)
+    events = events_of(flood, 3, pixels=2, dead_time=3.2)
+    assert len(events) == 2 * 2 * 3
+    assert np.allclose(np.sort(events.time)[[0, -1]], [0.5, 3.7], atol=1e-6)
+    np.testing.assert_allclose(events.lost.sum(), 3 * 4e12, rtol=1e-5)
     with pytest.raises(ValueError, match=r"give 4e\+12 events; admissible are up to 1e\+08"):
         events_of(flood, 1, dead_time=0.0)
     with pytest.raises(ValueError, match=r"give 4e\+15 photons; admissible are up to 1e\+15"):
@@ -230,32 +239,32 @@ def test_no_light_and_too_much(precision, tmp_path):
 
 
 def test_the_waveforms_of_a_survey(survey, monkeypatch, tmp_path):
-    got = events_of(survey, 50, dead_time=0.0)
+    events = events_of(survey, 50, dead_time=0.0)
     mean = 50 * survey.energy.sum(axis=2, dtype=float) / (PLANCK_TIMES_LIGHT / survey.wavelength)
     for i, wavelength in enumerate(survey.wavelength):
-        counts = np.bincount(got.shot[got.wavelength == wavelength], minlength=SHOTS)
+        counts = np.bincount(events.shot[events.wavelength == wavelength], minlength=SHOTS)
         assert np.all(np.abs(counts - mean[:, i]) < 5 * np.sqrt(mean[:, i]))
         assert stats.chisquare(counts, counts.sum() * mean[:, i] / mean[:, i].sum()).pvalue > P_LIMIT
-    means = np.bincount(got.shot, got.height) / np.bincount(got.shot)
+    means = np.bincount(events.shot, events.height) / np.bincount(events.shot)
     np.testing.assert_allclose(means, 2.0, atol=0.1)
     alone = events_of(survey[3], 50, dead_time=0.0)
-    np.testing.assert_allclose(alone.window[0], got.window[3], rtol=1e-4)
-    assert np.all(np.diff(got.shot) >= 0)
-    order = np.lexsort((got.time, got.pulse, got.shot))
-    assert np.array_equal(order, np.arange(len(got)))
-    again, other = events_of(survey, 50, dead_time=0.0), events_of(survey, 50, seed=1, dead_time=0.0)
-    assert np.array_equal(again.time, got.time)
-    assert not np.array_equal(other.time[:9], got.time[:9])
-    # A few shots at a time draw other numbers of the same kind.
-    monkeypatch.setattr(photon_counter, "_BLOCK", 16 * 50 * 2 * 150)
-    parts = events_of(survey, 50, dead_time=0.0)
-    assert set(parts.shot) == set(range(SHOTS))
-    assert abs(len(parts) - mean.sum()) < Z_LIMIT * np.sqrt(mean.sum())
-    got.save(tmp_path / "events.nc")
+    np.testing.assert_allclose(alone.window[0], events.window[3], rtol=1e-4)
+    assert np.all(np.diff(events.shot) >= 0)
+    order = np.lexsort((events.time, events.pulse, events.shot))
+    assert np.array_equal(order, np.arange(len(events)))
+    same_key, another_key = (events_of(survey, 50, seed=seed, dead_time=0.0) for seed in (0, 1))
+    assert np.array_equal(same_key.time, events.time)
+    assert not np.array_equal(another_key.time[:9], events.time[:9])
+    # Blocks of a few shots draw other random numbers from the same distribution.
+    monkeypatch.setattr(photon_counter, "_BLOCK_SIZE", 16 * 50 * 2 * 150)
+    in_blocks = events_of(survey, 50, dead_time=0.0)
+    assert set(in_blocks.shot) == set(range(SHOTS))
+    assert abs(len(in_blocks) - mean.sum()) < Z_LIMIT * np.sqrt(mean.sum())
+    events.save(tmp_path / "events.nc")
     back = jl.open(tmp_path / "events.nc")
-    for name in (f.name for f in dataclasses.fields(got)):
-        sent, found = (np.asarray(getattr(events, name)) for events in (got, back))
-        assert (sent.dtype, sent.tobytes()) == (found.dtype, found.tobytes())
+    for name in (f.name for f in dataclasses.fields(events)):
+        saved, read = (np.asarray(getattr(record, name)) for record in (events, back))
+        assert (saved.dtype, saved.tobytes()) == (read.dtype, read.tobytes())
 
 
 def test_a_waveform_is_recorded_as_its_energies_are(survey):

@@ -1,4 +1,4 @@
-"""Pulses against quadrature in high precision, at the edges of their parameters, and their derivatives."""
+"""Pulses against quadrature in high precision, at the extremes of their parameters, and their derivatives."""
 
 import functools
 import itertools
@@ -18,7 +18,7 @@ from jaxlidar.instrument.pulse import (
 )
 
 TOLERANCE = {"float32": 1e-6, "float64": 1e-13}
-# Compiling takes far longer than running here.
+# Without optimisation: compilation takes far longer than execution here.
 quick_jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
 cumulative = quick_jit(lambda pulse, t, jitter: pulse.cumulative(t, jitter))
 power = quick_jit(lambda pulse, t, jitter: pulse.power(t, jitter))
@@ -32,8 +32,8 @@ def exact_gaussian(t, jitter, fwhm):
     return mp.ncdf(t / s)
 
 
-def exact_pieces(t, jitter, knots):
-    """The blurred running integral of the power through `knots`, by quadrature between them."""
+def exact_segments(t, jitter, knots):
+    """Integrate the power through `knots`, blurred by jitter, by quadrature between them."""
     area = sum((b[0] - a[0]) * (a[1] + b[1]) / 2 for a, b in itertools.pairwise(knots))
     total = mp.mpf(0)
     for (ta, pa), (tb, pb) in itertools.pairwise(knots):
@@ -53,13 +53,14 @@ def exact_emg(t, jitter, fwhm, decay):
     s, t = mp.sqrt((fwhm / FWHM) ** 2 + mp.mpf(jitter) ** 2), t + decay
     if s == 0:
         return 1 - mp.exp(-t / decay) if t > 0 else mp.mpf(0)
-    # mpmath's range is unlimited, so the textbook form serves with enough digits.
+    # The textbook form overflows in floating point, but not in mpmath; with enough digits it is exact.
     with mp.workdps(60):
         tail = mp.exp(s**2 / (2 * decay**2) - t / decay) * mp.ncdf(t / s - s / decay)
         return mp.ncdf(t / s) - tail
 
 
-KNOTS = [(-3.0, 0.0), (-1.0, 2.0), (-0.75, 1.5), (4.0, 0.25), (6.0, 1.0)]  # jumps at its end
+# The power jumps to zero at the end.
+KNOTS = [(-3.0, 0.0), (-1.0, 2.0), (-0.75, 1.5), (4.0, 0.25), (6.0, 1.0)]
 SAMPLED = {"time": [a for a, _ in KNOTS], "power": [b for _, b in KNOTS]}
 
 
@@ -73,11 +74,11 @@ CASES = {
     "gaussian, instant": (lambda: GaussianPulse(0.0), lambda t, j: exact_gaussian(t, j, 0.0)),
     "rectangle": (
         lambda: RectangularPulse(6.0),
-        lambda t, j: exact_pieces(t, j, [(-3.0, 1.0), (3.0, 1.0)]),
+        lambda t, j: exact_segments(t, j, [(-3.0, 1.0), (3.0, 1.0)]),
     ),
     "rectangle, narrow": (
         lambda: RectangularPulse(0.0078125),
-        lambda t, j: exact_pieces(t, j, [(-0.00390625, 1.0), (0.00390625, 1.0)]),
+        lambda t, j: exact_segments(t, j, [(-0.00390625, 1.0), (0.00390625, 1.0)]),
     ),
     "rectangle, instant": (lambda: RectangularPulse(0.0), lambda t, j: exact_gaussian(t, j, 0.0)),
     "exponential": (
@@ -104,10 +105,10 @@ CASES = {
         lambda: ExponentiallyModifiedGaussianPulse(0.0, 0.0),
         lambda t, j: exact_gaussian(t, j, 0.0),
     ),
-    "sampled": (sampled, lambda t, j: exact_pieces(t, j, KNOTS)),
+    "sampled": (sampled, lambda t, j: exact_segments(t, j, KNOTS)),
 }
 NAMES = list(CASES)
-# Representable in both precisions, so that rounding of the input is no part of the error.
+# Representable in both precisions, so that rounding of the input does not add to the error.
 TIMES = [
     -1000.0,
     -20.0,
@@ -137,9 +138,9 @@ def expected_of(name, jitter):
 @pytest.mark.parametrize("name", NAMES)
 def test_cumulative_is_exact(name, jitter, precision):
     expected = expected_of(name, jitter)
-    got = cumulative(CASES[name][0](), np.array(TIMES, precision), jitter)
-    assert got.dtype == precision
-    np.testing.assert_allclose(got, expected, rtol=0, atol=TOLERANCE[precision])
+    computed = cumulative(CASES[name][0](), np.array(TIMES, precision), jitter)
+    assert computed.dtype == precision
+    np.testing.assert_allclose(computed, expected, rtol=0, atol=TOLERANCE[precision])
 
 
 @functools.cache
@@ -149,12 +150,12 @@ def exponentials(times, jitter, decay):
 
 @pytest.mark.parametrize("ratio", [2.0**k for k in range(-8, 9, 2)])
 def test_exponential_is_exact_for_every_ratio_of_width_to_decay(ratio, precision):
-    """Dense in time, so that both evaluations and the change between them are met."""
+    """Dense in time, so that both formulas of the Mills ratio and the switch between them are tested."""
     jitter, decay = 2.0, 2.0 / ratio
     t = np.linspace(-12, 24, 145)
     expected = exponentials(tuple(t.tolist()), jitter, decay)
-    got = cumulative(ExponentiallyModifiedGaussianPulse(0.0, decay), t.astype(precision), jitter)
-    np.testing.assert_allclose(got, expected, rtol=0, atol=TOLERANCE[precision])
+    computed = cumulative(ExponentiallyModifiedGaussianPulse(0.0, decay), t.astype(precision), jitter)
+    np.testing.assert_allclose(computed, expected, rtol=0, atol=TOLERANCE[precision])
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -168,7 +169,7 @@ def test_area_is_one_and_the_integral_never_falls(name, precision):
 
 @pytest.mark.parametrize("jitter", [0.0, 0.7])
 @pytest.mark.parametrize("name", NAMES)
-def test_support_leaves_out_less_than_it_says(name, jitter):
+def test_less_than_1e_7_of_the_energy_lies_outside_the_support(name, jitter):
     with jax.enable_x64(True):
         pulse = CASES[name][0]()
         low, high = pulse.support(jitter)
@@ -185,11 +186,11 @@ def test_mean_and_std_are_those_of_the_shape(name, precision):
     low, high = pulse.support(jitter)
     edges = np.linspace(low, high, 20001)
     with jax.enable_x64(True):
-        share = np.diff(np.asarray(cumulative(pulse, edges, jitter)))
+        energy = np.diff(np.asarray(cumulative(pulse, edges, jitter)))
     centres = (edges[1:] + edges[:-1]) / 2
-    mean = np.sum(share * centres)
-    # Bins add their own variance; jitter's adds to the pulse's.
-    variance = np.sum(share * (centres - mean) ** 2) - (edges[1] - edges[0]) ** 2 / 12 - jitter**2
+    mean = np.sum(energy * centres)
+    # The variances of the bins' width and of the jitter add to that of the pulse.
+    variance = np.sum(energy * (centres - mean) ** 2) - (edges[1] - edges[0]) ** 2 / 12 - jitter**2
     np.testing.assert_allclose(pulse.mean, mean, atol=2e-5 * (high - low))
     np.testing.assert_allclose(pulse.std, np.sqrt(max(variance, 0.0)), atol=2e-4 * (high - low))
 
@@ -291,7 +292,7 @@ def test_a_finely_sampled_shape_is_that_shape(precision):
     pulse = GaussianPulse(6.0)
     copy = SampledPulse(time, 37.0 * np.asarray(pulse.power(time)))
     t = np.linspace(-15, 15, 61)
-    # Linear pieces err by (step^2 / 8) p'', here 5e-6 of the area's scale.
+    # Linear interpolation has the error (step^2 / 8) p'', here 5e-6 of the area.
     np.testing.assert_allclose(cumulative(copy, t, 0.4), cumulative(pulse, t, 0.4), atol=2e-5)
     shifted = SampledPulse(time + 2.0, pulse.power(time))
     np.testing.assert_allclose(cumulative(shifted, t + 2.0, 0.0), cumulative(copy, t, 0.0), atol=2e-6)
@@ -321,8 +322,8 @@ def test_jit_and_vmap_without_retracing():
             function(GaussianPulse(width), t), GaussianPulse(width).cumulative(t, 0.1), atol=1e-6
         )
     assert len(traces) == 1
-    many = eqx.filter_vmap(lambda w: RectangularPulse(w).cumulative(t))(jnp.array([0.0, 1.0, 5.0]))
-    np.testing.assert_allclose(many[2], RectangularPulse(5.0).cumulative(t), atol=1e-7)
+    by_length = eqx.filter_vmap(lambda w: RectangularPulse(w).cumulative(t))(jnp.array([0.0, 1.0, 5.0]))
+    np.testing.assert_allclose(by_length[2], RectangularPulse(5.0).cumulative(t), atol=1e-7)
     grid = sampled().cumulative(t.reshape(5, 1), 0.2)
     np.testing.assert_allclose(grid[:, 0], sampled().cumulative(t, 0.2), atol=1e-7)
 

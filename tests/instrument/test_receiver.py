@@ -1,4 +1,8 @@
-"""Detection, noise and digitisation: every field has its effect; noise has its statistics."""
+"""Detection, noise and digitisation: the effect of every field, and the statistics of noise.
+
+Poisson counts of mean m have the variance m; the variance of their sample variance over n draws is (m + 2
+m^2) / n.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -7,7 +11,7 @@ import pytest
 
 from jaxlidar._constants import PLANCK_TIMES_LIGHT
 from jaxlidar.instrument.receiver import Receiver, first_return_window, record
-from tests.helpers import NARROW
+from tests.helpers import BY_PRECISION
 
 WAVELENGTH = np.array([532.0, 1064.0])
 PHOTON = PLANCK_TIMES_LIGHT / WAVELENGTH
@@ -15,8 +19,7 @@ Z_LIMIT = 4.5  # one false alarm in 150,000
 
 
 def z_scores(counts, expected):
-    """How far the mean and the variance of draws (draws, ...) lie from a Poisson variable's, in
-    standard errors."""
+    """Compare mean and variance of draws (draws, ...) with those of Poisson variables, in standard errors."""
     n = counts.shape[0]
     mean = (counts.mean(0) - expected) / np.sqrt(expected / n)
     # The variance of a sample variance: (mu4 - s^4) / n, mu4 = m + 3 m^2.
@@ -38,58 +41,59 @@ def test_the_default_changes_nothing_without_a_key(precision):
     np.testing.assert_array_equal(record(energy, WAVELENGTH, Receiver()), energy)
 
 
-@NARROW
+@BY_PRECISION
 def test_shot_noise_is_poisson(precision):
-    """Means below the sampler's change of method at 10, above it, and where the normal takes over."""
+    """Means below the sampler's change of method at 10, above it, and in the range of the normal limit."""
     photons = np.array([[0.3, 4.0, 40.0, 900.0, 3e6], [2.0, 12.0, 150.0, 5e4, 2e9]])
-    got = draws(jnp.asarray(photons * PHOTON[:, None]), Receiver(), 4000) / PHOTON[:, None]
-    mean, variance = z_scores(got, photons)
+    counts = draws(jnp.asarray(photons * PHOTON[:, None]), Receiver(), 4000) / PHOTON[:, None]
+    mean, variance = z_scores(counts, photons)
     assert mean < Z_LIMIT
     assert variance < Z_LIMIT
     small = photons < 1e4
-    np.testing.assert_allclose(got[:, small], np.round(got[:, small]), atol=2e-3)
+    np.testing.assert_allclose(counts[:, small], np.round(counts[:, small]), atol=2e-3)
 
 
 def test_planted_wrong_noise_is_rejected():
     photons = np.array([[4.0, 40.0], [12.0, 150.0]])
     energy = jnp.asarray(photons * PHOTON[:, None])
-    got = draws(energy, Receiver(), 4000) / PHOTON[:, None]
-    assert z_scores(got, 1.03 * photons)[0] > Z_LIMIT
+    counts = draws(energy, Receiver(), 4000) / PHOTON[:, None]
+    assert z_scores(counts, 1.03 * photons)[0] > Z_LIMIT
     swapped = draws(energy, Receiver(), 4000) / PHOTON[::-1, None]  # the photon energies exchanged
     assert z_scores(swapped, photons * PHOTON[:, None] / PHOTON[::-1, None])[1] > Z_LIMIT
 
 
-@NARROW
+@BY_PRECISION
 def test_background_is_recorded_and_is_noisy(precision):
     receiver = Receiver(background=20 * PHOTON[1])
     energy = jnp.zeros((2, 3))
     np.testing.assert_allclose(record(energy, WAVELENGTH, receiver), 20 * PHOTON[1], rtol=1e-6)
-    got = draws(energy, receiver, 3000) / PHOTON[:, None]
-    assert max(z_scores(got, np.broadcast_to([[10.0], [20.0]], (2, 3)))) < Z_LIMIT
+    counts = draws(energy, receiver, 3000) / PHOTON[:, None]
+    assert max(z_scores(counts, np.broadcast_to([[10.0], [20.0]], (2, 3)))) < Z_LIMIT
 
 
 def test_photon_noise_can_be_left_out_and_electronic_noise_is_normal(precision):
     quiet = Receiver(photon_noise=False)
     energy = jnp.full((2, 4), 1e-17)
     np.testing.assert_array_equal(record(energy, WAVELENGTH, quiet, key=jax.random.key(1)), energy)
-    got = draws(energy, Receiver(photon_noise=False, electronic_noise=3e-18), 4000)
-    z = (got - 1e-17) / 3e-18
+    noisy = draws(energy, Receiver(photon_noise=False, electronic_noise=3e-18), 4000)
+    z = (noisy - 1e-17) / 3e-18
     assert np.abs(z.mean(0)).max() * np.sqrt(4000) < Z_LIMIT
     assert np.abs(z.var(0) - 1).max() * np.sqrt(4000 / 2) < Z_LIMIT
     assert np.abs(np.mean(z**4) - 3) * np.sqrt(8 * 4000 / 96) < Z_LIMIT
 
 
-def test_energies_below_detection_are_lost(precision):
+def test_energies_below_the_detection_threshold_are_recorded_as_zero(precision):
     energy = jnp.array([[1e-18, 2e-18, 3e-18]])
-    got = record(energy, 1064.0, Receiver(detection_threshold=2e-18))
-    np.testing.assert_allclose(got, [[0.0, 2e-18, 3e-18]], rtol=1e-6)
+    recorded = record(energy, 1064.0, Receiver(detection_threshold=2e-18))
+    np.testing.assert_allclose(recorded, [[0.0, 2e-18, 3e-18]], rtol=1e-6)
+    # Without a threshold, samples that noise makes negative stay negative.
     noisy = Receiver(photon_noise=False, electronic_noise=1e-18)
-    assert draws(jnp.zeros((2, 50)), noisy, 2).min() < 0  # at no threshold nothing is lost
+    assert draws(jnp.zeros((2, 50)), noisy, 2).min() < 0
 
 
 def test_saturation_clips(precision):
-    got = record(jnp.array([[1.0, 5.0]]), 1064.0, Receiver(saturation=2.0))
-    np.testing.assert_array_equal(got, [[1.0, 2.0]])
+    recorded = record(jnp.array([[1.0, 5.0]]), 1064.0, Receiver(saturation=2.0))
+    np.testing.assert_array_equal(recorded, [[1.0, 2.0]])
 
 
 def test_quantisation_is_to_the_nearest_level_and_transparent_to_derivatives(precision):
@@ -170,7 +174,7 @@ def test_first_return_window_has_a_threshold():
 
 
 def test_first_return_window_raises_a_peak_that_fixed_bins_split():
-    """The paper's artefact: an echo of one bin's length at every position against fixed bins."""
+    """The paper's artefact, with an echo as long as a bin at positions from 0 to 1 bin after a fixed edge."""
     time = np.arange(0.0, 20.0, 0.1) + 0.05
     peaks = []
     for start in np.arange(5.0, 6.0, 0.1):

@@ -1,7 +1,7 @@
-"""Where the digitiser's bins lie: at fixed instants, or opened at the first return as in the paper (2.1).
+"""Position of the digitiser's bins: at fixed instants, or from the first return on as in the paper (2.1).
 
-A plate 1 m above the ground under a 2 ns pulse, sampled every 4 ns. Opening the bins at the first
-return keeps the energy, starts the record flush with the first echo, and changes the peak of the ground.
+Layout: a plate 1 m above the ground under a pulse of 2 ns, sampled every 4 ns. Bins that start at the first
+return conserve the energy, start the record at the edge of the first echo, and change the peak of the ground.
 """
 
 import jax
@@ -25,7 +25,7 @@ def record(window, height):
     return jl.simulate(lidar, scene, key=KEY, max_orders=1)
 
 
-def test_energy_is_kept_and_the_record_starts_with_the_first_return():
+def test_energy_is_conserved_and_the_record_starts_with_the_first_return():
     fixed, opened = record("fixed", 1.0), record("first return", 1.0)
     total = 0.3 + 0.3**2 * 0.5
     assert float(jnp.sum(fixed.reflectance)) == pytest.approx(total, rel=1e-4)
@@ -34,14 +34,14 @@ def test_energy_is_kept_and_the_record_starts_with_the_first_return():
     # The plate returns at -6.67 ns; its pulse rises about 2.7 ns earlier.
     first = float(opened.time[0]) - 2.0
     assert first == pytest.approx(-6.67 - 2.7, abs=0.6)
-    for name, part in opened.components.items():
-        assert float(jnp.sum(part)) == pytest.approx(
+    for name, component in opened.components.items():
+        assert float(jnp.sum(component)) == pytest.approx(
             float(jnp.sum(fixed.components[name])), rel=5e-3, abs=1e-6
         )
 
 
 def test_the_ground_peak_depends_on_the_scene_above_it():
-    """At fixed instants the ground's samples do not change when the plate moves; otherwise they do."""
+    """The height of the plate changes the samples of the ground, unless they lie at fixed instants."""
     grounds = {}
     for window in ("fixed", "first return"):
         grounds[window] = [float(jnp.max(record(window, h).components["ground"])) for h in (2.0, 2.2)]

@@ -1,4 +1,8 @@
-"""Surveys: the geometry of every shot against closed forms, and what is refused."""
+"""Surveys: the geometry of every shot against closed forms, and inadmissible arguments.
+
+At the height H, a beam at the angle alpha from the vertical meets flat ground at the distance H tan(alpha),
+after the slant range H / cos(alpha).
+"""
 
 import jax.numpy as jnp
 import numpy as np
@@ -7,7 +11,7 @@ import pytest
 import jaxlidar as jl
 
 LINE = {"start": (100.0, 50.0), "end": (160.0, 130.0), "speed": 20.0, "pulse_rate": 400.0}
-# Of the line above: unit vectors ahead and to the right.
+# Unit vectors along this line and to its right.
 AHEAD, RIGHT = np.array([0.6, 0.8]), np.array([0.8, -0.6])
 HEIGHT = 300.0
 
@@ -17,13 +21,13 @@ def scanned(pattern, **changes):
 
 
 def on_ground(survey):
-    """Places ahead of and right of the platform, and times; the platform flies evenly."""
+    """Return positions ahead of and right of the platform, which has a constant speed, and times."""
     time = np.arange(len(survey)) / LINE["pulse_rate"]
     off = survey.position - np.array(LINE["start"]) - np.outer(time * LINE["speed"], AHEAD)
     return off @ AHEAD, off @ RIGHT, time
 
 
-def test_a_shot_is_the_lidar_that_stands_and_looks_there():
+def test_a_shot_is_a_lidar_with_its_position_and_direction():
     survey = jl.Survey(
         jl.Lidar(altitude=HEIGHT, divergence=2.0), [(3.0, 4.0), (5.0, -6.0)], [10.0, 40.0], 70.0
     )
@@ -35,7 +39,7 @@ def test_a_shot_is_the_lidar_that_stands_and_looks_there():
         assert np.isclose(survey.sensor[i, 2], HEIGHT)
 
 
-def test_parts_and_ends_of_a_survey():
+def test_slices_and_indices_of_a_survey():
     survey = jl.Survey.grid(jl.Lidar(zenith=3.0), (0, 0), (30, 30), 10.0)
     assert len(survey) == 16
     assert np.array_equal(survey[4:8].position, survey.position[4:8])
@@ -45,7 +49,7 @@ def test_parts_and_ends_of_a_survey():
     assert np.all(survey.zenith == np.float32(3.0))
 
 
-def test_places_keep_their_digits_in_single_precision():
+def test_positions_keep_their_digits_in_single_precision():
     survey = jl.Survey.grid(jl.Lidar(), (4_500_000.1, 600_000.2), (4_500_000.3, 600_000.2), 0.1)
     assert survey.position[2].tolist() == [4_500_000.1 + 0.2, 600_000.2]
     assert survey[2].position.tolist() == survey.position[2].tolist()
@@ -60,12 +64,12 @@ def test_a_grid_has_its_spacings_and_no_footprint_beyond_its_end():
 
 def test_beams_of_a_track_lie_side_by_side():
     survey = jl.Survey.track(jl.Lidar(), (0, 0), (300, 400), 50.0, beams=3, beam_spacing=20.0)
-    place = survey.position.reshape(3, 11, 2)
-    assert np.allclose(np.hypot(*(place[:, 1:] - place[:, :-1]).reshape(-1, 2).T), 50.0)
-    assert np.allclose(np.hypot(*(place[1:] - place[:-1]).reshape(-1, 2).T), 20.0)
+    position = survey.position.reshape(3, 11, 2)
+    assert np.allclose(np.hypot(*(position[:, 1:] - position[:, :-1]).reshape(-1, 2).T), 50.0)
+    assert np.allclose(np.hypot(*(position[1:] - position[:-1]).reshape(-1, 2).T), 20.0)
     # The middle one is the line itself; the first is on its left.
-    assert np.allclose(place[1, -1], [300.0, 400.0])
-    assert np.allclose(place[0, 0], 20.0 * np.array([-0.8, 0.6]))
+    assert np.allclose(position[1, -1], [300.0, 400.0])
+    assert np.allclose(position[0, 0], 20.0 * np.array([-0.8, 0.6]))
 
 
 def test_the_number_of_shots_of_a_line():
@@ -110,18 +114,18 @@ def test_a_nutating_mirror_draws_circles():
 def test_every_shot_leaves_from_the_platform(pattern):
     survey = scanned(pattern)
     time = np.arange(len(survey)) / LINE["pulse_rate"]
-    flown = np.array(LINE["start"]) + np.outer(time * LINE["speed"], AHEAD)
-    assert np.allclose(survey.sensor[:, :2], flown, atol=1e-6)
+    platform = np.array(LINE["start"]) + np.outer(time * LINE["speed"], AHEAD)
+    assert np.allclose(survey.sensor[:, :2], platform, atol=1e-6)
     assert np.allclose(survey.sensor[:, 2], HEIGHT)
-    # A lidar of single precision agrees to its digits.
-    assert np.allclose(survey[7].sensor[:2], flown[7], atol=1e-2)
+    # The lidar has single precision.
+    assert np.allclose(survey[7].sensor[:2], platform[7], atol=1e-2)
 
 
 LIDAR, NADIR = jl.Lidar(), [(0.0, 0.0), (1.0, 1.0)]
 
 
 @pytest.mark.parametrize(
-    ("make", "error", "said"),
+    ("make", "error", "message"),
     [
         (lambda: jl.Survey(jl.Scene(), NADIR), TypeError, "lidar"),
         (lambda: jl.Survey(LIDAR, [0.0, 1.0]), ValueError, r"position has shape \(2,\)"),
@@ -150,8 +154,8 @@ LIDAR, NADIR = jl.Lidar(), [(0.0, 0.0), (1.0, 1.0)]
         (lambda: jl.Oscillating(30.0, 1.0, "square"), ValueError, "motion = 'square'"),
     ],
 )
-def test_what_is_refused(make, error, said):
-    with pytest.raises(error, match=said):
+def test_inadmissible_input_is_refused(make, error, message):
+    with pytest.raises(error, match=message):
         make()
 
 
@@ -163,18 +167,18 @@ def test_a_figure_draws_every_footprint_where_it_lies():
     voxels = jl.VoxelMap.from_lad(np.ones((4, 4, 2)), voxel_size=5.0)
     scene = jl.Scene(canopy=jl.Canopy(voxels, leaf=jl.LeafOptics(0.4, 0.4)), ground=jl.Ground())
     ax = jl.plot.survey(survey, scene, Figure().subplots(), values=[1.0, 2.0], label="height (m)")
-    (drawn,) = ax.collections
-    assert np.allclose(drawn.get_offsets(), survey.position)
+    (footprints,) = ax.collections
+    assert np.allclose(footprints.get_offsets(), survey.position)
     # Looking east at 60 degrees: twice the slant range and twice as long along the azimuth.
-    assert np.allclose(drawn.get_widths(), [6.0, 24.0])
-    assert np.allclose(drawn.get_heights(), [6.0, 12.0])
-    assert np.allclose(drawn.get_angles() % 180, [90.0, 0.0])
+    assert np.allclose(footprints.get_widths(), [6.0, 24.0])
+    assert np.allclose(footprints.get_heights(), [6.0, 12.0])
+    assert np.allclose(footprints.get_angles() % 180, [90.0, 0.0])
     low, high = ax.get_xlim()
     assert low < -3.0
     assert high > 22.0
-    # Too small to see: dots.
-    far = jl.Survey.grid(jl.Lidar(), (0, 0), (900, 900), 300.0)
-    dots = jl.plot.survey(far, None, Figure().subplots()).collections
+    # Footprints that would be too small to see are dots.
+    distant = jl.Survey.grid(jl.Lidar(), (0, 0), (900, 900), 300.0)
+    dots = jl.plot.survey(distant, None, Figure().subplots()).collections
     assert len(dots[0].get_offsets()) == 16
     with pytest.raises(ValueError, match=r"values has shape \(3,\)"):
-        jl.plot.survey(far, None, Figure().subplots(), values=[1, 2, 3])
+        jl.plot.survey(distant, None, Figure().subplots(), values=[1, 2, 3])

@@ -58,7 +58,7 @@ def small(tmp_path):
 
 @pytest.fixture(scope="module")
 def recorded():
-    from conftest import SHARED
+    from tests.conftest import SHARED
 
     if not (SHARED / "gedi" / RECORD).is_file():
         pytest.skip("the recorded GEDI file is not beside this checkout")

@@ -85,7 +85,7 @@ def test_waveforms_of_different_lengths_and_pulses_of_any_kind(many, path):
     lidar = dataclasses.replace(LIDAR, pulse=jl.RectangularPulse(length=90.0))
     survey = jl.Survey(lidar, many.position[:2], many.zenith[:2])
     write_gedi_l1b(path, waves, survey, **HERE, shot_number=[7, 2**60])
-    for shot, wave in zip(read_gedi_l1b(path, [7, 2**60]), waves):
+    for shot, wave in zip(read_gedi_l1b(path, [7, 2**60]), waves, strict=True):
         assert shot.time.size == wave.time.size + 2 * 200
         assert shot.signal.sum() == pytest.approx(float(50_000 * wave.reflectance.sum()), rel=2e-4)
         assert shot.elevation[0] == pytest.approx(340.0 - 0.149896229 * (float(wave.time[0]) - 200), abs=1e-2)
@@ -98,7 +98,7 @@ def test_background_is_part_of_the_pedestal(many, survey, path):
     of = jl.Survey(lit, survey.position, survey.zenith, survey.azimuth)
     waves = dataclasses.replace(many, recorded=np.full_like(many.recorded, 1e-16))
     write_gedi_l1b(path, waves, of, **HERE)
-    for shot, zenith in zip(by_shot(path), np.deg2rad(survey.zenith)):
+    for shot, zenith in zip(by_shot(path), np.deg2rad(survey.zenith), strict=True):
         counts = 240.0 + 50_000 * 1e-16 / (0.01 * 0.4**2 * np.cos(zenith) ** 2 / 4e5**2)
         assert shot.noise_mean == pytest.approx(counts, rel=1e-6)
         assert counts > 250.0
@@ -196,7 +196,7 @@ def test_projected_positions_and_the_grids_north(many, path):
     place = many.position + np.array([700_000.0, 5_550_000.0])
     survey = jl.Survey(LIDAR, position=place, zenith=many.zenith, azimuth=many.azimuth)
     write_gedi_l1b(path, dataclasses.replace(many, position=place), survey, **ELSEWHERE)
-    for shot, given in zip(by_shot(path), many.azimuth):
+    for shot, given in zip(by_shot(path), many.azimuth, strict=True):
         # Of the transverse Mercator projection: tan(convergence) = tan(longitude - 15) sin(latitude).
         phi, lam = np.deg2rad([shot.latitude, shot.longitude - 15.0])
         turned = np.rad2deg(np.arctan(np.tan(lam) * np.sin(phi)))

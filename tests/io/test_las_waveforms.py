@@ -365,6 +365,6 @@ def test_recorded_shots_are_written_and_read_again(shared, tmp_path):
     assert_same(read_las_waveforms(tmp_path / "a.las"), shots)
     lvis = read_pulsewaves(shared / "airborne" / "lvis_example2.pls")[::50]
     write_las_waveforms(tmp_path / "b.las", lvis)
-    for one, other in zip(read_las_waveforms(tmp_path / "b.las"), lvis):
+    for one, other in zip(read_las_waveforms(tmp_path / "b.las"), lvis, strict=True):
         np.testing.assert_array_equal(one.waveform, other.waveform)
         assert np.abs((one.position - other.position) * other.metres).max() < 2e-3

@@ -48,7 +48,7 @@ def write_small(path, **arrays):
 
 @pytest.fixture(scope="module")
 def recorded():
-    from conftest import SHARED
+    from tests.conftest import SHARED
 
     path = SHARED / "neon" / "neon_harvard_250.npz"
     if not path.is_file():
@@ -142,17 +142,18 @@ def test_damaged_bytes(tmp_path):
     """A byte changed anywhere leads to no other error than one that names the file."""
     whole = write_small(tmp_path / "small.npz").read_bytes()
     bad = tmp_path / "bad.npz"
-    rng = np.random.default_rng(0)
+    rng, refusals = np.random.default_rng(0), 0
     for at in [*rng.integers(0, len(whole), 60), *range(0, 40), *range(len(whole) - 60, len(whole))]:
         changed = bytearray(whole)
         changed[at] ^= 0x5A
         bad.write_bytes(changed)
-        said = "bad.npz"
         try:
             read_neon(bad)
         except ValueError as error:
-            said = str(error)
-        assert "bad.npz" in said
+            assert "bad.npz" in str(error)  # noqa: PT017
+            refusals += 1
+    # Some bytes are padding or names that nothing reads.
+    assert refusals > 50
     for size in (0, 10, len(whole) // 2, len(whole) - 1):
         bad.write_bytes(whole[:size])
         with pytest.raises(ValueError, match=r"bad\.npz"):

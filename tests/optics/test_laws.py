@@ -21,7 +21,7 @@ from scipy.stats import chi2 as chi2_distribution
 
 import jaxlidar as jl
 from jaxlidar.extend import dot, vec
-from tests.helpers import WHOLE, agrees, batch_mean, slow_unless, whole_lidar
+from tests.helpers import SINGLE_SAMPLE, agrees, batch_mean, single_sample_lidar, slow_unless
 
 ROOT = Path(__file__).resolve().parents[2]
 spec = importlib.util.spec_from_file_location("minnaert", ROOT / "examples" / "minnaert.py")
@@ -163,8 +163,8 @@ def test_minnaert_is_reciprocal_and_equal_angle_is_not():
 @pytest.mark.parametrize("slope", [0.0, 30.0])
 def test_first_return_of_minnaert(slope):
     scene = jl.Scene(ground=jl.Ground(reflectance=0.4, slope=slope, law=Minnaert(k=1.7)))
-    lidar = whole_lidar()
-    wave = jl.simulate(lidar, scene, key=jax.random.key(0), **WHOLE)
+    lidar = single_sample_lidar()
+    wave = jl.simulate(lidar, scene, key=jax.random.key(0), **SINGLE_SAMPLE)
     cosine = np.cos(np.deg2rad(slope))
     assert float(wave.reflectance.sum()) == pytest.approx(0.4 * 1.35 * cosine**2.4, rel=1e-4)
     # What the law does not scatter is absorbed.
@@ -182,18 +182,18 @@ def below_plate(p, law=Minnaert):
 
 
 START = {"slope": jnp.asarray(20.0), "k": jnp.asarray(1.6)}
-LIDAR = whole_lidar()
+LIDAR = single_sample_lidar()
 
 
 @pytest.mark.slow
 def test_the_ledger_of_all_orders_adds_up():
-    wave = jl.simulate(LIDAR, below_plate(START), key=jax.random.key(1), n_photons=65536, **WHOLE)
+    wave = jl.simulate(LIDAR, below_plate(START), key=jax.random.key(1), n_photons=65536, **SINGLE_SAMPLE)
     assert float(sum(wave.energy_budget.values())[0]) == pytest.approx(1.0, abs=1e-4)
 
 
 def derivatives(law, name, step):
     """By automatic differentiation and as a central difference: means of batches, with standard errors."""
-    plan = jl.plan(LIDAR, below_plate(START, law), max_orders=4, n_photons=65536, n_rays=512, **WHOLE)
+    plan = jl.plan(LIDAR, below_plate(START, law), max_orders=4, n_photons=65536, n_rays=512, **SINGLE_SAMPLE)
 
     def measure(value, key):
         setup = jl.make_setup(LIDAR, below_plate(START | {name: value}, law), plan)
@@ -257,7 +257,7 @@ def test_scattering_between_surfaces_follows_the_law():
     """
     plate = jl.Plate(height=4.0, reflectance=0.0, transmittance=1.0, transmission="diffuse")
     scene = jl.Scene(plates=(plate,), ground=jl.Ground(reflectance=0.5, law=Minnaert(k=2.0)))
-    plan = jl.plan(LIDAR, scene, max_orders=3, n_photons=16384, n_rays=64, **WHOLE)
+    plan = jl.plan(LIDAR, scene, max_orders=3, n_photons=16384, n_rays=64, **SINGLE_SAMPLE)
     mean, stderr = batch_mean(LIDAR, scene, plan, seed=2, count=16, quantity=returned)
     assert agrees(mean, stderr, 0.5 * 2 / 3, bound=1e-3, sigmas=4.0)
     assert not agrees(mean, stderr, 0.5, bound=1e-3, sigmas=4.0)

@@ -15,7 +15,7 @@ import pytest
 
 from jaxlidar.optics.leaf_surface import LeafSurface, leaf_surface
 from jaxlidar.optics.plate_model import plate_model, plate_model_slopes
-from tests.helpers import NARROW
+from tests.helpers import BY_PRECISION
 
 KS = (0.0, 1e-8, 1e-4, 1e-2, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
 NS = (1.0, 1.0001, 1.5, 2.0, 3.4, 10.0)
@@ -147,7 +147,7 @@ def test_slopes_are_the_derivatives(precision):
     )
 
 
-@NARROW
+@BY_PRECISION
 def test_reverse_equals_forward(precision):
     unit = float(np.finfo(precision).eps)
     k, N = jnp.array([0.0, 0.0, 0.1, 0.5, 50.0]), jnp.array([1.0, 2.0, 1.0, 2.3, 9.0])
@@ -191,7 +191,7 @@ def test_second_derivatives():
         np.testing.assert_allclose(second[1], [in_k[1], in_N[1]], rtol=1e-6)
 
 
-@NARROW
+@BY_PRECISION
 def test_nothing_is_nan_or_infinite(precision):
     grid = [
         (k, N, n, a)

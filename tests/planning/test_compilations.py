@@ -1,4 +1,4 @@
-"""Programs are compiled for the sizes of a short ladder: everyday changes of a scene compile nothing anew.
+"""Programs are compiled for size buckets: everyday changes of a scene do not compile anything.
 
 The program that builds the device scene is not counted: it is short, and compiled for the sizes as they are.
 """
@@ -18,21 +18,23 @@ SHAPE = (8, 8, 18)
 
 
 def simulate(**changes):
-    """The waveform of a crown over ground, with changes, and how it was simulated."""
-    given = {"rtol": 0.05, "window": (-120.0, 60.0), "shape": SHAPE, "angles": "planophile"} | changes
+    """Simulate a crown over ground, with changes."""
+    values = {"rtol": 0.05, "window": (-120.0, 60.0), "shape": SHAPE, "angles": "planophile"} | changes
     lidar = {"wavelength": (532.0, 1064.0, 1550.0), "divergence": 2.0, "zenith": 5.0}
-    lidar |= {name: given[name] for name in ("wavelength", "divergence", "zenith", "pulse") if name in given}
+    lidar |= {
+        name: values[name] for name in ("wavelength", "divergence", "zenith", "pulse") if name in values
+    }
     ground = {"reflectance": 0.3, "slope": 5.0}
-    ground |= {name: given[name] for name in ("slope", "height") if name in given}
+    ground |= {name: values[name] for name in ("slope", "height") if name in values}
     voxels = jl.VoxelMap.from_lad(
-        np.full(given["shape"], 0.5),
+        np.full(values["shape"], 0.5),
         voxel_size=0.5,
         origin=(-2, -2, 5),
-        leaf_angles=jl.LeafAngles.named(given["angles"]),
+        leaf_angles=jl.LeafAngles.named(values["angles"]),
     )
-    leaf = jl.Prospect(N=1.5, Cab=given.get("Cab", 40.0), Car=8.0, Cw=0.01, Cm=0.009)
+    leaf = jl.Prospect(N=1.5, Cab=values.get("Cab", 40.0), Car=8.0, Cw=0.01, Cm=0.009)
     scene = jl.Scene(canopy=jl.Canopy(voxels, leaf=leaf), ground=jl.Ground(**ground))
-    return jl.simulate(jl.Lidar(**lidar), scene, key=KEY, rtol=given["rtol"], window=given["window"])
+    return jl.simulate(jl.Lidar(**lidar), scene, key=KEY, rtol=values["rtol"], window=values["window"])
 
 
 CHANGES = {
@@ -53,7 +55,7 @@ CHANGES = {
 
 @pytest.fixture(scope="module")
 def compiled():
-    """Counts the versions of the programs, after a first simulation."""
+    """Return a function that counts the versions of the programs, after a first simulation."""
     programs = {name: p for name, p in vars(batch_programs).items() if isinstance(p, Program)}
     del programs["compiled_geometry"]
     for program in programs.values():
@@ -79,15 +81,15 @@ def test_everyday_changes_compile_nothing(compiled, name):
 
 @pytest.mark.slow
 def test_a_new_effect_does_compile(compiled):
-    """The counting can fail: the trace of a beam at nadir is another program."""
+    """Negative control of the counting: the trace of a beam at nadir is another program."""
     before = compiled()
     simulate(zenith=0.0)
     assert compiled()["_compiled_higher"] == before["_compiled_higher"] + 1
 
 
 @pytest.mark.slow
-def test_room_changes_no_value():
-    """A plan without room to spare gives the same waveform, to rounding."""
+def test_rounding_up_of_sizes_changes_no_value():
+    """A plan with exact sizes gives the same waveform, to rounding."""
     scene = jl.Scene(
         canopy=jl.Canopy(
             jl.VoxelMap.from_lad(np.full((3, 2, 5), 0.8), voxel_size=1.0, origin=(-1.5, -1.0, 2.0)),
@@ -96,9 +98,9 @@ def test_room_changes_no_value():
         ground=jl.Ground(reflectance=0.4),
     )
     lidar = jl.Lidar(divergence=2.0, wavelength=(1000.0, 1064.0, 1100.0))
-    given = {"key": KEY, "n_photons": 20_000, "max_orders": 5, "window": (-60.0, 30.0)}
-    wave = jl.simulate(lidar, scene, **given)
-    # Within a transformation nothing is rounded up but what the plan has.
+    settings = {"key": KEY, "n_photons": 20_000, "max_orders": 5, "window": (-60.0, 30.0)}
+    wave = jl.simulate(lidar, scene, **settings)
+    # Within a transformation sizes are those of the plan.
     setup = jl.make_setup(
         lidar, scene, jl.plan(lidar, scene, max_orders=5, window=(-60.0, 30.0), n_photons=2500)
     )
@@ -111,18 +113,18 @@ def test_room_changes_no_value():
 
 
 @pytest.mark.parametrize("steps", [1, 2, 4, 8, 16])
-def test_the_ladder(steps):
+def test_size_buckets(steps):
     sizes = np.arange(1, 3000)
-    rungs = np.array([size_bucket(int(n), steps) for n in sizes])
-    assert np.all(rungs >= sizes)
-    assert np.all(rungs <= np.maximum(np.ceil(sizes * (1 + 1.0 / steps)), 2))
-    assert np.all(np.diff(rungs) >= 0)
-    assert np.all([size_bucket(int(n), steps) == n for n in rungs])
-    assert len(np.unique(rungs)) <= 12 * steps + 2
+    buckets = np.array([size_bucket(int(n), steps) for n in sizes])
+    assert np.all(buckets >= sizes)
+    assert np.all(buckets <= np.maximum(np.ceil(sizes * (1 + 1.0 / steps)), 2))
+    assert np.all(np.diff(buckets) >= 0)
+    assert np.all([size_bucket(int(n), steps) == n for n in buckets])
+    assert len(np.unique(buckets)) <= 12 * steps + 2
 
 
 def test_keys_can_be_mapped_over():
-    """The sizes of what JAX transforms are those of the plan, with a known scene too."""
+    """Under a transformation the sizes are those of the plan, also with a concrete scene."""
     scene = jl.Scene(plates=(jl.Plate(5.0, 0.3, 0.3),), ground=jl.Ground())
     plan = jl.plan(jl.Lidar(), scene, max_orders=2)
     keys = jax.random.split(KEY, 2)

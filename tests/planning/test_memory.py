@@ -1,4 +1,4 @@
-"""What does not fit into memory is refused with numbers; long records need no matrix."""
+"""Plans that do not fit into memory are refused with numbers; long records need no matrix."""
 
 import dataclasses
 import math
@@ -19,7 +19,7 @@ from inversion.fit.unknowns import bind_unknowns
 from jaxlidar.planning import memory
 from jaxlidar.planning.memory import check_memory, in_words, memory_limit
 from jaxlidar.spectral.pulse_convolution import pulse_convolution
-from tests.helpers import applied, slab, slow_unless
+from tests.helpers import slab, slow_unless, with_applied_optics
 
 ROOT = Path(__file__).resolve().parents[2]
 KEY = jax.random.key(2)
@@ -38,7 +38,7 @@ def test_many_plates_are_refused_before_anything_is_allocated():
         jl.plan(lidar, scene, max_orders=12, describe=False)
 
 
-TWO = jl.Lidar(wavelength=(532.0, 1064.0))
+TWO_WAVELENGTHS = jl.Lidar(wavelength=(532.0, 1064.0))
 LEAF = jl.LeafOptics(0.3, 0.2)
 SCENES = {
     "leaf and bark over ground": {"ground": GROUND, "canopy": {"bark": 0.4}},
@@ -53,44 +53,49 @@ SCENES = {
 
 @pytest.mark.parametrize("name", slow_unless(["leaf and bark over ground"], SCENES))
 def test_optics_applied_while_light_is_traced_give_the_same(name):
-    """The same photons, and so the same waveform, errors and energy_budget, to rounding."""
-    given = dict(SCENES[name])
-    bark = [0.1] if "bark" in given["canopy"] else []
+    """The photons are the same, and so are waveform, errors and energy budget, to rounding."""
+    scene_fields = dict(SCENES[name])
+    bark = [0.1] if "bark" in scene_fields["canopy"] else []
     leaf = jl.Prospect(Cab=40.0) if "straight" not in name else LEAF
-    canopy = jl.Canopy(slab(0.5, *bark), leaf=leaf, **given.pop("canopy"))
-    scene = jl.Scene(canopy=canopy, **given)
-    plan = jl.plan(TWO, scene, max_orders=4, describe=False)
+    canopy = jl.Canopy(slab(0.5, *bark), leaf=leaf, **scene_fields.pop("canopy"))
+    scene = jl.Scene(canopy=canopy, **scene_fields)
+    plan = jl.plan(TWO_WAVELENGTHS, scene, max_orders=4, describe=False)
     assert plan.config.keeps_histories
-    a, b = (jl.simulate(TWO, scene, key=KEY, plan=p, n_photons=2048) for p in (plan, applied(plan)))
-    for found in ("reflectance", "stderr", "neglected"):
-        np.testing.assert_allclose(getattr(b, found), getattr(a, found), rtol=2e-4, atol=1e-7)
+    a, b = (
+        jl.simulate(TWO_WAVELENGTHS, scene, key=KEY, plan=p, n_photons=2048)
+        for p in (plan, with_applied_optics(plan))
+    )
+    for quantity in ("reflectance", "stderr", "neglected"):
+        np.testing.assert_allclose(getattr(b, quantity), getattr(a, quantity), rtol=2e-4, atol=1e-7)
     assert a.energy_budget.keys() == b.energy_budget.keys()
-    for name, share in a.energy_budget.items():
-        np.testing.assert_allclose(b.energy_budget[name], share, rtol=2e-4, atol=1e-6)
-    for name, part in a.components.items():
-        np.testing.assert_allclose(b.components[name], part, rtol=2e-4, atol=1e-7)
+    for name, fraction in a.energy_budget.items():
+        np.testing.assert_allclose(b.energy_budget[name], fraction, rtol=2e-4, atol=1e-6)
+    for name, component in a.components.items():
+        np.testing.assert_allclose(b.components[name], component, rtol=2e-4, atol=1e-7)
 
 
 @pytest.mark.slow
 def test_derivatives_where_optics_are_applied_while_light_is_traced():
-    """In an optical and in a geometric value."""
+    """With respect to an optical and a geometric value."""
 
     def total(plan, x):
         canopy = jl.Canopy(slab(0.5), leaf=jl.LeafOptics(x[0], 0.2))
         scene = jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=0.3, height=x[1]))
-        setup = jl.make_setup(TWO, scene, plan)
+        setup = jl.make_setup(TWO_WAVELENGTHS, scene, plan)
         return jl.total_reflectance(jl.trace_scene(setup, KEY), setup)
 
     scene = jl.Scene(canopy=jl.Canopy(slab(0.5), leaf=LEAF), ground=GROUND)
-    plan = jl.plan(TWO, scene, max_orders=4, n_photons=2048, window=(-100.0, 60.0), describe=False)
+    plan = jl.plan(
+        TWO_WAVELENGTHS, scene, max_orders=4, n_photons=2048, window=(-100.0, 60.0), describe=False
+    )
     x = jax.numpy.array([0.3, 0.1])
-    a, b = (jax.jit(jax.jacfwd(lambda x, p=p: total(p, x)))(x) for p in (plan, applied(plan)))
+    a, b = (jax.jit(jax.jacfwd(lambda x, p=p: total(p, x)))(x) for p in (plan, with_applied_optics(plan)))
     assert np.max(np.abs(a)) > 1e-3
     np.testing.assert_allclose(b, a, rtol=2e-3, atol=1e-5 * np.max(np.abs(a)))
 
 
 def test_when_optics_are_applied_while_light_is_traced():
-    """Where histories take much more memory, and wavelengths are few; fits then trace for every optics."""
+    """They are if histories take much more memory and wavelengths are few; fits then trace for new optics."""
     scene = jl.Scene(canopy=jl.Canopy(slab(1.0), leaf=jl.LeafOptics(0.5, 0.5)), ground=jl.Ground(0.0, 1.0))
     long = {"max_orders": 300, "window": (-81.0, 3000.0), "describe": False}
     plan = jl.plan(jl.Lidar(), scene, **long)
@@ -99,20 +104,26 @@ def test_when_optics_are_applied_while_light_is_traced():
     assert "optics applied while light is traced" in str(plan)
     assert jl.plan(jl.Lidar(), scene, describe=False, max_orders=10).config.keeps_histories
     unknown = inversion.Unknown("ground.reflectance", bounds=(0.1, 1.0))
-    settled = bind_unknowns([unknown], scene)
-    for given, traces in ((plan, True), (jl.plan(jl.Lidar(), scene, describe=False, max_orders=3), False)):
-        assert Model(jl.Lidar(), scene, given, settled, KEY).retraces == traces
+    bound_unknowns = bind_unknowns([unknown], scene)
+    for case_plan, traces in (
+        (plan, True),
+        (jl.plan(jl.Lidar(), scene, describe=False, max_orders=3), False),
+    ):
+        assert Model(jl.Lidar(), scene, case_plan, bound_unknowns, KEY).retraces == traces
     with pytest.raises(ValueError, match="300 orders, too many to keep histories"):
         jl.analog_returns(jl.Lidar(), scene, plan, key=KEY, n_photons=10)
 
 
-def test_the_limit_is_the_users():
+def test_the_user_sets_the_limit():
     scene = jl.Scene(canopy=jl.Canopy(slab(1.0), leaf=jl.LeafOptics(0.4, 0.4)), ground=GROUND)
     plan = jl.plan(jl.Lidar(), scene, describe=False)
     assert 1e5 < plan.memory < 1e9
-    one, two = (plan.jacobian_memory(n) for n in (1, 2))
-    more = f"a Jacobian in one geometric unknown {in_words(one)}, in each more {in_words(two - one)}"
-    assert str(plan).splitlines()[-1] == f"about {in_words(plan.memory)} of memory; {more}"
+    memory_of_one, memory_of_two = (plan.jacobian_memory(n) for n in (1, 2))
+    additional = memory_of_two - memory_of_one
+    jacobian_text = (
+        f"a Jacobian in one geometric unknown {in_words(memory_of_one)}, in each more {in_words(additional)}"
+    )
+    assert str(plan).splitlines()[-1] == f"about {in_words(plan.memory)} of memory; {jacobian_text}"
     with pytest.raises(ValueError, match=r"admissible is max_memory = 0\.001 GB"):
         jl.simulate(jl.Lidar(), scene, key=KEY, max_memory=0.001)
     for bad in (0.0, -1.0, np.nan):
@@ -134,11 +145,12 @@ def test_a_grazing_beam_over_a_slope_takes_no_matrix():
     assert plan.bins.count * plan.n_samples > memory.MAX_DENSE_PULSE
     assert plan.memory < 1e9
     wave = jl.simulate(lidar, scene, key=KEY, plan=plan)
-    whole = float(wave.reflectance.sum())
+    total = float(wave.reflectance.sum())
     assert np.isfinite(np.asarray(wave.reflectance)).all()
-    # Plate 0.2 and, through it and back, the ground: 0.1^2 of 0.4; both are seen at 85 degrees.
+    # The plate returns 0.2, the ground 0.4 through the plate twice (0.1^2), both times the cosine of 85
+    # degrees.
     cosine = np.cos(np.deg2rad(85.0))
-    assert whole == pytest.approx((0.2 + 0.4 * 0.1**2) * cosine, rel=2e-3)
+    assert total == pytest.approx((0.2 + 0.4 * 0.1**2) * cosine, rel=2e-3)
 
 
 @pytest.mark.parametrize(
@@ -166,75 +178,80 @@ def test_the_band_is_the_matrix(pulse, window, monkeypatch):
     assert not np.allclose(wrong(fine), expected, atol=1e-6 * float(np.max(expected)))
 
 
-def layers_scaled(scene, share):
-    """Geometric, for the place of the map is among what it sets."""
+def layers_scaled(scene, factor):
+    """Scale the extinction of layers; it sets the voxel size too, which makes the unknown geometric."""
     voxels = scene.canopy.voxels
     return eqx.tree_at(
         lambda s: (s.canopy.voxels.leaf, s.canopy.voxels.voxel_size),
         scene,
-        (voxels.leaf * share[None, None], 1.0 * voxels.voxel_size),
+        (voxels.leaf * factor[None, None], 1.0 * voxels.voxel_size),
     )
 
 
-def layered(orders, layers=4, end=100.0, most=None, **given):
-    """A model whose unknowns are leaf by layer, and height and reflectance of the ground; and its start."""
+def layered(orders, layers=4, end=100.0, max_memory=None, **settings):
+    """Return a model with leaf by layer and height and reflectance of the ground unknown, and its start."""
     voxels = slab(0.4, 0.05, shape=(1, 1, layers))
     scene = jl.Scene(canopy=jl.Canopy(voxels, leaf=LEAF, bark=0.3), ground=GROUND)
-    given = {"n_photons": 256, "n_rays": 64, **given}
-    plan = jl.plan(TWO, scene, max_orders=orders, window=(-81.0, end), describe=False, **given)
-    plan = dataclasses.replace(plan, scope=plan.scope._replace(max_memory=most))
-    share = {"bounds": (0.5, 2.0), "start": np.ones(layers), "apply": layers_scaled, "name": "layers"}
-    settled = bind_unknowns(
+    settings = {"n_photons": 256, "n_rays": 64, **settings}
+    plan = jl.plan(TWO_WAVELENGTHS, scene, max_orders=orders, window=(-81.0, end), describe=False, **settings)
+    plan = dataclasses.replace(plan, scope=plan.scope._replace(max_memory=max_memory))
+    layer_factors = {"bounds": (0.5, 2.0), "start": np.ones(layers), "apply": layers_scaled, "name": "layers"}
+    bound_unknowns = bind_unknowns(
         [
-            inversion.Unknown(**share),
+            inversion.Unknown(**layer_factors),
             inversion.Unknown("ground.height", bounds=(-1.0, 1.0)),
             inversion.Unknown("ground.reflectance", bounds=(0.1, 1.0)),
         ],
         scene,
     )
-    return Model(TWO, scene, plan, settled, KEY), np.concatenate([np.ravel(s.start) for s in settled])
+    return Model(TWO_WAVELENGTHS, scene, plan, bound_unknowns, KEY), np.concatenate(
+        [np.ravel(s.start) for s in bound_unknowns]
+    )
 
 
 def room_for(model, columns):
-    """GB that so many columns at once need."""
+    """Return the memory of `columns` columns at once, GB."""
     return 1.0001e-9 * model.forward.plan.jacobian_memory(columns)
 
 
-def test_columns_of_a_jacobian_are_computed_in_groups_where_memory_is_short():
-    """The same columns, the last group filled up; refused where there is no room for one."""
-    whole, start = layered(1)
-    expected = whole(start)
-    limits = [room_for(whole, n) for n in (2, 1)]
-    model, _ = layered(1, most=limits[0])
+def test_columns_of_a_jacobian_are_computed_in_groups_if_memory_is_short():
+    """The columns are the same, with the last group padded; a limit below one column is refused."""
+    unlimited, start = layered(1)
+    expected = unlimited(start)
+    limits = [room_for(unlimited, n) for n in (2, 1)]
+    model, _ = layered(1, max_memory=limits[0])
     assert (
-        whole.forward.tangents_per_pass,
+        unlimited.forward.tangents_per_pass,
         model.forward.tangents_per_pass,
         expected.jacobian.shape[-1],
     ) == (5, 2, 6)
-    found = model(start)
-    np.testing.assert_allclose(found.jacobian, expected.jacobian, rtol=1e-3, atol=1e-5)
-    np.testing.assert_allclose(found.total, expected.total, rtol=1e-5, atol=1e-8)
-    assert np.abs(found.jacobian).max(axis=(0, 1)).min() > 1e-5
-    assert layered(1, most=limits[1])[0].forward.tangents_per_pass == 1
+    grouped = model(start)
+    np.testing.assert_allclose(grouped.jacobian, expected.jacobian, rtol=1e-3, atol=1e-5)
+    np.testing.assert_allclose(grouped.total, expected.total, rtol=1e-5, atol=1e-8)
+    assert np.abs(grouped.jacobian).max(axis=(0, 1)).min() > 1e-5
+    assert layered(1, max_memory=limits[1])[0].forward.tangents_per_pass == 1
     with pytest.raises(ValueError, match=r"one at a time; admissible is max_memory = .* GB of the plan"):
-        layered(1, most=0.5 * limits[1])
+        layered(1, max_memory=0.5 * limits[1])
 
 
 def test_derivatives_have_no_histories_beyond_the_last_order():
-    """A plan has room for more, which programs without derivatives share."""
+    """Programs without derivatives have room for more histories, to be shared by plans."""
     scene = jl.Scene(canopy=jl.Canopy(slab(0.4), leaf=LEAF), ground=GROUND)
-    given = {"n_photons": 16, "window": (-81.0, 50.0), "describe": False}
-    plan = jl.plan(TWO, scene, max_orders=9, **given)
-    letters = len(plan.config.channels)
-    assert 9 == plan.config.degree < plan.config.degree
-    setup = jl.make_setup(TWO, scene, plan)
+    settings = {"n_photons": 16, "window": (-81.0, 50.0), "describe": False}
+    plan = jl.plan(TWO_WAVELENGTHS, scene, max_orders=9, **settings)
+    n_channels = len(plan.config.channels)
+    assert 9 == plan.degree < plan.config.degree
+    setup = jl.make_setup(TWO_WAVELENGTHS, scene, plan)
     shapes = jax.eval_shape(lambda key: jl.trace_scene(setup, key, reverse=False), KEY)
-    assert shapes.higher.shape[2] == math.comb(9 + letters, letters)
-    # Every flight, and the way back, may pass the plate.
-    assert jl.plan(TWO, jl.Scene(ground=GROUND, plates=plates(1)), max_orders=2, **given).degree == 5
+    assert shapes.higher.shape[2] == math.comb(9 + n_channels, n_channels)
+    # Every flight and the return path may pass the plate.
+    assert (
+        jl.plan(TWO_WAVELENGTHS, jl.Scene(ground=GROUND, plates=plates(1)), max_orders=2, **settings).degree
+        == 5
+    )
 
 
-def test_groups_are_about_as_large():
+def test_groups_have_about_equal_sizes():
     model = layered(4)[0]
     plan = model.forward.plan
     for columns, room, expected in ((0, 1, 0), (7, 7, 7), (7, 6, 4), (7, 3, 3), (20, 9, 7)):
@@ -243,7 +260,7 @@ def test_groups_are_about_as_large():
         assert tangents_per_pass(limited, columns) == expected
 
 
-WATCHED = """
+MEASURE_MEMORY = """
 import sys, threading, time
 import jax, numpy as np
 import jaxlidar as jl
@@ -269,7 +286,7 @@ def watched(run):
     return peak - base
 """
 
-SIMULATED = """
+SIMULATE = """
 orders, end, bark = int(sys.argv[1]), float(sys.argv[2]), float(sys.argv[3])
 voxels = jl.VoxelMap.from_extinction(
     leaf=np.full((2, 2, 4), 0.2), bark=np.full((2, 2, 4), bark), voxel_size=2.0, origin=(-2.0, -2.0, 0.0)
@@ -277,29 +294,29 @@ voxels = jl.VoxelMap.from_extinction(
 canopy = jl.Canopy(voxels, leaf=jl.LeafOptics(0.4, 0.3), bark=0.3)
 scene = jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=0.3))
 lidar = jl.Lidar(wavelength=np.linspace(500.0, 1600.0, 9))
-given = {"window": (-81.0, end), "max_memory": 15.0}
-jl.simulate(lidar, scene, key=jax.random.key(0), max_orders=2, n_photons=8192, **given)
-plan = jl.plan(lidar, scene, max_orders=orders, **given)
-given = {"key": jax.random.key(0), "plan": plan, "n_photons": 65536}
-print(plan.memory, watched(lambda: jl.simulate(lidar, scene, **given)))
+settings = {"window": (-81.0, end), "max_memory": 15.0}
+jl.simulate(lidar, scene, key=jax.random.key(0), max_orders=2, n_photons=8192, **settings)
+plan = jl.plan(lidar, scene, max_orders=orders, **settings)
+settings = {"key": jax.random.key(0), "plan": plan, "n_photons": 65536}
+print(plan.memory, watched(lambda: jl.simulate(lidar, scene, **settings)))
 """
 
-EVALUATED = """
+EVALUATE_MODEL = """
 from tests.planning.test_memory import layered, room_for
 
 orders, layers, end = int(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3])
-model, start = layered(orders, layers, end, most=15.0, n_photons=2048)
+model, start = layered(orders, layers, end, max_memory=15.0, n_photons=2048)
 model(start)
 assert model.forward.tangents_per_pass == layers + 1
 print(1e9 * room_for(model, layers + 1), watched(lambda: model(start)))
 """
 
 
-def predicted_and_measured(program, *given):
-    command = [sys.executable, "-c", WATCHED + program, *map(str, given)]
+def predicted_and_measured(program, *arguments):
+    command = [sys.executable, "-c", MEASURE_MEMORY + program, *map(str, arguments)]
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
-    done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT, env=environment)
-    return tuple(map(float, done.stdout.split()))
+    process = subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT, env=environment)
+    return tuple(map(float, process.stdout.split()))
 
 
 @pytest.mark.slow
@@ -307,7 +324,7 @@ def predicted_and_measured(program, *given):
 @pytest.mark.parametrize(("orders", "end", "bark"), [(9, 500.0, 0.05), (13, 800.0, 0.05)])
 def test_memory_is_as_predicted(orders, end, bark):
     """To 30 %."""
-    predicted, measured = predicted_and_measured(SIMULATED, orders, end, bark)
+    predicted, measured = predicted_and_measured(SIMULATE, orders, end, bark)
     assert measured == pytest.approx(predicted, rel=0.3)
 
 
@@ -316,5 +333,5 @@ def test_memory_is_as_predicted(orders, end, bark):
 @pytest.mark.parametrize(("orders", "layers", "end"), [(9, 3, 800.0), (9, 12, 300.0)])
 def test_memory_of_a_jacobian_is_as_predicted(orders, layers, end):
     """To 30 %."""
-    predicted, measured = predicted_and_measured(EVALUATED, orders, layers, end)
+    predicted, measured = predicted_and_measured(EVALUATE_MODEL, orders, layers, end)
     assert measured == pytest.approx(predicted, rel=0.3)

@@ -1,4 +1,4 @@
-"""Only the effects a scene calls for: what is off is not compiled, and every choice can be overridden."""
+"""Plans have only the effects of the scene, programs only those of the plan; users can override choices."""
 
 import dataclasses
 
@@ -23,7 +23,7 @@ RANDOM = ("random_", "threefry")
 
 
 def traced(lidar, scene, plan):
-    """The trace as text, as it is compiled; the lidar's arrays are in it as far as they are used."""
+    """Return the trace as text of its jaxpr; arrays of the lidar are in it if they are used."""
 
     setup = jl.make_setup(lidar, scene, plan)
 
@@ -41,7 +41,7 @@ def effect(plan, name):
     return next(e for e in plan.effects if e.name == name)
 
 
-# What is off is not compiled.
+# Effects that are off are not compiled.
 
 
 @pytest.mark.parametrize("slope", [0.0, 10.0])
@@ -51,7 +51,7 @@ def test_ground_alone_has_no_loop_and_nothing_random(slope):
     assert not any(word in text for word in LOOPS + RANDOM)
 
 
-def test_ground_alone_with_all_that_a_lidar_may_have_has_no_loop_either():
+def test_ground_alone_has_no_loop_with_all_effects_of_a_lidar():
     lidar = jl.Lidar(field_of_view=1.0, jitter=0.5)
     scene = jl.Scene(ground=GROUND, atmosphere=jl.Atmosphere(lidar_ratio=40.0))
     plan = planned(lidar, scene)
@@ -64,7 +64,7 @@ def test_ground_alone_with_all_that_a_lidar_may_have_has_no_loop_either():
     assert not any(word in text for word in LOOPS + RANDOM)
 
 
-def test_one_order_draws_nothing_but_the_shift_of_the_footprint():
+def test_the_first_order_draws_only_the_shift_of_the_footprint():
     scene = jl.Scene(canopy=LEAVES, ground=GROUND)
     off = {"multiple scattering": False}
     fixed = traced(jl.Lidar(), scene, planned(jl.Lidar(), scene, effects=off, footprint="fixed"))
@@ -81,7 +81,7 @@ def test_a_beam_without_width_is_one_ray_that_is_not_random():
     assert not any(word in traced(jl.Lidar(), scene, plan) for word in RANDOM)
 
 
-def test_what_is_not_there_has_no_letter():
+def test_absent_materials_have_no_channel():
     with_bark, bare = jl.Scene(canopy=TREES, ground=GROUND), jl.Scene(canopy=LEAVES, ground=GROUND)
     plans = [
         planned(jl.Lidar(), with_bark),
@@ -98,11 +98,11 @@ def test_what_is_not_there_has_no_letter():
 
 
 @pytest.mark.parametrize("canopy", [None, TREES])
-def test_the_trace_never_sees_a_wavelength(canopy):
+def test_the_trace_does_not_depend_on_wavelengths(canopy):
     scene = jl.Scene(canopy=canopy, plates=() if canopy else (PLATE,), ground=GROUND)
-    one, three = jl.Lidar(), jl.Lidar(wavelength=(532.0, 1064.0, 1550.0))
-    plan = planned(one, scene, max_orders=3)
-    assert traced(one, scene, plan) == traced(three, scene, plan)
+    one_wavelength, three_wavelengths = jl.Lidar(), jl.Lidar(wavelength=(532.0, 1064.0, 1550.0))
+    plan = planned(one_wavelength, scene, max_orders=3)
+    assert traced(one_wavelength, scene, plan) == traced(three_wavelengths, scene, plan)
 
 
 # Choices.
@@ -112,17 +112,17 @@ def test_switching_off_is_the_scene_without():
     scene = jl.Scene(canopy=TREES, plates=(PLATE,), ground=jl.Ground(slope=5.0), atmosphere=HAZE)
     lidar = jl.Lidar(field_of_view=1.0, jitter=0.5)
 
-    def less(**changes):
+    def with_fields(**changes):
         return dataclasses.replace(scene, **changes)
 
     expected = {
-        "bark": (lidar, less(canopy=LEAVES)),
-        "leaf": (lidar, less(canopy=jl.Canopy(slab(bark=0.1), bark=0.3))),
-        "plates": (lidar, less(plates=())),
-        "ground": (lidar, less(ground=None)),
-        "slope spread": (lidar, less(ground=jl.Ground())),
-        "atmospheric extinction": (lidar, less(atmosphere=None)),
-        "atmospheric backscatter": (lidar, less(atmosphere=jl.Atmosphere(visibility=10.0))),
+        "bark": (lidar, with_fields(canopy=LEAVES)),
+        "leaf": (lidar, with_fields(canopy=jl.Canopy(slab(bark=0.1), bark=0.3))),
+        "plates": (lidar, with_fields(plates=())),
+        "ground": (lidar, with_fields(ground=None)),
+        "slope spread": (lidar, with_fields(ground=jl.Ground())),
+        "atmospheric extinction": (lidar, with_fields(atmosphere=None)),
+        "atmospheric backscatter": (lidar, with_fields(atmosphere=jl.Atmosphere(visibility=10.0))),
         "jitter": (jl.Lidar(field_of_view=1.0), scene),
         "field of view": (jl.Lidar(jitter=0.5), scene),
         "divergence": (jl.Lidar(field_of_view=1.0, jitter=0.5, divergence=0.0), scene),
@@ -139,9 +139,11 @@ def test_without_twice_is_without_once():
     assert eqx.tree_equal(once[1], jl.Scene())
     assert once[0].field_of_view is None
     off = ("slope spread", "leaf")
-    level = without(lidar, scene, off)
-    again = without(*level, off)
-    assert all(np.allclose(a, b, rtol=1e-5) for a, b in zip(*map(jax.tree.leaves, (level, again))))
+    first_pass = without(lidar, scene, off)
+    twice = without(*first_pass, off)
+    assert all(
+        np.allclose(a, b, rtol=1e-5) for a, b in zip(*map(jax.tree.leaves, (first_pass, twice)), strict=True)
+    )
 
 
 def test_simulate_passes_choices_on():
@@ -173,7 +175,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_choices_that_cannot_be_are_refused(case):
+def test_impossible_choices_are_refused(case):
     effects, message = BAD[case]
     scene = jl.Scene(ground=jl.Ground(slope=5.0), atmosphere=HAZE)
     with pytest.raises(ValueError, match=message):
@@ -210,7 +212,7 @@ def test_every_effect_has_a_line_in_the_table():
         (jl.GaussianPulse(2.0), 0.0, 2048),
         (jl.GaussianPulse(2.0), 1.0, 1024),
         (jl.GaussianPulse(6.0), 0.0, 1024),
-        # Its power jumps: its finest feature is 0.
+        # The power of a rectangular pulse jumps: its finest feature is 0.
         (jl.RectangularPulse(2.0), 0.0, 2048),
         (jl.RectangularPulse(6.0), 0.0, 1024),
     ],

@@ -15,12 +15,12 @@ KEY = jax.random.key(0)
 LEAF = jl.LeafOptics(0.4, 0.3)
 
 
-def stand(extinction=0.1, height=6.0, size=1.0, base=0.0, **more):
+def stand(extinction=0.1, height=6.0, size=1.0, base=0.0, **canopy_fields):
     shape = (8, 8, round(height / size))
     voxels = jl.VoxelMap.from_extinction(
         leaf=np.full(shape, extinction), voxel_size=size, origin=(-4 * size, -4 * size, base)
     )
-    return jl.Canopy(voxels, leaf=more.pop("leaf", LEAF), **more)
+    return jl.Canopy(voxels, leaf=canopy_fields.pop("leaf", LEAF), **canopy_fields)
 
 
 LIDAR = jl.Lidar(divergence=0.3)
@@ -35,7 +35,7 @@ def canopy(**changes):
 
 
 def narrower(width):
-    """The scene with voxels that are as high as they were."""
+    """Return the scene with voxels of another width and the same height."""
     assert SCENE.canopy is not None
     voxels = SCENE.canopy.voxels
     size = np.array([width, width, voxels.voxel_size[2]])
@@ -56,7 +56,7 @@ def lidar(**changes):
     return jl.Lidar(**({"divergence": 0.3} | changes))
 
 
-# What differs from the plan's, and what is said of it.
+# Lidars and scenes that differ from those of the plan, and the message.
 MISFITS = {
     "ground below": (LIDAR, ground(height=-60.0), r"covers returns .* the scene has .* to 400"),
     "canopy above": (LIDAR, canopy(base=2.0), "rays start 6.301 m .*; the scene reaches to 8 m"),
@@ -82,9 +82,9 @@ MISFITS = {
 
 @pytest.mark.parametrize("name", list(MISFITS))
 def test_a_plan_that_does_not_fit_is_refused_with_numbers(name):
-    other_lidar, other_scene, said = MISFITS[name]
+    other_lidar, other_scene, message = MISFITS[name]
     plan = jl.plan(LIDAR, SCENE, describe=False)
-    with pytest.raises(ValueError, match=f"the plan does not fit: .*{said}"):
+    with pytest.raises(ValueError, match=f"the plan does not fit: .*{message}"):
         jl.simulate(other_lidar, other_scene, key=KEY, plan=plan)
 
 
@@ -98,13 +98,13 @@ PLANE_MISFITS = {
 
 
 @pytest.mark.parametrize("name", list(PLANE_MISFITS))
-def test_plans_of_planes_too(name):
-    scene, said = PLANE_MISFITS[name]
-    with pytest.raises(ValueError, match=f"the plan does not fit: .*{said}"):
+def test_a_plan_of_planes_that_does_not_fit_is_refused(name):
+    scene, message = PLANE_MISFITS[name]
+    with pytest.raises(ValueError, match=f"the plan does not fit: .*{message}"):
         check_plan(jl.plan(LIDAR, PLANES, max_orders=3, describe=False), LIDAR, scene)
 
 
-def test_a_plan_fits_what_it_was_made_for_and_all_that_is_less():
+def test_a_plan_serves_its_scene_and_smaller_ones():
     plan = jl.plan(LIDAR, SCENE, describe=False)
     served = [
         (LIDAR, SCENE),
@@ -122,14 +122,14 @@ def test_a_plan_fits_what_it_was_made_for_and_all_that_is_less():
         check_plan(plan, *served[-1])
 
 
-def test_what_is_switched_off_may_differ():
+def test_switched_off_effects_may_differ():
     off = {"multiple scattering": False, "slope spread": False}
     plan = jl.plan(LIDAR, SCENE, effects=off, describe=False)
     check_plan(plan, LIDAR, ground(slope=20.0))
     check_plan(plan, LIDAR, canopy(leaf=jl.LeafOptics(0.5, 0.5)))
 
 
-def test_a_window_of_ones_own_may_leave_light_out():
+def test_a_window_of_the_user_may_leave_light_out():
     plan = jl.plan(LIDAR, SCENE, window=(-20.0, 5.0), describe=False)
     check_plan(plan, LIDAR, SCENE)
     with pytest.raises(ValueError, match="covers returns"):
@@ -142,7 +142,7 @@ def test_a_plan_together_with_its_arguments_is_refused():
         jl.simulate(LIDAR, SCENE, key=KEY, plan=plan, max_orders=2, window=(0.0, 5.0))
 
 
-def test_what_leaves_the_bins_under_a_transformation_is_lost_and_said():
+def test_light_outside_the_bins_is_reported_as_lost_under_a_transformation():
     """A plan for ground at 0 m serves ground at -1 m in part, and at -20 m not at all."""
     flat = jl.Scene(ground=jl.Ground(reflectance=0.4))
     plan = jl.plan(LIDAR, flat, describe=False)
@@ -153,16 +153,16 @@ def test_what_leaves_the_bins_under_a_transformation_is_lost_and_said():
         scene = eqx.tree_at(lambda s: s.ground.height, flat, height)
         return jl.simulate(LIDAR, scene, key=KEY, plan=plan)
 
-    found = waves(jnp.array([0.0, -1.0, -20.0]))
-    np.testing.assert_allclose(found.lost[:, 0], [0.0, 0.4, 0.4], atol=1e-5)
-    for name, share in found.energy_budget.items():
-        assert np.isfinite(share).all(), name
-    np.testing.assert_allclose(sum(found.energy_budget.values()), 1.0, atol=1e-5)
-    marked = jax.vmap(lambda wave: wave.nan_where_lost())(found)
+    mapped = waves(jnp.array([0.0, -1.0, -20.0]))
+    np.testing.assert_allclose(mapped.lost[:, 0], [0.0, 0.4, 0.4], atol=1e-5)
+    for name, fraction in mapped.energy_budget.items():
+        assert np.isfinite(fraction).all(), name
+    np.testing.assert_allclose(sum(mapped.energy_budget.values()), 1.0, atol=1e-5)
+    marked = jax.vmap(lambda wave: wave.nan_where_lost())(mapped)
     assert np.isnan(marked.reflectance).all(axis=(1, 2)).tolist() == [False, True, True]
-    np.testing.assert_array_equal(marked.reflectance[0], found.reflectance[0])
+    np.testing.assert_array_equal(marked.reflectance[0], mapped.reflectance[0])
     with pytest.raises(ValueError, match="share = 0"):
-        found.nan_where_lost(0.0)
+        mapped.nan_where_lost(0.0)
 
 
 def with_bark(extinction):
@@ -171,20 +171,20 @@ def with_bark(extinction):
     return jl.Scene(canopy=jl.Canopy(voxels, leaf=LEAF, bark=0.3), ground=jl.Ground(reflectance=0.3))
 
 
-def test_what_is_zero_everywhere_is_not_in_the_scene():
-    none, little = with_bark(0.0), with_bark(1e-3)
-    plan = jl.plan(LIDAR, none)
+def test_a_material_of_zero_extinction_is_not_in_the_scene():
+    without_bark, with_little_bark = with_bark(0.0), with_bark(1e-3)
+    plan = jl.plan(LIDAR, without_bark)
     assert {row.name: row.reason for row in plan.effects}["bark"] == "zero everywhere"
     assert plan.config.channels == ("leaf.R", "leaf.T", "ground.R")
-    assert jl.make_setup(LIDAR, none, plan).scene.canopy.voxels.bark is None
-    asked = jl.plan(LIDAR, none, effects={"bark": True}, describe=False)
-    assert "bark.R" in asked.config.channels
-    assert "bark" not in asked.off
-    check_plan(asked, LIDAR, little)
+    assert jl.make_setup(LIDAR, without_bark, plan).scene.canopy.voxels.bark is None
+    plan_with_bark = jl.plan(LIDAR, without_bark, effects={"bark": True}, describe=False)
+    assert "bark.R" in plan_with_bark.config.channels
+    assert "bark" not in plan_with_bark.off
+    check_plan(plan_with_bark, LIDAR, with_little_bark)
     with pytest.raises(ValueError, match="for a map without bark"):
-        check_plan(plan, LIDAR, little)
+        check_plan(plan, LIDAR, with_little_bark)
     with pytest.raises(ValueError, match=r'make the plan with effects={"bark": True}'):
-        eqx.filter_eval_shape(lambda scene: jl.make_setup(LIDAR, scene, plan).admissible, none)
+        eqx.filter_eval_shape(lambda scene: jl.make_setup(LIDAR, scene, plan).admissible, without_bark)
 
 
 def test_a_map_of_zeros_is_no_canopy():

@@ -215,7 +215,7 @@ def test_a_forest_keeps_its_distances_and_density():
     gap = np.linalg.norm(place[:, None] - place[None], axis=2)[np.triu_indices(90, 1)]
     assert 2.5 <= gap.min() < 3.0
     again = jl.forest(jl.shrub(shoots=0), density=600.0, area=(50.0, 30.0), minimum_distance=2.5, seed=4)
-    assert all(np.array_equal(a.end, b.end) for a, b in zip(trees, again))
+    assert all(np.array_equal(a.end, b.end) for a, b in zip(trees, again, strict=True))
 
 
 def test_without_a_distance_places_are_even():

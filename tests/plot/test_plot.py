@@ -1,4 +1,4 @@
-"""The figures: what they draw, with which units, on whose axes."""
+"""Figures: data and units that are drawn, on the given axes or new ones."""
 
 import jax
 import matplotlib
@@ -34,14 +34,14 @@ def axes():
     return Figure().subplots()
 
 
-def drawn(axes):
-    """Names and data of the lines."""
+def lines_of(axes):
+    """Return the data of the lines by their labels."""
     return {line.get_label(): line.get_xydata() for line in axes.lines}
 
 
 def test_waveform_has_height_upward_and_its_components(wave, axes):
     assert plot.waveform(wave, axes, wavelength=1064.0) is axes
-    lines = drawn(axes)
+    lines = lines_of(axes)
     assert np.allclose(lines["total"][:, 0], wave.reflectance[1])
     assert np.allclose(lines["total"][:, 1], wave.height)
     assert np.allclose(lines["scattered twice\nor more"][:, 0], wave.components["higher"][1])
@@ -56,7 +56,7 @@ def test_waveform_has_height_upward_and_its_components(wave, axes):
 
 def test_waveform_of_several_wavelengths_draws_their_totals(wave, axes):
     plot.waveform(wave, axes)
-    assert [name for name in drawn(axes) if name[0] != "_"] == ["532 nm", "1064 nm", "1550 nm"]
+    assert [name for name in lines_of(axes) if name[0] != "_"] == ["532 nm", "1064 nm", "1550 nm"]
 
 
 def test_waveform_band_is_in_standard_errors(wave, axes):
@@ -78,7 +78,7 @@ def test_waveform_in_joules(wave, axes):
     assert axes.get_xlabel() == "energy per sample of 1 ns (J)"
 
 
-def test_waveform_draws_what_is_empty_or_noisy(wave, axes):
+def test_empty_and_noisy_waveforms_are_drawn(wave, axes):
     empty = jax.tree.map(jax.numpy.zeros_like, wave)
     plot.waveform(empty, axes, wavelength=0.0)
     axes.clear()
@@ -151,13 +151,13 @@ def test_terrain_is_drawn_at_the_middle_of_the_map(axes):
 def test_an_empty_scene_and_new_figures():
     from matplotlib import pyplot
 
-    for made in (plot.scene(jl.Scene()), plot.scene(jl.Scene(), jl.Lidar(profile="top-hat"))):
-        assert made.get_ylabel() == "height (m)"
-        pyplot.close(made.figure)
+    for axes in (plot.scene(jl.Scene()), plot.scene(jl.Scene(), jl.Lidar(profile="top-hat"))):
+        assert axes.get_ylabel() == "height (m)"
+        pyplot.close(axes.figure)
 
 
 @pytest.mark.parametrize(
-    ("call", "says"),
+    ("call", "message"),
     [
         (lambda w: plot.waveform(w, wavelength=700.0), "wavelength = 700 nm is none of the waveform's: 532"),
         (lambda w: plot.waveform(w, quantity="power"), "quantity = 'power' is none of"),
@@ -169,12 +169,12 @@ def test_an_empty_scene_and_new_figures():
         (lambda w: plot.scene(jl.Scene(), along="z"), "along = 'z' is none of"),
     ],
 )
-def test_inadmissible_input_is_refused(wave, call, says):
-    with pytest.raises(ValueError, match=says):
+def test_inadmissible_input_is_refused(wave, call, message):
+    with pytest.raises(ValueError, match=message):
         call(wave)
 
 
-def test_ledger_adds_up_and_names_what_is_seen(wave, axes):
+def test_the_energy_budget_adds_up_to_100_percent(wave, axes):
     assert plot.energy_budget(wave, axes) is axes
     assert [t.get_text() for t in axes.get_yticklabels()] == ["532 nm", "1064 nm", "1550 nm"]
     ends = np.zeros(3)
@@ -182,20 +182,20 @@ def test_ledger_adds_up_and_names_what_is_seen(wave, axes):
         row = round(bar.get_y() + 0.4)
         ends[row] = max(ends[row], bar.get_x() + bar.get_width())
     assert np.allclose(ends, 100.0, atol=0.2)
-    bars = {bar.get_label(): [part.get_width() for part in bar] for bar in axes.containers}
+    bars = {bar.get_label(): [rectangle.get_width() for rectangle in bar] for bar in axes.containers}
     assert np.allclose(bars["absorbed by leaf"], 100 * np.asarray(wave.energy_budget["absorbed by leaf"]))
 
 
-def test_accuracy_has_the_error_and_the_aim(wave, axes):
+def test_accuracy_has_the_error_and_the_target(wave, axes):
     steps = [jl.Progress(8 * n, 65536 * n, 0.1 * n, 0.02 / n**0.5, 0.01) for n in (4, 1)]
     assert plot.accuracy(steps, axes) is axes
-    lines = drawn(axes)
+    lines = lines_of(axes)
     assert np.allclose(lines["relative error"], [[65536, 0.02], [262144, 0.01]])
     assert np.allclose(np.prod(lines["square root of the photons"] ** [0.5, 1.0], axis=1), 0.01 * 512)
     assert "aim 0.01" in lines
     axes.clear()
     plot.accuracy([wave], axes)
-    assert drawn(axes)["relative error"][0, 0] == wave.info["photons"]
+    assert lines_of(axes)["relative error"][0, 0] == wave.info["photons"]
     with pytest.raises(ValueError, match="steps has no photons"):
         plot.accuracy([], axes)
 
@@ -203,27 +203,27 @@ def test_accuracy_has_the_error_and_the_aim(wave, axes):
 def test_spectra_of_leaves_and_surfaces(axes):
     leaf = jl.Prospect(Cab=20.0)
     assert plot.spectrum(leaf, axes, wavelength=[532.0, 1064.0]) is axes
-    lines = drawn(axes)
+    lines = lines_of(axes)
     R, T = leaf([532.0, 1064.0])
     assert np.allclose(lines["reflectance"][:, 1], R)
     assert np.allclose(lines["transmittance"][:, 1], T)
     plot.spectrum(jl.LeafOptics(reflectance=0.9), axes, label="bright")
     plot.spectrum(jl.spectrum("soil-medium"), axes)
-    assert {"bright", "soil-medium"} <= set(drawn(axes))
-    # What is drawn last does not push what was drawn first out of sight.
+    assert {"bright", "soil-medium"} <= set(lines_of(axes))
+    # The limits include the lines of all calls.
     assert axes.get_ylim()[1] > 0.9
 
 
 def test_fit_shows_data_model_and_residuals(wave):
     observed = np.asarray(wave.reflectance) + 0.002
     pair = Figure().subplots(1, 2)
-    left, right = plot.fit(wave, observed, 0.001, pair, wavelength=1064.0)
-    assert np.allclose(drawn(left)["observed"][:, 0], observed[1])
-    assert np.allclose(drawn(left)["fitted"][:, 0], wave.reflectance[1])
-    points = np.concatenate([line.get_xydata() for line in right.lines if line.get_marker() == "o"])
+    waveform_axes, residual_axes = plot.fit(wave, observed, 0.001, pair, wavelength=1064.0)
+    assert np.allclose(lines_of(waveform_axes)["observed"][:, 0], observed[1])
+    assert np.allclose(lines_of(waveform_axes)["fitted"][:, 0], wave.reflectance[1])
+    points = np.concatenate([line.get_xydata() for line in residual_axes.lines if line.get_marker() == "o"])
     assert np.allclose(points[:, 0], 2.0, atol=1e-3)
     with pytest.raises(ValueError, match="axes has 1 axes; admissible are 2"):
-        plot.fit(wave, observed, 0.001, [left])
+        plot.fit(wave, observed, 0.001, [waveform_axes])
 
 
 def test_photons_are_drawn_at_their_heights_in_the_colours_of_their_labels(axes):
@@ -231,14 +231,14 @@ def test_photons_are_drawn_at_their_heights_in_the_colours_of_their_labels(axes)
     sun = jl.PhotonCounter(background_rate=1e7)
     events = jl.record(wave, receiver=sun, mode="photons", key=jax.random.key(1), pulses=50)
     assert plot.photons(events, ax=axes) is axes
-    lines = drawn(axes)
+    lines = lines_of(axes)
     assert np.array_equal(lines["signal"][:, 1], events.height[events.signal])
     assert np.array_equal(lines["noise"][:, 1], events.height[~events.signal])
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("shot", "height (m)")
     axes.clear()
     label = np.where(events.height > 2.0, 2, 1)
     plot.photons(events, [70.0], axes, label=label, color="red")
-    lines = drawn(axes)
+    lines = lines_of(axes)
     assert set(lines) == {"ground", "canopy"}
     assert np.array_equal(lines["canopy"][:, 1], events.height[label == 2])
     assert np.all(lines["canopy"][:, 0] == 70.0)

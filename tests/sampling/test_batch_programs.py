@@ -9,7 +9,7 @@ import jaxlidar as jl
 from jaxlidar.sampling import batch_programs
 from jaxlidar.spectral.apply_optics import samples_and_budget
 from jaxlidar.trace.response import trace_device_scene
-from tests.helpers import applied
+from tests.helpers import with_applied_optics
 
 KEY = jax.random.key(7)
 LIDAR = jl.Lidar(divergence=2.0, wavelength=(532.0, 1064.0))
@@ -29,7 +29,7 @@ def same(plan):
 
 @pytest.mark.parametrize(
     ("orders", "transmission", "change"),
-    [(1, "diffuse", same), (2, "diffuse", same), (2, "straight", same), (2, "diffuse", applied)],
+    [(1, "diffuse", same), (2, "diffuse", same), (2, "straight", same), (2, "diffuse", with_applied_optics)],
     ids=["one order", "two orders", "straight", "optics applied"],
 )
 def test_a_batch_is_the_trace_of_its_key(orders, transmission, change):
@@ -45,10 +45,10 @@ def test_a_batch_is_the_trace_of_its_key(orders, transmission, change):
         return np.max(np.abs(np.asarray(a) - np.asarray(b))) / np.max(np.abs(np.asarray(b)))
 
     assert jax.tree.structure(response) == jax.tree.structure(expected)
-    # Of 256 photons one, at an edge, may round to another side.
+    # One of 256 photons, at a face, may round to the other side.
     assert differ(estimate.samples, samples) < 2e-3
-    other = samples_and_budget(batch(2)[0], tracer.error_model)[0]
-    assert differ(other, samples) > 1e-2
+    other_samples = samples_and_budget(batch(2)[0], tracer.error_model)[0]
+    assert differ(other_samples, samples) > 1e-2
     assert set(estimate.budget_names) == set(terms.energy_budget)
     for name, row in zip(estimate.budget_names, estimate.budget):
         np.testing.assert_allclose(row, terms.energy_budget[name], atol=2e-3)
@@ -58,10 +58,10 @@ def test_a_batch_is_the_trace_of_its_key(orders, transmission, change):
 def test_traces_begin_to_compile_before_the_waveform_model_is_made(monkeypatch):
     """The program that takes longest begins first, in another thread."""
     batch_programs._compiled_higher.versions.clear()
-    make, begun = batch_programs.make_padded_waveform_model, []
+    make, compilations = batch_programs.make_padded_waveform_model, []
 
     def make_model(setup):
-        begun.extend(version.ahead for version in batch_programs._compiled_higher.versions.values())
+        compilations.extend(version.ahead for version in batch_programs._compiled_higher.versions.values())
         return make(setup)
 
     monkeypatch.setattr(batch_programs, "make_padded_waveform_model", make_model)
@@ -69,5 +69,5 @@ def test_traces_begin_to_compile_before_the_waveform_model_is_made(monkeypatch):
     # A scene that has not been simulated before: its device scene, too, has yet to be compiled.
     plan = jl.plan(LIDAR, crown, max_orders=3, n_photons=96, n_rays=64, window=(-50.0, 20.0))
     batch_programs.make_batch_tracer(jl.make_setup(LIDAR, crown, plan), KEY)
-    (ahead,) = begun
+    (ahead,) = compilations
     assert ahead is not None

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from jaxlidar.scenes.atmosphere import Atmosphere, aerosol_extinction, rayleigh_optical_depth
-from tests.helpers import NARROW
+from tests.helpers import BY_PRECISION
 
 WAVELENGTHS = np.array([355.0, 532.0, 1064.0, 1550.0])
 
@@ -45,7 +45,7 @@ def test_visibility_reference(reference):
 
 
 def test_rayleigh_formula():
-    """Bodhaine's fit (their eq. 30), which holds from 250 to 850 nm, and the fourth power far from it."""
+    """Against Bodhaine's fit (eq. 30), which holds from 250 to 850 nm, and the fourth power beyond."""
     for nm in (300.0, 400.0, 550.0, 700.0, 850.0):
         x = (nm / 1000) ** 2
         fit = (
@@ -88,7 +88,7 @@ def test_optical_depth_is_the_integral(precision, altitude, height):
             extinction = Atmosphere(visibility=8.0, base_height=700.0).extinction(532.0, z)
         integral = np.sum(half * weights * np.asarray(extinction)) / math.cos(math.radians(35.0))
     depth = air.optical_depth(532.0, height, altitude, 35.0)
-    # The sensor's height itself is rounded: the thinnest path here is 0.1 m.
+    # The heights are rounded, and the thinnest path here is 0.1 m.
     tolerance = 5e-6 if precision == "float32" else 1e-9
     assert float(depth) == pytest.approx(integral, rel=tolerance)
     two_way = air.two_way_transmittance(532.0, height, altitude, 35.0)
@@ -136,7 +136,7 @@ def test_backscatter_sums_to_its_closed_form():
 
 
 def test_backscatter_value():
-    """At the sensor, where nothing is lost: pi (sigma_molecules 3 / (8 pi) + sigma_aerosol / S)."""
+    """At the sensor the transmittance is 1, and the return pi (k_molecules 3 / (8 pi) + k_aerosol / S)."""
     air = Atmosphere(visibility=10.0, lidar_ratio=40.0)
     molecules = float(Atmosphere(visibility=None).extinction(532.0, 100.0))
     aerosol = float(air.extinction(532.0, 100.0)) - molecules
@@ -144,7 +144,7 @@ def test_backscatter_value():
     assert float(air.backscatter(532.0, 100.0, 100.0)) == pytest.approx(expected, rel=1e-5)
 
 
-@NARROW
+@BY_PRECISION
 def test_derivatives(precision):
     air = Atmosphere(visibility=15.0, lidar_ratio=50.0, base_height=200.0)
     heights = jnp.linspace(0.0, 30.0, 4)

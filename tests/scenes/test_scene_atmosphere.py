@@ -28,14 +28,14 @@ def test_ground_through_the_air():
 
 
 @pytest.mark.parametrize("ratio", [30.0, 60.0])
-def test_the_air_returns_light(ratio):
+def test_the_return_of_the_air(ratio):
     air = jl.Atmosphere(visibility=5.0, lidar_ratio=ratio)
     scene = jl.Scene(ground=jl.Ground(reflectance=0.0), atmosphere=air)
     wave = jl.simulate(LIDAR, scene, key=KEY, window=(-300.0, -50.0))
     heights = np.asarray(wave.height, float)
     per_metre = air.backscatter(LIDAR.wavelength, jnp.asarray(heights), 3000.0, 0.0)
     expected = np.asarray(per_metre) * 0.5 * 0.299792458
-    # Away from the ends of the window, where the pulse reaches over the edge.
+    # At the ends of the window, part of the pulse lies outside.
     inner = slice(20, -20)
     assert np.allclose(wave.reflectance[:, inner], expected[:, inner], rtol=2e-3)
     assert np.array_equal(wave.components["air"], wave.components["first"])

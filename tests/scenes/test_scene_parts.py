@@ -1,4 +1,4 @@
-"""Scenes in parts: the same waveforms as of the whole, from rectangles of one size."""
+"""Tiled scenes: the same waveforms as of the untiled scene, from rectangles of one size."""
 
 import functools
 from concurrent.futures import ThreadPoolExecutor
@@ -17,13 +17,12 @@ DENSITY = np.where(np.random.default_rng(0).uniform(size=(SIDE, SIDE, TALL)) < 0
 
 
 class Forest:
-    """Parts of a forest whose corner is at `origin`; what was asked for is kept."""
+    """The function `part` of a forest whose south-west corner is at `origin`."""
 
     def __init__(self, origin=(0.0, 0.0), density=DENSITY):
-        self.origin, self.density, self.asked = np.asarray(origin), density, []
+        self.origin, self.density = np.asarray(origin), density
 
     def __call__(self, low, high):
-        self.asked.append((low, high))
         first = np.clip(np.floor(low - self.origin), 0, SIDE - 1).astype(int)
         last = np.clip(np.ceil(high - self.origin), 1, SIDE).astype(int)
         density = self.density[first[0] : last[0], first[1] : last[1]]
@@ -31,10 +30,10 @@ class Forest:
         canopy = jl.Canopy(voxels, leaf=LEAF) if density.any() else None
         return jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=0.4))
 
-    def whole(self):
+    def untiled(self):
         return self(self.origin, self.origin + SIDE)
 
-    # Two forests with the same density are the same.
+    # The fingerprint of a survey includes its function by pickle: forests of the same density are the same.
     def __reduce__(self):
         return Forest, (tuple(self.origin), self.density)
 
@@ -44,60 +43,61 @@ def survey(origin=(0.0, 0.0), zenith=0.0) -> jl.Survey:
     return jl.Survey(lidar, np.add(origin, [(12, 12), (13, 14), (36, 13), (20, 35), (34, 36), (35, 35)]))
 
 
-def parts(forest, **how) -> jl.SceneParts:
-    return jl.SceneParts(forest, z=(0.0, TALL), tile=20.0, **how)
+def tiled(forest, **options) -> jl.SceneParts:
+    return jl.SceneParts(forest, z=(0.0, TALL), tile=20.0, **options)
 
 
-def simulated(scene, seed=0, **how):
-    how = {"rtol": 0.05, "shared": False, **how}
-    return jl.simulate_many(how.pop("survey", survey()), scene, key=jax.random.key(seed), **how)
+def simulate_forest(scene, seed=0, **options):
+    options = {"rtol": 0.05, "shared": False, **options}
+    return jl.simulate_many(options.pop("survey", survey()), scene, key=jax.random.key(seed), **options)
 
 
-def off(a, b) -> np.ndarray:
-    """Standard errors by which the light after the first return of two campaigns differs, shot by shot."""
+def z_of_late_light(a, b) -> np.ndarray:
+    """Compare the light after the first return of two surveys, shot by shot, in standard errors."""
     late = slice(3 * a.time.size // 5, None)
     light = (m.components["higher"][..., late].sum(axis=(1, 2)) for m in (a, b))
-    # Errors of samples of one shot are not independent: the bound that they are one and the same.
+    # Errors of the samples of one shot are not independent. Their sum is an upper bound.
     errors = (m.stderr[..., late].sum(axis=(1, 2)) for m in (a, b))
     return np.subtract(*light) / np.hypot(*errors)
 
 
 @pytest.fixture(scope="module")
-def both() -> tuple[jl.Waveforms, jl.Waveforms]:
-    """The forest as a whole and in parts, at first order, with the truth."""
-    whole, found = (simulated(s, max_orders=1, truth=True) for s in (Forest().whole(), parts(Forest())))
-    return whole, found
+def untiled_and_tiled() -> tuple[jl.Waveforms, jl.Waveforms]:
+    """Simulate the untiled and the tiled forest at first order, with the truth."""
+    scenes = (Forest().untiled(), tiled(Forest()))
+    untiled, in_tiles = (simulate_forest(scene, max_orders=1, truth=True) for scene in scenes)
+    return untiled, in_tiles
 
 
-def test_the_same_waveforms_as_of_the_whole_at_first_order(both):
-    whole, found = both
-    np.testing.assert_array_equal(whole.time, found.time)
-    np.testing.assert_array_equal(whole.ground_height, found.ground_height)
-    np.testing.assert_array_equal(found.position, survey().position)
-    z = (whole.reflectance - found.reflectance) / np.hypot(whole.stderr, found.stderr).max()
+def test_the_same_waveforms_as_of_the_untiled_scene_at_first_order(untiled_and_tiled):
+    untiled, in_tiles = untiled_and_tiled
+    np.testing.assert_array_equal(untiled.time, in_tiles.time)
+    np.testing.assert_array_equal(untiled.ground_height, in_tiles.ground_height)
+    np.testing.assert_array_equal(in_tiles.position, survey().position)
+    z = (untiled.reflectance - in_tiles.reflectance) / np.hypot(untiled.stderr, in_tiles.stderr).max()
     assert np.abs(z).max() < 4
-    assert not np.allclose(found.reflectance[0], found.reflectance[2], rtol=0.05)
-    assert (found.info["parts"], found.info["margin"]) == (3, 0.0)
+    assert not np.allclose(in_tiles.reflectance[0], in_tiles.reflectance[2], rtol=0.05)
+    assert (in_tiles.info["parts"], in_tiles.info["margin"]) == (3, 0.0)
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::jaxlidar.LateLightWarning")
-def test_a_margin_as_wide_as_all_light_loses_none_and_a_small_one_does():
-    bright = {"rtol": 0.02, "max_orders": 30}
-    whole = simulated(Forest().whole(), **bright)
-    found = simulated(parts(Forest()), seed=1, **bright)
-    assert found.info["margin"] == found.info["margin of all light"] > 10
-    assert np.abs(off(whole, found)).max() < 3
-    assert np.abs(np.mean(off(whole, found))) < 0.75
-    narrow = simulated(jl.SceneParts(Forest(), z=(0.0, TALL), tile=1.0, margin=0.0), **bright)
+def test_the_default_margin_loses_no_light_and_a_small_one_does():
+    orders = {"rtol": 0.02, "max_orders": 30}
+    untiled = simulate_forest(Forest().untiled(), **orders)
+    in_tiles = simulate_forest(tiled(Forest()), seed=1, **orders)
+    assert in_tiles.info["margin"] == in_tiles.info["margin of all light"] > 10
+    assert np.abs(z_of_late_light(untiled, in_tiles)).max() < 3
+    assert np.abs(np.mean(z_of_late_light(untiled, in_tiles))) < 0.75
+    narrow = simulate_forest(jl.SceneParts(Forest(), z=(0.0, TALL), tile=1.0, margin=0.0), **orders)
     assert narrow.info["margin"] == 0.0 < narrow.info["margin of all light"]
-    # Light falls in through the sides where there is forest.
-    assert np.mean(off(narrow, whole)) > 1.5
+    # Through the cut sides of the tile light enters and leaves that the forest around would attenuate.
+    assert np.mean(z_of_late_light(narrow, untiled)) > 1.5
 
 
 def test_rectangles_have_one_size_and_hold_all_light():
     for zenith in (0.0, 30.0):
-        shots, scene = survey(zenith=zenith), parts(Forest())
+        shots, scene = survey(zenith=zenith), tiled(Forest())
         for margin in (0.0, 7.0):
             squares = squares_of(shots, scene, margin)
             assert sorted(np.concatenate([s.shots for s in squares])) == list(range(len(shots)))
@@ -106,78 +106,78 @@ def test_rectangles_have_one_size_and_hold_all_light():
             for square in squares:
                 for z in scene.z:
                     axis = shots.direction[square.shots]
-                    at = shots.position[square.shots] + z * axis[:, :2] / axis[:, 2:]
-                    reach = shots.footprint_radius[square.shots, None] + margin
-                    assert np.all(at - reach >= square.low)
-                    assert np.all(at + reach <= square.high)
+                    centre = shots.position[square.shots] + z * axis[:, :2] / axis[:, 2:]
+                    extent = shots.footprint_radius[square.shots, None] + margin
+                    assert np.all(centre - extent >= square.low)
+                    assert np.all(centre + extent <= square.high)
 
 
 def test_light_that_goes_farther_comes_back_too_late():
-    """The shortest path to a place and back, against the distance, for places and directions at random."""
+    """The shortest path over two random points farther apart than the bound ends after the record."""
     random = np.random.default_rng(2)
     for zenith in (0.0, 20.0, 50.0):
         shots = survey(zenith=zenith)
         w, last, top = shots.direction[0], 60.0, 10.0
-        far = all_light(shots, last, top)
+        bound = all_light(shots, last, top)
         z = random.uniform(0, top, (20_000, 2))
-        turn, apart = random.uniform(0, 2 * np.pi, 20_000), far * random.uniform(0.5, 1.5, 20_000)
+        azimuth, separation = random.uniform(0, 2 * np.pi, 20_000), bound * random.uniform(0.5, 1.5, 20_000)
         first = z[:, :1] / w[2] * w
-        then = first + np.c_[apart * np.cos(turn), apart * np.sin(turn), z[:, 1] - z[:, 0]]
-        path = first @ w + np.linalg.norm(then - first, axis=1) + then @ w
-        assert path[apart > far].min() >= last
-        # The bound is not idle: in the worst direction it is reached to a few per cent.
-        assert apart[path < last].max() > 0.7 * far
+        second = first + np.c_[separation * np.cos(azimuth), separation * np.sin(azimuth), z[:, 1] - z[:, 0]]
+        path = first @ w + np.linalg.norm(second - first, axis=1) + second @ w
+        assert path[separation > bound].min() >= last
+        # The bound is tight: in the worst direction, light from 0.7 of it returns in time.
+        assert separation[path < last].max() > 0.7 * bound
 
 
 def test_an_interrupted_run_goes_on_and_gives_the_same(tmp_path):
     path = tmp_path / "many.nc"
 
-    def stop(done):
-        if done.done < 6:
+    def interrupt(progress):
+        if progress.done < 6:
             raise KeyboardInterrupt
 
-    how = {"max_orders": 1, "path": path}
+    options = {"max_orders": 1, "path": path}
     with pytest.raises(KeyboardInterrupt):
-        simulated(parts(Forest()), progress=stop, **how)
-    assert 0 < len(stored_tasks(path)) < 4
-    found = simulated(parts(Forest()), **how)
+        simulate_forest(tiled(Forest()), progress=interrupt, **options)
+    stored = stored_tasks(path)
+    assert 0 < len(stored) < 4
+    continued = simulate_forest(tiled(Forest()), **options)
     with ThreadPoolExecutor(2) as executor:
-        again = simulated(parts(Forest()), max_orders=1, executor=executor)
+        uninterrupted = simulate_forest(tiled(Forest()), max_orders=1, executor=executor)
     for name in ("reflectance", "stderr", "ground_height"):
-        np.testing.assert_array_equal(getattr(found, name), getattr(again, name))
+        np.testing.assert_array_equal(getattr(continued, name), getattr(uninterrupted, name))
     with pytest.raises(ValueError, match="scene"):
-        simulated(parts(Forest(density=0.9 * DENSITY)), **how)
+        simulate_forest(tiled(Forest(density=0.9 * DENSITY)), **options)
 
 
-def test_millions_of_metres_lose_nothing_and_bare_parts_have_all_materials():
+def test_coordinates_of_millions_of_metres_change_nothing_and_bare_tiles_have_all_materials():
     density = DENSITY.copy()
     density[:26, :26] = 0.0
-    near, far = (0.0, 0.0), (400_000.0, 5_000_000.0)
-    how = {"max_orders": 1, "truth": True}
-    a, b = (
-        simulated(parts(Forest(origin, density), margin=0.0), survey=survey(origin), **how)
-        for origin in (near, far)
+    options = {"max_orders": 1, "truth": True}
+    near, distant = (
+        simulate_forest(tiled(Forest(origin, density), margin=0.0), survey=survey(origin), **options)
+        for origin in ((0.0, 0.0), (400_000.0, 5_000_000.0))
     )
-    np.testing.assert_allclose(a.reflectance, b.reflectance, atol=1e-6)
-    for leaf in (a.components["leaf"], a.truth.returns["leaf"]):
+    np.testing.assert_allclose(near.reflectance, distant.reflectance, atol=1e-6)
+    for leaf in (near.components["leaf"], near.truth.returns["leaf"]):
         assert float(leaf[0].max()) == 0.0 < float(leaf[5].max())
-    total = sum(v[0] for v in a.energy_budget.values())
+    total = sum(v[0] for v in near.energy_budget.values())
     np.testing.assert_allclose(total, 1.0, atol=1e-5)
 
 
-def test_the_truth_is_that_of_the_whole(both, tmp_path):
+def test_the_truth_is_that_of_the_untiled_scene(untiled_and_tiled, tmp_path):
     """In memory and from a file, in the survey's order."""
-    whole, found = both
-    filed = simulated(parts(Forest()), max_orders=1, truth=True, path=tmp_path / "many.nc")
+    untiled, in_tiles = untiled_and_tiled
+    from_file = simulate_forest(tiled(Forest()), max_orders=1, truth=True, path=tmp_path / "many.nc")
     compare = functools.partial(np.testing.assert_allclose, rtol=1e-5, atol=2e-5)
-    for mine in (found.truth, filed.truth):
-        assert set(mine.returns) == set(whole.truth.returns) == {"leaf", "ground"}
-        for name, expected in vars(whole.truth).items():
-            jax.tree.map(compare, getattr(mine, name), expected)
-    assert float(found[3].truth.surface_height["ground"]) == pytest.approx(0.0, abs=1e-6)
+    for truth in (in_tiles.truth, from_file.truth):
+        assert set(truth.returns) == set(untiled.truth.returns) == {"leaf", "ground"}
+        for name, expected in vars(untiled.truth).items():
+            jax.tree.map(compare, getattr(truth, name), expected)
+    assert float(in_tiles[3].truth.surface_height["ground"]) == pytest.approx(0.0, abs=1e-6)
 
 
-def test_bad_input_is_refused_before_any_work():
+def test_inadmissible_input_is_refused_before_any_work():
     with pytest.raises(TypeError, match="part"):
         jl.SceneParts(3, z=(0, 1))  # pyright: ignore[reportArgumentType]
     for z in ((1.0, 0.0), (0.0, np.inf), (0.0,)):
@@ -188,8 +188,8 @@ def test_bad_input_is_refused_before_any_work():
     with pytest.raises(ValueError, match="margin"):
         jl.SceneParts(Forest(), z=(0, 1), margin=-1.0)
     with pytest.raises(TypeError, match=r"part\(\[.*a Scene"):
-        simulated(jl.SceneParts(lambda low, high: None, z=(0, 1)))  # pyright: ignore[reportArgumentType]
+        simulate_forest(jl.SceneParts(lambda low, high: None, z=(0, 1)))  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match=r"voxels from 0 m to 6 m; admissible is z = \(0.0, 5.0\)"):
-        simulated(jl.SceneParts(Forest(), z=(0, 5)))
+        simulate_forest(jl.SceneParts(Forest(), z=(0, 5)))
     with pytest.raises(TypeError, match="Scene"):
-        jl.simulate(jl.Lidar(), parts(Forest()), key=jax.random.key(0))  # pyright: ignore[reportArgumentType]
+        jl.simulate(jl.Lidar(), tiled(Forest()), key=jax.random.key(0))  # pyright: ignore[reportArgumentType]

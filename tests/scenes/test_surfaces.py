@@ -1,8 +1,7 @@
-"""Surfaces of one's own: a disc, written as a user would, beside closed forms.
+"""Surfaces of the user: a disc, written as a user would, against closed forms.
 
-Layout: a horizontal disc of radius a in the axis of a top-hat beam of radius b > a, over black ground. Its
-first order returns R a^2 / b^2; opaque, over white ground, it returns that and leaves 1 - a^2 / b^2 to the
-ground.
+Layout: a horizontal disc of radius a on the axis of a top-hat beam of radius b > a, over ground of
+reflectance 1. With f = a^2 / b^2, first order returns R f from the disc and (1 - f) + f T^2 from the ground.
 """
 
 from typing import final
@@ -15,11 +14,11 @@ from jaxtyping import Array, Float
 
 import jaxlidar as jl
 from jaxlidar.extend import Vec, as_array, as_scalar
-from tests.helpers import WHOLE, agrees, batch_mean, whole_lidar
+from tests.helpers import SINGLE_SAMPLE, agrees, batch_mean, single_sample_lidar
 
 
 @final
-class Round(jl.AbstractShape):
+class DiscShape(jl.AbstractShape):
     """A horizontal disc."""
 
     centre: Float[Array, "3"]
@@ -30,13 +29,13 @@ class Round(jl.AbstractShape):
         return False
 
     def moved(self, by):
-        return Round(self.centre + by, self.radius)
+        return DiscShape(self.centre + by, self.radius)
 
     def distance(self, x: Vec, w: Vec):
         up = jnp.asarray([0.0, 0.0, 1.0])
         s = jl.Plane(up, self.centre).distance(x, w)
-        away = (x[0] + s * w[0] - self.centre[0]) ** 2 + (x[1] + s * w[1] - self.centre[1]) ** 2
-        return jnp.where(away < self.radius**2, s, 1e30)
+        radius2 = (x[0] + s * w[0] - self.centre[0]) ** 2 + (x[1] + s * w[1] - self.centre[1]) ** 2
+        return jnp.where(radius2 < self.radius**2, s, 1e30)
 
     def tangent(self, x: Vec):
         zero = jnp.zeros_like(self.radius)
@@ -66,11 +65,11 @@ class Disc(jl.AbstractSheet):
     @property
     def shape(self):
         zero = jnp.zeros_like(self.height)
-        return Round(jnp.stack([zero, zero, self.height]), self.radius)
+        return DiscShape(jnp.stack([zero, zero, self.height]), self.radius)
 
 
-# 20 m across, from 400 km.
-LIDAR = whole_lidar(profile="top-hat", divergence=0.05)
+# The footprint has a radius of 10 m.
+LIDAR = single_sample_lidar(profile="top-hat", divergence=0.05)
 
 
 def sums(wave):
@@ -83,43 +82,46 @@ def scene(ground, **disc):
 
 @pytest.mark.parametrize(("reflectance", "transmittance"), [(0.6, 0.0), (0.5, 0.4)])
 def test_first_order_of_a_disc(reflectance, transmittance):
-    what = scene(1.0, reflectance=reflectance, transmittance=transmittance)
-    plan = jl.plan(LIDAR, what, max_orders=1, n_rays=4096, **WHOLE)
-    mean, stderr = batch_mean(LIDAR, what, plan, seed=0, count=16, quantity=sums)
-    share = (4.0 / 10.0) ** 2
-    assert agrees(mean["disc"], stderr["disc"], reflectance * share, sigmas=4.0)
-    assert agrees(mean["ground"], stderr["ground"], 1 - share + share * transmittance**2, sigmas=4.0)
-    assert not agrees(mean["disc"], stderr["disc"], 1.02 * reflectance * share, sigmas=4.0)
+    disc_scene = scene(1.0, reflectance=reflectance, transmittance=transmittance)
+    plan = jl.plan(LIDAR, disc_scene, max_orders=1, n_rays=4096, **SINGLE_SAMPLE)
+    mean, stderr = batch_mean(LIDAR, disc_scene, plan, seed=0, count=16, quantity=sums)
+    fraction = (4.0 / 10.0) ** 2
+    ground = 1 - fraction + fraction * transmittance**2
+    assert agrees(mean["disc"], stderr["disc"], reflectance * fraction, sigmas=4.0)
+    assert agrees(mean["ground"], stderr["ground"], ground, sigmas=4.0)
+    assert not agrees(mean["disc"], stderr["disc"], 1.02 * reflectance * fraction, sigmas=4.0)
 
 
-def test_a_disc_in_the_ledger_and_in_the_plan():
-    what = scene(0.7, reflectance=0.5, transmittance=0.3)
-    wave = jl.simulate(LIDAR, what, key=jax.random.key(0), n_photons=65536, max_orders=8, **WHOLE)
+def test_a_disc_in_the_energy_budget_and_in_the_plan():
+    disc_scene = scene(0.7, reflectance=0.5, transmittance=0.3)
+    wave = jl.simulate(
+        LIDAR, disc_scene, key=jax.random.key(0), n_photons=65536, max_orders=8, **SINGLE_SAMPLE
+    )
     assert float(sum(wave.energy_budget.values())[0]) == pytest.approx(1.0, abs=1e-4)
     assert set(wave.components) == {"ground", "disc", "first", "higher"}
-    # No bound but the one that always holds is known for such a shape.
-    table = {e.name: e for e in jl.plan(LIDAR, what).effects}
+    # Plans know planes only: for another shape they state the bound that always holds.
+    table = {e.name: e for e in jl.plan(LIDAR, disc_scene).effects}
     assert table["plates"].bound == 1.0
 
 
-def test_surfaces_of_a_name_are_numbered():
-    plate = jl.Plate(height=1.0, reflectance=0.2)
-    other = jl.Plate(height=2.0, reflectance=0.2)
-    what = jl.Scene(plates=(plate, Disc(5.0, 4.0, reflectance=0.5), other), ground=jl.Ground())
-    materials = jl.plan(LIDAR, what, max_orders=1, describe=False).config.materials
+def test_surfaces_of_the_same_name_are_numbered():
+    lower, upper = (jl.Plate(height=height, reflectance=0.2) for height in (1.0, 2.0))
+    disc = Disc(5.0, 4.0, reflectance=0.5)
+    disc_scene = jl.Scene(plates=(lower, disc, upper), ground=jl.Ground())
+    materials = jl.plan(LIDAR, disc_scene, max_orders=1, describe=False).config.materials
     assert materials == ("ground", "plate 1", "disc", "plate 2")
 
 
 @pytest.mark.slow
 def test_derivative_in_the_height_of_a_disc():
-    """The mean time of its echo: 2 / c per metre."""
+    """The mean time of its echo changes by -2 / c per metre."""
     lidar = jl.Lidar(divergence=0.1, pulse=jl.GaussianPulse(fwhm=4.0))
-    what = jl.Scene(plates=(Disc(5.0, 4.0, reflectance=0.5),))
-    plan = jl.plan(lidar, what, max_orders=1, window=(-80.0, 20.0), footprint="fixed")
+    disc_scene = jl.Scene(plates=(Disc(5.0, 4.0, reflectance=0.5),))
+    plan = jl.plan(lidar, disc_scene, max_orders=1, window=(-80.0, 20.0), footprint="fixed")
 
     def mean_time(height):
-        disc = eqx.tree_at(lambda s: s.plates[0].height, what, height)
-        setup = jl.make_setup(lidar, disc, plan)
+        moved = eqx.tree_at(lambda s: s.plates[0].height, disc_scene, height)
+        setup = jl.make_setup(lidar, moved, plan)
         wave = jl.waveform_of(jl.trace_scene(setup, jax.random.key(0)), setup)
         return jnp.sum(wave.reflectance[0] * wave.time) / jnp.sum(wave.reflectance[0])
 

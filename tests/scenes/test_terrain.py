@@ -1,12 +1,12 @@
-r"""Terrain: planes, roofs and valleys beside closed forms, rays beside bisection, derivatives, refusals.
+r"""Terrain against closed forms and bisection, its derivatives, and inadmissible arguments.
 
 Closed forms, for Lambertian facets of slope s and reflectance rho, seen from straight above:
 
-- roof: two facets that fall from a ridge on the beam's axis return rho cos(s) in all. Places across the ridge
-  are normal with the footprint's sigma, so heights are -tan(s) |x|: with mean sigma sqrt(2 / pi) tan(s) below
-  the ridge and variance sigma^2 (1 - 2 / pi) tan^2(s).
-- valley: a facet sees the share F = (1 + cos(psi)) / 2 of its half-space filled by the other, psi being the
-  angle between the two, at any distance from the line where they meet. All orders together return
+- roof: two facets that fall from a ridge on the beam's axis return rho cos(s) together. Positions across the
+  ridge are normal with the standard deviation sigma of the footprint, and heights are -tan(s) |x|. Their mean
+  is sigma sqrt(2 / pi) tan(s) below the ridge, their variance sigma^2 (1 - 2 / pi) tan^2(s).
+- valley: the view factor from one facet to the other is F = (1 + cos(psi)) / 2, psi being the angle between
+  the two, at any distance from the line where they meet. All orders together return
   rho cos(s) / (1 - rho F), and (1 - rho) / (1 - rho F) is absorbed.
 """
 
@@ -21,7 +21,7 @@ import pytest
 import jaxlidar as jl
 from jaxlidar.extend import vec
 from jaxlidar.scenes.height_field import HeightField
-from tests.helpers import WHOLE, agrees, batch_mean, whole_lidar
+from tests.helpers import SINGLE_SAMPLE, agrees, batch_mean, single_sample_lidar
 
 KEY = jax.random.key(3)
 X, Y = np.meshgrid(np.arange(21.0), np.arange(17.0), indexing="ij")
@@ -32,95 +32,96 @@ def hills(**changes):
     return jl.Terrain(**({"heights": HILLS, "spacing": 1.0, "origin": (-10.0, -8.0)} | changes))
 
 
-def height_of(heights, place):
-    """Bilinear, in double precision, with the origin at a node and a spacing of 1 m."""
-    i, j = (
-        np.clip(np.floor(p), 0, n - 2).astype(int) for p, n in zip(np.moveaxis(place, -1, 0), heights.shape)
-    )
-    x, y = place[..., 0] - i, place[..., 1] - j
+def height_of(heights, position):
+    """Interpolate heights bilinearly in double precision; the spacing is 1 m, node 0 at the origin."""
+    x, y = np.moveaxis(position, -1, 0)
+    i, j = (np.clip(np.floor(p), 0, n - 2).astype(int) for p, n in zip((x, y), heights.shape))
+    x, y = x - i, y - j
     rows = [(1 - y) * heights[i + k, j] + y * heights[i + k, j + 1] for k in range(2)]
     return (1 - x) * rows[0] + x * rows[1]
 
 
-def first_fall(heights, start, way, longest=40.0, steps=8000):
-    """Where rays fall through the surface first: by small steps, and bisection."""
-    s = np.linspace(0.0, longest, steps)
+def first_hit(heights, start, direction, max_distance=40.0, steps=8000):
+    """Find the distance at which rays first fall through the surface, by small steps and bisection."""
+    s = np.linspace(0.0, max_distance, steps)
     size = np.array(heights.shape) - 1
 
-    def above(s):
-        at = start[:, None, :] + s[..., None] * way[:, None, :]
-        inside = np.all((at[..., :2] >= 0) & (at[..., :2] <= size), axis=-1)
-        return np.where(inside, at[..., 2] - height_of(heights, at[..., :2]), np.nan)
+    def clearance(s):
+        point = start[:, None, :] + s[..., None] * direction[:, None, :]
+        inside = np.all((point[..., :2] >= 0) & (point[..., :2] <= size), axis=-1)
+        return np.where(inside, point[..., 2] - height_of(heights, point[..., :2]), np.nan)
 
-    f = above(np.broadcast_to(s, (len(start), steps)))
+    f = clearance(np.broadcast_to(s, (len(start), steps)))
     falls = (f[:, :-1] >= 0) & (f[:, 1:] < 0)
-    first, met = np.argmax(falls, axis=1), np.any(falls, axis=1)
+    first, hit = np.argmax(falls, axis=1), np.any(falls, axis=1)
     low, high = s[first], s[first + 1]
     for _ in range(50):
         middle = 0.5 * (low + high)
-        up = above(middle[:, None])[:, 0] >= 0
-        low, high = np.where(up, middle, low), np.where(up, high, middle)
-    return np.where(met, low, 1e30)
+        is_above = clearance(middle[:, None])[:, 0] >= 0
+        low, high = np.where(is_above, middle, low), np.where(is_above, high, middle)
+    return np.where(hit, low, 1e30)
 
 
 @pytest.mark.parametrize("from_surface", [False, True])
-def test_rays_meet_the_surface_where_bisection_finds_it(from_surface):
+def test_rays_meet_the_surface_where_bisection_does(from_surface):
     random = np.random.default_rng(1)
     start = np.c_[random.uniform(1, 19, 300), random.uniform(1, 15, 300), np.full(300, 3.0)]
-    way = random.normal(size=(300, 3)) * (1.0, 1.0, 0.3)
-    way /= np.linalg.norm(way, axis=1)[:, None]
-    way[:, 2] = np.abs(way[:, 2]) * (1 if from_surface else -1)
+    direction = random.normal(size=(300, 3)) * (1.0, 1.0, 0.3)
+    direction /= np.linalg.norm(direction, axis=1)[:, None]
+    direction[:, 2] = np.abs(direction[:, 2]) * (1 if from_surface else -1)
     shape = hills(origin=(0.0, 0.0)).shape
     if from_surface:
         start[:, 2] = height_of(HILLS, start[:, :2])
         normal, _ = shape.tangent(vec(jnp.asarray(start.T, float)))
-        rises = np.einsum("kn,nk->n", np.asarray(normal), way) > 1e-2
-        start, way = start[rises], way[rises]
-    found = np.asarray(shape.distance(*(vec(jnp.asarray(a.T, float)) for a in (start, way))), float)
+        rises = np.einsum("kn,nk->n", np.asarray(normal), direction) > 1e-2
+        start, direction = start[rises], direction[rises]
+    rays = (vec(jnp.asarray(a.T, float)) for a in (start, direction))
+    distance = np.asarray(shape.distance(*rays), float)
+    # Bisection must not take the start itself for an intersection.
     just_above = np.array([0.0, 0.0, 1e-9 * from_surface])
-    expected = first_fall(HILLS, start + just_above, way)
-    np.testing.assert_array_equal(found < 1e29, expected < 1e29)
-    met = expected < 1e29
-    assert met.sum() > 30
-    # A ray that grazes moves along by far more than it is off in height.
-    off = height_of(HILLS, (start + found[:, None] * way)[met, :2]) - (start + found[:, None] * way)[met, 2]
-    assert np.abs(off).max() < 1e-5
-    assert np.median(np.abs(found - expected)[met]) < 1e-5
+    expected = first_hit(HILLS, start + just_above, direction)
+    np.testing.assert_array_equal(distance < 1e29, expected < 1e29)
+    hit = expected < 1e29
+    assert hit.sum() > 30
+    # The error in height is bounded for all rays; the distance along a grazing ray has a far larger one.
+    points = (start + distance[:, None] * direction)[hit]
+    assert np.abs(height_of(HILLS, points[:, :2]) - points[:, 2]).max() < 1e-5
+    assert np.median(np.abs(distance - expected)[hit]) < 1e-5
 
 
-def test_rays_that_are_many_meet_what_each_meets_by_itself():
-    # The longest of many are followed apart from the others.
+def test_distances_do_not_depend_on_the_number_of_rays():
+    # With many rays, the last active ones are gathered and traced alone.
     random = np.random.default_rng(3)
     start = np.c_[random.uniform(1, 19, 600), random.uniform(1, 15, 600), random.uniform(-1, 4, 600)]
-    way = random.normal(size=(600, 3)) * (1.0, 1.0, 0.1)
-    way /= np.linalg.norm(way, axis=1)[:, None]
+    direction = random.normal(size=(600, 3)) * (1.0, 1.0, 0.1)
+    direction /= np.linalg.norm(direction, axis=1)[:, None]
     shape = hills(origin=(0.0, 0.0)).shape
 
-    def distance(start, way):
-        return np.asarray(shape.distance(*(vec(jnp.asarray(a.T, float)) for a in (start, way))))
+    def distance(start, direction):
+        return np.asarray(shape.distance(*(vec(jnp.asarray(a.T, float)) for a in (start, direction))))
 
-    few = [distance(start[n : n + 50], way[n : n + 50]) for n in range(0, 600, 50)]
-    assert 100 < np.sum(np.concatenate(few) < 1e29) < 550
-    np.testing.assert_array_equal(distance(start, way), np.concatenate(few))
+    by_fifty = [distance(start[n : n + 50], direction[n : n + 50]) for n in range(0, 600, 50)]
+    assert 100 < np.sum(np.concatenate(by_fifty) < 1e29) < 550
+    np.testing.assert_array_equal(distance(start, direction), np.concatenate(by_fifty))
 
 
-def test_a_ray_from_below_passes_and_one_beside_misses():
+def test_rays_from_below_and_outside_the_nodes_do_not_hit():
     shape = hills().shape
     assert isinstance(shape, HeightField)
     start = vec(jnp.asarray([[0.0, 0.0, -5.0], [10.5, 0.0, 9.0]]).T)
-    way = vec(jnp.asarray([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]).T)
-    assert np.all(np.asarray(shape.distance(start, way)) == np.float32(1e30))
+    direction = vec(jnp.asarray([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]).T)
+    assert np.all(np.asarray(shape.distance(start, direction)) == np.float32(1e30))
 
 
 # -- planes, roofs and valleys -----------------------------------------------------------------------------
 
 
 SLOPE = np.tan(np.deg2rad(15.0))
-# From so far away that all rays are parallel.
+# At this altitude all rays are parallel to the accuracy of the tests.
 WIDE = jl.Lidar(altitude=1e5, divergence=0.02, pulse=jl.GaussianPulse(fwhm=4.0))
 
 
-def test_terrain_that_is_a_plane_is_ground():
+def test_terrain_in_a_plane_is_traced_as_a_plane():
     flat = jl.Terrain(SLOPE * X + 3.0, 1.0, (-10.0, -8.0), 0.4)
     ground = jl.Ground(SLOPE * 10.0 + 3.0, 0.4, slope=15.0, aspect=270.0)
     plans = [jl.plan(WIDE, jl.Scene(ground=g)) for g in (flat, ground)]
@@ -134,7 +135,7 @@ def test_terrain_that_is_a_plane_is_ground():
 
 
 def test_a_plane_traced_as_heights():
-    """Every ray sees the same slope, and the mean height is that of the axis."""
+    """Every ray meets the same slope, and the mean height is that on the axis."""
     flat = jl.Scene(ground=jl.Terrain(SLOPE * X, 1.0, (-10.0, -8.0), 0.4))
     plan = jl.plan(WIDE, flat, effects={"relief": True}, max_orders=1)
     assert not plan.config.smooth_footprint
@@ -175,16 +176,17 @@ def energies(wave):
 
 
 @pytest.mark.slow
-def test_a_valley_lights_itself():
-    """45 degrees, so F = 1/2. The valley is ten million times as wide as the beam is off: double precision.
+def test_facets_of_a_valley_light_each_other():
+    """Slopes of 45 degrees, so F = 1/2. The valley is 10^7 times as wide as the beam is off its axis.
 
-    Of what flies a share of 1e-7 leaves the valley at its sides; 12 orders leave 0.4^12 = 2e-5.
+    That needs double precision. A fraction of 1e-7 of the light leaves the valley at its ends; 12 orders
+    truncate 0.4^12 = 2e-5.
     """
     with jax.enable_x64(True):
         side = 1000.0
         valley = jl.Terrain([[side] * 2, [0.0] * 2, [side] * 2], (side, 2 * side), (-side, -side), 0.8)
         with pytest.warns(jl.UnitWarning):
-            lidar = whole_lidar(position=(1e-4, 0.0), divergence=5e-9, sampling_interval=2e4)
+            lidar = single_sample_lidar(position=(1e-4, 0.0), divergence=5e-9, sampling_interval=2e4)
         scene = jl.Scene(ground=valley)
         plan = jl.plan(lidar, scene, max_orders=12, window=(8000.0, 8001.0), bin_width=20.0)
         (total, absorbed), (e1, e2) = batch_mean(lidar, scene, plan, seed=0, count=16, quantity=energies)
@@ -203,32 +205,34 @@ def test_no_light_leaks_through_white_terrain():
     assert float(budget.transmitted[0]) > 1.05
 
 
-# -- reflectance by place ----------------------------------------------------------------------------------
+# -- reflectance by position -------------------------------------------------------------------------------
 
 
 def test_a_raster_of_reflectance():
-    """Of a plane with rho = a + b x: the mean over the footprint."""
-    lidar, level = whole_lidar(divergence=0.005), np.zeros_like(HILLS)
+    """On a plane with rho = a + b x, the footprint returns the reflectance at its centre."""
+    lidar, level = single_sample_lidar(divergence=0.005), np.zeros_like(HILLS)
     ramp = jl.Scene(ground=hills(heights=level, reflectance=0.3 + 0.02 * (X - 10.0)))
-    off = dataclasses.replace(lidar, position=(2.5, 0.0))
-    plan = jl.plan(off, ramp, **WHOLE)
+    off_centre = dataclasses.replace(lidar, position=(2.5, 0.0))
+    plan = jl.plan(off_centre, ramp, **SINGLE_SAMPLE)
     assert plan.orders == 1
     assert not plan.config.smooth_footprint
-    wave = jl.simulate(off, ramp, key=KEY, plan=plan)
+    wave = jl.simulate(off_centre, ramp, key=KEY, plan=plan)
     assert float(wave.reflectance.sum()) == pytest.approx(0.35, rel=1e-3)
     assert float(wave.energy_budget["absorbed by ground"][0]) == pytest.approx(0.65, rel=1e-3)
 
 
 @pytest.mark.slow
 def test_a_raster_of_equal_numbers_is_one_number():
-    lidar = whole_lidar(divergence=0.005)
+    lidar = single_sample_lidar(divergence=0.005)
     number, raster = (jl.Scene(ground=hills(reflectance=rho)) for rho in (0.4, np.full_like(HILLS, 0.4)))
-    plans = [jl.plan(lidar, scene, max_orders=3, n_photons=1024, **WHOLE) for scene in (number, raster)]
-    one, other = (
+    plans = [
+        jl.plan(lidar, scene, max_orders=3, n_photons=1024, **SINGLE_SAMPLE) for scene in (number, raster)
+    ]
+    of_number, of_raster = (
         batch_mean(lidar, scene, plan, seed=0, count=2, quantity=energies)[0]
         for scene, plan in zip((number, raster), plans)
     )
-    np.testing.assert_allclose(one, other, rtol=1e-5)
+    np.testing.assert_allclose(of_number, of_raster, rtol=1e-5)
 
 
 @pytest.mark.slow
@@ -252,9 +256,10 @@ NODE[10, 8] = -1.0
     ],
 )
 def test_derivatives_with_respect_to_heights(zenith, orders, photons, keys, heights):
-    """Amplitude of the relief, one node and the reflectance of a strip, against central differences.
+    """Derivatives in the amplitude of the relief, in one node and in the reflectance of a strip.
 
-    The bowl has no edge that could hide one place from another.
+    They are compared with central differences over independent keys. In higher orders, derivatives leave out
+    that slopes begin or cease to hide one another: in the bowl none does.
     """
     lidar = jl.Lidar(divergence=2.0, pulse=jl.GaussianPulse(fwhm=3.0), zenith=zenith, azimuth=40.0)
     start = {"relief": jnp.asarray(1.0), "node": jnp.asarray(0.1), "strip": jnp.asarray(0.3)}
@@ -276,18 +281,20 @@ def test_derivatives_with_respect_to_heights(zenith, orders, photons, keys, heig
 
     value, jacobian = jax.jit(measure), jax.jit(jax.jacfwd(measure))
     exact = [jacobian(start, key) for key in jax.random.split(jax.random.key(1), keys)]
-    others = jax.random.split(jax.random.key(2), keys)
+    difference_keys = jax.random.split(jax.random.key(2), keys)
     for name, step in steps.items():
         sides = [
-            np.array([value(start | {name: start[name] + s}, key) for key in others]) for s in (-step, step)
+            np.array([value(start | {name: start[name] + s}, key) for key in difference_keys])
+            for s in (-step, step)
         ]
         difference = (sides[1] - sides[0]) / (2 * step)
-        found = np.array([e[name] for e in exact])
-        spread = np.sqrt((found.var(axis=0, ddof=1) + difference.var(axis=0, ddof=1)) / keys)
-        # Of third order in the step: what the difference itself is off by.
-        slack = 0.004 * np.abs(difference.mean(axis=0))
-        assert agrees(found.mean(axis=0), spread + slack / 3, difference.mean(axis=0), sigmas=3.5), name
-        assert not agrees(1.3 * found.mean(axis=0), spread + slack / 3, difference.mean(axis=0), sigmas=3.5)
+        derivative = np.array([jacobian_of_key[name] for jacobian_of_key in exact])
+        stderr = np.sqrt((derivative.var(axis=0, ddof=1) + difference.var(axis=0, ddof=1)) / keys)
+        # Truncation error of the central difference, of second order in the step.
+        truncation = 0.004 * np.abs(difference.mean(axis=0))
+        mean, expected = derivative.mean(axis=0), difference.mean(axis=0)
+        assert agrees(mean, stderr + truncation / 3, expected, sigmas=3.5), name
+        assert not agrees(1.3 * mean, stderr + truncation / 3, expected, sigmas=3.5)
 
 
 @pytest.mark.slow
@@ -302,17 +309,17 @@ def test_the_gradient_is_that_of_the_jacobian():
         total = jl.total_reflectance(jl.trace_scene(setup, KEY), setup)[0]
         return jnp.sum(total * jnp.arange(total.size))
 
-    way = jnp.asarray(np.cos(X * Y))
-    _, forward = eqx.filter_jit(lambda h: jax.jvp(brightness, (h,), (way,)))(scene.ground.heights)
+    tangent = jnp.asarray(np.cos(X * Y))
+    _, forward = eqx.filter_jit(lambda h: jax.jvp(brightness, (h,), (tangent,)))(scene.ground.heights)
     reverse = eqx.filter_jit(jax.grad(brightness))(scene.ground.heights)
     assert np.all(np.isfinite(reverse))
-    assert float(jnp.sum(reverse * way)) == pytest.approx(float(forward), rel=1e-3)
+    assert float(jnp.sum(reverse * tangent)) == pytest.approx(float(forward), rel=1e-3)
 
 
-# -- places ------------------------------------------------------------------------------------------------
+# -- positions ---------------------------------------------------------------------------------------------
 
 
-def test_millions_of_metres_away_nothing_changes():
+def test_coordinates_of_millions_of_metres_change_nothing():
     def setup(east, north):
         terrain = hills(origin=(east - 10.0, north - 8.0), reflectance=0.3 + 0.01 * X)
         lad = np.random.default_rng(0).uniform(0, 1, (4, 3, 5))
@@ -325,10 +332,10 @@ def test_millions_of_metres_away_nothing_changes():
         plan = jl.plan(lidar, scene, max_orders=2)
         return jl.make_setup(lidar, scene, plan), plan
 
-    (here, plan), (there, other) = setup(0.0, 0.0), setup(512_345.0, 5_212_345.0)
-    assert plan == other
-    for one, two in zip(*map(jax.tree.leaves, (here, there))):
-        np.testing.assert_allclose(one, two, rtol=1e-6, atol=1e-6)
+    (near_setup, near_plan), (distant_setup, distant_plan) = setup(0.0, 0.0), setup(512_345.0, 5_212_345.0)
+    assert near_plan == distant_plan
+    for near, distant in zip(*map(jax.tree.leaves, (near_setup, distant_setup))):
+        np.testing.assert_allclose(near, distant, rtol=1e-6, atol=1e-6)
 
 
 def test_a_map_is_lifted_above_the_terrain():
@@ -344,24 +351,25 @@ def test_a_map_is_lifted_above_the_terrain():
         np.testing.assert_allclose(after.sum(axis=2), before.sum(axis=2), rtol=1e-5)
         z = float(lifted.origin[2]) + 0.5 * (np.arange(after.shape[2]) + 0.5)
         middle = np.sum(np.asarray(after) * z, axis=2) / np.sum(np.asarray(after), axis=2)
-        own = np.sum(np.asarray(before) * 0.5 * (np.arange(4) + 0.5), axis=2) / np.sum(before, axis=2)
+        z = 0.5 * (np.arange(4) + 0.5)
+        middle_before = np.sum(np.asarray(before) * z, axis=2) / np.sum(before, axis=2)
         x, y = np.meshgrid(-6 + 2 * (np.arange(6) + 0.5), -5 + 2 * (np.arange(5) + 0.5), indexing="ij")
-        within = np.array([-2 / 3, 0.0, 2 / 3])
-        at = (x[..., None, None] + within[:, None] + 10.0, y[..., None, None] + within + 8.0)
-        ground = height_of(HILLS, np.stack(np.broadcast_arrays(*at), axis=-1)).mean(axis=(2, 3))
-        np.testing.assert_allclose(middle - own, ground, atol=1e-5)
+        in_voxel = np.array([-2 / 3, 0.0, 2 / 3])
+        points = (x[..., None, None] + in_voxel[:, None] + 10.0, y[..., None, None] + in_voxel + 8.0)
+        ground = height_of(HILLS, np.stack(np.broadcast_arrays(*points), axis=-1)).mean(axis=(2, 3))
+        np.testing.assert_allclose(middle - middle_before, ground, atol=1e-5)
     level = voxels.above(hills(heights=np.full_like(HILLS, 7.0)))
     assert level.shape == voxels.shape
     assert float(level.origin[2]) == 7.0
     np.testing.assert_allclose(level.leaf, voxels.leaf, rtol=1e-6)
 
 
-def test_a_slope_hides_what_lies_behind_it():
-    """Looked at from the west, 60 degrees from the zenith, an eastern slope of 45 degrees is dark."""
+def test_a_ridge_hides_its_far_slope():
+    """A sensor in the west, 60 degrees from the zenith, does not see an eastern slope of 45 degrees."""
     ridge = np.maximum(0.0, 6.0 - np.abs(X - 10.0))
     scene = jl.Scene(ground=hills(heights=ridge, reflectance=0.9))
-    lidar = whole_lidar(zenith=60.0, azimuth=90.0, altitude=1e3, position=(5.0, 0.0), divergence=0.5)
-    plan = jl.plan(lidar, scene, max_orders=2, n_photons=2048, n_rays=64, **WHOLE)
+    lidar = single_sample_lidar(zenith=60.0, azimuth=90.0, altitude=1e3, position=(5.0, 0.0), divergence=0.5)
+    plan = jl.plan(lidar, scene, max_orders=2, n_photons=2048, n_rays=64, **SINGLE_SAMPLE)
     setup = jl.make_setup(lidar, scene, plan)
     from jaxlidar.trace.device_scene import build_device_scene
 
@@ -372,13 +380,13 @@ def test_a_slope_hides_what_lies_behind_it():
     assert (np.asarray(shape.distance(x, device_scene.beam.view(x))) < 1e29).tolist() == [True, False]
 
 
-# -- refusals ----------------------------------------------------------------------------------------------
+# -- inadmissible input ------------------------------------------------------------------------------------
 
 
 CANOPY = jl.Canopy(
     jl.VoxelMap.from_lad(np.ones((3, 3, 3)), voxel_size=1.0), leaf=jl.LeafOptics(0.4, 0.3), sides="periodic"
 )
-BAD = {
+INADMISSIBLE = {
     "one row": (lambda: hills(heights=np.zeros((1, 5))), r"heights has shape \(1, 5\)"),
     "not finite": (lambda: hills(heights=np.full((2, 2), np.nan)), "heights = nan is outside"),
     "spacing": (lambda: hills(spacing=0.0), "spacing = 0 is outside"),
@@ -402,10 +410,10 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize("case", BAD)
-def test_bad_terrain_is_refused(case):
-    make, says = BAD[case]
-    with pytest.raises(ValueError, match=says):
+@pytest.mark.parametrize("case", INADMISSIBLE)
+def test_inadmissible_terrain_is_refused(case):
+    make, message = INADMISSIBLE[case]
+    with pytest.raises(ValueError, match=message):
         make()
 
 
@@ -416,7 +424,7 @@ def test_a_footprint_off_the_terrain_is_refused_with_a_plan_too():
         jl.simulate(jl.Lidar(position=(0.0, 500.0)), scene, key=KEY, plan=plan)
 
 
-def test_a_plan_for_a_plane_serves_no_relief():
+def test_a_plan_for_a_plane_does_not_admit_relief():
     level = jl.Scene(ground=hills(heights=0.0 * HILLS))
     plan = jl.plan(jl.Lidar(), level)
     with pytest.raises(ValueError, match="takes the terrain for a plane"):

@@ -1,21 +1,21 @@
-"""A table of hard cases: admissible input at the limits, by family, with the number to differentiate by."""
+"""A table of hard cases: admissible input at the limits, by family, with the variable of the derivative."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 
 @dataclass(frozen=True)
-class Case:
-    """One case: the family that measures it, what differs from the family's usual numbers, and tags.
+class HardCase:
+    """One case: its family, the numbers that differ from the usual ones of the family, and tags.
 
-    - `of`: the number that derivatives are with respect to.
-    - `kink`: there the derivative is one-sided or has no single value, and must only be finite.
-    - `bounds`: errors admitted in single and double precision; default the family's.
+    - `variable`: name of the number that derivatives are with respect to.
+    - `kink`: the derivative is one-sided or has no single value there, and must only be finite.
+    - `bounds`: errors admitted in single and double precision. Default: those of the family.
     """
 
     family: str
     name: str
-    of: str
+    variable: str
     numbers: Mapping[str, float] = field(default_factory=dict)
     tags: tuple[str, ...] = ()
     kink: bool = False
@@ -25,13 +25,13 @@ class Case:
         return f"{self.family}: {self.name}"
 
 
-def family(name: str, *rows: tuple) -> tuple[Case, ...]:
-    """Rows of (name, of, numbers, tags) and, where needed, a dict of the other fields."""
-    return tuple(Case(name, *row[:4], **(row[4] if len(row) > 4 else {})) for row in rows)
+def family(name: str, *rows: tuple) -> tuple[HardCase, ...]:
+    """Make cases from rows of (name, variable, numbers, tags) and, where needed, other fields in a dict."""
+    return tuple(HardCase(name, *row[:4], **(row[4] if len(row) > 4 else {})) for row in rows)
 
 
 KINK = {"kink": True}
-FAR = {"altitude": 4e5, "divergence": 0.3 / 400, "aperture": 80.0}
+FROM_400_KM = {"altitude": 4e5, "divergence": 0.3 / 400, "aperture": 80.0}
 
 GROUND = family(
     "ground",
@@ -50,15 +50,15 @@ GROUND = family(
     ("slope facing the beam", "slope", {"slope": 40.0, "zenith": 40.0}, ("grazing",), KINK),
     ("field of view a third of the beam", "fov", {"fov": 0.1}, ("field of view",)),
     ("field of view as wide as the beam", "divergence", {"fov": 0.3}, ("field of view",)),
-    ("from 400 km", "height", FAR, ("400 km",)),
-    ("from 400 km, sloping", "slope", FAR | {"slope": 30.0}, ("400 km",)),
+    ("from 400 km", "height", FROM_400_KM, ("400 km",)),
+    ("from 400 km, sloping", "slope", FROM_400_KM | {"slope": 30.0}, ("400 km",)),
     ("far below the reference", "height", {"height": -5.0}, ("flat",)),
 )
 FINE = family(
     "ground, 0.1 ns",
     ("from 1 km", "height", {"height": 0.7}, ("0.1 ns",)),
-    ("from 400 km", "height", FAR | {"height": 0.7}, ("0.1 ns", "400 km")),
-    ("from 400 km, sloping", "slope", FAR | {"slope": 30.0}, ("0.1 ns", "400 km")),
+    ("from 400 km", "height", FROM_400_KM | {"height": 0.7}, ("0.1 ns", "400 km")),
+    ("from 400 km, sloping", "slope", FROM_400_KM | {"slope": 30.0}, ("0.1 ns", "400 km")),
 )
 SHORT = family(
     "short pulse",
@@ -76,7 +76,7 @@ EQUAL_ANGLE = family(
     ("at the normal, by aperture", "aperture", {}, ("normal",)),
     ("a slope of the aperture's angle", "slope", {"slope": 0.0057}, ("normal",)),
     ("a slope of 80 degrees", "slope", {"slope": 80.0}, ("grazing",)),
-    ("from 400 km", "rho", FAR | {"divergence": 0.0}, ("400 km", "normal")),
+    ("from 400 km", "rho", FROM_400_KM | {"divergence": 0.0}, ("400 km", "normal")),
 )
 WIDE = {"divergence": 0.3}
 MIRROR = family(
@@ -207,7 +207,7 @@ CROWN = family(
     ("from 400 km", "height", {"altitude": 4e5, "divergence": 1.0 / 400}, ("400 km",)),
     ("without divergence, by it", "divergence", {"divergence": 0.0}, ("divergence 0",)),
 )
-MANY = family(
+FORTY_ORDERS = family(
     "40 orders",
     ("albedo 1 over white ground", "albedo", {}, ("albedo 1",)),
     ("albedo 1 over white ground, by depth", "tau", {}, ("albedo 1",)),
@@ -215,7 +215,8 @@ MANY = family(
     ("albedo 1, 1e-8 deep", "albedo", {"tau": 1e-8}, ("albedo 1", "optical depth")),
     ("albedo 0", "albedo", {"albedo": 0.0}, ("R = T = 0",)),
 )
-# Between the two plates half of the photons carry the series: some percent of its second and third terms.
+# Photons estimate the second and third terms of the series; half of them go to and fro between plate and
+# ground.
 PLATE = family(
     "plate",
     ("a millimetre above the ground", "rho", {}, ("1 mm",)),
@@ -227,7 +228,7 @@ PLATE = family(
     ("10 m up", "rho", {"height": 10.0}, ()),
 )
 
-CHANCE = family(
+PROBABILITY = family(
     "probability",
     ("ordinary", "p_leaf", {}, ()),
     ("nothing", "p_leaf", {"p_leaf": 0.0}, ("p = 0",)),
@@ -262,7 +263,7 @@ CHORD_ROWS = (
     ("within a hair of horizontal", "k", {"u": 0.6, "v": 0.8, "w": 1e-7, "z": 1.5}, ("horizontal",)),
 )
 CHORD = family("chord", *CHORD_ROWS, ("past", "k", {"u": 0.0, "v": 0.0, "w": -1.0, "x": 5.0}, ("empty",)))
-ENDLESS = family(
+PERIODIC_CHORD = family(
     "endless chord",
     *CHORD_ROWS,
     (
@@ -317,9 +318,9 @@ PULSES = family(
 
 CASES = (
     *(*GROUND, *FINE, *SHORT, *EQUAL_ANGLE, *MIRROR),
-    *(*SLAB, *HOT_SPOT, *SMALL, *LARGE, *CROWN, *MANY, *PLATE),
-    *(*CHANCE, *CHORD, *ENDLESS, *LEAF, *AIR, *PULSES),
+    *(*SLAB, *HOT_SPOT, *SMALL, *LARGE, *CROWN, *FORTY_ORDERS, *PLATE),
+    *(*PROBABILITY, *CHORD, *PERIODIC_CHORD, *LEAF, *AIR, *PULSES),
 )
 
-# By `str(case)`: what was measured that is wrong.
+# By `str(case)`: the wrong result that was measured.
 KNOWN_FAILURES: dict[str, str] = {}

@@ -1,7 +1,8 @@
-"""What the hard cases measure: families of simulations of one structure, compiled once for all their cases.
+"""Measures of the hard cases: families of simulations of one structure, compiled once for all their cases.
 
-A family has its usual numbers and a function that makes its measure: from a dict of scalars to a vector.
-Plans are made within, for the precision in use, and hold for all numbers of the family.
+A family has its usual numbers and a function that makes its measure: from a dict of scalars to a vector. The
+measure includes the plan, made for the precision in use, which holds for all numbers of the family. The first
+families are simulations, the last ones components of the library.
 """
 
 import functools
@@ -14,21 +15,23 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxlidar as jl
-from tests.helpers import WHOLE, whole_lidar
+from jaxlidar.trace.voxel_traversal import make_medium, march_to_depths
+from tests.helpers import SINGLE_SAMPLE, single_sample_lidar
 from tests.stability import hard_answers as answers
-from tests.stability import hard_parts
 
 KEY = jax.random.key(24)
-DOUBLE, BOTH = ("float64",), ("float32", "float64")
+DOUBLE_PRECISION, BOTH_PRECISIONS = ("float64",), ("float32", "float64")
 
 
 @dataclass(frozen=True)
 class Family:
     """Simulations of one structure.
 
-    `make()` gives the measure, `answer` its closed form (see `hard_answers`). `bounds`, `slopes`: errors of
-    values and of derivatives admitted in single and double precision, relative to the largest output.
-    `slow`: precisions that are left to -m slow.
+    - `make`: returns the measure.
+    - `answer`: closed form of the measure (see `hard_answers`).
+    - `bounds`, `slopes`: errors of values and of derivatives admitted in single and double precision,
+      relative to the largest output.
+    - `slow`: precisions that run with `-m slow` only.
     """
 
     usual: Mapping[str, float]
@@ -40,7 +43,10 @@ class Family:
 
 
 def simulation(build, usual, outputs, **settings):
-    """A measure: a scene and its lidar out of numbers, by one trace; `widest` are the numbers of the plan."""
+    """Return a measure: one trace of the scene and lidar that `build` makes of numbers.
+
+    `widest` are the numbers for which the plan is made, where they differ from the usual ones.
+    """
     widest = usual | settings.pop("widest", {})
     plan = jl.plan(*build({k: jnp.asarray(v, float) for k, v in widest.items()}), **settings)
 
@@ -51,16 +57,16 @@ def simulation(build, usual, outputs, **settings):
     return measure
 
 
-def samples(setup, response):
+def sample_values(setup, response):
     return jl.total_reflectance(response, setup)[0]
 
 
-def summed(setup, response):
-    return jnp.sum(samples(setup, response))[None]
+def sample_sum(setup, response):
+    return jnp.sum(sample_values(setup, response))[None]
 
 
-def parts(*names):
-    """Sums of components, or of all shares of energy."""
+def component_sums(*names):
+    """Return a function for the sums of named components, and of the energy budget (`"shares"`)."""
 
     def outputs(setup, response):
         wave = jl.waveform_of(response, setup)
@@ -102,7 +108,7 @@ def over_ground(p, interval=1.0):
         field_of_view=p["fov"],
         sampling_interval=interval,
     )
-    # It falls away from the sensor's side: zenith and slope are in one plane.
+    # The ground falls away from the sensor: zenith and slope lie in one plane.
     return lidar, jl.Scene(
         ground=jl.Ground(reflectance=p["rho"], height=p["height"], slope=p["slope"], aspect=180.0)
     )
@@ -113,23 +119,23 @@ def ground_family(interval, half, bounds, slopes, slow=()):
 
     def make():
         build = functools.partial(over_ground, interval=interval)
-        return simulation(build, OVER_GROUND, samples, window=(-half, half), widest={"height": 10.0})
+        return simulation(build, OVER_GROUND, sample_values, window=(-half, half), widest={"height": 10.0})
 
     def answer(n):
-        # As the plan has them, counted from the first.
+        # Times of the samples as the plan has them, counted from the first.
         exact = [answers.mpf(str(interval)) * i - answers.mpf(str(half)) for i in range(times.size)]
         return answers.ground(n, exact)
 
     return Family(OVER_GROUND, make, answer, bounds, slopes, slow)
 
 
-def short_pulse():
+def measure_short_pulse():
     def build(p):
         lidar = jl.Lidar(pulse=jl.RectangularPulse(length=p["length"]), jitter=p["jitter"], divergence=0.0)
         return lidar, jl.Scene(ground=jl.Ground(reflectance=p["rho"], height=p["height"]))
 
-    # Not the plan's own bins: they follow the pulse's length, which the cases change.
-    return simulation(build, SHORT_PULSE, samples, window=(-20.0, 20.0), bin_width=0.25)
+    # A fixed width of bins: the plan would choose it by the length of the pulse, which the cases change.
+    return simulation(build, SHORT_PULSE, sample_values, window=(-20.0, 20.0), bin_width=0.25)
 
 
 SHORT_PULSE = {"rho": 0.3, "height": 0.0, "length": 4.0, "jitter": 0.0}
@@ -146,8 +152,9 @@ def law_family(law, answer, bounds, slopes, slow=()):
 
         def outputs(setup, response):
             alpha = setup.lidar.aperture_half_angle
-            # Reflectances are in the thousands; a mirror's is by share of the pulse.
-            return summed(setup, response) * (alpha**2 if law is jl.Specular else alpha)
+            # Scale apparent reflectances, in the thousands, to order one; for a mirror to the fraction of the
+            # pulse.
+            return sample_sum(setup, response) * (alpha**2 if law is jl.Specular else alpha)
 
         return simulation(build, usual, outputs, window=(-30.0, 30.0), widest={"slope": 80.0})
 
@@ -193,7 +200,7 @@ def slab_family(hotspot, slow=()):
         )
         leaf = jl.LeafOptics(reflectance=p["R"], transmittance=p["T"])
         canopy = jl.Canopy(voxels, leaf=leaf, bark=p["bark_R"], hotspot=hotspot, sides="periodic")
-        lidar = whole_lidar(
+        lidar = single_sample_lidar(
             altitude=p["altitude"],
             divergence=p["divergence"],
             zenith=p["zenith"],
@@ -205,9 +212,9 @@ def slab_family(hotspot, slow=()):
         return lidar, jl.Scene(canopy=canopy, ground=ground)
 
     def make():
-        outputs = parts("leaf", "bark", "ground", "shares")
-        more = {"max_orders": 1, "n_rays": 32, "footprint": "fixed", "max_step": 1.0, **CENTRED}
-        return simulation(build, SLAB, outputs, widest={"zenith": 85.0}, **more)
+        outputs = component_sums("leaf", "bark", "ground", "shares")
+        settings = {"max_orders": 1, "n_rays": 32, "footprint": "fixed", "max_step": 1.0, **CENTRED}
+        return simulation(build, SLAB, outputs, widest={"zenith": 85.0}, **settings)
 
     answer = functools.partial(answers.slab, kappa=1 if hotspot else 2)
     return Family(SLAB, make, answer, (1e-5, 1e-8), (2e-4, 1e-6), slow)
@@ -227,15 +234,15 @@ def one_voxel_family(edge, interval):
             origin=jnp.stack([-0.4 * size, -0.4 * size, jnp.zeros_like(size)]),
         )
         canopy = jl.Canopy(voxels, leaf=jl.LeafOptics(reflectance=p["R"], transmittance=0.0))
-        lidar = whole_lidar(sampling_interval=interval, divergence=0.0)
+        lidar = single_sample_lidar(sampling_interval=interval, divergence=0.0)
         return lidar, jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=p["rho"]))
 
     def make():
         window = (-0.4 * interval, -0.399 * interval)
-        more = {"max_orders": 1, "n_rays": 1, "footprint": "fixed", "bin_width": 2e-3 * interval}
-        return simulation(build, ONE_VOXEL, summed, window=window, **more)
+        settings = {"max_orders": 1, "n_rays": 1, "footprint": "fixed", "bin_width": 2e-3 * interval}
+        return simulation(build, ONE_VOXEL, sample_sum, window=window, **settings)
 
-    return Family(ONE_VOXEL, make, answers.one_voxel, (1e-5, 1e-9), (1e-4, 1e-9), DOUBLE)
+    return Family(ONE_VOXEL, make, answers.one_voxel, (1e-5, 1e-9), (1e-4, 1e-9), DOUBLE_PRECISION)
 
 
 # -- all orders --------------------------------------------------------------------------------------------
@@ -257,7 +264,7 @@ CROWN = {
 }
 
 
-def crown():
+def measure_crown():
     def build(p):
         voxels = jl.VoxelMap.from_probability(
             leaf=jnp.broadcast_to(p["p_leaf"], (2, 2, 3)),
@@ -275,95 +282,207 @@ def crown():
         ground = jl.Ground(reflectance=p["rho"], height=p["height"], slope=p["slope"], aspect=90.0)
         return lidar, jl.Scene(canopy=jl.Canopy(voxels, leaf=leaf, bark=p["bark_R"]), ground=ground)
 
-    more = {"max_orders": 3, "n_photons": 64, "n_rays": 32, "window": (-45.0, 45.0), "bin_width": 1.0}
-    return simulation(build, CROWN, parts("shares", "all"), widest={"height": 4.5, "slope": 80.0}, **more)
+    settings = {"max_orders": 3, "n_photons": 64, "n_rays": 32, "window": (-45.0, 45.0), "bin_width": 1.0}
+    return simulation(
+        build, CROWN, component_sums("shares", "all"), widest={"height": 4.5, "slope": 80.0}, **settings
+    )
 
 
 MANY_ORDERS = {"tau": 1.0, "albedo": 1.0, "rho": 1.0}
 
 
-def many_orders():
+def measure_many_orders():
     def build(p):
         voxels = jl.VoxelMap.from_extinction(
             leaf=jnp.broadcast_to(p["tau"] / 3.0, (1, 1, 3)), voxel_size=1.0, origin=(-0.5, -0.5, 0.0)
         )
         canopy = jl.Canopy(voxels, leaf=jl.Isotropic(albedo=p["albedo"]), sides="periodic")
-        return whole_lidar(), jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=p["rho"]))
+        return single_sample_lidar(), jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=p["rho"]))
 
-    more = {"max_orders": 40, "n_photons": 64, "n_rays": 4, **WHOLE}
-    return simulation(build, MANY_ORDERS, parts("shares", "absorbed"), **more)
+    settings = {"max_orders": 40, "n_photons": 64, "n_rays": 4, **SINGLE_SAMPLE}
+    return simulation(build, MANY_ORDERS, component_sums("shares", "absorbed"), **settings)
 
 
 PLATE = {"R": 0.4, "T": 0.5, "coverage": 1.0, "height": 1e-3, "rho": 0.6}
 PLATE_ORDERS = 5
 
 
-def plate_over_ground():
+def measure_plate_over_ground():
     def build(p):
         plate = jl.Plate(height=p["height"], reflectance=p["R"], transmittance=p["T"], coverage=p["coverage"])
-        return whole_lidar(), jl.Scene(plates=(plate,), ground=jl.Ground(reflectance=p["rho"]))
+        return single_sample_lidar(), jl.Scene(plates=(plate,), ground=jl.Ground(reflectance=p["rho"]))
 
-    more = {
+    settings = {
         "max_orders": PLATE_ORDERS,
         "n_photons": 16384,
         "widest": {"coverage": 0.5, "height": 12.0},
-        **WHOLE,
+        **SINGLE_SAMPLE,
     }
-    return simulation(build, PLATE, summed, **more)
+    return simulation(build, PLATE, sample_sum, **settings)
+
+
+# -- components of the library ------------------------------------------------------------------------------
+
+PROBABILITY = {"p_leaf": 0.3, "p_bark": 0.1, "edge": 0.5}
+
+
+def measure_probability():
+    def measure(p):
+        fill = [jnp.broadcast_to(p[name], (1, 1, 1)) for name in ("p_leaf", "p_bark")]
+        size = jnp.broadcast_to(p["edge"], (3,))
+        voxels = jl.VoxelMap.from_probability(leaf=fill[0], bark=fill[1], voxel_size=size)
+        return jnp.concatenate([voxels.leaf.reshape(-1), voxels.bark.reshape(-1)])
+
+    return measure
+
+
+CHORD = {
+    "x": 0.3,
+    "y": 0.4,
+    "z": 3.5,
+    "u": 0.48,
+    "v": 0.6,
+    "w": -0.64,
+    "k": 0.7,
+    "contrast": 0.5,
+    "limit": 100.0,
+}
+CHORD_SHAPE = (2, 2, 3)
+
+
+def measure_chord(periodic):
+    sign = 1 - 2 * (np.indices(CHORD_SHAPE).sum(axis=0) % 2)
+
+    def measure(p):
+        k = p["k"] * (1.0 + p["contrast"] * jnp.asarray(sign))
+        voxels = jl.VoxelMap.from_extinction(leaf=k, voxel_size=1.0)
+        leaf = jl.LeafOptics(reflectance=0.5, transmittance=0.3)
+        canopy = jl.Canopy(voxels, leaf=leaf, sides="periodic" if periodic else "open")
+        medium = make_medium(canopy, jnp.zeros(3))
+        x, w = (tuple(p[n][None] for n in names) for names in ("xyz", "uvw"))
+        none, active = jnp.zeros((0, 1)), jnp.ones((1,), bool)
+        return march_to_depths(medium, x, w, none, p["limit"][None], active, 512).total_depth
+
+    return measure
+
+
+LEAF = {
+    "N": 1.5,
+    "Cab": 40.0,
+    "Car": 8.0,
+    "Cant": 1.0,
+    "Cbrown": 0.1,
+    "Cw": 0.01,
+    "Cm": 0.009,
+}
+# The ends of the table, and where pigments, dry matter and water absorb.
+LEAF_WAVELENGTHS = (400.0, 532.0, 1064.0, 1450.5, 2500.0)
+
+
+def measure_leaf():
+    def measure(p):
+        plant = jl.Prospect(**p)
+        optics = (*plant(LEAF_WAVELENGTHS), plant.absorptance(LEAF_WAVELENGTHS))
+        return jnp.stack(optics, axis=1).reshape(-1)
+
+    return measure
+
+
+AIR = {"visibility": 23.0, "height": 0.0, "altitude": 1000.0, "zenith": 0.0, "lidar_ratio": 50.0}
+
+
+def measure_air():
+    def measure(p):
+        atmosphere = jl.Atmosphere(
+            visibility=p["visibility"],
+            lidar_ratio=p["lidar_ratio"],
+            rayleigh=False,
+            aerosol_scale_height=1400.0,
+        )
+        where = (550.0, p["height"], p["altitude"], p["zenith"])
+        return jnp.stack([atmosphere.two_way_transmittance(*where), atmosphere.backscatter(*where)])
+
+    return measure
+
+
+PULSES = {"width": 6.0, "decay": 2.0, "jitter": 0.5, "shift": 0.0}
+PULSE_TIMES = (-1000.0, -3.5, -0.25, 0.0, 0.5, 7.0)
+
+
+def measure_pulses():
+    def measure(p):
+        shapes = (
+            jl.GaussianPulse(fwhm=p["width"]),
+            jl.RectangularPulse(length=p["width"]),
+            jl.ExponentiallyModifiedGaussianPulse(fwhm=p["width"], decay=p["decay"]),
+        )
+        times = jnp.asarray(PULSE_TIMES) + p["shift"]
+        return jnp.stack([s.cumulative(times, p["jitter"]) for s in shapes], axis=1).reshape(-1)
+
+    return measure
 
 
 def chord_family(periodic):
-    make = functools.partial(hard_parts.chord, periodic)
-    answer = functools.partial(answers.chord, shape=hard_parts.CHORD_SHAPE, periodic=periodic)
-    return Family(hard_parts.CHORD, make, answer, (2e-6, 1e-13), (2e-6, 1e-13))
+    make = functools.partial(measure_chord, periodic)
+    answer = functools.partial(answers.chord, shape=CHORD_SHAPE, periodic=periodic)
+    return Family(CHORD, make, answer, (2e-6, 1e-13), (2e-6, 1e-13))
 
 
 FAMILIES = {
-    # Of the derivative in time, samples of 1 ns have an error of second order in the fine bin of 0.5 ns.
+    # Derivatives with respect to time have an error of second order in the fine bin of 0.5 ns.
     "ground": ground_family(1.0, 60.0, (2e-4, 2e-4), (1e-2, 1e-2)),
-    "ground, 0.1 ns": ground_family(0.1, 12.0, (1e-4, 1e-5), (1e-3, 1e-4), DOUBLE),
+    "ground, 0.1 ns": ground_family(0.1, 12.0, (1e-4, 1e-5), (1e-3, 1e-4), DOUBLE_PRECISION),
     "short pulse": Family(
         SHORT_PULSE,
-        short_pulse,
+        measure_short_pulse,
         lambda n: answers.rectangle(n, [answers.mpf(t) for t in range(-20, 21)]),
         (2e-5, 1e-9),
         (1e-4, 1e-9),
-        DOUBLE,
+        DOUBLE_PRECISION,
     ),
-    "equal-angle": law_family(jl.EqualAngle, answers.equal_angle, (1e-5, 1e-9), (1e-4, 1e-9), DOUBLE),
-    "mirror": law_family(jl.Specular, answers.mirror, (1e-5, 1e-6), (1e-4, 1e-4), DOUBLE),
-    "slab": slab_family(hotspot=False, slow=DOUBLE),
-    "slab, hot spot": slab_family(hotspot=True, slow=BOTH),
+    "equal-angle": law_family(
+        jl.EqualAngle, answers.equal_angle, (1e-5, 1e-9), (1e-4, 1e-9), DOUBLE_PRECISION
+    ),
+    "mirror": law_family(jl.Specular, answers.mirror, (1e-5, 1e-6), (1e-4, 1e-4), DOUBLE_PRECISION),
+    "slab": slab_family(hotspot=False, slow=DOUBLE_PRECISION),
+    "slab, hot spot": slab_family(hotspot=True, slow=BOTH_PRECISIONS),
     "one voxel of 1 mm": one_voxel_family(1e-3, 1000.0),
     "one voxel of 1 km": one_voxel_family(1e3, 20000.0),
-    "crown": Family(CROWN, crown, answers.crown, (1e-5, 1e-9), (1e-4, 1e-9), slow=BOTH),
-    "40 orders": Family(MANY_ORDERS, many_orders, answers.many_orders, (1e-5, 1e-9), (1e-4, 1e-9), slow=BOTH),
-    # The second and third terms of the series are from photons.
+    "crown": Family(CROWN, measure_crown, answers.crown, (1e-5, 1e-9), (1e-4, 1e-9), slow=BOTH_PRECISIONS),
+    "40 orders": Family(
+        MANY_ORDERS,
+        measure_many_orders,
+        answers.many_orders,
+        (1e-5, 1e-9),
+        (1e-4, 1e-9),
+        slow=BOTH_PRECISIONS,
+    ),
+    # Photons estimate the second and third terms of the series.
     "plate": Family(
         PLATE,
-        plate_over_ground,
+        measure_plate_over_ground,
         functools.partial(answers.plate_over_ground, orders=PLATE_ORDERS),
         (2e-3, 2e-3),
         (1e-2, 1e-2),
-        BOTH,
+        BOTH_PRECISIONS,
     ),
     "probability": Family(
-        hard_parts.PROBABILITY, hard_parts.probability, answers.probability, (1e-6, 1e-14), (1e-6, 1e-14)
+        PROBABILITY, measure_probability, answers.probability, (1e-6, 1e-14), (1e-6, 1e-14)
     ),
     "chord": chord_family(periodic=False),
     "endless chord": chord_family(periodic=True),
     "leaf": Family(
-        hard_parts.LEAF,
-        hard_parts.leaf,
-        lambda n: answers.leaf(n, hard_parts.LEAF_WAVELENGTHS),
+        LEAF,
+        measure_leaf,
+        lambda n: answers.leaf(n, LEAF_WAVELENGTHS),
         (1e-6, 1e-13),
         (1e-6, 1e-13),
     ),
-    "air": Family(hard_parts.AIR, hard_parts.air, answers.air, (1e-6, 1e-13), (1e-5, 1e-12)),
+    "air": Family(AIR, measure_air, answers.air, (1e-6, 1e-13), (1e-5, 1e-12)),
     "pulses": Family(
-        hard_parts.PULSES,
-        hard_parts.pulses,
-        lambda n: answers.pulses(n, [answers.mpf(t) for t in hard_parts.PULSE_TIMES]),
+        PULSES,
+        measure_pulses,
+        lambda n: answers.pulses(n, [answers.mpf(t) for t in PULSE_TIMES]),
         (1e-6, 1e-13),
         (1e-6, 1e-13),
     ),

@@ -108,7 +108,7 @@ def test_traced_geometry_needs_a_plan():
         jax.grad(height)(1.0)
 
 
-def test_a_plan_that_would_miss_parts_of_the_scene_is_refused():
+def test_a_plan_that_does_not_cover_the_scene_is_refused():
     lidar, low = jl.Lidar(), jl.Scene(ground=jl.Ground())
     plan = jl.plan(lidar, low)
     with pytest.raises(ValueError, match=r"plan does not fit: .*the scene reaches to 1 m"):
@@ -119,7 +119,7 @@ def test_a_plan_that_would_miss_parts_of_the_scene_is_refused():
 
 
 def test_a_spectrum_and_a_transmittance_that_fit():
-    """They fit together where both are defined, or are known only where a lidar measures."""
+    """Their sum is checked where both are defined; values by wavelength are checked with the lidar."""
     jl.Plate(height=0.0, reflectance=PALE, transmittance=0.1)
     jl.Plate(height=0.0, reflectance=DARK, transmittance=jl.Spectrum([1200.0, 2000.0], [0.6, 0.9]))
     jl.Plate(height=0.0, reflectance=PALE, transmittance=[0.5, 0.1])

@@ -1,9 +1,9 @@
 """Degenerate but admissible input: values and derivatives are finite in both precisions.
 
-Layout: small scenes at the limits of what is admissible, with few photons. Only finiteness is asked for, and
-that forward and reverse derivatives are those of one function: with g the gradient of the sum of all outputs,
-the derivative along ones sums to the sum of g. Tolerance of that: 1 % of the sum of |g|, for rounding only,
-since both differentiate the same draws. Scenes of one family share a plan, so that it is compiled once.
+Layout: small scenes at the limits of admissible input, with few photons. Values must be finite, and forward
+and reverse derivatives those of one function: with g the gradient of the sum of all outputs, the derivative
+along ones sums to the sum of g. Tolerance of that: 1 % of the sum of |g|, for rounding only, since both
+differentiate the same random numbers. Scenes of one family share a plan, so that it is compiled once.
 """
 
 import equinox as eqx
@@ -13,42 +13,42 @@ import numpy as np
 import pytest
 
 import jaxlidar as jl
-from tests.helpers import NARROW, slow_unless
+from tests.helpers import BY_PRECISION, slow_unless
 
 SIZE = (2, 2, 3)
 
 
 @eqx.filter_jit
 def evaluate(lidar, scene, plan, key, mode):
-    """A waveform, and derivatives with respect to every number of lidar and scene: gradient or tangent."""
-    numbers, rest = eqx.partition((lidar, scene), eqx.is_inexact_array)
+    """Return a waveform and its derivatives with respect to all numbers of lidar and scene, by one mode."""
+    arrays, static = eqx.partition((lidar, scene), eqx.is_inexact_array)
 
-    def simulated(numbers):
-        beam, target = eqx.combine(numbers, rest)
+    def simulated(arrays):
+        beam, target = eqx.combine(arrays, static)
         setup = jl.make_setup(beam, target, plan)
         wave = jl.waveform_of(jl.trace_scene(setup, key), setup)
-        other = (wave.components, wave.neglected, wave.energy_budget, wave.time, wave.height)
-        return (wave.reflectance, wave.energy / 1e-12), other
+        diagnostics = (wave.components, wave.neglected, wave.energy_budget, wave.time, wave.height)
+        return (wave.reflectance, wave.energy / 1e-12), diagnostics
 
     if mode == "forward":
-        ones = jax.tree.map(jnp.ones_like, numbers)
-        return jax.jvp(simulated, (numbers,), (ones,), has_aux=True)
-    outputs, pull, other = jax.vjp(simulated, numbers, has_aux=True)
+        tangents = jax.tree.map(jnp.ones_like, arrays)
+        return jax.jvp(simulated, (arrays,), (tangents,), has_aux=True)
+    outputs, pull, diagnostics = jax.vjp(simulated, arrays, has_aux=True)
     (gradient,) = pull(jax.tree.map(jnp.ones_like, outputs))
-    return outputs, gradient, other
+    return outputs, gradient, diagnostics
 
 
 def check(lidar, scene, plan, modes=("reverse",)):
-    """Everything finite and of the precision in use; forward and reverse agree where both are asked for."""
+    """Assert that results are finite and of the precision in use, and that derivatives of all modes agree."""
     totals, scale = [], 0.0
     for mode in modes:
-        found = evaluate(lidar, scene, plan, jax.random.key(24), mode)
-        for name, tree in zip(("value", mode, "other"), found):
+        results = evaluate(lidar, scene, plan, jax.random.key(24), mode)
+        for name, tree in zip(("value", mode, "diagnostics"), results):
             for path, leaf in jax.tree.leaves_with_path(tree):
-                where = f"{name}{jax.tree_util.keystr(path)}"
-                assert np.all(np.isfinite(leaf)), where
-                assert leaf.dtype == jnp.zeros(()).dtype, where
-        terms = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(found[1])]).astype(float)
+                leaf_path = f"{name}{jax.tree_util.keystr(path)}"
+                assert np.all(np.isfinite(leaf)), leaf_path
+                assert leaf.dtype == jnp.zeros(()).dtype, leaf_path
+        terms = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(results[1])]).astype(float)
         totals.append(terms.sum())
         scale = max(scale, np.sum(np.abs(terms)))
     assert np.ptp(totals) <= 0.01 * scale
@@ -113,7 +113,7 @@ def test_canopies(name, precision):
     check(*canopy(**CANOPIES[name]), plan, ("forward", "reverse"))
 
 
-# Made within a test: numbers take the precision that is in use then.
+# Classes, not instances: a test constructs them in the precision that it runs in.
 LAWS = {"Lambertian": jl.Lambertian, "equal-angle": jl.EqualAngle, "mirror": jl.Specular}
 GROUNDS = {
     "met at the normal": ({}, {}),
@@ -129,7 +129,7 @@ GROUNDS = {
 
 @pytest.mark.parametrize("law", slow_unless(["Lambertian"], LAWS))
 @pytest.mark.parametrize("name", GROUNDS)
-@NARROW
+@BY_PRECISION
 def test_grounds(name, law, ground_plans, precision):
     beam, ground = GROUNDS[name]
     beam = dict(beam)
@@ -140,7 +140,7 @@ def test_grounds(name, law, ground_plans, precision):
 
 @pytest.fixture(scope="module")
 def ground_plans():
-    """A plan for each law; grounds at grazing angles reach far beyond its window, which is admissible."""
+    """One plan for each law; grounds at grazing angles reach far beyond its window, which is admissible."""
     lidar = jl.Lidar(pulse=jl.RectangularPulse(length=4.0))
     scenes = {name: jl.Scene(ground=jl.Ground(slope=80.0, law=law())) for name, law in LAWS.items()}
     return {name: jl.plan(lidar, scene, window=(-20.0, 20.0)) for name, scene in scenes.items()}
@@ -155,7 +155,7 @@ def test_a_scene_with_nothing_in_it(precision):
 
 
 @pytest.mark.slow
-@NARROW
+@BY_PRECISION
 def test_one_voxel_and_one_sample(precision):
     """Of optical depth 1e-8, 1 and 1e4, first order: 2/3 R (1 - exp(-2 tau)) / 2."""
     lidar = jl.Lidar(pulse=jl.RectangularPulse(length=0.0), divergence=1e-3, sampling_interval=100.0)

@@ -1,4 +1,4 @@
-"""The table of hard cases: values and both derivatives finite, and right where a closed form exists."""
+"""The table of hard cases: values and both derivatives are finite, and right where a closed form exists."""
 
 import functools
 
@@ -10,20 +10,20 @@ import pytest
 
 import inversion
 import jaxlidar as jl
-from tests.helpers import WHOLE, first_wave, one_batch, whole_lidar
+from tests.helpers import SINGLE_SAMPLE, first_wave, one_batch, single_sample_lidar
 from tests.stability.hard_answers import value_and_slope
 from tests.stability.hard_cases import CASES, KNOWN_FAILURES
 from tests.stability.hard_families import FAMILIES
 
 KEY = jax.random.key(24)
 
-# Compiling takes far longer than running here.
+# Compilation takes far longer than execution here: leave out the optimisation of machine code.
 quick_jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
 
 
 @functools.cache
 def compiled(family, precision):
-    """Value, derivative along a direction, and gradient of a weighted sum, for the precision in use.
+    """Return a program for value, derivative along a direction, and gradient of a weighted sum, by precision.
 
     The measure is linearised once: the linear map is the forward derivative, its transpose the reverse.
     """
@@ -38,7 +38,7 @@ def compiled(family, precision):
 
 
 def weights(size, dtype=float):
-    """One number per output, no two alike."""
+    """Return one weight per output, all different."""
     return jnp.asarray(1.0 + 0.5 * np.sin(1.0 + np.arange(size)), dtype)
 
 
@@ -46,11 +46,11 @@ def weights(size, dtype=float):
 def exact(number):
     case = CASES[number]
     family = FAMILIES[case.family]
-    return value_and_slope(family.answer, {**family.usual, **case.numbers}, case.of)
+    return value_and_slope(family.answer, {**family.usual, **case.numbers}, case.variable)
 
 
-def listed():
-    """Every case in both precisions, one family after another."""
+def case_parameters():
+    """Yield every case in both precisions, one family after another."""
     for precision in ("float32", "float64"):
         for number, case in enumerate(CASES):
             marks = [pytest.mark.slow] if precision in FAMILIES[case.family].slow else []
@@ -59,7 +59,7 @@ def listed():
             yield pytest.param(number, precision, marks=marks, id=f"{case}, {precision}")
 
 
-@pytest.mark.parametrize(("number", "precision"), list(listed()))
+@pytest.mark.parametrize(("number", "precision"), list(case_parameters()))
 def test_case(number, precision):
     with jax.enable_x64(precision == "float64"):
         check(number, precision)
@@ -69,7 +69,7 @@ def check(number, precision):
     case = CASES[number]
     family = FAMILIES[case.family]
     p = {name: jnp.asarray(x, float) for name, x in {**family.usual, **case.numbers}.items()}
-    along = {name: jnp.asarray(float(name == case.of)) for name in p}
+    along = {name: jnp.asarray(float(name == case.variable)) for name in p}
     value, tangent, gradient = compiled(case.family, precision)(p, along)
     assert value.dtype == tangent.dtype == precision
     assert np.all(np.isfinite(value))
@@ -82,36 +82,36 @@ def check(number, precision):
     assert error_of(value, sought) <= bound
     if case.kink:
         return
-    # A derivative that is zero is compared with the value.
+    # The error of a derivative that is zero is measured in units of the value.
     unit, w = np.nanmax(np.abs(sought)), np.asarray(weights(value.size), float)
     assert error_of(tangent, slope, unit) <= slope_bound
     if not np.any(np.isnan(slope)):
         summed, size = np.sum(w * slope, keepdims=True), np.sum(np.abs(w * slope))
-        assert error_of(gradient[case.of][None], summed, unit, size) <= slope_bound
+        assert error_of(gradient[case.variable][None], summed, unit, size) <= slope_bound
     else:
-        # No closed form: the two derivatives are of one function.
+        # Without a closed form forward and reverse derivatives must agree.
         terms = w * np.asarray(tangent, float)
-        assert abs(float(gradient[case.of]) - np.sum(terms)) <= 1e-3 * np.sum(np.abs(terms)) + 1e-6
+        assert abs(float(gradient[case.variable]) - np.sum(terms)) <= 1e-3 * np.sum(np.abs(terms)) + 1e-6
 
 
-def error_of(found, sought, unit=1.0, size=0.0):
-    """Largest error of those that are known, relative to the largest of them, or else to `unit`."""
-    found = np.asarray(found, float)
-    known = ~np.isnan(sought)
-    if not np.any(known):
+def error_of(computed, sought, unit=1.0, size=0.0):
+    """Return the largest error of outputs with an answer, relative to the largest answer or to `unit`."""
+    computed = np.asarray(computed, float)
+    has_answer = ~np.isnan(sought)
+    if not np.any(has_answer):
         return 0.0
-    scale = max(np.max(np.abs(sought[known])), size)
-    # What underflows in single precision is as good as zero.
+    scale = max(np.max(np.abs(sought[has_answer])), size)
+    # Numbers that underflow in single precision count as zero.
     scale = scale if scale > 1e-15 else unit
-    error = np.max(np.abs(found - sought)[known])
+    error = np.max(np.abs(computed - sought)[has_answer])
     return float(error / scale) if error > 0 else 0.0
 
 
-def test_every_case_has_its_own_name_and_a_number_of_its_family():
+def test_cases_have_unique_names_and_numbers_of_their_family():
     assert len({str(case) for case in CASES}) == len(CASES)
     assert set(KNOWN_FAILURES) <= {str(case) for case in CASES}
     for case in CASES:
-        assert {case.of, *case.numbers} <= set(FAMILIES[case.family].usual), str(case)
+        assert {case.variable, *case.numbers} <= set(FAMILIES[case.family].usual), str(case)
     assert {case.family for case in CASES} == set(FAMILIES)
 
 
@@ -136,8 +136,8 @@ def over_ground(leaf, n_layers=3):
 
 @pytest.mark.slow
 def test_batches_of_one_photon():
-    lidar, scene = whole_lidar(), over_ground(jl.LeafOptics(reflectance=0.5, transmittance=0.3))
-    plan = jl.plan(lidar, scene, max_orders=3, n_rays=64, **WHOLE)
+    lidar, scene = single_sample_lidar(), over_ground(jl.LeafOptics(reflectance=0.5, transmittance=0.3))
+    plan = jl.plan(lidar, scene, max_orders=3, n_rays=64, **SINGLE_SAMPLE)
     wave = jl.simulate(lidar, scene, key=KEY, plan=plan, n_photons=1)
     assert wave.info["photons"] == 8
     assert all(np.all(np.isfinite(a)) for a in jax.tree.leaves(wave))
@@ -146,9 +146,9 @@ def test_batches_of_one_photon():
 
 @pytest.mark.slow
 def test_a_batch_of_ten_million_photons():
-    """Each carries a ten-millionth, less than single precision tells apart at one half."""
-    lidar, scene = whole_lidar(), over_ground(jl.LeafOptics(reflectance=0.0, transmittance=0.0))
-    plan = jl.plan(lidar, scene, max_orders=2, n_photons=10_000_000, n_rays=64, **WHOLE)
+    """Each photon carries 1e-7, less than the spacing of single precision at one half."""
+    lidar, scene = single_sample_lidar(), over_ground(jl.LeafOptics(reflectance=0.0, transmittance=0.0))
+    plan = jl.plan(lidar, scene, max_orders=2, n_photons=10_000_000, n_rays=64, **SINGLE_SAMPLE)
     setup = jl.make_setup(lidar, scene, plan)
     wave = one_batch(setup, KEY)
     np.testing.assert_allclose(sum(wave.energy_budget.values()), 1.0, atol=2e-4)
@@ -160,29 +160,29 @@ def test_a_batch_of_ten_million_photons():
 
 @pytest.mark.parametrize("precision", ["float32", pytest.param("float64", marks=pytest.mark.slow)])
 def test_a_canopy_from_400_km_as_from_1_km(precision):
-    """In samples of 0.1 ns, by a beam of the same width and an aperture of the same angle."""
+    """In samples of 0.1 ns, by a beam of the same width and an aperture of the same angular size."""
     with jax.enable_x64(precision == "float64"):
         lidars = [
             jl.Lidar(
-                altitude=1e3 * far,
-                divergence=0.2 / far,
-                aperture=0.2 * far,
+                altitude=1e3 * scale,
+                divergence=0.2 / scale,
+                aperture=0.2 * scale,
                 sampling_interval=0.1,
                 pulse=jl.GaussianPulse(fwhm=1.0),
             )
-            for far in (1.0, 400.0)
+            for scale in (1.0, 400.0)
         ]
         scene = over_ground(jl.LeafOptics(reflectance=0.5, transmittance=0.3))
         plan = jl.plan(lidars[0], scene, max_orders=1, n_rays=512, footprint="fixed", window=(-35.0, 5.0))
-        near, far = (first_wave(lidar, scene, plan).reflectance for lidar in lidars)
-        np.testing.assert_allclose(far, near, rtol=0, atol=1e-4 * float(np.max(near)))
-        assert float(np.max(near)) > 1e-3
+        low, high = (first_wave(lidar, scene, plan).reflectance for lidar in lidars)
+        np.testing.assert_allclose(high, low, rtol=0, atol=1e-4 * float(np.max(low)))
+        assert float(np.max(low)) > 1e-3
 
 
 def fitted(observed, lidar, start, unknowns):
     noise = 0.01 * float(np.max(observed.reflectance))
-    more = {"n_photons": 4096, "n_rays": 1024, "max_orders": 1}
-    return inversion.retrieve(observed, lidar, start, unknowns, noise=noise, key=jax.random.key(1), **more)
+    sizes = {"n_photons": 4096, "n_rays": 1024, "max_orders": 1}
+    return inversion.retrieve(observed, lidar, start, unknowns, noise=noise, key=jax.random.key(1), **sizes)
 
 
 @pytest.mark.slow
@@ -207,7 +207,7 @@ def test_fits_that_start_at_a_bound(reflectance, height):
 
 @pytest.mark.slow
 def test_chlorophyll_is_undetermined_at_1064_nm():
-    """Not given with a covariance, however large; what the waveform does tell is found beside it."""
+    """It has no finite covariance, and the unknown that the waveform determines is fitted all the same."""
     lidar = jl.Lidar(wavelength=1064.0, altitude=500.0, divergence=4.0)
     observed = jl.simulate(lidar, over_ground(jl.Prospect(Cab=40.0)), key=KEY, max_orders=1)
     start = eqx.tree_at(lambda s: s.ground.reflectance, over_ground(jl.Prospect(Cab=60.0)), jnp.asarray(0.2))

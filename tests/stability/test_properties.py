@@ -1,8 +1,8 @@
-"""What holds for every admissible scene, by random ones: a canopy of few voxels, a plate and sloping ground.
+"""Properties of every admissible scene, by random ones: a canopy of few voxels, a plate and sloping ground.
 
 Structure and shapes stay the same, so that all scenes share one compiled simulation for each precision.
-Random numbers do not change either: what must agree is compared photon by photon, in double precision, where
-no photon falls on the other side of a face by rounding.
+Random numbers do not change either: waveforms that must agree are compared photon by photon, in double
+precision, where rounding moves no photon to the other side of a face.
 """
 
 import functools
@@ -23,35 +23,36 @@ CELLS = int(np.prod(SHAPE))
 usually = functools.partial(
     settings, deadline=None, derandomize=True, database=None, suppress_health_check=[HealthCheck.too_slow]
 )
-shares = st.floats(0.0, 1.0)
+fractions = st.floats(0.0, 1.0)
 # Mostly ordinary voxels, and some that are empty or solid.
-chances = st.one_of(st.floats(0.0, 0.9), st.sampled_from([0.0, 1.0, 1e-8]))
-volumes = st.lists(chances, min_size=CELLS, max_size=CELLS)
+probabilities = st.one_of(st.floats(0.0, 0.9), st.sampled_from([0.0, 1.0, 1e-8]))
+voxel_probabilities = st.lists(probabilities, min_size=CELLS, max_size=CELLS)
 
 
 @st.composite
 def scenes(draw):
-    """Numbers of an admissible scene; reflectance and transmittance are drawn as their sum and its share."""
-    leaf, leaf_part, plate, plate_part = (draw(shares) for _ in range(4))
+    """Numbers of an admissible scene; of reflectance and transmittance the sum and a fraction are drawn."""
+    leaf, leaf_reflected, plate, plate_reflected = (draw(fractions) for _ in range(4))
     height = draw(st.floats(-3.0, 3.0))
-    # Not in one plane: which is met first is then unknown.
-    apart = st.floats(-1.0, 6.0).filter(lambda h: abs(h - height) > 1e-3)
+    # The plate must not lie in the plane of the ground: the order in which light meets them is undefined
+    # then.
+    plate_heights = st.floats(-1.0, 6.0).filter(lambda h: abs(h - height) > 1e-3)
     return {
-        "p_leaf": np.reshape(draw(volumes), SHAPE),
-        "p_bark": np.reshape(draw(volumes), SHAPE),
-        "leaf": np.array([leaf * leaf_part, leaf * (1 - leaf_part)]),
-        "plate": np.array([plate * plate_part, plate * (1 - plate_part)]),
-        "bark": draw(shares),
-        "rho": draw(shares),
-        "coverage": draw(shares),
-        "plate height": draw(apart),
+        "p_leaf": np.reshape(draw(voxel_probabilities), SHAPE),
+        "p_bark": np.reshape(draw(voxel_probabilities), SHAPE),
+        "leaf": np.array([leaf * leaf_reflected, leaf * (1 - leaf_reflected)]),
+        "plate": np.array([plate * plate_reflected, plate * (1 - plate_reflected)]),
+        "bark": draw(fractions),
+        "rho": draw(fractions),
+        "coverage": draw(fractions),
+        "plate height": draw(plate_heights),
         "height": height,
         "slope": draw(st.floats(0.0, 40.0)),
         "aspect": draw(st.floats(0.0, 360.0)),
         "zenith": draw(st.floats(0.0, 20.0)),
         "azimuth": draw(st.floats(0.0, 360.0)),
         "divergence": draw(st.floats(0.0, 2.0)),
-        # Off the faces of voxels: on one, rounding has to choose a side.
+        # Away from faces of voxels, where rounding would choose a side.
         "position": np.array([draw(st.sampled_from([-1, 1])) * draw(st.floats(0.05, 0.9)) for _ in range(2)]),
         "origin": np.array([-1.0, -1.0, 0.5]),
     }
@@ -81,7 +82,7 @@ def build(p):
 
 @functools.cache
 def compiled(precision):
-    """A waveform out of numbers; the plan is that of the widest of all scenes."""
+    """Return the program from numbers to a waveform, by the plan of the widest of all scenes."""
     widest = {
         "p_leaf": np.full(SHAPE, 0.5),
         "p_bark": np.full(SHAPE, 0.5),
@@ -127,9 +128,9 @@ def simulate(p, precision="float64"):
         return jax.tree.map(np.asarray, compiled(precision)(arrays(p)))
 
 
-def alike(found, wanted, tolerance=1e-6):
-    found, wanted = np.asarray(found, float), np.asarray(wanted, float)
-    np.testing.assert_allclose(found, wanted, rtol=0, atol=tolerance * np.max(wanted) + 1e-12)
+def assert_alike(actual, expected, tolerance=1e-6):
+    actual, expected = np.asarray(actual, float), np.asarray(expected, float)
+    np.testing.assert_allclose(actual, expected, rtol=0, atol=tolerance * np.max(expected) + 1e-12)
 
 
 @pytest.mark.parametrize("precision", [pytest.param("float32", marks=pytest.mark.slow), "float64"])
@@ -140,8 +141,8 @@ def test_finite_and_not_negative_and_no_more_than_was_emitted(precision, p):
     for path, value in jax.tree.leaves_with_path(wave):
         assert np.all(np.isfinite(value)), path
     slack = 1e-6 * float(np.max(wave.reflectance)) + 1e-9
-    for name, part in {**wave.components, "all": wave.reflectance}.items():
-        assert float(np.min(part)) >= -slack, name
+    for name, component in {**wave.components, "all": wave.reflectance}.items():
+        assert float(np.min(component)) >= -slack, name
     assert np.sum(wave.energy) <= 1e-3
     np.testing.assert_allclose(np.sum(list(wave.energy_budget.values()), axis=0), 1.0, atol=2e-5)
     for name in ("returned", "escaped", "after the window", "unfollowed"):
@@ -149,9 +150,9 @@ def test_finite_and_not_negative_and_no_more_than_was_emitted(precision, p):
 
 
 @usually(max_examples=20)
-@given(scenes(), shares)
-def test_brighter_ground_never_darkens(p, other):
-    low, high = sorted((p["rho"], other))
+@given(scenes(), fractions)
+def test_brighter_ground_never_darkens(p, other_reflectance):
+    low, high = sorted((p["rho"], other_reflectance))
     dark, bright = (np.asarray(simulate(p | {"rho": rho}).reflectance) for rho in (low, high))
     assert np.all(bright - dark >= -1e-6 * np.max(bright) - 1e-12)
     ground = np.asarray(simulate(p | {"rho": high}).components["ground"])
@@ -170,8 +171,8 @@ def test_moving_everything_sideways(p, east, north):
         "origin": p["origin"] + np.append(shift, 0.0),
         "height": p["height"] + rise,
     }
-    found, wanted = (simulate(q) for q in (moved, p))
-    alike(found.reflectance, wanted.reflectance)
+    moved_wave, wave = (simulate(q) for q in (moved, p))
+    assert_alike(moved_wave.reflectance, wave.reflectance)
 
 
 @usually(max_examples=20)
@@ -187,5 +188,5 @@ def test_turning_everything_about_the_vertical(p, quarters):
         turned["position"] = np.array([y, -x])
         turned["aspect"] += 90.0
         turned["azimuth"] += 90.0
-    found, wanted = (simulate(q) for q in (turned, p))
-    alike(found.components["first"], wanted.components["first"])
+    turned_wave, wave = (simulate(q) for q in (turned, p))
+    assert_alike(turned_wave.components["first"], wave.components["first"])

@@ -1,4 +1,4 @@
-"""Values outside their range are found where JAX is tracing, as constructors refuse known ones."""
+"""Values outside their range are detected while JAX is tracing, as constructors refuse concrete ones."""
 
 import equinox as eqx
 import jax
@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 import jaxlidar as jl
-from jaxlidar._ranges import SUM_OF_FRACTIONS, Range, is_outside, reasons
-from jaxlidar.extend import inadmissible
+from jaxlidar._ranges import SUM_OF_FRACTIONS, is_outside
+from jaxlidar.extend import Range, inadmissible, reasons
 
 CUBE = np.full((2, 2, 2), 0.5)
-MADE = {
+CONSTRUCTORS = {
     "Ground.slope": (lambda x: jl.Ground(slope=x), (0.0, 45.0, 89.9), (90.0, 200.0)),
     "Ground.height": (lambda x: jl.Ground(height=x), (-1e4, 0.0), ()),
     "Ground.reflectance": (lambda x: jl.Ground(reflectance=x), (0.0, 1.0), (-0.01, 1.01)),
@@ -45,27 +45,27 @@ MADE = {
 }
 
 
-@pytest.mark.parametrize("name", list(MADE))
-def test_traced_and_known_values_have_one_range(name):
-    make, good, bad = MADE[name]
+@pytest.mark.parametrize("name", list(CONSTRUCTORS))
+def test_traced_and_concrete_values_have_one_range(name):
+    make, good, bad = CONSTRUCTORS[name]
     field = name.partition(".")[2]
 
     @jax.jit
-    def found(x):
+    def checks(x):
         return inadmissible(make(x)), reasons(make(x))[field]
 
     for x in good:
         assert not inadmissible(make(x))
-        assert not any(found(x))
+        assert not any(checks(x))
     for x in bad:
         with pytest.raises(ValueError, match="outside the admissible range"):
             make(x)
     for x in (*bad, np.nan, np.inf):
-        assert all(found(x)), x
+        assert all(checks(x)), x
 
 
 def test_angles_from_the_vertical_may_pass_through_zero_where_they_are_traced():
-    make, _, _ = MADE["Ground.slope"]
+    make, _, _ = CONSTRUCTORS["Ground.slope"]
     with pytest.raises(ValueError, match="slope = -1"):
         make(-1.0)
     assert not jax.jit(lambda x: inadmissible(make(x)))(-1.0)
@@ -84,28 +84,28 @@ def test_waveforms_of_inadmissible_values_are_nan():
 
     assert np.isfinite(total(5.0)).all()
     assert np.isnan(total(200.0)[0])
-    # Of several scenes at once the others are not touched.
+    # In a batch the other scenes are not affected.
     values, _ = jax.vmap(total)(jnp.array([5.0, 200.0]))
     assert np.isnan(values).tolist() == [False, True]
 
 
-def test_every_reason_has_its_place():
+def test_every_reason_has_a_path():
     @jax.jit
-    def of(slope, coverage, zenith, bark):
+    def reasons_of(slope, coverage, zenith, bark):
         canopy = jl.Canopy(jl.VoxelMap.from_extinction(bark=CUBE, voxel_size=1.0), bark=bark)
         plates = (jl.Plate(4.0, 0.2), jl.Plate(5.0, 0.2, coverage=coverage))
         return reasons((jl.Lidar(zenith=zenith), jl.Scene(canopy, plates, jl.Ground(slope=slope))))
 
-    said = of(200.0, 2.0, 90.0, 1.5)
-    wrong = {name for name, is_so in said.items() if is_so}
+    verdicts = reasons_of(200.0, 2.0, 90.0, 1.5)
+    wrong = {name for name, is_so in verdicts.items() if is_so}
     assert wrong == {"[0].zenith", "[1].ground.slope", "[1].plates[1].coverage", "[1].canopy.bark"}
-    assert not any(of(20.0, 0.5, 1.0, 0.5).values())
-    # A spectrum states its own ranges.
+    assert not any(reasons_of(20.0, 0.5, 1.0, 0.5).values())
+    # A spectrum as reflectance has ranges of its fields.
     gravel = jl.Ground(reflectance=jl.spectrum("gravel"))
     assert "ground.reflectance.scale" in reasons(jl.Scene(ground=gravel))
 
 
-def test_each_of_a_batch_and_of_the_wavelengths():
+def test_values_of_a_batch_and_of_wavelengths_are_checked_one_by_one():
     slopes = jnp.array([0.0, 95.0, 30.0, jnp.nan])
     assert jax.vmap(lambda s: inadmissible(jl.Ground(slope=s)))(slopes).tolist() == [False, True, False, True]
     plate = jax.jit(lambda r: inadmissible(jl.Plate(0.0, r, jnp.array([0.5, 0.1]))))
@@ -115,18 +115,18 @@ def test_each_of_a_batch_and_of_the_wavelengths():
         plate(jnp.array([0.1, 0.1, 0.1]))
 
 
-def test_what_is_out_of_order_is_found():
+def test_values_out_of_order_are_detected():
     lidar = jax.jit(lambda x: inadmissible(jl.Lidar(wavelength=x)))
     pulse = jax.jit(lambda x: inadmissible(jl.SampledPulse(x, [0.0, 1.0, 0.0])))
-    for found, good in ((lidar, [532.0, 1064.0, 1550.0]), (pulse, [-1.0, 0.0, 2.0])):
-        assert not found(jnp.array(good))
-        assert found(jnp.array([good[0], good[2], good[1]]))
-        assert found(jnp.array([good[0], good[1], good[1]]))
+    for is_inadmissible, good in ((lidar, [532.0, 1064.0, 1550.0]), (pulse, [-1.0, 0.0, 2.0])):
+        assert not is_inadmissible(jnp.array(good))
+        assert is_inadmissible(jnp.array([good[0], good[2], good[1]]))
+        assert is_inadmissible(jnp.array([good[0], good[1], good[1]]))
     spectrum = jax.jit(lambda x: inadmissible(jl.Spectrum(x, [0.1, 0.2, 0.3])))
     assert spectrum(jnp.array([500.0, 700.0, 600.0]))
 
 
-def test_values_changed_after_construction_are_found():
+def test_values_changed_after_construction_are_detected():
     ground = eqx.tree_at(lambda g: g.slope, jl.Ground(), jnp.asarray(200.0))
     assert inadmissible(ground)
 
@@ -142,5 +142,5 @@ def test_rounding_at_a_limit_is_admissible(precision):
     assert is_outside(jnp.asarray(0.0, precision), Range(0.0, low_open=True))
 
 
-def test_what_has_no_ranges_is_admissible():
+def test_objects_without_ranges_are_admissible():
     assert not inadmissible((jl.Lambertian(), None, 3.0, [jl.Scene()], {"a": "text"}))

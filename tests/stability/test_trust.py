@@ -1,7 +1,7 @@
-"""Random scenes, as a user would simulate them: what is returned is right to its error, or something is said.
+"""Random scenes with default settings: the waveform is right to its error, or the user is warned.
 
-Every scene is simulated again with more of everything: a third of the error, fine bins of half the width,
-four times the rays, and twice the orders where there is room for them.
+Every scene is simulated again with finer settings: a third of the error, fine bins of half the width, four
+times the rays, and twice the orders where memory admits them.
 """
 
 import warnings
@@ -16,10 +16,10 @@ import jaxlidar as jl
 
 KEY = jax.random.key(17)
 RTOL = 0.05
-# Fine bins leave this share of the peak, see the costs of accuracy.
-RESOLUTION = 0.004
+# Error of the fine bins, of the peak; see examples/benchmarks/accuracy_cost.py.
+BIN_ERROR = 0.004
 
-shares = st.floats(0.02, 0.98)
+fractions = st.floats(0.02, 0.98)
 STRUCTURES = {
     "crown over ground": ("open", 0, True),
     "stand over ground": ("periodic", 0, True),
@@ -40,8 +40,8 @@ def cases(draw):
     def layer(number):
         return {
             "height": 20.0 * number + draw(st.floats(3.0, 20.0)),
-            "albedo": draw(shares),
-            "reflected": draw(shares),
+            "albedo": draw(fractions),
+            "reflected": draw(fractions),
             "coverage": draw(st.floats(0.1, 1.0)),
         }
 
@@ -49,8 +49,8 @@ def cases(draw):
     return {
         "structure": structure,
         "layers": [layer(i) for i in range(STRUCTURES[structure][1])],
-        "albedo": draw(shares),
-        "reflected": draw(shares),
+        "albedo": draw(fractions),
+        "reflected": draw(fractions),
         "shape": tuple(draw(st.integers(2, 8)) for _ in range(3)),
         "seed": draw(st.integers(0, 1000)),
         "depth": draw(st.floats(0.05, 8.0)),
@@ -60,7 +60,7 @@ def cases(draw):
         "origin": (draw(st.floats(-4.0, 0.0)), draw(st.floats(-4.0, 0.0)), draw(st.floats(1.0, 6.0))),
         "slope": draw(st.floats(0.0, 35.0)),
         "aspect": draw(st.floats(0.0, 360.0)),
-        "rho": draw(shares),
+        "rho": draw(fractions),
         "divergence": draw(st.floats(0.1, 20.0)),
         "zenith": draw(st.sampled_from([0.0, 15.0, 40.0])),
         "azimuth": draw(st.floats(0.0, 360.0)),
@@ -70,7 +70,7 @@ def cases(draw):
 
 
 def build(p):
-    """The lidar and the scene."""
+    """Return the lidar and the scene."""
     sides, _, with_ground = STRUCTURES[p["structure"]]
     canopy = ground = None
     if sides is not None:
@@ -93,62 +93,69 @@ def build(p):
 
 
 def split(p):
-    """Reflectance and transmittance."""
+    """Return reflectance and transmittance."""
     return p["albedo"] * p["reflected"], p["albedo"] * (1 - p["reflected"])
 
 
-def simulated(lidar, scene, **more):
-    """The waveform, and whether anything was said."""
-    with warnings.catch_warnings(record=True) as said:
+def simulated(lidar, scene, **settings):
+    """Return the waveform, and whether the user was warned (`info["stopped"]` counts)."""
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        wave = jl.simulate(lidar, scene, key=KEY, **more)
-    return wave, bool(said) or wave.info["stopped"] not in ("tolerance met", "nothing is random")
+        wave = jl.simulate(lidar, scene, key=KEY, **settings)
+    return wave, bool(caught) or wave.info["stopped"] not in ("tolerance met", "nothing is random")
 
 
 def disagreement(wave, better):
-    """The largest excess of a difference over what the two waveforms say of their errors; 1 is too much."""
-    ours, theirs = (np.asarray(w.reflectance, float)[0] for w in (wave, better))
+    """Return the largest difference over the tolerance by the errors of both waveforms; 1 is the bound."""
+    estimate, reference = (np.asarray(w.reflectance, float)[0] for w in (wave, better))
     error = np.hypot(np.asarray(wave.stderr, float)[0], np.asarray(better.stderr, float)[0])
-    # The few batches of samples with little light are skew.
-    seen = theirs > 0.01 * np.max(theirs)
-    allowed = 5.0 * error + RESOLUTION * np.max(theirs) + 0.25 * RTOL * theirs
-    return float(np.max(np.abs(ours - theirs)[seen] / allowed[seen], initial=0.0))
+    # Only bright samples: with few batches the distribution of the others is too skew for a z-test.
+    seen = reference > 0.01 * np.max(reference)
+    tolerance = 5.0 * error + BIN_ERROR * np.max(reference) + 0.25 * RTOL * reference
+    return float(np.max(np.abs(estimate - reference)[seen] / tolerance[seen], initial=0.0))
 
 
-def more_of_everything(lidar, scene, plan):
+def finer_settings(lidar, scene, plan):
     interval = plan.sample_interval
-    more = {
+    settings = {
         "rtol": RTOL / 3,
         "n_rays": 4 * plan.n_rays,
         "bin_width": plan.bins.width / 2,
         "window": (plan.sample_start, plan.sample_start + interval * (plan.n_samples - 1)),
     }
-    room = jl.plan(lidar, scene, describe=False, **more).limits.most_orders
-    return {**more, "max_orders": min(2 * plan.orders, room), "max_seconds": 30.0}
+    max_orders = jl.plan(lidar, scene, describe=False, **settings).limits.most_orders
+    return {**settings, "max_orders": min(2 * plan.orders, max_orders), "max_seconds": 30.0}
 
 
 @pytest.mark.slow
-@settings(
-    max_examples=16,
-    deadline=None,
-    derandomize=True,
-    database=None,
-    suppress_health_check=[HealthCheck.too_slow],
-)
-@given(case=cases())
-def test_right_to_its_error_or_something_is_said(case):
-    lidar, scene = build(case)
-    wave, said = simulated(lidar, scene, rtol=RTOL)
-    for name, part in {**wave.components, "all": wave.reflectance}.items():
-        assert float(np.min(part)) >= -1e-6 * float(np.max(wave.reflectance)), name
-    total = np.sum([np.asarray(v) for v in wave.energy_budget.values()], axis=0)
-    slack = 5 * float(np.sqrt(sum(float(e[0]) ** 2 for e in wave.energy_budget_stderr.values()))) + 1e-4
-    np.testing.assert_allclose(total, 1.0, atol=slack)
-    if said:
-        return
-    plan = jl.plan(lidar, scene, rtol=RTOL, describe=False)
-    better, _ = simulated(lidar, scene, **more_of_everything(lidar, scene, plan))
-    assert disagreement(wave, better) < 1.0
+def test_waveforms_are_right_to_their_error_or_the_user_is_warned():
+    compared = []
+
+    @settings(
+        max_examples=16,
+        deadline=None,
+        derandomize=True,
+        database=None,
+        suppress_health_check=[HealthCheck.too_slow],
+    )
+    @given(case=cases())
+    def check(case):
+        lidar, scene = build(case)
+        wave, is_warned = simulated(lidar, scene, rtol=RTOL)
+        for name, component in {**wave.components, "all": wave.reflectance}.items():
+            assert float(np.min(component)) >= -1e-6 * float(np.max(wave.reflectance)), name
+        total = np.sum([np.asarray(v) for v in wave.energy_budget.values()], axis=0)
+        slack = 5 * float(np.sqrt(sum(float(e[0]) ** 2 for e in wave.energy_budget_stderr.values()))) + 1e-4
+        np.testing.assert_allclose(total, 1.0, atol=slack)
+        if not is_warned:
+            plan = jl.plan(lidar, scene, rtol=RTOL, describe=False)
+            better, _ = simulated(lidar, scene, **finer_settings(lidar, scene, plan))
+            compared.append(disagreement(wave, better))
+            assert compared[-1] < 1.0
+
+    check()
+    # A library that always warned would pass without a single comparison.
+    assert len(compared) >= 4
 
 
 @pytest.mark.slow
@@ -158,7 +165,7 @@ def test_a_wrong_waveform_is_noticed():
     plates = (jl.Plate(8.0, 0.3, 0.3),)
     lidar, scene = jl.Lidar(), jl.Scene(plates=plates, ground=ground)
     plan = jl.plan(lidar, scene, rtol=RTOL)
-    better, _ = simulated(lidar, scene, **more_of_everything(lidar, scene, plan))
+    better, _ = simulated(lidar, scene, **finer_settings(lidar, scene, plan))
     same, _ = simulated(lidar, scene, rtol=RTOL)
     assert disagreement(same, better) < 1.0
     wrong, _ = simulated(lidar, jl.Scene(plates=plates, ground=jl.Ground(reflectance=0.33)), rtol=RTOL)

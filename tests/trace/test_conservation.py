@@ -1,9 +1,9 @@
-"""Conservation: the shares of the emitted energy add up to one.
+"""Conservation: the fractions of the emitted energy sum to one.
 
-What a material absorbs is counted as what arrived there less what went on; what escapes, what outlasts the
-window and what is left after the last order are counted where that happens. The sum is one to rounding for
-each wavelength, unless a photon is lost or counted twice. Where nothing absorbs, the absorbed share is zero
-to the noise of choosing between reflection and transmission.
+Absorption by a material is the light that arrives there minus the light that leaves; escaped light, light
+after the record and light beyond the last order are counted where they occur. The sum is one to rounding for
+each wavelength, unless a photon is lost or counted twice. Without absorbers the absorbed fraction is zero to
+the noise of sampling reflection or transmission.
 """
 
 import jax
@@ -47,10 +47,10 @@ CASES = {
 
 
 @pytest.mark.parametrize("name", slow_unless(["periodic, off nadir"], CASES))
-def test_shares_add_up(name):
-    what, zenith = CASES[name]
+def test_the_energy_budget_sums_to_one(name):
+    case_scene, zenith = CASES[name]
     lidar = jl.Lidar(wavelength=(532.0, 1064.0), zenith=zenith, divergence=2.0)
-    wave = jl.simulate(lidar, what, key=jax.random.key(4), n_photons=4096, max_orders=4, n_rays=512)
+    wave = jl.simulate(lidar, case_scene, key=jax.random.key(4), n_photons=4096, max_orders=4, n_rays=512)
     total = sum(wave.energy_budget.values())
     assert np.allclose(total, 1.0, atol=1e-5)
     assert all(bool(jnp.all(share > -0.02)) for share in wave.energy_budget.values())
@@ -61,20 +61,25 @@ def test_shares_add_up(name):
 
 
 @pytest.mark.parametrize("name", ["absorbing", "plate"])
-def test_shares_of_a_single_order_add_up(name):
-    what, _ = CASES[name]
+def test_the_energy_budget_of_one_order_sums_to_one(name):
+    case_scene, _ = CASES[name]
     wave = jl.simulate(
-        jl.Lidar(divergence=2.0), what, key=jax.random.key(0), max_orders=1, n_rays=512, footprint="fixed"
+        jl.Lidar(divergence=2.0),
+        case_scene,
+        key=jax.random.key(0),
+        max_orders=1,
+        n_rays=512,
+        footprint="fixed",
     )
     assert np.allclose(sum(wave.energy_budget.values()), 1.0, atol=1e-5)
 
 
 @pytest.mark.slow
 def test_small_deposits_on_large_sums():
-    """Of 300,000 photons in one batch; added to a sum one by one, single precision gains or loses 0.2 %."""
-    lidar, what = jl.Lidar(divergence=2.0), scene()
-    plan = jl.plan(lidar, what, max_orders=3, n_photons=300_000, n_rays=512)
+    """300,000 photons in one batch: added to a sum one by one, single precision gains or loses 0.2 %."""
+    lidar, crown = jl.Lidar(divergence=2.0), scene()
+    plan = jl.plan(lidar, crown, max_orders=3, n_photons=300_000, n_rays=512)
     key = jax.random.key(0)
-    setup = jl.make_setup(lidar, what, plan)
+    setup = jl.make_setup(lidar, crown, plan)
     wave = one_batch(setup, key)
     np.testing.assert_allclose(sum(wave.energy_budget.values()), 1.0, atol=2e-4)

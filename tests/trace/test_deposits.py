@@ -9,7 +9,7 @@ import pytest
 import jaxlidar as jl
 from jaxlidar.planning.config import KERNEL_BINS, KERNEL_VARIANCE, TimeBins
 from jaxlidar.trace.deposit import bspline_row, smooth_bins
-from tests.helpers import WHOLE, agrees, batch_mean, slab, slow_unless, whole_lidar
+from tests.helpers import SINGLE_SAMPLE, agrees, batch_mean, single_sample_lidar, slab, slow_unless
 
 LIDAR = jl.Lidar(divergence=2.0, sampling_interval=5.0)
 SCENE = jl.Scene(
@@ -25,11 +25,11 @@ SIZES = {"n_photons": 2048, "n_rays": 512, "window": (-80.0, 40.0)}
 
 
 def samples(wave):
-    # Without the tails, which are too skew for a z-test.
+    # Without the tails, whose distribution is too skew for a z-test.
     return wave.reflectance[0, 2:20]
 
 
-def mean_of(scene, seed, **config):
+def batch_mean_of(scene, seed, **config):
     plan = jl.plan(LIDAR, scene, max_orders=3, **SIZES).with_config(**config)
     return batch_mean(LIDAR, scene, plan, seed=seed, count=24, quantity=samples)
 
@@ -37,40 +37,40 @@ def mean_of(scene, seed, **config):
 @pytest.mark.slow
 @pytest.mark.parametrize("scene", [SCENE, BETWEEN], ids=["canopy", "canopy and plate"])
 def test_the_number_of_deposits_does_not_change_the_mean(scene):
-    a, a_stderr = mean_of(scene, 1)
-    b, b_stderr = mean_of(scene, 2, deposits_per_flight=1)
+    a, a_stderr = batch_mean_of(scene, 1)
+    b, b_stderr = batch_mean_of(scene, 2, deposits_per_flight=1)
     bright = a > 0.01 * a.max()
     stderr = np.hypot(a_stderr, b_stderr)[bright]
     assert agrees(b[bright], stderr, a[bright], sigmas=4.0)
     assert not agrees(b[bright], stderr, 1.05 * a[bright], sigmas=4.0)
 
 
-def second(wave):
+def second_order(wave):
     return wave.components["higher"].sum(axis=1)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("transmission", slow_unless(["straight"], ["diffuse", "straight"]))
-def test_what_one_plate_scatters_down_returns_from_the_next(transmission):
-    """Two paths, there and back: scattered by the upper plate, reflected by the lower, through a gap."""
+def test_light_between_two_plates_returns_by_both_paths(transmission):
+    """Scattered by the upper plate, reflected by the lower, through a gap; and the same path reversed."""
     upper = jl.Plate(height=6.0, reflectance=0.0, transmittance=0.5, coverage=0.5, transmission="diffuse")
     lower = jl.Plate(height=2.0, reflectance=0.4, transmittance=0.3, coverage=0.7, transmission=transmission)
     scene = jl.Scene(plates=(upper, lower))
-    # All lie far below a lidar 400 km up, whose light is vertical.
-    lidar = whole_lidar()
-    plan = jl.plan(lidar, scene, max_orders=2, n_photons=4096, **WHOLE)
-    mean, stderr = batch_mean(lidar, scene, plan, seed=0, count=32, quantity=second)
-    one_way = 0.5 * 0.5 * 0.7 * 0.4 * 0.5
-    assert agrees(mean, stderr, 2 * one_way)
-    # Without the probability of reflection in the weight of one path.
-    assert not agrees(mean, stderr, one_way * (1 + plan.limits.reflection_probability))
+    # From 400 km all light is vertical.
+    lidar = single_sample_lidar()
+    plan = jl.plan(lidar, scene, max_orders=2, n_photons=4096, **SINGLE_SAMPLE)
+    mean, stderr = batch_mean(lidar, scene, plan, seed=0, count=32, quantity=second_order)
+    path_reflectance = 0.5 * 0.5 * 0.7 * 0.4 * 0.5
+    assert agrees(mean, stderr, 2 * path_reflectance)
+    # The same test rejects a weight of one path that lacks the probability of reflection.
+    assert not agrees(mean, stderr, path_reflectance * (1 + plan.limits.reflection_probability))
 
 
 @pytest.mark.slow
 def test_four_deposits_vary_less_than_one():
-    _, four = mean_of(SCENE, 1)
-    _, one = mean_of(SCENE, 1, deposits_per_flight=1)
-    assert np.median(one) > 1.3 * np.median(four)
+    _, stderr_of_four = batch_mean_of(SCENE, 1)
+    _, stderr_of_one = batch_mean_of(SCENE, 1, deposits_per_flight=1)
+    assert np.median(stderr_of_one) > 1.3 * np.median(stderr_of_four)
 
 
 def test_moments_of_the_kernel_do_not_depend_on_the_instant():

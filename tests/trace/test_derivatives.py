@@ -2,8 +2,9 @@
 
 A crown of 6 x 5 x 8 random voxels of leaf and bark over ground (and, in the second scene, a half-open plate
 beneath it), five orders. The functionals are the first three moments of the waveform in time: the zeroth
-sees what is returned, the others when. Both sides are means over independent keys, and their difference is
-tested against its own standard error. The level is Sidak's for all comparisons of one scene at 1 in 1,000.
+depends on the returned energy, the others on its times. Both sides are means over independent keys, and their
+difference is tested against its standard error. The level is Sidak's for all comparisons of one scene at 1 in
+1,000.
 """
 
 import equinox as eqx
@@ -37,7 +38,7 @@ SCENES = {
 
 
 def build(p):
-    """The scene from a dict of parameters."""
+    """Return the scene of a dict of parameters."""
     leaf = jnp.asarray(LEAF) * p["leaf extinction"]
     leaf = leaf.at[2, 2, 6].mul(p["one voxel"])
     voxels = jl.VoxelMap.from_extinction(
@@ -68,7 +69,7 @@ def build(p):
     params=["nadir, slope", pytest.param("off nadir, plate", marks=pytest.mark.slow)],
 )
 def estimates(request):
-    """AD and differences for every parameter, (keys, moments) each."""
+    """Derivatives by AD and by differences for every parameter, of shape (keys, moments) each."""
     zenith, table = SCENES[request.param]
     lidar = jl.Lidar(
         divergence=2.0, pulse=jl.GaussianPulse(fwhm=4.0), zenith=zenith, azimuth=0.0, wavelength=1064.0
@@ -85,27 +86,30 @@ def estimates(request):
 
     value, jacobian = jax.jit(measure), jax.jit(jax.jacfwd(measure))
     keys = jax.random.split(jax.random.key(11), KEYS)
-    exact = [jacobian(start, k) for k in keys]
+    jacobians = [jacobian(start, k) for k in keys]
     # Other keys, so that the two sides are independent.
-    others = jax.random.split(jax.random.key(12), 2 * KEYS)
-    found = {}
+    other_keys = jax.random.split(jax.random.key(12), 2 * KEYS)
+    estimates_by_name = {}
     for name, (middle, step) in table.items():
-        sides = [
-            np.array([value(start | {name: jnp.asarray(middle + s)}, k) for k in others])
+        values = [
+            np.array([value(start | {name: jnp.asarray(middle + s)}, k) for k in other_keys])
             for s in (-step, step)
         ]
-        found[name] = (np.array([e[name] for e in exact]), (sides[1] - sides[0]) / (2 * step))
-    return found
+        estimates_by_name[name] = (
+            np.array([e[name] for e in jacobians]),
+            (values[1] - values[0]) / (2 * step),
+        )
+    return estimates_by_name
 
 
 def z_scores(exact, difference):
-    """Difference of the two means over its standard error."""
+    """Return the difference of the two means over its standard error."""
     spread = np.sqrt(sum(np.var(a, axis=0, ddof=1) / len(a) for a in (exact, difference)))
     return (exact.mean(axis=0) - difference.mean(axis=0)) / spread
 
 
 def limit(comparisons):
-    """Two-sided bound on |z| at a level of 1 in 1,000 for all comparisons together."""
+    """Return the two-sided bound on |z| at a level of 1 in 1,000 for all comparisons together (Sidak)."""
     return norm.isf(0.5 * (1 - 0.999 ** (1 / comparisons)))
 
 
@@ -117,7 +121,7 @@ def test_derivatives_agree_with_differences(estimates):
 
 
 def test_a_planted_wrong_derivative_is_rejected(estimates):
-    """The test has the power to see derivatives 30 % or 50 % too large, and one of the wrong sign."""
+    """The test has the power to reject derivatives 30 % or 50 % too large, and one of the wrong sign."""
     bound = limit(3 * len(estimates))
     for name, factor in (("voxel size", 1.5), ("ground reflectance", 1.3), ("canopy height", -1.0)):
         exact, difference = estimates[name]
@@ -132,7 +136,7 @@ def test_derivatives_are_not_noisier_than_their_differences(estimates):
 
 @pytest.mark.slow
 def test_forward_and_reverse_agree():
-    """J v by forward mode and w J v by reverse mode are the same number."""
+    """The derivative along v by forward mode is the product of v and the gradient by reverse mode."""
     _, table = SCENES["nadir, slope"]
     lidar = jl.Lidar(divergence=2.0, wavelength=1064.0)
     start = {name: jnp.asarray(value) for name, (value, _) in table.items()}

@@ -1,4 +1,4 @@
-r"""Bare ground: its apparent reflectance, when it arrives, how long it lasts and how bright it is.
+r"""Bare ground: apparent reflectance, arrival time, duration and energy of its return.
 
 Layout: a lidar over one infinite plane, no atmosphere. With rho the reflectance, R the range, theta the
 angle between the beam and the plane's normal, the apparent reflectance summed over samples is
@@ -8,7 +8,7 @@ angle between the beam and the plane's normal, the apparent reflectance summed o
     equal-angle     rho / (pi sqrt(sin^2(theta) + alpha^2 / 4))
 
 a the aperture's radius, alpha = a / R, w_f the footprint's 1/e^2 radius, m the roughness; alpha^2 times
-the apparent reflectance is the share of the pulse that enters the aperture. The energy is
+the apparent reflectance is the fraction of the pulse that enters the aperture. The energy is
 E eta A_r / (pi R^2) times it. A plane tilted by `slope` returns a Gaussian pulse (standard deviation
 sigma_p) under a Gaussian beam (sigma_f = w_f / 2) with the variance
 
@@ -16,8 +16,8 @@ sigma_p) under a Gaussian beam (sigma_f = w_f / 2) with the variance
 
 dt^2 / 12 being that of the sample.
 
-Tolerance: one plane is integrated by a Gauss rule, so only rounding (1e-6), the pulse cut at 5.5 sigma (1e-7)
-and the divergence (second order, below 1e-5) are left: 1e-4 throughout.
+Tolerance: one plane is integrated by a Gauss rule, so that only rounding (1e-6), the truncation of the pulse
+at 5.5 sigma (1e-7) and the divergence (second order, below 1e-5) contribute: 1e-4 throughout.
 """
 
 import itertools
@@ -39,15 +39,15 @@ def total(wave):
 
 
 def moments(wave):
-    """Centroid and variance of the first wavelength's waveform, in ns and ns^2."""
+    """Return centroid and variance of the waveform at the first wavelength, in ns and ns^2."""
     time, power = np.asarray(wave.time, float), np.asarray(wave.reflectance[0], float)
     mean = np.sum(time * power) / np.sum(power)
     return mean, np.sum((time - mean) ** 2 * power) / np.sum(power)
 
 
 @pytest.fixture(scope="module", params=["gaussian", "top-hat"])
-def flat(request):
-    """A lidar of three wavelengths, and one plan for all grounds between -40 and 100 m: compiled once."""
+def flat_ground(request):
+    """A lidar of three wavelengths, and one plan for all grounds between -40 and 100 m, to compile once."""
     lidar = jl.Lidar(
         wavelength=(532.0, 1064.0, 1550.0),
         profile=request.param,
@@ -58,8 +58,8 @@ def flat(request):
 
 
 @pytest.mark.parametrize("height", [0.0, 12.34, 100.0, -40.0])
-def test_flat_ground_returns_its_reflectance_at_the_two_way_time(flat, height):
-    lidar, plan = flat
+def test_flat_ground_returns_its_reflectance_at_the_two_way_time(flat_ground, height):
+    lidar, plan = flat_ground
     rho = np.array([0.1, 0.35, 1.0])
     scene = jl.Scene(ground=jl.Ground(height=height, reflectance=rho))
     wave = jl.simulate(lidar, scene, key=KEY, plan=plan)
@@ -73,7 +73,7 @@ def test_flat_ground_returns_its_reflectance_at_the_two_way_time(flat, height):
     height_at_peak = float(wave.height[np.argmax(wave.reflectance[0])])
     assert abs(height_at_peak - height) <= 0.25 * SPEED_OF_LIGHT + 1e-3
 
-    # The lidar equation, with the range of the ground itself.
+    # The lidar equation with the range of the ground; the range of the reference plane is rejected.
     area = np.pi * 0.1**2
     joules = np.array([1e-3, 2e-3, 5e-4]) * [0.5, 0.6, 0.7] * area / (np.pi * (1000.0 - height) ** 2) * rho
     np.testing.assert_allclose(np.asarray(wave.energy, float).sum(axis=1), joules, rtol=TOLERANCE)
@@ -82,7 +82,7 @@ def test_flat_ground_returns_its_reflectance_at_the_two_way_time(flat, height):
 
 
 @pytest.fixture(scope="module")
-def wide():
+def wide_beam():
     """A beam of 2 mrad (sigma_f = 0.5 m), and one plan for all slopes up to 60 degrees."""
     lidar = jl.Lidar(divergence=2.0, pulse=jl.GaussianPulse(fwhm=4.0))
     steepest = jl.Scene(ground=jl.Ground(slope=60.0))
@@ -92,8 +92,8 @@ def wide():
 @pytest.mark.parametrize(
     ("slope", "aspect"), [(0.0, 0.0), (1.0, 40.0), (15.0, 0.0), (30.0, 135.0), (45.0, 270.0), (60.0, 10.0)]
 )
-def test_tilted_ground_broadens_the_pulse(wide, slope, aspect):
-    lidar, plan = wide
+def test_tilted_ground_broadens_the_pulse(wide_beam, slope, aspect):
+    lidar, plan = wide_beam
     scene = jl.Scene(ground=jl.Ground(reflectance=0.4, slope=slope, aspect=aspect))
     wave = jl.simulate(lidar, scene, key=KEY, plan=plan)
     assert total(wave)[0] == pytest.approx(0.4 * np.cos(np.deg2rad(slope)), rel=TOLERANCE)
@@ -107,22 +107,25 @@ def test_tilted_ground_broadens_the_pulse(wide, slope, aspect):
 @pytest.mark.parametrize("divergence", [0.0, 1e-3, 0.02, 0.3, 3.0])
 def test_a_mirror_fills_the_aperture_as_a_gaussian_beam_does(divergence, mirror_plan):
     w = 2.0 * 0.5 * divergence
-    share = -np.expm1(-2.0 * 0.1**2 / max(w, 1e-6) ** 2)
-    assert mirrored(divergence, 0.0, mirror_plan) == pytest.approx(share, rel=TOLERANCE)
+    exact = -np.expm1(-2.0 * 0.1**2 / max(w, 1e-6) ** 2)
+    assert mirrored_fraction(divergence, 0.0, mirror_plan) == pytest.approx(exact, rel=TOLERANCE)
 
 
 @pytest.mark.parametrize("roughness", [3e-5, 1e-4, 1e-2])
 @pytest.mark.parametrize("divergence", [0.0, 0.02, 0.3, 3.0])
 def test_roughness_widens_the_mirror_image(divergence, roughness, mirror_plan):
     w2, blur = (2.0 * 0.5 * divergence) ** 2, 4.0 * (1000.0 * roughness) ** 2
-    share, smooth = -np.expm1(-2.0 * 0.1**2 / (w2 + blur)), -np.expm1(-2.0 * 0.1**2 / max(w2, 1e-12))
-    found = mirrored(divergence, roughness, mirror_plan)
-    assert found == pytest.approx(share, rel=TOLERANCE)
-    assert blur < 0.01 * w2 or found != pytest.approx(smooth, rel=10 * TOLERANCE)
+    exact, without_roughness = (
+        -np.expm1(-2.0 * 0.1**2 / (w2 + blur)),
+        -np.expm1(-2.0 * 0.1**2 / max(w2, 1e-12)),
+    )
+    fraction = mirrored_fraction(divergence, roughness, mirror_plan)
+    assert fraction == pytest.approx(exact, rel=TOLERANCE)
+    assert blur < 0.01 * w2 or fraction != pytest.approx(without_roughness, rel=10 * TOLERANCE)
 
 
-def mirrored(divergence, roughness, plan):
-    """The share of a pulse that a mirror sends into the aperture."""
+def mirrored_fraction(divergence, roughness, plan):
+    """Return the fraction of a pulse that a mirror sends into the aperture."""
     scene = jl.Scene(ground=jl.Ground(reflectance=0.8, law=jl.Specular(roughness=roughness)))
     wave = jl.simulate(jl.Lidar(divergence=divergence), scene, key=KEY, plan=plan)
     return total(wave)[0] * (0.1 / 1000.0) ** 2 / 0.8
@@ -134,7 +137,7 @@ def mirror_plan():
 
 
 @pytest.fixture(scope="module")
-def pencil():
+def pencil_beam():
     """A beam without divergence, and one plan for all slopes."""
     lidar = jl.Lidar(divergence=0.0)
     scene = jl.Scene(ground=jl.Ground(slope=80.0, law=jl.EqualAngle()))
@@ -142,8 +145,8 @@ def pencil():
 
 
 @pytest.mark.parametrize("slope", [0.0, 1e-3, 0.1, 5.0, 45.0, 80.0])
-def test_equal_angle_ground_averages_its_density_over_the_aperture(pencil, slope):
-    lidar, plan = pencil
+def test_equal_angle_ground_averages_its_density_over_the_aperture(pencil_beam, slope):
+    lidar, plan = pencil_beam
     scene = jl.Scene(ground=jl.Ground(reflectance=0.6, slope=slope, law=jl.EqualAngle()))
     wave = jl.simulate(lidar, scene, key=KEY, plan=plan)
     alpha = 0.1 / 1000.0
@@ -154,16 +157,16 @@ def test_equal_angle_ground_averages_its_density_over_the_aperture(pencil, slope
 
 
 @pytest.fixture(scope="module")
-def oblique():
+def oblique_plan():
     lidar = jl.Lidar(zenith=60.0)
     return jl.plan(lidar, jl.Scene(ground=jl.Ground()), window=(-40.0, 40.0))
 
 
 @pytest.mark.parametrize("zenith", [10.0, 30.0, 60.0])
-def test_pointing_off_nadir_costs_the_cosine_and_forgets_the_azimuth(oblique, zenith):
+def test_pointing_off_nadir_costs_the_cosine_and_forgets_the_azimuth(oblique_plan, zenith):
     scene = jl.Scene(ground=jl.Ground(reflectance=0.5))
     waves = [
-        jl.simulate(jl.Lidar(zenith=zenith, azimuth=azimuth), scene, key=KEY, plan=oblique)
+        jl.simulate(jl.Lidar(zenith=zenith, azimuth=azimuth), scene, key=KEY, plan=oblique_plan)
         for azimuth in (0.0, 77.0, 200.0)
     ]
     assert total(waves[0])[0] == pytest.approx(0.5 * np.cos(np.deg2rad(zenith)), rel=TOLERANCE)
@@ -176,42 +179,42 @@ def test_pointing_off_nadir_costs_the_cosine_and_forgets_the_azimuth(oblique, ze
 @pytest.mark.parametrize("field_of_view", [0.05, 0.3, 3.0])
 @pytest.mark.parametrize("profile", ["gaussian", "top-hat"])
 def test_the_edge_of_the_field_of_view(profile, field_of_view):
-    """Of a beam of 0.3 mrad: the share of the energy within it, integrated over its soft edge of 2 %."""
+    """The fraction of a beam of 0.3 mrad within the field of view, integrated over its soft edge of 2 %."""
     lidar = jl.Lidar(profile=profile, field_of_view=field_of_view)
     wave = jl.simulate(lidar, jl.Scene(ground=jl.Ground(reflectance=0.5)), key=KEY)
     edge, beam = 0.5 * field_of_view, 0.15
-    end = 4.0 * beam if profile == "gaussian" else beam
+    beam_edge = 4.0 * beam if profile == "gaussian" else beam
 
     def seen(r):
         density = np.exp(-2.0 * (r / beam) ** 2) * 4.0 * r if profile == "gaussian" else 2.0 * r
         return density / beam**2 / (1.0 + np.exp(np.clip((r / edge - 1.0) / 0.02, -80.0, 80.0)))
 
-    pieces = np.clip([0.0, 0.8 * edge, edge, 1.2 * edge, end], 0.0, end)
-    share = sum(quad(seen, a, b)[0] for a, b in itertools.pairwise(pieces))
-    assert total(wave)[0] == pytest.approx(0.5 * share, rel=TOLERANCE)
+    breakpoints = np.clip([0.0, 0.8 * edge, edge, 1.2 * edge, beam_edge], 0.0, beam_edge)
+    fraction = sum(quad(seen, a, b)[0] for a, b in itertools.pairwise(breakpoints))
+    assert total(wave)[0] == pytest.approx(0.5 * fraction, rel=TOLERANCE)
 
 
 @pytest.mark.parametrize("slope", [0.0, 40.0])
-def test_ground_facing_the_beam_is_flat_ground(oblique, slope):
+def test_ground_facing_the_beam_is_flat_ground(oblique_plan, slope):
     """A slope of the zenith angle towards the sensor is met at normal incidence."""
     scene = jl.Scene(ground=jl.Ground(reflectance=0.5, slope=slope, aspect=180.0))
-    wave = jl.simulate(jl.Lidar(zenith=40.0), scene, key=KEY, plan=oblique)
+    wave = jl.simulate(jl.Lidar(zenith=40.0), scene, key=KEY, plan=oblique_plan)
     assert total(wave)[0] == pytest.approx(0.5 * np.cos(np.deg2rad(40.0 - slope)), rel=TOLERANCE)
 
 
 @pytest.mark.parametrize(("law", "slope"), [(jl.Lambertian(), 40.0), (jl.EqualAngle(), 40.0)])
 def test_from_400_km_as_from_1_km(law, slope):
-    """Divergence / 400 and aperture * 400: the same footprint and aperture's angle, hence the same waveform.
+    """Divergence / 400 and aperture * 400 give the same footprint and angular aperture: the same waveform.
 
-    The beam is narrow (0.5 mrad), as the slope's asymmetry within it grows as its square.
+    The beam is narrow (0.5 mrad), as the asymmetry of a slope within it grows with the square of its width.
     """
     scene = jl.Scene(ground=jl.Ground(reflectance=0.5, slope=slope, law=law))
-    near_lidar = jl.Lidar(divergence=0.5)
-    far_lidar = jl.Lidar(altitude=4e5, divergence=0.5 / 400, aperture=0.2 * 400)
-    plan = jl.plan(near_lidar, scene, window=(-60.0, 40.0))
-    near, far = (jl.simulate(lidar, scene, key=KEY, plan=plan) for lidar in (near_lidar, far_lidar))
-    peak = float(near.reflectance.max())
-    np.testing.assert_allclose(far.reflectance, near.reflectance, atol=TOLERANCE * peak)
+    low_lidar = jl.Lidar(divergence=0.5)
+    high_lidar = jl.Lidar(altitude=4e5, divergence=0.5 / 400, aperture=0.2 * 400)
+    plan = jl.plan(low_lidar, scene, window=(-60.0, 40.0))
+    low_wave, high_wave = (jl.simulate(lidar, scene, key=KEY, plan=plan) for lidar in (low_lidar, high_lidar))
+    peak = float(low_wave.reflectance.max())
+    np.testing.assert_allclose(high_wave.reflectance, low_wave.reflectance, atol=TOLERANCE * peak)
 
 
 def test_a_mirror_400_km_away(mirror_plan):
@@ -219,5 +222,5 @@ def test_a_mirror_400_km_away(mirror_plan):
     lidar = jl.Lidar(altitude=4e5, divergence=0.0625, aperture=0.8)
     scene = jl.Scene(ground=jl.Ground(reflectance=0.02, law=jl.Specular()))
     wave = jl.simulate(lidar, scene, key=KEY, plan=mirror_plan)
-    share = -np.expm1(-2.0 * 0.4**2 / 25.0**2)
-    assert total(wave)[0] * 1e-12 == pytest.approx(0.02 * share, rel=TOLERANCE)
+    exact = -np.expm1(-2.0 * 0.4**2 / 25.0**2)
+    assert total(wave)[0] * 1e-12 == pytest.approx(0.02 * exact, rel=TOLERANCE)

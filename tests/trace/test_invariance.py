@@ -1,9 +1,9 @@
-"""What must not change a waveform: chunks of photons, where the scene stands, which way it is turned, whether
-its voxels are divided, and how many wavelengths one trace serves.
+"""Invariance of waveforms under chunk size, position and orientation of the scene, division of voxels, and
+the number of wavelengths.
 
 Layout: a crown of random voxels, leaf (R != T) and bark, over sloping ground, off nadir. The random numbers
-depend on a photon's number alone, so that changes which leave its path alone are compared photon by photon:
-tolerance 1e-4 of the peak, for the rounding of distances. Others are compared by a z-test.
+depend on the index of a photon alone, so that changes that do not alter its path are compared photon by
+photon: tolerance 1e-4 of the peak, for the rounding of distances. Others are compared by a z-test.
 """
 
 import equinox as eqx
@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import jaxlidar as jl
-from tests.helpers import WHOLE, agrees, batch_mean, slab, slow_unless, whole_lidar
+from tests.helpers import SINGLE_SAMPLE, agrees, batch_mean, single_sample_lidar, slab, slow_unless
 
 KEY = jax.random.key(31)
 SHAPE, EDGE = (6, 6, 8), 1.0
@@ -23,15 +23,15 @@ SIZES = {"max_orders": 4, "n_rays": 512, "bin_width": 0.5, "window": (-80.0, 60.
 
 
 def build(shift=(0.0, 0.0, 0.0), turns=0, divide=1, zenith=20.0, pick=slice(None), empty=0):
-    """The scene and its lidar, moved by `shift`, turned clockwise by quarter `turns` about the beam's aim."""
+    """Return lidar and scene, moved by `shift`, turned clockwise by quarter `turns` about the aim point."""
     k = np.rot90(EXTINCTION, -turns, axes=(0, 1))
     for axis in range(3):
         k = np.repeat(k, divide, axis=axis)
     k = np.pad(k, ((empty, empty), (empty, empty), (0, empty)))
-    low = np.array([-3.0 - empty * EDGE, -3.0 - empty * EDGE, 0.5]) + shift
-    voxels = jl.VoxelMap.from_extinction(leaf=0.8 * k, bark=0.2 * k, voxel_size=EDGE / divide, origin=low)
+    origin = np.array([-3.0 - empty * EDGE, -3.0 - empty * EDGE, 0.5]) + shift
+    voxels = jl.VoxelMap.from_extinction(leaf=0.8 * k, bark=0.2 * k, voxel_size=EDGE / divide, origin=origin)
     aspect, azimuth = np.deg2rad(30.0), np.deg2rad(50.0)
-    # The height of a plane is that below the origin.
+    # The height of a sloping plane is given at the origin.
     downhill = shift[0] * np.sin(aspect) + shift[1] * np.cos(aspect)
     wavelength = np.array([532.0, 1064.0, 1550.0])[pick]
     leaf = jl.LeafOptics(**{name: value[pick] for name, value in LEAF.items()})
@@ -45,7 +45,7 @@ def build(shift=(0.0, 0.0, 0.0), turns=0, divide=1, zenith=20.0, pick=slice(None
         ),
     )
     tilt = np.tan(np.deg2rad(zenith)) * shift[2]
-    # Where the axis meets z = 0 when it aims at the shifted scene.
+    # Point where the beam axis crosses z = 0 if it aims at the shifted scene.
     position = (shift[0] + tilt * np.sin(azimuth), shift[1] + tilt * np.cos(azimuth))
     lidar = jl.Lidar(
         wavelength=wavelength,
@@ -59,15 +59,15 @@ def build(shift=(0.0, 0.0, 0.0), turns=0, divide=1, zenith=20.0, pick=slice(None
 
 
 @pytest.fixture(scope="module")
-def plain():
+def reference_wave():
     lidar, scene = build()
     plan = jl.plan(lidar, scene, n_photons=512, **SIZES)
     return plan, jl.simulate(lidar, scene, key=KEY, plan=plan, n_photons=4096)
 
 
-def alike(found, wanted, rtol=1e-4):
-    peak = float(np.max(wanted))
-    np.testing.assert_allclose(found, wanted, rtol=0, atol=rtol * peak)
+def assert_alike(actual, expected, rtol=1e-4):
+    peak = float(np.max(expected))
+    np.testing.assert_allclose(actual, expected, rtol=0, atol=rtol * peak)
 
 
 def traced(lidar, scene, plan, key):
@@ -76,52 +76,52 @@ def traced(lidar, scene, plan, key):
 
 
 @pytest.mark.slow
-def test_chunks_do_not_matter(plain, monkeypatch):
-    plan, wave = plain
+def test_the_chunk_size_does_not_matter(reference_wave, monkeypatch):
+    plan, wave = reference_wave
     monkeypatch.setattr("jaxlidar.trace.higher_orders.PHOTONS_PER_CHUNK", 96)
     monkeypatch.setattr("jaxlidar.trace.first_order.RAYS_AT_ONCE", 100)
-    # Two functions, so that each is compiled with its own sizes.
-    again = eqx.filter_jit(lambda *given: traced(*given))
+    # Two functions, so that JAX compiles each with its chunk size.
+    trace_small_chunks = eqx.filter_jit(lambda *arguments: traced(*arguments))
     lidar, scene = build()
     key = jax.random.fold_in(KEY, 0)
-    small = again(lidar, scene, plan, key)
+    small_chunks = trace_small_chunks(lidar, scene, plan, key)
     monkeypatch.undo()
-    whole = eqx.filter_jit(lambda *given: traced(*given))
-    alike(small, whole(lidar, scene, plan, key), 1e-5)
+    trace_default_chunks = eqx.filter_jit(lambda *arguments: traced(*arguments))
+    assert_alike(small_chunks, trace_default_chunks(lidar, scene, plan, key), 1e-5)
     assert float(np.max(wave.components["higher"])) > 0.01 * float(np.max(wave.reflectance))
 
 
-def test_one_trace_serves_every_wavelength(plain):
-    plan, wave = plain
+def test_one_trace_serves_every_wavelength(reference_wave):
+    plan, wave = reference_wave
     for i in range(3):
         lidar, scene = build(pick=slice(i, i + 1))
         single = jl.simulate(lidar, scene, key=KEY, plan=plan, n_photons=4096)
-        alike(single.reflectance[0], wave.reflectance[i], 1e-6)
-        for name, part in single.components.items():
-            alike(part[0], wave.components[name][i], 1e-5)
+        assert_alike(single.reflectance[0], wave.reflectance[i], 1e-6)
+        for name, component in single.components.items():
+            assert_alike(component[0], wave.components[name][i], 1e-5)
 
 
-def test_moving_everything_sideways_changes_nothing(plain):
-    plan, wave = plain
+def test_moving_everything_sideways_changes_nothing(reference_wave):
+    plan, wave = reference_wave
     lidar, scene = build(shift=(250.0, -120.0, 0.0))
     moved = jl.simulate(lidar, scene, key=KEY, plan=plan, n_photons=4096)
-    alike(moved.reflectance, wave.reflectance)
+    assert_alike(moved.reflectance, wave.reflectance)
 
 
 @pytest.mark.slow
-def test_empty_voxels_around_the_crown_change_nothing(plain):
-    _, wave = plain
+def test_empty_voxels_around_the_crown_change_nothing(reference_wave):
+    _, wave = reference_wave
     lidar, scene = build(empty=3)
     larger = jl.plan(lidar, scene, n_photons=512, **SIZES)
-    found = jl.simulate(lidar, scene, key=KEY, plan=larger, n_photons=4096)
-    alike(found.reflectance, wave.reflectance)
-    for name, share in found.energy_budget.items():
+    padded_wave = jl.simulate(lidar, scene, key=KEY, plan=larger, n_photons=4096)
+    assert_alike(padded_wave.reflectance, wave.reflectance)
+    for name, share in padded_wave.energy_budget.items():
         np.testing.assert_allclose(share, wave.energy_budget[name], atol=1e-4, err_msg=name)
 
 
-def test_a_lower_scene_shifts_the_time(plain):
-    """Scene and sensor 3 m lower: what arrived at t arrives 2 * 3 m / (c cos zenith) later."""
-    _, wave = plain
+def test_a_lower_scene_shifts_the_time(reference_wave):
+    """Scene and sensor 3 m lower: light arrives 2 * 3 m / (c cos zenith) later."""
+    _, wave = reference_wave
     delay = 2 * 3.0 / (0.299792458 * np.cos(np.deg2rad(20.0)))
     lidar, scene = build(shift=(0.0, 0.0, -3.0))
     later = tuple(t + round(delay) for t in SIZES["window"])
@@ -133,11 +133,11 @@ def test_a_lower_scene_shifts_the_time(plain):
         assert centroids[0] - centroids[1] == pytest.approx(delay, abs=0.02)
 
 
-def sums(wave):
+def order_sums(wave):
     return wave.components["first"].sum(axis=1), wave.components["higher"].sum(axis=1)
 
 
-BATCHES = {"max_orders": 4, "n_photons": 2048, "n_rays": 512, **WHOLE}
+BATCHES = {"max_orders": 4, "n_photons": 2048, "n_rays": 512, **SINGLE_SAMPLE}
 
 
 @pytest.fixture(scope="module")
@@ -148,10 +148,10 @@ def totals():
 def expectation(**changes):
     """First and higher orders of the whole waveform, and their standard errors, at three wavelengths."""
     lidar, scene = build(**changes)
-    far = whole_lidar(
+    far_lidar = single_sample_lidar(
         wavelength=lidar.wavelength, divergence=0.01, zenith=20.0, azimuth=lidar.azimuth, aperture=80.0
     )
-    return batch_mean(far, scene, jl.plan(far, scene, **BATCHES), seed=5, quantity=sums)
+    return batch_mean(far_lidar, scene, jl.plan(far_lidar, scene, **BATCHES), seed=5, quantity=order_sums)
 
 
 @pytest.mark.parametrize(
@@ -185,16 +185,16 @@ def test_within_a_transformation():
         return jax.jvp(reflectance, (rho,), (jnp.ones_like(rho),))
 
     values = jnp.asarray([0.2, 0.4])
-    many, slopes = jax.jit(jax.vmap(with_slope))(values)
-    for value, found in zip(values, many):
-        alike(found, reflectance(value), 1e-5)
-    # The second order is linear in the ground's reflectance, too: the ground cannot light itself.
-    alike(slopes[0], (many[1] - many[0]) / 0.2, 1e-4)
-    alike(slopes[1], slopes[0], 1e-4)
+    reflectances, slopes = jax.jit(jax.vmap(with_slope))(values)
+    for value, mapped in zip(values, reflectances):
+        assert_alike(mapped, reflectance(value), 1e-5)
+    # Two orders are linear in the reflectance of the ground, which cannot illuminate itself.
+    assert_alike(slopes[0], (reflectances[1] - reflectances[0]) / 0.2, 1e-4)
+    assert_alike(slopes[1], slopes[0], 1e-4)
 
 
 def test_the_plan_is_a_value():
-    """Equal scenes have equal plans, which therefore compile once."""
+    """Equal scenes have equal plans, so that they share compiled programs."""
     lidar, scene = build()
     first, second = (jl.plan(lidar, scene, n_photons=512, **SIZES) for _ in range(2))
     assert first == second

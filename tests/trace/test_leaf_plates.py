@@ -1,4 +1,4 @@
-r"""The paper's leaf plate over ground: what each returns at first order, and what all orders add up to.
+r"""The leaf plate of the paper over ground: first-order returns of both, and the sum of all orders.
 
 Layout: an infinite horizontal plate (reflectance R, transmittance T, coverage c) one metre above Lambertian
 ground (rho), nadir view. A ray meets the plate with probability c at each crossing, so the plate acts with
@@ -7,7 +7,7 @@ R' = c R and T' = (1 - c) + c T. First order:
     plate            c R
     ground           T'^2 rho where transmission is straight, (1 - c)^2 rho where it is diffuse,
 
-for what diffuse transmission sends on has been scattered. All orders, by adding fluxes (adding method),
+as diffusely transmitted light has been scattered. All orders, by adding fluxes (adding method),
 for either transmission:
 
     c R + T'^2 rho / (1 - rho c R).
@@ -22,7 +22,7 @@ import pytest
 
 import jaxlidar as jl
 from jaxlidar import SPEED_OF_LIGHT
-from tests.helpers import WHOLE, agrees, slow_unless, whole_lidar
+from tests.helpers import SINGLE_SAMPLE, agrees, single_sample_lidar, slow_unless
 
 KEY = jax.random.key(21)
 R, T, RHO = 0.3, 0.5, 0.6
@@ -66,32 +66,32 @@ def all_orders(coverage=1.0, denominator=None, passing=None):
 @pytest.mark.parametrize("coverage", slow_unless([0.6], [0.6, 1.0]))
 def test_all_orders(transmission, coverage):
     wave = jl.simulate(
-        whole_lidar(),
+        single_sample_lidar(),
         scene(coverage, transmission),
         key=KEY,
         max_orders=8 if transmission == "straight" else 10,
         n_photons=16_384,
-        **(WHOLE | {"bin_width": 10.0}),
+        **(SINGLE_SAMPLE | {"bin_width": 10.0}),
     )
-    found = (float(wave.reflectance[0, 0]), float(wave.stderr[0, 0]))
-    assert found[1] < 0.005 * found[0]
-    assert agrees(*found, all_orders(coverage), bound=wave.neglected[0])
-    # Without light that goes to and fro, or with T for R in it.
-    assert not agrees(*found, all_orders(coverage, denominator=1.0), bound=wave.neglected[0])
-    assert not agrees(*found, all_orders(coverage, denominator=1 - RHO * T), bound=wave.neglected[0])
+    estimate = (float(wave.reflectance[0, 0]), float(wave.stderr[0, 0]))
+    assert estimate[1] < 0.005 * estimate[0]
+    assert agrees(*estimate, all_orders(coverage), bound=wave.neglected[0])
+    # The same test rejects a series without multiple bounces, or with T in place of R.
+    assert not agrees(*estimate, all_orders(coverage, denominator=1.0), bound=wave.neglected[0])
+    assert not agrees(*estimate, all_orders(coverage, denominator=1 - RHO * T), bound=wave.neglected[0])
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("lower", "upper"), slow_unless([(0.5, 0.4)], [(0.5, 0.4), (0.5, 0.0)]))
-def test_two_plates_shade_what_lies_below(lower, upper):
-    """Each passes 1 - c + c T on either way, opaque ones (T = 0) as well."""
+def test_plates_shade_surfaces_below(lower, upper):
+    """Each transmits 1 - c + c T on both paths; also opaque ones (T = 0)."""
     plates = (
         jl.Plate(height=1.0, reflectance=R, transmittance=lower, coverage=0.5),
         jl.Plate(height=2.5, reflectance=0.2, transmittance=upper, coverage=0.25),
     )
-    both = jl.Scene(plates=plates, ground=jl.Ground(reflectance=RHO))
-    wave = jl.simulate(jl.Lidar(), both, key=KEY, max_orders=1)
-    sums = {name: float(part.sum()) for name, part in wave.components.items()}
+    plate_scene = jl.Scene(plates=plates, ground=jl.Ground(reflectance=RHO))
+    wave = jl.simulate(jl.Lidar(), plate_scene, key=KEY, max_orders=1)
+    sums = {name: float(component.sum()) for name, component in wave.components.items()}
     past_upper, past_lower = 0.75 + 0.25 * upper, 0.5 + 0.5 * lower
     assert sums["plate 2"] == pytest.approx(0.25 * 0.2, rel=1e-4)
     assert sums["plate 1"] == pytest.approx(past_upper**2 * 0.5 * R, rel=1e-4)
@@ -119,7 +119,7 @@ def test_a_tilted_plate_over_tilted_ground():
     assert float(wave.components["ground"].sum()) == pytest.approx(T**2 * RHO * cosine, rel=1e-4)
 
 
-def test_what_lies_in_one_plane_is_refused_and_is_nan_where_it_is_traced():
+def test_coincident_planes_are_refused_and_give_nan_where_they_are_traced():
     plate, ground = jl.Plate(2.0, R, T, slope=10.0), jl.Ground(height=2.0, slope=10.0)
     with pytest.raises(
         ValueError, match=r"plates\[0\] lies 0 m from the plane of the ground: .* 0.0001 m or more"
@@ -127,14 +127,14 @@ def test_what_lies_in_one_plane_is_refused_and_is_nan_where_it_is_traced():
         jl.Scene(plates=(plate,), ground=ground)
     with pytest.raises(ValueError, match=r"plates\[2\] lies 5e-05 m from the plane of plates\[0\]"):
         jl.Scene(plates=(jl.Plate(0.0, R), jl.Plate(1.0, R), jl.Plate(5e-5, R)))
-    # Planes that cross one another are told apart.
+    # Planes that cross one another are admissible.
     jl.Scene(plates=(plate, jl.Plate(2.0, R, slope=11.0)), ground=jl.Ground(height=1.999, slope=10.0))
 
     def scene(height):
         return jl.Scene(plates=(jl.Plate(height, R),), ground=jl.Ground())
 
-    lidar = whole_lidar()
-    plan = jl.plan(lidar, scene(1.0), max_orders=1, **WHOLE)
+    lidar = single_sample_lidar()
+    plan = jl.plan(lidar, scene(1.0), max_orders=1, **SINGLE_SAMPLE)
     seen = jax.jit(lambda h: jl.simulate(lidar, scene(h), key=KEY, plan=plan).reflectance.sum())
     assert np.isfinite(seen(0.001))
     assert np.isnan(seen(0.0))

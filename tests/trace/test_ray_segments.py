@@ -18,13 +18,13 @@ KEY = jax.random.key(3)
 
 
 def crown(n: int = 6) -> np.ndarray:
-    """A map of which two thirds are empty."""
+    """Return a map of which two thirds are empty."""
     density = np.random.default_rng(0).uniform(0.2, 1.5, (n, n, n))
     return np.where(np.random.default_rng(1).uniform(size=density.shape) < 0.65, 0.0, density)
 
 
 def scenes() -> dict[str, jl.Scene]:
-    """Scenes whose rays meet leaves, bark, angles, plates and terrain."""
+    """Return scenes with leaves, bark, leaf angles, plates and terrain."""
     voxels = jl.VoxelMap.from_lad(crown(), voxel_size=1.0)
     bark = eqx.tree_at(lambda v: v.bark, voxels, 0.3 * voxels.leaf[::-1], is_leaf=lambda x: x is None)
     angled = dataclasses.replace(voxels, leaf_angles=jl.LeafAngles.named("erectophile"))
@@ -45,7 +45,7 @@ LIDAR = jl.Lidar(altitude=500.0, divergence=6.0, zenith=12.0, pulse=jl.GaussianP
 
 
 @pytest.mark.parametrize("kind", slow_unless(["bark"], scenes()))
-def test_what_is_left_out_adds_nothing(kind: str):
+def test_skipped_segments_add_nothing(kind: str):
     scene = scenes()[kind]
     setup = jl.make_setup(LIDAR, scene, jl.plan(LIDAR, scene, max_orders=1, n_rays=700, describe=False))
 
@@ -53,10 +53,10 @@ def test_what_is_left_out_adds_nothing(kind: str):
         device_scene = build_device_scene(setup, derivatives=derivatives)
         return eqx.filter_jit(trace_device_scene)(device_scene, KEY)
 
-    whole, ahead, plain = traced("all"), traced("forward"), traced("none")
-    assert float(whole.first.sum()) > 0.05
-    for other in (ahead, plain):
-        for a, b in zip(jax.tree.leaves(whole), jax.tree.leaves(other), strict=True):
+    complete, forward_only, no_derivatives = traced("all"), traced("forward"), traced("none")
+    assert float(complete.first.sum()) > 0.05
+    for shortened in (forward_only, no_derivatives):
+        for a, b in zip(jax.tree.leaves(complete), jax.tree.leaves(shortened), strict=True):
             np.testing.assert_allclose(a, b, rtol=2e-5, atol=2e-6)
 
 
@@ -70,22 +70,20 @@ def test_blocks_hold_every_segment_once(block: int, monkeypatch: pytest.MonkeyPa
     extinction = np.where(random.uniform(size=start.shape) < 0.5, 0.0, 1.0)
     segments = ray_segments.RaySegments(*(jnp.asarray(a) for a in (start, length, start, cell, extinction)))
 
-    def add(tally, its, ray):
-        there = its.length > 0
-        return tally.at[its.cell].add(jnp.where(there, 1.0 + ray, 0.0))
+    def add(tally, block, ray):
+        is_real = block.length > 0
+        return tally.at[block.cell].add(jnp.where(is_real, 1.0 + ray, 0.0))
 
     tally, ray = jnp.zeros(start.size), jnp.arange(60.0)
-    own = 1.0 + np.broadcast_to(np.arange(60.0), start.shape)
-    found = ray_segments.add_in_blocks(add, tally, segments, ray, None).reshape(start.shape)
-    np.testing.assert_array_equal(found, np.where(length > 0, own, 0.0))
-    found = ray_segments.add_in_blocks(add, tally, segments, ray, segments.extinction > 0).reshape(
-        start.shape
-    )
-    np.testing.assert_array_equal(found, np.where((length > 0) & (extinction > 0), own, 0.0))
+    ray_weight = 1.0 + np.broadcast_to(np.arange(60.0), start.shape)
+    sums = ray_segments.add_in_blocks(add, tally, segments, ray, None).reshape(start.shape)
+    np.testing.assert_array_equal(sums, np.where(length > 0, ray_weight, 0.0))
+    sums = ray_segments.add_in_blocks(add, tally, segments, ray, segments.extinction > 0).reshape(start.shape)
+    np.testing.assert_array_equal(sums, np.where((length > 0) & (extinction > 0), ray_weight, 0.0))
 
 
 def test_empty_voxels_have_their_derivatives():
-    """Forward, in reverse, and as differences; leaving out what is empty would make them zero."""
+    """Forward, in reverse, and as differences; skipping empty voxels would make them zero."""
     with jax.enable_x64(True):
         scene = scenes()["leaves"]
         plan = jl.plan(LIDAR, scene, max_orders=1, n_rays=300, describe=False)
@@ -98,14 +96,14 @@ def test_empty_voxels_have_their_derivatives():
             setup = jl.make_setup(LIDAR, moved, plan)
             return jl.total_reflectance(jl.trace_scene(setup, KEY, reverse=reverse), setup)[0]
 
-        ahead = jax.jit(jax.jacfwd(total))(0.0)
+        forward = jax.jit(jax.jacfwd(total))(0.0)
         step = 1e-5
         differences = (jax.jit(total)(step) - jax.jit(total)(0.0)) / step
-        np.testing.assert_allclose(ahead, differences, atol=1e-4 * float(jnp.max(jnp.abs(ahead))))
-        assert float(jnp.max(jnp.abs(ahead))) > 1e-3
-        weight = jnp.cos(jnp.arange(ahead.size))
-        back = jax.jit(jax.grad(lambda f: jnp.vdot(weight, total(f, True))))(0.0)
-        np.testing.assert_allclose(back, jnp.vdot(weight, ahead), rtol=1e-9)
+        np.testing.assert_allclose(forward, differences, atol=1e-4 * float(jnp.max(jnp.abs(forward))))
+        assert float(jnp.max(jnp.abs(forward))) > 1e-3
+        weight = jnp.cos(jnp.arange(forward.size))
+        backward = jax.jit(jax.grad(lambda f: jnp.vdot(weight, total(f, True))))(0.0)
+        np.testing.assert_allclose(backward, jnp.vdot(weight, forward), rtol=1e-9)
 
 
 def test_the_result_does_not_depend_on_the_longest_segment():

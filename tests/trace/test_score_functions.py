@@ -26,11 +26,11 @@ LEAF, BARK = RANDOM.uniform(0, 1, (6, 5, 8)), RANDOM.uniform(0, 0.3, (6, 5, 8))
 LEAF[2, 2, 5] = 0.0
 
 
-class Case(NamedTuple):
-    """A scene, the unknowns, and how many of them move one voxel at most."""
+class ScoreCase(NamedTuple):
+    """A scene, its unknowns, and the largest number of unknowns that change one voxel."""
 
     unknowns: str
-    most: int
+    max_columns: int
     bark: bool = False
     slope: float = 0.0
     zenith: float = 0.0
@@ -45,26 +45,26 @@ class Case(NamedTuple):
 
 
 CASES = {
-    "layers": Case("layers", 1),
-    "group, bark, slope, off nadir": Case("group", 2, bark=True, slope=10.0, zenith=12.0),
+    "layers": ScoreCase("layers", 1),
+    "group, bark, slope, off nadir": ScoreCase("group", 2, bark=True, slope=10.0, zenith=12.0),
 }
-MORE = {
-    "factor": Case("factor", 1, bark=True, slope=10.0),
-    "layers, off nadir": Case("layers", 1, zenith=12.0),
-    "layers, two to a voxel": Case("overlapping", 2, bark=True, slope=10.0, zenith=12.0),
-    "layers, plate": Case("layers", 1, plates=1, zenith=12.0, orders=3),
-    "layers, leaf angles": Case("layers", 1, angles="planophile", zenith=12.0),
-    "layers, hot spot": Case("layers", 1, hotspot=True),
-    "layers, periodic": Case("layers", 1, sides="periodic", slope=10.0),
-    "layers, field of view": Case("layers", 1, zenith=12.0, field_of_view=2.0),
-    "layers, phase function": Case("layers", 1, phase=True, slope=10.0),
-    "layers, air": Case("layers", 1, air=True),
-    "layers, one order": Case("layers", 1, bark=True, zenith=12.0, orders=1),
+MORE_CASES = {
+    "factor": ScoreCase("factor", 1, bark=True, slope=10.0),
+    "layers, off nadir": ScoreCase("layers", 1, zenith=12.0),
+    "layers, two to a voxel": ScoreCase("overlapping", 2, bark=True, slope=10.0, zenith=12.0),
+    "layers, plate": ScoreCase("layers", 1, plates=1, zenith=12.0, orders=3),
+    "layers, leaf angles": ScoreCase("layers", 1, angles="planophile", zenith=12.0),
+    "layers, hot spot": ScoreCase("layers", 1, hotspot=True),
+    "layers, periodic": ScoreCase("layers", 1, sides="periodic", slope=10.0),
+    "layers, field of view": ScoreCase("layers", 1, zenith=12.0, field_of_view=2.0),
+    "layers, phase function": ScoreCase("layers", 1, phase=True, slope=10.0),
+    "layers, air": ScoreCase("layers", 1, air=True),
+    "layers, one order": ScoreCase("layers", 1, bark=True, zenith=12.0, orders=1),
 }
 START = {"layers": jnp.ones(8), "overlapping": jnp.ones(9), "factor": jnp.ones(1), "group": jnp.ones(2)}
 
 
-def build(case: Case, x: jax.Array) -> jl.Scene:
+def build(case: ScoreCase, x: jax.Array) -> jl.Scene:
     leaf, bark = jnp.asarray(LEAF), jnp.asarray(BARK)
     match case.unknowns:
         case "layers":
@@ -75,11 +75,11 @@ def build(case: Case, x: jax.Array) -> jl.Scene:
             leaf, bark = leaf * x[0], bark * x[0]
         case "group":
             leaf, bark = leaf.at[2:4, 2:4, 3:6].multiply(x[0]), bark * x[1]
-    place = {"voxel_size": 0.5, "origin": (-1.5, -1.25, 1.0)}
+    geometry = {"voxel_size": 0.5, "origin": (-1.5, -1.25, 1.0)}
     if case.angles is not None:
-        voxels = jl.VoxelMap.from_lad(leaf, leaf_angles=case.angles, **place)
+        voxels = jl.VoxelMap.from_lad(leaf, leaf_angles=case.angles, **geometry)
     else:
-        voxels = jl.VoxelMap.from_extinction(leaf=leaf, bark=bark if case.bark else None, **place)
+        voxels = jl.VoxelMap.from_extinction(leaf=leaf, bark=bark if case.bark else None, **geometry)
     optics = jl.LeafOptics(reflectance=0.4, transmittance=0.3)
     leaves = jl.HenyeyGreenstein(albedo=0.8, g=0.3) if case.phase else optics
     return jl.Scene(
@@ -90,9 +90,9 @@ def build(case: Case, x: jax.Array) -> jl.Scene:
     )
 
 
-def both_ways(case: Case):
-    """Total and derivatives by tangents, and by scores."""
-    # Of the precision that is on.
+def tangents_and_scores(case: ScoreCase):
+    """Return the reflectance and its derivatives, once by tangents and once by scores."""
+    # In the precision in use.
     start = jnp.asarray(np.asarray(START[case.unknowns]), jnp.result_type(float))
     seen = {"zenith": case.zenith, "azimuth": 0.0, "field_of_view": case.field_of_view}
     lidar = jl.Lidar(divergence=2.0, wavelength=(532.0, 1064.0), **seen)
@@ -121,7 +121,7 @@ def both_ways(case: Case):
         setup = setup_at(x)
         device_scene, optics = build_device_scene(setup, derivatives="forward"), setup_optics(setup)
         leaf, bark = jax.vmap(lambda t: jax.jvp(extinction, (x,), (t,))[1])(directions)
-        slopes = make_slopes(device_scene, leaf, bark, optics, case.most)
+        slopes = make_slopes(device_scene, leaf, bark, optics, case.max_columns)
         device_scene = dataclasses.replace(device_scene, slopes=slopes)
         response, fine = trace_with_scores(device_scene, optics, key)
         return jl.total_reflectance(response, setup), derivatives_to_samples(fine, make_waveform_model(setup))
@@ -129,9 +129,9 @@ def both_ways(case: Case):
     return by_tangents(start), by_scores(start)
 
 
-def difference(case: Case) -> float:
-    """Of the derivatives, in units of the largest."""
-    (total, columns), (same, scored) = both_ways(case)
+def relative_difference(case: ScoreCase) -> float:
+    """Return the largest difference of the derivatives over the largest derivative."""
+    (total, columns), (same, scored) = tangents_and_scores(case)
     rounding = 10 * float(jnp.finfo(total.dtype).eps)
     np.testing.assert_allclose(same, total, rtol=0, atol=rounding * float(jnp.max(total)))
     return float(jnp.max(jnp.abs(scored - columns)) / jnp.max(jnp.abs(columns)))
@@ -142,13 +142,13 @@ TOLERANCE = {"float32": 1e-5, "float64": 1e-13}
 
 @pytest.mark.parametrize("name", CASES)
 def test_scores_are_tangents(name, precision):
-    assert difference(CASES[name]) < TOLERANCE[precision]
+    assert relative_difference(CASES[name]) < TOLERANCE[precision]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", MORE)
+@pytest.mark.parametrize("name", MORE_CASES)
 def test_more_scores_are_tangents(name, precision):
-    assert difference(MORE[name]) < TOLERANCE[precision]
+    assert relative_difference(MORE_CASES[name]) < TOLERANCE[precision]
 
 
 @pytest.mark.parametrize("left_out", ["vertical_depth_slopes", "collision_score"])
@@ -156,10 +156,12 @@ def test_a_wrong_score_is_rejected(left_out, monkeypatch):
     """Without the way back to the sensor, or without what collisions add."""
     right = getattr(higher_orders, left_out)
     monkeypatch.setattr(higher_orders, left_out, lambda *a: 0.0 * right(*a))
-    assert difference(CASES["layers"]) > 1e-2
+    assert relative_difference(CASES["layers"]) > 1e-2
 
 
 def test_a_voxel_that_too_many_columns_move_is_not_a_number():
     """A wrong promise spoils the derivatives, rather than being believed."""
-    (_, _), (_, scored) = both_ways(MORE["layers, two to a voxel"]._replace(most=1, orders=1))
+    (_, _), (_, scored) = tangents_and_scores(
+        MORE_CASES["layers, two to a voxel"]._replace(max_columns=1, orders=1)
+    )
     assert bool(jnp.any(jnp.isnan(scored)))

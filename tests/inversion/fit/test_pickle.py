@@ -68,7 +68,7 @@ def unknowns():
 
 def test_unknowns_can_be_pickled():
     copies = pickle.loads(pickle.dumps(unknowns()))
-    for copy, original in zip(copies, unknowns()):
+    for copy, original in zip(copies, unknowns(), strict=True):
         assert (copy.where, copy.name) == (original.where, original.name)
         assert jax.tree.structure(copy) == jax.tree.structure(original)
         assert jax.tree.all(jax.tree.map(np.array_equal, copy, original))

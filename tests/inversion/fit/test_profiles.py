@@ -25,7 +25,7 @@ from inversion.fit.profiles import AbstractPosterior
 from inversion.fit.solver import DEFAULT_SOLVER, LeastSquaresFit, SolverSettings, run_fit
 from inversion.fit.unknowns import BoundUnknown, Setter, bounds_by_name, split_by_name
 from inversion.receiver.recorder import RecorderModel
-from tests.helpers import NARROW
+from tests.helpers import BY_PRECISION
 
 LAYERS, SAMPLES, STRENGTH = 12, 40, 0.3
 SMOOTH = Smooth(3.0, strength=STRENGTH)
@@ -357,7 +357,7 @@ def noisy_records(n, seed=0):
     return np.asarray(wave.reflectance) + noise, lidar, start, unknowns, options
 
 
-@NARROW
+@BY_PRECISION
 def test_a_profile_from_two_wavelengths(precision, tmp_path):
     observed, lidar, start, unknowns, options = noisy_records(3)
     fit = inversion.retrieve(observed[0], lidar, start, unknowns, **options)

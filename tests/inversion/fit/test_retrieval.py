@@ -17,7 +17,7 @@ from inversion.fit.planning import TraceSizes, corner_scenes, plan_for_bounds
 from inversion.fit.uncertainty import estimate_covariance
 from inversion.fit.unknowns import bind_unknowns, bounded_logistic, bounded_logit, optical_arrays
 from jaxlidar.planning.plan import MIN_BATCHES
-from tests.helpers import NARROW
+from tests.helpers import BY_PRECISION
 
 LIDAR = jl.Lidar(
     wavelength=(532.0, 1064.0, 1550.0), altitude=500.0, divergence=8.0, pulse=jl.GaussianPulse(fwhm=4.0)
@@ -225,7 +225,7 @@ def retrieve_ground(observed=None, unknowns=GROUND, noise=1e-3, scene=None, lida
     return inversion.retrieve(observed, lidar, scene, unknowns, noise=noise, key=jax.random.key(0), **options)
 
 
-@NARROW
+@BY_PRECISION
 def test_errors_are_as_large_as_stated(precision):
     """Over realisations of the noise, deviations over standard errors have variance 1, chi2 has mean 1."""
     wave, random = ground_wave(), np.random.default_rng(0)
@@ -381,7 +381,7 @@ def test_the_plan_serves_the_corners_of_the_bounds():
         assert corner_plan.config.max_ray_segments <= plan.config.max_ray_segments
         assert corner_plan.config.max_faces <= plan.config.max_faces
         assert corner_plan.bins.width == plan.bins.width
-        assert corner_plan.bins.row <= plan.bins.row
+        assert corner_plan.bins.max_span <= plan.bins.max_span
         assert corner_plan.bins.start >= plan.bins.start - 1e-6
         end, longest = (b.start + b.width * b.count for b in (corner_plan.bins, plan.bins))
         assert end <= longest + 1e-6

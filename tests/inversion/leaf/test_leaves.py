@@ -10,7 +10,7 @@ from scipy.optimize import least_squares
 import jaxlidar as jl
 from inversion import invert_leaves
 from inversion.leaf.leaves import STATUS
-from tests.helpers import NARROW, slow_unless
+from tests.helpers import BY_PRECISION, slow_unless
 
 BANDS = np.arange(400.0, 2501.0, 10.0)
 RANGES = {
@@ -38,7 +38,7 @@ def spectra(traits, bands=BANDS):
     return (np.array(s) for s in jl.prospect_spectra(leaves, bands))
 
 
-@NARROW
+@BY_PRECISION
 def test_traits_without_noise(precision):
     truth = random_traits(45)
     fit = invert_leaves(BANDS, *spectra(truth))

@@ -22,7 +22,6 @@ RECORD = "GEDI01_B_2019108080338_O01964_T05337_02_003_01_sub.h5"
 def recorded():
     """Shots with values of the level 2 products, and those values in the same order."""
     pytest.importorskip("h5py")
-
     from jaxlidar.io import read_gedi_l1b
 
     if not (SHARED / "gedi" / RECORD).is_file():

@@ -119,8 +119,8 @@ def test_segments_and_percentiles():
     coarse = inversion.photon_ground_and_canopy(events, DISTANCE, segment=100.0, percentile=50.0)
     np.testing.assert_allclose(coarse.distance, [50.0, 150.0])
     np.testing.assert_allclose(coarse.canopy, 10.0, atol=0.7)
-    repeated = inversion.photon_ground_and_canopy(events, DISTANCE, segment=100.0, percentile=50.0)
-    assert all(np.array_equal(a, b) for a, b in zip(coarse, repeated))
+    again = inversion.photon_ground_and_canopy(events, DISTANCE, segment=100.0, percentile=50.0)
+    assert all(np.array_equal(a, b) for a, b in zip(coarse, again, strict=True))
 
 
 def test_percentiles_are_those_of_numpy():

@@ -1,4 +1,4 @@
-"""What a record cuts off is said: light on its way when it ends, and orders beyond the last."""
+"""Warnings of truncated light: light that arrives after the record, and orders beyond the last."""
 
 import importlib
 import time
@@ -31,7 +31,7 @@ def late(wave):
     return float(np.max(wave.energy_budget["after the window"]))
 
 
-def test_a_window_that_the_plan_chose_warns_and_one_of_ones_own_does_not():
+def test_a_window_of_the_plan_warns_and_one_of_the_user_does_not():
     with pytest.warns(LateLightWarning, match=r"% of the light is still on its way .* give window="):
         wave = jl.simulate(LIDAR, BRIGHT, key=KEY, n_photons=20_000, max_orders=4)
     assert late(wave) > 0.01
@@ -39,13 +39,15 @@ def test_a_window_that_the_plan_chose_warns_and_one_of_ones_own_does_not():
     end = float(wave.time[-1])
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        own = jl.simulate(LIDAR, BRIGHT, key=KEY, n_photons=20_000, max_orders=4, window=(-600.0, end))
-    assert late(own) > 0.01
-    assert "of the light is still on its way when the record ends" in str(own)
+        user_window = jl.simulate(
+            LIDAR, BRIGHT, key=KEY, n_photons=20_000, max_orders=4, window=(-600.0, end)
+        )
+    assert late(user_window) > 0.01
+    assert "of the light is still on its way when the record ends" in str(user_window)
 
 
 @pytest.mark.slow
-def test_where_little_is_cut_off_nothing_is_said():
+def test_little_light_after_the_record_does_not_warn():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         wave = jl.simulate(LIDAR, dense(0.3, 2.0, 0.1), key=KEY, n_photons=20_000)
@@ -55,20 +57,20 @@ def test_where_little_is_cut_off_nothing_is_said():
 
 @pytest.mark.slow
 def test_the_chosen_window_takes_in_bright_dense_stands():
-    """Of a stand of depth 6 and albedo 0.95 over ground, less than a hundredth of the light is late."""
+    """Less than 1 % of the light from a stand of depth 6 and albedo 0.95 arrives after the record."""
     wave = jl.simulate(LIDAR, dense(0.95, 6.0, 0.3), key=KEY, n_photons=40_000)
     assert late(wave) < 0.01
 
 
-def test_the_table_has_a_row_for_it():
-    few, many = (jl.plan(LIDAR, dense(a, 10.0)) for a in (0.3, 0.98))
-    (row,) = (effect for effect in few.effects if effect.name == "after the window")
-    (more,) = (effect for effect in many.effects if effect.name == "after the window")
-    assert row.bound < more.bound
-    # A window of one's own may leave out all.
-    own = jl.plan(LIDAR, dense(0.3, 10.0), window=(-90.0, -80.0))
-    assert next(effect.bound for effect in own.effects if effect.name == "after the window") == 1.0
-    assert "window" in str(many)
+def test_the_table_of_effects_has_a_row_for_light_after_the_record():
+    dark_plan, bright_plan = (jl.plan(LIDAR, dense(a, 10.0)) for a in (0.3, 0.98))
+    (dark_row,) = (effect for effect in dark_plan.effects if effect.name == "after the window")
+    (bright_row,) = (effect for effect in bright_plan.effects if effect.name == "after the window")
+    assert dark_row.bound < bright_row.bound
+    # A window of the user may leave out all light.
+    narrow_plan = jl.plan(LIDAR, dense(0.3, 10.0), window=(-90.0, -80.0))
+    assert next(effect.bound for effect in narrow_plan.effects if effect.name == "after the window") == 1.0
+    assert "window" in str(bright_plan)
 
 
 @pytest.mark.slow
@@ -81,7 +83,7 @@ def test_tolerance_is_met_only_if_the_neglected_orders_are_below_it():
     assert share > 0.03
     assert wave.info["stopped"].startswith("orders beyond ")
     assert "orders beyond the last may add" in str(wave)
-    # The plan's own estimate is no smaller than what the photons say.
+    # The estimate of the plan is no smaller than that of the photons.
     assert jl.plan(LIDAR, scene, rtol=0.03, describe=False).likely_beyond >= float(
         wave.energy_budget["unfollowed"][0]
     ) - 3 * float(wave.energy_budget_stderr["unfollowed"][0])
@@ -89,30 +91,35 @@ def test_tolerance_is_met_only_if_the_neglected_orders_are_below_it():
 
 @pytest.mark.slow
 def test_more_orders_are_followed_where_too_few_were_planned(monkeypatch):
-    """The plan is made to expect that little is scattered again: two orders, of 6 that there is room for."""
+    """The plan is patched to expect little further scattering: two orders, of six that memory admits."""
     monkeypatch.setattr(orders, "scattered_again", lambda scene, optics: 1e-3)
     monkeypatch.setattr(orders, "MAX_HISTORIES", 60)
-    seen = []
-    given = {"key": KEY, "rtol": 0.05, "window": (-90.0, 60.0), "progress": lambda _: seen.append(len(seen))}
-    wave = jl.simulate(LIDAR, dense(0.9, 3.0), **given)
+    calls = []
+    settings = {
+        "key": KEY,
+        "rtol": 0.05,
+        "window": (-90.0, 60.0),
+        "progress": lambda _: calls.append(len(calls)),
+    }
+    wave = jl.simulate(LIDAR, dense(0.9, 3.0), **settings)
     orders_followed = jl.plan(LIDAR, dense(0.9, 3.0), window=(-90.0, 60.0), describe=False).limits.most_orders
     assert orders_followed > 2
     assert wave.info["stopped"].startswith(f"orders beyond {orders_followed} may add")
 
-    # Time that is spent, and memory, are limits of both attempts together.
+    # Limits of time and memory hold for both attempts together.
     def interrupt(_):
         raise KeyboardInterrupt
 
-    early = jl.simulate(LIDAR, dense(0.9, 3.0), **given | {"progress": interrupt})
+    early = jl.simulate(LIDAR, dense(0.9, 3.0), **settings | {"progress": interrupt})
     assert early.info["stopped"] == "interrupted"
-    short = jl.simulate(LIDAR, dense(0.9, 3.0), **given, max_seconds=1e-6)
+    short = jl.simulate(LIDAR, dense(0.9, 3.0), **settings, max_seconds=1e-6)
     assert short.info["stopped"].startswith("orders beyond 2 may add")
     three = jl.plan(LIDAR, dense(0.9, 3.0), window=(-90.0, 60.0), max_orders=3, describe=False)
-    tight = jl.simulate(LIDAR, dense(0.9, 3.0), **given, max_memory=1.0001 * three.memory / 1e9)
+    tight = jl.simulate(LIDAR, dense(0.9, 3.0), **settings, max_memory=1.0001 * three.memory / 1e9)
     assert tight.info["stopped"].startswith("orders beyond 3 may add")
 
 
-def test_orders_that_the_user_chose_are_enough_for_the_user():
+def test_orders_of_the_user_are_not_extended():
     wave = jl.simulate(LIDAR, dense(0.8, 3.0), key=KEY, max_orders=2, rtol=0.05)
     assert wave.info["stopped"] == "tolerance met"
     assert float(wave.neglected[0]) > 0
@@ -120,7 +127,7 @@ def test_orders_that_the_user_chose_are_enough_for_the_user():
 
 @pytest.mark.slow
 def test_the_ledger_has_standard_errors():
-    """Forty simulations scatter as their errors say; errors a third or three times as large are refused."""
+    """The scatter of forty simulations agrees with their errors; errors three times wrong are rejected."""
     scene, n = dense(0.8, 3.0, 0.3), 40
     plan = jl.plan(LIDAR, scene, describe=False)
     waves = [jl.simulate(LIDAR, scene, key=k, plan=plan, n_photons=4_000) for k in jax.random.split(KEY, n)]
@@ -142,19 +149,19 @@ def test_light_is_accounted_for():
 
 
 def test_time_for_planning_counts(monkeypatch):
-    """Eight batches take less than `max_seconds`: without the plan's own time, more would be traced."""
+    """Eight batches take less than `max_seconds`: if planning did not count, more would be traced."""
     make = simulation.make_plan
 
-    def slow_plan(*given, **more):
+    def slow_plan(*arguments, **keywords):
         time.sleep(1.0)
-        return make(*given, **more)
+        return make(*arguments, **keywords)
 
-    given = {"key": KEY, "rtol": 1e-6, "max_orders": 2, "window": (-90.0, 60.0)}
-    # What is to be compiled is compiled before.
-    jl.simulate(LIDAR, dense(0.3), **given, max_seconds=1e-6)
-    alone = jl.simulate(LIDAR, dense(0.3), **given, max_seconds=1.0)
-    assert alone.info["batches"] > 8
+    settings = {"key": KEY, "rtol": 1e-6, "max_orders": 2, "window": (-90.0, 60.0)}
+    # Compile everything before.
+    jl.simulate(LIDAR, dense(0.3), **settings, max_seconds=1e-6)
+    fast = jl.simulate(LIDAR, dense(0.3), **settings, max_seconds=1.0)
+    assert fast.info["batches"] > 8
     monkeypatch.setattr(simulation, "make_plan", slow_plan)
-    late = jl.simulate(LIDAR, dense(0.3), **given, max_seconds=1.0)
-    assert (late.info["batches"], late.info["stopped"]) == (8, "time spent")
-    assert late.info["seconds"] > 1.0
+    slow = jl.simulate(LIDAR, dense(0.3), **settings, max_seconds=1.0)
+    assert (slow.info["batches"], slow.info["stopped"]) == (8, "time spent")
+    assert slow.info["seconds"] > 1.0

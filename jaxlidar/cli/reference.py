@@ -1,0 +1,121 @@
+"""`jaxlidar reference`."""
+
+import importlib
+import importlib.util
+import re
+import shutil
+import types
+from importlib import metadata
+from pathlib import Path
+
+import click
+
+from jaxlidar.cli import COMMANDS, version
+
+LINK = re.compile(r"(!?)\[([^]]*)\]\(([^)#\s]*)(#[^)]*)?\)")
+# Of the web pages that are made from pages of documentation.
+PAGES = "pages"
+
+
+@click.command()
+@click.option(
+    "-o",
+    "--out",
+    type=click.Path(file_okay=False, path_type=Path),
+    default="jaxlidar-reference",
+    help="Folder, in which files of an earlier reference are replaced.",
+)
+def reference(out: Path) -> None:
+    """Build the API reference as web pages: public names by topic, and the pages of documentation.
+
+    It covers this package and those that add commands to it. Needs pdoc (pip install 'jaxlidar[docs]').
+
+    \b
+    Example:
+      jaxlidar reference -o reference
+    """
+    try:
+        from pdoc import doc, extract, render
+    except ImportError as error:
+        raise click.ClickException(f"{error.name} is missing: pip install 'jaxlidar[docs]'") from None
+    packages = ["jaxlidar", *(point.module for point in metadata.entry_points(group=COMMANDS))]
+    packages = list(dict.fromkeys(name.partition(".")[0] for name in packages))
+    modules = {name: doc.Module.from_name(name) for name in extract.walk_specs(packages) if _is_module(name)}
+    pages = find_pages(packages)
+    for name in packages:
+        modules[name].docstring += _list_of_pages(pages)
+    pictures: dict[str, Path] = {}
+    for path, module_name in pages.items():
+        modules[module_name] = doc.Module(_page_module(path, pages, pictures))
+    render.configure(docformat="markdown", footer_text=f"jaxlidar {version()}", show_source=False)
+    for name, module in modules.items():
+        web_page = out / f"{name.replace('.', '/')}.html"
+        web_page.parent.mkdir(parents=True, exist_ok=True)
+        web_page.write_text(render.html_module(module, modules), encoding="utf-8")
+    (out / "index.html").write_text(render.html_index(modules), encoding="utf-8")
+    (out / "search.js").write_text(render.search_index(modules), encoding="utf-8")
+    for name, picture in pictures.items():
+        shutil.copyfile(picture, out / PAGES / name)
+    click.echo(f"{len(modules)} web pages: {out / 'jaxlidar.html'}")
+
+
+def _is_module(name: str) -> bool:
+    """Return whether a name is that of a module for users of its package.
+
+    `jaxlidar.simulate` is not: there the function has hidden the module of the same name.
+    """
+    package, _, member = name.rpartition(".")
+    return not package or isinstance(getattr(importlib.import_module(package), member), types.ModuleType)
+
+
+def find_pages(packages: list[str]) -> dict[Path, str]:
+    """Find the README.md of each package, and every page that these link to, directly or not.
+
+    An installed package has its own pages alone; a checkout of the project has those of its examples too.
+
+    **Returns:** names of modules for pdoc by path, in the order in which pages are met.
+    """
+    specs = (importlib.util.find_spec(name) for name in packages)
+    roots = [Path(spec.origin).resolve().parent for spec in specs if spec and spec.origin]
+    queue = [root / "README.md" for root in roots if (root / "README.md").exists()]
+    pages: dict[Path, str] = {}
+    while queue:
+        page = queue.pop(0)
+        if page in pages:
+            continue
+        place = page.relative_to(roots[0].parent) if page.is_relative_to(roots[0].parent) else page
+        name = "_".join(place.parent.parts) if place.name == "README.md" else place.stem.lower()
+        pages[page] = f"{PAGES}.{name or 'front'}"
+        targets = [(page.parent / target).resolve() for _, _, target, _ in LINK.findall(page.read_text())]
+        queue += [target for target in targets if target.suffix == ".md" and target.exists()]
+    return pages
+
+
+def _title(page: Path) -> str:
+    return page.read_text().partition("\n")[0].lstrip("# ")
+
+
+def _list_of_pages(pages: dict[Path, str]) -> str:
+    links = [f"- [{_title(path)}]({name.replace('.', '/')}.html)" for path, name in pages.items()]
+    return "\n".join(["\n\n## Pages\n", *links])
+
+
+def _page_module(page: Path, pages: dict[Path, str], pictures: dict[str, Path]) -> types.ModuleType:
+    """Return a page as the docstring of a module, and add the pictures that it shows to `pictures`.
+
+    So pdoc gives pages the looks, the search and the links to functions that it gives to modules. Links to
+    other files than pages and pictures become plain text, for the files do not come with the web pages.
+    """
+
+    def web_link(match: re.Match) -> str:
+        mark, text, target, fragment = match[1], match[2], match[3], match[4] or ""
+        path = (page.parent / target).resolve() if target else page
+        if mark and path.exists():
+            name = f"{path.parent.name}_{path.name}"
+            pictures[name] = path
+            return f"![{text}]({name})"
+        if path in pages:
+            return f"[{text}]({pages[path].removeprefix(PAGES + '.')}.html{fragment})"
+        return text
+
+    return types.ModuleType(pages[page], LINK.sub(web_link, page.read_text()))
