@@ -21,9 +21,9 @@ from scipy.optimize import nnls
 import inversion
 import jaxlidar as jl
 from inversion.fit.data import SampleNoise, neighbour_correlation
+from inversion.fit.recorder_model import RecorderModel
 from inversion.fit.retrieval import scale_unknown
 from inversion.receiver.digitiser import amplitude_table
-from inversion.receiver.recorder import RecorderModel
 from jaxlidar.io import read_pulsewaves
 from jaxlidar.io.pedestal import above_pedestal
 

@@ -13,6 +13,7 @@ from inversion.fit.data import ObservedWaveform, as_observed, with_fixed_window
 from inversion.fit.fit_record import Step
 from inversion.fit.model import Model
 from inversion.fit.planning import checked_plan, trace_sizes
+from inversion.fit.recorder_model import RecorderModel, check_names
 from inversion.fit.result import Retrieval, retrieval_of
 from inversion.fit.solver import (
     DEFAULT_SOLVER,
@@ -23,7 +24,7 @@ from inversion.fit.solver import (
     run_fit,
 )
 from inversion.fit.unknowns import BoundUnknown, Setter, Unknown, bind_unknowns
-from inversion.receiver.recorder import Recorder, RecorderModel, check_names
+from inversion.receiver.recorder import Recorder
 from jaxlidar import Lidar, Plan, Scene, Waveform
 from jaxlidar.extend import check_integer, check_key, check_kind, check_kinds, check_range
 

@@ -32,6 +32,7 @@ from inversion.fit.data import ObservedWaveform, as_noise, as_numbers, as_observ
 from inversion.fit.fit_record import FitRecord, RecordSizes
 from inversion.fit.model import Evaluation, ForwardModel, Model, evaluate_scene
 from inversion.fit.planning import checked_plan, trace_sizes
+from inversion.fit.recorder_model import RecorderModel, check_names, recorder_unknowns
 from inversion.fit.result import Retrievals, retrievals_of
 from inversion.fit.retrieval import check_progress, check_solver_for, scale_unknown, solver_settings
 from inversion.fit.solver import (
@@ -43,7 +44,7 @@ from inversion.fit.solver import (
     multistart,
 )
 from inversion.fit.unknowns import BoundUnknown, Unknown, bind_unknowns, smooth_names, with_start
-from inversion.receiver.recorder import Recorder, RecorderModel, check_names, recorder_unknowns
+from inversion.receiver.recorder import Recorder
 from jaxlidar import Lidar, Plan, Scene
 from jaxlidar.extend import (
     ONE_CORE,

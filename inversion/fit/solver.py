@@ -56,6 +56,7 @@ from inversion.fit.data import (
 from inversion.fit.fit_record import CompletedFit, FitDetails, FitRecord, Step
 from inversion.fit.model import Evaluation, batch_stderr
 from inversion.fit.prior_residuals import PriorResiduals
+from inversion.fit.recorder_model import RecorderModel
 from inversion.fit.uncertainty import (
     EstimateCovariance,
     SampleIndex,
@@ -73,7 +74,6 @@ from inversion.fit.unknowns import (
     flat_start,
     split_by_name,
 )
-from inversion.receiver.recorder import RecorderModel
 
 # A fit has converged if a Gauss-Newton step would move it by less than this many standard errors.
 _SMALL_STEP = 0.05

@@ -165,9 +165,7 @@ CHANGES = [
 @pytest.mark.parametrize(("named_part", "change"), CHANGES)
 def test_another_problem_is_refused_and_what_differs_is_named(resumes, tmp_path, named_part, change):
     before = (tmp_path / "fits.sqlite").read_bytes()
-    with pytest.raises(
-        ValueError, match=rf"fits\.sqlite holds results of another .* in .*\b{named_part}"
-    ):
+    with pytest.raises(ValueError, match=rf"fits\.sqlite holds results of another .* in .*\b{named_part}"):
         resumes(**change)
     assert (tmp_path / "fits.sqlite").read_bytes() == before
 

@@ -10,6 +10,7 @@ import jaxlidar as jl
 from inversion.fit.data import ObservedWaveform
 from inversion.fit.model import PILOT_BATCHES, Evaluation, Model
 from inversion.fit.planning import TraceSizes, plan_for_bounds
+from inversion.fit.recorder_model import RecorderModel
 from inversion.fit.retrieval_many import LockstepGroups, LockstepModel, ManyFits
 from inversion.fit.solver import (
     DEFAULT_SOLVER,
@@ -19,7 +20,6 @@ from inversion.fit.solver import (
     run_fit,
 )
 from inversion.fit.unknowns import BoundUnknown, Setter, bind_unknowns
-from inversion.receiver.recorder import RecorderModel
 from jaxlidar.planning.plan import MIN_BATCHES
 from tests.inversion.fit.test_retrieval import LIDAR, UNKNOWNS, retrieve_canopy, start_scene, target  # noqa: F401
 

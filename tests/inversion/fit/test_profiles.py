@@ -22,9 +22,9 @@ from inversion.fit.fit_record import FitRecord
 from inversion.fit.model import Evaluation
 from inversion.fit.prior_residuals import PriorResiduals
 from inversion.fit.profiles import AbstractPosterior
+from inversion.fit.recorder_model import RecorderModel
 from inversion.fit.solver import DEFAULT_SOLVER, LeastSquaresFit, SolverSettings, run_fit
 from inversion.fit.unknowns import BoundUnknown, Setter, bounds_by_name, split_by_name
-from inversion.receiver.recorder import RecorderModel
 from tests.helpers import BY_PRECISION
 
 LAYERS, SAMPLES, STRENGTH = 12, 40, 0.3

@@ -7,8 +7,8 @@ import pytest
 import inversion
 import jaxlidar as jl
 from inversion import Recorder, Unknown
+from inversion.fit.recorder_model import RecorderModel
 from inversion.fit.retrieval import scale_unknown
-from inversion.receiver.recorder import RecorderModel
 
 TIME = np.arange(-40.0, 61.0)
 HEIGHT = Unknown("ground.height", bounds=(-2.0, 2.0), name="height")
