@@ -7,8 +7,8 @@ import pytest
 import inversion
 import jaxlidar as jl
 from inversion import Recorder, Unknown
-from inversion.fit.retrieval import scale_of
-from inversion.receiver.recorder import RecorderModel
+from inversion.fit.recorder_model import RecorderModel
+from inversion.fit.retrieval import scale_unknown
 
 TIME = np.arange(-40.0, 61.0)
 HEIGHT = Unknown("ground.height", bounds=(-2.0, 2.0), name="height")
@@ -138,7 +138,7 @@ def test_derivatives_are_those_of_differences():
     """In every unknown of the recorder, and through the simulated waveform."""
     random = np.random.default_rng(0)
     recorder = Recorder(width=(0.2, 5.0), impulse=[0.2, 1.0, -0.1], offset=(-1.0, 1.0), interleaved=3)
-    model = RecorderModel(recorder, [scale_of((0.1, 10.0), [])], jl.Lidar(), 50)
+    model = RecorderModel(recorder, [scale_unknown((0.1, 10.0), [])], jl.Lidar(), 50)
     # Width, three offsets and scale.
     values = np.array([1.3, 0.1, -0.2, 0.05, 2.0])
     total, scene_jacobian = random.normal(size=(2, 50)), random.normal(size=(2, 50, 1))
