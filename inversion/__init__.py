@@ -36,6 +36,7 @@
 `files`.
 """
 
+import warnings
 from typing import Any
 
 from inversion import files
@@ -65,7 +66,6 @@ from inversion.metrics.points import EchoPoints, echo_points
 from inversion.receiver.digitiser import Amplitudes, amplitudes, corrected_table
 from inversion.receiver.impulse import receiver_impulse, recorded_pulse
 from inversion.receiver.recorder import Recorder
-from jaxlidar._deprecated import warn_renamed
 from jaxlidar.extend import shorten_signatures
 
 __all__ = [
@@ -138,6 +138,9 @@ def __dir__() -> list[str]:
 
 def __getattr__(name: str) -> Any:
     if name == "Progress":
-        warn_renamed("inversion.Progress", "inversion.RetrievalProgress")
+        message = (
+            "inversion.Progress is renamed: use inversion.RetrievalProgress; the old name goes with the next"
+        )
+        warnings.warn(f"{message} version", DeprecationWarning, stacklevel=2)
         return RetrievalProgress
     raise AttributeError(f"module 'inversion' has no attribute {name!r}")

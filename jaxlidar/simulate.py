@@ -145,7 +145,7 @@ def simulate(
 
 
 class _Goal(NamedTuple):
-    """When to stop: after a number of photons, or below tolerances. `rtol` None takes the plan's."""
+    """The stopping rule: a number of photons, or tolerances. `rtol` None takes the plan's."""
 
     rtol: float | None
     atol: float

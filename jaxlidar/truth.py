@@ -11,7 +11,7 @@ with tau the optical depth.
 """
 
 import dataclasses
-from typing import NamedTuple, final
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxlidar._checks import briefly, check_kind, is_traced
+from jaxlidar._checks import check_kind, is_traced
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._programs import Program
 from jaxlidar._vectors import FAR, Scalar
@@ -38,6 +38,7 @@ from jaxlidar.spectral.apply_optics import (
     make_padded_waveform_model,
     make_waveform_model,
 )
+from jaxlidar.spectral.labels import Truth
 from jaxlidar.trace.deposit import add_rows, padded_index
 from jaxlidar.trace.device_scene import DeviceScene, build_device_scene
 from jaxlidar.trace.first_order import FootprintRays, march_rays, send_rays
@@ -50,58 +51,8 @@ TOP_INTERCEPTION = 0.01
 _RAYS_AT_ONCE = 512
 
 
-@final
-@briefly
-class Truth(eqx.Module):
-    """What a beam meets in a scene: labels for its waveform, sample by sample.
-
-    - `time`: (bins,) ns, `height`: (bins,) m, of the samples, as those of `Waveform`. Off nadir samples are
-      shells of equal range, and `height` is where these meet the beam's axis.
-    - `returns`: dict of (wavelengths, bins) apparent reflectance by material ("ground", "leaf", "bark",
-      "plate", "air"): order one, as recorded of a pulse without duration. Its sums over bins are the
-      amplitudes of layers. What returns at one instant is spread over three fine bins of the plan.
-    - `gap_probability`: (bins,) share of the beam's energy that meets no leaf, bark or plate down to the
-      lower end of each sample. Its last is that of all above the ground.
-    - `leaf_area_density`, `bark_area_density`: (bins,) m2/m3, half of the surface (which is twice the
-      extinction coefficient at G = 1/2), mean over the footprint, weighted by the beam's energy. Below the
-      ground there is none.
-    - `plant_area_index`: (bins,) m2 of leaf and bark per m2 of ground, above the lower end of each sample:
-      the sum of densities times the distance of samples in height.
-    - `top_height`: () m, the height above which plants and plates intercept 1 % of the beam's energy, to
-      within a sample; NaN where they intercept less, or do so above the record.
-    - `surface_height`, `surface_spread`: dict of () m, by surface ("ground", "plate", or "plate 1", ...):
-      mean height and standard deviation of where the beam would meet it if nothing lay above, weighted by
-      the beam's energy; NaN where it does not meet it.
-
-    Gaps are those of the geometry, whatever the wavelength and whatever leaves transmit.
-
-    **Example:** a plate that covers half of the beam, above sloping ground.
-
-    >>> import jaxlidar as jl
-    >>> scene = jl.Scene(plates=[jl.Plate(3.0, 0.4, coverage=0.5)], ground=jl.Ground(1.0, slope=10.0))
-    >>> truth = jl.truth_of(jl.Lidar(altitude=1e4, divergence=1.0), scene)
-    >>> {name: round(float(z), 2) for name, z in truth.surface_height.items()}
-    {'ground': 1.0, 'plate': 3.0}
-    >>> print(f"{float(truth.surface_spread['ground']):.2f} m")  # tan(10 degrees) of half the radius of 5 m
-    0.44 m
-    >>> print(f"{float(truth.gap_probability[-1]):.2f}")
-    0.50
-    """
-
-    time: Float[Array, "bins"]
-    height: Float[Array, "bins"]
-    returns: dict[str, Float[Array, "wavelengths bins"]]
-    gap_probability: Float[Array, "bins"]
-    leaf_area_density: Float[Array, "bins"]
-    bark_area_density: Float[Array, "bins"]
-    plant_area_index: Float[Array, "bins"]
-    top_height: Float[Array, ""]
-    surface_height: dict[str, Float[Array, ""]]
-    surface_spread: dict[str, Float[Array, ""]]
-
-
 def truth_of(lidar: Lidar, scene: Scene, *, plan: Plan | None = None) -> Truth:
-    """What the beam of `lidar` meets in `scene`, as labels for its waveform.
+    """Compute the labels of the waveform of `lidar` over `scene`, without simulating it.
 
     `simulate(..., truth=True)` and `simulate_many(..., truth=True)` give it with the waveforms.
 

@@ -12,19 +12,9 @@ import os
 import sys
 import warnings
 from collections.abc import Sequence
-from importlib import metadata
 from typing import Any
 
-COMMANDS = "jaxlidar.commands"
-SUCCESS, FAILURE, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130
-
-
-def version() -> str:
-    """Return the installed version."""
-    try:
-        return metadata.version("jaxlidar")
-    except metadata.PackageNotFoundError:
-        return "unknown (not installed)"
+from jaxlidar.cli.constants import FAILURE, INTERRUPTED, SUCCESS
 
 
 def main(argv: Sequence[str] | None = None) -> int:

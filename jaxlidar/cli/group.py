@@ -5,8 +5,8 @@ from typing import Any
 
 import click
 
-from jaxlidar.cli import COMMANDS, version
 from jaxlidar.cli.cache import compilation_cache
+from jaxlidar.cli.constants import COMMANDS, version
 from jaxlidar.cli.files import convert, info
 from jaxlidar.cli.optics import prospect, spectra
 from jaxlidar.cli.reference import reference

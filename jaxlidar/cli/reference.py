@@ -9,7 +9,7 @@ from pathlib import Path
 
 import click
 
-from jaxlidar.cli import COMMANDS, version
+from jaxlidar.cli.constants import COMMANDS, version
 
 LINK = re.compile(r"(!?)\[([^]]*)\]\(([^)#\s]*)(#[^)]*)?\)")
 # Of the web pages that are made from pages of documentation.

@@ -6,7 +6,7 @@ from pathlib import Path
 import click
 import jax
 
-from jaxlidar.cli import INTERRUPTED, SUCCESS
+from jaxlidar.cli.constants import INTERRUPTED, SUCCESS
 from jaxlidar.cli.shared import (
     CASE_ARGUMENT,
     PLOT_OPTION,

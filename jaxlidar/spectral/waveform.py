@@ -32,8 +32,8 @@ from jaxlidar.spectral.apply_optics import (
     make_waveform_model,
     total_samples,
 )
+from jaxlidar.spectral.labels import Truth
 from jaxlidar.trace.response import Response
-from jaxlidar.truth import Truth
 
 
 @final
@@ -136,7 +136,7 @@ class Waveform(eqx.Module):
         return summary(self)
 
     def _repr_html_(self) -> str | None:
-        """What notebooks show: the summary and a small figure."""
+        """Return HTML for notebooks: the summary and a small figure."""
         if any(is_traced(x) for x in (self.time, self.reflectance)):
             return None
         return waveform_html(self)
