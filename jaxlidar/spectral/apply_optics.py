@@ -329,7 +329,7 @@ class ResponseSums(NamedTuple):
 
 
 def sum_response(response: Response, model: WaveformModel) -> ResponseSums:
-    """Sum a response over bins. A material absorbs the energy that arrived there less that which left."""
+    """Sum a response over bins. A material absorbs the energy that arrived there less that which departed."""
     first_table = model.first_histories
     table = first_table if response.higher is None else model.histories
 
@@ -344,7 +344,7 @@ def sum_response(response: Response, model: WaveformModel) -> ResponseSums:
     if response.higher is not None and response.higher_outside is not None:
         rows += [jnp.sum(response.higher, axis=(1, 3)), jnp.sum(response.higher_outside, axis=1)]
     n_rows = len(rows)
-    absorbed = response.arrived - response.left
+    absorbed = response.arrived - response.departed
     materials = [absorbed[:, m] for m in range(absorbed.shape[1])]
     totals = sums([*rows, *materials], table)
     if n_rows > 3:

@@ -24,17 +24,17 @@ _COUNT_BITS = 10
 def compact(scene: DeviceScene, photons: Photons) -> tuple[Int[Array, "chunks size"], Int[Array, ""]]:
     """Return the numbers of living photons in their new order, zeros after them, and their count.
 
-    1. Give every living photon its class, and dead ones the class `N_CLASSES`. 2. Within each chunk, run a
-    cumulative count of every class, packed into one integer. 3. A photon's new position is the count of lower
-    classes, plus that of its class in earlier chunks, plus its rank
-       within the chunk.
+    1. Give every living photon its class, and dead ones the class `N_CLASSES`.
+    2. Within each chunk, run a cumulative count of every class, packed into one integer.
+    3. A photon's new position is the count of lower classes, plus that of its class in earlier chunks, plus
+       its rank within the chunk.
     4. Scatter photon numbers to their new positions; dead photons fall off the end.
     """
     alive = photons.alive
     # Optimisation barriers: these arrays would otherwise be computed again for each use.
     path_class = once(jnp.where(alive, _path_classes(scene, photons), N_CLASSES))
-    ones = jnp.where(alive, 1 << (_COUNT_BITS * path_class), 0)
-    running = once(jnp.cumsum(ones, axis=1))
+    class_bit = jnp.where(alive, 1 << (_COUNT_BITS * path_class), 0)
+    running = once(jnp.cumsum(class_bit, axis=1))
 
     def count_of(packed: Int[Array, "*s"], number: int) -> Int[Array, "*s"]:
         return (packed >> (_COUNT_BITS * number)) & ((1 << _COUNT_BITS) - 1)

@@ -69,7 +69,7 @@ class HigherOrderTally(eqx.Module):
 
     - `weights`, `outside`: returns within the bins and outside of them; with both margins while photons are
       traced.
-    - `arrived`, `left`: weight that reached each material, and that went on from it.
+    - `arrived`, `departed`: weight that reached each material, and that went on from it.
     - `escaped`, `late`, `remaining`: weight that left the scene, that could not be recorded any more, and
       that had scatterings left when the last order was reached.
     - `weight_slopes`: derivatives of the returns, where scores are asked for; else None.
@@ -78,7 +78,7 @@ class HigherOrderTally(eqx.Module):
     weights: Float[Array, "materials seen bins"]
     outside: Float[Array, "materials seen"]
     arrived: Float[Array, "materials entries"]
-    left: Float[Array, "materials entries"]
+    departed: Float[Array, "materials entries"]
     escaped: Float[Array, "entries"]
     late: Float[Array, "entries"]
     remaining: Float[Array, "entries"]
@@ -91,8 +91,8 @@ class HigherOrderTally(eqx.Module):
 
     def with_departure(self, material: Array | int, index: TallyIndex, weight: Scalar) -> "HigherOrderTally":
         """Return the tally with weight that went on from a material."""
-        left = add_to_tally(self.left, (material,), index, weight)
-        return eqx.tree_at(lambda t: t.left, self, left)
+        departed = add_to_tally(self.departed, (material,), index, weight)
+        return eqx.tree_at(lambda t: t.departed, self, departed)
 
 
 def trace_higher_orders(
@@ -200,7 +200,7 @@ def _empty_tally(scene: DeviceScene, nodes: EntryNodes | None) -> HigherOrderTal
         weights=jnp.zeros((n_materials, n_seen, bins.padded)),
         outside=jnp.zeros((n_materials, n_seen)),
         arrived=jnp.zeros((n_materials, n_entries)),
-        left=jnp.zeros((n_materials, n_entries)),
+        departed=jnp.zeros((n_materials, n_entries)),
         escaped=jnp.zeros((n_entries,)),
         late=jnp.zeros((n_entries,)),
         remaining=jnp.zeros((n_entries,)),
@@ -360,10 +360,10 @@ def _pass_plates(
     for i, transmitted in transmits.items():
         scatterer, is_transmitted = config.surfaces[i], select_end(transmitted)
         arriving_weight, arriving_index = selected_weight, selected_index
-        for j, other in transmits.items():
+        for j, other_transmitted in transmits.items():
             if j != i:
                 is_nearer = encounters.distances[j] < encounters.distances[i]
-                before = is_transmitted & select_end(other) & is_nearer
+                before = is_transmitted & select_end(other_transmitted) & is_nearer
                 arriving_weight = jnp.where(
                     before, arriving_weight / transmission_probability, arriving_weight
                 )

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxlidar._checks import briefly, check_flag, check_key, check_kind
+from jaxlidar._deprecated import renamed_property
 from jaxlidar.planning.setup import Setup
 from jaxlidar.trace.device_scene import DeviceScene, build_device_scene
 from jaxlidar.trace.first_order import FirstOrder, first_order
@@ -41,7 +42,8 @@ class Response(eqx.Module):
     - `higher`: (traces, materials, histories, bins) orders two and above, or None where they were not traced.
     - `first_outside`: (traces, materials, first histories), `higher_outside`: (traces, materials, histories)
       returns before the first bin or after the last.
-    - `arrived`, `left`: (traces, materials, histories) weight that reached each material, and that went on.
+    - `arrived`, `departed`: (traces, materials, histories) weight that reached each material, and that went
+      on from it.
     - `escaped`, `late`, `remaining`: (traces, histories) weight that left the scene, that outlasted the
       window, and that had scatterings left when the last order was reached.
 
@@ -62,10 +64,11 @@ class Response(eqx.Module):
     first_outside: Float[Array, "traces materials short"]
     higher_outside: Float[Array, "traces materials histories"] | None
     arrived: Float[Array, "traces materials histories"]
-    left: Float[Array, "traces materials histories"]
+    departed: Float[Array, "traces materials histories"]
     escaped: Float[Array, "traces histories"]
     late: Float[Array, "traces histories"]
     remaining: Float[Array, "traces histories"]
+    left = renamed_property("left", "departed")
 
 
 def trace_scene(setup: Setup, key: PRNGKeyArray, *, reverse: bool = True) -> Response:
@@ -190,7 +193,7 @@ def join_orders(first: FirstOrderResponse, higher: HigherOrderTally) -> Response
         first_outside=first.outside,
         higher_outside=higher.outside,
         arrived=higher.arrived,
-        left=higher.left,
+        departed=higher.departed,
         escaped=higher.escaped,
         late=higher.late,
         remaining=higher.remaining,
@@ -252,7 +255,7 @@ def first_order_response(
     its path.
     """
     config, table = scene.config, scene.first_histories
-    left = jnp.zeros_like(first.arrived)
+    departed = jnp.zeros_like(first.arrived)
     remaining = jnp.zeros_like(first.escaped)
     scatterers = [(s, False) for s in (config.leaf, config.bark) if s is not None]
     scatterers += [(s, surface.straight) for s, surface in zip(config.surfaces, scene.surfaces)]
@@ -266,7 +269,7 @@ def first_order_response(
             after = table.next_history[:, channel]
             # Histories of the largest degree, which have no successor, are not scattered again.
             scattered = jnp.where(after != jnp.arange(table.count), energy[scatterer.material], 0.0)
-            left = left.at[scatterer.material, after].add(scattered)
+            departed = departed.at[scatterer.material, after].add(scattered)
             # Light that goes straight through a plate was followed to what lies behind it.
             if not (is_straight and channel == scatterer.transmission):
                 remaining = remaining.at[after].add(scattered)
@@ -274,15 +277,15 @@ def first_order_response(
     lights_itself = any(surface.shape.lights_itself for surface in scene.surfaces)
     if len(scatterers) == 1 and not (config.leaf or config.bark or lights_itself):
         escaped, remaining = escaped + remaining, late
-    budget = (first.arrived, left, escaped, late, remaining)
-    arrived, left, escaped, late, remaining = (a[None] for a in budget)
+    budget = (first.arrived, departed, escaped, late, remaining)
+    arrived, departed, escaped, late, remaining = (a[None] for a in budget)
     return Response(
         first=weights[None],
         higher=None,
         first_outside=first.outside[None],
         higher_outside=None,
         arrived=arrived,
-        left=left,
+        departed=departed,
         escaped=escaped,
         late=late,
         remaining=remaining,

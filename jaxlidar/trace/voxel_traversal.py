@@ -206,7 +206,7 @@ def enter_grid(medium: Medium, x: Vec, w: Vec, box: VoxelBox | None = None) -> D
     Slab by slab: the ray is within the bounds of axis k between two distances; it is in the grid where all
     three intervals overlap.
     """
-    near, far = jnp.zeros_like(x[0]), jnp.full_like(x[0], FAR)
+    enter, leave = jnp.zeros_like(x[0]), jnp.full_like(x[0], FAR)
     gap, offset, step = [], [], []
     low, high = box if box is not None else ((0, 0, 0), tuple(medium.counts))
     for k in range(3):
@@ -222,19 +222,19 @@ def enter_grid(medium: Medium, x: Vec, w: Vec, box: VoxelBox | None = None) -> D
         lower, upper = lower + medium.size[k] * low[k], lower + medium.size[k] * high[k]
         within = (lower <= 0) & (upper >= 0)
         a, b = lower * inverse, upper * inverse
-        near = jnp.maximum(near, jnp.where(flat, jnp.where(within, 0.0, FAR), jnp.minimum(a, b)))
-        far = jnp.minimum(far, jnp.where(flat, FAR, jnp.maximum(a, b)))
-    hits = near < far
-    near, far = jnp.where(hits, near, 0.0), jnp.where(hits, far, 0.0)
+        enter = jnp.maximum(enter, jnp.where(flat, jnp.where(within, 0.0, FAR), jnp.minimum(a, b)))
+        leave = jnp.minimum(leave, jnp.where(flat, FAR, jnp.maximum(a, b)))
+    hits = enter < leave
+    enter, leave = jnp.where(hits, enter, 0.0), jnp.where(hits, leave, 0.0)
     voxel = []
     for k in range(3):
-        position = (x[k] + w[k] * near - medium.origin[k]) / medium.size[k]
+        position = (x[k] + w[k] * enter - medium.origin[k]) / medium.size[k]
         number = jnp.floor(lax.stop_gradient(position))
         if not (medium.periodic and k < 2):
             # The point of entry lies on a face, and may be rounded to the wrong side.
             number = jnp.clip(number, 0, medium.counts[k] - 1)
         voxel.append(number.astype(jnp.int32))
-    return DDAState(tuple(gap), tuple(offset), tuple(step), tuple(voxel), near, far)
+    return DDAState(tuple(gap), tuple(offset), tuple(step), tuple(voxel), enter, leave)
 
 
 def cell_index(medium: Medium, voxel: tuple[Int[Array, "*s"], ...]) -> Int[Array, "*s"]:
@@ -388,10 +388,8 @@ def march_to_depths(
         return lax.scan(block, state, None, length=-(-max_faces // STEPS_PER_CHECK))[0]
 
     distance, total_depth, _, _, crossings, depth_slopes = (march if reverse else one_function(march))(state)
-    entered, left, depth, cell = crossings
-    return DepthCrossings(
-        entered >= 0, cell, entered, left - entered, depth, distance, total_depth, depth_slopes
-    )
+    enter, leave, depth, cell = crossings
+    return DepthCrossings(enter >= 0, cell, enter, leave - enter, depth, distance, total_depth, depth_slopes)
 
 
 def column_of(medium: Medium, x: Vec) -> tuple[Int[Array, "..."], Scalar, Bool[Array, "..."]]:

@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 import inversion.demo
 import jaxlidar as jl
 from jaxlidar import cli
+from jaxlidar.cli.constants import COMMANDS
 from tests.helpers import slow_unless
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -26,8 +27,13 @@ SCENES = ROOT / "examples" / "scenes"
 @pytest.fixture(autouse=True)
 def as_installed(monkeypatch):
     """Add the commands of `inversion` as an installed package does, without a cache of compiled programs."""
-    points = [metadata.EntryPoint(n, f"inversion.commands:{n}", cli.constants.COMMANDS) for n in ("demo", "retrieve")]
-    monkeypatch.setattr(metadata, "entry_points", lambda group: points if group == cli.constants.COMMANDS else [])
+    points = [
+        metadata.EntryPoint(n, f"inversion.commands:{n}", cli.constants.COMMANDS)
+        for n in ("demo", "retrieve")
+    ]
+    monkeypatch.setattr(
+        metadata, "entry_points", lambda group: points if group == cli.constants.COMMANDS else []
+    )
     monkeypatch.setattr("jaxlidar.cli.group.compilation_cache", contextlib.nullcontext)
 
 
