@@ -27,13 +27,8 @@ SCENES = ROOT / "examples" / "scenes"
 @pytest.fixture(autouse=True)
 def as_installed(monkeypatch):
     """Add the commands of `inversion` as an installed package does, without a cache of compiled programs."""
-    points = [
-        metadata.EntryPoint(n, f"inversion.commands:{n}", cli.constants.COMMANDS)
-        for n in ("demo", "retrieve")
-    ]
-    monkeypatch.setattr(
-        metadata, "entry_points", lambda group: points if group == cli.constants.COMMANDS else []
-    )
+    points = [metadata.EntryPoint(n, f"inversion.commands:{n}", COMMANDS) for n in ("demo", "retrieve")]
+    monkeypatch.setattr(metadata, "entry_points", lambda group: points if group == COMMANDS else [])
     monkeypatch.setattr("jaxlidar.cli.group.compilation_cache", contextlib.nullcontext)
 
 
@@ -193,8 +188,8 @@ def test_compiled_programs_are_stored_unless_refused(tmp_path):
 
 def test_a_command_that_cannot_be_loaded_reports_the_reason(monkeypatch, capsys):
     points = [
-        metadata.EntryPoint("gone", "inversion.nowhere:gone", cli.constants.COMMANDS),
-        metadata.EntryPoint("number", "math:pi", cli.constants.COMMANDS),
+        metadata.EntryPoint("gone", "inversion.nowhere:gone", COMMANDS),
+        metadata.EntryPoint("number", "math:pi", COMMANDS),
     ]
     monkeypatch.setattr(metadata, "entry_points", lambda group: points)
     assert cli.main(["--help"]) == 0
