@@ -88,6 +88,8 @@ def trace_to_end(
     start_key, key = jax.random.split(key)
     x, w = source(scene, start_key, count)
     zero_history = jnp.zeros((count,), jnp.int32)
+    # Path, weight and history stay as they are: time does not matter here, and the energy is an array of its
+    # own, by wavelength.
     zero, one = jnp.zeros_like(x[0]), jnp.ones_like(x[0])
     photons = Photons(
         x=x,
@@ -104,6 +106,8 @@ def trace_to_end(
     absorbed = jnp.zeros((len(scene.config.materials), n_wavelengths), optics.dtype)
     fractions = EnergyFractions(absorbed, nothing, nothing, nothing, nothing)
     energy = jnp.ones((count, n_wavelengths), optics.dtype)
+    # A loop of unknown length: energy is followed until no photon is left, which no fixed number of orders
+    # would do. It has no reverse derivative; `energy_budget` needs none.
     start = _PhotonLoop(photons, energy, fractions, jnp.zeros((), jnp.int32))
 
     def continue_(loop: _PhotonLoop) -> Bool[Array, ""]:
@@ -113,6 +117,7 @@ def trace_to_end(
         return _trace_order(scene, optics, loop, jax.random.fold_in(key, loop.order))
 
     end = jax.lax.while_loop(continue_, step, start)
+    # Not lost silently: what the last order leaves is reported as unfollowed.
     remaining = jnp.sum(jnp.where(end.photons.alive[:, None], end.energy, 0.0), axis=0)
     unfollowed = end.fractions.unfollowed + remaining
     fractions = eqx.tree_at(lambda f: f.unfollowed, end.fractions, unfollowed)
@@ -129,12 +134,14 @@ def _trace_order(scene: DeviceScene, optics: Array, loop: _PhotonLoop, key: PRNG
     5. Multiply the energy by the optics of the sampled channel; end faint photons by Russian roulette.
     """
     config, p, energy, fractions = scene.config, loop.photons, loop.energy, loop.fractions
+    # Not zero, whose logarithm would be an infinite optical depth.
     tiny = jnp.finfo(energy.dtype).tiny
     draw_key, roulette_key = jax.random.split(key)
     shape = (PhotonDraws.dimensions(scene.n_plates, return_path=False), p.weight.size)
     uniform = jax.random.uniform(draw_key, shape, p.weight.dtype, tiny)
     draws = PhotonDraws.from_numbers(list(uniform), scene.n_plates)
     encounters = meet_surfaces(scene, p, draws.plates_ahead)
+    # Light is followed however late it would come, within the length that bounds the march.
     max_length = jnp.full_like(encounters.nearest_stop, scene.limits.max_flight)
     flights = sample_flights(scene, p, encounters.nearest_stop, max_length, draws.flight[None])
     flight = jax.tree.map(lambda a: a[0], flights)
@@ -147,8 +154,10 @@ def _trace_order(scene: DeviceScene, optics: Array, loop: _PhotonLoop, key: PRNG
         reflected = optics_at(scatterer.reflection) * albedo[:, None]
         return jnp.sum(arriving * (1.0 - reflected - optics_at(scatterer.transmission)), axis=0)
 
+    # Within the medium and in straight transmission everything that is not absorbed goes on.
     full_albedo = jnp.ones_like(p.weight)
     absorbed = fractions.absorbed
+    # Each plate needs what arrives at it, in order of distance; the product of all factors needs no order.
     energy_before = energy
     for i, surface in enumerate(scene.surfaces):
         distance, outcome = encounters.distances[i], encounters.outcomes[i]
@@ -183,9 +192,11 @@ def _trace_order(scene: DeviceScene, optics: Array, loop: _PhotonLoop, key: PRNG
         if not surface.is_plate:
             on_ground = on_ground + jnp.sum(arriving, axis=0)
 
+    # Photons that hit nothing have the channel -1, and the energy zero.
     channel = jnp.maximum(collision.channel, 0)
     energy = energy * optics[channel] * (collision.ratio * collision.onward_weight)[:, None]
     alive = flight.has_hit & (jnp.max(energy, axis=1) > 0)
+    # By the largest energy of all wavelengths: one photon carries them all, and ends for all at once.
     survival = jnp.minimum(jnp.max(energy, axis=1) / _ROULETTE_ENERGY, 1.0)
     survives = alive & (jax.random.uniform(roulette_key, survival.shape, survival.dtype) < survival)
     energy = jnp.where(survives[:, None], energy / jnp.where(survives, survival, 1.0)[:, None], 0.0)

@@ -62,6 +62,8 @@ def sample_collision(
     not_scattered = LastScattering(jnp.zeros_like(none), w, w)
     # What photons that hit nothing have; their weight is zero.
     collision = Collision(jnp.zeros_like(none), none, one, one, w, none, none, none, w, not_scattered)
+    # Every case is computed for every photon and one is selected: photons of a chunk run in lockstep, and a
+    # branch would not save anything.
     if scene.medium is not None:
         collision = select_collision(collided, _in_medium(scene, scene.medium, w, cell, draws), collision)
     for i, surface in enumerate(scene.surfaces):
@@ -75,9 +77,11 @@ def _on_surface(
     """Sample scattering by a surface: reflection by its law, or diffuse transmission by the cosine law."""
     q, scatterer, law = scene.limits.reflection_probability, scene.config.surfaces[number], surface.law
     normal = surface.lit_normal(x, w)
+    # Directions are decisions: they are drawn from detached inputs, and keep no derivative.
     held_w, held_normal = jax.tree.map(detach, (w, normal))
     out = jax.tree.map(detach, law.sample(held_w, held_normal, *draws.direction))
     ratio = jnp.ones_like(draws.choice)
+    # Drawn with the density of the law itself, what is left of BRDF over density is the albedo.
     onward_weight = surface.at_position(x, law.albedo(w, normal)) * attached_ratio(
         law.density(w, normal, out)
     )
@@ -87,10 +91,12 @@ def _on_surface(
     transmits_diffusely = scatterer.transmission >= 0 and not surface.straight
     if transmits_diffusely:
         through = draws.choice >= q
+        # Diffuse transmission is a Lambertian surface seen from behind.
         below = scale(held_normal, jnp.asarray(-1.0))
         transmitted = about(below, *draws.direction)
         out, facing = _select(through, transmitted, out), _select(through, below, facing)
         law_number = jnp.where(through, COSINE_LAW, law_number)
+        # The cosine is the density up to a constant, which an attached ratio does not see.
         transmitted_weight = attached_ratio(-dot(normal, transmitted)) / (1.0 - q)
         onward_weight = jnp.where(through, transmitted_weight, onward_weight / q)
         channel = jnp.where(through, scatterer.transmission, channel)
@@ -120,6 +126,7 @@ def _in_medium(
     if bark is None:
         assert leaf is not None
         return _on_leaf(scene, medium, leaf, w, medium.leaf_extinction(cell, w), draws.choice, draws)
+    # Leaf and bark collide independently: the probability of each is its part of the extinction.
     bark_k = medium.bark_extinction(cell)
     on_bark = _on_bark(scene, medium, bark, w, bark_k, draws)
     if leaf is None:
@@ -141,10 +148,12 @@ def _on_leaf(
     ratio, onward_weight, q = attached_ratio(k), jnp.ones_like(k), scene.limits.reflection_probability
     channel = jnp.full(k.shape, leaf.reflection, jnp.int32)
     if medium.angle_tables is None:
+        # The normal is drawn in proportion to the area that the facet shows to the light: no weight is left.
         normal = facet_normal(w, *draws.normal)
     else:
         normal, normal_weight = _leaf_normal(medium, w, *draws.normal)
         ratio = ratio * normal_weight
+    # Cosine law about the facet's lit side.
     out, facing = about(normal, *draws.direction), normal
     if leaf.transmission >= 0:
         through = choice >= q
@@ -174,6 +183,7 @@ def _by_phase(
     """Sample scattering by a phase function."""
     channel = jnp.full(k.shape, scatterer.reflection, jnp.int32)
     out = jax.tree.map(detach, phase.sample(jax.tree.map(detach, w), *draws.direction))
+    # Sampled by the phase function itself: the weight is one, with the derivative of the density.
     onward_weight = attached_ratio(phase.density(w, out))
     return _voxel_collision(scatterer, channel, attached_ratio(k), onward_weight, number, w, out, w, w)
 
@@ -217,9 +227,11 @@ def _leaf_normal(medium: Medium, w: Vec, u: Scalar, v: Scalar) -> tuple[Vec, Sca
     assert medium.leaf_angles is not None
     assert medium.angle_tables is not None
     p = medium.leaf_angles.normalised()
+    # Inverse of a distribution in steps: the class of inclination, then its middle.
     number = jnp.sum(jnp.cumsum(detach(p))[None, :-1] < u[:, None], axis=1)
     theta = (number + 0.5) * (0.5 * jnp.pi / p.size)
     normal = polar(jnp.cos(theta), 2 * jnp.pi * v)
+    # A leaf has two sides: the one that faces the light is taken.
     cosine = dot(normal, w)
     normal = _select(cosine > 0, scale(normal, jnp.asarray(-1.0)), normal)
     return normal, jnp.abs(cosine) / medium.angle_tables.projection_at(w) * attached_ratio(p[number])
@@ -247,6 +259,7 @@ def intensity_factors(
     """
     config, medium = scene.config, scene.medium
     reflected, transmitted = jnp.zeros_like(w[0]), jnp.zeros_like(w[0])
+    # Light that is transmitted straight on is no scattering: it returns from what lies behind the plate.
     transmits = [s.transmission >= 0 and not p.straight for s, p in zip(config.surfaces, scene.surfaces)]
     if medium is not None:
         cos_scattering = dot(w, v)
@@ -271,6 +284,7 @@ def intensity_factors(
             bark = front if medium.bark_phase is None else medium.bark_phase.intensity_factor(w, v)
             reflected = jnp.where(on_bark, bark, reflected)
     for i, surface in enumerate(scene.surfaces):
+        # Recomputed from the point, with its derivative: the sampled normal is detached.
         on_surface, normal = collision.surface == i, surface.lit_normal(x, w)
         cosine = dot(normal, v)
         factor = surface.law.intensity_factor(w, normal, v, scene.beam.half_angle)

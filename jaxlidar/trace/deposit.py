@@ -48,6 +48,8 @@ def smooth_bins(integrals: Float[Array, "*s n"]) -> Float[Array, "*s n+2"]:
 
 def padded_index(bins: TimeBins, number: Float[Array, "*s"], length: int) -> Int[Array, "*s"]:
     """Return the index, counting the margin, of bin `number`, from which a row of `length` bins starts."""
+    # Returns outside the record fall into the margins, where `TimeBins.trim` sums them: clipping keeps energy
+    # countable.
     start = jnp.clip(number + bins.max_span, 0, bins.padded - length)
     return start.astype(jnp.int32)
 

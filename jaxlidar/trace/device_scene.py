@@ -106,12 +106,14 @@ class DeviceScene(eqx.Module):
     def with_leaf_transmittance(self, transmittance: Float[Array, ""]) -> "DeviceScene":
         """Return the scene where leaves transmit that much straight on: extinction is scaled by (1 - T)."""
         assert self.medium is not None
+        # Light that is transmitted straight on is as if it had met no leaf.
         medium = self.medium.with_leaf_scaled(1.0 - transmittance)
         depth_above = None if self.depth_above is None else vertical_depths(medium)
         return dataclasses.replace(self, medium=medium, depth_above=depth_above, straight_transmittance=None)
 
     def longest_flight(self, p: Photons) -> Float[Array, "photons"]:
         """Return how far, m, photons may fly so that their light can still be recorded."""
+        # A flight so long that its light cannot be back in time needs no march.
         recorded = self.beam.longest_flight(p.x, p.w, self.limits.max_path - p.path)
         return jnp.minimum(recorded, self.limits.max_flight)
 
@@ -121,6 +123,7 @@ class DeviceScene(eqx.Module):
         """Return the history after one more scattering; unchanged where the channel is -1."""
         if isinstance(channel, int):
             return self.next_history[history, channel] if channel >= 0 else history
+        # Channel -1 must not index from the end of the table.
         grown = self.next_history[history, jnp.maximum(channel, 0)]
         return jnp.where(channel >= 0, grown, history)
 
@@ -133,6 +136,8 @@ class DeviceScene(eqx.Module):
         density = _density(self.laws[0], last_scattering, w)
         for number, law in enumerate(self.laws[1:], 1):
             density = jnp.where(last_scattering.law == number, _density(law, last_scattering, w), density)
+        # A reparametrised direction may lie where the law sends nothing; the floor keeps the quotient of
+        # densities finite.
         return jnp.maximum(density, 1e-6)
 
 
@@ -159,6 +164,7 @@ def geometry_arguments(
     """Return the arguments of `compiled_geometry`."""
     limits, bins = jax.tree.map(jnp.asarray, (setup.plan.limits, setup.plan.bins))
     config = setup.plan.config
+    # Orders are rounded up to sizes that programs share, which costs little time but memory for each tangent.
     if derivatives != "none":
         # Each tangent has its own tally of histories: no room for orders beyond the last.
         config = dataclasses.replace(config, degree=setup.plan.degree)
@@ -189,7 +195,10 @@ def _without_spectrum(lidar: Lidar) -> Lidar:
 def _build_geometry(
     lidar: Lidar, scene: Scene, limits: PathLimits, bins: TimeBins, config: TraceConfig
 ) -> DeviceScene:
+    # Coordinates relative to the aim point: map coordinates of millions of m would leave single precision no
+    # digits for voxels.
     aim = jnp.concatenate([lidar.position, jnp.zeros_like(lidar.position[:1])])
+    # Photons remember their law by number: a Lambertian one, the most common, is always number zero.
     laws: list[AbstractLaw | AbstractPhase] = [Lambertian()]
 
     def law_number(law: AbstractLaw | AbstractPhase | None) -> int:
@@ -230,6 +239,7 @@ def aim_at(scene: DeviceScene, lidar: Lidar, by: Float[Array, "2"]) -> DeviceSce
 
     Map and terrain are shifted, not built again: a shot costs the same over a map of any size.
     """
+    # The aim point is the origin: the scene moves against the shot.
     back = -jnp.concatenate([by, jnp.zeros_like(by[:1])])
     medium = scene.medium
     if medium is not None:

@@ -65,6 +65,7 @@ class EntryNodes(eqx.Module):
     ) -> tuple[UInt32[Array, "photons"], Photons]:
         """Send photons into the scene; also return their numbers in the lattices of later random numbers."""
         assert scene.optics is not None
+        # Lanes beyond the last photon fill up the last chunk, with the weight zero.
         photon = jnp.minimum(lane, self.n_photons - 1)
         node, fraction = self.photon_node[photon], self.photon_fraction[photon]
         number, entry = self._sample_entries(node, self.photon_rank[photon], key)
@@ -99,12 +100,16 @@ class EntryNodes(eqx.Module):
         self, node: Int[Array, "*s"], rank: Int[Array, "*s"], key: PRNGKeyArray
     ) -> tuple[UInt32[Array, "*s"], tuple[Scalar, Scalar]]:
         """Sample points of entry about nodes: one lattice per node, at random offsets."""
+        # Node n takes a stretch of the lattice that starts n strides on. The stride is random, so that the
+        # entries of two nodes are as good as independent.
         words = random_words(key, 5)
         stride = words[0] | jnp.uint32(1)
         number = rank.astype(jnp.uint32) + node.astype(jnp.uint32) * stride
         cumulative = jnp.asarray(_CUMULATIVE / _CUMULATIVE[-1], float)
         positions = jnp.asarray(_POSITIONS, float)
         uniform = shifted_lattices(words[1:], 1, 2)(number, jnp.asarray(0))
+        # Linear interpolation of the inverse distribution: exact enough, as the density is smooth over the
+        # table's steps.
         offset = [jnp.interp(u, cumulative, positions) for u in uniform]
         x, y = (self.position[node, k] + self.spacing * offset[k] for k in range(2))
         return number, (x, y)

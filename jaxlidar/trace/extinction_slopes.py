@@ -60,6 +60,7 @@ class ExtinctionSlopes(eqx.Module):
 
     def columns_at(self, cell: Int[Array, "*s"]) -> list[Int[Array, "*s"]]:
         """Return the column numbers of the slopes of voxels; empty where these are all columns in turn."""
+        # Profiles of few layers may move every voxel by every column: then no numbers are stored.
         if self.column_number is None:
             return []
         return [row.at[cell].get(mode="promise_in_bounds") for row in self.column_number]
@@ -89,6 +90,7 @@ class ExtinctionSlopes(eqx.Module):
     ) -> Float[Array, "ends columns photons"]:
         """Add a segment to derivatives of optical depths; `length`, m, of it lies before each end."""
         slopes, columns = self.slopes_at(cell, leaf_factor), self.columns_at(cell)
+        # Optimisation barrier: inside the march, fused slopes would be gathered again for every target.
         slopes, length = once((slopes, length))
         if self.column_number is None:
             return depth_slopes + jnp.stack(slopes)[None] * length[:, None]
@@ -143,6 +145,7 @@ def pack_slopes(
         return leaf, bark, None
     selected, numbers = [], jnp.arange(count, dtype=jnp.int32)[:, None]
     for _ in range(per_voxel):
+        # The lowest column that is left, voxel by voxel; all-False columns give 0.
         number = jnp.argmax(is_moved, axis=0).astype(jnp.int32)
         selected.append(number)
         is_moved = is_moved & (numbers != number[None])

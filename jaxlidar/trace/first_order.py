@@ -89,6 +89,7 @@ class PlateTransmission:
             number = jnp.full(distance.shape, history, jnp.int32)
             weight = jnp.ones_like(distance)
             for (i, _, channel), (exponent, value, if_absent) in zip(self.plates, combination):
+                # A plate behind the point of return shades nothing.
                 in_path = surface_distances[i] < distance
                 after = number
                 for _ in range(exponent if channel >= 0 else 0):
@@ -201,6 +202,7 @@ def first_order(
     next_history = table.next_history
     n_materials, slopes = len(config.materials), scene.slopes
 
+    # Materials are deposited one after the other, so that each has its own histories and intensity factor.
     def add_segments(tally, segments, per_ray):
         """Add segments to a `_FirstOrderTally`; `per_ray`: the ray of each, and its seen energy."""
         assert medium is not None
@@ -289,10 +291,13 @@ def first_order(
                 weight = hit_energy * jnp.exp(-depth_at_surfaces[i]) * factor
                 entry = scatterer.material * n_histories + history
                 arrived = _add(arrived, entry, weight)
+                # What a law does not reflect per unit reflectance is absorbed, not scattered.
                 albedo = surface.at_position(point, surface.law.albedo(w, normal))
                 scattered = _add(scattered, entry, weight * albedo)
             if mirror is None and isinstance(surface.law, AbstractMirror):
                 continue
+            # A plate may lie far above the ground, where the field of view is narrower: it is taken at the
+            # point itself.
             seen = surface.at_position(point, beam.in_view(point))
             if mirror is None:
                 seen = surface.law.intensity_factor(w, normal, back, beam.half_angle) * seen
@@ -310,6 +315,7 @@ def first_order(
                     rows = outer_rows(values, -kappa * slopes_at_surfaces[i])
                     return_slopes = add_column_rows(return_slopes, entry, first_bin, rows)
 
+        # Rays that meet the ground end there; only those that fly past it escape.
         unscattered = jnp.where(end < FAR, 0.0, energy * jnp.exp(-total_depth))
         for history, factor in one_passage.terms(table, 0, end, distances):
             escaped = _add(escaped, history, unscattered * factor)
@@ -333,6 +339,7 @@ def first_order(
         chunks = jax.vmap(chunk)(*padded)
         returned, budget, weight_slopes = jax.tree.map(lambda a: jnp.sum(a, axis=0), chunks)
     else:
+        # The loop needs zeros of the result's shape; evaluating shapes compiles nothing.
         shapes = jax.eval_shape(trace_chunk, across, energy)
         zero = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), shapes)
 

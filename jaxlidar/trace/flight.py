@@ -94,6 +94,8 @@ def meet_surfaces(scene: DeviceScene, p: Photons, draws: tuple[Scalar, ...]) -> 
             continue
         u, coverage = next(remaining_draws), jnp.broadcast_to(surface.coverage, p.weight.shape)
         is_hit = u < coverage
+        # A partial plate is a mixture: sampling gap or material gives each photon one history, and no path is
+        # split.
         outcome = jnp.where(is_hit, SCATTERED, GAP)
         if surface.straight and scene.config.surfaces[i].transmission >= 0:
             # The number that decided that the plate was hit decides between reflection and transmission, too.
@@ -101,6 +103,8 @@ def meet_surfaces(scene: DeviceScene, p: Photons, draws: tuple[Scalar, ...]) -> 
             outcome = jnp.where(transmitted, TRANSMITTED, outcome)
         outcomes.append(outcome)
         ratios.append(attached_ratio(jnp.where(is_hit, coverage, 1.0 - coverage)))
+        # A plate that lets the photon pass is no obstacle to the flight; `_pass_plates` accounts for it
+        # afterwards.
         stops.append(jnp.where(outcome == SCATTERED, distance, FAR))
     nearest_stop = jnp.full_like(p.weight, FAR)
     for stop in stops:
@@ -124,6 +128,7 @@ def sample_flights(
     3. Attach the ratio of its density: exp(-tau) times the chord.
     4. Sort out what ended the flight.
     """
+    # Nothing beyond these two can be an end: the march need not go there.
     max_distance = jnp.minimum(nearest_stop, max_length)
     to_ends = functools.partial(jnp.broadcast_to, shape=u.shape)
     if scene.medium is None:
@@ -145,17 +150,25 @@ def sample_flights(
             slopes=scene.slopes,
         )
         collided, cell, depth_slopes = crossing.crossed, crossing.cell, crossing.depth_slopes
+        # Looked up again rather than carried through the march, whose loop is the hot spot.
         k = jnp.where(collided, jax.vmap(medium.extinction, (0, None))(cell, p.w), 1.0)
         chord = jnp.where(collided, crossing.chord, 1.0)
         # Guards against 0/0 where a voxel is empty or the chord zero.
         fraction = jnp.clip((target - crossing.depth) / jnp.maximum(k * chord, 1e-30), 0.0, 1.0)
+        # Held fixed as a fraction, the point stays within its voxel when voxels move or grow.
         fraction = detach(jnp.where(collided, fraction, 0.0))
         depth = jnp.where(collided, crossing.depth + fraction * k * chord, to_ends(crossing.total_depth))
         distance = jnp.where(collided, crossing.entered + fraction * chord, to_ends(max_distance))
+        # The density per m is k exp(-tau), and the point moves with its chord: exp(-tau) and the chord are
+        # attached here, k with the material that is hit.
         ratio = jnp.exp(detach(depth) - depth) * chord / detach(chord)
+        # Exactly one: rounding of the quotient would make waveforms depend on whether derivatives are taken.
         ratio = with_derivative_of(jnp.ones_like(ratio), ratio)
+        # The march may also end at the box of occupied voxels, behind which there is nothing.
         stopped_in_medium = ~collided & to_ends(crossing.distance >= max_length)
     alive = to_ends(p.alive)
+    # Compared with `max_length`, not with the distance flown: a surface that lies just beyond it would be
+    # recorded too late.
     landed = alive & ~collided & to_ends(nearest_stop < max_length)
     collided = alive & collided
     hits_nothing = alive & ~collided & ~landed

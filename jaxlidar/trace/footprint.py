@@ -66,6 +66,7 @@ class Beam(eqx.Module):
             # footprint.
             return dot(point, self.axis) + 0.25 * self.radius**2 / self.slant_range
         r = self.slant_range
+        # |x + R a|^2 = R^2 (1 + q / R): the leading R is taken out before the root.
         x = 2.0 * dot(point, self.axis) + dot(point, point) / r
         return x / (1.0 + jnp.sqrt(jnp.maximum(1.0 + x / r, 1e-12)))
 
@@ -86,6 +87,8 @@ class Beam(eqx.Module):
             # The divisor is near zero only for light that flies back to the sensor, which may fly on.
             flight = (max_path - out) / jnp.maximum(1.0 + dot(self.axis, w), 1e-9)
             return jnp.where(max_path < out, 0.0, jnp.minimum(flight, FAR))
+        # An ellipse in polar form about the focus `x`; where the divisor is not positive, the flight never
+        # leaves it.
         divisor = r * (1.0 + dot(self.axis, w)) + max_path + dot(x, w)
         flight = 0.5 * (max_path - out) * (2.0 * r + max_path + out) / jnp.where(divisor > 0, divisor, 1.0)
         return jnp.where(max_path < out, 0.0, jnp.where(divisor > 0, jnp.minimum(flight, FAR), FAR))
@@ -138,6 +141,7 @@ def disc(radius: Scalar, turn: Scalar) -> tuple[Scalar, Scalar]:
 
 def across_beam(beam: Beam, energy_fraction: Scalar, turn: Scalar) -> tuple[Scalar, Scalar]:
     """Return the point across the beam, m, whose circle encloses `energy_fraction`."""
+    # All of a Gaussian beam's energy is within an infinite circle.
     enclosed = jnp.clip(energy_fraction, 0.0, 1.0 - 1e-7)
     return disc(beam.radius * jnp.sqrt(-0.5 * jnp.log1p(-enclosed) if beam.gaussian else enclosed), turn)
 

@@ -110,13 +110,16 @@ def trace_higher_orders(
     config, bins, slopes = scene.config, scene.bins, scene.slopes
     n_photons = config.n_photons if nodes is None else nodes.n_photons
     dimensions = PhotonDraws.dimensions(scene.n_plates)
-    # The first two words shift the footprint of order one (`jaxlidar.trace.response`), from the same key.
+    # The first two words shift the footprint of order one (`jaxlidar.trace.response`) from the same key. The
+    # next two shift the disc from which photons start, and every order and dimension takes a step and a
+    # shift.
     words = random_words(key, 4 + 2 * config.order_steps * dimensions)[2:]
     footprint_shift = to_unit(words[:2])
     lattices = shifted_lattices(words[2:], config.order_steps, dimensions)
     node_key = None if nodes is None else jax.random.split(key)[0]
     chunk_size = min(PHOTONS_PER_CHUNK, n_photons)
     n_chunks = -(-n_photons // chunk_size)
+    # Groups are made equally large, so that the last one is not mostly padding.
     n_groups = -(-n_chunks * chunk_size // (CHUNKS_PER_GROUP * PHOTONS_PER_CHUNK))
     chunks_per_group = -(-n_chunks // n_groups)
 
@@ -126,13 +129,18 @@ def trace_higher_orders(
             return nodes.send_photons(scene, lane, node_key)
         return lane, _send_photons(scene, lane, footprint_shift)
 
+    # A group is a loop body, so that memory for photons does not grow with the batch.
     def trace_group(total: HigherOrderTally, group: UInt32[Array, ""]):
         first = group * (chunks_per_group * chunk_size)
         lane = first + jnp.arange(chunks_per_group * chunk_size, dtype=jnp.uint32)
 
         def one_order(carry, order):
             photons, tally = carry
+            # Late orders have few photons left, and their paths differ in length: sorted, whole chunks are
+            # dead or end together, and can be skipped.
             source, n_living = compact(scene, photons[1])
+            # Photons are gathered chunk by chunk, in their new order: a sort of the whole state would copy
+            # all of it through memory.
             flat = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), photons)
 
             def gather(chunk):
@@ -182,6 +190,7 @@ def trace_higher_orders(
     tally, _ = lax.scan(trace_group, empty, jnp.arange(n_groups, dtype=jnp.uint32))
     if slopes is not None:
         assert tally.weight_slopes is not None
+        # Derivatives outside the record have no use, unlike the energy there, which `trim` sums up.
         inside = tally.weight_slopes[bins.max_span : bins.max_span + bins.count]
         tally = eqx.tree_at(lambda t: t.weight_slopes, tally, inside)
     return eqx.tree_at(lambda t: (t.weights, t.outside), tally, bins.trim(tally.weights))
@@ -194,6 +203,7 @@ def _empty_tally(scene: DeviceScene, nodes: EntryNodes | None) -> HigherOrderTal
         n_entries = scene.histories.count
     else:
         n_entries = n_wavelengths * (1 if nodes is None else len(nodes.position))
+    # What is recorded is tallied by shot; what no receiver sees (absorption, escape) by node.
     n_seen = n_entries if scene.shot_views is None else n_wavelengths * scene.shot_views.n_shots
     n_materials, bins, slopes = len(scene.config.materials), scene.bins, scene.slopes
     return HigherOrderTally(
@@ -214,6 +224,7 @@ def _send_photons(scene: DeviceScene, lane: UInt32[Array, "photons"], shift: Flo
     """Send photons from the sensor, on a Fibonacci disc over the footprint that `shift` moves at random."""
     n_photons, slopes = scene.config.n_photons, scene.slopes
     n_wavelengths = 0 if scene.optics is None else scene.optics.shape[1]
+    # Stratified in enclosed energy: every ring of equal energy gets one photon.
     fraction = (lane.astype(float) + shift[0]) / n_photons
     # Turns by the golden angle, in 32-bit integers: floats would lose the fraction of large numbers.
     turn = (lane * jnp.uint32(GOLDEN * 2**32)).astype(float) * 2.0**-32 + shift[1]
@@ -224,6 +235,8 @@ def _send_photons(scene: DeviceScene, lane: UInt32[Array, "photons"], shift: Flo
         across, ratio = rays_with_terrain(scene, across)
         energy = energy * ratio
     point, w, excess = scene.beam.ray(across)
+    # Photons start at a plane above everything in the scene, not at the sensor: positions stay small enough
+    # for single precision.
     to_start = jnp.asarray(-scene.limits.start_distance, excess.dtype)
     return Photons(
         x=along(point, w, to_start),
@@ -244,9 +257,9 @@ def _trace_order(
 ) -> tuple[Photons, HigherOrderTally]:
     """Trace a chunk of photons through one order of scattering: fly, collide, deposit, scatter.
 
-    1. Find the surfaces ahead, and sample which plates will stop the photon or let it pass. 2. Sample the
-    ends of the flight, one in each stratum of the probability of collision; one of them is where the
-       photon goes on from.
+    1. Find the surfaces ahead, and sample which plates will stop the photon or let it pass.
+    2. Sample the ends of the flight, one in each stratum of the probability of collision. The photon goes on
+       from one of them.
     3. Apply the plates that the flight passes to weights and histories.
     4. Deposit the return of every end, except at order one, which `jaxlidar.trace.first_order` deposits.
     5. Tally light that escapes or would come after the record.
@@ -255,6 +268,8 @@ def _trace_order(
     ends = scene.config.deposits_per_flight
     encounters = meet_surfaces(scene, p, draws.plates_ahead)
     max_length = detach(scene.longest_flight(p))
+    # Directions from a surface to a height field are reparametrised, so that landings move with the grid: only
+    # so is the derivative complete where a landing may change from facet to facet.
     if moves_landings(scene):
         heading = (order > 0) & (encounters.nearest_stop < max_length)
         w, nearest_stop, ratio = landings_with_grids(scene, p, encounters, heading)
@@ -272,12 +287,14 @@ def _trace_order(
     p, draws, flights, stops = once((p, draws, flights, stops))
     encounters = dataclasses.replace(encounters, stops=stops[0], nearest_stop=stops[1])
 
+    # All arrays by end have ends along their first axis; each photon goes on from its own selected one.
     def select_end(a: Array) -> Array:
         number = selected.astype(jnp.int32).reshape((1,) * (a.ndim - 1) + selected.shape)
         return jnp.take_along_axis(a, number, 0, mode="promise_in_bounds")[0]
 
     to_ends = functools.partial(jnp.broadcast_to, shape=strata.shape)
     weight, index = to_ends(p.weight) * flights.ratio, jax.tree.map(to_ends, TallyIndex.of(p))
+    # Before deposits: these carry the history with the plates that their flight has passed.
     weight, index, tally = _pass_plates(scene, p, flights, encounters, weight, index, select_end, tally)
 
     # The first order is deterministic and has been deposited.
@@ -288,6 +305,8 @@ def _trace_order(
         tally,
     )
 
+    # The selected end is distributed as the end of a flight with one uniform number: to go on from it needs
+    # no weight.
     flight, weight, index = jax.tree.map(select_end, (flights, weight, index))
     escaped = add_to_tally(tally.escaped, (), index, jnp.where(flight.escaped, weight, 0.0))
     late = add_to_tally(tally.late, (), index, jnp.where(flight.late, weight, 0.0))
@@ -295,16 +314,21 @@ def _trace_order(
 
     flown = jnp.where(flight.has_hit, flight.distance, 0.0)
     x = along(p.x, p.w, flown)
+    # The collision is sampled again for the selected end: taking it from the deposits would keep the onward
+    # directions of all ends alive.
     landed = flight.landed_on(encounters)
     collision = sample_collision(scene, x, p.w, flight.cell, flight.collided, landed, draws)
     weight = jnp.where(flight.has_hit, weight, 0.0)
     tally = tally.with_arrival(collision.material, index, weight)
     index = index.after(scene, collision.channel)
+    # `ratio` belongs to the collision, `onward_weight` to the direction onward: deposits take the first
+    # alone.
     weight = weight * collision.ratio * collision.onward_weight
     tally = tally.with_departure(collision.material, index, weight)
     score = None
     if p.score is not None:
         assert flight.depth_slopes is not None
+        # The score grows by the collision and falls by the depth flown (`jaxlidar.trace.score_functions`).
         gain = collision_score(scene, flight.cell, flight.collided, collision)
         score = p.score - flight.depth_slopes.T + gain
     onward = Photons(
@@ -336,10 +360,10 @@ def _pass_plates(
     """Apply the plates that flights pass, by a gap or straight through, to weights and histories.
 
     1. Every plate that was passed, or is landed on, multiplies the weight by the ratio of its sampled
-    outcome. 2. Transmission divides the weight by its probability, and adds the plate's channel to the
-    history. 3. For the energy budget, weight arrives at a plate with the history that it has there. The
-    product of optics does
-       not depend on the order of plates, but what arrives at each does: plates that lie nearer come first.
+       outcome.
+    2. Transmission divides the weight by its probability, and adds the plate's channel to the history.
+    3. For the energy budget, weight arrives at a plate with the history that it has there. The product of
+       optics does not depend on the order of plates, but what arrives at each does: nearer plates come first.
     """
     config, limits = scene.config, scene.limits
     to_ends = functools.partial(jnp.broadcast_to, shape=weight.shape)
@@ -348,13 +372,17 @@ def _pass_plates(
         if not surface.is_plate:
             continue
         distance, outcome = encounters.distances[i], encounters.outcomes[i]
+        # A plate at which the photon stops is an end, not a passage.
         is_stop = to_ends(encounters.stops[i]) <= flights.distance
         is_ahead = to_ends(p.alive & (distance < FAR))
         passed = is_ahead & ((to_ends(distance) < flights.distance) | ~flights.has_hit) & ~is_stop
         ratio = encounters.ratios[i]
         assert ratio is not None
+        # The ratio of the outcome belongs to passed plates and to the plate that was hit; plates behind the
+        # end were not met.
         weight = weight * jnp.where(passed | (flights.landed & is_stop), to_ends(ratio), 1.0)
         transmits[i] = passed & to_ends(outcome == TRANSMITTED)
+    # The budget follows the selected end alone: it is the photon; other ends are estimates of what returns.
     selected_weight, selected_index = select_end(weight), jax.tree.map(select_end, index)
     transmission_probability = 1.0 - limits.reflection_probability
     for i, transmitted in transmits.items():
@@ -407,6 +435,7 @@ def _deposit_flights(
     x = along(p.x, p.w, flown)
     landed = flights.landed_on(encounters)
     collision = sample_collision(scene, x, p.w, flights.cell, flights.collided, landed, draws)
+    # Each end stands for its stratum: an equal share of the probability.
     value = jnp.where(flights.has_hit, flatten(weight), 0.0) * collision.ratio / ends
     if score is not None:
         score = score + collision_score(scene, flights.cell, flights.collided, collision)
@@ -449,11 +478,14 @@ def _deposit_collisions(
     beam, bins = scene.beam, scene.bins
     v = beam.view(x)
     reflected, transmitted = intensity_factors(scene, x, w, v, collision)
+    # The return path is not sampled: its transmittance is computed, which is what makes the deposit an
+    # expectation.
     transmittance, score = _return_transmittance(scene, x, v, weight, score)
     transmittance, index = _return_through_surfaces(scene, x, v, collision, plate_draws, transmittance, index)
     out = beam.excess(x)
     time = (path + out) / SPEED_OF_LIGHT
-    # Apparent reflectance refers to the range that the time of arrival stands for.
+    # Apparent reflectance refers to the range that the time of arrival stands for: light of a long path is
+    # recorded at a longer range than that from which it came.
     range_factor = ((beam.slant_range + 0.5 * (path + out)) / (beam.slant_range + out)) ** 2
     value = weight * transmittance * range_factor * beam.in_view(x)
     channel_factors = [(collision.reflection, reflected)]
@@ -465,6 +497,7 @@ def _deposit_collisions(
         # One row for each shot that may see the path.
         shots, seen, delay = once(scene.shot_views.seen_by_shots(beam.axis, index.entry, x))
         time, value, material = time[:, None] + delay, value[:, None] * seen, material[:, None]
+    # One row serves all channels and wavelengths, which differ by factors alone.
     first_bin, row = once(bspline_row(bins, time, value))
     n_entries = tally.weights.shape[1]
     weights = tally.weights.reshape(-1, bins.padded)
@@ -504,6 +537,7 @@ def _return_transmittance(
         if score is not None:
             score = score - vertical_depth_slopes(scene, medium, x)
         return transmittance, score
+    # Without targets the march follows rays to where they leave the grid.
     no_targets, to_end = jnp.zeros((0, weight.size)), jnp.full_like(weight, FAR)
     return_path = march_to_depths(
         medium,
@@ -539,6 +573,7 @@ def _return_through_surfaces(
     draws = iter(plate_draws)
     for i, (surface, scatterer) in enumerate(zip(scene.surfaces, scene.config.surfaces)):
         if not surface.is_plate:
+            # Only a height field can lie in the way of its own return; a plane never does.
             if surface.shape.lights_itself and not scene.beam.parallel:
                 transmittance = jnp.where(surface.distance(x, v) < FAR, 0.0, transmittance)
             continue

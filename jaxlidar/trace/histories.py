@@ -74,6 +74,7 @@ def histories(n_channels: int, degree: int) -> Histories:
     if n_channels == 0:
         rows = [[]]
     exponents = np.array(rows, dtype=np.int32).reshape(len(rows), n_channels)
+    # Cached and built on the host: tables are constants of compiled programs.
     number = {tuple(row): i for i, row in enumerate(exponents.tolist())}
     next_history = np.empty_like(exponents)
     for i, row in enumerate(exponents.tolist()):

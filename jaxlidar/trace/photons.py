@@ -115,5 +115,7 @@ def attached_ratio(density: Scalar) -> Scalar:
     Without derivative where the density is zero: such outcomes are never drawn.
     """
     held = detach(density)
+    # Inside both branches the quotient must be finite: the derivative of `where` multiplies the unused one by
+    # zero, and zero times infinity is NaN.
     safe = jnp.where(held == 0, 1.0, held)
     return with_derivative_of(jnp.ones_like(held), jnp.where(held == 0, 1.0, density / safe))

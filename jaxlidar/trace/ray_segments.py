@@ -58,6 +58,7 @@ def _decay(x: Scalar) -> tuple[Scalar, Scalar]:
     """exp(-x) and (1 - exp(-x)) / x, the latter for small x as exp(-x/2) sinh(x/2) / (x/2), by its series."""
     small = x < 1.0
     square = 0.25 * x * x
+    # The direct formula loses all digits near zero, and its derivative more.
     series = jnp.ones_like(x)
     # So many terms are exact to the last digit at x = 1.
     for n in range(3 if jnp.finfo(x.dtype).bits == 32 else 7, 0, -1):
@@ -81,6 +82,7 @@ def march_ray(
     **Returns:** the segments; the optical depth at each of `stops`, which are distances along the ray; and
     that at its end. Segments after the end have no length.
     """
+    # No target depth stops these rays, unlike photons: the first order needs every voxel on the way.
     ray = enter_grid(medium, x, w)
     end = minimum(end, ray.leave)
 
@@ -121,6 +123,7 @@ def integrate_over_bins(
     """
     bin_length = 0.5 * SPEED_OF_LIGHT * bins.width
     end_position = start_position + segments.length / bin_length
+    # Bin n covers positions n - 1/2 to n + 1/2.
     first_number = jnp.round(lax.stop_gradient(start_position))
     # Rows of an even length are added faster; a piece beyond the end is zero.
     count = bins.max_span - 2 + bins.max_span % 2

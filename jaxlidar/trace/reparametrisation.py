@@ -56,9 +56,10 @@ def landings_with_grids(
     with the fraction `fade` of the motion at a fixed direction: none at the faces of a column or a cell, and
     nearly all for rays shorter than the distance to the next face. The steps:
 
-    1. The landing point at a fixed direction, and the tangent plane there. 2. The landing point held fixed in
-    its column, and the ratio of the density of its direction, per area. 3. The blend of both motions, and its
-    Jacobian determinant: 1 + (1 - fade) (ratio - 1) + grad(fade) . difference.
+    1. The landing point at a fixed direction, and the tangent plane there.
+    2. The landing point held fixed in its column, and the ratio of the density of its direction, per area.
+    3. The blend of both motions, and its Jacobian determinant: 1 + (1 - fade) (ratio - 1) + grad(fade) .
+       difference.
 
     **Arguments:** `heading`: True for photons on their way to a surface.
 

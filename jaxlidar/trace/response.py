@@ -123,6 +123,7 @@ def trace_with_scores(
     """
     first, weights = _first(scene, key)
     assert first.weight_slopes is not None
+    # Derivatives of all materials together: Jacobians are of the recorded sum.
     derivatives = jnp.einsum("hw,mhbc->bcw", scene.first_histories.monomials(optics), first.weight_slopes)
     if not scene.config.follows_higher_orders:
         return first_order_response(scene, first, weights), jnp.moveaxis(derivatives, 0, 2)
@@ -241,6 +242,8 @@ def footprint_rays(
     """Return the positions of the footprint's rays across the beam, and their fractions of its energy."""
     if scene.config.smooth_footprint:
         return product_rule(scene.beam)
+    # Shifted at random, rays are an unbiased sample of the footprint; not shifted, they are the same for every
+    # key.
     random = scene.config.random_footprint
     shift = to_unit(random_words(key, 2)) if random else jnp.asarray([0.5, 0.0])
     return fibonacci_disc(scene.beam, scene.config.n_rays, shift, ray_slice)

@@ -45,12 +45,14 @@ def collision_score(
     medium, config, slopes = scene.medium, scene.config, scene.slopes
     assert medium is not None
     assert slopes is not None
+    # Collisions with surfaces do not depend on extinction.
     in_voxel = collided & (collision.surface < 0)
     by_material = []
     for table, scatterer in ((medium.leaf, config.leaf), (medium.bark, config.bark)):
         if table is None or scatterer is None:
             by_material.append(None)
             continue
+        # Detached: a score is the first derivative itself, and is not differentiated again.
         by_material.append((in_voxel & (collision.material == scatterer.material), detach(table)))
     return slopes.log_extinction_slopes(cell, *by_material)
 
@@ -62,6 +64,7 @@ def vertical_depth_slopes(scene: DeviceScene, medium: Medium, x: Vec) -> Float[A
     assert slopes.depth_above is not None
     cell, above, inside = detach(column_of(medium, x))
     up = (jnp.zeros_like(above), jnp.zeros_like(above), jnp.ones_like(above))
+    # The part of its own voxel that lies above the point; voxels above that are in the table.
     length = jnp.where(inside, above * detach(medium.size[2]), 0.0)
     in_voxel = [slope * length for slope in slopes.slopes_at(cell, medium.projection_factor(up))]
     in_voxel = slopes.to_columns(slopes.columns_at(cell), in_voxel, axis=-1)
@@ -85,6 +88,8 @@ def add_scored_returns(
     """
     slopes = scene.slopes
     assert slopes is not None
+    # Optics are applied here, because derivatives by history, wavelength and column would not fit into
+    # memory.
     returned = jnp.zeros((first_bin.size, slopes.history_optics.shape[1]), row.dtype)
     for channel, factor in channel_factors:
         factor = jnp.where(channel >= 0, factor, 0.0)
@@ -93,6 +98,7 @@ def add_scored_returns(
             mode="promise_in_bounds"
         )
     scored = score[:, :, None] * detach(returned)[:, None, :]
+    # All columns and wavelengths of a bin lie side by side, so that a deposit is one contiguous run.
     rows = outer_rows(detach(row), scored.reshape(first_bin.size, -1))
     flat = tally.reshape(1, len(tally), -1)
     return add_column_rows(flat, jnp.zeros_like(first_bin), first_bin, rows)[0].reshape(tally.shape)
@@ -117,8 +123,11 @@ def with_depth_slopes(
     medium, slopes = scene.medium, scene.slopes
     assert medium is not None
     assert slopes is not None
+    # Directions are fixed: only k depends on the unknowns.
     leaf_factor = detach(medium.projection_factor(w))
 
+    # Along the ray, because the depth before a segment is a running sum. The slopes at stops are those of the
+    # segment in which each stop lies.
     def step(carry, segment):
         before, at_stops = carry
         start, length, cell = segment
@@ -160,15 +169,18 @@ def segment_derivatives(
         return integrate_over_bins(bins, start_position, at_k, kappa)[1]
 
     k = segments.extinction
+    # One tangent gives dI/dk for all columns: they act on the integral through the k of the voxel alone.
     pieces, d_pieces_dk = jax.jvp(integrals, (k,), (jnp.ones_like(k),))
     columns = slopes.columns_at(segments.cell)
     slope = slopes.to_columns(columns, slopes.slopes_at(segments.cell, leaf_factor), axis=-1)
+    # k_m is the extinction of the returning material, k that of both: leaf may move while bark returns.
     material_slopes = slopes.of_material(is_leaf)
     if material_slopes is None:
         material_slope = jnp.zeros_like(slope)
     else:
         rows = material_slopes.slopes_at(segments.cell, leaf_factor)
         material_slope = material_slopes.to_columns(columns, rows, axis=-1)
+    # Both terms of the module's equation: the one at fixed I, and that through dI/dk.
     at_fixed_integral = value[:, None] * (material_slope - (kappa * extinction)[:, None] * depth_slopes)
     return outer_rows(pieces.T, at_fixed_integral) + outer_rows(
         d_pieces_dk.T, (value * extinction)[:, None] * slope
@@ -191,6 +203,7 @@ def make_slopes(
     leaf, bark, column_number = pack_slopes(leaf, bark, per_voxel)
     history_optics = scene.histories.monomials(optics)
     slopes = ExtinctionSlopes(leaf, bark, column_number, None, history_optics, count=count)
+    # Off nadir, return paths are marched, and sum their own slopes.
     if scene.depth_above is None:
         return slopes
     return dataclasses.replace(slopes, depth_above=_vertical_slopes(medium, slopes))
@@ -208,5 +221,6 @@ def _vertical_slopes(medium: Medium, slopes: ExtinctionSlopes) -> Float[Array, "
         return above + slopes.to_columns(slopes.columns_at(cell), in_layer, axis=-1), above
 
     zero = jnp.zeros((nx * ny, slopes.count), medium.size.dtype)
+    # From the top down, each layer before its own slope is added: the table is for upper faces.
     _, above = jax.lax.scan(layer, zero, cells, reverse=True)
     return jnp.swapaxes(above, 0, 1).reshape(-1, slopes.count)

@@ -40,11 +40,13 @@ def trace_nodes(scene: DeviceScene, nodes: EntryNodes, key: PRNGKeyArray) -> Res
     ) -> FirstOrder:
         return first_order(scene, (x, y), jnp.broadcast_to(fraction, x.shape))
 
+    # Rays of one node are few; groups of equal size let one program trace the rays of all nodes.
     groups = jax.vmap(trace_group)(*nodes.ray_entries(ray_key), nodes.group_fraction)
     first = jax.tree.map(lambda a: jax.ops.segment_sum(a, nodes.group_node, n_nodes), groups)
     if not scene.config.follows_higher_orders:
         response = jax.vmap(lambda f: first_order_response(scene, f, f.weights))(first)
         return _apply_optics_to_first(response, scene)
+    # Order one has few histories, and keeps them until here; photons had optics applied on the way.
     table, optics = scene.first_histories, scene.optics
     n_wavelengths = optics.shape[1]
     higher = trace_higher_orders(scene, photon_key, nodes)
@@ -111,12 +113,15 @@ def trace_shots(scene: DeviceScene, lidar: Lidar, nodes: EntryNodes, key: PRNGKe
     higher = trace_higher_orders(scene, photon_key, nodes)
     n_shots, n_wavelengths = views.n_shots, optics.shape[1]
 
+    # Order one is traced with the group of nodes that owns the shot, once; to other groups it adds zero.
     def to_all_shots(a: Array) -> Array:
         return jnp.zeros((n_shots, *a.shape[1:]), a.dtype).at[views.first_order_shots].set(a)
 
     def by_shot(a: Array) -> Array:
         return jnp.moveaxis(a.reshape(len(a), n_shots, n_wavelengths, *a.shape[2:]), (1, 2), (0, 1))
 
+    # The budget was tallied by node. To shots it goes by the splines' coefficients, with the grid's error,
+    # which is tolerable for what no receiver records.
     def from_nodes(a: Array) -> Array:
         by_node = a.reshape(*a.shape[:-1], -1, n_wavelengths)
         return jnp.einsum("sn,...nw->sw...", views.node_coefficients, by_node)[..., None]
@@ -145,6 +150,8 @@ def trace_first_of_shots(
     assert views is not None
 
     def trace_shot(number: Array) -> FirstOrderResponse:
+        # The first order depends on the shot's own divergent rays: a narrow beam through a coarse map would
+        # show the difference.
         shot_scene = aim_at(dataclasses.replace(scene, shot_views=None), lidar, views.position[number])
         return trace_first(shot_scene, jax.random.fold_in(key, number))
 

@@ -66,12 +66,17 @@ class ShotViews(eqx.Module):
         Paths enter at `entry` of the reference plane and end at `x`, m from the aim point. The delay is
         relative to a shot whose axis goes through the entry.
         """
+        # The end is projected along the axis onto the reference plane, where positions of shots are known.
         end = x[0] - x[2] * (axis[0] / axis[2]), x[1] - x[2] * (axis[1] / axis[2])
+        # Cells of entries or of ends, whichever leaves fewer candidates: a path is seen by few shots of a
+        # survey.
         shots = self._candidates_at(end if self.by_path_end else entry)
         shot_x, shot_y = (self.position[:, i].at[shots].get(mode="promise_in_bounds") for i in range(2))
         advance, squared_distance = _beam_coordinates(
             axis, (entry[0][:, None] - shot_x, entry[1][:, None] - shot_y)
         )
+        # Entries have the density p = 1/area on the reference plane, which is tilted against the beam: hence
+        # the cosine, -axis[2].
         fraction = self._irradiance(squared_distance) * (self.area * -axis[2])
         if self.view_radius is not None:
             _, squared_distance = _beam_coordinates(
@@ -82,6 +87,8 @@ class ShotViews(eqx.Module):
 
     def _candidates_at(self, point: PlanePoint) -> Int[Array, "photons candidates"]:
         nx, ny, n_candidates = self.candidates.shape
+        # Paths that enter or end outside the grid take the cell at its edge; their irradiance or view factor
+        # is zero anyway.
         i, j = (
             jnp.clip((a - low) / self.cell_size, 0.0, n - 1.0).astype(jnp.int32)
             for a, low, n in zip(point, self.cell_origin, (nx, ny))
@@ -92,11 +99,13 @@ class ShotViews(eqx.Module):
         """Fraction of the energy per m2 across the beam, at the squared distance from the axis."""
         w2 = self.radius**2
         if self.gaussian:
+            # Capped before the exponential underflows to a denormal, which processors are slow at.
             return 2.0 / (np.pi * w2) * jnp.exp(-jnp.minimum(2.0 / w2 * squared_distance, 80.0))
         return jnp.where(squared_distance <= w2, 1.0 / (np.pi * w2), 0.0)
 
 
 def _beam_coordinates(axis: Vec, offset: PlanePoint) -> tuple[Scalar, Scalar]:
     """Return how far points of the reference plane lie along the axis, and their squared distance from it."""
+    # Shots with parallel axes lie at different ranges of a common wave front: the advance is the delay.
     advance = offset[0] * axis[0] + offset[1] * axis[1]
     return advance, jnp.maximum(offset[0] ** 2 + offset[1] ** 2 - advance**2, 0.0)

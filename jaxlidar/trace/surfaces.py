@@ -46,12 +46,15 @@ class TracedSurface(eqx.Module):
         s = self.shape.distance(x, w)
         if self.is_plate:
             return s
+        # Ground seen from below is no ground: a ray that starts under the terrain by rounding must not end
+        # there.
         normal, _ = self.shape.tangent(along(x, w, jnp.where(s < FAR, s, 0.0)))
         return jnp.where(dot(normal, w) < 0, s, FAR)
 
     def lit_normal(self, x: Vec, w: Vec) -> Vec:
         """Normal, at the point `x`, of the side that light travelling along `w` falls on."""
         normal, _ = self.shape.tangent(x)
+        # Plates are lit from either side; the normal is turned against the light.
         sign = jnp.where(dot(normal, w) > 0, -1.0, 1.0)
         return scale(normal, sign)
 

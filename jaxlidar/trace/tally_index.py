@@ -39,6 +39,7 @@ class TallyIndex(eqx.Module):
         """Return the index after one more scattering; unchanged where the channel is -1."""
         if scene.optics is None:
             return TallyIndex(scene.history_after(self.number, channel), (), self.entry)
+        # A channel that is known when the program is compiled needs no look-up, and -1 no operation.
         if isinstance(channel, int):
             if channel < 0:
                 return self
@@ -51,6 +52,7 @@ class TallyIndex(eqx.Module):
     ) -> "TallyIndex":
         """Return the index after one more scattering where `where` holds."""
         after = self.after(scene, channel)
+        # With optics applied the number is that of the entry node, which scattering does not change.
         number = self.number if scene.optics is not None else jnp.where(where, after.number, self.number)
         weights = tuple(
             jnp.where(where, new, old) for new, old in zip(after.optical_weights, self.optical_weights)
@@ -71,6 +73,7 @@ class TallyIndex(eqx.Module):
         number = self.number if number is None else number
         if not self.optical_weights:
             return [(number, None)]
+        # Wavelengths lie innermost: the entries of one shot or node are neighbours in memory.
         n_wavelengths = len(self.optical_weights)
         return [(number * n_wavelengths + k, weight) for k, weight in enumerate(self.optical_weights)]
 
@@ -82,6 +85,7 @@ def add_to_tally(
     weight: Scalar,
 ) -> Float[Array, "*rows entries"]:
     """Return a tally of the energy budget with weights added, without derivatives."""
+    # A budget is a diagnostic: its derivatives would double the work of every order.
     for entry, factor in index.entries():
         term = weight if factor is None else weight * factor
         tally = tally.at[(*rows, entry)].add(detach(term))

@@ -44,6 +44,7 @@ class AngleTables(eqx.Module):
     squared_cosine: Float[Array, "nodes"]
 
     def _interpolate(self, table: Float[Array, "nodes"], w: Vec) -> Scalar:
+        # Leaves have no azimuth and two sides: G depends on |cos zenith| alone.
         position = jnp.clip(jnp.abs(w[2]), 0.0, 1.0) * (ANGLE_NODES - 1)
         below = jnp.clip(lax.stop_gradient(position).astype(jnp.int32), 0, ANGLE_NODES - 2)
         return table[below] + (position - below) * (table[below + 1] - table[below])
@@ -214,9 +215,11 @@ def enter_grid(medium: Medium, x: Vec, w: Vec, box: VoxelBox | None = None) -> D
         flat, ahead = jnp.abs(w[k]) < 1e-12, w[k] > 0
         inverse = 1.0 / jnp.where(flat, 1.0, w[k])
         lower = medium.origin[k] - x[k]
+        # A flat axis has its faces at FAR, whatever the voxel.
         gap.append(jnp.where(flat, 0.0, medium.size[k] * inverse))
         offset.append(jnp.where(flat, FAR, (lower + jnp.where(ahead, medium.size[k], 0.0)) * inverse))
         step.append(jnp.where(ahead, 1, -1))
+        # A periodic map has no sides: the ray is never outside of it in x and y.
         if medium.periodic and k < 2:
             continue
         lower, upper = lower + medium.size[k] * low[k], lower + medium.size[k] * high[k]
@@ -229,6 +232,7 @@ def enter_grid(medium: Medium, x: Vec, w: Vec, box: VoxelBox | None = None) -> D
     voxel = []
     for k in range(3):
         position = (x[k] + w[k] * enter - medium.origin[k]) / medium.size[k]
+        # Which voxel is a decision; its faces carry the derivative.
         number = jnp.floor(lax.stop_gradient(position))
         if not (medium.periodic and k < 2):
             # The point of entry lies on a face, and may be rounded to the wrong side.
@@ -351,13 +355,17 @@ def march_to_depths(
         k = medium.extinction(cell, w)
         to, cell = once((to, cell))
         next_depth = once(depth + k * (to - distance))
+        # Half-open, so that each target is crossed once; an empty voxel (equal depths) is never crossed.
         crossed = for_targets(running) & (for_targets(depth) <= targets) & (targets < for_targets(next_depth))
+        # Photons whose last target is passed stop here: most flights are shorter than the map.
         goes_on = running & (next_depth <= largest) & (to < end)
         crossed, goes_on = once((crossed, goes_on))
         crossings = tuple(
             select(crossed, for_targets(new), old) for new, old in zip((distance, to, depth, cell), crossings)
         )
         if slopes is not None:
+            # Up to each target, a segment counts as far as the target: within the voxel where it lies, in
+            # part.
             length = jnp.where(running, to - distance, 0.0)[None]
             if len(targets):
                 to_target = (targets - for_targets(depth)) / for_targets(jnp.maximum(k, 1e-30))
@@ -368,6 +376,8 @@ def march_to_depths(
         distance, depth = select(running, to, distance), select(running, next_depth, depth)
         return (distance, depth, next_voxel, goes_on, crossings, depth_slopes), None
 
+    # A loop of static length has a reverse derivative; skipping dead blocks gives back the time of a loop
+    # that stops early.
     def block(state, _):
         def run(state):
             return lax.scan(step, state, None, length=STEPS_PER_CHECK)[0]
@@ -405,6 +415,7 @@ def column_of(medium: Medium, x: Vec) -> tuple[Int[Array, "..."], Scalar, Bool[A
     if not medium.periodic:
         inside &= (voxel[0] >= 0) & (voxel[0] < nx) & (voxel[1] >= 0) & (voxel[1] < ny)
     cell = cell_index(medium, tuple(voxel))
+    # Below the map the whole lowest voxel lies above the point; above the map, nothing.
     above = jnp.clip(jnp.clip(voxel[2], 0, nz - 1) + 1 - jnp.maximum(position[2], 0.0), 0.0, 1.0)
     return cell, above, inside
 
