@@ -1,7 +1,7 @@
 """How many geometric columns of a Jacobian are pushed through the trace at once: as many as memory allows."""
 
 from jaxlidar import Plan
-from jaxlidar.planning.memory import in_words, memory_limit
+from jaxlidar.planning.memory import format_bytes, memory_limit
 
 
 def columns_at_once(plan: Plan, columns: int, beside: float = 0.0) -> int:
@@ -16,8 +16,8 @@ def columns_at_once(plan: Plan, columns: int, beside: float = 0.0) -> int:
         most -= 1
     if columns and (size := plan.jacobian_memory(most)) > limit:
         raise ValueError(
-            f"derivatives in the geometric unknowns would take about {in_words(size)} of memory, one at a "
-            f"time; admissible is max_memory = {limit / 1e9:.3g} GB of the plan: follow fewer orders "
+            f"derivatives in the geometric unknowns would take about {format_bytes(size)} of memory, one at "
+            f"a time; admissible is max_memory = {limit / 1e9:.3g} GB of the plan: follow fewer orders "
             "(max_orders=), record a shorter window, have fewer plates or materials, or give a plan with more"
         )
     return -(-columns // -(-columns // most)) if columns else 0
