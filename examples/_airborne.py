@@ -14,7 +14,7 @@ import inversion
 import jaxlidar as jl
 from inversion.receiver.digitiser import Amplitudes
 from jaxlidar.io import AirborneShot, Segment, read_las_waveforms, read_neon, read_pulsewaves
-from jaxlidar.io.pedestal import above_pedestal
+from jaxlidar.io.noise import above_pedestal
 
 # Readers by the suffix of a file.
 SUFFIXES = {".npz": read_neon, ".pls": read_pulsewaves, ".las": read_las_waveforms}

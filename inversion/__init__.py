@@ -1,4 +1,40 @@
-"""Retrieval of scene properties from waveforms: fits with standard errors, and tools that need no model."""
+"""Retrieval of scene properties from waveforms: fits with standard errors, and tools that need no model.
+
+## Fits with a model
+
+`retrieve`, `retrieve_many`, `Unknown`, `LogNormal`, `Smooth`, `put_profile`, `Retrieval`, `Retrievals`,
+`Step`, `Progress`, `AveragingKernel`.
+
+## How well a fit can do, and how well it did
+
+`cramer_rao`, `CramerRao`, `profile_likelihood`, `Profile`, `judge_fit`, `judge_fits`, `judge_record`,
+`Verdict`.
+
+## Echoes and deconvolution
+
+`gaussian_decomposition`, `Echoes`, `echo_points`, `EchoPoints`, `richardson_lucy`, `wiener`.
+
+## Heights, cover and plant area
+
+`find_ground`, `signal_ends`, `SignalEnds`, `relative_heights`, `ground_and_canopy`, `GroundAndCanopy`,
+`gap_probability`, `plant_area_index`, `plant_area_profile`.
+
+## GEDI and photon counters
+
+`gedi_metrics`, `GediMetrics`, `gedi_settings`, `GediSettings`, `photon_ground_and_canopy`, `PhotonHeights`.
+
+## What the receiver did
+
+`Recorder`, `receiver_impulse`, `recorded_pulse`, `amplitudes`, `Amplitudes`, `corrected_table`.
+
+## Leaf traits from leaf spectra
+
+`invert_leaves`, `LeafFit`.
+
+## Files
+
+`files`.
+"""
 
 from inversion import files
 from inversion.fit.batch import Progress, Retrievals, retrieve_many
@@ -29,55 +65,63 @@ from inversion.receiver.recorder import Recorder
 from jaxlidar.extend import shorten_signatures
 
 __all__ = [
-    "Amplitudes",
-    "AveragingKernel",
-    "CramerRao",
-    "EchoPoints",
-    "Echoes",
-    "GediMetrics",
-    "GediSettings",
-    "GroundAndCanopy",
-    "LeafFit",
+    # Fits with a model.
+    "retrieve",
+    "retrieve_many",
+    "Unknown",
     "LogNormal",
-    "PhotonHeights",
-    "Profile",
-    "Progress",
-    "Recorder",
+    "Smooth",
+    "put_profile",
     "Retrieval",
     "Retrievals",
-    "SignalEnds",
-    "Smooth",
     "Step",
-    "Unknown",
-    "Verdict",
-    "amplitudes",
-    "corrected_table",
+    "Progress",
+    "AveragingKernel",
+    # How well a fit can do, and how well it did.
     "cramer_rao",
-    "echo_points",
-    "files",
-    "find_ground",
-    "gap_probability",
-    "gaussian_decomposition",
-    "gedi_metrics",
-    "gedi_settings",
-    "ground_and_canopy",
-    "invert_leaves",
+    "CramerRao",
+    "profile_likelihood",
+    "Profile",
     "judge_fit",
     "judge_fits",
     "judge_record",
-    "photon_ground_and_canopy",
+    "Verdict",
+    # Echoes and deconvolution.
+    "gaussian_decomposition",
+    "Echoes",
+    "echo_points",
+    "EchoPoints",
+    "richardson_lucy",
+    "wiener",
+    # Heights, cover and plant area.
+    "find_ground",
+    "signal_ends",
+    "SignalEnds",
+    "relative_heights",
+    "ground_and_canopy",
+    "GroundAndCanopy",
+    "gap_probability",
     "plant_area_index",
     "plant_area_profile",
-    "profile_likelihood",
-    "put_profile",
+    # GEDI and photon counters.
+    "gedi_metrics",
+    "GediMetrics",
+    "gedi_settings",
+    "GediSettings",
+    "photon_ground_and_canopy",
+    "PhotonHeights",
+    # What the receiver did.
+    "Recorder",
     "receiver_impulse",
     "recorded_pulse",
-    "relative_heights",
-    "retrieve",
-    "retrieve_many",
-    "richardson_lucy",
-    "signal_ends",
-    "wiener",
+    "amplitudes",
+    "Amplitudes",
+    "corrected_table",
+    # Leaf traits from leaf spectra.
+    "invert_leaves",
+    "LeafFit",
+    # Files.
+    "files",
 ]
 
 shorten_signatures(globals())

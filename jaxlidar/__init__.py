@@ -1,10 +1,67 @@
 """A differentiable simulator of full-waveform lidar in JAX.
 
-`simulate` gives the waveform of a `Lidar` over a `Scene`. Its steps can also be taken one by one: `plan`,
-`make_setup`, `trace_scene`, `waveform_of`.
+`simulate` gives the waveform of a `Lidar` over a `Scene`. Readers of files are in `jaxlidar.io`, figures in
+`jaxlidar.plot`, and what extensions build on in `jaxlidar.extend`. Retrieval of scene properties from
+waveforms is in the package `inversion`.
 
-Readers of files are in `jaxlidar.io`, figures in `jaxlidar.plot`, and what extensions build on in
-`jaxlidar.extend`. Retrieval of scene properties from waveforms is in the package `inversion`.
+## Simulate a waveform
+
+`simulate`, `Waveform`, `total_reflectance`, `Progress`, `open`, `rerun`.
+
+## The instrument
+
+`Lidar`, `AbstractPulse`, `GaussianPulse`, `ExponentiallyModifiedGaussianPulse`, `RectangularPulse`,
+`SampledPulse`.
+
+## Record as a receiver does
+
+`record`, `Receiver`, `first_return_window`, `PhotonCounter`, `PhotonEvents`.
+
+## Surveys of many shots
+
+`Survey`, `AbstractScan`, `Oscillating`, `RotatingPolygon`, `Conical`, `simulate_many`, `Waveforms`,
+`SurveyProgress`, `SceneParts`.
+
+## Scenes
+
+`Scene`, `Canopy`, `VoxelMap`, `Ground`, `Terrain`, `Plate`, `Atmosphere`, `AbstractSurface`,
+`AbstractGround`, `AbstractSheet`, `AbstractShape`, `Plane`.
+
+## Leaf optics and spectra
+
+`Prospect`, `LeafOptics`, `prospect_spectra`, `prospect_jacobian`, `plate_model`, `load_coefficients`,
+`Spectrum`, `spectrum`, `spectrum_names`, `read_spectrum_csv`.
+
+## Reflection, scattering and leaf angles
+
+`AbstractLaw`, `AbstractMirror`, `Lambertian`, `Specular`, `EqualAngle`, `LeafSurface`, `leaf_surface`,
+`LeafAngles`, `AbstractPhase`, `Isotropic`, `HenyeyGreenstein`.
+
+## Plants
+
+`Habit`, `Branching`, `broadleaf`, `conifer`, `shrub`, `spreading_tree`, `grow`, `forest`, `Tree`,
+`LSystem`, `Rule`, `Symbol`, `Word`, `turtle`, `voxelise`, `voxelise_points`, `voxelise_mesh`, `Mesh`,
+`trim_empty_layers`.
+
+## Truth and energy
+
+`truth_of`, `Truth`, `Truths`, `energy_budget`, `EnergyBudget`.
+
+## The steps of a simulation
+
+`plan`, `Plan`, `Effect`, `make_setup`, `Setup`, `trace_scene`, `Response`, `waveform_of`.
+
+## Paths as the paper traces them
+
+`analog_returns`, `AnalogReturns`, `photon_paths`.
+
+## Warnings and constants
+
+`LateLightWarning`, `LostWorkersWarning`, `OffMapWarning`, `UnitWarning`, `SPEED_OF_LIGHT`.
+
+## Packages of their own
+
+`io`, `plot`, `extend`.
 """
 
 import importlib
@@ -64,7 +121,7 @@ from jaxlidar.simulate import LateLightWarning, simulate
 from jaxlidar.spectral.waveform import Waveform, total_reflectance, waveform_of
 from jaxlidar.survey.coverage import OffMapWarning
 from jaxlidar.survey.progress import SurveyProgress
-from jaxlidar.survey.run import simulate_many
+from jaxlidar.survey.simulate_many import simulate_many
 from jaxlidar.survey.truths import Truths
 from jaxlidar.survey.waveforms import Waveforms
 from jaxlidar.trace.response import Response, trace_scene
@@ -74,108 +131,121 @@ if TYPE_CHECKING:
     from jaxlidar import plot
 
 __all__ = [
-    "SPEED_OF_LIGHT",
-    "AbstractGround",
-    "AbstractLaw",
-    "AbstractMirror",
-    "AbstractPhase",
-    "AbstractPulse",
-    "AbstractScan",
-    "AbstractShape",
-    "AbstractSheet",
-    "AbstractSurface",
-    "AnalogReturns",
-    "Atmosphere",
-    "Branching",
-    "Canopy",
-    "Conical",
-    "Effect",
-    "EnergyBudget",
-    "EqualAngle",
-    "ExponentiallyModifiedGaussianPulse",
-    "GaussianPulse",
-    "Ground",
-    "Habit",
-    "HenyeyGreenstein",
-    "Isotropic",
-    "LSystem",
-    "Lambertian",
-    "LateLightWarning",
-    "LeafAngles",
-    "LeafOptics",
-    "LeafSurface",
+    # Simulate a waveform.
+    "simulate",
+    "Waveform",
+    "total_reflectance",
+    "Progress",
+    "open",
+    "rerun",
+    # The instrument.
     "Lidar",
-    "LostWorkersWarning",
-    "Mesh",
-    "OffMapWarning",
-    "Oscillating",
+    "AbstractPulse",
+    "GaussianPulse",
+    "ExponentiallyModifiedGaussianPulse",
+    "RectangularPulse",
+    "SampledPulse",
+    # Record as a receiver does.
+    "record",
+    "Receiver",
+    "first_return_window",
     "PhotonCounter",
     "PhotonEvents",
-    "Plan",
-    "Plane",
-    "Plate",
-    "Progress",
-    "Prospect",
-    "Receiver",
-    "RectangularPulse",
-    "Response",
-    "RotatingPolygon",
-    "Rule",
-    "SampledPulse",
-    "Scene",
-    "SceneParts",
-    "Setup",
-    "Specular",
-    "Spectrum",
+    # Surveys of many shots.
     "Survey",
-    "SurveyProgress",
-    "Symbol",
-    "Terrain",
-    "Tree",
-    "Truth",
-    "Truths",
-    "UnitWarning",
-    "VoxelMap",
-    "Waveform",
-    "Waveforms",
-    "Word",
-    "analog_returns",
-    "broadleaf",
-    "conifer",
-    "energy_budget",
-    "extend",
-    "first_return_window",
-    "forest",
-    "grow",
-    "io",
-    "leaf_surface",
-    "load_coefficients",
-    "make_setup",
-    "open",
-    "photon_paths",
-    "plan",
-    "plate_model",
-    "plot",
-    "prospect_jacobian",
-    "prospect_spectra",
-    "read_spectrum_csv",
-    "record",
-    "rerun",
-    "shrub",
-    "simulate",
+    "AbstractScan",
+    "Oscillating",
+    "RotatingPolygon",
+    "Conical",
     "simulate_many",
+    "Waveforms",
+    "SurveyProgress",
+    "SceneParts",
+    # Scenes.
+    "Scene",
+    "Canopy",
+    "VoxelMap",
+    "Ground",
+    "Terrain",
+    "Plate",
+    "Atmosphere",
+    "AbstractSurface",
+    "AbstractGround",
+    "AbstractSheet",
+    "AbstractShape",
+    "Plane",
+    # Leaf optics and spectra.
+    "Prospect",
+    "LeafOptics",
+    "prospect_spectra",
+    "prospect_jacobian",
+    "plate_model",
+    "load_coefficients",
+    "Spectrum",
     "spectrum",
     "spectrum_names",
+    "read_spectrum_csv",
+    # Reflection, scattering and leaf angles.
+    "AbstractLaw",
+    "AbstractMirror",
+    "Lambertian",
+    "Specular",
+    "EqualAngle",
+    "LeafSurface",
+    "leaf_surface",
+    "LeafAngles",
+    "AbstractPhase",
+    "Isotropic",
+    "HenyeyGreenstein",
+    # Plants.
+    "Habit",
+    "Branching",
+    "broadleaf",
+    "conifer",
+    "shrub",
     "spreading_tree",
-    "total_reflectance",
-    "trace_scene",
-    "trim_empty_layers",
-    "truth_of",
+    "grow",
+    "forest",
+    "Tree",
+    "LSystem",
+    "Rule",
+    "Symbol",
+    "Word",
     "turtle",
     "voxelise",
-    "voxelise_mesh",
     "voxelise_points",
+    "voxelise_mesh",
+    "Mesh",
+    "trim_empty_layers",
+    # Truth and energy.
+    "truth_of",
+    "Truth",
+    "Truths",
+    "energy_budget",
+    "EnergyBudget",
+    # The steps of a simulation.
+    "plan",
+    "Plan",
+    "Effect",
+    "make_setup",
+    "Setup",
+    "trace_scene",
+    "Response",
     "waveform_of",
+    # Paths as the paper traces them.
+    "analog_returns",
+    "AnalogReturns",
+    "photon_paths",
+    # Warnings and constants.
+    "LateLightWarning",
+    "LostWorkersWarning",
+    "OffMapWarning",
+    "UnitWarning",
+    "SPEED_OF_LIGHT",
+    # Packages of their own.
+    "io",
+    "plot",
+    "extend",
 ]
 
 shorten_signatures(globals())

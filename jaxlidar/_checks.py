@@ -18,6 +18,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
+# For modules that take all helpers of construction from here.
 from jaxlidar._signatures import briefly  # noqa: F401
 
 # -- conversions -------------------------------------------------------------------------------------------

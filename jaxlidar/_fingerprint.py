@@ -52,13 +52,14 @@ def fingerprint(parts: Mapping[str, Any]) -> dict[str, str]:
             found[name] = digest_of(part)
         except (TypeError, RecursionError) as error:
             raise TypeError(f"{name} cannot be compared with that of another run: {error}") from error
-    found |= {f"version of {name}": _version(name) for name in _PACKAGES}
+    found |= {f"version of {name}": version_of(name) for name in _PACKAGES}
     found["version of python"] = ".".join(platform.python_version_tuple()[:2])
     found |= {name: str(getattr(jax.config, name, None)) for name in _SETTINGS}
     return found | {"jax.default_backend()": jax.default_backend()}
 
 
-def _version(name: str) -> str:
+def version_of(name: str) -> str:
+    """Return the version of an installed package, by its name."""
     try:
         return importlib.metadata.version(name)
     except importlib.metadata.PackageNotFoundError:
@@ -145,7 +146,7 @@ def _is_installed(module: str | None) -> bool:
 def _release_of(module: str | None) -> str:
     """The release of an installed package, but for those of which the fingerprint has it in any case."""
     package = (module or "builtins").partition(".")[0]
-    return "" if package in _BY_NAME else _version(package)
+    return "" if package in _BY_NAME else version_of(package)
 
 
 def _file_of(module: ModuleType) -> bytes:

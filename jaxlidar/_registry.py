@@ -37,7 +37,7 @@ class RegisteredFunction:
 
 save_result = RegisteredFunction("saving a result", "jaxlidar.io")
 waveform_html = RegisteredFunction("the figure of a waveform in a notebook", "jaxlidar")
-simulate_survey = RegisteredFunction("simulating a survey", "jaxlidar.survey.run")
+simulate_survey = RegisteredFunction("simulating a survey", "jaxlidar.survey.simulate_many")
 
 # The public names of jaxlidar. `jaxlidar.io` finds among them the classes that a table of a TOML file can
 # stand for.

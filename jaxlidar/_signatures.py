@@ -50,12 +50,16 @@ def briefly(exported: Exported) -> Exported:
     """Shorten the signature that `help` shows of a function, or of a class and its public methods.
 
     A function shows its types by short names, such as `Float[ArrayLike, "bins"]` and `Lidar`. A class shows
-    its arguments with their defaults alone: its fields have the types that they are converted to, and what it
-    admits stands in its docstring.
+    its arguments with their defaults alone: the types of its fields are those after conversion, and its
+    docstring states what it admits.
+
+    As a decorator of a class it also hides these types from jaxtyping's import hook, which would otherwise
+    check arguments against them: constructors check and convert their arguments, and compiled programs build
+    modules of shapes in the place of arrays.
 
     **Arguments:**
 
-    - `exported`: a function or a class. Use it as a decorator, too.
+    - `exported`: a function or a class.
 
     **Returns:** `exported` itself.
 

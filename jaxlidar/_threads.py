@@ -1,4 +1,4 @@
-"""Compiled programs side by side: XLA runs one on one core, so that several threads use them all."""
+"""Compiled programs side by side: XLA runs each on one core, and several threads use all cores."""
 
 import contextlib
 import os
@@ -10,7 +10,8 @@ from typing import Any
 
 import jax
 
-# For programs that run side by side: they would wait for one another if each spread over several cores.
+# Compiler options of programs that run side by side: programs that each spread over several cores would wait
+# for one another.
 ONE_CORE: dict[str, Any] = {
     "compiler_options": {
         "xla_cpu_multi_thread_eigen": False,
@@ -21,33 +22,36 @@ ONE_CORE: dict[str, Any] = {
 
 @contextlib.contextmanager
 def side_by_side(
-    most: int | None = None, *, devices: Sequence[Any] | None = None
+    max_threads: int | None = None, *, devices: Sequence[Any] | None = None
 ) -> Iterator[Callable[[Callable, Iterable], Iterator]]:
-    """A `map` that runs calls on as many threads as there are cores, or `most`; results come in order.
+    """Yield a `map` that runs calls on one thread for each core and returns results in order.
 
-    With `devices`, there is one thread for each, which computes on it. JAX keeps its precision and its
-    default device by thread: here they are the caller's. Threads that ask for the same program at once wait
-    for one compilation. What has not begun when the block ends is dropped.
+    There are at most `max_threads` threads. With `devices`, there is one thread for each of them, which
+    computes on it. JAX keeps its precision and its default device by thread: here they are the caller's.
+    Threads that need the same program at the same time wait for one compilation. Calls that have not started
+    when the block ends are dropped.
     """
     config: Any = jax.config
-    double, own = config.jax_enable_x64, threading.local()
+    double, thread = config.jax_enable_x64, threading.local()
     if devices is None:
-        devices = [config.jax_default_device] * max(min(os.cpu_count() or 1, most or 1024), 1)
-    free = queue.SimpleQueue()
+        devices = [config.jax_default_device] * max(min(os.cpu_count() or 1, max_threads or 1024), 1)
+    free_devices = queue.SimpleQueue()
     for device in devices:
-        free.put(device)
+        free_devices.put(device)
 
-    def begin() -> None:
-        own.device = free.get()
+    def take_device() -> None:
+        thread.device = free_devices.get()
 
-    pool = ThreadPoolExecutor(max_workers=len(devices), initializer=begin)
+    pool = ThreadPoolExecutor(max_workers=len(devices), initializer=take_device)
 
     def run(function: Callable, items: Iterable) -> Iterator:
-        def one(item: Any) -> Any:
-            with jax.enable_x64(double), jax.default_device(own.device):
+        def call(item: Any) -> Any:
+            with jax.enable_x64(double), jax.default_device(thread.device):
+                # JAX returns before results are there: a thread that goes on would have more than one in
+                # flight.
                 return jax.block_until_ready(function(item))
 
-        return pool.map(one, items)
+        return pool.map(call, items)
 
     try:
         yield run

@@ -1,4 +1,4 @@
-"""Chunks of work: done here on all cores or devices, or by the workers of an executor."""
+"""Units of work: run in this process on all cores or devices, or by the workers of an executor."""
 
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -12,14 +12,16 @@ from jaxtyping import PRNGKeyArray
 
 from jaxlidar._threads import side_by_side
 
-# Chunks that an executor is given ahead of its workers.
-_AHEAD = 32
+# Units that an executor is given ahead of its workers: enough to keep many of them busy, few enough that
+# those which wait there do not fill the memory.
+_QUEUED = 32
 
 
-class Task(NamedTuple):
-    """A chunk of work that any process can do: a function, its arguments, and JAX's precision.
+class WorkUnit(NamedTuple):
+    """A unit of work that any process can do: a function, its arguments, and JAX's precision.
 
-    `key` is the data of a random key and, for keys of the new style, the name of its kind.
+    `key`: the data of a random key and, for keys of the new style, the name of its implementation, since keys
+    themselves cannot be pickled.
     """
 
     number: int
@@ -29,101 +31,118 @@ class Task(NamedTuple):
     double: bool
 
 
-class Outcome(NamedTuple):
-    """What a task gave: arrays, or the exception that it raised."""
+class UnitOutcome(NamedTuple):
+    """The outcome of a unit: arrays, or the exception that it raised."""
 
     arrays: Any
     error: Exception | None
 
 
-def portable(key: PRNGKeyArray) -> tuple[np.ndarray, str | None]:
-    """A random key as plain data."""
+def portable_key(key: PRNGKeyArray) -> tuple[np.ndarray, str | None]:
+    """Return a random key as plain data, see `WorkUnit`."""
     if jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
         return np.asarray(jax.random.key_data(key)), str(jax.random.key_impl(key))
     return np.asarray(key), None
 
 
-def task(number: int, function: Callable[..., Any], arguments: tuple[Any, ...], key: PRNGKeyArray) -> Task:
-    """The chunk of work `function(*arguments, key)`, in JAX's present precision."""
-    return Task(number, function, arguments, portable(key), jnp.result_type(float).itemsize == 8)
+def task(
+    number: int, function: Callable[..., Any], arguments: tuple[Any, ...], key: PRNGKeyArray
+) -> WorkUnit:
+    """Return the unit of work `function(*arguments, key)`, in JAX's present precision."""
+    double = jnp.result_type(float).itemsize == 8
+    return WorkUnit(number, function, arguments, portable_key(key), double)
 
 
-def done(task: Task) -> Outcome:
-    """Do a task; this runs in workers. Its own exceptions come back, others mean that the worker died."""
-    data, kind = task.key
-    with jax.enable_x64(task.double):
+def run_unit(unit: WorkUnit) -> UnitOutcome:
+    """Do a unit of work; this runs in workers.
+
+    Exceptions of the work itself are part of the outcome. Any other exception that a worker causes means that
+    it died.
+    """
+    data, implementation = unit.key
+    with jax.enable_x64(unit.double):
         try:
             key = jnp.asarray(data)
-            key = key if kind is None else jax.random.wrap_key_data(key, impl=kind)
-            result = task.function(*task.arguments, key)
-            return Outcome(jax.tree.map(np.asarray, result), None)
+            if implementation is not None:
+                key = jax.random.wrap_key_data(key, impl=implementation)
+            result = unit.function(*unit.arguments, key)
+            return UnitOutcome(jax.tree.map(np.asarray, result), None)
         except Exception as error:
-            return Outcome(None, error)
+            return UnitOutcome(None, error)
 
 
 def outcomes(
-    tasks: Sequence[Task], executor: Executor | None, devices: Sequence[Any] | None = None
-) -> Iterator[tuple[Task, Any]]:
-    """Tasks and what they gave, as they come: from workers, from so many devices, or from all cores.
+    tasks: Sequence[WorkUnit], executor: Executor | None, devices: Sequence[Any] | None = None
+) -> Iterator[tuple[WorkUnit, Any]]:
+    """Yield tasks and their results as they come: from workers, from these devices, or from all cores.
 
-    **Raises:** what a task raises, and RuntimeError where the worker of one died twice.
+    **Raises:** the exception of a task, and RuntimeError where the worker of one died twice.
     """
-    for task, outcome in _here(tasks, devices) if executor is None else _there(list(tasks), executor):
+    pairs = _run_locally(tasks, devices) if executor is None else _run_by_workers(list(tasks), executor)
+    for unit, outcome in pairs:
         if outcome.error is not None:
             raise outcome.error
-        yield task, outcome.arrays
+        yield unit, outcome.arrays
 
 
-def _here(tasks: Sequence[Task], devices: Sequence[Any] | None = None) -> Iterator[tuple[Task, Outcome]]:
+def _run_locally(
+    units: Sequence[WorkUnit], devices: Sequence[Any] | None = None
+) -> Iterator[tuple[WorkUnit, UnitOutcome]]:
     with side_by_side(devices=devices) as run:
-        yield from zip(tasks, run(done, tasks))
+        yield from zip(units, run(run_unit, units))
 
 
-def _there(tasks: list[Task], executor: Executor) -> Iterator[tuple[Task, Outcome]]:
-    waiting, tried = tasks[::-1], dict.fromkeys((t.number for t in tasks), 0)
-    running: dict[Future, Task] = {}
+def _run_by_workers(units: list[WorkUnit], executor: Executor) -> Iterator[tuple[WorkUnit, UnitOutcome]]:
+    """Yield units and their outcomes from the workers of an executor.
+
+    1. Submit units until as many are queued as may be.
+    2. If the executor takes no more, as a process pool that lost a worker, run all remaining units locally.
+    3. Yield the outcomes that have come; a unit whose worker died is submitted once more.
+    """
+    # Taken from the end.
+    waiting, deaths = units[::-1], dict.fromkeys((unit.number for unit in units), 0)
+    running: dict[Future, WorkUnit] = {}
     try:
         while waiting or running:
-            while waiting and len(running) < _AHEAD:
-                task = waiting.pop()
+            while waiting and len(running) < _QUEUED:
+                unit = waiting.pop()
                 try:
-                    running[executor.submit(done, task)] = task
+                    running[executor.submit(run_unit, unit)] = unit
                 except (BrokenExecutor, RuntimeError) as error:
                     warnings.warn(
-                        f"executor takes no more work ({error}): what is left is done in this process",
+                        f"executor takes no more work ({error}): remaining tasks are done in this process",
                         LostWorkersWarning,
                         stacklevel=2,
                     )
-                    left = [task, *reversed(waiting)]
+                    # Running units are lost with the executor.
+                    remaining = [unit, *reversed(waiting), *running.values()]
                     waiting.clear()
-                    # What runs was given up with the executor.
-                    left += list(running.values())
                     running.clear()
-                    yield from _here(left)
+                    yield from _run_locally(remaining)
             if not running:
                 return
             for future in wait(running, return_when=FIRST_COMPLETED).done:
-                task = running.pop(future)
+                unit = running.pop(future)
                 try:
                     outcome = future.result()
                 except (Exception, CancelledError) as error:
-                    tried[task.number] += 1
-                    if tried[task.number] > 1:
+                    deaths[unit.number] += 1
+                    if deaths[unit.number] > 1:
                         raise RuntimeError(
-                            f"the workers of chunk {task.number} died twice: {error}"
+                            f"the workers of chunk {unit.number} died twice: {error}"
                         ) from error
-                    waiting.append(task)
+                    waiting.append(unit)
                     continue
-                yield task, outcome
+                yield unit, outcome
     finally:
         for future in running:
             future.cancel()
 
 
 class LostWorkersWarning(UserWarning):
-    """The warning that an executor takes no more work, as a process pool that lost a worker.
+    """Warning that an executor takes no more work, as a process pool that lost a worker.
 
-    What is left is done in the own process, with the same results.
+    The remaining work is done in this process, with the same results.
 
     **Example:**
 

@@ -1,10 +1,9 @@
 """Energy budgets: light that a scene absorbs, returns to the sky and transmits to the ground, at any time."""
 
 import dataclasses
-import math
 import time
-from collections.abc import Callable
-from typing import final
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, final
 
 import equinox as eqx
 import jax
@@ -12,16 +11,24 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxlidar._checks import check_choice, check_integer, check_key, check_range, concrete_number
+from jaxlidar._checks import briefly, check_choice, check_integer, check_key, check_range, concrete_number
 from jaxlidar._programs import Program
 from jaxlidar._progress import Progress
-from jaxlidar._statistics import Moments, batches_needed
 from jaxlidar._threads import ONE_CORE, side_by_side
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.planning.path_lengths import PathLengths
 from jaxlidar.planning.plan import MIN_BATCHES
 from jaxlidar.planning.plan import plan as make_plan
 from jaxlidar.planning.setup import Setup, make_setup
+from jaxlidar.sampling.adaptive import (
+    BATCH_STEPS,
+    AbstractEstimate,
+    EstimateErrors,
+    HasErrors,
+    StoppingRule,
+    sample_until,
+)
+from jaxlidar.sampling.moments import RunningMoments
 from jaxlidar.scenes.scene import Scene, check_kinds
 from jaxlidar.spectral.apply_optics import setup_optics
 from jaxlidar.trace.absorption import EnergyFractions, from_beam, from_the_sky, trace_to_end
@@ -33,6 +40,7 @@ MAX_FLIGHT_HEIGHTS = 300.0
 
 
 @final
+@briefly
 class EnergyBudget(eqx.Module):
     """Fractions of the emitted energy, (wavelengths,) each.
 
@@ -123,46 +131,32 @@ def energy_budget(
     setup = _with_longest_flights(
         make_setup(lidar, scene, make_plan(lidar, scene, max_orders=1, describe=False))
     )
-    started = time.perf_counter()
-    moments = Moments()
-    wanted, stopped, error, n = MIN_BATCHES, "tolerance met", math.inf, lidar.wavelength.size
+    start_time = time.perf_counter()
 
     def trace_batch(number: int) -> EnergyFractions:
         return _compiled_trace(setup, jax.random.fold_in(key, number), illumination == "parallel", max_orders)
 
     with side_by_side() as run:
-        try:
-            while True:
-                for fractions in run(trace_batch, range(moments.count, wanted)):
-                    moments.add(
-                        np.concatenate([np.asarray(a).reshape(-1, n) for a in jax.tree.leaves(fractions)])
-                    )
-                error, done = float(np.max(moments.stderr, initial=0.0)), moments.count
-                photons, seconds = done * PHOTONS_PER_BATCH, time.perf_counter() - started
-                if progress is not None:
-                    progress(Progress(done, photons, seconds, error, rtol))
-                if error <= rtol:
-                    break
-                if photons >= max_photons:
-                    stopped = "photons traced"
-                    break
-                wanted = min(
-                    batches_needed(done, error, rtol), max(-(-max_photons // PHOTONS_PER_BATCH), done + 1)
-                )
-        except KeyboardInterrupt:
-            if moments.count < MIN_BATCHES:
-                raise
-            error, stopped = float(np.max(moments.stderr, initial=0.0)), "interrupted"
+        estimate = _BudgetEstimate(lambda numbers: run(trace_batch, numbers))
+
+        def report(errors: HasErrors) -> None:
+            if progress is not None:
+                batches, seconds = estimate.n_batches, time.perf_counter() - start_time
+                progress(Progress(batches, batches * PHOTONS_PER_BATCH, seconds, errors.relative, rtol))
+
+        stop = StoppingRule(rtol, min_size=MIN_BATCHES, max_size=-(-max_photons // PHOTONS_PER_BATCH))
+        reason, errors = sample_until(estimate, stop, BATCH_STEPS, report=report, keeps_interrupted=True)
     info = {
-        "photons": moments.count * PHOTONS_PER_BATCH,
-        "batches": moments.count,
-        "seconds": time.perf_counter() - started,
-        "error": error,
-        "stopped": stopped,
+        "photons": estimate.n_batches * PHOTONS_PER_BATCH,
+        "batches": estimate.n_batches,
+        "seconds": time.perf_counter() - start_time,
+        "error": errors.relative,
+        "stopped": reason.value,
     }
     names = setup.plan.config.materials
-    rows = [*names, "returned", "below", "transmitted", "unfollowed"]
-    mean, stderr = (dict(zip(rows, map(jnp.asarray, a))) for a in (moments.mean, moments.stderr))
+    mean, stderr = (
+        _by_name(fractions, names) for fractions in (estimate.moments.mean, estimate.moments.stderr)
+    )
     return EnergyBudget(
         absorbed={name: mean[name] for name in names},
         returned=mean["returned"],
@@ -173,6 +167,41 @@ def energy_budget(
         wavelength=lidar.wavelength,
         info=info,
     )
+
+
+class _BudgetEstimate(AbstractEstimate):
+    """Moments of the energy fractions of batches of photons.
+
+    `trace`: traces the batches with the given numbers.
+    """
+
+    def __init__(self, trace: Callable[[range], Iterable[EnergyFractions]]):
+        self.trace = trace
+        self.moments: Any = None
+
+    @property
+    def n_batches(self) -> int:
+        """Number of batches."""
+        return 0 if self.moments is None else self.moments.count
+
+    def add_batches(self, numbers: range) -> None:
+        """Trace batches and add them."""
+        for fractions in self.trace(numbers):
+            moments = RunningMoments.on_host(fractions) if self.moments is None else self.moments
+            self.moments = moments.update(fractions)
+
+    def errors(self) -> EstimateErrors:
+        """Return the largest standard error: it is relative to the emitted energy, which is one."""
+        stderr = jax.tree.leaves(self.moments.stderr)
+        return EstimateErrors(max(float(np.max(a, initial=0.0)) for a in stderr))
+
+
+def _by_name(fractions: Any, materials: Sequence[str]) -> dict[str, Float[Array, "wavelengths"]]:
+    """Return energy fractions, or their standard errors, by name."""
+    rows = dict(zip(materials, fractions.absorbed))
+    rows |= {"returned": fractions.up, "below": fractions.down}
+    rows |= {"transmitted": fractions.on_ground, "unfollowed": fractions.unfollowed}
+    return {name: jnp.asarray(row) for name, row in rows.items()}
 
 
 def _with_longest_flights(setup: Setup) -> Setup:

@@ -4,7 +4,7 @@ import dataclasses
 import math
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -14,7 +14,6 @@ from jaxtyping import Array, PRNGKeyArray
 
 from jaxlidar._checks import check_flag, check_integer, check_key, check_range, is_traced
 from jaxlidar._progress import Progress
-from jaxlidar._statistics import Moments, batches_needed, widening
 from jaxlidar._summary import NOTABLE_FRACTION, late_fraction, percent
 from jaxlidar._threads import side_by_side
 from jaxlidar.instrument.lidar import Lidar
@@ -22,7 +21,18 @@ from jaxlidar.planning.plan import MIN_BATCHES, Plan
 from jaxlidar.planning.plan import plan as make_plan
 from jaxlidar.planning.plan_check import check_plan
 from jaxlidar.planning.setup import make_setup
-from jaxlidar.sampling.batch_programs import BatchTracer, make_batch_tracer
+from jaxlidar.sampling.adaptive import (
+    BATCH_STEPS,
+    AbstractEstimate,
+    HasErrors,
+    StoppingRule,
+    StopReason,
+    sample_until,
+)
+from jaxlidar.sampling.batch_programs import BatchEstimate, BatchTracer, make_batch_tracer
+from jaxlidar.sampling.errors import student_widening
+from jaxlidar.sampling.moments import RunningMoments
+from jaxlidar.sampling.waveform_moments import WaveformErrors, make_waveform_moments
 from jaxlidar.scenes.scene import Scene, check_kinds
 from jaxlidar.spectral.apply_optics import BudgetTerms, samples_and_budget
 from jaxlidar.spectral.waveform import Waveform, open_at_first_return
@@ -255,10 +265,53 @@ def _trace_transformed(tracer: BatchTracer, key: PRNGKeyArray) -> _Traced:
     def stderr(values: Array) -> Array:
         # Standard errors have no derivatives: they would be those of the noise.
         variance = jnp.var(jax.lax.stop_gradient(values), axis=0)
-        return widening(MIN_BATCHES) * jnp.sqrt(variance / (MIN_BATCHES - 1))
+        return student_widening(MIN_BATCHES) * jnp.sqrt(variance / (MIN_BATCHES - 1))
 
     total = jax.tree.map(lambda a: jnp.sum(a, axis=0), responses)
     return _Traced(total, MIN_BATCHES, stderr(samples), jax.tree.map(stderr, terms.energy_budget), {})
+
+
+class _WaveformEstimate(AbstractEstimate):
+    """Sum of the responses of batches, and the moments from which their standard errors follow.
+
+    - `response_sum`: the sum. - `waveforms`: moments of waveforms.
+    - `budgets`: moments of energy budgets, with the mean of the neglected reflectance. - `budget_names`: of
+      their rows.
+    """
+
+    def __init__(
+        self, tracer: BatchTracer, trace: Callable[[range], Iterable[tuple[Response, BatchEstimate]]]
+    ):
+        """`trace`: traces the batches with the given numbers."""
+        self.tracer, self.trace = tracer, trace
+        self.n_wavelengths = tracer.setup.lidar.wavelength.size
+        n_samples = tracer.setup.plan.n_samples
+        self.waveforms = make_waveform_moments(tracer.error_model, self.n_wavelengths, n_samples)
+        self.response_sum: Any = None
+        self.budgets: Any = None
+        self.budget_names: tuple[str, ...] = ()
+
+    @property
+    def n_batches(self) -> int:
+        """Number of batches."""
+        return self.waveforms.count
+
+    def add_batches(self, numbers: range) -> None:
+        """Trace batches and add them."""
+        for response, batch in self.trace(numbers):
+            self.response_sum = self.tracer.add(self.response_sum, response)
+            # Wavelengths beyond the lidar's are padding.
+            budget = np.asarray(batch.budget)[:, : self.n_wavelengths]
+            neglected = np.asarray(batch.neglected)[: self.n_wavelengths]
+            if self.budgets is None:
+                self.budgets = RunningMoments.on_host(budget, neglected)
+                self.budget_names = batch.budget_names
+            self.budgets = self.budgets.update(budget, neglected)
+            self.waveforms.add(batch.samples)
+
+    def errors(self) -> WaveformErrors:
+        """Return the errors of the waveform."""
+        return self.waveforms.errors()
 
 
 def _trace_batches(
@@ -269,57 +322,51 @@ def _trace_batches(
     start_time: float,
 ) -> _Traced:
     """Trace batches on all cores, round after round, until the goal is reached."""
-    begun, plan = time.perf_counter(), tracer.setup.plan
+    plan = tracer.setup.plan
     rtol = plan.rtol if goal.rtol is None else goal.rtol
-    fixed = None if goal.n_photons is None else max(MIN_BATCHES, -(-goal.n_photons // plan.n_photons))
-    many = tracer.setup.lidar.wavelength.size
-    counted = plan.photons_traced
-    whole: Any = None
-    waves, shares, neglected = tracer.error_model.moments(many, plan.n_samples), Moments(), Moments()
-    wanted, stopped = MIN_BATCHES, "tolerance met"
-    batch = tracer.batch_function(key)
+    if goal.n_photons is None:
+        stop = StoppingRule(rtol, goal.atol, MIN_BATCHES)
+    else:
+        stop = StoppingRule(None, 0.0, MIN_BATCHES, max(MIN_BATCHES, -(-goal.n_photons // plan.n_photons)))
+    trace_batch = tracer.batch_function(key)
     with side_by_side() as run:
-        try:
-            while True:
-                for response, its in run(batch, range(waves.count, wanted)):
-                    whole = tracer.add(whole, response)
-                    waves.add(its.samples)
-                    shares.add(np.asarray(its.budget)[:, :many])
-                    neglected.add(np.asarray(its.neglected)[:many])
-                    names = its.budget_names
-                done, seconds = waves.count, time.perf_counter() - start_time
-                known = waves.spectra()
-                if progress is not None:
-                    progress(Progress(done, done * counted, seconds, known.relative, None if fixed else rtol))
-                if fixed is not None and done >= fixed:
-                    stopped = "photons traced"
-                    break
-                if fixed is None and (known.relative <= rtol or known.largest <= goal.atol):
-                    break
-                if seconds >= goal.max_seconds:
-                    stopped = "time spent"
-                    break
-                # Rounds are short, so that time and interrupts are looked at in between.
-                wanted = min(fixed, 4 * done) if fixed else batches_needed(done, known.relative, rtol)
-                if math.isfinite(goal.max_seconds):
-                    pace = done / max(time.perf_counter() - begun, 1e-9)
-                    wanted = max(min(wanted, done + int(pace * (goal.max_seconds - seconds))), done + 1)
-        except KeyboardInterrupt:
-            if waves.count < MIN_BATCHES:
-                raise
-            known, stopped = waves.spectra(), "interrupted"
-    neglected_fraction = 0.0
-    if stopped == "tolerance met" and plan.scope.automatic_orders:
-        share = float(np.max(neglected.mean / np.maximum(known.whole, 1e-30), initial=0.0))
-        if share > rtol and float(np.max(neglected.mean, initial=0.0)) > goal.atol:
-            neglected_fraction, stopped = share, f"orders beyond {plan.orders} may add {percent(share)}"
+        estimate = _WaveformEstimate(tracer, lambda numbers: run(trace_batch, numbers))
+
+        def report(errors: HasErrors) -> None:
+            if progress is not None:
+                batches, seconds = estimate.n_batches, time.perf_counter() - start_time
+                photons = batches * plan.photons_traced
+                progress(Progress(batches, photons, seconds, errors.relative, stop.rtol))
+
+        reason, errors = sample_until(
+            estimate,
+            stop,
+            BATCH_STEPS,
+            max_seconds=goal.max_seconds,
+            start_time=start_time,
+            report=report,
+            keeps_interrupted=True,
+        )
+    assert isinstance(errors, WaveformErrors)
+    stopped, neglected_fraction = reason.value, 0.0
+    if reason is StopReason.TOLERANCE_MET and plan.scope.automatic_orders:
+        neglected = estimate.budgets.mean_only
+        fraction = float(np.max(neglected / np.maximum(errors.total, 1e-30), initial=0.0))
+        if fraction > rtol and float(np.max(neglected, initial=0.0)) > goal.atol:
+            neglected_fraction = fraction
+            stopped = f"orders beyond {plan.orders} may add {percent(fraction)}"
     info = {
-        "photons": waves.count * counted,
-        "batches": waves.count,
+        "photons": estimate.n_batches * plan.photons_traced,
+        "batches": estimate.n_batches,
         "seconds": time.perf_counter() - start_time,
-        "error": known.relative,
+        "error": errors.relative,
         "stopped": stopped,
     }
-    assert whole is not None
-    budget_stderr = {name: jnp.asarray(row) for name, row in zip(names, shares.stderr)}
-    return _Traced(whole, waves.count, jnp.asarray(known.stderr), budget_stderr, info, neglected_fraction)
+    return _Traced(
+        response=estimate.response_sum,
+        batches=estimate.n_batches,
+        stderr=jnp.asarray(errors.stderr),
+        energy_budget_stderr=dict(zip(estimate.budget_names, map(jnp.asarray, estimate.budgets.stderr))),
+        info=info,
+        neglected_fraction=neglected_fraction,
+    )

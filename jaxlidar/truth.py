@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxlidar._checks import check_kind, is_traced
+from jaxlidar._checks import briefly, check_kind, is_traced
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._programs import Program
 from jaxlidar._vectors import FAR, Scalar
@@ -51,6 +51,7 @@ _RAYS_AT_ONCE = 512
 
 
 @final
+@briefly
 class Truth(eqx.Module):
     """What a beam meets in a scene: labels for its waveform, sample by sample.
 

@@ -10,6 +10,9 @@ import matplotlib
 import numpy as np
 import pytest
 
+import inversion
+import jaxlidar
+
 matplotlib.use("agg")
 ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("jaxlidar", "inversion", "examples")
@@ -41,6 +44,15 @@ def test_examples_run_as_printed(path, number, tmp_path, monkeypatch):
     exec(compile(blocks(path, "python")[number], page_name(path), "exec"), names)
     if "wave" in names:
         assert np.all(np.isfinite(np.asarray(names["wave"].reflectance)))
+
+
+@pytest.mark.parametrize("path", PAGES, ids=page_name)
+def test_printed_output_is_that_of_the_example_above_it(path, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    pairs = r"^```python\n((?:(?!^```).)*)^```\n\n```text\n(.*?)^```"
+    for code, printed in re.findall(pairs, path.read_text(), re.MULTILINE | re.DOTALL):
+        exec(compile(code, page_name(path), "exec"), {})
+        assert [line.rstrip() for line in capsys.readouterr().out.splitlines()] == printed.splitlines()
 
 
 def anchor(heading):
@@ -81,14 +93,31 @@ def test_the_example_of_a_new_law_is_the_tested_one():
     assert law in (ROOT / "examples" / "minnaert.py").read_text()
 
 
-def test_the_reference_builds_without_a_warning(tmp_path):
-    command = [sys.executable, "-W", "error::UserWarning", "-m", "pdoc", "-o", str(tmp_path)]
-    process = subprocess.run([*command, "jaxlidar", "inversion"], capture_output=True, text=True, cwd=ROOT)
+@pytest.mark.parametrize("package", [jaxlidar, inversion], ids=lambda package: package.__name__)
+def test_every_public_name_has_its_place_under_one_topic(package):
+    topics = re.split(r"^## .*$", package.__doc__, flags=re.MULTILINE)[1:]
+    assert len(topics) >= 4
+    assert [name for topic in topics for name in re.findall(r"`(\w+)`", topic)] == package.__all__
+
+
+def test_the_reference_builds_without_a_warning_and_its_links_have_targets(tmp_path):
+    command = [sys.executable, "-W", "error::UserWarning", "-m", "jaxlidar.cli", "reference", "-o", tmp_path]
+    process = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
     assert process.returncode == 0, process.stderr
     assert "Warn" not in process.stderr, process.stderr
-    for page in ("jaxlidar.html", "inversion.html", "jaxlidar/io.html", "jaxlidar/plot.html"):
-        assert (tmp_path / page).exists()
-    assert "HenyeyGreenstein" in (tmp_path / "jaxlidar.html").read_text()
+    main_page = (tmp_path / "jaxlidar.html").read_text()
+    assert "HenyeyGreenstein" in main_page
+    assert "Surveys of many shots" in main_page
+    web_pages = list(tmp_path.rglob("*.html"))
+    for name in ("inversion", "jaxlidar/io", "jaxlidar/plot", "pages/jaxlidar", "pages/jaxlidar_io"):
+        assert tmp_path / f"{name}.html" in web_pages
+    for page in web_pages:
+        links = re.findall(r'(?:href|src)="([^"#:]+\.(?:html|png))(?:#([^"]+))?"', page.read_text())
+        assert links
+        for target, fragment in links:
+            linked = (page.parent / target).resolve()
+            assert linked.exists(), (page, target)
+            assert not fragment or f'id="{fragment}"' in linked.read_text(), (page, target, fragment)
 
 
 def test_the_benchmarks_page_is_made_from_their_records():

@@ -133,9 +133,47 @@ def question_docstrings(folder: str) -> tuple[list[str], float]:
 
 IN_WORK = pytest.mark.xfail(strict=False, reason="in work")
 # Folders that do not meet a bound yet. A folder that meets it leaves its list.
-VAGUE_IN_WORK = set(folders_with_sources("jaxlidar", "inversion", "tests"))
-DOCSTRINGS_IN_WORK = set(folders_with_sources("jaxlidar", "inversion"))
-COMMENTS_IN_WORK = set(COMMENTED)
+VAGUE_IN_WORK = {
+    "inversion",
+    "inversion/fit",
+    "jaxlidar",
+    "jaxlidar/cli",
+    "jaxlidar/io",
+    "jaxlidar/optics",
+    "jaxlidar/planning",
+    "jaxlidar/plants",
+    "jaxlidar/plot",
+    "jaxlidar/survey",
+    "jaxlidar/trace",
+    "tests/cli",
+    "tests/fuzz",
+    "tests/instrument",
+    "tests/inversion/fit",
+    "tests/io",
+    "tests/optics",
+    "tests/plants",
+    "tests/plot",
+    "tests/scenes",
+    "tests/survey",
+}
+DOCSTRINGS_IN_WORK = {
+    "inversion/fit",
+    "jaxlidar",
+    "jaxlidar/cli",
+    "jaxlidar/io",
+    "jaxlidar/optics",
+    "jaxlidar/planning",
+    "jaxlidar/plants",
+    "jaxlidar/plot",
+    "jaxlidar/spectral",
+    "jaxlidar/survey",
+}
+COMMENTS_IN_WORK = {
+    "jaxlidar/trace",
+    "jaxlidar/planning",
+    "jaxlidar/survey",
+    "inversion",
+}
 CLASSES_IN_WORK = IN_WORK
 
 

@@ -96,16 +96,16 @@ def main() -> None:
         return jax.jacfwd(lambda o: apply_optics(traced, o, geometric))(optical)
 
     def layer_columns(optical, geometric, key):
-        def total(shares):
-            grown = extinction * shares[layer][None, None]
+        def total(factors):
+            grown = extinction * factors[layer][None, None]
             setup = jl.make_setup(lidar, scene_at(optical, geometric, grown), plan)
             return jl.total_reflectance(jl.trace_scene(setup, key, reverse=False), setup)
 
         push = jax.vmap(lambda t: jax.jvp(total, (jnp.ones(LAYERS),), (t,)), out_axes=(None, -1))
         return push(jnp.eye(LAYERS))
 
-    def grow(scene, shares):
-        grown = extinction * shares[layer][None, None]
+    def grow(scene, factors):
+        grown = extinction * factors[layer][None, None]
         return eqx.tree_at(lambda s: s.canopy.voxels.leaf, scene, grown)
 
     unknown = inversion.Unknown(apply=grow, name="layers", bounds=(0.1, 4.0), start=jnp.ones(LAYERS))

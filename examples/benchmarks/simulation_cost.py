@@ -49,7 +49,7 @@ def split(scene: jl.Scene, rounds: int) -> dict[str, float]:
         # Without derivatives, as `simulate` does.
         def trace(scene, key):
             return trace_device_scene(
-                build_device_scene(jl.make_setup(LIDAR, scene, plan), derivatives="none"), None, key
+                build_device_scene(jl.make_setup(LIDAR, scene, plan), derivatives="none"), key
             )
 
         return eqx.filter_jit(trace)

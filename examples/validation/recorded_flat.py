@@ -25,7 +25,7 @@ from inversion.fit.retrieval import scale_of
 from inversion.receiver.digitiser import amplitude_table
 from inversion.receiver.recorder import RecorderModel
 from jaxlidar.io import read_pulsewaves
-from jaxlidar.io.pedestal import above_pedestal
+from jaxlidar.io.noise import above_pedestal
 
 COUNTS, CORRELATED = 0.9, 0.6
 STRONG, NARROWEST = (120, 200), 120

@@ -32,6 +32,7 @@ from inversion.receiver.recorder import Recorder, check_names, recorder_unknowns
 from jaxlidar import Lidar, Plan, Scene
 from jaxlidar.extend import briefly, check_integer, check_key, check_kind, fingerprint
 from jaxlidar.io import save
+from jaxlidar.io.datasets import datasets_of, variables_by_item
 
 
 @dataclasses.dataclass(frozen=True)
@@ -134,22 +135,17 @@ class Retrievals(AbstractFitted):
         """
         import xarray
 
-        def variable(name: str, array: np.ndarray) -> tuple:
-            return (("footprint", *(f"{name} {i}" for i in range(array.ndim - 1))), array)
-
-        columns = {name: variable(name, v) for name, v in self.values.items()}
-        for field in ("stderr", "robust_stderr", "prior_share", "at_bound"):
-            called = field.replace("_", " ")
-            columns |= {f"{name} {called}": variable(name, v) for name, v in getattr(self, field).items()}
-        columns |= {
-            "reduced_chi2": ("footprint", self.reduced_chi2),
-            "second_minimum": ("footprint", self.second_minimum),
-            "independent_samples": ("footprint", self.independent_samples),
-            "converged": ("footprint", self.converged),
-            "steps": ("footprint", self.steps),
-            "status": ("footprint", np.array(self.status, dtype=object)),
-            "fitted": (("footprint", "wavelength", "bin"), self.fitted),
-        }
+        stored = datasets_of(self)["/"]
+        columns: dict[str, Any] = {}
+        for field in ("values", "stderr", "robust_stderr", "prior_share", "at_bound"):
+            suffix = "" if field == "values" else f" {field.replace('_', ' ')}"
+            for name, variable in variables_by_item(stored, field).items():
+                axes = {axis: f"{name} {i}" for i, axis in enumerate(stored[variable].dims[1:])}
+                columns[f"{name}{suffix}"] = stored[variable].rename(axes)
+        for name in ("reduced_chi2", "second_minimum", "independent_samples", "converged", "steps"):
+            columns[name] = stored[name]
+        columns["status"] = ("footprint", np.array(self.status, dtype=object))
+        columns["fitted"] = stored["fitted"].rename(time="bin")
         return xarray.Dataset(columns)
 
 

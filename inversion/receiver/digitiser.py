@@ -21,7 +21,7 @@ from jaxtyping import ArrayLike, Float, Shaped
 
 from inversion.receiver.impulse import HardTargetEcho, receiver_impulse
 from jaxlidar.extend import check_range
-from jaxlidar.io.pedestal import above_pedestal
+from jaxlidar.io.noise import above_pedestal
 
 # Tables in decibels mark counts without an amplitude by entries below this (RIEGL's PulseWaves: -2e37).
 _NO_AMPLITUDE = -1e3

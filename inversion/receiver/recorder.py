@@ -29,7 +29,7 @@ from scipy import linalg, optimize
 
 from inversion.fit.unknowns import Place, Settled, start_from
 from jaxlidar import Lidar
-from jaxlidar.extend import as_array, as_scalar, check_integer, check_range, concrete
+from jaxlidar.extend import as_array, as_scalar, briefly, check_integer, check_range, concrete
 
 _WIDTH, _OFFSET = "receiver width", "offset"
 # Returns of the scene below this fraction of the strongest one are rounding.
@@ -51,6 +51,7 @@ def _scalar(x: Any) -> Array:
 
 
 @final
+@briefly
 class Recorder(eqx.Module):
     """Receiver and digitisers of a recorder, for `retrieve` and `retrieve_many`. Its gain is their `scale`.
 

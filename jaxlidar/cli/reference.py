@@ -1,7 +1,9 @@
 """`jaxlidar reference`."""
 
+import importlib
 import importlib.util
 import re
+import shutil
 import types
 from importlib import metadata
 from pathlib import Path
@@ -10,7 +12,7 @@ import click
 
 from jaxlidar.cli import COMMANDS, version
 
-LINK = re.compile(r"(?<!!)\[([^]]*)\]\(([^)#\s]*)(#[^)]*)?\)")
+LINK = re.compile(r"(!?)\[([^]]*)\]\(([^)#\s]*)(#[^)]*)?\)")
 # Of the web pages that are made from pages of documentation.
 PAGES = "pages"
 
@@ -38,12 +40,13 @@ def reference(out: Path) -> None:
         raise click.ClickException(f"{error.name} is missing: pip install 'jaxlidar[docs]'") from None
     packages = ["jaxlidar", *(point.module for point in metadata.entry_points(group=COMMANDS))]
     packages = list(dict.fromkeys(name.partition(".")[0] for name in packages))
-    modules = {name: doc.Module.from_name(name) for name in extract.walk_specs(packages)}
+    modules = {name: doc.Module.from_name(name) for name in extract.walk_specs(packages) if _is_module(name)}
     pages = find_pages(packages)
     for name in packages:
         modules[name].docstring += _list_of_pages(pages)
+    pictures: dict[str, Path] = {}
     for path, module_name in pages.items():
-        modules[module_name] = doc.Module(_page_module(path, pages))
+        modules[module_name] = doc.Module(_page_module(path, pages, pictures))
     render.configure(docformat="markdown", footer_text=f"jaxlidar {version()}", show_source=False)
     for name, module in modules.items():
         web_page = out / f"{name.replace('.', '/')}.html"
@@ -51,7 +54,18 @@ def reference(out: Path) -> None:
         web_page.write_text(render.html_module(module, modules), encoding="utf-8")
     (out / "index.html").write_text(render.html_index(modules), encoding="utf-8")
     (out / "search.js").write_text(render.search_index(modules), encoding="utf-8")
+    for name, picture in pictures.items():
+        shutil.copyfile(picture, out / PAGES / name)
     click.echo(f"{len(modules)} web pages: {out / 'jaxlidar.html'}")
+
+
+def _is_module(name: str) -> bool:
+    """Return whether a name is that of a module for users of its package.
+
+    `jaxlidar.simulate` is not: there the function has hidden the module of the same name.
+    """
+    package, _, member = name.rpartition(".")
+    return not package or isinstance(getattr(importlib.import_module(package), member), types.ModuleType)
 
 
 def find_pages(packages: list[str]) -> dict[Path, str]:
@@ -72,7 +86,7 @@ def find_pages(packages: list[str]) -> dict[Path, str]:
         place = page.relative_to(roots[0].parent) if page.is_relative_to(roots[0].parent) else page
         name = "_".join(place.parent.parts) if place.name == "README.md" else place.stem.lower()
         pages[page] = f"{PAGES}.{name or 'front'}"
-        targets = [(page.parent / target).resolve() for _, target, _ in LINK.findall(page.read_text())]
+        targets = [(page.parent / target).resolve() for _, _, target, _ in LINK.findall(page.read_text())]
         queue += [target for target in targets if target.suffix == ".md" and target.exists()]
     return pages
 
@@ -86,19 +100,22 @@ def _list_of_pages(pages: dict[Path, str]) -> str:
     return "\n".join(["\n\n## Pages\n", *links])
 
 
-def _page_module(page: Path, pages: dict[Path, str]) -> types.ModuleType:
-    """Return a page as the docstring of a module, whose links lead to web pages.
+def _page_module(page: Path, pages: dict[Path, str], pictures: dict[str, Path]) -> types.ModuleType:
+    """Return a page as the docstring of a module, and add the pictures that it shows to `pictures`.
 
     So pdoc gives pages the looks, the search and the links to functions that it gives to modules. Links to
-    other files than pages become plain text, for web pages do not come with them.
+    other files than pages and pictures become plain text, for the files do not come with the web pages.
     """
 
     def web_link(match: re.Match) -> str:
-        text, target, fragment = match[1], match[2], match[3] or ""
-        name = pages.get((page.parent / target).resolve()) if target else pages[page]
-        return text if name is None else f"[{text}]({name.removeprefix(PAGES + '.')}.html{fragment})"
+        mark, text, target, fragment = match[1], match[2], match[3], match[4] or ""
+        path = (page.parent / target).resolve() if target else page
+        if mark and path.exists():
+            name = f"{path.parent.name}_{path.name}"
+            pictures[name] = path
+            return f"![{text}]({name})"
+        if path in pages:
+            return f"[{text}]({pages[path].removeprefix(PAGES + '.')}.html{fragment})"
+        return text
 
-    module = types.ModuleType(pages[page], LINK.sub(web_link, page.read_text()))
-    # pdoc looks for the pictures of a docstring beside its file.
-    module.__file__ = str(page)
-    return module
+    return types.ModuleType(pages[page], LINK.sub(web_link, page.read_text()))

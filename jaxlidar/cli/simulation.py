@@ -17,6 +17,7 @@ from jaxlidar.cli.shared import (
     simulation_progress_bar,
     survey_progress_bar,
 )
+from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.io import Case, read_case
 from jaxlidar.planning.plan import plan as make_plan
 
@@ -29,8 +30,6 @@ def read_complete_case(path: Path, seed: int | None = None, rtol: float | None =
 
     **Raises:** UsageError for a case without a scene.
     """
-    from jaxlidar.instrument.lidar import Lidar
-
     case = read_case(path)
     if case.scene is None:
         raise click.UsageError(f"{path} has no scene")

@@ -34,6 +34,7 @@ from jaxlidar._checks import (
     warn_units,
 )
 from jaxlidar._ranges import Range, check_ranges
+from jaxlidar._signatures import briefly
 from jaxlidar.instrument.pulse import AbstractPulse, GaussianPulse
 from jaxlidar.instrument.receiver import Receiver
 
@@ -56,6 +57,7 @@ def _slant_range(altitude: Float[Array, ""], zenith: Float[Array, ""]) -> Float[
 
 
 @final
+@briefly
 class Lidar(eqx.Module):
     """A full-waveform lidar: its position and pointing, beam, pulse and receiver.
 

@@ -40,6 +40,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from jaxlidar._checks import as_array, as_scalar, check_range, concrete, scalar, warn_units
 from jaxlidar._ranges import Range, check_ranges
+from jaxlidar._signatures import briefly
 
 _FWHM_PER_SIGMA = 2 * math.sqrt(2 * math.log(2))
 # Extents of `support` in standard deviations and in mean lives. A normal variable lies outside +-5.5 sigma
@@ -133,6 +134,7 @@ class AbstractPulse(eqx.Module):
 
 
 @final
+@briefly
 class GaussianPulse(AbstractPulse):
     """A Gaussian pulse, centred on time zero.
 
@@ -180,6 +182,7 @@ class GaussianPulse(AbstractPulse):
 
 
 @final
+@briefly
 class RectangularPulse(AbstractPulse):
     """A pulse of constant power, centred on time zero.
 
@@ -227,6 +230,7 @@ class RectangularPulse(AbstractPulse):
 
 
 @final
+@briefly
 class ExponentiallyModifiedGaussianPulse(AbstractPulse):
     """A Gaussian convolved with a decaying exponential: a pulse with a sharp rise and a long tail.
 
@@ -282,6 +286,7 @@ class ExponentiallyModifiedGaussianPulse(AbstractPulse):
 
 
 @final
+@briefly
 class SampledPulse(AbstractPulse):
     """A recorded transmit waveform: linear between its samples, zero outside, scaled to unit area.
 

@@ -39,6 +39,7 @@ from jaxlidar._checks import (
 )
 from jaxlidar._constants import PLANCK_TIMES_LIGHT
 from jaxlidar._ranges import Range, check_ranges
+from jaxlidar._signatures import briefly
 from jaxlidar.instrument.photon_counter import PhotonCounter, PhotonEvents, count_photons
 
 # Above this expectation a Poisson count is drawn as a normal variable (skewness below 1e-3): the exact
@@ -49,6 +50,7 @@ Wavelengths: TypeAlias = ArrayLike | Sequence[ArrayLike]
 
 
 @final
+@briefly
 class Receiver(eqx.Module):
     """Detection, noise and digitisation of a waveform. The default is a perfect record.
 

@@ -30,6 +30,7 @@ from jaxlidar._checks import (
     concrete_array,
     concrete_number,
 )
+from jaxlidar._signatures import briefly
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.instrument.scan import MAX_ZENITH, AbstractScan
 
@@ -39,6 +40,7 @@ _SPACING_TOLERANCE = 1e-6
 
 
 @final
+@briefly
 class Survey(eqx.Module):
     """Many shots of one lidar: where the beam axis of each meets the reference plane, and its direction.
 

@@ -2,17 +2,24 @@
 
 from jaxlidar._files import atomic_write
 from jaxlidar._signatures import shorten_signatures
-from jaxlidar.io.airborne import AirborneShot, Returns, Scanner, Segment
-from jaxlidar.io.airborne_shots import AirborneShots, ShotStack, stack_shots
+from jaxlidar.io.airborne import (
+    AirborneShot,
+    AirborneShots,
+    Returns,
+    Scanner,
+    Segment,
+    ShotStack,
+    stack_shots,
+)
 from jaxlidar.io.case import Case, write_case
+from jaxlidar.io.datasets import keep_as_netcdf
 from jaxlidar.io.dem import DemRead, read_dem
 from jaxlidar.io.gedi import GediShot, read_gedi_l1b
 from jaxlidar.io.gedi_writer import write_gedi_l1b
-from jaxlidar.io.las import PointCloud, read_las
-from jaxlidar.io.las_waveforms import read_las_waveforms
-from jaxlidar.io.las_write import write_las, write_las_waveforms
+from jaxlidar.io.las import PointCloud, read_las, write_las
+from jaxlidar.io.las_waveforms import read_las_waveforms, write_las_waveforms
 from jaxlidar.io.neon import NeonImpulse, NeonRead, read_neon
-from jaxlidar.io.netcdf import keep_as_netcdf, read_case, save
+from jaxlidar.io.netcdf import read_case, save
 from jaxlidar.io.obj import MeshRead, read_obj
 from jaxlidar.io.pulsewaves import read_pulsewaves
 from jaxlidar.io.qsm import TreeRead, read_qsm

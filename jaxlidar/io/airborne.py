@@ -1,29 +1,39 @@
-"""Records of airborne full-waveform lidar, one kind for all formats.
+"""Shots of airborne full-waveform lidar, in one form for all file formats.
 
-A digitiser records segments: some of the outgoing pulse, some of what returns. All segments of a shot have
-one clock, in ns. What returns at time t comes from a target at `anchor` + t `direction`, whose echo has the
+A digitiser records segments of the outgoing pulse and of the return. All segments of a shot have one clock,
+in ns. Light that returns at time t comes from a target at `anchor` + t `direction`, whose echo has the
 pulse's time zero at t. `pulse_zero` is that zero on the clock of the outgoing segments.
 
-Samples stay as they were recorded. What an instrument adds to them (pedestals that differ between interleaved
-digitisers, tables that give counts amplitudes, saturation) is not removed.
+Samples stay as they were recorded. Effects of the instrument (pedestals that differ between interleaved
+digitisers, tables that give counts amplitudes, saturation) are not removed.
 """
 
+import abc
 import dataclasses
 import functools
 import itertools
-from typing import NamedTuple
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple, overload
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
-from jaxlidar.io.pedestal import above_pedestal
+from jaxlidar.io.noise import NoiseLevels, above_pedestal, estimate_noise_levels
 
 # Most samples from the first to the last one of a shot: 150 km at 1 ns.
-_LONGEST = 1_000_000
+_MAX_SAMPLES = 1_000_000
+# Shots of a file, evenly spaced, from which noise is estimated.
+_MAX_SHOTS_FOR_NOISE = 1000
+
+
+def evenly_spaced(count: int) -> slice:
+    """Return a slice of so many shots that selects at most a thousand of them, evenly spaced."""
+    return slice(0, count, -(-count // _MAX_SHOTS_FOR_NOISE))
 
 
 class Segment(NamedTuple):
-    """Samples in a row of one channel of a digitiser.
+    """Consecutive samples of one channel of a digitiser.
 
     - `samples`: (samples,) as stored.
     - `start`: time of the first sample, ns on the shot's clock.
@@ -88,9 +98,9 @@ class Returns(NamedTuple):
 
 
 class Scanner(NamedTuple):
-    """What a file says of the scanner; None where it says nothing.
+    """The scanner of a file; None for properties that the file does not state.
 
-    - `instrument`, `serial`: names.
+    - `instrument`, `serial`: name and serial number.
     - `wavelength`: nm.
     - `pulse_width`: full width at half maximum of the outgoing pulse, ns.
     - `divergence`: mrad.
@@ -119,9 +129,10 @@ class AirborneShot:
     **Arguments:**
 
     - `index`: the file's number of the shot.
-    - `anchor`: (3,) where what returns at time 0 comes from: easting, northing and elevation in m, or as in
-      the file.
-    - `direction`: (3,) the way from there of what returns 1 ns later, in units of `anchor`.
+    - `anchor`: (3,) position from which light returns at time 0: easting, northing and elevation in m, or as
+      in the file.
+    - `direction`: (3,) vector from there to the position from which light returns 1 ns later, in units of
+      `anchor`.
     - `returning`: `Segment`s of the return, at least one.
     - `outgoing`: `Segment`s of the outgoing pulse. Default: none.
     - `noise_mean`, `noise_std`: mean and standard deviation of the noise in values of samples, estimated from
@@ -172,33 +183,33 @@ class AirborneShot:
                     f"shot {self.index}: a segment of {segment.samples.size} samples every {step:g} ns from "
                     f"{start:g} ns, gain {segment.gain:g}, offset {segment.offset:g}"
                 )
-        first, places = self._segments[0], self._places
+        first, indices = self._segments[0], self._first_indices
         if any(segment.step != first.step for segment in self._segments):
             raise ValueError(f"shot {self.index}: segments of channel {first.channel} have different steps")
-        ends = [place + segment.samples.size for place, segment in zip(places, self._segments)]
-        if any(start < end for start, end in zip(places[1:], ends)):
+        ends = [index + segment.samples.size for index, segment in zip(indices, self._segments)]
+        if any(start < end for start, end in zip(indices[1:], ends)):
             raise ValueError(f"shot {self.index}: segments of channel {first.channel} overlap")
-        if ends[-1] > _LONGEST:
+        if ends[-1] > _MAX_SAMPLES:
             raise ValueError(
-                f"shot {self.index}: {ends[-1]} samples from the first to the last; at most {_LONGEST} are "
-                "admissible"
+                f"shot {self.index}: {ends[-1]} samples from the first to the last; at most {_MAX_SAMPLES} "
+                "are admissible"
             )
 
     @functools.cached_property
     def _segments(self) -> tuple[Segment, ...]:
-        """The returning segments of the first one's channel, in order of time."""
+        """Returning segments of the first segment's channel, in order of time."""
         channel = self.returning[0].channel
         return tuple(sorted((s for s in self.returning if s.channel == channel), key=lambda s: s.start))
 
     @functools.cached_property
-    def _places(self) -> list[int]:
-        """At which samples, counted from the first, the segments begin."""
+    def _first_indices(self) -> list[int]:
+        """Index of the first sample of each segment, counted from the first sample of the shot."""
         steps = (round((b.start - a.start) / a.step) for a, b in itertools.pairwise(self._segments))
         return list(itertools.accumulate(steps, initial=0))
 
     @property
     def is_geographic(self) -> bool:
-        """Whether x and y are degrees."""
+        """True if x and y are degrees."""
         return bool(self.metres[0] != self.metres[2])
 
     @property
@@ -208,37 +219,33 @@ class AirborneShot:
 
     @functools.cached_property
     def recorded(self) -> Bool[np.ndarray, " samples"]:
-        """Whether a sample was recorded: between segments nothing was."""
-        last = self._places[-1] + self._segments[-1].samples.size
-        found = np.zeros(last, bool)
-        for place, segment in zip(self._places, self._segments):
-            found[place : place + segment.samples.size] = True
-        return found
+        """True for samples that were recorded, False between segments."""
+        recorded = np.zeros(self._first_indices[-1] + self._segments[-1].samples.size, bool)
+        for index, segment in zip(self._first_indices, self._segments):
+            recorded[index : index + segment.samples.size] = True
+        return recorded
 
     @functools.cached_property
     def time(self) -> Float[np.ndarray, " samples"]:
         """Times of the samples, ns on the shot's clock, increasing; interpolated between segments."""
-        numbers = np.concatenate(
-            [p + np.arange(s.samples.size) for p, s in zip(self._places, self._segments)]
-        )
         times = np.concatenate([segment.time for segment in self._segments])
-        return np.interp(np.arange(self.recorded.size), numbers, times)
+        return np.interp(np.arange(self.recorded.size), np.flatnonzero(self.recorded), times)
 
     @functools.cached_property
     def waveform(self) -> Float[np.ndarray, " samples"]:
-        """The values received, noise included; 0 where nothing was recorded."""
+        """Values received, noise included; 0 where nothing was recorded."""
         values = np.zeros(self.recorded.size)
         values[self.recorded] = np.concatenate([segment.values for segment in self._segments])
         return values
 
     @property
     def signal(self) -> Float[np.ndarray, " samples"]:
-        """The received waveform less the mean noise; 0 where nothing was recorded."""
+        """Received waveform less the mean noise; 0 where nothing was recorded."""
         return np.where(self.recorded, self.waveform - self.noise_mean, 0.0)
 
     @property
     def position(self) -> Float[np.ndarray, "samples 3"]:
-        """Where a target lies whose echo has the pulse's time zero in a sample, in units of `anchor`."""
+        """Position of a target whose echo has the pulse's time zero in a sample, in units of `anchor`."""
         return self.anchor + self.time[:, None] * self.direction
 
     @property
@@ -254,8 +261,7 @@ class AirborneShot:
 
     @property
     def azimuth(self) -> float:
-        """The horizontal direction in which the light travels, in degrees clockwise from north, as in
-        `Lidar`."""
+        """Horizontal direction in which the light travels, in degrees clockwise from north, as in `Lidar`."""
         east, north, _ = self.direction * self.metres
         return float(np.rad2deg(np.arctan2(east, north))) % 360.0
 
@@ -278,14 +284,14 @@ class AirborneShot:
 
     @property
     def pulse_power(self) -> Float[np.ndarray, " pulse_samples"]:
-        """The outgoing pulse: pedestal removed, not negative, and zero before and after the pulse.
+        """Power of the outgoing pulse: pedestal removed, not negative, and zero before and after the pulse.
 
         **Raises:** ValueError where no pulse was recorded, and for one without energy.
         """
         return self._pulse[1]
 
     def of_channel(self, channel: int) -> "AirborneShot":
-        """The shot as one channel recorded it.
+        """Return the shot as one channel recorded it.
 
         **Arguments:** `channel`: number of a channel that a returning segment has.
 
@@ -293,14 +299,14 @@ class AirborneShot:
 
         **Raises:** ValueError where the shot has no such channel.
         """
-        chosen = tuple(segment for segment in self.returning if segment.channel == channel)
-        if not chosen:
-            known = sorted({segment.channel for segment in self.returning})
-            raise ValueError(f"shot {self.index}: channel = {channel} is none of {known}")
-        return dataclasses.replace(self, returning=chosen)
+        segments = tuple(segment for segment in self.returning if segment.channel == channel)
+        if not segments:
+            channels = sorted({segment.channel for segment in self.returning})
+            raise ValueError(f"shot {self.index}: channel = {channel} is none of {channels}")
+        return dataclasses.replace(self, returning=segments)
 
     def time_from(self, elevation: float) -> Float[np.ndarray, " samples"]:
-        """Times of the samples in ns, for a simulation whose reference plane z = 0 lies at `elevation`.
+        """Return the times of the samples in ns, for a simulation whose plane z = 0 lies at `elevation`.
 
         **Arguments:** `elevation`: of the plane, in the unit of `anchor`.
 
@@ -310,10 +316,141 @@ class AirborneShot:
         return self.time - (elevation - self.anchor[2]) / self.direction[2]
 
     def position_at(self, elevation: float) -> Float[np.ndarray, " 2"]:
-        """Where the beam axis meets an elevation.
+        """Return the position in which the beam axis meets an elevation.
 
         **Arguments:** `elevation`: in the unit of `anchor`.
 
         **Returns:** easting and northing, in units of `anchor`.
         """
         return self.anchor[:2] + self.direction[:2] * (elevation - self.anchor[2]) / self.direction[2]
+
+
+# Not Sequence[AirborneShot]: checkers of types at run time would read a shot wherever the sequence is passed.
+class AirborneShots(Sequence, abc.ABC):
+    """The shots of a file: a sequence that reads a shot when it is indexed.
+
+    `shots[5]` is an `AirborneShot`, `shots[:100]` a list of them. The file is mapped, so it may be larger
+    than memory. `read_pulsewaves` and `read_las_waveforms` return it.
+
+    - `path`: the file.
+    - `gps_time`: (shots,) s.
+    - `anchor`, `direction`: (shots, 3) as in `AirborneShot`.
+    - `levels`: mean and standard deviation of the noise, and the pedestal of outgoing pulses: medians of up
+      to 1,000 shots, evenly spread.
+    - `tables`: (counts,) amplitudes of the counts, by the `table` of a `Segment`. They are not applied.
+    - `dropped`: how many points of the file were left out, by reason.
+
+    **Raises:** a shot's ValueError, which names the file and the shot, where it is damaged.
+
+    **Example:**
+
+    >>> from jaxlidar.io import read_pulsewaves
+    >>> shots = read_pulsewaves("flight.pls")  # doctest: +SKIP
+    >>> top = [shot.elevation[shot.signal.argmax()] for shot in shots]  # doctest: +SKIP
+    """
+
+    path: Path
+    tables: dict[int, np.ndarray]
+    dropped: dict[str, int]
+
+    @property
+    @abc.abstractmethod
+    def gps_time(self) -> Float[np.ndarray, " shots"]:
+        """GPS times of the shots, s."""
+
+    @property
+    @abc.abstractmethod
+    def anchor(self) -> Float[np.ndarray, "shots 3"]:
+        """Positions from which light returns at time 0."""
+
+    @property
+    @abc.abstractmethod
+    def direction(self) -> Float[np.ndarray, "shots 3"]:
+        """Vectors from the anchors to the positions from which light returns 1 ns later."""
+
+    @abc.abstractmethod
+    def _read(self, index: int) -> dict[str, Any]:
+        """Return the arguments of `AirborneShot` but for its index and its noise levels."""
+
+    @functools.cached_property
+    def levels(self) -> NoiseLevels:
+        """Mean and standard deviation of the noise, and the pedestal of outgoing pulses."""
+        sampled = (self._read(i) for i in range(len(self))[evenly_spaced(len(self))])
+        return estimate_noise_levels(
+            (shot["outgoing"][0].values if shot["outgoing"] else None, shot["returning"][0].values)
+            for shot in sampled
+        )
+
+    @overload
+    def __getitem__(self, index: int) -> AirborneShot: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[AirborneShot]: ...
+    def __getitem__(self, index: int | slice) -> AirborneShot | list[AirborneShot]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        i = range(len(self))[index]
+        arguments = self._read(i)
+        try:
+            return AirborneShot(i, **self.levels._asdict(), **arguments)
+        except ValueError as error:
+            raise ValueError(f"{self.path}: {error}") from error
+
+    def __iter__(self) -> Iterator[AirborneShot]:
+        return (self[i] for i in range(len(self)))
+
+    def __repr__(self) -> str:
+        return f"{len(self):,} shots of {self.path.name}"
+
+
+class ShotStack(NamedTuple):
+    """Waveforms of several shots as arrays of one length, for `inversion.gaussian_decomposition` and batches.
+
+    - `time`: (samples,) ns from the first sample of each shot.
+    - `signal`: (shots, samples) values less the mean noise; 0 where nothing was recorded.
+    - `recorded`: (shots, samples) True for samples that were recorded.
+
+    **Example:**
+
+    >>> import numpy as np
+    >>> from jaxlidar.io import ShotStack
+    >>> stack = ShotStack(np.arange(3.0), np.array([[0.0, 80.0, 2.0]]), np.full((1, 3), True))
+    >>> noise = np.where(stack.recorded, 1.5, np.inf)
+    """
+
+    time: Float[np.ndarray, " samples"]
+    signal: Float[np.ndarray, "shots samples"]
+    recorded: Bool[np.ndarray, "shots samples"]
+
+
+def stack_shots(shots: Iterable[AirborneShot]) -> ShotStack:
+    """Return the waveforms of several shots, padded to the longest.
+
+    **Arguments:**
+
+    - `shots`: `AirborneShot`s of one sampling interval, at least one.
+
+    **Returns:** a `ShotStack`.
+
+    **Raises:** ValueError where there is no shot, and where sampling intervals differ.
+
+    **Example:**
+
+    >>> import numpy as np
+    >>> from jaxlidar.io import AirborneShot, Segment, stack_shots
+    >>> way = {"anchor": np.array([0.0, 0.0, 20.15]), "direction": np.array([0.0, 0.0, -0.15])}
+    >>> echoes = (np.array([1, 9, 1]), np.array([2, 8, 5, 2]))
+    >>> shots = [AirborneShot(i, **way, returning=(Segment(e, 0.0),)) for i, e in enumerate(echoes)]
+    >>> print(stack_shots(shots).signal)
+    [[1. 9. 1. 0.]
+     [2. 8. 5. 2.]]
+    """
+    shots = list(shots)
+    steps = {shot.sampling_interval for shot in shots}
+    if len(steps) != 1:
+        raise ValueError(f"shots have the sampling intervals {sorted(steps)} ns; admissible is one")
+    size = max(shot.recorded.size for shot in shots)
+    signal, recorded = np.zeros((len(shots), size)), np.zeros((len(shots), size), bool)
+    for row, shot in enumerate(shots):
+        signal[row, : shot.recorded.size] = shot.signal
+        recorded[row, : shot.recorded.size] = shot.recorded
+    return ShotStack(steps.pop() * np.arange(size), signal, recorded)

@@ -32,7 +32,7 @@ from jaxlidar._registry import simulate_survey
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.instrument.survey import Survey
 from jaxlidar.io.kinds import UNITS, Argument
-from jaxlidar.io.npz import arrays_of
+from jaxlidar.io.npz import read_arrays
 from jaxlidar.io.tables import Arrays, check_keys, table_of, value_of
 from jaxlidar.io.toml import tables_of, text_of
 from jaxlidar.scenes.scene import Scene
@@ -265,6 +265,6 @@ def read_case(path: Path) -> Case:
     def arrays(file: str | None, name: str) -> np.ndarray:
         if file is None:
             raise ValueError(f"array = {name!r} has no file: which .npz file it is in")
-        return arrays_of(path.parent / file, (name,))[name]
+        return read_arrays(path.parent / file, (name,))[name]
 
     return case_of(text, path, arrays)

@@ -1,85 +1,93 @@
-"""Coordinates of airborne files: whether they are geographic, and what their units are in metres.
+"""Units of the coordinates of airborne files: geographic or not, and their size in metres.
 
-Files name their coordinate system by GeoTIFF keys or as text. The unit of length need not be read from it:
-two ways of 1 ns are 0.1499 m long, in whatever unit.
+Files name their coordinate system by GeoTIFF keys (OGC GeoTIFF 1.1, section 7) or as text. The unit of length
+need not be read from it: light that returns 1 ns later comes from 0.1499 m farther, in whatever unit.
 """
 
 import struct
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
-from jaxlidar.io.checks import STEP, STEP_TOLERANCE
+from jaxlidar.io.checks import TWO_WAY_METRES_PER_NS, TWO_WAY_TOLERANCE
 
-# Record of the GeoTIFF keys and of the system as text; the key of the kind of system and its value.
+# Numbers of the variable length records with the GeoTIFF keys, and with the system as text.
 GEO_KEYS, WKT = 34735, 2112
+# The key GTModelTypeGeoKey and its value for longitude and latitude.
 _MODEL, _GEOGRAPHIC = 1024, 2
+# The key GeodeticCRSGeoKey and the EPSG code of WGS-84.
+_SYSTEM, _WGS84 = 2048, 4326
 _KEY = struct.Struct("<4H")
 # Units of length in m: metre and foot.
-_UNITS = (1.0, 0.3048)
+_LENGTHS = (1.0, 0.3048)
 # WGS-84: semi-major axis in m, and squared eccentricity.
-_AXIS, _ECCENTRICITY2 = 6378137.0, 0.00669437999014
+_SEMI_MAJOR_AXIS, _ECCENTRICITY2 = 6378137.0, 0.00669437999014
 
 
 def is_geographic(keys: bytes, wkt: bytes = b"") -> bool:
-    """Whether coordinates are longitude and latitude in degrees, by a record of GeoTIFF keys or by text."""
-    whole = len(keys) // _KEY.size * _KEY.size
-    return (_MODEL, 0, 1, _GEOGRAPHIC) in _KEY.iter_unpack(keys[:whole]) or wkt.startswith(b"GEOG")
+    """Return True if GeoTIFF keys, or a text, say that coordinates are longitude and latitude in degrees."""
+    complete = len(keys) // _KEY.size * _KEY.size
+    return (_MODEL, 0, 1, _GEOGRAPHIC) in _KEY.iter_unpack(keys[:complete]) or wkt.startswith(b"GEOG")
 
 
 def geographic_keys() -> bytes:
-    """A record of GeoTIFF keys that says that coordinates are geographic, WGS-84."""
-    return b"".join(
-        _KEY.pack(*row) for row in ((1, 1, 0, 2), (_MODEL, 0, 1, _GEOGRAPHIC), (2048, 0, 1, 4326))
-    )
+    """Return GeoTIFF keys that say that coordinates are geographic, WGS-84."""
+    header = (1, 1, 0, 2)
+    rows = (header, (_MODEL, 0, 1, _GEOGRAPHIC), (_SYSTEM, 0, 1, _WGS84))
+    return b"".join(_KEY.pack(*row) for row in rows)
 
 
-class Frame(NamedTuple):
-    """How the coordinates of a file become metres.
+class CoordinateUnits(NamedTuple):
+    """Units of coordinates x, y and z.
 
-    - `geographic`: whether x and y are degrees.
-    - `unit`: m per unit of length.
+    - `geographic`: True if x and y are degrees.
+    - `length`: m per unit of length.
     """
 
     geographic: bool
-    unit: float
+    length: float
 
-    def metres(self, anchor: Float[np.ndarray, "*shots 3"]) -> Float[np.ndarray, "*shots 3"]:
-        """Metres per unit of x, y and z at places."""
+    def metres(self, position: Float[np.ndarray, "*shots 3"]) -> Float[np.ndarray, "*shots 3"]:
+        """Return the metres per unit of x, y and z at positions.
+
+        A degree of longitude has the length of the parallel's radius, one of latitude that of the meridian's
+        radius of curvature, both at the height of the position.
+        """
         if not self.geographic:
-            return np.full(anchor.shape, self.unit)
-        latitude, up = np.deg2rad(anchor[..., 1]), self.unit * anchor[..., 2]
+            return np.full(position.shape, self.length)
+        latitude, height = np.deg2rad(position[..., 1]), self.length * position[..., 2]
         w = 1.0 - _ECCENTRICITY2 * np.sin(latitude) ** 2
-        east = (_AXIS / np.sqrt(w) + up) * np.cos(latitude)
-        north = _AXIS * (1.0 - _ECCENTRICITY2) / w**1.5 + up
+        east = (_SEMI_MAJOR_AXIS / np.sqrt(w) + height) * np.cos(latitude)
+        north = _SEMI_MAJOR_AXIS * (1.0 - _ECCENTRICITY2) / w**1.5 + height
         degree = np.pi / 180.0
-        return np.stack([east * degree, north * degree, np.full(up.shape, self.unit)], axis=-1)
+        return np.stack([east * degree, north * degree, np.full(height.shape, self.length)], axis=-1)
 
-    def wrong(
+    def has_wrong_length(
         self, anchor: Float[np.ndarray, "*shots 3"], direction: Float[np.ndarray, "*shots 3"]
-    ) -> np.ndarray:
-        """Whether directions do not have the length that light goes there and back in 1 ns."""
+    ) -> Bool[np.ndarray, "*shots"]:
+        """Return True for directions whose length is not that which light goes there and back in 1 ns."""
         length = np.linalg.norm(direction * self.metres(anchor), axis=-1)
-        return np.asarray(~(np.abs(length - STEP) <= STEP_TOLERANCE * STEP))
+        difference = np.abs(length - TWO_WAY_METRES_PER_NS)
+        return np.asarray(~(difference <= TWO_WAY_TOLERANCE * TWO_WAY_METRES_PER_NS))
 
 
-def frame_of(
-    place: str,
+def find_units(
+    location: str,
     geographic: bool,
     anchor: Float[np.ndarray, "shots 3"],
     direction: Float[np.ndarray, "shots 3"],
-) -> Frame:
-    """The frame in which most directions, in units per ns, have the length that they must have.
+) -> CoordinateUnits:
+    """Return the units in which most directions, per ns, have the length that light goes there and back.
 
-    **Raises:** ValueError, naming the place and the length, where there is none.
+    **Raises:** ValueError, naming the location in the file and the length, where there are none.
     """
-    frames = [Frame(geographic, unit) for unit in _UNITS]
-    for frame in frames:
-        if np.mean(frame.wrong(anchor, direction)) < 0.5:
-            return frame
-    length = np.median(np.linalg.norm(direction * frames[0].metres(anchor), axis=-1))
+    candidates = [CoordinateUnits(geographic, length) for length in _LENGTHS]
+    for units in candidates:
+        if np.mean(units.has_wrong_length(anchor, direction)) < 0.5:
+            return units
+    length = np.median(np.linalg.norm(direction * candidates[0].metres(anchor), axis=-1))
     raise ValueError(
-        f"{place}: directions of {length:g} m per ns, where light goes {STEP:.4f} m there and back; read are "
-        "coordinates in metres, feet or, where the file says so, degrees"
+        f"{location}: directions of {length:g} m per ns, where light goes {TWO_WAY_METRES_PER_NS:.4f} m "
+        "there and back; read are coordinates in metres, feet or, where the file says so, degrees"
     )

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxlidar._checks import check_range, check_shape
-from jaxlidar.io.checks import FARTHEST, check_unpacked, existing
-from jaxlidar.io.text import lines_of, number_in, whole_in
+from jaxlidar.io.checks import MAX_COORDINATE, check_unpacked_size, existing_file
+from jaxlidar.io.text import parse_integer, parse_number, read_lines
 from jaxlidar.optics.laws import AbstractLaw, Lambertian
 from jaxlidar.scenes.terrain import Terrain
 
@@ -17,19 +17,19 @@ _CORNERS = ("xllcorner", "yllcorner")
 _CENTRES = ("xllcenter", "yllcenter")
 _KEYS = ("ncols", "nrows", *_CORNERS, *_CENTRES, "cellsize", "dx", "dy", "nodata_value")
 _TIFF = (".tif", ".tiff")
-# What ESRI's own readers take for "no data" where a file does not say.
-_NO_DATA = -9999.0
-# No cell is smaller, and no height is larger, m.
-_FINEST = 1e-3
-_HIGHEST = 1e5
+# The height that ESRI's own readers take for "no data" where a file does not say.
+_DEFAULT_NO_DATA = -9999.0
+# Admissible cell sizes and heights, m.
+_MIN_CELL_SIZE = 1e-3
+_MAX_HEIGHT = 1e5
 
 
 class DemRead(NamedTuple):
-    """What `read_dem` returns: terrain, its coordinates' reference, and what was filled in.
+    """Result of `read_dem`: terrain, its coordinate reference system, and the number of nodes filled in.
 
     - `terrain`: a `Terrain`, one node for each sample of the file.
     - `crs`: the coordinate reference system as the file names it, or None.
-    - `filled`: how many nodes without data were given the height `fill`.
+    - `filled`: number of nodes without data, which have the height `fill`.
 
     **Example:**
 
@@ -53,10 +53,10 @@ def read_dem(
     reflectance: Any = 0.3,
     law: AbstractLaw = Lambertian(),  # noqa: B008
 ) -> DemRead:
-    """The terrain in a digital elevation model: a GeoTIFF (.tif, .tiff) or an ESRI ASCII grid.
+    """Read terrain from a digital elevation model: a GeoTIFF (.tif, .tiff) or an ESRI ASCII grid.
 
-    Samples stand for the centres of their cells, and become the nodes. Coordinates and heights are taken to
-    be in metres.
+    Samples are those at the centres of their cells, which become the nodes. Coordinates and heights are
+    metres.
 
     **Arguments:**
 
@@ -94,112 +94,115 @@ def read_dem(
         west, south, east, north = map(float, bounds)
         if not (west < east and south < north):
             raise ValueError(f"bounds = {tuple(bounds)} is not (west, south, east, north)")
-    path = existing(path)
+    path = existing_file(path)
     read = _tiff if path.suffix.lower() in _TIFF else _ascii
     heights, missing, origin, spacing, crs = read(path, bounds)
-    if not np.all((spacing >= _FINEST) & (spacing <= FARTHEST) & (np.abs(origin) <= FARTHEST)):
+    if not np.all(
+        (spacing >= _MIN_CELL_SIZE) & (spacing <= MAX_COORDINATE) & (np.abs(origin) <= MAX_COORDINATE)
+    ):
         raise ValueError(
             f"{path}: the header: cells of {spacing.tolist()} m at {origin.tolist()}; admissible are "
-            f"cells of {_FINEST:g} m or more, at places within {FARTHEST:g} m"
+            f"cells of {_MIN_CELL_SIZE:g} m or more, at places within {MAX_COORDINATE:g} m"
         )
     if np.any(missing) and fill is None:
-        (row, column), many = np.argwhere(missing)[0], int(missing.sum())
-        x, y = origin + spacing * (row, column)
+        x, y = origin + spacing * np.argwhere(missing)[0]
         raise ValueError(
-            f"{path}: {many} of {missing.size} nodes have no data, the first at x = {x:.9g}, y = {y:.9g}; "
-            "give their height as fill=, or leave them out by bounds="
+            f"{path}: {int(missing.sum())} of {missing.size} nodes have no data, the first at x = {x:.9g}, "
+            f"y = {y:.9g}; give their height as fill=, or leave them out by bounds="
         )
-    bad = ~missing & ~(np.abs(np.where(missing, 0.0, heights)) <= _HIGHEST)
-    if np.any(bad):
-        x, y = origin + spacing * np.argwhere(bad)[0]
+    inadmissible = ~missing & ~(np.abs(np.where(missing, 0.0, heights)) <= _MAX_HEIGHT)
+    if np.any(inadmissible):
+        x, y = origin + spacing * np.argwhere(inadmissible)[0]
         raise ValueError(
-            f"{path}: a height of {heights[bad][0]:g} m at x = {x:.9g}, y = {y:.9g}; admissible is at most "
-            f"{_HIGHEST:g}"
+            f"{path}: a height of {heights[inadmissible][0]:g} m at x = {x:.9g}, y = {y:.9g}; admissible is "
+            f"at most {_MAX_HEIGHT:g}"
         )
     heights = np.where(missing, fill if fill is not None else 0.0, heights)
     terrain = Terrain(heights=heights, spacing=spacing, origin=origin, reflectance=reflectance, law=law)
     return DemRead(terrain, crs, int(missing.sum()))
 
 
-# Heights (nx, ny), where they are missing, the place of the south-west node, spacing, and reference system.
+# Heights (nx, ny), True where they are missing, position of the south-west node, spacing, reference system.
 _Grid = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, str | None]
 
 
 def _within(
     path: Path, bounds: Any, origin: np.ndarray, spacing: np.ndarray, shape: tuple[int, int]
 ) -> tuple[slice, slice]:
-    """Which nodes lie within the bounds, along x and along y."""
+    """Return slices of the nodes within the bounds, along x and along y."""
     if bounds is None:
         return slice(0, shape[0]), slice(0, shape[1])
-    parts = []
+    slices = []
     for k in range(2):
-        place = origin[k] + spacing[k] * np.arange(shape[k])
-        inside = np.flatnonzero((place >= bounds[k]) & (place <= bounds[k + 2]))
+        position = origin[k] + spacing[k] * np.arange(shape[k])
+        inside = np.flatnonzero((position >= bounds[k]) & (position <= bounds[k + 2]))
         if inside.size < 2:
             raise ValueError(
                 f"{path}: {inside.size} nodes lie between {bounds[k]:.9g} and {bounds[k + 2]:.9g} m along "
-                f"{'xy'[k]}; the file has {place[0]:.9g} to {place[-1]:.9g} m, and at least 2 are needed"
+                f"{'xy'[k]}; the file has {position[0]:.9g} to {position[-1]:.9g} m, and at least 2 are "
+                "needed"
             )
-        parts.append(slice(int(inside[0]), int(inside[-1]) + 1))
-    return parts[0], parts[1]
+        slices.append(slice(int(inside[0]), int(inside[-1]) + 1))
+    return slices[0], slices[1]
 
 
 def _ascii(path: Path, bounds: Any) -> _Grid:
-    _, lines = lines_of(path)
+    _, lines = read_lines(path)
+    # Text and line number of each entry of the header, which ends where a line begins with no keyword.
     head: dict[str, tuple[str, int]] = {}
-    at = 0
-    for at, line in enumerate(lines):
+    end = 0
+    for end, line in enumerate(lines):
         cells = line.split()
         if not cells or cells[0].lower() not in _KEYS:
             break
         key = cells[0].lower()
         if len(cells) != 2 or key in head:
-            raise ValueError(f"{path}: line {at + 1}: {line.strip()[:40]!r} is no line of a header")
-        head[key] = (cells[1], at + 1)
+            raise ValueError(f"{path}: line {end + 1}: {line.strip()[:40]!r} is no line of a header")
+        head[key] = (cells[1], end + 1)
 
     def number(key: str) -> float:
         if key not in head:
-            raise ValueError(f"{path}: line {at + 1}: the header has no {key}: no ESRI ASCII grid")
+            raise ValueError(f"{path}: line {end + 1}: the header has no {key}: no ESRI ASCII grid")
         text, line = head[key]
-        value = number_in(path, line, key, text)
-        if not abs(value) <= FARTHEST:
-            raise ValueError(f"{path}: line {line}: {key} = {text} lies beyond {FARTHEST:g}")
+        value = parse_number(path, line, key, text)
+        if not abs(value) <= MAX_COORDINATE:
+            raise ValueError(f"{path}: line {line}: {key} = {text} lies beyond {MAX_COORDINATE:g}")
         return value
 
     nx, ny = (int(number(key)) for key in ("ncols", "nrows"))
     for key, count in (("ncols", nx), ("nrows", ny)):
-        if whole_in(path, head[key][1], key, head[key][0]) < 2:
+        if parse_integer(path, head[key][1], key, head[key][0]) < 2:
             raise ValueError(f"{path}: line {head[key][1]}: {key} = {count}; at least 2 are needed")
-    sides = ("dx", "dy") if "dx" in head else ("cellsize",) * 2
-    spacing = np.array([number(key) for key in sides])
-    for key, size in zip(sides, spacing):
+    size_keys = ("dx", "dy") if "dx" in head else ("cellsize",) * 2
+    spacing = np.array([number(key) for key in size_keys])
+    for key, size in zip(size_keys, spacing):
         if not size > 0:
             raise ValueError(f"{path}: line {head[key][1]}: {key} = {size:g}; admissible is above 0")
-    centred = _CENTRES[0] in head
-    corner = np.array([number(key) for key in (_CENTRES if centred else _CORNERS)])
-    origin = corner if centred else corner + 0.5 * spacing
-    check_unpacked(path, "the header", 2 * nx * ny)
+    is_centred = _CENTRES[0] in head
+    corner = np.array([number(key) for key in (_CENTRES if is_centred else _CORNERS)])
+    origin = corner if is_centred else corner + 0.5 * spacing
+    check_unpacked_size(path, "the header", 2 * nx * ny)
     x, y = _within(path, bounds, origin, spacing, (nx, ny))
     heights = np.empty((ny, nx))
-    # Rows of the file need not be lines: values are counted.
-    filled, flat = 0, heights.reshape(-1)
-    for row, line in enumerate(lines[at:], at + 1):
+    # Rows of the grid need not be lines of the file, so values are counted.
+    count, flat = 0, heights.reshape(-1)
+    for number_of_line, line in enumerate(lines[end:], end + 1):
         cells = line.split()
-        if filled + len(cells) > flat.size:
-            raise ValueError(f"{path}: line {row}: more than {nx} x {ny} heights")
+        if count + len(cells) > flat.size:
+            raise ValueError(f"{path}: line {number_of_line}: more than {nx} x {ny} heights")
         try:
-            flat[filled : filled + len(cells)] = cells
+            flat[count : count + len(cells)] = cells
         except ValueError:
+            # One by one, for an error that names the cell.
             for cell in cells:
-                number_in(path, row, "height", cell)
-        filled += len(cells)
-    if filled < flat.size:
-        raise ValueError(
-            f"{path}: line {len(lines)}: {flat.size - filled} of {flat.size} heights are missing"
-        )
-    none = number("nodata_value") if "nodata_value" in head else _NO_DATA
+                parse_number(path, number_of_line, "height", cell)
+        count += len(cells)
+    if count < flat.size:
+        raise ValueError(f"{path}: line {len(lines)}: {flat.size - count} of {flat.size} heights are missing")
+    no_data = number("nodata_value") if "nodata_value" in head else _DEFAULT_NO_DATA
+    # Rows run from north to south.
     heights = heights[::-1].T[x, y]
-    missing = (heights == none) | np.isnan(heights)
+    missing = (heights == no_data) | np.isnan(heights)
     return heights, missing, origin + spacing * (x.start, y.start), spacing, None
 
 
@@ -212,10 +215,11 @@ def _tiff(path: Path, bounds: Any) -> _Grid:
         raise ImportError("GeoTIFF needs the package rasterio: pip install 'jaxlidar[io]'") from error
     try:
         with warnings.catch_warnings():
-            # Refused below.
+            # A file without a position is refused below.
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            opened = rasterio.open(path, driver="GTiff")
-        with opened as file:
+            dataset = rasterio.open(path, driver="GTiff")
+        with dataset as file:
+            # x = a column + b row + c, y = d column + e row + f.
             t, (ny, nx) = file.transform, (file.height, file.width)
             if t.is_identity or t.b != 0 or t.d != 0 or t.a <= 0 or t.e >= 0:
                 raise ValueError(f"{path}: the transform {tuple(t)[:6]} is not north-up")
@@ -226,7 +230,7 @@ def _tiff(path: Path, bounds: Any) -> _Grid:
             if nx < 2 or ny < 2:
                 raise ValueError(f"{path}: {nx} x {ny} samples; at least 2 x 2 are needed")
             x, y = _within(path, bounds, origin, spacing, (nx, ny))
-            check_unpacked(path, "the header", 4 * (x.stop - x.start) * (y.stop - y.start))
+            check_unpacked_size(path, "the header", 4 * (x.stop - x.start) * (y.stop - y.start))
             window = Window.from_slices((ny - y.stop, ny - y.start), (x.start, x.stop))
             band = file.read(1, window=window, masked=True)
             crs = None if file.crs is None else file.crs.to_string()

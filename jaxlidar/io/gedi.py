@@ -1,11 +1,11 @@
-"""Reader of recorded waveforms: GEDI's level 1B product.
+"""Reader of spaceborne waveforms: GEDI's level 1B product.
 
-The product's data dictionary does not say everything about what the fields of a shot refer to. The following
-was found from the recorded numbers, and `GediShot` relies on it.
+The product's data dictionary does not say everything about the fields of a shot. The following was found from
+the recorded numbers, and `GediShot` relies on it.
 
 - The time from transmission to the first received bin, 2 `bounce_time_offset_bin0`, equals `rx_open` +
   `rx_offset` - `tx_gloc` plus a constant of the channel, in samples of 1 ns (to 1e-6 ns in some beams, else
-  to whole clock steps of 4 ns). So the elevation of a bin is where a target lies whose echo has the *Gaussian
+  to whole clock steps of 4 ns). So the elevation of a bin is that of a target whose echo has the *Gaussian
   fit* of the transmitted pulse centred on that bin: time zero of the pulse is `tx_gloc`, counted from sample
   0. (Flat ground fitted with the recorded pulse then lies within 0.1 m of level 2's `elev_lowestmode`.) The
   pulse is skewed: its largest sample comes 0.7 to 1.3 ns before, its centroid 2 to 3 ns after (0.3 to 0.5 m
@@ -22,6 +22,8 @@ Level 2 results (L2A `elev_lowestmode`, `rh`; L2B `pai`, `cover`) belong to the 
 
 import contextlib
 import dataclasses
+import functools
+import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -30,12 +32,38 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxlidar.io.checks import STEP, STEP_TOLERANCE, existing
-from jaxlidar.io.gedi_beam import Beam, refusing
-from jaxlidar.io.pedestal import above_pedestal
+from jaxlidar.io.checks import (
+    MAX_COORDINATE,
+    MAX_COUNTS,
+    TWO_WAY_METRES_PER_NS,
+    TWO_WAY_TOLERANCE,
+    check_unpacked_size,
+    existing_file,
+    refuse_damage,
+)
+from jaxlidar.io.noise import above_pedestal
 
+# Datasets of a beam's group with a number for each shot.
+_PER_SHOT = (
+    "rx_sample_count",
+    "rx_sample_start_index",
+    "tx_sample_count",
+    "tx_sample_start_index",
+    "tx_gloc",
+    "noise_mean_corrected",
+    "noise_stddev_corrected",
+    "geolocation/elevation_bin0",
+    "geolocation/elevation_lastbin",
+    "geolocation/latitude_lastbin",
+    "geolocation/longitude_lastbin",
+    "geolocation/altitude_instrument",
+    "geolocation/local_beam_elevation",
+    "geolocation/local_beam_azimuth",
+)
+# Datasets of the flags of a GediShot; subsets may have left them out.
+_FLAGS = {"degrade": "geolocation/degrade", "stale_return": "stale_return_flag"}
 # Equal samples in a row that noise does not make.
-_FLAT = 3
+_MIN_SATURATED_RUN = 3
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -45,8 +73,8 @@ class GediShot:
     - `beam`: name of the beam's group, such as "BEAM0101".
     - `shot_number`: the product's unique number.
     - `time`: (bins,) ns, 0 at the first bin and increasing downward.
-    - `elevation`: (bins,) m above the WGS-84 ellipsoid, decreasing: where a target lies whose echo of
-      `pulse_power` has its time zero in that bin.
+    - `elevation`: (bins,) m above the WGS-84 ellipsoid, decreasing: that of a target whose echo of
+      `pulse_power` has its time zero in the bin.
     - `waveform`: (bins,) received, in counts, noise included.
     - `noise_mean`, `noise_std`: mean and standard deviation of the received noise in counts, as the product
       gives them.
@@ -94,40 +122,40 @@ class GediShot:
 
     @property
     def saturated(self) -> int:
-        """Most samples in a row at the largest value of the record, where they are three or more, else 0.
+        """Length of the longest run of samples at the largest value, if it is three or more, else 0.
 
         The level 1B product has no flag of saturation. A receiver or digitiser at its limit repeats one
         value.
         """
         ends = np.flatnonzero(np.diff(np.r_[False, self.waveform == self.waveform.max(), False]))
         longest = int(np.max(ends[1::2] - ends[::2]))
-        return longest if longest >= _FLAT else 0
+        return longest if longest >= _MIN_SATURATED_RUN else 0
 
     @property
     def signal(self) -> Float[np.ndarray, " bins"]:
-        """The received waveform less the mean noise, in counts."""
+        """Received waveform less the mean noise, in counts."""
         return self.waveform - self.noise_mean
 
 
 def read_gedi_l1b(
     path: str | os.PathLike[str], shot: int | np.integer | Sequence[int] | np.ndarray | None = None
 ) -> list[GediShot]:
-    """The shots of a GEDI L1B file, or of a subset of one in the same layout.
+    """Read the shots of a GEDI L1B file, or of a subset of one in the same layout.
 
-    This needs h5py (`pip install "jaxlidar[io]"`). Of beams without a shot that is asked for nothing is read
-    but, to find shots by number, the numbers.
+    This needs h5py (`pip install "jaxlidar[io]"`). From beams without a requested shot nothing is read but,
+    to find shots by number, the numbers.
 
     Start indices are used where they fit the stored samples. Where they do not, as in subsets that kept the
-    numbering of the full file, the shots lie end to end, and the counts say where.
+    numbering of the full file, the samples of shots follow one another without gaps, as many as the counts.
 
     **Arguments:**
 
     - `path`: an HDF5 file.
-    - `shot`: which shots, an integer or several. A number below the number of shots in the file is an index,
-      from 0, into all shots, beam after beam in the order of the file; any other is a shot number. Default
-      None: all.
+    - `shot`: the requested shots, an integer or several. A number below the number of shots in the file is an
+      index, from 0, into all shots, beam after beam in the order of the file; any other is a shot number.
+      Default None: all.
 
-    **Returns:** a list of `GediShot`, in the order asked for; one integer gives a list of one.
+    **Returns:** a list of `GediShot`, in the order of `shot`; one integer gives a list of one.
 
     **Raises:** FileNotFoundError where there is no such file. ImportError without h5py. ValueError, naming
     the file and the place, for a file that is not HDF5, is damaged or declares more than it can hold, is no
@@ -149,33 +177,35 @@ def read_gedi_l1b(
         import h5py
     except ImportError as error:
         raise ImportError('reading HDF5 needs h5py: pip install "jaxlidar[io]"') from error
-    path = existing(path)
+    path = existing_file(path)
     with contextlib.ExitStack() as stack:
-        with refusing(f"{path}: not a readable HDF5 file"):
+        with refuse_damage(f"{path}: not a readable HDF5 file"):
             file = stack.enter_context(h5py.File(path, "r"))
             names = [name for name in map(str, file) if name.startswith("BEAM")]
         if not names:
             raise ValueError(f"{path}: no group BEAM...: no GEDI L1B product")
-        chosen = _select(path, [Beam(path, file, name) for name in names], shot)
-        wanted: dict[Beam, set[int]] = {}
-        for beam, i in chosen:
-            wanted.setdefault(beam, set()).add(i)
-        read = {beam: _shots(beam, sorted(indices)) for beam, indices in wanted.items()}
-        return [read[beam][i] for beam, i in chosen]
+        selected = _select(path, [_Beam(path, file, name) for name in names], shot)
+        # By beam, so that the samples of neighbouring shots are read together.
+        indices_by_beam: dict[_Beam, set[int]] = {}
+        for beam, i in selected:
+            indices_by_beam.setdefault(beam, set()).add(i)
+        shots = {beam: _shots(beam, sorted(indices)) for beam, indices in indices_by_beam.items()}
+        return [shots[beam][i] for beam, i in selected]
 
 
-def _select(path: Path, beams: list[Beam], shot: Any) -> list[tuple[Beam, int]]:
+def _select(path: Path, beams: "list[_Beam]", shot: Any) -> "list[tuple[_Beam, int]]":
+    """Return the beam, and the index within it, of each requested shot. **Raises:** as `read_gedi_l1b`."""
     order = [(beam, i) for beam in beams for i in range(len(beam))]
     if shot is None:
         return order
-    wanted = [shot] if isinstance(shot, int | np.integer) else list(shot)
-    by_number: dict[int, tuple[Beam, int]] = {}
-    chosen = []
-    for number in wanted:
+    requested = [shot] if isinstance(shot, int | np.integer) else list(shot)
+    by_number: dict[int, tuple[_Beam, int]] = {}
+    selected = []
+    for number in requested:
         if not isinstance(number, int | np.integer) or isinstance(number, bool):
             raise ValueError(f"shot = {number} is neither an index nor a shot number: both are integers")
         if 0 <= number < len(order):
-            chosen.append(order[int(number)])
+            selected.append(order[int(number)])
             continue
         if not by_number:
             by_number = {int(n): (beam, i) for beam in beams for i, n in enumerate(beam.shot_number)}
@@ -184,30 +214,32 @@ def _select(path: Path, beams: list[Beam], shot: Any) -> list[tuple[Beam, int]]:
                 f"{path}: shot = {number} is neither an index in [0, {len(order) - 1}] "
                 "nor the number of a shot here"
             )
-        chosen.append(by_number[int(number)])
-    return chosen
+        selected.append(by_number[int(number)])
+    return selected
 
 
-def _shots(beam: Beam, indices: list[int]) -> dict[int, GediShot]:
+def _shots(beam: "_Beam", indices: list[int]) -> dict[int, GediShot]:
     received, transmitted = beam.samples("rx", indices), beam.samples("tx", indices)
     return {i: _shot(beam, i, received[i], transmitted[i]) for i in indices}
 
 
-def _shot(beam: Beam, i: int, received: np.ndarray, transmitted: np.ndarray) -> GediShot:
-    # The pointing vector has its elevation above the horizon: it points from the footprint to the sensor.
+def _shot(beam: "_Beam", i: int, received: np.ndarray, transmitted: np.ndarray) -> GediShot:
+    # The pointing vector leads from the footprint to the sensor, so its elevation is above the horizon.
     above_horizon = beam.number("geolocation/local_beam_elevation", i, 0.0, np.pi / 2 + 1e-6)
     towards = beam.number("geolocation/local_beam_azimuth", i, -2 * np.pi, 2 * np.pi)
     top = beam.number("geolocation/elevation_bin0", i)
     bottom = beam.number("geolocation/elevation_lastbin", i)
-    place = beam.at("geolocation/elevation_lastbin", i)
+    location = beam.location("geolocation/elevation_lastbin", i)
     if bottom >= top:
-        raise ValueError(f"{place}: {bottom:g} m is not below the first bin, {top:g} m")
-    step, expected = (top - bottom) / (received.size - 1), STEP * np.sin(above_horizon)
-    if abs(step - expected) > STEP_TOLERANCE * expected:
+        raise ValueError(f"{location}: {bottom:g} m is not below the first bin, {top:g} m")
+    step = (top - bottom) / (received.size - 1)
+    expected = TWO_WAY_METRES_PER_NS * np.sin(above_horizon)
+    if abs(step - expected) > TWO_WAY_TOLERANCE * expected:
         raise ValueError(
-            f"{place}: {step:g} m from bin to bin, where 1 ns along the beam is {expected:.4f} m of elevation"
+            f"{location}: {step:g} m from bin to bin, where 1 ns along the beam is {expected:.4f} m of "
+            "elevation"
         )
-    reference = beam.number("tx_gloc", i, 0.0, transmitted.size - 1)
+    pulse_zero = beam.number("tx_gloc", i, 0.0, transmitted.size - 1)
     pedestal = float(np.median(transmitted[: max(transmitted.size // 4, 1)]))
     return GediShot(
         beam=beam.name,
@@ -217,8 +249,8 @@ def _shot(beam: Beam, i: int, received: np.ndarray, transmitted: np.ndarray) -> 
         waveform=received,
         noise_mean=beam.number("noise_mean_corrected", i),
         noise_std=beam.number("noise_stddev_corrected", i, 0.0),
-        pulse_time=np.arange(transmitted.size) - reference,
-        pulse_power=above_pedestal(transmitted, pedestal, beam.at("txwaveform", i)),
+        pulse_time=np.arange(transmitted.size) - pulse_zero,
+        pulse_power=above_pedestal(transmitted, pedestal, beam.location("txwaveform", i)),
         latitude=beam.number("geolocation/latitude_lastbin", i, -90.0, 90.0),
         longitude=beam.number("geolocation/longitude_lastbin", i, -180.0, 360.0),
         altitude=beam.number("geolocation/altitude_instrument", i),
@@ -227,3 +259,166 @@ def _shot(beam: Beam, i: int, received: np.ndarray, transmitted: np.ndarray) -> 
         degrade=beam.flag("degrade", i),
         stale_return=beam.flag("stale_return", i),
     )
+
+
+class _Beam:
+    """The group of one beam: its numbers for each shot, and the samples of shots.
+
+    Datasets are compared with the file before they are read. Numbers of all shots are read when the first is
+    used. Two beams are equal if they are the same object.
+    """
+
+    def __init__(self, path: Path, file: Any, name: str):
+        self.path, self.file, self.name = path, file, name
+        self.size = self._dataset("shot_number").shape[0]
+
+    def __len__(self) -> int:
+        return self.size
+
+    def location(self, field: str, shot: int | None = None) -> str:
+        """Return the location of a field, and of a shot in it, for messages."""
+        location = f"{self.path}: /{self.name}/{field}"
+        return location if shot is None else f"{location}, shot {int(self.shot_number[shot])}"
+
+    def number(
+        self, field: str, shot: int, low: float = -MAX_COORDINATE, high: float = MAX_COORDINATE
+    ) -> float:
+        """Return the number of a shot. **Raises:** ValueError where it is not in [low, high]."""
+        value = float(self._per_shot[field][shot])
+        if not low <= value <= high:
+            raise ValueError(
+                f"{self.location(field, shot)}: {value:g} is outside the admissible range [{low:g}, {high:g}]"
+            )
+        return value
+
+    def flag(self, name: str, shot: int) -> int | None:
+        """Return a flag of a shot, or None where the file does not have it."""
+        values = self._flags.get(name)
+        return None if values is None else int(values[shot])
+
+    def samples(self, kind: str, shots: Sequence[int]) -> dict[int, np.ndarray]:
+        """Return the samples of shots in increasing order, of the received ("rx") or sent ("tx") waveform.
+
+        Shots that follow one another are read in one pass.
+        """
+        field = f"{kind}waveform"
+        start, count = self._start_and_count[kind]
+        dataset, samples_by_shot = self._dataset(field), {}
+        runs = np.split(np.array(shots), np.flatnonzero(np.diff(shots) > 1) + 1)
+        for run in (run.tolist() for run in runs):
+            first, end = int(start[run[0]]), int(start[run[-1]] + count[run[-1]])
+            with refuse_damage(f"{self.location(field, run[0])}: damaged"):
+                run_samples = dataset[first:end]
+            for i in run:
+                if count[i] < 2:
+                    raise ValueError(
+                        f"{self.location(f'{kind}_sample_count', i)}: {count[i]} samples; at least 2 belong "
+                        "here"
+                    )
+                offset = start[i] - first
+                samples = run_samples[offset : offset + count[i]].astype(np.float64)
+                wrong = ~(np.abs(samples) <= MAX_COUNTS)
+                if wrong.any():
+                    k = int(np.argmax(wrong))
+                    raise ValueError(f"{self.location(field, i)}: sample {k} is {samples[k]:g}")
+                samples_by_shot[i] = samples
+        return samples_by_shot
+
+    @functools.cached_property
+    def shot_number(self) -> np.ndarray:
+        """(shots,) unique numbers of the product."""
+        numbers = self._read("shot_number")
+        if numbers.dtype.kind not in "iu":
+            raise ValueError(
+                f"{self.location('shot_number')}: type {numbers.dtype} where whole numbers belong"
+            )
+        return numbers
+
+    @functools.cached_property
+    def _per_shot(self) -> dict[str, np.ndarray]:
+        for field in _PER_SHOT:
+            shape = self._dataset(field).shape
+            if shape != (self.size,):
+                raise ValueError(
+                    f"{self.location(field)}: shape {shape}, but shot_number has the shape {(self.size,)}"
+                )
+        return {field: self._read(field) for field in _PER_SHOT}
+
+    @functools.cached_property
+    def _flags(self) -> dict[str, np.ndarray]:
+        flags = {}
+        for name, field in _FLAGS.items():
+            with refuse_damage(f"{self.location(field)}: damaged"):
+                is_missing = f"{self.name}/{field}" not in self.file
+            if is_missing:
+                continue
+            values = self._read(field)
+            if values.shape != (self.size,) or values.dtype.kind not in "iu":
+                raise ValueError(
+                    f"{self.location(field)}: shape {values.shape} and type {values.dtype}, where a whole "
+                    f"number for each of {self.size} shots belongs"
+                )
+            flags[name] = values
+        return flags
+
+    @functools.cached_property
+    def _start_and_count(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """Index of the first sample of each shot, from 0, and number of samples; received and sent."""
+        start_and_count = {}
+        for kind in ("rx", "tx"):
+            size = self._dataset(f"{kind}waveform").size
+            count = self._integers(f"{kind}_sample_count", size)
+            # The product counts from 1.
+            start = self._integers(f"{kind}_sample_start_index", 2**62) - 1
+            end = start + count
+            if not (np.all(start >= 0) and np.all(end <= size) and np.all(start[1:] >= end[:-1])):
+                if count.sum() != size:
+                    raise ValueError(
+                        f"{self.location(f'{kind}_sample_start_index')}: neither do the indices fit the "
+                        f"{size} samples stored, nor do the counts ({count.sum()} in all)"
+                    )
+                start = np.cumsum(count) - count
+            start_and_count[kind] = (start, count)
+        return start_and_count
+
+    def _integers(self, field: str, high: int) -> np.ndarray:
+        values = self._per_shot[field]
+        if values.dtype.kind == "f":
+            # Half precision does not hold the limits of the comparison.
+            values = values.astype(np.float64)
+        wrong = ~((values >= 0) & (values <= high) & (values == np.floor(values)))
+        if wrong.any():
+            i = int(np.argmax(wrong))
+            raise ValueError(f"{self.location(field, i)}: {values[i]:g} is no whole number in [0, {high}]")
+        return values.astype(np.int64)
+
+    def _dataset(self, field: str) -> Any:
+        """Return a dataset of numbers in one dimension, all of which are stored in the file."""
+        with refuse_damage(f"{self.location(field)}: damaged"):
+            node = self.file.get(f"{self.name}/{field}")
+            shape, kind = getattr(node, "shape", None), getattr(getattr(node, "dtype", None), "kind", None)
+        if shape is None or kind is None:
+            raise ValueError(f"{self.location(field)}: no such dataset; it is part of a GEDI L1B product")
+        if kind not in "iuf":
+            raise ValueError(f"{self.location(field)}: type {node.dtype} where numbers belong")
+        if len(shape) != 1:
+            raise ValueError(f"{self.location(field)}: shape {shape}, where one dimension belongs")
+        with refuse_damage(f"{self.location(field)}: damaged"):
+            # HDF5 returns zeros for what is not stored, as many as are declared.
+            is_elsewhere = node.is_virtual or node.external
+            (chunk,) = node.chunks or shape
+            chunks = math.ceil(shape[0] / chunk) if chunk else 0
+            contiguous = node.id.get_storage_size() // max(node.nbytes, 1)
+            stored = node.id.get_num_chunks() if node.chunks else contiguous
+        if is_elsewhere or stored < chunks:
+            raise ValueError(
+                f"{self.location(field)}: {shape[0]} numbers are declared, but the file holds {stored} of "
+                f"{chunks} parts of them"
+            )
+        check_unpacked_size(self.path, f"/{self.name}/{field}", chunks * chunk * node.dtype.itemsize)
+        return node
+
+    def _read(self, field: str) -> np.ndarray:
+        dataset = self._dataset(field)
+        with refuse_damage(f"{self.location(field)}: damaged"):
+            return dataset[:]

@@ -1,7 +1,7 @@
 """Writer of simulated waveforms in the layout of GEDI's level 1B product, for the tools that read it.
 
-What a simulation does not have is left out: the orbit, the fit of the transmitted pulse, geophysical
-corrections, the sun, and what the product knows of its own processing. Standard errors of places are zero.
+Datasets without a counterpart in a simulation are left out: the orbit, the fit of the transmitted pulse,
+geophysical corrections, the sun, and the history of processing. Standard errors of positions are zero.
 """
 
 import dataclasses
@@ -11,7 +11,7 @@ import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -28,16 +28,16 @@ from jaxlidar._checks import (
     check_shape,
     concrete_number,
 )
+from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._files import atomic_write
+from jaxlidar._fingerprint import version_of
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.instrument.survey import Survey
-from jaxlidar.io.checks import MOST_COUNTS
-from jaxlidar.io.gedi_places import geolocation, reference_system
-from jaxlidar.io.netcdf import version
+from jaxlidar.io.checks import MAX_COUNTS
 from jaxlidar.spectral.waveform import Waveform, energy_per_reflectance
 
-# The beams' groups: the number of the laser's channel, and whether the laser's full power is in the beam.
-BEAMS = {
+# Groups of beams: the number of the laser's channel, and True for a beam with the full power of its laser.
+_BEAMS = {
     "BEAM0000": (0, False),
     "BEAM0001": (0, False),
     "BEAM0010": (1, False),
@@ -47,19 +47,22 @@ BEAMS = {
     "BEAM1000": (4, True),
     "BEAM1011": (5, True),
 }
-# Shot numbers are orbit, beam (2 digits), reserved (3) and number within the orbit (8).
-_ORBIT, _BEAM = 10**13, 10**11
+# Digits of shot numbers: orbit, beam (2), reserved (3) and number within the orbit (8).
+_ORBIT_DIGIT, _BEAM_DIGIT = 10**13, 10**11
 # Shots per second of one beam.
-_RATE = 242.0
-# Samples of the transmitted pulse, its pedestal, and counts of its largest sample above it.
-_SENT, _SENT_PEDESTAL, _SENT_PEAK = 128, 250.0, 1000.0
-# Standard deviation in bins of the Gaussian that the product smooths with, and where it ends.
-_SMOOTHING, _REACH = 1.7, 8
+_SHOT_RATE = 242.0
+# The transmitted pulse: samples, pedestal, and counts of its largest sample above the pedestal.
+_PULSE_SAMPLES, _PULSE_PEDESTAL, _PULSE_PEAK = 128, 250.0, 1000.0
+# Standard deviation in bins of the Gaussian that the product smooths with, and half of its length.
+_SMOOTHING_STD, _SMOOTHING_HALF_LENGTH = 1.7, 8
 # Admissible difference of the sampling interval from 1 ns, which single precision rounds.
-_OFF = 1e-3
-# Counts of bins are stored in 16 bits.
-_MOST_BINS = 2**16 - 1
+_STEP_TOLERANCE = 1e-3
+# Numbers of bins are stored in 16 bits.
+_MAX_BINS = 2**16 - 1
+# Shots that are written at once.
 _BLOCK = 256
+# Distance in m over which the direction of true north is found.
+_NORTH_BASELINE = 100.0
 
 
 def write_gedi_l1b(
@@ -86,24 +89,24 @@ def write_gedi_l1b(
 
     **Arguments:**
 
-    - `path`: the HDF5 file to write. It appears when it is whole.
+    - `path`: the HDF5 file to write. It appears when it is complete.
     - `waveforms`: the `Waveforms` of `jaxlidar.simulate_many`, or one `Waveform` for each shot, of one
       wavelength and samples of 1 ns. Their `recorded` energies are written.
     - `survey`: the `Survey` that was simulated; `Survey.of(lidar)` for one waveform.
-    - `origin`: longitude and latitude of x = y = 0 in degrees, where y is north. Places are those of the
+    - `origin`: longitude and latitude of x = y = 0 in degrees, where y is north. Positions are those of the
       azimuthal equidistant projection about it.
     - `crs`: in place of `origin`, the projected coordinate reference system of the survey's positions, in
       metres, such as "EPSG:32633". Azimuths are turned from its grid's north to true north.
-    - `elevation`: of the reference plane z = 0 above the WGS-84 ellipsoid in m, one number or (shots,).
+    - `elevation`: that of the reference plane z = 0 above the WGS-84 ellipsoid in m, one number or (shots,).
       Default 0.
     - `beam`: one of the product's eight, such as "BEAM0000", for all shots or for each. Shots lie in the file
       beam after beam. Default "BEAM0101".
     - `shot_number`: (shots,) unique whole numbers. Default None: numbers of the product's form, of orbit 1.
-    - `margin`: bins without light that are added above and below what was simulated, 0 or more; tools take
-      the noise from there. Default 200, 30 m.
+    - `margin`: bins without light that are added above and below the simulated ones, 0 or more; tools
+      estimate the noise from them. Default 200, 30 m.
     - `gain`: counts of a sample per apparent reflectance of it, positive: energies are related to that of a
-      Lambertian target at the reference plane. Default 50,000: ground of reflectance 0.35 gives the 17,500
-      counts in all of recorded full-power beams.
+      Lambertian target at the reference plane. Default 50,000: ground of reflectance 0.35 gives 17,500 counts
+      over all samples, as in recorded full-power beams.
     - `noise_mean`: counts without light, 0 or more. The receiver's background comes in addition. Default 240.
     - `noise_std`: standard deviation of the noise in counts before the product's smoothing, 0 or more, as
       `noise_stddev_corrected` has it. Default 3.
@@ -139,15 +142,15 @@ def write_gedi_l1b(
         raise ImportError("GEDI files need h5py and rasterio: pip install 'jaxlidar[io]'") from error
     check_kind("survey", survey, Survey, "a Survey, such as Survey.of(lidar)")
     margin = check_integer("margin", margin, 0)
-    first, count = _spans(waveforms, survey, margin)
+    first_time, bins = _spans(waveforms, survey, margin)
     shots = len(survey)
     check_range("elevation", elevation)
     check_shape("elevation", elevation, (), (shots,))
-    plane = np.broadcast_to(np.asarray(elevation, float), (shots,))
+    plane_elevation = np.broadcast_to(np.asarray(elevation, float), (shots,))
     beams = np.array([beam] * shots if isinstance(beam, str) else list(beam))
     check_shape("beam", beams, (shots,))
     for name in np.unique(beams):
-        check_choice("beam", str(name), tuple(BEAMS))
+        check_choice("beam", str(name), tuple(_BEAMS))
     check_number("gain", gain, 0.0, low_open=True)
     check_number("noise_mean", noise_mean, 0.0)
     check_number("noise_std", noise_std, 0.0)
@@ -155,143 +158,164 @@ def write_gedi_l1b(
         check_key(key)
     per_joule = gain / _energy_per_reflectance(survey)
     background = concrete_number(survey.lidar.receiver.background)
-    sent, reference = _sent(survey.lidar)
+    pulse, pulse_zero = _transmitted_pulse(survey.lidar)
     columns = {
-        "shot_number": _numbers(shot_number, beams),
+        "shot_number": _shot_numbers(shot_number, beams),
         "noise_mean_corrected": noise_mean + per_joule * background,
         "noise_stddev_corrected": np.full(shots, float(noise_std)),
-        "rx_sample_count": count.astype(np.uint16),
+        "rx_sample_count": bins.astype(np.uint16),
         "stale_return_flag": np.zeros(shots, np.uint8),
-        "tx_gloc": np.full(shots, reference, np.float32),
-        "tx_sample_count": np.full(shots, sent.size, np.uint16),
+        "tx_gloc": np.full(shots, pulse_zero, np.float32),
+        "tx_sample_count": np.full(shots, pulse.size, np.uint16),
     }
-    place = geolocation(survey, first, count, plane, reference_system(origin, crs))
-    records = _Records(waveforms, per_joule, noise_mean, noise_std, key, count, margin, background)
+    projection = _projection(origin, crs)
+    geolocation = _geolocation(survey, first_time, bins, plane_elevation, projection)
+    digitiser = _Digitiser(
+        waveforms=waveforms,
+        per_joule=per_joule,
+        noise_mean=noise_mean,
+        noise_std=noise_std,
+        key=key,
+        bins=bins,
+        margin=margin,
+        background=background,
+    )
     with atomic_write(path) as draft, h5py.File(draft, "w") as file:
-        _describe(file, Path(path).name)
-        for name in BEAMS:
-            (chosen,) = np.nonzero(beams == name)
-            beam_columns = {field: column[chosen] for field, column in columns.items()}
-            group = _beam_group(file, name, beam_columns)
-            group["txwaveform"] = np.tile(sent, chosen.size)
-            _receive(group, records, chosen)
-            located = group.create_group("geolocation")
-            for field, column in place.items():
-                located[field] = column[chosen]
+        _write_description(file, Path(path).name)
+        for name in _BEAMS:
+            (indices,) = np.nonzero(beams == name)
+            beam_columns = {field: column[indices] for field, column in columns.items()}
+            group = _write_beam(file, name, beam_columns)
+            group["txwaveform"] = np.tile(pulse, indices.size)
+            _write_received(group, digitiser, indices)
+            geolocation_group = group.create_group("geolocation")
+            for field, column in geolocation.items():
+                geolocation_group[field] = column[indices]
             for field in ("delta_time", "shot_number"):
-                located[field] = group[field][:]
+                geolocation_group[field] = group[field][:]
 
 
-def _beam_group(file: Any, name: str, columns: dict[str, np.ndarray]) -> Any:
-    """The group of a beam, with what is known of its shots before their records."""
-    channel, full = BEAMS[name]
+def _write_beam(file: Any, name: str, columns: dict[str, np.ndarray]) -> Any:
+    """Write the group of a beam but for its waveforms and their geolocation, and return it."""
+    channel, is_full_power = _BEAMS[name]
     group = file.create_group(name)
-    group.attrs["description"] = _text(f"{'Full power' if full else 'Coverage'} beam")
+    group.attrs["description"] = _attribute(f"{'Full power' if is_full_power else 'Coverage'} beam")
     shots = len(columns["shot_number"])
     for field, column in columns.items():
         group[field] = column
     group["beam"] = np.full(shots, int(name[-4:], 2), np.uint16)
     group["channel"] = np.full(shots, channel, np.uint8)
-    group["delta_time"] = np.arange(shots) / _RATE
+    group["delta_time"] = np.arange(shots) / _SHOT_RATE
     for kind in ("rx", "tx"):
         count = columns[f"{kind}_sample_count"].astype(np.uint64)
+        # The product counts samples from 1.
         group[f"{kind}_sample_start_index"] = np.cumsum(count, dtype=np.uint64) - count + np.uint64(1)
     return group
 
 
-def _receive(group: Any, records: "_Records", chosen: np.ndarray) -> None:
-    """Write the records of a beam's shots, some at a time, and their energies."""
+def _write_received(group: Any, digitiser: "_Digitiser", indices: np.ndarray) -> None:
+    """Write the received waveforms of a beam's shots, some at a time, and their energies."""
     starts = group["rx_sample_start_index"][:].astype(int) - 1
-    received = group.create_dataset("rxwaveform", (int(records.count[chosen].sum()),), np.float32)
-    energy = np.zeros(chosen.size)
-    for block in range(0, chosen.size, _BLOCK):
-        some = slice(block, block + _BLOCK)
-        counts = records.of(chosen[some])
-        together = np.concatenate(counts)
-        received[starts[block] : starts[block] + together.size] = together
-        above = group["noise_mean_corrected"][some]
-        energy[some] = [own.sum(dtype=float) - own.size * dark for own, dark in zip(counts, above)]
+    received = group.create_dataset("rxwaveform", (int(digitiser.bins[indices].sum()),), np.float32)
+    energy = np.zeros(indices.size)
+    for start in range(0, indices.size, _BLOCK):
+        block = slice(start, start + _BLOCK)
+        waveforms = digitiser.counts(indices[block])
+        samples = np.concatenate(waveforms)
+        received[starts[start] : starts[start] + samples.size] = samples
+        noise_mean = group["noise_mean_corrected"][block]
+        energy[block] = [w.sum(dtype=float) - w.size * mean for w, mean in zip(waveforms, noise_mean)]
     group["rx_energy"] = energy
 
 
-class _Records(NamedTuple):
-    """What the digitiser would store of the shots: pedestal, energies times `per_joule`, noise."""
+@dataclasses.dataclass(frozen=True)
+class _Digitiser:
+    """The digitiser of all shots, counts = `noise_mean` + `per_joule` * energy + noise.
+
+    - `waveforms`: `Waveforms`, or a sequence of `Waveform`.
+    - `per_joule`: (shots,) counts per J.
+    - `noise_mean`, `noise_std`: counts. `key`: of the noise; None for none.
+    - `bins`: (shots,) number of bins, of which `margin` at either end have only the `background`, J.
+    """
 
     waveforms: Any
     per_joule: np.ndarray
     noise_mean: float
     noise_std: float
     key: Any
-    count: np.ndarray
+    bins: np.ndarray
     margin: int
     background: float
 
-    def of(self, shots: np.ndarray) -> list[np.ndarray]:
-        """Counts of some shots, (bins,) each."""
-        longest = int(self.count.max())
-        noise = np.zeros((shots.size, longest))
+    def counts(self, shots: np.ndarray) -> list[np.ndarray]:
+        """Return the counts of shots, (bins,) each."""
+        max_bins = int(self.bins.max())
+        noise = np.zeros((shots.size, max_bins))
         if self.key is not None:
-            noise = self.noise_std * np.asarray(_noise(self.key, jnp.asarray(shots), longest), float)
-        return [self._one(int(i), own[: self.count[i]]) for i, own in zip(shots, noise)]
+            noise = self.noise_std * np.asarray(_smooth_noise(self.key, jnp.asarray(shots), max_bins), float)
+        return [self._shot_counts(int(i), row[: self.bins[i]]) for i, row in zip(shots, noise)]
 
-    def _one(self, i: int, noise: np.ndarray) -> np.ndarray:
-        survey_wide = hasattr(self.waveforms, "position")
-        energy = self.waveforms.recorded[i, 0] if survey_wide else self.waveforms[i].recorded[0]
+    def _shot_counts(self, i: int, noise: np.ndarray) -> np.ndarray:
+        is_survey = hasattr(self.waveforms, "position")
+        energy = self.waveforms.recorded[i, 0] if is_survey else self.waveforms[i].recorded[0]
         energy = np.asarray(energy, float)
         check_range(f"recorded of shot {i}", energy)
         energy = np.pad(energy, self.margin, constant_values=self.background)
         counts = self.noise_mean + self.per_joule[i] * energy + noise
-        if np.abs(counts).max() > MOST_COUNTS:
+        if np.abs(counts).max() > MAX_COUNTS:
             raise ValueError(
-                f"gain: shot {i} has {np.abs(counts).max():g} counts; admissible are up to {MOST_COUNTS:g}"
+                f"gain: shot {i} has {np.abs(counts).max():g} counts; admissible are up to {MAX_COUNTS:g}"
             )
         return counts.astype(np.float32)
 
 
 def _spans(waveforms: Any, survey: Survey, margin: int) -> tuple[np.ndarray, np.ndarray]:
-    """Time of the first bin in ns, and number of bins, of each shot. **Raises:** as `write_gedi_l1b`."""
-    place = getattr(waveforms, "position", None)
-    if place is None:
+    """Return the time of the first bin in ns, and the number of bins, of each shot.
+
+    **Raises:** as `write_gedi_l1b`.
+    """
+    position = getattr(waveforms, "position", None)
+    if position is None:
         check_kind("waveforms", waveforms, Sequence, "the Waveforms of simulate_many, or a list of Waveform")
         for i, wave in enumerate(waveforms):
             check_kind(f"waveforms {i}", wave, Waveform, "a Waveform")
     if len(waveforms) != len(survey):
         raise ValueError(f"{len(waveforms)} waveforms are of a survey of {len(survey)} shots; give its own")
-    if place is not None and not np.array_equal(place, survey.position):
+    if position is not None and not np.array_equal(position, survey.position):
         raise ValueError("the waveforms have another position than the shots of the survey; give their own")
-    if place is not None:
+    if position is not None:
         spans = [_span(waveforms, "waveforms", margin)] * len(survey)
     else:
         spans = [_span(wave, f"waveforms {i}", margin) for i, wave in enumerate(waveforms)]
-    first, count = zip(*spans)
-    return np.array(first), np.array(count)
+    first_times, bins = zip(*spans)
+    return np.array(first_times), np.array(bins)
 
 
 def _span(waves: Any, name: str, margin: int) -> tuple[float, int]:
     wavelengths, time = np.size(waves.wavelength), np.asarray(waves.time, float)
     if wavelengths != 1:
         raise ValueError(f"{name}: {wavelengths} wavelengths; admissible is one, as in the product")
-    if not 2 <= time.size <= _MOST_BINS - 2 * margin:
-        raise ValueError(f"{name}: {time.size} bins; admissible are 2 to {_MOST_BINS - 2 * margin}")
+    if not 2 <= time.size <= _MAX_BINS - 2 * margin:
+        raise ValueError(f"{name}: {time.size} bins; admissible are 2 to {_MAX_BINS - 2 * margin}")
     step = (time[-1] - time[0]) / (time.size - 1)
-    if abs(step - 1.0) > _OFF:
+    if abs(step - 1.0) > _STEP_TOLERANCE:
         raise ValueError(f"{name}: samples are {step:g} ns apart; admissible is 1 ns, as in the product")
     return float(time[0]) - margin, time.size + 2 * margin
 
 
 def _energy_per_reflectance(survey: Survey) -> np.ndarray:
-    """J of a sample per apparent reflectance of it, at the reference plane, (shots,)."""
+    """Return the energy, J, of a sample per apparent reflectance of it, at the reference plane, (shots,)."""
     plane = jnp.zeros(1)
     upright = dataclasses.replace(survey.lidar, zenith=0.0)
     return float(energy_per_reflectance(upright, plane)[0, 0]) * np.cos(np.deg2rad(survey.zenith)) ** 2
 
 
-def _numbers(given: Any, beams: np.ndarray) -> np.ndarray:
-    """Shot numbers, unique. **Raises:** as `write_gedi_l1b`."""
-    if given is None:
+def _shot_numbers(shot_number: Any, beams: np.ndarray) -> np.ndarray:
+    """Return unique shot numbers. **Raises:** as `write_gedi_l1b`."""
+    if shot_number is None:
         beam = np.array([int(name[-4:], 2) for name in beams])
-        return (_ORBIT + _BEAM * beam + np.arange(1, beams.size + 1)).astype(np.uint64)
-    numbers = np.asarray(given)
+        return (_ORBIT_DIGIT + _BEAM_DIGIT * beam + np.arange(1, beams.size + 1)).astype(np.uint64)
+    numbers = np.asarray(shot_number)
     check_shape("shot_number", numbers, beams.shape)
     if numbers.dtype.kind not in "iu" or numbers.min() < 0:
         raise ValueError(f"shot_number has the type {numbers.dtype}; admissible are whole numbers from 0 on")
@@ -301,46 +325,143 @@ def _numbers(given: Any, beams: np.ndarray) -> np.ndarray:
     return numbers.astype(np.uint64)
 
 
-def _sent(lidar: Lidar) -> tuple[np.ndarray, float]:
-    """The transmitted waveform in counts, and the sample at which its time is zero."""
-    low, high = (float(t) for t in lidar.pulse.support())
-    # A quarter of the samples, at least, comes before the pulse: the pedestal.
-    size = _SENT * math.ceil(4 / 3 * (high - low + 2) / _SENT)
-    reference = math.ceil(size / 4 + 1 - low)
-    edges = np.arange(size + 1) - reference - 0.5
+def _transmitted_pulse(lidar: Lidar) -> tuple[np.ndarray, float]:
+    """Return the transmitted waveform in counts, and the index of the sample at its time zero."""
+    start, end = (float(t) for t in lidar.pulse.support())
+    # At least a quarter of the samples comes before the pulse: readers take the pedestal from them.
+    size = _PULSE_SAMPLES * math.ceil(4 / 3 * (end - start + 2) / _PULSE_SAMPLES)
+    zero = math.ceil(size / 4 + 1 - start)
+    edges = np.arange(size + 1) - zero - 0.5
     power = np.diff(np.asarray(lidar.pulse.cumulative(edges), float))
-    return (_SENT_PEDESTAL + _SENT_PEAK * power / power.max()).astype(np.float32), float(reference)
+    return (_PULSE_PEDESTAL + _PULSE_PEAK * power / power.max()).astype(np.float32), float(zero)
 
 
 @functools.partial(jax.jit, static_argnums=2)
-def _noise(key: PRNGKeyArray, shots: Array, bins: int) -> Float[Array, "shots bins"]:
-    """White noise of unit standard deviation, smoothed as the product's records are."""
-    lag = np.arange(-_REACH, _REACH + 1)
-    kernel = np.exp(-0.5 * (lag / _SMOOTHING) ** 2)
+def _smooth_noise(key: PRNGKeyArray, shots: Array, bins: int) -> Float[Array, "shots bins"]:
+    """Return white noise of unit standard deviation, smoothed as the product's waveforms are."""
+    lag = np.arange(-_SMOOTHING_HALF_LENGTH, _SMOOTHING_HALF_LENGTH + 1)
+    kernel = np.exp(-0.5 * (lag / _SMOOTHING_STD) ** 2)
     kernel = jnp.asarray(kernel / kernel.sum(), float)
 
-    def one(shot: Array) -> Array:
-        white = jax.random.normal(jax.random.fold_in(key, shot), (bins + 2 * _REACH,))
+    def shot_noise(shot: Array) -> Array:
+        # The noise of a shot follows from its index, however many are written at once.
+        white = jax.random.normal(jax.random.fold_in(key, shot), (bins + 2 * _SMOOTHING_HALF_LENGTH,))
         return jnp.convolve(white, kernel, mode="valid")
 
-    return jax.vmap(one)(shots)
+    return jax.vmap(shot_noise)(shots)
 
 
-def _text(text: str) -> np.ndarray:
-    """An attribute as the product has it."""
+def _attribute(text: str) -> np.ndarray:
+    """Return an attribute in the type of the product's: an array of one text."""
     return np.array([text], object)
 
 
-def _describe(file: Any, name: str) -> None:
-    """What the file is: the product's attributes, with its simulated origin."""
-    file.attrs["short_name"] = _text("GEDI_L1B")
-    said = {
+def _write_description(file: Any, name: str) -> None:
+    """Write the attributes of the product that describe the file, and that it is simulated."""
+    file.attrs["short_name"] = _attribute("GEDI_L1B")
+    description = {
         "abstract": "Simulated waveforms in the layout of the GEDI L1B product; no measurements.",
         "creationDate": f"{datetime.datetime.now(datetime.UTC):%Y-%m-%dT%H:%M:%S.%fZ}",
-        "credit": f"jaxlidar {version('jaxlidar')}",
+        "credit": f"jaxlidar {version_of('jaxlidar')}",
         "fileName": name,
         "shortName": "GEDI_L1B",
     }
     group = file.create_group("METADATA/DatasetIdentification")
-    for field, text in said.items():
-        group.attrs[field] = _text(text)
+    for field, text in description.items():
+        group.attrs[field] = _attribute(text)
+
+
+# -- geolocation -------------------------------------------------------------------------------------------
+
+
+def _projection(origin: tuple[float, float] | None, crs: str | None) -> Any:
+    """Return the projected reference system of a survey's positions. **Raises:** as `write_gedi_l1b`."""
+    from rasterio import CRS
+    from rasterio.errors import CRSError
+
+    if (origin is None) == (crs is None):
+        raise ValueError(f"origin = {origin} and crs = {crs}: give one of them")
+    if origin is not None:
+        longitude, latitude = origin
+        check_number("longitude of origin", longitude, -180.0, 180.0)
+        check_number("latitude of origin", latitude, -90.0, 90.0)
+        return CRS.from_string(
+            f"+proj=aeqd +lat_0={float(latitude)!r} +lon_0={float(longitude)!r} +datum=WGS84 +units=m"
+        )
+    check_kind("crs", crs, str, "the name of a coordinate reference system")
+    try:
+        system = CRS.from_string(crs)
+    except CRSError as error:
+        raise ValueError(f"crs = {crs!r} is not known ({error})") from error
+    if not system.is_projected or system.linear_units_factor[1] != 1.0:
+        raise ValueError(
+            f"crs = {crs!r} is not in metres; admissible is a projected system, such as EPSG:32633"
+        )
+    return system
+
+
+def _geolocation(
+    survey: Survey,
+    first_time: Float[np.ndarray, " shots"],
+    bins: np.ndarray,
+    plane_elevation: Float[np.ndarray, " shots"],
+    projection: Any,
+) -> dict[str, np.ndarray]:
+    """Return the datasets of the group `geolocation`, each (shots,), with standard errors of zero.
+
+    **Arguments:** `first_time`: ns, of the first bin. `bins`: number of bins of 1 ns. `plane_elevation`: m,
+    of the reference plane. `projection`: of the survey's positions.
+    """
+    zenith, azimuth = np.deg2rad(survey.zenith), np.deg2rad(survey.azimuth)
+    altitude = concrete_number(survey.lidar.altitude)
+    last_time = first_time + bins - 1
+    # Heights above the reference plane, as those of `Waveform.height`.
+    height_per_ns = -0.5 * SPEED_OF_LIGHT * np.cos(zenith)
+    heights = {"bin0": height_per_ns * first_time, "lastbin": height_per_ns * last_time}
+    heights["instrument"] = np.full_like(first_time, altitude)
+    # Horizontal displacement of the light per metre that it descends.
+    drift = np.stack([np.sin(azimuth), np.cos(azimuth)], axis=1) * np.tan(zenith)[:, None]
+    columns = {}
+    for name, height in heights.items():
+        longitude, latitude = _longitude_latitude(projection, survey.position - height[:, None] * drift)
+        columns[f"longitude_{name}"], columns[f"latitude_{name}"] = longitude, latitude
+        elevation_name = "altitude_instrument" if name == "instrument" else f"elevation_{name}"
+        columns[elevation_name] = plane_elevation + height
+    for name, time in (("bin0", first_time), ("lastbin", last_time)):
+        columns[f"bounce_time_offset_{name}"] = (
+            1e-9 * (2 * altitude / (SPEED_OF_LIGHT * np.cos(zenith)) + time) / 2
+        )
+    # The product's vector leads from the footprint to the sensor, against the light.
+    towards_sensor = np.remainder(azimuth + _convergence(projection, survey.position), 2 * math.pi) - math.pi
+    columns["local_beam_azimuth"] = towards_sensor.astype(np.float32)
+    columns["local_beam_elevation"] = (0.5 * math.pi - zenith).astype(np.float32)
+    columns |= {f"{name}_error": np.zeros(len(survey), np.float32) for name in columns}
+    columns["degrade"] = np.zeros(len(survey), np.int8)
+    return columns
+
+
+def _longitude_latitude(projection: Any, position: Float[np.ndarray, "n 2"]) -> tuple[np.ndarray, np.ndarray]:
+    """Return longitude and latitude on WGS-84. **Raises:** ValueError outside the projection."""
+    from rasterio.warp import transform
+
+    longitude, latitude = map(np.array, transform(projection, "EPSG:4326", *position.T))
+    outside = ~(np.isfinite(longitude) & np.isfinite(latitude))
+    if outside.any():
+        shot = int(np.argmax(outside))
+        raise ValueError(
+            f"position: shot {shot} at {position[shot].tolist()} m lies outside the projection {projection}"
+        )
+    return longitude, latitude
+
+
+def _convergence(projection: Any, position: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
+    """Return the direction of the projection's north in rad clockwise from true north.
+
+    It is found from the true direction of a short line along the grid's north, to a hundredth of itself.
+    """
+    half = np.array([0.0, 0.5 * _NORTH_BASELINE])
+    (west, south), (east, north) = (
+        _longitude_latitude(projection, position + side * half) for side in (-1.0, 1.0)
+    )
+    eastward = np.remainder(east - west + 180.0, 360.0) - 180.0
+    return np.arctan2(eastward * np.cos(np.deg2rad(0.5 * (south + north))), north - south)

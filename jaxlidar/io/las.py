@@ -1,18 +1,35 @@
-"""Reader of point clouds in LAS and LAZ files."""
+"""Point clouds in LAS and LAZ files: reader, and writer of LAS.
+
+Source: LAS specification 1.4 (ASPRS).
+"""
 
 import os
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import ArrayLike, Float, Int, Num
 
-from jaxlidar._checks import check_range
-from jaxlidar.io.checks import FARTHEST, existing
-from jaxlidar.io.las_header import read_header
-from jaxlidar.io.laz import unpack
+from jaxlidar._checks import check_range, check_shape
+from jaxlidar._files import atomic_write
+from jaxlidar.io.checks import MAX_COORDINATE, existing_file
+from jaxlidar.io.coordinates import GEO_KEYS, geographic_keys
+from jaxlidar.io.las_header import LasHeader, read_header
+from jaxlidar.io.laz import decompress_points
 
-# Classes of the LAS 1.4 specification that are not returns of the scene: low noise and high noise.
-_NOISE = (7, 18)
+# Classes of points that are not returns of the scene: low noise and high noise.
+_NOISE_CLASSES = (7, 18)
+# Scale of written coordinates: mm; 1e-8 degrees, which is about as much.
+_MM, _DEGREES = (1e-3, 1e-3, 1e-3), (1e-8, 1e-8, 1e-3)
+# The first point format of LAS 1.4, whose fields hold larger numbers.
+_FORMAT_6 = 6
+# Largest numbers by field: in point formats up to 5, and from 6 on.
+_MAX_NUMBERS = {
+    "return_number": (7, 15),
+    "number_of_returns": (7, 15),
+    "classification": (31, 255),
+    "intensity": (2**16 - 1, 2**16 - 1),
+}
 
 
 class PointCloud(NamedTuple):
@@ -43,7 +60,7 @@ class PointCloud(NamedTuple):
 
 
 def read_las(path: str | os.PathLike[str], *, scale: float = 1.0) -> PointCloud:
-    """The points of a LAS or LAZ file.
+    """Read the points of a LAS or LAZ file.
 
     This needs laspy, and lazrs for LAZ (`pip install "jaxlidar[io]"`). Points classified as noise (classes 7
     and 18) and those flagged as withheld are dropped and counted.
@@ -73,43 +90,158 @@ def read_las(path: str | os.PathLike[str], *, scale: float = 1.0) -> PointCloud:
     >>> print(cloud.position, cloud.dropped)
     [[0. 0. 5.]] {'noise': 1, 'withheld': 0}
     """
-    try:
-        import laspy
-    except ImportError as error:
-        raise ImportError('reading LAS needs laspy: pip install "jaxlidar[io]"') from error
     check_range("scale", scale, 0.0, low_open=True)
-    path = existing(path)
+    laspy = import_laspy("reading")
+    path = existing_file(path)
     with path.open("rb") as file:
         header = read_header(path, file)
         if header.laszip is None:
             file.seek(header.start)
             content = file.read(header.points * header.point_size)
         else:
-            content = unpack(path, file, header)
+            content = decompress_points(path, file, header)
+    cloud = laspy.PackedPointRecord.from_buffer(content, point_format_of(header))
+    units = (np.asarray(cloud[name], float) for name in "XYZ")
+    position = scale * np.stack([u * s + o for u, s, o in zip(units, header.scales, header.offsets)], axis=1)
+    (too_far,) = np.nonzero(~(np.abs(position) <= MAX_COORDINATE).all(axis=1))
+    if too_far.size:
+        raise ValueError(
+            f"{path}: record {too_far[0]}: coordinates {position[too_far[0]].tolist()} lie beyond "
+            f"{MAX_COORDINATE:g} m"
+        )
+    classes = np.asarray(cloud.classification).astype(int)
+    noise = np.isin(classes, _NOISE_CLASSES)
+    withheld = np.asarray(cloud.withheld).astype(bool) & ~noise
+    selected = ~(noise | withheld)
+    return PointCloud(
+        position[selected],
+        classes[selected],
+        np.asarray(cloud["return_number"]).astype(int)[selected],
+        np.asarray(cloud["number_of_returns"]).astype(int)[selected],
+        np.asarray(cloud["intensity"]).astype(float)[selected],
+        {"noise": int(noise.sum()), "withheld": int(withheld.sum())},
+    )
+
+
+def import_laspy(purpose: str) -> Any:
+    """Return the package laspy. **Raises:** ImportError that names the purpose, "reading" or "writing"."""
+    try:
+        import laspy
+    except ImportError as error:
+        raise ImportError(f'{purpose} LAS needs laspy: pip install "jaxlidar[io]"') from error
+    return laspy
+
+
+def point_format_of(header: LasHeader) -> Any:
+    """Return laspy's description of the point records of a file."""
+    laspy = import_laspy("reading")
     point_format = laspy.PointFormat(header.point_format)
     if header.extra_bytes:
         point_format.add_extra_dimension(laspy.ExtraBytesParams("extra", f"{header.extra_bytes}u1"))
-    cloud = laspy.PackedPointRecord.from_buffer(content, point_format)
-    units = (np.asarray(cloud[name], float) for name in "XYZ")
-    position = scale * np.stack([u * s + o for u, s, o in zip(units, header.scales, header.offsets)], axis=1)
-    far = np.flatnonzero(~(np.abs(position) <= FARTHEST).all(axis=1))
-    if far.size:
-        raise ValueError(
-            f"{path}: record {far[0]}: coordinates {position[far[0]].tolist()} lie beyond {FARTHEST:g} m"
-        )
-    classes = np.asarray(cloud.classification).astype(int)
-    noise = np.isin(classes, _NOISE)
-    withheld = np.asarray(cloud.withheld).astype(bool) & ~noise
-    keep = ~(noise | withheld)
+    return point_format
 
-    def kept(name: str, kind: type) -> np.ndarray:
-        return np.asarray(cloud[name]).astype(kind)[keep]
 
-    return PointCloud(
-        position[keep],
-        classes[keep],
-        kept("return_number", int),
-        kept("number_of_returns", int),
-        kept("intensity", float),
-        {"noise": int(noise.sum()), "withheld": int(withheld.sum())},
-    )
+def write_las(
+    path: str | os.PathLike[str],
+    position: Num[ArrayLike, "..."],
+    *,
+    intensity: Num[ArrayLike, "..."] | None = None,
+    return_number: Num[ArrayLike, "..."] | None = None,
+    number_of_returns: Num[ArrayLike, "..."] | None = None,
+    gps_time: Num[ArrayLike, "..."] | None = None,
+    classification: Num[ArrayLike, "..."] | None = None,
+) -> None:
+    """Write points as a LAS 1.4 file (point format 6).
+
+    This needs laspy (`pip install "jaxlidar[io]"`). An existing file is replaced when the new one is
+    complete.
+
+    **Arguments:**
+
+    - `path`: the file, which ends in ".las".
+    - `position`: (n, 3) m, at least one point. They are rounded to mm.
+    - `intensity`: (n,) from 0 to 65535, rounded to whole numbers. Default None: 0.
+    - `return_number`, `number_of_returns`: (n,) whole numbers from 0 to 15. Default None: 1.
+    - `gps_time`: (n,) s. Default None: 0.
+    - `classification`: (n,) classes of the LAS specification, from 0 to 255. Default None: 0.
+
+    **Returns:** nothing.
+
+    **Raises:** ImportError without laspy. ValueError for another ending, arrays of different lengths, and
+    numbers outside their range. OSError where the file cannot be written.
+
+    **Example:**
+
+    >>> import numpy as np, pathlib, tempfile
+    >>> import jaxlidar.io
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "echoes.las"
+    >>> echoes, two = np.array([[0.0, 0.0, 12.5], [0.1, 0.0, 0.25]]), np.array([2, 2])
+    >>> jaxlidar.io.write_las(path, echoes, return_number=np.array([1, 2]), number_of_returns=two)
+    >>> print(jaxlidar.io.read_las(path).position[:, 2])
+    [12.5   0.25]
+    """
+    path, coordinates = las_path(path), np.asarray(position, float)
+    n = len(coordinates)
+    fields = {
+        "intensity": np.zeros(n) if intensity is None else np.round(intensity),
+        "return_number": np.ones(n, int) if return_number is None else return_number,
+        "number_of_returns": np.ones(n, int) if number_of_returns is None else number_of_returns,
+        "gps_time": np.zeros(n) if gps_time is None else gps_time,
+        "classification": np.zeros(n, int) if classification is None else classification,
+    }
+    points = las_points(_FORMAT_6, coordinates, fields, geographic=False)
+    with atomic_write(path) as draft:
+        write_points(points, draft)
+
+
+def las_points(point_format: int, position: np.ndarray, fields: dict[str, Any], geographic: bool) -> Any:
+    """Return points as a `laspy.LasData`, which is not written yet.
+
+    **Arguments:** `position`: (n, 3) coordinates. `fields`: (n,) numbers by laspy's names. `geographic`: True
+    if x and y are degrees.
+
+    **Raises:** ValueError for numbers that the point format does not hold.
+    """
+    laspy = import_laspy("writing")
+    if len(position) == 0:
+        raise ValueError("position holds no point; admissible is one or more")
+    check_shape("position", position, (len(position), 3))
+    check_range("position", position, -MAX_COORDINATE, MAX_COORDINATE)
+    fields = {name: np.asarray(values) for name, values in fields.items()}
+    for name, values in fields.items():
+        check_shape(name, values, (len(position),))
+        if name not in _MAX_NUMBERS:
+            check_range(name, values)
+            continue
+        check_range(name, values, 0, _MAX_NUMBERS[name][point_format >= _FORMAT_6])
+        if np.any(values != np.floor(values)):
+            raise ValueError(f"{name} has values that are not whole numbers")
+    scale, offset = np.array(_DEGREES if geographic else _MM), np.floor(position.min(axis=0))
+    counts = np.round((position - offset) / scale)
+    if counts.max() >= 2**31:
+        spans = np.ptp(position, axis=0).tolist()
+        raise ValueError(f"position spans {spans}; admissible is 2^31 steps of {scale.tolist()}")
+    header = laspy.LasHeader(point_format=point_format, version="1.4")
+    header.generating_software, header.scales, header.offsets = "jaxlidar", scale, offset
+    if geographic:
+        header.vlrs.append(laspy.VLR("LASF_Projection", GEO_KEYS, "", geographic_keys()))
+    points = laspy.LasData(header, laspy.ScaleAwarePointRecord.zeros(len(position), header=header))
+    for axis, values in zip("XYZ", counts.T):
+        points[axis] = values.astype(np.int32)
+    for name, values in fields.items():
+        points[name] = values
+    return points
+
+
+def write_points(points: Any, path: Path) -> None:
+    """Write a `laspy.LasData`, not compressed."""
+    with path.open("wb") as file:
+        points.write(file, do_compress=False)
+
+
+def las_path(path: str | os.PathLike[str]) -> Path:
+    """Return a path. **Raises:** ValueError where it does not end in .las."""
+    path = Path(path)
+    if path.suffix.lower() != ".las":
+        raise ValueError(f"path = {path}: its name does not end in .las")
+    return path

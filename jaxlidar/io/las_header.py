@@ -1,43 +1,81 @@
-"""The header of LAS and LAZ files, each of whose sizes is compared with the file's."""
+"""Headers and variable length records of LAS and LAZ files; each size in them is compared with the file's.
+
+Source: LAS specification 1.4 (ASPRS). PulseWaves files have variable length records of the same kind.
+"""
 
 import dataclasses
 import math
 import struct
+from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
-from jaxlidar.io.checks import check_unpacked
-from jaxlidar.io.variable_records import variable_records
+from jaxlidar.io.checks import check_unpacked_size
 
-# The public header block: signature, version, sizes of header and records, legacy count, scales and offsets;
-# of LAS 1.4 the extended records and the count.
-_PUBLIC = struct.Struct("<4s20x2B68xHIIBHI20x3d3d")
-_EXTENDED, _EXTENDED_AT = struct.Struct("<QIQ"), 235
-_HEADER_SIZE = {0: 227, 1: 227, 2: 227, 3: 235, 4: 375, 5: 393}
-# The header of a variable length record (user, number, length) and the length of that of an extended one.
-_RECORD, _EXTENDED_RECORD_SIZE = struct.Struct("<2x16sHH32x"), 60
-_LASZIP = (b"laszip encoded", 22204)
+# The public header block: signature, version, sizes of header and point records, legacy number of points,
+# scales and offsets; from LAS 1.4 on, place and number of the extended records, and the number of points.
+_PUBLIC_BLOCK = struct.Struct("<4s20x2B68xHIIBHI20x3d3d")
+_EXTENDED_BLOCK, _EXTENDED_BLOCK_OFFSET = struct.Struct("<QIQ"), 235
+_HEADER_SIZES = {0: 227, 1: 227, 2: 227, 3: 235, 4: 375, 5: 393}
+# The header of a variable length record (user, number, length), and the size of that of an extended one.
+_RECORD_HEADER, _EXTENDED_RECORD_SIZE = struct.Struct("<2x16sHH32x"), 60
+_LASZIP_RECORD = (b"laszip encoded", 22204)
+# The bit of the point format that says that points are compressed, by LAZ and not by the specification.
 _COMPRESSED = 128
-# The parts of a record by point format, as LAZ numbers them, and their sizes in bytes. Extra bytes may
+# Items of a point record by point format, as LAZ numbers them, and their sizes in bytes. Extra bytes may
 # follow.
-PARTS = {
+ITEMS = {
     **{0: (6,), 1: (6, 7), 2: (6, 8), 3: (6, 7, 8), 4: (6, 7, 9), 5: (6, 7, 8, 9)},
     **{6: (10,), 7: (10, 11), 8: (10, 12), 9: (10, 13), 10: (10, 12, 13)},
 }
-PART_SIZES = {6: 20, 7: 8, 8: 6, 9: 29, 10: 30, 11: 6, 12: 8, 13: 29}
-# Units of length in the file that coordinates may be counted in.
-_SCALES = (1e-9, 1e3)
+ITEM_SIZES = {6: 20, 7: 8, 8: 6, 9: 29, 10: 30, 11: 6, 12: 8, 13: 29}
+# Admissible units of length in which coordinates are counted.
+_MIN_SCALE, _MAX_SCALE = 1e-9, 1e3
+
+
+class VariableRecord(NamedTuple):
+    """A variable length record: its user, its number, and the offset and length in bytes of its content."""
+
+    user: bytes
+    number: int
+    offset: int
+    length: int
+
+
+def variable_records(
+    path: Path, file: BinaryIO, header: struct.Struct, start: int, end: int, count: int, next_content: str
+) -> Iterator[VariableRecord]:
+    """Yield the variable length records that lie between two offsets of a file.
+
+    `header` unpacks user, number and length of a record; `next_content` names what begins at `end`.
+
+    **Raises:** ValueError, naming the file and the record, where records do not fit.
+    """
+    offset = start
+    for i in range(count):
+        if offset + header.size > end:
+            raise ValueError(f"{path}: header: {count} variable length records, but there is room for {i}")
+        file.seek(offset)
+        user, number, length = header.unpack(file.read(header.size))
+        offset += header.size + length
+        if length < 0 or offset > end:
+            raise ValueError(
+                f"{path}: variable length record {i}: its {length} bytes run into the {next_content}, from "
+                f"{end} on"
+            )
+        yield VariableRecord(user.split(b"\0")[0], number, offset - length, length)
 
 
 @dataclasses.dataclass(frozen=True)
 class LasHeader:
-    """What a LAS file says of its points.
+    """The header of a LAS file.
 
-    - `point_format`: number of the point format, and `point_size`: bytes of a point's record.
-    - `points`: number of points, and `start`: where they begin, in bytes.
+    - `point_format`: number of the point format, and `point_size`: bytes of a point record.
+    - `points`: number of points, and `start`: offset of the first, in bytes.
     - `scales`, `offsets`: of x, y and z.
-    - `laszip`: the record that says how points are compressed; None where they are not.
-    - `records`: place and length of each variable length record, by user and number.
+    - `laszip`: the variable length record that describes the compression of points; None where they are not
+      compressed.
+    - `records`: offset and length of each variable length record, by user and number.
     """
 
     point_format: int
@@ -50,65 +88,74 @@ class LasHeader:
     records: dict[tuple[bytes, int], tuple[int, int]] = dataclasses.field(default_factory=dict)
 
     def record(self, file: BinaryIO, user: bytes, number: int) -> bytes | None:
-        """The content of a variable length record; None where there is none."""
+        """Return the content of a variable length record; None where there is none."""
         if (user, number) not in self.records:
             return None
-        at, length = self.records[user, number]
-        file.seek(at)
+        offset, length = self.records[user, number]
+        file.seek(offset)
         return file.read(length)
 
     @property
     def extra_bytes(self) -> int:
-        """Bytes of a point's record beyond what its format names."""
-        return self.point_size - sum(PART_SIZES[part] for part in PARTS[self.point_format])
+        """Bytes of a point record beyond those that its format names."""
+        return self.point_size - sum(ITEM_SIZES[item] for item in ITEMS[self.point_format])
 
 
 def read_header(path: Path, file: BinaryIO) -> LasHeader:
-    """The header of a file, whose points then fit into it; compressed ones at least plausibly.
+    """Read the header of a file, whose points then fit into it; compressed ones at least plausibly.
 
     **Raises:** ValueError, naming the file and the place, for a header that makes no sense.
     """
     size = path.stat().st_size
-    block = file.read(max(_HEADER_SIZE.values()))
+    block = file.read(max(_HEADER_SIZES.values()))
     if not block.startswith(b"LASF"):
         raise ValueError(f"{path}: header: not a LAS file: it does not begin with LASF")
-    if len(block) < _PUBLIC.size:
+    if len(block) < _PUBLIC_BLOCK.size:
         raise ValueError(f"{path}: header: the file ends after {size} bytes")
-    _, major, minor, header_size, start, records, kind, point_size, points, *xyz = _PUBLIC.unpack_from(block)
-    if major != 1 or minor not in _HEADER_SIZE:
+    fields = _PUBLIC_BLOCK.unpack_from(block)
+    _, major, minor, header_size, start, records, format_byte, point_size, points, *scales_and_offsets = (
+        fields
+    )
+    scales, offsets = tuple(scales_and_offsets[:3]), tuple(scales_and_offsets[3:])
+    if major != 1 or minor not in _HEADER_SIZES:
         raise ValueError(f"{path}: header: version {major}.{minor} is none of LAS 1.0 to 1.5")
-    if not _HEADER_SIZE[minor] <= header_size <= start <= size:
+    if not _HEADER_SIZES[minor] <= header_size <= start <= size:
         raise ValueError(
             f"{path}: header: it is {header_size} bytes long and points begin at {start}: a file of {size} "
-            f"bytes and version 1.{minor} admits {_HEADER_SIZE[minor]} or more, in this order"
+            f"bytes and version 1.{minor} admits {_HEADER_SIZES[minor]} or more, in this order"
         )
     if minor >= 4:
-        extended, count, points = _EXTENDED.unpack_from(block, _EXTENDED_AT)
+        extended, count, points = _EXTENDED_BLOCK.unpack_from(block, _EXTENDED_BLOCK_OFFSET)
         if count and extended + count * _EXTENDED_RECORD_SIZE > size:
             raise ValueError(
                 f"{path}: header: {count} extended records from {extended} on do not fit into {size} bytes"
             )
-    header = LasHeader(kind & ~_COMPRESSED, point_size, points, start, tuple(xyz[:3]), tuple(xyz[3:]))
-    if header.point_format not in PARTS or header.extra_bytes < 0:
+    header = LasHeader(format_byte & ~_COMPRESSED, point_size, points, start, scales, offsets)
+    if header.point_format not in ITEMS or header.extra_bytes < 0:
         raise ValueError(f"{path}: header: point format {header.point_format}, records of {point_size} bytes")
-    for axis, scale, offset in zip("xyz", xyz[:3], xyz[3:]):
-        if not _SCALES[0] <= scale <= _SCALES[1]:
-            raise ValueError(f"{path}: header: scale of {axis} = {scale:g} is outside the range {_SCALES}")
+    for axis, scale, offset in zip("xyz", scales, offsets):
+        if not _MIN_SCALE <= scale <= _MAX_SCALE:
+            raise ValueError(
+                f"{path}: header: scale of {axis} = {scale:g} is outside the range {(_MIN_SCALE, _MAX_SCALE)}"
+            )
         if not math.isfinite(offset):
             raise ValueError(f"{path}: header: offset of {axis} = {offset:g} is not finite")
     if points == 0:
         raise ValueError(f"{path}: header: the file holds no points")
-    found = variable_records(path, file, _RECORD, header_size, start, records, "points")
-    header = dataclasses.replace(header, records={(r.user, r.number): (r.place, r.length) for r in found})
-    laszip = header.record(file, *_LASZIP)
-    if not kind & _COMPRESSED:
+    locations = {
+        (record.user, record.number): (record.offset, record.length)
+        for record in variable_records(path, file, _RECORD_HEADER, header_size, start, records, "points")
+    }
+    header = dataclasses.replace(header, records=locations)
+    laszip = header.record(file, *_LASZIP_RECORD)
+    if not format_byte & _COMPRESSED:
         if start + points * point_size > size:
             raise ValueError(
                 f"{path}: record {(size - start) // point_size}: the file ends, but its header names "
                 f"{points} points"
             )
         return header
-    check_unpacked(path, f"header: {points} points", points * point_size)
+    check_unpacked_size(path, f"header: {points} points", points * point_size)
     if laszip is None:
-        raise ValueError(f"{path}: header: points are compressed, but no record {_LASZIP[1]} says how")
+        raise ValueError(f"{path}: header: points are compressed, but no record {_LASZIP_RECORD[1]} says how")
     return dataclasses.replace(header, laszip=laszip)

@@ -1,10 +1,10 @@
-"""Reader of recorded waveforms: NEON's airborne full-waveform lidar, as an .npz of arrays.
+"""Reader of airborne waveforms: NEON's full-waveform lidar, as an .npz of arrays.
 
-The arrays are those of the sample that comes with the R package waveformlidar, with its names for the columns
-of the geolocation. What they refer to was found from the recorded numbers, and `read_neon` relies on it.
+The arrays are those of the sample data of the R package waveformlidar, with its names for the columns of the
+geolocation. The following was found from the recorded numbers, and `read_neon` relies on it.
 
-- (`V9`, `V10`, `V11`) is where sample `V16` (0 throughout) of the return lies, and (`dx`, `dy`, `dz`) is the
-  way from one sample to the next, 0.14986 m: half of what light travels in air in 1 ns.
+- (`V9`, `V10`, `V11`) is the position of sample `V16` (0 throughout) of the return, and (`dx`, `dy`, `dz`) is
+  the step from one sample to the next, 0.14986 m: half of what light travels in air in 1 ns.
 - (`x`, `y`, `z`), the position of the first return, lies at the sample `fr` + `V15` - `or`, to 0.0001 m of
   height. `fr` and `or` are where the return and the outgoing pulse rise to half of their height, `V15` is the
   outgoing pulse's largest sample, counted from 0. So a sample lies where a target is whose echo has the
@@ -26,12 +26,24 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxlidar.io.airborne import AirborneShot, Segment
-from jaxlidar.io.airborne_shots import QUIET, QUIET_PULSE, Levels, levels_of
-from jaxlidar.io.checks import FARTHEST, LARGEST_WHOLE, MOST_COUNTS, STEP, STEP_TOLERANCE, column_of
-from jaxlidar.io.npz import arrays_of
-from jaxlidar.io.pedestal import above_pedestal
+from jaxlidar.io.checks import (
+    MAX_COORDINATE,
+    MAX_COUNTS,
+    MAX_EXACT_INTEGER,
+    TWO_WAY_METRES_PER_NS,
+    TWO_WAY_TOLERANCE,
+    column_index,
+)
+from jaxlidar.io.noise import (
+    QUIET_PULSE_SAMPLES,
+    QUIET_SAMPLES,
+    NoiseLevels,
+    above_pedestal,
+    estimate_noise_levels,
+)
+from jaxlidar.io.npz import read_arrays
 
-# The arrays that are used, and the columns of `geo`.
+# Arrays in use, and columns of `geo`.
 _ARRAYS = ("ret", "outgoing", "system_impulse", "impulse_outgoing", "geo", "geo_cols")
 _COLUMNS: tuple[str, ...] = ("index", "dx", "dy", "dz", "V9", "V10", "V11", "V15", "V16")
 
@@ -60,11 +72,11 @@ class NeonImpulse(NamedTuple):
 
 
 class NeonRead(NamedTuple):
-    """What `read_neon` returns: the shots of a file and its system impulse.
+    """Result of `read_neon`: the shots of a file and its system impulse.
 
     - `shots`: list of `AirborneShot`, in the order of the file, in counts.
     - `impulse`: the `NeonImpulse`.
-    - `dropped`: how many shots of the file were left out, by reason.
+    - `dropped`: number of shots of the file that were left out, by reason.
 
     **Example:**
 
@@ -82,7 +94,7 @@ class NeonRead(NamedTuple):
 
 
 def read_neon(path: str | os.PathLike[str]) -> NeonRead:
-    """The full-waveform returns of NEON's airborne lidar in a file.
+    """Read the shots of NEON's airborne full-waveform lidar in a file.
 
     **Arguments:**
 
@@ -115,27 +127,26 @@ def read_neon(path: str | os.PathLike[str]) -> NeonRead:
     80.0 counts at 28.65 m
     """
     path = Path(path)
-    data = arrays_of(path, _ARRAYS)
-    ret, outgoing = _counts(path, data, "ret", 2), _counts(path, data, "outgoing", 2)
+    arrays = read_arrays(path, _ARRAYS)
+    ret, outgoing = _counts(path, arrays, "ret", 2), _counts(path, arrays, "outgoing", 2)
     if len(outgoing) != len(ret):
         raise ValueError(f"{path}: outgoing: {len(outgoing)} shots, but ret has {len(ret)}")
-    geo = _geolocation(path, data, len(ret))
-    system, sent = (_impulse(path, data, key) for key in ("system_impulse", "impulse_outgoing"))
+    geo = _geolocation(path, arrays, len(ret))
+    system, sent = (_impulse(path, arrays, key) for key in ("system_impulse", "impulse_outgoing"))
 
-    has_return = np.count_nonzero(ret, axis=1) >= QUIET
-    has_pulse = np.count_nonzero(outgoing, axis=1) >= QUIET
-    kept = np.flatnonzero(has_return & has_pulse)
-    if kept.size == 0:
+    has_return = np.count_nonzero(ret, axis=1) >= QUIET_SAMPLES
+    has_pulse = np.count_nonzero(outgoing, axis=1) >= QUIET_SAMPLES
+    complete = np.flatnonzero(has_return & has_pulse)
+    if complete.size == 0:
         raise ValueError(f"{path}: ret, outgoing: no shot has both a return and a pulse")
-    recorded = ([(Segment(_recorded(rows[i]), 0.0),) for rows in (outgoing, ret)] for i in kept)
-    levels = levels_of((sent, received) for sent, received in recorded)
-    shots = [_shot(path, geo[i], ret[i], outgoing[i], levels) for i in kept]
+    levels = estimate_noise_levels((_nonzero(outgoing[i]), _nonzero(ret[i])) for i in complete)
+    shots = [_shot(path, geo[i], ret[i], outgoing[i], levels) for i in complete]
     dropped = {"without a return": int((~has_return).sum()), "without a pulse": int((~has_pulse).sum())}
     return NeonRead(shots, NeonImpulse(*system, *sent), dropped)
 
 
 def _segments(row: np.ndarray) -> tuple[Segment, ...]:
-    """What was recorded of a return, in pieces between zeros."""
+    """Return the segments of a return, which lie between zeros."""
     ends = np.flatnonzero(np.diff(np.r_[False, row > 0, False]))
     return tuple(Segment(row[a:b], float(a)) for a, b in zip(ends[::2], ends[1::2]))
 
@@ -145,27 +156,28 @@ def _shot(
     geo: dict[str, float],
     received: np.ndarray,
     sent: np.ndarray,
-    levels: Levels,
+    levels: NoiseLevels,
 ) -> AirborneShot:
     shot = f"shot {geo['index']:.0f}"
-    place = f"{path}: geo: {shot}"
+    location = f"{path}: geo: {shot}"
     step = np.array([geo["dx"], geo["dy"], geo["dz"]])
     length = float(np.linalg.norm(step))
-    if abs(length - STEP) > STEP_TOLERANCE * STEP:
+    if abs(length - TWO_WAY_METRES_PER_NS) > TWO_WAY_TOLERANCE * TWO_WAY_METRES_PER_NS:
         raise ValueError(
-            f"{place}: dx, dy, dz: {length:g} m from sample to sample, where 1 ns is {STEP:.4f} m"
+            f"{location}: dx, dy, dz: {length:g} m from sample to sample, where 1 ns is "
+            f"{TWO_WAY_METRES_PER_NS:.4f} m"
         )
     if step[2] >= 0:
-        raise ValueError(f"{place}: dz = {step[2]:g} m does not lead down")
+        raise ValueError(f"{location}: dz = {step[2]:g} m does not lead down")
     anchor = np.array([geo["V9"], geo["V10"], geo["V11"]]) - geo["V16"] * step
     returning = _segments(received)
     last = anchor + returning[-1].time[-1] * step
-    if max(np.abs(anchor).max(), np.abs(last).max()) > FARTHEST:
-        raise ValueError(f"{place}: V9, V10, V11, V16: the return lies beyond {FARTHEST:g} m")
+    if max(np.abs(anchor).max(), np.abs(last).max()) > MAX_COORDINATE:
+        raise ValueError(f"{location}: V9, V10, V11, V16: the return lies beyond {MAX_COORDINATE:g} m")
     peak = geo["V15"]
     if not (0 <= peak < sent.size and peak.is_integer()) or sent[int(peak)] <= levels.pedestal:
-        raise ValueError(f"{place}: V15 = {peak:g} is no sample of the outgoing pulse")
-    # Its message says where a pulse has no energy.
+        raise ValueError(f"{location}: V15 = {peak:g} is no sample of the outgoing pulse")
+    # Called for its error: a pulse without energy is refused when the file is read, not when it is used.
     above_pedestal(sent, levels.pedestal, f"{path}: outgoing: {shot}")
     segments = {"returning": returning, "outgoing": (Segment(sent, -peak),)}
     return AirborneShot(
@@ -173,60 +185,61 @@ def _shot(
     )
 
 
-def _impulse(path: Path, data: dict[str, np.ndarray], key: str) -> tuple[np.ndarray, np.ndarray]:
-    """Times from the largest sample, and power above the pedestal."""
-    samples = _counts(path, data, key, 1)
-    if np.count_nonzero(samples) < QUIET:
-        raise ValueError(f"{path}: {key}: fewer than {QUIET} samples")
-    pedestal = float(_recorded(samples)[:QUIET_PULSE].mean())
+def _impulse(path: Path, arrays: dict[str, np.ndarray], key: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return the times of an impulse from its largest sample, and its power above the pedestal."""
+    samples = _counts(path, arrays, key, 1)
+    if np.count_nonzero(samples) < QUIET_SAMPLES:
+        raise ValueError(f"{path}: {key}: fewer than {QUIET_SAMPLES} samples")
+    pedestal = float(_nonzero(samples)[:QUIET_PULSE_SAMPLES].mean())
     time = np.arange(samples.size) - float(np.argmax(samples))
     return time, above_pedestal(samples, pedestal, f"{path}: {key}")
 
 
-def _array(path: Path, data: dict[str, np.ndarray], key: str, ndim: int) -> np.ndarray:
-    if data[key].ndim != ndim:
-        raise ValueError(f"{path}: {key}: shape {data[key].shape} where {ndim} dimensions belong")
-    if 0 in data[key].shape[1:]:
-        raise ValueError(f"{path}: {key}: shape {data[key].shape} has no columns")
-    return data[key]
+def _array(path: Path, arrays: dict[str, np.ndarray], key: str, ndim: int) -> np.ndarray:
+    if arrays[key].ndim != ndim:
+        raise ValueError(f"{path}: {key}: shape {arrays[key].shape} where {ndim} dimensions belong")
+    if 0 in arrays[key].shape[1:]:
+        raise ValueError(f"{path}: {key}: shape {arrays[key].shape} has no columns")
+    return arrays[key]
 
 
-def _numbers(path: Path, data: dict[str, np.ndarray], key: str, ndim: int) -> np.ndarray:
-    array = _array(path, data, key, ndim)
+def _numbers(path: Path, arrays: dict[str, np.ndarray], key: str, ndim: int) -> np.ndarray:
+    array = _array(path, arrays, key, ndim)
     if array.dtype.kind not in "iuf":
         raise ValueError(f"{path}: {key}: type {array.dtype} where numbers belong")
     with np.errstate(over="ignore"):
         array = array.astype(np.float64)
     if not np.all(np.isfinite(array)):
-        place = tuple(int(n) for n in np.argwhere(~np.isfinite(array))[0])
-        raise ValueError(f"{path}: {key}: element {place} is {array[place]}")
+        index = tuple(int(n) for n in np.argwhere(~np.isfinite(array))[0])
+        raise ValueError(f"{path}: {key}: element {index} is {array[index]}")
     return array
 
 
-def _counts(path: Path, data: dict[str, np.ndarray], key: str, ndim: int) -> np.ndarray:
-    array = _numbers(path, data, key, ndim)
-    wrong = (array < 0) | (array > MOST_COUNTS)
+def _counts(path: Path, arrays: dict[str, np.ndarray], key: str, ndim: int) -> np.ndarray:
+    array = _numbers(path, arrays, key, ndim)
+    wrong = (array < 0) | (array > MAX_COUNTS)
     if np.any(wrong):
-        place = tuple(int(n) for n in np.argwhere(wrong)[0])
+        index = tuple(int(n) for n in np.argwhere(wrong)[0])
         raise ValueError(
-            f"{path}: {key}: element {place} is {array[place]:g}; counts are not negative, and at most "
-            f"{MOST_COUNTS:g}"
+            f"{path}: {key}: element {index} is {array[index]:g}; counts are not negative, and at most "
+            f"{MAX_COUNTS:g}"
         )
     return array
 
 
-def _geolocation(path: Path, data: dict[str, np.ndarray], shots: int) -> list[dict[str, float]]:
-    """The columns of the geolocation that are used, shot by shot."""
-    geo, names = _numbers(path, data, "geo", 2), _array(path, data, "geo_cols", 1).tolist()
+def _geolocation(path: Path, arrays: dict[str, np.ndarray], shots: int) -> list[dict[str, float]]:
+    """Return the columns of the geolocation in use, shot by shot."""
+    geo, names = _numbers(path, arrays, "geo", 2), _array(path, arrays, "geo_cols", 1).tolist()
     if geo.shape != (shots, len(names)):
         raise ValueError(f"{path}: geo: shape {geo.shape}, but ret and geo_cols have {(shots, len(names))}")
-    used = [column_of(f"{path}: geo_cols", names, name) for name in _COLUMNS]
+    used = [column_index(f"{path}: geo_cols", names, name) for name in _COLUMNS]
     rows = [dict(zip(_COLUMNS, row)) for row in geo[:, used].tolist()]
     for i, index in enumerate(row["index"] for row in rows):
-        if not (index.is_integer() and abs(index) <= LARGEST_WHOLE):
+        if not (index.is_integer() and abs(index) <= MAX_EXACT_INTEGER):
             raise ValueError(f"{path}: geo: row {i}: index = {index:g} is no whole number")
     return rows
 
 
-def _recorded(row: np.ndarray) -> np.ndarray:
+def _nonzero(row: np.ndarray) -> np.ndarray:
+    """Return the samples of a row: zeros fill it up."""
     return row[row > 0]

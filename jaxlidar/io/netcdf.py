@@ -5,7 +5,6 @@ import datetime
 import json
 import os
 from collections.abc import Callable, Iterator
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -13,46 +12,63 @@ import jax
 import numpy as np
 
 from jaxlidar._files import atomic_write
+from jaxlidar._fingerprint import version_of
 from jaxlidar._registry import save_result
 from jaxlidar.instrument.photon_counter import PhotonEvents
 from jaxlidar.io.case import Case
 from jaxlidar.io.case import read_case as read_case_text
-from jaxlidar.io.gedi_beam import refusing
-from jaxlidar.io.layouts import LAYOUTS, keep_as_netcdf, layout_of
-from jaxlidar.io.zarr_groups import ZarrGroup, is_zarr, opened
+from jaxlidar.io.checks import refuse_damage
+from jaxlidar.io.datasets import (
+    KIND,
+    LAYOUTS,
+    case_dataset,
+    case_of_group,
+    datasets_of,
+    keep_as_netcdf,
+    result_of,
+)
+from jaxlidar.io.rows import BLOCK, CHECKSUMS, RowWriter
+from jaxlidar.io.stores import (
+    FORMAT,
+    NetcdfFile,
+    Store,
+    ZarrStore,
+    check_replaceable,
+    is_result_file,
+    is_zarr,
+)
 from jaxlidar.spectral.waveform import Waveform
 from jaxlidar.truth import Truth
 
 CONVENTIONS = "CF-1.11"
-# The layout of the files. A reader refuses those that are newer.
-FORMAT = 1
-HDF5 = b"\x89HDF\r\n\x1a\n"
-# The file that makes a folder a Zarr store of version 3.
-ZARR = "zarr.json"
+# Number of the format of files. A reader refuses newer ones. Version 0.2.0 wrote format 1: a waveform's
+# `energy_budget` is its `ledger`, and the checksum of texts in netCDF files does not include names.
+FORMAT_NUMBER = 2
 # Reasons why a simulation stopped that depend on more than its arguments.
-NOT_REPEATABLE = ("time spent", "interrupted")
+_NOT_REPEATABLE = ("time spent", "interrupted")
 
 
 @save_result.register
 def save(result: Any, path: str | os.PathLike[str], case: Case | None = None) -> None:
-    """Write a `Waveform`, or another result, as netCDF or Zarr: with units, names, and where it comes from.
+    """Write a `Waveform`, or another result, as netCDF or Zarr, with units, names and its origin.
 
-    The file appears when it is whole. Numbers are exact: `jaxlidar.open` gives the same bits. Any program
-    that knows netCDF-4 reads it, `xarray.open_dataset` for one; or Zarr, `xarray.open_zarr`.
+    The file appears when it is complete. Numbers are exact: `jaxlidar.open` returns the same bits. Any
+    program that reads netCDF-4 reads the file, such as `xarray.open_dataset`; `xarray.open_zarr` reads Zarr.
 
     **Arguments:**
 
-    - `result`: a `Waveform`, or an object of any other class that `keep_as_netcdf` was told of, such as
+    - `result`: a `Waveform`, or an object of any other class that `keep_as_netcdf` registered, such as
       `inversion.Retrieval` and `inversion.Retrievals`.
     - `path`: the file to write, or the folder of a Zarr store, whose name ends in ".zarr".
-    - `case`: the `Case` that a waveform, or those of a survey, were simulated from, kept with them so that
-      `jaxlidar.rerun` can simulate them again. Default None: not kept.
+    - `case`: the `Case` from which a waveform, or those of a survey, were simulated. It is written with them
+      so that `jaxlidar.rerun` can simulate them again. Default None: not written.
 
     **Returns:** nothing.
 
-    **Raises:** TypeError for an object that no file can hold, or whose scene has classes of one's own.
-    ImportError where h5netcdf, or zarr, is not installed. ValueError for a case of other wavelengths or
-    shots, and where a ".zarr" is there that is no Zarr store. OSError for a path that cannot be written.
+    **Raises:** TypeError for an object that no file can hold, or whose scene has classes of your own.
+    ImportError where xarray, and h5netcdf or zarr, are not installed. ValueError for a case of other
+    wavelengths or shots, and where a folder of that name exists that is no Zarr store. OSError for a path
+    that cannot be written.
 
     **Example:**
 
@@ -67,14 +83,12 @@ def save(result: Any, path: str | os.PathLike[str], case: Case | None = None) ->
     """
     if case is not None:
         _check_case(result, case)
-    with _new_file(result, path) as (writer, file):
-        writer.result(file, result)
-        if case is not None:
-            writer.case(file, "case", case)
+    with _new_file(result, path, case) as file:
+        _write_rows(file, result, "/")
 
 
 def _check_case(result: Any, case: Case) -> None:
-    """**Raises:** ValueError where a result cannot be that of a case."""
+    """Refuse a case from which a result cannot have been simulated. **Raises:** ValueError."""
     lidar = case.lidar if case.survey is None else case.survey.lidar
     if lidar is not None and hasattr(result, "wavelength"):
         sent, received = np.asarray(lidar.wavelength), np.asarray(result.wavelength)
@@ -83,122 +97,135 @@ def _check_case(result: Any, case: Case) -> None:
                 f"case has a lidar of {sent.tolist()} nm, the waveform is of {received.tolist()} nm: it is "
                 "not the case that it was simulated from"
             )
-    place = getattr(result, "position", None)
-    if (case.survey is None) != (place is None):
+    position = getattr(result, "position", None)
+    if (case.survey is None) != (position is None):
         raise ValueError("a case with a survey belongs to Waveforms, one without to a Waveform")
-    if case.survey is not None and not np.array_equal(case.survey.position, np.asarray(place)):
+    if case.survey is not None and not np.array_equal(case.survey.position, np.asarray(position)):
         raise ValueError("the shots of the case have another position than the waveforms")
 
 
 @contextlib.contextmanager
-def by_rows(result: Any, path: str | os.PathLike[str], case: Case | None = None) -> Iterator[Any]:
-    """Write a result whose rows are only known later: what the block is given adds them.
+def by_rows(result: Any, path: str | os.PathLike[str], case: Case | None = None) -> Iterator[RowWriter]:
+    """Write a result whose rows are not known yet; the block adds them to the `RowWriter` that it is given.
 
-    The arrays of `result` with rows have the right shape and type, but their values do not count. `case` is
-    kept as by `save`.
+    The arrays of `result` with rows must have the right shape and type, but their values do not count
+    (`jaxlidar.io.rows.unwritten_rows`). `case` is as for `save`.
     """
-    with _new_file(result, path) as (writer, file):
-        if case is not None:
-            writer.case(file, "case", case)
-        rows = writer.frame(file, result)
-        yield rows
-        rows.end()
+    with _new_file(result, path, case) as file:
+        writer = _row_writer(file, result, "/")
+        yield writer
+        writer.end()
 
 
 @contextlib.contextmanager
-def _new_file(result: Any, path: str | os.PathLike[str]) -> Iterator[tuple[Any, Any]]:
-    """A file that appears under its name when the block ends: what writes into it, and its root group."""
-    from jaxlidar.io.groups import Writer
-
+def _new_file(result: Any, path: str | os.PathLike[str], case: Case | None) -> Iterator[Store]:
+    """Write a result but for its rows; the file appears under its name when the block ends."""
     path, name = Path(path), type(result).__name__
     if name not in LAYOUTS or LAYOUTS[name].kind is not type(result):
         raise TypeError(f"result is of the class {name}; admissible are {', '.join(sorted(LAYOUTS))}")
-    if is_zarr(path) and path.exists() and not (path / ZARR).is_file():
-        raise ValueError(f"{path}: it is there already and no Zarr store; nothing is overwritten")
+    check_replaceable(path)
+    store = ZarrStore if is_zarr(path) else NetcdfFile
+    store.import_packages()
+    datasets = datasets_of(result, row_values=False)
+    attributes = _file_attributes()
+    if case is not None:
+        case_attributes, arrays = case_dataset("case", case)
+        attributes |= case_attributes
+        if arrays is not None:
+            datasets["/case_arrays"] = arrays
+    # A static field of the result may have the same name, as the `history` of a fit: that one stays.
+    datasets["/"].attrs = attributes | datasets["/"].attrs
+    rows = {}
+    for group, dataset in datasets.items():
+        layout = LAYOUTS.get(dataset.attrs.get(KIND, ""))
+        if layout is not None and layout.rows is not None:
+            rows[group] = layout.row_variables
+            checksums = np.zeros(dataset.sizes[rows[group].dimension], np.uint32)
+            datasets[group] = dataset.assign({CHECKSUMS: (rows[group].dimension, checksums)})
+    with atomic_write(path) as draft, store.create(draft, datasets, rows) as file:
+        yield file
+
+
+def _file_attributes() -> dict[str, Any]:
     now = f"{datetime.datetime.now(datetime.UTC):%Y-%m-%dT%H:%M:%SZ}"
-    with contextlib.ExitStack() as stack:
-        draft = stack.enter_context(atomic_write(path))
-        file = opened(draft, "w") if is_zarr(path) else stack.enter_context(_h5netcdf().File(draft, "w"))
-        file.attrs.update(
-            {
-                "Conventions": CONVENTIONS,
-                "title": LAYOUTS[name].title,
-                "source": f"jaxlidar {version('jaxlidar')}",
-                "history": f"{now}: written by jaxlidar.io.save",
-                "jaxlidar_format": FORMAT,
-                "jaxlidar_kind": name,
-                "versions": json.dumps({p: version(p) for p in ("jaxlidar", "jax", "jaxlib", "numpy")}),
-                "platform": jax.default_backend(),
-                "precision": precision(),
-            }
-        )
-        yield Writer(LAYOUTS), file
+    return {
+        "Conventions": CONVENTIONS,
+        "source": f"jaxlidar {version_of('jaxlidar')}",
+        "history": f"{now}: written by jaxlidar.io.save",
+        FORMAT: FORMAT_NUMBER,
+        "versions": json.dumps({p: version_of(p) for p in ("jaxlidar", "jax", "jaxlib", "numpy")}),
+        "platform": jax.default_backend(),
+        "precision": _precision(),
+    }
 
 
-def version(package: str) -> str:
-    """The installed version of a package."""
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return "not installed"
+def _inner_results(result: Any, group: str) -> dict[str, tuple[Any, str]]:
+    """Return the objects of known classes in the fields of a result, each with its group, by field."""
+    return {
+        name: (value, f"{group.rstrip('/')}/{name}")
+        for name, value in vars(result).items()
+        if type(value).__name__ in LAYOUTS
+    }
 
 
-def precision() -> str:
-    """JAX's precision."""
+def _row_writer(file: Store, result: Any, group: str) -> RowWriter:
+    """Return the writer of the rows of a result, and of the objects in its fields that have rows."""
+    fields = LAYOUTS[type(result).__name__].row_variables.names
+    return RowWriter(
+        variables={name: file.variable(group, name) for name in fields},
+        items={name: list(v) for name in fields if isinstance(v := getattr(result, name), dict)},
+        checksums=file.variable(group, CHECKSUMS),
+        inner={
+            name: _row_writer(file, value, inner_group)
+            for name, (value, inner_group) in _inner_results(result, group).items()
+            if LAYOUTS[type(value).__name__].rows is not None
+        },
+    )
+
+
+def _write_rows(file: Store, result: Any, group: str) -> None:
+    """Write the rows of a result that is known, and those of the objects in its fields."""
+    if LAYOUTS[type(result).__name__].rows is None:
+        for value, inner_group in _inner_results(result, group).values():
+            _write_rows(file, value, inner_group)
+        return
+    writer = _row_writer(file, result, group)
+    values = {name: getattr(result, name) for name in (*writer.fields, *writer.inner)}
+    # Block by block: the arrays may be those of a file that is larger than memory.
+    for start in range(0, writer.count, BLOCK):
+        rows = slice(start, start + BLOCK)
+        writer.add(rows, jax.tree.map(lambda array, rows=rows: array[rows], values))
+    writer.end()
+
+
+def _precision() -> str:
+    """Return the type of JAX's numbers, "float32" or "float64"."""
     return jax.numpy.asarray(0.0).dtype.name
 
 
-def _h5netcdf() -> Any:
-    try:
-        import h5netcdf
-    except ImportError as error:
-        raise ImportError("netCDF files need h5netcdf: pip install 'jaxlidar[io]'") from error
-    return h5netcdf
-
-
-def _with_file(path: str | os.PathLike[str], use: Callable[[Path, Any], Any]) -> Any:
-    """What `use` makes of an open file of this package."""
+@contextlib.contextmanager
+def _open_file(path: str | os.PathLike[str]) -> Iterator[Store]:
+    """Open a file of `save`. **Raises:** as `open`."""
     path = Path(path)
-    with contextlib.ExitStack() as stack:
-        file = _zarr_store(path) if is_zarr(path) else _netcdf_file(path, stack)
-        with refusing(f"{path}: the attributes: damaged"):
-            attributes = dict(file.attrs)
-        if "jaxlidar_kind" not in attributes:
-            raise ValueError(f"{path}: no attribute jaxlidar_kind: jaxlidar.io.save did not write it")
-        written = attributes.get("jaxlidar_format")
-        if not isinstance(written, int | np.integer) or not 1 <= written <= FORMAT:
+    with (ZarrStore if is_zarr(path) else NetcdfFile).open(path) as file:
+        attributes = _root_attributes(file)
+        if KIND not in attributes:
+            raise ValueError(f"{path}: no attribute {KIND}: jaxlidar.io.save did not write it")
+        written = attributes.get(FORMAT)
+        if not isinstance(written, int | np.integer) or not 1 <= written <= FORMAT_NUMBER:
             raise ValueError(
-                f"{path}: jaxlidar_format = {written} is outside [1, {FORMAT}]: a newer jaxlidar's?"
+                f"{path}: {FORMAT} = {written} is outside [1, {FORMAT_NUMBER}]: a newer jaxlidar's?"
             )
-        return use(path, file)
+        yield file
 
 
-def _netcdf_file(path: Path, stack: contextlib.ExitStack) -> Any:
-    """A netCDF-4 file that is open until the stack closes. **Raises:** as `open`."""
-    netcdf = _h5netcdf()
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
-    # HDF5 keeps files that it has opened by name, damaged ones too; not those that are opened for it.
-    stream = stack.enter_context(path.open("rb"))
-    if stream.read(len(HDF5)) != HDF5:
-        raise ValueError(f"{path}: byte 0: no netCDF-4 file")
-    stream.seek(0)
-    with refusing(f"{path}: damaged"):
-        return stack.enter_context(netcdf.File(stream, "r"))
-
-
-def _zarr_store(path: Path) -> ZarrGroup:
-    """A Zarr store. **Raises:** as `open`."""
-    if not path.is_dir():
-        raise FileNotFoundError(f"{path}: no such folder")
-    if not (path / ZARR).is_file():
-        raise ValueError(f"{path}: no Zarr store of version 3: it has no {ZARR}")
-    with refusing(f"{path}: damaged"):
-        return opened(path, "r")
+def _root_attributes(file: Store) -> dict[str, Any]:
+    with refuse_damage(f"{file.path}: the attributes: damaged"):
+        return dict(file.dataset("/").attrs)
 
 
 def open(path: str | os.PathLike[str]) -> Any:
-    """What `save` wrote: a `Waveform`, or another result.
+    """Read a `Waveform`, or another result, from a file that `save` wrote.
 
     Waveforms of surveys in netCDF files are compared with their checksums, but not read into memory: their
     arrays are mapped (`numpy.memmap`), and read where they are used.
@@ -208,8 +235,8 @@ def open(path: str | os.PathLike[str]) -> Any:
     **Returns:** an object of the class that was saved, with the same bits.
 
     **Raises:** FileNotFoundError where there is no such file. ValueError, naming the file and the place, for
-    one that is damaged, or not written by `save`, or whose class is not known. ImportError where h5netcdf, or
-    zarr, is not installed.
+    one that is damaged, or not written by `save`, or whose class is not known. ImportError where xarray, and
+    h5netcdf or zarr, are not installed.
 
     **Example:**
 
@@ -221,21 +248,17 @@ def open(path: str | os.PathLike[str]) -> Any:
     >>> jl.open(path).info["stopped"]
     'nothing is random'
     """
-    from jaxlidar.io.groups import Reader
-
-    def read(path: Path, file: Any) -> Any:
-        return Reader(path, layout_of).result(file, str(file.attrs["jaxlidar_kind"]), "")
-
-    return _with_file(path, read)
+    with _open_file(path) as file:
+        return result_of(file)
 
 
 def read_case(path: str | os.PathLike[str]) -> Case:
-    """The case of a TOML file, or the one that a waveform was saved with.
+    """Read the case of a TOML file, or the one that a waveform was saved with.
 
     **Arguments:**
 
-    - `path`: a TOML file with the tables `lidar`, `scene` and `simulate`, any of which may be missing; files
-      that it names lie relative to it. Or a file, or Zarr store, of `jaxlidar.io.save`.
+    - `path`: a TOML file with the tables `lidar`, `survey`, `scene` and `simulate`, any of which may be
+      missing; files that it names lie relative to it. Or a file, or Zarr store, of `jaxlidar.io.save`.
 
     **Returns:** a `Case`.
 
@@ -253,16 +276,11 @@ def read_case(path: str | os.PathLike[str]) -> Case:
     >>> print(float(case.scene.ground.slope), case.lidar)
     5.0 None
     """
-    from jaxlidar.io.groups import Reader
-
     path = Path(path)
-    kept = is_zarr(path)
-    if not kept and path.is_file():
-        with path.open("rb") as start:
-            kept = start.read(len(HDF5)) == HDF5
-    if not kept:
+    if not is_result_file(path):
         return read_case_text(path)
-    return _with_file(path, lambda path, file: Reader(path, layout_of).case(file, "case", ""))
+    with _open_file(path) as file:
+        return case_of_group(file, "case")
 
 
 def rerun(path: str | os.PathLike[str], progress: Callable[[Any], None] | None = None) -> Any:
@@ -270,7 +288,7 @@ def rerun(path: str | os.PathLike[str], progress: Callable[[Any], None] | None =
 
     On the same machine, with the same versions (the attribute `versions`), the waveform is the same bit for
     bit, but for `info["seconds"]`. Files that `simulate_many` wrote have their case, unless the scene has
-    classes of one's own.
+    classes of your own.
 
     **Arguments:**
 
@@ -292,16 +310,17 @@ def rerun(path: str | os.PathLike[str], progress: Callable[[Any], None] | None =
     >>> bool((jl.rerun(path).reflectance == jl.open(path).reflectance).all())
     True
     """
-    case, wave = read_case(path), open(path)
+    with _open_file(path) as file:
+        case, wave = case_of_group(file, "case"), result_of(file)
+        precision = str(_root_attributes(file).get("precision"))
     stopped = wave.info.get("stopped")
-    if stopped in NOT_REPEATABLE:
+    if stopped in _NOT_REPEATABLE:
         raise ValueError(
-            f"{path}: the run ended early ({stopped}); when that happens is no part of a case. "
-            "read_case(path).simulate() runs it anew"
+            f"{path}: the run ended early ({stopped}); the time when it ended is no part of a case. "
+            "read_case(path).simulate() starts it anew"
         )
-    kept = _with_file(path, lambda _, file: str(file.attrs.get("precision")))
-    if kept != precision():
-        raise ValueError(f"{path}: it was simulated in {kept}; JAX is configured for {precision()} now")
+    if precision != _precision():
+        raise ValueError(f"{path}: it was simulated in {precision}; JAX is configured for {_precision()} now")
     return case.simulate(progress)
 
 
@@ -325,6 +344,7 @@ keep_as_netcdf(
     dimensions={"bins": "time", "wavelengths": "wavelength"},
     items={"components": "component", "energy_budget": "fate", "energy_budget_stderr": "fate"},
     coordinates={"height": "time"},
+    former_names={"energy_budget": "ledger", "energy_budget_stderr": "ledger_stderr"},
 )
 
 keep_as_netcdf(
@@ -344,8 +364,8 @@ keep_as_netcdf(
     dimensions={"2": "end"},
 )
 
-# What `Truth` has, and that of many shots as well.
-TRUTH = {
+# Quantities of a `Truth`, and of the `Truths` of many shots.
+TRUTH_QUANTITIES = {
     "returns": ("1", "apparent reflectance of order one per sample by material, of a pulse without duration"),
     "gap_probability": ("1", "share of the beam that meets nothing down to the end of the sample"),
     "leaf_area_density": ("m2 m-3", "one-sided area of leaf per volume"),
@@ -355,14 +375,14 @@ TRUTH = {
     "surface_height": ("m", "mean height at which the beam meets the surface"),
     "surface_spread": ("m", "standard deviation of the height at which the beam meets the surface"),
 }
-# Its samples may be finer than those of the waveform that it belongs to.
+# Samples are a dimension of their own: they may be finer than those of the waveform that it belongs to.
 keep_as_netcdf(
     Truth,
     "truth of a simulated lidar waveform",
     {
         "time": ("ns", "time of arrival after the two-way travel time of the reference plane"),
         "height": ("m", "height above the reference plane from which light of order one arrives"),
-        **TRUTH,
+        **TRUTH_QUANTITIES,
     },
     dimensions={"bins": "sample", "wavelengths": "wavelength"},
     items={"returns": "material", "surface_height": "surface", "surface_spread": "surface"},

@@ -1,4 +1,4 @@
-"""Writer of maps of a survey: one number for each shot of a grid, as bands of a GeoTIFF."""
+"""Writer of maps of a survey: one number for each shot on a grid, as bands of a GeoTIFF."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -12,8 +12,8 @@ from jaxlidar._checks import check_kind, check_numbers, check_range, check_shape
 from jaxlidar._files import atomic_write
 
 _TIFF = (".tif", ".tiff")
-# Shots lie on a grid if they are off by less than this share of its spacing.
-_OFF = 1e-3
+# Shots lie on a grid if they are off by less than this fraction of its spacing.
+_GRID_TOLERANCE = 1e-3
 
 
 def write_raster(
@@ -23,10 +23,11 @@ def write_raster(
     *,
     crs: str | None = None,
 ) -> None:
-    """Write maps, such as heights, cover or ground that were retrieved for the shots of a grid, as a GeoTIFF.
+    """Write maps, such as heights, cover or ground retrieved for the shots of a grid, as a GeoTIFF.
 
-    Every shot is the middle of a cell. Cells without a shot have no data, and so have those whose number is
-    NaN: they are NaN in the file, which says so. Numbers keep their bits: bands are of float64.
+    Every shot is the centre of a cell. Cells without a shot, and those whose number is NaN, have no data:
+    they are NaN, which the file declares as its value of no data. Bands are of float64, so numbers keep their
+    bits.
 
     **Arguments:**
 
@@ -39,7 +40,7 @@ def write_raster(
     **Returns:** nothing.
 
     **Raises:** ImportError where `rasterio` is not installed, which the extra `io` installs. ValueError for
-    values of another number, infinite ones, shots that are not on a grid or twice at one place, an unknown
+    values of another number, infinite ones, shots that are not on a grid or twice in one cell, an unknown
     `crs`, and another kind of file. OSError for a path that cannot be written.
 
     **Source:** OGC GeoTIFF 1.1.
@@ -69,13 +70,13 @@ def write_raster(
         raise ValueError("values is empty; admissible is one map or more")
     cells, origin, spacing, shape = _grid(position)
     bands = np.full((len(values), *shape), np.nan)
-    for band, (name, of_shots) in zip(bands, values.items()):
-        check_numbers(f"values of {name!r}", of_shots)
-        known = np.asarray(of_shots, float)
-        check_shape(f"values of {name!r}", known, (len(cells),))
-        check_range(f"values of {name!r}", np.where(np.isnan(known), 0.0, known))
+    for band, (name, shot_values) in zip(bands, values.items()):
+        check_numbers(f"values of {name!r}", shot_values)
+        numbers = np.asarray(shot_values, float)
+        check_shape(f"values of {name!r}", numbers, (len(cells),))
+        check_range(f"values of {name!r}", np.where(np.isnan(numbers), 0.0, numbers))
         # Rows run from north to south.
-        band[shape[0] - 1 - cells[:, 1], cells[:, 0]] = known
+        band[shape[0] - 1 - cells[:, 1], cells[:, 0]] = numbers
     west, north = origin[0] - 0.5 * spacing[0], origin[1] + (shape[0] - 0.5) * spacing[1]
     transform = rasterio.Affine(spacing[0], 0.0, west, 0.0, -spacing[1], north)
     profile: dict[str, Any] = {"driver": "GTiff", "count": len(bands), "dtype": "float64", "nodata": np.nan}
@@ -91,42 +92,46 @@ def write_raster(
 
 
 def _grid(position: ArrayLike | Sequence) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[int, int]]:
-    """Column and row of every shot from the south-west, where that is, spacing, and (rows, columns)."""
+    """Return the grid of shots: column and row of each, south-west position, spacing, and (rows, columns).
+
+    **Raises:** as `write_raster`.
+    """
     check_numbers("position", position)
-    place = np.asarray(position, float)
-    if place.ndim != 2 or place.shape[1] != 2 or len(place) == 0:
-        raise ValueError(f"position has the shape {place.shape}; admissible is (shots, 2), one or more")
-    check_range("position", place)
-    low = place.min(axis=0)
-    spacing = np.array([_step(place[:, axis], low[axis]) for axis in range(2)])
-    # One row or column alone has the spacing of the other.
+    xy = np.asarray(position, float)
+    if xy.ndim != 2 or xy.shape[1] != 2 or len(xy) == 0:
+        raise ValueError(f"position has the shape {xy.shape}; admissible is (shots, 2), one or more")
+    check_range("position", xy)
+    low = xy.min(axis=0)
+    spacing = np.array([_grid_spacing(xy[:, axis]) for axis in range(2)])
+    # A single row or column has the spacing of the other axis.
     spacing = np.where(spacing > 0, spacing, spacing.max())
     spacing = np.where(spacing > 0, spacing, 1.0)
-    number = (place - low) / spacing
-    cells = np.round(number).astype(int)
-    off = np.abs(number - cells).max(axis=1)
-    if np.any(off > _OFF):
-        worst = int(np.argmax(off))
+    cell_coordinates = (xy - low) / spacing
+    cells = np.round(cell_coordinates).astype(int)
+    deviation = np.abs(cell_coordinates - cells).max(axis=1)
+    if np.any(deviation > _GRID_TOLERANCE):
+        worst = int(np.argmax(deviation))
         raise ValueError(
-            f"position: shot {worst} at {place[worst].tolist()} m is off the grid of {spacing.tolist()} m "
+            f"position: shot {worst} at {xy[worst].tolist()} m is off the grid of {spacing.tolist()} m "
             f"from {low.tolist()}; admissible are shots on a grid along x and y"
         )
     columns, rows = (int(n) + 1 for n in cells.max(axis=0))
     unique, first = np.unique(cells[:, 1] * columns + cells[:, 0], return_index=True)
     if len(unique) < len(cells):
-        twice = int(np.setdiff1d(np.arange(len(cells)), first)[0])
+        duplicate = int(np.setdiff1d(np.arange(len(cells)), first)[0])
         raise ValueError(
-            f"position: shot {twice} lies where another one does; admissible is one for each cell"
+            f"position: shot {duplicate} lies where another one does; admissible is one for each cell"
         )
     return cells, low, spacing, (rows, columns)
 
 
-def _step(x: np.ndarray, low: float) -> float:
-    """The smallest distance between different coordinates, or 0 where there is one alone."""
-    apart = np.diff(np.unique(x))
-    apart = apart[apart > _OFF * max(float(np.ptp(x)), 1e-9) / len(x)]
-    if apart.size == 0:
+def _grid_spacing(x: np.ndarray) -> float:
+    """Return the smallest distance between different coordinates, or 0 where all are equal."""
+    extent = float(np.ptp(x))
+    distances = np.diff(np.unique(x))
+    # Coordinates that differ by rounding alone are equal.
+    distances = distances[distances > _GRID_TOLERANCE * max(extent, 1e-9) / len(x)]
+    if distances.size == 0:
         return 0.0
-    # The mean over all of them is exact where single steps are rounded.
-    smallest = float(apart.min())
-    return float(np.ptp(x)) / max(round(float(np.ptp(x)) / smallest), 1)
+    # The extent over the number of steps is more exact than a single step, which is rounded.
+    return extent / max(round(extent / float(distances.min())), 1)

@@ -1,16 +1,19 @@
-"""What the readers of text files share: lines, cells and numbers, refused by their place."""
+"""Lines, cells and numbers of text files; what is not admissible is refused with its file and line."""
 
 import codecs
 import csv
 import os
 from pathlib import Path
 
-from jaxlidar.io.checks import LARGEST_WHOLE, existing
+from jaxlidar.io.checks import MAX_EXACT_INTEGER, existing_file
 
 
-def lines_of(path: str | os.PathLike[str]) -> tuple[Path, list[str]]:
-    """The path of a text file in UTF-8, and its lines."""
-    path = existing(path)
+def read_lines(path: str | os.PathLike[str]) -> tuple[Path, list[str]]:
+    """Return the path of a text file in UTF-8, and its lines.
+
+    **Raises:** FileNotFoundError; ValueError, naming file and line, where it is no UTF-8.
+    """
+    path = existing_file(path)
     lines = []
     for number, line in enumerate(path.read_bytes().removeprefix(codecs.BOM_UTF8).splitlines(), 1):
         try:
@@ -20,24 +23,27 @@ def lines_of(path: str | os.PathLike[str]) -> tuple[Path, list[str]]:
     return path, lines
 
 
-def number_in(path: Path, line: int, column: str, text: str) -> float:
-    """A number, or a ValueError that says where it is not one."""
+def parse_number(path: Path, line: int, column: str, text: str) -> float:
+    """Return the number in a cell. **Raises:** ValueError, naming file, line and column."""
     try:
         return float(text)
     except ValueError:
-        raise ValueError(f"{path}: line {line}: {column} = {_shown(text)} is no number") from None
+        raise ValueError(f"{path}: line {line}: {column} = {_abbreviated(text)} is no number") from None
 
 
-def whole_in(path: Path, line: int, column: str, text: str) -> int:
-    """A whole number, or a ValueError that says where it is not one."""
-    value = number_in(path, line, column, text)
-    if not (value.is_integer() and abs(value) <= LARGEST_WHOLE):
-        raise ValueError(f"{path}: line {line}: {column} = {_shown(text)} is no whole number")
+def parse_integer(path: Path, line: int, column: str, text: str) -> int:
+    """Return the whole number in a cell. **Raises:** ValueError, naming file, line and column."""
+    value = parse_number(path, line, column, text)
+    if not (value.is_integer() and abs(value) <= MAX_EXACT_INTEGER):
+        raise ValueError(f"{path}: line {line}: {column} = {_abbreviated(text)} is no whole number")
     return int(value)
 
 
-def cells_of(path: Path, line: int, text: str, delimiter: str, columns: int | None = None) -> list[str]:
-    """The cells of a line. There must be `columns` cells, where that is given."""
+def split_cells(path: Path, line: int, text: str, delimiter: str, columns: int | None = None) -> list[str]:
+    """Return the cells of a line, of which there must be `columns` if that is given.
+
+    **Raises:** ValueError, naming file and line.
+    """
     if delimiter == " ":
         cells = text.split()
     else:
@@ -50,6 +56,6 @@ def cells_of(path: Path, line: int, text: str, delimiter: str, columns: int | No
     return cells
 
 
-def _shown(text: str) -> str:
+def _abbreviated(text: str) -> str:
     text = text.strip()
     return repr(text if len(text) <= 40 else text[:37] + "...")

@@ -9,25 +9,26 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxlidar._checks import check_choice, check_range
-from jaxlidar.io.checks import FARTHEST, column_of
-from jaxlidar.io.text import cells_of, lines_of, number_in, whole_in
+from jaxlidar.io.checks import MAX_COORDINATE, column_index
+from jaxlidar.io.text import parse_integer, parse_number, read_lines, split_cells
 from jaxlidar.optics.leaf_angles import LeafAngles
 from jaxlidar.scenes.voxels import VoxelMap
 
 _FIRST_LINE = "VOXEL SPACE"
-_DENSITY = ("PadBVTotal", "attenuation_FPL_unbiasedMLE")
-# Columns that say which voxels no beam sampled, and which lie below the ground.
-_OPTIONAL = ("nbSampling", "ground_distance")
-_HEADER = ("min_corner", "max_corner", "split", "lad_type")
+# Columns of plant area density, or of attenuation, in the order in which they are looked for.
+_DENSITY_COLUMNS = ("PadBVTotal", "attenuation_FPL_unbiasedMLE")
+# Columns with the number of beams that sampled a voxel, and with its height above the ground.
+_OPTIONAL_COLUMNS = ("nbSampling", "ground_distance")
+_HEADER_KEYS = ("min_corner", "max_corner", "split", "lad_type")
 # The largest density that is finite in single precision.
-_MOST = float(np.finfo(np.float32).max)
+_MAX_DENSITY = float(np.finfo(np.float32).max)
 
 
 class VoxelsRead(NamedTuple):
-    """What `read_vox` returns: a voxel map and what was left out of it.
+    """Result of `read_vox`: a voxel map, and the number of voxels that were left out of it.
 
     - `voxels`: a `VoxelMap`.
-    - `dropped`: how many voxels of the file do not have their density in the map, by reason.
+    - `dropped`: number of voxels of the file that do not have their density in the map, by reason.
 
     **Example:**
 
@@ -47,7 +48,7 @@ class VoxelsRead(NamedTuple):
 def read_vox(
     path: str | os.PathLike[str], *, density: str | None = None, fill: float = 0.0, name: str = "leaf"
 ) -> VoxelsRead:
-    r"""The voxel map of plant area density in an AMAPVox file.
+    r"""Read the voxel map of plant area density in an AMAPVox file.
 
     **Arguments:**
 
@@ -56,18 +57,17 @@ def read_vox(
       extinction coefficients, 1/m, which are doubled. Default None: "PadBVTotal", or, where it is missing,
       "attenuation_FPL_unbiasedMLE".
     - `fill`: density of voxels that no beam sampled, m2/m3. Default 0.
-    - `name`: what the plant area is taken for, "leaf" or "bark". Default "leaf".
+    - `name`: material of the plant area, "leaf" or "bark". Default "leaf".
 
-    **Returns:** a `VoxelsRead`: the `VoxelMap` and what was dropped, by reason: voxels that no beam sampled
-    ("not sampled") or whose density is not a number ("without a density"), which have the density `fill`, and
-    voxels below the ground ("below the ground") that hold a density, which is left out. Leaf angles are those
-    that the file names (`lad_type`).
+    **Returns:** a `VoxelsRead`: the `VoxelMap`, and the voxels that were dropped, by reason: those that no
+    beam sampled ("not sampled") or whose density is not a number ("without a density"), which have the
+    density `fill`, and those below the ground ("below the ground") that hold a density, which is left out.
+    Leaf angles are those that the file names (`lad_type`).
 
-    **Raises:** FileNotFoundError where there is no such file. ValueError, naming the file and the line, for
-    what is damaged: a first line or a header that is missing or makes no sense, columns that
-    are missing or given twice, rows of the wrong length or number, indices outside the grid or given twice,
-    negative densities. ValueError for a `fill` that is
-    negative or not finite and for another `name`.
+    **Raises:** FileNotFoundError where there is no such file. ValueError, naming the file and the line, for a
+    first line or a header that is missing or makes no sense, columns that are missing or given twice, rows of
+    the wrong length or number, indices outside the grid or given twice, and negative densities. ValueError
+    for a `fill` that is negative or not finite, and for another `name`.
 
     **Source:** Vincent et al. (2017), Remote Sens. Environ. 190, 273; AMAPVox's output format.
 
@@ -85,8 +85,8 @@ def read_vox(
     """
     check_choice("name", name, ("leaf", "bark"))
     check_range("fill", fill, 0.0)
-    path, lines = lines_of(path)
-    head, at = _header(path, lines)
+    path, lines = read_lines(path)
+    head, column_line = _read_header(path, lines)
     low, high = (_triple(path, head, key) for key in ("min_corner", "max_corner"))
     split = _triple(path, head, "split")
     shape = tuple(int(n) for n in split)
@@ -94,31 +94,33 @@ def read_vox(
         raise ValueError(f"{path}: line {head['split'][1]}: split = {head['split'][0]} are no whole numbers")
     if not all(np.float32(h - b) > 0 for h, b in zip(high, low)):
         raise ValueError(f"{path}: line {head['max_corner'][1]}: max_corner does not lie beyond min_corner")
-    names = lines[at].split()
+    names = lines[column_line].split()
     if density is None:
-        density = next((c for c in _DENSITY if c in names), _DENSITY[0])
-    needed = ("i", "j", "k", density, *(c for c in _OPTIONAL if c in names))
-    column = {c: column_of(f"{path}: line {at + 1}", names, c) for c in needed}
+        density = next((c for c in _DENSITY_COLUMNS if c in names), _DENSITY_COLUMNS[0])
+    needed = ("i", "j", "k", density, *(c for c in _OPTIONAL_COLUMNS if c in names))
+    column = {c: column_index(f"{path}: line {column_line + 1}", names, c) for c in needed}
 
-    rows = [(number, text) for number, text in enumerate(lines[at + 1 :], at + 2) if text.strip()]
+    numbered = enumerate(lines[column_line + 1 :], column_line + 2)
+    rows = [(number, text) for number, text in numbered if text.strip()]
     if len(rows) < (count := math.prod(shape)):
         raise ValueError(f"{path}: line {len(lines)}: {count - len(rows)} of {count} voxels are missing")
-    values, seen = np.full(shape, float(fill)), np.zeros(shape, bool)
+    values, is_read = np.full(shape, float(fill)), np.zeros(shape, bool)
     dropped = {"not sampled": 0, "without a density": 0, "below the ground": 0}
+    # Attenuation is half of the plant area density, for G = 1/2 of spherical angles.
     factor = 2.0 if density.startswith("attenuation") else 1.0
     for number, text in rows:
-        cells = cells_of(path, number, text, " ", len(names))
-        voxel = tuple(whole_in(path, number, c, cells[column[c]]) for c in "ijk")
+        cells = split_cells(path, number, text, " ", len(names))
+        voxel = tuple(parse_integer(path, number, c, cells[column[c]]) for c in "ijk")
         if any(not 0 <= v < n for v, n in zip(voxel, shape)):
             raise ValueError(f"{path}: line {number}: voxel {voxel} lies outside the grid {shape}")
-        if seen[voxel]:
+        if is_read[voxel]:
             raise ValueError(f"{path}: line {number}: voxel {voxel} is given a second time")
-        seen[voxel] = True
-        row = {c: number_in(path, number, c, cells[column[c]]) for c in needed[3:]}
+        is_read[voxel] = True
+        row = {c: parse_number(path, number, c, cells[column[c]]) for c in needed[3:]}
         value = factor * row[density]
         if np.isnan(value):
             dropped["without a density"] += 1
-        elif not 0 <= value <= _MOST:
+        elif not 0 <= value <= _MAX_DENSITY:
             raise ValueError(
                 f"{path}: line {number}: {density} = {value:g} is outside the range [0, inf) of single "
                 "precision"
@@ -139,8 +141,8 @@ def read_vox(
     return VoxelsRead(voxels, dropped)
 
 
-def _header(path: Path, lines: list[str]) -> tuple[dict[str, tuple[str, int]], int]:
-    """What the header says and in which line, by name; and the index of the first line after it."""
+def _read_header(path: Path, lines: list[str]) -> tuple[dict[str, tuple[str, int]], int]:
+    """Return text and line number of the entries of the header, and the index of the line after it."""
     if not lines or lines[0].strip() != _FIRST_LINE:
         raise ValueError(f"{path}: line 1: {_FIRST_LINE!r} is missing: no AMAPVox file")
     head: dict[str, tuple[str, int]] = {}
@@ -148,14 +150,14 @@ def _header(path: Path, lines: list[str]) -> tuple[dict[str, tuple[str, int]], i
         if not line.startswith("#"):
             return head, number - 1
         for key, value in re.findall(r"#([\w-]+):(\([^)]*\)|\S+)", line):
-            if key in _HEADER and key in head:
+            if key in _HEADER_KEYS and key in head:
                 raise ValueError(f"{path}: line {number}: #{key} was given in line {head[key][1]}")
             head[key] = (value, number)
     raise ValueError(f"{path}: line {len(lines)}: the file ends where the names of the columns belong")
 
 
 def _leaf_angles(path: Path, head: dict[str, tuple[str, int]]) -> str | LeafAngles:
-    """The leaf angles that the header names."""
+    """Return the leaf angles that the header names."""
     angles, line = head.get("lad_type", ("spherical", 0))
     if angles.lower() == "spherical":
         return "spherical"
@@ -166,13 +168,14 @@ def _leaf_angles(path: Path, head: dict[str, tuple[str, int]]) -> str | LeafAngl
 
 
 def _triple(path: Path, head: dict[str, tuple[str, int]], key: str) -> tuple[float, float, float]:
+    """Return the three numbers of an entry of the header."""
     if key not in head:
         raise ValueError(f"{path}: line 2: the header has no #{key}")
     text, line = head[key]
-    parts = text.strip("()").split(",")
-    if len(parts) != 3:
+    texts = text.strip("()").split(",")
+    if len(texts) != 3:
         raise ValueError(f"{path}: line {line}: {key} = {text} are not three numbers")
-    x, y, z = (number_in(path, line, key, part) for part in parts)
-    if not all(abs(v) <= FARTHEST for v in (x, y, z)):
-        raise ValueError(f"{path}: line {line}: {key} = {text} lies beyond {FARTHEST:g}")
+    x, y, z = (parse_number(path, line, key, number) for number in texts)
+    if not all(abs(v) <= MAX_COORDINATE for v in (x, y, z)):
+        raise ValueError(f"{path}: line {line}: {key} = {text} lies beyond {MAX_COORDINATE:g}")
     return x, y, z

@@ -8,7 +8,7 @@ import os
 
 import numpy as np
 
-# The traits that absorb, version by version, in the order of the tables' columns.
+# Traits with a specific absorption coefficient, by version, in the order of the tables' columns.
 TRAITS: dict[str, tuple[str, ...]] = {
     "4": ("Cab", "Cw", "Cm"),
     "5": ("Cab", "Car", "Cbrown", "Cw", "Cm"),
@@ -17,9 +17,9 @@ TRAITS: dict[str, tuple[str, ...]] = {
     "PRO": ("Cab", "Car", "Cant", "Cbrown", "Cw", "Cp", "Cc"),
 }
 
-# The header of the authors' dataSpec_PRO.txt. SAC_LMA is there for the other versions; PRO splits it.
+# Columns of the authors' dataSpec_PRO.txt (R package jbferet/prospect). Its column SAC_LMA, dry matter, is
+# for the other versions: PRO splits dry matter into SAC_PROT and SAC_CBC.
 _INDEX = "nrefrac"
-_LARGEST = float(np.finfo(np.float32).max)
 _HEADER = {
     "lambda": "wavelength",
     "SAC_CHL": "Cab",
@@ -30,6 +30,7 @@ _HEADER = {
     "SAC_PROT": "Cp",
     "SAC_CBC": "Cc",
 }
+_LARGEST_SINGLE = float(np.finfo(np.float32).max)
 
 
 class Coefficients:
@@ -53,6 +54,7 @@ class Coefficients:
             np.array(x, dtype=float) for x in (wavelength, index, absorption)
         )
         self.traits = traits
+        # JAX compares static fields at every call of a compiled function: comparing digests is quick.
         digest = hashlib.sha256(repr(traits).encode())
         for x in (self.wavelength, self.index, self.absorption):
             x.setflags(write=False)
@@ -72,7 +74,7 @@ class Coefficients:
 
 @functools.cache
 def shipped(version: str) -> Coefficients:
-    """The shipped table of a PROSPECT version, read on first use.
+    """Return the shipped table of a PROSPECT version, read on first use.
 
     **Arguments:**
 
@@ -86,16 +88,17 @@ def shipped(version: str) -> Coefficients:
         if version == "D":
             table = D
         elif version == "PC":
-            # Its pigments and water are PROSPECT-D's.
-            own = archive["PC"]
-            table = np.concatenate([own[:, :1], D[:, 1:6], own[:, 1:]], axis=1)
+            # Columns: refractive index, Cp, Cc. Pigments and water are PROSPECT-D's.
+            index_protein_cellulose = archive["PC"]
+            index, dry_matter = index_protein_cellulose[:, :1], index_protein_cellulose[:, 1:]
+            table = np.concatenate([index, D[:, 1:6], dry_matter], axis=1)
         else:
             table = archive[f"version_{version}"]
     return Coefficients(wavelength, table[:, 0], table[:, 1:].T, TRAITS[version])
 
 
 def load_coefficients(path: str | os.PathLike[str]) -> Coefficients:
-    r"""The coefficients of PROSPECT-PRO, read from its authors' file `dataSpec_PRO.txt`.
+    r"""Read the coefficients of PROSPECT-PRO from its authors' file `dataSpec_PRO.txt`.
 
     The file (of the R package jbferet/prospect, MIT licence) is a table of columns separated by white space,
     under a header that names them: lambda (nm), nrefrac, SAC_CHL, SAC_CAR, SAC_ANT (cm2/ug), SAC_BROWN,
@@ -156,11 +159,12 @@ def load_coefficients(path: str | os.PathLike[str]) -> Coefficients:
 
 
 def _number(text: str, column: str, name: str, line: int) -> float:
+    """Read a cell. **Raises:** ValueError for text, negative numbers and those too large for JAX's arrays."""
     try:
         value = float(text)
     except ValueError:
         value = math.nan
-    if not 0 <= value <= _LARGEST:
+    if not 0 <= value <= _LARGEST_SINGLE:
         raise ValueError(
             f"{name}, line {line}: {column} = {text[:40]!r} is no number in the admissible range [0, inf) of "
             "single precision"

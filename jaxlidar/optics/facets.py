@@ -1,9 +1,16 @@
-"""Facets: flat Lambertian pieces of leaf or bark that light meets in a voxel.
+"""Facets: flat Lambertian elements of leaf or bark in a voxel, with normals in all directions alike.
 
-Spherically oriented facets scatter by Ross's phase function (Ross 1981, eq. II.3.8; Shultis and Myneni 1988).
-Its reflected part, per unit projected area, is the *intensity factor* 2/(3 pi) (sin b - b cos b), with b the
-angle between incident and view direction. An intensity factor is pi times the radiant intensity towards the
-view per unit of scattered flux, that is pi times the density per steradian.
+Light that travels along w meets a facet of normal n (on the lit side) with the density |n . w|/pi per
+steradian: the projected area. The facet reflects by the cosine law into the lit side, or transmits by the
+cosine law into the other. The mean over normals is Ross's phase function (Ross 1981, The Radiation Regime and
+Architecture of Plant Stands, eq. II.3.8; Shultis and Myneni 1988, J. Quant. Spectrosc. Radiat. Transf. 39,
+115). With b the angle between the incident direction of travel w and the view direction v, its reflected part
+has the *intensity factor* (pi times the radiant intensity towards v per unit of reflected flux)
+
+    f(b) = pi * integral over n of [|n . w|/pi] [(n . v)+/pi] dn = 2/(3 pi) (sin b - b cos b),
+
+and its transmitted part f(pi - b). Straight back, at b = pi, f = 2/3: the mean squared cosine 1/3 over the
+mean cosine 1/2.
 """
 
 import jax.numpy as jnp
@@ -11,13 +18,12 @@ import numpy as np
 
 from jaxlidar._vectors import Scalar, Vec, about, scale
 
-# Backscatter of spherically oriented facets: the mean squared cosine 1/3 over the mean cosine 1/2, hence
-# Ross's R/3 for leaf area.
+# f(pi), per unit of intercepted and reflected light. Per leaf area, with G = 1/2, this is Ross's R/3.
 FACET_BACKSCATTER = 2.0 / 3.0
 
 
 def facet_reflection(cos_angle: Scalar) -> Scalar:
-    """Intensity factor of reflection by spherically oriented facets.
+    """Intensity factor of reflection by spherically oriented facets, f(b).
 
     **Arguments:**
 
@@ -31,7 +37,7 @@ def facet_reflection(cos_angle: Scalar) -> Scalar:
 
 
 def facet_transmission(cos_angle: Scalar) -> Scalar:
-    """Intensity factor of diffuse transmission by spherically oriented facets.
+    """Intensity factor of diffuse transmission by spherically oriented facets, f(pi - b).
 
     **Arguments:**
 
@@ -43,6 +49,7 @@ def facet_transmission(cos_angle: Scalar) -> Scalar:
 
 
 def _one_minus_square(c: Scalar) -> Scalar:
+    """1 - c^2 without cancellation near c = 1 and -1; above zero, for the derivative of its root."""
     return jnp.maximum((1.0 - c) * (1.0 + c), 1e-30)
 
 
@@ -52,9 +59,10 @@ def _arccos(c: Scalar) -> Scalar:
 
 
 def facet_normal(incident: Vec, u: Scalar, v: Scalar) -> Vec:
-    """Normal of the spherically oriented facet that light hits, drawn at random.
+    """Draw the normal of the spherically oriented facet that light hits.
 
-    Its density is |n . incident| / pi, on the lit side.
+    Its density per steradian is |n . incident| / pi, on the lit side: the cosine law about the direction in
+    which the light came.
 
     **Arguments:**
 

@@ -1,14 +1,27 @@
 """Laws of reflection: how a surface distributes the light that it reflects over directions.
 
-Everything is normalised by reflectance, which the tracer does not need. The *intensity factor* of a law is pi
-times the radiant intensity towards the view per incident flux and unit reflectance, averaged over the
-receiver's aperture: pi times BRDF times the cosine of the view angle.
+Everything is per unit reflectance, which the tracer does not need. A law has an *albedo*, the reflected
+fraction a(w) of the flux that arrives along w; a *density* p(w, v), the probability per steradian that
+reflected light leaves along v, which `sample` draws from; and an *intensity factor*
 
-    Lambertian      cos(theta)
-    equal-angle     1 / (pi sqrt(sin^2(theta) + alpha^2 / 4)),  alpha the half-angle of the aperture
+    f(w, v) = pi a(w) p(w, v), averaged over the receiver's aperture.
 
-The equal-angle law (the paper's "every angle equally likely") has the density 1/(pi^2 sin theta), which is
-singular at the normal. The form above is its average over the aperture, exact at the normal.
+This is pi times the radiant intensity towards the view per incident flux, or pi times BRDF times the cosine
+of the view angle: a surface of reflectance rho that fills the footprint has the apparent reflectance rho f.
+With theta the angle between view and surface normal, alpha the half-angle of the aperture as seen from the
+surface, delta the angle between view and mirror direction and sigma the roughness,
+
+    law             density p                                     intensity factor f
+    Lambertian      cos(theta) / pi                               cos(theta)
+    equal-angle     1 / (pi^2 sin(theta))                         1 / (pi sqrt(sin^2(theta) + alpha^2 / 4))
+    specular        exp(-delta^2/(2 sigma^2)) / (2 pi sigma^2)    exp(-delta^2/(2 S)) / (2 S),
+                                                                  S = sigma^2 + alpha^2 / 4
+
+The equal-angle law (the paper's "every angle equally likely") has a polar angle that is uniform in [0, 90]
+degrees. Its density is singular at the normal; averaged over the aperture, a disc of solid angle pi alpha^2,
+it is 2/(pi^2 alpha) there, and the form above is exact at the normal and far from it. The specular lobe is
+Gaussian in the small angle delta; alpha^2 / 4 is the variance of a uniform disc of radius alpha along an
+axis.
 
 A law of your own is one class in one file: derive it from `AbstractLaw`, give its five methods, and pass it
 as `law=`. `examples/minnaert.py` shows Minnaert's law.
@@ -22,7 +35,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxlidar._checks import scalar
+from jaxlidar._checks import briefly, scalar
 from jaxlidar._deprecated import RenamedMethods
 from jaxlidar._ranges import Range, check_ranges
 from jaxlidar._vectors import Scalar, Vec, about, cross, dot, from_frame, polar, vec
@@ -77,7 +90,7 @@ class AbstractLaw(RenamedMethods, eqx.Module):
     def albedo(self, incident: Vec, normal: Vec) -> Scalar:
         """Directional-hemispherical reflectance per unit reflectance, in [0, 1]; one for most laws.
 
-        This is the share of the light that is reflected at all.
+        This is the fraction of the incident light that is reflected at all.
 
         **Arguments:**
 
@@ -88,7 +101,7 @@ class AbstractLaw(RenamedMethods, eqx.Module):
 
     @abc.abstractmethod
     def sample(self, incident: Vec, normal: Vec, u: Scalar, v: Scalar) -> Vec:
-        """A direction of reflection, drawn at random.
+        """Draw a direction of reflection.
 
         **Arguments:**
 
@@ -146,6 +159,7 @@ class AbstractMirror(AbstractLaw):
 
 
 @final
+@briefly
 class Lambertian(AbstractLaw):
     """Lambertian reflection: equal radiance in all directions of the lit side (intensity by the cosine law).
 
@@ -177,6 +191,7 @@ class Lambertian(AbstractLaw):
 
 
 @final
+@briefly
 class EqualAngle(AbstractLaw):
     """Reflection with a polar angle uniform in [0, 90] degrees: the paper's "every angle equally likely".
 
@@ -205,7 +220,7 @@ class EqualAngle(AbstractLaw):
         return from_frame(normal, polar(jnp.cos(0.5 * np.pi * u), 2 * np.pi * v))
 
     def density(self, incident: Vec, normal: Vec, out: Vec) -> Scalar:
-        # A floor on the squared sine keeps the derivative finite at the normal.
+        # The floor on the squared sine keeps the derivative finite at the normal.
         sine = jnp.sqrt(jnp.maximum(_square_of_sine(normal, out), 1e-6))
         return jnp.where(dot(normal, out) > 0, 1.0 / (np.pi**2 * sine), 0.0)
 
@@ -215,11 +230,12 @@ class EqualAngle(AbstractLaw):
 
 def _square_of_sine(normal: Vec, out: Vec) -> Scalar:
     """Squared sine of the angle between two unit vectors: |n x v|^2, without cancellation near the normal."""
-    across = cross(normal, out)
-    return dot(across, across)
+    product = cross(normal, out)
+    return dot(product, product)
 
 
 @final
+@briefly
 class Specular(AbstractMirror):
     """Specular reflection: a mirror of slightly tilted facets, with a Gaussian lobe about its direction.
 
@@ -233,7 +249,7 @@ class Specular(AbstractMirror):
     - `roughness`: standard deviation of the reflected direction about the mirror direction along each of two
       perpendicular axes, rad, in [0, 0.5]; 0 is a perfect mirror. Default 0.
 
-    **Raises:** ValueError for a roughness outside its range; TypeError for what is no number.
+    **Raises:** ValueError for a roughness outside its range; TypeError for arguments that are no numbers.
 
     **Example:** straight back, a lobe of 0.1 rad is 1 / (2 * 0.1^2) times as bright as a Lambertian surface.
 
@@ -253,30 +269,35 @@ class Specular(AbstractMirror):
         check_ranges(self)
 
     def intensity_factor(self, incident: Vec, normal: Vec, view: Vec, half_angle: Scalar) -> Scalar:
-        mirror = _mirror(incident, normal)
-        # The receiver's own disc blurs the lobe; alpha^2 / 4 is the variance of a disc along an axis.
+        # The receiver's disc blurs the lobe.
         variance = self.roughness**2 + half_angle**2 / 4
-        off2 = 2.0 * (1.0 - jnp.clip(dot(mirror, view), -1.0, 1.0))
-        return jnp.exp(-off2 / (2 * variance)) / (2 * variance)
+        # delta^2, as the squared distance between two unit vectors.
+        cosine = jnp.clip(dot(_mirror_direction(incident, normal), view), -1.0, 1.0)
+        square = 2.0 * (1.0 - cosine)
+        return jnp.exp(-square / (2 * variance)) / (2 * variance)
 
     def albedo(self, incident: Vec, normal: Vec) -> Scalar:
         return jnp.ones_like(incident[0])
 
     def sample(self, incident: Vec, normal: Vec, u: Scalar, v: Scalar) -> Vec:
+        # Of two independent normal deviates the distance from zero has Rayleigh's distribution; inverted.
         tilt = self.roughness * jnp.sqrt(-2.0 * jnp.log1p(-u))
-        out = from_frame(_mirror(incident, normal), polar(jnp.cos(jnp.minimum(tilt, 1.5)), 2 * np.pi * v))
-        # What the lobe would send through the surface is turned back into the lit side.
+        lobe = polar(jnp.cos(jnp.minimum(tilt, 1.5)), 2 * np.pi * v)
+        out = from_frame(_mirror_direction(incident, normal), lobe)
+        # Directions of the lobe that lead through the surface are reflected back into the lit side.
         below = jnp.minimum(dot(out, normal), 0.0)
         return vec(o - 2.0 * below * n for o, n in zip(out, normal))
 
     def density(self, incident: Vec, normal: Vec, out: Vec) -> Scalar:
-        # Taken as constant: the lobe's own derivative grows without bound as it becomes narrow.
+        # Not the density of the lobe: the tracer uses relative changes of densities alone, and that of a lobe
+        # grows without bound as it becomes narrow.
         return jnp.ones_like(out[0])
 
     def largest_intensity_factor(self, half_angle: float) -> float:
         return np.inf
 
 
-def _mirror(incident: Vec, normal: Vec) -> Vec:
-    along = 2.0 * dot(incident, normal)
-    return vec(i - along * n for i, n in zip(incident, normal))
+def _mirror_direction(incident: Vec, normal: Vec) -> Vec:
+    """The mirror direction w - 2 (w . n) n of light that travels along w."""
+    projection = 2.0 * dot(incident, normal)
+    return vec(i - projection * n for i, n in zip(incident, normal))

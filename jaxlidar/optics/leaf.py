@@ -1,4 +1,4 @@
-"""Leaves (or other scatterers) of known reflectance and transmittance, in the form of a leaf model."""
+"""Leaf optics given as numbers, with the interface of a leaf model."""
 
 from collections.abc import Sequence
 from typing import ClassVar, final
@@ -8,11 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxlidar._checks import array
+from jaxlidar._checks import array, briefly
 from jaxlidar._ranges import FRACTION, SUM_OF_FRACTIONS, check_ranges
 
 
 @final
+@briefly
 class LeafOptics(eqx.Module):
     """Leaf optics from given reflectance and transmittance: `R, T = optics(wavelengths)`, as with `Prospect`.
 
@@ -24,7 +25,7 @@ class LeafOptics(eqx.Module):
 
     **Raises:** ValueError, naming the field, its value and the admissible range, for values outside their
     range, for a sum above 1, for more than one dimension, and for different numbers of values; TypeError for
-    what is no number. Inside a JAX transformation values cannot be checked.
+    arguments that are no numbers. Inside a JAX transformation values cannot be checked.
 
     **Example:**
 

@@ -1,10 +1,15 @@
-"""Phase functions: how a volume scatters, in place of the facets of leaves or bark.
+"""Phase functions of volume scattering, in place of the facets of leaves or bark.
 
-The *intensity factor* of a phase function is pi times its density per steradian, as for laws of reflection:
-pi times the radiant intensity towards the view per unit of scattered flux. With beta the scattering angle,
+The *density* p of a phase function is the probability per steradian that scattered light travels on in a
+direction; its integral over the sphere is one. As for laws of reflection, the *intensity factor* is pi p: pi
+times the radiant intensity towards the view per unit of scattered flux. With beta the scattering angle (0 is
+forward) and g its mean cosine,
 
+    phase function       intensity factor pi p
     isotropic            1 / 4
     Henyey-Greenstein    (1 - g^2) / (4 (1 + g^2 - 2 g cos beta)^(3/2))
+
+(Henyey and Greenstein 1941). The single scattering albedo is the fraction of the collisions that scatter.
 
 A phase function of your own is one class in one file: derive it from `AbstractPhase`, give its albedo and
 three methods, and pass it as `leaf=` or `bark=` of a `Canopy`.
@@ -18,12 +23,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxlidar._checks import array, scalar
+from jaxlidar._checks import array, briefly, scalar
 from jaxlidar._deprecated import RenamedMethods
 from jaxlidar._ranges import FRACTION, Range, check_ranges
 from jaxlidar._vectors import Scalar, Vec, dot, from_frame, polar
 
-# Of isotropic scattering.
+# Pi times the density 1/(4 pi) of isotropic scattering.
 ISOTROPIC_INTENSITY_FACTOR = 0.25
 
 
@@ -68,7 +73,7 @@ class AbstractPhase(RenamedMethods, eqx.Module):
 
     @abc.abstractmethod
     def sample(self, incident: Vec, u: Scalar, v: Scalar) -> Vec:
-        """A direction of scattering, drawn at random with this density.
+        """Draw a direction of scattering from this density.
 
         **Arguments:**
 
@@ -97,7 +102,7 @@ class AbstractPhase(RenamedMethods, eqx.Module):
         return self.intensity_factor(incident, out) / np.pi
 
 
-def _check(phase: AbstractPhase) -> None:
+def _check_phase(phase: AbstractPhase) -> None:
     albedo = phase.albedo
     if albedo.ndim > 1 or albedo.size == 0:
         raise ValueError(f"albedo has shape {albedo.shape}; admissible is a number or one per wavelength")
@@ -105,6 +110,7 @@ def _check(phase: AbstractPhase) -> None:
 
 
 @final
+@briefly
 class Isotropic(AbstractPhase):
     """Isotropic volume scattering, the same in all directions: often assumed by discrete ordinates codes.
 
@@ -112,8 +118,8 @@ class Isotropic(AbstractPhase):
 
     - `albedo`: single scattering albedo, one number or one per wavelength, in [0, 1].
 
-    **Raises:** ValueError for an albedo outside its range or of more than one dimension; TypeError for what
-    is no number.
+    **Raises:** ValueError for an albedo outside its range or of more than one dimension; TypeError for
+    arguments that are no numbers.
 
     **Example:** a canopy of isotropic scatterers at two wavelengths.
 
@@ -130,7 +136,7 @@ class Isotropic(AbstractPhase):
     ranges: ClassVar = {"albedo": FRACTION}
 
     def __check_init__(self):
-        _check(self)
+        _check_phase(self)
 
     def intensity_factor(self, incident: Vec, view: Vec) -> Scalar:
         return jnp.full_like(incident[0], ISOTROPIC_INTENSITY_FACTOR)
@@ -143,6 +149,7 @@ class Isotropic(AbstractPhase):
 
 
 @final
+@briefly
 class HenyeyGreenstein(AbstractPhase):
     """Volume scattering by Henyey and Greenstein's phase function: a forward or a backward lobe.
 
@@ -153,7 +160,7 @@ class HenyeyGreenstein(AbstractPhase):
       forward. Default 0.
 
     **Raises:** ValueError for values outside their ranges and for an albedo of more than one dimension;
-    TypeError for what is no number.
+    TypeError for arguments that are no numbers.
 
     **Source:** Henyey and Greenstein (1941), Astrophys. J. 93, 70.
 
@@ -175,17 +182,18 @@ class HenyeyGreenstein(AbstractPhase):
     ranges: ClassVar = {"albedo": FRACTION, "g": Range(-0.95, 0.95)}
 
     def __check_init__(self):
-        _check(self)
+        _check_phase(self)
 
     def intensity_factor(self, incident: Vec, view: Vec) -> Scalar:
         g = self.g
         cosine = jnp.clip(dot(incident, view), -1.0, 1.0)
-        # 1 + g^2 - 2 g cos without cancellation for lobes ahead.
-        across = (1.0 - g) ** 2 + 2.0 * g * (1.0 - cosine)
-        return ISOTROPIC_INTENSITY_FACTOR * (1.0 - g * g) / (across * jnp.sqrt(across))
+        # 1 + g^2 - 2 g cos(beta) without cancellation in a narrow forward lobe.
+        square = (1.0 - g) ** 2 + 2.0 * g * (1.0 - cosine)
+        return ISOTROPIC_INTENSITY_FACTOR * (1.0 - g * g) / (square * jnp.sqrt(square))
 
     def sample(self, incident: Vec, u: Scalar, v: Scalar) -> Vec:
-        # The inverse of the distribution function, as a form without a quotient by g.
+        # The inverse of the distribution function is {1 + g^2 - [(1 - g^2)/(1 + g s)]^2}/(2 g), s = 2 u - 1;
+        # this is the same without the quotient by g, which may be zero.
         g, s = self.g, 2.0 * u - 1.0
         cosine = (s * (1.0 + g * g) + 0.5 * g * (s * s * (1.0 + g * g) + 3.0 - g * g)) / (1.0 + g * s) ** 2
         return from_frame(incident, polar(jnp.clip(cosine, -1.0, 1.0), 2 * np.pi * v))

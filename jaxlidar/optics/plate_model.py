@@ -1,30 +1,39 @@
 """The generalised plate model: a leaf as N absorbing plates with rough surfaces, without cancellation.
 
-*Surface* (Stern 1964; Allen 1973). Light that arrives within the cone of half-angle alpha around the
-normal is reflected with the mean r = 2/(1 - c^2) * integral over mu in [c, 1] of mu R(mu), c = cos alpha,
-where
+Symbols: k optical depth of a plate, N number of plates (real), n refractive index, alpha half-angle of the
+cone of incidence. r, t, A reflectance, transmittance and absorptance of one plate in diffuse light; Ra, Ta,
+Aa of the first plate, lit within the cone; Rs, Ts, As of the pile of the others; R, T, 1 - R - T of the leaf.
+Of a surface, t12 and r12 are the transmittance and reflectance for diffuse light from outside, t21 and r21
+from inside, t_alpha and r_alpha for light within the cone (`jaxlidar.optics.leaf_surface`).
 
-    R(mu) = ((mu - g)/(mu + g))^2 / 2 + ((n^2 mu - g)/(n^2 mu + g))^2 / 2,   g = sqrt(n^2 - 1 + mu^2).
+*Plate* (Allen et al. 1969). With the diffuse transmittance tau = 2 E3(k) of the interior, omega = 1 - tau,
+q = t21 + r21 omega (which is 1 - r21 tau) and p = 1 + r21 tau,
 
-The mean is an average over mu, which is smooth at alpha = 0 and 90 degrees, by Gauss-Legendre quadrature.
-r and 1 - r come from separate sums of positive terms.
+    t = t12 t21 tau/(q p),    r = r12 + r21 tau t,    A = 1 - r - t = t12 omega/q.
 
-*Plate* (Allen et al. 1969). With the diffuse transmittance tau = 2 E3(k) of the interior, omega = 1 - tau
-and q = t21 + r21 omega (which is 1 - r21 tau), one plate has t = t12 t21 tau / (q (1 + r21 tau)),
-r = r12 + r21 tau t and the absorptance A = 1 - r - t = t12 omega / q. For the first plate, lit within the
-cone, t12 and r12 are replaced by those of alpha.
+For the first plate t12 and r12 are replaced by t_alpha and r_alpha.
 
-*Pile* (Stokes 1862) of M = N - 1 plates, M real. With y = A (2 r + A), the decay per plate is
-v = exp(-beta) = 2 t / (2 t + y + sqrt(y (y + 4 t))); with V = v^M, g = v/t, W = (1 - V^2)/(1 - v^2) and
-s = 1 + r^2 - t^2 = (r + A)(1 + t) + r^2,
+*Pile* (Stokes 1862) of M = N - 1 plates, M real. Light decays by v = exp(-beta) per plate,
+cosh(beta) = (1 + t^2 - r^2)/(2 t) = 1 + y/(2 t) with y = A (2 r + A). Stokes' solution, with
+s = 1 + r^2 - t^2 = (r + A)(1 + t) + r^2, S = sinh(M beta)/(t sinh beta) and C = cosh(M beta), is
 
-    D = s g W + 1 + V^2,  Rs = 2 r g W/D,  Ts = 2 V/D,  1 - Rs - Ts = (g W A (A + 2 t) + (1 - V)^2)/D.
+    Rs = 2 r S/(s S + 2 C),    Ts = 2/(s S + 2 C).
 
-Nothing here is a difference of close numbers, so that all three are accurate from transparent (A = 0: V = 1,
-W = M) to opaque. Single precision needs more: V = v^M magnifies the rounding of beta by M beta, which
-reaches 80. There v is corrected and beta carried with twice the digits (`jaxlidar._double_single`).
-The derivatives below are those of these expressions, put into the same form. Textbook Stokes' a, b and
-their square root are not differentiable at A = 0, while the result is.
+Multiplied by V = v^M, with g = v/t and W = (1 - V^2)/(1 - v^2), so that V S = g W and 2 V C = 1 + V^2:
+
+    v = 2 t/(2 t + y + sqrt(y (y + 4 t))),    D = s g W + 1 + V^2,
+    Rs = 2 r g W/D,    Ts = 2 V/D,    As = 1 - Rs - Ts = (g W A (A + 2 t) + (1 - V)^2)/D.
+
+*Leaf.* Light is reflected to and fro between the first plate and the pile:
+
+    R = Ra + Ta Rs t/(1 - Rs r),    T = Ta Ts/(1 - Rs r),    1 - R - T = Aa + Ta (As + Rs A)/(1 - Rs r).
+
+*Numerics.* Nothing here is a difference of close numbers, so that all three are accurate from transparent
+plates (A = 0: V = 1, W = M) to opaque ones. Single precision needs more: V = v^M magnifies the rounding of
+beta by M beta, which reaches 80. There v is corrected and beta carried with twice the digits
+(`jaxlidar._double_single`). The derivatives are those of these expressions, put into the same form
+(`_slopes_k`, `_slopes_M`): the textbook's a, b and their square root are not differentiable at A = 0, while
+the result is.
 """
 
 import math
@@ -37,7 +46,7 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from jaxlidar import _double_single as pair
+from jaxlidar import _double_single as double_single
 from jaxlidar import _expint
 from jaxlidar._double_single import DoubleSingle
 from jaxlidar._one_function import once
@@ -108,41 +117,42 @@ def _arrays(k: Any, N: Any, surface: LeafSurface) -> tuple[_Reals, _Reals, LeafS
     """Arrays of one type, and in single precision kappa = (r12 + r21)/t21 in double-single."""
     dtype = jnp.result_type(k, N, float)
     k, N, *face = (jnp.asarray(x, dtype) for x in (k, N, *surface))
-    face, bounces = LeafSurface(*face), None
+    face, kappa = LeafSurface(*face), None
     if dtype == jnp.float32:
         if any(isinstance(x, jax.Array) for x in surface):
-            total = pair.plus(pair.split(face.r21), pair.split(face.r12))
-            bounces = pair.over(total, pair.split(face.t21), 1 / face.t21)
+            numerator = double_single.add(double_single.split(face.r21), double_single.split(face.r12))
+            kappa = double_single.divide(numerator, double_single.split(face.t21), 1 / face.t21)
         else:
-            bounces = pair.constant((np.asarray(surface.r12, float) + surface.r21) / surface.t21)
-    return k, N, face, bounces
+            # NumPy numbers have the digits of double precision: kappa is computed from these.
+            kappa = double_single.from_double((np.asarray(surface.r12, float) + surface.r21) / surface.t21)
+    return k, N, face, kappa
 
 
-# Compiled whole: by itself, every operation of it would be a program to compile.
+# Compiled as one program: called outside of `jit`, every operation would be compiled by itself.
 @jax.jit
-def _values_of(k: _Reals, N: _Reals, face: LeafSurface, bounces: DoubleSingle | None) -> Triple:
-    k, N, face, bounces = _alike(k, N, face, bounces)
-    return _leaf(k, N - 1, face, bounces)
+def _values_of(k: _Reals, N: _Reals, face: LeafSurface, kappa: DoubleSingle | None) -> Triple:
+    k, N, face, kappa = _broadcast(k, N, face, kappa)
+    return _leaf(k, N - 1, face, kappa)
 
 
 @jax.jit
 def _slopes_of(
-    k: _Reals, N: _Reals, face: LeafSurface, bounces: DoubleSingle | None
+    k: _Reals, N: _Reals, face: LeafSurface, kappa: DoubleSingle | None
 ) -> tuple[Triple, Triple, Triple]:
-    k, N, face, bounces = _alike(k, N, face, bounces)
-    return _everything(k, N - 1, face, bounces)
+    k, N, face, kappa = _broadcast(k, N, face, kappa)
+    return _values_and_slopes(k, N - 1, face, kappa)
 
 
-def _alike(
-    k: _Reals, N: _Reals, face: LeafSurface, bounces: DoubleSingle | None
+def _broadcast(
+    k: _Reals, N: _Reals, face: LeafSurface, kappa: DoubleSingle | None
 ) -> tuple[_Reals, _Reals, LeafSurface, DoubleSingle | None]:
     """Arrays of one shape."""
-    k, N, *rest = jnp.broadcast_arrays(k, N, *face, *(bounces or ()))
-    return k, N, LeafSurface(*rest[:6]), bounces and DoubleSingle(*rest[6:])
+    k, N, *columns = jnp.broadcast_arrays(k, N, *face, *(kappa or ()))
+    return k, N, LeafSurface(*columns[:6]), kappa and DoubleSingle(*columns[6:])
 
 
-class _State(NamedTuple):
-    """What values and derivatives share, in the names of the module's docstring."""
+class _PileState(NamedTuple):
+    """The quantities that values and derivatives share, in the symbols of the module's docstring."""
 
     tau: Array
     t: Array
@@ -165,7 +175,8 @@ class _State(NamedTuple):
     D: Array
 
 
-def _state(k: _Reals, M: _Reals, face: LeafSurface, bounces: DoubleSingle | None) -> _State:
+def _state(k: _Reals, M: _Reals, face: LeafSurface, kappa: DoubleSingle | None) -> _PileState:
+    """Evaluate plate and pile: the equations of the module's docstring from top to bottom."""
     # The barriers keep the compiler from computing these again for every output (twice as fast on the CPU).
     tau, omega = once((_expint.tau(k), _expint.omega(k)))
     q, p = face.t21 + face.r21 * omega, 1 + face.r21 * tau
@@ -176,36 +187,43 @@ def _state(k: _Reals, M: _Reals, face: LeafSurface, bounces: DoubleSingle | None
     A, Aa = face.t12 * absorbed, face.t_alpha * absorbed
     y = A * (2 * r + A)
     s = (r + A) * (1 + t) + r * r
-    clear = y <= 0
-    root = jnp.where(clear, 0.0, jnp.sqrt(jnp.where(clear, 1.0, y * (y + 4 * t))))
-    per_total = 1 / (2 * t + y + root)
-    g, w = 2 * per_total, (y + root) * per_total
+    # Guards the derivative of the square root, and the quotient in W, where plates are transparent.
+    is_clear = y <= 0
+    root = jnp.where(is_clear, 0.0, jnp.sqrt(jnp.where(is_clear, 1.0, y * (y + 4 * t))))
+    reciprocal = 1 / (2 * t + y + root)
+    g, w = 2 * reciprocal, (y + root) * reciprocal
     v = t * g
-    fine = None
-    if bounces is not None:
-        scaled = face.t12 * face.t21 * _expint.scaled_tau(k) / (q * p) * g
-        exact, fine = pair.refined(*jax.lax.stop_gradient((k, w, scaled, bounces)))
-        w = w + (exact[0] - jax.lax.stop_gradient(w))
-        v = v + (exact[1] - jax.lax.stop_gradient(v))
-    beta, V, Z = once(_decay(w, jax.lax.stop_gradient(v), M, fine))
-    W = jnp.where(clear, M, Z * (1 + V) / (jnp.where(clear, 1.0, w) * (1 + v)))
+    fine_beta = None
+    if kappa is not None:
+        # The corrected values replace those of single precision; derivatives are of the latter.
+        scaled_v = face.t12 * face.t21 * _expint.scaled_tau(k) / (q * p) * g
+        (fine_w, fine_v), fine_beta = double_single.refine_decay(
+            *jax.lax.stop_gradient((k, w, scaled_v, kappa))
+        )
+        w = w + (fine_w - jax.lax.stop_gradient(w))
+        v = v + (fine_v - jax.lax.stop_gradient(v))
+    beta, V, Z = once(_decay(w, jax.lax.stop_gradient(v), M, fine_beta))
+    W = jnp.where(is_clear, M, Z * (1 + V) / (jnp.where(is_clear, 1.0, w) * (1 + v)))
     D = s * g * W + 1 + V * V
-    return _State(tau, t, r, A, Ta, Ra, Aa, q, p, y, s, g, v, w, beta, V, Z, W, D)
+    return _PileState(tau, t, r, A, Ta, Ra, Aa, q, p, y, s, g, v, w, beta, V, Z, W, D)
 
 
 @jax.custom_jvp
-def _decay(w: _Reals, v: _Reals, M: _Reals, fine: DoubleSingle | None) -> Triple:
+def _decay(w: _Reals, v: _Reals, M: _Reals, fine_beta: DoubleSingle | None) -> Triple:
     """beta = -ln v, V = v^M and 1 - V, where v = 1 - w is given in both forms."""
-    if fine is not None:
-        return pair.single(fine), *pair.exp_minus(pair.times(pair.split(M), fine))
-    thin = w < 0.3
+    if fine_beta is not None:
+        decay = double_single.exp_minus(double_single.multiply(double_single.split(M), fine_beta))
+        return double_single.to_single(fine_beta), *decay
+    # The logarithm of the form that has more digits: of 1 - w for v near 1, else of v.
+    is_thin = w < 0.3
     v = jnp.maximum(v, jnp.finfo(v.dtype).tiny)
-    beta = -jnp.where(thin, jnp.log1p(-jnp.where(thin, w, 0.0)), jnp.log(jnp.where(thin, 1.0, v)))
+    beta = -jnp.where(is_thin, jnp.log1p(-jnp.where(is_thin, w, 0.0)), jnp.log(jnp.where(is_thin, 1.0, v)))
     return beta, jnp.exp(-M * beta), -jnp.expm1(-M * beta)
 
 
 @_decay.defjvp
 def _decay_jvp(primals, tangents):
+    # The derivative goes through w alone, for v = 1 - w.
     _, v, M, _ = primals
     dw, _, dM, _ = tangents
     beta, V, Z = _decay(*primals)
@@ -216,165 +234,203 @@ def _decay_jvp(primals, tangents):
 
 @jax.custom_jvp
 @jax.jit
-def _leaf(k: _Reals, M: _Reals, face: LeafSurface, bounces: DoubleSingle | None) -> Triple:
-    return _values(_state(k, M, face, bounces))
+def _leaf(k: _Reals, M: _Reals, face: LeafSurface, kappa: DoubleSingle | None) -> Triple:
+    return _values(_state(k, M, face, kappa))
 
 
 @jax.jit
-def _everything(
-    k: _Reals, M: _Reals, face: LeafSurface, bounces: DoubleSingle | None
+def _values_and_slopes(
+    k: _Reals, M: _Reals, face: LeafSurface, kappa: DoubleSingle | None
 ) -> tuple[Triple, Triple, Triple]:
     """Values, derivatives in k and derivatives in M."""
-    x = _state(k, M, face, bounces)
+    x = _state(k, M, face, kappa)
     return _values(x), _slopes_k(x, k, M, face), _slopes_M(x)
 
 
 @jax.jit
-def _change(
-    k: _Reals, M: _Reals, face: LeafSurface, bounces: DoubleSingle | None, dface: LeafSurface
+def _surface_tangents(
+    k: _Reals, M: _Reals, face: LeafSurface, kappa: DoubleSingle | None, dface: LeafSurface
 ) -> Triple:
     """Changes of reflectance, transmittance and absorptance with a change of the surface."""
-    return jax.jvp(lambda f: _values(_state(k, M, f, bounces)), (face,), (dface,))[1]
+    return jax.jvp(lambda f: _values(_state(k, M, f, kappa)), (face,), (dface,))[1]
 
 
-def _pile(x: _State) -> Triple:
-    """Rs, Ts and 1 - Rs - Ts."""
+def _pile(x: _PileState) -> Triple:
+    """Rs, Ts and As = 1 - Rs - Ts."""
     per_D = 1 / x.D
-    lost = x.g * x.W * x.A * (x.A + 2 * x.t) + x.Z * x.Z
-    return 2 * x.r * x.g * x.W * per_D, 2 * x.V * per_D, lost * per_D
+    absorbed = x.g * x.W * x.A * (x.A + 2 * x.t) + x.Z * x.Z
+    return 2 * x.r * x.g * x.W * per_D, 2 * x.V * per_D, absorbed * per_D
 
 
-def _values(x: _State) -> Triple:
+def _values(x: _PileState) -> Triple:
+    """R, T and 1 - R - T of the leaf."""
     Rs, Ts, As = _pile(x)
-    into = x.Ta / (1 - Rs * x.r)
-    return x.Ra + into * Rs * x.t, into * Ts, x.Aa + into * (As + Rs * x.A)
+    # Light that travels down between the first plate and the pile, after all reflections.
+    downward = x.Ta / (1 - Rs * x.r)
+    return x.Ra + downward * Rs * x.t, downward * Ts, x.Aa + downward * (As + Rs * x.A)
 
 
 def _leaf_jvp(primals, tangents):
-    k, M, face, bounces = primals
+    # Symbolic zeros tell which derivatives are not asked for. Those in the surface then cost nothing.
+    k, M, face, kappa = primals
     dk, dM, dface, _ = tangents
-    out, in_k, in_M = _everything(k, M, face, bounces)
+    values, in_k, in_M = _values_and_slopes(k, M, face, kappa)
     total: list = [jnp.zeros_like(k)] * 3
     for slopes, change in ((in_k, dk), (in_M, dM)):
         if not isinstance(change, SymbolicZero):
             total = [a + b * change for a, b in zip(total, slopes)]
     if not all(isinstance(d, SymbolicZero) for d in dface):
         dface = LeafSurface(*(jnp.zeros_like(k) if isinstance(d, SymbolicZero) else d for d in dface))
-        total = [a + b for a, b in zip(total, _change(k, M, face, bounces, dface))]
-    return out, tuple(total)
+        total = [a + b for a, b in zip(total, _surface_tangents(k, M, face, kappa, dface))]
+    return values, tuple(total)
 
 
 _leaf.defjvp(_leaf_jvp, symbolic_zeros=True)
 
 
-def _slopes_M(x: _State) -> Triple:
-    """Derivatives of the leaf's reflectance, transmittance and absorptance in M."""
+def _slopes_M(x: _PileState) -> Triple:
+    """Derivatives of the leaf's reflectance, transmittance and absorptance in M.
+
+    From dV/dM = -beta V, with P = beta/(1 - v^2):
+
+        dRs/dM = 8 r g P (V/D)^2,    d ln Ts/dM = -(s g P (1 + V^2) + beta (1 - V^2))/D,
+        dAs/dM = 4 g P V [s (1 - V)^2/2 + V A (2 t + A) + (1 - v^2)(1 - V^2)/(2 g)]/D^2.
+    """
     r, t, A, g, V = x.r, x.t, x.A, x.g, x.V
-    P = _beta_share(x)
-    square, rest = 1 + V * V, x.Z * (1 + V)
+    P = _beta_over_one_minus_v2(x)
+    one_plus_V2, one_minus_V2 = 1 + V * V, x.Z * (1 + V)
     per_D = 1 / x.D
     dRs = 8 * r * g * P * (V * per_D) ** 2
-    log_Ts = -(x.s * g * P * square + x.beta * rest) * per_D
-    gain = x.s * x.Z * x.Z / 2 + V * A * (2 * t + A) + x.w * (1 + x.v) * rest / (2 * g)
-    dAs = 4 * g * P * V * gain * per_D * per_D
+    log_Ts = -(x.s * g * P * one_plus_V2 + x.beta * one_minus_V2) * per_D
+    bracket = x.s * x.Z * x.Z / 2 + V * A * (2 * t + A) + x.w * (1 + x.v) * one_minus_V2 / (2 * g)
+    dAs = 4 * g * P * V * bracket * per_D * per_D
     Rs, Ts, As = _pile(x)
     inverse = 1 / (1 - Rs * r)
-    into = x.Ta * inverse
-    again = r * dRs * inverse
+    downward = x.Ta * inverse
+    # d ln(downward)/dM: more light returns from the pile to the first plate and down again.
+    log_downward = r * dRs * inverse
     return (
-        into * inverse * t * dRs,
-        into * Ts * (log_Ts + again),
-        into * (dAs + A * dRs + (As + Rs * A) * again),
+        downward * inverse * t * dRs,
+        downward * Ts * (log_Ts + log_downward),
+        downward * (dAs + A * dRs + (As + Rs * A) * log_downward),
     )
 
 
-def _slopes_k(x: _State, k: _Reals, M: _Reals, face: LeafSurface) -> Triple:
-    """Derivatives of the leaf's reflectance, transmittance and absorptance in k."""
+def _slopes_k(x: _PileState, k: _Reals, M: _Reals, face: LeafSurface) -> Triple:
+    """Derivatives of the leaf's reflectance, transmittance and absorptance in k.
+
+    1. The plate: d ln tau/dk = -2 E2/tau, and with rho = r21 tau
+
+           d ln t = d ln tau (1 + rho^2)/(q p),    dr = rho t (d ln t + d ln tau),    dA = -d ln tau t p/q.
+
+    2. The pile, a function of r, s, y and t. Subscripts y and t are derivatives of S and C in y, and in ln t
+    at
+       constant y:
+
+           dRs = 2/D {g W dr - r/D [2 V^2 (S C_y - C S_y) dy + (g W)^2 ds + 2 V^2 (S C_t - C S_t) d ln t]},
+           d ln Ts = -V/D {S ds + (s S_y + 2 C_y) dy + (s S_t + 2 C_t) d ln t}.
+
+       With dbeta/dy = 1/(2 t sinh beta), all of them follow from
+
+           psi(a) = (cosh a - sinh(a)/a)/a^2,    phi(a) = (sinh(a)/a - 1)/a^2,    L(a) = (a coth a - 1)/a^2,
+
+       at a = M beta, 2 M beta and beta: these carry the differences that would lose digits at small beta.
+    3. The leaf, by the product rule.
+    """
     r, t, A, g, v, V, W, per_D = x.r, x.t, x.A, x.g, x.v, x.V, x.W, 1 / x.D
-    slope = _expint.log_slope(k)
+    log_tau = _expint.log_slope(k)
     rho = face.r21 * x.tau
-    log_t = slope * (1 + rho * rho) / (x.q * x.p)
-    dt, dr, dA = t * log_t, rho * t * (log_t + slope), -slope * t * x.p / x.q
+    log_t = log_tau * (1 + rho * rho) / (x.q * x.p)
+    dt, dr, dA = t * log_t, rho * t * (log_t + log_tau), -log_tau * t * x.p / x.q
     dy, ds = 2 * ((r + A) * dA + A * dr), 2 * (r * dr - t * dt)
 
-    P = _beta_share(x)
-    square, rest = 1 + V * V, x.Z * (1 + V)
+    P = _beta_over_one_minus_v2(x)
+    one_plus_V2, one_minus_V2 = 1 + V * V, x.Z * (1 + V)
     a = M * x.beta
-    flat = a <= 0
-    V_sinhc = jnp.where(flat, V, rest / jnp.where(flat, 1.0, 2 * a))
-    V_psi = _scaled_psi(a, V, rest)
-    VV_phi = _scaled_phi(2 * a, V * V, rest * square)
-    coth = P * (1 + v * v)  # beta coth(beta)
-    phi_2 = _langevin(x.beta, coth)
-    gamma = 4 * g * g * M * P * P * (4 * M * M * VV_phi * coth + V * V * phi_2)
-    h = 4 * g * g * P * P * M * (M * M * V_psi - V_sinhc * phi_2)
-    per_sum = 1 / (1 + v) ** 2
-    drain = g * (2 * v * W * square + 4 * M * V * V) * per_sum
-    dRs = 2 * per_D * (g * W * dr - r * per_D * (gamma * dy + (g * W) ** 2 * ds + drain * log_t))
-    fall = 2 * x.s * g * (2 * v * W + M * square) * per_sum + 2 * M * W * x.w * x.w
-    log_Ts = (fall * log_t - 2 * g * W * ds - (x.s * h + 2 * M * g * W) * dy) * (per_D / 2)
+    is_flat = a <= 0
+    # V sinh(a)/a, V psi(a) and V^2 phi(2 a).
+    V_sinhc = jnp.where(is_flat, V, one_minus_V2 / jnp.where(is_flat, 1.0, 2 * a))
+    V_psi = _scaled_psi(a, V, one_minus_V2)
+    VV_phi = _scaled_phi(2 * a, V * V, one_minus_V2 * one_plus_V2)
+    beta_coth = P * (1 + v * v)  # beta coth(beta)
+    L = _langevin(x.beta, beta_coth)
+    # 2 V^2 (S C_y - C S_y), and 2 V S_y.
+    cross_y = 4 * g * g * M * P * P * (4 * M * M * VV_phi * beta_coth + V * V * L)
+    V_S_y = 4 * g * g * P * P * M * (M * M * V_psi - V_sinhc * L)
+    per_square = 1 / (1 + v) ** 2
+    # 2 V^2 (S C_t - C S_t), and -2 V (s S_t + 2 C_t).
+    cross_t = g * (2 * v * W * one_plus_V2 + 4 * M * V * V) * per_square
+    minus_V_D_t = 2 * x.s * g * (2 * v * W + M * one_plus_V2) * per_square + 2 * M * W * x.w * x.w
+    dRs = 2 * per_D * (g * W * dr - r * per_D * (cross_y * dy + (g * W) ** 2 * ds + cross_t * log_t))
+    # 4 V C_y = 2 M g W.
+    log_Ts = (minus_V_D_t * log_t - 2 * g * W * ds - (x.s * V_S_y + 2 * M * g * W) * dy) * (per_D / 2)
 
     Rs, Ts, _ = _pile(x)
     inverse = 1 / (1 - Rs * r)
-    into = x.Ta * inverse
-    # All contributions to either are negative; the absorptance takes what they lose.
-    dR = rho * x.Ta * (log_t + slope) + into * (
+    downward = x.Ta * inverse
+    # All contributions to dR and dT are negative: no digits are lost. The absorptance gains what they lose.
+    dR = rho * x.Ta * (log_t + log_tau) + downward * (
         Rs * t * log_t + inverse * (t * dRs + Rs * Rs * t * dr) + Rs * dt
     )
-    dT = into * Ts * (log_t + log_Ts + (r * dRs + Rs * dr) * inverse)
+    dT = downward * Ts * (log_t + log_Ts + (r * dRs + Rs * dr) * inverse)
     return dR, dT, -(dR + dT)
 
 
-def _beta_share(x: _State) -> _Reals:
-    """beta/(1 - v^2), which is 1/2 at beta = 0."""
-    clear = x.y <= 0
-    return jnp.where(clear, 0.5, x.beta / (jnp.where(clear, 1.0, x.w) * (1 + x.v)))
+def _beta_over_one_minus_v2(x: _PileState) -> _Reals:
+    """P = beta/(1 - v^2), which is 1/2 at beta = 0."""
+    is_clear = x.y <= 0
+    return jnp.where(is_clear, 0.5, x.beta / (jnp.where(is_clear, 1.0, x.w) * (1 + x.v)))
 
 
-def _scaled_psi(a: _Reals, decay: _Reals, rest: _Reals) -> _Reals:
-    """exp(-a) (cosh a - sinh(a)/a)/a^2; `decay` = exp(-a), `rest` = 1 - exp(-2 a).
+def _scaled_psi(a: _Reals, decay: _Reals, one_minus_decay2: _Reals) -> _Reals:
+    """exp(-a) (cosh a - sinh(a)/a)/a^2; `decay` = exp(-a), `one_minus_decay2` = 1 - exp(-2 a).
 
     Here and below, a Taylor series in a^2 below a = 1.5, where the difference would lose digits.
     """
-    near, z, far = _ranges(a)
-    series = _expint.polynomial(z, [(2 * j + 2) / math.factorial(2 * j + 3) for j in range(_terms(a))])
-    return jnp.where(near, decay * series, (1 - rest / 2 - rest / 2 * far) * (far * far))
+    is_near, z, inverse = _series_or_closed_form(a)
+    series = _expint.polynomial(z, [(2 * j + 2) / math.factorial(2 * j + 3) for j in range(_n_terms(a))])
+    closed = (1 - one_minus_decay2 / 2 - one_minus_decay2 / 2 * inverse) * (inverse * inverse)
+    return jnp.where(is_near, decay * series, closed)
 
 
-def _scaled_phi(a: _Reals, decay: _Reals, rest: _Reals) -> _Reals:
+def _scaled_phi(a: _Reals, decay: _Reals, one_minus_decay2: _Reals) -> _Reals:
     """exp(-a) (sinh(a)/a - 1)/a^2, with the same arguments."""
-    near, z, far = _ranges(a)
-    series = _expint.polynomial(z, [1 / math.factorial(2 * j + 3) for j in range(_terms(a))])
-    return jnp.where(near, decay * series, (rest / 2 * far - decay) * (far * far))
+    is_near, z, inverse = _series_or_closed_form(a)
+    series = _expint.polynomial(z, [1 / math.factorial(2 * j + 3) for j in range(_n_terms(a))])
+    closed = (one_minus_decay2 / 2 * inverse - decay) * (inverse * inverse)
+    return jnp.where(is_near, decay * series, closed)
 
 
-def _langevin(a: _Reals, coth: _Reals) -> _Reals:
-    """(a coth a - 1)/a^2, given `coth` = a coth a; for small a by Lambert's continued fraction in a^2."""
-    near, z, far = _ranges(a)
+def _langevin(a: _Reals, a_coth: _Reals) -> _Reals:
+    """(a coth a - 1)/a^2, given `a_coth` = a coth a; for small a by Lambert's continued fraction in a^2."""
+    is_near, z, inverse = _series_or_closed_form(a)
     numerator, denominator = _LAMBERT[a.dtype == jnp.float64]
-    return jnp.where(
-        near, _expint.polynomial(z, numerator) / _expint.polynomial(z, denominator), (coth - 1) * (far * far)
-    )
+    fraction = _expint.polynomial(z, numerator) / _expint.polynomial(z, denominator)
+    return jnp.where(is_near, fraction, (a_coth - 1) * (inverse * inverse))
 
 
-def _ranges(a: _Reals) -> tuple[Bool[Array, "..."], _Reals, _Reals]:
-    """Whether the series is used; its argument a^2; 1/a for the closed form."""
-    near = a < 1.5
-    return near, jnp.where(near, a * a, 0.0), 1 / jnp.maximum(a, 1.5)
+def _series_or_closed_form(a: _Reals) -> tuple[Bool[Array, "..."], _Reals, _Reals]:
+    """True where the series is used; its argument a^2; 1/a for the closed form."""
+    is_near = a < 1.5
+    return is_near, jnp.where(is_near, a * a, 0.0), 1 / jnp.maximum(a, 1.5)
 
 
-def _terms(a: _Reals) -> int:
+def _n_terms(a: _Reals) -> int:
     return 10 if a.dtype == jnp.float64 else 6
 
 
 def _lambert(depth: int) -> tuple[Sequence[float], Sequence[float]]:
-    """1/(3 + z/(5 + z/(7 + ...))), cut after `depth` levels, as a ratio of polynomials in z."""
+    """1/(3 + z/(5 + z/(7 + ...))), cut after `depth` levels, as a ratio of polynomials in z.
+
+    With z = a^2 this is (a coth a - 1)/a^2, by Lambert's continued fraction of tanh (DLMF 4.39.1).
+    """
     numerator, denominator = np.array([1.0]), np.array([2.0 * depth + 1])
     for b in range(2 * depth - 1, 1, -2):
         # b + z numerator/denominator, then its reciprocal.
-        up = np.polynomial.polynomial.polyadd(b * denominator, np.concatenate([[0.0], numerator]))
-        numerator, denominator = denominator, up
+        total = np.polynomial.polynomial.polyadd(b * denominator, np.concatenate([[0.0], numerator]))
+        numerator, denominator = denominator, total
     return (numerator / denominator[0]).tolist(), (denominator / denominator[0]).tolist()
 
 
+# By precision: single (False) and double.
 _LAMBERT = {False: _lambert(5), True: _lambert(9)}

@@ -1,9 +1,19 @@
 """PROSPECT: leaf reflectance and transmittance from 400 to 2500 nm, from leaf structure and chemistry.
 
-The absorption of one of the leaf's N plates is k = sum(c_i K_i)/N, with the contents c_i per leaf area and
-the specific absorption coefficients K_i of leaf material. `jaxlidar.optics.plate_model` turns k, N and the
-refractive index into reflectance and transmittance. Coefficients are interpolated linearly between the
-table's wavelengths, before anything is computed from them.
+A leaf is a pile of N absorbing plates (Jacquemoud and Baret 1990, RSE 34, 75). One plate has the optical
+depth
+
+    k(wavelength) = sum over traits i of c_i K_i(wavelength) / N,
+
+with the contents c_i per leaf area and the specific absorption coefficients K_i. The plate model
+(`jaxlidar.optics.plate_model`) turns k, N and the refractive index n(wavelength) into reflectance and
+transmittance,
+
+    R, T = plate_model(k, N, leaf_surface(n, alpha)).
+
+K_i and n are interpolated linearly between the table's wavelengths. All traits but N act through k alone, so
+that derivatives are a chain: dR/dc_i = (dR/dk) K_i/N, and in N at constant c_i, (dR/dN at constant k) -
+(dR/dk) k/N.
 
 The versions differ in their coefficients and in their traits (RSE: Remote Sens. Environ.):
 
@@ -32,6 +42,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from jaxlidar._checks import (
     as_scalar,
+    briefly,
     check_choice,
     check_integer,
     check_kind,
@@ -63,6 +74,7 @@ _Batch = Float[Array, "leaves *wavelengths"]
 
 
 @final
+@briefly
 class Prospect(eqx.Module):
     """A leaf by the PROSPECT model: `R, T = leaf(wavelengths)` are its reflectance and transmittance.
 
@@ -91,8 +103,8 @@ class Prospect(eqx.Module):
     **Raises:** ValueError, naming field, value and admissible range: for a trait that is negative, not finite
     or not a single number, for a trait other than 0 that the version does not have (hence `Cm` with "PC" and
     "PRO"), for N below 1, alpha outside [0, 90], an unknown version, and `coefficients` that are missing or
-    not admissible. TypeError for what is no number. Traced values are not checked. A content so large that
-    another unit is likely, such as a `Cw` in micrometres, gives a `UnitWarning`.
+    not admissible. TypeError for arguments that are no numbers. Traced values are not checked. A content so
+    large that another unit is likely, such as a `Cw` in micrometres, gives a `UnitWarning`.
 
     **Source:** Jacquemoud and Baret (1990), Remote Sens. Environ. 34, 75, and those of the versions.
 
@@ -146,18 +158,18 @@ class Prospect(eqx.Module):
             check_kind("coefficients", coefficients, Coefficients, "a table from load_coefficients")
         check_number("alpha", alpha, 0.0, 90.0)
         pigments = {"Cab": Cab, "Car": Car, "Cant": Cant, "Cbrown": Cbrown}
-        given = {**pigments, "Cw": Cw, "Cm": Cm, "Cp": Cp, "Cc": Cc}
-        self.N = _scalar("N", N)
-        for name, value in given.items():
-            known = name in TRAITS[version]
+        contents = {**pigments, "Cw": Cw, "Cm": Cm, "Cp": Cp, "Cc": Cc}
+        self.N = _trait("N", N)
+        for name, value in contents.items():
+            is_in_version = name in TRAITS[version]
             if value is None:
-                value = _DEFAULTS[name] if known else 0.0
-            elif not known and not _is_zero(value):
+                value = _DEFAULTS[name] if is_in_version else 0.0
+            elif not is_in_version and not _is_zero(value):
                 raise ValueError(
                     f"{name} = {value} is no trait of version {version!r} ({', '.join(TRAITS[version])}): "
                     "only 0 is admissible"
                 )
-            setattr(self, name, _scalar(name, value))
+            setattr(self, name, _trait(name, value))
         self.version, self.alpha, self.coefficients = version, float(alpha), coefficients
         check_ranges(self)
         warn_units(self)
@@ -211,15 +223,18 @@ class Prospect(eqx.Module):
         return plate_model(self._k(absorption), self.N, face)
 
     def _k(self, absorption: Array) -> Array:
-        return _absorbed([getattr(self, name) for name in TRAITS[self.version]], absorption, self.N)
+        """Optical depth of one plate, from the specific absorption coefficients (traits, wavelengths)."""
+        return _optical_depth([getattr(self, name) for name in TRAITS[self.version]], absorption, self.N)
 
 
 @jax.jit
-def _absorbed(contents: list[Array], absorption: Array, N: Array) -> Array:
+def _optical_depth(contents: list[Array], absorption: Array, N: Array) -> Array:
+    # The highest precision: some accelerators multiply matrices of single precision with fewer digits.
     return jnp.tensordot(jnp.stack(contents), absorption, 1, precision=jax.lax.Precision.HIGHEST) / N
 
 
-def _scalar(name: str, value: ArrayLike) -> Float[Array, ""]:
+def _trait(name: str, value: ArrayLike) -> Float[Array, ""]:
+    """Convert a trait to a scalar array. **Raises:** as `Prospect`."""
     check_numbers(name, value)
     if np.size(value) != 1:
         raise ValueError(
@@ -229,12 +244,16 @@ def _scalar(name: str, value: ArrayLike) -> Float[Array, ""]:
 
 
 def _is_zero(value: ArrayLike) -> bool:
-    known = concrete(value)
-    return known is not None and bool(np.all(known == 0))
+    number = concrete(value)
+    return number is not None and bool(np.all(number == 0))
 
 
 def material(leaf: Prospect, wavelengths: Any) -> tuple[Array, LeafSurface]:
-    """Specific absorption coefficients (traits, wavelengths) and the surface, at the wavelengths."""
+    """Specific absorption coefficients (traits, wavelengths) and the leaf's surface, at the wavelengths.
+
+    Both depend on nothing that is fitted: for wavelengths that are not traced they are constants of the
+    compiled program.
+    """
     table = shipped(leaf.version) if leaf.coefficients is None else leaf.coefficients
     dtype = leaf.N.dtype
     if isinstance(wavelengths, Tracer):
@@ -256,6 +275,7 @@ def material(leaf: Prospect, wavelengths: Any) -> tuple[Array, LeafSurface]:
 def _tabulated(
     table: Coefficients, wavelengths: bytes, shape: tuple[int, ...], alpha: float
 ) -> tuple[np.ndarray, LeafSurface]:
+    """`material` at wavelengths given by the bytes of an array of float64, which a cache can look up."""
     x = np.frombuffer(wavelengths).reshape(shape)
     absorption = np.stack([np.interp(x, table.wavelength, c) for c in table.absorption])
     return absorption, leaf_surface(np.interp(x, table.wavelength, table.index), alpha)
@@ -290,11 +310,11 @@ def prospect_spectra(
     >>> print([f"{x:.2f}" for x in R[:, 0]], [f"{x:.2f}" for x in T[:, 0]])
     ['0.38', '0.51'] ['0.53', '0.40']
     """
-    batch_size = _check_batch(leaves, batch_size)
+    batch_size = _checked_batch_size(leaves, batch_size)
     return jax.lax.map(lambda leaf: leaf(wavelengths), leaves, batch_size=batch_size)
 
 
-def _check_batch(leaves: Prospect, batch_size: int) -> int:
+def _checked_batch_size(leaves: Prospect, batch_size: int) -> int:
     check_kind("leaves", leaves, Prospect, "a Prospect of many leaves, as jax.vmap returns it")
     if leaves.N.ndim == 0:
         raise ValueError("leaves has traits of shape (); admissible are traits of shape (leaves,)")
@@ -306,7 +326,7 @@ def prospect_jacobian(
 ) -> tuple[tuple[_Batch, _Batch], dict[str, tuple[_Batch, _Batch]]]:
     """Spectra of many leaves with their derivatives in every trait, at less than three times the cost.
 
-    All traits but N act through k alone, so the plate model is differentiated only twice.
+    All traits but N act through k alone, so the plate model is differentiated only twice, in k and in N.
 
     **Arguments:**
 
@@ -331,19 +351,20 @@ def prospect_jacobian(
     >>> print([f"{x:.4f}" for x in slopes["Cab"][0][:, 0]])
     ['-0.0053', '-0.0015']
     """
-    batch_size = _check_batch(leaves, batch_size)
+    batch_size = _checked_batch_size(leaves, batch_size)
 
-    def one(leaf: Prospect) -> tuple[tuple[Array, Array], dict[str, tuple[Array, Array]]]:
+    def spectra_and_slopes(leaf: Prospect) -> tuple[tuple[Array, Array], dict[str, tuple[Array, Array]]]:
         absorption, face = material(leaf, wavelengths)
         k = leaf._k(absorption)
         (R, T, _), (R_k, T_k, _), (R_N, T_N, _) = plate_model_slopes(k, leaf.N, face)
-        # Else the compiler would compute them again for every trait.
+        # Without this optimisation barrier the compiler would compute them again for every trait.
         R, T, R_k, T_k, R_N, T_N = once((R, T, R_k, T_k, R_N, T_N))
-        thinner = k / leaf.N
-        slopes = {"N": (R_N - R_k * thinner, T_N - T_k * thinner)}
+        # At constant contents dk/dN = -k/N.
+        k_over_N = k / leaf.N
+        slopes = {"N": (R_N - R_k * k_over_N, T_N - T_k * k_over_N)}
         R_k, T_k = R_k / leaf.N, T_k / leaf.N
         for name, column in zip(TRAITS[leaf.version], absorption):
             slopes[name] = (R_k * column, T_k * column)
         return (R, T), slopes
 
-    return jax.lax.map(one, leaves, batch_size=batch_size)
+    return jax.lax.map(spectra_and_slopes, leaves, batch_size=batch_size)

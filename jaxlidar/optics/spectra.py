@@ -32,6 +32,7 @@ from jaxtyping import Array, ArrayLike, Float
 from jaxlidar._checks import (
     array,
     as_array,
+    briefly,
     check_choice,
     check_kind,
     check_range,
@@ -41,11 +42,12 @@ from jaxlidar._checks import (
 )
 from jaxlidar._ranges import FRACTION, SUM_OF_FRACTIONS, Range, check_ranges
 
-# nm: the largest number that is finite in single precision.
-_LONGEST = float(np.finfo(np.float32).max)
+# The largest wavelength, nm, that is finite in single precision.
+_LARGEST_SINGLE = float(np.finfo(np.float32).max)
 
 
 @final
+@briefly
 class Spectrum(eqx.Module):
     """A reflectance spectrum, linear between its samples: `spectrum(wavelength)` is the reflectance.
 
@@ -101,7 +103,7 @@ class Spectrum(eqx.Module):
         warn_units(self)
 
     def __call__(self, wavelength: ArrayLike) -> Float[Array, "..."]:
-        """The reflectance at the given wavelengths.
+        """Interpolate the reflectance at wavelengths.
 
         **Arguments:**
 
@@ -115,15 +117,15 @@ class Spectrum(eqx.Module):
         wavelength = as_array(wavelength)
         table = concrete(self.wavelength)
         if table is not None:
-            what = f"wavelength of the spectrum {self.name!r}" if self.name else "wavelength"
-            check_range(what, wavelength, table[0], table[-1])
+            field = f"wavelength of the spectrum {self.name!r}" if self.name else "wavelength"
+            check_range(field, wavelength, table[0], table[-1])
         return self.scale * jnp.interp(wavelength, self.wavelength, self.reflectance)
 
 
 def reflectance_at(
     value: ArrayLike | Spectrum, wavelength: ArrayLike, field: str = "reflectance"
 ) -> Float[Array, " wavelengths"]:
-    """A reflectance in any of its forms, as one number per wavelength.
+    """Turn a reflectance in any of its three forms into one number per wavelength.
 
     **Arguments:**
 
@@ -158,7 +160,7 @@ def _library() -> dict[str, np.ndarray]:
 
 
 def spectrum_names(kind: str | None = None) -> dict[str, str]:
-    """Names of the bundled reflectance spectra, each with its kind.
+    """List the names of the bundled reflectance spectra, each with its kind.
 
     **Arguments:**
 
@@ -166,7 +168,7 @@ def spectrum_names(kind: str | None = None) -> dict[str, str]:
 
     **Returns:** a dict from name to kind.
 
-    **Raises:** ValueError for an unknown kind; TypeError for what is no name.
+    **Raises:** ValueError for an unknown kind; TypeError for a kind that is no string.
 
     **Example:**
 
@@ -175,15 +177,15 @@ def spectrum_names(kind: str | None = None) -> dict[str, str]:
     ['asphalt', 'concrete', 'gravel']
     """
     library = _library()
-    listed = dict(zip(library["name"].tolist(), library["kind"].tolist()))
+    kind_of_name = dict(zip(library["name"].tolist(), library["kind"].tolist()))
     if kind is None:
-        return listed
-    check_choice("kind", kind, tuple(dict.fromkeys(listed.values())))
-    return {name: k for name, k in listed.items() if k == kind}
+        return kind_of_name
+    check_choice("kind", kind, tuple(dict.fromkeys(kind_of_name.values())))
+    return {name: k for name, k in kind_of_name.items() if k == kind}
 
 
 def spectrum(name: str) -> Spectrum:
-    """A bundled reflectance spectrum, from 400 to 2450 nm.
+    """Return a bundled reflectance spectrum, from 400 to 2450 nm.
 
     **Arguments:**
 
@@ -191,7 +193,8 @@ def spectrum(name: str) -> Spectrum:
 
     **Returns:** a `Spectrum`.
 
-    **Raises:** ValueError for an unknown name; it lists similar names. TypeError for what is no name.
+    **Raises:** ValueError for an unknown name; it lists similar names. TypeError for a name that is no
+    string.
 
     **Example:**
 
@@ -205,6 +208,7 @@ def spectrum(name: str) -> Spectrum:
     check_kind("name", name, str, "a name that jaxlidar.spectrum_names lists")
     names = library["name"].tolist()
     if name not in names:
+        # Misspelt names; without any, the kinds. And names with that word, such as soil-red for "red".
         close = difflib.get_close_matches(name, names, n=5, cutoff=0.4) or sorted(
             set(library["kind"].tolist())
         )
@@ -217,7 +221,7 @@ def spectrum(name: str) -> Spectrum:
 
 
 def read_spectrum_csv(path: str | os.PathLike[str], name: str | None = None) -> Spectrum:
-    r"""A reflectance spectrum, read from a text file of two columns: wavelength in nm, reflectance in [0, 1].
+    r"""Read a reflectance spectrum from a text file of two columns: wavelength in nm, reflectance in [0, 1].
 
     **Arguments:**
 
@@ -248,6 +252,7 @@ def read_spectrum_csv(path: str | os.PathLike[str], name: str | None = None) -> 
         raise FileNotFoundError(f"{path}: no such file")
     samples: list[tuple[float, float]] = []
     header_allowed = True
+    # As bytes: text would also be split at form feeds and the separators of Unicode, and lines miscounted.
     lines = path.read_bytes().removeprefix(codecs.BOM_UTF8).splitlines()
     for number, content in enumerate(lines, 1):
         try:
@@ -257,7 +262,7 @@ def read_spectrum_csv(path: str | os.PathLike[str], name: str | None = None) -> 
         if not line.strip() or line.lstrip().startswith("#"):
             continue
         cells = _cells(line)
-        place = f"{path}, line {number}"
+        position = f"{path}, line {number}"
         try:
             wavelength, reflectance = map(float, cells)
         except ValueError:
@@ -265,21 +270,23 @@ def read_spectrum_csv(path: str | os.PathLike[str], name: str | None = None) -> 
                 header_allowed = False
                 continue
             shown = line.strip()[:40]
-            raise ValueError(f"{place}: {shown!r} is not a wavelength and a reflectance") from None
+            raise ValueError(f"{position}: {shown!r} is not a wavelength and a reflectance") from None
         header_allowed = False
-        if not 100 <= wavelength <= _LONGEST:
+        if not 100 <= wavelength <= _LARGEST_SINGLE:
             raise ValueError(
-                f"{place}: wavelength = {wavelength:g} is outside the admissible range [100, inf) nm"
+                f"{position}: wavelength = {wavelength:g} is outside the admissible range [100, inf) nm"
                 " of single precision"
             )
-        # Samples closer than single precision tells apart are no samples of their own.
+        # Compared in single precision, in which the spectrum is stored by default.
         if samples and np.float32(wavelength) <= np.float32(samples[-1][0]):
             raise ValueError(
-                f"{place}: wavelength = {wavelength:g} follows {samples[-1][0]:g}; the admissible ones "
+                f"{position}: wavelength = {wavelength:g} follows {samples[-1][0]:g}; the admissible ones "
                 "increase strictly"
             )
         if not 0 <= reflectance <= 1:
-            raise ValueError(f"{place}: reflectance = {reflectance:g} is outside the admissible range [0, 1]")
+            raise ValueError(
+                f"{position}: reflectance = {reflectance:g} is outside the admissible range [0, 1]"
+            )
         samples.append((wavelength, reflectance))
     if len(samples) < 2:
         raise ValueError(
@@ -290,6 +297,7 @@ def read_spectrum_csv(path: str | os.PathLike[str], name: str | None = None) -> 
 
 
 def _cells(line: str) -> list[str]:
+    """Split a line at the first separator that it has; a line of unpaired quotes is one cell."""
     for separator in ",;\t":
         if separator in line:
             with contextlib.suppress(csv.Error):

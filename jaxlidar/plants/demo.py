@@ -1,4 +1,4 @@
-"""The scene that `jaxlidar demo` shows: a tree 15 m tall on bare soil, under one large footprint."""
+"""Scene and lidar of `jaxlidar demo`: a tree 15 m tall on bare soil, under one large footprint."""
 
 from jaxlidar._checks import check_number
 from jaxlidar.instrument.lidar import Lidar
@@ -12,13 +12,14 @@ from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.surfaces import Ground
 from jaxlidar.scenes.voxels import VoxelMap
 
+# Height of the tree, m; one-sided area of all its leaves, m2; wavelengths of its lidar, nm.
 HEIGHT = 15.0
 LEAF_AREA = 250.0
 WAVELENGTHS = (532.0, 1064.0, 1550.0)
 
 
 def demo_lidar(wavelength: float | tuple[float, ...] = 1064.0) -> Lidar:
-    """The lidar of the demonstration: 1000 m above the ground, with a footprint 6 m across.
+    """Return the lidar of the demonstration: 1000 m above the ground, with a footprint 6 m across.
 
     The footprint covers much of the crown. The pulse is 6 ns long, the sampling interval 1 ns, the aperture
     0.2 m, and the field of view 8 m across.
@@ -48,7 +49,7 @@ def demo_lidar(wavelength: float | tuple[float, ...] = 1064.0) -> Lidar:
 
 
 def demo_scene(voxel_size: float = 0.25, *, seed: int = 0) -> Scene:
-    """The scene of the demonstration: one tree on soil of medium brightness, at z = 0.
+    """Return the scene of the demonstration: one tree on soil of medium brightness, at z = 0.
 
     Leaf reflectance and transmittance are those of PROSPECT-D. The reflectance of the bark is measured.
 
@@ -64,7 +65,7 @@ def demo_scene(voxel_size: float = 0.25, *, seed: int = 0) -> Scene:
     check_number("voxel_size", voxel_size, 0.0, 1.0, low_open=True)
     return Scene(
         canopy=Canopy(
-            tree(voxel_size, seed=seed),
+            demo_tree(voxel_size, seed=seed),
             leaf=Prospect(N=1.6, Cab=45.0, Car=10.0, Cw=0.012, Cm=0.008),
             bark=spectrum("bark-oak"),
         ),
@@ -72,7 +73,7 @@ def demo_scene(voxel_size: float = 0.25, *, seed: int = 0) -> Scene:
     )
 
 
-def tree(voxel_size: float, *, seed: int) -> VoxelMap:
+def demo_tree(voxel_size: float, *, seed: int) -> VoxelMap:
     """The voxel map of the default tree with 250 m2 of leaves; `voxel_size` is the voxel edge in m."""
-    grown = grow(seed=seed)
-    return voxelise(grown, voxel_size, leaf_area=LEAF_AREA / len(grown.bud_position), wood="surface")
+    tree = grow(seed=seed)
+    return voxelise(tree, voxel_size, leaf_area=LEAF_AREA / len(tree.bud_position), wood="surface")

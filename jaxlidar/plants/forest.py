@@ -11,7 +11,8 @@ from jaxlidar.plants.habits import Habit, grow
 from jaxlidar.plants.tree import Tree
 
 # The area is taken as full after this many rejected positions in a row.
-FRUITLESS = 20_000
+MAX_REJECTED = 20_000
+# Positions drawn at a time.
 BATCH = 200
 
 
@@ -29,8 +30,8 @@ def forest(
 ) -> list[Tree]:
     """Grow a forest stand: trees at random positions on a level rectangle, each with a random azimuth.
 
-    Positions are drawn one by one, uniformly over the rectangle. A position is kept if no other stem is
-    closer than the minimum distance (random sequential addition). Crowns may reach over the edges.
+    Positions are drawn one by one, uniformly over the rectangle. A position is accepted if no stem is closer
+    than the minimum distance (random sequential addition). Crowns may reach over the edges.
 
     **Arguments:**
 
@@ -42,8 +43,8 @@ def forest(
       equal.
     - `size`: (low, high), positive: the range of a factor on height and trunk diameter, drawn uniformly for
       each individual grown. Trunks do not get thinner than the habit's smallest diameter. Default (1, 1).
-    - `individuals`: how many different trees are grown of each habit, at most; 1 or more. The trees of the
-      stand are drawn from these, so that some differ in position and azimuth only. None: every tree is
+    - `individuals`: largest number of different trees that are grown of each habit, 1 or more. The trees of
+      the stand are drawn from these, so that some differ in position and azimuth only. None: every tree is
       grown separately, which takes longer. Default 8.
     - `origin`: (x, y, z) of the south-west corner at the ground, m. Default (0, 0, 0).
     - `seed`: random seed, or a NumPy generator. Default 0.
@@ -51,7 +52,7 @@ def forest(
     **Returns:** a list of `Tree`, in the order of placement. The position of a tree is its `base`.
 
     **Raises:** ValueError for arguments outside the ranges above, and if so many trees cannot be placed at
-    that distance; TypeError for what is no `Habit`. Random placement fills at most about
+    that distance; TypeError for an object that is no `Habit`. Random placement fills at most about
     0.7 / minimum_distance^2 stems per m2.
 
     **Example:**
@@ -88,53 +89,57 @@ def forest(
         )
     check_range("sum of shares", weight.sum(), 0.0, low_open=True)
 
-    rng = np.random.default_rng(seed)
-    places, kind_rng, growth = rng.spawn(3)
+    # Streams of their own: another minimum distance, for instance, leaves the trees as they are.
+    position_rng, kind_rng, growth_rng = np.random.default_rng(seed).spawn(3)
     count = max(1, round(density * area[0] * area[1] / 1e4))
-    position = _places(count, area, minimum_distance, density, places)
+    position = _stem_positions(count, area, minimum_distance, density, position_rng)
     kind = kind_rng.choice(len(kinds), count, p=weight / weight.sum())
     number = np.arange(count) if individuals is None else kind_rng.integers(individuals, size=count)
     azimuth = kind_rng.uniform(0.0, 360.0, count)
+    # By habit and number of the individual.
     grown: dict[tuple[int, int], Tree] = {}
     trees = []
     for i in range(count):
-        which = int(kind[i]), int(number[i])
-        if which not in grown:
-            habit, factor = kinds[which[0]], growth.uniform(*size)
+        individual = int(kind[i]), int(number[i])
+        if individual not in grown:
+            habit, factor = kinds[individual[0]], growth_rng.uniform(*size)
             habit = replace(
                 habit,
                 height=factor * habit.height,
                 trunk_diameter=max(factor * habit.trunk_diameter, habit.smallest_diameter),
             )
-            grown[which] = grow(habit, seed=growth)
-        trees.append(grown[which].rotated(azimuth[i]).translated(np.append(position[i], 0.0) + origin))
+            grown[individual] = grow(habit, seed=growth_rng)
+        base = np.append(position[i], 0.0) + origin
+        trees.append(grown[individual].rotated(azimuth[i]).translated(base))
     return trees
 
 
-def _places(
+def _stem_positions(
     count: int, area: tuple[float, float], distance: float, density: float, rng: np.random.Generator
 ) -> Float[np.ndarray, "{count} 2"]:
-    """Random positions, no two of them closer than `distance`."""
-    placed = np.empty((count, 2))
-    done, missed = 0, 0
-    while done < count:
-        # Darts are thrown many at a time but judged one after the other, as if they were thrown singly.
-        darts = rng.uniform(0.0, area, (BATCH, 2))
-        away = np.linalg.norm(darts[:, None] - placed[None, :done], axis=2).min(axis=1, initial=np.inf)
-        fresh = done
-        for dart, free in zip(darts, away >= distance):
-            new = placed[fresh:done]
-            if free and np.all(np.linalg.norm(new - dart, axis=1) >= distance):
-                placed[done] = dart
-                done, missed = done + 1, 0
-                if done == count:
+    """Draw random positions, no two of them closer than `distance`; `density` is for the error message."""
+    positions = np.empty((count, 2))
+    n_placed, n_rejected = 0, 0
+    while n_placed < count:
+        # Candidates are drawn many at a time but judged one after the other, as if they were drawn singly.
+        candidates = rng.uniform(0.0, area, (BATCH, 2))
+        gap = np.linalg.norm(candidates[:, None] - positions[None, :n_placed], axis=2)
+        is_free = gap.min(axis=1, initial=np.inf) >= distance
+        first_of_batch = n_placed
+        for candidate, free in zip(candidates, is_free):
+            # Against those placed since the gaps were computed.
+            recent = positions[first_of_batch:n_placed]
+            if free and np.all(np.linalg.norm(recent - candidate, axis=1) >= distance):
+                positions[n_placed] = candidate
+                n_placed, n_rejected = n_placed + 1, 0
+                if n_placed == count:
                     break
             else:
-                missed += 1
-        if missed >= FRUITLESS:
+                n_rejected += 1
+        if n_rejected >= MAX_REJECTED:
             raise ValueError(
                 f"density = {density:g} stems/ha with minimum_distance = {distance:g} m cannot be placed: "
-                f"room was found for {done} of {count} trees, that is for at most about "
-                f"{1e4 * done / (area[0] * area[1]):.3g} stems/ha"
+                f"room was found for {n_placed} of {count} trees, that is for at most about "
+                f"{1e4 * n_placed / (area[0] * area[1]):.3g} stems/ha"
             )
-    return placed
+    return positions

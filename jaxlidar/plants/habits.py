@@ -1,28 +1,41 @@
 """Growth habits of trees: parameters of an L-system whose branching follows da Vinci's rule.
 
-Where an axis of diameter d branches, d^p = sum of d_i^p over the axis that continues and its laterals. With
-p = 2 the cross-section is conserved (da Vinci; Richter 1970, The Notebooks of Leonardo da Vinci, 394). The
-length from any point of an axis to its tip is proportional to d^`length_exponent`. Laterals are therefore
-shorter than the axis that bears them, and the outline of the crown follows from how the cross-section is
-shared. An axis ends where a fork would be thinner than `smallest_diameter`: in a twig that tapers to exactly
-that diameter. Thinner wood is not modelled; buds sit on shoots without wood.
+Where an axis of diameter d branches, into an axis that continues and laterals of diameters d_i,
+
+    d^p = sum of d_i^p                        (da Vinci's rule; p = 2 conserves the cross-section),
+    l(d) = (d/D)^q                            (length from a point of an axis to its tip, relative),
+
+with p = `exponent`, q = `length_exponent` and the diameter D of the trunk (Richter 1970, The Notebooks of
+Leonardo da Vinci, 394). Laterals are therefore shorter than the axis that bears them, and the outline of the
+crown follows from the division of the cross-section. The L-system rewrites the end of an axis of diameter d,
+as long as d^p >= 2 d_min^p, with d_min = `smallest_diameter`:
+
+1. The laterals of the node take the random fraction `share` of d^p together, each at least d_min^p. The axis
+   continues with d' = d (1 - sum of fractions)^(1/p).
+2. An internode of the length l(d) - l(d') is added, in `pieces` that bend at random and by tropism.
+3. Each lateral begins at its end, as an axis of its own.
+
+An axis that is thinner ends in a twig that tapers to exactly d_min. Thinner wood is not modelled; buds sit on
+shoots without wood. Lengths are scaled to the height of the tree at the end.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, final
 
 import numpy as np
 
-from jaxlidar._checks import check_integer, check_kind, check_number, check_shape, warn_units
+from jaxlidar._checks import briefly, check_integer, check_kind, check_number, check_shape, warn_units
 from jaxlidar.plants.lsystem import Item, LSystem, Rule, Word
 from jaxlidar.plants.tree import Tree
 from jaxlidar.plants.turtle import turtle
 
+# In degrees: 360 (1 - 1/golden ratio).
 GOLDEN_ANGLE = 137.50776405
 # Standard deviations in degrees: of a lateral's azimuth around its axis, and of a shoot's bend at each bud.
 DIVERGENCE_SPREAD = 15.0
 SHOOT_SPREAD = 28.0
+# Fields of a tree that have an element per bud.
 BUDS = ("bud_position", "bud_direction", "bud_radius")
 
 
@@ -33,9 +46,9 @@ class Branching:
 
     **Arguments:**
 
-    - `laterals`: number of lateral branches at a node, 1 or more. Near the twigs, where so many would be too
-      thin, a node has one. Default 1.
-    - `share`: (low, high) share of the cross-section that the laterals of a node take together, within
+    - `laterals`: number of lateral branches at a node, 1 or more. Near the twigs, where this number would be
+      too thin, a node has one. Default 1.
+    - `share`: (low, high) fraction of the cross-section that the laterals of a node take together, within
       [0, 1]; drawn uniformly. No lateral gets thicker than the axis that continues. Default (0.2, 0.5).
     - `angle`: angle between a lateral and the axis that continues, degrees, 0 to 180. With one lateral, both
       turn away from the old direction, the thicker one less. Default 50.
@@ -46,7 +59,7 @@ class Branching:
       of an internode, 0 or more. Thicker wood bends less, by the fourth root of its diameter. Default 7.
     - `tropism`: upward bend of a horizontal piece, degrees; negative is downward. Default 2.
 
-    **Raises:** ValueError for values outside the ranges above; TypeError for what is no number.
+    **Raises:** ValueError for values outside the ranges above; TypeError for arguments that are no numbers.
 
     **Example:**
 
@@ -79,6 +92,7 @@ class Branching:
 
 
 @final
+@briefly
 @dataclass(frozen=True)
 class Habit:
     """The growth habit of a tree: sizes and branching proportions from which `grow` makes individuals.
@@ -95,7 +109,7 @@ class Habit:
     - `exponent`: exponent p of da Vinci's rule, positive. Default 2.
     - `length_exponent`: exponent q in length ~ diameter^q, for the length from a point of an axis to its tip;
       positive. Default 0.65.
-    - `bole`: share of the trunk's length that is below its first node, in [0, 1). Default 0.08.
+    - `bole`: fraction of the trunk's length that is below its first node, in [0, 1). Default 0.08.
     - `stems`: number of stems that grow from the base, 1 or more. All but the first have 0.6 to 1 times
       `trunk_diameter`, drawn uniformly. Default 1.
     - `stem_angle`: outward lean of the stems, degrees, 0 to 90. Each stem leans by 0.4 to 1.3 times this,
@@ -103,7 +117,7 @@ class Habit:
     - `trunk`: `Branching` of the axes of order 0. Default `Branching()`.
     - `branches`: `Branching` of all other axes. Default `Branching()`.
     - `pieces`: number of straight segments in an internode, 1 or more. Default 3.
-    - `twig`: length of the twig beyond the last fork, as a share of the length that an axis as thin as
+    - `twig`: length of the twig beyond the last fork, as a fraction of the length that an axis as thin as
       `smallest_diameter` would have; positive. Twigs that start thicker are longer. Default 0.4.
     - `shoots`: number of shoots on each twig, 0 or more. The last one continues the twig. Default 8.
     - `shoot_length`: length of a shoot, m, positive. Default 0.6.
@@ -163,8 +177,8 @@ class Habit:
         **Returns:** an `LSystem`.
         """
         rules = [Rule("R", self._stems, random=True)]
-        for symbol, how in (("A", self.trunk), ("B", self.branches)):
-            rules += self._axis(symbol, how)
+        for symbol, branching in (("A", self.trunk), ("B", self.branches)):
+            rules += self._axis(symbol, branching)
         return LSystem("R", rules)
 
     def foliage(self, wood: Word) -> LSystem:
@@ -186,88 +200,113 @@ class Habit:
 
         return LSystem(wood, [Rule("S", shoot, random=True)])
 
-    def _path(self, diameter: Any) -> Any:
-        """Relative length from the point where an axis has this diameter to its tip."""
+    def _length_to_tip(self, diameter: Any) -> Any:
+        """l(d): relative length from the point where an axis has this diameter to its tip."""
         return (diameter / self.trunk_diameter) ** self.length_exponent
 
     def _stems(self, *, rng: np.random.Generator) -> Iterator[Item]:
-        turn = rng.uniform(0.0, 360.0)
+        """Successor of the root: each stem's bole and growing end."""
+        azimuth = rng.uniform(0.0, 360.0)
         for i in range(self.stems):
             d = self.trunk_diameter * (1.0 if i == 0 else rng.uniform(0.6, 1.0))
             lean = self.stem_angle * rng.uniform(0.4, 1.3)
-            yield from ["[", ("/", turn + i * GOLDEN_ANGLE), ("&", lean)]
-            yield from self._internode(self._path(d) * self.bole / (1 - self.bole), d, d, self.trunk, rng, ())
+            yield from ["[", ("/", azimuth + i * GOLDEN_ANGLE), ("&", lean)]
+            bole = self._length_to_tip(d) * self.bole / (1 - self.bole)
+            yield from self._internode(bole, d, d, self.trunk, rng)
             yield from [("A", d), "]"]
 
-    def _axis(self, symbol: str, how: Branching) -> list[Rule]:
-        """Rules of an axis: the laterals of `how`; one lateral if those are too thin; else a twig."""
+    def _axis(self, symbol: str, branching: Branching) -> list[Rule]:
+        """Rules of an axis: all laterals; one lateral if those are too thin; else a twig."""
         p, smallest = self.exponent, self.smallest_diameter
-        many, two = ((n * smallest**p) ** (1 / p) for n in (how.laterals + 1, 2))
+        # Diameters from which a node's axes can have the smallest diameter each: laterals and one more axis.
+        all_laterals, one_lateral = ((n * smallest**p) ** (1 / p) for n in (branching.laterals + 1, 2))
 
-        def end(d: Any, *, rng: np.random.Generator) -> Iterator[Item]:
-            yield from self._twig(d, how, rng)
+        def twig(d: Any, *, rng: np.random.Generator) -> Iterator[Item]:
+            yield from self._twig(d, branching, rng)
 
         def node(laterals: int) -> Any:
-            def branch(d: Any, *, rng: np.random.Generator) -> Iterator[Item]:
-                yield from self._node(symbol, d, laterals, how, rng)
+            def fork(d: Any, *, rng: np.random.Generator) -> Iterator[Item]:
+                yield from self._node(symbol, d, laterals, branching, rng)
 
-            return branch
+            return fork
 
         return [
-            Rule(symbol, node(how.laterals), condition=lambda d: d >= many, random=True),
-            Rule(symbol, node(1), condition=lambda d: (d >= two) & (d < many), random=True),
-            Rule(symbol, end, condition=lambda d: d < two, random=True),
+            Rule(symbol, node(branching.laterals), condition=lambda d: d >= all_laterals, random=True),
+            Rule(
+                symbol,
+                node(1),
+                condition=lambda d: (d >= one_lateral) & (d < all_laterals),
+                random=True,
+            ),
+            Rule(symbol, twig, condition=lambda d: d < one_lateral, random=True),
         ]
 
     def _node(
-        self, symbol: str, d: Any, laterals: int, how: Branching, rng: np.random.Generator
+        self, symbol: str, d: Any, laterals: int, branching: Branching, rng: np.random.Generator
     ) -> Iterator[Item]:
+        """Successor of axes of (n,) diameters d: an internode, its laterals, and the axis that continues."""
         n, p = len(d), self.exponent
         # No lateral is thinner than the smallest diameter or thicker than the axis that continues.
         low, high = (self.smallest_diameter / d) ** p, 1 / (laterals + 1)
-        shares = np.clip(rng.uniform(*how.share, (laterals, n)) / laterals, np.minimum(low, high), high)
-        rest = 1 - shares.sum(axis=0)
-        after = d * rest ** (1 / p)
-        yield from self._internode(self._path(d) - self._path(after), d, d, how, rng, ())
-        yield ("/", how.divergence + rng.normal(0.0, DIVERGENCE_SPREAD, n))
-        for share in shares:
-            angle = np.clip(rng.normal(how.angle, how.angle_spread, n), 0.0, 180.0)
-            turn = share / (share + rest) * angle if laterals == 1 else 0.0
-            yield from ["[", ("&", angle - turn), ("B", d * share ** (1 / p)), "]"]
-            yield (
-                ("/", 360 / laterals + rng.normal(0.0, DIVERGENCE_SPREAD, n)) if laterals > 1 else ("^", turn)
-            )
-        yield (symbol, after)
+        fractions = rng.uniform(*branching.share, (laterals, n)) / laterals
+        fractions = np.clip(fractions, np.minimum(low, high), high)
+        remainder = 1 - fractions.sum(axis=0)
+        d_next = d * remainder ** (1 / p)
+        length = self._length_to_tip(d) - self._length_to_tip(d_next)
+        yield from self._internode(length, d, d, branching, rng)
+        yield ("/", branching.divergence + rng.normal(0.0, DIVERGENCE_SPREAD, n))
+        for fraction in fractions:
+            angle = np.clip(rng.normal(branching.angle, branching.angle_spread, n), 0.0, 180.0)
+            # With one lateral, the axis turns away from it, in proportion to the lateral's cross-section.
+            deflection = fraction / (fraction + remainder) * angle if laterals == 1 else 0.0
+            yield from ["[", ("&", angle - deflection), ("B", d * fraction ** (1 / p)), "]"]
+            if laterals > 1:
+                yield ("/", 360 / laterals + rng.normal(0.0, DIVERGENCE_SPREAD, n))
+            else:
+                yield ("^", deflection)
+        yield (symbol, d_next)
 
-    def _twig(self, d: Any, how: Branching, rng: np.random.Generator) -> Iterator[Item]:
-        length = self._path(d) - self._path(self.smallest_diameter) * (1 - self.twig)
+    def _twig(self, d: Any, branching: Branching, rng: np.random.Generator) -> Iterator[Item]:
+        """Successor of axes too thin to branch: a tapering internode with shoots."""
+        smallest = self.smallest_diameter
+        length = self._length_to_tip(d) - self._length_to_tip(smallest) * (1 - self.twig)
         # An axis of just the smallest diameter may have come out thinner by rounding.
-        d, thin = np.maximum(d, self.smallest_diameter), self.smallest_diameter
-        turn = rng.uniform(0.0, 360.0, len(d))
+        d = np.maximum(d, smallest)
+        azimuth = rng.uniform(0.0, 360.0, len(d))
+        # The last shoot continues the twig.
         last = self.shoots - 1
-        shoots = [("/", turn + i * GOLDEN_ANGLE, self.shoot_angle * (i < last)) for i in range(last + 1)]
-        yield from self._internode(np.maximum(length, 0.0), d, thin, how, rng, shoots)
+        shoots = [(azimuth + i * GOLDEN_ANGLE, self.shoot_angle * (i < last)) for i in range(self.shoots)]
+        yield from self._internode(np.maximum(length, 0.0), d, smallest, branching, rng, shoots)
 
     def _internode(
-        self, length: Any, begin: Any, end: Any, how: Branching, rng: np.random.Generator, shoots: Any
+        self,
+        length: Any,
+        d_start: Any,
+        d_end: Any,
+        branching: Branching,
+        rng: np.random.Generator,
+        shoots: Sequence[tuple[Any, Any]] = (),
     ) -> Iterator[Item]:
-        """Pieces with bends between them and shoots at their ends; `begin` and `end` are diameters in m."""
+        """Pieces with bends between them, and shoots (azimuth, angle in degrees) at their ends.
+
+        `d_start` and `d_end` are diameters in m.
+        """
         k = self.pieces
-        bend = how.bend * (self.smallest_diameter / begin) ** 0.25
+        bend = branching.bend * (self.smallest_diameter / d_start) ** 0.25
         for i in range(k):
-            radii = [0.5 * (begin + (end - begin) * (i + j) / k) for j in (0, 1)]
-            yield from [(symbol, rng.normal(0.0, bend, np.shape(begin))) for symbol in "+&"]
-            yield from [("T", how.tropism), ("F", length / k, *radii)]
-            for _, roll, angle in shoots[i * len(shoots) // k : (i + 1) * len(shoots) // k]:
-                yield from ["[", ("/", roll), ("&", angle), "S", "]"]
+            radii = [0.5 * (d_start + (d_end - d_start) * (i + j) / k) for j in (0, 1)]
+            yield from [(symbol, rng.normal(0.0, bend, np.shape(d_start))) for symbol in "+&"]
+            yield from [("T", branching.tropism), ("F", length / k, *radii)]
+            for azimuth, angle in shoots[i * len(shoots) // k : (i + 1) * len(shoots) // k]:
+                yield from ["[", ("/", azimuth), ("&", angle), "S", "]"]
 
 
 def grow(habit: Habit | None = None, *, seed: int | np.random.Generator = 0) -> Tree:
     """Grow one tree of a habit, with its base at the origin.
 
     The L-system of the wood is rewritten until no axis can branch further. Lengths are then scaled to the
-    height of the habit, and shoots and buds are added. Buds whose clumps would reach below the base are left
-    out.
+    height of the habit, and shoots and buds are added. Buds whose clumps would reach below the base are
+    dropped.
 
     **Arguments:**
 
@@ -276,7 +315,8 @@ def grow(habit: Habit | None = None, *, seed: int | np.random.Generator = 0) -> 
 
     **Returns:** a `Tree`.
 
-    **Raises:** ValueError if the wood of the habit does not grow upward; TypeError for what is no `Habit`.
+    **Raises:** ValueError if the wood of the habit does not grow upward; TypeError for an object that is no
+    `Habit`.
 
     **Example:**
 
@@ -289,21 +329,21 @@ def grow(habit: Habit | None = None, *, seed: int | np.random.Generator = 0) -> 
     check_kind("habit", habit, Habit, "a Habit or None")
     rng = np.random.default_rng(seed)
     word = habit.wood().rewrite(seed=rng)
-    relative = turtle(word).height
-    if not relative > 1e-6:
+    relative_height = turtle(word).height
+    if not relative_height > 1e-6:
         raise ValueError(
             f"height = {habit.height:g} cannot be had: the wood of this habit does not grow upward"
         )
     lengths = word.parameters.copy()
-    lengths[word.where("F"), 0] *= habit.height / relative
+    lengths[word.where("F"), 0] *= habit.height / relative_height
     word = replace(word, parameters=lengths)
     tree = turtle(habit.foliage(word).rewrite(1, seed=rng))
-    above = tree.bud_position[:, 2] >= tree.bud_radius
-    return replace(tree, **{name: getattr(tree, name)[above] for name in BUDS})
+    is_above_base = tree.bud_position[:, 2] >= tree.bud_radius
+    return replace(tree, **{name: getattr(tree, name)[is_above_base] for name in BUDS})
 
 
 def broadleaf(**changes: Any) -> Habit:
-    """The habit of an open-grown broadleaved tree: the tree of Table 2 of the paper, 15 m tall.
+    """Return the habit of an open-grown broadleaved tree: the tree of Table 2 of the paper, 15 m tall.
 
     **Arguments:**
 
@@ -324,7 +364,7 @@ def broadleaf(**changes: Any) -> Habit:
 
 
 def conifer(**changes: Any) -> Habit:
-    """The habit of a spruce-like conifer: a straight trunk, whorls of branches, a conical crown, 20 m tall.
+    """Return the habit of a spruce-like conifer, 20 m tall: a straight trunk, whorls, a conical crown.
 
     **Arguments:**
 
@@ -356,7 +396,7 @@ def conifer(**changes: Any) -> Habit:
 
 
 def spreading_tree(**changes: Any) -> Habit:
-    """The habit of a spreading broadleaved tree, 10 m tall and mostly wider, such as an old oak in a field.
+    """Return the habit of a spreading broadleaved tree, 10 m tall and mostly wider: an old oak in a field.
 
     **Arguments:**
 
@@ -385,7 +425,7 @@ def spreading_tree(**changes: Any) -> Habit:
 
 
 def shrub(**changes: Any) -> Habit:
-    """The habit of a shrub with nine stems from one base, 2.5 m tall.
+    """Return the habit of a shrub with nine stems from one base, 2.5 m tall.
 
     **Arguments:**
 

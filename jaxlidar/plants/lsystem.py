@@ -88,7 +88,7 @@ class Word:
         **Returns:** a `Word`.
 
         **Raises:** ValueError for letters that are not one character and parameters that are not finite;
-        TypeError for what is no sequence.
+        TypeError for items that are no sequence.
         """
         check_kind("items", items, Iterable, "a string, or a sequence of strings and tuples")
         codes, arity, parameters = _successor(items, 1, "the word")

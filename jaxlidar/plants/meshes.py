@@ -1,9 +1,14 @@
 """Voxel maps of triangle meshes: every triangle is cut at the faces of the voxels, and its pieces counted.
 
-A triangle that planes of the grid cross is cut in two parts at the middle one of these planes, the parts
-again, until each piece lies within one voxel. So areas of voxels are exact to rounding, and their sum is that
-of the mesh. A piece in the face between two voxels counts in the upper one; at the upper side of the grid, in
-the last one.
+In a voxel of volume V with the one-sided leaf area L and the bark area B, the leaf area density is L/V and
+the extinction coefficient of bark is B/(4 V) (Cauchy: a convex body's mean projected area is a quarter of its
+surface).
+
+L and B are exact to rounding, and their sums are the areas of the mesh. Along x, then y, then z, a triangle
+that planes of the grid cross is cut at the middle one of these planes, and the pieces again, until each lies
+between two neighbouring planes: the number of cuts in sequence grows with the logarithm of the number of
+planes. A piece in the face between two voxels counts in the upper one; at the upper side of the grid, in the
+last one.
 """
 
 from collections.abc import Iterator, Sequence
@@ -13,18 +18,19 @@ from typing import final
 import numpy as np
 from jaxtyping import ArrayLike, Bool, Float, Int
 
-from jaxlidar._checks import check_kind, check_range, check_shape
+from jaxlidar._checks import briefly, check_kind, check_range, check_shape
 from jaxlidar.optics.leaf_angles import ANGLE_CELLS, LeafAngles
-from jaxlidar.plants.grid import Grid, edges
+from jaxlidar.plants.grid import Grid, voxel_edges
 from jaxlidar.scenes.voxels import VoxelMap
 
-# Pieces that are made at a time, by a bound on their number.
-_CHUNK = 1_000_000
-# A corner so close to a plane of the grid, in voxels, lies in it.
-_NEAR = 1e-9
+# Largest number of pieces in memory at a time, by an upper bound on their number.
+_MAX_PIECES = 1_000_000
+# A corner closer to a plane of the grid than this, in voxels, is moved into the plane.
+_SNAP_DISTANCE = 1e-9
 
 
 @final
+@briefly
 @dataclass(frozen=True, eq=False, init=False)
 class Mesh:
     """A mesh of n triangles over m vertices, each triangle of one of several materials.
@@ -34,14 +40,14 @@ class Mesh:
 
     **Arguments:**
 
-    - `vertices`: (m, 3) places, m.
+    - `vertices`: (m, 3) positions, m.
     - `faces`: (n, 3) indices of the corners of each triangle, whole numbers from 0.
     - `material`: (n,) for each triangle the index of its material. Default None: the first.
     - `materials`: names of the materials, each its own. Default ("mesh",).
 
-    **Raises:** ValueError for arrays of other shapes, no triangle, places that are not finite, indices of
-    vertices and materials that are not there, and a name that is given twice; TypeError for indices that are
-    no integers.
+    **Raises:** ValueError for arrays of other shapes, no triangle, positions that are not finite, indices of
+    vertices and materials that do not exist, and a name that occurs twice; TypeError for indices that are no
+    integers.
 
     **Example:**
 
@@ -81,8 +87,8 @@ class Mesh:
         if len(set(names)) < len(names):
             raise ValueError(f"materials = {names} has a name twice")
         check_range("material", material, 0, len(names) - 1)
-        made = {"vertices": vertices, "faces": faces, "material": material, "materials": names}
-        for name, value in made.items():
+        fields = {"vertices": vertices, "faces": faces, "material": material, "materials": names}
+        for name, value in fields.items():
             object.__setattr__(self, name, value)
 
     @property
@@ -96,7 +102,7 @@ class Mesh:
         return _areas(self.corners)
 
     def of(self, names: Sequence[str]) -> Bool[np.ndarray, " n"]:
-        """Which triangles are of the materials of these names.
+        """(n,) booleans, true for the triangles of the materials of these names.
 
         **Raises:** ValueError for a name that no material has.
         """
@@ -119,11 +125,11 @@ def voxelise_mesh(
     origin: tuple[float, float, float] | None = None,
     shape: tuple[int, int, int] | None = None,
 ) -> VoxelMap:
-    """The voxel map of leaf and bark of a triangle mesh, with the mesh's own area in every voxel.
+    """Voxelise leaf and bark of a triangle mesh, with the mesh's own area in every voxel.
 
-    Triangles of leaf are leaves without thickness: both sides of a triangle together are one leaf's. The leaf
-    area density is their area over the voxel's volume. Triangles of bark are the outer surfaces of solids;
-    their extinction coefficient is a quarter of the area per volume (Cauchy), as for `voxelise` with
+    Triangles of leaf are leaves without thickness: a triangle's two faces are the two sides of one leaf. The
+    leaf area density is their area over the voxel's volume. Triangles of bark are the outer surfaces of
+    solids; their extinction coefficient is a quarter of the area per volume (Cauchy), as for `voxelise` with
     `wood="surface"`.
 
     **Arguments:**
@@ -142,7 +148,7 @@ def voxelise_mesh(
 
     **Raises:** ValueError for inadmissible arguments, a material that the mesh does not have or that is both
     leaf and bark, triangles that have no area in all, and a mesh that reaches out of a given grid; TypeError
-    for what is no `Mesh`.
+    for an object that is no `Mesh`.
 
     **Source:** Cauchy (1841).
 
@@ -156,24 +162,27 @@ def voxelise_mesh(
     (2, 1, 2) 1.414 m2 per m3
     """
     check_kind("mesh", mesh, Mesh, "a Mesh, such as jaxlidar.io.read_obj gives")
-    size = edges(voxel_size)
+    size = voxel_edges(voxel_size)
     is_bark = mesh.of(bark)
     is_leaf = ~is_bark if leaf is None else mesh.of(leaf)
-    if np.any(both := is_leaf & is_bark):
-        name = mesh.materials[mesh.material[np.argmax(both)]]
+    if np.any(is_ambiguous := is_leaf & is_bark):
+        name = mesh.materials[mesh.material[np.argmax(is_ambiguous)]]
         raise ValueError(f"{name!r} is among the materials of leaf and of bark; admissible is one of them")
-    area, used = mesh.area, is_leaf | is_bark
-    if not np.any(area[used] > 0):
-        raise ValueError(f"{used.sum()} triangles are leaf or bark, none with an area: nothing to voxelise")
-    reach = mesh.corners[used].reshape(-1, 3)
-    grid = Grid.of(reach.min(axis=0), reach.max(axis=0), size, origin, shape)
-    cell = size.prod()
-    density = [_shared_out(mesh, chosen, area, grid) / cell for chosen in (is_leaf, is_bark)]
-    wood = 0.25 * density[1] if np.any(is_bark) else None
+    area, is_used = mesh.area, is_leaf | is_bark
+    if not np.any(area[is_used] > 0):
+        raise ValueError(
+            f"{is_used.sum()} triangles are leaf or bark, none with an area: nothing to voxelise"
+        )
+    corners = mesh.corners[is_used].reshape(-1, 3)
+    grid = Grid.enclosing(corners.min(axis=0), corners.max(axis=0), size, origin, shape)
+    leaf_density, bark_density = (
+        _area_in_voxels(mesh, selected, area, grid) / size.prod() for selected in (is_leaf, is_bark)
+    )
+    wood = 0.25 * bark_density if np.any(is_bark) else None
     if not np.any(is_leaf):
         return VoxelMap.from_extinction(bark=wood, voxel_size=size, origin=grid.low)
     angles = _inclinations(mesh.corners[is_leaf]) if leaf_angles is None else leaf_angles
-    return VoxelMap.from_lad(density[0], bark=wood, voxel_size=size, origin=grid.low, leaf_angles=angles)
+    return VoxelMap.from_lad(leaf_density, bark=wood, voxel_size=size, origin=grid.low, leaf_angles=angles)
 
 
 def _areas(corners: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, " n"]:
@@ -182,7 +191,10 @@ def _areas(corners: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, " n"]:
 
 
 def _normals(corners: Float[np.ndarray, "n 3 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Normals of twice the length of the areas."""
+    """Cross products of two sides: normals whose length is twice the area.
+
+    Written out by components: `numpy.cross` takes several times as long on rows of three.
+    """
     (ax, ay, az), (bx, by, bz) = (np.moveaxis(corners[:, k] - corners[:, 0], -1, 0) for k in (1, 2))
     return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
 
@@ -192,46 +204,48 @@ def _inclinations(corners: Float[np.ndarray, "n 3 3"]) -> LeafAngles | str:
     x, y, z = _normals(corners)
     angle = np.rad2deg(np.arctan2(np.hypot(x, y), np.abs(z)))
     cells = np.minimum(angle * (ANGLE_CELLS / 90.0), ANGLE_CELLS - 1).astype(int)
-    share = np.bincount(cells, _areas(corners), ANGLE_CELLS)
-    return LeafAngles(share / share.sum()) if share.sum() > 0 else "spherical"
+    area_of_cell = np.bincount(cells, _areas(corners), ANGLE_CELLS)
+    return LeafAngles(area_of_cell / area_of_cell.sum()) if area_of_cell.sum() > 0 else "spherical"
 
 
-def _shared_out(
-    mesh: Mesh, chosen: Bool[np.ndarray, " n"], area: Float[np.ndarray, " n"], grid: Grid
+def _area_in_voxels(
+    mesh: Mesh, selected: Bool[np.ndarray, " n"], area: Float[np.ndarray, " n"], grid: Grid
 ) -> Float[np.ndarray, "nx ny nz"]:
-    """The area of some triangles in every voxel."""
-    total = grid.empty()
-    number = np.flatnonzero(chosen & (area > 0))
-    # In voxels from the grid's corner: a plane of the grid is a whole number.
-    corners = (mesh.corners[number] - grid.low) / grid.size
-    whole = np.round(corners)
-    corners = np.where(np.abs(corners - whole) < _NEAR, whole, corners)
-    for some in _chunks(corners):
-        pieces, owner = _pieces(corners[some])
-        part = _areas(pieces * grid.size)
-        sums = np.bincount(owner, part, len(number[some]))
-        # A triangle may be so small that its corners fall together when they are moved to a plane.
-        share = np.where(sums[owner] > 0, part / np.where(sums > 0, sums, 1.0)[owner], 1.0)
-        middle = (pieces[:, 0] + pieces[:, 1] + pieces[:, 2]) / 3
-        grid.count(grid.low + grid.size * middle, share * area[number[some]][owner], total)
+    """The area of the selected triangles in every voxel, m2."""
+    total = grid.zeros()
+    triangles = np.flatnonzero(selected & (area > 0))
+    # In voxels from the grid's corner: a plane of the grid is at a whole number.
+    corners = (mesh.corners[triangles] - grid.low) / grid.size
+    nearest_plane = np.round(corners)
+    corners = np.where(np.abs(corners - nearest_plane) < _SNAP_DISTANCE, nearest_plane, corners)
+    for chunk in _chunks(corners):
+        pieces, triangle = _pieces(corners[chunk])
+        piece_area = _areas(pieces * grid.size)
+        sums = np.bincount(triangle, piece_area, len(triangles[chunk]))
+        # The areas of the pieces serve to divide the triangle's own. A triangle may be so small that its
+        # corners coincide when they are moved to a plane: its one piece gets all of its area.
+        fraction = np.where(sums[triangle] > 0, piece_area / np.where(sums > 0, sums, 1.0)[triangle], 1.0)
+        centroid = (pieces[:, 0] + pieces[:, 1] + pieces[:, 2]) / 3
+        grid.accumulate(grid.low + grid.size * centroid, fraction * area[triangles[chunk]][triangle], total)
     return total
 
 
 def _chunks(corners: Float[np.ndarray, "n 3 3"]) -> Iterator[slice]:
-    """Ranges of triangles that are cut together: of few pieces, or one triangle alone."""
-    low, high = _ends(corners)
+    """Ranges of triangles that are cut together: of at most _MAX_PIECES pieces, or one triangle alone."""
+    low, high = _extremes(corners)
+    # A triangle that spans x by y by z voxels is plane: it meets at most about x y + y z + z x of them.
     x, y, z = (np.floor(high) - np.floor(low) + 1).T
-    before = np.cumsum(x * y + y * z + z * x)
+    cumulative = np.cumsum(x * y + y * z + z * x)
     start = 0
     while start < len(corners):
-        done = before[start - 1] if start else 0.0
-        end = max(int(np.searchsorted(before, done + _CHUNK)), start + 1)
+        before_start = cumulative[start - 1] if start else 0.0
+        end = max(int(np.searchsorted(cumulative, before_start + _MAX_PIECES)), start + 1)
         yield slice(start, end)
         start = end
 
 
-def _ends(corners: Float[np.ndarray, "n 3 *axes"]) -> tuple[np.ndarray, np.ndarray]:
-    """The least and the largest of the three corners; reductions over so few are slow."""
+def _extremes(corners: Float[np.ndarray, "n 3 *axes"]) -> tuple[np.ndarray, np.ndarray]:
+    """The least and the largest of the three corners. (`min(axis=1)` over so few is slow.)"""
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     return np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
 
@@ -239,36 +253,41 @@ def _ends(corners: Float[np.ndarray, "n 3 *axes"]) -> tuple[np.ndarray, np.ndarr
 def _pieces(
     corners: Float[np.ndarray, "n 3 3"],
 ) -> tuple[Float[np.ndarray, "pieces 3 3"], Int[np.ndarray, " pieces"]]:
-    """Pieces that lie within voxels of edge 1 each, and the triangle that each is of."""
-    owner = np.arange(len(corners))
+    """Cut triangles into pieces that lie within voxels of edge 1 each; and the triangle of each piece."""
+    triangle = np.arange(len(corners))
     for axis in range(3):
-        within: list[tuple[np.ndarray, np.ndarray]] = []
+        finished: list[tuple[np.ndarray, np.ndarray]] = []
         while len(corners):
-            low, high = _ends(corners[:, :, axis])
+            low, high = _extremes(corners[:, :, axis])
+            # Planes strictly between the lowest and the highest corner.
             first, last = np.floor(low) + 1, np.ceil(high) - 1
-            crossed = first <= last
-            within.append((corners[~crossed], owner[~crossed]))
-            plane = np.floor(0.5 * (first + last))[crossed]
-            corners = _cut(corners[crossed], axis, plane)
-            owner = np.tile(owner[crossed], 3)
-        corners, owner = (np.concatenate(parts) for parts in zip(*within))
-    return corners, owner
+            is_crossed = first <= last
+            finished.append((corners[~is_crossed], triangle[~is_crossed]))
+            plane = np.floor(0.5 * (first + last))[is_crossed]
+            corners = _cut(corners[is_crossed], axis, plane)
+            triangle = np.tile(triangle[is_crossed], 3)
+        corners, triangle = (np.concatenate(columns) for columns in zip(*finished))
+    return corners, triangle
 
 
 def _cut(corners: Float[np.ndarray, "n 3 3"], axis: int, plane: Float[np.ndarray, " n"]) -> np.ndarray:
-    """The three triangles that a plane across an axis makes of each; one is empty where it meets a corner."""
-    row, below = np.arange(len(corners)), corners[:, :, axis] < plane[:, None]
-    # The corner that is alone on its side of the plane, and the two others.
-    first, second, third = below.T
+    """Cut each triangle by a plane across an axis into three; one is empty where the plane meets a corner.
+
+    With a the corner that is alone on its side of the plane, and p and q the points where the plane meets the
+    sides a b and a c, they are a p q, p b c and p c q.
+    """
+    row, is_below = np.arange(len(corners)), corners[:, :, axis] < plane[:, None]
+    first, second, third = is_below.T
     lone = np.where(second == third, 0, np.where(first == third, 1, 2))
     a, b, c = (corners[row, (lone + k) % 3] for k in range(3))
 
-    def met(end: np.ndarray) -> np.ndarray:
-        """Where the side from the lone corner to an end meets the plane."""
-        share = (plane - a[:, axis]) / (end[:, axis] - a[:, axis])
-        point = a + share[:, None] * (end - a)
+    def intersection(end: np.ndarray) -> np.ndarray:
+        """The point at which the side from the lone corner to `end` meets the plane."""
+        fraction = (plane - a[:, axis]) / (end[:, axis] - a[:, axis])
+        point = a + fraction[:, None] * (end - a)
+        # Exactly, lest rounding leaves a sliver beyond the plane that would be cut again.
         point[:, axis] = plane
         return point
 
-    p, q = met(b), met(c)
+    p, q = intersection(b), intersection(c)
     return np.concatenate([np.stack(t, axis=1) for t in ((a, p, q), (p, b, c), (p, c, q))])

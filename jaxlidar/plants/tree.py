@@ -7,10 +7,11 @@ from typing import final
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxlidar._checks import check_kind, check_number, check_range, check_shape
+from jaxlidar._checks import briefly, check_kind, check_number, check_range, check_shape
 
 
 @final
+@briefly
 @dataclass(frozen=True, eq=False)
 class Tree:
     """The geometry of a tree: n branch segments, each a cone frustum, and m spherical leaf clumps.
@@ -30,7 +31,7 @@ class Tree:
 
     **Raises:** ValueError for arrays of other shapes, values that are not finite, radii that are not
     positive, negative orders, directions that are not unit vectors, and parents that do not come before their
-    children; TypeError for what is no NumPy array, and for parents and orders that are no integers.
+    children; TypeError for fields that are no NumPy arrays, and for parents and orders that are no integers.
 
     **Example:**
 
@@ -71,9 +72,9 @@ class Tree:
             check_range(name, getattr(self, name), 0.0, low_open=True)
         check_range("order", self.order, 0)
         check_range("parent", self.parent, -1)
-        late = np.flatnonzero(self.parent >= np.arange(n))
-        if late.size:
-            i = late[0]
+        misplaced = np.flatnonzero(self.parent >= np.arange(n))
+        if misplaced.size:
+            i = misplaced[0]
             raise ValueError(f"parent = {self.parent[i]} of segment {i} is outside the range [-1, {i - 1}]")
         length = np.linalg.norm(self.bud_direction, axis=1)
         check_range("length of bud_direction", length, 1 - 1e-6, 1 + 1e-6)
@@ -88,7 +89,7 @@ class Tree:
 
         **Returns:** a `Tree` with the stems of all.
 
-        **Raises:** ValueError if there is no tree; TypeError for what is no `Tree`.
+        **Raises:** ValueError if there is no tree; TypeError for an object that is no `Tree`.
         """
         check_kind("trees", trees, Iterable, "several Tree, as in [tree, other]")
         trees = tuple(trees)
@@ -96,15 +97,16 @@ class Tree:
             raise ValueError("trees is empty; at least one tree is admissible")
         for tree in trees:
             check_kind("one of trees", tree, Tree, "a Tree")
-        parts = {f.name: np.concatenate([getattr(t, f.name) for t in trees]) for f in fields(Tree)}
+        columns = {f.name: np.concatenate([getattr(t, f.name) for t in trees]) for f in fields(Tree)}
+        # Indices of parents count from the first segment of their own tree.
         sizes = [len(t.start) for t in trees]
         offset = np.repeat(np.cumsum([0, *sizes[:-1]]), sizes)
-        parts["parent"] = np.where(parts["parent"] < 0, -1, parts["parent"] + offset)
-        return Tree(**parts)
+        columns["parent"] = np.where(columns["parent"] < 0, -1, columns["parent"] + offset)
+        return Tree(**columns)
 
     @property
     def roots(self) -> Bool[np.ndarray, " n"]:
-        """Whether each segment is a root: it grows from the ground, not from another segment."""
+        """True for each segment that is a root: it grows from the ground, not from another segment."""
         return self.parent < 0
 
     @property
@@ -146,7 +148,7 @@ class Tree:
         return float(np.sum(4 / 3 * np.pi * self.bud_radius**3))
 
     def leafless(self) -> "Tree":
-        """The tree in leaf-off condition: the same wood without leaf clumps.
+        """Return the tree in leaf-off condition: the same wood without leaf clumps.
 
         **Returns:** a `Tree`.
         """
@@ -155,7 +157,7 @@ class Tree:
         )
 
     def with_bud_radius(self, radius: float) -> "Tree":
-        """The same tree with leaf clumps of another radius, that is with more or less leaf cover.
+        """Return the same tree with leaf clumps of another radius, that is with another leaf cover.
 
         **Arguments:**
 
@@ -169,7 +171,7 @@ class Tree:
         return replace(self, bud_radius=np.full(len(self.bud_radius), float(radius)))
 
     def translated(self, offset: tuple[float, float, float] | Float[np.ndarray, "3"]) -> "Tree":
-        """The tree moved to another place.
+        """Move the tree to another position.
 
         **Arguments:**
 
@@ -181,11 +183,11 @@ class Tree:
         """
         check_range("offset", offset)
         check_shape("offset", offset, (3,))
-        by = np.asarray(offset, dtype=float)
-        return replace(self, start=self.start + by, end=self.end + by, bud_position=self.bud_position + by)
+        d = np.asarray(offset, dtype=float)
+        return replace(self, start=self.start + d, end=self.end + d, bud_position=self.bud_position + d)
 
     def rotated(self, angle: float) -> "Tree":
-        """The tree turned about the z axis through the origin.
+        """Rotate the tree about the z axis through the origin.
 
         **Arguments:**
 
@@ -197,17 +199,18 @@ class Tree:
         """
         check_number("angle", angle)
         c, s = np.cos(np.deg2rad(angle)), np.sin(np.deg2rad(angle))
-        turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+        # The transpose of the usual matrix: clockwise seen from above.
+        rotation = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
         return replace(
             self,
-            start=self.start @ turn.T,
-            end=self.end @ turn.T,
-            bud_position=self.bud_position @ turn.T,
-            bud_direction=self.bud_direction @ turn.T,
+            start=self.start @ rotation.T,
+            end=self.end @ rotation.T,
+            bud_position=self.bud_position @ rotation.T,
+            bud_direction=self.bud_direction @ rotation.T,
         )
 
     def scaled(self, factor: float) -> "Tree":
-        """The tree scaled about the origin: all coordinates and radii, of wood and leaf clumps.
+        """Scale the tree about the origin: all coordinates and radii, of wood and leaf clumps.
 
         **Arguments:**
 

@@ -1,4 +1,26 @@
-"""Turtle interpretation of L-systems: a word becomes branch segments and leaf buds in space."""
+"""Turtle interpretation of L-systems: a word becomes branch segments and leaf buds in space.
+
+The turtle has a position x and an orthonormal frame of heading H, left L and up U = H x L (Prusinkiewicz and
+Lindenmayer 1990, The Algorithmic Beauty of Plants, section 1.5). `F` moves it by
+
+    x <- x + length * H.
+
+A turn by the angle a about one vector of the frame rotates the two others into one another,
+
+    A <- cos(a) A + s sin(a) B,    B <- cos(a) B - s sin(a) A,
+
+with s, A and B by symbol:
+
+    +  -    turn left, right    about U    A = H, B = L, s = 1, -1
+    &  ^    pitch down, up      about L    A = H, B = U, s = -1, 1
+    \\  /    roll left, right    about H    A = L, B = U, s = -1, 1
+
+Tropism `T(e)` (section 2.1) rotates the whole frame about the horizontal axis k = H x z / |H x z| by the
+angle a = e |H x z|, which is proportional to the sine of the angle between the heading and the vertical z. A
+vector v becomes, by Rodrigues' formula,
+
+    v <- v cos(a) + (k x v) sin(a) + k (k . v) (1 - cos(a)).
+"""
 
 from math import cos, radians, sin, sqrt
 
@@ -9,7 +31,7 @@ from jaxlidar.plants.lsystem import Word
 from jaxlidar.plants.tree import Tree
 
 Vector = tuple[float, float, float]
-# Axes are heading (0), left (1) and up (2): the first turns towards the second, with this sign.
+# A, B (0: heading, 1: left, 2: up) and s of the module's docstring.
 TURNS = {"+": (0, 1, 1), "-": (0, 1, -1), "&": (0, 2, -1), "^": (0, 2, 1), "\\": (1, 2, -1), "/": (1, 2, 1)}
 # A heading counts as vertical if the sine of its angle from the vertical is below this.
 VERTICAL = 1e-9
@@ -26,12 +48,12 @@ def turtle(
     heading: tuple[float, float, float] = (0.0, 0.0, 1.0),
     left: tuple[float, float, float] = (-1.0, 0.0, 0.0),
 ) -> Tree:
-    """The tree geometry that a word of an L-system describes, by turtle interpretation.
+    """Interpret a word of an L-system as the geometry of a tree, by turtle graphics.
 
     A turtle moves through space as the symbols say, and adds branch segments and leaf buds to the tree. It
     has a position, a heading H, a left L, an up U = H x L, and a branch radius. Angles are in degrees,
-    lengths and radii in m. Parameters in parentheses may be left out; then `angle`, `length`, `bud_radius`
-    and the turtle's own radius are used.
+    lengths and radii in m. Parameters in parentheses are optional; the defaults are `angle`, `length`,
+    `bud_radius` and the turtle's present branch radius.
 
     - `F(length, radius, end radius)`: moves forward and adds a branch segment. Without an end radius, the
       segment is a cylinder.
@@ -45,7 +67,7 @@ def turtle(
       downward if `angle` is negative.
     - `!(radius)`: sets the branch radius.
     - `J(radius)`: adds a leaf bud.
-    - `[`, `]`: stores the state, and returns to the state stored last. A branch stands between them.
+    - `[`, `]`: stores the state, and returns to the state stored last. They enclose a branch.
 
     All other symbols are skipped.
 
@@ -58,7 +80,7 @@ def turtle(
     - `bud_radius`: radius of leaf clumps where `J` has no parameter, m, positive. Default 0.03.
     - `position`: (x, y, z) of the start, m. Default (0, 0, 0).
     - `heading`: heading at the start, a vector of any length but zero. Default (0, 0, 1): up.
-    - `left`: left at the start, a vector not along the heading; only its part across the heading counts.
+    - `left`: left at the start, a vector not along the heading; only its component across the heading counts.
       Default (-1, 0, 0): west.
 
     **Returns:** a `Tree`. The order of a segment is the number of branchings between it and its root.
@@ -87,12 +109,13 @@ def turtle(
     check_shape("position", position, (3,))
     frame = _frame(heading, left)
     x, y, z = map(float, position)
+    # `branching`: the next segment begins a branch.
     parent, order, branching = -1, 0, False
     # Plain numbers in flat lists and no calls: this loop takes most of the time that a tree takes.
-    ends: list[float] = []
-    links: list[int] = []
+    segments: list[float] = []
+    parents_and_orders: list[int] = []
     buds: list[float] = []
-    memory = []
+    stack = []
     for code, arity, row in zip(word.codes.tolist(), word.arity.tolist(), word.parameters.tolist()):
         symbol = chr(code)
         if symbol in TURNS:
@@ -105,39 +128,38 @@ def turtle(
         elif symbol in "Ff":
             step = row[0] if arity else length
             hx, hy, hz = frame[0]
-            bx, by, bz = x + step * hx, y + step * hy, z + step * hz
+            x_end, y_end, z_end = x + step * hx, y + step * hy, z + step * hz
             if symbol == "F":
-                begin = row[1] if arity > 1 else radius
-                radius = row[2] if arity > 2 else begin
-                # A branch is one order above what it grows on; stems that share a base are trunks.
+                radius_start = row[1] if arity > 1 else radius
+                radius = row[2] if arity > 2 else radius_start
+                # A branch is one order above the axis that bears it; stems that share a base are trunks.
                 order += branching and parent >= 0
-                ends += (x, y, z, bx, by, bz, begin, radius)
-                links += (parent, order)
-                parent, branching = len(links) // 2 - 1, False
-            x, y, z = bx, by, bz
+                segments += (x, y, z, x_end, y_end, z_end, radius_start, radius)
+                parents_and_orders += (parent, order)
+                parent, branching = len(parents_and_orders) // 2 - 1, False
+            x, y, z = x_end, y_end, z_end
         elif symbol == "J":
             buds += (x, y, z, *frame[0], row[0] if arity else bud_radius)
         elif symbol == "[":
-            memory.append((x, y, z, tuple(frame), radius, parent, order, branching))
+            stack.append((x, y, z, tuple(frame), radius, parent, order, branching))
             branching = True
         elif symbol == "]":
-            if not memory:
+            if not stack:
                 raise ValueError("word has a ']' without its '['")
-            x, y, z, kept, radius, parent, order, branching = memory.pop()
-            frame = list(kept)
+            x, y, z, stored_frame, radius, parent, order, branching = stack.pop()
+            frame = list(stored_frame)
         elif symbol == "T":
-            # Turned about the horizontal axis k = H x z, by the formula of Rodrigues.
             hx, hy, _ = frame[0]
-            across = sqrt(hx * hx + hy * hy)
-            if across > VERTICAL:
-                kx, ky = hy / across, -hx / across
-                a = radians(across * (row[0] if arity else angle))
+            sine = sqrt(hx * hx + hy * hy)
+            if sine > VERTICAL:
+                kx, ky = hy / sine, -hx / sine
+                a = radians(sine * (row[0] if arity else angle))
                 c, s = cos(a), sin(a)
                 for i, (vx, vy, vz) in enumerate(frame):
-                    along = (kx * vx + ky * vy) * (1 - c)
+                    projection = (kx * vx + ky * vy) * (1 - c)
                     frame[i] = (
-                        vx * c + s * ky * vz + kx * along,
-                        vy * c - s * kx * vz + ky * along,
+                        vx * c + s * ky * vz + kx * projection,
+                        vy * c - s * kx * vz + ky * projection,
                         vz * c + s * (kx * vy - ky * vx),
                     )
         elif symbol == "!":
@@ -145,18 +167,18 @@ def turtle(
         elif symbol == "|":
             frame = [tuple(-v for v in frame[0]), tuple(-v for v in frame[1]), frame[2]]
         elif symbol == "$":
+            # L = z x H / |z x H|, and U = H x L. With a vertical heading, any left is horizontal.
             hx, hy, hz = frame[0]
-            across = sqrt(hx * hx + hy * hy)
-            # Straight up, any left is horizontal.
-            if across > VERTICAL:
-                lx, ly = -hy / across, hx / across
+            sine = sqrt(hx * hx + hy * hy)
+            if sine > VERTICAL:
+                lx, ly = -hy / sine, hx / sine
                 frame = [frame[0], (lx, ly, 0.0), (-hz * ly, hz * lx, hx * ly - hy * lx)]
-    if memory:
-        raise ValueError(f"word has {len(memory)} '[' without their ']'")
-    wood = np.array(ends, dtype=float).reshape(-1, 8)
-    link = np.array(links, dtype=int).reshape(-1, 2)
+    if stack:
+        raise ValueError(f"word has {len(stack)} '[' without their ']'")
+    wood = np.array(segments, dtype=float).reshape(-1, 8)
+    link = np.array(parents_and_orders, dtype=int).reshape(-1, 2)
     bud = np.array(buds, dtype=float).reshape(-1, 7)
-    # Many turns leave a rounding error in the frame.
+    # Many turns leave a rounding error in the length of the frame's vectors.
     direction = bud[:, 3:6] / np.linalg.norm(bud[:, 3:6], axis=1, keepdims=True)
     return Tree(
         start=wood[:, :3],
@@ -172,16 +194,16 @@ def turtle(
 
 
 def _frame(heading: Vector, left: Vector) -> list[Vector]:
-    """Heading, left and up, orthonormal."""
+    """Heading, left and up, made orthonormal. **Raises:** as `turtle`."""
     for name, value in (("heading", heading), ("left", left)):
         check_range(name, value)
         check_shape(name, value, (3,))
         check_range(f"length of {name}", np.linalg.norm(value), 0.0, low_open=True)
-    ahead = np.asarray(heading, dtype=float) / np.linalg.norm(heading)
-    aside = np.asarray(left, dtype=float) / np.linalg.norm(left)
-    aside = aside - (aside @ ahead) * ahead
-    if np.linalg.norm(aside) < 1e-9:
+    H = np.asarray(heading, dtype=float) / np.linalg.norm(heading)
+    L = np.asarray(left, dtype=float) / np.linalg.norm(left)
+    L = L - (L @ H) * H
+    if np.linalg.norm(L) < 1e-9:
         raise ValueError(f"left = {tuple(left)} is along the heading; any other direction is admissible")
-    aside = aside / np.linalg.norm(aside)
-    above = np.cross(ahead, aside)
-    return [(float(v[0]), float(v[1]), float(v[2])) for v in (ahead, aside, above)]
+    L = L / np.linalg.norm(L)
+    U = np.cross(H, L)
+    return [(float(v[0]), float(v[1]), float(v[2])) for v in (H, L, U)]

@@ -1,10 +1,24 @@
-"""Voxel maps of trees and point clouds: branches, leaf clumps and points are shared out on a regular grid.
+"""Voxel maps of trees and point clouds: volumes and areas of solids are counted on a regular grid.
 
-Thin branch segments and leaf clumps are filled with points of known volume, `voxel_size / samples` apart. A
-frustum is cut into slabs, and each slab's exact volume is shared among the points of a disc. Segments with a
-radius of four such distances or more use the centres of the subvoxels that lie within them, so that a voxel
-inside is full. Every point counts in the voxel in which it lies, and a clump within one voxel counts there as
-a whole. The sum over voxels is the volume of the solids, whatever the voxel size. Only the division between
+*Quantities.* In a voxel of volume V and edge e, with the volume v of wood or leaf clumps, the lateral area S
+of wood and the one-sided leaf area L that lie within it, the extinction coefficients (1/m) are
+
+    -ln(1 - v/V)/e    of solids: a ray that crosses the voxel meets them with the probability v/V,
+    S/(4 V)           of thin wood: a convex body's mean projected area is a quarter of its surface (Cauchy),
+    L/(2 V)           of leaves: G = 1/2 for spherical leaf angles.
+
+*Sampling.* v, S and L are sums over sample points, each of which carries a part of the volume or area of its
+solid and counts in the voxel in which it lies. Points are h = `voxel_size / samples` apart:
+
+- A frustum of length l and end radii a and b has the volume pi l (a^2 + a b + b^2)/3 and the lateral area
+  pi (a + b) sqrt(l^2 + (a - b)^2). It is cut into slabs of about h; each slab's exact volume or area is
+  divided among points of a sunflower disc (golden angle, r ~ sqrt(i + 1/2); Vogel 1979) or on its rim.
+- A frustum with radii of 4 h or more uses the centres of the subvoxels of edge h within it, so that a voxel
+  inside is full.
+- A sphere uses points at golden angles, whose heights and radii are low-discrepancy sequences. A clump within
+  one voxel counts there undivided.
+
+The sum over voxels is the volume of the solids, whatever the voxel size. Only the division between
 neighbouring voxels is uncertain: a voxel that the side of a trunk cuts through is off by about 1 % of its
 volume with 8 samples (root mean square, measured).
 """
@@ -23,15 +37,19 @@ from jaxlidar._checks import (
     check_shape,
     kind_of,
 )
-from jaxlidar.plants.grid import Grid, edges
+from jaxlidar.plants.grid import Grid, voxel_edges
 from jaxlidar.plants.tree import Tree
 from jaxlidar.scenes.voxels import VoxelMap
 
+# In radians.
 _GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
-# Points are made and counted for this many segments or clumps at a time, and clumps as wholes for so many.
-_CHUNK, _WHOLE = 2000, 500_000
-# More points for one solid would not change a voxel by 0.1 %.
-_MOST = 200_000
+# The fractional parts of its multiples fill [0, 1) evenly, and are not correlated with golden angles: the
+# reciprocal of the plastic number, 1.3247.
+_LOW_DISCREPANCY = 0.7548776662466927
+# Segments or clumps whose sample points are in memory at a time, and clumps that count undivided.
+_SAMPLED_CHUNK, _UNDIVIDED_CHUNK = 2000, 500_000
+# Largest number of points of one solid: more would not change a voxel by 0.1 %.
+_MAX_POINTS = 200_000
 
 
 def voxelise(
@@ -44,7 +62,7 @@ def voxelise(
     origin: tuple[float, float, float] | None = None,
     shape: tuple[int, int, int] | None = None,
 ) -> VoxelMap:
-    """The voxel map of leaf and bark of one tree, or of several trees together.
+    """Voxelise leaf and bark of one tree, or of several trees together.
 
     Where solids overlap, as branches do at joints, a voxel is at most full. The excess volume goes to the
     voxels around it, so that volumes are conserved.
@@ -55,21 +73,22 @@ def voxelise(
     - `voxel_size`: voxel edges in m, positive: one number for cubes, or three.
     - `leaf_area`: one-sided leaf area of every clump in m2, 0 or more, spread evenly through its sphere. The
       extinction coefficient of leaf is then area / (2 volume). None: a clump fills its sphere, and the
-      probability of leaf is the share of the voxel that clumps occupy. The clump radius is that of the tree;
-      see `Tree.with_bud_radius`. Default None.
-    - `wood`: "volume": the probability of bark is the share of the voxel that wood occupies. Twigs much
+      probability of leaf is the fraction of the voxel that clumps occupy. The clump radius is that of the
+      tree; see `Tree.with_bud_radius`. Default None.
+    - `wood`: "volume": the probability of bark is the fraction of the voxel that wood occupies. Twigs much
       thinner than a voxel then intercept less light than their width would. "surface": the extinction
       coefficient is a quarter of the wood surface per volume, as for thin convex bodies of random orientation
       (Cauchy), or that of "volume" where it is larger. Default "volume".
     - `samples`: points per voxel edge, an integer of at least 1. Default 8.
     - `origin`, `shape`: lower corner (x, y, z) in m and numbers of voxels (nx, ny, nz) of the grid; give both
-      or neither. Default None: the smallest grid that holds everything, with faces at multiples of the edge,
+      or neither. Default None: the smallest grid that holds all trees, with faces at multiples of the edge,
       so that the maps of neighbouring trees fit together.
 
     **Returns:** a `VoxelMap`.
 
     **Raises:** ValueError for inadmissible arguments, for trees with neither wood nor clumps, for trees that
-    reach out of a given grid, and for more material than the grid can hold; TypeError for what is no `Tree`.
+    reach out of a given grid, and for more material than the grid can hold; TypeError for an object that is
+    no `Tree`.
 
     **Source:** Cauchy (1841); for the meaning of a voxel's probabilities, `VoxelMap.from_probability`.
 
@@ -84,7 +103,7 @@ def voxelise(
     """
     check_kind("trees", trees, Tree | Iterable, "a Tree or several")
     trees = [trees] if isinstance(trees, Tree) else list(trees)
-    size = edges(voxel_size)
+    size = voxel_edges(voxel_size)
     check_choice("wood", wood, ("volume", "surface"))
     if leaf_area is not None:
         check_number("leaf_area", leaf_area, 0.0)
@@ -92,24 +111,23 @@ def voxelise(
     tree = Tree.joined(trees)
     if not len(tree.start) and not len(tree.bud_position):
         raise ValueError("trees have neither wood nor clumps; there is nothing to voxelise")
-    grid = Grid.of(*_reach(tree), size, origin, shape)
-    apart = float(size.min()) / samples
-    volume, surface, leaf = grid.empty(), grid.empty(), grid.empty()
-    thick = np.minimum(tree.radius_start, tree.radius_end) >= 4 * apart
-    for i in np.flatnonzero(thick).tolist():
-        grid.count(*_subvoxels_in(tree, i, size / samples), volume)
-    thin = np.flatnonzero(~thick)
-    for part in np.split(thin, range(_CHUNK, len(thin), _CHUNK)):
-        grid.count(*_in_frustums(tree, part, apart), volume)
+    grid = Grid.enclosing(*_bounding_box(tree), size, origin, shape)
+    spacing = float(size.min()) / samples
+    volume, surface, leaf = grid.zeros(), grid.zeros(), grid.zeros()
+    is_thick = np.minimum(tree.radius_start, tree.radius_end) >= 4 * spacing
+    for i in np.flatnonzero(is_thick).tolist():
+        grid.accumulate(*_subvoxels_in_frustum(tree, i, size / samples), volume)
+    for segments in _chunks(np.flatnonzero(~is_thick), _SAMPLED_CHUNK):
+        grid.accumulate(*_points_in_frustums(tree, segments, spacing), volume)
     if wood == "surface":
-        for part in np.split(np.arange(len(thick)), range(_CHUNK, len(thick), _CHUNK)):
-            grid.count(*_in_frustums(tree, part, apart, on_surface=True), surface)
-    for part in _parts(len(tree.bud_position), _WHOLE):
-        within = grid.within_a_voxel(tree.bud_position[part], tree.bud_radius[part])
-        grid.count(*_at_centres(tree, part[within], leaf_area), leaf)
-        for some in _parts(int(np.sum(~within)), _CHUNK):
-            grid.count(*_in_spheres(tree, part[~within][some], apart, leaf_area), leaf)
-    return _map(grid, leaf, volume, surface, tree, leaf_area, wood)
+        for segments in _chunks(np.arange(len(is_thick)), _SAMPLED_CHUNK):
+            grid.accumulate(*_points_in_frustums(tree, segments, spacing, on_surface=True), surface)
+    for clumps in _chunks(np.arange(len(tree.bud_position)), _UNDIVIDED_CHUNK):
+        is_undivided = grid.contains_in_one_voxel(tree.bud_position[clumps], tree.bud_radius[clumps])
+        grid.accumulate(*_clump_centres(tree, clumps[is_undivided], leaf_area), leaf)
+        for divided in _chunks(clumps[~is_undivided], _SAMPLED_CHUNK):
+            grid.accumulate(*_points_in_clumps(tree, divided, spacing, leaf_area), leaf)
+    return _voxel_map(grid, leaf, volume, surface, tree, leaf_area, wood)
 
 
 def voxelise_points(
@@ -123,10 +141,10 @@ def voxelise_points(
     origin: tuple[float, float, float] | None = None,
     shape: tuple[int, int, int] | None = None,
 ) -> VoxelMap:
-    """The voxel map of a point cloud, such as a terrestrial laser scan.
+    """Voxelise a point cloud, such as a terrestrial laser scan.
 
-    Points alone do not tell the leaf area. The total leaf area is therefore given, and shared out among the
-    voxels in proportion to their numbers of points. A scan has fewer points on what is occluded. Maps that
+    Points alone do not tell the leaf area. The total leaf area is therefore an argument, and is divided among
+    the voxels in proportion to their numbers of points. A scan has fewer points on occluded plants. Maps that
     account for the paths of the beams, such as those of AMAPVox, are better: `jaxlidar.io.read_vox`.
 
     **Arguments:**
@@ -134,7 +152,7 @@ def voxelise_points(
     - `points`: (n, 3) positions in m.
     - `voxel_size`: voxel edges in m, positive: one number for cubes, or three.
     - `leaf_area`: one-sided area of all leaves together, m2, 0 or more.
-    - `is_wood`: (n,) booleans: which points lie on wood. Default None: no point.
+    - `is_wood`: (n,) booleans, true for points on wood. Default None: no point.
     - `wood_probability`: probability of bark in a voxel with points on wood, in [0, 1]. Default 1.
     - `min_points`: a voxel with fewer leaf points than this has no leaf, and one with fewer wood points has
       no wood; 1 or more. Default 1.
@@ -162,29 +180,30 @@ def voxelise_points(
     check_number("wood_probability", wood_probability, 0.0, 1.0)
     min_points = check_integer("min_points", min_points)
     on_wood = np.zeros(len(points), bool) if is_wood is None else np.asarray(is_wood)
+    # Numbers are refused: they may be classes, as in a LAS file, and nearly all would count as true.
     if on_wood.dtype != bool:
         raise TypeError(f"is_wood is {kind_of(is_wood)}; admissible is an array of booleans, one a point")
     check_shape("is_wood", on_wood, (len(points),))
-    size = edges(voxel_size)
-    # A point on the upper face still counts in the voxel below it.
-    grid = Grid.of(points.min(axis=0), np.nextafter(points.max(axis=0), np.inf), size, origin, shape)
-    leaf, wood = grid.empty(), grid.empty()
-    for chosen, into in ((~on_wood, leaf), (on_wood, wood)):
-        grid.count(points[chosen], np.ones(int(chosen.sum())), into)
-        into[into < min_points] = 0.0
-    total = leaf.sum()
-    if total == 0 and leaf_area > 0:
+    size = voxel_edges(voxel_size)
+    # A point on the upper face of the grid counts in the voxel below it.
+    grid = Grid.enclosing(points.min(axis=0), np.nextafter(points.max(axis=0), np.inf), size, origin, shape)
+    leaf_points, wood_points = grid.zeros(), grid.zeros()
+    for selected, counts in ((~on_wood, leaf_points), (on_wood, wood_points)):
+        grid.accumulate(points[selected], np.ones(int(selected.sum())), counts)
+        counts[counts < min_points] = 0.0
+    n_leaf_points = leaf_points.sum()
+    if n_leaf_points == 0 and leaf_area > 0:
         raise ValueError(f"leaf_area = {leaf_area:g} m2, but no voxel holds {min_points} or more leaf points")
-    density = leaf * (leaf_area / max(total, 1.0) / size.prod())
+    density = leaf_points * (leaf_area / max(n_leaf_points, 1.0) / size.prod())
     bark = None
     if on_wood.any():
-        share = np.where(wood > 0, wood_probability, 0.0)
-        bark = VoxelMap.from_probability(bark=share, voxel_size=size).bark
+        probability = np.where(wood_points > 0, wood_probability, 0.0)
+        bark = VoxelMap.from_probability(bark=probability, voxel_size=size).bark
     return VoxelMap.from_lad(density, bark=bark, voxel_size=size, origin=grid.low)
 
 
 def trim_empty_layers(voxels: VoxelMap) -> VoxelMap:
-    """The voxel map without the empty layers at its sides. One voxel remains if all are empty.
+    """Trim a voxel map: without the empty layers at its sides. One voxel remains if all are empty.
 
     **Arguments:**
 
@@ -192,7 +211,7 @@ def trim_empty_layers(voxels: VoxelMap) -> VoxelMap:
 
     **Returns:** a `VoxelMap` of the same voxels, smaller, with `origin` moved to its new corner.
 
-    **Raises:** TypeError for what is no `VoxelMap`.
+    **Raises:** TypeError for an object that is no `VoxelMap`.
 
     **Example:**
 
@@ -204,165 +223,183 @@ def trim_empty_layers(voxels: VoxelMap) -> VoxelMap:
     (2, 3, 1) [1.0, 0.5, 1.5]
     """
     check_kind("voxels", voxels, VoxelMap, "a VoxelMap")
-    full = voxels.mean_extinction() > 0
-    if not full.any():
-        full[0, 0, 0] = True
-    parts, first = [], []
+    is_occupied = voxels.mean_extinction() > 0
+    if not is_occupied.any():
+        is_occupied[0, 0, 0] = True
+    ranges, first = [], []
     for axis in range(3):
-        (found,) = np.nonzero(full.any(axis=tuple(k for k in range(3) if k != axis)))
-        parts.append(slice(found[0], found[-1] + 1))
-        first.append(found[0])
-    inside = tuple(parts)
+        (layers,) = np.nonzero(is_occupied.any(axis=tuple(k for k in range(3) if k != axis)))
+        ranges.append(slice(layers[0], layers[-1] + 1))
+        first.append(layers[0])
+    occupied = tuple(ranges)
     return VoxelMap(
-        None if voxels.leaf is None else voxels.leaf[inside],
-        None if voxels.bark is None else voxels.bark[inside],
+        None if voxels.leaf is None else voxels.leaf[occupied],
+        None if voxels.bark is None else voxels.bark[occupied],
         voxels.voxel_size,
         np.asarray(voxels.origin, float) + np.asarray(voxels.voxel_size, float) * first,
         voxels.leaf_angles,
     )
 
 
-def _reach(tree: Tree) -> tuple[np.ndarray, np.ndarray]:
+def _bounding_box(tree: Tree) -> tuple[np.ndarray, np.ndarray]:
     """Lower and upper corner of a box around all wood and clumps."""
     axis = (tree.end - tree.start) / np.maximum(tree.length, 1e-30)[:, None]
     # Extent along x, y and z of a unit disc across the axis.
-    wide = np.sqrt(np.maximum(1.0 - axis * axis, 0.0))
+    disc = np.sqrt(np.maximum(1.0 - axis * axis, 0.0))
     lows, highs = [], []
-    for centre, reach in (
-        (tree.start, tree.radius_start[:, None] * wide),
-        (tree.end, tree.radius_end[:, None] * wide),
+    for centre, extent in (
+        (tree.start, tree.radius_start[:, None] * disc),
+        (tree.end, tree.radius_end[:, None] * disc),
         (tree.bud_position, tree.bud_radius[:, None]),
     ):
         if len(centre):
-            lows.append((centre - reach).min(axis=0))
-            highs.append((centre + reach).max(axis=0))
+            lows.append((centre - extent).min(axis=0))
+            highs.append((centre + extent).max(axis=0))
     return np.min(lows, axis=0), np.max(highs, axis=0)
 
 
-def _subvoxels_in(tree: Tree, i: int, step: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Centres of the subvoxels within a branch segment, and the share of its volume at each."""
+def _subvoxels_in_frustum(tree: Tree, i: int, step: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Centres of the subvoxels of edges `step` in branch segment i, and its volume divided among them."""
     start, a, b = tree.start[i], tree.radius_start[i], tree.radius_end[i]
     axis = tree.end[i] - start
     length = max(float(np.linalg.norm(axis)), 1e-30)
     axis = axis / length
-    wide = np.sqrt(np.maximum(1.0 - axis * axis, 0.0)) * max(a, b)
+    extent = np.sqrt(np.maximum(1.0 - axis * axis, 0.0)) * max(a, b)
     low, high = (f(start, tree.end[i]) for f in (np.minimum, np.maximum))
-    number = (
+    indices = (
         np.arange(int(np.floor(lo / d)), int(np.ceil(hi / d)) + 1)
-        for lo, hi, d in zip(low - wide, high + wide, step)
+        for lo, hi, d in zip(low - extent, high + extent, step)
     )
-    place = np.stack([n.ravel() for n in np.meshgrid(*number, indexing="ij")], axis=1)
-    place = (place + 0.5) * step
-    along = (place - start) @ axis
-    across2 = np.sum((place - start) ** 2, axis=1) - along**2
-    place = place[(along >= 0) & (along < length) & (across2 <= (a + (b - a) * along / length) ** 2)]
-    if not len(place):
+    position = np.stack([n.ravel() for n in np.meshgrid(*indices, indexing="ij")], axis=1)
+    position = (position + 0.5) * step
+    # Within the frustum: 0 <= z < length along the axis, and a distance from it below the radius at z.
+    z = (position - start) @ axis
+    distance2 = np.sum((position - start) ** 2, axis=1) - z**2
+    position = position[(z >= 0) & (z < length) & (distance2 <= (a + (b - a) * z / length) ** 2)]
+    if not len(position):
         # No centre lies within a thin or short segment: all of its volume counts at its middle.
-        place = (start + 0.5 * length * axis)[None, :]
+        position = (start + 0.5 * length * axis)[None, :]
     volume = np.pi / 3 * np.linalg.norm(tree.end[i] - start) * (a * a + a * b + b * b)
-    return place, np.full(len(place), volume / len(place))
+    return position, np.full(len(position), volume / len(position))
 
 
-def _in_frustums(
-    tree: Tree, part: np.ndarray, apart: float, *, on_surface: bool = False
+def _points_in_frustums(
+    tree: Tree, segments: np.ndarray, spacing: float, *, on_surface: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Points within branch segments, or on their sides, about `apart` m from each other, and their shares.
+    """Points within branch segments, or on their sides, about `spacing` m apart, and the amount at each.
 
-    Shares are of the volume in m3, or of the lateral surface in m2.
+    Amounts are of the volume in m3, or of the lateral surface in m2.
+
+    1. Every segment gets as many slabs as its length asks for, and every slab as many points as its widest
+       cross-section or circumference asks for.
+    2. The exact volume or lateral area of each slab, a frustum, is divided evenly among its points.
+    3. Points lie on a sunflower disc, or on the rim, at a depth within the slab of their own.
     """
-    start, end = tree.start[part], tree.end[part]
-    a, b = tree.radius_start[part], tree.radius_end[part]
+    start, end = tree.start[segments], tree.end[segments]
+    a, b = tree.radius_start[segments], tree.radius_end[segments]
     length = np.linalg.norm(end - start, axis=1)
-    widest = np.maximum(a, b) / apart
-    wide = np.clip(np.ceil(2 * np.pi * widest if on_surface else np.pi * widest**2), 3, _MOST).astype(int)
-    slabs = np.clip(np.ceil(length / apart), 1, np.maximum(_MOST // wide, 1)).astype(int)
+    widest = np.maximum(a, b) / spacing
+    n_points = np.ceil(2 * np.pi * widest if on_surface else np.pi * widest**2)
+    n_points = np.clip(n_points, 3, _MAX_POINTS).astype(int)
+    n_slabs = np.clip(np.ceil(length / spacing), 1, np.maximum(_MAX_POINTS // n_points, 1)).astype(int)
     axis = (end - start) / np.maximum(length, 1e-30)[:, None]
     # Two directions across the axis: from z, or from x where the axis is close to vertical.
-    other = np.where(np.abs(axis[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
-    u = np.cross(axis, other)
+    not_parallel = np.where(np.abs(axis[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
+    u = np.cross(axis, not_parallel)
     u /= np.maximum(np.linalg.norm(u, axis=1), 1e-30)[:, None]
     v = np.cross(axis, u)
 
-    def spread(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def members(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """For groups of `counts` members: the group of each member, and its number from 0 within it."""
-        owner = np.repeat(np.arange(len(counts)), counts)
-        return owner, np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
+        group = np.repeat(np.arange(len(counts)), counts)
+        return group, np.arange(len(group)) - np.repeat(np.cumsum(counts) - counts, counts)
 
-    segment, slab = spread(slabs)
-    lower, upper = slab / slabs[segment], (slab + 1) / slabs[segment]
-    slope, thick = (b - a)[segment], length[segment] / slabs[segment]
-    inner, outer = a[segment] + slope * lower, a[segment] + slope * upper
+    segment, slab = members(n_slabs)
+    # Lower and upper end of each slab as fractions of the segment's length, and the radii there.
+    lower, upper = slab / n_slabs[segment], (slab + 1) / n_slabs[segment]
+    taper, thickness = (b - a)[segment], length[segment] / n_slabs[segment]
+    radius_lower, radius_upper = a[segment] + taper * lower, a[segment] + taper * upper
     if on_surface:
-        amount = np.pi * (inner + outer) * np.hypot(thick, outer - inner)
+        amount = np.pi * (radius_lower + radius_upper) * np.hypot(thickness, radius_upper - radius_lower)
     else:
-        amount = np.pi / 3 * thick * (inner**2 + inner * outer + outer**2)
-    owner, point = spread(wide[segment])
-    s = segment[owner]
-    # Discs of successive slabs are rotated against each other, and their points lie at different depths.
-    turn = _GOLDEN_ANGLE * point + 2.399 * slab[owner]
-    depth = lower[owner] + (upper - lower)[owner] * ((point * 0.7548776662466927 + 0.5) % 1.0)
+        square = radius_lower**2 + radius_lower * radius_upper + radius_upper**2
+        amount = np.pi / 3 * thickness * square
+    slab_of_point, point = members(n_points[segment])
+    s = segment[slab_of_point]
+    # Discs of successive slabs are rotated against each other, by about the golden angle.
+    azimuth = _GOLDEN_ANGLE * point + 2.399 * slab[slab_of_point]
+    depth = lower[slab_of_point] + (upper - lower)[slab_of_point] * ((point * _LOW_DISCREPANCY + 0.5) % 1.0)
     r = a[s] + (b - a)[s] * depth
     if not on_surface:
-        r *= np.sqrt((point + 0.5) / wide[s])
-    place = start[s] + (end - start)[s] * depth[:, None]
-    place += (r * np.cos(turn))[:, None] * u[s] + (r * np.sin(turn))[:, None] * v[s]
-    return place, (amount / wide[segment])[owner]
+        r *= np.sqrt((point + 0.5) / n_points[s])
+    position = start[s] + (end - start)[s] * depth[:, None]
+    position += (r * np.cos(azimuth))[:, None] * u[s] + (r * np.sin(azimuth))[:, None] * v[s]
+    return position, (amount / n_points[segment])[slab_of_point]
 
 
-def _parts(count: int, most: int) -> Iterator[np.ndarray]:
-    """The numbers from 0 to `count`, at most so many at a time."""
-    for start in range(0, count, most):
-        yield np.arange(start, min(start + most, count))
+def _chunks(indices: np.ndarray, size: int) -> Iterator[np.ndarray]:
+    """Split indices into arrays of at most `size`, which bounds the memory that sample points take."""
+    for start in range(0, len(indices), size):
+        yield indices[start : start + size]
 
 
-def _at_centres(tree: Tree, part: np.ndarray, leaf_area: float | None) -> tuple[np.ndarray, np.ndarray]:
+def _clump_centres(tree: Tree, clumps: np.ndarray, leaf_area: float | None) -> tuple[np.ndarray, np.ndarray]:
     """Centres of leaf clumps, and the volume, or the leaf area, of each."""
-    radius = tree.bud_radius[part]
+    radius = tree.bud_radius[clumps]
     amount = np.full(len(radius), leaf_area) if leaf_area is not None else 4 / 3 * np.pi * radius**3
-    return tree.bud_position[part], amount
+    return tree.bud_position[clumps], amount
 
 
-def _in_spheres(
-    tree: Tree, part: np.ndarray, apart: float, leaf_area: float | None
+def _points_in_clumps(
+    tree: Tree, clumps: np.ndarray, spacing: float, leaf_area: float | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Points within leaf clumps, and the volume, or the leaf area, at each."""
-    (centre, amount), radius = _at_centres(tree, part, leaf_area), tree.bud_radius[part]
-    n = int(np.clip(np.ceil(4 / 3 * np.pi * (radius.max() / apart) ** 3), 32, _MOST))
+    (centre, amount), radius = _clump_centres(tree, clumps, leaf_area), tree.bud_radius[clumps]
+    # All clumps get the points of the largest.
+    n = int(np.clip(np.ceil(4 / 3 * np.pi * (radius.max() / spacing) ** 3), 32, _MAX_POINTS))
     i = np.arange(n)
-    height = 1.0 - 2.0 * ((i * 0.7548776662466927 + 0.5) % 1.0)
+    # Directions that are even over the sphere, at radii that fill the ball: r^3 is even in [0, 1].
+    height = 1.0 - 2.0 * ((i * _LOW_DISCREPANCY + 0.5) % 1.0)
     across = np.sqrt(1.0 - height * height)
     unit = np.stack([across * np.cos(_GOLDEN_ANGLE * i), across * np.sin(_GOLDEN_ANGLE * i), height], axis=1)
     unit *= np.cbrt((i + 0.5) / n)[:, None]
-    place = centre[:, None, :] + radius[:, None, None] * unit
-    return place.reshape(-1, 3), np.repeat(amount / n, n)
+    position = centre[:, None, :] + radius[:, None, None] * unit
+    return position.reshape(-1, 3), np.repeat(amount / n, n)
 
 
-def _settled(share: np.ndarray) -> np.ndarray:
-    """Shares of at most 1 with the same sum: the excess spreads to the neighbours, until little is left."""
-    if share.sum() >= share.size:
-        raise ValueError(f"trees = {share.sum():.3g} voxels of material, but the grid has {share.size}")
+def _spread_excess(fraction: np.ndarray) -> np.ndarray:
+    """Return volume fractions of at most 1 with the same sum, up to 1e-4 of it.
+
+    Where solids overlap, a fraction may exceed 1. The excess diffuses to the six neighbours, step by step.
+    """
+    if fraction.sum() >= fraction.size:
+        raise ValueError(f"trees = {fraction.sum():.3g} voxels of material, but the grid has {fraction.size}")
     while True:
-        excess = np.maximum(share - 1.0, 0.0)
-        share = share - excess
-        if excess.sum() <= 1e-4 * share.sum():
-            return share
+        excess = np.maximum(fraction - 1.0, 0.0)
+        fraction = fraction - excess
+        if excess.sum() <= 1e-4 * fraction.sum():
+            return fraction
         for axis in range(3):
-            # Nothing leaves the grid at its sides.
-            around = np.pad(excess, [(int(k == axis),) * 2 for k in range(3)], mode="edge")
-            around = np.moveaxis(around, axis, 0)
-            share += np.moveaxis(around[:-2] + around[2:], 0, axis) / 6
+            # Edge padding: nothing leaves the grid at its sides.
+            padded = np.pad(excess, [(int(k == axis),) * 2 for k in range(3)], mode="edge")
+            padded = np.moveaxis(padded, axis, 0)
+            fraction += np.moveaxis(padded[:-2] + padded[2:], 0, axis) / 6
 
 
-def _map(grid: Grid, leaf, volume, surface, tree: Tree, leaf_area: float | None, wood: str) -> VoxelMap:
-    cell = grid.size.prod()
+def _voxel_map(grid: Grid, leaf, volume, surface, tree: Tree, leaf_area: float | None, wood: str) -> VoxelMap:
+    """Extinction coefficients from sums per voxel (see the module): of leaf, m3 or m2, of wood, m3 and m2."""
+    voxel_volume = grid.size.prod()
     bark = None
     if len(tree.start):
-        solid = VoxelMap.from_probability(bark=_settled(volume / cell), voxel_size=grid.size).bark
-        bark = solid if wood == "volume" else np.maximum(np.asarray(solid), surface / (4.0 * cell))
-    green = None
+        fraction = _spread_excess(volume / voxel_volume)
+        solid = VoxelMap.from_probability(bark=fraction, voxel_size=grid.size).bark
+        # Inside thick wood there is no surface: the larger of the two is right there too.
+        bark = solid if wood == "volume" else np.maximum(np.asarray(solid), surface / (4.0 * voxel_volume))
+    leaf_extinction = None
     if len(tree.bud_position):
         if leaf_area is None:
-            green = VoxelMap.from_probability(leaf=_settled(leaf / cell), voxel_size=grid.size).leaf
+            fraction = _spread_excess(leaf / voxel_volume)
+            leaf_extinction = VoxelMap.from_probability(leaf=fraction, voxel_size=grid.size).leaf
         else:
-            green = 0.5 * leaf / cell
-    return VoxelMap.from_extinction(leaf=green, bark=bark, voxel_size=grid.size, origin=grid.low)
+            leaf_extinction = 0.5 * leaf / voxel_volume
+    return VoxelMap.from_extinction(leaf=leaf_extinction, bark=bark, voxel_size=grid.size, origin=grid.low)

@@ -196,5 +196,5 @@ def _begin_traces(scene: DeviceScene, key: PRNGKeyArray) -> Response | None:
         return None
     if has_higher_orders:
         higher = _compiled_higher.compile_ahead(**arguments)
-        return join_orders(_compiled_first.compile_ahead(**arguments), higher)
+        return jax.eval_shape(join_orders, _compiled_first.compile_ahead(**arguments), higher)
     return _compiled_batch.compile_ahead(**arguments)

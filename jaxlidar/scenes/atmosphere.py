@@ -50,6 +50,7 @@ from jaxlidar._checks import (
     warn_units,
 )
 from jaxlidar._ranges import Range, check_ranges
+from jaxlidar._signatures import briefly
 
 # Admissible wavelengths, nm. Peck and Reeder's formula is fitted to 230..1690 nm and smooth far beyond; the
 # exponents of aerosol hold to about 2500 nm.
@@ -158,6 +159,7 @@ def aerosol_extinction(
 
 
 @final
+@briefly
 class Atmosphere(eqx.Module):
     """A clear atmosphere: molecules and aerosol whose densities fall exponentially with height.
 

@@ -23,6 +23,7 @@ from jaxlidar._checks import (
     kind_of,
 )
 from jaxlidar._ranges import FRACTION
+from jaxlidar._signatures import briefly
 from jaxlidar.optics.phase import AbstractPhase
 from jaxlidar.optics.spectra import Spectrum, reflectance_at
 from jaxlidar.scenes.surfaces import Reflectance, check_reflectance, reflectance_field
@@ -34,6 +35,7 @@ def _as_bark(x: Any) -> Any:
 
 
 @final
+@briefly
 class Canopy(eqx.Module):
     """A canopy: leaf and bark in voxels, with their optical properties.
 

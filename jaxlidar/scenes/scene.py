@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from jaxlidar._checks import check_kind, concrete, kind_of
 from jaxlidar._ranges import Range
+from jaxlidar._signatures import briefly
 from jaxlidar._vectors import FAR
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.scenes.atmosphere import Atmosphere
@@ -30,6 +31,7 @@ def _as_plates(x: Any) -> Any:
 
 
 @final
+@briefly
 class Scene(eqx.Module):
     """A scene: the canopy, plates, ground and atmosphere that a lidar observes.
 

@@ -30,6 +30,7 @@ from jaxlidar._checks import (
     scalar,
 )
 from jaxlidar._ranges import FRACTION, SUM_OF_FRACTIONS, Range, check_ranges
+from jaxlidar._signatures import briefly
 from jaxlidar.optics.laws import AbstractLaw, Lambertian
 from jaxlidar.optics.spectra import Spectrum
 from jaxlidar.scenes.raster import Raster
@@ -217,6 +218,7 @@ class AbstractSheet(AbstractSurface):
 
 
 @final
+@briefly
 class Ground(AbstractGround):
     """The ground: an infinite opaque plane, level or sloping.
 
@@ -271,6 +273,7 @@ class Ground(AbstractGround):
 
 
 @final
+@briefly
 class Plate(AbstractSheet):
     """A leaf plate: an infinite sheet with a reflectance and a transmittance, the same on both sides.
 

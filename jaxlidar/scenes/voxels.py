@@ -26,6 +26,7 @@ from jaxlidar._checks import (
     warn_units,
 )
 from jaxlidar._ranges import Range, check_ranges
+from jaxlidar._signatures import briefly
 from jaxlidar.optics.leaf_angles import LeafAngles
 from jaxlidar.scenes.terrain import Terrain
 
@@ -58,6 +59,7 @@ def _volume(field: str) -> Callable[[Numbers | None], Float[Array, "..."] | None
 
 
 @final
+@briefly
 class VoxelMap(eqx.Module):
     """A voxel map: extinction coefficients of leaf and bark in a box of equal voxels, x east, y north, z up.
 

@@ -18,7 +18,6 @@ from jaxtyping import Array, Float
 
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._programs import Program
-from jaxlidar._statistics import FewMoments, WaveformMoments
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.planning.channels import channel_optics
 from jaxlidar.planning.effects import can_light_itself
@@ -91,12 +90,6 @@ class WaveformModel(eqx.Module):
     def sample_pivots(self) -> PivotWavelengths | None:
         """Pivots from which samples follow; None under an atmosphere, which is no such polynomial."""
         return self.pivots if self.transmittance is None else None
-
-    def moments(self, n_wavelengths: int, n_samples: int) -> WaveformMoments | FewMoments:
-        """Return empty moments of the samples of `samples_and_budget`, without padding."""
-        if self.sample_pivots is None:
-            return WaveformMoments(n_wavelengths, n_samples)
-        return FewMoments(np.asarray(self.sample_pivots.coefficients)[:, :n_wavelengths])
 
     @property
     def n_summed_wavelengths(self) -> int:

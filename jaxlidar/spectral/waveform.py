@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxlidar._checks import check_range, is_traced
+from jaxlidar._checks import briefly, check_range, is_traced
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._deprecated import renamed_property
 from jaxlidar._registry import save_result, waveform_html
@@ -37,6 +37,7 @@ from jaxlidar.truth import Truth
 
 
 @final
+@briefly
 class Waveform(eqx.Module):
     """A simulated waveform: apparent reflectance and received energy by wavelength and sample.
 

@@ -1,4 +1,4 @@
-"""How far a campaign has come, and how fast."""
+"""`SurveyProgress`: the progress of a survey and its rate."""
 
 import dataclasses
 import math
@@ -7,11 +7,11 @@ import time
 
 @dataclasses.dataclass(frozen=True)
 class SurveyProgress:
-    """How far `simulate_many` has come. Printed, it is one line of text.
+    """Progress of `simulate_many`. Printed, it is one line of text.
 
-    - `done`: shots done, those of an earlier run included.
-    - `total`: shots in all.
-    - `seconds`: time spent so far.
+    - `done`: number of shots traced, those of an earlier run included.
+    - `total`: number of shots in all.
+    - `seconds`: time since the start, s.
     - `rate`: shots per s.
     - `left`: estimated time left, s.
 
@@ -29,29 +29,32 @@ class SurveyProgress:
     left: float
 
     def __str__(self) -> str:
-        left = f", {self.left:.3g} s left" if math.isfinite(self.left) else ""
-        return f"{self.done} of {self.total} shots, {self.seconds:.3g} s, {self.rate:.3g} per s{left}"
+        remaining = f", {self.left:.3g} s left" if math.isfinite(self.left) else ""
+        return f"{self.done} of {self.total} shots, {self.seconds:.3g} s, {self.rate:.3g} per s{remaining}"
 
 
-class Pace:
-    """How fast shots come, and how long the rest will take."""
+class ProgressClock:
+    """The rate of shots since the start of a run, and the time that the remaining ones will take.
 
-    def __init__(self, total: int, kept: int):
-        self.total, self.kept, self.done = total, kept, kept
-        self.started = time.perf_counter()
+    `total`: shots in all. `stored`: those of earlier runs, which do not count in the rate.
+    """
+
+    def __init__(self, total: int, stored: int):
+        self.total, self.stored, self.done = total, stored, stored
+        self.start_time = time.perf_counter()
 
     @property
     def seconds(self) -> float:
         """Time since the start, s."""
-        return time.perf_counter() - self.started
+        return time.perf_counter() - self.start_time
 
     @property
     def rate(self) -> float:
         """Shots per s in this run; 0 before the first."""
-        return (self.done - self.kept) / max(self.seconds, 1e-9)
+        return (self.done - self.stored) / max(self.seconds, 1e-9)
 
     @property
-    def left(self) -> float:
+    def seconds_left(self) -> float:
         """Estimated time left, s; infinite before the first shot."""
         if self.done == self.total:
             return 0.0

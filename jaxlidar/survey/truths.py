@@ -1,22 +1,34 @@
-"""What the beams of all shots of a survey meet in a scene."""
+"""Truth of the shots of a survey: labels for algorithms, of what each beam meets in the scene."""
 
-from typing import final
+import dataclasses
+from collections.abc import Iterator, Mapping
+from typing import Any, final
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxlidar._checks import briefly
-from jaxlidar.io.netcdf import TRUTH, keep_as_netcdf
-from jaxlidar.truth import Truth
+from jaxlidar._programs import Program
+from jaxlidar._threads import ONE_CORE
+from jaxlidar._workers import WorkUnit, task
+from jaxlidar.io.datasets import keep_as_netcdf
+from jaxlidar.io.netcdf import TRUTH_QUANTITIES
+from jaxlidar.planning.setup import Setup
+from jaxlidar.spectral.apply_optics import make_waveform_model
+from jaxlidar.survey.per_shot import ShotGeometry, setup_of_shot, shot_geometry
+from jaxlidar.survey.results import ShotResults
+from jaxlidar.survey.strategy import AbstractStrategy
+from jaxlidar.trace.device_scene import DeviceScene, aim_at, build_device_scene
+from jaxlidar.truth import Truth, compute_labels, first_order_setup
 
 
 @final
 @briefly
 class Truths(eqx.Module):
-    """What the beams of all shots of a survey meet in a scene; axis 0 is the shots'.
+    """Truth of all shots of a survey: what their beams meet in a scene; axis 0 is the shots'.
 
     The fields are those of `Truth`, at the samples of the `Waveforms` that they belong to;
     `waves[i].truth` is the `Truth` of shot i.
@@ -43,21 +55,96 @@ class Truths(eqx.Module):
     surface_spread: dict[str, Float[np.ndarray, " shots"]]
 
     def of_shot(self, shot: int, time: Float[Array, "bins"], height: Float[Array, "bins"]) -> Truth:
-        """The truth of one shot, of which the samples are known.
+        """Return the truth of one shot.
 
-        **Arguments:** `shot`: its number. `time`, `height`: as those of `Truth`.
+        **Arguments:** `shot`: its number. `time`, `height`: of the samples, as those of `Truth`.
 
         **Returns:** a `Truth`.
         """
-        own = {name: jax.tree.map(lambda a: jnp.asarray(a[shot]), part) for name, part in vars(self).items()}
-        return Truth(time=time, height=height, **own)
+        fields = {
+            name: jax.tree.map(lambda a: jnp.asarray(a[shot]), field) for name, field in vars(self).items()
+        }
+        return Truth(time=time, height=height, **fields)
 
 
 keep_as_netcdf(
     Truths,
     "truth of the shots of a survey",
-    TRUTH,
+    TRUTH_QUANTITIES,
     dimensions={"shots": "shot", "bins": "time", "wavelengths": "wavelength"},
     items={"returns": "material", "surface_height": "surface", "surface_spread": "surface"},
     rows="shots",
 )
+
+
+@dataclasses.dataclass(frozen=True)
+class StrategyWithTruth(AbstractStrategy):
+    """A strategy that traces light, and the truth of all shots.
+
+    After the tasks of `light`, there is one for the truth of each of its slices of shots.
+    """
+
+    light: AbstractStrategy
+
+    @staticmethod
+    def around(light: AbstractStrategy) -> "StrategyWithTruth":
+        """Return `light` with the truth of its shots."""
+        return StrategyWithTruth(light.setup, light.survey, light.rtol, light)
+
+    @property
+    def shot_slices(self) -> list[slice]:
+        return self.light.shot_slices
+
+    def tasks(self, key: PRNGKeyArray) -> list[WorkUnit]:
+        return [*self.light.tasks(key), *self.truth_tasks(key)]
+
+    def truth_tasks(self, key: PRNGKeyArray) -> list[WorkUnit]:
+        """Return the tasks for the truth alone. They draw no random numbers: `key` is passed on unused."""
+        # All are as large as the first, for one program; the last one is filled up.
+        size = self.shot_slices[0].stop
+        return [
+            task(number, truths_of_chunk, (self.setup, shot_geometry(self.survey, shots.start, size)), key)
+            for number, shots in enumerate(self.shot_slices, self.light.n_tasks)
+        ]
+
+    @property
+    def n_tasks(self) -> int:
+        return self.light.n_tasks + len(self.shot_slices)
+
+    def result_class(self, number: int) -> Any:
+        return self.light.result_class(number) if number < self.light.n_tasks else Truths
+
+    def shot_results(self, task_results: Mapping[int, Any]) -> Iterator[tuple[slice, ShotResults]]:
+        results_of_slices = self.light.shot_results(task_results)
+        for number, (shots, results) in enumerate(results_of_slices, self.light.n_tasks):
+            count = shots.stop - shots.start
+            truths = jax.tree.map(lambda a, n=count: a[:n], task_results[number])
+            yield shots, results._replace(truth=truths)
+
+    def info(self) -> dict[str, Any]:
+        return self.light.info()
+
+
+def truths_of_chunk(setup: Setup, shots: ShotGeometry, key: PRNGKeyArray) -> Truths:
+    """Return the truth of a chunk of shots; no random numbers are drawn."""
+    # Labels are those of the first order with a fixed key: `key` is unused, as every task has one.
+    fields = _compiled_truths(first_order_setup(setup), shots.as_arrays())
+    return Truths(**jax.tree.map(np.asarray, fields))
+
+
+def _truth_of_shot(scene: DeviceScene, setup: Setup, shot: ShotGeometry) -> dict[str, Any]:
+    """Return the fields of `Truths` for one shot."""
+    offset = jnp.asarray(shot.position) - setup.lidar.position
+    setup = setup_of_shot(setup, shot)
+    scene = aim_at(scene, setup.lidar, offset)
+    truth = vars(compute_labels(scene, make_waveform_model(setup)))
+    return {field.name: truth[field.name] for field in dataclasses.fields(Truths)}
+
+
+def _truths_of_shots(setup: Setup, shots: ShotGeometry) -> dict[str, Any]:
+    """Return the fields of `Truths` for shots one after the other, over one device scene."""
+    scene = build_device_scene(setup)
+    return jax.lax.map(lambda shot: _truth_of_shot(scene, setup, shot), shots)
+
+
+_compiled_truths = Program(_truths_of_shots, **ONE_CORE)

@@ -2,8 +2,6 @@
 
 import operator
 import os
-import tempfile
-from pathlib import Path
 from typing import Any, final
 
 import equinox as eqx
@@ -11,17 +9,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxlidar._checks import briefly
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._deprecated import renamed_property
 from jaxlidar._summary import NOTABLE_FRACTION, percent
 from jaxlidar.io import netcdf
 from jaxlidar.io.case import Case
-from jaxlidar.io.rows import CHECKSUMS
+from jaxlidar.io.datasets import datasets_of, keep_as_netcdf
 from jaxlidar.spectral.waveform import Waveform
 from jaxlidar.survey.truths import Truths
 
 
 @final
+@briefly
 class Waveforms(eqx.Module):
     """The waveforms of all shots of a survey, on one time axis. `waves[i]` is the `Waveform` of shot i.
 
@@ -32,15 +32,15 @@ class Waveforms(eqx.Module):
     - `neglected`, `lost`: (shots, wavelengths), `energy_budget`, `energy_budget_stderr`, dicts of the same
       shape: as those of `Waveform`.
     - `position`: (shots, 2) m, `zenith`, `azimuth`: (shots,) degrees, as those of `Survey`.
-    - `ground_height`: (shots,) m, height of the ground where the beam axis meets it: the truth; NaN where
-      there is none.
-    - `off_map`: (shots,) share of the light that falls beside the voxel map.
-    - `error`: (shots,) relative error, as `simulate` defines it. `photons`: (shots,) traced.
-    - `truth`: a `Truths`, what each beam meets in the scene; None where it was not asked for.
-    - `info`: dict of "rtol", "orders" followed, "seconds" spent, whether light was "shared", then also the
-      spacing in m of the "grid" on which it was told apart, and a bound on the share of samples that
-      "parallel light" changes; and, where there is a file, "problem": digests of all that the waveforms
-      depend on.
+    - `ground_height`: (shots,) m, true height of the ground where the beam axis meets it; NaN where it meets
+      none.
+    - `off_map`: (shots,) fraction of the light that falls beside the voxel map.
+    - `error`: (shots,) relative error, as `simulate` defines it. `photons`: (shots,) number traced.
+    - `truth`: a `Truths`, what each beam meets in the scene; None unless it was asked for.
+    - `info`: dict of "rtol", "orders" followed, "seconds" that it took, and whether light was "shared". If it
+      was, also the spacing in m of the "grid" of nodes at which it entered, and a bound on the fraction of
+      samples that "parallel light" changes. If there is a file, also "problem": digests of all that the
+      waveforms depend on.
 
     **Example:**
 
@@ -82,9 +82,9 @@ class Waveforms(eqx.Module):
 
     @property
     def first_order_share(self) -> Float[np.ndarray, "shots wavelengths"]:
-        """Share of `reflectance` that was scattered once, (shots, wavelengths); 1 where nothing returns."""
-        first, whole = (np.sum(a, axis=2) for a in (self.components["first"], self.reflectance))
-        return np.where(whole > 0, first / np.where(whole > 0, whole, 1.0), 1.0).astype(whole.dtype)
+        """Fraction of `reflectance` scattered once, (shots, wavelengths); 1 where nothing returns."""
+        first, total = (np.sum(a, axis=2) for a in (self.components["first"], self.reflectance))
+        return np.where(total > 0, first / np.where(total > 0, total, 1.0), 1.0).astype(total.dtype)
 
     def __len__(self) -> int:
         return len(self.position)
@@ -96,8 +96,8 @@ class Waveforms(eqx.Module):
         for w, sums in zip(self.wavelength, self.reflectance.sum(axis=2).T):
             low, middle, high = np.quantile(sums, (0.0, 0.5, 1.0))
             lines.append(f"  {w:g} nm: apparent reflectance {low:.3g} to {high:.3g}, median {middle:.3g}")
-        if (beside := int(np.sum(self.off_map >= NOTABLE_FRACTION))) > 0:
-            lines.append(f"  {beside} lie partly beside the voxel map")
+        if (n_off_map := int(np.sum(self.off_map >= NOTABLE_FRACTION))) > 0:
+            lines.append(f"  {n_off_map} lie partly beside the voxel map")
         light = "which share light, " if self.info.get("shared") else ""
         lines.append(
             f"  {light}{self.info.get('seconds', 0.0):.2g} s, relative errors up to {self.error.max():.2g}"
@@ -112,9 +112,10 @@ class Waveforms(eqx.Module):
         if not -n <= i < n:
             raise IndexError(f"shot {i}: there are {n}; admissible are -{n} to {n - 1}")
 
-        def own(named: dict) -> dict:
-            return {name: jnp.asarray(a[i]) for name, a in named.items()}
+        def row(arrays: dict) -> dict:
+            return {name: jnp.asarray(a[i]) for name, a in arrays.items()}
 
+        # The survey has one time axis and shots of many zenith angles: heights differ between shots.
         height = -0.5 * SPEED_OF_LIGHT * self.time * np.cos(np.deg2rad(self.zenith[i]))
         axes = jnp.asarray(self.time), jnp.asarray(height, self.time.dtype)
         return Waveform(
@@ -123,10 +124,10 @@ class Waveforms(eqx.Module):
             reflectance=jnp.asarray(self.reflectance[i]),
             energy=jnp.asarray(self.energy[i]),
             stderr=jnp.asarray(self.stderr[i]),
-            components=own(self.components),
+            components=row(self.components),
             neglected=jnp.asarray(self.neglected[i]),
-            energy_budget=own(self.energy_budget),
-            energy_budget_stderr=own(self.energy_budget_stderr),
+            energy_budget=row(self.energy_budget),
+            energy_budget_stderr=row(self.energy_budget_stderr),
             lost=jnp.asarray(self.lost[i]),
             recorded=jnp.asarray(self.recorded[i]),
             wavelength=jnp.asarray(self.wavelength),
@@ -138,12 +139,13 @@ class Waveforms(eqx.Module):
         return {"photons": int(self.photons[i]), "error": float(self.error[i]), "stopped": self._stopped(i)}
 
     def _stopped(self, i: int) -> str:
-        whole = np.maximum(self.reflectance[i].sum(axis=-1), 1e-30)
-        beyond = float(np.max(self.neglected[i] / whole))
+        """Return the reason why tracing of shot i ended, as `Waveform.info` has it."""
+        total = np.maximum(self.reflectance[i].sum(axis=-1), 1e-30)
+        neglected = float(np.max(self.neglected[i] / total))
         if self.error[i] > self.info["rtol"]:
             return "batches spent"
-        if self.info["orders"] > 1 and beyond > self.info["rtol"]:
-            return f"orders beyond {self.info['orders']} may add {percent(beyond)}"
+        if self.info["orders"] > 1 and neglected > self.info["rtol"]:
+            return f"orders beyond {self.info['orders']} may add {percent(neglected)}"
         return "tolerance met"
 
     def to_xarray(self) -> Any:
@@ -151,17 +153,10 @@ class Waveforms(eqx.Module):
 
         **Returns:** an `xarray.Dataset`.
 
-        **Raises:** ImportError where xarray or h5netcdf is not installed.
+        **Raises:** ImportError where xarray is not installed.
         """
-        import xarray
-
-        with tempfile.TemporaryDirectory() as folder:
-            self.save(path := Path(folder) / "waveforms.nc")
-            how: dict[str, Any] = {"engine": "h5netcdf", "decode_timedelta": False}
-            found = xarray.load_dataset(path, **how)
-            if self.truth is None:
-                return found
-            return found.merge(xarray.load_dataset(path, group="truth", **how).drop_vars(CHECKSUMS))
+        datasets = datasets_of(self)
+        return datasets["/"].merge(datasets["/truth"]) if self.truth is not None else datasets["/"]
 
     def save(self, path: str | os.PathLike[str], case: Case | None = None) -> None:
         """Write the waveforms as a netCDF file, which `Waveforms.open` and `jaxlidar.open` read.
@@ -192,7 +187,7 @@ class Waveforms(eqx.Module):
         return found
 
 
-netcdf.keep_as_netcdf(
+keep_as_netcdf(
     Waveforms,
     "simulated lidar waveforms of a survey",
     {
@@ -205,18 +200,19 @@ netcdf.keep_as_netcdf(
         "components": ("1", "apparent reflectance per sample by material and by order of scattering"),
         "neglected": ("1", "apparent reflectance that orders beyond the last could add"),
         "lost": ("1", "apparent reflectance that arrives before or after all fine bins of the plan"),
-        "energy_budget": ("1", "share of the emitted energy by fate, before the atmosphere"),
-        "energy_budget_stderr": ("1", "standard error of the share of the emitted energy"),
+        "energy_budget": ("1", "fraction of the emitted energy by fate, before the atmosphere"),
+        "energy_budget_stderr": ("1", "standard error of the fraction of the emitted energy"),
         "position": ("m", "x and y where the beam axis meets the reference plane"),
         "zenith": ("degree", "angle between the beam and the vertical"),
         "azimuth": ("degree", "direction in which the beam travels, clockwise from north"),
         "ground_height": ("m", "height of the ground where the beam axis meets it"),
-        "off_map": ("1", "share of the light that falls beside the voxel map"),
+        "off_map": ("1", "fraction of the light that falls beside the voxel map"),
         "error": ("1", "relative error of the waveform"),
         "photons": ("1", "photons traced"),
     },
     dimensions={"shots": "shot", "bins": "time", "wavelengths": "wavelength", "2": "axis"},
     items={"components": "component", "energy_budget": "fate", "energy_budget_stderr": "fate"},
     coordinates={"zenith": "shot", "azimuth": "shot"},
+    former_names={"energy_budget": "ledger", "energy_budget_stderr": "ledger_stderr"},
     rows="shots",
 )

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxlidar._checks import check_flag, check_key, check_kind
+from jaxlidar._checks import briefly, check_flag, check_key, check_kind
 from jaxlidar.planning.setup import Setup
 from jaxlidar.trace.device_scene import DeviceScene, build_device_scene
 from jaxlidar.trace.first_order import FirstOrder, first_order
@@ -28,6 +28,7 @@ Traced = TypeVar("Traced")
 
 
 @final
+@briefly
 class Response(eqx.Module):
     """The geometric weight of all paths, by last material, scattering history and fine time bin.
 

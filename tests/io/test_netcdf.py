@@ -3,7 +3,10 @@
 import builtins
 import dataclasses
 import json
+import zipfile
+import zlib
 from importlib import metadata
+from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -13,7 +16,7 @@ from jaxtyping import Float
 
 import inversion
 import jaxlidar as jl
-from jaxlidar.io import layouts
+from jaxlidar.io import datasets
 
 h5py = pytest.importorskip("h5py")
 
@@ -171,7 +174,7 @@ def test_xarray_opens_it_with_coordinates_and_units(wave, case, tmp_path):
 
 def test_every_quantity_of_a_known_class_has_units():
 
-    for layout in layouts.LAYOUTS.values():
+    for layout in datasets.LAYOUTS.values():
         if layout.kind.__module__.startswith(("jaxlidar", "inversion")):
             names = {f.name for f in dataclasses.fields(layout.kind) if not f.metadata.get("static")}
             assert names - {"scene", "waveform", "truth"} == set(layout.quantities)
@@ -221,7 +224,7 @@ def test_other_files_are_refused(wave, tmp_path):
     wave.save(tmp_path / "a.nc")
     with h5py.File(tmp_path / "a.nc", "r+") as file:
         file.attrs["jaxlidar_format"] = 9
-    with pytest.raises(ValueError, match=r"jaxlidar_format = 9 is outside \[1, 1\]"):
+    with pytest.raises(ValueError, match=r"jaxlidar_format = 9 is outside \[1, 2\]"):
         jl.open(tmp_path / "a.nc")
     wave.save(tmp_path / "a.nc")
     with h5py.File(tmp_path / "a.nc", "r+") as file:
@@ -238,10 +241,10 @@ def test_a_class_of_another_package_is_found_by_its_entry_point(tmp_path, monkey
     with pytest.raises(TypeError, match="result is of the class Heights; admissible are"):
         jl.io.save(Heights(np.ones(2)), tmp_path / "a.nc")
     # Forgotten again when the test ends.
-    monkeypatch.setitem(layouts.LAYOUTS, "Heights", None)
+    monkeypatch.setitem(datasets.LAYOUTS, "Heights", None)
     jl.io.keep_as_netcdf(Heights, "heights", {"top": ("m", "height")})
     jl.io.save(Heights(np.array([1.0, 2.0])), tmp_path / "a.nc")
-    layout = layouts.LAYOUTS.pop("Heights")
+    layout = datasets.LAYOUTS.pop("Heights")
     with pytest.raises(ValueError, match=r"a.nc: it holds a Heights, which is not known here"):
         jl.open(tmp_path / "a.nc")
 
@@ -249,9 +252,10 @@ def test_a_class_of_another_package_is_found_by_its_entry_point(tmp_path, monkey
         name = "Heights"
 
         def load(self):
-            layouts.LAYOUTS["Heights"] = layout
+            datasets.LAYOUTS["Heights"] = layout
 
-    monkeypatch.setattr(metadata, "entry_points", lambda group: [Point()] if group == layouts.FILES else [])
+    points = {datasets.ENTRY_POINTS: [Point()]}
+    monkeypatch.setattr(metadata, "entry_points", lambda group: points.get(group, []))
     assert jl.open(tmp_path / "a.nc").top.tolist() == [1.0, 2.0]
 
 
@@ -276,3 +280,51 @@ def test_a_failed_write_leaves_the_old_file(wave, tmp_path):
         with_info(wave, {"seeds": {1, 2}}).save(path)
     assert same(jl.open(path), wave)
     assert list(tmp_path.iterdir()) == [path]
+
+
+def checksum_of(result):
+    """CRC-32 of the bytes of all arrays of a result, in the order of its fields."""
+    sums = 0
+    for array in jax.tree.leaves(result):
+        sums = zlib.crc32(np.ascontiguousarray(array).tobytes(), sums)
+    return sums
+
+
+@pytest.fixture(scope="module")
+def old_files(tmp_path_factory):
+    """A folder with files that version 0.2.0 wrote."""
+    folder = tmp_path_factory.mktemp("version_0_2_0")
+    with zipfile.ZipFile(Path(__file__).with_name("version_0_2_0.zip")) as archive:
+        archive.extractall(folder)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("name", "checksum"),
+    [
+        ("waveform.nc", 530060203),
+        ("waveform.zarr", 530060203),
+        ("waveforms.nc", 2727316193),
+        ("retrieval.nc", 2101734652),
+    ],
+)
+def test_files_of_version_0_2_0_are_read(old_files, name, checksum):
+    """To the bit: the checksums are those that version 0.2.0 itself computed."""
+    assert checksum_of(jl.open(old_files / name)) == checksum
+
+
+def test_old_files_have_their_case_and_static_fields(old_files):
+    assert jl.io.read_case(old_files / "waveform.nc").arguments == {"n_photons": 8192, "max_orders": 3}
+    assert jl.io.read_case(old_files / "waveforms.nc").survey.zenith.tolist() == [0.0, 10.0, 20.0]
+    fit = jl.open(old_files / "retrieval.nc")
+    assert fit.history == (3.0, 1.0 / 3.0, np.inf)
+    assert fit.labels[-1] == "label 7"
+
+
+def test_a_name_that_is_damaged_is_refused(wave, tmp_path):
+    path = tmp_path / "a.nc"
+    wave.save(path)
+    with h5py.File(path, "r+") as file:
+        file["component"][0] = "fist"
+    with pytest.raises(ValueError, match=r"a.nc: /: damaged \(the checksum of its texts is another\)"):
+        jl.open(path)

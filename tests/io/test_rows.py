@@ -12,8 +12,8 @@ import pytest
 from jaxtyping import Float, Int
 
 import jaxlidar as jl
-from jaxlidar.io import layouts, netcdf
-from jaxlidar.io.rows import BLOCK, blank
+from jaxlidar.io import datasets, netcdf
+from jaxlidar.io.rows import BLOCK, unwritten_rows
 
 SUFFIXES = [".nc", ".zarr"]
 
@@ -28,7 +28,7 @@ class Echoes(eqx.Module):
 
 @pytest.fixture(autouse=True)
 def known(monkeypatch):
-    monkeypatch.setitem(layouts.LAYOUTS, "Echoes", None)
+    monkeypatch.setitem(datasets.LAYOUTS, "Echoes", None)
     quantities = {"time": ("ns", "time"), "energy": ("J", "energy"), "parts": ("J", "energy by part")}
     quantities |= {"count": ("1", "number of echoes")}
     jl.io.keep_as_netcdf(
@@ -59,10 +59,10 @@ def add_all(rows, whole, step):
 def frame(whole):
     """What is known before the rows are."""
     count = len(whole.count)
-    parts = {name: blank(count, a[:1]) for name, a in whole.parts.items()}
-    return Echoes(
-        whole.time, blank(count, whole.energy[:1]), parts, blank(count, whole.count[:1]), whole.info
+    energy, parts, number = jax.tree.map(
+        lambda a: unwritten_rows(count, a[:1]), (whole.energy, whole.parts, whole.count)
     )
+    return Echoes(whole.time, energy, parts, number, whole.info)
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
@@ -83,9 +83,9 @@ def test_files_are_mapped_and_not_read(tmp_path):
     size = 3 * shots * block[0].nbytes
     shape = Echoes(
         np.arange(float(bins)),
-        blank(shots, block),
-        {name: blank(shots, block) for name in ("leaf", "ground")},
-        blank(shots, np.zeros(1, int)),
+        unwritten_rows(shots, block),
+        {name: unwritten_rows(shots, block) for name in ("leaf", "ground")},
+        unwritten_rows(shots, np.zeros(1, int)),
         {},
     )
     tracemalloc.start()
@@ -189,7 +189,8 @@ def test_a_waveform_as_zarr(tmp_path):
     assert found.info == wave.info
     assert np.array_equal(jl.rerun(path).reflectance, wave.reflectance)
     xarray = pytest.importorskip("xarray")
-    data = xarray.open_zarr(path, consolidated=False, decode_timedelta=False)
+    # Without a warning: the store has consolidated metadata.
+    data = xarray.open_zarr(path, decode_timedelta=False)
     assert data.reflectance.dims == ("wavelength", "time")
     assert data.energy.attrs["units"] == "J"
     assert Path(path).is_dir()

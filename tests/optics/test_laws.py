@@ -1,5 +1,4 @@
-"""Laws of reflection and phase functions: those that are built in, and Minnaert's, added in a file of its
-own.
+"""Laws of reflection and phase functions: the built-in ones, and Minnaert's from `examples/minnaert.py`.
 
 Samples are tested against densities (chi-squared over cells of equal solid angle), densities against
 intensity factors, both for conservation and reciprocity, and returns against the closed form
@@ -46,69 +45,72 @@ PHASES = {
 
 
 def direction(zenith, azimuth):
+    """Downward direction of travel, of angles in degrees; the zenith is that of the opposite direction."""
     z, a = np.deg2rad(zenith), np.deg2rad(azimuth)
     return np.array([np.sin(z) * np.cos(a), np.sin(z) * np.sin(a), -np.cos(z)])
 
 
 def arrays(vector, like):
+    """One vector for each element of the array `like`."""
     return vec(jnp.full(like.shape, c, like.dtype) for c in vector)
 
 
 def sphere(polar=400, azimuth=200):
     """Directions and their solid angles: Gauss-Legendre in the cosine, even in azimuth."""
     x, weight = np.polynomial.legendre.leggauss(polar)
-    turn = (np.arange(azimuth) + 0.5) * (2 * np.pi / azimuth)
-    c, a = (m.ravel() for m in np.meshgrid(x, turn, indexing="ij"))
+    phi = (np.arange(azimuth) + 0.5) * (2 * np.pi / azimuth)
+    c, a = (m.ravel() for m in np.meshgrid(x, phi, indexing="ij"))
     s = np.sqrt(1 - c * c)
-    return vec(jnp.asarray(v) for v in (s * np.cos(a), s * np.sin(a), c)), np.repeat(weight, azimuth) * (
-        2 * np.pi / azimuth
-    )
+    directions = vec(jnp.asarray(v) for v in (s * np.cos(a), s * np.sin(a), c))
+    return directions, np.repeat(weight, azimuth) * (2 * np.pi / azimuth)
 
 
-def density_of(thing, incident, normal, out):
-    if isinstance(thing, jl.AbstractPhase):
-        return thing.density(incident, out)
-    return thing.density(incident, normal, out)
+def density_of(law, incident, normal, out):
+    """Density of a law of reflection, or of a phase function, which has no normal."""
+    if isinstance(law, jl.AbstractPhase):
+        return law.density(incident, out)
+    return law.density(incident, normal, out)
 
 
-def drawn_by(thing, incident, normal, u, v):
-    if isinstance(thing, jl.AbstractPhase):
-        return thing.sample(incident, u, v)
-    return thing.sample(incident, normal, u, v)
+def sample_from(law, incident, normal, u, v):
+    """Directions drawn from a law of reflection, or from a phase function, which has no normal."""
+    if isinstance(law, jl.AbstractPhase):
+        return law.sample(incident, u, v)
+    return law.sample(incident, normal, u, v)
 
 
 def cells(out):
     """Number of the cell, 24 in height and 12 in azimuth, of equal solid angle."""
     x, y, z = (np.asarray(c, float) for c in out)
     height = np.clip(((z + 1) * 12).astype(int), 0, 23)
-    turn = ((np.arctan2(y, x) / (2 * np.pi)) % 1.0 * 12).astype(int) % 12
-    return 12 * height + turn
+    azimuth = ((np.arctan2(y, x) / (2 * np.pi)) % 1.0 * 12).astype(int) % 12
+    return 12 * height + azimuth
 
 
 def p_value(sampler, density, normal=TILTED, samples=200_000, seed=7):
-    """Of the hypothesis that what `sampler` draws has the density of `density`."""
+    """P-value of the hypothesis that directions drawn from `sampler` have the density of `density`."""
     u, v = jax.random.uniform(jax.random.key(seed), (2, samples), minval=1e-7)
     incident = arrays(direction(35.0, 20.0), u)
-    drawn = drawn_by(sampler, incident, arrays(normal, u), u, v)
-    # Cells are crossed by the horizon: integrate finely.
+    drawn = sample_from(sampler, incident, arrays(normal, u), u, v)
+    # The horizon, where densities jump, crosses cells: integrate finely.
     out, weight = sphere(1440, 720)
     like = out[0]
     p = np.asarray(density_of(density, arrays(direction(35.0, 20.0), like), arrays(normal, like), out), float)
     expected = samples * np.bincount(cells(out), p * weight, 288)
-    found = np.bincount(cells(drawn), minlength=288)
-    # Cells that expect little are counted together.
-    rare = expected < 20
-    expected = np.append(expected[~rare], expected[rare].sum())
-    found = np.append(found[~rare], found[rare].sum())
-    expected, found = expected[expected > 1], found[expected > 1]
-    statistic = np.sum((found - expected) ** 2 / expected)
+    observed = np.bincount(cells(drawn), minlength=288)
+    # Chi-squared needs counts that are nearly normal: rare cells are counted together.
+    is_rare = expected < 20
+    expected = np.append(expected[~is_rare], expected[is_rare].sum())
+    observed = np.append(observed[~is_rare], observed[is_rare].sum())
+    expected, observed = expected[expected > 1], observed[expected > 1]
+    statistic = np.sum((observed - expected) ** 2 / expected)
     return chi2_distribution.sf(statistic, len(expected) - 1)
 
 
 @pytest.mark.parametrize("name", [*LAWS, *PHASES])
 def test_samples_have_the_density(name):
-    thing = (LAWS | PHASES)[name]
-    assert p_value(thing, thing) > 1e-3
+    law = (LAWS | PHASES)[name]
+    assert p_value(law, law) > 1e-3
 
 
 @pytest.mark.parametrize(
@@ -122,24 +124,24 @@ def test_a_wrong_density_is_noticed(name, wrong):
 @pytest.mark.parametrize("name", [*LAWS, *PHASES])
 @pytest.mark.parametrize("zenith", [0.0, 50.0, 80.0])
 def test_laws_conserve_energy_and_agree_with_themselves(name, zenith):
-    thing = (LAWS | PHASES)[name]
+    law = (LAWS | PHASES)[name]
     out, weight = sphere()
     incident, normal = arrays(direction(zenith, 40.0), out[0]), arrays(UP, out[0])
-    density = np.asarray(density_of(thing, incident, normal, out), float)
+    density = np.asarray(density_of(law, incident, normal, out), float)
     # The equal-angle density is singular at the normal, and softened there.
     assert np.sum(density * weight) == pytest.approx(1.0, abs=5e-3 if name == "equal-angle" else 1e-4)
-    if isinstance(thing, jl.AbstractPhase):
-        seen, albedo, most = thing.intensity_factor(incident, out), 1.0, thing.largest_intensity_factor()
+    if isinstance(law, jl.AbstractPhase):
+        factor, albedo, bound = law.intensity_factor(incident, out), 1.0, law.largest_intensity_factor()
     else:
-        albedo = np.asarray(thing.albedo(incident, normal), float)
+        albedo = np.asarray(law.albedo(incident, normal), float)
         assert np.all((albedo >= 0) & (albedo <= 1))
-        # A wider aperture softens what is seen of the equal-angle singularity.
+        # A wider aperture would soften the equal-angle singularity visibly.
         half_angle = 2e-4
-        seen = thing.intensity_factor(incident, normal, out, jnp.asarray(half_angle))
-        most = thing.largest_intensity_factor(half_angle)
-    seen = np.asarray(seen, float)
-    np.testing.assert_allclose(seen, np.pi * albedo * density, rtol=2e-3, atol=1e-6)
-    assert np.max(seen) <= most * (1 + 1e-5)
+        factor = law.intensity_factor(incident, normal, out, jnp.asarray(half_angle))
+        bound = law.largest_intensity_factor(half_angle)
+    factor = np.asarray(factor, float)
+    np.testing.assert_allclose(factor, np.pi * albedo * density, rtol=2e-3, atol=1e-6)
+    assert np.max(factor) <= bound * (1 + 1e-5)
 
 
 def test_minnaert_is_reciprocal_and_equal_angle_is_not():
@@ -148,26 +150,29 @@ def test_minnaert_is_reciprocal_and_equal_angle_is_not():
     a, b = (np.stack([*v[:2], np.abs(v[2])]) / np.linalg.norm(v, axis=0) for v in (a, b))
     up = arrays(UP, jnp.zeros(1000))
 
-    def exchanged(law):
-        def brdf(towards, out):
-            incident, out = (vec(jnp.asarray(v)) for v in (-towards, out))
+    def asymmetry(law):
+        """Largest relative change of the BRDF when incident and view direction are exchanged."""
+
+        def brdf(source, out):
+            incident, out = (vec(jnp.asarray(v)) for v in (-source, out))
             intensity = law.intensity_factor(incident, up, out, jnp.asarray(1e-3))
             return np.asarray(intensity / dot(up, out), float)
 
         return np.max(np.abs(brdf(a, b) / brdf(b, a) - 1))
 
-    assert exchanged(Minnaert(k=2.5)) < 1e-4
-    assert exchanged(jl.EqualAngle()) > 0.1
+    assert asymmetry(Minnaert(k=2.5)) < 1e-4
+    assert asymmetry(jl.EqualAngle()) > 0.1
 
 
 @pytest.mark.parametrize("slope", [0.0, 30.0])
 def test_first_return_of_minnaert(slope):
+    """With k = 1.7: R (k + 1)/2 cos^(2 k - 1) returns, R cos^(k - 1) is reflected."""
     scene = jl.Scene(ground=jl.Ground(reflectance=0.4, slope=slope, law=Minnaert(k=1.7)))
     lidar = single_sample_lidar()
     wave = jl.simulate(lidar, scene, key=jax.random.key(0), **SINGLE_SAMPLE)
     cosine = np.cos(np.deg2rad(slope))
     assert float(wave.reflectance.sum()) == pytest.approx(0.4 * 1.35 * cosine**2.4, rel=1e-4)
-    # What the law does not scatter is absorbed.
+    # Light that the law does not scatter is absorbed.
     assert float(wave.energy_budget["absorbed by ground"][0]) == pytest.approx(
         1 - 0.4 * cosine**0.7, rel=1e-4
     )
@@ -186,39 +191,40 @@ LIDAR = single_sample_lidar()
 
 
 @pytest.mark.slow
-def test_the_ledger_of_all_orders_adds_up():
+def test_the_energy_budget_of_all_orders_adds_up():
     wave = jl.simulate(LIDAR, below_plate(START), key=jax.random.key(1), n_photons=65536, **SINGLE_SAMPLE)
     assert float(sum(wave.energy_budget.values())[0]) == pytest.approx(1.0, abs=1e-4)
 
 
-def derivatives(law, name, step):
-    """By automatic differentiation and as a central difference: means of batches, with standard errors."""
+def derivative_error(law, name, step):
+    """Difference of derivatives by JAX and by central differences, means of batches; its standard error."""
     plan = jl.plan(LIDAR, below_plate(START, law), max_orders=4, n_photons=65536, n_rays=512, **SINGLE_SAMPLE)
 
     def measure(value, key):
         setup = jl.make_setup(LIDAR, below_plate(START | {name: value}, law), plan)
         return jl.waveform_of(jl.trace_scene(setup, key), setup).components["higher"].sum()
 
-    both = jax.jit(lambda v, k: jax.jvp(lambda v: measure(v, k), (v,), (jnp.ones_like(v),))[1])
+    derivative = jax.jit(lambda v, k: jax.jvp(lambda v: measure(v, k), (v,), (jnp.ones_like(v),))[1])
     value = jax.jit(measure)
-    exact = np.array([both(START[name], k) for k in jax.random.split(jax.random.key(3), 12)])
+    by_jax = np.array([derivative(START[name], k) for k in jax.random.split(jax.random.key(3), 12)])
     keys = jax.random.split(jax.random.key(4), 24)
-    sides = [np.array([value(START[name] + s, k) for k in keys]) for s in (-step, step)]
     # The same keys on both sides: their noise nearly cancels.
-    slopes = (sides[1] - sides[0]) / (2 * step)
-    return exact.mean() - slopes.mean(), np.hypot(*(a.std(ddof=1) / np.sqrt(len(a)) for a in (exact, slopes)))
+    lower, upper = (np.array([value(START[name] + s, k) for k in keys]) for s in (-step, step))
+    differences = (upper - lower) / (2 * step)
+    stderr = np.hypot(*(x.std(ddof=1) / np.sqrt(len(x)) for x in (by_jax, differences)))
+    return by_jax.mean() - differences.mean(), stderr
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "step"), slow_unless([("slope", 1.0)], [("k", 0.05), ("slope", 1.0)]))
 def test_derivatives_of_a_law_of_ones_own(name, step):
-    off, stderr = derivatives(Minnaert, name, step)
-    assert abs(off) < 4 * stderr
+    error, stderr = derivative_error(Minnaert, name, step)
+    assert abs(error) < 4 * stderr
 
 
 @final
-class Forgetful(jl.AbstractLaw):
-    """Minnaert's law with a density that does not know its exponent."""
+class WrongDensity(jl.AbstractLaw):
+    """Minnaert's law with Lambert's density in place of its own."""
 
     k: jax.Array
 
@@ -240,25 +246,26 @@ class Forgetful(jl.AbstractLaw):
 
 @pytest.mark.slow
 def test_a_density_that_is_wrong_spoils_derivatives_visibly():
-    off, stderr = derivatives(Forgetful, "k", 0.05)
-    assert abs(off) > 6 * stderr
+    error, stderr = derivative_error(WrongDensity, "k", 0.05)
+    assert abs(error) > 6 * stderr
 
 
-def returned(wave):
+def total_return(wave):
+    """Apparent reflectance of the whole record, by wavelength."""
     return wave.reflectance.sum(axis=1)
 
 
 def test_scattering_between_surfaces_follows_the_law():
-    """Two orders: light that a white, diffusely transmitting plate spreads evenly, then Minnaert's ground.
+    """Three scatterings: a plate that transmits all light diffusely, Minnaert's ground, and the plate again.
 
-    The plate (R 0, T 1, opaque) sends all light down by the cosine law; the ground reflects the share 2/(k +
-    1) of it, and of what it sends up the plate transmits all, by the cosine law again: the sum is R times
-    2/(k + 1).
+    The plate (R = 0, T = 1, opaque) sends all light down by the cosine law. The ground reflects the fraction
+    R 2/(k + 1) of diffuse light, and the plate transmits all of it, by the cosine law again: the sum is
+    R 2/(k + 1).
     """
     plate = jl.Plate(height=4.0, reflectance=0.0, transmittance=1.0, transmission="diffuse")
     scene = jl.Scene(plates=(plate,), ground=jl.Ground(reflectance=0.5, law=Minnaert(k=2.0)))
     plan = jl.plan(LIDAR, scene, max_orders=3, n_photons=16384, n_rays=64, **SINGLE_SAMPLE)
-    mean, stderr = batch_mean(LIDAR, scene, plan, seed=2, count=16, quantity=returned)
+    mean, stderr = batch_mean(LIDAR, scene, plan, seed=2, count=16, quantity=total_return)
     assert agrees(mean, stderr, 0.5 * 2 / 3, bound=1e-3, sigmas=4.0)
     assert not agrees(mean, stderr, 0.5, bound=1e-3, sigmas=4.0)
 

@@ -1,3 +1,5 @@
+"""Leaf optics given as numbers: shapes, derivatives and refusals."""
+
 import jax
 import numpy as np
 import pytest

@@ -26,8 +26,8 @@ LEAVES = (
 )
 
 
-def lowered(leaf):
-    """The names that prosail gives the traits."""
+def prosail_arguments(leaf):
+    """Traits by the names that prosail gives them."""
     return {name.lower(): value for name, value in leaf.items()}
 
 
@@ -36,43 +36,42 @@ def lowered(leaf):
 def test_against_prosail(leaf, version, precision):
     ant = {"Cant": 3.0} if version == "D" else {}
     _, R, T = prosail.run_prospect(
-        **lowered(leaf), ant=ant.get("Cant", 0.0), prospect_version=version, alpha=40.0
+        **prosail_arguments(leaf), ant=ant.get("Cant", 0.0), prospect_version=version, alpha=40.0
     )
-    got = Prospect(**leaf, **ant, version=version)(WAVELENGTHS)
-    assert got[0].dtype == precision
-    np.testing.assert_allclose(got[0], R, atol=1e-5)
-    np.testing.assert_allclose(got[1], T, atol=1e-5)
+    reflectance, transmittance = Prospect(**leaf, **ant, version=version)(WAVELENGTHS)
+    assert reflectance.dtype == precision
+    np.testing.assert_allclose(reflectance, R, atol=1e-5)
+    np.testing.assert_allclose(transmittance, T, atol=1e-5)
 
 
 def test_against_prosail_at_another_incidence():
-    _, R, T = prosail.run_prospect(**lowered(LEAVES[0]), alpha=59.0)
-    got = Prospect(**LEAVES[0], alpha=59.0)(WAVELENGTHS)
-    np.testing.assert_allclose(got, (R, T), atol=1e-5)
+    _, R, T = prosail.run_prospect(**prosail_arguments(LEAVES[0]), alpha=59.0)
+    np.testing.assert_allclose(Prospect(**LEAVES[0], alpha=59.0)(WAVELENGTHS), (R, T), atol=1e-5)
 
 
 def optics_of_total(K, face):
+    """R, T and absorptance of a leaf of 3.4 plates with the total optical depth K."""
     return [float(x) for x in plate_model(K / 3.4, 3.4, face)]
 
 
 def test_table_4_from_its_absorptances():
-    """With D's refractive index, N = 3.4 and the absorption solved from A, R and T round to the table's."""
+    """With D's refractive index, N = 3.4 and K solved from the absorptance, R and T round to the table's."""
     table = shipped("D")
     with jax.enable_x64(True):
-        for wavelength, expected, about in zip(LASERS, TABLE_4, (0.2756, 0.0098, 0.0487)):
+        for wavelength, expected, expected_K in zip(LASERS, TABLE_4, (0.2756, 0.0098, 0.0487)):
             n = float(np.interp(wavelength, table.wavelength, table.index))
-
             face, target = leaf_surface(n, 40.0), expected[2] / 100
             optics = partial(optics_of_total, face=face)
             K = brentq(lambda K, optics=optics, target=target: optics(K)[2] - target, 1e-6, 5.0)
-            assert abs(K / about - 1) < 0.005
+            assert abs(K / expected_K - 1) < 0.005
             np.testing.assert_array_equal(np.round(100 * np.array(optics(K))), expected)
 
 
 def test_paper_leaf(precision):
     leaf = Prospect.paper()
     R, T = leaf(LASERS)
-    got = 100 * np.stack([R, T, leaf.absorptance(LASERS)], axis=1)
-    assert np.sqrt(np.mean((got - TABLE_4) ** 2)) < 0.3
+    per_cent = 100 * np.stack([R, T, leaf.absorptance(LASERS)], axis=1)
+    assert np.sqrt(np.mean((per_cent - TABLE_4) ** 2)) < 0.3
 
 
 def test_between_tabulated_wavelengths_coefficients_are_interpolated():
@@ -91,12 +90,12 @@ def test_every_trait_is_differentiable(version, precision):
     leaf = Prospect(N=1.7, version=version)
     slopes, reverse = (jax.jit(kind(lambda leaf: leaf(LASERS)))(leaf) for kind in (jax.jacfwd, jax.jacrev))
     unit = float(np.finfo(precision).eps)
-    given = {name: float(getattr(leaf, name)) for name in ("N", *TRAITS[version])}
-    for name in given:
-        step = 1e-6 * max(given[name], 0.01)
+    traits = {name: float(getattr(leaf, name)) for name in ("N", *TRAITS[version])}
+    for name in traits:
+        step = 1e-6 * max(traits[name], 0.01)
         with jax.enable_x64(True):
             base, up = (
-                np.asarray(Prospect(**{**given, name: given[name] + s}, version=version)(LASERS))
+                np.asarray(Prospect(**{**traits, name: traits[name] + s}, version=version)(LASERS))
                 for s in (0, step)
             )
         for output, (forward, backward) in enumerate(zip(slopes, reverse)):
@@ -112,7 +111,7 @@ def test_gradient_at_a_trait_of_zero(trait):
     assert slope < 0
 
 
-def test_no_pigment_no_water_no_matter():
+def test_a_leaf_without_pigments_water_and_dry_matter():
     """A leaf that absorbs nothing: gradients stay finite and R + T = 1."""
     names = TRAITS["D"]
     leaf = Prospect(1.0, *np.zeros(6))
@@ -147,7 +146,8 @@ def test_traced_wavelengths(precision):
     assert np.isnan(jax.jit(lambda w: leaf(w))(jnp.array([399.0]))[0][0])
 
 
-def many(n):
+def random_leaves(n):
+    """Leaves of version D whose traits differ by up to 30 %, as one `Prospect`."""
     rng = np.random.default_rng(1)
     values = [c * rng.uniform(0.7, 1.3, n) for c in (2.0, 40.0, 8.0, 1.0, 0.1, 0.01, 0.009)]
     return jax.vmap(lambda *traits: Prospect(*traits))(*map(jnp.asarray, values))
@@ -155,17 +155,18 @@ def many(n):
 
 @pytest.mark.slow
 def test_batches(precision):
-    leaves, some = many(7), np.array([450.0, 700.5, 1550.0])
-    R, T = jax.jit(lambda leaves: prospect_spectra(leaves, some, batch_size=3))(leaves)
-    (R_too, T_too), slopes = jax.jit(lambda leaves: prospect_jacobian(leaves, some, batch_size=3))(leaves)
+    leaves, wavelengths = random_leaves(7), np.array([450.0, 700.5, 1550.0])
+    R, T = jax.jit(lambda leaves: prospect_spectra(leaves, wavelengths, batch_size=3))(leaves)
+    jacobian = jax.jit(lambda leaves: prospect_jacobian(leaves, wavelengths, batch_size=3))
+    values, slopes = jacobian(leaves)
     tolerance = 20 * float(np.finfo(precision).eps)
-    np.testing.assert_allclose((R_too, T_too), (R, T), rtol=tolerance)
+    np.testing.assert_allclose(values, (R, T), rtol=tolerance)
     assert set(slopes) == {"N", *TRAITS["D"]}
-    each = jax.jit(jax.jacfwd(lambda leaf: leaf(some)))
+    jacobian_of_leaf = jax.jit(jax.jacfwd(lambda leaf: leaf(wavelengths)))
     for i in range(7):
         leaf = jax.tree.map(lambda x, i=i: x[i], leaves)
-        np.testing.assert_allclose((R[i], T[i]), leaf(some), rtol=tolerance)
-        for output, expected in enumerate(each(leaf)):
+        np.testing.assert_allclose((R[i], T[i]), leaf(wavelengths), rtol=tolerance)
+        for output, expected in enumerate(jacobian_of_leaf(leaf)):
             for name, columns in slopes.items():
                 np.testing.assert_allclose(
                     columns[output][i], getattr(expected, name), rtol=5 * tolerance, atol=tolerance
@@ -173,19 +174,20 @@ def test_batches(precision):
 
 
 def test_pro(shared, precision):
+    """The authors' table of PROSPECT-PRO: pigments, water and index are those of PROSPECT-D."""
     table = load_coefficients(shared / "prospect" / "dataSpec_PRO.txt")
-    own = shipped("D")
-    np.testing.assert_array_equal(table.wavelength, own.wavelength)
-    np.testing.assert_array_equal(table.index, own.index)
-    np.testing.assert_array_equal(table.absorption[:5], own.absorption[:5])
+    table_D = shipped("D")
+    np.testing.assert_array_equal(table.wavelength, table_D.wavelength)
+    np.testing.assert_array_equal(table.index, table_D.index)
+    np.testing.assert_array_equal(table.absorption[:5], table_D.absorption[:5])
     leaf = Prospect(Cp=0.0, Cc=0.0, version="PRO", coefficients=table)
     np.testing.assert_array_equal(leaf(WAVELENGTHS), Prospect(Cm=0.0)(WAVELENGTHS))
     darker = Prospect(version="PRO", coefficients=table)
     assert np.all(darker.absorptance(WAVELENGTHS) >= leaf.absorptance(WAVELENGTHS))
-    # Read again it is the same table: nothing compiles anew.
-    again = load_coefficients(str(shared / "prospect" / "dataSpec_PRO.txt"))
-    assert again == table
-    assert hash(again) == hash(table)
+    # The same file is an equal table, a static field: nothing compiles anew.
+    reread = load_coefficients(str(shared / "prospect" / "dataSpec_PRO.txt"))
+    assert reread == table
+    assert hash(reread) == hash(table)
     with pytest.raises(ValueError, match=r"Cm = 0.009 .*'PRO'.*only 0 is admissible"):
         Prospect(Cm=0.009, version="PRO", coefficients=table)
     with pytest.raises(ValueError, match="coefficients"):
@@ -272,7 +274,7 @@ def test_wavelengths_refused(wavelengths):
 
 def test_batch_size_refused():
     with pytest.raises(ValueError, match="batch_size = 0"):
-        prospect_spectra(many(2), LASERS, batch_size=0)
+        prospect_spectra(random_leaves(2), LASERS, batch_size=0)
 
 
 @pytest.mark.parametrize("version", ["4", "5", "D", "PC"])
@@ -288,9 +290,9 @@ def test_shipped_tables(version):
 
 @pytest.mark.parametrize(("version", "name"), [("D", "prospectd"), ("5", "prospect5")])
 def test_shipped_tables_equal_prosail(version, name):
-    table, theirs = shipped(version), getattr(prosail.spectral_lib, name)
+    table, prosail_table = shipped(version), getattr(prosail.spectral_lib, name)
     columns = {"Cab": "kab", "Car": "kcar", "Cant": "kant", "Cbrown": "kbrown", "Cw": "kw", "Cm": "km"}
     for trait, column in zip(TRAITS[version], table.absorption):
-        # Its version 5 is stored in single precision.
-        np.testing.assert_allclose(column, getattr(theirs, columns[trait]), rtol=1e-7)
-    np.testing.assert_allclose(table.index, theirs.nr, rtol=1e-7)
+        # prosail stores its version 5 in single precision.
+        np.testing.assert_allclose(column, getattr(prosail_table, columns[trait]), rtol=1e-7)
+    np.testing.assert_allclose(table.index, prosail_table.nr, rtol=1e-7)

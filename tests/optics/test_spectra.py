@@ -15,10 +15,10 @@ WAVELENGTH, REFLECTANCE = np.array([400.0, 500.0, 900.0]), np.array([0.1, 0.3, 0
 
 
 def test_library():
-    listed = spectrum_names()
-    assert len(listed) >= 36
-    assert set(listed.values()) == {"bark", "wood", "litter", "char", "soil", "built"}
-    for name in listed:
+    kind_of_name = spectrum_names()
+    assert len(kind_of_name) >= 36
+    assert set(kind_of_name.values()) == {"bark", "wood", "litter", "char", "soil", "built"}
+    for name in kind_of_name:
         s = spectrum(name)
         assert s.name == name
         assert s.wavelength.shape == s.reflectance.shape == (180,)
@@ -27,11 +27,11 @@ def test_library():
     data = resources.files("jaxlidar") / "data"
     assert len((data / "spectra.npz").read_bytes()) < 300_000
     provenance = (data / "spectra.md").read_text()
-    for name in listed:
+    for name in kind_of_name:
         assert f"`{name}`" in provenance
 
 
-def test_materials_look_as_they_should():
+def test_bark_and_soil_have_the_brightness_and_colour_of_their_kind():
     for name in spectrum_names("bark"):
         green, infrared = spectrum(name)(LASERS)[:2]
         assert 0.04 < green < 0.4

@@ -1,4 +1,4 @@
-"""L-systems: textbook words, rules with parameters, conditions and chances, and the turtle's moves."""
+"""L-systems: words of the textbook, parametric, conditional and stochastic rules, and the turtle's moves."""
 
 import numpy as np
 import pytest
@@ -62,12 +62,12 @@ def test_stochastic_rules_are_chosen_by_weight():
     word = jl.LSystem("A" * 80_000, rules).rewrite(1, seed=1)
     counts = [word.where(symbol).size for symbol in "XYZ"]
     assert stats.chisquare(counts, [10_000, 20_000, 50_000]).pvalue > 1e-3
-    # The test rejects weights that are a little different.
+    # The test rejects weights that differ by a few per cent.
     assert stats.chisquare(counts, [10_600, 19_400, 50_000]).pvalue < 1e-3
     # Neighbours are chosen independently.
     is_z = word.codes == ord("Z")
-    both = np.count_nonzero(is_z[:-1] & is_z[1:])
-    assert abs(both - 79_999 * 0.625**2) < 4 * np.sqrt(79_999 * 0.625**2)
+    pairs = np.count_nonzero(is_z[:-1] & is_z[1:])
+    assert abs(pairs - 79_999 * 0.625**2) < 4 * np.sqrt(79_999 * 0.625**2)
 
 
 def test_weights_may_depend_on_parameters_and_vanish():
@@ -76,8 +76,8 @@ def test_weights_may_depend_on_parameters_and_vanish():
         jl.Rule("A", lambda n: "Y", weight=lambda n: 1 - n),
     ]
     assert str(jl.LSystem([("A", 0), ("A", 1), ("A", 0)], rules).rewrite()) == "YXY"
-    none = jl.Rule("A", lambda n: "X", weight=lambda n: 0 * n)
-    assert str(jl.LSystem([("A", 3)], [none]).rewrite()) == "A(3)"
+    weightless = jl.Rule("A", lambda n: "X", weight=lambda n: 0 * n)
+    assert str(jl.LSystem([("A", 3)], [weightless]).rewrite()) == "A(3)"
 
 
 def test_random_parameters_come_from_the_seed():
@@ -99,8 +99,8 @@ def test_koch_curve():
     assert np.isclose(tree.end[:, 1].max(), np.sqrt(3) / 6)
 
 
-def test_a_users_binary_tree():
-    """The example of the module's docstring."""
+def test_a_binary_tree_by_ones_own_rules():
+    """The example of `LSystem`: every fork has a branch of 0.8 and one of 0.6 times its radius."""
     grow = jl.Rule(
         "A",
         lambda r: [("F", 50 * r, r), "[", ("+", 35), ("A", 0.8 * r), "]", ("-", 20), "/", ("A", 0.6 * r)],
@@ -132,7 +132,7 @@ def test_a_users_binary_tree():
     ],
 )
 def test_turns(moves, heading, left):
-    """The turtle looks east and its left is north; a step after a turn left shows where left is."""
+    """A turtle that looks east, with north at its left: a step, then one after a turn left."""
     tree = jl.turtle(moves + "F+FJ", heading=(1, 0, 0), left=(0, 1, 0))
     steps = tree.end - tree.start
     assert np.allclose(steps, [heading, left], atol=1e-12)
@@ -141,13 +141,13 @@ def test_turns(moves, heading, left):
 
 
 def test_tropism_bends_in_proportion_to_the_sine():
-    at = np.deg2rad(30)
-    heading = (np.sin(at), 0, np.cos(at))
+    zenith = np.deg2rad(30)
+    heading = (np.sin(zenith), 0, np.cos(zenith))
     for angle in (20.0, -20.0):
         word = jl.Word.of([("T", angle), "F"])
         tree = jl.turtle(word, heading=heading, left=(0, 1, 0))
-        now = np.arctan2(tree.end[0, 0], tree.end[0, 2])
-        assert np.isclose(np.rad2deg(now), 30 - 0.5 * angle)
+        bent = np.arctan2(tree.end[0, 0], tree.end[0, 2])
+        assert np.isclose(np.rad2deg(bent), 30 - 0.5 * angle)
     assert np.allclose(jl.turtle("TF").end, [[0, 0, 1]])
 
 
@@ -157,7 +157,7 @@ def test_rolling_to_the_horizontal():
     assert np.allclose(jl.turtle("$F").end, [[0, 0, 1]])
 
 
-def test_segments_buds_and_what_connects_them():
+def test_segments_buds_parents_and_orders():
     word = jl.Word.of(
         [("F", 2, 0.2), "[", ("+", 90), ("F", 1, 0.1, 0.05), "FJ]X", ("f", 1), ("!", 0.03), "F", ("J", 0.07)]
     )
@@ -178,7 +178,7 @@ def test_empty_words_are_trees_without_segments():
 
 
 @pytest.mark.parametrize(
-    ("call", "says"),
+    ("call", "message"),
     [
         (lambda: jl.Word.of([("AB", 1)]), "symbol in the word = 'AB' is not one character"),
         (lambda: jl.Word.of([("A", np.nan)]), "parameter 1 of 'A' in the word = nan is outside"),
@@ -209,6 +209,6 @@ def test_empty_words_are_trees_without_segments():
         (lambda: jl.turtle(jl.Word.of([("F", 1, -0.1)])), "radius_start = -0.1 is outside"),
     ],
 )
-def test_inadmissible_input_is_refused(call, says):
-    with pytest.raises(ValueError, match=says):
+def test_inadmissible_input_is_refused(call, message):
+    with pytest.raises(ValueError, match=message):
         call()

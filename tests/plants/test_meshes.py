@@ -14,42 +14,43 @@ def areas(voxels):
     return 2 * np.asarray(voxels.leaf, float) * np.prod(np.asarray(voxels.voxel_size, float))
 
 
-def mesh_of(other):
-    return jl.Mesh(np.asarray(other.vertices), np.asarray(other.faces))
+def mesh_of(trimesh_mesh):
+    """A mesh of the package trimesh as one of jaxlidar."""
+    return jl.Mesh(np.asarray(trimesh_mesh.vertices), np.asarray(trimesh_mesh.faces))
 
 
-def scattered(n, seed=0, size=0.3):
-    """Triangles of any direction and about that size, some with corners or sides in planes of the grid."""
+def random_triangles(n, seed=0, size=0.3):
+    """Triangles of random directions, about `size` m; some with corners or sides in planes of the grid."""
     rng = np.random.default_rng(seed)
     corners = rng.uniform(0.0, 3.0, (n, 1, 3)) + size * rng.normal(size=(n, 3, 3))
     corners[::3] = np.round(corners[::3] * 4) / 4
     return jl.Mesh(corners.reshape(-1, 3), np.arange(3 * n).reshape(-1, 3))
 
 
-def test_area_is_conserved_and_the_triangles_order_is_nothing(precision):
-    mesh = scattered(3000)
+def test_area_is_conserved_and_the_order_of_triangles_and_corners_does_not_matter(precision):
+    mesh = random_triangles(3000)
     total = areas(jl.voxelise_mesh(mesh, (0.25, 0.5, 1.0)))
-    exact = {"float32": 1e-6, "float64": 1e-12}[precision]
-    assert total.sum() == pytest.approx(mesh.area.sum(), rel=exact)
-    turned = jl.Mesh(mesh.vertices, mesh.faces[::-1, [2, 0, 1]])
-    np.testing.assert_allclose(areas(jl.voxelise_mesh(turned, (0.25, 0.5, 1.0))), total, atol=1e-6)
+    tolerance = {"float32": 1e-6, "float64": 1e-12}[precision]
+    assert total.sum() == pytest.approx(mesh.area.sum(), rel=tolerance)
+    reordered = jl.Mesh(mesh.vertices, mesh.faces[::-1, [2, 0, 1]])
+    np.testing.assert_allclose(areas(jl.voxelise_mesh(reordered, (0.25, 0.5, 1.0))), total, atol=1e-6)
 
 
-def test_voxels_of_a_mesh_have_the_area_that_another_implementation_cuts_out():
+def test_voxels_of_a_mesh_have_the_area_that_trimesh_cuts_out():
     sphere = trimesh.creation.icosphere(subdivisions=2, radius=1.1)
     sphere.apply_translation((0.03, -0.11, 0.21))
     voxels = jl.voxelise_mesh(mesh_of(sphere), 0.4)
-    found, low = areas(voxels), np.asarray(voxels.origin, float)
-    met = np.argwhere(found > 0)
-    assert len(met) > 100
-    for voxel in met[::9]:
+    leaf_area, low = areas(voxels), np.asarray(voxels.origin, float)
+    occupied = np.argwhere(leaf_area > 0)
+    assert len(occupied) > 100
+    for voxel in occupied[::9]:
         corner = low + 0.4 * voxel
         planes = [(corner, n) for n in np.eye(3)] + [(corner + 0.4, -n) for n in np.eye(3)]
-        inside = sphere.vertices, sphere.faces
+        vertices, faces = sphere.vertices, sphere.faces
         for origin, normal in planes:
-            inside = trimesh.intersections.slice_faces_plane(*inside, normal, origin)[:2]
-        area = trimesh.triangles.area(inside[0][inside[1]]).sum()
-        assert found[tuple(voxel)] == pytest.approx(area, rel=1e-5, abs=1e-8)
+            vertices, faces, _ = trimesh.intersections.slice_faces_plane(vertices, faces, normal, origin)
+        area = trimesh.triangles.area(vertices[faces]).sum()
+        assert leaf_area[tuple(voxel)] == pytest.approx(area, rel=1e-5, abs=1e-8)
 
 
 def test_a_tilted_plane():
@@ -57,11 +58,11 @@ def test_a_tilted_plane():
     steep = np.array([[0, 0, 0.1], [3, 0, 6.1], [3, 2, 6.1], [0, 2, 0.1]])
     voxels = jl.voxelise_mesh(jl.Mesh(steep, np.array([[0, 1, 2], [0, 2, 3]])), 1.0)
     assert voxels.shape == (3, 2, 7)
-    # Of z = 2 x + 0.1, the length in x of each voxel's part.
-    share = np.array(
+    # The length in x of the plane z = 2 x + 0.1 within each voxel.
+    length = np.array(
         [[0.45, 0.5, 0.05] + [0] * 4, [0] * 2 + [0.45, 0.5, 0.05] + [0] * 2, [0] * 4 + [0.45, 0.5, 0.05]]
     )
-    np.testing.assert_allclose(areas(voxels), np.sqrt(5) * share[:, None, :].repeat(2, axis=1), atol=1e-6)
+    np.testing.assert_allclose(areas(voxels), np.sqrt(5) * length[:, None, :].repeat(2, axis=1), atol=1e-6)
 
 
 def test_layers_of_a_sphere():
@@ -75,17 +76,18 @@ def test_layers_of_a_sphere():
 def test_leaf_angles_are_those_of_the_normals():
     sphere = jl.voxelise_mesh(mesh_of(trimesh.creation.icosphere(subdivisions=5)), 1.0)
     spherical = jl.LeafAngles.named("spherical").normalised()
-    # Twenty thousand triangles fill cells unevenly; how many lie below an inclination is even.
-    shares = (np.cumsum(probability) for probability in (sphere.leaf_angles.normalised(), spherical))
-    np.testing.assert_allclose(*shares, atol=1e-2)
+    # Twenty thousand triangles fill cells unevenly; their distribution function is even.
+    cumulative = (np.cumsum(probability) for probability in (sphere.leaf_angles.normalised(), spherical))
+    np.testing.assert_allclose(*cumulative, atol=1e-2)
     flat = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    # G towards the nadir of a horizontal and of a vertical triangle.
     for corners, nadir in (([0, 1, 2], 1.0), ([0, 1, 3], 0.0)):
         angles = jl.voxelise_mesh(jl.Mesh(flat, np.array([corners])), 1.0).leaf_angles
         # Cells are a degree wide.
         assert float(angles.tables()[0][-1]) == pytest.approx(nadir, abs=0.01)
-    named = jl.voxelise_mesh(scattered(10), 1.0, leaf_angles="planophile").leaf_angles
+    named = jl.voxelise_mesh(random_triangles(10), 1.0, leaf_angles="planophile").leaf_angles
     assert np.array_equal(named.probability, jl.LeafAngles.named("planophile").probability)
-    assert jl.voxelise_mesh(scattered(10), 1.0, leaf_angles="spherical").leaf_angles is None
+    assert jl.voxelise_mesh(random_triangles(10), 1.0, leaf_angles="spherical").leaf_angles is None
 
 
 def test_bark_is_a_quarter_of_its_surface_and_materials_are_chosen_by_name():
@@ -93,29 +95,30 @@ def test_bark_is_a_quarter_of_its_surface_and_materials_are_chosen_by_name():
     n = len(box.faces)
     faces = np.concatenate([box.faces, box.faces[:2]])
     mesh = jl.Mesh(np.asarray(box.vertices), faces, np.repeat([1, 0], [n, 2]), ("leaf", "trunk", "pot"))
-    both = jl.voxelise_mesh(mesh, 0.5, bark="trunk")
-    assert float(both.bark.sum()) * 0.5**3 == pytest.approx(box.area / 4, rel=1e-6)
-    assert areas(both).sum() == pytest.approx(mesh.area[n:].sum(), rel=1e-6)
-    wood = jl.voxelise_mesh(mesh, 0.5, leaf=(), bark=["trunk"])
-    assert wood.leaf is None
-    green = jl.voxelise_mesh(mesh, 0.5, leaf="leaf")
-    assert green.bark is None
-    assert areas(green).sum() == pytest.approx(mesh.area[n:].sum(), rel=1e-6)
+    leaf_and_bark = jl.voxelise_mesh(mesh, 0.5, bark="trunk")
+    assert float(leaf_and_bark.bark.sum()) * 0.5**3 == pytest.approx(box.area / 4, rel=1e-6)
+    assert areas(leaf_and_bark).sum() == pytest.approx(mesh.area[n:].sum(), rel=1e-6)
+    bark_only = jl.voxelise_mesh(mesh, 0.5, leaf=(), bark=["trunk"])
+    assert bark_only.leaf is None
+    leaf_only = jl.voxelise_mesh(mesh, 0.5, leaf="leaf")
+    assert leaf_only.bark is None
+    assert areas(leaf_only).sum() == pytest.approx(mesh.area[n:].sum(), rel=1e-6)
 
 
 def test_a_given_grid_and_pieces_in_its_faces():
     """A sheet in the face between two voxels lies in the upper one, and at the top in the last."""
     sheet = np.array([[0.0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]])
     faces = np.array([[0, 1, 2], [0, 2, 3]])
-    for layers, own in ((2, 1), (1, 0)):
+    for layers, occupied in ((2, 1), (1, 0)):
         voxels = jl.voxelise_mesh(jl.Mesh(sheet, faces), 1.0, origin=(0, 0, 0), shape=(1, 1, layers))
-        assert areas(voxels)[0, 0, own] == 1.0
-    near = jl.Mesh(sheet * [1, 1, 1 - 1e-12], faces)
-    assert areas(jl.voxelise_mesh(near, 1.0, origin=(0, 0, 0), shape=(1, 1, 2)))[0, 0, 1] == 1.0
+        assert areas(voxels)[0, 0, occupied] == 1.0
+    # Below the face by less than rounding: in the face.
+    just_below = jl.Mesh(sheet * [1, 1, 1 - 1e-12], faces)
+    assert areas(jl.voxelise_mesh(just_below, 1.0, origin=(0, 0, 0), shape=(1, 1, 2)))[0, 0, 1] == 1.0
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "message"),
     [
         ({"bark": "stem"}, "'stem' is no material of the mesh; it has 'mesh'"),
         ({"leaf": "mesh", "bark": "mesh"}, "'mesh' is among the materials of leaf and of bark"),
@@ -125,22 +128,22 @@ def test_a_given_grid_and_pieces_in_its_faces():
         ({"origin": (0, 0, 0), "shape": (1, 1, 1)}, "out of the grid"),
     ],
 )
-def test_inadmissible_arguments(change, says):
-    with pytest.raises(ValueError, match=says):
-        jl.voxelise_mesh(**{"mesh": scattered(10), "voxel_size": 0.5, **change})
+def test_inadmissible_arguments(change, message):
+    with pytest.raises(ValueError, match=message):
+        jl.voxelise_mesh(**{"mesh": random_triangles(10), "voxel_size": 0.5, **change})
 
 
 def test_inadmissible_meshes():
-    place, face = np.eye(3), np.array([[0, 1, 2]])
-    for arguments, says in (
-        ((place * np.nan, face), "vertices = nan"),
-        ((place, face + 1), r"faces = 3 .*\[0, 2\]"),
-        ((place, face - 1), "faces = -1"),
-        ((place, face[:0]), "faces is empty"),
-        ((place, face, np.array([1])), "material = 1"),
-        ((place, face, np.array([0]), ("a", "a")), "has a name twice"),
+    vertices, face = np.eye(3), np.array([[0, 1, 2]])
+    for arguments, message in (
+        ((vertices * np.nan, face), "vertices = nan"),
+        ((vertices, face + 1), r"faces = 3 .*\[0, 2\]"),
+        ((vertices, face - 1), "faces = -1"),
+        ((vertices, face[:0]), "faces is empty"),
+        ((vertices, face, np.array([1])), "material = 1"),
+        ((vertices, face, np.array([0]), ("a", "a")), "has a name twice"),
     ):
-        with pytest.raises(ValueError, match=says):
+        with pytest.raises(ValueError, match=message):
             jl.Mesh(*arguments)
     line = jl.Mesh(np.array([[0.0, 0, 0], [1, 1, 1], [2, 2, 2]]), face)
     with pytest.raises(ValueError, match="1 triangles are leaf or bark, none with an area"):
@@ -168,7 +171,9 @@ f 1 1 2
 
 
 @pytest.fixture
-def written(tmp_path):
+def obj_file(tmp_path):
+    """A function that writes a text to a file, and returns its path."""
+
     def write(text):
         path = tmp_path / "plant.obj"
         path.write_text(text)
@@ -177,30 +182,30 @@ def written(tmp_path):
     return write
 
 
-def test_an_obj_file(written):
-    mesh, dropped = read_obj(written(OBJ))
+def test_an_obj_file(obj_file):
+    mesh, dropped = read_obj(obj_file(OBJ))
     assert mesh.materials == ("green leaf", "stem")
     assert mesh.material.tolist() == [0, 0, 1]
     assert mesh.area.tolist() == [1.0, 1.0, 1.0]
     assert dropped == {"without an area": 1}
-    groups, _ = read_obj(written(OBJ), part="group", scale=0.1, up="y")
+    groups, _ = read_obj(obj_file(OBJ), part="group", scale=0.1, up="y")
     assert groups.materials == ("unnamed", "lower")
     assert groups.area.sum() == pytest.approx(0.03)
     np.testing.assert_allclose(groups.vertices[0], [0.0, -0.1, 0.0])
-    assert read_obj(written(OBJ), part="object")[0].materials == ("plant",)
+    assert read_obj(obj_file(OBJ), part="object")[0].materials == ("plant",)
 
 
-def test_what_another_package_writes(written):
-    other = trimesh.creation.icosphere(subdivisions=2)
-    mesh, dropped = read_obj(written(trimesh.exchange.obj.export_obj(other, digits=17)))
-    np.testing.assert_array_equal(mesh.vertices, other.vertices)
-    np.testing.assert_array_equal(mesh.faces, other.faces)
-    assert mesh.area.sum() == pytest.approx(other.area)
+def test_an_obj_file_that_trimesh_writes(obj_file):
+    sphere = trimesh.creation.icosphere(subdivisions=2)
+    mesh, dropped = read_obj(obj_file(trimesh.exchange.obj.export_obj(sphere, digits=17)))
+    np.testing.assert_array_equal(mesh.vertices, sphere.vertices)
+    np.testing.assert_array_equal(mesh.faces, sphere.faces)
+    assert mesh.area.sum() == pytest.approx(sphere.area)
     assert (mesh.materials, dropped) == (("unnamed",), {"without an area": 0})
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "message"),
     [
         (("v 2 1 1", "v 2 x 1"), "line 6: y = 'x' is no number"),
         (("v 2 1 1", "v 2 nan 1"), r"line 6: vertex at \(2.0, nan, 1.0\)"),
@@ -216,18 +221,18 @@ def test_what_another_package_writes(written):
         (("f ", "p "), "line 17: there is no face in the file"),
     ],
 )
-def test_damaged_obj_files(written, change, says):
-    with pytest.raises(ValueError, match=rf"plant.obj: {says}"):
-        read_obj(written(OBJ.replace(*change)))
+def test_damaged_obj_files(obj_file, change, message):
+    with pytest.raises(ValueError, match=rf"plant.obj: {message}"):
+        read_obj(obj_file(OBJ.replace(*change)))
 
 
-def test_faces_without_any_area(written):
+def test_faces_without_any_area(obj_file):
     with pytest.raises(ValueError, match=r"plant\.obj: line 3: 1 triangles, none with an area"):
-        read_obj(written("v 0 0 0\nv 1 1 1\nf 1 1 2\n"))
+        read_obj(obj_file("v 0 0 0\nv 1 1 1\nf 1 1 2\n"))
 
 
-def test_a_case_voxelises_a_mesh(written, tmp_path):
-    written(OBJ)
+def test_a_case_voxelises_a_mesh(obj_file, tmp_path):
+    obj_file(OBJ)
     case = tmp_path / "case.toml"
     case.write_text(
         '[scene.canopy]\nleaf = "Prospect"\nbark = 0.3\n[scene.canopy.voxels]\nkind = "voxelise_mesh"\n'

@@ -18,12 +18,12 @@ def individuals():
 
 
 def excess_at_nodes(tree, exponent=2.0):
-    """At each segment that bears others: their thickness' sum over its own, less 1, in da Vinci's sense."""
-    on = tree.parent >= 0
+    """Relative excess over da Vinci's rule, sum of d_i^p over d^p less 1, at each segment with children."""
+    is_child = tree.parent >= 0
     n = len(tree.parent)
-    thickness = np.bincount(tree.parent[on], tree.radius_start[on] ** exponent, minlength=n)
-    bears = np.bincount(tree.parent[on], minlength=n) > 0
-    return thickness[bears] / tree.radius_end[bears] ** exponent - 1
+    sum_of_children = np.bincount(tree.parent[is_child], tree.radius_start[is_child] ** exponent, minlength=n)
+    is_node = np.bincount(tree.parent[is_child], minlength=n) > 0
+    return sum_of_children[is_node] / tree.radius_end[is_node] ** exponent - 1
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -33,7 +33,7 @@ def test_the_default_is_table_2(seed):
     assert tree.trunk_diameter == pytest.approx(0.89, rel=1e-12)
     assert tree.smallest_diameter == pytest.approx(0.03, rel=1e-9)
     assert np.allclose(2 * tree.bud_radius, 0.06)
-    # With its leaves as well: the topmost shoots reach little higher than the wood.
+    # Leaves included: the topmost shoots reach little higher than the wood.
     assert (tree.bud_position + tree.bud_radius[:, None])[:, 2].max() == pytest.approx(15.0, rel=0.05)
 
 
@@ -62,21 +62,22 @@ def test_da_vincis_rule_holds_at_every_node(name, individuals):
 def test_da_vincis_exponent_is_a_parameter():
     tree = jl.grow(jl.broadleaf(exponent=2.4), seed=1)
     assert np.abs(excess_at_nodes(tree, 2.4)).max() < 1e-9
-    # The measure tells one exponent from the other.
+    # The excess distinguishes the exponents.
     assert np.abs(excess_at_nodes(tree, 2.0)).max() > 0.05
 
 
 @pytest.mark.parametrize("name", HABITS)
 def test_segments_start_where_their_parents_end(name, individuals):
     for tree in individuals[name]:
-        on = ~tree.roots
-        assert np.array_equal(tree.start[on], tree.end[tree.parent[on]])
-        step = tree.order[on] - tree.order[tree.parent[on]]
+        is_child = ~tree.roots
+        parent = tree.parent[is_child]
+        assert np.array_equal(tree.start[is_child], tree.end[parent])
+        step = tree.order[is_child] - tree.order[parent]
         assert np.all((step == 0) | (step == 1))
         assert np.all(tree.order[tree.roots] == 0)
         assert np.all(tree.length > 0)
-        # At most one of the children goes on as the same axis.
-        assert np.bincount(tree.parent[on][step == 0]).max() == 1
+        # At most one of the children continues the same axis.
+        assert np.bincount(parent[step == 0]).max() == 1
 
 
 @pytest.mark.parametrize("name", HABITS)
@@ -86,9 +87,9 @@ def test_twigs_end_at_the_smallest_diameter_and_bear_the_buds(name, individuals)
     tips = np.setdiff1d(np.arange(len(tree.parent)), tree.parent)
     assert np.allclose(2 * tree.radius_end[tips], habit.smallest_diameter)
     assert len(tree.bud_radius) == len(tips) * habit.shoots * habit.shoot_buds
-    # Each tip ends with at least the smallest cross-section, and none is lost on the way.
-    stems = np.sum(tree.radius_start[tree.roots] ** 2) / (0.5 * habit.smallest_diameter) ** 2
-    assert stems / 2 < len(tips) <= stems * (1 + 1e-9)
+    # Each tip ends with at least the smallest cross-section, and nodes conserve it.
+    max_tips = np.sum(tree.radius_start[tree.roots] ** 2) / (0.5 * habit.smallest_diameter) ** 2
+    assert max_tips / 2 < len(tips) <= max_tips * (1 + 1e-9)
     nearest = np.min(
         np.linalg.norm(tree.bud_position[::97, None] - tree.end[None, tips], axis=2), axis=1, initial=np.inf
     )
@@ -96,20 +97,22 @@ def test_twigs_end_at_the_smallest_diameter_and_bear_the_buds(name, individuals)
 
 
 def test_seeds_make_individuals():
-    one, same, other = (jl.grow(seed=seed) for seed in (5, 5, 6))
+    tree, repeated, different = (jl.grow(seed=seed) for seed in (5, 5, 6))
     for name in ("start", "end", "radius_start", "parent", "bud_position", "bud_direction"):
-        assert np.array_equal(getattr(one, name), getattr(same, name))
-    assert one.end.shape != other.end.shape or not np.allclose(one.end, other.end)
-    assert not np.allclose(one.end[:9], other.end[:9])
+        assert np.array_equal(getattr(tree, name), getattr(repeated, name))
+    assert tree.end.shape != different.end.shape or not np.allclose(tree.end, different.end)
+    assert not np.allclose(tree.end[:9], different.end[:9])
 
 
 def test_habits_differ_as_their_names_say(individuals):
+    """Conifers are conical with a straight trunk, shrubs have nine stems, spreading trees are the widest."""
+
     def widths(tree):
         """Mean distance of the wood from the axis, in the lower and the upper half of the crown."""
         tips = np.setdiff1d(np.arange(len(tree.parent)), tree.parent)
-        z, away = tree.end[tips, 2], np.hypot(tree.end[tips, 0], tree.end[tips, 1])
+        z, distance = tree.end[tips, 2], np.hypot(tree.end[tips, 0], tree.end[tips, 1])
         middle = 0.5 * (z.min() + z.max())
-        return away[z < middle].mean(), away[z >= middle].mean()
+        return distance[z < middle].mean(), distance[z >= middle].mean()
 
     for tree in individuals["conifer"]:
         low, high = widths(tree)
@@ -118,21 +121,24 @@ def test_habits_differ_as_their_names_say(individuals):
         assert np.hypot(*tree.end[trunk, :2].T).max() < 0.06 * tree.height
     for tree in individuals["shrub"]:
         assert tree.roots.sum() == 9
-    slim = np.mean([np.ptp(t.end[:, :2], axis=0).mean() / t.height for t in individuals["broadleaf"]])
-    wide = np.mean([np.ptp(t.end[:, :2], axis=0).mean() / t.height for t in individuals["spreading"]])
-    assert wide > 1.0 > slim
+    width_of_broadleaf, width_of_spreading = (
+        np.mean([np.ptp(t.end[:, :2], axis=0).mean() / t.height for t in individuals[name]])
+        for name in ("broadleaf", "spreading")
+    )
+    assert width_of_spreading > 1.0 > width_of_broadleaf
 
 
-def test_angles_between_fork_and_branch_are_as_asked():
-    how = jl.Branching(angle=40.0, angle_spread=0.0, bend=0.0, tropism=0.0)
-    tree = jl.grow(jl.Habit(trunk=how, branches=how), seed=2)
+def test_laterals_have_the_angle_of_their_branching_to_the_axis():
+    branching = jl.Branching(angle=40.0, angle_spread=0.0, bend=0.0, tropism=0.0)
+    tree = jl.grow(jl.Habit(trunk=branching, branches=branching), seed=2)
     direction = (tree.end - tree.start) / tree.length[:, None]
-    on = np.flatnonzero(~tree.roots)
-    onward = np.zeros(len(tree.parent), dtype=int)
-    same = on[tree.order[on] == tree.order[tree.parent[on]]]
-    onward[tree.parent[same]] = same
-    lateral = on[tree.order[on] > tree.order[tree.parent[on]]]
-    cosine = np.sum(direction[lateral] * direction[onward[tree.parent[lateral]]], axis=1)
+    child = np.flatnonzero(~tree.roots)
+    # For each segment, the child that continues its axis.
+    continuation = np.zeros(len(tree.parent), dtype=int)
+    continues = child[tree.order[child] == tree.order[tree.parent[child]]]
+    continuation[tree.parent[continues]] = continues
+    lateral = child[tree.order[child] > tree.order[tree.parent[child]]]
+    cosine = np.sum(direction[lateral] * direction[continuation[tree.parent[lateral]]], axis=1)
     assert np.allclose(np.rad2deg(np.arccos(cosine)), 40.0, atol=1e-4)
 
 
@@ -143,9 +149,9 @@ def test_leaf_off_keeps_the_wood(individuals):
     assert bare.clump_volume == 0
     assert bare.start is tree.start
     assert bare.wood_volume == tree.wood_volume
-    never = jl.grow(jl.broadleaf(shoots=0))
-    assert np.array_equal(never.end, tree.end)
-    assert len(never.bud_radius) == 0
+    without_shoots = jl.grow(jl.broadleaf(shoots=0))
+    assert np.array_equal(without_shoots.end, tree.end)
+    assert len(without_shoots.bud_radius) == 0
 
 
 def test_no_leaves_grow_in_the_ground():
@@ -161,8 +167,9 @@ def test_bud_radius_changes_cover(individuals):
     assert np.isclose(tree.with_bud_radius(0.06).clump_volume, 8 * tree.clump_volume)
 
 
-def frustum(**changes):
-    parts = {
+def frustum_and_cylinder(**changes):
+    """A tapering trunk, a level branch, and a clump at its end; `changes` replace fields of the tree."""
+    fields = {
         "start": np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 4.0]]),
         "end": np.array([[0.0, 0.0, 4.0], [0.0, 4.0, 4.0]]),
         "radius_start": np.array([0.2, 0.1]),
@@ -173,22 +180,22 @@ def frustum(**changes):
         "bud_direction": np.array([[0.0, 1.0, 0.0]]),
         "bud_radius": np.array([0.5]),
     }
-    return jl.Tree(**{**parts, **changes})
+    return jl.Tree(**{**fields, **changes})
 
 
 def test_volumes_are_those_of_frustums_and_spheres():
-    tree = frustum()
+    tree = frustum_and_cylinder()
     assert np.isclose(tree.wood_volume, np.pi / 3 * 3 * (0.04 + 0.02 + 0.01) + np.pi * 0.01 * 4)
     assert np.isclose(tree.clump_volume, 4 / 3 * np.pi * 0.125)
     assert (tree.height, tree.trunk_diameter, tree.smallest_diameter) == (3.0, 0.4, 0.2)
 
 
 def test_moves_turns_and_sizes():
-    tree = frustum()
+    tree = frustum_and_cylinder()
     moved = tree.translated((1.0, 2.0, 3.0))
     assert np.allclose(moved.base, [1, 2, 4])
     assert np.allclose(moved.bud_position, [[2, 6, 7]])
-    # What pointed north points east: azimuths are clockwise.
+    # The branch to the north then leads east: azimuths are clockwise.
     turned = tree.rotated(90.0)
     assert np.allclose(turned.end[1], [4, 0, 4])
     assert np.allclose(turned.bud_position, [[4, -1, 4]])
@@ -200,31 +207,31 @@ def test_moves_turns_and_sizes():
 
 
 def test_trees_join():
-    tree = frustum()
-    both = jl.Tree.joined([tree, tree.translated((9.0, 0.0, 0.0)), tree.leafless()])
-    assert both.parent.tolist() == [-1, 0, -1, 2, -1, 4]
-    assert np.isclose(both.wood_volume, 3 * tree.wood_volume)
-    assert len(both.bud_radius) == 2
+    tree = frustum_and_cylinder()
+    joined = jl.Tree.joined([tree, tree.translated((9.0, 0.0, 0.0)), tree.leafless()])
+    assert joined.parent.tolist() == [-1, 0, -1, 2, -1, 4]
+    assert np.isclose(joined.wood_volume, 3 * tree.wood_volume)
+    assert len(joined.bud_radius) == 2
 
 
-def test_a_forest_keeps_its_distances_and_density():
+def test_a_forest_has_its_density_and_minimum_distance():
     trees = jl.forest(jl.shrub(shoots=0), density=600.0, area=(50.0, 30.0), minimum_distance=2.5, seed=4)
     assert len(trees) == 90
-    place = np.array([tree.base for tree in trees])
-    assert np.all((place >= 0) & (place <= [50, 30, 0]))
-    gap = np.linalg.norm(place[:, None] - place[None], axis=2)[np.triu_indices(90, 1)]
+    position = np.array([tree.base for tree in trees])
+    assert np.all((position >= 0) & (position <= [50, 30, 0]))
+    gap = np.linalg.norm(position[:, None] - position[None], axis=2)[np.triu_indices(90, 1)]
     assert 2.5 <= gap.min() < 3.0
-    again = jl.forest(jl.shrub(shoots=0), density=600.0, area=(50.0, 30.0), minimum_distance=2.5, seed=4)
-    assert all(np.array_equal(a.end, b.end) for a, b in zip(trees, again, strict=True))
+    repeated = jl.forest(jl.shrub(shoots=0), density=600.0, area=(50.0, 30.0), minimum_distance=2.5, seed=4)
+    assert all(np.array_equal(a.end, b.end) for a, b in zip(trees, repeated, strict=True))
 
 
-def test_without_a_distance_places_are_even():
+def test_without_a_minimum_distance_positions_are_uniform():
     bush = jl.shrub(shoots=0, stems=1, smallest_diameter=0.05)
     trees = jl.forest(bush, density=1e4, area=(40.0, 20.0), minimum_distance=0.0, origin=(5.0, -3.0, 7.0))
-    place = np.array([tree.base for tree in trees])
-    assert stats.kstest(place[:, 0], stats.uniform(5.0, 40.0).cdf).pvalue > 1e-3
-    assert stats.kstest(place[:, 1], stats.uniform(-3.0, 20.0).cdf).pvalue > 1e-3
-    assert np.allclose(place[:, 2], 7.0)
+    position = np.array([tree.base for tree in trees])
+    assert stats.kstest(position[:, 0], stats.uniform(5.0, 40.0).cdf).pvalue > 1e-3
+    assert stats.kstest(position[:, 1], stats.uniform(-3.0, 20.0).cdf).pvalue > 1e-3
+    assert np.allclose(position[:, 2], 7.0)
 
 
 def test_a_forest_mixes_habits_by_shares_and_sizes():
@@ -241,11 +248,11 @@ def test_a_forest_mixes_habits_by_shares_and_sizes():
     height = np.array([tree.height for tree in trees])
     assert abs(np.mean(height > 5) - 0.75) < 4 * np.sqrt(0.75 * 0.25 / 800)
     assert len(np.unique(height.round(6))) == 16
-    each = [
-        tree.height for tree in jl.forest(low, density=100, area=(40, 20), size=(0.5, 1), individuals=None)
-    ]
-    assert len(set(each)) == 8
-    assert 0.5 <= min(each) <= max(each) <= 1.0
+    # Eight trees, each grown for itself.
+    trees = jl.forest(low, density=100, area=(40, 20), size=(0.5, 1), individuals=None)
+    heights = [tree.height for tree in trees]
+    assert len(set(heights)) == 8
+    assert 0.5 <= min(heights) <= max(heights) <= 1.0
 
 
 def test_a_hundred_default_trees():
@@ -255,7 +262,7 @@ def test_a_hundred_default_trees():
 
 
 @pytest.mark.parametrize(
-    ("call", "says"),
+    ("call", "message"),
     [
         (lambda: jl.Habit(height=-1.0), "height = -1 is outside"),
         (lambda: jl.Habit(trunk_diameter=np.nan), "trunk_diameter = nan is outside"),
@@ -281,19 +288,19 @@ def test_a_hundred_default_trees():
         (lambda: jl.Branching(divergence=np.inf), "divergence = inf is outside"),
         (lambda: jl.Branching(bend=-1.0), "bend = -1 is outside"),
         (lambda: jl.Branching(tropism=np.nan), "tropism = nan is outside"),
-        (lambda: frustum(start=np.full((2, 3), np.nan)), "start = nan is outside"),
-        (lambda: frustum(end=np.full((2, 3), np.inf)), "end = inf is outside"),
-        (lambda: frustum(radius_start=np.array([0.1, 0.0])), "radius_start = 0 is outside"),
-        (lambda: frustum(radius_end=np.array([0.1, -1.0])), "radius_end = -1 is outside"),
-        (lambda: frustum(bud_radius=np.array([0.0])), "bud_radius = 0 is outside"),
-        (lambda: frustum(bud_direction=np.full((1, 3), 2.0)), "length of bud_direction = 3.46"),
-        (lambda: frustum(parent=np.array([-1, 1])), "parent = 1 of segment 1 is outside"),
-        (lambda: frustum(parent=np.array([-2, 0])), "parent = -2 is outside"),
-        (lambda: frustum(order=np.array([0, -1])), "order = -1 is outside"),
-        (lambda: frustum().scaled(0.0), "factor = 0 is outside"),
-        (lambda: frustum().translated((0.0, 0.0, np.nan)), "offset = nan is outside"),
-        (lambda: frustum().rotated(np.inf), "angle = inf is outside"),
-        (lambda: frustum().with_bud_radius(0.0), "radius = 0 is outside"),
+        (lambda: frustum_and_cylinder(start=np.full((2, 3), np.nan)), "start = nan is outside"),
+        (lambda: frustum_and_cylinder(end=np.full((2, 3), np.inf)), "end = inf is outside"),
+        (lambda: frustum_and_cylinder(radius_start=np.array([0.1, 0.0])), "radius_start = 0 is outside"),
+        (lambda: frustum_and_cylinder(radius_end=np.array([0.1, -1.0])), "radius_end = -1 is outside"),
+        (lambda: frustum_and_cylinder(bud_radius=np.array([0.0])), "bud_radius = 0 is outside"),
+        (lambda: frustum_and_cylinder(bud_direction=np.full((1, 3), 2.0)), "length of bud_direction = 3.46"),
+        (lambda: frustum_and_cylinder(parent=np.array([-1, 1])), "parent = 1 of segment 1 is outside"),
+        (lambda: frustum_and_cylinder(parent=np.array([-2, 0])), "parent = -2 is outside"),
+        (lambda: frustum_and_cylinder(order=np.array([0, -1])), "order = -1 is outside"),
+        (lambda: frustum_and_cylinder().scaled(0.0), "factor = 0 is outside"),
+        (lambda: frustum_and_cylinder().translated((0.0, 0.0, np.nan)), "offset = nan is outside"),
+        (lambda: frustum_and_cylinder().rotated(np.inf), "angle = inf is outside"),
+        (lambda: frustum_and_cylinder().with_bud_radius(0.0), "radius = 0 is outside"),
         (lambda: jl.Tree.joined([]), "trees is empty"),
         (lambda: jl.forest(density=0.0, area=(9.0, 9.0)), "density = 0 is outside"),
         (lambda: jl.forest(density=1.0, area=(0.0, 9.0)), "area = 0 is outside"),
@@ -314,19 +321,19 @@ def test_a_hundred_default_trees():
         ),
     ],
 )
-def test_inadmissible_input_is_refused(call, says):
-    with pytest.raises(ValueError, match=says):
+def test_inadmissible_input_is_refused(call, message):
+    with pytest.raises(ValueError, match=message):
         call()
 
 
 def test_a_tree_that_does_not_grow_up_is_refused():
-    how = jl.Branching(angle=0.0, angle_spread=0.0, bend=0.0, tropism=0.0)
-    # Stems lean by up to 1.3 times their angle: these lie below the horizon.
-    habit = jl.Habit(stem_angle=90.0, trunk=how, branches=how)
-    fell = [seed for seed in range(12) if not _grows(habit, seed)]
-    assert fell
+    straight = jl.Branching(angle=0.0, angle_spread=0.0, bend=0.0, tropism=0.0)
+    # Stems lean by up to 1.3 times their angle: these may lead below the horizon.
+    habit = jl.Habit(stem_angle=90.0, trunk=straight, branches=straight)
+    seeds_that_fail = [seed for seed in range(12) if not _grows(habit, seed)]
+    assert seeds_that_fail
     with pytest.raises(ValueError, match="height = 15 cannot be had"):
-        jl.grow(habit, seed=fell[0])
+        jl.grow(habit, seed=seeds_that_fail[0])
 
 
 def _grows(habit, seed):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxlidar as jl
-from jaxlidar._statistics import FewMoments, WaveformMoments
+from jaxlidar.sampling.waveform_moments import PivotMoments, WaveformMoments
 from jaxlidar.spectral.apply_optics import budget_terms, make_waveform_model, total_samples
 from jaxlidar.spectral.pivot_wavelengths import find_pivots
 from jaxlidar.trace.histories import histories
@@ -126,17 +126,17 @@ def test_moments_at_pivots_are_those_at_all_wavelengths():
     """Interpolated moments of batches at pivots are those at all wavelengths, by rounds of any size."""
     random = np.random.default_rng(0)
     coefficients = random.uniform(-1.0, 1.0, (5, 40))
-    pivot_moments, moments = FewMoments(jnp.asarray(coefficients, jnp.float32)), WaveformMoments(40, 7)
+    pivot_moments, moments = PivotMoments(jnp.asarray(coefficients, jnp.float32)), WaveformMoments(40, 7)
     for batches in (8, 3, 21):
         for _ in range(batches):
             pivot_batch = 2.0 + random.uniform(size=(5, 7))
             pivot_moments.add(pivot_batch)
             moments.add(np.pad(coefficients.T @ pivot_batch, ((0, 2), (0, 1))))
-        from_pivots, from_all = pivot_moments.spectra(), moments.spectra()
+        from_pivots, from_all = pivot_moments.errors(), moments.errors()
         # A second call, as after an interrupt, returns the same.
-        np.testing.assert_array_equal(from_pivots.stderr, pivot_moments.spectra().stderr)
+        np.testing.assert_array_equal(from_pivots.stderr, pivot_moments.errors().stderr)
         assert pivot_moments.count == moments.count
-        for name in ("whole", "stderr"):
+        for name in ("total", "stderr"):
             expected = getattr(from_all, name)
             np.testing.assert_allclose(
                 getattr(from_pivots, name), expected, atol=3e-6 * np.abs(expected).max()

@@ -1,4 +1,4 @@
-"""Campaigns on the workers of a real Dask cluster, one of which is killed."""
+"""Surveys on the workers of a real Dask cluster, one of which is killed."""
 
 import os
 
@@ -11,7 +11,7 @@ from tests.survey.test_simulate_many import FAST, KEY, die_once, nadir, same, st
 distributed = pytest.importorskip("distributed")
 pytestmark = [
     pytest.mark.slow,
-    # Of Dask's own making.
+    # Warnings of Dask itself.
     pytest.mark.filterwarnings("ignore::DeprecationWarning:(distributed|dask|tornado|zict).*"),
     pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
 ]
@@ -29,20 +29,27 @@ def client():
 
 
 @pytest.fixture(scope="module")
-def whole():
-    """What one process makes of the survey."""
+def one_process():
+    """The waveforms of the survey, traced by one process."""
     return jl.simulate_many(nadir(32), stand(), key=KEY, **FAST)
 
 
-def test_workers_of_a_cluster_give_the_same(client, whole):
-    assert same(whole, jl.simulate_many(nadir(32), stand(), key=KEY, **FAST, executor=client.get_executor()))
+def test_workers_of_a_cluster_trace_the_same_waveforms(client, one_process):
+    assert same(
+        one_process, jl.simulate_many(nadir(32), stand(), key=KEY, **FAST, executor=client.get_executor())
+    )
 
 
-def test_light_is_shared_by_workers(client):
-    survey, how = jl.Survey.grid(nadir(1).lidar, (-20, -20), (20, 20), 4.0), {"rtol": 0.1, "max_orders": 2}
-    many = jl.simulate_many(survey, stand(), key=KEY, **how)
-    assert many.info["shared"]
-    assert same(many, jl.simulate_many(survey, stand(), key=KEY, **how, executor=client.get_executor()))
+def test_workers_share_illumination(client):
+    survey, options = (
+        jl.Survey.grid(nadir(1).lidar, (-20, -20), (20, 20), 4.0),
+        {"rtol": 0.1, "max_orders": 2},
+    )
+    waveforms = jl.simulate_many(survey, stand(), key=KEY, **options)
+    assert waveforms.info["shared"]
+    assert same(
+        waveforms, jl.simulate_many(survey, stand(), key=KEY, **options, executor=client.get_executor())
+    )
 
 
 class KilledOnce(distributed.cfexecutor.ClientExecutor):
@@ -54,14 +61,14 @@ class KilledOnce(distributed.cfexecutor.ClientExecutor):
         return super().submit(die_once, self.marker, function, *args)
 
 
-def test_a_worker_that_is_killed_costs_its_chunk_a_second_try(client, whole, tmp_path):
+def test_a_worker_that_is_killed_costs_its_chunk_a_second_try(client, one_process, tmp_path):
     pool = KilledOnce(client)
     pool.marker = str(tmp_path / "died")
-    assert same(whole, jl.simulate_many(nadir(32), stand(), key=KEY, **FAST, executor=pool))
+    assert same(one_process, jl.simulate_many(nadir(32), stand(), key=KEY, **FAST, executor=pool))
     assert os.path.exists(pool.marker)
 
 
-def test_fits_by_workers_are_the_same(client, footprints):  # noqa: F811
-    here = fit(footprints, lanes=2)
-    assert same(here, fit(footprints, lanes=2, executor=client.get_executor()))
-    assert here.converged.all()
+def test_workers_of_a_cluster_fit_the_same_values(client, footprints):  # noqa: F811
+    local = fit(footprints, lanes=2)
+    assert same(local, fit(footprints, lanes=2, executor=client.get_executor()))
+    assert local.converged.all()

@@ -1,4 +1,4 @@
-"""Campaigns on several devices of one process, as many as are forced upon the host."""
+"""Surveys on several devices of one process: XLA makes them of the host's processor."""
 
 import os
 import subprocess
@@ -13,7 +13,7 @@ from tests.survey.test_simulate_many import FAST, KEY, nadir, stand
 
 # Surveys, how they are simulated, and how many devices have work to do.
 SURVEYS = {
-    "apart": (nadir(32), FAST | {"shared": False}, 4),
+    "per shot": (nadir(32), FAST | {"shared": False}, 4),
     "shared": (jl.Survey.grid(nadir(1).lidar, (-20, -20), (20, 20), 4.0), {"rtol": 0.1, "max_orders": 2}, 2),
 }
 ON_FOUR_DEVICES = """
@@ -22,7 +22,7 @@ import sys
 import jax
 
 import jaxlidar as jl
-from jaxlidar.survey import shared, ways
+from jaxlidar.survey import per_shot, shared_illumination
 from tests.survey.test_simulate_many import KEY, stand
 from tests.survey.test_devices import SURVEYS
 
@@ -30,35 +30,38 @@ assert len(jax.devices()) == 4
 mesh, used = jax.make_mesh((2, 2), ("x", "y")), set()
 
 
-def noting(program):
-    def noted(*given):
-        found = program(*given)
-        used.update(*(a.devices() for a in jax.tree.leaves(found)))
-        return found
+def record_devices(program):
+    def recording(*arguments):
+        result = program(*arguments)
+        used.update(*(a.devices() for a in jax.tree.leaves(result)))
+        return result
 
-    return noted
+    return recording
 
 
-ways.several, shared._several = noting(ways.several), noting(shared._several)
-for name, (survey, how, busy) in SURVEYS.items():
+per_shot.compiled_shots = record_devices(per_shot.compiled_shots)
+shared_illumination.compiled_group_moments = record_devices(shared_illumination.compiled_group_moments)
+for name, (survey, options, n_busy) in SURVEYS.items():
     used.clear()
-    many = jl.simulate_many(survey, stand(), key=KEY, mesh=mesh, **how)
-    assert len(used) == busy, (name, used)
-    assert many.info["shared"] is (name == "shared")
-    many.save(f"{sys.argv[1]}/{name}.nc")
+    waveforms = jl.simulate_many(survey, stand(), key=KEY, mesh=mesh, **options)
+    assert len(used) == n_busy, (name, used)
+    assert waveforms.info["shared"] is (name == "shared")
+    waveforms.save(f"{sys.argv[1]}/{name}.nc")
 """
 
 
 @pytest.mark.slow
-def test_devices_of_a_mesh_give_the_same(tmp_path):
-    here = Path(__file__).parent
-    own = {
+def test_devices_of_a_mesh_trace_the_same_waveforms(tmp_path):
+    folder = Path(__file__).parent
+    environment = {
         "XLA_FLAGS": "--xla_force_host_platform_device_count=4",
-        "PYTHONPATH": os.pathsep.join([str(here), str(here.parent)]),
+        "PYTHONPATH": os.pathsep.join([str(folder), str(folder.parent)]),
     }
-    subprocess.run([sys.executable, "-c", ON_FOUR_DEVICES, str(tmp_path)], check=True, env=os.environ | own)
-    for name, (survey, how, _) in SURVEYS.items():
-        alone = jl.simulate_many(survey, stand(), key=KEY, **how)
-        found = jl.Waveforms.open(tmp_path / f"{name}.nc")
-        assert np.array_equal(found.reflectance, alone.reflectance), name
-        assert np.array_equal(found.stderr, alone.stderr), name
+    subprocess.run(
+        [sys.executable, "-c", ON_FOUR_DEVICES, str(tmp_path)], check=True, env=os.environ | environment
+    )
+    for name, (survey, options, _) in SURVEYS.items():
+        on_one = jl.simulate_many(survey, stand(), key=KEY, **options)
+        on_four = jl.Waveforms.open(tmp_path / f"{name}.nc")
+        assert np.array_equal(on_four.reflectance, on_one.reflectance), name
+        assert np.array_equal(on_four.stderr, on_one.stderr), name

@@ -1,4 +1,4 @@
-"""Many shots at once against one by one: agreement, repeatability, interrupted runs, workers, bad input."""
+"""Surveys against single simulations: agreement, repeatability, interrupted runs, workers, bad input."""
 
 import concurrent.futures
 import multiprocessing
@@ -16,7 +16,7 @@ KEY = jax.random.key(5)
 
 
 def stand(reflectance=0.45, *, ground=None, **canopy):
-    """Crowns of different heights, 60 m wide."""
+    """Return a stand of crowns of different heights, 60 m wide."""
     random = np.random.default_rng(2)
     lad = np.zeros((30, 30, 6))
     for _ in range(40):
@@ -30,9 +30,14 @@ def stand(reflectance=0.45, *, ground=None, **canopy):
 
 
 def lidar(**changes):
-    """Samples far apart for the pulse, so that their errors are nearly independent."""
-    own = {"altitude": 2e4, "divergence": 0.5, "pulse": jl.GaussianPulse(fwhm=2.0), "sampling_interval": 8.0}
-    return jl.Lidar(**(own | changes))
+    """Return a lidar with samples far apart for its pulse, so that their errors are nearly independent."""
+    options = {
+        "altitude": 2e4,
+        "divergence": 0.5,
+        "pulse": jl.GaussianPulse(fwhm=2.0),
+        "sampling_interval": 8.0,
+    }
+    return jl.Lidar(**(options | changes))
 
 
 def nadir(count, **changes):
@@ -40,7 +45,7 @@ def nadir(count, **changes):
 
 
 def scan(count):
-    """Shots in many directions, from low above."""
+    """Return shots in many directions, from low altitude."""
     line = {"start": (0.0, -10.0), "end": (0.0, 10.0), "speed": 20.0, "pulse_rate": count - 1}
     return jl.Survey.scan(lidar(altitude=100.0, divergence=60.0), jl.Oscillating(8.0, 7.0), **line)
 
@@ -48,25 +53,26 @@ def scan(count):
 FAST = {"rtol": 0.3, "max_orders": 1}
 
 
-def one_by_one(survey, scene, **how):
-    plan = jl.plan(survey, scene, describe=False, **how)
+def simulate_each(survey, scene, **options):
+    """Simulate the shots one by one, with keys of their own."""
+    plan = jl.plan(survey, scene, describe=False, **options)
     keys = jax.random.split(jax.random.key(99), len(survey))
-    return [jl.simulate(own, scene, key=k, plan=plan) for own, k in zip(survey, keys)]
+    return [jl.simulate(lidar, scene, key=k, plan=plan) for lidar, k in zip(survey, keys)]
 
 
-def deviations(many, waves, wavelength=slice(None)):
-    """(many - waves) / standard error, of all samples above 1 % of their waveform's peak."""
-    found = []
+def deviations(waveforms, waves, wavelength=slice(None)):
+    """Return difference / standard error of all samples above 1 % of their waveform's peak."""
+    scores = []
     for i, wave in enumerate(waves):
         mean, error = np.asarray(wave.reflectance, float), np.asarray(wave.stderr, float)
-        seen = mean > 0.01 * mean.max(axis=1, keepdims=True)
-        z = (many.reflectance[i] - mean) / np.maximum(np.hypot(many.stderr[i], error), 1e-12)
-        found.append(z[wavelength][seen[wavelength]])
-    return np.concatenate(found)
+        counts = mean > 0.01 * mean.max(axis=1, keepdims=True)
+        z = (waveforms.reflectance[i] - mean) / np.maximum(np.hypot(waveforms.stderr[i], error), 1e-12)
+        scores.append(z[wavelength][counts[wavelength]])
+    return np.concatenate(scores)
 
 
 def agree(z):
-    """z-test of every sample, at a level of 1 % for all together, and chi-squared of all."""
+    """Return True if z-tests of all samples, at a level of 1 % together, and chi-squared of all pass."""
     # 2.6 is the normal quantile of 1 %; by Sidak the worst of n has that of 1 % / n.
     worst = np.sqrt(2 * np.log(z.size / 0.01))
     # Standard errors are widened for few batches: on average by a tenth or two.
@@ -79,24 +85,24 @@ def same(a, b):
 
 
 def top_hats(count):
-    """Footprints with an edge."""
+    """Return footprints with an edge."""
     return nadir(count, profile="top-hat")
 
 
 def limited(count):
-    """A field of view as wide as the footprints, which have an edge."""
+    """Return shots with a field of view as wide as their footprints, which have an edge."""
     return nadir(count, profile="top-hat", field_of_view=0.5)
 
 
-def leaning(count, **changes):
-    """The same direction for all, from so far that rays are parallel."""
+def oblique(count, **changes):
+    """Return shots of one oblique direction, from so far that rays are parallel."""
     survey = nadir(count, **changes)
     return jl.Survey(survey.lidar, survey.position, 20.0, 30.0)
 
 
-def leaning_and_limited(count):
-    """In one direction, with a field of view narrower than the beam."""
-    return leaning(count, field_of_view=0.4)
+def oblique_and_limited(count):
+    """Return shots of one oblique direction, with a field of view narrower than the beam."""
+    return oblique(count, field_of_view=0.4)
 
 
 @pytest.mark.parametrize("shots", [6, pytest.param(50, marks=pytest.mark.slow)])
@@ -107,140 +113,140 @@ def leaning_and_limited(count):
         pytest.param(nadir, False, marks=pytest.mark.slow),
         pytest.param(top_hats, True, marks=pytest.mark.slow),
         pytest.param(limited, True, marks=pytest.mark.slow),
-        pytest.param(leaning, True, marks=pytest.mark.slow),
-        (leaning_and_limited, True),
+        pytest.param(oblique, True, marks=pytest.mark.slow),
+        (oblique_and_limited, True),
         pytest.param(scan, False, marks=pytest.mark.slow),
     ],
 )
-def test_shots_agree_with_simulate_one_by_one(kind, shared, shots):
-    survey, scene, how = kind(shots), stand(), {"rtol": 0.03, "max_orders": 2}
-    waves = one_by_one(survey, scene, **how)
-    how |= {"shared": shared}
-    many = jl.simulate_many(survey, scene, key=KEY, **how)
-    assert many.info["shared"] is shared
-    assert np.array_equal(many.time, waves[0].time)
-    assert np.all(many.error <= 0.03)
-    z = deviations(many, waves)
+def test_shots_agree_with_single_simulations(kind, shared, shots):
+    survey, scene, options = kind(shots), stand(), {"rtol": 0.03, "max_orders": 2}
+    waves = simulate_each(survey, scene, **options)
+    options |= {"shared": shared}
+    waveforms = jl.simulate_many(survey, scene, key=KEY, **options)
+    assert waveforms.info["shared"] is shared
+    assert np.array_equal(waveforms.time, waves[0].time)
+    assert np.all(waveforms.error <= 0.03)
+    z = deviations(waveforms, waves)
     assert z.size > 5 * shots
     assert agree(z)
     # Planted: each shot 2 m further, and leaves that are a tenth darker.
-    assert not agree(deviations(jl.simulate_many(survey, stand(0.4), key=KEY, **how), waves))
-    beside = jl.Survey(survey.lidar, survey.position + np.array([2.0, 0.0]), survey.zenith, survey.azimuth)
-    assert not agree(deviations(jl.simulate_many(beside, scene, key=KEY, **how), waves))
+    assert not agree(deviations(jl.simulate_many(survey, stand(0.4), key=KEY, **options), waves))
+    shifted = jl.Survey(survey.lidar, survey.position + np.array([2.0, 0.0]), survey.zenith, survey.azimuth)
+    assert not agree(deviations(jl.simulate_many(shifted, scene, key=KEY, **options), waves))
 
 
-def test_what_is_not_random_is_the_same_as_one_by_one():
+def test_deterministic_shots_equal_single_simulations():
     survey = jl.Survey(lidar(wavelength=(532.0, 1064.0)), [(0, 0), (40, 5)], [0.0, 30.0], [0.0, 70.0])
     scene = jl.Scene(
         plates=[jl.Plate(6.0, 0.4, 0.3, coverage=0.5)],
         ground=jl.Ground(reflectance=0.3, slope=10.0),
         atmosphere=jl.Atmosphere(),
     )
-    many = jl.simulate_many(survey, scene, key=KEY, max_orders=1)
+    waveforms = jl.simulate_many(survey, scene, key=KEY, max_orders=1)
     plan = jl.plan(survey, scene, max_orders=1)
-    for own, wave in zip(survey, many):
-        alone = jl.simulate(own, scene, key=KEY, plan=plan)
+    for lidar_of_shot, wave in zip(survey, waveforms):
+        single = jl.simulate(lidar_of_shot, scene, key=KEY, plan=plan)
         for name in ("time", "height", "reflectance", "energy", "recorded", "neglected", "wavelength"):
-            assert np.allclose(getattr(wave, name), getattr(alone, name), rtol=2e-4, atol=1e-9), name
-        for part in alone.components:
-            assert np.allclose(wave.components[part], alone.components[part], rtol=2e-4, atol=1e-9), part
-        for part in alone.energy_budget:
-            assert np.allclose(wave.energy_budget[part], alone.energy_budget[part], rtol=2e-4, atol=1e-9), (
-                part
-            )
+            assert np.allclose(getattr(wave, name), getattr(single, name), rtol=2e-4, atol=1e-9), name
+        for name in single.components:
+            assert np.allclose(wave.components[name], single.components[name], rtol=2e-4, atol=1e-9), name
+        for name, energy in single.energy_budget.items():
+            assert np.allclose(wave.energy_budget[name], energy, rtol=2e-4, atol=1e-9), name
 
 
 @pytest.mark.slow
 def test_straight_transmission_is_traced_for_each_wavelength():
-    survey, how = nadir(2, wavelength=(532.0, 1064.0)), {"rtol": 0.05, "max_orders": 2}
+    survey, options = nadir(2, wavelength=(532.0, 1064.0)), {"rtol": 0.05, "max_orders": 2}
     leaf = jl.LeafOptics(np.array([0.1, 0.4]), np.array([0.1, 0.4]))
     scene = stand(transmission="straight")
     scene = jl.Scene(
         canopy=jl.Canopy(scene.canopy.voxels, leaf=leaf, transmission="straight"), ground=scene.ground
     )
-    many = jl.simulate_many(survey, scene, key=KEY, **how)
-    assert agree(deviations(many, one_by_one(survey, scene, **how)))
+    waveforms = jl.simulate_many(survey, scene, key=KEY, **options)
+    assert agree(deviations(waveforms, simulate_each(survey, scene, **options)))
 
 
-def test_far_places_lose_nothing():
-    survey, scene, how = nadir(16), stand(), FAST
-    many = jl.simulate_many(survey, scene, key=KEY, **how)
-    far = np.array([4_500_000.0, 600_000.0])
+def test_large_coordinates_lose_no_precision():
+    survey, scene = nadir(16), stand()
+    waveforms = jl.simulate_many(survey, scene, key=KEY, **FAST)
+    shift = np.array([4_500_000.0, 600_000.0])
     voxels = scene.canopy.voxels
-    origin = np.asarray(voxels.origin, float) + np.append(far, 0.0)
-    moved = jl.VoxelMap(voxels.leaf, None, voxels.voxel_size, origin)
-    there = jl.Scene(canopy=jl.Canopy(moved, leaf=scene.canopy.leaf), ground=scene.ground)
-    away = jl.simulate_many(jl.Survey(survey.lidar, survey.position + far), there, key=KEY, **how)
-    assert np.allclose(away.reflectance, many.reflectance, rtol=1e-3, atol=1e-6)
+    origin = np.asarray(voxels.origin, float) + np.append(shift, 0.0)
+    moved_voxels = jl.VoxelMap(voxels.leaf, None, voxels.voxel_size, origin)
+    moved_scene = jl.Scene(canopy=jl.Canopy(moved_voxels, leaf=scene.canopy.leaf), ground=scene.ground)
+    moved_waveforms = jl.simulate_many(
+        jl.Survey(survey.lidar, survey.position + shift), moved_scene, key=KEY, **FAST
+    )
+    assert np.allclose(moved_waveforms.reflectance, waveforms.reflectance, rtol=1e-3, atol=1e-6)
 
 
-def test_the_ground_below_every_shot():
-    slope, place = np.tan(np.deg2rad(10.0)), np.array([[0.0, 0.0], [30.0, 0.0], [0.0, 30.0]])
+def test_heights_of_the_ground_below_every_shot():
+    slope, position = np.tan(np.deg2rad(10.0)), np.array([[0.0, 0.0], [30.0, 0.0], [0.0, 30.0]])
     scene = jl.Scene(ground=jl.Ground(height=2.0, slope=10.0, aspect=90.0))
-    level = jl.simulate_many(jl.Survey(lidar(), place), scene, key=KEY)
-    assert np.allclose(level.ground_height, 2.0 - slope * place[:, 0], atol=1e-4)
+    level = jl.simulate_many(jl.Survey(lidar(), position), scene, key=KEY)
+    assert np.allclose(level.ground_height, 2.0 - slope * position[:, 0], atol=1e-4)
     # Looking east at 45 degrees, the ray falls as fast as it goes east: z = x0 - x = 2 - slope x.
-    aslant = jl.simulate_many(jl.Survey(lidar(), place, 45.0, 90.0), scene, key=KEY)
-    x = (place[:, 0] - 2.0) / (1.0 - slope)
-    assert np.allclose(aslant.ground_height, 2.0 - slope * x, atol=1e-3)
+    oblique_shots = jl.simulate_many(jl.Survey(lidar(), position, 45.0, 90.0), scene, key=KEY)
+    x = (position[:, 0] - 2.0) / (1.0 - slope)
+    assert np.allclose(oblique_shots.ground_height, 2.0 - slope * x, atol=1e-3)
     plate = jl.Scene(plates=[jl.Plate(2.0, 0.4)])
-    assert np.all(np.isnan(jl.simulate_many(jl.Survey(lidar(), place), plate, key=KEY).ground_height))
+    assert np.all(np.isnan(jl.simulate_many(jl.Survey(lidar(), position), plate, key=KEY).ground_height))
 
 
-def test_a_shot_does_not_depend_on_the_others_nor_on_how_they_are_cut():
-    survey, scene, how = nadir(16), stand(), FAST
-    many = jl.simulate_many(survey, scene, key=KEY, **how)
-    again = jl.simulate_many(survey, scene, key=KEY, **how)
-    assert same(many, again)
+def test_a_shot_depends_neither_on_other_shots_nor_on_workers():
+    survey, scene = nadir(16), stand()
+    waveforms = jl.simulate_many(survey, scene, key=KEY, **FAST)
+    repeated = jl.simulate_many(survey, scene, key=KEY, **FAST)
+    assert same(waveforms, repeated)
     with concurrent.futures.ThreadPoolExecutor(3) as pool:
-        assert same(many, jl.simulate_many(survey, scene, key=KEY, **how, executor=pool))
-    other = jl.simulate_many(survey, scene, key=jax.random.key(6), **how)
-    assert not np.allclose(other.reflectance, many.reflectance, rtol=1e-6)
+        assert same(waveforms, jl.simulate_many(survey, scene, key=KEY, **FAST, executor=pool))
+    other_key = jl.simulate_many(survey, scene, key=jax.random.key(6), **FAST)
+    assert not np.allclose(other_key.reflectance, waveforms.reflectance, rtol=1e-6)
 
 
 class Dying(concurrent.futures.Executor):
-    """Its workers die over the chunks that it is told; after `lasts` deaths it takes no more."""
+    """An executor whose workers die over given chunks; after `max_deaths` it takes no more work."""
 
-    def __init__(self, deaths, lasts=100):
-        self.deaths, self.lasts, self.given = list(deaths), lasts, []
+    def __init__(self, deaths, max_deaths=100):
+        self.deaths, self.max_deaths, self.submitted = list(deaths), max_deaths, []
 
     def submit(self, function, /, *args, **kwargs):
-        if self.lasts <= 0:
+        if self.max_deaths <= 0:
             raise concurrent.futures.BrokenExecutor("a worker died")
-        future, (task,) = concurrent.futures.Future(), args
-        self.given.append(task.number)
-        if task.number in self.deaths:
-            self.deaths.remove(task.number)
-            self.lasts -= 1
+        future, (unit,) = concurrent.futures.Future(), args
+        self.submitted.append(unit.number)
+        if unit.number in self.deaths:
+            self.deaths.remove(unit.number)
+            self.max_deaths -= 1
             future.set_exception(concurrent.futures.BrokenExecutor("a worker died"))
         else:
-            future.set_result(function(task))
+            future.set_result(function(unit))
         return future
 
 
 def test_a_worker_that_dies_costs_its_chunk_a_second_try():
     survey, scene = nadir(16), stand()
-    many = jl.simulate_many(survey, scene, key=KEY, **FAST)
+    waveforms = jl.simulate_many(survey, scene, key=KEY, **FAST)
     dying = Dying([1, 3])
-    assert same(many, jl.simulate_many(survey, scene, key=KEY, **FAST, executor=dying))
-    assert sorted(dying.given) == sorted([*range(8), 1, 3])
+    assert same(waveforms, jl.simulate_many(survey, scene, key=KEY, **FAST, executor=dying))
+    assert sorted(dying.submitted) == sorted([*range(8), 1, 3])
     with pytest.raises(RuntimeError, match="the workers of chunk 2 died twice"):
         jl.simulate_many(survey, scene, key=KEY, **FAST, executor=Dying([2, 2]))
     with pytest.warns(jl.LostWorkersWarning, match="done in this process"):
-        here = jl.simulate_many(survey, scene, key=KEY, **FAST, executor=Dying([1], lasts=1))
-    assert same(many, here)
+        finished_locally = jl.simulate_many(survey, scene, key=KEY, **FAST, executor=Dying([1], max_deaths=1))
+    assert same(waveforms, finished_locally)
 
 
-def die_once(marker, function, task):
-    """A worker that is killed as the operating system kills, the first time."""
-    if task.number == 0 and not os.path.exists(marker):
+def die_once(marker, function, unit):
+    """Run a unit of work in a worker that the operating system kills the first time."""
+    if unit.number == 0 and not os.path.exists(marker):
         Path(marker).touch()
         os._exit(1)
-    return function(task)
+    return function(unit)
 
 
 class KilledOnce(concurrent.futures.ProcessPoolExecutor):
-    """A real process pool, one worker of which is killed."""
+    """A process pool, one worker of which is killed."""
 
     def __init__(self, marker):
         super().__init__(2, mp_context=multiprocessing.get_context("spawn"))
@@ -251,22 +257,22 @@ class KilledOnce(concurrent.futures.ProcessPoolExecutor):
 
 
 @pytest.mark.slow
-def test_a_process_pool_gives_the_same_and_may_lose_a_worker(tmp_path):
+def test_a_process_pool_traces_the_same_and_may_lose_a_worker(tmp_path):
     survey, scene = nadir(32), stand()
-    many = jl.simulate_many(survey, scene, key=KEY, **FAST)
+    waveforms = jl.simulate_many(survey, scene, key=KEY, **FAST)
     with concurrent.futures.ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn")) as pool:
-        assert same(many, jl.simulate_many(survey, scene, key=KEY, **FAST, executor=pool))
+        assert same(waveforms, jl.simulate_many(survey, scene, key=KEY, **FAST, executor=pool))
     with KilledOnce(str(tmp_path / "died")) as pool, pytest.warns(jl.LostWorkersWarning):
-        assert same(many, jl.simulate_many(survey, scene, key=KEY, **FAST, executor=pool))
+        assert same(waveforms, jl.simulate_many(survey, scene, key=KEY, **FAST, executor=pool))
 
 
 class Stopped(Exception):
     pass
 
 
-def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path):
+def test_an_interrupted_run_continues(tmp_path):
     survey, scene, path = nadir(16), stand(), tmp_path / "many.nc"
-    whole = jl.simulate_many(survey, scene, key=KEY, **FAST)
+    uninterrupted = jl.simulate_many(survey, scene, key=KEY, **FAST)
 
     def stop(progress):
         if progress.done >= 6:
@@ -275,22 +281,22 @@ def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path):
     with pytest.raises(Stopped):
         jl.simulate_many(survey, scene, key=KEY, **FAST, path=path, progress=stop)
     assert not path.exists()
-    kept = sorted(p.name for p in (tmp_path / "many.nc.parts").glob("*.npz"))
-    assert len(kept) >= 3
+    stored = sorted(p.name for p in (tmp_path / "many.nc.parts").glob("*.npz"))
+    assert len(stored) >= 3
     with pytest.raises(ValueError, match=r"another problem, which differs in scene; nothing is overwritten"):
         jl.simulate_many(survey, stand(0.3), key=KEY, **FAST, path=path)
-    said = []
-    many = jl.simulate_many(survey, scene, key=KEY, **FAST, path=path, progress=said.append)
-    assert same(whole, many)
-    assert (said[0].done, said[-1].done, said[-1].total) == (2 * len(kept) + 2, 16, 16)
-    assert said[-1].left == 0.0
-    assert str(said[-1]).startswith("16 of 16 shots")
+    reports = []
+    waveforms = jl.simulate_many(survey, scene, key=KEY, **FAST, path=path, progress=reports.append)
+    assert same(uninterrupted, waveforms)
+    assert (reports[0].done, reports[-1].done, reports[-1].total) == (2 * len(stored) + 2, 16, 16)
+    assert reports[-1].left == 0.0
+    assert str(reports[-1]).startswith("16 of 16 shots")
     assert not (tmp_path / "many.nc.parts").exists()
     # The file is there: nothing is traced.
-    assert same(many, jl.simulate_many(survey, scene, key=KEY, **FAST, path=path, progress=pytest.fail))
+    assert same(waveforms, jl.simulate_many(survey, scene, key=KEY, **FAST, path=path, progress=pytest.fail))
     opened = jl.Waveforms.open(path)
-    assert same(many, opened)
-    assert opened.info == many.info
+    assert same(waveforms, opened)
+    assert opened.info == waveforms.info
     with pytest.raises(ValueError, match="differs in key"):
         jl.simulate_many(survey, scene, key=jax.random.key(6), **FAST, path=path)
 
@@ -303,9 +309,9 @@ def test_damaged_files_are_refused_by_name(tmp_path):
 
     with pytest.raises(Stopped):
         jl.simulate_many(survey, scene, key=KEY, **FAST, path=path, progress=stop)
-    part = next((tmp_path / "many.nc.parts").glob("*.npz"))
-    part.write_bytes(part.read_bytes()[:100])
-    with pytest.raises(ValueError, match=rf"{part.name}: damaged"):
+    result_file = next((tmp_path / "many.nc.parts").glob("*.npz"))
+    result_file.write_bytes(result_file.read_bytes()[:100])
+    with pytest.raises(ValueError, match=rf"{result_file.name}: damaged"):
         jl.simulate_many(survey, scene, key=KEY, **FAST, path=path)
     path.write_bytes(b"no netCDF")
     with pytest.raises(ValueError, match=r"many.nc: byte 0: no netCDF-4 file"):
@@ -315,28 +321,28 @@ def test_damaged_files_are_refused_by_name(tmp_path):
 
 
 def test_a_dataset_has_units_and_all_waveforms():
-    many = jl.simulate_many(nadir(16), stand(), key=KEY, **FAST)
-    data = many.to_xarray()
+    waveforms = jl.simulate_many(nadir(16), stand(), key=KEY, **FAST)
+    data = waveforms.to_xarray()
     assert data.reflectance.dims == ("shot", "wavelength", "time")
     assert data.sizes["shot"] == 16
     assert data.energy.attrs["units"] == "J"
-    assert np.array_equal(data.components.sel(component="ground"), many.components["ground"])
-    assert np.array_equal(data.energy_budget.sel(fate="escaped"), many.energy_budget["escaped"])
-    wave = many[-1]
+    assert np.array_equal(data.components.sel(component="ground"), waveforms.components["ground"])
+    assert np.array_equal(data.energy_budget.sel(fate="escaped"), waveforms.energy_budget["escaped"])
+    wave = waveforms[-1]
     assert isinstance(wave, jl.Waveform)
-    assert np.array_equal(wave.reflectance, many.reflectance[15])
+    assert np.array_equal(wave.reflectance, waveforms.reflectance[15])
     assert wave.info["stopped"] == "tolerance met"
     with pytest.raises(IndexError, match="shot 16: there are 16"):
-        many[16]
-    assert len(list(many)) == 16
+        waveforms[16]
+    assert len(list(waveforms)) == 16
 
 
 @pytest.mark.slow
-def test_footprints_partly_beside_the_map_are_said_and_how_much():
+def test_footprints_partly_beside_the_map_warn_with_their_fractions():
     survey = jl.Survey(lidar(profile="top-hat"), [(0.0, 0.0), (30.0, 0.0), (300.0, 0.0)])
     with pytest.warns(jl.OffMapWarning, match=r"2 of 3 .*shot 2 with 100 %, shot 1 with 50 % of their light"):
-        many = jl.simulate_many(survey, stand(), key=KEY, **FAST)
-    assert np.allclose(many.off_map, [0.0, 0.5, 1.0], atol=0.01)
+        waveforms = jl.simulate_many(survey, stand(), key=KEY, **FAST)
+    assert np.allclose(waveforms.off_map, [0.0, 0.5, 1.0], atol=0.01)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         jl.simulate_many(survey, stand(sides="periodic"), key=KEY, **FAST)
@@ -346,7 +352,7 @@ NADIR = nadir(2)
 
 
 @pytest.mark.parametrize(
-    ("given", "error", "said"),
+    ("arguments", "error", "message"),
     [
         (
             {
@@ -382,9 +388,9 @@ NADIR = nadir(2)
         ),
     ],
 )
-def test_what_is_refused_before_any_work(given, error, said, monkeypatch):
-    from jaxlidar.survey import run
+def test_inadmissible_arguments_are_refused_before_any_work(arguments, error, message, monkeypatch):
+    from jaxlidar.survey import simulate_many
 
-    monkeypatch.setattr(run, "outcomes", lambda *_: pytest.fail("work was done"))
-    with pytest.raises(error, match=said):
-        jl.simulate_many(**({"survey": NADIR, "scene": stand(), "key": KEY} | given))
+    monkeypatch.setattr(simulate_many, "outcomes", lambda *_: pytest.fail("work was done"))
+    with pytest.raises(error, match=message):
+        jl.simulate_many(**({"survey": NADIR, "scene": stand(), "key": KEY} | arguments))

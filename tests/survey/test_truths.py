@@ -1,4 +1,4 @@
-"""Truth for all shots of a survey: as of each shot alone, in memory and in files, whoever does the work."""
+"""Truth of all shots of a survey: that of each shot alone, in memory, in files, and by workers."""
 
 import concurrent.futures
 import multiprocessing
@@ -13,7 +13,7 @@ import jaxlidar as jl
 h5py = pytest.importorskip("h5py")
 
 KEY = jax.random.key(4)
-HOW = {"key": KEY, "rtol": 0.3, "max_orders": 1, "truth": True}
+OPTIONS = {"key": KEY, "rtol": 0.3, "max_orders": 1, "truth": True}
 
 
 def stand():
@@ -27,11 +27,11 @@ def stand():
 SCENE = stand()
 LIDAR = jl.Lidar(altitude=2e4, divergence=0.5, wavelength=(532.0, 1064.0), sampling_interval=4.0)
 SURVEY = jl.Survey(LIDAR, np.random.default_rng(2).uniform(-12.0, 12.0, (11, 2)))
-ASLANT = jl.Survey(LIDAR, SURVEY.position, np.linspace(0.0, 20.0, 11), 70.0)
+OBLIQUE = jl.Survey(LIDAR, SURVEY.position, np.linspace(0.0, 20.0, 11), 70.0)
 
 
 def same(a, b):
-    """To the bit; arrays mapped from a file count as arrays."""
+    """Return True if all bits are equal; arrays mapped from a file count as arrays."""
     leaves = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
     return all(
         np.asarray(x).dtype == np.asarray(y).dtype and np.array_equal(x, y, equal_nan=True) for x, y in leaves
@@ -39,8 +39,8 @@ def same(a, b):
 
 
 @pytest.fixture(scope="module")
-def many():
-    return jl.simulate_many(ASLANT, SCENE, **HOW)
+def waveforms():
+    return jl.simulate_many(OBLIQUE, SCENE, **OPTIONS)
 
 
 def near(a, b, tolerance=1e-3):
@@ -50,21 +50,21 @@ def near(a, b, tolerance=1e-3):
     )
 
 
-def test_it_is_that_of_each_shot_alone(many):
-    plan = jl.plan(ASLANT, SCENE, max_orders=1, n_rays=512)
-    assert many.info["shared"] is False
+def test_truths_are_those_of_each_shot_alone(waveforms):
+    plan = jl.plan(OBLIQUE, SCENE, max_orders=1, n_rays=512)
+    assert waveforms.info["shared"] is False
     for shot in (0, 7):
-        alone, truth = jl.truth_of(ASLANT[shot], SCENE, plan=plan), many[shot].truth
-        assert near(truth, alone)
-        assert not near(truth, many[3].truth)
-        assert np.array_equal(truth.time, many.time)
-        assert np.array_equal(truth.height, many[shot].height)
+        single, truth = jl.truth_of(OBLIQUE[shot], SCENE, plan=plan), waveforms[shot].truth
+        assert near(truth, single)
+        assert not near(truth, waveforms[3].truth)
+        assert np.array_equal(truth.time, waveforms.time)
+        assert np.array_equal(truth.height, waveforms[shot].height)
     # The mean of a slope is where the axis meets it.
-    assert np.allclose(many.truth.surface_height["ground"], many.ground_height, atol=0.02)
-    assert np.allclose(many.first_order_share, 1.0)
+    assert np.allclose(waveforms.truth.surface_height["ground"], waveforms.ground_height, atol=0.02)
+    assert np.allclose(waveforms.first_order_share, 1.0)
 
 
-def test_it_is_kept_in_files_and_a_run_that_was_killed_goes_on(many, tmp_path):
+def test_truths_are_stored_in_files_and_a_killed_run_continues(waveforms, tmp_path):
     path = tmp_path / "many.nc"
 
     class Killed(Exception):
@@ -75,79 +75,79 @@ def test_it_is_kept_in_files_and_a_run_that_was_killed_goes_on(many, tmp_path):
             raise Killed
 
     with pytest.raises(Killed):
-        jl.simulate_many(ASLANT, SCENE, **HOW, path=path, progress=kill)
+        jl.simulate_many(OBLIQUE, SCENE, **OPTIONS, path=path, progress=kill)
     assert len(list((tmp_path / "many.nc.parts").glob("*.npz"))) > 2
-    kept = jl.simulate_many(ASLANT, SCENE, **HOW, path=path)
-    assert same(kept, many)
-    assert isinstance(kept.truth.gap_probability, np.memmap)
-    assert same(jl.open(path), many)
-    assert same(pickle.loads(pickle.dumps(many[5])), many[5])
-    many[5].save(tmp_path / "one.nc")
-    assert same(jl.open(tmp_path / "one.nc"), many[5])
+    stored = jl.simulate_many(OBLIQUE, SCENE, **OPTIONS, path=path)
+    assert same(stored, waveforms)
+    assert isinstance(stored.truth.gap_probability, np.memmap)
+    assert same(jl.open(path), waveforms)
+    assert same(pickle.loads(pickle.dumps(waveforms[5])), waveforms[5])
+    waveforms[5].save(tmp_path / "one.nc")
+    assert same(jl.open(tmp_path / "one.nc"), waveforms[5])
     # Beside the waveforms, not in place of them.
-    found = many.to_xarray()
-    assert found.gap_probability.dims == ("shot", "time")
-    assert found.gap_probability.attrs["units"] == "1"
-    assert np.array_equal(found.returns.sel(material="leaf"), many.truth.returns["leaf"])
+    dataset = waveforms.to_xarray()
+    assert dataset.gap_probability.dims == ("shot", "time")
+    assert dataset.gap_probability.attrs["units"] == "1"
+    assert np.array_equal(dataset.returns.sel(material="leaf"), waveforms.truth.returns["leaf"])
     with pytest.raises(ValueError, match="another problem, which differs in truth"):
-        jl.simulate_many(ASLANT, SCENE, **HOW | {"truth": False}, path=path)
+        jl.simulate_many(OBLIQUE, SCENE, **OPTIONS | {"truth": False}, path=path)
 
 
-def test_damage_does_not_pass(many, tmp_path):
+def test_damaged_files_are_refused(waveforms, tmp_path):
     path = tmp_path / "many.nc"
-    many.save(path)
+    waveforms.save(path)
     with h5py.File(path) as file:
-        place = file["truth/gap_probability"].id.get_offset()
+        offset = file["truth/gap_probability"].id.get_offset()
     data = bytearray(path.read_bytes())
-    data[place] ^= 1
+    data[offset] ^= 1
     path.write_bytes(data)
     with pytest.raises(ValueError, match=r"many.nc: /truth: row 0: damaged \(its checksum is another\)"):
         jl.open(path)
-    many.save(path)
+    waveforms.save(path)
     with h5py.File(path, "a") as file:
         del file["truth"]
     with pytest.raises(ValueError, match=r"many.nc: /truth: no such group"):
         jl.open(path)
 
 
-def test_without_it_nothing_is_added(tmp_path):
+def test_truth_is_none_unless_asked_for(tmp_path):
     scene = jl.Scene(ground=jl.Ground())
-    few = jl.simulate_many(jl.Survey(jl.Lidar(), [(0, 0), (1, 0)]), scene, key=KEY)
-    assert few.truth is None
-    assert few[1].truth is None
-    few.save(tmp_path / "few.nc")
+    waveforms = jl.simulate_many(jl.Survey(jl.Lidar(), [(0, 0), (1, 0)]), scene, key=KEY)
+    assert waveforms.truth is None
+    assert waveforms[1].truth is None
+    waveforms.save(tmp_path / "few.nc")
     assert jl.open(tmp_path / "few.nc").truth is None
     with pytest.raises(TypeError, match="truth"):
         jl.simulate_many(jl.Survey.of(jl.Lidar()), scene, key=KEY, truth=1)  # pyright: ignore
 
 
-def test_a_survey_in_a_file_may_ask_for_it(tmp_path):
+def test_a_case_file_may_ask_for_truth(tmp_path):
     scene = jl.Scene(plates=[jl.Plate(3.0, 0.4, coverage=0.5)])
     survey = jl.Survey(jl.Lidar(), [(0, 0), (1, 0)])
     case = jl.io.Case(survey=survey, scene=scene, key=KEY, arguments={"truth": True})
     jl.io.write_case(tmp_path / "a.toml", case)
-    many = jl.io.read_case(tmp_path / "a.toml").simulate(path=tmp_path / "a.zarr")
-    assert np.allclose(many.truth.gap_probability[:, -1], 0.5)
-    assert set(many.truth.surface_height) == {"plate"}
+    waveforms = jl.io.read_case(tmp_path / "a.toml").simulate(path=tmp_path / "a.zarr")
+    assert np.allclose(waveforms.truth.gap_probability[:, -1], 0.5)
+    assert set(waveforms.truth.surface_height) == {"plate"}
 
 
 @pytest.mark.slow
-def test_footprints_that_share_light_have_the_same_truth(tmp_path):
-    apart = jl.simulate_many(SURVEY, SCENE, **HOW, shared=False)
-    together = jl.simulate_many(SURVEY, SCENE, **HOW, shared=True, path=tmp_path / "a.zarr")
-    assert together.info["shared"] is True
-    assert same(together.truth, apart.truth)
-    # Empty dicts are kept as well.
+def test_shared_illumination_has_the_same_truth(tmp_path):
+    per_shot = jl.simulate_many(SURVEY, SCENE, **OPTIONS, shared=False)
+    shared = jl.simulate_many(SURVEY, SCENE, **OPTIONS, shared=True, path=tmp_path / "a.zarr")
+    assert shared.info["shared"] is True
+    assert same(shared.truth, per_shot.truth)
+    # Empty dicts are stored as well.
     bare = jl.Scene(canopy=SCENE.canopy)
-    for shared in (True, False):
-        path = tmp_path / f"bare {shared}.nc"
-        many = jl.simulate_many(SURVEY, bare, **HOW, shared=shared, path=path)
-        assert many.truth.surface_height == {}
-        assert many[2].truth.surface_spread == {}
+    for is_shared in (True, False):
+        path = tmp_path / f"bare {is_shared}.nc"
+        waveforms = jl.simulate_many(SURVEY, bare, **OPTIONS, shared=is_shared, path=path)
+        assert waveforms.truth.surface_height == {}
+        assert waveforms[2].truth.surface_spread == {}
 
 
 @pytest.mark.slow
-def test_workers_give_the_same(many):
+def test_workers_find_the_same_truth(waveforms):
     context = multiprocessing.get_context("spawn")
     with concurrent.futures.ProcessPoolExecutor(2, mp_context=context) as pool:
-        assert same(jl.simulate_many(ASLANT, SCENE, **HOW, executor=pool), many)
+        assert same(jl.simulate_many(OBLIQUE, SCENE, **OPTIONS, executor=pool), waveforms)

@@ -69,7 +69,7 @@ def test_a_worker_that_dies_costs_its_fits_a_second_try(footprints, tmp_path):
     here, path = fit(footprints, lanes=2), tmp_path / "fits.sqlite"
     dying = Dying([1])
     assert np.array_equal(fit(footprints, lanes=2, executor=dying).fitted, here.fitted)
-    assert dying.given.count(1) == 2
+    assert dying.submitted.count(1) == 2
     with pytest.raises(RuntimeError, match="the workers of chunk 1 died twice"):
         fit(footprints, lanes=2, executor=Dying([1, 1]), path=path)
     # What the others had done is kept.

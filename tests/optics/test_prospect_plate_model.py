@@ -1,8 +1,10 @@
-"""The plate model against the textbook's formulas in 150 digits, in both precisions, with its derivatives.
+"""PROSPECT's plate model (a leaf as N absorbing plates) against the textbook's formulas in 150 digits.
 
-Errors are relative. Numbers below the smallest normal number of single precision (1.2e-38) are measured
-against that one, in both precisions. The surface is the exact index's, as it is to `Prospect`: NumPy arrays
-of double precision, of which the model makes use in single precision too.
+Reflectance, transmittance, absorptance and their derivatives in k (optical depth of a plate) and N, in single
+and double precision. Errors are relative. Numbers below the smallest normal number of single precision
+(1.2e-38) are measured against that one, in both precisions. The surface is that of the exact refractive
+index, as `Prospect` passes it: NumPy arrays of double precision, whose digits the model uses in single
+precision too.
 """
 
 import functools
@@ -17,19 +19,20 @@ from jaxlidar.optics.leaf_surface import LeafSurface, leaf_surface
 from jaxlidar.optics.plate_model import plate_model, plate_model_slopes
 from tests.helpers import BY_PRECISION
 
+# Optical depths and numbers of plates, half-angles of incidence in degrees, refractive indices.
 KS = (0.0, 1e-8, 1e-4, 1e-2, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
 NS = (1.0, 1.0001, 1.5, 2.0, 3.4, 10.0)
 ALPHAS = (0.0, 40.0, 59.0, 90.0)
 INDICES = (1.2, 1.3, 1.42, 1.55)
-# Compiling takes far longer than running here.
+# Compiling takes much longer than running here.
 quick_jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
 NAMES = ("R", "T", "A", "dR/dk", "dT/dk", "dA/dk", "dR/dN", "dT/dN", "dA/dN")
 SMALLEST = mpmath.mpf(float(np.finfo(np.float32).tiny))
 
 
 @functools.cache
-def cone(n, alpha):
-    """The mean transmittance of a surface, by adaptive quadrature of Fresnel's formulas."""
+def exact_cone_transmittance(n, alpha):
+    """Mean transmittance of a surface within a cone, by adaptive quadrature of Fresnel's formulas."""
     c = mpmath.cos(mpmath.radians(alpha)) if alpha < 90 else mpmath.mpf(0)
 
     def transmitted(mu):
@@ -44,20 +47,23 @@ def cone(n, alpha):
 
 
 @functools.cache
-def tau(k):
+def exact_tau(k):
+    """Transmittance 2 E3(k) of the interior of a plate for diffuse light."""
     return 2 * mpmath.expint(3, k)
 
 
 def textbook(k, N, n, alpha):
-    """Allen et al. (1969) and Stokes (1862) as printed in the literature on PROSPECT."""
-    t_alpha, t12 = cone(n, alpha), cone(n, 90.0)
+    """R, T and 1 - R - T by Allen et al. (1969) and Stokes (1862), as printed in the literature on
+    PROSPECT."""
+    t_alpha, t12 = exact_cone_transmittance(n, alpha), exact_cone_transmittance(n, 90.0)
     t21 = t12 / mpmath.mpf(n) ** 2
     r21 = 1 - t21
-    bounce = 1 - (r21 * tau(k)) ** 2
-    Ta = t_alpha * tau(k) * t21 / bounce
-    Ra = 1 - t_alpha + r21 * tau(k) * Ta
-    t = t12 * tau(k) * t21 / bounce
-    r = 1 - t12 + r21 * tau(k) * t
+    tau = exact_tau(k)
+    denominator = 1 - (r21 * tau) ** 2
+    Ta = t_alpha * tau * t21 / denominator
+    Ra = 1 - t_alpha + r21 * tau * Ta
+    t = t12 * tau * t21 / denominator
+    r = 1 - t12 + r21 * tau * t
     root = mpmath.sqrt((1 + r + t) * (1 + r - t) * (1 - r + t) * (1 - r - t))
     a, b = (1 + r**2 - t**2 + root) / (2 * r), (1 - r**2 + t**2 + root) / (2 * t)
     power = b ** (N - 1)
@@ -67,8 +73,12 @@ def textbook(k, N, n, alpha):
     return R, T, 1 - R - T
 
 
-def exact(k, N, n, alpha):
-    """The nine numbers of NAMES. The formulas fail at k = 0; 1e-50 is as good."""
+@functools.cache
+def exact_values_and_slopes(k, N, n, alpha):
+    """The nine numbers of NAMES; derivatives as differences in 150 digits.
+
+    The formulas fail at k = 0, for which k = 1e-50 stands.
+    """
     with mpmath.workdps(150):
         k, N, small = max(mpmath.mpf(k), mpmath.mpf(10) ** -50), mpmath.mpf(N), mpmath.mpf(10) ** -18
         values = textbook(k, N, n, alpha)
@@ -81,7 +91,8 @@ def exact(k, N, n, alpha):
         ]
 
 
-def points(precision):
+def grid_points(precision):
+    """All combinations (k, N, n, alpha), with k and N in a precision."""
     real = np.dtype(precision).type
     return [(real(k), real(N), n, a) for k in KS for N in NS for n in INDICES for a in ALPHAS]
 
@@ -89,49 +100,50 @@ def points(precision):
 static_surface = functools.cache(leaf_surface)
 
 
-def surfaces(where):
-    each = [static_surface(n, alpha) for *_, n, alpha in where]
-    return LeafSurface(*(np.array(column) for column in zip(*each)))
+def surfaces(points):
+    """The surfaces of points (k, N, n, alpha), as one `LeafSurface` of arrays."""
+    rows = [static_surface(n, alpha) for *_, n, alpha in points]
+    return LeafSurface(*(np.array(column) for column in zip(*rows)))
 
 
-def derivatives(k, N, face):
-    """Values, and forward derivatives through the public function."""
-    one = jnp.ones_like(k)
-    values, in_k = jax.jvp(lambda k: plate_model(k, N, face), (k,), (one,))
-    _, in_N = jax.jvp(lambda N: plate_model(k, N, face), (N,), (one,))
+def values_and_slopes(k, N, face):
+    """The nine numbers of NAMES by the public function and its forward derivatives."""
+    tangent = jnp.ones_like(k)
+    values, in_k = jax.jvp(lambda k: plate_model(k, N, face), (k,), (tangent,))
+    _, in_N = jax.jvp(lambda N: plate_model(k, N, face), (N,), (tangent,))
     return jnp.stack([*values, *in_k, *in_N])
 
 
 TOLERANCE = {"float32": 1e-6, "float64": 1e-13}
-exactly = functools.cache(exact)
 
 
 def test_against_the_textbook_in_150_digits(precision):
-    where = points(precision)
-    k, N = (jnp.array([p[i] for p in where]) for i in (0, 1))
-    face = surfaces(where)
-    got = np.asarray(jax.jit(lambda k, N: derivatives(k, N, face))(k, N), dtype=float)
-    for i, p in enumerate(where):
-        for name, value, x in zip(NAMES, got[:, i], exactly(float(p[0]), float(p[1]), *p[2:])):
+    points = grid_points(precision)
+    k, N = (jnp.array([p[i] for p in points]) for i in (0, 1))
+    face = surfaces(points)
+    computed = np.asarray(jax.jit(lambda k, N: values_and_slopes(k, N, face))(k, N), dtype=float)
+    for i, p in enumerate(points):
+        exact = exact_values_and_slopes(float(p[0]), float(p[1]), *p[2:])
+        for name, value, x in zip(NAMES, computed[:, i], exact):
             error = float(abs(mpmath.mpf(float(value)) - x) / max(abs(x), SMALLEST))
             # Below SMALLEST single precision has no digits, and zero is exact.
-            underflown = abs(x) < SMALLEST and value < 1e-37
-            assert error < TOLERANCE[precision] or underflown, (name, p, value, float(x), error)
+            is_underflow = abs(x) < SMALLEST and value < 1e-37
+            assert error < TOLERANCE[precision] or is_underflow, (name, p, value, float(x), error)
 
 
-def test_a_surface_that_is_rounded_costs_its_rounding():
+def test_a_rounded_surface_adds_no_more_than_its_rounding():
     k, N = (x.ravel() for x in jnp.meshgrid(jnp.geomspace(1e-3, 8, 30), jnp.linspace(1, 10, 10)))
     face = leaf_surface(np.full(k.size, 1.42))
-    exactly, rounded = (
+    with_digits, rounded = (
         np.asarray(plate_model_slopes(k, N, f)) for f in (face, LeafSurface(*map(jnp.asarray, face)))
     )
-    np.testing.assert_allclose(rounded, exactly, rtol=1.5e-6)
+    np.testing.assert_allclose(rounded, with_digits, rtol=1.5e-6)
 
 
 def test_energy_is_conserved(precision):
-    where = points(precision)
-    k, N = (jnp.array([p[i] for p in where]) for i in (0, 1))
-    R, T, A = jax.jit(plate_model)(k, N, surfaces(where))
+    points = grid_points(precision)
+    k, N = (jnp.array([p[i] for p in points]) for i in (0, 1))
+    R, T, A = jax.jit(plate_model)(k, N, surfaces(points))
     unit = float(np.finfo(precision).eps)
     np.testing.assert_allclose(R + T + A, 1, rtol=4 * unit)
     np.testing.assert_allclose((R + T)[k == 0], 1, rtol=4 * unit)
@@ -143,7 +155,7 @@ def test_slopes_are_the_derivatives(precision):
     face = LeafSurface(*(jnp.asarray(f, precision) for f in leaf_surface(np.full(4, 1.42))))
     values, in_k, in_N = plate_model_slopes(k, N, face)
     np.testing.assert_allclose(
-        jnp.stack([*values, *in_k, *in_N]), jax.jit(derivatives)(k, N, face), rtol=1e-6
+        jnp.stack([*values, *in_k, *in_N]), jax.jit(values_and_slopes)(k, N, face), rtol=1e-6
     )
 
 
@@ -202,7 +214,7 @@ def test_nothing_is_nan_or_infinite(precision):
     ]
     k, N = (jnp.array([p[i] for p in grid]) for i in (0, 1))
     face = surfaces(grid)
-    assert np.all(np.isfinite(jax.jit(derivatives)(k, N, face)))
+    assert np.all(np.isfinite(jax.jit(values_and_slopes)(k, N, face)))
 
     def total(k, N, face):
         return sum(jnp.sum(x) for x in plate_model(k, N, face))
@@ -219,17 +231,14 @@ def test_nothing_is_nan_or_infinite(precision):
 @pytest.mark.parametrize("alpha", ALPHAS)
 def test_surface(alpha, precision):
     for n in (1.01, 1.2, 1.55, 2.5):
-        exact_alpha, exact_12 = float(cone(n, alpha)), float(cone(n, 90.0))
-        want = LeafSurface(
-            exact_alpha, 1 - exact_alpha, exact_12, 1 - exact_12, exact_12 / n**2, 1 - exact_12 / n**2
-        )
-        np.testing.assert_allclose(leaf_surface(n, alpha), want, rtol=3e-12)
+        t_alpha, t12 = float(exact_cone_transmittance(n, alpha)), float(exact_cone_transmittance(n, 90.0))
+        exact = LeafSurface(t_alpha, 1 - t_alpha, t12, 1 - t12, t12 / n**2, 1 - t12 / n**2)
+        np.testing.assert_allclose(leaf_surface(n, alpha), exact, rtol=3e-12)
         # Traced or JAX indices go through working precision.
-        got = leaf_surface(jnp.asarray(n), alpha)
-        np.testing.assert_allclose(
-            got, leaf_surface(float(jnp.asarray(n)), alpha), rtol=8 * float(np.finfo(precision).eps)
-        )
+        n = jnp.asarray(n)
+        rtol = 8 * float(np.finfo(precision).eps)
+        np.testing.assert_allclose(leaf_surface(n, alpha), leaf_surface(float(n), alpha), rtol=rtol)
 
 
-def test_no_surface():
+def test_an_index_of_one_has_no_surface():
     np.testing.assert_allclose(leaf_surface(1.0, 40.0), (1, 0, 1, 0, 1, 0), atol=1e-15)

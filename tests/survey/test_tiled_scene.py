@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxlidar as jl
-from jaxlidar.survey.squares import all_light, squares_of
+from jaxlidar.survey.tiled_scene import lossless_margin, tiles_of
 
 SIDE, TALL = 48, 6
 LEAF = jl.LeafOptics(0.5, 0.45)
@@ -98,37 +98,37 @@ def test_rectangles_have_one_size_and_hold_all_light():
     for zenith in (0.0, 30.0):
         shots, scene = survey(zenith=zenith), tiled(Forest())
         for margin in (0.0, 7.0):
-            squares = squares_of(shots, scene, margin)
-            assert sorted(np.concatenate([s.shots for s in squares])) == list(range(len(shots)))
-            sizes = np.array([s.high - s.low for s in squares])
+            tiles = tiles_of(shots, scene, margin)
+            assert sorted(np.concatenate([s.shots for s in tiles])) == list(range(len(shots)))
+            sizes = np.array([s.high - s.low for s in tiles])
             np.testing.assert_allclose(sizes, sizes[0, 0])
-            for square in squares:
+            for tile in tiles:
                 for z in scene.z:
-                    axis = shots.direction[square.shots]
-                    centre = shots.position[square.shots] + z * axis[:, :2] / axis[:, 2:]
-                    extent = shots.footprint_radius[square.shots, None] + margin
-                    assert np.all(centre - extent >= square.low)
-                    assert np.all(centre + extent <= square.high)
+                    axis = shots.direction[tile.shots]
+                    centre = shots.position[tile.shots] + z * axis[:, :2] / axis[:, 2:]
+                    extent = shots.footprint_radius[tile.shots, None] + margin
+                    assert np.all(centre - extent >= tile.low)
+                    assert np.all(centre + extent <= tile.high)
 
 
-def test_light_that_goes_farther_comes_back_too_late():
+def test_light_beyond_the_lossless_margin_returns_after_the_record():
     """The shortest path over two random points farther apart than the bound ends after the record."""
     random = np.random.default_rng(2)
     for zenith in (0.0, 20.0, 50.0):
         shots = survey(zenith=zenith)
-        w, last, top = shots.direction[0], 60.0, 10.0
-        bound = all_light(shots, last, top)
+        w, longest, top = shots.direction[0], 60.0, 10.0
+        bound = lossless_margin(shots, longest, top)
         z = random.uniform(0, top, (20_000, 2))
         azimuth, separation = random.uniform(0, 2 * np.pi, 20_000), bound * random.uniform(0.5, 1.5, 20_000)
         first = z[:, :1] / w[2] * w
         second = first + np.c_[separation * np.cos(azimuth), separation * np.sin(azimuth), z[:, 1] - z[:, 0]]
         path = first @ w + np.linalg.norm(second - first, axis=1) + second @ w
-        assert path[separation > bound].min() >= last
+        assert path[separation > bound].min() >= longest
         # The bound is tight: in the worst direction, light from 0.7 of it returns in time.
-        assert separation[path < last].max() > 0.7 * bound
+        assert separation[path < longest].max() > 0.7 * bound
 
 
-def test_an_interrupted_run_goes_on_and_gives_the_same(tmp_path):
+def test_an_interrupted_run_continues_with_the_same_results(tmp_path):
     path = tmp_path / "many.nc"
 
     def interrupt(progress):

@@ -1,0 +1,461 @@
+"""Results as `xarray.Dataset`s, one for each group of a file, and back: `datasets_of`, `result_of`.
+
+The annotations of a class decide what becomes of its fields:
+
+| field | in the Dataset |
+| --- | --- |
+| array of shape "wavelengths bins" | a variable with these dimensions, or as a `ResultLayout` renames them |
+| dict of such arrays | one variable with one more dimension, the first, whose coordinate has the keys |
+| dict of arrays of any shape, "..." | a variable "FIELD.NUMBER.KEY" for each, with the attribute `item` |
+| static field | an attribute, as JSON; a tuple of texts is a coordinate |
+| `Scene` or `Lidar` | an attribute, as TOML of a `Case`; its long arrays in the group "FIELD_arrays" |
+| object of another known class | the group of the field's name |
+
+`keep_as_netcdf` makes a class known, with the units and long names of its fields, so that other packages can
+add theirs. `jaxlidar.open` finds packages that are not imported yet by the entry points `jaxlidar.files`.
+
+xarray's `DataTree` would hold all groups in one object, but it refuses groups in which a dimension has
+another size than in the group above. Such results are legitimate, so groups are kept in a dict.
+"""
+
+import dataclasses
+import hashlib
+import json
+import re
+import typing
+from collections.abc import Collection, Mapping
+from importlib import metadata
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool
+
+from jaxlidar.instrument.lidar import Lidar
+from jaxlidar.io.case import Case, case_of, case_text
+from jaxlidar.io.checks import refuse_damage
+from jaxlidar.io.kinds import is_tuple
+from jaxlidar.io.rows import CHECKSUMS, RowVariables, check_rows, unwritten_rows
+from jaxlidar.io.stores import FORMAT, Store
+from jaxlidar.io.tables import nearest
+from jaxlidar.scenes.scene import Scene
+
+# The group of entry points that name the modules which call `keep_as_netcdf`, by class.
+ENTRY_POINTS = "jaxlidar.files"
+# Classes of fields that are written as the TOML text of a case, and the field of the case.
+_CASE_FIELDS: dict[Any, str] = {Scene: "scene", Lidar: "lidar"}
+# Attributes of a group: the name of the class, and the checksum of its texts.
+KIND, _TEXT_DIGEST = "jaxlidar_kind", "text_sha256"
+
+
+class ResultLayout(NamedTuple):
+    """Names and units with which a class of results is written; see `keep_as_netcdf`."""
+
+    kind: type
+    title: str
+    quantities: Mapping[str, tuple[str, str]]
+    dimensions: Mapping[str, str]
+    items: Mapping[str, str]
+    coordinates: Mapping[str, str]
+    former_names: Mapping[str, str]
+    rows: str | None
+
+    @property
+    def row_variables(self) -> RowVariables:
+        """Fields whose first dimension is that of rows, each of which is one variable."""
+        if self.rows is None:
+            return RowVariables((), "")
+        names = [
+            field.name
+            for field in dataclasses.fields(self.kind)
+            if (_dimensions(field.type) or [None])[0] == self.rows
+        ]
+        return RowVariables(tuple(names), self.dimensions.get(self.rows, self.rows))
+
+    def items_of(self, field: str) -> str:
+        """Dimension of the keys of a field that is a dict."""
+        return self.items.get(field, f"{field}_item")
+
+
+LAYOUTS: dict[str, ResultLayout] = {}
+
+
+def keep_as_netcdf(
+    kind: type,
+    title: str,
+    quantities: Mapping[str, tuple[str, str]],
+    *,
+    dimensions: Mapping[str, str] | None = None,
+    items: Mapping[str, str] | None = None,
+    coordinates: Mapping[str, str] | None = None,
+    former_names: Mapping[str, str] | None = None,
+    rows: str | None = None,
+) -> None:
+    """Let `save` and `open` know a class of results, an `equinox.Module` whose fields are annotated.
+
+    Fields are arrays, dicts of arrays, modules that are known themselves, a `Scene` or a `Lidar`; static
+    fields hold what JSON holds.
+
+    **Arguments:**
+
+    - `kind`: the class.
+    - `title`: what it is, in a few words.
+    - `quantities`: (units, long name) of every field that is an array or a dict of arrays.
+    - `dimensions`: names of dimensions in the file by those in annotations, where they differ. A dimension
+      with the name of a field of one axis makes that field a coordinate. Default None: none differs.
+    - `items`: names of the dimensions of the keys of dicts, by field. Default None: "FIELD_item".
+    - `coordinates`: further fields that are coordinates, each with the dimension that it lies along. Default
+      None: none.
+    - `former_names`: names of fields in files that were written before the fields were renamed, by their
+      names now. Default None: none was renamed.
+    - `rows`: a dimension of the annotations that is the first of some fields. Their values are written and
+      checked some rows at a time, and not read into memory. Default None: none.
+
+    **Returns:** nothing.
+
+    **Example:**
+
+    >>> import equinox as eqx, numpy as np, pathlib, tempfile
+    >>> import jaxlidar as jl
+    >>> from jaxtyping import Float
+    >>> class Heights(eqx.Module):
+    ...     top: Float[np.ndarray, " trees"]
+    >>> jl.io.keep_as_netcdf(Heights, "heights of trees", {"top": ("m", "height of the highest twig")})
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "trees.nc"
+    >>> jl.io.save(Heights(np.array([12.5, 20.0])), path)
+    >>> jl.open(path).top
+    array([12.5, 20. ])
+    """
+    LAYOUTS[kind.__name__] = ResultLayout(
+        kind,
+        title,
+        quantities,
+        dimensions or {},
+        items or {},
+        coordinates or {},
+        former_names or {},
+        rows,
+    )
+
+
+def layout_of(name: str, path: Path) -> ResultLayout:
+    """Return the layout of a class by its name; a package that registers it is imported first.
+
+    **Raises:** ValueError, naming the file, for a class that nobody registers.
+    """
+    if name not in LAYOUTS:
+        for point in metadata.entry_points(group=ENTRY_POINTS):
+            if point.name == name:
+                point.load()
+    if name not in LAYOUTS:
+        raise ValueError(
+            f"{path}: it holds a {name}, which is not known here ({nearest(name, LAYOUTS)}): import the "
+            "package that has it first"
+        )
+    return LAYOUTS[name]
+
+
+def _array_dimensions(annotation: Any) -> list[str] | None:
+    """Dimensions of an annotated array; None where the annotation is no array."""
+    shape = getattr(annotation, "dim_str", None)
+    return None if shape is None else shape.split()
+
+
+def _item_annotation(annotation: Any) -> Any:
+    """Annotation of the values of a dict of arrays; None where the annotation is no such dict."""
+    arguments = typing.get_args(annotation)
+    is_dict = typing.get_origin(annotation) is dict and len(arguments) == 2
+    return arguments[1] if is_dict and _array_dimensions(arguments[1]) is not None else None
+
+
+def _dimensions(annotation: Any) -> list[str] | None:
+    """Dimensions of an array, or of each array of a dict."""
+    shape = _array_dimensions(annotation)
+    return _array_dimensions(_item_annotation(annotation)) if shape is None else shape
+
+
+# -- to datasets -------------------------------------------------------------------------------------------
+
+
+def datasets_of(result: Any, group: str = "/", *, row_values: bool = True) -> dict[str, Any]:
+    """Return a result as `xarray.Dataset`s by the path of their group: "/", "/truth", ...
+
+    **Arguments:**
+
+    - `result`: an object of a class that `keep_as_netcdf` knows.
+    - `group`: path of its own group; those of objects in its fields lie below. Default "/".
+    - `row_values`: False gives row fields variables of the right shape and type whose values are zeros that
+      take no memory: their values are written later. Default True.
+
+    **Returns:** a dict of `xarray.Dataset`.
+
+    **Raises:** TypeError for values that no file can hold. ImportError where xarray is not installed.
+    """
+    try:
+        import xarray
+    except ImportError as error:
+        raise ImportError("datasets need xarray: pip install 'jaxlidar[io]'") from error
+    layout = LAYOUTS[type(result).__name__]
+    builder = _DatasetBuilder(layout, () if row_values else layout.row_variables.names)
+    inner_datasets: dict[str, Any] = {}
+    for field in dataclasses.fields(result):
+        name, value = field.name, getattr(result, field.name)
+        inner_group = f"{group.rstrip('/')}/{name}"
+        if field.metadata.get("static"):
+            builder.add_static(name, value)
+        elif (dimensions := _array_dimensions(field.type)) is not None:
+            builder.add_array(name, name, dimensions, value)
+        elif (annotation := _item_annotation(field.type)) is not None:
+            builder.add_arrays(name, _array_dimensions(annotation) or [], value)
+        elif field.type in _CASE_FIELDS:
+            case = Case(**{_CASE_FIELDS[field.type]: value})
+            attributes, inner_datasets[f"{inner_group}_arrays"] = case_dataset(name, case)
+            builder.attributes |= attributes
+        elif type(value).__name__ in LAYOUTS:
+            inner_datasets |= datasets_of(value, inner_group, row_values=row_values)
+        elif value is None:
+            builder.add_static(name, value)
+        else:
+            raise TypeError(f"{name} is of the class {type(value).__name__}, which no file can hold")
+    dataset = xarray.Dataset(builder.variables, attrs=builder.attributes).set_coords(list(layout.coordinates))
+    dataset.attrs[_TEXT_DIGEST] = _text_digest(dataset, layout)
+    return {group: dataset, **{path: inner for path, inner in inner_datasets.items() if inner is not None}}
+
+
+def case_dataset(name: str, case: Case) -> tuple[dict[str, str], Any]:
+    """Return a case as attributes with its TOML text, and as a Dataset of its arrays; None without arrays."""
+    import xarray
+
+    text, arrays = case_text(case)
+    attributes = {name: text, f"{name}_sha256": hashlib.sha256(text.encode()).hexdigest()}
+    variables = {
+        key: ([f"{key}.{axis}" for axis in range(array.ndim)], array) for key, array in arrays.items()
+    }
+    return attributes, xarray.Dataset(variables) if variables else None
+
+
+def variables_by_item(dataset: Any, field: str) -> dict[str, str]:
+    """Return the names of the variables of a field that is a dict of arrays of any shape, by their key."""
+    names = [str(name) for name in dataset.variables if str(name).startswith(f"{field}.")]
+    names.sort(key=lambda name: int(name.split(".")[1]))
+    return {str(dataset.variables[name].attrs["item"]): name for name in names}
+
+
+class _DatasetBuilder:
+    """Variables and attributes of the Dataset of one object."""
+
+    def __init__(self, layout: ResultLayout, unwritten_fields: Collection[str]):
+        self.layout, self.unwritten_fields = layout, unwritten_fields
+        self.variables: dict[str, Any] = {}
+        self.attributes: dict[str, Any] = {"title": layout.title, KIND: layout.kind.__name__}
+        self._sizes: dict[str, int] = {}
+
+    def add_static(self, name: str, value: Any) -> None:
+        if isinstance(value, tuple) and value and all(isinstance(text, str) for text in value):
+            self._add_texts(name, list(value))
+        else:
+            self.attributes[name] = json.dumps(value, default=_json_value)
+
+    def add_array(self, field: str, name: str, annotated: list[str], value: Any, **attrs: str) -> None:
+        """Add the variable `name` with the units of a field, and with further attributes."""
+        array, dimensions = np.asarray(value), self._named(name, annotated, np.ndim(value))
+        if field in self.unwritten_fields:
+            array = unwritten_rows(len(array), array)
+        units, long_name = self.layout.quantities[field]
+        self._sizes |= dict(zip(dimensions, array.shape))
+        self.variables[name] = (dimensions, array, {"units": units, "long_name": long_name, **attrs})
+
+    def add_arrays(self, field: str, annotated: list[str], arrays: Mapping[str, Any]) -> None:
+        """Add a dict of arrays: one variable where all have one shape, otherwise one for each."""
+        if "..." in annotated:
+            for number, (key, array) in enumerate(arrays.items()):
+                # Any program that reads netCDF admits such a name.
+                plain_key = re.sub(r"\W+", "_", key)
+                self.add_array(field, f"{field}.{number}.{plain_key}", annotated, array, item=key)
+            return
+        keys = self.layout.items_of(field)
+        self._add_texts(keys, list(arrays))
+        if not arrays:
+            named = self._named(field, annotated, len(annotated))
+            stacked = np.zeros((0, *(self._sizes[dimension] for dimension in named)))
+        elif field in self.unwritten_fields:
+            stacked = unwritten_rows(len(arrays), np.asarray(next(iter(arrays.values())))[None])
+        else:
+            stacked = np.stack([np.asarray(array) for array in arrays.values()])
+        self.add_array(field, field, [keys, *annotated], stacked)
+
+    def _add_texts(self, name: str, texts: list[str]) -> None:
+        """Add a coordinate of texts; several dicts with the same keys share one."""
+        if name in self.variables and (before := self.variables[name][1].tolist()) != texts:
+            raise ValueError(f"{name} = {texts} differs from the {name} of another field, {before}")
+        self.variables[name] = ([name], np.array(texts, dtype=str))
+
+    def _named(self, name: str, annotated: list[str], ndim: int) -> list[str]:
+        """Names of all dimensions of a variable, from those of its annotation."""
+        named = [self.layout.dimensions.get(d, d) for d in annotated if d != "..."]
+        if "..." in annotated:
+            # Axes without a name of their own.
+            at = annotated.index("...")
+            named[at:at] = [f"{name}.{axis}" for axis in range(ndim - len(named))]
+        # A dimension cannot be two axes of one variable: the second axis of a covariance is "labels_2".
+        return [d if d not in named[:i] else f"{d}_{i + 1}" for i, d in enumerate(named)]
+
+
+def _json_value(value: Any) -> Any:
+    if isinstance(value, np.generic | np.ndarray | jax.Array):
+        return np.asarray(value).tolist()
+    raise TypeError(f"a {type(value).__name__} is nothing that a file can hold")
+
+
+def _text_digest(dataset: Any, layout: ResultLayout, *, with_names: bool = True) -> str:
+    """Checksum of the texts of a Dataset: netCDF has checksums for numbers alone.
+
+    The texts are the static fields, the keys in attributes, and, if `with_names`, the coordinates of texts.
+    """
+    variables = sorted(dataset.variables.items())
+    items = [(name, variable.attrs["item"]) for name, variable in variables if "item" in variable.attrs]
+    names = [
+        (name, [str(text) for text in variable.values])
+        for name, variable in variables
+        if variable.dtype.kind in "OUT" and variable.ndim == 1
+    ]
+    static = [field.name for field in dataclasses.fields(layout.kind) if field.metadata.get("static")]
+    attributes = [(name, str(dataset.attrs[name])) for name in static if name in dataset.attrs]
+    texts = [items, names if with_names else [], attributes]
+    return hashlib.sha256(json.dumps(texts).encode()).hexdigest()
+
+
+# -- from datasets -----------------------------------------------------------------------------------------
+
+
+def result_of(stored: Store, group: str = "/") -> Any:
+    """Return the object that a group holds, the inverse of `datasets_of`.
+
+    **Arguments:** `stored`: the open file. `group`: path of the group. Default "/".
+
+    **Raises:** ValueError, naming the file and the place in it, for damage and for what is missing.
+    """
+    return _GroupReader(stored, group).result()
+
+
+def case_of_group(stored: Store, name: str, group: str = "/") -> Case:
+    """Return the case that is an attribute of a group. **Raises:** as `result_of`."""
+    return _GroupReader(stored, group).case(name)
+
+
+class _GroupReader:
+    """Reads the object of one group."""
+
+    def __init__(self, stored: Store, group: str):
+        self.stored, self.group, self.path = stored, group, stored.path
+        with refuse_damage(f"{self.path}: {group}: damaged"):
+            self.dataset = stored.dataset(group)
+        if self.dataset is None:
+            raise ValueError(f"{self.path}: {group}: no such group")
+
+    def _place(self, name: str) -> str:
+        return f"{self.path}: {self.group.rstrip('/')}/{name}"
+
+    def result(self) -> Any:
+        layout = layout_of(self._attribute(KIND), self.path)
+        place = f"{self.path}: {self.group}"
+        with refuse_damage(f"{place}: damaged"):
+            digests = {_text_digest(self.dataset, layout)}
+            if self.stored.dataset("/").attrs.get(FORMAT) == 1:
+                # The checksum in netCDF files of the first format does not include names.
+                digests.add(_text_digest(self.dataset, layout, with_names=False))
+            is_intact = self.dataset.attrs.get(_TEXT_DIGEST) in digests
+        if not is_intact:
+            raise ValueError(f"{place}: damaged (the checksum of its texts is another)")
+        fields = {field.name: self._field(layout, field) for field in dataclasses.fields(layout.kind)}
+        if layout.rows is not None:
+            checksums = self._numbers(CHECKSUMS)
+            check_rows(place, checksums, {name: fields[name] for name in layout.row_variables.names})
+        try:
+            return layout.kind(**fields)
+        except (ValueError, TypeError) as error:
+            raise type(error)(f"{place}: {error}") from error
+
+    def _field(self, layout: ResultLayout, field: Any) -> Any:
+        name, annotation = field.name, field.type
+        has_rows = name in layout.row_variables.names
+        keys_name, former_name = layout.items_of(name), layout.former_names.get(name, name)
+        if name not in self.dataset.variables and former_name in self.dataset.variables:
+            name = former_name
+        if field.metadata.get("static"):
+            return self._static(name, annotation)
+        if _array_dimensions(annotation) is not None:
+            return self._array(name, annotation, has_rows)
+        if (item_annotation := _item_annotation(annotation)) is not None:
+            if "..." in (_array_dimensions(item_annotation) or []):
+                return self._arrays_of_any_shape(name, item_annotation)
+            keys = self._texts(keys_name)
+            arrays = self._array(name, item_annotation, has_rows)
+            if len(arrays) != len(keys):
+                raise ValueError(f"{self._place(name)}: {len(arrays)} rows for {len(keys)} names")
+            return dict(zip(keys, arrays))
+        if annotation in _CASE_FIELDS:
+            return getattr(self.case(name), _CASE_FIELDS[annotation])
+        if name in self.dataset.attrs and self._static(name, annotation) is None:
+            return None
+        return result_of(self.stored, f"{self.group.rstrip('/')}/{name}")
+
+    def case(self, name: str) -> Case:
+        if name not in self.dataset.attrs:
+            raise ValueError(f"{self._place(name)}: no such attribute: it was saved without its case")
+        text = self._attribute(name)
+        if hashlib.sha256(text.encode()).hexdigest() != self._attribute(f"{name}_sha256", name):
+            raise ValueError(f"{self._place(name)}: damaged (its checksum is another)")
+
+        def arrays(file: str | None, key: str) -> np.ndarray:
+            if file is not None:
+                raise ValueError(f"array = {key!r} lies in {file!r}, not in this file")
+            return _GroupReader(self.stored, f"{self.group.rstrip('/')}/{name}_arrays")._numbers(key)
+
+        return case_of(text, self.path, arrays)
+
+    def _attribute(self, name: str, place: str | None = None) -> str:
+        with refuse_damage(f"{self._place(place or name)}: damaged"):
+            if name not in self.dataset.attrs:
+                raise ValueError(f"the attribute {name} is missing")
+            return str(self.dataset.attrs[name])
+
+    def _static(self, name: str, annotation: Any) -> Any:
+        if name in self.dataset.variables:
+            return tuple(self._texts(name))
+        text = self._attribute(name)
+        with refuse_damage(f"{self._place(name)}: damaged"):
+            value = json.loads(text)
+        return tuple(value) if is_tuple(annotation) else value
+
+    def _texts(self, name: str) -> list[str]:
+        if name not in self.dataset.variables:
+            raise ValueError(f"{self._place(name)}: no such variable")
+        with refuse_damage(f"{self._place(name)}: damaged"):
+            return [str(text) for text in self.stored.values(self.group, name)]
+
+    def _arrays_of_any_shape(self, field: str, annotation: Any) -> dict[str, Any]:
+        with refuse_damage(f"{self._place(field)}: damaged"):
+            variables = variables_by_item(self.dataset, field)
+        return {item: self._array(name, annotation, False) for item, name in variables.items()}
+
+    def _numbers(self, name: str, has_rows: bool = False) -> np.ndarray:
+        if name not in self.dataset.variables:
+            raise ValueError(f"{self._place(name)}: no such variable")
+        with refuse_damage(f"{self._place(name)}: damaged"):
+            if has_rows:
+                return self.stored.row_values(self.group, name)
+            return self.stored.values(self.group, name)
+
+    def _array(self, name: str, annotation: Any, has_rows: bool) -> Any:
+        array = self._numbers(name, has_rows)
+        if annotation.dtype is Bool:
+            # netCDF has no such type: bytes stand for it.
+            array = array.astype(bool)
+        if annotation.array_type is np.ndarray:
+            return array
+        # Double precision stays double, in whatever precision JAX computes now.
+        with jax.enable_x64(True):
+            return jnp.asarray(array)

@@ -1,0 +1,176 @@
+"""The choice of strategy, per shot or shared illumination, for the shots of a survey over one scene."""
+
+import math
+
+import numpy as np
+
+from jaxlidar._checks import concrete_array, concrete_number
+from jaxlidar._summary import percent
+from jaxlidar.instrument.survey import Survey
+from jaxlidar.optics.laws import AbstractMirror
+from jaxlidar.planning.local_origin import move_aim_to_origin
+from jaxlidar.planning.parallel_light import beams_are_parallel, parallel_light_bound
+from jaxlidar.planning.plan import DEFAULT_RTOL, Plan
+from jaxlidar.planning.plan import plan as make_plan
+from jaxlidar.planning.setup import Setup, make_setup
+from jaxlidar.scenes.scene import Scene
+from jaxlidar.survey.footprint_splines import FootprintSplines, fit_footprints
+from jaxlidar.survey.node_groups import IlluminatedNodes, NodeGroup, illuminated_nodes, make_groups
+from jaxlidar.survey.per_shot import PerShotStrategy
+from jaxlidar.survey.shared_illumination import SharedIlluminationStrategy
+from jaxlidar.survey.strategy import AbstractStrategy
+from jaxlidar.survey.view_geometry import ViewGeometry
+
+# Fractions of the tolerance that parallel light may take, and the grid of nodes; the finest grid may take
+# more.
+_PARALLEL_LIGHT, _GRID, _FINEST_GRID = 0.5, 0.2, 0.5
+# Where responses are kept by shot, the grid serves only absorption and escape: its error may be as large as
+# this.
+_GRID_BY_SHOT = 0.01
+# Coefficients below this fraction of the tolerance, of the largest, do not count.
+_FAINT = 0.01
+# A batch of a shot traced alone has so many times the photons and the rays of a footprint that shares light,
+# for which batches are many and small. A ray costs about as much as a photon, and even half the rays add
+# little to the error.
+_FEWER_PHOTONS, _FEWER_RAYS = 4.0, 2.0
+# By shot, a batch costs something for every shot, and photons cost more: batches are as large as those of one
+# shot.
+_FEWER_PHOTONS_BY_SHOT = 1.0
+# Sharing pays where so many footprints overlap in the mean, by node and by shot, and shots are so many.
+_MIN_OVERLAP, _MIN_OVERLAP_BY_SHOT, _MIN_SHOTS = 1.3, 2.0, 4
+# Numbers of rays and of photons of a batch are powers of two in these ranges: surveys share compiled
+# programs.
+_RAYS, _PHOTONS = (64, 4096), (256, 8192)
+
+
+def choose_strategy(
+    survey: Survey,
+    scene: Scene,
+    rtol: float | None,
+    max_orders: int | None,
+    shared: bool | None,
+    window: tuple[float, float] | None = None,
+) -> AbstractStrategy:
+    """Return the strategy for the shots of a survey over one scene; arguments are those of `simulate_many`.
+
+    `window`: times of the first and the last sample, ns; None: those that the scene needs.
+    """
+    plan = make_plan(survey, scene, rtol=rtol, max_orders=max_orders, window=window, describe=False)
+    rtol = DEFAULT_RTOL if rtol is None else float(rtol)
+    # Eight batches then have 6.4 / rtol^2 photons: a sample with a sixth of the light has the relative error
+    # rtol.
+    n_photons = _power_of_two(0.8 / rtol**2, *_PHOTONS)
+    plan = plan.with_config(n_rays=_rays_of_batch(plan, survey, scene, rtol), n_photons=n_photons)
+    # The setup is that of one shot in the middle of the survey, with the largest zenith angle.
+    middle = survey.middle
+    setup = make_setup(middle, scene, plan)
+    # Coordinates are relative to the survey's middle, where single precision is fine. A scene that cannot be
+    # moved keeps its coordinates, and the lidar its position.
+    lidar, _ = move_aim_to_origin(middle, scene)
+    relative_survey = survey.about(concrete_array(middle.position) - concrete_array(lidar.position))
+    strategy = _shared_illumination(relative_survey, setup, rtol, shared)
+    return PerShotStrategy(setup, relative_survey, rtol) if strategy is None else strategy
+
+
+def _rays_of_batch(plan: Plan, survey: Survey, scene: Scene, rtol: float) -> int:
+    """Return the number of rays of a footprint in a batch.
+
+    Enough for the tolerance, and at most 32 for each column of voxels: more would meet the same voxels.
+    """
+    rays = 10.0 / rtol
+    if scene.canopy is not None:
+        edge = float(np.min(concrete_array(scene.canopy.voxels.voxel_size)[:2]))
+        columns = (1.0 + 2.0 * float(np.max(survey.footprint_radius)) / edge) ** 2
+        rays = min(rays, 32.0 * columns)
+    return min(_power_of_two(rays, *_RAYS), plan.n_rays)
+
+
+def _power_of_two(x: float, low: int, high: int) -> int:
+    """Return the smallest power of two that is not below `x`, within bounds."""
+    return int(min(max(2 ** math.ceil(math.log2(x)), low), high))
+
+
+def _shared_illumination(
+    survey: Survey, setup: Setup, rtol: float, shared: bool | None
+) -> SharedIlluminationStrategy | None:
+    """Return the strategy with shared light, or None where shots cannot share it, or where it does not pay.
+
+    1. Can shots share light at all (`reason_against_sharing`)?
+    2. Is there a grid whose error is small against the tolerance?
+    3. Do enough footprints overlap?
+    4. Make groups of nodes.
+
+    `survey` and `setup` have the same origin of coordinates. `shared`: True where shots must share light,
+    None where they do if it pays.
+
+    **Raises:** ValueError where shots must share light and cannot.
+    """
+    if shared is False:
+        return None
+    reason = reason_against_sharing(survey, setup, rtol)
+    if reason is not None:
+        if shared:
+            raise ValueError(f"shared = True, but {reason}; admissible is None or False")
+        return None
+    if shared is None and len(survey) < _MIN_SHOTS:
+        return None
+    by_shot = _is_by_shot(survey)
+    splines = fit_footprints(survey, max(_GRID * rtol, _GRID_BY_SHOT) if by_shot else _GRID * rtol)
+    if not by_shot and splines.error > _FINEST_GRID * rtol:
+        if shared:
+            raise ValueError(
+                f"shared = True, but the finest grid misplaces {percent(splines.error)} of the light, at "
+                f"rtol = {rtol:g}; admissible is None or False"
+            )
+        return None
+    nodes = illuminated_nodes(splines, _FAINT * rtol)
+    if shared is None and nodes.overlap < (_MIN_OVERLAP_BY_SHOT if by_shot else _MIN_OVERLAP):
+        return None
+    fewer_photons = _FEWER_PHOTONS_BY_SHOT if by_shot else _FEWER_PHOTONS
+    groups = _groups(splines, nodes, setup, fewer_photons)
+    view_geometry = ViewGeometry.of(survey, groups, splines.spacing) if by_shot else None
+    bound = _parallel_light_bound(survey, setup)
+    return SharedIlluminationStrategy(setup, survey, rtol, groups, splines.spacing, view_geometry, bound)
+
+
+def _is_by_shot(survey: Survey) -> bool:
+    """Return True where shots see light each in its own way: oblique beams, or a field of view."""
+    return survey.lidar.field_of_view is not None or bool(np.any(survey.zenith > 0))
+
+
+def _parallel_light_bound(survey: Survey, setup: Setup) -> float:
+    return parallel_light_bound(survey, setup.plan.limits.start_distance, setup.plan.scope.last_return)
+
+
+def _groups(
+    splines: FootprintSplines, nodes: IlluminatedNodes, setup: Setup, fewer_photons: float
+) -> list[NodeGroup]:
+    """Return groups of nodes with as many photons as make batches of a footprint of the size aimed at."""
+    plan = setup.plan
+    light_per_footprint = float(nodes.light.sum()) * nodes.overlap / len(splines.first_node)
+    photons = plan.n_photons / fewer_photons / light_per_footprint if plan.orders > 1 else 0.0
+    return make_groups(splines, nodes, photons, plan.n_rays / _FEWER_RAYS / light_per_footprint)
+
+
+def reason_against_sharing(survey: Survey, setup: Setup, rtol: float) -> str | None:
+    """Return the reason why the shots of a survey cannot share light; None where they can."""
+    canopy, lidar = setup.scene.canopy, setup.lidar
+    if not beams_are_parallel(survey):
+        return "shots have more than one direction"
+    if _is_by_shot(survey) and setup.plan.orders == 1:
+        return "one order is followed, which shots that lean or have a field of view do not share"
+    if not setup.plan.is_random:
+        return "nothing is random"
+    if concrete_number(lidar.divergence) == 0:
+        return "the beam has no width"
+    # Where leaves transmit straight on, extinction depends on wavelength: photons cannot be shared among
+    # wavelengths.
+    if canopy is not None and canopy.is_straight:
+        return "transmission = 'straight': light of every wavelength goes its own way"
+    # A mirror returns the image of the beam, which depends on the spreading that parallel light lacks.
+    if any(isinstance(s.law, AbstractMirror) for s in setup.scene.surfaces):
+        return "a surface is a mirror"
+    bound = _parallel_light_bound(survey, setup)
+    if bound > _PARALLEL_LIGHT * rtol:
+        return f"light that is not parallel changes up to {percent(bound)} of samples, at rtol = {rtol:g}"
+    return None

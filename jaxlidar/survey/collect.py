@@ -1,0 +1,149 @@
+"""`Waveforms` from the results of a strategy's tasks, in memory or, a few shots at a time, in a file."""
+
+import dataclasses
+import itertools
+import os
+import time
+import warnings
+from collections.abc import Callable, Iterator, Mapping, MutableMapping
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxlidar._summary import NOTABLE_FRACTION, percent
+from jaxlidar.io.case import Case
+from jaxlidar.io.netcdf import by_rows
+from jaxlidar.io.parts import Parts
+from jaxlidar.io.rows import unwritten_rows
+from jaxlidar.simulate import LateLightWarning
+from jaxlidar.spectral.apply_optics import make_waveform_model
+from jaxlidar.survey.results import ShotResults
+from jaxlidar.survey.strategy import AbstractStrategy
+from jaxlidar.survey.waveforms import Waveforms
+
+
+class StoredResults(MutableMapping[int, Any]):
+    """Results of tasks in files, by number; `result_class` returns the class of each."""
+
+    def __init__(self, result_files: Parts, result_class: Callable[[int], Any]):
+        self.result_files, self.result_class = result_files, result_class
+        self.numbers = result_files.done()
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(sorted(self.numbers))
+
+    def __contains__(self, number: object) -> bool:
+        return number in self.numbers
+
+    def __getitem__(self, number: int) -> Any:
+        return _from_arrays(self.result_class(number), self.result_files[number])
+
+    def __setitem__(self, number: int, result: Any) -> None:
+        self.result_files.add(number, _as_arrays(result))
+        self.numbers.add(number)
+
+    def __delitem__(self, number: int) -> None:
+        raise TypeError("results in files are not deleted")
+
+
+def waveforms_in_memory(
+    strategy: AbstractStrategy,
+    survey_fields: dict[str, Any],
+    task_results: Mapping[int, Any],
+    start_time: float,
+) -> Waveforms:
+    """Return all waveforms. `survey_fields`: the fields of `Waveforms` that are known before any tracing."""
+    blocks = [results for _, results in strategy.shot_results(task_results)]
+    results: ShotResults = jax.tree.map(lambda *a: np.concatenate(a), *blocks)
+    _warn_of_late_light(strategy, float(np.max(results.energy_budget["after the window"], initial=0.0)))
+    return _waveforms(strategy, {**survey_fields, **results._asdict()}, start_time)
+
+
+def waveforms_on_disk(
+    strategy: AbstractStrategy,
+    survey_fields: dict[str, Any],
+    task_results: Mapping[int, Any],
+    start_time: float,
+    path: str | os.PathLike[str],
+    problem: dict[str, str],
+    case: Case | None,
+) -> Waveforms:
+    """Write all waveforms to a file, slice by slice, with their case if there is one, and open it.
+
+    `problem`: digests of all that the waveforms depend on.
+    """
+    blocks, largest_late = strategy.shot_results(task_results), 0.0
+    first = next(blocks)
+    # The file is laid out before its rows are known: from the shapes of the first block.
+    empty = jax.tree.map(lambda a: unwritten_rows(len(strategy.survey), a), first[1]._asdict())
+    layout = _waveforms(strategy, {**survey_fields, **empty}, start_time, problem=problem)
+    with by_rows(layout, path, case) as rows:
+        for shots, results in itertools.chain([first], blocks):
+            fields = {name: a[shots] for name, a in survey_fields.items()}
+            rows.add(shots, {**fields, **results._asdict()})
+            largest_late = max(largest_late, float(np.max(results.energy_budget["after the window"])))
+    _warn_of_late_light(strategy, largest_late)
+    return Waveforms.open(path)
+
+
+def _waveforms(
+    strategy: AbstractStrategy, fields: dict[str, Any], start_time: float, **info: Any
+) -> Waveforms:
+    return Waveforms(
+        time=np.asarray(make_waveform_model(strategy.setup).time),
+        wavelength=np.asarray(strategy.setup.lidar.wavelength),
+        **fields,
+        info={
+            "rtol": strategy.rtol,
+            "orders": strategy.setup.plan.orders,
+            "seconds": time.perf_counter() - start_time,
+            **strategy.info(),
+            **info,
+        },
+    )
+
+
+def _warn_of_late_light(strategy: AbstractStrategy, late_fraction: float) -> None:
+    """Warn if a notable fraction of the light of a shot arrives after the record."""
+    plan = strategy.setup.plan
+    if late_fraction >= NOTABLE_FRACTION:
+        end = plan.sample_start + plan.sample_interval * plan.n_samples
+        warnings.warn(
+            f"{percent(late_fraction)} of the light of a shot is still on its way when the record ends at "
+            f"{end:.4g} ns: see Waveforms.energy_budget",
+            LateLightWarning,
+            # The caller of `simulate_many`: above this function, its caller, and `simulate_many` itself.
+            stacklevel=4,
+        )
+
+
+def _as_arrays(result: Any) -> dict[str, np.ndarray]:
+    """Return the arrays of a result by name.
+
+    Those of a dict are named "field/item", and a dict without items has the name "field/" and an empty array.
+    Fields that are None are left out.
+    """
+    arrays, fields = {}, vars(result) if dataclasses.is_dataclass(result) else result._asdict()
+    for field, value in fields.items():
+        if isinstance(value, dict):
+            items = {f"{field}/{item}": array for item, array in value.items()}
+            arrays |= items or {f"{field}/": np.empty(0)}
+        elif value is not None:
+            arrays[field] = value
+    return arrays
+
+
+def _from_arrays(result_class: Any, arrays: Mapping[str, np.ndarray]) -> Any:
+    """Return the result of that class from its arrays, the inverse of `_as_arrays`."""
+    fields: dict[str, Any] = {}
+    for name, array in arrays.items():
+        field, slash, item = name.partition("/")
+        if not slash:
+            fields[field] = array
+        else:
+            fields.setdefault(field, {}).update({item: array} if item else {})
+    return result_class(**fields)

@@ -1,0 +1,520 @@
+"""The strategy shared illumination: one trace of the scene serves all footprints that overlap.
+
+The response is linear in the irradiance. Let beams be parallel, of one direction, and footprint f have the
+irradiance I_f(a) at the position a of the reference plane (1/m2, integral one). Light enters all over the
+scene, with the density p(a). A path that enters at a, leaves at b and returns at the time t with the weight w
+contributes
+
+    w I_f(a) / p(a) V_f(b)
+
+to the sample of f at t, where V_f(b) is the fraction of the light from b that the receiver of f sees. The
+estimator is unbiased for every f, from one set of paths; standard errors are those of each shot, and
+neighbours are correlated.
+
+Light enters about the nodes n of a grid with the spacing d, with the density of a B-spline each; together
+p = 1 / d^2.
+
+- *By node.* Straight down and without a field of view, V_f = 1 and I_f is a sum of the splines with
+  coefficients c_fn (`jaxlidar.survey.footprint_splines`). Responses are kept by node. Photons of two nodes
+  are independent, so that
+
+      W_f = sum_n c_fn W_n,    Var W_f = sum_n c_fn^2 Var W_n + sum_n (m_fn W_n)^2
+
+  where the last term is the error of the grid: the energy m_fn that the spline misplaces about the node.
+- *By shot.* Otherwise I_f(a) / p(a) V_f(b) = d^2 I_f(a) V_f(b) is computed for each path and each shot that
+  may see it (`jaxlidar.survey.view_geometry`), without any error of the grid. Responses are kept by shot. The
+  first order is traced for each shot alone: a lattice of its own rays has less variance than rays that it
+  shares. Absorbed and escaped energy is tallied by node: it is seen by no receiver.
+
+Nodes are traced in groups (`jaxlidar.survey.node_groups`), which are the tasks. If a group has the fraction s
+of f's light, its own relative error may be r / sqrt(s): squared errors of all groups, each
+s^2 (r / sqrt(s))^2 = s r^2, then add up to r^2. A group has as many batches as its worst shot needs.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+from scipy import sparse
+
+from jaxlidar._programs import Program
+from jaxlidar._threads import ONE_CORE
+from jaxlidar._workers import WorkUnit, task
+from jaxlidar.planning.plan import MIN_BATCHES
+from jaxlidar.planning.setup import Setup
+from jaxlidar.sampling.adaptive import AbstractEstimate, EstimateErrors, StepRule, StoppingRule, sample_until
+from jaxlidar.sampling.errors import relative_error, student_widening
+from jaxlidar.sampling.moments import RunningMoments
+from jaxlidar.spectral.apply_optics import (
+    ResponseSums,
+    WaveformModel,
+    budget_of_sums,
+    component_samples,
+    make_waveform_model,
+    response_samples,
+    sum_response,
+    total_samples,
+)
+from jaxlidar.survey.node_groups import NodeAllocation, NodeGroup
+from jaxlidar.survey.results import ShotErrors, ShotResults, make_shot_results
+from jaxlidar.survey.strategy import AbstractStrategy, slices_of_shots
+from jaxlidar.survey.view_geometry import ViewGeometry
+from jaxlidar.trace.device_scene import DeviceScene, aim_at, build_device_scene
+from jaxlidar.trace.entry_nodes import EntryNodes
+from jaxlidar.trace.footprint import parallel_beam
+from jaxlidar.trace.response import Response
+from jaxlidar.trace.shared_illumination import trace_first_of_shots, trace_nodes, trace_shots
+from jaxlidar.trace.shot_views import ShotViews
+
+# Coefficients of shots at nodes, or at shots, (shots, traced): a NumPy array, or a sparse one of SciPy.
+ShotCoefficients = Any
+# Largest number of batches of a group: a tolerance that is out of reach ends here.
+MAX_BATCHES = 1024
+# Shots whose results are completed together.
+SHOTS_PER_BLOCK = 256
+# Footprints of whose light a group has less than this fraction do not decide on its number of batches.
+_NEGLIGIBLE_FRACTION = 1e-3
+# Largest number of deposits along a flight. Where optics are applied, and for each shot that may see them,
+# deposits cost more than elsewhere.
+_MAX_DEPOSITS = 2
+# Smallest number of rays of a batch of a shot's own first order.
+_MIN_RAYS = 64
+# The worst error of many shots, from few batches, is overestimated: steps are short.
+_STEPS = StepRule(safety=1.05, max_growth=1.05 * 1.4**2, min_step=2)
+# Groups aim a little below the tolerance: where some are brighter than others, squared errors add up to a
+# little more.
+_AIM = 0.97
+# Fraction of the squared error that the first order may have where it is traced for each shot alone.
+_FIRST_ORDER_VARIANCE = 0.25
+
+
+@dataclasses.dataclass(frozen=True)
+class SharedIlluminationStrategy(AbstractStrategy):
+    """A shot is a sum over nodes, or over the paths that it sees; a task traces a group of nodes.
+
+    - `groups`: of nodes. - `spacing`: of nodes, m.
+    - `view_geometry`: how shots see shared light; None where they see all of it, straight down.
+    - `parallel_light_bound`: bound on the fraction of samples that parallel light changes.
+    """
+
+    groups: list[NodeGroup]
+    spacing: float
+    view_geometry: ViewGeometry | None
+    parallel_light_bound: float
+
+    @functools.cached_property
+    def context(self) -> "GroupContext":
+        """Inputs that all groups have in common."""
+        # One object for all tasks of this process: its device scene is built once.
+        return make_group_context(self.setup, self.spacing, self.view_geometry)
+
+    def tasks(self, key: PRNGKeyArray) -> list[WorkUnit]:
+        return [
+            task(number, trace_group, (self.context, group, number, self.rtol), key)
+            for number, group in enumerate(self.groups)
+        ]
+
+    @property
+    def n_tasks(self) -> int:
+        return len(self.groups)
+
+    @property
+    def shot_slices(self) -> list[slice]:
+        return slices_of_shots(len(self.survey), SHOTS_PER_BLOCK)
+
+    def result_class(self, number: int) -> "type[GroupContribution]":
+        return GroupContribution
+
+    def shot_results(self, task_results: Mapping[int, Any]) -> Iterator[tuple[slice, ShotResults]]:
+        for shots in self.shot_slices:
+            numbers = [
+                number
+                for number, group in enumerate(self.groups)
+                if np.any((group.shots >= shots.start) & (group.shots < shots.stop))
+            ]
+            # One contribution at a time is in memory: the mapping may be one of files.
+            contributions = (task_results[number] for number in numbers)
+            yield shots, sum_contributions(self.context, contributions, shots)
+
+    def info(self) -> dict[str, Any]:
+        return {
+            "shared": True,
+            "grid": self.spacing,
+            "parallel light": self.parallel_light_bound,
+        }
+
+
+class GroupContext(NamedTuple):
+    """Inputs that all groups of nodes have in common.
+
+    - `scene`: of the survey's middle. - `model`: without histories, for optics are applied while light
+      is traced, and without what the `air` returns, which is added once.
+    - `spacing`: of nodes, m. - `view_geometry`: as in `SharedIlluminationStrategy`.
+    """
+
+    scene: DeviceScene
+    model: WaveformModel
+    air: Any
+    spacing: float
+    view_geometry: ViewGeometry | None
+
+
+def make_group_context(setup: Setup, spacing: float, view_geometry: ViewGeometry | None) -> GroupContext:
+    """Return the common inputs of groups over a grid of that spacing."""
+    model = make_waveform_model(setup)
+    # The air's own return is not random and has no share in the light of nodes: `_complete_shot` adds it
+    # once.
+    without_air = dataclasses.replace(model.for_applied_optics(), air_return=None)
+    plan = setup.plan
+    plan = plan.with_config(deposits_per_flight=min(plan.config.deposits_per_flight, _MAX_DEPOSITS))
+    if view_geometry is not None:
+        # Paths are timed from their own entry. For a shot whose axis is beside it, an oblique path may be
+        # later.
+        plan = plan.with_limits(max_path=plan.limits.max_path + view_geometry.extra_path)
+        plan = plan.with_config(n_rays=max(plan.n_rays // 4, _MIN_RAYS))
+    scene = build_device_scene(dataclasses.replace(setup, plan=plan), derivatives="none")
+    return GroupContext(scene, without_air, model.air_return, spacing, view_geometry)
+
+
+class GroupLight(NamedTuple):
+    """The light of a group: its nodes, the views of its shots (None: by node), and the aim point, m."""
+
+    nodes: EntryNodes
+    shot_views: ShotViews | None
+    aim: Float[Array, "2"]
+
+
+class BatchSums(NamedTuple):
+    """Results of one batch, by node or by shot.
+
+    - `waveform`: (nodes, wavelengths, samples), all materials together. - `energy`: sums of
+      `jaxlidar.spectral.apply_optics.ResponseSums`, by name. - `response`: their responses.
+    """
+
+    waveform: Any
+    energy: Any
+    response: Response
+
+
+class GroupContribution(NamedTuple):
+    """Contribution of a group to its shots.
+
+    - `shots`: their numbers. - `lines`: samples by material, then those of the first order.
+    - `energy`: as in `BatchSums`. - `variance`, `energy_variance`: squared standard errors of the waveform
+      and of the energy. - `photons`: number of photons that contribute.
+    """
+
+    shots: Int[np.ndarray, " shots"]
+    lines: Float[np.ndarray, "shots lines wavelengths samples"]
+    energy: dict[str, Float[np.ndarray, "shots *rows wavelengths"]]
+    variance: Float[np.ndarray, "shots wavelengths samples"]
+    energy_variance: dict[str, Float[np.ndarray, "shots *rows wavelengths"]]
+    photons: Int[np.ndarray, " shots"]
+
+
+def _trace_batch(scene: DeviceScene, nodes: EntryNodes, model: WaveformModel, key: PRNGKeyArray) -> BatchSums:
+    """Trace one batch."""
+
+    def sums(response: Response) -> tuple[Array, dict[str, Array]]:
+        all_orders = response
+        if response.higher is not None:
+            # With optics applied, both orders have one history: one convolution with the pulse serves their
+            # sum.
+            all_orders = dataclasses.replace(response, first=response.first + response.higher, higher=None)
+        return total_samples(all_orders, model), sum_response(response, model)._asdict()
+
+    if scene.shot_views is None:
+        response = trace_nodes(scene, nodes, key)
+    else:
+        response = trace_shots(scene, model.lidar, nodes, key)
+    return BatchSums(*jax.vmap(sums)(response), response)
+
+
+def _lines(response: Response, model: WaveformModel) -> Float[Array, "lines wavelengths samples"]:
+    """Return samples by material, then those of the first order."""
+    by_component = component_samples(response, model)
+    return jnp.stack([*(by_component[name] for name in model.materials), by_component["first"]])
+
+
+def _group_moments(
+    scene: DeviceScene,
+    model: WaveformModel,
+    light: GroupLight,
+    key: PRNGKeyArray,
+    first: Int[Array, ""],
+    count: Int[Array, ""],
+) -> RunningMoments:
+    """Trace `count` batches from number `first` on.
+
+    Returns the moments of their waveforms and energies; `mean_only` are their mean lines.
+    """
+    scene = _group_scene(scene, model, light)
+
+    def trace_batch(number: Array) -> BatchSums:
+        return _trace_batch(scene, light.nodes, model, jax.random.fold_in(key, first + number))
+
+    def add_batch(number: Array, moments: RunningMoments) -> RunningMoments:
+        batch = trace_batch(number)
+        return moments.update((batch.waveform, batch.energy), batch.response)
+
+    shapes: BatchSums = jax.eval_shape(trace_batch, first)
+    empty = RunningMoments.compiled((shapes.waveform, shapes.energy), shapes.response)
+    moments = jax.lax.fori_loop(0, count, add_batch, empty)
+    # Waveforms by material are linear in the response: those of its mean are their mean, made once.
+    lines = jax.vmap(lambda response: _lines(response, model))(moments.mean_only)
+    return moments._replace(mean_only=lines)
+
+
+compiled_group_moments = Program(_group_moments, **ONE_CORE)
+
+
+def _group_scene(scene: DeviceScene, model: WaveformModel, light: GroupLight) -> DeviceScene:
+    """Return the device scene of a group: at its aim point, with parallel light, and with optics."""
+    lidar = model.lidar
+    scene = aim_at(scene, lidar, light.aim - lidar.position)
+    beam = parallel_beam(lidar)
+    return dataclasses.replace(scene, beam=beam, optics=model.optics, shot_views=light.shot_views)
+
+
+def _first_order_samples(
+    scene: DeviceScene, model: WaveformModel, light: GroupLight, key: PRNGKeyArray
+) -> Float[Array, "shots wavelengths samples"]:
+    """Return samples of the first order, from few rays, of all shots of a group."""
+    scene = _group_scene(scene, model, light)
+    assert light.shot_views is not None
+    # The last shot is a dummy.
+    shots = jnp.arange(light.shot_views.n_shots - 1)
+    weights = trace_first_of_shots(scene, model.lidar, shots, key).weights
+    return jax.vmap(lambda w: response_samples(jnp.sum(w, axis=1), model.first_histories, model))(weights)
+
+
+_compiled_first_order_samples = Program(_first_order_samples, **ONE_CORE)
+
+
+class ErrorTarget(NamedTuple):
+    """The shots that decide on the number of batches of a group, and the error that each of them may have.
+
+    - `coefficients`: of these shots. - `light_fraction`: s, of their light that is the group's.
+    - `variance_fraction`: of their squared error that may be the group's; s where all is traced by node.
+    - `first_order_excess`: samples that belong to the shot's light in this group but are traced in another
+      one, positive, or the other way round, negative: errors are relative to what the group's fraction
+      returns.
+    """
+
+    coefficients: ShotCoefficients
+    light_fraction: Float[np.ndarray, " shots"]
+    variance_fraction: Float[np.ndarray, " shots"]
+    first_order_excess: Float[np.ndarray, "shots wavelengths samples"] | float
+
+    def worst_error(self, moments: RunningMoments) -> float:
+        """Return the largest relative error of a shot, over the square root of its variance fraction."""
+        mean = np.maximum(_sum_over_traced(self.coefficients, moments.mean[0]) + self.first_order_excess, 0.0)
+        stderr = np.sqrt(_variance_of_sums(self.coefficients, moments.squares[0], moments.count))
+        # The error relative to the group's fraction is that times s relative to the complete waveform.
+        error = relative_error(mean, stderr) * self.light_fraction / np.sqrt(self.variance_fraction)
+        return float(np.max(error, initial=0.0))
+
+
+def _error_target(
+    context: GroupContext,
+    group: NodeGroup,
+    coefficients: ShotCoefficients,
+    light: GroupLight,
+    key: PRNGKeyArray,
+) -> ErrorTarget:
+    """Return the shots that decide on the number of batches, and their errors."""
+    fraction = group.coefficients.sum(axis=1)
+    counts = fraction > _NEGLIGIBLE_FRACTION
+    fraction, has_centre = fraction[counts], group.has_centre[counts]
+    if light.shot_views is None:
+        return ErrorTarget(coefficients[counts], fraction, fraction, 0.0)
+    first = _compiled_first_order_samples(context.scene, context.model, light, key)
+    # A shot's first order is traced, all of it, in the group that has its centre.
+    excess = (fraction - has_centre)[:, None, None] * np.asarray(first)[: len(group.shots)][counts]
+    variance = _FIRST_ORDER_VARIANCE * has_centre + (1.0 - _FIRST_ORDER_VARIANCE) * fraction
+    return ErrorTarget(coefficients[counts], fraction, variance, excess)
+
+
+class GroupEstimate(AbstractEstimate):
+    """Moments of the batches of a group. `trace`: returns those of the batches with the given numbers."""
+
+    def __init__(self, trace: Callable[[range], RunningMoments], target: ErrorTarget):
+        self.trace, self.target = trace, target
+        self.moments: Any = None
+
+    @property
+    def n_batches(self) -> int:
+        """Number of batches."""
+        return 0 if self.moments is None else self.moments.count
+
+    def add_batches(self, numbers: range) -> None:
+        """Trace batches and merge their moments."""
+        moments = self.trace(numbers)
+        self.moments = moments if self.moments is None else self.moments.merge(moments)
+
+    def errors(self) -> EstimateErrors:
+        """Return the largest relative error of the shots that count."""
+        return EstimateErrors(self.target.worst_error(self.moments))
+
+
+def trace_group(
+    context: GroupContext, group: NodeGroup, number: int, rtol: float, key: PRNGKeyArray
+) -> GroupContribution:
+    """Trace a group of nodes until its error is below the tolerance for all its shots.
+
+    1. Put the group's light together: nodes with their photons and rays, and the shots that view them.
+    2. Find the error that each shot may have from this group.
+    3. Add batches until none has a larger one.
+    4. Sum over nodes to means and variances of shots, and add the error of the grid.
+    """
+    key, shot_views, coefficients = jax.random.fold_in(key, number), None, group.coefficients
+    if context.view_geometry is not None:
+        shot_views = context.view_geometry.views_of_group(group, context.spacing)
+        # Responses are those of shots: the sum over what is traced picks each shot's own row, without the
+        # padding.
+        unit_diagonal = np.ones(len(group.shots), np.float32)
+        shape = (len(group.shots), context.view_geometry.max_shots)
+        diagonal = sparse.dia_array((unit_diagonal, 0), shape)
+        coefficients = sparse.csr_array(diagonal)
+    light = GroupLight(_nodes(group, context.spacing), shot_views, jnp.asarray(group.aim, float))
+
+    def trace(numbers: range) -> RunningMoments:
+        first, count = jnp.asarray(numbers.start, jnp.int32), jnp.asarray(len(numbers), jnp.int32)
+        moments = compiled_group_moments(context.scene, context.model, light, key, first, count)
+        # Sums over nodes are made on the host: their shapes differ between groups, and would be compiled
+        # each.
+        moments = jax.tree.map(np.asarray, moments)
+        return moments._replace(count=int(moments.count))
+
+    estimate = GroupEstimate(trace, _error_target(context, group, coefficients, light, key))
+    stop = StoppingRule(_AIM * rtol, min_size=MIN_BATCHES, max_size=MAX_BATCHES)
+    sample_until(estimate, stop, _STEPS)
+
+    moments: RunningMoments = estimate.moments
+    variance, energy_variance = (_variance_of_sums(coefficients, a, moments.count) for a in moments.squares)
+    if context.view_geometry is None:
+        # Light at the wrong place about a node is an error as large as what the node returns of it.
+        variance = variance + _sum_over_traced(group.misplaced_energy**2, moments.mean[0] ** 2)
+    # A shot counts the photons of all nodes that it uses, which other shots may count too.
+    illuminated = np.abs(group.coefficients) > 0
+    photons_per_node = np.bincount(group.photons.node, minlength=group.coefficients.shape[1])
+    return GroupContribution(
+        shots=group.shots,
+        lines=_sum_over_traced(coefficients, moments.mean_only),
+        energy=_sum_over_traced(coefficients, moments.mean[1]),
+        variance=variance,
+        energy_variance=energy_variance,
+        photons=(illuminated @ photons_per_node) * moments.count,
+    )
+
+
+def _nodes(group: NodeGroup, spacing: float) -> EntryNodes:
+    """Return the nodes of a group, with their photons and rays, as arrays of JAX's present precision."""
+
+    def arrays(allocation: NodeAllocation) -> tuple[Array, Array, Array]:
+        return (
+            jnp.asarray(allocation.node, jnp.int32),
+            jnp.asarray(allocation.rank, jnp.int32),
+            jnp.asarray(allocation.fraction, float),
+        )
+
+    return EntryNodes(
+        jnp.asarray(group.node_position, float),
+        jnp.asarray(spacing, float),
+        *arrays(group.photons),
+        *arrays(group.rays),
+    )
+
+
+class ShotSums(NamedTuple):
+    """Sums of the contributions of all groups to shots; axis 0 is the shots'. See `GroupContribution`."""
+
+    lines: Float[Array, "shots lines wavelengths samples"]
+    energy: dict[str, Float[Array, "shots *rows wavelengths"]]
+    stderr: Float[Array, "shots wavelengths samples"]
+    energy_stderr: dict[str, Float[Array, "shots *rows wavelengths"]]
+
+
+def sum_contributions(
+    context: GroupContext, contributions: Iterable[GroupContribution], shots: slice
+) -> ShotResults:
+    """Return the results of at most `SHOTS_PER_BLOCK` shots, from the contributions of groups."""
+    sums: Any = None
+    for contribution in contributions:
+        mine = (contribution.shots >= shots.start) & (contribution.shots < shots.stop)
+        arrays = contribution._asdict()
+        rows = arrays.pop("shots")[mine] - shots.start
+        if sums is None:
+            # Always as many shots, so that one compiled program completes all blocks; in double precision.
+            sums = jax.tree.map(lambda a: np.zeros((SHOTS_PER_BLOCK, *a.shape[1:])), arrays)
+        jax.tree.map(lambda s, a, r=rows, m=mine: np.add.at(s, r, a[m]), sums, arrays)
+    # Variances of groups add up, since their photons are independent.
+    of_shots = ShotSums(
+        lines=sums["lines"],
+        energy=sums["energy"],
+        stderr=np.sqrt(sums["variance"]),
+        energy_stderr=jax.tree.map(np.sqrt, sums["energy_variance"]),
+    )
+    of_shots, count = jax.tree.map(lambda a: jnp.asarray(a, float), of_shots), shots.stop - shots.start
+    padded = _compiled_complete(context.model, context.air, of_shots)
+    results: ShotResults = jax.tree.map(lambda a: np.asarray(a)[:count], padded)
+    return results._replace(photons=sums["photons"][:count].astype(int))
+
+
+def _complete_shot(
+    model: WaveformModel, air: Float[Array, "wavelengths samples"] | None, sums: ShotSums
+) -> ShotResults:
+    """Return the results of one shot. `air`: what the air itself returns, order one."""
+    by_component = dict(zip(model.materials, sums.lines))
+    reflectance, first = jnp.sum(sums.lines[:-1], axis=0), sums.lines[-1]
+    by_component |= {"first": first, "higher": reflectance - first}
+    if air is not None:
+        by_component |= {"air": air, "first": first + air}
+        reflectance = reflectance + air
+    budget, errors = (
+        budget_of_sums(ResponseSums(**energy), model) for energy in (sums.energy, sums.energy_stderr)
+    )
+    # `budget_of_sums` takes the returned light off one of these fates. That is no rule for errors: their own
+    # stay.
+    fates = {"escaped": "escaped", "after the window": "late", "unfollowed": "remaining"}
+    energy_budget_stderr = errors.energy_budget | {
+        name: sums.energy_stderr[fate] for name, fate in fates.items()
+    }
+    shot_errors = ShotErrors(sums.stderr, energy_budget_stderr, relative_error(reflectance, sums.stderr))
+    return make_shot_results(model, by_component, budget, shot_errors, jnp.zeros((), jnp.int32))
+
+
+def _complete_shots(model: WaveformModel, air: Array | None, sums: ShotSums) -> ShotResults:
+    return jax.vmap(lambda shot: _complete_shot(model, air, shot))(sums)
+
+
+_compiled_complete = Program(_complete_shots)
+
+
+def _sum_over_traced(coefficients: ShotCoefficients, values: Any) -> Any:
+    """Return sums over nodes (or rows of shots) of a tree of arrays, with the coefficients of every shot."""
+
+    def sum_array(a: np.ndarray) -> np.ndarray:
+        return (coefficients @ a.reshape(len(a), -1)).reshape(coefficients.shape[0], *a.shape[1:])
+
+    return jax.tree.map(sum_array, values)
+
+
+def _variance_of_sums(coefficients: ShotCoefficients, squares: Any, count: int) -> Any:
+    """Return the variances of shots from the squared deviations of `count` batches of every node.
+
+    Var W_f = sum_n c_fn^2 S_n / (count (count - 1)), widened by the square of Student's factor. The sum of
+    independent variances has more degrees of freedom than each of them: count - 1 times (sum c^2)^2 / sum
+    c^4, the number of nodes that take part (Satterthwaite 1946, Biometrics Bull. 2, 110, for equal
+    variances).
+    """
+    weight = coefficients * coefficients
+    nodes = weight.sum(axis=1) ** 2 / np.maximum((weight * weight).sum(axis=1), 1e-30)
+    freedom = (count - 1.0) * np.maximum(nodes, 1.0)
+    scale = student_widening(1.0 + freedom) ** 2 / (count * (count - 1.0))
+    return _sum_over_traced((weight * scale[:, None]).astype(coefficients.dtype), squares)

@@ -1,0 +1,244 @@
+"""`simulate_many`: simulate the waveforms of all shots of a survey.
+
+1. Check the arguments.
+2. Choose the strategy that cuts the shots into tasks: per shot (`per_shot`), shared illumination
+   (`shared_illumination`), or, for a scene larger than memory, one of these for each tile (`tiled_scene`).
+3. Run the tasks: in this process, on its devices, or by workers. With a `path`, results go to files as they
+   come, and a later call runs the remaining tasks alone.
+4. Collect their results in `Waveforms` (`collect`).
+"""
+
+import functools
+import os
+import time
+import warnings
+from collections.abc import Callable, Iterator, Mapping, MutableMapping
+from concurrent.futures import Executor
+from pathlib import Path
+from typing import Any
+
+import jax
+from jaxtyping import PRNGKeyArray
+
+from jaxlidar._checks import check_flag, check_integer, check_key, check_kind, is_traced
+from jaxlidar._fingerprint import fingerprint
+from jaxlidar._registry import simulate_survey
+from jaxlidar._workers import WorkUnit, outcomes
+from jaxlidar.instrument.survey import Survey
+from jaxlidar.io.case import Case, case_text
+from jaxlidar.io.parts import Parts, refuse_another
+from jaxlidar.scenes.scene import Scene, check_kinds
+from jaxlidar.scenes.scene_parts import SceneParts
+from jaxlidar.survey.choose_strategy import choose_strategy
+from jaxlidar.survey.collect import StoredResults, waveforms_in_memory, waveforms_on_disk
+from jaxlidar.survey.coverage import OffMapWarning, ground_heights, off_map, off_map_message
+from jaxlidar.survey.progress import ProgressClock, SurveyProgress
+from jaxlidar.survey.strategy import AbstractStrategy
+from jaxlidar.survey.tiled_scene import TiledSceneStrategy
+from jaxlidar.survey.truths import StrategyWithTruth
+from jaxlidar.survey.waveforms import Waveforms
+
+
+@simulate_survey.register
+def simulate_many(
+    survey: Survey,
+    scene: Scene | SceneParts,
+    *,
+    key: PRNGKeyArray,
+    rtol: float | None = None,
+    max_orders: int | None = None,
+    path: str | os.PathLike[str] | None = None,
+    executor: Executor | None = None,
+    mesh: jax.sharding.Mesh | None = None,
+    progress: Callable[[SurveyProgress], None] | None = None,
+    shared: bool | None = None,
+    truth: bool = False,
+) -> Waveforms:
+    """Simulate the waveforms that all shots of a survey record of one scene.
+
+    One program is compiled for all shots. They are traced with one of two strategies:
+
+    - *Shared illumination*: shots of one direction share light where their footprints overlap. Parallel light
+      falls on the area that they cover and is traced once. For shots straight down without a field of view,
+      it is separated by where it enters, on a grid: every footprint is a weighted sum, and the error of the
+      grid is part of the standard errors. For other shots, each path is weighted by the irradiance of the
+      shot's own beam where the path enters, and by its field of view where the path ends. That is exact and
+      takes longer; the first order is traced for each shot alone. The effect of light that is not parallel is
+      bounded (`info["parallel light"]`). Standard errors are those of each shot; errors of neighbours are
+      correlated.
+    - *Per shot*: all other shots are traced one by one. A shot costs the same over a map of any size, because
+      the work for the map itself is done once for many shots. Its waveform does not depend on other shots.
+
+    Batches are traced until the error of every shot is below the tolerance, as `simulate` defines it. Results
+    do not depend on the number of workers or devices, nor on whether the run was interrupted.
+
+    All waveforms have one time axis, from the first return of any shot to the last; over steep terrain it is
+    long. For derivatives, use `simulate`.
+
+    **Arguments:**
+
+    - `survey`: a `Survey`.
+    - `scene`: a `Scene`; or `SceneParts`, for one that is larger than memory.
+    - `key`: a JAX random key. The same key gives the same waveforms.
+    - `rtol`: relative error to reach for every shot, in (0, 1). Default None: 0.01.
+    - `max_orders`: number of scatterings followed, at least 1. Default None: from `rtol` and the largest
+      albedo.
+    - `path`: a netCDF file, or a Zarr store (".zarr"), for the waveforms. It appears when all are traced,
+      with its case, so that `jaxlidar.rerun` can simulate them again. Until then the folder "PATH.parts" has
+      the results so far; the same call continues with them, also after it was killed. If the file exists
+      already, it is read. Only a few shots are in memory at a time, also of a netCDF file that is returned:
+      see `jaxlidar.open`. Default None: no file.
+    - `executor`: a `concurrent.futures.Executor`, whose workers trace chunks of shots: a process pool (with
+      the start method "spawn" or "forkserver"), that of a Dask client (`client.get_executor()`; the extra
+      `cluster` installs Dask), of mpi4py. A chunk whose worker dies gets a second try. Default None: this
+      process, on all cores.
+    - `mesh`: a `jax.sharding.Mesh`, whose devices trace chunks of shots: each takes the next chunk. A program
+      is compiled for each device. Default None: the default device.
+    - `progress`: a function called with a `SurveyProgress` after every chunk; for instance `print`. Default
+      None.
+    - `shared`: True traces with shared illumination, and refuses shots that cannot share light; False traces
+      per shot. Default None: shared where it is possible and saves time.
+    - `truth`: True adds what each beam meets in the scene, as labels for algorithms: `Waveforms.truth`.
+      Default False.
+
+    **Returns:** a `Waveforms`.
+
+    **Warns:** `OffMapWarning` where footprints lie partly beside the voxel map, `LateLightWarning` where much
+    light arrives after the end of the record.
+
+    **Raises:** TypeError for arguments of another class. ValueError, before any work, for inadmissible
+    arguments, a scene that reaches up to the sensor, shots that do not meet the ground, a receiver whose
+    window opens at the first return, shots that must share light and cannot, and a `path` with results of
+    another problem, naming what differs. RuntimeError where the workers of a chunk die twice.
+
+    **Example:**
+
+    >>> import jax, jaxlidar as jl
+    >>> survey = jl.Survey.track(jl.Lidar(), start=(0, 0), end=(100, 0), spacing=50.0)
+    >>> scene = jl.Scene(ground=jl.Ground(height=5.0, reflectance=0.4, slope=5.0, aspect=90.0))
+    >>> many = jl.simulate_many(survey, scene, key=jax.random.key(0))
+    >>> print(many.ground_height.round(2).tolist(), f"{float(many[0].reflectance.sum()):.2f}")
+    [5.0, 0.63, -3.75] 0.40
+    """
+    check_kind("survey", survey, Survey, "a Survey, as in Survey(lidar, position=...)")
+    if not isinstance(scene, SceneParts):
+        check_kinds(survey.lidar, scene)
+    check_key(key)
+    check_kind("path", path, str | os.PathLike | None, "a path, or None")
+    check_kind("executor", executor, Executor | None, "a concurrent.futures.Executor, or None")
+    check_kind("mesh", mesh, jax.sharding.Mesh | None, "a jax.sharding.Mesh, or None")
+    devices = None if mesh is None else _devices(mesh, executor)
+    check_kind("progress", progress, Callable | None, "a function, or None")
+    check_kind("shared", shared, bool | None, "True, False or None")
+    check_flag("truth", truth)
+    if max_orders is not None:
+        max_orders = check_integer("max_orders", max_orders)
+    # Shots are traced until their tolerance is met: loops of unknown length have no reverse derivatives.
+    if any(is_traced(x) for x in jax.tree.leaves((survey, scene, key))):
+        raise TypeError("simulate_many is not for JAX transformations: use simulate, with plan= made outside")
+    # Waveforms share one time axis, in memory and in files.
+    if survey.lidar.receiver.window != "fixed":
+        raise ValueError(
+            f"receiver window = {survey.lidar.receiver.window!r} gives every shot a time axis of its own; "
+            "admissible is 'fixed'"
+        )
+    start_time = time.perf_counter()
+    if isinstance(scene, SceneParts):
+        strategy = TiledSceneStrategy.of(survey, scene, rtol, max_orders, shared, truth)
+        off_map_fractions, heights = strategy.off_map, strategy.ground_height
+    else:
+        strategy = choose_strategy(survey, scene, rtol, max_orders, shared)
+        if truth:
+            strategy = StrategyWithTruth.around(strategy)
+        setup = strategy.setup
+        off_map_fractions = off_map(strategy.survey, setup.scene)
+        heights = ground_heights(strategy.survey, setup.scene, setup.plan.limits.start_distance)
+    if (message := off_map_message(off_map_fractions)) is not None:
+        warnings.warn(message, OffMapWarning, stacklevel=2)
+    survey_fields: dict[str, Any] = {
+        "position": survey.position,
+        "zenith": survey.zenith,
+        "azimuth": survey.azimuth,
+        "ground_height": heights,
+        "off_map": off_map_fractions,
+    }
+    run_tasks = functools.partial(outcomes, executor=executor, devices=devices)
+    if path is None:
+        task_results = _trace(strategy, key, run_tasks, progress, {})
+        return waveforms_in_memory(strategy, survey_fields, task_results, start_time)
+
+    # Digests of all that the waveforms depend on: results of another problem are neither used nor
+    # overwritten.
+    scene_content = (scene, strategy.digests) if isinstance(strategy, TiledSceneStrategy) else scene
+    problem = fingerprint(
+        {
+            "survey": survey,
+            "scene": scene_content,
+            "key": key,
+            "rtol": strategy.rtol,
+            "max_orders": max_orders,
+            "shared": strategy.info()["shared"],
+            "truth": bool(truth),
+        }
+    )
+    # A complete file stands for the call that made it.
+    if Path(path).exists():
+        waveforms = Waveforms.open(path)
+        refuse_another(Path(path), waveforms.info.get("problem", {}), problem)
+        return waveforms
+    arguments = {"rtol": rtol, "max_orders": max_orders, "shared": shared, "truth": truth}
+    case = None if isinstance(scene, SceneParts) else _case(survey, scene, key, arguments)
+    result_files = Parts(path, problem)
+    stored_results = StoredResults(result_files, strategy.result_class)
+    task_results = _trace(strategy, key, run_tasks, progress, stored_results)
+    waveforms = waveforms_on_disk(strategy, survey_fields, task_results, start_time, path, problem, case)
+    result_files.remove()
+    return waveforms
+
+
+def _case(survey: Survey, scene: Scene, key: PRNGKeyArray, arguments: dict[str, Any]) -> Case | None:
+    """Return the case of a call, or None where the scene or the lidar has classes of the user's own."""
+    set_arguments = {name: value for name, value in arguments.items() if value is not None}
+    case = Case(survey=survey, scene=scene, key=key, arguments=set_arguments)
+    try:
+        # The case is written when all is traced: find out before whether it can be.
+        case_text(case)
+    except TypeError:
+        return None
+    return case
+
+
+def _devices(mesh: jax.sharding.Mesh, executor: Executor | None) -> list[Any]:
+    """Return the devices of a mesh. **Raises:** as `simulate_many`."""
+    if executor is not None:
+        raise ValueError(
+            "mesh and executor are both given; admissible is one: workers have their own devices"
+        )
+    devices, process = list(mesh.devices.flat), jax.process_index()
+    if remote := [device for device in devices if device.process_index != process]:
+        raise ValueError(
+            f"mesh has {len(remote)} of {len(devices)} devices in other processes ({remote[0]}); admissible "
+            "are devices of this process; for several processes give an executor"
+        )
+    return devices
+
+
+def _trace(
+    strategy: AbstractStrategy,
+    key: PRNGKeyArray,
+    run_tasks: Callable[[list[WorkUnit]], Iterator[tuple[WorkUnit, Any]]],
+    progress: Callable[[SurveyProgress], None] | None,
+    task_results: MutableMapping[int, Any],
+) -> Mapping[int, Any]:
+    """Run the tasks without a result yet, and return the results of all tasks by number."""
+    tasks, shots = strategy.tasks(key), len(strategy.survey)
+    n_done = len(task_results)
+    # Shots are counted in proportion to tasks: with shared illumination no task has shots of its own.
+    clock = ProgressClock(shots, shots * n_done // len(tasks))
+    for unit, result in run_tasks([t for t in tasks if t.number not in task_results]):
+        task_results[unit.number] = result
+        n_done += 1
+        clock.done = shots * n_done // len(tasks)
+        if progress is not None:
+            progress(SurveyProgress(clock.done, shots, clock.seconds, clock.rate, clock.seconds_left))
+    return task_results

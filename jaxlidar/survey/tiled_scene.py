@@ -1,0 +1,349 @@
+"""The strategy tiled scene: the shots of each square tile of a scene that is larger than memory are one task.
+
+A task asks for the part of the scene that its shots need, a rectangle around the tile, and traces them with
+one of the other strategies. The rectangle reaches beyond the tile
+
+- by the footprints of its shots, at all heights of the scene, and
+- by a margin: as far as light may travel sideways and still return before the record ends.
+
+A path comes down at the zenith angle z to where it first scatters, at most the height h above the reference
+plane, flies the length L between scatterings, and returns. Its length, relative to the reference plane, is at
+least L - 2 h / cos z - L sin z; it is recorded if that is at most l. So the margin is at most
+
+    L = (l + 2 h / cos z) / (1 - sin z)
+
+All tiles have one record, one number of orders and rectangles of one size, so that they share compiled
+programs. To find the record, all parts are looked at twice: for what each would record, and then with that
+record and their margins.
+"""
+
+import dataclasses
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float, Int, PRNGKeyArray
+
+from jaxlidar._constants import SPEED_OF_LIGHT
+from jaxlidar._fingerprint import digest_of
+from jaxlidar._workers import WorkUnit, run_unit, task
+from jaxlidar.instrument.survey import Survey
+from jaxlidar.scenes.scene import check_kinds
+from jaxlidar.scenes.scene_parts import SceneParts
+from jaxlidar.survey.choose_strategy import choose_strategy
+from jaxlidar.survey.coverage import ground_heights, off_map
+from jaxlidar.survey.results import ShotResults
+from jaxlidar.survey.strategy import AbstractStrategy, slices_of_shots
+from jaxlidar.survey.truths import StrategyWithTruth, Truths
+
+# Radius within which a Gaussian beam is followed, over its 1/e^2 radius; 2e-8 of its energy lies beyond.
+_GAUSSIAN_EXTENT = 3.0
+# Shots whose results are completed together, and tiles whose results stay in memory for the next ones.
+_SHOTS_PER_BLOCK, _CACHED_TILES = 256, 4
+# Rectangles reach beyond tiles by multiples of the tile's edge over this.
+_STEPS = 10
+
+
+class SceneTile(NamedTuple):
+    """Numbers of the shots of a tile, and the corners of the rectangle of the scene that they need, m."""
+
+    shots: Int[np.ndarray, " shots"]
+    low: Float[np.ndarray, "2"]
+    high: Float[np.ndarray, "2"]
+
+
+class TileOptions(NamedTuple):
+    """Arguments of `simulate_many` for all tiles; `window`: times of the first and the last sample, ns."""
+
+    rtol: float | None
+    orders: int
+    shared: bool | None
+    window: tuple[float, float]
+    truth: bool
+
+
+def tiles_of(survey: Survey, scene: SceneParts, margin: float = 0.0) -> list[SceneTile]:
+    """Return the tiles that have any shots, with rectangles of one size.
+
+    All light of the shots of a tile enters and leaves the scene within its rectangle, with `margin`, m, to
+    spare.
+    """
+    direction, radius = survey.direction, survey.footprint_radius
+    cosine = -direction[:, 2]
+    # The footprint on a plane at the scene's lowest or highest point: longer for oblique beams, and wider
+    # below.
+    largest_height = max(abs(z) for z in scene.z)
+    radius = radius * (_GAUSSIAN_EXTENT if survey.lidar.profile == "gaussian" else 1.0)
+    radius = (radius / cosine * (1.0 + largest_height / survey.slant_range))[:, None]
+    ends = np.stack([survey.position + z * (direction[:, :2] / direction[:, 2:]) for z in scene.z])
+    # A shot belongs to the tile of the middle of its beam axis between the scene's lowest and highest points.
+    corner = scene.tile * np.floor(ends.mean(axis=0) / scene.tile)
+    overhang = np.maximum(corner - ends.min(axis=0), ends.max(axis=0) - corner - scene.tile) + radius
+    step = scene.tile / _STEPS
+    # Multiples of a step: the corners of rectangles depend on the survey in steps only.
+    extension = step * np.ceil(max(float(overhang.max()) + margin, 0.0) / step)
+    corners, tile_of_shot = np.unique(corner, axis=0, return_inverse=True)
+    shots = [np.flatnonzero(tile_of_shot.reshape(-1) == n) for n in range(len(corners))]
+    return [
+        SceneTile(numbers, low - extension, low + scene.tile + extension)
+        for numbers, low in zip(shots, corners)
+    ]
+
+
+def lossless_margin(survey: Survey, longest_path: float, top: float) -> float:
+    """Return the distance, m, from its first scattering within which all light that is recorded travels.
+
+    `longest_path`: length of the longest path that is recorded, m, to the reference plane and from there;
+    `top`: height of the scene, m. See the module's docstring for the formula.
+    """
+    zenith = np.deg2rad(float(survey.zenith.max()))
+    return float(max((longest_path + 2.0 * top / np.cos(zenith)) / (1.0 - np.sin(zenith)), 0.0))
+
+
+def subset(survey: Survey, shots: Int[np.ndarray, " shots"]) -> Survey:
+    """Return the shots of a survey with these numbers."""
+    return Survey(survey.lidar, survey.position[shots], survey.zenith[shots], survey.azimuth[shots])
+
+
+@dataclasses.dataclass(frozen=True)
+class TiledSceneStrategy(AbstractStrategy):
+    """A task traces the shots of a tile over its part of the scene; further tasks find their truth.
+
+    - `setup`: of the first tile. - `tiles`: with their margins.
+    - `materials`, `surfaces`: names of those of all parts.
+    - `off_map`, `ground_height`: (shots,), as in `Waveforms`. - `digests`: of all parts.
+    - `margin`, `lossless_margin`: m, the one in use and the one that loses no light.
+    """
+
+    scene: SceneParts
+    tiles: list[SceneTile]
+    options: TileOptions
+    materials: tuple[str, ...]
+    surfaces: tuple[str, ...]
+    off_map: Float[np.ndarray, " shots"]
+    ground_height: Float[np.ndarray, " shots"]
+    digests: list[str]
+    margin: float
+    lossless_margin: float
+    shared: bool
+
+    @staticmethod
+    def of(
+        survey: Survey,
+        scene: SceneParts,
+        rtol: float | None,
+        max_orders: int | None,
+        shared: bool | None,
+        truth: bool,
+    ) -> "TiledSceneStrategy":
+        """Look at all parts of the scene, one after the other, and return the strategy.
+
+        1. Without margins: the record that each part needs, and the largest number of orders.
+        2. The record of all, and the margin from its length.
+        3. With these: materials, surfaces, ground, coverage, and a digest of each part.
+
+        **Raises:** as `simulate_many`, with the corners of the part.
+        """
+        starts, ends, longest_paths, orders = [], [], [], []
+        for tile in tiles_of(survey, scene):
+            plan = _strategy_of(survey, scene, tile, rtol, max_orders, shared, None).setup.plan
+            starts.append(plan.sample_start)
+            ends.append(plan.sample_start + plan.sample_interval * (plan.n_samples - 1))
+            longest_paths.append(float(plan.limits.max_path))
+            orders.append(plan.orders)
+        options = TileOptions(rtol, max(orders), shared, (min(starts), max(ends)), truth)
+
+        lossless = 0.0
+        if options.orders > 1:
+            # A part's record may end before that of all: paths may then be longer by as much.
+            longer = max(options.window[1] - end for end in ends) * SPEED_OF_LIGHT
+            lossless = lossless_margin(survey, max(longest_paths) + longer, scene.z[1])
+        margin = lossless if scene.margin is None else float(scene.margin)
+
+        tiles = tiles_of(survey, scene, margin)
+        beside_map, heights, digests, shared_by_tile = np.zeros(len(survey)), np.zeros(len(survey)), [], []
+        # Dicts without values: sets that keep their order.
+        materials: dict[str, None] = {}
+        surfaces: dict[str, None] = {}
+        first_strategy = None
+        for tile in tiles:
+            strategy = _strategy_of(survey, scene, tile, rtol, options.orders, shared, options.window)
+            first_strategy = strategy if first_strategy is None else first_strategy
+            scene_part, plan = strategy.setup.scene, strategy.setup.plan
+            beside_map[tile.shots] = off_map(strategy.survey, scene_part)
+            heights[tile.shots] = ground_heights(strategy.survey, scene_part, plan.limits.start_distance)
+            # Of the part as it is given: the strategy's has been moved to the survey's origin.
+            digests.append(digest_of(scene.between(tile.low, tile.high)))
+            materials |= dict.fromkeys(plan.config.materials)
+            surfaces |= dict.fromkeys(plan.config.materials[s.material] for s in plan.config.surfaces)
+            shared_by_tile.append(bool(strategy.info()["shared"]))
+        assert first_strategy is not None
+        return TiledSceneStrategy(
+            setup=first_strategy.setup,
+            survey=survey,
+            rtol=first_strategy.rtol,
+            scene=scene,
+            tiles=tiles,
+            options=options,
+            materials=tuple(materials),
+            surfaces=tuple(surfaces),
+            off_map=beside_map,
+            ground_height=heights,
+            digests=digests,
+            margin=margin,
+            lossless_margin=lossless,
+            shared=all(shared_by_tile),
+        )
+
+    def tasks(self, key: PRNGKeyArray) -> list[WorkUnit]:
+        arguments = [(self.survey, self.scene, tile, n, self.options) for n, tile in enumerate(self.tiles)]
+        tasks = [task(n, trace_tile, tile_arguments, key) for n, tile_arguments in enumerate(arguments)]
+        if self.options.truth:
+            tasks += [
+                task(n, truth_of_tile, tile_arguments, key)
+                for n, tile_arguments in enumerate(arguments, len(arguments))
+            ]
+        return tasks
+
+    @property
+    def n_tasks(self) -> int:
+        return len(self.tiles) * (2 if self.options.truth else 1)
+
+    @property
+    def shot_slices(self) -> list[slice]:
+        return slices_of_shots(len(self.survey), _SHOTS_PER_BLOCK)
+
+    def result_class(self, number: int) -> type[ShotResults | Truths]:
+        return ShotResults if number < len(self.tiles) else Truths
+
+    def shot_results(self, task_results: Mapping[int, Any]) -> Iterator[tuple[slice, ShotResults]]:
+        """Yield results in the order of shots, from those of tiles.
+
+        Successive shots are mostly of few tiles: the results of the last ones stay in memory, since reading
+        those of a tile from a file for every slice would take long.
+        """
+        tile_of_shot, row_of_shot = (np.empty(len(self.survey), int) for _ in range(2))
+        for n, tile in enumerate(self.tiles):
+            tile_of_shot[tile.shots], row_of_shot[tile.shots] = n, np.arange(len(tile.shots))
+        cache: dict[int, ShotResults] = {}
+        for shots in self.shot_slices:
+            results_by_tile, positions = [], []
+            for n in np.unique(tile_of_shot[shots]):
+                # Taken out and put in again: the tile used last is at the end, the one used longest ago is
+                # dropped.
+                results = cache.pop(int(n), None)
+                results = self._results_of_tile(int(n), task_results) if results is None else results
+                cache[int(n)] = results
+                position = np.flatnonzero(tile_of_shot[shots] == n)
+                positions.append(position)
+                rows = row_of_shot[shots][position]
+                results_by_tile.append(jax.tree.map(lambda a, r=rows: a[r], results))
+                while len(cache) > _CACHED_TILES:
+                    del cache[next(iter(cache))]
+            # Back from the order of tiles to that of shots.
+            order = np.argsort(np.concatenate(positions), kind="stable")
+            yield shots, jax.tree.map(lambda *a, o=order: np.concatenate(a)[o], *results_by_tile)
+
+    def _results_of_tile(self, number: int, task_results: Mapping[int, Any]) -> ShotResults:
+        """Return the results of a tile, with zeros for the materials that its part of the scene lacks."""
+        results: ShotResults = task_results[number]
+        energy_budget, energy_budget_stderr = (
+            _in_order_of_names(a, [f"absorbed by {m}" for m in self.materials], np.zeros_like(a["escaped"]))
+            for a in (results.energy_budget, results.energy_budget_stderr)
+        )
+        nothing = np.zeros_like(results.reflectance)
+        truth = None
+        if self.options.truth:
+            truths: Truths = task_results[number + len(self.tiles)]
+            no_height = np.full(len(truths.top_height), np.nan)
+            truth = dataclasses.replace(
+                truths,
+                returns=_in_order_of_names(truths.returns, self.materials, nothing),
+                surface_height=_in_order_of_names(truths.surface_height, self.surfaces, no_height),
+                surface_spread=_in_order_of_names(truths.surface_spread, self.surfaces, no_height),
+            )
+        return results._replace(
+            components=_in_order_of_names(results.components, self.materials, nothing),
+            energy_budget=energy_budget,
+            energy_budget_stderr=energy_budget_stderr,
+            truth=truth,
+        )
+
+    def info(self) -> dict[str, Any]:
+        return {
+            "shared": self.shared,
+            "parts": len(self.tiles),
+            "margin": self.margin,
+            "margin of all light": self.lossless_margin,
+        }
+
+
+def _strategy_of(
+    survey: Survey,
+    scene: SceneParts,
+    tile: SceneTile,
+    rtol: float | None,
+    orders: int | None,
+    shared: bool | None,
+    window: tuple[float, float] | None,
+) -> AbstractStrategy:
+    """Return the strategy of the shots of a tile. **Raises:** as `simulate_many`, with the part's corners."""
+    scene_part = scene.between(tile.low, tile.high)
+    try:
+        check_kinds(survey.lidar, scene_part)
+        return choose_strategy(subset(survey, tile.shots), scene_part, rtol, orders, shared, window)
+    except ValueError as error:
+        corners = f"part({tile.low.tolist()}, {tile.high.tolist()})"
+        raise ValueError(f"{corners}, shots {tile.shots[:5].tolist()}: {error}") from error
+
+
+def _in_order_of_names(
+    arrays: dict[str, np.ndarray], names: Any, missing: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Return the arrays of `names` in their order, `missing` for names without one, then all others."""
+    return {**dict.fromkeys(names, missing), **arrays}
+
+
+def trace_tile(
+    survey: Survey,
+    scene: SceneParts,
+    tile: SceneTile,
+    number: int,
+    options: TileOptions,
+    key: PRNGKeyArray,
+) -> ShotResults:
+    """Trace the shots of a tile."""
+    strategy = _strategy_of(survey, scene, tile, options.rtol, options.orders, options.shared, options.window)
+    task_results = _run_in_turn(strategy.tasks(jax.random.fold_in(key, number)))
+    blocks = [results for _, results in strategy.shot_results(task_results)]
+    return jax.tree.map(lambda *a: np.concatenate(a), *blocks)
+
+
+def truth_of_tile(
+    survey: Survey,
+    scene: SceneParts,
+    tile: SceneTile,
+    number: int,
+    options: TileOptions,
+    key: PRNGKeyArray,
+) -> Truths:
+    """Return the truth of the shots of a tile; no random numbers are drawn."""
+    strategy = _strategy_of(survey, scene, tile, options.rtol, options.orders, options.shared, options.window)
+    chunks = _run_in_turn(StrategyWithTruth.around(strategy).truth_tasks(key))
+    truths: Truths = jax.tree.map(
+        lambda *a: np.concatenate(a), *(chunk for _, chunk in sorted(chunks.items()))
+    )
+    # The last chunk is as large as the others, and filled up.
+    return jax.tree.map(lambda a: a[: len(tile.shots)], truths)
+
+
+def _run_in_turn(tasks: list[WorkUnit]) -> dict[int, Any]:
+    """Return the results of tasks by number, one after the other: this process has one core of its own."""
+    results = {}
+    for unit in tasks:
+        outcome = run_unit(unit)
+        if outcome.error is not None:
+            raise outcome.error
+        results[unit.number] = outcome.arrays
+    return results
