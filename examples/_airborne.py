@@ -18,8 +18,8 @@ from jaxlidar.io.noise import above_pedestal
 
 # Readers by the suffix of a file.
 SUFFIXES = {".npz": read_neon, ".pls": read_pulsewaves, ".las": read_las_waveforms}
-# Samples before the return, from which pedestals are taken: one in so many of the first segment, at least so
-# many, and so many of a pulse.
+# Samples before the return, from which pedestals are taken: this divisor gives their number in the first
+# segment; the fewest of them; and their number before a pulse.
 QUIET_DIVISOR, FEWEST_QUIET, QUIET_PULSE = 7, 8, 5
 # Hard targets that a receiver's response is estimated from: fewest and most, and shots that are searched.
 FEWEST_TARGETS, MOST_TARGETS, SEARCHED_SHOTS = 10, 60, 1000
@@ -74,8 +74,8 @@ class Instrument:
         return 1e-3 * self.altitude * self.divergence
 
 
-# NEON's pulse is 15 ns (2.3 m) long: two echoes cannot tell ground from canopy. Its jitter is what a hard
-# target's echo is blurred by. LVIS has two digitisers, and footprints of 20 m, in which slopes show. RIEGL's
+# NEON's pulse is 15 ns (2.3 m) long: two echoes cannot separate ground from canopy. Its jitter is that
+# of a hard target's echo. LVIS has two digitisers, and footprints of 20 m, which slopes broaden. RIEGL's
 # counts are rounded, and its receiver rings.
 INSTRUMENTS = {
     "neon": Instrument(divergence=0.8, jitter=1.9, correlated=5, pulse_noise=False, above=25.5, below=7.5,

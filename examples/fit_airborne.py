@@ -2,7 +2,7 @@
 
     python examples/fit_airborne.py FILE [--shots 9] [--every 10] [--out figures]
 
-FILE is what NEON publishes (.npz, `jaxlidar.io.read_neon`), PulseWaves (.pls, as RIEGL and LVIS data are
+FILE is a record of NEON (.npz, `jaxlidar.io.read_neon`), PulseWaves (.pls, as RIEGL and LVIS data are
 published in) or LAS with wave packets (.las). LAS has no outgoing pulses: give one as a table (`--pulse`), as
 a Gaussian (`--pulse-width`), or those of the same shots in a PulseWaves file (`--pulses`). Every K-th shot,
 or a number of the longest, are fitted in one batch for each kind of scene, which resumes where it was

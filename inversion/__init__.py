@@ -3,9 +3,9 @@
 ## Fits with a model
 
 `retrieve`, `retrieve_many`, `Unknown`, `LogNormal`, `Smooth`, `put_profile`, `Retrieval`, `Retrievals`,
-`Step`, `Progress`, `AveragingKernel`.
+`Step`, `RetrievalProgress`, `AveragingKernel`.
 
-## How well a fit can do, and how well it did
+## Identifiability and verdicts
 
 `cramer_rao`, `CramerRao`, `profile_likelihood`, `Profile`, `judge_fit`, `judge_fits`, `judge_record`,
 `Verdict`.
@@ -23,7 +23,7 @@
 
 `gedi_metrics`, `GediMetrics`, `gedi_settings`, `GediSettings`, `photon_ground_and_canopy`, `PhotonHeights`.
 
-## What the receiver did
+## Receivers and digitisers
 
 `Recorder`, `receiver_impulse`, `recorded_pulse`, `amplitudes`, `Amplitudes`, `corrected_table`.
 
@@ -36,14 +36,17 @@
 `files`.
 """
 
+from typing import Any
+
 from inversion import files
-from inversion.fit.batch import Progress, Retrievals, retrieve_many
+from inversion.fit.fit_record import Step
 from inversion.fit.identifiability import CramerRao, Profile, cramer_rao, profile_likelihood
 from inversion.fit.priors import LogNormal, Smooth
 from inversion.fit.profiles import AveragingKernel, put_profile
 from inversion.fit.quality import Verdict, judge_fit, judge_fits, judge_record
-from inversion.fit.result import Retrieval, Step
+from inversion.fit.result import Retrieval, Retrievals
 from inversion.fit.retrieval import retrieve
+from inversion.fit.retrieval_many import RetrievalProgress, retrieve_many
 from inversion.fit.unknowns import Unknown
 from inversion.leaf.leaves import LeafFit, invert_leaves
 from inversion.metrics.cover import (
@@ -62,6 +65,7 @@ from inversion.metrics.points import EchoPoints, echo_points
 from inversion.receiver.digitiser import Amplitudes, amplitudes, corrected_table
 from inversion.receiver.impulse import receiver_impulse, recorded_pulse
 from inversion.receiver.recorder import Recorder
+from jaxlidar._deprecated import warn_renamed
 from jaxlidar.extend import shorten_signatures
 
 __all__ = [
@@ -75,9 +79,9 @@ __all__ = [
     "Retrieval",
     "Retrievals",
     "Step",
-    "Progress",
+    "RetrievalProgress",
     "AveragingKernel",
-    # How well a fit can do, and how well it did.
+    # Identifiability and verdicts.
     "cramer_rao",
     "CramerRao",
     "profile_likelihood",
@@ -110,7 +114,7 @@ __all__ = [
     "GediSettings",
     "photon_ground_and_canopy",
     "PhotonHeights",
-    # What the receiver did.
+    # Receivers and digitisers.
     "Recorder",
     "receiver_impulse",
     "recorded_pulse",
@@ -130,3 +134,10 @@ shorten_signatures(globals())
 def __dir__() -> list[str]:
     # Public names alone, without the modules and helpers that the imports leave here.
     return sorted(__all__)
+
+
+def __getattr__(name: str) -> Any:
+    if name == "Progress":
+        warn_renamed("inversion.Progress", "inversion.RetrievalProgress")
+        return RetrievalProgress
+    raise AttributeError(f"module 'inversion' has no attribute {name!r}")

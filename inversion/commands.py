@@ -1,4 +1,8 @@
-"""Commands of this package: `jaxlidar demo` and `jaxlidar retrieve`."""
+"""The commands `jaxlidar demo` and `jaxlidar retrieve`.
+
+`jaxlidar` never imports this package: its command line finds the commands by the group of entry points
+"jaxlidar.commands" in pyproject.toml.
+"""
 
 import math
 import sys
@@ -21,7 +25,7 @@ from jaxlidar.cli.shared import ResultPath
 @click.option(
     "--out", type=click.Path(file_okay=False, path_type=Path), default="jaxlidar-demo", help="Folder."
 )
-@click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=0, help="Of photons and noise.")
+@click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=0, help="Seed of photons and noise.")
 @click.option(
     "--rtol",
     type=click.FloatRange(0, 1, min_open=True, max_open=True),
@@ -32,20 +36,22 @@ from jaxlidar.cli.shared import ResultPath
 @click.option("--voxel-size", type=click.FloatRange(0, 1, min_open=True), default=0.25, hidden=True)
 def demo(out: Path, seed: int, rtol: float, quiet: bool, voxel_size: float) -> None:
     """Simulate a tree's waveform, retrieve leaf, crown and ground from a noisy one, and draw both."""
+    # click's ranges let NaN pass.
     if math.isnan(rtol):
         raise click.BadParameter("nan is not in the range 0<x<1.", param_hint="--rtol")
-    # Made first, so that a folder that cannot be written ends the command before the work.
+    # Before the work: a folder that cannot be written ends the command at once.
     out.mkdir(parents=True, exist_ok=True)
-    started = time.perf_counter()
-    say = demonstration.Say(None if quiet else sys.stderr)
-    demonstration.run(out, seed=seed, rtol=rtol, voxel_size=voxel_size, say=say)
-    click.echo(f"\n{time.perf_counter() - started:.0f} s")
+    start_time = time.perf_counter()
+    log = demonstration.ProgressLog(None if quiet else sys.stderr)
+    demonstration.run(out, seed=seed, rtol=rtol, voxel_size=voxel_size, log=log)
+    click.echo(f"\n{time.perf_counter() - start_time:.0f} s")
 
 
-def _unknown(ctx: Any, parameter: Any, given: tuple[str, ...]) -> list[Unknown]:
-    """Unknowns of the form PATH:LOW:HIGH."""
+def _parse_unknowns(ctx: Any, parameter: Any, texts: tuple[str, ...]) -> list[Unknown]:
+    """Return the unknowns of texts PATH:LOW:HIGH."""
     unknowns = []
-    for text in given:
+    for text in texts:
+        # Paths hold no colon: the rest are the bounds.
         path, *bounds = text.split(":")
         try:
             low, high = map(float, bounds)
@@ -63,12 +69,12 @@ def _unknown(ctx: Any, parameter: Any, given: tuple[str, ...]) -> list[Unknown]:
     "unknowns",
     multiple=True,
     required=True,
-    callback=_unknown,
+    callback=_parse_unknowns,
     metavar="PATH:LOW:HIGH",
     help="A quantity of the scene and its bounds; repeat for more.",
 )
 @click.option("--noise", type=click.FloatRange(0, min_open=True), help="Standard deviation of the samples.")
-@click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=0, help="Of the photons of the fit.")
+@click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=0, help="Seed of the photons of the fit.")
 @click.option("-o", "--out", type=ResultPath(), help="Write the result as netCDF, or as Zarr (.zarr).")
 @click.option(
     "--plot", type=click.Path(dir_okay=False, path_type=Path), help="Draw the fit and its residuals."
@@ -86,7 +92,7 @@ def retrieve(
 ) -> int:
     """Retrieve quantities of a scene from a waveform that was saved as netCDF, starting from a case.
 
-    Noise is the waveform's own standard error where it is not given. The status is 1 where the fit has not
+    Without --noise, noise is the waveform's own standard error. The exit status is 1 for a fit that has not
     converged.
 
     \b
@@ -95,31 +101,35 @@ def retrieve(
     """
     wave, case = jl.open(observed), jl.io.read_case(start)
     if not isinstance(wave, jl.Waveform):
-        raise click.UsageError(f"{observed} holds a {type(wave).__name__}, no waveform")
+        raise click.UsageError(f"{observed} holds a {type(wave).__name__}, not a waveform")
     if case.scene is None:
         raise click.UsageError(f"{start} has no scene")
-    spread: Any = np.asarray(wave.stderr) if noise is None else noise
-    if noise is None and not np.any(spread > 0):
+    # Standard errors are zero in bins that no photon reached: any above zero will do.
+    sigma: Any = np.asarray(wave.stderr) if noise is None else noise
+    if noise is None and not np.any(sigma > 0):
         raise click.UsageError(f"{observed} has no standard errors: give --noise")
-    say = demonstration.Say(sys.stderr if sys.stderr.isatty() and not quiet else None)
+    # Steps are for a person who watches, not for a log file.
+    log = demonstration.ProgressLog(sys.stderr if sys.stderr.isatty() and not quiet else None)
     fit = fit_waveform(
         wave,
         case.lidar or jl.Lidar(),
         case.scene,
         unknowns,
-        noise=spread,
+        noise=sigma,
         key=jax.random.key(seed),
-        progress=lambda step: say(str(step)),
+        progress=lambda step: log(str(step)),
     )
     click.echo(str(fit))
     if out is not None:
         fit.save(out)
         click.echo(f"result: {out}")
     if plot is not None:
+        # matplotlib takes a while to import: only for a figure.
         from matplotlib.figure import Figure
 
         axes = Figure(figsize=(6.0, 4.2), layout="constrained").subplots(1, 2, sharey=True)
-        jl.plot.fit(fit.waveform, wave.reflectance, spread, axes)
+        jl.plot.fit(fit.waveform, wave.reflectance, sigma, axes)
+        # The draft has another suffix: the format is that of the final name.
         with jl.io.atomic_write(plot) as draft:
             axes[0].get_figure().savefig(draft, format=plot.suffix.lstrip(".") or "png", dpi=150)
         click.echo(f"figure: {plot}")

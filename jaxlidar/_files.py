@@ -9,10 +9,10 @@ from pathlib import Path
 
 @contextlib.contextmanager
 def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """A temporary path beside `path`, which takes its place when the block ends without an error.
+    """Give a temporary path beside `path`, which replaces it when the block ends without an error.
 
-    Whoever reads `path` finds the old file or the new one, never half. Missing folders are made. The block
-    may also make a folder: the old one is moved aside first.
+    Readers of `path` find the old file or the new one, never an incomplete one. Missing folders are created.
+    The block may also create a folder: the old one is moved aside first.
 
     **Arguments:** `path`: the file to write.
 
@@ -32,21 +32,23 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
+    # In the same folder, as a rename is atomic within one file system only; hidden, and one for each process.
     draft = path.with_name(f".{path.name}.{os.getpid()}.part")
-    aside = draft.with_suffix(".old")
+    old_folder = draft.with_suffix(".old")
     try:
         yield draft
+        # A folder cannot be replaced by a rename, as a file can.
         if draft.is_dir() and path.is_dir():
-            path.replace(aside)
+            path.replace(old_folder)
         try:
             draft.replace(path)
         except OSError:
-            if aside.exists():
-                aside.replace(path)
+            if old_folder.exists():
+                old_folder.replace(path)
             raise
     finally:
-        for left in (draft, aside):
-            if left.is_dir():
-                shutil.rmtree(left)
+        for temporary in (draft, old_folder):
+            if temporary.is_dir():
+                shutil.rmtree(temporary)
             else:
-                left.unlink(missing_ok=True)
+                temporary.unlink(missing_ok=True)

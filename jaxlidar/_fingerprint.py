@@ -1,11 +1,11 @@
-"""Fingerprints: digests of all that a result depends on, equal in any process for equal contents.
+"""Fingerprints: digests of everything that a result depends on, equal in any process for equal contents.
 
-Arrays are told by type, shape and every bit; instances of dataclasses by class and fields, static ones
-included, but not by fields that do not count in comparisons; other objects by what pickle would keep of them.
+Arrays enter a digest by type, shape and every bit; instances of dataclasses by class and fields, static ones
+included, but without fields that do not count in comparisons; other objects by what pickle would store.
 
-What an installed package defines is told by name. Functions and classes of one's own are told by their code,
-with its constants, defaults, closures, and the globals that it names. A module of one's own is told by its
-file: for `helpers.double(x)`, that of `helpers`, but not the files that `helpers` imports in turn.
+Functions and classes of installed packages enter by name. Those of the user enter by their code, with its
+constants, defaults, closures, and the globals that it names. A module of the user enters by its file: for
+`helpers.double(x)`, that of `helpers`, but not the files that `helpers` imports in turn.
 """
 
 import copyreg
@@ -28,66 +28,74 @@ import numpy as np
 
 # Another release of these may give other results.
 _PACKAGES = ("jaxlidar", "jax", "jaxlib", "equinox", "optimistix", "lineax", "numpy")
-_BY_NAME = {"inversion", *_PACKAGES, *sys.stdlib_module_names} - {"__main__"}
-# Results depend on these as well.
-_SETTINGS = (
+_INSTALLED = {"inversion", *_PACKAGES, *sys.stdlib_module_names} - {"__main__"}
+# Settings of JAX that results depend on.
+_JAX_SETTINGS = (
     "jax_enable_x64",
     "jax_default_matmul_precision",
     "jax_default_prng_impl",
     "jax_threefry_partitionable",
 )
 
-# Digests of functions and classes met so far, by id; with them, so that no other object gets the id.
-_Told = dict[int, tuple[Any, str]]
+# Digests of functions and classes that were met, by id. The objects are stored with them, so that no other
+# object gets the id.
+_CodeDigests = dict[int, tuple[Any, str]]
 
 
 def fingerprint(parts: Mapping[str, Any]) -> dict[str, str]:
-    """A digest of each part of a problem, and the releases and settings with which it is solved.
+    """Return a digest of each part of a problem, and the releases and settings with which it is solved.
 
-    **Raises:** TypeError for a part that has no content to tell, such as an open file.
+    **Raises:** TypeError for a part whose content is not accessible, such as an open file.
     """
-    found = {}
-    for name, part in parts.items():
+    digests = {}
+    for name, value in parts.items():
         try:
-            found[name] = digest_of(part)
+            digests[name] = digest_of(value)
         except (TypeError, RecursionError) as error:
             raise TypeError(f"{name} cannot be compared with that of another run: {error}") from error
-    found |= {f"version of {name}": version_of(name) for name in _PACKAGES}
-    found["version of python"] = ".".join(platform.python_version_tuple()[:2])
-    found |= {name: str(getattr(jax.config, name, None)) for name in _SETTINGS}
-    return found | {"jax.default_backend()": jax.default_backend()}
+    digests |= {f"version of {name}": version_of(name) for name in _PACKAGES}
+    digests["version of python"] = ".".join(platform.python_version_tuple()[:2])
+    digests |= {name: str(getattr(jax.config, name, None)) for name in _JAX_SETTINGS}
+    return digests | {"jax.default_backend()": jax.default_backend()}
 
 
 def version_of(name: str) -> str:
-    """Return the version of an installed package, by its name."""
+    """Return the version of an installed package."""
     try:
         return importlib.metadata.version(name)
     except importlib.metadata.PackageNotFoundError:
         return "not installed"
 
 
-def digest_of(x: Any, told: _Told | None = None) -> str:
-    """The digest of anything. **Raises:** TypeError for what has no content to tell, such as an open file."""
-    told = {} if told is None else told
-    by_code = isinstance(x, FunctionType | type)
-    if by_code:
-        if id(x) in told:
-            return told[id(x)][1]
-        # Code may name itself.
-        told[id(x)] = x, f"number {len(told)}"
-    head, parts = _apart(x)
+def digest_of(x: Any, code_digests: _CodeDigests | None = None) -> str:
+    """Return the digest of any object.
+
+    `code_digests` has those of functions and classes on the way from the outermost object.
+
+    **Raises:** TypeError for an object whose content is not accessible, such as an open file.
+    """
+    code_digests = {} if code_digests is None else code_digests
+    is_code = isinstance(x, FunctionType | type)
+    if is_code:
+        if id(x) in code_digests:
+            return code_digests[id(x)][1]
+        # Code may name itself: within it, its order among the objects met stands for its digest.
+        code_digests[id(x)] = x, f"number {len(code_digests)}"
+    head, components = _decompose(x)
     digest = hashlib.sha256(repr(head).encode())
     if isinstance(x, set | frozenset):
-        digest.update("\n".join(sorted(digest_of(part) for part in parts)).encode())
+        # The order of a set is another in every process. Sorted digests must not depend on it either, so each
+        # is computed by itself.
+        digest.update("\n".join(sorted(digest_of(component) for component in components)).encode())
     else:
-        digest.update("\n".join(digest_of(part, told) for part in parts).encode())
-    if by_code:
-        told[id(x)] = x, digest.hexdigest()
+        digest.update("\n".join(digest_of(component, code_digests) for component in components).encode())
+    if is_code:
+        code_digests[id(x)] = x, digest.hexdigest()
     return digest.hexdigest()
 
 
-def _apart(x: Any) -> tuple[Any, list[Any]]:
-    """What tells a thing by itself, and the parts of which it is made."""
+def _decompose(x: Any) -> tuple[Any, list[Any]]:
+    """Return what identifies an object itself, as an object with a stable `repr`, and its components."""
     match x:
         case None | bool() | int() | float() | complex() | str() | bytes():
             return (type(x).__qualname__, x), []
@@ -103,12 +111,13 @@ def _apart(x: Any) -> tuple[Any, list[Any]]:
         case tuple() | list() | set() | frozenset():
             return type(x).__qualname__, list(x)
         case ModuleType():
-            installed = _is_installed(x.__name__)
-            return (x.__name__, _release_of(x.__name__) if installed else _file_of(x)), []
+            is_installed = _is_installed(x.__name__)
+            return (x.__name__, _release_of(x.__name__) if is_installed else _source_of(x)), []
         case type() | FunctionType() | BuiltinFunctionType() if _is_installed(x.__module__):
-            # What a package's function has made may hold one's own.
-            held = (getattr(x, "__closure__", None) or ()) if "<locals>" in x.__qualname__ else ()
-            return (x.__module__, x.__qualname__, _release_of(x.__module__)), [*map(_content, held)]
+            # A function that a package's function returned may hold objects of the user in its closure.
+            is_local = "<locals>" in x.__qualname__
+            closure = (getattr(x, "__closure__", None) or ()) if is_local else ()
+            return (x.__module__, x.__qualname__, _release_of(x.__module__)), [*map(_content, closure)]
         case type():
             return x.__qualname__, list(_members(x))
         case FunctionType():
@@ -122,41 +131,41 @@ def _apart(x: Any) -> tuple[Any, list[Any]]:
         fields = [f.name for f in dataclasses.fields(x) if f.compare]
         return fields, [type(x), *(getattr(x, name) for name in fields)]
     if callable(x) and hasattr(x, "__wrapped__"):
-        # Such as the rules of `jax.custom_jvp`.
-        public = {n: part for n, part in getattr(x, "__dict__", {}).items() if not n.startswith("_")}
+        # For instance `jax.custom_jvp`, whose rules are attributes.
+        public = {n: value for n, value in getattr(x, "__dict__", {}).items() if not n.startswith("_")}
         return "wrapped", [type(x), x.__wrapped__, public]
     try:
         reduce = copyreg.dispatch_table.get(type(x))
-        kept = x.__reduce_ex__(2) if reduce is None else reduce(x)
+        reduced = x.__reduce_ex__(2) if reduce is None else reduce(x)
     except (TypeError, pickle.PicklingError):
         raise TypeError(f"the content of a {type(x).__qualname__} is not known") from None
-    if isinstance(kept, str):
-        return kept, [type(x)]
-    # State, then items, which come as iterators.
-    return "object", [type(x), *(list(part) if isinstance(part, Iterator) else part for part in kept)]
+    if isinstance(reduced, str):
+        return reduced, [type(x)]
+    # A tuple: callable, arguments and state, then iterators of items.
+    return "object", [type(x), *(list(item) if isinstance(item, Iterator) else item for item in reduced)]
 
 
 def _is_installed(module: str | None) -> bool:
-    """Whether a module is of an installed package, which its release stands for."""
+    """Return True if a module belongs to an installed package, for which its release stands."""
     module = module or "builtins"
-    place = getattr(sys.modules.get(module), "__file__", None) or ""
-    return module.partition(".")[0] in _BY_NAME or "site-packages" in place or "dist-packages" in place
+    path = getattr(sys.modules.get(module), "__file__", None) or ""
+    return module.partition(".")[0] in _INSTALLED or "site-packages" in path or "dist-packages" in path
 
 
 def _release_of(module: str | None) -> str:
-    """The release of an installed package, but for those of which the fingerprint has it in any case."""
+    """Return the release of an installed package; empty for those whose release every fingerprint has."""
     package = (module or "builtins").partition(".")[0]
-    return "" if package in _BY_NAME else version_of(package)
+    return "" if package in _INSTALLED else version_of(package)
 
 
-def _file_of(module: ModuleType) -> bytes:
-    """The content of a module's file, where it has one."""
-    place = getattr(module, "__file__", None)
-    return Path(place).read_bytes() if place else b""
+def _source_of(module: ModuleType) -> bytes:
+    """Return the content of a module's file, if it has one."""
+    path = getattr(module, "__file__", None)
+    return Path(path).read_bytes() if path else b""
 
 
 def _members(kind: type) -> Iterator[Any]:
-    """Bases, methods and constants of a class."""
+    """Yield the bases, methods and constants of a class."""
     yield from kind.__bases__
     for name, member in sorted(vars(kind).items()):
         if isinstance(member, staticmethod | classmethod):
@@ -175,7 +184,7 @@ def _content(cell: CellType) -> Any:
 
 
 def _globals_of(code: CodeType) -> list[str]:
-    """Names of the globals that code uses, that of nested functions included."""
+    """Return the names of the globals that code uses, including nested functions."""
     names = {i.argval for i in dis.get_instructions(code) if i.opname == "LOAD_GLOBAL"}
     for const in code.co_consts:
         if isinstance(const, CodeType):

@@ -1,7 +1,6 @@
 """Tasks in threads: results in order, JAX configured as by the caller, no task started after an error."""
 
 import os
-import sys
 import threading
 import time
 
@@ -12,6 +11,8 @@ import pytest
 
 import jaxlidar as jl
 from jaxlidar.extend import side_by_side
+from jaxlidar.sampling import batch_programs
+from jaxlidar.trace.response import join_orders
 from tests.helpers import slow_unless
 
 
@@ -54,16 +55,16 @@ def test_waiting_tasks_are_dropped_after_an_error():
 @pytest.mark.parametrize("double", slow_unless([True], [False, True]))
 def test_simulate_keeps_the_precision(double, monkeypatch):
     expected = "float64" if double else "float32"
-    batches, dtypes = sys.modules["jaxlidar.sampling.batch_programs"], []
-    original_joined = batches.joined
+    dtypes = []
 
-    def watched_joined(*args):
-        out = original_joined(*args)
-        if not isinstance(out.first, jax.ShapeDtypeStruct):
-            dtypes.append(str(out.first.dtype))
-        return out
+    def recording_join(*orders):
+        response = join_orders(*orders)
+        # Shapes are computed ahead by tracing the function.
+        if not isinstance(response.first, jax.core.Tracer):
+            dtypes.append(str(response.first.dtype))
+        return response
 
-    monkeypatch.setattr(batches, "joined", watched_joined)
+    monkeypatch.setattr(batch_programs, "join_orders", recording_join)
     with jax.enable_x64(double):
         voxels = jl.VoxelMap.from_lad(np.full((1, 1, 4), 0.2), voxel_size=2.0, origin=(-1.0, -1.0, 0.0))
         canopy = jl.Canopy(voxels, leaf=jl.Isotropic(albedo=0.8))

@@ -25,7 +25,7 @@ from retrieval_coverage import LIDAR, NOISE, RANGES, plan_of, scene_of, unknowns
 
 import inversion
 import jaxlidar as jl
-from inversion.fit.unknowns import put, settle
+from inversion.fit.unknowns import bind_unknowns, set_values
 from jaxlidar.planning.plan import MIN_BATCHES
 
 OPTICAL = ("Cab", "Cw", "N", "ground brightness")
@@ -65,13 +65,13 @@ def main() -> None:
             )
             ours = time.perf_counter() - start
 
-            bound_unknowns = settle(chosen_unknowns, base)
-            paths = tuple(s.place for s in bound_unknowns)
+            bound_unknowns = bind_unknowns(chosen_unknowns, base)
+            setters = tuple(s.setter for s in bound_unknowns)
             keys = [jax.random.fold_in(key, n) for n in range(MIN_BATCHES)]
 
-            def residuals(x, base=base, paths=paths, keys=keys, observed=observed, sigma=sigma):
+            def residuals(x, base=base, setters=setters, keys=keys, observed=observed, sigma=sigma):
                 values = tuple(jax.numpy.asarray(v, jax.numpy.zeros(()).dtype) for v in x)
-                waveforms = pool.map(lambda k: _simulated(base, plan, paths, values, k), keys)
+                waveforms = pool.map(lambda k: _simulated(base, plan, setters, values, k), keys)
                 return (
                     (np.mean([np.asarray(p, float) for p in waveforms], axis=0) - observed) / sigma
                 ).ravel()
@@ -144,8 +144,8 @@ def draw(record: dict, path: Path) -> None:
 
 
 @eqx.filter_jit
-def _simulated(scene, plan, paths, values, key):
-    setup = jl.make_setup(LIDAR, put(scene, paths, values), plan)
+def _simulated(scene, plan, setters, values, key):
+    setup = jl.make_setup(LIDAR, set_values(scene, setters, values), plan)
     return jl.total_reflectance(jl.trace_scene(setup, key, reverse=False), setup)
 
 

@@ -20,10 +20,10 @@ from scipy.optimize import nnls
 
 import inversion
 import jaxlidar as jl
-from inversion.fit.noise import Noise, correlation_between
-from inversion.fit.retrieval import scale_of
+from inversion.fit.data import SampleNoise, neighbour_correlation
+from inversion.fit.recorder_model import RecorderModel
+from inversion.fit.retrieval import scale_unknown
 from inversion.receiver.digitiser import amplitude_table
-from inversion.receiver.recorder import RecorderModel
 from jaxlidar.io import read_pulsewaves
 from jaxlidar.io.noise import above_pedestal
 
@@ -115,17 +115,17 @@ def best_pulse_sum(shot, columns, model, noise, random):
     """Return the chi-squared of the best sum, and its mean for synthetic records of the model plus noise."""
     signal, sigma = shot.window()
     used = np.isfinite(sigma)
-    baseline = np.linalg.qr(noise.white(np.ones((used.sum(), 1))))[0]
-    projected = noise.white(columns[used])
+    baseline = np.linalg.qr(noise.whiten(np.ones((used.sum(), 1))))[0]
+    projected = noise.whiten(columns[used])
     projected = projected - baseline @ (baseline.T @ projected)
     projected = projected / np.maximum(np.linalg.norm(projected, axis=0), 1e-9)
 
     def residual_chi2(record):
-        white = noise.white(record)
+        white = noise.whiten(record)
         return nnls(projected, white - baseline @ (baseline.T @ white), maxiter=20000)[1] ** 2
 
     # The inverse of the whitening matrix correlates independent numbers like the noise.
-    unwhitening = np.linalg.inv(noise.white(np.eye(used.sum())))
+    unwhitening = np.linalg.inv(noise.whiten(np.eye(used.sum())))
     drawn = [residual_chi2(model[used] + unwhitening @ random.normal(size=used.sum())) for _ in range(DRAWS)]
     return residual_chi2(signal[used]), float(np.mean(drawn))
 
@@ -159,10 +159,10 @@ def main(argv=None):
         model = recorders[i].recorded(fits.fitted[i, 0], fit_values)
         signal, sigma = shot.window()
         used = np.isfinite(sigma)
-        terms = RecorderModel(recorders[i], [scale_of(SCALE, [])], lidars[i], TIME.size)
+        terms = RecorderModel(recorders[i], [scale_unknown(SCALE, [])], lidars[i], TIME.size)
         flat = np.concatenate([np.ravel(fit_values[name]) for name in ("receiver width", "offset", "scale")])
         common = terms.pulse_noise(fits.fitted[i], flat)
-        noise = Noise(sigma[used], common[0][used], correlation_between(CORRELATED, used[None]))
+        noise = SampleNoise(sigma[used], common[0][used], neighbour_correlation(CORRELATED, used[None]))
         sums.append(best_pulse_sum(shot, shifted_echoes(lidars[i], recorders[i]), model, noise, random))
         residuals.append(np.where(used, signal - model, np.nan) / np.nanmax(model))
     best, expected = np.sum(sums, axis=0)

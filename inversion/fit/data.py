@@ -1,36 +1,110 @@
-"""Checked observations: waveforms, their sample times and their noise."""
+r"""Observed waveforms and their noise.
+
+The noise of the samples of a record has the covariance
+
+    C = S (R + B B^T) S,   S = diag(sigma),
+
+with sigma the standard deviations of independent errors, R their correlation, and S B the errors that several
+samples share, such as those of a noisy recorded pulse: column k is the change of the record by one standard
+deviation of shared error k. With R + B B^T = L L^T (Cholesky), L^-1 S^-1 whitens differences: it makes them
+independent and of unit variance.
+"""
 
 import dataclasses
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+from scipy import linalg
 
 from jaxlidar import Lidar, Waveform
 from jaxlidar.extend import check_kind, check_numbers, check_range
 
 
-class Data(NamedTuple):
-    """Observed apparent reflectance and its standard deviation; infinite where a sample is left out."""
+class ObservedWaveform(NamedTuple):
+    """Observed apparent reflectance and its standard deviation, infinite for samples that are left out."""
 
     time: Float[np.ndarray, " bins"]
-    observed: Float[np.ndarray, "wavelengths bins"]
+    reflectance: Float[np.ndarray, "wavelengths bins"]
     sigma: Float[np.ndarray, "wavelengths bins"]
 
     @property
-    def used(self) -> np.ndarray:
-        """Which samples are fitted."""
+    def is_fitted(self) -> np.ndarray:
+        """(wavelengths, bins) True for samples that are fitted."""
         return np.isfinite(self.sigma)
 
 
-def at_fixed_times(lidar: Lidar) -> Lidar:
-    """The lidar without what opens its recording window: samples lie at given times."""
+class SampleNoise(NamedTuple):
+    """Noise of the fitted samples of a record: see the module.
+
+    - `sigma_independent`: (samples,) standard deviation of the errors that no other sample shares.
+    - `shared_errors`: (samples, errors) change of the samples by one standard deviation of each shared error,
+      or None.
+    - `correlation`: (samples, samples) of the errors of `sigma_independent`, or None if there is none.
+    """
+
+    sigma_independent: Float[np.ndarray, " samples"]
+    shared_errors: Float[np.ndarray, "samples errors"] | None = None
+    correlation: Float[np.ndarray, "samples samples"] | None = None
+
+    @property
+    def sigma(self) -> Float[np.ndarray, " samples"]:
+        """Standard deviation of the samples, shared errors included."""
+        if self.shared_errors is None:
+            return self.sigma_independent
+        return np.sqrt(self.sigma_independent**2 + np.sum(self.shared_errors**2, axis=1))
+
+    def whiten(self, x: Float[np.ndarray, "samples ..."]) -> Float[np.ndarray, "samples ..."]:
+        """Return differences, or columns of them, made independent and of unit variance."""
+        # Rows are samples; x may have any number of columns.
+        scaled = x / self.sigma_independent.reshape(-1, *(1,) * (x.ndim - 1))
+        if self.shared_errors is None and self.correlation is None:
+            return scaled
+        covariance = np.eye(self.sigma_independent.size) if self.correlation is None else self.correlation
+        if self.shared_errors is not None:
+            shared = self.shared_errors / self.sigma_independent[:, None]
+            covariance = covariance + shared @ shared.T
+        # Not finite differences, of a simulation that failed, pass through: the solver rejects them.
+        root = np.linalg.cholesky(covariance)
+        return linalg.solve_triangular(root, scaled, lower=True, check_finite=False)
+
+
+def neighbour_correlation(
+    correlation: float, is_fitted: Bool[np.ndarray, "wavelengths bins"]
+) -> Float[np.ndarray, "samples samples"] | None:
+    """Return the correlation matrix of the fitted samples, or None for a correlation of 0.
+
+    Samples of one wavelength that are n bins apart have `correlation` ** n; wavelengths are independent.
+    """
+    if correlation == 0:
+        return None
+    wavelength, sample = np.nonzero(is_fitted)
+    distance = np.abs(sample[:, None] - sample)
+    return np.where(wavelength[:, None] == wavelength, correlation**distance, 0.0)
+
+
+def shared_errors_of_samples(
+    errors: Float[np.ndarray, "wavelengths bins errors"] | None,
+    is_fitted: Bool[np.ndarray, "wavelengths bins"],
+) -> Float[np.ndarray, "samples all_errors"] | None:
+    """Return the shared errors of the fitted samples; those of different wavelengths are independent."""
+    if errors is None:
+        return None
+    # Errors of one wavelength are zero at the samples of the others.
+    return np.asarray(linalg.block_diag(*(e[fitted] for e, fitted in zip(errors, is_fitted))))
+
+
+def with_fixed_window(lidar: Lidar) -> Lidar:
+    """Return the lidar with a fixed recording window: the samples of a record lie at known times."""
     check_kind("lidar", lidar, Lidar, "a Lidar")
+    # A window that opens at the first return would move with the scene during a fit.
     return dataclasses.replace(lidar, receiver=dataclasses.replace(lidar.receiver, window="fixed"))
 
 
-def data_of(observed: object, time: object, noise: object, floor: float, lidar: Lidar) -> Data:
-    """Read and check the observations passed to `retrieve`. **Raises:** ValueError where inadmissible."""
+def as_observed(
+    observed: object, time: object, noise: object, noise_floor: float, lidar: Lidar
+) -> ObservedWaveform:
+    """Read and check the observation passed to `retrieve`. **Raises:** ValueError if it is inadmissible."""
     if isinstance(observed, Waveform):
         if time is not None:
             raise ValueError("time is given, but observed is a Waveform, which has its own")
@@ -44,43 +118,51 @@ def data_of(observed: object, time: object, noise: object, floor: float, lidar: 
         time, observed = observed.time, observed.reflectance
     elif time is None:
         raise ValueError("time = None, but observed is an array: its sample times are needed")
-    t = time_axis(time, lidar)
-    y = numbers("observed", observed)
+    t = as_sample_times(time, lidar)
+    y = as_numbers("observed", observed)
+    # The axis of a single wavelength may be left out.
     if y.ndim == 1:
         y = y[None, :]
     shape = (lidar.wavelength.size, t.size)
     if y.shape != shape:
         raise ValueError(f"observed has the shape {y.shape}; admissible is (wavelengths, bins) = {shape}")
-    sigma = noise_of(noise, shape)
+    sigma = as_noise(noise, shape)
+    # Written so that NaN is refused.
     if not np.all(sigma >= 0):
-        bad = sigma[~(sigma >= 0)].flat[0]
-        raise ValueError(f"noise = {bad:g} is outside the admissible range [0, inf]")
-    used = np.isfinite(sigma)
-    if not np.any(used):
+        inadmissible = sigma[~(sigma >= 0)].flat[0]
+        raise ValueError(f"noise = {inadmissible:g} is outside the admissible range [0, inf]")
+    is_fitted = np.isfinite(sigma)
+    if not np.any(is_fitted):
         raise ValueError("noise is infinite throughout, which leaves no sample to fit")
-    check_range("observed", y[used])
-    check_range("noise_floor", floor, 0.0, 1.0)
-    peak = np.max(np.abs(np.where(used, y, 0.0)), axis=1, keepdims=True)
-    sigma = np.maximum(sigma, floor * peak)
+    check_range("observed", y[is_fitted])
+    check_range("noise_floor", noise_floor, 0.0, 1.0)
+    # The standard error of a simulated bin that no photon reached is zero; the floor keeps its weight finite.
+    peak = np.max(np.abs(np.where(is_fitted, y, 0.0)), axis=1, keepdims=True)
+    sigma = np.maximum(sigma, noise_floor * peak)
     if not np.all(sigma > 0):
         raise ValueError(
-            f"noise = 0 with noise_floor = {floor:g} and a largest observed value of {float(peak.min()):g}; "
-            "admissible is a noise above 0"
+            f"noise = 0 with noise_floor = {noise_floor:g} and a largest observed value of "
+            f"{float(peak.min()):g}; admissible is a noise above 0"
         )
-    return Data(t, np.where(used, y, 0.0), sigma)
+    # Samples that are left out may be NaN, which a weight of zero would not remove.
+    return ObservedWaveform(t, np.where(is_fitted, y, 0.0), sigma)
 
 
-def noise_of(noise: object, shape: tuple[int, ...]) -> np.ndarray:
-    """Standard deviations of this shape. **Raises:** ValueError for what does not broadcast to it."""
-    sigma = numbers("noise", noise)
+def as_noise(noise: object, shape: tuple[int, ...]) -> np.ndarray:
+    """Return standard deviations of this shape. **Raises:** ValueError for one that does not broadcast."""
+    sigma = as_numbers("noise", noise)
     try:
+        # A copy: a broadcast array cannot be written.
         return np.broadcast_to(sigma, shape).copy()
     except ValueError:
         raise ValueError(f"noise has the shape {sigma.shape}, which does not broadcast to {shape}") from None
 
 
-def numbers(field: str, x: Any) -> np.ndarray:
-    """An array in double precision. **Raises:** TypeError for no numbers, ValueError for ragged rows."""
+def as_numbers(field: str, x: Any) -> np.ndarray:
+    """Return an array in double precision.
+
+    **Raises:** TypeError for anything but numbers, ValueError for rows of different lengths.
+    """
     check_numbers(field, x)
     try:
         return np.asarray(x, dtype=float)
@@ -88,17 +170,23 @@ def numbers(field: str, x: Any) -> np.ndarray:
         raise ValueError(f"{field} has rows of different lengths; admissible is a regular array") from None
 
 
-def time_axis(time: object, lidar: Lidar) -> Float[np.ndarray, " bins"]:
-    """Sample times in double precision. **Raises:** ValueError unless they lie a sampling interval apart."""
-    t = numbers("time", time)
+def as_sample_times(time: object, lidar: Lidar) -> Float[np.ndarray, " bins"]:
+    """Return sample times in double precision.
+
+    **Raises:** ValueError unless they lie a sampling interval apart.
+    """
+    t = as_numbers("time", time)
     if t.ndim != 1 or t.size == 0 or not np.all(np.isfinite(t)):
         raise ValueError(f"time has the shape {t.shape}; admissible is (bins,), finite, one bin or more")
     interval = float(lidar.sampling_interval)
-    slack = 1e-3 * interval + 4e-7 * float(np.max(np.abs(t)))
-    if np.max(np.abs(t - t[0] - interval * np.arange(t.size))) > slack:
+    # Times may have been stored in single precision: a few units in the last place of the largest are
+    # allowed.
+    tolerance = 1e-3 * interval + 4e-7 * float(np.max(np.abs(t)))
+    if np.max(np.abs(t - t[0] - interval * np.arange(t.size))) > tolerance:
         steps = np.diff(t)
-        worst = steps[np.argmax(np.abs(steps - interval))]
+        worst_step = steps[np.argmax(np.abs(steps - interval))]
         raise ValueError(
-            f"time has a step of {worst:g} ns; admissible is the lidar's sampling_interval, {interval:g} ns"
+            f"time has a step of {worst_step:g} ns; admissible is the lidar's sampling_interval, "
+            f"{interval:g} ns"
         )
     return t

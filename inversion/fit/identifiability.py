@@ -1,5 +1,21 @@
-"""Identifiability of unknowns from waveforms: Cramer-Rao bounds and profile likelihoods."""
+r"""Identifiability of unknowns from waveforms: Cramer-Rao bounds and profile likelihoods.
 
+**Cramer-Rao bound.** For independent normal noise sigma and priors of precision P, the Fisher information at
+x is
+
+    I = J^T diag(1 / sigma^2) J + P,   J = dw / dx,
+
+and no unbiased estimate has a covariance below I^-1.
+
+**Profile likelihood.** With one unknown fixed at v, chi-squared is minimised over the others:
+
+    chi2(v) = minimum over the others of |C^-1/2 (w(v, others) - y)|^2 + |q(v, others)|^2.
+
+The confidence interval of a level is where chi2(v) minus its minimum is below the quantile of chi-squared
+with one degree of freedom (Wilks 1938, Ann. Math. Stat. 9, 60).
+"""
+
+import dataclasses
 import inspect
 import itertools
 from collections.abc import Callable, Sequence
@@ -11,26 +27,30 @@ import jax.scipy.special
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
-from inversion.fit.data import at_fixed_times, data_of, noise_of, numbers, time_axis
+from inversion.fit.data import as_noise, as_numbers, as_sample_times, with_fixed_window
 from inversion.fit.model import Model
-from inversion.fit.planning import batch_sizes, check_samples, plan_for, plan_within
-from inversion.fit.priors import Priors, known_priors
-from inversion.fit.retrieval import (
-    check_progress,
-    check_solution,
-    check_solver,
-    retrieve,
-    retrieve_with,
-    scale_of,
+from inversion.fit.planning import check_samples, checked_plan, plan_for_bounds, trace_sizes
+from inversion.fit.prior_residuals import PriorResiduals, fixed_priors
+from inversion.fit.result import Retrieval
+from inversion.fit.retrieval import check_progress, checked_problem, retrieve, solve_problem
+from inversion.fit.uncertainty import correlation_of, estimate_covariance
+from inversion.fit.unknowns import (
+    BoundUnknown,
+    Unknown,
+    bind_unknowns,
+    flat_bounds,
+    flat_labels,
+    flat_start,
+    set_values,
+    split_by_name,
 )
-from inversion.fit.solver import labels_of, named
-from inversion.fit.uncertainty import correlation_of, errors_of
-from inversion.fit.unknowns import Unknown, put, settle
-from inversion.receiver.recorder import Recorder, check_names
 from jaxlidar import Lidar, Plan, Scene, Waveform
 from jaxlidar import plan as make_plan
-from jaxlidar.extend import check_key, check_kind, check_kinds, check_range
+from jaxlidar.extend import check_key, check_kinds, check_range
 from jaxlidar.planning.plan_check import check_reach
+
+# Unknowns whose correlation exceeds this are named in the summary.
+_HIGH_CORRELATION = 0.95
 
 
 @final
@@ -40,7 +60,7 @@ class CramerRao(eqx.Module):
     Rows of the matrices are the flattened unknowns, named by `labels`, in natural units. `print(bound)` shows
     a summary, with pairs of unknowns whose correlation exceeds 0.95.
 
-    - `stderr`: by name; infinite where the waveforms do not constrain the unknown, alone or in combination
+    - `stderr`: by name; infinite for unknowns that the waveforms do not constrain, alone or in combination
       with others.
     - `covariance`: (n, n) inverse of the Fisher information, priors included; infinite variances as in
       `stderr`.
@@ -74,13 +94,12 @@ class CramerRao(eqx.Module):
             f"{label.ljust(width)}  +- {s:.3g}" if np.isfinite(s) else f"{label.ljust(width)}  not determined"
             for label, s in zip(self.labels, std)
         ]
-        close = np.abs(np.asarray(self.correlation)) > 0.95
+        correlation = np.asarray(self.correlation)
         rows += [
-            f"{self.labels[i]} and {self.labels[j]} are hard to tell apart: correlation "
-            f"{float(self.correlation[i, j]):.3f}"
+            f"{self.labels[i]} and {self.labels[j]} are hard to separate: correlation {correlation[i, j]:.3f}"
             for i in range(len(std))
             for j in range(i)
-            if close[i, j]
+            if abs(correlation[i, j]) > _HIGH_CORRELATION
         ]
         return "\n".join(rows)
 
@@ -131,39 +150,43 @@ def cramer_rao(
     """
     check_kinds(lidar, scene)
     check_key(key)
-    lidar = at_fixed_times(lidar)
-    photons, rays = batch_sizes(n_photons, n_rays, max_orders, plan)
-    settled = settle(unknowns, scene)
-    priors = known_priors(settled)
-    axis = None if time is None else time_axis(time, lidar)
-    if plan is None:
-        if axis is None:
-            plan = make_plan(lidar, scene, max_orders=max_orders, n_photons=photons, n_rays=rays)
-        else:
-            plan = plan_for(lidar, scene, settled, axis, max_orders=max_orders, photons=photons, rays=rays)
-    else:
+    lidar = with_fixed_window(lidar)
+    sizes = trace_sizes(n_photons, n_rays, max_orders, plan)
+    bound_unknowns = bind_unknowns(unknowns, scene)
+    priors = fixed_priors(bound_unknowns)
+    sample_times = None if time is None else as_sample_times(time, lidar)
+    # Derivatives are needed at the scene only: without sample times, its own plan serves.
+    if plan is not None:
         check_reach(plan, lidar, scene)
-    if axis is not None:
-        check_samples(plan, axis)
-    sigma = noise_of(noise, (lidar.wavelength.size, plan.n_samples))
+    elif sample_times is not None:
+        plan = plan_for_bounds(lidar, scene, bound_unknowns, sample_times, sizes)
+    else:
+        photons, rays, _ = sizes
+        plan = make_plan(lidar, scene, max_orders=max_orders, n_photons=photons, n_rays=rays)
+    if sample_times is not None:
+        check_samples(plan, sample_times)
+    sigma = as_noise(noise, (lidar.wavelength.size, plan.n_samples))
     if not np.all(sigma > 0):
         raise ValueError(f"noise = {np.min(sigma):g} is outside the admissible range (0, inf]")
-    start = np.concatenate([np.ravel(np.asarray(s.start, float)) for s in settled])
-    evaluation = Model(lidar, scene, plan, settled, key)(start)
+    start = flat_start(bound_unknowns)
+    # All batches: the Jacobian's noise enters the bound.
+    evaluation = Model(lidar, scene, plan, bound_unknowns, key)(start)
     jacobian = (evaluation.jacobian / sigma[..., None]).reshape(-1, start.size)
-    slope = priors(start)[1]
-    precision = slope.T @ slope
-    width = np.concatenate([np.ravel(s.high - s.low) for s in settled])
-    errors = errors_of(jacobian, precision, width, np.ones(len(jacobian)), None, priors.basis)
-    labels = labels_of(settled)
-    std = np.sqrt(np.diag(errors.covariance))
+    prior_jacobian = priors(start)[1]
+    precision = prior_jacobian.T @ prior_jacobian
+    low, high = flat_bounds(bound_unknowns)
+    # The simulation's own noise is no part of the bound.
+    measurement_fraction = np.ones(len(jacobian))
+    estimate = estimate_covariance(jacobian, precision, high - low, measurement_fraction, None, priors.basis)
+    labels = flat_labels(bound_unknowns)
+    std = np.sqrt(np.diag(estimate.covariance))
     return CramerRao(
-        stderr={k: jnp.asarray(v) for k, v in named(std, settled).items()},
-        covariance=jnp.asarray(errors.covariance),
-        correlation=jnp.asarray(correlation_of(errors.covariance)),
+        stderr={name: jnp.asarray(s) for name, s in split_by_name(std, bound_unknowns).items()},
+        covariance=jnp.asarray(estimate.covariance),
+        correlation=jnp.asarray(correlation_of(estimate.covariance)),
         information=jnp.asarray(jacobian.T @ jacobian + precision),
         labels=labels,
-        undetermined=tuple(label for label, o in zip(labels, errors.open) if o),
+        undetermined=tuple(label for label, u in zip(labels, estimate.is_undetermined) if u),
     )
 
 
@@ -174,7 +197,7 @@ class Profile(eqx.Module):
     - `values`: (points,) values of the unknown.
     - `chi2`: (points,) chi-squared, priors included, less its minimum.
     - `others`: by name, (points, ...) fitted values of the other unknowns.
-    - `converged`: (points,) whether the fit converged.
+    - `converged`: (points,) True for fits that converged.
 
     **Example:**
 
@@ -194,7 +217,7 @@ class Profile(eqx.Module):
     converged: Any
 
     def interval(self, level: float = 0.683) -> tuple[float, float]:
-        """Confidence interval of the unknown: where chi-squared is below the quantile of `level`.
+        """Confidence interval of the unknown: values whose chi-squared is below the quantile of `level`.
 
         The root of chi-squared is interpolated linearly between the values.
 
@@ -202,21 +225,23 @@ class Profile(eqx.Module):
 
         - `level`: probability, in (0, 1). Default 0.683.
 
-        **Returns:** (low, high). An end is infinite where chi-squared stays below the quantile up to the last
-        value: the waveform does not constrain the unknown to that side, as far as the values reach.
+        **Returns:** (low, high). An end is infinite if chi-squared stays below the quantile up to the last
+        value: the waveform does not constrain the unknown to that side, within the range of the values.
 
         **Raises:** ValueError for a `level` outside (0, 1).
         """
         check_range("level", level, 0.0, 1.0, low_open=True, high_open=True)
+        # Chi-squared of one degree of freedom is the square of a normal number.
         limit = float(jax.scipy.special.ndtri(0.5 * (1.0 + level)))
         root, best = np.sqrt(self.chi2), int(np.argmin(self.chi2))
 
-        def end(numbers: range) -> float:
-            for inner, outer in itertools.pairwise(numbers):
+        def end(points: range) -> float:
+            # Outwards from the minimum to the first crossing: a second minimum further out does not count.
+            for inner, outer in itertools.pairwise(points):
                 if root[outer] > limit:
-                    share = (limit - root[inner]) / (root[outer] - root[inner])
-                    return float(self.values[inner] + share * (self.values[outer] - self.values[inner]))
-            return float("inf") * (-1 if numbers.step < 0 else 1)
+                    fraction = (limit - root[inner]) / (root[outer] - root[inner])
+                    return float(self.values[inner] + fraction * (self.values[outer] - self.values[inner]))
+            return float("inf") * (-1 if points.step < 0 else 1)
 
         return end(range(best, -1, -1)), end(range(best, len(root)))
 
@@ -234,11 +259,11 @@ def profile_likelihood(
     time: ArrayLike | Sequence | None = None,
     plan: Plan | None = None,
     progress: Callable[[int], None] | None = None,
-    **more: Any,
+    **retrieve_options: Any,
 ) -> Profile:
     """Profile likelihood of one unknown: all others are fitted at each of several fixed values of it.
 
-    Where chi-squared is not a parabola of the unknown, as when two solutions compete, the standard error is
+    If chi-squared is not a parabola of the unknown, as when two solutions compete, the standard error is
     misleading; the interval of the profile is not. Fits begin at the value nearest to the unknown's start and
     proceed outwards; each starts from the result of its neighbour.
 
@@ -246,11 +271,11 @@ def profile_likelihood(
 
     - `observed`, `lidar`, `scene`, `unknowns`, `noise`, `key`, `time`, `plan`: as for `retrieve`, but with
       two unknowns or more.
-    - `name`: name of the unknown that is held fixed; it must be a single number. Its value is put into the
-      scene before the others.
+    - `name`: name of the unknown that is fixed; it must be a single number. Its value is put into the scene
+      before the others.
     - `values`: (points,) values of that unknown, two or more, increasing, within its bounds.
     - `progress`: called with the index of each value when its fit has ended.
-    - `more`: further arguments of `retrieve`, for all fits.
+    - `retrieve_options`: further arguments of `retrieve`, for all fits.
 
     **Returns:** a `Profile`.
 
@@ -271,76 +296,85 @@ def profile_likelihood(
     >>> print("{:.2f} m to {:.2f} m".format(*profile.interval()))
     0.47 m to 0.53 m
     """
-    check_kinds(lidar, scene)
-    # Names that `retrieve` does not know are found before the work.
-    given = inspect.signature(retrieve).bind(observed, lidar, scene, unknowns, noise=noise, key=key, **more)
-    given.apply_defaults()
-    own = given.arguments
-    solution = check_solution(own["solver"], own["max_steps"], own["starts"])
+    # Arguments that `retrieve` does not have are found before the work.
+    arguments = inspect.signature(retrieve).bind(
+        observed, lidar, scene, unknowns, noise=noise, key=key, **retrieve_options
+    )
+    arguments.apply_defaults()
+    options = arguments.arguments
     check_progress(progress)
     check_key(key)
-    lidar = at_fixed_times(lidar)
-    photons, rays = batch_sizes(own["n_photons"], own["n_rays"], own["max_orders"], plan)
-    settled = settle(unknowns, scene)
-    priors = known_priors(settled)
-    names = [s.name for s in settled]
-    if name not in names:
-        raise ValueError(f"name = {name!r} is none of the unknowns: {', '.join(names)}")
-    held = settled[names.index(name)]
-    if held.start.size != 1 or len(settled) == 1:
-        raise ValueError(
-            f"name = {name!r} has {held.start.size} values beside {len(settled) - 1} unknowns; admissible is "
-            "one value beside one unknown or more"
-        )
-    points = numbers("values", values)
+    sizes = trace_sizes(options["n_photons"], options["n_rays"], options["max_orders"], plan)
+    names = ("solver", "max_steps", "starts", "scale", "recorder", "noise_floor")
+    problem = checked_problem(
+        observed, lidar, scene, unknowns, noise=noise, time=time, **{n: options[n] for n in names}
+    )
+    priors = fixed_priors(problem.unknowns)
+    fixed = _fixed_unknown(name, problem.unknowns)
+    points = as_numbers("values", values)
     if points.ndim != 1 or points.size < 2 or not np.all(np.diff(points) > 0):
         raise ValueError(f"values has the shape {points.shape}; admissible are two or more, increasing")
-    check_range("values", points, float(held.low), float(held.high))
-    others = [u for u, s in zip(unknowns, settled) if s is not held]
-    recorder = own["recorder"]
-    check_solver(own["solver"], settled)
-    check_kind("recorder", recorder, Recorder | None, "a Recorder, or None")
-    check_names(recorder, settled)
-    extra = [] if own["scale"] is None else [scale_of(own["scale"], settled)]
-    data = data_of(observed, time, noise, own["noise_floor"], lidar)
-    sizes = {"max_orders": own["max_orders"], "photons": photons, "rays": rays}
-    plan = plan_within(plan, lidar, scene, settled, data.time, **sizes)
-    how = (recorder, *solution, None, own["throw"])
-    middle = int(np.argmin(np.abs(points - float(held.start))))
-    found: dict[int, Any] = {}
-    for order in (range(middle, points.size), range(middle - 1, -1, -1)):
-        # The result of the neighbour towards the middle.
-        last = found.get(middle)
-        for i in order:
-            here = put(
-                scene, (held.place,), (jnp.asarray(points[i], held.start.dtype).reshape(held.start.shape),)
-            )
-            begun = settle(others, here)
-            if last is not None:
-                begun = settle([_from(u, s, last) for u, s in zip(others, begun)], here)
-            last = retrieve_with(plan, data, lidar, here, begun, extra, key, *how)
-            found[i] = last
+    check_range("values", points, float(fixed.low), float(fixed.high))
+    plan = checked_plan(plan, problem.lidar, scene, problem.unknowns, problem.observed.time, sizes)
+    free_unknowns = [u for u, bound in zip(unknowns, problem.unknowns) if bound is not fixed]
+    middle = int(np.argmin(np.abs(points - float(fixed.start))))
+    fits: dict[int, Retrieval] = {}
+    for outwards in (range(middle, points.size), range(middle - 1, -1, -1)):
+        # Both directions start from the fit in the middle; None for the first one of all.
+        neighbour = fits.get(middle)
+        for i in outwards:
+            # First of all values: the `apply` of other unknowns may depend on it.
+            value = jnp.asarray(points[i], fixed.start.dtype).reshape(fixed.start.shape)
+            scene_at_point = set_values(scene, (fixed.setter,), (value,))
+            # Bound again: they may depend on the scene.
+            bound_unknowns = bind_unknowns(free_unknowns, scene_at_point)
+            if neighbour is not None:
+                started = [_started_from(u, b, neighbour) for u, b in zip(free_unknowns, bound_unknowns)]
+                bound_unknowns = bind_unknowns(started, scene_at_point)
+            problem_at_point = dataclasses.replace(problem, scene=scene_at_point, unknowns=bound_unknowns)
+            neighbour = solve_problem(problem_at_point, plan, key, throw=options["throw"])
+            fits[i] = neighbour
             if progress is not None:
                 progress(i)
-    fits = [found[i] for i in range(points.size)]
-    chi2 = np.array([_chi2(f, settled, priors, name, p) for f, p in zip(fits, points)])
+    # From the order in which fits ran to that of the values.
+    ordered = [fits[i] for i in range(points.size)]
+    chi2 = np.array([_chi2(f, problem.unknowns, priors, name, p) for f, p in zip(ordered, points)])
     return Profile(
         values=points,
         chi2=chi2 - chi2.min(),
-        others={k: np.stack([np.asarray(f.values[k]) for f in fits]) for k in fits[0].values},
-        converged=np.array([f.converged for f in fits]),
+        others={k: np.stack([np.asarray(f.values[k]) for f in ordered]) for k in ordered[0].values},
+        converged=np.array([f.converged for f in ordered]),
     )
 
 
-def _from(unknown: Unknown, settled: Any, fit: Any) -> Unknown:
-    value = np.clip(np.asarray(fit.values[settled.name], float), settled.low, settled.high)
-    return eqx.tree_at(
-        lambda u: u.start, unknown, jnp.asarray(value, settled.start.dtype), is_leaf=lambda x: x is None
-    )
+def _fixed_unknown(name: str, unknowns: Sequence[BoundUnknown]) -> BoundUnknown:
+    """Return the unknown of a profile. **Raises:** ValueError unless it is a single number beside others."""
+    names = [u.name for u in unknowns]
+    if name not in names:
+        raise ValueError(f"name = {name!r} is none of the unknowns: {', '.join(names)}")
+    fixed = unknowns[names.index(name)]
+    if fixed.start.size != 1 or len(unknowns) == 1:
+        raise ValueError(
+            f"name = {name!r} has {fixed.start.size} values beside {len(unknowns) - 1} unknowns; admissible "
+            "is one value beside one unknown or more"
+        )
+    return fixed
 
 
-def _chi2(fit: Any, settled: list, priors: Priors, name: str, value: float) -> float:
+def _started_from(unknown: Unknown, bound: BoundUnknown, fit: Retrieval) -> Unknown:
+    """Return the unknown with the estimate of a fit as its start."""
+    # Results in single precision may be rounded to beyond a bound.
+    value = np.clip(np.asarray(fit.values[bound.name], float), bound.low, bound.high)
+    start = jnp.asarray(value, bound.start.dtype)
+    return eqx.tree_at(lambda u: u.start, unknown, start, is_leaf=lambda x: x is None)
+
+
+def _chi2(
+    fit: Retrieval, unknowns: Sequence[BoundUnknown], priors: PriorResiduals, name: str, value: float
+) -> float:
+    """Return chi-squared of a fit with the unknown `name` fixed at `value`, the priors of all included."""
+    # Residuals are those of the data. The prior of the fixed unknown counts as well.
     flat = np.concatenate(
-        [[value] if s.name == name else np.ravel(np.asarray(fit.values[s.name], float)) for s in settled]
+        [[value] if u.name == name else np.ravel(np.asarray(fit.values[u.name], float)) for u in unknowns]
     )
     return float(np.sum(np.asarray(fit.residuals, float) ** 2) + np.sum(priors(flat)[0] ** 2))

@@ -1,15 +1,33 @@
-"""The simulated waveform and its Jacobian, with each unknown's column computed in the cheapest way.
+r"""Forward model of a fit: the simulated waveform and its Jacobian, each column in the cheapest way.
 
-Optical unknowns do not change the response: their columns are a small matrix product with the traced
-response. Unknowns that change extinction alone are scored while photons are traced (`inversion.extinction`).
-Geometric unknowns need tangents pushed through the trace, all of them in one pass that shares what does not
-depend on them, or as many as memory allows. Where all unknowns are optical, photons are traced once.
+The waveform w(x) of the unknowns x is linear in the traced response (`jaxlidar.Response`): w = optics(x)
+applied to response(x). A column dw/dx_k of the Jacobian is computed
 
-All evaluations use the same random keys, so that the waveform is a smooth function of the unknowns. An
-evaluation averages batches of photons, each with its own key; their spread is the simulation's own noise.
-Few of the batches are an evaluation as well, of more noise, for fits that are far from their end.
+- for an *optical* unknown from the derivative of the optics: a small matrix product with the response;
+- for an unknown that changes *extinction* only, from the score function of the traced paths, d log(path
+  probability) / d x_k (likelihood-ratio method, `jaxlidar.trace.score_functions`), if that is possible and
+  pays;
+- for any other, *geometric* unknown as a tangent (forward-mode derivative) pushed through the trace; all
+  tangents share one pass, or as many as memory allows.
+
+If all unknowns are optical, photons are traced once.
+
+**Scores.** They are exact and take less than half of the time of a tangent if
+
+- the response keeps scattering histories apart from optics and no leaf transmits straight on, so that one
+  trace serves all wavelengths;
+- wavelengths and columns are few, as every collision adds to all of them; off nadir, two columns or more.
+
+**Common random numbers.** All evaluations of a fit use the same random keys, so that w is a smooth function
+of x. An evaluation is the mean of batches of photons, each with its own key; their spread gives the
+simulation's own noise. The first few batches are an evaluation with more noise, for fits that are far from
+their end.
+
+**Source:** score function: Glynn (1990), Comm. ACM 33(10), 75; common random numbers and sample averages:
+Shapiro, Dentcheva and Ruszczynski (2009), Lectures on Stochastic Programming, chapter 5.
 """
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -18,11 +36,9 @@ import jax
 import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from inversion.fit.columns import columns_at_once
-from inversion.fit.extinction import scores_at, sorted_places, traced_with
-from inversion.fit.unknowns import Kind, Place, Settled, put
+from inversion.fit.unknowns import BoundUnknown, Dependence, Setter, set_values
 from jaxlidar import (
     Lidar,
     Plan,
@@ -36,105 +52,260 @@ from jaxlidar import (
     waveform_of,
 )
 from jaxlidar.extend import ONE_CORE, concrete, side_by_side
+from jaxlidar.planning.memory import format_bytes, memory_limit, scored_bytes
 from jaxlidar.planning.plan import MIN_BATCHES
+from jaxlidar.spectral.apply_optics import derivatives_to_samples, make_waveform_model, setup_optics
+from jaxlidar.trace.device_scene import build_device_scene
 from jaxlidar.trace.extinction_slopes import ExtinctionSlopes
+from jaxlidar.trace.response import trace_with_scores
+from jaxlidar.trace.score_functions import make_slopes
 
 Values = tuple[Array, ...]
-# So many batches are few: a quarter of the work of all, and their difference still tells the noise.
-FEW_BATCHES = 2
-# Rounding of coordinates, m, with which fits are still admissible.
-ROUNDING = 1e-3
+# Batches of a pilot evaluation: a quarter of the work of all, and the least that shows its own noise.
+PILOT_BATCHES = 2
+# Largest rounding of the lidar's position in a fit, m.
+MAX_ROUNDING = 1e-3
+# Most columns and wavelengths of scores: every collision adds to all of them.
+MAX_SCORED_COLUMNS, MAX_SCORED_WAVELENGTHS = 64, 16
+# With more than DENSE_COLUMNS columns, of which at most SPARSE_COLUMNS move one voxel, a voxel lists its own
+# columns: this is faster than a derivative for all columns in every voxel.
+DENSE_COLUMNS, SPARSE_COLUMNS = 8, 2
+# Points within the bounds at which the columns of each voxel are probed.
+N_PROBES = 4
 
 
-class Problem(eqx.Module):
+class JacobianMethods(NamedTuple):
+    """The method for each unknown: its setter's `dependence`, which says "geometric" if scores do not serve.
+
+    - `columns_per_voxel`: the most columns that move the extinction of one voxel; 0 without scores.
+    - `score_bytes`: memory of the scores.
+    """
+
+    setters: tuple[Setter, ...]
+    columns_per_voxel: int
+    score_bytes: float
+
+
+def choose_jacobian_methods(
+    lidar: Lidar, scene: Scene, plan: Plan, unknowns: Sequence[BoundUnknown]
+) -> JacobianMethods:
+    """Choose scores for unknowns that change extinction, if they are exact and pay, and tangents if not."""
+    setters = tuple(u.setter for u in unknowns)
+    as_tangents = tuple(
+        setter._replace(dependence="geometric") if setter.dependence == "extinction" else setter
+        for setter in setters
+    )
+    if not plan.config.keeps_histories:
+        # Optics are applied while light is traced: even optical unknowns change the trace.
+        return JacobianMethods(tuple(s._replace(dependence="geometric") for s in setters), 0, 0.0)
+    columns = sum(u.start.size for u in unknowns if u.setter.dependence == "extinction")
+    if columns == 0:
+        return JacobianMethods(setters, 0, 0.0)
+    # The setup's scene: a plan may leave the canopy out.
+    canopy, wavelengths = make_setup(lidar, scene, plan).scene.canopy, lidar.wavelength.size
+    # Off nadir the return path is marched as well, which takes as long as the tangent of one column.
+    min_columns = 1 if plan.config.vertical else 2
+    pays = min_columns <= columns <= MAX_SCORED_COLUMNS and wavelengths <= MAX_SCORED_WAVELENGTHS
+    if canopy is None or canopy.is_straight or not pays:
+        return JacobianMethods(as_tangents, 0, 0.0)
+    n_voxels = int(np.prod(canopy.voxels.shape))
+    size = scored_bytes(plan.config, plan.bins, cells=n_voxels, columns=columns, wavelengths=wavelengths)
+    if size > 0.5 * memory_limit(plan.scope.max_memory):
+        return JacobianMethods(as_tangents, 0, 0.0)
+    return JacobianMethods(setters, max_columns_per_voxel(scene, unknowns), size)
+
+
+def max_columns_per_voxel(scene: Scene, unknowns: Sequence[BoundUnknown]) -> int:
+    """Return the most columns that move the extinction of one voxel: few if that is certain, else all.
+
+    Few columns (`DENSE_COLUMNS`) are not probed. More are probed at the start and at random points between
+    the bounds of all unknowns, in the scene and with plants in every voxel: scenes that are fitted together
+    may have plants in different voxels.
+    """
+    scored = [i for i, u in enumerate(unknowns) if u.setter.dependence == "extinction"]
+    columns = sum(unknowns[i].start.size for i in scored)
+    if columns <= DENSE_COLUMNS:
+        return columns
+    setters, random = tuple(u.setter for u in unknowns), np.random.default_rng(0)
+    points = [tuple(u.start for u in unknowns)]
+    for _ in range(N_PROBES):
+        fractions = [random.uniform(size=u.start.shape) for u in unknowns]
+        between = [u.low + fraction * (u.high - u.low) for u, fraction in zip(unknowns, fractions)]
+        points.append(tuple(jnp.asarray(b, u.start.dtype) for u, b in zip(unknowns, between)))
+    plants_everywhere = eqx.tree_at(_extinction_tables, scene, replace_fn=jnp.ones_like)
+    cases = [(probed_scene, values) for probed_scene in (scene, plants_everywhere) for values in points]
+    zeros = [jnp.zeros_like(u.start) for u in unknowns]
+    count = np.zeros(())
+    for i in scored:
+        for element in range(unknowns[i].start.size):
+            direction = list(zeros)
+            direction[i] = zeros[i].reshape(-1).at[element].set(1.0).reshape(zeros[i].shape)
+            moved = [_moved_voxels(s, values, setters, tuple(direction)) for s, values in cases]
+            count = count + np.stack(moved)
+    most = int(np.max(count))
+    return most if most <= SPARSE_COLUMNS else columns
+
+
+def _extinction_tables(scene: Any) -> list[Any]:
+    """Return the extinction of leaf and bark, of those that the canopy has."""
+    voxels = scene.canopy.voxels
+    return [table for table in (voxels.leaf, voxels.bark) if table is not None]
+
+
+@eqx.filter_jit
+def _moved_voxels(
+    scene: Scene, values: Values, setters: tuple[Setter, ...], direction: Values
+) -> Bool[Array, "nx ny nz"]:
+    """Return True for voxels whose extinction changes with the values along a direction."""
+    derivatives = jax.jvp(
+        lambda values: _extinction_tables(set_values(scene, setters, values)), (values,), (direction,)
+    )[1]
+    return jnp.any(jnp.stack(derivatives) != 0, axis=0)
+
+
+def tangents_per_pass(plan: Plan, columns: int, reserved: float = 0.0) -> int:
+    """Return the number of tangents that are pushed through the trace at once: as many as memory allows.
+
+    Passes are about equally large. `reserved`: bytes that the other columns take.
+
+    **Raises:** ValueError if a single column takes more memory than the plan may.
+    """
+    fitting, limit = columns, memory_limit(plan.scope.max_memory) - reserved
+    while fitting > 1 and plan.jacobian_memory(fitting) > limit:
+        fitting -= 1
+    if columns and (size := plan.jacobian_memory(fitting)) > limit:
+        raise ValueError(
+            f"derivatives in the geometric unknowns would take about {format_bytes(size)} of memory, one at "
+            f"a time; admissible is max_memory = {limit / 1e9:.3g} GB of the plan: follow fewer orders "
+            "(max_orders=), record a shorter window, have fewer plates or materials, or give a plan with more"
+        )
+    if not columns:
+        return 0
+    # Ceiling division, twice: the number of passes, then columns per pass.
+    passes = -(-columns // fitting)
+    return -(-columns // passes)
+
+
+class ForwardModel(eqx.Module):
     """Inputs of a simulation, except the values of the unknowns.
 
-    `at_once`: geometric columns of the Jacobian that are pushed through the trace together. `most`: unknowns
-    that move the extinction of one voxel, if scored.
+    - `tangents_per_pass`: geometric columns of the Jacobian that are pushed through the trace together.
+    - `columns_per_voxel`: the most unknowns that move the extinction of one voxel; 0 without scores.
     """
 
     lidar: Lidar
     scene: Scene
     plan: Plan = eqx.field(static=True)
-    places: tuple[Place, ...] = eqx.field(static=True)
-    at_once: int = eqx.field(static=True)
-    most: int = eqx.field(static=True, default=0)
+    setters: tuple[Setter, ...] = eqx.field(static=True)
+    tangents_per_pass: int = eqx.field(static=True)
+    columns_per_voxel: int = eqx.field(static=True, default=0)
 
-    def at(self, values: Values) -> Setup:
-        """The setup with these values."""
-        return make_setup(self.lidar, put(self.scene, self.places, values), self.plan)
+    def setup(self, values: Values) -> Setup:
+        """Return the setup with these values."""
+        return make_setup(self.lidar, set_values(self.scene, self.setters, values), self.plan)
 
-    def moving(self, values: Values, kind: Kind) -> tuple[Array, Callable[[Array], Setup]]:
-        """The values of the unknowns of a kind as one vector, and the setup as its function.
+    def as_function_of(
+        self, dependence: Dependence, values: Values
+    ) -> tuple[Array, Callable[[Array], Setup]]:
+        """Return the values of the unknowns of one dependence as a vector, and the setup as its function.
 
         The other unknowns keep their values.
         """
-        numbers = [i for i, place in enumerate(self.places) if place.kind == kind]
-        flat, restore = jax.flatten_util.ravel_pytree([values[i] for i in numbers])
+        indices = [i for i, setter in enumerate(self.setters) if setter.dependence == dependence]
+        flat, restore = jax.flatten_util.ravel_pytree([values[i] for i in indices])
 
-        def setup(flat: Array) -> Setup:
-            moved = dict(zip(numbers, restore(flat)))
-            return self.at(tuple(moved.get(i, v) for i, v in enumerate(values)))
+        def setup_at(flat: Array) -> Setup:
+            changed = dict(zip(indices, restore(flat)))
+            return self.setup(tuple(changed.get(i, v) for i, v in enumerate(values)))
 
-        return flat, setup
-
-
-def _scores(problem: Problem, values: Values) -> ExtinctionSlopes | None:
-    """Scores of the unknowns that change extinction alone, which all batches share."""
-    flat, setup_at = problem.moving(values, "extinction")
-    return scores_at(setup_at, flat, problem.most)
+        return flat, setup_at
 
 
-def _batch(
-    problem: Problem, values: Values, key: PRNGKeyArray, scores: ExtinctionSlopes | None
-) -> tuple[Response, Float[Array, "wavelengths bins"], Float[Array, "columns wavelengths bins"]]:
-    """Response and total of one batch, and its derivatives in geometric unknowns, then in extinction."""
-    flat, setup_at = problem.moving(values, "geometric")
-
-    def total(flat: Array) -> tuple[Array, tuple[Response, Array | None]]:
-        setup = setup_at(flat)
-        if scores is None:
-            response, scored = trace_scene(setup, key, reverse=False), None
-        else:
-            response, scored = traced_with(setup, scores, key)
-        return total_reflectance(response, setup), (response, scored)
-
-    value, columns, (response, scored) = _pushed(total, flat, problem.at_once)
-    return response, value, columns if scored is None else jnp.concatenate([columns, scored])
-
-
-def _pushed(
-    total: Callable[[Array], tuple[Array, Any]], flat: Float[Array, "columns"], size: int
-) -> tuple[Array, Array, Any]:
-    """A function's value, its derivatives, `size` of them at once, and what it gives beside."""
+def _extinction_slopes(model: ForwardModel, values: Values) -> ExtinctionSlopes | None:
+    """Return the derivatives of extinction by the unknowns that change it only; all batches share them."""
+    flat, setup_at = model.as_function_of("extinction", values)
     if not flat.size:
-        value, beside = total(flat)
-        return value, jnp.zeros((0, *value.shape), value.dtype), beside
+        return None
+
+    def extinction(flat: Array) -> tuple[Array | None, Array | None]:
+        medium = build_device_scene(setup_at(flat), derivatives="forward").medium
+        assert medium is not None
+        return medium.leaf, medium.bark
+
+    derivatives = jax.vmap(lambda tangent: jax.jvp(extinction, (flat,), (tangent,))[1])
+    leaf, bark = derivatives(jnp.eye(flat.size, dtype=flat.dtype))
+    setup = setup_at(flat)
+    device_scene = build_device_scene(setup, derivatives="forward")
+    return make_slopes(device_scene, leaf, bark, setup_optics(setup), model.columns_per_voxel)
+
+
+def _trace_with_slopes(
+    setup: Setup, slopes: ExtinctionSlopes, key: PRNGKeyArray
+) -> tuple[Response, Float[Array, "columns wavelengths samples"]]:
+    """Trace one batch. Return its response, and the derivatives of its total by scores."""
+    device_scene = dataclasses.replace(build_device_scene(setup, derivatives="forward"), slopes=slopes)
+    response, fine_columns = trace_with_scores(device_scene, setup_optics(setup), key)
+    return response, derivatives_to_samples(fine_columns, make_waveform_model(setup))
+
+
+def _trace_batch(
+    model: ForwardModel, values: Values, key: PRNGKeyArray, slopes: ExtinctionSlopes | None
+) -> tuple[Response, Float[Array, "wavelengths bins"], Float[Array, "columns wavelengths bins"]]:
+    """Trace one batch. Return its response, total, and derivatives: geometric ones, then by extinction."""
+    flat, setup_at = model.as_function_of("geometric", values)
+    # Optical columns are left out: they are computed later from the mean response of all batches.
+
+    def simulate(flat: Array) -> tuple[Array, tuple[Response, Array | None]]:
+        setup = setup_at(flat)
+        if slopes is None:
+            response, score_columns = trace_scene(setup, key, reverse=False), None
+        else:
+            response, score_columns = _trace_with_slopes(setup, slopes, key)
+        return total_reflectance(response, setup), (response, score_columns)
+
+    total, columns, (response, score_columns) = _value_and_tangents(simulate, flat, model.tangents_per_pass)
+    if score_columns is not None:
+        columns = jnp.concatenate([columns, score_columns])
+    return response, total, columns
+
+
+def _value_and_tangents(
+    function: Callable[[Array], tuple[Array, Any]], flat: Float[Array, "columns"], per_pass: int
+) -> tuple[Array, Array, Any]:
+    """Return a function's value, its derivatives (columns, ...) and its auxiliary output.
+
+    `per_pass`: derivatives that are computed at once.
+    """
+    if not flat.size:
+        value, auxiliary = function(flat)
+        return value, jnp.zeros((0, *value.shape), value.dtype), auxiliary
     directions = jnp.eye(flat.size, dtype=flat.dtype)
-    if size == flat.size:
-        # What is beside, without its tangents is the same in all directions, hence not batched.
-        push = jax.vmap(lambda t: jax.jvp(total, (flat,), (t,), has_aux=True), out_axes=(None, 0, None))
+    if per_pass == flat.size:
+        # The auxiliary output without its tangents is the same in all directions: out_axes=None does not
+        # batch it, and the primal computation is shared.
+        push = jax.vmap(lambda t: jax.jvp(function, (flat,), (t,), has_aux=True), out_axes=(None, 0, None))
         return push(directions)
 
-    def some(directions: Array) -> Array:
-        return jax.vmap(lambda t: jax.jvp(lambda x: total(x)[0], (flat,), (t,))[1])(directions)
+    def one_pass(directions: Array) -> Array:
+        return jax.vmap(lambda t: jax.jvp(lambda x: function(x)[0], (flat,), (t,))[1])(directions)
 
-    value, beside = total(flat)
-    groups = jnp.pad(directions, ((0, -flat.size % size), (0, 0))).reshape(-1, size, flat.size)
-    columns = jax.lax.map(some, groups).reshape(-1, *value.shape)
-    return value, columns[: flat.size], beside
+    value, auxiliary = function(flat)
+    # The last pass is filled up with zero directions.
+    passes = jnp.pad(directions, ((0, -flat.size % per_pass), (0, 0))).reshape(-1, per_pass, flat.size)
+    columns = jax.lax.map(one_pass, passes).reshape(-1, *value.shape)
+    return value, columns[: flat.size], auxiliary
 
 
-_compiled_batch = eqx.filter_jit(_batch, **ONE_CORE)
-_compiled_scores = eqx.filter_jit(_scores)
+_compiled_trace_batch = eqx.filter_jit(_trace_batch, **ONE_CORE)
+_compiled_slopes = eqx.filter_jit(_extinction_slopes)
 
 
 @eqx.filter_jit
-def _colour(
-    problem: Problem, values: Values, response: Response
+def _apply_optics(
+    model: ForwardModel, values: Values, response: Response
 ) -> tuple[Float[Array, "wavelengths bins"], Float[Array, "columns wavelengths bins"]]:
-    """Total of a response, and its derivatives in the optical unknowns."""
-    flat, setup_at = problem.moving(values, "optical")
+    """Return the total of a response, and its derivatives by the optical unknowns."""
+    flat, setup_at = model.as_function_of("optical", values)
 
     def total(flat: Array) -> Array:
         return total_reflectance(response, setup_at(flat))
@@ -147,43 +318,45 @@ def _colour(
 
 
 @eqx.filter_jit
-def _recorded(problem: Problem, values: Values, response: Response, stderr: Array) -> Waveform:
-    return waveform_of(response, problem.at(values), stderr=stderr)
+def _as_waveform(model: ForwardModel, values: Values, response: Response, stderr: Array) -> Waveform:
+    return waveform_of(response, model.setup(values), stderr=stderr)
 
 
 @jax.jit
-def _mean(responses: list[Any]) -> Any:
+def _mean_response(responses: list[Any]) -> Any:
     return jax.tree.map(lambda *a: sum(a) / len(a), *responses)
 
 
-def evaluate(
-    problem: Problem, values: Values, keys: Array, count: Int[Array, ""]
+def evaluate_scene(
+    model: ForwardModel, values: Values, keys: Array, n_batches: Int[Array, ""]
 ) -> tuple[
     Float[Array, "wavelengths bins"],
     Float[Array, "columns wavelengths bins"],
     Float[Array, "batches wavelengths bins"],
 ]:
-    """Total, derivatives and batches of one scene, in one function.
+    """Return total, derivatives and batches of one scene: a pure function, to be mapped over scenes.
 
-    Columns are the geometric ones, then those in extinction, then the optical ones. The function is pure, to
-    be batched over scenes; `keys` has one random key for each batch of photons. Only the first `count`
-    batches are traced: the others are zero.
+    Columns are the geometric ones, then those by extinction, then the optical ones. `keys` has a random key
+    for each batch of photons. Only the first `n_batches` are traced; the rows of the others are zero. As
+    their number is data, one compiled program serves pilot evaluations and full ones.
     """
-    scores = _scores(problem, values)
-    batch = jax.jit(lambda key: _batch(problem, values, key, scores))
+    slopes = _extinction_slopes(model, values)
+    # Under jit the batch is traced by JAX once for shapes and loop alike.
+    trace_batch = jax.jit(lambda key: _trace_batch(model, values, key, slopes))
 
-    def add(n: Array, sums: Any) -> Any:
-        response, total, columns = batch(keys[n])
+    def add_batch(n: Array, sums: Any) -> Any:
+        response, total, columns = trace_batch(keys[n])
         summed, totals = sums
         return jax.tree.map(jnp.add, summed, (response, columns)), totals.at[n].set(total)
 
-    shapes = jax.eval_shape(batch, keys[0])
+    shapes = jax.eval_shape(trace_batch, keys[0])
     response, total, columns = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), shapes)
-    none = (response, columns), jnp.zeros((len(keys), *total.shape), total.dtype)
-    sums, totals = jax.lax.fori_loop(0, count, add, none)
-    response, columns = jax.tree.map(lambda a: a / jnp.maximum(count, 1), sums)
-    total, more = _colour(problem, values, response)
-    return total, jnp.concatenate([columns, more]), totals
+    zero = (response, columns), jnp.zeros((len(keys), *total.shape), total.dtype)
+    sums, totals = jax.lax.fori_loop(0, n_batches, add_batch, zero)
+    # At least 1: an idle member of a lockstep group traces nothing.
+    response, columns = jax.tree.map(lambda a: a / jnp.maximum(n_batches, 1), sums)
+    total, optical_columns = _apply_optics(model, values, response)
+    return total, jnp.concatenate([columns, optical_columns]), totals
 
 
 class Evaluation(NamedTuple):
@@ -191,123 +364,141 @@ class Evaluation(NamedTuple):
 
     - `total`: (wavelengths, bins) apparent reflectance, the mean of the batches.
     - `jacobian`: (wavelengths, bins, columns), columns in the order of the flattened unknowns.
-    - `response`: mean of the batches' responses, or None where many scenes are simulated together.
-    - `batches`: (batches, wavelengths, bins) the total of each, or None where it was not asked for.
-    - `few`: whether these are few of the batches. Default False: they are all.
+    - `response`: mean of the batches' responses, or None if many scenes are simulated together.
+    - `batches`: (batches, wavelengths, bins) the total of each, or None if they were not requested.
+    - `is_pilot`: True if only the first few batches were traced. Default False.
     """
 
     total: np.ndarray
     jacobian: np.ndarray
     response: Response | None
     batches: np.ndarray | None
-    few: bool = False
+    is_pilot: bool = False
 
 
-def check_place(lidar: Lidar) -> None:
-    """Refuse places that JAX's precision rounds by more than a millimetre: the fit's programs round them.
+def check_position(lidar: Lidar) -> None:
+    """Refuse positions that JAX's precision rounds by more than a millimetre.
+
+    `simulate` moves the origin before it rounds; the compiled programs of a fit take positions as they are.
 
     **Raises:** ValueError with the rounding.
     """
-    place, kind = concrete(lidar.position), jnp.result_type(float)
-    if place is None:
+    position, dtype = concrete(lidar.position), jnp.result_type(float)
+    if position is None:
         return
-    rounding = float(np.max(np.spacing(np.abs(place).astype(kind))))
-    if rounding > ROUNDING:
+    rounding = float(np.max(np.spacing(np.abs(position).astype(dtype))))
+    if rounding > MAX_ROUNDING:
         raise ValueError(
-            f"position = {place.tolist()} m is rounded by {rounding:.1g} m in {kind}; admissible for fits is "
-            f"{ROUNDING:g} m: tell the lidar and the scene from a place nearby, or enable double precision"
+            f"position = {position.tolist()} m is rounded by {rounding:.1g} m in {dtype}; admissible for "
+            f"fits is {MAX_ROUNDING:g} m: give lidar and scene relative to a nearby origin, or enable double "
+            "precision"
         )
 
 
 class Model:
     """The simulated waveform as a function of the unknowns. Photons are traced no more often than needed."""
 
-    def __init__(self, lidar: Lidar, scene: Scene, plan: Plan, settled: Sequence[Settled], key: PRNGKeyArray):
-        check_place(lidar)
-        places, most, beside = sorted_places(lidar, scene, plan, settled)
-        moving = sum(s.start.size for s, place in zip(settled, places) if place.kind == "geometric")
-        at_once = columns_at_once(plan, moving, beside)
-        self.problem = Problem(lidar, scene, plan, places, at_once, most)
-        self.shapes = [s.start.shape for s in settled]
-        self.dtypes = [s.start.dtype for s in settled]
-        self.sizes = [s.start.size for s in settled]
+    def __init__(
+        self, lidar: Lidar, scene: Scene, plan: Plan, unknowns: Sequence[BoundUnknown], key: PRNGKeyArray
+    ):
+        check_position(lidar)
+        methods = choose_jacobian_methods(lidar, scene, plan, unknowns)
+        n_geometric = sum(
+            u.start.size for u, setter in zip(unknowns, methods.setters) if setter.dependence == "geometric"
+        )
+        per_pass = tangents_per_pass(plan, n_geometric, methods.score_bytes)
+        self.forward = ForwardModel(lidar, scene, plan, methods.setters, per_pass, methods.columns_per_voxel)
+        self.shapes = [u.start.shape for u in unknowns]
+        self.dtypes = [u.start.dtype for u in unknowns]
+        self.sizes = [u.start.size for u in unknowns]
+        # Pilot batches are the first ones: a full evaluation at the same values reuses them. Without random
+        # numbers one batch is exact.
         self.keys = [jax.random.fold_in(key, n) for n in range(MIN_BATCHES if plan.is_random else 1)]
-        self.few = min(FEW_BATCHES, len(self.keys))
-        self.traces = any(p.traced for p in self.problem.places)
-        self._kept: tuple[np.ndarray, list[Any]] | None = None
-        owner = np.repeat(np.arange(len(self.sizes)), self.sizes)
-        kinds = np.array([p.kind for p in self.problem.places])[owner]
-        found = [np.flatnonzero(kinds == kind) for kind in ("geometric", "extinction", "optical")]
-        self.order = np.argsort(np.concatenate(found))
+        self.n_pilot = min(PILOT_BATCHES, len(self.keys))
+        self.retraces = any(setter.changes_response for setter in methods.setters)
+        # Values of the last call, and its traced batches.
+        self._cache: tuple[np.ndarray, list[Any]] | None = None
+        # Columns are computed by dependence; `order` sorts them as the flattened unknowns.
+        column_dependence = np.repeat([setter.dependence for setter in methods.setters], self.sizes)
+        computed = [np.flatnonzero(column_dependence == d) for d in ("geometric", "extinction", "optical")]
+        self.order = np.argsort(np.concatenate(computed))
 
     def values(self, flat: Float[np.ndarray, " columns"]) -> Values:
-        """The unknowns' values from one vector."""
-        parts = np.split(np.asarray(flat), np.cumsum(self.sizes)[:-1])
-        return tuple(jnp.asarray(p.reshape(s), d) for p, s, d in zip(parts, self.shapes, self.dtypes))
+        """Return the values of the unknowns from one vector."""
+        pieces = np.split(np.asarray(flat), np.cumsum(self.sizes)[:-1])
+        return tuple(jnp.asarray(p.reshape(s), d) for p, s, d in zip(pieces, self.shapes, self.dtypes))
 
     def scene_at(self, flat: Float[np.ndarray, " columns"]) -> Scene:
-        """The scene with these values."""
-        return put(self.problem.scene, self.problem.places, self.values(flat))
+        """Return the scene with these values."""
+        return set_values(self.forward.scene, self.forward.setters, self.values(flat))
 
     def __call__(
-        self, flat: Float[np.ndarray, " columns"], *, spread: bool = False, few: bool = False
+        self, flat: Float[np.ndarray, " columns"], *, with_batches: bool = False, pilot: bool = False
     ) -> Evaluation:
         """Simulate at the values `flat`.
 
         **Arguments:**
 
-        - `spread`: whether the batches are needed one by one. Default False.
-        - `few`: whether few of the batches will do; where none is traced again, all are given. Default False.
+        - `with_batches`: give the batches one by one. Default False: only if photons are traced anyway.
+        - `pilot`: only the first few batches are needed. Traced batches that serve again are all used.
+          Default False.
         """
         values = self.values(flat)
-        fresh = self.traces or self._kept is None
-        traced = self._trace(flat, self.few if few and self.traces else len(self.keys))
+        is_new_trace = self.retraces or self._cache is None
+        traced = self._trace(flat, self.n_pilot if pilot and self.retraces else len(self.keys))
         responses = [t[0] for t in traced]
-        response, batches = _mean(responses), None
-        total, more = _colour(self.problem, values, response)
-        columns = np.asarray(more, float)
-        if fresh:
+        # The waveform is linear in the response: optics are applied once, to the mean.
+        response, batches = _mean_response(responses), None
+        total, optical_columns = _apply_optics(self.forward, values, response)
+        columns = np.asarray(optical_columns, float)
+        # The batches of a new trace have been evaluated at these values already.
+        if is_new_trace:
             batches = np.stack([np.asarray(t[1], float) for t in traced])
-            geometric = np.mean([np.asarray(t[2], float) for t in traced], axis=0)
-            columns = np.concatenate([geometric, columns])
-        elif spread:
-            batches = np.stack([np.asarray(_colour(self.problem, values, r)[0], float) for r in responses])
+            traced_columns = np.mean([np.asarray(t[2], float) for t in traced], axis=0)
+            columns = np.concatenate([traced_columns, columns])
+        elif with_batches:
+            batches = np.stack(
+                [np.asarray(_apply_optics(self.forward, values, r)[0], float) for r in responses]
+            )
         jacobian = np.moveaxis(columns[self.order], 0, -1)
-        few = len(traced) < len(self.keys)
-        return Evaluation(np.asarray(total, float), jacobian, response, batches, few)
+        is_pilot = len(traced) < len(self.keys)
+        return Evaluation(np.asarray(total, float), jacobian, response, batches, is_pilot)
 
-    def _trace(self, flat: Float[np.ndarray, " columns"], number: int) -> list[Any]:
-        """The first batches, so many. Those of the last call are kept where they serve again."""
-        kept = []
-        if self._kept is not None and (not self.traces or np.array_equal(self._kept[0], flat)):
-            kept = self._kept[1]
+    def _trace(self, flat: Float[np.ndarray, " columns"], n_batches: int) -> list[Any]:
+        """Trace the first `n_batches`, or take those of the last call that serve again."""
+        reused = []
+        if self._cache is not None and (not self.retraces or np.array_equal(self._cache[0], flat)):
+            reused = self._cache[1]
         values = self.values(flat)
-        scores = _compiled_scores(self.problem, values) if self.problem.most else None
+        slopes = _compiled_slopes(self.forward, values) if self.forward.columns_per_voxel else None
 
-        def one(key):
-            return _compiled_batch(self.problem, values, key, scores)
+        def trace_batch(key):
+            return _compiled_trace_batch(self.forward, values, key, slopes)
 
         with side_by_side() as run:
-            traced = [*kept[:number], *run(one, self.keys[len(kept) : number])]
-        # With all of them, a fit goes on to other values.
-        again = not self.traces or number < len(self.keys)
-        self._kept = (np.array(flat), traced) if again else None
+            traced = [*reused[:n_batches], *run(trace_batch, self.keys[len(reused) : n_batches])]
+        # After a full evaluation a fit goes on to other values: responses may be large and are not kept.
+        may_serve_again = not self.retraces or n_batches < len(self.keys)
+        self._cache = (np.array(flat), traced) if may_serve_again else None
         return traced
 
     def waveform(
         self, flat: Float[np.ndarray, " columns"], evaluation: Evaluation, stderr: np.ndarray
     ) -> Waveform:
-        """The evaluation as a waveform."""
+        """Return the evaluation as a waveform."""
         assert evaluation.response is not None
         error = jnp.asarray(stderr, self.dtypes[0])
-        return _recorded(self.problem, self.values(flat), evaluation.response, error)
+        return _as_waveform(self.forward, self.values(flat), evaluation.response, error)
 
 
-def spread_of(batches: np.ndarray | None) -> np.ndarray | float:
-    """Standard error of the mean of batches, smoothed over five bins; zero where there is one batch."""
+def batch_stderr(batches: np.ndarray | None) -> np.ndarray | float:
+    """Return the standard error of the mean of batches, smoothed over five bins; zero for a single batch.
+
+    Few batches give a poor estimate in each bin, while the error varies slowly with time.
+    """
     if batches is None or len(batches) < 2:
         return 0.0
     variance = np.var(batches, axis=0, ddof=1) / len(batches)
     padded = np.pad(variance, ((0, 0), (2, 2)), mode="edge")
-    smooth = np.mean([padded[:, i : i + variance.shape[1]] for i in range(5)], axis=0)
-    return np.sqrt(smooth)
+    smoothed = np.mean([padded[:, i : i + variance.shape[1]] for i in range(5)], axis=0)
+    return np.sqrt(smoothed)

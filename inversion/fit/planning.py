@@ -1,14 +1,19 @@
-"""Plans that are valid for every scene within the bounds of the geometric unknowns."""
+"""Plans for fits: one plan that is valid for all scenes within the bounds of the unknowns.
+
+A compiled simulation has loops of fixed length and a fixed time axis. In a fit the scene moves, so that both
+have to be long enough for every scene within the bounds. The bounds' corners are examined, which suffices for
+quantities that are monotonic in each unknown, such as heights and sizes.
+"""
 
 import dataclasses
 import itertools
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from inversion.fit.unknowns import Settled, put
+from inversion.fit.unknowns import BoundUnknown, set_values
 from jaxlidar import Lidar, Plan, Scene
 from jaxlidar import plan as make_plan
 from jaxlidar.extend import check_integer, check_kind
@@ -18,76 +23,97 @@ from jaxlidar.planning.plan import MIN_BATCHES
 from jaxlidar.planning.plan_check import check_reach
 from jaxlidar.planning.size_buckets import size_bucket
 
-# With more geometric unknowns than this, not every corner of the bounds is examined.
-_ALL_CORNERS = 4
-
-
-# Of all batches together, where neither they nor a plan are given.
+# Up to this many geometric unknowns, every corner of the bounds is examined: 2^4 of them.
+_MAX_UNKNOWNS_FOR_ALL_CORNERS = 4
+# Photons and rays of all batches together, unless they or a plan are given.
 N_PHOTONS, N_RAYS = 65536, 8192
 
 
-def batch_sizes(
-    n_photons: float | None, n_rays: float | None, max_orders: int | None, plan: Plan | None
-) -> tuple[int, int]:
-    """Photons and rays of each batch of a simulation.
+class TraceSizes(NamedTuple):
+    """Size of a simulation: photons and rays of a batch, and orders of scattering (None: by the albedos)."""
 
-    **Raises:** ValueError for less than one in a batch, and for a plan together with what it would replace.
+    photons_per_batch: int
+    rays_per_batch: int
+    max_orders: int | None
+
+
+def trace_sizes(
+    n_photons: float | None, n_rays: float | None, max_orders: int | None, plan: Plan | None
+) -> TraceSizes:
+    """Return the size of a simulation from the arguments of `retrieve`.
+
+    **Raises:** ValueError for less than one photon or ray in a batch, and for a plan that is given together
+    with a size, which it has already.
     """
-    own = {"n_photons": n_photons, "n_rays": n_rays, "max_orders": max_orders}
-    given = [name for name, value in own.items() if value is not None]
-    if plan is not None and given:
+    arguments = {"n_photons": n_photons, "n_rays": n_rays, "max_orders": max_orders}
+    conflicting = [name for name, value in arguments.items() if value is not None]
+    if plan is not None and conflicting:
         raise ValueError(
-            f"plan is given together with {', '.join(given)}; admissible is either: make the plan with them"
+            f"plan is given together with {', '.join(conflicting)}; admissible is either: make the plan with "
+            "them"
         )
     photons = check_integer("n_photons", N_PHOTONS if n_photons is None else n_photons, MIN_BATCHES)
     rays = check_integer("n_rays", N_RAYS if n_rays is None else n_rays, MIN_BATCHES)
-    return photons // MIN_BATCHES, rays // MIN_BATCHES
+    return TraceSizes(photons // MIN_BATCHES, rays // MIN_BATCHES, max_orders)
 
 
-def corners(scene: Scene, settled: list[Settled]) -> list[Scene]:
-    """The scene at its start, and with the geometric unknowns at their bounds.
+def corner_scenes(scene: Scene, unknowns: list[BoundUnknown]) -> list[Scene]:
+    """Return the scene at its start, and with the geometric unknowns at their bounds.
 
-    All combinations for up to four unknowns; for more, each alone and all together. An array is at its low or
-    its high bounds as a whole.
+    All combinations for up to four unknowns; for more, each alone and all together. An array is at its lower
+    or its upper bounds as a whole.
     """
-    moving = [i for i, s in enumerate(settled) if s.place.traced]
-    if len(moving) <= _ALL_CORNERS:
-        sides = [dict(zip(moving, c)) for c in itertools.product("lh", repeat=len(moving))] if moving else []
+    moving = [i for i, u in enumerate(unknowns) if u.setter.changes_response]
+    if len(moving) <= _MAX_UNKNOWNS_FOR_ALL_CORNERS:
+        corners = (
+            [dict(zip(moving, c)) for c in itertools.product(("low", "high"), repeat=len(moving))]
+            if moving
+            else []
+        )
     else:
-        sides = [{i: c} for i in moving for c in "lh"] + [dict.fromkeys(moving, c) for c in "lh"]
+        corners = [{i: side} for i in moving for side in ("low", "high")]
+        corners += [dict.fromkeys(moving, side) for side in ("low", "high")]
+    setters = tuple(u.setter for u in unknowns)
     scenes = []
-    for side in [{}, *sides]:
+    for side_of in [{}, *corners]:
         values = [
-            s.start if i not in side else jnp.asarray(s.low if side[i] == "l" else s.high, s.start.dtype)
-            for i, s in enumerate(settled)
+            jnp.asarray(getattr(u, side_of[i]), u.start.dtype) if i in side_of else u.start
+            for i, u in enumerate(unknowns)
         ]
-        scenes.append(put(scene, tuple(s.place for s in settled), tuple(values)))
+        scenes.append(set_values(scene, setters, tuple(values)))
     return scenes
 
 
-def plan_for(
+def plan_for_bounds(
     lidar: Lidar,
     scene: Scene,
-    settled: list[Settled],
+    unknowns: list[BoundUnknown],
     time: Float[np.ndarray, " bins"],
-    *,
-    max_orders: int | None,
-    photons: int,
-    rays: int,
+    sizes: TraceSizes,
 ) -> Plan:
-    """The plan of the starting scene, with loops and time bins long enough for all `corners`.
+    """Plan the starting scene, with loops and time bins long enough for all `corner_scenes`.
 
-    Letters, orders and step lengths are those of the starting scene.
+    Scatterer channels, orders and step lengths are those of the starting scene.
 
-    **Raises:** ValueError where a corner is inadmissible, such as a canopy that reaches above the sensor.
+    1. Plan the starting scene; all plans share its orders, bin width and step length.
+    2. Plan every corner.
+    3. Take the union of the time bins, and the largest of each loop's length.
+
+    **Raises:** ValueError for an inadmissible corner, such as a canopy that reaches above the sensor.
     """
     interval = float(lidar.sampling_interval)
+    # A thousandth of a sample keeps the last one in a window whose end is rounded.
     window = (float(time[0]), float(time[0]) + (time.size - 1 + 1e-3) * interval)
-    scenes = corners(scene, settled)
-    common = {"window": window, "n_photons": photons, "n_rays": rays, "describe": False}
-    # What is zero at the start may be more elsewhere.
-    common["effects"] = dict.fromkeys(find_empty_materials(scenes[0]), True)
-    first = make_plan(lidar, scenes[0], max_orders=max_orders, **common)
+    scenes = corner_scenes(scene, unknowns)
+    common: dict[str, Any] = {
+        "window": window,
+        "n_photons": sizes.photons_per_batch,
+        "n_rays": sizes.rays_per_batch,
+        "describe": False,
+        # An effect that is zero at the start may not be at other values: none is left out.
+        "effects": dict.fromkeys(find_empty_materials(scenes[0]), True),
+    }
+    first = make_plan(lidar, scenes[0], max_orders=sizes.max_orders, **common)
     common.update(max_orders=first.orders, bin_width=first.bins.width)
     if scene.canopy is not None:
         common.update(max_step=first.limits.max_segment)
@@ -97,6 +123,7 @@ def plan_for(
             plans.append(make_plan(lidar, corner, **common))
         except ValueError as error:
             raise ValueError(f"at the bounds of the unknowns the scene is inadmissible: {error}") from error
+    # All plans share the bin width, so that the union of their bins is a whole number of bins.
     start = min(p.bins.start for p in plans)
     end = max(p.bins.start + p.bins.width * p.bins.count for p in plans)
     bins = dataclasses.replace(
@@ -107,56 +134,61 @@ def plan_for(
     )
     start_distance = max(p.limits.start_distance for p in plans)
     max_path = max(p.limits.max_path for p in plans)
-    extents = [PathLengths(lidar, s) for s in scenes]
+    path_lengths = [PathLengths(lidar, s) for s in scenes]
+    # Rays start above the scene: the distance down to it is part of the path.
     longest = max_path + start_distance
     plan = first.with_limits(
         start_distance=start_distance,
         max_path=max_path,
-        max_flight=max(e.longest_flight(longest) for e in extents),
+        max_flight=max(p.longest_flight(longest) for p in path_lengths),
     ).with_config(
         max_ray_segments=max(p.config.max_ray_segments for p in plans),
-        max_faces=size_bucket(max(e.max_faces(longest) for e in extents)),
+        # A bucket of sizes, so that fits of similar scenes share a compiled program.
+        max_faces=size_bucket(max(p.max_faces(longest) for p in path_lengths)),
         covers_fully=tuple(all(c) for c in zip(*(p.config.covers_fully for p in plans))),
     )
     return dataclasses.replace(plan, bins=bins)
 
 
-def plan_within(
+def checked_plan(
     plan: Plan | None,
     lidar: Lidar,
     scene: Scene,
-    settled: list[Settled],
+    unknowns: list[BoundUnknown],
     time: Float[np.ndarray, " bins"],
-    **sizes: Any,
+    sizes: TraceSizes,
 ) -> Plan:
-    """A plan that was given, checked for the samples and for all `corners`; or else one of `plan_for`.
+    """Check a plan for the samples and for all `corner_scenes`, or make one with `plan_for_bounds`.
 
-    A given plan may end before the light does: what comes then is not recorded.
+    A plan that is given may end before the light does: later light is not recorded.
 
-    **Raises:** ValueError where a plan would leave out light that is recorded, or a part of the scene, and as
-    `plan_for`.
+    **Raises:** ValueError for a plan that would leave out recorded light or a part of the scene, and as
+    `plan_for_bounds`.
     """
-    given = plan is not None
     if plan is None:
-        plan = plan_for(lidar, scene, settled, time, **sizes)
+        plan = plan_for_bounds(lidar, scene, unknowns, time, sizes)
+        check_samples(plan, time)
+        return plan
     check_samples(plan, time)
-    for number, corner in enumerate(corners(scene, settled) if given else ()):
+    # The first scene is the start itself.
+    for number, corner in enumerate(corner_scenes(scene, unknowns)):
         try:
             check_reach(plan, lidar, corner)
         except ValueError as error:
-            where = "at the bounds of the unknowns " if number else ""
+            position = "at the bounds of the unknowns " if number else ""
             raise ValueError(
-                f"{where}{error}, or for the largest one within the bounds; without plan= one is made here"
+                f"{position}{error}, or for the largest one within the bounds; without plan= one is made here"
             ) from error
     return plan
 
 
 def check_samples(plan: Plan, time: Float[np.ndarray, " bins"]) -> None:
-    """Check that the samples of a plan are at `time`. **Raises:** ValueError where they are not."""
+    """Check that the samples of a plan are at `time`. **Raises:** ValueError if they are not."""
     check_kind("plan", plan, Plan, "a Plan")
-    slack = 1e-3 * plan.sample_interval + 4e-7 * float(np.max(np.abs(time)))
+    # As for sample times: rounding of single precision is allowed.
+    tolerance = 1e-3 * plan.sample_interval + 4e-7 * float(np.max(np.abs(time)))
     expected = plan.sample_start + plan.sample_interval * np.arange(plan.n_samples)
-    if time.size != plan.n_samples or np.max(np.abs(expected - time)) > slack:
+    if time.size != plan.n_samples or np.max(np.abs(expected - time)) > tolerance:
         raise ValueError(
             f"time has {time.size} samples from {time[0]:g} to {time[-1]:g} ns, but the plan has "
             f"{plan.n_samples} every {plan.sample_interval:g} ns from {plan.sample_start:g} ns; "

@@ -1,12 +1,13 @@
-r"""Vertical profiles: layers of plants above the ground, and what a fit tells of their heights.
+r"""Vertical profiles: layers of plants above the ground, credible bands and averaging kernels.
 
-The credible band is that of a normal posterior about the fit, cut at the bounds. With whitened Jacobian J and
-prior precision P at the fit, the averaging kernel
+The posterior of a fit is taken as normal. With whitened Jacobian J and prior precision P at the fit, its
+covariance is H^-1, H = J^T J + P; the credible band is cut at the bounds. The averaging kernel
 
     A = d estimate / d truth = (J^T J + P)^-1 J^T J
 
-is the identity where the data tell all and zero where they tell nothing. It is that of the posterior without
-bounds.
+is the identity for unknowns that the data determine fully, and zero for those they do not constrain. It is
+that of the posterior without bounds. Its trace is the number of degrees of freedom for signal: how many
+numbers the data determine.
 
 **Source:** Rodgers (2000), Inverse Methods for Atmospheric Sounding, chapters 2 and 3; resolution as spacing
 over diagonal: Purser and Huang (1993), J. Appl. Meteorol. 32, 1211.
@@ -25,23 +26,24 @@ from jaxlidar.extend import check_kind, check_range, concrete
 
 
 def put_profile(scene: Scene, density: Float[Array, " layers"]) -> Scene:
-    """The scene with leaves in layers above its ground, the same everywhere: an `apply` for `Unknown`.
+    """Put horizontally uniform layers of leaves above the scene's ground: an `apply` for `Unknown`.
 
     Layers are as thick as the voxels are high, the first lies on the ground, and all follow its slope: each
-    column of voxels is lifted by the ground's height below its middle. Differentiable in the density and the
-    ground's height, slope and aspect, which may be unknowns listed before it. On a slope, columns should be
-    so narrow that the ground rises by about a layer or less from one to the next; level ground needs one.
+    column of voxels is raised by the height of the ground below its middle. The result is differentiable in
+    the density and in the ground's height, slope and aspect, which may be unknowns listed before it. On a
+    slope, choose columns so narrow that the ground rises by about a layer or less from one to the next; level
+    ground needs one.
 
     **Arguments:**
 
-    - `scene`: with a canopy whose voxel map has leaf and reaches from the lowest ground to the highest
-      plants. With a plane as ground, or none: then layers begin at z = 0.
+    - `scene`: with a canopy whose voxel map has leaf and extends from the lowest ground to the highest
+      plants. Its ground is a plane; without ground, layers begin at z = 0.
     - `density`: (layers,) leaf area density in m2/m3, from the lowest layer up.
 
     **Returns:** a `Scene`.
 
-    **Raises:** ValueError for a scene without leaf or with a ground that is no plane, and for plants that
-    reach out of the voxel map; of values that a JAX transformation is tracing, these are left out.
+    **Raises:** ValueError for a scene without leaf or with a ground that is no plane, and for plants outside
+    the voxel map; the latter is not checked for values that a JAX transformation is tracing.
 
     **Example:** two layers of 2 m on a slope that falls to the east.
 
@@ -68,50 +70,58 @@ def put_profile(scene: Scene, density: Float[Array, " layers"]) -> Scene:
             raise ValueError("the scene's ground is no plane; admissible are planes: see VoxelMap.above")
         east, north, up = plane.upward
         ground = plane.foot[2] - (east * (x - plane.foot[0]) + north * (y - plane.foot[1])) / up
-    # Voxel k spans the layers from t to t + 1, most of two of them.
+    # In units of layers, voxel k extends from t to t + 1 above the ground: it overlaps the layers floor(t)
+    # and floor(t) + 1, the first with the fraction 1 - (t - floor(t)).
     t = jnp.arange(nz)[None, None, :] - ((ground - origin[2]) / size[2])[..., None]
-    first = jnp.floor(t)
-    share = t - first
-    layers = jnp.pad(jnp.asarray(density), 1)
+    lower_layer = jnp.floor(t)
+    upper_fraction = t - lower_layer
+    # An empty layer on either side stands for all layers outside.
+    padded = jnp.pad(jnp.asarray(density), 1)
 
-    def at(number: Array) -> Array:
-        return layers[jnp.clip(number.astype(int) + 1, 0, layers.size - 1)]
+    def density_of(layer: Array) -> Array:
+        return padded[jnp.clip(layer.astype(int) + 1, 0, padded.size - 1)]
 
-    leaf = 0.5 * ((1.0 - share) * at(first) + share * at(first + 1.0))
-    _refuse_plants_outside(voxels, layers, ground, leaf)
+    # A voxel map stores half of the leaf area density, as `VoxelMap.from_lad` does.
+    leaf = 0.5 * (
+        (1.0 - upper_fraction) * density_of(lower_layer) + upper_fraction * density_of(lower_layer + 1.0)
+    )
+    _check_plants_inside(voxels, padded, ground, leaf)
     return eqx.tree_at(lambda s: s.canopy.voxels.leaf, scene, leaf)
 
 
-def _refuse_plants_outside(
+def _check_plants_inside(
     voxels: VoxelMap,
-    layers: Float[Array, "padded"],
+    padded: Float[Array, "padded"],
     ground: Float[Array, "nx ny"],
     leaf: Float[Array, "x y z"],
 ) -> None:
-    known = [concrete(a) for a in (layers, ground, leaf, voxels.voxel_size)]
-    if any(a is None for a in known):
+    """Refuse plants outside of the voxel map, unless JAX is tracing. **Raises:** ValueError."""
+    arrays = [concrete(a) for a in (padded, ground, leaf, voxels.voxel_size)]
+    if any(a is None for a in arrays):
         return
-    density, feet, held, size = (np.asarray(a, float) for a in known)
-    there = np.flatnonzero(density[1:-1])
-    if np.all(2.0 * held.sum(axis=-1) >= 0.999 * density.sum()) or not there.size:
+    density, ground_height, extinction, size = (np.asarray(a, float) for a in arrays)
+    planted = np.flatnonzero(density[1:-1])
+    # Twice the extinction of each column adds up to all layers, up to single precision's rounding.
+    if np.all(2.0 * extinction.sum(axis=-1) >= 0.999 * density.sum()) or not planted.size:
         return
-    low, high = feet.min() + size[2] * there[0], feet.max() + size[2] * (there[-1] + 1)
+    low = ground_height.min() + size[2] * planted[0]
+    high = ground_height.max() + size[2] * (planted[-1] + 1)
     bottom = float(voxels.origin[2])
     raise ValueError(
         f"density has plants from {low:g} m to {high:g} m, but the voxel map reaches from {bottom:g} m to "
-        f"{bottom + size[2] * held.shape[2]:g} m; admissible is a map that holds all of them"
+        f"{bottom + size[2] * extinction.shape[2]:g} m; admissible is a map that holds all of them"
     )
 
 
 class AveragingKernel(NamedTuple):
-    """How the estimate of a profile follows the truth.
+    """Response of the estimate of a profile to the true profile.
 
     - `matrix`: (..., layers, layers) derivatives of the estimated values (rows) in the true ones (columns).
-    - `degrees_of_freedom`: (...) how many numbers the data tell of the profile: the trace.
-    - `resolution`: (..., layers) height that one number from the data stands for, in the unit of the spacing:
-      spacing over diagonal; infinite where the data tell nothing.
+    - `degrees_of_freedom`: (...) number of independent numbers that the data determine: the trace.
+    - `resolution`: (..., layers) height per number that the data determine, in the unit of the spacing:
+      spacing over diagonal; infinite for layers that the data do not constrain.
 
-    **Example:** data that tell every second layer.
+    **Example:** a diagonal of one half: two layers for each number from the data.
 
     >>> import inversion, numpy as np
     >>> kernel = inversion.AveragingKernel(0.5 * np.eye(4), np.array(2.0), np.full(4, 1.5 / 0.5))
@@ -124,33 +134,8 @@ class AveragingKernel(NamedTuple):
     resolution: Float[np.ndarray, "... layers"]
 
 
-def averaging_kernel_of(fit: "AbstractFitted", name: str, spacing: float) -> AveragingKernel:
-    """The averaging kernel of an unknown of a fit, or of each of many."""
-    check_range("spacing", spacing, 0.0, low_open=True)
-    place = _place(fit, name)
-    matrix = np.asarray(fit.averaging, float)[..., place, place]
-    diagonal = np.diagonal(matrix, axis1=-2, axis2=-1)
-    told = np.where(diagonal > 0.0, diagonal, 1.0)
-    resolution = np.where(diagonal > 0.0, float(spacing) / told, np.inf)
-    return AveragingKernel(matrix, np.sum(diagonal, axis=-1), resolution)
-
-
-def band_of(fit: "AbstractFitted", name: str, level: float, robust: bool) -> tuple[Any, Any]:
-    """The credible band of an unknown of a fit, or of each of many."""
-    check_range("level", level, 0.0, 1.0, low_open=True, high_open=True)
-    check_kind("robust", robust, bool, "True or False")
-    _place(fit, name)
-    values = np.asarray(fit.values[name], float)
-    stderr = np.asarray((fit.robust_stderr if robust else fit.stderr)[name], float)
-    low, high = (np.broadcast_to(b, values.shape) for b in np.asarray(fit.bounds[name], float))
-    known = np.isfinite(stderr)
-    reach = special.ndtri(0.5 + 0.5 * level) * np.where(known, stderr, 0.0)
-    below, above = np.maximum(values - reach, low), np.minimum(values + reach, high)
-    return np.where(known, below, low), np.where(known, above, high)
-
-
-class AbstractFitted(eqx.Module):
-    """What a fit, and each of many, tells of its unknowns as profiles."""
+class AbstractPosterior(eqx.Module):
+    """Normal posterior of the unknowns of a fit, or of each of many fits."""
 
     values: eqx.AbstractVar[dict[str, Any]]
     stderr: eqx.AbstractVar[dict[str, Any]]
@@ -159,25 +144,33 @@ class AbstractFitted(eqx.Module):
     bounds: eqx.AbstractVar[dict[str, Any]]
 
     def band(self, name: str, level: float = 0.95, *, robust: bool = False) -> tuple[np.ndarray, np.ndarray]:
-        """Credible band of an unknown, within its bounds: see `inversion.profiles`.
+        """Credible band of an unknown, within its bounds: see `inversion.fit.profiles`.
 
         **Arguments:**
 
         - `name`: of the unknown.
         - `level`: probability, in (0, 1). Default 0.95.
-        - `robust`: with `robust_stderr` in place of `stderr`. Default False.
+        - `robust`: use `robust_stderr` in place of `stderr`. Default False.
 
-        **Returns:** (low, high), each of the shape of the values; the bounds, where the standard error is
-        infinite.
+        **Returns:** (low, high), each of the shape of the values; the bounds for an infinite standard error.
 
-        **Raises:** ValueError for a name that the fit has not, and a `level` outside (0, 1).
+        **Raises:** ValueError for a name that the fit does not have, and a `level` outside (0, 1).
         """
-        return band_of(self, name, level, robust)
+        check_range("level", level, 0.0, 1.0, low_open=True, high_open=True)
+        check_kind("robust", robust, bool, "True or False")
+        self._rows_of(name)
+        values = np.asarray(self.values[name], float)
+        stderr = np.asarray((self.robust_stderr if robust else self.stderr)[name], float)
+        low, high = (np.broadcast_to(b, values.shape) for b in np.asarray(self.bounds[name], float))
+        is_determined = np.isfinite(stderr)
+        half_width = special.ndtri(0.5 + 0.5 * level) * np.where(is_determined, stderr, 0.0)
+        lower, upper = np.maximum(values - half_width, low), np.minimum(values + half_width, high)
+        return np.where(is_determined, lower, low), np.where(is_determined, upper, high)
 
     def averaging_kernel(self, name: str, spacing: float = 1.0) -> AveragingKernel:
-        """How the estimate of a profile follows the truth, and its height resolution.
+        """Response of the estimate of a profile to the true profile, and its height resolution.
 
-        Other unknowns are taken as fitted along, and strengths of smoothness priors as known.
+        The other unknowns are fitted as well; strengths of smoothness priors are taken as known.
 
         **Arguments:**
 
@@ -186,19 +179,26 @@ class AbstractFitted(eqx.Module):
 
         **Returns:** an `AveragingKernel`, of NumPy arrays.
 
-        **Raises:** ValueError for a name that the fit has not, and a `spacing` that is not positive.
+        **Raises:** ValueError for a name that the fit does not have, and a `spacing` that is not positive.
         """
-        return averaging_kernel_of(self, name, spacing)
+        check_range("spacing", spacing, 0.0, low_open=True)
+        rows = self._rows_of(name)
+        matrix = np.asarray(self.averaging, float)[..., rows, rows]
+        diagonal = np.diagonal(matrix, axis1=-2, axis2=-1)
+        # The inner where keeps the division finite.
+        positive = np.where(diagonal > 0.0, diagonal, 1.0)
+        resolution = np.where(diagonal > 0.0, float(spacing) / positive, np.inf)
+        return AveragingKernel(matrix, np.sum(diagonal, axis=-1), resolution)
 
-
-def _place(fit: Any, name: str) -> slice:
-    """Where an unknown is among all. **Raises:** ValueError for a name that the fit has not."""
-    if name not in fit.values:
-        raise ValueError(f"name = {name!r}; admissible are {', '.join(map(repr, fit.values))}")
-    begin = 0
-    for other, bounds in fit.bounds.items():
-        size = int(np.size(bounds)) // 2
-        if other == name:
-            return slice(begin, begin + size)
-        begin += size
-    raise AssertionError(name)
+    def _rows_of(self, name: str) -> slice:
+        """Return the rows of an unknown among the flattened ones. **Raises:** ValueError for another name."""
+        if name not in self.values:
+            raise ValueError(f"name = {name!r}; admissible are {', '.join(map(repr, self.values))}")
+        first = 0
+        for other_name, bounds in self.bounds.items():
+            # Bounds have the shape (2, ...).
+            size = int(np.size(bounds)) // 2
+            if other_name == name:
+                return slice(first, first + size)
+            first += size
+        raise AssertionError(name)

@@ -1,19 +1,18 @@
-"""Whether a fit of a recorded waveform can be trusted: "good", "doubtful" or "bad", with reasons.
+"""Verdicts on fits of recorded waveforms: "good", "doubtful" or "bad", with reasons.
 
-A verdict is the worst of a small set of named checks; each gives a reason where it finds something. Those
-of a fit (`judge_fit`, `judge_fits`), with n the number of independent samples that the correlated ones
-amount to:
+A verdict is the worst of a small set of named checks; each check that fails gives a reason. The checks of a
+fit (`judge_fit`, `judge_fits`), with n the effective number of independent samples:
 
 | check | doubtful | bad |
 | --- | --- | --- |
-| end | | not converged |
+| convergence | | not converged |
 | misfit | reduced chi-squared above 3, or 1 + 4 sqrt(2 / n) if more | above 10, or 1 + 12 sqrt(2 / n) |
 | undetermined | an unknown has an infinite standard error | |
-| bound | an unknown lies at a bound, unless its prior is one of smoothness | |
-| prior | the prior has more than half of the information on an unknown, the same | |
-| second minimum | another end within 4 in chi-squared, counted as independent samples | |
+| bound | an unknown without a smoothness prior lies at a bound | |
+| prior | more than half of the information on an unknown without a smoothness prior is the prior's | |
+| second minimum | another minimum within 4 in chi-squared, counted as independent samples | |
 
-and those of a record before any fit (`judge_record`), with the noise's standard deviation s:
+The checks of a record before any fit (`judge_record`), with s the standard deviation of the noise:
 
 | check | doubtful | bad |
 | --- | --- | --- |
@@ -24,40 +23,37 @@ and those of a record before any fit (`judge_record`), with the noise's standard
 | uneven noise | that of the last quiet samples over that of the first is above 1.7 or below 1 / 1.7 | |
 | flags | the product's flag `degrade` is set | its flag `stale_return` is set |
 
-The thresholds are those that hold for any instrument; the checks of a record are for one that is sampled
-several times within its pulse.
+The thresholds hold for any instrument; the checks of a record need several samples within the pulse.
 """
 
-from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import ArrayLike, Float
 
 from jaxlidar.extend import check_range
 
-if TYPE_CHECKING:
-    from inversion.fit.batch import Retrievals
-    from inversion.fit.result import Retrieval
-
-_ORDER = ("good", "doubtful", "bad")
-_GOOD, _DOUBTFUL, _BAD = _ORDER
-# See the table.
-_CHI2, _CHI2_SIGMAS = (3.0, 10.0), (4.0, 12.0)
-_PRIOR, _SECOND = 0.5, 4.0
-_SIGNAL, _FLAT, _DEAD, _UNEVEN = (10.0, 6.0), 3, 6.0, 1.7
-_CUT, _CUT_SHARES = 4.0, (0.01, 0.1)
-# Samples at each end of a record; fewest and most of either end that show its noise.
-_END, _QUIET = 3, (100, 200)
-# What the pulse departs by from cubics is taken so many times, for echoes that are narrower.
-_NARROWER = 1.5
+_QUALITIES = ("good", "doubtful", "bad")
+_GOOD, _DOUBTFUL, _BAD = _QUALITIES
+# Thresholds of a fit: see the table. Reduced chi-squared, doubtful and bad, and its standard deviations for
+# few samples.
+_CHI2_LIMITS, _CHI2_SIGMAS = (3.0, 10.0), (4.0, 12.0)
+_MAX_PRIOR_FRACTION, _MIN_SECOND_MINIMUM = 0.5, 4.0
+# Thresholds of a record: see the table.
+_SIGNAL_TO_NOISE, _CLIPPED_SAMPLES, _DEAD_SIGMAS, _UNEVEN_RATIO = (10.0, 6.0), 3, 6.0, 1.7
+_CUT_OFF_SIGMAS, _CUT_OFF_FRACTIONS = 4.0, (0.01, 0.1)
+# Samples at each end of a record; fewest and most quiet samples of either end that show its noise.
+_END_SAMPLES, _QUIET_SAMPLES = 3, (100, 200)
+# Echoes may be narrower than the transmitted pulse, and depart from cubics by so much more.
+_NARROWER_ECHO_FACTOR = 1.5
 
 
 class Verdict(NamedTuple):
-    """How far a fit can be trusted.
+    """Trustworthiness of a fit.
 
     - `quality`: "good", "doubtful" or "bad".
-    - `reasons`: a sentence for each check that found something, the gravest first; empty where it is good.
+    - `reasons`: a sentence for each check that failed, the gravest first; empty for a good fit.
 
     **Example:**
 
@@ -70,32 +66,56 @@ class Verdict(NamedTuple):
     quality: str
     reasons: tuple[str, ...]
 
-    def __and__(self, other: "Verdict") -> "Verdict":
-        """The worse of two, with the reasons of both."""
-        first, second = sorted((self, other), key=lambda v: -_ORDER.index(v.quality))
-        return Verdict(first.quality, (*first.reasons, *second.reasons))
+    def __and__(self, verdict: "Verdict") -> "Verdict":
+        """Return the worse of two, with the reasons of both."""
+        worse, better = sorted((self, verdict), key=lambda v: -_QUALITIES.index(v.quality))
+        return Verdict(worse.quality, (*worse.reasons, *better.reasons))
 
 
-def _worst(found: Iterable[tuple[str, str]]) -> Verdict:
-    """The verdict of what checks found: pairs of a quality and a reason."""
-    ordered = sorted(found, key=lambda pair: -_ORDER.index(pair[0]))
+@runtime_checkable
+class JudgedFit(Protocol):
+    """The quantities of a fit (`Retrieval`), or of many (`Retrievals`), on which a verdict depends."""
+
+    @property
+    def values(self) -> Mapping[str, Any]: ...
+    @property
+    def stderr(self) -> Mapping[str, Any]: ...
+    @property
+    def at_bound(self) -> Mapping[str, Any]: ...
+    @property
+    def prior_share(self) -> Mapping[str, Any]: ...
+    @property
+    def strength(self) -> Mapping[str, Any]: ...
+    @property
+    def converged(self) -> Any: ...
+    @property
+    def reduced_chi2(self) -> Any: ...
+    @property
+    def independent_samples(self) -> Any: ...
+    @property
+    def second_minimum(self) -> Any: ...
+
+
+def _worst_of(failures: Iterable[tuple[str, str]]) -> Verdict:
+    """Return the verdict of failed checks: pairs of a quality and a reason."""
+    ordered = sorted(failures, key=lambda failure: -_QUALITIES.index(failure[0]))
     return Verdict(ordered[0][0] if ordered else _GOOD, tuple(reason for _, reason in ordered))
 
 
-def judge_fit(fit: "Retrieval", *, about: Sequence[str] | None = None) -> Verdict:
-    """Whether a fit can be trusted: the first table of `inversion.quality`.
+def judge_fit(fit: JudgedFit, *, about: Sequence[str] | None = None) -> Verdict:
+    """Judge whether a fit can be trusted, by the first table of `inversion.fit.quality`.
 
     **Arguments:**
 
-    - `fit`: what `retrieve` gave.
-    - `about`: names of the unknowns that the verdict is about: of others, bounds and priors do not matter.
+    - `fit`: a `Retrieval`, the result of `retrieve`.
+    - `about`: names of the unknowns that the verdict is about; bounds and priors of others are ignored.
       Default None: all.
 
     **Returns:** a `Verdict`.
 
-    **Raises:** ValueError for a name that the fit has not.
+    **Raises:** ValueError for a name that the fit does not have.
 
-    **Example:** a plate that is not there is fitted to an echo of the ground.
+    **Example:** the ground lies above the bounds of its height.
 
     >>> import jaxlidar as jl
     >>> import inversion, jax
@@ -106,17 +126,18 @@ def judge_fit(fit: "Retrieval", *, about: Sequence[str] | None = None) -> Verdic
     >>> inversion.judge_fit(fit).quality
     'bad'
     """
+    # The index () leaves the quantities of a single fit as they are.
     return _judge(fit, about, ())
 
 
-def judge_fits(fits: "Retrievals", *, about: Sequence[str] | None = None) -> tuple[Verdict, ...]:
-    """Whether each fit of many can be trusted: see `judge_fit`.
+def judge_fits(fits: Any, *, about: Sequence[str] | None = None) -> tuple[Verdict, ...]:
+    """Judge whether each of many fits can be trusted: see `judge_fit`.
 
-    **Arguments:** `fits`: what `retrieve_many` gave. `about`: as for `judge_fit`.
+    **Arguments:** `fits`: a `Retrievals`, the result of `retrieve_many`. `about`: as for `judge_fit`.
 
     **Returns:** a `Verdict` for each footprint.
 
-    **Raises:** ValueError for a name that the fits have not.
+    **Raises:** ValueError for a name that the fits do not have.
 
     **Example:**
 
@@ -133,38 +154,44 @@ def judge_fits(fits: "Retrievals", *, about: Sequence[str] | None = None) -> tup
     return tuple(_judge(fits, about, i) for i in range(len(fits.status)))
 
 
-def _judge(fit: Any, about: Sequence[str] | None, at: Any) -> Verdict:
-    """The verdict of a fit, or of one of many at a place."""
+def _judge(fit: JudgedFit, about: Sequence[str] | None, index: Any) -> Verdict:
+    """Judge a fit (index ()), or one of many by its index."""
 
-    def of(name: str) -> Any:
-        return np.asarray(getattr(fit, name))[at]
+    def scalar(x: Any) -> float:
+        return float(np.asarray(x)[index])
 
     names = list(fit.values) if about is None else list(about)
     for name in names:
         if name not in fit.values:
             raise ValueError(f"about has {name!r}; admissible are {', '.join(map(repr, fit.values))}")
 
-    def those(field: str, wrong: Any, but: Iterable[str] = ()) -> str:
-        found = getattr(fit, field)
-        return ", ".join(n for n in names if n not in but and np.any(wrong(np.asarray(found[n])[at])))
+    def failing(quantity: Mapping[str, Any], fails: Callable[[Any], Any], exempt: Iterable[str] = ()) -> str:
+        """Return the names of the unknowns with any failing value."""
+        return ", ".join(
+            n for n in names if n not in exempt and np.any(fails(np.asarray(quantity[n])[index]))
+        )
 
-    found = []
-    if not of("converged"):
-        found.append((_BAD, "not converged"))
-    chi2, samples = float(of("reduced_chi2")), max(float(of("independent_samples")), 1.0)
-    limits = [max(c, 1.0 + k * np.sqrt(2.0 / samples)) for c, k in zip(_CHI2, _CHI2_SIGMAS)]
-    # What is not finite is bad.
+    failures = []
+    if not scalar(fit.converged):
+        failures.append((_BAD, "not converged"))
+    chi2, n_samples = scalar(fit.reduced_chi2), max(scalar(fit.independent_samples), 1.0)
+    # The standard deviation of reduced chi-squared is sqrt(2 / n).
+    limits = [max(c, 1.0 + k * np.sqrt(2.0 / n_samples)) for c, k in zip(_CHI2_LIMITS, _CHI2_SIGMAS)]
+    # Written so that NaN fails.
     if not chi2 <= limits[0]:
-        found.append((_DOUBTFUL if chi2 <= limits[1] else _BAD, f"misfit: reduced chi-squared {chi2:.3g}"))
-    if open := those("stderr", np.isinf):
-        found.append((_DOUBTFUL, f"undetermined: {open}"))
-    if bound := those("at_bound", np.asarray, but=fit.strength):
-        found.append((_DOUBTFUL, f"at a bound: {bound}"))
-    if prior := those("prior_share", lambda share: share > _PRIOR, but=fit.strength):
-        found.append((_DOUBTFUL, f"from the prior: {prior}"))
-    if (rise := float(of("second_minimum"))) < _SECOND:
-        found.append((_DOUBTFUL, f"second minimum: {rise:.2g} above in chi-squared"))
-    return _worst(found)
+        quality = _DOUBTFUL if chi2 <= limits[1] else _BAD
+        failures.append((quality, f"misfit: reduced chi-squared {chi2:.3g}"))
+    if undetermined := failing(fit.stderr, np.isinf):
+        failures.append((_DOUBTFUL, f"undetermined: {undetermined}"))
+    # Layers without plants lie at their bound, and smoothness priors fill in layers: both are as intended.
+    if at_bound := failing(fit.at_bound, np.asarray, exempt=fit.strength):
+        failures.append((_DOUBTFUL, f"at a bound: {at_bound}"))
+    from_prior = failing(fit.prior_share, lambda f: f > _MAX_PRIOR_FRACTION, exempt=fit.strength)
+    if from_prior:
+        failures.append((_DOUBTFUL, f"from the prior: {from_prior}"))
+    if (rise := scalar(fit.second_minimum)) < _MIN_SECOND_MINIMUM:
+        failures.append((_DOUBTFUL, f"second minimum: {rise:.2g} above in chi-squared"))
+    return _worst_of(failures)
 
 
 def judge_record(
@@ -175,15 +202,15 @@ def judge_record(
     degrade: int | None = None,
     stale_return: int | None = None,
 ) -> Verdict:
-    """Whether a record can be fitted: the second table of `inversion.quality`.
+    """Judge whether a record can be fitted, by the second table of `inversion.fit.quality`.
 
     **Arguments:**
 
     - `signal`: (bins,) record, background removed.
     - `noise`: standard deviation of a sample, above 0.
     - `pulse`: (lags,) the transmitted pulse at the record's sampling. Default None: dead samples are not
-      looked for, as they cannot be told from narrow echoes.
-    - `degrade`, `stale_return`: GEDI's flags, as `jaxlidar.io.GediShot` has them. Default None: not known.
+      checked, as they cannot be distinguished from narrow echoes.
+    - `degrade`, `stale_return`: GEDI's flags, as `jaxlidar.io.GediShot` has them. Default None: unknown.
 
     **Returns:** a `Verdict`.
 
@@ -202,43 +229,43 @@ def judge_record(
     if y.ndim != 1 or y.size < 5:
         raise ValueError(f"signal has the shape {y.shape}; admissible is (bins,), five or more")
     check_range("signal", y)
-    peak, found = float(y.max()), []
-    if peak < _SIGNAL[0] * noise:
-        quality = _DOUBTFUL if peak >= _SIGNAL[1] * noise else _BAD
-        found.append((quality, f"weak: the largest sample is {peak / noise:.1f} times the noise"))
-    if (flat := _longest(y == peak)) >= _FLAT:
-        found.append((_DOUBTFUL, f"clipped: {flat} samples in a row at the largest value"))
-    for which, end in (("first", y[:_END]), ("last", y[-_END:])):
-        reached = float(end.mean())
-        if reached > max(_CUT * noise, _CUT_SHARES[0] * peak):
-            quality = _DOUBTFUL if reached <= _CUT_SHARES[1] * peak else _BAD
-            found.append((quality, f"cut off: the signal reaches the {which} samples"))
+    peak, failures = float(y.max()), []
+    if peak < _SIGNAL_TO_NOISE[0] * noise:
+        quality = _DOUBTFUL if peak >= _SIGNAL_TO_NOISE[1] * noise else _BAD
+        failures.append((quality, f"weak: the largest sample is {peak / noise:.1f} times the noise"))
+    if (flat := _longest_run(y == peak)) >= _CLIPPED_SAMPLES:
+        failures.append((_DOUBTFUL, f"clipped: {flat} samples in a row at the largest value"))
+    for end, samples in (("first", y[:_END_SAMPLES]), ("last", y[-_END_SAMPLES:])):
+        mean = float(samples.mean())
+        if mean > max(_CUT_OFF_SIGMAS * noise, _CUT_OFF_FRACTIONS[0] * peak):
+            quality = _DOUBTFUL if mean <= _CUT_OFF_FRACTIONS[1] * peak else _BAD
+            failures.append((quality, f"cut off: the signal reaches the {end} samples"))
     if pulse is not None:
         shape = np.asarray(pulse, float)
-        own = np.max(np.abs(_off_cubic(shape)), initial=0.0) / np.max(shape)
-        limit = _DEAD * noise + _NARROWER * own * peak
-        if (dead := int(np.sum(np.abs(_off_cubic(y)) > limit))) > 0:
-            found.append((_DOUBTFUL, f"dead samples: {dead} do not fit their neighbours"))
-    lit = np.flatnonzero(y > _CUT * noise)
+        departure = np.max(np.abs(_departure_from_cubic(shape)), initial=0.0) / np.max(shape)
+        limit = _DEAD_SIGMAS * noise + _NARROWER_ECHO_FACTOR * departure * peak
+        if (dead := int(np.sum(np.abs(_departure_from_cubic(y)) > limit))) > 0:
+            failures.append((_DOUBTFUL, f"dead samples: {dead} do not fit their neighbours"))
+    lit = np.flatnonzero(y > _CUT_OFF_SIGMAS * noise)
     if lit.size:
         before, after = y[: lit[0]], y[lit[-1] + 1 :]
-        if min(before.size, after.size) >= _QUIET[0]:
-            ratio = np.std(after[-_QUIET[1] :]) / max(np.std(before[: _QUIET[1]]), 1e-30)
-            if max(ratio, 1.0 / max(ratio, 1e-30)) > _UNEVEN:
-                found.append((_DOUBTFUL, f"uneven noise: {ratio:.2g} times as much at the end"))
+        if min(before.size, after.size) >= _QUIET_SAMPLES[0]:
+            ratio = np.std(after[-_QUIET_SAMPLES[1] :]) / max(np.std(before[: _QUIET_SAMPLES[1]]), 1e-30)
+            if max(ratio, 1.0 / max(ratio, 1e-30)) > _UNEVEN_RATIO:
+                failures.append((_DOUBTFUL, f"uneven noise: {ratio:.2g} times as much at the end"))
     if degrade:
-        found.append((_DOUBTFUL, f"flag: degrade = {degrade}"))
+        failures.append((_DOUBTFUL, f"flag: degrade = {degrade}"))
     if stale_return:
-        found.append((_BAD, f"flag: stale_return = {stale_return}"))
-    return _worst(found)
+        failures.append((_BAD, f"flag: stale_return = {stale_return}"))
+    return _worst_of(failures)
 
 
-def _longest(which: np.ndarray) -> int:
-    """Length of the longest run of what is true."""
-    ends = np.flatnonzero(np.diff(np.r_[False, which, False]))
-    return int(np.max(ends[1::2] - ends[::2], initial=0))
+def _longest_run(condition: np.ndarray) -> int:
+    """Return the length of the longest run of True."""
+    edges = np.flatnonzero(np.diff(np.r_[False, condition, False]))
+    return int(np.max(edges[1::2] - edges[::2], initial=0))
 
 
-def _off_cubic(y: np.ndarray) -> np.ndarray:
-    """Samples less the cubic through the two neighbours on each side; those at the ends have none."""
+def _departure_from_cubic(y: np.ndarray) -> np.ndarray:
+    """Return samples less the cubic through two neighbours on each side, for all but two at each end."""
     return y[2:-2] - (4.0 * (y[1:-3] + y[3:-1]) - y[:-4] - y[4:]) / 6.0

@@ -1,411 +1,681 @@
-"""Nonlinear least squares with a stochastic simulation.
+r"""Nonlinear least squares with a stochastic simulation.
 
-The residuals are whitened, (simulated - observed) / sigma, where sigma holds the noise of the measurement and
-of the simulation; a prior adds one residual per value. With fixed random numbers the simulation is smooth
-except for small jumps, and its derivatives are unbiased estimates of the derivatives of its expectation. Near
-the minimum the two disagree by a fraction of a standard error and no step improves the fit: it ends there.
+**Objective.** With w(x) the simulated waveform as recorded, y the observed one, C the covariance of their
+difference, and the priors as residuals q(x) (`inversion.fit.prior_residuals`),
 
-Simulations come in batches of photons. Where photons are traced at every step, a fit descends with few of the
-batches as far as they can tell, and goes on from there with all. What it ends with, and all that is said of
-it, comes from all batches.
+    minimise over x within bounds   |C^-1/2 (w(x) - y)|^2 + |q(x)|^2.
 
-A fit is a generator: it yields the values at which it needs a simulation, and is sent the result. The same
-code serves one fit and many at once.
+C holds the noise of the measurement, of the simulation and of a recorded pulse. The simulation's and the
+pulse's depend on x; they are taken at the start, renewed when all batches are first used, and again at the
+solution.
+
+**Stochastic part.** With common random numbers (the same photons at all x), w is smooth in x except for small
+jumps, and its Jacobian is an unbiased estimate of the derivative of its expectation (a sample average
+approximation). Near the minimum the sampled waveform and the sampled Jacobian disagree by a fraction of a
+standard error, and no step improves the fit: it ends there. The simulation's noise lowers the weight of the
+samples that it affects and is part of the covariance (`inversion.fit.uncertainty`).
+
+A simulation is the mean of batches of photons. Far from the solution the first few batches, a *pilot*
+evaluation, are accurate enough. The fit descends with them until a step is below one standard error and goes
+on with all batches. Estimates, covariances and chi-squared come from all batches (variable sample size:
+Pasupathy 2010, Oper. Res. 58, 889).
+
+**Steps.** Without smoothness priors, a Gauss-Newton method of optimistix (Levenberg-Marquardt by default)
+takes steps in the free parameters z of the bounded unknowns (`bounded_logistic`), with the Jacobian J dx/dz.
+With smoothness priors, layers without plants lie at their lower bound, many at a time, and come off it as
+others change. In z each of them would run away for many steps. Every step then solves the linearised problem
+within the bounds in natural units (bounded-variable least squares; Stark and Parker 1995, Comput. Stat. 10,
+129) and is cut to a quarter until it improves the fit.
+
+**Stopping rule.** A fit has converged when a Gauss-Newton step would lower chi-squared by less than 0.05^2
+(the Newton decrement, a length in standard errors, is below 0.05), or below a larger limit after rejected
+steps: see `_STALL_LIMITS`.
+
+**Fits as generators.** A fit yields the values at which it needs a simulation and is sent the evaluation. The
+same code serves a single fit and many fits whose simulations run in one compiled call.
 """
 
+import dataclasses
 from collections.abc import Callable, Generator, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array
+from jaxtyping import Array, Float, PRNGKeyArray
+from scipy import linalg, optimize
 
-from inversion.fit.data import Data
-from inversion.fit.descent import descend_within
-from inversion.fit.misfit import misfit_of
-from inversion.fit.model import Evaluation, spread_of
-from inversion.fit.noise import Noise, blocks, correlation_between
-from inversion.fit.priors import Priors, inside, outside
-from inversion.fit.result import Step
-from inversion.fit.uncertainty import Errors, correlation_of, decrement, errors_of
-from inversion.fit.unknowns import Settled
-from inversion.receiver.recorder import RecorderModel
+from inversion.fit.data import (
+    ObservedWaveform,
+    SampleNoise,
+    neighbour_correlation,
+    shared_errors_of_samples,
+)
+from inversion.fit.fit_record import CompletedFit, FitDetails, FitRecord, Step
+from inversion.fit.model import Evaluation, batch_stderr
+from inversion.fit.prior_residuals import PriorResiduals
+from inversion.fit.recorder_model import RecorderModel
+from inversion.fit.uncertainty import (
+    EstimateCovariance,
+    SampleIndex,
+    estimate_covariance,
+    newton_decrement,
+    residual_covariance,
+)
+from inversion.fit.unknowns import (
+    MARGIN,
+    BoundUnknown,
+    bounded_logistic,
+    bounded_logit,
+    flat_bounds,
+    flat_labels,
+    flat_start,
+    split_by_name,
+)
 
-# A fit has converged when a Gauss-Newton step would move it by less than this many standard errors.
+# A fit has converged if a Gauss-Newton step would move it by less than this many standard errors.
 _SMALL_STEP = 0.05
-# It has also converged after (so many rejected steps, if the step is below so many standard errors).
-_STALLED = ((1, 0.3), (3, 0.6), (8, 1.0))
-# The same with few batches, which tell no more: it goes on with all of them.
-_SMALL_STEP_OF_FEW, _STALLED_OF_FEW = 1.0, ((1, 2.0), (3, 5.0))
-# Largest change of a free parameter in one step: far out the bijection is flat, and a fit would be stuck.
-_LONGEST_STEP = 2.0
-# At the solution the weights are renewed if those of the start differ by more than this, in the mean.
-_WRONG_WEIGHTS = 0.05
-# An unknown closer to a bound than this share of the bounds' width is reported as at the bound.
+# It has also converged after (number of rejected steps, if the step is below this many standard errors).
+_STALL_LIMITS = ((1, 0.3), (3, 0.6), (8, 1.0))
+# The same for pilot evaluations, whose noise hides smaller steps; the fit then goes on with all batches.
+_PILOT_SMALL_STEP, _PILOT_STALL_LIMITS = 1.0, ((1, 2.0), (3, 5.0))
+# Largest change of a free parameter in one step: far out the logistic function is flat, and a fit would be
+# stuck.
+_MAX_FREE_STEP = 2.0
+# At the solution the weights are renewed if they differ from those of the start by more than this, in the
+# mean.
+_MAX_WEIGHT_CHANGE = 0.05
+# An unknown closer to a bound than this fraction of the bounds' width is reported as at the bound.
 _AT_BOUND = 1e-3
-# Strengths of smoothness priors stay once none changes by more than this share; so many are tried.
-_SAME_STRENGTH, _MOST_STRENGTHS = 0.1, 12
+# Strengths of smoothness priors are final once none changes by more than this fraction; most updates of them.
+_STRENGTH_TOLERANCE, _MAX_STRENGTH_UPDATES = 0.1, 12
+# Values in the bounded Gauss-Newton method keep off their bounds by this fraction of the bounds' width, where
+# the logit is finite.
+_BOUND_MARGIN = 1e-5
+# Factor of a step that does not improve the fit.
+_STEP_CUT = 0.25
+# Added to the diagonal of the information, as a fraction of its trace: undetermined unknowns stay where they
+# are.
+_RIDGE = 1e-13
+# Residual of a simulation that is not finite: so large that any solver rejects the step.
+_REJECTED_RESIDUAL = 1e8
+
+DEFAULT_SOLVER = optx.LevenbergMarquardt(rtol=1e-3, atol=1e-3)
 
 
-def _linear(y: Array, args: tuple[Array, Array, Array]) -> tuple[Array, None]:
-    """Linear model of the residuals about `at`, which is all that a Gauss-Newton step needs."""
-    at, residual, jacobian = args
-    return residual + jacobian @ (y - at), None
+@dataclasses.dataclass(frozen=True)
+class SolverSettings:
+    """Gauss-Newton method of optimistix, most simulations from each start, and number of starts."""
+
+    solver: optx.AbstractLeastSquaresSolver
+    max_steps: int
+    starts: int
 
 
-@eqx.filter_jit
-def _begin(solver: Any, y: Array, args: Any) -> Any:
-    struct = eqx.filter_eval_shape(lambda: _linear(y, args)[0])
-    return solver.init(_linear, y, args, {}, struct, None, frozenset())
+class EvaluationRequest(NamedTuple):
+    """Values of the scene's unknowns at which a fit needs a simulation.
 
-
-@eqx.filter_jit
-def _advance(solver: Any, y: Array, args: Any, state: Any) -> Any:
-    y, state, _ = solver.step(_linear, y, args, {}, state, frozenset())
-    done, result = solver.terminate(_linear, y, args, {}, state, frozenset())
-    return y, state, done, result == optx.RESULTS.successful
-
-
-class Request(NamedTuple):
-    """Values at which a fit needs a simulation.
-
-    - `spread`: whether it needs the batches one by one.
-    - `few`: whether few of the batches will do.
+    - `with_batches`: True if it needs the batches one by one.
+    - `pilot`: True if the first few batches suffice.
     """
 
     values: np.ndarray
-    spread: bool
-    few: bool
+    with_batches: bool
+    pilot: bool
 
 
-class Outcome(NamedTuple):
-    """Result of a fit. Vectors are the flattened unknowns in natural units; see `Retrieval`.
-
-    - `cost`: chi-squared with the measurement's noise only, plus that of the priors (-2 ln of their density).
-    - `strength`: of the smoothness priors.
-    - `simulation`: (wavelengths, bins) one standard error of the simulated waveform.
-    """
-
-    values: np.ndarray
-    stderr: np.ndarray
-    simulation_error: np.ndarray
-    covariance: np.ndarray
-    correlation: np.ndarray
-    residuals: np.ndarray
-    reduced_chi2: float
-    cost: float
-    converged: bool
-    status: str
-    steps: int
-    history: tuple[float, ...]
-    evaluation: Evaluation
-    simulation: np.ndarray
-    robust_stderr: np.ndarray
-    prior_share: np.ndarray
-    at_bound: np.ndarray
-    second_minimum: float
-    independent_samples: float
-    averaging: np.ndarray
-    strength: np.ndarray
+# A fit yields requests, is sent evaluations, and returns its result.
+FitGenerator = Generator[EvaluationRequest, Evaluation, CompletedFit]
 
 
-Fitting = Generator[Request, Evaluation, Outcome]
-
-
-def drive(fitting: Fitting, simulate: Callable[[Request], Evaluation]) -> Outcome:
+def run_fit(fit: FitGenerator, simulate: Callable[[EvaluationRequest], Evaluation]) -> CompletedFit:
     """Run one fit to its end."""
     try:
-        request = next(fitting)
+        request = next(fit)
         while True:
-            request = fitting.send(simulate(request))
+            request = fit.send(simulate(request))
     except StopIteration as end:
         return end.value
 
 
-class Point:
-    """One simulation: the values, its result, and the residuals with their Jacobian in natural units."""
+# -- Gauss-Newton steps of optimistix
+# ---------------------------------------------------------------------------
 
-    def __init__(self, fit: "Fit", z: np.ndarray, evaluation: Evaluation):
+
+def _linear_model(y: Array, args: tuple[Array, Array, Array]) -> tuple[Array, None]:
+    """Residuals linearised about `y0`: all that a Gauss-Newton step needs of the simulation.
+
+    optimistix differentiates its residual function itself; given this one, it takes residual and Jacobian as
+    data, and the solver compiles once for all fits of equal shapes.
+    """
+    y0, residual, jacobian = args
+    return residual + jacobian @ (y - y0), None
+
+
+@eqx.filter_jit
+def _initial_state(solver: Any, y: Array, args: Any) -> Any:
+    struct = eqx.filter_eval_shape(lambda: _linear_model(y, args)[0])
+    return solver.init(_linear_model, y, args, {}, struct, None, frozenset())
+
+
+@eqx.filter_jit
+def _advance(solver: Any, y: Array, args: Any, state: Any) -> Any:
+    """Return the accepted point, the state with the next trial, and flags: terminated, successful."""
+    y, state, _ = solver.step(_linear_model, y, args, {}, state, frozenset())
+    terminated, result = solver.terminate(_linear_model, y, args, {}, state, frozenset())
+    return y, state, terminated, result == optx.RESULTS.successful
+
+
+# -- bounded Gauss-Newton step
+# ----------------------------------------------------------------------------------
+
+
+def bounded_step(
+    jacobian: Float[np.ndarray, "data n"],
+    residual: Float[np.ndarray, " data"],
+    low: Float[np.ndarray, " n"],
+    high: Float[np.ndarray, " n"],
+) -> tuple[Float[np.ndarray, " n"], float]:
+    """Return the step within bounds that minimises the linearised residuals, and its length.
+
+    The length is in standard errors: the root of the fall in chi-squared.
+    """
+    width = high - low
+    scaled = jacobian * width
+    information = scaled.T @ scaled
+    # Normal equations: there are far more samples than unknowns. Their Cholesky root R has R^T R =
+    # information, so that |R^T step - b| is the same problem with as many rows as unknowns.
+    information += _RIDGE * max(np.trace(information), 1e-300) * np.eye(width.size)
+    root = np.linalg.cholesky(information)
+    target = linalg.solve_triangular(root, -scaled.T @ residual, lower=True)
+    bounds = (low / width, high / width)
+    step = optimize.lsq_linear(root.T, target, bounds=bounds, method="bvls").x * width
+    decrease = residual @ residual - np.sum((residual + jacobian @ step) ** 2)
+    return step, float(np.sqrt(max(decrease, 0.0)))
+
+
+# -- a fit from one start
+# ---------------------------------------------------------------------------------------
+
+
+class Iterate:
+    """A simulated point of a fit.
+
+    - `z`, `values`, `slope`: free parameters, values, and derivative of the values in the free parameters.
+    - `recorder_values`: the last of the values, those of the recorder's unknowns.
+    - `evaluation`: the simulation.
+    - `difference`, `jacobian`: simulated minus observed, of the fitted samples, and its Jacobian in natural
+      units.
+    - `is_finite`: True if both are finite.
+    """
+
+    def __init__(self, fit: "LeastSquaresFit", z: np.ndarray, evaluation: Evaluation):
         self.z, self.evaluation = z, evaluation
-        self.values, self.slope = inside(z, fit.low, fit.high)
-        self.own = fit.own(self.values)
-        recorded = fit.terms(evaluation.total, evaluation.jacobian, self.own)
-        self.difference = (recorded.total - fit.data.observed)[fit.data.used]
-        self.jacobian = recorded.jacobian[fit.data.used]
-        self.finite = bool(np.all(np.isfinite(self.difference)) and np.all(np.isfinite(self.jacobian)))
+        self.values, self.slope = bounded_logistic(z, fit.low, fit.high)
+        self.recorder_values = self.values[fit.n_scene :]
+        recorded = fit.recorder(evaluation.total, evaluation.jacobian, self.recorder_values)
+        self.difference = (recorded.total - fit.observed.reflectance)[fit.is_fitted]
+        self.jacobian = recorded.jacobian[fit.is_fitted]
+        self.is_finite = bool(np.all(np.isfinite(self.difference)) and np.all(np.isfinite(self.jacobian)))
 
 
-class Fit:
-    """A running fit. Vectors are the flattened unknowns, in natural units unless named z."""
+# Best iterate of a descent, True if it converged, and its status.
+Descent = tuple[Iterate, bool, str]
+
+
+class LeastSquaresFit:
+    """A running fit. Vectors are the flattened unknowns, in natural units unless named z.
+
+    - `start`: starting values. Default None: those of the unknowns.
+
+    Its state: `noise`, the present weights; `prior`, with the present strengths; `use_pilot`, True while few
+    batches suffice; `n_simulations` and `history`, chi-squared of every step.
+    """
 
     def __init__(
         self,
-        data: Data,
-        settled: list[Settled],
-        terms: RecorderModel,
-        solver: Any,
-        max_steps: int,
-        progress: Callable[[Step], None] | None,
+        observed: ObservedWaveform,
+        scene_unknowns: list[BoundUnknown],
+        recorder: RecorderModel,
+        settings: SolverSettings,
+        progress: Callable[[Step], None] | None = None,
         start: np.ndarray | None = None,
     ):
-        self.data, self.settled, self.terms = data, [*settled, *terms.unknowns], terms
-        self.solver, self.max_steps, self.progress = solver, max_steps, progress
-        flat = lambda pick: np.concatenate([np.ravel(pick(s)) for s in self.settled])  # noqa: E731
-        self.low, self.high = flat(lambda s: s.low), flat(lambda s: s.high)
-        self.start = flat(lambda s: np.asarray(s.start, float)) if start is None else start
-        self.prior = Priors(self.settled)
-        self.correlation = correlation_between(float(terms.recorder.correlation), data.used)
-        self.noise = Noise(data.sigma[data.used], None, self.correlation)
-        self.count, self.history = 0, []
-        self.few = max_steps > 1
+        self.observed, self.is_fitted, self.recorder = observed, observed.is_fitted, recorder
+        self.unknowns = [*scene_unknowns, *recorder.unknowns]
+        self.settings, self.progress = settings, progress
+        self.low, self.high = flat_bounds(self.unknowns)
+        self.n_scene = self.low.size - recorder.count
+        self.start = flat_start(self.unknowns) if start is None else start
+        self.prior = PriorResiduals(self.unknowns)
+        self.correlation = neighbour_correlation(float(recorder.recorder.correlation), self.is_fitted)
+        self.noise = SampleNoise(observed.sigma[self.is_fitted], None, self.correlation)
+        # A single simulation has to be one with all batches.
+        self.use_pilot = settings.max_steps > 1
+        self.n_simulations, self.history = 0, []
 
-    # -- simulation ------------------------------------------------------------------------------------
+    # -- objective
+    # ---------------------------------------------------------------------------------------------
 
-    def at(self, z: np.ndarray, *, spread: bool = False) -> Generator[Request, Evaluation, Point]:
-        values = inside(z, self.low, self.high)[0]
-        evaluation = yield Request(values[: values.size - self.terms.count], spread, self.few)
-        return Point(self, z, evaluation)
+    def simulate(
+        self, z: np.ndarray, *, with_batches: bool = False
+    ) -> Generator[EvaluationRequest, Evaluation, Iterate]:
+        """Request a simulation at the free parameters `z`."""
+        values = bounded_logistic(z, self.low, self.high)[0]
+        evaluation = yield EvaluationRequest(values[: self.n_scene], with_batches, self.use_pilot)
+        return Iterate(self, z, evaluation)
 
-    def own(self, values: np.ndarray) -> np.ndarray:
-        """Those of the recorder's terms."""
-        return values[values.size - self.terms.count :]
+    def residuals(self, iterate: Iterate) -> tuple[np.ndarray, np.ndarray]:
+        """Return whitened residuals, of data and then priors, and their Jacobian in natural units."""
+        prior_residual, prior_jacobian = self.prior(iterate.values)
+        jacobian = np.concatenate([self.noise.whiten(iterate.jacobian), prior_jacobian])
+        return np.concatenate([self.noise.whiten(iterate.difference), prior_residual]), jacobian
 
-    def natural(self, p: Point) -> tuple[np.ndarray, np.ndarray]:
-        """Whitened residuals, then those of the priors, and their Jacobian in natural units."""
-        off, slope = self.prior(p.values)
-        jacobian = np.concatenate([self.noise.white(p.jacobian), slope])
-        return np.concatenate([self.noise.white(p.difference), off]), jacobian
+    def cost(self, iterate: Iterate) -> float:
+        """Return the objective."""
+        residual, _ = self.residuals(iterate)
+        return float(residual @ residual)
 
-    def reweigh(self, p: Point) -> float:
-        """Include the noise of simulation and pulse at `p`. **Returns:** the mean relative change."""
-        used, batches = self.data.used, p.evaluation.batches
-        received = None if batches is None else self.terms.received(batches, p.own)
-        noise = np.broadcast_to(spread_of(received), used.shape)[used]
-        pulse = self.terms.pulse_noise(p.evaluation.total, p.own)
-        before = self.noise.sigma
-        alone = np.hypot(self.data.sigma[used], noise)
-        self.noise = Noise(alone, blocks(pulse, used), self.correlation)
-        return float(np.mean(np.abs(self.noise.sigma / before - 1.0)))
+    def update_weights(self, iterate: Iterate) -> float:
+        """Renew the noise of simulation and pulse at an iterate. **Returns:** the mean relative change."""
+        batches = iterate.evaluation.batches
+        received = None if batches is None else self.recorder.received(batches, iterate.recorder_values)
+        simulation_sigma = np.broadcast_to(batch_stderr(received), self.is_fitted.shape)[self.is_fitted]
+        pulse_errors = self.recorder.pulse_noise(iterate.evaluation.total, iterate.recorder_values)
+        previous_sigma = self.noise.sigma
+        self.noise = SampleNoise(
+            np.hypot(self.observed.sigma[self.is_fitted], simulation_sigma),
+            shared_errors_of_samples(pulse_errors, self.is_fitted),
+            self.correlation,
+        )
+        return float(np.mean(np.abs(self.noise.sigma / previous_sigma - 1.0)))
 
-    def first(self) -> Generator[Request, Evaluation, Point]:
-        z = outside(self.start, self.low, self.high)
-        p = yield from self.at(z, spread=True)
-        if self.terms.count and p.finite:
-            best = self.terms.fit_linear(p.own, p.evaluation.total, self.data.observed, self.data.sigma)
-            start = np.append(self.start[: self.start.size - self.terms.count], best)
-            p = Point(self, outside(start, self.low, self.high), p.evaluation)
-        return p
+    # -- algorithm
+    # ---------------------------------------------------------------------------------------------
 
-    # -- iteration -------------------------------------------------------------------------------------
+    def run(self) -> FitGenerator:
+        """Run the fit.
 
-    def run(self) -> Fitting:
-        best = yield from self.first()
-        self.count = 1
-        if not best.finite:
-            return self.result(
-                best, False, "failed: at the starting values the simulated waveform is not finite"
-            )
-        self.reweigh(best)
-        # Where photons are traced once, or in one batch, all come at once.
-        self.few = best.evaluation.few
-        if self.few:
-            best = yield from self.approach(best)
-            if not best.finite:
-                return self.result(best, False, self.ended("failed: the simulated waveform is not finite"))
-        best, converged, status = yield from self.settle_down(best)
+        1. Simulate at the start, and choose the recorder's offset and scale there by linear least squares.
+        2. Weight the samples by the noise of measurement, simulation and pulse at the start.
+        3. If photons are traced at every step: minimise with pilot evaluations, then simulate at their
+           minimum with all batches and renew the weights.
+        4. Minimise with all batches.
+        5. Renew the weights at the solution. If they changed by more than 5 % in the mean, minimise again.
+        6. Compute covariances at the solution.
+        """
+        best = yield from self._first_iterate()
+        self.n_simulations = 1
+        if not best.is_finite:
+            status = "failed: at the starting values the simulated waveform is not finite"
+            return self._completed(best, False, status)
+        self.update_weights(best)
+        # The first evaluation shows whether the model has pilot evaluations at all.
+        self.use_pilot = best.evaluation.is_pilot
+        if self.use_pilot:
+            best = yield from self._minimise_with_pilot(best)
+            if not best.is_finite:
+                status = self._status("failed: the simulated waveform is not finite")
+                return self._completed(best, False, status)
+        best, converged, status = yield from self._minimise(best)
         if converged and best.evaluation.batches is None:
-            best = yield from self.at(best.z, spread=True)
-        if converged and self.reweigh(best) > _WRONG_WEIGHTS and self.count < self.max_steps:
-            best, converged, status = yield from self.settle_down(best)
+            best = yield from self.simulate(best.z, with_batches=True)
+        weights_changed = converged and self.update_weights(best) > _MAX_WEIGHT_CHANGE
+        if weights_changed and self.n_simulations < self.settings.max_steps:
+            best, converged, status = yield from self._minimise(best)
             if best.evaluation.batches is None:
-                best = yield from self.at(best.z, spread=True)
-        return self.result(best, converged, status)
+                best = yield from self.simulate(best.z, with_batches=True)
+        return self._completed(best, converged, status)
 
-    def approach(self, best: Point) -> Generator[Request, Evaluation, Point]:
-        """Descend as far as few of the batches can tell, and simulate there with all of them."""
-        best, _, _ = yield from self.settle_down(best)
-        self.few = False
-        best = yield from self.at(best.z, spread=True)
-        self.count += 1
-        if best.finite:
-            self.reweigh(best)
+    def _first_iterate(self) -> Generator[EvaluationRequest, Evaluation, Iterate]:
+        z = bounded_logit(self.start, self.low, self.high)
+        iterate = yield from self.simulate(z, with_batches=True)
+        if self.recorder.count and iterate.is_finite:
+            # The record is linear in offset and scale: a start far off would lead the other unknowns astray.
+            recorder_values = self.recorder.fit_linear(
+                iterate.recorder_values,
+                iterate.evaluation.total,
+                self.observed.reflectance,
+                self.observed.sigma,
+            )
+            start = np.append(self.start[: self.n_scene], recorder_values)
+            iterate = Iterate(self, bounded_logit(start, self.low, self.high), iterate.evaluation)
+        return iterate
+
+    def _minimise_with_pilot(self, best: Iterate) -> Generator[EvaluationRequest, Evaluation, Iterate]:
+        """Minimise as far as pilot evaluations are accurate, and simulate there with all batches."""
+        best, _, _ = yield from self._minimise(best)
+        self.use_pilot = False
+        best = yield from self.simulate(best.z, with_batches=True)
+        self.n_simulations += 1
+        if best.is_finite:
+            self.update_weights(best)
         return best
 
-    def settle_down(self, best: Point) -> Generator[Request, Evaluation, tuple[Point, bool, str]]:
-        """Descend, with strengths of smoothness priors by the data: each is that of the fit with it."""
-        for _ in range(_MOST_STRENGTHS):
-            way = self.descend(best)
-            if self.prior.blocks:
-                way = descend_within(self, best, *self.small)
-            best, converged, status = yield from way
-            if not converged or not self.prior.by_the_data:
+    def _minimise(self, best: Iterate) -> Generator[EvaluationRequest, Evaluation, Descent]:
+        """Minimise the objective, and choose the strengths of smoothness priors by the evidence.
+
+        1. Minimise at the present strengths.
+        2. Maximise the evidence over the strengths that are left to the data, linearised about the minimum.
+        3. Repeat until no strength changes by more than 10 %.
+        """
+        for _ in range(_MAX_STRENGTH_UPDATES):
+            descend = self._bounded_gauss_newton if self.prior.processes else self._gauss_newton
+            best, converged, status = yield from descend(best)
+            if not converged or not self.prior.has_free_strengths:
                 return best, converged, status
-            white = self.noise.white(best.difference), self.noise.white(best.jacobian)
-            strengths = self.prior.likeliest(best.values, *white)
-            if np.all(np.abs(np.log(strengths / self.prior.strengths)) < _SAME_STRENGTH):
+            residual, jacobian = self.noise.whiten(best.difference), self.noise.whiten(best.jacobian)
+            strengths = self.prior.maximise_evidence(best.values, residual, jacobian)
+            if np.all(np.abs(np.log(strengths / self.prior.strengths)) < _STRENGTH_TOLERANCE):
                 return best, True, status
-            self.prior.put(strengths)
-        return best, False, self.ended("not converged: the strength of a smoothness prior did not settle")
+            self.prior.set_strengths(strengths)
+        status = "not converged: the strength of a smoothness prior did not settle"
+        return best, False, self._status(status)
 
-    def descend(self, best: Point) -> Generator[Request, Evaluation, tuple[Point, bool, str]]:
-        """Run the solver until it ends or no step improves the fit."""
+    def _gauss_newton(self, best: Iterate) -> Generator[EvaluationRequest, Evaluation, Descent]:
+        """Descend in the free parameters with a Gauss-Newton method of optimistix, from `best`.
+
+        1. Give the solver residual and Jacobian at the trial; it accepts the trial or goes back to `best`.
+        2. Stop if the Newton decrement at the best iterate is small, by the solver's own rule, or at
+           max_steps.
+        3. Simulate at the solver's next trial, at most 2 away in each free parameter.
+        """
         trial, state, y = best, None, jnp.asarray(best.z)
-        remaining, rejected = np.inf, 0
+        decrement, n_rejected = np.inf, 0
         while True:
-            r, jacobian = self.natural(trial)
+            residual, jacobian = self.residuals(trial)
             jacobian = jacobian * trial.slope
-            if not trial.finite:
-                # So large that the solver rejects the step.
-                r, jacobian = np.full_like(r, 1e8), np.zeros_like(jacobian)
-            args = tuple(jnp.asarray(a, y.dtype) for a in (trial.z, r, jacobian))
+            if not trial.is_finite:
+                residual, jacobian = np.full_like(residual, _REJECTED_RESIDUAL), np.zeros_like(jacobian)
+            args = tuple(jnp.asarray(a, y.dtype) for a in (trial.z, residual, jacobian))
             if state is None:
-                state = _begin(self.solver, y, args)
-            y, state, done, sound = _advance(self.solver, y, args, state)
-            accepted = bool(jnp.all(y == args[0])) and trial.finite
+                state = _initial_state(self.settings.solver, y, args)
+            y, state, terminated, successful = _advance(self.settings.solver, y, args, state)
+            # An accepted trial is the solver's new point, bit by bit.
+            accepted = bool(jnp.all(y == args[0])) and trial.is_finite
             if accepted:
-                best, remaining, rejected = trial, decrement(jacobian[:, self.free(trial, r, jacobian)], r), 0
+                inactive = jacobian[:, self._is_inactive(trial, residual, jacobian)]
+                best, decrement, n_rejected = trial, newton_decrement(inactive, residual), 0
             else:
-                rejected += 1
-            self.report(trial, accepted)
-            small, limits = self.small
-            stalled = any(rejected >= n and remaining < limit for n, limit in limits)
-            if bool(done) or remaining < small or stalled:
-                return best, True, self.ended("converged")
-            if not bool(sound):
-                return best, False, self.ended("failed: the equations for the next step could not be solved")
-            if self.spent:
-                return best, False, self.ended("not converged: stopped at max_steps")
-            ahead = jnp.clip(state.y_eval - y, -_LONGEST_STEP, _LONGEST_STEP)
-            state = eqx.tree_at(lambda s: s.y_eval, state, y + ahead)
-            trial = yield from self.at(np.asarray(state.y_eval, float))
-            self.count += 1
+                n_rejected += 1
+            self._report(trial, accepted)
+            if bool(terminated) or self._has_converged(decrement, n_rejected):
+                return best, True, self._status("converged")
+            if not bool(successful):
+                status = "failed: the equations for the next step could not be solved"
+                return best, False, self._status(status)
+            if self._is_exhausted:
+                return best, False, self._status("not converged: stopped at max_steps")
+            step = jnp.clip(state.y_eval - y, -_MAX_FREE_STEP, _MAX_FREE_STEP)
+            state = eqx.tree_at(lambda s: s.y_eval, state, y + step)
+            trial = yield from self.simulate(np.asarray(state.y_eval, float))
+            self.n_simulations += 1
+
+    def _bounded_gauss_newton(self, best: Iterate) -> Generator[EvaluationRequest, Evaluation, Descent]:
+        """Descend in natural units with steps that are solved within the bounds, from `best`.
+
+        1. Solve the linearised problem within the bounds: a step and its length in standard errors.
+        2. Stop if the length is small, or at max_steps.
+        3. Simulate after the step; cut it to a quarter until it improves the fit.
+        """
+        margin = _BOUND_MARGIN * (self.high - self.low)
+        low, high = self.low + margin, self.high - margin
+        self._report(best, True)
+        while True:
+            residual, jacobian = self.residuals(best)
+            values = np.clip(best.values, low, high)
+            step, length = bounded_step(jacobian, residual, low - values, high - values)
+            fraction, n_rejected, accepted = 1.0, 0, False
+            while not accepted:
+                if self._has_converged(length, n_rejected):
+                    return best, True, self._status("converged")
+                if n_rejected > self._stall_limits[-1][0]:
+                    return best, False, self._status("failed: no step improves the fit")
+                if self._is_exhausted:
+                    return best, False, self._status("not converged: stopped at max_steps")
+                z = bounded_logit(values + fraction * step, self.low, self.high)
+                trial = yield from self.simulate(z)
+                self.n_simulations += 1
+                accepted = trial.is_finite and self.cost(trial) < float(residual @ residual)
+                self._report(trial, accepted)
+                fraction, n_rejected = fraction * _STEP_CUT, n_rejected + 1
+            best = trial
+
+    # -- stopping rule
+    # -----------------------------------------------------------------------------------------
 
     @property
-    def small(self) -> tuple[float, tuple[tuple[int, float], ...]]:
-        """The length of a step at which a descent ends, and those at which it does after rejected steps."""
-        return (_SMALL_STEP_OF_FEW, _STALLED_OF_FEW) if self.few else (_SMALL_STEP, _STALLED)
+    def _stall_limits(self) -> tuple[tuple[int, float], ...]:
+        return _PILOT_STALL_LIMITS if self.use_pilot else _STALL_LIMITS
+
+    def _has_converged(self, length: float, n_rejected: int) -> bool:
+        """Return True for a step of this length, in standard errors, after so many rejected steps."""
+        if length < (_PILOT_SMALL_STEP if self.use_pilot else _SMALL_STEP):
+            return True
+        return any(n_rejected >= n and length < limit for n, limit in self._stall_limits)
 
     @property
-    def spent(self) -> bool:
-        """Whether no simulation is left; half of them are for all batches."""
-        return self.count >= (self.max_steps // 2 if self.few else self.max_steps)
+    def _is_exhausted(self) -> bool:
+        """True if no simulation is left; pilot evaluations get half of them."""
+        max_steps = self.settings.max_steps
+        return self.n_simulations >= (max_steps // 2 if self.use_pilot else max_steps)
 
-    def free(self, p: Point, r: np.ndarray, jacobian: np.ndarray) -> np.ndarray:
-        """Which unknowns are free: not at a bound beyond which the fit would be better."""
-        share, downhill = (p.values - self.low) / (self.high - self.low), -(jacobian.T @ r)
-        held = ((share < _AT_BOUND) & (downhill < 0)) | ((share > 1 - _AT_BOUND) & (downhill > 0))
-        return ~held
+    def _is_inactive(self, iterate: Iterate, residual: np.ndarray, jacobian: np.ndarray) -> np.ndarray:
+        """Return True for unknowns whose bounds are inactive.
 
-    def ended(self, how: str) -> str:
-        return f"{how} after {self.count} simulation{'s' if self.count > 1 else ''}"
+        A bound is active if the unknown is at it and the fit would improve beyond it. In a free parameter,
+        the step towards a bound never ends; such unknowns do not count in the decrement.
+        """
+        fraction = (iterate.values - self.low) / (self.high - self.low)
+        descent = -(jacobian.T @ residual)
+        at_active_bound = ((fraction < _AT_BOUND) & (descent < 0)) | (
+            (fraction > 1 - _AT_BOUND) & (descent > 0)
+        )
+        return ~at_active_bound
 
-    def report(self, p: Point, accepted: bool) -> None:
-        freedom = max(p.difference.size - self.low.size, 1)
-        chi2 = float(np.sum(self.noise.white(p.difference) ** 2)) / freedom
+    def _status(self, end: str) -> str:
+        plural = "s" if self.n_simulations > 1 else ""
+        return f"{end} after {self.n_simulations} simulation{plural}"
+
+    def _report(self, iterate: Iterate, accepted: bool) -> None:
+        freedom = max(iterate.difference.size - self.low.size, 1)
+        chi2 = float(np.sum(self.noise.whiten(iterate.difference) ** 2)) / freedom
         self.history.append(chi2)
         if self.progress is not None:
-            self.progress(Step(len(self.history), chi2, accepted, self.named(p.values)))
+            values = split_by_name(iterate.values, self.unknowns)
+            self.progress(Step(len(self.history), chi2, accepted, values))
 
-    # -- result ----------------------------------------------------------------------------------------
+    # -- result
+    # ------------------------------------------------------------------------------------------------
 
-    def named(self, flat: np.ndarray) -> dict[str, np.ndarray]:
-        return named(flat, self.settled)
-
-    def result(self, p: Point, converged: bool, status: str) -> Outcome:
-        n, used, batches = self.low.size, self.data.used, p.evaluation.batches
-        simulation = np.broadcast_to(spread_of(batches), used.shape)
-        deviations = None
-        if batches is not None and p.finite:
-            received = self.terms.received(batches - np.mean(batches, axis=0), p.own)
-            deviations = self.noise.white(received[:, used].T).T
-        jacobian = self.noise.white(p.jacobian) if p.finite else np.zeros_like(p.jacobian)
-        measured = (self.data.sigma[used] / self.noise.alone) ** 2
-        off, slope = self.prior(p.values)
-        precision = slope.T @ slope
-        width = self.high - self.low
-        errors = errors_of(jacobian, precision, width, measured, deviations, self.prior.basis)
-        stderr = np.sqrt(np.diag(errors.covariance))
-        robust, samples = self.widened(p, stderr, errors, jacobian, precision)
-        labels = labels_of(self.settled)
-        share = (p.values - self.low) / (self.high - self.low)
-        notes = [
-            ("the data do not determine {} (infinite standard error)", errors.open),
-            ("at the lower bound: {}", low := share < _AT_BOUND),
-            ("at the upper bound: {}", high := share > 1 - _AT_BOUND),
-        ]
-        for text, which in notes:
-            if np.any(which):
-                status += "; " + text.format(", ".join(m for m, w in zip(labels, which) if w))
-        residuals = np.zeros(used.shape)
-        residuals[used] = -self.noise.white(p.difference)
-        freedom = max(p.difference.size - n + int(np.sum(errors.open)), 1)
-        chi2 = np.sum(residuals**2) / freedom
-
-        plain = self.noise._replace(alone=self.data.sigma[used])
-        cost = float(np.sum(plain.white(p.difference) ** 2) + np.sum(off**2)) + self.prior.volume
-        return Outcome(
-            values=p.values,
-            stderr=stderr,
-            simulation_error=errors.simulation,
-            covariance=errors.covariance,
-            correlation=correlation_of(errors.covariance),
-            residuals=residuals,
-            reduced_chi2=float(chi2),
-            cost=cost if p.finite else np.inf,
-            converged=converged,
-            status=status,
-            steps=self.count,
-            history=tuple(self.history),
-            evaluation=p.evaluation,
-            simulation=np.asarray(simulation),
-            robust_stderr=robust,
-            prior_share=errors.prior_share,
-            at_bound=low | high,
-            second_minimum=np.inf,
-            independent_samples=samples,
-            averaging=errors.averaging,
-            strength=self.prior.strengths,
+    def _completed(self, iterate: Iterate, converged: bool, status: str) -> CompletedFit:
+        """Return the result at an iterate."""
+        is_fitted, evaluation = self.is_fitted, iterate.evaluation
+        deviations = self._whitened_deviations(iterate)
+        jacobian = np.zeros_like(iterate.jacobian)
+        if iterate.is_finite:
+            jacobian = self.noise.whiten(iterate.jacobian)
+        measured_sigma = self.observed.sigma[is_fitted]
+        prior_residual, prior_jacobian = self.prior(iterate.values)
+        precision = prior_jacobian.T @ prior_jacobian
+        estimate = estimate_covariance(
+            jacobian,
+            precision,
+            self.high - self.low,
+            (measured_sigma / self.noise.sigma_independent) ** 2,
+            deviations,
+            self.prior.basis,
         )
+        stderr = np.sqrt(np.diag(estimate.covariance))
+        robust_stderr, effective_samples = self._robust_stderr(iterate, stderr, estimate, jacobian, precision)
+        fraction = (iterate.values - self.low) / (self.high - self.low)
+        at_low, at_high = fraction < _AT_BOUND, fraction > 1 - _AT_BOUND
+        residuals = np.zeros(is_fitted.shape)
+        residuals[is_fitted] = -self.noise.whiten(iterate.difference)
+        n_undetermined = int(np.sum(estimate.is_undetermined))
+        freedom = max(iterate.difference.size - self.low.size + n_undetermined, 1)
+        # Costs of fits from several starts are compared: without the simulation's noise, they have equal
+        # weights.
+        measurement = self.noise._replace(sigma_independent=measured_sigma)
+        cost = np.sum(measurement.whiten(iterate.difference) ** 2) + np.sum(prior_residual**2)
+        record = FitRecord(
+            values=iterate.values,
+            stderr=stderr,
+            robust_stderr=robust_stderr,
+            prior_share=estimate.prior_fraction,
+            at_bound=at_low | at_high,
+            covariance=estimate.covariance,
+            averaging=estimate.averaging,
+            reduced_chi2=float(np.sum(residuals**2) / freedom),
+            independent_samples=effective_samples,
+            second_minimum=np.inf,
+            strength=self.prior.strengths,
+            converged=converged,
+            status=status + self._notes(estimate.is_undetermined, at_low, at_high),
+            steps=self.n_simulations,
+            fitted=np.asarray(evaluation.total),
+        )
+        details = FitDetails(
+            simulation_error=estimate.simulation_stderr,
+            residuals=residuals,
+            waveform_stderr=np.asarray(np.broadcast_to(batch_stderr(evaluation.batches), is_fitted.shape)),
+            cost=float(cost) + self.prior.log_normalisation if iterate.is_finite else np.inf,
+            history=tuple(self.history),
+            evaluation=evaluation,
+        )
+        return CompletedFit(record, details)
 
-    def widened(
-        self, p: Point, stderr: np.ndarray, errors: Errors, jacobian: np.ndarray, precision: np.ndarray
+    def _whitened_deviations(self, iterate: Iterate) -> np.ndarray | None:
+        """Return the whitened deviations of the batches from their mean, (batches, samples), or None."""
+        batches = iterate.evaluation.batches
+        if batches is None or not iterate.is_finite:
+            return None
+        received = self.recorder.received(batches - np.mean(batches, axis=0), iterate.recorder_values)
+        return self.noise.whiten(received[:, self.is_fitted].T).T
+
+    def _notes(self, is_undetermined: np.ndarray, at_low: np.ndarray, at_high: np.ndarray) -> str:
+        """Return the end of a status: unknowns that are undetermined or at a bound."""
+        labels, notes = flat_labels(self.unknowns), ""
+        for text, condition in (
+            ("the data do not determine {} (infinite standard error)", is_undetermined),
+            ("at the lower bound: {}", at_low),
+            ("at the upper bound: {}", at_high),
+        ):
+            if np.any(condition):
+                notes += "; " + text.format(", ".join(m for m, c in zip(labels, condition) if c))
+        return notes
+
+    def _robust_stderr(
+        self,
+        iterate: Iterate,
+        stderr: np.ndarray,
+        estimate: EstimateCovariance,
+        jacobian: np.ndarray,
+        precision: np.ndarray,
     ) -> tuple[np.ndarray, float]:
-        """Standard errors widened by misfit, and how many independent samples tell as much as all."""
-        if not p.finite:
-            return stderr, float(p.difference.size)
-        used = self.data.used
-        signal = (p.difference + self.data.observed[used]) / self.noise.sigma
-        open = errors.open
-        told = float(np.sum(1.0 - errors.prior_share[~open]))
-        difference = self.noise.white(p.difference)
-        wavelength, sample = np.nonzero(used)
-        misfit = misfit_of(difference, jacobian, precision, told, signal, (wavelength, sample))
-        variance = np.diag(errors.inverse @ (misfit.middle + precision) @ errors.inverse)
-        return np.where(open, np.inf, np.maximum(stderr, np.sqrt(variance))), misfit.samples
+        """Return standard errors widened by misfit, and the effective number of samples."""
+        if not iterate.is_finite:
+            return stderr, float(iterate.difference.size)
+        difference, is_undetermined = iterate.difference, estimate.is_undetermined
+        signal = (difference + self.observed.reflectance[self.is_fitted]) / self.noise.sigma
+        n_determined = float(np.sum(1.0 - estimate.prior_fraction[~is_undetermined]))
+        misfit = residual_covariance(
+            self.noise.whiten(difference),
+            jacobian,
+            precision,
+            n_determined,
+            signal,
+            SampleIndex(*np.nonzero(self.is_fitted)),
+        )
+        inverse = estimate.inverse_information
+        variance = np.diag(inverse @ (misfit.meat + precision) @ inverse)
+        robust = np.where(is_undetermined, np.inf, np.maximum(stderr, np.sqrt(variance)))
+        return robust, misfit.effective_samples
 
 
-def named(flat: np.ndarray, settled: Sequence[Settled]) -> dict[str, np.ndarray]:
-    """Values by name from vectors (..., unknowns)."""
-    parts = np.split(flat, np.cumsum([s.start.size for s in settled])[:-1], axis=-1)
-    return {s.name: p.reshape((*flat.shape[:-1], *s.start.shape)) for s, p in zip(settled, parts)}
+# -- several starts
+# ---------------------------------------------------------------------------------------------
 
 
-def bounds_of(settled: Sequence[Settled]) -> dict[str, np.ndarray]:
-    """Lower and upper bounds by name, (2, ...)."""
-    return {s.name: np.stack([s.low, s.high]) for s in settled}
+def fits_from_starts(
+    observed: ObservedWaveform,
+    scene_unknowns: list[BoundUnknown],
+    recorder: RecorderModel,
+    settings: SolverSettings,
+    key: PRNGKeyArray,
+    progress: Callable[[Step], None] | None = None,
+) -> list[LeastSquaresFit]:
+    """Return a fit from the unknowns' own start, and further ones from a Latin hypercube over the bounds."""
+    starts: list[np.ndarray | None] = [None]
+    if settings.starts > 1:
+        unknowns = [*scene_unknowns, *recorder.unknowns]
+        starts += list(latin_hypercube(unknowns, settings.starts - 1, jax.random.fold_in(key, 1)))
+    return [LeastSquaresFit(observed, scene_unknowns, recorder, settings, progress, s) for s in starts]
 
 
-def smooth_names(settled: Sequence[Settled]) -> list[str]:
-    """Names of the unknowns with smoothness priors."""
-    return [s.name for s in settled if s.smooth is not None]
+def latin_hypercube(
+    unknowns: Sequence[BoundUnknown], count: int, key: PRNGKeyArray
+) -> Float[np.ndarray, "count unknowns"]:
+    """Draw starting points spread over the bounds: each unknown has one in each of `count` equal intervals.
+
+    **Source:** McKay, Beckman and Conover (1979), Technometrics 21, 239.
+    """
+    low, high = flat_bounds(unknowns)
+    order_key, position_key = jax.random.split(key)
+    order = jax.vmap(lambda k: jax.random.permutation(k, count))(jax.random.split(order_key, low.size))
+    position = np.asarray(jax.random.uniform(position_key, (count, low.size)), float)
+    fraction = (np.asarray(order).T + position) / count
+    return low + (high - low) * np.clip(fraction, MARGIN, 1.0 - MARGIN)
 
 
-def labels_of(settled: Sequence[Settled]) -> tuple[str, ...]:
-    """Names of the flattened unknowns."""
-    return tuple(
-        s.name + ("" if s.start.ndim == 0 else str(list(map(int, np.unravel_index(i, s.start.shape)))))
-        for s in settled
-        for i in range(s.start.size)
+def multistart(fits: Sequence[LeastSquaresFit]) -> FitGenerator:
+    """Run fits from several starts, one after the other, and return the converged one of the lowest cost.
+
+    Its steps and history are those of all fits.
+    """
+    completed = []
+    for fit in fits:
+        completed.append((yield from fit.run()))
+
+    def rank(fit: CompletedFit) -> tuple[bool, bool, float]:
+        # Infinite and NaN costs come last.
+        return not fit.record.converged, not np.isfinite(fit.details.cost), fit.details.cost
+
+    best = min(completed, key=rank)
+    if len(fits) == 1:
+        return best
+    other_minima = [fit for fit in completed if fit.record.converged and fit is not best]
+    second_minimum, robust_stderr = compare_minima(best, other_minima)
+    n_same = sum(f.record.converged and f.details.cost < best.details.cost + 1.0 for f in completed)
+    record = dataclasses.replace(
+        best.record,
+        steps=sum(fit.record.steps for fit in completed),
+        status=f"{best.record.status}; {n_same} of {len(fits)} starts ended there",
+        second_minimum=second_minimum,
+        robust_stderr=robust_stderr,
     )
+    history = tuple(chi2 for fit in completed for chi2 in fit.details.history)
+    return CompletedFit(record, dataclasses.replace(best.details, history=history))
+
+
+def compare_minima(best: CompletedFit, other_minima: Sequence[CompletedFit]) -> tuple[float, np.ndarray]:
+    """Return the rise in chi-squared to the second minimum, and standard errors with the spread over minima.
+
+    Minima are the same within two standard errors of all unknowns. Chi-squared counts correlated samples by
+    their effective number, and in units of the best fit's reduced one. A minimum has the weight exp(-rise /
+    2), its relative likelihood.
+    """
+    record = best.record
+    n_samples = max(np.count_nonzero(best.details.residuals), 1)
+    scale = record.independent_samples / n_samples / max(record.reduced_chi2, 1.0)
+    second_minimum, variance, weight = np.inf, np.zeros_like(record.values), 1.0
+    for minimum in other_minima:
+        rise = max(minimum.details.cost - best.details.cost, 0.0) * scale
+        distance = minimum.record.values - record.values
+        if np.any(np.abs(distance) > 2.0 * record.robust_stderr):
+            second_minimum = min(second_minimum, rise)
+        variance += np.exp(-0.5 * rise) * distance**2
+        weight += np.exp(-0.5 * rise)
+    return float(second_minimum), np.hypot(record.robust_stderr, np.sqrt(variance / weight))

@@ -1,117 +1,335 @@
-r"""Standard errors of a fit, and which unknowns the data do not constrain.
+r"""Covariance of the estimates of a fit: of the noise, of the simulation, and robust to misfit.
 
-With whitened Jacobian J and prior precision P, H = J^T J + P, the covariance of the fitted values is
+**Notation.** J: whitened Jacobian of the data (data, n); P: precision of the priors; H = J^T J + P: the
+information, whose inverse is the posterior covariance of the linearised problem.
+
+**Stated noise and simulation.** Residuals are whitened by the noise of measurement and simulation together.
+The covariance of the estimates is
 
     H^-1 (J^T W J + P) H^-1  +  covariance of (H^-1 J^T d) / batches,
 
-with W the share of the weights' variance that is measurement noise, and d the deviations of the simulation's
-batches from their mean. The second term is the simulation's own noise, with all correlation between its bins
-and wavelengths. The diagonal of H^-1 P is the share of what is known of each unknown that is the prior's.
+with W the diagonal fraction of the variance that is the measurement's, and d the deviations of the
+simulation's batches from their mean. The second term is the simulation's own noise. As all batches of all
+samples enter it together, it has the full correlation between bins and wavelengths, which W alone would miss.
+
+**Fraction of the prior.** The diagonal of H^-1 P is the fraction of the information on each unknown that is
+the prior's. A = H^-1 J^T J = d estimate / d truth is the averaging kernel.
+
+**Undetermined unknowns.** An unknown is undetermined if its standard error exceeds the width of its bounds,
+alone or in combination with others: eigenvectors of H, scaled to a unit diagonal, whose eigenvalue is
+rounding.
+
+**Misfit.** A wrong model leaves residuals that are large where the signal is, and alike from sample to
+sample. The whitened residuals of a fit are taken as a draw from
+
+    C_ij = a^2 (delta_ij + k^2 g_i g_j phi^|i - j|),    g_i = s_i / max s,
+
+with s the simulated signal in the same units: white noise of amplitude a, and an error of the model that is k
+times as large at the signal's peak, proportional to the signal, first-order autoregressive over samples, and
+independent between wavelengths. Each phi and k of a grid is weighted by the restricted likelihood of the
+residuals (the unknowns are integrated out, which accounts for the degrees of freedom that they took; a has
+its value of largest likelihood). With C the mean over the grid, the robust covariance is the sandwich
+
+    H^-1 (J^T C J + P) H^-1.
+
+Short records determine phi and k poorly, and the mean over the grid is then on the safe side: with noise
+only, robust errors are up to twice the plain ones. Errors of the model that the unknowns absorb without a
+trace, such as an offset of the clock, remain hidden.
+
+**Source:** restricted likelihood: Patterson and Thompson (1971), Biometrika 58, 545; sandwich: White (1980),
+Econometrica 48, 817; averaging kernel: Rodgers (2000), Inverse Methods for Atmospheric Sounding, chapter 2;
+Newton decrement: Boyd and Vandenberghe (2004), Convex Optimization, section 9.5.
 """
 
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-# Smallest eigenvalue of the correlation form of H at which a combination counts as determined.
-_COLLINEAR = 1e-6
+# Smallest eigenvalue of H, scaled to a unit diagonal, at which a combination of unknowns counts as
+# determined.
+_MIN_EIGENVALUE = 1e-6
+# An unknown with more than this squared component in an undetermined combination is undetermined.
+_MIN_COMPONENT = 1e-3
+# Smallest singular value, relative to columns of unit length, that counts in the Newton decrement.
+_MIN_SINGULAR_VALUE = 1e-3
+# Grids of phi and k^2.
+_PHI_GRID = (0.0, 0.5, 0.8, 0.92, 0.97)
+_K2_GRID = (0.0, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)
+# With fewer degrees of freedom residuals do not determine a covariance.
+_MIN_FREEDOM = 8.0
+# Added to the unit diagonal of the scaled information: keeps it regular for collinear unknowns.
+_RIDGE = 1e-12
 
 
-class Errors(NamedTuple):
+class EstimateCovariance(NamedTuple):
     """Covariance of the unknowns in natural units.
 
-    - `covariance`: of all unknowns. Open ones have an infinite variance and no covariance with the others,
-      whose covariance is as if the open ones were free.
-    - `simulation`: standard errors from the simulation's noise alone.
-    - `open`: whether the data do not constrain the unknown.
-    - `inverse`: of the information H; zero where no eigenvalue tells.
-    - `prior_share`: of the information on each unknown, from 0 (all from the data) to 1 (all from the prior).
-    - `averaging`: H^-1 J^T J, how the estimates follow the truth.
+    - `covariance`: of all unknowns. Undetermined ones have an infinite variance and no covariance with
+      others, whose covariance is as if the undetermined ones were free.
+    - `simulation_stderr`: standard errors from the simulation's noise alone.
+    - `is_undetermined`: True for unknowns that the data do not constrain.
+    - `inverse_information`: H^-1; zero for undetermined combinations.
+    - `prior_fraction`: of the information on each unknown, from 0 (all from the data) to 1 (all from the
+      prior).
+    - `averaging`: A = H^-1 J^T J.
     """
 
     covariance: Float[np.ndarray, "n n"]
-    simulation: Float[np.ndarray, " n"]
-    open: np.ndarray
-    inverse: Float[np.ndarray, "n n"]
-    prior_share: Float[np.ndarray, " n"]
+    simulation_stderr: Float[np.ndarray, " n"]
+    is_undetermined: np.ndarray
+    inverse_information: Float[np.ndarray, "n n"]
+    prior_fraction: Float[np.ndarray, " n"]
     averaging: Float[np.ndarray, "n n"]
 
 
-def errors_of(
+def estimate_covariance(
     jacobian: Float[np.ndarray, "data n"],
     precision: Float[np.ndarray, "n n"],
     width: Float[np.ndarray, " n"],
-    measured: Float[np.ndarray, " data"],
+    measurement_fraction: Float[np.ndarray, " data"],
     deviations: Float[np.ndarray, "batches data"] | None,
     basis: Float[np.ndarray, "n n"] | None = None,
-) -> Errors:
-    """Covariance at the solution.
-
-    An unknown is open if its standard error exceeds the width of its bounds, alone or in combination with
-    others.
+) -> EstimateCovariance:
+    """Return the covariance at the solution.
 
     **Arguments:**
 
     - `jacobian`: whitened, in natural units.
-    - `precision`: matrix of the prior, 0 where there is none.
+    - `precision`: matrix of the priors, 0 without priors.
     - `width`: of the bounds.
-    - `measured`: measurement variance over the variance used for whitening.
-    - `deviations`: of each batch from their mean, whitened.
-    - `basis`: columns in which a prior that correlates unknowns is the identity. Default None: there is none.
-
-    **Returns:** an `Errors`.
+    - `measurement_fraction`: measurement variance over the variance used for whitening.
+    - `deviations`: of each batch from their mean, whitened, or None.
+    - `basis`: columns in which a prior that correlates unknowns is the identity; such a prior's P alone is
+      too ill-conditioned to invert. Default None: no such prior.
     """
     n = width.size
-    columns = np.eye(n) if basis is None else basis
-    data = jacobian.T @ jacobian
-    information = columns.T @ (data + precision) @ columns
-    mixed = np.any(columns != np.diag(np.diag(columns)), axis=0)
-    opened = np.diag(information) * np.where(mixed, 1.0, width) ** 2 < 1.0 - 1e-6
-    own = np.diag(precision)
-    alone = own / np.where(own > 0, own + np.diag(data), 1.0)
-    keep = np.flatnonzero(~opened)
-    norm = np.sqrt(np.diag(information)[keep])
-    value, vector = np.linalg.eigh(information[np.ix_(keep, keep)] / np.outer(norm, norm))
-    known = value > _COLLINEAR
-    opened[keep] |= np.any(vector[:, ~known] ** 2 > 1e-3, axis=1)
-    inverse = np.zeros((n, n))
-    inverse[np.ix_(keep, keep)] = (
-        (vector[:, known] / value[known]) @ vector[:, known].T / np.outer(norm, norm)
+    basis = np.eye(n) if basis is None else basis
+    data_information = jacobian.T @ jacobian
+    information = basis.T @ (data_information + precision) @ basis
+    # Unknowns with less information than a flat prior over their bounds. Columns of a correlating prior
+    # already have unit variance.
+    is_mixed = np.any(basis != np.diag(np.diag(basis)), axis=0)
+    undetermined = np.diag(information) * np.where(is_mixed, 1.0, width) ** 2 < 1.0 - 1e-6
+    prior_information = np.diag(precision)
+    marginal_fraction = prior_information / np.where(
+        prior_information > 0, prior_information + np.diag(data_information), 1.0
     )
-    inverse = columns @ inverse @ columns.T
-    share = np.clip(np.where(opened, alone, np.diag(inverse @ precision)), 0.0, 1.0)
-    middle = (jacobian.T * measured) @ jacobian + precision
-    covariance = inverse @ middle @ inverse
+    # Pseudo-inverse, for a unit diagonal so that units of unknowns do not matter.
+    candidates = np.flatnonzero(~undetermined)
+    block = np.ix_(candidates, candidates)
+    norm = np.sqrt(np.diag(information)[candidates])
+    eigenvalue, eigenvector = np.linalg.eigh(information[block] / np.outer(norm, norm))
+    determined = eigenvalue > _MIN_EIGENVALUE
+    undetermined[candidates] |= np.any(eigenvector[:, ~determined] ** 2 > _MIN_COMPONENT, axis=1)
+    inverse = np.zeros((n, n))
+    inverse[block] = (
+        (eigenvector[:, determined] / eigenvalue[determined])
+        @ eigenvector[:, determined].T
+        / np.outer(norm, norm)
+    )
+    inverse = basis @ inverse @ basis.T
+    prior_fraction = np.where(undetermined, marginal_fraction, np.diag(inverse @ precision))
+    meat = (jacobian.T * measurement_fraction) @ jacobian + precision
+    covariance = inverse @ meat @ inverse
     simulation = np.zeros((n, n))
     if deviations is not None and len(deviations) > 1:
-        moved = deviations @ jacobian @ inverse
-        simulation = moved.T @ moved / (len(moved) * (len(moved) - 1))
+        # Change of the estimates by each batch; the variance of their mean.
+        shifts = deviations @ jacobian @ inverse
+        simulation = shifts.T @ shifts / (len(shifts) * (len(shifts) - 1))
     covariance = covariance + simulation
-    opened |= np.diag(covariance) > width**2
-    covariance[opened, :] = 0.0
-    covariance[:, opened] = 0.0
-    covariance[opened, opened] = np.inf
-    simulated = np.where(opened, 0.0, np.sqrt(np.diag(simulation)))
-    return Errors(covariance, simulated, opened, inverse, share, inverse @ data)
+    undetermined |= np.diag(covariance) > width**2
+    covariance[undetermined, :] = 0.0
+    covariance[:, undetermined] = 0.0
+    covariance[undetermined, undetermined] = np.inf
+    simulation_stderr = np.where(undetermined, 0.0, np.sqrt(np.diag(simulation)))
+    return EstimateCovariance(
+        covariance,
+        simulation_stderr,
+        undetermined,
+        inverse,
+        np.clip(prior_fraction, 0.0, 1.0),
+        inverse @ data_information,
+    )
 
 
 def correlation_of(covariance: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
-    """Correlation matrix; unknowns of infinite or zero variance have no correlation with others."""
+    """Return the correlation matrix. Unknowns of infinite or zero variance are uncorrelated with others."""
     std = np.sqrt(np.diag(covariance))
-    fine = np.isfinite(std) & (std > 0)
-    safe = np.where(fine, std, 1.0)
-    correlation = np.where(np.outer(fine, fine), np.where(np.isfinite(covariance), covariance, 0.0), 0.0)
-    correlation = correlation / np.outer(safe, safe)
+    is_regular = np.isfinite(std) & (std > 0)
+    safe_std = np.where(is_regular, std, 1.0)
+    finite_covariance = np.where(np.isfinite(covariance), covariance, 0.0)
+    correlation = np.where(np.outer(is_regular, is_regular), finite_covariance, 0.0)
+    correlation = correlation / np.outer(safe_std, safe_std)
     np.fill_diagonal(correlation, 1.0)
     return correlation
 
 
-def decrement(jacobian: Float[np.ndarray, "data n"], residual: Float[np.ndarray, " data"]) -> float:
-    """Length of a Gauss-Newton step in standard errors: the root of the fall in chi-squared."""
+def newton_decrement(jacobian: Float[np.ndarray, "data n"], residual: Float[np.ndarray, " data"]) -> float:
+    """Return the length of a Gauss-Newton step in standard errors: the root of the fall in chi-squared.
+
+    (r^T J (J^T J)^-1 J^T r)^1/2, which is the norm of r projected onto the columns of J.
+    """
     norm = np.linalg.norm(jacobian, axis=0)
-    seen = norm > 0
-    if not np.any(seen):
+    is_sensitive = norm > 0
+    if not np.any(is_sensitive):
         return 0.0
-    basis, value, _ = np.linalg.svd(jacobian[:, seen] / norm[seen], full_matrices=False)
-    return float(np.linalg.norm(basis[:, value > 1e-3].T @ residual))
+    scaled = jacobian[:, is_sensitive] / norm[is_sensitive]
+    basis, singular_value, _ = np.linalg.svd(scaled, full_matrices=False)
+    return float(np.linalg.norm(basis[:, singular_value > _MIN_SINGULAR_VALUE].T @ residual))
+
+
+# -- misfit
+# ------------------------------------------------------------------------------------------------------
+
+
+class ResidualCovariance(NamedTuple):
+    """Covariance C of the residuals of a fit, as the sandwich needs it.
+
+    - `meat`: J^T C J, the middle of the sandwich.
+    - `effective_samples`: number of independent samples with the information of the correlated ones,
+      (tr C)^2 / tr C^2.
+    """
+
+    meat: Float[np.ndarray, "n n"]
+    effective_samples: float
+
+
+class SampleIndex(NamedTuple):
+    """Index of the wavelength, and of the bin, of each sample."""
+
+    wavelength: Int[np.ndarray, " data"]
+    bin: Int[np.ndarray, " data"]
+
+
+def residual_covariance(
+    residual: Float[np.ndarray, " data"],
+    jacobian: Float[np.ndarray, "data n"],
+    precision: Float[np.ndarray, "n n"],
+    n_determined: float,
+    signal: Float[np.ndarray, " data"],
+    index: SampleIndex,
+) -> ResidualCovariance:
+    """Estimate the covariance of the residuals of a fit by restricted likelihood: see the module.
+
+    1. For each (phi, k^2) of the grid, form M^T C^-1 M and ln det C, with M = (J, r) and a = 1.
+    2. Its Cholesky root, with the priors' information added, gives in its last diagonal element the norm of
+       what the unknowns leave of r, hence a^2 and the restricted likelihood.
+    3. Average J^T C J and the effective number of samples with the likelihoods as weights.
+
+    **Arguments:**
+
+    - `residual`, `jacobian`: whitened by the stated noise.
+    - `precision`: matrix of the priors, 0 without priors.
+    - `n_determined`: number of unknowns that the data determine.
+    - `signal`: simulated, in standard deviations of the stated noise.
+    - `index`: wavelength and bin of each sample.
+
+    **Returns:** the covariance; that of the stated noise for too few degrees of freedom.
+    """
+    freedom = residual.size - n_determined
+    if freedom < _MIN_FREEDOM or not np.any(residual):
+        return ResidualCovariance(jacobian.T @ jacobian, float(residual.size))
+    columns = np.column_stack([jacobian, residual])
+    # Unit columns: units of unknowns do not matter.
+    norm = np.linalg.norm(columns, axis=0)
+    norm = np.where(norm > 1e-100, norm, 1.0)
+    columns = columns / norm
+    prior_information = np.pad(precision, (0, 1)) / np.outer(norm, norm) + _RIDGE * np.eye(norm.size)
+    relative_signal = np.abs(signal) / max(np.max(np.abs(signal)), 1e-300)
+    phi, k2 = (a.ravel() for a in np.meshgrid(_PHI_GRID, _K2_GRID, indexing="ij"))
+    order = _sample_order(index)
+    product, log_determinant = _whitened_products(columns, relative_signal, k2, phi, order)
+    root = np.linalg.cholesky(product + prior_information)
+    diagonal = np.diagonal(root, axis1=1, axis2=2)
+    a2 = (diagonal[:, -1] * norm[-1]) ** 2 / freedom
+    # -2 ln restricted likelihood; the last term is ln det of the information on the unknowns.
+    deviance = log_determinant + freedom * np.log(a2) + 2.0 * np.sum(np.log(diagonal[:, :-1]), axis=1)
+    weight = np.exp(-0.5 * (deviance - deviance.min()))
+    weight /= np.sum(weight)
+    correlated = _autoregressive_products(relative_signal[:, None] * columns[:, :-1], phi, order)
+    white = columns[:, :-1].T @ columns[:, :-1]
+    meat = np.sum(weight * a2) * white + np.einsum("cdg,g->cd", correlated, weight * a2 * k2)
+    # tr C and tr C^2, with a = 1.
+    power = (relative_signal**2)[:, None]
+    trace = residual.size + k2 * np.sum(power)
+    trace_of_square = residual.size + 2.0 * k2 * np.sum(power)
+    trace_of_square = trace_of_square + k2**2 * _autoregressive_products(power, phi**2, order)[0, 0]
+    effective_samples = float(weight @ (trace**2 / trace_of_square))
+    return ResidualCovariance(meat * np.outer(norm[:-1], norm[:-1]), effective_samples)
+
+
+class _SampleOrder(NamedTuple):
+    """Order in which a filter visits samples. Wavelengths are independent, and visited side by side.
+
+    - `visits`: indices of the first sample of each wavelength, of the second, and so on.
+    - `gap`: bins from a sample to the one before it; 0 for the first of a wavelength.
+    """
+
+    visits: list[Int[np.ndarray, " wavelengths"]]
+    gap: Int[np.ndarray, " data"]
+
+    def correlation_with_previous(self, visit: np.ndarray, phi: np.ndarray) -> np.ndarray:
+        """Return (wavelengths, grid) correlation of samples with those before."""
+        gap = self.gap[visit, None]
+        return np.where(gap > 0, phi**gap, 0.0)
+
+
+def _sample_order(index: SampleIndex) -> _SampleOrder:
+    wavelength, sample_bin = index
+    _, first, count = np.unique(wavelength, return_index=True, return_counts=True)
+    # Wavelengths with most samples first: those that have samples left at a visit are then a leading slice.
+    order = np.argsort(-count, kind="stable")
+    first, count = first[order], count[order]
+    visits = [first[: np.searchsorted(-count, -visit)] + visit for visit in range(count[0])]
+    gap = np.append(0, np.where(np.diff(wavelength) == 0, np.diff(sample_bin), 0))
+    return _SampleOrder(visits, gap)
+
+
+def _whitened_products(
+    columns: np.ndarray, relative_signal: np.ndarray, k2: np.ndarray, phi: np.ndarray, order: _SampleOrder
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return columns^T C^-1 columns (grid, columns, columns), and ln det C, for a = 1: by a Kalman filter.
+
+    The state is the autoregressive error u_i, of unit variance and correlation phi^gap; a sample observes
+    k g_i u_i in white noise of unit variance. Its innovations are white, so that their products need no
+    (data, data) matrix.
+    """
+    n_columns, n_grid = columns.shape[1], phi.size
+    product, log_determinant = np.zeros((n_grid, n_columns, n_columns)), np.zeros(n_grid)
+    n_wavelengths = len(order.visits[0])
+    mean, variance = np.zeros((n_wavelengths, n_columns, n_grid)), np.ones((n_wavelengths, n_grid))
+    for visit in order.visits:
+        # Prediction.
+        decay = order.correlation_with_previous(visit, phi)
+        mean = decay[:, None] * mean[: len(visit)]
+        variance = 1.0 - decay**2 * (1.0 - variance[: len(visit)])
+        # Innovation, and update.
+        gain = relative_signal[visit, None] * np.sqrt(k2)
+        innovation = columns[visit, :, None] - gain[:, None] * mean
+        innovation_variance = 1.0 + gain**2 * variance
+        mean = mean + (variance * gain / innovation_variance)[:, None] * innovation
+        variance = variance / innovation_variance
+        white = innovation / np.sqrt(innovation_variance)[:, None]
+        # Batched matrix products over the grid are faster than einsum here.
+        white = white.transpose(2, 0, 1)
+        product += white.swapaxes(1, 2) @ white
+        log_determinant += np.sum(np.log(innovation_variance), axis=0)
+    return product, log_determinant
+
+
+def _autoregressive_products(columns: np.ndarray, phi: np.ndarray, order: _SampleOrder) -> np.ndarray:
+    """Return columns^T R columns (columns, columns, grid), R_ij = phi^|i - j| of the autoregressive error.
+
+    `carried` is the sum over earlier samples, each decayed to the present one.
+    """
+    n_columns = columns.shape[1]
+    carried = np.zeros((len(order.visits[0]), n_columns, phi.size))
+    total = np.zeros((n_columns, n_columns, phi.size))
+    for visit in order.visits:
+        rows = columns[visit]
+        carried = order.correlation_with_previous(visit, phi)[:, None] * carried[: len(visit)]
+        with_earlier = np.einsum("wi,wjg->ijg", rows, carried)
+        total += with_earlier + with_earlier.transpose(1, 0, 2) + (rows.T @ rows)[..., None]
+        carried = rows[..., None] + carried
+    return total

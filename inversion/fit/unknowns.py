@@ -1,7 +1,14 @@
-"""Unknowns of a retrieval: their bounds, priors and starting values, and how a value enters the scene.
+"""Unknowns of a retrieval: bounds, priors and starting values, and the way a value enters the scene.
 
-A bounded value is a smooth bijection of a free parameter z, value = low + (high - low) / (1 + exp(-z)): a
-solver in z never reaches the bounds.
+**Bounds.** A bounded value x is a smooth bijection of a free parameter z,
+
+    x = low + (high - low) / (1 + exp(-z)),   z = ln(x - low) - ln(high - x),
+
+the scaled logistic function and its inverse, the logit. A solver in z never reaches the bounds.
+
+**Scene.** `bind_unknowns` locates every `Unknown` in a scene and gives a `BoundUnknown`, whose `Setter` puts
+a value into the scene. Setters are hashable and equal for equal unknowns, so that programs compiled for one
+fit serve the next.
 """
 
 import difflib
@@ -12,19 +19,33 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
+from jaxtyping import Array, ArrayLike, Float
+from scipy import special
 
 from inversion.fit.priors import LogNormal, Smooth
 from jaxlidar import Scene
 from jaxlidar.extend import as_array, check_kind, check_range
 
-# (mean, standard deviation), or a prior with a name.
+# (mean, standard deviation), or one of the named priors.
 Prior = tuple[Float[Array, "..."], Float[Array, "..."]] | LogNormal | Smooth
-# Least distance of a starting value from a bound, as a share of the bounds' width.
+# Least distance of a starting value from its bounds, over the bounds' width: the bijection is flat at the
+# bounds.
 MARGIN = 0.01
 
 
-def _as_pair(x: Any) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+def bounded_logistic(z: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the bounded value of a free parameter, and its derivative."""
+    fraction = special.expit(z)
+    # expit(-z) is 1 - fraction without cancellation.
+    return low + (high - low) * fraction, (high - low) * fraction * special.expit(-z)
+
+
+def bounded_logit(value: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Return the free parameter of a value within its bounds: the inverse of `bounded_logistic`."""
+    return np.log(value - low) - np.log(high - value)
+
+
+def _as_bounds(x: Any) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
     try:
         low, high = x
     except (TypeError, ValueError):
@@ -32,7 +53,7 @@ def _as_pair(x: Any) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
     return as_array(low, "lower bound"), as_array(high, "upper bound")
 
 
-def _optional_prior(x: Any) -> Prior | None:
+def _as_optional_prior(x: Any) -> Prior | None:
     if x is None or isinstance(x, LogNormal | Smooth):
         return x
     try:
@@ -44,7 +65,7 @@ def _optional_prior(x: Any) -> Prior | None:
     return as_array(mean, "prior mean"), as_array(std, "prior standard deviation")
 
 
-def _optional_array(x: ArrayLike | None) -> Float[Array, "..."] | None:
+def _as_optional_start(x: ArrayLike | None) -> Float[Array, "..."] | None:
     return None if x is None else as_array(x, "start")
 
 
@@ -56,9 +77,9 @@ class Unknown(eqx.Module):
 
     **Arguments:**
 
-    - `where`: the place of one array in the scene, of any shape: its path, such as "canopy.leaf.Cab" or
-      "plates[0].height", or a function that picks it, as for `equinox.tree_at`. An element of an array, or a
-      property, is no such array: use `apply`. Default None.
+    - `where`: path of one array in the scene, of any shape, such as "canopy.leaf.Cab" or "plates[0].height",
+      or a function that picks the array, as for `equinox.tree_at`. An element of an array, or a property, is
+      not such an array: use `apply`. Default None.
     - `bounds`: (low, high) in the unknown's own unit, finite, low below high, numbers or arrays that
       broadcast to the value.
     - `name`: key of the result; needed with `apply`. Default None: the path of `where`.
@@ -68,11 +89,11 @@ class Unknown(eqx.Module):
     - `start`: starting value within the bounds; needed with `apply`. Default None: the scene's value.
     - `apply`: a function `apply(scene, value) -> scene`, given instead of `where`, for values that change
       several arrays at once. It must be differentiable and keep the tree structure of the scene. Unknowns are
-      applied in the order in which they are listed. Define the function once, outside of loops: every new one
-      compiles the simulation again. Default None.
+      applied in the order in which they are listed. Define the function once, outside of loops: a new
+      function compiles the simulation again. Default None.
 
-    An unknown given by a path can be pickled and sent to other processes; one given by a function can be if
-    the function can, which a lambda cannot.
+    An unknown given by a path can be pickled and sent to other processes. One given by a function can be
+    pickled if the function can; a lambda cannot.
 
     **Raises:** ValueError for bounds that are not finite and increasing, for a standard deviation that is not
     positive, unless exactly one of `where` and `apply` is given, and for an `apply` without `name` and
@@ -93,114 +114,129 @@ class Unknown(eqx.Module):
     """
 
     where: str | Callable[[Any], Any] | None = eqx.field(static=True, default=None)
-    bounds: tuple[Float[Array, "..."], Float[Array, "..."]] = eqx.field(converter=_as_pair, kw_only=True)
+    bounds: tuple[Float[Array, "..."], Float[Array, "..."]] = eqx.field(converter=_as_bounds, kw_only=True)
     name: str | None = eqx.field(static=True, default=None, kw_only=True)
-    prior: Prior | None = eqx.field(converter=_optional_prior, default=None, kw_only=True)
-    start: Float[Array, "..."] | None = eqx.field(converter=_optional_array, default=None, kw_only=True)
+    prior: Prior | None = eqx.field(converter=_as_optional_prior, default=None, kw_only=True)
+    start: Float[Array, "..."] | None = eqx.field(converter=_as_optional_start, default=None, kw_only=True)
     apply: Callable[[Scene, Array], Scene] | None = eqx.field(static=True, default=None, kw_only=True)
 
     def __check_init__(self):
-        called = "an unknown" if self.name is None else f"unknown {self.name!r}"
+        label = _label(self.name)
         if (self.where is None) == (self.apply is None):
-            raise ValueError(f"{called}: give either where = ... or apply = ..., and not both")
+            raise ValueError(f"{label}: give either where = ... or apply = ..., and not both")
         if not (self.where is None or isinstance(self.where, str) or callable(self.where)):
-            raise TypeError(f"{called}: where = {self.where!r} is no path and no function")
+            raise TypeError(f"{label}: where = {self.where!r} is no path and no function")
         if not (self.apply is None or callable(self.apply)):
-            raise TypeError(f"{called}: apply = {self.apply!r} is no function")
+            raise TypeError(f"{label}: apply = {self.apply!r} is no function")
         if self.apply is not None and (self.name is None or self.start is None):
-            raise ValueError(f"{called}: with apply = ..., a name and a start are needed")
+            raise ValueError(f"{label}: with apply = ..., a name and a start are needed")
         low, high = self.bounds
-        check_range(f"{called}: bounds", low)
-        check_range(f"{called}: bounds", high)
+        check_range(f"{label}: bounds", low)
+        check_range(f"{label}: bounds", high)
         if not np.all(np.asarray(low) < np.asarray(high)):
-            raise ValueError(f"{called}: bounds = ({low}, {high}) are not low < high")
+            raise ValueError(f"{label}: bounds = ({low}, {high}) are not low < high")
         if isinstance(self.prior, LogNormal):
             # Zero is admissible: the bijection never reaches the bounds.
-            check_range(f"{called}: lower bound, with a log-normal prior,", low, 0.0)
+            check_range(f"{label}: lower bound, with a log-normal prior,", low, 0.0)
         elif isinstance(self.prior, tuple):
-            check_range(f"{called}: prior mean", self.prior[0])
-            check_range(f"{called}: prior standard deviation", self.prior[1], 0.0, low_open=True)
+            check_range(f"{label}: prior mean", self.prior[0])
+            check_range(f"{label}: prior standard deviation", self.prior[1], 0.0, low_open=True)
 
 
-Kind = Literal["optical", "extinction", "geometric"]
+def _label(name: str | None) -> str:
+    """Subject of error messages."""
+    return "an unknown" if name is None else f"unknown {name!r}"
 
 
-class Place(NamedTuple):
-    """How a value enters the scene: hashable, and equal for equal unknowns.
+# Dependence of the simulation on an unknown: on the optics, on extinction only, or on the paths of light.
+Dependence = Literal["optical", "extinction", "geometric"]
 
-    - `leaf`: number of the scene's leaf that it replaces, or None where `apply` sets it.
-    - `kind`: what a change of the value changes: "optical", only what is left of light; "extinction", the
-      weights of paths of light; "geometric", the paths.
+
+class Setter(NamedTuple):
+    """The way in which a value enters the scene: hashable, and equal for equal unknowns.
+
+    - `leaf_index`: index of the leaf of the scene's pytree that the value replaces, or None with `apply`.
+    - `apply`: function that puts the value into the scene, or None with `leaf_index`. Both are None for
+      unknowns that are not of the scene, such as the receiver's.
+    - `dependence`: of the simulation on the value. "optical": the value only weights the traced histories of
+      light; "extinction": it changes the weights of paths of light; "geometric": it changes the paths.
     """
 
-    leaf: int | None
+    leaf_index: int | None
     apply: Callable[[Scene, Array], Scene] | None
-    kind: Kind
+    dependence: Dependence
 
     @property
-    def traced(self) -> bool:
-        """Whether the response depends on the value."""
-        return self.kind != "optical"
+    def changes_response(self) -> bool:
+        """True if the response depends on the value, so that photons have to be traced again."""
+        return self.dependence != "optical"
 
 
-class Settled(NamedTuple):
-    """An unknown of a given scene. Arrays have the value's shape, in double precision (`start`: JAX's).
+class BoundUnknown(NamedTuple):
+    """An unknown bound to a scene. Arrays have the value's shape, in double precision (`start`: JAX's).
 
-    `prior`: mean and standard deviation, of the logarithm where `log_prior`. `smooth`: a smoothness prior.
+    - `prior`: mean and standard deviation, of the logarithm if `is_log_prior`; None without such a prior.
+    - `smooth`: a smoothness prior, or None.
     """
 
     name: str
-    place: Place
+    setter: Setter
     start: Array
     low: np.ndarray
     high: np.ndarray
     prior: tuple[np.ndarray, np.ndarray] | None
-    log_prior: bool = False
+    is_log_prior: bool = False
     smooth: Smooth | None = None
 
 
-def settle(unknowns: Sequence[Unknown], scene: Scene) -> list[Settled]:
-    """Locate the unknowns in the scene. **Raises:** ValueError for what cannot be retrieved."""
+def bind_unknowns(unknowns: Sequence[Unknown], scene: Scene) -> list[BoundUnknown]:
+    """Locate the unknowns in the scene. **Raises:** ValueError for unknowns that cannot be retrieved."""
     check_kind("scene", scene, Scene, "a Scene")
     check_kind("unknowns", unknowns, Sequence, "a sequence of Unknown")
     for i, unknown in enumerate(unknowns):
         check_kind(f"unknowns[{i}]", unknown, Unknown, "an Unknown")
     if len(unknowns) == 0:
         raise ValueError("unknowns is empty; admissible is one unknown or more")
-    kinds: list[tuple[Kind, frozenset[int]]] = [
-        ("optical", optical_leaves(scene)),
-        ("extinction", extinction_leaves(scene)),
+    arrays_by_dependence: list[tuple[Dependence, frozenset[int]]] = [
+        ("optical", optical_arrays(scene)),
+        ("extinction", extinction_arrays(scene)),
     ]
-    found = [_settle_one(u, scene, kinds) for u in unknowns]
-    names = [f.name for f in found]
+    bound = [_bind(u, scene, arrays_by_dependence) for u in unknowns]
+    names = [u.name for u in bound]
     for name in names:
         if names.count(name) > 1:
             raise ValueError(f"name = {name!r} is given to {names.count(name)} unknowns; each needs its own")
-    leaves = [f.place.leaf for f in found if f.place.leaf is not None]
-    for f in found:
-        if f.place.leaf is not None and leaves.count(f.place.leaf) > 1:
-            raise ValueError(f"unknown {f.name!r} picks an array of the scene that another one picks as well")
-    return found
+    # Two values for one array: the second would overwrite the first.
+    indices = [u.setter.leaf_index for u in bound if u.setter.leaf_index is not None]
+    for u in bound:
+        if u.setter.leaf_index is not None and indices.count(u.setter.leaf_index) > 1:
+            raise ValueError(f"unknown {u.name!r} picks an array of the scene that another one picks as well")
+    return bound
 
 
-def _settle_one(u: Unknown, scene: Scene, kinds: list[tuple[Kind, frozenset[int]]]) -> Settled:
-    number, name, start = None, u.name, u.start
+def _bind(
+    u: Unknown, scene: Scene, arrays_by_dependence: list[tuple[Dependence, frozenset[int]]]
+) -> BoundUnknown:
+    leaf_index, name, start = None, u.name, u.start
     if u.where is None:
-        touched = _touched(u, scene)
+        changed_arrays = _changed_arrays(u, scene)
     else:
-        number, path = _find(u.where, scene, u.name)
-        touched = frozenset([number])
+        leaf_index, path = _locate(u.where, scene, u.name)
+        changed_arrays = frozenset([leaf_index])
         name = path if name is None else name
-        own = jax.tree.leaves(scene)[number]
-        if not eqx.is_inexact_array(own):
+        # Integers have no derivative.
+        scene_value = jax.tree.leaves(scene)[leaf_index]
+        if not eqx.is_inexact_array(scene_value):
             raise ValueError(
-                f"unknown {name!r} is {own!r}; admissible is a floating-point array of the scene"
+                f"unknown {name!r} is {scene_value!r}; admissible is a floating-point array of the scene"
             )
-        start = as_array(own) if start is None else _broadcast(name, "start", start, own.shape)
+        start = (
+            as_array(scene_value) if start is None else _broadcast(name, "start", start, scene_value.shape)
+        )
     assert name is not None
     assert start is not None
     low, high = (np.asarray(_broadcast(name, "bounds", b, start.shape), float) for b in u.bounds)
-    prior, log_prior, smooth = None, isinstance(u.prior, LogNormal), None
+    prior, is_log_prior, smooth = None, isinstance(u.prior, LogNormal), None
     if isinstance(u.prior, Smooth):
         smooth = u.prior
         if not (start.size > 1 and max(start.shape) == start.size):
@@ -211,22 +247,27 @@ def _settle_one(u: Unknown, scene: Scene, kinds: list[tuple[Kind, frozenset[int]
         if smooth.mean is not None:
             _broadcast(name, "mean", smooth.mean, start.shape)
     elif u.prior is not None:
-        pair = (u.prior.median, u.prior.spread) if isinstance(u.prior, LogNormal) else u.prior
-        mean, std = (np.asarray(_broadcast(name, "prior", p, start.shape), float) for p in pair)
-        prior = np.log(mean) if log_prior else mean, std
-    those: list[Kind] = [kind for kind, leaves in kinds if touched <= leaves]
-    place = Place(number, u.apply, those[0] if those else "geometric")
-    return start_from(Settled(name, place, start, low, high, prior, log_prior, smooth), start)
+        mean_and_std = (u.prior.median, u.prior.spread) if isinstance(u.prior, LogNormal) else u.prior
+        mean, std = (np.asarray(_broadcast(name, "prior", p, start.shape), float) for p in mean_and_std)
+        prior = np.log(mean) if is_log_prior else mean, std
+    # The first kind that covers all changed arrays; a mixture is geometric.
+    matches: list[Dependence] = [kind for kind, arrays in arrays_by_dependence if changed_arrays <= arrays]
+    setter = Setter(leaf_index, u.apply, matches[0] if matches else "geometric")
+    return with_start(BoundUnknown(name, setter, start, low, high, prior, is_log_prior, smooth), start)
 
 
-def start_from(unknown: Settled, start: Array) -> Settled:
-    """The unknown with another start, at a margin from its bounds. **Raises:** ValueError outside them."""
+def with_start(unknown: BoundUnknown, start: Array) -> BoundUnknown:
+    """Return the unknown with another start, kept at `MARGIN` from its bounds.
+
+    **Raises:** ValueError for a start outside the bounds.
+    """
     value, low, high = np.asarray(start, float), unknown.low, unknown.high
-    bad = ~((value >= low) & (value <= high))
-    if np.any(bad):
+    # Written so that NaN counts as outside.
+    is_outside = ~((value >= low) & (value <= high))
+    if np.any(is_outside):
         raise ValueError(
-            f"unknown {unknown.name!r} starts from {value[bad].flat[0]:g}, which is outside its bounds "
-            f"[{low[bad].flat[0]:g}, {high[bad].flat[0]:g}]"
+            f"unknown {unknown.name!r} starts from {value[is_outside].flat[0]:g}, which is outside its "
+            f"bounds [{low[is_outside].flat[0]:g}, {high[is_outside].flat[0]:g}]"
         )
     margin = MARGIN * (high - low)
     return unknown._replace(start=jnp.asarray(np.clip(value, low + margin, high - margin), start.dtype))
@@ -241,35 +282,37 @@ def _broadcast(name: str, field: str, x: Array, shape: tuple[int, ...]) -> Array
         ) from None
 
 
-def _find(where: str | Callable, scene: Scene, name: str | None) -> tuple[int, str]:
-    """Number and path of the leaf at `where`."""
+def _locate(where: str | Callable, scene: Scene, name: str | None) -> tuple[int, str]:
+    """Return the index and path of the scene's leaf at `where`."""
     leaves = jax.tree_util.tree_leaves_with_path(scene)
     paths = [jax.tree_util.keystr(path).lstrip(".") for path, _ in leaves]
-    called = "an unknown" if name is None else f"unknown {name!r}"
+    label = _label(name)
     if isinstance(where, str):
         if where in paths:
             return paths.index(where), where
-        near = difflib.get_close_matches(where, paths, n=3, cutoff=0.0)
+        # A cutoff of 0: some suggestion is better than none.
+        nearest = difflib.get_close_matches(where, paths, n=3, cutoff=0.0)
         raise ValueError(
-            f"{called}: where = {where!r} is no array of this scene; the nearest are "
-            f"{', '.join(map(repr, near))}"
+            f"{label}: where = {where!r} is no array of this scene; the nearest are "
+            f"{', '.join(map(repr, nearest))}"
         )
-    marks = [object() for _ in paths]
+    # `where` is called on a scene of unique markers: values of arrays may be equal, markers are not.
+    markers = [object() for _ in paths]
     try:
-        picked = where(jax.tree.unflatten(jax.tree.structure(scene), marks))
+        picked = where(jax.tree.unflatten(jax.tree.structure(scene), markers))
     except (AttributeError, IndexError, KeyError, TypeError) as error:
-        raise ValueError(f"{called}: where picks nothing in this scene ({error}); see `apply`") from error
-    for i, mark in enumerate(marks):
-        if picked is mark:
+        raise ValueError(f"{label}: where picks nothing in this scene ({error}); see `apply`") from error
+    for i, marker in enumerate(markers):
+        if picked is marker:
             return i, paths[i]
     kind = "nothing (None)" if picked is None else f"a {type(picked).__name__}"
-    raise ValueError(f"{called}: where picks {kind}; admissible is one array of the scene")
+    raise ValueError(f"{label}: where picks {kind}; admissible is one array of the scene")
 
 
-def _touched(u: Unknown, scene: Scene) -> frozenset[int]:
-    """Numbers of the scene's leaves that `apply` changes."""
+def _changed_arrays(u: Unknown, scene: Scene) -> frozenset[int]:
+    """Return the indices of the scene's leaves that `apply` changes."""
     before, structure = jax.tree.flatten(scene)
-    touched: list[int] = []
+    changed: list[int] = []
 
     def probe(value):
         assert u.apply is not None
@@ -279,25 +322,30 @@ def _touched(u: Unknown, scene: Scene) -> frozenset[int]:
                 f"unknown {u.name!r}: apply returns a scene with other parts, or none; admissible is one "
                 "of the same tree structure"
             )
-        touched.extend(i for i, (a, b) in enumerate(zip(before, jax.tree.leaves(after))) if a is not b)
+        # A leaf that `apply` does not touch is the same object.
+        changed.extend(i for i, (a, b) in enumerate(zip(before, jax.tree.leaves(after))) if a is not b)
 
+    # Shapes suffice: nothing is computed.
     jax.eval_shape(probe, u.start)
-    if not touched:
+    if not changed:
         raise ValueError(f"unknown {u.name!r}: apply changes nothing in the scene")
-    return frozenset(touched)
+    return frozenset(changed)
 
 
-def optical_leaves(scene: Scene) -> frozenset[int]:
-    """Numbers of the scene's leaves that act only after the trace: the response does not depend on them."""
-    # Where transmitted light goes straight on, the leaves' transmittance scales extinction.
-    straight = scene.canopy is not None and scene.canopy.transmission == "straight"
+def optical_arrays(scene: Scene) -> frozenset[int]:
+    """Return the indices of the scene's pytree leaves on which the response does not depend.
 
-    def acts_later(path: tuple[Any, ...]) -> bool:
+    They act after the trace: leaf and bark optics, reflectances, the atmosphere.
+    """
+    # With straight transmission, the transmittance of leaves scales extinction.
+    is_straight = scene.canopy is not None and scene.canopy.transmission == "straight"
+
+    def acts_after_trace(path: tuple[Any, ...]) -> bool:
         match [getattr(key, "name", None) for key in path]:
             case ["canopy", "leaf", *_]:
-                return not straight
+                return not is_straight
             case ["ground", "reflectance", *_]:
-                # Where it varies from place to place, light is traced with it.
+                # A reflectance that varies with position is applied while light is traced.
                 return scene.ground is None or scene.ground.pattern is None
             case ["canopy", "bark", *_] | ["atmosphere", *_]:
                 return True
@@ -306,42 +354,68 @@ def optical_leaves(scene: Scene) -> frozenset[int]:
         return False
 
     leaves = jax.tree_util.tree_leaves_with_path(scene)
-    return frozenset(i for i, (path, _) in enumerate(leaves) if acts_later(path))
+    return frozenset(i for i, (path, _) in enumerate(leaves) if acts_after_trace(path))
 
 
-def extinction_leaves(scene: Scene) -> frozenset[int]:
-    """Numbers of the scene's leaves that change the extinction of leaf or bark, and nothing else."""
+def extinction_arrays(scene: Scene) -> frozenset[int]:
+    """Return the indices of the scene's pytree leaves that change the extinction of leaf or bark only."""
     leaves = jax.tree_util.tree_leaves_with_path(scene)
     paths = [[getattr(key, "name", None) for key in path] for path, _ in leaves]
-    ours = (["canopy", "voxels", "leaf"], ["canopy", "voxels", "bark"])
-    return frozenset(i for i, path in enumerate(paths) if path in ours)
+    extinction_paths = (["canopy", "voxels", "leaf"], ["canopy", "voxels", "bark"])
+    return frozenset(i for i, path in enumerate(paths) if path in extinction_paths)
 
 
-def put(scene: Scene, places: tuple[Place, ...], values: tuple[Array, ...]) -> Scene:
-    """The scene with the values of the unknowns, applied in their order."""
-    for place, value in zip(places, values):
-        if place.apply is not None:
-            scene = place.apply(scene, value)
+def set_values(scene: Scene, setters: tuple[Setter, ...], values: tuple[Array, ...]) -> Scene:
+    """Return the scene with the values of the unknowns, applied in their order."""
+    for setter, value in zip(setters, values):
+        if setter.apply is not None:
+            scene = setter.apply(scene, value)
         else:
-            assert place.leaf is not None
+            assert setter.leaf_index is not None
+            # Flattened for each value: an earlier `apply` may have replaced arrays.
             leaves, structure = jax.tree.flatten(scene)
-            leaves[place.leaf] = value
+            leaves[setter.leaf_index] = value
             scene = jax.tree.unflatten(structure, leaves)
     return scene
 
 
-def latin_hypercube(
-    settled: Sequence[Settled], count: int, key: PRNGKeyArray
-) -> Float[np.ndarray, "count unknowns"]:
-    """Starting points spread over the bounds: each unknown has one in each of `count` equal intervals.
+# -- flattened unknowns: one vector of all values, in the order of the unknowns
+# --------------------------------
 
-    **Source:** McKay, Beckman and Conover (1979), Technometrics 21, 239.
-    """
-    low = np.concatenate([np.ravel(s.low) for s in settled])
-    high = np.concatenate([np.ravel(s.high) for s in settled])
-    order_key, place_key = jax.random.split(key)
-    order = jax.vmap(lambda k: jax.random.permutation(k, count))(jax.random.split(order_key, low.size))
-    share = (
-        np.asarray(order).T + np.asarray(jax.random.uniform(place_key, (count, low.size)), float)
-    ) / count
-    return low + (high - low) * np.clip(share, MARGIN, 1.0 - MARGIN)
+
+def flat_start(unknowns: Sequence[BoundUnknown]) -> Float[np.ndarray, " n"]:
+    """Return the starting values as one vector."""
+    return np.concatenate([np.ravel(np.asarray(u.start, float)) for u in unknowns])
+
+
+def flat_bounds(
+    unknowns: Sequence[BoundUnknown],
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Return the lower and upper bounds as two vectors."""
+    low = np.concatenate([np.ravel(u.low) for u in unknowns])
+    return low, np.concatenate([np.ravel(u.high) for u in unknowns])
+
+
+def split_by_name(flat: np.ndarray, unknowns: Sequence[BoundUnknown]) -> dict[str, np.ndarray]:
+    """Return values by name, (..., *shape), from vectors (..., n)."""
+    pieces = np.split(flat, np.cumsum([u.start.size for u in unknowns])[:-1], axis=-1)
+    return {u.name: p.reshape((*flat.shape[:-1], *u.start.shape)) for u, p in zip(unknowns, pieces)}
+
+
+def bounds_by_name(unknowns: Sequence[BoundUnknown]) -> dict[str, np.ndarray]:
+    """Return lower and upper bounds by name, (2, ...)."""
+    return {u.name: np.stack([u.low, u.high]) for u in unknowns}
+
+
+def smooth_names(unknowns: Sequence[BoundUnknown]) -> list[str]:
+    """Return the names of the unknowns with smoothness priors."""
+    return [u.name for u in unknowns if u.smooth is not None]
+
+
+def flat_labels(unknowns: Sequence[BoundUnknown]) -> tuple[str, ...]:
+    """Return the names of the flattened values, with an index for those of arrays."""
+    return tuple(
+        u.name + ("" if u.start.ndim == 0 else str(list(map(int, np.unravel_index(i, u.start.shape)))))
+        for u in unknowns
+        for i in range(u.start.size)
+    )

@@ -299,7 +299,7 @@ def invert_leaves(
         noise is not None,
         int(chunk),
     )
-    # An error beyond the width of the bounds says no more than they do.
+    # An error larger than the width of the bounds adds nothing to them: the trait is not constrained.
     errors = jnp.where(is_lost | (errors > problem.high - problem.low), jnp.inf, errors)
     n_samples = np.count_nonzero(~np.isnan(observed) & np.isfinite(sigma), axis=(1, 2))
     reduced_chi2 = all_bands.best.chi2 / np.maximum(n_samples - len(unknown_names), 1)

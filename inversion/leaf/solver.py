@@ -47,7 +47,7 @@ from jaxlidar.optics.plate_model import plate_model_slopes
 _SMALL_STEP = 0.02
 # Least uncertainty of a residual, in units of the last place of the floating-point type.
 _ROUNDING_UNITS = 64
-# A fall of chi-squared by less than so many units of its last place cannot be measured.
+# Least measurable fall of chi-squared, in units of its last place.
 _CHI2_UNITS = 8
 # The first damping holds for the first step: accepting the start, which is tried first, lowers it once.
 _FIRST_DAMPING, _LEAST_DAMPING, _LARGEST_DAMPING = 1e-2, 1e-5, 1e8

@@ -145,7 +145,7 @@ def _split_energy(height, power, n_samples, pulse, ground, top, bottom):
     late_energy = above(bottom) - above(ground - mode * step)
     lag = jnp.arange(pulse.size) - pulse.size // 2
     late_fraction = jnp.sum(pulse * jnp.clip(lag + 0.5 - mode, 0.0, 1.0)) / jnp.sum(pulse)
-    # A pulse that ends at its mode says nothing of the energy before it.
+    # The energy of a pulse that ends at its mode cannot be derived from the light after it.
     ground_energy = jnp.maximum(late_energy, 0.0) / jnp.maximum(late_fraction, _LEAST_LATE_FRACTION)
     is_missing = jnp.isnan(ground) | jnp.isnan(top)
     ground_energy = jnp.minimum(ground_energy, signal_energy)

@@ -56,14 +56,14 @@ from jaxlidar.extend import as_array, check_integer, check_range
 
 _SOLVER = optx.LevenbergMarquardt(rtol=1e-3, atol=1e-3)
 _MAX_STEPS = 40
-# Echoes are added until so many in a row have not lowered the criterion.
+# Number of echoes in a row that do not lower the criterion, after which no more are added.
 _PATIENCE = 2
 # Bounds of the width of a Gaussian echo, and of the Gaussian that broadens a copy, in widths of the pulse.
 _WIDTH_BOUNDS = {"gaussian": (0.5, 8.0), "copies": (0.5, 8.0), "broadened": (0.1, 8.0)}
 # The width that fits start from, in widths of the pulse, and the cost of an echo, in ln(bins).
 _START_WIDTH = {"gaussian": 1.0, "copies": 1.0, "broadened": 0.4}
 _COST = {"gaussian": 3, "copies": 3, "broadened": 4}
-# An echo is at most so many standard deviations above the record.
+# Largest height of an echo above the record, in standard deviations of the noise.
 _EXCESS = 1.0
 # Fits start at least this fraction of the bounds' width away from them: the logistic function is flat there.
 _MARGIN = 0.01
@@ -419,7 +419,7 @@ def _decompose(
         fitted = optx.least_squares(
             residual, _SOLVER, start, args=is_active, max_steps=_MAX_STEPS, throw=False
         ).value
-        # A fit that fails leaves the echoes where they started; the criterion then tells its worth.
+        # A fit that fails leaves the echoes where they started; the criterion decides about them as usual.
         free = jnp.where(jnp.all(jnp.isfinite(fitted)), fitted, start)
         chi2 = jnp.sum(residual(free, is_active) ** 2)
         return _EchoFit(free, is_active, chi2, chi2 + _COST[kind] * (k + 1) * log_bins)

@@ -6,7 +6,7 @@ A waveform is y = h * x + noise, with h the pulse of unit sum and x the target's
 
     x <- x / s [h~ * (y / (h * x))],    h~(i) = h(-i),    s = h~ * 1,
 
-from an even start. s is one but near the ends of the record, where part of what a bin returns is not
+from an even start. s is one except near the ends of the record, where a part of the light of a bin is not
 recorded (Richardson 1972; Lucy 1974).
 
 **Wiener** minimises the mean square error of a linear estimate for stationary signal and noise. In the

@@ -48,7 +48,7 @@ from jaxlidar.extend import as_array, check_range
 
 # Median of the absolute value of a normal variable of unit variance.
 _NORMAL_MEDIAN = 0.6745
-# Sigma clipping: samples beyond so many standard deviations are signal; number of iterations.
+# Sigma clipping: largest noise in standard deviations, and number of iterations.
 _CLIP, _CLIP_ITERATIONS = 3.0, 5
 # Least height of a mode: in standard deviations of the noise, and over the largest sample.
 _MODE_THRESHOLD = 5.0

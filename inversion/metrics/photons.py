@@ -37,7 +37,7 @@ _CELL_HEIGHT, _CLIP, _CLIP_ITERATIONS = 5.0, 3.0, 30
 _HALF_WEIGHT_ABOVE, _HALF_WEIGHT_BELOW = 1.0, 5.0
 # Iterations of the fit, the first ones with those weights. It starts from this percentile of the heights.
 _ITERATIONS, _WEIGHTED_ITERATIONS, _START_PERCENTILE = 40, 30, 10.0
-# Ground lies within so many metres of the line, canopy at least so many above it.
+# Largest distance of ground from the line, and least height of canopy above it, m.
 _GROUND_RANGE, _CANOPY_CLEARANCE = 1.0, 2.0
 # Labels of photons.
 _NOISE, _GROUND, _CANOPY, _OTHER_SIGNAL = 0, 1, 2, 3
@@ -212,8 +212,8 @@ def _fit_ground(
             np.bincount(number, weight * a, n_segments)
             for a in (np.ones_like(x), x, x * x, residual, x * residual)
         )
-        # The last term acts like a photon a metre away that says that the slope stays: it fixes the slope of
-        # segments in which x hardly varies.
+        # One is added to the sum of w x^2: a prior that the slope does not change, of the weight of a photon
+        # 1 m from the middle. It fixes the slope of segments in which x hardly varies.
         determinant = w * wxx - wx**2 + w
         w = np.maximum(w, 1e-300)
         slope_change = (w * wxr - wx * wr) / np.maximum(determinant, 1e-300)

@@ -187,12 +187,12 @@ def sample_pulse_at_heights(pulse: Pulse | None, height: ArrayLike) -> Float[Arr
 
 
 class SmoothedPulse(NamedTuple):
-    """The Gaussian that smooths a record, and what it makes of an echo of the record's pulse.
+    """The Gaussian that smooths a record, and the shape of a smoothed echo of the record's pulse.
 
     - `kernel`: (lags,) the Gaussian g, of unit area.
     - `mode`: samples from the pulse's time zero to the mode of the smoothed echo.
-    - `tail`: (2 lags - 1,) largest value of the smoothed echo so many samples after its mode or later, over
-      its peak; 0 at 0. It bounds what one echo can put below its mode.
+    - `tail`: (2 lags - 1,) at delay j, largest value of the smoothed echo j samples after its mode or later,
+      over its peak; 0 at 0. It bounds the signal of one echo below its mode.
     """
 
     kernel: Float[Array, " lags"]
@@ -205,7 +205,7 @@ def smooth_pulse(pulse: Float[Array, " lags"]) -> SmoothedPulse:
 
     1. Kernel: the Gaussian of the pulse's peak (one) and area.
     2. Mode of the smoothed pulse, between samples by a parabola.
-    3. Tail: running maximum, from the end, of what follows the mode.
+    3. Tail: running maximum, from the end, of the samples after the mode.
     """
     if pulse.size == 1:
         return SmoothedPulse(jnp.ones(1), jnp.zeros(()), jnp.zeros(1))

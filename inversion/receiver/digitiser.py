@@ -210,7 +210,7 @@ def corrected_table(
         information, right_side = np.zeros((n_free, n_free)), np.zeros(n_free)
         for pulse, echo, sigma, echo_counts in zip(sent, received, sigmas, echoes):
             model, _ = HardTargetEcho(pulse, echo, sigma).fit(response)
-            # Amplitude and background of the echo are free: what they can explain is projected out.
+            # Amplitude and background of the echo are free: their columns are projected out.
             basis = np.linalg.qr(np.stack([model, np.ones_like(model)], axis=1) / sigma[:, None])[0]
             # Column j is the whitened derivative with respect to g at knot j: its hat function times T.
             columns = np.stack(

@@ -162,7 +162,7 @@ class HardTargetEcho:
 
     - `position`: of the pulse's time zero in the record, in samples; at first the largest sample's.
     - `amplitude`: of the echo over the pulse.
-    - `whitened`: (bins,) echo over its noise, without what offsets of the digitisers can explain.
+    - `whitened`: (bins,) echo over its noise, with offsets of the digitisers projected out.
     """
 
     def __init__(self, pulse: np.ndarray, echo: np.ndarray, noise: np.ndarray, interleaved: int = 1):
@@ -184,7 +184,7 @@ class HardTargetEcho:
         return columns - self._offset_basis @ (self._offset_basis.T @ columns)
 
     def _shift(self, shifts: np.ndarray) -> np.ndarray:
-        """(frequencies, shifts) factors that move a pulse to so many samples after the echo's position."""
+        """(frequencies, shifts) factors that move a pulse to the echo's position plus shifts, in samples."""
         return np.exp(-1j * self._omega[:, None] * (self.position - self._pulse_zero + shifts))
 
     def _response_spectrum(self, lags: np.ndarray, response: np.ndarray) -> np.ndarray:
@@ -196,7 +196,7 @@ class HardTargetEcho:
         return self._without_offsets(records * self._weight[:, None])
 
     def delayed_pulses(self, lags: np.ndarray) -> np.ndarray:
-        """(bins, lags) whitened pulses so many samples after the echo's position."""
+        """(bins, lags) whitened pulses at the echo's position plus lags, in samples."""
         return self._records(self._spectrum[:, None] * self._shift(lags))
 
     def locate(self, lags: np.ndarray, response: np.ndarray, shifts: np.ndarray) -> None:

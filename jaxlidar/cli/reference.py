@@ -1,9 +1,8 @@
 """`jaxlidar reference`."""
 
-import importlib
-import importlib.util
 import re
 import shutil
+import sys
 import types
 from importlib import metadata
 from pathlib import Path
@@ -65,18 +64,17 @@ def _is_module(name: str) -> bool:
     `jaxlidar.simulate` is not: there the function has hidden the module of the same name.
     """
     package, _, member = name.rpartition(".")
-    return not package or isinstance(getattr(importlib.import_module(package), member), types.ModuleType)
+    return not package or isinstance(getattr(sys.modules[package], member), types.ModuleType)
 
 
 def find_pages(packages: list[str]) -> dict[Path, str]:
-    """Find the README.md of each package, and every page that these link to, directly or not.
+    """Find the README.md of each imported package, and every page that these link to, directly or not.
 
     An installed package has its own pages alone; a checkout of the project has those of its examples too.
 
     **Returns:** names of modules for pdoc by path, in the order in which pages are met.
     """
-    specs = (importlib.util.find_spec(name) for name in packages)
-    roots = [Path(spec.origin).resolve().parent for spec in specs if spec and spec.origin]
+    roots = [Path(str(sys.modules[name].__file__)).resolve().parent for name in packages]
     queue = [root / "README.md" for root in roots if (root / "README.md").exists()]
     pages: dict[Path, str] = {}
     while queue:

@@ -1,4 +1,4 @@
-"""Readers of recorded waveforms, voxel maps, points, tree models, meshes and terrain; writers of results."""
+"""Files: recorded waveforms, voxel maps, points, tree models, meshes and terrain; cases and results."""
 
 from jaxlidar._files import atomic_write
 from jaxlidar._signatures import shorten_signatures

@@ -1,7 +1,7 @@
-"""Cases: a lidar or a survey, a scene and how they are simulated, in a TOML file that a person can write.
+"""Cases: a lidar or a survey, a scene and the arguments of a simulation, as TOML that people can write.
 
     [lidar]
-    altitude = 500.0                                  # m; what is left out has the default of the class
+    altitude = 500.0                                  # m; missing keys have the defaults of the class
     pulse = {kind = "GaussianPulse", fwhm = 4.0}
 
     [scene.ground]
@@ -33,22 +33,21 @@ from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.instrument.survey import Survey
 from jaxlidar.io.kinds import UNITS, Argument
 from jaxlidar.io.npz import read_arrays
-from jaxlidar.io.tables import Arrays, check_keys, table_of, value_of
-from jaxlidar.io.toml import tables_of, text_of
+from jaxlidar.io.toml import ArrayReader, check_keys, table_of, tables_of, text_of, value_of
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.simulate import simulate
 
-# Arguments of `simulate` that a file cannot hold, or that a case has as fields of its own.
-_NOT_KEPT = ("lidar", "scene", "key", "plan", "progress")
-SECTIONS = ("lidar", "survey", "scene", "simulate")
+# Arguments of `simulate` that a file cannot hold, or that a case has as fields.
+_EXCLUDED_ARGUMENTS = ("lidar", "scene", "key", "plan", "progress")
+_SECTIONS = ("lidar", "survey", "scene", "simulate")
 # Arguments of `simulate_many`; `simulate` has all but the last as well.
-_OF_SURVEYS = ("rtol", "max_orders", "truth", "shared")
+_SURVEY_ARGUMENTS = ("rtol", "max_orders", "truth", "shared")
 
 
 @final
 @dataclasses.dataclass(frozen=True, eq=False)
 class Case:
-    """A lidar or a survey, a scene and how they are simulated. Any of them may be missing in a file.
+    """A lidar or a survey, a scene and the arguments of their simulation. Any may be missing in a file.
 
     **Arguments:**
 
@@ -59,8 +58,8 @@ class Case:
       `progress`. With a survey: `rtol`, `max_orders` and `shared`. Default: none.
     - `survey`: a `Survey`, which is simulated in place of the lidar, or None. Default None.
 
-    **Raises:** TypeError for a thing of another kind; ValueError for an unknown argument, and for one that
-    `jaxlidar.simulate_many` does not have, with a survey.
+    **Raises:** TypeError for an object of another class; ValueError for an unknown argument, and, with a
+    survey, for one that `jaxlidar.simulate_many` does not have.
 
     **Example:**
 
@@ -83,11 +82,13 @@ class Case:
         if self.key is not None:
             check_key(self.key)
         check_kind("survey", self.survey, Survey | None, "a Survey or None")
-        check_keys(self.arguments, _arguments() if self.survey is None else _OF_SURVEYS, "arguments")
+        check_keys(
+            self.arguments, _simulate_arguments() if self.survey is None else _SURVEY_ARGUMENTS, "arguments"
+        )
 
     def __getstate__(self) -> dict[str, Any]:
-        # A key that is pickled comes back with a generator of its own, which Poisson numbers refuse, its own
-        # and those of other keys.
+        # A pickled key comes back with another object for its generator, and JAX draws Poisson numbers with
+        # the one object of threefry only.
         return {**vars(self), "key": None if self.key is None else _key_table(self.key)}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -96,12 +97,12 @@ class Case:
     def simulate(
         self, progress: Callable[[Any], None] | None = None, path: str | os.PathLike[str] | None = None
     ) -> Any:
-        """The waveform of this case, or those of its survey.
+        """Simulate the waveform of this case, or those of its survey.
 
         **Arguments:**
 
         - `progress`: as for `jaxlidar.simulate`, or for `jaxlidar.simulate_many`. Default None.
-        - `path`: of a survey alone, as for `jaxlidar.simulate_many`. Default None.
+        - `path`: as for `jaxlidar.simulate_many`; for surveys only. Default None.
 
         **Returns:** a `Waveform`, or the `Waveforms` of a survey.
 
@@ -113,8 +114,9 @@ class Case:
         if self.scene is None or self.key is None or missing:
             raise ValueError(f"the case has no {' and no '.join(missing)}: nothing can be simulated")
         if self.survey is not None:
-            given = {"key": self.key, "path": path, "progress": progress, **self.arguments}
-            return simulate_survey(self.survey, self.scene, **given)
+            return simulate_survey(
+                self.survey, self.scene, key=self.key, path=path, progress=progress, **self.arguments
+            )
         if path is not None:
             raise ValueError(
                 f"path = {os.fspath(path)!r} is given without a survey; use save on the waveform"
@@ -124,95 +126,103 @@ class Case:
 
 
 @functools.cache
-def _arguments() -> Mapping[str, Argument]:
-    """The arguments of `simulate` that are kept."""
+def _simulate_arguments() -> Mapping[str, Argument]:
+    """Return the arguments of `simulate` that a case holds."""
     return {
         name: Argument(annotation, False, UNITS.get(name, ""), name)
         for name, annotation in inspect.get_annotations(simulate).items()
-        if name not in (*_NOT_KEPT, "return")
+        if name not in (*_EXCLUDED_ARGUMENTS, "return")
     }
 
 
 def case_text(case: Case, file: str | None = None) -> tuple[str, dict[str, np.ndarray]]:
-    """A case as TOML, and the arrays that lie apart from it, by name; `file` is where they will lie."""
+    """Return a case as TOML, and the arrays that lie apart from the text, by name.
+
+    `file` is the name of the file for the arrays; None where they lie in the same file as the text.
+    """
     arrays: dict[str, np.ndarray] = {}
     tables: dict[str, tuple[dict[str, Any], Callable[..., Any]]] = {}
-    for name, part in (("lidar", case.lidar), ("survey", case.survey), ("scene", case.scene)):
-        if part is not None:
-            tables[name] = (_with_file(table_of(part, name, arrays), file), type(part))
-    given = {key: table_of(value, f"simulate.{key}", arrays) for key, value in case.arguments.items()}
+    for name, value in (("lidar", case.lidar), ("survey", case.survey), ("scene", case.scene)):
+        if value is not None:
+            tables[name] = (_with_array_file(table_of(value, name, arrays), file), type(value))
+    arguments = {key: table_of(value, f"simulate.{key}", arrays) for key, value in case.arguments.items()}
     if case.key is not None:
-        given = {**_key_table(case.key), **given}
-    if given:
-        tables["simulate"] = (given, simulate)
+        arguments = {**_key_table(case.key), **arguments}
+    if arguments:
+        tables["simulate"] = (arguments, simulate)
     return text_of(tables), arrays
 
 
-def _with_file(table: Any, file: str | None) -> Any:
-    """The same table, with the file in which arrays lie named beside them."""
+def _with_array_file(table: Any, file: str | None) -> Any:
+    """Return a table in which references to arrays name their file."""
     if isinstance(table, list):
-        return [_with_file(part, file) for part in table]
+        return [_with_array_file(item, file) for item in table]
     if not isinstance(table, dict):
         return table
     if "array" in table:
         return table if file is None else {"file": file, **table}
-    return {key: _with_file(part, file) for key, part in table.items()}
+    return {key: _with_array_file(item, file) for key, item in table.items()}
 
 
 def _key_table(key: PRNGKeyArray) -> dict[str, Any]:
+    """Return the entries of a random key: its words, and its generator if it is a new-style key."""
     if key.dtype == np.uint32:
         return {"key": np.asarray(key).tolist()}
     return {"key": jax.random.key_data(key).tolist(), "key_kind": str(jax.random.key_impl(key))}
 
 
-def case_of(text: str, path: Path, arrays: Arrays) -> Case:
-    """The case of a TOML text; `path` is the file that it is from, `arrays` gives those that lie apart."""
+def case_of(text: str, path: Path, read_array: ArrayReader) -> Case:
+    """Return the case of a TOML text; `path` is the file that it is from.
+
+    **Raises:** ValueError or TypeError, naming the file and the path of the entry in it.
+    """
     try:
         tables = tables_of(text, path)
-        check_keys(tables, SECTIONS, "")
+        check_keys(tables, _SECTIONS, "")
         survey = tables.get("survey")
         if isinstance(survey, dict) and "lidar" not in survey and "lidar" in tables:
             # The lidar of the case is that of its survey.
             tables = {**tables, "survey": {**survey, "lidar": tables["lidar"]}}
-        parts = {
-            name: value_of(tables[name], Argument(kind, False, "", name), name, arrays, path.parent)
+        fields = {
+            name: value_of(tables[name], Argument(kind, False, "", name), name, read_array, path.parent)
             for name, kind in (("lidar", Lidar), ("survey", Survey), ("scene", Scene))
             if name in tables
         }
-        given = tables.get("simulate", {})
-        check_kind("simulate", given, dict, "a table")
-        known = _arguments()
+        table = tables.get("simulate", {})
+        check_kind("simulate", table, dict, "a table")
+        signature = _simulate_arguments()
         if survey is not None:
-            known = {**known, "shared": Argument(bool | None, False, "", "shared")}
-        check_keys(given, (*known, "seed", "key", "key_kind"), "simulate")
+            signature = {**signature, "shared": Argument(bool | None, False, "", "shared")}
+        check_keys(table, (*signature, "seed", "key", "key_kind"), "simulate")
         arguments = {
-            name: value_of(given[name], known[name], f"simulate.{name}", arrays, path.parent)
-            for name in given
-            if name in known
+            name: value_of(table[name], signature[name], f"simulate.{name}", read_array, path.parent)
+            for name in table
+            if name in signature
         }
-        return Case(**parts, key=_key_of(given), arguments=arguments)
+        return Case(**fields, key=_key_of(table), arguments=arguments)
     except (ValueError, TypeError) as error:
         raise error if str(error).startswith(str(path)) else type(error)(f"{path}: {error}") from error
 
 
-def _key_of(given: Mapping[str, Any]) -> PRNGKeyArray | None:
-    if "seed" in given:
-        if "key" in given:
+def _key_of(table: Mapping[str, Any]) -> PRNGKeyArray | None:
+    """Return the random key of the entries of a table; None where there are none."""
+    if "seed" in table:
+        if "key" in table:
             raise ValueError("simulate has both seed and key; admissible is one of them")
-        return jax.random.key(check_integer("simulate.seed", given["seed"], 0, 2**31 - 1))
-    if "key" not in given:
+        return jax.random.key(check_integer("simulate.seed", table["seed"], 0, 2**31 - 1))
+    if "key" not in table:
         return None
-    words = given["key"]
+    words = table["key"]
     if not isinstance(words, list) or not all(type(w) is int and 0 <= w < 2**32 for w in words):
         raise ValueError(f"simulate.key = {words!r} is no row of whole numbers in [0, {2**32})")
     data = jax.numpy.asarray(np.array(words, np.uint32))
-    kind = given.get("key_kind")
-    if kind is None:
+    generator = table.get("key_kind")
+    if generator is None:
         return data
     try:
-        return jax.random.wrap_key_data(data, impl=kind)
+        return jax.random.wrap_key_data(data, impl=generator)
     except (ValueError, TypeError) as error:
-        raise ValueError(f"simulate.key = {words} is no key of the kind {kind!r}: {error}") from error
+        raise ValueError(f"simulate.key = {words} is no key of the kind {generator!r}: {error}") from error
 
 
 def write_case(path: str | os.PathLike[str], case: Case) -> None:
@@ -225,7 +235,7 @@ def write_case(path: str | os.PathLike[str], case: Case) -> None:
     - `path`: the file to write, `NAME.toml`. The arrays, if there are any, go to `NAME.npz`.
     - `case`: a `Case`.
 
-    **Raises:** TypeError, naming the place, for classes and functions of one's own. ImportError where tomlkit
+    **Raises:** TypeError, naming the entry, for classes and functions of your own. ImportError where tomlkit
     is not installed. ValueError for a path that does not end in .toml, OSError for one that cannot be
     written.
 
@@ -243,18 +253,18 @@ def write_case(path: str | os.PathLike[str], case: Case) -> None:
     path = Path(path)
     if path.suffix != ".toml":
         raise ValueError(f"path = {str(path)!r} does not end in .toml")
-    beside = path.with_suffix(".npz")
-    text, arrays = case_text(case, beside.name)
-    # The arrays first: a text that is there has its arrays.
+    array_path = path.with_suffix(".npz")
+    text, arrays = case_text(case, array_path.name)
+    # The arrays first: a text that exists has its arrays.
     if arrays:
-        with atomic_write(beside) as draft, draft.open("wb") as file:
+        with atomic_write(array_path) as draft, draft.open("wb") as file:
             np.savez_compressed(file, **arrays)  # pyright: ignore[reportArgumentType]
     with atomic_write(path) as draft:
         draft.write_text(text, encoding="utf-8")
 
 
 def read_case(path: Path) -> Case:
-    """The case of a TOML file; see `jaxlidar.io.read_case`."""
+    """Read the case of a TOML file; see `jaxlidar.io.read_case`."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
     try:
@@ -262,9 +272,9 @@ def read_case(path: Path) -> Case:
     except UnicodeDecodeError as error:
         raise ValueError(f"{path}: byte {error.start}: no UTF-8 text") from error
 
-    def arrays(file: str | None, name: str) -> np.ndarray:
+    def read_array(file: str | None, name: str) -> np.ndarray:
         if file is None:
             raise ValueError(f"array = {name!r} has no file: which .npz file it is in")
         return read_arrays(path.parent / file, (name,))[name]
 
-    return case_of(text, path, arrays)
+    return case_of(text, path, read_array)

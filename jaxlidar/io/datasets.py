@@ -36,10 +36,10 @@ from jaxtyping import Bool
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.io.case import Case, case_of, case_text
 from jaxlidar.io.checks import refuse_damage
-from jaxlidar.io.kinds import is_tuple
+from jaxlidar.io.kinds import admits_tuple
 from jaxlidar.io.rows import CHECKSUMS, RowVariables, check_rows, unwritten_rows
 from jaxlidar.io.stores import FORMAT, Store
-from jaxlidar.io.tables import nearest
+from jaxlidar.io.toml import nearest
 from jaxlidar.scenes.scene import Scene
 
 # The group of entry points that name the modules which call `keep_as_netcdf`, by class.
@@ -409,12 +409,12 @@ class _GroupReader:
         if hashlib.sha256(text.encode()).hexdigest() != self._attribute(f"{name}_sha256", name):
             raise ValueError(f"{self._place(name)}: damaged (its checksum is another)")
 
-        def arrays(file: str | None, key: str) -> np.ndarray:
+        def read_array(file: str | None, key: str) -> np.ndarray:
             if file is not None:
                 raise ValueError(f"array = {key!r} lies in {file!r}, not in this file")
             return _GroupReader(self.stored, f"{self.group.rstrip('/')}/{name}_arrays")._numbers(key)
 
-        return case_of(text, self.path, arrays)
+        return case_of(text, self.path, read_array)
 
     def _attribute(self, name: str, place: str | None = None) -> str:
         with refuse_damage(f"{self._place(place or name)}: damaged"):
@@ -428,7 +428,7 @@ class _GroupReader:
         text = self._attribute(name)
         with refuse_damage(f"{self._place(name)}: damaged"):
             value = json.loads(text)
-        return tuple(value) if is_tuple(annotation) else value
+        return tuple(value) if admits_tuple(annotation) else value
 
     def _texts(self, name: str) -> list[str]:
         if name not in self.dataset.variables:

@@ -1,4 +1,4 @@
-"""What a table of a case file can stand for: classes and functions of jaxlidar, with arguments and units."""
+"""Kinds of the tables of a case file: classes and functions of jaxlidar, with their arguments and units."""
 
 import dataclasses
 import functools
@@ -28,12 +28,12 @@ from jaxlidar.plants.voxelise import trim_empty_layers, voxelise
 from jaxlidar.scenes.surfaces import AbstractGround, AbstractSheet, Ground, Plate
 from jaxlidar.scenes.voxels import VoxelMap
 
-# Classes of these rooms are kinds, if the package exports them.
-ROOMS = ("jaxlidar.optics.", "jaxlidar.instrument.", "jaxlidar.scenes.")
-# But for what comes after a simulation.
-RECORDS = ("PhotonCounter", "PhotonEvents")
-# Other ways to make a part of a scene.
-MAKERS: tuple[Callable[..., Any], ...] = (
+# Exported classes of these packages are kinds.
+_PACKAGES = ("jaxlidar.optics.", "jaxlidar.instrument.", "jaxlidar.scenes.")
+# But for receivers and results of photon counting, which come after a simulation.
+_NO_KINDS = ("PhotonCounter", "PhotonEvents")
+# Functions that return scenes or lidars, or objects in them, and classes of other packages.
+_FUNCTIONS: tuple[Callable[..., Any], ...] = (
     *(Branching, Habit, broadleaf, conifer, shrub, spreading_tree, grow, forest),
     *(voxelise, voxelise_mesh, trim_empty_layers),
     *(VoxelMap.from_lad, VoxelMap.from_extinction, VoxelMap.from_probability),
@@ -41,10 +41,10 @@ MAKERS: tuple[Callable[..., Any], ...] = (
     *(LeafAngles.named, LeafAngles.beta, Prospect.paper),
     *(spectrum, read_spectrum_csv, read_vox, read_dem, read_obj, load_coefficients, Coefficients),
 )
-# What a table without `kind` stands for where any class of these is admissible.
-USUAL = {AbstractGround: Ground, AbstractSheet: Plate}
-# Where an argument is not stored under its own name.
-STORED = {(SampledPulse, "power"): "samples"}
+# The class of a table without `kind`, by the abstract class that is admissible.
+_DEFAULT_CLASSES = {AbstractGround: Ground, AbstractSheet: Plate}
+# Fields of arguments that are not stored under their own name.
+_FIELD_NAMES = {(SampledPulse, "power"): "samples"}
 
 DEGREES = "degrees"
 COMPASS = "degrees clockwise from north"
@@ -130,27 +130,27 @@ UNITS_OF = {
 
 
 class Argument(NamedTuple):
-    """An argument of a kind: what it may be, whether it must be given, its unit, and where it is stored."""
+    """An argument of a kind: annotation, True if it has no default, unit, and the field with its value."""
 
     annotation: Any
     required: bool
     unit: str
-    stored: str
+    field: str
 
 
 @functools.cache
 def kinds() -> Mapping[str, Callable[..., Any]]:
-    """All kinds by name: exported classes of scenes, lidars and optics, and functions that make them."""
+    """Return all kinds by name: exported classes of scenes, lidars and optics, and functions."""
     classes = {
         name: value
         for name, value in public_objects.items()
         if isinstance(value, type)
         and issubclass(value, eqx.Module)
-        and value.__module__.startswith(ROOMS)
+        and value.__module__.startswith(_PACKAGES)
         and not inspect.isabstract(value)
-        and name not in RECORDS
+        and name not in _NO_KINDS
     }
-    return {**classes, **{maker.__qualname__: maker for maker in MAKERS}}
+    return {**classes, **{function.__qualname__: function for function in _FUNCTIONS}}
 
 
 def current_kind(name: str) -> str:
@@ -162,30 +162,31 @@ def current_kind(name: str) -> str:
 
 
 @functools.cache
-def arguments_of(maker: Callable[..., Any]) -> Mapping[str, Argument]:
-    """The arguments of a class or function by name, in their order."""
+def arguments_of(kind: Callable[..., Any]) -> Mapping[str, Argument]:
+    """Return the arguments of a class or function by name, in their order."""
     # Signatures are shortened for display; the annotations of fields and functions are the real ones.
-    own = dataclasses.fields(maker) if isinstance(maker, type) and dataclasses.is_dataclass(maker) else ()
-    fields = {f.name: f for f in own}
-    annotations = inspect.get_annotations(maker.__init__ if isinstance(maker, type) else maker)
-    found = {}
-    for name, parameter in inspect.signature(maker).parameters.items():
+    fields = {}
+    if isinstance(kind, type) and dataclasses.is_dataclass(kind):
+        fields = {field.name: field for field in dataclasses.fields(kind)}
+    annotations = inspect.get_annotations(kind.__init__ if isinstance(kind, type) else kind)
+    arguments = {}
+    for name, parameter in inspect.signature(kind).parameters.items():
         if parameter.kind is parameter.VAR_KEYWORD:
-            # Of habits by name: changes of what they have.
+            # The functions of habits, such as `broadleaf`, take changes of the fields of a `Habit`.
             return arguments_of(Habit)
-        stored = STORED.get((maker, name), name)  # pyright: ignore[reportArgumentType, reportCallIssue]
-        annotation = fields[stored].type if stored in fields else annotations.get(name, Any)
-        unit = UNITS_OF.get((maker, name), UNITS.get(name, ""))  # pyright: ignore[reportArgumentType, reportCallIssue]
-        found[name] = Argument(annotation, parameter.default is parameter.empty, unit, stored)
-    return found
+        field = _FIELD_NAMES.get((kind, name), name)  # pyright: ignore[reportArgumentType, reportCallIssue]
+        annotation = fields[field].type if field in fields else annotations.get(name, Any)
+        unit = UNITS_OF.get((kind, name), UNITS.get(name, ""))  # pyright: ignore[reportArgumentType, reportCallIssue]
+        arguments[name] = Argument(annotation, parameter.default is parameter.empty, unit, field)
+    return arguments
 
 
-def made(maker: Callable[..., Any], arguments: Mapping[str, Any]) -> Any:
-    """What a class or function gives; of what a reader reports, the voxel map, terrain or mesh alone.
+def call_kind(kind: Callable[..., Any], arguments: Mapping[str, Any]) -> Any:
+    """Return the result of a class or function; of that of a reader, the voxel map, terrain or mesh alone.
 
-    **Raises:** what `maker` raises; ValueError where a reader left anything out.
+    **Raises:** what `kind` raises; ValueError where a reader left voxels out that no `fill` is given for.
     """
-    result = maker(**arguments)
+    result = kind(**arguments)
     if isinstance(result, DemRead):
         return result.terrain
     if isinstance(result, MeshRead):
@@ -200,34 +201,39 @@ def made(maker: Callable[..., Any], arguments: Mapping[str, Any]) -> Any:
     return result.voxels
 
 
-def choices(annotation: Any) -> tuple[Any, ...]:
-    """The members of a union, or the annotation itself."""
+def union_members(annotation: Any) -> tuple[Any, ...]:
+    """Return the members of a union, or the annotation itself."""
     if typing.get_origin(annotation) in (typing.Union, types.UnionType):
-        return tuple(c for member in typing.get_args(annotation) for c in choices(member))
+        return tuple(m for argument in typing.get_args(annotation) for m in union_members(argument))
     return (annotation,)
 
 
-def item_of(annotation: Any) -> Any:
-    """What the items of a sequence may be."""
-    for choice in choices(annotation):
-        if typing.get_origin(choice) in (tuple, list, Iterable, Sequence) and typing.get_args(choice):
-            return typing.get_args(choice)[0]
+def item_annotation(annotation: Any) -> Any:
+    """Return the annotation of the items of a sequence."""
+    for member in union_members(annotation):
+        if typing.get_origin(member) in (tuple, list, Iterable, Sequence) and typing.get_args(member):
+            return typing.get_args(member)[0]
     return Any
 
 
-def is_tuple(annotation: Any) -> bool:
-    """Whether a tuple is admissible."""
-    return any(choice is tuple or typing.get_origin(choice) is tuple for choice in choices(annotation))
+def admits_tuple(annotation: Any) -> bool:
+    """Return True if a tuple is admissible."""
+    return any(m is tuple or typing.get_origin(m) is tuple for m in union_members(annotation))
 
 
-def is_text(annotation: Any) -> bool:
-    """Whether a string is admissible."""
-    return any(choice is str for choice in choices(annotation))
+def admits_text(annotation: Any) -> bool:
+    """Return True if a string is admissible."""
+    return any(member is str for member in union_members(annotation))
 
 
-def usual_of(annotation: Any) -> Callable[..., Any] | None:
-    """The one class that an argument can be, if there is only one, or one that is usual."""
-    known = set(kinds().values())
-    found = {USUAL.get(choice, choice) for choice in choices(annotation) if isinstance(choice, type)}
-    fitting = [kind for kind in found if kind in known]
-    return fitting[0] if len(fitting) == 1 else None
+def admits_mapping(annotation: Any) -> bool:
+    """Return True if a mapping is admissible."""
+    classes = (getattr(member, "__origin__", member) for member in union_members(annotation))
+    return any(isinstance(c, type) and issubclass(c, Mapping) for c in classes)
+
+
+def default_kind(annotation: Any) -> Callable[..., Any] | None:
+    """Return the class of a table without `kind`: the only one that is admissible, or a default class."""
+    classes = {_DEFAULT_CLASSES.get(m, m) for m in union_members(annotation) if isinstance(m, type)}
+    admissible = classes & set(kinds().values())
+    return admissible.pop() if len(admissible) == 1 else None

@@ -51,7 +51,7 @@ class HasErrors(Protocol):
 
 
 class EstimateErrors(NamedTuple):
-    """Errors of an estimate, of which the largest standard error is not needed if there is no `atol`."""
+    """Errors of an estimate; the largest standard error is needed for an `atol` alone."""
 
     relative: Any
     largest: Any = math.inf

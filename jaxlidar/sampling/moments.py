@@ -34,8 +34,8 @@ class RunningMoments(NamedTuple):
     - `count`: number of batches; an int on the host, an int32 scalar in compiled programs.
     - `mean`: tree of arrays, the mean of the quantities whose standard errors are needed.
     - `squares`: the same tree, their sums of squared deviations.
-    - `mean_only`: tree of arrays, the mean of quantities whose errors nobody asks for. Squared deviations of
-      whole responses would double the memory and the time that they take.
+    - `mean_only`: tree of arrays, the mean of quantities without standard errors. Squared deviations of
+      responses would double the memory and the time that they take.
     """
 
     count: Any

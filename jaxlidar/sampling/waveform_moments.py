@@ -2,7 +2,7 @@
 
 Waveforms at thousands of wavelengths follow linearly from those at some thirty pivot wavelengths: W_n = A^T
 P_n, with the matrix A of interpolation coefficients (pivots, wavelengths) of an interpolative decomposition.
-Batches are kept at the pivots alone. Their means are interpolated as they are. Standard errors are not
+Batches are evaluated at the pivots alone. Their means are interpolated as they are. Standard errors are not
 linear, but the scaled deviations e_n of `jaxlidar.sampling.moments` are, so that the squared deviations at
 all wavelengths are
 

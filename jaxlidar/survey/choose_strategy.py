@@ -24,8 +24,8 @@ from jaxlidar.survey.view_geometry import ViewGeometry
 # Fractions of the tolerance that parallel light may take, and the grid of nodes; the finest grid may take
 # more.
 _PARALLEL_LIGHT, _GRID, _FINEST_GRID = 0.5, 0.2, 0.5
-# Where responses are kept by shot, the grid serves only absorption and escape: its error may be as large as
-# this.
+# Where responses are tallied by shot, the grid serves only absorption and escape: its error may be as large
+# as this.
 _GRID_BY_SHOT = 0.01
 # Coefficients below this fraction of the tolerance, of the largest, do not count.
 _FAINT = 0.01
@@ -158,7 +158,7 @@ def reason_against_sharing(survey: Survey, setup: Setup, rtol: float) -> str | N
     if not beams_are_parallel(survey):
         return "shots have more than one direction"
     if _is_by_shot(survey) and setup.plan.orders == 1:
-        return "one order is followed, which shots that lean or have a field of view do not share"
+        return "one order is followed, which oblique shots and shots with a field of view do not share"
     if not setup.plan.is_random:
         return "nothing is random"
     if concrete_number(lidar.divergence) == 0:
@@ -166,7 +166,7 @@ def reason_against_sharing(survey: Survey, setup: Setup, rtol: float) -> str | N
     # Where leaves transmit straight on, extinction depends on wavelength: photons cannot be shared among
     # wavelengths.
     if canopy is not None and canopy.is_straight:
-        return "transmission = 'straight': light of every wavelength goes its own way"
+        return "transmission = 'straight': light of every wavelength takes other paths"
     # A mirror returns the image of the beam, which depends on the spreading that parallel light lacks.
     if any(isinstance(s.law, AbstractMirror) for s in setup.scene.surfaces):
         return "a surface is a mirror"

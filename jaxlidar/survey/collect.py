@@ -5,7 +5,7 @@ import itertools
 import os
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping, MutableMapping
+from collections.abc import Iterator, Mapping, MutableMapping
 from typing import Any
 
 import jax
@@ -13,8 +13,8 @@ import numpy as np
 
 from jaxlidar._summary import NOTABLE_FRACTION, percent
 from jaxlidar.io.case import Case
+from jaxlidar.io.checkpoint import Checkpoint
 from jaxlidar.io.netcdf import by_rows
-from jaxlidar.io.parts import Parts
 from jaxlidar.io.rows import unwritten_rows
 from jaxlidar.simulate import LateLightWarning
 from jaxlidar.spectral.apply_optics import make_waveform_model
@@ -24,11 +24,17 @@ from jaxlidar.survey.waveforms import Waveforms
 
 
 class StoredResults(MutableMapping[int, Any]):
-    """Results of tasks in files, by number; `result_class` returns the class of each."""
+    """Results of a survey's tasks by number, in a checkpoint."""
 
-    def __init__(self, result_files: Parts, result_class: Callable[[int], Any]):
-        self.result_files, self.result_class = result_files, result_class
-        self.numbers = result_files.done()
+    def __init__(self, checkpoint: Checkpoint, strategy: AbstractStrategy):
+        self.checkpoint, self.strategy = checkpoint, strategy
+        # Every entry is read once here: damaged ones are traced again with the missing ones.
+        self.numbers = {number for number, _ in checkpoint.intact_entries(self._decode)}
+
+    def _decode(self, number: int, arrays: Mapping[str, np.ndarray]) -> Any:
+        if not 0 <= number < self.strategy.n_tasks:
+            raise ValueError(f"its number is outside the admissible range [0, {self.strategy.n_tasks - 1}]")
+        return _from_arrays(self.strategy.result_class(number), arrays)
 
     def __len__(self) -> int:
         return len(self.numbers)
@@ -40,14 +46,14 @@ class StoredResults(MutableMapping[int, Any]):
         return number in self.numbers
 
     def __getitem__(self, number: int) -> Any:
-        return _from_arrays(self.result_class(number), self.result_files[number])
+        return _from_arrays(self.strategy.result_class(number), self.checkpoint.read(number))
 
     def __setitem__(self, number: int, result: Any) -> None:
-        self.result_files.add(number, _as_arrays(result))
+        self.checkpoint.add(number, _as_arrays(result))
         self.numbers.add(number)
 
     def __delitem__(self, number: int) -> None:
-        raise TypeError("results in files are not deleted")
+        raise TypeError("results in a checkpoint are not deleted")
 
 
 def waveforms_in_memory(
@@ -57,6 +63,7 @@ def waveforms_in_memory(
     start_time: float,
 ) -> Waveforms:
     """Return all waveforms. `survey_fields`: the fields of `Waveforms` that are known before any tracing."""
+    # Blocks come in the order of shots.
     blocks = [results for _, results in strategy.shot_results(task_results)]
     results: ShotResults = jax.tree.map(lambda *a: np.concatenate(a), *blocks)
     _warn_of_late_light(strategy, float(np.max(results.energy_budget["after the window"], initial=0.0)))
@@ -130,6 +137,7 @@ def _as_arrays(result: Any) -> dict[str, np.ndarray]:
     arrays, fields = {}, vars(result) if dataclasses.is_dataclass(result) else result._asdict()
     for field, value in fields.items():
         if isinstance(value, dict):
+            # Files of arrays know no dicts: without a name of its own, an empty one would be lost.
             items = {f"{field}/{item}": array for item, array in value.items()}
             arrays |= items or {f"{field}/": np.empty(0)}
         elif value is not None:

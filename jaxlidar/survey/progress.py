@@ -51,6 +51,7 @@ class ProgressClock:
     @property
     def rate(self) -> float:
         """Shots per s in this run; 0 before the first."""
+        # Shots of earlier runs took none of this run's time.
         return (self.done - self.stored) / max(self.seconds, 1e-9)
 
     @property

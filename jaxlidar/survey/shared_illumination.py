@@ -15,15 +15,15 @@ Light enters about the nodes n of a grid with the spacing d, with the density of
 p = 1 / d^2.
 
 - *By node.* Straight down and without a field of view, V_f = 1 and I_f is a sum of the splines with
-  coefficients c_fn (`jaxlidar.survey.footprint_splines`). Responses are kept by node. Photons of two nodes
+  coefficients c_fn (`jaxlidar.survey.footprint_splines`). Responses are tallied by node. Photons of two nodes
   are independent, so that
 
       W_f = sum_n c_fn W_n,    Var W_f = sum_n c_fn^2 Var W_n + sum_n (m_fn W_n)^2
 
   where the last term is the error of the grid: the energy m_fn that the spline misplaces about the node.
 - *By shot.* Otherwise I_f(a) / p(a) V_f(b) = d^2 I_f(a) V_f(b) is computed for each path and each shot that
-  may see it (`jaxlidar.survey.view_geometry`), without any error of the grid. Responses are kept by shot. The
-  first order is traced for each shot alone: a lattice of its own rays has less variance than rays that it
+  may see it (`jaxlidar.survey.view_geometry`), without any error of the grid. Responses are tallied by shot.
+  The first order is traced for each shot alone: a lattice of its own rays has less variance than rays that it
   shares. Absorbed and escaped energy is tallied by node: it is seen by no receiver.
 
 Nodes are traced in groups (`jaxlidar.survey.node_groups`), which are the tasks. If a group has the fraction s
@@ -167,7 +167,7 @@ class GroupContext(NamedTuple):
 def make_group_context(setup: Setup, spacing: float, view_geometry: ViewGeometry | None) -> GroupContext:
     """Return the common inputs of groups over a grid of that spacing."""
     model = make_waveform_model(setup)
-    # The air's own return is not random and has no share in the light of nodes: `_complete_shot` adds it
+    # The air's own return is not random and is no part of the light of nodes: `_complete_shot` adds it
     # once.
     without_air = dataclasses.replace(model.for_applied_optics(), air_return=None)
     plan = setup.plan

@@ -3,8 +3,8 @@
 1. Check the arguments.
 2. Choose the strategy that cuts the shots into tasks: per shot (`per_shot`), shared illumination
    (`shared_illumination`), or, for a scene larger than memory, one of these for each tile (`tiled_scene`).
-3. Run the tasks: in this process, on its devices, or by workers. With a `path`, results go to files as they
-   come, and a later call runs the remaining tasks alone.
+3. Run the tasks: in this process, on its devices, or by workers. With a `path`, results go to a checkpoint as
+   they come, and a later call runs the remaining tasks alone.
 4. Collect their results in `Waveforms` (`collect`).
 """
 
@@ -26,7 +26,7 @@ from jaxlidar._registry import simulate_survey
 from jaxlidar._workers import WorkUnit, outcomes
 from jaxlidar.instrument.survey import Survey
 from jaxlidar.io.case import Case, case_text
-from jaxlidar.io.parts import Parts, refuse_another
+from jaxlidar.io.checkpoint import check_same_problem, open_checkpoint
 from jaxlidar.scenes.scene import Scene, check_kinds
 from jaxlidar.scenes.scene_parts import SceneParts
 from jaxlidar.survey.choose_strategy import choose_strategy
@@ -84,10 +84,10 @@ def simulate_many(
     - `max_orders`: number of scatterings followed, at least 1. Default None: from `rtol` and the largest
       albedo.
     - `path`: a netCDF file, or a Zarr store (".zarr"), for the waveforms. It appears when all are traced,
-      with its case, so that `jaxlidar.rerun` can simulate them again. Until then the folder "PATH.parts" has
-      the results so far; the same call continues with them, also after it was killed. If the file exists
-      already, it is read. Only a few shots are in memory at a time, also of a netCDF file that is returned:
-      see `jaxlidar.open`. Default None: no file.
+      with its case, so that `jaxlidar.rerun` can simulate them again. Until then the file "PATH.parts" (of
+      SQLite) has the results so far; the same call continues with them, also after it was killed. One run at
+      a time can use it. If the file exists already, it is read. Only a few shots are in memory at a time,
+      also of a netCDF file that is returned: see `jaxlidar.open`. Default None: no file.
     - `executor`: a `concurrent.futures.Executor`, whose workers trace chunks of shots: a process pool (with
       the start method "spawn" or "forkserver"), that of a Dask client (`client.get_executor()`; the extra
       `cluster` installs Dask), of mpi4py. A chunk whose worker dies gets a second try. Default None: this
@@ -109,7 +109,8 @@ def simulate_many(
     **Raises:** TypeError for arguments of another class. ValueError, before any work, for inadmissible
     arguments, a scene that reaches up to the sensor, shots that do not meet the ground, a receiver whose
     window opens at the first return, shots that must share light and cannot, and a `path` with results of
-    another problem, naming what differs. RuntimeError where the workers of a chunk die twice.
+    another problem, naming what differs. OSError for a `path` that another run uses, or that cannot be
+    written. RuntimeError where the workers of a chunk die twice.
 
     **Example:**
 
@@ -184,15 +185,16 @@ def simulate_many(
     # A complete file stands for the call that made it.
     if Path(path).exists():
         waveforms = Waveforms.open(path)
-        refuse_another(Path(path), waveforms.info.get("problem", {}), problem)
+        check_same_problem(path, waveforms.info.get("problem", {}), problem)
         return waveforms
     arguments = {"rtol": rtol, "max_orders": max_orders, "shared": shared, "truth": truth}
     case = None if isinstance(scene, SceneParts) else _case(survey, scene, key, arguments)
-    result_files = Parts(path, problem)
-    stored_results = StoredResults(result_files, strategy.result_class)
-    task_results = _trace(strategy, key, run_tasks, progress, stored_results)
-    waveforms = waveforms_on_disk(strategy, survey_fields, task_results, start_time, path, problem, case)
-    result_files.remove()
+    path = Path(path)
+    with open_checkpoint(path.with_name(path.name + ".parts"), problem) as checkpoint:
+        stored_results = StoredResults(checkpoint, strategy)
+        task_results = _trace(strategy, key, run_tasks, progress, stored_results)
+        waveforms = waveforms_on_disk(strategy, survey_fields, task_results, start_time, path, problem, case)
+        checkpoint.remove()
     return waveforms
 
 

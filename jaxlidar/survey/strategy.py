@@ -15,7 +15,7 @@ from jaxlidar.survey.results import ShotResults
 
 @dataclasses.dataclass(frozen=True)
 class AbstractStrategy(abc.ABC):
-    """A way to trace the shots of a survey.
+    """A strategy to trace the shots of a survey.
 
     Tasks are independent of one another, so that any process may do them, in any order, now or in a later
     run.

@@ -67,6 +67,7 @@ class Truths(eqx.Module):
         return Truth(time=time, height=height, **fields)
 
 
+# In files, truths are a group of their own beside the waveforms.
 keep_as_netcdf(
     Truths,
     "truth of the shots of a survey",

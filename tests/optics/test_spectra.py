@@ -32,10 +32,12 @@ def test_library():
 
 
 def test_bark_and_soil_have_the_brightness_and_colour_of_their_kind():
+    # Bark is dark in the green, and brighter in the near infrared.
     for name in spectrum_names("bark"):
         green, infrared = spectrum(name)(LASERS)[:2]
         assert 0.04 < green < 0.4
         assert 1.5 < infrared / green < 10
+    # Soils darken by name; red soil reflects little blue light.
     brightness = [float(spectrum(f"soil-{s}")(1064.0)) for s in ("very-dark", "dark", "medium", "bright")]
     assert brightness == sorted(brightness)
     assert float(spectrum("soil-red")(650.0)) > 3 * float(spectrum("soil-red")(450.0))

@@ -14,9 +14,8 @@ import pytest
 
 import inversion
 import jaxlidar as jl
-from inversion.fit.columns import columns_at_once
-from inversion.fit.model import Model
-from inversion.fit.unknowns import settle
+from inversion.fit.model import Model, tangents_per_pass
+from inversion.fit.unknowns import bind_unknowns
 from jaxlidar.planning import memory
 from jaxlidar.planning.memory import check_memory, format_bytes, memory_limit
 from jaxlidar.spectral.pulse_convolution import pulse_convolution
@@ -105,12 +104,12 @@ def test_when_optics_are_applied_while_light_is_traced():
     assert "optics applied while light is traced" in str(plan)
     assert jl.plan(jl.Lidar(), scene, describe=False, max_orders=10).config.keeps_histories
     unknown = inversion.Unknown("ground.reflectance", bounds=(0.1, 1.0))
-    bound_unknowns = settle([unknown], scene)
+    bound_unknowns = bind_unknowns([unknown], scene)
     for case_plan, traces in (
         (plan, True),
         (jl.plan(jl.Lidar(), scene, describe=False, max_orders=3), False),
     ):
-        assert Model(jl.Lidar(), scene, case_plan, bound_unknowns, KEY).traces == traces
+        assert Model(jl.Lidar(), scene, case_plan, bound_unknowns, KEY).retraces == traces
     with pytest.raises(ValueError, match="300 orders, too many to keep histories"):
         jl.analog_returns(jl.Lidar(), scene, plan, key=KEY, n_photons=10)
 
@@ -203,7 +202,7 @@ def layered(orders, layers=4, end=100.0, max_memory=None, **settings):
     plan = jl.plan(TWO_WAVELENGTHS, scene, max_orders=orders, window=(-81.0, end), describe=False, **settings)
     plan = dataclasses.replace(plan, scope=plan.scope._replace(max_memory=max_memory))
     layer_factors = {"bounds": (0.5, 2.0), "start": np.ones(layers), "apply": layers_scaled, "name": "layers"}
-    bound_unknowns = settle(
+    bound_unknowns = bind_unknowns(
         [
             inversion.Unknown(**layer_factors),
             inversion.Unknown("ground.height", bounds=(-1.0, 1.0)),
@@ -218,7 +217,7 @@ def layered(orders, layers=4, end=100.0, max_memory=None, **settings):
 
 def room_for(model, columns):
     """Return the memory of `columns` columns at once, GB."""
-    return 1.0001e-9 * model.problem.plan.jacobian_memory(columns)
+    return 1.0001e-9 * model.forward.plan.jacobian_memory(columns)
 
 
 def test_columns_of_a_jacobian_are_computed_in_groups_if_memory_is_short():
@@ -227,12 +226,16 @@ def test_columns_of_a_jacobian_are_computed_in_groups_if_memory_is_short():
     expected = unlimited(start)
     limits = [room_for(unlimited, n) for n in (2, 1)]
     model, _ = layered(1, max_memory=limits[0])
-    assert (unlimited.problem.at_once, model.problem.at_once, expected.jacobian.shape[-1]) == (5, 2, 6)
+    assert (
+        unlimited.forward.tangents_per_pass,
+        model.forward.tangents_per_pass,
+        expected.jacobian.shape[-1],
+    ) == (5, 2, 6)
     grouped = model(start)
     np.testing.assert_allclose(grouped.jacobian, expected.jacobian, rtol=1e-3, atol=1e-5)
     np.testing.assert_allclose(grouped.total, expected.total, rtol=1e-5, atol=1e-8)
     assert np.abs(grouped.jacobian).max(axis=(0, 1)).min() > 1e-5
-    assert layered(1, max_memory=limits[1])[0].problem.at_once == 1
+    assert layered(1, max_memory=limits[1])[0].forward.tangents_per_pass == 1
     with pytest.raises(ValueError, match=r"one at a time; admissible is max_memory = .* GB of the plan"):
         layered(1, max_memory=0.5 * limits[1])
 
@@ -243,7 +246,7 @@ def test_derivatives_have_no_histories_beyond_the_last_order():
     settings = {"n_photons": 16, "window": (-81.0, 50.0), "describe": False}
     plan = jl.plan(TWO_WAVELENGTHS, scene, max_orders=9, **settings)
     n_channels = len(plan.config.channels)
-    assert 9 == plan.degree < plan.config.degree
+    assert 9 == plan.config.degree < plan.config.degree
     setup = jl.make_setup(TWO_WAVELENGTHS, scene, plan)
     shapes = jax.eval_shape(lambda key: jl.trace_scene(setup, key, reverse=False), KEY)
     assert shapes.higher.shape[2] == math.comb(9 + n_channels, n_channels)
@@ -256,11 +259,11 @@ def test_derivatives_have_no_histories_beyond_the_last_order():
 
 def test_groups_have_about_equal_sizes():
     model = layered(4)[0]
-    plan = model.problem.plan
+    plan = model.forward.plan
     for columns, room, expected in ((0, 1, 0), (7, 7, 7), (7, 6, 4), (7, 3, 3), (20, 9, 7)):
         scope = plan.scope._replace(max_memory=room_for(model, room))
         limited = dataclasses.replace(plan, scope=scope)
-        assert columns_at_once(limited, columns) == expected
+        assert tangents_per_pass(limited, columns) == expected
 
 
 MEASURE_MEMORY = """
@@ -310,7 +313,7 @@ from tests.planning.test_memory import layered, room_for
 orders, layers, end = int(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3])
 model, start = layered(orders, layers, end, max_memory=15.0, n_photons=2048)
 model(start)
-assert model.problem.at_once == layers + 1
+assert model.forward.tangents_per_pass == layers + 1
 print(1e9 * room_for(model, layers + 1), watched(lambda: model(start)))
 """
 

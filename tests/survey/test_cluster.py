@@ -5,7 +5,7 @@ import os
 import pytest
 
 import jaxlidar as jl
-from tests.inversion.fit.test_batch import fit, footprints  # noqa: F401
+from tests.inversion.fit.test_retrieval_many import fit, footprints  # noqa: F401
 from tests.survey.test_simulate_many import FAST, KEY, die_once, nadir, same, stand
 
 distributed = pytest.importorskip("distributed")

@@ -1,8 +1,10 @@
 """Surveys against single simulations: agreement, repeatability, interrupted runs, workers, bad input."""
 
 import concurrent.futures
+import contextlib
 import multiprocessing
 import os
+import sqlite3
 import warnings
 from pathlib import Path
 
@@ -270,6 +272,12 @@ class Stopped(Exception):
     pass
 
 
+def stored_tasks(path):
+    """Return the numbers of the tasks in the checkpoint of a run that writes `path`."""
+    with contextlib.closing(sqlite3.connect(f"{path}.parts")) as connection:
+        return {number for (number,) in connection.execute("SELECT number FROM entries")}
+
+
 def test_an_interrupted_run_continues(tmp_path):
     survey, scene, path = nadir(16), stand(), tmp_path / "many.nc"
     uninterrupted = jl.simulate_many(survey, scene, key=KEY, **FAST)
@@ -281,14 +289,14 @@ def test_an_interrupted_run_continues(tmp_path):
     with pytest.raises(Stopped):
         jl.simulate_many(survey, scene, key=KEY, **FAST, path=path, progress=stop)
     assert not path.exists()
-    stored = sorted(p.name for p in (tmp_path / "many.nc.parts").glob("*.npz"))
-    assert len(stored) >= 3
+    n_stored = len(stored_tasks(path))
+    assert n_stored >= 3
     with pytest.raises(ValueError, match=r"another problem, which differs in scene; nothing is overwritten"):
         jl.simulate_many(survey, stand(0.3), key=KEY, **FAST, path=path)
     reports = []
     waveforms = jl.simulate_many(survey, scene, key=KEY, **FAST, path=path, progress=reports.append)
     assert same(uninterrupted, waveforms)
-    assert (reports[0].done, reports[-1].done, reports[-1].total) == (2 * len(stored) + 2, 16, 16)
+    assert (reports[0].done, reports[-1].done, reports[-1].total) == (2 * n_stored + 2, 16, 16)
     assert reports[-1].left == 0.0
     assert str(reports[-1]).startswith("16 of 16 shots")
     assert not (tmp_path / "many.nc.parts").exists()
@@ -301,6 +309,14 @@ def test_an_interrupted_run_continues(tmp_path):
         jl.simulate_many(survey, scene, key=jax.random.key(6), **FAST, path=path)
 
 
+def test_one_run_at_a_time_writes_a_file(tmp_path):
+    path = tmp_path / "many.nc"
+    with contextlib.closing(sqlite3.connect(f"{path}.parts", isolation_level=None)) as connection:
+        connection.execute("BEGIN EXCLUSIVE")
+        with pytest.raises(OSError, match=r"many\.nc\.parts is in use by another run"):
+            jl.simulate_many(nadir(16), stand(), key=KEY, **FAST, path=path)
+
+
 def test_damaged_files_are_refused_by_name(tmp_path):
     survey, scene, path = nadir(16), stand(), tmp_path / "many.nc"
 
@@ -309,9 +325,16 @@ def test_damaged_files_are_refused_by_name(tmp_path):
 
     with pytest.raises(Stopped):
         jl.simulate_many(survey, scene, key=KEY, **FAST, path=path, progress=stop)
-    result_file = next((tmp_path / "many.nc.parts").glob("*.npz"))
-    result_file.write_bytes(result_file.read_bytes()[:100])
-    with pytest.raises(ValueError, match=rf"{result_file.name}: damaged"):
+    # A damaged task is named and traced again; a damaged file is refused.
+    number = min(stored_tasks(path))
+    with contextlib.closing(sqlite3.connect(f"{path}.parts", isolation_level=None)) as connection:
+        connection.execute("UPDATE entries SET content = substr(content, 1, 100) WHERE number = ?", (number,))
+    with pytest.warns(UserWarning, match=rf"many\.nc\.parts is damaged, and .* again: entry {number} "):
+        many = jl.simulate_many(survey, scene, key=KEY, **FAST, path=path)
+    assert same(many, jl.simulate_many(survey, scene, key=KEY, **FAST))
+    path.unlink()
+    (tmp_path / "many.nc.parts").write_bytes(b"no checkpoint")
+    with pytest.raises(ValueError, match=r"many\.nc\.parts is damaged or no checkpoint"):
         jl.simulate_many(survey, scene, key=KEY, **FAST, path=path)
     path.write_bytes(b"no netCDF")
     with pytest.raises(ValueError, match=r"many.nc: byte 0: no netCDF-4 file"):

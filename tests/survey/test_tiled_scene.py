@@ -9,6 +9,7 @@ import pytest
 
 import jaxlidar as jl
 from jaxlidar.survey.tiled_scene import lossless_margin, tiles_of
+from tests.survey.test_simulate_many import stored_tasks
 
 SIDE, TALL = 48, 6
 LEAF = jl.LeafOptics(0.5, 0.45)
@@ -138,7 +139,7 @@ def test_an_interrupted_run_continues_with_the_same_results(tmp_path):
     options = {"max_orders": 1, "path": path}
     with pytest.raises(KeyboardInterrupt):
         simulate_forest(tiled(Forest()), progress=interrupt, **options)
-    stored = list((tmp_path / "many.nc.parts").glob("*.npz"))
+    stored = stored_tasks(path)
     assert 0 < len(stored) < 4
     continued = simulate_forest(tiled(Forest()), **options)
     with ThreadPoolExecutor(2) as executor:

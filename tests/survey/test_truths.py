@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import jaxlidar as jl
+from tests.survey.test_simulate_many import stored_tasks
 
 h5py = pytest.importorskip("h5py")
 
@@ -76,7 +77,7 @@ def test_truths_are_stored_in_files_and_a_killed_run_continues(waveforms, tmp_pa
 
     with pytest.raises(Killed):
         jl.simulate_many(OBLIQUE, SCENE, **OPTIONS, path=path, progress=kill)
-    assert len(list((tmp_path / "many.nc.parts").glob("*.npz"))) > 2
+    assert len(stored_tasks(path)) > 2
     stored = jl.simulate_many(OBLIQUE, SCENE, **OPTIONS, path=path)
     assert same(stored, waveforms)
     assert isinstance(stored.truth.gap_probability, np.memmap)

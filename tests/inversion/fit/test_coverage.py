@@ -16,14 +16,14 @@ def test_retrievals_reach_the_bound_and_their_intervals_cover(tmp_path, monkeypa
     options = ["--targets", "16", "--photons", "8192", "--starts", "2", "--exact", "2"]
     monkeypatch.setattr(sys, "argv", ["retrieval_coverage.py", "--out", str(tmp_path), *options])
     try:
-        found = importlib.import_module("retrieval_coverage").main()
+        summary = importlib.import_module("retrieval_coverage").main()
     finally:
         for name in ("_common", "retrieval_coverage"):
             sys.modules.pop(name, None)
-    assert found["converged"] >= 0.9
+    assert summary["converged"] >= 0.9
     # 112 intervals, of which neighbours share a fit: 0.95 with a standard error of about 0.03.
-    assert 0.86 <= found["covered"] <= 1.0
-    for unknown in found["unknowns"].values():
+    assert 0.86 <= summary["covered"] <= 1.0
+    for unknown in summary["unknowns"].values():
         # The root mean square of 16 normal numbers is below 1.5 in 99.9 % of cases.
         assert unknown["rms_over_bound"] < 1.5
         assert unknown["noise_free_median"] < 5e-3

@@ -1,7 +1,7 @@
-"""Unknowns that change extinction alone: which they are, and a fit's Jacobian without tangents.
+"""Unknowns that change extinction only: their detection, and a fit's Jacobian by score functions.
 
-The Jacobian of a model whose columns of extinction are scored is compared with that of the same model where
-they are pushed through the trace as tangents, on the same keys: they differ in rounding alone.
+The Jacobian of a model whose extinction columns come from scores is compared with that of the same model with
+tangents pushed through the trace, on the same keys: they differ only by rounding.
 """
 
 import dataclasses
@@ -14,9 +14,9 @@ import pytest
 
 import inversion
 import jaxlidar as jl
-from inversion.fit import extinction
-from inversion.fit.model import Model
-from inversion.fit.unknowns import settle
+from inversion.fit import model as fit_model
+from inversion.fit.model import Model, choose_jacobian_methods, max_columns_per_voxel
+from inversion.fit.unknowns import bind_unknowns, flat_start
 
 KEY = jax.random.key(7)
 LIDAR = jl.Lidar(wavelength=(532.0, 1064.0), divergence=2.0)
@@ -26,62 +26,66 @@ LEAF = np.random.default_rng(2).uniform(0.0, 1.0, (4, 4, LAYERS))
 
 def scene_with(**canopy):
     voxels = jl.VoxelMap.from_extinction(leaf=LEAF, bark=0.2 * LEAF, voxel_size=0.5, origin=(-1.0, -1.0, 1.0))
-    given = {"leaf": jl.Prospect(), "bark": 0.3, **canopy}
-    return jl.Scene(canopy=jl.Canopy(voxels, **given), ground=jl.Ground(reflectance=0.4, slope=5.0))
+    canopy = {"leaf": jl.Prospect(), "bark": 0.3, **canopy}
+    return jl.Scene(canopy=jl.Canopy(voxels, **canopy), ground=jl.Ground(reflectance=0.4, slope=5.0))
 
 
-def scale_layers(scene, share):
-    return eqx.tree_at(lambda s: s.canopy.voxels.leaf, scene, replace_fn=lambda k: k * share[None, None])
+def scale_layers(scene, factors):
+    return eqx.tree_at(lambda s: s.canopy.voxels.leaf, scene, replace_fn=lambda k: k * factors[None, None])
 
 
-def scale_all(scene, share):
-    where = lambda s: (s.canopy.voxels.leaf, s.canopy.voxels.bark)  # noqa: E731
-    return eqx.tree_at(where, scene, replace_fn=lambda k: k * share)
+def scale_extinction(scene, factor):
+    tables = lambda s: (s.canopy.voxels.leaf, s.canopy.voxels.bark)  # noqa: E731
+    return eqx.tree_at(tables, scene, replace_fn=lambda k: k * factor)
 
 
-def scale_area_and_pigment(scene, share):
-    return eqx.tree_at(lambda s: s.canopy.leaf.Cab, scale_all(scene, share), 40.0 * share)
+def scale_extinction_and_pigment(scene, factor):
+    return eqx.tree_at(lambda s: s.canopy.leaf.Cab, scale_extinction(scene, factor), 40.0 * factor)
 
 
-LAYER_SHARES = inversion.Unknown(
+LAYER_FACTORS = inversion.Unknown(
     apply=scale_layers, name="layers", bounds=(0.1, 4.0), start=np.linspace(0.8, 1.2, LAYERS)
 )
-FACTOR = inversion.Unknown(apply=scale_all, name="factor", bounds=(0.1, 4.0), start=1.1)
-BOTH = inversion.Unknown(apply=scale_area_and_pigment, name="both", bounds=(0.1, 4.0), start=1.1)
-# One of them between the others, so that columns have to be sorted.
+EXTINCTION_FACTOR = inversion.Unknown(apply=scale_extinction, name="factor", bounds=(0.1, 4.0), start=1.1)
+EXTINCTION_AND_PIGMENT = inversion.Unknown(
+    apply=scale_extinction_and_pigment, name="extinction and pigment", bounds=(0.1, 4.0), start=1.1
+)
+# Dependences alternate, so that columns have to be sorted.
 UNKNOWNS = [
     inversion.Unknown("canopy.leaf.Cab", bounds=(5.0, 100.0)),
-    LAYER_SHARES,
+    LAYER_FACTORS,
     inversion.Unknown("ground.height", bounds=(-1.0, 0.5)),
-    FACTOR,
+    EXTINCTION_FACTOR,
     inversion.Unknown("ground.reflectance", bounds=(0.1, 0.9)),
 ]
 
 
-def model_of(scene, unknowns=UNKNOWNS, lidar=LIDAR, orders=3, **given):
-    settled = settle(unknowns, scene)
+def model_of(scene, unknowns=UNKNOWNS, lidar=LIDAR, orders=3):
+    """Return a model of few photons, and the unknowns' starting values."""
+    bound = bind_unknowns(unknowns, scene)
     sizes = {"n_photons": 256, "n_rays": 64, "window": (-60.0, 60.0), "describe": False}
     plan = jl.plan(lidar, scene, max_orders=orders, **sizes)
-    plan = dataclasses.replace(plan, **given)
-    return Model(lidar, scene, plan, settled, KEY), np.concatenate([np.ravel(s.start) for s in settled])
+    return Model(lidar, scene, plan, bound, KEY), flat_start(bound)
 
 
-def kinds(model):
-    return [place.kind for place in model.problem.places]
+def dependences(model):
+    return [setter.dependence for setter in model.forward.setters]
 
 
-@pytest.mark.parametrize("few", [4, pytest.param(8, marks=pytest.mark.slow)])
-def test_jacobians_are_the_same_as_with_tangents(monkeypatch, precision, few):
-    """With voxels that have the numbers of the two columns which move them, and with slopes in all."""
-    monkeypatch.setattr(extinction, "FEW", few)
-    model, start = model_of(scene_with())
-    assert kinds(model) == ["optical", "extinction", "geometric", "extinction", "optical"]
-    assert (model.problem.most, model.problem.at_once) == (2 if few == 4 else LAYERS + 1, 1)
-    monkeypatch.setattr(extinction, "COLUMNS", 1)
-    other, _ = model_of(scene_with())
-    assert kinds(other) == ["optical", "geometric", "geometric", "geometric", "optical"]
-    assert other.problem.at_once == LAYERS + 2
-    scored, pushed = model(start), other(start)
+@pytest.mark.parametrize("dense_columns", [4, pytest.param(8, marks=pytest.mark.slow)])
+def test_jacobians_are_the_same_as_with_tangents(monkeypatch, precision, dense_columns):
+    """With voxels that list the two columns which move them, and with derivatives of all columns in each."""
+    monkeypatch.setattr(fit_model, "DENSE_COLUMNS", dense_columns)
+    with_scores, start = model_of(scene_with())
+    assert dependences(with_scores) == ["optical", "extinction", "geometric", "extinction", "optical"]
+    forward = with_scores.forward
+    assert forward.columns_per_voxel == (2 if dense_columns == 4 else LAYERS + 1)
+    assert forward.tangents_per_pass == 1
+    monkeypatch.setattr(fit_model, "MAX_SCORED_COLUMNS", 1)
+    with_tangents, _ = model_of(scene_with())
+    assert dependences(with_tangents) == ["optical", "geometric", "geometric", "geometric", "optical"]
+    assert with_tangents.forward.tangents_per_pass == LAYERS + 2
+    scored, pushed = with_scores(start), with_tangents(start)
     scale = np.abs(pushed.jacobian).max(axis=(0, 1))
     assert scale.min() > 0
     rtol = 2e-5 if precision == "float32" else 1e-12
@@ -89,33 +93,36 @@ def test_jacobians_are_the_same_as_with_tangents(monkeypatch, precision, few):
     np.testing.assert_allclose(scored.total, pushed.total, rtol=rtol, atol=rtol * pushed.total.max())
 
 
-def test_what_changes_optics_or_places_as_well_is_geometric():
-    assert kinds(model_of(scene_with(), [BOTH])[0]) == ["geometric"]
-    assert kinds(model_of(scene_with(), [FACTOR])[0]) == ["extinction"]
+def test_unknowns_that_change_optics_as_well_are_geometric():
+    assert dependences(model_of(scene_with(), [EXTINCTION_AND_PIGMENT])[0]) == ["geometric"]
+    assert dependences(model_of(scene_with(), [EXTINCTION_FACTOR])[0]) == ["extinction"]
 
 
-def test_where_scores_do_not_serve_columns_are_pushed():
-    """Leaves that transmit straight on, many wavelengths, one column off nadir, little memory."""
-    assert kinds(model_of(scene_with(transmission="straight"), [FACTOR])[0]) == ["geometric"]
-    many = jl.Lidar(wavelength=np.linspace(500.0, 900.0, 17))
-    assert kinds(model_of(scene_with(), [FACTOR], many, orders=1)[0]) == ["geometric"]
-    slant = jl.Lidar(zenith=10.0)
-    assert kinds(model_of(scene_with(), [FACTOR], slant)[0]) == ["geometric"]
-    assert kinds(model_of(scene_with(), [LAYER_SHARES], slant)[0]) == ["extinction"]
-    settled = settle([LAYER_SHARES], scene_with())
-    plan = model_of(scene_with(), [LAYER_SHARES])[0].problem.plan
-    room = extinction.sorted_places(LIDAR, scene_with(), plan, settled)[2]
-    assert room > 0
-    for share, kind in ((2.1, "extinction"), (1.9, "geometric")):
-        scope = plan.scope._replace(max_memory=1e-9 * share * room)
+def test_columns_are_tangents_where_scores_do_not_serve():
+    """Straight transmission, many wavelengths, one column off nadir, little memory."""
+    straight = scene_with(transmission="straight")
+    assert dependences(model_of(straight, [EXTINCTION_FACTOR])[0]) == ["geometric"]
+    hyperspectral = jl.Lidar(wavelength=np.linspace(500.0, 900.0, 17))
+    model, _ = model_of(scene_with(), [EXTINCTION_FACTOR], hyperspectral, orders=1)
+    assert dependences(model) == ["geometric"]
+    off_nadir = jl.Lidar(zenith=10.0)
+    assert dependences(model_of(scene_with(), [EXTINCTION_FACTOR], off_nadir)[0]) == ["geometric"]
+    assert dependences(model_of(scene_with(), [LAYER_FACTORS], off_nadir)[0]) == ["extinction"]
+    bound = bind_unknowns([LAYER_FACTORS], scene_with())
+    plan = model_of(scene_with(), [LAYER_FACTORS])[0].forward.plan
+    size = choose_jacobian_methods(LIDAR, scene_with(), plan, bound).score_bytes
+    assert size > 0
+    # Scores may take half of the plan's memory.
+    for factor, dependence in ((2.1, "extinction"), (1.9, "geometric")):
+        scope = plan.scope._replace(max_memory=1e-9 * factor * size)
         limited = dataclasses.replace(plan, scope=scope)
-        places, _, _ = extinction.sorted_places(LIDAR, scene_with(), limited, settled)
-        assert [place.kind for place in places] == [kind]
+        methods = choose_jacobian_methods(LIDAR, scene_with(), limited, bound)
+        assert [setter.dependence for setter in methods.setters] == [dependence]
 
 
-def test_voxels_that_other_unknowns_move_into_several_layers_have_all_slopes(monkeypatch):
+def test_columns_of_voxels_are_found_at_other_values_than_the_start(monkeypatch):
     """At the start each voxel lies in one layer of the profile; with the ground at other heights, in two."""
-    monkeypatch.setattr(extinction, "FEW", 1)
+    monkeypatch.setattr(fit_model, "DENSE_COLUMNS", 1)
     voxels = jl.VoxelMap.from_lad(np.full((1, 1, 10), 0.5), voxel_size=1.0, origin=(-0.5, -0.5, -2.0))
     canopy = jl.Canopy(voxels, leaf=jl.LeafOptics(0.4, 0.4))
     scene = jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=0.4))
@@ -124,16 +131,16 @@ def test_voxels_that_other_unknowns_move_into_several_layers_have_all_slopes(mon
         apply=inversion.put_profile, name="profile", bounds=(0.01, 2.0), start=np.full(5, 0.5)
     )
     for unknowns, most in (([profile], 1), ([height, profile], 2)):
-        assert extinction._most(scene, settle(unknowns, scene), [len(unknowns) - 1]) == most
+        assert max_columns_per_voxel(scene, bind_unknowns(unknowns, scene)) == most
 
 
 @pytest.mark.slow
 def test_layers_are_retrieved():
-    """A fit through scores finds the shares that a waveform without noise was simulated with."""
+    """A fit with scores recovers the factors that a waveform without noise was simulated with."""
     scene = scene_with()
     truth = scale_layers(scene, jnp.linspace(0.7, 1.3, LAYERS))
     wave = jl.simulate(LIDAR, truth, key=jax.random.key(1), max_orders=1)
     fit = inversion.retrieve(
-        wave, LIDAR, scene, [LAYER_SHARES], noise=1e-5, key=KEY, max_orders=1, n_rays=8192
+        wave, LIDAR, scene, [LAYER_FACTORS], noise=1e-5, key=KEY, max_orders=1, n_rays=8192
     )
     np.testing.assert_allclose(fit.values["layers"], np.linspace(0.7, 1.3, LAYERS), atol=0.05)

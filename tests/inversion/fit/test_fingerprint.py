@@ -1,4 +1,4 @@
-"""Checkpoints: a file goes on with its own problem alone, and another is told by what differs."""
+"""Fingerprints of checkpoints: a file goes on with its own problem only, and what differs is named."""
 
 import dataclasses
 import importlib
@@ -25,24 +25,24 @@ SCENE = jl.Scene(
     canopy=jl.Canopy(VOXELS, leaf=jl.Prospect(), sides="periodic"), ground=jl.Ground(reflectance=0.3)
 )
 LIDAR = jl.Lidar(wavelength=(532.0, 1064.0))
-# What `brightened` depends on beside its own code.
+# A global that `scale_brightness` uses.
 GAIN = 1.0
 
 
-def brightened(scene, value):
+def scale_brightness(scene, value):
     return eqx.tree_at(lambda s: s.ground.reflectance, scene, GAIN * value)
 
 
-def brightened_otherwise(scene, value):
+def square_brightness(scene, value):
     return eqx.tree_at(lambda s: s.ground.reflectance, scene, GAIN * value**2)
 
 
-def brightening(gain):
+def brightness_setter(gain):
     return lambda scene, value: eqx.tree_at(lambda s: s.ground.reflectance, scene, gain * value)
 
 
-def unknowns(height=None, apply=brightened):
-    """The unknowns of the problem, with other fields of the height, and another function, where given."""
+def unknowns(height=None, apply=scale_brightness):
+    """Return the unknowns of the problem. `height`: changed fields of the first. `apply`: of the second."""
     return [
         Unknown(**({"where": "ground.height", "bounds": (-2.0, 2.0), "name": "height"} | (height or {}))),
         Unknown(apply=apply, bounds=(0.0, 1.0), name="brightness", start=0.3),
@@ -64,37 +64,40 @@ PROBLEM = {
 }
 
 
-class SimulationBegunError(Exception):
-    """The file was taken, and the work began."""
+class SimulationStartedError(Exception):
+    """The file was accepted, and the work began."""
 
 
-def begin(**problem):
-    """Run a problem up to its first simulation; whether it came so far."""
+def starts_work(**problem):
+    """Run a problem up to its first simulation. Return True if it comes that far."""
 
-    def simulator(*_):
-        raise SimulationBegunError
+    def start(*_):
+        raise SimulationStartedError
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("inversion.fit.job.Simulator", simulator)
+        patch.setattr("inversion.fit.retrieval_many.LockstepModel", start)
         try:
             inversion.retrieve_many(**problem)
-        except SimulationBegunError:
+        except SimulationStartedError:
             return True
 
 
 @pytest.fixture(scope="module")
-def begun(tmp_path_factory):
+def empty_checkpoint(tmp_path_factory):
     """A file of the problem, without fits."""
-    path = tmp_path_factory.mktemp("begun") / "fits.sqlite"
-    assert begin(**PROBLEM, path=path)
+    path = tmp_path_factory.mktemp("checkpoint") / "fits.sqlite"
+    assert starts_work(**PROBLEM, path=path)
     return path
 
 
 @pytest.fixture
-def begins(begun, tmp_path):
-    """Goes on with the problem, changed in some arguments, in a copy of the file."""
-    path = shutil.copy(begun, tmp_path)
-    return lambda **changes: begin(**PROBLEM | {"path": path} | changes)
+def resumes(empty_checkpoint, tmp_path):
+    """A function that runs the problem, with some arguments changed, with a copy of the file."""
+    path = shutil.copy(empty_checkpoint, tmp_path)
+    return lambda **changes: starts_work(**PROBLEM | {"path": path} | changes)
+
+
+# Arguments of a problem with a changed lidar, canopy, ground, or unknown height.
 
 
 def lidar(**changes):
@@ -138,13 +141,13 @@ CHANGES = [
     ("unknowns", {"unknowns": unknowns()[::-1]}),
     ("unknowns", {"unknowns": unknowns()[:2]}),
     ("unknowns", height(name="z")),
-    ("place of 'height'", height(where="ground.slope", bounds=(-2.0, 2.0))),
+    ("where or apply of 'height'", height(where="ground.slope", bounds=(-2.0, 2.0))),
     ("bounds of 'height'", height(bounds=(-2.0, 2.1))),
     ("prior of 'height'", height(prior=(0.0, 1.0))),
     ("start of 'height'", height(start=0.1)),
     ("start of 'height'", {"start": {"height": np.array([0.0, 0.1])}}),
-    ("place of 'brightness'", {"unknowns": unknowns(apply=brightened_otherwise)}),
-    ("place of 'brightness'", {"unknowns": unknowns(apply=brightening(1.0))}),
+    ("where or apply of 'brightness'", {"unknowns": unknowns(apply=square_brightness)}),
+    ("where or apply of 'brightness'", {"unknowns": unknowns(apply=brightness_setter(1.0))}),
     ("scale", {"scale": (0.5, 2.0)}),
     ("key", {"key": jax.random.key(1)}),
     ("key", {"key": jax.random.key(0, impl="rbg")}),
@@ -159,30 +162,30 @@ CHANGES = [
 ]
 
 
-@pytest.mark.parametrize(("part", "change"), CHANGES)
-def test_another_problem_is_refused_and_what_differs_is_named(begins, tmp_path, part, change):
+@pytest.mark.parametrize(("named_part", "change"), CHANGES)
+def test_another_problem_is_refused_and_what_differs_is_named(resumes, tmp_path, named_part, change):
     before = (tmp_path / "fits.sqlite").read_bytes()
-    with pytest.raises(ValueError, match=rf"fits\.sqlite keeps fits of another problem; .*: .*\b{part}"):
-        begins(**change)
+    with pytest.raises(ValueError, match=rf"fits\.sqlite holds results of another .* in .*\b{named_part}"):
+        resumes(**change)
     assert (tmp_path / "fits.sqlite").read_bytes() == before
 
 
-def test_only_what_differs_is_named(begins):
-    with pytest.raises(ValueError, match=r"what differs: bounds of 'height', key$"):
-        begins(key=jax.random.key(1), **height(bounds=(-3.0, 2.0)))
+def test_only_what_differs_is_named(resumes):
+    with pytest.raises(ValueError, match=r"which differs in bounds of 'height', key; "):
+        resumes(key=jax.random.key(1), **height(bounds=(-3.0, 2.0)))
 
 
-def test_the_kind_of_prior_and_the_scale_count(begins, tmp_path):
+def test_the_kind_of_prior_and_the_scale_count(resumes, tmp_path):
     path = tmp_path / "prior.sqlite"
     normal = {"bounds": (0.0, 2.0), "start": 1.0, "prior": (1.0, 0.5)}
-    assert begins(path=path, scale=(0.5, 2.0), **height(**normal))
-    with pytest.raises(ValueError, match=r"what differs: prior of 'height'$"):
-        begins(path=path, scale=(0.5, 2.0), **height(**normal | {"prior": LogNormal(1.0, 0.5)}))
-    with pytest.raises(ValueError, match=r"what differs: scale$"):
-        begins(path=path, scale=(0.5, 2.1), **height(**normal))
+    assert resumes(path=path, scale=(0.5, 2.0), **height(**normal))
+    with pytest.raises(ValueError, match=r"which differs in prior of 'height'; "):
+        resumes(path=path, scale=(0.5, 2.0), **height(**normal | {"prior": LogNormal(1.0, 0.5)}))
+    with pytest.raises(ValueError, match=r"which differs in scale; "):
+        resumes(path=path, scale=(0.5, 2.1), **height(**normal))
 
 
-def test_coefficients_of_leaves_count(begins, tmp_path):
+def test_coefficients_of_leaves_count(resumes, tmp_path):
     path, table = tmp_path / "leaf.sqlite", shipped("PC")
 
     def leaf(factor):
@@ -190,63 +193,63 @@ def test_coefficients_of_leaves_count(begins, tmp_path):
         coefficients = Coefficients(table.wavelength, table.index, absorption, table.traits)
         return canopy(leaf=jl.Prospect(version="PRO", coefficients=coefficients))
 
-    assert begins(path=path, **leaf(1.001))
-    assert begins(path=path, **leaf(1.001))
-    with pytest.raises(ValueError, match=r"what differs: scene$"):
-        begins(path=path, **leaf(1.002))
+    assert resumes(path=path, **leaf(1.001))
+    assert resumes(path=path, **leaf(1.001))
+    with pytest.raises(ValueError, match=r"which differs in scene; "):
+        resumes(path=path, **leaf(1.002))
 
 
-def test_functions_are_told_by_what_they_use(begins, tmp_path, monkeypatch):
+def test_functions_are_identified_by_code_closures_and_globals(resumes, tmp_path, monkeypatch):
     path = tmp_path / "closure.sqlite"
-    assert begins(path=path, unknowns=unknowns(apply=brightening(2.0)))
-    assert begins(path=path, unknowns=unknowns(apply=brightening(2.0)))
-    with pytest.raises(ValueError, match=r"what differs: place of 'brightness'$"):
-        begins(path=path, unknowns=unknowns(apply=brightening(3.0)))
+    assert resumes(path=path, unknowns=unknowns(apply=brightness_setter(2.0)))
+    assert resumes(path=path, unknowns=unknowns(apply=brightness_setter(2.0)))
+    with pytest.raises(ValueError, match=r"which differs in where or apply of 'brightness'; "):
+        resumes(path=path, unknowns=unknowns(apply=brightness_setter(3.0)))
     monkeypatch.setitem(globals(), "GAIN", 2.0)
-    with pytest.raises(ValueError, match=r"what differs: place of 'brightness'$"):
-        begins()
+    with pytest.raises(ValueError, match=r"which differs in where or apply of 'brightness'; "):
+        resumes()
     with (tmp_path / "open").open("w") as file:
-        said = "place of 'brightness' cannot be compared .*: the content of a TextIOWrapper is not known"
-        with pytest.raises(TypeError, match=said):
-            begins(unknowns=unknowns(apply=lambda s, value: brightened(s, value * file.writable())))
+        message = "where or apply of 'brightness' cannot be compared .*: the content of a TextIOWrapper"
+        with pytest.raises(TypeError, match=message):
+            resumes(unknowns=unknowns(apply=lambda s, value: scale_brightness(s, value * file.writable())))
 
 
-def test_releases_and_settings_count(begins, monkeypatch):
-    with jax.enable_x64(True), pytest.raises(ValueError, match=r"what differs: .*jax_enable_x64"):
-        begins()
+def test_releases_and_settings_count(resumes, monkeypatch):
+    with jax.enable_x64(True), pytest.raises(ValueError, match=r"which differs in .*jax_enable_x64"):
+        resumes()
     monkeypatch.setattr("importlib.metadata.version", lambda name: "0.0.1" if name == "jax" else "1.0")
-    with pytest.raises(ValueError, match=r"what differs: .*\bversion of jax\b"):
-        begins()
+    with pytest.raises(ValueError, match=r"which differs in .*\bversion of jax\b"):
+        resumes()
 
 
-def test_what_changes_no_result_is_accepted(begins):
-    assert begins()
-    assert begins(lanes=1)
-    assert begins(progress=print)
-    assert begins(noise=np.full((2, 2, TIME.size), 0.1), time=TIME.tolist(), starts=1.0)
-    assert begins(unknowns=unknowns(height={"where": lambda s: s.ground.height}))
-    assert begins(**lidar(receiver=jl.Receiver(window="first return")))
-    assert begins(scene=jax.tree.map(lambda a: a.copy(), SCENE))
+def test_changes_that_affect_no_result_are_accepted(resumes):
+    assert resumes()
+    assert resumes(lanes=1)
+    assert resumes(progress=print)
+    assert resumes(noise=np.full((2, 2, TIME.size), 0.1), time=TIME.tolist(), starts=1.0)
+    assert resumes(unknowns=unknowns(height={"where": lambda s: s.ground.height}))
+    assert resumes(**lidar(receiver=jl.Receiver(window="first return")))
+    assert resumes(scene=jax.tree.map(lambda a: a.copy(), SCENE))
     # The same number in each of eight batches.
-    assert begins(n_photons=513)
+    assert resumes(n_photons=513)
 
 
 class Law(eqx.Module):
-    """One of its own."""
+    """A class of a user, with a constant, a method that names the class, and a global."""
 
     strength: jax.Array = eqx.field(converter=jnp.asarray)
     LIMIT = 2.0
 
     def __call__(self, x):
-        return self.deeper(x) * self.LIMIT
+        return self.inner(x) * self.LIMIT
 
-    def deeper(self, x):
+    def inner(self, x):
         return Law(self.strength) if x is None else GAIN * x
 
 
-def test_laws_of_ones_own_are_told_by_their_code(monkeypatch):
-    first = digest_of(Law(1.0))
-    assert digest_of(Law(1.0)) == first
+def test_classes_of_a_user_are_identified_by_their_code(monkeypatch):
+    original = digest_of(Law(1.0))
+    assert digest_of(Law(1.0)) == original
     changed = [digest_of(Law(2.0))]
     monkeypatch.setattr(Law, "LIMIT", 3.0)
     changed.append(digest_of(Law(1.0)))
@@ -254,15 +257,15 @@ def test_laws_of_ones_own_are_told_by_their_code(monkeypatch):
     monkeypatch.setitem(globals(), "GAIN", 2.0)
     changed.append(digest_of(Law(1.0)))
     monkeypatch.undo()
-    monkeypatch.setattr(Law, "deeper", lambda self, x: x)
+    monkeypatch.setattr(Law, "inner", lambda self, x: x)
     changed.append(digest_of(Law(1.0)))
     monkeypatch.undo()
-    assert digest_of(Law(1.0)) == first
-    assert len({first, *changed}) == 5
+    assert digest_of(Law(1.0)) == original
+    assert len({original, *changed}) == 5
 
 
 def squared(derivative):
-    """A function with a rule of one's own for its derivative."""
+    """Return a function with a custom rule for its derivative."""
 
     @eqx.filter_custom_jvp
     def f(x):
@@ -279,7 +282,7 @@ def test_rules_for_derivatives_count():
     assert digest_of(squared(2.0)) == digest_of(squared(2.0)) != digest_of(squared(2.1))
 
 
-def test_modules_of_ones_own_are_told_by_their_file(tmp_path, monkeypatch):
+def test_modules_of_a_user_are_identified_by_their_file(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     digests = []
     for line in ("double = lambda x: 2 * x", "double = lambda x: 2 * x", "double = lambda x: 3 * x"):
@@ -290,7 +293,7 @@ def test_modules_of_ones_own_are_told_by_their_file(tmp_path, monkeypatch):
     assert digests[0] == digests[1] != digests[2]
 
 
-def test_what_packages_define_is_told_by_name():
+def test_objects_of_packages_are_identified_by_name():
     for x in (
         np.exp,
         jnp.exp,

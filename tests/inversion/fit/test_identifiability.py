@@ -18,45 +18,47 @@ HEIGHT = Unknown(lambda s: s.ground.height, bounds=(-2.0, 2.0), name="height")
 BRIGHTNESS = Unknown(lambda s: s.ground.reflectance, bounds=(0.0, 1.0), name="reflectance")
 UNKNOWNS = [HEIGHT, BRIGHTNESS]
 KEY = jax.random.key(0)
+# Of light, m/ns.
 SPEED = 0.299792458
 
 
 def pulse_at(time, height=0.1):
-    """The ground's echo in samples of 1 ns, and its derivative in height, from the pulse's formula."""
+    """Return the ground's echo in samples of 1 ns, and its derivative in height, by the pulse's formula."""
     sigma = 6.0 / np.sqrt(8 * np.log(2))
-    fine = (
-        np.asarray(time, float)[:, None] + (np.arange(100) + 0.5) / 100 - 0.5 + 2 * height / SPEED
-    ) / sigma
-    density = np.exp(-0.5 * fine**2) / np.sqrt(2 * np.pi) / sigma
-    return density.mean(axis=1), (-fine * density * 2 / SPEED / sigma).mean(axis=1)
+    # The mean over a sample, by 100 midpoints.
+    within_sample = (np.arange(100) + 0.5) / 100 - 0.5
+    u = (np.asarray(time, float)[:, None] + within_sample + 2 * height / SPEED) / sigma
+    density = np.exp(-0.5 * u**2) / np.sqrt(2 * np.pi) / sigma
+    return density.mean(axis=1), (-u * density * 2 / SPEED / sigma).mean(axis=1)
 
 
 def test_bounds_of_a_flat_ground_are_the_closed_form():
-    found = inversion.cramer_rao(LIDAR, SCENE, UNKNOWNS, noise=NOISE, key=KEY)
+    bound = inversion.cramer_rao(LIDAR, SCENE, UNKNOWNS, noise=NOISE, key=KEY)
     plan = jl.plan(LIDAR, SCENE)
     time = plan.sample_start + np.arange(plan.n_samples)
     echo, slope = pulse_at(time)
-    assert np.allclose(found.stderr["reflectance"], NOISE / np.linalg.norm(echo), rtol=2e-3)
+    assert np.allclose(bound.stderr["reflectance"], NOISE / np.linalg.norm(echo), rtol=2e-3)
     expected = NOISE / np.sqrt(np.sum(REFLECTANCE**2) * np.sum(slope**2))
-    assert np.isclose(found.stderr["height"], expected, rtol=2e-3)
-    assert not np.isclose(found.stderr["height"], 1.1 * expected, rtol=2e-3)
-    assert found.undetermined == ()
-    assert found.labels == ("height", "reflectance[0]", "reflectance[1]")
-    assert np.allclose(np.diag(found.correlation), 1.0)
-    assert np.allclose(np.linalg.inv(found.information), found.covariance, rtol=1e-3, atol=1e-9)
+    assert np.isclose(bound.stderr["height"], expected, rtol=2e-3)
+    assert not np.isclose(bound.stderr["height"], 1.1 * expected, rtol=2e-3)
+    assert bound.undetermined == ()
+    assert bound.labels == ("height", "reflectance[0]", "reflectance[1]")
+    assert np.allclose(np.diag(bound.correlation), 1.0)
+    assert np.allclose(np.linalg.inv(bound.information), bound.covariance, rtol=1e-3, atol=1e-9)
 
 
 def test_priors_add_to_the_information():
-    tight = Unknown(
+    with_prior = Unknown(
         lambda s: s.ground.reflectance,
         bounds=(0.0, 1.0),
         name="reflectance",
         prior=LogNormal(REFLECTANCE, 0.001),
     )
-    found = inversion.cramer_rao(LIDAR, SCENE, [tight], noise=NOISE, key=KEY)
-    free = inversion.cramer_rao(LIDAR, SCENE, [BRIGHTNESS], noise=NOISE, key=KEY)
-    expected = 1 / np.hypot(1 / (0.001 * REFLECTANCE), 1 / np.asarray(free.stderr["reflectance"]))
-    assert np.allclose(found.stderr["reflectance"], expected, rtol=1e-3)
+    bound = inversion.cramer_rao(LIDAR, SCENE, [with_prior], noise=NOISE, key=KEY)
+    data_bound = inversion.cramer_rao(LIDAR, SCENE, [BRIGHTNESS], noise=NOISE, key=KEY)
+    # Information adds up; the spread of a log-normal prior is relative.
+    expected = 1 / np.hypot(1 / (0.001 * REFLECTANCE), 1 / np.asarray(data_bound.stderr["reflectance"]))
+    assert np.allclose(bound.stderr["reflectance"], expected, rtol=1e-3)
 
 
 def test_chlorophyll_is_invisible_at_1064_nm():
@@ -69,14 +71,14 @@ def test_chlorophyll_is_invisible_at_1064_nm():
         Unknown(lambda s: s.canopy.leaf.Cab, bounds=(5.0, 100.0), name="Cab"),
         Unknown(lambda s: s.canopy.leaf.Cm, bounds=(0.001, 0.03), name="Cm"),
     ]
-    given = {"noise": 1e-4, "key": KEY, "max_orders": 1, "n_rays": 64}
-    infrared = inversion.cramer_rao(jl.Lidar(wavelength=1064.0), scene, unknowns, **given)
+    options = {"noise": 1e-4, "key": KEY, "max_orders": 1, "n_rays": 64}
+    infrared = inversion.cramer_rao(jl.Lidar(wavelength=1064.0), scene, unknowns, **options)
     assert infrared.undetermined == ("Cab",)
     assert np.isinf(infrared.stderr["Cab"])
     assert np.isfinite(infrared.stderr["Cm"])
     assert "Cab  not determined" in str(infrared)
-    both = inversion.cramer_rao(jl.Lidar(wavelength=(532.0, 1064.0)), scene, unknowns, **given)
-    assert both.undetermined == ()
+    with_green = inversion.cramer_rao(jl.Lidar(wavelength=(532.0, 1064.0)), scene, unknowns, **options)
+    assert with_green.undetermined == ()
 
 
 @pytest.fixture(scope="module")
@@ -87,10 +89,10 @@ def target():
     return np.asarray(wave.reflectance) + noise, np.asarray(wave.time)
 
 
-def profile(target, name, values, unknowns=UNKNOWNS, lidar=LIDAR, **more):
+def profile(target, name, values, unknowns=UNKNOWNS, lidar=LIDAR, **options):
     observed, time = target
-    given = {"noise": NOISE, "time": time, "key": KEY, "noise_floor": 0.0, **more}
-    return inversion.profile_likelihood(observed, lidar, SCENE, unknowns, name, values, **given)
+    options = {"noise": NOISE, "time": time, "key": KEY, "noise_floor": 0.0, **options}
+    return inversion.profile_likelihood(observed, lidar, SCENE, unknowns, name, values, **options)
 
 
 def test_a_profile_of_a_linear_problem_is_the_standard_error(target):
@@ -99,40 +101,39 @@ def test_a_profile_of_a_linear_problem_is_the_standard_error(target):
         observed, LIDAR, SCENE, UNKNOWNS, noise=NOISE, time=time, key=KEY, noise_floor=0.0
     )
     best, error = float(fit.values["height"]), float(fit.stderr["height"])
-    seen = []
-    found = profile(target, "height", best + error * np.linspace(-3, 3, 9), progress=seen.append)
-    assert sorted(seen) == list(range(9))
-    assert np.all(found.converged)
-    assert np.allclose(found.chi2, np.linspace(-3, 3, 9) ** 2, rtol=0.05, atol=0.05)
-    low, high = found.interval()
+    finished = []
+    result = profile(target, "height", best + error * np.linspace(-3, 3, 9), progress=finished.append)
+    assert sorted(finished) == list(range(9))
+    assert np.all(result.converged)
+    assert np.allclose(result.chi2, np.linspace(-3, 3, 9) ** 2, rtol=0.05, atol=0.05)
+    low, high = result.interval()
     assert np.allclose([low, high], [best - error, best + error], atol=0.05 * error)
-    low, high = found.interval(0.954)
+    low, high = result.interval(0.954)
     assert np.allclose([low, high], [best - 2 * error, best + 2 * error], atol=0.1 * error)
-    assert found.others["reflectance"].shape == (9, 2)
+    assert result.others["reflectance"].shape == (9, 2)
 
 
 def test_an_interval_that_the_values_do_not_close_is_infinite(target):
-    found = profile(target, "height", [0.08, 0.1, 0.1005])
-    low, high = found.interval()
+    low, high = profile(target, "height", [0.08, 0.1, 0.1005]).interval()
     assert np.isfinite(low)
     assert high == np.inf
 
 
-def test_samples_lie_at_given_times_whatever_opened_the_window(target):
-    opened = dataclasses.replace(LIDAR, receiver=jl.Receiver(window="first return"))
-    for more in ({"time": target[1]}, {}):
-        bound, same = (
-            inversion.cramer_rao(lidar, SCENE, UNKNOWNS, noise=NOISE, key=KEY, **more)
-            for lidar in (opened, LIDAR)
+def test_samples_lie_at_the_record_s_times_whatever_opened_the_window(target):
+    first_return = dataclasses.replace(LIDAR, receiver=jl.Receiver(window="first return"))
+    for times in ({"time": target[1]}, {}):
+        bound, expected = (
+            inversion.cramer_rao(lidar, SCENE, UNKNOWNS, noise=NOISE, key=KEY, **times)
+            for lidar in (first_return, LIDAR)
         )
-        assert np.array_equal(bound.covariance, same.covariance)
+        assert np.array_equal(bound.covariance, expected.covariance)
     values = [0.09, 0.1, 0.11]
-    found, same = (profile(target, "height", values, lidar=lidar) for lidar in (opened, LIDAR))
-    assert np.array_equal(found.chi2, same.chi2)
+    result, expected = (profile(target, "height", values, lidar=lidar) for lidar in (first_return, LIDAR))
+    assert np.array_equal(result.chi2, expected.chi2)
 
 
 def test_bad_input_is_refused(target):
-    for change, words in (
+    for change, message in (
         ({"name": "depth"}, "name = 'depth' is none of the unknowns: height, reflectance"),
         ({"name": "reflectance"}, "has 2 values"),
         ({"unknowns": [HEIGHT]}, "beside 0 unknowns"),
@@ -141,7 +142,7 @@ def test_bad_input_is_refused(target):
         ({"unknowns": []}, "unknowns is empty"),
         ({"n_photons": 4}, "n_photons = 4 is outside"),
     ):
-        with pytest.raises(ValueError, match=words):
+        with pytest.raises(ValueError, match=message):
             profile(target, **{"name": "height", "values": [0.0, 0.1], **change})
     with pytest.raises(ValueError, match="noise = 0 is outside"):
         inversion.cramer_rao(LIDAR, SCENE, UNKNOWNS, noise=0.0, key=KEY)
@@ -152,23 +153,23 @@ def test_bad_input_is_refused(target):
     for name in ("n_photons", "n_rays"):
         with pytest.raises(ValueError, match=rf"{name} = 4 is outside the admissible range \[8, inf\)"):
             inversion.cramer_rao(LIDAR, SCENE, UNKNOWNS, noise=NOISE, key=KEY, **{name: 4})
-    found = profile(target, "height", [0.08, 0.12])
+    result = profile(target, "height", [0.08, 0.12])
     with pytest.raises(ValueError, match="level = 1 is outside"):
-        found.interval(1.0)
+        result.interval(1.0)
 
 
 def test_plans_that_leave_out_light_are_refused():
-    low, ground = jl.Scene(ground=jl.Ground()), jl.Scene(ground=jl.Ground(height=8.0))
+    low_scene, high_scene = jl.Scene(ground=jl.Ground()), jl.Scene(ground=jl.Ground(height=8.0))
     lidar, time = jl.Lidar(), np.arange(-80.0, 81.0)
-    plan = jl.plan(lidar, low, window=(time[0], time[-1]), describe=False)
+    plan = jl.plan(lidar, low_scene, window=(time[0], time[-1]), describe=False)
     height = inversion.Unknown("ground.height", bounds=(-1.0, 9.0), name="height")
     bright = inversion.Unknown("ground.reflectance", bounds=(0.0, 1.0), name="bright")
-    given = {"noise": 0.01, "key": KEY, "time": time, "plan": plan}
+    options = {"noise": 0.01, "key": KEY, "time": time, "plan": plan}
     with pytest.raises(ValueError, match="the plan does not fit: its rays start"):
-        inversion.cramer_rao(lidar, ground, [height], **given)
+        inversion.cramer_rao(lidar, high_scene, [height], **options)
     with pytest.raises(
         ValueError, match="at the bounds of the unknowns the plan does not fit: its rays start"
     ):
         inversion.profile_likelihood(
-            np.zeros((1, time.size)), lidar, low, [height, bright], "bright", [0.2, 0.4], **given
+            np.zeros((1, time.size)), lidar, low_scene, [height, bright], "bright", [0.2, 0.4], **options
         )

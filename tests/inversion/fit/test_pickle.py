@@ -1,4 +1,4 @@
-"""Unknowns by their path: found in a scene or refused with the nearest names, and sent to other processes."""
+"""Unknowns by path: located in a scene or refused with the nearest paths, and sent to other processes."""
 
 import multiprocessing
 import pickle
@@ -11,14 +11,14 @@ import pytest
 import inversion
 import jaxlidar as jl
 from inversion import LogNormal, Unknown
-from inversion.fit.unknowns import settle
+from inversion.fit.unknowns import bind_unknowns
 
 SCENE = jl.Scene(
     canopy=jl.Canopy(jl.VoxelMap.from_lad(np.ones((1, 1, 2)), voxel_size=1.0), leaf=jl.Prospect()),
     plates=(jl.Plate(height=5.0, reflectance=0.3), jl.Plate(height=6.0, reflectance=0.3)),
     ground=jl.Ground(height=0.1, reflectance=0.3),
 )
-PLACES = {
+SELECTORS = {
     "ground.height": lambda s: s.ground.height,
     "canopy.leaf.Cab": lambda s: s.canopy.leaf.Cab,
     "canopy.voxels.leaf": lambda s: s.canopy.voxels.leaf,
@@ -27,14 +27,14 @@ PLACES = {
 }
 
 
-@pytest.mark.parametrize("path", PLACES)
-def test_a_path_is_the_function_that_picks(path):
-    (by_path,) = settle([Unknown(path, bounds=(-1000.0, 1000.0))], SCENE)
-    (by_function,) = settle([Unknown(PLACES[path], bounds=(-1000.0, 1000.0))], SCENE)
+@pytest.mark.parametrize("path", SELECTORS)
+def test_a_path_picks_the_array_that_a_function_picks(path):
+    (by_path,) = bind_unknowns([Unknown(path, bounds=(-1000.0, 1000.0))], SCENE)
+    (by_function,) = bind_unknowns([Unknown(SELECTORS[path], bounds=(-1000.0, 1000.0))], SCENE)
     assert by_path.name == by_function.name == path
-    assert by_path.place == by_function.place
+    assert by_path.setter == by_function.setter
     np.testing.assert_array_equal(by_path.start, by_function.start)
-    (named,) = settle([Unknown(path, bounds=(-1000.0, 1000.0), name="x")], SCENE)
+    (named,) = bind_unknowns([Unknown(path, bounds=(-1000.0, 1000.0), name="x")], SCENE)
     assert named.name == "x"
 
 
@@ -53,10 +53,10 @@ def test_a_path_is_the_function_that_picks(path):
         ("", r"\w+"),
     ],
 )
-def test_a_path_that_is_not_there_is_refused_with_the_nearest(path, nearest):
-    said = rf"where = '.*' is no array of this scene; the nearest are '{nearest}"
-    with pytest.raises(ValueError, match=said):
-        settle([Unknown(path, bounds=(0.0, 1.0))], SCENE)
+def test_a_path_of_no_array_is_refused_with_the_nearest(path, nearest):
+    message = rf"where = '.*' is no array of this scene; the nearest are '{nearest}"
+    with pytest.raises(ValueError, match=message):
+        bind_unknowns([Unknown(path, bounds=(0.0, 1.0))], SCENE)
 
 
 def unknowns():
@@ -67,30 +67,30 @@ def unknowns():
 
 
 def test_unknowns_can_be_pickled():
-    back = pickle.loads(pickle.dumps(unknowns()))
-    for got, sent in zip(back, unknowns(), strict=True):
-        assert (got.where, got.name) == (sent.where, sent.name)
-        assert jax.tree.structure(got) == jax.tree.structure(sent)
-        assert jax.tree.all(jax.tree.map(np.array_equal, got, sent))
+    copies = pickle.loads(pickle.dumps(unknowns()))
+    for copy, original in zip(copies, unknowns(), strict=True):
+        assert (copy.where, copy.name) == (original.where, original.name)
+        assert jax.tree.structure(copy) == jax.tree.structure(original)
+        assert jax.tree.all(jax.tree.map(np.array_equal, copy, original))
     by_lambda = Unknown(lambda s: s.ground.height, bounds=(-2.0, 2.0))
     with pytest.raises((pickle.PicklingError, AttributeError), match="lambda"):
         pickle.dumps(by_lambda)
 
 
-def retrieve(observed, sought):
+def retrieve(observed, unknowns):
     scene = jl.Scene(ground=jl.Ground(height=0.0, reflectance=0.5))
-    return inversion.retrieve(observed, jl.Lidar(), scene, sought, noise=1e-3, key=jax.random.key(1))
+    return inversion.retrieve(observed, jl.Lidar(), scene, unknowns, noise=1e-3, key=jax.random.key(1))
 
 
 @pytest.mark.slow
-def test_a_spawned_process_retrieves_what_this_one_does():
-    """Problem and result are both sent; forked after JAX was used, the process would wait for ever."""
+def test_a_spawned_process_gives_the_same_retrieval():
+    """Problem and result are both sent. Spawned, as a process forked after JAX was used may wait for ever."""
     scene = jl.Scene(ground=jl.Ground(height=0.1, reflectance=0.3))
     wave = jl.simulate(jl.Lidar(), scene, key=jax.random.key(0))
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
-        there = pool.submit(retrieve, wave, unknowns()).result(timeout=300)
-    here = retrieve(wave, unknowns())
-    assert there.status == here.status
-    for name, value in here.values.items():
-        np.testing.assert_array_equal(there.values[name], value)
-    assert float(there.values["ground.height"]) == pytest.approx(0.1, abs=0.01)
+        from_worker = pool.submit(retrieve, wave, unknowns()).result(timeout=300)
+    from_this_process = retrieve(wave, unknowns())
+    assert from_worker.status == from_this_process.status
+    for name, value in from_this_process.values.items():
+        np.testing.assert_array_equal(from_worker.values[name], value)
+    assert float(from_worker.values["ground.height"]) == pytest.approx(0.1, abs=0.01)

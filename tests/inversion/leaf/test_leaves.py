@@ -126,6 +126,7 @@ def test_a_leaf_that_fails_does_not_affect_others(noisy_leaves):
     R, T = (s[:30].copy() for s in data)
     before = invert_leaves(BANDS, R, T, noise=NOISE)
     R[7], T[7] = np.nan, np.nan
+    # Leaf 7 has no samples, leaf 8 spectra that no leaf has.
     R[8], T[8] = 2.0, -1.0
     after = invert_leaves(BANDS, R, T, noise=NOISE)
     unchanged = np.setdiff1d(np.arange(30), [7, 8])
@@ -191,6 +192,7 @@ def test_domains(noisy_leaves):
     for name in ("Cw", "Cm"):
         np.testing.assert_allclose(fit.traits[name], alone.traits[name], rtol=1e-3)
         assert not np.allclose(fit.traits[name], all_bands.traits[name], rtol=1e-3)
+    # Bounds of several intervals are those of the bands within them.
     several = invert_leaves(BANDS, R, T, domain={"Cm": ((1700.0, 1800.0), (2205.0, 2400.0))})
     np.testing.assert_array_equal(several.domain["Cm"], [[1700.0, 1800.0], [2210.0, 2400.0]])
 

@@ -44,6 +44,7 @@ def test_points_lie_at_the_planted_echoes(shots, points):
     expected = [shots[i].anchor + t * DIRECTION for i, t in times]
     np.testing.assert_allclose(points.position, expected, rtol=0, atol=2e-3)
     np.testing.assert_allclose(points.intensity, [80, 40, 150], rtol=1e-2)
+    # Shot 1 has no echo and no point.
     np.testing.assert_array_equal(points.return_number, [1, 2, 1])
     np.testing.assert_array_equal(points.number_of_returns, [2, 2, 1])
     np.testing.assert_array_equal(points.gps_time, [4e5, 4e5, 4e5 + 2])
@@ -53,6 +54,7 @@ def test_points_are_written(points, tmp_path):
     path = tmp_path / "echoes.las"
     write_las(path, **points._asdict())
     cloud = read_las(path)
+    # LAS stores coordinates in whole millimetres.
     np.testing.assert_allclose(cloud.position, points.position, rtol=0, atol=0.6e-3)
     np.testing.assert_array_equal(cloud.intensity, np.round(points.intensity))
     np.testing.assert_array_equal(cloud.return_number, points.return_number)

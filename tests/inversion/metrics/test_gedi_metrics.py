@@ -47,6 +47,7 @@ def test_metrics_are_those_of_the_product(recorded):
     np.testing.assert_allclose(metrics.elev_highestreturn, product["elev_highest"], atol=0.06, rtol=0)
     np.testing.assert_allclose(metrics.rh, product["rh"], atol=0.1, rtol=0)
     np.testing.assert_array_equal(metrics.num_detectedmodes, product["nmodes"])
+    # Negative control: the higher front threshold of group 4.
     of_group_4 = gedi_metrics(shots, gedi_settings(4))
     assert np.mean(np.abs(of_group_4.elev_highestreturn - product["elev_highest"]) < 0.15) < 0.2
 
@@ -93,6 +94,7 @@ def test_shots_of_all_lengths_in_their_order():
     shots = []
     for i, ground_elevation in enumerate(ground):
         elevation = 130.0 - 0.15 * np.arange(380 if i % 2 else 300)
+        # Shot 7 has no signal.
         amplitude = 0.0 if i == 7 else 300.0
         echo = amplitude * np.exp(-0.5 * ((elevation - ground_elevation) / 0.9) ** 2)
         shots.append(made_up_shot(elevation, 200.0 + echo))

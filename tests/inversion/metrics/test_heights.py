@@ -47,6 +47,7 @@ def test_ends_with_an_estimate_of_the_noise():
     power = np.stack([noisy(echoes((80.0, 18.0), (150.0, 2.0)), 2.0, seed) for seed in range(200)])
     for offset in (0.0, 1.0):
         ends = signal_ends(HEIGHT, power + offset, pulse=system_pulse())
+        # The echoes' pulses begin above the targets, and end below them with the tail.
         assert np.all((np.asarray(ends.top) > 18.0) & (np.asarray(ends.top) < 22.0))
         assert np.all((np.asarray(ends.bottom) < 2.0) & (np.asarray(ends.bottom) > -8.0))
 
@@ -68,12 +69,14 @@ def test_ripples_of_the_pulses_tail_are_no_ground():
     power = np.stack([noisy(echoes((100.0, 3.03)), 1.0, seed) for seed in range(100)])
     ground = np.asarray(find_ground(HEIGHT, power, pulse=system_pulse(), noise=1.0))
     assert np.max(np.abs(ground - 3.03)) < 0.1
+    # Negative control: without the pulse, the bump of the tail is the lowest mode.
     smooth = np.stack([np.convolve(row, np.hanning(9) / 4.0, mode="same") for row in power])
     assert np.max(np.asarray(find_ground(HEIGHT, smooth, noise=1.0))) < 0.0
 
 
 def test_a_mode_beyond_the_tail_is_ground():
     """At the bump of a tail, an echo well above it is ground, and one below the threshold is not."""
+    # The bump lies 30 samples of 0.15 m below the mode.
     bump = 3.03 - 30 * 0.15
     strong, weak = echoes((100.0, 3.03), (30.0, bump)), echoes((100.0, 3.03), (2.0, bump))
     assert float(find_ground(HEIGHT, strong, pulse=system_pulse(), noise=0.5)) == pytest.approx(bump, abs=0.2)
@@ -81,6 +84,7 @@ def test_a_mode_beyond_the_tail_is_ground():
 
 
 def test_the_pulse_may_be_one_of_jaxlidars_and_its_zero_anywhere():
+    # The pulse's mode is 9 samples after its time zero, from which heights count.
     late = np.roll(system_pulse(), 9)
     power = echoes((100.0, 3.03), pulse=late)
     assert float(find_ground(HEIGHT, power, pulse=late, noise=0.5)) == pytest.approx(3.03, abs=0.03)
@@ -117,6 +121,7 @@ def test_the_ground_is_split_from_the_canopy(fraction, precision):
     assert float(split.height) == pytest.approx(0.0, abs=0.1)
     assert float(split.canopy) / total == pytest.approx(fraction, abs=0.03)
     assert float(split.ground) / total == pytest.approx(1 - fraction, abs=0.03)
+    # Canopy 1.5 times as bright as the ground, and G = 0.5: PAI = -2 ln(gap).
     cover = fraction / (fraction + 1.5 * (1 - fraction))
     assert float(plant_area_index(split.gap)) == pytest.approx(-2 * np.log(1 - cover), rel=0.2)
 

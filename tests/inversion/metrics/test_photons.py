@@ -67,6 +67,7 @@ def test_ground_and_canopy_are_found_by_night_and_by_day(slope, rate):
     ground, canopy, (purity, recall) = errors(slope, rate)
     assert abs(ground.mean()) < 0.05
     assert rms(ground) < 0.15
+    # The few photons of the canopy's top are lost with the noise: by day, heights read low.
     assert abs(canopy.mean()) < 0.5
     assert rms(canopy) < 1.0
     assert purity > 0.8
@@ -77,6 +78,7 @@ def test_without_the_noise_filter_the_canopy_is_missed(monkeypatch):
     """Negative control: if all photons pass for signal, background by day is taken for canopy."""
     monkeypatch.setattr(photons, "_count_neighbours", lambda x, z: np.full(x.size, np.inf))
     _, canopy, (purity, _) = errors(0.0, 5e6)
+    # Noise fills the window of 300 m: percentiles of it are far above the canopy.
     assert not np.any(np.abs(canopy) < 5.0)
     assert purity < 0.6
 
@@ -119,8 +121,8 @@ def test_segments_and_percentiles():
     coarse = inversion.photon_ground_and_canopy(events, DISTANCE, segment=100.0, percentile=50.0)
     np.testing.assert_allclose(coarse.distance, [50.0, 150.0])
     np.testing.assert_allclose(coarse.canopy, 10.0, atol=0.7)
-    again = inversion.photon_ground_and_canopy(events, DISTANCE, segment=100.0, percentile=50.0)
-    assert all(np.array_equal(a, b) for a, b in zip(coarse, again, strict=True))
+    repeated = inversion.photon_ground_and_canopy(events, DISTANCE, segment=100.0, percentile=50.0)
+    assert all(np.array_equal(a, b) for a, b in zip(coarse, repeated, strict=True))
 
 
 def test_percentiles_are_those_of_numpy():

@@ -35,6 +35,7 @@ def test_a_hard_target_has_one_echo(ratio):
     times, power = hard_targets(ratio)
     echoes = gaussian_decomposition(TIME, power, noise=1 / ratio, pulse=impulse(LAG))
     np.testing.assert_array_equal(echoes.count, 1)
+    # The error of the pulse, 1 %, limits strong echoes, and noise weak ones.
     np.testing.assert_allclose(echoes.time[:, 0], times, atol=0.02 + 5 / ratio)
     np.testing.assert_allclose(echoes.amplitude[:, 0], 1.0, atol=0.01 + 3 / ratio)
 
@@ -65,6 +66,7 @@ def test_a_wide_target_is_a_broadened_copy():
     """The variances of a Gaussian pulse and of the target add."""
     pulse = jl.GaussianPulse(fwhm=9.0)
     width = np.hypot(9.0 / 2.3548, 5.0)
+    # A Gaussian of 9 ns full width, broadened by one of 5 ns standard deviation.
     power = np.exp(-0.5 * ((TIME - 61.4) / width) ** 2)
     echoes = gaussian_decomposition(TIME, power, noise=0.005, pulse=pulse)
     assert int(echoes.count) == 1

@@ -7,13 +7,14 @@ import pytest
 import inversion
 import jaxlidar as jl
 from inversion import Recorder, Unknown
-from inversion.fit.retrieval import scale_of
-from inversion.receiver.recorder import RecorderModel
+from inversion.fit.recorder_model import RecorderModel
+from inversion.fit.retrieval import scale_unknown
 
 TIME = np.arange(-40.0, 61.0)
 HEIGHT = Unknown("ground.height", bounds=(-2.0, 2.0), name="height")
 START = jl.Scene(ground=jl.Ground(height=0.1, reflectance=0.5))
 SHOTS = 24
+# A skewed pulse.
 LAG = np.arange(-15.0, 26.0)
 POWER = np.where(LAG < 0, np.exp(-0.5 * (LAG / 2.0) ** 2), np.exp(-0.5 * (LAG / 3.5) ** 2))
 
@@ -80,11 +81,13 @@ def test_offsets_and_width_are_found_with_errors_as_stated(interleaved):
     truths = {"height": height, "receiver width": np.full(SHOTS, 1.5), "offset": offsets}
     for name, truth in truths.items():
         assert is_standard_normal(((fits.values[name] - truth) / fits.stderr[name]).ravel()), name
+    # Standard error of the mean of reduced chi-squared over shots, with five unknowns each.
     spread = np.sqrt(2.0 / (TIME.size - 5) / SHOTS)
     assert abs(fits.reduced_chi2.mean() - 1.0) < 4.5 * spread
     # Negative controls: one baseline for both digitisers, and none.
     for wrong in (Recorder(width=(0.2, 5.0), offset=(-1.0, 1.0)), Recorder(width=(0.2, 5.0))):
         assert fits_of(records, [pulse], 0.01, wrong, height).reduced_chi2.mean() > 1.0 + 45 * spread
+    # The record of the fitted values has the chi-squared of the fit.
     record = recorder.recorded(fits.fitted[0, 0], {name: v[0] for name, v in fits.values.items()})
     chi2 = np.sum(((record - records[0]) / 0.01) ** 2) / (TIME.size - 5)
     assert chi2 == pytest.approx(fits.reduced_chi2[0], rel=1e-3)
@@ -115,6 +118,7 @@ def test_noise_of_the_recorded_pulse_is_noise_of_the_fit(jitter):
     clean = amplitude[:, None] * echoes(fine, height, jitter)
     records = clean + 0.002 * random.normal(size=clean.shape)
     sent = np.diff(np.asarray(fine.cumulative(np.append(lag - 0.5, lag[-1] + 0.5))))
+    # The recorded pulse of every shot: the true one with noise of its own.
     sent = np.maximum(sent / sent.max() + 0.005 * random.normal(size=(SHOTS, lag.size)), 0.0)
     sent[:, [0, -1]] = 0.0
     pulses = [inversion.recorded_pulse(lag, s, finer=2) for s in sent]
@@ -134,7 +138,7 @@ def test_derivatives_are_those_of_differences():
     """In every unknown of the recorder, and through the simulated waveform."""
     random = np.random.default_rng(0)
     recorder = Recorder(width=(0.2, 5.0), impulse=[0.2, 1.0, -0.1], offset=(-1.0, 1.0), interleaved=3)
-    model = RecorderModel(recorder, [scale_of((0.1, 10.0), [])], jl.Lidar(), 50)
+    model = RecorderModel(recorder, [scale_unknown((0.1, 10.0), [])], jl.Lidar(), 50)
     # Width, three offsets and scale.
     values = np.array([1.3, 0.1, -0.2, 0.05, 2.0])
     total, scene_jacobian = random.normal(size=(2, 50)), random.normal(size=(2, 50, 1))
@@ -238,6 +242,7 @@ def test_a_recorded_pulse_is_simulated_as_it_was_recorded():
 
 def test_amplitudes_of_tables_in_decibels():
     """A linear table from a pedestal of two counts, in decibels: noise about the pedestal keeps its mean."""
+    # Counts 0 to 3 have no amplitude, as RIEGL's files mark them.
     decibels = np.where(np.arange(100) < 4, -2e37, 10 * np.log10(np.maximum(np.arange(100) - 2, 1) / 7))
     converted = inversion.amplitudes(np.array([0, 2, 9, 99]), decibels, noise=0.7, decibels=True)
     np.testing.assert_allclose(converted.values, [-2 / 7, 0.0, 1.0, 97 / 7], atol=1e-9)
@@ -291,6 +296,7 @@ def test_correlated_noise_is_noise_of_the_fit():
     """Standard errors and chi-squared are as stated; with noise taken as independent they are not."""
     random, pulse, rho = np.random.default_rng(11), jl.SampledPulse(LAG, POWER), 0.6
     height = random.uniform(-0.5, 0.5, SHOTS)
+    # Root of the covariance rho^|i - j| of the noise.
     root = np.linalg.cholesky(rho ** np.abs(np.subtract.outer(TIME, TIME)))
     records = echoes(pulse, height) + 0.02 * random.normal(size=(SHOTS, TIME.size)) @ root.T
     settings = {"offset": (-1.0, 1.0)}
@@ -329,6 +335,7 @@ def test_a_corrected_table_undoes_the_compression():
     table, options = np.arange(256.0), {"noise": 0.5, "knots": [100.0, 115.0, 130.0, 145.0, 160.0]}
     pulses, echoes = shots_of_a_compressed_digitiser(np.random.default_rng(4))
     corrected = inversion.corrected_table(table, pulses, echoes, **options)
+    # Light of 180 gives 159 counts, just below the last knot.
     light = np.linspace(50.0, 180.0, 50)
     read = np.interp(compressed(light), table, corrected)
     np.testing.assert_allclose(read, light, rtol=0.02)

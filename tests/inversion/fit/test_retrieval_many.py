@@ -1,4 +1,4 @@
-"""Many fits at once: the same as one at a time, each on its own, and resumed where they were interrupted."""
+"""Many fits: equal to single fits, independent of one another, and resumed after an interruption."""
 
 import concurrent.futures
 import dataclasses
@@ -43,102 +43,103 @@ def footprints():
     return clean + noise * np.random.default_rng(0).normal(size=clean.shape), noise, np.asarray(waves[0].time)
 
 
-def fit(footprints, lidar=LIDAR, scene=START, unknowns=UNKNOWNS, **more):
+def fit(footprints, lidar=LIDAR, scene=START, unknowns=UNKNOWNS, **options):
     observed, noise, time = footprints
-    given = {"noise": noise, "time": time, "key": jax.random.key(1), "lanes": 6, **more}
-    return inversion.retrieve_many(observed, lidar, scene, unknowns, **given)
+    options = {"noise": noise, "time": time, "key": jax.random.key(1), "lanes": 6, **options}
+    return inversion.retrieve_many(observed, lidar, scene, unknowns, **options)
 
 
 @pytest.mark.parametrize(
-    "own", slow_unless([{}], [{}, {"starts": 2}, {"max_orders": 2, "n_photons": 1024, "max_steps": 3}])
+    "options", slow_unless([{}], [{}, {"starts": 2}, {"max_orders": 2, "n_photons": 1024, "max_steps": 3}])
 )
-def test_workers_give_the_same_fits(footprints, own):
-    """One lidar for all, and for each, with an unknown that starts elsewhere in each footprint."""
-    own |= {"lidar": [LIDAR] * COUNT, "start": {"height": np.linspace(-0.2, 0.7, COUNT)}, "lanes": 2}
-    here, seen = fit(footprints, **own), []
+def test_workers_give_the_same_fits(footprints, options):
+    """With a lidar and a start for each footprint, and one scene for all."""
+    options |= {"lidar": [LIDAR] * COUNT, "start": {"height": np.linspace(-0.2, 0.7, COUNT)}, "lanes": 2}
+    in_process, reports = fit(footprints, **options), []
     with concurrent.futures.ThreadPoolExecutor(2) as pool:
-        there = fit(footprints, **own, executor=pool, progress=seen.append)
-    assert here.status == there.status
+        by_workers = fit(footprints, **options, executor=pool, progress=reports.append)
+    assert in_process.status == by_workers.status
     for name in ("values", "stderr", "covariance", "reduced_chi2", "converged", "steps", "fitted"):
-        pairs = zip(jax.tree.leaves(getattr(here, name)), jax.tree.leaves(getattr(there, name)), strict=True)
-        assert all(np.array_equal(a, b) for a, b in pairs), name
-    assert [p.done for p in seen] == list(range(1, COUNT + 1))
+        a, b = (jax.tree.leaves(getattr(fits, name)) for fits in (in_process, by_workers))
+        assert all(np.array_equal(x, y) for x, y in zip(a, b, strict=True)), name
+    assert [p.done for p in reports] == list(range(1, COUNT + 1))
 
 
 def test_a_worker_that_dies_costs_its_fits_a_second_try(footprints, tmp_path):
-    here, path = fit(footprints, lanes=2), tmp_path / "fits.sqlite"
+    expected, path = fit(footprints, lanes=2), tmp_path / "fits.sqlite"
     dying = Dying([1])
-    assert np.array_equal(fit(footprints, lanes=2, executor=dying).fitted, here.fitted)
+    assert np.array_equal(fit(footprints, lanes=2, executor=dying).fitted, expected.fitted)
     assert dying.submitted.count(1) == 2
     with pytest.raises(RuntimeError, match="the workers of chunk 1 died twice"):
         fit(footprints, lanes=2, executor=Dying([1, 1]), path=path)
-    # What the others had done is kept.
-    seen = []
-    again = fit(footprints, lanes=2, path=path, progress=seen.append)
-    assert np.array_equal(again.fitted, here.fitted)
-    assert seen[0].done > 1
+    # The checkpoint has the fits of the other chunks.
+    reports = []
+    resumed = fit(footprints, lanes=2, path=path, progress=reports.append)
+    assert np.array_equal(resumed.fitted, expected.fitted)
+    assert reports[0].done > 1
 
 
-def test_every_footprint_is_found_within_its_errors(footprints):
-    seen = []
-    found = fit(footprints, progress=seen.append)
-    assert np.all(found.converged)
-    z = np.concatenate([np.ravel((found.values[k] - TRUTH[k]) / found.stderr[k]) for k in TRUTH])
+def test_every_footprint_is_retrieved_within_its_errors(footprints):
+    reports = []
+    fits = fit(footprints, progress=reports.append)
+    assert np.all(fits.converged)
+    z = np.concatenate([np.ravel((fits.values[k] - TRUTH[k]) / fits.stderr[k]) for k in TRUTH])
     assert 0.7 < np.std(z) < 1.3
     assert np.max(np.abs(z)) < 4
-    # A wrong truth is told apart: the neighbour's.
-    wrong = np.ravel((found.values["height"][1:] - TRUTH["height"][:-1]) / found.stderr["height"][1:])
-    assert np.median(np.abs(wrong)) > 4
-    assert [p.done for p in seen] == list(range(1, COUNT + 1))
-    assert str(seen[-1]) == f"{COUNT} of {COUNT} fits, {COUNT} converged"
-    assert found.fitted.shape == footprints[0].shape
-    assert found.labels == ("height", "reflectance[0]", "reflectance[1]")
+    # Negative control: the truth of the neighbour.
+    neighbour_z = np.ravel((fits.values["height"][1:] - TRUTH["height"][:-1]) / fits.stderr["height"][1:])
+    assert np.median(np.abs(neighbour_z)) > 4
+    assert [p.done for p in reports] == list(range(1, COUNT + 1))
+    assert str(reports[-1]) == f"{COUNT} of {COUNT} fits, {COUNT} converged"
+    assert fits.fitted.shape == footprints[0].shape
+    assert fits.labels == ("height", "reflectance[0]", "reflectance[1]")
 
 
-def test_a_batch_is_the_fits_one_by_one(footprints):
+def test_many_fits_are_the_single_fits(footprints):
     observed, noise, time = footprints
-    found = fit(footprints)
+    fits = fit(footprints)
     for i in (0, 7, COUNT - 1):
-        one = inversion.retrieve(
+        single = inversion.retrieve(
             observed[i], LIDAR, START, UNKNOWNS, noise=noise, time=time, key=jax.random.key(1)
         )
         for name in TRUTH:
-            assert np.allclose(found.values[name][i], one.values[name], rtol=1e-4, atol=1e-5)
-            assert np.allclose(found.stderr[name][i], one.stderr[name], rtol=1e-3)
-        assert found.steps[i] == one.steps
-        assert found.status[i] == one.status
+            assert np.allclose(fits.values[name][i], single.values[name], rtol=1e-4, atol=1e-5)
+            assert np.allclose(fits.stderr[name][i], single.stderr[name], rtol=1e-3)
+        assert fits.steps[i] == single.steps
+        assert fits.status[i] == single.status
 
 
-def test_a_failed_fit_leaves_its_neighbours_alone(footprints):
+def test_a_failed_fit_does_not_affect_its_neighbours(footprints):
     observed, noise, time = footprints
-    spoiled = observed.copy()
-    spoiled[3] = 1e3 * np.random.default_rng(1).normal(size=spoiled[3].shape)
-    good, bad = fit(footprints), fit((spoiled, noise, time), max_steps=50)
-    others = np.arange(COUNT) != 3
-    assert not bad.converged[3] or bad.reduced_chi2[3] > 1e3
-    assert np.array_equal(good.values["height"][others], bad.values["height"][others])
-    assert np.all(np.isfinite(bad.values["height"]))
+    damaged = observed.copy()
+    damaged[3] = 1e3 * np.random.default_rng(1).normal(size=damaged[3].shape)
+    expected, fits = fit(footprints), fit((damaged, noise, time), max_steps=50)
+    is_neighbour = np.arange(COUNT) != 3
+    assert not fits.converged[3] or fits.reduced_chi2[3] > 1e3
+    assert np.array_equal(expected.values["height"][is_neighbour], fits.values["height"][is_neighbour])
+    assert np.all(np.isfinite(fits.values["height"]))
 
 
-def test_each_footprint_may_have_a_pulse_and_a_start_of_its_own(footprints):
-    wide = dataclasses.replace(LIDAR, pulse=jl.GaussianPulse(fwhm=6.0))
-    lidars = [LIDAR if i % 2 else wide for i in range(COUNT)]
+def test_each_footprint_may_have_its_own_pulse_and_start(footprints):
+    wide_pulse = dataclasses.replace(LIDAR, pulse=jl.GaussianPulse(fwhm=6.0))
+    lidars = [LIDAR if i % 2 else wide_pulse for i in range(COUNT)]
     starts = [
         START if i % 3 else jl.Scene(ground=jl.Ground(reflectance=np.array([0.5, 0.2]))) for i in range(COUNT)
     ]
-    found = fit(footprints, lidar=lidars, scene=starts)
+    fits = fit(footprints, lidar=lidars, scene=starts)
     # Recorded with the narrow pulse: the wide one does not fit.
-    assert found.reduced_chi2[1::2].max() < 2 < 10 < found.reduced_chi2[0::2].min()
+    assert fits.reduced_chi2[1::2].max() < 2 < 10 < fits.reduced_chi2[0::2].min()
     with pytest.raises(ValueError, match="lidar has 3 elements; admissible is one, or 20"):
         fit(footprints, lidar=lidars[:3])
-    other = [START] * (COUNT - 1) + [jl.Scene(ground=jl.Ground(reflectance=0.3))]
+    # One scene with a reflectance for all wavelengths.
+    unequal = [START] * (COUNT - 1) + [jl.Scene(ground=jl.Ground(reflectance=0.3))]
     with pytest.raises(ValueError, match="scene 19 differs from the first"):
-        fit(footprints, scene=other)
+        fit(footprints, scene=unequal)
 
 
-def test_what_is_done_is_kept_when_interrupted(footprints, tmp_path):
+def test_an_interrupted_run_goes_on_from_its_checkpoint(footprints, tmp_path):
     path = tmp_path / "fits.sqlite"
-    whole = fit(footprints)
+    expected = fit(footprints)
 
     def stop(progress):
         if progress.done == 9:
@@ -146,28 +147,26 @@ def test_what_is_done_is_kept_when_interrupted(footprints, tmp_path):
 
     with pytest.raises(KeyboardInterrupt):
         fit(footprints, path=path, progress=stop)
-    seen = []
-    resumed = fit(footprints, path=path, progress=seen.append)
-    assert [p.done for p in seen] == list(range(10, COUNT + 1))
-    assert np.array_equal(resumed.values["height"], whole.values["height"])
-    assert resumed.status == whole.status
-    # Nothing is left to do, and nothing else may be put there.
-    assert np.array_equal(fit(footprints, path=path, progress=stop).covariance, whole.covariance)
+    reports = []
+    resumed = fit(footprints, path=path, progress=reports.append)
+    assert [p.done for p in reports] == list(range(10, COUNT + 1))
+    assert np.array_equal(resumed.values["height"], expected.values["height"])
+    assert resumed.status == expected.status
+    # No fit is left, and the file takes no other problem.
+    assert np.array_equal(fit(footprints, path=path, progress=stop).covariance, expected.covariance)
     observed, noise, time = footprints
-    with pytest.raises(ValueError, match="keeps fits of another problem; what differs: observed"):
+    with pytest.raises(ValueError, match="holds results of another problem, which differs in observed"):
         fit((observed + 0.1, noise, time), path=path)
 
 
-def test_starts_find_what_one_start_misses(footprints):
+def test_several_starts_find_a_minimum_that_one_start_misses(footprints):
     observed, noise, time = footprints
-    far = jl.Scene(ground=jl.Ground(height=-1.9, reflectance=np.array([0.3, 0.3])))
-    sharp = dataclasses.replace(LIDAR, pulse=jl.GaussianPulse(fwhm=4.0))
-    found = inversion.retrieve_many(
-        observed[-2:], sharp, far, UNKNOWNS, noise=noise, time=time, key=jax.random.key(1), starts=8
-    )
-    assert np.all(found.converged)
-    assert np.allclose(found.values["height"], TRUTH["height"][-2:], atol=0.05)
-    assert all("of 8 starts ended there" in s for s in found.status)
+    far_start = jl.Scene(ground=jl.Ground(height=-1.9, reflectance=np.array([0.3, 0.3])))
+    options = {"noise": noise, "time": time, "key": jax.random.key(1), "starts": 8}
+    fits = inversion.retrieve_many(observed[-2:], LIDAR, far_start, UNKNOWNS, **options)
+    assert np.all(fits.converged)
+    assert np.allclose(fits.values["height"], TRUTH["height"][-2:], atol=0.05)
+    assert all("of 8 starts ended there" in s for s in fits.status)
 
 
 def test_results_go_to_xarray(footprints):
@@ -179,20 +178,20 @@ def test_results_go_to_xarray(footprints):
     assert "converged" in str(table["status"].values[0])
 
 
-def test_bad_input_is_refused(footprints):
+def test_inadmissible_records_are_refused(footprints):
     observed, noise, time = footprints
-    for change, words in (
+    for change, message in (
         ((observed[0], noise, time), "observed has the shape"),
         ((observed, np.ones(3), time), "noise has the shape"),
         ((observed, -1.0, time), "noise = -1"),
         ((observed, noise, time[:-1]), "observed has the shape"),
     ):
-        with pytest.raises(ValueError, match=words):
+        with pytest.raises(ValueError, match=message):
             fit(change)
 
 
 @pytest.mark.parametrize(
-    ("change", "words"),
+    ("change", "message"),
     [
         ({"lanes": 0}, r"lanes = 0 is outside the admissible range \[1, inf\) of integers"),
         ({"starts": 0}, "starts = 0 is outside"),
@@ -210,44 +209,69 @@ def test_bad_input_is_refused(footprints):
         ({"start": {"height": np.full(COUNT, 5.0)}}, "unknown 'height' starts from 5, which is outside"),
     ],
 )
-def test_bad_arguments_are_refused(footprints, change, words):
-    with pytest.raises(ValueError, match=words):
+def test_inadmissible_arguments_are_refused(footprints, change, message):
+    with pytest.raises(ValueError, match=message):
         fit(footprints, **change)
 
 
-KINDS = """
+WRONG_TYPES = """
 import jax, numpy as np, inversion, jaxlidar as jl
 from inversion import Unknown
 lidar, scene = jl.Lidar(), jl.Scene(ground=jl.Ground())
-given = {
+arguments = {
     "observed": np.ones((1, 1, 9)), "lidar": lidar, "scene": scene,
     "unknowns": [Unknown("ground.height", bounds=(-1.0, 1.0))],
     "noise": 1.0, "time": np.arange(-4.0, 5.0), "key": jax.random.key(0),
 }
-def many(**changes):
-    inversion.retrieve_many(**given | changes)
-def one(**changes):
-    inversion.retrieve(**given | {"observed": np.ones((1, 9))} | changes)
+def fit_many(**changes):
+    inversion.retrieve_many(**arguments | changes)
+def fit_one(**changes):
+    inversion.retrieve(**arguments | {"observed": np.ones((1, 9))} | changes)
 def profile(**changes):
-    two = [*given["unknowns"], Unknown("ground.reflectance", bounds=(0.0, 1.0))]
-    named = {"name": "ground.height", "values": [0.0, 0.1], "unknowns": two}
-    inversion.profile_likelihood(**given | {"observed": np.ones((1, 9))} | named | changes)
+    two_unknowns = [*arguments["unknowns"], Unknown("ground.reflectance", bounds=(0.0, 1.0))]
+    named = {"name": "ground.height", "values": [0.0, 0.1], "unknowns": two_unknowns}
+    inversion.profile_likelihood(**arguments | {"observed": np.ones((1, 9))} | named | changes)
 def bound(**changes):
-    inversion.cramer_rao(**{k: v for k, v in given.items() if k != "observed"} | changes)
+    inversion.cramer_rao(**{k: v for k, v in arguments.items() if k != "observed"} | changes)
 for call in (
-    lambda: many(observed="all"), lambda: many(observed=None), lambda: many(noise="low"),
-    lambda: many(time=None), lambda: many(key=3), lambda: many(solver=None), lambda: many(lidar=scene),
-    lambda: many(scene=[lidar]), lambda: many(unknowns=given["unknowns"][0]), lambda: many(unknowns=["z"]),
-    lambda: many(starts="two"), lambda: many(start=[0.0]), lambda: many(path=3), lambda: many(progress=3),
-    lambda: many(key=jax.random.split(given["key"])), lambda: many(start={"ground.height": "low"}),
-    lambda: one(observed="all"), lambda: one(progress=3),
-    lambda: one(unknowns=given["unknowns"][0]), lambda: one(solver=None),
-    lambda: one(max_steps=None), lambda: bound(unknowns=iter(given["unknowns"])), lambda: bound(noise=None),
-    lambda: one(lidar=None), lambda: one(scene=lidar), lambda: one(plan="p"), lambda: bound(key=None),
-    lambda: profile(solver=None), lambda: profile(key=0), lambda: profile(values="all"),
-    lambda: profile(steps=9), lambda: profile(max_steps=0), lambda: profile(starts=1.5),
-    lambda: profile(scale=2.0), lambda: profile(progress=3), lambda: profile(noise=[1.0, 2.0]),
-    lambda: Unknown(3, bounds=(0.0, 1.0)), lambda: Unknown(apply=3, name="x", start=0.5, bounds=(0.0, 1.0)),
+    lambda: fit_many(observed="all"),
+    lambda: fit_many(observed=None),
+    lambda: fit_many(noise="low"),
+    lambda: fit_many(time=None),
+    lambda: fit_many(key=3),
+    lambda: fit_many(solver=None),
+    lambda: fit_many(lidar=scene),
+    lambda: fit_many(scene=[lidar]),
+    lambda: fit_many(unknowns=arguments["unknowns"][0]),
+    lambda: fit_many(unknowns=["z"]),
+    lambda: fit_many(starts="two"),
+    lambda: fit_many(start=[0.0]),
+    lambda: fit_many(path=3),
+    lambda: fit_many(progress=3),
+    lambda: fit_many(key=jax.random.split(arguments["key"])),
+    lambda: fit_many(start={"ground.height": "low"}),
+    lambda: fit_one(observed="all"),
+    lambda: fit_one(progress=3),
+    lambda: fit_one(unknowns=arguments["unknowns"][0]),
+    lambda: fit_one(solver=None),
+    lambda: fit_one(max_steps=None),
+    lambda: bound(unknowns=iter(arguments["unknowns"])),
+    lambda: bound(noise=None),
+    lambda: fit_one(lidar=None),
+    lambda: fit_one(scene=lidar),
+    lambda: fit_one(plan="p"),
+    lambda: bound(key=None),
+    lambda: profile(solver=None),
+    lambda: profile(key=0),
+    lambda: profile(values="all"),
+    lambda: profile(steps=9),
+    lambda: profile(max_steps=0),
+    lambda: profile(starts=1.5),
+    lambda: profile(scale=2.0),
+    lambda: profile(progress=3),
+    lambda: profile(noise=[1.0, 2.0]),
+    lambda: Unknown(3, bounds=(0.0, 1.0)),
+    lambda: Unknown(apply=3, name="x", start=0.5, bounds=(0.0, 1.0)),
 ):
     try:
         call()
@@ -257,10 +281,10 @@ for call in (
 """
 
 
-def test_things_of_another_kind_are_refused():
-    """Without the tests' own checks of types."""
-    done = subprocess.run([sys.executable, "-c", KINDS], check=True, capture_output=True, text=True)
-    assert done.stdout.splitlines() == [
+def test_arguments_of_the_wrong_type_are_refused():
+    """In another process, without the type checks of the tests."""
+    process = subprocess.run([sys.executable, "-c", WRONG_TYPES], check=True, capture_output=True, text=True)
+    assert process.stdout.splitlines() == [
         "TypeError observed is a str; admissible are real numbers",
         "TypeError observed is None; admissible are real numbers",
         "TypeError noise is a str; admissible are real numbers",

@@ -1,0 +1,188 @@
+"""Record of one fit: all quantities that its result has, as plain arrays over the flattened unknowns.
+
+`FitRecord` is the one place in which the quantities of a fit are listed. Each field names its axes and its
+kind of number; from these,
+
+- `inversion.fit.result` makes a `Retrieval` from one record and a `Retrievals` from many;
+- `to_arrays`, `from_arrays` and `check` write an entry of a checkpoint, and read and check it.
+
+`FitDetails` holds what only the result of a single fit has.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from inversion.fit.model import Evaluation
+
+
+@dataclasses.dataclass(frozen=True)
+class Step:
+    """One step of a fit, as `retrieve` passes it to `progress`: values that were tried in a simulation.
+
+    The first steps of a fit may trace few of the photons, the last ones trace all. Chi-squared, which counts
+    the simulation's own noise, may rise between the two.
+
+    - `number`: from 1 on.
+    - `reduced_chi2`: reduced chi-squared at the values tried.
+    - `accepted`: True if the step was accepted.
+    - `values`: by name, the values tried.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> import inversion
+    >>> print(inversion.Step(number=2, reduced_chi2=1.5, accepted=False, values={"height": 0.25}))
+    step 2: chi2 = 1.5 (not kept); height = 0.25
+    """
+
+    number: int
+    reduced_chi2: float
+    accepted: bool
+    values: Mapping[str, np.ndarray | float]
+
+    def __str__(self) -> str:
+        values = ", ".join(f"{name} = {short_text(value)}" for name, value in self.values.items())
+        rejection = "" if self.accepted else " (not kept)"
+        return f"step {self.number}: chi2 = {self.reduced_chi2:.4g}{rejection}; {values}"
+
+
+def short_text(value: Any) -> str:
+    """Return a number or array in four digits, long arrays abridged."""
+    return np.array2string(np.asarray(value), precision=4, threshold=8, edgeitems=3)
+
+
+class RecordSizes(NamedTuple):
+    """Lengths of the axes of a record: flattened unknowns, smoothness priors, and those of a waveform."""
+
+    unknowns: int
+    smooth_priors: int
+    wavelengths: int
+    bins: int
+
+
+def _axes(axes: str = "", kind: str = "f") -> dict[str, Any]:
+    """Return the metadata of a quantity: its axes (fields of `RecordSizes`), and NumPy's code of its kind."""
+    return {"axes": tuple(axes.split()), "kind": kind}
+
+
+@dataclasses.dataclass(frozen=True)
+class FitRecord:
+    """The result of one fit, in natural units.
+
+    - `values`, `stderr`: estimates and standard errors; infinite errors for unknowns that the data do not
+      constrain.
+    - `robust_stderr`: standard errors widened by misfit and by the spread over several starts.
+    - `prior_share`: fraction of the information on each unknown that is the prior's.
+    - `at_bound`: True for unknowns at one of their bounds.
+    - `covariance`: of the estimates. `averaging`: averaging kernel, d estimate / d truth.
+    - `reduced_chi2`, `independent_samples`: misfit, and effective number of samples.
+    - `second_minimum`: rise in chi-squared to the next minimum, infinite if no start ended in another one.
+    - `strength`: of the smoothness priors.
+    - `converged`, `status`: end of the fit. `steps`: number of simulations.
+    - `fitted`: simulated apparent reflectance at the estimates, without the recorder's terms.
+    """
+
+    # Estimates.
+    values: np.ndarray = dataclasses.field(metadata=_axes("unknowns"))
+    stderr: np.ndarray = dataclasses.field(metadata=_axes("unknowns"))
+    robust_stderr: np.ndarray = dataclasses.field(metadata=_axes("unknowns"))
+    prior_share: np.ndarray = dataclasses.field(metadata=_axes("unknowns"))
+    at_bound: np.ndarray = dataclasses.field(metadata=_axes("unknowns", kind="b"))
+    covariance: np.ndarray = dataclasses.field(metadata=_axes("unknowns unknowns"))
+    averaging: np.ndarray = dataclasses.field(metadata=_axes("unknowns unknowns"))
+    # Evidence.
+    reduced_chi2: float = dataclasses.field(metadata=_axes())
+    independent_samples: float = dataclasses.field(metadata=_axes())
+    second_minimum: float = dataclasses.field(metadata=_axes())
+    strength: np.ndarray = dataclasses.field(metadata=_axes("smooth_priors"))
+    # End of the fit.
+    converged: bool = dataclasses.field(metadata=_axes(kind="b"))
+    status: str = dataclasses.field(metadata=_axes(kind="U"))
+    steps: int = dataclasses.field(metadata=_axes(kind="i"))
+    fitted: np.ndarray = dataclasses.field(metadata=_axes("wavelengths bins"))
+
+    @staticmethod
+    def axes() -> dict[str, tuple[str, ...]]:
+        """Return the axes of every quantity, by name."""
+        return {f.name: f.metadata["axes"] for f in dataclasses.fields(FitRecord)}
+
+    def to_arrays(self) -> dict[str, Any]:
+        """Return the quantities by name."""
+        return {name: getattr(self, name) for name in self.axes()}
+
+    @staticmethod
+    def from_arrays(arrays: Mapping[str, np.ndarray]) -> "FitRecord":
+        """Return the record of quantities that `to_arrays` gave, as NumPy arrays.
+
+        **Raises:** ValueError for quantities of other names.
+        """
+        if arrays.keys() != FitRecord.axes().keys():
+            raise ValueError(f"it has {', '.join(arrays)}; admissible are {', '.join(FitRecord.axes())}")
+        # Scalars were stored as arrays without axes.
+        quantities: dict[str, Any] = {name: a if a.ndim else a.item() for name, a in arrays.items()}
+        return FitRecord(**quantities)
+
+    def check(self, sizes: RecordSizes) -> None:
+        """Check a record that was read from a file.
+
+        **Raises:** ValueError for quantities of another kind or shape, and for numbers that no fit gives.
+        """
+        # A file with intact checksums may still hold entries that another program wrote.
+        for field in dataclasses.fields(self):
+            array, kind = np.asarray(getattr(self, field.name)), field.metadata["kind"]
+            shape = tuple(getattr(sizes, axis) for axis in field.metadata["axes"])
+            if (array.dtype.kind, array.shape) != (kind, shape):
+                raise ValueError(
+                    f"{field.name} is {array.dtype} of the shape {array.shape}; admissible is {kind!r} of "
+                    f"{shape}"
+                )
+        if self.steps < 1 or not np.all(np.isfinite(self.values)):
+            raise ValueError(
+                f"values = {self.values} after {self.steps} steps; admissible are finite ones after 1"
+            )
+        if self.converged and not self._is_regular():
+            raise ValueError("it is said to have converged, but its numbers are not finite")
+
+    def _is_regular(self) -> bool:
+        """Return True for the numbers of a converged fit.
+
+        A fit that has not converged may have no finite waveform, and an undetermined unknown has an infinite
+        error.
+        """
+        return bool(
+            np.isfinite(self.reduced_chi2)
+            and np.all(np.isfinite(self.fitted))
+            and np.all(self.stderr >= 0)
+            and np.all(self.robust_stderr >= self.stderr)
+            and not np.any(np.isnan(self.covariance))
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class FitDetails:
+    """Further quantities of one fit, which are neither stored nor given for many fits.
+
+    - `simulation_error`: (n,) part of the standard errors that is the simulation's own noise.
+    - `residuals`: (wavelengths, bins) observed minus fitted, whitened; zero for samples that are left out.
+    - `waveform_stderr`: (wavelengths, bins) standard error of the simulated waveform.
+    - `cost`: chi-squared by the measurement's noise only, plus -2 ln of the prior density: compares minima.
+    - `history`: reduced chi-squared of every step.
+    - `evaluation`: the simulation at the estimates.
+    """
+
+    simulation_error: np.ndarray
+    residuals: np.ndarray
+    waveform_stderr: np.ndarray
+    cost: float
+    history: tuple[float, ...]
+    evaluation: Evaluation
+
+
+class CompletedFit(NamedTuple):
+    """A fit that has ended."""
+
+    record: FitRecord
+    details: FitDetails
