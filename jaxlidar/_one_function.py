@@ -1,9 +1,9 @@
-"""What older compilers have to be told: which loops are one function, and which values to compute once.
+"""Hints for older XLA compilers: loops to compile as one function, and values to compute once.
 
-XLA runs a program on a processor as a list of small kernels. In a loop whose arrays fit into the processor's
-cache, handing on from kernel to kernel takes longer than computing. Newer versions compile such loops as one
-function by themselves. Older ones also drop optimisation barriers, and compute what several results share
-again for each of them.
+XLA runs a program on a CPU as a list of small kernels. In a loop whose arrays fit into the cache, the
+overhead between kernels takes longer than the computation. Newer versions compile such loops as one function
+by themselves. Older ones also drop optimisation barriers, and compute a value again for each result that uses
+it.
 """
 
 from collections.abc import Callable
@@ -14,38 +14,40 @@ from jax import lax
 
 State = TypeVar("State")
 
-# From this version on, XLA finds the loops itself, and keeps barriers.
-_UNAIDED = (0, 12)
+# From this version of JAX on, XLA finds the loops itself, and keeps barriers.
+_FIRST_VERSION_WITHOUT_HINTS = (0, 12)
 
 
-def _is_aided() -> bool:
-    return jax.__version_info__ < _UNAIDED and jax.default_backend() == "cpu"
+def _needs_hints() -> bool:
+    return jax.__version_info__ < _FIRST_VERSION_WITHOUT_HINTS and jax.default_backend() == "cpu"
 
 
-def _apart(function: Callable[[State], State], **marks: str) -> Callable[[State], State]:
-    """`function`, which the compiler calls, and does not make part of what calls it."""
+def _called_separately(function: Callable[[State], State], **attributes: str) -> Callable[[State], State]:
+    """Return `function`, which the compiler calls and does not inline, with more attributes for XLA."""
     # Experimental: only where it is needed.
     from jax.experimental.xla_metadata import set_xla_metadata
 
     compiled = jax.jit(function)
 
-    def marked(values: State) -> State:
-        # XLA's own marks. A version that does not know them compiles the function as ever.
-        with set_xla_metadata(inlineable="false", **marks):
+    def with_attributes(values: State) -> State:
+        # XLA's own attributes. A version that does not know them compiles the function as usual.
+        with set_xla_metadata(inlineable="false", **attributes):
             return compiled(values)
 
-    return marked
+    return with_attributes
 
 
 def one_function(loop: Callable[[State], State]) -> Callable[[State], State]:
-    """`loop`, compiled as one function on processors; elsewhere as it is.
+    """Return `loop`, compiled as one function on CPUs; elsewhere as it is.
 
-    It may not scatter. So it cannot be differentiated in reverse, which makes scatters of gathers.
+    The loop must not scatter. So it cannot be differentiated in reverse, which turns gathers into scatters.
     """
-    return _apart(loop, xla_cpu_small_call="true") if _is_aided() else loop
+    return _called_separately(loop, xla_cpu_small_call="true") if _needs_hints() else loop
 
 
 def once(values: State) -> State:
-    """The same values, computed once for all that use them."""
-    # A function that is called is a barrier.
-    return _apart(lax.optimization_barrier)(values) if _is_aided() else lax.optimization_barrier(values)
+    """Return the same values behind an optimisation barrier: they are computed once for all their uses."""
+    # Older versions drop the barrier itself, but not a function call around it.
+    if _needs_hints():
+        return _called_separately(lax.optimization_barrier)(values)
+    return lax.optimization_barrier(values)

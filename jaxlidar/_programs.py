@@ -1,5 +1,11 @@
-"""Compiled programs, a bounded number of them: those used longest ago are forgotten, and their memory is
-freed.
+"""Compiled programs, a bounded number of them: the least recently used are dropped, and their memory freed.
+
+JAX keeps every program that it has compiled. A simulation of many scenes of different sizes would fill the
+memory with programs that are not used again. A `Program` keeps a bounded number of *versions* instead, one
+for each structure, shapes and types of the arguments and each relevant setting of JAX.
+
+Arguments are pytrees. Flattened, an argument is a *static part* (its structure, and the leaves that are not
+arrays), on which the version depends, and its arrays, which are passed to the compiled function.
 """
 
 import functools
@@ -15,80 +21,97 @@ import numpy as np
 from jaxlidar._checks import is_traced
 
 # A compiled simulation takes 50 to 250 MB.
-MOST = 16
+MAX_VERSIONS = 16
 
 
 class Program:
     """A function of pytrees, compiled once for each structure, shape and type of its arguments.
 
     As with `equinox.filter_jit`, arrays (NumPy's among them) are traced and all else is static. At most
-    `most` compiled versions are kept. Within a JAX transformation the function is called as it is.
+    `max_versions` compiled versions are kept. Within a JAX transformation the function is called directly.
+
+    **Arguments:**
+
+    - `function`: the function to compile; all its static arguments are hashable.
+    - `max_versions`: number of versions to keep. Default 16.
+    - `options`: keyword arguments of `jax.jit`.
     """
 
-    def __init__(self, function: Callable, *, most: int = MOST, **options: Any):
+    def __init__(self, function: Callable, *, max_versions: int = MAX_VERSIONS, **options: Any):
         functools.update_wrapper(self, function)
-        self.function, self.most, self.options = function, most, options
+        self.function, self.max_versions, self.options = function, max_versions, options
         self.versions: OrderedDict[Any, _Version] = OrderedDict()
         self._lock = threading.Lock()
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        return self._run(_parts(args, kwargs))
+        return self._run(_flatten_arguments(args, kwargs))
 
-    def given(self, **kept: Any) -> Callable:
-        """The program with these arguments given; it takes the others by name.
+    def bind(self, **bound: Any) -> Callable:
+        """Return the program with these arguments bound; it takes its remaining arguments by name.
 
-        They are taken apart once, for many calls. For an equinox module of thirty arrays that takes longer
-        than a short program runs, and Python lets only one thread at a time do it.
+        Bound arguments are flattened once, for many calls. For an equinox module of thirty arrays that takes
+        longer than a short program runs, and Python lets only one thread at a time do it.
         """
-        known = _parts((), kept)
-        return lambda **others: self._run(dict(sorted({**known, **_parts((), others)}.items())))
+        flat_bound = _flatten_arguments((), bound)
 
-    def begin(self, *args: Any, **kwargs: Any) -> Any:
-        """Begin to compile for arguments of this kind, in a thread of its own.
+        def call(**kwargs: Any) -> Any:
+            arguments = {**flat_bound, **_flatten_arguments((), kwargs)}
+            # In the order of a call with all arguments, so that the two share a version.
+            return self._run(dict(sorted(arguments.items())))
 
-        Arrays may be given, or shapes that another `begin` has returned.
+        return call
 
-        **Returns:** the shapes of the result, in place of its arrays.
+    def compile_ahead(self, *args: Any, **kwargs: Any) -> Any:
+        """Begin to compile for arguments like these, in another thread.
+
+        Arguments may have arrays, or shapes that another `compile_ahead` has returned.
+
+        **Returns:** the result, with shapes in place of its arrays.
         """
-        parts = _parts(args, kwargs)
-        return self._version(parts).begin(_arrays(parts))
+        arguments = _flatten_arguments(args, kwargs)
+        return self._version(arguments).compile_ahead(_all_arrays(arguments))
 
     def is_compiled(self, *args: Any, **kwargs: Any) -> bool:
-        """Whether a call with such arguments compiles nothing."""
-        return self._version(_parts(args, kwargs)).ready
+        """Return True if a call with arguments like these compiles nothing."""
+        return self._version(_flatten_arguments(args, kwargs)).is_compiled
 
-    def _run(self, parts: "dict[str | int, _Part]") -> Any:
-        arrays = _arrays(parts)
+    def _run(self, arguments: "dict[str | int, _FlatArgument]") -> Any:
+        arrays = _all_arrays(arguments)
         if any(map(is_traced, arrays)):
-            return _call(self.function, {name: part.kind for name, part in parts.items()}, arrays)
-        return self._version(parts)(arrays)
+            # The transformation around it differentiates or compiles the function.
+            static_parts = {name: argument.static for name, argument in arguments.items()}
+            return _call(self.function, static_parts, arrays)
+        return self._version(arguments)(arrays)
 
-    def _version(self, parts: "dict[str | int, _Part]") -> "_Version":
+    def _version(self, arguments: "dict[str | int, _FlatArgument]") -> "_Version":
+        """Return the version for arguments like these, a new one if there is none."""
         config: Any = jax.config
-        setting = (config.jax_enable_x64, config.jax_default_device, config.jax_numpy_rank_promotion)
-        kinds = {name: part.kind for name, part in parts.items()}
-        key = (tuple(kinds.items()), tuple(part.types for part in parts.values()), setting)
+        # Settings by thread or context that change what a function compiles to.
+        settings = (config.jax_enable_x64, config.jax_default_device, config.jax_numpy_rank_promotion)
+        static_parts = {name: argument.static for name, argument in arguments.items()}
+        types = tuple(argument.types for argument in arguments.values())
+        key = (tuple(static_parts.items()), types, settings)
         with self._lock:
             version = self.versions.get(key)
             if version is None:
-                version = self.versions[key] = _Version(self.function, kinds, self.options)
+                version = self.versions[key] = _Version(self.function, static_parts, self.options)
             self.versions.move_to_end(key)
-            while len(self.versions) > self.most:
+            while len(self.versions) > self.max_versions:
                 self.versions.popitem(last=False)
         return version
 
 
-class _Kind(NamedTuple):
-    """What a pytree is without its arrays: `leaves` has `_ARRAY` where one belongs."""
+class _StaticPart(NamedTuple):
+    """A pytree without its arrays: `leaves` has `_ARRAY` in their places."""
 
     structure: Any
     leaves: tuple[Any, ...]
 
 
-class _Part(NamedTuple):
-    """One argument, taken apart."""
+class _FlatArgument(NamedTuple):
+    """One argument, flattened. `types` has the shape, type and weak type of each array."""
 
-    kind: _Kind
+    static: _StaticPart
     types: tuple[Any, ...]
     arrays: list[Any]
 
@@ -96,78 +119,93 @@ class _Part(NamedTuple):
 _ARRAY = object()
 
 
-def _part(tree: Any) -> _Part:
+def _flatten(tree: Any) -> _FlatArgument:
     leaves, structure = jax.tree.flatten(tree)
-    arrays = [x for x in leaves if _is_shape(x)]
+    arrays = [x for x in leaves if _is_array_or_shape(x)]
     types = tuple((a.shape, a.dtype, getattr(a, "weak_type", False)) for a in arrays)
-    return _Part(_Kind(structure, tuple(_ARRAY if _is_shape(x) else x for x in leaves)), types, arrays)
+    static_leaves = tuple(_ARRAY if _is_array_or_shape(x) else x for x in leaves)
+    return _FlatArgument(_StaticPart(structure, static_leaves), types, arrays)
 
 
-def _whole(kind: _Kind, arrays: Iterator[Any]) -> Any:
-    """The pytree of a kind, with the next of the arrays."""
-    return jax.tree.unflatten(kind.structure, [next(arrays) if x is _ARRAY else x for x in kind.leaves])
+def _unflatten(static: _StaticPart, arrays: Iterator[Any]) -> Any:
+    """Return the pytree with this static part; it takes as many of `arrays` as it needs."""
+    leaves = [next(arrays) if x is _ARRAY else x for x in static.leaves]
+    return jax.tree.unflatten(static.structure, leaves)
 
 
-def _parts(args: tuple, kwargs: dict[str, Any]) -> dict[str | int, _Part]:
-    """The arguments by place or name, in an order that does not depend on how they were given."""
-    return {n: _part(x) for n, x in enumerate(args)} | {name: _part(kwargs[name]) for name in sorted(kwargs)}
+def _flatten_arguments(args: tuple, kwargs: dict[str, Any]) -> dict[str | int, _FlatArgument]:
+    """Return flat arguments by position or name; names are sorted, so that their order makes no version."""
+    positional = {position: _flatten(x) for position, x in enumerate(args)}
+    return positional | {name: _flatten(kwargs[name]) for name in sorted(kwargs)}
 
 
-def _arrays(parts: dict[str | int, _Part]) -> list[Any]:
-    return [a for part in parts.values() for a in part.arrays]
+def _all_arrays(arguments: dict[str | int, _FlatArgument]) -> list[Any]:
+    return [array for argument in arguments.values() for array in argument.arrays]
 
 
-def _call(function: Callable, kinds: dict[str | int, _Kind], arrays: Iterable[Any]) -> Any:
-    every = iter(arrays)
-    found = {name: _whole(kind, every) for name, kind in kinds.items()}
-    args = [x for name, x in found.items() if isinstance(name, int)]
-    return function(*args, **{name: x for name, x in found.items() if isinstance(name, str)})
+def _call(function: Callable, static_parts: dict[str | int, _StaticPart], arrays: Iterable[Any]) -> Any:
+    """Call a function with the arguments that these static parts and arrays make up."""
+    remaining_arrays = iter(arrays)
+    arguments = {name: _unflatten(static, remaining_arrays) for name, static in static_parts.items()}
+    args = [x for name, x in arguments.items() if isinstance(name, int)]
+    return function(*args, **{name: x for name, x in arguments.items() if isinstance(name, str)})
 
 
-def _is_shape(x: Any) -> bool:
+def _is_array_or_shape(x: Any) -> bool:
     return isinstance(x, (jax.Array, np.ndarray, np.number, jax.ShapeDtypeStruct))
 
 
 class _Version:
-    """One compiled version. What its result has beside arrays is known once it has been traced."""
+    """One compiled version of a function, for arguments with given static parts.
 
-    def __init__(self, function: Callable, kinds: dict[str | int, _Kind], options: dict[str, Any]):
+    - `result`: static part of the result, known once the function has been traced.
+    - `result_shapes`: shapes of the result's arrays, once the version has been compiled ahead.
+    - `is_compiled`: True once the version has been called.
+    """
+
+    def __init__(
+        self, function: Callable, static_parts: dict[str | int, _StaticPart], options: dict[str, Any]
+    ):
         self.result: Any = None
         self._lock = threading.Lock()
 
-        def compiled(arrays: list[Any]) -> list[Any]:
-            found = _part(_call(function, kinds, arrays))
-            self.result = found.kind
-            return found.arrays
+        def of_arrays(arrays: list[Any]) -> list[Any]:
+            flat_result = _flatten(_call(function, static_parts, arrays))
+            # A side effect of tracing: jax.jit returns arrays only.
+            self.result = flat_result.static
+            return flat_result.arrays
 
-        compiled.__name__ = getattr(function, "__name__", "program")
-        self.compiled, self.ready = jax.jit(compiled, **options), False
-        self.shapes: Any = None
-        self.ahead: Future | None = None
+        # The name that profiles and dumps of the compiler show.
+        of_arrays.__name__ = getattr(function, "__name__", "program")
+        # A jax.jit of its own: when the version is dropped, so is its program.
+        self.compiled, self.is_compiled = jax.jit(of_arrays, **options), False
+        self.result_shapes: Any = None
+        self.compilation: Future | None = None
 
     def __call__(self, arrays: list[Any]) -> Any:
-        if not self.ready:
+        if not self.is_compiled:
             # Threads that ask at once wait for one compilation.
             with self._lock:
-                if self.ahead is not None:
-                    wait([self.ahead])
-                found = self.compiled(arrays)
-                self.ready = True
+                if self.compilation is not None:
+                    wait([self.compilation])
+                result_arrays = self.compiled(arrays)
+                self.is_compiled = True
         else:
-            found = self.compiled(arrays)
-        return _whole(self.result, iter(found))
+            result_arrays = self.compiled(arrays)
+        return _unflatten(self.result, iter(result_arrays))
 
-    def begin(self, arrays: list[Any]) -> Any:
+    def compile_ahead(self, arrays: list[Any]) -> Any:
         with self._lock:
-            if self.shapes is None:
+            if self.result_shapes is None:
                 # Tracing takes the caller's precision, which JAX keeps by thread; compiling needs it no more.
+                # JAX keeps what is compiled here, so that the call after it compiles nothing.
                 traced = self.compiled.trace(arrays)
-                self.shapes = traced.out_info
-                if not self.ready:
-                    self.ahead = _ahead().submit(traced.lower().compile)
-        return _whole(self.result, iter(self.shapes))
+                self.result_shapes = traced.out_info
+                if not self.is_compiled:
+                    self.compilation = _compilation_threads().submit(traced.lower().compile)
+        return _unflatten(self.result, iter(self.result_shapes))
 
 
 @functools.cache
-def _ahead() -> ThreadPoolExecutor:
+def _compilation_threads() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(2, thread_name_prefix="compile")

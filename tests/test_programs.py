@@ -50,7 +50,7 @@ def test_one_program_for_each_structure_shape_and_type():
 
 def test_the_least_recently_used_programs_are_dropped():
     function = CountedFunction()
-    program = Program(function, most=3)
+    program = Program(function, max_versions=3)
     for n in (1, 2, 3, 1, 4):
         program(jnp.zeros(n))
     assert (function.n_traces, len(program.versions)) == (4, 3)
@@ -63,15 +63,15 @@ def test_the_least_recently_used_programs_are_dropped():
 def test_bound_arguments_share_the_program():
     function = CountedFunction()
     program = Program(function)
-    program.begin(x=jnp.arange(3.0), scale=jnp.array(2.0))
+    program.compile_ahead(x=jnp.arange(3.0), scale=jnp.array(2.0))
     for bound_name, free_name in (("scale", "x"), ("x", "scale")):
         arguments = {"x": jnp.arange(3.0), "scale": jnp.array(2.0)}
-        bound = program.given(**{bound_name: arguments[bound_name]})
+        bound = program.bind(**{bound_name: arguments[bound_name]})
         for factor in (1.0, 3.0):
             result = bound(**{free_name: factor * arguments[free_name]})
             np.testing.assert_array_equal(result["twice"], factor * np.array([0.0, 4.0, 8.0]))
     assert (function.n_traces, len(program.versions)) == (1, 1)
-    slope = jax.grad(lambda scale: program.given(x=jnp.arange(3.0))(scale=scale)["twice"].sum())
+    slope = jax.grad(lambda scale: program.bind(x=jnp.arange(3.0))(scale=scale)["twice"].sum())
     assert float(slope(2.0)) == 6.0
 
 
@@ -127,17 +127,17 @@ def test_resident_memory_levels_off_over_a_hundred_shapes():
 
 
 def test_compilation_ahead_happens_once():
-    """The shapes of results are there at once, and serve to compile the next program; a call waits for it."""
+    """Shapes of results are returned at once and serve to compile the next program; a call waits for it."""
     first_function, second_function = CountedFunction(), CountedFunction()
     first_program, second_program = (
         Program(first_function),
         Program(lambda result: second_function(result["twice"])),
     )
-    shapes = first_program.begin(jnp.arange(3.0))
+    shapes = first_program.compile_ahead(jnp.arange(3.0))
     assert shapes["twice"].shape == (3,)
     assert (shapes["name"], shapes["size"]) == ("a name", 3)
-    assert second_program.begin(shapes)["twice"].dtype == jnp.float32
-    assert second_program.begin(shapes)["size"] == 3
+    assert second_program.compile_ahead(shapes)["twice"].dtype == jnp.float32
+    assert second_program.compile_ahead(shapes)["size"] == 3
     assert not first_program.is_compiled(jnp.arange(3.0))
     np.testing.assert_array_equal(second_program(first_program(jnp.arange(3.0)))["twice"], [0.0, 4.0, 8.0])
     assert (first_function.n_traces, second_function.n_traces) == (1, 1)
@@ -148,7 +148,7 @@ def test_compilation_ahead_happens_once():
 def test_compilation_ahead_has_the_precision_of_the_caller():
     program = Program(CountedFunction())
     with jax.enable_x64(True):
-        assert program.begin(np.float64(1.0) + jnp.zeros(2))["twice"].dtype == jnp.float64
+        assert program.compile_ahead(np.float64(1.0) + jnp.zeros(2))["twice"].dtype == jnp.float64
         assert program(jnp.ones(2))["twice"].dtype == jnp.float64
     assert program(jnp.ones(2))["twice"].dtype == jnp.float32
 
@@ -158,4 +158,4 @@ def test_errors_of_compilation_ahead_are_raised_where_it_begins():
         raise ValueError("no such value")
 
     with pytest.raises(ValueError, match="no such value"):
-        Program(refuse).begin(jnp.zeros(2))
+        Program(refuse).compile_ahead(jnp.zeros(2))

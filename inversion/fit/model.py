@@ -52,7 +52,7 @@ from jaxlidar import (
     waveform_of,
 )
 from jaxlidar.extend import ONE_CORE, concrete, side_by_side
-from jaxlidar.planning.memory import in_words, memory_limit, scored_bytes
+from jaxlidar.planning.memory import format_bytes, memory_limit, scored_bytes
 from jaxlidar.planning.plan import MIN_BATCHES
 from jaxlidar.spectral.apply_optics import derivatives_to_samples, make_waveform_model, setup_optics
 from jaxlidar.trace.device_scene import build_device_scene
@@ -175,8 +175,8 @@ def tangents_per_pass(plan: Plan, columns: int, reserved: float = 0.0) -> int:
         fitting -= 1
     if columns and (size := plan.jacobian_memory(fitting)) > limit:
         raise ValueError(
-            f"derivatives in the geometric unknowns would take about {in_words(size)} of memory, one at a "
-            f"time; admissible is max_memory = {limit / 1e9:.3g} GB of the plan: follow fewer orders "
+            f"derivatives in the geometric unknowns would take about {format_bytes(size)} of memory, one at "
+            f"a time; admissible is max_memory = {limit / 1e9:.3g} GB of the plan: follow fewer orders "
             "(max_orders=), record a shorter window, have fewer plates or materials, or give a plan with more"
         )
     if not columns:

@@ -42,6 +42,7 @@ class ScattererChannels(NamedTuple):
 def surface_names(scene: Scene) -> list[str]:
     """Return the names of the scene's surfaces, in their order; repeated names are numbered from 1."""
     names = [surface.name for surface in scene.surfaces]
+    # A name that occurs once is not numbered, as "ground" and the plate of most scenes.
     totals, seen = Counter(names), Counter()
     numbered = []
     for name in names:
@@ -64,6 +65,7 @@ def scene_optics(lidar: Lidar, scene: Scene) -> list[MaterialOptics]:
             # T = 1 would divide by zero; such leaves have no extinction, so that the quotient never counts.
             optics.append(MaterialOptics("leaf", r / jnp.maximum(1.0 - t, 1e-6), None))
         else:
+            # A phase function redirects all scattered light: one channel, with the albedo as its reflectance.
             optics.append(MaterialOptics("leaf", r, None if isinstance(canopy.leaf, AbstractPhase) else t))
     if canopy is not None and canopy.voxels.bark is not None:
         optics.append(MaterialOptics("bark", canopy.bark_reflectance(wavelength), None))

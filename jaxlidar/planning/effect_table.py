@@ -45,18 +45,20 @@ def effect_table(
     - `records_all_of_order_one`: True if the window was chosen so that no light of order one is cut off.
     """
     orders = order_choice.count
+    # An effect may be gone although it is not switched off: the air's return goes with its extinction.
     has, planned = present_effects(lidar, scene), present_effects(*without_effects(lidar, scene, off))
     reasons = dict.fromkeys(EFFECT_NAMES, "in the scene") | {"multiple scattering": order_choice.reason}
     reasons |= _sized_reasons(lidar, scene)
     # Bounds need values, which are unknown while they are being traced, and hold for planes only.
     bounded = not any(is_traced(x) for x in jax.tree.leaves((lidar, scene))) and surfaces_are_planes(scene)
 
+    # Most rows have the same effects switched off, and share one set of bounds.
     @functools.cache
     def bound_functions(off: tuple[str, ...]) -> dict[str, Callable[[], float]]:
         return _bound_functions(Bounds(*without_effects(lidar, scene, off), orders), bins, start_distance)
 
     def bound(name: str, off: tuple[str, ...]) -> float:
-        """Bound on the change without `name`, where `off` is left out, too; 1 if none is known."""
+        """Return a bound on the change without `name`, where `off` is left out, too; 1 if none is known."""
         remaining = without_effects(lidar, scene, off)
         # A canopy without the hot spot can have it switched on: its bound is of interest too.
         has_effect = present_effects(*remaining) | {"hot spot": remaining[1].canopy is not None}
@@ -66,7 +68,7 @@ def effect_table(
 
     rows = []
     for name in EFFECT_NAMES:
-        on = planned[name] and name not in off and (name != "multiple scattering" or orders > 1)
+        simulated = planned[name] and name not in off and (name != "multiple scattering" or orders > 1)
         reason, also_off = reasons[name], off
         if name in off:
             # The bound says what switching it on again would change.
@@ -77,12 +79,13 @@ def effect_table(
             reason = "not in the scene"
         elif has[name] and not planned[name] and name != "multiple scattering":
             reason = "gone with what is switched off"
-        rows.append(Effect(name, on, reason, bound(name, also_off), _measure(name)))
-        if on and name == "multiple scattering":
+        rows.append(Effect(name, simulated, reason, bound(name, also_off), _measure(name)))
+        if simulated and name == "multiple scattering":
             name = f"orders beyond {orders}"
             upper_bound = bound(name, off)
             likely = min(order_choice.beyond, upper_bound)
             rows.append(Effect(name, False, f"likely below {percent(likely)}", upper_bound, "sum"))
+            # What comes after a window that has all of order one is of higher order.
             late = bound("multiple scattering", off) if records_all_of_order_one else 1.0
             reason = "light on its way at the end of the record"
             rows.append(Effect("after the window", False, reason, late, "sum"))
@@ -93,6 +96,7 @@ def effect_table(
 
 
 def _measure(name: str) -> str:
+    """Return the measure of an effect's bound: "samples" for those that shift light in time."""
     return "samples" if name in ("slope spread", "divergence", "jitter") else "sum"
 
 
@@ -119,7 +123,7 @@ def _bound_functions(bounds: Bounds, bins: TimeBins, start_distance: float) -> d
         "atmospheric extinction": lambda: bounds.extinction(bins, start_distance),
         "atmospheric backscatter": lambda: bounds.air_backscatter(bins, start_distance),
         "jitter": bounds.jitter,
-        # What the air scatters to the receiver beyond first order is at most what was lost.
+        # The air scatters to the receiver, beyond first order, at most the light that it took from the beam.
         "scattering within the atmosphere": lambda: bounds.air_loss(bins),
     }
 
@@ -127,6 +131,7 @@ def _bound_functions(bounds: Bounds, bins: TimeBins, start_distance: float) -> d
 def _sized_reasons(lidar: Lidar, scene: Scene) -> dict[str, str]:
     """Return reasons that state the size of an effect, for those that have one."""
     radius = concrete_number(lidar.footprint_radius)
+    # Two-way: 2 sigma tan(slope) / c, with the standard deviation sigma = radius / 2 of a Gaussian footprint.
     slope = concrete_number(scene.ground.slope) if isinstance(scene.ground, Ground) else 0.0
     spread = radius * math.tan(math.radians(slope)) / SPEED_OF_LIGHT
     view = lidar.field_of_view

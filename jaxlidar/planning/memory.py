@@ -46,7 +46,7 @@ def response_bytes(config: TraceConfig, bins: TimeBins, *, degree: int, n_traces
     higher = math.comb(degree + n_channels, n_channels) if config.follows_higher_orders else 0
     first_degree = config.first_degree
     first = math.comb(first_degree + n_channels, n_channels)
-    return float(_item() * n_traces * n_materials * (higher + first) * bins.padded)
+    return float(_number_bytes() * n_traces * n_materials * (higher + first) * bins.padded)
 
 
 def simulation_bytes(
@@ -63,7 +63,7 @@ def simulation_bytes(
     - `n_traces`: traces of a response; one for each wavelength where leaves transmit straight on.
     """
     response = response_bytes(config, bins, degree=degree, n_traces=n_traces)
-    pulse = _item() * min(bins.count * n_samples, max(MAX_DENSE_PULSE, pulse_bins))
+    pulse = _number_bytes() * min(bins.count * n_samples, max(MAX_DENSE_PULSE, pulse_bins))
     return response * (_RESPONSE_COPIES * (os.cpu_count() or 1) + 1) + 2 * pulse + _COMPILATION
 
 
@@ -87,7 +87,9 @@ def jacobian_bytes(
     """
     cores = min(os.cpu_count() or 1, batches)
     response = response_bytes(config, bins, degree=degree, n_traces=n_traces)
-    tangents = _RESPONSE_TANGENTS * response + _STATE_TANGENTS * _states(config) * _item()
+    tangents = (
+        _RESPONSE_TANGENTS * response + _STATE_TANGENTS * _photons_and_segments(config) * _number_bytes()
+    )
     return (batches + 1) * response + cores * (response + columns * tangents)
 
 
@@ -97,22 +99,22 @@ def scored_bytes(config: TraceConfig, bins: TimeBins, *, cells: int, columns: in
     **Arguments:** `cells`: voxels of the map. `columns`: unknowns that change extinction alone.
     """
     rows = columns * wavelengths * bins.padded
-    per_core = _RESPONSE_COPIES * rows + _RESPONSE_TANGENTS * columns * _states(config)
+    per_core = _RESPONSE_COPIES * rows + _RESPONSE_TANGENTS * columns * _photons_and_segments(config)
     slopes = 4 * columns * cells
-    return float(_item() * ((os.cpu_count() or 1) * per_core + slopes))
+    return float(_number_bytes() * ((os.cpu_count() or 1) * per_core + slopes))
 
 
-def _item() -> int:
+def _number_bytes() -> int:
     """Bytes of a number in JAX's present precision."""
     return jnp.result_type(float).itemsize
 
 
-def _states(config: TraceConfig) -> int:
+def _photons_and_segments(config: TraceConfig) -> int:
     """Photons and ray segments that are alive at once."""
     return config.n_photons + min(config.n_rays, _RAYS_AT_ONCE) * config.max_ray_segments
 
 
-def in_words(size: float) -> str:
+def format_bytes(size: float) -> str:
     """Format a number of bytes as GB, MB or kB, to two digits."""
     for unit, factor in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
         if size >= factor:
@@ -132,7 +134,7 @@ def check_memory(size: float, limit: float) -> None:
     """
     if size > limit:
         raise ValueError(
-            f"the simulation would take about {in_words(size)} of memory; admissible is max_memory = "
+            f"the simulation would take about {format_bytes(size)} of memory; admissible is max_memory = "
             f"{limit / 1e9:.3g} GB: follow fewer orders (max_orders=), record a shorter window (window=), "
             f"use wider fine bins (bin_width=), have fewer plates or materials, or at most "
             f"{MAX_APPLIED_WAVELENGTHS} wavelengths"

@@ -22,7 +22,7 @@ from jaxlidar.planning.size_buckets import size_bucket
 from jaxlidar.scenes.canopy import Canopy
 from jaxlidar.scenes.scene import Scene
 
-# Orders are followed while their histories are not more than this (16 orders of four letters, 29 of three).
+# Orders are followed while their histories are not more than this (16 orders of four channels, 29 of three).
 MAX_HISTORIES = 5000
 MAX_ORDERS = 100
 # The loop over orders is rounded up to a size bucket only while its histories are not more than this.

@@ -25,7 +25,7 @@ from jaxlidar.planning.effects import (
 from jaxlidar.planning.local_origin import move_aim_to_origin
 from jaxlidar.planning.memory import (
     check_memory,
-    in_words,
+    format_bytes,
     jacobian_bytes,
     keeps_histories,
     memory_limit,
@@ -34,7 +34,7 @@ from jaxlidar.planning.memory import (
 from jaxlidar.planning.orders import choose_orders, max_degree, multiple_scattering_tail, order_steps
 from jaxlidar.planning.parallel_light import beams_are_parallel, parallel_light_bound
 from jaxlidar.planning.path_lengths import PathLengths, check_footprints_on_terrain, longest_segment
-from jaxlidar.planning.record_times import fine_bin, times_of, with_air
+from jaxlidar.planning.record_times import bins_and_samples, extend_to_air_return, target_bin_width
 from jaxlidar.planning.size_buckets import size_bucket
 from jaxlidar.scenes.scene import Scene, check_kinds
 from jaxlidar.scenes.surfaces import AbstractSheet
@@ -73,7 +73,7 @@ class PlanScope(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """How a lidar and a scene will be simulated: effects, time bins, orders and numbers of rays and photons.
+    """Plan of a simulation: effects, time bins, orders of scattering, and numbers of rays and photons.
 
     Plans are made by `jaxlidar.plan`. Printed, a plan is a table of effects, followed by a line of sizes. It
     is static: what a plan leaves out is never compiled.
@@ -141,6 +141,7 @@ class Plan:
     @property
     def degree(self) -> int:
         """Longest history of the orders that are followed; `config.degree` has room for longer ones."""
+        # Surfaces are the ground, if there is one, and plates.
         n_plates = len(self.config.surfaces) - self.config.has_ground
         return max_degree(self.orders, n_plates) if self.config.keeps_histories else 0
 
@@ -180,9 +181,10 @@ class Plan:
             sizes += f", {self.n_photons} photons a batch, {self.orders} orders"
         if not self.config.keeps_histories:
             sizes += ", optics applied while light is traced"
-        one, two = (self.jacobian_memory(n) for n in (1, 2))
-        memory = f"about {in_words(self.memory)} of memory; a Jacobian in one geometric unknown "
-        memory += f"{in_words(one)}, in each more {in_words(two - one)}"
+        # Memory is linear in the number of columns: two of them give the intercept and the slope.
+        one_column, two_columns = (self.jacobian_memory(n) for n in (1, 2))
+        memory = f"about {format_bytes(self.memory)} of memory; a Jacobian in one geometric unknown "
+        memory += f"{format_bytes(one_column)}, in each more {format_bytes(two_columns - one_column)}"
         return "\n".join([*lines, sizes, memory])
 
 
@@ -202,7 +204,7 @@ def plan(
     max_memory: float | None = None,
     describe: bool = True,
 ) -> Plan:
-    """The plan of what `simulate` will do for a lidar and a scene.
+    """Plan what `simulate` will do for a lidar and a scene.
 
     Effects that the lidar and the scene do not have are off, and never compiled. All others are on, however
     small, unless they are switched off: a plan also serves other values of the same scene, in fits and
@@ -217,8 +219,8 @@ def plan(
       0.01.
     - `max_orders`: number of scatterings followed, at least 1. Default None: from `rtol` and the largest
       albedo.
-    - `max_step`: longest stretch, m, that the first order takes at once; positive. The result does not depend
-      on it. Default None: what lies within one voxel, or 64 fine bins.
+    - `max_step`: longest segment, m, of a footprint ray that order one deposits at once; positive. The result
+      does not depend on it. Default None: the ray's chord in a voxel, or 64 fine bins.
     - `n_photons`: photons per batch, at least 1. Default 8192.
     - `n_rays`: rays of the footprint per batch, at least 1; without effect over planes alone, where a
       quadrature rule takes their place. Default None: 4096 with one order or a fixed footprint; else 2048
@@ -235,7 +237,7 @@ def plan(
       of terrain that is a plane, are off unless True asks for them. The names are those of the table's first
       column. Default None.
     - `max_memory`: GB that the simulation may take, positive. Default None: a quarter of the machine's.
-    - `describe`: whether to make the table of effects with its bounds, which takes some 40 ms. Default True.
+    - `describe`: True to make the table of effects with its bounds, which takes some 40 ms. Default True.
 
     **Returns:** a `Plan`; `print` shows it as a table.
 
@@ -267,6 +269,7 @@ def plan(
         check_range("max_memory", max_memory, 0.0, low_open=True)
     check_choice("footprint", footprint, ("random", "fixed"))
     check_footprints_on_terrain(lidar if survey is None else survey, scene)
+    # From here on x = y = 0 is the aim point, or the middle of the survey (see `local_origin`).
     survey = None if survey is None else survey.about(concrete_array(lidar.position))
     lidar, scene = move_aim_to_origin(lidar, scene)
     # 1. Effects: leaf or bark that is zero everywhere and relief of flat terrain are off, then what the user
@@ -292,17 +295,20 @@ def plan(
     steps = order_steps(orders, n_plates, n_channels)
     # 3. Time: fine bins from the pulse's features, samples from the window.
     jitter, interval = concrete_number(lidar.jitter), concrete_number(lidar.sampling_interval)
+    # Jitter smooths the pulse: widths add in quadrature.
     pulse_feature = math.hypot(concrete_number(lidar.pulse.finest), jitter)
     pulse_duration = math.hypot(concrete_number(lidar.pulse.std), jitter)
     first_return = path_lengths.first_path / SPEED_OF_LIGHT
     last_return = path_lengths.last_path / SPEED_OF_LIGHT
     tail = multiple_scattering_tail(scene, optics, first_return, last_return) if orders > 1 else 0.0
-    target_width = fine_bin(interval, pulse_feature, pulse_duration, bin_width)
-    bins, samples = times_of(lidar, scene, path_lengths, tail, window, target_width)
-    bins_with_air = with_air(bins, lidar, samples)
+    target_width = target_bin_width(interval, pulse_feature, pulse_duration, bin_width)
+    bins, samples = bins_and_samples(lidar, scene, path_lengths, tail, window, target_width)
+    bins_with_air = extend_to_air_return(bins, lidar, samples)
     bin_length = 0.5 * SPEED_OF_LIGHT * bins.width
     max_segment, max_span = longest_segment(path_lengths.longest_chord, bin_length, max_step)
+    # Light that comes later is not recorded, so that longer paths need not be followed.
     max_path = SPEED_OF_LIGHT * (bins.start + bins.width * bins.count)
+    # Rounded up only now: the bins beyond `max_path` stay empty, and cost less than a compilation.
     bins = dataclasses.replace(bins, max_span=max_span, count=size_bucket(bins.count, 4))
     pulse_support = lidar.pulse.support(jitter)
     # 4. Sizes of loops and batches.
@@ -336,7 +342,7 @@ def plan(
         degree=max_degree(steps, n_plates),
         first_degree=1 + 2 * n_plates,
         keeps_histories=True,
-        # A beam without width is one ray.
+        # A beam without divergence is one ray.
         n_rays=int(n_rays) if wide_beam else 1,
         n_photons=int(n_photons),
         smooth_footprint=consists_of_planes(scene) and wide_beam,
@@ -353,8 +359,11 @@ def plan(
     # 5. Memory decides between histories and applied optics, and how many orders there is room for.
     straight = scene.canopy is not None and scene.canopy.is_straight
     wavelengths = lidar.wavelength.size
+    # A sample collects the pulse's support and its own interval, and partial bins at the ends.
     pulse_bins = math.ceil((pulse_support[1] - pulse_support[0] + samples.interval) / bins.width) + 5
 
+    # A trace for each wavelength where extinction depends on it (leaves that transmit straight on), or where
+    # optics are applied to deposits.
     def n_traces(keeps: bool) -> int:
         return wavelengths if straight or not keeps else 1
 
@@ -375,9 +384,11 @@ def plan(
         config = dataclasses.replace(config, keeps_histories=False, degree=0)
     memory = memory_of(orders, keeps)
     check_memory(memory, limit)
+    # Fits may ask for more orders later: the scope says how many there would be memory for.
     possible_orders = range(max(order_choice.max_orders, orders), orders - 1, -1)
     table = ()
     if describe:
+        # With all effects: a row also says what an effect that is off would change.
         table = effect_table(
             complete_lidar,
             complete_scene,

@@ -47,6 +47,7 @@ def _check(plan: Plan, lidar: Lidar, scene: Scene, checks: Sequence[Callable]) -
             raise ValueError(
                 f"the plan does not fit: it is for a map without {name}; make one for this scene"
             )
+    # The plan is for the scene without the effects that it leaves out: compare like with like.
     lidar, scene = without_effects(*move_aim_to_origin(lidar, scene), plan.off)
     for check in checks:
         for misfit in check(plan, lidar, scene):
@@ -88,6 +89,7 @@ def _misfit_materials(plan: Plan, lidar: Lidar, scene: Scene) -> Iterator[str]:
         yield f"it is for a beam at nadir; zenith = {concrete_number(lidar.zenith):g} degrees"
     if config.smooth_footprint and not consists_of_planes(scene):
         yield "it is for planes; the scene has more"
+    # Orders that the user chose are followed whatever the albedo. A larger albedo may still need no more.
     albedo = largest_albedo(optics)
     if scope.automatic_orders and albedo > scope.albedo + 1e-3:
         needed = choose_orders(scene, optics, len(scatterers.channels), plan.rtol, None).count
@@ -117,6 +119,7 @@ def _misfit_lengths(plan: Plan, lidar: Lidar, scene: Scene) -> Iterator[str]:
         "segments of a ray": (lengths.max_ray_segments(segment), config.max_ray_segments),
         "voxels along a flight": (lengths.max_faces(longest), config.max_faces),
     }
+    # Loops of fixed length would end before the ray does, and lose its light.
     for name, (needed, planned) in counts.items():
         if needed > planned:
             yield f"it allows for {planned} {name}; the scene may have {needed}"
@@ -151,6 +154,7 @@ def _misfit_pulse(plan: Plan, lidar: Lidar, scene: Scene) -> Iterator[str]:
             f"its fine bins suit pulses with features of {planned_feature:.3g} ns; the lidar's pulse has "
             f"some of {feature:.3g} ns"
         )
+    # With a window of the user's, the part of the pulse that it cuts off is the user's choice.
     low, high = lidar.pulse.support(jitter)
     planned_low, planned_high = plan.pulse_support
     slack = plan.bins.width + _ROUNDING * (high - low)

@@ -21,16 +21,21 @@ class SampleTimes(NamedTuple):
     bins_per_sample: int
 
 
-def fine_bin(interval: float, pulse_feature: float, duration: float, bin_width: float | None) -> float:
-    """Return the width of fine bins to aim at, ns: a quarter of the pulse's finest feature, or the user's."""
+def target_bin_width(
+    interval: float, pulse_feature: float, duration: float, bin_width: float | None
+) -> float:
+    """Return the width of fine bins to aim at, ns: from the pulse's finest feature, or the user's."""
     if bin_width is None:
-        return min(interval, max(0.25 * pulse_feature, 0.05 * interval) if duration > 0 else 0.5 * interval)
+        # A quarter of the finest feature, as the B-spline that spreads returns over bins widens it. A pulse
+        # without duration has no features.
+        feature_width = max(0.25 * pulse_feature, 0.05 * interval)
+        return min(interval, feature_width if duration > 0 else 0.5 * interval)
     if not 0 < bin_width < math.inf:
         raise ValueError(f"bin_width = {bin_width:g} is outside the admissible range (0, inf)")
     return bin_width
 
 
-def times_of(
+def bins_and_samples(
     lidar: Lidar,
     scene: Scene,
     path_lengths: PathLengths,
@@ -47,11 +52,12 @@ def times_of(
     bins_per_sample = max(math.ceil(interval / target - 1e-6), 1)
     width = interval / bins_per_sample
     if lidar.receiver.window == "first return":
-        # Sampled finely here; the digitiser's own bins are laid when the first return is known.
+        # Sampled finely here; the digitiser's bins are laid when the time of the first return is known.
         interval, bins_per_sample = width, 1
     first, last = path_lengths.first_path / SPEED_OF_LIGHT, path_lengths.last_path / SPEED_OF_LIGHT
     last += tail
     if window is None:
+        # Samples are at multiples of the interval, so that small changes of the scene do not shift them.
         begin = math.floor((first + low) / interval) * interval
         samples = math.ceil((last + high - begin) / interval) + 1
     else:
@@ -66,6 +72,8 @@ def times_of(
     if scene.atmosphere is not None and scene.atmosphere.lidar_ratio is not None:
         # Air scatters light back before the scene does, from the start of the record on.
         first = min(first, begin - interval - high)
+    # Fine bins share edges with the samples, which are centred on their times. Three more bins at each end
+    # take the B-spline and rounding.
     edge = begin - 0.5 * interval
     lead = math.ceil((edge - first) / width) + 3
     count = lead + math.ceil((last - edge) / width) + 3
@@ -74,9 +82,10 @@ def times_of(
     return bins, SampleTimes(begin, interval, samples, bins_per_sample)
 
 
-def with_air(bins: TimeBins, lidar: Lidar, samples: SampleTimes) -> TimeBins:
+def extend_to_air_return(bins: TimeBins, lidar: Lidar, samples: SampleTimes) -> TimeBins:
     """Extend bins back to where the air's own return would begin, whether it is simulated or not."""
     _, high = lidar.pulse.support(concrete_number(lidar.jitter))
+    # The same margin of three bins as above.
     missing = math.ceil((bins.start - (samples.start - samples.interval - high)) / bins.width) + 3
     added = max(missing, 0)
     return dataclasses.replace(bins, start=bins.start - added * bins.width, count=bins.count + added)

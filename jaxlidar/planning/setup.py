@@ -72,6 +72,7 @@ def make_setup(lidar: Lidar, scene: Scene, plan: Plan) -> Setup:
     """
     check_kinds(lidar, scene)
     check_kind("plan", plan, Plan, "a Plan that jaxlidar.plan made")
+    # What the plan found to be flat or empty is not simulated: traced, it would lose its derivatives.
     ground = scene.ground
     if plan.scope.flat_terrain and isinstance(ground, Terrain) and is_traced(ground.heights):
         raise ValueError(
@@ -84,6 +85,7 @@ def make_setup(lidar: Lidar, scene: Scene, plan: Plan) -> Setup:
                 f"the plan is for a map whose {name} is zero everywhere, but {name} is being traced by a JAX "
                 f'transformation; make the plan with effects={{"{name}": True}}'
             )
+    # A traced value cannot raise an error. NaN in all waveforms cannot be overlooked, and costs one product.
     admissible = jnp.ones(())
     if any(is_traced(x) for x in jax.tree.leaves((lidar, scene))):
         admissible = jnp.where(inadmissible((lidar, scene)), jnp.nan, admissible)

@@ -9,6 +9,8 @@ def size_bucket(size: int, per_octave: int = 2) -> int:
     """
     if size <= 2:
         return size
+    # With 2^k < size <= 2^(k + 1), buckets divide the octave from 2^k to 2^(k + 1) evenly. The first octaves
+    # have fewer integers than that.
     octave = 1 << ((size - 1).bit_length() - 1)
     buckets = min(per_octave, octave)
     return octave + -(-(size - octave) * buckets // octave) * octave // buckets

@@ -106,10 +106,10 @@ class BatchTracer(NamedTuple):
         """Return the function that traces batch `n`; shared arguments are flattened once."""
         common, higher = {"scene": self.scene, "key": key}, None
         if self.scene.config.follows_higher_orders:
-            first, higher = _compiled_first.given(**common), _compiled_higher.given(**common)
+            first, higher = _compiled_first.bind(**common), _compiled_higher.bind(**common)
         else:
-            first = _compiled_batch.given(**common)
-        estimate = _compiled_estimate.given(model=self.error_model)
+            first = _compiled_batch.bind(**common)
+        estimate = _compiled_estimate.bind(model=self.error_model)
 
         def trace_batch(n: int) -> tuple[Response, BatchEstimate]:
             number = np.array(n, np.uint32)
@@ -160,9 +160,9 @@ def make_batch_tracer(setup: Setup, key: PRNGKeyArray) -> BatchTracer:
     model = make_model(setup)
     error_model = model if exact_sizes else model.at_pivots()
     if response_shapes is not None:
-        _compiled_waveform.begin(response_shapes, jnp.asarray(1.0), model)
-        _compiled_estimate.begin(response=response_shapes, model=error_model)
-        _compiled_sum.begin(response_shapes, response_shapes)
+        _compiled_waveform.compile_ahead(response_shapes, jnp.asarray(1.0), model)
+        _compiled_estimate.compile_ahead(response=response_shapes, model=error_model)
+        _compiled_sum.compile_ahead(response_shapes, response_shapes)
     return BatchTracer(setup, finish_scene(), model, error_model)
 
 
@@ -180,7 +180,7 @@ def _begin_device_scene(setup: Setup) -> tuple[DeviceScene, Callable[[], DeviceS
     if compiled_geometry.is_compiled(*arguments):
         scene = finish()
         return scene, lambda: scene
-    return complete_device_scene(compiled_geometry.begin(*arguments), setup, "none"), finish
+    return complete_device_scene(compiled_geometry.compile_ahead(*arguments), setup, "none"), finish
 
 
 def _begin_traces(scene: DeviceScene, key: PRNGKeyArray) -> Response | None:
@@ -195,6 +195,6 @@ def _begin_traces(scene: DeviceScene, key: PRNGKeyArray) -> Response | None:
     if longest.is_compiled(**arguments):
         return None
     if has_higher_orders:
-        higher = _compiled_higher.begin(**arguments)
-        return jax.eval_shape(join_orders, _compiled_first.begin(**arguments), higher)
-    return _compiled_batch.begin(**arguments)
+        higher = _compiled_higher.compile_ahead(**arguments)
+        return jax.eval_shape(join_orders, _compiled_first.compile_ahead(**arguments), higher)
+    return _compiled_batch.compile_ahead(**arguments)

@@ -17,7 +17,7 @@ import jaxlidar as jl
 from inversion.fit.model import Model, tangents_per_pass
 from inversion.fit.unknowns import bind_unknowns
 from jaxlidar.planning import memory
-from jaxlidar.planning.memory import check_memory, in_words, memory_limit
+from jaxlidar.planning.memory import check_memory, format_bytes, memory_limit
 from jaxlidar.spectral.pulse_convolution import pulse_convolution
 from tests.helpers import slab, slow_unless, with_applied_optics
 
@@ -121,9 +121,10 @@ def test_the_user_sets_the_limit():
     memory_of_one, memory_of_two = (plan.jacobian_memory(n) for n in (1, 2))
     additional = memory_of_two - memory_of_one
     jacobian_text = (
-        f"a Jacobian in one geometric unknown {in_words(memory_of_one)}, in each more {in_words(additional)}"
+        f"a Jacobian in one geometric unknown {format_bytes(memory_of_one)}, "
+        f"in each more {format_bytes(additional)}"
     )
-    assert str(plan).splitlines()[-1] == f"about {in_words(plan.memory)} of memory; {jacobian_text}"
+    assert str(plan).splitlines()[-1] == f"about {format_bytes(plan.memory)} of memory; {jacobian_text}"
     with pytest.raises(ValueError, match=r"admissible is max_memory = 0\.001 GB"):
         jl.simulate(jl.Lidar(), scene, key=KEY, max_memory=0.001)
     for bad in (0.0, -1.0, np.nan):
@@ -132,7 +133,12 @@ def test_the_user_sets_the_limit():
 
 
 def test_sizes_in_words():
-    assert [in_words(x) for x in (20.0, 2.34e4, 5.6e6, 1.234e10)] == ["20 bytes", "23 kB", "5.6 MB", "12 GB"]
+    assert [format_bytes(x) for x in (20.0, 2.34e4, 5.6e6, 1.234e10)] == [
+        "20 bytes",
+        "23 kB",
+        "5.6 MB",
+        "12 GB",
+    ]
     check_memory(0.9e9, memory_limit(1.0))
     assert memory.machine_memory() > 1e8
 

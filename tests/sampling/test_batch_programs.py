@@ -61,7 +61,8 @@ def test_traces_begin_to_compile_before_the_waveform_model_is_made(monkeypatch):
     make, compilations = batch_programs.make_padded_waveform_model, []
 
     def make_model(setup):
-        compilations.extend(version.ahead for version in batch_programs._compiled_higher.versions.values())
+        versions = batch_programs._compiled_higher.versions.values()
+        compilations.extend(version.compilation for version in versions)
         return make(setup)
 
     monkeypatch.setattr(batch_programs, "make_padded_waveform_model", make_model)
@@ -69,5 +70,5 @@ def test_traces_begin_to_compile_before_the_waveform_model_is_made(monkeypatch):
     # A scene that has not been simulated before: its device scene, too, has yet to be compiled.
     plan = jl.plan(LIDAR, crown, max_orders=3, n_photons=96, n_rays=64, window=(-50.0, 20.0))
     batch_programs.make_batch_tracer(jl.make_setup(LIDAR, crown, plan), KEY)
-    (ahead,) = compilations
-    assert ahead is not None
+    (compilation,) = compilations
+    assert compilation is not None
