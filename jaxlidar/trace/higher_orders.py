@@ -268,8 +268,8 @@ def _trace_order(
     ends = scene.config.deposits_per_flight
     encounters = meet_surfaces(scene, p, draws.plates_ahead)
     max_length = detach(scene.longest_flight(p))
-    # Directions from a surface to a height field are reparametrised, so that landings move with the grid: only
-    # so is the derivative complete where a landing may change from facet to facet.
+    # Directions from a surface to a height field are reparametrised, so that landings move with the grid:
+    # only so is the derivative complete where a landing may change from facet to facet.
     if moves_landings(scene):
         heading = (order > 0) & (encounters.nearest_stop < max_length)
         w, nearest_stop, ratio = landings_with_grids(scene, p, encounters, heading)

@@ -242,8 +242,8 @@ def footprint_rays(
     """Return the positions of the footprint's rays across the beam, and their fractions of its energy."""
     if scene.config.smooth_footprint:
         return product_rule(scene.beam)
-    # Shifted at random, rays are an unbiased sample of the footprint; not shifted, they are the same for every
-    # key.
+    # Shifted at random, rays are an unbiased sample of the footprint; not shifted, they are the same for
+    # every key.
     random = scene.config.random_footprint
     shift = to_unit(random_words(key, 2)) if random else jnp.asarray([0.5, 0.0])
     return fibonacci_disc(scene.beam, scene.config.n_rays, shift, ray_slice)
