@@ -15,18 +15,16 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from jaxlidar._checks import briefly, check_integer, check_key, check_range
 from jaxlidar._constants import SPEED_OF_LIGHT
-from jaxlidar._vectors import FAR, along, dot
+from jaxlidar._vectors import along, dot
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.planning.plan import Plan
 from jaxlidar.planning.setup import make_setup
 from jaxlidar.scenes.scene import Scene, check_kinds
 from jaxlidar.spectral.apply_optics import setup_optics
-from jaxlidar.trace.collisions import sample_collision
-from jaxlidar.trace.device_scene import DeviceScene, build_device_scene, not_scattered
-from jaxlidar.trace.flight import meet_surfaces, sample_flights
+from jaxlidar.trace.device_scene import DeviceScene, build_device_scene
 from jaxlidar.trace.footprint import across_beam
-from jaxlidar.trace.photons import TRANSMITTED, Photons
-from jaxlidar.trace.random_numbers import PhotonDraws
+from jaxlidar.trace.photon_step import collide, fly_once, passed_plates, start_photons
+from jaxlidar.trace.photons import Photons
 
 PHOTONS_PER_CHUNK = 512
 
@@ -212,17 +210,7 @@ def _send_photons(scene: DeviceScene, count: int, key: PRNGKeyArray) -> Photons:
     fraction, turn = jax.random.uniform(radius_key, (count,)), jax.random.uniform(turn_key, (count,))
     point, w, excess = scene.beam.ray(across_beam(scene.beam, fraction, turn))
     to_start = jnp.asarray(-scene.limits.start_distance, excess.dtype)
-    zero_history = jnp.zeros((count,), jnp.int32)
-    return Photons(
-        x=along(point, w, to_start),
-        w=w,
-        path=excess + to_start,
-        weight=jnp.ones_like(excess),
-        history=zero_history,
-        surface=zero_history - 1,
-        last_scattering=not_scattered(excess),
-        alive=zero_history == 0,
-    )
+    return start_photons(along(point, w, to_start), w, excess + to_start)
 
 
 def _trace_flight(
@@ -236,23 +224,13 @@ def _trace_flight(
     4. Other photons collide and scatter.
     """
     beam, config = scene.beam, scene.config
-    tiny = jnp.finfo(p.weight.dtype).tiny
-    shape = (PhotonDraws.dimensions(scene.n_plates, return_path=False), p.weight.size)
-    uniform = jax.random.uniform(key, shape, p.weight.dtype, tiny)
-    draws = PhotonDraws.from_numbers(list(uniform), scene.n_plates)
-    encounters = meet_surfaces(scene, p, draws.plates_ahead)
-    max_length = scene.longest_flight(p)
-    flights = sample_flights(scene, p, encounters.nearest_stop, max_length, draws.flight[None])
-    flight = jax.tree.map(lambda a: a[0], flights)
+    draws, encounters, flight = fly_once(scene, p, key, scene.longest_flight(p))
     weight, history = p.weight, p.history
-    for i, surface in enumerate(scene.surfaces):
-        if surface.is_plate:
-            distance, outcome = encounters.distances[i], encounters.outcomes[i]
-            passed = (distance < FAR) & ((distance < flight.distance) | ~flight.has_hit)
-            transmitted = p.alive & (outcome == TRANSMITTED) & passed
-            after = scene.history_after(history, config.surfaces[i].transmission)
-            history = jnp.where(transmitted, after, history)
-            weight = jnp.where(transmitted, weight / (1.0 - scene.limits.reflection_probability), weight)
+    for passage in passed_plates(scene, p, flight, encounters):
+        after = scene.history_after(history, config.surfaces[passage.plate].transmission)
+        history = jnp.where(passage.is_transmitted, after, history)
+        transmitted_weight = weight / (1.0 - scene.limits.reflection_probability)
+        weight = jnp.where(passage.is_transmitted, transmitted_weight, weight)
 
     out = beam.excess(p.x)
     in_cone = dot(p.w, beam.view(p.x)) > jnp.cos(jnp.deg2rad(cone))
@@ -262,14 +240,11 @@ def _trace_flight(
     arrived = _Arrivals((p.path + out) / SPEED_OF_LIGHT, value, history)
 
     has_hit = flight.has_hit
-    flown = jnp.where(has_hit, flight.distance, 0.0)
-    x = along(p.x, p.w, flown)
-    landed = flight.landed_on(encounters)
-    collision = sample_collision(scene, x, p.w, flight.cell, flight.collided, landed, draws)
+    x, path, collision = collide(scene, p, flight, encounters, draws)
     onward = Photons(
         x=x,
         w=collision.w,
-        path=p.path + flown,
+        path=path,
         weight=jnp.where(has_hit, weight * collision.ratio * collision.onward_weight, 0.0),
         history=scene.history_after(history, collision.channel),
         surface=collision.surface,

@@ -13,15 +13,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from jaxlidar._vectors import FAR, Vec, along, vec
+from jaxlidar._vectors import Vec, along, vec
 from jaxlidar.planning.config import Scatterer
 from jaxlidar.scenes.height_field import HeightField
-from jaxlidar.trace.collisions import sample_collision
-from jaxlidar.trace.device_scene import DeviceScene, not_scattered
-from jaxlidar.trace.flight import SurfaceEncounters, meet_surfaces, sample_flights
+from jaxlidar.trace.device_scene import DeviceScene
+from jaxlidar.trace.flight import SurfaceEncounters
 from jaxlidar.trace.footprint import across_beam
+from jaxlidar.trace.photon_step import collide, fly_once, passed_plates, start_photons
 from jaxlidar.trace.photons import TRANSMITTED, Photons
-from jaxlidar.trace.random_numbers import PhotonDraws
 
 # Below this fraction of the emitted energy a photon may be ended.
 _ROULETTE_ENERGY = 0.05
@@ -87,20 +86,8 @@ def trace_to_end(
     """
     start_key, key = jax.random.split(key)
     x, w = source(scene, start_key, count)
-    zero_history = jnp.zeros((count,), jnp.int32)
-    # Path, weight and history stay as they are: time does not matter here, and the energy is an array of its
-    # own, by wavelength.
-    zero, one = jnp.zeros_like(x[0]), jnp.ones_like(x[0])
-    photons = Photons(
-        x=x,
-        w=w,
-        path=zero,
-        weight=one,
-        history=zero_history,
-        surface=zero_history - 1,
-        last_scattering=not_scattered(zero),
-        alive=zero_history == 0,
-    )
+    # Weight and history stay as they are: the energy is an array of its own, by wavelength.
+    photons = start_photons(x, w, jnp.zeros_like(x[0]))
     n_wavelengths = optics.shape[1]
     nothing = jnp.zeros((n_wavelengths,), optics.dtype)
     absorbed = jnp.zeros((len(scene.config.materials), n_wavelengths), optics.dtype)
@@ -134,17 +121,10 @@ def _trace_order(scene: DeviceScene, optics: Array, loop: _PhotonLoop, key: PRNG
     5. Multiply the energy by the optics of the sampled channel; end faint photons by Russian roulette.
     """
     config, p, energy, fractions = scene.config, loop.photons, loop.energy, loop.fractions
-    # Not zero, whose logarithm would be an infinite optical depth.
-    tiny = jnp.finfo(energy.dtype).tiny
     draw_key, roulette_key = jax.random.split(key)
-    shape = (PhotonDraws.dimensions(scene.n_plates, return_path=False), p.weight.size)
-    uniform = jax.random.uniform(draw_key, shape, p.weight.dtype, tiny)
-    draws = PhotonDraws.from_numbers(list(uniform), scene.n_plates)
-    encounters = meet_surfaces(scene, p, draws.plates_ahead)
     # Light is followed however late it would come, within the length that bounds the march.
-    max_length = jnp.full_like(encounters.nearest_stop, scene.limits.max_flight)
-    flights = sample_flights(scene, p, encounters.nearest_stop, max_length, draws.flight[None])
-    flight = jax.tree.map(lambda a: a[0], flights)
+    max_length = jnp.full_like(p.weight, scene.limits.max_flight)
+    draws, encounters, flight = fly_once(scene, p, draw_key, max_length)
 
     def optics_at(channel: int) -> Float[Array, "1 wavelengths"]:
         return optics[channel : channel + 1] if channel >= 0 else jnp.zeros_like(optics[:1])
@@ -159,25 +139,18 @@ def _trace_order(scene: DeviceScene, optics: Array, loop: _PhotonLoop, key: PRNG
     absorbed = fractions.absorbed
     # Each plate needs what arrives at it, in order of distance; the product of all factors needs no order.
     energy_before = energy
-    for i, surface in enumerate(scene.surfaces):
-        distance, outcome = encounters.distances[i], encounters.outcomes[i]
-        if not surface.is_plate or outcome is None:
-            continue
-        scatterer = config.surfaces[i]
-        is_passed = (distance < flight.distance) | ~flight.has_hit
-        transmitted = p.alive & (distance < FAR) & is_passed & (outcome == TRANSMITTED)
-        arriving = _arriving_energy(scene, optics, energy_before, encounters, i)
-        arriving = jnp.where(transmitted[:, None], arriving, 0.0)
+    for passage in passed_plates(scene, p, flight, encounters):
+        scatterer, is_transmitted = config.surfaces[passage.plate], passage.is_transmitted[:, None]
+        arriving = _arriving_energy(scene, optics, energy_before, encounters, passage.plate)
+        arriving = jnp.where(is_transmitted, arriving, 0.0)
         absorbed = absorbed.at[scatterer.material].add(absorbed_of(scatterer, arriving, full_albedo))
         factor = optics_at(scatterer.transmission) / (1.0 - scene.limits.reflection_probability)
-        energy = jnp.where(transmitted[:, None], energy * factor, energy)
+        energy = jnp.where(is_transmitted, energy * factor, energy)
 
     escaped = jnp.where(flight.escaped[:, None], energy, 0.0)
     upward = (p.w[2] > 0)[:, None]
     late = jnp.where(flight.late[:, None], energy, 0.0)
-    x = along(p.x, p.w, jnp.where(flight.has_hit, flight.distance, 0.0))
-    landed = flight.landed_on(encounters)
-    collision = sample_collision(scene, x, p.w, flight.cell, flight.collided, landed, draws)
+    x, path, collision = collide(scene, p, flight, encounters, draws)
     energy = jnp.where(flight.has_hit[:, None], energy, 0.0)
     for scatterer in (config.leaf, config.bark):
         if scatterer is not None:
@@ -185,7 +158,7 @@ def _trace_order(scene: DeviceScene, optics: Array, loop: _PhotonLoop, key: PRNG
             arriving = jnp.where(on_material[:, None], energy, 0.0)
             absorbed = absorbed.at[scatterer.material].add(absorbed_of(scatterer, arriving, full_albedo))
     on_ground = fractions.on_ground
-    for surface, on_surface, scatterer in zip(scene.surfaces, landed, config.surfaces):
+    for surface, on_surface, scatterer in zip(scene.surfaces, flight.landed_on(encounters), config.surfaces):
         arriving = jnp.where(on_surface[:, None], energy, 0.0)
         albedo = surface.at_position(x, surface.law.albedo(p.w, surface.lit_normal(x, p.w)))
         absorbed = absorbed.at[scatterer.material].add(absorbed_of(scatterer, arriving, albedo))
@@ -203,7 +176,7 @@ def _trace_order(scene: DeviceScene, optics: Array, loop: _PhotonLoop, key: PRNG
     photons = Photons(
         x=x,
         w=collision.w,
-        path=p.path,
+        path=path,
         weight=p.weight,
         history=p.history,
         surface=collision.surface,

@@ -34,14 +34,15 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt32
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._one_function import once
 from jaxlidar._vectors import FAR, Scalar, Vec, along
-from jaxlidar.trace.collisions import intensity_factors, sample_collision, visible_collision
+from jaxlidar.trace.collisions import intensity_factors, visible_collision
 from jaxlidar.trace.compaction import compact
 from jaxlidar.trace.deposit import add_rows, bspline_row
 from jaxlidar.trace.device_scene import DeviceScene, not_scattered
 from jaxlidar.trace.entry_nodes import EntryNodes
 from jaxlidar.trace.flight import Flight, SurfaceEncounters, meet_surfaces, sample_flights
 from jaxlidar.trace.footprint import GOLDEN, across_beam
-from jaxlidar.trace.photons import TRANSMITTED, Photons, VisibleCollision, attached_ratio, detach
+from jaxlidar.trace.photon_step import collide, passed_plates
+from jaxlidar.trace.photons import Photons, VisibleCollision, attached_ratio, detach
 from jaxlidar.trace.random_numbers import PhotonDraws, random_words, shifted_lattices, to_unit
 from jaxlidar.trace.reparametrisation import (
     landings_with_grids,
@@ -312,12 +313,9 @@ def _trace_order(
     late = add_to_tally(tally.late, (), index, jnp.where(flight.late, weight, 0.0))
     tally = eqx.tree_at(lambda t: (t.escaped, t.late), tally, (escaped, late))
 
-    flown = jnp.where(flight.has_hit, flight.distance, 0.0)
-    x = along(p.x, p.w, flown)
     # The collision is sampled again for the selected end: taking it from the deposits would keep the onward
     # directions of all ends alive.
-    landed = flight.landed_on(encounters)
-    collision = sample_collision(scene, x, p.w, flight.cell, flight.collided, landed, draws)
+    x, path, collision = collide(scene, p, flight, encounters, draws)
     weight = jnp.where(flight.has_hit, weight, 0.0)
     tally = tally.with_arrival(collision.material, index, weight)
     index = index.after(scene, collision.channel)
@@ -334,7 +332,7 @@ def _trace_order(
     onward = Photons(
         x=x,
         w=collision.w,
-        path=p.path + flown,
+        path=path,
         weight=weight,
         history=index.number,
         surface=collision.surface,
@@ -368,20 +366,13 @@ def _pass_plates(
     config, limits = scene.config, scene.limits
     to_ends = functools.partial(jnp.broadcast_to, shape=weight.shape)
     transmits: dict[int, Bool[Array, "ends photons"]] = {}
-    for i, surface in enumerate(scene.surfaces):
-        if not surface.is_plate:
-            continue
-        distance, outcome = encounters.distances[i], encounters.outcomes[i]
-        # A plate at which the photon stops is an end, not a passage.
-        is_stop = to_ends(encounters.stops[i]) <= flights.distance
-        is_ahead = to_ends(p.alive & (distance < FAR))
-        passed = is_ahead & ((to_ends(distance) < flights.distance) | ~flights.has_hit) & ~is_stop
-        ratio = encounters.ratios[i]
+    for passage in passed_plates(scene, p, flights, encounters):
+        ratio = encounters.ratios[passage.plate]
         assert ratio is not None
         # The ratio of the outcome belongs to passed plates and to the plate that was hit; plates behind the
         # end were not met.
-        weight = weight * jnp.where(passed | (flights.landed & is_stop), to_ends(ratio), 1.0)
-        transmits[i] = passed & to_ends(outcome == TRANSMITTED)
+        weight = weight * jnp.where(passage.is_met, to_ends(ratio), 1.0)
+        transmits[passage.plate] = passage.is_transmitted
     # The budget follows the selected end alone: it is the photon; other ends are estimates of what returns.
     selected_weight, selected_index = select_end(weight), jax.tree.map(select_end, index)
     transmission_probability = 1.0 - limits.reflection_probability
@@ -431,10 +422,7 @@ def _deposit_flights(
         return jax.tree.map(lambda a: jnp.broadcast_to(a, (ends, a.shape[-1])).reshape(-1), tree)
 
     p, flights, encounters, draws, index = flatten((p, flights, encounters, draws, index))
-    flown = jnp.where(flights.has_hit, flights.distance, 0.0)
-    x = along(p.x, p.w, flown)
-    landed = flights.landed_on(encounters)
-    collision = sample_collision(scene, x, p.w, flights.cell, flights.collided, landed, draws)
+    x, path, collision = collide(scene, p, flights, encounters, draws)
     # Each end stands for its stratum: an equal share of the probability.
     value = jnp.where(flights.has_hit, flatten(weight), 0.0) * collision.ratio / ends
     if score is not None:
@@ -445,7 +433,7 @@ def _deposit_flights(
         (
             p.w,
             x,
-            p.path + flown,
+            path,
             value,
             index,
             visible_collision(scene, collision),
