@@ -246,7 +246,7 @@ def test_derivatives_have_no_histories_beyond_the_last_order():
     settings = {"n_photons": 16, "window": (-81.0, 50.0), "describe": False}
     plan = jl.plan(TWO_WAVELENGTHS, scene, max_orders=9, **settings)
     n_channels = len(plan.config.channels)
-    assert 9 == plan.config.degree < plan.config.degree
+    assert 9 == plan.degree < plan.config.degree
     setup = jl.make_setup(TWO_WAVELENGTHS, scene, plan)
     shapes = jax.eval_shape(lambda key: jl.trace_scene(setup, key, reverse=False), KEY)
     assert shapes.higher.shape[2] == math.comb(9 + n_channels, n_channels)
