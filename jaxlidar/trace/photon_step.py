@@ -20,7 +20,7 @@ from jaxlidar._vectors import FAR, Scalar, Vec, along
 from jaxlidar.trace.collisions import sample_collision
 from jaxlidar.trace.device_scene import DeviceScene, not_scattered
 from jaxlidar.trace.flight import Flight, SurfaceEncounters, meet_surfaces, sample_flights
-from jaxlidar.trace.photons import TRANSMITTED, Collision, Photons
+from jaxlidar.trace.photons import SCATTERED, TRANSMITTED, Collision, Photons
 from jaxlidar.trace.random_numbers import PhotonDraws
 
 
@@ -84,7 +84,7 @@ def passed_plates(
             continue
         distance = encounters.distances[i]
         # A plate at which the photon stops is an end, not a passage.
-        is_stop = to_ends(encounters.stops[i]) <= flights.distance
+        is_stop = to_ends(outcome == SCATTERED) & (to_ends(distance) <= flights.distance)
         is_ahead = to_ends(p.alive & (distance < FAR))
         is_passed = is_ahead & ((to_ends(distance) < flights.distance) | ~flights.has_hit) & ~is_stop
         is_met = is_passed | (flights.landed & is_stop)
