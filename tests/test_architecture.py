@@ -52,7 +52,6 @@ LAYERS = (
 FACADES = {"__init__", "extend"}
 PRIVATE_HELPERS = {path.stem for path in (ROOT / "jaxlidar").glob("_*.py")} - FACADES
 SOURCES = sorted((ROOT / "jaxlidar").rglob("*.py"))
-IN_WORK = pytest.mark.xfail(strict=False, reason="being removed")
 
 
 # -- reading imports ---------------------------------------------------------------------------------------
@@ -165,13 +164,9 @@ def upward_imports(module: str, imported: set[str]) -> list[str]:
 
 
 GRAPH = import_graph(ROOT, "jaxlidar")
-# Modules that import upper layers today.
-UPWARD = {"jaxlidar.spectral.waveform"}
 
 
-@pytest.mark.parametrize(
-    "module", [pytest.param(m, marks=IN_WORK if m in UPWARD else ()) for m in sorted(GRAPH)]
-)
+@pytest.mark.parametrize("module", sorted(GRAPH))
 def test_a_module_imports_only_lower_layers(module):
     assert upward_imports(module, GRAPH[module]) == []
 
@@ -209,7 +204,7 @@ def test_importing_all_of_jaxlidar_leaves_inversion_out():
 # -- circles -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("package", [pytest.param(name, marks=IN_WORK) for name in ("jaxlidar", "inversion")])
+@pytest.mark.parametrize("package", ["jaxlidar", "inversion"])
 def test_no_files_import_one_another(package):
     assert import_circles(import_graph(ROOT, package)) == []
 

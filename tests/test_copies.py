@@ -72,7 +72,7 @@ INSTANCES = {
     "jaxlidar.Word": jl.LSystem([("A", 0.1)], [jl.Rule("A", grown)]).rewrite(1),
     "jaxlidar.io.Case": jl.io.Case(LIDAR, SCENE, jax.random.key(0), {"rtol": 0.1}),
     "inversion.LogNormal": inversion.LogNormal(0.3, 0.5),
-    "inversion.Progress": inversion.Progress(1, 2, 1),
+    "inversion.RetrievalProgress": inversion.RetrievalProgress(1, 2, 1),
     "inversion.Smooth": inversion.Smooth(4.0, spacing=1.5, mean=[0.1, 0.2]),
     "inversion.Step": inversion.Step(1, 2.0, True, {"a": np.ones(2)}),
     "inversion.Unknown": inversion.Unknown("ground.height", bounds=(0.0, 1.0)),

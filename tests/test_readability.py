@@ -131,79 +131,26 @@ def question_docstrings(folder: str) -> tuple[list[str], float]:
 
 # -- the source --------------------------------------------------------------------------------------------
 
-IN_WORK = pytest.mark.xfail(strict=False, reason="in work")
-# Folders that do not meet a bound yet. A folder that meets it leaves its list.
-VAGUE_IN_WORK = {
-    "inversion",
-    "inversion/fit",
-    "jaxlidar",
-    "jaxlidar/cli",
-    "jaxlidar/io",
-    "jaxlidar/optics",
-    "jaxlidar/planning",
-    "jaxlidar/plants",
-    "jaxlidar/plot",
-    "jaxlidar/survey",
-    "jaxlidar/trace",
-    "tests/cli",
-    "tests/fuzz",
-    "tests/instrument",
-    "tests/inversion/fit",
-    "tests/io",
-    "tests/optics",
-    "tests/plants",
-    "tests/plot",
-    "tests/scenes",
-    "tests/survey",
-}
-DOCSTRINGS_IN_WORK = {
-    "inversion/fit",
-    "jaxlidar",
-    "jaxlidar/cli",
-    "jaxlidar/io",
-    "jaxlidar/optics",
-    "jaxlidar/planning",
-    "jaxlidar/plants",
-    "jaxlidar/plot",
-    "jaxlidar/spectral",
-    "jaxlidar/survey",
-}
-COMMENTS_IN_WORK = {
-    "jaxlidar/trace",
-    "jaxlidar/planning",
-    "jaxlidar/survey",
-    "inversion",
-}
-CLASSES_IN_WORK = IN_WORK
 
-
-def marked(folders: list[str], in_work: set[str]) -> list:
-    """Parameters of a test, one for each folder."""
-    return [pytest.param(folder, marks=IN_WORK if folder in in_work else ()) for folder in folders]
-
-
-@pytest.mark.parametrize(
-    "folder", marked(folders_with_sources("jaxlidar", "inversion", "tests"), VAGUE_IN_WORK)
-)
+@pytest.mark.parametrize("folder", folders_with_sources("jaxlidar", "inversion", "tests"))
 def test_names_say_what_their_values_are(folder):
     vague, fraction = vague_names(folder)
     assert fraction < MAX_VAGUE_NAMES, "\n".join(vague)
 
 
-@pytest.mark.parametrize("folder", marked(folders_with_sources("jaxlidar", "inversion"), DOCSTRINGS_IN_WORK))
+@pytest.mark.parametrize("folder", folders_with_sources("jaxlidar", "inversion"))
 def test_docstrings_do_not_open_with_a_question_word(folder):
     questions, fraction = question_docstrings(folder)
     assert fraction < MAX_QUESTION_DOCSTRINGS, "\n".join(questions)
 
 
-@pytest.mark.parametrize("folder", marked(list(COMMENTED), COMMENTS_IN_WORK))
+@pytest.mark.parametrize("folder", list(COMMENTED))
 def test_difficult_code_has_comments(folder):
     counts = [count_comment_and_code_lines(p.read_text()) for p in sources(folder, recursive=True)]
     comments, code = map(sum, zip(*counts, strict=True))
     assert comments / code >= MIN_COMMENTS
 
 
-@CLASSES_IN_WORK
 def test_no_class_name_is_defined_twice():
     definitions = class_definitions(*(ROOT / name for name in ("jaxlidar", "inversion", "tests", "examples")))
     assert {name: lines for name, lines in definitions.items() if len(lines) > 1} == {}

@@ -42,7 +42,7 @@ from jaxlidar.truth import Truth
 
 CONVENTIONS = "CF-1.11"
 # Number of the format of files. A reader refuses newer ones. Version 0.2.0 wrote format 1: a waveform's
-# `energy_budget` is its `energy_budget`, and the checksum of texts in netCDF files does not include names.
+# `energy_budget` is its `ledger`, and the checksum of texts in netCDF files does not include names.
 FORMAT_NUMBER = 2
 # Reasons why a simulation stopped that depend on more than its arguments.
 _NOT_REPEATABLE = ("time spent", "interrupted")
@@ -344,7 +344,7 @@ keep_as_netcdf(
     dimensions={"bins": "time", "wavelengths": "wavelength"},
     items={"components": "component", "energy_budget": "fate", "energy_budget_stderr": "fate"},
     coordinates={"height": "time"},
-    former_names={"energy_budget": "energy_budget", "energy_budget_stderr": "energy_budget_stderr"},
+    former_names={"energy_budget": "ledger", "energy_budget_stderr": "ledger_stderr"},
 )
 
 keep_as_netcdf(

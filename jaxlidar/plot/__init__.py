@@ -39,7 +39,7 @@ def __dir__() -> list[str]:
 
 
 def __getattr__(name: str) -> Any:
-    if name == "energy_budget":
-        warn_renamed("jaxlidar.plot.energy_budget", "jaxlidar.plot.energy_budget")
+    if name == "ledger":
+        warn_renamed("jaxlidar.plot.ledger", "jaxlidar.plot.energy_budget")
         return energy_budget
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -213,6 +213,6 @@ keep_as_netcdf(
     dimensions={"shots": "shot", "bins": "time", "wavelengths": "wavelength", "2": "axis"},
     items={"components": "component", "energy_budget": "fate", "energy_budget_stderr": "fate"},
     coordinates={"zenith": "shot", "azimuth": "shot"},
-    former_names={"energy_budget": "energy_budget", "energy_budget_stderr": "energy_budget_stderr"},
+    former_names={"energy_budget": "ledger", "energy_budget_stderr": "ledger_stderr"},
     rows="shots",
 )

@@ -247,7 +247,7 @@ def test_all_spectra_are_listed_without_a_kind(capsys):
 
 def test_version_is_the_installed_one(capsys):
     assert cli.main(["--version"]) == 0
-    assert capsys.readouterr().out == f"jaxlidar {cli.version()}\n"
+    assert capsys.readouterr().out == f"jaxlidar {metadata.version('jaxlidar')}\n"
 
 
 @pytest.mark.parametrize("argv", [["nonsense"], ["spectra", "--nonsense"]])

@@ -31,7 +31,8 @@ import numpy as np
 
 from tests.fuzz.fuzz_kinds import BYTES, KINDS, SECONDS, Kind
 
-SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
+ROOT = Path(__file__).resolve().parents[2]
+SHARED = ROOT.parent / "shared" / "data"
 # Mutants of each kind where no other number is asked for, and those that one child reads.
 FEW = {"text": 400, "binary": 200}
 PER_CHILD = 500
@@ -39,10 +40,9 @@ GOOD = ("read", "refused")
 
 
 def reader_of(kind: Kind) -> Callable[[Path], Any]:
-    import fuzz_kinds
-
     import jaxlidar
     import jaxlidar.io
+    from tests.fuzz import fuzz_kinds
 
     return next(
         getattr(place, kind.reader)
@@ -143,9 +143,9 @@ def hunt(name: str, count: int, first: int = 0) -> list[Outcome]:
     found: list[Outcome] = []
     while len(found) < count:
         at, last = first + len(found), min(first + len(found) + PER_CHILD, first + count)
-        command = [sys.executable, __file__, "--work", name, str(at), str(last)]
+        command = [sys.executable, "-m", "tests.fuzz.fuzz", "--work", name, str(at), str(last)]
         with tempfile.TemporaryFile() as trace:
-            child = subprocess.run(command, stdout=subprocess.PIPE, stderr=trace, check=False)
+            child = subprocess.run(command, stdout=subprocess.PIPE, stderr=trace, check=False, cwd=ROOT)
             trace.seek(0)
             errors = trace.read().decode(errors="replace")
         found += [Outcome(*json.loads(line)) for line in child.stdout.splitlines()]

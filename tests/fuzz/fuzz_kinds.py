@@ -22,19 +22,19 @@ SECONDS, BYTES = 10.0, 2**28
 
 
 def small_vox() -> bytes:
-    from test_readers import vox
+    from tests.io.test_readers import vox
 
     return vox().encode()
 
 
 def small_qsm() -> bytes:
-    from test_readers import QSM
+    from tests.io.test_readers import QSM
 
     return QSM.encode()
 
 
 def small_obj() -> bytes:
-    from test_meshes import OBJ
+    from tests.plants.test_meshes import OBJ
 
     return OBJ.encode()
 
@@ -88,14 +88,14 @@ def small_cloud(compress: bool, point_format: int = 6, points: int = 60) -> byte
 
 
 def small_gedi() -> bytes:
-    from test_io import write_small
+    from tests.io.test_gedi import write_small
 
     with tempfile.TemporaryDirectory() as folder:
         return write_small(Path(folder) / "small.h5").read_bytes()
 
 
 def small_neon() -> bytes:
-    from test_neon import write_small
+    from tests.io.test_neon import write_small
 
     with tempfile.TemporaryDirectory() as folder:
         return write_small(Path(folder) / "small.npz").read_bytes()
@@ -104,7 +104,7 @@ def small_neon() -> bytes:
 @functools.cache
 def small_pulses(which: int) -> bytes:
     """Of the two files, that of the pulses (0) or of their waves (1)."""
-    from test_pulsewaves import small_files
+    from tests.io.test_pulsewaves import small_files
 
     return small_files()[which]
 
@@ -112,7 +112,7 @@ def small_pulses(which: int) -> bytes:
 @functools.cache
 def small_packets(which: int) -> bytes:
     """Of the two files, that of the points (0) or of their packets (1)."""
-    from test_las_waveforms import small_files
+    from tests.io.test_las_waveforms import small_files
 
     with tempfile.TemporaryDirectory() as folder:
         return small_files(Path(folder))[which]

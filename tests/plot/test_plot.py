@@ -187,8 +187,8 @@ def test_the_energy_budget_adds_up_to_100_percent(wave, axes):
 
 
 def test_the_old_name_of_the_energy_budget_warns():
-    with pytest.warns(DeprecationWarning, match=r"plot\.energy_budget"):
-        assert plot.energy_budget is plot.energy_budget
+    with pytest.warns(DeprecationWarning, match=r"plot\.ledger"):
+        assert plot.ledger is plot.energy_budget
     with pytest.raises(AttributeError, match="no attribute 'legder'"):
         _ = plot.legder
 

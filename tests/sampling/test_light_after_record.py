@@ -126,7 +126,7 @@ def test_orders_of_the_user_are_not_extended():
 
 
 @pytest.mark.slow
-def test_the_ledger_has_standard_errors():
+def test_the_energy_budget_has_standard_errors():
     """The scatter of forty simulations agrees with their errors; errors three times wrong are rejected."""
     scene, n = dense(0.8, 3.0, 0.3), 40
     plan = jl.plan(LIDAR, scene, describe=False)
