@@ -57,7 +57,8 @@ waveforms is in the package `inversion`.
 
 ## Warnings and constants
 
-`LateLightWarning`, `LostWorkersWarning`, `OffMapWarning`, `UnitWarning`, `SPEED_OF_LIGHT`.
+`LateLightWarning`, `UnfollowedLightWarning`, `LostWorkersWarning`, `OffMapWarning`, `UnitWarning`,
+`SPEED_OF_LIGHT`.
 
 ## Packages of their own
 
@@ -117,7 +118,7 @@ from jaxlidar.scenes.shapes import AbstractShape, Plane
 from jaxlidar.scenes.surfaces import AbstractGround, AbstractSheet, AbstractSurface, Ground, Plate
 from jaxlidar.scenes.terrain import Terrain
 from jaxlidar.scenes.voxels import VoxelMap
-from jaxlidar.simulate import LateLightWarning, simulate
+from jaxlidar.simulate import LateLightWarning, UnfollowedLightWarning, simulate
 from jaxlidar.spectral.waveform import Waveform, total_reflectance, waveform_of
 from jaxlidar.survey.coverage import OffMapWarning
 from jaxlidar.survey.progress import SurveyProgress
@@ -238,6 +239,7 @@ __all__ = [
     "photon_paths",
     # Warnings and constants.
     "LateLightWarning",
+    "UnfollowedLightWarning",
     "LostWorkersWarning",
     "OffMapWarning",
     "UnitWarning",

@@ -17,6 +17,8 @@ from jaxlidar._progress import Progress
 from jaxlidar._summary import NOTABLE_FRACTION, late_fraction, percent
 from jaxlidar._threads import side_by_side
 from jaxlidar.instrument.lidar import Lidar
+from jaxlidar.planning.memory import MAX_APPLIED_WAVELENGTHS
+from jaxlidar.planning.orders import MAX_ORDERS, orders_to_tolerance
 from jaxlidar.planning.plan import MIN_BATCHES, Plan
 from jaxlidar.planning.plan import plan as make_plan
 from jaxlidar.planning.plan_check import check_plan
@@ -131,16 +133,15 @@ def simulate(
     plan = _check_or_make_plan(lidar, scene, given_plan, goal, planning)
     tracer = make_batch_tracer(make_setup(lidar, scene, plan), key)
     result = _trace(tracer, key, goal, progress, start_time)
-    can_follow_more = given_plan is None and plan.orders < plan.scope.max_orders
-    has_time = time.perf_counter() - start_time < max_seconds
-    if result.neglected_fraction > 0 and can_follow_more and has_time:
-        # Orders beyond the last matter: follow as many as there is room for.
-        planning["max_orders"] = plan.scope.max_orders
-        plan = _check_or_make_plan(lidar, scene, None, goal, planning)
+    while result.needs_more_orders and given_plan is None:
+        more = _more_orders(plan, lidar.wavelength.size, result.neglected_fraction, goal)
+        if more is None or time.perf_counter() - start_time >= max_seconds:
+            break
+        plan = _check_or_make_plan(lidar, scene, None, goal, planning | more)
         plan = dataclasses.replace(plan, scope=plan.scope._replace(automatic_orders=True))
         tracer = make_batch_tracer(make_setup(lidar, scene, plan), key)
         result = _trace(tracer, key, goal, progress, start_time)
-    wave = _make_waveform(tracer, result)
+    wave = _make_waveform(tracer, result, goal)
     return dataclasses.replace(wave, truth=truth_of_setup(tracer.setup)) if truth else wave
 
 
@@ -151,6 +152,10 @@ class _Goal(NamedTuple):
     atol: float
     n_photons: int | None
     max_seconds: float
+
+    def tolerance(self, plan: Plan) -> float:
+        """Relative tolerance aimed at."""
+        return plan.rtol if self.rtol is None else self.rtol
 
 
 def _make_goal(rtol: float | None, atol: float, n_photons: int | None, max_seconds: float) -> _Goal:
@@ -183,11 +188,29 @@ def _check_or_make_plan(
     return plan.with_config(n_photons=min(max(goal.n_photons // MIN_BATCHES, 1), MAX_BATCH_PHOTONS))
 
 
+def _more_orders(
+    plan: Plan, wavelengths: int, neglected_fraction: float, goal: _Goal
+) -> dict[str, Any] | None:
+    """Return the planning arguments of a simulation that follows more orders, or None where none can.
+
+    First as many as histories have room for; then, with optics applied, as many as the fraction that is
+    neglected asks for.
+    """
+    if plan.config.keeps_histories and plan.orders < plan.scope.max_orders:
+        return {"max_orders": plan.scope.max_orders, "histories": True}
+    if wavelengths > MAX_APPLIED_WAVELENGTHS or plan.orders >= MAX_ORDERS:
+        return None
+    # The first orders may fall faster than later ones, so that the mean ratio of orders is a lower bound.
+    ratio = max(plan.likely_beyond, neglected_fraction) ** (1.0 / plan.orders)
+    orders = plan.orders + orders_to_tolerance(ratio, goal.tolerance(plan) / neglected_fraction)
+    return {"max_orders": min(orders, MAX_ORDERS), "histories": False}
+
+
 class _Traced(NamedTuple):
     """The sum of the responses of some batches, standard errors, and `info`.
 
     Standard errors are None where nothing is random. `neglected_fraction`: fraction that orders beyond the
-    last may add, where nothing else was short of the goal; else 0.
+    last may add. `needs_more_orders`: True if nothing else was short of the goal.
     """
 
     response: Response
@@ -196,6 +219,7 @@ class _Traced(NamedTuple):
     energy_budget_stderr: dict[str, Array] | None
     info: dict[str, Any]
     neglected_fraction: float = 0.0
+    needs_more_orders: bool = False
 
 
 def _trace(
@@ -215,7 +239,7 @@ def _trace(
     return _trace_batches(tracer, key, goal, progress, start_time)
 
 
-def _make_waveform(tracer: BatchTracer, result: _Traced) -> Waveform:
+def _make_waveform(tracer: BatchTracer, result: _Traced, goal: _Goal) -> Waveform:
     """Make the waveform of traced batches, on the digitiser's bins; warn where it misses much light."""
     plan, lidar = tracer.setup.plan, tracer.setup.lidar
     wave = tracer.waveform(result.response, result.batches)
@@ -232,7 +256,40 @@ def _make_waveform(tracer: BatchTracer, result: _Traced) -> Waveform:
             LateLightWarning,
             stacklevel=3,
         )
+    if result.neglected_fraction > goal.tolerance(plan):
+        message = unfollowed_message(plan, result.neglected_fraction)
+        warnings.warn(message, UnfollowedLightWarning, stacklevel=3)
     return open_at_first_return(wave, lidar) if lidar.receiver.window == "first return" else wave
+
+
+def unfollowed_message(plan: Plan, fraction: float) -> str:
+    """Return the text of the warning that orders beyond the plan's last may add a fraction of the light."""
+    remedy = "give max_orders="
+    if plan.config.keeps_histories:
+        remedy = f"give max_orders=, or have at most {MAX_APPLIED_WAVELENGTHS} wavelengths"
+    return f"orders of scattering beyond {plan.orders} may add {percent(fraction)} of the light: {remedy}"
+
+
+class UnfollowedLightWarning(UserWarning):
+    """The warning that orders of scattering that were not followed may add more than the tolerance.
+
+    It is given where the plan chose the number of orders. `max_orders=` of your own is taken as it is; what
+    it leaves out is in `Waveform.neglected`.
+
+    **Example:** light in a deep canopy that absorbs nothing, for more wavelengths than optics can be applied
+    to.
+
+    >>> import warnings
+    >>> import jax, jaxlidar as jl, numpy as np
+    >>> voxels = jl.VoxelMap.from_lad(np.full((1, 1, 4), 10.0), voxel_size=1.0)
+    >>> canopy = jl.Canopy(voxels, leaf=jl.Isotropic(0.999), sides="periodic")
+    >>> lidar = jl.Lidar(wavelength=np.linspace(800.0, 900.0, 9))
+    >>> with warnings.catch_warnings(record=True) as caught:
+    ...     warnings.simplefilter("always")
+    ...     wave = jl.simulate(lidar, jl.Scene(canopy=canopy), key=jax.random.key(0), n_photons=1000)
+    >>> caught[0].category.__name__
+    'UnfollowedLightWarning'
+    """
 
 
 class LateLightWarning(UserWarning):
@@ -323,7 +380,7 @@ def _trace_batches(
 ) -> _Traced:
     """Trace batches on all cores, round after round, until the goal is reached."""
     plan = tracer.setup.plan
-    rtol = plan.rtol if goal.rtol is None else goal.rtol
+    rtol = goal.tolerance(plan)
     if goal.n_photons is None:
         stop = StoppingRule(rtol, goal.atol, MIN_BATCHES)
     else:
@@ -348,13 +405,13 @@ def _trace_batches(
             keeps_interrupted=True,
         )
     assert isinstance(errors, WaveformErrors)
-    stopped, neglected_fraction = reason.value, 0.0
-    if reason is StopReason.TOLERANCE_MET and plan.scope.automatic_orders:
-        neglected = estimate.budgets.mean_only
-        fraction = float(np.max(neglected / np.maximum(errors.total, 1e-30), initial=0.0))
-        if fraction > rtol and float(np.max(neglected, initial=0.0)) > goal.atol:
-            neglected_fraction = fraction
-            stopped = f"orders beyond {plan.orders} may add {percent(fraction)}"
+    stopped, neglected = reason.value, estimate.budgets.mean_only
+    neglected_fraction = 0.0
+    if plan.scope.automatic_orders and float(np.max(neglected, initial=0.0)) > goal.atol:
+        neglected_fraction = float(np.max(neglected / np.maximum(errors.total, 1e-30), initial=0.0))
+    needs_more_orders = reason is StopReason.TOLERANCE_MET and neglected_fraction > rtol
+    if needs_more_orders:
+        stopped = f"orders beyond {plan.orders} may add {percent(neglected_fraction)}"
     info = {
         "photons": estimate.n_batches * plan.photons_traced,
         "batches": estimate.n_batches,
@@ -369,4 +426,5 @@ def _trace_batches(
         energy_budget_stderr=dict(zip(estimate.budget_names, map(jnp.asarray, estimate.budgets.stderr))),
         info=info,
         neglected_fraction=neglected_fraction,
+        needs_more_orders=needs_more_orders,
     )

@@ -114,7 +114,8 @@ def plan_for_bounds(
         "effects": dict.fromkeys(find_empty_materials(scenes[0]), True),
     }
     first = make_plan(lidar, scenes[0], max_orders=sizes.max_orders, **common)
-    common.update(max_orders=first.orders, bin_width=first.bins.width)
+    histories = first.config.keeps_histories
+    common.update(max_orders=first.orders, bin_width=first.bins.width, histories=histories)
     if scene.canopy is not None:
         common.update(max_step=first.limits.max_segment)
     plans = [first]

@@ -67,15 +67,15 @@ def simulation_bytes(
     return response * (_RESPONSE_COPIES * (os.cpu_count() or 1) + 1) + 2 * pulse + _COMPILATION
 
 
-def keeps_histories(with_histories: float, applied: float, limit: float, wavelengths: int) -> bool:
+def keeps_histories(with_histories: float, applied: float, limit: float) -> bool:
     """Return True if the response shall keep scattering histories, so that one trace serves all optics.
 
-    Otherwise optics are applied while light is traced. That is done where histories take far more memory,
-    `with_histories` in place of `applied` bytes, and wavelengths, whose deposits are then made one by one,
-    are few.
+    Otherwise optics are applied while light is traced. That is done where histories take more memory,
+    `with_histories` in place of `applied` bytes. Wavelengths, whose deposits are then made one by one, must
+    be few: at most `MAX_APPLIED_WAVELENGTHS`.
     """
     affordable = with_histories <= min(limit, LARGE_RESPONSE)
-    return affordable or applied >= with_histories or wavelengths > MAX_APPLIED_WAVELENGTHS
+    return affordable or applied >= with_histories
 
 
 def jacobian_bytes(

@@ -7,6 +7,9 @@ albedo w, q tends to the decay per scattering of the slowest diffusion mode,
     q = w (1 - (pi^2 / 3) / (tau + 1.42)^2),
 
 where 1.42 = 2 x 0.71 are the two extrapolation lengths (Case and Zweifel 1967).
+
+A trace that keeps scattering histories has room for a limited number of orders. Where so many would leave out
+more than the tolerance, optics are applied while light is traced: then there is no such limit.
 """
 
 import math
@@ -24,13 +27,20 @@ from jaxlidar.scenes.scene import Scene
 
 # Orders are followed while their histories are not more than this (16 orders of four channels, 29 of three).
 MAX_HISTORIES = 5000
-MAX_ORDERS = 100
+# With histories, the weight of a photon is 2 at every scattering by leaves that reflect and transmit: in
+# single precision, 2^128 is infinite.
+MAX_ORDERS_OF_HISTORIES = 100
+# With optics applied: a slab of optical depth 20 that absorbs nothing takes 900 orders to a tolerance of 1 %.
+MAX_ORDERS = 1000
 # The loop over orders is rounded up to a size bucket only while its histories are not more than this.
 MAX_BUCKETED_HISTORIES = 7000
 # The fraction of scattered light that is scattered again is taken to be at least this, times the albedo.
 MIN_REPEATED_FRACTION = 0.8
 # Multiple scattering is recorded this long after the last first-order return, ns, at least and at most.
 TAIL = (10.0, 300.0)
+# It may be longer, up to this, where the ratio of successive orders is larger than this: light lingers in
+# dense canopies that absorb little.
+LONG_TAIL, LINGERING = 3000.0, 0.9
 # The record ends when the estimated fraction of light that is still in the scene falls below this.
 LATE_FRACTION = 0.003
 
@@ -41,12 +51,14 @@ class OrderChoice(NamedTuple):
     - `count`: the number. - `reason`: in words. - `beyond`: estimated fraction of the light in all later
       orders.
     - `max_orders`: largest number for which the table of histories stays small enough.
+    - `needs_applied_optics`: True where so many orders would leave out more than the tolerance.
     """
 
     count: int
     reason: str
     beyond: float
     max_orders: int
+    needs_applied_optics: bool = False
 
 
 def max_degree(orders: int, n_plates: int) -> int:
@@ -89,12 +101,18 @@ def repeated_fraction(scene: Scene, optics: list[MaterialOptics]) -> float:
     Ground that reflects makes the slab of the canopy deeper. Between two surfaces q is the root of the
     product of their reflectances. It is never taken to be less than 0.8 times the largest albedo.
     """
-    albedo = largest_albedo(optics)
-    fraction = MIN_REPEATED_FRACTION * albedo
+    return min(max(MIN_REPEATED_FRACTION * largest_albedo(optics), slowest_decay(scene, optics)), 1.0)
+
+
+def slowest_decay(scene: Scene, optics: list[MaterialOptics]) -> float:
+    """Estimate the ratio of successive orders in the slowest mode, without the floor of `repeated_fraction`.
+
+    Zero for a canopy of an optical depth of at most one, which diffusion does not describe.
+    """
+    albedo, fraction = largest_albedo(optics), 0.0
     if scene.canopy is not None:
         ground = 0.0 if scene.ground is None else _largest_reflectance(optics, "ground")
         depth = mean_depth(scene.canopy) * (1.0 + ground)
-        # Diffusion describes thin slabs badly; there the floor stands.
         if depth > 1.0:
             fraction = max(fraction, albedo * (1.0 - math.pi**2 / 3 / (depth + 1.42) ** 2))
     surfaces = [o.name for o in optics if o.name not in ("leaf", "bark")]
@@ -110,26 +128,52 @@ def _largest_reflectance(optics: list[MaterialOptics], name: str) -> float:
 
 
 def choose_orders(
-    scene: Scene, optics: list[MaterialOptics], n_channels: int, rtol: float, max_orders: int | None
+    scene: Scene,
+    optics: list[MaterialOptics],
+    n_channels: int,
+    rtol: float,
+    max_orders: int | None,
+    histories: bool | None = None,
 ) -> OrderChoice:
-    """Choose the number of orders to follow: `max_orders`, or as many as `rtol` needs and histories allow."""
+    """Choose the number of orders to follow: `max_orders`, or as many as `rtol` needs.
+
+    With `histories` True these are at most as many as histories allow. With None optics are applied where
+    histories do not allow enough: by the slowest decay, as the floor of `repeated_fraction` is no reason to
+    trace again for every change of optics.
+    """
     if not can_light_itself(scene):
         return OrderChoice(1, "one plane cannot light itself", 0.0, 1)
     n_plates, fraction, albedo = len(scene.plates), repeated_fraction(scene, optics), largest_albedo(optics)
     affordable = 2
-    while affordable < MAX_ORDERS:
+    while affordable < MAX_ORDERS_OF_HISTORIES:
         histories = math.comb(max_degree(affordable + 1, n_plates) + n_channels, n_channels)
         if histories > MAX_HISTORIES:
             break
         affordable += 1
-    needed = affordable
-    if fraction < 1:
-        needed = 1 + math.ceil(math.log(rtol / 10) / math.log(max(fraction, 1e-6)))
-    count = min(max(needed, 2), affordable) if max_orders is None else int(max_orders)
+    if max_orders is None:
+        is_known = all(concrete(o.reflectance) is not None for o in optics) and math.isfinite(
+            0.0 if scene.canopy is None else mean_depth(scene.canopy)
+        )
+        is_short = slowest_decay(scene, optics) ** affordable > rtol
+        applies_optics = histories is False or (histories is None and is_known and is_short)
+        possible = MAX_ORDERS if applies_optics else affordable
+        count = min(max(orders_to_tolerance(fraction, rtol), 2), possible)
+    else:
+        applies_optics, count = histories is False, int(max_orders)
     if count == 1:
         return OrderChoice(1, "one order is asked for", 0.0, affordable)
     reason = f"orders 2 to {count}; largest albedo {albedo:.2f}"
-    return OrderChoice(count, reason, fraction**count, affordable)
+    return OrderChoice(count, reason, fraction**count, affordable, applies_optics)
+
+
+def orders_to_tolerance(fraction: float, rtol: float) -> int:
+    """Return the number of orders after which a tenth of the tolerance is left; at most `MAX_ORDERS`.
+
+    `fraction`: ratio of the light of successive orders, at most one.
+    """
+    if fraction >= 1:
+        return MAX_ORDERS
+    return min(1 + math.ceil(math.log(rtol / 10) / math.log(max(fraction, 1e-6))), MAX_ORDERS)
 
 
 def multiple_scattering_tail(
@@ -149,7 +193,8 @@ def multiple_scattering_tail(
         size, shape = concrete_array(scene.canopy.voxels.voxel_size), scene.canopy.voxels.shape
         height = float(size[2]) * shape[2]
         time_between = height / max(depth, 0.5) / SPEED_OF_LIGHT if math.isfinite(depth) else time_between
+    longest = LONG_TAIL if LINGERING < slowest_decay(scene, optics) < 1 else TAIL[1]
     if fraction >= 1:
-        return TAIL[1]
+        return longest
     scatterings = math.log(LATE_FRACTION) / math.log(max(fraction, 1e-6))
-    return min(max(usual_tail, scatterings * time_between), TAIL[1])
+    return min(max(usual_tail, scatterings * time_between), longest)

@@ -5,12 +5,25 @@ import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from jaxlidar._checks import check_choice, check_integer, check_range, concrete_array, concrete_number
+from jaxlidar._checks import (
+    check_choice,
+    check_integer,
+    check_kind,
+    check_range,
+    concrete_array,
+    concrete_number,
+)
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.instrument.survey import Survey
 from jaxlidar.optics.laws import AbstractMirror
-from jaxlidar.planning.channels import largest_albedo, number_channels, reflection_probability, scene_optics
+from jaxlidar.planning.channels import (
+    ScattererChannels,
+    largest_albedo,
+    number_channels,
+    reflection_probability,
+    scene_optics,
+)
 from jaxlidar.planning.config import PathLimits, TimeBins, TraceConfig
 from jaxlidar.planning.effect_table import effect_table, table_lines
 from jaxlidar.planning.effects import (
@@ -24,6 +37,7 @@ from jaxlidar.planning.effects import (
 )
 from jaxlidar.planning.local_origin import move_aim_to_origin
 from jaxlidar.planning.memory import (
+    MAX_APPLIED_WAVELENGTHS,
     check_memory,
     format_bytes,
     jacobian_bytes,
@@ -31,7 +45,13 @@ from jaxlidar.planning.memory import (
     memory_limit,
     simulation_bytes,
 )
-from jaxlidar.planning.orders import choose_orders, max_degree, multiple_scattering_tail, order_steps
+from jaxlidar.planning.orders import (
+    MAX_ORDERS_OF_HISTORIES,
+    choose_orders,
+    max_degree,
+    multiple_scattering_tail,
+    order_steps,
+)
 from jaxlidar.planning.parallel_light import beams_are_parallel, parallel_light_bound
 from jaxlidar.planning.path_lengths import PathLengths, check_footprints_on_terrain, longest_segment
 from jaxlidar.planning.record_times import bins_and_samples, extend_to_air_return, target_bin_width
@@ -202,6 +222,7 @@ def plan(
     footprint: str = "random",
     effects: Mapping[str, bool] | None = None,
     max_memory: float | None = None,
+    histories: bool | None = None,
     describe: bool = True,
 ) -> Plan:
     """Plan what `simulate` will do for a lidar and a scene.
@@ -217,8 +238,8 @@ def plan(
     - `scene`: a `Scene`.
     - `rtol`: relative accuracy aimed at, in (0, 1); sets how many orders are worth following. Default None:
       0.01.
-    - `max_orders`: number of scatterings followed, at least 1. Default None: from `rtol` and the largest
-      albedo.
+    - `max_orders`: number of scatterings followed, at least 1. Default None: from `rtol` and the optics; with
+      histories, as many as their table has room for (some 16 to 29).
     - `max_step`: longest segment, m, of a footprint ray that order one deposits at once; positive. The result
       does not depend on it. Default None: the ray's chord in a voxel, or 64 fine bins.
     - `n_photons`: photons per batch, at least 1. Default 8192.
@@ -226,7 +247,8 @@ def plan(
       quadrature rule takes their place. Default None: 4096 with one order or a fixed footprint; else 2048
       where the pulse's standard deviation, with its jitter, is below a sampling interval; else 1024.
     - `window`: (first, last) sample time, ns. Default None: covers the scene, and multiple scattering until
-      little of it is left, or 300 ns at most.
+      little of it is left, or 300 ns at most (3000 ns in dense canopies that absorb
+      little).
     - `bin_width`: width of the fine bins, ns, positive; reduced to a whole fraction of the sampling interval.
       Default None: a quarter of the pulse's finest feature with its jitter, between 0.05 and 1 sampling
       intervals; half an interval for a pulse without duration.
@@ -237,13 +259,19 @@ def plan(
       of terrain that is a plane, are off unless True asks for them. The names are those of the table's first
       column. Default None.
     - `max_memory`: GB that the simulation may take, positive. Default None: a quarter of the machine's.
+    - `histories`: True to keep scattering histories, so that one trace serves all optics and wavelengths;
+      False to apply optics while light is traced, for at most 8 wavelengths, which has no limit on orders
+      but 1000, and takes less memory. Default None: histories, but where these would take more than 1 GB, or
+      leave out orders that are likely to matter (dense and bright canopies).
     - `describe`: True to make the table of effects with its bounds, which takes some 40 ms. Default True.
 
     **Returns:** a `Plan`; `print` shows it as a table.
 
-    **Raises:** ValueError for inadmissible arguments, for a scene that reaches up to the sensor, for a
-    footprint that lies partly off the terrain, for what would take more memory than `max_memory`, and if the
-    geometry is being traced by a JAX transformation: make the plan outside and pass it in.
+    **Raises:** ValueError for inadmissible arguments, for more than 100 orders with histories where leaves or
+    plates both reflect and transmit (weights of single precision), for a scene that reaches up to the
+    sensor, for a footprint that lies partly off the terrain, for what would take more memory than
+    `max_memory`, and if the geometry is being traced by a JAX transformation: make the plan outside and pass
+    it in.
 
     **Example:**
 
@@ -268,6 +296,7 @@ def plan(
     if max_memory is not None:
         check_range("max_memory", max_memory, 0.0, low_open=True)
     check_choice("footprint", footprint, ("random", "fixed"))
+    check_kind("histories", histories, bool | None, "True, False or None")
     check_footprints_on_terrain(lidar if survey is None else survey, scene)
     # From here on x = y = 0 is the aim point, or the middle of the survey (see `local_origin`).
     survey = None if survey is None else survey.about(concrete_array(lidar.position))
@@ -288,8 +317,10 @@ def plan(
     optics = scene_optics(lidar, scene)
     scatterers = number_channels(optics)
     n_channels, n_plates = len(scatterers.channels), len(scene.plates)
+    wavelengths = lidar.wavelength.size
+    histories = _possible_histories(histories, max_orders, scatterers, wavelengths)
     order_choice = choose_orders(
-        scene, optics, n_channels, rtol, 1 if "multiple scattering" in off else max_orders
+        scene, optics, n_channels, rtol, 1 if "multiple scattering" in off else max_orders, histories
     )
     orders = order_choice.count
     steps = order_steps(orders, n_plates, n_channels)
@@ -358,7 +389,6 @@ def plan(
     )
     # 5. Memory decides between histories and applied optics, and how many orders there is room for.
     straight = scene.canopy is not None and scene.canopy.is_straight
-    wavelengths = lidar.wavelength.size
     # A sample collects the pulse's support and its own interval, and partial bins at the ends.
     pulse_bins = math.ceil((pulse_support[1] - pulse_support[0] + samples.interval) / bins.width) + 5
 
@@ -379,7 +409,11 @@ def plan(
         )
 
     limit = memory_limit(max_memory)
-    keeps = keeps_histories(memory_of(orders, True), memory_of(orders, False), limit, wavelengths)
+    if order_choice.needs_applied_optics:
+        histories = False
+    if histories is None:
+        histories = keeps_histories(memory_of(orders, True), memory_of(orders, False), limit)
+    keeps = histories
     if not keeps:
         config = dataclasses.replace(config, keeps_histories=False, degree=0)
     memory = memory_of(orders, keeps)
@@ -430,3 +464,30 @@ def plan(
         memory=memory,
         effects=table,
     )
+
+
+def _possible_histories(
+    histories: bool | None, max_orders: int | None, scatterers: ScattererChannels, wavelengths: int
+) -> bool | None:
+    """Return True or False where histories must, or cannot be kept, and else what is asked for.
+
+    **Raises:** ValueError where neither is possible.
+    """
+    few_wavelengths = wavelengths <= MAX_APPLIED_WAVELENGTHS
+    if histories is False and not few_wavelengths:
+        raise ValueError(
+            f"histories = False with {wavelengths} wavelengths; admissible are at most "
+            f"{MAX_APPLIED_WAVELENGTHS}, or histories = True"
+        )
+    # A photon's weight is divided by the probability of reflection or transmission at every scattering.
+    all_scatterers = (scatterers.leaf, scatterers.bark, *scatterers.surfaces)
+    splits = any(s is not None and min(s.reflection, s.transmission) >= 0 for s in all_scatterers)
+    if max_orders is not None and max_orders > MAX_ORDERS_OF_HISTORIES and splits and histories is not False:
+        if histories or not few_wavelengths:
+            raise ValueError(
+                f"max_orders = {max_orders} with scattering histories, of materials that reflect and "
+                f"transmit; admissible are at most {MAX_ORDERS_OF_HISTORIES}, or histories = False and at most "
+                f"{MAX_APPLIED_WAVELENGTHS} wavelengths"
+            )
+        return False
+    return histories if few_wavelengths else True

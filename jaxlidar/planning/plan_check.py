@@ -92,7 +92,8 @@ def _misfit_materials(plan: Plan, lidar: Lidar, scene: Scene) -> Iterator[str]:
     # Orders that the user chose are followed whatever the albedo. A larger albedo may still need no more.
     albedo = largest_albedo(optics)
     if scope.automatic_orders and albedo > scope.albedo + 1e-3:
-        needed = choose_orders(scene, optics, len(scatterers.channels), plan.rtol, None).count
+        histories, n_channels = plan.config.keeps_histories, len(scatterers.channels)
+        needed = choose_orders(scene, optics, n_channels, plan.rtol, None, histories).count
         if needed > plan.orders:
             yield (
                 f"it follows {plan.orders} orders, for albedos up to {scope.albedo:.3g}; the scene has "

@@ -6,7 +6,7 @@ import os
 import time
 import warnings
 from collections.abc import Iterator, Mapping, MutableMapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -16,7 +16,7 @@ from jaxlidar.io.case import Case
 from jaxlidar.io.checkpoint import Checkpoint
 from jaxlidar.io.netcdf import by_rows
 from jaxlidar.io.rows import unwritten_rows
-from jaxlidar.simulate import LateLightWarning
+from jaxlidar.simulate import LateLightWarning, UnfollowedLightWarning, unfollowed_message
 from jaxlidar.spectral.apply_optics import make_waveform_model
 from jaxlidar.survey.results import ShotResults
 from jaxlidar.survey.strategy import AbstractStrategy
@@ -66,7 +66,7 @@ def waveforms_in_memory(
     # Blocks come in the order of shots.
     blocks = [results for _, results in strategy.shot_results(task_results)]
     results: ShotResults = jax.tree.map(lambda *a: np.concatenate(a), *blocks)
-    _warn_of_late_light(strategy, float(np.max(results.energy_budget["after the window"], initial=0.0)))
+    _warn_of_missing_light(strategy, _MissingLight.of(results))
     return _waveforms(strategy, {**survey_fields, **results._asdict()}, start_time)
 
 
@@ -83,7 +83,7 @@ def waveforms_on_disk(
 
     `problem`: digests of all that the waveforms depend on.
     """
-    blocks, largest_late = strategy.shot_results(task_results), 0.0
+    blocks, missing = strategy.shot_results(task_results), _MissingLight()
     first = next(blocks)
     # The file is laid out before its rows are known: from the shapes of the first block.
     empty = jax.tree.map(lambda a: unwritten_rows(len(strategy.survey), a), first[1]._asdict())
@@ -92,8 +92,8 @@ def waveforms_on_disk(
         for shots, results in itertools.chain([first], blocks):
             fields = {name: a[shots] for name, a in survey_fields.items()}
             rows.add(shots, {**fields, **results._asdict()})
-            largest_late = max(largest_late, float(np.max(results.energy_budget["after the window"])))
-    _warn_of_late_light(strategy, largest_late)
+            missing = missing.or_more(_MissingLight.of(results))
+    _warn_of_missing_light(strategy, missing)
     return Waveforms.open(path)
 
 
@@ -114,13 +114,40 @@ def _waveforms(
     )
 
 
-def _warn_of_late_light(strategy: AbstractStrategy, late_fraction: float) -> None:
-    """Warn if a notable fraction of the light of a shot arrives after the record."""
+class _MissingLight(NamedTuple):
+    """Largest fractions, over shots and wavelengths, of light that waveforms lack.
+
+    - `late`: of the emitted light, after the end of the record. - `unfollowed`: of the waveform, that orders
+      beyond the last may add.
+    """
+
+    late: float = 0.0
+    unfollowed: float = 0.0
+
+    @staticmethod
+    def of(results: ShotResults) -> "_MissingLight":
+        """Return the missing light of some shots."""
+        total = np.sum(results.reflectance, axis=-1)
+        return _MissingLight(
+            float(np.max(results.energy_budget["after the window"], initial=0.0)),
+            float(np.max(results.neglected / np.maximum(total, 1e-30), initial=0.0)),
+        )
+
+    def or_more(self, other: "_MissingLight") -> "_MissingLight":
+        """Return the larger of each fraction."""
+        return _MissingLight(*map(max, self, other))
+
+
+def _warn_of_missing_light(strategy: AbstractStrategy, missing: _MissingLight) -> None:
+    """Warn if much light of a shot is after the record, or may be in orders that were not followed."""
     plan = strategy.setup.plan
-    if late_fraction >= NOTABLE_FRACTION:
+    if plan.scope.automatic_orders and missing.unfollowed > strategy.rtol:
+        # As below, for the caller of `simulate_many`.
+        warnings.warn(unfollowed_message(plan, missing.unfollowed), UnfollowedLightWarning, stacklevel=4)
+    if missing.late >= NOTABLE_FRACTION:
         end = plan.sample_start + plan.sample_interval * plan.n_samples
         warnings.warn(
-            f"{percent(late_fraction)} of the light of a shot is still on its way when the record ends at "
+            f"{percent(missing.late)} of the light of a shot is still on its way when the record ends at "
             f"{end:.4g} ns: see Waveforms.energy_budget",
             LateLightWarning,
             # The caller of `simulate_many`: above this function, its caller, and `simulate_many` itself.

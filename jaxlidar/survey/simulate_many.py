@@ -81,8 +81,7 @@ def simulate_many(
     - `scene`: a `Scene`; or `SceneParts`, for one that is larger than memory.
     - `key`: a JAX random key. The same key gives the same waveforms.
     - `rtol`: relative error to reach for every shot, in (0, 1). Default None: 0.01.
-    - `max_orders`: number of scatterings followed, at least 1. Default None: from `rtol` and the largest
-      albedo.
+    - `max_orders`: number of scatterings followed, at least 1. Default None: from `rtol` and the optics.
     - `path`: a netCDF file, or a Zarr store (".zarr"), for the waveforms. It appears when all are traced,
       with its case, so that `jaxlidar.rerun` can simulate them again. Until then the file "PATH.parts" (of
       SQLite) has the results so far; the same call continues with them, also after it was killed. One run at
@@ -104,7 +103,8 @@ def simulate_many(
     **Returns:** a `Waveforms`.
 
     **Warns:** `OffMapWarning` where footprints lie partly beside the voxel map, `LateLightWarning` where much
-    light arrives after the end of the record.
+    light arrives after the end of the record, `UnfollowedLightWarning` where orders that are not followed may
+    add more than `rtol`.
 
     **Raises:** TypeError for arguments of another class. ValueError, before any work, for inadmissible
     arguments, a scene that reaches up to the sensor, shots that do not meet the ground, a receiver whose

@@ -323,6 +323,10 @@ def _trace_order(
     # alone.
     weight = weight * collision.ratio * collision.onward_weight
     tally = tally.with_departure(collision.material, index, weight)
+    if index.optical_weights:
+        # The geometric weight doubles at every scattering by a leaf, and the optical weight halves: over
+        # hundreds of orders only their product stays in the range of single precision.
+        weight, index = jnp.ones_like(weight), index.times(weight)
     score = None
     if p.score is not None:
         assert flight.depth_slopes is not None

@@ -41,13 +41,13 @@ class Photons(eqx.Module):
 
     - `x`, `w`: position, m from the aim point, and direction.
     - `path`: path length since the sensor, m, less the range of the reference plane.
-    - `weight`: geometric weight of the path.
+    - `weight`: geometric weight of the path; where optics are applied, that since the last scattering.
     - `history`: number of the scattering history; or of the entry node (see `jaxlidar.trace.tally_index`).
     - `surface`: number of the surface from which the photon starts, or -1.
     - `last_scattering`: None where no derivatives are taken.
     - `alive`: False for photons that were recorded to their end.
-    - `optical_weights`: for each wavelength, the product of optics along the path, where optics are applied
-      while light is traced; otherwise empty.
+    - `optical_weights`: for each wavelength, the product of optics along the path and of geometric weights up
+      to the last scattering, where optics are applied while light is traced; otherwise empty.
     - `entry`: x and y of where light entered the scene, m, where shots share it; otherwise None.
     - `score`: derivatives of the log path probability (see `jaxlidar.trace.score_functions`), or None.
     """

@@ -43,9 +43,13 @@ class TallyIndex(eqx.Module):
         if isinstance(channel, int):
             if channel < 0:
                 return self
-            return self._multiplied(scene.optics[channel])
+            return self._multiplied_by(scene.optics[channel])
         factors = [jnp.where(channel >= 0, o[jnp.maximum(channel, 0)], 1.0) for o in scene.optics.T]
-        return self._multiplied(factors)
+        return self._multiplied_by(factors)
+
+    def times(self, weight: Scalar) -> "TallyIndex":
+        """Return the index with optical weights that are multiplied by `weight`."""
+        return self._multiplied_by([weight for _ in self.optical_weights])
 
     def after_where(
         self, where: Bool[Array, "*photons"], scene: DeviceScene, channel: Int[Array, "*photons"] | int
@@ -59,7 +63,7 @@ class TallyIndex(eqx.Module):
         )
         return TallyIndex(number, weights, self.entry)
 
-    def _multiplied(self, factors: Iterable[Array]) -> "TallyIndex":
+    def _multiplied_by(self, factors: Iterable[Array]) -> "TallyIndex":
         weights = tuple(weight * factor for weight, factor in zip(self.optical_weights, factors))
         return TallyIndex(self.number, weights, self.entry)
 

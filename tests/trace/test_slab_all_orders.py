@@ -14,6 +14,7 @@ import sys
 import warnings
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -57,6 +58,49 @@ def test_isotropic_scattering(shared, tau):
     exact = float(row["nadir_BRF"])
     assert -3 * stderr - neglected < value - exact < 3 * stderr
     assert value == pytest.approx(exact, rel=5e-3)
+
+
+SHARED_SLABS = (0.1, 1.0, 2.0, 5.0, 50.0)
+
+
+def default_sum(leaf, tau, ground, **arguments):
+    """Return the mean sum of four waveforms that `simulate` plans, its standard error, and one of them."""
+    voxels = jl.VoxelMap.from_extinction(leaf=np.full((1, 1, 4), tau / THICKNESS), voxel_size=THICKNESS / 4)
+    canopy = jl.Canopy(voxels, leaf=leaf, sides="periodic", hotspot=False)
+    scene = jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=ground))
+    lidar = jl.Lidar(altitude=4e5, divergence=1e-3)
+    waves = [jl.simulate(lidar, scene, key=jax.random.key(n), **arguments) for n in range(4)]
+    sums = [float(wave.reflectance.sum()) for wave in waves]
+    return np.mean(sums), np.std(sums, ddof=1) / 2.0, waves[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("tau", SHARED_SLABS)
+def test_the_default_plan_follows_all_orders_that_matter(shared, tau):
+    with (shared / "reference" / "slabs_isotropic.csv").open() as file:
+        (row,) = [r for r in csv.DictReader(file) if float(r["tau"]) == tau]
+    leaf = jl.Isotropic(albedo=float(row["omega"]))
+    value, stderr, _ = default_sum(leaf, tau, float(row["rho_ground"]))
+    exact = float(row["nadir_BRF"])
+    assert abs(value - exact) < 4 * stderr + 2e-3 * exact
+    assert value == pytest.approx(exact, rel=5e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("leaf", "ground", "exact"),
+    [
+        (jl.Isotropic(albedo=0.999), 0.2, lambda: discrete_ordinates([1.0] + [0.0] * 63, 0.999, 10.0, 0.2)),
+        (jl.Isotropic(albedo=1.0), 0.2, lambda: discrete_ordinates([1.0] + [0.0] * 63, 1 - 1e-9, 10.0, 0.2)),
+        (jl.LeafOptics(0.49, 0.49), 0.9, lambda: ross_brf(0.49, 0.49, 10.0, 0.9)),
+    ],
+)
+def test_hundreds_of_orders_are_followed_by_default(leaf, ground, exact):
+    """Deep canopies that absorb next to nothing: histories alone leave out 3, 6 and 9 % of the light."""
+    value, stderr, wave = default_sum(leaf, 10.0, ground, rtol=0.02)
+    assert abs(value - exact()) < 4 * stderr + 2e-3 * exact()
+    assert value == pytest.approx(exact(), rel=5e-3)
+    assert float(wave.neglected[0]) < 2e-3 * value
 
 
 def discrete_ordinates(moments, albedo, tau, ground):
