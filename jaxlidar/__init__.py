@@ -57,8 +57,8 @@ waveforms is in the package `inversion`.
 
 ## Warnings and constants
 
-`LateLightWarning`, `UnfollowedLightWarning`, `LostWorkersWarning`, `OffMapWarning`, `UnitWarning`,
-`SPEED_OF_LIGHT`.
+`LateLightWarning`, `UnfollowedLightWarning`, `MisplacedCanopyWarning`, `LostWorkersWarning`, `OffMapWarning`,
+`UnitWarning`, `SPEED_OF_LIGHT`.
 
 ## Packages of their own
 
@@ -112,6 +112,7 @@ from jaxlidar.plants.turtle import turtle
 from jaxlidar.plants.voxelise import trim_empty_layers, voxelise, voxelise_points
 from jaxlidar.scenes.atmosphere import Atmosphere
 from jaxlidar.scenes.canopy import Canopy
+from jaxlidar.scenes.relative_height import MisplacedCanopyWarning
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.scene_parts import SceneParts
 from jaxlidar.scenes.shapes import AbstractShape, Plane
@@ -240,6 +241,7 @@ __all__ = [
     # Warnings and constants.
     "LateLightWarning",
     "UnfollowedLightWarning",
+    "MisplacedCanopyWarning",
     "LostWorkersWarning",
     "OffMapWarning",
     "UnitWarning",

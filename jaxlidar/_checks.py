@@ -386,14 +386,21 @@ def warn_unit(field: str, x: object) -> None:
             hint = f"Is it given in {likely_unit}? {value:g} {likely_unit} is {value * factor:g} {unit}"
             break
     message = f"{field} = {value:g} {unit} is absurdly {size}. {hint}"
-    # The warning points to the innermost line outside of the project and of the packages that call it back.
+    warn_user(message, UnitWarning)
+
+
+def warn_user(message: str, category: type[Warning]) -> None:
+    """Warn at the innermost line outside of the project and of the packages that call it back.
+
+    No warning is given where `dataclasses.replace` within the project copies an object that the user was
+    warned of already.
+    """
     frame, level = sys._getframe(), 1
     while frame.f_back is not None and _top_package(frame) in _INTERNAL_PACKAGES:
         if _top_package(frame) == "dataclasses" and _top_package(frame.f_back) in _PROJECT_PACKAGES:
-            # `dataclasses.replace` within the project copies an object that the user was warned of already.
             return
         frame, level = frame.f_back, level + 1
-    warnings.warn(message, UnitWarning, stacklevel=level)
+    warnings.warn(message, category, stacklevel=level)
 
 
 def _top_package(frame: FrameType) -> str:

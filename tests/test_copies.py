@@ -45,6 +45,7 @@ INSTANCES = {
     "jaxlidar.LSystem": jl.LSystem([("A", 0.1)], [jl.Rule("A", grown)]),
     "jaxlidar.Lambertian": jl.Lambertian(),
     "jaxlidar.LateLightWarning": jl.LateLightWarning("late"),
+    "jaxlidar.MisplacedCanopyWarning": jl.MisplacedCanopyWarning("below"),
     "jaxlidar.UnfollowedLightWarning": jl.UnfollowedLightWarning("beyond"),
     "jaxlidar.LostWorkersWarning": jl.LostWorkersWarning("lost"),
     "jaxlidar.OffMapWarning": jl.OffMapWarning("off"),

@@ -216,7 +216,8 @@ def without_effects(lidar: Lidar, scene: Scene, off: tuple[str, ...]) -> tuple[L
         ground = _level_ground(ground, lidar)
     if air is not None and "atmospheric backscatter" in off:
         air = dataclasses.replace(air, lidar_ratio=None)
-    return lidar, Scene(
+    return lidar, dataclasses.replace(
+        scene,
         canopy=canopy,
         plates=() if "plates" in off else scene.plates,
         ground=None if "ground" in off else ground,

@@ -146,8 +146,8 @@ def choose_orders(
     n_plates, fraction, albedo = len(scene.plates), repeated_fraction(scene, optics), largest_albedo(optics)
     affordable = 2
     while affordable < MAX_ORDERS_OF_HISTORIES:
-        histories = math.comb(max_degree(affordable + 1, n_plates) + n_channels, n_channels)
-        if histories > MAX_HISTORIES:
+        n_histories = math.comb(max_degree(affordable + 1, n_plates) + n_channels, n_channels)
+        if n_histories > MAX_HISTORIES:
             break
         affordable += 1
     if max_orders is None:

@@ -486,8 +486,8 @@ def _possible_histories(
         if histories or not few_wavelengths:
             raise ValueError(
                 f"max_orders = {max_orders} with scattering histories, of materials that reflect and "
-                f"transmit; admissible are at most {MAX_ORDERS_OF_HISTORIES}, or histories = False and at most "
-                f"{MAX_APPLIED_WAVELENGTHS} wavelengths"
+                f"transmit; admissible are at most {MAX_ORDERS_OF_HISTORIES}, or histories = False and at "
+                f"most {MAX_APPLIED_WAVELENGTHS} wavelengths"
             )
         return False
     return histories if few_wavelengths else True

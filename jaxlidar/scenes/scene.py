@@ -16,6 +16,7 @@ from jaxlidar._vectors import FAR
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.scenes.atmosphere import Atmosphere
 from jaxlidar.scenes.canopy import Canopy
+from jaxlidar.scenes.relative_height import check_relative_height
 from jaxlidar.scenes.shapes import Plane
 from jaxlidar.scenes.surfaces import AbstractGround, AbstractSheet, AbstractSurface
 from jaxlidar.scenes.terrain import Terrain
@@ -45,7 +46,10 @@ class Scene(eqx.Module):
     - `atmosphere`: an `Atmosphere`, or None. Default None.
 
     **Raises:** TypeError for an argument of the wrong type; ValueError for a plate in the plane of the
-    ground or of another plate, and for a canopy with periodic sides over terrain of another period.
+    ground or of another plate, for a canopy with periodic sides over terrain of another period, and for one
+    that lies below the terrain as a whole.
+
+    **Warns:** `MisplacedCanopyWarning` for plants below the terrain, or far above it.
 
     **Example:**
 
@@ -74,6 +78,7 @@ class Scene(eqx.Module):
         check_kind("plates", self.plates, tuple, "a tuple, as in (plate,)")
         if self.canopy is not None and isinstance(self.ground, Terrain):
             check_periods(self.canopy, self.ground)
+            check_relative_height(self.canopy, self.ground)
         for plate in self.plates:
             if not isinstance(plate, AbstractSheet):
                 raise TypeError(f"plates has {kind_of(plate)}; admissible is a tuple of Plate")
