@@ -1,9 +1,10 @@
 """Counts of how the source reads: vague names, riddling docstrings, comments, class names.
 
 A vague name is one that says nothing of its value: it has one or two words, all of them in `VAGUE_WORDS`
-(`found`, `the_rest`, `_kept`). Docstrings say what a function does or returns, and do not open with a
-question word. Comments count where they have a line of their own, against the lines that have code
-(docstrings are neither). The counts are a floor: a source that passes can still be hard to read.
+(`found`, `_kept`, `far_left`). Names such as `__all__`, which Python prescribes, do not count. Docstrings say
+what a function does or returns, and do not open with a question word. Comments count where they have a line
+of their own, against the lines that have code (docstrings are neither). The counts are a floor: a source that
+passes can still be hard to read.
 """
 
 import ast
@@ -48,7 +49,12 @@ def defined_names(tree: ast.AST) -> Iterator[tuple[str, int]]:
 
 
 def is_vague(name: str) -> bool:
-    """True if a name has one or two words and all are vague; underscores at its ends do not count."""
+    """True if a name has one or two words and all are vague; underscores at its ends do not count.
+
+    Names of the form `__name__` are Python's and not vague.
+    """
+    if name.startswith("__") and name.endswith("__"):
+        return False
     words = [word for word in name.lower().split("_") if word]
     return 1 <= len(words) <= 2 and VAGUE_WORDS.issuperset(words)
 
@@ -172,6 +178,8 @@ def test_vague_names_are_counted():
     assert is_vague("Known")
     assert not is_vague("known_values")
     assert not is_vague("_")
+    assert not is_vague("__all__")
+    assert is_vague("__all")
 
 
 def test_question_words_are_counted():

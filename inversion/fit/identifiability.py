@@ -233,6 +233,7 @@ class Profile(eqx.Module):
         check_range("level", level, 0.0, 1.0, low_open=True, high_open=True)
         # Chi-squared of one degree of freedom is the square of a normal number.
         limit = float(jax.scipy.special.ndtri(0.5 * (1.0 + level)))
+        # Near its minimum chi-squared is a parabola, and its root linear in the unknown.
         root, best = np.sqrt(self.chi2), int(np.argmin(self.chi2))
 
         def end(points: range) -> float:
@@ -332,6 +333,8 @@ def profile_likelihood(
                 started = [_started_from(u, b, neighbour) for u, b in zip(free_unknowns, bound_unknowns)]
                 bound_unknowns = bind_unknowns(started, scene_at_point)
             problem_at_point = dataclasses.replace(problem, scene=scene_at_point, unknowns=bound_unknowns)
+            # The same photons at all values: the noise of the simulation is no part of differences in
+            # chi-squared.
             neighbour = solve_problem(problem_at_point, plan, key, throw=options["throw"])
             fits[i] = neighbour
             if progress is not None:

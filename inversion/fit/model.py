@@ -110,6 +110,7 @@ def choose_jacobian_methods(
         return JacobianMethods(as_tangents, 0, 0.0)
     n_voxels = int(np.prod(canopy.voxels.shape))
     size = scored_bytes(plan.config, plan.bins, cells=n_voxels, columns=columns, wavelengths=wavelengths)
+    # The other half is for the response and for tangents of the geometric unknowns.
     if size > 0.5 * memory_limit(plan.scope.max_memory):
         return JacobianMethods(as_tangents, 0, 0.0)
     return JacobianMethods(setters, max_columns_per_voxel(scene, unknowns), size)
@@ -126,6 +127,7 @@ def max_columns_per_voxel(scene: Scene, unknowns: Sequence[BoundUnknown]) -> int
     columns = sum(unknowns[i].start.size for i in scored)
     if columns <= DENSE_COLUMNS:
         return columns
+    # A fixed seed: the count decides which program is compiled, and must not differ between equal fits.
     setters, random = tuple(u.setter for u in unknowns), np.random.default_rng(0)
     points = [tuple(u.start for u in unknowns)]
     for _ in range(N_PROBES):
@@ -255,6 +257,8 @@ def _trace_batch(
     flat, setup_at = model.as_function_of("geometric", values)
     # Optical columns are left out: they are computed later from the mean response of all batches.
 
+    # The response is an auxiliary output: its tangents, with all histories, would take far more memory than
+    # those of the total.
     def simulate(flat: Array) -> tuple[Array, tuple[Response, Array | None]]:
         setup = setup_at(flat)
         if slopes is None:
@@ -344,6 +348,7 @@ def evaluate_scene(
     # Under jit the batch is traced by JAX once for shapes and loop alike.
     trace_batch = jax.jit(lambda key: _trace_batch(model, values, key, slopes))
 
+    # One batch after the other: batches side by side would multiply the memory that the plan was made for.
     def add_batch(n: Array, sums: Any) -> Any:
         response, total, columns = trace_batch(keys[n])
         summed, totals = sums

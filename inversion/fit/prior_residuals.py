@@ -137,6 +137,7 @@ class PriorResiduals:
                 trial = np.where(np.arange(strengths.size) == i, np.exp(log_strength), strengths)
                 return self._evidence_deviance(values, information, gradient, trial)
 
+            # In logarithms: a strength is positive, and its plausible range spans orders of magnitude.
             interval = process.strength * np.array([1.0 / _MAX_FACTOR, _MAX_FACTOR])
             interval = np.log(np.clip(interval, *process.strength_range))
             minimum: Any = optimize.minimize_scalar(deviance, bounds=interval, method="bounded")

@@ -423,6 +423,7 @@ def run_fits(problem: ManyFits, key: PRNGKeyArray, indices: Sequence[int]) -> It
         observed, lidar = problem.observed[i], _item(problem.lidars, i)
         recorder = _item(problem.recorders, i)
         recorder_model = RecorderModel(recorder, problem.scale, lidar, observed.time.size)
+        # It determines the starting points alone, which do not depend on the chunk or on earlier runs.
         fit_key = jax.random.fold_in(key, problem.numbers[i])
         unknowns = _item(problem.unknowns, i)
         return multistart(fits_from_starts(observed, unknowns, recorder_model, problem.settings, fit_key))
@@ -433,6 +434,8 @@ def run_fits(problem: ManyFits, key: PRNGKeyArray, indices: Sequence[int]) -> It
     # The fits that run at present, with the request that each waits for.
     waiting, running = list(indices), dict[int, tuple[FitGenerator, EvaluationRequest]]()
     while waiting or running:
+        # A fit that has ended makes room at once: in groups of fits that begin and end together, most members
+        # would be idle until the slowest fit has ended.
         while waiting and len(running) < problem.groups.n_fits:
             i = waiting.pop(0)
             fit = fit_of(i)

@@ -187,11 +187,14 @@ def bounded_step(
     information = scaled.T @ scaled
     # Normal equations: there are far more samples than unknowns. Their Cholesky root R has R^T R =
     # information, so that |R^T step - b| is the same problem with as many rows as unknowns.
+    # The floor lets the decomposition succeed for a Jacobian of zeros: then the step is zero.
     information += _RIDGE * max(np.trace(information), 1e-300) * np.eye(width.size)
     root = np.linalg.cholesky(information)
     target = linalg.solve_triangular(root, -scaled.T @ residual, lower=True)
+    # An active-set method ends with values exactly at their bounds; interior methods only come near them.
     bounds = (low / width, high / width)
     step = optimize.lsq_linear(root.T, target, bounds=bounds, method="bvls").x * width
+    # Of the problem itself, without the ridge.
     decrease = residual @ residual - np.sum((residual + jacobian @ step) ** 2)
     return step, float(np.sqrt(max(decrease, 0.0)))
 
@@ -320,6 +323,8 @@ class LeastSquaresFit:
                 status = self._status("failed: the simulated waveform is not finite")
                 return self._completed(best, False, status)
         best, converged, status = yield from self._minimise(best)
+        # If all unknowns are optical, steps apply optics to the mean response alone. Weights and covariances
+        # need the batches: they are evaluated from the same photons, which does not count as a simulation.
         if converged and best.evaluation.batches is None:
             best = yield from self.simulate(best.z, with_batches=True)
         weights_changed = converged and self.update_weights(best) > _MAX_WEIGHT_CHANGE
@@ -408,6 +413,8 @@ class LeastSquaresFit:
                 return best, False, self._status(status)
             if self._is_exhausted:
                 return best, False, self._status("not converged: stopped at max_steps")
+            # Cut within the solver's state: the solver predicts the fall of the cost from the trial itself,
+            # and so judges the shorter step by the right number.
             step = jnp.clip(state.y_eval - y, -_MAX_FREE_STEP, _MAX_FREE_STEP)
             state = eqx.tree_at(lambda s: s.y_eval, state, y + step)
             trial = yield from self.simulate(np.asarray(state.y_eval, float))
@@ -431,6 +438,8 @@ class LeastSquaresFit:
             while not accepted:
                 if self._has_converged(length, n_rejected):
                     return best, True, self._status("converged")
+                # A step that promises more than the noise of the simulation explains, while not even a tiny
+                # part of it improves the fit, is no sign of a minimum: the Jacobian is wrong.
                 if n_rejected > self._stall_limits[-1][0]:
                     return best, False, self._status("failed: no step improves the fit")
                 if self._is_exhausted:
@@ -580,6 +589,7 @@ class LeastSquaresFit:
             return stderr, float(iterate.difference.size)
         difference, is_undetermined = iterate.difference, estimate.is_undetermined
         signal = (difference + self.observed.reflectance[self.is_fitted]) / self.noise.sigma
+        # Degrees of freedom for signal: the trace of the averaging kernel (Rodgers 2000).
         n_determined = float(np.sum(1.0 - estimate.prior_fraction[~is_undetermined]))
         misfit = residual_covariance(
             self.noise.whiten(difference),
@@ -591,6 +601,7 @@ class LeastSquaresFit:
         )
         inverse = estimate.inverse_information
         variance = np.diag(inverse @ (misfit.meat + precision) @ inverse)
+        # Never below the stated errors: that residuals happen to be small is no evidence of less noise.
         robust = np.where(is_undetermined, np.inf, np.maximum(stderr, np.sqrt(variance)))
         return robust, misfit.effective_samples
 
@@ -648,6 +659,7 @@ def multistart(fits: Sequence[LeastSquaresFit]) -> FitGenerator:
         return best
     other_minima = [fit for fit in completed if fit.record.converged and fit is not best]
     second_minimum, robust_stderr = compare_minima(best, other_minima)
+    # Within one unit of chi-squared: fits stop at slightly different points of one minimum.
     n_same = sum(f.record.converged and f.details.cost < best.details.cost + 1.0 for f in completed)
     record = dataclasses.replace(
         best.record,

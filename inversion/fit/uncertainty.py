@@ -110,6 +110,7 @@ def estimate_covariance(
     # Unknowns with less information than a flat prior over their bounds. Columns of a correlating prior
     # already have unit variance.
     is_mixed = np.any(basis != np.diag(np.diag(basis)), axis=0)
+    # A prior as wide as the bounds has the information one, but for rounding, and counts as determined.
     undetermined = np.diag(information) * np.where(is_mixed, 1.0, width) ** 2 < 1.0 - 1e-6
     prior_information = np.diag(precision)
     marginal_fraction = prior_information / np.where(
@@ -129,6 +130,7 @@ def estimate_covariance(
         / np.outer(norm, norm)
     )
     inverse = basis @ inverse @ basis.T
+    # The inverse lacks undetermined combinations: of their unknowns, information without correlations counts.
     prior_fraction = np.where(undetermined, marginal_fraction, np.diag(inverse @ precision))
     meat = (jacobian.T * measurement_fraction) @ jacobian + precision
     covariance = inverse @ meat @ inverse
@@ -138,6 +140,7 @@ def estimate_covariance(
         shifts = deviations @ jacobian @ inverse
         simulation = shifts.T @ shifts / (len(shifts) * (len(shifts) - 1))
     covariance = covariance + simulation
+    # Again, with the noise of the simulation and the covariance of determined combinations.
     undetermined |= np.diag(covariance) > width**2
     covariance[undetermined, :] = 0.0
     covariance[:, undetermined] = 0.0
@@ -174,6 +177,8 @@ def newton_decrement(jacobian: Float[np.ndarray, "data n"], residual: Float[np.n
     is_sensitive = norm > 0
     if not np.any(is_sensitive):
         return 0.0
+    # Along a direction with a tiny singular value, the predicted fall in chi-squared would take a step far
+    # beyond the range in which the simulation is linear: it does not count.
     scaled = jacobian[:, is_sensitive] / norm[is_sensitive]
     basis, singular_value, _ = np.linalg.svd(scaled, full_matrices=False)
     return float(np.linalg.norm(basis[:, singular_value > _MIN_SINGULAR_VALUE].T @ residual))
@@ -240,6 +245,8 @@ def residual_covariance(
     phi, k2 = (a.ravel() for a in np.meshgrid(_PHI_GRID, _K2_GRID, indexing="ij"))
     order = _sample_order(index)
     product, log_determinant = _whitened_products(columns, relative_signal, k2, phi, order)
+    # The last column is r. Its diagonal element is what is left of r once all columns of J are projected out;
+    # the elements before it are those of the information on the unknowns.
     root = np.linalg.cholesky(product + prior_information)
     diagonal = np.diagonal(root, axis1=1, axis2=2)
     a2 = (diagonal[:, -1] * norm[-1]) ** 2 / freedom
@@ -300,7 +307,8 @@ def _whitened_products(
     n_wavelengths = len(order.visits[0])
     mean, variance = np.zeros((n_wavelengths, n_columns, n_grid)), np.ones((n_wavelengths, n_grid))
     for visit in order.visits:
-        # Prediction.
+        # Prediction: variance = decay^2 variance + (1 - decay^2), as the stationary one is 1. The decay
+        # before the first sample of a wavelength is zero: the state starts from its stationary distribution.
         decay = order.correlation_with_previous(visit, phi)
         mean = decay[:, None] * mean[: len(visit)]
         variance = 1.0 - decay**2 * (1.0 - variance[: len(visit)])

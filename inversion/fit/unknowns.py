@@ -206,7 +206,8 @@ def bind_unknowns(unknowns: Sequence[Unknown], scene: Scene) -> list[BoundUnknow
     for name in names:
         if names.count(name) > 1:
             raise ValueError(f"name = {name!r} is given to {names.count(name)} unknowns; each needs its own")
-    # Two values for one array: the second would overwrite the first.
+    # Two values for one array: the second would overwrite the first. Not so with `apply`, which may scale
+    # what another unknown has set.
     indices = [u.setter.leaf_index for u in bound if u.setter.leaf_index is not None]
     for u in bound:
         if u.setter.leaf_index is not None and indices.count(u.setter.leaf_index) > 1:
@@ -359,6 +360,7 @@ def optical_arrays(scene: Scene) -> frozenset[int]:
 
 def extinction_arrays(scene: Scene) -> frozenset[int]:
     """Return the indices of the scene's pytree leaves that change the extinction of leaf or bark only."""
+    # Not the leaf angles of a map: they determine the directions into which leaves scatter as well.
     leaves = jax.tree_util.tree_leaves_with_path(scene)
     paths = [[getattr(key, "name", None) for key in path] for path, _ in leaves]
     extinction_paths = (["canopy", "voxels", "leaf"], ["canopy", "voxels", "bark"])

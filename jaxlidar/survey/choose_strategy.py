@@ -27,7 +27,8 @@ _PARALLEL_LIGHT, _GRID, _FINEST_GRID = 0.5, 0.2, 0.5
 # Where responses are tallied by shot, the grid serves only absorption and escape: its error may be as large
 # as this.
 _GRID_BY_SHOT = 0.01
-# Coefficients below this fraction of the tolerance, of the largest, do not count.
+# Coefficients below this fraction of the tolerance, of the largest, do not count. They lie at the rim of the
+# footprint; without them its energy changes by less than 0.1 % where the tolerance is 10 %.
 _FAINT = 0.01
 # A batch of a shot traced alone has so many times the photons and the rays of a footprint that shares light,
 # for which batches are many and small. A ray costs about as much as a photon, and even half the rays add
@@ -147,6 +148,8 @@ def _groups(
 ) -> list[NodeGroup]:
     """Return groups of nodes with as many photons as make batches of a footprint of the size aimed at."""
     plan = setup.plan
+    # The sum of the coefficients of a mean footprint, over the largest one. A node with `light` one gets the
+    # photons of a batch divided by this sum, so that all nodes of a footprint together have at least a batch.
     light_per_footprint = float(nodes.light.sum()) * nodes.overlap / len(splines.first_node)
     photons = plan.n_photons / fewer_photons / light_per_footprint if plan.orders > 1 else 0.0
     return make_groups(splines, nodes, photons, plan.n_rays / _FEWER_RAYS / light_per_footprint)
@@ -157,6 +160,7 @@ def reason_against_sharing(survey: Survey, setup: Setup, rtol: float) -> str | N
     canopy, lidar = setup.scene.canopy, setup.lidar
     if not beams_are_parallel(survey):
         return "shots have more than one direction"
+    # Such shots share higher orders alone; their first order has rays of its own in either strategy.
     if _is_by_shot(survey) and setup.plan.orders == 1:
         return "one order is followed, which oblique shots and shots with a field of view do not share"
     if not setup.plan.is_random:

@@ -89,6 +89,7 @@ def waveforms_on_disk(
     empty = jax.tree.map(lambda a: unwritten_rows(len(strategy.survey), a), first[1]._asdict())
     layout = _waveforms(strategy, {**survey_fields, **empty}, start_time, problem=problem)
     with by_rows(layout, path, case) as rows:
+        # One block of results is in memory at a time, whatever the number of shots.
         for shots, results in itertools.chain([first], blocks):
             fields = {name: a[shots] for name, a in survey_fields.items()}
             rows.add(shots, {**fields, **results._asdict()})

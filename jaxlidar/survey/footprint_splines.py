@@ -86,6 +86,7 @@ def fit_footprints(survey: Survey, tolerance: float) -> FootprintSplines:
     # error.
     beam, sample = section_of(survey), survey.position[:: max(len(survey) // 8, 1)]
     spacing = beam.radius
+    # Where no candidate meets the tolerance, the finest one is used: the caller judges its error.
     for candidate in _SPACINGS:
         spacing = beam.radius * candidate
         if max(spline_error(position, beam, spacing) for position in sample) <= tolerance:
@@ -125,6 +126,7 @@ def _misplaced_by_cell(
     basis = _basis(nodes)
     fitted = basis @ coefficients @ basis.T / spacing**2
     cells = irradiance.shape[1] // _FINE
+    # Points lie between nodes, so that their blocks of _FINE x _FINE are the cells.
     error = (fitted - irradiance).reshape(-1, cells, _FINE, cells, _FINE)
     net, absolute = np.abs(error.sum(axis=(2, 4))), np.abs(error).sum(axis=(2, 4))
     # Energy that is moved within a cell is missing at one point and in excess at another: half of it counts.
@@ -183,7 +185,8 @@ def _irradiance(
     """Return the irradiance on the reference plane, 1/m2, at positions relative to the beam's axis, m."""
     x, y = x[:, :, None], y[:, None, :]
     w2, cosine = beam.radius**2, -beam.axis[2]
-    # Squared distance from the axis, across the beam, over the squared radius.
+    # Squared distance from the axis, across the beam, over the squared radius. An oblique beam lights an area
+    # of the plane that is larger by 1 / cosine: hence the cosine in the irradiance.
     r2 = (x**2 + y**2 - (x * beam.axis[0] + y * beam.axis[1]) ** 2) / w2
     if beam.gaussian:
         return 2.0 * cosine / (np.pi * w2) * np.exp(-2.0 * r2)

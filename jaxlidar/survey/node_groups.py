@@ -89,6 +89,7 @@ def illuminated_nodes(splines: FootprintSplines, threshold: float) -> Illuminate
         block_keys, block_light = _largest_by_key(key[counts], light[counts])
         keys.append(block_keys)
         lights.append(block_light)
+    # Without overlap, each node has light of one footprint alone, the largest one: the quotient is 1.
     node_key, node_light = _largest_by_key(np.concatenate(keys), np.concatenate(lights))
     index = np.stack(np.divmod(node_key, span[1]), axis=-1) + lowest
     return IlluminatedNodes(index, node_light, total_light / float(node_light.sum()))
@@ -115,6 +116,7 @@ def make_groups(
     largest_light = max(_MAX_PHOTONS / max(photons, 16 * rays), 1.0)
     members = _halve(nodes, np.arange(len(nodes.light)), largest_light)
     size = size_bucket(max(len(group) for group in members), 4)
+    # The brightest group determines the shape; darker ones get as many photons, and need fewer batches.
     light = max(float(nodes.light[group].sum()) for group in members)
     n_photons, n_ray_groups = (
         size_bucket(max(int(np.ceil(light * per_light)), size), 4) if per_light else 0
@@ -175,6 +177,7 @@ def _allocate(light: Float[np.ndarray, " nodes"], total: int) -> NodeAllocation:
     """Allocate `total` photons to nodes in proportion to their light, and one to each at least."""
     if total == 0:
         return NodeAllocation(np.zeros(0, int), np.zeros(0, int), np.zeros(0))
+    # A node without photons would lose its light, and footprints that use it would be too dark on average.
     surplus = total - len(light)
     count = 1 + np.floor(surplus * light / light.sum()).astype(int)
     # What was lost by rounding down goes to the brightest.
@@ -189,6 +192,7 @@ def _have_centre(
     splines: FootprintSplines, shots: Int[np.ndarray, " shots"], index: Int[np.ndarray, "nodes 2"]
 ) -> Bool[np.ndarray, " shots"]:
     """Return True for shots whose central node is among the nodes."""
+    # A footprint is brightest there, so that the node is illuminated and belongs to exactly one group.
     centre = splines.first_node[shots] + splines.coefficients.shape[1] // 2
     return np.any(np.all(centre[:, None, :] == index[None, :, :], axis=2), axis=1)
 

@@ -176,6 +176,7 @@ def make_group_context(setup: Setup, spacing: float, view_geometry: ViewGeometry
         # Paths are timed from their own entry. For a shot whose axis is beside it, an oblique path may be
         # later.
         plan = plan.with_limits(max_path=plan.limits.max_path + view_geometry.extra_path)
+        # Rays are traced for each shot alone, while photons are shared: with few rays a batch costs little.
         plan = plan.with_config(n_rays=max(plan.n_rays // 4, _MIN_RAYS))
     scene = build_device_scene(dataclasses.replace(setup, plan=plan), derivatives="none")
     return GroupContext(scene, without_air, model.air_return, spacing, view_geometry)
@@ -255,6 +256,7 @@ def _group_moments(
     """
     scene = _group_scene(scene, model, light)
 
+    # A batch has the same random numbers in whichever round it is traced.
     def trace_batch(number: Array) -> BatchSums:
         return _trace_batch(scene, light.nodes, model, jax.random.fold_in(key, first + number))
 
@@ -275,6 +277,8 @@ compiled_group_moments = Program(_group_moments, **ONE_CORE)
 
 def _group_scene(scene: DeviceScene, model: WaveformModel, light: GroupLight) -> DeviceScene:
     """Return the device scene of a group: at its aim point, with parallel light, and with optics."""
+    # Coordinates are relative to the aim point of each group, so that single precision resolves them equally
+    # well all over a large survey.
     lidar = model.lidar
     scene = aim_at(scene, lidar, light.aim - lidar.position)
     beam = parallel_beam(lidar)
@@ -313,6 +317,7 @@ class ErrorTarget(NamedTuple):
 
     def worst_error(self, moments: RunningMoments) -> float:
         """Return the largest relative error of a shot, over the square root of its variance fraction."""
+        # The mean and the excess are estimated separately: where little returns, their sum may be negative.
         mean = np.maximum(_sum_over_traced(self.coefficients, moments.mean[0]) + self.first_order_excess, 0.0)
         stderr = np.sqrt(_variance_of_sums(self.coefficients, moments.squares[0], moments.count))
         # The error relative to the group's fraction is that times s relative to the complete waveform.
@@ -329,6 +334,7 @@ def _error_target(
 ) -> ErrorTarget:
     """Return the shots that decide on the number of batches, and their errors."""
     fraction = group.coefficients.sum(axis=1)
+    # The light and the error of the other shots are added all the same; they only do not cause more batches.
     counts = fraction > _NEGLIGIBLE_FRACTION
     fraction, has_centre = fraction[counts], group.has_centre[counts]
     if light.shot_views is None:
@@ -336,6 +342,8 @@ def _error_target(
     first = _compiled_first_order_samples(context.scene, context.model, light, key)
     # A shot's first order is traced, all of it, in the group that has its centre.
     excess = (fraction - has_centre)[:, None, None] * np.asarray(first)[: len(group.shots)][counts]
+    # Over all groups these fractions add up to 1: a shot has its centre in one of them, and its light in all.
+    # The group with the centre has a larger one, as it alone traces the first order.
     variance = _FIRST_ORDER_VARIANCE * has_centre + (1.0 - _FIRST_ORDER_VARIANCE) * fraction
     return ErrorTarget(coefficients[counts], fraction, variance, excess)
 
@@ -384,6 +392,7 @@ def trace_group(
     light = GroupLight(_nodes(group, context.spacing), shot_views, jnp.asarray(group.aim, float))
 
     def trace(numbers: range) -> RunningMoments:
+        # As arrays, since Python numbers are static: each round would compile a program of its own.
         first, count = jnp.asarray(numbers.start, jnp.int32), jnp.asarray(len(numbers), jnp.int32)
         moments = compiled_group_moments(context.scene, context.model, light, key, first, count)
         # Sums over nodes are made on the host: their shapes differ between groups, and would be compiled
@@ -472,6 +481,7 @@ def _complete_shot(
     """Return the results of one shot. `air`: what the air itself returns, order one."""
     by_component = dict(zip(model.materials, sums.lines))
     reflectance, first = jnp.sum(sums.lines[:-1], axis=0), sums.lines[-1]
+    # Higher orders have no samples of their own: only sums of all orders are kept by material.
     by_component |= {"first": first, "higher": reflectance - first}
     if air is not None:
         by_component |= {"air": air, "first": first + air}
@@ -513,7 +523,9 @@ def _variance_of_sums(coefficients: ShotCoefficients, squares: Any, count: int) 
     c^4, the number of nodes that take part (Satterthwaite 1946, Biometrics Bull. 2, 110, for equal
     variances).
     """
+    # Elementwise, for NumPy's arrays and for SciPy's sparse arrays alike (its matrices would multiply).
     weight = coefficients * coefficients
+    # Fourth powers of faint coefficients underflow; at least one node takes part.
     nodes = weight.sum(axis=1) ** 2 / np.maximum((weight * weight).sum(axis=1), 1e-30)
     freedom = (count - 1.0) * np.maximum(nodes, 1.0)
     scale = student_widening(1.0 + freedom) ** 2 / (count * (count - 1.0))

@@ -81,7 +81,8 @@ def tiles_of(survey: Survey, scene: SceneParts, margin: float = 0.0) -> list[Sce
     corner = scene.tile * np.floor(ends.mean(axis=0) / scene.tile)
     overhang = np.maximum(corner - ends.min(axis=0), ends.max(axis=0) - corner - scene.tile) + radius
     step = scene.tile / _STEPS
-    # Multiples of a step: the corners of rectangles depend on the survey in steps only.
+    # One extension for all tiles, the largest of any shot, as parts must have one shape to share compiled
+    # programs. It is a multiple of a step, so that similar surveys ask for the same rectangles.
     extension = step * np.ceil(max(float(overhang.max()) + margin, 0.0) / step)
     corners, tile_of_shot = np.unique(corner, axis=0, return_inverse=True)
     shots = [np.flatnonzero(tile_of_shot.reshape(-1) == n) for n in range(len(corners))]
@@ -163,7 +164,8 @@ class TiledSceneStrategy(AbstractStrategy):
 
         tiles = tiles_of(survey, scene, margin)
         beside_map, heights, digests, shared_by_tile = np.zeros(len(survey)), np.zeros(len(survey)), [], []
-        # Dicts without values: sets that keep their order.
+        # Parts may differ in their materials, but the results of a survey have one set of names. Dicts
+        # without values are sets that keep their order.
         materials: dict[str, None] = {}
         surfaces: dict[str, None] = {}
         first_strategy = None
@@ -197,6 +199,7 @@ class TiledSceneStrategy(AbstractStrategy):
         )
 
     def tasks(self, key: PRNGKeyArray) -> list[WorkUnit]:
+        # Tasks get the function that returns parts, not the parts: all of them would fill the memory.
         arguments = [(self.survey, self.scene, tile, n, self.options) for n, tile in enumerate(self.tiles)]
         tasks = [task(n, trace_tile, tile_arguments, key) for n, tile_arguments in enumerate(arguments)]
         if self.options.truth:
@@ -314,6 +317,7 @@ def trace_tile(
     key: PRNGKeyArray,
 ) -> ShotResults:
     """Trace the shots of a tile."""
+    # With the window and the orders of all tiles the strategy comes out as in `TiledSceneStrategy.of`.
     strategy = _strategy_of(survey, scene, tile, options.rtol, options.orders, options.shared, options.window)
     task_results = _run_in_turn(strategy.tasks(jax.random.fold_in(key, number)))
     blocks = [results for _, results in strategy.shot_results(task_results)]

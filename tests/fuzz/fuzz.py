@@ -1,14 +1,16 @@
-"""Mutants of every kind of file that a reader takes: each is read well or refused by name, soon, in little
-memory.
+"""Fuzzing of the file readers with mutants, which are valid files with a few random changes.
 
-    python -m tests.fuzz.fuzz                                      a few hundred mutants of each kind
-    python -m tests.fuzz.fuzz --text 4000 --binary 1000            all that the readers are held to
-    python -m tests.fuzz.fuzz las --first 17 --binary 1 --keep .   one mutant, and what was done to it
+A reader has to do one of two things with a mutant: read it, if the result is plausible, or refuse it with a
+`ValueError` that names the file and the place of the fault. It has to do so within limits of time and memory.
 
-A mutant follows from its kind and its number. Half of the mutants of a kind are of small files that are
-written here, half of the recorded files that lie beside the checkout, where they do. Each is read in a child
-process (on Linux) that may take so much more memory and so much time; a child that dies is noticed and
-replaced.
+    python -m tests.fuzz.fuzz                                      a few hundred mutants of each kind of file
+    python -m tests.fuzz.fuzz --text 4000 --binary 1000            as many as a reader must pass in total
+    python -m tests.fuzz.fuzz las --first 17 --binary 1 --keep .   reproduce one mutant and write it to a file
+
+A mutant is determined by its kind of file and its number. The files that are changed are small ones, which
+are written here, and recorded ones from the folder of reference data, if it lies beside the checkout. Mutants
+are read in a child process (on Linux only), for which the operating system limits the memory and a timer
+limits the time. A child process that dies is noticed and replaced.
 """
 
 import argparse
@@ -29,167 +31,200 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tests.fuzz.fuzz_kinds import BYTES, KINDS, SECONDS, Kind
+from tests.fuzz.fuzz_kinds import KINDS, MAX_BYTES, MAX_SECONDS, FileKind
 
 ROOT = Path(__file__).resolve().parents[2]
 SHARED = ROOT.parent / "shared" / "data"
-# Mutants of each kind where no other number is asked for, and those that one child reads.
-FEW = {"text": 400, "binary": 200}
-PER_CHILD = 500
-GOOD = ("read", "refused")
+# Number of mutants of each kind of file by default, for text and for binary files.
+DEFAULT_COUNTS = {"text": 400, "binary": 200}
+MUTANTS_PER_CHILD = 500
+GOOD_VERDICTS = ("read", "refused")
 
 
-def reader_of(kind: Kind) -> Callable[[Path], Any]:
+def reader_of(kind: FileKind) -> Callable[[Path], Any]:
+    """Return the function that reads a kind of file, from the package or from `fuzz_kinds`."""
     import jaxlidar
     import jaxlidar.io
     from tests.fuzz import fuzz_kinds
 
     return next(
-        getattr(place, kind.reader)
-        for place in (jaxlidar.io, jaxlidar, fuzz_kinds)
-        if hasattr(place, kind.reader)
+        getattr(namespace, kind.reader)
+        for namespace in (jaxlidar.io, jaxlidar, fuzz_kinds)
+        if hasattr(namespace, kind.reader)
     )
 
 
 def mutants(name: str, first: int, last: int, recorded: bool = True) -> Iterator[tuple[int, bytes, str]]:
-    """Number, content and description of mutants of a kind; `recorded`: also of those of recorded files."""
+    """Generate mutants of a kind of file: number, content, and a description of the changes.
+
+    Without `recorded`, mutants of recorded files are skipped; the numbers of the others stay the same.
+    """
     kind = KINDS[name]
-    bases = [make() for make in kind.small]
+    originals = [make() for make in kind.small_files]
     if kind.recorded and SHARED.is_dir():
-        bases += [path.read_bytes() for path in sorted(SHARED.glob(kind.recorded))] * len(bases)
+        # Once for each small file: where one file is recorded, it is the original of half of the mutants.
+        paths = sorted(SHARED.glob(kind.recorded))
+        originals += [path.read_bytes() for path in paths] * len(originals)
     for number in range(first, last):
-        if not recorded and number % len(bases) >= len(kind.small):
+        if not recorded and number % len(originals) >= len(kind.small_files):
             continue
         random = np.random.default_rng([zlib.crc32(name.encode()), number])
-        data, done = bases[number % len(bases)], []
+        content, changes = originals[number % len(originals)], []
         for _ in range(int(random.integers(1, 4))):
-            data, said = kind.change(random, data)
-            done.append(said)
-        yield number, data, "; ".join(done)
+            content, change = kind.change(random, content)
+            changes.append(change)
+        yield number, content, "; ".join(changes)
 
 
-# -- reading and hunting -----------------------------------------------------------------------------------
+# -- reading mutants ---------------------------------------------------------------------------------------
 
 
 class Outcome(NamedTuple):
-    """What came of a mutant: a verdict, which is one of `GOOD` or says what is wrong; what was said; what was
-    done to the file; and the seconds and bytes that reading took, where the child lived to tell."""
+    """Result of reading one mutant.
+
+    - `number`: number of the mutant.
+    - `verdict`: one of `GOOD_VERDICTS`, or the name of a fault of the reader.
+    - `message`: the error message, or the implausible result.
+    - `changes`: description of the changes that made the mutant.
+    - `seconds`, `bytes`: time and memory that reading took; NaN if the child process died.
+    """
 
     number: int
     verdict: str
-    said: str
-    done: str
+    message: str
+    changes: str
     seconds: float = math.nan
     bytes: float = math.nan
 
 
-def verdict(kind: Kind, read: Callable[[Path], Any], path: Path) -> tuple[str, str]:
+def read_and_judge(kind: FileKind, read: Callable[[Path], Any], path: Path) -> tuple[str, str]:
+    """Read a file in this process and return the verdict and the message of its `Outcome`.
+
+    Verdicts: "read" (the result is plausible), "refused" (a `ValueError` names the file and the place), "no
+    place" (a `ValueError` does not), "nonsense" (the result is not plausible), "memory" (too much was
+    allocated), "escaped" (an error of another class). A warning is an error here.
+    """
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            # Of files from NumPy for Python 2, which are read.
+            # NumPy warns of headers that NumPy for Python 2 wrote; such files are valid.
             warnings.filterwarnings("ignore", "Reading `.npy`")
             result = read(path)
     except ValueError as error:
-        said = str(error)
-        if not re.search(re.escape(path.name) + kind.place, said):
-            return "no place", f"{type(error).__name__}: {said}"
-        return "refused", said
+        message = str(error)
+        if not re.search(re.escape(path.name) + kind.place, message):
+            return "no place", f"{type(error).__name__}: {message}"
+        return "refused", message
     except MemoryError as error:
         return "memory", repr(error)
     except BaseException as error:
         return "escaped", f"{type(error).__module__}.{type(error).__name__}: {error}"
     with np.errstate(all="ignore"):
-        return ("read", "") if kind.sound(result) else ("nonsense", str(result)[:300])
+        return ("read", "") if kind.is_plausible(result) else ("nonsense", str(result)[:300])
 
 
-def work(name: str, first: int, last: int) -> None:
-    """Reads mutants, and prints one line of JSON for each."""
+def read_mutants_in_child(name: str, first: int, last: int) -> None:
+    """Read mutants and print the outcome of each as a line of JSON; this runs in the child process."""
     import resource
 
     kind = KINDS[name]
     read = reader_of(kind)
     warnings.simplefilter("ignore")
     with tempfile.TemporaryDirectory() as folder:
-        for base in kind.small:
-            path = Path(folder) / f"base-0{kind.ending}"
-            path.write_bytes(base())
+        # The unchanged files are read first, as imports and compilation do not count for any mutant.
+        for make in kind.small_files:
+            path = Path(folder) / f"unchanged-0{kind.suffix}"
+            path.write_bytes(make())
             read(path)
-        for number, data, done in mutants(name, first, last):
-            path = Path(folder) / f"{name}-{number}{kind.ending}"
-            path.write_bytes(data)
-            resource.setrlimit(resource.RLIMIT_AS, (memory("VmSize") + BYTES, resource.RLIM_INFINITY))
-            # From here on, the high-water mark is that of this mutant.
+        for number, content, changes in mutants(name, first, last):
+            path = Path(folder) / f"{name}-{number}{kind.suffix}"
+            path.write_bytes(content)
+            limit = memory_use("VmSize") + MAX_BYTES
+            resource.setrlimit(resource.RLIMIT_AS, (limit, resource.RLIM_INFINITY))
+            # Writing 5 resets the high-water mark VmHWM, which then is that of this mutant alone.
             Path("/proc/self/clear_refs").write_text("5")
-            before, began = memory("VmHWM"), time.perf_counter()
-            faulthandler.dump_traceback_later(SECONDS, exit=True)
-            came = verdict(kind, read, path)
+            memory_before, start_time = memory_use("VmHWM"), time.perf_counter()
+            # No exception interrupts a reader that hangs in compiled code: the process has to end.
+            faulthandler.dump_traceback_later(MAX_SECONDS, exit=True)
+            verdict, message = read_and_judge(kind, read, path)
             faulthandler.cancel_dump_traceback_later()
-            took = time.perf_counter() - began, memory("VmHWM") - before
+            elapsed, peak = time.perf_counter() - start_time, memory_use("VmHWM") - memory_before
             resource.setrlimit(resource.RLIMIT_AS, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
             path.unlink()
-            print(json.dumps(Outcome(number, *came, done, *took)), flush=True)
+            print(json.dumps(Outcome(number, verdict, message, changes, elapsed, peak)), flush=True)
 
 
-def memory(what: str) -> int:
-    """Bytes that this process has, by the kernel's name."""
-    found = re.search(rf"{what}:\s+(\d+) kB", Path("/proc/self/status").read_text())
-    assert found, what
-    return 1024 * int(found[1])
+def memory_use(field: str) -> int:
+    """Return a memory statistic of this process in bytes; `field` is its name in /proc/self/status."""
+    match = re.search(rf"{field}:\s+(\d+) kB", Path("/proc/self/status").read_text())
+    assert match, field
+    return 1024 * int(match[1])
 
 
-def hunt(name: str, count: int, first: int = 0) -> list[Outcome]:
-    """What came of `count` mutants of a kind."""
-    found: list[Outcome] = []
-    while len(found) < count:
-        at, last = first + len(found), min(first + len(found) + PER_CHILD, first + count)
-        command = [sys.executable, "-m", "tests.fuzz.fuzz", "--work", name, str(at), str(last)]
-        with tempfile.TemporaryFile() as trace:
-            child = subprocess.run(command, stdout=subprocess.PIPE, stderr=trace, check=False, cwd=ROOT)
-            trace.seek(0)
-            errors = trace.read().decode(errors="replace")
-        found += [Outcome(*json.loads(line)) for line in child.stdout.splitlines()]
-        hung = "Timeout" in errors
-        if child.returncode > 0 and not hung:
+def fuzz_reader(name: str, count: int, first: int = 0) -> list[Outcome]:
+    """Read `count` mutants of a kind of file in child processes and return their outcomes."""
+    outcomes: list[Outcome] = []
+    while len(outcomes) < count:
+        start = first + len(outcomes)
+        last = min(start + MUTANTS_PER_CHILD, first + count)
+        command = [sys.executable, "-m", "tests.fuzz.fuzz", "--child", name, str(start), str(last)]
+        with tempfile.TemporaryFile() as stderr:
+            child = subprocess.run(command, stdout=subprocess.PIPE, stderr=stderr, check=False, cwd=ROOT)
+            stderr.seek(0)
+            errors = stderr.read().decode(errors="replace")
+        outcomes += [Outcome(*json.loads(line)) for line in child.stdout.splitlines()]
+        timed_out = "Timeout" in errors
+        if child.returncode > 0 and not timed_out:
             raise RuntimeError(f"the child failed: {errors[-2000:]}")
         if child.returncode:
-            at = first + len(found)
-            ((_, _, done),) = mutants(name, at, at + 1)
-            said = f"exit status {child.returncode}: {errors[:300]}"
-            found.append(Outcome(at, "hang" if hung else "abort", said, done))
-    return found
+            # The child died of the mutant after the last one that it reported.
+            number = first + len(outcomes)
+            ((_, _, changes),) = mutants(name, number, number + 1)
+            message = f"exit status {child.returncode}: {errors[:300]}"
+            outcomes.append(Outcome(number, "hang" if timed_out else "abort", message, changes))
+    return outcomes
 
 
 def main() -> int:
+    """Run the command line and return its exit status: 1 if a mutant has a verdict that is not good."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
     kinds = [name for name in KINDS if name != "planted"]
     parser.add_argument("kinds", nargs="*", default=kinds, metavar="KIND", help=", ".join(kinds))
-    parser.add_argument("--text", type=int, default=FEW["text"], help="mutants of each kind of text file")
-    parser.add_argument("--binary", type=int, default=FEW["binary"], help="mutants of each binary kind")
+    parser.add_argument(
+        "--text", type=int, default=DEFAULT_COUNTS["text"], help="mutants of each kind of text file"
+    )
+    parser.add_argument(
+        "--binary", type=int, default=DEFAULT_COUNTS["binary"], help="mutants of each kind of binary file"
+    )
     parser.add_argument("--first", type=int, default=0, help="number of the first mutant")
     parser.add_argument(
-        "--keep", type=Path, help="a folder for the mutants that are not read well or refused"
+        "--keep", type=Path, help="folder for the mutants that are neither read well nor refused"
     )
-    parser.add_argument("--work", nargs=3, help=argparse.SUPPRESS)
-    given = parser.parse_args()
-    if given.work:
-        work(given.work[0], int(given.work[1]), int(given.work[2]))
+    parser.add_argument("--child", nargs=3, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.child:
+        name, first, last = options.child
+        read_mutants_in_child(name, int(first), int(last))
         return 0
-    wrong = 0
-    for name in given.kinds:
-        outcomes = hunt(name, given.text if KINDS[name].of == "text" else given.binary, given.first)
-        verdicts = ", ".join(f"{n} {v}" for v, n in collections.Counter(o.verdict for o in outcomes).items())
-        longest, most = (max(getattr(o, what) for o in outcomes) for what in ("seconds", "bytes"))
-        print(f"{name}: {verdicts}; at most {longest:.2f} s and {most / 2**20:.0f} MB", flush=True)
-        for number, verdict, said, done, *_ in outcomes:
-            if verdict in GOOD:
+    n_faults = 0
+    for name in options.kinds:
+        count = options.text if KINDS[name].format == "text" else options.binary
+        outcomes = fuzz_reader(name, count, options.first)
+        verdicts = collections.Counter(outcome.verdict for outcome in outcomes)
+        summary = ", ".join(f"{n} {verdict}" for verdict, n in verdicts.items())
+        max_seconds = max(outcome.seconds for outcome in outcomes)
+        max_bytes = max(outcome.bytes for outcome in outcomes)
+        print(f"{name}: {summary}; at most {max_seconds:.2f} s and {max_bytes / 2**20:.0f} MB", flush=True)
+        for outcome in outcomes:
+            if outcome.verdict in GOOD_VERDICTS:
                 continue
-            wrong += 1
-            print(f"  {name} {number}: {verdict}: {said}\n    {done}", flush=True)
-            if given.keep:
-                ((_, data, _),) = mutants(name, number, number + 1)
-                (given.keep / f"{name}-{number}{KINDS[name].ending}").write_bytes(data)
-    return int(wrong > 0)
+            n_faults += 1
+            print(f"  {name} {outcome.number}: {outcome.verdict}: {outcome.message}", flush=True)
+            print(f"    {outcome.changes}", flush=True)
+            if options.keep:
+                ((_, content, _),) = mutants(name, outcome.number, outcome.number + 1)
+                (options.keep / f"{name}-{outcome.number}{KINDS[name].suffix}").write_bytes(content)
+    return int(n_faults > 0)
 
 
 if __name__ == "__main__":

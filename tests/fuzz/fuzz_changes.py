@@ -1,5 +1,7 @@
-"""Changes that make mutants of files, for fuzz.py: each takes bytes and gives other bytes, and says what it
-did."""
+"""Random changes that make mutants of files, for fuzz.py.
+
+Each function takes the content of a file and returns the changed content with a description of the change.
+"""
 
 import io
 import re
@@ -14,6 +16,8 @@ import numpy as np
 Random = np.random.Generator
 Changed = tuple[bytes, str]
 
+# Words that replace one word of a text file: numbers at and beyond limits, empty text, other alphabets,
+# separators, and words longer than Python's csv module allows for one field (131072 characters).
 WORDS = (
     *("nan", "inf", "-inf", "-1", "0", "1", "2", "0.5", "1e308", "1e39", "1e-320", "1e-30", "1_0", "-0.0"),
     *(
@@ -33,12 +37,14 @@ WORDS = (
     ),
     *(",", ";", "\t", "(", "#", "# #", "9" * 200_000, '"' + "1" * 140_000),
 )
-NUMBERS = (
+# Whole numbers that replace 1 to 8 bytes of a binary file.
+INTEGERS = (
     *(0, 1, 2, 3, 5, 7, 8, 16, 127, 128, 255, 2**15, 2**16 - 1, 10**8),
     *(2**31 - 1, 2**31, 2**32 - 1, 2**63, 2**64 - 1),
 )
+# Values that replace elements of arrays.
 VALUES = (np.nan, np.inf, -1.0, 0.0, 0.5, 1e10, 1e39, 1e308, 2.0**63, 200.0, 1e-320)
-# Of .npy files, what is replaced in the header, and by what.
+# Shapes and types that replace those in the header of an .npy file.
 SHAPES = (
     *("()", "(0,)", "(1000000000,)", "(99999,99999)", "(-1,)", "(0,10**9)", "(1.5,)"),
     *("(1000000000,0)", "(2**62,4)", "((", "(3,4611686018427387904)"),
@@ -47,38 +53,46 @@ TYPES = (
     *("'|O'", "'<U0'", "'<f2'", "'<i8'", "'<c16'", "'<M8[s]'", "'|V8'", "'<f16'", "'[('", "'<U9'", "'|b1'"),
     *("'>f8'", "7"),
 )
-HEADERS = (
+# Regular expressions of what is replaced in such a header, and the replacements.
+HEADER_CHANGES = (
     *((rb"\([^)]*\)", shape.encode()) for shape in SHAPES),
-    *((rb"'[<|][^']*'", kind.encode()) for kind in TYPES),
+    *((rb"'[<|][^']*'", dtype.encode()) for dtype in TYPES),
     *((b"False", b"True"), (b"shape", b"sharp"), (b"NUMPY.", b"NUMPY\x03"), (b"NUMPY.", b"NUMPY\x07")),
 )
 
 
-def pick(random: Random, things: Any) -> Any:
-    return things[int(random.integers(len(things)))]
+def choose(random: Random, choices: Any) -> Any:
+    """Choose an element of a sequence; all are equally probable."""
+    return choices[int(random.integers(len(choices)))]
 
 
-def somewhere(random: Random, size: int, head: int, tail: int) -> int:
-    """An index below `size`, most often in the head or in the tail."""
-    low, high = pick(random, [(0, head), (0, head), (size - tail, size), (0, size), (0, size)])
+def random_index(random: Random, size: int, head: int, tail: int) -> int:
+    """Draw an index below `size`.
+
+    Its first `head` and last `tail` elements are preferred, as headers and tables of contents lie there.
+    """
+    low, high = choose(random, [(0, head), (0, head), (size - tail, size), (0, size), (0, size)])
     return int(random.integers(max(low, 0), max(min(high, size), 1)))
 
 
-def change_text(random: Random, data: bytes) -> Changed:
-    """One change of a line, a word or a few bytes."""
-    lines = data.decode("utf-8", "surrogateescape").split("\n")
-    i = somewhere(random, len(lines), 15, 2)
-    kind = pick(random, ["word", "word", "word", "insert", "delete", "double", "swap", "end", "join", "byte"])
-    word = pick(random, WORDS)
+def change_text(random: Random, content: bytes) -> Changed:
+    """Change one line, one word or a few bytes of a text file."""
+    lines = content.decode("utf-8", "surrogateescape").split("\n")
+    i = random_index(random, len(lines), 15, 2)
+    kind = choose(
+        random, ["word", "word", "word", "insert", "delete", "double", "swap", "end", "join", "byte"]
+    )
+    word = choose(random, WORDS)
     if kind == "byte":
-        return change_bytes(random, data)
+        return change_bytes(random, content)
     if kind == "word":
-        parts = re.split(r"([\s,;:()]+)", lines[i])
-        parts[2 * int(random.integers((len(parts) + 1) // 2))] = word
-        lines[i] = "".join(parts)
+        # Words have even indices, the separators between them odd ones.
+        tokens = re.split(r"([\s,;:()]+)", lines[i])
+        tokens[2 * int(random.integers((len(tokens) + 1) // 2))] = word
+        lines[i] = "".join(tokens)
     elif kind == "insert":
-        at = int(random.integers(len(lines[i]) + 1))
-        lines[i] = lines[i][:at] + word + lines[i][at:]
+        column = int(random.integers(len(lines[i]) + 1))
+        lines[i] = lines[i][:column] + word + lines[i][column:]
     elif kind == "delete":
         del lines[i]
     elif kind == "double":
@@ -94,126 +108,134 @@ def change_text(random: Random, data: bytes) -> Changed:
     return changed, f"{kind} in line {i + 1}" + (f": {word[:12]!r}" if kind in ("word", "insert") else "")
 
 
-def change_bytes(random: Random, data: bytes) -> Changed:
-    """One change of a number in the file, of a bit, or of a stretch of bytes."""
-    out = bytearray(data)
-    at, length = somewhere(random, len(out), 1000, 200), int(random.integers(1, 64))
-    length = len(out[at : at + length])
-    kind = pick(random, ["number"] * 3 + ["bit", "byte", "end", "zeros", "ones", "noise", "cut", "copy"])
+def change_bytes(random: Random, content: bytes) -> Changed:
+    """Change one number, one bit or some consecutive bytes of a binary file."""
+    changed = bytearray(content)
+    offset, length = random_index(random, len(content), 1000, 200), int(random.integers(1, 64))
+    # No further than to the end of the file; 0 if the file is empty.
+    length = len(changed[offset : offset + length])
+    kind = choose(random, ["number"] * 3 + ["bit", "byte", "end", "zeros", "ones", "noise", "cut", "copy"])
     if kind == "number":
-        width, value = pick(random, [1, 2, 4, 8]), pick(random, NUMBERS)
-        out[at : at + width] = (value % 256**width).to_bytes(width, "little")
-        return bytes(out), f"{width} bytes at {at} are {value % 256**width}"
+        width, value = choose(random, [1, 2, 4, 8]), choose(random, INTEGERS)
+        changed[offset : offset + width] = (value % 256**width).to_bytes(width, "little")
+        return bytes(changed), f"{width} bytes at {offset} are {value % 256**width}"
     if kind == "bit" and length:
-        out[at] ^= 1 << int(random.integers(8))
+        changed[offset] ^= 1 << int(random.integers(8))
     elif kind == "byte" and length:
-        out[at] = int(random.integers(256))
+        changed[offset] = int(random.integers(256))
     elif kind == "end":
-        del out[at:]
+        del changed[offset:]
     elif kind in ("zeros", "ones"):
-        out[at : at + length] = (b"\0" if kind == "zeros" else b"\xff") * length
+        changed[offset : offset + length] = (b"\0" if kind == "zeros" else b"\xff") * length
     elif kind == "noise":
-        out[at : at + length] = random.bytes(length)
+        changed[offset : offset + length] = random.bytes(length)
     elif kind == "cut":
-        del out[at : at + length]
+        del changed[offset : offset + length]
     elif kind == "copy":
-        start = int(random.integers(len(out) + 1))
-        out[at:at] = out[start : start + length]
-    return bytes(out), f"{kind} at {at}"
+        start = int(random.integers(len(changed) + 1))
+        changed[offset:offset] = changed[start : start + length]
+    return bytes(changed), f"{kind} at {offset}"
 
 
-def change_archive(random: Random, data: bytes) -> Changed:
-    """One change of an array in an .npz file, whose checksums then are right; or of the archive's bytes."""
+def change_archive(random: Random, content: bytes) -> Changed:
+    """Change one array of an .npz file, or the bytes of the archive.
+
+    An archive with a changed array is written anew. Its checksums are right, so that the array is read.
+    """
     try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
             members = {name: archive.read(name) for name in archive.namelist()}
     except (zipfile.BadZipFile, zlib.error, NotImplementedError, OSError, RuntimeError, ValueError, EOFError):
         members = {}
-    kind = pick(random, ["archive", "archive", "archive", "bytes", "header", "value", "value", "leave out"])
+    kind = choose(random, ["archive", "archive", "archive", "bytes", "header", "value", "value", "remove"])
     if kind == "archive" or not members:
-        return change_bytes(random, data)
-    name = pick(random, sorted(members))
-    said = kind
+        return change_bytes(random, content)
+    name = choose(random, sorted(members))
+    description = kind
     if kind == "bytes":
-        members[name], said = change_bytes(random, members[name])
+        members[name], description = change_bytes(random, members[name])
     elif kind == "header":
-        old, new = pick(random, HEADERS)
-        header, rest = members[name][:128], members[name][128:]
+        old, new = choose(random, HEADER_CHANGES)
+        header, values = members[name][:128], members[name][128:]
         changed = re.sub(old, lambda _: new, header, count=1, flags=re.DOTALL)
-        # Blanks at its end make room.
-        room = len(header) - len(changed)
-        members[name] = (changed[:-1] + b" " * room + b"\n" if room >= 0 else changed) + rest
-        said = f"header {new!r}"
+        # NumPy pads headers with blanks before their final newline; they keep the length that is declared.
+        padding = len(header) - len(changed)
+        members[name] = (changed[:-1] + b" " * padding + b"\n" if padding >= 0 else changed) + values
+        description = f"header {new!r}"
     elif kind == "value":
-        value = pick(random, VALUES)
+        value = choose(random, VALUES)
         try:
             array = np.load(io.BytesIO(members[name]))
-            at = int(random.integers(array.size)) if random.random() < 0.7 else slice(None)
-            array.flat[at] = value
+            index = int(random.integers(array.size)) if random.random() < 0.7 else slice(None)
+            array.flat[index] = value
         except (ValueError, OverflowError, TypeError, EOFError, SyntaxError, MemoryError):
-            return change_bytes(random, data)
+            return change_bytes(random, content)
         file = io.BytesIO()
         np.save(file, array)
-        members[name], said = file.getvalue(), f"value {value}"
+        members[name], description = file.getvalue(), f"value {value}"
     else:
         del members[name]
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
-        for key, content in members.items():
-            archive.writestr(key, content)
-    return file.getvalue(), f"{name}: {said}"
+        for key, member in members.items():
+            archive.writestr(key, member)
+    return file.getvalue(), f"{name}: {description}"
 
 
-def change_hdf5(random: Random, data: bytes) -> Changed:
-    """One change of a dataset in a small HDF5 file; or of the file's bytes."""
+def change_hdf5(random: Random, content: bytes) -> Changed:
+    """Change one dataset of a small HDF5 file, or the bytes of the file."""
     import h5py
 
-    if random.random() < 0.5 or len(data) > 2**19:
-        return change_bytes(random, data)
+    if random.random() < 0.5 or len(content) > 2**19:
+        return change_bytes(random, content)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "changed.h5"
-        path.write_bytes(data)
+        path.write_bytes(content)
         try:
             with h5py.File(path, "r+") as file:
-                said = _change_dataset(random, file[pick(random, sorted(file))])
+                description = _change_dataset(random, file[choose(random, sorted(file))])
         except (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError, AttributeError):
-            return change_bytes(random, data)
-        return path.read_bytes(), said
+            return change_bytes(random, content)
+        return path.read_bytes(), description
 
 
 def _change_dataset(random: Random, group: Any) -> str:
+    """Replace one dataset of a group: by other values, another type or shape, a link, or none at all."""
     import h5py
 
     names: list[str] = []
     group.visititems(lambda name, node: names.append(name) if hasattr(node, "shape") else None)
-    name = pick(random, sorted(names))
+    name = choose(random, sorted(names))
     array, empty = group[name][...], h5py.Empty("f8")
-    kind = pick(random, ["value"] * 3 + ["all", "type", "shape", "sparse", "chunk", "link", "gone"])
-    said = f"{group.name}/{name}: {kind}"
+    kind = choose(random, ["value"] * 3 + ["all", "type", "shape", "sparse", "chunk", "link", "gone"])
+    description = f"{group.name}/{name}: {kind}"
     del group[name]
     if kind in ("value", "all"):
-        value = pick(random, VALUES)
-        at = int(random.integers(array.size)) if kind == "value" else slice(None)
+        value = choose(random, VALUES)
+        index = int(random.integers(array.size)) if kind == "value" else slice(None)
         array = array.astype(float) if random.random() < 0.5 else array
-        array[at] = value if array.dtype.kind == "f" else int(np.clip(np.nan_to_num(value), 0, 2**16))
-        group[name], said = array, f"{said} {value}"
+        array[index] = value if array.dtype.kind == "f" else int(np.clip(np.nan_to_num(value), 0, 2**16))
+        group[name], description = array, f"{description} {value}"
     elif kind == "sparse":
-        size = pick(random, [1, 2**24, 2**28, 2**33])
-        chunks = pick(random, [None, (min(size, 2**20),)])
+        # It declares its size and holds no values.
+        size = choose(random, [1, 2**24, 2**28, 2**33])
+        chunks = choose(random, [None, (min(size, 2**20),)])
         group.create_dataset(name, (size,), array.dtype, chunks=chunks)
     elif kind == "chunk":
-        length = pick(random, [1, 1000, 2**20, 2**27])
+        # A compressed chunk is unpacked as a whole, whatever the shape of the dataset.
+        length = choose(random, [1, 1000, 2**20, 2**27])
         packed = {"chunks": (length,), "maxshape": (None,), "compression": 1}
         dataset = group.create_dataset(name, array.shape, array.dtype, **packed)
         if length < 2**24:
             dataset[...] = array
     elif kind == "type":
-        group[name] = array.astype(pick(random, ["i1", "f2", "S5", "u8", "i8", "c8", "bool", "f8"]))
+        group[name] = array.astype(choose(random, ["i1", "f2", "S5", "u8", "i8", "c8", "bool", "f8"]))
     elif kind == "shape":
-        group[name] = pick(
+        group[name] = choose(
             random, [array[:-1], array[:0], array[:, None], array[0], np.repeat(array, 2), empty]
         )
     elif kind == "link":
-        soft = h5py.SoftLink(pick(random, ["/nowhere", f"{group.name}/{name}"]))
-        group[name] = pick(random, [soft, h5py.ExternalLink("none.h5", "/x")])
-    return said
+        # To nowhere, to itself, or to a file that does not exist.
+        soft = h5py.SoftLink(choose(random, ["/nowhere", f"{group.name}/{name}"]))
+        group[name] = choose(random, [soft, h5py.ExternalLink("none.h5", "/x")])
+    return description

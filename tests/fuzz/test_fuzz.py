@@ -1,59 +1,76 @@
-"""Mutants of every kind of file are read well or refused by name; what the hunt is to find, it finds."""
+"""Readers of all kinds of files read or refuse mutants, and the fuzzing detects planted faults."""
 
 import sys
 
 import pytest
 
-from tests.fuzz.fuzz import FEW, GOOD, hunt, mutants, reader_of, verdict
-from tests.fuzz.fuzz_kinds import KINDS, PLANTED
+from tests.fuzz.fuzz import (
+    DEFAULT_COUNTS,
+    GOOD_VERDICTS,
+    fuzz_reader,
+    mutants,
+    read_and_judge,
+    reader_of,
+)
+from tests.fuzz.fuzz_kinds import KINDS, PLANTED_VERDICTS
 
-FILES = [name for name in KINDS if name != "planted"]
-# What reads a kind of file beside the library itself.
-NEEDS = {"laz": "lazrs", "tiff": "rasterio"}
+FILE_KINDS = [name for name in KINDS if name != "planted"]
+# Optional packages that a kind of file needs.
+REQUIRED_PACKAGES = {"laz": "lazrs", "tiff": "rasterio"}
 linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="children are bounded on Linux only")
 
 
+def skip_without_package(name):
+    """Skip a test if the package that a kind of file needs is not installed."""
+    if name in REQUIRED_PACKAGES:
+        pytest.importorskip(REQUIRED_PACKAGES[name])
+
+
 @pytest.fixture
-def verdicts(tmp_path):
-    """Gives the verdict and the message for the first mutants of small files, read in this process."""
+def judge(tmp_path):
+    """A function that reads the first mutants of small files in this process.
 
-    def read_all(name, count):
-        if name in NEEDS:
-            pytest.importorskip(NEEDS[name])
+    It returns a verdict and a message for each (see `fuzz.read_and_judge`).
+    """
+
+    def judge(name, count):
+        skip_without_package(name)
         kind = KINDS[name]
-        for number, data, _ in mutants(name, 0, count, recorded=False):
-            path = tmp_path / f"{name}-{number}{kind.ending}"
-            path.write_bytes(data)
-            yield verdict(kind, reader_of(kind), path)
+        results = []
+        for number, content, _ in mutants(name, 0, count, recorded=False):
+            path = tmp_path / f"{name}-{number}{kind.suffix}"
+            path.write_bytes(content)
+            results.append(read_and_judge(kind, reader_of(kind), path))
+        return results
 
-    return read_all
-
-
-@pytest.mark.parametrize("name", FILES)
-def test_a_few_mutants(name, verdicts):
-    found = list(verdicts(name, 60))
-    assert not [said for said in found if said[0] not in GOOD]
-    assert {said[0] for said in found} == set(GOOD)
+    return judge
 
 
-def test_what_is_planted_is_found_in_one_process(verdicts):
-    harmless = PLANTED[: PLANTED.index("memory")]
-    assert [said[0] for said in verdicts("planted", len(harmless))] == list(harmless)
+@pytest.mark.parametrize("name", FILE_KINDS)
+def test_mutants_of_small_files_are_read_or_refused(name, judge):
+    results = judge(name, 60)
+    assert not [(verdict, message) for verdict, message in results if verdict not in GOOD_VERDICTS]
+    assert {verdict for verdict, _ in results} == set(GOOD_VERDICTS)
 
 
-@linux
-@pytest.mark.slow
-@pytest.mark.parametrize("name", FILES)
-def test_mutants(name):
-    if name in NEEDS:
-        pytest.importorskip(NEEDS[name])
-    outcomes = hunt(name, FEW[KINDS[name].of])
-    assert not [outcome for outcome in outcomes if outcome.verdict not in GOOD]
-    for good in GOOD:
-        assert sum(outcome.verdict == good for outcome in outcomes) > 10
+def test_planted_faults_are_detected_in_one_process(judge):
+    harmless = PLANTED_VERDICTS[: PLANTED_VERDICTS.index("memory")]
+    assert tuple(verdict for verdict, _ in judge("planted", len(harmless))) == harmless
 
 
 @linux
 @pytest.mark.slow
-def test_what_is_planted_is_found():
-    assert [outcome.verdict for outcome in hunt("planted", 2 * len(PLANTED))] == [*PLANTED, *PLANTED]
+@pytest.mark.parametrize("name", FILE_KINDS)
+def test_mutants_are_read_or_refused_in_child_processes(name):
+    skip_without_package(name)
+    outcomes = fuzz_reader(name, DEFAULT_COUNTS[KINDS[name].format])
+    assert not [outcome for outcome in outcomes if outcome.verdict not in GOOD_VERDICTS]
+    for good_verdict in GOOD_VERDICTS:
+        assert sum(outcome.verdict == good_verdict for outcome in outcomes) > 10
+
+
+@linux
+@pytest.mark.slow
+def test_planted_faults_are_detected_in_child_processes():
+    outcomes = fuzz_reader("planted", 2 * len(PLANTED_VERDICTS))
+    assert [outcome.verdict for outcome in outcomes] == [*PLANTED_VERDICTS, *PLANTED_VERDICTS]

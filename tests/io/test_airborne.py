@@ -1,4 +1,4 @@
-"""The record that all readers of airborne waveforms give, and stacks of several."""
+"""`AirborneShot`, the record that all readers of airborne waveforms return, and stacks of several."""
 
 import dataclasses
 import pickle
@@ -10,45 +10,48 @@ import pytest
 import jaxlidar as jl
 from jaxlidar.io import AirborneShot, Segment, stack_shots
 
-WAY = np.array([0.02, 0.01, -0.1482])
+# Displacement of light in 1 ns and a point on the beam, in m.
+DIRECTION = np.array([0.02, 0.01, -0.1482])
 ANCHOR = np.array([5e5, 4e6, 300.0])
 
 
 def shot_of(*returning, **changes):
-    own = {"anchor": ANCHOR, "direction": WAY, "returning": returning}
-    return AirborneShot(7, **(own | changes))
+    """Return shot 7 with some returning segments."""
+    fields = {"anchor": ANCHOR, "direction": DIRECTION, "returning": returning}
+    return AirborneShot(7, **(fields | changes))
 
 
 def echo(start, *samples, **changes):
+    """Return a segment of 8-bit samples that begins at the time `start` in ns."""
     return Segment(np.array(samples, np.uint8), start, **changes)
 
 
-def test_one_segment():
+def test_samples_of_one_segment_have_times_and_positions():
     shot = shot_of(echo(10.25, 3, 4, 90, 5, step=2.0), noise_mean=3.0)
     np.testing.assert_array_equal(shot.time, [10.25, 12.25, 14.25, 16.25])
     np.testing.assert_array_equal(shot.waveform, [3, 4, 90, 5])
     np.testing.assert_array_equal(shot.signal, [0, 1, 87, 2])
     assert shot.recorded.all()
-    np.testing.assert_allclose(shot.position[2], ANCHOR + 14.25 * WAY, rtol=1e-14)
+    np.testing.assert_allclose(shot.position[2], ANCHOR + 14.25 * DIRECTION, rtol=1e-14)
     assert shot.zenith == pytest.approx(np.rad2deg(np.arctan2(np.hypot(0.02, 0.01), 0.1482)))
     assert shot.azimuth == pytest.approx(np.rad2deg(np.arctan2(0.02, 0.01)))
     np.testing.assert_allclose(shot.time_from(shot.elevation[2]), [-4, -2, 0, 2], atol=1e-9)
     np.testing.assert_allclose(shot.position_at(shot.elevation[2]), shot.position[2, :2], rtol=1e-14)
 
 
-def test_several_segments_with_a_gap_between_them():
-    """Segments are in order of time; they begin where they begin, also between samples of the first."""
+def test_samples_between_two_segments_are_marked_as_not_recorded():
+    """Segments are sorted by time. The second one keeps its start, which is no multiple of the interval."""
     shot = shot_of(echo(105.003, 7, 8), echo(100.0, 1, 2, 3), noise_mean=1.0)
     np.testing.assert_array_equal(shot.recorded, [1, 1, 1, 0, 0, 1, 1])
     np.testing.assert_array_equal(shot.waveform, [1, 2, 3, 0, 0, 7, 8])
     np.testing.assert_array_equal(shot.signal, [0, 1, 2, 0, 0, 6, 7])
     np.testing.assert_allclose(shot.time[[0, 2, 5, 6]], [100, 102, 105.003, 106.003], rtol=1e-14)
     assert np.all(np.diff(shot.time) > 0)
-    # One that follows at once, half a sample off at most, leaves no gap.
+    # A segment that begins within half a sample of the end of the one before leaves no gap.
     assert shot_of(echo(0.4, 1, 2), echo(2.0, 3)).recorded.all()
 
 
-def test_channels_are_kept_apart():
+def test_segments_of_different_channels_are_not_joined():
     shot = shot_of(echo(5.0, 1, 9, channel=1), echo(6.4, 2, 4, channel=0))
     np.testing.assert_array_equal(shot.waveform, [1, 9])
     np.testing.assert_array_equal(shot.of_channel(0).waveform, [2, 4])
@@ -56,28 +59,28 @@ def test_channels_are_kept_apart():
         shot.of_channel(2)
 
 
-def test_the_digitiser_has_a_gain_and_an_offset():
+def test_gain_and_offset_of_the_digitiser_are_applied():
     shot = shot_of(echo(0.0, 0, 100, gain=0.5, offset=-3.0))
     np.testing.assert_array_equal(shot.waveform, [-3.0, 47.0])
 
 
-def test_the_pulse():
-    sent = Segment(np.array([12, 11, 10, 60, 90, 40, 10, 9]), -4.0)
-    shot = shot_of(echo(0.0, 1), outgoing=(sent,), pedestal=10.0)
+def test_the_outgoing_pulse_has_times_and_power_above_the_pedestal():
+    outgoing = Segment(np.array([12, 11, 10, 60, 90, 40, 10, 9]), -4.0)
+    shot = shot_of(echo(0.0, 1), outgoing=(outgoing,), pedestal=10.0)
     np.testing.assert_array_equal(shot.pulse_time, np.arange(-4.0, 4.0))
     np.testing.assert_array_equal(shot.pulse_power, [0, 0, 0, 50, 80, 30, 0, 0])
-    other = dataclasses.replace(shot, pulse_zero=1.0)
-    np.testing.assert_array_equal(other.pulse_time, np.arange(-5.0, 3.0))
+    shifted = dataclasses.replace(shot, pulse_zero=1.0)
+    np.testing.assert_array_equal(shifted.pulse_time, np.arange(-5.0, 3.0))
     with pytest.raises(ValueError, match="shot 7: no outgoing pulse"):
         _ = shot_of(echo(0.0, 1)).pulse_power
     with pytest.raises(ValueError, match="shot 7: outgoing: a pulse without energy"):
         _ = dataclasses.replace(shot, pedestal=90.0).pulse_power
 
 
-def test_a_simulated_echo_lies_at_its_place():
-    """A target put where a sample lies returns its echo in this sample."""
-    sent = Segment(np.array([0, 30, 80, 30, 0]), -2.0)
-    shot = shot_of(Segment(np.zeros(60, int), 40.0), outgoing=(sent,))
+def test_a_simulated_echo_returns_at_the_elevation_of_its_target():
+    """The echo of a target at the elevation of sample 25 is largest in sample 25."""
+    outgoing = Segment(np.array([0, 30, 80, 30, 0]), -2.0)
+    shot = shot_of(Segment(np.zeros(60, int), 40.0), outgoing=(outgoing,))
     lidar = jl.Lidar(
         pulse=jl.SampledPulse(time=shot.pulse_time, power=shot.pulse_power),
         zenith=shot.zenith,
@@ -91,10 +94,10 @@ def test_a_simulated_echo_lies_at_its_place():
     assert samples.argmax() == 25
 
 
-def test_degrees():
-    """Directions in degrees become metres with the factors for each axis."""
+def test_directions_in_degrees_are_converted_to_metres():
+    """`metres` holds the metres per unit of each axis."""
     metres = np.array([88_000.0, 111_000.0, 1.0])
-    shot = shot_of(echo(0.0, 1), direction=WAY / metres, metres=metres)
+    shot = shot_of(echo(0.0, 1), direction=DIRECTION / metres, metres=metres)
     assert shot.zenith == pytest.approx(shot_of(echo(0.0, 1)).zenith)
     assert shot.azimuth == pytest.approx(shot_of(echo(0.0, 1)).azimuth)
     assert shot.is_geographic
@@ -102,7 +105,7 @@ def test_degrees():
 
 
 @pytest.mark.parametrize(
-    ("segments", "says"),
+    ("segments", "message"),
     [
         ([], "no returning segment"),
         ([echo(0.0)], "a segment of 0 samples"),
@@ -114,17 +117,17 @@ def test_degrees():
         ([echo(0.0, 1), echo(1e9, 1)], r"1000000001 samples from the first to the last; at most 1000000"),
     ],
 )
-def test_records_that_make_no_sense(segments, says):
-    with pytest.raises(ValueError, match=f"shot 7: .*{says}"):
+def test_inconsistent_segments_are_refused(segments, message):
+    with pytest.raises(ValueError, match=f"shot 7: .*{message}"):
         shot_of(*segments)
 
 
-def test_a_shot_is_sent_elsewhere():
+def test_a_shot_can_be_pickled():
     shot = pickle.loads(pickle.dumps(shot_of(echo(0.0, 1, 2), noise_std=0.5)))
     np.testing.assert_array_equal(shot.waveform, [1, 2])
 
 
-def test_stacks():
+def test_stacked_shots_share_their_times():
     shots = [shot_of(echo(40.0, 3, 9, 3), noise_mean=3.0), shot_of(echo(1.0, 5, 8), echo(6.0, 7))]
     stack = stack_shots(shots)
     np.testing.assert_array_equal(stack.time, np.arange(6))

@@ -1,4 +1,4 @@
-"""Cases as TOML: the round trip is exact for every class; what makes no sense is refused with its place."""
+"""Cases as TOML: every class is read bit for bit as it was written, and bad files are refused by place."""
 
 import dataclasses
 import inspect
@@ -25,20 +25,24 @@ ANGLED = jl.VoxelMap.from_lad(RANDOM.random((1, 1, 2)), voxel_size=0.7, leaf_ang
 
 
 def with_ground(**fields):
+    """Return a scene of ground alone."""
     return jl.Scene(ground=jl.Ground(**fields))
 
 
 def with_leaf(leaf, **fields):
+    """Return a scene of a small canopy, with the optics of its leaves."""
     return jl.Scene(canopy=jl.Canopy(ANGLED, leaf=leaf, **fields))
 
 
-def pro():
+def prospect_pro():
+    """Return leaves of PROSPECT-PRO, of which the coefficients are given as a table."""
     table = shipped("PC")
     return jl.Prospect(N=1.7, Cp=1 / 900, Cc=0.005, version="PRO", coefficients=table)
 
 
-# One or more of every class, none at its defaults.
-PARTS = {
+# A lidar, survey or scene for every class that a case can hold, with values other than the defaults. The key
+# is the name of the class, followed by a comma and what is special about this example.
+EXAMPLES = {
     "Lidar": jl.Lidar(
         wavelength=(532.1, 1064.0), altitude=1 / 3e-4, energy=(1e-3, 2e-4), position=(0.1, -0.0), zenith=7.7,
         profile="top-hat", field_of_view=0.7, efficiency=0.3, jitter=0.123456789, azimuth=-1e-8,
@@ -72,18 +76,20 @@ PARTS = {
     "Isotropic": with_leaf(jl.Isotropic((0.9, 1.0))),
     "HenyeyGreenstein": with_leaf(jl.LeafOptics(0.1), bark=jl.HenyeyGreenstein(0.9, 1 / 3)),
     "Prospect": with_leaf(jl.Prospect(N=1.1, Cab=1 / 3, version="5", alpha=39.123456789)),
-    "Coefficients": with_leaf(pro()),
+    "Coefficients": with_leaf(prospect_pro()),
 }  # fmt: skip
 
 
-def case_of(part, **more):
-    kinds = {jl.Lidar: "lidar", jl.Survey: "survey", jl.Scene: "scene"}
-    return jl.io.Case(**{kinds[type(part)]: part}, **more)
+def case_of(example):
+    """Return a case that holds a lidar, a survey or a scene."""
+    fields = {jl.Lidar: "lidar", jl.Survey: "survey", jl.Scene: "scene"}
+    return jl.io.Case(**{fields[type(example)]: example})
 
 
 def round_trip(case, tmp_path):
+    """Write a case, move its files to another folder, and read it."""
     jl.io.write_case(tmp_path / "a.toml", case)
-    # Wherever the two files lie.
+    # The TOML file must refer to the file of its arrays by a relative path.
     (tmp_path / "moved").mkdir()
     for file in tmp_path.glob("a.*"):
         shutil.move(file, tmp_path / "moved")
@@ -91,48 +97,51 @@ def round_trip(case, tmp_path):
 
 
 def bits(tree):
+    """Return the type, shape and bytes of every array of a pytree."""
     return [
         (np.asarray(leaf).dtype, np.shape(leaf), np.asarray(leaf).tobytes()) for leaf in jax.tree.leaves(tree)
     ]
 
 
-def same(got, sent):
-    """Equal to the bit, static fields included."""
-    return jax.tree.structure(got) == jax.tree.structure(sent) and bits(got) == bits(sent)
+def same(result, expected):
+    """True if two pytrees are equal bit for bit, static fields included."""
+    return jax.tree.structure(result) == jax.tree.structure(expected) and bits(result) == bits(expected)
 
 
 @pytest.mark.parametrize("x64", [False, True], ids=["float32", "float64"])
-@pytest.mark.parametrize("name", PARTS)
-def test_every_class_comes_back_to_the_bit(name, x64, tmp_path):
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_every_class_is_read_as_it_was_written(name, x64, tmp_path):
     with jax.enable_x64(x64):
-        # Places are NumPy's, in double precision, as they are.
-        sent = jax.tree.map(
-            lambda x: jnp.asarray(x, float) / 1.0 if isinstance(x, jax.Array) else x, PARTS[name]
+        # Positions are arrays of NumPy, which have double precision in both modes.
+        example = jax.tree.map(
+            lambda x: jnp.asarray(x, float) / 1.0 if isinstance(x, jax.Array) else x, EXAMPLES[name]
         )
         if x64:
-            sent = jax.tree.map(lambda x: x * (1 - 2**-50), sent)
-        back = round_trip(case_of(sent), tmp_path)
-        case = case_of(sent)
-        assert same((back.lidar, back.survey, back.scene), (case.lidar, case.survey, case.scene))
+            # Values that single precision cannot hold.
+            example = jax.tree.map(lambda x: x * (1 - 2**-50), example)
+        case = case_of(example)
+        result = round_trip(case, tmp_path)
+        assert same((result.lidar, result.survey, result.scene), (case.lidar, case.survey, case.scene))
 
 
-def test_one_bit_is_noticed():
-    nearly = with_ground(height=np.nextafter(np.float32(1 / 3), np.float32(1)), reflectance=(0.1, 0.2))
-    assert not same(nearly, with_ground(height=1 / 3, reflectance=(0.1, 0.2)))
+def test_a_difference_of_one_bit_is_detected():
+    changed = with_ground(height=np.nextafter(np.float32(1 / 3), np.float32(1)), reflectance=(0.1, 0.2))
+    assert not same(changed, with_ground(height=1 / 3, reflectance=(0.1, 0.2)))
 
 
-def test_every_class_is_tried():
+def test_every_class_has_an_example():
     classes = {name for name, kind in kinds().items() if isinstance(kind, type)}
-    of_plants = {"Habit", "Branching"}
-    # Patterns of scans are no part of the survey that they make.
-    scans = {"Oscillating", "RotatingPolygon", "Conical"}
-    assert classes - of_plants - scans - {"Plane"} == {name.partition(",")[0] for name in PARTS}
+    # No lidar, survey or scene holds one of these: they make trees, surveys and the shapes of surfaces.
+    plants, scan_patterns = {"Habit", "Branching"}, {"Oscillating", "RotatingPolygon", "Conical"}
+    examples = {name.partition(",")[0] for name in EXAMPLES}
+    assert classes - plants - scan_patterns - {"Plane"} == examples
 
 
-def numbers_of(kind):
+def numeric_arguments(kind):
+    """Generate the names of the arguments of a class or function that are numbers, by their annotations."""
     for name, argument in arguments_of(kind).items():
-        said = str(argument.annotation)
-        if any(word in said for word in ("Float", "float", "ArrayLike", "Reflectance")):
+        annotation = str(argument.annotation)
+        if any(word in annotation for word in ("Float", "float", "ArrayLike", "Reflectance")):
             yield name
 
 
@@ -142,34 +151,34 @@ def test_every_quantity_has_a_unit_or_is_a_pure_number():
     pure |= {"rtol", "atol", "n_photons", "n_rays", "lad", "upward", "foot", "a", "b"}
     pure |= {"density", "shares", "size", "share", "exponent", "length_exponent", "bole", "twig", "beams"}
     for name, kind in kinds().items():
-        for argument in numbers_of(kind):
-            known = argument in UNITS or (kind, argument) in UNITS_OF
-            assert known or argument in pure, f"{name}.{argument}"
+        for argument in numeric_arguments(kind):
+            has_unit = argument in UNITS or (kind, argument) in UNITS_OF
+            assert has_unit or argument in pure, f"{name}.{argument}"
 
 
-def test_a_case_comes_back_with_its_key_and_arguments(tmp_path):
+def test_key_and_arguments_of_a_case_are_read_as_they_were_written(tmp_path):
     arguments = {"rtol": 0.1, "effects": {"divergence": False}, "window": (-10.0, 1 / 3), "max_orders": 3}
-    sent = jl.io.Case(PARTS["Lidar"], PARTS["Canopy"], jax.random.split(jax.random.key(7))[1], arguments)
-    back = round_trip(sent, tmp_path)
-    assert dict(back.arguments) == arguments
-    assert back.key.dtype == sent.key.dtype
-    assert np.array_equal(jax.random.key_data(back.key), jax.random.key_data(sent.key))
+    key = jax.random.split(jax.random.key(7))[1]
+    result = round_trip(jl.io.Case(EXAMPLES["Lidar"], EXAMPLES["Canopy"], key, arguments), tmp_path)
+    assert dict(result.arguments) == arguments
+    assert result.key.dtype == key.dtype
+    assert np.array_equal(jax.random.key_data(result.key), jax.random.key_data(key))
 
 
-def test_keys_of_the_old_style_and_of_other_generators(tmp_path):
+def test_raw_keys_and_keys_of_other_generators_are_read_as_they_were_written(tmp_path):
     for number, key in enumerate((jax.random.PRNGKey(5), jax.random.key(3, impl="rbg"))):
         folder = tmp_path / str(number)
         folder.mkdir()
-        back = round_trip(jl.io.Case(key=key), folder).key
-        assert back.dtype == key.dtype
-        assert np.array_equal(jax.random.uniform(back), jax.random.uniform(key))
+        result = round_trip(jl.io.Case(key=key), folder).key
+        assert result.dtype == key.dtype
+        assert np.array_equal(jax.random.uniform(result), jax.random.uniform(key))
 
 
 @pytest.mark.parametrize("path", SCENES, ids=lambda p: p.stem)
-def test_the_shipped_cases_are_whole(path, tmp_path):
+def test_example_cases_can_be_read_and_planned(path, tmp_path):
     text = path.read_text()
     if "voxelise" in text:
-        # Coarser trees, for speed.
+        # Coarser voxels, for speed.
         (tmp_path / path.name).write_text(text.replace("voxel_size = 0.25", "voxel_size = 2.0"))
         path = tmp_path / path.name
     case = jl.io.read_case(path)
@@ -178,28 +187,30 @@ def test_the_shipped_cases_are_whole(path, tmp_path):
     assert plan.n_samples > 1
 
 
-def test_a_case_simulates(tmp_path):
+def test_a_case_can_be_simulated(tmp_path):
     wave = jl.io.read_case(SCENES[[p.stem for p in SCENES].index("leaf_plate")]).simulate()
     assert np.allclose(wave.reflectance.sum(axis=1), [0.36, 0.66, 0.57], rtol=1e-4)
     with pytest.raises(ValueError, match="no lidar and no key"):
         jl.io.Case(scene=jl.Scene()).simulate()
 
 
-def test_the_page_has_a_case_that_can_be_read(tmp_path):
+def test_the_case_in_the_documentation_can_be_read(tmp_path):
     page = (Path(jl.io.__file__).parent / "README.md").read_text()
-    (block,) = [part.partition("```")[0] for part in page.split("```toml\n")[1:]]
+    (block,) = [text.partition("```")[0] for text in page.split("```toml\n")[1:]]
     (tmp_path / "a.toml").write_text(block)
     np.savez(tmp_path / "plot.npz", lad=np.full((2, 2, 3), 0.5))
     case = jl.io.read_case(tmp_path / "a.toml")
     assert case.scene.canopy.voxels.shape == (2, 2, 3)
     assert isinstance(case.scene.ground.law, jl.EqualAngle)
     assert set(tomllib.loads(block)) == {"lidar", "scene", "simulate"}
-    listed = page.partition("| functions |")[2]
+    list_of_functions = page.partition("| functions |")[2]
     functions = {name for name, kind in kinds().items() if not isinstance(kind, type)}
-    assert all(f"`{name}`" in listed for name in functions)
+    assert all(f"`{name}`" in list_of_functions for name in functions)
 
 
-class OwnLaw(jl.AbstractLaw):
+class CustomLaw(jl.AbstractLaw):
+    """A law of a user's program, whose code a file cannot hold."""
+
     k: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=1.0)
 
     def intensity_factor(self, incident, normal, view, half_angle):
@@ -208,30 +219,34 @@ class OwnLaw(jl.AbstractLaw):
     albedo = sample = density = largest_intensity_factor = intensity_factor
 
 
-class Lambertian(OwnLaw):
-    """Of the same name as one that jaxlidar has."""
+# A class of a user's program may have the name of a class of jaxlidar.
+CustomLambertian = type("Lambertian", (CustomLaw,), {})
 
 
-def own_leaf(wavelength):
+def custom_leaf(wavelength):
+    """Return reflectance and transmittance of a leaf."""
     return 0.4 + 0 * wavelength, 0.3 + 0 * wavelength
 
 
 @pytest.mark.parametrize(
-    ("scene", "says"),
+    ("scene", "message"),
     [
-        (with_ground(law=OwnLaw()), "scene.ground.law is an OwnLaw, a class of your own: a file cannot hold"),
-        (with_ground(law=Lambertian()), "scene.ground.law is a Lambertian, a class of your own"),
-        (with_leaf(own_leaf), "scene.canopy.leaf is a function: a file cannot hold the code"),
+        (
+            with_ground(law=CustomLaw()),
+            "scene.ground.law is a CustomLaw, a class of your own: a file cannot hold",
+        ),
+        (with_ground(law=CustomLambertian()), "scene.ground.law is a Lambertian, a class of your own"),
+        (with_leaf(custom_leaf), "scene.canopy.leaf is a function: a file cannot hold the code"),
     ],
 )
-def test_what_is_ones_own_is_refused(scene, says, tmp_path):
-    with pytest.raises(TypeError, match=says):
+def test_classes_and_functions_of_users_are_refused(scene, message, tmp_path):
+    with pytest.raises(TypeError, match=message):
         jl.io.write_case(tmp_path / "a.toml", jl.io.Case(scene=scene))
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
+    ("text", "message"),
     [
         ("[scen.ground]", "scen is not known; the nearest is scene$"),
         ("[lidar]\naltitud = 3", r"lidar.altitud is not known; the nearest is altitude"),
@@ -272,15 +287,15 @@ def test_what_is_ones_own_is_refused(scene, says, tmp_path):
         ),
     ],
 )
-def test_what_makes_no_sense_is_refused_with_its_place(text, says, tmp_path):
+def test_bad_files_are_refused_with_the_place_of_the_fault(text, message, tmp_path):
     path = tmp_path / "a.toml"
     path.write_text(text)
-    with pytest.raises((ValueError, TypeError, FileNotFoundError), match=says) as refused:
+    with pytest.raises((ValueError, TypeError, FileNotFoundError), match=message) as refusal:
         jl.io.read_case(path)
-    assert str(tmp_path) in str(refused.value)
+    assert str(tmp_path) in str(refusal.value)
 
 
-def test_files_lie_relative_to_the_case(tmp_path, monkeypatch):
+def test_paths_in_a_case_are_relative_to_its_folder(tmp_path, monkeypatch):
     (tmp_path / "data").mkdir()
     (tmp_path / "data" / "soil.csv").write_text("400,0.1\n2400,0.4\n")
     lines = ["VOXEL SPACE", "#min_corner:(0,0,0)", "#max_corner:(1,1,2)", "#split:(1,1,2)"]
@@ -303,7 +318,7 @@ def test_files_lie_relative_to_the_case(tmp_path, monkeypatch):
         jl.io.read_case(tmp_path / "a.toml")
 
 
-def test_terrain_is_read_from_its_file_and_kept_in_numbers(tmp_path):
+def test_terrain_is_read_from_its_file_and_written_as_numbers(tmp_path):
     head = "ncols 2\nnrows 2\nxllcorner 600000\nyllcorner 5200000\ncellsize 10\n"
     (tmp_path / "hill.asc").write_text(head + "7 8\n5 6\n")
     (tmp_path / "a.toml").write_text(
@@ -334,15 +349,15 @@ max_orders = 1
 """
 
 
-def test_surveys_are_told_by_a_few_numbers(tmp_path):
+def test_a_case_defines_a_survey_by_its_flight_line_and_scan_pattern(tmp_path):
     (tmp_path / "a.toml").write_text(SURVEY)
     case = jl.io.read_case(tmp_path / "a.toml")
     line = {"start": (0, 0), "end": (0, 10), "speed": 50.0, "pulse_rate": 25.0}
     scan = jl.Conical(half_angle=20.0, frequency=40.0)
     assert same(case.survey, jl.Survey.scan(jl.Lidar(altitude=500.0), scan, **line))
-    many = case.simulate(path=tmp_path / "many.nc")
-    assert many.reflectance.shape[:2] == (6, 1)
-    assert len(jl.open(tmp_path / "many.nc")) == 6
+    waveforms = case.simulate(path=tmp_path / "survey.nc")
+    assert waveforms.reflectance.shape[:2] == (6, 1)
+    assert len(jl.open(tmp_path / "survey.nc")) == 6
     with pytest.raises(ValueError, match=r"arguments\.atol is not known; the nearest"):
         jl.io.Case(survey=case.survey, arguments={"atol": 0.1})
     with pytest.raises(ValueError, match="the case has no scene and no key"):
@@ -354,16 +369,16 @@ def test_surveys_are_told_by_a_few_numbers(tmp_path):
 def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
     path = tmp_path / "a.toml"
     jl.io.write_case(path, jl.io.Case(jl.Lidar()))
-    old = path.read_text()
+    text_before = path.read_text()
 
-    def full(self, *args, **kwargs):
-        raise OSError("full")
+    def fail(self, *args, **kwargs):
+        raise OSError("the disk is full")
 
-    monkeypatch.setattr(Path, "write_text", full)
+    monkeypatch.setattr(Path, "write_text", fail)
     with pytest.raises(OSError, match="full"):
         jl.io.write_case(path, jl.io.Case(jl.Lidar(altitude=1.0)))
     monkeypatch.undo()
-    assert path.read_text() == old
+    assert path.read_text() == text_before
     assert list(tmp_path.iterdir()) == [path]
 
 

@@ -1,4 +1,4 @@
-"""Checkpoints: atomic entries, locks, damage, other problems, and files that cannot be written."""
+"""Checkpoints: entries are written atomically, a file is locked, and damaged or foreign files are refused."""
 
 import os
 import sqlite3
@@ -16,7 +16,7 @@ PROBLEM = {"observed": "a", "key": "b"}
 
 
 def entry(number):
-    """Return arrays of several kinds, among them strings, infinities and an empty array."""
+    """Return the arrays of an entry, among them a string, an infinite value and an empty array."""
     return {
         "values": np.array([0.5, number, np.inf]),
         "converged": np.array(number % 2 == 0),
@@ -43,7 +43,7 @@ def intact(path, problem=PROBLEM):
 
 @pytest.fixture
 def path(tmp_path):
-    """A file of three entries."""
+    """Path of a checkpoint with the entries 0, 1 and 3."""
     path = tmp_path / "run.sqlite"
     with open_checkpoint(path, PROBLEM) as checkpoint:
         for number in (0, 3, 1):
@@ -159,10 +159,10 @@ def test_all_damaged_entries_are_named_at_once(path):
     assert len(warned) == 1
 
 
-# -- other problems --------------------------------------------------------------------------------------
+# -- checkpoints of another problem -----------------------------------------------------------------------
 
 
-def test_another_problem_is_refused_with_the_parts_that_differ(path):
+def test_another_problem_is_refused_and_the_message_names_what_differs(path):
     before = path.read_bytes()
     with pytest.raises(
         ValueError, match=r"run\.sqlite holds results of another problem, which differs in key; nothing is"
@@ -176,13 +176,13 @@ def test_another_problem_is_refused_with_the_parts_that_differ(path):
     [
         ({"a": "1", "b": "3"}, "b"),
         ({"a": "3", "b": "3"}, "a, b"),
-        # Parts of one problem only are named if no others differ.
+        # A quantity that only one of the problems has is named if all common ones are equal.
         ({"a": "1", "b": "3", "c": "1"}, "b"),
         ({"a": "1", "b": "2", "c": "1"}, "c"),
         ({}, "a, b"),
     ],
 )
-def test_the_parts_that_differ(stored, differing):
+def test_differing_quantities_of_problems_are_named(stored, differing):
     problem = {"a": "1", "b": "2"}
     check_same_problem("path", problem, problem)
     with pytest.raises(ValueError, match=rf"path = path holds .* which differs in {differing}; "):
@@ -232,8 +232,8 @@ def test_a_path_that_cannot_be_written_is_refused(tmp_path, kind):
         intact(unwritable(kind, tmp_path))
 
 
-def test_missing_folders_are_made_and_no_name_is_special(tmp_path, monkeypatch):
-    """SQLite gives the name ":memory:" a meaning, this module does not."""
+def test_missing_folders_are_made_and_memory_is_an_ordinary_name(tmp_path, monkeypatch):
+    """To SQLite, ":memory:" is a database in memory; here it is the name of a file."""
     monkeypatch.chdir(tmp_path)
     for path in ("a/b/run", ":memory:"):
         with open_checkpoint(path, PROBLEM) as checkpoint:
@@ -242,7 +242,7 @@ def test_missing_folders_are_made_and_no_name_is_special(tmp_path, monkeypatch):
 
 
 def test_a_full_disk_keeps_entries_in_memory_until_there_is_room(tmp_path, monkeypatch):
-    """SQLite is told that its file may have no more than eight pages of 4 kB, later that more are allowed."""
+    """SQLite limits the file to eight pages of 4 kB, which stands for a full disk, and later to more."""
     path, connect, connections = tmp_path / "run.sqlite", sqlite3.connect, []
 
     def connect_to_small_disk(*args, **options):
@@ -257,7 +257,7 @@ def test_a_full_disk_keeps_entries_in_memory_until_there_is_room(tmp_path, monke
         for number in (3, 4):
             with pytest.raises(OSError, match=r"could not be written \(database or disk is full\)"):
                 checkpoint.add(number, large[number] | {"more": np.zeros(3000)})
-        # All entries can be read, those that were written and those that were not.
+        # Entries 3 and 4, which could not be written, are read from memory.
         assert checkpoint.numbers() == [0, 3, 4]
         for number in (0, 3, 4):
             np.testing.assert_array_equal(checkpoint.read(number)["values"], large[number]["values"])

@@ -1,4 +1,4 @@
-"""Digital elevation models: what is written is read, at its place; damaged files are refused by place."""
+"""Reader of digital elevation models: positions of the heights, missing data, bounds, and damaged files."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ ROWS = np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.5]])
 HEAD = {"ncols": 3, "nrows": 2, "xllcorner": 600_000, "yllcorner": 5_200_000, "cellsize": 10}
 
 
-def ascii_grid(folder, rows=ROWS, **changes):
+def write_ascii_grid(folder, rows=ROWS, **changes):
     head = {**HEAD, **changes}
     lines = [f"{key} {value}" for key, value in head.items() if value is not None]
     path = folder / "dem.asc"
@@ -18,7 +18,7 @@ def ascii_grid(folder, rows=ROWS, **changes):
     return path
 
 
-def tiff(folder, rows=ROWS, crs="EPSG:32632", **changes):
+def write_tiff(folder, rows=ROWS, crs="EPSG:32632", **changes):
     rasterio = pytest.importorskip("rasterio")
     transform = rasterio.Affine(10.0, 0.0, 600_000.0, 0.0, -10.0, 5_200_020.0)
     path = folder / "dem.tif"
@@ -29,20 +29,20 @@ def tiff(folder, rows=ROWS, crs="EPSG:32632", **changes):
     return path
 
 
-@pytest.mark.parametrize("write", [ascii_grid, tiff])
+@pytest.mark.parametrize("write", [write_ascii_grid, write_tiff])
 def test_heights_lie_at_the_centres_of_cells(tmp_path, write):
     terrain, crs, filled = read_dem(write(tmp_path), reflectance=0.2)
     np.testing.assert_array_equal(terrain.origin, [600_005.0, 5_200_005.0])
     np.testing.assert_array_equal(terrain.spacing, [10.0, 10.0])
-    # North-east.
+    # Of the north-eastern cell and the one south of it.
     assert float(terrain.height_at(600_025.0, 5_200_015.0)) == 3.0
     assert float(terrain.height_at(600_025.0, 5_200_005.0)) == 6.5
-    assert (crs, filled) == (None if write is ascii_grid else "EPSG:32632", 0)
+    assert (crs, filled) == (None if write is write_ascii_grid else "EPSG:32632", 0)
     assert float(terrain.reflectance) == pytest.approx(0.2)
 
 
-@pytest.mark.parametrize("write", [ascii_grid, tiff])
-def test_nodes_without_data(tmp_path, write):
+@pytest.mark.parametrize("write", [write_ascii_grid, write_tiff])
+def test_nodes_without_data_are_refused_or_filled(tmp_path, write):
     rows = np.where(ROWS == 2.0, -9999.0, ROWS)
     with pytest.raises(ValueError, match=r"1 of 6 nodes have no data, the first at x = 600015, y = 5200015"):
         read_dem(write(tmp_path, rows))
@@ -51,8 +51,8 @@ def test_nodes_without_data(tmp_path, write):
     assert filled == 1
 
 
-@pytest.mark.parametrize("write", [ascii_grid, tiff])
-def test_only_what_lies_within_bounds(tmp_path, write):
+@pytest.mark.parametrize("write", [write_ascii_grid, write_tiff])
+def test_only_nodes_within_the_bounds_are_read(tmp_path, write):
     terrain, _, _ = read_dem(write(tmp_path), bounds=(600_010, 5_200_000, 600_030, 5_200_020))
     np.testing.assert_array_equal(terrain.heights, [[5.0, 2.0], [6.5, 3.0]])
     np.testing.assert_array_equal(terrain.origin, [600_015.0, 5_200_005.0])
@@ -60,13 +60,13 @@ def test_only_what_lies_within_bounds(tmp_path, write):
         read_dem(write(tmp_path), bounds=(1, 1, 2, 2))
 
 
-def test_corners_or_centres(tmp_path):
-    path = ascii_grid(tmp_path, xllcorner=None, yllcorner=None, xllcenter=3, yllcenter=4)
+def test_a_header_may_name_the_centre_of_the_first_cell(tmp_path):
+    path = write_ascii_grid(tmp_path, xllcorner=None, yllcorner=None, xllcenter=3, yllcenter=4)
     np.testing.assert_array_equal(read_dem(path).terrain.origin, [3.0, 4.0])
 
 
 @pytest.mark.parametrize(
-    ("changes", "says"),
+    ("changes", "message"),
     [
         ({"ncols": None}, "line 5: the header has no ncols"),
         ({"ncols": 2.5}, "line 1: ncols = '2.5' is no whole number"),
@@ -80,15 +80,15 @@ def test_corners_or_centres(tmp_path):
         ({"rows": np.full((2, 3), 1e9)}, "a height of 1e[+]09 m"),
     ],
 )
-def test_damaged_grids_are_refused(tmp_path, changes, says):
-    with pytest.raises(ValueError, match=says):
-        read_dem(ascii_grid(tmp_path, **changes))
+def test_damaged_grids_are_refused(tmp_path, changes, message):
+    with pytest.raises(ValueError, match=message):
+        read_dem(write_ascii_grid(tmp_path, **changes))
 
 
-def test_tiffs_that_cannot_serve_are_refused(tmp_path):
+def test_geographic_and_truncated_tiffs_are_refused(tmp_path):
     with pytest.raises(ValueError, match="coordinates in degrees"):
-        read_dem(tiff(tmp_path, crs="EPSG:4326"))
-    path = tiff(tmp_path)
+        read_dem(write_tiff(tmp_path, crs="EPSG:4326"))
+    path = write_tiff(tmp_path)
     for size in (10, 200):
         path.write_bytes(path.read_bytes()[:size])
         with pytest.raises(ValueError, match=r"dem\.tif: "):
@@ -99,6 +99,6 @@ def test_tiffs_that_cannot_serve_are_refused(tmp_path):
 
 def test_bad_arguments_are_refused(tmp_path):
     with pytest.raises(ValueError, match="west, south, east, north"):
-        read_dem(ascii_grid(tmp_path), bounds=(2, 0, 1, 1))
+        read_dem(write_ascii_grid(tmp_path), bounds=(2, 0, 1, 1))
     with pytest.raises(ValueError, match="fill = nan"):
-        read_dem(ascii_grid(tmp_path), fill=np.nan)
+        read_dem(write_ascii_grid(tmp_path), fill=np.nan)

@@ -1,4 +1,4 @@
-"""GEDI's level 1B reader: a small file written here, the recorded one, and damaged ones."""
+"""Reader of GEDI level 1B files: a small file that is written here, a recorded file, and damaged files."""
 
 import dataclasses
 import sys
@@ -14,62 +14,69 @@ h5py = pytest.importorskip("h5py")
 RECORD = "GEDI01_B_2019108080338_O01964_T05337_02_003_01_sub.h5"
 
 
-def _tx(reference):
+def _transmitted_pulse(reference):
+    """Return 128 counts of a Gaussian pulse that is centred on sample `reference`."""
     t = np.arange(128) - reference
     return 250 + 900 * np.exp(-0.5 * (t / 6) ** 2)
 
 
-def write_small(path, start="right"):
-    """Two beams, of 3 shots (40, 50, 60 bins) and 1 (30). Bin k of shot i holds 200 + 10 i + k / 100."""
-    counts = {"BEAM0001": [40, 50, 60], "BEAM0101": [30]}
+def write_small(path, *, is_subset=False):
+    """Write a file of two beams, of 3 shots (40, 50, 60 bins) and of 1 (30).
+
+    Bin k of shot i holds 200 + 10 i + k / 100. `is_subset`: the start indices are those of a larger file, as
+    in subsets that some tools cut from a granule.
+    """
+    bins_of_beams = {"BEAM0001": [40, 50, 60], "BEAM0101": [30]}
     with h5py.File(path, "w") as file:
-        for b, (name, count) in enumerate(counts.items()):
-            n = len(count)
+        for b, (name, bins) in enumerate(bins_of_beams.items()):
+            n = len(bins)
             group = file.create_group(name)
-            first = np.cumsum(count) - count
-            if start == "full file":
-                first = first + 123456
+            first = np.cumsum(bins) - bins + (123456 if is_subset else 0)
             group["shot_number"] = np.array([10**16 + 10 * b + i for i in range(n)], dtype=np.uint64)
-            group["rx_sample_count"] = np.array(count, dtype=np.uint16)
+            group["rx_sample_count"] = np.array(bins, dtype=np.uint16)
             group["rx_sample_start_index"] = (first + 1).astype(np.uint64)
             group["tx_sample_count"] = np.full(n, 128, dtype=np.uint16)
             group["tx_sample_start_index"] = (128 * np.arange(n) + 1).astype(np.uint64)
-            waveforms = [200.0 + 10 * i + np.arange(c) / 100 for i, c in enumerate(count)]
+            waveforms = [200.0 + 10 * i + np.arange(c) / 100 for i, c in enumerate(bins)]
             group["rxwaveform"] = np.concatenate(waveforms).astype(np.float32)
-            group["txwaveform"] = np.concatenate([_tx(55.25 + i) for i in range(n)]).astype(np.float32)
+            group["txwaveform"] = np.concatenate([_transmitted_pulse(55.25 + i) for i in range(n)]).astype(
+                np.float32
+            )
             group["tx_gloc"] = (55.25 + np.arange(n)).astype(np.float32)
             group["noise_mean_corrected"] = np.full(n, 199.5)
             group["noise_stddev_corrected"] = np.full(n, 3.0)
-            where = group.create_group("geolocation")
-            where["elevation_bin0"] = np.full(n, 500.0)
-            where["elevation_lastbin"] = 500.0 - 0.15 * (np.array(count) - 1)
-            where["latitude_lastbin"] = np.full(n, -13.5)
-            where["longitude_lastbin"] = np.full(n, -44.25)
-            where["altitude_instrument"] = np.full(n, 412000.0)
-            where["local_beam_elevation"] = np.full(n, np.deg2rad(88.5), dtype=np.float32)
-            where["local_beam_azimuth"] = np.full(n, np.deg2rad(-160.0), dtype=np.float32)
+            geolocation = group.create_group("geolocation")
+            geolocation["elevation_bin0"] = np.full(n, 500.0)
+            geolocation["elevation_lastbin"] = 500.0 - 0.15 * (np.array(bins) - 1)
+            geolocation["latitude_lastbin"] = np.full(n, -13.5)
+            geolocation["longitude_lastbin"] = np.full(n, -44.25)
+            geolocation["altitude_instrument"] = np.full(n, 412000.0)
+            geolocation["local_beam_elevation"] = np.full(n, np.deg2rad(88.5), dtype=np.float32)
+            geolocation["local_beam_azimuth"] = np.full(n, np.deg2rad(-160.0), dtype=np.float32)
     return path
 
 
 @pytest.fixture
 def small(tmp_path):
+    """Path of the small file."""
     return write_small(tmp_path / "small.h5")
 
 
 @pytest.fixture(scope="module")
 def recorded():
+    """Shots of the recorded file by their numbers, and values of the level 2 products for 60 of them."""
     from tests.conftest import SHARED
 
     if not (SHARED / "gedi" / RECORD).is_file():
         pytest.skip("the recorded GEDI file is not beside this checkout")
-    answers = np.load(SHARED / "gedi" / "level2_answers_60_shots.npz")
+    level_2 = np.load(SHARED / "gedi" / "level2_answers_60_shots.npz")
     shots = {shot.shot_number: shot for shot in read_gedi_l1b(SHARED / "gedi" / RECORD)}
-    return shots, answers
+    return shots, level_2
 
 
-@pytest.mark.parametrize("start", ["right", "full file"])
-def test_fields(tmp_path, start):
-    shots = read_gedi_l1b(write_small(tmp_path / "small.h5", start))
+@pytest.mark.parametrize("is_subset", [False, True])
+def test_fields_of_shots(tmp_path, is_subset):
+    shots = read_gedi_l1b(write_small(tmp_path / "small.h5", is_subset=is_subset))
     assert [(s.beam, s.shot_number - 10**16, s.time.size) for s in shots] == [
         ("BEAM0001", 0, 40),
         ("BEAM0001", 1, 50),
@@ -91,45 +98,45 @@ def test_fields(tmp_path, start):
     assert float(pulse.std) == pytest.approx(6, rel=5e-3)
 
 
-def test_selection(small):
-    everything = read_gedi_l1b(small)
+def test_shots_are_selected_by_index_or_number(small):
+    all_shots = read_gedi_l1b(small)
 
-    def numbers(shot):
-        return [s.shot_number for s in read_gedi_l1b(small, shot)]
+    def numbers(selection):
+        return [shot.shot_number for shot in read_gedi_l1b(small, selection)]
 
-    assert numbers(2) == [everything[2].shot_number]
-    assert numbers([3, 0]) == [everything[3].shot_number, everything[0].shot_number]
-    assert numbers(np.array([1])) == [everything[1].shot_number]
+    assert numbers(2) == [all_shots[2].shot_number]
+    assert numbers([3, 0]) == [all_shots[3].shot_number, all_shots[0].shot_number]
+    assert numbers(np.array([1])) == [all_shots[1].shot_number]
     assert numbers(10**16 + 10) == [10**16 + 10]
     assert numbers(np.array([10**16 + 1], dtype=np.uint64)) == [10**16 + 1]
     assert numbers([]) == []
-    for bad in (4, -1, 10**16 + 5):
-        with pytest.raises(ValueError, match=rf"small\.h5.*{bad}.*\[0, 3\]"):
-            read_gedi_l1b(small, bad)
+    for selection in (4, -1, 10**16 + 5):
+        with pytest.raises(ValueError, match=rf"small\.h5.*{selection}.*\[0, 3\]"):
+            read_gedi_l1b(small, selection)
     with pytest.raises(ValueError, match=r"shot = 0\.5"):
         read_gedi_l1b(small, np.array([0.5]))
 
 
-def test_wrong_files(tmp_path):
+def test_missing_foreign_and_truncated_files_are_refused(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"none\.h5"):
         read_gedi_l1b(tmp_path / "none.h5")
     text = tmp_path / "text.h5"
     text.write_text("no HDF5")
     with pytest.raises(ValueError, match=r"text\.h5.*HDF5"):
         read_gedi_l1b(text)
-    other = tmp_path / "other.h5"
-    with h5py.File(other, "w") as file:
+    foreign = tmp_path / "foreign.h5"
+    with h5py.File(foreign, "w") as file:
         file["x"] = 1.0
-    with pytest.raises(ValueError, match=r"other\.h5.*BEAM"):
-        read_gedi_l1b(other)
-    cut = tmp_path / "cut.h5"
-    cut.write_bytes(write_small(tmp_path / "small.h5").read_bytes()[:5000])
-    with pytest.raises(ValueError, match=r"cut\.h5"):
-        read_gedi_l1b(cut)
+    with pytest.raises(ValueError, match=r"foreign\.h5.*BEAM"):
+        read_gedi_l1b(foreign)
+    truncated = tmp_path / "truncated.h5"
+    truncated.write_bytes(write_small(tmp_path / "small.h5").read_bytes()[:5000])
+    with pytest.raises(ValueError, match=r"truncated\.h5"):
+        read_gedi_l1b(truncated)
 
 
 @pytest.mark.parametrize(
-    ("field", "change", "place"),
+    ("field", "change", "message"),
     [
         ("tx_gloc", None, "tx_gloc.*no such dataset"),
         ("rxwaveform", None, "rxwaveform.*no such dataset"),
@@ -164,19 +171,19 @@ def test_wrong_files(tmp_path):
         ("tx_gloc", lambda x: x[0], r"tx_gloc: shape \(\), where one dimension belongs"),
     ],
 )
-def test_damage_is_named(small, field, change, place):
+def test_damaged_datasets_are_refused_by_name(small, field, change, message):
     with h5py.File(small, "r+") as file:
         group = file["BEAM0001"]
-        old = group[field][()]
+        values = group[field][()]
         del group[field]
         if change is not None:
-            group[field] = change(old)
-    with pytest.raises(ValueError, match=r"small\.h5: /BEAM0001/" + place):
+            group[field] = change(values)
+    with pytest.raises(ValueError, match=r"small\.h5: /BEAM0001/" + message):
         read_gedi_l1b(small)
 
 
 @pytest.mark.parametrize(
-    ("how", "says"),
+    ("options", "message"),
     [
         ({"shape": (2**33,)}, "8589934592 numbers are declared, but the file holds 0 of 1 parts"),
         ({"shape": (2**33,), "chunks": (2**20,)}, "the file holds 0 of 8192 parts"),
@@ -184,25 +191,26 @@ def test_damage_is_named(small, field, change, place):
         ({"shape": (3,), "external": [("elsewhere.bin", 0, 24)]}, "3 numbers are declared, but"),
     ],
 )
-def test_what_a_file_declares_but_does_not_hold_is_not_allocated(small, how, says):
+def test_a_declared_size_that_the_file_does_not_hold_is_refused(small, options, message):
+    """No memory is allocated for it: the first two would need 64 GiB."""
     with h5py.File(small, "r+") as file:
         del file["BEAM0001/noise_mean_corrected"]
-        file["BEAM0001"].create_dataset("noise_mean_corrected", dtype="f8", **how)
-    with pytest.raises(ValueError, match=r"small\.h5: /BEAM0001/noise_mean_corrected: .*" + says):
+        file["BEAM0001"].create_dataset("noise_mean_corrected", dtype="f8", **options)
+    with pytest.raises(ValueError, match=r"small\.h5: /BEAM0001/noise_mean_corrected: .*" + message):
         read_gedi_l1b(small)
 
 
 def test_a_chunk_far_larger_than_the_file_is_refused(small):
     with h5py.File(small, "r+") as file:
-        old = file["BEAM0001/tx_gloc"][()]
+        values = file["BEAM0001/tx_gloc"][()]
         del file["BEAM0001/tx_gloc"]
-        chunked = {"chunks": (2**23,), "maxshape": (None,), "compression": 9}
-        file["BEAM0001"].create_dataset("tx_gloc", data=old, **chunked)
+        options = {"chunks": (2**23,), "maxshape": (None,), "compression": 9}
+        file["BEAM0001"].create_dataset("tx_gloc", data=values, **options)
     with pytest.raises(ValueError, match="/BEAM0001/tx_gloc: 33554432 bytes are declared in a file of"):
         read_gedi_l1b(small)
 
 
-def test_beams_without_a_shot_that_is_asked_for_are_not_read(small):
+def test_beams_without_a_selected_shot_are_not_read(small):
     with h5py.File(small, "r+") as file:
         del file["BEAM0101/rxwaveform"]
     assert [shot.beam for shot in read_gedi_l1b(small, [0, 10**16 + 2])] == ["BEAM0001"] * 2
@@ -210,20 +218,20 @@ def test_beams_without_a_shot_that_is_asked_for_are_not_read(small):
         read_gedi_l1b(small, 3)
 
 
-def test_shots_apart_are_those_of_the_whole(small):
-    everything = read_gedi_l1b(small)
+def test_selected_shots_equal_those_of_the_whole_file(small):
+    all_shots = read_gedi_l1b(small)
     for shot, i in zip(read_gedi_l1b(small, [3, 0, 2, 0]), (3, 0, 2, 0)):
-        np.testing.assert_array_equal(shot.waveform, everything[i].waveform)
-        np.testing.assert_array_equal(shot.pulse_power, everything[i].pulse_power)
+        np.testing.assert_array_equal(shot.waveform, all_shots[i].waveform)
+        np.testing.assert_array_equal(shot.pulse_power, all_shots[i].pulse_power)
 
 
-def test_without_h5py(small, monkeypatch):
+def test_missing_h5py_names_the_extra_to_install(small, monkeypatch):
     monkeypatch.setitem(sys.modules, "h5py", None)
     with pytest.raises(ImportError, match=r"jaxlidar\[io\]"):
         read_gedi_l1b(small)
 
 
-def test_record_reads(recorded):
+def test_recorded_shots_are_plausible(recorded):
     shots, _ = recorded
     assert len(shots) == 300
     assert len({shot.beam for shot in shots.values()}) == 7
@@ -233,47 +241,42 @@ def test_record_reads(recorded):
         assert 0.4 < shot.zenith < 1.6
         assert abs(np.median(shot.signal[:100])) < 3 * shot.noise_std
         assert shot.signal.max() > 20 * shot.noise_std
-        width = shot.pulse_time[shot.pulse_power > shot.pulse_power.max() / 2]
-        assert 10 <= width[-1] - width[0] <= 22
+        above_half = shot.pulse_time[shot.pulse_power > shot.pulse_power.max() / 2]
+        assert 10 <= above_half[-1] - above_half[0] <= 22
         assert 0 < np.average(shot.pulse_time, weights=shot.pulse_power) < 4
 
 
-def test_record_agrees_with_level_2(recorded):
-    """The products' ground and canopy top lie where the waveforms have them."""
-    shots, answers = recorded
-    ground, top = [], []
-    for i, number in enumerate(answers["shot"]):
+def test_recorded_ground_and_canopy_top_agree_with_level_2(recorded):
+    """Waveforms have a maximum at the ground of level 2, and only noise above its highest return."""
+    shots, level_2 = recorded
+    ground_errors, signal_above_top = [], []
+    for i, number in enumerate(level_2["shot"]):
         shot = shots[int(number)]
-        near = np.abs(shot.elevation - answers["elev_lowestmode"][i]) < 2.0
-        ground.append(shot.elevation[near][shot.signal[near].argmax()] - answers["elev_lowestmode"][i])
-        assert (
-            shot.elevation[-1]
-            < answers["elev_lowestmode"][i]
-            < answers["elev_highest"][i]
-            < shot.elevation[0]
-        )
-        # No return above the highest: what is there is noise.
-        above = shot.signal[shot.elevation > answers["elev_highest"][i] + 1.0]
-        top.append(above.max() / shot.noise_std)
-        # rh is in whole centimetres above the lowest mode, cut off.
-        height = answers["elev_highest"][i] - answers["elev_lowestmode"][i]
-        assert height == pytest.approx(answers["rh100"][i] / 100, abs=0.02)
-    assert np.max(np.abs(ground)) < 1.0  # a mode among others may be a shoulder
-    assert abs(np.median(ground)) < 0.1
-    assert np.median(np.abs(ground)) < 0.2  # the local maximum of a noisy echo, in bins of 0.15 m
-    assert np.quantile(top, 0.9) < 5
-    # L2B's energies above and of the ground are the waveform's integral.
-    total = np.array([shots[int(n)].signal.sum() for n in answers["shot"]])
-    ratio = total / (answers["rv"] + answers["rg"])
+        ground, top = level_2["elev_lowestmode"][i], level_2["elev_highest"][i]
+        near_ground = np.abs(shot.elevation - ground) < 2.0
+        ground_errors.append(shot.elevation[near_ground][shot.signal[near_ground].argmax()] - ground)
+        assert shot.elevation[-1] < ground < top < shot.elevation[0]
+        signal_above_top.append(shot.signal[shot.elevation > top + 1.0].max() / shot.noise_std)
+        # Level 2 gives rh in whole centimetres above the lowest mode, rounded down.
+        assert top - ground == pytest.approx(level_2["rh100"][i] / 100, abs=0.02)
+    # The lowest mode may be the shoulder of a larger echo, which has its maximum elsewhere.
+    assert np.max(np.abs(ground_errors)) < 1.0
+    assert abs(np.median(ground_errors)) < 0.1
+    # The maximum of a noisy echo, in bins of 0.15 m.
+    assert np.median(np.abs(ground_errors)) < 0.2
+    assert np.quantile(signal_above_top, 0.9) < 5
+    # The energies of canopy (rv) and ground (rg) in level 2B sum to the integral of the waveform.
+    energy = np.array([shots[int(n)].signal.sum() for n in level_2["shot"]])
+    ratio = energy / (level_2["rv"] + level_2["rg"])
     assert abs(np.median(ratio) - 1) < 0.05
 
 
-def test_time_zero_of_the_pulse(recorded):
-    """Echoes of low vegetation, fitted with the recorded pulse, lie at level 2's ground elevation."""
-    shots, answers = recorded
+def test_time_zero_of_the_pulse_places_the_ground_where_level_2_has_it(recorded):
+    """Where vegetation is low, the recorded pulse is shifted until it fits the echo best."""
+    shots, level_2 = recorded
     shifts = np.arange(-6.0, 6.0, 0.1)
     errors = []
-    for number, ground, height in zip(answers["shot"], answers["elev_lowestmode"], answers["rh100"]):
+    for number, ground, height in zip(level_2["shot"], level_2["elev_lowestmode"], level_2["rh100"]):
         shot = shots[int(number)]
         if height > 600:  # cm
             continue
@@ -281,16 +284,17 @@ def test_time_zero_of_the_pulse(recorded):
         window = slice(peak - 60, peak + 90)
         time, signal = shot.time[window] - peak, shot.signal[window]
         echoes = [np.interp(time - d, shot.pulse_time, shot.pulse_power, 0.0, 0.0) for d in shifts]
+        # Least squares with a free amplitude: the sum of squares that each echo explains.
         explained = [(echo @ signal) ** 2 / (echo @ echo) for echo in echoes]
         errors.append(shot.elevation[peak] - 0.1498 * shifts[np.argmax(explained)] - ground)
     assert len(errors) > 30
-    # 0.07 m remain, as level 2 fits other shapes. With the centroid for time zero it would be 0.4 m.
+    # The mean error is 0.07 m, as level 2 fits another shape. With time zero at the centroid it is 0.4 m.
     assert abs(np.mean(errors)) < 0.1
     assert np.std(errors) < 0.1
 
 
-def test_flags_stay_with_the_shot(small):
-    """Absent in this subset; where they are, each shot keeps its own, and a damaged one is refused."""
+def test_quality_flags_are_read_where_a_file_has_them(small):
+    """The small file has none. Flags that are added are those of their shots; damaged ones are refused."""
     assert [(s.degrade, s.stale_return) for s in read_gedi_l1b(small)] == [(None, None)] * 4
     with h5py.File(small, "a") as file:
         file["BEAM0001/geolocation/degrade"] = np.array([0, 30, 80], np.int8)
@@ -305,7 +309,7 @@ def test_flags_stay_with_the_shot(small):
         read_gedi_l1b(small)
 
 
-def test_saturated_records_are_told(small, recorded):
+def test_saturated_bins_are_counted(small, recorded):
     shot = read_gedi_l1b(small, 0)[0]
     assert shot.saturated == 0
     clipped = dataclasses.replace(shot, waveform=np.minimum(shot.waveform, shot.waveform[30]))

@@ -1,4 +1,4 @@
-"""Simulated shots in the layout of GEDI's level 1B: what is read back, where it lies, what tools find."""
+"""Writer of GEDI level 1B files: values, positions, layout and noise of shots, and bad arguments."""
 
 import dataclasses
 
@@ -19,21 +19,22 @@ SCENE = jl.Scene(
     ground=jl.Ground(height=2.0, reflectance=0.4, slope=3.0, aspect=90.0),
     plates=(jl.Plate(height=14.0, reflectance=0.3, coverage=0.4),),
 )
-# Of the WGS-84 ellipsoid.
+# Semi-major axis (m) and squared eccentricity of the WGS-84 ellipsoid.
 A, E2 = 6378137.0, 0.00669437999014
-HERE = {"origin": (-72.18, 42.54), "elevation": 340.0}
-ELSEWHERE = {"crs": "EPSG:32633", "elevation": 340.0}
-BEAM_OF = ["BEAM0101", "BEAM0000", "BEAM0101", "BEAM1011"]
+# Two ways to place a scene on the Earth: by its origin (longitude, latitude), or by a projection.
+GEOGRAPHIC_PLACE = {"origin": (-72.18, 42.54), "elevation": 340.0}
+PROJECTED_PLACE = {"crs": "EPSG:32633", "elevation": 340.0}
+BEAMS = ["BEAM0101", "BEAM0000", "BEAM0101", "BEAM1011"]
 
 
 @pytest.fixture(scope="module")
 def survey():
-    place = [(0.0, 0.0), (60.0, 0.0), (120.0, 30.0), (-50.0, 700.0)]
-    return jl.Survey(LIDAR, position=place, zenith=[0.0, 1.0, 1.5, 0.5], azimuth=[0.0, 30.0, 200.0, 300.0])
+    position = [(0.0, 0.0), (60.0, 0.0), (120.0, 30.0), (-50.0, 700.0)]
+    return jl.Survey(LIDAR, position=position, zenith=[0.0, 1.0, 1.5, 0.5], azimuth=[0.0, 30.0, 200.0, 300.0])
 
 
 @pytest.fixture(scope="module")
-def many(survey):
+def waveforms(survey):
     return jl.simulate_many(survey, SCENE, key=jax.random.key(1), max_orders=1)
 
 
@@ -42,85 +43,90 @@ def path(tmp_path):
     return tmp_path / "simulated.h5"
 
 
-def by_shot(path):
-    """The shots of a file in the order of the survey: by the last digits of their numbers."""
+def shots_in_survey_order(path):
+    """Return the shots of a file in the order of the survey, by the last digits of their numbers."""
     return sorted(read_gedi_l1b(path), key=lambda shot: shot.shot_number % 10**8)
 
 
-def test_what_is_read_is_what_was_simulated(many, survey, path):
-    light = {"gain": 2e4, "noise_mean": 210.0, "noise_std": 2.5}
-    write_gedi_l1b(path, many, survey, **HERE, **light, beam=BEAM_OF, margin=0)
-    assert [shot.beam for shot in read_gedi_l1b(path)] == sorted(BEAM_OF)
-    for i, shot in enumerate(by_shot(path)):
-        assert shot.beam == BEAM_OF[i]
+def test_shots_are_read_as_they_were_simulated(waveforms, survey, path):
+    digitiser = {"gain": 2e4, "noise_mean": 210.0, "noise_std": 2.5}
+    write_gedi_l1b(path, waveforms, survey, **GEOGRAPHIC_PLACE, **digitiser, beam=BEAMS, margin=0)
+    assert [shot.beam for shot in read_gedi_l1b(path)] == sorted(BEAMS)
+    for i, shot in enumerate(shots_in_survey_order(path)):
+        assert shot.beam == BEAMS[i]
         assert shot.shot_number == 10**13 + int(shot.beam[4:], 2) * 10**11 + i + 1
         assert (shot.noise_mean, shot.noise_std, shot.degrade, shot.stale_return) == (210.0, 2.5, 0, 0)
-        # Between light from 14 m above and the reference plane, energies differ by 7e-5.
-        counts = 210.0 + 2e4 * many.reflectance[i, 0]
+        # Counts are proportional to energy, which falls with the square of the range: by 7e-5 over the 14 m
+        # between the plate and the reference plane.
+        counts = 210.0 + 2e4 * waveforms.reflectance[i, 0]
         np.testing.assert_allclose(shot.waveform, counts, rtol=1e-4)
         assert np.ptp(shot.waveform) > 100
-        np.testing.assert_allclose(shot.elevation, 340.0 + np.asarray(many[i].height), atol=1e-4)
+        np.testing.assert_allclose(shot.elevation, 340.0 + np.asarray(waveforms[i].height), atol=1e-4)
         assert shot.zenith == pytest.approx(survey.zenith[i], abs=1e-5)
         assert shot.altitude == 400340.0
         pulse = jl.SampledPulse(time=shot.pulse_time, power=shot.pulse_power)
         assert float(pulse.mean) == pytest.approx(0.0, abs=1e-4)
-        # Samples are energies of 1 ns, and lines join them: 1/12 and 1/6 ns2 more.
+        # Samples are means over 1 ns, which adds 1/12 ns2 to the variance, and `SampledPulse` interpolates
+        # linearly between them, which adds 1/6 ns2.
         assert float(pulse.std) ** 2 == pytest.approx(float(LIDAR.pulse.std) ** 2 + 1 / 12 + 1 / 6, rel=1e-4)
 
 
-def test_the_same_from_single_waveforms_to_the_bit(many, survey, path, tmp_path):
-    write_gedi_l1b(path, many, survey, **HERE, key=jax.random.key(2))
-    write_gedi_l1b(tmp_path / "list.h5", list(many), survey, **HERE, key=jax.random.key(2))
-    with h5py.File(path) as one, h5py.File(tmp_path / "list.h5") as other:
-        sets = []
-        one.visititems(lambda name, node: sets.append(name) if isinstance(node, h5py.Dataset) else None)
-        assert len(sets) > 8 * 30
-        assert all(np.array_equal(one[name], other[name]) for name in sets)
+def test_a_list_of_waveforms_makes_the_same_file(waveforms, survey, path, tmp_path):
+    write_gedi_l1b(path, waveforms, survey, **GEOGRAPHIC_PLACE, key=jax.random.key(2))
+    write_gedi_l1b(tmp_path / "list.h5", list(waveforms), survey, **GEOGRAPHIC_PLACE, key=jax.random.key(2))
+    with h5py.File(path) as file, h5py.File(tmp_path / "list.h5") as file_of_list:
+        datasets = []
+        file.visititems(lambda name, node: datasets.append(name) if isinstance(node, h5py.Dataset) else None)
+        # Eight beams, of more than 30 datasets each.
+        assert len(datasets) > 8 * 30
+        assert all(np.array_equal(file[name], file_of_list[name]) for name in datasets)
 
 
-def test_waveforms_of_different_lengths_and_pulses_of_any_kind(many, path):
-    some, last = slice(20, 150), many[1]
-    cut = {name: getattr(last, name)[:, some] for name in ("reflectance", "recorded")}
-    waves = [many[0], dataclasses.replace(last, time=last.time[some], **cut)]
+def test_waveforms_of_different_lengths_and_a_rectangular_pulse(waveforms, path):
+    bins, second = slice(20, 150), waveforms[1]
+    shortened = {name: getattr(second, name)[:, bins] for name in ("reflectance", "recorded")}
+    waves = [waveforms[0], dataclasses.replace(second, time=second.time[bins], **shortened)]
     lidar = dataclasses.replace(LIDAR, pulse=jl.RectangularPulse(length=90.0))
-    survey = jl.Survey(lidar, many.position[:2], many.zenith[:2])
-    write_gedi_l1b(path, waves, survey, **HERE, shot_number=[7, 2**60])
+    survey = jl.Survey(lidar, waveforms.position[:2], waveforms.zenith[:2])
+    write_gedi_l1b(path, waves, survey, **GEOGRAPHIC_PLACE, shot_number=[7, 2**60])
     for shot, wave in zip(read_gedi_l1b(path, [7, 2**60]), waves, strict=True):
+        # A margin of 200 bins on both sides is the default.
         assert shot.time.size == wave.time.size + 2 * 200
         assert shot.signal.sum() == pytest.approx(float(50_000 * wave.reflectance.sum()), rel=2e-4)
         assert shot.elevation[0] == pytest.approx(340.0 - 0.149896229 * (float(wave.time[0]) - 200), abs=1e-2)
         assert shot.pulse_power.sum() == pytest.approx(90 * shot.pulse_power.max(), rel=1e-4)
 
 
-def test_background_is_part_of_the_pedestal(many, survey, path):
-    """Energies relate to E eta A / (pi R^2) of a Lambertian target; margins have background as well."""
-    lit = dataclasses.replace(LIDAR, receiver=jl.Receiver(background=1e-16), energy=0.01)
-    of = jl.Survey(lit, survey.position, survey.zenith, survey.azimuth)
-    waves = dataclasses.replace(many, recorded=np.full_like(many.recorded, 1e-16))
-    write_gedi_l1b(path, waves, of, **HERE)
-    for shot, zenith in zip(by_shot(path), np.deg2rad(survey.zenith), strict=True):
+def test_background_is_part_of_the_pedestal(waveforms, survey, path):
+    """Counts are the gain times the energy in units of E eta A / (pi R^2), also those of margins."""
+    lidar = dataclasses.replace(LIDAR, receiver=jl.Receiver(background=1e-16), energy=0.01)
+    sunlit_survey = jl.Survey(lidar, survey.position, survey.zenith, survey.azimuth)
+    sunlit = dataclasses.replace(waveforms, recorded=np.full_like(waveforms.recorded, 1e-16))
+    write_gedi_l1b(path, sunlit, sunlit_survey, **GEOGRAPHIC_PLACE)
+    for shot, zenith in zip(shots_in_survey_order(path), np.deg2rad(survey.zenith), strict=True):
         counts = 240.0 + 50_000 * 1e-16 / (0.01 * 0.4**2 * np.cos(zenith) ** 2 / 4e5**2)
         assert shot.noise_mean == pytest.approx(counts, rel=1e-6)
         assert counts > 250.0
         np.testing.assert_allclose(shot.waveform, counts, rtol=1e-6)
 
 
-def test_datasets_are_the_products(many, survey, path, shared):
-    """Every dataset has the name, type and number of axes that it has in a recorded file."""
+def test_datasets_have_the_layout_of_the_product(waveforms, survey, path, shared):
+    """Every dataset has the name, type and number of axes of the same dataset in a recorded file."""
     if not (shared / "gedi" / RECORD).is_file():
         pytest.skip("the recorded GEDI file is not beside this checkout")
-    write_gedi_l1b(path, many, survey, **HERE)
-    with h5py.File(path) as file, h5py.File(shared / "gedi" / RECORD) as real:
-        assert file.attrs["short_name"] == real.attrs["short_name"]
-        assert set(file) == {*real, "BEAM0000"}
-        for name in set(real) - {"METADATA"}:
-            assert file[name].attrs["description"] == real[name].attrs["description"]
+    write_gedi_l1b(path, waveforms, survey, **GEOGRAPHIC_PLACE)
+    with h5py.File(path) as file, h5py.File(shared / "gedi" / RECORD) as product:
+        assert file.attrs["short_name"] == product.attrs["short_name"]
+        # The recorded subset lacks one beam.
+        assert set(file) == {*product, "BEAM0000"}
+        for name in set(product) - {"METADATA"}:
+            assert file[name].attrs["description"] == product[name].attrs["description"]
             for field in ("beam", "channel"):
-                assert {int(real[f"{name}/{field}"][0])} >= set(file[f"{name}/{field}"][:].tolist())
+                assert {int(product[f"{name}/{field}"][0])} >= set(file[f"{name}/{field}"][:].tolist())
 
         def compare(name, node):
             if isinstance(node, h5py.Dataset):
-                assert (node.dtype, node.ndim) == (real[f"BEAM0101/{name}"].dtype, 1), name
+                assert (node.dtype, node.ndim) == (product[f"BEAM0101/{name}"].dtype, 1), name
             else:
                 assert name == "geolocation"
 
@@ -128,10 +134,10 @@ def test_datasets_are_the_products(many, survey, path, shared):
             file[name].visititems(compare)
 
 
-def test_tools_find_records_and_elevations(many, survey, path):
-    """As rGEDI and pyGEDI do: all eight groups, indices from 1, elevations from both ends and the count."""
-    write_gedi_l1b(path, many, survey, **HERE, beam=BEAM_OF)
-    found = {}
+def test_records_can_be_read_as_rgedi_and_pygedi_do(waveforms, survey, path):
+    """These tools read all eight groups, and find records by indices that start at 1 and by their lengths."""
+    write_gedi_l1b(path, waveforms, survey, **GEOGRAPHIC_PLACE, beam=BEAMS)
+    records = {}
     with h5py.File(path) as file:
         for name in ("0000", "0001", "0010", "0011", "0101", "0110", "1000", "1011"):
             group = file[f"BEAM{name}"]
@@ -141,90 +147,99 @@ def test_tools_find_records_and_elevations(many, survey, path):
                 start = int(group["rx_sample_start_index"][i] - group["rx_sample_start_index"][:].min())
                 count = int(group["rx_sample_count"][i])
                 record = group["rxwaveform"][start : start + count]
-                above = record.sum(dtype=float) - count * group["noise_mean_corrected"][i]
-                assert group["rx_energy"][i] == pytest.approx(above)
-                found[int(number)] = record
+                signal = record.sum(dtype=float) - count * group["noise_mean_corrected"][i]
+                assert group["rx_energy"][i] == pytest.approx(signal)
+                records[int(number)] = record
     shots = read_gedi_l1b(path)
-    assert len(shots) == len(found) == 4
-    assert all(np.array_equal(shot.waveform, found[shot.shot_number]) for shot in shots)
+    assert len(shots) == len(records) == 4
+    assert all(np.array_equal(shot.waveform, records[shot.shot_number]) for shot in shots)
 
 
-def test_the_command_tells_what_a_file_has(many, survey, path, capsys):
+def test_the_info_command_describes_a_file(waveforms, survey, path, capsys):
     from jaxlidar import cli
 
-    write_gedi_l1b(path, many, survey, **HERE, beam=BEAM_OF)
+    write_gedi_l1b(path, waveforms, survey, **GEOGRAPHIC_PLACE, beam=BEAMS)
     assert cli.main(["info", str(path)]) == 0
-    said = capsys.readouterr().out.splitlines()
-    assert said[0] == "4 GEDI shots of BEAM0000, BEAM0101, BEAM1011"
-    assert said[1].startswith("latitude ")
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "4 GEDI shots of BEAM0000, BEAM0101, BEAM1011"
+    assert lines[1].startswith("latitude ")
 
 
-def test_level_2_finds_the_simulated_ground(many, survey, path):
-    write_gedi_l1b(path, many, survey, **HERE, key=jax.random.key(3))
-    found = gedi_metrics(by_shot(path))
-    assert np.all(np.abs(found.elev_lowestmode - (340.0 + many.ground_height)) < 0.1)
-    assert found.num_detectedmodes.tolist() == [2] * 4
-    # Half of the light of the plate comes from above it, spread by the pulse.
-    assert np.all(np.abs(found.rh[:, 98] - (14.0 - many.ground_height)) < 3.0)
+def test_the_level_2_algorithm_detects_the_simulated_ground(waveforms, survey, path):
+    write_gedi_l1b(path, waveforms, survey, **GEOGRAPHIC_PLACE, key=jax.random.key(3))
+    metrics = gedi_metrics(shots_in_survey_order(path))
+    assert np.all(np.abs(metrics.elev_lowestmode - (340.0 + waveforms.ground_height)) < 0.1)
+    assert metrics.num_detectedmodes.tolist() == [2] * 4
+    # The pulse spreads the echo of the plate, so that half of it appears above the plate.
+    assert np.all(np.abs(metrics.rh[:, 98] - (14.0 - waveforms.ground_height)) < 3.0)
 
 
-def test_places_on_the_ellipsoid(survey, many, path):
-    """Near the origin: metres by the radii of curvature; the light comes from where the sensor is."""
-    write_gedi_l1b(path, many, survey, **HERE)
-    phi = np.deg2rad(42.54)
-    bend = 1 - E2 * np.sin(phi) ** 2
-    north, east = A * (1 - E2) / bend**1.5, A / np.sqrt(bend) * np.cos(phi)
+def test_positions_lie_on_the_ellipsoid(survey, waveforms, path):
+    """Degrees become metres by the radii of curvature at the origin: along the meridian and across it."""
+    write_gedi_l1b(path, waveforms, survey, **GEOGRAPHIC_PLACE)
+    latitude = np.deg2rad(42.54)
+    w = 1 - E2 * np.sin(latitude) ** 2
+    metres_north, metres_east = A * (1 - E2) / w**1.5, A / np.sqrt(w) * np.cos(latitude)
     slope = np.tan(np.deg2rad(survey.zenith))[:, None]
-    down = np.stack([np.sin(np.deg2rad(survey.azimuth)), np.cos(np.deg2rad(survey.azimuth))], 1)
+    # Horizontal direction in which the light travels downwards.
+    heading = np.stack([np.sin(np.deg2rad(survey.azimuth)), np.cos(np.deg2rad(survey.azimuth))], 1)
     with h5py.File(path) as file:
-        place = {name: node[:] for name, node in file["BEAM0101/geolocation"].items()}
+        geolocation = {name: node[:] for name, node in file["BEAM0101/geolocation"].items()}
     for name in ("bin0", "lastbin"):
-        x, y = (survey.position - (place[f"elevation_{name}"] - 340.0)[:, None] * slope * down).T
-        assert np.abs(np.deg2rad(place[f"longitude_{name}"] + 72.18) * east - x).max() < 0.2
-        assert np.abs(np.deg2rad(place[f"latitude_{name}"] - 42.54) * north - y).max() < 0.2
-        # To the bounce and no farther: half the way there and back.
-        drop = (place["altitude_instrument"] - place[f"elevation_{name}"]) / np.cos(np.arctan(slope[:, 0]))
-        np.testing.assert_allclose(place[f"bounce_time_offset_{name}"] * 299792458.0, drop, rtol=1e-9)
-    towards = np.stack([np.sin(place["local_beam_azimuth"]), np.cos(place["local_beam_azimuth"])], 1)
-    np.testing.assert_allclose(towards, -down, atol=3e-4)
-    shift = np.stack([place["longitude_instrument"] + 72.18, place["latitude_instrument"] - 42.54], 1)
-    away = np.hypot(*(np.deg2rad(shift) * [east, north] - survey.position).T)
-    np.testing.assert_allclose(away, 4e5 * slope[:, 0], rtol=5e-3, atol=0.2)
+        height = (geolocation[f"elevation_{name}"] - 340.0)[:, None]
+        x, y = (survey.position - height * slope * heading).T
+        assert np.abs(np.deg2rad(geolocation[f"longitude_{name}"] + 72.18) * metres_east - x).max() < 0.2
+        assert np.abs(np.deg2rad(geolocation[f"latitude_{name}"] - 42.54) * metres_north - y).max() < 0.2
+        # The offset is the time from the sensor to the bin, one way.
+        drop = geolocation["altitude_instrument"] - geolocation[f"elevation_{name}"]
+        distance = drop / np.cos(np.arctan(slope[:, 0]))
+        offset = geolocation[f"bounce_time_offset_{name}"]
+        np.testing.assert_allclose(offset * 299792458.0, distance, rtol=1e-9)
+    # The azimuth of the product points from the ground to the sensor.
+    azimuth = geolocation["local_beam_azimuth"]
+    np.testing.assert_allclose(np.stack([np.sin(azimuth), np.cos(azimuth)], 1), -heading, atol=3e-4)
+    longitude, latitude = geolocation["longitude_instrument"], geolocation["latitude_instrument"]
+    degrees = np.stack([longitude + 72.18, latitude - 42.54], 1)
+    sensor_offset = np.deg2rad(degrees) * [metres_east, metres_north] - survey.position
+    np.testing.assert_allclose(np.hypot(*sensor_offset.T), 4e5 * slope[:, 0], rtol=5e-3, atol=0.2)
 
 
-def test_projected_positions_and_the_grids_north(many, path):
-    place = many.position + np.array([700_000.0, 5_550_000.0])
-    survey = jl.Survey(LIDAR, position=place, zenith=many.zenith, azimuth=many.azimuth)
-    write_gedi_l1b(path, dataclasses.replace(many, position=place), survey, **ELSEWHERE)
-    for shot, given in zip(by_shot(path), many.azimuth, strict=True):
-        # Of the transverse Mercator projection: tan(convergence) = tan(longitude - 15) sin(latitude).
-        phi, lam = np.deg2rad([shot.latitude, shot.longitude - 15.0])
-        turned = np.rad2deg(np.arctan(np.tan(lam) * np.sin(phi)))
-        assert turned == pytest.approx(2.2, abs=0.1)
-        assert (shot.azimuth - given - turned + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=0.02)
+def test_azimuths_of_projected_surveys_are_relative_to_true_north(waveforms, path):
+    position = waveforms.position + np.array([700_000.0, 5_550_000.0])
+    survey = jl.Survey(LIDAR, position=position, zenith=waveforms.zenith, azimuth=waveforms.azimuth)
+    write_gedi_l1b(path, dataclasses.replace(waveforms, position=position), survey, **PROJECTED_PLACE)
+    for shot, grid_azimuth in zip(shots_in_survey_order(path), waveforms.azimuth, strict=True):
+        # Transverse Mercator projection: tan(convergence) = tan(longitude - 15 degrees) sin(latitude).
+        latitude, longitude = np.deg2rad([shot.latitude, shot.longitude - 15.0])
+        convergence = np.rad2deg(np.arctan(np.tan(longitude) * np.sin(latitude)))
+        assert convergence == pytest.approx(2.2, abs=0.1)
+        difference = (shot.azimuth - grid_azimuth - convergence + 180.0) % 360.0 - 180.0
+        assert difference == pytest.approx(0.0, abs=0.02)
 
 
 def noise_of(shots, noise_mean):
+    """Return the waveforms of shots without light, less the pedestal."""
     return np.stack([shot.waveform - noise_mean for shot in shots])
 
 
-def test_noise_is_that_of_the_product(many, survey, path):
-    """Standard deviation and correlation of recorded noise; another shot has other noise."""
-    many = dataclasses.replace(many, time=np.arange(4000.0), recorded=np.zeros((4, 1, 4000), np.float32))
-    write_gedi_l1b(path, many, survey, **HERE, key=jax.random.key(5), noise_std=3.0)
-    noise = noise_of(by_shot(path), 240.0)
+def test_noise_has_the_statistics_of_the_product(waveforms, survey, path):
+    """It has the standard deviation and autocorrelation of recorded noise; shots have independent noise."""
+    recorded = np.zeros((4, 1, 4000), np.float32)
+    dark = dataclasses.replace(waveforms, time=np.arange(4000.0), recorded=recorded)
+    write_gedi_l1b(path, dark, survey, **GEOGRAPHIC_PLACE, key=jax.random.key(5), noise_std=3.0)
+    noise = noise_of(shots_in_survey_order(path), 240.0)
     assert np.abs(np.corrcoef(noise)[np.triu_indices(4, 1)]).max() < 0.15
     assert noise.std() == pytest.approx(0.407 * 3.0, rel=0.03)
     power = (noise**2).mean()
     lagged = [(noise[:, lag:] * noise[:, : noise.shape[1] - lag]).mean() / power for lag in range(1, 6)]
-    # Measured of recorded shots, and white noise is far from it.
+    # Autocorrelations that were measured in recorded shots; those of white noise would be 0.
     np.testing.assert_allclose(lagged, [0.92, 0.71, 0.45, 0.21, 0.1], atol=0.05)
-    write_gedi_l1b(path, many, survey, **HERE)
-    assert not noise_of(by_shot(path), 240.0).any()
+    write_gedi_l1b(path, dark, survey, **GEOGRAPHIC_PLACE)
+    assert not noise_of(shots_in_survey_order(path), 240.0).any()
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "message"),
     [
         ({"origin": None}, r"origin = None and crs = None: give one of them"),
         ({"crs": "EPSG:32633"}, "give one of them"),
@@ -244,28 +259,29 @@ def test_noise_is_that_of_the_product(many, survey, path):
         ({"shot_number": np.array([1.0, 2.0, 3.0, 4.0])}, "shot_number has the type float64"),
     ],
 )
-def test_refusals(many, survey, path, change, says):
+def test_bad_arguments_are_refused_and_the_old_file_remains(waveforms, survey, path, change, message):
     path.write_text("old")
-    with pytest.raises(ValueError, match=says):
-        write_gedi_l1b(path, many, survey, **{**HERE, **change})
+    with pytest.raises(ValueError, match=message):
+        write_gedi_l1b(path, waveforms, survey, **{**GEOGRAPHIC_PLACE, **change})
     assert [p.name for p in path.parent.iterdir()] == [path.name]
     assert path.read_text() == "old"
 
 
-def test_waveforms_that_are_not_the_products_are_refused(many, survey, path):
-    def refused(says, waves=many, of=survey, error=ValueError):
-        with pytest.raises(error, match=says):
-            write_gedi_l1b(path, waves, of, **HERE)
+def test_waveforms_that_the_product_cannot_hold_are_refused(waveforms, survey, path):
+    def assert_refused(message, waves=waveforms, survey=survey, error=ValueError):
+        with pytest.raises(error, match=message):
+            write_gedi_l1b(path, waves, survey, **GEOGRAPHIC_PLACE)
 
-    refused(r"4 waveforms are of a survey of 2 shots", of=survey[:2])
-    refused("another position", of=jl.Survey(LIDAR, position=many.position + 1.0))
-    refused(r"samples are 2 ns apart; admissible is 1 ns", dataclasses.replace(many, time=2 * many.time))
-    two = dataclasses.replace(many, wavelength=np.array([532.0, 1064.0]))
-    refused("2 wavelengths; admissible is one", two)
-    long = dataclasses.replace(many, time=np.arange(70_000.0))
-    refused("70000 bins; admissible are 2 to 65135", long)
-    lost = many.recorded.copy()
-    lost[2, 0, 3] = np.nan
-    refused("recorded of shot 2 = nan", dataclasses.replace(many, recorded=lost))
-    refused("waveforms 1 is .* admissible is a Waveform", [many[0], 1, 2, 3], error=TypeError)
+    def changed(**fields):
+        return dataclasses.replace(waveforms, **fields)
+
+    assert_refused(r"4 waveforms are of a survey of 2 shots", survey=survey[:2])
+    assert_refused("another position", survey=jl.Survey(LIDAR, position=waveforms.position + 1.0))
+    assert_refused(r"samples are 2 ns apart; admissible is 1 ns", changed(time=2 * waveforms.time))
+    assert_refused("2 wavelengths; admissible is one", changed(wavelength=np.array([532.0, 1064.0])))
+    assert_refused("70000 bins; admissible are 2 to 65135", changed(time=np.arange(70_000.0)))
+    recorded = waveforms.recorded.copy()
+    recorded[2, 0, 3] = np.nan
+    assert_refused("recorded of shot 2 = nan", changed(recorded=recorded))
+    assert_refused("waveforms 1 is .* admissible is a Waveform", [waveforms[0], 1, 2, 3], error=TypeError)
     assert not list(path.parent.iterdir())

@@ -1,4 +1,4 @@
-"""Results as netCDF: they come back to the bit, carry their units and case, and damage does not pass."""
+"""Results as netCDF: exact round trips, units, cases that can be run again, damage, and old files."""
 
 import builtins
 import dataclasses
@@ -89,27 +89,27 @@ def fits():
     )
 
 
-def same(got, sent):
-    """Equal to the bit; types, names and static fields too."""
-    pairs = list(zip(jax.tree.leaves(got), jax.tree.leaves(sent)))
-    kinds = all(isinstance(a, np.ndarray) == isinstance(b, np.ndarray) for a, b in pairs)
-    bits = all(
+def same(result, expected):
+    """True if two results are equal bit for bit, in their types, names and static fields too."""
+    pairs = list(zip(jax.tree.leaves(result), jax.tree.leaves(expected)))
+    same_classes = all(isinstance(a, np.ndarray) == isinstance(b, np.ndarray) for a, b in pairs)
+    same_bits = all(
         np.asarray(a).dtype == np.asarray(b).dtype and np.asarray(a).tobytes() == np.asarray(b).tobytes()
         for a, b in pairs
     )
-    return jax.tree.structure(got) == jax.tree.structure(sent) and kinds and bits
+    return jax.tree.structure(result) == jax.tree.structure(expected) and same_classes and same_bits
 
 
 @pytest.mark.parametrize("name", ["wave", "fit", "fits"])
-def test_it_comes_back_to_the_bit(name, request, tmp_path):
-    sent = request.getfixturevalue(name)
-    jl.io.save(sent, tmp_path / "a.nc")
-    assert same(jl.open(tmp_path / "a.nc"), sent)
-    other = eqx.tree_at(lambda r: jax.tree.leaves(r)[0], sent, replace_fn=lambda x: x + 1)
-    assert not same(jl.open(tmp_path / "a.nc"), other)
+def test_results_are_read_as_they_were_written(name, request, tmp_path):
+    result = request.getfixturevalue(name)
+    jl.io.save(result, tmp_path / "a.nc")
+    assert same(jl.open(tmp_path / "a.nc"), result)
+    changed = eqx.tree_at(lambda r: jax.tree.leaves(r)[0], result, replace_fn=lambda x: x + 1)
+    assert not same(jl.open(tmp_path / "a.nc"), changed)
 
 
-def test_double_precision_comes_back_in_single(wave, tmp_path):
+def test_double_precision_is_kept_when_jax_reads_in_single_precision(wave, tmp_path):
     with jax.enable_x64(True):
         double = jax.tree.map(lambda x: np.asarray(x, np.float64) / 3, wave)
         double = jax.tree.map(jax.numpy.asarray, double)
@@ -117,7 +117,7 @@ def test_double_precision_comes_back_in_single(wave, tmp_path):
     assert same(jl.open(tmp_path / "a.nc"), double)
 
 
-def test_methods_save_as_well(wave, fit, fits, tmp_path):
+def test_results_have_a_method_that_saves_them(wave, fit, fits, tmp_path):
     fits.save(tmp_path / "fits.nc")
     assert same(jl.open(tmp_path / "fits.nc"), fits)
     wave.save(tmp_path / "wave.nc")
@@ -126,23 +126,25 @@ def test_methods_save_as_well(wave, fit, fits, tmp_path):
     assert same(jl.open(tmp_path / "fit.nc").scene, fit.scene)
 
 
-def test_a_run_is_repeated_bit_for_bit(wave, case, tmp_path):
+def test_a_saved_run_is_repeated_bit_for_bit(wave, case, tmp_path):
     path = tmp_path / "a.nc"
     wave.save(path, case)
-    again = jl.rerun(path)
-    assert jax.tree.all(jax.tree.map(np.array_equal, again, with_info(wave, again.info)))
-    other = jl.io.Case(case.lidar, case.scene, jax.random.key(4), case.arguments).simulate()
-    assert not np.array_equal(other.reflectance, wave.reflectance)
-    assert again.info["photons"] == wave.info["photons"] > 0
-    kept = jl.io.read_case(path)
-    assert same((kept.lidar, kept.scene), (case.lidar, case.scene))
+    repeated = jl.rerun(path)
+    # `info` has the elapsed time, which differs.
+    assert jax.tree.all(jax.tree.map(np.array_equal, repeated, with_info(wave, repeated.info)))
+    other_key = jl.io.Case(case.lidar, case.scene, jax.random.key(4), case.arguments).simulate()
+    assert not np.array_equal(other_key.reflectance, wave.reflectance)
+    assert repeated.info["photons"] == wave.info["photons"] > 0
+    stored_case = jl.io.read_case(path)
+    assert same((stored_case.lidar, stored_case.scene), (case.lidar, case.scene))
 
 
 def with_info(wave, info):
+    """Return a waveform with its `info` replaced."""
     return type(wave)(**{**vars(wave), "info": info})
 
 
-def test_what_cannot_be_repeated_is_refused(wave, case, tmp_path):
+def test_runs_that_cannot_be_repeated_are_refused(wave, case, tmp_path):
     path = tmp_path / "a.nc"
     wave.save(path)
     with pytest.raises(ValueError, match=r"a.nc: /case: no such attribute: it was saved without its case"):
@@ -157,7 +159,7 @@ def test_what_cannot_be_repeated_is_refused(wave, case, tmp_path):
         wave.save(path, jl.io.Case(jl.Lidar()))
 
 
-def test_xarray_opens_it_with_coordinates_and_units(wave, case, tmp_path):
+def test_xarray_reads_coordinates_and_units(wave, case, tmp_path):
     xarray = pytest.importorskip("xarray")
     wave.save(tmp_path / "a.nc", case)
     with xarray.open_dataset(tmp_path / "a.nc", engine="h5netcdf", decode_timedelta=False) as data:
@@ -172,8 +174,7 @@ def test_xarray_opens_it_with_coordinates_and_units(wave, case, tmp_path):
         assert all({"units", "long_name"} <= set(v.attrs) for v in data.data_vars.values())
 
 
-def test_every_quantity_of_a_known_class_has_units():
-
+def test_every_quantity_of_a_registered_class_has_units():
     for layout in datasets.LAYOUTS.values():
         if layout.kind.__module__.startswith(("jaxlidar", "inversion")):
             names = {f.name for f in dataclasses.fields(layout.kind) if not f.metadata.get("static")}
@@ -181,40 +182,42 @@ def test_every_quantity_of_a_known_class_has_units():
 
 
 @pytest.mark.parametrize("name", ["wave", "fits"])
-def test_damage_does_not_pass(name, request, tmp_path):
-    """Whatever byte is another, or wherever the file ends: it is refused by name, or nothing is lost."""
-    sent, path = request.getfixturevalue(name), tmp_path / "a.nc"
-    jl.io.save(sent, path)
-    whole, refused = path.read_bytes(), 0
+def test_damaged_files_are_refused_by_name(name, request, tmp_path):
+    """A file with one changed byte is refused, unless the result is unchanged."""
+    result, path = request.getfixturevalue(name), tmp_path / "a.nc"
+    jl.io.save(result, path)
+    content, n_refusals = path.read_bytes(), 0
     rng = np.random.default_rng(5)
-    for at in rng.integers(0, len(whole), 60):
-        path.write_bytes(whole[:at] + bytes([whole[at] ^ rng.integers(1, 256)]) + whole[at + 1 :])
+    for offset in rng.integers(0, len(content), 60):
+        byte = bytes([content[offset] ^ rng.integers(1, 256)])
+        path.write_bytes(content[:offset] + byte + content[offset + 1 :])
         try:
-            back = jl.open(path)
+            result_of_damaged_file = jl.open(path)
         except ValueError as error:
             assert str(error).startswith(str(path))  # noqa: PT017
-            refused += 1
+            n_refusals += 1
         else:
-            assert same(back, sent), at
-    assert refused > 5
-    for end in (0, 7, 100, len(whole) // 2, len(whole) - 1):
-        path.write_bytes(whole[:end])
+            assert same(result_of_damaged_file, result), offset
+    assert n_refusals > 5
+    for size in (0, 7, 100, len(content) // 2, len(content) - 1):
+        path.write_bytes(content[:size])
         with pytest.raises(ValueError, match=r"a.nc: "):
             jl.open(path)
 
 
-def test_damaged_numbers_are_refused_with_their_place(wave, tmp_path):
+def test_damaged_values_are_refused_with_the_name_of_their_variable(wave, tmp_path):
     path = tmp_path / "a.nc"
     wave.save(path)
-    whole, row = path.read_bytes(), np.asarray(wave.recorded).tobytes()
-    assert whole.count(row) >= 1
-    at = whole.rindex(row) + 5
-    path.write_bytes(whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :])
+    content, recorded = path.read_bytes(), np.asarray(wave.recorded).tobytes()
+    assert content.count(recorded) >= 1
+    offset = content.rindex(recorded) + 5
+    path.write_bytes(content[:offset] + bytes([content[offset] ^ 1]) + content[offset + 1 :])
+    # Without noise, `energy` has the same bytes as `recorded`.
     with pytest.raises(ValueError, match=r"a.nc: /(recorded|energy): damaged"):
         jl.open(path)
 
 
-def test_other_files_are_refused(wave, tmp_path):
+def test_missing_foreign_and_incomplete_files_are_refused(wave, tmp_path):
     with pytest.raises(FileNotFoundError, match="no such file"):
         jl.open(tmp_path / "none.nc")
     with h5py.File(tmp_path / "a.nc", "w") as file:
@@ -237,10 +240,10 @@ class Heights(eqx.Module):
     top: Float[np.ndarray, " trees"]
 
 
-def test_a_class_of_another_package_is_found_by_its_entry_point(tmp_path, monkeypatch):
+def test_a_class_of_another_package_is_loaded_by_its_entry_point(tmp_path, monkeypatch):
     with pytest.raises(TypeError, match="result is of the class Heights; admissible are"):
         jl.io.save(Heights(np.ones(2)), tmp_path / "a.nc")
-    # Forgotten again when the test ends.
+    # When the test ends, monkeypatch removes the class from the registry.
     monkeypatch.setitem(datasets.LAYOUTS, "Heights", None)
     jl.io.keep_as_netcdf(Heights, "heights", {"top": ("m", "height")})
     jl.io.save(Heights(np.array([1.0, 2.0])), tmp_path / "a.nc")
@@ -248,26 +251,26 @@ def test_a_class_of_another_package_is_found_by_its_entry_point(tmp_path, monkey
     with pytest.raises(ValueError, match=r"a.nc: it holds a Heights, which is not known here"):
         jl.open(tmp_path / "a.nc")
 
-    class Point:
+    class EntryPoint:
         name = "Heights"
 
         def load(self):
             datasets.LAYOUTS["Heights"] = layout
 
-    points = {datasets.ENTRY_POINTS: [Point()]}
-    monkeypatch.setattr(metadata, "entry_points", lambda group: points.get(group, []))
+    entry_points = {datasets.ENTRY_POINTS: [EntryPoint()]}
+    monkeypatch.setattr(metadata, "entry_points", lambda group: entry_points.get(group, []))
     assert jl.open(tmp_path / "a.nc").top.tolist() == [1.0, 2.0]
 
 
-def test_without_the_library_it_says_what_to_install(wave, tmp_path, monkeypatch):
-    real = builtins.__import__
+def test_missing_h5netcdf_names_the_extra_to_install(wave, tmp_path, monkeypatch):
+    original_import = builtins.__import__
 
-    def missing(name, *args, **kwargs):
+    def import_without_h5netcdf(name, *args, **kwargs):
         if name == "h5netcdf":
             raise ImportError(name)
-        return real(name, *args, **kwargs)
+        return original_import(name, *args, **kwargs)
 
-    monkeypatch.setattr(builtins, "__import__", missing)
+    monkeypatch.setattr(builtins, "__import__", import_without_h5netcdf)
     with pytest.raises(ImportError, match=r"pip install 'jaxlidar\[io\]'"):
         wave.save(tmp_path / "a.nc")
     assert list(tmp_path.iterdir()) == []
@@ -283,11 +286,11 @@ def test_a_failed_write_leaves_the_old_file(wave, tmp_path):
 
 
 def checksum_of(result):
-    """CRC-32 of the bytes of all arrays of a result, in the order of its fields."""
-    sums = 0
+    """Return the CRC-32 of the bytes of all arrays of a result, in the order of its fields."""
+    checksum = 0
     for array in jax.tree.leaves(result):
-        sums = zlib.crc32(np.ascontiguousarray(array).tobytes(), sums)
-    return sums
+        checksum = zlib.crc32(np.ascontiguousarray(array).tobytes(), checksum)
+    return checksum
 
 
 @pytest.fixture(scope="module")
@@ -309,11 +312,11 @@ def old_files(tmp_path_factory):
     ],
 )
 def test_files_of_version_0_2_0_are_read(old_files, name, checksum):
-    """To the bit: the checksums are those that version 0.2.0 itself computed."""
+    """Bit for bit: version 0.2.0 computed the checksums of the results that it wrote."""
     assert checksum_of(jl.open(old_files / name)) == checksum
 
 
-def test_old_files_have_their_case_and_static_fields(old_files):
+def test_old_files_hold_their_case_and_static_fields(old_files):
     assert jl.io.read_case(old_files / "waveform.nc").arguments == {"n_photons": 8192, "max_orders": 3}
     assert jl.io.read_case(old_files / "waveforms.nc").survey.zenith.tolist() == [0.0, 10.0, 20.0]
     fit = jl.open(old_files / "retrieval.nc")
@@ -321,7 +324,7 @@ def test_old_files_have_their_case_and_static_fields(old_files):
     assert fit.labels[-1] == "label 7"
 
 
-def test_a_name_that_is_damaged_is_refused(wave, tmp_path):
+def test_damaged_text_is_refused(wave, tmp_path):
     path = tmp_path / "a.nc"
     wave.save(path)
     with h5py.File(path, "r+") as file:

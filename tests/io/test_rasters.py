@@ -1,4 +1,4 @@
-"""Maps of surveys as GeoTIFF: at their place, to the bit, and refused where shots are on no grid."""
+"""Maps of surveys as GeoTIFF: exact values at the positions of the shots, and refusal of bad arguments."""
 
 import numpy as np
 import pytest
@@ -13,50 +13,52 @@ COUNT = len(SURVEY)
 
 
 def maps(seed=0):
+    """Return two quantities of every shot."""
     random = np.random.default_rng(seed)
     return {"RH98": random.uniform(5, 30, COUNT), "ground": random.normal(size=COUNT)}
 
 
-def test_every_shot_is_the_middle_of_a_cell(tmp_path):
+def test_every_shot_is_the_centre_of_a_cell(tmp_path):
     values = maps()
     write_raster(tmp_path / "a.tif", values, SURVEY.position, crs="EPSG:32632")
     with rasterio.open(tmp_path / "a.tif") as file:
         assert file.descriptions == ("RH98", "ground")
         assert file.crs.to_epsg() == 32632
         assert (file.height, file.width) == (3, 5)
-        for number, of_shots in enumerate(values.values(), 1):
-            found = [value[number - 1] for value in file.sample(SURVEY.position)]
-            assert np.array_equal(found, of_shots)
+        for band, values_of_shots in enumerate(values.values()):
+            sampled = [pixel[band] for pixel in file.sample(SURVEY.position)]
+            assert np.array_equal(sampled, values_of_shots)
     terrain, crs, _ = read_dem(tmp_path / "a.tif")
     assert crs == "EPSG:32632"
     assert np.array_equal(terrain.origin, SURVEY.position[0])
     assert [p.name for p in tmp_path.iterdir()] == ["a.tif"]
 
 
-def test_any_order_and_cells_without_a_shot(tmp_path):
+def test_shots_may_be_in_any_order_and_cells_may_have_no_shot(tmp_path):
     order = np.random.default_rng(1).permutation(COUNT)[:-2]
     values = {"RH98": maps()["RH98"][order]}
     values["RH98"][0] = np.nan
     write_raster(tmp_path / "a.tif", values, SURVEY.position[order])
     with rasterio.open(tmp_path / "a.tif") as file:
-        found = np.array([value[0] for value in file.sample(SURVEY.position[order])])
-        assert np.array_equal(found, values["RH98"], equal_nan=True)
+        sampled = np.array([pixel[0] for pixel in file.sample(SURVEY.position[order])])
+        assert np.array_equal(sampled, values["RH98"], equal_nan=True)
+        # Two cells without a shot, and one with NaN.
         assert int((file.read_masks(1) == 0).sum()) == 3
         assert file.crs is None
 
 
 @pytest.mark.parametrize("axis", [0, 1])
-def test_one_row_alone(tmp_path, axis):
-    place = np.zeros((4, 2))
-    place[:, axis] = 0.1 * np.arange(4) + 7e5
-    write_raster(tmp_path / "a.tiff", {"x": np.arange(4.0)}, place)
+def test_a_raster_may_have_a_single_row_or_column(tmp_path, axis):
+    position = np.zeros((4, 2))
+    position[:, axis] = 0.1 * np.arange(4) + 7e5
+    write_raster(tmp_path / "a.tiff", {"x": np.arange(4.0)}, position)
     with rasterio.open(tmp_path / "a.tiff") as file:
-        assert [v[0] for v in file.sample(place)] == [0.0, 1.0, 2.0, 3.0]
+        assert [pixel[0] for pixel in file.sample(position)] == [0.0, 1.0, 2.0, 3.0]
         assert file.res == pytest.approx((0.1, 0.1), rel=1e-4)
 
 
 @pytest.mark.parametrize(
-    ("given", "error", "said"),
+    ("arguments", "error", "message"),
     [
         ({"path": "a.png"}, ValueError, r"path = a.png ends in '.png'; admissible are .tif, .tiff"),
         ({"values": {}}, ValueError, "values is empty"),
@@ -74,9 +76,9 @@ def test_one_row_alone(tmp_path, axis):
         ),
     ],
 )
-def test_what_is_refused(tmp_path, monkeypatch, given, error, said):
+def test_bad_arguments_are_refused(tmp_path, monkeypatch, arguments, error, message):
     monkeypatch.chdir(tmp_path)
-    usual = {"path": "a.tif", "values": maps(), "position": SURVEY.position}
-    with pytest.raises(error, match=said):
-        write_raster(**(usual | given))
+    good_arguments = {"path": "a.tif", "values": maps(), "position": SURVEY.position}
+    with pytest.raises(error, match=message):
+        write_raster(**(good_arguments | arguments))
     assert list(tmp_path.iterdir()) == []

@@ -1,4 +1,4 @@
-"""Voxel maps, point clouds and tree models from files: recorded ones, and damaged ones refused by place."""
+"""Readers of voxel maps, tree models and point clouds: small, recorded and damaged files."""
 
 import struct
 import sys
@@ -26,7 +26,7 @@ i j k ground_distance nbSampling PadBVTotal attenuation_FPL_unbiasedMLE
 
 @pytest.fixture
 def written(tmp_path):
-    """Writes a text file and gives its path."""
+    """A function that writes a text file and returns its path."""
 
     def write(text, name="map.txt"):
         path = tmp_path / name
@@ -37,10 +37,11 @@ def written(tmp_path):
 
 
 def vox(angles="Spherical"):
+    """Return the text of a .vox file."""
     return VOX.format(angles=angles).replace("#min_corner: ", "#min_corner:")
 
 
-def test_a_vox_file(written):
+def test_voxels_of_a_vox_file(written):
     voxels, dropped = read_vox(written(vox()))
     assert dropped == {"not sampled": 1, "without a density": 1, "below the ground": 1}
     np.testing.assert_allclose(voxels.leaf[:, :, 0], [[0.75, 0.0], [0.0, 0.0]])
@@ -50,7 +51,7 @@ def test_a_vox_file(written):
     assert voxels.leaf_angles is None
 
 
-def test_another_column_and_what_unsampled_voxels_hold(written):
+def test_column_fill_value_and_material_can_be_chosen(written):
     voxels, _ = read_vox(written(vox()), density="attenuation_FPL_unbiasedMLE", fill=0.4)
     np.testing.assert_allclose(voxels.leaf[:, :, 0], [[0.7, 0.2], [0.0, 0.2]], rtol=1e-6)
     bark, _ = read_vox(written(vox()), name="bark")
@@ -63,7 +64,7 @@ def test_leaf_angles_of_a_vox_file(written):
     assert voxels.leaf_angles is not None
 
 
-def test_the_recorded_vox_file(shared):
+def test_a_recorded_vox_file(shared):
     path = shared / "voxels" / "amapvox_tls_sample.vox"
     voxels, dropped = read_vox(path)
     assert voxels.shape == (7, 6, 10)
@@ -76,14 +77,13 @@ def test_the_recorded_vox_file(shared):
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "message"),
     [
         (("VOXEL SPACE", "VOXELS"), r"map.txt: line 1: 'VOXEL SPACE' is missing"),
         (("#split:(2, 2, 1)\n", ""), "the header has no #split"),
         (("#split:(2, 2, 1)", "#split:(2, 2.5, 1)"), "line 4: split = .* no whole numbers"),
         (("(1.0, 3.0, 1.0)", "(1.0, 0.5, 1.0)"), "line 3: max_corner"),
         (("(1.0, 3.0, 1.0)", "(1.0, x, 1.0)"), "line 3: max_corner = 'x' is no number"),
-        (("PadBVTotal", "density"), "line 10: density = NaN|voxel"),
         (("0 0 0 0.5 10 1.5 0.7", "0 0 0 0.5 10 1.5"), "line 7: 6 values; the header names 7"),
         (("0 0 0 0.5 10 1.5 0.7", "0 0 0 0.5 10 -1.5 0.7"), r"line 7: PadBVTotal = -1.5 .*\[0, inf\)"),
         (("0 0 0 0.5 10 1.5 0.7", "0 0 0 0.5 10 much 0.7"), "line 7: PadBVTotal = 'much' is no number"),
@@ -108,16 +108,17 @@ def test_the_recorded_vox_file(shared):
         ),
     ],
 )
-def test_damaged_vox_files(written, change, says):
-    text = vox().replace(*change)
-    density = "nothing" if change[0] == "PadBVTotal" else None
-    if density:
-        says = "line 6: no column nothing; there are i, j, k"
-    with pytest.raises(ValueError, match=says):
-        read_vox(written(text), density=density)
+def test_damaged_vox_files_are_refused_by_line(written, change, message):
+    with pytest.raises(ValueError, match=message):
+        read_vox(written(vox().replace(*change)))
 
 
-def test_other_names_of_plant_area_are_refused(written):
+def test_an_unknown_density_column_is_refused(written):
+    with pytest.raises(ValueError, match="line 6: no column nothing; there are i, j, k"):
+        read_vox(written(vox()), density="nothing")
+
+
+def test_unknown_materials_and_negative_fill_values_are_refused(written):
     with pytest.raises(ValueError, match="name = 'wood' is none of 'leaf', 'bark'"):
         read_vox(written(vox()), name="wood")
     with pytest.raises(ValueError, match=r"fill = -1 .*\[0, inf\)"):
@@ -132,21 +133,21 @@ QSM = """ID, parentID, startX, startY, startZ, endX, endY, endZ, radius, branchO
 """
 
 
-def test_a_tree_model(written):
+def test_cylinders_of_a_tree_model(written):
     tree, dropped = read_qsm(written(QSM))
     assert dropped == {"without a length": 1}
     assert len(tree.start) == 3
-    # A cylinder without length leaves its child to its parent.
+    # Cylinder 7 has no length, so its child 9 becomes a child of its parent 5.
     np.testing.assert_array_equal(np.sort(tree.parent), [-1, 0, 0])
     assert tree.height == 2.0
     assert tree.trunk_diameter == pytest.approx(0.2)
     assert tree.wood_volume == pytest.approx(np.pi * (0.01 + np.sqrt(2) * (0.05**2 + 0.06**2)))
     assert len(tree.bud_position) == 0
-    small, _ = read_qsm(written(QSM.replace(",", ";")), scale=0.01)
-    assert small.height == pytest.approx(0.02)
+    scaled, _ = read_qsm(written(QSM.replace(",", ";")), scale=0.01)
+    assert scaled.height == pytest.approx(0.02)
 
 
-def test_the_recorded_tree_model(shared):
+def test_a_recorded_tree_model(shared):
     path = shared / "voxels" / "tree_qsm.csv"
     tree, dropped = read_qsm(path)
     table = np.genfromtxt(path, delimiter=",", skip_header=1)
@@ -156,7 +157,7 @@ def test_the_recorded_tree_model(shared):
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "message"),
     [
         (("radius", "thickness"), "line 1: no column radius"),
         (("branchOrder", "radius"), "line 1: 2 times the column radius"),
@@ -177,16 +178,18 @@ def test_the_recorded_tree_model(shared):
         (("8,5,0", "8," + "5" * 1000 + ",0"), r"line 5: parent = '5{37}\.\.\.' is no whole number"),
     ],
 )
-def test_damaged_tree_models(written, change, says):
-    with pytest.raises(ValueError, match=says):
+def test_damaged_tree_models_are_refused_by_line(written, change, message):
+    with pytest.raises(ValueError, match=message):
         read_qsm(written(QSM.replace(*change)))
     with pytest.raises(ValueError, match="line 1: there is no cylinder in the file"):
         read_qsm(written(QSM.splitlines()[0]))
 
 
-def test_a_long_chain_without_lengths(written):
-    """Each of many cylinders stands on a chain of as many that have no length; time grows with their number
-    alone."""
+def test_long_chains_of_cylinders_without_length_take_linear_time(written):
+    """2000 cylinders have the end of a chain of 1999 cylinders without length as their parent.
+
+    Following the chain anew for each of them would take quadratic time.
+    """
     rows = [QSM.splitlines()[0], "0,-1,0,0,0,0,0,1,1,0"]
     rows += [f"{i},{i - 1},0,0,1,0,0,1,1,0" for i in range(1, 2_000)]
     rows += [f"{i},1999,0,0,1,0,0,2,1,0" for i in range(2_000, 4_000)]
@@ -195,14 +198,14 @@ def test_a_long_chain_without_lengths(written):
     np.testing.assert_array_equal(tree.parent, [-1, *[0] * 2_000])
 
 
-def test_a_tree_model_in_quotes(written):
+def test_a_tree_model_may_have_quoted_fields_and_a_byte_order_mark(written):
     quoted = QSM.replace("parentID", '"parent_ID"').replace("8,5,", '"8","5",')
     assert len(read_qsm(written("\ufeff" + quoted)).tree.start) == 3
     with pytest.raises(ValueError, match=r"scale = 0 .*\(0, inf\)"):
         read_qsm(written(QSM), scale=0.0)
 
 
-def test_coefficients_that_single_precision_does_not_hold(written):
+def test_coefficients_beyond_single_precision_are_refused(written):
     header = "lambda nrefrac SAC_CHL SAC_CAR SAC_ANT SAC_BROWN SAC_EWT SAC_PROT SAC_CBC\n"
     row = "1 1.4 0 0 0 0 0 0 0\n2 1.4 1e39 0 0 0 0 0 0\n"
     with pytest.raises(ValueError, match=r"map\.txt, line 3: SAC_CHL = '1e39' is no number in .*\[0, inf\)"):
@@ -211,7 +214,7 @@ def test_coefficients_that_single_precision_does_not_hold(written):
 
 @pytest.fixture
 def cloud(tmp_path):
-    """A LAS file of five points, of which one is noise and one is withheld."""
+    """Path of a LAS file of five points, of which one is noise and one is withheld."""
     las = laspy.create(point_format=6, file_version="1.4")
     las.header.scales = [0.001] * 3
     las.x, las.y, las.z = np.arange(15.0).reshape(3, 5)
@@ -224,7 +227,7 @@ def cloud(tmp_path):
     return path
 
 
-def test_a_point_cloud(cloud):
+def test_points_of_a_cloud_without_noise_and_withheld_points(cloud):
     points = read_las(cloud, scale=0.5)
     assert points.dropped == {"noise": 1, "withheld": 1}
     np.testing.assert_allclose(points.position, [[0, 2.5, 5], [0.5, 3, 5.5], [2, 4.5, 7]])
@@ -233,16 +236,16 @@ def test_a_point_cloud(cloud):
     np.testing.assert_array_equal(points.intensity, [0.0, 10.0, 40.0])
 
 
-def test_the_recorded_point_cloud(shared):
+def test_a_recorded_point_cloud(shared):
     points = read_las(shared / "voxels" / "tree_point_cloud.las")
     assert len(points.position) == 20198
     assert points.dropped == {"noise": 0, "withheld": 0}
     assert np.ptp(points.position[:, 2]) == pytest.approx(21.97, abs=0.01)
 
 
-def test_damaged_point_clouds(cloud, tmp_path):
-    whole = cloud.read_bytes()
-    for name, content in (("empty", b""), ("text", b"not a cloud" * 100), ("short", whole[:-40])):
+def test_empty_foreign_and_truncated_point_clouds_are_refused(cloud, tmp_path):
+    data = cloud.read_bytes()
+    for name, content in (("empty", b""), ("text", b"not a cloud" * 100), ("truncated", data[:-40])):
         path = tmp_path / f"{name}.las"
         path.write_bytes(content)
         with pytest.raises(ValueError, match=f"{name}.las"):
@@ -250,7 +253,7 @@ def test_damaged_point_clouds(cloud, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("at", "kind", "value", "says"),
+    ("offset", "format", "value", "message"),
     [
         (96, "<I", 2**32 - 1, "header: it is 375 bytes long and points begin at 4294967295: a file of"),
         (94, "<H", 20, "header: it is 20 bytes long"),
@@ -269,17 +272,17 @@ def test_damaged_point_clouds(cloud, tmp_path):
         (104, "<B", 6 + 128, "header: points are compressed, but no record 22204 says how"),
     ],
 )
-def test_headers_of_point_clouds_that_make_no_sense(cloud, at, kind, value, says):
+def test_damaged_headers_of_point_clouds_are_refused(cloud, offset, format, value, message):
     content = bytearray(cloud.read_bytes())
-    struct.pack_into(kind, content, at, value)
+    struct.pack_into(format, content, offset, value)
     cloud.write_bytes(content)
-    with pytest.raises(ValueError, match=r"cloud\.las: (" + says + ")"):
+    with pytest.raises(ValueError, match=r"cloud\.las: (" + message + ")"):
         read_las(cloud)
 
 
 @pytest.fixture
-def packed(tmp_path):
-    """Writes a LAZ file of so many points in a point format and gives its path and where points begin."""
+def compressed(tmp_path):
+    """A function that writes a LAZ file and returns its path and the offset of its points."""
     pytest.importorskip("lazrs")
 
     def write(point_format=6, points=60):
@@ -293,29 +296,30 @@ def packed(tmp_path):
 @pytest.mark.parametrize(
     ("point_format", "points"), [*((n, 60) for n in range(11)), (3, 120_000), (6, 120_000)]
 )
-def test_a_packed_point_cloud(packed, tmp_path, point_format, points):
-    path, _ = packed(point_format, points)
+def test_compressed_points_equal_uncompressed_ones(compressed, tmp_path, point_format, points):
+    path, _ = compressed(point_format, points)
     (tmp_path / "cloud.las").write_bytes(small_cloud(False, point_format, points))
-    for one, other in zip(read_las(path)[:5], read_las(tmp_path / "cloud.las")[:5]):
-        np.testing.assert_array_equal(one, other)
+    # The first five fields are arrays; the last one counts dropped points.
+    for array, expected in zip(read_las(path)[:5], read_las(tmp_path / "cloud.las")[:5]):
+        np.testing.assert_array_equal(array, expected)
 
 
 @pytest.mark.parametrize("point_format", [3, 6])
-def test_a_packed_point_cloud_that_is_cut_short(packed, point_format):
-    path, start = packed(point_format)
-    whole = path.read_bytes()
-    for size in (0, 100, 400, start - 1, start, start + 7, start + 20, start + 60, len(whole) - 250):
-        path.write_bytes(whole[:size])
+def test_truncated_compressed_point_clouds_are_refused(compressed, point_format):
+    path, start = compressed(point_format)
+    data = path.read_bytes()
+    for size in (0, 100, 400, start - 1, start, start + 7, start + 20, start + 60, len(data) - 250):
+        path.write_bytes(data[:size])
         with pytest.raises(ValueError, match=r"cloud\.laz: \w"):
             read_las(path)
 
 
-def test_packed_point_clouds_that_declare_too_much(packed):
-    path, start = packed()
-    whole = path.read_bytes()
-    (table,) = struct.unpack_from("<q", whole, start)
-    record = whole.index(b"laszip encoded") + 52
-    for at, kind, value, says in (
+def test_impossible_sizes_in_compressed_point_clouds_are_refused(compressed):
+    path, start = compressed()
+    data = path.read_bytes()
+    (table,) = struct.unpack_from("<q", data, start)
+    record = data.index(b"laszip encoded") + 52
+    for offset, format, value, message in (
         (247, "<Q", 10**8, "header: 100000000 points: 3400000000 bytes are declared in a file of"),
         (247, "<Q", 61_000, "chunk table: its 1 chunks do not add up to 61000 points"),
         (start, "<q", 2**40, "chunk table: 1099511627776 is no place after"),
@@ -329,15 +333,15 @@ def test_packed_point_clouds_that_declare_too_much(packed):
         (record + 34, "<H", 6, r"record of the compression: items \[\(6, 30\)"),
         (record + 32, "<H", 60_000, "record of the compression: 46 bytes cannot name 60000 items"),
     ):
-        content = bytearray(whole)
-        struct.pack_into(kind, content, at, value)
+        content = bytearray(data)
+        struct.pack_into(format, content, offset, value)
         path.write_bytes(content)
-        with pytest.raises(ValueError, match=rf"cloud\.laz: {says}"):
+        with pytest.raises(ValueError, match=rf"cloud\.laz: {message}"):
             read_las(path)
 
 
-def test_bytes_on_which_the_decompressor_would_run_out_of_stack(packed):
-    path, start = packed(1, 500)
+def test_bytes_that_would_overflow_the_stack_of_the_decompressor_are_refused(compressed):
+    path, start = compressed(1, 500)
     content = bytearray(path.read_bytes())
     content[start + 100 : -40] = b"\xff" * len(content[start + 100 : -40])
     path.write_bytes(content)
@@ -347,28 +351,28 @@ def test_bytes_on_which_the_decompressor_would_run_out_of_stack(packed):
         read_las(path)
 
 
-def test_without_lazrs(packed, monkeypatch):
-    path, _ = packed()
+def test_missing_lazrs_names_the_extra_to_install(compressed, monkeypatch):
+    path, _ = compressed()
     monkeypatch.setitem(sys.modules, "lazrs", None)
     with pytest.raises(ImportError, match=r"needs lazrs: .*jaxlidar\[io\]"):
         read_las(path)
 
 
 @pytest.mark.parametrize("read", [read_las, read_qsm, read_vox])
-def test_files_that_are_not_there(read, tmp_path):
+def test_missing_files_are_refused(read, tmp_path):
     with pytest.raises(FileNotFoundError, match=r"nothing\.txt: no such file"):
         read(tmp_path / "nothing.txt")
 
 
 @pytest.mark.parametrize("read", [read_qsm, read_vox])
-def test_files_that_are_no_text(read, tmp_path):
+def test_binary_files_are_refused_as_text(read, tmp_path):
     path = tmp_path / "binary"
     path.write_bytes(b"\n\n" + bytes(range(128, 256)))
     with pytest.raises(ValueError, match="binary: not a text file: line 3: "):
         read(path)
 
 
-def test_without_laspy(cloud, monkeypatch):
+def test_missing_laspy_names_the_extra_to_install(cloud, monkeypatch):
     monkeypatch.setitem(sys.modules, "laspy", None)
     with pytest.raises(ImportError, match=r"jaxlidar\[io\]"):
         read_las(cloud)

@@ -52,8 +52,8 @@ def test_workers_share_illumination(client):
     )
 
 
-class KilledOnce(distributed.cfexecutor.ClientExecutor):
-    """The executor of a client, one worker of which is killed."""
+class ClientWithKilledWorker(distributed.cfexecutor.ClientExecutor):
+    """The executor of a cluster, one worker of which makes the file `marker` and is killed."""
 
     marker = ""
 
@@ -61,11 +61,11 @@ class KilledOnce(distributed.cfexecutor.ClientExecutor):
         return super().submit(die_once, self.marker, function, *args)
 
 
-def test_a_worker_that_is_killed_costs_its_chunk_a_second_try(client, one_process, tmp_path):
-    pool = KilledOnce(client)
-    pool.marker = str(tmp_path / "died")
-    assert same(one_process, jl.simulate_many(nadir(32), stand(), key=KEY, **FAST, executor=pool))
-    assert os.path.exists(pool.marker)
+def test_the_chunk_of_a_killed_worker_is_run_again(client, one_process, tmp_path):
+    executor = ClientWithKilledWorker(client)
+    executor.marker = str(tmp_path / "died")
+    assert same(one_process, jl.simulate_many(nadir(32), stand(), key=KEY, **FAST, executor=executor))
+    assert os.path.exists(executor.marker)
 
 
 def test_workers_of_a_cluster_fit_the_same_values(client, footprints):  # noqa: F811

@@ -240,15 +240,15 @@ def test_a_worker_that_dies_costs_its_chunk_a_second_try():
 
 
 def die_once(marker, function, unit):
-    """Run a unit of work in a worker that the operating system kills the first time."""
+    """Run a unit of work in a worker that dies with the first unit, unless the file `marker` exists."""
     if unit.number == 0 and not os.path.exists(marker):
         Path(marker).touch()
         os._exit(1)
     return function(unit)
 
 
-class KilledOnce(concurrent.futures.ProcessPoolExecutor):
-    """A process pool, one worker of which is killed."""
+class PoolWithKilledWorker(concurrent.futures.ProcessPoolExecutor):
+    """A process pool of two workers, one of which makes the file `marker` and is killed."""
 
     def __init__(self, marker):
         super().__init__(2, mp_context=multiprocessing.get_context("spawn"))
@@ -264,7 +264,7 @@ def test_a_process_pool_traces_the_same_and_may_lose_a_worker(tmp_path):
     waveforms = jl.simulate_many(survey, scene, key=KEY, **FAST)
     with concurrent.futures.ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn")) as pool:
         assert same(waveforms, jl.simulate_many(survey, scene, key=KEY, **FAST, executor=pool))
-    with KilledOnce(str(tmp_path / "died")) as pool, pytest.warns(jl.LostWorkersWarning):
+    with PoolWithKilledWorker(str(tmp_path / "died")) as pool, pytest.warns(jl.LostWorkersWarning):
         assert same(waveforms, jl.simulate_many(survey, scene, key=KEY, **FAST, executor=pool))
 
 
