@@ -327,7 +327,7 @@ class _March(NamedTuple):
     depth: Float[Array, "photons"]
     voxel: tuple[Int[Array, "photons"], ...]
     running: Bool[Array, "photons"]
-    crossings: tuple[Array, Array, Array, Array]
+    crossings: tuple[Array, ...]
     depth_slopes: Float[Array, "ends parameters photons"] | None
 
 
@@ -400,6 +400,7 @@ def march_to_depths(
             if len(targets):
                 to_target = (targets - for_targets(depth)) / for_targets(jnp.maximum(k, 1e-30))
                 length = jnp.clip(to_target, 0.0, for_targets(length[0]))
+            assert depth_slopes is not None
             length = lax.stop_gradient(length)
             depth_slopes = slopes.add_segment(depth_slopes, cell, length, projection_factor)
         # The voxel of a ray that has stopped does not matter.
