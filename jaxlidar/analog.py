@@ -245,7 +245,7 @@ def _trace_flight(
         x=x,
         w=collision.w,
         path=path,
-        weight=jnp.where(has_hit, weight * collision.ratio * collision.onward_weight, 0.0),
+        weight=jnp.where(has_hit, weight * collision.weight * collision.onward_weight, 0.0),
         history=scene.history_after(history, collision.channel),
         surface=collision.surface,
         last_scattering=collision.last_scattering,

@@ -31,7 +31,7 @@ from jaxlidar.sampling.adaptive import (
 from jaxlidar.sampling.moments import RunningMoments
 from jaxlidar.scenes.scene import Scene, check_kinds
 from jaxlidar.spectral.apply_optics import setup_optics
-from jaxlidar.trace.absorption import EnergyFractions, from_beam, from_the_sky, trace_to_end
+from jaxlidar.trace.absorption import EnergyFractions, from_beam, from_parallel_light, trace_to_end
 from jaxlidar.trace.device_scene import build_device_scene
 
 PHOTONS_PER_BATCH = 8192
@@ -218,7 +218,7 @@ def _with_longest_flights(setup: Setup) -> Setup:
 
 def _trace(setup: Setup, key: PRNGKeyArray, parallel: bool, max_orders: int) -> EnergyFractions:
     """Trace one batch; where leaves transmit straight on, once for each wavelength."""
-    source = from_the_sky if parallel else from_beam
+    source = from_parallel_light if parallel else from_beam
     optics = setup_optics(setup)
     scene = build_device_scene(setup, derivatives="none")
     if scene.straight_transmittance is None:

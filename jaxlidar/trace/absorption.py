@@ -1,9 +1,12 @@
 """Absorption and escape: light that is followed to its end, without time and without a last order.
 
 Photons carry their energy at every wavelength; optics are applied at every scattering. A collision of energy
-E with a material (R, T) absorbs E (1 - R a - T), tallied as its expectation, with a the albedo of the law;
-the photon goes on with the rest. Photons below the fraction f of the emitted energy survive with the
-probability E / f, with the energy f (Russian roulette), which keeps all expectations.
+E with a material (R, T) absorbs E (1 - R a - T), tallied as its expectation, with a the albedo of the law.
+The photon goes on by one sampled channel, with E R a or E T divided by the probability of that channel: in
+the mean E (R a + T), so that energy is conserved in the mean.
+
+Russian roulette: with E the largest energy of any wavelength, relative to the emitted one, a photon of E < f
+survives with the probability E / f, and its energies are divided by that. This is unbiased.
 """
 
 from collections.abc import Callable
@@ -43,7 +46,7 @@ class EnergyFractions(eqx.Module):
 
 
 class _PhotonLoop(eqx.Module):
-    """State of the loop over orders: photons, their energy, sums so far, and the number of the order."""
+    """State of the loop over orders: photons, their energy, sums so far, and the order."""
 
     photons: Photons
     energy: Float[Array, "photons wavelengths"]
@@ -58,8 +61,11 @@ def from_beam(scene: DeviceScene, key: PRNGKeyArray, count: int) -> tuple[Vec, V
     return along(point, w, jnp.asarray(-scene.limits.start_distance, fraction.dtype)), w
 
 
-def from_the_sky(scene: DeviceScene, key: PRNGKeyArray, count: int) -> tuple[Vec, Vec]:
-    """Sample parallel light over one period of the voxel map, from its top or above all terrain."""
+def from_parallel_light(scene: DeviceScene, key: PRNGKeyArray, count: int) -> tuple[Vec, Vec]:
+    """Sample collimated light in the direction of the beam, uniform over one period of the voxel map.
+
+    It starts at the top of the map, or of the terrain where that is higher.
+    """
     medium = scene.medium
     assert medium is not None
     u, v = jax.random.uniform(key, (2, count))
@@ -80,18 +86,27 @@ def trace_to_end(
     source: Callable[[DeviceScene, PRNGKeyArray, int], tuple[Vec, Vec]],
     max_orders: int,
 ) -> EnergyFractions:
-    """Trace `count` photons of a source to their ends, at most through `max_orders` scatterings.
+    """Trace photons of a source to their ends, at most through `max_orders` scatterings.
 
-    `optics`: reflectance or transmittance of every channel.
+    1. Sample the starts and directions of `count` photons, each of energy one.
+    2. Trace order after order while any photon lives.
+    3. Count the energy that the last order leaves as unfollowed.
+    4. Divide all sums by the number of photons.
+
+    **Arguments:**
+
+    - `optics`: reflectance or transmittance of every channel.
+    - `count`: number of photons.
+    - `source`: returns starts and directions of so many photons, as `from_beam` does.
     """
     start_key, key = jax.random.split(key)
     x, w = source(scene, start_key, count)
     # Weight and history stay as they are: the energy is an array of its own, by wavelength.
     photons = start_photons(x, w, jnp.zeros_like(x[0]))
     n_wavelengths = optics.shape[1]
-    nothing = jnp.zeros((n_wavelengths,), optics.dtype)
+    zeros = jnp.zeros((n_wavelengths,), optics.dtype)
     absorbed = jnp.zeros((len(scene.config.materials), n_wavelengths), optics.dtype)
-    fractions = EnergyFractions(absorbed, nothing, nothing, nothing, nothing)
+    fractions = EnergyFractions(absorbed, zeros, zeros, zeros, zeros)
     energy = jnp.ones((count, n_wavelengths), optics.dtype)
     # A loop of unknown length: energy is followed until no photon is left, which no fixed number of orders
     # would do. It has no reverse derivative; `energy_budget` needs none.
@@ -124,13 +139,15 @@ def _trace_order(scene: DeviceScene, optics: Array, loop: _PhotonLoop, key: PRNG
     draw_key, roulette_key = jax.random.split(key)
     # Light is followed however late it would come, within the length that bounds the march.
     max_length = jnp.full_like(p.weight, scene.limits.max_flight)
+    # Ratios of flights and of plate outcomes are one in value, and no derivatives are taken. The weight of
+    # the collision is not one: it is used below.
     draws, encounters, flight = fly_once(scene, p, draw_key, max_length)
 
     def optics_at(channel: int) -> Float[Array, "1 wavelengths"]:
         return optics[channel : channel + 1] if channel >= 0 else jnp.zeros_like(optics[:1])
 
     def absorbed_of(scatterer: Scatterer, arriving: Array, albedo: Array) -> Array:
-        """Energy of that which arrives that is absorbed; `albedo`: of the law."""
+        """Sum of the arriving energy that a material absorbs; `albedo`: of the law."""
         reflected = optics_at(scatterer.reflection) * albedo[:, None]
         return jnp.sum(arriving * (1.0 - reflected - optics_at(scatterer.transmission)), axis=0)
 
@@ -160,14 +177,14 @@ def _trace_order(scene: DeviceScene, optics: Array, loop: _PhotonLoop, key: PRNG
     on_ground = fractions.on_ground
     for surface, on_surface, scatterer in zip(scene.surfaces, flight.landed_on(encounters), config.surfaces):
         arriving = jnp.where(on_surface[:, None], energy, 0.0)
-        albedo = surface.at_position(x, surface.law.albedo(p.w, surface.lit_normal(x, p.w)))
+        albedo = surface.scale_by_pattern(x, surface.law.albedo(p.w, surface.lit_normal(x, p.w)))
         absorbed = absorbed.at[scatterer.material].add(absorbed_of(scatterer, arriving, albedo))
         if not surface.is_plate:
             on_ground = on_ground + jnp.sum(arriving, axis=0)
 
-    # Photons that hit nothing have the channel -1, and the energy zero.
+    # Photons that hit zeros have the channel -1, and the energy zero.
     channel = jnp.maximum(collision.channel, 0)
-    energy = energy * optics[channel] * (collision.ratio * collision.onward_weight)[:, None]
+    energy = energy * optics[channel] * (collision.weight * collision.onward_weight)[:, None]
     alive = flight.has_hit & (jnp.max(energy, axis=1) > 0)
     # By the largest energy of all wavelengths: one photon carries them all, and ends for all at once.
     survival = jnp.minimum(jnp.max(energy, axis=1) / _ROULETTE_ENERGY, 1.0)
@@ -194,14 +211,14 @@ def _trace_order(scene: DeviceScene, optics: Array, loop: _PhotonLoop, key: PRNG
 
 
 def _arriving_energy(
-    scene: DeviceScene, optics: Array, energy: Array, encounters: SurfaceEncounters, number: int
+    scene: DeviceScene, optics: Array, energy: Array, encounters: SurfaceEncounters, plate: int
 ) -> Array:
-    """Return the energy that arrives at a plate: after transmission by those that lie nearer."""
+    """Return the energy that arrives at a plate: after transmission by the plates that lie nearer."""
     for j, surface in enumerate(scene.surfaces):
         scatterer, outcome = scene.config.surfaces[j], encounters.outcomes[j]
-        if j == number or not surface.is_plate or scatterer.transmission < 0:
+        if j == plate or not surface.is_plate or scatterer.transmission < 0:
             continue
-        is_nearer = encounters.distances[j] < encounters.distances[number]
+        is_nearer = encounters.distances[j] < encounters.distances[plate]
         transmitted = is_nearer & (outcome == TRANSMITTED)
         factor = optics[scatterer.transmission][None, :] / (1.0 - scene.limits.reflection_probability)
         energy = jnp.where(transmitted[:, None], energy * factor, energy)

@@ -1,10 +1,10 @@
-r"""Collisions: the material that is hit, the direction onward, and the brightness towards the sensor.
+r"""Collisions: the material that is hit, the direction onward, and the radiant intensity towards the sensor.
 
 A collision at extinction k = k_leaf + k_bark is with leaf with the probability k_leaf / k. A leaf or bark
-facet has a normal n with density proportional to g(n) |w.n| (of spherically oriented facets that is a cosine
-law about -w); it reflects by the cosine law into the lit side and transmits by it into the other. In place of
-facets a phase function may scatter. A surface reflects by its own law, or transmits diffusely by the cosine
-law.
+facet has a normal n with the density g(n) |w.n| / G(w) (of spherically oriented facets, with G = 1/2, that is
+a cosine law about -w); it reflects by the cosine law into the lit side and transmits by it into the other. In
+place of facets a phase function may scatter. A surface reflects by its own law, or transmits diffusely by the
+cosine law.
 
 Reflection or transmission is chosen with a fixed probability q that does not depend on wavelength; going on,
 the weight is divided by q or 1 - q. Optics (R, T) are not part of the weight: they belong to the history.
@@ -12,10 +12,13 @@ the weight is divided by q or 1 - q. Optics (R, T) are not part of the weight: t
 Light that returns from a collision is not sampled but deposited as its expectation. Per unit reflectance or
 transmittance, as apparent reflectance, it is the intensity factor
 
-    pi x BRDF x cos(view)  of a surface,   pi x p(w -> v)  of a volume with the phase function p (1/sr),
+    V = pi x BRDF x cos(view)  of a surface,   V = pi x p(w -> v)  of a volume with the phase function p,
 
-times the transmittance of the return path. The attached ratios of the densities by which facets and
-directions were drawn keep derivatives unbiased (`jaxlidar.trace.photons`).
+times the transmittance of the return path. Of a surface that is the bidirectional reflectance factor (BRF)
+times the cosine of the view angle, per unit reflectance; p integrates to one over solid angle (1/sr).
+
+The attached ratios of the densities by which facets and directions were drawn keep derivatives unbiased
+(`jaxlidar.trace.photons`).
 """
 
 import jax
@@ -29,8 +32,8 @@ from jaxlidar.planning.config import Scatterer
 from jaxlidar.trace.device_scene import COSINE_LAW, DeviceScene
 from jaxlidar.trace.photons import (
     Collision,
+    CollisionForReturn,
     LastScattering,
-    VisibleCollision,
     attached_ratio,
     detach,
     select_collision,
@@ -49,7 +52,11 @@ def sample_collision(
     landed: list[Bool[Array, "photons"]],
     draws: PhotonDraws,
 ) -> Collision:
-    """Sample what photons that fly along `w` hit at `x`, and how and in which direction it scatters.
+    """Sample the material that photons hit at `x`, flying along `w`, and the direction in which it scatters.
+
+    1. In the medium: leaf or bark, in proportion to their extinction, and scattering by it.
+    2. On each surface: scattering by that surface.
+    3. Select, for each photon, the case of its flight.
 
     **Arguments:**
 
@@ -58,10 +65,20 @@ def sample_collision(
     - `draws`: uniform numbers.
     """
     one = jnp.ones_like(w[0])
-    none = jnp.full(one.shape, -1, jnp.int32)
-    not_scattered = LastScattering(jnp.zeros_like(none), w, w)
-    # What photons that hit nothing have; their weight is zero.
-    collision = Collision(jnp.zeros_like(none), none, one, one, w, none, none, none, w, not_scattered)
+    minus_one = jnp.full(one.shape, -1, jnp.int32)
+    # Of photons that hit nothing, whose weight is zero.
+    collision = Collision(
+        material=jnp.zeros_like(minus_one),
+        channel=minus_one,
+        weight=one,
+        onward_weight=one,
+        w=w,
+        surface=minus_one,
+        reflection=minus_one,
+        transmission=minus_one,
+        normal=w,
+        last_scattering=LastScattering(jnp.zeros_like(minus_one), w, w),
+    )
     # Every case is computed for every photon and one is selected: photons of a chunk run in lockstep, and a
     # branch would not save anything.
     if scene.medium is not None:
@@ -74,27 +91,35 @@ def sample_collision(
 def _on_surface(
     scene: DeviceScene, surface: TracedSurface, number: int, x: Vec, w: Vec, draws: PhotonDraws
 ) -> Collision:
-    """Sample scattering by a surface: reflection by its law, or diffuse transmission by the cosine law."""
+    """Sample scattering by a surface: reflection by its law, or diffuse transmission by the cosine law.
+
+    1. Draw a reflected direction from the law, at detached inputs.
+    2. Its weight is the albedo, with the pattern of reflectance, and the attached ratio of its density.
+    3. A plate that transmits diffusely sends light on by the cosine law about its far normal with the
+       probability 1 - q; weights are divided by q or 1 - q.
+    4. At a plate that transmits straight on, the photon stopped with the probability q: the weight of the
+       collision is divided by it.
+    """
     q, scatterer, law = scene.limits.reflection_probability, scene.config.surfaces[number], surface.law
     normal = surface.lit_normal(x, w)
     # Directions are decisions: they are drawn from detached inputs, and keep no derivative.
-    held_w, held_normal = jax.tree.map(detach, (w, normal))
-    out = jax.tree.map(detach, law.sample(held_w, held_normal, *draws.direction))
-    ratio = jnp.ones_like(draws.choice)
+    detached_w, detached_normal = jax.tree.map(detach, (w, normal))
+    out = jax.tree.map(detach, law.sample(detached_w, detached_normal, *draws.direction))
+    weight = jnp.ones_like(draws.choice)
     # Drawn with the density of the law itself, what is left of BRDF over density is the albedo.
-    onward_weight = surface.at_position(x, law.albedo(w, normal)) * attached_ratio(
+    onward_weight = surface.scale_by_pattern(x, law.albedo(w, normal)) * attached_ratio(
         law.density(w, normal, out)
     )
-    none = jnp.full(ratio.shape, -1, jnp.int32)
-    law_number, facing = jnp.full_like(none, scene.surface_laws[number]), held_normal
-    channel = jnp.full_like(none, scatterer.reflection)
+    minus_one = jnp.full(weight.shape, -1, jnp.int32)
+    law_number, exit_normal = jnp.full_like(minus_one, scene.surface_laws[number]), detached_normal
+    channel = jnp.full_like(minus_one, scatterer.reflection)
     transmits_diffusely = scatterer.transmission >= 0 and not surface.straight
     if transmits_diffusely:
         through = draws.choice >= q
         # Diffuse transmission is a Lambertian surface seen from behind.
-        below = scale(held_normal, jnp.asarray(-1.0))
+        below = scale(detached_normal, jnp.asarray(-1.0))
         transmitted = about(below, *draws.direction)
-        out, facing = _select(through, transmitted, out), _select(through, below, facing)
+        out, exit_normal = _select(through, transmitted, out), _select(through, below, exit_normal)
         law_number = jnp.where(through, COSINE_LAW, law_number)
         # The cosine is the density up to a constant, which an attached ratio does not see.
         transmitted_weight = attached_ratio(-dot(normal, transmitted)) / (1.0 - q)
@@ -103,18 +128,18 @@ def _on_surface(
     elif scatterer.transmission >= 0:
         # Straight transmission: that the photon stops here, to be reflected, was drawn on the way
         # (`meet_surfaces`).
-        ratio = ratio / q
+        weight = weight / q
     return Collision(
-        material=jnp.full_like(none, scatterer.material),
+        material=jnp.full_like(minus_one, scatterer.material),
         channel=channel,
-        ratio=ratio,
+        weight=weight,
         onward_weight=onward_weight,
         w=jax.tree.map(detach, out),
-        surface=jnp.full_like(none, number),
-        reflection=jnp.full_like(none, scatterer.reflection),
-        transmission=jnp.full_like(none, scatterer.transmission if transmits_diffusely else -1),
+        surface=jnp.full_like(minus_one, number),
+        reflection=jnp.full_like(minus_one, scatterer.reflection),
+        transmission=jnp.full_like(minus_one, scatterer.transmission if transmits_diffusely else -1),
         normal=normal,
-        last_scattering=LastScattering(law_number, held_w, facing),
+        last_scattering=LastScattering(law_number, detached_w, exit_normal),
     )
 
 
@@ -142,27 +167,35 @@ def _in_medium(
 def _on_leaf(
     scene: DeviceScene, medium: Medium, leaf: Scatterer, w: Vec, k: Scalar, choice: Scalar, draws: PhotonDraws
 ) -> Collision:
-    """Sample scattering by leaf: by a bi-Lambertian facet, or by a phase function."""
+    """Sample scattering by leaf: by a bi-Lambertian facet, or by a phase function.
+
+    1. Where there is a phase function, that scatters.
+    2. The facet's normal: of spherically oriented facets drawn with its own density, so that its weight is
+       one; of others from g(n), with the weight |n.w| / G.
+    3. The direction onward: the cosine law about the lit side.
+    4. Of a leaf that transmits, with the probability 1 - q mirrored into the other side; onward weights are
+       divided by q or 1 - q.
+    """
     if medium.leaf_phase is not None:
         return _by_phase(medium.leaf_phase, scene.leaf_law, leaf, w, k, draws)
-    ratio, onward_weight, q = attached_ratio(k), jnp.ones_like(k), scene.limits.reflection_probability
+    weight, onward_weight, q = attached_ratio(k), jnp.ones_like(k), scene.limits.reflection_probability
     channel = jnp.full(k.shape, leaf.reflection, jnp.int32)
     if medium.angle_tables is None:
         # The normal is drawn in proportion to the area that the facet shows to the light: no weight is left.
         normal = facet_normal(w, *draws.normal)
     else:
         normal, normal_weight = _leaf_normal(medium, w, *draws.normal)
-        ratio = ratio * normal_weight
+        weight = weight * normal_weight
     # Cosine law about the facet's lit side.
-    out, facing = about(normal, *draws.direction), normal
+    out, exit_normal = about(normal, *draws.direction), normal
     if leaf.transmission >= 0:
         through = choice >= q
-        facing = _select(through, scale(normal, jnp.asarray(-1.0)), normal)
+        exit_normal = _select(through, scale(normal, jnp.asarray(-1.0)), normal)
         # Transmission is reflection mirrored in the facet.
         out = along(out, normal, jnp.where(through, -2.0 * dot(out, normal), 0.0))
         channel = jnp.where(through, leaf.transmission, channel)
         onward_weight = jnp.where(through, 1.0 / (1.0 - q), 1.0 / q)
-    return _voxel_collision(leaf, channel, ratio, onward_weight, COSINE_LAW, w, out, normal, facing)
+    return _voxel_collision(leaf, channel, weight, onward_weight, COSINE_LAW, w, out, normal, exit_normal)
 
 
 def _on_bark(
@@ -185,33 +218,36 @@ def _by_phase(
     out = jax.tree.map(detach, phase.sample(jax.tree.map(detach, w), *draws.direction))
     # Sampled by the phase function itself: the weight is one, with the derivative of the density.
     onward_weight = attached_ratio(phase.density(w, out))
-    return _voxel_collision(scatterer, channel, attached_ratio(k), onward_weight, number, w, out, w, w)
+    # A phase function has no normal: `w` fills the fields, which nothing reads.
+    return _voxel_collision(
+        scatterer, channel, attached_ratio(k), onward_weight, number, w, out, normal=w, exit_normal=w
+    )
 
 
 def _voxel_collision(
     scatterer: Scatterer,
     channel: Int[Array, "photons"],
-    ratio: Scalar,
+    weight: Scalar,
     onward_weight: Scalar,
     law: int,
     incident: Vec,
     out: Vec,
     normal: Vec,
-    facing: Vec,
+    exit_normal: Vec,
 ) -> Collision:
-    """Assemble a collision within a voxel, scattered about the normal `facing` by the law of that number."""
-    incident, out, normal, facing = jax.tree.map(detach, (incident, out, normal, facing))
+    """Assemble a collision in a voxel, sent on by the law of index `law` about the normal `exit_normal`."""
+    incident, out, normal, exit_normal = jax.tree.map(detach, (incident, out, normal, exit_normal))
     return Collision(
         material=jnp.full_like(channel, scatterer.material),
         channel=channel,
-        ratio=ratio,
+        weight=weight,
         onward_weight=onward_weight,
         w=out,
         surface=jnp.full_like(channel, -1),
         reflection=jnp.full_like(channel, scatterer.reflection),
         transmission=jnp.full_like(channel, scatterer.transmission),
         normal=normal,
-        last_scattering=LastScattering(jnp.full_like(channel, law), incident, facing),
+        last_scattering=LastScattering(jnp.full_like(channel, law), incident, exit_normal),
     )
 
 
@@ -237,10 +273,10 @@ def _leaf_normal(medium: Medium, w: Vec, u: Scalar, v: Scalar) -> tuple[Vec, Sca
     return normal, jnp.abs(cosine) / medium.angle_tables.projection_at(w) * attached_ratio(p[number])
 
 
-def visible_collision(scene: DeviceScene, collision: Collision) -> VisibleCollision:
-    """Return the part of a collision that `intensity_factors` asks for; the compiler then drops all else."""
+def collision_for_return(scene: DeviceScene, collision: Collision) -> CollisionForReturn:
+    """Return the fields of a collision that its return depends on; the compiler then drops all else."""
     needs_normal = scene.medium is not None and scene.medium.angle_tables is not None
-    return VisibleCollision(
+    return CollisionForReturn(
         collision.material,
         collision.surface,
         collision.reflection,
@@ -250,12 +286,17 @@ def visible_collision(scene: DeviceScene, collision: Collision) -> VisibleCollis
 
 
 def intensity_factors(
-    scene: DeviceScene, x: Vec, w: Vec, v: Vec, collision: VisibleCollision
+    scene: DeviceScene, x: Vec, w: Vec, v: Vec, collision: CollisionForReturn
 ) -> tuple[Scalar, Scalar | None]:
     """Return the intensity factors towards `v` of light that collides at `x`, flying along `w`.
 
     They are apparent reflectance per unit reflectance, and per unit transmittance (None if nothing
     transmits).
+
+    1. Leaf: the phase function, or the cosine with the sampled normal; of spherically oriented facets the
+       mean over all normals.
+    2. Bark: the phase function, or that mean.
+    3. Surfaces: their law on the lit side, the cosine law on the other.
     """
     config, medium = scene.config, scene.medium
     reflected, transmitted = jnp.zeros_like(w[0]), jnp.zeros_like(w[0])
@@ -288,7 +329,7 @@ def intensity_factors(
         on_surface, normal = collision.surface == i, surface.lit_normal(x, w)
         cosine = dot(normal, v)
         factor = surface.law.intensity_factor(w, normal, v, scene.beam.half_angle)
-        factor = surface.at_position(x, factor)
+        factor = surface.scale_by_pattern(x, factor)
         reflected = jnp.where(on_surface, jnp.where(cosine > 0, factor, 0.0), reflected)
         transmitted = jnp.where(on_surface, jnp.maximum(-cosine, 0.0), transmitted)
     return reflected, transmitted if any(transmits) else None

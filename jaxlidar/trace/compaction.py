@@ -1,8 +1,10 @@
 """Stream compaction: living photons first, those with a short path through the medium before long ones.
 
 Photons of a chunk march together until the last of them has stopped. With living photons alone, and paths of
-about one length, in a chunk, fewer lanes wait. Photons are sorted into few classes by the number of faces
-that their ray crosses before it leaves the medium, by a counting sort that keeps their order within a class.
+about one length, in a chunk, fewer of its places idle. Photons are sorted into few classes by the number of
+voxel faces that their ray crosses, by a counting sort that keeps their order within a class.
+
+No estimate depends on the order: a photon takes its lane, which selects its random numbers, along.
 """
 
 import jax.numpy as jnp
@@ -14,7 +16,7 @@ from jaxlidar.trace.device_scene import DeviceScene
 from jaxlidar.trace.photons import Photons
 from jaxlidar.trace.voxel_traversal import enter_grid
 
-# Classes: rays that cross no face, at most `SHORT_PATH` faces, and more.
+# Classes: rays that miss the box of occupied voxels, cross at most about `SHORT_PATH` faces in it, and more.
 N_CLASSES, SHORT_PATH = 3, 32
 # Counts of all classes are packed into one integer, of so many bits each: a chunk has fewer than 1,024
 # photons.
@@ -22,7 +24,7 @@ _COUNT_BITS = 10
 
 
 def compact(scene: DeviceScene, photons: Photons) -> tuple[Int[Array, "chunks size"], Int[Array, ""]]:
-    """Return the numbers of living photons in their new order, zeros after them, and their count.
+    """Return the indices of living photons in their new order, zeros after them, and their count.
 
     1. Give every living photon its class, and dead ones the class `N_CLASSES`.
     2. Within each chunk, run a cumulative count of every class, packed into one integer.
@@ -50,7 +52,10 @@ def compact(scene: DeviceScene, photons: Photons) -> tuple[Int[Array, "chunks si
 
 
 def _path_classes(scene: DeviceScene, photons: Photons) -> Int[Array, "chunks size"]:
-    """Return 0 where a photon crosses no face before it leaves the medium, 1 for few faces, and 2."""
+    """Return 0 where a ray misses all occupied voxels, 1 where it crosses few faces in their box, else 2.
+
+    The number of faces is estimated by the length of the ray in the box times its faces per metre.
+    """
     medium = scene.medium
     if medium is None:
         return jnp.zeros(photons.alive.shape, jnp.int32)

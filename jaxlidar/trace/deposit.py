@@ -1,14 +1,16 @@
-r"""Soft time binning: deposits of returned light into fine bins, smooth in time and exactly conserving.
+r"""Soft time binning: deposits of returned light into fine bins, smooth in time, which conserve energy.
 
 A return at the time t (in bins) is spread over three bins by the quadratic B-spline B,
 
     weight of bin n = B(t - n),   B(x) = 3/4 - x^2 for |x| < 1/2,  (3/2 - |x|)^2 / 2 for 1/2 < |x| < 3/2.
 
-The weights sum to one, their second moment, 1/4 bin^2, does not depend on where in the bin t falls, and their
-derivative with respect to t is continuous. A return that extends over a ray segment is integrated exactly
-over each bin (a box of second moment 1/12) and smoothed by (1, 10, 1)/12 (second moment 1/6), which gives it
-the same second moment of 1/4 in all. That common second moment is taken out again when the pulse is applied
+The weights sum to one, their variance about t, 1/4 bin^2, does not depend on where in the bin t falls, and
+their derivative with respect to t is continuous. A return that extends over a ray segment is integrated
+exactly over each bin (a box of variance 1/12) and smoothed by (1, 10, 1)/12 (variance 1/6), which gives it
+the same variance of 1/4 in all. That common variance is taken out again when the pulse is applied
 (`jaxlidar.spectral.pulse_convolution`).
+
+Rows of bins have a margin at either end, which collects what falls outside the record.
 """
 
 import jax.numpy as jnp
@@ -36,9 +38,13 @@ def bspline_row(
 
 
 def smooth_bins(integrals: Float[Array, "*s n"]) -> Float[Array, "*s n+2"]:
-    """Smooth integrals over bins by (1, 10, 1)/12, so that their second moment is that of the B-spline."""
+    """Smooth integrals over bins by (1, 10, 1)/12, so that their variance is that of the B-spline.
+
+    This is a full convolution: the result has one more bin at either end.
+    """
     zero = jnp.zeros_like(integrals[..., :1])
-    side = (KERNEL_BINS - 1) / 24
+    # The variance of (side, 1 - 2 side, side) is 2 side: 1/4 of the B-spline less 1/12 of the box.
+    side = 1.0 / 12.0
     return (
         side * jnp.concatenate([integrals, zero, zero], -1)
         + (1.0 - 2.0 * side) * jnp.concatenate([zero, integrals, zero], -1)

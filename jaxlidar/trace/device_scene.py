@@ -1,7 +1,25 @@
-"""The device scene: beam, voxels, surfaces and laws as arrays, in coordinates relative to the aim point.
+"""The device scene: beam, voxels, surfaces and laws as arrays on the accelerator, the input of the tracer.
 
-It is the array side of `jit`, as `TraceConfig` is the static side: programs that trace light take one
-`DeviceScene` and a random key. Throughout `jaxlidar.trace` the name `scene` stands for a `DeviceScene`.
+The aim point, where the axis of the beam meets the reference plane, is the origin of its coordinates. It
+joins the arrays and, as static fields, the `TraceConfig` and the indices of laws: programs that trace light
+take one `DeviceScene` and a random key.
+
+Throughout `jaxlidar.trace`:
+
+    scene           a `DeviceScene`
+    p               a `Photons`, the state of some photons
+    x, w            position, and direction of travel (unit vector)
+    v               direction towards the sensor
+    k, tau          extinction coefficient (1/m), optical depth
+    R, T            reflectance, transmittance of a material
+    q               probability of sampling reflection rather than transmission
+    channel         reflection, or transmission, by one material ("leaf.R"); no detector channel
+    history         number of scatterings by each channel along a path (`jaxlidar.trace.histories`)
+    number          index of a law, material, surface, channel or history in the tuple or table of these
+    lane            number of a photon in its batch, which its random numbers depend on
+    ratio           attached likelihood ratio: one in value, with a derivative (`jaxlidar.trace.photons`)
+    parameter       theta_j of a Jacobian; "slopes" are derivatives with respect to the parameters
+                    (`jaxlidar.trace.extinction_slopes`), but `slope_x` and `slope_y` those of terrain
 """
 
 import dataclasses
@@ -29,7 +47,7 @@ from jaxlidar.trace.shot_views import ShotViews
 from jaxlidar.trace.surfaces import TracedSurface, traced_surfaces
 from jaxlidar.trace.voxel_traversal import Medium, VoxelBox, make_medium, occupied_box, vertical_depths
 
-# Number of the cosine law, by which facets, diffusely transmitting plates and most surfaces send light on.
+# Index of the cosine law, by which facets, diffusely transmitting plates and most surfaces send light on.
 COSINE_LAW = 0
 
 Derivatives = Literal["all", "forward", "none"]
@@ -42,7 +60,8 @@ class DeviceScene(eqx.Module):
 
     - `beam`, `medium`, `surfaces`: footprint, voxels (None: no canopy), and surfaces, ground first, then
       plates.
-    - `laws`: the laws by which photons are sent on; `surface_laws`, `leaf_law`, `bark_law` are their numbers.
+    - `laws`: the laws by which photons are sent on; `surface_laws`, `leaf_law`, `bark_law` are indices of
+      these.
     - `depth_above`: optical depth straight up from every voxel's upper face, for a beam at nadir; else None.
     - `occupied_box`: the block of the grid that holds all voxels with any extinction.
 
@@ -54,7 +73,7 @@ class DeviceScene(eqx.Module):
 
     The tally:
 
-    - `next_history`: number of the history after one more scattering, by history and channel.
+    - `next_history`: index of the history after one more scattering, by history and channel.
     - `optics`: of every channel, by wavelength, where optics are applied while light is traced, because light
       is distinguished by its entry node, or because histories would be too many; None where histories keep
       them.
@@ -128,7 +147,7 @@ class DeviceScene(eqx.Module):
         return jnp.where(channel >= 0, grown, history)
 
     def if_differentiated(self, last_scattering: LastScattering) -> LastScattering | None:
-        """Return how photons were sent on, or None where no derivatives are taken, which alone need it."""
+        """Return how photons were sent on; None where no derivatives are taken: nothing else needs it."""
         return None if self.derivatives == "none" else last_scattering
 
     def direction_density(self, last_scattering: LastScattering, w: Vec) -> Scalar:
@@ -178,7 +197,7 @@ def complete_device_scene(geometry: DeviceScene, setup: Setup, derivatives: Deri
         optics = channel_optics(setup.lidar, setup.scene, setup.plan.config.channels)
     if canopy is not None and canopy.is_straight:
         transmittance = canopy.leaf_optics(setup.lidar.wavelength)[1]
-    # `tree_at`, because the geometry may consist of shapes, which constructors refuse.
+    # `tree_at`, because the geometry may be made of `jax.ShapeDtypeStruct`s, which constructors refuse.
     fields = (optics, transmittance)
     scene = eqx.tree_at(
         lambda s: (s.optics, s.straight_transmittance), geometry, fields, is_leaf=lambda x: x is None
@@ -195,6 +214,14 @@ def _without_spectrum(lidar: Lidar) -> Lidar:
 def _build_geometry(
     lidar: Lidar, scene: Scene, limits: PathLimits, bins: TimeBins, config: TraceConfig
 ) -> DeviceScene:
+    """Build the geometry of a device scene.
+
+    1. Take the aim point as origin.
+    2. Lay out the voxels and the surfaces.
+    3. Number the laws by which these send light on, the cosine law as 0.
+    4. Compute the tables of the march: optical depths straight up, the box of occupied voxels; and that of
+       next histories.
+    """
     # Coordinates relative to the aim point: map coordinates of millions of m would leave single precision no
     # digits for voxels.
     aim = jnp.concatenate([lidar.position, jnp.zeros_like(lidar.position[:1])])
@@ -234,13 +261,13 @@ def _build_geometry(
 compiled_geometry = Program(_build_geometry)
 
 
-def aim_at(scene: DeviceScene, lidar: Lidar, by: Float[Array, "2"]) -> DeviceScene:
-    """Return the scene for a lidar that aims `by` m farther to the east and to the north.
+def aim_at(scene: DeviceScene, lidar: Lidar, offset: Float[Array, "2"]) -> DeviceScene:
+    """Return the scene for a lidar that aims `offset` m farther to the east and to the north.
 
     Map and terrain are shifted, not built again: a shot costs the same over a map of any size.
     """
     # The aim point is the origin: the scene moves against the shot.
-    back = -jnp.concatenate([by, jnp.zeros_like(by[:1])])
+    back = -jnp.concatenate([offset, jnp.zeros_like(offset[:1])])
     medium = scene.medium
     if medium is not None:
         medium = eqx.tree_at(lambda m: m.origin, medium, medium.origin + back)

@@ -1,9 +1,9 @@
-r"""Shared illumination, part one: light that enters all over a scene, tallied by entry node.
+r"""Entry nodes of shared illumination: light that enters all over a scene, tallied by entry node.
 
 Light falls about every node n of a grid with the density of a cubic B-spline B_n(a), four spacings wide. The
 response to an irradiance sum_n c_n B_n(a) is sum_n c_n response_n, so that one trace, tallied by node, serves
-every footprint that is near to such a spline. Photons of two nodes are independent, so that variances add
-with the squares of c_n.
+every footprint that is near to such a spline. Photons of two nodes are nearly independent, so that variances
+add with the squares of c_n.
 
 Histories times nodes would be too many; optics are applied while light is traced. The response of a node has
 one trace for each wavelength, with one history.
@@ -40,7 +40,7 @@ class EntryNodes(eqx.Module):
     """Nodes of a grid, and the photons and rays that enter about each.
 
     - `position`: of the nodes, m from the aim point. `spacing`: of the grid, m.
-    - `photon_node`, `photon_rank`: of every photon its node, and its number among the photons of this node.
+    - `photon_node`, `photon_rank`: of every photon its node, and its rank among the photons of this node.
     - `photon_fraction`: of every photon in the light of its node; 0 for spare photons.
     - `group_node`, `group_rank`, `group_fraction`: the same for groups of `RAYS_PER_GROUP` rays of order one;
       `group_rank` is the number of the first ray, and `group_fraction` that of each.
@@ -63,7 +63,16 @@ class EntryNodes(eqx.Module):
     def send_photons(
         self, scene: DeviceScene, lane: UInt32[Array, "photons"], key: PRNGKeyArray
     ) -> tuple[UInt32[Array, "photons"], Photons]:
-        """Send photons into the scene; also return their numbers in the lattices of later random numbers."""
+        """Send photons into the scene; also return their numbers in the lattices of later random numbers.
+
+        `lane`: number of the photon in the batch; lanes beyond the last photon are padding.
+
+        1. The node and the rank of each photon.
+        2. Its point of entry, with the density of the node's spline.
+        3. Its start above the scene, on the ray through that point.
+        4. Its weight, the fraction of the node's light; zero for padding. The index of the node takes the
+           place of the history.
+        """
         assert scene.optics is not None
         # Lanes beyond the last photon fill up the last chunk, with the weight zero.
         photon = jnp.minimum(lane, self.n_photons - 1)
@@ -72,7 +81,8 @@ class EntryNodes(eqx.Module):
         point, w, excess = scene.beam.ray(entry)
         to_start = jnp.asarray(-scene.limits.start_distance, excess.dtype)
         is_real = (lane < self.n_photons) & (fraction > 0)
-        # Times of light that shots see each in their own direction are relative to where it enters.
+        # With shot views, times are relative to a shot whose axis goes through the point of entry:
+        # `ShotViews.seen_by_shots` adds the delay of each shot.
         entry_path = 0.0 if scene.shot_views is None else 2.0 * dot(point, w)
         photons = Photons(
             x=along(point, w, to_start),
@@ -84,7 +94,7 @@ class EntryNodes(eqx.Module):
             last_scattering=scene.if_differentiated(not_scattered(excess)),
             alive=is_real,
             optical_weights=tuple(jnp.ones_like(excess) for _ in range(scene.optics.shape[1])),
-            entry=None if scene.shot_views is None else entry,
+            entry_point=None if scene.shot_views is None else entry,
         )
         return number, photons
 
@@ -101,7 +111,7 @@ class EntryNodes(eqx.Module):
     ) -> tuple[UInt32[Array, "*s"], tuple[Scalar, Scalar]]:
         """Sample points of entry about nodes: one lattice per node, at random offsets."""
         # Node n takes a stretch of the lattice that starts n strides on. The stride is random, so that the
-        # entries of two nodes are as good as independent.
+        # entries of two nodes are nearly independent.
         words = random_words(key, 5)
         stride = words[0] | jnp.uint32(1)
         number = rank.astype(jnp.uint32) + node.astype(jnp.uint32) * stride

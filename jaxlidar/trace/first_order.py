@@ -1,14 +1,16 @@
 r"""First order: every ray of the footprint is marched through the scene, and its expected return deposited.
 
-Nothing is random. With extinction coefficients k_m of the materials m, their sum k, and the optical depth tau
-from the sensor, the return from a segment of the ray is
+Given the rays, nothing is random (`jaxlidar.trace.response` may shift the rays at random). With extinction
+coefficients k_m of the materials m, their sum k, and the optical depth tau from the sensor, the return from a
+segment of the ray, per unit of its energy, is
 
     V_m * integral of k_m exp(-kappa tau(s)) ds,    kappa = 2, or 1 with the hot spot,
 
 integrated exactly over every piece of the ray that lies within one voxel and one time bin. V_m is the
-intensity factor for backscatter (`jaxlidar.optics.facets`, `jaxlidar.optics.phase`). A surface at the
-distance d returns V exp(-kappa tau(d)) at one instant. Plates in the path multiply by their transmittance
-once on the way in and once on the way out.
+intensity factor for backscatter: 2/3 of spherically oriented facets, <cos^2> / G of others, pi p(w -> -w) of
+a phase function p (`jaxlidar.optics.facets`, `jaxlidar.optics.phase`). A surface at the distance d returns
+V exp(-kappa tau(d)) at one instant. Plates in the path multiply by their transmittance once on the way in and
+once on the way out.
 """
 
 import itertools
@@ -38,8 +40,12 @@ from jaxlidar.trace.ray_segments import (
     march_ray,
     mean_decay,
 )
-from jaxlidar.trace.reparametrisation import moves_with_terrain, rays_with_columns, rays_with_terrain
-from jaxlidar.trace.score_functions import add_column_rows, segment_derivatives, with_depth_slopes
+from jaxlidar.trace.reparametrisation import (
+    has_rays_moving_with_terrain,
+    rays_with_columns,
+    rays_with_terrain,
+)
+from jaxlidar.trace.score_functions import add_parameter_rows, segment_derivatives, with_depth_slopes
 from jaxlidar.trace.surfaces import TracedSurface
 from jaxlidar.trace.voxel_traversal import Medium
 
@@ -75,7 +81,7 @@ class PlateTransmission:
         self.combinations = list(itertools.product(*terms_by_plate))
 
     def terms(
-        self, table: Histories, history: int, distance: Scalar, surface_distances: list[Scalar]
+        self, histories: Histories, history: int, distance: Scalar, surface_distances: list[Scalar]
     ) -> Iterator[tuple[Int[Array, "..."] | int, Scalar]]:
         """Yield pairs of history and weight of light that scatters at `distance` into `history`.
 
@@ -84,19 +90,19 @@ class PlateTransmission:
         if not self.plates:
             yield history, jnp.ones_like(distance)
             return
-        next_history = jnp.asarray(table.next_history)
+        next_history = jnp.asarray(histories.next_history)
         for combination in self.combinations:
-            number = jnp.full(distance.shape, history, jnp.int32)
+            path_history = jnp.full(distance.shape, history, jnp.int32)
             weight = jnp.ones_like(distance)
             for (i, _, channel), (exponent, value, if_absent) in zip(self.plates, combination):
                 # A plate behind the point of return shades nothing.
                 in_path = surface_distances[i] < distance
-                after = number
+                after = path_history
                 for _ in range(exponent if channel >= 0 else 0):
                     after = next_history[after, channel]
-                number = jnp.where(in_path, after, number)
+                path_history = jnp.where(in_path, after, path_history)
                 weight = weight * jnp.where(in_path, value, if_absent)
-            yield number, weight
+            yield path_history, weight
 
 
 class FirstOrder(eqx.Module):
@@ -104,8 +110,8 @@ class FirstOrder(eqx.Module):
 
     - `weights`, `outside`: apparent reflectance per unit optics, within the bins and outside of them.
     - `arrived`, `escaped`: energy that reached each material, and that left the scene unscattered.
-    - `scattered`: the part of `arrived` that is scattered at all, per unit optics (a law's albedo).
-    - `weight_slopes`: derivatives of the weights, where scores are asked for; else None.
+    - `scattered`: `arrived` times the albedo of the law, energy that is scattered per unit optics.
+    - `weight_slopes`: derivatives of the weights with respect to parameters; None without score functions.
     """
 
     weights: Float[Array, "materials histories bins"]
@@ -113,7 +119,7 @@ class FirstOrder(eqx.Module):
     arrived: Float[Array, "materials histories"]
     scattered: Float[Array, "materials histories"]
     escaped: Float[Array, "histories"]
-    weight_slopes: Float[Array, "materials histories bins columns"] | None = None
+    weight_slopes: Float[Array, "materials histories bins parameters"] | None = None
 
 
 class FootprintRays(NamedTuple):
@@ -137,7 +143,7 @@ def send_rays(scene: DeviceScene, across: tuple[Scalar, Scalar], energy: Scalar)
     # These change derivatives alone: rays move with the geometry.
     across, ratio = rays_with_columns(beam, scene.medium, across)
     energy = energy * ratio
-    if moves_with_terrain(scene):
+    if has_rays_moving_with_terrain(scene):
         across, ratio = rays_with_terrain(scene, across)
         energy = energy * ratio
     point, w, excess = beam.ray(across)
@@ -162,14 +168,14 @@ def march_rays(scene: DeviceScene, rays: FootprintRays) -> tuple[RaySegments, li
 
 
 class _FirstOrderTally(NamedTuple):
-    """Sums over rays while they are deposited; entries are materials times histories.
+    """Sums over rays while they are deposited, in rows (axis `entries`): materials times histories.
 
-    `returned`: by entry and padded bin. `arrived`: by entry. `slopes`: derivatives of `returned`, or None.
+    `returned`: by row and padded bin. `arrived`: by row. `slopes`: derivatives of `returned`, or None.
     """
 
     returned: Float[Array, "entries padded"]
     arrived: Float[Array, "entries"]
-    slopes: Float[Array, "entries padded columns"] | None
+    slopes: Float[Array, "entries padded parameters"] | None
 
 
 def first_order(
@@ -194,36 +200,42 @@ def first_order(
     5. What is left of rays that meet no ground escapes.
     """
     beam, medium, surfaces = scene.beam, scene.medium, scene.surfaces
-    config, table, bins = scene.config, scene.first_histories, scene.bins
-    n_histories, leaf_material = table.count, -1 if config.leaf is None else config.leaf.material
+    config, histories, bins = scene.config, scene.first_histories, scene.bins
+    n_histories, leaf_material = histories.count, -1 if config.leaf is None else config.leaf.material
     one_passage = PlateTransmission(surfaces, config, 1)
     two_passages = PlateTransmission(surfaces, config, 2)
     kappa = 1.0 if config.hotspot else 2.0
-    next_history = table.next_history
+    next_history = histories.next_history
     n_materials, slopes = len(config.materials), scene.slopes
 
     # Materials are deposited one after the other, so that each has its own histories and intensity factor.
     def add_segments(tally, segments, per_ray):
-        """Add segments to a `_FirstOrderTally`; `per_ray`: the ray of each, and its seen energy."""
+        """Add segments to a `_FirstOrderTally`; `per_ray`: the ray of each, and its seen energy.
+
+        1. Integrate exp(-kappa tau) ds over each segment, bin by bin.
+        2. For each material, and each term of the plates in the path: add V_m k_m times these integrals.
+        3. With score functions, add their derivatives.
+        4. Add the energy that arrives, k_m times the integral of exp(-tau) ds.
+        """
         assert medium is not None
         (returned, arrived, return_slopes), (rays, seen_energy) = tally, per_ray
         k, w, distances = segments.extinction, rays.w, rays.surface_distances
         start_position = bins.position(2.0 * (rays.excess + segments.start) / SPEED_OF_LIGHT)
         first_bin, pieces = integrate_over_bins(bins, start_position, segments, kappa)
         # Integral of exp(-tau) ds over the segment: what arrives is attenuated once.
-        passing = jnp.exp(-segments.depth) * mean_decay(k * segments.length) * segments.length
+        attenuated_length = jnp.exp(-segments.depth) * mean_decay(k * segments.length) * segments.length
         middle = segments.start + 0.5 * segments.length
         materials = _medium_materials(medium, config, segments, w)
         for m, material in materials if mirror is None else ():
             value = material.extinction * (material.intensity_factor * seen_energy)
             scattered_history = int(next_history[0, material.channel])
-            for history, factor in two_passages.terms(table, scattered_history, middle, distances):
-                entry = jnp.broadcast_to(m * n_histories + history, first_bin.shape)
+            for history, factor in two_passages.terms(histories, scattered_history, middle, distances):
+                tally_row = jnp.broadcast_to(m * n_histories + history, first_bin.shape)
                 # Optimisation barriers: fused, the factor would be computed again for each piece, out of
                 # order.
                 row = once(pieces * once(value * factor)[None])
                 row = jnp.moveaxis(row, 0, -1)
-                returned = add_rows(returned, entry, first_bin, row)
+                returned = add_rows(returned, tally_row, first_bin, row)
                 if slopes is not None:
                     assert return_slopes is not None
                     rows = segment_derivatives(
@@ -236,13 +248,15 @@ def first_order(
                         material.extinction,
                         material.intensity_factor * seen_energy * factor,
                     )
-                    return_slopes = add_column_rows(return_slopes, entry, first_bin, rows)
-            for history, factor in one_passage.terms(table, 0, middle, distances):
-                weight = material.extinction * passing * factor * rays.energy
+                    return_slopes = add_parameter_rows(return_slopes, tally_row, first_bin, rows)
+            for history, factor in one_passage.terms(histories, 0, middle, distances):
+                weight = material.extinction * attenuated_length * factor * rays.energy
                 arrived = _add(arrived, m * n_histories + history, weight)
         return _FirstOrderTally(returned, arrived, return_slopes)
 
     def trace_chunk(across, energy):
+        """Trace a chunk of rays by the five steps of `first_order`."""
+        # Step 1.
         rays = send_rays(scene, across, energy)
         x, w, excess, energy, distances, end = rays
         # What the receiver sees of a ray, at the ground or at the reference plane: beams are narrow in angle.
@@ -260,6 +274,7 @@ def first_order(
             if slopes is not None:
                 segments, slopes_at_surfaces = with_depth_slopes(scene, segments, w, distances)
 
+            # Step 2.
             tally, per_ray = _FirstOrderTally(returned, arrived, return_slopes), (rays, seen_energy)
             if scene.reverse:
 
@@ -270,16 +285,17 @@ def first_order(
                 returned, arrived, return_slopes = lax.scan(step, tally, segments)[0]
             else:
                 # Segments of zero extinction return nothing, but have derivatives.
-                counts = segments.extinction > 0.0 if scene.derivatives == "none" else None
+                contributes = segments.extinction > 0.0 if scene.derivatives == "none" else None
                 returned, arrived, return_slopes = add_in_blocks(
-                    add_segments, tally, segments, per_ray, counts
+                    add_segments, tally, segments, per_ray, contributes
                 )
-            # All that collides in the medium is scattered.
+            # Step 3. All energy that collides in the medium is scattered.
             returned, scattered = smooth_bins(returned)[:, 1:-1], arrived
             if return_slopes is not None:
                 smooth = smooth_bins(jnp.swapaxes(return_slopes, 1, 2))[..., 1:-1]
                 return_slopes = jnp.swapaxes(smooth, 1, 2)
 
+        # Step 4.
         for i, (surface, scatterer) in enumerate(zip(surfaces, config.surfaces)):
             if mirror is not None and i != mirror:
                 continue
@@ -287,18 +303,18 @@ def first_order(
             hit_energy = jnp.where((distances[i] <= end) & is_met, surface.coverage * energy, 0.0)
             point = along(x, w, jnp.where(is_met, distances[i], 0.0))
             normal, back = surface.lit_normal(point, w), scale(w, jnp.asarray(-1.0))
-            for history, factor in one_passage.terms(table, 0, distances[i], distances):
+            for history, factor in one_passage.terms(histories, 0, distances[i], distances):
                 weight = hit_energy * jnp.exp(-depth_at_surfaces[i]) * factor
-                entry = scatterer.material * n_histories + history
-                arrived = _add(arrived, entry, weight)
+                tally_row = scatterer.material * n_histories + history
+                arrived = _add(arrived, tally_row, weight)
                 # What a law does not reflect per unit reflectance is absorbed, not scattered.
-                albedo = surface.at_position(point, surface.law.albedo(w, normal))
-                scattered = _add(scattered, entry, weight * albedo)
+                albedo = surface.scale_by_pattern(point, surface.law.albedo(w, normal))
+                scattered = _add(scattered, tally_row, weight * albedo)
             if mirror is None and isinstance(surface.law, AbstractMirror):
                 continue
             # A plate may lie far above the ground, where the field of view is narrower: it is taken at the
             # point itself.
-            seen = surface.at_position(point, beam.in_view(point))
+            seen = surface.scale_by_pattern(point, beam.in_view(point))
             if mirror is None:
                 seen = surface.law.intensity_factor(w, normal, back, beam.half_angle) * seen
             # FAR would overflow when it is converted to bins.
@@ -307,17 +323,18 @@ def first_order(
                 bins, time, hit_energy * seen * jnp.exp(-kappa * depth_at_surfaces[i])
             )
             reflected_history = int(next_history[0, scatterer.reflection])
-            for history, factor in two_passages.terms(table, reflected_history, distances[i], distances):
-                entry = jnp.broadcast_to(scatterer.material * n_histories + history, first_bin.shape)
-                returned = add_rows(returned, entry, first_bin, row * factor[:, None])
+            terms = two_passages.terms(histories, reflected_history, distances[i], distances)
+            for history, factor in terms:
+                tally_row = jnp.broadcast_to(scatterer.material * n_histories + history, first_bin.shape)
+                returned = add_rows(returned, tally_row, first_bin, row * factor[:, None])
                 if return_slopes is not None:
                     values = lax.stop_gradient(row * factor[:, None])
                     rows = outer_rows(values, -kappa * slopes_at_surfaces[i])
-                    return_slopes = add_column_rows(return_slopes, entry, first_bin, rows)
+                    return_slopes = add_parameter_rows(return_slopes, tally_row, first_bin, rows)
 
-        # Rays that meet the ground end there; only those that fly past it escape.
+        # Step 5. Rays that meet the ground end there; only those that fly past it escape.
         unscattered = jnp.where(end < FAR, 0.0, energy * jnp.exp(-total_depth))
-        for history, factor in one_passage.terms(table, 0, end, distances):
+        for history, factor in one_passage.terms(histories, 0, end, distances):
             escaped = _add(escaped, history, unscattered * factor)
         shape = (n_materials, n_histories)
         if return_slopes is not None:
@@ -353,11 +370,11 @@ def first_order(
 
 
 def _add(
-    tally: Float[Array, "entries"], entry: Int[Array, "*s"] | int, weight: Float[Array, "*s"]
+    tally: Float[Array, "entries"], tally_row: Int[Array, "*s"] | int, weight: Float[Array, "*s"]
 ) -> Float[Array, "entries"]:
-    """Add weights to entries; as one sum where all rays have the same entry."""
-    weight = jnp.sum(weight) if isinstance(entry, int) else weight
-    return tally.at[entry].add(weight)
+    """Add weights to rows of a tally; as one sum where all rays have the same row."""
+    weight = jnp.sum(weight) if isinstance(tally_row, int) else weight
+    return tally.at[tally_row].add(weight)
 
 
 class MediumMaterial(eqx.Module):

@@ -12,7 +12,10 @@ that it moves with voxel sizes and heights, and the weight carries the attached 
 
     p(s) ds = k exp(-tau) ds  ->  (k and exp(-tau) and the chord, each over its detached value).
 
-The factor k is attached where the collision's material is known (`jaxlidar.trace.collisions`).
+exp(-tau) and the chord are attached here. The material m is drawn with the probability k_m / k, so that the
+density of position and material together has the factor k_m in place of k; it is attached where the material
+is known (`jaxlidar.trace.collisions`). The ratio of a flight that does not collide is that of its
+probability, exp(-tau) of the whole flight.
 """
 
 import functools
@@ -24,7 +27,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxlidar._vectors import FAR, Scalar, with_derivative_of
 from jaxlidar.trace.device_scene import DeviceScene
-from jaxlidar.trace.photons import GAP, SCATTERED, TRANSMITTED, Photons, attached_ratio, detach
+from jaxlidar.trace.photons import GAP, STOPPED, TRANSMITTED, Photons, attached_ratio, detach
 from jaxlidar.trace.voxel_traversal import march_to_depths
 
 
@@ -34,8 +37,10 @@ class Flight(eqx.Module):
     - `collided`, `landed`, `late`, `escaped`: which of these, all False for photons that are not alive.
     - `cell`: the voxel of a collision.
     - `distance`: length flown, m.
-    - `ratio`: attached ratio of the density of that distance.
-    - `depth_slopes`: derivatives of the optical depth flown, where scores are asked for; else None.
+    - `ratio`: attached ratio of the density of that distance but for the factor k (see the module), or of
+      the probability of no collision.
+    - `depth_slopes`: derivatives of the optical depth flown with respect to parameters; None without
+      score functions.
     """
 
     collided: Bool[Array, "*photons"]
@@ -45,7 +50,7 @@ class Flight(eqx.Module):
     cell: Int[Array, "*photons"]
     distance: Float[Array, "*photons"]
     ratio: Float[Array, "*photons"]
-    depth_slopes: Float[Array, "ends columns photons"] | None = None
+    depth_slopes: Float[Array, "ends parameters photons"] | None = None
 
     @property
     def has_hit(self) -> Bool[Array, "*photons"]:
@@ -61,7 +66,8 @@ class SurfaceEncounters(eqx.Module):
     """The surfaces ahead of photons, and what will happen there.
 
     - `distances`: to each surface, m; FAR where it is not met.
-    - `outcomes`: for each plate GAP, SCATTERED or TRANSMITTED; None for the ground.
+    - `outcomes`: for each plate GAP, STOPPED (reflected, absorbed, or transmitted diffusely) or TRANSMITTED
+      (straight on); None for the ground.
     - `ratios`: for each plate, attached ratio of that outcome; None for the ground.
     - `stops`: distance to each surface if the photon will stop there, else FAR.
     - `nearest_stop`: distance to the nearest surface at which the photon stops.
@@ -77,14 +83,19 @@ class SurfaceEncounters(eqx.Module):
 def meet_surfaces(scene: DeviceScene, p: Photons, draws: tuple[Scalar, ...]) -> SurfaceEncounters:
     """Find the surfaces ahead of photons, and sample the outcome at each plate.
 
-    `draws`: one uniform number for each plate.
+    1. The distance to each surface. The ground stops every photon that meets it.
+    2. A plate of the coverage c: u < c meets its material, else a gap. With straight transmission, u from c q
+       to c is transmitted; other photons that meet material stop.
+    3. The nearest distance at which the photon stops.
+
+    `draws`: one uniform number u for each plate.
     """
     distances, outcomes, ratios, stops = [], [], [], []
     remaining_draws = iter(draws)
     for i, surface in enumerate(scene.surfaces):
         distance = surface.distance(p.x, p.w)
         if not surface.shape.lights_itself:
-            # A photon starts on this surface within rounding, and would meet it at once.
+            # Light that leaves this surface never meets it again; by rounding, the photon may start below it.
             distance = jnp.where(p.surface == i, FAR, distance)
         distances.append(distance)
         if not surface.is_plate:
@@ -96,7 +107,7 @@ def meet_surfaces(scene: DeviceScene, p: Photons, draws: tuple[Scalar, ...]) -> 
         is_hit = u < coverage
         # A partial plate is a mixture: sampling gap or material gives each photon one history, and no path is
         # split.
-        outcome = jnp.where(is_hit, SCATTERED, GAP)
+        outcome = jnp.where(is_hit, STOPPED, GAP)
         if surface.straight and scene.config.surfaces[i].transmission >= 0:
             # The number that decided that the plate was hit decides between reflection and transmission, too.
             transmitted = is_hit & (u >= coverage * scene.limits.reflection_probability)
@@ -105,7 +116,7 @@ def meet_surfaces(scene: DeviceScene, p: Photons, draws: tuple[Scalar, ...]) -> 
         ratios.append(attached_ratio(jnp.where(is_hit, coverage, 1.0 - coverage)))
         # A plate that lets the photon pass is no obstacle to the flight; `_pass_plates` accounts for it
         # afterwards.
-        stops.append(jnp.where(outcome == SCATTERED, distance, FAR))
+        stops.append(jnp.where(outcome == STOPPED, distance, FAR))
     nearest_stop = jnp.full_like(p.weight, FAR)
     for stop in stops:
         nearest_stop = jnp.minimum(nearest_stop, stop)
@@ -150,7 +161,7 @@ def sample_flights(
             slopes=scene.slopes,
         )
         collided, cell, depth_slopes = crossing.crossed, crossing.cell, crossing.depth_slopes
-        # Looked up again rather than carried through the march, whose loop is the hot spot.
+        # Looked up again rather than carried through the march, whose loop takes most of the time.
         k = jnp.where(collided, jax.vmap(medium.extinction, (0, None))(cell, p.w), 1.0)
         chord = jnp.where(collided, crossing.chord, 1.0)
         # Guards against 0/0 where a voxel is empty or the chord zero.

@@ -7,9 +7,10 @@ cancellation as
 
     excess = q / (1 + sqrt(1 + q / R)),   q = 2 x.a + |x|^2 / R.
 
-Rays carry equal energies. Of a Gaussian beam with the radius w (at 1/e^2) the circle of radius r encloses the
-share 1 - exp(-2 r^2 / w^2); of a top-hat r^2 / w^2. Rays lie on a Fibonacci disc: shares of equal steps,
-directions that turn by the golden angle.
+Of a Gaussian beam with the radius w0 (at 1/e^2) the circle of radius r encloses the fraction
+1 - exp(-2 r^2 / w0^2) of the energy; of a top-hat r^2 / w0^2. Rays lie on a Fibonacci disc (Vogel's spiral):
+enclosed fractions in equal steps, so that rays carry equal energies, and directions that turn by the golden
+angle. For smooth integrands, a product rule of unequal weights is more accurate (`product_rule`).
 """
 
 import dataclasses
@@ -62,13 +63,13 @@ class Beam(eqx.Module):
     def excess(self, point: Vec) -> Scalar:
         """Distance from the sensor minus the slant range, m, computed without cancellation."""
         if self.parallel:
-            # A beam's wave front is curved: its light arrives later by w^2 / (4 R) in the mean over the
+            # A beam's wave front is curved: its light arrives later by w0^2 / (4 R) in the mean over the
             # footprint.
             return dot(point, self.axis) + 0.25 * self.radius**2 / self.slant_range
         r = self.slant_range
         # |x + R a|^2 = R^2 (1 + q / R): the leading R is taken out before the root.
-        x = 2.0 * dot(point, self.axis) + dot(point, point) / r
-        return x / (1.0 + jnp.sqrt(jnp.maximum(1.0 + x / r, 1e-12)))
+        q = 2.0 * dot(point, self.axis) + dot(point, point) / r
+        return q / (1.0 + jnp.sqrt(jnp.maximum(1.0 + q / r, 1e-12)))
 
     def view(self, point: Vec) -> Vec:
         """Unit vector from `point` to the sensor."""
@@ -108,10 +109,10 @@ class Beam(eqx.Module):
     def irradiance(self, across: tuple[Scalar, Scalar]) -> Scalar:
         """Fraction of the pulse's energy per m2 across the beam, at x and y across it, m."""
         r2 = across[0] ** 2 + across[1] ** 2
-        w2 = jnp.maximum(self.radius, 1e-6) ** 2
+        radius2 = jnp.maximum(self.radius, 1e-6) ** 2
         if self.gaussian:
-            return 2.0 / (np.pi * w2) * jnp.exp(-jnp.minimum(2.0 * r2 / w2, 80.0))
-        return jnp.where(r2 <= w2, 1.0 / (np.pi * w2), 0.0)
+            return 2.0 / (np.pi * radius2) * jnp.exp(-jnp.minimum(2.0 * r2 / radius2, 80.0))
+        return jnp.where(r2 <= radius2, 1.0 / (np.pi * radius2), 0.0)
 
 
 def make_beam(lidar: Lidar) -> Beam:
@@ -134,8 +135,8 @@ def parallel_beam(lidar: Lidar) -> Beam:
     return dataclasses.replace(beam, view_radius=None, gaussian=False, parallel=True)
 
 
-def disc(radius: Scalar, turn: Scalar) -> tuple[Scalar, Scalar]:
-    """Return x and y of the point at `radius` in the direction `turn`, in turns."""
+def from_polar(radius: Scalar, turn: Scalar) -> tuple[Scalar, Scalar]:
+    """Return x and y of the point at `radius` in the direction `turn`, in whole turns."""
     return radius * jnp.cos(2 * np.pi * turn), radius * jnp.sin(2 * np.pi * turn)
 
 
@@ -143,7 +144,9 @@ def across_beam(beam: Beam, energy_fraction: Scalar, turn: Scalar) -> tuple[Scal
     """Return the point across the beam, m, whose circle encloses `energy_fraction`."""
     # All of a Gaussian beam's energy is within an infinite circle.
     enclosed = jnp.clip(energy_fraction, 0.0, 1.0 - 1e-7)
-    return disc(beam.radius * jnp.sqrt(-0.5 * jnp.log1p(-enclosed) if beam.gaussian else enclosed), turn)
+    return from_polar(
+        beam.radius * jnp.sqrt(-0.5 * jnp.log1p(-enclosed) if beam.gaussian else enclosed), turn
+    )
 
 
 class RaySlice(NamedTuple):
@@ -168,7 +171,8 @@ def fibonacci_disc(
     """
     before = jnp.asarray(ray_slice.number * count)
     u = (before + jnp.arange(count) + shift[0]) / (count * ray_slice.count)
-    # Integers overflow as turns do, and lose no digits where there are many rays.
+    # The golden angle in units of 2^-32 turns: integers overflow as turns do, and lose no digits where there
+    # are many rays.
     turned = (before.astype(jnp.uint32) * np.uint32(round(GOLDEN * 2**32))).astype(u.dtype) * 2.0**-32
     turn = jnp.asarray((np.arange(count) * GOLDEN) % 1.0, u.dtype) + turned + shift[1]
     return across_beam(beam, u, turn), jnp.full((count,), 1.0 / count, u.dtype)
@@ -179,7 +183,7 @@ def product_rule(
 ) -> tuple[tuple[Scalar, Scalar], Float[Array, "rays"]]:
     """Return a Gauss rule in radius times equal steps in azimuth: spectrally accurate for smooth integrands.
 
-    It is Gauss-Laguerre in 2 r^2 / w^2 for the Gaussian beam, and Gauss-Legendre in r^2 for the top-hat. At
+    It is Gauss-Laguerre in 2 r^2 / w0^2 for the Gaussian beam, and Gauss-Legendre in r^2 for the top-hat. At
     the edge of a field of view the integrand is not smooth: there, panels of a Gauss-Legendre rule in r end
     at the edge.
 
@@ -191,6 +195,7 @@ def product_rule(
         x, weight = np.polynomial.laguerre.laggauss(radial)
         r, weight = beam.radius * jnp.sqrt(jnp.asarray(x / 2)), jnp.asarray(weight)
     else:
+        # The fraction of energy is r^2 / w0^2, from 0 to 1.
         x, weight = np.polynomial.legendre.leggauss(radial)
         r, weight = beam.radius * jnp.sqrt(jnp.asarray((x + 1) / 2)), jnp.asarray(weight / 2)
     a = 2 * np.pi * (np.arange(angular) + 0.5) / angular
@@ -201,11 +206,14 @@ def product_rule(
 def _rule_with_edge(
     beam: Beam, edge: Float[Array, ""], order: int = 16
 ) -> tuple[Float[Array, "radii"], Float[Array, "radii"]]:
-    """Return radii and energy fractions: Gauss-Legendre panels that resolve a soft edge of 2 %."""
+    """Return radii and energy fractions: Gauss-Legendre panels that resolve a soft edge of 2 %.
+
+    Panels end at 0.8, 1 and 1.2 times the radius of the edge, and at the end of the beam.
+    """
     # In units of the beam's radius; beyond four of them a Gaussian beam has 1e-14 of its energy.
     end = jnp.asarray(4.0 if beam.gaussian else 1.0, edge.dtype)
-    at = edge / jnp.maximum(beam.radius, 1e-9)
-    ends = jnp.stack([0.0 * end, *(jnp.minimum(f * at, end) for f in (0.8, 1.0, 1.2)), end])
+    edge_in_radii = edge / jnp.maximum(beam.radius, 1e-9)
+    ends = jnp.stack([0.0 * end, *(jnp.minimum(f * edge_in_radii, end) for f in (0.8, 1.0, 1.2)), end])
     node, weight = (jnp.asarray(v, edge.dtype)[None, :] for v in np.polynomial.legendre.leggauss(order))
     half = 0.5 * jnp.diff(ends)[:, None]
     r = (ends[:-1, None] + half * (1.0 + node)).reshape(-1)

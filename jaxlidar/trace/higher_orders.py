@@ -4,11 +4,16 @@ Photons carry no energy, only the geometric weight of their path and the number 
 Each order samples a collision: the optical depth to it, the material, the direction onward. From there the
 photon deposits, for every channel by which light may return (next-event estimation),
 
-    weight * V(w -> v) * exp(-tau(x -> sensor)) * (fraction that the receiver sees),
+    weight * V(w -> v) * exp(-tau(x -> sensor)) * (fraction that the receiver sees) * (R_t / R_x)^2,
 
-with V the intensity factor towards the sensor (`jaxlidar.trace.collisions`), at the time of the whole path.
-It does so from `deposits_per_flight` points of the flight, one in each stratum of the probability of getting
-there, each with an equal share of the weight, and goes on from one of them.
+with V the intensity factor towards the sensor (`jaxlidar.trace.collisions`), R_x the distance of x from the
+sensor, and R_t the range for which the time of arrival stands, half of the whole path: apparent reflectance
+refers to that range.
+
+It does so from the ends of n = `deposits_per_flight` flights of the same direction. Their transmittances u,
+by which depths -ln u are sampled, are stratified, u_i = (i + r) / n for i = 0 ... n - 1, with the remainder r
+of one uniform number times n; each end has the weight 1 / n. The photon goes on from the end that this number
+itself selects.
 
 Photons are grouped in chunks, which stay in the processor's cache, and chunks in groups. All chunks of a
 group are traced order by order, with living photons compacted before each order
@@ -17,13 +22,15 @@ group are traced order by order, with living photons compacted before each order
 Derivatives: decisions are detached, their densities attached (`jaxlidar.trace.photons`). Directions,
 materials, and the fraction of a chord at which a collision lies are held fixed; voxel sizes, heights and
 extinction move positions, path lengths and densities continuously, so that the expected value of the
-derivative is the derivative of the expected value. Photons never collide where the extinction coefficient is
-exactly zero, and the derivative with respect to it is zero here.
+derivative is the derivative of the expected value. Photons that head for a surface are the exception: their
+directions move with voxel columns and terrain cells (`jaxlidar.trace.reparametrisation`). Photons never
+collide where the extinction coefficient is exactly zero, and the derivative with respect to it is zero here.
 """
 
 import dataclasses
 import functools
 from collections.abc import Callable
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -34,7 +41,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt32
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._one_function import once
 from jaxlidar._vectors import FAR, Scalar, Vec, along
-from jaxlidar.trace.collisions import intensity_factors, visible_collision
+from jaxlidar.trace.collisions import collision_for_return, intensity_factors
 from jaxlidar.trace.compaction import compact
 from jaxlidar.trace.deposit import add_rows, bspline_row
 from jaxlidar.trace.device_scene import DeviceScene, not_scattered
@@ -42,16 +49,16 @@ from jaxlidar.trace.entry_nodes import EntryNodes
 from jaxlidar.trace.flight import Flight, SurfaceEncounters, meet_surfaces, sample_flights
 from jaxlidar.trace.footprint import GOLDEN, across_beam
 from jaxlidar.trace.photon_step import collide, passed_plates
-from jaxlidar.trace.photons import Photons, VisibleCollision, attached_ratio, detach
+from jaxlidar.trace.photons import CollisionForReturn, Photons, attached_ratio, detach
 from jaxlidar.trace.random_numbers import PhotonDraws, random_words, shifted_lattices, to_unit
 from jaxlidar.trace.reparametrisation import (
+    has_moving_landings,
+    has_rays_moving_with_terrain,
     landings_with_grids,
-    moves_landings,
-    moves_with_terrain,
     rays_with_columns,
     rays_with_terrain,
 )
-from jaxlidar.trace.score_functions import add_scored_returns, collision_score, vertical_depth_slopes
+from jaxlidar.trace.score_functions import add_derivatives_of_returns, collision_score, vertical_depth_slopes
 from jaxlidar.trace.tally_index import TallyIndex, add_to_tally
 from jaxlidar.trace.voxel_traversal import depth_to_top, march_to_depths
 
@@ -66,24 +73,25 @@ class HigherOrderTally(eqx.Module):
     """Response of orders two and above, and the energy budget of all light (see `jaxlidar.trace.response`).
 
     The axis `entries` is that of histories; or, where optics are applied, of wavelengths, with `EntryNodes`
-    of nodes and wavelengths; that of `weights` and `outside` is of shots and wavelengths with `ShotViews`.
+    of nodes times wavelengths. The axis `return_entries` is the same, or with `ShotViews` of shots times
+    wavelengths. Wavelengths lie innermost (`jaxlidar.trace.tally_index`).
 
     - `weights`, `outside`: returns within the bins and outside of them; with both margins while photons are
       traced.
     - `arrived`, `departed`: weight that reached each material, and that went on from it.
     - `escaped`, `late`, `remaining`: weight that left the scene, that could not be recorded any more, and
-      that had scatterings left when the last order was reached.
-    - `weight_slopes`: derivatives of the returns, where scores are asked for; else None.
+      that was still in flight after the last order.
+    - `weight_slopes`: derivatives of the returns with respect to parameters; None without score functions.
     """
 
-    weights: Float[Array, "materials seen bins"]
-    outside: Float[Array, "materials seen"]
+    weights: Float[Array, "materials return_entries bins"]
+    outside: Float[Array, "materials return_entries"]
     arrived: Float[Array, "materials entries"]
     departed: Float[Array, "materials entries"]
     escaped: Float[Array, "entries"]
     late: Float[Array, "entries"]
     remaining: Float[Array, "entries"]
-    weight_slopes: Float[Array, "bins columns wavelengths"] | None = None
+    weight_slopes: Float[Array, "bins parameters wavelengths"] | None = None
 
     def with_arrival(self, material: Array | int, index: TallyIndex, weight: Scalar) -> "HigherOrderTally":
         """Return the tally with weight that reached a material."""
@@ -94,6 +102,13 @@ class HigherOrderTally(eqx.Module):
         """Return the tally with weight that went on from a material."""
         departed = add_to_tally(self.departed, (material,), index, weight)
         return eqx.tree_at(lambda t: t.departed, self, departed)
+
+
+class _Lanes(NamedTuple):
+    """Photons, and the number of each in its batch, which its random numbers depend on."""
+
+    lane: UInt32[Array, "*photons"]
+    photons: Photons
 
 
 def trace_higher_orders(
@@ -124,53 +139,71 @@ def trace_higher_orders(
     n_groups = -(-n_chunks * chunk_size // (CHUNKS_PER_GROUP * PHOTONS_PER_CHUNK))
     chunks_per_group = -(-n_chunks // n_groups)
 
-    def send(lane: UInt32[Array, "photons"]) -> tuple[UInt32[Array, "photons"], Photons]:
+    def send(lane: UInt32[Array, "photons"]) -> _Lanes:
         if nodes is not None:
             assert node_key is not None
-            return nodes.send_photons(scene, lane, node_key)
-        return lane, _send_photons(scene, lane, footprint_shift)
+            return _Lanes(*nodes.send_photons(scene, lane, node_key))
+        return _Lanes(lane, _send_photons(scene, lane, footprint_shift))
 
-    # A group is a loop body, so that memory for photons does not grow with the batch.
+    empty = _empty_tally(scene, nodes)
+
     def trace_group(total: HigherOrderTally, group: UInt32[Array, ""]):
+        """Trace all orders of a group of chunks, and add its tally to the total.
+
+        1. Send photons, and arrange them in chunks.
+        2. Trace order after order.
+        3. Tally the weight that is still in flight.
+        """
+        # A group is a loop body, so that memory for photons does not grow with the batch.
         first = group * (chunks_per_group * chunk_size)
         lane = first + jnp.arange(chunks_per_group * chunk_size, dtype=jnp.uint32)
 
         def one_order(carry, order):
-            photons, tally = carry
+            """Trace one order of all chunks.
+
+            1. Compact: find the new order of living photons.
+            2. Gather a chunk of photons in that order.
+            3. Trace it, if any of them lives, and put it in its place; chunk after chunk.
+            """
+            lanes, tally = carry
             # Late orders have few photons left, and their paths differ in length: sorted, whole chunks are
             # dead or end together, and can be skipped.
-            source, n_living = compact(scene, photons[1])
+            source, n_living = compact(scene, lanes.photons)
             # Photons are gathered chunk by chunk, in their new order: a sort of the whole state would copy
             # all of it through memory.
-            flat = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), photons)
+            flat = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), lanes)
 
-            def gather(chunk):
+            def gather(chunk) -> _Lanes:
                 number = source[chunk]
-                lane, p = jax.tree.map(lambda a: a.at[number].get(mode="promise_in_bounds"), flat)
+                in_chunk = jax.tree.map(lambda a: a.at[number].get(mode="promise_in_bounds"), flat)
                 alive = chunk * chunk_size + jnp.arange(chunk_size) < n_living
-                return once((lane, eqx.tree_at(lambda p: p.alive, p, alive)))
+                return once(eqx.tree_at(lambda c: c.photons.alive, in_chunk, alive))
 
-            def trace(lane, p, tally):
-                draws = PhotonDraws.from_numbers(lattices(lane, order), scene.n_plates)
-                p, tally = _trace_order(scene, p, tally, draws, order)
-                return (lane, p), tally
+            def trace(in_chunk, tally):
+                draws = PhotonDraws.from_numbers(lattices(in_chunk.lane, order), scene.n_plates)
+                p, tally = _trace_order(scene, in_chunk.photons, tally, draws, order)
+                return _Lanes(in_chunk.lane, p), tally
+
+            def skip(in_chunk, tally):
+                return in_chunk, tally
 
             def scanned_chunk(tally, chunk):
-                lane, p = gather(chunk)
-                p, tally = lax.cond(jnp.any(p.alive), trace, lambda *c: (c[:2], c[2]), lane, p, tally)
-                return tally, p
+                in_chunk = gather(chunk)
+                in_chunk, tally = lax.cond(jnp.any(in_chunk.photons.alive), trace, skip, in_chunk, tally)
+                return tally, in_chunk
 
             def looped_chunk(chunk, state):
-                photons, tally = state
-                p, tally = trace(*gather(chunk), tally)
-                return jax.tree.map(lambda a, b: a.at[chunk].set(b), photons, p), tally
+                lanes, tally = state
+                in_chunk, tally = trace(gather(chunk), tally)
+                return jax.tree.map(lambda a, b: a.at[chunk].set(b), lanes, in_chunk), tally
 
             if scene.reverse:
                 # Chunks of dead photons are skipped. The loop has a static length, as reverse mode needs.
-                tally, photons = lax.scan(scanned_chunk, tally, jnp.arange(chunks_per_group))
-                return photons, tally
+                tally, lanes = lax.scan(scanned_chunk, tally, jnp.arange(chunks_per_group))
+                return lanes, tally
             # Chunks of dead photons are not even looked at.
-            all_dead = eqx.tree_at(lambda p: p[1].alive, photons, jnp.zeros_like(photons[1].alive))
+            none_alive = jnp.zeros_like(lanes.photons.alive)
+            all_dead = eqx.tree_at(lambda c: c.photons.alive, lanes, none_alive)
             n_living_chunks = -(-n_living // chunk_size)
             return lax.fori_loop(0, n_living_chunks, looped_chunk, (all_dead, tally))
 
@@ -179,15 +212,15 @@ def trace_higher_orders(
             return lax.cond(order < scene.limits.orders, one_order, lambda c, _: c, carry, order), None
 
         shape = (chunks_per_group, chunk_size)
-        photons = jax.tree.map(lambda a: a.reshape(*shape, *a.shape[1:]), send(lane))
+        lanes = jax.tree.map(lambda a: a.reshape(*shape, *a.shape[1:]), send(lane))
         orders = jnp.arange(config.order_steps)
-        ((_, p), tally), _ = lax.scan(order_step, (photons, empty), orders)
+        (lanes, tally), _ = lax.scan(order_step, (lanes, empty), orders)
+        p = lanes.photons
         weight = jnp.where(p.alive, p.weight, 0.0)
         remaining = add_to_tally(tally.remaining, (), TallyIndex.of(p), weight)
         tally = eqx.tree_at(lambda t: t.remaining, tally, remaining)
         return jax.tree.map(jnp.add, total, tally), None
 
-    empty = _empty_tally(scene, nodes)
     tally, _ = lax.scan(trace_group, empty, jnp.arange(n_groups, dtype=jnp.uint32))
     if slopes is not None:
         assert tally.weight_slopes is not None
@@ -198,18 +231,22 @@ def trace_higher_orders(
 
 
 def _empty_tally(scene: DeviceScene, nodes: EntryNodes | None) -> HigherOrderTally:
-    """Return a tally of zeros; its bins have both margins."""
+    """Return a tally of zeros; its bins have both margins.
+
+    Returns are tallied by history; by wavelength where optics are applied; by node, or shot, and wavelength
+    where light is shared. The energy budget has no shots: it is tallied by node.
+    """
     n_wavelengths = 0 if scene.optics is None else scene.optics.shape[1]
     if scene.optics is None:
         n_entries = scene.histories.count
     else:
         n_entries = n_wavelengths * (1 if nodes is None else len(nodes.position))
-    # What is recorded is tallied by shot; what no receiver sees (absorption, escape) by node.
-    n_seen = n_entries if scene.shot_views is None else n_wavelengths * scene.shot_views.n_shots
+    # Returns are tallied by shot; what no receiver sees (absorption, escape) by node.
+    n_return_entries = n_entries if scene.shot_views is None else n_wavelengths * scene.shot_views.n_shots
     n_materials, bins, slopes = len(scene.config.materials), scene.bins, scene.slopes
     return HigherOrderTally(
-        weights=jnp.zeros((n_materials, n_seen, bins.padded)),
-        outside=jnp.zeros((n_materials, n_seen)),
+        weights=jnp.zeros((n_materials, n_return_entries, bins.padded)),
+        outside=jnp.zeros((n_materials, n_return_entries)),
         arrived=jnp.zeros((n_materials, n_entries)),
         departed=jnp.zeros((n_materials, n_entries)),
         escaped=jnp.zeros((n_entries,)),
@@ -222,7 +259,12 @@ def _empty_tally(scene: DeviceScene, nodes: EntryNodes | None) -> HigherOrderTal
 
 
 def _send_photons(scene: DeviceScene, lane: UInt32[Array, "photons"], shift: Float[Array, "2"]) -> Photons:
-    """Send photons from the sensor, on a Fibonacci disc over the footprint that `shift` moves at random."""
+    """Send photons from the sensor, on a Fibonacci disc over the footprint that `shift` moves at random.
+
+    1. Point across the beam: the enclosed fraction of energy in equal steps, the direction by golden angles.
+    2. Move it with the geometry (derivatives alone), with the ratio of its density.
+    3. Start above everything in the scene; the weight is 1 / (number of photons), zero for padding.
+    """
     n_photons, slopes = scene.config.n_photons, scene.slopes
     n_wavelengths = 0 if scene.optics is None else scene.optics.shape[1]
     # Stratified in enclosed energy: every ring of equal energy gets one photon.
@@ -231,10 +273,10 @@ def _send_photons(scene: DeviceScene, lane: UInt32[Array, "photons"], shift: Flo
     turn = (lane * jnp.uint32(GOLDEN * 2**32)).astype(float) * 2.0**-32 + shift[1]
     # Lanes beyond the last photon fill up chunks.
     is_real = lane < n_photons
-    across, energy = rays_with_columns(scene.beam, scene.medium, across_beam(scene.beam, fraction, turn))
-    if moves_with_terrain(scene):
-        across, ratio = rays_with_terrain(scene, across)
-        energy = energy * ratio
+    across, ratio = rays_with_columns(scene.beam, scene.medium, across_beam(scene.beam, fraction, turn))
+    if has_rays_moving_with_terrain(scene):
+        across, terrain_ratio = rays_with_terrain(scene, across)
+        ratio = ratio * terrain_ratio
     point, w, excess = scene.beam.ray(across)
     # Photons start at a plane above everything in the scene, not at the sensor: positions stay small enough
     # for single precision.
@@ -243,7 +285,7 @@ def _send_photons(scene: DeviceScene, lane: UInt32[Array, "photons"], shift: Flo
         x=along(point, w, to_start),
         w=w,
         path=excess + to_start,
-        weight=jnp.where(is_real, energy / n_photons, 0.0),
+        weight=jnp.where(is_real, ratio / n_photons, 0.0),
         history=jnp.zeros(lane.shape, jnp.int32),
         surface=jnp.full(lane.shape, -1, jnp.int32),
         last_scattering=scene.if_differentiated(not_scattered(excess)),
@@ -259,8 +301,8 @@ def _trace_order(
     """Trace a chunk of photons through one order of scattering: fly, collide, deposit, scatter.
 
     1. Find the surfaces ahead, and sample which plates will stop the photon or let it pass.
-    2. Sample the ends of the flight, one in each stratum of the probability of collision. The photon goes on
-       from one of them.
+    2. Sample the ends of the flight, one in each stratum of u, the transmittance up to the end. The photon
+       goes on from one of them.
     3. Apply the plates that the flight passes to weights and histories.
     4. Deposit the return of every end, except at order one, which `jaxlidar.trace.first_order` deposits.
     5. Tally light that escapes or would come after the record.
@@ -269,9 +311,10 @@ def _trace_order(
     ends = scene.config.deposits_per_flight
     encounters = meet_surfaces(scene, p, draws.plates_ahead)
     max_length = detach(scene.longest_flight(p))
-    # Directions from a surface to a height field are reparametrised, so that landings move with the grid:
-    # only so is the derivative complete where a landing may change from facet to facet.
-    if moves_landings(scene):
+    # Directions of photons that head for a surface are reparametrised, so that landings move with voxel
+    # columns and terrain cells: only so is the derivative complete where a landing may change from one to the
+    # next.
+    if has_moving_landings(scene):
         heading = (order > 0) & (encounters.nearest_stop < max_length)
         w, nearest_stop, ratio = landings_with_grids(scene, p, encounters, heading)
         encounters = eqx.tree_at(lambda e: e.nearest_stop, encounters, nearest_stop)
@@ -280,7 +323,7 @@ def _trace_order(
     # lies, the remainder: the ends (i + remainder) / n are stratified, and the selected one is u itself.
     selected = jnp.minimum(jnp.floor(draws.flight * ends), ends - 1)
     strata = jnp.stack([(i + (draws.flight * ends - selected)) / ends for i in range(ends)])
-    # The logarithm of zero would be an infinite depth.
+    # The logarithm of zero would be an infinite depth: depths end at -ln(1e-9) = 20.7.
     u = jnp.maximum(strata, 1e-9)
     flights = sample_flights(scene, p, encounters.nearest_stop, max_length, u)
     # Optimisation barrier: flights serve several results, each of which would compute the march again.
@@ -319,9 +362,9 @@ def _trace_order(
     weight = jnp.where(flight.has_hit, weight, 0.0)
     tally = tally.with_arrival(collision.material, index, weight)
     index = index.after(scene, collision.channel)
-    # `ratio` belongs to the collision, `onward_weight` to the direction onward: deposits take the first
-    # alone.
-    weight = weight * collision.ratio * collision.onward_weight
+    # `collision.weight` belongs to the collision, `onward_weight` to the direction onward: deposits take the
+    # first alone.
+    weight = weight * collision.weight * collision.onward_weight
     tally = tally.with_departure(collision.material, index, weight)
     if index.optical_weights:
         # The geometric weight doubles at every scattering by a leaf, and the optical weight halves: over
@@ -331,8 +374,8 @@ def _trace_order(
     if p.score is not None:
         assert flight.depth_slopes is not None
         # The score grows by the collision and falls by the depth flown (`jaxlidar.trace.score_functions`).
-        gain = collision_score(scene, flight.cell, flight.collided, collision)
-        score = p.score - flight.depth_slopes.T + gain
+        at_collision = collision_score(scene, flight.cell, flight.collided, collision)
+        score = p.score - flight.depth_slopes.T + at_collision
     onward = Photons(
         x=x,
         w=collision.w,
@@ -343,7 +386,7 @@ def _trace_order(
         last_scattering=scene.if_differentiated(collision.last_scattering),
         alive=flight.has_hit,
         optical_weights=index.optical_weights,
-        entry=index.entry,
+        entry_point=index.entry_point,
         score=score,
     )
     return onward, tally
@@ -412,14 +455,17 @@ def _deposit_flights(
 ) -> HigherOrderTally:
     """Deposit the expected return of every end of the flights, each with an equal share of the weight.
 
-    All ends are flattened into one axis of photons, so that one program serves them.
+    1. With score functions: the score at each end, that of the photon less the derivative of the depth flown.
+    2. Flatten all ends into one axis of photons, so that one program serves them.
+    3. Sample the collision at each end, and add its score.
+    4. Deposit the return, with the weight divided by the number of ends.
     """
     ends, score = scene.config.deposits_per_flight, None
     if p.score is not None:
         assert flights.depth_slopes is not None
         score = p.score[None] - jnp.swapaxes(flights.depth_slopes, 1, 2)
         score = score.reshape(-1, score.shape[-1])
-    # Scores have an axis of columns, and were flattened above.
+    # Scores have an axis of parameters, and were flattened above.
     p, flights = dataclasses.replace(p, score=None), dataclasses.replace(flights, depth_slopes=None)
 
     def flatten(tree):
@@ -428,11 +474,11 @@ def _deposit_flights(
     p, flights, encounters, draws, index = flatten((p, flights, encounters, draws, index))
     x, path, collision = collide(scene, p, flights, encounters, draws)
     # Each end stands for its stratum: an equal share of the probability.
-    value = jnp.where(flights.has_hit, flatten(weight), 0.0) * collision.ratio / ends
+    value = jnp.where(flights.has_hit, flatten(weight), 0.0) * collision.weight / ends
     if score is not None:
         score = score + collision_score(scene, flights.cell, flights.collided, collision)
-    # Optimisation barrier: of the collision only what is visible passes, so that directions onward are not
-    # computed.
+    # Optimisation barrier: of the collision only what its return depends on passes, so that directions onward
+    # are not computed.
     deposits = once(
         (
             p.w,
@@ -440,7 +486,7 @@ def _deposit_flights(
             path,
             value,
             index,
-            visible_collision(scene, collision),
+            collision_for_return(scene, collision),
             draws.plates_behind,
             score,
         )
@@ -456,9 +502,9 @@ def _deposit_collisions(
     path: Scalar,
     weight: Scalar,
     index: TallyIndex,
-    collision: VisibleCollision,
+    collision: CollisionForReturn,
     plate_draws: tuple[Scalar, ...],
-    score: Float[Array, "photons columns"] | None,
+    score: Float[Array, "photons parameters"] | None,
 ) -> HigherOrderTally:
     """Deposit the expected return of collisions at `x`, of light that flew along `w`.
 
@@ -485,9 +531,9 @@ def _deposit_collisions(
         channel_factors.append((collision.transmission, transmitted))
     shots, material = None, collision.material
     if scene.shot_views is not None:
-        assert index.entry is not None
+        assert index.entry_point is not None
         # One row for each shot that may see the path.
-        shots, seen, delay = once(scene.shot_views.seen_by_shots(beam.axis, index.entry, x))
+        shots, seen, delay = once(scene.shot_views.seen_by_shots(beam.axis, index.entry_point, x))
         time, value, material = time[:, None] + delay, value[:, None] * seen, material[:, None]
     # One row serves all channels and wavelengths, which differ by factors alone.
     first_bin, row = once(bspline_row(bins, time, value))
@@ -495,14 +541,14 @@ def _deposit_collisions(
     weights = tally.weights.reshape(-1, bins.padded)
     for channel, factor in channel_factors:
         factor = jnp.where(channel >= 0, factor, 0.0)
-        for entry, optical_weight in index.after(scene, channel).entries(shots):
+        for tally_row, optical_weight in index.after(scene, channel).rows(shots):
             # Optimisation barrier: fused into the rows, the factor would be computed again for each bin.
             scaled = once(factor if optical_weight is None else factor * optical_weight)
             scaled = scaled.reshape(scaled.shape + (1,) * (row.ndim - 1))
-            weights = add_rows(weights, material * n_entries + entry, first_bin, row * scaled)
+            weights = add_rows(weights, material * n_entries + tally_row, first_bin, row * scaled)
     if score is not None:
         assert tally.weight_slopes is not None
-        weight_slopes = add_scored_returns(
+        weight_slopes = add_derivatives_of_returns(
             scene, tally.weight_slopes, first_bin, row, score, channel_factors, index
         )
         tally = eqx.tree_at(lambda t: t.weight_slopes, tally, weight_slopes)
@@ -514,11 +560,12 @@ def _return_transmittance(
     x: Vec,
     v: Vec,
     weight: Scalar,
-    score: Float[Array, "photons columns"] | None,
-) -> tuple[Scalar, Float[Array, "photons columns"] | None]:
+    score: Float[Array, "photons parameters"] | None,
+) -> tuple[Scalar, Float[Array, "photons parameters"] | None]:
     """Return exp(-tau) of the voxels from `x` to the sensor along `v`, and scores less the derivative of tau.
 
-    At nadir tau is looked up in the column above the point; otherwise rays are marched to the sensor.
+    1. At nadir, tau is looked up in the column of voxels above the point.
+    2. Otherwise rays are marched to where they leave the voxels.
     """
     medium = scene.medium
     if medium is None:
@@ -552,15 +599,21 @@ def _return_through_surfaces(
     scene: DeviceScene,
     x: Vec,
     v: Vec,
-    collision: VisibleCollision,
+    collision: CollisionForReturn,
     plate_draws: tuple[Scalar, ...],
     transmittance: Scalar,
     index: TallyIndex,
 ) -> tuple[Scalar, TallyIndex]:
     """Apply the surfaces between `x` and the sensor to the transmittance and the history of the return path.
 
-    A partial plate is sampled, gap or material, so that each photon has one history. Ground hides the points
-    below its own slopes; parallel light (shared illumination) is seen straight down, where nothing is hidden.
+    For each surface:
+
+    1. Ground that can hide points below its own slopes lets nothing through; parallel light (shared
+       illumination) is seen straight down, where nothing is hidden.
+    2. A plate that is crossed is sampled, gap or material, so that each photon has one history; the factor is
+       the attached ratio of that outcome.
+    3. Material of a plate that transmits straight on adds its channel to the history; of another it lets
+       nothing through.
     """
     draws = iter(plate_draws)
     for i, (surface, scatterer) in enumerate(zip(scene.surfaces, scene.config.surfaces)):

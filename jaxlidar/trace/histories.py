@@ -3,7 +3,10 @@
 The product of reflectances and transmittances does not depend on the order of scatterings, so that a history
 is a tuple of exponents (n_1, ..., n_c), and its optical weight the monomial
 
-    prod over channels s of  optics_s ** n_s.
+    prod over channels s of  optics_s ** n_s,
+
+with optics_s the reflectance or transmittance of the channel. A scatterer channel is reflection, or
+transmission, by one material; detector channels are not meant.
 
 All histories with n_1 + ... + n_c <= degree are numbered by their total degree: those of short paths come
 first. There are C(degree + c, c) of them.
@@ -23,7 +26,7 @@ class Histories:
     """The table of histories of up to `degree` scatterings by a number of channels.
 
     - `exponents`: (histories, channels), the degree not decreasing along the first axis.
-    - `next_history`: (histories, channels), number of the history after one more scattering by a channel;
+    - `next_history`: (histories, channels), index of the history after one more scattering by a channel;
       where that would exceed the degree, the history itself.
     """
 
@@ -52,10 +55,10 @@ class Histories:
 
         Powers are repeated products: exact, with finite derivatives at zero too, where `**` has NaN.
         """
-        powers, square = jnp.ones((1, *optics.shape), optics.dtype), optics[None]
+        powers, nth_power = jnp.ones((1, *optics.shape), optics.dtype), optics[None]
         # Doubling: powers 0 .. n - 1 times the n-th power are powers n .. 2 n - 1.
         while len(powers) <= self.degree:
-            powers, square = jnp.concatenate([powers, powers * square]), square * square
+            powers, nth_power = jnp.concatenate([powers, powers * nth_power]), nth_power * nth_power
         product = jnp.ones((self.count, optics.shape[1]), optics.dtype)
         for channel in range(self.n_channels):
             product = product * powers[self.exponents[:, channel], channel]
@@ -64,7 +67,11 @@ class Histories:
 
 @functools.cache
 def histories(n_channels: int, degree: int) -> Histories:
-    """Return all histories of at most `degree` scatterings, numbered by degree."""
+    """Return all histories of at most `degree` scatterings, numbered by degree.
+
+    1. For each total degree: all ways to divide it among the channels.
+    2. Look up, for each history and channel, the history with one scattering more.
+    """
     rows: list[list[int]] = []
     for total in range(degree + 1):
         # Stars and bars: `n_channels - 1` bars divide `total` stars.

@@ -1,18 +1,23 @@
 r"""First-order return of a specular surface.
 
-A mirror sends back only what falls into the aperture, which rays of the ordinary footprint mostly miss. Let e
-be a point of the beam on the mirror, I the irradiance there, m the point where the mirror image of the beam
-axis meets the receiver's plane, a the radius of the aperture, R the range and r the roughness. The receiver
-gets
+A mirror sends back only what falls into the aperture, which rays of the ordinary footprint mostly miss. With
 
-    integral over e of  I(e) P(|m + 2 e|) de,
+    e       a point of the beam on the mirror, across the beam      I       the irradiance there
+    m       where the mirror image of the beam axis meets the receiver's plane
+    a       radius of the aperture                                  R       distance of the mirror
+    w0      radius of the beam on the mirror (at 1/e^2)             rho     roughness, rad
+    P(d)    fraction of a Gaussian of the standard deviation rho R, centred d from the axis, within a of it
 
-where P(d) is the fraction of a Gaussian of standard deviation r R, centred d from the axis, that falls within
-a of it; the factor 2 is the spreading of the beam on its return. Half of the rays are drawn from I and half
-from P, and weighted by the balance heuristic (Veach and Guibas 1995), so that images much smaller and much
-larger than the aperture are sampled equally well. The integral over a Gaussian beam is P(|m|) with the
-variance w^2 + (r R)^2, and the rays are scaled to it. Without roughness and at normal incidence it is 1 -
-exp(-2 a^2 / w^2), w being the radius of the beam at twice the range.
+the receiver gets
+
+    integral over e of  I(e) P(|m + 2 e|) de;
+
+the factor 2 is the spreading of the beam on its return. The rays e are a fixed set of points, half of them
+distributed as I and half as the points whose image falls into the aperture, weighted by the balance heuristic
+(Veach and Guibas 1995), so that images much smaller and much larger than the aperture are resolved equally
+well. The integral over a Gaussian beam is P(|m|) with the variance w0^2 + (rho R)^2, and the rays are scaled
+to it. Without roughness and at normal incidence it is 1 - exp(-a^2 / (2 w0^2)): the beam's radius on its
+return is 2 w0.
 """
 
 import equinox as eqx
@@ -24,7 +29,7 @@ from jaxtyping import Array, Float
 
 from jaxlidar._vectors import Scalar, dot, to_frame, vec
 from jaxlidar.optics.laws import AbstractMirror
-from jaxlidar.trace.footprint import GOLDEN, Beam, across_beam, disc
+from jaxlidar.trace.footprint import GOLDEN, Beam, across_beam, from_polar
 from jaxlidar.trace.surfaces import TracedSurface
 
 RAYS = 4096
@@ -33,62 +38,66 @@ _MIN_LOBE = 1e-3
 # Keeps quotients of densities and their derivatives finite in single precision where all are zero.
 _TINY = 1e-9
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(48)
+# Steps of the two-dimensional golden-ratio sequence (Roberts's R2): 1/g and 1/g^2 with g^3 = g + 1.
+_R2_STEPS = (0.7548776662466927, 0.5698402909980532)
 
 
 def mirror_rays(
     beam: Beam, surface: TracedSurface
 ) -> tuple[tuple[Float[Array, "rays"], Float[Array, "rays"]], Float[Array, "rays"]]:
-    """Sample rays across the beam that return from a mirror, and the apparent reflectance that each carries.
+    """Place rays across the beam that return from a mirror, and give each its apparent reflectance.
 
     The apparent reflectance is per unit reflectance and for a transparent path. The angle between the beam
     axis and its mirror image is assumed to be small.
 
     1. The distance of the mirror along the beam axis, and the beam's width there.
     2. The point m where the mirrored axis meets the receiver's plane.
-    3. Half of the rays from the beam's profile, half from points of the aperture mapped back to the mirror.
+    3. Half of the rays distributed as the beam's profile, half as points of the aperture, less a point of the
+       lobe and m, mapped back to the mirror.
     4. Weights by the balance heuristic; for a Gaussian beam scaled to the closed form of their sum.
     """
     assert isinstance(surface.law, AbstractMirror)
-    r, a = beam.slant_range, beam.half_angle * beam.slant_range
+    slant_range, aperture = beam.slant_range, beam.half_angle * beam.slant_range
     # Along the axis; the mirror may lie above the reference plane, before the aim point.
-    aim = vec(jnp.zeros(3, r.dtype))
+    aim = vec(jnp.zeros(3, slant_range.dtype))
     upward, offset = surface.shape.tangent(aim)
     towards = dot(upward, beam.axis)
     parallel = jnp.abs(towards) < 1e-9
-    distance = r + jnp.where(parallel, 0.0, offset / jnp.where(parallel, 1.0, towards))
+    distance = slant_range + jnp.where(parallel, 0.0, offset / jnp.where(parallel, 1.0, towards))
     # From here on the beam has the width that it has on the mirror.
-    magnification = distance / r
+    magnification = distance / slant_range
     beam = eqx.tree_at(lambda b: b.radius, beam, beam.radius * magnification)
     normal = surface.lit_normal(aim, beam.axis)
     cosine = -dot(normal, beam.axis)
-    # m: along the normal's component across the axis.
+    # The vector m lies along the normal's component across the axis.
     miss = vec(2.0 * cosine * distance * (n + cosine * k) for n, k in zip(normal, beam.axis))
     miss = to_frame(beam.axis, miss)[:2]
-    sigma = jnp.maximum(surface.law.roughness * distance, _MIN_LOBE * a)
+    sigma = jnp.maximum(surface.law.roughness * distance, _MIN_LOBE * aperture)
 
-    n = RAYS // 2
-    i = np.arange(n)
-    u = jnp.asarray((i + 0.5) / n, r.dtype)
-    turn = _fraction_of_turn(i * GOLDEN, r)
-    # A second pair of coordinates for the lobe, from the two-dimensional golden-ratio lattice.
-    lobe_radius = sigma * jnp.sqrt(-2.0 * jnp.log1p(-_fraction_of_turn(i * 0.7548776662466927 + 0.5, r)))
-    lobe = disc(lobe_radius, _fraction_of_turn(i * 0.5698402909980532 + 0.5, r))
-    in_aperture = disc(a * jnp.sqrt(u), turn)
+    n_half = RAYS // 2
+    i = np.arange(n_half)
+    u = jnp.asarray((i + 0.5) / n_half, slant_range.dtype)
+    turn = _fractional_part(i * GOLDEN, slant_range)
+    # A second pair of coordinates for the lobe.
+    lobe_u, lobe_turn = (_fractional_part(i * step + 0.5, slant_range) for step in _R2_STEPS)
+    lobe = from_polar(sigma * jnp.sqrt(-2.0 * jnp.log1p(-lobe_u)), lobe_turn)
+    in_aperture = from_polar(aperture * jnp.sqrt(u), turn)
     from_beam = across_beam(beam, u, turn)
     from_aperture = tuple((q - m - g) / 2.0 for q, m, g in zip(in_aperture, miss, lobe))
     x, y = (jnp.concatenate([p, q]) for p, q in zip(from_beam, from_aperture))
 
     irradiance = beam.irradiance((x, y))
-    caught = gaussian_within(_length((miss[0] + 2.0 * x, miss[1] + 2.0 * y)), sigma, a)
-    # Density with which e was drawn: the mean of I and that of points whose image falls into the aperture.
-    density = 0.5 * (irradiance + 4.0 * caught / (np.pi * a**2))
+    # P(|m + 2 e|).
+    caught = gaussian_within(_length((miss[0] + 2.0 * x, miss[1] + 2.0 * y)), sigma, aperture)
+    # Density of the rays: the mean of I and that of points whose image falls into the aperture.
+    density = 0.5 * (irradiance + 4.0 * caught / (np.pi * aperture**2))
     # Divided by the aperture's squared half-angle, the fraction of the energy is apparent reflectance.
-    unit = (distance / a) ** 2
-    value = unit * irradiance * caught / jnp.maximum(density, _TINY) / (2 * n)
+    unit = (distance / aperture) ** 2
+    value = unit * irradiance * caught / jnp.maximum(density, _TINY) / (2 * n_half)
     if beam.gaussian:
         estimate = jnp.sum(value)
         is_seen = estimate > _TINY
-        exact = unit * gaussian_within(_length(miss), jnp.hypot(beam.radius, sigma), a)
+        exact = unit * gaussian_within(_length(miss), jnp.hypot(beam.radius, sigma), aperture)
         value = value * jnp.where(is_seen, exact / jnp.where(is_seen, estimate, 1.0), 0.0)
     return (x / magnification, y / magnification), value
 
@@ -112,7 +121,7 @@ def gaussian_within(distance: Scalar, sigma: Scalar, radius: Scalar) -> Scalar:
     return jnp.sum(jax.vmap(at)(jnp.asarray(_NODES, dtype), jnp.asarray(_WEIGHTS, dtype)), axis=0)
 
 
-def _fraction_of_turn(number: np.ndarray, like: Scalar) -> Scalar:
+def _fractional_part(number: np.ndarray, like: Scalar) -> Scalar:
     return jnp.asarray(number % 1.0, like.dtype)
 
 

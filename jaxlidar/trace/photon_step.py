@@ -1,6 +1,6 @@
 """One step of photons, in the parts that all estimators share: fly, pass plates, collide.
 
-The response (`jaxlidar.trace.higher_orders`), absorption (`jaxlidar.trace.absorption`) and the paper's
+The response (`jaxlidar.trace.higher_orders`), absorption (`jaxlidar.trace.absorption`) and the analog
 estimator (`jaxlidar.analog`) follow photons in the same way, and differ in what they add to a tally on the
 way:
 
@@ -20,7 +20,7 @@ from jaxlidar._vectors import FAR, Scalar, Vec, along
 from jaxlidar.trace.collisions import sample_collision
 from jaxlidar.trace.device_scene import DeviceScene, not_scattered
 from jaxlidar.trace.flight import Flight, SurfaceEncounters, meet_surfaces, sample_flights
-from jaxlidar.trace.photons import SCATTERED, TRANSMITTED, Collision, Photons
+from jaxlidar.trace.photons import STOPPED, TRANSMITTED, Collision, Photons
 from jaxlidar.trace.random_numbers import PhotonDraws
 
 
@@ -73,7 +73,11 @@ class PlatePassage(NamedTuple):
 def passed_plates(
     scene: DeviceScene, p: Photons, flights: Flight, encounters: SurfaceEncounters
 ) -> list[PlatePassage]:
-    """Return the passage of every plate. Flights may have several ends, along their first axis."""
+    """Return the passage of every plate. Flights may have several ends, along their first axis.
+
+    A plate is passed if it lies nearer than the end of the flight, or the flight ends nowhere, and the photon
+    did not stop at it; it is met if it is passed, or the flight ends on it.
+    """
 
     def to_ends(a: Array) -> Array:
         return jnp.broadcast_to(a, flights.distance.shape)
@@ -84,7 +88,7 @@ def passed_plates(
             continue
         distance = encounters.distances[i]
         # A plate at which the photon stops is an end, not a passage.
-        is_stop = to_ends(outcome == SCATTERED) & (to_ends(distance) <= flights.distance)
+        is_stop = to_ends(outcome == STOPPED) & (to_ends(distance) <= flights.distance)
         is_ahead = to_ends(p.alive & (distance < FAR))
         is_passed = is_ahead & ((to_ends(distance) < flights.distance) | ~flights.has_hit) & ~is_stop
         is_met = is_passed | (flights.landed & is_stop)

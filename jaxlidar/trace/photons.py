@@ -1,13 +1,15 @@
 """The state of photons and of their collisions, and attached likelihood ratios.
 
-Derivatives use detached sampling with attached weights: random decisions are drawn from a density p whose
-derivative is not followed, and the weight is multiplied by
+Derivatives use detached sampling with likelihood ratios: random decisions are drawn from a density f whose
+derivative is not followed (`detach`), and the weight is multiplied by
 
-    p / detach(p),
+    f / detach(f),
 
-which is one, but has the derivative of ln p. The expected value of the derivative of the weight is then the
-derivative of the expected value (the score-function or likelihood-ratio estimator; Zeltner et al. 2021, ACM
-Trans. Graph. 40, 78).
+which is one, but has the derivative of ln f. The expected value of the derivative of the weight is then the
+derivative of the expected value, as long as the support of f does not move (the score-function or
+likelihood-ratio estimator; Zeltner et al. 2021, ACM Trans. Graph. 40, 78). This is called the attached ratio
+of f here: the density stays attached to its parameters. The sample itself does not, so that it is not the
+"attached sampling" of that paper.
 """
 
 import equinox as eqx
@@ -22,13 +24,13 @@ detach = lax.stop_gradient
 
 # Outcomes of a photon's encounter with a plate in its path: it flies through a gap, is scattered, or is
 # transmitted straight on.
-GAP, SCATTERED, TRANSMITTED = 0, 1, 2
+GAP, STOPPED, TRANSMITTED = 0, 1, 2
 
 
 class LastScattering(eqx.Module):
     """The law that sent a photon on, its incident direction and its normal; derivatives alone need it.
 
-    `law` is a number among those of the device scene.
+    `law` is an index into `DeviceScene.laws`.
     """
 
     law: Int[Array, "photons"]
@@ -42,13 +44,15 @@ class Photons(eqx.Module):
     - `x`, `w`: position, m from the aim point, and direction.
     - `path`: path length since the sensor, m, less the range of the reference plane.
     - `weight`: geometric weight of the path; where optics are applied, that since the last scattering.
-    - `history`: number of the scattering history; or of the entry node (see `jaxlidar.trace.tally_index`).
-    - `surface`: number of the surface from which the photon starts, or -1.
+    - `history`: index of the scattering history; or of the entry node (see `jaxlidar.trace.tally_index`).
+    - `surface`: index of the surface from which the photon starts, or -1.
     - `last_scattering`: None where no derivatives are taken.
-    - `alive`: False for photons that were recorded to their end.
+    - `alive`: False for photons that left the scene, flew too far to be recorded, or ended by roulette, and
+      for padding.
     - `optical_weights`: for each wavelength, the product of optics along the path and of geometric weights up
       to the last scattering, where optics are applied while light is traced; otherwise empty.
-    - `entry`: x and y of where light entered the scene, m, where shots share it; otherwise None.
+    - `entry_point`: x and y of where light entered the scene, m, where shots share it; otherwise None. Then
+      `path` is relative to a shot whose axis goes through that point.
     - `score`: derivatives of the log path probability (see `jaxlidar.trace.score_functions`), or None.
     """
 
@@ -61,27 +65,28 @@ class Photons(eqx.Module):
     last_scattering: LastScattering | None
     alive: Bool[Array, "photons"]
     optical_weights: tuple[Float[Array, "photons"], ...] = ()
-    entry: tuple[Float[Array, "photons"], Float[Array, "photons"]] | None = None
-    score: Float[Array, "photons columns"] | None = None
+    entry_point: tuple[Float[Array, "photons"], Float[Array, "photons"]] | None = None
+    score: Float[Array, "photons parameters"] | None = None
 
 
 class Collision(eqx.Module):
     """A collision of each photon, and how it scatters.
 
-    - `material`: number of the material that was hit.
+    - `material`: index of the material that was hit.
     - `channel`: scatterer channel by which the photon goes on.
-    - `ratio`: attached likelihood ratio of the collision.
-    - `onward_weight`: factor of the weight of going on along `w`.
+    - `weight`: importance weight of the collision with its attached ratio, for returns as well as for going
+      on: 1/q at a plate that transmits straight on, |n.w| / G where normals are drawn from g, else one.
+    - `onward_weight`: factor of the weight of going on along `w`, with the attached ratio of its density.
     - `w`: direction onward.
-    - `surface`: number of the surface that was hit, or -1 within a voxel.
-    - `reflection`, `transmission`: channels of light that returns to the sensor from here, or -1.
+    - `surface`: index of the surface that was hit, or -1 within a voxel.
+    - `reflection`, `transmission`: channels (indices) of light that returns to the sensor from here, or -1.
     - `normal`: normal of the facet, or of the lit side of the surface.
     - `last_scattering`: how the photon was sent on.
     """
 
     material: Int[Array, "photons"]
     channel: Int[Array, "photons"]
-    ratio: Float[Array, "photons"]
+    weight: Float[Array, "photons"]
     onward_weight: Float[Array, "photons"]
     w: Vec
     surface: Int[Array, "photons"]
@@ -91,8 +96,8 @@ class Collision(eqx.Module):
     last_scattering: LastScattering
 
 
-class VisibleCollision(eqx.Module):
-    """The part of a `Collision` on which its brightness towards the sensor depends.
+class CollisionForReturn(eqx.Module):
+    """The fields of a `Collision` on which the light that returns from it to the sensor depends.
 
     `normal` is None where facets have no preferred direction, so that it does not matter.
     """
@@ -112,10 +117,11 @@ def select_collision(where: Bool[Array, "photons"], a: Collision, b: Collision) 
 def attached_ratio(density: Scalar) -> Scalar:
     """Return density / detach(density): one, with the derivative of the logarithm of a density.
 
-    Without derivative where the density is zero: such outcomes are never drawn.
+    Without derivative where the density is zero: such outcomes are never drawn. A constant factor of the
+    density does not matter.
     """
-    held = detach(density)
+    detached = detach(density)
     # Inside both branches the quotient must be finite: the derivative of `where` multiplies the unused one by
     # zero, and zero times infinity is NaN.
-    safe = jnp.where(held == 0, 1.0, held)
-    return with_derivative_of(jnp.ones_like(held), jnp.where(held == 0, 1.0, density / safe))
+    safe = jnp.where(detached == 0, 1.0, detached)
+    return with_derivative_of(jnp.ones_like(detached), jnp.where(detached == 0, 1.0, density / safe))

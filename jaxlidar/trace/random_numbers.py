@@ -1,14 +1,15 @@
-"""Random numbers for photons: randomly shifted lattices, one for each order and dimension.
+"""Random numbers for photons: Kronecker sequences with a random shift, one for each order and dimension.
 
 Photon i takes the uniform number
 
     u = frac(z i + s)
 
 in each dimension, in 32-bit integer arithmetic. The shift s is random, so that every number is uniform and
-every estimate unbiased, whatever z is. For the first collision the z of all dimensions form a lattice of low
-discrepancy (Roberts's generalised golden ratio: z_d = phi^-d with phi the root of x^(d+1) = x + 1); later z
-is random, which makes any two photons independent. This costs two integer operations, where a counter-based
-generator costs fifty.
+every estimate unbiased, whatever z is (a Cranley-Patterson rotation; Kronecker sequences are the lattices of
+any number of points). For the first collision the z of all D dimensions form a sequence of low discrepancy
+(Roberts's R_D: z_j = phi^-j for j = 1 ... D, with phi the root of x^(D+1) = x + 1); later z is random, which
+makes photons nearly independent in pairs. This costs two integer operations, where a counter-based generator
+costs fifty.
 
 Photons of one batch are not independent of one another: standard errors come from batches with independent
 keys (randomised quasi-Monte Carlo; L'Ecuyer and Lemieux 2000, Manage. Sci. 46, 1214).
@@ -72,6 +73,9 @@ class Lattices(eqx.Module):
 
 def random_words(key: PRNGKeyArray, count: int) -> UInt32[Array, "count"]:
     """Return the first random words of a key; those of a smaller count are the first of them.
+
+    That holds for JAX's default generator (partitionable Threefry), which numbers words by their position;
+    rays and photons of a batch rely on it.
 
     A program draws everything from one call, because compiling each generator takes a while.
     """

@@ -7,8 +7,8 @@ first-order return of a piece [a, b] of it, per unit of k and of intensity facto
 
     D(x) = (1 - exp(-x)) / x,
 
-with kappa = 2 for independent paths in and out, or 1 with the hot spot. Segments are cut at the edges of time
-bins, so that every piece belongs to one bin.
+with kappa = 2 for independent paths in and out, or 1 with the hot spot. D is the mean of exp(-t) for t from 0
+to x ("mean decay"). Segments are cut at the edges of time bins, so that every piece belongs to one bin.
 """
 
 from collections.abc import Callable
@@ -38,7 +38,7 @@ class RaySegments(eqx.Module):
 
     - `start`, `length`: distance from the start of the ray, and length, m.
     - `depth`: optical depth before the segment. `cell`: the voxel. `extinction`: 1/m.
-    - `depth_slopes`: derivatives of that depth, where scores are asked for; else None.
+    - `depth_slopes`: derivatives of that depth with respect to parameters; None without score functions.
     """
 
     start: Float[Array, "*steps"]
@@ -46,7 +46,7 @@ class RaySegments(eqx.Module):
     depth: Float[Array, "*steps"]
     cell: Int[Array, "*steps"]
     extinction: Float[Array, "*steps"]
-    depth_slopes: Float[Array, "*steps columns"] | None = None
+    depth_slopes: Float[Array, "*steps parameters"] | None = None
 
 
 def mean_decay(x: Scalar) -> Scalar:
@@ -64,8 +64,8 @@ def _decay(x: Scalar) -> tuple[Scalar, Scalar]:
     for n in range(3 if jnp.finfo(x.dtype).bits == 32 else 7, 0, -1):
         series = 1.0 + square * (1.0 / (2 * n * (2 * n + 1))) * series
     half = jnp.exp(-0.5 * x)
-    passing = half * half
-    return passing, jnp.where(small, half * series, (1.0 - passing) / jnp.where(small, 1.0, x))
+    decay = half * half
+    return decay, jnp.where(small, half * series, (1.0 - decay) / jnp.where(small, 1.0, x))
 
 
 def march_ray(
@@ -78,6 +78,13 @@ def march_ray(
     max_length: Scalar,
 ) -> tuple[RaySegments, list[Scalar], Scalar]:
     """Cut one ray into segments up to `end`, none longer than `max_length`.
+
+    Each step:
+
+    1. Find the nearest of the faces ahead, the stops ahead, the end, and the greatest length.
+    2. Look up the extinction of the voxel.
+    3. Add to the depths of the stops what of the segment lies before each.
+    4. Add the segment's depth, and go on to the voxel behind the face, if one was met.
 
     **Returns:** the segments; the optical depth at each of `stops`, which are distances along the ray; and
     that at its end. Segments after the end have no length.
@@ -117,6 +124,10 @@ def integrate_over_bins(
 ) -> tuple[Int[Array, "*s"], Float[Array, "pieces *s"]]:
     """Integrate exp(-kappa tau) ds over the pieces of each segment, bin by bin.
 
+    1. Number the bin in which the segment starts.
+    2. For that bin and those behind it: the end of the piece is the bin's edge or the segment's end, and the
+       integral is exp(-kappa tau) before the piece, times its length, times its mean decay.
+
     **Arguments:** `start_position`: of the start of each segment on the axis of bins.
 
     **Returns:** index of the first bin, counting the margin, and the integrals, m, from there on.
@@ -125,15 +136,16 @@ def integrate_over_bins(
     end_position = start_position + segments.length / bin_length
     # Bin n covers positions n - 1/2 to n + 1/2.
     first_number = jnp.round(lax.stop_gradient(start_position))
-    # Rows of an even length are added faster; a piece beyond the end is zero.
+    # `max_span` counts two bins by which smoothing widens a row. Rows of an even length are added faster; a
+    # piece beyond the end is zero.
     count = bins.max_span - 2 + bins.max_span % 2
 
     def piece(carry, j):
         transmittance, start = carry
         end = jnp.clip(first_number + (j + 0.5), start_position, end_position)
         length = (end - start) * bin_length
-        passing, mean = _decay(kappa * segments.extinction * length)
-        return (transmittance * passing, end), transmittance * mean * length
+        decay, mean = _decay(kappa * segments.extinction * length)
+        return (transmittance * decay, end), transmittance * mean * length
 
     # A scan computes each piece once; unrolled, compilers compute them again for every element.
     state = (jnp.exp(-kappa * segments.depth), start_position)
@@ -146,35 +158,40 @@ def add_in_blocks(
     tally: Tally,
     segments: RaySegments,
     per_ray: Any,
-    counts: Bool[Array, "steps rays"] | None,
+    contributes: Bool[Array, "steps rays"] | None,
 ) -> Tally:
-    """Add segments to a tally by `add`, in blocks of those that count, and have not ended.
+    """Add segments to a tally by `add`, in blocks of those that contribute, and have not ended.
+
+    1. Number the segments that contribute, ray by ray.
+    2. List them by these numbers.
+    3. Gather them from the list, `SEGMENTS_AT_ONCE` at a time; those that fill up the last block get no
+       length.
+    4. Add each block.
 
     **Arguments:**
 
     - `add`: returns the tally with some segments added; its last argument is `per_ray` at the ray of each.
     - `per_ray`: arrays with one row for each ray.
-    - `counts`: False for segments that return nothing. None: all count.
+    - `contributes`: False for segments that return nothing. None: all contribute.
 
     Blocks stay within the processor's cache, and most voxels of a forest are empty.
     """
     shape = segments.start.shape
     not_ended = (segments.start < segments.start[-1:]) | (segments.length > 0.0)
-    counts = not_ended if counts is None else not_ended & counts
-    # Number the segments that count, ray by ray: `position` of each among them.
-    one, none = counts.astype(jnp.int32), jnp.zeros(shape[1], jnp.int32)
-    per_ray_count, rank = lax.scan(lambda n, is_counted: (n + is_counted, n), none, one)
+    contributes = not_ended if contributes is None else not_ended & contributes
+    # `rank` of each among those of its ray, `position` among all.
+    one, zero = contributes.astype(jnp.int32), jnp.zeros(shape[1], jnp.int32)
+    per_ray_count, rank = lax.scan(lambda n, is_counted: (n + is_counted, n), zero, one)
     upto = jnp.cumsum(per_ray_count)
     first = jnp.concatenate([jnp.zeros(1, jnp.int32), upto[:-1]])
-    position = jnp.where(counts, first[None] + rank, counts.size)
-    number = jnp.arange(counts.size, dtype=jnp.int32)
-    selected = jnp.zeros((counts.size + SEGMENTS_AT_ONCE,), jnp.int32)
+    position = jnp.where(contributes, first[None] + rank, contributes.size)
+    number = jnp.arange(contributes.size, dtype=jnp.int32)
+    selected = jnp.zeros((contributes.size + SEGMENTS_AT_ONCE,), jnp.int32)
     selected = selected.at[position.reshape(-1)].set(number, mode="drop")
 
     def block(n, tally):
         numbers = lax.dynamic_slice(selected, (n * SEGMENTS_AT_ONCE,), (SEGMENTS_AT_ONCE,))
         in_block = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[numbers], segments)
-        # Segments that fill up the last block get no length.
         is_real = n * SEGMENTS_AT_ONCE + jnp.arange(SEGMENTS_AT_ONCE) < upto[-1]
         in_block = eqx.tree_at(lambda s: s.length, in_block, jnp.where(is_real, in_block.length, 0.0))
         return add(tally, in_block, jax.tree.map(lambda a: a[numbers % shape[1]], per_ray))

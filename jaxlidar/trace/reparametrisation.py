@@ -1,4 +1,4 @@
-r"""Reparametrised rays: they move with the geometry, so that derivatives of jumps are unbiased.
+r"""Reparametrised rays and photons: they move with the geometry, so that derivatives of jumps are unbiased.
 
 Let f jump at places that depend on a parameter theta. Under the integral over fixed sample points the
 derivative of the jumps is lost. With points x = T(u, theta) that move with the jumps,
@@ -10,7 +10,9 @@ f(T(u, theta)) does not jump in theta, and automatic differentiation of the righ
 derivatives, and the factor p(T) |dT/du| is one in value, the attached ratio.
 
 The optical depth of a ray jumps where it crosses from one column of voxels to the next, the normal of terrain
-where its landing point crosses from one cell to the next. Rays therefore move along with columns and cells.
+where its landing point crosses from one cell to the next. Therefore the rays of the footprint move along with
+columns (`rays_with_columns`) and cells (`rays_with_terrain`), and so do the landing points of photons that
+head for a surface (`landings_with_grids`).
 """
 
 import jax
@@ -41,8 +43,8 @@ from jaxlidar.trace.voxel_traversal import Medium
 Grid = tuple[Float[Array, "2"], Float[Array, "2"]]
 
 
-def moves_landings(scene: DeviceScene) -> bool:
-    """Return True if derivatives are taken and rays may land on columns or cells that move."""
+def has_moving_landings(scene: DeviceScene) -> bool:
+    """Return True if derivatives are taken and photons may land on columns or cells that move."""
     return scene.derivatives != "none" and bool(scene.surfaces) and bool(_grids(scene))
 
 
@@ -52,14 +54,24 @@ def landings_with_grids(
     """Move the rays of photons towards surfaces as columns of voxels and cells of terrain move.
 
     With the direction held fixed, landing points would cross from column to column. With the point held fixed
-    in its column, rays that start just above the surface would have to turn without bound. So points move
-    with the fraction `fade` of the motion at a fixed direction: none at the faces of a column or a cell, and
-    nearly all for rays shorter than the distance to the next face. The steps:
+    in its column, rays that start just above the surface would have to turn without bound. So landing points
+    u move by a blend,
+
+        T(u) = (1 - fade) column motion + fade * motion at a fixed direction,
+
+    with fade(u) zero at the faces of columns and of cells, and one where the start of the ray is lower above
+    the tangent plane than u is away from the next face. With r the ratio p(T) |dT/du| of the column motion
+    alone (that of a fixed direction is one), the ratio of the blend is, to first order,
+
+        1 + (1 - fade) (r - 1) + grad(fade) . (motion at a fixed direction - column motion).
 
     1. The landing point at a fixed direction, and the tangent plane there.
-    2. The landing point held fixed in its column, and the ratio of the density of its direction, per area.
-    3. The blend of both motions, and its Jacobian determinant: 1 + (1 - fade) (ratio - 1) + grad(fade) .
-       difference.
+    2. The landing point fixed in its column, and the ratio r: density of directions per area of the map.
+    3. The fade, as the product of those of all grids, and its gradient.
+    4. The blend of both motions, and its ratio.
+
+    Columns are those of the first grid, of voxels if there are any. Over terrain the derivative is unbiased
+    if the cells do not move relative to them.
 
     **Arguments:** `heading`: True for photons on their way to a surface.
 
@@ -71,7 +83,7 @@ def landings_with_grids(
     heading &= p.alive
     distance = jnp.where(heading, encounters.nearest_stop, 1.0)
     direct = along(p.x, p.w, distance)
-    held = jax.tree.map(detach, direct)
+    landing = jax.tree.map(detach, direct)
     normal, offset = vec(jnp.zeros_like(distance) for _ in range(3)), jnp.zeros_like(distance)
     for surface, stop in zip(scene.surfaces, encounters.stops):
         is_target = stop <= encounters.nearest_stop
@@ -89,11 +101,12 @@ def landings_with_grids(
         distance2 = jnp.maximum(dot(to_point, to_point), 1e-20)
         return scale(to_point, 1.0 / jnp.sqrt(distance2)), jnp.sqrt(distance2)
 
-    # Fixed in the column.
-    in_column = [detach((held[k] - origin[k]) / size[k]) for k in range(2)]
+    # The position in units of columns is fixed.
+    in_column = [detach((landing[k] - origin[k]) / size[k]) for k in range(2)]
     column = on_surface(*(origin[k] + size[k] * in_column[k] for k in range(2)))
     w, distance_to_column = towards(column)
-    # Per area of the map, onto which the sloping surface is projected.
+    # Per area of the map, onto which the sloping surface is projected; the last factor is |dT/du| of a point
+    # that is fixed in its column, up to a constant.
     density = (
         scene.direction_density(p.last_scattering, w)
         * jnp.abs(dot(normal, w) / normal_z)
@@ -103,30 +116,30 @@ def landings_with_grids(
     ratio = jnp.where(heading, attached_ratio(density), 1.0)
 
     height_above = jnp.maximum(detach(distance * jnp.abs(dot(normal, p.w))), 1e-6)
-    fade, gradient = _fade(grids[0], held, height_above)
+    fade, gradient = _fade(grids[0], landing, height_above)
     for grid in grids[1:]:
-        # Product rule: points rest at the faces of every grid.
-        next_fade, next_gradient = _fade(grid, held, height_above)
+        # Product rule: the fade is zero at the faces of every grid.
+        next_fade, next_gradient = _fade(grid, landing, height_above)
         fade, gradient = (
             fade * next_fade,
             tuple(g * next_fade + fade * m for g, m in zip(gradient, next_gradient)),
         )
-    difference = [(direct[k] - held[k]) - (column[k] - detach(column[k])) for k in range(2)]
-    determinant = (
+    difference = [(direct[k] - landing[k]) - (column[k] - detach(column[k])) for k in range(2)]
+    blend_ratio = (
         1.0 + (1.0 - fade) * (ratio - 1.0) + gradient[0] * difference[0] + gradient[1] * difference[1]
     )
-    x, y = (held[k] + (column[k] - detach(column[k])) + fade * difference[k] for k in range(2))
+    x, y = (landing[k] + (column[k] - detach(column[k])) + fade * difference[k] for k in range(2))
     w, moved_distance = towards(on_surface(x, y))
     # Values stay those that were drawn.
     w = vec(with_derivative_of(a, jnp.where(heading, b, a)) for a, b in zip(p.w, w))
     nearest_stop = encounters.nearest_stop
     nearest_stop = with_derivative_of(nearest_stop, jnp.where(heading, moved_distance, nearest_stop))
-    ratio = with_derivative_of(jnp.ones_like(nearest_stop), jnp.where(heading, determinant, 1.0))
+    ratio = with_derivative_of(jnp.ones_like(nearest_stop), jnp.where(heading, blend_ratio, 1.0))
     return w, nearest_stop, ratio
 
 
 def _grids(scene: DeviceScene) -> list[Grid]:
-    """Return columns of voxels, then cells of terrain."""
+    """Return the columns of voxels, then the cells of terrain, if there are any."""
     medium = scene.medium
     grids = [] if medium is None else [(medium.size[:2], medium.origin[:2])]
     fields = [s.shape.heights for s in scene.surfaces if isinstance(s.shape, HeightField)]
@@ -150,8 +163,8 @@ def _fade(grid: Grid, point: Vec, height_above: Scalar) -> tuple[Scalar, tuple[S
     return fades[0] * fades[1], (slopes[0] * fades[1], slopes[1] * fades[0])
 
 
-def moves_with_terrain(scene: DeviceScene) -> bool:
-    """Return True if the beam leans, is Gaussian, and may meet terrain."""
+def has_rays_moving_with_terrain(scene: DeviceScene) -> bool:
+    """Return True if the beam is oblique and Gaussian, and may meet terrain."""
     ground = scene.surfaces[0].shape if scene.config.has_ground else None
     return isinstance(ground, HeightField) and scene.beam.gaussian and not scene.config.vertical
 
@@ -165,6 +178,11 @@ def rays_with_terrain(
     jumps, as heights change; straight from above they do not. The profile of a Gaussian beam makes up for the
     motion; the edge of a top-hat would not.
 
+    1. Where the ray meets the terrain, detached.
+    2. The same place among the cells, where and as high as it is now.
+    3. Its central projection onto the plane across the beam.
+    4. The ratio of irradiance times |dT/du|, per area of cells.
+
     **Returns:** positions across the beam, and the ratio of the density, each with their derivative alone
     changed.
     """
@@ -176,11 +194,12 @@ def rays_with_terrain(
     distance = detach(shape.distance(start, w))
     # A beam without width has no profile that could make up for the motion.
     is_met = (distance < FAR) & (beam.radius > 1e-6)
-    held = along(start, w, jnp.where(is_met, distance, start_distance))
+    landing = along(start, w, jnp.where(is_met, distance, start_distance))
     # The same places among the cells, at the heights that the terrain has there.
     field = shape.heights
     x, y = (
-        field.origin[k] + field.spacing[k] * detach(at) for k, at in enumerate(field.grid_coordinates(held))
+        field.origin[k] + field.spacing[k] * detach(at)
+        for k, at in enumerate(field.grid_coordinates(landing))
     )
     height, (slope_x, slope_y) = field.value_and_slope((x, y))
     in_beam = to_frame(beam.axis, (x, y, height))
@@ -188,11 +207,10 @@ def rays_with_terrain(
     magnification = beam.slant_range / (beam.slant_range + in_beam[2])
     moved = (in_beam[0] * magnification, in_beam[1] * magnification)
     _, direction, _ = beam.ray(moved)
-    facing = jnp.abs(direction[2] - slope_x * direction[0] - slope_y * direction[1])
+    cosine = jnp.abs(direction[2] - slope_x * direction[0] - slope_y * direction[1])
     area = field.spacing[0] * field.spacing[1] * beam.radius**2
-    density = jnp.where(is_met, beam.irradiance(moved) * area * facing * magnification**2, 1.0)
-    held_density = detach(density)
-    ratio = jnp.where(is_met, density / jnp.maximum(held_density, 1e-30), 1.0)
+    density = jnp.where(is_met, beam.irradiance(moved) * area * cosine * magnification**2, 1.0)
+    ratio = jnp.where(is_met, density / jnp.maximum(detach(density), 1e-30), 1.0)
     x, y = (with_derivative_of(a, jnp.where(is_met, a + (b - detach(b)), a)) for a, b in zip(across, moved))
     return (x, y), with_derivative_of(one, ratio)
 
@@ -206,6 +224,10 @@ def rays_with_columns(
     derivative with respect to a sideways motion of the grid lies in rare, nearly parallel crossings. Rays
     that move along with the columns do not cross. The profile of a Gaussian beam makes up for the motion; the
     edge of a top-hat would not, so that its rays stay, and that derivative stays noisy.
+
+    1. Where the rays meet the reference plane.
+    2. The motion of these points with the grid, across the beam.
+    3. The ratio of irradiance times |dT/du|: rays move with the widths of voxels and of the beam.
 
     **Returns:** positions across the beam, and the ratio of the density, each with their derivative alone
     changed.
@@ -227,5 +249,5 @@ def rays_with_columns(
     # Rays lie farther apart where voxels or the beam are wider.
     area = medium.size[0] * medium.size[1] * beam.radius**2
     density = jnp.where(has_width, beam.irradiance(across) * area, 1.0)
-    held = detach(density)
-    return across, 1.0 + (density - held) / jnp.maximum(held, 1e-30)
+    detached = detach(density)
+    return across, 1.0 + (density - detached) / jnp.maximum(detached, 1e-30)

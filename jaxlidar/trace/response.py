@@ -3,7 +3,13 @@
     received[wavelength, bin] = sum over histories h of
         response[bin, h] * prod over channels s of optics_s[wavelength] ** exponent[h, s]
 
-This is known in biomedical optics as white Monte Carlo (Alerstam et al. 2008).
+This is known in biomedical optics as white Monte Carlo (Alerstam et al. 2008). Order one is deterministic
+(`jaxlidar.trace.first_order`), orders two and above are a Monte Carlo estimate
+(`jaxlidar.trace.higher_orders`).
+
+Arrays have an axis `traces`, one run of the tracer for each: usually a single one, of all wavelengths; one
+for each wavelength where leaves transmit straight on, because extinction then depends on it; and one for each
+wavelength, with one history, where optics are applied while light is traced.
 """
 
 import dataclasses
@@ -34,8 +40,8 @@ class Response(eqx.Module):
     """The geometric weight of all paths, by last material, scattering history and fine time bin.
 
     Multiplied by the optics of each history (see `jaxlidar.waveform_of`) it gives the waveform. The first
-    axis has one trace for all wavelengths; or one for each, where leaves transmit straight on, so that
-    extinction depends on the wavelength, and where optics are applied while light is traced, because
+    axis has one run of the tracer for all wavelengths; or one for each, where leaves transmit straight on, so
+    that extinction depends on the wavelength, and where optics are applied while light is traced, because
     histories would be too many: then there is one history, and its optics are 1.
 
     - `first`: (traces, materials, first histories, bins) order one, apparent reflectance per unit optics.
@@ -45,7 +51,7 @@ class Response(eqx.Module):
     - `arrived`, `departed`: (traces, materials, histories) weight that reached each material, and that went
       on from it.
     - `escaped`, `late`, `remaining`: (traces, histories) weight that left the scene, that outlasted the
-      window, and that had scatterings left when the last order was reached.
+      window, and that was still in flight after the last order.
 
     **Example:**
 
@@ -59,9 +65,9 @@ class Response(eqx.Module):
     (1, 1) 1.000
     """
 
-    first: Float[Array, "traces materials short bins"]
+    first: Float[Array, "traces materials first_histories bins"]
     higher: Float[Array, "traces materials histories bins"] | None
-    first_outside: Float[Array, "traces materials short"]
+    first_outside: Float[Array, "traces materials first_histories"]
     higher_outside: Float[Array, "traces materials histories"] | None
     arrived: Float[Array, "traces materials histories"]
     departed: Float[Array, "traces materials histories"]
@@ -75,7 +81,8 @@ def trace_scene(setup: Setup, key: PRNGKeyArray, *, reverse: bool = True) -> Res
     """Trace the response of one batch: the deterministic first order, and photons for the higher ones.
 
     A batch has `plan.n_photons` photons. The function is pure, to be compiled, batched and differentiated.
-    Wavelengths enter only where leaves transmit straight on.
+    Wavelengths enter only where leaves transmit straight on, and where optics are applied while light is
+    traced, because histories would be too many.
 
     **Arguments:**
 
@@ -116,10 +123,11 @@ def trace_device_scene(scene: DeviceScene, key: PRNGKeyArray) -> Response:
 
 def trace_with_scores(
     scene: DeviceScene, optics: Float[Array, "channels wavelengths"], key: PRNGKeyArray
-) -> tuple[Response, Float[Array, "columns wavelengths bins"]]:
-    """Trace the response of one batch, and its derivatives by the columns of `scene.slopes` at these optics.
+) -> tuple[Response, Float[Array, "parameters wavelengths bins"]]:
+    """Trace the response of one batch, and its derivatives with respect to the parameters of `scene.slopes`.
 
-    For plans that keep histories, and leaves that do not transmit straight on. Derivatives are in fine bins.
+    Derivatives are of the sum over histories at the values `optics`, in fine bins; for plans that keep
+    histories, and leaves that do not transmit straight on.
     """
     first, weights = _first(scene, key)
     assert first.weight_slopes is not None
@@ -147,8 +155,8 @@ def trace_first_only(scene: DeviceScene, key: PRNGKeyArray, ray_slice: RaySlice 
 class FirstOrderResponse(eqx.Module):
     """Order one of a response that has more: `first` and `first_outside` of `Response`."""
 
-    weights: Float[Array, "traces materials short bins"]
-    outside: Float[Array, "traces materials short"]
+    weights: Float[Array, "traces materials first_histories bins"]
+    outside: Float[Array, "traces materials first_histories"]
 
 
 # First and higher orders share nothing, so that they can be compiled side by side.
@@ -171,11 +179,12 @@ def trace_higher(scene: DeviceScene, key: PRNGKeyArray) -> HigherOrderTally:
     """Trace orders two and above of a batch, and the energy budget of all light."""
 
     def trace(scene: DeviceScene) -> HigherOrderTally:
-        # The same key as for the footprint: photons leave out the words with which that is shifted.
+        # The same key as for the footprint: photons leave out the random words with which that is shifted.
         tally = trace_higher_orders(scene, key)
         if scene.optics is None:
             return jax.tree.map(lambda a: a[None], tally)
         # Wavelengths, in place of histories, become traces with one history each.
+        # Their axis is the first of arrays with a single axis, else the second, after materials.
         return jax.tree.map(lambda a: _axis_to_traces(a, min(a.ndim - 1, 1)), tally)
 
     return _for_each_trace(trace, scene)
@@ -221,7 +230,7 @@ def _for_each_trace(trace: Callable[[DeviceScene], Traced], scene: DeviceScene) 
 
 def _first(
     scene: DeviceScene, key: PRNGKeyArray, ray_slice: RaySlice = ALL_RAYS
-) -> tuple[FirstOrder, Float[Array, "materials short bins"]]:
+) -> tuple[FirstOrder, Float[Array, "materials first_histories bins"]]:
     """Trace order one; also return its weights together with the returns of mirrors."""
     across, energy = footprint_rays(scene, key, ray_slice)
     first = first_order(scene, across, energy)
@@ -250,14 +259,15 @@ def footprint_rays(
 
 
 def first_order_response(
-    scene: DeviceScene, first: FirstOrder, weights: Float[Array, "materials short bins"]
+    scene: DeviceScene, first: FirstOrder, weights: Float[Array, "materials first_histories bins"]
 ) -> Response:
     """Make the response where nothing is followed beyond the first scattering.
 
-    Light that is scattered remains unfollowed; but what one plane alone scatters escapes, as nothing is in
-    its path.
+    1. For each material and channel: the light that it scatters departs with the next history.
+    2. That light remains unfollowed, unless it went straight through a plate.
+    3. What one plane alone scatters escapes, as nothing is in its path.
     """
-    config, table = scene.config, scene.first_histories
+    config, histories = scene.config, scene.first_histories
     departed = jnp.zeros_like(first.arrived)
     remaining = jnp.zeros_like(first.escaped)
     scatterers = [(s, False) for s in (config.leaf, config.bark) if s is not None]
@@ -269,18 +279,19 @@ def first_order_response(
         ):
             if channel < 0:
                 continue
-            after = table.next_history[:, channel]
+            after = histories.next_history[:, channel]
             # Histories of the largest degree, which have no successor, are not scattered again.
-            scattered = jnp.where(after != jnp.arange(table.count), energy[scatterer.material], 0.0)
+            scattered = jnp.where(after != jnp.arange(histories.count), energy[scatterer.material], 0.0)
             departed = departed.at[scatterer.material, after].add(scattered)
             # Light that goes straight through a plate was followed to what lies behind it.
             if not (is_straight and channel == scatterer.transmission):
                 remaining = remaining.at[after].add(scattered)
-    escaped, late = first.escaped, jnp.zeros_like(remaining)
+    escaped, none = first.escaped, jnp.zeros_like(remaining)
     lights_itself = any(surface.shape.lights_itself for surface in scene.surfaces)
     if len(scatterers) == 1 and not (config.leaf or config.bark or lights_itself):
-        escaped, remaining = escaped + remaining, late
-    budget = (first.arrived, departed, escaped, late, remaining)
+        escaped, remaining = escaped + remaining, none
+    # No light is late: none is followed beyond its first scattering.
+    budget = (first.arrived, departed, escaped, none, remaining)
     arrived, departed, escaped, late, remaining = (a[None] for a in budget)
     return Response(
         first=weights[None],

@@ -1,4 +1,4 @@
-r"""Score functions of paths: derivatives of the waveform by unknowns that change extinction alone.
+r"""Score functions of paths: derivatives of the waveform with respect to parameters of extinction alone.
 
 Where only extinction k moves, paths stay where they are. The weight of a path is a product of extinction
 coefficients, where it collided, and of exp(-integral of k ds). Its score, d ln(weight) / d theta, is
@@ -10,15 +10,18 @@ the material that was hit, a flight of length l through the voxel subtracts l d 
 path subtracts the derivative of its optical depth. The derivative of the waveform is the mean of weight times
 score (likelihood-ratio method; Rubinstein and Shapiro 1993).
 
-Scores are numbers like the weights themselves, one for each column of a Jacobian: no derivative is pushed
-through the march, which would carry tangents of positions, directions and times along.
+Scores ("score" is the value of this function, not a contribution to a tally) are numbers like the weights
+themselves, one for each parameter theta_j: no derivative is pushed through the march, which would carry
+tangents of positions, directions and times along.
 
 First order is deterministic, and differentiated piece by piece. Of the return of a material with the
-extinction k_m from a piece of a segment, V k_m I with I = integral of exp(-kappa tau) ds, the derivative is
+extinction k_m and the intensity factor V_m from a piece of a segment of a ray of the energy E,
+V_m E k_m I with I = integral of exp(-kappa tau) ds, the derivative is
 
-    V [ k_m (dI/dk) dk  +  I (d k_m - kappa k_m D) ],
+    V_m E [ k_m (dI/dk) dk  +  I (d k_m - kappa k_m d tau_0) ],
 
-with D the derivative of the optical depth before the segment, and dI/dk taken at fixed depth before it.
+with d the derivative with respect to theta_j, tau_0 the optical depth before the segment, and dI/dk taken at
+fixed tau_0.
 """
 
 import dataclasses
@@ -35,12 +38,12 @@ from jaxlidar.trace.extinction_slopes import ExtinctionSlopes, outer_rows, pack_
 from jaxlidar.trace.photons import Collision, detach
 from jaxlidar.trace.ray_segments import RaySegments, integrate_over_bins
 from jaxlidar.trace.tally_index import TallyIndex
-from jaxlidar.trace.voxel_traversal import Medium, column_of
+from jaxlidar.trace.voxel_traversal import Medium, voxel_above
 
 
 def collision_score(
     scene: DeviceScene, cell: Int[Array, "photons"], collided: Bool[Array, "photons"], collision: Collision
-) -> Float[Array, "photons columns"]:
+) -> Float[Array, "photons parameters"]:
     """Score of a collision, (d k / d theta) / k of the material that was hit; zero on surfaces."""
     medium, config, slopes = scene.medium, scene.config, scene.slopes
     assert medium is not None
@@ -57,38 +60,42 @@ def collision_score(
     return slopes.log_extinction_slopes(cell, *by_material)
 
 
-def vertical_depth_slopes(scene: DeviceScene, medium: Medium, x: Vec) -> Float[Array, "photons columns"]:
+def vertical_depth_slopes(scene: DeviceScene, medium: Medium, x: Vec) -> Float[Array, "photons parameters"]:
     """Return derivatives of the optical depth from `x` straight up."""
     slopes = scene.slopes
     assert slopes is not None
     assert slopes.depth_above is not None
-    cell, above, inside = detach(column_of(medium, x))
+    cell, above, inside = detach(voxel_above(medium, x))
     up = (jnp.zeros_like(above), jnp.zeros_like(above), jnp.ones_like(above))
-    # The part of its own voxel that lies above the point; voxels above that are in the table.
+    # Length within the point's own voxel; the voxels above it are in the table.
     length = jnp.where(inside, above * detach(medium.size[2]), 0.0)
     in_voxel = [slope * length for slope in slopes.slopes_at(cell, medium.projection_factor(up))]
-    in_voxel = slopes.to_columns(slopes.columns_at(cell), in_voxel, axis=-1)
+    in_voxel = slopes.to_all_parameters(slopes.parameters_at(cell), in_voxel, axis=-1)
     above_voxel = slopes.depth_above.at[cell].get(mode="promise_in_bounds")
     return jnp.where(inside[:, None], above_voxel, 0.0) + in_voxel
 
 
-def add_scored_returns(
+def add_derivatives_of_returns(
     scene: DeviceScene,
-    tally: Float[Array, "bins columns wavelengths"],
+    tally: Float[Array, "bins parameters wavelengths"],
     first_bin: Int[Array, "photons"],
     row: Float[Array, "photons kernel"],
-    score: Float[Array, "photons columns"],
+    score: Float[Array, "photons parameters"],
     channel_factors: list[tuple[Array, Scalar]],
     index: TallyIndex,
-) -> Float[Array, "bins columns wavelengths"]:
+) -> Float[Array, "bins parameters wavelengths"]:
     """Add the derivatives of photons' returns, score times return, to a tally.
+
+    1. For each channel by which light returns: its intensity factor times the optics of the history.
+    2. The sum of these times the score, for each parameter and wavelength.
+    3. That times the return in each bin, added to the tally.
 
     `channel_factors`: channels by which light returns, with intensity factors; `row`: returns without these
     factors.
     """
     slopes = scene.slopes
     assert slopes is not None
-    # Optics are applied here, because derivatives by history, wavelength and column would not fit into
+    # Optics are applied here, because derivatives by history, wavelength and parameter would not fit into
     # memory.
     returned = jnp.zeros((first_bin.size, slopes.history_optics.shape[1]), row.dtype)
     for channel, factor in channel_factors:
@@ -98,40 +105,50 @@ def add_scored_returns(
             mode="promise_in_bounds"
         )
     scored = score[:, :, None] * detach(returned)[:, None, :]
-    # All columns and wavelengths of a bin lie side by side, so that a deposit is one contiguous run.
+    # All parameters and wavelengths of a bin lie side by side, so that a deposit is one contiguous run.
     rows = outer_rows(detach(row), scored.reshape(first_bin.size, -1))
     flat = tally.reshape(1, len(tally), -1)
-    return add_column_rows(flat, jnp.zeros_like(first_bin), first_bin, rows)[0].reshape(tally.shape)
+    return add_parameter_rows(flat, jnp.zeros_like(first_bin), first_bin, rows)[0].reshape(tally.shape)
 
 
-def add_column_rows(
-    tally: Float[Array, "entries bins columns"],
-    entry: Int[Array, "rows"],
+def add_parameter_rows(
+    tally: Float[Array, "entries bins parameters"],
+    tally_row: Int[Array, "rows"],
     first_bin: Int[Array, "rows"],
-    rows: Float[Array, "rows kernel columns"],
-) -> Float[Array, "entries bins columns"]:
-    """Add runs of contiguous bins, each with all columns, to a tally. Columns lie innermost in memory."""
-    n_entries, bins, columns = tally.shape
-    flat = add_rows(tally.reshape(n_entries, -1), entry, first_bin * columns, rows.reshape(len(rows), -1))
-    return flat.reshape(n_entries, bins, columns)
+    rows: Float[Array, "rows kernel parameters"],
+) -> Float[Array, "entries bins parameters"]:
+    """Add runs of contiguous bins, each with all parameters, to rows of a tally; parameters lie innermost."""
+    n_entries, bins, parameters = tally.shape
+    flat = add_rows(
+        tally.reshape(n_entries, -1), tally_row, first_bin * parameters, rows.reshape(len(rows), -1)
+    )
+    return flat.reshape(n_entries, bins, parameters)
 
 
 def with_depth_slopes(
     scene: DeviceScene, segments: RaySegments, w: Vec, stops: list[Scalar]
-) -> tuple[RaySegments, list[Float[Array, "rays columns"]]]:
-    """Add derivatives of the depth before each segment; also return those up to `stops`."""
+) -> tuple[RaySegments, list[Float[Array, "rays parameters"]]]:
+    """Add derivatives of the depth before each segment; also return those up to `stops`.
+
+    Segment after segment along each ray:
+
+    1. The derivative of the voxel's extinction.
+    2. Add to those of the stops what of the segment lies before each, times that derivative.
+    3. Keep the sum before the segment, and add the length of the segment times that derivative.
+    """
     medium, slopes = scene.medium, scene.slopes
     assert medium is not None
     assert slopes is not None
-    # Directions are fixed: only k depends on the unknowns.
-    leaf_factor = detach(medium.projection_factor(w))
+    # Directions are fixed: only k depends on the parameters.
+    projection_factor = detach(medium.projection_factor(w))
 
     # Along the ray, because the depth before a segment is a running sum. The slopes at stops are those of the
     # segment in which each stop lies.
     def step(carry, segment):
         before, at_stops = carry
         start, length, cell = segment
-        slope = slopes.to_columns(slopes.columns_at(cell), slopes.slopes_at(cell, leaf_factor), axis=-1)
+        parameters, at_cell = slopes.parameters_at(cell), slopes.slopes_at(cell, projection_factor)
+        slope = slopes.to_all_parameters(parameters, at_cell, axis=-1)
         to_stops = [jnp.clip(stop - start, 0.0, length)[:, None] for stop in detach(stops)]
         at_stops = [a + slope * to_stop for a, to_stop in zip(at_stops, to_stops)]
         return (before + slope * length[:, None], at_stops), before
@@ -151,10 +168,15 @@ def segment_derivatives(
     kappa: float,
     extinction: Scalar,
     value: Scalar,
-) -> Float[Array, "segments pieces columns"]:
+) -> Float[Array, "segments pieces parameters"]:
     """Return the derivatives of what leaf, or bark, returns from segments, bin by bin (see the module).
 
-    `extinction` is that material's k_m, and `value` is V, the intensity factor times the ray's energy.
+    1. I and dI/dk of every piece, by one tangent.
+    2. The slopes of the extinction of all materials, dk, and of the one that returns, d k_m.
+    3. The term at fixed I: V_m E (d k_m - kappa k_m d tau_0) times I.
+    4. The term of the change of I: V_m E k_m dk times dI/dk.
+
+    `extinction` is that material's k_m, and `value` is V_m E, the intensity factor times the ray's energy.
     """
     medium, slopes, bins = scene.medium, scene.slopes, scene.bins
     assert medium is not None
@@ -162,24 +184,25 @@ def segment_derivatives(
     depth_slopes = segments.depth_slopes
     assert depth_slopes is not None
     segments, start_position, extinction, value = detach((segments, start_position, extinction, value))
-    leaf_factor = detach(medium.projection_factor(w))
+    projection_factor = detach(medium.projection_factor(w))
 
     def integrals(k):
         at_k = dataclasses.replace(segments, extinction=k)
         return integrate_over_bins(bins, start_position, at_k, kappa)[1]
 
     k = segments.extinction
-    # One tangent gives dI/dk for all columns: they act on the integral through the k of the voxel alone.
+    # One tangent gives dI/dk for all parameters: they act on the integral through the k of the voxel alone.
     pieces, d_pieces_dk = jax.jvp(integrals, (k,), (jnp.ones_like(k),))
-    columns = slopes.columns_at(segments.cell)
-    slope = slopes.to_columns(columns, slopes.slopes_at(segments.cell, leaf_factor), axis=-1)
-    # k_m is the extinction of the returning material, k that of both: leaf may move while bark returns.
+    parameters = slopes.parameters_at(segments.cell)
+    at_cell = slopes.slopes_at(segments.cell, projection_factor)
+    slope = slopes.to_all_parameters(parameters, at_cell, axis=-1)
+    # k_m is the extinction of the returning material, k that of both: leaf may change while bark returns.
     material_slopes = slopes.of_material(is_leaf)
     if material_slopes is None:
         material_slope = jnp.zeros_like(slope)
     else:
-        rows = material_slopes.slopes_at(segments.cell, leaf_factor)
-        material_slope = material_slopes.to_columns(columns, rows, axis=-1)
+        at_cell = material_slopes.slopes_at(segments.cell, projection_factor)
+        material_slope = material_slopes.to_all_parameters(parameters, at_cell, axis=-1)
     # Both terms of the module's equation: the one at fixed I, and that through dI/dk.
     at_fixed_integral = value[:, None] * (material_slope - (kappa * extinction)[:, None] * depth_slopes)
     return outer_rows(pieces.T, at_fixed_integral) + outer_rows(
@@ -189,36 +212,36 @@ def segment_derivatives(
 
 def make_slopes(
     scene: DeviceScene,
-    leaf: Float[Array, "columns cells"] | None,
-    bark: Float[Array, "columns cells"] | None,
+    leaf: Float[Array, "parameters cells"] | None,
+    bark: Float[Array, "parameters cells"] | None,
     optics: Float[Array, "channels wavelengths"],
     per_voxel: int,
 ) -> ExtinctionSlopes:
-    """Make extinction slopes from d k / d theta; at most `per_voxel` columns move one voxel."""
+    """Make extinction slopes from d k / d theta; a voxel depends on at most `per_voxel` parameters."""
     medium = scene.medium
     assert medium is not None
     table = leaf if leaf is not None else bark
     assert table is not None
     count = len(table)
-    leaf, bark, column_number = pack_slopes(leaf, bark, per_voxel)
+    leaf, bark, parameter_index = pack_slopes(leaf, bark, per_voxel)
     history_optics = scene.histories.monomials(optics)
-    slopes = ExtinctionSlopes(leaf, bark, column_number, None, history_optics, count=count)
+    slopes = ExtinctionSlopes(leaf, bark, parameter_index, None, history_optics, count=count)
     # Off nadir, return paths are marched, and sum their own slopes.
     if scene.depth_above is None:
         return slopes
     return dataclasses.replace(slopes, depth_above=_vertical_slopes(medium, slopes))
 
 
-def _vertical_slopes(medium: Medium, slopes: ExtinctionSlopes) -> Float[Array, "cells columns"]:
+def _vertical_slopes(medium: Medium, slopes: ExtinctionSlopes) -> Float[Array, "cells parameters"]:
     """Return the derivatives of the optical depth straight up from each voxel's upper face."""
     nx, ny, nz = medium.shape
     cells = jnp.arange(int(np.prod(medium.shape))).reshape(nx * ny, nz).T
     one = jnp.ones((nx * ny,), medium.size.dtype)
-    leaf_factor = medium.projection_factor((0.0 * one, 0.0 * one, one))
+    projection_factor = medium.projection_factor((0.0 * one, 0.0 * one, one))
 
     def layer(above, cell):
-        in_layer = [slope * medium.size[2] for slope in slopes.slopes_at(cell, leaf_factor)]
-        return above + slopes.to_columns(slopes.columns_at(cell), in_layer, axis=-1), above
+        in_layer = [slope * medium.size[2] for slope in slopes.slopes_at(cell, projection_factor)]
+        return above + slopes.to_all_parameters(slopes.parameters_at(cell), in_layer, axis=-1), above
 
     zero = jnp.zeros((nx * ny, slopes.count), medium.size.dtype)
     # From the top down, each layer before its own slope is added: the table is for upper faces.

@@ -1,13 +1,17 @@
-r"""Shared illumination, part three: responses of nodes, or of shots, from one trace.
+r"""Shared illumination: responses of nodes, or of shots, from one trace.
 
-What returns is linear in what is sent. A photon that enters at a with the density p(a) and returns the weight
-w
+It builds on the light that enters about nodes (`jaxlidar.trace.entry_nodes`) and on the fraction of each path
+that a shot sees (`jaxlidar.trace.shot_views`).
 
-    contributes  w I_f(a) / p(a) * V_f(b)  to the footprint f
+What returns is linear in what is sent. A photon that enters at a with the density p(a), ends at b and returns
+the weight W
 
-(`jaxlidar.trace.shot_views`). Straight down, without a field of view, V_f = 1, and I_f is nearly a sum of
-B-splines: then the response is tallied by node, and footprints are summed afterwards (`trace_nodes`).
-Otherwise every deposit is added to the shots that see it (`trace_shots`).
+    contributes  W I_f(a) / p(a) * V_f(b)  to the footprint f,
+
+with I_f the irradiance of its beam and V_f the fraction that its receiver sees. Straight down, without a
+field of view, V_f = 1, and I_f is nearly a sum of B-splines: then the response is tallied by node, and
+footprints are summed afterwards (`trace_nodes`). Otherwise every deposit is added to the shots that see it
+(`trace_shots`).
 """
 
 import dataclasses
@@ -30,6 +34,10 @@ def trace_nodes(scene: DeviceScene, nodes: EntryNodes, key: PRNGKeyArray) -> Res
 
     `scene` has parallel light, and optics. Each wavelength is a trace of its own, with one history, for which
     optics are 1.
+
+    1. Order one from few rays about each node, in groups of equal size; sum the groups of each node.
+    2. Orders two and above from photons about the nodes, tallied by node and wavelength.
+    3. Apply optics to order one; photons had theirs applied on the way.
     """
     assert scene.optics is not None
     ray_key, photon_key = jax.random.split(key)
@@ -47,20 +55,21 @@ def trace_nodes(scene: DeviceScene, nodes: EntryNodes, key: PRNGKeyArray) -> Res
         response = jax.vmap(lambda f: first_order_response(scene, f, f.weights))(first)
         return _apply_optics_to_first(response, scene)
     # Order one has few histories, and keeps them until here; photons had optics applied on the way.
-    table, optics = scene.first_histories, scene.optics
+    histories, optics = scene.first_histories, scene.optics
     n_wavelengths = optics.shape[1]
     higher = trace_higher_orders(scene, photon_key, nodes)
 
     def by_node(a: Array) -> Array:
         """Split entries into nodes and wavelengths, as leading axes."""
+        # Entries are the last axis but one of arrays with bins, else the last.
         axis = a.ndim - (2 if a.ndim == 3 else 1)
         a = a.reshape(*a.shape[:axis], n_nodes, n_wavelengths, *a.shape[axis + 1 :])
         return jnp.moveaxis(a, (axis, axis + 1), (0, 1))
 
     return Response(
-        first=_apply_optics(first.weights, table, optics),
+        first=_apply_optics(first.weights, histories, optics),
         higher=jnp.expand_dims(by_node(higher.weights), 3),
-        first_outside=_apply_optics(first.outside[..., None], table, optics)[..., 0],
+        first_outside=_apply_optics(first.outside[..., None], histories, optics)[..., 0],
         higher_outside=by_node(higher.outside)[..., None],
         arrived=by_node(higher.arrived)[..., None],
         departed=by_node(higher.departed)[..., None],
@@ -71,25 +80,25 @@ def trace_nodes(scene: DeviceScene, nodes: EntryNodes, key: PRNGKeyArray) -> Res
 
 
 def _apply_optics(
-    weights: Float[Array, "nodes *rows histories columns"],
-    table: Histories,
+    weights: Float[Array, "nodes *rows histories bins"],
+    histories: Histories,
     optics: Float[Array, "channels wavelengths"],
-) -> Float[Array, "nodes wavelengths *rows 1 columns"]:
+) -> Float[Array, "nodes wavelengths *rows 1 bins"]:
     """Sum weights over histories with optics; wavelengths become the second axis."""
-    by_wavelength = jnp.einsum("hw,...hc->...wc", table.monomials(optics), weights)
+    by_wavelength = jnp.einsum("hw,...hc->...wc", histories.monomials(optics), weights)
     return jnp.expand_dims(jnp.moveaxis(by_wavelength, -2, 1), -2)
 
 
 def _apply_optics_to_first(response: Response, scene: DeviceScene) -> Response:
     """Apply optics to a response of order one alone, which has one trace."""
     assert scene.optics is not None
-    table, optics = scene.first_histories, scene.optics
+    histories, optics = scene.first_histories, scene.optics
 
     def apply(a: Array) -> Array:
-        return _apply_optics(a[:, 0, ..., None], table, optics)[..., 0]
+        return _apply_optics(a[:, 0, ..., None], histories, optics)[..., 0]
 
     return Response(
-        first=_apply_optics(response.first[:, 0], table, optics),
+        first=_apply_optics(response.first[:, 0], histories, optics),
         higher=None,
         first_outside=apply(response.first_outside),
         higher_outside=None,
@@ -105,6 +114,11 @@ def trace_shots(scene: DeviceScene, lidar: Lidar, nodes: EntryNodes, key: PRNGKe
     """Trace the response of one batch to light about nodes, as each shot sees it; leading axis: shots.
 
     `scene` has `shot_views`. Order one of its `first_order_shots` is traced from rays of their own.
+
+    1. Orders two and above from photons about the nodes, tallied by shot and wavelength.
+    2. Order one of each shot, from the rays of its own beam.
+    3. The energy budget from nodes, by the coefficients of each shot's spline.
+    4. Drop the dummy shot.
     """
     views, optics = scene.shot_views, scene.optics
     assert views is not None

@@ -1,4 +1,4 @@
-r"""Shared illumination, part two: shots of one direction that each see a fraction of every path.
+r"""Views of shots in shared illumination: shots of one direction each see a fraction of every path.
 
 Light enters all over the scene with the density p(a) (`jaxlidar.trace.entry_nodes`). A path that enters at
 the point a of the reference plane and ends at the point b contributes to shot f the fraction
@@ -6,7 +6,8 @@ the point a of the reference plane and ends at the point b contributes to shot f
     I_f(a) / p(a) * V_f(b)
 
 of its weight: I_f is the irradiance of the shot's own beam, V_f the fraction that its receiver sees. Neither
-is approximated: what shots share is the path.
+is approximated but for parallel light: beams and fields of view have the width that they have at the aim
+point at every height. What shots share is the path.
 """
 
 import equinox as eqx
@@ -65,6 +66,12 @@ class ShotViews(eqx.Module):
 
         Paths enter at `entry` of the reference plane and end at `x`, m from the aim point. The delay is
         relative to a shot whose axis goes through the entry.
+
+        1. Project the end of the path along the axis onto the reference plane.
+        2. Look up the candidates, by that point or by the entry.
+        3. I_f / p, by the distance of the entry from the axis of each candidate.
+        4. V_f, by the distance of the end from it.
+        5. The delay, by how far the entry lies along the axis.
         """
         # The end is projected along the axis onto the reference plane, where positions of shots are known.
         end = x[0] - x[2] * (axis[0] / axis[2]), x[1] - x[2] * (axis[1] / axis[2])
@@ -72,17 +79,15 @@ class ShotViews(eqx.Module):
         # survey.
         shots = self._candidates_at(end if self.by_path_end else entry)
         shot_x, shot_y = (self.position[:, i].at[shots].get(mode="promise_in_bounds") for i in range(2))
-        advance, squared_distance = _beam_coordinates(
+        advance, entry_distance2 = _beam_coordinates(
             axis, (entry[0][:, None] - shot_x, entry[1][:, None] - shot_y)
         )
         # Entries have the density p = 1/area on the reference plane, which is tilted against the beam: hence
         # the cosine, -axis[2].
-        fraction = self._irradiance(squared_distance) * (self.area * -axis[2])
+        fraction = self._irradiance(entry_distance2) * (self.area * -axis[2])
         if self.view_radius is not None:
-            _, squared_distance = _beam_coordinates(
-                axis, (end[0][:, None] - shot_x, end[1][:, None] - shot_y)
-            )
-            fraction = fraction * visible_fraction(jnp.sqrt(squared_distance) / self.view_radius)
+            _, end_distance2 = _beam_coordinates(axis, (end[0][:, None] - shot_x, end[1][:, None] - shot_y))
+            fraction = fraction * visible_fraction(jnp.sqrt(end_distance2) / self.view_radius)
         return shots, fraction, 2.0 / SPEED_OF_LIGHT * advance
 
     def _candidates_at(self, point: PlanePoint) -> Int[Array, "photons candidates"]:
@@ -97,11 +102,11 @@ class ShotViews(eqx.Module):
 
     def _irradiance(self, squared_distance: Scalar) -> Scalar:
         """Fraction of the energy per m2 across the beam, at the squared distance from the axis."""
-        w2 = self.radius**2
+        radius2 = self.radius**2
         if self.gaussian:
             # Capped before the exponential underflows to a denormal, which processors are slow at.
-            return 2.0 / (np.pi * w2) * jnp.exp(-jnp.minimum(2.0 / w2 * squared_distance, 80.0))
-        return jnp.where(squared_distance <= w2, 1.0 / (np.pi * w2), 0.0)
+            return 2.0 / (np.pi * radius2) * jnp.exp(-jnp.minimum(2.0 / radius2 * squared_distance, 80.0))
+        return jnp.where(squared_distance <= radius2, 1.0 / (np.pi * radius2), 0.0)
 
 
 def _beam_coordinates(axis: Vec, offset: PlanePoint) -> tuple[Scalar, Scalar]:

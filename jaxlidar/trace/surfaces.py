@@ -24,7 +24,8 @@ class TracedSurface(eqx.Module):
 
     - `coverage`: fraction of a plate that is not gap; 1 for ground.
     - `law`: law of reflection.
-    - `pattern`: factor of the reflectance by position, or None where it is the same everywhere.
+    - `pattern`: factor of the reflectance by position, 1 where it is brightest; None where it is the same
+      everywhere.
     - `is_plate`: True for plates, False for the ground.
     - `straight`: True if the plate transmits light straight on.
     """
@@ -36,10 +37,10 @@ class TracedSurface(eqx.Module):
     is_plate: bool = eqx.field(static=True)
     straight: bool = eqx.field(static=True)
 
-    def moved(self, by: Float[Array, "3"]) -> "TracedSurface":
-        """Return the same surface, moved."""
-        pattern = None if self.pattern is None else self.pattern.moved(by[:2])
-        return dataclasses.replace(self, shape=self.shape.moved(by), pattern=pattern)
+    def moved(self, displacement: Float[Array, "3"]) -> "TracedSurface":
+        """Return the same surface, moved by a displacement in m."""
+        pattern = None if self.pattern is None else self.pattern.moved(displacement[:2])
+        return dataclasses.replace(self, shape=self.shape.moved(displacement), pattern=pattern)
 
     def distance(self, x: Vec, w: Vec) -> Scalar:
         """Distance from `x` along `w`; FAR if the surface is behind, missed, or met from under the ground."""
@@ -58,8 +59,8 @@ class TracedSurface(eqx.Module):
         sign = jnp.where(dot(normal, w) > 0, -1.0, 1.0)
         return scale(normal, sign)
 
-    def at_position(self, x: Vec, value: Scalar) -> Scalar:
-        """Scale `value`, which holds where the pattern is brightest, to the point `x`."""
+    def scale_by_pattern(self, x: Vec, value: Scalar) -> Scalar:
+        """Multiply `value` by the pattern of reflectance at the point `x`."""
         return value if self.pattern is None else value * self.pattern.value(x)
 
 

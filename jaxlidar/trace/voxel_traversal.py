@@ -1,8 +1,8 @@
 r"""Exact traversal of the voxel grid, face by face, by a digital differential analyser (DDA).
 
-A ray x + s w leaves voxel number v along axis k at the distance
+A ray x + s w leaves voxel number v along axis i at the distance
 
-    s_k(v) = gap_k v + offset_k,   gap_k = size_k / w_k,
+    s_i(v) = gap_i v + offset_i,   gap_i = size_i / w_i,
 
 and its next face is the nearest of the three (Amanatides and Woo 1987). Within a voxel the extinction
 coefficient k is constant, so that the optical depth tau grows by k ds to the next face and is linear between
@@ -13,6 +13,7 @@ A chunk of photons stops as soon as the last of them has stopped.
 """
 
 import dataclasses
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -154,16 +155,20 @@ def make_medium(canopy: Canopy, aim: Float[Array, "3"]) -> Medium:
 
 
 def _padded_shape(shape: tuple[int, ...]) -> tuple[int, int, int]:
-    """Voxels along each axis for which there is room: size buckets, unless the map is large."""
+    """Voxels along each axis for which there is room: size buckets, unless the map is large.
+
+    The bucket is that of one voxel more: a map of a round number of voxels (16, 32, 64 ...) then shares its
+    programs with maps that are a little larger.
+    """
     x, y, z = shape
     if x * y * z <= MAX_PADDED_VOXELS:
-        # One more than a round number of voxels needs no other bucket.
+        # Finer buckets for long axes: up to half of a coarse one would be empty.
         x, y, z = (n if n == 1 else size_bucket(n + 1, 2 if n <= 32 else 8) for n in shape)
     return x, y, z
 
 
-class DDAState(eqx.Module):
-    """A ray on the grid: it leaves voxel v along axis k at the distance `gap[k] * v[k] + offset[k]`.
+class VoxelRay(eqx.Module):
+    """Constants of a ray on the grid: it leaves voxel v along axis i at `gap[i] * v[i] + offset[i]`, m.
 
     - `step`: +1 or -1 along each axis. - `voxel`: the first voxel.
     - `enter`, `leave`: distances, m, at which the ray enters and leaves the grid.
@@ -199,13 +204,15 @@ def maximum(a: Scalar, b: Scalar) -> Scalar:
     return select(b > a, b, a)
 
 
-def enter_grid(medium: Medium, x: Vec, w: Vec, box: VoxelBox | None = None) -> DDAState:
+def enter_grid(medium: Medium, x: Vec, w: Vec, box: VoxelBox | None = None) -> VoxelRay:
     """Find where rays from `x` along `w` enter the grid (0 if inside) and leave it, and their first voxel.
 
     With `box`, the same for that block of the grid. A ray that misses it enters and leaves at once, at 0.
 
-    Slab by slab: the ray is within the bounds of axis k between two distances; it is in the grid where all
-    three intervals overlap.
+    1. Along each axis: distances to the faces, and the interval of distances in which the ray is within the
+       bounds of the grid.
+    2. The ray is in the grid where all three intervals overlap.
+    3. The first voxel, at the point of entry.
     """
     enter, leave = jnp.zeros_like(x[0]), jnp.full_like(x[0], FAR)
     gap, offset, step = [], [], []
@@ -238,7 +245,7 @@ def enter_grid(medium: Medium, x: Vec, w: Vec, box: VoxelBox | None = None) -> D
             # The point of entry lies on a face, and may be rounded to the wrong side.
             number = jnp.clip(number, 0, medium.counts[k] - 1)
         voxel.append(number.astype(jnp.int32))
-    return DDAState(tuple(gap), tuple(offset), tuple(step), tuple(voxel), enter, leave)
+    return VoxelRay(tuple(gap), tuple(offset), tuple(step), tuple(voxel), enter, leave)
 
 
 def cell_index(medium: Medium, voxel: tuple[Int[Array, "*s"], ...]) -> Int[Array, "*s"]:
@@ -263,7 +270,7 @@ def _wrap(number: Int[Array, "*s"], count: Int[Array, ""]) -> Int[Array, "*s"]:
 
 
 def step_voxel(
-    ray: DDAState, voxel: tuple[Int[Array, "*s"], ...], faces: tuple[Scalar, ...], distance: Scalar
+    ray: VoxelRay, voxel: tuple[Int[Array, "*s"], ...], faces: tuple[Scalar, ...], distance: Scalar
 ) -> tuple[Int[Array, "*s"], ...]:
     """Return the voxel behind the faces that are met by `distance`; through an edge or a corner, several."""
     return tuple(
@@ -292,8 +299,8 @@ class DepthCrossings(eqx.Module):
     - `depth`: optical depth at `entered`.
     - `distance`, `total_depth`: length, m, and optical depth of the whole ray; without meaning after the last
       target, where rays are not followed.
-    - `depth_slopes`: derivatives of the optical depth up to each target, or up to the end of the ray if there
-      are no targets; None where no scores are asked for.
+    - `depth_slopes`: derivatives, with respect to parameters, of the optical depth up to each target, or up
+      to the end of the ray if there are no targets; None without score functions.
     """
 
     crossed: Bool[Array, "targets photons"]
@@ -303,7 +310,25 @@ class DepthCrossings(eqx.Module):
     depth: Float[Array, "targets photons"]
     distance: Float[Array, "photons"]
     total_depth: Float[Array, "photons"]
-    depth_slopes: Float[Array, "ends columns photons"] | None = None
+    depth_slopes: Float[Array, "ends parameters photons"] | None = None
+
+
+class _March(NamedTuple):
+    """State of the march of rays through voxels.
+
+    - `distance`, `depth`: length, m, and optical depth up to here. `voxel`: the voxel ahead.
+    - `running`: False for rays that have stopped.
+    - `crossings`: of every target, distances at which its voxel is entered (-1: not crossed) and left,
+      optical depth at the former, and the cell.
+    - `depth_slopes`: as in `DepthCrossings`.
+    """
+
+    distance: Float[Array, "photons"]
+    depth: Float[Array, "photons"]
+    voxel: tuple[Int[Array, "photons"], ...]
+    running: Bool[Array, "photons"]
+    crossings: tuple[Array, ...]
+    depth_slopes: Float[Array, "ends parameters photons"] | None
 
 
 def march_to_depths(
@@ -321,10 +346,15 @@ def march_to_depths(
 ) -> DepthCrossings:
     """March rays to their largest target depth, to `max_length`, or until they leave the grid, or `box`.
 
-    Each step: (1) find the nearest face, or the end of the ray; (2) look up the extinction of the voxel; (3)
-    for every target depth that lies in this step, remember the voxel, its faces and the depth before it; (4)
-    go on to the next voxel. A ray stops when it has passed its largest target or its end. The loop has a
-    static length, in blocks of `STEPS_PER_CHECK` steps that are skipped when all rays have stopped.
+    Each step:
+
+    1. Find the nearest face, or the end of the ray.
+    2. Look up the extinction of the voxel.
+    3. For every target depth that lies in this step, remember the voxel, its faces and the depth before it.
+    4. Go on to the next voxel.
+
+    A ray stops when it has passed its largest target or its end. The loop has a static length, in blocks of
+    `STEPS_PER_CHECK` steps that are skipped when all rays have stopped.
 
     **Arguments:**
 
@@ -344,9 +374,10 @@ def march_to_depths(
     def for_targets(a: Array) -> Array:
         return jnp.broadcast_to(a, targets.shape)
 
-    leaf_factor = None if slopes is None else lax.stop_gradient(medium.projection_factor(w))
+    projection_factor = None if slopes is None else lax.stop_gradient(medium.projection_factor(w))
 
-    def step(state, _):
+    def step(state: _March, _):
+        """March all rays by one step, 1 to 4 of `march_to_depths`."""
         distance, depth, voxel, running, crossings, depth_slopes = state
         faces = once(ray.face_distances(voxel))
         # Not before `distance`: a ray that starts on a face would step back by rounding.
@@ -364,25 +395,26 @@ def march_to_depths(
             select(crossed, for_targets(new), old) for new, old in zip((distance, to, depth, cell), crossings)
         )
         if slopes is not None:
-            # Up to each target, a segment counts as far as the target: within the voxel where it lies, in
-            # part.
+            # Up to each target, a segment counts as far as the target, which may lie within it.
             length = jnp.where(running, to - distance, 0.0)[None]
             if len(targets):
                 to_target = (targets - for_targets(depth)) / for_targets(jnp.maximum(k, 1e-30))
                 length = jnp.clip(to_target, 0.0, for_targets(length[0]))
-            depth_slopes = slopes.add_segment(depth_slopes, cell, lax.stop_gradient(length), leaf_factor)
+            assert depth_slopes is not None
+            length = lax.stop_gradient(length)
+            depth_slopes = slopes.add_segment(depth_slopes, cell, length, projection_factor)
         # The voxel of a ray that has stopped does not matter.
         next_voxel = step_voxel(ray, voxel, faces, to)
         distance, depth = select(running, to, distance), select(running, next_depth, depth)
-        return (distance, depth, next_voxel, goes_on, crossings, depth_slopes), None
+        return _March(distance, depth, next_voxel, goes_on, crossings, depth_slopes), None
 
     # A loop of static length has a reverse derivative; skipping dead blocks gives back the time of a loop
     # that stops early.
-    def block(state, _):
+    def block(state: _March, _):
         def run(state):
             return lax.scan(step, state, None, length=STEPS_PER_CHECK)[0]
 
-        return lax.cond(jnp.any(state[3]), run, lambda s: s, state), None
+        return lax.cond(jnp.any(state.running), run, lambda s: s, state), None
 
     zero = jnp.zeros_like(targets)
     # Entered at -1: not crossed.
@@ -392,17 +424,26 @@ def march_to_depths(
     if slopes is not None:
         depth_slopes = jnp.zeros((max(len(targets), 1), slopes.count, *max_length.shape), max_length.dtype)
     running = active & (ray.enter < end)
-    state = (start, jnp.zeros_like(max_length), ray.voxel, running, no_crossings, depth_slopes)
+    state = _March(start, jnp.zeros_like(max_length), ray.voxel, running, no_crossings, depth_slopes)
 
-    def march(state):
+    def march(state: _March) -> _March:
         return lax.scan(block, state, None, length=-(-max_faces // STEPS_PER_CHECK))[0]
 
-    distance, total_depth, _, _, crossings, depth_slopes = (march if reverse else one_function(march))(state)
-    enter, leave, depth, cell = crossings
-    return DepthCrossings(enter >= 0, cell, enter, leave - enter, depth, distance, total_depth, depth_slopes)
+    state = (march if reverse else one_function(march))(state)
+    enter, leave, depth, cell = state.crossings
+    return DepthCrossings(
+        crossed=enter >= 0,
+        cell=cell,
+        entered=enter,
+        chord=leave - enter,
+        depth=depth,
+        distance=state.distance,
+        total_depth=state.depth,
+        depth_slopes=state.depth_slopes,
+    )
 
 
-def column_of(medium: Medium, x: Vec) -> tuple[Int[Array, "..."], Scalar, Bool[Array, "..."]]:
+def voxel_above(medium: Medium, x: Vec) -> tuple[Int[Array, "..."], Scalar, Bool[Array, "..."]]:
     """Find the voxel at or straight above `x`, the fraction of it above `x`, and if there is one."""
     voxel = []
     position = []
@@ -422,7 +463,7 @@ def column_of(medium: Medium, x: Vec) -> tuple[Int[Array, "..."], Scalar, Bool[A
 
 def depth_to_top(medium: Medium, x: Vec, depth_above: Float[Array, "cells"]) -> Scalar:
     """Return the optical depth from `x` straight up; `depth_above` as `vertical_depths` returns it."""
-    cell, above, inside = column_of(medium, x)
+    cell, above, inside = voxel_above(medium, x)
     up = (jnp.zeros_like(x[0]), jnp.zeros_like(x[0]), jnp.ones_like(x[0]))
     depth = _gather(depth_above, cell) + medium.extinction(cell, up) * above * medium.size[2]
     return jnp.where(inside, depth, 0.0)
