@@ -131,11 +131,11 @@ def simulate(
     plan = _check_or_make_plan(lidar, scene, given_plan, goal, planning)
     tracer = make_batch_tracer(make_setup(lidar, scene, plan), key)
     result = _trace(tracer, key, goal, progress, start_time)
-    can_follow_more = given_plan is None and plan.orders < plan.scope.max_orders
+    can_follow_more = given_plan is None and plan.orders < plan.scope.affordable_orders
     has_time = time.perf_counter() - start_time < max_seconds
     if result.neglected_fraction > 0 and can_follow_more and has_time:
         # Orders beyond the last matter: follow as many as there is room for.
-        planning["max_orders"] = plan.scope.max_orders
+        planning["max_orders"] = plan.scope.affordable_orders
         plan = _check_or_make_plan(lidar, scene, None, goal, planning)
         plan = dataclasses.replace(plan, scope=plan.scope._replace(automatic_orders=True))
         tracer = make_batch_tracer(make_setup(lidar, scene, plan), key)

@@ -20,7 +20,7 @@ from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._programs import Program
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.planning.channels import channel_optics
-from jaxlidar.planning.effects import can_light_itself
+from jaxlidar.planning.effects import allows_interreflection
 from jaxlidar.planning.setup import Setup
 from jaxlidar.planning.size_buckets import size_bucket
 from jaxlidar.scenes.atmosphere import Atmosphere
@@ -179,7 +179,7 @@ def _make_model(setup: Setup, n_samples: int, degree: int) -> WaveformModel:
         first_degree=plan.config.first_degree if plan.config.keeps_histories else 0,
         degree=degree,
         one_order=plan.orders == 1,
-        can_scatter_again=can_light_itself(setup.scene),
+        can_scatter_again=allows_interreflection(setup.scene),
     )
 
 
