@@ -56,7 +56,7 @@ MAX_SIZE = 1024
 # every fourth: an estimate that stops at the first moment at which it seems precise is wrong more often.
 _BATCH_STEPS = StepRule(max_growth=1.0, min_step=4)
 # Coarser lattices are dropped when denser ones are traced: small steps would waste most of the rays.
-_LATTICE_STEPS = StepRule(order=0.75, safety=1.2, min_growth=2.0, max_growth=32.0)
+_LATTICE_STEPS = StepRule(convergence_rate=0.75, safety=1.2, min_growth=2.0, max_growth=32.0)
 
 
 class ShotGeometry(NamedTuple):
@@ -220,7 +220,7 @@ def _relative_error(estimate: RunningMoments) -> Array:
 
 def _no_batches(shapes: ShotBatch) -> RunningMoments:
     """Return the moments of no batch, for batches of these shapes."""
-    return RunningMoments.compiled(_with_errors(_zeros(shapes)), shapes)
+    return RunningMoments.in_program(_with_errors(_zeros(shapes)), shapes)
 
 
 def _add_batches(

@@ -263,7 +263,7 @@ def _group_moments(
         return moments.update((batch.waveform, batch.energy), batch.response)
 
     shapes: BatchSums = jax.eval_shape(trace_batch, first)
-    empty = RunningMoments.compiled((shapes.waveform, shapes.energy), shapes.response)
+    empty = RunningMoments.in_program((shapes.waveform, shapes.energy), shapes.response)
     moments = jax.lax.fori_loop(0, count, add_batch, empty)
     # Waveforms by material are linear in the response: those of its mean are their mean, made once.
     lines = jax.vmap(lambda response: _lines(response, model))(moments.mean_only)
