@@ -211,7 +211,7 @@ def _with_longest_flights(setup: Setup) -> Setup:
         return setup
     lengths = PathLengths(setup.lidar, setup.scene)
     height = concrete_number(canopy.voxels.voxel_size[2]) * canopy.voxels.shape[2]
-    max_flight = min(MAX_FLIGHT_HEIGHTS * height, lengths.longest_march)
+    max_flight = min(MAX_FLIGHT_HEIGHTS * height, lengths.longest_affordable_flight)
     plan = plan.with_limits(max_flight=max_flight).with_config(max_faces=lengths.voxels_along(max_flight))
     return dataclasses.replace(setup, plan=plan)
 

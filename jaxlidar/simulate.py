@@ -95,8 +95,8 @@ def simulate(
       `jaxlidar.plan`. Default None: as there.
     - `max_seconds`: stop after this time in s, planning and compilation included, however large the error;
       positive. At least eight batches are traced. Default inf.
-    - `truth`: True to add what the beam meets in the scene, as labels for algorithms: `Waveform.truth`.
-      Default False.
+    - `truth`: True to add `Waveform.truth`: reference quantities computed from the scene itself (gap
+      probability, area densities, heights), to train or to test retrieval algorithms. Default False.
     - `progress`: a function called with a `Progress` after every round of batches; for instance `print`.
       Default None.
 
@@ -132,21 +132,26 @@ def simulate(
     given_plan = plan
     plan = _check_or_make_plan(lidar, scene, given_plan, goal, planning)
     tracer = make_batch_tracer(make_setup(lidar, scene, plan), key)
-    result = _trace(tracer, key, goal, progress, start_time)
+    result = _run_batches(tracer, key, goal, progress, start_time)
     while result.needs_more_orders and given_plan is None:
         more = _more_orders(plan, lidar.wavelength.size, result.neglected_fraction, goal)
         if more is None or time.perf_counter() - start_time >= max_seconds:
             break
         plan = _check_or_make_plan(lidar, scene, None, goal, planning | more)
+        # Orders given as an argument count as the user's. These are still the plan's choice, so that what
+        # lies beyond them is reported.
         plan = dataclasses.replace(plan, scope=plan.scope._replace(automatic_orders=True))
         tracer = make_batch_tracer(make_setup(lidar, scene, plan), key)
-        result = _trace(tracer, key, goal, progress, start_time)
+        result = _run_batches(tracer, key, goal, progress, start_time)
     wave = _make_waveform(tracer, result, goal)
     return dataclasses.replace(wave, truth=truth_of_setup(tracer.setup)) if truth else wave
 
 
 class _Goal(NamedTuple):
-    """The stopping rule: a number of photons, or tolerances. `rtol` None takes the plan's."""
+    """The arguments of `simulate` that decide when to stop.
+
+    `_trace_batches` makes the `StoppingRule` of them. `rtol`: None takes the plan's.
+    """
 
     rtol: float | None
     atol: float
@@ -196,8 +201,8 @@ def _more_orders(
     First as many as histories have room for; then, with optics applied, as many as the fraction that is
     neglected asks for.
     """
-    if plan.config.keeps_histories and plan.orders < plan.scope.max_orders:
-        return {"max_orders": plan.scope.max_orders, "histories": True}
+    if plan.config.keeps_histories and plan.orders < plan.scope.affordable_orders:
+        return {"max_orders": plan.scope.affordable_orders, "histories": True}
     if wavelengths > MAX_APPLIED_WAVELENGTHS or plan.orders >= MAX_ORDERS:
         return None
     # The first orders may fall faster than later ones, so that the mean ratio of orders is a lower bound.
@@ -206,14 +211,14 @@ def _more_orders(
     return {"max_orders": min(orders, MAX_ORDERS), "histories": False}
 
 
-class _Traced(NamedTuple):
+class _BatchResults(NamedTuple):
     """The sum of the responses of some batches, standard errors, and `info`.
 
     Standard errors are None where nothing is random. `neglected_fraction`: fraction that orders beyond the
     last may add. `needs_more_orders`: True if nothing else was short of the goal.
     """
 
-    response: Response
+    response_sum: Response
     batches: int
     stderr: Array | None
     energy_budget_stderr: dict[str, Array] | None
@@ -222,27 +227,27 @@ class _Traced(NamedTuple):
     needs_more_orders: bool = False
 
 
-def _trace(
+def _run_batches(
     tracer: BatchTracer,
     key: PRNGKeyArray,
     goal: _Goal,
     progress: Callable[[Progress], None] | None,
     start_time: float,
-) -> _Traced:
+) -> _BatchResults:
     """Trace once if nothing is random, a fixed number of batches if transformed, or until the goal."""
     if not tracer.setup.plan.is_random:
         response = jax.block_until_ready(tracer.trace(key))
         info = {"photons": 0, "batches": 1, "error": 0.0, "stopped": "nothing is random"}
-        return _Traced(response, 1, None, None, {**info, "seconds": time.perf_counter() - start_time})
+        return _BatchResults(response, 1, None, None, {**info, "seconds": time.perf_counter() - start_time})
     if any(is_traced(x) for x in jax.tree.leaves((tracer.setup, key))):
         return _trace_transformed(tracer, key)
     return _trace_batches(tracer, key, goal, progress, start_time)
 
 
-def _make_waveform(tracer: BatchTracer, result: _Traced, goal: _Goal) -> Waveform:
-    """Make the waveform of traced batches, on the digitiser's bins; warn where it misses much light."""
+def _make_waveform(tracer: BatchTracer, result: _BatchResults, goal: _Goal) -> Waveform:
+    """Make the waveform of the batches, on the digitiser's samples; warn where it misses much light."""
     plan, lidar = tracer.setup.plan, tracer.setup.lidar
-    wave = tracer.waveform(result.response, result.batches)
+    wave = tracer.waveform(result.response_sum, result.batches)
     errors = {"stderr": result.stderr, "energy_budget_stderr": result.energy_budget_stderr}
     errors = {name: value for name, value in errors.items() if value is not None}
     wave = dataclasses.replace(wave, info=result.info, **errors)
@@ -310,7 +315,7 @@ class LateLightWarning(UserWarning):
     """
 
 
-def _trace_transformed(tracer: BatchTracer, key: PRNGKeyArray) -> _Traced:
+def _trace_transformed(tracer: BatchTracer, key: PRNGKeyArray) -> _BatchResults:
     """Trace a fixed number of batches, within a JAX transformation."""
 
     def trace_batch(key: PRNGKeyArray) -> tuple[Response, Array, BudgetTerms]:
@@ -324,8 +329,9 @@ def _trace_transformed(tracer: BatchTracer, key: PRNGKeyArray) -> _Traced:
         variance = jnp.var(jax.lax.stop_gradient(values), axis=0)
         return student_widening(MIN_BATCHES) * jnp.sqrt(variance / (MIN_BATCHES - 1))
 
-    total = jax.tree.map(lambda a: jnp.sum(a, axis=0), responses)
-    return _Traced(total, MIN_BATCHES, stderr(samples), jax.tree.map(stderr, terms.energy_budget), {})
+    response_sum = jax.tree.map(lambda a: jnp.sum(a, axis=0), responses)
+    energy_budget_stderr = jax.tree.map(stderr, terms.energy_budget)
+    return _BatchResults(response_sum, MIN_BATCHES, stderr(samples), energy_budget_stderr, {})
 
 
 class _WaveformEstimate(AbstractEstimate):
@@ -377,14 +383,21 @@ def _trace_batches(
     goal: _Goal,
     progress: Callable[[Progress], None] | None,
     start_time: float,
-) -> _Traced:
-    """Trace batches on all cores, round after round, until the goal is reached."""
+) -> _BatchResults:
+    """Trace batches on all cores, round after round, until the goal is reached.
+
+    1. Stop at the tolerances, or at a number of batches where the goal is a number of photons.
+    2. Add batches in rounds of growing size (`sample_until`); report after each.
+    3. Where the tolerance is met and the plan chose the orders, say what orders beyond the last may add.
+    """
     plan = tracer.setup.plan
     rtol = goal.tolerance(plan)
     if goal.n_photons is None:
         stop = StoppingRule(rtol, goal.atol, MIN_BATCHES)
     else:
-        stop = StoppingRule(None, 0.0, MIN_BATCHES, max(MIN_BATCHES, -(-goal.n_photons // plan.n_photons)))
+        # Rounded up: at least as many photons as were asked for.
+        max_batches = max(MIN_BATCHES, -(-goal.n_photons // plan.n_photons))
+        stop = StoppingRule(rtol=None, min_size=MIN_BATCHES, max_size=max_batches)
     trace_batch = tracer.batch_function(key)
     with side_by_side() as run:
         estimate = _WaveformEstimate(tracer, lambda numbers: run(trace_batch, numbers))
@@ -419,8 +432,8 @@ def _trace_batches(
         "error": errors.relative,
         "stopped": stopped,
     }
-    return _Traced(
-        response=estimate.response_sum,
+    return _BatchResults(
+        response_sum=estimate.response_sum,
         batches=estimate.n_batches,
         stderr=jnp.asarray(errors.stderr),
         energy_budget_stderr=dict(zip(estimate.budget_names, map(jnp.asarray, estimate.budgets.stderr))),

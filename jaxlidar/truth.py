@@ -38,7 +38,7 @@ from jaxlidar.spectral.apply_optics import (
     make_padded_waveform_model,
     make_waveform_model,
 )
-from jaxlidar.spectral.labels import Truth
+from jaxlidar.spectral.truth_class import Truth
 from jaxlidar.trace.deposit import add_rows, padded_index
 from jaxlidar.trace.device_scene import DeviceScene, build_device_scene
 from jaxlidar.trace.first_order import FootprintRays, march_rays, send_rays

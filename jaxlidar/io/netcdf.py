@@ -328,7 +328,7 @@ keep_as_netcdf(
     Waveform,
     "simulated lidar waveform",
     {
-        "time": ("ns", "time of arrival after the two-way travel time of the reference plane"),
+        "time": ("ns", "time of arrival relative to the two-way travel time of the reference plane"),
         "height": ("m", "height above the reference plane from which light of order one arrives"),
         "reflectance": ("1", "apparent reflectance per sample"),
         "energy": ("J", "energy that the detector registers per sample"),
@@ -341,7 +341,7 @@ keep_as_netcdf(
         "recorded": ("J", "energy that the receiver records per sample, without noise"),
         "wavelength": ("nm", "wavelength of the lidar"),
     },
-    dimensions={"bins": "time", "wavelengths": "wavelength"},
+    dimensions={"samples": "time", "wavelengths": "wavelength"},
     items={"components": "component", "energy_budget": "fate", "energy_budget_stderr": "fate"},
     coordinates={"height": "time"},
     former_names={"energy_budget": "ledger", "energy_budget_stderr": "ledger_stderr"},
@@ -380,11 +380,11 @@ keep_as_netcdf(
     Truth,
     "truth of a simulated lidar waveform",
     {
-        "time": ("ns", "time of arrival after the two-way travel time of the reference plane"),
+        "time": ("ns", "time of arrival relative to the two-way travel time of the reference plane"),
         "height": ("m", "height above the reference plane from which light of order one arrives"),
         **TRUTH_QUANTITIES,
     },
-    dimensions={"bins": "sample", "wavelengths": "wavelength"},
+    dimensions={"samples": "sample", "wavelengths": "wavelength"},
     items={"returns": "material", "surface_height": "surface", "surface_spread": "surface"},
     coordinates={"time": "sample", "height": "sample"},
 )

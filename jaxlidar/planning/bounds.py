@@ -1,8 +1,13 @@
 """Upper bounds on what leaving out an effect changes: cheap to compute, and valid for every scene.
 
+They hold up to the resolution of 2048 rays of the footprint, 201 depths of the canopy and 400 cells of the
+pulse: the extremes over these, and the total variation of the pulse, are approached from below.
+
 Symbols, all by wavelength:
 
-- R, T: reflectance and transmittance of a material. v: its intensity factor for backscatter.
+- R, T: reflectance and transmittance of a material. v: its intensity factor for backscatter, pi times BRDF
+  times cosine per unit reflectance, which is 1 for a Lambertian surface that is met at right angles.
+- k: extinction coefficient of the canopy, 1/m. s: path length, m.
 - tau: optical depth of a ray through the canopy. x = exp(-tau): transmittance.
 - kappa: 2, or 1 with the hot spot; light of order one is attenuated by exp(-kappa tau) on its way in and out.
 - c, P: coverage of a plate, and the fraction of light that meets no plate or passes all of them straight on.
@@ -80,7 +85,8 @@ class PlateFractions(NamedTuple):
 class Bounds:
     """Bounds on what each effect changes (see `jaxlidar.Effect`) in a scene simulated up to a given order.
 
-    A method bounds the effect that it is named after. Bounds are for the worst wavelength, and in [0, 1].
+    Most methods bound the effect that they are named after. Bounds are for the worst wavelength, and in
+    [0, 1].
 
     **Arguments:**
 
@@ -107,7 +113,7 @@ class Bounds:
         # Materials are in the order leaf, bark, surfaces.
         surface_names = [name for name in self.optics if name not in ("leaf", "bark")]
         self.surfaces = dict(zip(surface_names, scene.surfaces))
-        self.sheets = {name: s for name, s in self.surfaces.items() if isinstance(s, AbstractSheet)}
+        self.plate_surfaces = {name: s for name, s in self.surfaces.items() if isinstance(s, AbstractSheet)}
         self.kappa = 1.0 if scene.canopy is not None and scene.canopy.hotspot else 2.0
 
     # -- returns of materials ------------------------------------------------------------------------------
@@ -154,7 +160,7 @@ class Bounds:
         return backscatter_factors(surface.law, rays, upward, self.aperture_half_angle, is_sheet)
 
     def _plate_fractions(self, name: str) -> PlateFractions:
-        plate, (r, t) = self.sheets[name], self.optics[name]
+        plate, (r, t) = self.plate_surfaces[name], self.optics[name]
         coverage, straight = concrete_number(plate.coverage), plate.transmission == "straight"
         return PlateFractions(
             reflected=coverage * r,
@@ -179,12 +185,14 @@ class Bounds:
 
     def _straight_through_plates(self) -> PerWavelength:
         """Fraction P that meets no plate or goes straight through all plates, one way."""
-        fractions = [self._plate_fractions(name).straight for name in self.sheets]
+        fractions = [self._plate_fractions(name).straight for name in self.plate_surfaces]
         return np.prod([np.ones(self.lidar.wavelength.size), *fractions], axis=0)
 
     def _largest_plate_return(self) -> PerWavelength:
         """Largest return of order one of all plates together: the sum of c R v."""
-        returns = [self._plate_fractions(n).reflected * self._backscatter_range(n)[1] for n in self.sheets]
+        returns = [
+            self._plate_fractions(n).reflected * self._backscatter_range(n)[1] for n in self.plate_surfaces
+        ]
         return np.sum([np.zeros(self.lidar.wavelength.size), *returns], axis=0)
 
     # -- multiple scattering -------------------------------------------------------------------------------
@@ -208,8 +216,10 @@ class Bounds:
                 scattered = self._scattered_between_plate_and_ground(order)
             else:
                 scattered = self._scattered_in_any_scene(order)
-            x = largest_factor * scattered
-            return _worst_wavelength(np.where(scattered > 0, 1.0 / (1.0 + 1.0 / x), 0.0))
+            # v E / F.
+            higher_per_first_order = largest_factor * scattered
+            fraction = 1.0 / (1.0 + 1.0 / higher_per_first_order)
+            return _worst_wavelength(np.where(scattered > 0, fraction, 0.0))
 
     def _scattered_between_plate_and_ground(self, order: int) -> PerWavelength:
         """Energy E that a plate and the ground scatter above `order`, over the return F of order one.
@@ -222,7 +232,7 @@ class Bounds:
         all that one of them scatters meets the other. As A_(n+2) = s R A_n, and likewise B, the sum over all
         n > order is the sum of its first two terms over 1 - s R.
         """
-        (name,), (r, _) = self.sheets, self.optics["ground"]
+        (name,), (r, _) = self.plate_surfaces, self.optics["ground"]
         plate = self._plate_fractions(name)
         plate_return = plate.reflected * self._backscatter_range(name)[0]
         ground_return = plate.straight**2 * r * self._backscatter_range("ground")[0]
@@ -249,10 +259,10 @@ class Bounds:
         """
         s, return_transmittance = np.zeros(self.lidar.wavelength.size), 1.0
         for name, (r, t) in self.optics.items():
-            if name not in self.sheets:
+            if name not in self.plate_surfaces:
                 s = np.maximum(s, r + t)
         ratio = self._largest_scattered_per_return()
-        for name in self.sheets:
+        for name in self.plate_surfaces:
             plate = self._plate_fractions(name)
             plate_ratio = plate.scattered / (plate.reflected * self._backscatter_range(name)[0])
             ratio = np.maximum(ratio, np.where(plate.scattered > 0, plate_ratio, 0.0))
@@ -260,8 +270,10 @@ class Bounds:
             # an opaque plate nothing is lit, so that it counts as transparent.
             return_transmittance = return_transmittance * np.where(plate.straight > 0, plate.straight, 1.0)
         # After any plate another may follow. Each repetition takes in one more, as often as there are plates.
-        for _ in self.sheets:
-            s = np.max([s, *(self._scattered_at_plate_or_behind(name, s) for name in self.sheets)], axis=0)
+        for _ in self.plate_surfaces:
+            s = np.max(
+                [s, *(self._scattered_at_plate_or_behind(name, s) for name in self.plate_surfaces)], axis=0
+            )
         out_of_view = np.zeros_like(s)
         if self.fraction_out_of_view > 0:
             least_return = self._first_order_range()[0] * self._straight_through_plates() ** 2
@@ -312,23 +324,24 @@ class Bounds:
     def canopy_material(self, name: str) -> float:
         """Bound on the change without leaf, or without bark.
 
-        The material, of depth tau at most, shades all else by x = exp(-kappa tau) at least, and returns at
-        most A = R v (1 - x) / kappa. Let F' be the return without it, and F_min its least value. With the
-        material the ray returns at least x F': without it, the scene is brighter by at most
+        The material, of depth tau at most, lets at least the fraction y = exp(-kappa tau) of all other light
+        through, both ways, and returns at most A = R v (1 - y) / kappa. Let F' be the return without it, and
+        F_min its least value. With the material the ray returns at least y F': without it, the scene is
+        brighter by at most
 
-            (F' - F) / F' <= 1 - x,
+            (F' - F) / F' <= 1 - y,
 
-        and darker by at most (F - F') / F <= A / (A + F') <= A / (A + x F_min), since F <= A + F'.
+        and darker by at most (F - F') / F <= A / (A + F') <= A / (A + y F_min), since F <= A + F'.
         """
         canopy = self.scene.canopy
         # Without ground, nothing but the material may be in view.
         if canopy is None or self.scene.ground is None or self.scene.plates:
             return 1.0
-        x = np.exp(-self.kappa * self._largest_depth(canopy, name))
-        material_return = self.optics[name][0] * self._backscatter_range(name)[1] * (1.0 - x) / self.kappa
-        least_background = self._first_order_range(name)[0] * x
+        y = np.exp(-self.kappa * self._largest_depth(canopy, name))
+        material_return = self.optics[name][0] * self._backscatter_range(name)[1] * (1.0 - y) / self.kappa
+        least_background = self._first_order_range(name)[0] * y
         darker = _worst_wavelength(_fraction(material_return, least_background))
-        return self._with_higher_orders(max(1.0 - float(x), darker))
+        return self._with_higher_orders(max(1.0 - float(y), darker))
 
     def plates(self) -> float:
         """Bound on the change without plates, which shade what lies behind by P^2 and return light.
@@ -343,7 +356,7 @@ class Bounds:
         straight_both_ways = self._straight_through_plates() ** 2
         (least, largest), plate_return = self._first_order_range(), self._largest_plate_return()
         if self._is_plate_over_ground():
-            (name,) = self.sheets
+            (name,) = self.plate_surfaces
             least_plate_return = self._plate_fractions(name).reflected * self._backscatter_range(name)[0]
             darker = 1.0 - straight_both_ways - least_plate_return / np.maximum(largest, _TINY)
             excess = plate_return - (1.0 - straight_both_ways) * least
@@ -363,7 +376,7 @@ class Bounds:
         """
         if not self._is_plate_over_ground():
             return 1.0
-        (name,) = self.sheets
+        (name,) = self.plate_surfaces
         plate = self._plate_fractions(name)
         ground_return = self._first_order_range()[1] * plate.straight**2
         plate_return = plate.reflected * self._backscatter_range(name)[0]
@@ -536,13 +549,13 @@ class Bounds:
 
     # -- atmosphere ----------------------------------------------------------------------------------------
 
-    def extinction(self, bins: TimeBins, start_distance: float) -> float:
+    def atmospheric_extinction(self, bins: TimeBins, start_distance: float) -> float:
         """Bound on the change without the air, and so without its own return either.
 
         Extinction makes a scene darker by at most `air_loss`, the air's return makes it brighter by at most
-        `air_backscatter`. The two counteract, so that the larger of them bounds the change.
+        `atmospheric_backscatter`. The two counteract, so that the larger of them bounds the change.
         """
-        return max(self.air_loss(bins), self.air_backscatter(bins, start_distance))
+        return max(self.air_loss(bins), self.atmospheric_backscatter(bins, start_distance))
 
     def air_loss(self, bins: TimeBins) -> float:
         """Fraction of light lost in the air, 1 - T^2, on the longest path: to the height of the last bin."""
@@ -553,7 +566,7 @@ class Bounds:
         transmittance = air.two_way_transmittance(self.lidar.wavelength, lowest, *self._sensor_view())
         return 1.0 - float(np.min(concrete_array(transmittance)))
 
-    def air_backscatter(self, bins: TimeBins, start_distance: float) -> float:
+    def atmospheric_backscatter(self, bins: TimeBins, start_distance: float) -> float:
         """Bound on the change without the air's return A: A / (A + a), with the least return a of the scene.
 
         A is the sum over bins above the scene, a is F_min P^2 (1 - u) times the transmittance of the air.

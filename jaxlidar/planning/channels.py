@@ -54,8 +54,9 @@ def surface_names(scene: Scene) -> list[str]:
 def scene_optics(lidar: Lidar, scene: Scene) -> list[MaterialOptics]:
     """Return the optics of every material at the lidar's wavelengths: leaf, bark, ground, plates.
 
-    Where leaves transmit straight on, transmitted light stays on its ray and extinction is scaled by (1 - T):
-    a collision then reflects R / (1 - T), and nothing is transmitted.
+    Where leaves transmit straight on (regular transmittance, without scattering), transmitted light stays on
+    its ray and extinction is scaled by (1 - T): a collision then reflects R / (1 - T), and nothing is
+    transmitted.
     """
     wavelength, optics = lidar.wavelength, []
     canopy = scene.canopy
@@ -126,8 +127,9 @@ def largest_albedo(optics: list[MaterialOptics]) -> float:
 def reflection_probability(optics: list[MaterialOptics]) -> float:
     """Return the probability of sampling reflection rather than transmission: about the mean of R / (R + T).
 
-    Any value in (0, 1) is unbiased; this one gives both lobes weights near one. It is rounded to a tenth, so
-    that small changes of optics leave the random paths as they are.
+    Any value in (0, 1) is unbiased; this one gives both lobes weights near one. It is kept within 0.2 to 0.8,
+    so that no weight becomes large, and rounded to a tenth, so that small changes of optics leave the random
+    paths as they are.
     """
     fractions = []
     for material_optics in optics:

@@ -1,9 +1,9 @@
 """The two halves of what the tracer needs of a plan: a static configuration, and numbers that are traced.
 
-Compiled programs depend on everything in a `TraceConfig`: names, switches, sizes of loops and arrays. The
-numbers in `PathLimits` and `TimeBins` are arguments of these programs, so that another height or window
-compiles nothing. A `Plan` holds all three with Python numbers; a `jaxlidar.trace.device_scene.DeviceScene`
-holds the latter two with JAX arrays.
+Compiled programs depend on everything in a `TraceConfig`: names, switches, sizes of loops and arrays; and on
+the sizes of `TimeBins`. The numbers in `PathLimits`, and the start and the width of `TimeBins`, are arguments
+of these programs, so that another height or window compiles nothing. A `Plan` holds all three with Python
+numbers; a `jaxlidar.trace.device_scene.DeviceScene` holds the latter two with JAX arrays.
 """
 
 import dataclasses
@@ -103,7 +103,8 @@ class TraceConfig:
     - `max_ray_segments`: bound on the segments of a footprint ray (first order).
     - `max_faces`: bound on the voxel faces that a flight crosses.
     - `order_steps`: length of the loop over orders of scattering; at least `PathLimits.orders`.
-    - `deposits_per_flight`: points of each flight from which light returns to the sensor.
+    - `deposits_per_flight`: local estimates (next-event estimation) per free flight: points of each flight
+      from which light returns to the sensor.
     - `degree`, `first_degree`: largest number of scatterings and passages through plates in a history, for
       all orders and for order one.
     - `keeps_histories`: True if the response keeps scattering histories; otherwise optics are applied while
@@ -112,7 +113,7 @@ class TraceConfig:
 
     The footprint:
 
-    - `smooth_footprint`: True if a quadrature rule takes the place of the rays, as over planes.
+    - `uses_quadrature`: True if a quadrature rule takes the place of the rays, as over planes.
     - `random_footprint`: True if each batch shifts the rays at random.
     """
 
@@ -136,7 +137,7 @@ class TraceConfig:
     keeps_histories: bool
     n_rays: int
     n_photons: int
-    smooth_footprint: bool
+    uses_quadrature: bool
     random_footprint: bool
 
     @property
@@ -147,4 +148,4 @@ class TraceConfig:
     @property
     def is_random(self) -> bool:
         """True if anything is drawn at random."""
-        return self.follows_higher_orders or (self.random_footprint and not self.smooth_footprint)
+        return self.follows_higher_orders or (self.random_footprint and not self.uses_quadrature)

@@ -36,6 +36,12 @@ def effect_table(
 ) -> tuple[Effect, ...]:
     """Return a row for every effect.
 
+    1. For each effect: whether it is simulated and why, and the bound on the change from the scene as planned
+       to the scene without it. Where it is off, the bound is on the change from the scene with it.
+    2. Where multiple scattering is simulated: rows for the orders beyond the last, and for light after the
+       record.
+    3. A row for scattering within the atmosphere beyond order one, which is never simulated.
+
     **Arguments:**
 
     - `lidar`, `scene`: with all their effects. `off`: names of those that are switched off.
@@ -54,17 +60,19 @@ def effect_table(
 
     # Most rows have the same effects switched off, and share one set of bounds.
     @functools.cache
-    def bound_functions(off: tuple[str, ...]) -> dict[str, Callable[[], float]]:
-        return _bound_functions(Bounds(*without_effects(lidar, scene, off), orders), bins, start_distance)
+    def bound_functions(left_out: tuple[str, ...]) -> dict[str, Callable[[], float]]:
+        bounds = Bounds(*without_effects(lidar, scene, left_out), orders)
+        return _bound_functions(bounds, bins, start_distance)
 
-    def bound(name: str, off: tuple[str, ...]) -> float:
-        """Return a bound on the change without `name`, where `off` is left out, too; 1 if none is known."""
-        remaining = without_effects(lidar, scene, off)
+    def bound(name: str, left_out: tuple[str, ...]) -> float:
+        """Return a bound on the change without `name`, where `left_out` is, too; 1 if none is known."""
+        remaining = without_effects(lidar, scene, left_out)
         # A canopy without the hot spot can have it switched on: its bound is of interest too.
         has_effect = present_effects(*remaining) | {"hot spot": remaining[1].canopy is not None}
         if not has_effect.get(name, True):
             return 0.0
-        return bound_functions(off)[name]() if bounded else 1.0
+        # A scene with relief is not bounded: "relief" itself needs no function.
+        return bound_functions(left_out)[name]() if bounded else 1.0
 
     rows = []
     for name in EFFECT_NAMES:
@@ -120,8 +128,8 @@ def _bound_functions(bounds: Bounds, bins: TimeBins, start_distance: float) -> d
         "divergence": bounds.divergence,
         "field of view": bounds.field_of_view,
         "hot spot": bounds.hot_spot,
-        "atmospheric extinction": lambda: bounds.extinction(bins, start_distance),
-        "atmospheric backscatter": lambda: bounds.air_backscatter(bins, start_distance),
+        "atmospheric extinction": lambda: bounds.atmospheric_extinction(bins, start_distance),
+        "atmospheric backscatter": lambda: bounds.atmospheric_backscatter(bins, start_distance),
         "jitter": bounds.jitter,
         # The air scatters to the receiver, beyond first order, at most the light that it took from the beam.
         "scattering within the atmosphere": lambda: bounds.air_loss(bins),

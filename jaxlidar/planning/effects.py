@@ -1,8 +1,9 @@
 """The effects that a plan lists, and the removal of those that are switched off from a lidar and a scene.
 
 An effect is a material ("leaf"), a property ("hot spot") or a process ("multiple scattering") that can be
-left out of a simulation. Most are left out by simulating another lidar or scene, in which the effect is
-absent, so that the tracer needs no switches.
+left out of a simulation. "slope spread" is the slope-induced pulse broadening: a sloping ground spreads its
+return over the range of heights within the footprint. Most effects are left out by simulating another lidar
+or scene, in which the effect is absent, so that the tracer needs no switches.
 """
 
 import dataclasses
@@ -117,8 +118,8 @@ def without_relief(scene: Scene) -> Scene:
     return dataclasses.replace(scene, ground=ground.without_relief())
 
 
-def can_light_itself(scene: Scene) -> bool:
-    """Return True if scattered light can meet the scene again; that of a single plane cannot."""
+def allows_interreflection(scene: Scene) -> bool:
+    """Return True if scattered light can meet the scene again (interreflection); a single plane's cannot."""
     surfaces = scene.surfaces
     return scene.canopy is not None or len(surfaces) > 1 or any(s.shape.lights_itself for s in surfaces)
 
@@ -133,7 +134,7 @@ def present_effects(lidar: Lidar, scene: Scene) -> dict[str, bool]:
         "ground": scene.ground is not None,
         "relief": isinstance(ground, Terrain) and ground.relief,
         "slope spread": isinstance(ground, Ground) and concrete_number(ground.slope) > 0,
-        "multiple scattering": can_light_itself(scene),
+        "multiple scattering": allows_interreflection(scene),
         "specular return": any(isinstance(s.law, AbstractMirror) for s in scene.surfaces),
         "divergence": concrete_number(lidar.divergence) > 0,
         "field of view": lidar.field_of_view is not None,

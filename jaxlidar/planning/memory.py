@@ -22,6 +22,9 @@ _RESPONSE_TANGENTS = 2
 _STATE_TANGENTS = 4
 # Footprint rays that are marched at once.
 _RAYS_AT_ONCE = 512
+# Tables with a number for each column and voxel: slopes of leaf, of bark, and of the optical depth above, and
+# the columns' numbers (`jaxlidar.trace.extinction_slopes.ExtinctionSlopes`).
+_SLOPE_TABLES = 4
 # Bytes that compiling takes.
 _COMPILATION = 150e6
 # Optics may be applied while light is traced where a response with histories takes more bytes than this ...
@@ -60,9 +63,11 @@ def simulation_bytes(
     - `degree`: largest number of scatterings in a history.
     - `n_samples`: samples of the waveform.
     - `pulse_bins`: fine bins that the pulse spans.
-    - `n_traces`: traces of a response; one for each wavelength where leaves transmit straight on.
+    - `n_traces`: traces of a response; one for each wavelength where leaves transmit straight on, or where
+      optics are applied while light is traced.
     """
     response = response_bytes(config, bins, degree=degree, n_traces=n_traces)
+    # A matrix has at most `MAX_DENSE_PULSE` elements, a band `pulse_bins`: this is an upper bound for both.
     pulse = _number_bytes() * min(bins.count * n_samples, max(MAX_DENSE_PULSE, pulse_bins))
     return response * (_RESPONSE_COPIES * (os.cpu_count() or 1) + 1) + 2 * pulse + _COMPILATION
 
@@ -70,9 +75,10 @@ def simulation_bytes(
 def keeps_histories(with_histories: float, applied: float, limit: float) -> bool:
     """Return True if the response shall keep scattering histories, so that one trace serves all optics.
 
-    Otherwise optics are applied while light is traced. That is done where histories take more memory,
-    `with_histories` in place of `applied` bytes. Wavelengths, whose deposits are then made one by one, must
-    be few: at most `MAX_APPLIED_WAVELENGTHS`.
+    Otherwise optics are applied while light is traced. That is done where histories take more memory than
+    there is (or than `LARGE_RESPONSE`) and more than applied optics, `with_histories` in place of `applied`
+    bytes. Wavelengths, whose deposits are then made one by one, must be few: at most
+    `MAX_APPLIED_WAVELENGTHS`.
     """
     affordable = with_histories <= min(limit, LARGE_RESPONSE)
     return affordable or applied >= with_histories
@@ -100,7 +106,7 @@ def scored_bytes(config: TraceConfig, bins: TimeBins, *, cells: int, columns: in
     """
     rows = columns * wavelengths * bins.padded
     per_core = _RESPONSE_COPIES * rows + _RESPONSE_TANGENTS * columns * _photons_and_segments(config)
-    slopes = 4 * columns * cells
+    slopes = _SLOPE_TABLES * columns * cells
     return float(_number_bytes() * ((os.cpu_count() or 1) * per_core + slopes))
 
 

@@ -1,8 +1,9 @@
 """Number of orders of scattering to follow, and for how long, with estimates of what they leave out.
 
-Let q be the fraction of scattered light that is scattered again. The light of order n is about q^n, so that
-orders up to 1 + ln(rtol / 10) / ln q leave a tenth of the tolerance. In a slab of optical depth tau and
-albedo w, q tends to the decay per scattering of the slowest diffusion mode,
+Let q = p w be the fraction of scattered light that is scattered again, with the recollision probability p
+(Smolander and Stenberg 2005, Remote Sens. Environ. 94, 355) and the albedo w. The light of order n is about
+q^n, so that orders up to 1 + ln(rtol / 10) / ln q leave a tenth of the tolerance. In a slab of optical depth
+tau, q tends to the decay per scattering of the slowest diffusion mode,
 
     q = w (1 - (pi^2 / 3) / (tau + 1.42)^2),
 
@@ -20,7 +21,7 @@ import numpy as np
 from jaxlidar._checks import concrete, concrete_array
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar.planning.channels import MaterialOptics, largest_albedo
-from jaxlidar.planning.effects import can_light_itself
+from jaxlidar.planning.effects import allows_interreflection
 from jaxlidar.planning.size_buckets import size_bucket
 from jaxlidar.scenes.canopy import Canopy
 from jaxlidar.scenes.scene import Scene
@@ -34,8 +35,8 @@ MAX_ORDERS_OF_HISTORIES = 100
 MAX_ORDERS = 1000
 # The loop over orders is rounded up to a size bucket only while its histories are not more than this.
 MAX_BUCKETED_HISTORIES = 7000
-# The fraction of scattered light that is scattered again is taken to be at least this, times the albedo.
-MIN_REPEATED_FRACTION = 0.8
+# The recollision probability p is taken to be at least this.
+MIN_RECOLLISION = 0.8
 # Multiple scattering is recorded this long after the last first-order return, ns, at least and at most.
 TAIL = (10.0, 300.0)
 # It may be longer, up to this, where the ratio of successive orders is larger than this: light lingers in
@@ -50,14 +51,14 @@ class OrderChoice(NamedTuple):
 
     - `count`: the number. - `reason`: in words. - `beyond`: estimated fraction of the light in all later
       orders.
-    - `max_orders`: largest number for which the table of histories stays small enough.
+    - `affordable_orders`: largest number for which the table of histories stays small enough.
     - `needs_applied_optics`: True where so many orders would leave out more than the tolerance.
     """
 
     count: int
     reason: str
     beyond: float
-    max_orders: int
+    affordable_orders: int
     needs_applied_optics: bool = False
 
 
@@ -77,7 +78,7 @@ def order_steps(orders: int, n_plates: int, n_channels: int) -> int:
     return steps if histories <= MAX_BUCKETED_HISTORIES else orders
 
 
-def mean_depth(canopy: Canopy) -> float:
+def mean_optical_depth(canopy: Canopy) -> float:
     """Return the vertical optical depth of the canopy, the mean over its columns that are not empty.
 
     Infinite where extinction is being traced.
@@ -95,24 +96,27 @@ def mean_depth(canopy: Canopy) -> float:
     return float(occupied.mean()) if occupied.size else 0.0
 
 
-def repeated_fraction(scene: Scene, optics: list[MaterialOptics]) -> float:
-    """Estimate the fraction q of scattered light that is scattered again (see the module).
+def scattered_again(scene: Scene, optics: list[MaterialOptics]) -> float:
+    """Estimate the fraction q = p w of scattered light that is scattered again (see the module).
 
-    Ground that reflects makes the slab of the canopy deeper. Between two surfaces q is the root of the
-    product of their reflectances. It is never taken to be less than 0.8 times the largest albedo.
+    1. The least recollision probability times the largest albedo.
+    2. A canopy: the decay of the slowest diffusion mode; ground that reflects makes its slab deeper.
+    3. Between two surfaces: the root of the product of their reflectances.
+
+    q is the largest of these, and at most 1.
     """
-    return min(max(MIN_REPEATED_FRACTION * largest_albedo(optics), slowest_decay(scene, optics)), 1.0)
+    return min(max(MIN_RECOLLISION * largest_albedo(optics), slowest_decay(scene, optics)), 1.0)
 
 
 def slowest_decay(scene: Scene, optics: list[MaterialOptics]) -> float:
-    """Estimate the ratio of successive orders in the slowest mode, without the floor of `repeated_fraction`.
+    """Estimate the ratio of successive orders in the slowest mode: steps 2 and 3 of `scattered_again`.
 
     Zero for a canopy of an optical depth of at most one, which diffusion does not describe.
     """
     albedo, fraction = largest_albedo(optics), 0.0
     if scene.canopy is not None:
         ground = 0.0 if scene.ground is None else _largest_reflectance(optics, "ground")
-        depth = mean_depth(scene.canopy) * (1.0 + ground)
+        depth = mean_optical_depth(scene.canopy) * (1.0 + ground)
         if depth > 1.0:
             fraction = max(fraction, albedo * (1.0 - math.pi**2 / 3 / (depth + 1.42) ** 2))
     surfaces = [o.name for o in optics if o.name not in ("leaf", "bark")]
@@ -135,15 +139,15 @@ def choose_orders(
     max_orders: int | None,
     histories: bool | None = None,
 ) -> OrderChoice:
-    """Choose the number of orders to follow: `max_orders`, or as many as `rtol` needs.
+    """Choose the number of orders to follow: exactly `max_orders`, or (None) as many as `rtol` needs.
 
     With `histories` True these are at most as many as histories allow. With None optics are applied where
-    histories do not allow enough: by the slowest decay, as the floor of `repeated_fraction` is no reason to
+    histories do not allow enough: by the slowest decay, as the least recollision probability is no reason to
     trace again for every change of optics.
     """
-    if not can_light_itself(scene):
+    if not allows_interreflection(scene):
         return OrderChoice(1, "one plane cannot light itself", 0.0, 1)
-    n_plates, fraction, albedo = len(scene.plates), repeated_fraction(scene, optics), largest_albedo(optics)
+    n_plates, fraction, albedo = len(scene.plates), scattered_again(scene, optics), largest_albedo(optics)
     affordable = 2
     while affordable < MAX_ORDERS_OF_HISTORIES:
         n_histories = math.comb(max_degree(affordable + 1, n_plates) + n_channels, n_channels)
@@ -152,7 +156,7 @@ def choose_orders(
         affordable += 1
     if max_orders is None:
         is_known = all(concrete(o.reflectance) is not None for o in optics) and math.isfinite(
-            0.0 if scene.canopy is None else mean_depth(scene.canopy)
+            0.0 if scene.canopy is None else mean_optical_depth(scene.canopy)
         )
         is_short = slowest_decay(scene, optics) ** affordable > rtol
         applies_optics = histories is False or (histories is None and is_known and is_short)
@@ -182,14 +186,15 @@ def multiple_scattering_tail(
     """Estimate for how long, ns, after the last first-order return multiple scattering is worth recording.
 
     From one scattering to the next light takes the time of a mean free path in the canopy, or of the height
-    between first and last return. The light that is still in the scene falls by the repeated fraction each
-    time.
+    between first and last return. The light that is still in the scene falls by the factor q each time. The
+    tail is at least three times as long as order one lasts, but no more than 60 ns of that, and 10 to 300 ns
+    long in all.
     """
     usual_tail = min(max(3 * (last_return - first_return), TAIL[0]), 60.0)
-    fraction = repeated_fraction(scene, optics)
+    fraction = scattered_again(scene, optics)
     time_between = 0.5 * (last_return - first_return)
     if scene.canopy is not None:
-        depth = mean_depth(scene.canopy)
+        depth = mean_optical_depth(scene.canopy)
         size, shape = concrete_array(scene.canopy.voxels.voxel_size), scene.canopy.voxels.shape
         height = float(size[2]) * shape[2]
         time_between = height / max(depth, 0.5) / SPEED_OF_LIGHT if math.isfinite(depth) else time_between

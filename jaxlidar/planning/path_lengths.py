@@ -74,6 +74,10 @@ class PathLengths:
 
     Those of a survey are bounds for all of its shots.
 
+    1. Lines along the axis of each beam and around it (`footprint_rims`).
+    2. Distances from the reference plane at which the lines cross surfaces, and the map's top and bottom.
+    3. Their extremes are those of the paths; rays start before the nearest.
+
     - `first_path`, `last_path`: two-way path, m, of the first and the last return of order one, relative to
       that of the aim point.
     - `start_distance`: distance before the reference plane, m, at which all rays start.
@@ -111,12 +115,12 @@ class PathLengths:
         self.last_path = 2.0 * (farthest + float(np.max(distance - slant_range)))
         # A twentieth of the extent before the first surface: the plan also serves scenes a little higher.
         self.start_distance = 0.05 * (farthest - nearest) + 1e-3 - nearest
-        lowest = float(np.min(slant_range))
-        if self.start_distance >= lowest:
+        least_range = float(np.min(slant_range))
+        if self.start_distance >= least_range:
             altitude = concrete_number(lidar.altitude)
             raise ValueError(
                 f"altitude = {altitude:g} m: the scene reaches up to the sensor; "
-                f"admissible is more than {altitude + self.start_distance - lowest:g} m"
+                f"admissible is more than {altitude + self.start_distance - least_range:g} m"
             )
 
     @property
@@ -161,10 +165,10 @@ class PathLengths:
         # at least s (1 - sin(theta)) - height cos(theta).
         height, cosine = self.size[2] * self.shape[2], float(np.abs(self.rays[:, 2]).min())
         flight = (path + height * cosine) / max(1.0 - math.sqrt(1.0 - cosine * cosine), 0.1)
-        return float(min(flight, self.longest_march))
+        return float(min(flight, self.longest_affordable_flight))
 
     @property
-    def longest_march(self) -> float:
+    def longest_affordable_flight(self) -> float:
         """Length, m, of the longest flight through a periodic canopy that crosses at most `MAX_VOXELS`."""
         return float(max(MAX_VOXELS - self.shape[2], 1) / np.sum(1.0 / self.size[:2]))
 
@@ -201,6 +205,9 @@ def longest_segment(chord: float, bin_length: float, max_step: float | None) -> 
 def check_footprints_on_terrain(shots: Lidar | Survey, scene: Scene) -> None:
     """Refuse footprints that lie partly off open terrain. 3e-4 of a Gaussian beam may lie off it.
 
+    1. For all shots at once: the extent of the rim's rays between the terrain's lowest and highest points.
+    2. For shots where that crosses the border: the extent between the heights beneath their own rays.
+
     **Raises:** ValueError with the shot and both extents.
     """
     ground = scene.ground
@@ -215,8 +222,7 @@ def check_footprints_on_terrain(shots: Lidar | Survey, scene: Scene) -> None:
         rims.points + rims.rays * (z - rims.points[..., 2:]) / downward
         for z in (heights.min(), heights.max())
     ]
-    # First, for all shots at once: between the terrain's extreme heights all rays meet the ground. Only shots
-    # whose extent crosses the border are looked at closely, with the heights beneath them.
+    # Between the terrain's extreme heights all rays meet the ground.
     low, high = (f(np.concatenate(ends, axis=1)[..., :2], axis=1) + survey.position for f in (np.min, np.max))
     for i in np.flatnonzero(np.any((low < origin) | (high > end), axis=1)):
         position = survey.position[i]

@@ -62,7 +62,8 @@ from jaxlidar.scenes.surfaces import AbstractSheet
 DEFAULT_RTOL = 0.01
 # Fewer batches give no trustworthy standard error.
 MIN_BATCHES = 8
-# Points of each flight through a canopy from which light returns to the sensor.
+# Local estimates (next-event estimation) per free flight through a canopy: points from which light returns to
+# the sensor.
 DEPOSITS_PER_FLIGHT = 4
 
 
@@ -73,7 +74,7 @@ class PlanScope(NamedTuple):
     - `albedo`: largest reflectance + transmittance of any material and wavelength.
     - `pulse_feature`: scale, ns, of the finest feature of the pulse.
     - `automatic_orders`, `automatic_window`: True if the plan chose the orders, and the window.
-    - `max_orders`: largest number of orders that memory has room for.
+    - `affordable_orders`: largest number of orders that memory has room for.
     - `flat_terrain`: True if the terrain was found to be a plane, and is simulated as one.
     - `empty_materials`: which of "leaf" and "bark" were found to be zero everywhere, and left out.
     - `max_memory`: the user's limit in GB, or None.
@@ -85,7 +86,7 @@ class PlanScope(NamedTuple):
     pulse_feature: float
     automatic_orders: bool
     automatic_window: bool
-    max_orders: int
+    affordable_orders: int
     flat_terrain: bool
     empty_materials: tuple[str, ...]
     max_memory: float | None
@@ -195,7 +196,7 @@ class Plan:
             f"{self.n_samples} samples of {self.sample_interval:g} ns from {self.sample_start:g} ns, "
             f"{self.bins.count} fine bins of {self.bins.width:.3g} ns"
         )
-        if not self.config.smooth_footprint and self.n_rays > 1:
+        if not self.config.uses_quadrature and self.n_rays > 1:
             sizes += f", {self.n_rays} rays"
         if self.orders > 1:
             sizes += f", {self.n_photons} photons a batch, {self.orders} orders"
@@ -238,10 +239,10 @@ def plan(
     - `scene`: a `Scene`.
     - `rtol`: relative accuracy aimed at, in (0, 1); sets how many orders are worth following. Default None:
       0.01.
-    - `max_orders`: number of scatterings followed, at least 1. Default None: from `rtol` and the optics; with
-      histories, as many as their table has room for (some 16 to 29).
+    - `max_orders`: follow exactly this many scatterings, whatever `rtol` needs; at least 1. Default None:
+      from `rtol` and the optics; with histories, as many as their table has room for (some 16 to 29).
     - `max_step`: longest segment, m, of a footprint ray that order one deposits at once; positive. The result
-      does not depend on it. Default None: the ray's chord in a voxel, or 64 fine bins.
+      does not depend on it. Default None: the ray's chord in a voxel, or about 64 fine bins.
     - `n_photons`: photons per batch, at least 1. Default 8192.
     - `n_rays`: rays of the footprint per batch, at least 1; without effect over planes alone, where a
       quadrature rule takes their place. Default None: 4096 with one order or a fixed footprint; else 2048
@@ -328,11 +329,11 @@ def plan(
     jitter, interval = concrete_number(lidar.jitter), concrete_number(lidar.sampling_interval)
     # Jitter smooths the pulse: widths add in quadrature.
     pulse_feature = math.hypot(concrete_number(lidar.pulse.finest), jitter)
-    pulse_duration = math.hypot(concrete_number(lidar.pulse.std), jitter)
+    pulse_std = math.hypot(concrete_number(lidar.pulse.std), jitter)
     first_return = path_lengths.first_path / SPEED_OF_LIGHT
     last_return = path_lengths.last_path / SPEED_OF_LIGHT
     tail = multiple_scattering_tail(scene, optics, first_return, last_return) if orders > 1 else 0.0
-    target_width = target_bin_width(interval, pulse_feature, pulse_duration, bin_width)
+    target_width = target_bin_width(interval, pulse_feature, pulse_std, bin_width)
     bins, samples = bins_and_samples(lidar, scene, path_lengths, tail, window, target_width)
     bins_with_air = extend_to_air_return(bins, lidar, samples)
     bin_length = 0.5 * SPEED_OF_LIGHT * bins.width
@@ -345,7 +346,7 @@ def plan(
     # 4. Sizes of loops and batches.
     if n_rays is None:
         # The shorter the pulse, the fewer rays a sample is made of.
-        short_pulse = pulse_duration < interval
+        short_pulse = pulse_std < interval
         n_rays = 4096 if orders == 1 or footprint == "fixed" else 2048 if short_pulse else 1024
     # Rays march through steps that they do not need: buckets are at most a quarter apart where steps are few,
     # a sixteenth where they are many.
@@ -373,10 +374,11 @@ def plan(
         degree=max_degree(steps, n_plates),
         first_degree=1 + 2 * n_plates,
         keeps_histories=True,
-        # A beam without divergence is one ray.
+        # A beam whose divergence is switched off is one ray. One whose divergence is zero is not, as the plan
+        # also serves wider beams.
         n_rays=int(n_rays) if wide_beam else 1,
         n_photons=int(n_photons),
-        smooth_footprint=consists_of_planes(scene) and wide_beam,
+        uses_quadrature=consists_of_planes(scene) and wide_beam,
         random_footprint=footprint == "random" and wide_beam,
     )
     limits = PathLimits(
@@ -419,7 +421,7 @@ def plan(
     memory = memory_of(orders, keeps)
     check_memory(memory, limit)
     # Fits may ask for more orders later: the scope says how many there would be memory for.
-    possible_orders = range(max(order_choice.max_orders, orders), orders - 1, -1)
+    possible_orders = range(max(order_choice.affordable_orders, orders), orders - 1, -1)
     table = ()
     if describe:
         # With all effects: a row also says what an effect that is off would change.
@@ -456,7 +458,7 @@ def plan(
             pulse_feature=pulse_feature,
             automatic_orders=max_orders is None and "multiple scattering" not in off,
             automatic_window=window is None,
-            max_orders=next(n for n in possible_orders if memory_of(n, keeps) <= limit),
+            affordable_orders=next(n for n in possible_orders if memory_of(n, keeps) <= limit),
             flat_terrain=flat_terrain,
             empty_materials=empty_materials,
             max_memory=max_memory,

@@ -87,7 +87,7 @@ def _misfit_materials(plan: Plan, lidar: Lidar, scene: Scene) -> Iterator[str]:
         yield f"it has hotspot = {config.hotspot}; the canopy has not"
     if config.vertical and concrete_number(lidar.zenith) != 0:
         yield f"it is for a beam at nadir; zenith = {concrete_number(lidar.zenith):g} degrees"
-    if config.smooth_footprint and not consists_of_planes(scene):
+    if config.uses_quadrature and not consists_of_planes(scene):
         yield "it is for planes; the scene has more"
     # Orders that the user chose are followed whatever the albedo. A larger albedo may still need no more.
     albedo = largest_albedo(optics)

@@ -22,14 +22,14 @@ class SampleTimes(NamedTuple):
 
 
 def target_bin_width(
-    interval: float, pulse_feature: float, duration: float, bin_width: float | None
+    interval: float, pulse_feature: float, pulse_std: float, bin_width: float | None
 ) -> float:
     """Return the width of fine bins to aim at, ns: from the pulse's finest feature, or the user's."""
     if bin_width is None:
         # A quarter of the finest feature, as the B-spline that spreads returns over bins widens it. A pulse
         # without duration has no features.
         feature_width = max(0.25 * pulse_feature, 0.05 * interval)
-        return min(interval, feature_width if duration > 0 else 0.5 * interval)
+        return min(interval, feature_width if pulse_std > 0 else 0.5 * interval)
     if not 0 < bin_width < math.inf:
         raise ValueError(f"bin_width = {bin_width:g} is outside the admissible range (0, inf)")
     return bin_width
@@ -45,10 +45,17 @@ def bins_and_samples(
 ) -> tuple[TimeBins, SampleTimes]:
     """Return fine bins about `target` ns wide, a whole number of them per sample, and the samples.
 
+    1. A sample has a whole number of fine bins, none wider than `target`.
+    2. Returns come from the first of order one to the last and its tail.
+    3. Samples cover these and the pulse, or the window of the user. Of the latter returns are those that the
+       pulse carries into it.
+    4. Fine bins go from the first return that reaches a sample to the last, and three more at each end.
+
     `tail` is the time, ns, during which multiple scattering is recorded after the last return of first order.
     """
     interval = concrete_number(lidar.sampling_interval)
-    low, high = lidar.pulse.support(concrete_number(lidar.jitter))
+    pulse_start, pulse_end = lidar.pulse.support(concrete_number(lidar.jitter))
+    # The slack keeps a whole number from being rounded up.
     bins_per_sample = max(math.ceil(interval / target - 1e-6), 1)
     width = interval / bins_per_sample
     if lidar.receiver.window == "first return":
@@ -58,8 +65,8 @@ def bins_and_samples(
     last += tail
     if window is None:
         # Samples are at multiples of the interval, so that small changes of the scene do not shift them.
-        begin = math.floor((first + low) / interval) * interval
-        samples = math.ceil((last + high - begin) / interval) + 1
+        begin = math.floor((first + pulse_start) / interval) * interval
+        samples = math.ceil((last + pulse_end - begin) / interval) + 1
     else:
         begin, end = map(float, window)
         if not (math.isfinite(begin) and begin < end < math.inf):
@@ -67,11 +74,11 @@ def bins_and_samples(
         # The relative slack: an interval in single precision is off by its rounding.
         samples = math.floor((end - begin) / interval * (1 + 1e-6) + 1e-6) + 1
         # Returns that the pulse can carry into the window.
-        first = max(first, begin - interval - high)
-        last = max(begin + samples * interval - low, first + width)
+        first = max(first, begin - interval - pulse_end)
+        last = max(begin + samples * interval - pulse_start, first + width)
     if scene.atmosphere is not None and scene.atmosphere.lidar_ratio is not None:
         # Air scatters light back before the scene does, from the start of the record on.
-        first = min(first, begin - interval - high)
+        first = min(first, begin - interval - pulse_end)
     # Fine bins share edges with the samples, which are centred on their times. Three more bins at each end
     # take the B-spline and rounding.
     edge = begin - 0.5 * interval
@@ -84,8 +91,8 @@ def bins_and_samples(
 
 def extend_to_air_return(bins: TimeBins, lidar: Lidar, samples: SampleTimes) -> TimeBins:
     """Extend bins back to where the air's own return would begin, whether it is simulated or not."""
-    _, high = lidar.pulse.support(concrete_number(lidar.jitter))
+    _, pulse_end = lidar.pulse.support(concrete_number(lidar.jitter))
     # The same margin of three bins as above.
-    missing = math.ceil((bins.start - (samples.start - samples.interval - high)) / bins.width) + 3
+    missing = math.ceil((bins.start - (samples.start - samples.interval - pulse_end)) / bins.width) + 3
     added = max(missing, 0)
     return dataclasses.replace(bins, start=bins.start - added * bins.width, count=bins.count + added)

@@ -28,7 +28,8 @@ class Setup(eqx.Module):
     - `lidar`: a `Lidar`.
     - `scene`: a `Scene`.
     - `plan`: a `Plan`.
-    - `admissible`: 1; NaN where a traced value lies outside its range. Waveforms are multiplied by it.
+    - `admissible`: a factor by which waveforms are multiplied: 1, or NaN where a traced value lies outside
+      its range.
 
     **Example:**
 

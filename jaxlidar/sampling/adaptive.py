@@ -1,13 +1,14 @@
 """Adaptive sampling: add batches until the error of an estimate is below its tolerance.
 
-The error of a mean of n samples falls as n^-p: p = 1/2 for independent batches, p = 3/4 for randomised
-lattices in the plane, where the integrand jumps. From the error e of n samples, the tolerance r is met by
+The size n of an estimate is its number of batches, or of parts of a lattice. Its error falls as n^-p: p = 1/2
+for independent batches, p = 3/4 for randomised lattices in the plane, where the integrand jumps. From the
+error e at the size n, the tolerance r is met at the size
 
     n' = n (e / r)^(1 / p)
 
-samples (`StepRule`). Batches are added in rounds of growing size and the error is looked at between rounds
-alone (`StoppingRule`): an estimate that is examined after every batch stops too early too often, at the
-moment when its error happens to be underestimated (Glynn and Whitt 1992, Ann. Appl. Probab. 2, 180).
+(`StepRule`). The size grows in rounds, and the error is looked at between rounds alone (`StoppingRule`): an
+estimate that is examined after every batch stops too early too often, at the moment when its error happens to
+be underestimated (Glynn and Whitt 1992, Ann. Appl. Probab. 2, 180).
 
 There are two drivers with the same two rules: `sample_until` runs on the host, where rounds may be reported,
 limited in time, and interrupted; `sample_until_compiled` is a loop within a compiled program.
@@ -59,19 +60,19 @@ class EstimateErrors(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class StepRule:
-    """Number of samples of the next round.
+    """Size of an estimate after the next round.
 
-    - `order`: p, the power of the number of samples with which the error falls.
-    - `safety`: factor on the predicted number, since the present error is itself an estimate.
-    - `min_growth`, `max_growth`: bounds of the next number over the present one. Few batches know their error
+    - `convergence_rate`: p, the power of the size with which the error falls.
+    - `safety`: factor on the predicted size, since the present error is itself an estimate.
+    - `min_growth`, `max_growth`: bounds of the next size over the present one. Few batches know their error
       badly.
-    - `min_step`: fewest samples that are added. - `multiple`: numbers are multiples of this, to keep all
-      cores busy.
-    - `widened`: whether samples are batches whose standard error is widened by Student's t. More of them are
-      then better than n^-p.
+    - `min_step`: least increase of the size. - `multiple`: sizes are multiples of this, to keep all cores
+      busy.
+    - `widened`: True where the size is a number of batches whose standard error is widened by Student's t. It
+      then falls faster than n^-p, as the factor falls, too.
     """
 
-    order: float = 0.5
+    convergence_rate: float = 0.5
     safety: float = 1.0
     min_growth: float = 1.0
     max_growth: float = 4.0
@@ -80,22 +81,23 @@ class StepRule:
     widened: bool = False
 
     def next_size(self, size: Any, error: Any, tolerance: Any) -> Any:
-        """Return how many samples in all to have after the next round; on the host, an int.
+        """Return the size after the next round; on the host, an int.
 
-        `size`: number of samples so far; `error`, `tolerance`: present and largest admissible relative error.
+        `size`: the present one; `error`, `tolerance`: present and largest admissible relative error.
         """
         xp = namespace_of(error)
-        growth = (error / tolerance) ** (1.0 / self.order)
+        growth = (error / tolerance) ** (1.0 / self.convergence_rate)
         if self.widened:
             predicted = xp.ceil(size * xp.maximum(growth, 1.0))
-            growth *= (student_widening(predicted) / student_widening(size)) ** (1.0 / self.order)
+            widening_ratio = student_widening(predicted) / student_widening(size)
+            growth *= widening_ratio ** (1.0 / self.convergence_rate)
         growth = xp.clip(self.safety * growth, self.min_growth, self.max_growth)
         rounded = self.multiple * xp.ceil(size * growth / self.multiple)
         following = xp.maximum(rounded, size + self.min_step)
         return int(following) if xp is np else following.astype(jnp.int32)
 
     def largest_size(self, size: int) -> int:
-        """Return the largest number of samples that may follow `size`."""
+        """Return the size after a step of the largest growth."""
         return int(self.max_growth * size)
 
 
@@ -108,10 +110,10 @@ BATCH_STEPS = StepRule(safety=1.05, max_growth=4.0, min_step=4, multiple=4, wide
 class StoppingRule:
     """Limits of adaptive sampling.
 
-    - `rtol`: relative error to reach; None: take `max_size` samples, whatever the error.
+    - `rtol`: relative error to reach; None: go to `max_size`, whatever the error.
     - `atol`: stop also when the largest standard error is at most this.
-    - `min_size`: samples of the first round. - `max_size`: largest number of samples; None: no limit. A
-      tolerance that is out of reach ends there.
+    - `min_size`: size after the first round. - `max_size`: largest size; None: no limit. A tolerance that is
+      out of reach ends there.
     """
 
     rtol: Any
@@ -124,11 +126,11 @@ class StoppingRule:
         return (errors.relative > self.rtol) & (errors.largest > self.atol)
 
     def can_grow(self, size: Any) -> Any:
-        """Return True where there are fewer samples than the largest number."""
+        """Return True where the size is below the largest one."""
         return True if self.max_size is None else size < self.max_size
 
     def limited(self, size: Any) -> Any:
-        """Return a number of samples, at most the largest one."""
+        """Return a size, at most the largest one."""
         return size if self.max_size is None else namespace_of(size).minimum(size, self.max_size)
 
 
@@ -226,7 +228,8 @@ def sample_until_compiled(
     - `stop`, `step`: the rules.
     """
 
-    # Before the first round the error is not a number, in any comparison False: the size decides.
+    # Before the first round the error says nothing (0 or NaN, which is not above any tolerance): the size
+    # decides.
     def continues(state: tuple[jax.Array, Estimate]) -> jax.Array:
         size, estimate = state
         exceeds = stop.exceeds(EstimateErrors(relative_error(estimate)))

@@ -1,4 +1,4 @@
-"""Batches of photons: the programs that trace them, and the estimate that each gives of the errors.
+"""Batches of photons: the programs that trace them, and what is taken of each batch for standard errors.
 
 `make_batch_tracer` compiles these programs while other work is done: on a first call compilation takes most
 of the time. First and higher orders share nothing, and are compiled side by side; programs of the sums are
@@ -43,14 +43,15 @@ from jaxlidar.trace.response import (
 class BatchEstimate(NamedTuple):
     """The quantities of one batch from whose spread standard errors are computed.
 
-    - `samples`: apparent reflectance (see `jaxlidar.spectral.apply_optics.samples_and_budget`).
-    - `budget_names`, `budget`: rows of the energy budget, fractions of the pulse's energy.
+    - `samples`: apparent reflectance, in rows of wavelengths or of pivots (see
+      `jaxlidar.spectral.apply_optics.samples_and_budget`).
+    - `budget_names`, `budget`: terms of the energy budget, fractions of the pulse's energy.
     - `neglected`: apparent reflectance that orders beyond the last may add.
     """
 
-    samples: Float[Array, "summed samples"]
+    samples: Float[Array, "rows samples"]
     budget_names: tuple[str, ...]
-    budget: Float[Array, "rows wavelengths"]
+    budget: Float[Array, "terms wavelengths"]
     neglected: Float[Array, "wavelengths"]
 
 
@@ -104,19 +105,22 @@ class BatchTracer(NamedTuple):
 
     def batch_function(self, key: PRNGKeyArray) -> Callable[[int], tuple[Response, BatchEstimate]]:
         """Return the function that traces batch `n`; shared arguments are flattened once."""
-        common, higher = {"scene": self.scene, "key": key}, None
+        common = {"scene": self.scene, "key": key}
         if self.scene.config.follows_higher_orders:
-            first, higher = _compiled_first.bind(**common), _compiled_higher.bind(**common)
+            trace_first_order, trace_higher_orders = (
+                _compiled_first.bind(**common),
+                _compiled_higher.bind(**common),
+            )
         else:
-            first = _compiled_batch.bind(**common)
-        estimate = _compiled_estimate.bind(model=self.error_model)
+            trace_first_order, trace_higher_orders = _compiled_batch.bind(**common), None
+        make_estimate = _compiled_estimate.bind(model=self.error_model)
 
         def trace_batch(n: int) -> tuple[Response, BatchEstimate]:
             number = np.array(n, np.uint32)
-            response = first(number=number)
-            if higher is not None:
-                response = join_orders(response, higher(number=number))
-            return response, estimate(response=response)
+            response = trace_first_order(number=number)
+            if trace_higher_orders is not None:
+                response = join_orders(response, trace_higher_orders(number=number))
+            return response, make_estimate(response=response)
 
         return trace_batch
 

@@ -26,11 +26,13 @@ def namespace_of(value: Any) -> Any:
 
 
 def student_widening(batches: Any) -> Any:
-    """Factor that widens a standard error estimated from few batches, at least 2.
+    """Factor that widens a standard error estimated from few batches.
 
-    It is the quantile of Student's t at the probability of two standard errors of a normal distribution,
-    divided by two, from its expansion in 1 / (degrees of freedom) (Abramowitz and Stegun 26.7.5): to 0.1 %
-    for eight batches.
+    `batches`: number of batches, at least 2. It may be a fraction: it is the degrees of freedom plus one.
+
+    The factor is the quantile of Student's t at the probability of two standard errors of a normal
+    distribution, divided by two, from its expansion in 1 / (degrees of freedom) (Abramowitz and Stegun
+    26.7.5): to 0.1 % for eight batches.
     """
     # Floating point first: the third power of an int32 may overflow.
     x, freedom = 2.0, batches - 1.0
@@ -49,8 +51,8 @@ def relative_error(mean: Any, stderr: Any) -> Any:
     Samples below 1 % of the wavelength's peak do not count. Returns (*shots,).
     """
     xp = namespace_of(mean)
-    counts = mean > PEAK_FRACTION * xp.max(mean, axis=-1, keepdims=True)
+    is_significant = mean > PEAK_FRACTION * xp.max(mean, axis=-1, keepdims=True)
     # Guard the inside of the `where`: the mean may be zero where it does not count.
-    squares = xp.where(counts, (stderr / xp.where(counts, mean, 1.0)) ** 2, 0.0)
-    mean_squares = xp.sum(squares, axis=-1) / xp.maximum(xp.sum(counts, axis=-1), 1)
+    squares = xp.where(is_significant, (stderr / xp.where(is_significant, mean, 1.0)) ** 2, 0.0)
+    mean_squares = xp.sum(squares, axis=-1) / xp.maximum(xp.sum(is_significant, axis=-1), 1)
     return xp.max(xp.sqrt(mean_squares), axis=-1, initial=0.0)

@@ -53,8 +53,8 @@ class RunningMoments(NamedTuple):
         return RunningMoments(0, zeros(like), zeros(like), zeros(mean_only_like))
 
     @staticmethod
-    def compiled(like: Any, mean_only_like: Any = ()) -> "RunningMoments":
-        """Return moments of no batch for compiled programs, with the shapes and types of `like`."""
+    def in_program(like: Any, mean_only_like: Any = ()) -> "RunningMoments":
+        """Return moments of no batch within a compiled program, with the shapes and types of `like`."""
 
         def zeros(tree: Any) -> Any:
             return jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), tree)
@@ -84,11 +84,11 @@ class RunningMoments(NamedTuple):
         count = self.count + second.count
         fraction = second.count * (1.0 / count)
 
-        def mean(a: Any, b: Any) -> Any:
-            return a + fraction * (b - a)
+        def mean(mean_a: Any, mean_b: Any) -> Any:
+            return mean_a + fraction * (mean_b - mean_a)
 
-        def squares(s: Any, t: Any, a: Any, b: Any) -> Any:
-            return s + t + self.count * fraction * (b - a) ** 2
+        def squares(s_a: Any, s_b: Any, mean_a: Any, mean_b: Any) -> Any:
+            return s_a + s_b + self.count * fraction * (mean_b - mean_a) ** 2
 
         return RunningMoments(
             count,

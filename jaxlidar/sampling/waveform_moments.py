@@ -1,12 +1,12 @@
 """Moments of waveforms, at all wavelengths or at pivot wavelengths that stand for them.
 
-Waveforms at thousands of wavelengths follow linearly from those at some thirty pivot wavelengths: W_n = A^T
-P_n, with the matrix A of interpolation coefficients (pivots, wavelengths) of an interpolative decomposition.
-Batches are evaluated at the pivots alone. Their means are interpolated as they are. Standard errors are not
-linear, but the scaled deviations e_n of `jaxlidar.sampling.moments` are, so that the squared deviations at
-all wavelengths are
+Waveforms at thousands of wavelengths follow linearly from those at some thirty pivot wavelengths: batch n has
+W_n = C^T V_n, with the waveforms V_n at the pivots and the coefficients C (pivots, wavelengths) of an
+interpolative decomposition (`jaxlidar.spectral.pivot_wavelengths`). Batches are evaluated at the pivots
+alone. Their means are interpolated as they are. Standard errors are not linear, but the scaled deviations e_n
+of `jaxlidar.sampling.moments` are, so that the squared deviations at all wavelengths are
 
-    S = sum over n of (A^T e_n)^2
+    S = sum over n of (C^T e_n)^2
 """
 
 from typing import Any, NamedTuple
@@ -63,7 +63,7 @@ class WaveformMoments:
 class PivotMoments:
     """Moments of waveforms at all wavelengths, from batches at pivot wavelengths.
 
-    `interpolation`: the matrix A.
+    `interpolation`: the matrix C.
     """
 
     def __init__(self, interpolation: Float[ArrayLike, "pivots wavelengths"]):
@@ -95,9 +95,11 @@ class PivotMoments:
         """Return the errors of the batches so far, which are two or more."""
         assert self._pivot_means is not None
         count, dtype = self._pivot_means.count, self._interpolation.dtype
-        scale = student_widening(count) ** 2 / (count * (count - 1.0))
-        mean, scale = (jnp.asarray(a, dtype) for a in (self._pivot_means.mean_only, scale))
-        errors, squares = _compiled_errors(mean, self._block(), self._interpolation, self._squares, scale)
+        variance_scale = student_widening(count) ** 2 / (count * (count - 1.0))
+        mean, variance_scale = (jnp.asarray(a, dtype) for a in (self._pivot_means.mean_only, variance_scale))
+        errors, squares = _compiled_errors(
+            mean, self._block(), self._interpolation, self._squares, variance_scale
+        )
         # The block is among the squares now: to ask again, as after an interrupt, adds nothing twice.
         self._squares, self._deviations = squares, []
         return errors._replace(relative=float(errors.relative), largest=float(errors.largest))
@@ -137,14 +139,14 @@ def _errors(
     deviations: Float[Array, "block pivots samples"],
     interpolation: Float[Array, "pivots wavelengths"],
     squares: Float[Array, "wavelengths samples"] | None,
-    scale: Float[Array, ""],
+    variance_scale: Float[Array, ""],
 ) -> tuple[WaveformErrors, Float[Array, "wavelengths samples"]]:
     """Return the errors with one more block of deviations, and the squared deviations with it.
 
-    `scale`: squared standard error of the mean over squared deviations.
+    `variance_scale`: squared standard error of the mean over squared deviations.
     """
     squares = _add_squares(deviations, interpolation, squares)
-    mean, stderr = interpolation.T @ mean, jnp.sqrt(scale * squares)
+    mean, stderr = interpolation.T @ mean, jnp.sqrt(variance_scale * squares)
     errors = WaveformErrors(jnp.sum(mean, axis=1), stderr, relative_error(mean, stderr), jnp.max(stderr))
     return errors, squares
 

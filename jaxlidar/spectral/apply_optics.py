@@ -1,10 +1,11 @@
 r"""From response to samples: optics of every history, the atmosphere, the pulse, and the energy budget.
 
-    samples[w, s] = sum over fine bins b of  pulse[b, s] * T_air[w, b] *
+    samples[w, s] = sum over fine bins b of  pulse[b, s] * transmittance[w, b] *
                     sum over histories h of  response[b, h] * prod_c optics[c, w] ** exponent[h, c]
 
-Both sums are matrix products. The energy budget applies the same optics to the weights that arrived at each
-material, went on from it, escaped, came after the record, or remained unfollowed.
+with the two-way transmittance of the atmosphere. Both sums are matrix products. The energy budget applies the
+same optics to the weights that arrived at each material, went on from it, escaped, came after the record, or
+remained unfollowed.
 """
 
 import dataclasses
@@ -20,7 +21,7 @@ from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._programs import Program
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.planning.channels import channel_optics
-from jaxlidar.planning.effects import can_light_itself
+from jaxlidar.planning.effects import allows_interreflection
 from jaxlidar.planning.setup import Setup
 from jaxlidar.planning.size_buckets import size_bucket
 from jaxlidar.scenes.atmosphere import Atmosphere
@@ -44,7 +45,7 @@ class WaveformModel(eqx.Module):
     - `convolution`: pulse and digitiser. `time`: of the samples, ns.
     - `transmittance`: two-way, of the atmosphere, in fine bins. `air_return`: its own return, in samples.
       None where there is no atmosphere, or no return from it.
-    - `admissible`: see `Setup`.
+    - `admissible`: a factor, 1 or NaN; see `Setup`.
     - `lidar`: the lidar, with its spectrum.
     - `materials`: their names. `first_degree`, `degree`: of histories.
     - `one_order`: True if one order is followed. `can_scatter_again`: True if scattered light can meet the
@@ -98,26 +99,27 @@ class WaveformModel(eqx.Module):
 
     def sum_histories(
         self, weights: Float[Array, "traces *rest histories columns"], table: Histories
-    ) -> Float[Array, "*rest summed columns"]:
-        """Sum weights with their optics over histories, at all wavelengths or at the pivots."""
+    ) -> Float[Array, "*rest rows columns"]:
+        """Sum weights with their optics over histories, in rows of wavelengths or of pivots."""
         optics = self.optics if self.pivots is None else self.optics[:, self.pivots.indices]
         return apply_optics(weights, table, optics)
 
     def interpolate(
-        self, sums: Float[Array, "*rest summed columns"]
+        self, sums: Float[Array, "*rest rows columns"]
     ) -> Float[Array, "*rest wavelengths columns"]:
         """Return the results of `sum_histories` at all wavelengths."""
         return sums if self.pivots is None else self.pivots.interpolate(sums)
 
     def padded_to(self, n_wavelengths: int) -> "WaveformModel":
         """Return the model with copies of the last wavelength, so that there are `n_wavelengths`."""
-        missing = n_wavelengths - self.lidar.wavelength.size
+        n_original = self.lidar.wavelength.size
+        missing = n_wavelengths - n_original
         if missing <= 0:
             return self
 
         def pad(a: Array, axis: int = 0) -> Array:
             # One number that serves all wavelengths stays one.
-            if a.ndim == 0 or a.shape[axis] == 1 < n_wavelengths - missing:
+            if a.ndim == 0 or (a.shape[axis] == 1 and n_original > 1):
                 return a
             last = np.repeat(np.take(np.asarray(a), [-1], axis), missing, axis)
             return jnp.asarray(np.concatenate([a, last], axis))
@@ -156,6 +158,12 @@ def make_padded_waveform_model(setup: Setup) -> WaveformModel:
 
 
 def _make_model(setup: Setup, n_samples: int, degree: int) -> WaveformModel:
+    """Make the waveform model of a setup.
+
+    1. The convolution with the pulse.
+    2. Where there is an atmosphere: its transmittance in fine bins, and its own return in samples.
+    3. The optics of all channels, and the degrees of histories: 0 where optics are applied by the tracer.
+    """
     lidar, plan, atmosphere = setup.lidar, setup.plan, setup.scene.atmosphere
     convolution = pulse_convolution(lidar, plan, n_samples)
     transmittance = air_return = None
@@ -179,11 +187,11 @@ def _make_model(setup: Setup, n_samples: int, degree: int) -> WaveformModel:
         first_degree=plan.config.first_degree if plan.config.keeps_histories else 0,
         degree=degree,
         one_order=plan.orders == 1,
-        can_scatter_again=can_light_itself(setup.scene),
+        can_scatter_again=allows_interreflection(setup.scene),
     )
 
 
-def _apply_atmosphere(
+def _atmosphere_in_bins(
     atmosphere: Atmosphere,
     lidar: Lidar,
     time: Float[Array, "fine"],
@@ -205,7 +213,7 @@ def _apply_atmosphere(
     return transmittance, jnp.where((heights > top)[None, :], per_metre * bin_length, 0.0)
 
 
-_compiled_atmosphere = Program(_apply_atmosphere)
+_compiled_atmosphere = Program(_atmosphere_in_bins)
 
 
 def height_of(lidar: Lidar, time: Float[Array, "bins"]) -> Float[Array, "bins"]:
@@ -242,8 +250,8 @@ def response_samples(
 
 def _samples_without_air(
     weights: Float[Array, "traces *rest histories bins"], table: Histories, model: WaveformModel
-) -> Float[Array, "*rest summed samples"]:
-    """Return samples without atmosphere, at all wavelengths or at the pivots.
+) -> Float[Array, "*rest rows samples"]:
+    """Return samples without atmosphere, in rows of wavelengths or of pivots.
 
     Pulse and optics commute: the order with fewer operations is taken.
     """
@@ -317,7 +325,8 @@ class ResponseSums(NamedTuple):
     """Sums of a response with optics applied, (wavelengths,) each.
 
     - `returned`, `lost`: apparent reflectance within all fine bins, and before and after them.
-    - `absorbed`: by each material; (materials, wavelengths). - `escaped`, `late`, `remaining`: energy.
+    - `absorbed`: by each material; (materials, wavelengths). - `escaped`, `late`, `remaining`: energy that
+      the budget lists as "escaped", "after the window" and "unfollowed".
     """
 
     returned: Float[Array, "wavelengths"]
@@ -329,7 +338,13 @@ class ResponseSums(NamedTuple):
 
 
 def sum_response(response: Response, model: WaveformModel) -> ResponseSums:
-    """Sum a response over bins. A material absorbs the energy that arrived there less that which departed."""
+    """Sum a response over bins, with optics applied.
+
+    1. Order one has a table of histories of its own: what it returns, within all fine bins and outside.
+    2. All else in one product: escaped, late and remaining energy, and what each material absorbs, which is
+       the energy that arrived there less that which departed.
+    3. What higher orders return, if they are followed, is added to order one.
+    """
     first_table = model.first_histories
     table = first_table if response.higher is None else model.histories
 
@@ -343,13 +358,14 @@ def sum_response(response: Response, model: WaveformModel) -> ResponseSums:
     rows = [response.escaped, response.late, response.remaining]
     if response.higher is not None and response.higher_outside is not None:
         rows += [jnp.sum(response.higher, axis=(1, 3)), jnp.sum(response.higher_outside, axis=1)]
-    n_rows = len(rows)
-    absorbed = response.arrived - response.departed
-    materials = [absorbed[:, m] for m in range(absorbed.shape[1])]
-    totals = sums([*rows, *materials], table)
-    if n_rows > 3:
-        returned, lost = returned + totals[3], lost + totals[4]
-    return ResponseSums(returned, lost, totals[n_rows:], totals[0], totals[1], totals[2])
+    absorbed_weights = response.arrived - response.departed
+    materials = [absorbed_weights[:, m] for m in range(absorbed_weights.shape[1])]
+    totals, n_rows = sums([*rows, *materials], table), len(rows)
+    (escaped, late, remaining), higher, absorbed = totals[:3], totals[3:n_rows], totals[n_rows:]
+    if len(higher):
+        higher_returned, higher_lost = higher
+        returned, lost = returned + higher_returned, lost + higher_lost
+    return ResponseSums(returned, lost, absorbed, escaped, late, remaining)
 
 
 def budget_terms(response: Response, model: WaveformModel) -> BudgetTerms:
@@ -366,13 +382,16 @@ def budget_of_sums(sums: ResponseSums, model: WaveformModel) -> BudgetTerms:
         "after the window": sums.late,
         "unfollowed": sums.remaining,
     }
-    # Apparent reflectance is energy per pi steradian of the aperture.
+    # The energy into the aperture is the apparent reflectance times the aperture's solid angle over pi, here
+    # at the range of the reference plane; `energy_per_reflectance` has that of each sample.
     returned = sums.returned * lidar.aperture_area / (jnp.pi * lidar.range_to_reference**2)
     # Light that returns is part of that which escaped or, where only one order was followed, would have.
     source = "unfollowed" if model.one_order and model.can_scatter_again else "escaped"
     returned = jnp.minimum(returned, budget[source])
     budget = {"returned": returned, **budget, source: budget[source] - returned}
-    # Unfollowed light is taken to return as much per energy as the light that escaped, within a factor of 4.
+    # Unfollowed light is taken to return as much per energy as the light that escaped, but an apparent
+    # reflectance of 1 per unit of energy at least, and 4 at most. Where one order is followed no scattered
+    # light has escaped to compare with, and the user left higher orders out: the estimate is zero.
     return_per_energy = sums.returned / jnp.maximum(budget["escaped"], 1e-6)
     unfollowed = jnp.zeros_like(sums.returned) if model.one_order else budget["unfollowed"]
     return BudgetTerms(budget, unfollowed * jnp.clip(return_per_energy, 1.0, 4.0), sums.lost)
@@ -380,10 +399,10 @@ def budget_of_sums(sums: ResponseSums, model: WaveformModel) -> BudgetTerms:
 
 def samples_and_budget(
     response: Response, model: WaveformModel
-) -> tuple[Float[Array, "summed samples"], BudgetTerms]:
+) -> tuple[Float[Array, "rows samples"], BudgetTerms]:
     """Return the quantities of a batch whose standard errors are estimated.
 
-    Samples are at the pivots of `WaveformModel.sample_pivots`, where there are any.
+    Samples are in rows of wavelengths, or of the pivots `WaveformModel.sample_pivots` where there are any.
     """
     to_samples = response_samples if model.sample_pivots is None else _samples_without_air
     return _sum_orders(response, model, to_samples), budget_terms(response, model)

@@ -4,11 +4,11 @@ What light collects along its path is a polynomial in the optics of the material
 with wavelength. The matrix A of such polynomials (rows) at all wavelengths (columns) has low rank, and an
 interpolative decomposition (Cheng, Gimbutas, Martinsson and Rokhlin 2005, SIAM J. Sci. Comput. 26, 1389)
 
-    A ~ A[:, pivots] P
+    A ~ A[:, pivots] C
 
 gives every column from few pivot columns: some thirty for 2,101 wavelengths. A is sampled by random
-polynomials up to the largest degree. With the pivoted QR decomposition A[:, order] = Q [R11 R12], P = [I,
-R11^-1 R12].
+polynomials up to the largest degree. With the pivoted QR decomposition A[:, order] = Q [R11 R12], C[:, order]
+= [I, R11^-1 R12].
 """
 
 from typing import final
@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, Int
 
 # Random polynomials that sample the matrix.
 _N_POLYNOMIALS = 64
-# Norm of the residual of any column at which the decomposition stops, relative to the largest column.
+# Norm of the residual of any column, of the norm 1, at which the decomposition stops.
 _RELATIVE_RESIDUAL = 1e-5
 # Programs are compiled for multiples of so many pivots.
 _PIVOT_BUCKET = 16
@@ -28,7 +28,7 @@ _PIVOT_BUCKET = 16
 
 @final
 class PivotWavelengths(eqx.Module):
-    """Pivot wavelengths, and the coefficients P of an interpolative decomposition. Made by `find_pivots`.
+    """Pivot wavelengths, and the coefficients C of an interpolative decomposition. Made by `find_pivots`.
 
     - `indices`: numbers of the pivot wavelengths. - `coefficients`: of each in the spectrum at all
       wavelengths.
@@ -45,12 +45,19 @@ class PivotWavelengths(eqx.Module):
 
 
 def find_pivots(optics: Float[Array, "channels wavelengths"], degree: int) -> PivotWavelengths | None:
-    """Find pivots for polynomials of up to `degree` in the optics; None where hardly fewer would do.
+    """Find pivots for polynomials of up to `degree` in the optics.
 
-    Pivots beyond those that are needed fill a bucket, with coefficients of zero.
+    None where hardly fewer wavelengths would do, or where 64 polynomials do not resolve the rank.
+
+    1. Random polynomials sample the rows of A.
+    2. Rows are scaled to the largest value 1, then columns to the norm 1, so that the residual of each is
+       judged relative to itself.
+    3. Pivoted QR; pivots beyond those that are needed fill a bucket, with coefficients of zero.
+    4. Coefficients of scaled columns, R11^-1 R, by back substitution.
+    5. Coefficients of A's own columns: times the norm of the column over that of the pivot.
     """
     values, random = np.asarray(optics, float), np.random.default_rng(0)
-    # Powers of random affine forms span all polynomials, and are numbers of one size.
+    # Powers of random affine forms span all polynomials and, unlike monomials, are of similar magnitude.
     weights = random.uniform(-1, 1, (_N_POLYNOMIALS, len(values)))
     constants = random.uniform(-1, 1, (_N_POLYNOMIALS, 1))
     forms = np.einsum("tl,lw->tw", weights, values) + constants

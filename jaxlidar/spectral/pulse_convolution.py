@@ -7,10 +7,10 @@ A return in the fine bin at t_i adds to the sample at t_s, of the width D, the f
 which depends on t_s - t_i alone. It is applied as a matrix of fine bins and samples where that is small, else
 as a strided convolution with a band.
 
-Deposits were spread by a kernel of the second moment v (`jaxlidar.trace.deposit`). It is taken out again to
-second order, F - v/2 F'', by fluxes that are limited so that no fraction becomes negative (as those of Boris
-and Book 1973, J. Comput. Phys. 11, 38). Where the pulse is smooth on the scale of a fine bin, the error left
-is of fourth order in the bin's width.
+Deposits were spread by a kernel (`jaxlidar.trace.deposit`) of the second moment v = 1/4 bin^2
+(`KERNEL_VARIANCE`). It is taken out again to second order, F - v/2 F'', by fluxes that are limited so that no
+fraction becomes negative (as those of Boris and Book 1973, J. Comput. Phys. 11, 38). Where the pulse is
+smooth on the scale of a fine bin, the error left is of fourth order in the bin's width.
 """
 
 import math
@@ -86,16 +86,17 @@ def pulse_convolution(lidar: Lidar, plan: Plan, n_samples: int | None = None) ->
     """
     # Offsets between a sample's centre and a fine bin's, in fine bins, from the last bin to the first.
     bins, bins_per_sample, n_samples = plan.bins, plan.bins_per_sample, n_samples or plan.n_samples
-    shift = (plan.sample_start - bins.start) / bins.width
+    # That of the first sample's centre from the first bin's.
+    first_sample = (plan.sample_start - bins.start) / bins.width
     low, high = -(bins.count - 1), (n_samples - 1) * bins_per_sample
     if bins.count * n_samples > MAX_DENSE_PULSE:
         # A band as wide as the pulse.
         half = 0.5 * plan.sample_interval
-        low = max(low, math.floor((plan.pulse_support[0] - half) / bins.width - shift) - 2)
-        high = min(high, math.ceil((plan.pulse_support[1] + half) / bins.width - shift) + 2)
-    # The edges of samples lie a whole number of fine bins apart.
-    number = np.arange(low - 1, high + bins_per_sample + 2) - 0.5 * bins_per_sample
-    edges = jnp.asarray((number + shift) * bins.width)
+        low = max(low, math.floor((plan.pulse_support[0] - half) / bins.width - first_sample) - 2)
+        high = min(high, math.ceil((plan.pulse_support[1] + half) / bins.width - first_sample) + 2)
+    # The edges of samples lie a whole number of fine bins apart; one more at each end serves the fluxes.
+    edge_offset = np.arange(low - 1, high + bins_per_sample + 2) - 0.5 * bins_per_sample
+    edges = jnp.asarray((edge_offset + first_sample) * bins.width)
     fractions = _compiled_fractions(lidar.pulse, lidar.jitter, edges, KERNEL_VARIANCE, bins_per_sample)
     return PulseConvolution(fractions, low, bins.count, n_samples, bins_per_sample)
 

@@ -32,7 +32,7 @@ from jaxlidar.spectral.apply_optics import (
     make_waveform_model,
     total_samples,
 )
-from jaxlidar.spectral.labels import Truth
+from jaxlidar.spectral.truth_class import Truth
 from jaxlidar.trace.response import Response
 
 
@@ -41,26 +41,27 @@ from jaxlidar.trace.response import Response
 class Waveform(eqx.Module):
     """A simulated waveform: apparent reflectance and received energy by wavelength and sample.
 
-    - `time`: (bins,) ns, centres of the samples. Zero is the two-way travel time of the reference plane.
-    - `height`: (bins,) m, the height from which light of order one arrives at that time.
-    - `reflectance`: (wavelengths, bins) apparent reflectance per sample, with the transmittance of the
-      atmosphere; its sum over bins is that of the target.
-    - `energy`: (wavelengths, bins) J that the detector registers per sample.
-    - `stderr`: (wavelengths, bins) one standard error of `reflectance`; zero where nothing was random. The
+    - `time`: (samples,) ns, centres of the samples. Zero is the two-way travel time of the reference plane.
+    - `height`: (samples,) m, the height from which light of order one arrives at that time.
+    - `reflectance`: (wavelengths, samples) apparent reflectance per sample, with the transmittance of the
+      atmosphere; its sum over samples is that of the target.
+    - `energy`: (wavelengths, samples) J that the detector registers per sample.
+    - `stderr`: (wavelengths, samples) one standard error of `reflectance`; zero where nothing was random. The
       expected value lies within two of them in 95 % of cases. For more than 16 wavelengths they are computed
       at pivot wavelengths and interpolated, to three digits of the wavelength's largest.
     - `components`: dict of arrays like `reflectance`: by material of the last scattering ("ground", "leaf",
       "bark", "plate", "air"), and by order ("first", "higher").
     - `neglected`: (wavelengths,) apparent reflectance that orders beyond the last could still add.
     - `energy_budget`: dict of (wavelengths,) fractions of the emitted energy, before the atmosphere:
-      "returned" into the aperture, "escaped", "absorbed by ...", "after the window", "unfollowed" beyond the
-      last order.
+      "returned" into the aperture (from the range of the reference plane), "escaped", "absorbed by ...",
+      "after the window", "unfollowed" beyond the last order.
     - `energy_budget_stderr`: dict like `energy_budget`, one standard error each; zero where nothing was
       random.
-    - `lost`: (wavelengths,) apparent reflectance that arrives before or after all fine bins of the plan: late
-      multiple scattering, or, where the geometry was traced by a JAX transformation, what a plan does not
-      cover.
-    - `recorded`: (wavelengths, bins) J that the receiver records of `energy`, without noise: background
+    - `lost`: (wavelengths,) apparent reflectance, of light that reaches the sensor, that arrives before or
+      after all fine bins of the plan: late multiple scattering, or, where the geometry was traced by a JAX
+      transformation, what a plan does not cover. Light that is still in the scene at the end of the record is
+      "after the window" in `energy_budget` instead.
+    - `recorded`: (wavelengths, samples) J that the receiver records of `energy`, without noise: background
       added, saturated, cut at the detection threshold, quantised. `jaxlidar.record` draws noise as well.
     - `wavelength`: (wavelengths,) nm, the lidar's.
     - `info`: dict: "photons", "batches", "seconds" spent, "error" reached, and why the simulation "stopped".
@@ -78,17 +79,17 @@ class Waveform(eqx.Module):
     0.60
     """
 
-    time: Float[Array, "bins"]
-    height: Float[Array, "bins"]
-    reflectance: Float[Array, "wavelengths bins"]
-    energy: Float[Array, "wavelengths bins"]
-    stderr: Float[Array, "wavelengths bins"]
-    components: dict[str, Float[Array, "wavelengths bins"]]
+    time: Float[Array, "samples"]
+    height: Float[Array, "samples"]
+    reflectance: Float[Array, "wavelengths samples"]
+    energy: Float[Array, "wavelengths samples"]
+    stderr: Float[Array, "wavelengths samples"]
+    components: dict[str, Float[Array, "wavelengths samples"]]
     neglected: Float[Array, "wavelengths"]
     energy_budget: dict[str, Float[Array, "wavelengths"]]
     energy_budget_stderr: dict[str, Float[Array, "wavelengths"]]
     lost: Float[Array, "wavelengths"]
-    recorded: Float[Array, "wavelengths bins"]
+    recorded: Float[Array, "wavelengths samples"]
     wavelength: Float[Array, "wavelengths"]
     info: dict = eqx.field(static=True)
     truth: Truth | None = None
@@ -174,7 +175,7 @@ def waveform_of(
     response: Response,
     setup: Setup,
     *,
-    stderr: Float[Array, "wavelengths bins"] | None = None,
+    stderr: Float[Array, "wavelengths samples"] | None = None,
     energy_budget_stderr: dict[str, Float[Array, "wavelengths"]] | None = None,
     info: dict | None = None,
 ) -> Waveform:
@@ -245,12 +246,14 @@ def remove_padding(wave: Waveform, n_wavelengths: int, n_samples: int) -> Wavefo
     return jax.device_put(eqx.tree_at(lambda w: (w.time, w.height), trimmed, axes))
 
 
-def energy_per_reflectance(lidar: Lidar, time: Float[Array, "bins"]) -> Float[Array, "wavelengths bins"]:
+def energy_per_reflectance(
+    lidar: Lidar, time: Float[Array, "samples"]
+) -> Float[Array, "wavelengths samples"]:
     """Return the energy, J, per apparent reflectance at the range of each sample."""
     distance = lidar.range_to_reference + 0.5 * SPEED_OF_LIGHT * time
     # A window may begin before the pulse is sent.
-    solid_angle = lidar.aperture_area / (jnp.pi * jnp.maximum(distance, 1e-3) ** 2)
-    return jnp.outer(lidar.energy_per_wavelength * lidar.efficiency_per_wavelength, solid_angle)
+    solid_angle_over_pi = lidar.aperture_area / (jnp.pi * jnp.maximum(distance, 1e-3) ** 2)
+    return jnp.outer(lidar.energy_per_wavelength * lidar.efficiency_per_wavelength, solid_angle_over_pi)
 
 
 def open_at_first_return(wave: Waveform, lidar: Lidar) -> Waveform:
@@ -264,10 +267,9 @@ def open_at_first_return(wave: Waveform, lidar: Lidar) -> Waveform:
     threshold = jnp.maximum(lidar.receiver.detection_threshold, 1e-3 * jnp.max(energy))
     is_open = jnp.cumsum(jnp.any(energy > threshold, axis=0)) > 0
     arrays = [wave.reflectance, energy, wave.stderr, *wave.components.values()]
-    # The energy alone opens the window: all arrays are zero before it does.
+    # The energy alone opens the window: all arrays are zero before it does, and exceed zero from there on.
     opened = jnp.stack([jnp.where(is_open[None, :], a, 0.0) for a in arrays])
-    interval = float(lidar.sampling_interval)
-    time, rows = first_return_window(wave.time, opened, interval, jnp.minimum(threshold, 0.0))
+    time, rows = first_return_window(wave.time, opened, float(lidar.sampling_interval), threshold=0.0)
     return dataclasses.replace(
         wave,
         time=time,

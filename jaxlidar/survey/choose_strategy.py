@@ -21,24 +21,26 @@ from jaxlidar.survey.shared_illumination import SharedIlluminationStrategy
 from jaxlidar.survey.strategy import AbstractStrategy
 from jaxlidar.survey.view_geometry import ViewGeometry
 
-# Fractions of the tolerance that parallel light may take, and the grid of nodes; the finest grid may take
-# more.
-_PARALLEL_LIGHT, _GRID, _FINEST_GRID = 0.5, 0.2, 0.5
+# Shared light is tallied by node or by shot (`shared_illumination`). Constants of the latter are named
+# SHOT_TALLIES.
+#
+# Largest errors, as fractions of rtol, by parallel light and by the grid of nodes; the finest grid may have a
+# larger one.
+_PARALLEL_LIGHT_OF_RTOL, _GRID_OF_RTOL, _FINEST_GRID_OF_RTOL = 0.5, 0.2, 0.5
 # Where responses are tallied by shot, the grid serves only absorption and escape: its error may be as large
-# as this.
-_GRID_BY_SHOT = 0.01
-# Coefficients below this fraction of the tolerance, of the largest, do not count. They lie at the rim of the
-# footprint; without them its energy changes by less than 0.1 % where the tolerance is 10 %.
-_FAINT = 0.01
-# A batch of a shot traced alone has so many times the photons and the rays of a footprint that shares light,
-# for which batches are many and small. A ray costs about as much as a photon, and even half the rays add
-# little to the error.
-_FEWER_PHOTONS, _FEWER_RAYS = 4.0, 2.0
-# By shot, a batch costs something for every shot, and photons cost more: batches are as large as those of one
-# shot.
-_FEWER_PHOTONS_BY_SHOT = 1.0
-# Sharing pays where so many footprints overlap in the mean, by node and by shot, and shots are so many.
-_MIN_OVERLAP, _MIN_OVERLAP_BY_SHOT, _MIN_SHOTS = 1.3, 2.0, 4
+# as this, whatever rtol.
+_GRID_OF_SHOT_TALLIES = 0.01
+# Coefficients below this fraction of rtol, relative to the largest coefficient, do not count. They lie at the
+# rim of the footprint; without them its energy changes by less than 0.1 % where rtol is 0.1.
+_FAINT_OF_RTOL = 0.01
+# Batches of a footprint that shares light are many and small: they have so many times fewer photons and rays
+# than those of a shot traced alone. Of rays even half add little to the error.
+_PHOTONS_DIVISOR, _RAYS_DIVISOR = 4.0, 2.0
+# Tallied by shot, a batch costs something for every shot, and photons cost more: batches have as many photons
+# as those of a shot traced alone.
+_PHOTONS_DIVISOR_OF_SHOT_TALLIES = 1.0
+# Sharing pays where so many footprints overlap in the mean, by either tally, and shots are so many.
+_MIN_OVERLAP, _MIN_OVERLAP_OF_SHOT_TALLIES, _MIN_SHOTS = 1.3, 2.0, 4
 # Numbers of rays and of photons of a batch are powers of two in these ranges: surveys share compiled
 # programs.
 _RAYS, _PHOTONS = (64, 4096), (256, 8192)
@@ -58,8 +60,8 @@ def choose_strategy(
     """
     plan = make_plan(survey, scene, rtol=rtol, max_orders=max_orders, window=window, describe=False)
     rtol = DEFAULT_RTOL if rtol is None else float(rtol)
-    # Eight batches then have 6.4 / rtol^2 photons: a sample with a sixth of the light has the relative error
-    # rtol.
+    # Eight batches then have 6.4 / rtol^2 photons, before these are rounded and bounded: a sample with a
+    # sixth of the light has the relative error rtol.
     n_photons = _power_of_two(0.8 / rtol**2, *_PHOTONS)
     plan = plan.with_config(n_rays=_rays_of_batch(plan, survey, scene, rtol), n_photons=n_photons)
     # The setup is that of one shot in the middle of the survey, with the largest zenith angle.
@@ -78,6 +80,8 @@ def _rays_of_batch(plan: Plan, survey: Survey, scene: Scene, rtol: float) -> int
 
     Enough for the tolerance, and at most 32 for each column of voxels: more would meet the same voxels.
     """
+    # Chosen by trial. If the error of N rays is N^(-3/4) (see `per_shot`), that of eight batches is then 0.2
+    # rtol at rtol = 0.01, and less than that at larger ones.
     rays = 10.0 / rtol
     if scene.canopy is not None:
         edge = float(np.min(concrete_array(scene.canopy.voxels.voxel_size)[:2]))
@@ -115,27 +119,29 @@ def _shared_illumination(
         return None
     if shared is None and len(survey) < _MIN_SHOTS:
         return None
-    by_shot = _is_by_shot(survey)
-    splines = fit_footprints(survey, max(_GRID * rtol, _GRID_BY_SHOT) if by_shot else _GRID * rtol)
-    if not by_shot and splines.error > _FINEST_GRID * rtol:
+    tallies_by_shot = _tallies_by_shot(survey)
+    grid_error = max(_GRID_OF_RTOL * rtol, _GRID_OF_SHOT_TALLIES) if tallies_by_shot else _GRID_OF_RTOL * rtol
+    splines = fit_footprints(survey, grid_error)
+    if not tallies_by_shot and splines.error > _FINEST_GRID_OF_RTOL * rtol:
         if shared:
             raise ValueError(
                 f"shared = True, but the finest grid misplaces {percent(splines.error)} of the light, at "
                 f"rtol = {rtol:g}; admissible is None or False"
             )
         return None
-    nodes = illuminated_nodes(splines, _FAINT * rtol)
-    if shared is None and nodes.overlap < (_MIN_OVERLAP_BY_SHOT if by_shot else _MIN_OVERLAP):
+    nodes = illuminated_nodes(splines, _FAINT_OF_RTOL * rtol)
+    min_overlap = _MIN_OVERLAP_OF_SHOT_TALLIES if tallies_by_shot else _MIN_OVERLAP
+    if shared is None and nodes.overlap < min_overlap:
         return None
-    fewer_photons = _FEWER_PHOTONS_BY_SHOT if by_shot else _FEWER_PHOTONS
-    groups = _groups(splines, nodes, setup, fewer_photons)
-    view_geometry = ViewGeometry.of(survey, groups, splines.spacing) if by_shot else None
+    photons_divisor = _PHOTONS_DIVISOR_OF_SHOT_TALLIES if tallies_by_shot else _PHOTONS_DIVISOR
+    groups = _groups(splines, nodes, setup, photons_divisor)
+    view_geometry = ViewGeometry.of(survey, groups, splines.spacing) if tallies_by_shot else None
     bound = _parallel_light_bound(survey, setup)
     return SharedIlluminationStrategy(setup, survey, rtol, groups, splines.spacing, view_geometry, bound)
 
 
-def _is_by_shot(survey: Survey) -> bool:
-    """Return True where shots see light each in its own way: oblique beams, or a field of view."""
+def _tallies_by_shot(survey: Survey) -> bool:
+    """Return True where shared light is tallied by shot, not by node: oblique beams, or a field of view."""
     return survey.lidar.field_of_view is not None or bool(np.any(survey.zenith > 0))
 
 
@@ -144,15 +150,15 @@ def _parallel_light_bound(survey: Survey, setup: Setup) -> float:
 
 
 def _groups(
-    splines: FootprintSplines, nodes: IlluminatedNodes, setup: Setup, fewer_photons: float
+    splines: FootprintSplines, nodes: IlluminatedNodes, setup: Setup, photons_divisor: float
 ) -> list[NodeGroup]:
     """Return groups of nodes with as many photons as make batches of a footprint of the size aimed at."""
     plan = setup.plan
     # The sum of the coefficients of a mean footprint, over the largest one. A node with `light` one gets the
     # photons of a batch divided by this sum, so that all nodes of a footprint together have at least a batch.
     light_per_footprint = float(nodes.light.sum()) * nodes.overlap / len(splines.first_node)
-    photons = plan.n_photons / fewer_photons / light_per_footprint if plan.orders > 1 else 0.0
-    return make_groups(splines, nodes, photons, plan.n_rays / _FEWER_RAYS / light_per_footprint)
+    photons = plan.n_photons / photons_divisor / light_per_footprint if plan.orders > 1 else 0.0
+    return make_groups(splines, nodes, photons, plan.n_rays / _RAYS_DIVISOR / light_per_footprint)
 
 
 def reason_against_sharing(survey: Survey, setup: Setup, rtol: float) -> str | None:
@@ -161,7 +167,7 @@ def reason_against_sharing(survey: Survey, setup: Setup, rtol: float) -> str | N
     if not beams_are_parallel(survey):
         return "shots have more than one direction"
     # Such shots share higher orders alone; their first order has rays of its own in either strategy.
-    if _is_by_shot(survey) and setup.plan.orders == 1:
+    if _tallies_by_shot(survey) and setup.plan.orders == 1:
         return "one order is followed, which oblique shots and shots with a field of view do not share"
     if not setup.plan.is_random:
         return "nothing is random"
@@ -175,6 +181,6 @@ def reason_against_sharing(survey: Survey, setup: Setup, rtol: float) -> str | N
     if any(isinstance(s.law, AbstractMirror) for s in setup.scene.surfaces):
         return "a surface is a mirror"
     bound = _parallel_light_bound(survey, setup)
-    if bound > _PARALLEL_LIGHT * rtol:
+    if bound > _PARALLEL_LIGHT_OF_RTOL * rtol:
         return f"light that is not parallel changes up to {percent(bound)} of samples, at rtol = {rtol:g}"
     return None

@@ -79,18 +79,18 @@ def waveforms_on_disk(
     problem: dict[str, str],
     case: Case | None,
 ) -> Waveforms:
-    """Write all waveforms to a file, slice by slice, with their case if there is one, and open it.
+    """Write all waveforms to a file, block of shots by block, with their case if there is one, and open it.
 
     `problem`: digests of all that the waveforms depend on.
     """
     blocks, missing = strategy.shot_results(task_results), _MissingLight()
-    first = next(blocks)
+    first_shots, first_results = next(blocks)
     # The file is laid out before its rows are known: from the shapes of the first block.
-    empty = jax.tree.map(lambda a: unwritten_rows(len(strategy.survey), a), first[1]._asdict())
+    empty = jax.tree.map(lambda a: unwritten_rows(len(strategy.survey), a), first_results._asdict())
     layout = _waveforms(strategy, {**survey_fields, **empty}, start_time, problem=problem)
     with by_rows(layout, path, case) as rows:
         # One block of results is in memory at a time, whatever the number of shots.
-        for shots, results in itertools.chain([first], blocks):
+        for shots, results in itertools.chain([(first_shots, first_results)], blocks):
             fields = {name: a[shots] for name, a in survey_fields.items()}
             rows.add(shots, {**fields, **results._asdict()})
             missing = missing.or_more(_MissingLight.of(results))

@@ -1,4 +1,4 @@
-"""Coverage of a survey: heights of the ground below its shots, and footprints partly beside the voxel map."""
+"""Coverage of a survey: heights of the ground below its shots, and footprints partly outside the map."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,12 +15,12 @@ _POINTS, _SHOTS_PER_BLOCK = 512, 1024
 
 
 class OffMapWarning(UserWarning):
-    """Warning that a hundredth of a footprint's light or more falls beside the voxel map.
+    """Warning that a hundredth of a footprint's light or more falls outside the voxel map.
 
     Beyond a map with open sides the scene is empty, so that such a shot sees less canopy than there may be.
     `Waveforms.off_map` has the fraction of every shot.
 
-    **Example:** half a footprint beside the map.
+    **Example:** half a footprint outside the map.
 
     >>> import warnings
     >>> import jax, numpy as np, jaxlidar as jl
@@ -32,26 +32,27 @@ class OffMapWarning(UserWarning):
     ...         jl.Survey(jl.Lidar(), [(0, 2)]), scene, key=jax.random.key(0), max_orders=1, rtol=0.05
     ...     )
     >>> print(caught[0].message)
-    1 of 1 footprints lie partly beside the voxel map: shot 0 with 50 % of its light
+    1 of 1 footprints lie partly outside the voxel map: shot 0 with 50 % of its light
     """
 
 
-def ground_heights(survey: Survey, scene: Scene, upstream: float) -> Float[np.ndarray, " shots"]:
+def ground_heights(survey: Survey, scene: Scene, start_distance: float) -> Float[np.ndarray, " shots"]:
     """Return the heights, m, of the ground where each beam axis meets it; NaN where it meets none.
 
-    `survey` and `scene` have the same origin of coordinates. `upstream`: distance above the reference plane
-    at which rays start, m, of a plan.
+    `survey` and `scene` have the same origin of coordinates. `start_distance`: distance, m, before the
+    reference plane, along the beam, at which rays start: that of a plan.
 
-    **Raises:** ValueError for shots beside a ground of finite extent.
+    **Raises:** ValueError for shots outside a ground of finite extent.
     """
     if scene.ground is None:
         return np.full(len(survey), np.nan)
     # From where rays start, above the scene: a ray that starts on the reference plane would miss ground above
     # it.
-    start = np.pad(survey.position, ((0, 0), (0, 1))) - upstream * survey.direction
+    start = np.pad(survey.position, ((0, 0), (0, 1))) - start_distance * survey.direction
     x, w = (vec(jnp.asarray(a, float).T) for a in (start, survey.direction))
     shape = scene.ground.shape
     distance = np.asarray(shape.distance(x, w), float)
+    # A miss is at FAR; a tenth of that leaves room for rounding.
     hits = distance < 0.1 * FAR
     # A plane has no rim: an axis that does not meet it runs along it, and has no height.
     if not hits.all() and not isinstance(shape, Plane):
@@ -66,7 +67,7 @@ def ground_heights(survey: Survey, scene: Scene, upstream: float) -> Float[np.nd
 
 
 def off_map(survey: Survey, scene: Scene) -> Float[np.ndarray, " shots"]:
-    """Return the fraction of each footprint's light beside the voxel map, at the map's top or its bottom.
+    """Return the fraction of each footprint's light outside the voxel map, at the map's top or its bottom.
 
     1. Points of equal energy in a footprint of radius one: r follows from the energy within r, 1 - exp(-2
        r^2) of a Gaussian and r^2 of a top hat, and angles advance by the golden angle (a Fibonacci lattice).
@@ -77,9 +78,9 @@ def off_map(survey: Survey, scene: Scene) -> Float[np.ndarray, " shots"]:
     if canopy is None or canopy.sides == "periodic":
         return np.zeros(len(survey))
     low, high = (np.asarray(a, float) for a in (canopy.voxels.origin, canopy.voxels.top))
-    energy = (np.arange(_POINTS) + 0.5) / _POINTS
+    enclosed_energy = (np.arange(_POINTS) + 0.5) / _POINTS
     gaussian = survey.lidar.profile == "gaussian"
-    radius = np.sqrt(-0.5 * np.log1p(-energy) if gaussian else energy)
+    radius = np.sqrt(-0.5 * np.log1p(-enclosed_energy) if gaussian else enclosed_energy)
     angle = np.pi * (np.sqrt(5.0) - 1.0) * np.arange(_POINTS)
     disc = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=-1)
     fractions = []
@@ -100,7 +101,7 @@ def off_map(survey: Survey, scene: Scene) -> Float[np.ndarray, " shots"]:
 
 
 def off_map_message(fractions: Float[np.ndarray, " shots"]) -> str | None:
-    """Return a sentence on the footprints that lie partly beside the map, or None where there are none."""
+    """Return a sentence on the footprints that lie partly outside the map, or None where there are none."""
     shots = np.flatnonzero(fractions >= NOTABLE_FRACTION)
     if shots.size == 0:
         return None
@@ -109,4 +110,4 @@ def off_map_message(fractions: Float[np.ndarray, " shots"]) -> str | None:
     ellipsis = ", ..." if shots.size > 3 else ""
     pronoun = "its" if shots.size == 1 else "their"
     count = f"{shots.size} of {fractions.size} footprints"
-    return f"{count} lie partly beside the voxel map: {examples}{ellipsis} of {pronoun} light"
+    return f"{count} lie partly outside the voxel map: {examples}{ellipsis} of {pronoun} light"

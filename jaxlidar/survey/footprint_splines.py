@@ -7,12 +7,15 @@ by
 
 with the cubic B-spline B of integral one and the grid's spacing d, so that the coefficients of a footprint
 add up to its energy, 1. They minimise the squared error at _FINE^2 points of each cell between nodes. Since B
-is separable, the coefficients are P I P^T with the pseudoinverse P of the matrix of B at the points.
+is separable, the coefficients are d^2 P I P^T with the pseudoinverse P of the matrix of B at the points,
+scaled so that they add up to one.
 
 The error of the grid is the energy that the spline puts at the wrong place. A cell has a net surplus or
-deficit, and an internal part, which is moved within it:
+deficit, and energy that is moved within it. What is moved is missing at one point and in excess at another,
+so that half of it counts:
 
-    m_f,cell = 1/2 (|sum of e| + sum of |e|),    e = (spline - irradiance) x area of a point
+    m_f,cell = |sum of e| + 1/2 (sum of |e| - |sum of e|),    e = (spline - irradiance) x area of a point
+             = 1/2 (|sum of e| + sum of |e|)
 
 If places one cell apart return independent waveforms, the relative error of f's waveform is the root of the
 sum of m_f,cell^2 over cells. The grid is the coarsest one that keeps this below a tolerance.
@@ -37,7 +40,11 @@ _BLOCK = 128
 
 
 class BeamSection(NamedTuple):
-    """The cross-section of a beam: its radius, m, whether it is a Gaussian, and the direction of its axis."""
+    """The cross-section of a beam.
+
+    - `radius`: m across the beam, at 1/e^2 of a Gaussian, or of the edge of a top hat.
+    - `gaussian`: True for a Gaussian, False for a top hat. - `axis`: unit vector along which light travels.
+    """
 
     radius: float
     gaussian: bool
@@ -81,7 +88,10 @@ class FootprintSplines(NamedTuple):
 
 
 def fit_footprints(survey: Survey, tolerance: float) -> FootprintSplines:
-    """Fit footprints of one direction on the coarsest grid whose error is below `tolerance`."""
+    """Fit footprints of one direction on the coarsest grid whose error is at most `tolerance`.
+
+    Where none is that good, the finest grid is taken: see `FootprintSplines.error`.
+    """
     # Footprints of one direction differ in their position relative to the grid alone: some eight tell the
     # error.
     beam, sample = section_of(survey), survey.position[:: max(len(survey) // 8, 1)]
@@ -129,14 +139,18 @@ def _misplaced_by_cell(
     # Points lie between nodes, so that their blocks of _FINE x _FINE are the cells.
     error = (fitted - irradiance).reshape(-1, cells, _FINE, cells, _FINE)
     net, absolute = np.abs(error.sum(axis=(2, 4))), np.abs(error).sum(axis=(2, 4))
-    # Energy that is moved within a cell is missing at one point and in excess at another: half of it counts.
     return 0.5 * (net + absolute) * (spacing / _FINE) ** 2
 
 
 def _fit(
     position: Float[np.ndarray, "shots 2"], beam: BeamSection, spacing: float
 ) -> tuple[Int[np.ndarray, "shots 2"], Float[np.ndarray, "shots nodes nodes"]]:
-    """Return the first nodes and the least-squares coefficients of footprints."""
+    """Return the first nodes and the least-squares coefficients of footprints, d^2 P I P^T of the module.
+
+    1. The patch of nodes around each footprint, which is of one shape.
+    2. The irradiance I at the patch's points; of a round Gaussian, its factors along x and y.
+    3. The product with the pseudoinverse P, scaled to the sum one.
+    """
     extent = beam.extent / -beam.axis[2]
     # Splines are four spacings wide: two nodes more on the low side and, with rounding, on the high side.
     first_node = np.floor((position - extent) / spacing).astype(int) - 2

@@ -15,9 +15,10 @@ from jaxlidar.planning.size_buckets import size_bucket
 from jaxlidar.survey.footprint_splines import FootprintSplines
 from jaxlidar.trace.entry_nodes import RAYS_PER_GROUP
 
-# Largest number of nodes of a group, and of photons of a batch if a group has several nodes: a batch cannot
-# be interrupted.
-_MAX_NODES, _MAX_PHOTONS = 512, 32_768
+# Largest number of nodes of a group, and of photons and of rays of a batch if a group has several nodes: a
+# batch cannot be interrupted. A ray deposits light in every voxel that it crosses, a photon at two points of
+# a flight.
+_MAX_NODES, _MAX_PHOTONS, _MAX_RAYS = 512, 32_768, 2048
 
 
 class NodeAllocation(NamedTuple):
@@ -58,7 +59,8 @@ class IlluminatedNodes(NamedTuple):
 
     - `index`: (nodes, 2) numbers along x and y.
     - `light`: (nodes,) largest coefficient of any footprint, over the largest of all; at most 1.
-    - `overlap`: mean number of footprints that share the light of a node.
+    - `overlap`: mean number of footprints that share the light of a node: the sum of |c_fn| over footprints
+      and nodes, over the sum over nodes of the largest.
     """
 
     index: Int[np.ndarray, "nodes 2"]
@@ -70,6 +72,10 @@ def illuminated_nodes(splines: FootprintSplines, threshold: float) -> Illuminate
     """Return the nodes that footprints illuminate, in the order of their numbers.
 
     `threshold`: coefficients at most this fraction of the largest do not count.
+
+    1. For each block of footprints: the nodes with a larger coefficient, as integer keys, and for each node
+       the largest coefficient of the block.
+    2. The same over all blocks.
     """
     width = splines.coefficients.shape[1]
     lowest = splines.first_node.min(axis=0)
@@ -84,9 +90,9 @@ def illuminated_nodes(splines: FootprintSplines, threshold: float) -> Illuminate
         x, y = (first_node[:, k, None] + offsets for k in range(2))
         # One integer for each node of the rectangle around all footprints.
         key = (x[:, :, None] * span[1] + y[:, None, :]).reshape(len(first_node), -1)
-        counts = light > threshold
+        is_significant = light > threshold
         total_light += float(light.sum())
-        block_keys, block_light = _largest_by_key(key[counts], light[counts])
+        block_keys, block_light = _largest_by_key(key[is_significant], light[is_significant])
         keys.append(block_keys)
         lights.append(block_light)
     # Without overlap, each node has light of one footprint alone, the largest one: the quotient is 1.
@@ -112,8 +118,7 @@ def make_groups(
 
     `photons`, `rays`: those of a batch at a node with `light` one; photons may be 0.
     """
-    # The limit is on photons, or on a sixteenth as many rays where few photons or none are traced.
-    largest_light = max(_MAX_PHOTONS / max(photons, 16 * rays), 1.0)
+    largest_light = max(1.0 / max(photons / _MAX_PHOTONS, rays / _MAX_RAYS), 1.0)
     members = _halve(nodes, np.arange(len(nodes.light)), largest_light)
     size = size_bucket(max(len(group) for group in members), 4)
     # The brightest group determines the shape; darker ones get as many photons, and need fewer batches.
@@ -140,7 +145,7 @@ def _halve(
     # Neither half is empty, also where one node has more than half of the light.
     cut = int(np.clip(np.searchsorted(cumulative, 0.5 * cumulative[-1]), 1, len(group) - 1))
     halves = group[order[:cut]], group[order[cut:]]
-    return [quarter for half in halves for quarter in _halve(nodes, half, largest_light)]
+    return [small_group for half in halves for small_group in _halve(nodes, half, largest_light)]
 
 
 def _make_group(

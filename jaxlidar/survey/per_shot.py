@@ -10,10 +10,11 @@ one of two ways:
 
 - Higher orders: photons are independent. The error falls as n^-1/2, and batches are added.
 - First order alone: a batch is the mean over the N rays of a randomly shifted Fibonacci lattice in the
-  footprint. Its error falls as N^-3/4 where the integrand jumps, as at the edges of crowns (He and Wang 2015,
-  SIAM J. Numer. Anal. 53, 2488). So N grows and the number of batches stays at the fewest that tell a
-  standard error. A lattice of N = m N_0 rays is traced in m parts of N_0 rays, since compiled programs need
-  fixed shapes.
+  footprint. Its error falls as N^-3/4 where the integrand jumps along a line, as at the edges of crowns: the
+  jump crosses about N^1/2 of the cells around points, each with an independent error of about 1 / N, which
+  gives N^1/4 / N. (He and Owen 2016, J. R. Stat. Soc. B 78, 917, prove this rate for stratified points along
+  a space-filling curve.) So N grows and the number of batches stays at the fewest that tell a standard error.
+  A lattice of N = m N_0 rays is traced in m parts of N_0 rays, since compiled programs need fixed shapes.
 """
 
 import dataclasses
@@ -51,12 +52,12 @@ from jaxlidar.trace.response import Response, trace_device_scene, trace_first_on
 # Largest number of shots of a chunk, of first order alone and of more: a chunk cannot be interrupted.
 _CHUNK_FIRST_ORDER, _CHUNK_HIGHER_ORDERS = 128, 16
 # Largest number of batches of a shot, or of parts of a lattice: a tolerance that is out of reach ends here.
-MAX_SIZE = 1024
+MAX_BATCHES_OR_PARTS = 1024
 # Batches of a shot follow one another, so that steps could be as small as one. The error is looked at after
 # every fourth: an estimate that stops at the first moment at which it seems precise is wrong more often.
 _BATCH_STEPS = StepRule(max_growth=1.0, min_step=4)
 # Coarser lattices are dropped when denser ones are traced: small steps would waste most of the rays.
-_LATTICE_STEPS = StepRule(order=0.75, safety=1.2, min_growth=2.0, max_growth=32.0)
+_LATTICE_STEPS = StepRule(convergence_rate=0.75, safety=1.2, min_growth=2.0, max_growth=32.0)
 
 
 class ShotGeometry(NamedTuple):
@@ -99,8 +100,11 @@ class PerShotStrategy(AbstractStrategy):
     """Every shot has photons of its own; a task is a chunk of shots."""
 
     @property
-    def chunk(self) -> int:
-        """Shots of a chunk. It depends on the survey and the plan alone, not on the number of workers."""
+    def shots_per_chunk(self) -> int:
+        """Number of shots of a chunk.
+
+        It depends on the survey and the plan alone, not on the number of workers.
+        """
         shots = len(self.survey)
         largest = _CHUNK_HIGHER_ORDERS if self.setup.plan.orders > 1 else _CHUNK_FIRST_ORDER
         largest = min(largest, max(1, shots // 8))
@@ -114,7 +118,7 @@ class PerShotStrategy(AbstractStrategy):
         ]
 
     def _chunk_geometry(self, shots: slice) -> ShotGeometry:
-        return shot_geometry(self.survey, shots.start, self.chunk)
+        return shot_geometry(self.survey, shots.start, self.shots_per_chunk)
 
     @property
     def n_tasks(self) -> int:
@@ -122,7 +126,7 @@ class PerShotStrategy(AbstractStrategy):
 
     @property
     def shot_slices(self) -> list[slice]:
-        return slices_of_shots(len(self.survey), self.chunk)
+        return slices_of_shots(len(self.survey), self.shots_per_chunk)
 
     def result_class(self, number: int) -> type[ShotResults]:
         return ShotResults
@@ -197,15 +201,15 @@ def _trace_shot(
         batch_key = jax.random.fold_in(key, number)
         return _trace_batch(scene, model, batch_key, n_parts)
 
-    first, undivided = jnp.zeros((), jnp.int32), jnp.ones((), jnp.int32)
+    zero, undivided = jnp.zeros((), jnp.int32), jnp.ones((), jnp.int32)
     if not setup.plan.is_random:
-        batch = trace_batch(first, undivided)
+        batch = trace_batch(zero, undivided)
         waveform, energy_budget = jax.tree.map(jnp.zeros_like, _with_errors(batch))
         errors = ShotErrors(waveform, energy_budget, jnp.zeros(()))
-        return make_shot_results(model, batch.components, batch.budget, errors, first)
+        return make_shot_results(model, batch.components, batch.budget, errors, photons=zero)
 
     refine = _add_batches if scene.config.follows_higher_orders else _densify_lattices
-    estimate = refine(trace_batch, jax.eval_shape(trace_batch, first, undivided), rtol)
+    estimate = refine(trace_batch, jax.eval_shape(trace_batch, zero, undivided), rtol)
     mean: ShotBatch = estimate.mean_only
     waveform_stderr, energy_budget_stderr = estimate.stderr
     errors = ShotErrors(waveform_stderr, energy_budget_stderr, _relative_error(estimate))
@@ -220,7 +224,7 @@ def _relative_error(estimate: RunningMoments) -> Array:
 
 def _no_batches(shapes: ShotBatch) -> RunningMoments:
     """Return the moments of no batch, for batches of these shapes."""
-    return RunningMoments.compiled(_with_errors(_zeros(shapes)), shapes)
+    return RunningMoments.in_program(_with_errors(_zeros(shapes)), shapes)
 
 
 def _add_batches(
@@ -236,7 +240,7 @@ def _add_batches(
     def refine(estimate: RunningMoments, size: Array, next_size: Array) -> RunningMoments:
         return jax.lax.fori_loop(size, next_size, add_batch, estimate)
 
-    stop = StoppingRule(rtol, min_size=MIN_BATCHES, max_size=MAX_SIZE)
+    stop = StoppingRule(rtol, min_size=MIN_BATCHES, max_size=MAX_BATCHES_OR_PARTS)
     return sample_until_compiled(refine, _no_batches(shapes), _relative_error, stop, _BATCH_STEPS)
 
 
@@ -253,7 +257,7 @@ def _densify_lattices(
 
         return jax.lax.fori_loop(0, MIN_BATCHES, add_batch, _no_batches(shapes))
 
-    stop = StoppingRule(rtol, min_size=1, max_size=MAX_SIZE)
+    stop = StoppingRule(rtol, min_size=1, max_size=MAX_BATCHES_OR_PARTS)
     return sample_until_compiled(refine, _no_batches(shapes), _relative_error, stop, _LATTICE_STEPS)
 
 

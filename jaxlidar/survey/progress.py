@@ -9,9 +9,10 @@ import time
 class SurveyProgress:
     """Progress of `simulate_many`. Printed, it is one line of text.
 
-    - `done`: number of shots traced, those of an earlier run included.
+    - `done`: number of shots traced, those of an earlier run included. With shared illumination, and with
+      truth, it is in proportion to the tasks that are done.
     - `total`: number of shots in all.
-    - `seconds`: time since the start, s.
+    - `seconds`: time since tracing began, s; planning comes before.
     - `rate`: shots per s.
     - `left`: estimated time left, s.
 
@@ -34,7 +35,7 @@ class SurveyProgress:
 
 
 class ProgressClock:
-    """The rate of shots since the start of a run, and the time that the remaining ones will take.
+    """The rate of shots since tracing began, and the time that the remaining ones will take.
 
     `total`: shots in all. `stored`: those of earlier runs, which do not count in the rate.
     """
@@ -45,7 +46,7 @@ class ProgressClock:
 
     @property
     def seconds(self) -> float:
-        """Time since the start, s."""
+        """Time since tracing began, s."""
         return time.perf_counter() - self.start_time
 
     @property

@@ -2,27 +2,34 @@
 
 from typing import Any, NamedTuple
 
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxlidar.instrument.receiver import record
 from jaxlidar.spectral.apply_optics import BudgetTerms, WaveformModel
 from jaxlidar.spectral.waveform import energy_per_reflectance
 
+# Arrays of JAX within compiled programs, of one shot or of several; of NumPy outside.
+_PerSample = Float[Any, "*shots wavelengths samples"]
+_PerWavelength = Float[Any, "*shots wavelengths"]
+
 
 class ShotResults(NamedTuple):
-    """Results of shots; axis 0 is the shots'. The quantities are those of `Waveforms`."""
+    """Results of one shot, or of several along axis 0. The quantities are those of `Waveforms`.
 
-    reflectance: Any
-    stderr: Any
-    energy: Any
-    recorded: Any
-    components: Any
-    neglected: Any
-    lost: Any
-    energy_budget: Any
-    energy_budget_stderr: Any
-    error: Any
-    photons: Any
+    `truth`: a `Truths`, or None.
+    """
+
+    reflectance: _PerSample
+    stderr: _PerSample
+    energy: _PerSample
+    recorded: _PerSample
+    components: dict[str, _PerSample]
+    neglected: _PerWavelength
+    lost: _PerWavelength
+    energy_budget: dict[str, _PerWavelength]
+    energy_budget_stderr: dict[str, _PerWavelength]
+    error: Float[Any, "*shots"]
+    photons: Int[Any, "*shots"]
     truth: Any = None
 
 

@@ -11,8 +11,9 @@ to the sample of f at t, where V_f(b) is the fraction of the light from b that t
 estimator is unbiased for every f, from one set of paths; standard errors are those of each shot, and
 neighbours are correlated.
 
-Light enters about the nodes n of a grid with the spacing d, with the density of a B-spline each; together
-p = 1 / d^2.
+Light enters about the nodes n of a grid with the spacing d: each sends light of the energy 1 with the density
+B / d^2 about itself, where B is a B-spline of integral one. All together have the density p = 1 / d^2
+everywhere.
 
 - *By node.* Straight down and without a field of view, V_f = 1 and I_f is a sum of the splines with
   coefficients c_fn (`jaxlidar.survey.footprint_splines`). Responses are tallied by node. Photons of two nodes
@@ -79,12 +80,13 @@ MAX_BATCHES = 1024
 SHOTS_PER_BLOCK = 256
 # Footprints of whose light a group has less than this fraction do not decide on its number of batches.
 _NEGLIGIBLE_FRACTION = 1e-3
-# Largest number of deposits along a flight. Where optics are applied, and for each shot that may see them,
-# deposits cost more than elsewhere.
+# Largest number of deposits along a flight. They cost more here than elsewhere: each is made for every
+# wavelength, since optics are applied, and for every shot that may see it.
 _MAX_DEPOSITS = 2
 # Smallest number of rays of a batch of a shot's own first order.
 _MIN_RAYS = 64
-# The worst error of many shots, from few batches, is overestimated: steps are short.
+# The worst error of many shots, from few batches, is overestimated: steps are short, and the error
+# is predicted to fall by a factor of at most 1.4 in each.
 _STEPS = StepRule(safety=1.05, max_growth=1.05 * 1.4**2, min_step=2)
 # Groups aim a little below the tolerance: where some are brighter than others, squared errors add up to a
 # little more.
@@ -176,7 +178,8 @@ def make_group_context(setup: Setup, spacing: float, view_geometry: ViewGeometry
         # Paths are timed from their own entry. For a shot whose axis is beside it, an oblique path may be
         # later.
         plan = plan.with_limits(max_path=plan.limits.max_path + view_geometry.extra_path)
-        # Rays are traced for each shot alone, while photons are shared: with few rays a batch costs little.
+        # Rays serve the first order of each shot alone, which may have only `_FIRST_ORDER_VARIANCE` of the
+        # squared error, and whose error falls faster with their number than that of photons.
         plan = plan.with_config(n_rays=max(plan.n_rays // 4, _MIN_RAYS))
     scene = build_device_scene(dataclasses.replace(setup, plan=plan), derivatives="none")
     return GroupContext(scene, without_air, model.air_return, spacing, view_geometry)
@@ -205,13 +208,14 @@ class BatchSums(NamedTuple):
 class GroupContribution(NamedTuple):
     """Contribution of a group to its shots.
 
-    - `shots`: their numbers. - `lines`: samples by material, then those of the first order.
+    - `shots`: their numbers. - `lines`: components (the name is that in checkpoints): samples by material,
+      then those of the first order.
     - `energy`: as in `BatchSums`. - `variance`, `energy_variance`: squared standard errors of the waveform
       and of the energy. - `photons`: number of photons that contribute.
     """
 
     shots: Int[np.ndarray, " shots"]
-    lines: Float[np.ndarray, "shots lines wavelengths samples"]
+    lines: Float[np.ndarray, "shots components wavelengths samples"]
     energy: dict[str, Float[np.ndarray, "shots *rows wavelengths"]]
     variance: Float[np.ndarray, "shots wavelengths samples"]
     energy_variance: dict[str, Float[np.ndarray, "shots *rows wavelengths"]]
@@ -236,7 +240,9 @@ def _trace_batch(scene: DeviceScene, nodes: EntryNodes, model: WaveformModel, ke
     return BatchSums(*jax.vmap(sums)(response), response)
 
 
-def _lines(response: Response, model: WaveformModel) -> Float[Array, "lines wavelengths samples"]:
+def _stacked_components(
+    response: Response, model: WaveformModel
+) -> Float[Array, "components wavelengths samples"]:
     """Return samples by material, then those of the first order."""
     by_component = component_samples(response, model)
     return jnp.stack([*(by_component[name] for name in model.materials), by_component["first"]])
@@ -252,7 +258,7 @@ def _group_moments(
 ) -> RunningMoments:
     """Trace `count` batches from number `first` on.
 
-    Returns the moments of their waveforms and energies; `mean_only` are their mean lines.
+    Returns the moments of their waveforms and energies; `mean_only` is the mean of their components.
     """
     scene = _group_scene(scene, model, light)
 
@@ -265,11 +271,11 @@ def _group_moments(
         return moments.update((batch.waveform, batch.energy), batch.response)
 
     shapes: BatchSums = jax.eval_shape(trace_batch, first)
-    empty = RunningMoments.compiled((shapes.waveform, shapes.energy), shapes.response)
+    empty = RunningMoments.in_program((shapes.waveform, shapes.energy), shapes.response)
     moments = jax.lax.fori_loop(0, count, add_batch, empty)
     # Waveforms by material are linear in the response: those of its mean are their mean, made once.
-    lines = jax.vmap(lambda response: _lines(response, model))(moments.mean_only)
-    return moments._replace(mean_only=lines)
+    components = jax.vmap(lambda response: _stacked_components(response, model))(moments.mean_only)
+    return moments._replace(mean_only=components)
 
 
 compiled_group_moments = Program(_group_moments, **ONE_CORE)
@@ -305,9 +311,9 @@ class ErrorTarget(NamedTuple):
 
     - `coefficients`: of these shots. - `light_fraction`: s, of their light that is the group's.
     - `variance_fraction`: of their squared error that may be the group's; s where all is traced by node.
-    - `first_order_excess`: samples that belong to the shot's light in this group but are traced in another
-      one, positive, or the other way round, negative: errors are relative to what the group's fraction
-      returns.
+    - `first_order_excess`: (s - 1) times the shot's order one in the group that traces it, s times in all
+      others; 0 where all is traced by node. Added to the mean, it gives the fraction s of the complete
+      waveform, to which errors are relative.
     """
 
     coefficients: ShotCoefficients
@@ -335,17 +341,18 @@ def _error_target(
     """Return the shots that decide on the number of batches, and their errors."""
     fraction = group.coefficients.sum(axis=1)
     # The light and the error of the other shots are added all the same; they only do not cause more batches.
-    counts = fraction > _NEGLIGIBLE_FRACTION
-    fraction, has_centre = fraction[counts], group.has_centre[counts]
+    is_significant = fraction > _NEGLIGIBLE_FRACTION
+    fraction, has_centre = fraction[is_significant], group.has_centre[is_significant]
     if light.shot_views is None:
-        return ErrorTarget(coefficients[counts], fraction, fraction, 0.0)
+        return ErrorTarget(coefficients[is_significant], fraction, fraction, 0.0)
     first = _compiled_first_order_samples(context.scene, context.model, light, key)
     # A shot's first order is traced, all of it, in the group that has its centre.
-    excess = (fraction - has_centre)[:, None, None] * np.asarray(first)[: len(group.shots)][counts]
+    first_of_shots = np.asarray(first)[: len(group.shots)][is_significant]
+    excess = (fraction - has_centre)[:, None, None] * first_of_shots
     # Over all groups these fractions add up to 1: a shot has its centre in one of them, and its light in all.
     # The group with the centre has a larger one, as it alone traces the first order.
     variance = _FIRST_ORDER_VARIANCE * has_centre + (1.0 - _FIRST_ORDER_VARIANCE) * fraction
-    return ErrorTarget(coefficients[counts], fraction, variance, excess)
+    return ErrorTarget(coefficients[is_significant], fraction, variance, excess)
 
 
 class GroupEstimate(AbstractEstimate):
@@ -366,7 +373,7 @@ class GroupEstimate(AbstractEstimate):
         self.moments = moments if self.moments is None else self.moments.merge(moments)
 
     def errors(self) -> EstimateErrors:
-        """Return the largest relative error of the shots that count."""
+        """Return the largest relative error of the shots that decide."""
         return EstimateErrors(self.target.worst_error(self.moments))
 
 
@@ -443,7 +450,7 @@ def _nodes(group: NodeGroup, spacing: float) -> EntryNodes:
 class ShotSums(NamedTuple):
     """Sums of the contributions of all groups to shots; axis 0 is the shots'. See `GroupContribution`."""
 
-    lines: Float[Array, "shots lines wavelengths samples"]
+    components: Float[Array, "shots components wavelengths samples"]
     energy: dict[str, Float[Array, "shots *rows wavelengths"]]
     stderr: Float[Array, "shots wavelengths samples"]
     energy_stderr: dict[str, Float[Array, "shots *rows wavelengths"]]
@@ -464,7 +471,7 @@ def sum_contributions(
         jax.tree.map(lambda s, a, r=rows, m=mine: np.add.at(s, r, a[m]), sums, arrays)
     # Variances of groups add up, since their photons are independent.
     of_shots = ShotSums(
-        lines=sums["lines"],
+        components=sums["lines"],
         energy=sums["energy"],
         stderr=np.sqrt(sums["variance"]),
         energy_stderr=jax.tree.map(np.sqrt, sums["energy_variance"]),
@@ -479,20 +486,20 @@ def _complete_shot(
     model: WaveformModel, air: Float[Array, "wavelengths samples"] | None, sums: ShotSums
 ) -> ShotResults:
     """Return the results of one shot. `air`: what the air itself returns, order one."""
-    by_component = dict(zip(model.materials, sums.lines))
-    reflectance, first = jnp.sum(sums.lines[:-1], axis=0), sums.lines[-1]
-    # Higher orders have no samples of their own: only sums of all orders are kept by material.
+    # The last component is the first order, which materials have in them already.
+    by_component = dict(zip(model.materials, sums.components))
+    reflectance, first = jnp.sum(sums.components[:-1], axis=0), sums.components[-1]
     by_component |= {"first": first, "higher": reflectance - first}
     if air is not None:
         by_component |= {"air": air, "first": first + air}
         reflectance = reflectance + air
-    budget, errors = (
+    budget, budget_stderr = (
         budget_of_sums(ResponseSums(**energy), model) for energy in (sums.energy, sums.energy_stderr)
     )
     # `budget_of_sums` takes the returned light off one of these fates. That is no rule for errors: their own
     # stay.
     fates = {"escaped": "escaped", "after the window": "late", "unfollowed": "remaining"}
-    energy_budget_stderr = errors.energy_budget | {
+    energy_budget_stderr = budget_stderr.energy_budget | {
         name: sums.energy_stderr[fate] for name, fate in fates.items()
     }
     shot_errors = ShotErrors(sums.stderr, energy_budget_stderr, relative_error(reflectance, sums.stderr))
@@ -520,13 +527,14 @@ def _variance_of_sums(coefficients: ShotCoefficients, squares: Any, count: int) 
 
     Var W_f = sum_n c_fn^2 S_n / (count (count - 1)), widened by the square of Student's factor. The sum of
     independent variances has more degrees of freedom than each of them: count - 1 times (sum c^2)^2 / sum
-    c^4, the number of nodes that take part (Satterthwaite 1946, Biometrics Bull. 2, 110, for equal
+    c^4, the effective number of nodes (Satterthwaite 1946, Biometrics Bull. 2, 110, for equal
     variances).
     """
     # Elementwise, for NumPy's arrays and for SciPy's sparse arrays alike (its matrices would multiply).
     weight = coefficients * coefficients
     # Fourth powers of faint coefficients underflow; at least one node takes part.
-    nodes = weight.sum(axis=1) ** 2 / np.maximum((weight * weight).sum(axis=1), 1e-30)
-    freedom = (count - 1.0) * np.maximum(nodes, 1.0)
-    scale = student_widening(1.0 + freedom) ** 2 / (count * (count - 1.0))
-    return _sum_over_traced((weight * scale[:, None]).astype(coefficients.dtype), squares)
+    effective_nodes = weight.sum(axis=1) ** 2 / np.maximum((weight * weight).sum(axis=1), 1e-30)
+    freedom = (count - 1.0) * np.maximum(effective_nodes, 1.0)
+    # `student_widening` takes a number of batches, which is one more than their degrees of freedom.
+    variance_scale = student_widening(1.0 + freedom) ** 2 / (count * (count - 1.0))
+    return _sum_over_traced((weight * variance_scale[:, None]).astype(coefficients.dtype), squares)

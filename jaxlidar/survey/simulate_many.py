@@ -67,10 +67,12 @@ def simulate_many(
       bounded (`info["parallel light"]`). Standard errors are those of each shot; errors of neighbours are
       correlated.
     - *Per shot*: all other shots are traced one by one. A shot costs the same over a map of any size, because
-      the work for the map itself is done once for many shots. Its waveform does not depend on other shots.
+      the work for the map itself is done once for many shots. Its random numbers follow from its number in
+      the survey, whatever the other shots are.
 
-    Batches are traced until the error of every shot is below the tolerance, as `simulate` defines it. Results
-    do not depend on the number of workers or devices, nor on whether the run was interrupted.
+    Batches are traced until the error of every shot is below the tolerance, as `simulate` defines it, or 1024
+    batches are done (`Waveforms.error` is the error that was reached). Results do not depend on the number of
+    workers or devices, nor on whether the run was interrupted.
 
     All waveforms have one time axis, from the first return of any shot to the last; over steep terrain it is
     long. For derivatives, use `simulate`.
@@ -81,36 +83,37 @@ def simulate_many(
     - `scene`: a `Scene`; or `SceneParts`, for one that is larger than memory.
     - `key`: a JAX random key. The same key gives the same waveforms.
     - `rtol`: relative error to reach for every shot, in (0, 1). Default None: 0.01.
-    - `max_orders`: number of scatterings followed, at least 1. Default None: from `rtol` and the optics.
+    - `max_orders`: follow exactly this many scatterings, whatever `rtol` needs; at least 1. Default None:
+      from `rtol` and the optics.
     - `path`: a netCDF file, or a Zarr store (".zarr"), for the waveforms. It appears when all are traced,
       with its case, so that `jaxlidar.rerun` can simulate them again. Until then the file "PATH.parts" (of
       SQLite) has the results so far; the same call continues with them, also after it was killed. One run at
       a time can use it. If the file exists already, it is read. Only a few shots are in memory at a time,
       also of a netCDF file that is returned: see `jaxlidar.open`. Default None: no file.
-    - `executor`: a `concurrent.futures.Executor`, whose workers trace chunks of shots: a process pool (with
-      the start method "spawn" or "forkserver"), that of a Dask client (`client.get_executor()`; the extra
-      `cluster` installs Dask), of mpi4py. A chunk whose worker dies gets a second try. Default None: this
-      process, on all cores.
-    - `mesh`: a `jax.sharding.Mesh`, whose devices trace chunks of shots: each takes the next chunk. A program
-      is compiled for each device. Default None: the default device.
-    - `progress`: a function called with a `SurveyProgress` after every chunk; for instance `print`. Default
+    - `executor`: a `concurrent.futures.Executor`, whose workers do tasks (chunks of shots, groups of nodes of
+      the grid, or tiles of the scene): a process pool (with the start method "spawn" or "forkserver"), that
+      of a Dask client (`client.get_executor()`; the extra `cluster` installs Dask), of mpi4py. A task whose
+      worker dies gets a second try. Default None: this process, on all cores.
+    - `mesh`: a `jax.sharding.Mesh`, whose devices do tasks: each takes the next one. A program is compiled
+      for each device. Default None: the default device.
+    - `progress`: a function called with a `SurveyProgress` after every task; for instance `print`. Default
       None.
     - `shared`: True traces with shared illumination, and refuses shots that cannot share light; False traces
       per shot. Default None: shared where it is possible and saves time.
-    - `truth`: True adds what each beam meets in the scene, as labels for algorithms: `Waveforms.truth`.
-      Default False.
+    - `truth`: True adds `Waveforms.truth`: reference quantities computed from the scene itself (gap
+      probability, area densities, heights), to train or to test retrieval algorithms. Default False.
 
     **Returns:** a `Waveforms`.
 
-    **Warns:** `OffMapWarning` where footprints lie partly beside the voxel map, `LateLightWarning` where much
-    light arrives after the end of the record, `UnfollowedLightWarning` where orders that are not followed may
-    add more than `rtol`.
+    **Warns:** `OffMapWarning` where footprints lie partly outside the voxel map, `LateLightWarning` where
+    much light arrives after the end of the record, `UnfollowedLightWarning` where orders that are not
+    followed may add more than `rtol`.
 
     **Raises:** TypeError for arguments of another class. ValueError, before any work, for inadmissible
     arguments, a scene that reaches up to the sensor, shots that do not meet the ground, a receiver whose
     window opens at the first return, shots that must share light and cannot, and a `path` with results of
     another problem, naming what differs. OSError for a `path` that another run uses, or that cannot be
-    written. RuntimeError where the workers of a chunk die twice.
+    written. RuntimeError where the workers of a task die twice.
 
     **Example:**
 

@@ -20,7 +20,8 @@ class AbstractStrategy(abc.ABC):
     Tasks are independent of one another, so that any process may do them, in any order, now or in a later
     run.
 
-    - `setup`: that of the middle of the survey. - `survey`: relative to the setup's origin of coordinates.
+    - `setup`: that of the middle of the survey, or of the first tile of a tiled scene.
+    - `survey`: relative to the setup's origin of coordinates; over a tiled scene, in map coordinates.
     - `rtol`: relative error to reach.
     """
 

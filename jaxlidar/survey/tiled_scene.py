@@ -1,7 +1,7 @@
 """The strategy tiled scene: the shots of each square tile of a scene that is larger than memory are one task.
 
-A task asks for the part of the scene that its shots need, a rectangle around the tile, and traces them with
-one of the other strategies. The rectangle reaches beyond the tile
+A task asks `SceneParts.part` for the scene within the rectangle that its shots need, and traces them with one
+of the other strategies. The rectangle reaches beyond the tile
 
 - by the footprints of its shots, at all heights of the scene, and
 - by a margin: as far as light may travel sideways and still return before the record ends.
@@ -37,7 +37,8 @@ from jaxlidar.survey.results import ShotResults
 from jaxlidar.survey.strategy import AbstractStrategy, slices_of_shots
 from jaxlidar.survey.truths import StrategyWithTruth, Truths
 
-# Radius within which a Gaussian beam is followed, over its 1/e^2 radius; 2e-8 of its energy lies beyond.
+# Radius within which a Gaussian beam is followed, over its 1/e^2 radius; 2e-8 of its energy lies beyond. It
+# is larger than in `footprint_splines`: what lies outside the rectangle is missing altogether.
 _GAUSSIAN_EXTENT = 3.0
 # Shots whose results are completed together, and tiles whose results stay in memory for the next ones.
 _SHOTS_PER_BLOCK, _CACHED_TILES = 256, 4
@@ -66,20 +67,25 @@ class TileOptions(NamedTuple):
 def tiles_of(survey: Survey, scene: SceneParts, margin: float = 0.0) -> list[SceneTile]:
     """Return the tiles that have any shots, with rectangles of one size.
 
-    All light of the shots of a tile enters and leaves the scene within its rectangle, with `margin`, m, to
-    spare.
+    All unscattered light of the shots of a tile lies within its rectangle, with `margin`, m, to spare.
+
+    1. The tile of each shot, and how far its beam, between the scene's lowest and highest points, reaches
+       beyond that tile.
+    2. The largest of these distances and the margin extend all tiles.
+    3. The tiles that have shots, with these.
     """
-    direction, radius = survey.direction, survey.footprint_radius
-    cosine = -direction[:, 2]
+    direction, cosine = survey.direction, -survey.direction[:, 2]
     # The footprint on a plane at the scene's lowest or highest point: longer for oblique beams, and wider
     # below.
     largest_height = max(abs(z) for z in scene.z)
-    radius = radius * (_GAUSSIAN_EXTENT if survey.lidar.profile == "gaussian" else 1.0)
-    radius = (radius / cosine * (1.0 + largest_height / survey.slant_range))[:, None]
+    followed_radius = survey.footprint_radius * (
+        _GAUSSIAN_EXTENT if survey.lidar.profile == "gaussian" else 1.0
+    )
+    reach = (followed_radius / cosine * (1.0 + largest_height / survey.slant_range))[:, None]
     ends = np.stack([survey.position + z * (direction[:, :2] / direction[:, 2:]) for z in scene.z])
     # A shot belongs to the tile of the middle of its beam axis between the scene's lowest and highest points.
     corner = scene.tile * np.floor(ends.mean(axis=0) / scene.tile)
-    overhang = np.maximum(corner - ends.min(axis=0), ends.max(axis=0) - corner - scene.tile) + radius
+    overhang = np.maximum(corner - ends.min(axis=0), ends.max(axis=0) - corner - scene.tile) + reach
     step = scene.tile / _STEPS
     # One extension for all tiles, the largest of any shot, as parts must have one shape to share compiled
     # programs. It is a multiple of a step, so that similar surveys ask for the same rectangles.
@@ -95,7 +101,7 @@ def tiles_of(survey: Survey, scene: SceneParts, margin: float = 0.0) -> list[Sce
 def lossless_margin(survey: Survey, longest_path: float, top: float) -> float:
     """Return the distance, m, from its first scattering within which all light that is recorded travels.
 
-    `longest_path`: length of the longest path that is recorded, m, to the reference plane and from there;
+    `longest_path`: longest path that is recorded, m, relative to twice the range of the reference plane;
     `top`: height of the scene, m. See the module's docstring for the formula.
     """
     zenith = np.deg2rad(float(survey.zenith.max()))
@@ -163,7 +169,8 @@ class TiledSceneStrategy(AbstractStrategy):
         margin = lossless if scene.margin is None else float(scene.margin)
 
         tiles = tiles_of(survey, scene, margin)
-        beside_map, heights, digests, shared_by_tile = np.zeros(len(survey)), np.zeros(len(survey)), [], []
+        off_map_fractions, heights = np.zeros(len(survey)), np.zeros(len(survey))
+        digests, shared_by_tile = [], []
         # Parts may differ in their materials, but the results of a survey have one set of names. Dicts
         # without values are sets that keep their order.
         materials: dict[str, None] = {}
@@ -173,7 +180,7 @@ class TiledSceneStrategy(AbstractStrategy):
             strategy = _strategy_of(survey, scene, tile, rtol, options.orders, shared, options.window)
             first_strategy = strategy if first_strategy is None else first_strategy
             scene_part, plan = strategy.setup.scene, strategy.setup.plan
-            beside_map[tile.shots] = off_map(strategy.survey, scene_part)
+            off_map_fractions[tile.shots] = off_map(strategy.survey, scene_part)
             heights[tile.shots] = ground_heights(strategy.survey, scene_part, plan.limits.start_distance)
             # Of the part as it is given: the strategy's has been moved to the survey's origin.
             digests.append(digest_of(scene.between(tile.low, tile.high)))
@@ -190,7 +197,7 @@ class TiledSceneStrategy(AbstractStrategy):
             options=options,
             materials=tuple(materials),
             surfaces=tuple(surfaces),
-            off_map=beside_map,
+            off_map=off_map_fractions,
             ground_height=heights,
             digests=digests,
             margin=margin,
@@ -224,7 +231,7 @@ class TiledSceneStrategy(AbstractStrategy):
         """Yield results in the order of shots, from those of tiles.
 
         Successive shots are mostly of few tiles: the results of the last ones stay in memory, since reading
-        those of a tile from a file for every slice would take long.
+        those of a tile from a file for every block would take long.
         """
         tile_of_shot, row_of_shot = (np.empty(len(self.survey), int) for _ in range(2))
         for n, tile in enumerate(self.tiles):
@@ -343,7 +350,7 @@ def truth_of_tile(
 
 
 def _run_in_turn(tasks: list[WorkUnit]) -> dict[int, Any]:
-    """Return the results of tasks by number, one after the other: this process has one core of its own."""
+    """Return the results of tasks by number, one after the other: the task of a tile has one core."""
     results = {}
     for unit in tasks:
         outcome = run_unit(unit)

@@ -1,4 +1,4 @@
-"""Truth of the shots of a survey: labels for algorithms, of what each beam meets in the scene."""
+"""Truth of the shots of a survey: reference quantities of what each beam meets in the scene."""
 
 import dataclasses
 from collections.abc import Iterator, Mapping
@@ -45,16 +45,16 @@ class Truths(eqx.Module):
     0.40
     """
 
-    returns: dict[str, Float[np.ndarray, "shots wavelengths bins"]]
-    gap_probability: Float[np.ndarray, "shots bins"]
-    leaf_area_density: Float[np.ndarray, "shots bins"]
-    bark_area_density: Float[np.ndarray, "shots bins"]
-    plant_area_index: Float[np.ndarray, "shots bins"]
+    returns: dict[str, Float[np.ndarray, "shots wavelengths samples"]]
+    gap_probability: Float[np.ndarray, "shots samples"]
+    leaf_area_density: Float[np.ndarray, "shots samples"]
+    bark_area_density: Float[np.ndarray, "shots samples"]
+    plant_area_index: Float[np.ndarray, "shots samples"]
     top_height: Float[np.ndarray, " shots"]
     surface_height: dict[str, Float[np.ndarray, " shots"]]
     surface_spread: dict[str, Float[np.ndarray, " shots"]]
 
-    def of_shot(self, shot: int, time: Float[Array, "bins"], height: Float[Array, "bins"]) -> Truth:
+    def of_shot(self, shot: int, time: Float[Array, "samples"], height: Float[Array, "samples"]) -> Truth:
         """Return the truth of one shot.
 
         **Arguments:** `shot`: its number. `time`, `height`: of the samples, as those of `Truth`.
@@ -72,7 +72,7 @@ keep_as_netcdf(
     Truths,
     "truth of the shots of a survey",
     TRUTH_QUANTITIES,
-    dimensions={"shots": "shot", "bins": "time", "wavelengths": "wavelength"},
+    dimensions={"shots": "shot", "samples": "time", "wavelengths": "wavelength"},
     items={"returns": "material", "surface_height": "surface", "surface_spread": "surface"},
     rows="shots",
 )
@@ -82,22 +82,23 @@ keep_as_netcdf(
 class StrategyWithTruth(AbstractStrategy):
     """A strategy that traces light, and the truth of all shots.
 
-    After the tasks of `light`, there is one for the truth of each of its slices of shots.
+    After the tasks of `light_strategy`, there is one for the truth of each of its blocks of shots.
     """
 
-    light: AbstractStrategy
+    light_strategy: AbstractStrategy
 
     @staticmethod
-    def around(light: AbstractStrategy) -> "StrategyWithTruth":
-        """Return `light` with the truth of its shots."""
-        return StrategyWithTruth(light.setup, light.survey, light.rtol, light)
+    def around(light_strategy: AbstractStrategy) -> "StrategyWithTruth":
+        """Return a strategy that traces light, with the truth of its shots."""
+        setup, survey, rtol = light_strategy.setup, light_strategy.survey, light_strategy.rtol
+        return StrategyWithTruth(setup, survey, rtol, light_strategy)
 
     @property
     def shot_slices(self) -> list[slice]:
-        return self.light.shot_slices
+        return self.light_strategy.shot_slices
 
     def tasks(self, key: PRNGKeyArray) -> list[WorkUnit]:
-        return [*self.light.tasks(key), *self.truth_tasks(key)]
+        return [*self.light_strategy.tasks(key), *self.truth_tasks(key)]
 
     def truth_tasks(self, key: PRNGKeyArray) -> list[WorkUnit]:
         """Return the tasks for the truth alone. They draw no random numbers: `key` is passed on unused."""
@@ -105,30 +106,30 @@ class StrategyWithTruth(AbstractStrategy):
         size = self.shot_slices[0].stop
         return [
             task(number, truths_of_chunk, (self.setup, shot_geometry(self.survey, shots.start, size)), key)
-            for number, shots in enumerate(self.shot_slices, self.light.n_tasks)
+            for number, shots in enumerate(self.shot_slices, self.light_strategy.n_tasks)
         ]
 
     @property
     def n_tasks(self) -> int:
-        return self.light.n_tasks + len(self.shot_slices)
+        return self.light_strategy.n_tasks + len(self.shot_slices)
 
     def result_class(self, number: int) -> Any:
-        return self.light.result_class(number) if number < self.light.n_tasks else Truths
+        return self.light_strategy.result_class(number) if number < self.light_strategy.n_tasks else Truths
 
     def shot_results(self, task_results: Mapping[int, Any]) -> Iterator[tuple[slice, ShotResults]]:
-        results_of_slices = self.light.shot_results(task_results)
-        for number, (shots, results) in enumerate(results_of_slices, self.light.n_tasks):
+        results_of_slices = self.light_strategy.shot_results(task_results)
+        for number, (shots, results) in enumerate(results_of_slices, self.light_strategy.n_tasks):
             count = shots.stop - shots.start
             truths = jax.tree.map(lambda a, n=count: a[:n], task_results[number])
             yield shots, results._replace(truth=truths)
 
     def info(self) -> dict[str, Any]:
-        return self.light.info()
+        return self.light_strategy.info()
 
 
 def truths_of_chunk(setup: Setup, shots: ShotGeometry, key: PRNGKeyArray) -> Truths:
     """Return the truth of a chunk of shots; no random numbers are drawn."""
-    # Labels are those of the first order with a fixed key: `key` is unused, as every task has one.
+    # The truth is that of the first order with a fixed key: `key` is unused, as every task has one.
     fields = _compiled_truths(first_order_setup(setup), shots.as_arrays())
     return Truths(**jax.tree.map(np.asarray, fields))
 

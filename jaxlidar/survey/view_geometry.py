@@ -49,7 +49,7 @@ class ViewGeometry(NamedTuple):
     - `beam`: of all shots. - `position`: of the shots, m.
     - `view_radius`: of fields of view, m across the beam; None without limit.
     - `max_shots`, `max_central`: largest number of a group's shots, and of those whose centre is in it.
-    - `cells`: (nx, ny, candidates), as in `jaxlidar.trace.shot_views.ShotViews`.
+    - `cell_shape`: (nx, ny, candidates), the shape of `candidates` in `jaxlidar.trace.shot_views.ShotViews`.
     """
 
     beam: BeamSection
@@ -57,7 +57,7 @@ class ViewGeometry(NamedTuple):
     view_radius: float | None
     max_shots: int
     max_central: int
-    cells: tuple[int, int, int]
+    cell_shape: tuple[int, int, int]
 
     @staticmethod
     def of(survey: Survey, groups: list[NodeGroup], spacing: float) -> "ViewGeometry":
@@ -71,14 +71,14 @@ class ViewGeometry(NamedTuple):
             view_radius=None if field is None else 0.5e-3 * concrete_number(field) * slant,
             max_shots=size_bucket(max(len(group.shots) for group in groups), 4),
             max_central=size_bucket(max(int(group.has_centre.sum()) for group in groups), 4),
-            cells=(0, 0, 0),
+            cell_shape=(0, 0, 0),
         )
         # Sizes alone are stored: `views_of_group` makes the cells of a group again, in the task that needs
         # them.
-        cells = [geometry._cells(group, spacing) for group in groups]
-        nx, ny = (size_bucket(max(c.shape[k] for c in cells), 4) for k in range(2))
-        candidates = max(len(shots) for c in cells for shots in c.shots)
-        return geometry._replace(cells=(nx, ny, size_bucket(candidates, 8)))
+        cells_by_group = [geometry._candidate_cells(group, spacing) for group in groups]
+        nx, ny = (size_bucket(max(cells.shape[k] for cells in cells_by_group), 4) for k in range(2))
+        candidates = max(len(shots) for cells in cells_by_group for shots in cells.shots)
+        return geometry._replace(cell_shape=(nx, ny, size_bucket(candidates, 8)))
 
     @property
     def extent(self) -> float:
@@ -96,7 +96,10 @@ class ViewGeometry(NamedTuple):
 
     @property
     def extra_path(self) -> float:
-        """Length, m, by which a path may be longer for a shot than for a shot at its own entry, two-way."""
+        """Length, m, two-way, by which a path may be longer for a shot than for one at the path's entry.
+
+        The latter is a shot whose axis passes through the entry.
+        """
         x, y, z = self.beam.axis
         return 2.0 * self.beam.extent * math.hypot(x, y) / -z
 
@@ -108,14 +111,14 @@ class ViewGeometry(NamedTuple):
         rotation = np.array([[x, -y], [y, x]]) / math.hypot(x, y) if self.beam.is_oblique else np.eye(2)
         return position @ rotation * np.array([-z, 1.0])
 
-    def _cells(self, group: NodeGroup, spacing: float) -> CandidateCells:
+    def _candidate_cells(self, group: NodeGroup, spacing: float) -> CandidateCells:
         """Divide the surroundings of a group into cells, and list the shots that may see each."""
         shot_position = self.position[group.shots] - group.aim
         edge = self.extent / _CELLS
         if self.by_path_end:
             centres, margin = shot_position, self.extent / -self.beam.axis[2]
         else:
-            # Light enters within two spacings of a node: the width of a spline.
+            # Light enters within two spacings of a node: half the width of a spline.
             centres, margin = group.node_position, 2.0 * spacing
         low, high = centres.min(axis=0) - margin, centres.max(axis=0) + margin
         x, y = (low[k] + edge * (np.arange(math.ceil((high[k] - low[k]) / edge)) + 0.5) for k in range(2))
@@ -127,11 +130,15 @@ class ViewGeometry(NamedTuple):
         return CandidateCells(low, edge, (len(x), len(y)), shots)
 
     def views_of_group(self, group: NodeGroup, spacing: float) -> ShotViews:
-        """Return the arrays for the shots of a group, padded with the number of a shot that sees nothing."""
-        low, edge, (nx, ny), shots = self._cells(group, spacing)
-        no_shot, n_candidates = self.max_shots, self.cells[2]
+        """Return the arrays for the shots of a group, padded with the number of a shot that sees nothing.
+
+        1. Candidates of each cell. 2. Positions of the shots from the aim point, and one that no light comes
+        to. 3. Coefficients of the shots at nodes. 4. Shots whose centre is in the group.
+        """
+        low, edge, (nx, ny), shots = self._candidate_cells(group, spacing)
+        no_shot, n_candidates = self.max_shots, self.cell_shape[2]
         rows = [[*row, *[no_shot] * (n_candidates - len(row))] for row in shots]
-        candidates = np.full(self.cells, no_shot, np.int32)
+        candidates = np.full(self.cell_shape, no_shot, np.int32)
         candidates[:nx, :ny] = np.array(rows, np.int32).reshape(nx, ny, n_candidates)
         position = np.full((self.max_shots + 1, 2), _NOWHERE)
         position[: len(group.shots)] = self.position[group.shots] - group.aim
@@ -143,7 +150,8 @@ class ViewGeometry(NamedTuple):
             position=jnp.asarray(position, float),
             radius=jnp.asarray(self.beam.radius, float),
             view_radius=None if self.view_radius is None else jnp.asarray(self.view_radius, float),
-            # Nodes together give the density 1 / spacing^2 to light of the energy 1 each: it is 1 / p.
+            # 1 / p, m2: the light that enters has the density p = 1 / spacing^2, as one node of the energy 1
+            # has that area.
             area=jnp.asarray(spacing**2, float),
             cell_origin=jnp.asarray(low, float),
             cell_size=jnp.asarray(edge, float),

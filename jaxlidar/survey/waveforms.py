@@ -25,22 +25,24 @@ from jaxlidar.survey.truths import Truths
 class Waveforms(eqx.Module):
     """The waveforms of all shots of a survey, on one time axis. `waves[i]` is the `Waveform` of shot i.
 
-    - `time`: (bins,) ns, centres of the samples, after the two-way travel time of each shot's aim point.
+    - `time`: (samples,) ns, centres of the samples, relative to the two-way travel time of each shot's aim
+      point.
     - `wavelength`: (wavelengths,) nm.
-    - `reflectance`, `stderr`, `energy`, `recorded`: (shots, wavelengths, bins), and
+    - `reflectance`, `stderr`, `energy`, `recorded`: (shots, wavelengths, samples), and
     - `components`, dict of the same shape: as those of `Waveform`.
     - `neglected`, `lost`: (shots, wavelengths), `energy_budget`, `energy_budget_stderr`, dicts of the same
       shape: as those of `Waveform`.
     - `position`: (shots, 2) m, `zenith`, `azimuth`: (shots,) degrees, as those of `Survey`.
     - `ground_height`: (shots,) m, true height of the ground where the beam axis meets it; NaN where it meets
       none.
-    - `off_map`: (shots,) fraction of the light that falls beside the voxel map.
+    - `off_map`: (shots,) fraction of the light that falls outside the voxel map.
     - `error`: (shots,) relative error, as `simulate` defines it. `photons`: (shots,) number traced.
     - `truth`: a `Truths`, what each beam meets in the scene; None unless it was asked for.
-    - `info`: dict of "rtol", "orders" followed, "seconds" that it took, and whether light was "shared". If it
-      was, also the spacing in m of the "grid" of nodes at which it entered, and a bound on the fraction of
-      samples that "parallel light" changes. If there is a file, also "problem": digests of all that the
-      waveforms depend on.
+    - `info`: dict of "rtol", "orders" followed, "seconds" that it took, and whether light was "shared" (over
+      `SceneParts`: in all tiles). Over one scene with shared light, also the spacing in m of the "grid" of
+      nodes at which it entered, and a bound on the fraction of samples that "parallel light" changes. Over
+      `SceneParts`, also the number of "parts", the "margin" in m around tiles, and the "margin of all light",
+      which loses none. If there is a file, also "problem": digests of all that the waveforms depend on.
 
     **Example:**
 
@@ -56,13 +58,13 @@ class Waveforms(eqx.Module):
       1064 nm: apparent reflectance 0.394 to 0.394, median 0.394
     """
 
-    time: Float[np.ndarray, " bins"]
+    time: Float[np.ndarray, " samples"]
     wavelength: Float[np.ndarray, " wavelengths"]
-    reflectance: Float[np.ndarray, "shots wavelengths bins"]
-    stderr: Float[np.ndarray, "shots wavelengths bins"]
-    energy: Float[np.ndarray, "shots wavelengths bins"]
-    recorded: Float[np.ndarray, "shots wavelengths bins"]
-    components: dict[str, Float[np.ndarray, "shots wavelengths bins"]]
+    reflectance: Float[np.ndarray, "shots wavelengths samples"]
+    stderr: Float[np.ndarray, "shots wavelengths samples"]
+    energy: Float[np.ndarray, "shots wavelengths samples"]
+    recorded: Float[np.ndarray, "shots wavelengths samples"]
+    components: dict[str, Float[np.ndarray, "shots wavelengths samples"]]
     neglected: Float[np.ndarray, "shots wavelengths"]
     lost: Float[np.ndarray, "shots wavelengths"]
     energy_budget: dict[str, Float[np.ndarray, "shots wavelengths"]]
@@ -97,7 +99,7 @@ class Waveforms(eqx.Module):
             low, middle, high = np.quantile(sums, (0.0, 0.5, 1.0))
             lines.append(f"  {w:g} nm: apparent reflectance {low:.3g} to {high:.3g}, median {middle:.3g}")
         if (n_off_map := int(np.sum(self.off_map >= NOTABLE_FRACTION))) > 0:
-            lines.append(f"  {n_off_map} lie partly beside the voxel map")
+            lines.append(f"  {n_off_map} lie partly outside the voxel map")
         light = "which share light, " if self.info.get("shared") else ""
         lines.append(
             f"  {light}{self.info.get('seconds', 0.0):.2g} s, relative errors up to {self.error.max():.2g}"
@@ -191,7 +193,7 @@ keep_as_netcdf(
     Waveforms,
     "simulated lidar waveforms of a survey",
     {
-        "time": ("ns", "time of arrival after the two-way travel time of the aim point"),
+        "time": ("ns", "time of arrival relative to the two-way travel time of the aim point"),
         "wavelength": ("nm", "wavelength of the lidar"),
         "reflectance": ("1", "apparent reflectance per sample"),
         "stderr": ("1", "standard error of the apparent reflectance"),
@@ -206,11 +208,11 @@ keep_as_netcdf(
         "zenith": ("degree", "angle between the beam and the vertical"),
         "azimuth": ("degree", "direction in which the beam travels, clockwise from north"),
         "ground_height": ("m", "height of the ground where the beam axis meets it"),
-        "off_map": ("1", "fraction of the light that falls beside the voxel map"),
+        "off_map": ("1", "fraction of the light that falls outside the voxel map"),
         "error": ("1", "relative error of the waveform"),
         "photons": ("1", "photons traced"),
     },
-    dimensions={"shots": "shot", "bins": "time", "wavelengths": "wavelength", "2": "axis"},
+    dimensions={"shots": "shot", "samples": "time", "wavelengths": "wavelength", "2": "axis"},
     items={"components": "component", "energy_budget": "fate", "energy_budget_stderr": "fate"},
     coordinates={"zenith": "shot", "azimuth": "shot"},
     former_names={"energy_budget": "ledger", "energy_budget_stderr": "ledger_stderr"},

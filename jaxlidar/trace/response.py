@@ -249,7 +249,7 @@ def footprint_rays(
     scene: DeviceScene, key: PRNGKeyArray, ray_slice: RaySlice = ALL_RAYS
 ) -> tuple[tuple[Float[Array, "rays"], Float[Array, "rays"]], Float[Array, "rays"]]:
     """Return the positions of the footprint's rays across the beam, and their fractions of its energy."""
-    if scene.config.smooth_footprint:
+    if scene.config.uses_quadrature:
         return product_rule(scene.beam)
     # Shifted at random, rays are an unbiased sample of the footprint; not shifted, they are the same for
     # every key.

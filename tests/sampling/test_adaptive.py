@@ -82,9 +82,9 @@ def test_time_and_interrupts_end_it():
 
 
 def test_steps_follow_the_order_of_convergence():
-    assert StepRule(order=0.5, max_growth=100.0).next_size(10, 0.04, 0.01) == 160
-    assert StepRule(order=0.75, max_growth=100.0).next_size(1, 0.08, 0.01) == 16
-    assert StepRule(order=0.75, max_growth=8.0).next_size(1, 0.08, 0.01) == 8
+    assert StepRule(convergence_rate=0.5, max_growth=100.0).next_size(10, 0.04, 0.01) == 160
+    assert StepRule(convergence_rate=0.75, max_growth=100.0).next_size(1, 0.08, 0.01) == 16
+    assert StepRule(convergence_rate=0.75, max_growth=8.0).next_size(1, 0.08, 0.01) == 8
     assert StepRule(max_growth=1.0, min_step=4).next_size(8, 1.0, 0.1) == 12
     # Few batches have a wide Student's factor, which more of them have not.
     plain, widened = (StepRule(max_growth=100.0, widened=w).next_size(8, 0.1, 0.01) for w in (False, True))

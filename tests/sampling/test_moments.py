@@ -44,7 +44,7 @@ def test_compiled_moments_are_those_on_the_host(precision):
 
     @jax.jit
     def compiled(batches):
-        empty = RunningMoments.compiled(jax.eval_shape(lambda: batches[0]))
+        empty = RunningMoments.in_program(jax.eval_shape(lambda: batches[0]))
         return jax.lax.fori_loop(0, len(batches), lambda n, m: m.update(batches[n]), empty)
 
     moments, close = compiled(batches), {"rtol": 1e-5 if precision == "float32" else 1e-12}

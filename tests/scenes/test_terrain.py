@@ -138,7 +138,7 @@ def test_a_plane_traced_as_heights():
     """Every ray meets the same slope, and the mean height is that on the axis."""
     flat = jl.Scene(ground=jl.Terrain(SLOPE * X, 1.0, (-10.0, -8.0), 0.4))
     plan = jl.plan(WIDE, flat, effects={"relief": True}, max_orders=1)
-    assert not plan.config.smooth_footprint
+    assert not plan.config.uses_quadrature
     mean, stderr = batch_mean(WIDE, flat, plan, seed=1, count=8, quantity=moments)
     assert mean[0] == pytest.approx(0.4 * np.cos(np.deg2rad(15.0)), rel=1e-4)
     spread = 2.0 * 0.5 * SLOPE / jl.SPEED_OF_LIGHT
@@ -215,7 +215,7 @@ def test_a_raster_of_reflectance():
     off_centre = dataclasses.replace(lidar, position=(2.5, 0.0))
     plan = jl.plan(off_centre, ramp, **SINGLE_SAMPLE)
     assert plan.orders == 1
-    assert not plan.config.smooth_footprint
+    assert not plan.config.uses_quadrature
     wave = jl.simulate(off_centre, ramp, key=KEY, plan=plan)
     assert float(wave.reflectance.sum()) == pytest.approx(0.35, rel=1e-3)
     assert float(wave.energy_budget["absorbed by ground"][0]) == pytest.approx(0.65, rel=1e-3)
