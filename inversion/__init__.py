@@ -40,7 +40,7 @@ import warnings
 from typing import Any
 
 from inversion import files
-from inversion.fit.fit_record import Step
+from inversion.fit.fit_summary import Step
 from inversion.fit.identifiability import CramerRao, Profile, cramer_rao, profile_likelihood
 from inversion.fit.priors import LogNormal, Smooth
 from inversion.fit.profiles import AveragingKernel, put_profile

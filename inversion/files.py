@@ -16,11 +16,11 @@ _QUANTITIES = {
         _UNIT_OF_UNKNOWN,
         "standard error of an unknown, widened by misfit and the spread over starts",
     ),
-    "prior_share": ("1", "fraction of the information on an unknown that is the prior's"),
+    "prior_share": ("1", "share of the prior in an estimate: one less the diagonal of the averaging kernel"),
     "at_bound": ("1", "1 for an unknown at one of its bounds"),
     "covariance": (_UNIT_OF_UNKNOWN, "covariance of the unknowns, in the order of labels"),
     "reduced_chi2": ("1", "sum of squared residuals over the degrees of freedom"),
-    "second_minimum": ("1", "rise in chi-squared to a second minimum, in units of independent samples"),
+    "second_minimum": ("1", "rise in chi-squared to a second minimum, for independent samples"),
     "averaging": (
         "ratio of the units of the unknowns",
         "derivatives of the estimates in the truth, in the order of labels",
@@ -37,7 +37,7 @@ keep_as_netcdf(
         **_QUANTITIES,
         "simulation_error": (_UNIT_OF_UNKNOWN, "part of the standard error from the simulation's noise"),
         "correlation": ("1", "correlation of the unknowns, in the order of labels"),
-        "residuals": ("1", "observed minus fitted over its standard deviation"),
+        "residuals": ("1", "observed minus fitted, whitened by the covariance of the noise"),
     },
     dimensions={"n": "labels", "bins": "time", "wavelengths": "wavelength"},
 )
@@ -48,7 +48,7 @@ keep_as_netcdf(
         **_QUANTITIES,
         "converged": ("1", "1 for a fit that ended at a minimum"),
         "steps": ("1", "waveforms simulated, each with its Jacobian"),
-        "fitted": ("1", "fitted apparent reflectance per sample, without the scale"),
+        "fitted": ("1", "fitted apparent reflectance per sample, before the recorder"),
     },
     dimensions={"n": "labels", "footprints": "footprint", "bins": "time", "wavelengths": "wavelength"},
 )

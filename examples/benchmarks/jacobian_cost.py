@@ -21,7 +21,7 @@ from _common import best, machine, new_figure, options, print_table, race, save_
 
 import inversion
 import jaxlidar as jl
-from inversion.fit.model import Model
+from inversion.fit.model import ForwardModel
 from inversion.fit.unknowns import bind_unknowns
 from jaxlidar.planning.plan import MIN_BATCHES
 
@@ -110,7 +110,7 @@ def main() -> None:
 
     unknown = inversion.Unknown(apply=grow, name="layers", bounds=(0.1, 4.0), start=jnp.ones(LAYERS))
     scene = scene_at(*START, extinction)
-    model = Model(lidar, scene, plan, bind_unknowns([unknown], scene), jax.random.key(0))
+    model = ForwardModel(lidar, scene, plan, bind_unknowns([unknown], scene), jax.random.key(0))
 
     keys = list(jax.random.split(jax.random.key(0), MIN_BATCHES))
     pool = ThreadPoolExecutor(os.cpu_count() or 1)

@@ -1,13 +1,14 @@
 r"""Observed waveforms and their noise.
 
-The noise of the samples of a record has the covariance
+The difference of a record and its simulation has the covariance
 
     C = S (R + B B^T) S,   S = diag(sigma),
 
-with sigma the standard deviations of independent errors, R their correlation, and S B the errors that several
-samples share, such as those of a noisy recorded pulse: column k is the change of the record by one standard
-deviation of shared error k. With R + B B^T = L L^T (Cholesky), L^-1 S^-1 whitens differences: it makes them
-independent and of unit variance.
+with sigma the standard deviation of each sample's separate error, R the correlation of these errors between
+samples, and S B the errors common to several samples, such as those of a noisy recorded pulse: column k is
+the change of the record by one standard deviation of common error k. sigma holds the noise of record and
+simulation; R is applied to both, which is an approximation. With R + B B^T = L L^T (Cholesky), L^-1 S^-1
+whitens differences: it makes them independent and of unit variance.
 """
 
 import dataclasses
@@ -35,15 +36,15 @@ class ObservedWaveform(NamedTuple):
 
 
 class SampleNoise(NamedTuple):
-    """Noise of the fitted samples of a record: see the module.
+    """Noise of the fitted samples, of record and simulation: see the module.
 
-    - `sigma_independent`: (samples,) standard deviation of the errors that no other sample shares.
-    - `shared_errors`: (samples, errors) change of the samples by one standard deviation of each shared error,
-      or None.
-    - `correlation`: (samples, samples) of the errors of `sigma_independent`, or None if there is none.
+    - `sigma_unshared`: (samples,) standard deviation of each sample's separate error.
+    - `shared_errors`: (samples, errors) change of the samples by one standard deviation of each error that
+      they share, or None.
+    - `correlation`: (samples, samples) of the separate errors between samples, or None if there is none.
     """
 
-    sigma_independent: Float[np.ndarray, " samples"]
+    sigma_unshared: Float[np.ndarray, " samples"]
     shared_errors: Float[np.ndarray, "samples errors"] | None = None
     correlation: Float[np.ndarray, "samples samples"] | None = None
 
@@ -51,22 +52,23 @@ class SampleNoise(NamedTuple):
     def sigma(self) -> Float[np.ndarray, " samples"]:
         """Standard deviation of the samples, shared errors included."""
         if self.shared_errors is None:
-            return self.sigma_independent
-        return np.sqrt(self.sigma_independent**2 + np.sum(self.shared_errors**2, axis=1))
+            return self.sigma_unshared
+        return np.sqrt(self.sigma_unshared**2 + np.sum(self.shared_errors**2, axis=1))
 
     def whiten(self, x: Float[np.ndarray, "samples ..."]) -> Float[np.ndarray, "samples ..."]:
         """Return differences, or columns of them, made independent and of unit variance."""
         # Rows are samples; x may have any number of columns.
-        scaled = x / self.sigma_independent.reshape(-1, *(1,) * (x.ndim - 1))
+        scaled = x / self.sigma_unshared.reshape(-1, *(1,) * (x.ndim - 1))
         if self.shared_errors is None and self.correlation is None:
             return scaled
-        covariance = np.eye(self.sigma_independent.size) if self.correlation is None else self.correlation
+        # Over sigma_unshared.
+        scaled_covariance = np.eye(self.sigma_unshared.size) if self.correlation is None else self.correlation
         if self.shared_errors is not None:
-            shared = self.shared_errors / self.sigma_independent[:, None]
-            covariance = covariance + shared @ shared.T
+            shared = self.shared_errors / self.sigma_unshared[:, None]
+            scaled_covariance = scaled_covariance + shared @ shared.T
         # Not finite differences, of a simulation that failed, pass through: the solver rejects them.
-        root = np.linalg.cholesky(covariance)
-        return linalg.solve_triangular(root, scaled, lower=True, check_finite=False)
+        cholesky = np.linalg.cholesky(scaled_covariance)
+        return linalg.solve_triangular(cholesky, scaled, lower=True, check_finite=False)
 
 
 def neighbour_correlation(
@@ -104,7 +106,14 @@ def with_fixed_window(lidar: Lidar) -> Lidar:
 def as_observed(
     observed: object, time: object, noise: object, noise_floor: float, lidar: Lidar
 ) -> ObservedWaveform:
-    """Read and check the observation passed to `retrieve`. **Raises:** ValueError if it is inadmissible."""
+    """Read and check the observation passed to `retrieve`.
+
+    1. Take times and reflectances from a `Waveform`, or from arrays.
+    2. Leave out samples of infinite noise.
+    3. Raise the noise of the others to the floor.
+
+    **Raises:** ValueError if the observation is inadmissible.
+    """
     if isinstance(observed, Waveform):
         if time is not None:
             raise ValueError("time is given, but observed is a Waveform, which has its own")
@@ -136,7 +145,8 @@ def as_observed(
         raise ValueError("noise is infinite throughout, which leaves no sample to fit")
     check_range("observed", y[is_fitted])
     check_range("noise_floor", noise_floor, 0.0, 1.0)
-    # The standard error of a simulated bin that no photon reached is zero; the floor keeps its weight finite.
+    # The simulation's standard error is zero in bins that no photon reached: with a record without noise,
+    # their weight would be infinite. The floor also replaces stated noise below it.
     peak = np.max(np.abs(np.where(is_fitted, y, 0.0)), axis=1, keepdims=True)
     sigma = np.maximum(sigma, noise_floor * peak)
     if not np.all(sigma > 0):

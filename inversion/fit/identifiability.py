@@ -1,11 +1,12 @@
 r"""Identifiability of unknowns from waveforms: Cramer-Rao bounds and profile likelihoods.
 
-**Cramer-Rao bound.** For independent normal noise sigma and priors of precision P, the Fisher information at
-x is
+**Cramer-Rao bound.** For independent normal noise sigma, the Fisher information at x is J^T diag(1/sigma^2)
+J, J = dw / dx, and no unbiased estimate has a covariance below its inverse. With priors of precision P,
 
-    I = J^T diag(1 / sigma^2) J + P,   J = dw / dx,
+    I = J^T diag(1 / sigma^2) J + P
 
-and no unbiased estimate has a covariance below I^-1.
+is the Bayesian information at x. Its inverse is the posterior covariance of the linearised problem (the bound
+of van Trees 1968, Detection, Estimation and Modulation Theory, averages I over the prior).
 
 **Profile likelihood.** With one unknown fixed at v, chi-squared is minimised over the others:
 
@@ -28,7 +29,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from inversion.fit.data import as_noise, as_numbers, as_sample_times, with_fixed_window
-from inversion.fit.model import Model
+from inversion.fit.model import ForwardModel
 from inversion.fit.planning import check_samples, checked_plan, plan_for_bounds, trace_sizes
 from inversion.fit.prior_residuals import PriorResiduals, fixed_priors
 from inversion.fit.result import Retrieval
@@ -60,14 +61,13 @@ class CramerRao(eqx.Module):
     Rows of the matrices are the flattened unknowns, named by `labels`, in natural units. `print(bound)` shows
     a summary, with pairs of unknowns whose correlation exceeds 0.95.
 
-    - `stderr`: by name; infinite for unknowns that the waveforms do not constrain, alone or in combination
-      with others.
-    - `covariance`: (n, n) inverse of the Fisher information, priors included; infinite variances as in
-      `stderr`.
+    - `stderr`: by name; infinite for unknowns that neither waveforms nor priors constrain to within their
+      bounds, alone or in combination with others.
+    - `covariance`: (n, n) inverse of `information`; infinite variances as in `stderr`.
     - `correlation`: (n, n).
-    - `information`: (n, n) Fisher information, priors included.
+    - `information`: (n, n) Fisher information; with priors, their precision is added (Bayesian information).
     - `labels`: names of the rows.
-    - `undetermined`: labels of the unknowns that the waveforms do not constrain.
+    - `undetermined`: labels of the unknowns with an infinite `stderr`.
 
     **Example:**
 
@@ -119,9 +119,10 @@ def cramer_rao(
 ) -> CramerRao:
     """Cramer-Rao bounds of the unknowns of a scene: the smallest standard errors, before data are recorded.
 
-    For independent normal noise, the Fisher information is J^T diag(1/noise^2) J plus that of the priors,
-    with J the derivatives of the waveform at the scene's values. An unknown with a start of its own
-    (`Unknown(start=)`) is taken there.
+    For independent normal noise, the Fisher information is J^T diag(1/noise^2) J, with J the derivatives of
+    the waveform at the scene's values. With priors, their precision is added: the result is then the
+    posterior covariance of the linearised problem, and no bound of unbiased estimates. An unknown with a
+    start of its own (`Unknown(start=)`) is taken there.
 
     **Arguments:**
 
@@ -169,8 +170,8 @@ def cramer_rao(
     if not np.all(sigma > 0):
         raise ValueError(f"noise = {np.min(sigma):g} is outside the admissible range (0, inf]")
     start = flat_start(bound_unknowns)
-    # All batches: the Jacobian's noise enters the bound.
-    evaluation = Model(lidar, scene, plan, bound_unknowns, key)(start)
+    # All batches, as noise of the Jacobian would falsify the bound.
+    evaluation = ForwardModel(lidar, scene, plan, bound_unknowns, key)(start)
     jacobian = (evaluation.jacobian / sigma[..., None]).reshape(-1, start.size)
     prior_jacobian = priors(start)[1]
     precision = prior_jacobian.T @ prior_jacobian
@@ -192,7 +193,7 @@ def cramer_rao(
 
 @final
 class Profile(eqx.Module):
-    """The result of `profile_likelihood`: the best fit at each of several values of one unknown.
+    """The result of `profile_likelihood`: the likelihood profile of one unknown, with the fit at each value.
 
     - `values`: (points,) values of the unknown.
     - `chi2`: (points,) chi-squared, priors included, less its minimum.
@@ -231,20 +232,21 @@ class Profile(eqx.Module):
         **Raises:** ValueError for a `level` outside (0, 1).
         """
         check_range("level", level, 0.0, 1.0, low_open=True, high_open=True)
-        # Chi-squared of one degree of freedom is the square of a normal number.
-        limit = float(jax.scipy.special.ndtri(0.5 * (1.0 + level)))
+        # Chi-squared of one degree of freedom is the square of a normal number: its root has a normal
+        # quantile.
+        z_limit = float(jax.scipy.special.ndtri(0.5 * (1.0 + level)))
         # Near its minimum chi-squared is a parabola, and its root linear in the unknown.
-        root, best = np.sqrt(self.chi2), int(np.argmin(self.chi2))
+        root_chi2, best = np.sqrt(self.chi2), int(np.argmin(self.chi2))
 
         def end(points: range) -> float:
             # Outwards from the minimum to the first crossing: a second minimum further out does not count.
             for inner, outer in itertools.pairwise(points):
-                if root[outer] > limit:
-                    fraction = (limit - root[inner]) / (root[outer] - root[inner])
+                if root_chi2[outer] > z_limit:
+                    fraction = (z_limit - root_chi2[inner]) / (root_chi2[outer] - root_chi2[inner])
                     return float(self.values[inner] + fraction * (self.values[outer] - self.values[inner]))
             return float("inf") * (-1 if points.step < 0 else 1)
 
-        return end(range(best, -1, -1)), end(range(best, len(root)))
+        return end(range(best, -1, -1)), end(range(best, len(root_chi2)))
 
 
 def profile_likelihood(

@@ -12,16 +12,17 @@ applied to response(x). A column dw/dx_k of the Jacobian is computed
 
 If all unknowns are optical, photons are traced once.
 
-**Scores.** They are exact and take less than half of the time of a tangent if
+**Scores.** They are unbiased, though no derivative of the sampled waveform, and take less than half of the
+time of a tangent if
 
 - the response keeps scattering histories apart from optics and no leaf transmits straight on, so that one
   trace serves all wavelengths;
 - wavelengths and columns are few, as every collision adds to all of them; off nadir, two columns or more.
 
 **Common random numbers.** All evaluations of a fit use the same random keys, so that w is a smooth function
-of x. An evaluation is the mean of batches of photons, each with its own key; their spread gives the
-simulation's own noise. The first few batches are an evaluation with more noise, for fits that are far from
-their end.
+of x except for small jumps. An evaluation is the mean of batches of photons, each with its own key; their
+spread gives the simulation's own noise. The first few batches are an evaluation with more noise, for fits
+that are far from their end.
 
 **Source:** score function: Glynn (1990), Comm. ACM 33(10), 75; common random numbers and sample averages:
 Shapiro, Dentcheva and Ruszczynski (2009), Lectures on Stochastic Programming, chapter 5.
@@ -38,6 +39,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from inversion.fit.planning import N_BATCHES
 from inversion.fit.unknowns import BoundUnknown, Dependence, Setter, set_values
 from jaxlidar import (
     Lidar,
@@ -53,7 +55,6 @@ from jaxlidar import (
 )
 from jaxlidar.extend import ONE_CORE, concrete, side_by_side
 from jaxlidar.planning.memory import format_bytes, memory_limit, scored_bytes
-from jaxlidar.planning.plan import MIN_BATCHES
 from jaxlidar.spectral.apply_optics import derivatives_to_samples, make_waveform_model, setup_optics
 from jaxlidar.trace.device_scene import build_device_scene
 from jaxlidar.trace.extinction_slopes import ExtinctionSlopes
@@ -75,8 +76,10 @@ N_PROBES = 4
 
 
 class JacobianMethods(NamedTuple):
-    """The method for each unknown: its setter's `dependence`, which says "geometric" if scores do not serve.
+    """The method for each unknown.
 
+    - `setters`: their `dependence` names the method here: "geometric" (tangents) also for unknowns that act
+      through less, where the cheaper method cannot be used.
     - `columns_per_voxel`: the most columns that move the extinction of one voxel; 0 without scores.
     - `score_bytes`: memory of the scores.
     """
@@ -89,7 +92,11 @@ class JacobianMethods(NamedTuple):
 def choose_jacobian_methods(
     lidar: Lidar, scene: Scene, plan: Plan, unknowns: Sequence[BoundUnknown]
 ) -> JacobianMethods:
-    """Choose scores for unknowns that change extinction, if they are exact and pay, and tangents if not."""
+    """Choose scores for unknowns that change extinction, if they are valid and pay, and tangents if not.
+
+    Scores are valid if the plan keeps histories apart from optics, and no leaf transmits straight on. They
+    pay for some columns, at few wavelengths, if they take no more than half of the memory.
+    """
     setters = tuple(u.setter for u in unknowns)
     as_tangents = tuple(
         setter._replace(dependence="geometric") if setter.dependence == "extinction" else setter
@@ -117,7 +124,9 @@ def choose_jacobian_methods(
 
 
 def max_columns_per_voxel(scene: Scene, unknowns: Sequence[BoundUnknown]) -> int:
-    """Return the most columns that move the extinction of one voxel: few if that is certain, else all.
+    """Return the most columns that move the extinction of one voxel: a small number if probes show it.
+
+    Else it is the number of all columns, which is always right.
 
     Few columns (`DENSE_COLUMNS`) are not probed. More are probed at the start and at random points between
     the bounds of all unknowns, in the scene and with plants in every voxel: scenes that are fitted together
@@ -172,10 +181,10 @@ def tangents_per_pass(plan: Plan, columns: int, reserved: float = 0.0) -> int:
 
     **Raises:** ValueError if a single column takes more memory than the plan may.
     """
-    fitting, limit = columns, memory_limit(plan.scope.max_memory) - reserved
-    while fitting > 1 and plan.jacobian_memory(fitting) > limit:
-        fitting -= 1
-    if columns and (size := plan.jacobian_memory(fitting)) > limit:
+    n_at_once, limit = columns, memory_limit(plan.scope.max_memory) - reserved
+    while n_at_once > 1 and plan.jacobian_memory(n_at_once) > limit:
+        n_at_once -= 1
+    if columns and (size := plan.jacobian_memory(n_at_once)) > limit:
         raise ValueError(
             f"derivatives in the geometric unknowns would take about {format_bytes(size)} of memory, one at "
             f"a time; admissible is max_memory = {limit / 1e9:.3g} GB of the plan: follow fewer orders "
@@ -184,15 +193,15 @@ def tangents_per_pass(plan: Plan, columns: int, reserved: float = 0.0) -> int:
     if not columns:
         return 0
     # Ceiling division, twice: the number of passes, then columns per pass.
-    passes = -(-columns // fitting)
+    passes = -(-columns // n_at_once)
     return -(-columns // passes)
 
 
-class ForwardModel(eqx.Module):
+class SimulationInputs(eqx.Module):
     """Inputs of a simulation, except the values of the unknowns.
 
     - `tangents_per_pass`: geometric columns of the Jacobian that are pushed through the trace together.
-    - `columns_per_voxel`: the most unknowns that move the extinction of one voxel; 0 without scores.
+    - `columns_per_voxel`: the most columns that move the extinction of one voxel; 0 without scores.
     """
 
     lidar: Lidar
@@ -223,9 +232,9 @@ class ForwardModel(eqx.Module):
         return flat, setup_at
 
 
-def _extinction_slopes(model: ForwardModel, values: Values) -> ExtinctionSlopes | None:
-    """Return the derivatives of extinction by the unknowns that change it only; all batches share them."""
-    flat, setup_at = model.as_function_of("extinction", values)
+def _extinction_slopes(inputs: SimulationInputs, values: Values) -> ExtinctionSlopes | None:
+    """Return dk/dx per voxel, k the extinction, of the unknowns that change it only; all batches share it."""
+    flat, setup_at = inputs.as_function_of("extinction", values)
     if not flat.size:
         return None
 
@@ -238,24 +247,38 @@ def _extinction_slopes(model: ForwardModel, values: Values) -> ExtinctionSlopes 
     leaf, bark = derivatives(jnp.eye(flat.size, dtype=flat.dtype))
     setup = setup_at(flat)
     device_scene = build_device_scene(setup, derivatives="forward")
-    return make_slopes(device_scene, leaf, bark, setup_optics(setup), model.columns_per_voxel)
+    return make_slopes(device_scene, leaf, bark, setup_optics(setup), inputs.columns_per_voxel)
 
 
 def _trace_with_slopes(
     setup: Setup, slopes: ExtinctionSlopes, key: PRNGKeyArray
-) -> tuple[Response, Float[Array, "columns wavelengths samples"]]:
-    """Trace one batch. Return its response, and the derivatives of its total by scores."""
+) -> tuple[Response, Float[Array, "columns wavelengths bins"]]:
+    """Trace one batch. Return its response, and the derivatives of its reflectance by scores."""
     device_scene = dataclasses.replace(build_device_scene(setup, derivatives="forward"), slopes=slopes)
     response, fine_columns = trace_with_scores(device_scene, setup_optics(setup), key)
     return response, derivatives_to_samples(fine_columns, make_waveform_model(setup))
 
 
+class TracedBatch(NamedTuple):
+    """Response of one batch, its reflectance, and the columns of its Jacobian that need the trace.
+
+    These are the geometric ones, then those by extinction. Optical columns are computed later from the mean
+    response of all batches.
+    """
+
+    response: Response
+    reflectance: Float[Array, "wavelengths bins"]
+    columns: Float[Array, "columns wavelengths bins"]
+
+
 def _trace_batch(
-    model: ForwardModel, values: Values, key: PRNGKeyArray, slopes: ExtinctionSlopes | None
-) -> tuple[Response, Float[Array, "wavelengths bins"], Float[Array, "columns wavelengths bins"]]:
-    """Trace one batch. Return its response, total, and derivatives: geometric ones, then by extinction."""
-    flat, setup_at = model.as_function_of("geometric", values)
-    # Optical columns are left out: they are computed later from the mean response of all batches.
+    inputs: SimulationInputs, values: Values, key: PRNGKeyArray, slopes: ExtinctionSlopes | None
+) -> TracedBatch:
+    """Trace one batch, with its derivatives.
+
+    `slopes`: dk/dx of the unknowns of extinction, or None without scores.
+    """
+    flat, setup_at = inputs.as_function_of("geometric", values)
 
     # The response is an auxiliary output: its tangents, with all histories, would take far more memory than
     # those of the total.
@@ -267,10 +290,12 @@ def _trace_batch(
             response, score_columns = _trace_with_slopes(setup, slopes, key)
         return total_reflectance(response, setup), (response, score_columns)
 
-    total, columns, (response, score_columns) = _value_and_tangents(simulate, flat, model.tangents_per_pass)
+    reflectance, columns, (response, score_columns) = _value_and_tangents(
+        simulate, flat, inputs.tangents_per_pass
+    )
     if score_columns is not None:
         columns = jnp.concatenate([columns, score_columns])
-    return response, total, columns
+    return TracedBatch(response, reflectance, columns)
 
 
 def _value_and_tangents(
@@ -300,30 +325,31 @@ def _value_and_tangents(
     return value, columns[: flat.size], auxiliary
 
 
+# One core each: batches run side by side on threads.
 _compiled_trace_batch = eqx.filter_jit(_trace_batch, **ONE_CORE)
 _compiled_slopes = eqx.filter_jit(_extinction_slopes)
 
 
 @eqx.filter_jit
 def _apply_optics(
-    model: ForwardModel, values: Values, response: Response
+    inputs: SimulationInputs, values: Values, response: Response
 ) -> tuple[Float[Array, "wavelengths bins"], Float[Array, "columns wavelengths bins"]]:
-    """Return the total of a response, and its derivatives by the optical unknowns."""
-    flat, setup_at = model.as_function_of("optical", values)
+    """Return the reflectance of a response, and its derivatives by the optical unknowns."""
+    flat, setup_at = inputs.as_function_of("optical", values)
 
-    def total(flat: Array) -> Array:
+    def reflectance(flat: Array) -> Array:
         return total_reflectance(response, setup_at(flat))
 
     if not flat.size:
-        value = total(flat)
+        value = reflectance(flat)
         return value, jnp.zeros((0, *value.shape), value.dtype)
-    push = jax.vmap(lambda t: jax.jvp(total, (flat,), (t,)), out_axes=(None, 0))
+    push = jax.vmap(lambda t: jax.jvp(reflectance, (flat,), (t,)), out_axes=(None, 0))
     return push(jnp.eye(flat.size, dtype=flat.dtype))
 
 
 @eqx.filter_jit
-def _as_waveform(model: ForwardModel, values: Values, response: Response, stderr: Array) -> Waveform:
-    return waveform_of(response, model.setup(values), stderr=stderr)
+def _as_waveform(inputs: SimulationInputs, values: Values, response: Response, stderr: Array) -> Waveform:
+    return waveform_of(response, inputs.setup(values), stderr=stderr)
 
 
 @jax.jit
@@ -332,49 +358,49 @@ def _mean_response(responses: list[Any]) -> Any:
 
 
 def evaluate_scene(
-    model: ForwardModel, values: Values, keys: Array, n_batches: Int[Array, ""]
+    inputs: SimulationInputs, values: Values, keys: Array, n_batches: Int[Array, ""]
 ) -> tuple[
     Float[Array, "wavelengths bins"],
     Float[Array, "columns wavelengths bins"],
     Float[Array, "batches wavelengths bins"],
 ]:
-    """Return total, derivatives and batches of one scene: a pure function, to be mapped over scenes.
+    """Return reflectance, derivatives and batches of one scene: a pure function, to be mapped over scenes.
 
     Columns are the geometric ones, then those by extinction, then the optical ones. `keys` has a random key
     for each batch of photons. Only the first `n_batches` are traced; the rows of the others are zero. As
     their number is data, one compiled program serves pilot evaluations and full ones.
     """
-    slopes = _extinction_slopes(model, values)
+    slopes = _extinction_slopes(inputs, values)
     # Under jit the batch is traced by JAX once for shapes and loop alike.
-    trace_batch = jax.jit(lambda key: _trace_batch(model, values, key, slopes))
+    trace_batch = jax.jit(lambda key: _trace_batch(inputs, values, key, slopes))
 
     # One batch after the other: batches side by side would multiply the memory that the plan was made for.
     def add_batch(n: Array, sums: Any) -> Any:
-        response, total, columns = trace_batch(keys[n])
-        summed, totals = sums
-        return jax.tree.map(jnp.add, summed, (response, columns)), totals.at[n].set(total)
+        response, reflectance, columns = trace_batch(keys[n])
+        summed, batches = sums
+        return jax.tree.map(jnp.add, summed, (response, columns)), batches.at[n].set(reflectance)
 
     shapes = jax.eval_shape(trace_batch, keys[0])
-    response, total, columns = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), shapes)
-    zero = (response, columns), jnp.zeros((len(keys), *total.shape), total.dtype)
-    sums, totals = jax.lax.fori_loop(0, n_batches, add_batch, zero)
+    response, reflectance, columns = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), shapes)
+    zero = (response, columns), jnp.zeros((len(keys), *reflectance.shape), reflectance.dtype)
+    sums, batches = jax.lax.fori_loop(0, n_batches, add_batch, zero)
     # At least 1: an idle member of a lockstep group traces nothing.
     response, columns = jax.tree.map(lambda a: a / jnp.maximum(n_batches, 1), sums)
-    total, optical_columns = _apply_optics(model, values, response)
-    return total, jnp.concatenate([columns, optical_columns]), totals
+    reflectance, optical_columns = _apply_optics(inputs, values, response)
+    return reflectance, jnp.concatenate([columns, optical_columns]), batches
 
 
 class Evaluation(NamedTuple):
     """The simulated waveform at some values.
 
-    - `total`: (wavelengths, bins) apparent reflectance, the mean of the batches.
+    - `reflectance`: (wavelengths, bins) apparent reflectance of all orders, the mean of the batches.
     - `jacobian`: (wavelengths, bins, columns), columns in the order of the flattened unknowns.
     - `response`: mean of the batches' responses, or None if many scenes are simulated together.
-    - `batches`: (batches, wavelengths, bins) the total of each, or None if they were not requested.
+    - `batches`: (batches, wavelengths, bins) the reflectance of each, or None if they were not requested.
     - `is_pilot`: True if only the first few batches were traced. Default False.
     """
 
-    total: np.ndarray
+    reflectance: np.ndarray
     jacobian: np.ndarray
     response: Response | None
     batches: np.ndarray | None
@@ -400,8 +426,15 @@ def check_position(lidar: Lidar) -> None:
         )
 
 
-class Model:
-    """The simulated waveform as a function of the unknowns. Photons are traced no more often than needed."""
+class ForwardModel:
+    """The simulated waveform as a function of the unknowns. Photons are traced no more often than needed.
+
+    - If all unknowns are optical, photons are traced once, with all batches, and reused at every call; pilot
+      evaluations are full ones.
+    - Otherwise the batches of a pilot evaluation are stored, and a full evaluation at the same values traces
+      only the remaining ones. They are discarded after a full evaluation: the fit goes on to other values,
+      and responses may be large.
+    """
 
     def __init__(
         self, lidar: Lidar, scene: Scene, plan: Plan, unknowns: Sequence[BoundUnknown], key: PRNGKeyArray
@@ -412,17 +445,19 @@ class Model:
             u.start.size for u, setter in zip(unknowns, methods.setters) if setter.dependence == "geometric"
         )
         per_pass = tangents_per_pass(plan, n_geometric, methods.score_bytes)
-        self.forward = ForwardModel(lidar, scene, plan, methods.setters, per_pass, methods.columns_per_voxel)
+        self.inputs = SimulationInputs(
+            lidar, scene, plan, methods.setters, per_pass, methods.columns_per_voxel
+        )
         self.shapes = [u.start.shape for u in unknowns]
         self.dtypes = [u.start.dtype for u in unknowns]
         self.sizes = [u.start.size for u in unknowns]
         # Pilot batches are the first ones: a full evaluation at the same values reuses them. Without random
         # numbers one batch is exact.
-        self.keys = [jax.random.fold_in(key, n) for n in range(MIN_BATCHES if plan.is_random else 1)]
+        self.keys = [jax.random.fold_in(key, n) for n in range(N_BATCHES if plan.is_random else 1)]
         self.n_pilot = min(PILOT_BATCHES, len(self.keys))
         self.retraces = any(setter.changes_response for setter in methods.setters)
         # Values of the last call, and its traced batches.
-        self._cache: tuple[np.ndarray, list[Any]] | None = None
+        self._cache: tuple[np.ndarray, list[TracedBatch]] | None = None
         # Columns are computed by dependence; `order` sorts them as the flattened unknowns.
         column_dependence = np.repeat([setter.dependence for setter in methods.setters], self.sizes)
         computed = [np.flatnonzero(column_dependence == d) for d in ("geometric", "extinction", "optical")]
@@ -435,54 +470,56 @@ class Model:
 
     def scene_at(self, flat: Float[np.ndarray, " columns"]) -> Scene:
         """Return the scene with these values."""
-        return set_values(self.forward.scene, self.forward.setters, self.values(flat))
+        return set_values(self.inputs.scene, self.inputs.setters, self.values(flat))
 
     def __call__(
         self, flat: Float[np.ndarray, " columns"], *, with_batches: bool = False, pilot: bool = False
     ) -> Evaluation:
         """Simulate at the values `flat`.
 
+        1. Trace the batches that the cache does not have.
+        2. Average their responses, and apply the optics to the mean, with the optical columns.
+        3. Average the other columns over batches.
+
         **Arguments:**
 
         - `with_batches`: give the batches one by one. Default False: only if photons are traced anyway.
-        - `pilot`: only the first few batches are needed. Traced batches that serve again are all used.
-          Default False.
+        - `pilot`: the first few batches suffice. Without effect if all unknowns are optical. Default False.
         """
         values = self.values(flat)
         is_new_trace = self.retraces or self._cache is None
         traced = self._trace(flat, self.n_pilot if pilot and self.retraces else len(self.keys))
-        responses = [t[0] for t in traced]
+        responses = [batch.response for batch in traced]
         # The waveform is linear in the response: optics are applied once, to the mean.
         response, batches = _mean_response(responses), None
-        total, optical_columns = _apply_optics(self.forward, values, response)
+        reflectance, optical_columns = _apply_optics(self.inputs, values, response)
         columns = np.asarray(optical_columns, float)
         # The batches of a new trace have been evaluated at these values already.
         if is_new_trace:
-            batches = np.stack([np.asarray(t[1], float) for t in traced])
-            traced_columns = np.mean([np.asarray(t[2], float) for t in traced], axis=0)
+            batches = np.stack([np.asarray(batch.reflectance, float) for batch in traced])
+            traced_columns = np.mean([np.asarray(batch.columns, float) for batch in traced], axis=0)
             columns = np.concatenate([traced_columns, columns])
         elif with_batches:
             batches = np.stack(
-                [np.asarray(_apply_optics(self.forward, values, r)[0], float) for r in responses]
+                [np.asarray(_apply_optics(self.inputs, values, r)[0], float) for r in responses]
             )
         jacobian = np.moveaxis(columns[self.order], 0, -1)
         is_pilot = len(traced) < len(self.keys)
-        return Evaluation(np.asarray(total, float), jacobian, response, batches, is_pilot)
+        return Evaluation(np.asarray(reflectance, float), jacobian, response, batches, is_pilot)
 
-    def _trace(self, flat: Float[np.ndarray, " columns"], n_batches: int) -> list[Any]:
-        """Trace the first `n_batches`, or take those of the last call that serve again."""
+    def _trace(self, flat: Float[np.ndarray, " columns"], n_batches: int) -> list[TracedBatch]:
+        """Return the first `n_batches`: from the cache if it holds these values, else traced."""
         reused = []
         if self._cache is not None and (not self.retraces or np.array_equal(self._cache[0], flat)):
             reused = self._cache[1]
         values = self.values(flat)
-        slopes = _compiled_slopes(self.forward, values) if self.forward.columns_per_voxel else None
+        slopes = _compiled_slopes(self.inputs, values) if self.inputs.columns_per_voxel else None
 
         def trace_batch(key):
-            return _compiled_trace_batch(self.forward, values, key, slopes)
+            return _compiled_trace_batch(self.inputs, values, key, slopes)
 
         with side_by_side() as run:
             traced = [*reused[:n_batches], *run(trace_batch, self.keys[len(reused) : n_batches])]
-        # After a full evaluation a fit goes on to other values: responses may be large and are not kept.
         may_serve_again = not self.retraces or n_batches < len(self.keys)
         self._cache = (np.array(flat), traced) if may_serve_again else None
         return traced
@@ -493,7 +530,7 @@ class Model:
         """Return the evaluation as a waveform."""
         assert evaluation.response is not None
         error = jnp.asarray(stderr, self.dtypes[0])
-        return _as_waveform(self.forward, self.values(flat), evaluation.response, error)
+        return _as_waveform(self.inputs, self.values(flat), evaluation.response, error)
 
 
 def batch_stderr(batches: np.ndarray | None) -> np.ndarray | float:

@@ -2,7 +2,8 @@
 
 A compiled simulation has loops of fixed length and a fixed time axis. In a fit the scene moves, so that both
 have to be long enough for every scene within the bounds. The bounds' corners are examined, which suffices for
-quantities that are monotonic in each unknown, such as heights and sizes.
+quantities that are monotonic in each unknown, such as heights and sizes. Beyond four unknowns not all corners
+are examined (`corner_scenes`).
 """
 
 import dataclasses
@@ -23,8 +24,10 @@ from jaxlidar.planning.plan import MIN_BATCHES
 from jaxlidar.planning.plan_check import check_reach
 from jaxlidar.planning.size_buckets import size_bucket
 
-# Up to this many geometric unknowns, every corner of the bounds is examined: 2^4 of them.
+# Up to this many unknowns that change the response, every corner of the bounds is examined: 2^4 of them.
 _MAX_UNKNOWNS_FOR_ALL_CORNERS = 4
+# Batches of every full evaluation: as few as estimate the noise of a simulation.
+N_BATCHES = MIN_BATCHES
 # Photons and rays of all batches together, unless they or a plan are given.
 N_PHOTONS, N_RAYS = 65536, 8192
 
@@ -52,16 +55,16 @@ def trace_sizes(
             f"plan is given together with {', '.join(conflicting)}; admissible is either: make the plan with "
             "them"
         )
-    photons = check_integer("n_photons", N_PHOTONS if n_photons is None else n_photons, MIN_BATCHES)
-    rays = check_integer("n_rays", N_RAYS if n_rays is None else n_rays, MIN_BATCHES)
-    return TraceSizes(photons // MIN_BATCHES, rays // MIN_BATCHES, max_orders)
+    photons = check_integer("n_photons", N_PHOTONS if n_photons is None else n_photons, N_BATCHES)
+    rays = check_integer("n_rays", N_RAYS if n_rays is None else n_rays, N_BATCHES)
+    return TraceSizes(photons // N_BATCHES, rays // N_BATCHES, max_orders)
 
 
 def corner_scenes(scene: Scene, unknowns: list[BoundUnknown]) -> list[Scene]:
-    """Return the scene at its start, and with the geometric unknowns at their bounds.
+    """Return the scene at its start, and with the unknowns that change the response at their bounds.
 
-    All combinations for up to four unknowns; for more, each alone and all together. An array is at its lower
-    or its upper bounds as a whole.
+    These are the geometric ones and those of extinction. All combinations for up to four unknowns; for more,
+    each alone and all together. An array is at its lower or its upper bounds as a whole.
     """
     moving = [i for i, u in enumerate(unknowns) if u.setter.changes_response]
     if len(moving) <= _MAX_UNKNOWNS_FOR_ALL_CORNERS:
@@ -88,16 +91,18 @@ def plan_for_bounds(
     lidar: Lidar,
     scene: Scene,
     unknowns: list[BoundUnknown],
-    time: Float[np.ndarray, " bins"],
+    time: Float[np.ndarray, " samples"],
     sizes: TraceSizes,
 ) -> Plan:
-    """Plan the starting scene, with loops and time bins long enough for all `corner_scenes`.
+    """Plan the starting scene, with loops and fine time bins long enough for all `corner_scenes`.
+
+    Fine time bins are those in which light is collected; `time` has the samples of the record.
 
     Scatterer channels, orders and step lengths are those of the starting scene.
 
     1. Plan the starting scene; all plans share its orders, bin width and step length.
     2. Plan every corner.
-    3. Take the union of the time bins, and the largest of each loop's length.
+    3. Take the union of the fine time bins, and the largest of each loop's length.
 
     **Raises:** ValueError for an inadmissible corner, such as a canopy that reaches above the sensor.
     """
@@ -146,6 +151,7 @@ def plan_for_bounds(
         max_ray_segments=max(p.config.max_ray_segments for p in plans),
         # A bucket of sizes, so that fits of similar scenes share a compiled program.
         max_faces=size_bucket(max(p.max_faces(longest) for p in path_lengths)),
+        # A sheet that lets light through at any corner must be able to.
         covers_fully=tuple(all(c) for c in zip(*(p.config.covers_fully for p in plans))),
     )
     return dataclasses.replace(plan, bins=bins)
@@ -156,7 +162,7 @@ def checked_plan(
     lidar: Lidar,
     scene: Scene,
     unknowns: list[BoundUnknown],
-    time: Float[np.ndarray, " bins"],
+    time: Float[np.ndarray, " samples"],
     sizes: TraceSizes,
 ) -> Plan:
     """Check a plan for the samples and for all `corner_scenes`, or make one with `plan_for_bounds`.
@@ -183,7 +189,7 @@ def checked_plan(
     return plan
 
 
-def check_samples(plan: Plan, time: Float[np.ndarray, " bins"]) -> None:
+def check_samples(plan: Plan, time: Float[np.ndarray, " samples"]) -> None:
     """Check that the samples of a plan are at `time`. **Raises:** ValueError if they are not."""
     check_kind("plan", plan, Plan, "a Plan")
     # As for sample times: rounding of single precision is allowed.

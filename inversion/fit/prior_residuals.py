@@ -3,7 +3,8 @@ r"""Priors of a fit as residuals, and the strengths of smoothness priors by the 
 A normal prior with mean m and standard deviation s adds the residual (x - m) / s to a least-squares fit, a
 log-normal prior (ln x - m) / s. A Gaussian process with mean m and covariance t^2 K, t its strength and
 K = L L^T, adds the vector L^-1 (x - m) / t. Half of the sum of squares is -ln of the prior density, up to its
-normalisation; that of a Gaussian process depends on t:
+normalisation; for a log-normal prior it is the density of ln x, so that the estimate is the maximum a
+posteriori in ln x. The normalisation of a Gaussian process depends on t:
 
     -2 ln density = |L^-1 (x - m)|^2 / t^2 + ln det K + 2 n ln t + constant.
 
@@ -12,7 +13,9 @@ linear about the fit, the evidence (the density of the data with the unknowns in
 
     -2 ln evidence = minimum of the cost + ln det H - ln det P + constant.
 
-A strength left to the data minimises this.
+A strength left to the data minimises this. To keep H regular where the data leave an unknown without Gaussian
+process open, each of these gets a further prior in H, of one width of its bounds about its estimate. It has
+no gradient there, and changes the comparison of strengths only for unknowns that are open.
 
 **Source:** MacKay (1992), Neural Comput. 4, 415; Rasmussen and Williams (2006), Gaussian Processes for
 Machine Learning, section 5.4.
@@ -73,10 +76,11 @@ class PriorResiduals:
 
     def __call__(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return whitened residuals, one for each value, and their Jacobian (residuals, values)."""
-        positive = np.where(self.is_log, np.maximum(values, 1e-300), 1.0)
-        transformed = np.where(self.is_log, np.log(positive), values)
+        # x for log-normal priors, else 1: d ln x / dx = 1 / x.
+        log_argument = np.where(self.is_log, np.maximum(values, 1e-300), 1.0)
+        transformed = np.where(self.is_log, np.log(log_argument), values)
         residual = (transformed - self.mean) * self.weight
-        jacobian = np.diag(self.weight / positive)
+        jacobian = np.diag(self.weight / log_argument)
         for process in self.processes:
             columns = process.columns
             jacobian[columns, columns] = process.inverse_cholesky / process.strength
@@ -92,8 +96,11 @@ class PriorResiduals:
         return basis
 
     @property
-    def log_normalisation(self) -> float:
-        """-2 ln of the smoothness priors' normalisation, which makes costs at two strengths comparable."""
+    def log_determinant(self) -> float:
+        """ln det of the smoothness priors' covariance, which makes costs at two strengths comparable.
+
+        It is -2 ln of their normalisation, up to a constant.
+        """
         return float(sum(p.log_determinant + 2.0 * p.mean.size * np.log(p.strength) for p in self.processes))
 
     @property
@@ -121,8 +128,9 @@ class PriorResiduals:
         """
         prior_residual, prior_jacobian = self(values)
         is_plain = ~self.is_smooth
-        # In widths of the bounds. As all unknowns lie within their bounds, a unit-variance prior on the plain
-        # ones keeps H regular where the data leave one of them open.
+        # In widths of the bounds. As all unknowns lie within their bounds, a prior of unit variance about the
+        # estimates of the plain ones keeps H regular where the data leave one of them open. It is centred on
+        # the estimates: no term of the gradient.
         jacobian = jacobian * self.width
         prior_jacobian = prior_jacobian * np.outer(is_plain, is_plain) * self.width
         information = jacobian.T @ jacobian + prior_jacobian.T @ prior_jacobian
@@ -133,41 +141,44 @@ class PriorResiduals:
             if not process.has_free_strength:
                 continue
 
-            def deviance(log_strength: float, i: int = i) -> float:
+            def criterion(log_strength: float, i: int = i) -> float:
                 trial = np.where(np.arange(strengths.size) == i, np.exp(log_strength), strengths)
-                return self._evidence_deviance(values, information, gradient, trial)
+                return self._minus_two_log_evidence(values, information, gradient, trial)
 
             # In logarithms: a strength is positive, and its plausible range spans orders of magnitude.
             interval = process.strength * np.array([1.0 / _MAX_FACTOR, _MAX_FACTOR])
             interval = np.log(np.clip(interval, *process.strength_range))
-            minimum: Any = optimize.minimize_scalar(deviance, bounds=interval, method="bounded")
+            minimum: Any = optimize.minimize_scalar(criterion, bounds=interval, method="bounded")
             strengths[i] = np.exp(minimum.x)
         return strengths
 
-    def _evidence_deviance(
+    def _minus_two_log_evidence(
         self, values: np.ndarray, information: np.ndarray, gradient: np.ndarray, strengths: np.ndarray
     ) -> float:
         """-2 ln evidence at these strengths, up to a constant.
 
         `information`, `gradient`: J^T J and J^T r of data and plain priors, in widths of the bounds.
         """
-        information, gradient, cost = information.copy(), gradient.copy(), 0.0
+        information, gradient, prior_terms = information.copy(), gradient.copy(), 0.0
         for process, strength in zip(self.processes, strengths):
             columns, whitening = process.columns, process.inverse_cholesky / strength
             residual = whitening @ (values[columns] - process.mean)
             jacobian = whitening * self.width[columns]
             information[columns, columns] += jacobian.T @ jacobian
             gradient[columns] += jacobian.T @ residual
-            # The square, and -ln det P, of this process.
-            cost += residual @ residual + 2.0 * process.mean.size * np.log(strength)
-        # H = root root^T: the cost at its minimum is less by |root^-1 gradient|^2.
-        root = np.linalg.cholesky(information)
-        decrease = linalg.solve_triangular(root, gradient, lower=True)
-        return float(cost - decrease @ decrease + 2.0 * np.sum(np.log(np.diag(root))))
+            # |q|^2 - ln det P of this process.
+            prior_terms += residual @ residual + 2.0 * process.mean.size * np.log(strength)
+        # H = L L^T: the cost at its minimum is less by |L^-1 gradient|^2.
+        cholesky = np.linalg.cholesky(information)
+        decrease = linalg.solve_triangular(cholesky, gradient, lower=True)
+        return float(prior_terms - decrease @ decrease + 2.0 * np.sum(np.log(np.diag(cholesky))))
 
 
 def fixed_priors(unknowns: Sequence[BoundUnknown]) -> PriorResiduals:
-    """Return the priors for a task without a fit. **Raises:** ValueError for a strength left to the data."""
+    """Return priors whose strengths are all given: for Cramer-Rao bounds and profile likelihoods.
+
+    **Raises:** ValueError for a strength left to the data.
+    """
     for unknown in unknowns:
         if unknown.smooth is not None and unknown.smooth.strength is None:
             raise ValueError(

@@ -20,8 +20,8 @@ class LogNormal(eqx.Module):
     **Arguments:**
 
     - `median`: in the unknown's own unit, positive, a number or an array.
-    - `spread`: standard deviation of the natural logarithm, positive, a number or an array. For instance, 0.5
-      means within a factor of 1.65 of the median, to one standard deviation.
+    - `spread`: standard deviation of the natural logarithm (sigma of ln x), positive, a number or an array.
+      For instance, 0.5 means within a factor of 1.65 of the median, to one standard deviation.
 
     **Raises:** ValueError for a `median` or `spread` that is not positive.
 
@@ -51,10 +51,11 @@ class Smooth(eqx.Module):
 
         covariance(x_i, x_j) = strength^2 ((1 + d) exp(-d) + 9),   d = sqrt(3) |i - j| spacing / scale,
 
-    a once differentiable Matern process about a common level. The 9 leaves that level to the data: it is a
-    variance of three strengths squared. With a `mean` the 9 is absent. The prior fills in layers that the
-    data leave open; `Retrieval.averaging_kernel` shows where. Bounds, such as that no layer is negative, hold
-    as well.
+    a Matern 3/2 kernel about a common level. `strength` is the standard deviation of the process (the signal
+    standard deviation, or amplitude): a larger one is a weaker prior. The 9 is the prior variance of the
+    common level, (3 strength)^2, about the mean of the start. With a `mean` the 9 is absent. The prior fills
+    in layers that the data leave open; `Retrieval.averaging_kernel` shows where. Bounds, such as that no
+    layer is negative, hold as well.
 
     A strength left to the data maximises the evidence: the probability of the data with the unknowns
     integrated out, for the simulation linearised about the fit and without bounds. The fit is repeated with
@@ -64,12 +65,13 @@ class Smooth(eqx.Module):
 
     **Arguments:**
 
-    - `scale`: correlation length of the profile, in the unit of `spacing`, positive.
+    - `scale`: length scale of the kernel, the correlation length of the profile, in the unit of `spacing`,
+      positive.
     - `spacing`: distance between layers, positive: in m for a `scale` in m. Default 1: `scale` in layers.
-    - `strength`: standard deviation of a layer about the common level, in the unknown's own unit, positive.
-      Default None: by the data.
-    - `mean`: of the profile, in the unknown's own unit, one number or one for each layer. Default None: the
-      mean of the start, and a common level that is left to the data.
+    - `strength`: standard deviation of a layer about the common level, in the unknown's own unit, positive;
+      a larger one smooths less. Default None: by the data.
+    - `mean`: of the profile, in the unknown's own unit, one number or one for each layer. Default None: a
+      common level with the prior above, about the mean of the start.
 
     **Raises:** ValueError for a `scale`, `spacing` or `strength` that is not positive.
 

@@ -1,7 +1,10 @@
 r"""Vertical profiles: layers of plants above the ground, credible bands and averaging kernels.
 
-The posterior of a fit is taken as normal. With whitened Jacobian J and prior precision P at the fit, its
-covariance is H^-1, H = J^T J + P; the credible band is cut at the bounds. The averaging kernel
+The likelihood profile of one unknown is another thing: `inversion.fit.identifiability`.
+
+The posterior of a fit is taken as normal, with the standard errors of the fit: those of
+H^-1 (J^T W J + P) H^-1 and the simulation's noise (`inversion.fit.uncertainty`), H = J^T J + P, with whitened
+Jacobian J and prior precision P. The credible band is cut at the bounds. The averaging kernel
 
     A = d estimate / d truth = (J^T J + P)^-1 J^T J
 
@@ -70,11 +73,11 @@ def put_profile(scene: Scene, density: Float[Array, " layers"]) -> Scene:
             raise ValueError("the scene's ground is no plane; admissible are planes: see VoxelMap.above")
         east, north, up = plane.upward
         ground = plane.foot[2] - (east * (x - plane.foot[0]) + north * (y - plane.foot[1])) / up
-    # In units of layers, voxel k extends from t to t + 1 above the ground: it overlaps the layers floor(t)
-    # and floor(t) + 1, the first with the fraction 1 - (t - floor(t)).
-    t = jnp.arange(nz)[None, None, :] - ((ground - origin[2]) / size[2])[..., None]
-    lower_layer = jnp.floor(t)
-    upper_fraction = t - lower_layer
+    # Height of a voxel's lower face above the ground, t, in layers: the voxel extends from t to t + 1 and
+    # overlaps the layers floor(t) and floor(t) + 1, the first with the fraction 1 - (t - floor(t)).
+    lower_face = jnp.arange(nz)[None, None, :] - ((ground - origin[2]) / size[2])[..., None]
+    lower_layer = jnp.floor(lower_face)
+    upper_fraction = lower_face - lower_layer
     # An empty layer on either side stands for all layers outside.
     padded = jnp.pad(jnp.asarray(density), 1)
 
@@ -82,34 +85,34 @@ def put_profile(scene: Scene, density: Float[Array, " layers"]) -> Scene:
         return padded[jnp.clip(layer.astype(int) + 1, 0, padded.size - 1)]
 
     # A voxel map stores half of the leaf area density, as `VoxelMap.from_lad` does.
-    leaf = 0.5 * (
+    extinction = 0.5 * (
         (1.0 - upper_fraction) * density_of(lower_layer) + upper_fraction * density_of(lower_layer + 1.0)
     )
-    _check_plants_inside(voxels, padded, ground, leaf)
-    return eqx.tree_at(lambda s: s.canopy.voxels.leaf, scene, leaf)
+    _check_plants_inside(voxels, padded, ground, extinction)
+    return eqx.tree_at(lambda s: s.canopy.voxels.leaf, scene, extinction)
 
 
 def _check_plants_inside(
     voxels: VoxelMap,
     padded: Float[Array, "padded"],
     ground: Float[Array, "nx ny"],
-    leaf: Float[Array, "x y z"],
+    extinction: Float[Array, "x y z"],
 ) -> None:
     """Refuse plants outside of the voxel map, unless JAX is tracing. **Raises:** ValueError."""
-    arrays = [concrete(a) for a in (padded, ground, leaf, voxels.voxel_size)]
+    arrays = [concrete(a) for a in (padded, ground, extinction, voxels.voxel_size)]
     if any(a is None for a in arrays):
         return
-    density, ground_height, extinction, size = (np.asarray(a, float) for a in arrays)
+    density, ground_height, leaf_extinction, size = (np.asarray(a, float) for a in arrays)
     planted = np.flatnonzero(density[1:-1])
     # Twice the extinction of each column adds up to all layers, up to single precision's rounding.
-    if np.all(2.0 * extinction.sum(axis=-1) >= 0.999 * density.sum()) or not planted.size:
+    if np.all(2.0 * leaf_extinction.sum(axis=-1) >= 0.999 * density.sum()) or not planted.size:
         return
     low = ground_height.min() + size[2] * planted[0]
     high = ground_height.max() + size[2] * (planted[-1] + 1)
     bottom = float(voxels.origin[2])
     raise ValueError(
         f"density has plants from {low:g} m to {high:g} m, but the voxel map reaches from {bottom:g} m to "
-        f"{bottom + size[2] * extinction.shape[2]:g} m; admissible is a map that holds all of them"
+        f"{bottom + size[2] * leaf_extinction.shape[2]:g} m; admissible is a map that holds all of them"
     )
 
 
@@ -117,7 +120,8 @@ class AveragingKernel(NamedTuple):
     """Response of the estimate of a profile to the true profile.
 
     - `matrix`: (..., layers, layers) derivatives of the estimated values (rows) in the true ones (columns).
-    - `degrees_of_freedom`: (...) number of independent numbers that the data determine: the trace.
+    - `degrees_of_freedom`: (...) degrees of freedom for signal, the number of independent numbers that the
+      data determine: the trace.
     - `resolution`: (..., layers) height per number that the data determine, in the unit of the spacing:
       spacing over diagonal; infinite for layers that the data do not constrain.
 

@@ -9,7 +9,7 @@ fit (`judge_fit`, `judge_fits`), with n the effective number of independent samp
 | misfit | reduced chi-squared above 3, or 1 + 4 sqrt(2 / n) if more | above 10, or 1 + 12 sqrt(2 / n) |
 | undetermined | an unknown has an infinite standard error | |
 | bound | an unknown without a smoothness prior lies at a bound | |
-| prior | more than half of the information on an unknown without a smoothness prior is the prior's | |
+| prior | the share of the prior in an unknown without a smoothness prior is above a half | |
 | second minimum | another minimum within 4 in chi-squared, counted as independent samples | |
 
 The checks of a record before any fit (`judge_record`), with s the standard deviation of the noise:
@@ -18,10 +18,13 @@ The checks of a record before any fit (`judge_record`), with s the standard devi
 | --- | --- | --- |
 | signal | largest sample below 10 s | below 6 s |
 | clipped | three or more samples in a row at the largest value | |
-| cut off | an end of the record above 4 s and a hundredth of the peak | above a tenth of the peak |
-| dead samples | a sample departs by 6 s, and more than the pulse does, from the cubic by its neighbours | |
+| cut off | the mean of the first or last three samples is above 4 s and a hundredth of the peak | and above a
+tenth of it |
+| dead samples (outliers) | a sample departs from the cubic by its neighbours by more than 6 s + 1.5 d | |
 | uneven noise | that of the last quiet samples over that of the first is above 1.7 or below 1 / 1.7 | |
 | flags | the product's flag `degrade` is set | its flag `stale_return` is set |
+
+Here d is the largest departure of the pulse from such cubics, scaled to the peak of the record.
 
 The thresholds hold for any instrument; the checks of a record need several samples within the pulse.
 """
@@ -184,9 +187,10 @@ def _judge(fit: JudgedFit, about: Sequence[str] | None, index: Any) -> Verdict:
     if undetermined := failing(fit.stderr, np.isinf):
         failures.append((_DOUBTFUL, f"undetermined: {undetermined}"))
     # Layers without plants lie at their bound, and smoothness priors fill in layers: both are as intended.
-    if at_bound := failing(fit.at_bound, np.asarray, exempt=fit.strength):
+    has_smooth_prior = set(fit.strength)
+    if at_bound := failing(fit.at_bound, np.asarray, exempt=has_smooth_prior):
         failures.append((_DOUBTFUL, f"at a bound: {at_bound}"))
-    from_prior = failing(fit.prior_share, lambda f: f > _MAX_PRIOR_FRACTION, exempt=fit.strength)
+    from_prior = failing(fit.prior_share, lambda f: f > _MAX_PRIOR_FRACTION, exempt=has_smooth_prior)
     if from_prior:
         failures.append((_DOUBTFUL, f"from the prior: {from_prior}"))
     if (rise := scalar(fit.second_minimum)) < _MIN_SECOND_MINIMUM:

@@ -1,15 +1,21 @@
 r"""Model of a recorder in a fit: its unknowns, the record with its derivatives, and the noise of the pulse.
 
-**Record.** y = scale (r * g * w) + b_(i mod n) + noise (`inversion.receiver.recorder`). Width of g, offsets b
-and scale are unknowns of the fit like those of the scene, so that all standard errors include theirs. They
-act on the simulated waveform w: nothing is traced or compiled for them.
+**Record.** With * the convolution, sample i of a record is
 
-**Noise of the pulse.** A recorded pulse p has noise e of its own, and every return repeats it. With h the
-returns of the scene, so that w = h * p, the record contains scale (r * g * h * e). This noise is correlated
-over samples as the returns are: its covariance is sigma_p^2 G G^T, with G the convolution matrix of
-scale (r * g * h). It is added to the covariances of record and simulation, and the fit whitens its residuals
-by the root of the sum. h is estimated by non-negative least squares from the simulated waveform, one return a
-sample (Lawson and Hanson 1974, Solving Least Squares Problems).
+    y_i = scale (r * g * w)_i + b_(i mod n) + noise,
+
+with w the simulated waveform, r the receiver's impulse response, g a Gaussian of unknown width, and b_j the
+offset of digitiser j of n (`inversion.receiver.recorder`). Width, offsets and scale are unknowns of the fit
+like those of the scene, so that all standard errors include theirs. They act on w: nothing is traced or
+compiled for them.
+
+**Noise of the pulse.** A recorded pulse p has noise e of its own, independent from sample to sample with the
+standard deviation sigma_p (`Recorder.pulse_noise` times the pulse's peak), and every return repeats it. With
+h the returns of the scene, so that w = h * p, the record contains scale (r * g * h * e). This noise is
+correlated over samples as the returns are: its covariance is sigma_p^2 G G^T, with G the convolution matrix
+of scale (r * g * h). It is added to the covariances of record and simulation, and the fit whitens its
+residuals by the Cholesky factor of the sum. h is estimated by non-negative least squares from the simulated
+waveform, one return a sample (Lawson and Hanson 1974, Solving Least Squares Problems).
 """
 
 from collections.abc import Sequence
@@ -29,9 +35,9 @@ _FAINT = 1e-6
 
 
 class RecordWithJacobian(NamedTuple):
-    """A modelled record, (wavelengths, bins), and its Jacobian, (wavelengths, bins, unknowns)."""
+    """Modelled record, (wavelengths, bins), and its Jacobian, (wavelengths, bins, unknowns)."""
 
-    total: np.ndarray
+    reflectance: np.ndarray
     jacobian: np.ndarray
 
 
@@ -49,8 +55,8 @@ class RecorderModel:
 
     def __init__(self, recorder: Recorder | None, scale: Sequence[BoundUnknown], lidar: Lidar, bins: int):
         self.recorder = Recorder() if recorder is None else recorder
-        step = float(lidar.sampling_interval)
-        self.response = ReceiverResponse(self.recorder, bins, step)
+        interval = float(lidar.sampling_interval)
+        self.receiver = ReceiverResponse(self.recorder, bins, interval)
         self.has_scale = bool(scale)
         self.unknowns = [*recorder_unknowns(self.recorder), *scale]
         self.count = sum(unknown.start.size for unknown in self.unknowns)
@@ -59,7 +65,7 @@ class RecorderModel:
         n_offsets = self.recorder.interleaved if self.recorder.offset is not None else 0
         self.offset_columns = (digitiser == np.arange(n_offsets)).astype(float)
         has_pulse_noise = float(self.recorder.pulse_noise) > 0
-        self.pulse = _pulse_fractions(lidar, bins, step) if has_pulse_noise else None
+        self.pulse = _pulse_fractions(lidar, bins, interval) if has_pulse_noise else None
 
     def _split(self, values: np.ndarray) -> tuple[float, np.ndarray, float]:
         """Width, offsets and scale."""
@@ -68,22 +74,26 @@ class RecorderModel:
         offsets = values[int(has_width) : self.count - int(self.has_scale)]
         return (values[0] if has_width else 0.0), offsets, (values[-1] if self.has_scale else 1.0)
 
-    def __call__(self, total: np.ndarray, jacobian: np.ndarray, values: np.ndarray) -> RecordWithJacobian:
+    def __call__(
+        self, reflectance: np.ndarray, jacobian: np.ndarray, values: np.ndarray
+    ) -> RecordWithJacobian:
         """Model the record of a simulated waveform.
 
-        **Arguments:** `total`: (wavelengths, bins). `jacobian`: (wavelengths, bins, n), with respect to the
-        unknowns of the scene. `values`: of the recorder's unknowns.
+        **Arguments:** `reflectance`: (wavelengths, bins). `jacobian`: (wavelengths, bins, n), with respect to
+        the unknowns of the scene. `values`: of the recorder's unknowns.
 
         **Returns:** the record, and its Jacobian with the columns of the recorder's unknowns appended.
         """
         width, offsets, scale = self._split(values)
-        received = self.response(total, width)
+        received = self.receiver(reflectance, width)
         # The response acts along the last axis, which is that of unknowns in a Jacobian.
-        scene_columns = np.moveaxis(self.response(np.moveaxis(jacobian, -1, 0), width), 0, -1)
+        scene_columns = np.moveaxis(self.receiver(np.moveaxis(jacobian, -1, 0), width), 0, -1)
         columns = [scale * scene_columns]
         if self.recorder.width is not None:
-            columns.append(scale * self.response(total, width, derivative=True)[..., None])
-        columns.append(np.broadcast_to(self.offset_columns, (*total.shape, self.offset_columns.shape[-1])))
+            columns.append(scale * self.receiver(reflectance, width, derivative=True)[..., None])
+        columns.append(
+            np.broadcast_to(self.offset_columns, (*reflectance.shape, self.offset_columns.shape[-1]))
+        )
         if self.has_scale:
             columns.append(received[..., None])
         record = scale * received + self.offset_columns @ offsets
@@ -92,28 +102,30 @@ class RecorderModel:
     def received(self, batches: np.ndarray, values: np.ndarray) -> np.ndarray:
         """Return simulated batches as received and scaled, without offsets."""
         width, _, scale = self._split(values)
-        return scale * self.response(batches, width)
+        return scale * self.receiver(batches, width)
 
     def fit_linear(
-        self, values: np.ndarray, total: np.ndarray, observed: np.ndarray, sigma: np.ndarray
+        self, values: np.ndarray, reflectance: np.ndarray, observed: np.ndarray, sigma: np.ndarray
     ) -> np.ndarray:
         """Return the values with offsets and scale, in which the record is linear, fitted to an observation.
 
-        Weighted linear least squares, with columns scaled to unit length; the result is kept within the
-        bounds of the unknowns.
+        Weighted linear least squares, with columns scaled to unit length; the result is moved to `MARGIN`
+        from the bounds of the unknowns if it is closer to them or beyond.
 
-        **Arguments:** `values`: of the recorder's unknowns. `total`, `observed`: (wavelengths, bins)
+        **Arguments:** `values`: of the recorder's unknowns. `reflectance`, `observed`: (wavelengths, bins)
         simulated waveform and record. `sigma`: noise, infinite for samples without weight.
         """
-        linear = np.broadcast_to(self.offset_columns, (*total.shape, self.offset_columns.shape[-1]))
-        received = self.response(total, self._split(values)[0])
-        is_used, fixed = np.isfinite(sigma), np.zeros_like(total) if self.has_scale else received
+        linear = np.broadcast_to(self.offset_columns, (*reflectance.shape, self.offset_columns.shape[-1]))
+        received = self.receiver(reflectance, self._split(values)[0])
+        is_used = np.isfinite(sigma)
+        # Without the scale, the waveform is subtracted, and only offsets are fitted.
+        fixed_record = np.zeros_like(reflectance) if self.has_scale else received
         if self.has_scale:
             linear = np.concatenate([linear, received[..., None]], axis=-1)
         if linear.shape[-1] == 0:
             return values
         columns = linear[is_used] / sigma[is_used, None]
-        target = (observed - fixed)[is_used] / sigma[is_used]
+        target = (observed - fixed_record)[is_used] / sigma[is_used]
         norm = np.linalg.norm(columns, axis=0)
         norm = np.where(norm > 0, norm, 1.0)
         fitted = np.linalg.lstsq(columns / norm, target, rcond=None)[0] / norm
@@ -124,14 +136,15 @@ class RecorderModel:
         margin = MARGIN * (high - low)
         return np.clip(np.append(values[: values.size - fitted.size], fitted), low + margin, high - margin)
 
-    def pulse_noise(self, total: np.ndarray, values: np.ndarray) -> np.ndarray | None:
+    def pulse_noise(self, reflectance: np.ndarray, values: np.ndarray) -> np.ndarray | None:
         """Return the matrix sigma_p G of the noise of the pulse, or None for a pulse without noise.
 
         1. Returns h of the scene, one a sample: minimise |w - h * p| over h >= 0, with p the fractions of the
            pulse's energy in samples.
         2. Column j of G is the record of a unit error of sample j of the pulse: h delayed, as received.
 
-        **Arguments:** `total`: (wavelengths, bins) simulated waveform. `values`: of the recorder's unknowns.
+        **Arguments:** `reflectance`: (wavelengths, bins) simulated waveform. `values`: of the recorder's
+        unknowns.
 
         **Returns:** (wavelengths, bins, lags) change of the record by one standard deviation of each sample
         of the pulse.
@@ -139,20 +152,22 @@ class RecorderModel:
         if self.pulse is None:
             return None
         width, _, scale = self._split(values)
-        bins, lags = self.response.bins, self.pulse.size
+        bins, lags = self.receiver.bins, self.pulse.size
         # Returns are placed by the middle of the pulse's energy, which keeps most of an echo in the record.
-        zero = int(np.argmax(np.cumsum(self.pulse) >= 0.5))
+        middle = int(np.argmax(np.cumsum(self.pulse) >= 0.5))
         pulse_matrix = linalg.toeplitz(np.r_[self.pulse, np.zeros(bins - 1)], np.zeros(bins))
-        echoes = pulse_matrix[zero : zero + bins]
+        unit_echoes = pulse_matrix[middle : middle + bins]
         noise_matrices = []
-        for waveform in total:
+        for waveform in reflectance:
             # The solver's tolerances are absolute: the waveform is scaled to a peak of one.
             peak = max(float(np.max(waveform)), 1e-300)
-            returns = optimize.nnls(echoes, np.maximum(waveform, 0.0) / peak, maxiter=30 * bins)[0] * peak
+            returns = (
+                optimize.nnls(unit_echoes, np.maximum(waveform, 0.0) / peak, maxiter=30 * bins)[0] * peak
+            )
             returns[returns < _FAINT * peak] = 0.0
             first_row = np.r_[returns[0], np.zeros(lags - 1)]
             delayed = linalg.toeplitz(np.r_[returns, np.zeros(lags - 1)], first_row)
-            noise_matrices.append(self.response(delayed[zero : zero + bins].T, width).T)
+            noise_matrices.append(self.receiver(delayed[middle : middle + bins].T, width).T)
         sigma = scale * float(self.recorder.pulse_noise) * float(np.max(self.pulse))
         return sigma * np.stack(noise_matrices)
 
@@ -186,11 +201,11 @@ def check_names(recorder: Recorder | None, unknowns: Sequence[BoundUnknown]) -> 
             )
 
 
-def _pulse_fractions(lidar: Lidar, bins: int, step: float) -> np.ndarray:
-    """Fractions of the pulse's energy in samples, from its first to its last, at most a record's length."""
+def _pulse_fractions(lidar: Lidar, bins: int, interval: float) -> np.ndarray:
+    """Return the fractions of the pulse's energy in samples, at most a record's length about time zero."""
     low, high = lidar.pulse.support(lidar.jitter)
-    first, last = max(int(np.floor(low / step)), -bins), min(int(np.ceil(high / step)), bins)
-    edges = step * (np.arange(first, last + 2) - 0.5)
+    first, last = max(int(np.floor(low / interval)), -bins), min(int(np.ceil(high / interval)), bins)
+    edges = interval * (np.arange(first, last + 2) - 0.5)
     fractions = concrete(jnp.diff(lidar.pulse.cumulative(edges, lidar.jitter)))
     assert fractions is not None
     return np.asarray(fractions, float)

@@ -1,4 +1,4 @@
-"""Results of retrievals: `Retrieval` of one waveform, `Retrievals` of many, both made from `FitRecord`."""
+"""Results of retrievals: `Retrieval` of one waveform, `Retrievals` of many, both made from `FitSummary`."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from inversion.fit.fit_record import CompletedFit, FitRecord, short_text
+from inversion.fit.fit_summary import CompletedFit, FitSummary, short_text
 from inversion.fit.profiles import AbstractPosterior
 from inversion.fit.quality import Verdict, judge_fit, judge_fits
 from inversion.fit.uncertainty import correlation_of
@@ -28,23 +28,26 @@ class Retrieval(AbstractPosterior):
     flattened unknowns in the order given, named by `labels`. `print(fit)` shows a summary.
 
     - `values`: best values.
-    - `stderr`: one standard error each, of the same shapes; infinite for unknowns that the data do not
-      constrain.
+    - `stderr`: one standard error each, of the same shapes; infinite for unknowns that neither
+      data nor priors constrain to within their bounds.
     - `robust_stderr`: `stderr` widened by misfit and, with several starts, by the spread over their minima;
       never narrower. Use it for recorded waveforms, which no model fits to within the noise: see
       `inversion.fit.uncertainty`.
-    - `prior_share`: fraction of the information on each unknown that is the prior's, 0 to 1.
+    - `prior_share`: share of the prior in each estimate, 0 to 1: one less the diagonal of the averaging
+      kernel.
     - `at_bound`: True for unknowns at one of their bounds.
     - `simulation_error`: the part of `stderr` that comes from the simulation's own noise; it falls with
       `n_photons`.
     - `covariance`, `correlation`: (n, n). An unknown of infinite variance has no covariance with others.
     - `scene`: the fitted scene.
-    - `waveform`: the fitted waveform, without the fitted scale; its `stderr` is the simulation's.
-    - `residuals`: (wavelengths, bins) observed minus fitted over its standard deviation; zero for samples
-      that were left out.
+    - `waveform`: the fitted waveform, before the recorder (no receiver response, scale or offset); its
+      `stderr` is the simulation's.
+    - `residuals`: (wavelengths, bins) observed minus fitted, whitened (for independent errors: over the
+      standard deviation); zero for samples that were left out.
     - `reduced_chi2`: sum of squared residuals over the number of samples less that of determined unknowns.
-    - `second_minimum`: rise in chi-squared, in units of the reduced one and of independent samples, from the
-      best minimum to the next one elsewhere; infinite if no start ended in another one.
+    - `second_minimum`: rise of chi-squared from the best minimum to the next one elsewhere, times
+      `independent_samples` over the number of samples, over `reduced_chi2` if that exceeds one; infinite if
+      no start ended in another one.
     - `independent_samples`: effective number of independent samples among those fitted, whose residuals are
       correlated.
     - `averaging`: (n, n) averaging kernel, d estimate / d truth: see `averaging_kernel`.
@@ -53,7 +56,7 @@ class Retrieval(AbstractPosterior):
     - `converged`: True if the fit ended at a minimum.
     - `status`: a sentence on the end of the fit.
     - `steps`: number of waveforms simulated, with few photons or all, each with its Jacobian.
-    - `history`: reduced chi-squared of every step; see `Step`.
+    - `history`: reduced chi-squared of every call of `progress`; see `Step`.
     - `labels`: names of the flattened unknowns.
 
     **Example:**
@@ -129,15 +132,16 @@ class Retrievals(AbstractPosterior):
     Arrays have a leading axis `footprints`. The quantities are those of `Retrieval`.
 
     - `values`: by name, (footprints, ...) best values.
-    - `stderr`: by name, (footprints, ...) one standard error; infinite for unknowns that the data do not
-      constrain.
+    - `stderr`: by name, (footprints, ...) one standard error; infinite for unknowns that neither
+      data nor priors constrain to within their bounds.
     - `robust_stderr`, `prior_share`, `at_bound`: by name, (footprints, ...).
     - `covariance`, `averaging`: (footprints, n, n).
     - `strength`: by name, (footprints,). `bounds`: by name, (2, ...), those of all footprints.
     - `reduced_chi2`, `second_minimum`, `independent_samples`: (footprints,).
     - `converged`: (footprints,) True for fits that ended at a minimum.
     - `steps`: (footprints,) number of waveforms simulated, with few photons or all, each with its Jacobian.
-    - `fitted`: (footprints, wavelengths, bins) apparent reflectance, without the scale.
+    - `fitted`: (footprints, wavelengths, bins) apparent reflectance, before the recorder (no
+      receiver response, scale or offset).
     - `status`: a sentence for each footprint on the end of its fit.
     - `labels`: names of the rows of `covariance`.
 
@@ -218,14 +222,14 @@ def retrieval_of(
 
     **Arguments:** `unknowns`: of the scene, then those of the recorder. `scene`, `waveform`: fitted.
     """
-    quantities = _named_quantities(fit.record.to_arrays(), unknowns)
+    quantities = _named_quantities(fit.summary.to_arrays(), unknowns)
     # The waveform takes its place.
     del quantities["fitted"]
     # Static fields of the result: plain Python values.
     end_of_fit = {name: quantities.pop(name) for name in ("converged", "status", "steps")}
     quantities |= {
         "simulation_error": split_by_name(fit.details.simulation_error, unknowns),
-        "correlation": correlation_of(fit.record.covariance),
+        "correlation": correlation_of(fit.summary.covariance),
         "residuals": fit.details.residuals,
         "bounds": bounds_by_name(unknowns),
     }
@@ -240,16 +244,17 @@ def retrieval_of(
     )
 
 
-def retrievals_of(records: Sequence[FitRecord], unknowns: Sequence[BoundUnknown]) -> Retrievals:
+def retrievals_of(summaries: Sequence[FitSummary], unknowns: Sequence[BoundUnknown]) -> Retrievals:
     """Return the results of many fits, in their order.
 
     **Arguments:** `unknowns`: of the scene, then those of the recorder.
     """
     stacked: dict[str, Any] = {
-        name: np.stack([np.asarray(getattr(record, name)) for record in records]) for name in FitRecord.axes()
+        name: np.stack([np.asarray(getattr(summary, name)) for summary in summaries])
+        for name in FitSummary.axes()
     }
     # An equinox module cannot hold strings in an array.
-    stacked["status"] = tuple(record.status for record in records)
+    stacked["status"] = tuple(summary.status for summary in summaries)
     return Retrievals(
         **_named_quantities(stacked, unknowns),
         bounds=bounds_by_name(unknowns),
@@ -258,9 +263,9 @@ def retrievals_of(records: Sequence[FitRecord], unknowns: Sequence[BoundUnknown]
 
 
 def _named_quantities(quantities: Mapping[str, Any], unknowns: Sequence[BoundUnknown]) -> dict[str, Any]:
-    """Return the quantities of a record, or stacked ones of many, with vectors split by name of unknown."""
+    """Return the quantities of a summary, or stacked ones of many, with vectors split by name of unknown."""
     named = {}
-    for name, axes in FitRecord.axes().items():
+    for name, axes in FitSummary.axes().items():
         quantity = quantities[name]
         # Matrices stay over all unknowns, in the order of the labels.
         if axes == ("unknowns",):

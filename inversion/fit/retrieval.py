@@ -10,8 +10,8 @@ import optimistix as optx
 from jaxtyping import ArrayLike, PRNGKeyArray
 
 from inversion.fit.data import ObservedWaveform, as_observed, with_fixed_window
-from inversion.fit.fit_record import Step
-from inversion.fit.model import Model
+from inversion.fit.fit_summary import Step
+from inversion.fit.model import ForwardModel
 from inversion.fit.planning import checked_plan, trace_sizes
 from inversion.fit.recorder_model import RecorderModel, check_names
 from inversion.fit.result import Retrieval, retrieval_of
@@ -78,8 +78,8 @@ def retrieve(
     truth, else the fit may end in another echo. `starts` fits from several starting points.
 
     All simulations of a fit use the same random numbers, so that the waveform is a smooth function of the
-    unknowns. If photons are traced at every step, a fit begins with a quarter of them, two of eight
-    batches, and goes on with all once a step is below one standard error. It converges with all:
+    unknowns except for small jumps. If photons are traced at every step, a fit begins with a quarter of them,
+    two of eight batches, and goes on with all once a step is below one standard error. It converges with all:
     values, errors and chi-squared come from them.
 
     The remaining noise of the simulation is estimated from its batches. It lowers the weight of the
@@ -97,7 +97,7 @@ def retrieve(
     - `unknowns`: what to retrieve, one `Unknown` or more. Every scene within the bounds must be admissible: a
       sum of reflectance and transmittance above one, for instance, is not noticed.
     - `noise`: one standard deviation of `observed`, in [0, inf], anything that broadcasts to it. Samples are
-      taken as independent. Infinity leaves a sample out.
+      taken as independent unless `recorder` says otherwise. Infinity leaves a sample out.
     - `key`: a JAX random key, other than that of a simulated `observed`.
     - `time`: (bins,) ns, needed if `observed` is an array. Times must lie the lidar's sampling interval
       apart. Default None: those of the `Waveform`.
@@ -115,16 +115,18 @@ def retrieve(
       a `Smooth` prior, only the default is admissible: steps are then solved within the bounds.
     - `max_steps`: most simulations, each with its Jacobian, from each start; no more than half of them are
       with few photons. Default 50.
-    - `starts`: number of starting points; the best fit is returned. The first is the scene's own, the others
-      are a Latin hypercube over the bounds. Default 1.
+    - `starts`: number of starting points; the best fit is returned. The first is that of the unknowns
+      (`Unknown.start`), the others are a Latin hypercube over the bounds. Default 1.
     - `scale`: (low, high), bounds of a further unknown, "scale", which multiplies the simulated reflectance,
-      the same for all wavelengths (an uncalibrated receiver). It starts from its least-squares value. Default
-      None: no such unknown.
+      the same for all wavelengths (the gain, or calibration factor, of an uncalibrated receiver). It starts
+      from its least-squares value. Default None: no such unknown.
     - `recorder`: what the recorder adds, a `Recorder`: its receiver's response, offsets of its digitisers,
       and the noise of the recorded pulse. Default None: nothing.
     - `noise_floor`: fraction of each wavelength's largest observed value, 0 to 1, that replaces any smaller
-      `noise`: standard errors of a simulation are zero in bins that no photon reached. Default 1e-3.
-    - `progress`: called with a `Step` after every simulation, with few photons or all; for instance `print`.
+      `noise`: a record without noise would give bins that no photon reached, where the simulation's standard
+      error is zero, infinite weight. Default 1e-3.
+    - `progress`: called with a `Step` after every trial, with few photons or all, and again when a descent
+      starts anew, with new weights or strengths of priors; for instance `print`.
     - `throw`: raise RuntimeError if the fit does not converge. Default False: only `Retrieval.status` says
       so.
 
@@ -209,7 +211,7 @@ def solve_problem(
     throw: bool = False,
 ) -> Retrieval:
     """Fit one waveform: `retrieve` with checked arguments."""
-    model = Model(problem.lidar, problem.scene, plan, problem.unknowns, key)
+    model = ForwardModel(problem.lidar, problem.scene, plan, problem.unknowns, key)
     recorder = RecorderModel(problem.recorder, problem.scale, problem.lidar, problem.observed.time.size)
     fits = fits_from_starts(problem.observed, problem.unknowns, recorder, problem.settings, key, progress)
 
@@ -218,10 +220,10 @@ def solve_problem(
 
     fit = run_fit(multistart(fits), simulate)
     # Failure is a status of the result; it is raised only here, on request.
-    if throw and not fit.record.converged:
-        raise RuntimeError(fit.record.status)
+    if throw and not fit.summary.converged:
+        raise RuntimeError(fit.summary.status)
     # The recorder's unknowns come last, and are none of the scene's.
-    scene_values = fit.record.values[: fit.record.values.size - recorder.count]
+    scene_values = fit.summary.values[: fit.summary.values.size - recorder.count]
     waveform = model.waveform(scene_values, fit.details.evaluation, fit.details.waveform_stderr)
     all_unknowns = [*problem.unknowns, *recorder.unknowns]
     return retrieval_of(fit, all_unknowns, model.scene_at(scene_values), waveform)

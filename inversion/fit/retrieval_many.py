@@ -10,7 +10,7 @@ needs:
 
 The number of photon batches of a member is data, so that pilot evaluations, full ones and idle members share
 one compiled program. With an executor, chunks of footprints are fitted in the same way by its workers. The
-fit of a footprint depends on neither.
+fit of a footprint depends neither on `lanes` nor on the executor.
 """
 
 import contextlib
@@ -29,8 +29,8 @@ import optimistix as optx
 from jaxtyping import Array, ArrayLike, PRNGKeyArray
 
 from inversion.fit.data import ObservedWaveform, as_noise, as_numbers, as_observed, with_fixed_window
-from inversion.fit.fit_record import FitRecord, RecordSizes
-from inversion.fit.model import Evaluation, ForwardModel, Model, evaluate_scene
+from inversion.fit.fit_summary import FitSummary, SummarySizes
+from inversion.fit.model import Evaluation, ForwardModel, SimulationInputs, evaluate_scene
 from inversion.fit.planning import checked_plan, trace_sizes
 from inversion.fit.recorder_model import RecorderModel, check_names, recorder_unknowns
 from inversion.fit.result import Retrievals, retrievals_of
@@ -114,7 +114,8 @@ def retrieve_many(
 ) -> Retrievals:
     """Retrieve unknowns of a scene from many waveforms, each separately, as `retrieve` does for one.
 
-    A fit that fails says so in its status and does not affect the others.
+    A fit that fails says so in its status and does not affect the others. All footprints share the random
+    numbers of the simulation, so that its errors are correlated between footprints.
 
     **Arguments:**
 
@@ -129,7 +130,8 @@ def retrieve_many(
     - `plan`: one for all footprints. Default None: made for the first lidar and scene and the corners of the
       bounds.
     - `start`: by name, (footprints, ...) values that unknowns start from. Default None: their own.
-    - `lanes`: number of footprints simulated together, at least 1; memory grows with it. Default 16.
+    - `lanes`: number of footprints simulated together (batch size), at least 1; memory grows with it. Default
+      16.
     - `path`: a checkpoint, an SQLite file that stores every fit once it has ended, so that a run that was
       interrupted or killed goes on where it stopped. It belongs to the problem: everything that the result
       depends on must be as it was, and only `lanes`, `executor` and `progress` may change. One run at a time
@@ -181,7 +183,7 @@ def retrieve_many(
     bound = _with_starts(bound, {} if start is None else start, n_footprints)
     check_solver_for(bound[0], settings)
     observations = [
-        as_observed(y[i], time, sigma[i], noise_floor, _item(lidars, i)) for i in range(n_footprints)
+        as_observed(y[i], time, sigma[i], noise_floor, _of_footprint(lidars, i)) for i in range(n_footprints)
     ]
     sample_times = observations[0].time
     scale_unknowns = [] if scale is None else [scale_unknown(scale, bound[0])]
@@ -227,7 +229,7 @@ def retrieve_many(
         settings=settings,
         groups=LockstepGroups.for_fits(min(lanes, n_footprints)),
     )
-    record_sizes = RecordSizes(
+    summary_sizes = SummarySizes(
         unknowns=sum(u.start.size for u in all_unknowns),
         smooth_priors=len(smooth_names(all_unknowns)),
         wavelengths=n_wavelengths,
@@ -235,18 +237,18 @@ def retrieve_many(
     )
     no_checkpoint = contextlib.nullcontext()
     with no_checkpoint if path is None else open_checkpoint(path, fingerprint(problem_parts)) as checkpoint:
-        finished = FinishedFits(checkpoint, n_footprints, record_sizes)
-        missing = [i for i in range(n_footprints) if i not in finished.records]
+        finished = FinishedFits(checkpoint, n_footprints, summary_sizes)
+        missing = [i for i in range(n_footprints) if i not in finished.summaries]
         fits = (
             run_fits(problem, key, missing)
             if executor is None
             else run_fits_by_workers(executor, problem, key, missing)
         )
-        for i, record in fits:
-            finished.add(i, record)
+        for i, summary in fits:
+            finished.add(i, summary)
             if progress is not None:
                 progress(finished.progress())
-    return retrievals_of([finished.records[i] for i in range(n_footprints)], all_unknowns)
+    return retrievals_of([finished.summaries[i] for i in range(n_footprints)], all_unknowns)
 
 
 def _parts_of_unknowns(unknowns: list[list[BoundUnknown]]) -> dict[str, Any]:
@@ -281,7 +283,7 @@ def _with_starts(
     return [
         [
             with_start(u, jnp.asarray(starts[u.name][i], u.start.dtype)) if u.name in starts else u
-            for u in _item(unknowns, i)
+            for u in _of_footprint(unknowns, i)
         ]
         for i in range(n_footprints)
     ]
@@ -307,7 +309,7 @@ def _one_or_each(field: str, argument: Any, kind: type, n_footprints: int) -> li
     return objects
 
 
-def _item(objects: Sequence[Any], i: int) -> Any:
+def _of_footprint(objects: Sequence[Any], i: int) -> Any:
     """Return the object of footprint `i`, from one for all or one for each."""
     return objects[0] if len(objects) == 1 else objects[i]
 
@@ -315,28 +317,28 @@ def _item(objects: Sequence[Any], i: int) -> Any:
 class FinishedFits:
     """Records of the fits that have ended, by footprint, and their checkpoint, if there is one."""
 
-    def __init__(self, checkpoint: Checkpoint | None, n_footprints: int, sizes: RecordSizes):
+    def __init__(self, checkpoint: Checkpoint | None, n_footprints: int, sizes: SummarySizes):
         self._checkpoint, self.n_footprints, self._sizes = checkpoint, n_footprints, sizes
         self._has_warned = False
-        self.records: dict[int, FitRecord] = {}
+        self.summaries: dict[int, FitSummary] = {}
         if checkpoint is not None:
-            self.records |= checkpoint.intact_entries(self._decode)
+            self.summaries |= checkpoint.intact_entries(self._decode)
 
-    def _decode(self, number: int, arrays: Mapping[str, np.ndarray]) -> FitRecord:
+    def _decode(self, number: int, arrays: Mapping[str, np.ndarray]) -> FitSummary:
         if not 0 <= number < self.n_footprints:
             raise ValueError(f"its number is outside the admissible range [0, {self.n_footprints - 1}]")
-        record = FitRecord.from_arrays(arrays)
-        record.check(self._sizes)
-        return record
+        summary = FitSummary.from_arrays(arrays)
+        summary.check(self._sizes)
+        return summary
 
-    def add(self, number: int, record: FitRecord) -> None:
+    def add(self, number: int, summary: FitSummary) -> None:
         """Add a fit, and store it. A first failure to store warns; all fits are in memory anyway."""
         # In memory first: results are returned whatever happens to the file.
-        self.records[number] = record
+        self.summaries[number] = summary
         if self._checkpoint is None:
             return
         try:
-            self._checkpoint.add(number, record.to_arrays())
+            self._checkpoint.add(number, summary.to_arrays())
         except OSError as error:
             if not self._has_warned:
                 self._has_warned = True
@@ -348,12 +350,11 @@ class FinishedFits:
 
     def progress(self) -> RetrievalProgress:
         """Return the progress so far."""
-        n_converged = sum(record.converged for record in self.records.values())
-        return RetrievalProgress(len(self.records), self.n_footprints, n_converged)
+        n_converged = sum(summary.converged for summary in self.summaries.values())
+        return RetrievalProgress(len(self.summaries), self.n_footprints, n_converged)
 
 
 # -- fits in lockstep
-# -------------------------------------------------------------------------------------------
 
 
 class LockstepGroups(NamedTuple):
@@ -381,7 +382,9 @@ class ManyFits:
     `lidars`, `scenes`, `unknowns` and `recorders` have one object for all footprints, or one for each.
 
     - `numbers`: of the footprints; their random keys are made from these.
-    - `observed`: waveform of each. - `unknowns`: of the scene. - `scale`: the unknown "scale", or empty.
+    - `observed`: waveform of each.
+    - `unknowns`: of the scene.
+    - `scale`: the unknown "scale", or empty.
     - `groups`: sizes of lockstep groups.
     """
 
@@ -416,16 +419,18 @@ class ManyFits:
         )
 
 
-def run_fits(problem: ManyFits, key: PRNGKeyArray, indices: Sequence[int]) -> Iterator[tuple[int, FitRecord]]:
-    """Fit the footprints at these indices of a problem in lockstep. Yield index and record as fits end."""
+def run_fits(
+    problem: ManyFits, key: PRNGKeyArray, indices: Sequence[int]
+) -> Iterator[tuple[int, FitSummary]]:
+    """Fit the footprints at these indices of a problem in lockstep. Yield index and summary as fits end."""
 
     def fit_of(i: int) -> FitGenerator:
-        observed, lidar = problem.observed[i], _item(problem.lidars, i)
-        recorder = _item(problem.recorders, i)
+        observed, lidar = problem.observed[i], _of_footprint(problem.lidars, i)
+        recorder = _of_footprint(problem.recorders, i)
         recorder_model = RecorderModel(recorder, problem.scale, lidar, observed.time.size)
         # It determines the starting points alone, which do not depend on the chunk or on earlier runs.
         fit_key = jax.random.fold_in(key, problem.numbers[i])
-        unknowns = _item(problem.unknowns, i)
+        unknowns = _of_footprint(problem.unknowns, i)
         return multistart(fits_from_starts(observed, unknowns, recorder_model, problem.settings, fit_key))
 
     # The photons of all footprints have the same key, as those of a single fit: results do not depend on the
@@ -447,27 +452,27 @@ def run_fits(problem: ManyFits, key: PRNGKeyArray, indices: Sequence[int]) -> It
                 running[i] = fit, fit.send(evaluation)
             except StopIteration as end:
                 del running[i]
-                yield i, end.value.record
+                yield i, end.value.summary
 
 
 def run_fits_by_workers(
     executor: Executor, problem: ManyFits, key: PRNGKeyArray, indices: Sequence[int]
-) -> Iterator[tuple[int, FitRecord]]:
+) -> Iterator[tuple[int, FitSummary]]:
     """Fit the footprints as `run_fits`, in chunks by the workers of an executor."""
     size = _GROUPS_PER_CHUNK * problem.groups.fits_per_thread
     chunks = [indices[i : i + size] for i in range(0, len(indices), size)]
-    # Arrays and names instead of records: a task's result is a tree of arrays.
+    # Arrays and names instead of summaries: a task's result is a tree of arrays.
     tasks = [task(n, _fit_chunk, (problem.subset(chunk),), key) for n, chunk in enumerate(chunks)]
-    for completed, records in outcomes(tasks, executor):
-        for i, arrays in zip(chunks[completed.number], records):
-            yield i, FitRecord.from_arrays(arrays)
+    for completed, summaries in outcomes(tasks, executor):
+        for i, arrays in zip(chunks[completed.number], summaries):
+            yield i, FitSummary.from_arrays(arrays)
 
 
 def _fit_chunk(problem: ManyFits, key: PRNGKeyArray) -> list[dict[str, Any]]:
     """Fit a chunk of footprints in a worker."""
     indices = range(len(problem.numbers))
-    records = dict(run_fits(problem, key, indices))
-    return [records[i].to_arrays() for i in indices]
+    summaries = dict(run_fits(problem, key, indices))
+    return [summaries[i].to_arrays() for i in indices]
 
 
 class LockstepModel:
@@ -475,7 +480,7 @@ class LockstepModel:
 
     def __init__(self, problem: ManyFits, key: PRNGKeyArray):
         self.lidars, self.scenes, self.groups = problem.lidars, problem.scenes, problem.groups
-        self.model = Model(self.lidars[0], self.scenes[0], problem.plan, problem.unknowns[0], key)
+        self.model = ForwardModel(self.lidars[0], self.scenes[0], problem.plan, problem.unknowns[0], key)
 
     def __call__(self, requests: Mapping[int, EvaluationRequest]) -> dict[int, Evaluation]:
         """Evaluate the requests of fits, by the index of their footprint."""
@@ -496,26 +501,27 @@ class LockstepModel:
     def _evaluate_group(
         self, group: list[int], requests: Mapping[int, EvaluationRequest]
     ) -> dict[int, Evaluation]:
+        """Stack values, lidars and scenes of a group, evaluate them in one call, and split the results."""
         # The compiled call has a fixed size: idle members repeat the last request with no batches.
         n_idle = self.groups.fits_per_thread - len(group)
         members = [*group, *[group[-1]] * n_idle]
         n_batches = [*(self._n_batches(requests[i]) for i in group), *[0] * n_idle]
         model = self.model
         values = jax.tree.map(lambda *a: jnp.stack(a), *(model.values(requests[i].values) for i in members))
-        forward = dataclasses.replace(
-            model.forward, lidar=_stacked(self.lidars, members), scene=_stacked(self.scenes, members)
+        inputs = dataclasses.replace(
+            model.inputs, lidar=_stacked(self.lidars, members), scene=_stacked(self.scenes, members)
         )
         # Static: another combination compiles another program.
         has_axis = HasFootprintAxis(len(self.lidars) > 1, len(self.scenes) > 1)
         # Results of idle members are dropped.
-        arrays = _evaluate_in_lockstep(forward, values, jnp.stack(model.keys), jnp.array(n_batches), has_axis)
-        total, columns, batches = (np.asarray(a, float) for a in arrays)
+        arrays = _evaluate_in_lockstep(inputs, values, jnp.stack(model.keys), jnp.array(n_batches), has_axis)
+        reflectance, columns, batches = (np.asarray(a, float) for a in arrays)
         return {
             i: Evaluation(
-                total[n],
+                reflectance[n],
                 np.moveaxis(columns[n][model.order], 0, -1),
                 None,
-                batches[n][: n_batches[n]] if model.forward.plan.is_random else None,
+                batches[n][: n_batches[n]] if model.inputs.plan.is_random else None,
                 n_batches[n] < len(model.keys),
             )
             for n, i in enumerate(group)
@@ -540,19 +546,19 @@ class HasFootprintAxis(NamedTuple):
 
 @eqx.filter_jit(**ONE_CORE)
 def _evaluate_in_lockstep(
-    forward: ForwardModel, values: Any, keys: Array, n_batches: Array, has_axis: HasFootprintAxis
+    inputs: SimulationInputs, values: Any, keys: Array, n_batches: Array, has_axis: HasFootprintAxis
 ) -> tuple[Array, Array, Array]:
     """Map `evaluate_scene` over the members of a group."""
-    lidar, static_lidar = eqx.partition(forward.lidar, eqx.is_array)
-    scene, static_scene = eqx.partition(forward.scene, eqx.is_array)
+    lidar, static_lidar = eqx.partition(inputs.lidar, eqx.is_array)
+    scene, static_scene = eqx.partition(inputs.scene, eqx.is_array)
 
     def evaluate(lidar: Lidar, scene: Scene, values: Any, n_batches: Array) -> tuple[Array, Array, Array]:
         lidar, scene = eqx.combine(lidar, static_lidar), eqx.combine(scene, static_scene)
-        member = dataclasses.replace(forward, lidar=lidar, scene=scene)
+        member = dataclasses.replace(inputs, lidar=lidar, scene=scene)
         return evaluate_scene(member, values, keys, n_batches)
 
     # At first order there are no photons, and all members take equally long.
-    if forward.plan.orders == 1:
+    if inputs.plan.orders == 1:
         axes = (0 if has_axis.lidar else None, 0 if has_axis.scene else None, 0, 0)
         return jax.vmap(evaluate, in_axes=axes)(lidar, scene, values, n_batches)
 

@@ -5,9 +5,9 @@ difference, and the priors as residuals q(x) (`inversion.fit.prior_residuals`),
 
     minimise over x within bounds   |C^-1/2 (w(x) - y)|^2 + |q(x)|^2.
 
-C holds the noise of the measurement, of the simulation and of a recorded pulse. The simulation's and the
-pulse's depend on x; they are taken at the start, renewed when all batches are first used, and again at the
-solution.
+The unknowns x are in natural units: their own, such as m. C holds the noise of the measurement, of the
+simulation and of a recorded pulse. The simulation's and the pulse's depend on x; they are taken at the start,
+renewed when all batches are first used, and again at the solution.
 
 **Stochastic part.** With common random numbers (the same photons at all x), w is smooth in x except for small
 jumps, and its Jacobian is an unbiased estimate of the derivative of its expectation (a sample average
@@ -21,15 +21,15 @@ on with all batches. Estimates, covariances and chi-squared come from all batche
 Pasupathy 2010, Oper. Res. 58, 889).
 
 **Steps.** Without smoothness priors, a Gauss-Newton method of optimistix (Levenberg-Marquardt by default)
-takes steps in the free parameters z of the bounded unknowns (`bounded_logistic`), with the Jacobian J dx/dz.
-With smoothness priors, layers without plants lie at their lower bound, many at a time, and come off it as
-others change. In z each of them would run away for many steps. Every step then solves the linearised problem
-within the bounds in natural units (bounded-variable least squares; Stark and Parker 1995, Comput. Stat. 10,
-129) and is cut to a quarter until it improves the fit.
+takes steps in the unconstrained parameters z of the bounded unknowns (`bounded_logistic`), with the Jacobian
+J dx/dz. With smoothness priors, layers without plants lie at their lower bound, many at a time, and come off
+it as others change. In z each of them would run away for many steps. Every step then solves the linearised
+problem within the bounds in natural units (bounded-variable least squares; Stark and Parker 1995, Comput.
+Stat. 10, 129) and is cut to a quarter until it improves the fit.
 
 **Stopping rule.** A fit has converged when a Gauss-Newton step would lower chi-squared by less than 0.05^2
 (the Newton decrement, a length in standard errors, is below 0.05), or below a larger limit after rejected
-steps: see `_STALL_LIMITS`.
+steps: see `_STALL_LIMITS`. The termination of optimistix's method counts as well.
 
 **Fits as generators.** A fit yields the values at which it needs a simulation and is sent the evaluation. The
 same code serves a single fit and many fits whose simulations run in one compiled call.
@@ -53,7 +53,7 @@ from inversion.fit.data import (
     neighbour_correlation,
     shared_errors_of_samples,
 )
-from inversion.fit.fit_record import CompletedFit, FitDetails, FitRecord, Step
+from inversion.fit.fit_summary import CompletedFit, FitDetails, FitSummary, Step
 from inversion.fit.model import Evaluation, batch_stderr
 from inversion.fit.prior_residuals import PriorResiduals
 from inversion.fit.recorder_model import RecorderModel
@@ -77,12 +77,13 @@ from inversion.fit.unknowns import (
 
 # A fit has converged if a Gauss-Newton step would move it by less than this many standard errors.
 _SMALL_STEP = 0.05
-# It has also converged after (number of rejected steps, if the step is below this many standard errors).
+# Pairs (n, limit): it has also converged if n or more steps in a row were rejected and the step is below
+# limit standard errors.
 _STALL_LIMITS = ((1, 0.3), (3, 0.6), (8, 1.0))
 # The same for pilot evaluations, whose noise hides smaller steps; the fit then goes on with all batches.
 _PILOT_SMALL_STEP, _PILOT_STALL_LIMITS = 1.0, ((1, 2.0), (3, 5.0))
-# Largest change of a free parameter in one step: far out the logistic function is flat, and a fit would be
-# stuck.
+# Largest change of an unconstrained parameter in one step: far out the logistic function is flat, and a fit
+# would be stuck.
 _MAX_FREE_STEP = 2.0
 # At the solution the weights are renewed if they differ from those of the start by more than this, in the
 # mean.
@@ -141,7 +142,6 @@ def run_fit(fit: FitGenerator, simulate: Callable[[EvaluationRequest], Evaluatio
 
 
 # -- Gauss-Newton steps of optimistix
-# ---------------------------------------------------------------------------
 
 
 def _linear_model(y: Array, args: tuple[Array, Array, Array]) -> tuple[Array, None]:
@@ -169,7 +169,6 @@ def _advance(solver: Any, y: Array, args: Any, state: Any) -> Any:
 
 
 # -- bounded Gauss-Newton step
-# ----------------------------------------------------------------------------------
 
 
 def bounded_step(
@@ -185,28 +184,27 @@ def bounded_step(
     width = high - low
     scaled = jacobian * width
     information = scaled.T @ scaled
-    # Normal equations: there are far more samples than unknowns. Their Cholesky root R has R^T R =
-    # information, so that |R^T step - b| is the same problem with as many rows as unknowns.
+    # Normal equations: there are far more samples than unknowns. With L L^T = information (Cholesky) and
+    # b = -L^-1 J^T r, |L^T step - b| is the same problem with as many rows as unknowns.
     # The floor lets the decomposition succeed for a Jacobian of zeros: then the step is zero.
     information += _RIDGE * max(np.trace(information), 1e-300) * np.eye(width.size)
-    root = np.linalg.cholesky(information)
-    target = linalg.solve_triangular(root, -scaled.T @ residual, lower=True)
+    cholesky = np.linalg.cholesky(information)
+    target = linalg.solve_triangular(cholesky, -scaled.T @ residual, lower=True)
     # An active-set method ends with values exactly at their bounds; interior methods only come near them.
     bounds = (low / width, high / width)
-    step = optimize.lsq_linear(root.T, target, bounds=bounds, method="bvls").x * width
+    step = optimize.lsq_linear(cholesky.T, target, bounds=bounds, method="bvls").x * width
     # Of the problem itself, without the ridge.
     decrease = residual @ residual - np.sum((residual + jacobian @ step) ** 2)
     return step, float(np.sqrt(max(decrease, 0.0)))
 
 
 # -- a fit from one start
-# ---------------------------------------------------------------------------------------
 
 
 class Iterate:
     """A simulated point of a fit.
 
-    - `z`, `values`, `slope`: free parameters, values, and derivative of the values in the free parameters.
+    - `z`, `values`, `slope`: unconstrained parameters, values, and derivative of the values in z.
     - `recorder_values`: the last of the values, those of the recorder's unknowns.
     - `evaluation`: the simulation.
     - `difference`, `jacobian`: simulated minus observed, of the fitted samples, and its Jacobian in natural
@@ -218,14 +216,18 @@ class Iterate:
         self.z, self.evaluation = z, evaluation
         self.values, self.slope = bounded_logistic(z, fit.low, fit.high)
         self.recorder_values = self.values[fit.n_scene :]
-        recorded = fit.recorder(evaluation.total, evaluation.jacobian, self.recorder_values)
-        self.difference = (recorded.total - fit.observed.reflectance)[fit.is_fitted]
+        recorded = fit.recorder_model(evaluation.reflectance, evaluation.jacobian, self.recorder_values)
+        self.difference = (recorded.reflectance - fit.observed.reflectance)[fit.is_fitted]
         self.jacobian = recorded.jacobian[fit.is_fitted]
         self.is_finite = bool(np.all(np.isfinite(self.difference)) and np.all(np.isfinite(self.jacobian)))
 
 
-# Best iterate of a descent, True if it converged, and its status.
-Descent = tuple[Iterate, bool, str]
+class Descent(NamedTuple):
+    """Best iterate of a descent, True if it converged, and a sentence on its end."""
+
+    best: Iterate
+    converged: bool
+    status: str
 
 
 class LeastSquaresFit:
@@ -234,38 +236,37 @@ class LeastSquaresFit:
     - `start`: starting values. Default None: those of the unknowns.
 
     Its state: `noise`, the present weights; `prior`, with the present strengths; `use_pilot`, True while few
-    batches suffice; `n_simulations` and `history`, chi-squared of every step.
+    batches suffice; `n_simulations` and `history`, reduced chi-squared of every call of `progress`.
     """
 
     def __init__(
         self,
         observed: ObservedWaveform,
         scene_unknowns: list[BoundUnknown],
-        recorder: RecorderModel,
+        recorder_model: RecorderModel,
         settings: SolverSettings,
         progress: Callable[[Step], None] | None = None,
         start: np.ndarray | None = None,
     ):
-        self.observed, self.is_fitted, self.recorder = observed, observed.is_fitted, recorder
-        self.unknowns = [*scene_unknowns, *recorder.unknowns]
+        self.observed, self.is_fitted, self.recorder_model = observed, observed.is_fitted, recorder_model
+        self.unknowns = [*scene_unknowns, *recorder_model.unknowns]
         self.settings, self.progress = settings, progress
         self.low, self.high = flat_bounds(self.unknowns)
-        self.n_scene = self.low.size - recorder.count
+        self.n_scene = self.low.size - recorder_model.count
         self.start = flat_start(self.unknowns) if start is None else start
         self.prior = PriorResiduals(self.unknowns)
-        self.correlation = neighbour_correlation(float(recorder.recorder.correlation), self.is_fitted)
+        self.correlation = neighbour_correlation(float(recorder_model.recorder.correlation), self.is_fitted)
         self.noise = SampleNoise(observed.sigma[self.is_fitted], None, self.correlation)
         # A single simulation has to be one with all batches.
         self.use_pilot = settings.max_steps > 1
         self.n_simulations, self.history = 0, []
 
     # -- objective
-    # ---------------------------------------------------------------------------------------------
 
     def simulate(
         self, z: np.ndarray, *, with_batches: bool = False
     ) -> Generator[EvaluationRequest, Evaluation, Iterate]:
-        """Request a simulation at the free parameters `z`."""
+        """Request a simulation at the unconstrained parameters `z`."""
         values = bounded_logistic(z, self.low, self.high)[0]
         evaluation = yield EvaluationRequest(values[: self.n_scene], with_batches, self.use_pilot)
         return Iterate(self, z, evaluation)
@@ -284,9 +285,11 @@ class LeastSquaresFit:
     def update_weights(self, iterate: Iterate) -> float:
         """Renew the noise of simulation and pulse at an iterate. **Returns:** the mean relative change."""
         batches = iterate.evaluation.batches
-        received = None if batches is None else self.recorder.received(batches, iterate.recorder_values)
+        received = None if batches is None else self.recorder_model.received(batches, iterate.recorder_values)
         simulation_sigma = np.broadcast_to(batch_stderr(received), self.is_fitted.shape)[self.is_fitted]
-        pulse_errors = self.recorder.pulse_noise(iterate.evaluation.total, iterate.recorder_values)
+        pulse_errors = self.recorder_model.pulse_noise(
+            iterate.evaluation.reflectance, iterate.recorder_values
+        )
         previous_sigma = self.noise.sigma
         self.noise = SampleNoise(
             np.hypot(self.observed.sigma[self.is_fitted], simulation_sigma),
@@ -296,7 +299,6 @@ class LeastSquaresFit:
         return float(np.mean(np.abs(self.noise.sigma / previous_sigma - 1.0)))
 
     # -- algorithm
-    # ---------------------------------------------------------------------------------------------
 
     def run(self) -> FitGenerator:
         """Run the fit.
@@ -337,11 +339,11 @@ class LeastSquaresFit:
     def _first_iterate(self) -> Generator[EvaluationRequest, Evaluation, Iterate]:
         z = bounded_logit(self.start, self.low, self.high)
         iterate = yield from self.simulate(z, with_batches=True)
-        if self.recorder.count and iterate.is_finite:
+        if self.recorder_model.count and iterate.is_finite:
             # The record is linear in offset and scale: a start far off would lead the other unknowns astray.
-            recorder_values = self.recorder.fit_linear(
+            recorder_values = self.recorder_model.fit_linear(
                 iterate.recorder_values,
-                iterate.evaluation.total,
+                iterate.evaluation.reflectance,
                 self.observed.reflectance,
                 self.observed.sigma,
             )
@@ -370,22 +372,22 @@ class LeastSquaresFit:
             descend = self._bounded_gauss_newton if self.prior.processes else self._gauss_newton
             best, converged, status = yield from descend(best)
             if not converged or not self.prior.has_free_strengths:
-                return best, converged, status
+                return Descent(best, converged, status)
             residual, jacobian = self.noise.whiten(best.difference), self.noise.whiten(best.jacobian)
             strengths = self.prior.maximise_evidence(best.values, residual, jacobian)
             if np.all(np.abs(np.log(strengths / self.prior.strengths)) < _STRENGTH_TOLERANCE):
-                return best, True, status
+                return Descent(best, True, status)
             self.prior.set_strengths(strengths)
         status = "not converged: the strength of a smoothness prior did not settle"
-        return best, False, self._status(status)
+        return Descent(best, False, self._status(status))
 
     def _gauss_newton(self, best: Iterate) -> Generator[EvaluationRequest, Evaluation, Descent]:
-        """Descend in the free parameters with a Gauss-Newton method of optimistix, from `best`.
+        """Descend in the unconstrained parameters with a Gauss-Newton method of optimistix, from `best`.
 
         1. Give the solver residual and Jacobian at the trial; it accepts the trial or goes back to `best`.
         2. Stop if the Newton decrement at the best iterate is small, by the solver's own rule, or at
            max_steps.
-        3. Simulate at the solver's next trial, at most 2 away in each free parameter.
+        3. Simulate at the solver's next trial, at most 2 away in each parameter.
         """
         trial, state, y = best, None, jnp.asarray(best.z)
         decrement, n_rejected = np.inf, 0
@@ -401,18 +403,18 @@ class LeastSquaresFit:
             # An accepted trial is the solver's new point, bit by bit.
             accepted = bool(jnp.all(y == args[0])) and trial.is_finite
             if accepted:
-                inactive = jacobian[:, self._is_inactive(trial, residual, jacobian)]
-                best, decrement, n_rejected = trial, newton_decrement(inactive, residual), 0
+                free_columns = jacobian[:, self._is_inactive(trial, residual, jacobian)]
+                best, decrement, n_rejected = trial, newton_decrement(free_columns, residual), 0
             else:
                 n_rejected += 1
             self._report(trial, accepted)
             if bool(terminated) or self._has_converged(decrement, n_rejected):
-                return best, True, self._status("converged")
+                return Descent(best, True, self._status("converged"))
             if not bool(successful):
                 status = "failed: the equations for the next step could not be solved"
-                return best, False, self._status(status)
+                return Descent(best, False, self._status(status))
             if self._is_exhausted:
-                return best, False, self._status("not converged: stopped at max_steps")
+                return Descent(best, False, self._status("not converged: stopped at max_steps"))
             # Cut within the solver's state: the solver predicts the fall of the cost from the trial itself,
             # and so judges the shorter step by the right number.
             step = jnp.clip(state.y_eval - y, -_MAX_FREE_STEP, _MAX_FREE_STEP)
@@ -437,13 +439,13 @@ class LeastSquaresFit:
             fraction, n_rejected, accepted = 1.0, 0, False
             while not accepted:
                 if self._has_converged(length, n_rejected):
-                    return best, True, self._status("converged")
+                    return Descent(best, True, self._status("converged"))
                 # A step that promises more than the noise of the simulation explains, while not even a tiny
                 # part of it improves the fit, is no sign of a minimum: the Jacobian is wrong.
                 if n_rejected > self._stall_limits[-1][0]:
-                    return best, False, self._status("failed: no step improves the fit")
+                    return Descent(best, False, self._status("failed: no step improves the fit"))
                 if self._is_exhausted:
-                    return best, False, self._status("not converged: stopped at max_steps")
+                    return Descent(best, False, self._status("not converged: stopped at max_steps"))
                 z = bounded_logit(values + fraction * step, self.low, self.high)
                 trial = yield from self.simulate(z)
                 self.n_simulations += 1
@@ -453,7 +455,6 @@ class LeastSquaresFit:
             best = trial
 
     # -- stopping rule
-    # -----------------------------------------------------------------------------------------
 
     @property
     def _stall_limits(self) -> tuple[tuple[int, float], ...]:
@@ -474,8 +475,8 @@ class LeastSquaresFit:
     def _is_inactive(self, iterate: Iterate, residual: np.ndarray, jacobian: np.ndarray) -> np.ndarray:
         """Return True for unknowns whose bounds are inactive.
 
-        A bound is active if the unknown is at it and the fit would improve beyond it. In a free parameter,
-        the step towards a bound never ends; such unknowns do not count in the decrement.
+        A bound is active if the unknown is at it and the fit would improve beyond it. In an unconstrained
+        parameter, the step towards a bound never ends; such unknowns do not count in the decrement.
         """
         fraction = (iterate.values - self.low) / (self.high - self.low)
         descent = -(jacobian.T @ residual)
@@ -489,18 +490,23 @@ class LeastSquaresFit:
         return f"{end} after {self.n_simulations} simulation{plural}"
 
     def _report(self, iterate: Iterate, accepted: bool) -> None:
-        freedom = max(iterate.difference.size - self.low.size, 1)
-        chi2 = float(np.sum(self.noise.whiten(iterate.difference) ** 2)) / freedom
+        degrees_of_freedom = max(iterate.difference.size - self.low.size, 1)
+        chi2 = float(np.sum(self.noise.whiten(iterate.difference) ** 2)) / degrees_of_freedom
         self.history.append(chi2)
         if self.progress is not None:
             values = split_by_name(iterate.values, self.unknowns)
             self.progress(Step(len(self.history), chi2, accepted, values))
 
     # -- result
-    # ------------------------------------------------------------------------------------------------
 
     def _completed(self, iterate: Iterate, converged: bool, status: str) -> CompletedFit:
-        """Return the result at an iterate."""
+        """Return the result at an iterate.
+
+        1. Whiten Jacobian and deviations of the batches by the present weights.
+        2. Compute the covariance of the estimates, and the errors widened by misfit.
+        3. Find unknowns at a bound, and reduced chi-squared.
+        4. Compute the cost by which fits from several starts are compared.
+        """
         is_fitted, evaluation = self.is_fitted, iterate.evaluation
         deviations = self._whitened_deviations(iterate)
         jacobian = np.zeros_like(iterate.jacobian)
@@ -513,55 +519,57 @@ class LeastSquaresFit:
             jacobian,
             precision,
             self.high - self.low,
-            (measured_sigma / self.noise.sigma_independent) ** 2,
+            (measured_sigma / self.noise.sigma_unshared) ** 2,
             deviations,
             self.prior.basis,
         )
         stderr = np.sqrt(np.diag(estimate.covariance))
-        robust_stderr, effective_samples = self._robust_stderr(iterate, stderr, estimate, jacobian, precision)
+        robust_stderr, independent_samples = self._robust_stderr(
+            iterate, stderr, estimate, jacobian, precision
+        )
         fraction = (iterate.values - self.low) / (self.high - self.low)
         at_low, at_high = fraction < _AT_BOUND, fraction > 1 - _AT_BOUND
         residuals = np.zeros(is_fitted.shape)
         residuals[is_fitted] = -self.noise.whiten(iterate.difference)
         n_undetermined = int(np.sum(estimate.is_undetermined))
-        freedom = max(iterate.difference.size - self.low.size + n_undetermined, 1)
-        # Costs of fits from several starts are compared: without the simulation's noise, they have equal
-        # weights.
-        measurement = self.noise._replace(sigma_independent=measured_sigma)
+        degrees_of_freedom = max(iterate.difference.size - self.low.size + n_undetermined, 1)
+        # Costs of fits from several starts are compared. Without the simulation's noise, they have nearly
+        # equal weights: the noise of the pulse is that at each fit's own minimum, and ln det C is left out.
+        measurement = self.noise._replace(sigma_unshared=measured_sigma)
         cost = np.sum(measurement.whiten(iterate.difference) ** 2) + np.sum(prior_residual**2)
-        record = FitRecord(
+        summary = FitSummary(
             values=iterate.values,
             stderr=stderr,
             robust_stderr=robust_stderr,
-            prior_share=estimate.prior_fraction,
+            prior_share=estimate.prior_share,
             at_bound=at_low | at_high,
             covariance=estimate.covariance,
             averaging=estimate.averaging,
-            reduced_chi2=float(np.sum(residuals**2) / freedom),
-            independent_samples=effective_samples,
+            reduced_chi2=float(np.sum(residuals**2) / degrees_of_freedom),
+            independent_samples=independent_samples,
             second_minimum=np.inf,
             strength=self.prior.strengths,
             converged=converged,
             status=status + self._notes(estimate.is_undetermined, at_low, at_high),
             steps=self.n_simulations,
-            fitted=np.asarray(evaluation.total),
+            fitted=np.asarray(evaluation.reflectance),
         )
         details = FitDetails(
-            simulation_error=estimate.simulation_stderr,
+            simulation_error=estimate.simulation_error,
             residuals=residuals,
             waveform_stderr=np.asarray(np.broadcast_to(batch_stderr(evaluation.batches), is_fitted.shape)),
-            cost=float(cost) + self.prior.log_normalisation if iterate.is_finite else np.inf,
+            cost=float(cost) + self.prior.log_determinant if iterate.is_finite else np.inf,
             history=tuple(self.history),
             evaluation=evaluation,
         )
-        return CompletedFit(record, details)
+        return CompletedFit(summary, details)
 
     def _whitened_deviations(self, iterate: Iterate) -> np.ndarray | None:
         """Return the whitened deviations of the batches from their mean, (batches, samples), or None."""
         batches = iterate.evaluation.batches
         if batches is None or not iterate.is_finite:
             return None
-        received = self.recorder.received(batches - np.mean(batches, axis=0), iterate.recorder_values)
+        received = self.recorder_model.received(batches - np.mean(batches, axis=0), iterate.recorder_values)
         return self.noise.whiten(received[:, self.is_fitted].T).T
 
     def _notes(self, is_undetermined: np.ndarray, at_low: np.ndarray, at_high: np.ndarray) -> str:
@@ -584,13 +592,19 @@ class LeastSquaresFit:
         jacobian: np.ndarray,
         precision: np.ndarray,
     ) -> tuple[np.ndarray, float]:
-        """Return standard errors widened by misfit, and the effective number of samples."""
+        """Return standard errors widened by misfit, and the effective number of samples.
+
+        They are the roots of the diagonal of H^-1 (J^T C J + P) H^-1, with C estimated from the residuals
+        (`inversion.fit.uncertainty`), and never below `stderr`.
+        """
         if not iterate.is_finite:
             return stderr, float(iterate.difference.size)
         difference, is_undetermined = iterate.difference, estimate.is_undetermined
         signal = (difference + self.observed.reflectance[self.is_fitted]) / self.noise.sigma
-        # Degrees of freedom for signal: the trace of the averaging kernel (Rodgers 2000).
-        n_determined = float(np.sum(1.0 - estimate.prior_fraction[~is_undetermined]))
+        # Effective number of parameters (degrees of freedom for signal): residuals lose less than one degree
+        # of freedom to an unknown that its prior holds. Reduced chi-squared counts unknowns instead, as is
+        # usual.
+        n_determined = float(np.sum(1.0 - estimate.prior_share[~is_undetermined]))
         misfit = residual_covariance(
             self.noise.whiten(difference),
             jacobian,
@@ -603,17 +617,16 @@ class LeastSquaresFit:
         variance = np.diag(inverse @ (misfit.meat + precision) @ inverse)
         # Never below the stated errors: that residuals happen to be small is no evidence of less noise.
         robust = np.where(is_undetermined, np.inf, np.maximum(stderr, np.sqrt(variance)))
-        return robust, misfit.effective_samples
+        return robust, misfit.independent_samples
 
 
 # -- several starts
-# ---------------------------------------------------------------------------------------------
 
 
 def fits_from_starts(
     observed: ObservedWaveform,
     scene_unknowns: list[BoundUnknown],
-    recorder: RecorderModel,
+    recorder_model: RecorderModel,
     settings: SolverSettings,
     key: PRNGKeyArray,
     progress: Callable[[Step], None] | None = None,
@@ -621,9 +634,9 @@ def fits_from_starts(
     """Return a fit from the unknowns' own start, and further ones from a Latin hypercube over the bounds."""
     starts: list[np.ndarray | None] = [None]
     if settings.starts > 1:
-        unknowns = [*scene_unknowns, *recorder.unknowns]
+        unknowns = [*scene_unknowns, *recorder_model.unknowns]
         starts += list(latin_hypercube(unknowns, settings.starts - 1, jax.random.fold_in(key, 1)))
-    return [LeastSquaresFit(observed, scene_unknowns, recorder, settings, progress, s) for s in starts]
+    return [LeastSquaresFit(observed, scene_unknowns, recorder_model, settings, progress, s) for s in starts]
 
 
 def latin_hypercube(
@@ -644,7 +657,8 @@ def latin_hypercube(
 def multistart(fits: Sequence[LeastSquaresFit]) -> FitGenerator:
     """Run fits from several starts, one after the other, and return the converged one of the lowest cost.
 
-    Its steps and history are those of all fits.
+    Starts that ended at the same minimum are counted, and others compared with it (`compare_minima`). Its
+    steps and history are those of all fits.
     """
     completed = []
     for fit in fits:
@@ -652,42 +666,49 @@ def multistart(fits: Sequence[LeastSquaresFit]) -> FitGenerator:
 
     def rank(fit: CompletedFit) -> tuple[bool, bool, float]:
         # Infinite and NaN costs come last.
-        return not fit.record.converged, not np.isfinite(fit.details.cost), fit.details.cost
+        return not fit.summary.converged, not np.isfinite(fit.details.cost), fit.details.cost
 
     best = min(completed, key=rank)
     if len(fits) == 1:
         return best
-    other_minima = [fit for fit in completed if fit.record.converged and fit is not best]
-    second_minimum, robust_stderr = compare_minima(best, other_minima)
-    # Within one unit of chi-squared: fits stop at slightly different points of one minimum.
-    n_same = sum(f.record.converged and f.details.cost < best.details.cost + 1.0 for f in completed)
-    record = dataclasses.replace(
-        best.record,
-        steps=sum(fit.record.steps for fit in completed),
-        status=f"{best.record.status}; {n_same} of {len(fits)} starts ended there",
-        second_minimum=second_minimum,
+    further_fits = [fit for fit in completed if fit.summary.converged and fit is not best]
+    second_minimum_rise, robust_stderr = compare_minima(best, further_fits)
+    # Within one in chi-squared: the stopping rule leaves less than that.
+    n_same = sum(f.summary.converged and f.details.cost < best.details.cost + 1.0 for f in completed)
+    summary = dataclasses.replace(
+        best.summary,
+        steps=sum(fit.summary.steps for fit in completed),
+        status=f"{best.summary.status}; {n_same} of {len(fits)} starts ended there",
+        second_minimum=second_minimum_rise,
         robust_stderr=robust_stderr,
     )
     history = tuple(chi2 for fit in completed for chi2 in fit.details.history)
-    return CompletedFit(record, dataclasses.replace(best.details, history=history))
+    return CompletedFit(summary, dataclasses.replace(best.details, history=history))
 
 
-def compare_minima(best: CompletedFit, other_minima: Sequence[CompletedFit]) -> tuple[float, np.ndarray]:
+def compare_minima(best: CompletedFit, further_fits: Sequence[CompletedFit]) -> tuple[float, np.ndarray]:
     """Return the rise in chi-squared to the second minimum, and standard errors with the spread over minima.
 
-    Minima are the same within two standard errors of all unknowns. Chi-squared counts correlated samples by
-    their effective number, and in units of the best fit's reduced one. A minimum has the weight exp(-rise /
-    2), its relative likelihood.
+    1. The rise of chi-squared from the best fit to fit m counts correlated samples by their effective number,
+       and is in units of the best fit's reduced chi-squared.
+    2. Fit m is in another minimum if an unknown differs by more than two standard errors.
+    3. With the relative likelihood p_m = exp(-rise_m / 2), one for the best fit itself,
+
+           spread^2 = sum_m p_m (x_m - x_best)^2 / sum_m p_m
+
+       over all fits is added to the square of the standard errors.
     """
-    record = best.record
+    summary = best.summary
+    # Residuals of samples that are left out are zero.
     n_samples = max(np.count_nonzero(best.details.residuals), 1)
-    scale = record.independent_samples / n_samples / max(record.reduced_chi2, 1.0)
-    second_minimum, variance, weight = np.inf, np.zeros_like(record.values), 1.0
-    for minimum in other_minima:
-        rise = max(minimum.details.cost - best.details.cost, 0.0) * scale
-        distance = minimum.record.values - record.values
-        if np.any(np.abs(distance) > 2.0 * record.robust_stderr):
-            second_minimum = min(second_minimum, rise)
-        variance += np.exp(-0.5 * rise) * distance**2
+    scale = summary.independent_samples / n_samples / max(summary.reduced_chi2, 1.0)
+    second_minimum_rise, weighted_squares, weight = np.inf, np.zeros_like(summary.values), 1.0
+    for fit in further_fits:
+        rise = max(fit.details.cost - best.details.cost, 0.0) * scale
+        distance = fit.summary.values - summary.values
+        if np.any(np.abs(distance) > 2.0 * summary.robust_stderr):
+            second_minimum_rise = min(second_minimum_rise, rise)
+        weighted_squares += np.exp(-0.5 * rise) * distance**2
         weight += np.exp(-0.5 * rise)
-    return float(second_minimum), np.hypot(record.robust_stderr, np.sqrt(variance / weight))
+    spread = np.sqrt(weighted_squares / weight)
+    return float(second_minimum_rise), np.hypot(summary.robust_stderr, spread)

@@ -1,34 +1,39 @@
 r"""Covariance of the estimates of a fit: of the noise, of the simulation, and robust to misfit.
 
 **Notation.** J: whitened Jacobian of the data (data, n); P: precision of the priors; H = J^T J + P: the
-information, whose inverse is the posterior covariance of the linearised problem.
+posterior precision, whose inverse is the posterior covariance of the linearised problem. J^T J alone is the
+Fisher information.
 
 **Stated noise and simulation.** Residuals are whitened by the noise of measurement and simulation together.
 The covariance of the estimates is
 
-    H^-1 (J^T W J + P) H^-1  +  covariance of (H^-1 J^T d) / batches,
+    H^-1 (J^T W J + P) H^-1  +  (covariance of H^-1 J^T d over batches) / (number of batches),
 
 with W the diagonal fraction of the variance that is the measurement's, and d the deviations of the
-simulation's batches from their mean. The second term is the simulation's own noise. As all batches of all
-samples enter it together, it has the full correlation between bins and wavelengths, which W alone would miss.
+simulation's batches from their mean. W is exact for independent samples; with correlated or shared errors,
+where whitened samples are mixtures, it is an approximation. The second term is the simulation's own noise. As
+all batches of all samples enter it together, it has the full correlation between bins and wavelengths, which
+W alone would miss.
 
-**Fraction of the prior.** The diagonal of H^-1 P is the fraction of the information on each unknown that is
-the prior's. A = H^-1 J^T J = d estimate / d truth is the averaging kernel.
+**Share of the prior.** A = H^-1 J^T J = d estimate / d truth is the averaging kernel. The share of the prior
+in an estimate is 1 - A_ii, the diagonal of H^-1 P, cut to [0, 1], which it may leave if unknowns are
+correlated.
 
-**Undetermined unknowns.** An unknown is undetermined if its standard error exceeds the width of its bounds,
-alone or in combination with others: eigenvectors of H, scaled to a unit diagonal, whose eigenvalue is
-rounding.
+**Undetermined unknowns.** An unknown is undetermined if its standard error, from data and priors, exceeds the
+width of its bounds, alone or in combination with others: eigenvectors of H, scaled to a unit diagonal, whose
+eigenvalue is rounding.
 
 **Misfit.** A wrong model leaves residuals that are large where the signal is, and alike from sample to
 sample. The whitened residuals of a fit are taken as a draw from
 
     C_ij = a^2 (delta_ij + k^2 g_i g_j phi^|i - j|),    g_i = s_i / max s,
 
-with s the simulated signal in the same units: white noise of amplitude a, and an error of the model that is k
-times as large at the signal's peak, proportional to the signal, first-order autoregressive over samples, and
-independent between wavelengths. Each phi and k of a grid is weighted by the restricted likelihood of the
-residuals (the unknowns are integrated out, which accounts for the degrees of freedom that they took; a has
-its value of largest likelihood). With C the mean over the grid, the robust covariance is the sandwich
+with s the modelled record in the same units, offsets of digitisers included: white noise of amplitude a, and
+an error of the model that is k times as large at the signal's peak, proportional to the signal, first-order
+autoregressive over samples, and independent between wavelengths. Each phi and k of a grid is weighted by the
+restricted likelihood of the residuals (the unknowns are integrated out, which accounts for the degrees of
+freedom that they took; a has its value of largest likelihood). With C the mean over the grid, the robust
+covariance is the sandwich
 
     H^-1 (J^T C J + P) H^-1.
 
@@ -57,7 +62,7 @@ _MIN_SINGULAR_VALUE = 1e-3
 _PHI_GRID = (0.0, 0.5, 0.8, 0.92, 0.97)
 _K2_GRID = (0.0, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)
 # With fewer degrees of freedom residuals do not determine a covariance.
-_MIN_FREEDOM = 8.0
+_MIN_DEGREES_OF_FREEDOM = 8.0
 # Added to the unit diagonal of the scaled information: keeps it regular for collinear unknowns.
 _RIDGE = 1e-12
 
@@ -67,19 +72,18 @@ class EstimateCovariance(NamedTuple):
 
     - `covariance`: of all unknowns. Undetermined ones have an infinite variance and no covariance with
       others, whose covariance is as if the undetermined ones were free.
-    - `simulation_stderr`: standard errors from the simulation's noise alone.
-    - `is_undetermined`: True for unknowns that the data do not constrain.
+    - `simulation_error`: standard errors from the simulation's noise alone.
+    - `is_undetermined`: True for unknowns that neither data nor priors constrain to within their bounds.
     - `inverse_information`: H^-1; zero for undetermined combinations.
-    - `prior_fraction`: of the information on each unknown, from 0 (all from the data) to 1 (all from the
-      prior).
+    - `prior_share`: 1 - A_ii, cut to [0, 1]: from 0 (all from the data) to 1 (all from the prior).
     - `averaging`: A = H^-1 J^T J.
     """
 
     covariance: Float[np.ndarray, "n n"]
-    simulation_stderr: Float[np.ndarray, " n"]
+    simulation_error: Float[np.ndarray, " n"]
     is_undetermined: np.ndarray
     inverse_information: Float[np.ndarray, "n n"]
-    prior_fraction: Float[np.ndarray, " n"]
+    prior_share: Float[np.ndarray, " n"]
     averaging: Float[np.ndarray, "n n"]
 
 
@@ -92,6 +96,14 @@ def estimate_covariance(
     basis: Float[np.ndarray, "n n"] | None = None,
 ) -> EstimateCovariance:
     """Return the covariance at the solution.
+
+    1. Form H in the basis of the priors.
+    2. Mark unknowns with less information than a flat prior over their bounds.
+    3. Invert H of the others, scaled to a unit diagonal. Leave out eigenvectors of tiny eigenvalue, and mark
+       the unknowns in them.
+    4. Form the sandwich with the measurement's part.
+    5. Add the covariance from the batches of the simulation.
+    6. Mark unknowns whose error exceeds the width of their bounds.
 
     **Arguments:**
 
@@ -107,31 +119,32 @@ def estimate_covariance(
     basis = np.eye(n) if basis is None else basis
     data_information = jacobian.T @ jacobian
     information = basis.T @ (data_information + precision) @ basis
-    # Unknowns with less information than a flat prior over their bounds. Columns of a correlating prior
-    # already have unit variance.
+    # Unknowns with less information than a flat prior over their bounds. Columns of a correlating prior have
+    # an information of one or more from the prior, but for rounding (1e-6), and are never marked here: the
+    # index of a marked column is that of its unknown.
     is_mixed = np.any(basis != np.diag(np.diag(basis)), axis=0)
     # A prior as wide as the bounds has the information one, but for rounding, and counts as determined.
-    undetermined = np.diag(information) * np.where(is_mixed, 1.0, width) ** 2 < 1.0 - 1e-6
+    is_undetermined = np.diag(information) * np.where(is_mixed, 1.0, width) ** 2 < 1.0 - 1e-6
     prior_information = np.diag(precision)
     marginal_fraction = prior_information / np.where(
         prior_information > 0, prior_information + np.diag(data_information), 1.0
     )
     # Pseudo-inverse, for a unit diagonal so that units of unknowns do not matter.
-    candidates = np.flatnonzero(~undetermined)
+    candidates = np.flatnonzero(~is_undetermined)
     block = np.ix_(candidates, candidates)
     norm = np.sqrt(np.diag(information)[candidates])
     eigenvalue, eigenvector = np.linalg.eigh(information[block] / np.outer(norm, norm))
-    determined = eigenvalue > _MIN_EIGENVALUE
-    undetermined[candidates] |= np.any(eigenvector[:, ~determined] ** 2 > _MIN_COMPONENT, axis=1)
+    is_regular = eigenvalue > _MIN_EIGENVALUE
+    is_undetermined[candidates] |= np.any(eigenvector[:, ~is_regular] ** 2 > _MIN_COMPONENT, axis=1)
     inverse = np.zeros((n, n))
     inverse[block] = (
-        (eigenvector[:, determined] / eigenvalue[determined])
-        @ eigenvector[:, determined].T
+        (eigenvector[:, is_regular] / eigenvalue[is_regular])
+        @ eigenvector[:, is_regular].T
         / np.outer(norm, norm)
     )
     inverse = basis @ inverse @ basis.T
     # The inverse lacks undetermined combinations: of their unknowns, information without correlations counts.
-    prior_fraction = np.where(undetermined, marginal_fraction, np.diag(inverse @ precision))
+    prior_share = np.where(is_undetermined, marginal_fraction, np.diag(inverse @ precision))
     meat = (jacobian.T * measurement_fraction) @ jacobian + precision
     covariance = inverse @ meat @ inverse
     simulation = np.zeros((n, n))
@@ -141,17 +154,18 @@ def estimate_covariance(
         simulation = shifts.T @ shifts / (len(shifts) * (len(shifts) - 1))
     covariance = covariance + simulation
     # Again, with the noise of the simulation and the covariance of determined combinations.
-    undetermined |= np.diag(covariance) > width**2
-    covariance[undetermined, :] = 0.0
-    covariance[:, undetermined] = 0.0
-    covariance[undetermined, undetermined] = np.inf
-    simulation_stderr = np.where(undetermined, 0.0, np.sqrt(np.diag(simulation)))
+    is_undetermined |= np.diag(covariance) > width**2
+    covariance[is_undetermined, :] = 0.0
+    covariance[:, is_undetermined] = 0.0
+    # Twice the same mask picks elements of the diagonal only.
+    covariance[is_undetermined, is_undetermined] = np.inf
+    simulation_error = np.where(is_undetermined, 0.0, np.sqrt(np.diag(simulation)))
     return EstimateCovariance(
         covariance,
-        simulation_stderr,
-        undetermined,
+        simulation_error,
+        is_undetermined,
         inverse,
-        np.clip(prior_fraction, 0.0, 1.0),
+        np.clip(prior_share, 0.0, 1.0),
         inverse @ data_information,
     )
 
@@ -185,19 +199,18 @@ def newton_decrement(jacobian: Float[np.ndarray, "data n"], residual: Float[np.n
 
 
 # -- misfit
-# ------------------------------------------------------------------------------------------------------
 
 
 class ResidualCovariance(NamedTuple):
     """Covariance C of the residuals of a fit, as the sandwich needs it.
 
     - `meat`: J^T C J, the middle of the sandwich.
-    - `effective_samples`: number of independent samples with the information of the correlated ones,
+    - `independent_samples`: number of independent samples with the information of the correlated ones,
       (tr C)^2 / tr C^2.
     """
 
     meat: Float[np.ndarray, "n n"]
-    effective_samples: float
+    independent_samples: float
 
 
 class SampleIndex(NamedTuple):
@@ -218,22 +231,23 @@ def residual_covariance(
     """Estimate the covariance of the residuals of a fit by restricted likelihood: see the module.
 
     1. For each (phi, k^2) of the grid, form M^T C^-1 M and ln det C, with M = (J, r) and a = 1.
-    2. Its Cholesky root, with the priors' information added, gives in its last diagonal element the norm of
-       what the unknowns leave of r, hence a^2 and the restricted likelihood.
+    2. Its Cholesky factor, with the priors' precision added (for the unknowns only: the priors are centred on
+       the estimates), gives in its last diagonal element the norm of what the unknowns leave of r, hence a^2
+       and the restricted likelihood.
     3. Average J^T C J and the effective number of samples with the likelihoods as weights.
 
     **Arguments:**
 
     - `residual`, `jacobian`: whitened by the stated noise.
     - `precision`: matrix of the priors, 0 without priors.
-    - `n_determined`: number of unknowns that the data determine.
-    - `signal`: simulated, in standard deviations of the stated noise.
-    - `index`: wavelength and bin of each sample.
+    - `n_determined`: effective number of parameters that the data determine (degrees of freedom for signal).
+    - `signal`: modelled record, in standard deviations of the stated noise.
+    - `index`: wavelength and bin of each sample, in row-major order.
 
     **Returns:** the covariance; that of the stated noise for too few degrees of freedom.
     """
-    freedom = residual.size - n_determined
-    if freedom < _MIN_FREEDOM or not np.any(residual):
+    degrees_of_freedom = residual.size - n_determined
+    if degrees_of_freedom < _MIN_DEGREES_OF_FREEDOM or not np.any(residual):
         return ResidualCovariance(jacobian.T @ jacobian, float(residual.size))
     columns = np.column_stack([jacobian, residual])
     # Unit columns: units of unknowns do not matter.
@@ -247,12 +261,14 @@ def residual_covariance(
     product, log_determinant = _whitened_products(columns, relative_signal, k2, phi, order)
     # The last column is r. Its diagonal element is what is left of r once all columns of J are projected out;
     # the elements before it are those of the information on the unknowns.
-    root = np.linalg.cholesky(product + prior_information)
-    diagonal = np.diagonal(root, axis1=1, axis2=2)
-    a2 = (diagonal[:, -1] * norm[-1]) ** 2 / freedom
-    # -2 ln restricted likelihood; the last term is ln det of the information on the unknowns.
-    deviance = log_determinant + freedom * np.log(a2) + 2.0 * np.sum(np.log(diagonal[:, :-1]), axis=1)
-    weight = np.exp(-0.5 * (deviance - deviance.min()))
+    cholesky = np.linalg.cholesky(product + prior_information)
+    diagonal = np.diagonal(cholesky, axis1=1, axis2=2)
+    a2 = (diagonal[:, -1] * norm[-1]) ** 2 / degrees_of_freedom
+    # The last term is ln det of the posterior precision of the unknowns.
+    minus_two_log_likelihood = (
+        log_determinant + degrees_of_freedom * np.log(a2) + 2.0 * np.sum(np.log(diagonal[:, :-1]), axis=1)
+    )
+    weight = np.exp(-0.5 * (minus_two_log_likelihood - minus_two_log_likelihood.min()))
     weight /= np.sum(weight)
     correlated = _autoregressive_products(relative_signal[:, None] * columns[:, :-1], phi, order)
     white = columns[:, :-1].T @ columns[:, :-1]
@@ -262,8 +278,8 @@ def residual_covariance(
     trace = residual.size + k2 * np.sum(power)
     trace_of_square = residual.size + 2.0 * k2 * np.sum(power)
     trace_of_square = trace_of_square + k2**2 * _autoregressive_products(power, phi**2, order)[0, 0]
-    effective_samples = float(weight @ (trace**2 / trace_of_square))
-    return ResidualCovariance(meat * np.outer(norm[:-1], norm[:-1]), effective_samples)
+    independent_samples = float(weight @ (trace**2 / trace_of_square))
+    return ResidualCovariance(meat * np.outer(norm[:-1], norm[:-1]), independent_samples)
 
 
 class _SampleOrder(NamedTuple):

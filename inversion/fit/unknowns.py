@@ -1,6 +1,6 @@
 """Unknowns of a retrieval: bounds, priors and starting values, and the way a value enters the scene.
 
-**Bounds.** A bounded value x is a smooth bijection of a free parameter z,
+**Bounds.** A bounded value x is a smooth bijection of an unconstrained parameter z,
 
     x = low + (high - low) / (1 + exp(-z)),   z = ln(x - low) - ln(high - x),
 
@@ -34,14 +34,14 @@ MARGIN = 0.01
 
 
 def bounded_logistic(z: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the bounded value of a free parameter, and its derivative."""
+    """Return the bounded value of an unconstrained parameter, and its derivative."""
     fraction = special.expit(z)
     # expit(-z) is 1 - fraction without cancellation.
     return low + (high - low) * fraction, (high - low) * fraction * special.expit(-z)
 
 
 def bounded_logit(value: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Return the free parameter of a value within its bounds: the inverse of `bounded_logistic`."""
+    """Return the unconstrained parameter of a value within its bounds: the inverse of `bounded_logistic`."""
     return np.log(value - low) - np.log(high - value)
 
 
@@ -148,21 +148,23 @@ def _label(name: str | None) -> str:
     return "an unknown" if name is None else f"unknown {name!r}"
 
 
-# Dependence of the simulation on an unknown: on the optics, on extinction only, or on the paths of light.
+# Means by which an unknown acts on the simulation: the optics alone, extinction alone, or the paths of light.
 Dependence = Literal["optical", "extinction", "geometric"]
 
 
 class Setter(NamedTuple):
     """The way in which a value enters the scene: hashable, and equal for equal unknowns.
 
-    - `leaf_index`: index of the leaf of the scene's pytree that the value replaces, or None with `apply`.
-    - `apply`: function that puts the value into the scene, or None with `leaf_index`. Both are None for
+    - `array_index`: index of the array, among the scene's pytree leaves, that the value replaces, or None
+      with `apply`.
+    - `apply`: function that puts the value into the scene, or None with `array_index`. Both are None for
       unknowns that are not of the scene, such as the receiver's.
-    - `dependence`: of the simulation on the value. "optical": the value only weights the traced histories of
-      light; "extinction": it changes the weights of paths of light; "geometric": it changes the paths.
+    - `dependence`: means by which the value acts on the simulation. "optical": it only weights the traced
+      histories of light; "extinction": it changes the weights of paths of light; "geometric": it changes the
+      paths.
     """
 
-    leaf_index: int | None
+    array_index: int | None
     apply: Callable[[Scene, Array], Scene] | None
     dependence: Dependence
 
@@ -208,9 +210,9 @@ def bind_unknowns(unknowns: Sequence[Unknown], scene: Scene) -> list[BoundUnknow
             raise ValueError(f"name = {name!r} is given to {names.count(name)} unknowns; each needs its own")
     # Two values for one array: the second would overwrite the first. Not so with `apply`, which may scale
     # what another unknown has set.
-    indices = [u.setter.leaf_index for u in bound if u.setter.leaf_index is not None]
+    indices = [u.setter.array_index for u in bound if u.setter.array_index is not None]
     for u in bound:
-        if u.setter.leaf_index is not None and indices.count(u.setter.leaf_index) > 1:
+        if u.setter.array_index is not None and indices.count(u.setter.array_index) > 1:
             raise ValueError(f"unknown {u.name!r} picks an array of the scene that another one picks as well")
     return bound
 
@@ -218,15 +220,21 @@ def bind_unknowns(unknowns: Sequence[Unknown], scene: Scene) -> list[BoundUnknow
 def _bind(
     u: Unknown, scene: Scene, arrays_by_dependence: list[tuple[Dependence, frozenset[int]]]
 ) -> BoundUnknown:
-    leaf_index, name, start = None, u.name, u.start
+    """Locate one unknown in the scene.
+
+    1. Find the arrays that it changes, its name and its start.
+    2. Broadcast bounds and prior to the shape of the start.
+    3. Classify it by the arrays that it changes.
+    """
+    array_index, name, start = None, u.name, u.start
     if u.where is None:
         changed_arrays = _changed_arrays(u, scene)
     else:
-        leaf_index, path = _locate(u.where, scene, u.name)
-        changed_arrays = frozenset([leaf_index])
+        array_index, path = _locate(u.where, scene, u.name)
+        changed_arrays = frozenset([array_index])
         name = path if name is None else name
         # Integers have no derivative.
-        scene_value = jax.tree.leaves(scene)[leaf_index]
+        scene_value = jax.tree.leaves(scene)[array_index]
         if not eqx.is_inexact_array(scene_value):
             raise ValueError(
                 f"unknown {name!r} is {scene_value!r}; admissible is a floating-point array of the scene"
@@ -250,10 +258,10 @@ def _bind(
     elif u.prior is not None:
         mean_and_std = (u.prior.median, u.prior.spread) if isinstance(u.prior, LogNormal) else u.prior
         mean, std = (np.asarray(_broadcast(name, "prior", p, start.shape), float) for p in mean_and_std)
-        prior = np.log(mean) if is_log_prior else mean, std
+        prior = (np.log(mean) if is_log_prior else mean), std
     # The first kind that covers all changed arrays; a mixture is geometric.
     matches: list[Dependence] = [kind for kind, arrays in arrays_by_dependence if changed_arrays <= arrays]
-    setter = Setter(leaf_index, u.apply, matches[0] if matches else "geometric")
+    setter = Setter(array_index, u.apply, matches[0] if matches else "geometric")
     return with_start(BoundUnknown(name, setter, start, low, high, prior, is_log_prior, smooth), start)
 
 
@@ -284,7 +292,7 @@ def _broadcast(name: str, field: str, x: Array, shape: tuple[int, ...]) -> Array
 
 
 def _locate(where: str | Callable, scene: Scene, name: str | None) -> tuple[int, str]:
-    """Return the index and path of the scene's leaf at `where`."""
+    """Return the index and path of the array at `where` among the scene's pytree leaves."""
     leaves = jax.tree_util.tree_leaves_with_path(scene)
     paths = [jax.tree_util.keystr(path).lstrip(".") for path, _ in leaves]
     label = _label(name)
@@ -311,7 +319,7 @@ def _locate(where: str | Callable, scene: Scene, name: str | None) -> tuple[int,
 
 
 def _changed_arrays(u: Unknown, scene: Scene) -> frozenset[int]:
-    """Return the indices of the scene's leaves that `apply` changes."""
+    """Return the indices of the scene's pytree leaves that `apply` changes."""
     before, structure = jax.tree.flatten(scene)
     changed: list[int] = []
 
@@ -323,7 +331,7 @@ def _changed_arrays(u: Unknown, scene: Scene) -> frozenset[int]:
                 f"unknown {u.name!r}: apply returns a scene with other parts, or none; admissible is one "
                 "of the same tree structure"
             )
-        # A leaf that `apply` does not touch is the same object.
+        # An array that `apply` does not touch is the same object.
         changed.extend(i for i, (a, b) in enumerate(zip(before, jax.tree.leaves(after))) if a is not b)
 
     # Shapes suffice: nothing is computed.
@@ -334,9 +342,10 @@ def _changed_arrays(u: Unknown, scene: Scene) -> frozenset[int]:
 
 
 def optical_arrays(scene: Scene) -> frozenset[int]:
-    """Return the indices of the scene's pytree leaves on which the response does not depend.
+    """Return the indices of the scene's pytree leaves that act after the trace.
 
-    They act after the trace: leaf and bark optics, reflectances, the atmosphere.
+    These are leaf and bark optics, reflectances and the atmosphere. The response does not depend on them if
+    the plan keeps scattering histories apart from optics (`inversion.fit.model`).
     """
     # With straight transmission, the transmittance of leaves scales extinction.
     is_straight = scene.canopy is not None and scene.canopy.transmission == "straight"
@@ -373,16 +382,15 @@ def set_values(scene: Scene, setters: tuple[Setter, ...], values: tuple[Array, .
         if setter.apply is not None:
             scene = setter.apply(scene, value)
         else:
-            assert setter.leaf_index is not None
+            assert setter.array_index is not None
             # Flattened for each value: an earlier `apply` may have replaced arrays.
             leaves, structure = jax.tree.flatten(scene)
-            leaves[setter.leaf_index] = value
+            leaves[setter.array_index] = value
             scene = jax.tree.unflatten(structure, leaves)
     return scene
 
 
 # -- flattened unknowns: one vector of all values, in the order of the unknowns
-# --------------------------------
 
 
 def flat_start(unknowns: Sequence[BoundUnknown]) -> Float[np.ndarray, " n"]:

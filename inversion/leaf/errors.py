@@ -3,21 +3,21 @@ r"""Standard errors of leaf traits that include PROSPECT's own error, which is c
 **Estimator.** To first order, spectra that are off by e move a least-squares fit by A e, with the gain matrix
 A = (J'WJ)^-1 J'W. The covariance of the traits is A cov(e) A' (White 1980).
 
-**Model error.** cov(e) is independent noise plus, between wavelengths x and y of reflectance,
+**Model error.** cov(e) is independent noise plus, between wavelengths u and v of reflectance,
 
-    s^2 a(x) a(y) exp(-|x - y| / l),    a = sqrt(c^2 + (k dR/dk)^2),
+    s^2 a(u) a(v) exp(-|u - v| / l),    a = sqrt(c^2 + (k dR/dk)^2),
 
 and the same for transmittance, independent of reflectance: absorption coefficients are off by a fraction, and
 the scattering by a constant.
 
 **Restricted likelihood.** s, l and, where it is not given, the noise follow from the residuals r of the leaf.
-With V the covariance in units of the noise's variance v, f degrees of freedom and X the columns that the fit
+With V the covariance in units of the noise's variance q, f degrees of freedom and X the columns that the fit
 has taken out of the residuals (Patterson and Thompson 1971),
 
-    -2 ln L = f ln v + ln |V| + ln |X' V^-1 X|,    v = r' P r / f,
+    -2 ln L = f ln q + ln |V| + ln |X' V^-1 X|,    q = r' P r / f,
     P = V^-1 - V^-1 X (X' V^-1 X)^-1 X' V^-1.
 
-If the noise is given, v is one and -2 ln L = r' P r + ln |V| + ln |X' V^-1 X|. The variances of the traits
+If the noise is given, q is one and -2 ln L = r' P r + ln |V| + ln |X' V^-1 X|. The variances of the traits
 are averaged with the weight L over a grid of s and l.
 
 **Whitening.** V^-1/2 and |V| of an exponential covariance plus noise take one pass of a Kalman filter over
@@ -55,14 +55,14 @@ _MEANS = 128
 # Smallest eigenvalue of the normal matrix, of unit diagonal, of a combination of traits that is determined.
 _COLLINEAR = 1e-5
 # A trait with more than this of its square in combinations that are not determined is itself not determined.
-_LOST_FRACTION = 1e-3
+_UNDETERMINED_FRACTION = 1e-3
 
 
 class LinearisedFit(NamedTuple):
     """Linearisation of one fit of each leaf about its traits.
 
     - `x`: N and contents.
-    - `root`: W with W W' = (J'WJ)^-1 among the unknowns of the fit, zero elsewhere.
+    - `root`: B with B B' = (J'WJ)^-1 among the unknowns of the fit, zero elsewhere.
     - `link`: minus the derivative of its traits with respect to those that it kept fixed.
     - `bands`: one for the wavelengths that it used, zero for others.
     """
@@ -76,7 +76,7 @@ class LinearisedFit(NamedTuple):
 def inverse_root(
     normal: Float[np.ndarray, "leaves n n"],
 ) -> tuple[Float[np.ndarray, "leaves n n"], Bool[np.ndarray, "leaves n"]]:
-    """Return W with W W' the inverse of normal matrices, and True for traits that are not determined.
+    """Return B with B B' the inverse of normal matrices, and True for traits that are not determined.
 
     Eigenvectors of the matrix, scaled to unit diagonal, over the roots of their eigenvalues; combinations of
     traits with tiny eigenvalues are left out.
@@ -85,10 +85,10 @@ def inverse_root(
     norm = np.where(norm > 0, norm, 1.0)
     eigenvalues, eigenvectors = np.linalg.eigh(normal / (norm[:, :, None] * norm[:, None, :]))
     is_determined = (eigenvalues > _COLLINEAR)[:, None, :]
-    is_lost = np.sum(np.where(is_determined, 0.0, eigenvectors**2), axis=2) > _LOST_FRACTION
+    is_undetermined = np.sum(np.where(is_determined, 0.0, eigenvectors**2), axis=2) > _UNDETERMINED_FRACTION
     scale = np.sqrt(np.where(is_determined, eigenvalues[:, None, :], 1.0))
     root = np.where(is_determined, eigenvectors / scale, 0.0)
-    return root / norm[:, :, None], is_lost
+    return root / norm[:, :, None], is_undetermined
 
 
 def trait_errors(
@@ -201,7 +201,7 @@ def _trait_errors(
         scale = noise_sum / jnp.maximum(jnp.sum(amplitude**2), 1e-9)
         strength = (ratios * scale).astype(dtype)
 
-        # 3. Weighted means: residuals in the last column, before them the columns X = J W.
+        # 3. Weighted means: residuals in the last column, before them the columns X = J B.
         mean_weight = sum_in_means(weight)
         has_weight = mean_weight > 0
         mean_variance = jnp.where(has_weight, 1.0 / jnp.where(has_weight, mean_weight, 1.0), jnp.inf)
@@ -277,8 +277,8 @@ def _whiten(
         h = jnp.sqrt(strength)[:, None] * a[None]
         S = h**2 * P + R[None]
         innovation = y[None] - h[:, None] * m
-        gain = P * h / S
-        state = (m + gain[:, None] * innovation, P * (1.0 - gain * h))
+        kalman_gain = P * h / S
+        state = (m + kalman_gain[:, None] * innovation, P * (1.0 - kalman_gain * h))
         log_variance = jnp.where(jnp.isfinite(R)[None], jnp.log(S), 0.0)
         return state, (innovation / jnp.sqrt(S)[:, None], jnp.sum(log_variance, axis=1))
 

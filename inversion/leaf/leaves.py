@@ -257,7 +257,7 @@ def invert_leaves(
             int(chunk),
         )
         normal = np.asarray(state.best.normal, float)
-        root, is_lost = inverse_root(normal * np.outer(~is_fixed, ~is_fixed))
+        root, is_undetermined = inverse_root(normal * np.outer(~is_fixed, ~is_fixed))
         root = root * ~is_fixed[:, None]
         # Implicit differentiation of J'Wr = 0: dx_free = -(J'WJ)^-1 J'WJ_fixed dx_fixed.
         link = root @ root.transpose(0, 2, 1) @ (normal * is_fixed)
@@ -265,10 +265,10 @@ def invert_leaves(
         linearised = LinearisedFit(
             state.best.x, jnp.asarray(root, dtype), jnp.asarray(link, dtype), used_bands
         )
-        return state, linearised, is_lost
+        return state, linearised, is_undetermined
 
     # All bands, for all unknowns.
-    all_bands, linearised, is_lost = fit_bands(problem, unknown_names, np.ones(x.size, bool))
+    all_bands, linearised, is_undetermined = fit_bands(problem, unknown_names, np.ones(x.size, bool))
     linearised_fits, states = [linearised._replace(link=jnp.zeros_like(linearised.link))], [all_bands]
     fit_of_trait, best = np.zeros(len(trait_names), int), all_bands.best.x
     band_limits = {name: np.array([[x.min(), x.max()]]) for name in unknown_names}
@@ -277,14 +277,14 @@ def invert_leaves(
     has_both_spectra = reflectance is not None and transmittance is not None
     for names, bands, limits in domains:
         free_names = [n for n in unknown_names if n in names or (n == "N" and has_both_spectra)]
-        state, linearised, is_lost_here = fit_bands(
+        state, linearised, is_undetermined_in_domain = fit_bands(
             problem._replace(start=all_bands.best.x), free_names, bands
         )
         is_of_domain = np.array([name in names for name in trait_names])
         fit_of_trait[is_of_domain] = len(linearised_fits)
         # N comes from all bands, also where it was free.
         best = jnp.where(is_of_domain[None], state.best.x, best)
-        is_lost = np.where(is_of_domain, is_lost_here, is_lost)
+        is_undetermined = np.where(is_of_domain, is_undetermined_in_domain, is_undetermined)
         band_limits |= dict.fromkeys(names, limits)
         linearised_fits, states = [*linearised_fits, linearised], [*states, state]
 
@@ -300,7 +300,7 @@ def invert_leaves(
         int(chunk),
     )
     # An error larger than the width of the bounds adds nothing to them: the trait is not constrained.
-    errors = jnp.where(is_lost | (errors > problem.high - problem.low), jnp.inf, errors)
+    errors = jnp.where(is_undetermined | (errors > problem.high - problem.low), jnp.inf, errors)
     n_samples = np.count_nonzero(~np.isnan(observed) & np.isfinite(sigma), axis=(1, 2))
     reduced_chi2 = all_bands.best.chi2 / np.maximum(n_samples - len(unknown_names), 1)
     at_bound = dict(zip(trait_names, ((best <= problem.low) | (best >= problem.high)).T))

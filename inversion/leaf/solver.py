@@ -16,8 +16,8 @@ every step that lowers chi^2, and rises by ten with any other.
 
 **Bounds** are kept by projection (Bertsekas 1982): a trait on a bound beyond which the fit would improve is
 held for the step while the others move, and a trait that would leave its bounds is set to the bound. In
-`retrieve` unknowns never reach a bound; here they can, because leaves without anthocyanins or brown pigments
-have their minimum on one.
+`retrieve`, without smoothness priors, unknowns never reach a bound; here they can, because leaves without
+anthocyanins or brown pigments have their minimum on one.
 
 **Convergence.** A Gauss-Newton step would lower chi^2 by no more than (0.02)^2 times the reduced chi^2: it
 would move the traits by less than 0.02 standard errors.
@@ -49,7 +49,7 @@ _SMALL_STEP = 0.02
 _ROUNDING_UNITS = 64
 # Least measurable fall of chi-squared, in units of its last place.
 _CHI2_UNITS = 8
-# The first damping holds for the first step: accepting the start, which is tried first, lowers it once.
+# Accepting the start, which is tried first, lowers the damping once: the first step has a tenth of it.
 _FIRST_DAMPING, _LEAST_DAMPING, _LARGEST_DAMPING = 1e-2, 1e-5, 1e8
 # Fewest bands of the preliminary fit that gives the start of the fit to all bands.
 _PRELIMINARY_BANDS = 200
@@ -156,11 +156,14 @@ def _fit_leaf(
     """Fit one leaf: evaluate the trial, keep the better point, propose the next trial, and so on."""
     start, low, high = leaf.start, leaf.low, leaf.high
     is_used = jnp.isfinite(leaf.observed) & jnp.isfinite(leaf.sigma)
-    observed, weight = jnp.where(is_used, leaf.observed, 0.0), jnp.where(is_used, 1.0 / leaf.sigma, 0.0)
+    observed = jnp.where(is_used, leaf.observed, 0.0)
+    inverse_sigma = jnp.where(is_used, 1.0 / leaf.sigma, 0.0)
     n_samples = jnp.sum(is_used)
     degrees_of_freedom = jnp.maximum(n_samples - n_unknowns, 1)
     # Reduced chi-squared of residuals that are all rounding.
-    rounding_floor = residual_rounding(start.dtype) ** 2 * jnp.sum(weight**2) / jnp.maximum(n_samples, 1)
+    rounding_floor = (
+        residual_rounding(start.dtype) ** 2 * jnp.sum(inverse_sigma**2) / jnp.maximum(n_samples, 1)
+    )
 
     def evaluate(x: Array) -> NormalEquations:
         """Run PROSPECT at x and accumulate its normal equations (columns: see the module's docstring)."""
@@ -169,8 +172,8 @@ def _fit_leaf(
         # Optimisation barrier: without it the compiler would compute the model again for every sum below.
         values, dR_dk, dR_dN = once((values, dR_dk, dR_dN))
         deviation = values - observed
-        residual, s = deviation * weight, dR_dk * weight / x[0]
-        N_column = dR_dN * weight - s * k[None]
+        residual, s = deviation * inverse_sigma, dR_dk * inverse_sigma / x[0]
+        N_column = dR_dN * inverse_sigma - s * k[None]
         # Content columns s K_i differ by K_i only: with sums over spectra of s s K_i, s N_column and
         # s residual, one product with the table gives all elements that involve contents.
         rows = jnp.stack([jnp.sum(s * N_column, axis=0), jnp.sum(s * residual, axis=0)])

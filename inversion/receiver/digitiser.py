@@ -97,12 +97,12 @@ def amplitudes(
     if table is None:
         values, sigma = samples, np.full(samples.shape, float(noise))
     else:
-        heights = amplitude_table(np.asarray(table, float), decibels)
-        check_range("counts", samples, 0.0, heights.size - 1)
-        saturation = heights.size - 1 if saturation is None else saturation
-        table_counts = np.arange(heights.size)
-        values = np.interp(samples, table_counts, heights)
-        sigma = noise * np.interp(samples, table_counts, np.gradient(heights))
+        amplitude_of_count = amplitude_table(np.asarray(table, float), decibels)
+        check_range("counts", samples, 0.0, amplitude_of_count.size - 1)
+        saturation = amplitude_of_count.size - 1 if saturation is None else saturation
+        table_counts = np.arange(amplitude_of_count.size)
+        values = np.interp(samples, table_counts, amplitude_of_count)
+        sigma = noise * np.interp(samples, table_counts, np.gradient(amplitude_of_count))
     if saturation is not None:
         sigma = np.where(samples >= saturation, np.inf, sigma)
     return Amplitudes(values, sigma)
@@ -119,17 +119,17 @@ def amplitude_table(table: np.ndarray, decibels: bool) -> np.ndarray:
     first = int(np.argmax(has_amplitude))
     if table.ndim != 1 or np.sum(has_amplitude) < 2 or not np.all(has_amplitude[first:]):
         raise ValueError(f"table has the shape {table.shape}, or gaps; admissible is (counts,), two or more")
-    heights = 10.0 ** (np.where(has_amplitude, table, 0.0) / 10.0) if decibels else np.array(table)
+    amplitude_of_count = 10.0 ** (np.where(has_amplitude, table, 0.0) / 10.0) if decibels else np.array(table)
     if first:
-        rise = heights[first + 1] - heights[first]
-        heights[:first] = heights[first] - rise * np.arange(first, 0, -1)
-    if not np.all(np.diff(heights) > 0):
-        fall = int(np.argmax(np.diff(heights) <= 0))
+        rise = amplitude_of_count[first + 1] - amplitude_of_count[first]
+        amplitude_of_count[:first] = amplitude_of_count[first] - rise * np.arange(first, 0, -1)
+    if not np.all(np.diff(amplitude_of_count) > 0):
+        fall = int(np.argmax(np.diff(amplitude_of_count) <= 0))
         raise ValueError(
-            f"table has {heights[fall]:g} at {fall} counts and {heights[fall + 1]:g} at one more; "
-            "admissible is a table that increases"
+            f"table has {amplitude_of_count[fall]:g} at {fall} counts and {amplitude_of_count[fall + 1]:g} "
+            "at one more; admissible is a table that increases"
         )
-    return heights
+    return amplitude_of_count
 
 
 def corrected_table(

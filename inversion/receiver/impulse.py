@@ -11,8 +11,8 @@ The model is linear in r, and for a given r each shot has two unknowns only. So 
    a = <m, y> / <m, m> with m the shifted model, and the best shift has the largest <m, y>^2 / <m, m>.
 2. Solve the linear least squares for r, with a small ridge; scale r to unit sum.
 
-Residuals are weighted by the noise, and the background b_k is projected out of data and model. Echoes are
-shifted in the Fourier domain.
+Residuals are weighted by the noise, and the background b_k is projected out of data and model (variable
+projection). Echoes are shifted in the Fourier domain.
 
 **Pulses.** A record holds means over bins. If such samples are taken for the pulse itself, a simulation
 smooths it once more (`recorded_pulse`).
@@ -210,7 +210,7 @@ class HardTargetEcho:
         self.amplitude = float(matched[best] / norm[best])
 
     def fit(self, impulse: np.ndarray) -> tuple[np.ndarray, float]:
-        """Fit the echo by a response of an odd number of lags, time zero in the middle.
+        """Fit the echo by a response of an odd number of lags, time zero in the middle, for one digitiser.
 
         **Returns:** (bins,) the fitted echo without its background, and the background.
         """

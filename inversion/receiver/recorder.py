@@ -1,12 +1,12 @@
 r"""Recorder of waveforms: the receiver's response, offsets of digitisers, noise of the pulse.
 
-With w the simulated waveform, whose pulse is the recorded one, a record is
+With w the waveform simulated with the recorded pulse and * the convolution, sample i of a record is
 
-    y = scale (r * g * w) + b_(i mod n) + noise,
+    y_i = scale (r * g * w)_i + b_(i mod n) + noise,
 
-with r the receiver's impulse response, g a Gaussian of unknown width, and b the offsets of n digitisers that
-take samples in turn; one digitiser has a single baseline. The smoothing is done in the Fourier domain, which
-is exact for signals that the sampling resolves. Width, offsets and scale are unknowns of a fit:
+with r the receiver's impulse response, g a Gaussian of unknown width, and b_j the offset of digitiser j of n
+that take samples in turn; one digitiser has a single baseline. The smoothing is done in the Fourier domain,
+which is exact for signals that the sampling resolves. Width, offsets and scale are unknowns of a fit:
 `inversion.fit.recorder_model`.
 """
 
@@ -121,13 +121,13 @@ class Recorder(eqx.Module):
 class ReceiverResponse:
     """Convolution with the receiver's response r * g along the last axis, in the Fourier domain."""
 
-    def __init__(self, recorder: Recorder, bins: int, step: float):
+    def __init__(self, recorder: Recorder, bins: int, interval: float):
         self.bins = bins
         self.is_identity = recorder.width is None and recorder.impulse is None
         lags = 1 if recorder.impulse is None else recorder.impulse.size
         # Long enough that light smoothed out of the record at one end does not come back at the other.
         self.size = 2 * bins + lags
-        self.omega = 2.0 * np.pi * np.fft.rfftfreq(self.size, step)
+        self.omega = 2.0 * np.pi * np.fft.rfftfreq(self.size, interval)
         self.impulse_spectrum = np.ones(self.omega.size)
         if recorder.impulse is not None:
             samples = np.zeros(self.size)

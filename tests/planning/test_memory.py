@@ -14,7 +14,7 @@ import pytest
 
 import inversion
 import jaxlidar as jl
-from inversion.fit.model import Model, tangents_per_pass
+from inversion.fit.model import ForwardModel, tangents_per_pass
 from inversion.fit.unknowns import bind_unknowns
 from jaxlidar.planning import memory
 from jaxlidar.planning.memory import check_memory, format_bytes, memory_limit
@@ -109,7 +109,7 @@ def test_when_optics_are_applied_while_light_is_traced():
         (plan, True),
         (jl.plan(jl.Lidar(), scene, describe=False, max_orders=3), False),
     ):
-        assert Model(jl.Lidar(), scene, case_plan, bound_unknowns, KEY).retraces == traces
+        assert ForwardModel(jl.Lidar(), scene, case_plan, bound_unknowns, KEY).retraces == traces
     with pytest.raises(ValueError, match="300 orders, too many to keep histories"):
         jl.analog_returns(jl.Lidar(), scene, plan, key=KEY, n_photons=10)
 
@@ -210,14 +210,14 @@ def layered(orders, layers=4, end=100.0, max_memory=None, **settings):
         ],
         scene,
     )
-    return Model(TWO_WAVELENGTHS, scene, plan, bound_unknowns, KEY), np.concatenate(
+    return ForwardModel(TWO_WAVELENGTHS, scene, plan, bound_unknowns, KEY), np.concatenate(
         [np.ravel(s.start) for s in bound_unknowns]
     )
 
 
 def room_for(model, columns):
     """Return the memory of `columns` columns at once, GB."""
-    return 1.0001e-9 * model.forward.plan.jacobian_memory(columns)
+    return 1.0001e-9 * model.inputs.plan.jacobian_memory(columns)
 
 
 def test_columns_of_a_jacobian_are_computed_in_groups_if_memory_is_short():
@@ -227,15 +227,15 @@ def test_columns_of_a_jacobian_are_computed_in_groups_if_memory_is_short():
     limits = [room_for(unlimited, n) for n in (2, 1)]
     model, _ = layered(1, max_memory=limits[0])
     assert (
-        unlimited.forward.tangents_per_pass,
-        model.forward.tangents_per_pass,
+        unlimited.inputs.tangents_per_pass,
+        model.inputs.tangents_per_pass,
         expected.jacobian.shape[-1],
     ) == (5, 2, 6)
     grouped = model(start)
     np.testing.assert_allclose(grouped.jacobian, expected.jacobian, rtol=1e-3, atol=1e-5)
     np.testing.assert_allclose(grouped.total, expected.total, rtol=1e-5, atol=1e-8)
     assert np.abs(grouped.jacobian).max(axis=(0, 1)).min() > 1e-5
-    assert layered(1, max_memory=limits[1])[0].forward.tangents_per_pass == 1
+    assert layered(1, max_memory=limits[1])[0].inputs.tangents_per_pass == 1
     with pytest.raises(ValueError, match=r"one at a time; admissible is max_memory = .* GB of the plan"):
         layered(1, max_memory=0.5 * limits[1])
 
@@ -259,7 +259,7 @@ def test_derivatives_have_no_histories_beyond_the_last_order():
 
 def test_groups_have_about_equal_sizes():
     model = layered(4)[0]
-    plan = model.forward.plan
+    plan = model.inputs.plan
     for columns, room, expected in ((0, 1, 0), (7, 7, 7), (7, 6, 4), (7, 3, 3), (20, 9, 7)):
         scope = plan.scope._replace(max_memory=room_for(model, room))
         limited = dataclasses.replace(plan, scope=scope)
@@ -313,7 +313,7 @@ from tests.planning.test_memory import layered, room_for
 orders, layers, end = int(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3])
 model, start = layered(orders, layers, end, max_memory=15.0, n_photons=2048)
 model(start)
-assert model.forward.tangents_per_pass == layers + 1
+assert model.inputs.tangents_per_pass == layers + 1
 print(1e9 * room_for(model, layers + 1), watched(lambda: model(start)))
 """
 

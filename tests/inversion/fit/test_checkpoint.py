@@ -14,7 +14,7 @@ import pytest
 
 import inversion
 import jaxlidar as jl
-from inversion.fit.fit_record import FitRecord, RecordSizes
+from inversion.fit.fit_summary import FitSummary, SummarySizes
 from inversion.fit.retrieval_many import FinishedFits
 from jaxlidar.io.checkpoint import open_checkpoint
 from tests.inversion.fit.test_fingerprint import PROBLEM, TIME, unknowns
@@ -22,12 +22,12 @@ from tests.io.test_checkpoint import UNWRITABLE, unwritable
 
 # -- records of fits -------------------------------------------------------------------------------------
 
-SIZES = RecordSizes(unknowns=2, smooth_priors=0, wavelengths=1, bins=30)
+SIZES = SummarySizes(unknowns=2, smooth_priors=0, wavelengths=1, bins=30)
 N_FITS = 5
 
 
 def record(number, **changes):
-    fit = FitRecord(
+    fit = FitSummary(
         values=np.array([0.5, number]),
         stderr=np.array([0.1, np.inf]),
         robust_stderr=np.array([0.2, np.inf]),

@@ -15,7 +15,7 @@ import pytest
 import inversion
 import jaxlidar as jl
 from inversion.fit import model as fit_model
-from inversion.fit.model import Model, choose_jacobian_methods, max_columns_per_voxel
+from inversion.fit.model import ForwardModel, choose_jacobian_methods, max_columns_per_voxel
 from inversion.fit.unknowns import bind_unknowns, flat_start
 
 KEY = jax.random.key(7)
@@ -65,11 +65,11 @@ def model_of(scene, unknowns=UNKNOWNS, lidar=LIDAR, orders=3):
     bound = bind_unknowns(unknowns, scene)
     sizes = {"n_photons": 256, "n_rays": 64, "window": (-60.0, 60.0), "describe": False}
     plan = jl.plan(lidar, scene, max_orders=orders, **sizes)
-    return Model(lidar, scene, plan, bound, KEY), flat_start(bound)
+    return ForwardModel(lidar, scene, plan, bound, KEY), flat_start(bound)
 
 
 def dependences(model):
-    return [setter.dependence for setter in model.forward.setters]
+    return [setter.dependence for setter in model.inputs.setters]
 
 
 @pytest.mark.parametrize("dense_columns", [4, pytest.param(8, marks=pytest.mark.slow)])
@@ -78,13 +78,13 @@ def test_jacobians_are_the_same_as_with_tangents(monkeypatch, precision, dense_c
     monkeypatch.setattr(fit_model, "DENSE_COLUMNS", dense_columns)
     with_scores, start = model_of(scene_with())
     assert dependences(with_scores) == ["optical", "extinction", "geometric", "extinction", "optical"]
-    forward = with_scores.forward
+    forward = with_scores.inputs
     assert forward.columns_per_voxel == (2 if dense_columns == 4 else LAYERS + 1)
     assert forward.tangents_per_pass == 1
     monkeypatch.setattr(fit_model, "MAX_SCORED_COLUMNS", 1)
     with_tangents, _ = model_of(scene_with())
     assert dependences(with_tangents) == ["optical", "geometric", "geometric", "geometric", "optical"]
-    assert with_tangents.forward.tangents_per_pass == LAYERS + 2
+    assert with_tangents.inputs.tangents_per_pass == LAYERS + 2
     scored, pushed = with_scores(start), with_tangents(start)
     scale = np.abs(pushed.jacobian).max(axis=(0, 1))
     assert scale.min() > 0
@@ -109,7 +109,7 @@ def test_columns_are_tangents_where_scores_do_not_serve():
     assert dependences(model_of(scene_with(), [EXTINCTION_FACTOR], off_nadir)[0]) == ["geometric"]
     assert dependences(model_of(scene_with(), [LAYER_FACTORS], off_nadir)[0]) == ["extinction"]
     bound = bind_unknowns([LAYER_FACTORS], scene_with())
-    plan = model_of(scene_with(), [LAYER_FACTORS])[0].forward.plan
+    plan = model_of(scene_with(), [LAYER_FACTORS])[0].inputs.plan
     size = choose_jacobian_methods(LIDAR, scene_with(), plan, bound).score_bytes
     assert size > 0
     # Scores may take half of the plan's memory.

@@ -8,7 +8,7 @@ import pytest
 import inversion.fit.model
 import jaxlidar as jl
 from inversion.fit.data import ObservedWaveform
-from inversion.fit.model import PILOT_BATCHES, Evaluation, Model
+from inversion.fit.model import PILOT_BATCHES, Evaluation, ForwardModel
 from inversion.fit.planning import TraceSizes, plan_for_bounds
 from inversion.fit.recorder_model import RecorderModel
 from inversion.fit.retrieval_many import LockstepGroups, LockstepModel, ManyFits
@@ -131,7 +131,7 @@ def test_a_batch_that_is_not_finite_fails_the_fit():
     """The pilot batches are finite."""
     simulation = BatchedSimulation(PILOT_BATCHES)
     simulation.factors[-1] = np.nan
-    record = fit_echoes(simulation, 0).record
+    record = fit_echoes(simulation, 0).summary
     assert not record.converged
     assert record.status.startswith("failed: the simulated waveform is not finite")
 
@@ -153,12 +153,12 @@ def model_and_lockstep_model():
         settings=SolverSettings(DEFAULT_SOLVER, max_steps=1, starts=1),
         groups=LockstepGroups(n_threads=2, fits_per_thread=2),
     )
-    return Model(LIDAR, scene, plan, unknowns, key), LockstepModel(problem, key)
+    return ForwardModel(LIDAR, scene, plan, unknowns, key), LockstepModel(problem, key)
 
 
 @pytest.fixture
 def traced_batches(monkeypatch):
-    """A list that grows by one for every batch that a `Model` traces."""
+    """A list that grows by one for every batch that a `ForwardModel` traces."""
     traced, trace_batch = [], inversion.fit.model._compiled_trace_batch
     monkeypatch.setattr(
         "inversion.fit.model._compiled_trace_batch", lambda *args: (traced.append(1), trace_batch(*args))[1]

@@ -117,7 +117,7 @@ def test_checks_of_a_fit(quality, reason, changes):
 def test_prior_fraction_is_that_of_the_information():
     jacobian = np.array([[2.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     precision, width = np.diag([0.0, 3.0, 5.0]), np.full(3, 10.0)
-    fraction = estimate_covariance(jacobian, precision, width, np.ones(2), None).prior_fraction
+    fraction = estimate_covariance(jacobian, precision, width, np.ones(2), None).prior_share
     np.testing.assert_allclose(fraction, [0.0, 0.75, 1.0])
 
 
@@ -184,10 +184,10 @@ def test_samples_far_apart_or_of_other_wavelengths_are_independent():
         return residual_covariance(residual, constant, np.zeros((1, 1)), 1.0, np.ones(100), index)
 
     dense = covariance(zeros, bins)
-    assert dense.effective_samples < 40
+    assert dense.independent_samples < 40
     for wavelength, sample_bin in ((bins, bins), (zeros, 1000 * bins)):
         independent = covariance(wavelength, sample_bin)
-        assert independent.effective_samples == pytest.approx(100, rel=0.01)
+        assert independent.independent_samples == pytest.approx(100, rel=0.01)
         assert independent.meat < 0.3 * dense.meat
 
 
@@ -199,7 +199,7 @@ def test_undetermined_and_collinear_unknowns_have_a_finite_sandwich():
     precision = np.diag([0, 0, 0, 1e12])
     covariance = residual_covariance(random.normal(size=50), jacobian, precision, 2.0, np.ones(50), index)
     assert np.all(np.isfinite(covariance.meat))
-    assert 0 < covariance.effective_samples <= 50
+    assert 0 < covariance.independent_samples <= 50
 
 
 def test_one_fit_and_many_give_the_same_evidence():

@@ -12,7 +12,7 @@ import pytest
 import inversion
 import jaxlidar as jl
 from inversion import Unknown
-from inversion.fit.model import Model
+from inversion.fit.model import ForwardModel
 from inversion.fit.planning import TraceSizes, corner_scenes, plan_for_bounds
 from inversion.fit.uncertainty import estimate_covariance
 from inversion.fit.unknowns import bind_unknowns, bounded_logistic, bounded_logit, optical_arrays
@@ -176,7 +176,7 @@ def test_jacobian_is_that_of_the_simulation():
         scene = canopy_scene(ground=(0.1, 0.3))
         unknowns = bind_unknowns(UNKNOWNS, scene)
         plan = jl.plan(lidar, scene, max_orders=1, n_rays=64, window=WINDOW, footprint="fixed")
-        model = Model(lidar, scene, plan, unknowns, jax.random.key(0))
+        model = ForwardModel(lidar, scene, plan, unknowns, jax.random.key(0))
         x = np.array([40.0, 1.2, 0.1, 0.3, 0.1, 0.012])
         jacobian = model(x).jacobian
 
@@ -420,7 +420,7 @@ def test_covariance_of_a_linear_problem():
     # Batches that deviate along the first column, with variance 8: the mean of eight has the variance 1.
     deviations = np.outer(np.tile([1.0, -1.0], 4) * np.sqrt(7.0), a)
     estimate = estimate_covariance(a[:, None], np.zeros((1, 1)), np.full(1, 10.0), np.zeros(50), deviations)
-    assert estimate.simulation_stderr[0] == pytest.approx(1.0)
+    assert estimate.simulation_error[0] == pytest.approx(1.0)
     assert estimate.covariance[0, 0] == pytest.approx(1.0)
 
 

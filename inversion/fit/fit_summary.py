@@ -1,9 +1,9 @@
-"""Record of one fit: all quantities that its result has, as plain arrays over the flattened unknowns.
+"""Summary of one fit: all quantities that its result has, as plain arrays over the flattened unknowns.
 
-`FitRecord` is the one place in which the quantities of a fit are listed. Each field names its axes and its
+`FitSummary` is the one place in which the quantities of a fit are listed. Each field names its axes and its
 kind of number; from these,
 
-- `inversion.fit.result` makes a `Retrieval` from one record and a `Retrievals` from many;
+- `inversion.fit.result` makes a `Retrieval` from one summary and a `Retrievals` from many;
 - `to_arrays`, `from_arrays` and `check` write an entry of a checkpoint, and read and check it.
 
 `FitDetails` holds what only the result of a single fit has.
@@ -21,6 +21,8 @@ from inversion.fit.model import Evaluation
 @dataclasses.dataclass(frozen=True)
 class Step:
     """One step of a fit, as `retrieve` passes it to `progress`: values that were tried in a simulation.
+
+    A descent that starts anew, with new weights or strengths, begins with its first values once more.
 
     The first steps of a fit may trace few of the photons, the last ones trace all. Chi-squared, which counts
     the simulation's own noise, may rise between the two.
@@ -54,8 +56,8 @@ def short_text(value: Any) -> str:
     return np.array2string(np.asarray(value), precision=4, threshold=8, edgeitems=3)
 
 
-class RecordSizes(NamedTuple):
-    """Lengths of the axes of a record: flattened unknowns, smoothness priors, and those of a waveform."""
+class SummarySizes(NamedTuple):
+    """Lengths of the axes of a summary: flattened unknowns, smoothness priors, and those of a waveform."""
 
     unknowns: int
     smooth_priors: int
@@ -64,25 +66,28 @@ class RecordSizes(NamedTuple):
 
 
 def _axes(axes: str = "", kind: str = "f") -> dict[str, Any]:
-    """Return the metadata of a quantity: its axes (fields of `RecordSizes`), and NumPy's code of its kind."""
+    """Return metadata of a quantity: its axes (fields of `SummarySizes`), and NumPy's code of its kind."""
     return {"axes": tuple(axes.split()), "kind": kind}
 
 
 @dataclasses.dataclass(frozen=True)
-class FitRecord:
+class FitSummary:
     """The result of one fit, in natural units.
 
-    - `values`, `stderr`: estimates and standard errors; infinite errors for unknowns that the data do not
-      constrain.
+    - `values`, `stderr`: estimates and standard errors; infinite errors for unknowns that neither
+      data nor priors constrain to within their bounds.
     - `robust_stderr`: standard errors widened by misfit and by the spread over several starts.
-    - `prior_share`: fraction of the information on each unknown that is the prior's.
+    - `prior_share`: share of the prior in each estimate, one less the diagonal of the averaging kernel.
     - `at_bound`: True for unknowns at one of their bounds.
-    - `covariance`: of the estimates. `averaging`: averaging kernel, d estimate / d truth.
+    - `covariance`: of the estimates.
+    - `averaging`: averaging kernel, d estimate / d truth.
     - `reduced_chi2`, `independent_samples`: misfit, and effective number of samples.
     - `second_minimum`: rise in chi-squared to the next minimum, infinite if no start ended in another one.
     - `strength`: of the smoothness priors.
-    - `converged`, `status`: end of the fit. `steps`: number of simulations.
-    - `fitted`: simulated apparent reflectance at the estimates, without the recorder's terms.
+    - `converged`, `status`: end of the fit.
+    - `steps`: number of simulations.
+    - `fitted`: simulated apparent reflectance at the estimates, before the recorder (no receiver response,
+      scale or offset).
     """
 
     # Estimates.
@@ -93,7 +98,7 @@ class FitRecord:
     at_bound: np.ndarray = dataclasses.field(metadata=_axes("unknowns", kind="b"))
     covariance: np.ndarray = dataclasses.field(metadata=_axes("unknowns unknowns"))
     averaging: np.ndarray = dataclasses.field(metadata=_axes("unknowns unknowns"))
-    # Evidence.
+    # Goodness of fit, and smoothness priors.
     reduced_chi2: float = dataclasses.field(metadata=_axes())
     independent_samples: float = dataclasses.field(metadata=_axes())
     second_minimum: float = dataclasses.field(metadata=_axes())
@@ -107,26 +112,26 @@ class FitRecord:
     @staticmethod
     def axes() -> dict[str, tuple[str, ...]]:
         """Return the axes of every quantity, by name."""
-        return {f.name: f.metadata["axes"] for f in dataclasses.fields(FitRecord)}
+        return {f.name: f.metadata["axes"] for f in dataclasses.fields(FitSummary)}
 
     def to_arrays(self) -> dict[str, Any]:
         """Return the quantities by name."""
         return {name: getattr(self, name) for name in self.axes()}
 
     @staticmethod
-    def from_arrays(arrays: Mapping[str, np.ndarray]) -> "FitRecord":
-        """Return the record of quantities that `to_arrays` gave, as NumPy arrays.
+    def from_arrays(arrays: Mapping[str, np.ndarray]) -> "FitSummary":
+        """Return the summary of quantities that `to_arrays` gave, as NumPy arrays.
 
         **Raises:** ValueError for quantities of other names.
         """
-        if arrays.keys() != FitRecord.axes().keys():
-            raise ValueError(f"it has {', '.join(arrays)}; admissible are {', '.join(FitRecord.axes())}")
+        if arrays.keys() != FitSummary.axes().keys():
+            raise ValueError(f"it has {', '.join(arrays)}; admissible are {', '.join(FitSummary.axes())}")
         # Scalars were stored as arrays without axes.
         quantities: dict[str, Any] = {name: a if a.ndim else a.item() for name, a in arrays.items()}
-        return FitRecord(**quantities)
+        return FitSummary(**quantities)
 
-    def check(self, sizes: RecordSizes) -> None:
-        """Check a record that was read from a file.
+    def check(self, sizes: SummarySizes) -> None:
+        """Check a summary that was read from a file.
 
         **Raises:** ValueError for quantities of another kind or shape, and for numbers that no fit gives.
         """
@@ -141,7 +146,8 @@ class FitRecord:
                 )
         if self.steps < 1 or not np.all(np.isfinite(self.values)):
             raise ValueError(
-                f"values = {self.values} after {self.steps} steps; admissible are finite ones after 1"
+                f"values = {self.values} after {self.steps} simulations; admissible are finite values after "
+                "at least one"
             )
         if self.converged and not self._is_regular():
             raise ValueError("it is said to have converged, but its numbers are not finite")
@@ -168,8 +174,9 @@ class FitDetails:
     - `simulation_error`: (n,) part of the standard errors that is the simulation's own noise.
     - `residuals`: (wavelengths, bins) observed minus fitted, whitened; zero for samples that are left out.
     - `waveform_stderr`: (wavelengths, bins) standard error of the simulated waveform.
-    - `cost`: chi-squared by the measurement's noise only, plus -2 ln of the prior density: compares minima.
-    - `history`: reduced chi-squared of every step.
+    - `cost`: chi-squared by the noise of measurement and pulse, without the simulation's, plus -2 ln of the
+      prior density: compares minima.
+    - `history`: reduced chi-squared of every call of `progress`.
     - `evaluation`: the simulation at the estimates.
     """
 
@@ -184,5 +191,5 @@ class FitDetails:
 class CompletedFit(NamedTuple):
     """A fit that has ended."""
 
-    record: FitRecord
+    summary: FitSummary
     details: FitDetails
