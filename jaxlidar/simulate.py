@@ -253,6 +253,8 @@ def _make_waveform(tracer: BatchTracer, result: _BatchResults, goal: _Goal) -> W
     wave = dataclasses.replace(wave, info=result.info, **errors)
     if is_traced(wave.energy):
         return wave
+    # Heights tell the zenith angle of a waveform's lidar, and nothing else its altitude.
+    wave = dataclasses.replace(wave, info={**result.info, "altitude": float(lidar.altitude)})
     if plan.scope.automatic_window and late_fraction(wave) >= NOTABLE_FRACTION:
         end = plan.sample_start + plan.sample_interval * plan.n_samples
         warnings.warn(

@@ -121,5 +121,8 @@ def _unit_pulse(pulse: Float[ArrayLike, " lags"]) -> Float[Array, " lags"]:
     h = as_array(pulse)
     check_range("pulse", pulse)
     if h.ndim != 1 or h.size % 2 == 0:
-        raise ValueError(f"pulse has the shape {h.shape}; admissible is (lags,) with an odd number of lags")
+        raise ValueError(
+            f"pulse has the shape {h.shape}; admissible is (lags,) with an odd number of lags, the middle "
+            "one at the pulse's time zero: pad one end with zeros"
+        )
     return h / jnp.sum(h)

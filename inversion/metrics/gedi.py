@@ -23,7 +23,8 @@ then differ by 0.02 m (one standard deviation), which the end of the kernel expl
 choice among several modes of one group ("algorithm 10") is not reproduced.
 """
 
-from collections.abc import Sequence
+import os
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import jax
@@ -40,6 +41,8 @@ _SUBDIVISIONS, _CUT, _CHUNK = 4, 2.5, 64
 # Half the lags of the longest kernel of the published settings.
 _HALF_LAGS = 65
 _RH_FRACTIONS = np.arange(101) / 100
+# What is used of a shot.
+_SHOT_FIELDS = ("elevation", "waveform", "noise_mean", "noise_std")
 
 
 class GediSettings(NamedTuple):
@@ -126,21 +129,21 @@ class GediMetrics(NamedTuple):
     num_detectedmodes: Int[np.ndarray, " shots"]
 
 
-def gedi_metrics(shots: Sequence[Any], settings: GediSettings | None = None) -> GediMetrics:
+def gedi_metrics(shots: Any, settings: GediSettings | None = None) -> GediMetrics:
     """Compute GEDI's lowest mode, highest return and relative heights, by the rules of level 2A.
 
     Shots may differ in length. They are computed in batches of equal size buckets, each compiled once.
 
     **Arguments:**
 
-    - `shots`: those of `jaxlidar.io.read_gedi_l1b`, or objects with the same `elevation`, `waveform`,
-      `noise_mean` and `noise_std`.
+    - `shots`: a list of shots, those of `jaxlidar.io.read_gedi_l1b` or objects with the same `elevation`,
+      `waveform`, `noise_mean` and `noise_std`.
     - `settings`: see `gedi_settings`. Default: those of group 1.
 
     **Returns:** a `GediMetrics`.
 
-    **Raises:** ValueError for settings that are not above 0, and for records that are not finite or of fewer
-    than three samples.
+    **Raises:** TypeError for a path, one shot alone and other things than shots. ValueError for settings that
+    are not above 0, and for records that are not finite or of fewer than three samples.
 
     **Source:** Hofton and Blair (2019), GEDI transmit and receive waveform processing (theoretical basis
     document 1.0); Dubayah et al. (2020), Sci. Remote Sens. 1, 100002.
@@ -152,6 +155,7 @@ def gedi_metrics(shots: Sequence[Any], settings: GediSettings | None = None) -> 
     >>> metrics = inversion.gedi_metrics(shots, inversion.gedi_settings(1))  # doctest: +SKIP
     >>> rh98 = metrics.rh[:, 98]  # doctest: +SKIP
     """
+    shots = _list_of_shots(shots)
     settings = gedi_settings(1) if settings is None else GediSettings(*settings)
     for name, value in settings._asdict().items():
         check_range(name, value, 0.0, low_open=True)
@@ -203,6 +207,28 @@ def gedi_metrics(shots: Sequence[Any], settings: GediSettings | None = None) -> 
     )
 
 
+def _list_of_shots(shots: Any) -> list[Any]:
+    """Return shots as a list. **Raises:** TypeError, with the right call, for other things."""
+    if isinstance(shots, str | os.PathLike):
+        raise TypeError(
+            f"shots = {os.fspath(shots)!r} is a path; admissible are its shots, as in "
+            "gedi_metrics(jaxlidar.io.read_gedi_l1b(path))"
+        )
+    if not isinstance(shots, Iterable):
+        raise TypeError(
+            f"shots is a {type(shots).__name__}; admissible is a list of shots, as in gedi_metrics([shot])"
+        )
+    shots = list(shots)
+    for i, shot in enumerate(shots):
+        missing = [name for name in _SHOT_FIELDS if not hasattr(shot, name)]
+        if missing:
+            raise TypeError(
+                f"shots has a {type(shot).__name__} at index {i}, which has no {missing[0]}; admissible are "
+                f"objects with {', '.join(_SHOT_FIELDS)}, as jaxlidar.io.read_gedi_l1b returns them"
+            )
+    return shots
+
+
 def _record_above_noise(shot: Any) -> np.ndarray:
     """Record of a shot less its mean noise. **Raises:** ValueError for shapes or values that do not serve."""
     record = np.asarray(shot.waveform, float)
@@ -212,6 +238,7 @@ def _record_above_noise(shot: Any) -> np.ndarray:
             "admissible is (bins,) for both, three or more"
         )
     check_range("waveform", record)
+    check_range("noise_mean", shot.noise_mean)
     check_range("noise_std", shot.noise_std, 0.0)
     return record - shot.noise_mean
 

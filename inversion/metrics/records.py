@@ -162,7 +162,9 @@ def sample_pulse(pulse: Pulse | None, step: float | None) -> Float[Array, "... p
         samples = as_array(pulse, "pulse")
     if samples.ndim < 1 or samples.shape[-1] % 2 == 0:
         raise ValueError(
-            f"pulse has the shape {samples.shape}; admissible is (lags,) with an odd number of lags"
+            f"pulse has the shape {samples.shape}; admissible is (lags,) with an odd number of lags, the "
+            "middle one at the pulse's time zero: pad one end with zeros, or give its times as well, as "
+            "jaxlidar.SampledPulse(time=, power=)"
         )
     check_range("pulse", samples)
     # Ends can be cut only where the samples have values; inside a transformation all lags stay.

@@ -78,7 +78,7 @@ def describe_shots(shots: AirborneShots) -> str:
     lines = [f"{len(shots):,} airborne shots, GPS times {times.min():.6f} to {times.max():.6f} s"]
     lines += [_describe_records(sample)]
     lines += [f"noise {shots.levels.noise_mean:.4g} +- {shots.levels.noise_std:.3g}"]
-    return _with_counts(lines, shots.dropped, "points left out: ")
+    return _with_counts(lines, shots.dropped, "left out: ")
 
 
 def _describe_records(shots: Sequence[AirborneShot]) -> str:

@@ -12,6 +12,7 @@ from jaxlidar.io.airborne import (
     stack_shots,
 )
 from jaxlidar.io.case import Case, write_case
+from jaxlidar.io.checks import FileWarning
 from jaxlidar.io.datasets import keep_as_netcdf
 from jaxlidar.io.dem import DemRead, read_dem
 from jaxlidar.io.gedi import GediShot, read_gedi_l1b
@@ -31,6 +32,7 @@ __all__ = [
     "AirborneShots",
     "Case",
     "DemRead",
+    "FileWarning",
     "GediShot",
     "MeshRead",
     "NeonImpulse",

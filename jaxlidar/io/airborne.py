@@ -9,6 +9,7 @@ digitisers, tables that give counts amplitudes, saturation) are not removed.
 """
 
 import abc
+import contextlib
 import dataclasses
 import functools
 import itertools
@@ -144,6 +145,7 @@ class AirborneShot:
     - `gps_time`: s. Default None: not known.
     - `scanner`: a `Scanner`. Default None.
     - `returns`: the `Returns` that the file holds. Default None.
+    - `scanner_channel`: number of the channel of a scanner that sends several beams at one time. Default 0.
 
     **Raises:** ValueError for a shot without a returning segment, for segments whose numbers make no sense,
     for those of a channel that overlap, have different steps or lie too far apart.
@@ -172,6 +174,7 @@ class AirborneShot:
     gps_time: float | None = None
     scanner: Scanner | None = None
     returns: Returns | None = None
+    scanner_channel: int = 0
 
     def __post_init__(self):
         if not self.returning:
@@ -338,7 +341,7 @@ class AirborneShots(Sequence, abc.ABC):
     - `levels`: mean and standard deviation of the noise, and the pedestal of outgoing pulses: medians of up
       to 1,000 shots, evenly spread.
     - `tables`: (counts,) amplitudes of the counts, by the `table` of a `Segment`. They are not applied.
-    - `dropped`: how many points of the file were left out, by reason.
+    - `dropped`: how many points or pulses of the file were left out, by reason.
 
     **Raises:** a shot's ValueError, which names the file and the shot, where it is damaged.
 
@@ -370,16 +373,22 @@ class AirborneShots(Sequence, abc.ABC):
 
     @abc.abstractmethod
     def _read(self, index: int) -> dict[str, Any]:
-        """Return the arguments of `AirborneShot` but for its index and its noise levels."""
+        """Return the arguments of `AirborneShot` but for its noise levels; its index where it is another."""
 
     @functools.cached_property
     def levels(self) -> NoiseLevels:
         """Mean and standard deviation of the noise, and the pedestal of outgoing pulses."""
-        sampled = (self._read(i) for i in range(len(self))[evenly_spaced(len(self))])
+        sampled = range(len(self))[evenly_spaced(len(self))]
         return estimate_noise_levels(
             (shot["outgoing"][0].values if shot["outgoing"] else None, shot["returning"][0].values)
-            for shot in sampled
+            for shot in self._read_undamaged(sampled)
         )
+
+    def _read_undamaged(self, indices: Iterable[int]) -> Iterator[dict[str, Any]]:
+        """Yield what `_read` returns, but for damaged shots: those are refused when they are indexed."""
+        for i in indices:
+            with contextlib.suppress(ValueError):
+                yield self._read(i)
 
     @overload
     def __getitem__(self, index: int) -> AirborneShot: ...
@@ -389,9 +398,9 @@ class AirborneShots(Sequence, abc.ABC):
         if isinstance(index, slice):
             return [self[i] for i in range(*index.indices(len(self)))]
         i = range(len(self))[index]
-        arguments = self._read(i)
+        arguments: dict[str, Any] = {"index": i, **self._read(i)}
         try:
-            return AirborneShot(i, **self.levels._asdict(), **arguments)
+            return AirborneShot(**self.levels._asdict(), **arguments)
         except ValueError as error:
             raise ValueError(f"{self.path}: {error}") from error
 

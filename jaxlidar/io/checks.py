@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -19,6 +20,35 @@ MAX_EXACT_INTEGER = 2**53
 TWO_WAY_METRES_PER_NS, TWO_WAY_TOLERANCE = SPEED_OF_LIGHT / 2, 0.01
 # What HDF5, h5netcdf, zarr and xarray raise for damaged files.
 _DAMAGED = (OSError, RuntimeError, ValueError, KeyError, TypeError, AttributeError, OverflowError)
+
+
+class FileWarning(UserWarning, ValueError):
+    r"""Warning that a file was read, but not as a whole or not in every point as it says.
+
+    The message names the file and the first such place, and counts what was skipped. The class is that of an
+    error, too: a program that turns warnings into errors gets the ValueError that readers raise for files
+    that they refuse.
+
+    **Example:** refuse a tree whose second cylinder grows from one that is not in the file.
+
+    >>> import pathlib, tempfile, warnings
+    >>> import jaxlidar.io
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "tree.csv"
+    >>> names = "ID,parentID,startX,startY,startZ,endX,endY,endZ,radius"
+    >>> _ = path.write_text(f"{names}\n1,-1,0,0,0,0,0,2,0.1\n3,2,0,0,3,0,0,4,0.05\n")
+    >>> with warnings.catch_warnings():
+    ...     warnings.simplefilter("error", jaxlidar.io.FileWarning)
+    ...     try:
+    ...         jaxlidar.io.read_qsm(path)
+    ...     except ValueError as error:
+    ...         print(str(error).partition("line ")[2])
+    3: parent 2 is not in the file: 1 cylinder without a parent became a root
+    """
+
+
+def warn_of_file(message: str, stacklevel: int = 3) -> None:
+    """Give a `FileWarning`; by default, at the line that called the function that calls this one."""
+    warnings.warn(message, FileWarning, stacklevel=stacklevel)
 
 
 @contextlib.contextmanager
@@ -43,13 +73,17 @@ def check_unpacked_size(path: Path, location: str, size: int) -> None:
 
     **Raises:** ValueError naming the file, the location in it and both sizes.
     """
-    file_size = path.stat().st_size
-    max_size = max(_MAX_EXPANSION * file_size, _ALWAYS_ADMISSIBLE_BYTES)
+    file_size, max_size = path.stat().st_size, max_unpacked_size(path)
     if size > max_size:
         raise ValueError(
             f"{path}: {location}: {size} bytes are declared in a file of {file_size} bytes; at most "
             f"{max_size} are plausible"
         )
+
+
+def max_unpacked_size(path: Path) -> int:
+    """Return the most bytes to which a file of its size plausibly unpacks."""
+    return max(_MAX_EXPANSION * path.stat().st_size, _ALWAYS_ADMISSIBLE_BYTES)
 
 
 def column_index(location: str, names: Sequence[str], column: str) -> int:

@@ -24,31 +24,32 @@ import contextlib
 import dataclasses
 import functools
 import math
+import numbers
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxlidar.io.checks import (
     MAX_COORDINATE,
     MAX_COUNTS,
+    MAX_EXACT_INTEGER,
     TWO_WAY_METRES_PER_NS,
     TWO_WAY_TOLERANCE,
     check_unpacked_size,
     existing_file,
     refuse_damage,
+    warn_of_file,
 )
 from jaxlidar.io.noise import above_pedestal
 
-# Datasets of a beam's group with a number for each shot.
+# Datasets of a beam's group with a number for each shot; start indices of samples may be missing.
 _PER_SHOT = (
     "rx_sample_count",
-    "rx_sample_start_index",
     "tx_sample_count",
-    "tx_sample_start_index",
     "tx_gloc",
     "noise_mean_corrected",
     "noise_stddev_corrected",
@@ -62,6 +63,10 @@ _PER_SHOT = (
 )
 # Datasets of the flags of a GediShot; subsets may have left them out.
 _FLAGS = {"degrade": "geolocation/degrade", "stale_return": "stale_return_flag"}
+# The attribute of a dataset with the value that stands for a missing one.
+_FILL_ATTRIBUTE = "_FillValue"
+# Nothing that GEDI sees lies so far below the ellipsoid, m; fill values do.
+_MIN_ELEVATION = -1000.0
 # Equal samples in a row that noise does not make.
 _MIN_SATURATED_RUN = 3
 
@@ -137,30 +142,36 @@ class GediShot:
         return self.waveform - self.noise_mean
 
 
-def read_gedi_l1b(
-    path: str | os.PathLike[str], shot: int | np.integer | Sequence[int] | np.ndarray | None = None
-) -> list[GediShot]:
+def read_gedi_l1b(path: str | os.PathLike[str], shot: Any = None) -> list[GediShot]:
     """Read the shots of a GEDI L1B file, or of a subset of one in the same layout.
 
     This needs h5py (`pip install "jaxlidar[io]"`). From beams without a requested shot nothing is read but,
     to find shots by number, the numbers.
 
     Start indices are used where they fit the stored samples. Where they do not, as in subsets that kept the
-    numbering of the full file, the samples of shots follow one another without gaps, as many as the counts.
+    numbering of the full file, or are missing, the samples of shots follow one another without gaps, as many
+    as the counts.
+
+    Shots that are not complete (a missing number or one that makes no sense, such as a fill value, an
+    elevation that is NaN, samples that are not stored) are skipped where all shots are read, and so are
+    beams that lack a dataset. Flags that are no whole numbers become None.
 
     **Arguments:**
 
     - `path`: an HDF5 file.
     - `shot`: the requested shots, an integer or several. A number below the number of shots in the file is an
-      index, from 0, into all shots, beam after beam in the order of the file; any other is a shot number.
-      Default None: all.
+      index, from 0, into all shots, complete or not, beam after beam in the order of the file; any other is a
+      shot number. Default None: all.
 
     **Returns:** a list of `GediShot`, in the order of `shot`; one integer gives a list of one.
 
-    **Raises:** FileNotFoundError where there is no such file. ImportError without h5py. ValueError, naming
-    the file and the place, for a file that is not HDF5, is damaged or declares more than it can hold, is no
-    GEDI L1B product or holds a shot whose numbers make no sense, such as a pulse without energy or bins that
-    are not 1 ns apart, and for a shot that it does not hold.
+    **Warns:** `FileWarning` for every beam with shots that are skipped, naming the first and their number;
+    for beams that are skipped, for start indices that are missing, and for flags that are left out.
+
+    **Raises:** FileNotFoundError where there is no such file. ImportError without h5py. TypeError for a
+    `shot` that is neither an integer nor several. ValueError, naming the file and the place, for a file that
+    is not HDF5, is damaged or declares more than it can hold, is no GEDI L1B product or has no shot that is
+    complete, and for a requested shot that is not complete or that it does not hold.
 
     **Source:** GEDI L1B product data dictionary (Dubayah et al. 2020, doi:10.5067/GEDI/GEDI01_B.002); Luthcke
     et al. 2019, GEDI waveform geolocation for L1 and L2 products (theoretical basis document).
@@ -178,57 +189,115 @@ def read_gedi_l1b(
     except ImportError as error:
         raise ImportError('reading HDF5 needs h5py: pip install "jaxlidar[io]"') from error
     path = existing_file(path)
+    requested = None if shot is None else _requested_numbers(shot)
     with contextlib.ExitStack() as stack:
         with refuse_damage(f"{path}: not a readable HDF5 file"):
             file = stack.enter_context(h5py.File(path, "r"))
             names = [name for name in map(str, file) if name.startswith("BEAM")]
         if not names:
             raise ValueError(f"{path}: no group BEAM...: no GEDI L1B product")
-        selected = _select(path, [_Beam(path, file, name) for name in names], shot)
+        beams, beam_errors = _open_beams(path, file, names)
+        selected = _select(path, beams, requested)
         # By beam, so that the samples of neighbouring shots are read together.
         indices_by_beam: dict[_Beam, set[int]] = {}
         for beam, i in selected:
             indices_by_beam.setdefault(beam, set()).add(i)
-        shots = {beam: _shots(beam, sorted(indices)) for beam, indices in indices_by_beam.items()}
-        return [shots[beam][i] for beam, i in selected]
+        reads = {beam: _shots(beam, sorted(indices)) for beam, indices in indices_by_beam.items()}
+    first_error = next((error for _, errors in reads.values() for error in errors.values()), None)
+    complete = [reads[beam][0][i] for beam, i in selected if i in reads[beam][0]]
+    # What was asked for is read or refused; of all shots those that are not complete are skipped.
+    if first_error is not None and (requested is not None or not complete):
+        raise first_error
+    warnings = [f"{error}: the beam is skipped" for error in beam_errors]
+    for beam, (_, errors) in reads.items():
+        if errors:
+            warnings.append(
+                f"{next(iter(errors.values()))}: {len(errors)} of {len(beam)} shots of {beam.name} skipped"
+            )
+        warnings += beam.remarks
+    for warning in warnings:
+        warn_of_file(warning)
+    return complete
 
 
-def _select(path: Path, beams: "list[_Beam]", shot: Any) -> "list[tuple[_Beam, int]]":
+def _requested_numbers(shot: Any) -> list[int]:
+    """Return the requested indices and shot numbers. **Raises:** as `read_gedi_l1b`."""
+    is_several = isinstance(shot, Sequence | np.ndarray) and not isinstance(shot, str | bytes)
+    requested: list[Any] = list(shot) if is_several and np.shape(shot) != () else [shot]
+    for number in requested:
+        if isinstance(number, numbers.Real) and not isinstance(number, numbers.Integral):
+            raise ValueError(f"shot = {number} is neither an index nor a shot number: both are integers")
+        if isinstance(number, bool) or not isinstance(number, numbers.Integral):
+            raise TypeError(
+                f"shot = {number!r} is a {type(number).__name__}; admissible are an index or a shot number, "
+                "which are integers, or a list of them"
+            )
+    return [int(number) for number in requested]
+
+
+def _open_beams(path: Path, file: Any, names: list[str]) -> "tuple[list[_Beam], list[ValueError]]":
+    """Return the beams that have shot numbers, and the errors of the others.
+
+    **Raises:** the first of these errors, where no beam has shot numbers.
+    """
+    beams, errors = [], []
+    for name in names:
+        try:
+            beams.append(_Beam(path, file, name))
+        except ValueError as error:
+            errors.append(error)
+    if not beams:
+        raise errors[0]
+    return beams, errors
+
+
+def _select(path: Path, beams: "list[_Beam]", requested: list[int] | None) -> "list[tuple[_Beam, int]]":
     """Return the beam, and the index within it, of each requested shot. **Raises:** as `read_gedi_l1b`."""
     order = [(beam, i) for beam in beams for i in range(len(beam))]
-    if shot is None:
+    if requested is None:
         return order
-    requested = [shot] if isinstance(shot, int | np.integer) else list(shot)
     by_number: dict[int, tuple[_Beam, int]] = {}
     selected = []
     for number in requested:
-        if not isinstance(number, int | np.integer) or isinstance(number, bool):
-            raise ValueError(f"shot = {number} is neither an index nor a shot number: both are integers")
         if 0 <= number < len(order):
-            selected.append(order[int(number)])
+            selected.append(order[number])
             continue
         if not by_number:
             by_number = {int(n): (beam, i) for beam in beams for i, n in enumerate(beam.shot_number)}
-        if int(number) not in by_number:
+        if number not in by_number:
             raise ValueError(
                 f"{path}: shot = {number} is neither an index in [0, {len(order) - 1}] "
                 "nor the number of a shot here"
             )
-        selected.append(by_number[int(number)])
+        selected.append(by_number[number])
     return selected
 
 
-def _shots(beam: "_Beam", indices: list[int]) -> dict[int, GediShot]:
-    received, transmitted = beam.samples("rx", indices), beam.samples("tx", indices)
-    return {i: _shot(beam, i, received[i], transmitted[i]) for i in indices}
+def _shots(beam: "_Beam", indices: list[int]) -> tuple[dict[int, GediShot], dict[int, ValueError]]:
+    """Return the shots of a beam that are complete, and the errors of those that are not, by their index."""
+    shots: dict[int, GediShot] = {}
+    errors: dict[int, ValueError] = {}
+    try:
+        received, transmitted = (beam.samples(kind, indices, errors) for kind in ("rx", "tx"))
+    except ValueError as error:
+        # The beam lacks a dataset.
+        return {}, dict.fromkeys(indices, error)
+    for i in indices:
+        if i in errors:
+            continue
+        try:
+            shots[i] = _shot(beam, i, received[i], transmitted[i])
+        except ValueError as error:
+            errors[i] = error
+    return shots, dict(sorted(errors.items()))
 
 
 def _shot(beam: "_Beam", i: int, received: np.ndarray, transmitted: np.ndarray) -> GediShot:
     # The pointing vector leads from the footprint to the sensor, so its elevation is above the horizon.
     above_horizon = beam.number("geolocation/local_beam_elevation", i, 0.0, np.pi / 2 + 1e-6)
     towards = beam.number("geolocation/local_beam_azimuth", i, -2 * np.pi, 2 * np.pi)
-    top = beam.number("geolocation/elevation_bin0", i)
-    bottom = beam.number("geolocation/elevation_lastbin", i)
+    top = beam.number("geolocation/elevation_bin0", i, _MIN_ELEVATION)
+    bottom = beam.number("geolocation/elevation_lastbin", i, _MIN_ELEVATION)
     location = beam.location("geolocation/elevation_lastbin", i)
     if bottom >= top:
         raise ValueError(f"{location}: {bottom:g} m is not below the first bin, {top:g} m")
@@ -247,13 +316,13 @@ def _shot(beam: "_Beam", i: int, received: np.ndarray, transmitted: np.ndarray) 
         time=np.arange(received.size, dtype=np.float64),
         elevation=np.linspace(top, bottom, received.size),
         waveform=received,
-        noise_mean=beam.number("noise_mean_corrected", i),
+        noise_mean=beam.number("noise_mean_corrected", i, 0.0),
         noise_std=beam.number("noise_stddev_corrected", i, 0.0),
         pulse_time=np.arange(transmitted.size) - pulse_zero,
         pulse_power=above_pedestal(transmitted, pedestal, beam.location("txwaveform", i)),
         latitude=beam.number("geolocation/latitude_lastbin", i, -90.0, 90.0),
         longitude=beam.number("geolocation/longitude_lastbin", i, -180.0, 360.0),
-        altitude=beam.number("geolocation/altitude_instrument", i),
+        altitude=beam.number("geolocation/altitude_instrument", i, _MIN_ELEVATION),
         zenith=max(0.0, 90.0 - float(np.rad2deg(above_horizon))),
         azimuth=float(np.rad2deg(towards) + 180.0) % 360.0,
         degrade=beam.flag("degrade", i),
@@ -265,11 +334,15 @@ class _Beam:
     """The group of one beam: its numbers for each shot, and the samples of shots.
 
     Datasets are compared with the file before they are read. Numbers of all shots are read when the first is
-    used. Two beams are equal if they are the same object.
+    used. Two beams are equal if they are the same object. `remarks` are messages on what was read in another
+    way than the file says, or left out of shots.
+
+    **Raises:** ValueError where there are no shot numbers.
     """
 
     def __init__(self, path: Path, file: Any, name: str):
         self.path, self.file, self.name = path, file, name
+        self.remarks: list[str] = []
         self.size = self._dataset("shot_number").shape[0]
 
     def __len__(self) -> int:
@@ -294,35 +367,74 @@ class _Beam:
     def flag(self, name: str, shot: int) -> int | None:
         """Return a flag of a shot, or None where the file does not have it."""
         values = self._flags.get(name)
-        return None if values is None else int(values[shot])
+        return None if values is None or np.isnan(values[shot]) else int(values[shot])
 
-    def samples(self, kind: str, shots: Sequence[int]) -> dict[int, np.ndarray]:
+    def samples(
+        self, kind: str, shots: Sequence[int], errors: dict[int, ValueError]
+    ) -> dict[int, np.ndarray]:
         """Return the samples of shots in increasing order, of the received ("rx") or sent ("tx") waveform.
 
-        Shots that follow one another are read in one pass.
+        Shots that follow one another are read in one pass. Shots whose samples cannot be read are missing in
+        the result; their errors are added to `errors`.
+
+        **Raises:** ValueError where a dataset is missing.
         """
-        field = f"{kind}waveform"
-        start, count = self._start_and_count[kind]
-        dataset, samples_by_shot = self._dataset(field), {}
-        runs = np.split(np.array(shots), np.flatnonzero(np.diff(shots) > 1) + 1)
-        for run in (run.tolist() for run in runs):
-            first, end = int(start[run[0]]), int(start[run[-1]] + count[run[-1]])
-            with refuse_damage(f"{self.location(field, run[0])}: damaged"):
+        dataset, location = self._dataset(f"{kind}waveform"), self._sample_locations[kind]
+        for i in shots:
+            if i not in errors and (error := self._error_of_location(kind, i)) is not None:
+                errors[i] = error
+        readable = [i for i in shots if i not in errors]
+        samples_by_shot = {}
+        runs = np.split(np.array(readable, int), np.flatnonzero(np.diff(readable) > 1) + 1)
+        for run in (run.tolist() for run in runs if run.size):
+            first, end = location.start[run[0]], location.start[run[-1]] + location.count[run[-1]]
+            run_samples = None
+            # Where a chunk is damaged, the shots that lie in it are found one by one.
+            with contextlib.suppress(ValueError), refuse_damage("a damaged chunk"):
                 run_samples = dataset[first:end]
             for i in run:
-                if count[i] < 2:
-                    raise ValueError(
-                        f"{self.location(f'{kind}_sample_count', i)}: {count[i]} samples; at least 2 belong "
-                        "here"
-                    )
-                offset = start[i] - first
-                samples = run_samples[offset : offset + count[i]].astype(np.float64)
-                wrong = ~(np.abs(samples) <= MAX_COUNTS)
-                if wrong.any():
-                    k = int(np.argmax(wrong))
-                    raise ValueError(f"{self.location(field, i)}: sample {k} is {samples[k]:g}")
-                samples_by_shot[i] = samples
+                at, n = location.start[i], location.count[i]
+                try:
+                    with refuse_damage(f"{self.location(f'{kind}waveform', i)}: damaged"):
+                        raw = dataset[at : at + n] if run_samples is None else run_samples[at - first :][:n]
+                    samples_by_shot[i] = self._checked_samples(kind, i, raw)
+                except ValueError as error:
+                    errors[i] = error
         return samples_by_shot
+
+    def _checked_samples(self, kind: str, shot: int, raw: np.ndarray) -> np.ndarray:
+        """Return samples in double precision. **Raises:** ValueError for one that is no count."""
+        samples = raw.astype(np.float64)
+        wrong = ~(np.abs(samples) <= MAX_COUNTS)
+        if wrong.any():
+            k = int(np.argmax(wrong))
+            raise ValueError(f"{self.location(f'{kind}waveform', shot)}: sample {k} is {samples[k]:g}")
+        return samples
+
+    def _error_of_location(self, kind: str, shot: int) -> ValueError | None:
+        """Return the reason why the location of a shot's samples is not known, or None where it is."""
+        location = self._sample_locations[kind]
+        count_field, start_field = f"{kind}_sample_count", f"{kind}_sample_start_index"
+        count, start, size = location.count[shot], location.start[shot], location.size
+        if count < 0:
+            value = self._per_shot[count_field][shot]
+            return ValueError(
+                f"{self.location(count_field, shot)}: {value:g} is no whole number in [0, {size}]"
+            )
+        if count < 2:
+            return ValueError(f"{self.location(count_field, shot)}: {count} samples; at least 2 belong here")
+        if start < 0:
+            value = location.indices[shot]
+            return ValueError(
+                f"{self.location(start_field, shot)}: {value:g} does not place its {count} samples between "
+                f"those of its neighbours, in [1, {size}]"
+            )
+        if start + count > size:
+            return ValueError(
+                f"{self.location(start_field, shot)}: samples {start + 1} to {start + count} of {size} that "
+                "are stored"
+            )
+        return None
 
     @functools.cached_property
     def shot_number(self) -> np.ndarray:
@@ -336,61 +448,81 @@ class _Beam:
 
     @functools.cached_property
     def _per_shot(self) -> dict[str, np.ndarray]:
+        """Numbers of shots by field, in double precision; NaN where they are missing."""
         for field in _PER_SHOT:
-            shape = self._dataset(field).shape
-            if shape != (self.size,):
-                raise ValueError(
-                    f"{self.location(field)}: shape {shape}, but shot_number has the shape {(self.size,)}"
-                )
-        return {field: self._read(field) for field in _PER_SHOT}
+            self._check_shape(field)
+        return {field: self._read_numbers(field) for field in _PER_SHOT}
+
+    def _check_shape(self, field: str) -> None:
+        shape = self._dataset(field).shape
+        if shape != (self.size,):
+            raise ValueError(
+                f"{self.location(field)}: shape {shape}, but shot_number has the shape {(self.size,)}"
+            )
 
     @functools.cached_property
     def _flags(self) -> dict[str, np.ndarray]:
+        """Flags of shots by name, of those that the file has; NaN where they are no whole numbers."""
         flags = {}
         for name, field in _FLAGS.items():
-            with refuse_damage(f"{self.location(field)}: damaged"):
-                is_missing = f"{self.name}/{field}" not in self.file
-            if is_missing:
+            if not self._has(field):
                 continue
-            values = self._read(field)
-            if values.shape != (self.size,) or values.dtype.kind not in "iu":
-                raise ValueError(
-                    f"{self.location(field)}: shape {values.shape} and type {values.dtype}, where a whole "
-                    f"number for each of {self.size} shots belongs"
+            try:
+                self._check_shape(field)
+                values = self._read_numbers(field)
+            except ValueError as error:
+                self.remarks.append(f"{error}: the flag is left out")
+                continue
+            wrong = ~((values == np.floor(values)) & (np.abs(values) <= MAX_EXACT_INTEGER))
+            if wrong.any():
+                first = int(np.argmax(wrong))
+                self.remarks.append(
+                    f"{self.location(field, first)}: {values[first]:g} is no whole number: {np.sum(wrong)} "
+                    f"of {self.size} flags of {self.name} left out"
                 )
-            flags[name] = values
+            flags[name] = np.where(wrong, np.nan, values)
         return flags
 
-    @functools.cached_property
-    def _start_and_count(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """Index of the first sample of each shot, from 0, and number of samples; received and sent."""
-        start_and_count = {}
-        for kind in ("rx", "tx"):
-            size = self._dataset(f"{kind}waveform").size
-            count = self._integers(f"{kind}_sample_count", size)
-            # The product counts from 1.
-            start = self._integers(f"{kind}_sample_start_index", 2**62) - 1
-            end = start + count
-            if not (np.all(start >= 0) and np.all(end <= size) and np.all(start[1:] >= end[:-1])):
-                if count.sum() != size:
-                    raise ValueError(
-                        f"{self.location(f'{kind}_sample_start_index')}: neither do the indices fit the "
-                        f"{size} samples stored, nor do the counts ({count.sum()} in all)"
-                    )
-                start = np.cumsum(count) - count
-            start_and_count[kind] = (start, count)
-        return start_and_count
+    def _start_indices(self, kind: str) -> np.ndarray:
+        """Return the start indices of all shots, from 1; NaN where they are missing."""
+        field = f"{kind}_sample_start_index"
+        if not self._has(field):
+            return np.full(self.size, np.nan)
+        self._check_shape(field)
+        return self._read_numbers(field)
 
-    def _integers(self, field: str, high: int) -> np.ndarray:
-        values = self._per_shot[field]
-        if values.dtype.kind == "f":
-            # Half precision does not hold the limits of the comparison.
-            values = values.astype(np.float64)
-        wrong = ~((values >= 0) & (values <= high) & (values == np.floor(values)))
-        if wrong.any():
-            i = int(np.argmax(wrong))
-            raise ValueError(f"{self.location(field, i)}: {values[i]:g} is no whole number in [0, {high}]")
-        return values.astype(np.int64)
+    @functools.cached_property
+    def _sample_locations(self) -> "dict[str, _SampleLocation]":
+        """Locations of the samples received ("rx") and sent ("tx")."""
+        return {kind: self._sample_location(kind) for kind in ("rx", "tx")}
+
+    def _sample_location(self, kind: str) -> "_SampleLocation":
+        """Return the samples' location in a waveform dataset, and remark on start indices that are replaced.
+
+        **Raises:** ValueError for indices and counts that do not fit the stored samples.
+        """
+        size = self._dataset(f"{kind}waveform").size
+        count = _whole_numbers(self._per_shot[f"{kind}_sample_count"], 0, size)
+        indices = self._start_indices(kind)
+        # The product counts from 1.
+        recorded_start = np.maximum(_whole_numbers(indices, 1, 2**62) - 1, -1)
+        field = f"{kind}_sample_start_index"
+        # Shots without samples need no start.
+        (shots,) = np.nonzero(count != 0)
+        start = np.full(self.size, -1)
+        start[shots] = _locate_samples(self.location(field), recorded_start[shots], count[shots], size)
+        replaced = (recorded_start < 0) & (start >= 0)
+        if replaced.any():
+            first = int(np.argmax(replaced))
+            self.remarks.append(
+                f"{self.location(field, first)}: {indices[first]:g} is no whole number in [1, {size}]: the "
+                f"samples of {np.sum(replaced)} shots of {self.name} are located by the counts"
+            )
+        return _SampleLocation(start, count, indices, size)
+
+    def _has(self, field: str) -> bool:
+        with refuse_damage(f"{self.location(field)}: damaged"):
+            return f"{self.name}/{field}" in self.file
 
     def _dataset(self, field: str) -> Any:
         """Return a dataset of numbers in one dimension, all of which are stored in the file."""
@@ -422,3 +554,78 @@ class _Beam:
         dataset = self._dataset(field)
         with refuse_damage(f"{self.location(field)}: damaged"):
             return dataset[:]
+
+    def _read_numbers(self, field: str) -> np.ndarray:
+        """Return the numbers of a dataset in double precision; NaN where they have its fill value."""
+        values = self._read(field)
+        with refuse_damage(f"{self.location(field)}: damaged"):
+            fill = self._dataset(field).attrs.get(_FILL_ATTRIBUTE)
+        is_fill = np.zeros(values.shape, bool) if fill is None else np.isin(values, fill)
+        with np.errstate(over="ignore"):
+            return np.where(is_fill, np.nan, values.astype(np.float64))
+
+
+class _SampleLocation(NamedTuple):
+    """Location of the samples of shots in a dataset.
+
+    - `start`: (shots,) index of the first sample, from 0; -1 where it is not known.
+    - `count`: (shots,) number of samples; -1 where it is not known.
+    - `indices`: (shots,) start indices as in the file, NaN where they are missing.
+    - `size`: number of samples in the dataset.
+    """
+
+    start: Int[np.ndarray, " shots"]
+    count: Int[np.ndarray, " shots"]
+    indices: Float[np.ndarray, " shots"]
+    size: int
+
+
+def _whole_numbers(values: np.ndarray, low: int, high: int) -> np.ndarray:
+    """Return values as integers; -1 for those that are no whole numbers in [low, high]."""
+    is_whole = (values >= low) & (values <= high) & (values == np.floor(values))
+    return np.where(is_whole, values, -1.0).astype(np.int64)
+
+
+def _locate_samples(location: str, start: np.ndarray, count: np.ndarray, size: int) -> np.ndarray:
+    """Return the first samples of shots, which follow one another in a dataset.
+
+    1. Recorded starts are used if they all lie within the dataset, one after another.
+    2. If the counts of all shots add up to the size, samples follow one another without gaps: starts are
+       those of the full file, or some are missing.
+    3. Recorded starts are used if they follow one another without gaps from the first sample on, or up to the
+       last one: samples, or some starts or counts, are missing. Missing starts are replaced where their
+       neighbours leave room for just the samples of the shots between.
+
+    Where 2 and 3 place a shot differently, a count or a start is wrong: its place is not known.
+
+    **Arguments:** `location`: of the starts, for messages. `start`, `count`: (shots,), -1 where they are
+    missing. `size`: of the dataset.
+
+    **Returns:** (shots,) indices, -1 where they are not known.
+
+    **Raises:** ValueError where neither starts nor counts fit.
+    """
+    end = start + count
+    is_placed = (start >= 0) & (count >= 0)
+    if np.all(is_placed) and np.all(end <= size) and np.all(start[1:] >= end[:-1]):
+        return start
+    by_count = np.cumsum(count) - count if np.all(count >= 0) and count.sum() == size else None
+    (placed,) = np.nonzero(is_placed)
+    is_anchored = (is_placed[0] and start[0] == 0) or (is_placed[-1] and end[-1] == size)
+    follows = (start[1:] == end[:-1])[is_placed[1:] & is_placed[:-1]]
+    if not (is_anchored and np.all(follows)):
+        if by_count is None and np.any(count >= 0):
+            raise ValueError(
+                f"{location}: neither do the indices fit the {size} samples stored, nor do the counts "
+                f"({np.sum(np.maximum(count, 0))} in all)"
+            )
+        return np.full(start.shape, -1) if by_count is None else by_count
+    by_start = np.where(is_placed, start, -1)
+    # Runs of shots between two that are placed, or between one and an end of the dataset.
+    for before, after in zip(np.r_[-1, placed].tolist(), np.r_[placed, start.size].tolist()):
+        run = slice(before + 1, after)
+        run_begin = int(end[before]) if before >= 0 else 0
+        run_end = int(start[after]) if after < start.size else size
+        if np.all(count[run] >= 0) and count[run].sum() == run_end - run_begin:
+            by_start[run] = run_begin + np.cumsum(count[run]) - count[run]
+    return by_start if by_count is None else np.where(by_start == by_count, by_count, -1)

@@ -61,6 +61,10 @@ _STEP_TOLERANCE = 1e-3
 _MAX_BINS = 2**16 - 1
 # Shots that are written at once.
 _BLOCK = 256
+# Admissible differences between the lidar of waveforms and that of a survey: of angles in degrees, and of
+# altitude, wavelength and the cosine of the zenith angle as fractions. The last one shifts a sample 100 m
+# above the plane by 1 mm.
+_MAX_TURN, _MAX_RELATIVE_DIFFERENCE, _MAX_COSINE_DIFFERENCE = 1e-4, 1e-6, 1e-5
 # Distance in m over which the direction of true north is found.
 _NORTH_BASELINE = 100.0
 
@@ -285,10 +289,68 @@ def _spans(waveforms: Any, survey: Survey, margin: int) -> tuple[np.ndarray, np.
         raise ValueError("the waveforms have another position than the shots of the survey; give their own")
     if position is not None:
         spans = [_span(waveforms, "waveforms", margin)] * len(survey)
+        _check_lidar(waveforms, "waveforms", survey.lidar)
+        _check_directions(waveforms, survey)
     else:
         spans = [_span(wave, f"waveforms {i}", margin) for i, wave in enumerate(waveforms)]
+        for i, wave in enumerate(waveforms):
+            _check_lidar(wave, f"waveforms {i}", survey.lidar)
+            _check_zenith(wave, f"waveforms {i}", float(survey.zenith[i]))
     first_times, bins = zip(*spans)
     return np.array(first_times), np.array(bins)
+
+
+def _check_lidar(waves: Any, name: str, lidar: Lidar) -> None:
+    """Refuse waveforms of a lidar of another altitude or wavelength than the survey's.
+
+    Waveforms made by `waveform_of`, and those in files of earlier versions, do not have their altitude.
+    """
+    altitude = waves.info.get("altitude")
+    pairs = {"wavelength": (waves.wavelength, lidar.wavelength, "nm")}
+    if altitude is not None:
+        pairs["altitude"] = (altitude, lidar.altitude, "m")
+    for quantity, (of_waves, of_survey, unit) in pairs.items():
+        simulated, expected = (float(np.asarray(value).flat[0]) for value in (of_waves, of_survey))
+        if abs(simulated - expected) > _MAX_RELATIVE_DIFFERENCE * expected:
+            raise ValueError(
+                f"{name}: they are of a lidar of {quantity} {simulated:g} {unit}, that of the survey has "
+                f"{expected:g} {unit}; give the survey that was simulated"
+            )
+
+
+def _check_directions(waves: Any, survey: Survey) -> None:
+    """Refuse `Waveforms` of other directions than those of the survey's shots."""
+    turn = np.remainder(np.asarray(waves.azimuth) - survey.azimuth + 180.0, 360.0) - 180.0
+    differences = {
+        "zenith": np.abs(np.asarray(waves.zenith) - survey.zenith),
+        # A vertical beam has no azimuth.
+        "azimuth": np.abs(turn) * np.sin(np.deg2rad(survey.zenith)),
+    }
+    for angle, difference in differences.items():
+        if np.any(difference > _MAX_TURN):
+            i = int(np.argmax(difference > _MAX_TURN))
+            raise ValueError(
+                f"waveforms: shot {i} has the {angle} {getattr(waves, angle)[i]:g} degrees, that of the "
+                f"survey {getattr(survey, angle)[i]:g} degrees; give the survey that was simulated"
+            )
+
+
+def _check_zenith(wave: Waveform, name: str, zenith: float) -> None:
+    """Refuse a waveform whose heights are not those of a zenith angle, in degrees.
+
+    Its cosine is the fall of the height per ns, over that of a vertical beam.
+    """
+    height, time = np.asarray(wave.height), np.asarray(wave.time)
+    fall, duration = float(height[0]) - float(height[-1]), float(time[-1]) - float(time[0])
+    cosine = fall / (height.size - 1) / (duration / (time.size - 1)) / (0.5 * SPEED_OF_LIGHT)
+    relative_ends = np.abs(height).max() / max(fall, 1e-9) + np.abs(time).max() / duration
+    rounding = 4 * np.finfo(height.dtype).eps * relative_ends
+    if abs(cosine - math.cos(math.radians(zenith))) > _MAX_COSINE_DIFFERENCE + rounding:
+        simulated = math.degrees(math.acos(min(max(cosine, -1.0), 1.0)))
+        raise ValueError(
+            f"{name}: its heights are those of the zenith {simulated:.4g} degrees, the shot of the survey "
+            f"has {zenith:.4g} degrees; give the survey that was simulated"
+        )
 
 
 def _span(waves: Any, name: str, margin: int) -> tuple[float, int]:

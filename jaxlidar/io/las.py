@@ -29,6 +29,7 @@ _MAX_NUMBERS = {
     "number_of_returns": (7, 15),
     "classification": (31, 255),
     "intensity": (2**16 - 1, 2**16 - 1),
+    "scanner_channel": (0, 3),
 }
 
 
@@ -229,7 +230,9 @@ def las_points(point_format: int, position: np.ndarray, fields: dict[str, Any], 
     for axis, values in zip("XYZ", counts.T):
         points[axis] = values.astype(np.int32)
     for name, values in fields.items():
-        points[name] = values
+        # Formats below 6 have no scanner channels; they were checked to be zero.
+        if name in points.point_format.dimension_names:
+            points[name] = values
     return points
 
 

@@ -9,8 +9,8 @@ specification does not say it.
   sign. The reader takes the sign with which points of a packet agree on its first sample; where no packet has
   two points, light goes down.
 - Points of a packet agree on its first sample to 2 mm (RIEGL Q680i), which is the rounding of coordinates.
-- A packet is a segment. Packets of one GPS time that lie one after another on one line are segments of one
-  shot: of a crown and the ground far below it, for instance.
+- A packet is a segment. Packets of one GPS time and scanner channel that lie one after another on one line
+  are segments of one shot: of a crown and the ground far below it, for instance.
 - Packets without a point are not found, and no outgoing pulse is in the file.
 
 Source: LAS specification 1.4 (ASPRS). A packet's layout is the specification's waveform packet descriptor.
@@ -202,6 +202,7 @@ class _LasShots(AirborneShots):
             step=steps,
             gps_time=np.asarray(points["gps_time"])[heads],
             source=np.asarray(points["point_source_id"])[heads],
+            channel=_scanner_channel(points)[heads],
         )
         order, begins_shot = _group_into_shots(packets)
         self.points_by_packet, ends = indices, np.r_[first[1:], indices.size]
@@ -280,6 +281,7 @@ class _LasShots(AirborneShots):
             "direction": direction,
             "metres": self.units.metres(anchor),
             "gps_time": float(points_of_packets[0]["gps_time"][0]),
+            "scanner_channel": int(_scanner_channel(points_of_packets[0])[0]),
             "returns": Returns(np.concatenate(positions), np.concatenate(times), *numbers),
         }
 
@@ -292,6 +294,13 @@ def _vector(points: Any) -> np.ndarray:
 def _location(points: Any) -> np.ndarray:
     """Return the times in ns from the first sample of their packet to points."""
     return np.asarray(points["return_point_wave_location"], float) * _PS
+
+
+def _scanner_channel(points: Any) -> np.ndarray:
+    """Return the scanner channels of points; zeros in point formats that have none."""
+    if "scanner_channel" in points.point_format.dimension_names:
+        return np.asarray(points["scanner_channel"])
+    return np.zeros(len(points), np.uint8)
 
 
 def _packet_path(path: Path) -> Path:
@@ -392,7 +401,7 @@ class _Packets(NamedTuple):
 
     - `start`: position of the first sample, m. `direction`: of light, m per ns.
     - `length`: ns from the first sample to the end. `step`: ns from sample to sample.
-    - `gps_time`: s. `source`: number of the flight line or instrument.
+    - `gps_time`: s. `source`: number of the flight line or instrument. `channel`: of the scanner.
     """
 
     start: Float[np.ndarray, "packets 3"]
@@ -401,6 +410,7 @@ class _Packets(NamedTuple):
     step: Shaped[np.ndarray, " packets"]
     gps_time: Float[np.ndarray, " packets"]
     source: Shaped[np.ndarray, " packets"]
+    channel: Shaped[np.ndarray, " packets"]
 
 
 def _group_into_shots(
@@ -408,15 +418,15 @@ def _group_into_shots(
 ) -> tuple[Int[np.ndarray, " packets"], Bool[np.ndarray, " packets"]]:
     """Return the order of packets in which those of one shot follow one another, and which begin a shot.
 
-    Packets are of one shot if they have the same GPS time (not 0) and source and lie one after another on one
-    line.
+    Packets are of one shot if they have the same GPS time (not 0), source and scanner channel and lie one
+    after another on one line.
     """
     # Positions of some 1e6 m leave few digits for distances along the line: relative to their mean.
     centred = packets.start - packets.start.mean(axis=0)
     step2 = np.sum(packets.direction**2, axis=1)
     along = np.sum(centred * packets.direction, axis=1) / step2
-    order = np.lexsort((along, packets.source, packets.gps_time))
-    start, direction, length, step, gps_time, source = (field[order] for field in packets)
+    order = np.lexsort((along, packets.channel, packets.source, packets.gps_time))
+    start, direction, length, step, gps_time, source, channel = (field[order] for field in packets)
     between, step2 = np.diff(start, axis=0), step2[order][:-1]
     time = np.sum(between * direction[:-1], axis=1) / step2
     off_line = np.linalg.norm(between - time[:, None] * direction[:-1], axis=1)
@@ -425,6 +435,7 @@ def _group_into_shots(
         (np.diff(gps_time) == 0)
         & (gps_time[1:] != 0)
         & (source[1:] == source[:-1])
+        & (channel[1:] == channel[:-1])
         & (step[1:] == step[:-1])
         & (off_line < _MAX_OFF_LINE)
         & (turn < _MAX_TURN * np.sqrt(step2))
@@ -441,10 +452,11 @@ def write_las_waveforms(
 ) -> None:
     """Write airborne shots as a LAS 1.4 file with waveform packets in a .wdp file beside it.
 
-    Samples, their gain, offset and sampling interval and GPS times are kept exactly; positions are rounded to
-    mm, directions to single precision. The shots' returns become points. A segment without a return gets one,
-    at its largest sample, flagged as synthetic, because packets are found by their points. The format has no
-    place for outgoing pulses. Shots are taken one at a time, so that there may be more than memory holds.
+    Samples, their gain, offset and sampling interval, GPS times and scanner channels are kept exactly;
+    positions are rounded to mm, directions to single precision. The shots' returns become points. A segment
+    without a return gets one, at its largest sample, flagged as synthetic, because packets are found by their
+    points. The format has no place for outgoing pulses. Shots are taken one at a time, so that there may be
+    more than memory holds.
 
     This needs laspy (`pip install "jaxlidar[io]"`). Existing files are replaced when the new ones are
     complete, the .wdp file first.
@@ -548,6 +560,7 @@ class _PacketWriter:
             "classification": returns.classification,
             "synthetic": is_synthetic,
             "gps_time": np.full(returns.time.size, 0.0 if shot.gps_time is None else shot.gps_time),
+            "scanner_channel": np.full(returns.time.size, shot.scanner_channel),
             "wavepacket_index": layout[segment_of_return],
             "wavepacket_offset": offset[segment_of_return],
             "wavepacket_size": size[segment_of_return],

@@ -1,6 +1,8 @@
 """Reader of triangle meshes in Wavefront's OBJ format."""
 
 import os
+import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,6 +20,8 @@ _NAMING_STATEMENTS = {"material": "usemtl", "group": "g", "object": "o"}
 _IGNORED_STATEMENTS = frozenset(
     {"vt", "vn", "vp", "s", "mtllib", "p", "l", "mg", "lod", "bevel", "c_interp", "d_interp"}
 )
+# Comments: after statements that name something, only where a blank precedes; names may have the sign.
+_COMMENT, _COMMENT_AFTER_NAME = re.compile(r"#.*"), re.compile(r"(^|\s)#.*")
 _UNNAMED = "unnamed"
 _NO_AREA = "without an area"
 
@@ -47,8 +51,9 @@ def read_obj(
 ) -> MeshRead:
     r"""Read the triangle mesh of a Wavefront OBJ file, with the names of its materials, groups or objects.
 
-    Faces of more than three corners must be flat and convex, and are cut into triangles. Other formats are
-    read by the package trimesh: `Mesh(other.vertices, other.faces)`.
+    Faces of more than three corners must be flat and convex, and are cut into triangles. Vertices without a
+    face may be at places that are not numbers; these vertices are not in the mesh. Other formats are read by
+    the package trimesh: `Mesh(other.vertices, other.faces)`.
 
     **Arguments:**
 
@@ -62,8 +67,8 @@ def read_obj(
     "without an area".
 
     **Raises:** FileNotFoundError where there is no such file. ValueError, naming the file and the line, for
-    coordinates that are not numbers or not on Earth, indices of missing vertices, faces of fewer than three
-    corners or that are not convex, and statements that are not known. ValueError for other
+    corners of faces whose coordinates are not numbers or not on Earth, indices of missing vertices, faces of
+    fewer than three corners or that are not convex, and statements that are not known. ValueError for other
     inadmissible arguments, and for a file without a triangle that has an area.
 
     **Source:** Wavefront Technologies (1989), Advanced Visualizer manual, appendix B1.
@@ -84,11 +89,11 @@ def read_obj(
     check_choice("up", up, ("z", "y"))
     path, lines = read_lines(path)
     statements = _Statements(path, _NAMING_STATEMENTS[part])
-    for number, line in enumerate(lines, 1):
-        statements.add(number, line)
+    for number, statement in _joined_statements(lines):
+        statements.add(number, statement)
     if not statements.faces:
         raise ValueError(f"{path}: line {len(lines)}: there is no face in the file")
-    vertices = _checked_vertices(path, statements) * scale
+    vertices = _remove_misplaced_vertices(path, statements) * scale
     if up == "y":
         x, y, z = vertices.T
         vertices = np.stack([x, -z, y], axis=1)
@@ -100,6 +105,29 @@ def read_obj(
         raise ValueError(f"{path}: line {len(lines)}: {len(has_area)} triangles, none with an area")
     mesh = Mesh(vertices, triangles[has_area], mesh.material[has_area], mesh.materials)
     return MeshRead(mesh, {_NO_AREA: int(np.sum(~has_area))})
+
+
+def _joined_statements(lines: list[str]) -> Iterator[tuple[int, str]]:
+    """Yield statements without comments, and the number of the line in which each begins.
+
+    A statement goes on in the next line after a backslash at the end.
+    """
+    statement, first = "", 0
+    for number, line in enumerate(lines, 1):
+        text = (_without_comment(line) if "#" in line else line).rstrip()
+        first = first or number
+        if text.endswith("\\"):
+            statement += text[:-1] + " "
+            continue
+        yield first, statement + text
+        statement, first = "", 0
+    if first:
+        yield first, statement
+
+
+def _without_comment(line: str) -> str:
+    kind = line.split(maxsplit=1)[0]
+    return (_COMMENT_AFTER_NAME if kind in _NAMING_STATEMENTS.values() else _COMMENT).sub("", line)
 
 
 class _Statements:
@@ -115,10 +143,10 @@ class _Statements:
         self.names: dict[str, int] = {}
         self.name = _UNNAMED
 
-    def add(self, number: int, line: str) -> None:
-        """Add the statement of a line."""
-        words = line.split()
-        if not words or words[0].startswith("#"):
+    def add(self, number: int, statement: str) -> None:
+        """Add a statement, which begins in a line."""
+        words = statement.split()
+        if not words:
             return
         kind, *words = words
         if kind == "v":
@@ -166,17 +194,26 @@ class _Statements:
         self.material.append(self.names.setdefault(self.name, len(self.names)))
 
 
-def _checked_vertices(path: Path, statements: _Statements) -> Float[np.ndarray, "m 3"]:
-    """Return the vertices. **Raises:** ValueError for those that are not finite, or not on Earth."""
+def _remove_misplaced_vertices(path: Path, statements: _Statements) -> Float[np.ndarray, "m 3"]:
+    """Remove vertices that are not finite, or not on Earth, from the faces' numbers; return the others.
+
+    **Raises:** ValueError for one that is a corner of a face.
+    """
     vertices = np.array(statements.vertices)
-    wrong = ~np.all(np.abs(vertices) <= MAX_COORDINATE, axis=1)
-    if wrong.any():
-        first = int(np.argmax(wrong))
+    is_misplaced = ~np.all(np.abs(vertices) <= MAX_COORDINATE, axis=1)
+    if not is_misplaced.any():
+        return vertices
+    is_corner = np.zeros(len(vertices), bool)
+    is_corner[[corner for face in statements.faces for corner in face]] = True
+    if np.any(is_misplaced & is_corner):
+        first = int(np.argmax(is_misplaced & is_corner))
         raise ValueError(
             f"{path}: line {statements.vertex_lines[first]}: vertex at {tuple(statements.vertices[first])}; "
             f"admissible are numbers in [-{MAX_COORDINATE:g}, {MAX_COORDINATE:g}]"
         )
-    return vertices
+    number = (np.cumsum(~is_misplaced) - 1).tolist()
+    statements.faces = [[number[corner] for corner in face] for face in statements.faces]
+    return vertices[~is_misplaced]
 
 
 def _triangles(

@@ -12,11 +12,14 @@ files, and `read_pulsewaves` relies on it; the specification does not say it.
 - LVIS: the anchor is the first returning sample, and nothing tells when the pulse left: its time zero is
   taken at its largest sample. Two digitisers recorded odd and even samples, with pedestals of their own.
   About a third of the returns saturate near 225 counts. Coordinates are degrees and m; east is 0 to 360.
+- RIEGL Q560: pulses without a return have a descriptor without a returning sampling, or no segment in all
+  returning ones, and 0 as their first and last returning sample.
 - Samples are returned as they are stored: pedestals, tables and saturation are left to the user.
 
 Source: PulseWaves specification 0.3 (rapidlasso).
 """
 
+import contextlib
 import math
 import os
 import struct
@@ -25,9 +28,10 @@ from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, TypeVar, final
 
 import numpy as np
+from jaxtyping import Bool
 
 from jaxlidar.io.airborne import AirborneShots, Scanner, Segment, evenly_spaced
-from jaxlidar.io.checks import MAX_COORDINATE, existing_file
+from jaxlidar.io.checks import MAX_COORDINATE, existing_file, warn_of_file
 from jaxlidar.io.coordinates import GEO_KEYS, find_units, is_geographic
 from jaxlidar.io.las_header import variable_records
 
@@ -80,7 +84,11 @@ def read_pulsewaves(path: str | os.PathLike[str]) -> AirborneShots:
 
     - `path`: the .pls file; the .wvs file lies beside it, under the same name.
 
-    **Returns:** an `AirborneShots`. Segments have the counts as stored.
+    **Returns:** an `AirborneShots` of the pulses that have a return; `AirborneShot.index` is the number of
+    the pulse in the file, from 0. Its `dropped` counts the pulses "without a return". Segments have the
+    counts as stored.
+
+    **Warns:** `FileWarning` where pulses have no return, with their number.
 
     **Raises:** FileNotFoundError where there is no such file, or no .wvs file. ValueError, naming the file
     and the place, for one that is no PulseWaves file, is damaged, compressed, without pulses, or declares
@@ -162,7 +170,7 @@ class PulsesHeader(NamedTuple):
 @final
 class _PulseWavesShots(AirborneShots):
     def __init__(self, path: Path):
-        self.path, self.dropped = path, {}
+        self.path = path
         with path.open("rb") as file:
             header = self.header = _read_header(path, file)
         self.tables, self.scanners = header.tables, header.scanners
@@ -180,13 +188,42 @@ class _PulseWavesShots(AirborneShots):
         if compression:
             raise ValueError(f"{wave_path}: header: waves are compressed ({compression}): they are not read")
         self.waves, self.wave_path = np.memmap(wave_path, np.uint8, "r"), wave_path
-        rows = evenly_spaced(header.count)
+        has_return = self._has_return()
+        self.pulse_numbers = np.flatnonzero(has_return)
+        self.dropped = {"without a return": int(np.sum(~has_return))}
+        if self.pulse_numbers.size == 0:
+            raise ValueError(f"{path}: pulse 0: neither this pulse nor another has a returning segment")
+        if self.dropped["without a return"]:
+            warn_of_file(
+                f"{path}: pulse {int(np.argmin(has_return))}: it has no returning segment: "
+                f"{self.dropped['without a return']} of {header.count} pulses skipped",
+                stacklevel=4,
+            )
+        rows = self.pulse_numbers[evenly_spaced(len(self))]
         self.units = find_units(
             f"{path}: pulses", header.geographic, self._anchor(rows), self._direction(rows)
         )
 
     def __len__(self) -> int:
-        return self.header.count
+        return self.pulse_numbers.size
+
+    def _has_return(self) -> Bool[np.ndarray, " pulses"]:
+        """Return True for pulses that have a return, and for damaged ones, which are refused when read."""
+        has_return = np.ones(self.header.count, bool)
+        for number, descriptor in self.header.descriptors.items():
+            returning = [sampling for sampling in descriptor.samplings if not sampling.outgoing]
+            if any(sampling.segment_bits == 0 for sampling in returning):
+                continue
+            has_descriptor = self.pulses["descriptor"] == number
+            if not returning:
+                has_return[has_descriptor] = False
+                continue
+            # The waves say how many segments there are: they are read where the pulse itself names no sample.
+            is_unclear = has_descriptor & (self.pulses["first"] == self.pulses["last"])
+            for index in np.flatnonzero(is_unclear).tolist():
+                with contextlib.suppress(ValueError):
+                    has_return[index] = bool(self._segments(index, descriptor)[1])
+        return has_return
 
     def _anchor(self, rows: Any) -> np.ndarray:
         return self.pulses["anchor"][rows] * self.header.scale + self.header.offset
@@ -198,20 +235,23 @@ class _PulseWavesShots(AirborneShots):
 
     @property
     def gps_time(self) -> np.ndarray:
-        return self.pulses["time"] * self.header.time_scale + self.header.time_offset
+        return self.pulses["time"][self.pulse_numbers] * self.header.time_scale + self.header.time_offset
 
     @property
     def anchor(self) -> np.ndarray:
-        return self._anchor(slice(None))
+        return self._anchor(self.pulse_numbers)
 
     @property
     def direction(self) -> np.ndarray:
-        return self._direction(slice(None))
+        return self._direction(self.pulse_numbers)
 
     def _read(self, index: int) -> dict[str, Any]:
+        index = int(self.pulse_numbers[index])
         pulse, rows = self.pulses[index], slice(index, index + 1)
         descriptor = self._descriptor(index)
         outgoing, returning = self._segments(index, descriptor)
+        if not returning:
+            raise ValueError(f"{self.path}: pulse {index}: it has no returning segment")
         anchor, direction = self._anchor(rows)[0], self._direction(rows)[0]
         if np.abs(anchor).max() > MAX_COORDINATE:
             raise ValueError(
@@ -222,6 +262,7 @@ class _PulseWavesShots(AirborneShots):
                 f"{self.path}: pulse {index}: the way of light in 1 ns cannot be {direction.tolist()}"
             )
         return {
+            "index": index,
             "outgoing": outgoing,
             "returning": returning,
             "anchor": anchor,
@@ -254,8 +295,6 @@ class _PulseWavesShots(AirborneShots):
             for _ in range(count):
                 segment = self._segment(reader, sampling, descriptor.unit)
                 (outgoing if sampling.outgoing else returning).append(segment)
-        if not returning:
-            raise ValueError(f"{self.path}: pulse {index}: it has no returning segment")
         return tuple(outgoing), tuple(returning)
 
     @staticmethod

@@ -8,11 +8,13 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxlidar._checks import check_range
-from jaxlidar.io.checks import MAX_COORDINATE, column_index
+from jaxlidar.io.checks import MAX_COORDINATE, column_index, warn_of_file
 from jaxlidar.io.text import parse_integer, parse_number, read_lines, split_cells
 from jaxlidar.plants.tree import Tree
 
-# Columns in use, with their names in files, without case, spaces and underscores.
+# Columns in use, with their names in files, without case, spaces and underscores: those of SimpleForest, of
+# rTwig (id, parent, start_x ... end_z, radius, branch_order) and of aRchi (cyl_ID, parent_ID, radius_cyl,
+# branching_order).
 _COLUMNS = {
     "id": ("id", "cylid", "cylinderid"),
     "parent": ("parentid", "parent"),
@@ -22,6 +24,8 @@ _COLUMNS = {
 }
 _INTEGERS = ("id", "parent", "order")
 _LENGTHS = (*(f"{end}{axis}" for end in ("start", "end") for axis in "xyz"), "radius")
+# The parent of a cylinder that has none, as this module writes it.
+_NO_PARENT = -1
 
 
 class TreeRead(NamedTuple):
@@ -44,21 +48,30 @@ class TreeRead(NamedTuple):
 
 
 def read_qsm(path: str | os.PathLike[str], *, scale: float = 1.0) -> TreeRead:
-    r"""Read the tree of a quantitative structure model, a table of cylinders of SimpleForest or aRchi.
+    r"""Read the tree of a quantitative structure model: a table of cylinders of SimpleForest, aRchi or rTwig.
+
+    A cylinder is a root if its parent is negative, is itself, or is 0 where no cylinder has the ID 0. Where a
+    model was cut, cylinders have parents that are not in the file: they become roots.
 
     **Arguments:**
 
     - `path`: a text file of comma-, semicolon- or tab-separated values whose first line names the columns:
-      ID, parentID, startX .. endZ and radius, in any order and case; branchOrder where there is one.
+      ID, parentID, startX .. endZ and radius, in any order and case; branchOrder where there is one, from 0
+      or, as aRchi's, from 1 for the trunk on.
     - `scale`: metres per unit of length in the file. Default 1.
 
     **Returns:** a `TreeRead`: the `Tree`, leaf-off, each cylinder a segment of constant radius, and the
     cylinders that were dropped, by reason: those "without a length". Their children grow from their parents.
 
+    **Warns:** `FileWarning` where parents are not in the file, with the number of their cylinders.
+
     **Raises:** FileNotFoundError where there is no such file. ValueError, naming the file and the line, for
     columns that are missing, rows of the wrong length, cells that are not numbers, or not whole ones where
-    those belong, coordinates that are not on Earth, radii that are not positive, IDs given twice, missing
-    parents, and cylinders that are their own ancestors. ValueError for a scale that is not positive.
+    those belong, coordinates that are not on Earth, radii that are not positive, IDs given twice, and several
+    cylinders that are their own ancestors. ValueError for a scale that is not positive.
+
+    **Source:** Hackenberg et al. (2021), SimpleForest; Martin-Ducup and Lecigne (2022), the R package aRchi;
+    Morales and MacFarlane (2024), Forestry 98, 1, and the dictionary of the R package rTwig.
 
     **Example:**
 
@@ -86,13 +99,19 @@ def read_qsm(path: str | os.PathLike[str], *, scale: float = 1.0) -> TreeRead:
         if row.id in rows:
             raise ValueError(f"{path}: line {number}: ID {row.id} was given in line {rows[row.id].line}")
         rows[row.id] = row
+    parent_of = {row.id: _parent_in_file(row, rows) for row in rows.values()}
+    roots = [row for row in rows.values() if parent_of[row.id] == _NO_PARENT]
+    # The other roots are cylinders whose parents were cut off.
+    is_declared = [row.parent <= 0 or row.parent == row.id for row in roots]
+    trunk_orders = [row.order for row, declared in zip(roots, is_declared) if declared]
+    cut = [row for row, declared in zip(roots, is_declared) if not declared]
     cylinders, parents, dropped = [], [], {"without a length": 0}
     # Index of each cylinder in the tree, by ID. One without a length has the index of its parent.
-    index = {-1: -1}
-    for row in _parents_first(path, rows):
-        index[row.id] = index[row.parent]
+    index = {_NO_PARENT: -1}
+    for row in _parents_first(path, rows, parent_of):
+        index[row.id] = index[parent_of[row.id]]
         if sum((e - s) ** 2 for s, e in zip(row.start, row.end)) > 0:
-            parents.append(index[row.parent])
+            parents.append(index[row.id])
             index[row.id] = len(cylinders)
             cylinders.append(row)
         else:
@@ -106,16 +125,23 @@ def read_qsm(path: str | os.PathLike[str], *, scale: float = 1.0) -> TreeRead:
         radius_start=radius,
         radius_end=radius.copy(),
         parent=np.array(parents),
-        order=np.array([row.order for row in cylinders]),
+        order=np.array([row.order for row in cylinders]) - _first_order(rows, trunk_orders),
         bud_position=np.zeros((0, 3)),
         bud_direction=np.zeros((0, 3)),
         bud_radius=np.zeros(0),
     )
+    if cut:
+        became = "cylinder without a parent became a root"
+        if len(cut) > 1:
+            became = "cylinders without a parent became roots"
+        warn_of_file(
+            f"{path}: line {cut[0].line}: parent {cut[0].parent} is not in the file: {len(cut)} {became}"
+        )
     return TreeRead(tree, dropped)
 
 
 class _Cylinder(NamedTuple):
-    """A row of the table, with lengths in m. A parent of -1 means none."""
+    """A row of the table, with lengths in m."""
 
     line: int
     id: int
@@ -156,8 +182,7 @@ def _cylinder(path: Path, line: int, column: dict[str, int], cells: list[str], s
     return _Cylinder(
         line=line,
         id=integers["id"],
-        # Any negative number stands for no parent.
-        parent=max(integers["parent"], -1),
+        parent=integers["parent"],
         order=order,
         start=start,
         end=end,
@@ -165,17 +190,26 @@ def _cylinder(path: Path, line: int, column: dict[str, int], cells: list[str], s
     )
 
 
-def _parents_first(path: Path, rows: dict[int, _Cylinder]) -> list[_Cylinder]:
+def _parent_in_file(row: _Cylinder, rows: dict[int, _Cylinder]) -> int:
+    """Return the ID of a cylinder's parent, or `_NO_PARENT` where it is a root or its parent is missing."""
+    return row.parent if row.parent in rows and row.parent != row.id else _NO_PARENT
+
+
+def _first_order(rows: dict[int, _Cylinder], trunk_orders: list[int]) -> int:
+    """Return the branching order of the trunk in the file: 1 where no order is smaller, else 0."""
+    is_from_one = min(trunk_orders, default=0) == 1 and all(row.order >= 1 for row in rows.values())
+    return int(is_from_one)
+
+
+def _parents_first(path: Path, rows: dict[int, _Cylinder], parent_of: dict[int, int]) -> list[_Cylinder]:
     """Return the rows with parents before their children, in depth-first order.
 
-    **Raises:** ValueError, naming the line, for a missing parent and a cycle of parents.
+    **Raises:** ValueError, naming the line, for a cycle of parents.
     """
     children: dict[int, list[int]] = {}
-    for row in rows.values():
-        if row.parent != -1 and row.parent not in rows:
-            raise ValueError(f"{path}: line {row.line}: parent {row.parent} is not in the file")
-        children.setdefault(row.parent, []).append(row.id)
-    ordered, stack = {}, children.get(-1, [])[::-1]
+    for row_id, parent in parent_of.items():
+        children.setdefault(parent, []).append(row_id)
+    ordered, stack = {}, children.get(_NO_PARENT, [])[::-1]
     while stack:
         row_id = stack.pop()
         ordered[row_id] = rows[row_id]

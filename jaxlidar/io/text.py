@@ -9,18 +9,31 @@ from jaxlidar.io.checks import MAX_EXACT_INTEGER, existing_file
 
 
 def read_lines(path: str | os.PathLike[str]) -> tuple[Path, list[str]]:
-    """Return the path of a text file in UTF-8, and its lines.
+    """Return the path of a text file, and its lines.
 
-    **Raises:** FileNotFoundError; ValueError, naming file and line, where it is no UTF-8.
+    A file that is not UTF-8 is read as Windows-1252, which has the letters of Latin-1. Some bytes are none of
+    its characters, so that most binary files are refused.
+
+    **Raises:** FileNotFoundError; ValueError, naming file and line, where it is neither.
     """
     path = existing_file(path)
-    lines = []
-    for number, line in enumerate(path.read_bytes().removeprefix(codecs.BOM_UTF8).splitlines(), 1):
+    lines = path.read_bytes().removeprefix(codecs.BOM_UTF8).splitlines()
+    encoding = "utf-8" if _first_undecodable(lines, "utf-8") is None else "cp1252"
+    undecodable = _first_undecodable(lines, encoding)
+    if undecodable is not None:
+        number, error = undecodable
+        raise ValueError(f"{path}: not a text file: line {number}: {error}") from error
+    return path, [line.decode(encoding) for line in lines]
+
+
+def _first_undecodable(lines: list[bytes], encoding: str) -> tuple[int, UnicodeDecodeError] | None:
+    """Return the number of the first line that is not text of an encoding and the error; None for none."""
+    for number, line in enumerate(lines, 1):
         try:
-            lines.append(line.decode())
+            line.decode(encoding)
         except UnicodeDecodeError as error:
-            raise ValueError(f"{path}: not a text file: line {number}: {error}") from error
-    return path, lines
+            return number, error
+    return None
 
 
 def parse_number(path: Path, line: int, column: str, text: str) -> float:

@@ -1,15 +1,17 @@
-"""Reader of voxel maps of AMAPVox (.vox text files)."""
+"""Reader of voxel maps of AMAPVox and HELIOS++ (.vox text files)."""
 
 import math
 import os
 import re
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxlidar._checks import check_choice, check_range
-from jaxlidar.io.checks import MAX_COORDINATE, column_index
+from jaxlidar.io.checks import MAX_COORDINATE, column_index, max_unpacked_size, warn_of_file
 from jaxlidar.io.text import parse_integer, parse_number, read_lines, split_cells
 from jaxlidar.optics.leaf_angles import LeafAngles
 from jaxlidar.scenes.voxels import VoxelMap
@@ -17,9 +19,14 @@ from jaxlidar.scenes.voxels import VoxelMap
 _FIRST_LINE = "VOXEL SPACE"
 # Columns of plant area density, or of attenuation, in the order in which they are looked for.
 _DENSITY_COLUMNS = ("PadBVTotal", "attenuation_FPL_unbiasedMLE")
-# Columns with the number of beams that sampled a voxel, and with its height above the ground.
-_OPTIONAL_COLUMNS = ("nbSampling", "ground_distance")
-_HEADER_KEYS = ("min_corner", "max_corner", "split", "lad_type")
+# Columns that a file may have: number of beams that sampled a voxel, their mean angle from the vertical in
+# degrees, and the voxel's height above the ground in m.
+_SAMPLING, _ANGLE, _GROUND_DISTANCE = "nbSampling", "angleMean", "ground_distance"
+_HEADER_KEYS = ("min_corner", "max_corner", "split", "res", "lad_type")
+# Numbers of the header stand in brackets, with commas between them, or, in older files, without either.
+_BRACKETS, _SEPARATORS = "()[]{}", re.compile(r"[\s,;]+")
+# Edges of voxels that differ by less, in m, agree: headers are rounded. (AMAPVox has the same limit.)
+_EDGE_TOLERANCE = 1e-5
 # The largest density that is finite in single precision.
 _MAX_DENSITY = float(np.finfo(np.float32).max)
 
@@ -48,28 +55,39 @@ class VoxelsRead(NamedTuple):
 def read_vox(
     path: str | os.PathLike[str], *, density: str | None = None, fill: float = 0.0, name: str = "leaf"
 ) -> VoxelsRead:
-    r"""Read the voxel map of plant area density in an AMAPVox file.
+    r"""Read the voxel map of plant area density in a file of AMAPVox or HELIOS++.
+
+    Columns of attenuation, whose names begin with "attenuation", hold extinction coefficients k, 1/m, of the
+    beams that sampled a voxel. The plant area density is k / G(theta), with the projection function G of the
+    file's leaf angles, and theta the mean angle of these beams, column "angleMean". A file without this
+    column is taken to be one of vertical beams; for spherical angles, G = 1/2 in every direction.
 
     **Arguments:**
 
     - `path`: a text file that begins with "VOXEL SPACE".
-    - `density`: the column of plant area density, m2/m3; a column whose name begins with "attenuation" holds
-      extinction coefficients, 1/m, which are doubled. Default None: "PadBVTotal", or, where it is missing,
-      "attenuation_FPL_unbiasedMLE".
+    - `density`: the column of plant area density, m2/m3, or of attenuation. Default None: "PadBVTotal", or,
+      where it is missing, "attenuation_FPL_unbiasedMLE".
     - `fill`: density of voxels that no beam sampled, m2/m3. Default 0.
-    - `name`: material of the plant area, "leaf" or "bark". Default "leaf".
+    - `name`: material of the plant area, "leaf" or "bark". Attenuation of bark is taken as it is. Default
+      "leaf".
 
-    **Returns:** a `VoxelsRead`: the `VoxelMap`, and the voxels that were dropped, by reason: those that no
-    beam sampled ("not sampled") or whose density is not a number ("without a density"), which have the
-    density `fill`, and those below the ground ("below the ground") that hold a density, which is left out.
-    Leaf angles are those that the file names (`lad_type`).
+    **Returns:** a `VoxelsRead`: the `VoxelMap`, and the voxels that were dropped, by reason. The density
+    `fill` is that of voxels that no beam sampled ("not sampled"), which sparse maps leave out, and of those
+    whose density is not a number ("without a density"). Voxels below the ground ("below the ground") that
+    hold a density lose it. Leaf angles are those that the file names (`lad_type`), spherical where it names
+    none. Voxels have the edges `res` from `min_corner` on, or, without `res`, are those of the grid from
+    `min_corner` to `max_corner`.
+
+    **Warns:** `FileWarning` where the grid of `res` does not end at `max_corner`.
 
     **Raises:** FileNotFoundError where there is no such file. ValueError, naming the file and the line, for a
-    first line or a header that is missing or makes no sense, columns that are missing or given twice, rows of
-    the wrong length or number, indices outside the grid or given twice, and negative densities. ValueError
-    for a `fill` that is negative or not finite, and for another `name`.
+    first line or a header that is missing or makes no sense, leaf angles without a name here, columns that
+    are missing or given twice, rows of the wrong length, no row or implausibly few, indices outside the grid
+    or given twice, negative densities, and angles outside 0 to 180 degrees. ValueError for a `fill` that is
+    negative or not finite, and for another `name`.
 
-    **Source:** Vincent et al. (2017), Remote Sens. Environ. 190, 273; AMAPVox's output format.
+    **Source:** Vincent et al. (2017), Remote Sens. Environ. 190, 273; Vincent, Pimont and Verley (2021), A
+    note on PAD/LAD estimators implemented in AMAPVox 1.7, doi:10.23708/1AJNMP.
 
     **Example:**
 
@@ -86,93 +104,191 @@ def read_vox(
     check_choice("name", name, ("leaf", "bark"))
     check_range("fill", fill, 0.0)
     path, lines = read_lines(path)
-    head, column_line = _read_header(path, lines)
-    low, high = (_triple(path, head, key) for key in ("min_corner", "max_corner"))
-    split = _triple(path, head, "split")
-    shape = tuple(int(n) for n in split)
-    if any(n != s or n < 1 for n, s in zip(shape, split)):
-        raise ValueError(f"{path}: line {head['split'][1]}: split = {head['split'][0]} are no whole numbers")
-    if not all(np.float32(h - b) > 0 for h, b in zip(high, low)):
-        raise ValueError(f"{path}: line {head['max_corner'][1]}: max_corner does not lie beyond min_corner")
+    header, column_line = _read_header(path, lines)
+    grid = _read_grid(path, header)
+    angles = _leaf_angles(path, header)
     names = lines[column_line].split()
     if density is None:
         density = next((c for c in _DENSITY_COLUMNS if c in names), _DENSITY_COLUMNS[0])
-    needed = ("i", "j", "k", density, *(c for c in _OPTIONAL_COLUMNS if c in names))
-    column = {c: column_index(f"{path}: line {column_line + 1}", names, c) for c in needed}
+    optional = [c for c in (_SAMPLING, _ANGLE, _GROUND_DISTANCE) if c in names]
+    used = ("i", "j", "k", density, *optional)
+    column = {c: column_index(f"{path}: line {column_line + 1}", names, c) for c in used}
+    if "correction" in density.lower() or "biascorr" in density.lower():
+        raise ValueError(
+            f"{path}: line {column_line + 1}: {density} is a correction of the attenuation, no density; give "
+            "the name of another column as density"
+        )
+    _check_number_of_rows(path, lines, column_line, math.prod(grid.shape))
 
-    numbered = enumerate(lines[column_line + 1 :], column_line + 2)
-    rows = [(number, text) for number, text in numbered if text.strip()]
-    if len(rows) < (count := math.prod(shape)):
-        raise ValueError(f"{path}: line {len(lines)}: {count - len(rows)} of {count} voxels are missing")
-    values, is_read = np.full(shape, float(fill)), np.zeros(shape, bool)
+    def rows() -> Iterator[_VoxelRow]:
+        for number, text in enumerate(lines[column_line + 1 :], column_line + 2):
+            if text.strip():
+                cells = split_cells(path, number, text, " ", len(names))
+                voxel = tuple(parse_integer(path, number, c, cells[column[c]]) for c in "ijk")
+                values = {c: parse_number(path, number, c, cells[column[c]]) for c in used[3:]}
+                yield _VoxelRow(number, voxel, values)
+
+    # Files made from points, as HELIOS++'s are, count no beams: all their numbers of beams are zero.
+    counts_beams = _SAMPLING in column and any(row.values[_SAMPLING] > 0 for row in rows())
+    convert = None
+    if density.startswith("attenuation"):
+        convert = _density_of_attenuation(path, angles if name == "leaf" else None)
+
+    densities, is_read = np.full(grid.shape, float(fill)), np.zeros(grid.shape, bool)
     dropped = {"not sampled": 0, "without a density": 0, "below the ground": 0}
-    # Attenuation is half of the plant area density, for G = 1/2 of spherical angles.
-    factor = 2.0 if density.startswith("attenuation") else 1.0
-    for number, text in rows:
-        cells = split_cells(path, number, text, " ", len(names))
-        voxel = tuple(parse_integer(path, number, c, cells[column[c]]) for c in "ijk")
-        if any(not 0 <= v < n for v, n in zip(voxel, shape)):
-            raise ValueError(f"{path}: line {number}: voxel {voxel} lies outside the grid {shape}")
-        if is_read[voxel]:
-            raise ValueError(f"{path}: line {number}: voxel {voxel} is given a second time")
-        is_read[voxel] = True
-        row = {c: parse_number(path, number, c, cells[column[c]]) for c in needed[3:]}
-        value = factor * row[density]
+    for row in rows():
+        if any(not 0 <= v < n for v, n in zip(row.voxel, grid.shape)):
+            raise ValueError(f"{path}: line {row.line}: voxel {row.voxel} lies outside the grid {grid.shape}")
+        if is_read[row.voxel]:
+            raise ValueError(f"{path}: line {row.line}: voxel {row.voxel} is given a second time")
+        is_read[row.voxel] = True
+        value = row.values[density] if convert is None else convert(row, density)
         if np.isnan(value):
             dropped["without a density"] += 1
         elif not 0 <= value <= _MAX_DENSITY:
             raise ValueError(
-                f"{path}: line {number}: {density} = {value:g} is outside the range [0, inf) of single "
+                f"{path}: line {row.line}: {density} = {value:g} is outside the range [0, inf) of single "
                 "precision"
             )
-        elif row.get("nbSampling") == 0:
+        elif counts_beams and row.values[_SAMPLING] == 0:
             dropped["not sampled"] += 1
-        elif row.get("ground_distance", 0.0) < 0:
+        elif row.values.get(_GROUND_DISTANCE, 0.0) < 0:
             dropped["below the ground"] += int(value > 0)
-            values[voxel] = 0.0
+            densities[row.voxel] = 0.0
         else:
-            values[voxel] = value
-    size = (np.array(high) - low) / shape
+            densities[row.voxel] = value
+    # Sparse maps have no row of voxels that no beam sampled.
+    dropped["not sampled"] += int(np.sum(~is_read))
     if name == "bark":
-        voxels = VoxelMap.from_extinction(bark=0.5 * values, voxel_size=size, origin=low)
+        voxels = VoxelMap.from_extinction(bark=0.5 * densities, voxel_size=grid.edges, origin=grid.origin)
     else:
-        angles = _leaf_angles(path, head)
-        voxels = VoxelMap.from_lad(values, voxel_size=size, origin=low, leaf_angles=angles)
+        voxels = VoxelMap.from_lad(
+            densities, voxel_size=grid.edges, origin=grid.origin, leaf_angles=angles or "spherical"
+        )
     return VoxelsRead(voxels, dropped)
 
 
+class _VoxelRow(NamedTuple):
+    """A row: its line, the indices of its voxel, and its values by column."""
+
+    line: int
+    voxel: tuple[int, ...]
+    values: dict[str, float]
+
+
+class _VoxelGrid(NamedTuple):
+    """The grid of a file: numbers of voxels, edges of a voxel and lower corner, m, along x, y and z."""
+
+    shape: tuple[int, ...]
+    edges: Float[np.ndarray, "3"]
+    origin: tuple[float, float, float]
+
+
+def _check_number_of_rows(path: Path, lines: list[str], column_line: int, voxels: int) -> None:
+    """Refuse a map without a row, and one so sparse that its grid is not that of the file."""
+    missing = voxels - sum(bool(text.strip()) for text in lines[column_line + 1 :])
+    if missing == voxels or (missing > 0 and voxels * np.dtype(float).itemsize > max_unpacked_size(path)):
+        raise ValueError(f"{path}: line {len(lines)}: {missing} of {voxels} voxels are missing")
+
+
+def _density_of_attenuation(path: Path, angles: LeafAngles | None) -> Callable[[_VoxelRow, str], float]:
+    """Make the function of a row that returns the plant area density, m2/m3, of an attenuation column."""
+    projection = np.full(2, 0.5) if angles is None else np.asarray(angles.tables()[0], float)
+    cosines = np.linspace(0.0, 1.0, projection.size)
+
+    def convert(row: _VoxelRow, column: str) -> float:
+        attenuation, angle = row.values[column], row.values.get(_ANGLE, 0.0)
+        if angles is None or attenuation == 0.0:
+            return 2.0 * attenuation
+        if not (0.0 <= angle <= 180.0 or math.isnan(angle)):
+            raise ValueError(
+                f"{path}: line {row.line}: {_ANGLE} = {angle:g} is outside the range [0, 180] degrees"
+            )
+        return attenuation / float(np.interp(abs(math.cos(math.radians(angle))), cosines, projection))
+
+    return convert
+
+
+# -- header ------------------------------------------------------------------------------------------------
+
+
 def _read_header(path: Path, lines: list[str]) -> tuple[dict[str, tuple[str, int]], int]:
-    """Return text and line number of the entries of the header, and the index of the line after it."""
+    """Return text and line number of the entries of the header, and the index of the line after it.
+
+    A line may have several entries, "#key:value #key:value", with blanks around each word. Keys are returned
+    in small letters.
+    """
     if not lines or lines[0].strip() != _FIRST_LINE:
         raise ValueError(f"{path}: line 1: {_FIRST_LINE!r} is missing: no AMAPVox file")
-    head: dict[str, tuple[str, int]] = {}
+    header: dict[str, tuple[str, int]] = {}
     for number, line in enumerate(lines[1:], 2):
-        if not line.startswith("#"):
-            return head, number - 1
-        for key, value in re.findall(r"#([\w-]+):(\([^)]*\)|\S+)", line):
-            if key in _HEADER_KEYS and key in head:
-                raise ValueError(f"{path}: line {number}: #{key} was given in line {head[key][1]}")
-            head[key] = (value, number)
+        if not line.strip():
+            continue
+        before, *entries = line.split("#")
+        if before.strip():
+            return header, number - 1
+        for entry in entries:
+            key, colon, value = (word.strip() for word in entry.partition(":"))
+            if not colon:
+                raise ValueError(f"{path}: line {number}: #{key[:40]} has no colon and no value")
+            key = key.lower()
+            if key in _HEADER_KEYS and key in header:
+                raise ValueError(f"{path}: line {number}: #{key} was given in line {header[key][1]}")
+            header[key] = (value, number)
     raise ValueError(f"{path}: line {len(lines)}: the file ends where the names of the columns belong")
 
 
-def _leaf_angles(path: Path, head: dict[str, tuple[str, int]]) -> str | LeafAngles:
-    """Return the leaf angles that the header names."""
-    angles, line = head.get("lad_type", ("spherical", 0))
+def _read_grid(path: Path, header: dict[str, tuple[str, int]]) -> _VoxelGrid:
+    """Return the grid that the header describes.
+
+    **Raises:** ValueError, naming the file and the line, for entries that are missing or make no sense.
+    """
+    low, high = (_triple(path, header, key) for key in ("min_corner", "max_corner"))
+    split = _triple(path, header, "split")
+    shape = tuple(int(n) for n in split)
+    if any(n != s or n < 1 for n, s in zip(shape, split)):
+        text, line = header["split"]
+        raise ValueError(f"{path}: line {line}: split = {text} are no whole numbers")
+    if not all(np.float32(h - b) > 0 for h, b in zip(high, low)):
+        _, line = header["max_corner"]
+        raise ValueError(f"{path}: line {line}: max_corner does not lie beyond min_corner")
+    edges = (np.array(high) - low) / shape
+    if "res" in header:
+        text, line = header["res"]
+        resolution = np.array(_triple(path, header, "res"))
+        if not np.all(np.float32(resolution) > 0):
+            raise ValueError(f"{path}: line {line}: res = {text} is outside the range (0, inf)")
+        if np.any(np.abs(resolution - edges) > _EDGE_TOLERANCE):
+            # HELIOS++ writes the points' largest coordinates, rounded up, as max_corner.
+            end = (np.array(low) + shape * resolution).tolist()
+            warn_of_file(
+                f"{path}: line {line}: voxels of res = {text} end at {end}, not at max_corner = {[*high]}: "
+                "res is used",
+                stacklevel=4,
+            )
+            edges = resolution
+    return _VoxelGrid(shape, edges, low)
+
+
+def _leaf_angles(path: Path, header: dict[str, tuple[str, int]]) -> LeafAngles | None:
+    """Return the leaf angles that the header names; None for spherical ones."""
+    angles, line = header.get("lad_type", ("spherical", 0))
     if angles.lower() == "spherical":
-        return "spherical"
+        return None
     try:
         return LeafAngles.named(angles.lower())
     except ValueError as error:
-        raise ValueError(f"{path}: line {line}: {error}") from error
+        raise ValueError(f"{path}: line {line}: lad_type: {error}") from error
 
 
-def _triple(path: Path, head: dict[str, tuple[str, int]], key: str) -> tuple[float, float, float]:
-    """Return the three numbers of an entry of the header."""
-    if key not in head:
+def _triple(path: Path, header: dict[str, tuple[str, int]], key: str) -> tuple[float, float, float]:
+    """Return the three numbers of an entry of the header. One number of `res` is that of cubes."""
+    if key not in header:
         raise ValueError(f"{path}: line 2: the header has no #{key}")
-    text, line = head[key]
-    texts = text.strip("()").split(",")
+    text, line = header[key]
+    texts = _SEPARATORS.split(text.strip().strip(_BRACKETS).strip())
+    if len(texts) == 1 and key == "res":
+        texts = 3 * texts
     if len(texts) != 3:
         raise ValueError(f"{path}: line {line}: {key} = {text} are not three numbers")
     x, y, z = (parse_number(path, line, key, number) for number in texts)

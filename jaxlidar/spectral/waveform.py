@@ -64,7 +64,8 @@ class Waveform(eqx.Module):
     - `recorded`: (wavelengths, samples) J that the receiver records of `energy`, without noise: background
       added, saturated, cut at the detection threshold, quantised. `jaxlidar.record` draws noise as well.
     - `wavelength`: (wavelengths,) nm, the lidar's.
-    - `info`: dict: "photons", "batches", "seconds" spent, "error" reached, and why the simulation "stopped".
+    - `info`: dict: "photons", "batches", "seconds" spent, "error" reached, why the simulation "stopped", and
+      the "altitude" of the lidar in m.
     - `truth`: a `Truth`, what the beam meets in the scene; None where it was not asked for.
 
     **Example:**

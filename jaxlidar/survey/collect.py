@@ -108,6 +108,7 @@ def _waveforms(
         info={
             "rtol": strategy.rtol,
             "orders": strategy.setup.plan.orders,
+            "altitude": float(strategy.setup.lidar.altitude),
             "seconds": time.perf_counter() - start_time,
             **strategy.info(),
             **info,

@@ -38,11 +38,12 @@ class Waveforms(eqx.Module):
     - `off_map`: (shots,) fraction of the light that falls outside the voxel map.
     - `error`: (shots,) relative error, as `simulate` defines it. `photons`: (shots,) number traced.
     - `truth`: a `Truths`, what each beam meets in the scene; None unless it was asked for.
-    - `info`: dict of "rtol", "orders" followed, "seconds" that it took, and whether light was "shared" (over
-      `SceneParts`: in all tiles). Over one scene with shared light, also the spacing in m of the "grid" of
-      nodes at which it entered, and a bound on the fraction of samples that "parallel light" changes. Over
-      `SceneParts`, also the number of "parts", the "margin" in m around tiles, and the "margin of all light",
-      which loses none. If there is a file, also "problem": digests of all that the waveforms depend on.
+    - `info`: dict of "rtol", "orders" followed, "altitude" of the lidar in m, "seconds" that it took, and
+      whether light was "shared" (over `SceneParts`: in all tiles). Over one scene with shared light, also the
+      spacing in m of the "grid" of nodes at which it entered, and a bound on the fraction of samples that
+      "parallel light" changes. Over `SceneParts`, also the number of "parts", the "margin" in m around tiles,
+      and the "margin of all light", which loses none. If there is a file, also "problem": digests of all that
+      the waveforms depend on.
 
     **Example:**
 
@@ -138,7 +139,9 @@ class Waveforms(eqx.Module):
         )
 
     def _info(self, i: int) -> dict[str, Any]:
-        return {"photons": int(self.photons[i]), "error": float(self.error[i]), "stopped": self._stopped(i)}
+        shot = {"photons": int(self.photons[i]), "error": float(self.error[i]), "stopped": self._stopped(i)}
+        # Files of earlier versions do not have the altitude.
+        return shot | {name: self.info[name] for name in ("altitude",) if name in self.info}
 
     def _stopped(self, i: int) -> str:
         """Return the reason why tracing of shot i ended, as `Waveform.info` has it."""

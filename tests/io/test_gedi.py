@@ -2,12 +2,13 @@
 
 import dataclasses
 import sys
+import warnings
 
 import numpy as np
 import pytest
 
 from jaxlidar.instrument.pulse import SampledPulse
-from jaxlidar.io import read_gedi_l1b
+from jaxlidar.io import FileWarning, read_gedi_l1b
 
 h5py = pytest.importorskip("h5py")
 
@@ -54,6 +55,26 @@ def write_small(path, *, is_subset=False):
             geolocation["local_beam_elevation"] = np.full(n, np.deg2rad(88.5), dtype=np.float32)
             geolocation["local_beam_azimuth"] = np.full(n, np.deg2rad(-160.0), dtype=np.float32)
     return path
+
+
+def replace(path, name, change):
+    """Replaces a dataset of a file by what `change` makes of its values; by nothing, if it is None."""
+    with h5py.File(path, "r+") as file:
+        values = file[name][()]
+        del file[name]
+        if change is not None:
+            file[name] = change(values)
+
+
+def with_value(index, value):
+    """A change of one number of a dataset."""
+
+    def change(values):
+        changed = values.astype(np.result_type(values, np.asarray(value)))
+        changed[index] = value
+        return changed
+
+    return change
 
 
 @pytest.fixture
@@ -117,6 +138,17 @@ def test_shots_are_selected_by_index_or_number(small):
         read_gedi_l1b(small, np.array([0.5]))
 
 
+def test_shots_that_are_no_numbers(small):
+    with pytest.raises(TypeError, match=r"shot = 'text' is a str; admissible are an index or a shot number"):
+        read_gedi_l1b(small, "text")
+    with pytest.raises(TypeError, match=r"shot = '1' is a str; .* or a list of them"):
+        read_gedi_l1b(small, [0, "1"])
+    with pytest.raises(TypeError, match=r"shot = True is a bool"):
+        read_gedi_l1b(small, True)
+    with pytest.raises(ValueError, match=r"shot = 1\.5 is neither an index nor a shot number"):
+        read_gedi_l1b(small, 1.5)
+
+
 def test_missing_foreign_and_truncated_files_are_refused(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"none\.h5"):
         read_gedi_l1b(tmp_path / "none.h5")
@@ -171,15 +203,17 @@ def test_missing_foreign_and_truncated_files_are_refused(tmp_path):
         ("tx_gloc", lambda x: x[0], r"tx_gloc: shape \(\), where one dimension belongs"),
     ],
 )
-def test_damaged_datasets_are_refused_by_name(small, field, change, message):
-    with h5py.File(small, "r+") as file:
-        group = file["BEAM0001"]
-        values = group[field][()]
-        del group[field]
-        if change is not None:
-            group[field] = change(values)
-    with pytest.raises(ValueError, match=r"small\.h5: /BEAM0001/" + message):
-        read_gedi_l1b(small)
+def test_damage_is_named(small, field, change, place):
+    """A shot that is asked for is refused; of all shots, those of the other beam are read."""
+    replace(small, f"BEAM0001/{field}", change)
+    says = r"small\.h5: /BEAM0001/" + place
+    with pytest.warns(FileWarning, match=says):
+        shots = read_gedi_l1b(small)
+    assert "BEAM0101" in {shot.beam for shot in shots}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(ValueError, match=says):
+            read_gedi_l1b(small)
 
 
 @pytest.mark.parametrize(
@@ -196,8 +230,11 @@ def test_a_declared_size_that_the_file_does_not_hold_is_refused(small, options, 
     with h5py.File(small, "r+") as file:
         del file["BEAM0001/noise_mean_corrected"]
         file["BEAM0001"].create_dataset("noise_mean_corrected", dtype="f8", **options)
-    with pytest.raises(ValueError, match=r"small\.h5: /BEAM0001/noise_mean_corrected: .*" + message):
-        read_gedi_l1b(small)
+    says = r"small\.h5: /BEAM0001/noise_mean_corrected: .*" + message
+    with pytest.warns(FileWarning, match=says + r".*: 3 of 3 shots of BEAM0001 skipped"):
+        assert len(read_gedi_l1b(small)) == 1
+    with pytest.raises(ValueError, match=says):
+        read_gedi_l1b(small, 0)
 
 
 def test_a_chunk_far_larger_than_the_file_is_refused(small):
@@ -207,7 +244,7 @@ def test_a_chunk_far_larger_than_the_file_is_refused(small):
         options = {"chunks": (2**23,), "maxshape": (None,), "compression": 9}
         file["BEAM0001"].create_dataset("tx_gloc", data=values, **options)
     with pytest.raises(ValueError, match="/BEAM0001/tx_gloc: 33554432 bytes are declared in a file of"):
-        read_gedi_l1b(small)
+        read_gedi_l1b(small, 0)
 
 
 def test_beams_without_a_selected_shot_are_not_read(small):
@@ -293,8 +330,8 @@ def test_time_zero_of_the_pulse_places_the_ground_where_level_2_has_it(recorded)
     assert np.std(errors) < 0.1
 
 
-def test_quality_flags_are_read_where_a_file_has_them(small):
-    """The small file has none. Flags that are added are those of their shots; damaged ones are refused."""
+def test_flags_stay_with_the_shot(small):
+    """Absent in this subset; where they are, each shot keeps its own, and damaged ones are left out."""
     assert [(s.degrade, s.stale_return) for s in read_gedi_l1b(small)] == [(None, None)] * 4
     with h5py.File(small, "a") as file:
         file["BEAM0001/geolocation/degrade"] = np.array([0, 30, 80], np.int8)
@@ -305,7 +342,146 @@ def test_quality_flags_are_read_where_a_file_has_them(small):
     with h5py.File(small, "a") as file:
         del file["BEAM0001/stale_return_flag"]
         file["BEAM0001/stale_return_flag"] = np.array([0, 1], np.uint8)
-    with pytest.raises(ValueError, match="stale_return_flag: shape"):
+    with pytest.warns(FileWarning, match="stale_return_flag: shape .*: the flag is left out"):
+        shots = read_gedi_l1b(small)
+    assert [(s.degrade, s.stale_return) for s in shots] == [(0, None), (30, None), (80, None), (None, None)]
+
+
+def test_flags_in_floating_point(small):
+    with h5py.File(small, "a") as file:
+        file["BEAM0001/geolocation/degrade"] = np.array([0.0, 30.0, 80.0])
+    assert [s.degrade for s in read_gedi_l1b(small)] == [0, 30, 80, None]
+    replace(small, "BEAM0001/geolocation/degrade", lambda x: np.array([0.0, np.nan, np.inf]))
+    with pytest.warns(
+        FileWarning, match=r"degrade, shot .*1: nan is no whole number: 2 of 3 flags of BEAM0001"
+    ):
+        assert [s.degrade for s in read_gedi_l1b(small)] == [0, None, None, None]
+
+
+def numbers_of(shots):
+    return [shot.shot_number - 10**16 for shot in shots]
+
+
+@pytest.mark.parametrize(
+    ("field", "index", "value", "says"),
+    [
+        ("geolocation/elevation_bin0", 1, np.nan, "elevation_bin0, shot .*1: nan is outside"),
+        ("geolocation/elevation_lastbin", 1, -999999.0, "elevation_lastbin, shot .*1: -999999 is outside"),
+        ("geolocation/altitude_instrument", 1, -9999.0, "altitude_instrument, shot .*1: -9999 is outside"),
+        ("noise_mean_corrected", 1, -9999.0, r"noise_mean_corrected, shot .*1: -9999 .* range \[0, 1e\+09\]"),
+        ("noise_mean_corrected", 1, 9.96921e36, r"noise_mean_corrected, shot .*1: 9\.96921e\+36 is outside"),
+        ("rx_sample_count", 1, 0, "rx_sample_count, shot .*1: 0 samples; at least 2"),
+        ("rx_sample_count", 1, -9999.0, "rx_sample_count, shot .*1: -9999 is no whole number"),
+        ("rxwaveform", 45, np.nan, "rxwaveform, shot .*1: sample 5 is nan"),
+        ("tx_gloc", 1, np.nan, "tx_gloc, shot .*1: nan is outside"),
+    ],
+)
+def test_one_shot_that_is_not_complete(small, field, index, value, says):
+    """It is skipped and counted; the others are what they were, and keep their indices."""
+    expected = read_gedi_l1b(small)
+    replace(small, f"BEAM0001/{field}", with_value(index, value))
+    with pytest.warns(
+        FileWarning, match=rf"small\.h5: /BEAM0001/.*{says}.*: 1 of 3 shots of BEAM0001 skipped"
+    ):
+        shots = read_gedi_l1b(small)
+    assert numbers_of(shots) == [0, 2, 10]
+    for shot, i in zip(shots, (0, 2, 3), strict=True):
+        np.testing.assert_array_equal(shot.waveform, expected[i].waveform)
+        np.testing.assert_array_equal(shot.pulse_power, expected[i].pulse_power)
+    assert numbers_of(read_gedi_l1b(small, [2, 3])) == [2, 10]
+    with pytest.raises(ValueError, match=says):
+        read_gedi_l1b(small, 1)
+
+
+@pytest.mark.parametrize("fill", [240.0, np.array([240.0])])
+def test_fill_values_that_a_dataset_declares(small, fill):
+    """Also those that could be numbers of a shot."""
+    with h5py.File(small, "r+") as file:
+        file["BEAM0001/noise_mean_corrected"][1] = 240.0
+        file["BEAM0001/noise_mean_corrected"].attrs["_FillValue"] = fill
+    with pytest.warns(FileWarning, match="noise_mean_corrected, shot .*1: nan is outside"):
+        assert numbers_of(read_gedi_l1b(small)) == [0, 2, 10]
+
+
+@pytest.mark.parametrize("value", [0, 2**64 - 1, np.nan, None])
+def test_missing_start_indices(small, value):
+    """The counts locate the samples; without them, the neighbours do."""
+    expected = read_gedi_l1b(small)
+    field = "BEAM0001/rx_sample_start_index"
+    change = None if value is None else with_value(1, np.uint64(value) if isinstance(value, int) else value)
+    replace(small, field, change)
+    says = r"small\.h5: /BEAM0001/rx_sample_start_index, shot .*is no whole number in \[1, 150\]"
+    with pytest.warns(FileWarning, match=says):
+        shots = read_gedi_l1b(small)
+    assert numbers_of(shots) == numbers_of(expected)
+    for shot, original in zip(shots, expected):
+        np.testing.assert_array_equal(shot.waveform, original.waveform)
+
+
+def test_samples_that_are_not_stored(small):
+    """The last shot's are cut short: its own index says so, and no other shot moves."""
+    expected = read_gedi_l1b(small)
+    replace(small, "BEAM0001/rxwaveform", lambda x: x[:-1])
+    says = r"rx_sample_start_index, shot .*2: samples 91 to 150 of 149 .*: 1 of 3 shots"
+    with pytest.warns(FileWarning, match=says):
+        shots = read_gedi_l1b(small)
+    assert numbers_of(shots) == [0, 1, 10]
+    replace(small, "BEAM0001/rx_sample_start_index", with_value(1, np.uint64(0)))
+    with pytest.warns(FileWarning) as caught:
+        shots = read_gedi_l1b(small)
+    assert [str(w.message).rpartition(": ")[2] for w in caught] == [
+        "1 of 3 shots of BEAM0001 skipped",
+        "the samples of 1 shots of BEAM0001 are located by the counts",
+    ]
+    np.testing.assert_array_equal(shots[1].waveform, expected[1].waveform)
+    # Where the neighbours leave room for another number of samples, the shot is skipped. As the counts now
+    # add up to the samples stored, so is the shot that they place elsewhere than its index does.
+    replace(small, "BEAM0001/rx_sample_count", with_value(1, np.uint16(49)))
+    with pytest.warns(FileWarning, match=r"1: 0 does not place its 49 samples between .*: 2 of 3"):
+        assert numbers_of(read_gedi_l1b(small)) == [0, 10]
+
+
+def test_indices_of_the_full_file_and_missing_samples(small):
+    """Which samples are missing is not known: no shot of the beam is read at another's place."""
+    replace(small, "BEAM0001/rxwaveform", lambda x: x[:-1])
+    replace(small, "BEAM0001/rx_sample_start_index", lambda x: x + np.uint64(50))
+    with pytest.warns(
+        FileWarning, match=r"neither do the indices fit the 149 .*\(150 in all\): 3 of 3 shots"
+    ):
+        assert numbers_of(read_gedi_l1b(small)) == [10]
+
+
+@pytest.mark.parametrize("content", ["empty", "numbers alone", "dataset"])
+def test_beams_that_are_not_complete(small, content):
+    with h5py.File(small, "r+") as file:
+        if content == "dataset":
+            file["BEAM0010"] = np.zeros(3)
+        else:
+            group = file.create_group("BEAM0010")
+        if content == "numbers alone":
+            group["shot_number"] = np.array([10**16 + 90, 10**16 + 91], np.uint64)
+    says = {"numbers alone": r": 2 of 2 shots of BEAM0010 skipped"}.get(content, ": the beam is skipped")
+    with pytest.warns(FileWarning, match=r"small\.h5: /BEAM0010/.*: no such dataset.*" + says):
+        assert numbers_of(read_gedi_l1b(small)) == [0, 1, 2, 10]
+    if content == "numbers alone":
+        with pytest.raises(ValueError, match=r"/BEAM0010/.*: no such dataset"):
+            read_gedi_l1b(small, 10**16 + 91)
+
+
+def test_a_beam_without_shots_is_complete(small):
+    with h5py.File(small, "r+") as file:
+        file.create_group("BEAM0010")["shot_number"] = np.zeros(0, np.uint64)
+    assert len(read_gedi_l1b(small)) == 4
+
+
+def test_a_file_without_a_complete_shot(small):
+    for name in ("BEAM0001", "BEAM0101"):
+        replace(small, f"{name}/tx_gloc", lambda x: x * np.nan)
+    with pytest.raises(ValueError, match=r"small\.h5: /BEAM0001/tx_gloc, shot .*0: nan is outside"):
+        read_gedi_l1b(small)
+    for name in ("BEAM0001", "BEAM0101"):
+        replace(small, f"{name}/shot_number", None)
+    with pytest.raises(ValueError, match=r"small\.h5: /BEAM0001/shot_number: no such dataset"):
         read_gedi_l1b(small)
 
 

@@ -285,3 +285,52 @@ def test_waveforms_that_the_product_cannot_hold_are_refused(waveforms, survey, p
     assert_refused("recorded of shot 2 = nan", changed(recorded=recorded))
     assert_refused("waveforms 1 is .* admissible is a Waveform", [waveforms[0], 1, 2, 3], error=TypeError)
     assert not list(path.parent.iterdir())
+
+
+@pytest.mark.parametrize("from_file", [False, True])
+@pytest.mark.parametrize("one_by_one", [False, True])
+def test_waveforms_of_another_survey_are_refused(waveforms, survey, path, tmp_path, from_file, one_by_one):
+    """By what they know of their lidar, in memory and from files."""
+
+    def stored(waves, name):
+        waves.save(tmp_path / f"{name}.nc")
+        return jl.open(tmp_path / f"{name}.nc")
+
+    waves = list(waveforms) if one_by_one else waveforms
+    if from_file:
+        waves = [stored(w, f"{i}") for i, w in enumerate(waves)] if one_by_one else stored(waveforms, "all")
+
+    def refused(says, zenith=survey.zenith, azimuth=survey.azimuth, **changes):
+        another = jl.Survey(dataclasses.replace(LIDAR, **changes), survey.position, zenith, azimuth)
+        with pytest.raises(ValueError, match=says):
+            write_gedi_l1b(path, waves, another, **GEOGRAPHIC_PLACE)
+        assert not path.exists()
+
+    refused("of altitude 400000 m, that of the survey has 401000 m", altitude=401_000.0)
+    refused("of wavelength 1064 nm, that of the survey has 1065 nm", wavelength=1065.0)
+    tilted = np.array([0.0, 1.0, 1.5, 1.5])
+    if one_by_one:
+        refused(r"waveforms 3: its heights are those of the zenith 0\.5\d* degrees, .* has 1\.5", tilted)
+    else:
+        refused(r"shot 3 has the zenith 0\.5 degrees, that of the survey 1\.5 degrees", tilted)
+        turned = survey.azimuth + np.array([90.0, 0.0, 10.0, 0.0])
+        refused("shot 2 has the azimuth 200 degrees, that of the survey 210 degrees", azimuth=turned)
+    # The azimuth of a vertical beam, and whole turns, change nothing.
+    same = jl.Survey(
+        LIDAR, survey.position, survey.zenith, survey.azimuth + np.array([90.0, 360.0, 0.0, -360.0])
+    )
+    write_gedi_l1b(path, waves, same, **GEOGRAPHIC_PLACE)
+    assert len(read_gedi_l1b(path)) == 4
+
+
+def test_a_single_waveform_of_another_lidar_is_refused(path):
+    wave = jl.simulate(LIDAR, SCENE, key=jax.random.key(0), max_orders=1)
+    low = jl.Survey.of(dataclasses.replace(LIDAR, altitude=3e5))
+    with pytest.raises(
+        ValueError, match="waveforms 0: they are of a lidar of altitude 400000 m, that of the"
+    ):
+        write_gedi_l1b(path, [wave], low, **GEOGRAPHIC_PLACE)
+    # What does not have its altitude, as in files of earlier versions, is written.
+    bare = dataclasses.replace(wave, info={})
+    write_gedi_l1b(path, [bare], low, **GEOGRAPHIC_PLACE)
+    assert read_gedi_l1b(path)[0].altitude == 300340.0

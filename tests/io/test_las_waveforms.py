@@ -106,6 +106,35 @@ def test_shots_are_read_as_they_were_written(tmp_path, point_format):
     assert laspy.read(path).header.global_encoding.waveform_data_packets_external
 
 
+def two_beams():
+    """Two shots at one GPS time, whose packets lie one after another on one line."""
+    shot = small_shots()[0]
+    later = dataclasses.replace(shot, anchor=shot.anchor + 100.0 * DIRECTION, returns=None, index=1)
+    return [dataclasses.replace(shot, returns=None), dataclasses.replace(later, scanner_channel=2)]
+
+
+@pytest.mark.parametrize("point_format", [9, 10])
+def test_two_scanner_channels_at_one_gps_time_are_two_shots(tmp_path, point_format):
+    path, again = tmp_path / "a.las", tmp_path / "b.las"
+    write_las_waveforms(path, two_beams(), point_format=point_format)
+    shots = read_las_waveforms(path)
+    assert [shot.scanner_channel for shot in shots] == [0, 2]
+    for shot, expected in zip(shots, two_beams(), strict=True):
+        np.testing.assert_array_equal(shot.waveform, expected.waveform)
+        np.testing.assert_allclose(shot.anchor, expected.anchor, rtol=0, atol=2e-3)
+    write_las_waveforms(again, shots, point_format=point_format)
+    assert_same(read_las_waveforms(again), shots, places=0)
+    # In one channel they are segments of one shot.
+    write_las_waveforms(path, [dataclasses.replace(s, scanner_channel=1) for s in two_beams()])
+    (shot,) = read_las_waveforms(path)
+    assert (shot.scanner_channel, len(shot.returning)) == (1, 2)
+
+
+def test_formats_without_scanner_channels_refuse_them(tmp_path):
+    with pytest.raises(ValueError, match=r"scanner_channel = 2 is outside the admissible range \[0, 0\]"):
+        write_las_waveforms(tmp_path / "a.las", two_beams(), point_format=4)
+
+
 def test_names_of_both_files_may_be_in_upper_case(tmp_path):
     write_las_waveforms(tmp_path / "A.LAS", small_shots())
     assert (tmp_path / "A.WDP").exists()

@@ -5,7 +5,7 @@ import struct
 import numpy as np
 import pytest
 
-from jaxlidar.io import read_pulsewaves
+from jaxlidar.io import FileWarning, read_pulsewaves
 
 # Displacement of light in 1 ns, in m.
 STEP = np.array([0.01, 0.02, -0.1482])
@@ -157,6 +157,47 @@ def test_shots_are_a_sequence(written):
         _ = shots[3]
 
 
+# The third pulse has a varying number of returning segments, which lies before the first of them.
+THIRD_SEGMENTS = struct.pack("<BiH", 2, 4 * 700, 3)
+
+
+def no_segments(data):
+    at = data.index(THIRD_SEGMENTS)
+    data[at] = 0
+
+
+def no_returning_sampling(data):
+    """Takes one of the two samplings from the descriptor of the first pulse: that of the return."""
+    struct.pack_into("<H", data, DESCRIPTOR + 14, 1)
+
+
+@pytest.mark.parametrize(
+    ("changes", "numbers"),
+    [({"wvs": no_segments}, [0, 1]), ({"pls": no_returning_sampling}, [1, 2])],
+)
+def test_pulses_without_a_return_are_skipped_and_counted(written, changes, numbers):
+    (missing,) = {0, 1, 2} - set(numbers)
+    path = written(**changes)
+    says = rf"small\.pls: pulse {missing}: it has no returning segment: 1 of 3 pulses skipped"
+    with pytest.warns(FileWarning, match=says):
+        shots = read_pulsewaves(path)
+    assert shots.dropped == {"without a return": 1}
+    assert [shot.index for shot in shots] == numbers
+    np.testing.assert_array_equal(shots.gps_time, 4e5 + np.array(numbers))
+    np.testing.assert_allclose(shots.anchor[:, 0], 5e5 + np.array(numbers), rtol=1e-12)
+    assert shots.direction.shape == (2, 3)
+
+
+def test_a_file_without_any_return(written):
+    def no_return_at_all(data):
+        no_returning_sampling(data)
+        for n in (1, 2):
+            struct.pack_into("<B", data, struct.unpack_from("<q", data, 176)[0] + 48 * n + 44, 1)
+
+    with pytest.raises(ValueError, match=r"small\.pls: pulse 0: neither this pulse nor another has a return"):
+        read_pulsewaves(written(pls=no_return_at_all))
+
+
 def test_a_missing_file_of_waves_is_refused(written):
     path = written()
     path.with_suffix(".wvs").unlink()
@@ -256,10 +297,14 @@ def set_pulse_field(number, format, offset, *values):
         (set_pulse_field(1, "<i", 36, 0), r"pulse 1: the way of light in 1 ns cannot be \["),
     ],
 )
-def test_a_damaged_pulse_is_refused_by_number(written, change, message):
-    path = written(pls=change)
+def test_a_damaged_pulse_leaves_the_others_alone(written, change, message):
+    waveforms = [shot.waveform for shot in read_pulsewaves(written())]
+    shots = read_pulsewaves(written(pls=change))
+    for i in (0, 2):
+        np.testing.assert_array_equal(shots[i].waveform, waveforms[i])
+    assert shots.levels.pedestal == 2.0
     with pytest.raises(ValueError, match=rf"small\.pls: {message}"):
-        list(read_pulsewaves(path))
+        _ = shots[1]
 
 
 def test_directions_that_imply_a_wrong_speed_of_light_are_refused(written):
@@ -310,3 +355,14 @@ def test_recorded_pulses_of_lvis(shared):
     steps = [np.linalg.norm((s.position[1] - s.position[0]) * s.metres) for s in shots]
     np.testing.assert_allclose(steps, 0.29979, rtol=1e-3)
     assert all(s.is_geographic and s.zenith < 9 for s in shots)
+
+
+def test_recorded_pulses_without_a_return(shared):
+    path = shared / "airborne" / "test.pls"
+    with pytest.warns(FileWarning, match=r"test\.pls: pulse 3: .*: 1 of 15 pulses skipped"):
+        shots = read_pulsewaves(path)
+    assert [shot.index for shot in shots] == [n for n in range(15) if n != 3]
+    assert shots.dropped == {"without a return": 1}
+    # The pulse record names the first returning sample, in units of 1 ns.
+    for shot, first in zip(shots, shots.pulses["first"][shots.pulse_numbers], strict=True):
+        assert shot.returning[0].time[0] == pytest.approx(first, abs=1.0)

@@ -1,6 +1,7 @@
 """GEDI's level 2A metrics and the tools without a model, against the product's values for recorded shots."""
 
 import types
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -117,3 +118,31 @@ def test_bad_input_is_refused():
         gedi_metrics([made_up_shot(elevation[1:], elevation)])
     with pytest.raises(ValueError, match="smoothing = 0"):
         gedi_metrics([made_up_shot(elevation, elevation)], gedi_settings(1)._replace(smoothing=0.0))
+    lost_noise = made_up_shot(elevation, elevation)
+    lost_noise.noise_mean = np.nan
+    with pytest.raises(ValueError, match="noise_mean = nan"):
+        gedi_metrics([lost_noise])
+
+
+@pytest.mark.parametrize(
+    ("shots", "message"),
+    [
+        (
+            "GEDI01_B.h5",
+            r"shots = 'GEDI01_B\.h5' is a path; .*gedi_metrics\(jaxlidar\.io\.read_gedi_l1b\(path\)\)",
+        ),
+        (Path("GEDI01_B.h5"), r"shots = 'GEDI01_B\.h5' is a path; .*read_gedi_l1b"),
+        (made_up_shot(np.arange(3.0), np.arange(3.0)), r"SimpleNamespace; .*gedi_metrics\(\[shot\]\)"),
+        (["a.h5"], "shots has a str at index 0, which has no elevation; .*noise_std, as .*read_gedi_l1b"),
+    ],
+)
+def test_other_things_than_shots_are_refused_with_the_right_call(shots, message):
+    with pytest.raises(TypeError, match=message):
+        gedi_metrics(shots)
+
+
+def test_shots_may_come_one_by_one():
+    elevation = 120.0 - 0.15 * np.arange(300)
+    record = 200.0 + 400.0 * np.exp(-0.5 * ((elevation - 100.0) / 0.9) ** 2)
+    metrics = gedi_metrics(made_up_shot(elevation, record) for _ in range(2))
+    np.testing.assert_allclose(metrics.elev_lowestmode, 100.0, atol=0.05)
