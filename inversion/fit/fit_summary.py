@@ -146,8 +146,8 @@ class FitSummary:
                 )
         if self.steps < 1 or not np.all(np.isfinite(self.values)):
             raise ValueError(
-                f"values = {self.values} after {self.steps} simulations; admissible are finite values after "
-                "at least one"
+                f"values = {self.values} after {self.steps} steps; admissible are finite values after one or "
+                "more"
             )
         if self.converged and not self._is_regular():
             raise ValueError("it is said to have converged, but its numbers are not finite")

@@ -53,7 +53,7 @@ def stored_records(path, records=None):
         finished = FinishedFits(checkpoint, N_FITS, SIZES)
         for number, fit in (records or {}).items():
             finished.add(number, fit)
-        return finished.records
+        return finished.summaries
 
 
 @pytest.fixture

@@ -102,7 +102,7 @@ def test_a_fit_ends_where_one_with_all_batches_does(monkeypatch):
         # Negative control: a fit that stopped at what the pilot batches say ends elsewhere.
         pilot_only = BatchedSimulation(MIN_BATCHES, seed)
         pilot_only.factors = pilot_only.factors[:PILOT_BATCHES]
-        distances_of_pilot_fits.append(distance(fit_echoes(pilot_only, seed).record, b))
+        distances_of_pilot_fits.append(distance(fit_echoes(pilot_only, seed).summary, b))
     assert np.median(distances_of_pilot_fits) > 0.2
     traced_with_pilot, traced_with_all = np.sum(n_traced, axis=0)
     assert traced_with_pilot < 0.6 * traced_with_all
@@ -180,12 +180,12 @@ def test_a_lockstep_group_traces_the_batches_that_each_fit_requests(traced_batch
         for name in ("total", "jacobian", "batches"):
             a, b = getattr(together[i], name), getattr(alone, name)
             np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5 * np.max(np.abs(b)))
-        np.testing.assert_allclose(alone.total, np.mean(alone.batches, axis=0), rtol=1e-4, atol=1e-7)
+        np.testing.assert_allclose(alone.reflectance, np.mean(alone.batches, axis=0), rtol=1e-4, atol=1e-7)
     traced_batches.clear()
     pilot, full = model(points[0], pilot=True), model(points[0])
     assert len(traced_batches) == MIN_BATCHES
     np.testing.assert_array_equal(full.batches[:PILOT_BATCHES], pilot.batches)
-    assert not np.array_equal(full.total, pilot.total)
+    assert not np.array_equal(full.reflectance, pilot.reflectance)
 
 
 @pytest.mark.slow

@@ -49,7 +49,7 @@ def instrument():
 
 
 class FittedProfile(AbstractPosterior):
-    """The posterior of a fit of the linear instrument, and the record of the fit."""
+    """The posterior of a fit of the linear instrument, and the summary of the fit."""
 
     values: dict[str, Any]
     stderr: dict[str, Any]
@@ -57,7 +57,7 @@ class FittedProfile(AbstractPosterior):
     averaging: np.ndarray
     bounds: dict[str, Any]
     prior_share: dict[str, Any]
-    record: FitSummary
+    summary: FitSummary
 
 
 def fitted(observed, smooth, **bounds):
@@ -74,7 +74,7 @@ def fitted(observed, smooth, **bounds):
     vectors = ("values", "stderr", "robust_stderr", "prior_share")
     by_name = {field: split_by_name(getattr(result, field), unknowns) for field in vectors}
     return FittedProfile(
-        **by_name, averaging=result.averaging, bounds=bounds_by_name(unknowns), record=result
+        **by_name, averaging=result.averaging, bounds=bounds_by_name(unknowns), summary=result
     )
 
 

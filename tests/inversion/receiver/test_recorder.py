@@ -146,12 +146,12 @@ def test_derivatives_are_those_of_differences():
     step = 1e-5
     for i in range(values.size):
         plus, minus = (
-            model(total, scene_jacobian, values + sign * step * np.eye(values.size)[i]).total
+            model(total, scene_jacobian, values + sign * step * np.eye(values.size)[i]).reflectance
             for sign in (1.0, -1.0)
         )
         np.testing.assert_allclose(jacobian[..., 1 + i], (plus - minus) / (2.0 * step), atol=1e-8)
     plus, minus = (
-        model(total + sign * step * scene_jacobian[..., 0], scene_jacobian, values).total
+        model(total + sign * step * scene_jacobian[..., 0], scene_jacobian, values).reflectance
         for sign in (1.0, -1.0)
     )
     np.testing.assert_allclose(jacobian[..., 0], (plus - minus) / (2.0 * step), atol=1e-8)
@@ -162,7 +162,7 @@ def test_light_smoothed_out_of_the_record_does_not_come_back():
     total = np.zeros((1, 40))
     total[0, -1] = 1.0
     model = RecorderModel(Recorder(width=(0.1, 9.0)), [], jl.Lidar(), 40)
-    assert np.all(np.abs(model(total, np.zeros((1, 40, 0)), np.array([3.0])).total[0, :20]) < 1e-6)
+    assert np.all(np.abs(model(total, np.zeros((1, 40, 0)), np.array([3.0])).reflectance[0, :20]) < 1e-6)
 
 
 @pytest.mark.slow
