@@ -20,6 +20,8 @@ from jaxlidar.io import (
 )
 from tests.helpers import slow_unless
 
+# A NaN whose bits signal an error: NumPy warns where it is cast.
+SIGNALLING_NAN = np.array(0x7F800001, np.uint32).view(np.float32)
 WAY = np.array([0.015625, -0.03125, -0.1455])
 
 
@@ -227,6 +229,7 @@ def wdp(change):
         (set_field("wavepacket_offset", 10**6), "record 1: its packet of 60 bytes at byte 1000000 does not"),
         (set_field("wavepacket_offset", 2**64 - 1), "record 1: its packet of 60 bytes at byte 1844"),
         (set_field("return_point_wave_location", np.nan), "record 1: its place in space, its vector or"),
+        (set_field("x_t", SIGNALLING_NAN), "record 1: its place in space, its vector or"),
         (set_field("x_t", np.inf), "record 1: its place in space, its vector or"),
         (set_field("z_t", 1.0), "record 1: its place in space, its vector or .*makes no sense"),
         (wdp(lambda b: b[:-1]), "record 6: its packet of 40 bytes at byte .* does not lie within the"),
