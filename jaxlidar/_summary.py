@@ -25,6 +25,14 @@ def truncated_fraction(wave: Any) -> float:
     return float(np.max(np.asarray(wave.neglected) / np.maximum(total, 1e-30), initial=0.0))
 
 
+def unfollowed_message(orders: int, fraction: float) -> str:
+    """Return the text of the warning that orders beyond the last may add a fraction of the light."""
+    return (
+        f"orders of scattering beyond {orders} may add {percent(fraction)} of the light: give max_orders=, or "
+        "fewer wavelengths at once, for which more orders are followed"
+    )
+
+
 def summary(wave: Any) -> str:
     """Describe a waveform in a few lines: its samples, energy budget and accuracy."""
     wavelengths, total = np.asarray(wave.wavelength, float), np.asarray(wave.reflectance).sum(axis=1)

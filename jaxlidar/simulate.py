@@ -14,7 +14,7 @@ from jaxtyping import Array, PRNGKeyArray
 
 from jaxlidar._checks import check_flag, check_integer, check_key, check_range, is_traced
 from jaxlidar._progress import Progress
-from jaxlidar._summary import NOTABLE_FRACTION, late_fraction, percent
+from jaxlidar._summary import NOTABLE_FRACTION, late_fraction, percent, unfollowed_message
 from jaxlidar._threads import side_by_side
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.planning.memory import MAX_APPLIED_WAVELENGTHS
@@ -264,17 +264,9 @@ def _make_waveform(tracer: BatchTracer, result: _BatchResults, goal: _Goal) -> W
             stacklevel=3,
         )
     if result.neglected_fraction > goal.tolerance(plan):
-        message = unfollowed_message(plan, result.neglected_fraction)
+        message = unfollowed_message(plan.orders, result.neglected_fraction)
         warnings.warn(message, UnfollowedLightWarning, stacklevel=3)
     return open_at_first_return(wave, lidar) if lidar.receiver.window == "first return" else wave
-
-
-def unfollowed_message(plan: Plan, fraction: float) -> str:
-    """Return the text of the warning that orders beyond the plan's last may add a fraction of the light."""
-    remedy = "give max_orders="
-    if plan.config.keeps_histories:
-        remedy = f"give max_orders=, or have at most {MAX_APPLIED_WAVELENGTHS} wavelengths"
-    return f"orders of scattering beyond {plan.orders} may add {percent(fraction)} of the light: {remedy}"
 
 
 class UnfollowedLightWarning(UserWarning):

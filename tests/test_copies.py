@@ -72,6 +72,7 @@ INSTANCES = {
     "jaxlidar.UnitWarning": jl.UnitWarning("divergence"),
     "jaxlidar.VoxelMap": VOXELS,
     "jaxlidar.Word": jl.LSystem([("A", 0.1)], [jl.Rule("A", grown)]).rewrite(1),
+    "jaxlidar.io.FileWarning": jl.io.FileWarning("skipped"),
     "jaxlidar.io.Case": jl.io.Case(LIDAR, SCENE, jax.random.key(0), {"rtol": 0.1}),
     "inversion.LogNormal": inversion.LogNormal(0.3, 0.5),
     "inversion.RetrievalProgress": inversion.RetrievalProgress(1, 2, 1),

@@ -404,7 +404,9 @@ class _Beam:
 
     def _checked_samples(self, kind: str, shot: int, raw: np.ndarray) -> np.ndarray:
         """Return samples in double precision. **Raises:** ValueError for one that is no count."""
-        samples = raw.astype(np.float64)
+        # Casting warns of NaN whose bits signal an error.
+        with np.errstate(invalid="ignore"):
+            samples = raw.astype(np.float64)
         wrong = ~(np.abs(samples) <= MAX_COUNTS)
         if wrong.any():
             k = int(np.argmax(wrong))
@@ -561,7 +563,7 @@ class _Beam:
         with refuse_damage(f"{self.location(field)}: damaged"):
             fill = self._dataset(field).attrs.get(_FILL_ATTRIBUTE)
         is_fill = np.zeros(values.shape, bool) if fill is None else np.isin(values, fill)
-        with np.errstate(over="ignore"):
+        with np.errstate(over="ignore", invalid="ignore"):
             return np.where(is_fill, np.nan, values.astype(np.float64))
 
 

@@ -288,12 +288,18 @@ class _LasShots(AirborneShots):
 
 def _vector(points: Any) -> np.ndarray:
     """Return the vectors of points per ns."""
-    return np.stack([np.asarray(points[f"{axis}_t"], float) for axis in "xyz"], axis=-1) / _PS
+    return np.stack([_double(points, f"{axis}_t") for axis in "xyz"], axis=-1) / _PS
 
 
 def _location(points: Any) -> np.ndarray:
     """Return the times in ns from the first sample of their packet to points."""
-    return np.asarray(points["return_point_wave_location"], float) * _PS
+    return _double(points, "return_point_wave_location") * _PS
+
+
+def _double(points: Any, name: str) -> np.ndarray:
+    # Casting warns of NaN whose bits signal an error; such points are refused later.
+    with np.errstate(invalid="ignore"):
+        return np.asarray(points[name], float)
 
 
 def _scanner_channel(points: Any) -> np.ndarray:

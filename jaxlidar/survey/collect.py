@@ -11,12 +11,12 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from jaxlidar._summary import NOTABLE_FRACTION, percent
+from jaxlidar._summary import NOTABLE_FRACTION, percent, unfollowed_message
 from jaxlidar.io.case import Case
 from jaxlidar.io.checkpoint import Checkpoint
 from jaxlidar.io.netcdf import by_rows
 from jaxlidar.io.rows import unwritten_rows
-from jaxlidar.simulate import LateLightWarning, UnfollowedLightWarning, unfollowed_message
+from jaxlidar.simulate import LateLightWarning, UnfollowedLightWarning
 from jaxlidar.spectral.apply_optics import make_waveform_model
 from jaxlidar.survey.results import ShotResults
 from jaxlidar.survey.strategy import AbstractStrategy
@@ -145,7 +145,9 @@ def _warn_of_missing_light(strategy: AbstractStrategy, missing: _MissingLight) -
     plan = strategy.setup.plan
     if plan.scope.automatic_orders and missing.unfollowed > strategy.rtol:
         # As below, for the caller of `simulate_many`.
-        warnings.warn(unfollowed_message(plan, missing.unfollowed), UnfollowedLightWarning, stacklevel=4)
+        warnings.warn(
+            unfollowed_message(plan.orders, missing.unfollowed), UnfollowedLightWarning, stacklevel=4
+        )
     if missing.late >= NOTABLE_FRACTION:
         end = plan.sample_start + plan.sample_interval * plan.n_samples
         warnings.warn(

@@ -13,6 +13,8 @@ from jaxlidar.io import FileWarning, read_gedi_l1b
 h5py = pytest.importorskip("h5py")
 
 RECORD = "GEDI01_B_2019108080338_O01964_T05337_02_003_01_sub.h5"
+# A NaN whose bits signal an error: NumPy warns where it is cast.
+SIGNALLING_NAN = np.array(0x7F800001, np.uint32).view(np.float32)
 
 
 def _transmitted_pulse(reference):
@@ -203,10 +205,10 @@ def test_missing_foreign_and_truncated_files_are_refused(tmp_path):
         ("tx_gloc", lambda x: x[0], r"tx_gloc: shape \(\), where one dimension belongs"),
     ],
 )
-def test_damage_is_named(small, field, change, place):
+def test_damage_is_named(small, field, change, message):
     """A shot that is asked for is refused; of all shots, those of the other beam are read."""
     replace(small, f"BEAM0001/{field}", change)
-    says = r"small\.h5: /BEAM0001/" + place
+    says = r"small\.h5: /BEAM0001/" + message
     with pytest.warns(FileWarning, match=says):
         shots = read_gedi_l1b(small)
     assert "BEAM0101" in {shot.beam for shot in shots}
@@ -373,6 +375,8 @@ def numbers_of(shots):
         ("rx_sample_count", 1, 0, "rx_sample_count, shot .*1: 0 samples; at least 2"),
         ("rx_sample_count", 1, -9999.0, "rx_sample_count, shot .*1: -9999 is no whole number"),
         ("rxwaveform", 45, np.nan, "rxwaveform, shot .*1: sample 5 is nan"),
+        ("rxwaveform", 45, SIGNALLING_NAN, "rxwaveform, shot .*1: sample 5 is nan"),
+        ("tx_gloc", 1, SIGNALLING_NAN, "tx_gloc, shot .*1: nan is outside"),
         ("tx_gloc", 1, np.nan, "tx_gloc, shot .*1: nan is outside"),
     ],
 )
