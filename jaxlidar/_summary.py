@@ -28,8 +28,8 @@ def truncated_fraction(wave: Any) -> float:
 def unfollowed_message(orders: int, fraction: float) -> str:
     """Return the text of the warning that orders beyond the last may add a fraction of the light."""
     return (
-        f"orders of scattering beyond {orders} may add {percent(fraction)} of the light: give max_orders=, or "
-        "fewer wavelengths at once, for which more orders are followed"
+        f"orders of scattering beyond {orders} may add {percent(fraction)} of the light: give "
+        "max_orders=, or fewer wavelengths at once, for which more orders are followed"
     )
 
 
