@@ -24,10 +24,10 @@ def vec(a: Float[Array, "3"] | Iterable[Scalar]) -> Vec:
 
 
 @jax.custom_jvp
-def with_derivative_of(value: Scalar, other: Scalar) -> Scalar:
-    """Return `value` with the derivative of `other`.
+def with_derivative_of(value: Scalar, differentiated: Scalar) -> Scalar:
+    """Return `value` with the derivative of `differentiated`.
 
-    Where no derivatives are taken, `other` is not used and the compiler drops its computation.
+    Where no derivatives are taken, `differentiated` is not used and the compiler drops its computation.
     """
     return value
 

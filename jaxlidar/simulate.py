@@ -134,10 +134,10 @@ def simulate(
     tracer = make_batch_tracer(make_setup(lidar, scene, plan), key)
     result = _run_batches(tracer, key, goal, progress, start_time)
     while result.needs_more_orders and given_plan is None:
-        more = _more_orders(plan, lidar.wavelength.size, result.neglected_fraction, goal)
-        if more is None or time.perf_counter() - start_time >= max_seconds:
+        more_orders = _more_orders(plan, lidar.wavelength.size, result.neglected_fraction, goal)
+        if more_orders is None or time.perf_counter() - start_time >= max_seconds:
             break
-        plan = _check_or_make_plan(lidar, scene, None, goal, planning | more)
+        plan = _check_or_make_plan(lidar, scene, None, goal, planning | more_orders)
         # Orders given as an argument count as the user's. These are still the plan's choice, so that what
         # lies beyond them is reported.
         plan = dataclasses.replace(plan, scope=plan.scope._replace(automatic_orders=True))

@@ -135,9 +135,9 @@ class _MissingLight(NamedTuple):
             float(np.max(results.neglected / np.maximum(total, 1e-30), initial=0.0)),
         )
 
-    def or_more(self, other: "_MissingLight") -> "_MissingLight":
+    def or_more(self, second: "_MissingLight") -> "_MissingLight":
         """Return the larger of each fraction."""
-        return _MissingLight(*map(max, self, other))
+        return _MissingLight(*map(max, self, second))
 
 
 def _warn_of_missing_light(strategy: AbstractStrategy, missing: _MissingLight) -> None:

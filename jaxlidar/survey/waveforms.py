@@ -186,10 +186,10 @@ class Waveforms(eqx.Module):
 
         **Raises:** what `jaxlidar.open` raises; ValueError, naming the file, for one of another kind.
         """
-        found = netcdf.open(path)
-        if not isinstance(found, Waveforms):
-            raise ValueError(f"{path}: it holds a {type(found).__name__}, not Waveforms")
-        return found
+        result = netcdf.open(path)
+        if not isinstance(result, Waveforms):
+            raise ValueError(f"{path}: it holds a {type(result).__name__}, not Waveforms")
+        return result
 
 
 keep_as_netcdf(
