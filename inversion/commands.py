@@ -18,7 +18,7 @@ import jaxlidar as jl
 from inversion import demo as demonstration
 from inversion.fit.retrieval import retrieve as fit_waveform
 from inversion.fit.unknowns import Unknown
-from jaxlidar.cli.shared import ResultPath
+from jaxlidar.cli.shared import ResultPath, save_figure
 
 
 @click.command()
@@ -129,8 +129,5 @@ def retrieve(
 
         axes = Figure(figsize=(6.0, 4.2), layout="constrained").subplots(1, 2, sharey=True)
         jl.plot.fit(fit.waveform, wave.reflectance, sigma, axes)
-        # The draft has another suffix: the format is that of the final name.
-        with jl.io.atomic_write(plot) as draft:
-            axes[0].get_figure().savefig(draft, format=plot.suffix.lstrip(".") or "png", dpi=150)
-        click.echo(f"figure: {plot}")
+        save_figure(axes[0], plot)
     return 0 if fit.converged else 1

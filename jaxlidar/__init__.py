@@ -58,7 +58,7 @@ waveforms is in the package `inversion`.
 ## Warnings and constants
 
 `LateLightWarning`, `UnfollowedLightWarning`, `MisplacedCanopyWarning`, `LostWorkersWarning`, `OffMapWarning`,
-`UnitWarning`, `SPEED_OF_LIGHT`.
+`OutlineWarning`, `UnitWarning`, `SPEED_OF_LIGHT`.
 
 ## Packages of their own
 
@@ -115,7 +115,7 @@ from jaxlidar.scenes.canopy import Canopy
 from jaxlidar.scenes.relative_height import MisplacedCanopyWarning
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.scene_parts import SceneParts
-from jaxlidar.scenes.shapes import AbstractShape, Plane
+from jaxlidar.scenes.shapes import AbstractShape, OutlineWarning, Plane
 from jaxlidar.scenes.surfaces import AbstractGround, AbstractSheet, AbstractSurface, Ground, Plate
 from jaxlidar.scenes.terrain import Terrain
 from jaxlidar.scenes.voxels import VoxelMap
@@ -244,6 +244,7 @@ __all__ = [
     "MisplacedCanopyWarning",
     "LostWorkersWarning",
     "OffMapWarning",
+    "OutlineWarning",
     "UnitWarning",
     "SPEED_OF_LIGHT",
     # Packages of their own.

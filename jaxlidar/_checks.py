@@ -3,6 +3,10 @@
 A value outside its range or of the wrong shape raises ValueError; an object of the wrong type raises
 TypeError. A value that is admissible but implausible, as if given in another unit, gives a `UnitWarning`.
 Tracers pass every check of values: inside a JAX transformation values are not known.
+
+Numbers are real: booleans, complex numbers and times of NumPy are of a wrong type. NumPy and JAX drop the
+mask of a masked array without a word, so every argument becomes an array by `as_array` or `as_numpy`: masked
+elements become NaN where that stands for a missing number, and are refused elsewhere.
 """
 
 import sys
@@ -21,6 +25,9 @@ from jaxtyping import Array, ArrayLike, Float
 # For modules that take all helpers of construction from here.
 from jaxlidar._signatures import briefly  # noqa: F401
 
+# Largest distance of times or heights from evenly spaced ones, over their step.
+_UNEVENNESS = 0.05
+
 # -- conversions -------------------------------------------------------------------------------------------
 
 
@@ -37,12 +44,28 @@ def as_optional_scalar(x: ArrayLike | None, field: str = "value") -> Float[Array
     return None if x is None else as_scalar(x, field)
 
 
-def as_array(x: ArrayLike | Sequence, field: str = "value") -> Float[Array, "..."]:
-    """Convert to a floating-point JAX array in the default precision; a JAX float array is not changed."""
+def as_array(x: ArrayLike | Sequence, field: str = "value", *, missing: bool = False) -> Float[Array, "..."]:
+    """Convert to a floating-point JAX array in the default precision; a JAX float array is not changed.
+
+    With `missing`, NaN stands for missing numbers, and masked elements become NaN.
+
+    **Raises:** as `check_numbers`.
+    """
     if isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jnp.floating):
         return x
-    check_numbers(field, x)
-    return jnp.asarray(x, dtype=float)
+    check_numbers(field, x, missing=missing)
+    return jnp.asarray(_with_nan(x), dtype=float)
+
+
+def as_numpy(x: Any, field: str = "value", *, missing: bool = False) -> Float[np.ndarray, "..."]:
+    """Convert numbers whose values are known to a NumPy array of float64; arguments as for `as_array`.
+
+    **Raises:** as `check_numbers`; TypeError where JAX is tracing `x`.
+    """
+    check_numbers(field, x, missing=missing)
+    if is_traced(x):
+        raise TypeError(f"{field} is being traced by a JAX transformation; admissible are known numbers")
+    return np.asarray(_with_nan(x), dtype=float)
 
 
 def scalar(field: str) -> Callable[[ArrayLike], Float[Array, ""]]:
@@ -96,12 +119,20 @@ def is_traced(x: object) -> bool:
     return isinstance(x, Tracer)
 
 
+def is_within_program() -> bool:
+    """Return True while JAX traces a program (jit, scan, eval_shape): even constants are then traced."""
+    return is_traced(jnp.zeros(()))
+
+
 def concrete(x: object) -> np.ndarray | None:
-    """Convert `x` to a NumPy array of float64; None if it is traced or not numeric, and cannot be checked."""
+    """Convert `x` to a NumPy array of float64; None if it is traced or not numeric, and cannot be checked.
+
+    Masked elements become NaN.
+    """
     if is_traced(x) or not _is_numeric(x):
         return None
     try:
-        return np.asarray(x, dtype=float)
+        return np.asarray(_with_nan(x), dtype=float)
     except (TypeError, ValueError):
         return None
 
@@ -129,13 +160,32 @@ def concrete_array(x: object) -> np.ndarray:
 
 
 def _is_numeric(x: object) -> bool:
-    """Return True if `x` is a real number, or an array or nested sequence of them, concrete or traced."""
+    """Return True if `x` is a real number, or an array or nested sequence of them, concrete or traced.
+
+    Booleans are none. Neither are times, which NumPy counts among the integers.
+    """
     dtype = getattr(x, "dtype", None)
     if isinstance(dtype, np.dtype):
-        return any(jnp.issubdtype(dtype, kind) for kind in (jnp.floating, jnp.integer, jnp.bool_))
+        return dtype.kind in "iu" or bool(jnp.issubdtype(dtype, jnp.floating))
     if isinstance(x, Sequence) and not isinstance(x, str | bytes):
         return all(map(_is_numeric, x))
-    return isinstance(x, Real)
+    return isinstance(x, Real) and not isinstance(x, bool)
+
+
+def is_masked(x: object) -> bool:
+    """Return True if `x` is a masked array with masked elements, or a nested sequence that has one."""
+    if isinstance(x, Sequence) and not isinstance(x, str | bytes):
+        return any(map(is_masked, x))
+    return isinstance(x, np.ma.MaskedArray) and bool(np.ma.getmaskarray(x).any())
+
+
+def _with_nan(x: Any) -> Any:
+    """Return numbers with NaN in place of masked elements."""
+    if not is_masked(x):
+        return x
+    if isinstance(x, np.ma.MaskedArray):
+        return np.ma.filled(x.astype(float), np.nan)
+    return [_with_nan(item) for item in x]
 
 
 # -- values ------------------------------------------------------------------------------------------------
@@ -173,6 +223,48 @@ def check_range(
         )
 
 
+def even_step(field: str, axis: object, *, decreasing: bool = False) -> np.ndarray:
+    """Return the step of times or heights that are evenly spaced along the last dimension.
+
+    The step is the distance of the first from the last value over the number of steps, in double precision.
+    Values may lie off the even ones by a twentieth of a step, as those of a text file with few digits do, and
+    by the rounding of their type.
+
+    **Arguments:**
+
+    - `field`: name of the axis.
+    - `axis`: (..., bins) values that are known, two or more.
+    - `decreasing`: True for values that decrease, as heights along a beam do. Default False.
+
+    **Returns:** (...,) steps, positive.
+
+    **Raises:** `ValueError` naming `field`, the step and the admissible ones for values that are not finite,
+    do not increase (or decrease), or have uneven steps.
+    """
+    check_range(field, axis)
+    values = concrete_array(axis)
+    steps = np.diff(values, axis=-1)
+    if decreasing:
+        check_range(f"steps of {field}", steps, high=0.0, high_open=True)
+    else:
+        check_range(f"steps of {field}", steps, 0.0, low_open=True)
+    mean_step = (values[..., -1:] - values[..., :1]) / steps.shape[-1]
+    off_grid = np.abs(values - values[..., :1] - mean_step * np.arange(values.shape[-1]))
+    # Values of single precision are even to their rounding only, which is coarse far from zero.
+    dtype = getattr(axis, "dtype", float)
+    rounding = float(jnp.finfo(dtype if jnp.issubdtype(dtype, jnp.floating) else float).eps)
+    tolerance = _UNEVENNESS * np.abs(mean_step) + 2.0 * rounding * np.abs(values).max(axis=-1, keepdims=True)
+    is_uneven = np.any(off_grid > tolerance, axis=-1)
+    if np.any(is_uneven):
+        row_steps, row_mean = steps[is_uneven][0], mean_step[is_uneven][0]
+        worst = row_steps[np.argmax(np.abs(row_steps - row_mean))]
+        raise ValueError(
+            f"{field} has a step of {worst:g} among uneven steps of {float(row_mean[0]):g} on average; "
+            "admissible are even steps: interpolate the record to them"
+        )
+    return np.asarray(np.abs(mean_step[..., 0]))
+
+
 def check_number(field: str, x: Any, low: float = -np.inf, high: float = np.inf, **limits: bool) -> None:
     """Refuse `x` unless it is one number in a range, given as for `check_range`."""
     check_range(field, x, low, high, **limits)
@@ -198,6 +290,7 @@ def check_integer(field: str, x: Any, low: int = 1, high: float = np.inf) -> int
     value = concrete(x)
     if value is None or value.ndim:
         raise TypeError(f"{field} is {kind_of(x)}; admissible is an integer of at least {low}")
+    check_numbers(field, x)
     if not np.isfinite(value) or value != np.floor(value) or not low <= value <= high:
         closing = ")" if high == np.inf else "]"
         raise ValueError(f"{field} = {x} is outside the admissible range [{low}, {high}{closing} of integers")
@@ -241,16 +334,26 @@ def check_flag(field: str, x: object) -> None:
     check_kind(field, x, bool | np.bool_, "True or False")
 
 
-def check_numbers(field: str, x: object, admissible: str = "real numbers") -> None:
+def check_numbers(field: str, x: object, admissible: str = "real numbers", *, missing: bool = False) -> None:
     """Refuse `x` unless it is a real number, or an array or nested sequence of them, concrete or traced.
 
-    **Raises:** `TypeError` naming `field`, the type of `x` and what is admissible; `ValueError` for a nested
-    sequence with rows of different lengths.
+    With `missing`, masked elements pass.
+
+    **Raises:** `TypeError` naming `field`, the type of `x` and what is admissible; `ValueError` for masked
+    elements, and for a nested sequence with rows of different lengths.
     """
     if not _is_numeric(x):
         raise TypeError(f"{field} is {kind_of(x)}; admissible are {admissible}")
+    if not missing:
+        check_unmasked(field, x)
     if _is_ragged(x):
         raise ValueError(f"{field} has rows of different lengths; admissible is a regular array")
+
+
+def check_unmasked(field: str, x: object) -> None:
+    """Refuse a masked array with masked elements, of whatever type."""
+    if is_masked(x):
+        raise ValueError(f"{field} has masked elements; admissible is an array without a mask")
 
 
 def _is_ragged(x: object) -> bool:
@@ -265,6 +368,12 @@ def _shape(x: Any) -> tuple[int, ...]:
     if not isinstance(x, Sequence):
         return np.shape(x)
     return (len(x), *(_shape(x[0]) if len(x) else ()))
+
+
+def check_seed(x: Any) -> None:
+    """Refuse an object that is neither a whole number, 0 or more, nor a generator of NumPy."""
+    if not isinstance(x, np.random.Generator):
+        check_integer("seed", x, 0)
 
 
 def check_key(key: Any) -> None:

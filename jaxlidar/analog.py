@@ -13,8 +13,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from jaxlidar._checks import briefly, check_integer, check_key, check_range
+from jaxlidar._checks import briefly, check_integer, check_key, check_number
 from jaxlidar._constants import SPEED_OF_LIGHT
+from jaxlidar._mesh_axes import vary_together, vary_with, with_automatic_axes
 from jaxlidar._vectors import along, dot
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.planning.plan import Plan
@@ -52,7 +53,6 @@ class AnalogReturns(eqx.Module):
     weight: Float[Array, "wavelengths photons"]
 
 
-@eqx.filter_jit
 def analog_returns(
     lidar: Lidar,
     scene: Scene,
@@ -98,15 +98,23 @@ def analog_returns(
     """
     check_kinds(lidar, scene)
     check_key(key)
-    check_range("cone", cone, 0.0, 90.0, low_open=True)
-    check_integer("n_photons", n_photons)
+    check_number("cone", cone, 0.0, 90.0, low_open=True)
+    return _analog_returns(lidar, scene, plan, key, check_integer("n_photons", n_photons), cone)
+
+
+@eqx.filter_jit
+@with_automatic_axes
+def _analog_returns(
+    lidar: Lidar, scene: Scene, plan: Plan, key: PRNGKeyArray, n_photons: int, cone: float
+) -> AnalogReturns:
+    lidar, scene, key = vary_together((lidar, scene, key))
     device_scene = _build_scene(lidar, scene, plan)
     monomials = device_scene.histories.monomials(setup_optics(make_setup(lidar, scene, plan)))
     chunk_size = min(PHOTONS_PER_CHUNK, n_photons)
 
     def chunk(key: PRNGKeyArray) -> tuple[Array, Array]:
         start_key, key = jax.random.split(key)
-        start = _send_photons(device_scene, chunk_size, start_key)
+        start = vary_with(_send_photons(device_scene, chunk_size, start_key), device_scene)
 
         def order_step(carry, order):
             def trace(carry):
@@ -117,7 +125,8 @@ def analog_returns(
 
             return lax.cond(jnp.any(carry[0].alive), trace, lambda c: c, carry), None
 
-        no_arrivals = _Arrivals(jnp.zeros((chunk_size,)), jnp.zeros((chunk_size,)), start.history)
+        zeros = jnp.zeros_like(start.weight)
+        no_arrivals = _Arrivals(zeros, zeros, start.history)
         # One flight more than scatterings, to leave the scene.
         (_, arrivals), _ = lax.scan(order_step, (start, no_arrivals), jnp.arange(plan.orders + 1))
         return arrivals.time, monomials[arrivals.history].T * arrivals.value[None, :]
@@ -127,7 +136,6 @@ def analog_returns(
     return AnalogReturns(time.reshape(-1)[:n_photons], weight.reshape(weight.shape[0], -1)[:, :n_photons])
 
 
-@eqx.filter_jit
 def photon_paths(
     lidar: Lidar, scene: Scene, plan: Plan, *, key: PRNGKeyArray, n_photons: int, leaving: float = 5.0
 ) -> Float[Array, "photons points 3"]:
@@ -159,10 +167,19 @@ def photon_paths(
     """
     check_kinds(lidar, scene)
     check_key(key)
-    check_integer("n_photons", n_photons)
+    check_number("leaving", leaving, 0.0)
+    return _photon_paths(lidar, scene, plan, key, check_integer("n_photons", n_photons), leaving)
+
+
+@eqx.filter_jit
+@with_automatic_axes
+def _photon_paths(
+    lidar: Lidar, scene: Scene, plan: Plan, key: PRNGKeyArray, n_photons: int, leaving: float
+) -> Float[Array, "photons points 3"]:
+    lidar, scene, key = vary_together((lidar, scene, key))
     device_scene = _build_scene(lidar, scene, plan)
     start_key, key = jax.random.split(key)
-    start = _send_photons(device_scene, n_photons, start_key)
+    start = vary_with(_send_photons(device_scene, n_photons, start_key), device_scene)
 
     def order_step(p, order):
         onward, _ = _trace_flight(device_scene, p, jax.random.fold_in(key, order), 90.0)
@@ -189,7 +206,8 @@ def _build_scene(lidar: Lidar, scene: Scene, plan: Plan) -> DeviceScene:
     canopy = setup.scene.canopy
     if canopy is not None and canopy.hotspot:
         raise ValueError(
-            "hotspot = True; admissible is False: the return path is independent of the path of incidence"
+            "the canopy has hotspot = True; admissible is Canopy(..., hotspot=False): photons that fly back "
+            "on their own take paths independent of their paths in"
         )
     if not plan.config.keeps_histories:
         raise ValueError(

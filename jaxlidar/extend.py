@@ -2,9 +2,12 @@
 
 For laws, pulses and surfaces of your own, and for packages on top such as `inversion`:
 
-- fields: `as_array`, `as_scalar` convert them; `check_range`, `check_integer`, `check_choice` refuse values,
-  `check_kind`, `check_numbers`, `check_key` objects of another type; `concrete` returns the value of an
-  array, or None where a JAX transformation is tracing it.
+- fields: `as_array`, `as_scalar` and, in NumPy's double precision, `as_numpy` convert them, and refuse masked
+  elements unless these stand for missing numbers; `check_range`, `check_number`, `check_integer`,
+  `check_choice` refuse values, `check_kind`, `check_numbers`, `check_key` objects of another type; `concrete`
+  returns the value of an array, or None where a JAX transformation is tracing it; `even_step` the step of
+  times or heights, and refuses uneven ones;
+  `Converted[T]` is the type of a field with a converter, for mypy.
 - directions: a `Vec` is a tuple of three arrays, x, y and z; `dot`, `scale`, `add`, `normalise`; `polar` and
   `from_frame` make directions about an axis, `about` draws one by the cosine law.
 - ranges: a class states them by field, `ranges = {"slope": Range(0.0, 90.0)}`; its constructor calls
@@ -22,15 +25,19 @@ For laws, pulses and surfaces of your own, and for packages on top such as `inve
 
 from jaxlidar._checks import (
     as_array,
+    as_numpy,
     as_scalar,
     check_choice,
     check_integer,
     check_key,
     check_kind,
+    check_number,
     check_numbers,
     check_range,
     concrete,
+    even_step,
 )
+from jaxlidar._converted import Converted
 from jaxlidar._fingerprint import fingerprint
 from jaxlidar._one_function import once
 from jaxlidar._ranges import Range, check_ranges, inadmissible, reasons
@@ -55,6 +62,7 @@ from jaxlidar.scenes.scene import check_kinds
 
 __all__ = [
     "ONE_CORE",
+    "Converted",
     "Range",
     "Scalar",
     "Vec",
@@ -62,6 +70,7 @@ __all__ = [
     "add",
     "along",
     "as_array",
+    "as_numpy",
     "as_scalar",
     "briefly",
     "check_choice",
@@ -69,12 +78,14 @@ __all__ = [
     "check_key",
     "check_kind",
     "check_kinds",
+    "check_number",
     "check_numbers",
     "check_range",
     "check_ranges",
     "concrete",
     "cross",
     "dot",
+    "even_step",
     "fingerprint",
     "from_frame",
     "inadmissible",

@@ -12,7 +12,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PRNGKeyArray
 
-from jaxlidar._checks import check_flag, check_integer, check_key, check_range, is_traced
+from jaxlidar._checks import (
+    check_flag,
+    check_integer,
+    check_key,
+    check_number,
+    check_numbers,
+    check_shape,
+    is_traced,
+    is_within_program,
+)
+from jaxlidar._mesh_axes import with_automatic_axes
 from jaxlidar._progress import Progress
 from jaxlidar._summary import NOTABLE_FRACTION, late_fraction, percent, unfollowed_message
 from jaxlidar._threads import side_by_side
@@ -41,10 +51,12 @@ from jaxlidar.spectral.waveform import Waveform, open_at_first_return
 from jaxlidar.trace.response import Response, trace_device_scene
 from jaxlidar.truth import truth_of_setup
 
-# A batch has at most so many photons, because it cannot be interrupted.
+# A batch has at most so many photons, because it cannot be interrupted. Within a JAX transformation, which
+# cannot be interrupted at all, it may have more.
 MAX_BATCH_PHOTONS = 65_536
 
 
+@with_automatic_axes
 def simulate(
     lidar: Lidar,
     scene: Scene,
@@ -87,8 +99,10 @@ def simulate(
     - `rtol`: stop when the error is below this, in (0, 1). Default None: the plan's, 0.01 if not given there.
     - `atol`: stop also when the largest standard error of the reflectance is below this, not negative.
       Default 0.
-    - `n_photons`: trace this many photons, in eight batches, whatever the error; at least 1. Default None: as
-      many as the tolerances need.
+    - `n_photons`: trace at least this many photons, whatever the error; at least 1. They are traced in eight
+      batches of equal size, so that up to seven more are traced than asked for, or in more batches of 65,536
+      where eight would be larger. Within a JAX transformation there are always eight. Default None: as many
+      as the tolerances need.
     - `plan`: a `Plan` made by `jaxlidar.plan`. Cannot be combined with the arguments of the next line.
       Default None: made here.
     - `max_orders`, `max_step`, `n_rays`, `window`, `bin_width`, `footprint`, `effects`, `max_memory`: see
@@ -130,14 +144,15 @@ def simulate(
     }
     goal = _make_goal(rtol, atol, n_photons, max_seconds)
     given_plan = plan
-    plan = _check_or_make_plan(lidar, scene, given_plan, goal, planning)
+    is_transformed = is_within_program() or any(is_traced(x) for x in jax.tree.leaves((lidar, scene, key)))
+    plan = _check_or_make_plan(lidar, scene, given_plan, goal, planning, is_transformed)
     tracer = make_batch_tracer(make_setup(lidar, scene, plan), key)
     result = _run_batches(tracer, key, goal, progress, start_time)
     while result.needs_more_orders and given_plan is None:
         more_orders = _more_orders(plan, lidar.wavelength.size, result.neglected_fraction, goal)
         if more_orders is None or time.perf_counter() - start_time >= max_seconds:
             break
-        plan = _check_or_make_plan(lidar, scene, None, goal, planning | more_orders)
+        plan = _check_or_make_plan(lidar, scene, None, goal, planning | more_orders, is_transformed)
         # Orders given as an argument count as the user's. These are still the plan's choice, so that what
         # lies beyond them is reported.
         plan = dataclasses.replace(plan, scope=plan.scope._replace(automatic_orders=True))
@@ -164,19 +179,32 @@ class _Goal(NamedTuple):
 
 
 def _make_goal(rtol: float | None, atol: float, n_photons: int | None, max_seconds: float) -> _Goal:
-    for name, value in (("rtol", rtol), ("max_seconds", max_seconds)):
-        if value is not None and not value > 0:
-            raise ValueError(f"{name} = {value:g} is outside the admissible range (0, inf)")
-    check_range("atol", atol, 0.0)
+    # Here, not in `plan` alone: a plan that is passed in has been checked with its own.
+    if rtol is not None:
+        check_number("rtol", rtol, 0.0, 1.0, low_open=True, high_open=True)
+    # Infinite is admissible, so that `check_number` is not.
+    check_numbers("max_seconds", max_seconds)
+    check_shape("max_seconds", max_seconds, ())
+    if not max_seconds > 0:
+        raise ValueError(f"max_seconds = {max_seconds:g} is outside the admissible range (0, inf]")
+    check_number("atol", atol, 0.0)
     if n_photons is not None:
         n_photons = check_integer("n_photons", n_photons)
     return _Goal(rtol, atol, n_photons, max_seconds)
 
 
 def _check_or_make_plan(
-    lidar: Lidar, scene: Scene, plan: Plan | None, goal: _Goal, planning: dict[str, Any]
+    lidar: Lidar,
+    scene: Scene,
+    plan: Plan | None,
+    goal: _Goal,
+    planning: dict[str, Any],
+    is_transformed: bool,
 ) -> Plan:
-    """Check the plan that was given, or else make one; with the batch size that the goal asks for."""
+    """Check the plan that was passed in, or else make one; with the batch size that the goal asks for.
+
+    `is_transformed`: True where a JAX transformation traces the lidar, the scene or the key.
+    """
     arguments = {name: value for name, value in planning.items() if value is not None}
     if plan is None:
         plan = make_plan(lidar, scene, rtol=goal.rtol, describe=False, **arguments)
@@ -186,11 +214,17 @@ def _check_or_make_plan(
             "with them"
         )
     elif not any(is_traced(x) for x in jax.tree.leaves((lidar, scene))):
-        check_plan(plan, lidar, scene)
+        # While JAX traces a program, even what is computed of known values is traced, unless at compile time.
+        with jax.ensure_compile_time_eval():
+            check_plan(plan, lidar, scene)
     if goal.n_photons is None:
         return plan
-    # In eight batches, or in more of a size that leaves time for interrupts.
-    return plan.with_config(n_photons=min(max(goal.n_photons // MIN_BATCHES, 1), MAX_BATCH_PHOTONS))
+    # In eight batches, or in more of a size that leaves time for interrupts. Rounded up: no fewer photons
+    # than were asked for.
+    batch_photons = -(-goal.n_photons // MIN_BATCHES)
+    if not is_transformed:
+        batch_photons = min(batch_photons, MAX_BATCH_PHOTONS)
+    return plan.with_config(n_photons=batch_photons)
 
 
 def _more_orders(
@@ -237,8 +271,14 @@ def _run_batches(
     """Trace once if nothing is random, a fixed number of batches if transformed, or until the goal."""
     if not tracer.setup.plan.is_random:
         response = jax.block_until_ready(tracer.trace(key))
-        info = {"photons": 0, "batches": 1, "error": 0.0, "stopped": "nothing is random"}
-        return _BatchResults(response, 1, None, None, {**info, "seconds": time.perf_counter() - start_time})
+        info = {
+            "photons": 0,
+            "batches": 1,
+            "error": 0.0,
+            "stopped": StopReason.NOTHING_RANDOM.value,
+            "seconds": time.perf_counter() - start_time,
+        }
+        return _BatchResults(response, 1, None, None, info)
     if any(is_traced(x) for x in jax.tree.leaves((tracer.setup, key))):
         return _trace_transformed(tracer, key)
     return _trace_batches(tracer, key, goal, progress, start_time)

@@ -21,6 +21,7 @@ from jaxtyping import Array, Float
 
 from jaxlidar._checks import check_kind, is_traced
 from jaxlidar._constants import SPEED_OF_LIGHT
+from jaxlidar._mesh_axes import vary_with
 from jaxlidar._programs import Program
 from jaxlidar._vectors import FAR, Scalar
 from jaxlidar.instrument.lidar import Lidar
@@ -208,6 +209,7 @@ def _sum_rays(
         return sum_chunk(*arrays)
     chunks = [jnp.pad(a, (0, -energy.size % _RAYS_AT_ONCE)).reshape(-1, _RAYS_AT_ONCE) for a in arrays]
     zero = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(sum_chunk, *arrays))
+    zero = vary_with(zero, (scene, arrays))
 
     def add(total: _RaySums, chunk: list[Array]) -> tuple[_RaySums, None]:
         return jax.tree.map(jnp.add, total, sum_chunk(*chunk)), None

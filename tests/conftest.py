@@ -1,5 +1,6 @@
 """Set-up of all tests: rank promotion is refused; shapes and types of the packages are checked."""
 
+import itertools
 from pathlib import Path
 
 import equinox as eqx
@@ -22,12 +23,19 @@ SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 MAPPINGS = 40_000
 
 
+# Tests between two looks at the mappings: to list tens of thousands of them takes some 30 ms.
+TESTS_BETWEEN_COUNTS = 10
+_tests_run = itertools.count(1)
+
+
 @pytest.fixture(autouse=True)
 def limit_compiled_programs():
     """Drop compiled programs before their memory mappings are too many for one process."""
     yield
     maps = Path("/proc/self/maps")
-    if maps.exists() and maps.read_bytes().count(b"\n") > MAPPINGS:
+    if next(_tests_run) % TESTS_BETWEEN_COUNTS or not maps.exists():
+        return
+    if maps.read_bytes().count(b"\n") > MAPPINGS:
         jax.clear_caches()
         eqx.clear_caches()
 

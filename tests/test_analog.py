@@ -27,7 +27,10 @@ def test_leaf_angles_agree_with_simulate(angles):
         np.full((1, 1, 4), 0.2), voxel_size=(50, 50, 2.5), origin=(-25, -25, 0), leaf_angles=angles
     )
     leaf = jl.LeafOptics(reflectance=0.45, transmittance=0.35)
-    scene = jl.Scene(canopy=jl.Canopy(voxels, leaf=leaf, sides="periodic"), ground=jl.Ground(reflectance=0.4))
+    scene = jl.Scene(
+        canopy=jl.Canopy(voxels, leaf=leaf, sides="periodic", hotspot=False),
+        ground=jl.Ground(reflectance=0.4),
+    )
     value, stderr = total(LIDAR, scene, 60_000, max_orders=4, cone=12.0)
     wave = jl.simulate(LIDAR, scene, key=jax.random.key(1), rtol=0.02, max_orders=4)
     expected = float(np.sum(wave.reflectance))
@@ -65,7 +68,7 @@ def test_a_plate_over_ground_agrees_with_simulate():
 @pytest.mark.parametrize("transmission", slow_unless([], ["diffuse", "straight"]))
 def test_a_slab_agrees_with_simulate(transmission):
     leaf = jl.LeafOptics(reflectance=0.45, transmittance=0.35)
-    canopy = jl.Canopy(slab(leaf=1.0), leaf=leaf, transmission=transmission, sides="periodic")
+    canopy = jl.Canopy(slab(leaf=1.0), leaf=leaf, transmission=transmission, sides="periodic", hotspot=False)
     scene = jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=0.4))
     value, stderr = total(LIDAR, scene, 150_000, max_orders=8)
     wave = jl.simulate(LIDAR, scene, key=jax.random.key(1), rtol=0.01, max_orders=8)
@@ -102,7 +105,7 @@ def test_bad_input_is_refused():
     hot = jl.Scene(canopy=jl.Canopy(slab(leaf=1.0), leaf=leaf, hotspot=True))
     with pytest.raises(ValueError, match="hotspot"):
         jl.analog_returns(LIDAR, hot, jl.plan(LIDAR, hot), key=jax.random.key(0), n_photons=10)
-    straight = jl.Scene(canopy=jl.Canopy(slab(leaf=1.0), leaf=leaf, transmission="straight"))
+    straight = jl.Scene(canopy=jl.Canopy(slab(leaf=1.0), leaf=leaf, transmission="straight", hotspot=False))
     two = jl.Lidar(wavelength=(532.0, 1064.0))
     with pytest.raises(ValueError, match="straight"):
         jl.analog_returns(two, straight, jl.plan(two, straight), key=jax.random.key(0), n_photons=10)

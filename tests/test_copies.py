@@ -34,7 +34,7 @@ def grown(length):
 INSTANCES = {
     "jaxlidar.Atmosphere": jl.Atmosphere(),
     "jaxlidar.Branching": jl.Branching(),
-    "jaxlidar.Canopy": jl.Canopy(VOXELS, leaf=jl.Prospect(), bark=0.3),
+    "jaxlidar.Canopy": jl.Canopy(VOXELS, leaf=jl.Prospect(), bark=0.3, hotspot=False),
     "jaxlidar.EqualAngle": jl.EqualAngle(),
     "jaxlidar.ExponentiallyModifiedGaussianPulse": jl.ExponentiallyModifiedGaussianPulse(3.0, 2.0),
     "jaxlidar.GaussianPulse": jl.GaussianPulse(),
@@ -45,6 +45,7 @@ INSTANCES = {
     "jaxlidar.LSystem": jl.LSystem([("A", 0.1)], [jl.Rule("A", grown)]),
     "jaxlidar.Lambertian": jl.Lambertian(),
     "jaxlidar.LateLightWarning": jl.LateLightWarning("late"),
+    "jaxlidar.OutlineWarning": jl.OutlineWarning("outline"),
     "jaxlidar.MisplacedCanopyWarning": jl.MisplacedCanopyWarning("below"),
     "jaxlidar.UnfollowedLightWarning": jl.UnfollowedLightWarning("beyond"),
     "jaxlidar.LostWorkersWarning": jl.LostWorkersWarning("lost"),

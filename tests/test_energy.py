@@ -5,8 +5,10 @@ over one period of a canopy without sides. Fractions are compared within four st
 """
 
 import csv
+from typing import final
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -57,7 +59,7 @@ def test_absorption_is_split_between_two_plates():
 
 
 def test_albedo_one_returns_everything():
-    canopy = jl.Canopy(slab(2.0), leaf=jl.Isotropic(albedo=1.0), sides="periodic")
+    canopy = jl.Canopy(slab(2.0), leaf=jl.Isotropic(albedo=1.0), sides="periodic", hotspot=False)
     scene = jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=1.0))
     budget = jl.energy_budget(jl.Lidar(), scene, key=KEY, rtol=0.02, illumination="parallel")
     assert float(budget.unfollowed[0]) < 1e-3
@@ -71,7 +73,7 @@ def test_slabs_against_discrete_ordinates(shared, row):
         row_values = {name: float(value) for name, value in list(csv.DictReader(file))[row].items()}
     leaf = jl.Isotropic(albedo=row_values["omega"])
     scene = jl.Scene(
-        canopy=jl.Canopy(slab(row_values["tau"]), leaf=leaf, sides="periodic"),
+        canopy=jl.Canopy(slab(row_values["tau"]), leaf=leaf, sides="periodic", hotspot=False),
         ground=jl.Ground(reflectance=row_values["rho_ground"]),
     )
     budget = jl.energy_budget(jl.Lidar(), scene, key=KEY, rtol=0.001, illumination="parallel")
@@ -89,7 +91,7 @@ def test_slabs_against_discrete_ordinates(shared, row):
 @pytest.mark.slow
 def test_a_budget_agrees_with_that_of_a_waveform():
     voxels = jl.VoxelMap.from_lad(np.full((6, 6, 8), 0.6), voxel_size=0.5, origin=(-1.5, -1.5, 2.0))
-    canopy = jl.Canopy(voxels, leaf=jl.LeafOptics(reflectance=0.2, transmittance=0.1))
+    canopy = jl.Canopy(voxels, leaf=jl.LeafOptics(reflectance=0.2, transmittance=0.1), hotspot=False)
     scene = jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=0.2))
     budget = jl.energy_budget(jl.Lidar(divergence=1.0), scene, key=KEY, rtol=0.002)
     wave = jl.simulate(
@@ -126,4 +128,36 @@ def test_an_interrupt_keeps_finished_batches():
     assert budget.info["stopped"] == "interrupted"
     assert budget.info["batches"] == 8
     assert messages[0].endswith("(aim 1e-05)")
+    np.testing.assert_allclose(total(budget), 1.0, atol=0.01)
+
+
+@final
+class HalfLambertian(jl.AbstractLaw):
+    """A Lambertian law that reflects half of its reflectance, from every direction."""
+
+    def intensity_factor(self, incident, normal, view, half_angle):
+        return 0.5 * jl.Lambertian().intensity_factor(incident, normal, view, half_angle)
+
+    def albedo(self, incident, normal):
+        return 0.5 * jnp.ones_like(incident[0])
+
+    def sample(self, incident, normal, u, v):
+        return jl.Lambertian().sample(incident, normal, u, v)
+
+    def density(self, incident, normal, out):
+        return jl.Lambertian().density(incident, normal, out)
+
+    def largest_intensity_factor(self, half_angle):
+        return 0.5
+
+
+@pytest.mark.parametrize("transmission", ["straight", "diffuse"])
+def test_a_law_that_absorbs(transmission):
+    """A plate of R = 0.5, T = 0.3 and a law of albedo a = 1/2 absorbs 1 - R a - T, however light goes on."""
+    plate = jl.Plate(2.0, 0.5, 0.3, transmission=transmission, law=HalfLambertian())
+    budget = jl.energy_budget(jl.Lidar(), jl.Scene(plates=(plate,)), key=KEY, rtol=0.01)
+    exact = {"returned": 0.25, "below": 0.3, "plate": 0.45}
+    estimates = {"returned": budget.returned, "below": budget.below, **budget.absorbed}
+    for name, value in exact.items():
+        assert close(estimates[name], value, budget.stderr[name]), name
     np.testing.assert_allclose(total(budget), 1.0, atol=0.01)

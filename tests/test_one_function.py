@@ -16,7 +16,7 @@ KEY = jax.random.key(0)
 def flight(extinction, *, reverse):
     """Return optical depth and end points of 64 rays from the middle of a map."""
     voxels = jl.VoxelMap.from_extinction(leaf=extinction, voxel_size=1.0, origin=(-2.0, -2.0, 0.0))
-    medium = make_medium(jl.Canopy(voxels, leaf=jl.LeafOptics(0.4, 0.4)), jnp.zeros(3))
+    medium = make_medium(jl.Canopy(voxels, leaf=jl.LeafOptics(0.4, 0.4), hotspot=False), jnp.zeros(3))
     direction = jax.random.normal(KEY, (3, 64))
     direction = tuple(direction / jnp.linalg.norm(direction, axis=0, keepdims=True))
     start = tuple(jnp.full(64, v) for v in (0.1, 0.2, 2.3))
@@ -62,7 +62,7 @@ def test_a_scene_can_be_traced_for_forward_derivatives_alone():
     voxels = jl.VoxelMap.from_extinction(
         leaf=np.full((2, 2, 2), 0.3), voxel_size=1.0, origin=(-1.0, -1.0, 1.0)
     )
-    canopy = jl.Canopy(voxels, leaf=jl.LeafOptics(0.4, 0.4))
+    canopy = jl.Canopy(voxels, leaf=jl.LeafOptics(0.4, 0.4), hotspot=False)
     scene = jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=0.3))
     setup = jl.make_setup(lidar, scene, jl.plan(lidar, scene, max_orders=3, n_photons=256))
     totals = []

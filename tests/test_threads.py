@@ -67,7 +67,7 @@ def test_simulate_keeps_the_precision(double, monkeypatch):
     monkeypatch.setattr(batch_programs, "join_orders", recording_join)
     with jax.enable_x64(double):
         voxels = jl.VoxelMap.from_lad(np.full((1, 1, 4), 0.2), voxel_size=2.0, origin=(-1.0, -1.0, 0.0))
-        canopy = jl.Canopy(voxels, leaf=jl.Isotropic(albedo=0.8))
+        canopy = jl.Canopy(voxels, leaf=jl.Isotropic(albedo=0.8), hotspot=False)
         scene = jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=0.3))
         wave = jl.simulate(jl.Lidar(), scene, key=jax.random.key(0), n_photons=256, max_orders=2, n_rays=64)
     assert str(wave.reflectance.dtype) == str(wave.stderr.dtype) == expected

@@ -31,7 +31,7 @@ LEAF = jl.LeafOptics(0.45, 0.3)
 def stand(lad, *, bark=None, size=1.0, origin=(-20.0, -20.0, 2.0), ground=None, angles="spherical", **canopy):
     """Return a canopy above ground."""
     voxels = jl.VoxelMap.from_lad(lad, voxel_size=size, origin=origin, leaf_angles=angles, bark=bark)
-    canopy = {"leaf": LEAF, "bark": None if bark is None else 0.4} | canopy
+    canopy = {"leaf": LEAF, "bark": None if bark is None else 0.4, "hotspot": False} | canopy
     return jl.Scene(canopy=jl.Canopy(voxels, **canopy), ground=ground or jl.Ground(reflectance=0.3))
 
 
@@ -217,7 +217,7 @@ def test_derivatives_are_those_of_the_closed_form(k, precision):
     def scene(k):
         voxels = jl.VoxelMap(jnp.full((40, 40, 10), k), None, 1.0, (-20.0, -20.0, 2.0))
         ground = jl.Ground(reflectance=0.3)
-        return jl.Scene(canopy=jl.Canopy(voxels, leaf=LEAF), ground=ground)
+        return jl.Scene(canopy=jl.Canopy(voxels, leaf=LEAF, hotspot=False), ground=ground)
 
     plan = jl.plan(lidar, scene(0.2), max_orders=1, n_rays=1)
 
@@ -244,7 +244,7 @@ def test_absent_quantities_are_nan_and_all_others_finite():
     assert np.array_equal(np.asarray(empty.gap_probability), np.ones(empty.time.size))
     # Solid voxels leave no gap.
     solid = jl.VoxelMap.from_probability(leaf=np.ones((4, 4, 3)), voxel_size=10.0, origin=(-20, -20, 0))
-    none = jl.truth_of(jl.Lidar(**NARROW_BEAM), jl.Scene(canopy=jl.Canopy(solid, leaf=LEAF)))
+    none = jl.truth_of(jl.Lidar(**NARROW_BEAM), jl.Scene(canopy=jl.Canopy(solid, leaf=LEAF, hotspot=False)))
     assert float(none.gap_probability[-1]) == pytest.approx(0.0, abs=1e-6)
 
 

@@ -52,7 +52,7 @@ def tree_scene(voxel_size: float) -> jl.Scene:
     """Return a broadleaf tree of 15 m with 250 m2 of leaves over soil."""
     tree = jl.grow(jl.broadleaf(), seed=0)
     voxels = jl.voxelise(tree, voxel_size, leaf_area=250.0 / len(tree.bud_radius), wood="surface")
-    canopy = jl.Canopy(voxels, leaf=LEAF, bark=jl.spectrum("bark-oak"))
+    canopy = jl.Canopy(voxels, leaf=LEAF, bark=jl.spectrum("bark-oak"), hotspot=False)
     return jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=0.3))
 
 
@@ -62,7 +62,7 @@ def cases() -> dict[str, AccuracyCase]:
     voxels = jl.VoxelMap.from_lad(
         np.full((1, 1, 12), 0.5), voxel_size=(100.0, 100.0, 1.0), origin=(-50.0, -50.0, 2.0)
     )
-    stand = jl.Canopy(voxels, leaf=LEAF, sides="periodic")
+    stand = jl.Canopy(voxels, leaf=LEAF, sides="periodic", hotspot=False)
     ground = jl.Ground(reflectance=0.3)
     return {
         "ground": AccuracyCase(jl.Scene(ground=jl.Ground(reflectance=0.3, slope=10.0)), 1, (-30.0, 30.0)),

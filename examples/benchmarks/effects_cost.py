@@ -44,7 +44,7 @@ def canopy(leaf: float | None, bark: float | None) -> jl.Canopy:
         voxel_size=SIZE / N,
         origin=(-5.0, -5.0, 0.0),
     )
-    return jl.Canopy(voxels, leaf=LEAF, bark=0.4)
+    return jl.Canopy(voxels, leaf=LEAF, bark=0.4, hotspot=False)
 
 
 def scenes() -> dict[str, tuple[jl.Lidar, jl.Scene, jl.Scene, dict[str, bool]]]:

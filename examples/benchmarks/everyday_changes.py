@@ -74,7 +74,7 @@ def simulate(
         leaf_angles=angles,
     )
     leaf = jl.Prospect(N=1.5, Cab=Cab, Car=8.0, Cw=0.01, Cm=0.009)
-    canopy = jl.Canopy(voxels, leaf=leaf, bark=0.3 if bark else None)
+    canopy = jl.Canopy(voxels, leaf=leaf, bark=0.3 if bark else None, hotspot=False)
     scene = jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=0.3, slope=slope, height=height))
     pulse = jl.GaussianPulse(fwhm=length)
     lidar = jl.Lidar(wavelength=wavelength, divergence=divergence, zenith=zenith, pulse=pulse)

@@ -44,7 +44,9 @@ def crown() -> jl.Scene:
     k = np.where(inside, np.random.default_rng(0).uniform(0, 0.3, SHAPE), 0.0)
     voxels = jl.VoxelMap.from_extinction(leaf=k, voxel_size=EDGE, origin=(-8.0, -8.0, 0.0))
     leaf = jl.LeafOptics(reflectance=0.5, transmittance=0.0)
-    return jl.Scene(canopy=jl.Canopy(voxels, leaf=leaf), ground=jl.Ground(height=GROUND, reflectance=0.3))
+    return jl.Scene(
+        canopy=jl.Canopy(voxels, leaf=leaf, hotspot=False), ground=jl.Ground(height=GROUND, reflectance=0.3)
+    )
 
 
 @numba.njit(parallel=True, fastmath=True)

@@ -40,7 +40,7 @@ def scene_at(optical, geometric, extinction) -> jl.Scene:
         leaf=area * extinction, voxel_size=size * SIZE / N, origin=(-5.0, -5.0, 1.0)
     )
     return jl.Scene(
-        canopy=jl.Canopy(voxels, leaf=leaf),
+        canopy=jl.Canopy(voxels, leaf=leaf, hotspot=False),
         ground=jl.Ground(height=height, slope=slope, reflectance=ground),
     )
 

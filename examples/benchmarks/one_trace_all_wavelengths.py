@@ -25,7 +25,9 @@ def crown() -> jl.Scene:
     k = np.where(inside, 0.5 * np.random.default_rng(0).uniform(0, 2, (N, N, N)), 0.0)
     voxels = jl.VoxelMap.from_extinction(0.9 * k, 0.1 * k, voxel_size=SIZE / N, origin=(-5.0, -5.0, 0.0))
     leaf = jl.Prospect(N=1.5, Cab=40.0, Car=8.0, Cant=0.0, Cbrown=0.0, Cw=0.01, Cm=0.009)
-    return jl.Scene(canopy=jl.Canopy(voxels, leaf=leaf, bark=0.4), ground=jl.Ground(reflectance=0.3))
+    return jl.Scene(
+        canopy=jl.Canopy(voxels, leaf=leaf, bark=0.4, hotspot=False), ground=jl.Ground(reflectance=0.3)
+    )
 
 
 def main() -> None:

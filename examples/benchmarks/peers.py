@@ -85,7 +85,7 @@ def run_jaxlidar(extinction: np.ndarray, case: str, pulse: float, repeats: int, 
     voxels = jl.VoxelMap.from_extinction(
         leaf=extinction, voxel_size=SIZE / N, origin=(-SIZE / 2, -SIZE / 2, 0.0)
     )
-    canopy = jl.Canopy(voxels, leaf=jl.Isotropic(albedo=ALBEDO))
+    canopy = jl.Canopy(voxels, leaf=jl.Isotropic(albedo=ALBEDO), hotspot=False)
     scene = jl.Scene(canopy=canopy, ground=None if case == "alone" else jl.Ground(reflectance=SOIL))
     receiver = {"field_of_view": FIELD_OF_VIEW} if case == "camera" else {}
     lidar = jl.Lidar(

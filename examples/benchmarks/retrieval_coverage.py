@@ -73,7 +73,7 @@ def scene_of(values: dict[str, float]) -> jl.Scene:
     )
     leaf = jl.Prospect(N=values["N"], Cab=values["Cab"], Car=8.0, Cw=values["Cw"], Cm=0.009)
     ground = jl.Ground(height=values["ground height"], reflectance=values["ground brightness"] * SOIL)
-    return jl.Scene(canopy=jl.Canopy(voxels, leaf=leaf, sides="periodic"), ground=ground)
+    return jl.Scene(canopy=jl.Canopy(voxels, leaf=leaf, sides="periodic", hotspot=False), ground=ground)
 
 
 def unknowns() -> list[Unknown]:

@@ -31,7 +31,8 @@ def crown(n: int) -> jl.Scene:
     k = np.where(inside, coarse[np.ix_(half_metre, half_metre, half_metre)], 0.0).astype(np.float32)
     voxels = jl.VoxelMap.from_extinction(leaf=k, voxel_size=SIZE / n, origin=(-5.0, -5.0, 0.0))
     return jl.Scene(
-        canopy=jl.Canopy(voxels, leaf=jl.Isotropic(albedo=0.9)), ground=jl.Ground(reflectance=0.3)
+        canopy=jl.Canopy(voxels, leaf=jl.Isotropic(albedo=0.9), hotspot=False),
+        ground=jl.Ground(reflectance=0.3),
     )
 
 

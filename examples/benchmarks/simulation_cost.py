@@ -34,7 +34,9 @@ def scenes() -> dict[str, jl.Scene]:
     return {
         "flat ground": jl.Scene(ground=ground),
         "plate over ground": jl.Scene(plates=(plate,), ground=ground),
-        "crown over ground": jl.Scene(canopy=jl.Canopy(voxels, leaf=jl.Isotropic(albedo=0.9)), ground=ground),
+        "crown over ground": jl.Scene(
+            canopy=jl.Canopy(voxels, leaf=jl.Isotropic(albedo=0.9), hotspot=False), ground=ground
+        ),
     }
 
 

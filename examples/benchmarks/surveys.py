@@ -48,7 +48,7 @@ def forest(side: int) -> jl.Scene:
         density[np.ix_(i, j)] = np.where(crown, 0.8, block)
     terrain = rolling_terrain(side)
     voxels = jl.VoxelMap.from_lad(density, voxel_size=1.0).above(terrain)
-    return jl.Scene(canopy=jl.Canopy(voxels, leaf=jl.Prospect()), ground=terrain)
+    return jl.Scene(canopy=jl.Canopy(voxels, leaf=jl.Prospect(), hotspot=False), ground=terrain)
 
 
 def gedi_like_lidar(**changes) -> jl.Lidar:

@@ -79,6 +79,7 @@ def tree_scene(voxel_size: float, *, leaves: bool = True, **changes) -> jl.Scene
         jl.voxelise(tree, voxel_size, leaf_area=area, wood="surface"),
         leaf=jl.Prospect.paper(),
         bark=jl.spectrum("bark-oak"),
+        hotspot=False,
     )
     scene_fields = {"canopy": canopy, "ground": jl.Ground(reflectance=jl.spectrum("soil-medium"))}
     return jl.Scene(**(scene_fields | changes))

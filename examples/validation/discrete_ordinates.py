@@ -71,7 +71,7 @@ def solve(tau, leaf, ground, streams):
 def simulate_slab(tau, leaf, ground, orders, rtol, key):
     """Return the same four, their standard errors, and the bound on neglected orders of the first."""
     voxels = jl.VoxelMap.from_lad(np.full((2, 2, 20), tau / 5), voxel_size=(5.0, 5.0, 0.5))
-    canopy = jl.Canopy(voxels, leaf=leaf, sides="periodic")
+    canopy = jl.Canopy(voxels, leaf=leaf, sides="periodic", hotspot=False)
     scene = jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=ground))
     first, second = jax.random.split(key)
     wave = jl.simulate(LIDAR, scene, key=first, rtol=rtol, max_orders=orders, n_rays=256, **SINGLE_SAMPLE)

@@ -57,7 +57,7 @@ def crowns(count, seed, size=0.5, side=250.0, base=2.0):
 
 def fluxes(voxels, soil, zenith, rtol=0.002, seed=3):
     """Return light absorbed by leaves, reflected and transmitted, in (red, near infrared), and errors."""
-    canopy = jl.Canopy(voxels, leaf=LEAF, sides="periodic")
+    canopy = jl.Canopy(voxels, leaf=LEAF, sides="periodic", hotspot=False)
     scene = jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=SOILS[soil]))
     lidar = jl.Lidar(wavelength=(650.0, 850.0), zenith=float(zenith))
     key = jax.random.key(seed)

@@ -12,14 +12,14 @@ whitens differences: it makes them independent and of unit variance.
 """
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy import linalg
 
 from jaxlidar import Lidar, Waveform
-from jaxlidar.extend import check_kind, check_numbers, check_range
+from jaxlidar.extend import as_numpy, check_kind, check_range
 
 
 class ObservedWaveform(NamedTuple):
@@ -128,7 +128,7 @@ def as_observed(
     elif time is None:
         raise ValueError("time = None, but observed is an array: its sample times are needed")
     t = as_sample_times(time, lidar)
-    y = as_numbers("observed", observed)
+    y = as_numpy(observed, "observed", missing=True)
     # The axis of a single wavelength may be left out.
     if y.ndim == 1:
         y = y[None, :]
@@ -160,7 +160,7 @@ def as_observed(
 
 def as_noise(noise: object, shape: tuple[int, ...]) -> np.ndarray:
     """Return standard deviations of this shape. **Raises:** ValueError for one that does not broadcast."""
-    sigma = as_numbers("noise", noise)
+    sigma = as_numpy(noise, "noise")
     try:
         # A copy: a broadcast array cannot be written.
         return np.broadcast_to(sigma, shape).copy()
@@ -168,24 +168,12 @@ def as_noise(noise: object, shape: tuple[int, ...]) -> np.ndarray:
         raise ValueError(f"noise has the shape {sigma.shape}, which does not broadcast to {shape}") from None
 
 
-def as_numbers(field: str, x: Any) -> np.ndarray:
-    """Return an array in double precision.
-
-    **Raises:** TypeError for anything but numbers, ValueError for rows of different lengths.
-    """
-    check_numbers(field, x)
-    try:
-        return np.asarray(x, dtype=float)
-    except ValueError:
-        raise ValueError(f"{field} has rows of different lengths; admissible is a regular array") from None
-
-
 def as_sample_times(time: object, lidar: Lidar) -> Float[np.ndarray, " bins"]:
     """Return sample times in double precision.
 
     **Raises:** ValueError unless they lie a sampling interval apart.
     """
-    t = as_numbers("time", time)
+    t = as_numpy(time, "time")
     if t.ndim != 1 or t.size == 0 or not np.all(np.isfinite(t)):
         raise ValueError(f"time has the shape {t.shape}; admissible is (bins,), finite, one bin or more")
     interval = float(lidar.sampling_interval)

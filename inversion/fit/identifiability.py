@@ -28,7 +28,7 @@ import jax.scipy.special
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
-from inversion.fit.data import as_noise, as_numbers, as_sample_times, with_fixed_window
+from inversion.fit.data import as_noise, as_sample_times, with_fixed_window
 from inversion.fit.model import ForwardModel
 from inversion.fit.planning import check_samples, checked_plan, plan_for_bounds, trace_sizes
 from inversion.fit.prior_residuals import PriorResiduals, fixed_priors
@@ -47,7 +47,7 @@ from inversion.fit.unknowns import (
 )
 from jaxlidar import Lidar, Plan, Scene, Waveform
 from jaxlidar import plan as make_plan
-from jaxlidar.extend import check_key, check_kinds, check_range
+from jaxlidar.extend import as_numpy, check_key, check_kinds, check_range
 from jaxlidar.planning.plan_check import check_reach
 
 # Unknowns whose correlation exceeds this are named in the summary.
@@ -314,7 +314,7 @@ def profile_likelihood(
     )
     priors = fixed_priors(problem.unknowns)
     fixed = _fixed_unknown(name, problem.unknowns)
-    points = as_numbers("values", values)
+    points = as_numpy(values, "values")
     if points.ndim != 1 or points.size < 2 or not np.all(np.diff(points) > 0):
         raise ValueError(f"values has the shape {points.shape}; admissible are two or more, increasing")
     check_range("values", points, float(fixed.low), float(fixed.high))

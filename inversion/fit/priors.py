@@ -10,7 +10,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxlidar.extend import as_array, as_scalar, check_range
+from jaxlidar.extend import Converted, as_array, as_scalar, check_integer, check_range
 
 
 @final
@@ -35,8 +35,8 @@ class LogNormal(eqx.Module):
     0.3
     """
 
-    median: Float[Array, "..."] = eqx.field(converter=as_array)
-    spread: Float[Array, "..."] = eqx.field(converter=as_array)
+    median: Converted[Float[Array, "..."]] = eqx.field(converter=lambda x: as_array(x, "median"))
+    spread: Converted[Float[Array, "..."]] = eqx.field(converter=lambda x: as_array(x, "spread"))
 
     def __check_init__(self):
         check_range("median", self.median, 0.0, low_open=True)
@@ -88,12 +88,14 @@ class Smooth(eqx.Module):
     [1.   0.78 0.48]
     """
 
-    scale: Float[Array, ""] = eqx.field(converter=as_scalar)
-    spacing: Float[Array, ""] = eqx.field(converter=as_scalar, default=1.0, kw_only=True)
-    strength: Float[Array, ""] | None = eqx.field(
+    scale: Converted[Float[Array, ""]] = eqx.field(converter=lambda x: as_scalar(x, "scale"))
+    spacing: Converted[Float[Array, ""]] = eqx.field(
+        converter=lambda x: as_scalar(x, "spacing"), default=1.0, kw_only=True
+    )
+    strength: Converted[Float[Array, ""] | None] = eqx.field(
         converter=lambda x: None if x is None else as_scalar(x, "strength"), default=None, kw_only=True
     )
-    mean: Float[Array, "..."] | None = eqx.field(
+    mean: Converted[Float[Array, "..."] | None] = eqx.field(
         converter=lambda x: None if x is None else as_array(x, "mean"), default=None, kw_only=True
     )
 
@@ -113,6 +115,6 @@ class Smooth(eqx.Module):
         **Returns:** (layers, layers).
         """
         # In correlation lengths.
-        position = np.arange(layers) * float(self.spacing) / float(self.scale)
+        position = np.arange(check_integer("layers", layers)) * float(self.spacing) / float(self.scale)
         distance = np.sqrt(3.0) * np.abs(np.subtract.outer(position, position))
         return (1.0 + distance) * np.exp(-distance)

@@ -25,7 +25,7 @@ from jaxtyping import Array, Float
 from scipy import special
 
 from jaxlidar import Plane, Scene, VoxelMap
-from jaxlidar.extend import check_kind, check_range, concrete
+from jaxlidar.extend import as_array, check_kind, check_range, concrete
 
 
 def put_profile(scene: Scene, density: Float[Array, " layers"]) -> Scene:
@@ -64,8 +64,8 @@ def put_profile(scene: Scene, density: Float[Array, " layers"]) -> Scene:
     voxels = scene.canopy.voxels
     nx, ny, nz = voxels.shape
     size, origin = voxels.voxel_size, jnp.asarray(voxels.origin)
-    x = (origin[0] + size[0] * (jnp.arange(nx) + 0.5))[:, None]
-    y = (origin[1] + size[1] * (jnp.arange(ny) + 0.5))[None, :]
+    x = (origin[0] + size[0] * (jnp.arange(nx, dtype=size.dtype) + 0.5))[:, None]
+    y = (origin[1] + size[1] * (jnp.arange(ny, dtype=size.dtype) + 0.5))[None, :]
     ground = jnp.zeros((nx, ny), size.dtype)
     if scene.ground is not None:
         plane = scene.ground.shape
@@ -75,11 +75,11 @@ def put_profile(scene: Scene, density: Float[Array, " layers"]) -> Scene:
         ground = plane.foot[2] - (east * (x - plane.foot[0]) + north * (y - plane.foot[1])) / up
     # Height of a voxel's lower face above the ground, t, in layers: the voxel extends from t to t + 1 and
     # overlaps the layers floor(t) and floor(t) + 1, the first with the fraction 1 - (t - floor(t)).
-    lower_face = jnp.arange(nz)[None, None, :] - ((ground - origin[2]) / size[2])[..., None]
+    lower_face = jnp.arange(nz, dtype=size.dtype)[None, None, :] - ((ground - origin[2]) / size[2])[..., None]
     lower_layer = jnp.floor(lower_face)
     upper_fraction = lower_face - lower_layer
     # An empty layer on either side stands for all layers outside.
-    padded = jnp.pad(jnp.asarray(density), 1)
+    padded = jnp.pad(as_array(density, "density"), 1)
 
     def density_of(layer: Array) -> Array:
         return padded[jnp.clip(layer.astype(int) + 1, 0, padded.size - 1)]

@@ -35,7 +35,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import ArrayLike, Float
 
-from jaxlidar.extend import check_range
+from jaxlidar.extend import as_numpy, check_integer, check_number, check_range
 
 _QUALITIES = ("good", "doubtful", "bad")
 _GOOD, _DOUBTFUL, _BAD = _QUALITIES
@@ -228,8 +228,11 @@ def judge_record(
     >>> inversion.judge_record(echo, noise=1.0)
     Verdict(quality='bad', reasons=('cut off: the signal reaches the last samples',))
     """
-    check_range("noise", noise, 0.0, low_open=True)
-    y = np.asarray(signal, float)
+    check_number("noise", noise, 0.0, low_open=True)
+    for name, flag in (("degrade", degrade), ("stale_return", stale_return)):
+        if flag is not None:
+            check_integer(name, flag, 0)
+    y = as_numpy(signal, "signal")
     if y.ndim != 1 or y.size < 5:
         raise ValueError(f"signal has the shape {y.shape}; admissible is (bins,), five or more")
     check_range("signal", y)
@@ -245,7 +248,8 @@ def judge_record(
             quality = _DOUBTFUL if mean <= _CUT_OFF_FRACTIONS[1] * peak else _BAD
             failures.append((quality, f"cut off: the signal reaches the {end} samples"))
     if pulse is not None:
-        shape = np.asarray(pulse, float)
+        shape = as_numpy(pulse, "pulse")
+        check_range("pulse", shape)
         departure = np.max(np.abs(_departure_from_cubic(shape)), initial=0.0) / np.max(shape)
         limit = _DEAD_SIGMAS * noise + _NARROWER_ECHO_FACTOR * departure * peak
         if (dead := int(np.sum(np.abs(_departure_from_cubic(y)) > limit))) > 0:

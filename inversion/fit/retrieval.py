@@ -20,6 +20,7 @@ from inversion.fit.solver import (
     EvaluationRequest,
     SolverSettings,
     fits_from_starts,
+    key_of_starts,
     multistart,
     run_fit,
 )
@@ -213,7 +214,9 @@ def solve_problem(
     """Fit one waveform: `retrieve` with checked arguments."""
     model = ForwardModel(problem.lidar, problem.scene, plan, problem.unknowns, key)
     recorder = RecorderModel(problem.recorder, problem.scale, problem.lidar, problem.observed.time.size)
-    fits = fits_from_starts(problem.observed, problem.unknowns, recorder, problem.settings, key, progress)
+    fits = fits_from_starts(
+        problem.observed, problem.unknowns, recorder, problem.settings, key_of_starts(key), progress
+    )
 
     def simulate(request: EvaluationRequest) -> Any:
         return model(request.values, with_batches=request.with_batches, pilot=request.pilot)

@@ -28,7 +28,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, ArrayLike, PRNGKeyArray
 
-from inversion.fit.data import ObservedWaveform, as_noise, as_numbers, as_observed, with_fixed_window
+from inversion.fit.data import ObservedWaveform, as_noise, as_observed, with_fixed_window
 from inversion.fit.fit_summary import FitSummary, SummarySizes
 from inversion.fit.model import Evaluation, ForwardModel, SimulationInputs, evaluate_scene
 from inversion.fit.planning import checked_plan, trace_sizes
@@ -41,6 +41,7 @@ from inversion.fit.solver import (
     FitGenerator,
     SolverSettings,
     fits_from_starts,
+    key_of_starts,
     multistart,
 )
 from inversion.fit.unknowns import BoundUnknown, Unknown, bind_unknowns, smooth_names, with_start
@@ -48,6 +49,7 @@ from inversion.receiver.recorder import Recorder
 from jaxlidar import Lidar, Plan, Scene
 from jaxlidar.extend import (
     ONE_CORE,
+    as_numpy,
     check_integer,
     check_key,
     check_kind,
@@ -163,7 +165,7 @@ def retrieve_many(
     >>> fits.values["brightness"].round(3).tolist()
     [0.2, 0.4]
     """
-    y = as_numbers("observed", observed)
+    y = as_numpy(observed, "observed", missing=True)
     if y.ndim != 3 or len(y) == 0:
         raise ValueError(f"observed has the shape {y.shape}; admissible is (footprints, wavelengths, bins)")
     n_footprints, n_wavelengths, n_bins = y.shape
@@ -273,7 +275,7 @@ def _with_starts(
     for name, values in start.items():
         if name not in shapes:
             raise ValueError(f"start has {name!r}; admissible are {', '.join(map(repr, shapes))}")
-        starts[name] = as_numbers(f"start of {name!r}", values)
+        starts[name] = as_numpy(values, f"start of {name!r}")
         shape = (n_footprints, *shapes[name])
         if starts[name].shape != shape:
             raise ValueError(f"start of {name!r} has the shape {starts[name].shape}; admissible is {shape}")
@@ -429,9 +431,9 @@ def run_fits(
         recorder = _of_footprint(problem.recorders, i)
         recorder_model = RecorderModel(recorder, problem.scale, lidar, observed.time.size)
         # It determines the starting points alone, which do not depend on the chunk or on earlier runs.
-        fit_key = jax.random.fold_in(key, problem.numbers[i])
+        start_key = jax.random.fold_in(key_of_starts(key), problem.numbers[i])
         unknowns = _of_footprint(problem.unknowns, i)
-        return multistart(fits_from_starts(observed, unknowns, recorder_model, problem.settings, fit_key))
+        return multistart(fits_from_starts(observed, unknowns, recorder_model, problem.settings, start_key))
 
     # The photons of all footprints have the same key, as those of a single fit: results do not depend on the
     # chunk.

@@ -623,6 +623,12 @@ class LeastSquaresFit:
 # -- several starts
 
 
+def key_of_starts(key: PRNGKeyArray) -> PRNGKeyArray:
+    """Return the key of the starting points of fits with this key."""
+    # Batches of photons have the numbers from 0 on: starts and photons must be independent.
+    return jax.random.fold_in(key, 2**31 - 1)
+
+
 def fits_from_starts(
     observed: ObservedWaveform,
     scene_unknowns: list[BoundUnknown],
@@ -631,11 +637,14 @@ def fits_from_starts(
     key: PRNGKeyArray,
     progress: Callable[[Step], None] | None = None,
 ) -> list[LeastSquaresFit]:
-    """Return a fit from the unknowns' own start, and further ones from a Latin hypercube over the bounds."""
+    """Return a fit from the unknowns' own start, and further ones from a Latin hypercube over the bounds.
+
+    `key`: of the hypercube, made with `key_of_starts`.
+    """
     starts: list[np.ndarray | None] = [None]
     if settings.starts > 1:
         unknowns = [*scene_unknowns, *recorder_model.unknowns]
-        starts += list(latin_hypercube(unknowns, settings.starts - 1, jax.random.fold_in(key, 1)))
+        starts += list(latin_hypercube(unknowns, settings.starts - 1, key))
     return [LeastSquaresFit(observed, scene_unknowns, recorder_model, settings, progress, s) for s in starts]
 
 

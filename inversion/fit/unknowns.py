@@ -24,7 +24,7 @@ from scipy import special
 
 from inversion.fit.priors import LogNormal, Smooth
 from jaxlidar import Scene
-from jaxlidar.extend import as_array, check_kind, check_range
+from jaxlidar.extend import Converted, as_array, check_kind, check_range
 
 # (mean, standard deviation), or one of the named priors.
 Prior = tuple[Float[Array, "..."], Float[Array, "..."]] | LogNormal | Smooth
@@ -50,7 +50,7 @@ def _as_bounds(x: Any) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         low, high = x
     except (TypeError, ValueError):
         raise ValueError(f"bounds = {x!r} is not a pair (low, high)") from None
-    return as_array(low, "lower bound"), as_array(high, "upper bound")
+    return as_array(low, "lower of bounds"), as_array(high, "upper of bounds")
 
 
 def _as_optional_prior(x: Any) -> Prior | None:
@@ -114,10 +114,14 @@ class Unknown(eqx.Module):
     """
 
     where: str | Callable[[Any], Any] | None = eqx.field(static=True, default=None)
-    bounds: tuple[Float[Array, "..."], Float[Array, "..."]] = eqx.field(converter=_as_bounds, kw_only=True)
+    bounds: Converted[tuple[Float[Array, "..."], Float[Array, "..."]]] = eqx.field(
+        converter=_as_bounds, kw_only=True
+    )
     name: str | None = eqx.field(static=True, default=None, kw_only=True)
-    prior: Prior | None = eqx.field(converter=_as_optional_prior, default=None, kw_only=True)
-    start: Float[Array, "..."] | None = eqx.field(converter=_as_optional_start, default=None, kw_only=True)
+    prior: Converted[Prior | None] = eqx.field(converter=_as_optional_prior, default=None, kw_only=True)
+    start: Converted[Float[Array, "..."] | None] = eqx.field(
+        converter=_as_optional_start, default=None, kw_only=True
+    )
     apply: Callable[[Scene, Array], Scene] | None = eqx.field(static=True, default=None, kw_only=True)
 
     def __check_init__(self):

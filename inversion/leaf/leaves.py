@@ -18,7 +18,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 from inversion.leaf.errors import LinearisedFit, inverse_root, trait_errors
 from inversion.leaf.solver import LeafFitState, LeafProblem, fit_leaves
 from jaxlidar import Prospect
-from jaxlidar.extend import check_range
+from jaxlidar.extend import as_numpy, check_integer, check_numbers, check_range
 from jaxlidar.optics.coefficients import TRAITS
 from jaxlidar.optics.leaf_surface import LeafSurface
 from jaxlidar.optics.prospect import material
@@ -173,9 +173,9 @@ def invert_leaves(
     **Arguments:**
 
     - `wavelengths`: (wavelengths,) nm, in any order, within PROSPECT's 400 to 2500.
-    - `reflectance`, `transmittance`: (leaves, wavelengths) fractions, or (wavelengths,) of one leaf; NaN for
-      missing samples. One of the two may be None, but without transmittance the data hardly separate N from
-      the other traits.
+    - `reflectance`, `transmittance`: (leaves, wavelengths) fractions, or (wavelengths,) of one leaf; missing
+      samples are NaN or masked. One of the two may be None, but without transmittance the data hardly
+      separate N from the other traits.
     - `unknowns`: names out of "N" and the traits of the version. Default None: all of them.
     - `leaf`: a `Prospect` that gives the version, alpha and coefficients, the starting values of the unknowns
       and the fixed values of the other traits; its traits are scalars or of shape (leaves,). Default None:
@@ -222,9 +222,8 @@ def invert_leaves(
     observed, sigma = _check_spectra(wavelengths, reflectance, transmittance, noise)
     start, low, high = _start_and_bounds(leaf, trait_names, unknown_names, bounds or {}, len(observed))
     for field, value in (("max_steps", max_steps), ("chunk", chunk)):
-        if value != int(value) or value < 1:
-            raise ValueError(f"{field} = {value} is outside the admissible range [1, inf) of integers")
-    x = np.asarray(wavelengths, float)
+        check_integer(field, value)
+    x = as_numpy(wavelengths, "wavelengths")
     domains = [
         (names, *_bands_in(x, intervals, names))
         for intervals, names in _names_by_domain(domain, unknown_names).items()
@@ -337,11 +336,13 @@ def _check_spectra(
 
     **Raises:** ValueError for shapes that do not match and for values outside of their ranges.
     """
-    x = np.asarray(wavelengths, float)
+    x = as_numpy(wavelengths, "wavelengths")
     if x.ndim != 1 or x.size == 0:
         raise ValueError(f"wavelengths has the shape {x.shape}; admissible is (wavelengths,), one or more")
     arguments = {"reflectance": reflectance, "transmittance": transmittance}
-    spectra = {name: np.atleast_2d(np.asarray(s, float)) for name, s in arguments.items() if s is not None}
+    spectra = {
+        name: np.atleast_2d(as_numpy(s, name, missing=True)) for name, s in arguments.items() if s is not None
+    }
     if not spectra:
         raise ValueError(
             "reflectance = None and transmittance = None; admissible is an array for one or both"
@@ -355,7 +356,7 @@ def _check_spectra(
             )
         check_range(name, s[~np.isnan(s)], *_SPECTRUM_RANGE)
     observed = np.stack([spectra.get(name, np.full(shape, np.nan)) for name in arguments], axis=1)
-    sigma = np.asarray(1.0 if noise is None else noise, float)
+    sigma = as_numpy(1.0 if noise is None else noise, "noise")
     try:
         np.broadcast_to(sigma, observed.shape)
     except ValueError:
@@ -397,6 +398,7 @@ def _start_and_bounds(
             raise ValueError(f"leaf: {name} has the shape {value.shape}; admissible is () or ({n_leaves},)")
         low = high = value
         if name in unknown_names:
+            check_numbers(f"bounds of {name}", bounds.get(name, _BOUNDS[name]))
             try:
                 low, high = (float(b) for b in bounds.get(name, _BOUNDS[name]))
             except (TypeError, ValueError):
@@ -433,6 +435,7 @@ def _names_by_domain(
 
 def _intervals(name: str, value: Any) -> Intervals:
     """Return a pair (low, high), or several, as a tuple of pairs. **Raises:** ValueError for other values."""
+    check_numbers(f"domain of {name}", value)
     try:
         pairs = np.atleast_1d(np.asarray(value, float))
         pairs = pairs.reshape(1, 2) if pairs.shape == (2,) else pairs

@@ -28,11 +28,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from inversion.metrics.heights import SignalEnds, find_ground, signal_ends
-from inversion.metrics.records import Pulse, over_shots, pad_record, sample_pulse_at_heights, smooth_pulse
-from jaxlidar.extend import as_array, check_range, concrete
+from inversion.metrics.heights import SignalEnds, relative_ground, relative_signal_ends
+from inversion.metrics.records import (
+    PaddedRecord,
+    Pulse,
+    divide_by_largest,
+    over_shots,
+    pad_record,
+    sample_pulse_at_heights,
+    smooth_pulse,
+)
+from jaxlidar.extend import as_array, check_numbers, check_range, concrete
 
-# Least fraction of a pulse after its mode, and least energy of an echo's lower half, that are divided by.
+# Least fraction of a pulse after its mode, and least energy of an echo's lower half over the largest sample,
+# that are divided by.
 _LEAST_LATE_FRACTION, _LEAST_HALF = 1e-3, 1e-30
 
 Samples = Float[Array, " bins"]
@@ -102,36 +111,72 @@ def ground_and_canopy(
     >>> print(f"ground {split.ground:.0f}, canopy {split.canopy:.0f}, gap {split.gap:.2f}")
     ground 60, canopy 40, gap 0.69
     """
+    record = pad_record(height, power)
+    split = _split_record(record, pulse, ground, ends, noise, reflectance_ratio)
+    gap = 1.0 - split.canopy / jnp.where(split.total > 0, split.total, 1.0)
+    return GroundAndCanopy(
+        record.heights.absolute(split.ground_height),
+        record.times_magnitude(split.ground),
+        record.times_magnitude(split.canopy),
+        jnp.where(split.total > 0, gap, jnp.nan),
+    )
+
+
+class _SplitRecord(NamedTuple):
+    """Energies of a record over its magnitude, and heights over its first sample; (...,) each.
+
+    - `ground_height`: of the echo's time zero.
+    - `top`, `bottom`: ends of the signal.
+    - `ground`, `canopy`: energies.
+    - `total`: energy that the footprint would return if all of it were as bright as plants.
+    - `lags`: (..., lags) samples of the pulse.
+    """
+
+    ground_height: Array
+    top: Array
+    bottom: Array
+    ground: Array
+    canopy: Array
+    total: Array
+    lags: Array
+
+
+def _split_record(
+    record: PaddedRecord,
+    pulse: Pulse,
+    ground: ArrayLike | None,
+    ends: SignalEnds | tuple[ArrayLike, ArrayLike] | None,
+    noise: ArrayLike | None,
+    reflectance_ratio: float,
+) -> _SplitRecord:
+    """Split a record's energy into ground and canopy; arguments as for `ground_and_canopy`."""
     check_range("reflectance_ratio", reflectance_ratio, 0.0, low_open=True)
     if ground is None:
-        ground = find_ground(height, power, pulse=pulse, noise=noise)
+        ground_height = relative_ground(record, pulse=pulse, noise=noise)
+    else:
+        ground_height = record.heights.relative(ground, "ground")
     if ends is None:
-        ends = signal_ends(height, power, pulse=pulse, noise=noise)
-    top, bottom = (as_array(end) for end in ends)
-    ground_height = as_array(ground)
+        top, bottom = relative_signal_ends(record, pulse=pulse, noise=noise)
+    else:
+        top, bottom = (record.heights.relative(end, "ends") for end in ends)
+    lags = sample_pulse_at_heights(pulse, record.heights)
     ground_energy, signal_energy = _split_energy(
-        **pad_record(height, power)._asdict(),
-        pulse=sample_pulse_at_heights(pulse, height),
-        ground=ground_height,
-        top=top,
-        bottom=bottom,
+        **record.arguments(), pulse=lags, ground=ground_height, top=top, bottom=bottom
     )
     canopy_energy = jnp.maximum(signal_energy - ground_energy, 0.0)
-    # The energy that the footprint would return if all of it were as bright as plants.
     total = canopy_energy + ground_energy * reflectance_ratio
-    gap = 1.0 - canopy_energy / jnp.where(total > 0, total, 1.0)
-    return GroundAndCanopy(ground_height, ground_energy, canopy_energy, jnp.where(total > 0, gap, jnp.nan))
+    return _SplitRecord(ground_height, top, bottom, ground_energy, canopy_energy, total, lags)
 
 
-@over_shots(height=1, power=1, n_samples=0, pulse=1, ground=0, top=0, bottom=0)
-def _split_energy(height, power, n_samples, pulse, ground, top, bottom):
+@over_shots(step=0, power=1, n_samples=0, pulse=1, ground=0, top=0, bottom=0)
+def _split_energy(step, power, n_samples, pulse, ground, top, bottom):
     """Energy of the ground, at most that of the signal, and energy of the signal, of one padded record.
 
     1. Energy of the signal, between its ends.
     2. Energy below the mode of the ground's echo, which lies `mode` samples after its time zero.
     3. Fraction of the pulse's energy after its mode, each sample spread evenly over its step.
     """
-    step = height[0] - height[1]
+    height = -step * jnp.arange(power.size, dtype=power.dtype)
     is_recorded = jnp.arange(power.size) < n_samples
 
     def above(level):
@@ -143,7 +188,7 @@ def _split_energy(height, power, n_samples, pulse, ground, top, bottom):
     # Of the smoothed pulse, as `find_ground` reads the smoothed record.
     mode = smooth_pulse(pulse).mode
     late_energy = above(bottom) - above(ground - mode * step)
-    lag = jnp.arange(pulse.size) - pulse.size // 2
+    lag = jnp.arange(pulse.size, dtype=pulse.dtype) - pulse.size // 2
     late_fraction = jnp.sum(pulse * jnp.clip(lag + 0.5 - mode, 0.0, 1.0)) / jnp.sum(pulse)
     # The energy of a pulse that ends at its mode cannot be derived from the light after it.
     ground_energy = jnp.maximum(late_energy, 0.0) / jnp.maximum(late_fraction, _LEAST_LATE_FRACTION)
@@ -168,9 +213,10 @@ def gap_probability(
     - `ground`: energy of the ground's return, in the same unit.
     - `reflectance_ratio`: rho_v / rho_g, of apparent reflectances, above 0. Default 1.5, GEDI's.
 
-    **Returns:** (bins,) gap probability.
+    **Returns:** (bins,) gap probability; NaN where noise makes the sum of all energy negative.
 
-    **Raises:** ValueError for a `reflectance_ratio` that is not above 0.
+    **Raises:** ValueError for energies that are not finite, a negative `ground`, and a `reflectance_ratio`
+    that is not above 0.
 
     **Source:** Ni-Meister et al. (2001), IEEE Trans. Geosci. Remote Sens. 39, 1943; Tang and Armston (2019),
     GEDI footprint canopy cover and vertical profile metrics (theoretical basis document).
@@ -183,10 +229,25 @@ def gap_probability(
     ['0.86', '0.57', '0.43']
     """
     check_range("reflectance_ratio", reflectance_ratio, 0.0, low_open=True)
-    canopy_above = jnp.cumsum(as_array(canopy))
-    total = canopy_above[-1] + as_array(ground) * reflectance_ratio
-    # Nothing returned, nothing intercepted: the gap probability of an empty record is one.
-    return 1.0 - canopy_above / jnp.where(total > 0, total, 1.0)
+    check_range("ground", ground, 0.0)
+    if np.ndim(canopy) != 1 or np.ndim(ground):
+        raise ValueError(
+            f"canopy and ground have the shapes {np.shape(canopy)} and {np.shape(ground)}; admissible are "
+            "(bins,) and ()"
+        )
+    check_range("canopy", canopy)
+    canopy_values, ground_value = concrete(canopy), concrete(ground)
+    if canopy_values is None or ground_value is None:
+        all_energy = jnp.append(as_array(canopy, "canopy"), as_array(ground, "ground"))
+    else:
+        all_energy = np.append(canopy_values, ground_value)
+    energies, _ = divide_by_largest(all_energy, "canopy and ground")
+    canopy_above = jnp.cumsum(energies[:-1])
+    total = canopy_above[-1] + energies[-1] * reflectance_ratio
+    gap = 1.0 - canopy_above / jnp.where(total > 0, total, 1.0)
+    # Nothing returned, nothing intercepted: the gap probability of an empty record is one. Noise that makes
+    # the sum negative leaves none.
+    return jnp.where((total > 0) | (jnp.max(jnp.abs(energies)) == 0), gap, jnp.nan)
 
 
 def plant_area_index(
@@ -196,13 +257,14 @@ def plant_area_index(
 
     **Arguments:**
 
-    - `gap`: gap probability P, of any shape, above 0, at most 1.
+    - `gap`: gap probability P, of any shape, in [0, 1]; NaN where it is missing.
     - `zenith`: angle between the beam and the vertical in degrees, 0 to below 90. Default 0.
     - `projection`: G, mean projection of unit plant area onto the plane across the beam, above 0, at most 1.
       Default 0.5 (random orientations).
     - `clumping`: clumping index Omega, above 0. Default 1 (random positions).
 
-    **Returns:** m2 of plant area per m2 of ground, of the shape of `gap`.
+    **Returns:** m2 of plant area per m2 of ground, of the shape of `gap`; infinite where P is 0, which is
+    where no light of the ground was recorded, and NaN where P is missing.
 
     **Raises:** ValueError for arguments outside their ranges.
 
@@ -212,9 +274,14 @@ def plant_area_index(
     >>> print(f"{float(inversion.plant_area_index(0.5)):.2f}")
     1.39
     """
-    check_range("gap", gap, 0.0, 1.0, low_open=True)
+    check_numbers("gap", gap, missing=True)
+    values = concrete(gap)
+    if values is not None:
+        check_range("gap", values[~np.isnan(values)], 0.0, 1.0)
     _check_canopy_structure(zenith, projection, clumping)
-    return -jnp.log(as_array(gap)) * jnp.cos(jnp.deg2rad(zenith)) / (projection * clumping)
+    return (
+        -jnp.log(as_array(gap, "gap", missing=True)) * jnp.cos(jnp.deg2rad(zenith)) / (projection * clumping)
+    )
 
 
 def _check_canopy_structure(zenith: Any, projection: Any, clumping: Any) -> None:
@@ -287,20 +354,16 @@ def plant_area_profile(
         or (edge_values is not None and not np.all(np.diff(edge_values) > 0))
     ):
         raise ValueError(f"edges = {edges}; admissible are two heights or more, increasing")
-    if ends is None:
-        ends = signal_ends(height, power, pulse=pulse, noise=noise)
-    split = ground_and_canopy(
-        height, power, pulse=pulse, ground=ground, ends=ends, noise=noise, reflectance_ratio=reflectance_ratio
-    )
-    top, bottom = (as_array(end) for end in ends)
-    total = split.canopy + split.ground * reflectance_ratio
+    record = pad_record(height, power)
+    split = _split_record(record, pulse, ground, ends, noise, reflectance_ratio)
+    total = split.total
     canopy_above = _canopy_energy_above(
-        **pad_record(height, power)._asdict(),
-        pulse=sample_pulse_at_heights(pulse, height),
-        ground=split.height,
+        **record.arguments(),
+        pulse=split.lags,
+        ground=split.ground_height,
         ground_energy=split.ground,
-        top=top,
-        bottom=bottom,
+        top=split.top,
+        bottom=split.bottom,
         levels=edge_heights,
     )
     # Noise, and levels above the signal's top, make it negative or larger than all of the canopy's.
@@ -314,8 +377,8 @@ def plant_area_profile(
     return extinction * jnp.cos(jnp.deg2rad(zenith)) / (projection * clumping)
 
 
-@over_shots(height=1, power=1, n_samples=0, pulse=1, ground=0, ground_energy=0, top=0, bottom=0, levels=1)
-def _canopy_energy_above(height, power, n_samples, pulse, ground, ground_energy, top, bottom, levels):
+@over_shots(step=0, power=1, n_samples=0, pulse=1, ground=0, ground_energy=0, top=0, bottom=0, levels=1)
+def _canopy_energy_above(step, power, n_samples, pulse, ground, ground_energy, top, bottom, levels):
     """Energy of the canopy from above levels over the ground, of one padded record.
 
     It is all energy from above a level, less that of the ground's echo. The upper half of a symmetric echo
@@ -323,7 +386,7 @@ def _canopy_energy_above(height, power, n_samples, pulse, ground, ground_energy,
 
         E_canopy(z) = E(z, top) - E_ground / 2 * E(bottom, m - r) / E(bottom, m),    r = z - m.
     """
-    step = height[0] - height[1]
+    height = -step * jnp.arange(power.size, dtype=power.dtype)
     is_recorded = jnp.arange(power.size) < n_samples
     mode = ground - smooth_pulse(pulse).mode * step
 

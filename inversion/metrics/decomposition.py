@@ -47,12 +47,22 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from inversion.metrics.records import Pulse, over_shots, pad_to, sample_pulse, sampling_step, size_bucket
-from jaxlidar.extend import as_array, check_integer, check_range
+from inversion.metrics.records import (
+    Pulse,
+    divide,
+    divide_by_largest,
+    even_axis,
+    over_shots,
+    pad_to,
+    sample_pulse,
+    size_bucket,
+)
+from jaxlidar.extend import as_array, check_integer, check_range, concrete
 
 _SOLVER = optx.LevenbergMarquardt(rtol=1e-3, atol=1e-3)
 _MAX_STEPS = 40
@@ -69,6 +79,8 @@ _EXCESS = 1.0
 _MARGIN = 0.01
 # Least noise over the largest sample: models are computed to that precision.
 _ROUNDING = 1e-4
+# Least and largest finite noise over the largest sample that weights are made of.
+_NOISE_LIMITS = (1e-8, 1e15)
 
 FreeParameters = Float[Array, "echoes 3"]
 IsActive = Bool[Array, " echoes"]
@@ -127,7 +139,8 @@ def gaussian_decomposition(
 
     **Arguments:**
 
-    - `time`: (bins,) ns, increasing in equal steps.
+    - `time`: (bins,) ns, increasing in equal steps. Times of echoes are rounded to single precision, 0.06 ns
+      at 1e6 ns, unless JAX computes in double precision.
     - `power`: (bins,) record in any unit, background removed; or (shots, bins).
     - `noise`: standard deviation of `power`, above 0: one number, or of the shape of `power`. Samples of
       infinite noise have no weight. 1e-4 of the largest sample is added in quadrature.
@@ -156,32 +169,37 @@ def gaussian_decomposition(
     >>> [f"{float(t):.1f}" for t in echoes.time[: echoes.count]]
     ['20.0', '40.0']
     """
-    t, y, sigma = as_array(time), as_array(power), as_array(noise)
     max_echoes = check_integer("max_echoes", max_echoes)
-    if t.ndim != 1 or y.ndim < 1 or t.shape != y.shape[-1:] or t.size < 2:
+    check_range("time", time)
+    check_range("power", power)
+    y_shape, bins = np.shape(power), np.size(time)
+    if np.ndim(time) != 1 or y_shape[-1:] != (bins,) or bins < 2:
         raise ValueError(
-            f"time and power have the shapes {t.shape} and {y.shape}; admissible is (bins,) and (..., bins), "
-            "two or more"
+            f"time and power have the shapes {np.shape(time)} and {y_shape}; admissible is (bins,) and "
+            "(..., bins), two or more"
         )
-    if sigma.shape not in ((), t.shape, y.shape):
-        raise ValueError(f"noise has the shape {sigma.shape}; admissible is () or {y.shape}")
+    if np.shape(noise) not in ((), (bins,), y_shape):
+        raise ValueError(f"noise has the shape {np.shape(noise)}; admissible is () or {y_shape}")
     if (width is None) == (pulse is None):
         raise ValueError("width and pulse: admissible is one of them")
-    check_range("noise", jnp.where(jnp.isposinf(sigma), 1.0, sigma), 0.0, low_open=True)
-    check_range("power", power)
-    check_range("steps of time", jnp.diff(t), 0.0, low_open=True)
+    _check_noise(noise)
     check_range("pulse_error", pulse_error, 0.0)
-    size = size_bucket(t.size)
+    times = even_axis("time", time)
+    y, magnitude = divide_by_largest(power, "power", noise)
+    # Beyond these limits noise changes nothing, but the squares of weights would overflow or vanish.
+    sigma = _over_magnitude(noise, magnitude)
+    sigma = jnp.where(jnp.isinf(sigma), sigma, jnp.clip(sigma, *_NOISE_LIMITS))
+    size = size_bucket(bins)
     # Padding has no weight: it does not count as recorded.
     weight = pad_to(jnp.broadcast_to(1.0 / sigma, y.shape), size)
-    arrays = {"power": pad_to(y, size), "weight": weight, "step": t[1] - t[0]}
+    arrays = {"power": pad_to(y, size), "weight": weight, "step": jnp.asarray(times.step, y.dtype)}
     if pulse is None:
         assert width is not None
         check_range("width", width, 0.0, low_open=True)
-        arrays |= {"pulse": jnp.ones(1), "width": as_array(width), "pulse_error": jnp.zeros(())}
+        arrays |= {"pulse": jnp.ones(1), "width": as_array(width, "width"), "pulse_error": jnp.zeros(())}
         echoes = _compiled_decomposition("gaussian", max_echoes)(**arrays)
     else:
-        lags, error = sample_pulse(pulse, sampling_step(time)), as_array(pulse_error)
+        lags, error = sample_pulse(pulse, times.step), as_array(pulse_error, "pulse_error")
         arrays |= {"pulse": lags, "width": jnp.ones(()), "pulse_error": error}
         echoes = _compiled_decomposition("copies", max_echoes)(**arrays)
         if broaden:
@@ -190,8 +208,28 @@ def gaussian_decomposition(
             is_better = broadened.criterion < echoes.criterion
             echoes = jax.tree.map(partial(_select, is_better), broadened, echoes)
     # The program counts time from the first sample; empty entries stay zero.
-    absolute_time = jnp.where(echoes.amplitude > 0, t[0] + echoes.time, 0.0)
-    return echoes._replace(time=absolute_time, model=echoes.model[..., : t.size])
+    absolute_time = jnp.where(echoes.amplitude > 0, times.absolute(echoes.time), 0.0)
+    unit = jnp.asarray(magnitude, y.dtype)[..., None]
+    per_parameter = jnp.stack([unit, jnp.ones_like(unit), jnp.ones_like(unit)], axis=-1)
+    return echoes._replace(
+        amplitude=echoes.amplitude * unit,
+        time=absolute_time,
+        stderr=echoes.stderr * per_parameter,
+        model=echoes.model[..., :bins] * unit,
+    )
+
+
+def _check_noise(noise: ArrayLike) -> None:
+    """Refuse noise that is not above 0; it may be infinite. **Raises:** ValueError."""
+    values = concrete(noise)
+    check_range(
+        "noise", noise if values is None else np.where(np.isposinf(values), 1.0, values), 0.0, low_open=True
+    )
+
+
+def _over_magnitude(noise: ArrayLike, magnitude: Array | np.ndarray) -> Array:
+    """Noise, one number or one for each sample, over the magnitude of its record."""
+    return divide(noise, magnitude if np.ndim(magnitude) == 0 else magnitude[..., None], "noise")
 
 
 def _select(condition: Array, a: Array, b: Array) -> Array:
@@ -354,7 +392,7 @@ def _parameterisation(
     highest = jnp.maximum(between_samples * jnp.max(supported), jnp.finfo(y.dtype).tiny)
     log_low, log_high = (jnp.log(jnp.asarray(bound, y.dtype)) for bound in _WIDTH_BOUNDS[kind])
     length = jnp.maximum(last - first, 1).astype(y.dtype)
-    return _Parameterisation(kind, shape.width, highest, first, length, log_low, log_high)
+    return _Parameterisation(kind, shape.width, highest, first.astype(y.dtype), length, log_low, log_high)
 
 
 # -- fit -----------------------------------------------------------------------------------------------
@@ -414,7 +452,7 @@ def _decompose(
         # pushed there would not move any more.
         limits = parameters.restart_limits()
         start = jnp.clip(fit.free, -limits, limits)
-        start = start.at[k].set(parameters.start(matched[best] / norm[best], best))
+        start = start.at[k].set(parameters.start(matched[best] / norm[best], best.astype(y.dtype)))
         is_active = fit.is_active.at[k].set(True)
         fitted = optx.least_squares(
             residual, _SOLVER, start, args=is_active, max_steps=_MAX_STEPS, throw=False
@@ -422,7 +460,8 @@ def _decompose(
         # A fit that fails leaves the echoes where they started; the criterion decides about them as usual.
         free = jnp.where(jnp.all(jnp.isfinite(fitted)), fitted, start)
         chi2 = jnp.sum(residual(free, is_active) ** 2)
-        return _EchoFit(free, is_active, chi2, chi2 + _COST[kind] * (k + 1) * log_bins)
+        cost = _COST[kind] * (k + 1).astype(y.dtype) * log_bins
+        return _EchoFit(free, is_active, chi2, chi2 + cost)
 
     def give_up(fit: _EchoFit, k: Array) -> _EchoFit:
         return fit._replace(criterion=jnp.full((), jnp.inf, y.dtype))

@@ -22,13 +22,15 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxlidar.extend import as_array, check_integer, check_range
+from inversion.metrics.records import divide_by_largest
+from jaxlidar.extend import check_integer, check_range, concrete
 
-# Least model of a sample that one is divided by, over the largest sample of the waveform; least such sample.
-_LEAST_MODEL, _LEAST_PEAK = 1e-6, 1e-30
+# Least model of a sample that one is divided by, over the largest sample of the waveform.
+_LEAST_MODEL = 1e-6
 
 Samples = Float[Array, " bins"]
 
@@ -63,17 +65,21 @@ def richardson_lucy(
     """
     iterations = check_integer("iterations", iterations)
     check_range("pulse", pulse, 0.0)
-    return _richardson_lucy(jnp.maximum(as_array(power), 0.0), _unit_pulse(pulse), iterations)
+    y, magnitude = _scaled_waveform(power)
+    sharp = _richardson_lucy(jnp.maximum(y, 0.0), _unit_pulse(pulse), iterations)
+    return sharp * jnp.asarray(magnitude, sharp.dtype)
 
 
 @partial(jax.jit, static_argnames="iterations")
 def _richardson_lucy(y: Samples, h: Float[Array, " lags"], iterations: int) -> Samples:
-    least = _LEAST_MODEL * jnp.maximum(jnp.max(y), _LEAST_PEAK)
-    recorded_fraction = jnp.convolve(jnp.ones_like(y), h[::-1], mode="same")
+    recorded_fraction = _convolve(jnp.ones_like(y), h[::-1])
+    # Light of a bin whose pulse lies outside the record is not recorded at all, and stays at its start.
+    is_recorded = recorded_fraction > 0
+    divisor = jnp.where(is_recorded, recorded_fraction, 1.0)
 
     def iterate(x: Samples, _: None) -> tuple[Samples, None]:
-        ratio = y / jnp.maximum(jnp.convolve(x, h, mode="same"), least)
-        return x * jnp.convolve(ratio, h[::-1], mode="same") / recorded_fraction, None
+        ratio = y / jnp.maximum(_convolve(x, h), _LEAST_MODEL)
+        return jnp.where(is_recorded, x * _convolve(ratio, h[::-1]) / divisor, x), None
 
     return lax.scan(iterate, jnp.full_like(y, jnp.mean(y)), None, length=iterations)[0]
 
@@ -106,23 +112,42 @@ def wiener(
     peak 0.13 to 0.32
     """
     check_range("noise_to_signal", noise_to_signal, 0.0, low_open=True)
-    y, h = as_array(power), _unit_pulse(pulse)
+    (y, magnitude), h = _scaled_waveform(power), _unit_pulse(pulse)
     # Of the full convolution of record and pulse: the transforms do not wrap around.
     size = y.size + h.size - 1
     spectrum = jnp.fft.rfft(h, size)
     gain = jnp.conj(spectrum) / (jnp.abs(spectrum) ** 2 + noise_to_signal)
     # The first lag of the pulse lies half its length before time zero, and so does the padded record's start.
     padded = jnp.pad(y, ((h.size - 1) // 2, (h.size - 1) // 2))
-    return jnp.fft.irfft(jnp.fft.rfft(padded) * gain, size)[: y.size]
+    sharp = jnp.fft.irfft(jnp.fft.rfft(padded) * gain, size)[: y.size]
+    return sharp * jnp.asarray(magnitude, sharp.dtype)
+
+
+def _convolve(y: Samples, h: Float[Array, " lags"]) -> Samples:
+    """Convolve a record with a pulse, time zero in the middle, also one longer than the record."""
+    return jnp.convolve(y, h, mode="full")[h.size // 2 : h.size // 2 + y.size]
+
+
+def _scaled_waveform(power: ArrayLike) -> tuple[Samples, Array | np.ndarray]:
+    """Check one waveform and return it over its largest magnitude, and that. **Raises:** ValueError."""
+    if np.ndim(power) != 1 or np.size(power) == 0:
+        raise ValueError(
+            f"power has the shape {np.shape(power)}; admissible is (bins,): use jax.vmap for many"
+        )
+    return divide_by_largest(power, "power")
 
 
 def _unit_pulse(pulse: Float[ArrayLike, " lags"]) -> Float[Array, " lags"]:
-    """Check a pulse and scale it to unit sum. **Raises:** ValueError for an even number of lags."""
-    h = as_array(pulse)
+    """Check a pulse and scale it to unit sum. **Raises:** ValueError for even lags, or a sum of 0."""
     check_range("pulse", pulse)
-    if h.ndim != 1 or h.size % 2 == 0:
+    if np.ndim(pulse) != 1 or np.size(pulse) % 2 == 0:
         raise ValueError(
-            f"pulse has the shape {h.shape}; admissible is (lags,) with an odd number of lags, the middle "
+            f"pulse has the shape {np.shape(pulse)}; admissible is (lags,) with an odd number of lags, the "
+            "middle "
             "one at the pulse's time zero: pad one end with zeros"
         )
+    h, _ = divide_by_largest(pulse, "pulse")
+    total = concrete(jnp.sum(h))
+    if total == 0:
+        raise ValueError("sum of pulse = 0; admissible is a pulse with energy")
     return h / jnp.sum(h)

@@ -33,8 +33,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from inversion.metrics.records import size_bucket
-from jaxlidar.extend import check_range
+from inversion.metrics.records import refuse_baseline, size_bucket
+from jaxlidar.extend import as_numpy, check_integer, check_number, check_range, even_step
 
 # Subdivisions of a bin, where a Gaussian is cut (in standard deviations), and shots computed at a time.
 _SUBDIVISIONS, _CUT, _CHUNK = 4, 2.5, 64
@@ -98,9 +98,7 @@ def gedi_settings(group: int) -> GediSettings:
     >>> inversion.gedi_settings(5)
     GediSettings(smoothing=6.5, mode_smoothing=3.5, front_threshold=3.0, back_threshold=2.0)
     """
-    if isinstance(group, bool) or not isinstance(group, int | np.integer) or int(group) not in _GROUPS:
-        raise ValueError(f"group = {group!r} is outside the admissible range: whole numbers from 1 to 6")
-    return _GROUPS[int(group)]
+    return _GROUPS[check_integer("group", group, 1, len(_GROUPS))]
 
 
 class GediMetrics(NamedTuple):
@@ -143,7 +141,8 @@ def gedi_metrics(shots: Any, settings: GediSettings | None = None) -> GediMetric
     **Returns:** a `GediMetrics`.
 
     **Raises:** TypeError for a path, one shot alone and other things than shots. ValueError for settings that
-    are not above 0, and for records that are not finite or of fewer than three samples.
+    are not above 0, for records that are not finite, of fewer than three samples or with another background
+    than `noise_mean`, and for elevations that do not decrease in even steps.
 
     **Source:** Hofton and Blair (2019), GEDI transmit and receive waveform processing (theoretical basis
     document 1.0); Dubayah et al. (2020), Sci. Remote Sens. 1, 100002.
@@ -179,10 +178,12 @@ def gedi_metrics(shots: Any, settings: GediSettings | None = None) -> GediMetric
             noise, count = np.ones(_CHUNK), np.full(_CHUNK, 3)
             for row, i in enumerate(chunk):
                 shot = shots[i]
-                records[row, : n_samples[i]] = _record_above_noise(shot)
-                noise[row], count[row] = shot.noise_std, n_samples[i]
-                top[i] = shot.elevation[0]
-                step[i] = (shot.elevation[0] - shot.elevation[-1]) / (n_samples[i] - 1)
+                record = _record_above_noise(shot)
+                # Over the largest sample, which single precision holds whatever the unit of the record.
+                peak = np.max(np.abs(record)) or 1.0
+                records[row, : n_samples[i]] = record / peak
+                noise[row], count[row] = shot.noise_std / peak, n_samples[i]
+                top[i], step[i] = shot.elevation[0], even_step("elevation", shot.elevation, decreasing=True)
             computed = _record_features(
                 jnp.asarray(records, float),
                 jnp.asarray(count),
@@ -231,16 +232,18 @@ def _list_of_shots(shots: Any) -> list[Any]:
 
 def _record_above_noise(shot: Any) -> np.ndarray:
     """Record of a shot less its mean noise. **Raises:** ValueError for shapes or values that do not serve."""
-    record = np.asarray(shot.waveform, float)
+    record, _ = as_numpy(shot.waveform, "waveform"), as_numpy(shot.elevation, "elevation")
     if record.ndim != 1 or record.size < 3 or np.shape(shot.elevation) != record.shape:
         raise ValueError(
             f"waveform and elevation have the shapes {record.shape} and {np.shape(shot.elevation)}; "
             "admissible is (bins,) for both, three or more"
         )
     check_range("waveform", record)
-    check_range("noise_mean", shot.noise_mean)
-    check_range("noise_std", shot.noise_std, 0.0)
-    return record - shot.noise_mean
+    check_number("noise_mean", shot.noise_mean)
+    check_number("noise_std", shot.noise_std, 0.0)
+    above_noise = record - float(shot.noise_mean)
+    refuse_baseline("waveform less noise_mean", above_noise, np.asarray(shot.noise_std, float))
+    return above_noise
 
 
 def _smoothing_kernel(width: float) -> np.ndarray:
@@ -289,7 +292,8 @@ def _record_features(
         position = jnp.arange(size)
         # Nothing is extrapolated beyond the last sample.
         is_recorded = position <= (n_samples - 1) * _SUBDIVISIONS
-        fine = jnp.interp(position / _SUBDIVISIONS, jnp.arange(record.size), record)
+        sample = jnp.arange(record.size, dtype=record.dtype)
+        fine = jnp.interp(position.astype(record.dtype) / _SUBDIVISIONS, sample, record)
         fine = jnp.where(is_recorded, fine, 0.0)
         spectra = jnp.fft.rfft(fine, padded)[None, :] * kernel_spectra
         smooth = jnp.fft.irfft(spectra, padded)[:, half : half + size]

@@ -3,8 +3,8 @@ r"""Ends of a record's signal, relative heights and ground, without a model of t
 All functions take one record, (bins,), or several of one length, (shots, bins), heights decreasing. Records
 are padded to size buckets (64, 96, 128, 192, ... bins): each size is compiled once.
 
-**Smoothing.** With a `pulse`, records are smoothed first by the Gaussian of the pulse's peak and area
-(`records.py`).
+**Smoothing.** With a `pulse`, records are smoothed first by a Gaussian somewhat narrower than that of the
+pulse's peak and area (`records.py`).
 
 **Noise.** Thresholds count standard deviations of the noise before smoothing, as GEDI's do: smoothing hardly
 reduces a background that drifts. Where no noise is given, it is estimated by sigma clipping. The signal is
@@ -36,7 +36,10 @@ from jax import lax
 from jaxtyping import Array, ArrayLike, Float
 
 from inversion.metrics.records import (
+    NORMAL_MEDIAN,
+    PaddedRecord,
     Pulse,
+    check_background,
     over_shots,
     pad_record,
     sample_pulse_at_heights,
@@ -46,8 +49,6 @@ from inversion.metrics.records import (
 )
 from jaxlidar.extend import as_array, check_range
 
-# Median of the absolute value of a normal variable of unit variance.
-_NORMAL_MEDIAN = 0.6745
 # Sigma clipping: largest noise in standard deviations, and number of iterations.
 _CLIP, _CLIP_ITERATIONS = 3.0, 5
 # Least height of a mode: in standard deviations of the noise, and over the largest sample.
@@ -96,7 +97,7 @@ def signal_ends(
     **Arguments:**
 
     - `height`: (bins,) m, decreasing in equal steps, as `Waveform.height`; or one row for each shot.
-    - `power`: (bins,) record, background removed; or (shots, bins).
+    - `power`: (bins,) record in any unit, background removed; or (shots, bins).
     - `noise`: standard deviation of a sample of `power`, one number or (shots,). Default: from the record's
       quiet samples.
     - `pulse`: gives the width of the smoothing: a recorded pulse at the record's sampling, (lags,), an odd
@@ -106,7 +107,8 @@ def signal_ends(
 
     **Returns:** a `SignalEnds`.
 
-    **Raises:** ValueError for inadmissible arguments.
+    **Raises:** ValueError for inadmissible arguments, such as uneven steps of `height`, and for a `power`
+    with a baseline, unless a JAX transformation traces them.
 
     **Source:** Hofton and Blair (2019), GEDI transmit and receive waveform processing (theoretical basis
     document).
@@ -120,12 +122,27 @@ def signal_ends(
     >>> print(f"{float(top):.1f} m to {float(bottom):.1f} m")
     15.2 m to 0.8 m
     """
+    record = pad_record(height, power)
+    ends = relative_signal_ends(record, noise=noise, pulse=pulse, threshold=threshold)
+    return SignalEnds(*(record.heights.absolute(end) for end in ends))
+
+
+def relative_signal_ends(
+    record: PaddedRecord,
+    *,
+    noise: ArrayLike | None,
+    pulse: Pulse | None,
+    threshold: float = 6.0,
+) -> SignalEnds:
+    """Return the ends of the signal, as `signal_ends`, relative to the height of the first sample."""
     check_range("threshold", threshold, 0.0)
+    sigma = _optional_noise(record, noise)
+    check_background(record, None if noise is None else sigma)
     top, bottom = _signal_ends(
-        **pad_record(height, power)._asdict(),
-        noise=_optional_noise(noise),
-        pulse=sample_pulse_at_heights(pulse, height),
-        threshold=as_array(threshold),
+        **record.arguments(),
+        noise=sigma,
+        pulse=sample_pulse_at_heights(pulse, record.heights),
+        threshold=as_array(threshold, "threshold"),
     )
     return SignalEnds(top, bottom)
 
@@ -170,15 +187,17 @@ def relative_heights(
     7.0 m, 10.6 m
     """
     check_range("levels", levels, 0.0, 100.0)
+    record = pad_record(height, power)
     if ends is None:
-        ends = signal_ends(height, power, noise=noise, pulse=pulse, threshold=threshold)
-    top, bottom = (as_array(end) for end in ends)
+        top, bottom = relative_signal_ends(record, noise=noise, pulse=pulse, threshold=threshold)
+    else:
+        top, bottom = (record.heights.relative(end, "ends") for end in ends)
     return _relative_heights(
-        **pad_record(height, power)._asdict(),
+        **record.arguments(),
         top=top,
         bottom=bottom,
-        fractions=as_array(levels) / 100.0,
-        ground=as_array(ground),
+        fractions=as_array(levels, "levels") / 100.0,
+        ground=record.heights.relative(ground, "ground"),
     )
 
 
@@ -207,7 +226,7 @@ def find_ground(
 
     **Returns:** the height in m, () or (shots,); NaN where there is no such mode.
 
-    **Raises:** ValueError for inadmissible arguments.
+    **Raises:** as `signal_ends`.
 
     **Example:**
 
@@ -218,21 +237,35 @@ def find_ground(
     1.6 m
     """
     record = pad_record(height, power)
-    sigma = _optional_noise(noise)
+    ground = relative_ground(record, pulse=pulse, noise=noise, threshold=threshold)
+    return record.heights.absolute(ground)
+
+
+def relative_ground(
+    record: PaddedRecord,
+    *,
+    pulse: Pulse | None,
+    noise: ArrayLike | None,
+    threshold: ArrayLike | None = None,
+) -> Array:
+    """Return the height of the ground, as `find_ground`, relative to that of the first sample."""
+    sigma = _optional_noise(record, noise)
+    # NaN asks the compiled program for the default, so that both cases share it.
+    least = jnp.full((), jnp.nan, record.power.dtype)
     if threshold is not None:
         check_range("threshold", threshold)
-    # NaN asks the compiled program for the default, so that both cases share it.
-    least = jnp.full((), jnp.nan, record.power.dtype) if threshold is None else as_array(threshold)
-    lags = sample_pulse_at_heights(pulse, height)
-    return _find_ground(**record._asdict(), noise=sigma, pulse=lags, threshold=least)
+        least = record.over_magnitude(threshold, "threshold")
+    check_background(record, None if noise is None else sigma, None if threshold is None else least)
+    lags = sample_pulse_at_heights(pulse, record.heights)
+    return _find_ground(**record.arguments(), noise=sigma, pulse=lags, threshold=least)
 
 
-def _optional_noise(noise: ArrayLike | None) -> Array:
-    """Return the noise, or NaN, which asks the compiled programs to estimate it."""
+def _optional_noise(record: PaddedRecord, noise: ArrayLike | None) -> Array:
+    """Return the noise in the unit of the padded record, or NaN, which asks programs to estimate it."""
     if noise is None:
         return jnp.full((), jnp.nan)
     check_range("noise", noise, 0.0)
-    return as_array(noise)
+    return record.over_magnitude(noise, "noise")
 
 
 def _smooth(y: Array, kernel: Array) -> Array:
@@ -246,11 +279,11 @@ def _smooth(y: Array, kernel: Array) -> Array:
 
 def _noise_level(y: Array, noise: Array, is_recorded: Array) -> Array:
     """Return the standard deviation of the noise: as given or, where it is NaN, by sigma clipping."""
-    start = jnp.nanmedian(jnp.where(is_recorded & (y < 0), -y, jnp.nan)) / _NORMAL_MEDIAN
+    start = jnp.nanmedian(jnp.where(is_recorded & (y < 0), -y, jnp.nan)) / NORMAL_MEDIAN
 
     def clip(sigma: Array, _: None) -> tuple[Array, None]:
         is_quiet = is_recorded & (jnp.abs(y) <= _CLIP * sigma)
-        variance = jnp.sum(jnp.where(is_quiet, y * y, 0.0)) / jnp.maximum(jnp.sum(is_quiet), 1)
+        variance = jnp.sum(jnp.where(is_quiet, y * y, 0.0)) / jnp.maximum(jnp.sum(is_quiet, dtype=y.dtype), 1)
         return jnp.sqrt(jnp.where(variance > 0, variance, 0.0)), None
 
     start = jnp.where(jnp.isnan(start), 0.0, start)
@@ -259,13 +292,14 @@ def _noise_level(y: Array, noise: Array, is_recorded: Array) -> Array:
     return jnp.where(jnp.isnan(noise), lax.stop_gradient(estimate), noise)
 
 
-@over_shots(height=1, power=1, n_samples=0, pulse=1, noise=0, threshold=0)
-def _signal_ends(height, power, n_samples, pulse, noise, threshold):
-    """Heights of the first and last crossing of the threshold in one padded record.
+@over_shots(step=0, power=1, n_samples=0, pulse=1, noise=0, threshold=0)
+def _signal_ends(step, power, n_samples, pulse, noise, threshold):
+    """Heights of the first and last crossing of the threshold in one padded record, over its first sample.
 
     1. Smooth; find the first and the last sample above the level.
     2. Interpolate between that sample and the one outside of it.
     """
+    height = -step * jnp.arange(power.size, dtype=power.dtype)
     is_recorded = jnp.arange(power.size) < n_samples
     smooth = _smooth(power, smooth_pulse(pulse).kernel)
     level = threshold * _noise_level(power, noise, is_recorded)
@@ -283,16 +317,18 @@ def _signal_ends(height, power, n_samples, pulse, noise, threshold):
     return jnp.where(has_signal, top, jnp.nan), jnp.where(has_signal, bottom, jnp.nan)
 
 
-@over_shots(height=1, power=1, n_samples=0, top=0, bottom=0, fractions=1, ground=0)
-def _relative_heights(height, power, n_samples, top, bottom, fractions, ground):
+@over_shots(step=0, power=1, n_samples=0, top=0, bottom=0, fractions=1, ground=0)
+def _relative_heights(step, power, n_samples, top, bottom, fractions, ground):
     """Heights above the ground below which fractions of the energy lie, of one padded record.
+
+    Ends and ground count from the first sample.
 
     1. Turn the record over, from below; its padding then comes first and has no weight.
     2. Weight each sample by the fraction of its bin that lies between the ends of the signal.
     3. Cumulate to the edges of bins, and invert by linear interpolation.
     """
-    z, y, is_recorded = height[::-1], power[::-1], jnp.arange(power.size)[::-1] < n_samples
-    step = jnp.abs(z[-1] - z[-2])
+    number = jnp.arange(power.size)[::-1]
+    z, y, is_recorded = -step * number.astype(power.dtype), power[::-1], number < n_samples
     half = 0.5 * step
     bin_top, bin_bottom = jnp.minimum(z + half, top), jnp.maximum(z - half, bottom)
     overlap = jnp.where(is_recorded, jnp.maximum(bin_top - bin_bottom, 0.0) / step, 0.0)
@@ -307,9 +343,9 @@ def _relative_heights(height, power, n_samples, top, bottom, fractions, ground):
     return jnp.where(energy[-1] > 0, heights, jnp.nan) - ground
 
 
-@over_shots(height=1, power=1, n_samples=0, pulse=1, noise=0, threshold=0)
-def _find_ground(height, power, n_samples, pulse, noise, threshold):
-    """Height of the lowest mode that no tail explains, in one padded record.
+@over_shots(step=0, power=1, n_samples=0, pulse=1, noise=0, threshold=0)
+def _find_ground(step, power, n_samples, pulse, noise, threshold):
+    """Height of the lowest mode that no tail explains, in one padded record, over its first sample.
 
     1. Smooth, and set the least height of a mode from threshold, noise and largest sample.
     2. Find the modes: local maxima above it.
@@ -317,13 +353,13 @@ def _find_ground(height, power, n_samples, pulse, noise, threshold):
     4. Interpolate the lowest mode that remains, and go back from the mode of a smoothed echo to the pulse's
        time zero.
     """
-    number = jnp.arange(power.size)
+    number = jnp.arange(power.size, dtype=jnp.int32)
     is_recorded = number < n_samples
     echo = smooth_pulse(pulse)
     smooth = jnp.where(is_recorded, _smooth(power, echo.kernel), 0.0)
     sigma = _noise_level(power, noise, is_recorded)
     least = jnp.where(jnp.isnan(threshold), _MODE_THRESHOLD * sigma, threshold)
-    least = jnp.maximum(least, _MODE_FRACTION * jnp.max(smooth) * (pulse.size > 1))
+    least = jnp.maximum(least, _MODE_FRACTION * jnp.max(smooth) if pulse.size > 1 else 0.0)
     inner = smooth[1:-1]
     # A plateau of two equal samples is one mode: it exceeds the sample before, not the one after.
     is_mode = (inner > smooth[:-2]) & (inner >= smooth[2:]) & (inner > least) & is_recorded[2:]
@@ -336,5 +372,5 @@ def _find_ground(height, power, n_samples, pulse, noise, threshold):
         tail_here = jnp.where((distance > 0) & (distance < tail.size), tail_here, 0.0)
         is_mode &= inner > least + jnp.max(tail_here * strength[None, :], axis=1)
     lowest = power.size - 2 - jnp.argmax(is_mode[::-1])
-    ground = height[lowest] - (height[0] - height[1]) * (vertex_offset(smooth, lowest) - echo.mode)
+    ground = -step * (lowest.astype(power.dtype) + vertex_offset(smooth, lowest) - echo.mode)
     return jnp.where(jnp.any(is_mode), ground, jnp.nan)

@@ -24,7 +24,7 @@ from jaxtyping import ArrayLike, Float, Int
 from scipy import spatial, stats
 
 from jaxlidar import SPEED_OF_LIGHT, PhotonEvents
-from jaxlidar.extend import check_integer, check_kind, check_range
+from jaxlidar.extend import as_numpy, check_integer, check_kind, check_range
 
 # Half-axes of the ellipse in m: along the track, in height.
 _ALONG, _HIGH = 10.0, 3.0
@@ -118,7 +118,9 @@ def photon_ground_and_canopy(
     check_range("segment", segment, 0.0, low_open=True)
     check_range("percentile", percentile, 0.0, 100.0)
     least = check_integer("least", least, 2)
-    along = np.asarray(distance, float)
+    if background_rate is not None:
+        check_range("background_rate", background_rate, 0.0)
+    along = as_numpy(distance, "distance")
     if along.shape != (len(events.lost),) or np.ptp(along) == 0:
         raise ValueError(
             f"distance has shape {along.shape}; admissible is one for each of the {len(events.lost)} shots "
@@ -133,7 +135,6 @@ def photon_ground_and_canopy(
     if background_rate is None:
         density = _background_density(x - start, z, length, events.window)
     else:
-        check_range("background_rate", background_rate, 0.0)
         rate_per_metre = 1e-9 * background_rate * 2.0 / SPEED_OF_LIGHT
         density = rate_per_metre * len(along) * events.pulses / length
 

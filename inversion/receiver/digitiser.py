@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import ArrayLike, Float, Shaped
 
 from inversion.receiver.impulse import HardTargetEcho, receiver_impulse
-from jaxlidar.extend import check_range
+from jaxlidar.extend import as_numpy, check_number, check_range
 from jaxlidar.io.noise import above_pedestal
 
 # Tables in decibels mark counts without an amplitude by entries below this (RIEGL's PulseWaves: -2e37).
@@ -92,18 +92,19 @@ def amplitudes(
     ([2.0, 5.0, 9.0], [0.5, 1.5, inf])
     """
     check_range("noise", noise, 0.0, low_open=True)
-    samples = np.asarray(counts, float)
+    samples = as_numpy(counts, "counts")
     check_range("counts", samples, 0.0)
     if table is None:
         values, sigma = samples, np.full(samples.shape, float(noise))
     else:
-        amplitude_of_count = amplitude_table(np.asarray(table, float), decibels)
+        amplitude_of_count = amplitude_table(as_numpy(table, "table", missing=True), decibels)
         check_range("counts", samples, 0.0, amplitude_of_count.size - 1)
         saturation = amplitude_of_count.size - 1 if saturation is None else saturation
         table_counts = np.arange(amplitude_of_count.size)
         values = np.interp(samples, table_counts, amplitude_of_count)
         sigma = noise * np.interp(samples, table_counts, np.gradient(amplitude_of_count))
     if saturation is not None:
+        check_number("saturation", saturation)
         sigma = np.where(samples >= saturation, np.inf, sigma)
     return Amplitudes(values, sigma)
 
@@ -187,15 +188,16 @@ def corrected_table(
             f"pulses and echoes are {len(pulses)} and {len(echoes)}; admissible are as many, one or more"
         )
     check_range("noise", noise, 0.0, low_open=True)
-    knot_counts = np.asarray(knots, float)
+    knot_counts = as_numpy(knots, "knots")
     check_range("knots", knot_counts, 0.0)
     if knot_counts.ndim != 1 or knot_counts.size < 2 or not np.all(np.diff(knot_counts) > 0):
         raise ValueError(f"knots = {knots!r}; admissible are two or more that increase")
-    uncorrected = amplitude_table(np.asarray(table, float), decibels)
+    uncorrected = amplitude_table(as_numpy(table, "table", missing=True), decibels)
     counts = np.arange(uncorrected.size)
+    pulses, echoes = ([as_numpy(r, n) for r in x] for n, x in (("pulses", pulses), ("echoes", echoes)))
     for name, records in (("pulses", pulses), ("echoes", echoes)):
         for record in records:
-            check_range(name, np.asarray(record, float), 0.0, uncorrected.size - 1)
+            check_range(name, record, 0.0, uncorrected.size - 1)
     correction = np.ones(knot_counts.size)
     for _ in range(_ROUNDS):
         corrected = uncorrected * np.interp(counts, knot_counts, correction)

@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import ArrayLike, Float
 
 from jaxlidar import SampledPulse
-from jaxlidar.extend import check_integer, check_range
+from jaxlidar.extend import as_numpy, check_integer, check_range, even_step
 
 # Rounds of positions and response, and the shifts that the first and the later rounds search, in samples
 # about the last position.
@@ -54,7 +54,8 @@ def recorded_pulse(
 
     **Returns:** a `SampledPulse`; samples that ringing makes negative are zero.
 
-    **Raises:** ValueError for times that are not in equal steps, and as `SampledPulse`.
+    **Raises:** ValueError for times that are not in equal steps, for power without a positive sample, and as
+    `SampledPulse`.
 
     **Example:**
 
@@ -67,12 +68,17 @@ def recorded_pulse(
     0.000
     """
     finer = check_integer("finer", finer)
-    t, y = np.asarray(time, float), np.asarray(power, float)
+    t, y = as_numpy(time, "time"), as_numpy(power, "power")
     check_range("power", y)
-    if t.ndim != 1 or t.shape != y.shape or t.size < 2 or not np.allclose(np.diff(t), t[1] - t[0], rtol=1e-3):
-        raise ValueError(f"time and power have the shapes {t.shape} and {y.shape}, or uneven steps")
-    step = (t[-1] - t[0]) / (t.size - 1)
-    padded = np.pad(y, _PADDING)
+    if t.ndim != 1 or t.shape != y.shape or t.size < 2:
+        raise ValueError(
+            f"time and power have the shapes {t.shape} and {y.shape}; admissible is (samples,) for both, two "
+            "or more"
+        )
+    step = float(even_step("time", time))
+    check_range("largest power", y.max(), 0.0, low_open=True)
+    # The scale of a pulse does not matter, but single precision may not hold it.
+    padded = np.pad(y / y.max(), _PADDING)
     n_fine = finer * padded.size
     frequency = np.fft.rfftfreq(padded.size)
     smoothing = np.sinc(frequency) * np.sinc(frequency / finer) ** 2
@@ -114,7 +120,9 @@ def receiver_impulse(
     **Returns:** (2 n + 1,) with time zero in the middle, n the larger of `before` and `after`, of sum
     one, for `Recorder.impulse`. It may be negative.
 
-    **Raises:** ValueError for numbers of pulses, echoes and noises that differ, or are zero.
+    **Raises:** ValueError for numbers of pulses, echoes and noises that differ, or are zero, for samples that
+    are not finite, for pulses without a positive sample, for noise that is not above 0, of another length
+    than its echo, or infinite throughout all echoes, and for echoes without signal.
 
     **Example:** a receiver with an exponential tail.
 
@@ -136,9 +144,12 @@ def receiver_impulse(
         )
     check_integer("interleaved", interleaved)
     lags = np.arange(-check_integer("before", before, 0), check_integer("after", after, 0) + 1)
-    shots = [
-        HardTargetEcho(pulse, echo, sigma, interleaved) for pulse, echo, sigma in zip(pulses, echoes, noise)
-    ]
+    records = {"pulses": pulses, "echoes": echoes, "noise": noise}
+    arrays = zip(*([as_numpy(record, name) for record in records[name]] for name in records))
+    shots = []
+    for pulse, echo, sigma in arrays:
+        _check_hard_target(pulse, echo, sigma)
+        shots.append(HardTargetEcho(pulse, echo, sigma, interleaved))
     response = np.where(lags == 0, 1.0, 0.0)
     for iteration in range(_ROUNDS):
         rows = []
@@ -147,6 +158,8 @@ def receiver_impulse(
             rows.append((shot.amplitude * shot.delayed_pulses(lags), shot.whitened))
         columns, whitened = (np.concatenate(arrays) for arrays in zip(*rows))
         information = columns.T @ columns
+        if not np.trace(information) > 0:
+            raise ValueError("echoes have no signal like their pulses; admissible is one or more that has")
         ridge = _RIDGE * np.trace(information) / lags.size * np.eye(lags.size)
         response = np.linalg.solve(information + ridge, columns.T @ whitened)
         response = response / np.sum(response)
@@ -155,6 +168,19 @@ def receiver_impulse(
     impulse = np.zeros(2 * half + 1)
     impulse[half - before : half + after + 1] = response
     return impulse
+
+
+def _check_hard_target(pulse: np.ndarray, echo: np.ndarray, noise: np.ndarray) -> None:
+    """Refuse a shot from which no response can be estimated. **Raises:** ValueError."""
+    if pulse.ndim != 1 or echo.ndim != 1 or noise.shape != echo.shape or not pulse.size or not echo.size:
+        raise ValueError(
+            f"pulses, echoes and noise have the shapes {pulse.shape}, {echo.shape} and {noise.shape}; "
+            "admissible is (lags,) for a pulse and (bins,) for an echo and its noise"
+        )
+    check_range("pulses", pulse)
+    check_range("echoes", echo)
+    check_range("largest sample of pulses", pulse.max(), 0.0, low_open=True)
+    check_range("noise", np.where(np.isposinf(noise), 1.0, noise), 0.0, low_open=True)
 
 
 class HardTargetEcho:
@@ -204,6 +230,8 @@ class HardTargetEcho:
         received = self._response_spectrum(lags, response) * self._spectrum
         models = self._records(received[:, None] * self._shift(shifts))
         matched, norm = self.whitened @ models, np.sum(models**2, axis=0)
+        # A shot of infinite noise has neither; its amplitude is then zero.
+        norm = np.where(norm > 0, norm, 1.0)
         # A negative match would be an echo of negative amplitude.
         best = int(np.argmax(np.where(matched > 0, matched**2 / norm, 0.0)))
         self.position += float(shifts[best])

@@ -17,7 +17,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxlidar.extend import as_array, as_scalar, briefly, check_integer, check_range
+from jaxlidar.extend import (
+    Converted,
+    as_array,
+    as_numpy,
+    as_scalar,
+    briefly,
+    check_integer,
+    check_number,
+    check_range,
+)
 
 # Names of the unknowns that a recorder adds to a fit.
 WIDTH_NAME, OFFSET_NAME = "receiver width", "offset"
@@ -27,11 +36,6 @@ BoundPair = tuple[float, float]
 
 def _optional_impulse(x: Any) -> Array | None:
     return None if x is None else as_array(x, "impulse")
-
-
-def _scalar(x: Any) -> Array:
-    # Converters of fields are called with one argument.
-    return as_scalar(x)
 
 
 @final
@@ -75,11 +79,15 @@ class Recorder(eqx.Module):
     """
 
     width: BoundPair | None = eqx.field(static=True, default=None)
-    impulse: Float[Array, " lags"] | None = eqx.field(converter=_optional_impulse, default=None)
+    impulse: Converted[Float[Array, " lags"] | None] = eqx.field(converter=_optional_impulse, default=None)
     offset: BoundPair | None = eqx.field(static=True, default=None)
     interleaved: int = eqx.field(static=True, default=1)
-    pulse_noise: Float[Array, ""] = eqx.field(converter=_scalar, default=0.0)
-    correlation: Float[Array, ""] = eqx.field(converter=_scalar, default=0.0)
+    pulse_noise: Converted[Float[Array, ""]] = eqx.field(
+        converter=lambda x: as_scalar(x, "pulse_noise"), default=0.0
+    )
+    correlation: Converted[Float[Array, ""]] = eqx.field(
+        converter=lambda x: as_scalar(x, "correlation"), default=0.0
+    )
 
     def __check_init__(self):
         for field, low in (("width", 0.0), ("offset", -np.inf)):
@@ -109,7 +117,8 @@ class Recorder(eqx.Module):
 
         **Returns:** (..., bins) in the unit of the record.
         """
-        waveform = np.asarray(reflectance, float)
+        waveform = as_numpy(reflectance, "reflectance")
+        check_number("step", step, 0.0, low_open=True)
         bins = waveform.shape[-1]
         width = float(np.asarray(values.get(WIDTH_NAME, 0.0)))
         received = ReceiverResponse(self, bins, step)(waveform, width)
@@ -150,10 +159,10 @@ class ReceiverResponse:
 
 
 def _check_bounds(field: str, bounds: Any, least: float) -> None:
+    check_range(field, bounds, least)
     try:
         low, high = (float(b) for b in bounds)
     except (TypeError, ValueError):
         raise ValueError(f"{field} = {bounds!r} is not a pair (low, high)") from None
-    check_range(field, [low, high], least)
     if not low < high:
         raise ValueError(f"{field} = {bounds!r} is not low < high")

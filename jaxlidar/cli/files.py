@@ -13,9 +13,7 @@ from jaxlidar.io import (
     Case,
     atomic_write,
     read_case,
-    read_dem,
     read_gedi_l1b,
-    read_las,
     read_las_waveforms,
     read_neon,
     read_obj,
@@ -25,6 +23,8 @@ from jaxlidar.io import (
     write_case,
     write_las_waveforms,
 )
+from jaxlidar.io.dem import read_grid
+from jaxlidar.io.las import read_stored_points
 from jaxlidar.io.las_waveforms import has_packets
 from jaxlidar.io.netcdf import open as open_result
 from jaxlidar.optics.prospect import Prospect
@@ -63,9 +63,15 @@ def describe_voxels(voxels: VoxelMap, dropped: dict[str, int]) -> str:
 
 
 def describe_points(path: Path) -> str:
-    cloud = read_las(path)
-    spans = _spans(cloud.position.min(axis=0), cloud.position.max(axis=0))
-    lines = [f"{len(cloud.position):,} points: {spans}"]
+    # In the file's own units, so that points in degrees can be described.
+    cloud, system = read_stored_points(path)
+    low, high = cloud.position.min(axis=0), cloud.position.max(axis=0)
+    if system.kind == "map":
+        horizontal, vertical = system.lengths(f"{path}: header")
+        spans = _spans(low * [horizontal, horizontal, vertical], high * [horizontal, horizontal, vertical])
+    else:
+        spans = ", ".join(f"{axis} {a:.9g} to {b:.9g}" for axis, a, b in zip("xyz", low, high))
+    lines = [f"{len(cloud.position):,} points: {spans}, {system.name}"]
     text = _with_counts(lines, cloud.dropped, "points left out: ")
     return "\n".join([text, describe_shots(read_las_waveforms(path))]) if has_packets(path) else text
 
@@ -132,14 +138,16 @@ def describe_mesh(path: Path) -> str:
 
 
 def describe_terrain(path: Path) -> str:
-    terrain, crs, filled = read_dem(path)
-    heights, spacing = np.asarray(terrain.heights), np.asarray(terrain.spacing)
-    nodes, spacings = " x ".join(map(str, heights.shape)), " x ".join(f"{step:g}" for step in spacing)
+    grid = read_grid(path)
+    nodes = " x ".join(map(str, grid.heights.shape))
+    spacings = " x ".join(f"{step:g}" for step in grid.spacing)
+    heights = grid.heights[np.isfinite(grid.heights)]
+    range_of_heights = f"{heights.min():.2f} to {heights.max():.2f} m" if heights.size else "unknown"
     lines = [
         f"terrain of {nodes} nodes, {spacings} m apart",
-        f"heights {heights.min():.2f} to {heights.max():.2f} m, {crs or 'no coordinate reference system'}",
+        f"heights {range_of_heights}, {grid.crs or 'no coordinate reference system'}",
     ]
-    return "\n".join([*lines, *([f"{filled} nodes without data"] if filled else [])])
+    return _with_counts(lines, {"without data": grid.heights.size - heights.size}, "nodes ")
 
 
 def describe_spectrum(path: Path) -> str:

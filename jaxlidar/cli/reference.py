@@ -1,7 +1,6 @@
 """`jaxlidar reference`."""
 
 import re
-import shutil
 import sys
 import types
 from importlib import metadata
@@ -10,6 +9,7 @@ from pathlib import Path
 import click
 
 from jaxlidar.cli.constants import COMMANDS, version
+from jaxlidar.io import atomic_write
 
 LINK = re.compile(r"(!?)\[([^]]*)\]\(([^)#\s]*)(#[^)]*)?\)")
 # Of the web pages that are made from pages of documentation.
@@ -48,14 +48,17 @@ def reference(out: Path) -> None:
         modules[module_name] = doc.Module(_page_module(path, pages, pictures))
     render.configure(docformat="markdown", footer_text=f"jaxlidar {version()}", show_source=False)
     for name, module in modules.items():
-        web_page = out / f"{name.replace('.', '/')}.html"
-        web_page.parent.mkdir(parents=True, exist_ok=True)
-        web_page.write_text(render.html_module(module, modules), encoding="utf-8")
-    (out / "index.html").write_text(render.html_index(modules), encoding="utf-8")
-    (out / "search.js").write_text(render.search_index(modules), encoding="utf-8")
+        _write(out / f"{name.replace('.', '/')}.html", render.html_module(module, modules).encode())
+    _write(out / "index.html", render.html_index(modules).encode())
+    _write(out / "search.js", render.search_index(modules).encode())
     for name, picture in pictures.items():
-        shutil.copyfile(picture, out / PAGES / name)
+        _write(out / PAGES / name, picture.read_bytes())
     click.echo(f"{len(modules)} web pages: {out / 'jaxlidar.html'}")
+
+
+def _write(path: Path, content: bytes) -> None:
+    with atomic_write(path) as draft:
+        draft.write_bytes(content)
 
 
 def _is_module(name: str) -> bool:

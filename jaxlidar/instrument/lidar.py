@@ -33,6 +33,7 @@ from jaxlidar._checks import (
     scalar,
     warn_units,
 )
+from jaxlidar._converted import Converted
 from jaxlidar._ranges import Range, check_ranges
 from jaxlidar._signatures import briefly
 from jaxlidar.instrument.pulse import AbstractPulse, GaussianPulse
@@ -102,24 +103,26 @@ class Lidar(eqx.Module):
     ['0.0', '-88.2', '500.0']
     """
 
-    wavelength: Float[Array, " wavelengths"] = eqx.field(converter=_wavelengths, default=1064.0)
-    altitude: Float[Array, ""] = eqx.field(converter=scalar("altitude"), default=1000.0)
+    wavelength: Converted[Float[Array, " wavelengths"]] = eqx.field(converter=_wavelengths, default=1064.0)
+    altitude: Converted[Float[Array, ""]] = eqx.field(converter=scalar("altitude"), default=1000.0)
     pulse: AbstractPulse = eqx.field(default_factory=GaussianPulse)
-    divergence: Float[Array, ""] = eqx.field(converter=scalar("divergence"), default=0.3)
-    aperture: Float[Array, ""] = eqx.field(converter=scalar("aperture"), default=0.2)
-    zenith: Float[Array, ""] = eqx.field(converter=scalar("zenith"), default=0.0)
-    azimuth: Float[Array, ""] = eqx.field(converter=scalar("azimuth"), default=0.0)
-    energy: Float[Array, "..."] = eqx.field(converter=array("energy"), default=1e-3)
-    sampling_interval: Float[Array, ""] = eqx.field(converter=scalar("sampling_interval"), default=1.0)
+    divergence: Converted[Float[Array, ""]] = eqx.field(converter=scalar("divergence"), default=0.3)
+    aperture: Converted[Float[Array, ""]] = eqx.field(converter=scalar("aperture"), default=0.2)
+    zenith: Converted[Float[Array, ""]] = eqx.field(converter=scalar("zenith"), default=0.0)
+    azimuth: Converted[Float[Array, ""]] = eqx.field(converter=scalar("azimuth"), default=0.0)
+    energy: Converted[Float[Array, "..."]] = eqx.field(converter=array("energy"), default=1e-3)
+    sampling_interval: Converted[Float[Array, ""]] = eqx.field(
+        converter=scalar("sampling_interval"), default=1.0
+    )
     profile: str = eqx.field(static=True, default="gaussian")
-    position: Float[Array | np.ndarray, " 2"] = eqx.field(
+    position: Converted[Float[Array | np.ndarray, " 2"]] = eqx.field(
         converter=coordinates("position", 2), default=(0.0, 0.0)
     )
-    field_of_view: Float[Array, ""] | None = eqx.field(
+    field_of_view: Converted[Float[Array, ""] | None] = eqx.field(
         converter=optional_scalar("field_of_view"), default=None
     )
-    jitter: Float[Array, ""] = eqx.field(converter=scalar("jitter"), default=0.0)
-    efficiency: Float[Array, "..."] = eqx.field(converter=array("efficiency"), default=1.0)
+    jitter: Converted[Float[Array, ""]] = eqx.field(converter=scalar("jitter"), default=0.0)
+    efficiency: Converted[Float[Array, "..."]] = eqx.field(converter=array("efficiency"), default=1.0)
     receiver: Receiver = eqx.field(default_factory=Receiver)
 
     ranges: ClassVar = {

@@ -46,6 +46,7 @@ from jaxlidar._checks import (
     scalar,
 )
 from jaxlidar._constants import PLANCK_TIMES_LIGHT, SPEED_OF_LIGHT
+from jaxlidar._converted import Converted
 from jaxlidar._ranges import FRACTION, Range, check_ranges
 from jaxlidar._registry import save_result
 from jaxlidar._signatures import briefly
@@ -54,7 +55,7 @@ from jaxlidar._signatures import briefly
 _MAX_EVENTS = 1e8
 _MAX_ARRIVALS = 1e15
 # Largest fraction of a waveform's energy by which noise may make samples negative.
-_MAX_NEGATIVE_FRACTION = 0.01
+MAX_NEGATIVE_FRACTION = 0.01
 # Pixels, over all pulses and wavelengths, whose events are drawn at once.
 _BLOCK_SIZE = 2_000_000
 # Above this expectation a Poisson count is drawn as a normal variable (skewness below 1e-3).
@@ -99,13 +100,15 @@ class PhotonCounter(eqx.Module):
     """
 
     pixels: int = eqx.field(static=True, default=16)
-    dead_time: Float[Array, ""] = eqx.field(converter=scalar("dead_time"), default=3.2)
-    detection_probability: Float[Array, "..."] = eqx.field(
+    dead_time: Converted[Float[Array, ""]] = eqx.field(converter=scalar("dead_time"), default=3.2)
+    detection_probability: Converted[Float[Array, "..."]] = eqx.field(
         converter=array("detection_probability"), default=1.0
     )
-    background_rate: Float[Array, "..."] = eqx.field(converter=array("background_rate"), default=0.0)
-    jitter: Float[Array, ""] = eqx.field(converter=scalar("jitter"), default=0.0)
-    window: Float[Array, "..."] | None = eqx.field(converter=_window, default=None)
+    background_rate: Converted[Float[Array, "..."]] = eqx.field(
+        converter=array("background_rate"), default=0.0
+    )
+    jitter: Converted[Float[Array, ""]] = eqx.field(converter=scalar("jitter"), default=0.0)
+    window: Converted[Float[Array, "..."] | None] = eqx.field(converter=_window, default=None)
 
     ranges: ClassVar = {
         "dead_time": Range(0.0),
@@ -368,14 +371,22 @@ def _nonnegative(energy: Any) -> np.ndarray:
     """Set energies that noise made negative to zero. **Raises:** ValueError where they are too many."""
     energy = np.asarray(energy, float)
     check_range("energy", energy)
+    check_negative_energy(energy)
+    return np.maximum(energy, 0.0)
+
+
+def check_negative_energy(energy: np.ndarray) -> None:
+    """Refuse waveforms, (..., bins), from which negative samples take more than the noise of a simulation.
+
+    **Raises:** ValueError with the lowest sample.
+    """
     positive = np.maximum(energy, 0.0)
     negative_part = np.sum(positive - energy, axis=-1)
-    if np.any(negative_part > _MAX_NEGATIVE_FRACTION * np.sum(positive, axis=-1)):
+    if np.any(negative_part > MAX_NEGATIVE_FRACTION * np.sum(positive, axis=-1)):
         raise ValueError(
             f"energy = {energy.min():g} is too far below zero; admissible are samples that all together "
-            f"take up to {_MAX_NEGATIVE_FRACTION:.0%} from their waveform"
+            f"take up to {MAX_NEGATIVE_FRACTION:.0%} from their waveform"
         )
-    return positive
 
 
 def _shot_blocks(shots: int, pixels_per_shot: int) -> Iterator[slice]:

@@ -39,6 +39,7 @@ from jax.scipy.special import erfc
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxlidar._checks import as_array, as_scalar, check_range, concrete, scalar, warn_units
+from jaxlidar._converted import Converted
 from jaxlidar._ranges import Range, check_ranges
 from jaxlidar._signatures import briefly
 
@@ -129,7 +130,7 @@ class AbstractPulse(eqx.Module):
         **Returns:** an array shaped as `t`. Where the power jumps, it is half the jump. A pulse of zero width
         has no finite power: its step counts as flat, and the result is zero everywhere.
         """
-        t = as_array(t)
+        t = as_array(t, "t")
         return jax.jvp(lambda u: self.cumulative(u, jitter), (t,), (jnp.ones_like(t),))[1]
 
 
@@ -153,7 +154,7 @@ class GaussianPulse(AbstractPulse):
     0.500
     """
 
-    fwhm: Float[Array, ""] = eqx.field(converter=scalar("fwhm"), default=6.0)
+    fwhm: Converted[Float[Array, ""]] = eqx.field(converter=scalar("fwhm"), default=6.0)
 
     ranges: ClassVar = {"fwhm": Range(0.0)}
 
@@ -162,7 +163,7 @@ class GaussianPulse(AbstractPulse):
         warn_units(self)
 
     def cumulative(self, t: ArrayLike, jitter: ArrayLike = 0.0) -> Float[Array, "..."]:
-        return _normal_cdf(_z_score(as_array(t), _safe_hypot(self.std, as_scalar(jitter))))
+        return _normal_cdf(_z_score(as_array(t, "t"), _safe_hypot(self.std, as_scalar(jitter, "jitter"))))
 
     @property
     def mean(self) -> Float[Array, ""]:
@@ -177,7 +178,7 @@ class GaussianPulse(AbstractPulse):
         return self.std
 
     def support(self, jitter: ArrayLike = 0.0) -> tuple[float, float]:
-        extent = _GAUSSIAN_EXTENT * math.hypot(float(self.std), float(as_scalar(jitter)))
+        extent = _GAUSSIAN_EXTENT * math.hypot(float(self.std), float(as_scalar(jitter, "jitter")))
         return -extent, extent
 
 
@@ -201,7 +202,7 @@ class RectangularPulse(AbstractPulse):
     1.732 ns, 0.75 of the energy by 1.5 ns
     """
 
-    length: Float[Array, ""] = eqx.field(converter=scalar("length"), default=6.0)
+    length: Converted[Float[Array, ""]] = eqx.field(converter=scalar("length"), default=6.0)
 
     ranges: ClassVar = {"length": Range(0.0)}
 
@@ -210,7 +211,7 @@ class RectangularPulse(AbstractPulse):
         warn_units(self)
 
     def cumulative(self, t: ArrayLike, jitter: ArrayLike = 0.0) -> Float[Array, "..."]:
-        return _segment_integrals(as_array(t), self.length, jnp.abs(as_scalar(jitter)))[0]
+        return _segment_integrals(as_array(t, "t"), self.length, jnp.abs(as_scalar(jitter, "jitter")))[0]
 
     @property
     def mean(self) -> Float[Array, ""]:
@@ -225,7 +226,7 @@ class RectangularPulse(AbstractPulse):
         return jnp.zeros_like(self.length)
 
     def support(self, jitter: ArrayLike = 0.0) -> tuple[float, float]:
-        extent = 0.5 * float(self.length) + _GAUSSIAN_EXTENT * float(as_scalar(jitter))
+        extent = 0.5 * float(self.length) + _GAUSSIAN_EXTENT * float(as_scalar(jitter, "jitter"))
         return -extent, extent
 
 
@@ -253,8 +254,8 @@ class ExponentiallyModifiedGaussianPulse(AbstractPulse):
     0.570 of the energy, standard deviation 2.371 ns
     """
 
-    fwhm: Float[Array, ""] = eqx.field(converter=scalar("fwhm"))
-    decay: Float[Array, ""] = eqx.field(converter=scalar("decay"))
+    fwhm: Converted[Float[Array, ""]] = eqx.field(converter=scalar("fwhm"))
+    decay: Converted[Float[Array, ""]] = eqx.field(converter=scalar("decay"))
 
     ranges: ClassVar = {"fwhm": Range(0.0), "decay": Range(0.0)}
 
@@ -263,8 +264,8 @@ class ExponentiallyModifiedGaussianPulse(AbstractPulse):
         warn_units(self)
 
     def cumulative(self, t: ArrayLike, jitter: ArrayLike = 0.0) -> Float[Array, "..."]:
-        sigma = _safe_hypot(self.fwhm / _FWHM_PER_SIGMA, as_scalar(jitter))
-        from_centre = as_array(t) + self.decay
+        sigma = _safe_hypot(self.fwhm / _FWHM_PER_SIGMA, as_scalar(jitter, "jitter"))
+        from_centre = as_array(t, "t") + self.decay
         return _normal_cdf(_z_score(from_centre, sigma)) - _exponential_tail(from_centre, sigma, self.decay)
 
     @property
@@ -281,7 +282,7 @@ class ExponentiallyModifiedGaussianPulse(AbstractPulse):
 
     def support(self, jitter: ArrayLike = 0.0) -> tuple[float, float]:
         decay = float(self.decay)
-        extent = _GAUSSIAN_EXTENT * math.hypot(float(self.std), float(as_scalar(jitter)))
+        extent = _GAUSSIAN_EXTENT * math.hypot(float(self.std), float(as_scalar(jitter, "jitter")))
         return -decay - extent, -decay + extent + _EXPONENTIAL_EXTENT * decay
 
 
@@ -353,13 +354,13 @@ class SampledPulse(AbstractPulse):
 
     def cumulative(self, t: ArrayLike, jitter: ArrayLike = 0.0) -> Float[Array, "..."]:
         centre, length, mean, rise = self._segments()
-        sigma = jnp.abs(as_scalar(jitter))
+        sigma = jnp.abs(as_scalar(jitter, "jitter"))
 
         def at(time):
             even, odd = _segment_integrals(time - centre, length, sigma)
             return jnp.sum(length * (mean * even + rise * odd))
 
-        t = as_array(t)
+        t = as_array(t, "t")
         return jax.vmap(at)(t.reshape(-1)).reshape(t.shape)
 
     @property
@@ -388,7 +389,7 @@ class SampledPulse(AbstractPulse):
 
     def support(self, jitter: ArrayLike = 0.0) -> tuple[float, float]:
         time, nonzero = np.asarray(self.time, dtype=float), np.flatnonzero(np.asarray(self.samples))
-        extent = _GAUSSIAN_EXTENT * float(as_scalar(jitter))
+        extent = _GAUSSIAN_EXTENT * float(as_scalar(jitter, "jitter"))
         first, last = max(nonzero[0] - 1, 0), min(nonzero[-1] + 1, time.size - 1)
         return float(time[first]) - extent, float(time[last]) + extent
 

@@ -24,6 +24,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from jaxlidar._checks import (
     as_array,
+    as_numpy,
     as_scalar,
     check_choice,
     check_flag,
@@ -33,18 +34,28 @@ from jaxlidar._checks import (
     check_number,
     check_numbers,
     check_range,
+    concrete,
+    even_step,
     optional_scalar,
     scalar,
     warn_unit,
 )
 from jaxlidar._constants import PLANCK_TIMES_LIGHT
+from jaxlidar._converted import Converted
 from jaxlidar._ranges import Range, check_ranges
 from jaxlidar._signatures import briefly
-from jaxlidar.instrument.photon_counter import PhotonCounter, PhotonEvents, count_photons
+from jaxlidar.instrument.photon_counter import (
+    MAX_NEGATIVE_FRACTION,
+    PhotonCounter,
+    PhotonEvents,
+    check_negative_energy,
+    count_photons,
+)
 
-# Above this expectation a Poisson count is drawn as a normal variable (skewness below 1e-3): the exact
-# sampler counts in 32 bits.
-_POISSON_MAX = 1e6
+# Above this expectation a Poisson count is drawn as a normal variable of its first three moments. The exact
+# sampler of JAX weighs terms of the size m ln m in single precision, whatever the precision of the draws:
+# from some 1e5 photons on they are wrong by percents of their variance.
+_POISSON_MAX = 1e4
 
 Wavelengths: TypeAlias = ArrayLike | Sequence[ArrayLike]
 
@@ -83,12 +94,18 @@ class Receiver(eqx.Module):
     ['0.0e+00', '1.0e-15', '3.0e-15']
     """
 
-    detection_threshold: Float[Array, ""] = eqx.field(converter=scalar("detection_threshold"), default=0.0)
-    saturation: Float[Array, ""] | None = eqx.field(converter=optional_scalar("saturation"), default=None)
+    detection_threshold: Converted[Float[Array, ""]] = eqx.field(
+        converter=scalar("detection_threshold"), default=0.0
+    )
+    saturation: Converted[Float[Array, ""] | None] = eqx.field(
+        converter=optional_scalar("saturation"), default=None
+    )
     bits: int | None = eqx.field(static=True, default=None)
-    background: Float[Array, ""] = eqx.field(converter=scalar("background"), default=0.0)
+    background: Converted[Float[Array, ""]] = eqx.field(converter=scalar("background"), default=0.0)
     photon_noise: bool = eqx.field(static=True, default=True)
-    electronic_noise: Float[Array, ""] = eqx.field(converter=scalar("electronic_noise"), default=0.0)
+    electronic_noise: Converted[Float[Array, ""]] = eqx.field(
+        converter=scalar("electronic_noise"), default=0.0
+    )
     window: str = eqx.field(static=True, default="fixed")
 
     ranges: ClassVar = {
@@ -149,15 +166,16 @@ def record(
     **Arguments:**
 
     - `wave`: a `Waveform` or `Waveforms`. Where `mode` is "waveform", also an array (..., wavelengths, bins)
-      of expected detected energies in J per sample, not negative.
+      of expected detected energies in J per sample, not negative. Samples of NaN stay NaN. Samples of a
+      waveform may be negative by the noise of its simulation: they send no photons.
     - `wavelength`: nm, one number or (wavelengths,), where `wave` is an array: a photon carries the energy
       h c / wavelength. Default None: the waveform's.
     - `receiver`: the `Receiver` that records, or the `PhotonCounter` where `mode` is "photons". Default None:
       one with its defaults.
     - `key`: a JAX random key. Photon events need one. With a key, samples are one realisation of the noise:
-      the photons of signal and background are Poisson counts, or a normal variable where more than a million
-      are expected; electronic noise is normal. Default None: the samples of the expected energies, without
-      noise.
+      the photons of signal and background are Poisson counts, or a normal variable of mean, variance and
+      skewness of a Poisson count where more than 10,000 are expected; electronic noise is normal. Default
+      None: the samples of the expected energies, without noise.
     - `mode`: "waveform" for samples or "photons" for events. Default "waveform".
     - `pulses`: number of pulses, each with the waveform's energy, whose events are drawn; an integer of at
       least 1. Default 1, the only admissible one for samples.
@@ -167,10 +185,12 @@ def record(
     of a realisation with its draws held fixed, so not through Poisson counts. Events are NumPy arrays,
     without derivatives.
 
-    **Raises:** ValueError where the energies have fewer than two axes, for wavelengths that are not positive,
-    and for neither one nor one per row of the energies; for events, also where energies below zero take more
-    than 1 % from a waveform, and where there would be more than 10^8; TypeError for an object of the wrong
-    type.
+    **Raises:** ValueError where the energies have fewer than two axes, for infinite energies, for negative
+    ones in an array, and where those of a waveform take more than 1 % from it; for wavelengths that are not
+    positive, and for neither one nor one per row of the energies; for events, also for energies of NaN, and
+    where there would be more than 10^8; TypeError for an object of the wrong type. Inside a JAX
+    transformation, where values cannot be refused, such samples become NaN: the negative or infinite ones
+    of an array, all of a waveform.
 
     **Example:** samples, and the events of ten pulses over the same ground.
 
@@ -193,7 +213,7 @@ def record(
         raise ValueError("wavelength is given, but wave is a waveform, which has its own")
     if mode == "photons":
         return count_photons(wave, PhotonCounter() if receiver is None else receiver, key, pulses)
-    if pulses != 1:
+    if check_integer("pulses", pulses) != 1:
         raise ValueError(f"pulses = {pulses}; admissible is 1 where mode = 'waveform'")
     energies: Any = wave.energy if is_waveform else wave
     wavelengths: Any = wave.wavelength if is_waveform else wavelength
@@ -211,11 +231,36 @@ def record(
             f"wavelength has shape {wavelength.shape}; admissible is one number, or one for each of the "
             f"{energy.shape[-2]} wavelengths of energy"
         )
-    return _digitise(energy, wavelength, receiver, key)
+    energy = _admissible_waveform(energy) if is_waveform else _admissible_samples(energy)
+    return digitise(energy, wavelength, receiver, key)
 
 
-def _digitise(energy: Array, wavelength: Array, receiver: Receiver, key: Array | None) -> Array:
-    """Apply background, noise, saturation, threshold and quantisation; without noise if `key` is None."""
+def _admissible_samples(energy: Array) -> Array:
+    """Refuse negative and infinite energies; where they are traced, return NaN for them. NaN stays NaN."""
+    values = concrete(energy)
+    if values is not None:
+        check_range("energy", values[~np.isnan(values)], 0.0)
+    return jnp.where((energy >= 0) & (energy < jnp.inf), energy, jnp.nan)
+
+
+def _admissible_waveform(energy: Array) -> Array:
+    """Refuse waveforms that are infinite or too far below zero; where traced, return NaN for them."""
+    values = concrete(energy)
+    if values is not None:
+        check_range("energy", values[~np.isnan(values)])
+        check_negative_energy(np.where(np.isnan(values), 0.0, values))
+    missing = jnp.where(jnp.isnan(energy), 0.0, energy)
+    positive = jnp.sum(jnp.maximum(missing, 0.0), axis=-1, keepdims=True)
+    negative = jnp.sum(jnp.maximum(-missing, 0.0), axis=-1, keepdims=True)
+    is_admissible = (negative <= MAX_NEGATIVE_FRACTION * positive) & (positive < jnp.inf)
+    return jnp.where(is_admissible, energy, jnp.nan)
+
+
+def digitise(energy: Array, wavelength: Array, receiver: Receiver, key: Array | None = None) -> Array:
+    """Apply background, noise, saturation, threshold and quantisation; without noise if `key` is None.
+
+    For energies of the simulation itself: they are not checked.
+    """
     expected = energy + receiver.background
     value = expected
     if key is not None:
@@ -239,18 +284,30 @@ def _digitise(energy: Array, wavelength: Array, receiver: Receiver, key: Array |
 
 
 def _shot_noise(energy: Array, wavelength: Array, key: Array) -> Array:
-    """Draw the energy of a Poisson number of photons, or of its normal limit."""
+    """Draw the energy of a Poisson number of photons, or of its normal limit; NaN for energies of NaN.
+
+    With z a normal number, the count of a large mean m is
+
+        m + sqrt(m) z + (z^2 - 1) / 6,
+
+    the first terms of the expansion of Cornish and Fisher (1938): its mean and its third central moment are
+    m, its variance is m + 1/18.
+    """
     photon_energy = PLANCK_TIMES_LIGHT / wavelength.astype(energy.dtype)
     photon_energy = jnp.broadcast_to(photon_energy.reshape(-1, 1), energy.shape)
-    photons = energy / photon_energy
+    # No photons where noise of the simulation exceeds the signal; the maximum keeps NaN.
+    photons = jnp.maximum(energy / photon_energy, 0.0)
     count_key, normal_key = jax.random.split(key)
     use_normal = photons > _POISSON_MAX
-    counts = jax.random.poisson(count_key, jax.lax.stop_gradient(jnp.where(use_normal, 1.0, photons)))
+    # The sampler has integers, which hold no NaN.
+    is_count = ~use_normal & ~jnp.isnan(photons)
+    counts = jax.random.poisson(count_key, jax.lax.stop_gradient(jnp.where(is_count, photons, 1.0)))
     normal = jax.random.normal(normal_key, energy.shape, energy.dtype)
     # The square root of samples that do not use it must not reach zero: its derivative is infinite there.
     mean = jnp.where(use_normal, photons, 1.0)
-    counts = jnp.where(use_normal, mean + jnp.sqrt(mean) * normal, counts.astype(energy.dtype))
-    return photon_energy * counts
+    large_counts = mean + jnp.sqrt(mean) * normal + (normal**2 - 1.0) / 6.0
+    counts = jnp.where(use_normal, large_counts, counts.astype(energy.dtype))
+    return jnp.where(jnp.isnan(photons), jnp.nan, photon_energy * counts)
 
 
 def first_return_window(
@@ -295,19 +352,10 @@ def first_return_window(
     check_number("interval", interval, 0.0, low_open=True)
     check_range("time", time)
     energy, threshold = as_array(energy, "energy"), as_scalar(threshold, "threshold")
-    centres = np.asarray(time, dtype=float)
-    steps = np.diff(centres)
+    centres = as_numpy(time, "time")
     if centres.ndim != 1 or centres.size < 2 or energy.shape[-1:] != centres.shape:
         raise ValueError(f"time has shape {centres.shape}; admissible is one per bin of energy, two or more")
-    step = float((centres[-1] - centres[0]) / steps.size)
-    # Times in single precision are evenly spaced to their rounding only.
-    tolerance = 1e-4 * abs(step) + 4e-7 * float(np.max(np.abs(centres)))
-    if step <= 0 or np.max(np.abs(steps - step)) > tolerance:
-        worst = float(steps[np.argmax(np.abs(steps - step))])
-        raise ValueError(
-            f"time has a step of {worst:g}; admissible are even, positive steps ({step:g} on average)"
-        )
-
+    step = float(even_step("time", time))
     ratio = interval / step
     # The tolerance keeps rounding of the ratio from adding an empty bin.
     samples = math.ceil(centres.size / ratio - 1e-6)

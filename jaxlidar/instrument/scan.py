@@ -19,7 +19,8 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from jaxlidar._checks import check_choice, check_number
+from jaxlidar._checks import as_numpy, check_choice, check_number, concrete, is_masked
+from jaxlidar._converted import Converted
 
 # Largest angle between a beam and the vertical, degrees.
 MAX_ZENITH = 89.0
@@ -27,7 +28,8 @@ MAX_ZENITH = 89.0
 
 def _as_float(x: Any) -> Any:
     """Convert one number to a Python float (double precision); other objects are left to the checks."""
-    return float(x) if np.ndim(x) == 0 and not isinstance(x, str | None) else x
+    number = concrete(x)
+    return x if number is None or number.ndim or is_masked(x) else float(number)
 
 
 class AbstractScan(eqx.Module):
@@ -80,8 +82,8 @@ class Oscillating(AbstractScan):
     [[0.0, 0.0, 1.0], [0.0, 0.5, 0.866], [0.0, -0.5, 0.866]]
     """
 
-    half_angle: float = eqx.field(converter=_as_float)
-    frequency: float = eqx.field(converter=_as_float)
+    half_angle: Converted[float] = eqx.field(converter=_as_float)
+    frequency: Converted[float] = eqx.field(converter=_as_float)
     motion: str = eqx.field(static=True, default="sine")
 
     def __check_init__(self):
@@ -89,7 +91,7 @@ class Oscillating(AbstractScan):
         check_choice("motion", self.motion, ("sine", "triangle"))
 
     def direction(self, time: Float[np.ndarray, " shots"]) -> Float[np.ndarray, "shots 3"]:
-        cycle = np.asarray(time, float) * self.frequency
+        cycle = as_numpy(time, "time") * self.frequency
         if self.motion == "sine":
             fraction = np.sin(2 * np.pi * cycle)
         else:
@@ -119,14 +121,14 @@ class RotatingPolygon(AbstractScan):
     [[0.0, -0.5, 0.866], [0.0, 0.0, 1.0]]
     """
 
-    half_angle: float = eqx.field(converter=_as_float)
-    line_rate: float = eqx.field(converter=_as_float)
+    half_angle: Converted[float] = eqx.field(converter=_as_float)
+    line_rate: Converted[float] = eqx.field(converter=_as_float)
 
     def __check_init__(self):
         _check_pattern(self.half_angle, "line_rate", self.line_rate)
 
     def direction(self, time: Float[np.ndarray, " shots"]) -> Float[np.ndarray, "shots 3"]:
-        fraction = 2.0 * ((np.asarray(time, float) * self.line_rate) % 1.0) - 1.0
+        fraction = 2.0 * ((as_numpy(time, "time") * self.line_rate) % 1.0) - 1.0
         return _across_track(fraction * self.half_angle)
 
 
@@ -152,14 +154,14 @@ class Conical(AbstractScan):
     [[0.5, 0.0, 0.866], [0.0, 0.5, 0.866]]
     """
 
-    half_angle: float = eqx.field(converter=_as_float)
-    frequency: float = eqx.field(converter=_as_float)
+    half_angle: Converted[float] = eqx.field(converter=_as_float)
+    frequency: Converted[float] = eqx.field(converter=_as_float)
 
     def __check_init__(self):
         _check_pattern(self.half_angle, "frequency", self.frequency)
 
     def direction(self, time: Float[np.ndarray, " shots"]) -> Float[np.ndarray, "shots 3"]:
-        turn = 2 * np.pi * np.asarray(time, float) * self.frequency
+        turn = 2 * np.pi * as_numpy(time, "time") * self.frequency
         angle = np.deg2rad(self.half_angle)
         down = np.full(turn.shape, np.cos(angle))
         return np.stack([np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), down], axis=-1)

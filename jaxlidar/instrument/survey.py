@@ -21,15 +21,15 @@ import numpy as np
 from jaxtyping import ArrayLike, Float
 
 from jaxlidar._checks import (
+    as_numpy,
     check_integer,
     check_kind,
     check_number,
-    check_numbers,
     check_range,
-    concrete,
     concrete_array,
     concrete_number,
 )
+from jaxlidar._memory import format_bytes, machine_memory
 from jaxlidar._signatures import briefly
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.instrument.scan import MAX_ZENITH, AbstractScan
@@ -37,6 +37,10 @@ from jaxlidar.instrument.scan import MAX_ZENITH, AbstractScan
 # A length that falls short of a multiple of the spacing by this fraction, as by rounding, counts as the
 # multiple.
 _SPACING_TOLERANCE = 1e-6
+# Bytes of a shot while a survey is made: its position and direction, and the terms of their sums.
+_BYTES_PER_SHOT = 100.0
+# More positions along a line than fit into any memory.
+_LARGEST_COUNT = 1e30
 
 
 @final
@@ -82,7 +86,7 @@ class Survey(eqx.Module):
     ):
         check_kind("lidar", lidar, Lidar, "a Lidar, as in Survey(Lidar(), position=...)")
         check_range("position", position)
-        positions = _concrete("position", position)
+        positions = as_numpy(position, "position")
         if positions.ndim != 2 or positions.shape[1] != 2 or len(positions) == 0:
             raise ValueError(
                 f"position has shape {positions.shape}; admissible is (shots, 2), one shot or more"
@@ -130,6 +134,7 @@ class Survey(eqx.Module):
 
     def about(self, origin: Float[np.ndarray, "2"]) -> "Survey":
         """Make the same survey with positions relative to `origin`, (2,) x and y in m."""
+        origin = _horizontal_position("origin", origin)
         return Survey(self.lidar, self.position - origin, self.zenith, self.azimuth)
 
     @property
@@ -170,8 +175,8 @@ class Survey(eqx.Module):
 
         **Returns:** a `Survey`; along each axis it has one footprint at `low` and as many more as fit.
 
-        **Raises:** ValueError for values outside their ranges and other shapes; TypeError for arguments that
-        are not numbers.
+        **Raises:** ValueError for values outside their ranges, other shapes, and more shots than memory has
+        room for; TypeError for arguments that are not numbers.
 
         **Example:**
 
@@ -182,13 +187,15 @@ class Survey(eqx.Module):
         """
         first, last = _horizontal_position("low", low), _horizontal_position("high", high)
         check_range("spacing", spacing, 0.0, low_open=True)
-        step = _concrete("spacing", spacing)
+        step = as_numpy(spacing, "spacing")
         if step.shape not in ((), (2,)):
             raise ValueError(f"spacing has shape {step.shape}; admissible is one number or (2,)")
         if np.any(last < first):
             raise ValueError(f"high = {last.tolist()} lies below low = {first.tolist()}")
         step = np.broadcast_to(step, (2,))
-        x, y = (first[k] + step[k] * np.arange(_count_along(last[k] - first[k], step[k])) for k in range(2))
+        counts = [_count_along(float(last[k] - first[k]), float(step[k])) for k in range(2)]
+        _check_number_of_shots(f"spacing = {step.tolist()}", counts[0] * counts[1])
+        x, y = (first[k] + step[k] * np.arange(counts[k]) for k in range(2))
         return Survey(lidar, np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
 
     @staticmethod
@@ -208,8 +215,8 @@ class Survey(eqx.Module):
 
         **Returns:** a `Survey`: all footprints of the leftmost beam first, then those of the next.
 
-        **Raises:** ValueError for values outside their ranges and a line without length; TypeError for
-        arguments that are not numbers.
+        **Raises:** ValueError for values outside their ranges, a line without length, and more shots than
+        memory has room for; TypeError for arguments that are not numbers.
 
         **Example:**
 
@@ -223,7 +230,9 @@ class Survey(eqx.Module):
         check_number("spacing", spacing, 0.0, low_open=True)
         check_number("beam_spacing", beam_spacing, 0.0, low_open=True)
         count = check_integer("beams", beams)
-        along = float(spacing) * np.arange(_count_along(length, float(spacing)))
+        count_along = _count_along(length, float(spacing))
+        _check_number_of_shots(f"spacing = {float(spacing):g} with beams = {count}", count_along * count)
+        along = float(spacing) * np.arange(count_along)
         across = float(beam_spacing) * (np.arange(count) - 0.5 * (count - 1))
         positions = first + across[:, None, None] * right + along[None, :, None] * forward
         return Survey(lidar, positions.reshape(-1, 2))
@@ -247,8 +256,9 @@ class Survey(eqx.Module):
 
         **Returns:** a `Survey`, its shots in the order of time.
 
-        **Raises:** ValueError for values outside their ranges, a line without length, and a pattern that
-        looks more than 89 degrees from the vertical; TypeError for objects of the wrong type.
+        **Raises:** ValueError for values outside their ranges, a line without length, more shots than memory
+        has room for, and a pattern that looks more than 89 degrees from the vertical; TypeError for objects
+        of the wrong type.
 
         **Example:**
 
@@ -265,7 +275,10 @@ class Survey(eqx.Module):
         first, forward, right, length = _line(start, end)
         check_number("speed", speed, 0.0, low_open=True)
         check_number("pulse_rate", pulse_rate, 0.0, low_open=True)
-        time = np.arange(_count_along(length, float(speed) / float(pulse_rate))) / float(pulse_rate)
+        shots = _count_along(length, float(speed) / float(pulse_rate))
+        rate = f"pulse_rate = {float(pulse_rate):g} at speed = {float(speed):g}"
+        _check_number_of_shots(rate, shots)
+        time = np.arange(shots) / float(pulse_rate)
         ahead, aside, down = np.moveaxis(np.asarray(pattern.direction(time), float), -1, 0)
         horizontal = ahead[:, None] * forward + aside[:, None] * right
         sine = np.hypot(ahead, aside)
@@ -282,19 +295,10 @@ class Survey(eqx.Module):
         return Survey(lidar, positions, np.minimum(zenith, MAX_ZENITH), azimuth)
 
 
-def _concrete(field: str, x: Any) -> np.ndarray:
-    """Convert numbers to an array of float64. **Raises:** TypeError where JAX is tracing them."""
-    check_numbers(field, x)
-    value = concrete(x)
-    if value is None:
-        raise TypeError(f"{field} is being traced by a JAX transformation; admissible are known numbers")
-    return value
-
-
 def _per_shot(field: str, x: Any, shots: int) -> Float[np.ndarray, " shots"]:
     """Convert one number for all shots, or one for each, to an array with one for each."""
     check_range(field, x)
-    value = _concrete(field, x)
+    value = as_numpy(x, field)
     if value.shape not in ((), (shots,)):
         raise ValueError(
             f"{field} has shape {value.shape}; admissible is one number or ({shots},), as position"
@@ -304,7 +308,7 @@ def _per_shot(field: str, x: Any, shots: int) -> Float[np.ndarray, " shots"]:
 
 def _horizontal_position(field: str, x: Any) -> Float[np.ndarray, "2"]:
     check_range(field, x)
-    value = _concrete(field, x)
+    value = as_numpy(x, field)
     if value.shape != (2,):
         raise ValueError(f"{field} has shape {value.shape}; admissible is (2,): x and y")
     return value
@@ -322,4 +326,17 @@ def _line(start: Any, end: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, flo
 
 def _count_along(length: float, step: float) -> int:
     """Count the positions that lie `step` apart on a line of a given length, including its start."""
-    return math.floor(length / step * (1 + _SPACING_TOLERANCE) + _SPACING_TOLERANCE) + 1
+    # A step that underflows in the division counts as one that no memory has room for.
+    steps = min(length / step, _LARGEST_COUNT) if step > 0 else _LARGEST_COUNT
+    return math.floor(steps * (1 + _SPACING_TOLERANCE) + _SPACING_TOLERANCE) + 1
+
+
+def _check_number_of_shots(cause: str, shots: int) -> None:
+    """Refuse a survey that does not fit into memory. `cause`: the arguments that ask for so many shots."""
+    memory = machine_memory()
+    if shots * _BYTES_PER_SHOT > memory:
+        raise ValueError(
+            f"{cause} asks for {shots:.3g} shots, which take about {format_bytes(shots * _BYTES_PER_SHOT)} "
+            f"of memory; admissible are at most {memory / _BYTES_PER_SHOT:.3g} in the "
+            f"{format_bytes(memory)} of this machine"
+        )

@@ -20,6 +20,8 @@ from typing import Any, NamedTuple, overload
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
+from jaxlidar._checks import as_numpy, check_number, check_numbers, check_shape
+from jaxlidar.io.coordinates import is_angle
 from jaxlidar.io.noise import NoiseLevels, above_pedestal, estimate_noise_levels
 
 # Most samples from the first to the last one of a shot: 150 km at 1 ns.
@@ -146,6 +148,8 @@ class AirborneShot:
     - `scanner`: a `Scanner`. Default None.
     - `returns`: the `Returns` that the file holds. Default None.
     - `scanner_channel`: number of the channel of a scanner that sends several beams at one time. Default 0.
+    - `crs`: the coordinate reference system of `anchor`, as the file declares it: a code, such as
+      "EPSG:32633", or well-known text. Default None: not known.
 
     **Raises:** ValueError for a shot without a returning segment, for segments whose numbers make no sense,
     for those of a channel that overlap, have different steps or lie too far apart.
@@ -175,11 +179,20 @@ class AirborneShot:
     scanner: Scanner | None = None
     returns: Returns | None = None
     scanner_channel: int = 0
+    crs: str | None = None
 
     def __post_init__(self):
         if not self.returning:
             raise ValueError(f"shot {self.index}: it has no returning segment")
+        for name in ("anchor", "direction", "metres"):
+            check_shape(name, as_numpy(getattr(self, name), name), (3,))
+        fields = ("index", "noise_mean", "noise_std", "pedestal", "pulse_zero", "gps_time", "scanner_channel")
+        for name in fields:
+            if (number := getattr(self, name)) is not None:
+                check_numbers(name, number)
         for segment in (*self.returning, *self.outgoing):
+            for name, numbers in segment._asdict().items():
+                check_numbers(name, numbers)
             start, step, *_ = numbers = [segment.start, segment.step, segment.gain, segment.offset]
             if segment.samples.size == 0 or not (np.all(np.isfinite(numbers)) and step > 0):
                 raise ValueError(
@@ -212,8 +225,8 @@ class AirborneShot:
 
     @property
     def is_geographic(self) -> bool:
-        """True if x and y are degrees."""
-        return bool(self.metres[0] != self.metres[2])
+        """True if x and y are longitude and latitude."""
+        return is_angle(self.metres)
 
     @property
     def sampling_interval(self) -> float:
@@ -302,6 +315,7 @@ class AirborneShot:
 
         **Raises:** ValueError where the shot has no such channel.
         """
+        check_numbers("channel", channel)
         segments = tuple(segment for segment in self.returning if segment.channel == channel)
         if not segments:
             channels = sorted({segment.channel for segment in self.returning})
@@ -316,6 +330,7 @@ class AirborneShot:
         **Returns:** (samples,) ns. Zero is the two-way travel time to where the beam axis meets that plane;
         earlier times are negative.
         """
+        check_number("elevation", elevation)
         return self.time - (elevation - self.anchor[2]) / self.direction[2]
 
     def position_at(self, elevation: float) -> Float[np.ndarray, " 2"]:
@@ -325,6 +340,7 @@ class AirborneShot:
 
         **Returns:** easting and northing, in units of `anchor`.
         """
+        check_number("elevation", elevation)
         return self.anchor[:2] + self.direction[:2] * (elevation - self.anchor[2]) / self.direction[2]
 
 

@@ -27,7 +27,7 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from jaxlidar._checks import check_integer, check_key, check_kind
-from jaxlidar._files import atomic_write
+from jaxlidar._files import atomic_writes
 from jaxlidar._registry import simulate_survey
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.instrument.survey import Survey
@@ -256,11 +256,11 @@ def write_case(path: str | os.PathLike[str], case: Case) -> None:
     array_path = path.with_suffix(".npz")
     text, arrays = case_text(case, array_path.name)
     # The arrays first: a text that exists has its arrays.
-    if arrays:
-        with atomic_write(array_path) as draft, draft.open("wb") as file:
-            np.savez_compressed(file, **arrays)  # pyright: ignore[reportArgumentType]
-    with atomic_write(path) as draft:
-        draft.write_text(text, encoding="utf-8")
+    paths = [array_path, path] if arrays else [path]
+    with atomic_writes(*paths) as drafts:
+        if arrays:
+            np.savez_compressed(drafts[0], **arrays)  # pyright: ignore[reportArgumentType]
+        drafts[-1].write_text(text, encoding="utf-8")
 
 
 def read_case(path: Path) -> Case:

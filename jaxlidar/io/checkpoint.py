@@ -5,8 +5,9 @@ of shots. The same run, started again, computes the entries that are missing. Th
 
 - *Atomic entries.* An entry is written in one transaction of SQLite: it is in the file whole or not at all,
   also after the process was killed (https://www.sqlite.org/atomiccommit.html).
-- *One process.* The file is locked exclusively while it is open. The operating system lifts the lock when the
-  process ends, in whichever way. The file system has to support locks.
+- *One process.* A run holds the lock "PATH.lock" while it has the file open. The operating system lifts it
+  when the process ends, in whichever way; the empty file that a killed process leaves is locked by the next
+  run. The file system has to support locks.
 - *One problem.* Digests of all that the results depend on are stored; another problem is refused, with the
   names of what differs.
 - *Damage.* SQLite checks the structure of the file; a damaged file is refused and left as it is. An entry is
@@ -22,6 +23,7 @@ import contextlib
 import io
 import os
 import sqlite3
+import threading
 import warnings
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
@@ -51,6 +53,9 @@ _ENTRY_DAMAGE = (
     EOFError,
     zipfile.BadZipFile,
 )
+
+# Held while a thread takes the lock of a run.
+_ACQUIRING = threading.Lock()
 
 Entry = TypeVar("Entry")
 
@@ -146,6 +151,10 @@ class Checkpoint:
 def open_checkpoint(path: str | os.PathLike[str], problem: Mapping[str, str]) -> Iterator[Checkpoint]:
     """Open a checkpoint, which nobody else can open until the block ends. A missing file is made.
 
+    1. Lock the file "PATH.lock" for this run, or refuse where another run has it.
+    2. Open the checkpoint, create its tables or check them.
+    3. Afterwards, close it and remove the lock.
+
     **Arguments:**
 
     - `path`: the file. Missing folders are made.
@@ -160,14 +169,73 @@ def open_checkpoint(path: str | os.PathLike[str], problem: Mapping[str, str]) ->
     with contextlib.ExitStack() as stack:
         with _plain_errors(path):
             path.parent.mkdir(parents=True, exist_ok=True)
-            if path.is_dir():
-                raise IsADirectoryError("it is a folder")
-            # An absolute path: SQLite gives names such as ":memory:" a meaning.
-            # isolation_level None: transactions begin and end only as written here.
-            connection = sqlite3.connect(path.absolute(), timeout=0.0, isolation_level=None)
-            stack.enter_context(contextlib.closing(connection))
+            # SQLite would deny a group the right to write that its umask grants.
+            path.touch()
+            if not path.is_file():
+                raise OSError("it is no regular file")
+            stack.enter_context(_run_lock(path))
+            connection = stack.enter_context(contextlib.closing(_connect(path)))
             _lock_and_check(connection, path, problem)
         yield Checkpoint(path, connection)
+
+
+def _connect(path: Path) -> sqlite3.Connection:
+    # An absolute path: SQLite gives names such as ":memory:" a meaning.
+    # isolation_level None: transactions begin and end only as written here.
+    return sqlite3.connect(path.absolute(), timeout=0.0, isolation_level=None)
+
+
+@contextlib.contextmanager
+def _run_lock(path: Path) -> Iterator[None]:
+    """Hold the lock of the run that uses the checkpoint `path`, until the block ends.
+
+    The lock is an exclusive transaction of SQLite on an empty file beside the checkpoint, which the operating
+    system ends with the process, in whichever way. The checkpoint's own lock does not do: its file is removed
+    at the end of a run, and a second run that had opened it before would lock and change a file without a
+    name, or take the journal of a third run for its own.
+
+    **Raises:** sqlite3.Error where another run has it.
+    """
+    lock_path = path.with_name(path.name + ".lock")
+    with contextlib.ExitStack() as stack:
+        number = None
+        while number is None or number != _file_number(lock_path):
+            # A run that has just ended removes its lock. What was locked here may then be a file without a
+            # name, which keeps nobody else out: lock the next one.
+            stack.close()
+            # POSIX drops the locks of a process on a file when any descriptor of it is closed, as after its
+            # creation here, while another thread may have locked it.
+            with _ACQUIRING:
+                lock_path.touch()
+                number = _file_number(lock_path)
+                connection = stack.enter_context(contextlib.closing(_connect(lock_path)))
+                try:
+                    connection.execute("BEGIN EXCLUSIVE")
+                except sqlite3.OperationalError:
+                    # SQLite refuses a file that has been removed with an error of input and output.
+                    if number == _file_number(lock_path):
+                        raise
+        try:
+            yield
+        finally:
+            _remove_lock(lock_path)
+    # Windows removes no file that is open, as this one was until now.
+    if os.name == "nt":
+        _remove_lock(lock_path)
+
+
+def _remove_lock(lock_path: Path) -> None:
+    """Remove the file of a lock; not where Windows has it open, for this run or another one."""
+    with contextlib.suppress(PermissionError):
+        lock_path.unlink(missing_ok=True)
+
+
+def _file_number(path: Path) -> int | None:
+    """Return the number by which the file system knows a file; None if it has gone."""
+    try:
+        return path.stat().st_ino
+    except FileNotFoundError:
+        return None
 
 
 def check_same_problem(

@@ -33,6 +33,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxlidar._checks import check_numbers
 from jaxlidar.io.checks import (
     MAX_COORDINATE,
     MAX_COUNTS,
@@ -44,6 +45,7 @@ from jaxlidar.io.checks import (
     refuse_damage,
     warn_of_file,
 )
+from jaxlidar.io.coordinates import check_elevations, unit_angle, unit_length, units_agree
 from jaxlidar.io.noise import above_pedestal
 
 # Datasets of a beam's group with a number for each shot; start indices of samples may be missing.
@@ -61,6 +63,19 @@ _PER_SHOT = (
     "geolocation/local_beam_elevation",
     "geolocation/local_beam_azimuth",
 )
+# For datasets that may name a unit, the function that reads its name, and the size of the expected one.
+_UNITS = {
+    **{
+        f"geolocation/{name}_{end}": (unit_length, 1.0)
+        for name in ("elevation",)
+        for end in ("bin0", "lastbin")
+    },
+    "geolocation/altitude_instrument": (unit_length, 1.0),
+    **{f"geolocation/{name}_lastbin": (unit_angle, np.pi / 180) for name in ("latitude", "longitude")},
+    **{f"geolocation/local_beam_{name}": (unit_angle, 1.0) for name in ("elevation", "azimuth")},
+}
+# Attributes of numbers that are stored as counts.
+_STORED_AS_COUNTS = {"scale_factor": 1.0, "add_offset": 0.0}
 # Datasets of the flags of a GediShot; subsets may have left them out.
 _FLAGS = {"degrade": "geolocation/degrade", "stale_return": "stale_return_flag"}
 # The attribute of a dataset with the value that stands for a missing one.
@@ -229,9 +244,12 @@ def _requested_numbers(shot: Any) -> list[int]:
             raise ValueError(f"shot = {number} is neither an index nor a shot number: both are integers")
         if isinstance(number, bool) or not isinstance(number, numbers.Integral):
             raise TypeError(
-                f"shot = {number!r} is a {type(number).__name__}; admissible are an index or a shot number, "
+                f"shot = {' '.join(repr(number).split())} is a {type(number).__name__}; admissible are an "
+                "index or a shot number, "
                 "which are integers, or a list of them"
             )
+    # NumPy counts times among the integers.
+    check_numbers("shot", shot)
     return [int(number) for number in requested]
 
 
@@ -299,6 +317,7 @@ def _shot(beam: "_Beam", i: int, received: np.ndarray, transmitted: np.ndarray) 
     top = beam.number("geolocation/elevation_bin0", i, _MIN_ELEVATION)
     bottom = beam.number("geolocation/elevation_lastbin", i, _MIN_ELEVATION)
     location = beam.location("geolocation/elevation_lastbin", i)
+    check_elevations(location, bottom)
     if bottom >= top:
         raise ValueError(f"{location}: {bottom:g} m is not below the first bin, {top:g} m")
     step = (top - bottom) / (received.size - 1)
@@ -453,7 +472,7 @@ class _Beam:
         """Numbers of shots by field, in double precision; NaN where they are missing."""
         for field in _PER_SHOT:
             self._check_shape(field)
-        return {field: self._read_numbers(field) for field in _PER_SHOT}
+        return {field: self._in_units(field) for field in _PER_SHOT}
 
     def _check_shape(self, field: str) -> None:
         shape = self._dataset(field).shape
@@ -461,6 +480,18 @@ class _Beam:
             raise ValueError(
                 f"{self.location(field)}: shape {shape}, but shot_number has the shape {(self.size,)}"
             )
+
+    def _in_units(self, field: str) -> np.ndarray:
+        """Return the numbers of all shots in the unit of `_UNITS`, by the dataset's attribute `units`."""
+        values, dataset = self._read_numbers(field), self._dataset(field)
+        with refuse_damage(f"{self.location(field)}: damaged"):
+            attributes = dataset.attrs
+            stated = next((attributes[name] for name in ("units", "unit") if name in attributes), None)
+        if field not in _UNITS or stated is None:
+            return values
+        read_unit, expected = _UNITS[field]
+        unit = read_unit(self.location(field), stated.decode() if isinstance(stated, bytes) else str(stated))
+        return values if unit is None or units_agree(unit, expected) else values * (unit / expected)
 
     @functools.cached_property
     def _flags(self) -> dict[str, np.ndarray]:
@@ -540,6 +571,9 @@ class _Beam:
         with refuse_damage(f"{self.location(field)}: damaged"):
             # HDF5 returns zeros for what is not stored, as many as are declared.
             is_elsewhere = node.is_virtual or node.external
+            packed = [
+                name for name, usual in _STORED_AS_COUNTS.items() if node.attrs.get(name, usual) != usual
+            ]
             (chunk,) = node.chunks or shape
             chunks = math.ceil(shape[0] / chunk) if chunk else 0
             contiguous = node.id.get_storage_size() // max(node.nbytes, 1)
@@ -549,6 +583,8 @@ class _Beam:
                 f"{self.location(field)}: {shape[0]} numbers are declared, but the file holds {stored} of "
                 f"{chunks} parts of them"
             )
+        if packed:
+            raise ValueError(f"{self.location(field)}: {', '.join(packed)}: counts, which are not read")
         check_unpacked_size(self.path, f"/{self.name}/{field}", chunks * chunk * node.dtype.itemsize)
         return node
 

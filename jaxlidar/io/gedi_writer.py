@@ -24,6 +24,7 @@ from jaxlidar._checks import (
     check_key,
     check_kind,
     check_number,
+    check_numbers,
     check_range,
     check_shape,
     concrete_number,
@@ -34,7 +35,8 @@ from jaxlidar._fingerprint import version_of
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.instrument.survey import Survey
 from jaxlidar.io.checks import MAX_COUNTS
-from jaxlidar.spectral.waveform import Waveform, energy_per_reflectance
+from jaxlidar.io.coordinates import metric_system
+from jaxlidar.spectral.waveform import Waveform, energy_at_reference
 
 # Groups of beams: the number of the laser's channel, and True for a beam with the full power of its laser.
 _BEAMS = {
@@ -141,9 +143,8 @@ def write_gedi_l1b(
     """
     try:
         import h5py
-        import rasterio  # noqa: F401
     except ImportError as error:
-        raise ImportError("GEDI files need h5py and rasterio: pip install 'jaxlidar[io]'") from error
+        raise ImportError("GEDI files need h5py: pip install 'jaxlidar[io]'") from error
     check_kind("survey", survey, Survey, "a Survey, such as Survey.of(lidar)")
     margin = check_integer("margin", margin, 0)
     first_time, bins = _spans(waveforms, survey, margin)
@@ -367,9 +368,8 @@ def _span(waves: Any, name: str, margin: int) -> tuple[float, int]:
 
 def _energy_per_reflectance(survey: Survey) -> np.ndarray:
     """Return the energy, J, of a sample per apparent reflectance of it, at the reference plane, (shots,)."""
-    plane = jnp.zeros(1)
     upright = dataclasses.replace(survey.lidar, zenith=0.0)
-    return float(energy_per_reflectance(upright, plane)[0, 0]) * np.cos(np.deg2rad(survey.zenith)) ** 2
+    return float(energy_at_reference(upright)[0]) * np.cos(np.deg2rad(survey.zenith)) ** 2
 
 
 def _shot_numbers(shot_number: Any, beams: np.ndarray) -> np.ndarray:
@@ -377,6 +377,7 @@ def _shot_numbers(shot_number: Any, beams: np.ndarray) -> np.ndarray:
     if shot_number is None:
         beam = np.array([int(name[-4:], 2) for name in beams])
         return (_ORBIT_DIGIT + _BEAM_DIGIT * beam + np.arange(1, beams.size + 1)).astype(np.uint64)
+    check_numbers("shot_number", shot_number)
     numbers = np.asarray(shot_number)
     check_shape("shot_number", numbers, beams.shape)
     if numbers.dtype.kind not in "iu" or numbers.min() < 0:
@@ -438,28 +439,18 @@ def _write_description(file: Any, name: str) -> None:
 
 def _projection(origin: tuple[float, float] | None, crs: str | None) -> Any:
     """Return the projected reference system of a survey's positions. **Raises:** as `write_gedi_l1b`."""
-    from rasterio import CRS
-    from rasterio.errors import CRSError
-
     if (origin is None) == (crs is None):
         raise ValueError(f"origin = {origin} and crs = {crs}: give one of them")
     if origin is not None:
         longitude, latitude = origin
         check_number("longitude of origin", longitude, -180.0, 180.0)
         check_number("latitude of origin", latitude, -90.0, 90.0)
-        return CRS.from_string(
-            f"+proj=aeqd +lat_0={float(latitude)!r} +lon_0={float(longitude)!r} +datum=WGS84 +units=m"
-        )
-    check_kind("crs", crs, str, "the name of a coordinate reference system")
-    try:
-        system = CRS.from_string(crs)
-    except CRSError as error:
-        raise ValueError(f"crs = {crs!r} is not known ({error})") from error
-    if not system.is_projected or system.linear_units_factor[1] != 1.0:
-        raise ValueError(
-            f"crs = {crs!r} is not in metres; admissible is a projected system, such as EPSG:32633"
-        )
-    return system
+        crs = f"+proj=aeqd +lat_0={float(latitude)!r} +lon_0={float(longitude)!r} +datum=WGS84 +units=m"
+    assert crs is not None
+    projection = metric_system("crs", crs).crs
+    if not projection.is_projected:
+        raise ValueError(f"crs = {crs!r} has no place on Earth; admissible is a projected system")
+    return projection
 
 
 def _geolocation(

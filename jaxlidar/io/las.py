@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import ArrayLike, Float, Int, Num
 
-from jaxlidar._checks import check_range, check_shape
+from jaxlidar._checks import as_numpy, check_number, check_range, check_shape, check_unmasked
 from jaxlidar._files import atomic_write
 from jaxlidar.io.checks import MAX_COORDINATE, existing_file
-from jaxlidar.io.coordinates import GEO_KEYS, geographic_keys
-from jaxlidar.io.las_header import LasHeader, read_header
+from jaxlidar.io.coordinates import WKT_RECORD, CoordinateSystem, check_elevations, metric_system
+from jaxlidar.io.las_header import PROJECTION_USER, LasHeader, read_header
 from jaxlidar.io.laz import decompress_points
 
 # Classes of points that are not returns of the scene: low noise and high noise.
@@ -60,23 +60,27 @@ class PointCloud(NamedTuple):
     dropped: dict[str, int]
 
 
-def read_las(path: str | os.PathLike[str], *, scale: float = 1.0) -> PointCloud:
+def read_las(path: str | os.PathLike[str], *, scale: float | None = None) -> PointCloud:
     """Read the points of a LAS or LAZ file.
 
-    This needs laspy, and lazrs for LAZ (`pip install "jaxlidar[io]"`). Points classified as noise (classes 7
-    and 18) and those flagged as withheld are dropped and counted.
+    This needs laspy, lazrs for LAZ, and rasterio for files that declare a coordinate reference system
+    (`pip install "jaxlidar[io]"`). Points classified as noise (classes 7 and 18) and those flagged as
+    withheld are dropped and counted.
 
     **Arguments:**
 
     - `path`: the file.
-    - `scale`: metres per unit of length in the file. Default 1.
+    - `scale`: metres per unit of length in the file, in place of what it declares. Default None: the units of
+      its coordinate reference system, in which heights without a unit have that of x and y; metres in a file
+      that declares none.
 
     **Returns:** a `PointCloud`. Its `dropped` counts points as "noise" and "withheld".
 
     **Raises:** FileNotFoundError where there is no such file. ImportError without laspy, or without lazrs
     for LAZ. ValueError, naming the file and the place (for points the record), where it is damaged, cut
-    short, without points, declares more than it can hold or holds coordinates that are not on Earth.
-    ValueError for a scale that is not positive.
+    short, without points, declares more than it can hold or holds coordinates that are not on Earth; and for
+    coordinates in degrees, geocentric ones, and a coordinate reference system that is not known. ValueError
+    for a scale that is not positive.
 
     **Source:** LAS specification 1.4 (ASPRS).
 
@@ -91,11 +95,36 @@ def read_las(path: str | os.PathLike[str], *, scale: float = 1.0) -> PointCloud:
     >>> print(cloud.position, cloud.dropped)
     [[0. 0. 5.]] {'noise': 1, 'withheld': 0}
     """
-    check_range("scale", scale, 0.0, low_open=True)
-    laspy = import_laspy("reading")
+    if scale is not None:
+        check_number("scale", scale, 0.0, low_open=True)
     path = existing_file(path)
+    cloud, system = read_stored_points(path, skip_unknown_system=scale is not None)
+    # Degrees are refused with a scale, too.
+    system.horizontal_length(f"{path}: header")
+    lengths = system.lengths(f"{path}: header") if scale is None else (scale, scale)
+    position = cloud.position * [lengths[0], lengths[0], lengths[1]]
+    check_elevations(f"{path}: points", position[:, 2])
+    return cloud._replace(position=position)
+
+
+def read_stored_points(
+    path: Path, *, skip_unknown_system: bool = False
+) -> tuple[PointCloud, CoordinateSystem]:
+    """Return the points of a file in the units that it has, and its coordinate reference system.
+
+    With `skip_unknown_system`, a declaration that cannot be read counts as none.
+
+    **Raises:** as `read_las`.
+    """
+    laspy = import_laspy("reading")
     with path.open("rb") as file:
         header = read_header(path, file)
+        try:
+            system = header.coordinate_system(path, file)
+        except ValueError:
+            if not skip_unknown_system:
+                raise
+            system = CoordinateSystem()
         if header.laszip is None:
             file.seek(header.start)
             content = file.read(header.points * header.point_size)
@@ -103,7 +132,7 @@ def read_las(path: str | os.PathLike[str], *, scale: float = 1.0) -> PointCloud:
             content = decompress_points(path, file, header)
     cloud = laspy.PackedPointRecord.from_buffer(content, point_format_of(header))
     units = (np.asarray(cloud[name], float) for name in "XYZ")
-    position = scale * np.stack([u * s + o for u, s, o in zip(units, header.scales, header.offsets)], axis=1)
+    position = np.stack([u * s + o for u, s, o in zip(units, header.scales, header.offsets)], axis=1)
     (too_far,) = np.nonzero(~(np.abs(position) <= MAX_COORDINATE).all(axis=1))
     if too_far.size:
         raise ValueError(
@@ -114,7 +143,7 @@ def read_las(path: str | os.PathLike[str], *, scale: float = 1.0) -> PointCloud:
     noise = np.isin(classes, _NOISE_CLASSES)
     withheld = np.asarray(cloud.withheld).astype(bool) & ~noise
     selected = ~(noise | withheld)
-    return PointCloud(
+    points = PointCloud(
         position[selected],
         classes[selected],
         np.asarray(cloud["return_number"]).astype(int)[selected],
@@ -122,6 +151,7 @@ def read_las(path: str | os.PathLike[str], *, scale: float = 1.0) -> PointCloud:
         np.asarray(cloud["intensity"]).astype(float)[selected],
         {"noise": int(noise.sum()), "withheld": int(withheld.sum())},
     )
+    return points, system
 
 
 def import_laspy(purpose: str) -> Any:
@@ -151,6 +181,7 @@ def write_las(
     number_of_returns: Num[ArrayLike, "..."] | None = None,
     gps_time: Num[ArrayLike, "..."] | None = None,
     classification: Num[ArrayLike, "..."] | None = None,
+    crs: str | None = None,
 ) -> None:
     """Write points as a LAS 1.4 file (point format 6).
 
@@ -165,11 +196,14 @@ def write_las(
     - `return_number`, `number_of_returns`: (n,) whole numbers from 0 to 15. Default None: 1.
     - `gps_time`: (n,) s. Default None: 0.
     - `classification`: (n,) classes of the LAS specification, from 0 to 255. Default None: 0.
+    - `crs`: the coordinate reference system of `position`, in metres, such as "EPSG:32633". Default None: not
+      known. This needs rasterio.
 
     **Returns:** nothing.
 
-    **Raises:** ImportError without laspy. ValueError for another ending, arrays of different lengths, and
-    numbers outside their range. OSError where the file cannot be written.
+    **Raises:** ImportError without laspy, or without rasterio for `crs`. ValueError for another ending,
+    arrays of different lengths, numbers outside their range, and a `crs` that is not known or not in metres.
+    OSError where the file cannot be written.
 
     **Example:**
 
@@ -181,25 +215,30 @@ def write_las(
     >>> print(jaxlidar.io.read_las(path).position[:, 2])
     [12.5   0.25]
     """
-    path, coordinates = las_path(path), np.asarray(position, float)
+    path, coordinates = las_path(path), as_numpy(position, "position")
     n = len(coordinates)
+    if intensity is not None:
+        intensity = np.round(as_numpy(intensity, "intensity"))
     fields = {
-        "intensity": np.zeros(n) if intensity is None else np.round(intensity),
+        "intensity": np.zeros(n) if intensity is None else intensity,
         "return_number": np.ones(n, int) if return_number is None else return_number,
         "number_of_returns": np.ones(n, int) if number_of_returns is None else number_of_returns,
         "gps_time": np.zeros(n) if gps_time is None else gps_time,
         "classification": np.zeros(n, int) if classification is None else classification,
     }
-    points = las_points(_FORMAT_6, coordinates, fields, geographic=False)
+    system = None if crs is None else metric_system("crs", crs)
+    points = las_points(_FORMAT_6, coordinates, fields, system)
     with atomic_write(path) as draft:
         write_points(points, draft)
 
 
-def las_points(point_format: int, position: np.ndarray, fields: dict[str, Any], geographic: bool) -> Any:
+def las_points(
+    point_format: int, position: np.ndarray, fields: dict[str, Any], system: CoordinateSystem | None
+) -> Any:
     """Return points as a `laspy.LasData`, which is not written yet.
 
-    **Arguments:** `position`: (n, 3) coordinates. `fields`: (n,) numbers by laspy's names. `geographic`: True
-    if x and y are degrees.
+    **Arguments:** `position`: (n, 3) coordinates. `fields`: (n,) numbers by laspy's names. `system`: the
+    coordinate reference system of `position`; None for none.
 
     **Raises:** ValueError for numbers that the point format does not hold.
     """
@@ -208,6 +247,8 @@ def las_points(point_format: int, position: np.ndarray, fields: dict[str, Any], 
         raise ValueError("position holds no point; admissible is one or more")
     check_shape("position", position, (len(position), 3))
     check_range("position", position, -MAX_COORDINATE, MAX_COORDINATE)
+    for name, values in fields.items():
+        check_unmasked(name, values)
     fields = {name: np.asarray(values) for name, values in fields.items()}
     for name, values in fields.items():
         check_shape(name, values, (len(position),))
@@ -217,15 +258,18 @@ def las_points(point_format: int, position: np.ndarray, fields: dict[str, Any], 
         check_range(name, values, 0, _MAX_NUMBERS[name][point_format >= _FORMAT_6])
         if np.any(values != np.floor(values)):
             raise ValueError(f"{name} has values that are not whole numbers")
-    scale, offset = np.array(_DEGREES if geographic else _MM), np.floor(position.min(axis=0))
+    is_geographic = system is not None and system.kind == "geographic"
+    scale, offset = np.array(_DEGREES if is_geographic else _MM), np.floor(position.min(axis=0))
     counts = np.round((position - offset) / scale)
     if counts.max() >= 2**31:
         spans = np.ptp(position, axis=0).tolist()
         raise ValueError(f"position spans {spans}; admissible is 2^31 steps of {scale.tolist()}")
     header = laspy.LasHeader(point_format=point_format, version="1.4")
     header.generating_software, header.scales, header.offsets = "jaxlidar", scale, offset
-    if geographic:
-        header.vlrs.append(laspy.VLR("LASF_Projection", GEO_KEYS, "", geographic_keys()))
+    if system is not None and system.crs is not None:
+        wkt = system.wkt.encode() + b"\0"
+        header.vlrs.append(laspy.VLR(PROJECTION_USER.decode(), WKT_RECORD, "", wkt))
+        header.global_encoding.wkt = True
     points = laspy.LasData(header, laspy.ScaleAwarePointRecord.zeros(len(position), header=header))
     for axis, values in zip("XYZ", counts.T):
         points[axis] = values.astype(np.int32)

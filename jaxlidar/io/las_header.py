@@ -11,15 +11,18 @@ from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
 from jaxlidar.io.checks import check_unpacked_size
+from jaxlidar.io.coordinates import CoordinateSystem, declared_system
 
 # The public header block: signature, version, sizes of header and point records, legacy number of points,
 # scales and offsets; from LAS 1.4 on, place and number of the extended records, and the number of points.
 _PUBLIC_BLOCK = struct.Struct("<4s20x2B68xHIIBHI20x3d3d")
 _EXTENDED_BLOCK, _EXTENDED_BLOCK_OFFSET = struct.Struct("<QIQ"), 235
 _HEADER_SIZES = {0: 227, 1: 227, 2: 227, 3: 235, 4: 375, 5: 393}
-# The header of a variable length record (user, number, length), and the size of that of an extended one.
-_RECORD_HEADER, _EXTENDED_RECORD_SIZE = struct.Struct("<2x16sHH32x"), 60
+# The header of a variable length record (user, number, length), and that of an extended one.
+_RECORD_HEADER, _EXTENDED_RECORD_HEADER = struct.Struct("<2x16sHH32x"), struct.Struct("<2x16sHQ32x")
 _LASZIP_RECORD = (b"laszip encoded", 22204)
+# The user of the records that declare the coordinate reference system.
+PROJECTION_USER = b"LASF_Projection"
 # The bit of the point format that says that points are compressed, by LAZ and not by the specification.
 _COMPRESSED = 128
 # Items of a point record by point format, as LAZ numbers them, and their sizes in bytes. Extra bytes may
@@ -75,7 +78,8 @@ class LasHeader:
     - `scales`, `offsets`: of x, y and z.
     - `laszip`: the variable length record that describes the compression of points; None where they are not
       compressed.
-    - `records`: offset and length of each variable length record, by user and number.
+    - `records`: offsets and lengths of the variable length records, by user and number; the extended ones,
+      which lie after the points, come last.
     """
 
     point_format: int
@@ -85,15 +89,26 @@ class LasHeader:
     scales: tuple[float, ...]
     offsets: tuple[float, ...]
     laszip: bytes | None = None
-    records: dict[tuple[bytes, int], tuple[int, int]] = dataclasses.field(default_factory=dict)
+    records: dict[tuple[bytes, int], list[tuple[int, int]]] = dataclasses.field(default_factory=dict)
+
+    def contents(self, file: BinaryIO, user: bytes, number: int) -> list[bytes]:
+        """Return the contents of the variable length records of a user and number."""
+        contents = []
+        for offset, length in self.records.get((user, number), ()):
+            file.seek(offset)
+            contents.append(file.read(length))
+        return contents
 
     def record(self, file: BinaryIO, user: bytes, number: int) -> bytes | None:
-        """Return the content of a variable length record; None where there is none."""
-        if (user, number) not in self.records:
-            return None
-        offset, length = self.records[user, number]
-        file.seek(offset)
-        return file.read(length)
+        """Return the content of the first variable length record of a user and number; None without."""
+        return next(iter(self.contents(file, user, number)), None)
+
+    def coordinate_system(self, path: Path, file: BinaryIO) -> CoordinateSystem:
+        """Return the coordinate reference system that the file declares.
+
+        **Raises:** as `declared_system`.
+        """
+        return declared_system(f"{path}: header", lambda number: self.contents(file, PROJECTION_USER, number))
 
     @property
     def extra_bytes(self) -> int:
@@ -124,11 +139,13 @@ def read_header(path: Path, file: BinaryIO) -> LasHeader:
             f"{path}: header: it is {header_size} bytes long and points begin at {start}: a file of {size} "
             f"bytes and version 1.{minor} admits {_HEADER_SIZES[minor]} or more, in this order"
         )
+    extended, extended_count = 0, 0
     if minor >= 4:
-        extended, count, points = _EXTENDED_BLOCK.unpack_from(block, _EXTENDED_BLOCK_OFFSET)
-        if count and extended + count * _EXTENDED_RECORD_SIZE > size:
+        extended, extended_count, points = _EXTENDED_BLOCK.unpack_from(block, _EXTENDED_BLOCK_OFFSET)
+        if extended_count and extended + extended_count * _EXTENDED_RECORD_HEADER.size > size:
             raise ValueError(
-                f"{path}: header: {count} extended records from {extended} on do not fit into {size} bytes"
+                f"{path}: header: {extended_count} extended records from {extended} on do not fit into "
+                f"{size} bytes"
             )
     header = LasHeader(format_byte & ~_COMPRESSED, point_size, points, start, scales, offsets)
     if header.point_format not in ITEMS or header.extra_bytes < 0:
@@ -142,10 +159,13 @@ def read_header(path: Path, file: BinaryIO) -> LasHeader:
             raise ValueError(f"{path}: header: offset of {axis} = {offset:g} is not finite")
     if points == 0:
         raise ValueError(f"{path}: header: the file holds no points")
-    locations = {
-        (record.user, record.number): (record.offset, record.length)
-        for record in variable_records(path, file, _RECORD_HEADER, header_size, start, records, "points")
-    }
+    ordinary = variable_records(path, file, _RECORD_HEADER, header_size, start, records, "points")
+    appended = variable_records(
+        path, file, _EXTENDED_RECORD_HEADER, extended, size, extended_count, "end of the file"
+    )
+    locations: dict[tuple[bytes, int], list[tuple[int, int]]] = {}
+    for record in (*ordinary, *appended):
+        locations.setdefault((record.user, record.number), []).append((record.offset, record.length))
     header = dataclasses.replace(header, records=locations)
     laszip = header.record(file, *_LASZIP_RECORD)
     if not format_byte & _COMPRESSED:

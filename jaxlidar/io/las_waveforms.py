@@ -26,10 +26,16 @@ from typing import Any, BinaryIO, NamedTuple, final
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
-from jaxlidar._files import atomic_write
+from jaxlidar._files import atomic_writes
 from jaxlidar.io.airborne import AirborneShot, AirborneShots, Returns, Segment, evenly_spaced
 from jaxlidar.io.checks import MAX_COORDINATE, existing_file
-from jaxlidar.io.coordinates import GEO_KEYS, WKT, find_units, is_geographic
+from jaxlidar.io.coordinates import (
+    CoordinateSystem,
+    check_elevations,
+    find_units,
+    system_of_name,
+    wkt_of_units,
+)
 from jaxlidar.io.las import import_laspy, las_path, las_points, point_format_of, write_points
 from jaxlidar.io.las_header import LasHeader, read_header
 
@@ -41,7 +47,6 @@ _USER, _BEFORE_FIRST_LAYOUT, _MAX_LAYOUTS = b"LASF_Spec", 99, 255
 _LAYOUT = struct.Struct("<BBIIdd")
 # The header of the record that holds the packets, at the beginning of a .wdp file, and its number.
 _PACKETS_HEADER, _PACKETS_NUMBER = struct.Struct("<2x16sHQ32s"), 65535
-_PROJECTION_USER = b"LASF_Projection"
 # In the public header: offset of the flags, the flag of packets within the file, offset of their place.
 _FLAGS_OFFSET, _INTERNAL_PACKETS, _PACKETS_OFFSET = 6, 2, 227
 # The unit of times in the file, 1 ps, in ns.
@@ -103,7 +108,8 @@ def read_las_waveforms(path: str | os.PathLike[str]) -> AirborneShots:
     **Raises:** FileNotFoundError where there is no such file, or no .wdp file. ImportError without laspy.
     ValueError, naming the file and the place (the record of a point), where it is damaged, cut short,
     declares more than it can hold, has no packets or compressed ones, and where a point's packet has an
-    unknown layout or lies outside of the file, or its vector does not have the length that light goes.
+    unknown layout or lies outside of the file, or its vector does not have the length that light goes; and
+    for geocentric coordinates, and a coordinate reference system that is not known.
 
     **Source:** LAS specification 1.4 (ASPRS).
 
@@ -145,8 +151,7 @@ class _LasShots(AirborneShots):
             if header.laszip is not None:
                 raise ValueError(f"{path}: header: points are compressed: their packets are not read")
             self.layouts = _read_layouts(path, file, header)
-            systems = (header.record(file, _PROJECTION_USER, number) or b"" for number in (GEO_KEYS, WKT))
-            geographic = is_geographic(*systems)
+            self.system = header.coordinate_system(path, file)
             file.seek(_FLAGS_OFFSET)
             flags = int.from_bytes(file.read(2), "little")
             file.seek(_PACKETS_OFFSET)
@@ -163,9 +168,9 @@ class _LasShots(AirborneShots):
         self.points: Any = laspy.PackedPointRecord(
             np.memmap(path, point_format.dtype(), "r", header.start, (header.points,)), point_format
         )
-        self._sort_points_and_packets(geographic)
+        self._sort_points_and_packets()
 
-    def _sort_points_and_packets(self, geographic: bool) -> None:
+    def _sort_points_and_packets(self) -> None:
         points = self.points
         layout, offset, size = (np.asarray(points[f"wavepacket_{n}"]) for n in ("index", "offset", "size"))
         available = self.packet_bytes.size - self.packets_offset
@@ -188,8 +193,9 @@ class _LasShots(AirborneShots):
         direction = self.vector_sign * vector
         start = position - location[:, None] * direction
         sampled = evenly_spaced(indices.size)
-        self.units = find_units(f"{self.path}: points", geographic, start[sampled], direction[sampled])
+        self.units = find_units(f"{self.path}: points", self.system, start[sampled], direction[sampled])
         self._check_numbers(indices, direction, self.units.has_wrong_length(start, direction))
+        check_elevations(f"{self.path}: points", position[:, 2] * self.units.vertical)
 
         first = np.flatnonzero(is_first)
         heads, metres = indices[first], self.units.metres(start[first])
@@ -283,6 +289,7 @@ class _LasShots(AirborneShots):
             "gps_time": float(points_of_packets[0]["gps_time"][0]),
             "scanner_channel": int(_scanner_channel(points_of_packets[0])[0]),
             "returns": Returns(np.concatenate(positions), np.concatenate(times), *numbers),
+            "crs": self.system.text,
         }
 
 
@@ -499,7 +506,7 @@ def write_las_waveforms(
         raise ValueError(f"point_format = {point_format} has no packets; those of {_PACKET_FORMATS} have")
     path = las_path(path)
     # The inner file appears first: a LAS file that exists has its packets.
-    with atomic_write(path) as draft, atomic_write(_packet_path(path)) as packet_draft:
+    with atomic_writes(_packet_path(path), path) as (packet_draft, draft):
         writer = _PacketWriter()
         with packet_draft.open("wb") as file:
             file.write(bytes(_PACKETS_HEADER.size))
@@ -511,7 +518,7 @@ def write_las_waveforms(
         if not writer.positions:
             raise ValueError("shots: there is none; a file holds at least one")
         fields = {name: np.concatenate(values) for name, values in writer.fields.items()}
-        points = las_points(point_format, np.concatenate(writer.positions), fields, writer.geographic)
+        points = las_points(point_format, np.concatenate(writer.positions), fields, writer.system)
         points.header.global_encoding.waveform_data_packets_external = True
         laspy = import_laspy("writing")
         for layout, number in writer.layouts.items():
@@ -527,14 +534,21 @@ class _PacketWriter:
         self.layouts: dict[PacketLayout, int] = {}
         self.positions: list[np.ndarray] = []
         self.fields: dict[str, list[np.ndarray]] = {}
-        self.geographic = False
+        self.system: CoordinateSystem | None = None
+        self.geographic, self.crs = False, None
 
     def write(self, shot: AirborneShot, file: BinaryIO) -> None:
         """Write the packets of a shot, and collect its points."""
         if not self.positions:
-            self.geographic = shot.is_geographic
+            self.geographic, self.crs = shot.is_geographic, shot.crs
+            self.system = _system_of_shot(shot)
         if shot.is_geographic != self.geographic:
             raise ValueError(f"shot {shot.index}: degrees and metres in one file")
+        if shot.crs != self.crs:
+            raise ValueError(
+                f"shot {shot.index}: its coordinate reference system is {shot.crs}, that of the first shot "
+                f"{self.crs}; a file holds one"
+            )
         channels = {segment.channel for segment in shot.returning}
         if len(channels) > 1:
             raise ValueError(
@@ -564,7 +578,7 @@ class _PacketWriter:
             "return_number": returns.number,
             "number_of_returns": returns.count,
             "classification": returns.classification,
-            "synthetic": is_synthetic,
+            "synthetic": is_synthetic.astype(np.uint8),
             "gps_time": np.full(returns.time.size, 0.0 if shot.gps_time is None else shot.gps_time),
             "scanner_channel": np.full(returns.time.size, shot.scanner_channel),
             "wavepacket_index": layout[segment_of_return],
@@ -587,6 +601,16 @@ class _PacketWriter:
         if number > _MAX_LAYOUTS:
             raise ValueError(f"shot {shot.index}: one layout of packets more than {_MAX_LAYOUTS}")
         return number
+
+
+def _system_of_shot(shot: AirborneShot) -> CoordinateSystem | None:
+    """Return the coordinate reference system to declare for a shot; None for metres of an unknown one."""
+    east, _, up = (float(metres) for metres in shot.metres)
+    if shot.crs is not None:
+        return system_of_name(f"shot {shot.index}: crs", shot.crs)
+    if shot.is_geographic:
+        return system_of_name("crs", "EPSG:4326")
+    return None if east == up == 1.0 else system_of_name("crs", wkt_of_units(east, up))
 
 
 def _returns_with_synthetic(shot: AirborneShot, segments: list[Segment]) -> tuple[Returns, np.ndarray]:

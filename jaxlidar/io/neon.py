@@ -34,6 +34,7 @@ from jaxlidar.io.checks import (
     TWO_WAY_TOLERANCE,
     column_index,
 )
+from jaxlidar.io.coordinates import check_elevations
 from jaxlidar.io.noise import (
     QUIET_PULSE_SAMPLES,
     QUIET_SAMPLES,
@@ -174,6 +175,7 @@ def _shot(
     last = anchor + returning[-1].time[-1] * step
     if max(np.abs(anchor).max(), np.abs(last).max()) > MAX_COORDINATE:
         raise ValueError(f"{location}: V9, V10, V11, V16: the return lies beyond {MAX_COORDINATE:g} m")
+    check_elevations(f"{location}: V11", anchor[2])
     peak = geo["V15"]
     if not (0 <= peak < sent.size and peak.is_integer()) or sent[int(peak)] <= levels.pedestal:
         raise ValueError(f"{location}: V15 = {peak:g} is no sample of the outgoing pulse")

@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 
 from jaxlidar._checks import check_choice, check_number
 from jaxlidar.io.checks import MAX_COORDINATE
+from jaxlidar.io.coordinates import unit_length
 from jaxlidar.io.text import parse_integer, parse_number, read_lines
 from jaxlidar.plants.meshes import Mesh
 
@@ -22,6 +23,8 @@ _IGNORED_STATEMENTS = frozenset(
 )
 # Comments: after statements that name something, only where a blank precedes; names may have the sign.
 _COMMENT, _COMMENT_AFTER_NAME = re.compile(r"#.*"), re.compile(r"(^|\s)#.*")
+# A comment that names the unit of length, such as SketchUp's "# File units = meters".
+_UNIT_COMMENT = re.compile(r"\s*#.*\bunits?\s*[:=]\s*(.*?)\s*$", re.IGNORECASE)
 _UNNAMED = "unnamed"
 _NO_AREA = "without an area"
 
@@ -47,7 +50,7 @@ class MeshRead(NamedTuple):
 
 
 def read_obj(
-    path: str | os.PathLike[str], *, part: str = "material", scale: float = 1.0, up: str = "z"
+    path: str | os.PathLike[str], *, part: str = "material", scale: float | None = None, up: str = "z"
 ) -> MeshRead:
     r"""Read the triangle mesh of a Wavefront OBJ file, with the names of its materials, groups or objects.
 
@@ -60,7 +63,8 @@ def read_obj(
     - `path`: an OBJ file; its .mtl file is not needed.
     - `part`: the kind of names that become `Mesh.materials`: "material" (`usemtl`), "group" (`g`) or "object"
       (`o`). Faces before the first of these are "unnamed". Default "material".
-    - `scale`: metres per unit of length in the file, positive. Default 1.
+    - `scale`: metres per unit of length in the file, positive. Default None: the unit that a comment names,
+      as in "# units: cm", otherwise metres.
     - `up`: the file's vertical axis, "z" or "y"; of y, x stays and y becomes z. Default "z".
 
     **Returns:** a `MeshRead`: the `Mesh`, and the number of triangles that were left out, by reason: those
@@ -68,8 +72,9 @@ def read_obj(
 
     **Raises:** FileNotFoundError where there is no such file. ValueError, naming the file and the line, for
     corners of faces whose coordinates are not numbers or not on Earth, indices of missing vertices, faces of
-    fewer than three corners or that are not convex, and statements that are not known. ValueError for other
-    inadmissible arguments, and for a file without a triangle that has an area.
+    fewer than three corners or that are not convex, statements that are not known, and comments that name an
+    unknown unit or several units. ValueError for other inadmissible arguments, and for a file without a
+    triangle that has an area.
 
     **Source:** Wavefront Technologies (1989), Advanced Visualizer manual, appendix B1.
 
@@ -85,7 +90,8 @@ def read_obj(
     ('leaf', 'stem') [1.0, 1.0, 1.0] {'without an area': 0}
     """
     check_choice("part", part, tuple(_NAMING_STATEMENTS))
-    check_number("scale", scale, 0.0, low_open=True)
+    if scale is not None:
+        check_number("scale", scale, 0.0, low_open=True)
     check_choice("up", up, ("z", "y"))
     path, lines = read_lines(path)
     statements = _Statements(path, _NAMING_STATEMENTS[part])
@@ -93,7 +99,8 @@ def read_obj(
         statements.add(number, statement)
     if not statements.faces:
         raise ValueError(f"{path}: line {len(lines)}: there is no face in the file")
-    vertices = _remove_misplaced_vertices(path, statements) * scale
+    metres_per_unit = _unit(path, lines) if scale is None else scale
+    vertices = _remove_misplaced_vertices(path, statements) * metres_per_unit
     if up == "y":
         x, y, z = vertices.T
         vertices = np.stack([x, -z, y], axis=1)
@@ -192,6 +199,22 @@ class _Statements:
         self.faces.append(corners)
         self.face_lines.append(number)
         self.material.append(self.names.setdefault(self.name, len(self.names)))
+
+
+def _unit(path: Path, lines: list[str]) -> float:
+    """Return the metres of the unit of length that comments name; 1 where none does.
+
+    **Raises:** ValueError, naming the file and the line, for an unknown unit, and for several.
+    """
+    sizes = {}
+    for number, line in enumerate(lines, 1):
+        if name := _UNIT_COMMENT.match(line):
+            sizes[unit_length(f"{path}: line {number}", name[1]) or 1.0] = number
+    if len(sizes) > 1:
+        raise ValueError(
+            f"{path}: lines {', '.join(map(str, sizes.values()))} name different units of length"
+        )
+    return next(iter(sizes), 1.0)
 
 
 def _remove_misplaced_vertices(path: Path, statements: _Statements) -> Float[np.ndarray, "m 3"]:

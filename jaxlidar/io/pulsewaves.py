@@ -32,7 +32,15 @@ from jaxtyping import Bool
 
 from jaxlidar.io.airborne import AirborneShots, Scanner, Segment, evenly_spaced
 from jaxlidar.io.checks import MAX_COORDINATE, existing_file, warn_of_file
-from jaxlidar.io.coordinates import GEO_KEYS, find_units, is_geographic
+from jaxlidar.io.coordinates import (
+    GEOGRAPHIC_3D,
+    CoordinateSystem,
+    check_elevations,
+    declared_system,
+    find_units,
+    geographic_lines,
+    system_of_name,
+)
 from jaxlidar.io.las_header import variable_records
 
 # The header: signature, version, sizes, counts of records; then scale and offset of times, and those of
@@ -78,7 +86,9 @@ _Content = TypeVar("_Content")
 def read_pulsewaves(path: str | os.PathLike[str]) -> AirborneShots:
     """Open the shots of a PulseWaves file.
 
-    Both files are mapped: a shot is read when it is indexed. Coordinates may be metres, feet or degrees.
+    Both files are mapped: a shot is read when it is indexed. Coordinates may be metres, feet or degrees;
+    geocentric ones become longitude, latitude and height above the ellipsoid of WGS-84. Files that declare
+    their coordinate reference system need rasterio (`pip install "jaxlidar[io]"`).
 
     **Arguments:**
 
@@ -93,7 +103,8 @@ def read_pulsewaves(path: str | os.PathLike[str]) -> AirborneShots:
     **Raises:** FileNotFoundError where there is no such file, or no .wvs file. ValueError, naming the file
     and the place, for one that is no PulseWaves file, is damaged, compressed, without pulses, or declares
     more than it can hold; when a shot is read, for waves that lie outside of the .wvs file, an unknown
-    descriptor, a segment without samples, and a direction that does not have the length that light goes.
+    descriptor, a segment without samples, and a direction that does not have the length that light goes; and
+    for a coordinate reference system that is not known. ImportError without rasterio where one is declared.
 
     **Source:** PulseWaves specification 0.3 (rapidlasso).
 
@@ -158,7 +169,7 @@ class PulsesHeader(NamedTuple):
     time_offset: float
     scale: np.ndarray
     offset: np.ndarray
-    geographic: bool
+    system: CoordinateSystem
     scanners: dict[int, Scanner]
     descriptors: dict[int, PulseDescriptor]
     tables: dict[int, np.ndarray]
@@ -200,9 +211,12 @@ class _PulseWavesShots(AirborneShots):
                 stacklevel=4,
             )
         rows = self.pulse_numbers[evenly_spaced(len(self))]
-        self.units = find_units(
-            f"{path}: pulses", header.geographic, self._anchor(rows), self._direction(rows)
-        )
+        # Geocentric lines become geographic ones.
+        is_geocentric = header.system.kind == "geocentric"
+        self.system = system_of_name("coordinates", GEOGRAPHIC_3D) if is_geocentric else header.system
+        anchor, direction = self._lines(rows)
+        first_return = anchor + self._first_time(rows)[:, None] * direction
+        self.units = find_units(f"{path}: pulses", self.system, first_return, direction)
 
     def __len__(self) -> int:
         return self.pulse_numbers.size
@@ -225,13 +239,20 @@ class _PulseWavesShots(AirborneShots):
                     has_return[index] = bool(self._segments(index, descriptor)[1])
         return has_return
 
-    def _anchor(self, rows: Any) -> np.ndarray:
-        return self.pulses["anchor"][rows] * self.header.scale + self.header.offset
+    def _lines(self, rows: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Return the anchors and the directions per ns of pulses."""
+        pulses, header = self.pulses[rows], self.header
+        counts = pulses["target"].astype(float) - pulses["anchor"]
+        time_unit = self.time_units[pulses["descriptor"]]
+        anchor = pulses["anchor"] * header.scale + header.offset
+        direction = counts * header.scale / (_TARGET_TIME * time_unit[:, None])
+        if header.system.kind != "geocentric":
+            return anchor, direction
+        return geographic_lines(header.system, anchor, direction, self._first_time(rows))
 
-    def _direction(self, rows: Any) -> np.ndarray:
-        counts = self.pulses["target"][rows].astype(float) - self.pulses["anchor"][rows]
-        time = _TARGET_TIME * self.time_units[self.pulses["descriptor"][rows], None]
-        return counts * self.header.scale / time
+    def _first_time(self, rows: Any) -> np.ndarray:
+        """Return the times of the first returning samples of pulses, ns, to the whole unit of time."""
+        return self.pulses["first"][rows] * self.time_units[self.pulses["descriptor"][rows]]
 
     @property
     def gps_time(self) -> np.ndarray:
@@ -239,11 +260,11 @@ class _PulseWavesShots(AirborneShots):
 
     @property
     def anchor(self) -> np.ndarray:
-        return self._anchor(self.pulse_numbers)
+        return self._lines(self.pulse_numbers)[0]
 
     @property
     def direction(self) -> np.ndarray:
-        return self._direction(self.pulse_numbers)
+        return self._lines(self.pulse_numbers)[1]
 
     def _read(self, index: int) -> dict[str, Any]:
         index = int(self.pulse_numbers[index])
@@ -252,11 +273,13 @@ class _PulseWavesShots(AirborneShots):
         outgoing, returning = self._segments(index, descriptor)
         if not returning:
             raise ValueError(f"{self.path}: pulse {index}: it has no returning segment")
-        anchor, direction = self._anchor(rows)[0], self._direction(rows)[0]
+        anchor, direction = (array[0] for array in self._lines(rows))
         if np.abs(anchor).max() > MAX_COORDINATE:
             raise ValueError(
                 f"{self.path}: pulse {index}: its anchor {anchor.tolist()} lies beyond {MAX_COORDINATE:g}"
             )
+        first_return = (anchor + returning[0].start * direction)[2] * self.units.vertical
+        check_elevations(f"{self.path}: pulse {index}: its first return", first_return)
         if self.units.has_wrong_length(anchor, direction):
             raise ValueError(
                 f"{self.path}: pulse {index}: the way of light in 1 ns cannot be {direction.tolist()}"
@@ -271,6 +294,7 @@ class _PulseWavesShots(AirborneShots):
             "metres": self.units.metres(anchor),
             "gps_time": float(pulse["time"] * self.header.time_scale + self.header.time_offset),
             "scanner": self.scanners.get(descriptor.scanner or min(self.scanners, default=0)),
+            "crs": self.system.text,
         }
 
     def _descriptor(self, index: int) -> PulseDescriptor:
@@ -398,7 +422,10 @@ def _read_header(path: Path, file: BinaryIO) -> PulsesHeader:
     contents = dict(_record_contents(path, file, header_size, start, records))
     if appended:
         contents |= _appended_contents(path, file, start + count * pulse_size, size)
-    geographic = is_geographic(contents.get((_PROJECTION_USER, GEO_KEYS), b""))
+    projection = {
+        number: [content] for (user, number), content in contents.items() if user == _PROJECTION_USER
+    }
+    system = declared_system(location, lambda number: projection.get(number, []))
 
     def parse(numbers: range, parse_content: Callable[[str, bytes], _Content]) -> dict[int, _Content]:
         """Parse the records with some numbers of the specification, by their number from 0 on."""
@@ -416,7 +443,7 @@ def _read_header(path: Path, file: BinaryIO) -> PulsesHeader:
         time_offset=time_offset,
         scale=coordinates[:3],
         offset=coordinates[3:],
-        geographic=geographic,
+        system=system,
         scanners=parse(_SCANNERS, _parse_scanner),
         descriptors=parse(_DESCRIPTORS, _parse_descriptor),
         tables=parse(_TABLES, _parse_table),

@@ -2,13 +2,15 @@
 
 import math
 import os
+import re
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from jaxlidar._checks import check_range
+from jaxlidar._checks import check_number
 from jaxlidar.io.checks import MAX_COORDINATE, column_index, warn_of_file
+from jaxlidar.io.coordinates import unit_length
 from jaxlidar.io.text import parse_integer, parse_number, read_lines, split_cells
 from jaxlidar.plants.tree import Tree
 
@@ -26,6 +28,10 @@ _INTEGERS = ("id", "parent", "order")
 _LENGTHS = (*(f"{end}{axis}" for end in ("start", "end") for axis in "xyz"), "radius")
 # The parent of a cylinder that has none, as this module writes it.
 _NO_PARENT = -1
+
+
+# The name of a column, and its unit in brackets.
+_NAME_AND_UNIT = re.compile(r"\s*(.*?)\s*([\[(][^\])]*[\])])?\s*$")
 
 
 class TreeRead(NamedTuple):
@@ -47,7 +53,7 @@ class TreeRead(NamedTuple):
     dropped: dict[str, int]
 
 
-def read_qsm(path: str | os.PathLike[str], *, scale: float = 1.0) -> TreeRead:
+def read_qsm(path: str | os.PathLike[str], *, scale: float | None = None) -> TreeRead:
     r"""Read the tree of a quantitative structure model: a table of cylinders of SimpleForest, aRchi or rTwig.
 
     A cylinder is a root if its parent is negative, is itself, or is 0 where no cylinder has the ID 0. Where a
@@ -57,8 +63,9 @@ def read_qsm(path: str | os.PathLike[str], *, scale: float = 1.0) -> TreeRead:
 
     - `path`: a text file of comma-, semicolon- or tab-separated values whose first line names the columns:
       ID, parentID, startX .. endZ and radius, in any order and case; branchOrder where there is one, from 0
-      or, as aRchi's, from 1 for the trunk on.
-    - `scale`: metres per unit of length in the file. Default 1.
+      or, as aRchi's, from 1 for the trunk on. Names may be followed by their unit, as in "radius [cm]".
+    - `scale`: metres per unit of length in the file. Default None: the units that the columns name, otherwise
+      metres.
 
     **Returns:** a `TreeRead`: the `Tree`, leaf-off, each cylinder a segment of constant radius, and the
     cylinders that were dropped, by reason: those "without a length". Their children grow from their parents.
@@ -66,9 +73,10 @@ def read_qsm(path: str | os.PathLike[str], *, scale: float = 1.0) -> TreeRead:
     **Warns:** `FileWarning` where parents are not in the file, with the number of their cylinders.
 
     **Raises:** FileNotFoundError where there is no such file. ValueError, naming the file and the line, for
-    columns that are missing, rows of the wrong length, cells that are not numbers, or not whole ones where
-    those belong, coordinates that are not on Earth, radii that are not positive, IDs given twice, and several
-    cylinders that are their own ancestors. ValueError for a scale that is not positive.
+    columns that are missing or name an unknown unit, rows of the wrong length, cells that are not numbers, or
+    not whole ones where those belong, coordinates that are not on Earth, radii that are not positive, IDs
+    given twice, and several cylinders that are their own ancestors. ValueError for a scale that is not
+    positive.
 
     **Source:** Hackenberg et al. (2021), SimpleForest; Martin-Ducup and Lecigne (2022), the R package aRchi;
     Morales and MacFarlane (2024), Forestry 98, 1, and the dictionary of the R package rTwig.
@@ -84,18 +92,25 @@ def read_qsm(path: str | os.PathLike[str], *, scale: float = 1.0) -> TreeRead:
     >>> print(f"{tree.height:.1f} m, {tree.trunk_diameter:.1f} m", dropped)
     3.0 m, 0.2 m {'without a length': 0}
     """
-    check_range("scale", scale, 0.0, low_open=True)
+    if scale is not None:
+        check_number("scale", scale, 0.0, low_open=True)
     path, lines = read_lines(path)
     if not lines:
         raise ValueError(f"{path}: line 1: the file is empty")
     delimiter = max(",;\t", key=lines[0].count)
-    names = [c.strip().lower().replace("_", "") for c in split_cells(path, 1, lines[0], delimiter)]
+    head = [_NAME_AND_UNIT.match(cell) for cell in split_cells(path, 1, lines[0], delimiter)]
+    names = ["" if cell is None else cell[1].lower().replace("_", "") for cell in head]
     column = _column_indices(path, names)
+    units = {}
+    for k in _LENGTHS:
+        cell = head[column[k]]
+        stated = None if cell is None else unit_length(f"{path}: line 1: {k}", cell[2])
+        units[k] = scale or stated or 1.0
     rows: dict[int, _Cylinder] = {}
     for number, text in enumerate(lines[1:], 2):
         if not text.strip():
             continue
-        row = _cylinder(path, number, column, split_cells(path, number, text, delimiter, len(names)), scale)
+        row = _cylinder(path, number, column, split_cells(path, number, text, delimiter, len(names)), units)
         if row.id in rows:
             raise ValueError(f"{path}: line {number}: ID {row.id} was given in line {rows[row.id].line}")
         rows[row.id] = row
@@ -162,10 +177,12 @@ def _column_indices(path: Path, names: list[str]) -> dict[str, int]:
     return indices
 
 
-def _cylinder(path: Path, line: int, column: dict[str, int], cells: list[str], scale: float) -> _Cylinder:
+def _cylinder(
+    path: Path, line: int, column: dict[str, int], cells: list[str], units: dict[str, float]
+) -> _Cylinder:
     location = f"{path}: line {line}"
     integers = {k: parse_integer(path, line, k, cells[column[k]]) for k in _INTEGERS if k in column}
-    lengths = {k: scale * parse_number(path, line, k, cells[column[k]]) for k in _LENGTHS}
+    lengths = {k: units[k] * parse_number(path, line, k, cells[column[k]]) for k in _LENGTHS}
     for k, value in lengths.items():
         if not math.isfinite(value):
             raise ValueError(f"{location}: {k} is not finite")

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import ArrayLike
 
-from jaxlidar._checks import check_kind, check_numbers, check_range, check_shape
+from jaxlidar._checks import as_numpy, check_kind, check_range, check_shape
 from jaxlidar._files import atomic_write
+from jaxlidar.io.coordinates import import_rasterio, metric_system
 
 _TIFF = (".tif", ".tiff")
 # Shots lie on a grid if they are off by less than this fraction of its spacing.
@@ -32,16 +33,17 @@ def write_raster(
     **Arguments:**
 
     - `path`: the file to write, .tif or .tiff.
-    - `values`: (shots,) numbers by name; each becomes a band of that name.
+    - `values`: (shots,) numbers by name, NaN or masked where there is none; each becomes a band of that name.
     - `position`: (shots, 2) x and y of the shots in m, on a grid along x and y, such as
       `Survey.grid(...).position`, in any order.
-    - `crs`: the coordinate reference system of `position`, such as "EPSG:32633". Default None: not known.
+    - `crs`: the coordinate reference system of `position`, in metres, such as "EPSG:32633". Default None: not
+      known.
 
     **Returns:** nothing.
 
     **Raises:** ImportError where `rasterio` is not installed, which the extra `io` installs. ValueError for
-    values of another number, infinite ones, shots that are not on a grid or twice in one cell, an unknown
-    `crs`, and another kind of file. OSError for a path that cannot be written.
+    values of another number, infinite ones, shots that are not on a grid or twice in one cell, a `crs` that
+    is not known or not in metres, and another kind of file. OSError for a path that cannot be written.
 
     **Source:** OGC GeoTIFF 1.1.
 
@@ -56,23 +58,17 @@ def write_raster(
     >>> print(terrain.origin.tolist(), terrain.heights[:, 0].tolist())
     [0.0, 0.0] [18.0, 17.5, 19.0]
     """
-    try:
-        import rasterio
-        from rasterio.errors import CRSError
-    except ImportError as error:
-        raise ImportError("GeoTIFF needs the package rasterio: pip install 'jaxlidar[io]'") from error
+    rasterio = import_rasterio("GeoTIFF files")
     path = Path(path)
     if path.suffix.lower() not in _TIFF:
         raise ValueError(f"path = {path} ends in {path.suffix!r}; admissible are {', '.join(_TIFF)}")
     check_kind("values", values, Mapping, "a mapping of names to (shots,) numbers")
-    check_kind("crs", crs, str | None, "the name of a coordinate reference system, or None")
     if not values:
         raise ValueError("values is empty; admissible is one map or more")
     cells, origin, spacing, shape = _grid(position)
     bands = np.full((len(values), *shape), np.nan)
     for band, (name, shot_values) in zip(bands, values.items()):
-        check_numbers(f"values of {name!r}", shot_values)
-        numbers = np.asarray(shot_values, float)
+        numbers = as_numpy(shot_values, f"values of {name!r}", missing=True)
         check_shape(f"values of {name!r}", numbers, (len(cells),))
         check_range(f"values of {name!r}", np.where(np.isnan(numbers), 0.0, numbers))
         # Rows run from north to south.
@@ -80,10 +76,7 @@ def write_raster(
     west, north = origin[0] - 0.5 * spacing[0], origin[1] + (shape[0] - 0.5) * spacing[1]
     transform = rasterio.Affine(spacing[0], 0.0, west, 0.0, -spacing[1], north)
     profile: dict[str, Any] = {"driver": "GTiff", "count": len(bands), "dtype": "float64", "nodata": np.nan}
-    try:
-        profile["crs"] = None if crs is None else rasterio.CRS.from_string(crs)
-    except CRSError as error:
-        raise ValueError(f"crs = {crs!r} is not known ({error})") from error
+    profile["crs"] = None if crs is None else metric_system("crs", crs).crs
     profile |= {"height": shape[0], "width": shape[1], "transform": transform}
     with atomic_write(path) as draft, rasterio.open(draft, "w", **profile) as file:
         file.write(bands)
@@ -96,8 +89,7 @@ def _grid(position: ArrayLike | Sequence) -> tuple[np.ndarray, np.ndarray, np.nd
 
     **Raises:** as `write_raster`.
     """
-    check_numbers("position", position)
-    xy = np.asarray(position, float)
+    xy = as_numpy(position, "position")
     if xy.ndim != 2 or xy.shape[1] != 2 or len(xy) == 0:
         raise ValueError(f"position has the shape {xy.shape}; admissible is (shots, 2), one or more")
     check_range("position", xy)

@@ -12,6 +12,7 @@ noticed, too, that a damaged index of the file no longer names. Each row has one
 """
 
 import contextlib
+import threading
 import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -28,6 +29,8 @@ _ZARR_SUFFIX = ".zarr"
 # The file that makes a folder a Zarr store of version 3.
 _ZARR_ROOT = "zarr.json"
 _HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
+# Warning filters are one list for all threads: of two that change it, one would restore the other's.
+_FILTER_LOCK = threading.Lock()
 # Values as they are stored, and read when they are asked for: an index would read its coordinate at once.
 _RAW: dict[str, Any] = {"decode_cf": False, "create_default_indexes": False, "cache": False}
 
@@ -237,7 +240,7 @@ class ZarrStore:
             for name in variables.names:
                 cls._add_row_variable(root[group], datasets[group], name, variables.dimension, checksum)
         yield cls(path, root)
-        with warnings.catch_warnings():
+        with _FILTER_LOCK, warnings.catch_warnings():
             # zarr warns that the format does not specify them yet; xarray warns where they are missing.
             warnings.filterwarnings("ignore", "Consolidated metadata is currently not part", UserWarning)
             zarr.consolidate_metadata(path, zarr_format=3)

@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from jaxlidar._checks import check_choice, check_range
 from jaxlidar.io.checks import MAX_COORDINATE, column_index, max_unpacked_size, warn_of_file
+from jaxlidar.io.coordinates import metric_system, unit_length
 from jaxlidar.io.text import parse_integer, parse_number, read_lines, split_cells
 from jaxlidar.optics.leaf_angles import LeafAngles
 from jaxlidar.scenes.voxels import VoxelMap
@@ -81,10 +82,10 @@ def read_vox(
     **Warns:** `FileWarning` where the grid of `res` does not end at `max_corner`.
 
     **Raises:** FileNotFoundError where there is no such file. ValueError, naming the file and the line, for a
-    first line or a header that is missing or makes no sense, leaf angles without a name here, columns that
-    are missing or given twice, rows of the wrong length, no row or implausibly few, indices outside the grid
-    or given twice, negative densities, and angles outside 0 to 180 degrees. ValueError for a `fill` that is
-    negative or not finite, and for another `name`.
+    first line or a header that is missing or makes no sense, another unit than the metre in it, leaf angles
+    without a name here, columns that are missing or given twice, rows of the wrong length, no row or
+    implausibly few, indices outside the grid or given twice, negative densities, and angles outside 0 to 180
+    degrees. ValueError for a `fill` that is negative or not finite, and for another `name`.
 
     **Source:** Vincent et al. (2017), Remote Sens. Environ. 190, 273; Vincent, Pimont and Verley (2021), A
     note on PAD/LAD estimators implemented in AMAPVox 1.7, doi:10.23708/1AJNMP.
@@ -105,6 +106,7 @@ def read_vox(
     check_range("fill", fill, 0.0)
     path, lines = read_lines(path)
     header, column_line = _read_header(path, lines)
+    _check_units(path, header)
     grid = _read_grid(path, header)
     angles = _leaf_angles(path, header)
     names = lines[column_line].split()
@@ -236,6 +238,16 @@ def _read_header(path: Path, lines: list[str]) -> tuple[dict[str, tuple[str, int
                 raise ValueError(f"{path}: line {number}: #{key} was given in line {header[key][1]}")
             header[key] = (value, number)
     raise ValueError(f"{path}: line {len(lines)}: the file ends where the names of the columns belong")
+
+
+def _check_units(path: Path, header: dict[str, tuple[str, int]]) -> None:
+    """Refuse a header that names another unit than the metre, or a system of coordinates in another one."""
+    for key, (text, line) in header.items():
+        location = f"{path}: line {line}: {key}"
+        if key in ("unit", "units") and unit_length(location, text) != 1.0:
+            raise ValueError(f"{location} = {text}; read are voxels in metres")
+        if key in ("crs", "srs", "epsg"):
+            metric_system(location, f"EPSG:{text}" if text.isdigit() else text)
 
 
 def _read_grid(path: Path, header: dict[str, tuple[str, int]]) -> _VoxelGrid:

@@ -30,6 +30,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxlidar._checks import array, as_scalar, briefly, check_choice, check_range, concrete
+from jaxlidar._converted import Converted
 from jaxlidar._ranges import Range, check_ranges
 
 # Cells of inclination, one degree wide; nodes of |cos zenith| of the tables of G.
@@ -63,7 +64,7 @@ class LeafAngles(eqx.Module):
     0.849
     """
 
-    probability: Float[Array, "90"] = eqx.field(converter=array("probability"))
+    probability: Converted[Float[Array, "90"]] = eqx.field(converter=array("probability"))
 
     ranges: ClassVar = {"probability": Range(0.0)}
 

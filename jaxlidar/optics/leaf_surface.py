@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
-from jaxlidar._checks import check_number, check_range
+from jaxlidar._checks import as_numpy, check_number, check_range
 
 # Gauss-Legendre nodes and weights on [0, 1].
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(32)
@@ -84,7 +84,7 @@ def leaf_surface(n: ArrayLike, alpha: float | int = 40.0) -> LeafSurface:
     check_range("n", n, 1.0)
     check_number("alpha", alpha, 0.0, 90.0)
     xp: Any = jnp if isinstance(n, jax.Array) else np
-    index = n if isinstance(n, jax.Array) else np.asarray(n, dtype=float)
+    index = n if isinstance(n, jax.Array) else as_numpy(n, "n")
     t_alpha, r_alpha = _mean_within_cone(xp, index, alpha)
     t12, r12 = _mean_within_cone(xp, index, 90.0)
     square = index * index

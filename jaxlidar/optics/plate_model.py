@@ -48,6 +48,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from jaxlidar import _double_single as double_single
 from jaxlidar import _expint
+from jaxlidar._checks import check_numbers
 from jaxlidar._double_single import DoubleSingle
 from jaxlidar._one_function import once
 from jaxlidar.optics.leaf_surface import LeafSurface
@@ -115,6 +116,8 @@ def plate_model_slopes(
 
 def _arrays(k: Any, N: Any, surface: LeafSurface) -> tuple[_Reals, _Reals, LeafSurface, DoubleSingle | None]:
     """Arrays of one type, and in single precision kappa = (r12 + r21)/t21 in double-single."""
+    for name, x in {"k": k, "N": N, **surface._asdict()}.items():
+        check_numbers(name, x)
     dtype = jnp.result_type(k, N, float)
     k, N, *face = (jnp.asarray(x, dtype) for x in (k, N, *surface))
     face, kappa = LeafSurface(*face), None

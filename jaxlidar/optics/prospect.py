@@ -41,6 +41,7 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxlidar._checks import (
+    as_numpy,
     as_scalar,
     briefly,
     check_choice,
@@ -240,7 +241,7 @@ def _trait(name: str, value: ArrayLike) -> Float[Array, ""]:
         raise ValueError(
             f"{name} has shape {np.shape(value)}; a leaf's traits are scalars, see prospect_spectra"
         )
-    return as_scalar(value)
+    return as_scalar(value, name)
 
 
 def _is_zero(value: ArrayLike) -> bool:
@@ -264,7 +265,7 @@ def material(leaf: Prospect, wavelengths: Any) -> tuple[Array, LeafSurface]:
             jnp.interp(x, grid, jnp.asarray(c, dtype), **outside) for c in (table.index, *table.absorption)
         ]
         return jnp.stack(columns[1:]), leaf_surface(columns[0], leaf.alpha)
-    x = np.asarray(wavelengths, dtype=float)
+    x = as_numpy(wavelengths, "wavelengths")
     check_range("wavelengths", x, table.wavelength[0], table.wavelength[-1])
     absorption, face = _tabulated(table, x.tobytes(), x.shape, leaf.alpha)
     # The surface stays in double precision: the plate model uses its digits in single precision too.

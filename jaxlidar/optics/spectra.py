@@ -40,6 +40,7 @@ from jaxlidar._checks import (
     scalar,
     warn_units,
 )
+from jaxlidar._converted import Converted
 from jaxlidar._ranges import FRACTION, SUM_OF_FRACTIONS, Range, check_ranges
 
 # The largest wavelength, nm, that is finite in single precision.
@@ -72,10 +73,10 @@ class Spectrum(eqx.Module):
     0.305
     """
 
-    wavelength: Float[Array, " samples"] = eqx.field(converter=array("wavelength"))
-    reflectance: Float[Array, " samples"] = eqx.field(converter=array("reflectance"))
+    wavelength: Converted[Float[Array, " samples"]] = eqx.field(converter=array("wavelength"))
+    reflectance: Converted[Float[Array, " samples"]] = eqx.field(converter=array("reflectance"))
     name: str = eqx.field(static=True, default="")
-    scale: Float[Array, ""] = eqx.field(converter=scalar("scale"), default=1.0)
+    scale: Converted[Float[Array, ""]] = eqx.field(converter=scalar("scale"), default=1.0)
 
     ranges: ClassVar = {
         "wavelength": Range(0.0, low_open=True, increasing=True),
@@ -114,7 +115,7 @@ class Spectrum(eqx.Module):
         **Raises:** ValueError for a wavelength outside the range of the samples. Inside a JAX transformation
         of the wavelength nothing can be raised: the end values are used there.
         """
-        wavelength = as_array(wavelength)
+        wavelength = as_array(wavelength, "wavelength")
         table = concrete(self.wavelength)
         if table is not None:
             field = f"wavelength of the spectrum {self.name!r}" if self.name else "wavelength"
@@ -138,10 +139,10 @@ def reflectance_at(
     **Raises:** ValueError where the numbers of values and wavelengths differ, and for a wavelength outside
     the range of a spectrum.
     """
-    wavelength = jnp.atleast_1d(as_array(wavelength))
+    wavelength = jnp.atleast_1d(as_array(wavelength, "wavelength"))
     if isinstance(value, Spectrum):
         return value(wavelength)
-    value = as_array(value)
+    value = as_array(value, field)
     if value.shape not in ((), (1,), wavelength.shape):
         raise ValueError(
             f"{field} has shape {value.shape}; admissible is one number, or one for each of "

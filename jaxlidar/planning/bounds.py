@@ -331,7 +331,7 @@ class Bounds:
 
             (F' - F) / F' <= 1 - y,
 
-        and darker by at most (F - F') / F <= A / (A + F') <= A / (A + y F_min), since F <= A + F'.
+        and darker by at most (F - F') / F <= A / (A + F') <= A / (A + F_min), since F <= A + F'.
         """
         canopy = self.scene.canopy
         # Without ground, nothing but the material may be in view.
@@ -339,8 +339,7 @@ class Bounds:
             return 1.0
         y = np.exp(-self.kappa * self._largest_depth(canopy, name))
         material_return = self.optics[name][0] * self._backscatter_range(name)[1] * (1.0 - y) / self.kappa
-        least_background = self._first_order_range(name)[0] * y
-        darker = _worst_wavelength(_fraction(material_return, least_background))
+        darker = _worst_wavelength(_fraction(material_return, self._first_order_range(name)[0]))
         return self._with_higher_orders(max(1.0 - float(y), darker))
 
     def plates(self) -> float:

@@ -11,6 +11,7 @@ import os
 
 import jax.numpy as jnp
 
+from jaxlidar._memory import format_bytes, machine_memory
 from jaxlidar.planning.config import TimeBins, TraceConfig
 
 # Copies of a batch's response that are alive at once: sums of photons, of groups, and the result.
@@ -33,14 +34,6 @@ LARGE_RESPONSE = 1e9
 MAX_APPLIED_WAVELENGTHS = 8
 # The pulse is a dense matrix of fine bins and samples up to so many elements; beyond, it is a band.
 MAX_DENSE_PULSE = 1 << 22
-
-
-def machine_memory() -> float:
-    """Return the bytes of memory of this machine; 8 GB where the system does not tell."""
-    try:
-        return float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
-    except (AttributeError, OSError, ValueError):
-        return 8e9
 
 
 def response_bytes(config: TraceConfig, bins: TimeBins, *, degree: int, n_traces: int) -> float:
@@ -118,14 +111,6 @@ def _number_bytes() -> int:
 def _photons_and_segments(config: TraceConfig) -> int:
     """Photons and ray segments that are alive at once."""
     return config.n_photons + min(config.n_rays, _RAYS_AT_ONCE) * config.max_ray_segments
-
-
-def format_bytes(size: float) -> str:
-    """Format a number of bytes as GB, MB or kB, to two digits."""
-    for unit, factor in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
-        if size >= factor:
-            return f"{float(f'{size / factor:.2g}'):g} {unit}"
-    return f"{size:.0f} bytes"
 
 
 def memory_limit(max_memory: float | None) -> float:

@@ -27,6 +27,8 @@ MAX_VOXELS = 16_384
 _MAX_SEGMENT_BINS = 64
 # Bins that a segment touches besides those of its length: partial bins at both ends, and the kernel's.
 _SEGMENT_MARGIN = 3
+# Bound on the rounding of positions in single precision: 16 units in the last place of their distance.
+_ROUNDING = 2e-6
 # Points of the rim of a footprint; those where footprints are many, and how many that is.
 _RIM_POINTS, _COARSE_RIM_POINTS, _MANY_FOOTPRINTS = 32, 8, 1000
 # Footprint radii out to the rim. Outside of 2.5 is 4e-6 of a Gaussian beam, outside of 2 is 3e-4.
@@ -113,14 +115,19 @@ class PathLengths:
         self.first_path = 2.0 * nearest
         # Rays at the rim are longer than the axis, from which paths are counted.
         self.last_path = 2.0 * (farthest + float(np.max(distance - slant_range)))
-        # A twentieth of the extent before the first surface: the plan also serves scenes a little higher.
-        self.start_distance = 0.05 * (farthest - nearest) + 1e-3 - nearest
+        # A twentieth of the extent before the first surface: the plan also serves scenes a little higher. Far
+        # from the reference plane the margin exceeds the rounding of single precision: a ray that starts on a
+        # surface misses it.
+        margin = max(1e-3, _ROUNDING * max(abs(nearest), abs(farthest)))
+        self.start_distance = 0.05 * (farthest - nearest) + margin - nearest
         least_range = float(np.min(slant_range))
         if self.start_distance >= least_range:
             altitude = concrete_number(lidar.altitude)
+            # The range of the aim point is in proportion to the altitude.
+            lowest_altitude = altitude * self.start_distance / least_range
             raise ValueError(
                 f"altitude = {altitude:g} m: the scene reaches up to the sensor; "
-                f"admissible is more than {altitude + self.start_distance - least_range:g} m"
+                f"admissible is more than {lowest_altitude:g} m"
             )
 
     @property

@@ -5,15 +5,19 @@ import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+import jax
+
 from jaxlidar._checks import (
     check_choice,
     check_integer,
     check_kind,
+    check_number,
     check_range,
     concrete_array,
     concrete_number,
 )
 from jaxlidar._constants import SPEED_OF_LIGHT
+from jaxlidar._memory import format_bytes
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.instrument.survey import Survey
 from jaxlidar.optics.laws import AbstractMirror
@@ -39,7 +43,6 @@ from jaxlidar.planning.local_origin import move_aim_to_origin
 from jaxlidar.planning.memory import (
     MAX_APPLIED_WAVELENGTHS,
     check_memory,
-    format_bytes,
     jacobian_bytes,
     keeps_histories,
     memory_limit,
@@ -92,12 +95,14 @@ class PlanScope(NamedTuple):
     max_memory: float | None
 
 
+@jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class Plan:
     """Plan of a simulation: effects, time bins, orders of scattering, and numbers of rays and photons.
 
     Plans are made by `jaxlidar.plan`. Printed, a plan is a table of effects, followed by a line of sizes. It
-    is static: what a plan leaves out is never compiled.
+    is static: what a plan leaves out is never compiled. For JAX it is a pytree without leaves, so that it can
+    be an argument of `jax.jit` and other transformations; equal plans share a program.
 
     - `config`: the static configuration of the tracer: scatterers, switches, sizes of loops and batches.
     - `limits`: lengths that bound rays and photons, and the number of orders.
@@ -285,15 +290,15 @@ def plan(
     survey = lidar if isinstance(lidar, Survey) else None
     lidar = lidar.middle if isinstance(lidar, Survey) else lidar
     check_kinds(lidar, scene)
-    rtol = DEFAULT_RTOL if rtol is None else float(rtol)
-    if not 0 < rtol < 1:
-        raise ValueError(f"rtol = {rtol:g} is outside the admissible range (0, 1)")
+    rtol = DEFAULT_RTOL if rtol is None else rtol
+    check_number("rtol", rtol, 0.0, 1.0, low_open=True, high_open=True)
+    rtol = float(rtol)
     check_integer("n_photons", n_photons)
     for name, value in (("n_rays", n_rays), ("max_orders", max_orders)):
         if value is not None:
             check_integer(name, value)
-    if max_step is not None and not 0 < max_step < math.inf:
-        raise ValueError(f"max_step = {max_step:g} is outside the admissible range (0, inf)")
+    if max_step is not None:
+        check_number("max_step", max_step, 0.0, low_open=True)
     if max_memory is not None:
         check_range("max_memory", max_memory, 0.0, low_open=True)
     check_choice("footprint", footprint, ("random", "fixed"))

@@ -83,8 +83,9 @@ def _misfit_materials(plan: Plan, lidar: Lidar, scene: Scene) -> Iterator[str]:
         yield "it has plates that cover everything; the scene's have gaps"
     if config.mirrors != tuple(isinstance(s.law, AbstractMirror) for s in scene.surfaces):
         yield "its surfaces and the scene's differ in which are mirrors"
-    if config.hotspot != (scene.canopy is not None and scene.canopy.hotspot):
-        yield f"it has hotspot = {config.hotspot}; the canopy has not"
+    hotspot = scene.canopy is not None and scene.canopy.hotspot
+    if config.hotspot != hotspot:
+        yield f"it has hotspot = {config.hotspot}; the canopy has hotspot = {hotspot}"
     if config.vertical and concrete_number(lidar.zenith) != 0:
         yield f"it is for a beam at nadir; zenith = {concrete_number(lidar.zenith):g} degrees"
     if config.uses_quadrature and not consists_of_planes(scene):

@@ -4,7 +4,7 @@ import dataclasses
 import math
 from typing import NamedTuple
 
-from jaxlidar._checks import concrete_number
+from jaxlidar._checks import check_number, check_numbers, check_shape, concrete_number
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.planning.config import KERNEL_BINS, TimeBins
@@ -30,8 +30,7 @@ def target_bin_width(
         # without duration has no features.
         feature_width = max(0.25 * pulse_feature, 0.05 * interval)
         return min(interval, feature_width if pulse_std > 0 else 0.5 * interval)
-    if not 0 < bin_width < math.inf:
-        raise ValueError(f"bin_width = {bin_width:g} is outside the admissible range (0, inf)")
+    check_number("bin_width", bin_width, 0.0, low_open=True)
     return bin_width
 
 
@@ -68,6 +67,8 @@ def bins_and_samples(
         begin = math.floor((first + pulse_start) / interval) * interval
         samples = math.ceil((last + pulse_end - begin) / interval) + 1
     else:
+        check_numbers("window", window)
+        check_shape("window", window, (2,))
         begin, end = map(float, window)
         if not (math.isfinite(begin) and begin < end < math.inf):
             raise ValueError(f"window = {window} is not (first, last) with first < last, in ns")

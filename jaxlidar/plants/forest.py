@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from jaxlidar._checks import check_integer, check_kind, check_number, check_range, check_shape
+from jaxlidar._checks import check_integer, check_kind, check_number, check_range, check_seed, check_shape
 from jaxlidar.plants.habits import Habit, grow
 from jaxlidar.plants.tree import Tree
 
@@ -90,6 +90,7 @@ def forest(
     check_range("sum of shares", weight.sum(), 0.0, low_open=True)
 
     # Streams of their own: another minimum distance, for instance, leaves the trees as they are.
+    check_seed(seed)
     position_rng, kind_rng, growth_rng = np.random.default_rng(seed).spawn(3)
     count = max(1, round(density * area[0] * area[1] / 1e4))
     position = _stem_positions(count, area, minimum_distance, density, position_rng)

@@ -25,7 +25,15 @@ from typing import Any, final
 
 import numpy as np
 
-from jaxlidar._checks import briefly, check_integer, check_kind, check_number, check_shape, warn_units
+from jaxlidar._checks import (
+    briefly,
+    check_integer,
+    check_kind,
+    check_number,
+    check_seed,
+    check_shape,
+    warn_units,
+)
 from jaxlidar.plants.lsystem import Item, LSystem, Rule, Word
 from jaxlidar.plants.tree import Tree
 from jaxlidar.plants.turtle import turtle
@@ -327,6 +335,7 @@ def grow(habit: Habit | None = None, *, seed: int | np.random.Generator = 0) -> 
     """
     habit = broadleaf() if habit is None else habit
     check_kind("habit", habit, Habit, "a Habit or None")
+    check_seed(seed)
     rng = np.random.default_rng(seed)
     word = habit.wood().rewrite(seed=rng)
     relative_height = turtle(word).height

@@ -23,7 +23,7 @@ from typing import Any, NamedTuple, final
 import numpy as np
 from jaxtyping import Float, Int, UInt32
 
-from jaxlidar._checks import check_flag, check_integer, check_kind, check_number, kind_of
+from jaxlidar._checks import check_flag, check_integer, check_kind, check_number, check_seed, kind_of
 
 # A run of letters without parameters, or one letter with its parameters (in a rule's successor: arrays).
 Item = str | tuple[Any, ...]
@@ -256,6 +256,7 @@ class LSystem:
             steps = check_integer("steps", steps, 0)
         max_modules = check_integer("max_modules", max_modules)
         max_steps = check_integer("max_steps", max_steps)
+        check_seed(seed)
         rng = np.random.default_rng(seed)
         word = self.axiom if isinstance(self.axiom, Word) else Word.of(self.axiom)
         for _ in range(max_steps if steps is None else steps):

@@ -18,7 +18,7 @@ from typing import final
 import numpy as np
 from jaxtyping import ArrayLike, Bool, Float, Int
 
-from jaxlidar._checks import briefly, check_kind, check_range, check_shape
+from jaxlidar._checks import briefly, check_kind, check_range, check_shape, check_unmasked
 from jaxlidar.optics.leaf_angles import ANGLE_CELLS, LeafAngles
 from jaxlidar.plants.grid import Grid, voxel_edges
 from jaxlidar.scenes.voxels import VoxelMap
@@ -70,6 +70,8 @@ class Mesh:
         materials: Sequence[str] = ("mesh",),
     ):
         check_range("vertices", vertices)
+        for name, indices in (("faces", faces), ("material", material)):
+            check_unmasked(name, indices)
         vertices, faces = np.asarray(vertices, float), np.asarray(faces)
         material = np.zeros(len(faces), int) if material is None else np.asarray(material)
         for name, indices in (("faces", faces), ("material", material)):

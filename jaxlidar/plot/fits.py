@@ -7,7 +7,15 @@ import numpy as np
 from jaxtyping import ArrayLike
 from matplotlib.axes import Axes
 
-from jaxlidar.plot.style import TOTAL_COLOUR, WAVELENGTH_COLOURS, limit_height, make_axes, wavelength_rows
+from jaxlidar._checks import as_numpy, check_number
+from jaxlidar.plot.style import (
+    TOTAL_COLOUR,
+    WAVELENGTH_COLOURS,
+    check_waveform,
+    limit_height,
+    make_axes,
+    wavelength_rows,
+)
 from jaxlidar.spectral.waveform import Waveform
 
 
@@ -49,7 +57,8 @@ def residuals(
     >>> print(f"up to {ax.get_xlim()[1]:.1f} standard deviations")
     up to 5.0 standard deviations
     """
-    data, sigma = np.asarray(observed, dtype=float), np.asarray(noise, dtype=float)
+    check_waveform(wave)
+    data, sigma = as_numpy(observed, "observed"), as_numpy(noise, "noise")
     shape = np.asarray(wave.reflectance).shape
     if data.shape != shape:
         raise ValueError(f"observed has shape {data.shape}; admissible is the waveform's, {shape}")
@@ -57,8 +66,7 @@ def residuals(
         raise ValueError(f"noise has shape {sigma.shape}; admissible is a number or the waveform's {shape}")
     if not np.all(sigma > 0):
         raise ValueError(f"noise = {np.min(sigma):g} is outside the admissible range (0, inf)")
-    if not limit > 0:
-        raise ValueError(f"limit = {limit:g} is outside the admissible range (0, inf)")
+    check_number("limit", limit, 0.0, low_open=True)
     rows = wavelength_rows(wave, wavelength)
     ax = make_axes(ax, (2.2, 4.2))
     height = np.asarray(wave.height)
@@ -137,7 +145,7 @@ def fit(
     residuals(wave, observed, noise, residual_axes, wavelength=wavelength, limit=limit)
     residual_axes.set_ylabel("")
     rows, height = wavelength_rows(wave, wavelength), np.asarray(wave.height)
-    data, model = np.asarray(observed, float), np.asarray(wave.reflectance)
+    data, model = as_numpy(observed, "observed"), np.asarray(wave.reflectance)
     for number, i in enumerate(rows):
         is_one_of_many = len(rows) > 1
         colour = WAVELENGTH_COLOURS[number % len(WAVELENGTH_COLOURS)] if is_one_of_many else TOTAL_COLOUR

@@ -14,6 +14,7 @@ from jaxlidar.plot.style import (
     OTHER_COLOUR,
     TOTAL_COLOUR,
     WAVELENGTH_COLOURS,
+    check_waveform,
     make_axes,
 )
 from jaxlidar.spectral.waveform import Waveform
@@ -40,6 +41,8 @@ def energy_budget(wave: Waveform, ax: Axes | None = None, *, legend: bool = True
 
     **Returns:** the axes.
 
+    **Raises:** TypeError for a `Waveforms`, of several shots.
+
     **Example:**
 
     >>> import jax, jaxlidar as jl
@@ -50,6 +53,7 @@ def energy_budget(wave: Waveform, ax: Axes | None = None, *, legend: bool = True
     >>> print([text.get_text() for text in ax.get_legend().get_texts()])
     ['absorbed by ground', 'escaped']
     """
+    check_waveform(wave)
     names = [f"{w:g} nm" for w in np.asarray(wave.wavelength, float)]
     ax = make_axes(ax, (5.0, 0.9 + 0.4 * len(names)))
     absorbed = [name for name in wave.energy_budget if name.startswith("absorbed by ")]

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import ArrayLike
 from matplotlib.axes import Axes
 
+from jaxlidar._checks import as_numpy
 from jaxlidar.optics.leaf import LeafOptics
 from jaxlidar.optics.prospect import Prospect
 from jaxlidar.optics.spectra import Spectrum
@@ -47,11 +48,11 @@ def spectrum(
     ax = make_axes(ax, (5.0, 3.0))
     colour = WAVELENGTH_COLOURS[len(ax.lines) % len(WAVELENGTH_COLOURS)]
     if isinstance(source, Spectrum):
-        grid = np.asarray(source.wavelength if wavelength is None else wavelength, float)
+        grid = as_numpy(source.wavelength if wavelength is None else wavelength, "wavelength")
         line = {"color": colour, "label": source.name or "reflectance", **style}
         ax.plot(grid, np.asarray(source(grid)), **line)
     else:
-        grid = LEAF_WAVELENGTHS if wavelength is None else np.asarray(wavelength, float)
+        grid = LEAF_WAVELENGTHS if wavelength is None else as_numpy(wavelength, "wavelength")
         for values, linestyle, name in zip(source(grid), ("-", "--"), ("reflectance", "transmittance")):
             line = {"color": colour, "linestyle": linestyle, "label": name, **style}
             ax.plot(grid, np.broadcast_to(np.asarray(values), grid.shape), **line)

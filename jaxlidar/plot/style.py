@@ -4,12 +4,15 @@ Colours are those of Okabe and Ito (2008), which are distinct with any colour vi
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 
+from jaxlidar._checks import check_kind, check_number
 from jaxlidar.spectral.waveform import Waveform
+from jaxlidar.survey.waveforms import Waveforms
 
 MATERIAL_COLOURS = {"leaf": "#009E73", "bark": "#8C510A", "ground": "#E69F00", "plate": "#56B4E9"}
 OTHER_COLOUR = "#999999"
@@ -20,11 +23,25 @@ WAVELENGTH_COLOURS = ("#0072B2", "#D55E00", "#CC79A7", "#009E73", "#E69F00", "#5
 VISIBLE_FRACTION = 0.004
 
 
+def check_waveform(wave: Any) -> None:
+    """Refuse an object that is not one waveform, such as those of a survey.
+
+    **Raises:** TypeError that says how to draw one.
+    """
+    if isinstance(wave, Waveforms):
+        raise TypeError(
+            f"wave is a Waveforms of {len(wave)} shots; admissible is the Waveform of one shot, as in "
+            "many[0]; jaxlidar.plot.survey draws numbers of all shots"
+        )
+    check_kind("wave", wave, Waveform, "a Waveform")
+
+
 def wavelength_rows(wave: Waveform, wavelength: float | None) -> Sequence[int]:
     """Return the row of the waveform at `wavelength` (nm), or all rows for None."""
     wavelengths = np.asarray(wave.wavelength, dtype=float)
     if wavelength is None:
         return range(wavelengths.size)
+    check_number("wavelength", wavelength)
     # Wavelengths are stored in single precision.
     rows = np.flatnonzero(np.isclose(wavelengths, wavelength, rtol=1e-6))
     if rows.size == 0:

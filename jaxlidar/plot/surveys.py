@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection
 from matplotlib.colors import LinearSegmentedColormap
 
-from jaxlidar._checks import check_kind, check_range, check_shape, concrete
+from jaxlidar._checks import as_numpy, check_kind, check_range, check_shape
 from jaxlidar.instrument.survey import Survey
 from jaxlidar.plot.style import BEAM_COLOUR, MATERIAL_COLOURS, make_axes
 from jaxlidar.scenes.scene import Scene
@@ -102,9 +102,8 @@ def survey(
 
 
 def _checked_values(values: Any, shots: int) -> Float[np.ndarray, " shots"]:
-    array = concrete(values)
-    check_shape("values", values, (shots,))
-    assert array is not None
+    array = as_numpy(values, "values", missing=True)
+    check_shape("values", array, (shots,))
     # NaN marks shots without a value.
     check_range("values", np.nan_to_num(array))
     return array

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d import Axes3D, proj3d
 from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
-from jaxlidar._checks import check_range
+from jaxlidar._checks import check_number
 from jaxlidar.plants.tree import Tree
 from jaxlidar.plot.style import MATERIAL_COLOURS
 
@@ -58,8 +58,10 @@ def tree(
     >>> print(ax.get_zlabel())
     height (m)
     """
-    check_range("alpha", alpha, 0.0, 1.0)
-    check_range("max_buds", max_buds, 1)
+    check_number("alpha", alpha, 0.0, 1.0)
+    check_number("max_buds", max_buds, 1)
+    check_number("elevation", elevation)
+    check_number("azimuth", azimuth)
     joined = _joined(tree)
     if not len(joined.start):
         raise ValueError("tree has 0 segments; at least 1 is admissible")

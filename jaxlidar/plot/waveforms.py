@@ -5,11 +5,13 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
+from jaxlidar._checks import check_number
 from jaxlidar.plot.style import (
     MATERIAL_COLOURS,
     OTHER_COLOUR,
     TOTAL_COLOUR,
     WAVELENGTH_COLOURS,
+    check_waveform,
     limit_height,
     make_axes,
     wavelength_rows,
@@ -63,8 +65,8 @@ def waveform(
     """
     if quantity not in ("reflectance", "energy"):
         raise ValueError(f"quantity = {quantity!r} is none of 'reflectance', 'energy'")
-    if not sigma >= 0:
-        raise ValueError(f"sigma = {sigma:g} is outside the admissible range [0, inf)")
+    check_waveform(wave)
+    check_number("sigma", sigma, 0.0)
     rows = wavelength_rows(wave, wavelength)
     ax = make_axes(ax, (3.5, 4.2))
     height = np.asarray(wave.height)

@@ -26,16 +26,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxlidar.sampling.errors import namespace_of, student_widening
+from jaxlidar.sampling.errors import floating, namespace_of, student_widening
 
 Estimate = TypeVar("Estimate")
 
 
 class StopReason(enum.Enum):
-    """Reason why sampling ended, in words."""
+    """Reason why sampling ended, in words. Those of one shot and of a survey are the same."""
 
+    NOTHING_RANDOM = "nothing is random"
     TOLERANCE_MET = "tolerance met"
-    BATCHES_SPENT = "photons traced"
+    BATCHES_SPENT = "batches spent"
     TIME_SPENT = "time spent"
     INTERRUPTED = "interrupted"
 
@@ -86,6 +87,7 @@ class StepRule:
         `size`: the present one; `error`, `tolerance`: present and largest admissible relative error.
         """
         xp = namespace_of(error)
+        size = floating(size)
         growth = (error / tolerance) ** (1.0 / self.convergence_rate)
         if self.widened:
             predicted = xp.ceil(size * xp.maximum(growth, 1.0))

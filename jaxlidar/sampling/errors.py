@@ -25,6 +25,11 @@ def namespace_of(value: Any) -> Any:
     return jnp if isinstance(value, jax.Array) else np
 
 
+def floating(count: Any) -> Any:
+    """Return a count as a number that floats divide: JAX's default float for its arrays, else as it is."""
+    return count.astype(jnp.result_type(float)) if isinstance(count, jax.Array) else count
+
+
 def student_widening(batches: Any) -> Any:
     """Factor that widens a standard error estimated from few batches.
 
@@ -35,7 +40,7 @@ def student_widening(batches: Any) -> Any:
     26.7.5): to 0.1 % for eight batches.
     """
     # Floating point first: the third power of an int32 may overflow.
-    x, freedom = 2.0, batches - 1.0
+    x, freedom = 2.0, floating(batches) - 1.0
     terms = (
         (x**3 + x) / 4,
         (5 * x**5 + 16 * x**3 + 3 * x) / 96,
@@ -54,5 +59,6 @@ def relative_error(mean: Any, stderr: Any) -> Any:
     is_significant = mean > PEAK_FRACTION * xp.max(mean, axis=-1, keepdims=True)
     # Guard the inside of the `where`: the mean may be zero where it does not count.
     squares = xp.where(is_significant, (stderr / xp.where(is_significant, mean, 1.0)) ** 2, 0.0)
-    mean_squares = xp.sum(squares, axis=-1) / xp.maximum(xp.sum(is_significant, axis=-1), 1)
+    n_samples = xp.sum(is_significant, axis=-1, dtype=squares.dtype)
+    mean_squares = xp.sum(squares, axis=-1) / xp.maximum(n_samples, 1)
     return xp.max(xp.sqrt(mean_squares), axis=-1, initial=0.0)

@@ -25,7 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxlidar.sampling.errors import namespace_of, student_widening
+from jaxlidar.sampling.errors import floating, namespace_of, student_widening
 
 
 class RunningMoments(NamedTuple):
@@ -82,13 +82,14 @@ class RunningMoments(NamedTuple):
     def merge(self, second: "RunningMoments") -> "RunningMoments":
         """Return the moments of the batches of both."""
         count = self.count + second.count
-        fraction = second.count * (1.0 / count)
+        first_count, second_count = floating(self.count), floating(second.count)
+        fraction = second_count * (1.0 / floating(count))
 
         def mean(mean_a: Any, mean_b: Any) -> Any:
             return mean_a + fraction * (mean_b - mean_a)
 
         def squares(s_a: Any, s_b: Any, mean_a: Any, mean_b: Any) -> Any:
-            return s_a + s_b + self.count * fraction * (mean_b - mean_a) ** 2
+            return s_a + s_b + first_count * fraction * (mean_b - mean_a) ** 2
 
         return RunningMoments(
             count,
@@ -100,7 +101,8 @@ class RunningMoments(NamedTuple):
     @property
     def stderr(self) -> Any:
         """Standard errors of `mean`, widened for few batches; of two batches or more."""
-        scale = student_widening(self.count) / (self.count * (self.count - 1.0)) ** 0.5
+        count = floating(self.count)
+        scale = student_widening(count) / (count * (count - 1.0)) ** 0.5
         return jax.tree.map(lambda s: scale * namespace_of(s).sqrt(s), self.squares)
 
 
@@ -112,11 +114,11 @@ def scaled_deviation(value: Any, mean: Any, count: Any) -> Any:
     """
     # Not (count - 1) / count: JAX divides integers of 32 bits in single precision, also where all else is
     # double.
-    return (value - mean) * (1.0 - 1.0 / count) ** 0.5
+    return (value - mean) * (1.0 - 1.0 / floating(count)) ** 0.5
 
 
 def _update_mean(mean: Any, value: Any, count: Any) -> Any:
-    mean += (value - mean) / count
+    mean += (value - mean) / floating(count)
     return mean
 
 

@@ -49,6 +49,7 @@ from jaxlidar._checks import (
     scalar,
     warn_units,
 )
+from jaxlidar._converted import Converted
 from jaxlidar._ranges import Range, check_ranges
 from jaxlidar._signatures import briefly
 
@@ -196,17 +197,21 @@ class Atmosphere(eqx.Module):
     0.788
     """
 
-    visibility: Float[Array, ""] | None = eqx.field(converter=optional_scalar("visibility"), default=23.0)
+    visibility: Converted[Float[Array, ""] | None] = eqx.field(
+        converter=optional_scalar("visibility"), default=23.0
+    )
     rayleigh: bool = eqx.field(static=True, default=True)
     aerosol_model: str = eqx.field(static=True, default="kim")
-    rayleigh_scale_height: Float[Array, ""] = eqx.field(
+    rayleigh_scale_height: Converted[Float[Array, ""]] = eqx.field(
         converter=scalar("rayleigh_scale_height"), default=8450.0
     )
-    aerosol_scale_height: Float[Array, ""] = eqx.field(
+    aerosol_scale_height: Converted[Float[Array, ""]] = eqx.field(
         converter=scalar("aerosol_scale_height"), default=1400.0
     )
-    lidar_ratio: Float[Array, ""] | None = eqx.field(converter=optional_scalar("lidar_ratio"), default=None)
-    base_height: Float[Array, ""] = eqx.field(converter=scalar("base_height"), default=0.0)
+    lidar_ratio: Converted[Float[Array, ""] | None] = eqx.field(
+        converter=optional_scalar("lidar_ratio"), default=None
+    )
+    base_height: Converted[Float[Array, ""]] = eqx.field(converter=scalar("base_height"), default=0.0)
 
     ranges: ClassVar = {
         "visibility": Range(0.0, low_open=True),
@@ -248,6 +253,7 @@ class Atmosphere(eqx.Module):
         **Raises:** ValueError for a wavelength outside its range.
         """
         wavelength, height = _checked_wavelength(wavelength), as_array(height, "height")
+        check_range("height", height)
         total = jnp.zeros(wavelength.shape + height.shape)
         for at_zero, scale, _ in self._layers(wavelength):
             total = total + _outer(at_zero, jnp.exp(-height / scale))
@@ -318,7 +324,7 @@ class Atmosphere(eqx.Module):
         transmittance = self.two_way_transmittance(wavelength, height, altitude, zenith)
         if self.lidar_ratio is None:
             return jnp.zeros_like(transmittance)
-        height = as_array(height)
+        height = as_array(height, "height")
         total = jnp.zeros_like(transmittance)
         for at_zero, scale, ratio in self._layers(wavelength):
             total = total + _outer(at_zero / ratio, jnp.exp(-height / scale))

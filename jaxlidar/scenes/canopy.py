@@ -18,10 +18,12 @@ from jaxlidar._checks import (
     check_choice,
     check_flag,
     check_kind,
+    check_numbers,
     check_range,
     concrete,
     kind_of,
 )
+from jaxlidar._converted import Converted
 from jaxlidar._ranges import FRACTION
 from jaxlidar._signatures import briefly
 from jaxlidar.optics.phase import AbstractPhase
@@ -71,7 +73,7 @@ class Canopy(eqx.Module):
 
     voxels: VoxelMap
     leaf: Callable | AbstractPhase | None = None
-    bark: Reflectance | AbstractPhase | None = eqx.field(converter=_as_bark, default=None)
+    bark: Converted[Reflectance | AbstractPhase | None] = eqx.field(converter=_as_bark, default=None)
     transmission: str = eqx.field(static=True, default="diffuse")
     hotspot: bool = eqx.field(static=True, default=False)
     sides: str = eqx.field(static=True, default="open")
@@ -127,6 +129,7 @@ class Canopy(eqx.Module):
         **Raises:** ValueError if one of them is outside [0, 1], or their sum exceeds 1; TypeError where the
         leaf optics do not return the two.
         """
+        check_numbers("wavelength", wavelength)
         if isinstance(self.leaf, AbstractPhase):
             albedo = reflectance_at(self.leaf.albedo, wavelength, "leaf albedo")
             return albedo, jnp.zeros_like(albedo)

@@ -25,6 +25,7 @@ Derivatives do not pass through the loop. The distance s solves f(s, theta) = 0,
 differentiation ds/dtheta = -(df/dtheta) / (df/ds).
 """
 
+from collections.abc import Sequence
 from typing import Any, final
 
 import equinox as eqx
@@ -35,13 +36,15 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxlidar._checks import concrete_array
+from jaxlidar._mesh_axes import vary_together
 from jaxlidar._one_function import once
 from jaxlidar._vectors import FAR, Scalar, Vec, along, dot, normalise, vec
 from jaxlidar.scenes.raster import Cell, Raster
 from jaxlidar.scenes.shapes import AbstractShape
 
-# Largest number of steps of a ray over a field that repeats without end.
-MAX_STEPS = 16_384
+# Largest number of steps of a ray over a field that repeats without end: only rays that fall by less than a
+# millionth of the field's relief in every step need more. The loop ends with the last ray, long before.
+MAX_STEPS = 1 << 20
 # Cells along each side of a block: a power of two, so that the block of a cell is a shift of bits, because
 # processors divide vectors of integers one by one.
 _LOG2_BLOCK_SIZE = 3
@@ -101,6 +104,11 @@ class _GridRay(eqx.Module):
     ascending: tuple[Bool[Array, "*s"], ...]
     exit_distance: Float[Array, "*s"]
     tolerance: Float[Array, "*s"]
+
+    def face_distances(self, cell: Sequence[Int[Array, "*s"]]) -> list[Float[Array, "*s"]]:
+        """Distances at which the ray leaves a cell along x and y."""
+        dtype = self.exit_distance.dtype
+        return [self.cell_length[k] * cell[k].astype(dtype) + self.face_offset[k] for k in range(2)]
 
 
 @final
@@ -247,7 +255,7 @@ class HeightField(AbstractShape):
         blocks = [self._block_of(cell, axis) for axis, cell in enumerate((state.i, state.j))]
         highest = self.block_maxima.at[blocks[0][0], blocks[1][0]].get(mode="promise_in_bounds")
         edges = [jnp.where(ray.ascending[k], last, first) for k, (_, first, last) in enumerate(blocks)]
-        faces = [ray.cell_length[k] * edges[k] + ray.face_offset[k] for k in range(2)]
+        faces = ray.face_distances(edges)
         leave = jnp.minimum(jnp.minimum(faces[0], faces[1]), ray.exit_distance)
         leave = jnp.maximum(leave, state.distance)
         least_height = ray.height + jnp.minimum(ray.height_rate * state.distance, ray.height_rate * leave)
@@ -265,7 +273,7 @@ class HeightField(AbstractShape):
         """Return the coefficients a, b, c of the clearance within a cell, with u measured from `distance`."""
         c0, cx, cy, cxy = self.heights.bilinear_coefficients(cell)
         rate = ray.rate
-        x, y = (ray.position[k] + rate[k] * distance - cell[k] for k in range(2))
+        x, y = (ray.position[k] + rate[k] * distance - cell[k].astype(distance.dtype) for k in range(2))
         clearance = ray.height + ray.height_rate * distance - (c0 + cx * x + (cy + cxy * x) * y)
         slope = ray.height_rate - (cx + cxy * y) * rate[0] - (cy + cxy * x) * rate[1]
         return -cxy * rate[0] * rate[1], slope, clearance
@@ -280,9 +288,7 @@ class HeightField(AbstractShape):
             # `once` is an optimisation barrier: compilers would compute shared values again for every field
             # of the new state.
             stays_above, block_exit, block_next = once(self._cross_block(ray, state))
-            faces = [
-                ray.cell_length[k] * cell + ray.face_offset[k] for k, cell in enumerate((state.i, state.j))
-            ]
+            faces = ray.face_distances((state.i, state.j))
             cell_exit = jnp.minimum(jnp.minimum(faces[0], faces[1]), ray.exit_distance)
             cell_exit = jnp.maximum(state.distance, cell_exit)
             length = cell_exit - state.distance
@@ -306,7 +312,7 @@ class HeightField(AbstractShape):
             above = stays_above | (end_clearance >= 0)
             return _Traversal(distance, i, j, above, active, hit_distance, state.steps + 1)
 
-        return lax.while_loop(continue_, advance, state)
+        return lax.while_loop(continue_, advance, vary_together(state))
 
     def height_bounds_below(
         self, points: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]

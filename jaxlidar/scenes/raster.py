@@ -64,8 +64,9 @@ class Raster(eqx.Module):
         origin = self.origin + by
         steps = jnp.round(lax.stop_gradient(-origin / self.spacing))
         if not self.periodic:
-            last_node = jnp.asarray(self.values.shape) - 1
-            steps = jnp.clip(steps, -self.origin_node, last_node - self.origin_node)
+            last_node = jnp.asarray(self.values.shape, jnp.int32) - 1
+            first, last = ((n - self.origin_node).astype(steps.dtype) for n in (0, last_node))
+            steps = jnp.clip(steps, first, last)
         origin_node = self.origin_node + steps.astype(jnp.int32)
         return Raster(self.values, self.spacing, origin + steps * self.spacing, origin_node, self.periodic)
 
@@ -112,6 +113,6 @@ class Raster(eqx.Module):
         position = self.grid_coordinates(p)
         cell = self.cell_at(position)
         c0, cx, cy, cxy = self.bilinear_coefficients(cell)
-        x, y = (coordinate - number for coordinate, number in zip(position, cell))
+        x, y = (p - number.astype(p.dtype) for p, number in zip(position, cell))
         slope = ((cx + cxy * y) / self.spacing[0], (cy + cxy * x) / self.spacing[1])
         return c0 + cx * x + (cy + cxy * x) * y, slope

@@ -1,5 +1,6 @@
 """Heights of a canopy relative to its ground: a buried one is refused, a misplaced one reported."""
 
+import jax
 import numpy as np
 
 from jaxlidar._checks import concrete, warn_user
@@ -48,7 +49,8 @@ def check_relative_height(canopy: Canopy, ground: AbstractGround) -> None:
         return
     voxels = canopy.voxels
     size, origin = concrete(voxels.voxel_size), concrete(voxels.origin)
-    if size is None or origin is None or concrete(ground.heights) is None or concrete(ground.spacing) is None:
+    terrain = (concrete(a) for a in (ground.heights, ground.spacing, ground.origin))
+    if size is None or origin is None or any(a is None for a in terrain):
         return
     extinction = _total_extinction(voxels)
     if extinction is None or not np.any(extinction):
@@ -64,7 +66,9 @@ def check_relative_height(canopy: Canopy, ground: AbstractGround) -> None:
     has_plants = extinction > 0
     if not np.any(has_plants):
         return
-    surface = np.asarray(ground.height_at(*np.meshgrid(x, y, indexing="ij")), float)
+    # Within a transformation that traces other parts of the scene, constants would be traced, too.
+    with jax.ensure_compile_time_eval():
+        surface = np.asarray(ground.height_at(*np.meshgrid(x, y, indexing="ij")), float)
     # Only voxels that lie below the terrain as a whole count: in a map that was lifted onto terrain, the
     # lowest voxel of a column is partly in the ground.
     depth = surface[:, :, None] - (middles + 0.5 * size[2])

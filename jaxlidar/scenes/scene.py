@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxlidar._checks import check_kind, concrete, kind_of
+from jaxlidar._converted import Converted
 from jaxlidar._ranges import Range
 from jaxlidar._signatures import briefly
 from jaxlidar._vectors import FAR
@@ -61,7 +62,7 @@ class Scene(eqx.Module):
     """
 
     canopy: Canopy | None = None
-    plates: tuple[AbstractSheet, ...] = eqx.field(converter=_as_plates, default=())
+    plates: Converted[tuple[AbstractSheet, ...]] = eqx.field(converter=_as_plates, default=())
     ground: AbstractGround | None = None
     atmosphere: Atmosphere | None = None
 

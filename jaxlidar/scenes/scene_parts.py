@@ -7,7 +7,7 @@ from typing import final
 import numpy as np
 from jaxtyping import Float
 
-from jaxlidar._checks import check_kind, check_range
+from jaxlidar._checks import as_numpy, check_kind, check_range
 from jaxlidar.scenes.scene import Scene
 
 
@@ -64,7 +64,7 @@ class SceneParts:
         if not callable(self.part):
             raise TypeError(f"part is a {type(self.part).__name__}; admissible is a function of two corners")
         check_kind("z", self.z, Sequence | np.ndarray, "(low, high), m")
-        z = tuple(float(v) for v in self.z)
+        z = tuple(as_numpy(self.z, "z").tolist())
         if len(z) != 2 or not (np.isfinite(z[0]) and np.isfinite(z[1]) and z[0] <= z[1]):
             raise ValueError(f"z = {self.z}; admissible is (low, high), finite, low not above high")
         object.__setattr__(self, "z", z)
@@ -78,6 +78,7 @@ class SceneParts:
         **Raises:** TypeError where the function does not return a `Scene`, ValueError where its voxels extend
         beyond `z`.
         """
+        low, high = as_numpy(low, "low"), as_numpy(high, "high")
         call = f"part({low.tolist()}, {high.tolist()})"
         scene = self.part(low, high)
         check_kind(call, scene, Scene, "a Scene")

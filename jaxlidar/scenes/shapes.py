@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxlidar._checks import as_scalar, concrete_array
+from jaxlidar._checks import as_array, as_scalar, concrete_array
 from jaxlidar._vectors import FAR, Scalar, Vec, dot, vec
 
 # Rays whose cosine with the normal is smaller than this are taken as parallel and do not meet the plane.
@@ -31,9 +31,11 @@ _PARALLEL = 1e-9
 class AbstractShape(eqx.Module):
     """The shape and position of a surface in space.
 
-    Derive your own shape from this class and define its five methods. The upper side of a surface is the
-    side to which its normal points. Points (in m) and directions (unit vectors) are (x, y, z) tuples of
-    arrays of one shape.
+    Derive your own shape from this class and define its five methods; and `outline`, if the shape has one and
+    derivatives are taken with respect to anything that moves it or the beam: without, they leave out that
+    rays come to meet the shape or to miss it, and a `jaxlidar.OutlineWarning` says so. The upper side of a
+    surface is the side to which its normal points. Points (in m) and directions (unit vectors) are (x, y, z)
+    tuples of arrays of one shape.
 
     **Example:** the shape of a level ground, met 8 m below a point.
 
@@ -107,6 +109,40 @@ class AbstractShape(eqx.Module):
         **Returns:** (n,) distances in m, and (n,) cosines between direction and normal.
         """
 
+    def outline(self, x: Vec, w: Vec) -> Scalar | None:
+        """Return the signed distances of rays from the outline of the shape, by which derivatives see it.
+
+        The return jumps where rays come to meet the shape or to miss it. Derivatives of the first order, and
+        of the first flight of photons, take that in by this distance (see
+        `jaxlidar.trace.reparametrisation`); flights after a scattering leave it out.
+
+        **Arguments:**
+
+        - `x`: points, m.
+        - `w`: directions.
+
+        **Returns:** distances in m, negative for rays that meet the shape and positive for those that miss
+        it: a function of point and direction that can be differentiated twice, zero at the outline alone. A
+        constant, as `jnp.full_like(x[0], -1.0)`, for a shape that has no outline in view. None (default)
+        where it is not stated.
+        """
+        return None
+
+
+class OutlineWarning(UserWarning):
+    """The warning that a derivative leaves out the outline of a shape.
+
+    It is given where a derivative is taken through a shape of yours that does not define
+    `AbstractShape.outline`.
+
+    **Example:** it is an error in tests.
+
+    >>> import warnings
+    >>> import jaxlidar as jl
+    >>> with warnings.catch_warnings():
+    ...     warnings.simplefilter("error", jl.OutlineWarning)
+    """
+
 
 # Compiled: plans evaluate it often, and dispatching its operations one by one takes longer.
 @jax.jit
@@ -156,7 +192,8 @@ class Plane(AbstractShape):
         """
         height = as_scalar(height, "height")
         slope, aspect = as_scalar(slope, "slope"), as_scalar(aspect, "aspect")
-        return Plane(*_normal_and_point(slope, aspect, jnp.asarray(position, height.dtype), height))
+        place = as_array(position, "position").astype(height.dtype)
+        return Plane(*_normal_and_point(slope, aspect, place, height))
 
     @property
     def lights_itself(self) -> bool:

@@ -21,6 +21,7 @@ from jaxtyping import Array, Float
 
 from jaxlidar._checks import (
     as_array,
+    as_numpy,
     check_choice,
     check_kind,
     check_numbers,
@@ -29,6 +30,7 @@ from jaxlidar._checks import (
     coordinates,
     scalar,
 )
+from jaxlidar._converted import Converted
 from jaxlidar._ranges import FRACTION, SUM_OF_FRACTIONS, Range, check_ranges
 from jaxlidar._signatures import briefly
 from jaxlidar.optics.laws import AbstractLaw, Lambertian
@@ -244,12 +246,12 @@ class Ground(AbstractGround):
     normal: -0.342 north, 0.940 up
     """
 
-    height: Float[Array, ""] = eqx.field(converter=scalar("height"), default=0.0)
-    reflectance: Reflectance = eqx.field(converter=reflectance_field("reflectance"), default=0.3)
-    slope: Float[Array, ""] = eqx.field(converter=scalar("slope"), default=0.0)
-    aspect: Float[Array, ""] = eqx.field(converter=scalar("aspect"), default=0.0)
+    height: Converted[Float[Array, ""]] = eqx.field(converter=scalar("height"), default=0.0)
+    reflectance: Converted[Reflectance] = eqx.field(converter=reflectance_field("reflectance"), default=0.3)
+    slope: Converted[Float[Array, ""]] = eqx.field(converter=scalar("slope"), default=0.0)
+    aspect: Converted[Float[Array, ""]] = eqx.field(converter=scalar("aspect"), default=0.0)
     law: AbstractLaw = Lambertian()
-    position: Float[Array | np.ndarray, " 2"] = eqx.field(
+    position: Converted[Float[Array | np.ndarray, " 2"]] = eqx.field(
         converter=coordinates("position", 2), default=(0.0, 0.0)
     )
 
@@ -307,15 +309,17 @@ class Plate(AbstractSheet):
     0.15 of the light is absorbed
     """
 
-    height: Float[Array, ""] = eqx.field(converter=scalar("height"))
-    reflectance: Reflectance = eqx.field(converter=reflectance_field("reflectance"))
-    transmittance: Reflectance = eqx.field(converter=reflectance_field("transmittance"), default=0.0)
-    coverage: Float[Array, ""] = eqx.field(converter=scalar("coverage"), default=1.0)
-    slope: Float[Array, ""] = eqx.field(converter=scalar("slope"), default=0.0)
-    aspect: Float[Array, ""] = eqx.field(converter=scalar("aspect"), default=0.0)
+    height: Converted[Float[Array, ""]] = eqx.field(converter=scalar("height"))
+    reflectance: Converted[Reflectance] = eqx.field(converter=reflectance_field("reflectance"))
+    transmittance: Converted[Reflectance] = eqx.field(
+        converter=reflectance_field("transmittance"), default=0.0
+    )
+    coverage: Converted[Float[Array, ""]] = eqx.field(converter=scalar("coverage"), default=1.0)
+    slope: Converted[Float[Array, ""]] = eqx.field(converter=scalar("slope"), default=0.0)
+    aspect: Converted[Float[Array, ""]] = eqx.field(converter=scalar("aspect"), default=0.0)
     transmission: str = eqx.field(static=True, default="straight")
     law: AbstractLaw = Lambertian()
-    position: Float[Array | np.ndarray, " 2"] = eqx.field(
+    position: Converted[Float[Array | np.ndarray, " 2"]] = eqx.field(
         converter=coordinates("position", 2), default=(0.0, 0.0)
     )
 
@@ -355,7 +359,7 @@ def _moved(surface: PlaneSurface, by: Float[np.ndarray, "2"]) -> PlaneSurface:
     In double precision, the height at the new origin takes in the slope times the distance to a position that
     may be millions of metres away.
     """
-    position = concrete(surface.position)
+    position, by = concrete(surface.position), as_numpy(by, "by")
     if position is None:
         return eqx.tree_at(lambda s: s.position, surface, surface.position + jnp.asarray(by, float))
     position = position + by

@@ -22,15 +22,18 @@ from jaxtyping import Array, ArrayLike, Float
 from jaxlidar._checks import (
     array,
     as_array,
+    as_numpy,
     check_choice,
     check_flag,
     check_kind,
+    check_numbers,
     check_range,
     check_shape,
     concrete,
     concrete_array,
     coordinates,
 )
+from jaxlidar._converted import Converted
 from jaxlidar._ranges import FRACTION, Range, check_ranges
 from jaxlidar._signatures import briefly
 from jaxlidar._vectors import normalise
@@ -106,10 +109,12 @@ class Terrain(AbstractGround):
     0.268, of 0.268
     """
 
-    heights: Float[Array, "..."] = eqx.field(converter=array("heights"))
-    spacing: Float[Array, "2"] = eqx.field(converter=_pair("spacing"))
-    origin: Float[Array | np.ndarray, "2"] = eqx.field(converter=coordinates("origin", 2), default=(0.0, 0.0))
-    reflectance: Reflectance | Float[Array, "nx ny"] = eqx.field(
+    heights: Converted[Float[Array, "..."]] = eqx.field(converter=array("heights"))
+    spacing: Converted[Float[Array, "2"]] = eqx.field(converter=_pair("spacing"))
+    origin: Converted[Float[Array | np.ndarray, "2"]] = eqx.field(
+        converter=coordinates("origin", 2), default=(0.0, 0.0)
+    )
+    reflectance: Converted[Reflectance | Float[Array, "nx ny"]] = eqx.field(
         converter=reflectance_field("reflectance"), default=0.3
     )
     law: AbstractLaw = Lambertian()
@@ -175,7 +180,7 @@ class Terrain(AbstractGround):
         return self.reflectance if raster is None else jnp.max(raster)
 
     def moved(self, by: Float[np.ndarray, "2"]) -> "Terrain":
-        origin = concrete(self.origin)
+        origin, by = concrete(self.origin), as_numpy(by, "by")
         # The sum in double precision, if possible.
         origin = self.origin + jnp.asarray(by, float) if origin is None else jnp.asarray(origin + by, float)
         return eqx.tree_at(lambda s: s.origin, self, origin)
@@ -198,6 +203,8 @@ class Terrain(AbstractGround):
 
         **Raises:** ValueError for positions off a terrain with open sides.
         """
+        check_numbers("x", x)
+        check_numbers("y", y)
         values, origin = [concrete(v) for v in (x, y)], concrete(self.origin)
         if origin is None or values[0] is None or values[1] is None:
             terrain, east, north = self, jnp.asarray(x), jnp.asarray(y)

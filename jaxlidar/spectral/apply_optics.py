@@ -6,6 +6,11 @@ r"""From response to samples: optics of every history, the atmosphere, the pulse
 with the two-way transmittance of the atmosphere. Both sums are matrix products. The energy budget applies the
 same optics to the weights that arrived at each material, went on from it, escaped, came after the record, or
 remained unfollowed.
+
+The received energy falls with the square of the range R from which light was scattered. A pulse spreads what
+returns from R over all samples that it covers, so that (R_0 / R)^2, with the range R_0 of the reference
+plane, is a factor of fine bins: of response[b, h] above. In samples it would be that of other ranges; by the
+mean over a pulse that is long beside the range, energies would be too large.
 """
 
 import dataclasses
@@ -15,12 +20,14 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
 
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._programs import Program
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.planning.channels import channel_optics
+from jaxlidar.planning.config import KERNEL_VARIANCE
 from jaxlidar.planning.effects import allows_interreflection
 from jaxlidar.planning.setup import Setup
 from jaxlidar.planning.size_buckets import size_bucket
@@ -43,8 +50,10 @@ class WaveformModel(eqx.Module):
 
     - `optics`: reflectance or transmittance of every channel.
     - `convolution`: pulse and digitiser. `time`: of the samples, ns.
-    - `transmittance`: two-way, of the atmosphere, in fine bins. `air_return`: its own return, in samples.
-      None where there is no atmosphere, or no return from it.
+    - `bin_start`: centre of the first fine bin, ns. `bin_width`: width of fine bins, ns.
+    - `transmittance`: two-way, of the atmosphere, in fine bins. `air_return`: its own return, in samples;
+      `air_relative_energy`: the relative energy of that (see `relative_energy_samples`). None where there is
+      no atmosphere, or no return from it.
     - `admissible`: a factor, 1 or NaN; see `Setup`.
     - `lidar`: the lidar, with its spectrum.
     - `materials`: their names. `first_degree`, `degree`: of histories.
@@ -56,8 +65,11 @@ class WaveformModel(eqx.Module):
     optics: Float[Array, "channels wavelengths"]
     convolution: PulseConvolution
     time: Float[Array, "samples"]
+    bin_start: Float[Array, ""]
+    bin_width: Float[Array, ""]
     transmittance: Float[Array, "wavelengths fine"] | None
     air_return: Float[Array, "wavelengths samples"] | None
+    air_relative_energy: Float[Array, "wavelengths samples"] | None
     admissible: Float[Array, ""]
     lidar: Lidar
     materials: tuple[str, ...] = eqx.field(static=True)
@@ -76,6 +88,15 @@ class WaveformModel(eqx.Module):
     def histories(self) -> Histories:
         """Histories of all orders."""
         return histories(len(self.optics), self.degree)
+
+    @property
+    def range_factor(self) -> Float[Array, "fine"]:
+        """(R_0 / R)^2 in fine bins: energy of light from the range R, over that from the reference plane."""
+        return _range_factor(self.lidar, self.bin_start, self.bin_width, self.convolution.n_bins)
+
+    def without_air_return(self) -> "WaveformModel":
+        """Return the model without what the air returns."""
+        return dataclasses.replace(self, air_return=None, air_relative_energy=None)
 
     def at_pivots(self) -> "WaveformModel":
         """Return the model at pivot wavelengths, where wavelengths are many: for standard errors."""
@@ -124,13 +145,17 @@ class WaveformModel(eqx.Module):
             last = np.repeat(np.take(np.asarray(a), [-1], axis), missing, axis)
             return jnp.asarray(np.concatenate([a, last], axis))
 
+        def pad_or_none(a: Array | None) -> Array | None:
+            return None if a is None else pad(a)
+
         lidar = self.lidar
         spectrum = (pad(lidar.wavelength), pad(lidar.energy), pad(lidar.efficiency))
         return dataclasses.replace(
             self,
             optics=pad(self.optics, 1),
-            transmittance=None if self.transmittance is None else pad(self.transmittance),
-            air_return=None if self.air_return is None else pad(self.air_return),
+            transmittance=pad_or_none(self.transmittance),
+            air_return=pad_or_none(self.air_return),
+            air_relative_energy=pad_or_none(self.air_relative_energy),
             lidar=eqx.tree_at(lambda v: (v.wavelength, v.energy, v.efficiency), lidar, spectrum),
         )
 
@@ -165,22 +190,30 @@ def _make_model(setup: Setup, n_samples: int, degree: int) -> WaveformModel:
     3. The optics of all channels, and the degrees of histories: 0 where optics are applied by the tracer.
     """
     lidar, plan, atmosphere = setup.lidar, setup.plan, setup.scene.atmosphere
-    convolution = pulse_convolution(lidar, plan, n_samples)
-    transmittance = air_return = None
+    convolution, bins = pulse_convolution(lidar, plan, n_samples), plan.bins
+    bin_start, bin_width = (jnp.asarray(a, float) for a in (bins.start, bins.width))
+    transmittance = air_return = air_relative_energy = None
     if atmosphere is not None:
-        bins = plan.bins
         fine_time = jnp.asarray(bins.start + bins.width * np.arange(bins.count))
-        start_distance, bin_width = (jnp.asarray(a) for a in (plan.limits.start_distance, bins.width))
-        transmittance, air_return = _compiled_atmosphere(
+        start_distance = jnp.asarray(plan.limits.start_distance)
+        transmittance, fine_air_return = _compiled_atmosphere(
             atmosphere, lidar, fine_time, start_distance, bin_width
         )
-        air_return = None if air_return is None else convolution(air_return)
+        if fine_air_return is not None:
+            range_factor = _range_factor(lidar, bin_start, bin_width, bins.count)
+            air_return, air_relative_energy = (
+                convolution(fine_air_return),
+                convolution(fine_air_return * range_factor[None, :]),
+            )
     return WaveformModel(
         optics=setup_optics(setup),
         convolution=convolution,
         time=jnp.asarray(plan.sample_start + plan.sample_interval * np.arange(n_samples)),
+        bin_start=bin_start,
+        bin_width=bin_width,
         transmittance=transmittance,
         air_return=air_return,
+        air_relative_energy=air_relative_energy,
         admissible=setup.admissible,
         lidar=lidar,
         materials=plan.config.materials,
@@ -210,10 +243,33 @@ def _atmosphere_in_bins(
     per_metre = atmosphere.backscatter(lidar.wavelength, heights, lidar.altitude, lidar.zenith)
     top = start_distance * jnp.cos(jnp.deg2rad(lidar.zenith))
     bin_length = 0.5 * SPEED_OF_LIGHT * bin_width
-    return transmittance, jnp.where((heights > top)[None, :], per_metre * bin_length, 0.0)
+    # Nothing returns before the pulse is sent.
+    is_in_air = (heights > top) & (_range_at(lidar, time) > 0.0)
+    return transmittance, jnp.where(is_in_air[None, :], per_metre * bin_length, 0.0)
 
 
 _compiled_atmosphere = Program(_atmosphere_in_bins)
+
+
+def _range_at(lidar: Lidar, time: Float[Array, "bins"]) -> Float[Array, "bins"]:
+    """Range (m) from which order one arrives at `time` (ns)."""
+    return lidar.range_to_reference + 0.5 * SPEED_OF_LIGHT * time
+
+
+def _range_factor(
+    lidar: Lidar, bin_start: Float[Array, ""], bin_width: Float[Array, ""], n_bins: int
+) -> Float[Array, "fine"]:
+    """Return (R_0 / R)^2 in fine bins of centres from `bin_start`, ns, on.
+
+    1. The range of each bin's centre.
+    2. A return from the range R is spread over bins by a kernel of the variance v. The mean of 1 / R^2 over
+       it is (1 + 3 v / R^2) / R^2, to second order: 1 / (R^2 + 3 v) has the mean 1 / R^2.
+    3. No more light enters the aperture than all of it: A / (pi R^2) is at most 1.
+    """
+    distance = _range_at(lidar, bin_start + bin_width * jnp.arange(n_bins, dtype=bin_width.dtype))
+    variance = KERNEL_VARIANCE * (0.5 * SPEED_OF_LIGHT * bin_width) ** 2
+    aperture_radius = 0.5 * lidar.aperture
+    return lidar.range_to_reference**2 / jnp.maximum(distance**2 + 3.0 * variance, aperture_radius**2)
 
 
 def height_of(lidar: Lidar, time: Float[Array, "bins"]) -> Float[Array, "bins"]:
@@ -267,6 +323,20 @@ def _samples_without_air(
 def total_samples(response: Response, model: WaveformModel) -> Float[Array, "wavelengths samples"]:
     """Return the apparent reflectance per sample, all components together."""
     return _sum_orders(response, model, response_samples)
+
+
+def relative_energy_samples(response: Response, model: WaveformModel) -> Float[Array, "wavelengths samples"]:
+    """Return the relative energy per sample, all components together.
+
+    It is the received energy, over that of an apparent reflectance of 1 at the range of the reference plane.
+    """
+
+    def to_samples(weights: Array, table: Histories, model: WaveformModel) -> Array:
+        range_factor = model.range_factor.reshape((1,) * (weights.ndim - 1) + (-1,))
+        return response_samples(weights * range_factor, table, model)
+
+    air = model.air_relative_energy
+    return _sum_orders(response, dataclasses.replace(model, air_return=air), to_samples)
 
 
 def _sum_orders(
@@ -325,12 +395,14 @@ class ResponseSums(NamedTuple):
     """Sums of a response with optics applied, (wavelengths,) each.
 
     - `returned`, `lost`: apparent reflectance within all fine bins, and before and after them.
+    - `relative_energy`: of what returned (see `relative_energy_samples`).
     - `absorbed`: by each material; (materials, wavelengths). - `escaped`, `late`, `remaining`: energy that
       the budget lists as "escaped", "after the window" and "unfollowed".
     """
 
     returned: Float[Array, "wavelengths"]
     lost: Float[Array, "wavelengths"]
+    relative_energy: Float[Array, "wavelengths"]
     absorbed: Float[Array, "materials wavelengths"]
     escaped: Float[Array, "wavelengths"]
     late: Float[Array, "wavelengths"]
@@ -353,19 +425,29 @@ def sum_response(response: Response, model: WaveformModel) -> ResponseSums:
         products = model.interpolate(model.sum_histories(jnp.stack(rows, axis=-1), table))
         return jnp.moveaxis(products, -1, 0)
 
-    first_rows = [jnp.sum(response.first, axis=(1, 3)), jnp.sum(response.first_outside, axis=1)]
-    returned, lost = sums(first_rows, first_table)
+    factors = jnp.stack([jnp.ones_like(model.range_factor), model.range_factor], axis=-1)
+
+    def rows_of_returns(weights: Array, outside: Array) -> list[Array]:
+        # One product reads the response, which is large, once for both sums.
+        by_material = jnp.einsum("tmhb,bk->tmhk", weights, factors, precision=lax.Precision.HIGHEST)
+        returned, relative_energy = jnp.moveaxis(jnp.sum(by_material, axis=1), -1, 0)
+        return [returned, jnp.sum(outside, axis=1), relative_energy]
+
+    returned, lost, relative_energy = sums(
+        rows_of_returns(response.first, response.first_outside), first_table
+    )
     rows = [response.escaped, response.late, response.remaining]
     if response.higher is not None and response.higher_outside is not None:
-        rows += [jnp.sum(response.higher, axis=(1, 3)), jnp.sum(response.higher_outside, axis=1)]
+        rows += rows_of_returns(response.higher, response.higher_outside)
     absorbed_weights = response.arrived - response.departed
     materials = [absorbed_weights[:, m] for m in range(absorbed_weights.shape[1])]
     totals, n_rows = sums([*rows, *materials], table), len(rows)
     (escaped, late, remaining), higher, absorbed = totals[:3], totals[3:n_rows], totals[n_rows:]
     if len(higher):
-        higher_returned, higher_lost = higher
+        higher_returned, higher_lost, higher_relative_energy = higher
         returned, lost = returned + higher_returned, lost + higher_lost
-    return ResponseSums(returned, lost, absorbed, escaped, late, remaining)
+        relative_energy = relative_energy + higher_relative_energy
+    return ResponseSums(returned, lost, relative_energy, absorbed, escaped, late, remaining)
 
 
 def budget_terms(response: Response, model: WaveformModel) -> BudgetTerms:
@@ -373,22 +455,41 @@ def budget_terms(response: Response, model: WaveformModel) -> BudgetTerms:
     return budget_of_sums(sum_response(response, model), model)
 
 
-def budget_of_sums(sums: ResponseSums, model: WaveformModel) -> BudgetTerms:
-    """Return the energy budget from the sums of a response."""
+def _energy_fractions(sums: ResponseSums, model: WaveformModel) -> dict[str, Float[Array, "wavelengths"]]:
+    """Return energies by name from the sums of a response, or from those of its standard errors.
+
+    What returned is still part of what escaped, or remained unfollowed.
+    """
     lidar = model.lidar
-    budget = {
+    return {
+        # The energy into the aperture is the apparent reflectance times the aperture's solid angle over pi;
+        # that of the reference plane, as the relative energy has the factor of other ranges.
+        "returned": sums.relative_energy * lidar.aperture_area / (jnp.pi * lidar.range_to_reference**2),
         "escaped": sums.escaped,
         **{f"absorbed by {name}": sums.absorbed[i] for i, name in enumerate(model.materials)},
         "after the window": sums.late,
         "unfollowed": sums.remaining,
     }
-    # The energy into the aperture is the apparent reflectance times the aperture's solid angle over pi, here
-    # at the range of the reference plane; `energy_per_reflectance` has that of each sample.
-    returned = sums.returned * lidar.aperture_area / (jnp.pi * lidar.range_to_reference**2)
+
+
+def budget_stderr_of_sums(
+    stderr: ResponseSums, model: WaveformModel
+) -> dict[str, Float[Array, "wavelengths"]]:
+    """Return the standard errors of the energy budget from those of the sums of a response.
+
+    `budget_of_sums` takes what returned off its source, and returns no more than the source has. These are no
+    rules for standard errors: that of each sum stays its own.
+    """
+    return _energy_fractions(stderr, model)
+
+
+def budget_of_sums(sums: ResponseSums, model: WaveformModel) -> BudgetTerms:
+    """Return the energy budget from the sums of a response."""
+    budget = _energy_fractions(sums, model)
     # Light that returns is part of that which escaped or, where only one order was followed, would have.
     source = "unfollowed" if model.one_order and model.can_scatter_again else "escaped"
-    returned = jnp.minimum(returned, budget[source])
-    budget = {"returned": returned, **budget, source: budget[source] - returned}
+    returned = jnp.minimum(budget["returned"], budget[source])
+    budget = {**budget, "returned": returned, source: budget[source] - returned}
     # Unfollowed light is taken to return as much per energy as the light that escaped, but an apparent
     # reflectance of 1 per unit of energy at least, and 4 at most. Where one order is followed no scattered
     # light has escaped to compare with, and the user left higher orders out: the estimate is zero.

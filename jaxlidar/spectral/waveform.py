@@ -1,10 +1,11 @@
 """`Waveform`: apparent reflectance and received energy by wavelength and sample.
 
-A sample of apparent reflectance r, from the range d, has the energy
+A return of apparent reflectance r, from the range d, has the energy
 
     E = E_t eta A_r / (pi d^2) r,
 
-with the emitted energy E_t, the efficiency eta and the area A_r of the aperture.
+with the emitted energy E_t, the efficiency eta and the area A_r of the aperture. The pulse and the digitiser
+spread it over samples.
 """
 
 import dataclasses
@@ -17,12 +18,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxlidar._checks import briefly, check_range, is_traced
-from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._deprecated import renamed_property
 from jaxlidar._registry import save_result, waveform_html
 from jaxlidar._summary import summary
 from jaxlidar.instrument.lidar import Lidar
-from jaxlidar.instrument.receiver import first_return_window, record
+from jaxlidar.instrument.receiver import digitise, first_return_window
 from jaxlidar.planning.setup import Setup
 from jaxlidar.spectral.apply_optics import (
     WaveformModel,
@@ -30,6 +30,7 @@ from jaxlidar.spectral.apply_optics import (
     component_samples,
     height_of,
     make_waveform_model,
+    relative_energy_samples,
     total_samples,
 )
 from jaxlidar.spectral.truth_class import Truth
@@ -45,15 +46,22 @@ class Waveform(eqx.Module):
     - `height`: (samples,) m, the height from which light of order one arrives at that time.
     - `reflectance`: (wavelengths, samples) apparent reflectance per sample, with the transmittance of the
       atmosphere; its sum over samples is that of the target.
-    - `energy`: (wavelengths, samples) J that the detector registers per sample.
+    - `energy`: (wavelengths, samples) J that the detector registers per sample. Each return has the energy of
+      the range from which it comes, whatever the samples over which the pulse spreads it.
     - `stderr`: (wavelengths, samples) one standard error of `reflectance`; zero where nothing was random. The
-      expected value lies within two of them in 95 % of cases. For more than 16 wavelengths they are computed
-      at pivot wavelengths and interpolated, to three digits of the wavelength's largest.
+      expected value lies within two of them in 95 % of cases, in samples above 1 % of the waveform's largest.
+      In fainter ones, which few photons reached, the errors are underestimated: two of them hold some 92 %,
+      and a sample that no photon reached has the error zero, which says nothing of its value. For more than
+      16 wavelengths they are computed at pivot wavelengths and interpolated, to three digits of the
+      wavelength's largest.
     - `components`: dict of arrays like `reflectance`: by material of the last scattering ("ground", "leaf",
       "bark", "plate", "air"), and by order ("first", "higher").
-    - `neglected`: (wavelengths,) apparent reflectance that orders beyond the last could still add.
+    - `neglected`: (wavelengths,) apparent reflectance that orders beyond the last could still add, an
+      estimate. Zero where one order is followed, which says nothing of the others: order one tells nothing
+      about how much of the light that is scattered again returns. The light itself is in
+      `energy_budget["unfollowed"]`, and `jaxlidar.plan` bounds what the orders beyond add.
     - `energy_budget`: dict of (wavelengths,) fractions of the emitted energy, before the atmosphere:
-      "returned" into the aperture (from the range of the reference plane), "escaped", "absorbed by ...",
+      "returned" into the aperture, "escaped", "absorbed by ...",
       "after the window", "unfollowed" beyond the last order.
     - `energy_budget_stderr`: dict like `energy_budget`, one standard error each; zero where nothing was
       random.
@@ -64,8 +72,10 @@ class Waveform(eqx.Module):
     - `recorded`: (wavelengths, samples) J that the receiver records of `energy`, without noise: background
       added, saturated, cut at the detection threshold, quantised. `jaxlidar.record` draws noise as well.
     - `wavelength`: (wavelengths,) nm, the lidar's.
-    - `info`: dict: "photons", "batches", "seconds" spent, "error" reached, why the simulation "stopped", and
-      the "altitude" of the lidar in m.
+    - `info`: dict: "photons", "batches", "seconds" spent, "error" reached, and why the simulation "stopped":
+      "nothing is random", "tolerance met", "batches spent" (with `n_photons`, or at the largest number of a
+      survey), "time spent", "interrupted", or "orders beyond ... may add ..."; and the "altitude" of the
+      lidar in m.
     - `truth`: a `Truth`, what the beam meets in the scene; None where it was not asked for.
 
     **Example:**
@@ -217,7 +227,7 @@ def waveform_of_model(response: Response, model: WaveformModel) -> Waveform:
     components = component_samples(response, model)
     reflectance = components["first"] + components["higher"]
     energy_budget, neglected, lost = budget_terms(response, model)
-    energy = reflectance * energy_per_reflectance(lidar, time)
+    energy = energy_at_reference(lidar)[:, None] * relative_energy_samples(response, model)
     return Waveform(
         time=time,
         height=height_of(lidar, time),
@@ -229,7 +239,7 @@ def waveform_of_model(response: Response, model: WaveformModel) -> Waveform:
         energy_budget=energy_budget,
         energy_budget_stderr=jax.tree.map(jnp.zeros_like, energy_budget),
         lost=lost,
-        recorded=record(energy, lidar.wavelength, lidar.receiver),
+        recorded=digitise(energy, lidar.wavelength, lidar.receiver),
         wavelength=lidar.wavelength,
         info={},
     )
@@ -247,14 +257,10 @@ def remove_padding(wave: Waveform, n_wavelengths: int, n_samples: int) -> Wavefo
     return jax.device_put(eqx.tree_at(lambda w: (w.time, w.height), trimmed, axes))
 
 
-def energy_per_reflectance(
-    lidar: Lidar, time: Float[Array, "samples"]
-) -> Float[Array, "wavelengths samples"]:
-    """Return the energy, J, per apparent reflectance at the range of each sample."""
-    distance = lidar.range_to_reference + 0.5 * SPEED_OF_LIGHT * time
-    # A window may begin before the pulse is sent.
-    solid_angle_over_pi = lidar.aperture_area / (jnp.pi * jnp.maximum(distance, 1e-3) ** 2)
-    return jnp.outer(lidar.energy_per_wavelength * lidar.efficiency_per_wavelength, solid_angle_over_pi)
+def energy_at_reference(lidar: Lidar) -> Float[Array, "wavelengths"]:
+    """Return the energy, J, per apparent reflectance at the range of the reference plane."""
+    solid_angle_over_pi = lidar.aperture_area / (jnp.pi * lidar.range_to_reference**2)
+    return lidar.energy_per_wavelength * lidar.efficiency_per_wavelength * solid_angle_over_pi
 
 
 def open_at_first_return(wave: Waveform, lidar: Lidar) -> Waveform:
@@ -279,5 +285,5 @@ def open_at_first_return(wave: Waveform, lidar: Lidar) -> Waveform:
         energy=rows[1],
         stderr=rows[2],
         components=dict(zip(wave.components, rows[3:])),
-        recorded=record(rows[1], wave.wavelength, lidar.receiver),
+        recorded=digitise(rows[1], wave.wavelength, lidar.receiver),
     )

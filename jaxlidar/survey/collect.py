@@ -61,13 +61,18 @@ def waveforms_in_memory(
     survey_fields: dict[str, Any],
     task_results: Mapping[int, Any],
     start_time: float,
+    **info: Any,
 ) -> Waveforms:
-    """Return all waveforms. `survey_fields`: the fields of `Waveforms` that are known before any tracing."""
+    """Return all waveforms.
+
+    `survey_fields`: the fields of `Waveforms` that are known before any tracing. `info`: further entries of
+    `Waveforms.info`.
+    """
     # Blocks come in the order of shots.
     blocks = [results for _, results in strategy.shot_results(task_results)]
     results: ShotResults = jax.tree.map(lambda *a: np.concatenate(a), *blocks)
     _warn_of_missing_light(strategy, _MissingLight.of(results))
-    return _waveforms(strategy, {**survey_fields, **results._asdict()}, start_time)
+    return _waveforms(strategy, {**survey_fields, **results._asdict()}, start_time, **info)
 
 
 def waveforms_on_disk(
@@ -76,18 +81,18 @@ def waveforms_on_disk(
     task_results: Mapping[int, Any],
     start_time: float,
     path: str | os.PathLike[str],
-    problem: dict[str, str],
     case: Case | None,
+    **info: Any,
 ) -> Waveforms:
     """Write all waveforms to a file, block of shots by block, with their case if there is one, and open it.
 
-    `problem`: digests of all that the waveforms depend on.
+    `info`: further entries of `Waveforms.info`.
     """
     blocks, missing = strategy.shot_results(task_results), _MissingLight()
     first_shots, first_results = next(blocks)
     # The file is laid out before its rows are known: from the shapes of the first block.
     empty = jax.tree.map(lambda a: unwritten_rows(len(strategy.survey), a), first_results._asdict())
-    layout = _waveforms(strategy, {**survey_fields, **empty}, start_time, problem=problem)
+    layout = _waveforms(strategy, {**survey_fields, **empty}, start_time, **info)
     with by_rows(layout, path, case) as rows:
         # One block of results is in memory at a time, whatever the number of shots.
         for shots, results in itertools.chain([(first_shots, first_results)], blocks):

@@ -42,6 +42,7 @@ from jaxlidar.spectral.apply_optics import (
     budget_terms,
     component_samples,
     make_waveform_model,
+    relative_energy_samples,
 )
 from jaxlidar.survey.results import ShotErrors, ShotResults, make_shot_results
 from jaxlidar.survey.strategy import AbstractStrategy, slices_of_shots
@@ -147,9 +148,10 @@ def trace_chunk(setup: Setup, shots: ShotGeometry, rtol: float, key: PRNGKeyArra
 
 
 class ShotBatch(NamedTuple):
-    """Samples by component, and the energy budget, of one batch of a shot."""
+    """Samples by component and of the relative energy, and the energy budget, of one batch of a shot."""
 
     components: dict[str, Float[Array, "wavelengths samples"]]
+    relative_energy: Float[Array, "wavelengths samples"]
     budget: BudgetTerms
 
 
@@ -180,7 +182,11 @@ def _trace_batch(scene: DeviceScene, model: WaveformModel, key: PRNGKeyArray, n_
         response_sum = jax.lax.fori_loop(0, n_parts, add_part, _zeros(shapes))
         # Every part has the energy of the complete beam: the lattice is their mean.
         response = jax.tree.map(lambda a: a / n_parts, response_sum)
-    return ShotBatch(component_samples(response, model), budget_terms(response, model))
+    return ShotBatch(
+        component_samples(response, model),
+        relative_energy_samples(response, model),
+        budget_terms(response, model),
+    )
 
 
 def _trace_shot(
@@ -206,7 +212,9 @@ def _trace_shot(
         batch = trace_batch(zero, undivided)
         waveform, energy_budget = jax.tree.map(jnp.zeros_like, _with_errors(batch))
         errors = ShotErrors(waveform, energy_budget, jnp.zeros(()))
-        return make_shot_results(model, batch.components, batch.budget, errors, photons=zero)
+        return make_shot_results(
+            model, batch.components, batch.relative_energy, batch.budget, errors, photons=zero
+        )
 
     refine = _add_batches if scene.config.follows_higher_orders else _densify_lattices
     estimate = refine(trace_batch, jax.eval_shape(trace_batch, zero, undivided), rtol)
@@ -214,7 +222,7 @@ def _trace_shot(
     waveform_stderr, energy_budget_stderr = estimate.stderr
     errors = ShotErrors(waveform_stderr, energy_budget_stderr, _relative_error(estimate))
     photons = estimate.count * setup.plan.photons_traced
-    return make_shot_results(model, mean.components, mean.budget, errors, photons)
+    return make_shot_results(model, mean.components, mean.relative_energy, mean.budget, errors, photons)
 
 
 def _relative_error(estimate: RunningMoments) -> Array:

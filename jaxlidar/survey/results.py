@@ -4,9 +4,9 @@ from typing import Any, NamedTuple
 
 from jaxtyping import Array, Float, Int
 
-from jaxlidar.instrument.receiver import record
+from jaxlidar.instrument.receiver import digitise
 from jaxlidar.spectral.apply_optics import BudgetTerms, WaveformModel
-from jaxlidar.spectral.waveform import energy_per_reflectance
+from jaxlidar.spectral.waveform import energy_at_reference
 
 # Arrays of JAX within compiled programs, of one shot or of several; of NumPy outside.
 _PerSample = Float[Any, "*shots wavelengths samples"]
@@ -44,21 +44,23 @@ class ShotErrors(NamedTuple):
 def make_shot_results(
     model: WaveformModel,
     components: dict[str, Float[Array, "wavelengths samples"]],
+    relative_energy: Float[Array, "wavelengths samples"],
     budget: BudgetTerms,
     errors: ShotErrors,
     photons: Array,
 ) -> ShotResults:
     """Return the results of one shot from its components, its energy budget and their errors.
 
-    `photons`: number of photons traced.
+    `relative_energy`: see `jaxlidar.spectral.apply_optics.relative_energy_samples`. `photons`: number of
+    photons traced.
     """
     lidar, reflectance = model.lidar, components["first"] + components["higher"]
-    energy = reflectance * energy_per_reflectance(lidar, model.time)
+    energy = energy_at_reference(lidar)[:, None] * relative_energy
     return ShotResults(
         reflectance=reflectance,
         stderr=errors.waveform,
         energy=energy,
-        recorded=record(energy, lidar.wavelength, lidar.receiver),
+        recorded=digitise(energy, lidar.wavelength, lidar.receiver),
         components=components,
         neglected=budget.neglected,
         lost=budget.lost,

@@ -55,8 +55,10 @@ from jaxlidar.spectral.apply_optics import (
     ResponseSums,
     WaveformModel,
     budget_of_sums,
+    budget_stderr_of_sums,
     component_samples,
     make_waveform_model,
+    relative_energy_samples,
     response_samples,
     sum_response,
     total_samples,
@@ -151,17 +153,25 @@ class SharedIlluminationStrategy(AbstractStrategy):
         }
 
 
+class AirReturn(NamedTuple):
+    """Return of the air itself to every shot, order one: apparent reflectance, and relative energy."""
+
+    reflectance: Float[Array, "wavelengths samples"]
+    relative_energy: Float[Array, "wavelengths samples"]
+
+
 class GroupContext(NamedTuple):
     """Inputs that all groups of nodes have in common.
 
     - `scene`: of the survey's middle. - `model`: without histories, for optics are applied while light
       is traced, and without what the `air` returns, which is added once.
+    - `air`: None where the air returns nothing.
     - `spacing`: of nodes, m. - `view_geometry`: as in `SharedIlluminationStrategy`.
     """
 
     scene: DeviceScene
     model: WaveformModel
-    air: Any
+    air: AirReturn | None
     spacing: float
     view_geometry: ViewGeometry | None
 
@@ -171,7 +181,9 @@ def make_group_context(setup: Setup, spacing: float, view_geometry: ViewGeometry
     model = make_waveform_model(setup)
     # The air's own return is not random and is no part of the light of nodes: `_complete_shot` adds it
     # once.
-    without_air = dataclasses.replace(model.for_applied_optics(), air_return=None)
+    without_air, air = model.for_applied_optics().without_air_return(), None
+    if model.air_return is not None and model.air_relative_energy is not None:
+        air = AirReturn(model.air_return, model.air_relative_energy)
     plan = setup.plan
     plan = plan.with_config(deposits_per_flight=min(plan.config.deposits_per_flight, _MAX_DEPOSITS))
     if view_geometry is not None:
@@ -182,7 +194,7 @@ def make_group_context(setup: Setup, spacing: float, view_geometry: ViewGeometry
         # squared error, and whose error falls faster with their number than that of photons.
         plan = plan.with_config(n_rays=max(plan.n_rays // 4, _MIN_RAYS))
     scene = build_device_scene(dataclasses.replace(setup, plan=plan), derivatives="none")
-    return GroupContext(scene, without_air, model.air_return, spacing, view_geometry)
+    return GroupContext(scene, without_air, air, spacing, view_geometry)
 
 
 class GroupLight(NamedTuple):
@@ -209,7 +221,7 @@ class GroupContribution(NamedTuple):
     """Contribution of a group to its shots.
 
     - `shots`: their numbers. - `lines`: components (the name is that in checkpoints): samples by material,
-      then those of the first order.
+      then those of the first order, then the relative energy.
     - `energy`: as in `BatchSums`. - `variance`, `energy_variance`: squared standard errors of the waveform
       and of the energy. - `photons`: number of photons that contribute.
     """
@@ -243,9 +255,10 @@ def _trace_batch(scene: DeviceScene, nodes: EntryNodes, model: WaveformModel, ke
 def _stacked_components(
     response: Response, model: WaveformModel
 ) -> Float[Array, "components wavelengths samples"]:
-    """Return samples by material, then those of the first order."""
+    """Return samples by material, then those of the first order, then the relative energy of all."""
     by_component = component_samples(response, model)
-    return jnp.stack([*(by_component[name] for name in model.materials), by_component["first"]])
+    by_material = [by_component[name] for name in model.materials]
+    return jnp.stack([*by_material, by_component["first"], relative_energy_samples(response, model)])
 
 
 def _group_moments(
@@ -482,31 +495,27 @@ def sum_contributions(
     return results._replace(photons=sums["photons"][:count].astype(int))
 
 
-def _complete_shot(
-    model: WaveformModel, air: Float[Array, "wavelengths samples"] | None, sums: ShotSums
-) -> ShotResults:
-    """Return the results of one shot. `air`: what the air itself returns, order one."""
-    # The last component is the first order, which materials have in them already.
-    by_component = dict(zip(model.materials, sums.components))
-    reflectance, first = jnp.sum(sums.components[:-1], axis=0), sums.components[-1]
+def _complete_shot(model: WaveformModel, air: AirReturn | None, sums: ShotSums) -> ShotResults:
+    """Return the results of one shot."""
+    # The last components are the first order and the relative energy, which are no further light.
+    by_component, reflectance = (
+        dict(zip(model.materials, sums.components)),
+        jnp.sum(sums.components[:-2], axis=0),
+    )
+    first, relative_energy = sums.components[-2], sums.components[-1]
     by_component |= {"first": first, "higher": reflectance - first}
     if air is not None:
-        by_component |= {"air": air, "first": first + air}
-        reflectance = reflectance + air
-    budget, budget_stderr = (
-        budget_of_sums(ResponseSums(**energy), model) for energy in (sums.energy, sums.energy_stderr)
-    )
-    # `budget_of_sums` takes the returned light off one of these fates. That is no rule for errors: their own
-    # stay.
-    fates = {"escaped": "escaped", "after the window": "late", "unfollowed": "remaining"}
-    energy_budget_stderr = budget_stderr.energy_budget | {
-        name: sums.energy_stderr[fate] for name, fate in fates.items()
-    }
+        by_component |= {"air": air.reflectance, "first": first + air.reflectance}
+        reflectance = reflectance + air.reflectance
+        relative_energy = relative_energy + air.relative_energy
+    budget = budget_of_sums(ResponseSums(**sums.energy), model)
+    energy_budget_stderr = budget_stderr_of_sums(ResponseSums(**sums.energy_stderr), model)
     shot_errors = ShotErrors(sums.stderr, energy_budget_stderr, relative_error(reflectance, sums.stderr))
-    return make_shot_results(model, by_component, budget, shot_errors, jnp.zeros((), jnp.int32))
+    no_photons = jnp.zeros((), jnp.int32)
+    return make_shot_results(model, by_component, relative_energy, budget, shot_errors, no_photons)
 
 
-def _complete_shots(model: WaveformModel, air: Array | None, sums: ShotSums) -> ShotResults:
+def _complete_shots(model: WaveformModel, air: AirReturn | None, sums: ShotSums) -> ShotResults:
     return jax.vmap(lambda shot: _complete_shot(model, air, shot))(sums)
 
 

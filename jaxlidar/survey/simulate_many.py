@@ -20,7 +20,7 @@ from typing import Any
 import jax
 from jaxtyping import PRNGKeyArray
 
-from jaxlidar._checks import check_flag, check_integer, check_key, check_kind, is_traced
+from jaxlidar._checks import check_flag, check_integer, check_key, check_kind, is_traced, is_within_program
 from jaxlidar._fingerprint import fingerprint
 from jaxlidar._registry import simulate_survey
 from jaxlidar._workers import WorkUnit, outcomes
@@ -109,11 +109,11 @@ def simulate_many(
     much light arrives after the end of the record, `UnfollowedLightWarning` where orders that are not
     followed may add more than `rtol`.
 
-    **Raises:** TypeError for arguments of another class. ValueError, before any work, for inadmissible
-    arguments, a scene that reaches up to the sensor, shots that do not meet the ground, a receiver whose
-    window opens at the first return, shots that must share light and cannot, and a `path` with results of
-    another problem, naming what differs. OSError for a `path` that another run uses, or that cannot be
-    written. RuntimeError where the workers of a task die twice.
+    **Raises:** TypeError for arguments of another class, and inside a JAX transformation. ValueError, before
+    any work, for inadmissible arguments, a scene that reaches up to the sensor, shots that do not meet the
+    ground, a receiver whose window opens at the first return, shots that must share light and cannot, and a
+    `path` with results of another problem, naming what differs. OSError for a `path` that another run uses,
+    or that cannot be written. RuntimeError where the workers of a task die twice.
 
     **Example:**
 
@@ -125,6 +125,7 @@ def simulate_many(
     [5.0, 0.63, -3.75] 0.40
     """
     check_kind("survey", survey, Survey, "a Survey, as in Survey(lidar, position=...)")
+    _check_not_transformed(survey, scene, key)
     if not isinstance(scene, SceneParts):
         check_kinds(survey.lidar, scene)
     check_key(key)
@@ -137,9 +138,6 @@ def simulate_many(
     check_flag("truth", truth)
     if max_orders is not None:
         max_orders = check_integer("max_orders", max_orders)
-    # Shots are traced until their tolerance is met: loops of unknown length have no reverse derivatives.
-    if any(is_traced(x) for x in jax.tree.leaves((survey, scene, key))):
-        raise TypeError("simulate_many is not for JAX transformations: use simulate, with plan= made outside")
     # Waveforms share one time axis, in memory and in files.
     if survey.lidar.receiver.window != "fixed":
         raise ValueError(
@@ -167,9 +165,10 @@ def simulate_many(
         "off_map": off_map_fractions,
     }
     run_tasks = functools.partial(outcomes, executor=executor, devices=devices)
+    info: dict[str, Any] = {"automatic orders": max_orders is None}
     if path is None:
         task_results = _trace(strategy, key, run_tasks, progress, {})
-        return waveforms_in_memory(strategy, survey_fields, task_results, start_time)
+        return waveforms_in_memory(strategy, survey_fields, task_results, start_time, **info)
 
     # Digests of all that the waveforms depend on: results of another problem are neither used nor
     # overwritten.
@@ -185,19 +184,40 @@ def simulate_many(
             "truth": bool(truth),
         }
     )
-    # A complete file stands for the call that made it.
-    if Path(path).exists():
-        waveforms = Waveforms.open(path)
-        check_same_problem(path, waveforms.info.get("problem", {}), problem)
-        return waveforms
+    path = Path(path)
+    if path.exists():
+        return _open_complete(path, problem)
     arguments = {"rtol": rtol, "max_orders": max_orders, "shared": shared, "truth": truth}
     case = None if isinstance(scene, SceneParts) else _case(survey, scene, key, arguments)
-    path = Path(path)
     with open_checkpoint(path.with_name(path.name + ".parts"), problem) as checkpoint:
+        # Another run of the same problem may have ended since.
+        if path.exists():
+            checkpoint.remove()
+            return _open_complete(path, problem)
         stored_results = StoredResults(checkpoint, strategy)
         task_results = _trace(strategy, key, run_tasks, progress, stored_results)
-        waveforms = waveforms_on_disk(strategy, survey_fields, task_results, start_time, path, problem, case)
+        info["problem"] = problem
+        waveforms = waveforms_on_disk(strategy, survey_fields, task_results, start_time, path, case, **info)
         checkpoint.remove()
+    return waveforms
+
+
+def _check_not_transformed(survey: Survey, scene: Scene | SceneParts, key: PRNGKeyArray) -> None:
+    """Refuse to run within a JAX transformation. **Raises:** TypeError."""
+    # Tasks run until their tolerance is met, on the host. Within a program nothing of the arguments need be
+    # traced: all that is computed of them is.
+    if is_within_program() or any(is_traced(x) for x in jax.tree.leaves((survey, scene, key))):
+        raise TypeError(
+            "simulate_many cannot run inside a JAX transformation (jit, grad, vmap, ...): it traces until "
+            "the tolerance of every shot is met. Call it outside, or use simulate for each shot, with plan= "
+            "made outside"
+        )
+
+
+def _open_complete(path: Path, problem: dict[str, str]) -> Waveforms:
+    """Open a complete file, which stands for the call that made it; refuse one of another problem."""
+    waveforms = Waveforms.open(path)
+    check_same_problem(path, waveforms.info.get("problem", {}), problem)
     return waveforms
 
 

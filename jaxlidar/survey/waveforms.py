@@ -16,6 +16,7 @@ from jaxlidar._summary import NOTABLE_FRACTION, percent
 from jaxlidar.io import netcdf
 from jaxlidar.io.case import Case
 from jaxlidar.io.datasets import datasets_of, keep_as_netcdf
+from jaxlidar.sampling.adaptive import StopReason
 from jaxlidar.spectral.waveform import Waveform
 from jaxlidar.survey.truths import Truths
 
@@ -31,14 +32,15 @@ class Waveforms(eqx.Module):
     - `reflectance`, `stderr`, `energy`, `recorded`: (shots, wavelengths, samples), and
     - `components`, dict of the same shape: as those of `Waveform`.
     - `neglected`, `lost`: (shots, wavelengths), `energy_budget`, `energy_budget_stderr`, dicts of the same
-      shape: as those of `Waveform`.
+      shape: as those of `Waveform`. `neglected` is zero where one order is followed.
     - `position`: (shots, 2) m, `zenith`, `azimuth`: (shots,) degrees, as those of `Survey`.
     - `ground_height`: (shots,) m, true height of the ground where the beam axis meets it; NaN where it meets
       none.
     - `off_map`: (shots,) fraction of the light that falls outside the voxel map.
     - `error`: (shots,) relative error, as `simulate` defines it. `photons`: (shots,) number traced.
     - `truth`: a `Truths`, what each beam meets in the scene; None unless it was asked for.
-    - `info`: dict of "rtol", "orders" followed, "altitude" of the lidar in m, "seconds" that it took, and
+    - `info`: dict of "rtol", "orders" followed, "automatic orders" (False where
+      `max_orders` was given), "altitude" of the lidar in m, "seconds" that it took, and
       whether light was "shared" (over `SceneParts`: in all tiles). Over one scene with shared light, also the
       spacing in m of the "grid" of nodes at which it entered, and a bound on the fraction of samples that
       "parallel light" changes. Over `SceneParts`, also the number of "parts", the "margin" in m around tiles,
@@ -145,13 +147,18 @@ class Waveforms(eqx.Module):
 
     def _stopped(self, i: int) -> str:
         """Return the reason why tracing of shot i ended, as `Waveform.info` has it."""
+        # Standard errors are zero where nothing is random, and no photons are traced.
+        if self.photons[i] == 0 and not np.any(self.stderr[i]):
+            return StopReason.NOTHING_RANDOM.value
         total = np.maximum(self.reflectance[i].sum(axis=-1), 1e-30)
         neglected = float(np.max(self.neglected[i] / total))
         if self.error[i] > self.info["rtol"]:
-            return "batches spent"
-        if self.info["orders"] > 1 and neglected > self.info["rtol"]:
+            return StopReason.BATCHES_SPENT.value
+        # Orders that the user chose are what was asked for. Files of earlier versions do not say who chose.
+        automatic = self.info.get("automatic orders", True)
+        if automatic and self.info["orders"] > 1 and neglected > self.info["rtol"]:
             return f"orders beyond {self.info['orders']} may add {percent(neglected)}"
-        return "tolerance met"
+        return StopReason.TOLERANCE_MET.value
 
     def to_xarray(self) -> Any:
         """The waveforms as an `xarray.Dataset` over shots, wavelengths and times, with units.

@@ -151,7 +151,7 @@ def _trace_order(scene: DeviceScene, optics: Array, loop: _PhotonLoop, key: PRNG
         reflected = optics_at(scatterer.reflection) * albedo[:, None]
         return jnp.sum(arriving * (1.0 - reflected - optics_at(scatterer.transmission)), axis=0)
 
-    # Within the medium and in straight transmission everything that is not absorbed goes on.
+    # Within the medium everything that is not absorbed goes on.
     full_albedo = jnp.ones_like(p.weight)
     absorbed = fractions.absorbed
     # Each plate needs what arrives at it, in order of distance; the product of all factors needs no order.
@@ -160,7 +160,11 @@ def _trace_order(scene: DeviceScene, optics: Array, loop: _PhotonLoop, key: PRNG
         scatterer, is_transmitted = config.surfaces[passage.plate], passage.is_transmitted[:, None]
         arriving = _arriving_energy(scene, optics, energy_before, encounters, passage.plate)
         arriving = jnp.where(is_transmitted, arriving, 0.0)
-        absorbed = absorbed.at[scatterer.material].add(absorbed_of(scatterer, arriving, full_albedo))
+        # The expectation is over reflection as well, by the law, whatever was sampled.
+        distance = jnp.where(passage.is_transmitted, encounters.distances[passage.plate], 0.0)
+        point, surface = along(p.x, p.w, distance), scene.surfaces[passage.plate]
+        albedo = surface.scale_by_pattern(point, surface.law.albedo(p.w, surface.lit_normal(point, p.w)))
+        absorbed = absorbed.at[scatterer.material].add(absorbed_of(scatterer, arriving, albedo))
         factor = optics_at(scatterer.transmission) / (1.0 - scene.limits.reflection_probability)
         energy = jnp.where(is_transmitted, energy * factor, energy)
 

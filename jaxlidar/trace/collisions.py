@@ -181,8 +181,10 @@ def _on_leaf(
     weight, onward_weight, q = attached_ratio(k), jnp.ones_like(k), scene.limits.reflection_probability
     channel = jnp.full(k.shape, leaf.reflection, jnp.int32)
     if medium.angle_tables is None:
-        # The normal is drawn in proportion to the area that the facet shows to the light: no weight is left.
-        normal = facet_normal(w, *draws.normal)
+        # The normal is drawn in proportion to the area that the facet shows to the light: no weight is left
+        # in value, but the density has a derivative where the direction of flight has.
+        normal = jax.tree.map(detach, facet_normal(w, *draws.normal))
+        onward_weight = _attached_facet_ratio(w, normal)
     else:
         normal, normal_weight = _leaf_normal(medium, w, *draws.normal)
         weight = weight * normal_weight
@@ -194,7 +196,7 @@ def _on_leaf(
         # Transmission is reflection mirrored in the facet.
         out = along(out, normal, jnp.where(through, -2.0 * dot(out, normal), 0.0))
         channel = jnp.where(through, leaf.transmission, channel)
-        onward_weight = jnp.where(through, 1.0 / (1.0 - q), 1.0 / q)
+        onward_weight = onward_weight * jnp.where(through, 1.0 / (1.0 - q), 1.0 / q)
     return _voxel_collision(leaf, channel, weight, onward_weight, COSINE_LAW, w, out, normal, exit_normal)
 
 
@@ -204,10 +206,25 @@ def _on_bark(
     """Sample scattering by bark: an opaque facet of random orientation, or a phase function."""
     if medium.bark_phase is not None:
         return _by_phase(medium.bark_phase, scene.bark_law, bark, w, k, draws)
-    channel, one = jnp.full(k.shape, bark.reflection, jnp.int32), jnp.ones_like(k)
-    normal = facet_normal(w, *draws.normal)
-    out = about(normal, *draws.direction)
-    return _voxel_collision(bark, channel, attached_ratio(k), one, COSINE_LAW, w, out, normal, normal)
+    channel = jnp.full(k.shape, bark.reflection, jnp.int32)
+    normal = jax.tree.map(detach, facet_normal(w, *draws.normal))
+    out, onward_weight = about(normal, *draws.direction), _attached_facet_ratio(w, normal)
+    return _voxel_collision(
+        bark, channel, attached_ratio(k), onward_weight, COSINE_LAW, w, out, normal, normal
+    )
+
+
+def _attached_facet_ratio(w: Vec, normal: Vec) -> Scalar:
+    """Attached ratio of the density |n.w| / pi of a facet's normal; of the onward weight alone.
+
+    <<<<<<< HEAD
+        Returns to the sensor are means over all normals (`intensity_factors`), whichever was drawn.
+    =======
+        Returns to the sensor are means over all normals (`intensity_factors`), and do not depend on the one
+        drawn.
+    >>>>>>> trace9
+    """
+    return attached_ratio(-dot(normal, w))
 
 
 def _by_phase(

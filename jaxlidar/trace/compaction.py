@@ -63,4 +63,4 @@ def _path_classes(scene: DeviceScene, photons: Photons) -> Int[Array, "chunks si
     ray = enter_grid(medium, x, w, scene.occupied_box)
     faces_per_metre = sum(jnp.abs(w[k]) / medium.size[k] for k in range(3))
     faces = (ray.leave - ray.enter) * faces_per_metre
-    return (faces > 0).astype(jnp.int32) + (faces > SHORT_PATH)
+    return (faces > 0).astype(jnp.int32) + (faces > SHORT_PATH).astype(jnp.int32)

@@ -24,6 +24,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxlidar._constants import SPEED_OF_LIGHT
+from jaxlidar._mesh_axes import vary_with
 from jaxlidar._one_function import once
 from jaxlidar._vectors import FAR, Scalar, Vec, along, scale
 from jaxlidar.optics.facets import FACET_BACKSCATTER
@@ -40,11 +41,7 @@ from jaxlidar.trace.ray_segments import (
     march_ray,
     mean_decay,
 )
-from jaxlidar.trace.reparametrisation import (
-    has_rays_moving_with_terrain,
-    rays_with_columns,
-    rays_with_terrain,
-)
+from jaxlidar.trace.reparametrisation import rays_with_grids
 from jaxlidar.trace.score_functions import add_parameter_rows, segment_derivatives, with_depth_slopes
 from jaxlidar.trace.surfaces import TracedSurface
 from jaxlidar.trace.voxel_traversal import Medium
@@ -140,12 +137,9 @@ class FootprintRays(NamedTuple):
 def send_rays(scene: DeviceScene, across: tuple[Scalar, Scalar], energy: Scalar) -> FootprintRays:
     """Send rays through the points `across` the beam, which carry the fractions `energy`."""
     beam, config = scene.beam, scene.config
-    # These change derivatives alone: rays move with the geometry.
-    across, ratio = rays_with_columns(beam, scene.medium, across)
+    # This changes derivatives alone: rays move with the geometry.
+    across, ratio = rays_with_grids(scene, across)
     energy = energy * ratio
-    if has_rays_moving_with_terrain(scene):
-        across, ratio = rays_with_terrain(scene, across)
-        energy = energy * ratio
     point, w, excess = beam.ray(across)
     start_distance = scene.limits.start_distance
     x = along(point, w, jnp.asarray(-start_distance, energy.dtype))
@@ -268,6 +262,9 @@ def first_order(
         return_slopes, slopes_at_surfaces = None, []
         if slopes is not None:
             return_slopes = jnp.zeros((n_materials * n_histories, bins.padded, slopes.count), energy.dtype)
+        returned, arrived, scattered, escaped, return_slopes = vary_with(
+            (returned, arrived, scattered, escaped, return_slopes), scene
+        )
 
         if medium is not None:
             segments, depth_at_surfaces, total_depth = march_rays(scene, rays)
@@ -290,7 +287,7 @@ def first_order(
                     add_segments, tally, segments, per_ray, contributes
                 )
             # Step 3. All energy that collides in the medium is scattered.
-            returned, scattered = smooth_bins(returned)[:, 1:-1], arrived
+            returned, scattered = _smooth_padded(returned), arrived
             if return_slopes is not None:
                 smooth = smooth_bins(jnp.swapaxes(return_slopes, 1, 2))[..., 1:-1]
                 return_slopes = jnp.swapaxes(smooth, 1, 2)
@@ -358,7 +355,7 @@ def first_order(
     else:
         # The loop needs zeros of the result's shape; evaluating shapes compiles nothing.
         shapes = jax.eval_shape(trace_chunk, across, energy)
-        zero = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), shapes)
+        zero = vary_with(jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), shapes), scene)
 
         def add(total, rays):
             return jax.tree.map(jnp.add, total, chunk(*rays)), None
@@ -367,6 +364,12 @@ def first_order(
     weights, outside = bins.trim(returned.reshape(n_materials, n_histories, bins.padded))
     arrived, scattered, escaped = budget
     return FirstOrder(weights, outside, arrived, scattered, escaped, weight_slopes)
+
+
+def _smooth_padded(returned: Float[Array, "entries padded"]) -> Float[Array, "entries padded"]:
+    """Smooth bins with their margins; what would leave these at either end stays in the outermost bin."""
+    smooth = smooth_bins(returned)
+    return smooth[:, 1:-1].at[:, 0].add(smooth[:, 0]).at[:, -1].add(smooth[:, -1])
 
 
 def _add(

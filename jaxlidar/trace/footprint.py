@@ -170,7 +170,8 @@ def fibonacci_disc(
     **Returns:** x and y across the beam, m, and fractions of the energy.
     """
     before = jnp.asarray(ray_slice.number * count)
-    u = (before + jnp.arange(count) + shift[0]) / (count * ray_slice.count)
+    number = (before + jnp.arange(count, dtype=before.dtype)).astype(shift.dtype)
+    u = (number + shift[0]) / jnp.asarray(count * ray_slice.count, shift.dtype)
     # The golden angle in units of 2^-32 turns: integers overflow as turns do, and lose no digits where there
     # are many rays.
     turned = (before.astype(jnp.uint32) * np.uint32(round(GOLDEN * 2**32))).astype(u.dtype) * 2.0**-32

@@ -39,6 +39,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt32
 
 from jaxlidar._constants import SPEED_OF_LIGHT
+from jaxlidar._mesh_axes import vary_with
 from jaxlidar._one_function import once
 from jaxlidar._vectors import FAR, Scalar, Vec, along
 from jaxlidar.trace.collisions import collision_for_return, intensity_factors
@@ -53,10 +54,8 @@ from jaxlidar.trace.photons import CollisionForReturn, Photons, attached_ratio, 
 from jaxlidar.trace.random_numbers import PhotonDraws, random_words, shifted_lattices, to_unit
 from jaxlidar.trace.reparametrisation import (
     has_moving_landings,
-    has_rays_moving_with_terrain,
     landings_with_grids,
-    rays_with_columns,
-    rays_with_terrain,
+    rays_with_grids,
 )
 from jaxlidar.trace.score_functions import add_derivatives_of_returns, collision_score, vertical_depth_slopes
 from jaxlidar.trace.tally_index import TallyIndex, add_to_tally
@@ -145,7 +144,7 @@ def trace_higher_orders(
             return _Lanes(*nodes.send_photons(scene, lane, node_key))
         return _Lanes(lane, _send_photons(scene, lane, footprint_shift))
 
-    empty = _empty_tally(scene, nodes)
+    empty = vary_with(_empty_tally(scene, nodes), scene)
 
     def trace_group(total: HigherOrderTally, group: UInt32[Array, ""]):
         """Trace all orders of a group of chunks, and add its tally to the total.
@@ -212,7 +211,7 @@ def trace_higher_orders(
             return lax.cond(order < scene.limits.orders, one_order, lambda c, _: c, carry, order), None
 
         shape = (chunks_per_group, chunk_size)
-        lanes = jax.tree.map(lambda a: a.reshape(*shape, *a.shape[1:]), send(lane))
+        lanes = jax.tree.map(lambda a: a.reshape(*shape, *a.shape[1:]), vary_with(send(lane), scene))
         orders = jnp.arange(config.order_steps)
         (lanes, tally), _ = lax.scan(order_step, (lanes, empty), orders)
         p = lanes.photons
@@ -273,10 +272,7 @@ def _send_photons(scene: DeviceScene, lane: UInt32[Array, "photons"], shift: Flo
     turn = (lane * jnp.uint32(GOLDEN * 2**32)).astype(float) * 2.0**-32 + shift[1]
     # Lanes beyond the last photon fill up chunks.
     is_real = lane < n_photons
-    across, ratio = rays_with_columns(scene.beam, scene.medium, across_beam(scene.beam, fraction, turn))
-    if has_rays_moving_with_terrain(scene):
-        across, terrain_ratio = rays_with_terrain(scene, across)
-        ratio = ratio * terrain_ratio
+    across, ratio = rays_with_grids(scene, across_beam(scene.beam, fraction, turn))
     point, w, excess = scene.beam.ray(across)
     # Photons start at a plane above everything in the scene, not at the sensor: positions stay small enough
     # for single precision.
@@ -608,8 +604,8 @@ def _return_through_surfaces(
 
     For each surface:
 
-    1. Ground that can hide points below its own slopes lets nothing through; parallel light (shared
-       illumination) is seen straight down, where nothing is hidden.
+    1. Ground that can hide points below its own slopes lets nothing through. Straight up, along parallel
+       light of shared illumination at nadir, nothing is hidden.
     2. A plate that is crossed is sampled, gap or material, so that each photon has one history; the factor is
        the attached ratio of that outcome.
     3. Material of a plate that transmits straight on adds its channel to the history; of another it lets
@@ -619,7 +615,7 @@ def _return_through_surfaces(
     for i, (surface, scatterer) in enumerate(zip(scene.surfaces, scene.config.surfaces)):
         if not surface.is_plate:
             # Only a height field can lie in the way of its own return; a plane never does.
-            if surface.shape.lights_itself and not scene.beam.parallel:
+            if surface.shape.lights_itself and not (scene.beam.parallel and scene.config.vertical):
                 transmittance = jnp.where(surface.distance(x, v) < FAR, 0.0, transmittance)
             continue
         is_covered = next(draws) < surface.coverage

@@ -75,8 +75,9 @@ def passed_plates(
 ) -> list[PlatePassage]:
     """Return the passage of every plate. Flights may have several ends, along their first axis.
 
-    A plate is passed if it lies nearer than the end of the flight, or the flight ends nowhere, and the photon
-    did not stop at it; it is met if it is passed, or the flight ends on it.
+    A plate is passed if it lies nearer than the end of the flight, or the flight leaves the scene, and the
+    photon did not stop at it; it is met if it is passed, or the flight ends on it. Late flights end where
+    they can be recorded no more: plates behind that are not passed.
     """
 
     def to_ends(a: Array) -> Array:
@@ -90,7 +91,7 @@ def passed_plates(
         # A plate at which the photon stops is an end, not a passage.
         is_stop = to_ends(outcome == STOPPED) & (to_ends(distance) <= flights.distance)
         is_ahead = to_ends(p.alive & (distance < FAR))
-        is_passed = is_ahead & ((to_ends(distance) < flights.distance) | ~flights.has_hit) & ~is_stop
+        is_passed = is_ahead & ((to_ends(distance) < flights.distance) | flights.escaped) & ~is_stop
         is_met = is_passed | (flights.landed & is_stop)
         passages.append(PlatePassage(i, is_passed, is_met, is_passed & to_ends(outcome == TRANSMITTED)))
     return passages

@@ -21,6 +21,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxlidar._constants import SPEED_OF_LIGHT
+from jaxlidar._mesh_axes import vary_together
 from jaxlidar._one_function import once
 from jaxlidar._vectors import Scalar, Vec
 from jaxlidar.planning.config import TimeBins
@@ -114,7 +115,7 @@ def march_ray(
         return (to, depth + k * length, next_voxel, depth_at_stops), segment
 
     zero = jnp.zeros_like(end)
-    state = (jnp.minimum(ray.enter, end), zero, ray.voxel, [zero] * len(stops))
+    state = vary_together((jnp.minimum(ray.enter, end), zero, ray.voxel, [zero] * len(stops)))
     (_, total_depth, _, depth_at_stops), segments = lax.scan(step, state, None, length=max_segments)
     return segments, depth_at_stops, total_depth
 
@@ -148,7 +149,7 @@ def integrate_over_bins(
         return (transmittance * decay, end), transmittance * mean * length
 
     # A scan computes each piece once; unrolled, compilers compute them again for every element.
-    state = (jnp.exp(-kappa * segments.depth), start_position)
+    state = vary_together((jnp.exp(-kappa * segments.depth), start_position))
     _, pieces = lax.scan(piece, state, jnp.arange(count, dtype=start_position.dtype))
     return padded_index(bins, first_number, count), pieces
 
@@ -180,7 +181,8 @@ def add_in_blocks(
     not_ended = (segments.start < segments.start[-1:]) | (segments.length > 0.0)
     contributes = not_ended if contributes is None else not_ended & contributes
     # `rank` of each among those of its ray, `position` among all.
-    one, zero = contributes.astype(jnp.int32), jnp.zeros(shape[1], jnp.int32)
+    one = contributes.astype(jnp.int32)
+    zero = jnp.zeros_like(one[0])
     per_ray_count, rank = lax.scan(lambda n, is_counted: (n + is_counted, n), zero, one)
     upto = jnp.cumsum(per_ray_count)
     first = jnp.concatenate([jnp.zeros(1, jnp.int32), upto[:-1]])
@@ -192,7 +194,7 @@ def add_in_blocks(
     def block(n, tally):
         numbers = lax.dynamic_slice(selected, (n * SEGMENTS_AT_ONCE,), (SEGMENTS_AT_ONCE,))
         in_block = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[numbers], segments)
-        is_real = n * SEGMENTS_AT_ONCE + jnp.arange(SEGMENTS_AT_ONCE) < upto[-1]
+        is_real = n * SEGMENTS_AT_ONCE + jnp.arange(SEGMENTS_AT_ONCE, dtype=upto.dtype) < upto[-1]
         in_block = eqx.tree_at(lambda s: s.length, in_block, jnp.where(is_real, in_block.length, 0.0))
         return add(tally, in_block, jax.tree.map(lambda a: a[numbers % shape[1]], per_ray))
 

@@ -23,6 +23,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxlidar._checks import briefly, check_flag, check_key, check_kind
 from jaxlidar._deprecated import renamed_property
+from jaxlidar._mesh_axes import vary_together, vary_with, with_automatic_axes
 from jaxlidar.planning.setup import Setup
 from jaxlidar.trace.device_scene import DeviceScene, build_device_scene
 from jaxlidar.trace.first_order import FirstOrder, first_order
@@ -77,6 +78,7 @@ class Response(eqx.Module):
     left = renamed_property("left", "departed")
 
 
+@with_automatic_axes
 def trace_scene(setup: Setup, key: PRNGKeyArray, *, reverse: bool = True) -> Response:
     """Trace the response of one batch: the deterministic first order, and photons for the higher ones.
 
@@ -116,6 +118,7 @@ def trace_scene(setup: Setup, key: PRNGKeyArray, *, reverse: bool = True) -> Res
 
 def trace_device_scene(scene: DeviceScene, key: PRNGKeyArray) -> Response:
     """Trace the response of one batch."""
+    scene, key = vary_together((scene, key))
     if scene.config.follows_higher_orders:
         return join_orders(trace_first(scene, key), trace_higher(scene, key))
     return trace_first_only(scene, key)
@@ -232,12 +235,12 @@ def _first(
     scene: DeviceScene, key: PRNGKeyArray, ray_slice: RaySlice = ALL_RAYS
 ) -> tuple[FirstOrder, Float[Array, "materials first_histories bins"]]:
     """Trace order one; also return its weights together with the returns of mirrors."""
-    across, energy = footprint_rays(scene, key, ray_slice)
+    across, energy = vary_with(footprint_rays(scene, key, ray_slice), scene)
     first = first_order(scene, across, energy)
     weights, slopes = first.weights, first.weight_slopes
     for i, is_mirror in enumerate(scene.config.mirrors):
         if is_mirror and scene.config.returns_specular:
-            rays = mirror_rays(scene.beam, scene.surfaces[i])
+            rays = vary_with(mirror_rays(scene.beam, scene.surfaces[i]), scene)
             mirrored = first_order(scene, *rays, mirror=i)
             weights, slopes = jax.tree.map(
                 jnp.add, (weights, slopes), (mirrored.weights, mirrored.weight_slopes)
@@ -281,7 +284,9 @@ def first_order_response(
                 continue
             after = histories.next_history[:, channel]
             # Histories of the largest degree, which have no successor, are not scattered again.
-            scattered = jnp.where(after != jnp.arange(histories.count), energy[scatterer.material], 0.0)
+            scattered = jnp.where(
+                after != jnp.arange(histories.count, dtype=after.dtype), energy[scatterer.material], 0.0
+            )
             departed = departed.at[scatterer.material, after].add(scattered)
             # Light that goes straight through a plate was followed to what lies behind it.
             if not (is_straight and channel == scatterer.transmission):

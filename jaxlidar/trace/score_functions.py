@@ -31,6 +31,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxlidar._mesh_axes import vary_with
 from jaxlidar._vectors import Scalar, Vec
 from jaxlidar.trace.deposit import add_rows
 from jaxlidar.trace.device_scene import DeviceScene
@@ -153,8 +154,8 @@ def with_depth_slopes(
         at_stops = [a + slope * to_stop for a, to_stop in zip(at_stops, to_stops)]
         return (before + slope * length[:, None], at_stops), before
 
-    zero = jnp.zeros((w[0].size, slopes.count), w[0].dtype)
     rows = detach((segments.start, segments.length, segments.cell))
+    zero = vary_with(jnp.zeros((w[0].size, slopes.count), w[0].dtype), rows)
     (_, at_stops), before = jax.lax.scan(step, (zero, [zero] * len(stops)), rows)
     return dataclasses.replace(segments, depth_slopes=before), at_stops
 
@@ -243,7 +244,7 @@ def _vertical_slopes(medium: Medium, slopes: ExtinctionSlopes) -> Float[Array, "
         in_layer = [slope * medium.size[2] for slope in slopes.slopes_at(cell, projection_factor)]
         return above + slopes.to_all_parameters(slopes.parameters_at(cell), in_layer, axis=-1), above
 
-    zero = jnp.zeros((nx * ny, slopes.count), medium.size.dtype)
+    zero = vary_with(jnp.zeros((nx * ny, slopes.count), medium.size.dtype), medium)
     # From the top down, each layer before its own slope is added: the table is for upper faces.
     _, above = jax.lax.scan(layer, zero, cells, reverse=True)
     return jnp.swapaxes(above, 0, 1).reshape(-1, slopes.count)

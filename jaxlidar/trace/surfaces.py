@@ -6,16 +6,19 @@ material.
 """
 
 import dataclasses
+import warnings
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxlidar._vectors import FAR, Scalar, Vec, along, dot, scale
 from jaxlidar.optics.laws import AbstractLaw
+from jaxlidar.scenes.height_field import HeightField
 from jaxlidar.scenes.raster import Raster
 from jaxlidar.scenes.scene import Scene
-from jaxlidar.scenes.shapes import AbstractShape
+from jaxlidar.scenes.shapes import AbstractShape, OutlineWarning, Plane
 from jaxlidar.scenes.surfaces import AbstractSheet, AbstractSurface
 
 
@@ -45,6 +48,9 @@ class TracedSurface(eqx.Module):
     def distance(self, x: Vec, w: Vec) -> Scalar:
         """Distance from `x` along `w`; FAR if the surface is behind, missed, or met from under the ground."""
         s = self.shape.distance(x, w)
+        # Planes and height fields end nowhere within view.
+        if not isinstance(self.shape, (Plane, HeightField)) and self.shape.outline(x, w) is None:
+            s = _warn_if_differentiated(s)
         if self.is_plate:
             return s
         # Ground seen from below is no ground: a ray that starts under the terrain by rounding must not end
@@ -62,6 +68,23 @@ class TracedSurface(eqx.Module):
     def scale_by_pattern(self, x: Vec, value: Scalar) -> Scalar:
         """Multiply `value` by the pattern of reflectance at the point `x`."""
         return value if self.pattern is None else value * self.pattern.value(x)
+
+
+@jax.custom_jvp
+def _warn_if_differentiated(distance: Scalar) -> Scalar:
+    """Return the distance to a shape that states no outline; warn once where its derivative is taken."""
+    return distance
+
+
+@_warn_if_differentiated.defjvp
+def _(primals, tangents):
+    # JAX calls this rule only where the distance depends on what is differentiated by.
+    message = (
+        "derivatives through a shape without the method `outline` leave out how light comes to meet it or to "
+        "miss it as it moves or grows: see jaxlidar.AbstractShape.outline"
+    )
+    warnings.warn(message, OutlineWarning, stacklevel=2)
+    return primals[0], tangents[0]
 
 
 def traced_surfaces(scene: Scene, aim: Float[Array, "3"]) -> tuple[TracedSurface, ...]:

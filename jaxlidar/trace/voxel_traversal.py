@@ -21,6 +21,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxlidar._mesh_axes import vary_together
 from jaxlidar._one_function import once, one_function
 from jaxlidar._vectors import FAR, Scalar, Vec
 from jaxlidar.optics.leaf_angles import ANGLE_NODES, LeafAngles
@@ -163,7 +164,7 @@ def _padded_shape(shape: tuple[int, ...]) -> tuple[int, int, int]:
     x, y, z = shape
     if x * y * z <= MAX_PADDED_VOXELS:
         # Finer buckets for long axes: up to half of a coarse one would be empty.
-        x, y, z = (n if n == 1 else size_bucket(n + 1, 2 if n <= 32 else 8) for n in shape)
+        x, y, z = (n if n == 1 else size_bucket(n + 1, 2 if n < 32 else 8) for n in shape)
     return x, y, z
 
 
@@ -183,7 +184,9 @@ class VoxelRay(eqx.Module):
 
     def face_distances(self, voxel: tuple[Int[Array, "*s"], ...]) -> tuple[Scalar, ...]:
         """Distances to the faces at which the ray would leave `voxel` along each axis."""
-        return tuple(gap * v + offset for gap, offset, v in zip(self.gap, self.offset, voxel))
+        return tuple(
+            gap * v.astype(gap.dtype) + offset for gap, offset, v in zip(self.gap, self.offset, voxel)
+        )
 
 
 # In the loops below, in place of `jnp.where`, `jnp.minimum` and `jnp.maximum`:
@@ -229,7 +232,8 @@ def enter_grid(medium: Medium, x: Vec, w: Vec, box: VoxelBox | None = None) -> V
         # A periodic map has no sides: the ray is never outside of it in x and y.
         if medium.periodic and k < 2:
             continue
-        lower, upper = lower + medium.size[k] * low[k], lower + medium.size[k] * high[k]
+        first, last = (jnp.asarray(number[k], lower.dtype) for number in (low, high))
+        lower, upper = lower + medium.size[k] * first, lower + medium.size[k] * last
         within = (lower <= 0) & (upper >= 0)
         a, b = lower * inverse, upper * inverse
         enter = jnp.maximum(enter, jnp.where(flat, jnp.where(within, 0.0, FAR), jnp.minimum(a, b)))
@@ -243,7 +247,7 @@ def enter_grid(medium: Medium, x: Vec, w: Vec, box: VoxelBox | None = None) -> V
         number = jnp.floor(lax.stop_gradient(position))
         if not (medium.periodic and k < 2):
             # The point of entry lies on a face, and may be rounded to the wrong side.
-            number = jnp.clip(number, 0, medium.counts[k] - 1)
+            number = jnp.clip(number, 0, (medium.counts[k] - 1).astype(number.dtype))
         voxel.append(number.astype(jnp.int32))
     return VoxelRay(tuple(gap), tuple(offset), tuple(step), tuple(voxel), enter, leave)
 
@@ -425,6 +429,7 @@ def march_to_depths(
         depth_slopes = jnp.zeros((max(len(targets), 1), slopes.count, *max_length.shape), max_length.dtype)
     running = active & (ray.enter < end)
     state = _March(start, jnp.zeros_like(max_length), ray.voxel, running, no_crossings, depth_slopes)
+    state = vary_together(state)
 
     def march(state: _March) -> _March:
         return lax.scan(block, state, None, length=-(-max_faces // STEPS_PER_CHECK))[0]
@@ -457,7 +462,8 @@ def voxel_above(medium: Medium, x: Vec) -> tuple[Int[Array, "..."], Scalar, Bool
         inside &= (voxel[0] >= 0) & (voxel[0] < nx) & (voxel[1] >= 0) & (voxel[1] < ny)
     cell = cell_index(medium, tuple(voxel))
     # Below the map the whole lowest voxel lies above the point; above the map, nothing.
-    above = jnp.clip(jnp.clip(voxel[2], 0, nz - 1) + 1 - jnp.maximum(position[2], 0.0), 0.0, 1.0)
+    upper_face = (jnp.clip(voxel[2], 0, nz - 1) + 1).astype(position[2].dtype)
+    above = jnp.clip(upper_face - jnp.maximum(position[2], 0.0), 0.0, 1.0)
     return cell, above, inside
 
 

@@ -4,6 +4,8 @@ Poisson counts of mean m have the variance m; the variance of their sample varia
 m^2) / n.
 """
 
+import types
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -39,6 +41,56 @@ def test_a_photon_carries_h_c_over_wavelength():
 def test_the_default_changes_nothing_without_a_key(precision):
     energy = jnp.array([[0.0, 1e-17, 3e-12], [1e-30, 1e-18, 1.0]])
     np.testing.assert_array_equal(record(energy, WAVELENGTH, Receiver()), energy)
+
+
+@BY_PRECISION
+def test_shot_noise_is_poisson_at_all_levels(precision):
+    """Mean, variance and skewness from 1e3 to 1e7 photons, on both sides of the change of method at 1e4."""
+    photons = np.geomspace(1e3, 1e7, 17)
+    energy = jnp.asarray(np.tile(photons, (2, 500, 1)).transpose(2, 0, 1) * PHOTON[:, None])
+    counts = draws(energy, Receiver(), 200) / PHOTON[:, None]
+    counts = counts.transpose(0, 2, 3, 1).reshape(-1, photons.size)
+    mean, variance = z_scores(counts, photons)
+    assert mean < Z_LIMIT
+    assert variance < Z_LIMIT
+    # Skewness 1 / sqrt(m); its standard error over n draws is sqrt(6 / n).
+    skewness = np.mean(((counts - photons) / np.sqrt(photons)) ** 3, axis=0)
+    assert np.abs(skewness - 1 / np.sqrt(photons)).max() < Z_LIMIT * np.sqrt(15 / len(counts))
+    # Planted: the variance that the sampler of JAX has at 6e5 photons, 2 % off.
+    wrong = photons + np.sqrt(0.9785) * (counts - photons)
+    assert z_scores(wrong, photons)[1] > Z_LIMIT
+
+
+def test_missing_energies_stay_missing_and_negative_ones_are_refused():
+    noisy = Receiver(background=1e-18, saturation=1e-12, bits=12, electronic_noise=1e-19)
+    energy = np.array([[np.nan, 0.0, 1e-17, 1e-13]])
+    for receiver in (Receiver(), noisy):
+        for key in (None, jax.random.key(0)):
+            recorded = np.asarray(record(energy, 1064.0, receiver, key=key))
+            np.testing.assert_array_equal(np.isnan(recorded), [[True, False, False, False]])
+    for value in (-1e-19, -1.0, np.inf):
+        with pytest.raises(
+            ValueError, match=rf"energy = {value:g} is outside the admissible range \[0, inf\)"
+        ):
+            record(np.array([[1e-17, value]]), 1064.0)
+    # Inside a program they cannot be refused.
+    traced = jax.jit(lambda e: record(e, 1064.0, noisy, key=jax.random.key(0)))
+    recorded = np.asarray(traced(jnp.array([[-1e-17, jnp.inf, jnp.nan, 0.0, 1e-17]])))
+    np.testing.assert_array_equal(np.isnan(recorded), [[True, True, True, False, False]])
+
+
+def test_noise_of_a_simulation_below_zero_sends_no_photons():
+    wave = types.SimpleNamespace(energy=jnp.array([[1e-16, -5e-19, 0.0]]), wavelength=jnp.array([1064.0]))
+    np.testing.assert_array_equal(record(wave), wave.energy)
+    assert np.all(np.asarray(record(wave, key=jax.random.key(0)))[0, 1:] == 0.0)
+
+    def shifted(below):
+        return types.SimpleNamespace(energy=wave.energy - below, wavelength=wave.wavelength)
+
+    with pytest.raises(ValueError, match=r"energy = .* is too far below zero"):
+        record(shifted(1e-17))
+    assert np.all(np.isnan(jax.jit(lambda below: record(shifted(below)))(1e-17)))
+    assert np.all(np.isfinite(jax.jit(lambda below: record(shifted(below)))(0.0)))
 
 
 @BY_PRECISION
@@ -198,7 +250,7 @@ def test_first_return_window_is_differentiable_under_jit():
     [
         (np.arange(4.0), 0.0, "interval = 0"),
         (np.array([0.0, 1.0, 3.0, 4.0]), 1.0, "time has a step of 2"),
-        (np.array([3.0, 2.0, 1.0, 0.0]), 1.0, "time has a step of -1"),
+        (np.array([3.0, 2.0, 1.0, 0.0]), 1.0, "steps of time = -1"),
         (np.arange(3.0), 1.0, r"time has shape \(3,\)"),
     ],
 )

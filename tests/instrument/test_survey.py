@@ -148,6 +148,27 @@ LIDAR, NADIR = jl.Lidar(), [(0.0, 0.0), (1.0, 1.0)]
             ValueError,
             r"pulse_rate has shape \(2,\)",
         ),
+        (
+            lambda: jl.Survey.track(jl.Lidar(), (0, 0), (1e6, 0), spacing=1e-6, beams=8),
+            ValueError,
+            r"spacing = 1e-06 with beams = 8 asks for 8e\+12 shots, which take about 800000 GB of memory; "
+            r"admissible are at most \S+ in the \S+ GB of this machine",
+        ),
+        (
+            lambda: jl.Survey.track(jl.Lidar(), (0, 0), (1e6, 0), spacing=1e-320),
+            ValueError,
+            "spacing = 9.99989e-321 with beams = 1 asks for 1e\\+30 shots",
+        ),
+        (
+            lambda: jl.Survey.grid(jl.Lidar(), (0, 0), (1e6, 1e6), spacing=(1.0, 1e-3)),
+            ValueError,
+            r"spacing = \[1\.0, 0\.001\] asks for 1e\+15 shots",
+        ),
+        (
+            lambda: scanned(jl.Conical(15.0, 8.0), pulse_rate=1e20),
+            ValueError,
+            r"pulse_rate = 1e\+20 at speed = .* shots",
+        ),
         (lambda: jl.Conical(0.0, 8.0), ValueError, r"half_angle = 0 .*\(0, 89\]"),
         (lambda: jl.Conical("wide", 8.0), TypeError, "half_angle is a str"),
         (lambda: jl.RotatingPolygon(30.0, np.nan), ValueError, "line_rate = nan"),
@@ -165,7 +186,9 @@ def test_a_figure_draws_every_footprint_where_it_lies():
     lidar = jl.Lidar(altitude=HEIGHT, divergence=20.0)
     survey = jl.Survey(lidar, [(0.0, 0.0), (10.0, 5.0)], [0.0, 60.0], [0.0, 90.0])
     voxels = jl.VoxelMap.from_lad(np.ones((4, 4, 2)), voxel_size=5.0)
-    scene = jl.Scene(canopy=jl.Canopy(voxels, leaf=jl.LeafOptics(0.4, 0.4)), ground=jl.Ground())
+    scene = jl.Scene(
+        canopy=jl.Canopy(voxels, leaf=jl.LeafOptics(0.4, 0.4), hotspot=False), ground=jl.Ground()
+    )
     ax = jl.plot.survey(survey, scene, Figure().subplots(), values=[1.0, 2.0], label="height (m)")
     (footprints,) = ax.collections
     assert np.allclose(footprints.get_offsets(), survey.position)

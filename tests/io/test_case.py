@@ -70,7 +70,7 @@ EXAMPLES = {
     "Spectrum": with_ground(reflectance=SPECTRUM),
     "Spectrum, long": with_ground(reflectance=jl.spectrum("soil-medium")),
     "Canopy": jl.Scene(canopy=jl.Canopy(MAP, jl.LeafOptics(0.4), SPECTRUM, "straight", True, "periodic")),
-    "VoxelMap": jl.Scene(canopy=jl.Canopy(MAP, jl.LeafOptics(0.4), 0.1)),
+    "VoxelMap": jl.Scene(canopy=jl.Canopy(MAP, jl.LeafOptics(0.4), 0.1, hotspot=False)),
     "LeafAngles": with_leaf(jl.LeafOptics(0.4, 0.3)),
     "LeafOptics": with_leaf(jl.LeafOptics((0.4, 0.3), (0.1, 1 / 3))),
     "Isotropic": with_leaf(jl.Isotropic((0.9, 1.0))),

@@ -1,5 +1,6 @@
 """Checkpoints: entries are written atomically, a file is locked, and damaged or foreign files are refused."""
 
+import contextlib
 import os
 import sqlite3
 import subprocess
@@ -200,6 +201,58 @@ def test_one_process_at_a_time_uses_a_file(path):
     assert sorted(intact(path)) == [0, 1, 3, 4]
 
 
+def test_a_run_that_ends_while_another_begins_leaves_it_a_file(path, monkeypatch):
+    """The second run opens a file just before the first removes it: it must not go on with that file."""
+    connect, first_run = sqlite3.connect, contextlib.ExitStack()
+    first = first_run.enter_context(open_checkpoint(path, PROBLEM))
+
+    def connect_and_end_the_first_run(*args, **options):
+        connection = connect(*args, **options)
+        monkeypatch.undo()
+        first.remove()
+        first_run.close()
+        return connection
+
+    monkeypatch.setattr("jaxlidar.io.checkpoint.sqlite3.connect", connect_and_end_the_first_run)
+    with open_checkpoint(path, PROBLEM) as second:
+        second.add(2, entry(2))
+        with pytest.raises(OSError, match="is in use by another run"):
+            intact(path)
+    assert [p.name for p in path.parent.iterdir()] == ["run.sqlite"]
+    assert sorted(intact(path)) == [2]
+
+
+def use_briefly(path, seconds):
+    """Open the file again and again, and remove it every other time; print the outcomes."""
+    outcomes, start = set(), time.perf_counter()
+    while time.perf_counter() - start < seconds:
+        try:
+            with open_checkpoint(path, PROBLEM) as checkpoint:
+                checkpoint.add(0, entry(0))
+                if len(checkpoint.numbers()) and time.perf_counter_ns() % 2:
+                    checkpoint.remove()
+            outcomes.add("done")
+        except Exception as error:
+            outcomes.add(f"{type(error).__name__}: {error}")
+    print("\n".join(sorted(outcomes)))
+
+
+@pytest.mark.slow
+def test_processes_that_begin_and_end_at_once_are_refused_or_done(tmp_path):
+    """A file that another process was removing was read-only or missing, some ten times in 20 s."""
+    path = tmp_path / "run.sqlite"
+    code = f"import test_checkpoint as t; t.use_briefly({str(path)!r}, 20.0)"
+    processes = [
+        subprocess.Popen(
+            [sys.executable, "-c", code], cwd=Path(__file__).parent, stdout=subprocess.PIPE, text=True
+        )
+        for _ in range(3)
+    ]
+    outcomes = {line for process in processes for line in process.communicate()[0].splitlines()}
+    in_use = f"OSError: path = {path} is in use by another run: wait until it has ended, or give another path"
+    assert outcomes == {"done", in_use}
+
+
 def test_a_file_can_be_removed_when_its_run_has_ended(path):
     with open_checkpoint(path, PROBLEM) as checkpoint:
         checkpoint.remove()
@@ -246,9 +299,12 @@ def test_a_full_disk_keeps_entries_in_memory_until_there_is_room(tmp_path, monke
     path, connect, connections = tmp_path / "run.sqlite", sqlite3.connect, []
 
     def connect_to_small_disk(*args, **options):
-        connections.append(connect(*args, **options))
-        connections[0].execute("PRAGMA max_page_count = 8")
-        return connections[0]
+        connection = connect(*args, **options)
+        # The lock of the run is another file.
+        if not str(args[0]).endswith(".lock"):
+            connections.append(connection)
+            connection.execute("PRAGMA max_page_count = 8")
+        return connection
 
     monkeypatch.setattr("jaxlidar.io.checkpoint.sqlite3.connect", connect_to_small_disk)
     large = [{"values": number + np.zeros(1000)} for number in range(5)]

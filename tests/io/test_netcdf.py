@@ -251,13 +251,13 @@ def test_a_class_of_another_package_is_loaded_by_its_entry_point(tmp_path, monke
     with pytest.raises(ValueError, match=r"a.nc: it holds a Heights, which is not known here"):
         jl.open(tmp_path / "a.nc")
 
-    class EntryPoint:
+    class HeightsEntryPoint:
         name = "Heights"
 
         def load(self):
             datasets.LAYOUTS["Heights"] = layout
 
-    entry_points = {datasets.ENTRY_POINTS: [EntryPoint()]}
+    entry_points = {datasets.ENTRY_POINTS: [HeightsEntryPoint()]}
     monkeypatch.setattr(metadata, "entry_points", lambda group: entry_points.get(group, []))
     assert jl.open(tmp_path / "a.nc").top.tolist() == [1.0, 2.0]
 

@@ -48,7 +48,7 @@ def test_vertical_beams_find_the_attenuation_that_the_file_has(write_map, angles
 def test_the_two_way_gap_is_that_of_the_attenuation(write_map):
     """Two voxels of 1 m and of attenuation 1/2 per m leave exp(-2) of white ground to first-order light."""
     voxels, _ = read_vox(write_map(attenuation_map("Planophile", 0.5)))
-    canopy = jl.Canopy(voxels, leaf=jl.LeafOptics(0.0, 0.0))
+    canopy = jl.Canopy(voxels, leaf=jl.LeafOptics(0.0, 0.0), hotspot=False)
     scene = jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=1.0))
     lidar = jl.Lidar(altitude=500.0, divergence=1e-3)
     wave = jl.simulate(lidar, scene, key=jax.random.key(0), max_orders=1)

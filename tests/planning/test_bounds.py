@@ -5,13 +5,14 @@ import numpy as np
 import pytest
 
 import jaxlidar as jl
+from jaxlidar.optics.facets import FACET_BACKSCATTER
 from tests.helpers import batch_mean, first_wave, slab, slow_unless
 
 GROUND = jl.Ground(reflectance=0.3)
 PLATE = jl.Plate(height=3.0, reflectance=0.4, transmittance=0.3, coverage=0.5)
 LEAF = jl.LeafOptics(reflectance=0.1, transmittance=0.05)
-LEAVES = jl.Canopy(slab(0.8), leaf=LEAF)
-TREES = jl.Canopy(slab(0.8, 0.1), leaf=LEAF, bark=0.3)
+LEAVES = jl.Canopy(slab(0.8), leaf=LEAF, hotspot=False)
+TREES = jl.Canopy(slab(0.8, 0.1), leaf=LEAF, bark=0.3, hotspot=False)
 HAZE = jl.Atmosphere(visibility=10.0, lidar_ratio=30.0)
 
 
@@ -35,6 +36,7 @@ CLEARING = jl.Canopy(
         leaf=CLEARING_EXTINCTION, voxel_size=(5.0, 5.0, 2.5), origin=(-20.0, -20.0, 4.0)
     ),
     leaf=jl.LeafOptics(reflectance=0.5, transmittance=0.4),
+    hotspot=False,
 )
 CASES = {
     "slope spread": (WIDE_LIDAR, SLOPING, "slope spread"),
@@ -78,7 +80,10 @@ CASES = {
     "bark": (jl.Lidar(), jl.Scene(canopy=TREES, ground=GROUND), "bark"),
     "bright bark": (
         jl.Lidar(),
-        jl.Scene(canopy=jl.Canopy(slab(0.1, 0.1), leaf=LEAF, bark=0.9), ground=jl.Ground(reflectance=0.02)),
+        jl.Scene(
+            canopy=jl.Canopy(slab(0.1, 0.1), leaf=LEAF, bark=0.9, hotspot=False),
+            ground=jl.Ground(reflectance=0.02),
+        ),
         "bark",
     ),
     "plates": (jl.Lidar(), jl.Scene(plates=(PLATE,), ground=GROUND), "plates"),
@@ -157,6 +162,23 @@ def test_changes_of_the_first_order_lie_within_their_bounds(case):
     assert measured_change >= row.bound / 30
 
 
+def test_a_bright_canopy_is_compared_with_the_background_in_full():
+    """In closed form, order one of bark over dark ground, which is seen through it by y = exp(-2 tau).
+
+    Without the bark the scene is darker by (A - (1 - y) R) / (A + y R), at most by A / (A + R).
+    """
+    depth, bark, ground = 0.5, 0.9, 0.02
+    scene = jl.Scene(
+        jl.Canopy(slab(bark=depth), bark=bark, hotspot=False), ground=jl.Ground(reflectance=ground)
+    )
+    bound = effect(planned(jl.Lidar(), scene, max_orders=1), "bark").bound
+    transmittance = np.exp(-2 * depth)
+    bark_return = bark * FACET_BACKSCATTER * (1 - transmittance) / 2
+    change = (bark_return - (1 - transmittance) * ground) / (bark_return + transmittance * ground)
+    np.testing.assert_allclose(bound, bark_return / (bark_return + ground), rtol=1e-3)
+    assert change < bound
+
+
 def sum_of(wave):
     return wave.reflectance.sum(axis=1)
 
@@ -165,13 +187,15 @@ def orders_of(wave):
     return {key: wave.components[key].sum(axis=1) for key in ("first", "higher")}
 
 
-DARK = jl.Canopy(slab(1.0, width=400.0), leaf=LEAF, sides="periodic")
+DARK = jl.Canopy(slab(1.0, width=400.0), leaf=LEAF, sides="periodic", hotspot=False)
 HIGHER_ORDER_SCENES = {
     "leaves": jl.Scene(canopy=DARK),
     "leaves over ground": jl.Scene(canopy=DARK, ground=jl.Ground(reflectance=0.2)),
     "plate over ground": jl.Scene(plates=(PLATE,), ground=GROUND),
     "two plates": jl.Scene(plates=(PLATE, jl.Plate(height=1.0, reflectance=0.5)), ground=GROUND),
-    "isotropic": jl.Scene(canopy=jl.Canopy(slab(1.0), leaf=jl.Isotropic(albedo=0.3)), ground=GROUND),
+    "isotropic": jl.Scene(
+        canopy=jl.Canopy(slab(1.0), leaf=jl.Isotropic(albedo=0.3), hotspot=False), ground=GROUND
+    ),
 }
 
 
@@ -193,7 +217,7 @@ def test_higher_orders_lie_within_the_bound(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["bark", "field of view"])
 def test_changes_of_all_orders_lie_within_their_bounds(name):
-    canopy = jl.Canopy(slab(0.4, 0.1, width=400.0), leaf=LEAF, bark=0.1, sides="periodic")
+    canopy = jl.Canopy(slab(0.4, 0.1, width=400.0), leaf=LEAF, bark=0.1, sides="periodic", hotspot=False)
     scene = jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=0.1))
     lidar = jl.Lidar(divergence=5.0, field_of_view=5.0)
     plans = [planned(lidar, scene, max_orders=4, effects={name: on}) for on in (True, False)]
@@ -211,7 +235,9 @@ def test_changes_of_all_orders_lie_within_their_bounds(name):
 
 def test_brighter_scenes_have_larger_bounds_up_to_one():
     def bound(albedo):
-        scene = jl.Scene(canopy=jl.Canopy(slab(1.0), leaf=jl.Isotropic(albedo=albedo)), ground=GROUND)
+        scene = jl.Scene(
+            canopy=jl.Canopy(slab(1.0), leaf=jl.Isotropic(albedo=albedo), hotspot=False), ground=GROUND
+        )
         return effect(planned(jl.Lidar(), scene, max_orders=8), "orders beyond 8").bound
 
     bounds = [bound(a) for a in (0.1, 0.5, 0.9, 1.0)]
@@ -248,13 +274,14 @@ EXTREME = {
     "no light in view": (jl.Lidar(field_of_view=1e-4), jl.Scene(canopy=LEAVES), {"field of view": 1.0}),
     "nothing dark": (
         jl.Lidar(),
-        jl.Scene(canopy=jl.Canopy(slab(30.0), leaf=jl.Isotropic(albedo=1.0)), ground=GROUND),
+        jl.Scene(canopy=jl.Canopy(slab(30.0), leaf=jl.Isotropic(albedo=1.0), hotspot=False), ground=GROUND),
         {"multiple scattering": 1.0, "leaf": 1.0},
     ),
     "all dark": (
         jl.Lidar(),
         jl.Scene(
-            canopy=jl.Canopy(slab(1.0), leaf=jl.Isotropic(albedo=0.0)), ground=jl.Ground(reflectance=0.0)
+            canopy=jl.Canopy(slab(1.0), leaf=jl.Isotropic(albedo=0.0), hotspot=False),
+            ground=jl.Ground(reflectance=0.0),
         ),
         {"multiple scattering": 0.0},
     ),

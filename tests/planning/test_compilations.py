@@ -33,7 +33,7 @@ def simulate(**changes):
         leaf_angles=jl.LeafAngles.named(values["angles"]),
     )
     leaf = jl.Prospect(N=1.5, Cab=values.get("Cab", 40.0), Car=8.0, Cw=0.01, Cm=0.009)
-    scene = jl.Scene(canopy=jl.Canopy(voxels, leaf=leaf), ground=jl.Ground(**ground))
+    scene = jl.Scene(canopy=jl.Canopy(voxels, leaf=leaf, hotspot=False), ground=jl.Ground(**ground))
     return jl.simulate(jl.Lidar(**lidar), scene, key=KEY, rtol=values["rtol"], window=values["window"])
 
 
@@ -94,6 +94,7 @@ def test_rounding_up_of_sizes_changes_no_value():
         canopy=jl.Canopy(
             jl.VoxelMap.from_lad(np.full((3, 2, 5), 0.8), voxel_size=1.0, origin=(-1.5, -1.0, 2.0)),
             leaf=jl.LeafOptics(reflectance=0.4, transmittance=0.3),
+            hotspot=False,
         ),
         ground=jl.Ground(reflectance=0.4),
     )

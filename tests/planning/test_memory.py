@@ -31,7 +31,7 @@ def plates(count):
 
 
 def test_many_plates_are_refused_before_anything_is_allocated():
-    canopy = jl.Canopy(slab(1.0), leaf=jl.LeafOptics(0.4, 0.4))
+    canopy = jl.Canopy(slab(1.0), leaf=jl.LeafOptics(0.4, 0.4), hotspot=False)
     scene = jl.Scene(canopy=canopy, plates=plates(4), ground=GROUND)
     lidar = jl.Lidar(wavelength=np.linspace(500.0, 1600.0, memory.MAX_APPLIED_WAVELENGTHS + 1))
     with pytest.raises(ValueError, match=r"would take about .* GB of memory; .* at most 8 wavelengths"):
@@ -57,7 +57,7 @@ def test_optics_applied_while_light_is_traced_give_the_same(name):
     scene_fields = dict(SCENES[name])
     bark = [0.1] if "bark" in scene_fields["canopy"] else []
     leaf = jl.Prospect(Cab=40.0) if "straight" not in name else LEAF
-    canopy = jl.Canopy(slab(0.5, *bark), leaf=leaf, **scene_fields.pop("canopy"))
+    canopy = jl.Canopy(slab(0.5, *bark), leaf=leaf, **{"hotspot": False, **scene_fields.pop("canopy")})
     scene = jl.Scene(canopy=canopy, **scene_fields)
     plan = jl.plan(TWO_WAVELENGTHS, scene, max_orders=4, describe=False)
     assert plan.config.keeps_histories
@@ -79,12 +79,12 @@ def test_derivatives_where_optics_are_applied_while_light_is_traced():
     """With respect to an optical and a geometric value."""
 
     def total(plan, x):
-        canopy = jl.Canopy(slab(0.5), leaf=jl.LeafOptics(x[0], 0.2))
+        canopy = jl.Canopy(slab(0.5), leaf=jl.LeafOptics(x[0], 0.2), hotspot=False)
         scene = jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=0.3, height=x[1]))
         setup = jl.make_setup(TWO_WAVELENGTHS, scene, plan)
         return jl.total_reflectance(jl.trace_scene(setup, KEY), setup)
 
-    scene = jl.Scene(canopy=jl.Canopy(slab(0.5), leaf=LEAF), ground=GROUND)
+    scene = jl.Scene(canopy=jl.Canopy(slab(0.5), leaf=LEAF, hotspot=False), ground=GROUND)
     plan = jl.plan(
         TWO_WAVELENGTHS, scene, max_orders=4, n_photons=2048, window=(-100.0, 60.0), describe=False
     )
@@ -96,7 +96,9 @@ def test_derivatives_where_optics_are_applied_while_light_is_traced():
 
 def test_when_optics_are_applied_while_light_is_traced():
     """They are if histories take much more memory and wavelengths are few; fits then trace for new optics."""
-    scene = jl.Scene(canopy=jl.Canopy(slab(1.0), leaf=jl.LeafOptics(0.5, 0.5)), ground=jl.Ground(0.0, 1.0))
+    scene = jl.Scene(
+        canopy=jl.Canopy(slab(1.0), leaf=jl.LeafOptics(0.5, 0.5), hotspot=False), ground=jl.Ground(0.0, 1.0)
+    )
     long = {"max_orders": 300, "window": (-81.0, 3000.0), "describe": False}
     plan = jl.plan(jl.Lidar(), scene, **long)
     assert not plan.config.keeps_histories
@@ -115,7 +117,7 @@ def test_when_optics_are_applied_while_light_is_traced():
 
 
 def test_the_user_sets_the_limit():
-    scene = jl.Scene(canopy=jl.Canopy(slab(1.0), leaf=jl.LeafOptics(0.4, 0.4)), ground=GROUND)
+    scene = jl.Scene(canopy=jl.Canopy(slab(1.0), leaf=jl.LeafOptics(0.4, 0.4), hotspot=False), ground=GROUND)
     plan = jl.plan(jl.Lidar(), scene, describe=False)
     assert 1e5 < plan.memory < 1e9
     memory_of_one, memory_of_two = (plan.jacobian_memory(n) for n in (1, 2))
@@ -197,7 +199,7 @@ def layers_scaled(scene, factor):
 def layered(orders, layers=4, end=100.0, max_memory=None, **settings):
     """Return a model with leaf by layer and height and reflectance of the ground unknown, and its start."""
     voxels = slab(0.4, 0.05, shape=(1, 1, layers))
-    scene = jl.Scene(canopy=jl.Canopy(voxels, leaf=LEAF, bark=0.3), ground=GROUND)
+    scene = jl.Scene(canopy=jl.Canopy(voxels, leaf=LEAF, bark=0.3, hotspot=False), ground=GROUND)
     settings = {"n_photons": 256, "n_rays": 64, **settings}
     plan = jl.plan(TWO_WAVELENGTHS, scene, max_orders=orders, window=(-81.0, end), describe=False, **settings)
     plan = dataclasses.replace(plan, scope=plan.scope._replace(max_memory=max_memory))
@@ -220,6 +222,7 @@ def room_for(model, columns):
     return 1.0001e-9 * model.inputs.plan.jacobian_memory(columns)
 
 
+@pytest.mark.slow
 def test_columns_of_a_jacobian_are_computed_in_groups_if_memory_is_short():
     """The columns are the same, with the last group padded; a limit below one column is refused."""
     unlimited, start = layered(1)
@@ -242,7 +245,7 @@ def test_columns_of_a_jacobian_are_computed_in_groups_if_memory_is_short():
 
 def test_derivatives_have_no_histories_beyond_the_last_order():
     """Programs without derivatives have room for more histories, to be shared by plans."""
-    scene = jl.Scene(canopy=jl.Canopy(slab(0.4), leaf=LEAF), ground=GROUND)
+    scene = jl.Scene(canopy=jl.Canopy(slab(0.4), leaf=LEAF, hotspot=False), ground=GROUND)
     settings = {"n_photons": 16, "window": (-81.0, 50.0), "describe": False}
     plan = jl.plan(TWO_WAVELENGTHS, scene, max_orders=9, **settings)
     n_channels = len(plan.config.channels)

@@ -1,6 +1,7 @@
 """Plans have only the effects of the scene, programs only those of the plan; users can override choices."""
 
 import dataclasses
+import re
 
 import equinox as eqx
 import jax
@@ -14,8 +15,8 @@ from tests.helpers import slab
 GROUND = jl.Ground(reflectance=0.3)
 PLATE = jl.Plate(height=3.0, reflectance=0.4, transmittance=0.3, coverage=0.5)
 LEAF = jl.LeafOptics(reflectance=0.1, transmittance=0.05)
-LEAVES = jl.Canopy(slab(0.8), leaf=LEAF)
-TREES = jl.Canopy(slab(0.8, 0.1), leaf=LEAF, bark=0.3)
+LEAVES = jl.Canopy(slab(0.8), leaf=LEAF, hotspot=False)
+TREES = jl.Canopy(slab(0.8, 0.1), leaf=LEAF, bark=0.3, hotspot=False)
 HAZE = jl.Atmosphere(visibility=10.0, lidar_ratio=30.0)
 SIZES = {"n_photons": 512, "n_rays": 256, "window": (-100.0, 50.0)}
 LOOPS = ("scan[", "while[", "cond[")
@@ -117,7 +118,7 @@ def test_switching_off_is_the_scene_without():
 
     expected = {
         "bark": (lidar, with_fields(canopy=LEAVES)),
-        "leaf": (lidar, with_fields(canopy=jl.Canopy(slab(bark=0.1), bark=0.3))),
+        "leaf": (lidar, with_fields(canopy=jl.Canopy(slab(bark=0.1), bark=0.3, hotspot=False))),
         "plates": (lidar, with_fields(plates=())),
         "ground": (lidar, with_fields(ground=None)),
         "slope spread": (lidar, with_fields(ground=jl.Ground())),
@@ -203,6 +204,21 @@ def test_every_effect_has_a_line_in_the_table():
         assert row.reason in line
         assert 0 <= row.bound <= 1
     assert "switched off" in next(text for text in lines if text.startswith("bark"))
+
+
+@pytest.mark.parametrize("zenith", [0.0, 60.0])
+def test_the_lowest_altitude_is_named_where_a_scene_reaches_up_to_the_sensor(zenith):
+    scene = jl.Scene(ground=jl.Ground(height=20.0))
+
+    def plan(altitude):
+        return jl.plan(jl.Lidar(altitude=altitude, zenith=zenith), scene, describe=False)
+
+    with pytest.raises(ValueError, match=r"altitude = 10 m: the scene reaches up to the sensor") as refusal:
+        plan(10.0)
+    lowest = float(re.search(r"admissible is more than (\S+) m", str(refusal.value))[1])
+    plan(1.01 * lowest)
+    with pytest.raises(ValueError, match="reaches up to the sensor"):
+        plan(0.99 * lowest)
 
 
 @pytest.mark.parametrize(

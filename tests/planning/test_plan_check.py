@@ -20,7 +20,7 @@ def stand(extinction=0.1, height=6.0, size=1.0, base=0.0, **canopy_fields):
     voxels = jl.VoxelMap.from_extinction(
         leaf=np.full(shape, extinction), voxel_size=size, origin=(-4 * size, -4 * size, base)
     )
-    return jl.Canopy(voxels, leaf=canopy_fields.pop("leaf", LEAF), **canopy_fields)
+    return jl.Canopy(voxels, leaf=canopy_fields.pop("leaf", LEAF), **{"hotspot": False, **canopy_fields})
 
 
 LIDAR = jl.Lidar(divergence=0.3)
@@ -63,7 +63,7 @@ MISFITS = {
     "smaller voxels": (LIDAR, canopy(size=0.25), "segments of a ray; the scene may have"),
     "narrower voxels": (LIDAR, narrower(0.1), "voxels along a flight; the scene may have"),
     "brighter leaves": (LIDAR, canopy(leaf=jl.LeafOptics(0.5, 0.49)), "orders, for albedos up to 0.7"),
-    "hot spot": (LIDAR, canopy(hotspot=True), "has hotspot = False"),
+    "hot spot": (LIDAR, canopy(hotspot=True), "has hotspot = False; the canopy has hotspot = True"),
     "no ground": (LIDAR, dataclasses.replace(SCENE, ground=None), r"has leaf, ground; the scene has leaf"),
     "a plate more": (LIDAR, dataclasses.replace(SCENE, plates=PLANES.plates), r"also has plate 1\.R"),
     "straight leaves": (LIDAR, canopy(transmission="straight"), r"has leaf\.T; .* is not scattered"),
@@ -168,7 +168,9 @@ def test_light_outside_the_bins_is_reported_as_lost_under_a_transformation():
 def with_bark(extinction):
     bark = np.full((4, 4, 4), extinction)
     voxels = jl.VoxelMap.from_extinction(leaf=np.full((4, 4, 4), 0.3), bark=bark, voxel_size=1.0)
-    return jl.Scene(canopy=jl.Canopy(voxels, leaf=LEAF, bark=0.3), ground=jl.Ground(reflectance=0.3))
+    return jl.Scene(
+        canopy=jl.Canopy(voxels, leaf=LEAF, bark=0.3, hotspot=False), ground=jl.Ground(reflectance=0.3)
+    )
 
 
 def test_a_material_of_zero_extinction_is_not_in_the_scene():
@@ -190,6 +192,8 @@ def test_a_material_of_zero_extinction_is_not_in_the_scene():
 def test_a_map_of_zeros_is_no_canopy():
     zeros = jl.VoxelMap.from_extinction(leaf=np.zeros((4, 4, 4)), voxel_size=1.0)
     ground = jl.Ground(reflectance=0.3)
-    plan = jl.plan(LIDAR, jl.Scene(canopy=jl.Canopy(zeros, leaf=LEAF), ground=ground), describe=False)
+    plan = jl.plan(
+        LIDAR, jl.Scene(canopy=jl.Canopy(zeros, leaf=LEAF, hotspot=False), ground=ground), describe=False
+    )
     assert plan.orders == 1
     assert not plan.is_random

@@ -199,7 +199,9 @@ def test_a_voxelised_tree_is_simulated():
         [one_segment((0.0, 0.0, 0.0), (0.0, 0.0, 4.0), 0.2, 0.05), clumps_only((0.1, 0.0, 4.2), radius=0.3)]
     )
     leaf = jl.LeafOptics(reflectance=0.4, transmittance=0.3)
-    scene = jl.Scene(canopy=jl.Canopy(voxelise(tree, 0.1), leaf=leaf, bark=0.3), ground=jl.Ground())
+    scene = jl.Scene(
+        canopy=jl.Canopy(voxelise(tree, 0.1), leaf=leaf, bark=0.3, hotspot=False), ground=jl.Ground()
+    )
     wave = jl.simulate(jl.Lidar(), scene, key=jax.random.key(0), max_orders=1, footprint="fixed")
     sums = {name: float(component.sum()) for name, component in wave.components.items()}
     assert all(sums[name] > 0 for name in ("leaf", "bark", "ground"))

@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 
 import jaxlidar as jl
 from jaxlidar import plot
+from jaxlidar.plot.style import check_waveform
 
 matplotlib.use("agg")
 
@@ -19,7 +20,7 @@ def canopy_scene(**ground):
         leaf=np.full((2, 3, 4), 0.3), bark=np.full((2, 3, 4), 0.02), voxel_size=1.0, origin=(-1.0, -1.5, 2.0)
     )
     leaf = jl.LeafOptics(reflectance=0.4, transmittance=0.3)
-    return jl.Scene(canopy=jl.Canopy(voxels, leaf=leaf, bark=0.3), ground=jl.Ground(**ground))
+    return jl.Scene(canopy=jl.Canopy(voxels, leaf=leaf, bark=0.3, hotspot=False), ground=jl.Ground(**ground))
 
 
 @pytest.fixture(scope="module")
@@ -172,6 +173,17 @@ def test_an_empty_scene_and_new_figures():
 def test_inadmissible_input_is_refused(wave, call, message):
     with pytest.raises(ValueError, match=message):
         call(wave)
+
+
+def test_waveforms_of_a_survey_are_refused_with_what_to_draw():
+    """Tests check annotations before the functions do; this is the check of all that draw one waveform."""
+    survey = jl.Survey(jl.Lidar(), np.array([[0.0, 0.0], [5.0, 0.0]]))
+    scene = jl.Scene(ground=jl.Ground())
+    waveforms = jl.simulate_many(survey, scene, key=jax.random.key(0), rtol=0.1, max_orders=1)
+    says = r"wave is a Waveforms of 2 shots; admissible is the Waveform of one shot, as in many\[0\]"
+    with pytest.raises(TypeError, match=says):
+        check_waveform(waveforms)
+    assert plot.waveform(waveforms[0], Figure().subplots()).lines
 
 
 def test_the_energy_budget_adds_up_to_100_percent(wave, axes):

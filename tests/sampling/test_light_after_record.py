@@ -22,7 +22,7 @@ LIDAR = jl.Lidar()
 
 def dense(albedo, depth=10.0, reflectance=None):
     leaf = jl.LeafOptics(0.5 * albedo, 0.5 * albedo)
-    canopy = jl.Canopy(slab(depth, thickness=10.0), leaf=leaf, sides="periodic")
+    canopy = jl.Canopy(slab(depth, thickness=10.0), leaf=leaf, sides="periodic", hotspot=False)
     ground = None if reflectance is None else jl.Ground(reflectance=reflectance)
     return jl.Scene(canopy=canopy, ground=ground)
 

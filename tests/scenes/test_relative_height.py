@@ -47,7 +47,7 @@ def test_canopies_that_stand_on_their_terrain_are_accepted():
         jl.Scene(canopy=canopy(), ground=level(0.0))
         jl.Scene(canopy=canopy(), ground=level(0.6))
         jl.Scene(canopy=canopy(z=5.0), ground=level(0.0))
-        lifted = jl.Canopy(flat_map.voxels.above(slope), leaf=LEAF)
+        lifted = jl.Canopy(flat_map.voxels.above(slope), leaf=LEAF, hotspot=False)
         jl.Scene(canopy=lifted, ground=slope)
         # Neither columns beside the terrain nor what a transformation traces is checked.
         jl.Scene(canopy=canopy(z=500.0), ground=level(0.0).moved(np.array([50.0, 50.0])))
@@ -57,6 +57,19 @@ def test_canopies_that_stand_on_their_terrain_are_accepted():
     # The same map, not lifted, is reported.
     with pytest.warns(jl.MisplacedCanopyWarning, match="of the plants lie below"):
         jl.Scene(canopy=flat_map, ground=slope)
+
+
+def test_a_scene_is_made_where_other_parts_are_traced():
+    trees, ground, buried = canopy(), level(0.0), level(400.0)
+
+    @jax.jit
+    def height_of_plate(height):
+        return jl.Scene(canopy=trees, ground=ground, plates=(jl.Plate(height, 0.3),)).plates[0].height
+
+    assert float(height_of_plate(20.0)) == 20.0
+    # What is not traced is checked all the same.
+    with pytest.raises(ValueError, match="below the terrain"):
+        jax.jit(lambda height: jl.Scene(canopy=trees, ground=buried).ground.spacing + height)(20.0)
 
 
 def test_the_warning_points_at_the_caller():

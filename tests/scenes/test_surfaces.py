@@ -34,8 +34,15 @@ class DiscShape(jl.AbstractShape):
     def distance(self, x: Vec, w: Vec):
         up = jnp.asarray([0.0, 0.0, 1.0])
         s = jl.Plane(up, self.centre).distance(x, w)
-        radius2 = (x[0] + s * w[0] - self.centre[0]) ** 2 + (x[1] + s * w[1] - self.centre[1]) ** 2
-        return jnp.where(radius2 < self.radius**2, s, 1e30)
+        return jnp.where(self.squared_radius(x, w, s) < self.radius**2, s, 1e30)
+
+    def squared_radius(self, x: Vec, w: Vec, s: Array):
+        return (x[0] + s * w[0] - self.centre[0]) ** 2 + (x[1] + s * w[1] - self.centre[1]) ** 2
+
+    def outline(self, x: Vec, w: Vec):
+        s = (self.centre[2] - x[2]) / w[2]
+        # To first order the distance from the rim, and smooth at the centre.
+        return (self.squared_radius(x, w, s) - self.radius**2) / (2.0 * self.radius)
 
     def tangent(self, x: Vec):
         zero = jnp.zeros_like(self.radius)

@@ -77,7 +77,7 @@ def test_a_batch_at_pivots_gives_the_batch(air):
         np.full((1, 1, 4), 0.4), voxel_size=(4.0, 4.0, 1.0), origin=(-2.0, -2.0, 0.0)
     )
     scene = jl.Scene(
-        canopy=jl.Canopy(voxels, leaf=LEAF),
+        canopy=jl.Canopy(voxels, leaf=LEAF, hotspot=False),
         ground=jl.Ground(reflectance=optics(wavelength)[-1]),
         atmosphere=air,
     )
@@ -102,6 +102,7 @@ def test_a_batch_at_pivots_gives_the_batch(air):
     assert not np.allclose(wrong_samples, samples, atol=1e-4 * float(samples.max()))
 
 
+@pytest.mark.slow
 def test_errors_of_a_spectrum_are_those_of_its_wavelengths():
     """Each wavelength has the standard error of a simulation at this wavelength by the same photons."""
     scene = jl.Scene(

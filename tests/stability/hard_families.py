@@ -233,7 +233,7 @@ def one_voxel_family(edge, interval):
             voxel_size=jnp.broadcast_to(size, (3,)),
             origin=jnp.stack([-0.4 * size, -0.4 * size, jnp.zeros_like(size)]),
         )
-        canopy = jl.Canopy(voxels, leaf=jl.LeafOptics(reflectance=p["R"], transmittance=0.0))
+        canopy = jl.Canopy(voxels, leaf=jl.LeafOptics(reflectance=p["R"], transmittance=0.0), hotspot=False)
         lidar = single_sample_lidar(sampling_interval=interval, divergence=0.0)
         return lidar, jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=p["rho"]))
 
@@ -280,7 +280,9 @@ def measure_crown():
             position=jnp.stack([p["x"], p["y"]]),
         )
         ground = jl.Ground(reflectance=p["rho"], height=p["height"], slope=p["slope"], aspect=90.0)
-        return lidar, jl.Scene(canopy=jl.Canopy(voxels, leaf=leaf, bark=p["bark_R"]), ground=ground)
+        return lidar, jl.Scene(
+            canopy=jl.Canopy(voxels, leaf=leaf, bark=p["bark_R"], hotspot=False), ground=ground
+        )
 
     settings = {"max_orders": 3, "n_photons": 64, "n_rays": 32, "window": (-45.0, 45.0), "bin_width": 1.0}
     return simulation(
@@ -296,7 +298,7 @@ def measure_many_orders():
         voxels = jl.VoxelMap.from_extinction(
             leaf=jnp.broadcast_to(p["tau"] / 3.0, (1, 1, 3)), voxel_size=1.0, origin=(-0.5, -0.5, 0.0)
         )
-        canopy = jl.Canopy(voxels, leaf=jl.Isotropic(albedo=p["albedo"]), sides="periodic")
+        canopy = jl.Canopy(voxels, leaf=jl.Isotropic(albedo=p["albedo"]), sides="periodic", hotspot=False)
         return single_sample_lidar(), jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=p["rho"]))
 
     settings = {"max_orders": 40, "n_photons": 64, "n_rays": 4, **SINGLE_SAMPLE}
@@ -357,7 +359,7 @@ def measure_chord(periodic):
         k = p["k"] * (1.0 + p["contrast"] * jnp.asarray(sign))
         voxels = jl.VoxelMap.from_extinction(leaf=k, voxel_size=1.0)
         leaf = jl.LeafOptics(reflectance=0.5, transmittance=0.3)
-        canopy = jl.Canopy(voxels, leaf=leaf, sides="periodic" if periodic else "open")
+        canopy = jl.Canopy(voxels, leaf=leaf, sides="periodic" if periodic else "open", hotspot=False)
         medium = make_medium(canopy, jnp.zeros(3))
         x, w = (tuple(p[n][None] for n in names) for names in ("xyz", "uvw"))
         none, active = jnp.zeros((0, 1)), jnp.ones((1,), bool)

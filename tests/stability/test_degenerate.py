@@ -65,7 +65,7 @@ def canopy(
     )
     leaf = jl.LeafOptics(reflectance=optics[0], transmittance=optics[1])
     scene = jl.Scene(
-        canopy=jl.Canopy(voxels, leaf=leaf, bark=bark),
+        canopy=jl.Canopy(voxels, leaf=leaf, bark=bark, hotspot=False),
         ground=jl.Ground(height=height, slope=slope, reflectance=ground),
     )
     beam = {"field_of_view": 1.0} | (lidar or {})
@@ -165,7 +165,7 @@ def test_one_voxel_and_one_sample(precision):
         voxels = jl.VoxelMap.from_extinction(
             leaf=np.full((1, 1, 1), tau), voxel_size=1.0, origin=(-0.4, -0.4, 0)
         )
-        return jl.Scene(canopy=jl.Canopy(voxels, leaf=leaf))
+        return jl.Scene(canopy=jl.Canopy(voxels, leaf=leaf, hotspot=False))
 
     plan = jl.plan(
         lidar, scene(1.0), max_orders=1, n_rays=1, window=(0.0, 1.0), bin_width=5.0, footprint="fixed"

@@ -131,7 +131,10 @@ def over_ground(leaf, n_layers=3):
     voxels = jl.VoxelMap.from_extinction(
         leaf=np.full((1, 1, n_layers), 0.3), voxel_size=(4.0, 4.0, 1.0), origin=(-2.0, -2.0, 1.0)
     )
-    return jl.Scene(canopy=jl.Canopy(voxels, leaf=leaf, sides="periodic"), ground=jl.Ground(reflectance=0.4))
+    return jl.Scene(
+        canopy=jl.Canopy(voxels, leaf=leaf, sides="periodic", hotspot=False),
+        ground=jl.Ground(reflectance=0.4),
+    )
 
 
 @pytest.mark.slow

@@ -73,7 +73,10 @@ def build(p):
     )
     return lidar, jl.Scene(
         canopy=jl.Canopy(
-            voxels, leaf=jl.LeafOptics(reflectance=p["leaf"][0], transmittance=p["leaf"][1]), bark=p["bark"]
+            voxels,
+            leaf=jl.LeafOptics(reflectance=p["leaf"][0], transmittance=p["leaf"][1]),
+            bark=p["bark"],
+            hotspot=False,
         ),
         plates=(plate,),
         ground=jl.Ground(height=p["height"], reflectance=p["rho"], slope=p["slope"], aspect=p["aspect"]),

@@ -92,7 +92,7 @@ def test_waveforms_of_inadmissible_values_are_nan():
 def test_every_reason_has_a_path():
     @jax.jit
     def reasons_of(slope, coverage, zenith, bark):
-        canopy = jl.Canopy(jl.VoxelMap.from_extinction(bark=CUBE, voxel_size=1.0), bark=bark)
+        canopy = jl.Canopy(jl.VoxelMap.from_extinction(bark=CUBE, voxel_size=1.0), bark=bark, hotspot=False)
         plates = (jl.Plate(4.0, 0.2), jl.Plate(5.0, 0.2, coverage=coverage))
         return reasons((jl.Lidar(zenith=zenith), jl.Scene(canopy, plates, jl.Ground(slope=slope))))
 

@@ -82,7 +82,7 @@ def build(p):
         voxels = jl.VoxelMap.from_extinction(
             leaf=depth / step, voxel_size=(*p["sides"], step), origin=p["origin"]
         )
-        canopy = jl.Canopy(voxels, leaf=jl.LeafOptics(*split(p)), sides=sides)
+        canopy = jl.Canopy(voxels, leaf=jl.LeafOptics(*split(p)), sides=sides, hotspot=False)
     if with_ground:
         slope = 0.0 if sides == "periodic" else p["slope"]
         ground = jl.Ground(reflectance=p["rho"], slope=slope, aspect=p["aspect"])

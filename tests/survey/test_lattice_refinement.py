@@ -15,7 +15,7 @@ def edge(thickness: float = 3.0) -> jl.Scene:
     """Return a crown whose edge every shot sees."""
     density = np.zeros((20, 20, 6))
     density[10:, :, 6 - round(thickness) :] = 0.8
-    canopy = jl.Canopy(jl.VoxelMap.from_lad(density, voxel_size=1.0), leaf=jl.Prospect())
+    canopy = jl.Canopy(jl.VoxelMap.from_lad(density, voxel_size=1.0), leaf=jl.Prospect(), hotspot=False)
     return jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=0.3))
 
 

@@ -5,6 +5,7 @@ import pytest
 
 import jaxlidar as jl
 from jaxlidar.survey.footprint_splines import BeamSection, fit_footprints, section_of, spline_error
+from jaxlidar.survey.shared_illumination import GroupContribution, make_group_context, sum_contributions
 from tests.survey.test_simulate_many import (
     FAST,
     KEY,
@@ -34,7 +35,7 @@ def test_shared_illumination_over_terrain_below_plates_and_air(kind):
     survey = kind(4, wavelength=(532.0, 1064.0))
     leaf = jl.LeafOptics(np.array([0.1, 0.45]), np.array([0.1, 0.25]))
     plate = jl.Plate(16.0, 0.2, 0.5, coverage=0.5)
-    canopy = jl.Canopy(stand().canopy.voxels, leaf=leaf)
+    canopy = jl.Canopy(stand().canopy.voxels, leaf=leaf, hotspot=False)
     scene = jl.Scene(canopy, (plate,), ridges(), jl.Atmosphere(lidar_ratio=40.0))
     options = {"rtol": 0.1, "max_orders": 2}
     shared = jl.simulate_many(survey, scene, key=KEY, **options, shared=True)
@@ -56,6 +57,57 @@ def test_shared_illumination_over_terrain_below_plates_and_air(kind):
         mean, expected = shared.energy_budget[name].mean(axis=0), single.mean(axis=0)
         assert np.all(np.abs(mean - expected) < spread), name
         assert name != "absorbed by ground" or np.all(np.abs(1.2 * mean - expected) > spread)
+
+
+def test_standard_errors_of_the_energy_budget_are_those_of_its_sums():
+    """All that is scattered may escape or not: the standard error of what returns is its own.
+
+    It was that of the light that escaped where this is smaller: 0 in place of 0.2 A / (pi R^2).
+    """
+    beam, scene = lidar(), jl.Scene(ground=jl.Ground())
+    setup = jl.make_setup(beam, scene, jl.plan(beam, scene))
+    sums = {
+        "returned": 0.4,
+        "relative_energy": 0.4,
+        "lost": 0.0,
+        "escaped": 0.5,
+        "late": 0.1,
+        "remaining": 0.1,
+    }
+    stderr = {
+        "returned": 0.2,
+        "relative_energy": 0.2,
+        "lost": 0.0,
+        "escaped": 0.0,
+        "late": 0.03,
+        "remaining": 0.04,
+    }
+    energy, energy_stderr = (
+        {**{name: np.full((1, 1), x) for name, x in values.items()}, "absorbed": np.full((1, 1, 1), 0.05)}
+        for values in (sums, stderr)
+    )
+    samples = (1, setup.plan.n_samples)
+    contribution = GroupContribution(
+        shots=np.zeros(1, int),
+        lines=np.zeros((1, 3, *samples)),
+        energy=energy,
+        variance=np.zeros((1, *samples)),
+        energy_variance={name: a**2 for name, a in energy_stderr.items()},
+        photons=np.ones(1, int),
+    )
+    context = make_group_context(setup, spacing=1.0, view_geometry=None)
+    results = sum_contributions(context, [contribution], slice(0, 1))
+    solid_angle_over_pi = float(beam.aperture_area) / (np.pi * float(beam.range_to_reference) ** 2)
+    expected = {
+        "returned": 0.2 * solid_angle_over_pi,
+        "escaped": 0.0,
+        "absorbed by ground": 0.05,
+        "after the window": 0.03,
+        "unfollowed": 0.04,
+    }
+    assert results.energy_budget_stderr.keys() == expected.keys()
+    for name, value in expected.items():
+        np.testing.assert_allclose(results.energy_budget_stderr[name], [[value]], rtol=1e-5, err_msg=name)
 
 
 def test_splines_fit_footprints():

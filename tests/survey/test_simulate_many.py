@@ -2,9 +2,12 @@
 
 import concurrent.futures
 import contextlib
+import dataclasses
 import multiprocessing
 import os
 import sqlite3
+import subprocess
+import sys
 import warnings
 from pathlib import Path
 
@@ -13,6 +16,7 @@ import numpy as np
 import pytest
 
 import jaxlidar as jl
+from jaxlidar.sampling.adaptive import StopReason
 
 KEY = jax.random.key(5)
 
@@ -28,7 +32,7 @@ def stand(reflectance=0.45, *, ground=None, **canopy):
     voxels = jl.VoxelMap.from_lad(lad, voxel_size=2.0, origin=(-30.0, -30.0, 1.0))
     leaf = jl.LeafOptics(reflectance, 0.25)
     ground = jl.Ground(reflectance=0.3) if ground is None else ground
-    return jl.Scene(canopy=jl.Canopy(voxels, leaf=leaf, **canopy), ground=ground)
+    return jl.Scene(canopy=jl.Canopy(voxels, leaf=leaf, **{"hotspot": False, **canopy}), ground=ground)
 
 
 def lidar(**changes):
@@ -116,7 +120,7 @@ def oblique_and_limited(count):
         pytest.param(top_hats, True, marks=pytest.mark.slow),
         pytest.param(limited, True, marks=pytest.mark.slow),
         pytest.param(oblique, True, marks=pytest.mark.slow),
-        (oblique_and_limited, True),
+        pytest.param(oblique_and_limited, True, marks=pytest.mark.slow),
         pytest.param(scan, False, marks=pytest.mark.slow),
     ],
 )
@@ -162,10 +166,32 @@ def test_straight_transmission_is_traced_for_each_wavelength():
     leaf = jl.LeafOptics(np.array([0.1, 0.4]), np.array([0.1, 0.4]))
     scene = stand(transmission="straight")
     scene = jl.Scene(
-        canopy=jl.Canopy(scene.canopy.voxels, leaf=leaf, transmission="straight"), ground=scene.ground
+        canopy=jl.Canopy(scene.canopy.voxels, leaf=leaf, transmission="straight", hotspot=False),
+        ground=scene.ground,
     )
     waveforms = jl.simulate_many(survey, scene, key=KEY, **options)
     assert agree(deviations(waveforms, simulate_each(survey, scene, **options)))
+
+
+def test_shots_end_for_the_reasons_of_single_simulations():
+    survey, scene = jl.Survey(jl.Lidar(), [(0.0, 0.0)]), jl.Scene(ground=jl.Ground(reflectance=0.4))
+    many = jl.simulate_many(survey, scene, key=KEY)
+    wave = jl.simulate(jl.Lidar(), scene, key=KEY)
+    assert many[0].info["stopped"] == wave.info["stopped"] == "nothing is random"
+
+    def stopped(**changes):
+        """Return the reason for a shot with standard errors whose neglected orders may double it."""
+        info = {**many.info, "orders": 2, "rtol": 0.01, **changes.pop("info", {})}
+        fields = {"stderr": 0.001 * many.reflectance, "neglected": many.reflectance.sum(axis=2), **changes}
+        return dataclasses.replace(many, info=info, **fields)[0].info["stopped"]
+
+    assert stopped() == "orders beyond 2 may add 100 %"
+    # `simulate` does not report what lies beyond orders that the user chose.
+    assert stopped(info={"automatic orders": False}) == "tolerance met"
+    assert stopped(error=np.array([0.02])) == StopReason.BATCHES_SPENT.value
+    # Files of version 0.3.0 do not say who chose the orders.
+    del many.info["automatic orders"]
+    assert stopped() == "orders beyond 2 may add 100 %"
 
 
 def test_large_coordinates_lose_no_precision():
@@ -175,7 +201,9 @@ def test_large_coordinates_lose_no_precision():
     voxels = scene.canopy.voxels
     origin = np.asarray(voxels.origin, float) + np.append(shift, 0.0)
     moved_voxels = jl.VoxelMap(voxels.leaf, None, voxels.voxel_size, origin)
-    moved_scene = jl.Scene(canopy=jl.Canopy(moved_voxels, leaf=scene.canopy.leaf), ground=scene.ground)
+    moved_scene = jl.Scene(
+        canopy=jl.Canopy(moved_voxels, leaf=scene.canopy.leaf, hotspot=False), ground=scene.ground
+    )
     moved_waveforms = jl.simulate_many(
         jl.Survey(survey.lidar, survey.position + shift), moved_scene, key=KEY, **FAST
     )
@@ -317,6 +345,66 @@ def test_one_run_at_a_time_writes_a_file(tmp_path):
             jl.simulate_many(nadir(16), stand(), key=KEY, **FAST, path=path)
 
 
+# Another process runs this: it says that the first task is done, and waits.
+BUSY_RUN = """
+import sys, jax, jaxlidar as jl
+
+def wait(progress):
+    print(progress.done, flush=True)
+    sys.stdin.readline()
+
+survey = jl.Survey(jl.Lidar(), [(float(x), 0.0) for x in range(16)])
+scene = jl.Scene(ground=jl.Ground(slope=5.0))
+jl.simulate_many(survey, scene, key=jax.random.key(5), path=sys.argv[1], progress=wait)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("end", ["ends", "is killed"])
+def test_a_second_process_is_refused_until_the_first_has_gone(tmp_path, end):
+    survey = jl.Survey(jl.Lidar(), [(float(x), 0.0) for x in range(16)])
+    scene, path = jl.Scene(ground=jl.Ground(slope=5.0)), tmp_path / "many.nc"
+    process = subprocess.Popen(
+        [sys.executable, "-c", BUSY_RUN, str(path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    try:
+        assert int(process.stdout.readline()) > 0
+        with pytest.raises(
+            OSError, match=r"many\.nc\.parts is in use by another run: wait until it has ended"
+        ):
+            jl.simulate_many(survey, scene, key=KEY, path=path)
+        if end == "ends":
+            process.communicate("\n" * 16)
+            assert process.returncode == 0
+    finally:
+        process.kill()
+        process.communicate()
+    reports = []
+    waveforms = jl.simulate_many(survey, scene, key=KEY, path=path, progress=reports.append)
+    # Shots of the process that was killed are not traced again, nor any where it has ended.
+    assert [report.done for report in reports] == ([] if end == "ends" else list(range(4, 17, 2)))
+    assert same(waveforms, jl.simulate_many(survey, scene, key=KEY))
+    assert [p.name for p in tmp_path.iterdir()] == ["many.nc"]
+
+
+def test_a_run_that_has_ended_meanwhile_is_read(tmp_path, monkeypatch):
+    """Another run of the same problem ends after this one has looked for its file."""
+    from jaxlidar.survey import simulate_many
+
+    survey, scene, path = NADIR, jl.Scene(ground=jl.Ground(slope=5.0)), tmp_path / "many.nc"
+    expected, open_checkpoint = jl.simulate_many(survey, scene, key=KEY), simulate_many.open_checkpoint
+
+    def end_the_other_run(*arguments):
+        monkeypatch.undo()
+        jl.simulate_many(survey, scene, key=KEY, path=path)
+        return open_checkpoint(*arguments)
+
+    monkeypatch.setattr(simulate_many, "open_checkpoint", end_the_other_run)
+    waveforms = jl.simulate_many(survey, scene, key=KEY, path=path, progress=pytest.fail)
+    assert same(waveforms, expected)
+    assert [p.name for p in tmp_path.iterdir()] == ["many.nc"]
+
+
 def test_damaged_files_are_refused_by_name(tmp_path):
     survey, scene, path = nadir(16), stand(), tmp_path / "many.nc"
 
@@ -417,3 +505,20 @@ def test_inadmissible_arguments_are_refused_before_any_work(arguments, error, me
     monkeypatch.setattr(simulate_many, "outcomes", lambda *_: pytest.fail("work was done"))
     with pytest.raises(error, match=message):
         jl.simulate_many(**({"survey": NADIR, "scene": stand(), "key": KEY} | arguments))
+
+
+def test_a_jax_transformation_is_refused_with_its_cause():
+    """Within a program all that is computed is traced, also where no argument is."""
+    survey, scene = NADIR, jl.Scene(ground=jl.Ground())
+    message = r"simulate_many cannot run inside a JAX transformation \(jit, .* use simulate for each shot"
+
+    def scaled(x):
+        return x * jl.simulate_many(survey, scene, key=KEY).reflectance.sum()
+
+    def of_reflectance(reflectance):
+        ground = jl.Ground(reflectance=reflectance)
+        return jl.simulate_many(survey, jl.Scene(ground=ground), key=KEY).reflectance.sum()
+
+    for transformed in (jax.jit(scaled), jax.jit(of_reflectance), jax.grad(of_reflectance)):
+        with pytest.raises(TypeError, match=message):
+            transformed(0.3)

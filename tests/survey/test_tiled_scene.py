@@ -27,7 +27,7 @@ class Forest:
         last = np.clip(np.ceil(high - self.origin), 1, SIDE).astype(int)
         density = self.density[first[0] : last[0], first[1] : last[1]]
         voxels = jl.VoxelMap.from_lad(density, voxel_size=1.0, origin=(*(self.origin + first), 0.0))
-        canopy = jl.Canopy(voxels, leaf=LEAF) if density.any() else None
+        canopy = jl.Canopy(voxels, leaf=LEAF, hotspot=False) if density.any() else None
         return jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=0.4))
 
     def untiled(self):

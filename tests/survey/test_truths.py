@@ -22,7 +22,7 @@ def stand():
     lad = random.uniform(0.0, 1.0, (12, 12, 3)) * (random.uniform(size=(12, 12, 1)) < 0.6)
     voxels = jl.VoxelMap.from_lad(lad, voxel_size=5.0, origin=(-30.0, -30.0, 1.0))
     ground = jl.Ground(reflectance=0.3, slope=8.0, aspect=90.0)
-    return jl.Scene(canopy=jl.Canopy(voxels, leaf=jl.LeafOptics(0.45, 0.3)), ground=ground)
+    return jl.Scene(canopy=jl.Canopy(voxels, leaf=jl.LeafOptics(0.45, 0.3), hotspot=False), ground=ground)
 
 
 SCENE = stand()

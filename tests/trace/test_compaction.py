@@ -29,7 +29,7 @@ def photons(alive):
 @pytest.mark.parametrize("living_fraction", [0.0, 0.3, 1.0])
 def test_living_photons_come_first_and_those_with_short_paths_before_others(living_fraction):
     voxels = jl.VoxelMap.from_lad(np.full((24, 24, 24), 0.2), voxel_size=1.0, origin=(-12.0, -12.0, -12.0))
-    scene = jl.Scene(canopy=jl.Canopy(voxels, leaf=jl.LeafOptics(0.4, 0.4)))
+    scene = jl.Scene(canopy=jl.Canopy(voxels, leaf=jl.LeafOptics(0.4, 0.4), hotspot=False))
     lidar = jl.Lidar()
     device_scene = build_device_scene(jl.make_setup(lidar, scene, jl.plan(lidar, scene)), derivatives="none")
     batch = photons(np.random.default_rng(0).uniform(size=(5, 64)) < living_fraction)

@@ -28,7 +28,7 @@ def scene(leaf=(0.4, 0.3), bark=0.3, ground=0.5, sides="open", plate=None, **can
     )
     optics = jl.LeafOptics(reflectance=leaf[0], transmittance=leaf[1])
     return jl.Scene(
-        canopy=jl.Canopy(voxels, leaf=optics, bark=bark, sides=sides, **canopy),
+        canopy=jl.Canopy(voxels, leaf=optics, bark=bark, sides=sides, **{"hotspot": False, **canopy}),
         plates=() if plate is None else (plate,),
         ground=None if ground is None else jl.Ground(reflectance=ground),
     )
@@ -83,3 +83,30 @@ def test_small_deposits_on_large_sums():
     setup = jl.make_setup(lidar, crown, plan)
     wave = one_batch(setup, key)
     np.testing.assert_allclose(sum(wave.energy_budget.values()), 1.0, atol=2e-4)
+
+
+def test_light_outside_the_record_is_all_counted():
+    """A record far below the slab holds nothing: all returns of order one are outside of it."""
+    lidar = jl.Lidar(divergence=2.0)
+    outside = []
+    for window in (None, (3900.0, 4000.0)):
+        plan = jl.plan(lidar, scene(), max_orders=1, window=window, n_rays=512, footprint="fixed")
+        setup = jl.make_setup(lidar, scene(), plan)
+        response = jl.trace_scene(setup, jax.random.key(0))
+        assert (float(response.first.sum()) == 0.0) == (window is not None)
+        outside.append(np.asarray(response.first.sum(axis=-1) + response.first_outside))
+    # All of what the canopy returns was in the outermost bins, of which a twelfth was lost.
+    np.testing.assert_allclose(outside[1], outside[0], rtol=1e-5)
+
+
+def test_a_plate_behind_the_end_of_the_record_absorbs_nothing():
+    """The record ends between two black plates that transmit: the lower one is not reached any more."""
+    plates = (jl.Plate(5.0, 0.0, 0.5), jl.Plate(30.0, 0.0, 0.5))
+    black = jl.Scene(plates=plates, ground=jl.Ground(reflectance=0.5))
+    # Heights of 45 to 15 m; a second order, because photons carry the budget.
+    window = tuple(-2.0 * z / jl.SPEED_OF_LIGHT for z in (45.0, 15.0))
+    wave = jl.simulate(jl.Lidar(), black, key=jax.random.key(1), max_orders=2, n_photons=1024, window=window)
+    budget = {name: float(value[0]) for name, value in wave.energy_budget.items()}
+    assert budget["absorbed by plate 2"] == pytest.approx(0.5, abs=0.05)
+    assert budget["absorbed by plate 1"] == 0.0
+    assert budget["after the window"] == pytest.approx(0.5, abs=0.05)

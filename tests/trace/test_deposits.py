@@ -13,7 +13,9 @@ from tests.helpers import SINGLE_SAMPLE, agrees, batch_mean, single_sample_lidar
 
 LIDAR = jl.Lidar(divergence=2.0, sampling_interval=5.0)
 SCENE = jl.Scene(
-    canopy=jl.Canopy(slab(0.8, 0.1), leaf=jl.LeafOptics(reflectance=0.4, transmittance=0.3), bark=0.3),
+    canopy=jl.Canopy(
+        slab(0.8, 0.1), leaf=jl.LeafOptics(reflectance=0.4, transmittance=0.3), bark=0.3, hotspot=False
+    ),
     ground=jl.Ground(reflectance=0.3, slope=5.0),
 )
 PLATES = jl.Scene(

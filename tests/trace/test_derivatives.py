@@ -53,7 +53,7 @@ def build(p):
         plate = jl.Plate(height=p["plate height"], reflectance=0.3, transmittance=0.3, coverage=p["coverage"])
         plates = (plate,)
     return jl.Scene(
-        canopy=jl.Canopy(voxels, leaf=optics, bark=0.3),
+        canopy=jl.Canopy(voxels, leaf=optics, bark=0.3, hotspot=False),
         plates=plates,
         ground=jl.Ground(
             height=p["ground height"],

@@ -104,6 +104,42 @@ def test_tilted_ground_broadens_the_pulse(wide_beam, slope, aspect):
     assert variance == pytest.approx(sigma**2 + 1.0 / 12.0 + spread**2, rel=TOLERANCE)
 
 
+# Slope, aspect, azimuth and zenith of the beam, degrees. The plane lies 5 m above the aim point.
+FACING = {
+    "east, beam to the east": (20.0, 90.0, 90.0, 30.0),
+    "east, beam to the west": (20.0, 90.0, 270.0, 30.0),
+    "east, beam to the north": (20.0, 90.0, 0.0, 30.0),
+    "north-east, beam to the south": (35.0, 45.0, 180.0, 15.0),
+}
+
+
+def plane_return(slope, aspect, azimuth, zenith, height=5.0):
+    """Return cosine of incidence and two-way time, ns, of a pencil beam on a plane, in closed form.
+
+    With d the direction of the beam and n the normal of the plane, tilted towards its aspect, the beam meets
+    the plane at the distance n_z h / (n.d) behind the aim point.
+    """
+    s, a, b, z = np.deg2rad([slope, aspect, azimuth, zenith])
+    normal = np.array([np.sin(s) * np.sin(a), np.sin(s) * np.cos(a), np.cos(s)])
+    beam = np.array([np.sin(z) * np.sin(b), np.sin(z) * np.cos(b), -np.cos(z)])
+    return -normal @ beam, 2.0 * normal[2] * height / (normal @ beam) / SPEED_OF_LIGHT
+
+
+@pytest.mark.parametrize("name", FACING)
+def test_tilted_ground_off_nadir_returns_at_its_time(name):
+    """An aspect with the wrong sign of east is rejected where the plane falls to the east."""
+    slope, aspect, azimuth, zenith = FACING[name]
+    lidar = jl.Lidar(divergence=0.0, zenith=zenith, azimuth=azimuth)
+    ground = jl.Ground(height=5.0, reflectance=0.4, slope=slope, aspect=aspect)
+    wave = jl.simulate(lidar, jl.Scene(ground=ground), key=KEY, window=(-100.0, 30.0))
+    cosine, time = plane_return(slope, aspect, azimuth, zenith)
+    assert total(wave)[0] == pytest.approx(0.4 * cosine, rel=TOLERANCE)
+    assert moments(wave)[0] == pytest.approx(time, abs=2e-3)
+    mirrored_cosine, mirrored_time = plane_return(slope, -aspect, azimuth, zenith)
+    assert np.sin(np.deg2rad(azimuth)) == pytest.approx(0.0) or abs(mirrored_time - time) > 1.0
+    assert np.sin(np.deg2rad(azimuth)) == pytest.approx(0.0) or abs(mirrored_cosine - cosine) > 0.1
+
+
 @pytest.mark.parametrize("divergence", [0.0, 1e-3, 0.02, 0.3, 3.0])
 def test_a_mirror_fills_the_aperture_as_a_gaussian_beam_does(divergence, mirror_plan):
     w = 2.0 * 0.5 * divergence

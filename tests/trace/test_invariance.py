@@ -36,7 +36,7 @@ def build(shift=(0.0, 0.0, 0.0), turns=0, divide=1, zenith=20.0, pick=slice(None
     wavelength = np.array([532.0, 1064.0, 1550.0])[pick]
     leaf = jl.LeafOptics(**{name: value[pick] for name, value in LEAF.items()})
     scene = jl.Scene(
-        canopy=jl.Canopy(voxels, leaf=leaf, bark=np.array([0.2, 0.4, 0.5])[pick]),
+        canopy=jl.Canopy(voxels, leaf=leaf, bark=np.array([0.2, 0.4, 0.5])[pick], hotspot=False),
         ground=jl.Ground(
             height=shift[2] + np.tan(np.deg2rad(10.0)) * downhill,
             slope=10.0,
@@ -173,7 +173,7 @@ def test_within_a_transformation():
     lidar = jl.Lidar(divergence=4.0)
 
     def scene_of(rho):
-        canopy = jl.Canopy(slab(0.8), leaf=jl.Isotropic(albedo=0.6))
+        canopy = jl.Canopy(slab(0.8), leaf=jl.Isotropic(albedo=0.6), hotspot=False)
         return jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=rho))
 
     plan = jl.plan(lidar, scene_of(0.3), max_orders=2, n_rays=64)

@@ -31,13 +31,15 @@ def scenes() -> dict[str, jl.Scene]:
     ground = jl.Ground(reflectance=0.3, slope=10.0)
     hills = jl.Terrain(0.5 * np.random.default_rng(2).uniform(size=(9, 9)), 2.0, (-8, -8), reflectance=0.3)
     return {
-        "leaves": jl.Scene(canopy=jl.Canopy(voxels, leaf=jl.Prospect()), ground=ground),
-        "bark": jl.Scene(canopy=jl.Canopy(bark, leaf=jl.Prospect(), bark=0.3), ground=ground),
-        "angles": jl.Scene(canopy=jl.Canopy(angled, leaf=jl.Prospect()), ground=ground),
+        "leaves": jl.Scene(canopy=jl.Canopy(voxels, leaf=jl.Prospect(), hotspot=False), ground=ground),
+        "bark": jl.Scene(canopy=jl.Canopy(bark, leaf=jl.Prospect(), bark=0.3, hotspot=False), ground=ground),
+        "angles": jl.Scene(canopy=jl.Canopy(angled, leaf=jl.Prospect(), hotspot=False), ground=ground),
         "plate": jl.Scene(
-            canopy=jl.Canopy(voxels, leaf=jl.Prospect()), plates=[jl.Plate(3.3, 0.2, 0.5)], ground=ground
+            canopy=jl.Canopy(voxels, leaf=jl.Prospect(), hotspot=False),
+            plates=[jl.Plate(3.3, 0.2, 0.5)],
+            ground=ground,
         ),
-        "terrain": jl.Scene(canopy=jl.Canopy(voxels, leaf=jl.Prospect()), ground=hills),
+        "terrain": jl.Scene(canopy=jl.Canopy(voxels, leaf=jl.Prospect(), hotspot=False), ground=hills),
     }
 
 

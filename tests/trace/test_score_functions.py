@@ -20,6 +20,7 @@ from jaxlidar.trace import higher_orders
 from jaxlidar.trace.device_scene import build_device_scene
 from jaxlidar.trace.response import trace_with_scores
 from jaxlidar.trace.score_functions import make_slopes
+from tests.helpers import BY_PRECISION, slow_unless
 
 RANDOM = np.random.default_rng(5)
 LEAF, BARK = RANDOM.uniform(0, 1, (6, 5, 8)), RANDOM.uniform(0, 0.3, (6, 5, 8))
@@ -140,7 +141,8 @@ def relative_difference(case: ScoreCase) -> float:
 TOLERANCE = {"float32": 1e-5, "float64": 1e-13}
 
 
-@pytest.mark.parametrize("name", CASES)
+@BY_PRECISION
+@pytest.mark.parametrize("name", slow_unless(["layers"], CASES))
 def test_scores_are_tangents(name, precision):
     assert relative_difference(CASES[name]) < TOLERANCE[precision]
 
@@ -151,7 +153,9 @@ def test_more_scores_are_tangents(name, precision):
     assert relative_difference(MORE_CASES[name]) < TOLERANCE[precision]
 
 
-@pytest.mark.parametrize("left_out", ["vertical_depth_slopes", "collision_score"])
+@pytest.mark.parametrize(
+    "left_out", slow_unless(["collision_score"], ["vertical_depth_slopes", "collision_score"])
+)
 def test_a_wrong_score_is_rejected(left_out, monkeypatch):
     """Without the way back to the sensor, or without what collisions add."""
     right = getattr(higher_orders, left_out)

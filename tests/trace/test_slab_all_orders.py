@@ -37,7 +37,8 @@ def simulated(tau, leaf, ground, orders, photons, seed=0):
     lad = np.full((2, 2, 20), 2 * tau / THICKNESS)
     voxels = jl.VoxelMap.from_lad(lad, voxel_size=(5.0, 5.0, THICKNESS / 20))
     scene = jl.Scene(
-        canopy=jl.Canopy(voxels, leaf=leaf, sides="periodic"), ground=jl.Ground(reflectance=ground)
+        canopy=jl.Canopy(voxels, leaf=leaf, sides="periodic", hotspot=False),
+        ground=jl.Ground(reflectance=ground),
     )
     plan = jl.plan(FAR_LIDAR, scene, max_orders=orders, n_photons=photons // 32, n_rays=256, **SINGLE_SAMPLE)
     (value, neglected), (stderr, _) = batch_mean(FAR_LIDAR, scene, plan, seed=seed, quantity=returned)

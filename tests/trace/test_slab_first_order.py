@@ -103,7 +103,7 @@ def reference():
 def first_order(shape, **changes):
     """Return the waveform of a slab divided into voxels, by a beam 2 m wide and a pulse of 3 ns."""
     lidar = jl.Lidar(zenith=20.0, azimuth=70.0, divergence=2.0, pulse=jl.GaussianPulse(fwhm=3.0))
-    canopy = jl.Canopy(slab(0.9, 0.5, shape=shape), leaf=LEAF, bark=0.5, sides="periodic")
+    canopy = jl.Canopy(slab(0.9, 0.5, shape=shape), leaf=LEAF, bark=0.5, sides="periodic", hotspot=False)
     scene = jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=RHO, slope=15.0))
     return first_wave(lidar, scene, jl.plan(lidar, scene, window=(-110.0, 30.0), **(FIRST_ORDER | changes)))
 
@@ -125,7 +125,7 @@ def test_steps_voxels_and_fine_bins_do_not_change_the_waveform(reference, shape,
 
 def test_the_first_order_is_not_random(reference):
     lidar = jl.Lidar(**INSTANT_PENCIL)
-    scene = jl.Scene(canopy=jl.Canopy(slab(1.0), leaf=LEAF))
+    scene = jl.Scene(canopy=jl.Canopy(slab(1.0), leaf=LEAF, hotspot=False))
     plan = jl.plan(lidar, scene, **FIRST_ORDER)
     assert not plan.is_random
     a, b = (jl.simulate(lidar, scene, key=jax.random.key(seed), plan=plan) for seed in (1, 2))
@@ -185,7 +185,7 @@ def canopy_of(name):
         origin=(-20, -20, 0),
         leaf_angles=jl.LeafAngles.named(name),
     )
-    return jl.Canopy(voxels, leaf=LEAF, sides="periodic")
+    return jl.Canopy(voxels, leaf=LEAF, sides="periodic", hotspot=False)
 
 
 LEAF_AREA_INDEX = 1.5

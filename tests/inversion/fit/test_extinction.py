@@ -17,6 +17,7 @@ import jaxlidar as jl
 from inversion.fit import model as fit_model
 from inversion.fit.model import ForwardModel, choose_jacobian_methods, max_columns_per_voxel
 from inversion.fit.unknowns import bind_unknowns, flat_start
+from tests.helpers import BY_PRECISION
 
 KEY = jax.random.key(7)
 LIDAR = jl.Lidar(wavelength=(532.0, 1064.0), divergence=2.0)
@@ -26,7 +27,7 @@ LEAF = np.random.default_rng(2).uniform(0.0, 1.0, (4, 4, LAYERS))
 
 def scene_with(**canopy):
     voxels = jl.VoxelMap.from_extinction(leaf=LEAF, bark=0.2 * LEAF, voxel_size=0.5, origin=(-1.0, -1.0, 1.0))
-    canopy = {"leaf": jl.Prospect(), "bark": 0.3, **canopy}
+    canopy = {"leaf": jl.Prospect(), "bark": 0.3, "hotspot": False, **canopy}
     return jl.Scene(canopy=jl.Canopy(voxels, **canopy), ground=jl.Ground(reflectance=0.4, slope=5.0))
 
 
@@ -72,6 +73,7 @@ def dependences(model):
     return [setter.dependence for setter in model.inputs.setters]
 
 
+@BY_PRECISION
 @pytest.mark.parametrize("dense_columns", [4, pytest.param(8, marks=pytest.mark.slow)])
 def test_jacobians_are_the_same_as_with_tangents(monkeypatch, precision, dense_columns):
     """With voxels that list the two columns which move them, and with derivatives of all columns in each."""
@@ -125,7 +127,7 @@ def test_columns_of_voxels_are_found_at_other_values_than_the_start(monkeypatch)
     """At the start each voxel lies in one layer of the profile; with the ground at other heights, in two."""
     monkeypatch.setattr(fit_model, "DENSE_COLUMNS", 1)
     voxels = jl.VoxelMap.from_lad(np.full((1, 1, 10), 0.5), voxel_size=1.0, origin=(-0.5, -0.5, -2.0))
-    canopy = jl.Canopy(voxels, leaf=jl.LeafOptics(0.4, 0.4))
+    canopy = jl.Canopy(voxels, leaf=jl.LeafOptics(0.4, 0.4), hotspot=False)
     scene = jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=0.4))
     height = inversion.Unknown("ground.height", bounds=(-1.0, 1.0))
     profile = inversion.Unknown(

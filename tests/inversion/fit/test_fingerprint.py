@@ -22,7 +22,8 @@ from jaxlidar.optics.coefficients import Coefficients, shipped
 TIME = np.arange(-60.0, 21.0)
 VOXELS = jl.VoxelMap.from_lad(np.full((1, 1, 3), 0.3), voxel_size=(9.0, 9.0, 1.0), origin=(-4.5, -4.5, 2.0))
 SCENE = jl.Scene(
-    canopy=jl.Canopy(VOXELS, leaf=jl.Prospect(), sides="periodic"), ground=jl.Ground(reflectance=0.3)
+    canopy=jl.Canopy(VOXELS, leaf=jl.Prospect(), sides="periodic", hotspot=False),
+    ground=jl.Ground(reflectance=0.3),
 )
 LIDAR = jl.Lidar(wavelength=(532.0, 1064.0))
 # A global that `scale_brightness` uses.

@@ -66,7 +66,7 @@ def test_chlorophyll_is_invisible_at_1064_nm():
     voxels = jl.VoxelMap.from_lad(
         np.full((1, 1, 4), 0.3), voxel_size=(40.0, 40.0, 1.0), origin=(-20, -20, 2.0)
     )
-    scene = jl.Scene(canopy=jl.Canopy(voxels, leaf=leaf), ground=jl.Ground(reflectance=0.3))
+    scene = jl.Scene(canopy=jl.Canopy(voxels, leaf=leaf, hotspot=False), ground=jl.Ground(reflectance=0.3))
     unknowns = [
         Unknown(lambda s: s.canopy.leaf.Cab, bounds=(5.0, 100.0), name="Cab"),
         Unknown(lambda s: s.canopy.leaf.Cm, bounds=(0.001, 0.03), name="Cm"),

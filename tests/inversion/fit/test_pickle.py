@@ -14,7 +14,9 @@ from inversion import LogNormal, Unknown
 from inversion.fit.unknowns import bind_unknowns
 
 SCENE = jl.Scene(
-    canopy=jl.Canopy(jl.VoxelMap.from_lad(np.ones((1, 1, 2)), voxel_size=1.0), leaf=jl.Prospect()),
+    canopy=jl.Canopy(
+        jl.VoxelMap.from_lad(np.ones((1, 1, 2)), voxel_size=1.0), leaf=jl.Prospect(), hotspot=False
+    ),
     plates=(jl.Plate(height=5.0, reflectance=0.3), jl.Plate(height=6.0, reflectance=0.3)),
     ground=jl.Ground(height=0.1, reflectance=0.3),
 )

@@ -357,6 +357,7 @@ def noisy_records(n, seed=0):
     return np.asarray(wave.reflectance) + noise, lidar, start, unknowns, options
 
 
+@pytest.mark.slow
 @BY_PRECISION
 def test_a_profile_from_two_wavelengths(precision, tmp_path):
     observed, lidar, start, unknowns, options = noisy_records(3)

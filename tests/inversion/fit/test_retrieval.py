@@ -14,6 +14,7 @@ import jaxlidar as jl
 from inversion import Unknown
 from inversion.fit.model import ForwardModel
 from inversion.fit.planning import TraceSizes, corner_scenes, plan_for_bounds
+from inversion.fit.solver import latin_hypercube
 from inversion.fit.uncertainty import estimate_covariance
 from inversion.fit.unknowns import bind_unknowns, bounded_logistic, bounded_logit, optical_arrays
 from jaxlidar.planning.plan import MIN_BATCHES
@@ -32,7 +33,7 @@ def scale_leaf_area(scene, factor):
 def canopy_scene(Cab=40.0, Cw=0.012, height=0.0, ground=(0.1, 0.25, 0.35), extinction=0.3, **canopy):
     profile = extinction * np.array([0.5, 1.0, 1.5, 1.5, 1.0, 0.5]).reshape(1, 1, 6)
     voxels = jl.VoxelMap.from_extinction(leaf=profile, voxel_size=(4.0, 4.0, 1.0), origin=(0.0, 0.0, 2.0))
-    canopy = {"leaf": jl.Prospect(Cab=Cab, Cw=Cw), "sides": "periodic", **canopy}
+    canopy = {"leaf": jl.Prospect(Cab=Cab, Cw=Cw), "sides": "periodic", "hotspot": False, **canopy}
     return jl.Scene(
         canopy=jl.Canopy(voxels, **canopy), ground=jl.Ground(height=height, reflectance=np.array(ground))
     )
@@ -141,7 +142,7 @@ def test_the_tracer_does_not_read_optical_arrays():
     """All arrays called optical are taken out of the scene, and it is traced all the same."""
     voxels = jl.VoxelMap.from_extinction(leaf=np.ones((1, 1, 2)), bark=np.ones((1, 1, 2)), voxel_size=1.0)
     scene = jl.Scene(
-        canopy=jl.Canopy(voxels, leaf=jl.Prospect(), bark=0.4),
+        canopy=jl.Canopy(voxels, leaf=jl.Prospect(), bark=0.4, hotspot=False),
         plates=(jl.Plate(height=5.0, reflectance=0.3, transmittance=0.2, coverage=0.5),),
         ground=jl.Ground(reflectance=jl.spectrum("soil-medium")),
         atmosphere=jl.Atmosphere(visibility=23.0),
@@ -345,6 +346,31 @@ def test_a_step_to_a_simulation_that_is_not_finite_is_rejected():
     fit = retrieve_ground(unknowns=[unknown], scene=ground_scene())
     assert np.isfinite(fit.reduced_chi2)
     assert 0.5 < float(fit.values["factor"]) <= 0.9
+
+
+def test_starts_and_photons_have_different_keys(monkeypatch):
+    """Latin hypercubes of one fit and of many are drawn with keys of no batch of photons."""
+    keys = []
+
+    def record_key(unknowns, count, key):
+        keys.append(key)
+        return latin_hypercube(unknowns, count, key)
+
+    monkeypatch.setattr("inversion.fit.solver.latin_hypercube", record_key)
+    wave = jl.simulate(LIDAR, ground_scene(), key=jax.random.key(5))
+    unknown = Unknown(lambda s: s.ground.height, bounds=(-2.0, 2.0), name="height")
+    key = jax.random.key(1)
+    options = {"noise": 0.01, "key": key, "starts": 2, "max_steps": 1}
+    inversion.retrieve(wave, LIDAR, ground_scene(), [unknown], **options)
+    inversion.retrieve_many(
+        np.stack([wave.reflectance] * 2), LIDAR, ground_scene(), [unknown], time=wave.time, **options
+    )
+    assert len(keys) == 3
+    batches = [jax.random.fold_in(key, n) for n in range(MIN_BATCHES)]
+    # Keys that a batch, or a footprint, may derive from its own by a small number.
+    derived = [jax.random.fold_in(batch, n) for batch in batches for n in range(MIN_BATCHES)]
+    of_photons = {tuple(np.asarray(jax.random.key_data(k)).tolist()) for k in [*batches, *derived]}
+    assert not of_photons & {tuple(np.asarray(jax.random.key_data(k)).tolist()) for k in keys}
 
 
 def test_any_gauss_newton_method_serves():

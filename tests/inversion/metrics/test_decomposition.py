@@ -228,7 +228,7 @@ def test_plant_area_of_a_simulated_canopy():
         (lambda: wiener(TIME, np.ones(5), noise_to_signal=0.0), "noise_to_signal = 0"),
         (lambda: relative_heights(TIME, TIME, levels=(101.0,)), "levels = 101"),
         (lambda: gap_probability(TIME, 1.0, reflectance_ratio=0.0), "reflectance_ratio = 0"),
-        (lambda: plant_area_index(0.0), "gap = 0"),
+        (lambda: plant_area_index(-0.1), "gap = -0.1"),
         (lambda: plant_area_index(0.5, zenith=90.0), "zenith = 90"),
     ],
 )

@@ -146,3 +146,15 @@ def test_shots_may_come_one_by_one():
     record = 200.0 + 400.0 * np.exp(-0.5 * ((elevation - 100.0) / 0.9) ** 2)
     metrics = gedi_metrics(made_up_shot(elevation, record) for _ in range(2))
     np.testing.assert_allclose(metrics.elev_lowestmode, 100.0, atol=0.05)
+
+
+def test_ground_that_merges_with_the_canopy(shared):
+    """Smoothed by the width of the pulse, ground and canopy, 3 m apart, are one mode, 1.9 m too high."""
+    shot = np.load(shared / "gedi" / "shot_merged_ground.npz")
+    height, power, pulse = shot["height"], shot["signal"], shot["pulse"]
+    for noise in (float(shot["noise"]), None):
+        assert abs(float(find_ground(height, power, pulse=pulse, noise=noise))) < 0.5
+    # Negative control: a pulse a fifth wider, and with it the smoothing.
+    lag = np.arange(pulse.size) - pulse.size // 2
+    wide = np.interp(lag / 1.2, lag, pulse)
+    assert float(find_ground(height, power, pulse=wide)) > 1.0

@@ -103,9 +103,8 @@ def test_an_impulse_is_a_width_of_its_own_shape(interleaved):
     assert abs(fits.reduced_chi2.mean() - 1.0) < 4.5 * np.sqrt(2.0 / (TIME.size - 4) / SHOTS)
 
 
-@pytest.mark.parametrize(
-    "jitter", [0.0, pytest.param(1.5, marks=pytest.mark.slow)], ids=["fast", "slow receiver"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("jitter", [0.0, 1.5], ids=["fast", "slow receiver"])
 def test_noise_of_the_recorded_pulse_is_noise_of_the_fit(jitter):
     """A fast receiver repeats the noise of the pulse in the echo of hard ground; a slow one smooths it.
 
@@ -223,6 +222,37 @@ def test_a_response_is_estimated_from_hard_targets():
     assert largest_difference(response) < 0.06
     # Negative control: a receiver that repeats the pulse.
     assert largest_difference(np.eye(9)[4]) > 0.1
+
+
+@pytest.mark.parametrize("unit", [1e-60, 1e60])
+def test_a_response_does_not_depend_on_units_nor_on_shots_without_weight(unit):
+    pulse = np.exp(-0.5 * (np.arange(-9.0, 10.0) / 1.7) ** 2)
+    echo = np.convolve(np.pad(pulse, 20), [0.2, 0.5, 0.3])
+    noise = np.full(echo.size, 0.003)
+    expected = inversion.receiver_impulse([pulse], [echo], noise=[noise])
+    pulses, echoes = [unit * pulse, pulse, pulse], [unit * echo, unit * echo, 0.0 * echo]
+    # A shot of infinite noise, and one without an echo, have no weight.
+    noises = [unit * noise, np.full(echo.size, np.inf), noise]
+    response = inversion.receiver_impulse(pulses, echoes, noise=noises)
+    np.testing.assert_allclose(response, expected, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"pulses": [np.full(5, np.nan)]}, "pulses = nan"),
+        ({"pulses": [np.zeros(5)]}, "largest sample of pulses = 0"),
+        ({"echoes": [np.full(9, np.nan)]}, "echoes = nan"),
+        ({"noise": [np.zeros(9)]}, "noise = 0"),
+        ({"echoes": [np.zeros(9)]}, "echoes have no signal"),
+        ({"noise": [np.full(9, np.inf)]}, "echoes have no signal"),
+    ],
+)
+def test_bad_hard_targets_are_refused(changes, message):
+    pulse, echo = np.array([0.0, 1.0, 2.0, 1.0, 0.0]), np.pad([1.0, 2.0, 1.0], 3)
+    arguments = {"pulses": [pulse], "echoes": [echo], "noise": [np.ones(9)], **changes}
+    with pytest.raises(ValueError, match=message):
+        inversion.receiver_impulse(**arguments)
 
 
 def test_a_recorded_pulse_is_simulated_as_it_was_recorded():
