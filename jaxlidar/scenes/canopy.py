@@ -52,9 +52,11 @@ class Canopy(eqx.Module):
     - `transmission`: "diffuse": transmitted light leaves the far side of the leaf by the cosine law.
       "straight" (as in the paper): it keeps its direction; extinction then depends on the wavelength.
       Default "diffuse".
-    - `hotspot`: False: the attenuations on the way in and out are independent, and first-order light is
-      attenuated by exp(-2 tau). True: first-order light returns through the gap by which it entered, with
-      exp(-tau), as gap models assume. Default False.
+    - `hotspot`: True: first-order light returns through the gap by which it entered, attenuated by exp(-tau),
+      as source and receiver look along one line (the hot spot; Kuusk 1985). False: the attenuations on the
+      way in and out are independent, and it is attenuated by exp(-2 tau), as in the paper. Light of higher
+      orders leaves along another path than it came by; its attenuations are independent in both cases.
+      Default True.
     - `sides`: "open": there is no canopy beyond the map. "periodic": the map repeats without end. Default
       "open".
 
@@ -75,7 +77,7 @@ class Canopy(eqx.Module):
     leaf: Callable | AbstractPhase | None = None
     bark: Converted[Reflectance | AbstractPhase | None] = eqx.field(converter=_as_bark, default=None)
     transmission: str = eqx.field(static=True, default="diffuse")
-    hotspot: bool = eqx.field(static=True, default=False)
+    hotspot: bool = eqx.field(static=True, default=True)
     sides: str = eqx.field(static=True, default="open")
 
     ranges: ClassVar = {"bark": FRACTION}
