@@ -34,7 +34,7 @@ def same(plan):
         (1, "diffuse", same),
         (2, "diffuse", same),
         pytest.param(2, "straight", same, marks=pytest.mark.slow),
-        (2, "diffuse", with_applied_optics),
+        pytest.param(2, "diffuse", with_applied_optics, marks=pytest.mark.slow),
     ],
     ids=["one order", "two orders", "straight", "optics applied"],
 )

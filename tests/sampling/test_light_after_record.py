@@ -119,6 +119,7 @@ def test_more_orders_are_followed_where_too_few_were_planned(monkeypatch):
     assert tight.info["stopped"].startswith("orders beyond 3 may add")
 
 
+@pytest.mark.slow
 def test_orders_of_the_user_are_not_extended():
     wave = jl.simulate(LIDAR, dense(0.8, 3.0), key=KEY, max_orders=2, rtol=0.05)
     assert wave.info["stopped"] == "tolerance met"
@@ -148,6 +149,7 @@ def test_light_is_accounted_for():
     np.testing.assert_allclose(sum(np.asarray(v) for v in wave.energy_budget.values()), 1.0, atol=2e-3)
 
 
+@pytest.mark.slow
 def test_time_for_planning_counts(monkeypatch):
     """Eight batches take less than `max_seconds`: if planning did not count, more would be traced."""
     make = simulation.make_plan

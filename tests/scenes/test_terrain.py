@@ -66,7 +66,7 @@ def first_hit(heights, start, direction, max_distance=40.0, steps=8000):
     return np.where(hit, low, 1e30)
 
 
-@pytest.mark.parametrize("from_surface", [False, True])
+@pytest.mark.parametrize("from_surface", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_rays_meet_the_surface_where_bisection_does(from_surface):
     random = np.random.default_rng(1)
     start = np.c_[random.uniform(1, 19, 300), random.uniform(1, 15, 300), np.full(300, 3.0)]

@@ -129,6 +129,7 @@ def test_light_beyond_the_lossless_margin_returns_after_the_record():
         assert separation[path < longest].max() > 0.7 * bound
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_continues_with_the_same_results(tmp_path):
     path = tmp_path / "many.nc"
 

@@ -108,6 +108,7 @@ def test_empty_voxels_have_their_derivatives():
         np.testing.assert_allclose(backward, jnp.vdot(weight, forward), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_result_does_not_depend_on_the_longest_segment():
     scene = scenes()["leaves"]
     waves = [jl.simulate(LIDAR, scene, key=KEY, max_orders=1, max_step=step) for step in (None, 0.11, 5.0)]

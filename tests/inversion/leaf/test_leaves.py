@@ -388,6 +388,7 @@ def test_measured_leaves_of_lopex(shared):
         assert error_of(fit, record)[name] < largest, name
 
 
+@pytest.mark.slow
 def test_against_scipy_with_prosail(shared):
     """The same minimum, to a few hundredths of a standard error, by another solver and another model."""
     record, leaves, step = measured(shared, "angers_half.npz"), [0, 40, 135], 10

@@ -137,7 +137,8 @@ def within_bounds(echoes, power, noise):
     return np.all(~is_echo | (is_inside & (np.asarray(echoes.amplitude) <= 1.1 * highest)), axis=1)
 
 
-@pytest.mark.parametrize("count", [200, pytest.param(4000, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [200, 4000])
 def test_no_echo_leaves_its_record_with_noise_in_proportion(count):
     power, noise = records_with_proportional_noise(count, 8)
     lag, time = np.arange(-20.0, 21.0), np.arange(60.0)
