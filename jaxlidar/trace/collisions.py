@@ -217,12 +217,7 @@ def _on_bark(
 def _attached_facet_ratio(w: Vec, normal: Vec) -> Scalar:
     """Attached ratio of the density |n.w| / pi of a facet's normal; of the onward weight alone.
 
-    <<<<<<< HEAD
-        Returns to the sensor are means over all normals (`intensity_factors`), whichever was drawn.
-    =======
-        Returns to the sensor are means over all normals (`intensity_factors`), and do not depend on the one
-        drawn.
-    >>>>>>> trace9
+    Returns to the sensor are means over all normals (`intensity_factors`), whichever was drawn.
     """
     return attached_ratio(-dot(normal, w))
 
