@@ -42,7 +42,7 @@ from jaxlidar.spectral.apply_optics import (
 from jaxlidar.spectral.truth_class import Truth
 from jaxlidar.trace.deposit import add_rows, padded_index
 from jaxlidar.trace.device_scene import DeviceScene, build_device_scene
-from jaxlidar.trace.first_order import FootprintRays, march_rays, send_rays
+from jaxlidar.trace.first_order import FootprintRays, march_rays, move_rays, send_rays
 from jaxlidar.trace.ray_segments import integrate_over_bins
 from jaxlidar.trace.response import footprint_rays, trace_device_scene
 
@@ -199,6 +199,7 @@ def _sum_rays(
     axis_heights: Float[Array, "surfaces"],
 ) -> _RaySums:
     """Sum over all rays, `_RAYS_AT_ONCE` at a time."""
+    across, energy = move_rays(scene, across, energy)
 
     def sum_chunk(x: Array, y: Array, e: Array) -> _RaySums:
         rays = send_rays(scene, (x, y), e)
