@@ -104,9 +104,17 @@ def with_fixed_window(lidar: Lidar) -> Lidar:
 
 
 def as_observed(
-    observed: object, time: object, noise: object, noise_floor: float, lidar: Lidar
+    observed: object,
+    time: object,
+    noise: object,
+    noise_floor: float,
+    lidar: Lidar,
+    *,
+    has_offset: bool,
 ) -> ObservedWaveform:
     """Read and check the observation passed to `retrieve`.
+
+    `has_offset`: True for a record with offsets of digitisers, which are no signal.
 
     1. Take times and reflectances from a `Waveform`, or from arrays.
     2. Leave out samples of infinite noise.
@@ -147,7 +155,12 @@ def as_observed(
     check_range("noise_floor", noise_floor, 0.0, 1.0)
     # The simulation's standard error is zero in bins that no photon reached: with a record without noise,
     # their weight would be infinite. The floor also replaces stated noise below it.
-    peak = np.max(np.abs(np.where(is_fitted, y, 0.0)), axis=1, keepdims=True)
+    signal = np.where(is_fitted, y, 0.0)
+    if has_offset:
+        # The offset itself is fitted later; most samples of a record lie at it.
+        medians = [np.median(row[used]) if np.any(used) else 0.0 for row, used in zip(y, is_fitted)]
+        signal = np.where(is_fitted, y - np.array(medians)[:, None], 0.0)
+    peak = np.max(np.abs(signal), axis=1, keepdims=True)
     sigma = np.maximum(sigma, noise_floor * peak)
     if not np.all(sigma > 0):
         raise ValueError(

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from inversion.fit.data import SampleNoise
 from inversion.fit.model import Evaluation
 
 
@@ -174,8 +175,12 @@ class FitDetails:
     - `simulation_error`: (n,) part of the standard errors that is the simulation's own noise.
     - `residuals`: (wavelengths, bins) observed minus fitted, whitened; zero for samples that are left out.
     - `waveform_stderr`: (wavelengths, bins) standard error of the simulated waveform.
-    - `cost`: chi-squared by the noise of measurement and pulse, without the simulation's, plus -2 ln of the
-      prior density: compares minima.
+    - `cost`: chi-squared by the noise of measurement and pulse, without the simulation's, plus `prior_cost`:
+      ranks minima.
+    - `prior_cost`: -2 ln of the prior density at the estimates, up to a constant.
+    - `difference`: (samples,) simulated minus observed, of the fitted samples.
+    - `deviations`: (batches, samples) of the simulation's batches from their mean, or None for one batch.
+    - `noise`: of the fitted samples.
     - `history`: reduced chi-squared of every call of `progress`.
     - `evaluation`: the simulation at the estimates.
     """
@@ -184,6 +189,10 @@ class FitDetails:
     residuals: np.ndarray
     waveform_stderr: np.ndarray
     cost: float
+    prior_cost: float
+    difference: np.ndarray
+    deviations: np.ndarray | None
+    noise: SampleNoise
     history: tuple[float, ...]
     evaluation: Evaluation
 

@@ -12,6 +12,10 @@ of van Trees 1968, Detection, Estimation and Modulation Theory, averages I over 
 
     chi2(v) = minimum over the others of |C^-1/2 (w(v, others) - y)|^2 + |q(v, others)|^2.
 
+C, the covariance of the noise, depends on the simulated waveform. Every fit is weighted by its own, and
+chi-squared of all is that with C of the best one: otherwise values at which the noise is larger would seem
+better. The minimum over the others with other weights is the same to first order.
+
 The confidence interval of a level is where chi2(v) minus its minimum is below the quantile of chi-squared
 with one degree of freedom (Wilks 1938, Ann. Math. Stat. 9, 60).
 """
@@ -29,11 +33,11 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from inversion.fit.data import as_noise, as_sample_times, with_fixed_window
+from inversion.fit.fit_summary import CompletedFit
 from inversion.fit.model import ForwardModel
 from inversion.fit.planning import check_samples, checked_plan, plan_for_bounds, trace_sizes
-from inversion.fit.prior_residuals import PriorResiduals, fixed_priors
-from inversion.fit.result import Retrieval
-from inversion.fit.retrieval import check_progress, checked_problem, retrieve, solve_problem
+from inversion.fit.prior_residuals import fixed_priors
+from inversion.fit.retrieval import check_progress, checked_problem, fit_problem, retrieve
 from inversion.fit.uncertainty import correlation_of, estimate_covariance
 from inversion.fit.unknowns import (
     BoundUnknown,
@@ -44,6 +48,7 @@ from inversion.fit.unknowns import (
     flat_start,
     set_values,
     split_by_name,
+    with_start,
 )
 from jaxlidar import Lidar, Plan, Scene, Waveform
 from jaxlidar import plan as make_plan
@@ -320,11 +325,14 @@ def profile_likelihood(
     check_range("values", points, float(fixed.low), float(fixed.high))
     plan = checked_plan(plan, problem.lidar, scene, problem.unknowns, problem.observed.time, sizes)
     free_unknowns = [u for u, bound in zip(unknowns, problem.unknowns) if bound is not fixed]
+    # Smoothness priors without mean are about the first start, and no fit moves them.
+    levels = [bound.prior_level for bound in problem.unknowns if bound is not fixed]
     middle = int(np.argmin(np.abs(points - float(fixed.start))))
-    fits: dict[int, Retrieval] = {}
+    fits: dict[int, CompletedFit] = {}
+    estimates: dict[int, dict[str, np.ndarray]] = {}
     for outwards in (range(middle, points.size), range(middle - 1, -1, -1)):
         # Both directions start from the fit in the middle; None for the first one of all.
-        neighbour = fits.get(middle)
+        neighbour = estimates.get(middle)
         for i in outwards:
             # First of all values: the `apply` of other unknowns may depend on it.
             value = jnp.asarray(points[i], fixed.start.dtype).reshape(fixed.start.shape)
@@ -332,23 +340,33 @@ def profile_likelihood(
             # Bound again: they may depend on the scene.
             bound_unknowns = bind_unknowns(free_unknowns, scene_at_point)
             if neighbour is not None:
-                started = [_started_from(u, b, neighbour) for u, b in zip(free_unknowns, bound_unknowns)]
-                bound_unknowns = bind_unknowns(started, scene_at_point)
+                bound_unknowns = [
+                    with_start(u, jnp.asarray(neighbour[u.name], u.start.dtype)) for u in bound_unknowns
+                ]
+            bound_unknowns = [u._replace(smooth_level=v) for u, v in zip(bound_unknowns, levels)]
             problem_at_point = dataclasses.replace(problem, scene=scene_at_point, unknowns=bound_unknowns)
             # The same photons at all values: the noise of the simulation is no part of differences in
             # chi-squared.
-            neighbour = solve_problem(problem_at_point, plan, key, throw=options["throw"])
-            fits[i] = neighbour
+            fits[i], _, recorder = fit_problem(problem_at_point, plan, key, throw=options["throw"])
+            neighbour = split_by_name(fits[i].summary.values, [*bound_unknowns, *recorder.unknowns])
+            estimates[i] = neighbour
             if progress is not None:
                 progress(i)
     # From the order in which fits ran to that of the values.
     ordered = [fits[i] for i in range(points.size)]
-    chi2 = np.array([_chi2(f, problem.unknowns, priors, name, p) for f, p in zip(ordered, points)])
+    noise = min(ordered, key=lambda fit: fit.details.cost).details.noise
+    chi2 = np.zeros(points.size)
+    for i, fit in fits.items():
+        values_of_all = {**estimates[i], name: points[i]}
+        # The prior of the fixed unknown counts as well.
+        flat = np.concatenate([np.ravel(values_of_all[u.name]) for u in problem.unknowns])
+        residual = np.append(noise.whiten(fit.details.difference), priors(flat)[0])
+        chi2[i] = residual @ residual
     return Profile(
         values=points,
         chi2=chi2 - chi2.min(),
-        others={k: np.stack([np.asarray(f.values[k]) for f in ordered]) for k in ordered[0].values},
-        converged=np.array([f.converged for f in ordered]),
+        others={k: np.stack([estimates[i][k] for i in range(points.size)]) for k in estimates[middle]},
+        converged=np.array([fit.summary.converged for fit in ordered]),
     )
 
 
@@ -364,22 +382,3 @@ def _fixed_unknown(name: str, unknowns: Sequence[BoundUnknown]) -> BoundUnknown:
             "is one value beside one unknown or more"
         )
     return fixed
-
-
-def _started_from(unknown: Unknown, bound: BoundUnknown, fit: Retrieval) -> Unknown:
-    """Return the unknown with the estimate of a fit as its start."""
-    # Results in single precision may be rounded to beyond a bound.
-    value = np.clip(np.asarray(fit.values[bound.name], float), bound.low, bound.high)
-    start = jnp.asarray(value, bound.start.dtype)
-    return eqx.tree_at(lambda u: u.start, unknown, start, is_leaf=lambda x: x is None)
-
-
-def _chi2(
-    fit: Retrieval, unknowns: Sequence[BoundUnknown], priors: PriorResiduals, name: str, value: float
-) -> float:
-    """Return chi-squared of a fit with the unknown `name` fixed at `value`, the priors of all included."""
-    # Residuals are those of the data. The prior of the fixed unknown counts as well.
-    flat = np.concatenate(
-        [[value] if u.name == name else np.ravel(np.asarray(fit.values[u.name], float)) for u in unknowns]
-    )
-    return float(np.sum(np.asarray(fit.residuals, float) ** 2) + np.sum(priors(flat)[0] ** 2))

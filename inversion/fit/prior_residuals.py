@@ -45,8 +45,8 @@ class _GaussianProcess:
     def __init__(self, unknown: BoundUnknown, columns: slice):
         assert unknown.smooth is not None
         smooth, self.columns, n_layers = unknown.smooth, columns, unknown.low.size
-        level = float(np.mean(unknown.start)) if smooth.mean is None else np.asarray(smooth.mean, float)
-        self.mean = np.broadcast_to(level, unknown.low.shape).ravel()
+        mean = unknown.prior_level if smooth.mean is None else np.asarray(smooth.mean, float)
+        self.mean = np.broadcast_to(mean, unknown.low.shape).ravel()
         self.has_free_strength = smooth.strength is None
         width = float(np.max(unknown.high - unknown.low))
         self.strength_range = (_STRENGTH_RANGE[0] * width, _STRENGTH_RANGE[1] * width)

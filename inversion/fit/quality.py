@@ -7,10 +7,13 @@ fit (`judge_fit`, `judge_fits`), with n the effective number of independent samp
 | --- | --- | --- |
 | convergence | | not converged |
 | misfit | reduced chi-squared above 3, or 1 + 4 sqrt(2 / n) if more | above 10, or 1 + 12 sqrt(2 / n) |
-| undetermined | an unknown has an infinite standard error | |
+| undetermined | the standard error of an unknown is above 0.29 widths of its bounds (uniform in them) | |
 | bound | an unknown without a smoothness prior lies at a bound | |
 | prior | the share of the prior in an unknown without a smoothness prior is above a half | |
-| second minimum | another minimum within 4 in chi-squared, counted as independent samples | |
+| second minimum | a start ended elsewhere within 4 in chi-squared, counted as independent samples | |
+
+Misfit below these limits is named if another check has failed and reduced chi-squared is above 1 + 4 sqrt(2 /
+n): it may be the cause.
 
 The checks of a record before any fit (`judge_record`), with s the standard deviation of the noise:
 
@@ -43,6 +46,8 @@ _GOOD, _DOUBTFUL, _BAD = _QUALITIES
 # few samples.
 _CHI2_LIMITS, _CHI2_SIGMAS = (3.0, 10.0), (4.0, 12.0)
 _MAX_PRIOR_FRACTION, _MIN_SECOND_MINIMUM = 0.5, 4.0
+# Standard deviation of a uniform distribution, in widths: data that leave more say less than the bounds.
+_UNIFORM_SIGMA = 12.0**-0.5
 # Thresholds of a record: see the table.
 _SIGNAL_TO_NOISE, _CLIPPED_SAMPLES, _DEAD_SIGMAS, _UNEVEN_RATIO = (10.0, 6.0), 3, 6.0, 1.7
 _CUT_OFF_SIGMAS, _CUT_OFF_FRACTIONS = 4.0, (0.01, 0.1)
@@ -83,6 +88,8 @@ class JudgedFit(Protocol):
     def values(self) -> Mapping[str, Any]: ...
     @property
     def stderr(self) -> Mapping[str, Any]: ...
+    @property
+    def bounds(self) -> Mapping[str, Any]: ...
     @property
     def at_bound(self) -> Mapping[str, Any]: ...
     @property
@@ -179,12 +186,14 @@ def _judge(fit: JudgedFit, about: Sequence[str] | None, index: Any) -> Verdict:
         failures.append((_BAD, "not converged"))
     chi2, n_samples = scalar(fit.reduced_chi2), max(scalar(fit.independent_samples), 1.0)
     # The standard deviation of reduced chi-squared is sqrt(2 / n).
-    limits = [max(c, 1.0 + k * np.sqrt(2.0 / n_samples)) for c, k in zip(_CHI2_LIMITS, _CHI2_SIGMAS)]
+    scatter = [1.0 + k * np.sqrt(2.0 / n_samples) for k in _CHI2_SIGMAS]
+    limits = np.maximum(_CHI2_LIMITS, scatter)
+    misfit = f"misfit: reduced chi-squared {chi2:.3g}"
     # Written so that NaN fails.
     if not chi2 <= limits[0]:
-        quality = _DOUBTFUL if chi2 <= limits[1] else _BAD
-        failures.append((quality, f"misfit: reduced chi-squared {chi2:.3g}"))
-    if undetermined := failing(fit.stderr, np.isinf):
+        failures.append((_DOUBTFUL if chi2 <= limits[1] else _BAD, misfit))
+    relative_stderr = {n: fit.stderr[n] / np.diff(np.asarray(fit.bounds[n], float), axis=0)[0] for n in names}
+    if undetermined := failing(relative_stderr, lambda s: s > _UNIFORM_SIGMA):
         failures.append((_DOUBTFUL, f"undetermined: {undetermined}"))
     # Layers without plants lie at their bound, and smoothness priors fill in layers: both are as intended.
     has_smooth_prior = set(fit.strength)
@@ -195,6 +204,9 @@ def _judge(fit: JudgedFit, about: Sequence[str] | None, index: Any) -> Verdict:
         failures.append((_DOUBTFUL, f"from the prior: {from_prior}"))
     if (rise := scalar(fit.second_minimum)) < _MIN_SECOND_MINIMUM:
         failures.append((_DOUBTFUL, f"second minimum: {rise:.2g} above in chi-squared"))
+    is_named = any(reason == misfit for _, reason in failures)
+    if failures and not is_named and chi2 > scatter[0]:
+        failures.append((_DOUBTFUL, misfit))
     return _worst_of(failures)
 
 

@@ -25,7 +25,8 @@ class Retrieval(AbstractPosterior):
     """The result of `retrieve`: values of the unknowns, their standard errors, and the fitted scene.
 
     Unknowns are in their natural units, keyed by name. The rows of `covariance` and `correlation` are the
-    flattened unknowns in the order given, named by `labels`. `print(fit)` shows a summary.
+    flattened unknowns in the order given, named by `labels`. `print(fit)` shows a summary: values, standard
+    errors and robust ones, reduced chi-squared and status.
 
     - `values`: best values.
     - `stderr`: one standard error each, of the same shapes; infinite for unknowns that neither
@@ -45,9 +46,9 @@ class Retrieval(AbstractPosterior):
     - `residuals`: (wavelengths, bins) observed minus fitted, whitened (for independent errors: over the
       standard deviation); zero for samples that were left out.
     - `reduced_chi2`: sum of squared residuals over the number of samples less that of determined unknowns.
-    - `second_minimum`: rise of chi-squared from the best minimum to the next one elsewhere, times
-      `independent_samples` over the number of samples, over `reduced_chi2` if that exceeds one; infinite if
-      no start ended in another one.
+    - `second_minimum`: rise of chi-squared from the best minimum to the next one elsewhere, less two standard
+      errors of the simulation's noise, times `independent_samples` over the number of samples, over
+      `reduced_chi2` if that exceeds one; infinite if no start ended elsewhere.
     - `independent_samples`: effective number of independent samples among those fitted, whose residuals are
       correlated.
     - `averaging`: (n, n) averaging kernel, d estimate / d truth: see `averaging_kernel`.
@@ -113,6 +114,7 @@ class Retrieval(AbstractPosterior):
         width = max(map(len, self.values))
         rows = [
             f"{name.ljust(width)}  {short_text(value)} +- {short_text(self.stderr[name])}"
+            f" (robust {short_text(self.robust_stderr[name])})"
             for name, value in self.values.items()
         ]
         return "\n".join([*rows, f"reduced chi2 {float(self.reduced_chi2):.3g}; {self.status}"])

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +10,7 @@ import optimistix as optx
 from jaxtyping import ArrayLike, PRNGKeyArray
 
 from inversion.fit.data import ObservedWaveform, as_observed, with_fixed_window
-from inversion.fit.fit_summary import Step
+from inversion.fit.fit_summary import CompletedFit, Step
 from inversion.fit.model import ForwardModel
 from inversion.fit.planning import checked_plan, trace_sizes
 from inversion.fit.recorder_model import RecorderModel, check_names
@@ -111,9 +111,10 @@ def retrieve(
     - `n_rays`: rays of the footprint of one simulation, all eight batches together, at least 8. Default None:
       8192, or those of `plan`.
     - `max_orders`: orders of scattering. Default None: chosen by the albedos of the starting scene.
-    - `solver`: a Gauss-Newton method of optimistix. Default: Levenberg-Marquardt. A fit also ends if a
-      Gauss-Newton step would be below 0.05 standard errors, or if small steps no longer improve it. With
-      a `Smooth` prior, only the default is admissible: steps are then solved within the bounds.
+    - `solver`: a Gauss-Newton method of optimistix, whose steps are projected onto the bounds. Default:
+      Levenberg-Marquardt. A fit also ends if a Gauss-Newton step within the bounds would be below 0.05
+      standard errors, or if small steps no longer improve it. With a `Smooth` prior, only the default is
+      admissible: steps are then solved within the bounds.
     - `max_steps`: most simulations, each with its Jacobian, from each start; no more than half of them are
       with few photons. Default 50.
     - `starts`: number of starting points; the best fit is returned. The first is that of the unknowns
@@ -123,9 +124,9 @@ def retrieve(
       from its least-squares value. Default None: no such unknown.
     - `recorder`: what the recorder adds, a `Recorder`: its receiver's response, offsets of its digitisers,
       and the noise of the recorded pulse. Default None: nothing.
-    - `noise_floor`: fraction of each wavelength's largest observed value, 0 to 1, that replaces any smaller
-      `noise`: a record without noise would give bins that no photon reached, where the simulation's standard
-      error is zero, infinite weight. Default 1e-3.
+    - `noise_floor`: fraction of each wavelength's largest observed value (with offsets of a `recorder`, above
+      the median), 0 to 1, that replaces any smaller `noise`: a record without noise would give bins that no
+      photon reached, where the simulation's standard error is zero, infinite weight. Default 1e-3.
     - `progress`: called with a `Step` after every trial, with few photons or all, and again when a descent
       starts anew, with new weights or strengths of priors; for instance `print`.
     - `throw`: raise RuntimeError if the fit does not converge. Default False: only `Retrieval.status` says
@@ -193,25 +194,34 @@ def checked_problem(
     check_kinds(lidar, scene)
     settings = solver_settings(solver, max_steps, starts)
     lidar = with_fixed_window(lidar)
-    observation = as_observed(observed, time, noise, noise_floor, lidar)
+    check_kind("recorder", recorder, Recorder | None, "a Recorder, or None")
+    has_offset = recorder is not None and recorder.offset is not None
+    observation = as_observed(observed, time, noise, noise_floor, lidar, has_offset=has_offset)
     bound_unknowns = bind_unknowns(unknowns, scene)
     check_solver_for(bound_unknowns, settings)
-    check_kind("recorder", recorder, Recorder | None, "a Recorder, or None")
     check_names(recorder, bound_unknowns)
     # A list of none or one, as the recorder appends it to its own unknowns.
     scale_unknowns = [] if scale is None else [scale_unknown(scale, bound_unknowns)]
     return FitProblem(observation, lidar, scene, bound_unknowns, scale_unknowns, recorder, settings)
 
 
-def solve_problem(
+class FittedProblem(NamedTuple):
+    """The fit of one waveform, with the models of scene and recorder that it used."""
+
+    fit: CompletedFit
+    model: ForwardModel
+    recorder: RecorderModel
+
+
+def fit_problem(
     problem: FitProblem,
     plan: Plan,
     key: PRNGKeyArray,
     *,
     progress: Callable[[Step], None] | None = None,
     throw: bool = False,
-) -> Retrieval:
-    """Fit one waveform: `retrieve` with checked arguments."""
+) -> FittedProblem:
+    """Fit one waveform. **Raises:** RuntimeError with `throw`, if the fit does not converge."""
     model = ForwardModel(problem.lidar, problem.scene, plan, problem.unknowns, key)
     recorder = RecorderModel(problem.recorder, problem.scale, problem.lidar, problem.observed.time.size)
     fits = fits_from_starts(
@@ -225,6 +235,19 @@ def solve_problem(
     # Failure is a status of the result; it is raised only here, on request.
     if throw and not fit.summary.converged:
         raise RuntimeError(fit.summary.status)
+    return FittedProblem(fit, model, recorder)
+
+
+def solve_problem(
+    problem: FitProblem,
+    plan: Plan,
+    key: PRNGKeyArray,
+    *,
+    progress: Callable[[Step], None] | None = None,
+    throw: bool = False,
+) -> Retrieval:
+    """Fit one waveform: `retrieve` with checked arguments."""
+    fit, model, recorder = fit_problem(problem, plan, key, progress=progress, throw=throw)
     # The recorder's unknowns come last, and are none of the scene's.
     scene_values = fit.summary.values[: fit.summary.values.size - recorder.count]
     waveform = model.waveform(scene_values, fit.details.evaluation, fit.details.waveform_stderr)

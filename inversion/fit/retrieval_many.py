@@ -184,14 +184,17 @@ def retrieve_many(
     bound = [bind_unknowns(unknowns, s) for s in scenes]
     bound = _with_starts(bound, {} if start is None else start, n_footprints)
     check_solver_for(bound[0], settings)
-    observations = [
-        as_observed(y[i], time, sigma[i], noise_floor, _of_footprint(lidars, i)) for i in range(n_footprints)
-    ]
-    sample_times = observations[0].time
-    scale_unknowns = [] if scale is None else [scale_unknown(scale, bound[0])]
     recorders: list[Recorder | None] = (
         [None] if recorder is None else _one_or_each("recorder", recorder, Recorder, n_footprints)
     )
+    # Recorders of all footprints have the same unknowns.
+    has_offset = recorders[0] is not None and recorders[0].offset is not None
+    observations = [
+        as_observed(y[i], time, sigma[i], noise_floor, _of_footprint(lidars, i), has_offset=has_offset)
+        for i in range(n_footprints)
+    ]
+    sample_times = observations[0].time
+    scale_unknowns = [] if scale is None else [scale_unknown(scale, bound[0])]
     check_names(recorders[0], bound[0])
     of_recorder = [] if recorders[0] is None else recorder_unknowns(recorders[0])
     # Names, shapes and bounds are those of all footprints.
@@ -523,7 +526,7 @@ class LockstepModel:
                 reflectance[n],
                 np.moveaxis(columns[n][model.order], 0, -1),
                 None,
-                batches[n][: n_batches[n]] if model.inputs.plan.is_random else None,
+                batches[n][: n_batches[n]],
                 n_batches[n] < len(model.keys),
             )
             for n, i in enumerate(group)

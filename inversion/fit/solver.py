@@ -20,16 +20,26 @@ evaluation, are accurate enough. The fit descends with them until a step is belo
 on with all batches. Estimates, covariances and chi-squared come from all batches (variable sample size:
 Pasupathy 2010, Oper. Res. 58, 889).
 
-**Steps.** Without smoothness priors, a Gauss-Newton method of optimistix (Levenberg-Marquardt by default)
-takes steps in the unconstrained parameters z of the bounded unknowns (`bounded_logistic`), with the Jacobian
-J dx/dz. With smoothness priors, layers without plants lie at their lower bound, many at a time, and come off
-it as others change. In z each of them would run away for many steps. Every step then solves the linearised
-problem within the bounds in natural units (bounded-variable least squares; Stark and Parker 1995, Comput.
-Stat. 10, 129) and is cut to a quarter until it improves the fit.
+**Steps.** Steps are taken in natural units, scaled to the widths of the bounds. A bijection of the bounded
+unknowns onto unbounded ones would be flat at the bounds: a fit that came near one would hardly leave it
+again, and small steps there are no sign of a minimum.
+
+Without smoothness priors, a Gauss-Newton method of optimistix (Levenberg-Marquardt by default) proposes
+steps. A step that leaves the bounds, or a box about the present values (trust region), is replaced by the
+minimum of the linearised problem within both: bounded-variable least squares (Stark and Parker 1995, Comput.
+Stat. 10, 129). A mere projection need not improve the fit if unknowns are correlated. The box shrinks to a
+quarter of a rejected step, and grows fourfold with an accepted one.
+
+With smoothness priors, layers without plants lie at their lower bound, many at a time, and come off it as
+others change. Every step is then that minimum within the bounds, and is cut to a quarter until it improves
+the fit.
 
 **Stopping rule.** A fit has converged when a Gauss-Newton step would lower chi-squared by less than 0.05^2
 (the Newton decrement, a length in standard errors, is below 0.05), or below a larger limit after rejected
-steps: see `_STALL_LIMITS`. The termination of optimistix's method counts as well.
+steps: see `_STALL_LIMITS`. After rejected steps, 0.05 standard errors are those that include misfit. The
+decrement is that of the unknowns that no bound holds. The termination of optimistix's method, which sees
+small steps, counts as many rejected ones. If the decrement is larger, the steps are small because rejected
+ones have raised the damping, and the method starts afresh.
 
 **Fits as generators.** A fit yields the values at which it needs a simulation and is sent the evaluation. The
 same code serves a single fit and many fits whose simulations run in one compiled call.
@@ -67,8 +77,6 @@ from inversion.fit.uncertainty import (
 from inversion.fit.unknowns import (
     MARGIN,
     BoundUnknown,
-    bounded_logistic,
-    bounded_logit,
     flat_bounds,
     flat_labels,
     flat_start,
@@ -82,9 +90,8 @@ _SMALL_STEP = 0.05
 _STALL_LIMITS = ((1, 0.3), (3, 0.6), (8, 1.0))
 # The same for pilot evaluations, whose noise hides smaller steps; the fit then goes on with all batches.
 _PILOT_SMALL_STEP, _PILOT_STALL_LIMITS = 1.0, ((1, 2.0), (3, 5.0))
-# Largest change of an unconstrained parameter in one step: far out the logistic function is flat, and a fit
-# would be stuck.
-_MAX_FREE_STEP = 2.0
+# Largest change of an unknown in one step, in widths of its bounds: the simulation is linear only nearby.
+_MAX_STEP = 0.4
 # At the solution the weights are renewed if they differ from those of the start by more than this, in the
 # mean.
 _MAX_WEIGHT_CHANGE = 0.05
@@ -92,9 +99,12 @@ _MAX_WEIGHT_CHANGE = 0.05
 _AT_BOUND = 1e-3
 # Strengths of smoothness priors are final once none changes by more than this fraction; most updates of them.
 _STRENGTH_TOLERANCE, _MAX_STRENGTH_UPDATES = 0.1, 12
-# Values in the bounded Gauss-Newton method keep off their bounds by this fraction of the bounds' width, where
-# the logit is finite.
-_BOUND_MARGIN = 1e-5
+# Values of a fit keep off their bounds by this fraction of the bounds' width: a log-normal prior has no
+# logarithm of zero, and an extinction of zero has no score.
+_BOUND_MARGIN = 1e-6
+# An unknown closer to the end of its range than this fraction of the bounds' width is at it: steps are
+# rounded to single precision.
+_END_OF_RANGE = 1e-6
 # Factor of a step that does not improve the fit.
 _STEP_CUT = 0.25
 # Added to the diagonal of the information, as a fraction of its trace: undetermined unknowns stay where they
@@ -204,7 +214,7 @@ def bounded_step(
 class Iterate:
     """A simulated point of a fit.
 
-    - `z`, `values`, `slope`: unconstrained parameters, values, and derivative of the values in z.
+    - `values`: of the unknowns.
     - `recorder_values`: the last of the values, those of the recorder's unknowns.
     - `evaluation`: the simulation.
     - `difference`, `jacobian`: simulated minus observed, of the fitted samples, and its Jacobian in natural
@@ -212,9 +222,8 @@ class Iterate:
     - `is_finite`: True if both are finite.
     """
 
-    def __init__(self, fit: "LeastSquaresFit", z: np.ndarray, evaluation: Evaluation):
-        self.z, self.evaluation = z, evaluation
-        self.values, self.slope = bounded_logistic(z, fit.low, fit.high)
+    def __init__(self, fit: "LeastSquaresFit", values: np.ndarray, evaluation: Evaluation):
+        self.values, self.evaluation = values, evaluation
         self.recorder_values = self.values[fit.n_scene :]
         recorded = fit.recorder_model(evaluation.reflectance, evaluation.jacobian, self.recorder_values)
         self.difference = (recorded.reflectance - fit.observed.reflectance)[fit.is_fitted]
@@ -231,7 +240,7 @@ class Descent(NamedTuple):
 
 
 class LeastSquaresFit:
-    """A running fit. Vectors are the flattened unknowns, in natural units unless named z.
+    """A running fit. Vectors are the flattened unknowns, in natural units unless said otherwise.
 
     - `start`: starting values. Default None: those of the unknowns.
 
@@ -252,6 +261,10 @@ class LeastSquaresFit:
         self.unknowns = [*scene_unknowns, *recorder_model.unknowns]
         self.settings, self.progress = settings, progress
         self.low, self.high = flat_bounds(self.unknowns)
+        self.width = self.high - self.low
+        # Range of the values of the fit.
+        self.lowest = self.low + _BOUND_MARGIN * self.width
+        self.highest = self.high - _BOUND_MARGIN * self.width
         self.n_scene = self.low.size - recorder_model.count
         self.start = flat_start(self.unknowns) if start is None else start
         self.prior = PriorResiduals(self.unknowns)
@@ -264,12 +277,12 @@ class LeastSquaresFit:
     # -- objective
 
     def simulate(
-        self, z: np.ndarray, *, with_batches: bool = False
+        self, values: np.ndarray, *, with_batches: bool = False
     ) -> Generator[EvaluationRequest, Evaluation, Iterate]:
-        """Request a simulation at the unconstrained parameters `z`."""
-        values = bounded_logistic(z, self.low, self.high)[0]
+        """Request a simulation at these values, or at the end of their range if they are beyond."""
+        values = np.clip(values, self.lowest, self.highest)
         evaluation = yield EvaluationRequest(values[: self.n_scene], with_batches, self.use_pilot)
-        return Iterate(self, z, evaluation)
+        return Iterate(self, values, evaluation)
 
     def residuals(self, iterate: Iterate) -> tuple[np.ndarray, np.ndarray]:
         """Return whitened residuals, of data and then priors, and their Jacobian in natural units."""
@@ -328,17 +341,16 @@ class LeastSquaresFit:
         # If all unknowns are optical, steps apply optics to the mean response alone. Weights and covariances
         # need the batches: they are evaluated from the same photons, which does not count as a simulation.
         if converged and best.evaluation.batches is None:
-            best = yield from self.simulate(best.z, with_batches=True)
+            best = yield from self.simulate(best.values, with_batches=True)
         weights_changed = converged and self.update_weights(best) > _MAX_WEIGHT_CHANGE
         if weights_changed and self.n_simulations < self.settings.max_steps:
             best, converged, status = yield from self._minimise(best)
             if best.evaluation.batches is None:
-                best = yield from self.simulate(best.z, with_batches=True)
+                best = yield from self.simulate(best.values, with_batches=True)
         return self._completed(best, converged, status)
 
     def _first_iterate(self) -> Generator[EvaluationRequest, Evaluation, Iterate]:
-        z = bounded_logit(self.start, self.low, self.high)
-        iterate = yield from self.simulate(z, with_batches=True)
+        iterate = yield from self.simulate(self.start, with_batches=True)
         if self.recorder_model.count and iterate.is_finite:
             # The record is linear in offset and scale: a start far off would lead the other unknowns astray.
             recorder_values = self.recorder_model.fit_linear(
@@ -347,15 +359,15 @@ class LeastSquaresFit:
                 self.observed.reflectance,
                 self.observed.sigma,
             )
-            start = np.append(self.start[: self.n_scene], recorder_values)
-            iterate = Iterate(self, bounded_logit(start, self.low, self.high), iterate.evaluation)
+            start = np.append(iterate.values[: self.n_scene], recorder_values)
+            iterate = Iterate(self, start, iterate.evaluation)
         return iterate
 
     def _minimise_with_pilot(self, best: Iterate) -> Generator[EvaluationRequest, Evaluation, Iterate]:
         """Minimise as far as pilot evaluations are accurate, and simulate there with all batches."""
         best, _, _ = yield from self._minimise(best)
         self.use_pilot = False
-        best = yield from self.simulate(best.z, with_batches=True)
+        best = yield from self.simulate(best.values, with_batches=True)
         self.n_simulations += 1
         if best.is_finite:
             self.update_weights(best)
@@ -382,63 +394,114 @@ class LeastSquaresFit:
         return Descent(best, False, self._status(status))
 
     def _gauss_newton(self, best: Iterate) -> Generator[EvaluationRequest, Evaluation, Descent]:
-        """Descend in the unconstrained parameters with a Gauss-Newton method of optimistix, from `best`.
+        """Descend with steps of a Gauss-Newton method of optimistix, kept within the bounds, from `best`.
+
+        Its parameters y are the distances from the start of the descent, in widths of the bounds.
 
         1. Give the solver residual and Jacobian at the trial; it accepts the trial or goes back to `best`.
-        2. Stop if the Newton decrement at the best iterate is small, by the solver's own rule, or at
-           max_steps.
-        3. Simulate at the solver's next trial, at most 2 away in each parameter.
+        2. Stop if the Newton decrement at the best iterate is small, by the solver's own rule, if many steps
+           in a row were rejected, or at max_steps.
+        3. Simulate at the solver's next trial, or at the minimum of the linearised problem within bounds and
+           trust region if the trial is beyond them.
         """
-        trial, state, y = best, None, jnp.asarray(best.z)
-        decrement, n_rejected = np.inf, 0
+        origin, trial, state, step_limit = best.values, best, None, _MAX_STEP
+        # Distances rather than values: in single precision, values far below the width would be rounded.
+        y = y_trial = jnp.zeros(origin.size)
+        y_range = [jnp.asarray((end - origin) / self.width, y.dtype) for end in (self.lowest, self.highest)]
+        decrement, n_rejected, best_residual, best_jacobian = np.inf, 0, np.zeros(0), np.zeros(0)
         while True:
             residual, jacobian = self.residuals(trial)
-            jacobian = jacobian * trial.slope
             if not trial.is_finite:
                 residual, jacobian = np.full_like(residual, _REJECTED_RESIDUAL), np.zeros_like(jacobian)
-            args = tuple(jnp.asarray(a, y.dtype) for a in (trial.z, residual, jacobian))
+            args = tuple(jnp.asarray(a, y.dtype) for a in (y_trial, residual, jacobian * self.width))
             if state is None:
                 state = _initial_state(self.settings.solver, y, args)
             y, state, terminated, successful = _advance(self.settings.solver, y, args, state)
             # An accepted trial is the solver's new point, bit by bit.
             accepted = bool(jnp.all(y == args[0])) and trial.is_finite
             if accepted:
-                free_columns = jacobian[:, self._is_inactive(trial, residual, jacobian)]
-                best, decrement, n_rejected = trial, newton_decrement(free_columns, residual), 0
+                best, best_residual, best_jacobian, n_rejected = trial, residual, jacobian, 0
+                is_held = self._is_held(best.values, residual, jacobian)
+                decrement = newton_decrement(jacobian[:, ~is_held], residual)
+                step_limit = min(_MAX_STEP, step_limit / _STEP_CUT)
             else:
                 n_rejected += 1
+                step_limit = _STEP_CUT * float(jnp.max(jnp.abs(y_trial - y)))
             self._report(trial, accepted)
-            if bool(terminated) or self._has_converged(decrement, n_rejected):
+            # The solver's termination sees that steps are small, as many rejected steps do.
+            n_without_progress = (
+                max(n_rejected, self._stall_limits[-1][0]) if bool(terminated) else n_rejected
+            )
+            if self._has_converged(decrement, n_without_progress, best_residual):
                 return Descent(best, True, self._status("converged"))
             if not bool(successful):
                 status = "failed: the equations for the next step could not be solved"
                 return Descent(best, False, self._status(status))
+            # As for bounded steps: no sign of a minimum.
+            if n_rejected > _STALL_LIMITS[-1][0]:
+                return Descent(best, False, self._status("failed: no step improves the fit"))
             if self._is_exhausted:
                 return Descent(best, False, self._status("not converged: stopped at max_steps"))
-            # Cut within the solver's state: the solver predicts the fall of the cost from the trial itself,
-            # and so judges the shorter step by the right number.
-            step = jnp.clip(state.y_eval - y, -_MAX_FREE_STEP, _MAX_FREE_STEP)
-            state = eqx.tree_at(lambda s: s.y_eval, state, y + step)
-            trial = yield from self.simulate(np.asarray(state.y_eval, float))
+            if bool(terminated):
+                # Small steps, and yet no minimum: rejected ones have raised the damping.
+                state = _initial_state(self.settings.solver, y, args)
+                y, state, _, _ = _advance(self.settings.solver, y, args, state)
+                step_limit = _MAX_STEP
+            # Changed within the solver's state: the solver predicts the fall of the cost from the trial
+            # itself, and so judges the shorter step by the right number.
+            step = self.width * np.asarray(state.y_eval - y, float)
+            step = self._step_within(step, best.values, best_residual, best_jacobian, step_limit)
+            y_trial = jnp.clip(y + jnp.asarray(step / self.width, y.dtype), *y_range)
+            state = eqx.tree_at(lambda s: s.y_eval, state, y_trial)
+            trial = yield from self.simulate(origin + self.width * np.asarray(y_trial, float))
             self.n_simulations += 1
 
+    def _step_within(
+        self,
+        step: np.ndarray,
+        values: np.ndarray,
+        residual: np.ndarray,
+        jacobian: np.ndarray,
+        step_limit: float,
+    ) -> np.ndarray:
+        """Return a step if it keeps within bounds and trust region, else the bounded step within both.
+
+        `step_limit`: half of the trust region, in widths of the bounds.
+        """
+        low = np.maximum(self.lowest - values, -step_limit * self.width)
+        high = np.minimum(self.highest - values, step_limit * self.width)
+        if np.all((step >= low) & (step <= high)):
+            return step
+        # A damping of one width, as Levenberg-Marquardt has at first, holds unknowns that the data do not
+        # determine.
+        jacobian = np.concatenate([jacobian, np.diag(1.0 / self.width)])
+        return bounded_step(jacobian, np.append(residual, np.zeros(values.size)), low, high)[0]
+
+    def _is_held(self, values: np.ndarray, residual: np.ndarray, jacobian: np.ndarray) -> np.ndarray:
+        """Return True for unknowns at a bound that the minimum within the bounds has there as well."""
+        end = _END_OF_RANGE * self.width
+        is_at_end = (values < self.lowest + end) | (values > self.highest - end)
+        if not np.any(is_at_end):
+            return is_at_end
+        step, _ = bounded_step(jacobian, residual, self.lowest - values, self.highest - values)
+        return is_at_end & (np.abs(step) < end)
+
     def _bounded_gauss_newton(self, best: Iterate) -> Generator[EvaluationRequest, Evaluation, Descent]:
-        """Descend in natural units with steps that are solved within the bounds, from `best`.
+        """Descend with steps that are solved within the bounds, from `best`.
 
         1. Solve the linearised problem within the bounds: a step and its length in standard errors.
         2. Stop if the length is small, or at max_steps.
         3. Simulate after the step; cut it to a quarter until it improves the fit.
         """
-        margin = _BOUND_MARGIN * (self.high - self.low)
-        low, high = self.low + margin, self.high - margin
         self._report(best, True)
         while True:
             residual, jacobian = self.residuals(best)
-            values = np.clip(best.values, low, high)
-            step, length = bounded_step(jacobian, residual, low - values, high - values)
+            step, length = bounded_step(
+                jacobian, residual, self.lowest - best.values, self.highest - best.values
+            )
             fraction, n_rejected, accepted = 1.0, 0, False
             while not accepted:
-                if self._has_converged(length, n_rejected):
+                if self._has_converged(length, n_rejected, residual):
                     return Descent(best, True, self._status("converged"))
                 # A step that promises more than the noise of the simulation explains, while not even a tiny
                 # part of it improves the fit, is no sign of a minimum: the Jacobian is wrong.
@@ -446,8 +509,7 @@ class LeastSquaresFit:
                     return Descent(best, False, self._status("failed: no step improves the fit"))
                 if self._is_exhausted:
                     return Descent(best, False, self._status("not converged: stopped at max_steps"))
-                z = bounded_logit(values + fraction * step, self.low, self.high)
-                trial = yield from self.simulate(z)
+                trial = yield from self.simulate(best.values + fraction * step)
                 self.n_simulations += 1
                 accepted = trial.is_finite and self.cost(trial) < float(residual @ residual)
                 self._report(trial, accepted)
@@ -460,30 +522,28 @@ class LeastSquaresFit:
     def _stall_limits(self) -> tuple[tuple[int, float], ...]:
         return _PILOT_STALL_LIMITS if self.use_pilot else _STALL_LIMITS
 
-    def _has_converged(self, length: float, n_rejected: int) -> bool:
-        """Return True for a step of this length, in standard errors, after so many rejected steps."""
-        if length < (_PILOT_SMALL_STEP if self.use_pilot else _SMALL_STEP):
+    def _has_converged(self, length: float, n_rejected: int, residual: np.ndarray) -> bool:
+        """Return True for a step of this length, in standard errors, after so many rejected steps.
+
+        `residual`: at the point that the step starts from.
+        """
+        small_step = _PILOT_SMALL_STEP if self.use_pilot else _SMALL_STEP
+        if length < small_step:
             return True
-        return any(n_rejected >= n and length < limit for n, limit in self._stall_limits)
+        # With misfit, errors are larger than the stated ones. Not before a step was rejected: far from the
+        # solution, where residuals are large, short steps may lead to it.
+        degrees_of_freedom = max(residual.size - 2 * self.low.size, 1)
+        relative_misfit = np.sqrt(max(float(residual @ residual) / degrees_of_freedom, 1.0))
+        return any(
+            n_rejected >= n and length < max(limit, small_step * relative_misfit)
+            for n, limit in self._stall_limits
+        )
 
     @property
     def _is_exhausted(self) -> bool:
         """True if no simulation is left; pilot evaluations get half of them."""
         max_steps = self.settings.max_steps
         return self.n_simulations >= (max_steps // 2 if self.use_pilot else max_steps)
-
-    def _is_inactive(self, iterate: Iterate, residual: np.ndarray, jacobian: np.ndarray) -> np.ndarray:
-        """Return True for unknowns whose bounds are inactive.
-
-        A bound is active if the unknown is at it and the fit would improve beyond it. In an unconstrained
-        parameter, the step towards a bound never ends; such unknowns do not count in the decrement.
-        """
-        fraction = (iterate.values - self.low) / (self.high - self.low)
-        descent = -(jacobian.T @ residual)
-        at_active_bound = ((fraction < _AT_BOUND) & (descent < 0)) | (
-            (fraction > 1 - _AT_BOUND) & (descent > 0)
-        )
-        return ~at_active_bound
 
     def _status(self, end: str) -> str:
         plural = "s" if self.n_simulations > 1 else ""
@@ -508,7 +568,7 @@ class LeastSquaresFit:
         4. Compute the cost by which fits from several starts are compared.
         """
         is_fitted, evaluation = self.is_fitted, iterate.evaluation
-        deviations = self._whitened_deviations(iterate)
+        deviations = self._deviations(iterate)
         jacobian = np.zeros_like(iterate.jacobian)
         if iterate.is_finite:
             jacobian = self.noise.whiten(iterate.jacobian)
@@ -518,16 +578,16 @@ class LeastSquaresFit:
         estimate = estimate_covariance(
             jacobian,
             precision,
-            self.high - self.low,
+            self.width,
             (measured_sigma / self.noise.sigma_unshared) ** 2,
-            deviations,
+            None if deviations is None else self.noise.whiten(deviations.T).T,
             self.prior.basis,
         )
         stderr = np.sqrt(np.diag(estimate.covariance))
         robust_stderr, independent_samples = self._robust_stderr(
             iterate, stderr, estimate, jacobian, precision
         )
-        fraction = (iterate.values - self.low) / (self.high - self.low)
+        fraction = (iterate.values - self.low) / self.width
         at_low, at_high = fraction < _AT_BOUND, fraction > 1 - _AT_BOUND
         residuals = np.zeros(is_fitted.shape)
         residuals[is_fitted] = -self.noise.whiten(iterate.difference)
@@ -536,7 +596,8 @@ class LeastSquaresFit:
         # Costs of fits from several starts are compared. Without the simulation's noise, they have nearly
         # equal weights: the noise of the pulse is that at each fit's own minimum, and ln det C is left out.
         measurement = self.noise._replace(sigma_unshared=measured_sigma)
-        cost = np.sum(measurement.whiten(iterate.difference) ** 2) + np.sum(prior_residual**2)
+        prior_cost = float(np.sum(prior_residual**2)) + self.prior.log_determinant
+        cost = float(np.sum(measurement.whiten(iterate.difference) ** 2)) + prior_cost
         summary = FitSummary(
             values=iterate.values,
             stderr=stderr,
@@ -558,19 +619,23 @@ class LeastSquaresFit:
             simulation_error=estimate.simulation_error,
             residuals=residuals,
             waveform_stderr=np.asarray(np.broadcast_to(batch_stderr(evaluation.batches), is_fitted.shape)),
-            cost=float(cost) + self.prior.log_determinant if iterate.is_finite else np.inf,
+            cost=cost if iterate.is_finite else np.inf,
+            prior_cost=prior_cost,
+            difference=iterate.difference,
+            deviations=deviations,
+            noise=self.noise,
             history=tuple(self.history),
             evaluation=evaluation,
         )
         return CompletedFit(summary, details)
 
-    def _whitened_deviations(self, iterate: Iterate) -> np.ndarray | None:
-        """Return the whitened deviations of the batches from their mean, (batches, samples), or None."""
+    def _deviations(self, iterate: Iterate) -> np.ndarray | None:
+        """Return the deviations of the batches from their mean, (batches, samples), or None for one batch."""
         batches = iterate.evaluation.batches
-        if batches is None or not iterate.is_finite:
+        if batches is None or len(batches) < 2 or not iterate.is_finite:
             return None
         received = self.recorder_model.received(batches - np.mean(batches, axis=0), iterate.recorder_values)
-        return self.noise.whiten(received[:, self.is_fitted].T).T
+        return received[:, self.is_fitted]
 
     def _notes(self, is_undetermined: np.ndarray, at_low: np.ndarray, at_high: np.ndarray) -> str:
         """Return the end of a status: unknowns that are undetermined or at a bound."""
@@ -600,7 +665,9 @@ class LeastSquaresFit:
         if not iterate.is_finite:
             return stderr, float(iterate.difference.size)
         difference, is_undetermined = iterate.difference, estimate.is_undetermined
-        signal = (difference + self.observed.reflectance[self.is_fitted]) / self.noise.sigma
+        # Offsets of digitisers are no signal.
+        received = self.recorder_model.received(iterate.evaluation.reflectance, iterate.recorder_values)
+        signal = received[self.is_fitted] / self.noise.sigma
         # Effective number of parameters (degrees of freedom for signal): residuals lose less than one degree
         # of freedom to an unknown that its prior holds. Reduced chi-squared counts unknowns instead, as is
         # usual.
@@ -666,8 +733,9 @@ def latin_hypercube(
 def multistart(fits: Sequence[LeastSquaresFit]) -> FitGenerator:
     """Run fits from several starts, one after the other, and return the converged one of the lowest cost.
 
-    Starts that ended at the same minimum are counted, and others compared with it (`compare_minima`). Its
-    steps and history are those of all fits.
+    Starts that ended at the same minimum are counted, and the others compared with it (`compare_minima`), even
+    if they have not converged: a start that came as far with other values is reason to doubt. Its steps and
+    history are those of all fits.
     """
     completed = []
     for fit in fits:
@@ -680,10 +748,9 @@ def multistart(fits: Sequence[LeastSquaresFit]) -> FitGenerator:
     best = min(completed, key=rank)
     if len(fits) == 1:
         return best
-    further_fits = [fit for fit in completed if fit.summary.converged and fit is not best]
+    further_fits = [fit for fit in completed if np.isfinite(fit.details.cost) and fit is not best]
     second_minimum_rise, robust_stderr = compare_minima(best, further_fits)
-    # Within one in chi-squared: the stopping rule leaves less than that.
-    n_same = sum(f.summary.converged and f.details.cost < best.details.cost + 1.0 for f in completed)
+    n_same = sum(f.summary.converged and not ended_elsewhere(f, best) for f in completed)
     summary = dataclasses.replace(
         best.summary,
         steps=sum(fit.summary.steps for fit in completed),
@@ -695,13 +762,22 @@ def multistart(fits: Sequence[LeastSquaresFit]) -> FitGenerator:
     return CompletedFit(summary, dataclasses.replace(best.details, history=history))
 
 
+def ended_elsewhere(fit: CompletedFit, best: CompletedFit) -> bool:
+    """Return True if any unknown differs from that of the best fit by more than two standard errors."""
+    distance = np.abs(fit.summary.values - best.summary.values)
+    return bool(np.any(distance > 2.0 * best.summary.robust_stderr))
+
+
 def compare_minima(best: CompletedFit, further_fits: Sequence[CompletedFit]) -> tuple[float, np.ndarray]:
     """Return the rise in chi-squared to the second minimum, and standard errors with the spread over minima.
 
-    1. The rise of chi-squared from the best fit to fit m counts correlated samples by their effective number,
-       and is in units of the best fit's reduced chi-squared.
-    2. Fit m is in another minimum if an unknown differs by more than two standard errors.
-    3. With the relative likelihood p_m = exp(-rise_m / 2), one for the best fit itself,
+    1. Chi-squared of all fits is that with the noise of the best one, that of its simulation included. Its
+       rise to fit m is lessened by two of the standard errors that it has from the noise of both simulations
+       (`_chi2_with_noise`).
+    2. The rise counts correlated samples by their effective number, and is in units of the best fit's reduced
+       chi-squared.
+    3. Fit m is in another minimum if an unknown differs by more than two standard errors.
+    4. With the relative likelihood p_m = exp(-rise_m / 2), one for the best fit itself,
 
            spread^2 = sum_m p_m (x_m - x_best)^2 / sum_m p_m
 
@@ -711,13 +787,32 @@ def compare_minima(best: CompletedFit, further_fits: Sequence[CompletedFit]) -> 
     # Residuals of samples that are left out are zero.
     n_samples = max(np.count_nonzero(best.details.residuals), 1)
     scale = summary.independent_samples / n_samples / max(summary.reduced_chi2, 1.0)
+    least_chi2, least_variance = _chi2_with_noise(best, best.details.noise)
     second_minimum_rise, weighted_squares, weight = np.inf, np.zeros_like(summary.values), 1.0
     for fit in further_fits:
-        rise = max(fit.details.cost - best.details.cost, 0.0) * scale
-        distance = fit.summary.values - summary.values
-        if np.any(np.abs(distance) > 2.0 * summary.robust_stderr):
+        chi2, variance = _chi2_with_noise(fit, best.details.noise)
+        rise = max(chi2 - least_chi2 - 2.0 * np.sqrt(variance + least_variance), 0.0) * scale
+        if ended_elsewhere(fit, best):
             second_minimum_rise = min(second_minimum_rise, rise)
-        weighted_squares += np.exp(-0.5 * rise) * distance**2
+        weighted_squares += np.exp(-0.5 * rise) * (fit.summary.values - summary.values) ** 2
         weight += np.exp(-0.5 * rise)
     spread = np.sqrt(weighted_squares / weight)
     return float(second_minimum_rise), np.hypot(summary.robust_stderr, spread)
+
+
+def _chi2_with_noise(fit: CompletedFit, noise: SampleNoise) -> tuple[float, float]:
+    """Return chi-squared of a fit, priors included, and its variance from the simulation's noise.
+
+    With whitened residuals r and deviations d_b of n batches from their mean, the noise of the simulation
+    adds sum_b |d_b|^2 / n (n - 1) to |r|^2 in the mean, which is subtracted. The variance is, to first order,
+    4 sum_b (r . d_b)^2 / n (n - 1).
+    """
+    residual = noise.whiten(fit.details.difference)
+    chi2 = float(residual @ residual) + fit.details.prior_cost
+    if fit.details.deviations is None:
+        return chi2, 0.0
+    # Columns are batches.
+    deviations = noise.whiten(fit.details.deviations.T)
+    pairs = deviations.shape[1] * (deviations.shape[1] - 1)
+    mean_excess = float(np.sum(deviations**2)) / pairs
+    return chi2 - mean_excess, 4.0 * float(np.sum((residual @ deviations) ** 2)) / pairs

@@ -28,7 +28,7 @@ sample. The whitened residuals of a fit are taken as a draw from
 
     C_ij = a^2 (delta_ij + k^2 g_i g_j phi^|i - j|),    g_i = s_i / max s,
 
-with s the modelled record in the same units, offsets of digitisers included: white noise of amplitude a, and
+with s the modelled record in the same units, without offsets of digitisers: white noise of amplitude a, and
 an error of the model that is k times as large at the signal's peak, proportional to the signal, first-order
 autoregressive over samples, and independent between wavelengths. Each phi and k of a grid is weighted by the
 restricted likelihood of the residuals (the unknowns are integrated out, which accounts for the degrees of
@@ -241,7 +241,7 @@ def residual_covariance(
     - `residual`, `jacobian`: whitened by the stated noise.
     - `precision`: matrix of the priors, 0 without priors.
     - `n_determined`: effective number of parameters that the data determine (degrees of freedom for signal).
-    - `signal`: modelled record, in standard deviations of the stated noise.
+    - `signal`: modelled record without offsets, in standard deviations of the stated noise.
     - `index`: wavelength and bin of each sample, in row-major order.
 
     **Returns:** the covariance; that of the stated noise for too few degrees of freedom.

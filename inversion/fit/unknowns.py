@@ -1,10 +1,7 @@
 """Unknowns of a retrieval: bounds, priors and starting values, and the way a value enters the scene.
 
-**Bounds.** A bounded value x is a smooth bijection of an unconstrained parameter z,
-
-    x = low + (high - low) / (1 + exp(-z)),   z = ln(x - low) - ln(high - x),
-
-the scaled logistic function and its inverse, the logit. A solver in z never reaches the bounds.
+**Bounds.** A fit moves in the natural units of the unknowns and keeps within their bounds
+(`inversion.fit.solver`).
 
 **Scene.** `bind_unknowns` locates every `Unknown` in a scene and gives a `BoundUnknown`, whose `Setter` puts
 a value into the scene. Setters are hashable and equal for equal unknowns, so that programs compiled for one
@@ -20,7 +17,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
-from scipy import special
 
 from inversion.fit.priors import LogNormal, Smooth
 from jaxlidar import Scene
@@ -28,21 +24,9 @@ from jaxlidar.extend import Converted, as_array, check_kind, check_range
 
 # (mean, standard deviation), or one of the named priors.
 Prior = tuple[Float[Array, "..."], Float[Array, "..."]] | LogNormal | Smooth
-# Least distance of a starting value from its bounds, over the bounds' width: the bijection is flat at the
-# bounds.
+# Least distance of a starting value from its bounds, over the bounds' width: at a bound, such as a
+# reflectance of zero, the waveform may not depend on other unknowns.
 MARGIN = 0.01
-
-
-def bounded_logistic(z: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the bounded value of an unconstrained parameter, and its derivative."""
-    fraction = special.expit(z)
-    # expit(-z) is 1 - fraction without cancellation.
-    return low + (high - low) * fraction, (high - low) * fraction * special.expit(-z)
-
-
-def bounded_logit(value: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Return the unconstrained parameter of a value within its bounds: the inverse of `bounded_logistic`."""
-    return np.log(value - low) - np.log(high - value)
 
 
 def _as_bounds(x: Any) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
@@ -140,7 +124,7 @@ class Unknown(eqx.Module):
         if not np.all(np.asarray(low) < np.asarray(high)):
             raise ValueError(f"{label}: bounds = ({low}, {high}) are not low < high")
         if isinstance(self.prior, LogNormal):
-            # Zero is admissible: the bijection never reaches the bounds.
+            # Zero is admissible: a fit keeps off its bounds.
             check_range(f"{label}: lower bound, with a log-normal prior,", low, 0.0)
         elif isinstance(self.prior, tuple):
             check_range(f"{label}: prior mean", self.prior[0])
@@ -183,6 +167,8 @@ class BoundUnknown(NamedTuple):
 
     - `prior`: mean and standard deviation, of the logarithm if `is_log_prior`; None without such a prior.
     - `smooth`: a smoothness prior, or None.
+    - `smooth_level`: mean of the common level of a smoothness prior without mean. Default None: that of the
+      start.
     """
 
     name: str
@@ -193,6 +179,12 @@ class BoundUnknown(NamedTuple):
     prior: tuple[np.ndarray, np.ndarray] | None
     is_log_prior: bool = False
     smooth: Smooth | None = None
+    smooth_level: float | None = None
+
+    @property
+    def prior_level(self) -> float:
+        """Mean of the common level of a smoothness prior without mean."""
+        return float(np.mean(self.start)) if self.smooth_level is None else self.smooth_level
 
 
 def bind_unknowns(unknowns: Sequence[Unknown], scene: Scene) -> list[BoundUnknown]:

@@ -15,9 +15,8 @@ and a fit of seven traits costs little more than one of two.
 every step that lowers chi^2, and rises by ten with any other.
 
 **Bounds** are kept by projection (Bertsekas 1982): a trait on a bound beyond which the fit would improve is
-held for the step while the others move, and a trait that would leave its bounds is set to the bound. In
-`retrieve`, without smoothness priors, unknowns never reach a bound; here they can, because leaves without
-anthocyanins or brown pigments have their minimum on one.
+held for the step while the others move, and a trait that would leave its bounds is set to the bound. Leaves
+without anthocyanins or brown pigments have their minimum on one.
 
 **Convergence.** A Gauss-Newton step would lower chi^2 by no more than (0.02)^2 times the reduced chi^2: it
 would move the traits by less than 0.02 standard errors.

@@ -3,12 +3,13 @@
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import inversion
 import jaxlidar as jl
-from inversion import LogNormal, Unknown
+from inversion import LogNormal, Recorder, Unknown
 
 LIDAR = jl.Lidar(wavelength=(532.0, 1064.0), pulse=jl.GaussianPulse(fwhm=6.0), divergence=1e-3)
 REFLECTANCE = np.array([0.2, 0.4])
@@ -111,6 +112,55 @@ def test_a_profile_of_a_linear_problem_is_the_standard_error(target):
     low, high = result.interval(0.954)
     assert np.allclose([low, high], [best - 2 * error, best + 2 * error], atol=0.1 * error)
     assert result.others["reflectance"].shape == (9, 2)
+
+
+def test_all_points_of_a_profile_are_weighted_alike():
+    """Noise of the pulse grows with the echo: weighted by its own noise, bright ground would fit best."""
+    lidar, recorder = dataclasses.replace(LIDAR, wavelength=np.array([1064.0])), Recorder(pulse_noise=0.1)
+    scene = jl.Scene(ground=jl.Ground(height=0.1, reflectance=0.4))
+    plan = jl.plan(lidar, scene, window=(-20.0, 20.0))
+    wave = jl.simulate(lidar, scene, key=KEY, plan=plan)
+    unknowns = [HEIGHT, Unknown("ground.reflectance", bounds=(0.05, 0.9), name="brightness")]
+    options = {"noise": 1e-3, "time": wave.time, "key": KEY, "recorder": recorder}
+    fit = inversion.retrieve(wave.reflectance, lidar, scene, unknowns, **options)
+    z = np.linspace(-3.0, 3.0, 7)
+    values = float(fit.values["brightness"]) + float(fit.stderr["brightness"]) * z
+    result = inversion.profile_likelihood(
+        wave.reflectance, lidar, scene, unknowns, "brightness", values, **options
+    )
+    assert np.allclose(result.chi2, z**2, rtol=0.05, atol=0.05)
+
+
+def test_a_profile_does_not_move_smoothness_priors():
+    """A prior without mean is about the mean of the start, not of the neighbour's estimate."""
+    voxels = jl.VoxelMap.from_lad(
+        np.ones((1, 1, 6)), voxel_size=(40.0, 40.0, 2.0), origin=(-20.0, -20.0, -2.0)
+    )
+    canopy = jl.Canopy(voxels, leaf=jl.LeafOptics(0.5, 0.4), hotspot=True, sides="periodic")
+    base = jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=np.array([0.3, 0.3])))
+    truth = inversion.put_profile(base, jnp.array([0.1, 0.2, 0.2, 0.1]))
+    start = jnp.full(4, 1.0)
+    plants = Unknown(
+        apply=inversion.put_profile,
+        name="plants",
+        bounds=(0.0, 2.0),
+        start=start,
+        prior=inversion.Smooth(4.0, spacing=2.0, strength=0.05),
+    )
+    wave = jl.simulate(LIDAR, truth, key=KEY, max_orders=1, window=(-80.0, 20.0), n_rays=8)
+    options = {"noise": 0.01, "time": wave.time, "key": KEY, "max_orders": 1, "n_rays": 8}
+
+    def estimates(first, values):
+        height = Unknown("ground.height", bounds=(-2.0, 2.0), start=first, name="height")
+        scene = inversion.put_profile(base, start)
+        result = inversion.profile_likelihood(
+            wave.reflectance, LIDAR, scene, [height, plants], "height", values, **options
+        )
+        return result.others["plants"]
+
+    after_neighbours = estimates(-0.02, [-0.02, 0.0, 0.02])[-1]
+    first_of_all = estimates(0.02, [0.02, 0.04])[0]
+    np.testing.assert_allclose(after_neighbours, first_of_all, atol=2e-3)
 
 
 def test_an_interval_that_the_values_do_not_close_is_infinite(target):

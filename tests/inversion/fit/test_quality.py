@@ -3,12 +3,17 @@
 import types
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import inversion
 import jaxlidar as jl
 from inversion import Verdict, judge_fit, judge_record
+from inversion.fit.data import ObservedWaveform
+from inversion.fit.model import Evaluation
+from inversion.fit.recorder_model import RecorderModel
+from inversion.fit.solver import DEFAULT_SOLVER, LeastSquaresFit, SolverSettings, multistart, run_fit
 from inversion.fit.uncertainty import (
     SampleIndex,
     _autoregressive_products,
@@ -17,6 +22,7 @@ from inversion.fit.uncertainty import (
     estimate_covariance,
     residual_covariance,
 )
+from inversion.fit.unknowns import BoundUnknown, Setter
 
 BIN = np.arange(600)
 PULSE = np.exp(-0.5 * (np.arange(-40.0, 41.0) / 6.0) ** 2)
@@ -72,6 +78,7 @@ def test_verdicts_join():
 SOUND = types.SimpleNamespace(
     values={"ground": np.array(0.1), "layers": np.zeros(3)},
     stderr={"ground": np.array(0.1), "layers": np.ones(3)},
+    bounds={"ground": np.array([-1.0, 1.0]), "layers": np.stack([np.full(3, -9.0), np.full(3, 9.0)])},
     prior_share={"ground": np.array(0.01), "layers": np.full(3, 0.2)},
     at_bound={"ground": np.array(False), "layers": np.zeros(3, bool)},
     reduced_chi2=np.array(1.2),
@@ -94,6 +101,9 @@ SOUND = types.SimpleNamespace(
         ("good", None, {"reduced_chi2": np.array(3.5), "independent_samples": np.array(5.0)}),
         ("doubtful", "second minimum", {"second_minimum": np.array(3.0)}),
         ("doubtful", "undetermined: layers", {"stderr": {"ground": 0.1, "layers": np.array([1, np.inf, 1])}}),
+        # A uniform distribution over the bounds has a standard deviation of 5.2.
+        ("doubtful", "undetermined: layers", {"stderr": {"ground": 0.1, "layers": np.array([1, 5.3, 1])}}),
+        ("good", None, {"stderr": {"ground": 0.1, "layers": np.array([1, 5.1, 1])}}),
         (
             "doubtful",
             "at a bound: layers",
@@ -112,6 +122,19 @@ def test_checks_of_a_fit(quality, reason, changes):
     assert ground_is_good == (concerns_layers_only or quality == "good")
     with pytest.raises(ValueError, match="about has 'canopy'; admissible are 'ground', 'layers'"):
         judge_fit(fit, about=["canopy"])
+
+
+def test_misfit_is_among_the_reasons_of_a_verdict():
+    """Misfit beyond its scatter, though below its limits, is named beside a failure that it may cause."""
+    at_bound = {"at_bound": {"ground": True, "layers": np.zeros(3, bool)}}
+    for chi2, reasons in (
+        (1.8, ("at a bound: ground",)),
+        (2.0, ("at a bound: ground", "misfit: reduced chi-squared 2")),
+        (11.0, ("misfit: reduced chi-squared 11", "at a bound: ground")),
+    ):
+        fit = types.SimpleNamespace(**{**vars(SOUND), **at_bound, "reduced_chi2": np.array(chi2)})
+        assert judge_fit(fit).reasons == reasons
+    assert judge_fit(types.SimpleNamespace(**{**vars(SOUND), "reduced_chi2": np.array(2.0)})).reasons == ()
 
 
 def test_prior_fraction_is_that_of_the_information():
@@ -226,3 +249,82 @@ def test_one_fit_and_many_give_the_same_evidence():
     assert fit.quality == fits.quality[0] == Verdict("doubtful", ("from the prior: brightness",))
     assert judge_fit(fit, about=["height"]).quality == "good"
     assert "height at bound" in fits.to_xarray()
+
+
+def test_starts_that_end_elsewhere_at_the_same_misfit_are_doubt():
+    """Below a slanting beam, slopes of 10 and 30 degrees broaden the echo alike."""
+    lidar = jl.Lidar(altitude=500.0, divergence=10.0, zenith=20.0, azimuth=90.0)
+
+    def scene(slope):
+        return jl.Scene(ground=jl.Ground(slope=slope, aspect=270.0, reflectance=0.3))
+
+    wave = jl.simulate(lidar, scene(10.0), key=jax.random.key(0), window=(-80.0, 80.0))
+    unknowns = [
+        inversion.Unknown("ground.slope", bounds=(0.0, 50.0), name="slope"),
+        inversion.Unknown("ground.reflectance", bounds=(0.05, 0.9), name="reflectance"),
+    ]
+    options = {"noise": 1e-4, "starts": 3, "key": jax.random.key(1)}
+    fit = inversion.retrieve(wave, lidar, scene(40.0), unknowns, **options)
+    assert fit.converged
+    assert min(abs(float(fit.values["slope"]) - slope) for slope in (10.0, 30.0)) < 0.1
+    assert fit.quality.quality == "doubtful"
+    assert fit.quality.reasons[0].startswith("second minimum")
+    # Starts in the other minimum did not end there.
+    assert "3 of 3" not in fit.status
+    assert fit.robust_stderr["slope"] > 50.0 * fit.stderr["slope"]
+    assert f"(robust {float(fit.robust_stderr['slope']):.4g})" in str(fit)
+
+
+BINS = np.arange(40.0)
+ECHO = np.exp(-0.5 * ((BINS - 20.0) / 4.0) ** 2)
+
+
+def fit_from_two_starts(batch_sigma, max_steps_elsewhere=50):
+    """Fit x in an echo of strength 1 + x^2, which is 2 at x = -1 and 1, with other noise at either sign.
+
+    `max_steps_elsewhere`: of the start that ends at x = -1.
+    """
+    random = np.random.default_rng(3)
+    observed = 2.0 * ECHO + 0.001 * random.normal(size=BINS.size)
+    noise = {sign: 1.0 + batch_sigma * random.normal(size=(8, 1, BINS.size)) for sign in (-1.0, 1.0)}
+
+    def simulate(request):
+        x = float(request.values[0])
+        factors = noise[np.sign(x)]
+        batches = factors * (1.0 + x**2) * ECHO
+        slope = np.mean(factors, axis=0) * 2.0 * x * ECHO
+        return Evaluation(np.mean(batches, axis=0), slope[..., None], None, batches)
+
+    setter, bound = Setter(None, None, "geometric"), np.asarray(2.0)
+    unknown = BoundUnknown("x", setter, jnp.asarray(0.7), -bound, bound, None)
+    observation = ObservedWaveform(BINS, observed[None], np.full((1, BINS.size), 0.001))
+    recorder = RecorderModel(None, [], jl.Lidar(), BINS.size)
+    fits = [
+        LeastSquaresFit(
+            observation,
+            [unknown],
+            recorder,
+            SolverSettings(DEFAULT_SOLVER, steps, 2),
+            start=np.array([start]),
+        )
+        for start, steps in ((0.7, 50), (-0.7, max_steps_elsewhere))
+    ]
+    return run_fit(multistart(fits), simulate).summary
+
+
+def test_noise_of_the_simulation_is_no_difference_between_minima():
+    """Both minima are equally good, though their chi-squared by the measurement's noise alone differs."""
+    summary = fit_from_two_starts(batch_sigma=0.03)
+    assert summary.converged
+    assert summary.second_minimum < 4.0
+    assert "1 of 2 starts ended there" in summary.status
+    assert summary.robust_stderr[0] > 1.0
+    # Without noise of the simulation as well.
+    assert fit_from_two_starts(batch_sigma=0.0).second_minimum < 4.0
+
+
+def test_a_start_that_has_not_converged_elsewhere_is_doubt():
+    summary = fit_from_two_starts(batch_sigma=0.03, max_steps_elsewhere=4)
+    assert summary.converged
+    assert "1 of 2 starts ended there" in summary.status
+    assert summary.second_minimum < 4.0

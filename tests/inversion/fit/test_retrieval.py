@@ -16,7 +16,7 @@ from inversion.fit.model import ForwardModel
 from inversion.fit.planning import TraceSizes, corner_scenes, plan_for_bounds
 from inversion.fit.solver import latin_hypercube
 from inversion.fit.uncertainty import estimate_covariance
-from inversion.fit.unknowns import bind_unknowns, bounded_logistic, bounded_logit, optical_arrays
+from inversion.fit.unknowns import bind_unknowns, optical_arrays
 from jaxlidar.planning.plan import MIN_BATCHES
 from tests.helpers import BY_PRECISION
 
@@ -357,13 +357,13 @@ def test_starts_and_photons_have_different_keys(monkeypatch):
         return latin_hypercube(unknowns, count, key)
 
     monkeypatch.setattr("inversion.fit.solver.latin_hypercube", record_key)
-    wave = jl.simulate(LIDAR, ground_scene(), key=jax.random.key(5))
+    wave = jl.simulate(PLAIN, ground_scene(), key=jax.random.key(5))
     unknown = Unknown(lambda s: s.ground.height, bounds=(-2.0, 2.0), name="height")
     key = jax.random.key(1)
     options = {"noise": 0.01, "key": key, "starts": 2, "max_steps": 1}
-    inversion.retrieve(wave, LIDAR, ground_scene(), [unknown], **options)
+    inversion.retrieve(wave, PLAIN, ground_scene(), [unknown], **options)
     inversion.retrieve_many(
-        np.stack([wave.reflectance] * 2), LIDAR, ground_scene(), [unknown], time=wave.time, **options
+        np.stack([wave.reflectance] * 2), PLAIN, ground_scene(), [unknown], time=wave.time, **options
     )
     assert len(keys) == 3
     batches = [jax.random.fold_in(key, n) for n in range(MIN_BATCHES)]
@@ -417,17 +417,6 @@ def test_the_plan_serves_the_corners_of_the_bounds():
     high = [Unknown(lambda s: s.ground.height, bounds=(-1.0, 1000.0))]
     with pytest.raises(ValueError, match="at the bounds of the unknowns the scene is inadmissible: altitude"):
         plan_for_bounds(LIDAR, scene, bind_unknowns(high, scene), time, sizes)
-
-
-def test_the_bounded_logistic_function():
-    """Values stay within the bounds for any free parameter; inverse and derivative are right."""
-    z = np.array([-800.0, -30.0, -2.0, 0.0, 1.0, 30.0, 800.0])
-    bounds = np.full(7, -1.0), np.full(7, 3.0)
-    value, slope = bounded_logistic(z, *bounds)
-    assert np.all((value >= -1.0) & (value <= 3.0) & np.isfinite(slope) & (slope >= 0))
-    np.testing.assert_allclose(bounded_logit(value[2:5], np.full(3, -1.0), np.full(3, 3.0)), z[2:5])
-    difference = (bounded_logistic(z + 1e-5, *bounds)[0] - bounded_logistic(z - 1e-5, *bounds)[0]) / 2e-5
-    np.testing.assert_allclose(slope, difference, rtol=1e-6, atol=1e-9)
 
 
 def test_covariance_of_a_linear_problem():
