@@ -733,9 +733,9 @@ def latin_hypercube(
 def multistart(fits: Sequence[LeastSquaresFit]) -> FitGenerator:
     """Run fits from several starts, one after the other, and return the converged one of the lowest cost.
 
-    Starts that ended at the same minimum are counted, and the others compared with it (`compare_minima`), even
-    if they have not converged: a start that came as far with other values is reason to doubt. Its steps and
-    history are those of all fits.
+    Starts that ended at the same minimum are counted, and the others compared with it (`compare_minima`),
+    even if they have not converged: a start that came as far with other values is reason to doubt. Its steps
+    and history are those of all fits.
     """
     completed = []
     for fit in fits:
