@@ -177,7 +177,7 @@ def test_a_lockstep_group_traces_the_batches_that_each_fit_requests(traced_batch
         alone = model(values, with_batches=True, pilot=i != 1)
         assert alone.is_pilot == together[i].is_pilot == (i != 1)
         assert alone.batches.shape == together[i].batches.shape
-        for name in ("total", "jacobian", "batches"):
+        for name in ("reflectance", "jacobian", "batches"):
             a, b = getattr(together[i], name), getattr(alone, name)
             np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5 * np.max(np.abs(b)))
         np.testing.assert_allclose(alone.reflectance, np.mean(alone.batches, axis=0), rtol=1e-4, atol=1e-7)
