@@ -1,4 +1,4 @@
-"""What `jaxlidar._converted.Converted` is for type checkers; nothing here runs."""
+"""Types for which type checkers take `jaxlidar._converted.Converted`; nothing here runs."""
 
 from typing import Annotated, Any, Generic, TypeVar
 

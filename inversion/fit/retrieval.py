@@ -111,10 +111,10 @@ def retrieve(
     - `n_rays`: rays of the footprint of one simulation, all eight batches together, at least 8. Default None:
       8192, or those of `plan`.
     - `max_orders`: orders of scattering. Default None: chosen by the albedos of the starting scene.
-    - `solver`: a Gauss-Newton method of optimistix, whose steps are projected onto the bounds. Default:
-      Levenberg-Marquardt. A fit also ends if a Gauss-Newton step within the bounds would be below 0.05
-      standard errors, or if small steps no longer improve it. With a `Smooth` prior, only the default is
-      admissible: steps are then solved within the bounds.
+    - `solver`: a Gauss-Newton method of optimistix. A step that leaves the bounds is replaced by the minimum
+      of the linearised problem within them. Default: Levenberg-Marquardt. A fit also ends if a Gauss-Newton
+      step within the bounds would be below 0.05 standard errors, or if small steps no longer improve it. With
+      a `Smooth` prior, only the default is admissible: all steps are then solved within the bounds.
     - `max_steps`: most simulations, each with its Jacobian, from each start; no more than half of them are
       with few photons. Default 50.
     - `starts`: number of starting points; the best fit is returned. The first is that of the unknowns

@@ -57,7 +57,6 @@ from jaxlidar._vectors import (
     with_derivative_of,
 )
 from jaxlidar.scenes.height_field import HeightField
-from jaxlidar.scenes.shapes import Plane
 from jaxlidar.trace.device_scene import DeviceScene
 from jaxlidar.trace.flight import SurfaceEncounters
 from jaxlidar.trace.footprint import Beam
@@ -235,12 +234,12 @@ def rays_with_grids(
 
 
 def _surfaces_with_outline(scene: DeviceScene, across: tuple[Scalar, Scalar]) -> list[TracedSurface]:
-    """Return the surfaces whose shapes state an outline. Planes and height fields have none."""
+    """Return the surfaces whose shapes state an outline."""
     point, w, _ = scene.beam.ray(across)
     return [
         surface
         for surface in scene.surfaces
-        if not isinstance(surface.shape, (Plane, HeightField)) and surface.shape.outline(point, w) is not None
+        if surface.may_have_outline and surface.shape.outline(point, w) is not None
     ]
 
 

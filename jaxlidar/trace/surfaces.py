@@ -45,11 +45,15 @@ class TracedSurface(eqx.Module):
         pattern = None if self.pattern is None else self.pattern.moved(displacement[:2])
         return dataclasses.replace(self, shape=self.shape.moved(displacement), pattern=pattern)
 
+    @property
+    def may_have_outline(self) -> bool:
+        """True for shapes of the user; planes and height fields end nowhere within view."""
+        return not isinstance(self.shape, (Plane, HeightField))
+
     def distance(self, x: Vec, w: Vec) -> Scalar:
         """Distance from `x` along `w`; FAR if the surface is behind, missed, or met from under the ground."""
         s = self.shape.distance(x, w)
-        # Planes and height fields end nowhere within view.
-        if not isinstance(self.shape, (Plane, HeightField)) and self.shape.outline(x, w) is None:
+        if self.may_have_outline and self.shape.outline(x, w) is None:
             s = _warn_if_differentiated(s)
         if self.is_plate:
             return s
