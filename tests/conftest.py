@@ -1,12 +1,21 @@
 """Set-up of all tests: rank promotion is refused; shapes and types of the packages are checked."""
 
 import itertools
+import os
 from pathlib import Path
 
 import equinox as eqx
 import jax
 import pytest
 from jaxtyping import install_import_hook
+
+# Most of the time of the tests is compilation, which takes far longer than execution here: leave out the
+# optimisation of machine code and, in the XLA of JAX 0.10, its newer and slower generator of kernels. Whoever
+# sets XLA_FLAGS, if only to a blank, tests the code that users run. XLA reads it when JAX is first used.
+QUICK_COMPILATION = ["--xla_backend_optimization_level=0"]
+if jax.__version__.startswith("0.10."):
+    QUICK_COMPILATION.append("--xla_cpu_use_fusion_emitters=false")
+os.environ.setdefault("XLA_FLAGS", " ".join(QUICK_COMPILATION))
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
