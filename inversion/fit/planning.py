@@ -28,6 +28,8 @@ from jaxlidar.planning.size_buckets import size_bucket
 _MAX_UNKNOWNS_FOR_ALL_CORNERS = 4
 # Batches of every full evaluation: as few as estimate the noise of a simulation.
 N_BATCHES = MIN_BATCHES
+# Bytes up to which fits keep scattering histories.
+MAX_MEMORY_OF_HISTORIES = 1e9
 # Photons and rays of all batches together, unless they or a plan are given.
 N_PHOTONS, N_RAYS = 65536, 8192
 
@@ -119,6 +121,8 @@ def plan_for_bounds(
         "effects": dict.fromkeys(find_empty_materials(scenes[0]), True),
     }
     first = make_plan(lidar, scenes[0], max_orders=sizes.max_orders, **common)
+    if not first.config.keeps_histories:
+        first = _plan_with_histories(first, lidar, scenes[0], max_orders=sizes.max_orders, **common)
     histories = first.config.keeps_histories
     common.update(max_orders=first.orders, bin_width=first.bins.width, histories=histories)
     if scene.canopy is not None:
@@ -155,6 +159,20 @@ def plan_for_bounds(
         covers_fully=tuple(all(c) for c in zip(*(p.config.covers_fully for p in plans))),
     )
     return dataclasses.replace(plan, bins=bins)
+
+
+def _plan_with_histories(first: Plan, lidar: Lidar, scene: Scene, **options: Any) -> Plan:
+    """Return a plan with scattering histories that follows as much light as `first`, or `first`.
+
+    Derivatives with respect to optics cost next to nothing with histories, and another trace each without.
+    Fits therefore keep larger ones than simulations do.
+    """
+    try:
+        plan = make_plan(lidar, scene, histories=True, **options)
+    except ValueError:
+        return first
+    follows_as_much = plan.orders >= first.orders
+    return plan if follows_as_much and plan.memory <= MAX_MEMORY_OF_HISTORIES else first
 
 
 def checked_plan(

@@ -28,8 +28,12 @@ _RAYS_AT_ONCE = 512
 _SLOPE_TABLES = 4
 # Bytes that compiling takes.
 _COMPILATION = 150e6
-# Optics may be applied while light is traced where a response with histories takes more bytes than this ...
-LARGE_RESPONSE = 1e9
+# Optics may be applied while light is traced where one response with histories takes more bytes than
+# this. A program holds some three of them in one buffer. Beyond 32 MB the C library returns a buffer to
+# the system after each call, and the system clears every page of the next one, which took half of all
+# time. (Smaller ones lose a quarter at most so, and with histories a change of the number of wavelengths
+# compiles nothing) ...
+LARGE_RESPONSE = 24e6
 # ... for at most so many wavelengths, whose deposits are then made one by one.
 MAX_APPLIED_WAVELENGTHS = 8
 # The pulse is a dense matrix of fine bins and samples up to so many elements; beyond, it is a band.
@@ -65,15 +69,15 @@ def simulation_bytes(
     return response * (_RESPONSE_COPIES * (os.cpu_count() or 1) + 1) + 2 * pulse + _COMPILATION
 
 
-def keeps_histories(with_histories: float, applied: float, limit: float) -> bool:
+def keeps_histories(response: float, with_histories: float, applied: float, limit: float) -> bool:
     """Return True if the response shall keep scattering histories, so that one trace serves all optics.
 
-    Otherwise optics are applied while light is traced. That is done where histories take more memory than
-    there is (or than `LARGE_RESPONSE`) and more than applied optics, `with_histories` in place of `applied`
-    bytes. Wavelengths, whose deposits are then made one by one, must be few: at most
-    `MAX_APPLIED_WAVELENGTHS`.
+    Otherwise optics are applied while light is traced. That is done where one `response` with histories is
+    larger than `LARGE_RESPONSE`, or all of them take more memory than there is, and where applied optics take
+    less: `with_histories` and `applied` are the bytes of a simulation. Wavelengths, whose deposits are then
+    made one by one, must be few: at most `MAX_APPLIED_WAVELENGTHS`.
     """
-    affordable = with_histories <= min(limit, LARGE_RESPONSE)
+    affordable = response <= LARGE_RESPONSE and with_histories <= limit
     return affordable or applied >= with_histories
 
 

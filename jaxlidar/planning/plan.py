@@ -46,6 +46,7 @@ from jaxlidar.planning.memory import (
     jacobian_bytes,
     keeps_histories,
     memory_limit,
+    response_bytes,
     simulation_bytes,
 )
 from jaxlidar.planning.orders import (
@@ -267,8 +268,9 @@ def plan(
     - `max_memory`: GB that the simulation may take, positive. Default None: a quarter of the machine's.
     - `histories`: True to keep scattering histories, so that one trace serves all optics and wavelengths;
       False to apply optics while light is traced, for at most 8 wavelengths, which has no limit on orders
-      but 1000, and takes less memory. Default None: histories, but where these would take more than 1 GB, or
-      leave out orders that are likely to matter (dense and bright canopies).
+      but 1000, and takes less memory. Default None: histories, but where one response of them would take
+      more than 24 MB (some 18 orders of leaves over ground), or leave out orders that are likely to matter
+      (dense and bright canopies).
     - `describe`: True to make the table of effects with its bounds, which takes some 40 ms. Default True.
 
     **Returns:** a `Plan`; `print` shows it as a table.
@@ -404,12 +406,14 @@ def plan(
     def n_traces(keeps: bool) -> int:
         return wavelengths if straight or not keeps else 1
 
+    def degree_of(orders: int, keeps: bool) -> int:
+        return max_degree(order_steps(orders, n_plates, n_channels), n_plates) if keeps else 0
+
     def memory_of(orders: int, keeps: bool) -> float:
-        degree = max_degree(order_steps(orders, n_plates, n_channels), n_plates) if keeps else 0
         return simulation_bytes(
             config,
             bins,
-            degree=degree,
+            degree=degree_of(orders, keeps),
             n_samples=samples.count,
             pulse_bins=pulse_bins,
             n_traces=n_traces(keeps),
@@ -419,7 +423,8 @@ def plan(
     if order_choice.needs_applied_optics:
         histories = False
     if histories is None:
-        histories = keeps_histories(memory_of(orders, True), memory_of(orders, False), limit)
+        response = response_bytes(config, bins, degree=degree_of(orders, True), n_traces=n_traces(True))
+        histories = keeps_histories(response, memory_of(orders, True), memory_of(orders, False), limit)
     keeps = histories
     if not keeps:
         config = dataclasses.replace(config, keeps_histories=False, degree=0)
