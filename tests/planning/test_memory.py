@@ -15,6 +15,7 @@ import pytest
 import inversion
 import jaxlidar as jl
 from inversion.fit.model import ForwardModel, tangents_per_pass
+from inversion.fit.planning import plan_for_bounds, trace_sizes
 from inversion.fit.unknowns import bind_unknowns
 from jaxlidar.planning import memory
 from jaxlidar.planning.memory import check_memory, format_bytes, memory_limit
@@ -356,5 +357,6 @@ def test_large_histories_are_left_to_fits(orders, keeps):
     assert plan.config.keeps_histories is keeps
     unknown = inversion.Unknown("ground.reflectance", bounds=(0.1, 0.9))
     time = np.arange(-80.0, 40.0)
-    fitted = plan_fit(jl.Lidar(), scene, bind_unknowns([unknown], scene), time, TraceSizes(max_orders=orders))
+    sizes = trace_sizes(None, None, orders, None)
+    fitted = plan_for_bounds(jl.Lidar(), scene, bind_unknowns([unknown], scene), time, sizes)
     assert fitted.config.keeps_histories
