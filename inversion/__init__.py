@@ -10,6 +10,10 @@
 `cramer_rao`, `CramerRao`, `profile_likelihood`, `Profile`, `judge_fit`, `judge_fits`, `judge_record`,
 `Verdict`.
 
+## Design of instruments
+
+`design`, `Design`.
+
 ## Posteriors
 
 `log_density`, `LogDensity`.
@@ -44,6 +48,7 @@ import warnings
 from typing import Any
 
 from inversion import files
+from inversion.fit.design import Design, design
 from inversion.fit.fit_summary import Step
 from inversion.fit.identifiability import CramerRao, Profile, cramer_rao, profile_likelihood
 from inversion.fit.log_density import LogDensity, log_density
@@ -95,6 +100,9 @@ __all__ = [
     "judge_fits",
     "judge_record",
     "Verdict",
+    # Design of instruments.
+    "design",
+    "Design",
     # Posteriors.
     "log_density",
     "LogDensity",
