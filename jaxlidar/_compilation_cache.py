@@ -1,8 +1,6 @@
 """Cache of compiled programs on disk, for later sessions."""
 
-import hashlib
 import os
-import platform
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
@@ -11,6 +9,9 @@ from typing import Any
 import jax
 import platformdirs
 from jax.experimental.compilation_cache import compilation_cache as jax_cache
+
+from jaxlidar._executables import ExecutableStore, processor_digest
+from jaxlidar._programs import use_store
 
 # Programs that compile faster than this, s, are not stored.
 MIN_COMPILE_TIME = 0.05
@@ -22,19 +23,7 @@ def default_folder() -> Path:
     Machines with different processors may share a home folder, and a program may use instructions that only
     some of them have.
     """
-    return platformdirs.user_cache_path("jaxlidar") / "programs" / _processor_digest()
-
-
-def _processor_digest() -> str:
-    """Return a hash of the kind of processor and its instruction sets."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        lines = []
-    # "flags" on x86, "Features" on ARM.
-    features = next((line for line in lines if line.lower().startswith(("flags", "features"))), "")
-    description = f"{platform.machine()} {platform.processor()} {features}"
-    return hashlib.sha256(description.encode()).hexdigest()[:12]
+    return platformdirs.user_cache_path("jaxlidar") / "programs" / processor_digest()
 
 
 class CompilationCache:
@@ -46,13 +35,16 @@ class CompilationCache:
     folder: Path
 
     def __init__(self, folder: Path, previous: Mapping[str, Any]):
-        """`previous`: settings of JAX to which `close` returns."""
+        """Store executables in the folder. `previous`: settings of JAX to which `close` returns."""
         self.folder, self._previous = folder, dict(previous)
+        self._previous_store, self._is_open = use_store(ExecutableStore(folder)), True
 
     def close(self) -> None:
         """Give JAX back the settings that it had before; a second call does nothing."""
-        _configure(self._previous)
-        self._previous = {}
+        if self._is_open:
+            _configure(self._previous)
+            use_store(self._previous_store)
+        self._is_open = False
 
     def __enter__(self) -> "CompilationCache":
         return self
@@ -69,9 +61,11 @@ class CompilationCache:
 def compilation_cache(folder: str | os.PathLike[str] | None = None) -> CompilationCache:
     """Let JAX store compiled programs in a folder, and read them from there in later sessions.
 
-    Call it once at the start of a session, or use it as a context. It is JAX's own persistent cache,
-    switched on for programs of all packages; importing jaxlidar never does so. Programs depend on the
-    versions of JAX and of the processor, and are not reused for others. Nothing is removed from the folder.
+    Call it once at the start of a session, or use it as a context. It switches on JAX's own persistent cache,
+    for programs of all packages. Programs of jaxlidar are stored as executables as well, which are loaded
+    without being traced again. Importing jaxlidar does neither. Programs depend on the releases of packages,
+    on the processor and on your own functions, and are not reused for others. Nothing is removed from the
+    folder.
 
     **Arguments:** `folder`: is made if it does not exist; no one else should be able to write to it, as
     programs are run. Default None: the cache that JAX is configured for already, or else "jaxlidar/programs"

@@ -135,11 +135,11 @@ def test_sun_and_sensor_may_change_places():
     scene = jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=0.2))
     angles = (50.0, 30.0), (15.0, 200.0)
     options = {"wavelengths": 865.0, "key": KEY, "n_photons": 1 << 16}
-    there = jl.reflectance_factor(scene, sun=angles[0], view=angles[1], **options)
-    back = jl.reflectance_factor(scene, sun=angles[1], view=angles[0], **options)
-    difference = float(there.reflectance[0] - back.reflectance[0])
-    assert abs(difference) < 3 * float(jnp.hypot(there.stderr[0], back.stderr[0]))
-    assert float(there.stderr[0]) < 0.01 * float(there.reflectance[0])
+    forward = jl.reflectance_factor(scene, sun=angles[0], view=angles[1], **options)
+    swapped = jl.reflectance_factor(scene, sun=angles[1], view=angles[0], **options)
+    difference = float(forward.reflectance[0] - swapped.reflectance[0])
+    assert abs(difference) < 3 * float(jnp.hypot(forward.stderr[0], swapped.stderr[0]))
+    assert float(forward.stderr[0]) < 0.01 * float(forward.reflectance[0])
 
 
 def test_derivatives_are_those_of_finite_differences():

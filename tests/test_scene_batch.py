@@ -58,18 +58,18 @@ def test_each_waveform_is_that_of_its_scene_alone(waves, plan_of_two_orders):
 
 
 def test_standard_errors_are_those_of_each_scene(waves, plan_of_two_orders):
-    again = jl.simulate_scenes(
+    repeated = jl.simulate_scenes(
         LIDAR, random_stands(), plan=plan_of_two_orders, key=jax.random.key(4), chunk=3
     )
     bright = np.asarray(waves.reflectance) > 0.02 * np.max(waves.reflectance)
-    z = (again.reflectance - waves.reflectance) / np.hypot(again.stderr, waves.stderr)
+    z = (repeated.reflectance - waves.reflectance) / np.hypot(repeated.stderr, waves.stderr)
     assert 0.5 < np.sqrt(np.mean(np.square(np.asarray(z)[bright]))) < 1.3
 
 
 def test_chunks_and_other_scenes_change_nothing(waves, plan_of_two_orders):
     fewer = jax.tree.map(lambda a: a[:5], random_stands())
-    again = jl.simulate_scenes(LIDAR, fewer, plan=plan_of_two_orders, key=KEY, chunk=3)
-    np.testing.assert_allclose(again.reflectance, waves.reflectance[:5], rtol=1e-4, atol=1e-9)
+    repeated = jl.simulate_scenes(LIDAR, fewer, plan=plan_of_two_orders, key=KEY, chunk=3)
+    np.testing.assert_allclose(repeated.reflectance, waves.reflectance[:5], rtol=1e-4, atol=1e-9)
 
 
 def test_the_plan_of_a_stack_serves_all_of_its_scenes():
