@@ -10,6 +10,14 @@
 `cramer_rao`, `CramerRao`, `profile_likelihood`, `Profile`, `judge_fit`, `judge_fits`, `judge_record`,
 `Verdict`.
 
+## Design of instruments
+
+`design`, `Design`.
+
+## Posteriors
+
+`log_density`, `LogDensity`.
+
 ## Echoes and deconvolution
 
 `gaussian_decomposition`, `Echoes`, `echo_points`, `EchoPoints`, `richardson_lucy`, `wiener`.
@@ -40,8 +48,10 @@ import warnings
 from typing import Any
 
 from inversion import files
+from inversion.fit.design import Design, design
 from inversion.fit.fit_summary import Step
 from inversion.fit.identifiability import CramerRao, Profile, cramer_rao, profile_likelihood
+from inversion.fit.log_density import LogDensity, log_density
 from inversion.fit.priors import LogNormal, Smooth
 from inversion.fit.profiles import AveragingKernel, put_profile
 from inversion.fit.quality import Verdict, judge_fit, judge_fits, judge_record
@@ -90,6 +100,12 @@ __all__ = [
     "judge_fits",
     "judge_record",
     "Verdict",
+    # Design of instruments.
+    "design",
+    "Design",
+    # Posteriors.
+    "log_density",
+    "LogDensity",
     # Echoes and deconvolution.
     "gaussian_decomposition",
     "Echoes",

@@ -22,6 +22,10 @@ waveforms is in the package `inversion`.
 `Survey`, `AbstractScan`, `Oscillating`, `RotatingPolygon`, `Conical`, `simulate_many`, `Waveforms`,
 `SurveyProgress`, `SceneParts`.
 
+## Many scenes
+
+`simulate_scenes`, `SceneWaveforms`, `plan_scenes`.
+
 ## Scenes
 
 `Scene`, `Canopy`, `VoxelMap`, `Ground`, `Terrain`, `Plate`, `Atmosphere`, `AbstractSurface`,
@@ -43,6 +47,10 @@ waveforms is in the package `inversion`.
 `LSystem`, `Rule`, `Symbol`, `Word`, `turtle`, `voxelise`, `voxelise_points`, `voxelise_mesh`, `Mesh`,
 `trim_empty_layers`.
 
+## Sunlight
+
+`reflectance_factor`, `ReflectanceFactor`, `plan_reflectance`.
+
 ## Truth and energy
 
 `truth_of`, `Truth`, `Truths`, `energy_budget`, `EnergyBudget`.
@@ -50,6 +58,10 @@ waveforms is in the package `inversion`.
 ## The steps of a simulation
 
 `plan`, `Plan`, `Effect`, `make_setup`, `Setup`, `trace_scene`, `Response`, `waveform_of`.
+
+## Compiled programs
+
+`compilation_cache`, `CompilationCache`.
 
 ## Paths as the paper traces them
 
@@ -70,6 +82,7 @@ from typing import TYPE_CHECKING, Any
 
 from jaxlidar import extend, io
 from jaxlidar._checks import UnitWarning
+from jaxlidar._compilation_cache import CompilationCache, compilation_cache
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._deprecated import RENAMED, warn_renamed
 from jaxlidar._progress import Progress
@@ -100,8 +113,10 @@ from jaxlidar.optics.phase import AbstractPhase, HenyeyGreenstein, Isotropic
 from jaxlidar.optics.plate_model import plate_model
 from jaxlidar.optics.prospect import Prospect, prospect_jacobian, prospect_spectra
 from jaxlidar.optics.spectra import Spectrum, read_spectrum_csv, spectrum, spectrum_names
+from jaxlidar.passive import ReflectanceFactor, plan_reflectance, reflectance_factor
 from jaxlidar.planning.effects import Effect
 from jaxlidar.planning.plan import Plan, plan
+from jaxlidar.planning.scene_family import plan_scenes
 from jaxlidar.planning.setup import Setup, make_setup
 from jaxlidar.plants.forest import forest
 from jaxlidar.plants.habits import Branching, Habit, broadleaf, conifer, grow, shrub, spreading_tree
@@ -110,6 +125,7 @@ from jaxlidar.plants.meshes import Mesh, voxelise_mesh
 from jaxlidar.plants.tree import Tree
 from jaxlidar.plants.turtle import turtle
 from jaxlidar.plants.voxelise import trim_empty_layers, voxelise, voxelise_points
+from jaxlidar.scene_batch import SceneWaveforms, simulate_scenes
 from jaxlidar.scenes.atmosphere import Atmosphere
 from jaxlidar.scenes.canopy import Canopy
 from jaxlidar.scenes.relative_height import MisplacedCanopyWarning
@@ -163,6 +179,10 @@ __all__ = [
     "Waveforms",
     "SurveyProgress",
     "SceneParts",
+    # Many scenes.
+    "simulate_scenes",
+    "SceneWaveforms",
+    "plan_scenes",
     # Scenes.
     "Scene",
     "Canopy",
@@ -219,6 +239,10 @@ __all__ = [
     "voxelise_mesh",
     "Mesh",
     "trim_empty_layers",
+    # Sunlight.
+    "reflectance_factor",
+    "ReflectanceFactor",
+    "plan_reflectance",
     # Truth and energy.
     "truth_of",
     "Truth",
@@ -234,6 +258,9 @@ __all__ = [
     "trace_scene",
     "Response",
     "waveform_of",
+    # Compiled programs.
+    "compilation_cache",
+    "CompilationCache",
     # Paths as the paper traces them.
     "analog_returns",
     "AnalogReturns",

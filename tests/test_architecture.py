@@ -41,6 +41,8 @@ LAYERS = (
     "truth",
     "sampling",
     "simulate",
+    "scene_batch",
+    "passive",
     "energy",
     "analog",
     "io",

@@ -21,6 +21,8 @@ _RESPONSE_COPIES = 3
 _RESPONSE_TANGENTS = 2
 # Tangents of a photon, and of a ray segment, that are alive at once.
 _STATE_TANGENTS = 4
+# Numbers of a photon, and of a ray segment, that are alive at once.
+_STATE_NUMBERS = 16
 # Footprint rays that are marched at once.
 _RAYS_AT_ONCE = 512
 # Tables with a number for each column and voxel: slopes of leaf, of bark, and of the optical depth above, and
@@ -94,6 +96,15 @@ def jacobian_bytes(
         _RESPONSE_TANGENTS * response + _STATE_TANGENTS * _photons_and_segments(config) * _number_bytes()
     )
     return (batches + 1) * response + cores * (response + columns * tangents)
+
+
+def transformed_bytes(
+    config: TraceConfig, bins: TimeBins, *, degree: int, n_traces: int, batches: int
+) -> float:
+    """Return the bytes of one simulation within a JAX transformation, which keeps all of its batches."""
+    response = response_bytes(config, bins, degree=degree, n_traces=n_traces)
+    states = _STATE_NUMBERS * _photons_and_segments(config) * _number_bytes()
+    return (batches + _RESPONSE_COPIES) * response + states
 
 
 def scored_bytes(config: TraceConfig, bins: TimeBins, *, cells: int, columns: int, wavelengths: int) -> float:

@@ -300,7 +300,8 @@ def _trace_order(
     2. Sample the ends of the flight, one in each stratum of u, the transmittance up to the end. The photon
        goes on from one of them.
     3. Apply the plates that the flight passes to weights and histories.
-    4. Deposit the return of every end, except at order one, which `jaxlidar.trace.first_order` deposits.
+    4. Deposit the return of every end, except at order one, which `jaxlidar.trace.first_order` deposits for
+       light that returns along the beam.
     5. Tally light that escapes or would come after the record.
     6. Sample the collision at the selected end, tally what arrives and what goes on, and update the photon.
     """
@@ -337,9 +338,10 @@ def _trace_order(
     # Before deposits: these carry the history with the plates that their flight has passed.
     weight, index, tally = _pass_plates(scene, p, flights, encounters, weight, index, select_end, tally)
 
-    # The first order is deterministic and has been deposited.
+    # The first order is deterministic and has been deposited, unless light returns by another direction.
+    is_deposited = (order > 0) | (scene.beam.return_direction is not None)
     tally = lax.cond(
-        order > 0,
+        is_deposited,
         lambda t: _deposit_flights(scene, p, flights, encounters, weight, index, draws, t),
         lambda t: t,
         tally,

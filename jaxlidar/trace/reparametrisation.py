@@ -214,7 +214,8 @@ def rays_with_grids(
     changed.
     """
     one = jnp.ones_like(across[0])
-    if not has_moving_rays(scene):
+    # Light over a rectangle has no profile that could make up for a motion; the rectangle moves with the map.
+    if not has_moving_rays(scene) or scene.beam.rectangle is not None:
         return across, one
     beam, outlines = scene.beam, _surfaces_with_outline(scene, across)
     if beam.gaussian:

@@ -164,7 +164,8 @@ def test_retrieve_finds_the_ground(tmp_path, capsys):
 def test_compiled_programs_are_stored_unless_refused(tmp_path):
     """In the user's cache folder; when the command has ended, JAX has its previous configuration."""
     code = (
-        "import sys, jax; from jaxlidar.cli import cache, main; before = dict(jax.config.values);"
+        "import sys, jax; from jaxlidar import _compilation_cache as cache; from jaxlidar.cli import main;"
+        "before = dict(jax.config.values);"
         # A fast machine compiles all programs of the command in less than the minimum time.
         "cache.MIN_COMPILE_TIME = 0.0;"
         "print(main(sys.argv[1:]), jax.config.values == before)"
