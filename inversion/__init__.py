@@ -29,7 +29,12 @@
 
 ## GEDI and photon counters
 
-`gedi_metrics`, `GediMetrics`, `gedi_settings`, `GediSettings`, `photon_ground_and_canopy`, `PhotonHeights`.
+`gedi_metrics`, `GediMetrics`, `gedi_settings`, `GediSettings`, `gedi_table`, `TableProgress`,
+`photon_ground_and_canopy`, `PhotonHeights`.
+
+## Comparison with references
+
+`compare`, `Comparison`, `ComparisonStatistics`, `ComparedColumn`.
 
 ## Receivers and digitisers
 
@@ -60,6 +65,7 @@ from inversion.fit.retrieval import retrieve
 from inversion.fit.retrieval_many import RetrievalProgress, retrieve_many
 from inversion.fit.unknowns import Unknown
 from inversion.leaf.leaves import LeafFit, invert_leaves
+from inversion.metrics.comparison import ComparedColumn, Comparison, ComparisonStatistics, compare
 from inversion.metrics.cover import (
     GroundAndCanopy,
     gap_probability,
@@ -70,6 +76,7 @@ from inversion.metrics.cover import (
 from inversion.metrics.decomposition import Echoes, gaussian_decomposition
 from inversion.metrics.deconvolution import richardson_lucy, wiener
 from inversion.metrics.gedi import GediMetrics, GediSettings, gedi_metrics, gedi_settings
+from inversion.metrics.gedi_table import TableProgress, gedi_table
 from inversion.metrics.heights import SignalEnds, find_ground, relative_heights, signal_ends
 from inversion.metrics.photons import PhotonHeights, photon_ground_and_canopy
 from inversion.metrics.points import EchoPoints, echo_points
@@ -128,8 +135,15 @@ __all__ = [
     "GediMetrics",
     "gedi_settings",
     "GediSettings",
+    "gedi_table",
+    "TableProgress",
     "photon_ground_and_canopy",
     "PhotonHeights",
+    # Comparison with references.
+    "compare",
+    "Comparison",
+    "ComparisonStatistics",
+    "ComparedColumn",
     # Receivers and digitisers.
     "Recorder",
     "receiver_impulse",

@@ -136,6 +136,19 @@ def gedi() -> Path:
     return folder() / "a.h5"
 
 
+def level_2_file(kind: str) -> Path:
+    from tests.io.test_gedi_level2 import write_level_2
+
+    return write_level_2(folder() / f"{kind}.h5", kind)
+
+
+@functools.cache
+def photon_files() -> tuple[Path, Path]:
+    from tests.io.test_icesat2 import write_heights, write_photons
+
+    return write_photons(folder() / "atl03.h5"), write_heights(folder() / "atl08.h5")
+
+
 # -- calls -------------------------------------------------------------------------------------------------
 
 ENTRY_POINTS: dict[str, Callable[[], EntryPoint]] = {
@@ -435,7 +448,25 @@ ENTRY_POINTS: dict[str, Callable[[], EntryPoint]] = {
             folder() / "b.h5", [wave(), wave()], SURVEY, key=KEY, **arguments
         ),
         {"origin": (14.0, 50.0), "elevation": 0.0, "shot_number": [1, 2], "margin": 20, "gain": 1e4}
-        | {"noise_mean": 240.0, "noise_std": 3.0},
+        | {"noise_mean": 240.0, "noise_std": 3.0, "solar_elevation": -20.0},
+    ),
+    "io.read_gedi_l2a": lambda: EntryPoint(
+        lambda shot_number: jl.io.read_gedi_l2a(level_2_file("2A"), shot_number)["rh"],
+        {"shot_number": [1, 2]},
+    ),
+    "io.read_gedi_l2b": lambda: EntryPoint(
+        lambda shot_number: jl.io.read_gedi_l2b(level_2_file("2B"), shot_number)["pai"],
+        {"shot_number": [1, 2]},
+    ),
+    "io.read_atl03": lambda: EntryPoint(
+        lambda stretch: jl.io.read_atl03(photon_files()[0], stretch=stretch).height, {"stretch": (0.0, 90.0)}
+    ),
+    "io.read_atl03 latitude": lambda: EntryPoint(
+        lambda latitude: jl.io.read_atl03(photon_files()[0], latitude=latitude).height,
+        {"latitude": (40.0, 42.0)},
+    ),
+    "io.read_atl08": lambda: EntryPoint(
+        lambda segment: jl.io.read_atl08(photon_files()[1], segment=segment)["ground"], {"segment": 100.0}
     ),
     "io.write_las": lambda: EntryPoint(
         lambda **arguments: jl.io.write_las(folder() / "b.las", **arguments),
@@ -470,6 +501,12 @@ ENTRY_POINTS: dict[str, Callable[[], EntryPoint]] = {
     "plot.photons": lambda: EntryPoint(
         lambda **arguments: jl.plot.photons(events(), **arguments),
         {"distance": np.zeros(1), "label": np.zeros(len(events().time), int)},
+    ),
+    "plot.comparison": lambda: EntryPoint(
+        with_field(jl.plot.comparison, pairs=lambda x: {"ground": (np.ones(2), x)}),
+        {"pairs": np.ones(2)},
+        missing=("pairs",),
+        messages={"pairs": "ground"},
     ),
     "plot.spectrum": lambda: EntryPoint(
         lambda wavelength: jl.plot.spectrum(PROSPECT, wavelength=wavelength), {"wavelength": BANDS}
@@ -624,6 +661,15 @@ ENTRY_POINTS: dict[str, Callable[[], EntryPoint]] = {
         | {"mode_smoothing": 6.5, "front_threshold": 3.0, "back_threshold": 6.0},
     ),
     "inversion.gedi_settings": lambda: EntryPoint(inversion.gedi_settings, {"group": 1}),
+    "inversion.gedi_table": lambda: EntryPoint(
+        lambda **arguments: inversion.gedi_table([], **arguments)["ground"],
+        {"group": 1, "edges": np.array([0.0, 5.0]), "reflectance_ratio": 1.5, "projection": 0.5}
+        | {"clumping": 1.0},
+    ),
+    "inversion.compare": lambda: EntryPoint(
+        lambda sigmas: inversion.compare({"h": np.ones(2)}, {"h": np.ones(2)}, on=None, sigmas=sigmas),
+        {"sigmas": 2.0},
+    ),
     "inversion.photon_ground_and_canopy": lambda: EntryPoint(
         lambda **arguments: inversion.photon_ground_and_canopy(events(), **arguments),
         {

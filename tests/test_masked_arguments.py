@@ -115,13 +115,24 @@ RESULTS = (
         "LeafSurface",
         "inversion.GediSettings",
     ),
+    *("io.ColumnAxis", "io.Column", "io.ShotTable", "io.PhotonImpulse", "io.PhotonTrack"),
+    *("inversion.TableProgress", "inversion.Comparison", "inversion.ComparisonStatistics"),
+    *("inversion.ComparedColumn",),
 )
 OF_OBJECTS = (
     *("total_reflectance", "open", "rerun", "Scene", "load_coefficients", "spectrum_names"),
     *("read_spectrum_csv", "Symbol", "Word", "LSystem", "trim_empty_layers", "truth_of", "make_setup"),
     *("trace_scene", "waveform_of", "Lambertian", "EqualAngle", "spectrum", "Plane"),
     *("io.atomic_write", "io.keep_as_netcdf", "io.read_case", "io.read_las_waveforms", "io.read_neon"),
-    *("io.read_pulsewaves", "io.save", "io.stack_shots", "io.write_case", "plot.accuracy"),
+    *(
+        "io.read_lvis_l1b",
+        "io.read_lvis_l2",
+        "io.read_pulsewaves",
+        "io.save",
+        "io.stack_shots",
+        "io.write_case",
+        "plot.accuracy",
+    ),
     *("plot.energy_budget", "plot.leaf_on_and_off", "plot.scene", "inversion.judge_fit"),
     *("inversion.judge_fits", "inversion.echo_points"),
 )

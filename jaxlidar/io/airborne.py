@@ -349,7 +349,7 @@ class AirborneShots(Sequence, abc.ABC):
     """The shots of a file: a sequence that reads a shot when it is indexed.
 
     `shots[5]` is an `AirborneShot`, `shots[:100]` a list of them. The file is mapped, so it may be larger
-    than memory. `read_pulsewaves` and `read_las_waveforms` return it.
+    than memory. `read_pulsewaves`, `read_las_waveforms` and `read_lvis_l1b` return it.
 
     - `path`: the file.
     - `gps_time`: (shots,) s.
@@ -389,7 +389,10 @@ class AirborneShots(Sequence, abc.ABC):
 
     @abc.abstractmethod
     def _read(self, index: int) -> dict[str, Any]:
-        """Return the arguments of `AirborneShot` but for its noise levels; its index where it is another."""
+        """Return the arguments of `AirborneShot` but for its noise levels; its index where it is another.
+
+        A noise level that the file states for the shot may be among them.
+        """
 
     @functools.cached_property
     def levels(self) -> NoiseLevels:
@@ -414,9 +417,10 @@ class AirborneShots(Sequence, abc.ABC):
         if isinstance(index, slice):
             return [self[i] for i in range(*index.indices(len(self)))]
         i = range(len(self))[index]
-        arguments: dict[str, Any] = {"index": i, **self._read(i)}
+        # Levels of the file are replaced by those that it states for the shot.
+        arguments: dict[str, Any] = {**self.levels._asdict(), "index": i, **self._read(i)}
         try:
-            return AirborneShot(**self.levels._asdict(), **arguments)
+            return AirborneShot(**arguments)
         except ValueError as error:
             raise ValueError(f"{self.path}: {error}") from error
 
