@@ -23,6 +23,10 @@
 
 `gedi_metrics`, `GediMetrics`, `gedi_settings`, `GediSettings`, `photon_ground_and_canopy`, `PhotonHeights`.
 
+## The scene of many records
+
+`geolocate`, `Geolocation`.
+
 ## Receivers and digitisers
 
 `Recorder`, `receiver_impulse`, `recorded_pulse`, `amplitudes`, `Amplitudes`, `corrected_table`.
@@ -66,6 +70,7 @@ from inversion.metrics.points import EchoPoints, echo_points
 from inversion.receiver.digitiser import Amplitudes, amplitudes, corrected_table
 from inversion.receiver.impulse import receiver_impulse, recorded_pulse
 from inversion.receiver.recorder import Recorder
+from inversion.scene.geolocation import Geolocation, geolocate
 from jaxlidar.extend import shorten_signatures
 
 __all__ = [
@@ -114,6 +119,9 @@ __all__ = [
     "GediSettings",
     "photon_ground_and_canopy",
     "PhotonHeights",
+    # The scene of many records.
+    "geolocate",
+    "Geolocation",
     # Receivers and digitisers.
     "Recorder",
     "receiver_impulse",

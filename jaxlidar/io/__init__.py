@@ -17,7 +17,7 @@ from jaxlidar.io.datasets import keep_as_netcdf
 from jaxlidar.io.dem import DemRead, read_dem
 from jaxlidar.io.gedi import GediShot, read_gedi_l1b
 from jaxlidar.io.gedi_writer import write_gedi_l1b
-from jaxlidar.io.las import PointCloud, read_las, write_las
+from jaxlidar.io.las import read_las, write_las
 from jaxlidar.io.las_waveforms import read_las_waveforms, write_las_waveforms
 from jaxlidar.io.neon import NeonImpulse, NeonRead, read_neon
 from jaxlidar.io.netcdf import read_case, save
@@ -26,6 +26,7 @@ from jaxlidar.io.pulsewaves import read_pulsewaves
 from jaxlidar.io.qsm import TreeRead, read_qsm
 from jaxlidar.io.rasters import write_raster
 from jaxlidar.io.vox import VoxelsRead, read_vox
+from jaxlidar.plants.point_cloud import PointCloud
 
 __all__ = [
     "AirborneShot",
