@@ -36,6 +36,10 @@
 
 `compare`, `Comparison`, `ComparisonStatistics`, `ComparedColumn`.
 
+## The scene of many records
+
+`geolocate`, `Geolocation`.
+
 ## Receivers and digitisers
 
 `Recorder`, `receiver_impulse`, `recorded_pulse`, `amplitudes`, `Amplitudes`, `corrected_table`.
@@ -83,6 +87,7 @@ from inversion.metrics.points import EchoPoints, echo_points
 from inversion.receiver.digitiser import Amplitudes, amplitudes, corrected_table
 from inversion.receiver.impulse import receiver_impulse, recorded_pulse
 from inversion.receiver.recorder import Recorder
+from inversion.scene.geolocation import Geolocation, geolocate
 from jaxlidar.extend import shorten_signatures
 
 __all__ = [
@@ -144,6 +149,9 @@ __all__ = [
     "Comparison",
     "ComparisonStatistics",
     "ComparedColumn",
+    # The scene of many records.
+    "geolocate",
+    "Geolocation",
     # Receivers and digitisers.
     "Recorder",
     "receiver_impulse",

@@ -45,7 +45,7 @@ waveforms is in the package `inversion`.
 
 `Habit`, `Branching`, `broadleaf`, `conifer`, `shrub`, `spreading_tree`, `grow`, `forest`, `Tree`,
 `LSystem`, `Rule`, `Symbol`, `Word`, `turtle`, `voxelise`, `voxelise_points`, `voxelise_mesh`, `Mesh`,
-`trim_empty_layers`.
+`canopy_from_points`, `PointCanopy`, `trim_empty_layers`.
 
 ## Sunlight
 
@@ -122,6 +122,7 @@ from jaxlidar.plants.forest import forest
 from jaxlidar.plants.habits import Branching, Habit, broadleaf, conifer, grow, shrub, spreading_tree
 from jaxlidar.plants.lsystem import LSystem, Rule, Symbol, Word
 from jaxlidar.plants.meshes import Mesh, voxelise_mesh
+from jaxlidar.plants.point_canopy import PointCanopy, canopy_from_points
 from jaxlidar.plants.tree import Tree
 from jaxlidar.plants.turtle import turtle
 from jaxlidar.plants.voxelise import trim_empty_layers, voxelise, voxelise_points
@@ -236,6 +237,8 @@ __all__ = [
     "turtle",
     "voxelise",
     "voxelise_points",
+    "canopy_from_points",
+    "PointCanopy",
     "voxelise_mesh",
     "Mesh",
     "trim_empty_layers",

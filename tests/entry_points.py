@@ -89,6 +89,12 @@ def observation() -> dict[str, np.ndarray]:
 
 
 @functools.cache
+def point_cloud() -> jl.io.PointCloud:
+    one, position = np.ones(3, int), np.array([[1.0, 1.0, 0.0], [2.0, 3.0, 4.0], [4.0, 1.0, 0.0]])
+    return jl.io.PointCloud(position, np.array([2, 5, 2]), one, one, 1.0 * one, {})
+
+
+@functools.cache
 def events() -> jl.PhotonEvents:
     return jl.record(wave(), mode="photons", receiver=jl.PhotonCounter(), key=KEY, pulses=20)
 
@@ -371,6 +377,10 @@ ENTRY_POINTS: dict[str, Callable[[], EntryPoint]] = {
         lambda **arguments: jl.voxelise(TREE, **arguments),
         {"voxel_size": 0.5, "leaf_area": 1.0, "samples": 2, "origin": (-1.0, -1.0, 0.0)}
         | {"shape": (4, 4, 4)},
+    ),
+    "canopy_from_points": lambda: EntryPoint(
+        lambda **arguments: jl.canopy_from_points(point_cloud(), **arguments),
+        {"voxel_size": 1.0, "reflectance": 0.3, "origin": (0.0, 0.0, 0.0), "shape": (6, 6, 6)},
     ),
     "voxelise_points": lambda: EntryPoint(
         jl.voxelise_points,
@@ -679,6 +689,13 @@ ENTRY_POINTS: dict[str, Callable[[], EntryPoint]] = {
             "background_rate": 1.0,
             "least": 5,
         },
+    ),
+    "inversion.geolocate": lambda: EntryPoint(
+        lambda **arguments: inversion.geolocate(
+            survey=jl.Survey(jl.Lidar(divergence=20.0), TWO), scene=GROUND, key=KEY, **arguments
+        ),
+        {"records": np.stack([POWER, POWER]), "height": HEIGHT, "noise": 0.01, "search_radius": 2.0}
+        | {"height_error": 0.1, "max_orders": 1, "rtol": 0.1},
     ),
     "inversion.Recorder": lambda: EntryPoint(
         inversion.Recorder,

@@ -110,6 +110,8 @@ RESULTS = (
     *("inversion.SignalEnds", "inversion.GroundAndCanopy", "inversion.GediMetrics"),
     *(
         "inversion.PhotonHeights",
+        "inversion.Geolocation",
+        "PointCanopy",
         "inversion.Amplitudes",
         "inversion.LeafFit",
         "LeafSurface",

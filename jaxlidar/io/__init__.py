@@ -20,6 +20,7 @@ from jaxlidar.io.gedi_level2 import read_gedi_l2a, read_gedi_l2b
 from jaxlidar.io.gedi_writer import write_gedi_l1b
 from jaxlidar.io.icesat2 import PhotonImpulse, PhotonTrack, read_atl03, read_atl08
 from jaxlidar.io.las import PointCloud, read_las, write_las
+from jaxlidar.io.las import read_las, write_las
 from jaxlidar.io.las_waveforms import read_las_waveforms, write_las_waveforms
 from jaxlidar.io.lvis import read_lvis_l1b, read_lvis_l2
 from jaxlidar.io.neon import NeonImpulse, NeonRead, read_neon
@@ -30,6 +31,7 @@ from jaxlidar.io.qsm import TreeRead, read_qsm
 from jaxlidar.io.rasters import write_raster
 from jaxlidar.io.tables import Column, ColumnAxis, ShotTable
 from jaxlidar.io.vox import VoxelsRead, read_vox
+from jaxlidar.plants.point_cloud import PointCloud
 
 __all__ = [
     "AirborneShot",

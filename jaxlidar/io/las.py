@@ -5,10 +5,10 @@ Source: LAS specification 1.4 (ASPRS).
 
 import os
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from jaxtyping import ArrayLike, Float, Int, Num
+from jaxtyping import ArrayLike, Num
 
 from jaxlidar._checks import as_numpy, check_number, check_range, check_shape, check_unmasked
 from jaxlidar._files import atomic_write
@@ -16,6 +16,7 @@ from jaxlidar.io.checks import MAX_COORDINATE, existing_file
 from jaxlidar.io.coordinates import WKT_RECORD, CoordinateSystem, check_elevations, metric_system
 from jaxlidar.io.las_header import PROJECTION_USER, LasHeader, read_header
 from jaxlidar.io.laz import decompress_points
+from jaxlidar.plants.point_cloud import PointCloud
 
 # Classes of points that are not returns of the scene: low noise and high noise.
 _NOISE_CLASSES = (7, 18)
@@ -23,6 +24,8 @@ _NOISE_CLASSES = (7, 18)
 _MM, _DEGREES = (1e-3, 1e-3, 1e-3), (1e-8, 1e-8, 1e-3)
 # The first point format of LAS 1.4, whose fields hold larger numbers.
 _FORMAT_6 = 6
+# From that format on, scan angles are counted in steps of this size, degrees.
+_SCAN_ANGLE_STEP = 0.006
 # Largest numbers by field: in point formats up to 5, and from 6 on.
 _MAX_NUMBERS = {
     "return_number": (7, 15),
@@ -31,33 +34,6 @@ _MAX_NUMBERS = {
     "intensity": (2**16 - 1, 2**16 - 1),
     "scanner_channel": (0, 3),
 }
-
-
-class PointCloud(NamedTuple):
-    """Points of a laser scan.
-
-    - `position`: (n, 3) m, as in the file times the scale, in double precision.
-    - `classification`: (n,) classes of the LAS specification: 2 ground, 3 to 5 vegetation, ...
-    - `return_number`, `number_of_returns`: (n,) number of the return, and of all returns of its pulse.
-    - `intensity`: (n,) as recorded.
-    - `dropped`: how many points of the file were left out, by reason.
-
-    **Example:**
-
-    >>> import numpy as np
-    >>> from jaxlidar.io import PointCloud
-    >>> one, two = np.array([1, 1]), np.array([[0.0, 0.0, 1.0], [0.5, 0.0, 9.0]])
-    >>> cloud = PointCloud(two, np.array([2, 5]), one, one, np.array([40.0, 25.0]), {"noise": 0})
-    >>> print(cloud.position[cloud.classification == 5])
-    [[0.5 0.  9. ]]
-    """
-
-    position: Float[np.ndarray, "n 3"]
-    classification: Int[np.ndarray, " n"]
-    return_number: Int[np.ndarray, " n"]
-    number_of_returns: Int[np.ndarray, " n"]
-    intensity: Float[np.ndarray, " n"]
-    dropped: dict[str, int]
 
 
 def read_las(path: str | os.PathLike[str], *, scale: float | None = None) -> PointCloud:
@@ -150,8 +126,25 @@ def read_stored_points(
         np.asarray(cloud["number_of_returns"]).astype(int)[selected],
         np.asarray(cloud["intensity"]).astype(float)[selected],
         {"noise": int(noise.sum()), "withheld": int(withheld.sum())},
+        scan_angle=_scan_angle(cloud, header.point_format)[selected],
+        gps_time=_gps_time(cloud, selected),
+        source=np.asarray(cloud["point_source_id"]).astype(int)[selected],
     )
     return points, system
+
+
+def _scan_angle(cloud: Any, point_format: int) -> np.ndarray:
+    """Return the scan angles of all points, degrees."""
+    if point_format >= _FORMAT_6:
+        return np.asarray(cloud["scan_angle"], float) * _SCAN_ANGLE_STEP
+    return np.asarray(cloud["scan_angle_rank"], float)
+
+
+def _gps_time(cloud: Any, selected: np.ndarray) -> np.ndarray | None:
+    """Return the GPS times of the selected points, s; None where the point format has none."""
+    if "gps_time" not in cloud.point_format.dimension_names:
+        return None
+    return np.asarray(cloud["gps_time"], float)[selected]
 
 
 def import_laspy(purpose: str) -> Any:

@@ -8,8 +8,8 @@ Two kinds of damaged bytes also end the process, and are refused:
 
 - An arithmetic-coded stream never begins with four bytes of 255. In one that does, lazrs looks up symbols
   that do not exist.
-- Up to point format 5, lazrs calls itself at each change between sequences of GPS times. Many bytes of 255 in
-  a row decode to so many changes that the stack overflows.
+- lazrs calls itself at each change between sequences of GPS times. Many bytes of 255 in a row decode to so
+  many changes that the stack overflows.
 """
 
 import itertools
@@ -34,7 +34,9 @@ _EXTRA_BYTES, _EXTRA_LAYERS = 0, 14
 # Bytes that lazrs allocates for the statistics of each extra byte.
 _PER_EXTRA_BYTE = 10_000
 # The layers with the fields of a `PointCloud` come first.
-_USED_LAYERS = 5
+_USED_LAYERS = 9
+# Number of the layer with GPS times.
+_TIMES_LAYER = 8
 _TABLE_HEADER = struct.Struct("<2I")
 _IMPOSSIBLE_START, _ENDLESS_TIMES = b"\xff" * 4, b"\xff" * 8
 
@@ -87,6 +89,7 @@ def _import_lazrs() -> Any:
 def _selection(lazrs: Any) -> Any:
     """Return lazrs' selection of the fields that a `PointCloud` holds."""
     names = ("XY_RETURNS_CHANNEL", "Z", "CLASSIFICATION", "FLAGS", "INTENSITY")
+    names += ("SCAN_ANGLE", "POINT_SOURCE_ID", "GPS_TIME")
     return lazrs.DecompressionSelection(sum(getattr(lazrs, f"SELECTIVE_DECOMPRESS_{n}") for n in names))
 
 
@@ -178,6 +181,9 @@ def _check_layers(
             file.seek(starts[layer])
             if file.read(4) == _IMPOSSIBLE_START:
                 raise ValueError(f"{path}: chunk {i}: layer {layer} is damaged")
+        file.seek(starts[_TIMES_LAYER])
+        if _ENDLESS_TIMES in file.read(int(layers[_TIMES_LAYER])):
+            raise ValueError(f"{path}: chunk {i}: its GPS times are damaged: bytes of 255 in a row")
         offset += size
 
 
