@@ -10,8 +10,8 @@ waveforms is in the package `inversion`.
 
 ## The instrument
 
-`Lidar`, `AbstractPulse`, `GaussianPulse`, `ExponentiallyModifiedGaussianPulse`, `RectangularPulse`,
-`SampledPulse`.
+`Lidar`, `instrument`, `instruments`, `instrument_sources`, `InstrumentValue`, `AbstractPulse`,
+`GaussianPulse`, `ExponentiallyModifiedGaussianPulse`, `RectangularPulse`, `SampledPulse`.
 
 ## Record as a receiver does
 
@@ -20,7 +20,7 @@ waveforms is in the package `inversion`.
 ## Surveys of many shots
 
 `Survey`, `AbstractScan`, `Oscillating`, `RotatingPolygon`, `Conical`, `simulate_many`, `Waveforms`,
-`SurveyProgress`, `SceneParts`.
+`SurveyProgress`, `SceneParts`, `Acquisition`, `DiscreteReturns`.
 
 ## Scenes
 
@@ -72,12 +72,14 @@ from jaxlidar import extend, io
 from jaxlidar._checks import UnitWarning
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._deprecated import RENAMED, warn_renamed
+from jaxlidar._fingerprint import version_of
 from jaxlidar._progress import Progress
 from jaxlidar._registry import register_public_objects, waveform_html
 from jaxlidar._signatures import shorten_signatures
 from jaxlidar._workers import LostWorkersWarning
 from jaxlidar.analog import AnalogReturns, analog_returns, photon_paths
 from jaxlidar.energy import EnergyBudget, energy_budget
+from jaxlidar.instrument.catalogue import InstrumentValue, instrument, instrument_sources, instruments
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.instrument.photon_counter import PhotonCounter, PhotonEvents
 from jaxlidar.instrument.pulse import (
@@ -121,8 +123,10 @@ from jaxlidar.scenes.terrain import Terrain
 from jaxlidar.scenes.voxels import VoxelMap
 from jaxlidar.simulate import LateLightWarning, UnfollowedLightWarning, simulate
 from jaxlidar.spectral.waveform import Waveform, total_reflectance, waveform_of
+from jaxlidar.survey.acquisition import Acquisition
 from jaxlidar.survey.coverage import OffMapWarning
 from jaxlidar.survey.progress import SurveyProgress
+from jaxlidar.survey.returns import DiscreteReturns
 from jaxlidar.survey.simulate_many import simulate_many
 from jaxlidar.survey.truths import Truths
 from jaxlidar.survey.waveforms import Waveforms
@@ -142,6 +146,10 @@ __all__ = [
     "rerun",
     # The instrument.
     "Lidar",
+    "instrument",
+    "instruments",
+    "instrument_sources",
+    "InstrumentValue",
     "AbstractPulse",
     "GaussianPulse",
     "ExponentiallyModifiedGaussianPulse",
@@ -163,6 +171,8 @@ __all__ = [
     "Waveforms",
     "SurveyProgress",
     "SceneParts",
+    "Acquisition",
+    "DiscreteReturns",
     # Scenes.
     "Scene",
     "Canopy",
@@ -252,6 +262,8 @@ __all__ = [
     "plot",
     "extend",
 ]
+
+__version__ = version_of("jaxlidar")
 
 shorten_signatures(globals())
 
