@@ -10,8 +10,8 @@ waveforms is in the package `inversion`.
 
 ## The instrument
 
-`Lidar`, `AbstractPulse`, `GaussianPulse`, `ExponentiallyModifiedGaussianPulse`, `RectangularPulse`,
-`SampledPulse`.
+`Lidar`, `instrument`, `instruments`, `instrument_sources`, `InstrumentValue`, `AbstractPulse`,
+`GaussianPulse`, `ExponentiallyModifiedGaussianPulse`, `RectangularPulse`, `SampledPulse`.
 
 ## Record as a receiver does
 
@@ -20,7 +20,7 @@ waveforms is in the package `inversion`.
 ## Surveys of many shots
 
 `Survey`, `AbstractScan`, `Oscillating`, `RotatingPolygon`, `Conical`, `simulate_many`, `Waveforms`,
-`SurveyProgress`, `SceneParts`.
+`SurveyProgress`, `SceneParts`, `Acquisition`, `DiscreteReturns`.
 
 ## Many scenes
 
@@ -85,12 +85,14 @@ from jaxlidar._checks import UnitWarning
 from jaxlidar._compilation_cache import CompilationCache, compilation_cache
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._deprecated import RENAMED, warn_renamed
+from jaxlidar._fingerprint import version_of
 from jaxlidar._progress import Progress
 from jaxlidar._registry import register_public_objects, waveform_html
 from jaxlidar._signatures import shorten_signatures
 from jaxlidar._workers import LostWorkersWarning
 from jaxlidar.analog import AnalogReturns, analog_returns, photon_paths
 from jaxlidar.energy import EnergyBudget, energy_budget
+from jaxlidar.instrument.catalogue import InstrumentValue, instrument, instrument_sources, instruments
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.instrument.photon_counter import PhotonCounter, PhotonEvents
 from jaxlidar.instrument.pulse import (
@@ -138,8 +140,10 @@ from jaxlidar.scenes.terrain import Terrain
 from jaxlidar.scenes.voxels import VoxelMap
 from jaxlidar.simulate import LateLightWarning, UnfollowedLightWarning, simulate
 from jaxlidar.spectral.waveform import Waveform, total_reflectance, waveform_of
+from jaxlidar.survey.acquisition import Acquisition
 from jaxlidar.survey.coverage import OffMapWarning
 from jaxlidar.survey.progress import SurveyProgress
+from jaxlidar.survey.returns import DiscreteReturns
 from jaxlidar.survey.simulate_many import simulate_many
 from jaxlidar.survey.truths import Truths
 from jaxlidar.survey.waveforms import Waveforms
@@ -159,6 +163,10 @@ __all__ = [
     "rerun",
     # The instrument.
     "Lidar",
+    "instrument",
+    "instruments",
+    "instrument_sources",
+    "InstrumentValue",
     "AbstractPulse",
     "GaussianPulse",
     "ExponentiallyModifiedGaussianPulse",
@@ -184,6 +192,8 @@ __all__ = [
     "simulate_scenes",
     "SceneWaveforms",
     "plan_scenes",
+    "Acquisition",
+    "DiscreteReturns",
     # Scenes.
     "Scene",
     "Canopy",
@@ -282,6 +292,8 @@ __all__ = [
     "plot",
     "extend",
 ]
+
+__version__ = version_of("jaxlidar")
 
 shorten_signatures(globals())
 

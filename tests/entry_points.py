@@ -100,9 +100,13 @@ def events() -> jl.PhotonEvents:
 
 
 @functools.cache
+def waveforms() -> jl.Waveforms:
+    return jl.simulate_many(SURVEY, GROUND, key=KEY, rtol=0.1, max_orders=1, truth=True)
+
+
+@functools.cache
 def events_of_two_shots() -> jl.PhotonEvents:
-    many = jl.simulate_many(SURVEY, GROUND, key=KEY, rtol=0.1, max_orders=1)
-    return jl.record(many, mode="photons", receiver=jl.PhotonCounter(), key=KEY, pulses=20)
+    return jl.record(waveforms(), mode="photons", receiver=jl.PhotonCounter(), key=KEY, pulses=20)
 
 
 @functools.cache
@@ -203,7 +207,9 @@ ENTRY_POINTS: dict[str, Callable[[], EntryPoint]] = {
     ),
     "Survey": lambda: EntryPoint(
         lambda **arguments: jl.Survey(LIDAR, **arguments),
-        {"position": TWO, "zenith": np.array([0.0, 1.0]), "azimuth": np.array([0.0, 1.0])},
+        {"position": TWO, "zenith": np.array([0.0, 1.0]), "azimuth": np.array([0.0, 1.0])}
+        | {"gps_time": np.array([0.0, 1.0]), "scan_angle": np.array([0.0, 1.0])}
+        | {"flight_line": np.array([1, 2])},
     ),
     "Survey.about": lambda: EntryPoint(SURVEY.about, {"origin": np.array([1.0, 2.0])}),
     "Survey.grid": lambda: EntryPoint(
@@ -216,7 +222,8 @@ ENTRY_POINTS: dict[str, Callable[[], EntryPoint]] = {
     ),
     "Survey.scan": lambda: EntryPoint(
         lambda **arguments: jl.Survey.scan(LIDAR, jl.Oscillating(10.0, 50.0), **arguments),
-        {"start": (0.0, 0.0), "end": (0.5, 0.0), "speed": 50.0, "pulse_rate": 1000.0},
+        {"start": (0.0, 0.0), "end": (0.5, 0.0), "speed": 50.0, "pulse_rate": 1000.0}
+        | {"gps_time": 1.0, "flight_line": 2},
     ),
     "Oscillating": lambda: EntryPoint(jl.Oscillating, {"half_angle": 10.0, "frequency": 50.0}),
     "Oscillating.direction": lambda: EntryPoint(jl.Oscillating(10.0, 50.0).direction, {"time": BINS}),
@@ -400,6 +407,14 @@ ENTRY_POINTS: dict[str, Callable[[], EntryPoint]] = {
         lambda **arguments: jl.simulate(LIDAR, GROUND, key=KEY, **arguments),
         {"rtol": 0.1, "atol": 0.1, "n_photons": 1000, "max_orders": 1, "max_step": 1.0, "n_rays": 64},
     ),
+    "Waveforms.returns": lambda: EntryPoint(
+        waveforms().returns,
+        {"wavelength": 1064.0, "record": waveforms().recorded, "background": 0.0, "noise": 1e-18}
+        | {"threshold": 1e-17, "fraction": 0.5, "max_returns": 2},
+    ),
+    "Waveforms.true_returns": lambda: EntryPoint(
+        waveforms().true_returns, {"wavelength": 1064.0, "min_reflectance": 1e-3}
+    ),
     "simulate_many": lambda: EntryPoint(
         lambda **arguments: jl.simulate_many(SURVEY, GROUND, key=KEY, **arguments),
         {"rtol": 0.1, "max_orders": 1},
@@ -435,7 +450,7 @@ ENTRY_POINTS: dict[str, Callable[[], EntryPoint]] = {
     "io.AirborneShot": lambda: EntryPoint(
         lambda **arguments: jl.io.AirborneShot(returning=(SEGMENT,), **arguments),
         {"index": 0, **LINE, "noise_mean": 0.0, "noise_std": 1.0, "pedestal": 0.0, "pulse_zero": 0.0}
-        | {"metres": np.ones(3), "gps_time": 1.0},
+        | {"metres": np.ones(3), "gps_time": 1.0, "scan_angle": 1.0, "flight_line": 1},
     ),
     "io.AirborneShot.of_channel": lambda: EntryPoint(SHOT.of_channel, {"channel": 0}),
     "io.AirborneShot.time_from": lambda: EntryPoint(SHOT.time_from, {"elevation": 1.0}),
@@ -482,7 +497,7 @@ ENTRY_POINTS: dict[str, Callable[[], EntryPoint]] = {
         lambda **arguments: jl.io.write_las(folder() / "b.las", **arguments),
         {"position": np.zeros((2, 3)), "intensity": np.ones(2), "return_number": np.array([1, 2])}
         | {"number_of_returns": np.array([2, 2]), "gps_time": np.ones(2)}
-        | {"classification": np.array([1, 2])},
+        | {"classification": np.array([1, 2]), "scan_angle": np.ones(2), "point_source": np.array([1, 2])},
     ),
     "io.write_las_waveforms": lambda: EntryPoint(
         lambda point_format: jl.io.write_las_waveforms(folder() / "c.las", [SHOT], point_format=point_format),

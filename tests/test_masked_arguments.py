@@ -101,7 +101,7 @@ def test_masks_booleans_and_times(outcomes, name):
 # the others make.
 RESULTS = (
     *("Waveform", "Progress", "PhotonEvents", "Waveforms", "SurveyProgress", "Truth", "Truths"),
-    *("EnergyBudget",),
+    *("EnergyBudget", "Acquisition", "DiscreteReturns", "InstrumentValue"),
     *("Plan", "Effect", "Setup", "Response", "AnalogReturns", "io.DemRead", "io.GediShot", "io.MeshRead"),
     *("io.NeonImpulse", "io.NeonRead", "io.PointCloud", "io.Returns", "io.Scanner", "io.ShotStack"),
     *("io.TreeRead", "io.VoxelsRead", "io.AirborneShots", "inversion.Retrieval", "inversion.Retrievals"),
@@ -122,6 +122,7 @@ RESULTS = (
     *("inversion.ComparedColumn",),
 )
 OF_OBJECTS = (
+    *("instrument", "instruments", "instrument_sources"),
     *("total_reflectance", "open", "rerun", "Scene", "load_coefficients", "spectrum_names"),
     *("read_spectrum_csv", "Symbol", "Word", "LSystem", "trim_empty_layers", "truth_of", "make_setup"),
     *("trace_scene", "waveform_of", "Lambertian", "EqualAngle", "spectrum", "Plane"),

@@ -34,6 +34,7 @@ from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._files import atomic_write
 from jaxlidar._fingerprint import version_of
 from jaxlidar.instrument.lidar import Lidar
+from jaxlidar.instrument.receiver import Receiver
 from jaxlidar.instrument.survey import Survey
 from jaxlidar.io.checks import MAX_COUNTS
 from jaxlidar.io.coordinates import metric_system
@@ -182,6 +183,8 @@ def write_gedi_l1b(
     if key is not None:
         check_key(key)
     per_joule = gain / _energy_per_reflectance(survey)
+    check_kind("receiver", survey.lidar.receiver, Receiver, "a Receiver: GEDI digitises")
+    assert isinstance(survey.lidar.receiver, Receiver)
     background = concrete_number(survey.lidar.receiver.background)
     pulse, pulse_zero = _transmitted_pulse(survey.lidar)
     columns = {

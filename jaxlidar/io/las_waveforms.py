@@ -36,7 +36,14 @@ from jaxlidar.io.coordinates import (
     system_of_name,
     wkt_of_units,
 )
-from jaxlidar.io.las import import_laspy, las_path, las_points, point_format_of, write_points
+from jaxlidar.io.las import (
+    import_laspy,
+    las_path,
+    las_points,
+    point_format_of,
+    scan_angles,
+    write_points,
+)
 from jaxlidar.io.las_header import LasHeader, read_header
 
 # Point formats with packets.
@@ -288,6 +295,8 @@ class _LasShots(AirborneShots):
             "metres": self.units.metres(anchor),
             "gps_time": float(points_of_packets[0]["gps_time"][0]),
             "scanner_channel": int(_scanner_channel(points_of_packets[0])[0]),
+            "scan_angle": float(scan_angles(points_of_packets[0][:1])[0]),
+            "flight_line": int(points_of_packets[0]["point_source_id"][0]),
             "returns": Returns(np.concatenate(positions), np.concatenate(times), *numbers),
             "crs": self.system.text,
         }
@@ -466,7 +475,8 @@ def write_las_waveforms(
     """Write airborne shots as a LAS 1.4 file with waveform packets in a .wdp file beside it.
 
     Samples, their gain, offset and sampling interval, GPS times and scanner channels are kept exactly;
-    positions are rounded to mm, directions to single precision. The shots' returns become points. A segment
+    positions are rounded to mm, directions to single precision, scan angles to 0.006 degrees (whole ones in
+    formats 4 and 5). The shots' returns become points. A segment
     without a return gets one, at its largest sample, flagged as synthetic, because packets are found by their
     points. The format has no place for outgoing pulses. Shots are taken one at a time, so that there may be
     more than memory holds.
@@ -581,6 +591,8 @@ class _PacketWriter:
             "synthetic": is_synthetic.astype(np.uint8),
             "gps_time": np.full(returns.time.size, 0.0 if shot.gps_time is None else shot.gps_time),
             "scanner_channel": np.full(returns.time.size, shot.scanner_channel),
+            "scan_angle": np.full(returns.time.size, shot.scan_angle),
+            "point_source_id": np.full(returns.time.size, shot.flight_line),
             "wavepacket_index": layout[segment_of_return],
             "wavepacket_offset": offset[segment_of_return],
             "wavepacket_size": size[segment_of_return],

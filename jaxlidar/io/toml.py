@@ -19,6 +19,7 @@ from jaxlidar._checks import is_traced, kind_of
 from jaxlidar.io.kinds import (
     Argument,
     admits_mapping,
+    admits_numbers_alone,
     admits_text,
     admits_tuple,
     arguments_of,
@@ -116,6 +117,9 @@ def value_of(table: Any, argument: Argument, path: str, read_array: ArrayReader,
     valid ones, for missing arguments, and for what the kind itself refuses.
     """
     annotation = argument.annotation
+    if isinstance(table, str) and table != _NONE and admits_numbers_alone(annotation):
+        # Names of all kinds would not help here.
+        raise ValueError(f"{path} = {table!r} is a text; admissible is a number, without quotes")
     if isinstance(table, str) and not admits_text(annotation):
         return _kind_without_arguments(table, path, read_array, folder)
     if isinstance(table, list | tuple):

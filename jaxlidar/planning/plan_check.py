@@ -146,7 +146,7 @@ def _misfit_times(plan: Plan, lidar: Lidar, scene: Scene) -> Iterator[str]:
 def _misfit_pulse(plan: Plan, lidar: Lidar, scene: Scene) -> Iterator[str]:
     """Yield misfits in the pulse, and in its sampling."""
     interval = concrete_number(lidar.sampling_interval)
-    if lidar.receiver.window == "fixed" and abs(plan.sample_interval - interval) > _ROUNDING * interval:
+    if not lidar.opens_at_first_return and abs(plan.sample_interval - interval) > _ROUNDING * interval:
         yield f"it has samples of {plan.sample_interval:g} ns; sampling_interval = {interval:g} ns"
     jitter = concrete_number(lidar.jitter)
     feature = math.hypot(concrete_number(lidar.pulse.finest), jitter)

@@ -1,5 +1,6 @@
 """`Setup`: a lidar and a scene without the effects that a plan leaves out."""
 
+import dataclasses
 from typing import final
 
 import equinox as eqx
@@ -75,6 +76,9 @@ def make_setup(lidar: Lidar, scene: Scene, plan: Plan) -> Setup:
     check_kind("plan", plan, Plan, "a Plan that jaxlidar.plan made")
     # What the plan found to be flat or empty is not simulated: traced, it would lose its derivatives.
     ground = scene.ground
+    if lidar.scan is not None:
+        # Shots do not depend on the scan pattern: lidars with and without one share compiled programs.
+        lidar = dataclasses.replace(lidar, scan=None)
     if plan.scope.flat_terrain and isinstance(ground, Terrain) and is_traced(ground.heights):
         raise ValueError(
             "the plan takes the terrain for a plane, but its heights are being traced by a JAX "

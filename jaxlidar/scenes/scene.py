@@ -13,6 +13,7 @@ from jaxlidar._checks import check_kind, concrete, kind_of
 from jaxlidar._converted import Converted
 from jaxlidar._ranges import Range
 from jaxlidar._signatures import briefly
+from jaxlidar._text import object_text
 from jaxlidar._vectors import FAR
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.scenes.atmosphere import Atmosphere
@@ -67,6 +68,9 @@ class Scene(eqx.Module):
     atmosphere: Atmosphere | None = None
 
     ranges: ClassVar = {"gap": Range(MIN_GAP)}
+
+    def __str__(self) -> str:
+        return object_text(self)
 
     def __check_init__(self):
         hint = ", as in Canopy(voxels, leaf=...)" if isinstance(self.canopy, VoxelMap) else ""
