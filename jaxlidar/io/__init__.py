@@ -19,7 +19,6 @@ from jaxlidar.io.gedi import GediShot, read_gedi_l1b
 from jaxlidar.io.gedi_level2 import read_gedi_l2a, read_gedi_l2b
 from jaxlidar.io.gedi_writer import write_gedi_l1b
 from jaxlidar.io.icesat2 import PhotonImpulse, PhotonTrack, read_atl03, read_atl08
-from jaxlidar.io.las import PointCloud, read_las, write_las
 from jaxlidar.io.las import read_las, write_las
 from jaxlidar.io.las_waveforms import read_las_waveforms, write_las_waveforms
 from jaxlidar.io.lvis import read_lvis_l1b, read_lvis_l2

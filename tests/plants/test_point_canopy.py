@@ -140,7 +140,7 @@ def test_a_simulation_is_close_to_the_sum_of_points():
 )
 def test_points_that_are_no_returns_are_refused(change, message):
     ones = np.ones(4, int)
-    points = PointCloud(np.zeros((4, 3)), ones, ones, one, 1.0 * ones, {})
+    points = PointCloud(np.zeros((4, 3)), ones, ones, ones, 1.0 * ones, {})
     with pytest.raises(ValueError, match=message):
         jl.canopy_from_points(points._replace(**change))
     with pytest.raises(ValueError, match="voxel_size"):
