@@ -1,4 +1,4 @@
-"""The cache of compiled programs: programs are stored and read repeated, and JAX's settings come back."""
+"""The cache of compiled programs: programs are stored and read again, and JAX's settings come back."""
 
 import equinox as eqx
 import jax

@@ -142,6 +142,7 @@ def test_sun_and_sensor_may_change_places():
     assert float(forward.stderr[0]) < 0.01 * float(forward.reflectance[0])
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_finite_differences():
     def scene_of(values):
         leaf = jl.LeafOptics(values[0], 0.3)
