@@ -21,6 +21,8 @@ from jaxlidar.io.tables import matching_rows
 
 # Fewest rows of which a rank correlation is given, and the class of all rows.
 _MIN_RANKED, _ALL_ROWS = 3, "all"
+# Rows of statistics that are printed.
+_PRINTED_ROWS = 30
 # Ending of the names of standard errors.
 _STDERR = "_stderr"
 
@@ -103,12 +105,14 @@ class Comparison(NamedTuple):
             f"{'column':<22} {'class':<8} {'rows':>6} {'bias':>8} {'median':>8} {'rmse':>8} "
             f"{'|median|':>9} {'rank':>6} {covered:>14}"
         ]
-        for row in self.statistics:
+        for row in self.statistics[:_PRINTED_ROWS]:
             lines.append(
                 f"{row.column[:22]:<22} {row.group[:8]:<8} {row.count:>6} {row.bias:>8.3g} "
                 f"{row.median:>8.3g} {row.rmse:>8.3g} {row.median_absolute:>9.3g} {row.rank:>6.2f} "
                 f"{row.coverage:>14.2f}"
             )
+        if len(self.statistics) > _PRINTED_ROWS:
+            lines.append(f"... {len(self.statistics) - _PRINTED_ROWS} more rows")
         return "\n".join(lines)
 
 
@@ -158,6 +162,9 @@ def compare(
     if columns is None:
         names = {n: n for n in estimates if n in references and n != on and not n.endswith(_STDERR)}
         names = {n: n for n in names if all(_is_numeric(t[n]) for t in (estimates, references))}
+        # Levels of a second axis are compared where they are asked for: there may be hundreds.
+        if isinstance(table, ShotTable):
+            names = {n: n for n in names if n in table}
         if not names:
             raise ValueError("columns = None: the two tables have no column of numbers in common")
     else:

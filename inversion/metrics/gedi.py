@@ -174,8 +174,11 @@ class PaddedShots(NamedTuple):
     batches: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]
 
 
-def pad_shots(shots: list[Any], *, size: int | None = None) -> PaddedShots:
+def pad_shots(shots: list[Any], *, size: int | None = None, is_checked: bool = False) -> PaddedShots:
     """Check the records of shots and pad them to their size buckets, or all of them to `size` samples.
+
+    **Arguments:** `is_checked`: the records have been checked before, by `record_above_noise` and
+    `even_step`.
 
     **Raises:** ValueError as `gedi_metrics`.
     """
@@ -194,12 +197,15 @@ def pad_shots(shots: list[Any], *, size: int | None = None) -> PaddedShots:
             noise, count = np.ones(_CHUNK), np.full(_CHUNK, 3)
             for row, i in enumerate(chunk):
                 shot = shots[i]
-                record = record_above_noise(shot)
+                record = shot.waveform - shot.noise_mean if is_checked else record_above_noise(shot)
                 # Over the largest sample, which single precision holds whatever the unit of the record.
                 peak = np.max(np.abs(record)) or 1.0
                 records[row, : n_samples[i]] = record / peak
                 noise[row], count[row] = shot.noise_std / peak, n_samples[i]
-                top[i], step[i] = shot.elevation[0], even_step("elevation", shot.elevation, decreasing=True)
+                top[i], bottom = shot.elevation[0], shot.elevation[-1]
+                if not is_checked:
+                    even_step("elevation", shot.elevation, decreasing=True)
+                step[i] = (top[i] - bottom) / (n_samples[i] - 1)
             batches.append((chunk, records, count, noise))
     return PaddedShots(top, step, batches)
 

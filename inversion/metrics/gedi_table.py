@@ -123,7 +123,8 @@ def gedi_table(
     - `edges`: (edges,) heights of the layers' edges above the ground in m, increasing. Default: 30 layers of
       5 m, as in level 2B.
     - `reflectance_ratio`: of plants over ground, above 0. Default 1.5, level 2B's.
-    - `projection`, `clumping`: as for `plant_area_index`. Defaults 0.5 and 1.
+    - `projection`: of plant area, as for `plant_area_index`. Default 0.5.
+    - `clumping`: index of clumping, as for `plant_area_index`. Default 1.
     - `progress`: called with a `TableProgress` after each batch of shots. Default None.
 
     **Returns:** a `jaxlidar.io.ShotTable`, a row for each shot in their order, with
@@ -299,14 +300,14 @@ def _estimate(
     for row, shot in enumerate(filled):
         records[row, : shot.waveform.size] = shot.waveform - shot.noise_mean
     n_samples = np.array([shot.waveform.size for shot in filled])
-    step = np.array([float(even_step("elevation", shot.elevation, decreasing=True)) for shot in filled])
+    heights = np.array([np.asarray(shot.elevation, float)[[0, -1]] for shot in filled])
+    top, step = heights[:, 0], (heights[:, 0] - heights[:, 1]) / (n_samples - 1)
     # Heights over the first sample: elevations lose 0.1 mm to 1 mm in single precision.
     height = -step[:, None] * np.arange(padded_size)
-    top = np.array([float(shot.elevation[0]) for shot in filled])
     noise_std = np.array([float(shot.noise_std) for shot in filled])
     pulse = np.stack([_pulse_samples(shot) for shot in filled])
 
-    padded = pad_shots(filled, size=padded_size)
+    padded = pad_shots(filled, size=padded_size, is_checked=True)
     estimates: dict[str, np.ndarray] = {}
     for n in _GROUPS:
         metrics = metrics_of_records(padded, gedi_settings(n))

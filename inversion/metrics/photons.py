@@ -73,8 +73,9 @@ _GROUND_RANGE, _CANOPY_CLEARANCE, _CLEARANCE_SIGMAS = 0.75, 1.0, 3.0
 # Errors of the ground in m beside that of the recursion: on open ground, and more at most under a canopy that
 # goes on down to it. Larger errors than the limit make a ground doubtful, and so do fewer photons than these.
 _MODEL_ERROR, _CANOPY_ERROR, _DOUBTFUL_ERROR, _DOUBTFUL_PHOTONS = 0.1, 0.3, 0.7, 3
-# Depths in m below the ground in which photons are counted, and the number of segments of one count.
-_DEPTH_RANGE, _DEPTH_SEGMENTS = (1.0, 12.0), 5
+# Depths in m below the ground in which photons are counted, and the segments on either side that are counted
+# with each.
+_DEPTH_RANGE, _DEPTH_NEIGHBOURS = (1.0, 12.0), 2
 # Signal photons in a segment, over the fewest of a ground, with which its lower edge is the ground.
 _RICH_SIGNAL = 4.0
 # Length in m of the segments of ATL03. Segments that are printed.
@@ -249,10 +250,9 @@ def photon_ground_and_canopy(
     ground_stderr = np.hypot(curve.stderr_at(middle, lengths), model_error)
     # Light from below the ground: there is a deeper one. Segments about each are counted together.
     is_below = (above < -_DEPTH_RANGE[0]) & (above > -_DEPTH_RANGE[1])
-    window = np.ones(_DEPTH_SEGMENTS)
-    below = np.convolve(np.bincount(number[is_below], minlength=n_segments), window, mode="same")
-    depth_area = np.convolve(expected * lengths, window, mode="same") * (_DEPTH_RANGE[1] - _DEPTH_RANGE[0])
-    is_deeper = below > stats.poisson.isf(_FALSE_DEPTH, depth_area)
+    below = _moving_sum(np.bincount(number[is_below], minlength=n_segments), _DEPTH_NEIGHBOURS)
+    depth_background = _moving_sum(expected * lengths, _DEPTH_NEIGHBOURS) * np.ptp(_DEPTH_RANGE)
+    is_deeper = below > stats.poisson.isf(_FALSE_DEPTH, depth_background)
     verdicts = [
         _verdict(
             bool(has_ground[i]),
@@ -468,14 +468,17 @@ def _local_background(photons: _Photons, surface: _Curve) -> _Background:
     is_away = (offset < -_SURFACE_DEPTH) | (offset > _SURFACE_HEIGHT)
     count = np.bincount(number[is_away], minlength=middle.size)
     half = max(1, round(0.5 * _BACKGROUND_LENGTH / _GROUND_CELL))
-    kernel = np.ones(2 * half + 1)
     length = photons.length / middle.size
     area = length * (below + above)
-    sums = [np.convolve(np.pad(values, half), kernel, mode="valid") for values in (count, area)]
+    count, area = _moving_sum(count, half), _moving_sum(area, half)
     is_enough = below + above >= _MIN_BACKGROUND_HEIGHT
-    mean = _mean_background(photons)
-    density = np.where(is_enough, sums[0] / np.maximum(sums[1], 1e-9), mean)
+    density = np.where(is_enough, count / np.maximum(area, 1e-9), _mean_background(photons))
     return _Background(middle, np.maximum(density, _LEAST_BACKGROUND))
+
+
+def _moving_sum(values: np.ndarray, half: int) -> np.ndarray:
+    """Return the sum of each value and of `half` neighbours on either side, of those that there are."""
+    return np.convolve(np.pad(values, half), np.ones(2 * half + 1), mode="valid")
 
 
 # -- ground ------------------------------------------------------------------------------------------------

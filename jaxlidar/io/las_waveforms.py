@@ -45,6 +45,7 @@ from jaxlidar.io.las import (
     write_points,
 )
 from jaxlidar.io.las_header import LasHeader, read_header
+from jaxlidar.io.laz import decompress_points
 
 # Point formats with packets.
 _PACKET_FORMATS = (4, 5, 9, 10)
@@ -100,15 +101,16 @@ class PacketLayout(NamedTuple):
 
 
 def read_las_waveforms(path: str | os.PathLike[str]) -> AirborneShots:
-    """Open the shots of a LAS file with waveform packets (point formats 4, 5, 9 and 10).
+    """Open the shots of a LAS or LAZ file with waveform packets (point formats 4, 5, 9 and 10).
 
-    This needs laspy (`pip install "jaxlidar[io]"`). Both files are mapped: samples are read when a shot is
-    indexed. Each shot has its points as `returns`, and no outgoing pulse. Coordinates may be metres, feet or
-    degrees.
+    This needs laspy, and lazrs for LAZ (`pip install "jaxlidar[io]"`). Both files are mapped, but for the
+    points of LAZ, which are unpacked into memory: samples are read when a shot is indexed. Packets that are
+    compressed themselves are refused, as no library reads them. Each shot has its points as `returns`, and no
+    outgoing pulse. Coordinates may be metres, feet or degrees.
 
     **Arguments:**
 
-    - `path`: the .las file; packets lie in it, or in the .wdp file beside it under the same name.
+    - `path`: the .las or .laz file; packets lie in it, or in the .wdp file beside it under the same name.
 
     **Returns:** an `AirborneShots`, in the order of GPS time. Its `dropped` counts points "without a packet".
 
@@ -130,10 +132,10 @@ def read_las_waveforms(path: str | os.PathLike[str]) -> AirborneShots:
 
 
 def has_packets(path: Path) -> bool:
-    """Return True if the points of a LAS file, not compressed, have waveform packets."""
+    """Return True if the points of a LAS or LAZ file have waveform packets."""
     with path.open("rb") as file:
         header = read_header(path, file)
-    return header.point_format in _PACKET_FORMATS and header.laszip is None
+    return header.point_format in _PACKET_FORMATS
 
 
 @final
@@ -155,14 +157,16 @@ class _LasShots(AirborneShots):
                     f"{path}: header: point format {header.point_format} has no packets; {_PACKET_FORMATS} "
                     "have"
                 )
-            if header.laszip is not None:
-                raise ValueError(f"{path}: header: points are compressed: their packets are not read")
             self.layouts = _read_layouts(path, file, header)
             self.system = header.coordinate_system(path, file)
             file.seek(_FLAGS_OFFSET)
             flags = int.from_bytes(file.read(2), "little")
             file.seek(_PACKETS_OFFSET)
             internal_offset = int.from_bytes(file.read(8), "little")
+            # Points of LAZ files are unpacked into memory; those of LAS files are mapped.
+            unpacked = None
+            if header.laszip is not None:
+                unpacked = decompress_points(path, file, header, with_packets=True)
         packet_path, self.packets_offset = path, internal_offset
         if not flags & _INTERNAL_PACKETS:
             packet_path, self.packets_offset = existing_file(_packet_path(path)), 0
@@ -172,9 +176,11 @@ class _LasShots(AirborneShots):
         _check_packets_header(packet_path, self.packet_bytes, self.packets_offset)
         self.scale, self.offset = np.array(header.scales), np.array(header.offsets)
         point_format = point_format_of(header)
-        self.points: Any = laspy.PackedPointRecord(
-            np.memmap(path, point_format.dtype(), "r", header.start, (header.points,)), point_format
-        )
+        if unpacked is None:
+            records: Any = np.memmap(path, point_format.dtype(), "r", header.start, (header.points,))
+        else:
+            records = np.frombuffer(unpacked, point_format.dtype(), header.points)
+        self.points: Any = laspy.PackedPointRecord(records, point_format)
         self._sort_points_and_packets()
 
     def _sort_points_and_packets(self) -> None:

@@ -213,3 +213,26 @@ def test_a_recorded_track_agrees_with_the_product(shared):
     assert len(coarse.distance) == 5
     with pytest.raises(ValueError, match="distance is given; admissible for a PhotonTrack is None"):
         inversion.photon_ground_and_canopy(track, track.distance)
+
+
+def test_short_tracks_and_tracks_without_photons_have_rows_too():
+    none = np.zeros(0)
+    numbers = {name: none.astype(int) for name in ("pulse", "confidence", "quality", "segment")}
+    columns = dict.fromkeys(("distance", "height", "latitude", "longitude", "time", "background_rate"), none)
+    rows = dict.fromkeys(
+        ("segment_start", "segment_latitude", "segment_longitude", "solar_elevation"), np.zeros(1)
+    )
+    empty = jl.io.PhotonTrack(
+        beam="gt1r",
+        segment_id=np.array([7]),
+        segment_length=np.array([20.0]),
+        **numbers,
+        **columns,
+        **rows,
+    )
+    heights = inversion.photon_ground_and_canopy(empty)
+    assert heights.quality.tolist() == ["bad"]
+    assert np.isnan(heights.ground[0])
+    assert len(heights.label) == 0
+    short = inversion.photon_ground_and_canopy(events_of(track(0.0), 1e6), DISTANCE, segment=150.0)
+    assert short.quality.tolist() == ["good", "good"]
