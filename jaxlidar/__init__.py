@@ -24,8 +24,8 @@ waveforms is in the package `inversion`.
 
 ## Scenes
 
-`Scene`, `Canopy`, `VoxelMap`, `Ground`, `Terrain`, `Plate`, `Atmosphere`, `AbstractSurface`,
-`AbstractGround`, `AbstractSheet`, `AbstractShape`, `Plane`.
+`Scene`, `Canopy`, `VoxelMap`, `Ground`, `Terrain`, `Plate`, `MeshSurface`, `MeshInstances`, `Atmosphere`,
+`AbstractSurface`, `AbstractGround`, `AbstractSheet`, `AbstractShape`, `Plane`.
 
 ## Leaf optics and spectra
 
@@ -112,6 +112,7 @@ from jaxlidar.plants.turtle import turtle
 from jaxlidar.plants.voxelise import trim_empty_layers, voxelise, voxelise_points
 from jaxlidar.scenes.atmosphere import Atmosphere
 from jaxlidar.scenes.canopy import Canopy
+from jaxlidar.scenes.mesh_surface import MeshInstances, MeshSurface
 from jaxlidar.scenes.relative_height import MisplacedCanopyWarning
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.scene_parts import SceneParts
@@ -170,6 +171,8 @@ __all__ = [
     "Ground",
     "Terrain",
     "Plate",
+    "MeshSurface",
+    "MeshInstances",
     "Atmosphere",
     "AbstractSurface",
     "AbstractGround",
