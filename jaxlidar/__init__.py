@@ -41,7 +41,7 @@ waveforms is in the package `inversion`.
 
 `Habit`, `Branching`, `broadleaf`, `conifer`, `shrub`, `spreading_tree`, `grow`, `forest`, `Tree`,
 `LSystem`, `Rule`, `Symbol`, `Word`, `turtle`, `voxelise`, `voxelise_points`, `voxelise_mesh`, `Mesh`,
-`trim_empty_layers`.
+`mesh_of`, `trim_empty_layers`.
 
 ## Truth and energy
 
@@ -58,7 +58,7 @@ waveforms is in the package `inversion`.
 ## Warnings and constants
 
 `LateLightWarning`, `UnfollowedLightWarning`, `MisplacedCanopyWarning`, `LostWorkersWarning`, `OffMapWarning`,
-`OutlineWarning`, `UnitWarning`, `SPEED_OF_LIGHT`.
+`OutlineWarning`, `SolidMeshWarning`, `UnitWarning`, `SPEED_OF_LIGHT`.
 
 ## Packages of their own
 
@@ -106,7 +106,7 @@ from jaxlidar.planning.setup import Setup, make_setup
 from jaxlidar.plants.forest import forest
 from jaxlidar.plants.habits import Branching, Habit, broadleaf, conifer, grow, shrub, spreading_tree
 from jaxlidar.plants.lsystem import LSystem, Rule, Symbol, Word
-from jaxlidar.plants.meshes import Mesh, voxelise_mesh
+from jaxlidar.plants.meshes import Mesh, SolidMeshWarning, mesh_of, voxelise_mesh
 from jaxlidar.plants.tree import Tree
 from jaxlidar.plants.turtle import turtle
 from jaxlidar.plants.voxelise import trim_empty_layers, voxelise, voxelise_points
@@ -221,6 +221,7 @@ __all__ = [
     "voxelise_points",
     "voxelise_mesh",
     "Mesh",
+    "mesh_of",
     "trim_empty_layers",
     # Truth and energy.
     "truth_of",
@@ -248,6 +249,7 @@ __all__ = [
     "LostWorkersWarning",
     "OffMapWarning",
     "OutlineWarning",
+    "SolidMeshWarning",
     "UnitWarning",
     "SPEED_OF_LIGHT",
     # Packages of their own.

@@ -24,7 +24,6 @@ from jaxlidar.planning.orders import OrderChoice
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.surfaces import Ground
 
-
 # Reasons why effects are off that the user has not switched off.
 _REASONS_TO_LEAVE_OUT = {"relief": "the terrain is a plane", "meshes": "met by no ray of order one"}
 

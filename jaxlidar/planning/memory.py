@@ -75,7 +75,9 @@ def mesh_bytes(meshes: Sequence[MeshSurface]) -> float:
 
     While the tree is built, its levels and the table are alive at once.
     """
-    n_leaves, n_vertices = (sum(map(len, a)) for a in ([m.faces for m in meshes], [m.vertices for m in meshes]))
+    n_leaves, n_vertices = (
+        sum(map(len, a)) for a in ([m.faces for m in meshes], [m.vertices for m in meshes])
+    )
     n_instances = sum(len(mesh.instances) for mesh in meshes)
     numbers = 2 * _TREE_COPIES * ROW * (n_leaves + n_instances) + 9 * n_leaves + 3 * n_vertices
     return float(_number_bytes() * numbers + 4 * (6 * n_leaves + 3 * n_instances))

@@ -270,8 +270,8 @@ def plan(
       Default "random".
     - `effects`: effects to switch off, by name, as in {"multiple scattering": False}; True asks for what is
       on anyway and refuses scenes that do not have it. Only leaf or bark that is zero everywhere, relief of
-      terrain that is a plane, and meshes that no ray of one order meets are off unless True asks for them. The names are those of the table's first
-      column. Default None.
+      terrain that is a plane, and meshes that no ray of a single order meets are off unless True asks for
+      them. The names are those of the table's first column. Default None.
     - `max_memory`: GB that the simulation may take, positive. Default None: a quarter of the machine's.
     - `histories`: True to keep scattering histories, so that one trace serves all optics and wavelengths;
       False to apply optics while light is traced, for at most 8 wavelengths, which has no limit on orders
@@ -315,8 +315,8 @@ def plan(
     # From here on x = y = 0 is the aim point, or the middle of the survey (see `local_origin`).
     survey = None if survey is None else survey.about(concrete_array(lidar.position))
     lidar, scene = move_aim_to_origin(lidar, scene)
-    # 1. Effects: leaf or bark that is zero everywhere, relief of flat terrain, and meshes out of reach are off,
-    # then what the user switches off. The table compares with everything else in place.
+    # 1. Effects: leaf or bark that is zero everywhere, relief of flat terrain, and meshes out of reach are
+    # off, then what the user switches off. The table compares with everything else in place.
     empty_materials = find_empty_materials(scene, effects)
     scene = without_effects(lidar, scene, empty_materials)[1]
     with_relief, scene = scene, replace_plane_terrain(scene, effects)

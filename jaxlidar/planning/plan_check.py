@@ -49,7 +49,7 @@ def _check(plan: Plan, lidar: Lidar, scene: Scene, checks: Sequence[Callable]) -
             )
     if plan.scope.unreached_meshes and meshes_are_in_reach(lidar, scene):
         raise ValueError(
-            "the plan does not fit: it is for meshes that no ray meets; make one for this lidar and this scene"
+            "the plan does not fit: it is for meshes that no ray meets; make one for this lidar and scene"
         )
     # The plan is for the scene without the effects that it leaves out: compare like with like.
     lidar, scene = without_effects(*move_aim_to_origin(lidar, scene), plan.off)

@@ -89,8 +89,8 @@ def make_setup(lidar: Lidar, scene: Scene, plan: Plan) -> Setup:
             )
     if plan.scope.unreached_meshes and any(is_traced(x) for x in jax.tree.leaves(scene.meshes)):
         raise ValueError(
-            "the plan leaves out meshes that no ray meets, but they are being traced by a JAX transformation; "
-            'make the plan with effects={"meshes": True}'
+            "the plan leaves out meshes that no ray meets, but they are being traced by a JAX "
+            'transformation; make the plan with effects={"meshes": True}'
         )
     # A traced value cannot raise an error. NaN in all waveforms cannot be overlooked, and costs one product.
     admissible = jnp.ones(())

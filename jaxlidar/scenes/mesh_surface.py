@@ -145,7 +145,7 @@ def _matrices(rotation: Any, scale: Any, xp: Any) -> Any:
     x, y, z = (v[:, k] for k in range(3))
     zero = xp.zeros_like(x)
     k = xp.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
-    turned = xp.eye(3, dtype=v.dtype) + a[:, None, None] * k + b[:, None, None] * (k @ k)
+    turned = xp.eye(3, dtype=v.dtype)[None] + a[:, None, None] * k + b[:, None, None] * (k @ k)
     return scale[:, None, None] * turned
 
 
@@ -179,10 +179,10 @@ class MeshSurface(eqx.Module):
     Arrays of indices are part of a scene: differentiate with `equinox.filter_grad`, or by a number from which
     you make the scene.
 
-    **Raises:** ValueError for arrays of other shapes, no triangle with an area, more than 2^28,
-    positions that are not finite, indices of vertices that do not exist, optics outside [0, 1], names that the mesh does not have, and a mirror; TypeError for objects of another kind and
-    for vertices that JAX is tracing: make the surface outside, and replace its `vertices` by
-    `equinox.tree_at`.
+    **Raises:** ValueError for arrays of other shapes, no triangle with an area, more than 2^28 triangles,
+    positions that are not finite, indices of vertices that do not exist, optics outside [0, 1], names that
+    the mesh does not have, and a mirror; TypeError for objects of another kind and for vertices that JAX is
+    tracing: make the surface outside, and replace its `vertices` by `equinox.tree_at`.
 
     **Example:** a roof over ground.
 
@@ -272,13 +272,23 @@ class MeshSurface(eqx.Module):
         by = np.append(as_numpy(by, "by"), 0.0)
         if any(a is None for a in arrays):
             offset = self.instances.matrices() @ jnp.asarray(self.origin, float)
-            shift = jnp.asarray(self.instances.shift, float) + offset + jnp.asarray(by, float)
+            shift = jnp.asarray(self.instances.shift, float) + offset + jnp.asarray(by, float)[None]
         else:
             shift = arrays[0] + _matrices(arrays[1], arrays[2], np) @ self.origin + by
         # The origin of the mesh is part of the shift from here on.
-        return eqx.tree_at(
-            lambda s: (s.origin, s.instances.shift), self, (np.zeros_like(self.origin), shift)
-        )
+        return eqx.tree_at(lambda s: (s.origin, s.instances.shift), self, (np.zeros_like(self.origin), shift))
+
+    def corners(self) -> Float[np.ndarray, "triangles 3 3"]:
+        """Return the corners of the triangles of all instances, m, one instance after the other.
+
+        **Raises:** ValueError where JAX is tracing the mesh or its instances.
+        """
+        faces = np.unique(np.asarray(self.faces), axis=0)
+        places = self.instances
+        matrices = _matrices(concrete_array(places.rotation), concrete_array(places.scale), np)
+        vertices = concrete_array(self.vertices) + np.asarray(self.origin, float)
+        placed = np.einsum("nij,vj->nvi", matrices, vertices) + concrete_array(places.shift)[:, None]
+        return placed[:, faces].reshape(-1, 3, 3)
 
     def bounds(self) -> Float[np.ndarray, "instances 2 3"]:
         """Return the lowest and the highest corner, m, of a box around each instance.
@@ -312,7 +322,7 @@ def _mesh_arrays(mesh: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[s
             "mesh is being traced by a JAX transformation; make the MeshSurface outside, and replace its "
             "vertices within by equinox.tree_at"
         )
-    vertices = as_numpy(np.asarray(vertices), "vertices")
+    vertices = as_numpy(vertices, "vertices")
     check_unmasked("faces", faces)
     faces = np.asarray(faces)
     if faces.dtype.kind not in "iu":

@@ -43,7 +43,7 @@ _PARALLEL = 1e-15
 _NOWHERE = 1e35
 # Rounding of a signed area, in units of the floating-point precision and of its products.
 _AREA_ROUNDING = 4.0
-# Relative slack of the distances between which a ray is in a box (Ize 2013, J. Comput. Graph. Tech. 2(2), 12).
+# Relative slack of the distances at which a ray leaves a box (Ize 2013, J. Comput. Graph. Tech. 2(2), 12).
 _BOX_ROUNDING = 8.0
 # Smallest cosine of incidence in derivatives: those of grazing rays are bounded.
 _MIN_COSINE = 1e-4
@@ -125,7 +125,7 @@ def tree_rows(
 
 
 def triangle_rows(corners: Float[Array, "leaves 3 3"]) -> tuple[Float[Array, "rows 12"], Float[Array, "2 3"]]:
-    """Return the rows of the tree of a mesh, and its bounding box; triangles are in the order of the leaves."""
+    """Return the rows of the tree of a mesh, and its bounding box; `corners` in the order of the leaves."""
     leaf_rows = jnp.pad(corners.reshape(-1, 9), ((0, 0), (0, ROW - 9)))
     return tree_rows(leaf_rows, jnp.min(corners, axis=1), jnp.max(corners, axis=1))
 
@@ -140,7 +140,7 @@ def instance_order(centre: Float[Array, "leaves 3"], is_real: Bool[Array, "leave
     low = jnp.min(jnp.where(is_real[:, None], centre, FAR), axis=0)
     high = jnp.max(jnp.where(is_real[:, None], centre, -FAR), axis=0)
     # One scale for all axes, so that cells of the curve are cubes.
-    position = (centre - low) / jnp.maximum(jnp.max(high - low), 1e-30)
+    position = (centre - low[None]) / jnp.maximum(jnp.max(high - low), 1e-30)
     cell = jnp.clip(position * 1023.0, 0.0, 1023.0).astype(jnp.uint32)
     code = jnp.zeros(len(centre), jnp.uint32)
     for bit in range(10):
@@ -228,8 +228,8 @@ def nearest_triangle(
         # 5.
         next_node, next_trail, has_ended = _next_on_trail(node, trail)
         has_ended &= ~descends
-        next_node = jnp.where(descends, 2 * node + takes_second, next_node)
-        next_trail = jnp.where(descends, 2 * trail + (first_met & second_met), next_trail)
+        next_node = jnp.where(descends, 2 * node + takes_second.astype(node.dtype), next_node)
+        next_trail = jnp.where(descends, 2 * trail + (first_met & second_met).astype(trail.dtype), next_trail)
         leaves_mesh, in_upper = s.inside & has_ended, ~s.inside & ~enters
         upper_node, upper_trail, upper_has_ended = _next_on_trail(s.upper_node, s.upper_trail)
         nearest = jnp.where(is_nearer, distance, s.distance)
@@ -296,9 +296,7 @@ def triangle_plane(tree: TriangleTree, hit: TriangleHit, x: Vec, w: Vec) -> tupl
     a, b, c = (vec(corner[k : k + 3]) for k in (0, 3, 6))
     sides = [vec(p - q for p, q in zip(other, a)) for other in (b, c)]
     # A fixed vector where nothing is met keeps quotients finite.
-    local_normal = vec(
-        jnp.where(is_met, m, unit) for m, unit in zip(cross(*sides), (0.0, 0.0, 1.0))
-    )
+    local_normal = vec(jnp.where(is_met, m, unit) for m, unit in zip(cross(*sides), (0.0, 0.0, 1.0)))
     start, direction = to_mesh(transform, x, w)
     cosine, ahead = dot(local_normal, direction), dot(local_normal, vec(p - q for p, q in zip(a, start)))
     normal = vec(dot(local_normal, vec(transform[k + 3 * j] for j in range(3))) for k in range(3))
@@ -323,7 +321,7 @@ def _next_on_trail(node: Array, trail: Array) -> tuple[Array, Array, Array]:
 def _box_distance(
     low: list[Scalar], high: list[Scalar], x: Vec, inverse: Vec, largest: Scalar, precision: float
 ) -> tuple[Bool[Array, "rays"], Scalar]:
-    """Return True where rays meet a box no farther than `largest`, and the distance at which they enter it."""
+    """Return True where rays meet a box, no farther than `largest`, and where they enter it, m."""
     enter, leave = jnp.zeros_like(largest), largest
     for a, b, start, rate in zip(low, high, x, inverse):
         first, second = (a - start) * rate, (b - start) * rate
@@ -332,9 +330,7 @@ def _box_distance(
     return enter <= leave * (1.0 + _BOX_ROUNDING * precision), enter
 
 
-def _triangle_distance(
-    row: list[Scalar], x: Vec, w: Vec, one_sided: Array | int, precision: float
-) -> Scalar:
+def _triangle_distance(row: list[Scalar], x: Vec, w: Vec, one_sided: Array | int, precision: float) -> Scalar:
     """Return the distance along rays to triangles, FAR where they are missed (see the module)."""
     size = [jnp.abs(a) for a in w]
     z_largest = (size[2] >= size[0]) & (size[2] >= size[1])

@@ -86,7 +86,9 @@ def sample_collision(
     if scene.medium is not None:
         collision = select_collision(collided, _in_medium(scene, scene.medium, w, cell, draws), collision)
     for i, surface in enumerate(scene.surfaces):
-        collision = select_collision(landed[i], _on_surface(scene, surface, i, x, w, draws, mesh_normal), collision)
+        collision = select_collision(
+            landed[i], _on_surface(scene, surface, i, x, w, draws, mesh_normal), collision
+        )
     return collision
 
 

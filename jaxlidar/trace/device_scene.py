@@ -278,9 +278,7 @@ def aim_at(scene: DeviceScene, lidar: Lidar, offset: Float[Array, "2"]) -> Devic
         medium = eqx.tree_at(lambda m: m.origin, medium, medium.origin + back)
     surfaces = tuple(surface.moved(back) for surface in scene.surfaces)
     meshes = None if scene.meshes is None else scene.meshes.moved(back)
-    return dataclasses.replace(
-        scene, beam=make_beam(lidar), medium=medium, surfaces=surfaces, meshes=meshes
-    )
+    return dataclasses.replace(scene, beam=make_beam(lidar), medium=medium, surfaces=surfaces, meshes=meshes)
 
 
 def not_scattered(like: Scalar) -> LastScattering:
