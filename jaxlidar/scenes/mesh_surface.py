@@ -20,6 +20,7 @@ from jaxtyping import Array, ArrayLike, Float, Int
 from jaxlidar._checks import (
     as_array,
     as_numpy,
+    as_scalar,
     check_flag,
     check_kind,
     check_numbers,
@@ -31,6 +32,7 @@ from jaxlidar._checks import (
     is_traced,
     kind_of,
 )
+from jaxlidar._converted import Converted
 from jaxlidar._ranges import SUM_OF_FRACTIONS, Range, check_ranges
 from jaxlidar._signatures import briefly
 from jaxlidar._vectors import FAR, Scalar, Vec, along, dot, vec
@@ -259,11 +261,12 @@ class MeshSurface(eqx.Module):
     @property
     def surfaces(self) -> tuple["MeshMaterial", ...]:
         """The surfaces of the mesh, one of each material."""
-        if not self.materials:
-            return (MeshMaterial(self.reflectance, self.transmittance, self.law, self, "mesh"),)
+        optics = {"mesh": (self.reflectance, self.transmittance)}
+        if self.materials:
+            optics = {f"mesh:{n}": (self.reflectance[n], self.transmittance[n]) for n in self.materials}
         return tuple(
-            MeshMaterial(self.reflectance[name], self.transmittance[name], self.law, self, f"mesh:{name}")
-            for name in self.materials
+            MeshMaterial(reflectance=r, transmittance=t, law=self.law, mesh=self, label=name)
+            for name, (r, t) in optics.items()
         )
 
     def moved(self, by: Float[np.ndarray, "2"]) -> "MeshSurface":
@@ -304,15 +307,18 @@ class MeshSurface(eqx.Module):
         return np.stack([middle - half, middle + half], axis=1)
 
 
-def _mesh_arrays(mesh: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[str, ...]]:
+def _mesh_arrays(
+    mesh: Any,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[str, ...]]:
     """Return vertices, faces, the group of each face, and the names of groups, of any kind of mesh."""
+    group, names = None, ("mesh",)
     if isinstance(mesh, tuple | list) and len(mesh) == 2:
-        vertices, faces, group, names = *mesh, None, ("mesh",)
-    elif hasattr(mesh, "vertices") and hasattr(mesh, "faces"):
+        vertices, faces = mesh
+    elif not isinstance(mesh, tuple | list) and hasattr(mesh, "vertices") and hasattr(mesh, "faces"):
         vertices, faces = mesh.vertices, mesh.faces
-        names = getattr(mesh, "materials", None)
-        group = None if names is None else getattr(mesh, "material", None)
-        names = ("mesh",) if group is None else tuple(names)
+        if hasattr(mesh, "materials") and hasattr(mesh, "material"):
+            # A `Mesh`, whose package stands above this one.
+            group, names = mesh.material, tuple(mesh.materials)
     else:
         raise TypeError(
             f"mesh is {kind_of(mesh)}; admissible is a Mesh, a trimesh.Trimesh, or a tuple (vertices, faces)"
@@ -366,10 +372,7 @@ class MeshMaterial(AbstractSheet):
     mesh: MeshSurface
     label: str = eqx.field(static=True)
     transmission: str = eqx.field(static=True, default="diffuse")
-
-    @property
-    def coverage(self) -> Float[Array, ""]:
-        return jnp.ones(())
+    coverage: Converted[Float[Array, ""]] = eqx.field(converter=as_scalar, default=1.0)
 
     @property
     def name(self) -> str:
@@ -396,12 +399,13 @@ class MeshTree(eqx.Module):
     """The tree of the triangles of some meshes (`build_mesh_tree`).
 
     - `tree`: the tree, relative to `offset`, m. - `material`: that of the triangle in each row of the table;
-      None where all have one material.
+      None where all have one material. - `longest_side`: of all triangles, m.
     """
 
     tree: TriangleTree
     offset: Float[Array, "3"]
     material: Int[Array, "rows"] | None
+    longest_side: Float[Array, ""]
 
     def moved(self, by: Float[Array, "3"]) -> "MeshTree":
         """Move all meshes."""
@@ -422,7 +426,10 @@ class MeshTree(eqx.Module):
 
     def rounding(self, x: Vec) -> Scalar:
         """Return a bound, m, on the rounding of a point `x` on a triangle."""
-        size = sum(jnp.abs(a) + jnp.abs(b) for a, b in zip(x, self.offset))
+        # The plane of a triangle is as uncertain as its corners.
+        size = self.longest_side
+        for position, offset in zip(x, self.offset):
+            size = size + jnp.abs(position) + jnp.abs(offset)
         return _POSITION_ROUNDING * float(jnp.finfo(size.dtype).eps) * size
 
 
@@ -433,14 +440,17 @@ def build_mesh_tree(meshes: Sequence[MeshSurface]) -> MeshTree:
     2. The boxes of instances, and their order along a curve.
     3. The upper tree, before the lower ones in one table.
     """
-    lower, boxes, numbers = [], [], []
+    lower, boxes, numbers, longest_sides = [], [], [], []
     transforms, shifts = [], []
     n_instances = sum(len(mesh.instances) for mesh in meshes)
     n_leaves = 1 << (n_instances - 1).bit_length()
     first_row = 2 * n_leaves
     materials, first_material = [jnp.zeros(first_row, jnp.int32)], 0
     for mesh in meshes:
-        rows, box = triangle_rows(mesh.vertices[mesh.faces])
+        corners = mesh.vertices[mesh.faces]
+        rows, box = triangle_rows(corners)
+        longest = jnp.max(jnp.abs(corners - jnp.roll(corners, 1, axis=1)))
+        longest_sides.append(longest * jnp.max(mesh.instances.scale))
         matrices = mesh.instances.matrices()
         offset = matrices @ jnp.asarray(mesh.origin, matrices.dtype)
         transforms.append(matrices)
@@ -474,7 +484,10 @@ def build_mesh_tree(meshes: Sequence[MeshSurface]) -> MeshTree:
         jnp.concatenate([upper, *lower]), instances, numbers[0] if len(set(numbers)) == 1 else None
     )
     return MeshTree(
-        tree, jnp.zeros_like(shift[0]), jnp.concatenate(materials) if first_material > 1 else None
+        tree,
+        jnp.zeros_like(shift[0]),
+        jnp.concatenate(materials) if first_material > 1 else None,
+        lax.stop_gradient(jnp.max(jnp.stack(longest_sides))),
     )
 
 

@@ -197,7 +197,11 @@ def nearest_triangle(
 
     def visit(s: _Traversal) -> _Traversal:
         """Visit one node: steps 1 to 5."""
-        instance = Instance(*tree.uniform) if s.instance is None else s.instance
+        if s.instance is None:
+            assert tree.uniform is not None
+            instance = Instance(*tree.uniform)
+        else:
+            instance = s.instance
         node, trail = jnp.where(s.inside, s.node, s.upper_node), jnp.where(s.inside, s.trail, s.upper_trail)
         index = jnp.where(s.inside, instance.first_row, 0) + node
         row = [table.at[index, k].get(mode="promise_in_bounds") for k in range(ROW)]
@@ -304,8 +308,13 @@ def triangle_plane(tree: TriangleTree, hit: TriangleHit, x: Vec, w: Vec) -> tupl
     length = jnp.sqrt(dot(normal, normal))
     # |cosine| of incidence is |local_normal . direction| / |M^T local_normal|, as w has the length one.
     least = _MIN_COSINE * lax.stop_gradient(length)
-    cosine = jnp.where(jnp.abs(cosine) < least, jnp.where(cosine < 0, -least, least), cosine)
-    distance = with_derivative_of(hit.distance, jnp.where(is_met, ahead / cosine, FAR))
+    is_grazing = jnp.abs(cosine) < least
+    cosine = jnp.where(is_grazing, jnp.where(cosine < 0, -least, least), cosine)
+    plane_distance = ahead / cosine
+    # From the areas of a large triangle the distance is known to the rounding of its size, from the plane to
+    # that of the height above it. Grazing rays meet the plane within the triangle by the areas alone.
+    distance = jnp.where(is_met & ~is_grazing, jnp.maximum(plane_distance, 0.0), hit.distance)
+    distance = with_derivative_of(distance, jnp.where(is_met, plane_distance, FAR))
     return distance, scale(normal, 1.0 / length)
 
 

@@ -17,7 +17,7 @@ from scipy.special import erf, ndtr
 
 import jaxlidar as jl
 from jaxlidar._constants import SPEED_OF_LIGHT
-from tests.helpers import SINGLE_SAMPLE, agrees, first_wave, single_sample_lidar
+from tests.helpers import SINGLE_SAMPLE, agrees, first_wave, single_sample_lidar, slab
 
 ALTITUDE = 4e5
 
@@ -203,6 +203,34 @@ def test_derivatives_of_smooth_returns():
         warnings.simplefilter("ignore", jl.OutlineWarning)
         reverse = np.array(jax.jacrev(measure, (0, 1, 2, 3))(*values))
     np.testing.assert_allclose(reverse, forward, rtol=1e-3, atol=1e-5)
+
+
+def test_a_mesh_within_voxels():
+    """Below a depth d of leaf of the extinction k a mesh returns rho exp(-k d), with the derivative k by height.
+
+    Leaf above it returns what a slab of the depth d does, and nothing below it is lit.
+    """
+    k, top, rho = 0.05, 10.0, 0.4
+    canopy = jl.Canopy(slab(leaf=k * top), leaf=jl.LeafOptics(0.45, 0.4))
+    lidar = single_sample_lidar()
+    options = {"max_orders": 1, "n_rays": 64, "footprint": "fixed", **SINGLE_SAMPLE}
+    base = jl.Scene(canopy=canopy, ground=jl.Ground(), meshes=(level(15.0, 4.3, reflectance=rho),))
+    plan = jl.plan(lidar, base, describe=False, **options)
+
+    def returns(height):
+        vertices = base.meshes[0].vertices.at[:, 2].set(height - float(base.meshes[0].origin[2]))
+        scene = eqx.tree_at(lambda s: s.meshes[0].vertices, base, vertices)
+        setup = jl.make_setup(lidar, scene, plan)
+        wave = jl.waveform_of(jl.trace_scene(setup, jax.random.key(0), reverse=False), setup)
+        return jnp.stack([wave.components[name].sum() for name in ("mesh", "leaf", "ground")])
+
+    with pytest.warns(jl.OutlineWarning, match="mesh"):
+        value, slope = jax.jvp(returns, (jnp.asarray(4.3),), (jnp.asarray(1.0),))
+    passes = np.exp(-k * (top - 4.3))
+    # Facets of spherical orientation scatter back 2/3 of R; hot spot.
+    expected = np.array([rho * passes, 2 / 3 * 0.45 * (1 - passes), 0.0])
+    np.testing.assert_allclose(value, expected, atol=2e-5)
+    np.testing.assert_allclose(slope, [k * rho * passes, -k * 2 / 3 * 0.45 * passes, 0.0], atol=2e-5)
 
 
 def test_truth_counts_meshes_among_what_intercepts():
