@@ -149,7 +149,7 @@ def instance_order(centre: Float[Array, "leaves 3"], is_real: Bool[Array, "leave
     return jnp.argsort(jnp.where(is_real, code, jnp.uint32(2**32 - 1)))
 
 
-class _Traversal(eqx.Module):
+class _TreeTraversal(eqx.Module):
     """State of rays on their way through the trees.
 
     - `upper_node`, `upper_trail`: in the upper tree. - `node`, `trail`: in the lower tree.
@@ -195,7 +195,7 @@ def nearest_triangle(
     n_upper = tree.n_leaves
     precision = float(jnp.finfo(table.dtype).eps)
 
-    def visit(s: _Traversal) -> _Traversal:
+    def visit(s: _TreeTraversal) -> _TreeTraversal:
         """Visit one node: steps 1 to 5."""
         if s.instance is None:
             assert tree.uniform is not None
@@ -238,7 +238,7 @@ def nearest_triangle(
         upper_node, upper_trail, upper_has_ended = _next_on_trail(s.upper_node, s.upper_trail)
         nearest = jnp.where(is_nearer, distance, s.distance)
         active = s.active & ~(leaves_mesh & upper_has_ended) & ~(in_upper & has_ended)
-        return _Traversal(
+        return _TreeTraversal(
             upper_node=jnp.where(leaves_mesh, upper_node, jnp.where(in_upper, next_node, s.upper_node)),
             upper_trail=jnp.where(leaves_mesh, upper_trail, jnp.where(in_upper, next_trail, s.upper_trail)),
             node=jnp.where(enters, 1, next_node),
@@ -254,7 +254,7 @@ def nearest_triangle(
         )
 
     zero = jnp.zeros(x[0].shape, jnp.int32)
-    start = _Traversal(
+    start = _TreeTraversal(
         upper_node=zero + 1,
         upper_trail=zero,
         node=zero + 1,
@@ -269,7 +269,7 @@ def nearest_triangle(
         leaf=zero,
     )
 
-    def traverse(state: _Traversal) -> _Traversal:
+    def traverse(state: _TreeTraversal) -> _TreeTraversal:
         return lax.while_loop(lambda s: jnp.any(s.active), visit, state)
 
     # The loop is never differentiated, so that it may always be compiled as one function.
