@@ -478,11 +478,10 @@ def build_mesh_tree(meshes: Sequence[MeshSurface]) -> MeshTree:
     assert leaf_rows.shape[1] == ROW
     order = instance_order(fill(middle, 0.0), jnp.arange(n_leaves) < n_instances)
     low, high = fill(middle - half, FAR), fill(middle + half, -FAR)
-    upper, _ = tree_rows(leaf_rows[order], low[order], high[order])
+    upper, box = tree_rows(leaf_rows[order], low[order], high[order])
     instances = fill(jnp.asarray(numbers, jnp.int32), 0)[order]
-    tree = TriangleTree(
-        jnp.concatenate([upper, *lower]), instances, numbers[0] if len(set(numbers)) == 1 else None
-    )
+    uniform = numbers[0] if len(set(numbers)) == 1 else None
+    tree = TriangleTree(jnp.concatenate([upper, *lower]), instances, box, uniform)
     return MeshTree(
         tree,
         jnp.zeros_like(shift[0]),

@@ -26,6 +26,7 @@ its derivatives.
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -41,6 +42,8 @@ ROW = 12
 _PARALLEL = 1e-15
 # Coordinate of boxes that no ray meets: beyond `FAR`.
 _NOWHERE = 1e35
+# Rays that are followed at once.
+_LANES = 128
 # Rounding of a signed area, in units of the floating-point precision and of its products.
 _AREA_ROUNDING = 4.0
 # Relative slack of the distances at which a ray leaves a box (Ize 2013, J. Comput. Graph. Tech. 2(2), 12).
@@ -62,11 +65,13 @@ class TriangleTree(eqx.Module):
 
     - `table`: rows of all trees; those of the upper tree first.
     - `instances`: for each leaf of the upper tree, the numbers of its `Instance`.
+    - `box`: the lowest and the highest corner of the box around everything, m.
     - `uniform`: the `Instance` of all leaves where they have the same numbers; else None.
     """
 
     table: Float[Array, "rows 12"]
     instances: Int[Array, "leaves 3"]
+    box: Float[Array, "2 3"]
     uniform: tuple[int, int, int] | None = eqx.field(static=True)
 
     @property
@@ -150,27 +155,43 @@ def instance_order(centre: Float[Array, "leaves 3"], is_real: Bool[Array, "leave
 
 
 class _TreeTraversal(eqx.Module):
-    """State of rays on their way through the trees.
+    """State of the rays in some lanes on their way through the trees.
 
+    - `ray`: number of the ray in each lane; their count in lanes without one.
+    - `upper_x`, `upper_w`: start and direction of the ray. - `x`, `w`: the same in coordinates of the mesh.
     - `upper_node`, `upper_trail`: in the upper tree. - `node`, `trail`: in the lower tree.
     - `inside`: True if the ray is in a lower tree. - `active`: False for rays that have no node left.
-    - `x`, `w`: the ray in coordinates of the mesh of the lower tree.
-    - `instance`: that mesh, where meshes differ.
+    - `instance`: that of the lower tree, where instances differ.
     - `distance`, `row`, `leaf`: as in `TriangleHit`.
     """
 
-    upper_node: Int[Array, "rays"]
-    upper_trail: Int[Array, "rays"]
-    node: Int[Array, "rays"]
-    trail: Int[Array, "rays"]
-    inside: Bool[Array, "rays"]
-    active: Bool[Array, "rays"]
+    ray: Int[Array, "lanes"]
+    upper_x: Vec
+    upper_w: Vec
     x: Vec
     w: Vec
+    upper_node: Int[Array, "lanes"]
+    upper_trail: Int[Array, "lanes"]
+    node: Int[Array, "lanes"]
+    trail: Int[Array, "lanes"]
+    inside: Bool[Array, "lanes"]
+    active: Bool[Array, "lanes"]
     instance: Instance | None
-    distance: Float[Array, "rays"]
-    row: Int[Array, "rays"]
-    leaf: Int[Array, "rays"]
+    distance: Float[Array, "lanes"]
+    row: Int[Array, "lanes"]
+    leaf: Int[Array, "lanes"]
+
+
+class _RayQueue(eqx.Module):
+    """Rays that wait, those in lanes, and what others have met.
+
+    - `lanes`: the rays that are being followed. - `n_sent`: number of rays of the queue that have been.
+    - `hit`: of all rays, with a spare one at the end.
+    """
+
+    lanes: _TreeTraversal
+    n_sent: Int[Array, ""]
+    hit: TriangleHit
 
 
 def nearest_triangle(
@@ -178,7 +199,102 @@ def nearest_triangle(
 ) -> TriangleHit:
     """Find the triangles that rays meet first; with `any_hit`, one that they meet.
 
-    In each step of a loop, every ray visits one node:
+    Rays take very different numbers of steps, and most may miss all meshes. All lanes of a loop wait for its
+    last ray, so that rays take turns (persistent threads; Aila and Laine 2009, High Performance Graphics):
+
+    1. Put the rays that meet the box around everything into a queue.
+    2. Follow as many as there are lanes, until half of these are idle (`_visit_node`).
+    3. Note what the finished rays have met, fill their lanes from the queue, and go on with 2.
+
+    **Arguments:** `x`, `w`: starts and directions. `active`: False for rays that need no answer.
+    """
+    shape = jnp.broadcast_shapes(*(a.shape for a in (*x, *w)))
+    tree = jax.tree.map(lax.stop_gradient, tree)
+    x, w = (vec(jnp.broadcast_to(lax.stop_gradient(a), shape).reshape(-1) for a in v) for v in (x, w))
+    n_rays, precision = x[0].size, float(jnp.finfo(tree.table.dtype).eps)
+    low, high = (list(corner) for corner in tree.box)
+    waits, _ = _box_distance(low, high, x, _inverse(w), jnp.full_like(x[0], FAR), precision)
+    if active is not None:
+        waits &= jnp.broadcast_to(active, shape).reshape(-1)
+    zero = jnp.zeros(n_rays + 1, jnp.int32)
+    missed = TriangleHit(jnp.full(n_rays + 1, FAR, tree.table.dtype), zero, zero)
+    n_lanes = min(n_rays, _LANES)
+    # Stream compaction: the numbers of rays that wait, in order.
+    n_waiting = jnp.sum(waits, dtype=jnp.int32)
+    rank = jnp.where(waits, jnp.cumsum(waits, dtype=jnp.int32) - 1, n_rays)
+    numbers = jnp.arange(n_rays, dtype=jnp.int32)
+    queue = jnp.full(n_rays, n_rays, jnp.int32).at[rank].set(numbers, mode="drop")
+
+    def send(ray: Int[Array, "lanes"]) -> _TreeTraversal:
+        """Return rays at the root of the upper tree; lanes whose number is that of no ray are idle."""
+        zero = jnp.zeros_like(ray)
+        number = jnp.minimum(ray, n_rays - 1)
+        start, direction = (vec(a[number] for a in v) for v in (x, w))
+        return _TreeTraversal(
+            ray=ray,
+            upper_x=start,
+            upper_w=direction,
+            x=start,
+            w=direction,
+            upper_node=zero + 1,
+            upper_trail=zero,
+            node=zero + 1,
+            trail=zero,
+            inside=zero > 0,
+            active=ray < n_rays,
+            instance=Instance(zero, zero + 1, zero) if tree.uniform is None else None,
+            distance=jnp.full(ray.shape, FAR, tree.table.dtype),
+            row=zero,
+            leaf=zero,
+        )
+
+    def follow(lanes: _TreeTraversal, n_idle: Int[Array, ""]) -> _TreeTraversal:
+        """Follow rays until more than `n_idle` lanes are idle, or all are."""
+
+        def traverse(state: tuple[_TreeTraversal, Array]) -> tuple[_TreeTraversal, Array]:
+            def continue_(state: tuple[_TreeTraversal, Array]) -> Bool[Array, ""]:
+                n_active = jnp.sum(state[0].active, dtype=jnp.int32)
+                return (n_active > 0) & (n_active >= n_lanes - state[1])
+
+            def visit(state: tuple[_TreeTraversal, Array]) -> tuple[_TreeTraversal, Array]:
+                return _visit_node(tree, state[0], any_hit, precision), state[1]
+
+            return lax.while_loop(continue_, visit, state)
+
+        # The loop is never differentiated, so that it may always be compiled as one function.
+        return one_function(traverse)((lanes, n_idle))[0]
+
+    def note(hit: TriangleHit, lanes: _TreeTraversal) -> TriangleHit:
+        """Note what finished rays have met; idle lanes write to the spare ray."""
+        number = jnp.where(lanes.active, n_rays, lanes.ray)
+        results = (lanes.distance, lanes.row, lanes.leaf)
+        return TriangleHit(*(a.at[number].set(b) for a, b in zip(hit, results)))
+
+    def take_turns(state: _RayQueue) -> _RayQueue:
+        """Fill idle lanes from the queue, and follow rays until half of the lanes are idle."""
+        is_idle = ~state.lanes.active
+        hit = note(state.hit, state.lanes)
+        position = state.n_sent + jnp.cumsum(is_idle, dtype=jnp.int32) - 1
+        is_sent = is_idle & (position < n_waiting)
+        fresh = send(jnp.where(is_sent, queue[jnp.minimum(position, n_rays - 1)], n_rays))
+        lanes = jax.tree.map(lambda a, b: jnp.where(is_idle, a, b), fresh, state.lanes)
+        n_sent = jnp.minimum(state.n_sent + jnp.sum(is_idle, dtype=jnp.int32), n_waiting)
+        # Nobody waits any more: follow the last ones to their ends.
+        n_idle = jnp.where(n_sent < n_waiting, n_lanes // 2, n_lanes)
+        return _RayQueue(follow(lanes, n_idle), n_sent, hit)
+
+    def goes_on(state: _RayQueue) -> Bool[Array, ""]:
+        return (state.n_sent < n_waiting) | jnp.any(state.lanes.active)
+
+    idle = send(jnp.full(n_lanes, n_rays, jnp.int32))
+    state = vary_with(_RayQueue(idle, jnp.zeros((), jnp.int32), missed), (tree, x, w, waits))
+    state = lax.while_loop(goes_on, take_turns, state)
+    hit = note(state.hit, state.lanes)
+    return TriangleHit(*(a[:n_rays].reshape(shape) for a in hit))
+
+
+def _visit_node(tree: TriangleTree, s: _TreeTraversal, any_hit: bool, precision: float) -> _TreeTraversal:
+    """Let the ray of each lane visit one node.
 
     1. Read the row of the node.
     2. Of an inner node, intersect both boxes, and go on to the nearer one; the trail notes the other.
@@ -186,95 +302,70 @@ def nearest_triangle(
     4. Of a triangle, intersect it.
     5. Where nothing below is met, go on to the next node of the trail; at the end of a lower tree, to that of
        the upper tree; at the end of the latter, stop.
-
-    **Arguments:** `x`, `w`: starts and directions. `active`: False for rays that need no answer.
     """
-    shape = jnp.broadcast_shapes(*(a.shape for a in (*x, *w)))
-    table, instances = lax.stop_gradient((tree.table, tree.instances))
-    x, w = (vec(jnp.broadcast_to(lax.stop_gradient(a), shape).reshape(-1) for a in v) for v in (x, w))
-    n_upper = tree.n_leaves
-    precision = float(jnp.finfo(table.dtype).eps)
-
-    def visit(s: _TreeTraversal) -> _TreeTraversal:
-        """Visit one node: steps 1 to 5."""
-        if s.instance is None:
-            assert tree.uniform is not None
-            instance = Instance(*tree.uniform)
-        else:
-            instance = s.instance
-        node, trail = jnp.where(s.inside, s.node, s.upper_node), jnp.where(s.inside, s.trail, s.upper_trail)
-        index = jnp.where(s.inside, instance.first_row, 0) + node
-        row = [table.at[index, k].get(mode="promise_in_bounds") for k in range(ROW)]
-        is_leaf = node >= jnp.where(s.inside, instance.n_leaves, n_upper)
-        start, direction = (
-            vec(jnp.where(s.inside, a, b) for a, b in zip(p, q)) for p, q in ((s.x, x), (s.w, w))
-        )
-        # 2. Boxes beyond the nearest triangle so far are not met.
-        inverse = vec(1.0 / jnp.where(jnp.abs(a) < _PARALLEL, _PARALLEL, a) for a in direction)
-        boxes = [
-            _box_distance(row[k : k + 3], row[k + 6 : k + 9], start, inverse, s.distance, precision)
-            for k in (0, 3)
-        ]
-        (first_met, first_near), (second_met, second_near) = boxes
-        descends = ~is_leaf & (first_met | second_met)
-        takes_second = second_met & (~first_met | (second_near < first_near))
-        # 3.
-        enters = ~s.inside & is_leaf
-        leaf = jnp.where(s.inside | enters, s.upper_node - n_upper, 0)
-        local_x, local_w = to_mesh(row, x, w)
-        next_instance = s.instance
-        if s.instance is not None:
-            entered = [instances.at[leaf, k].get(mode="promise_in_bounds") for k in range(3)]
-            next_instance = Instance(*(jnp.where(enters, a, b) for a, b in zip(entered, s.instance)))
-        # 4.
-        distance = _triangle_distance(row, start, direction, instance.one_sided, precision)
-        is_nearer = s.active & s.inside & is_leaf & (distance < s.distance)
-        # 5.
-        next_node, next_trail, has_ended = _next_on_trail(node, trail)
-        has_ended &= ~descends
-        next_node = jnp.where(descends, 2 * node + takes_second.astype(node.dtype), next_node)
-        next_trail = jnp.where(descends, 2 * trail + (first_met & second_met).astype(trail.dtype), next_trail)
-        leaves_mesh, in_upper = s.inside & has_ended, ~s.inside & ~enters
-        upper_node, upper_trail, upper_has_ended = _next_on_trail(s.upper_node, s.upper_trail)
-        nearest = jnp.where(is_nearer, distance, s.distance)
-        active = s.active & ~(leaves_mesh & upper_has_ended) & ~(in_upper & has_ended)
-        return _TreeTraversal(
-            upper_node=jnp.where(leaves_mesh, upper_node, jnp.where(in_upper, next_node, s.upper_node)),
-            upper_trail=jnp.where(leaves_mesh, upper_trail, jnp.where(in_upper, next_trail, s.upper_trail)),
-            node=jnp.where(enters, 1, next_node),
-            trail=jnp.where(enters, 0, next_trail),
-            inside=enters | (s.inside & ~has_ended),
-            active=active & (nearest >= FAR) if any_hit else active,
-            x=vec(jnp.where(enters, a, b) for a, b in zip(local_x, s.x)),
-            w=vec(jnp.where(enters, a, b) for a, b in zip(local_w, s.w)),
-            instance=next_instance,
-            distance=nearest,
-            row=jnp.where(is_nearer, index, s.row),
-            leaf=jnp.where(is_nearer, leaf, s.leaf),
-        )
-
-    zero = jnp.zeros(x[0].shape, jnp.int32)
-    start = _TreeTraversal(
-        upper_node=zero + 1,
-        upper_trail=zero,
-        node=zero + 1,
-        trail=zero,
-        inside=zero > 0,
-        active=zero == 0 if active is None else jnp.broadcast_to(active, shape).reshape(-1),
-        x=x,
-        w=w,
-        instance=Instance(zero, zero + 1, zero) if tree.uniform is None else None,
-        distance=jnp.full(zero.shape, FAR, table.dtype),
-        row=zero,
-        leaf=zero,
+    n_upper, instance = tree.n_leaves, s.instance
+    if instance is None:
+        assert tree.uniform is not None
+        instance = Instance(*tree.uniform)
+    # 1.
+    node, trail = jnp.where(s.inside, s.node, s.upper_node), jnp.where(s.inside, s.trail, s.upper_trail)
+    index = jnp.where(s.inside, instance.first_row, 0) + node
+    row = [tree.table.at[index, k].get(mode="promise_in_bounds") for k in range(ROW)]
+    is_leaf = node >= jnp.where(s.inside, instance.n_leaves, n_upper)
+    start, direction = (
+        vec(jnp.where(s.inside, a, b) for a, b in zip(p, q)) for p, q in ((s.x, s.upper_x), (s.w, s.upper_w))
+    )
+    # 2. Boxes beyond the nearest triangle so far are not met.
+    inverse = _inverse(direction)
+    boxes = [
+        _box_distance(row[k : k + 3], row[k + 6 : k + 9], start, inverse, s.distance, precision)
+        for k in (0, 3)
+    ]
+    (first_met, first_near), (second_met, second_near) = boxes
+    descends = ~is_leaf & (first_met | second_met)
+    takes_second = second_met & (~first_met | (second_near < first_near))
+    # 3.
+    enters = ~s.inside & is_leaf
+    leaf = jnp.where(s.inside | enters, s.upper_node - n_upper, 0)
+    local_x, local_w = to_mesh(row, s.upper_x, s.upper_w)
+    next_instance = s.instance
+    if s.instance is not None:
+        entered = [tree.instances.at[leaf, k].get(mode="promise_in_bounds") for k in range(3)]
+        next_instance = Instance(*(jnp.where(enters, a, b) for a, b in zip(entered, s.instance)))
+    # 4.
+    distance = _triangle_distance(row, start, direction, instance.one_sided, precision)
+    is_nearer = s.active & s.inside & is_leaf & (distance < s.distance)
+    nearest = jnp.where(is_nearer, distance, s.distance)
+    # 5.
+    next_node, next_trail, has_ended = _next_on_trail(node, trail)
+    has_ended &= ~descends
+    next_node = jnp.where(descends, 2 * node + takes_second.astype(node.dtype), next_node)
+    next_trail = jnp.where(descends, 2 * trail + (first_met & second_met).astype(trail.dtype), next_trail)
+    leaves_mesh, in_upper = s.inside & has_ended, ~s.inside & ~enters
+    upper_node, upper_trail, upper_has_ended = _next_on_trail(s.upper_node, s.upper_trail)
+    active = s.active & ~(leaves_mesh & upper_has_ended) & ~(in_upper & has_ended)
+    return _TreeTraversal(
+        ray=s.ray,
+        upper_x=s.upper_x,
+        upper_w=s.upper_w,
+        x=vec(jnp.where(enters, a, b) for a, b in zip(local_x, s.x)),
+        w=vec(jnp.where(enters, a, b) for a, b in zip(local_w, s.w)),
+        upper_node=jnp.where(leaves_mesh, upper_node, jnp.where(in_upper, next_node, s.upper_node)),
+        upper_trail=jnp.where(leaves_mesh, upper_trail, jnp.where(in_upper, next_trail, s.upper_trail)),
+        node=jnp.where(enters, 1, next_node),
+        trail=jnp.where(enters, 0, next_trail),
+        inside=enters | (s.inside & ~has_ended),
+        active=active & (nearest >= FAR) if any_hit else active,
+        instance=next_instance,
+        distance=nearest,
+        row=jnp.where(is_nearer, index, s.row),
+        leaf=jnp.where(is_nearer, leaf, s.leaf),
     )
 
-    def traverse(state: _TreeTraversal) -> _TreeTraversal:
-        return lax.while_loop(lambda s: jnp.any(s.active), visit, state)
 
-    # The loop is never differentiated, so that it may always be compiled as one function.
-    end = one_function(traverse)(vary_with(start, (table, x, w)))
-    return TriangleHit(*(a.reshape(shape) for a in (end.distance, end.row, end.leaf)))
+def _inverse(w: Vec) -> Vec:
+    """Return the inverse of each component of directions, finite where a ray is parallel to a plane."""
+    return vec(1.0 / jnp.where(jnp.abs(a) < _PARALLEL, _PARALLEL, a) for a in w)
 
 
 def to_mesh(row: list[Scalar], x: Vec, w: Vec) -> tuple[Vec, Vec]:
