@@ -28,8 +28,8 @@ waveforms is in the package `inversion`.
 
 ## Scenes
 
-`Scene`, `Canopy`, `VoxelMap`, `Ground`, `Terrain`, `Plate`, `Atmosphere`, `AbstractSurface`,
-`AbstractGround`, `AbstractSheet`, `AbstractShape`, `Plane`.
+`Scene`, `Canopy`, `VoxelMap`, `Ground`, `Terrain`, `Plate`, `MeshSurface`, `MeshInstances`, `Atmosphere`,
+`AbstractSurface`, `AbstractGround`, `AbstractSheet`, `AbstractShape`, `Plane`.
 
 ## Leaf optics and spectra
 
@@ -50,6 +50,7 @@ waveforms is in the package `inversion`.
 ## Sunlight
 
 `reflectance_factor`, `ReflectanceFactor`, `plan_reflectance`.
+`mesh_of`, `trim_empty_layers`.
 
 ## Truth and energy
 
@@ -70,7 +71,7 @@ waveforms is in the package `inversion`.
 ## Warnings and constants
 
 `LateLightWarning`, `UnfollowedLightWarning`, `MisplacedCanopyWarning`, `LostWorkersWarning`, `OffMapWarning`,
-`OutlineWarning`, `UnitWarning`, `SPEED_OF_LIGHT`.
+`OutlineWarning`, `SolidMeshWarning`, `UnitWarning`, `SPEED_OF_LIGHT`.
 
 ## Packages of their own
 
@@ -123,7 +124,7 @@ from jaxlidar.planning.setup import Setup, make_setup
 from jaxlidar.plants.forest import forest
 from jaxlidar.plants.habits import Branching, Habit, broadleaf, conifer, grow, shrub, spreading_tree
 from jaxlidar.plants.lsystem import LSystem, Rule, Symbol, Word
-from jaxlidar.plants.meshes import Mesh, voxelise_mesh
+from jaxlidar.plants.meshes import Mesh, SolidMeshWarning, mesh_of, voxelise_mesh
 from jaxlidar.plants.point_canopy import PointCanopy, canopy_from_points
 from jaxlidar.plants.tree import Tree
 from jaxlidar.plants.turtle import turtle
@@ -131,6 +132,7 @@ from jaxlidar.plants.voxelise import trim_empty_layers, voxelise, voxelise_point
 from jaxlidar.scene_batch import SceneWaveforms, simulate_scenes
 from jaxlidar.scenes.atmosphere import Atmosphere
 from jaxlidar.scenes.canopy import Canopy
+from jaxlidar.scenes.mesh_surface import MeshInstances, MeshSurface
 from jaxlidar.scenes.relative_height import MisplacedCanopyWarning
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.scene_parts import SceneParts
@@ -201,6 +203,8 @@ __all__ = [
     "Ground",
     "Terrain",
     "Plate",
+    "MeshSurface",
+    "MeshInstances",
     "Atmosphere",
     "AbstractSurface",
     "AbstractGround",
@@ -251,6 +255,7 @@ __all__ = [
     "PointCanopy",
     "voxelise_mesh",
     "Mesh",
+    "mesh_of",
     "trim_empty_layers",
     # Sunlight.
     "reflectance_factor",
@@ -285,6 +290,7 @@ __all__ = [
     "LostWorkersWarning",
     "OffMapWarning",
     "OutlineWarning",
+    "SolidMeshWarning",
     "UnitWarning",
     "SPEED_OF_LIGHT",
     # Packages of their own.

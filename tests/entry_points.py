@@ -280,6 +280,14 @@ ENTRY_POINTS: dict[str, Callable[[], EntryPoint]] = {
         | {"aspect": 5.0, "position": (0.0, 0.0)},
     ),
     "Plate.moved": lambda: EntryPoint(jl.Plate(1.0, 0.2).moved, {"by": np.ones(2)}),
+    "MeshSurface": lambda: EntryPoint(
+        lambda vertices, faces, **optics: jl.MeshSurface((vertices, faces), **optics),
+        {"vertices": np.eye(3), "faces": np.array([[0, 1, 2]]), "reflectance": 0.3, "transmittance": 0.2},
+    ),
+    "MeshSurface.moved": lambda: EntryPoint(jl.MeshSurface(MESH).moved, {"by": np.ones(2)}),
+    "MeshInstances": lambda: EntryPoint(
+        jl.MeshInstances, {"shift": np.zeros((2, 3)), "rotation": np.zeros(2), "scale": np.ones(2)}
+    ),
     "Atmosphere": lambda: EntryPoint(
         jl.Atmosphere,
         {"visibility": 23.0, "rayleigh_scale_height": 8450.0, "aerosol_scale_height": 1400.0}
@@ -397,6 +405,10 @@ ENTRY_POINTS: dict[str, Callable[[], EntryPoint]] = {
     "voxelise_mesh": lambda: EntryPoint(
         lambda **arguments: jl.voxelise_mesh(MESH, **arguments),
         {"voxel_size": 0.5, "origin": (0.0, 0.0, 0.0), "shape": (3, 3, 3)},
+    ),
+    "mesh_of": lambda: EntryPoint(
+        lambda **arguments: jl.mesh_of(TREE, **arguments),
+        {"sides": 6, "leaves": 3, "leaf_length": 0.1, "seed": 0},
     ),
     "Mesh": lambda: EntryPoint(
         jl.Mesh,

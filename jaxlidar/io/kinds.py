@@ -32,8 +32,9 @@ from jaxlidar.scenes.voxels import VoxelMap
 
 # Exported classes of these packages are kinds.
 _PACKAGES = ("jaxlidar.optics.", "jaxlidar.instrument.", "jaxlidar.scenes.")
-# But for results of photon counting, which come after a simulation.
-_NO_KINDS = ("PhotonEvents",)
+# But for results of photon counting, which come after a simulation, and for meshes, whose files are read by
+# `read_obj` or trimesh.
+_NO_KINDS = ("PhotonEvents", "MeshSurface", "MeshInstances")
 # Functions that return scenes or lidars, or objects in them, and classes of other packages.
 _FUNCTIONS: tuple[Callable[..., Any], ...] = (
     *(Branching, Habit, broadleaf, conifer, shrub, spreading_tree, grow, forest),

@@ -8,11 +8,14 @@ at most `degree` scatterings. Batches run on all cores at once, each with its ow
 
 import math
 import os
+from collections.abc import Sequence
 
 import jax.numpy as jnp
 
 from jaxlidar._memory import format_bytes, machine_memory
 from jaxlidar.planning.config import TimeBins, TraceConfig
+from jaxlidar.scenes.mesh_surface import MeshSurface
+from jaxlidar.scenes.triangle_tree import ROW
 
 # Copies of a batch's response that are alive at once: sums of photons, of groups, and the result.
 _RESPONSE_COPIES = 3
@@ -28,6 +31,8 @@ _RAYS_AT_ONCE = 512
 # Tables with a number for each column and voxel: slopes of leaf, of bark, and of the optical depth above, and
 # the columns' numbers (`jaxlidar.trace.extinction_slopes.ExtinctionSlopes`).
 _SLOPE_TABLES = 4
+# Tables of the trees of meshes that are alive at once.
+_TREE_COPIES = 2
 # Bytes that compiling takes.
 _COMPILATION = 150e6
 # Optics may be applied while light is traced where one response with histories takes more bytes than
@@ -69,6 +74,19 @@ def simulation_bytes(
     # A matrix has at most `MAX_DENSE_PULSE` elements, a band `pulse_bins`: this is an upper bound for both.
     pulse = _number_bytes() * min(bins.count * n_samples, max(MAX_DENSE_PULSE, pulse_bins))
     return response * (_RESPONSE_COPIES * (os.cpu_count() or 1) + 1) + 2 * pulse + _COMPILATION
+
+
+def mesh_bytes(meshes: Sequence[MeshSurface]) -> float:
+    """Return the bytes of the trees of meshes: two rows for each triangle, and its corners and indices.
+
+    While the tree is built, its levels and the table are alive at once.
+    """
+    n_leaves, n_vertices = (
+        sum(map(len, a)) for a in ([m.faces for m in meshes], [m.vertices for m in meshes])
+    )
+    n_instances = sum(len(mesh.instances) for mesh in meshes)
+    numbers = 2 * _TREE_COPIES * ROW * (n_leaves + n_instances) + 9 * n_leaves + 3 * n_vertices
+    return float(_number_bytes() * numbers + 4 * (6 * n_leaves + 3 * n_instances))
 
 
 def keeps_histories(response: float, with_histories: float, applied: float, limit: float) -> bool:

@@ -62,7 +62,8 @@ def make_setup(lidar: Lidar, scene: Scene, plan: Plan) -> Setup:
     **Returns:** a `Setup`.
 
     **Raises:** TypeError for arguments of another kind; ValueError where heights of terrain are being traced
-    with a plan for a plane, or leaf or bark with a plan for a map that has none.
+    with a plan for a plane, leaf or bark with a plan for a map that has none, or meshes with a plan that
+    leaves them out.
 
     **Example:**
 
@@ -90,6 +91,11 @@ def make_setup(lidar: Lidar, scene: Scene, plan: Plan) -> Setup:
                 f"the plan is for a map whose {name} is zero everywhere, but {name} is being traced by a JAX "
                 f'transformation; make the plan with effects={{"{name}": True}}'
             )
+    if plan.scope.unreached_meshes and any(is_traced(x) for x in jax.tree.leaves(scene.meshes)):
+        raise ValueError(
+            "the plan leaves out meshes that no ray meets, but they are being traced by a JAX "
+            'transformation; make the plan with effects={"meshes": True}'
+        )
     # A traced value cannot raise an error. NaN in all waveforms cannot be overlooked, and costs one product.
     admissible = jnp.ones(())
     if any(is_traced(x) for x in jax.tree.leaves((lidar, scene))):
