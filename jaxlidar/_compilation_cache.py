@@ -30,6 +30,15 @@ class CompilationCache:
     """The result of `compilation_cache`: a cache in use until `close`, or until its `with` block ends.
 
     - `folder`: where programs are stored.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     with jl.compilation_cache(folder) as cache:
+    ...         print(cache.folder.is_dir())
+    True
     """
 
     folder: Path

@@ -188,8 +188,8 @@ def design(
     - `max_steps`: steps of the optimiser from each start. Default 100.
     - `key`: a JAX random key, for photons and starts. Default None: `jax.random.key(0)`; all designs are
       compared with the same random numbers.
-    - `max_orders`, `n_photons`, `n_rays`: of the simulation of each scene, as for `plan`; photons of all
-      batches together. Default None, 65536 and None.
+    - `max_orders`, `n_rays`: of the simulation of each scene, as for `plan`. Default None.
+    - `n_photons`: photons of all batches of a scene together. Default 65536.
 
     **Returns:** a `Design`.
 
@@ -253,8 +253,11 @@ def design(
         terms = [cost_and_slopes(jnp.asarray(fraction), *pair) for pair in zip(traced_scenes, noises)]
         mean = float(np.mean([float(value) for value, _ in terms]))
         slopes = np.mean([np.asarray(slope, float) for _, slope in terms], axis=0)
+        # The bounds are infinite where an unknown leaves no trace in the record. The line search of the
+        # optimiser steps back from a large number, but not from infinity.
         if not (np.isfinite(mean) and mean > 0 and np.all(np.isfinite(slopes))):
             return _REJECTED_COST, np.zeros_like(fraction)
+        # Variances span orders of magnitude over the limits: their logarithm has even steps.
         return float(np.log(mean)), slopes / mean
 
     width = free_values.high - free_values.low
@@ -263,6 +266,7 @@ def design(
     first = (start - free_values.low) / width
     initial_log_cost = log_mean_cost(first)[0]
     drawn = np.asarray(jax.random.uniform(start_key, (starts - 1, first.size)), float)
+    # The cost has minima at each absorption band: one start would end in the next of them.
     ends = [
         optimize.minimize(
             log_mean_cost,

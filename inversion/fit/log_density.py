@@ -181,6 +181,7 @@ class LogDensity(eqx.Module):
     _recorder: RecorderModel | None = eqx.field(static=True)
     _noise: _RecordNoise
 
+    # Compiled as a method: arrays of the density are arguments, and many densities share one program.
     @eqx.filter_jit
     def __call__(self, x: Float[Array, "..."]) -> Float[Array, ""]:
         """Return the log-density at unconstrained coordinates, -inf where the simulation is not finite.
@@ -204,6 +205,7 @@ class LogDensity(eqx.Module):
             record = self._recorder.record(record, recorder_values)
             scale = self._recorder.scale_of(recorder_values)
         total = self._noise.log_likelihood(record, scale) + self._log_prior(scene_values) + log_jacobian
+        # Samplers reject a point of density zero; NaN would stop them.
         return jnp.where(jnp.isfinite(total), total, -jnp.inf)
 
     def to_natural(self, x: Float[ArrayLike, "... n"]) -> dict[str, Float[Array, "..."]]:
@@ -257,6 +259,7 @@ class LogDensity(eqx.Module):
         return low + width * jax.nn.sigmoid(x)
 
     def _reflectance(self, scene_values: Array) -> Float[Array, "wavelengths bins"]:
+        # Optics act on a response after it has been traced: one response serves all values of such unknowns.
         if self._response is None:
             return _traced_reflectance(self._simulation, scene_values)
         values = _split_values(scene_values, self._simulation.shapes)

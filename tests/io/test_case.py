@@ -126,7 +126,11 @@ def test_every_class_is_read_as_it_was_written(name, x64, tmp_path):
         )
         if x64:
             # Values that single precision cannot hold.
+            flight_lines = [s.flight_line for s in [example] if isinstance(s, jl.Survey)]
             example = jax.tree.map(lambda x: x * (1 - 2**-50), example)
+            if flight_lines != [] and flight_lines[0] is not None:
+                # Whole numbers.
+                example = eqx.tree_at(lambda s: s.flight_line, example, flight_lines[0])
         case = case_of(example)
         result = round_trip(case, tmp_path)
         assert same((result.lidar, result.survey, result.scene), (case.lidar, case.survey, case.scene))
