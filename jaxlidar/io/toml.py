@@ -73,7 +73,9 @@ def table_of(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
         return [table_of(item, f"{path}.{i}", arrays) for i, item in enumerate(value)]
     name = type(value).__name__
     if kinds().get(name) is not type(value):
-        description = "a function" if inspect.isroutine(value) else f"{kind_of(value)}, a class of your own"
+        # Meshes are jaxlidar's, but their arrays are too many for a text.
+        author = "" if type(value).__module__.startswith("jaxlidar.") else ", a class of your own"
+        description = "a function" if inspect.isroutine(value) else f"{kind_of(value)}{author}"
         raise TypeError(
             f"{path} is {description}: a file cannot hold the code that makes it. Admissible is what "
             "jaxlidar exports; keep this scene as Python code, or pickle it"

@@ -222,3 +222,9 @@ def test_scenes_refuse_what_meshes_do_not_go_with():
         check_kinds(jl.Lidar(), surface)
     with pytest.raises(TypeError, match="mesh is being traced"):
         jax.jit(lambda v: jl.MeshSurface((v, ROOF[1])).vertices)(CORNERS)
+
+
+def test_case_files_refuse_meshes(tmp_path):
+    scene = jl.Scene(meshes=(jl.MeshSurface(ROOF),))
+    with pytest.raises(TypeError, match=r"meshes.* is a MeshSurface"):
+        jl.io.write_case(tmp_path / "roof.toml", jl.io.Case(scene=scene))
