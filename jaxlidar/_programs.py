@@ -231,6 +231,8 @@ class _Version:
                 if not self.is_compiled:
                     lowered = traced.lower()
                     self.compilation = _compilation_threads().submit(self._compile, lowered, _store)
+        # Either loaded from the store or traced.
+        assert self.result_shapes is not None
         return _unflatten(self.result, iter(self.result_shapes))
 
     def _compile(self, lowered: Any, store: ExecutableStore | None) -> None:

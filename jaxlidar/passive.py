@@ -333,7 +333,7 @@ def _rectangle(scene: Scene, area: Any, centre: np.ndarray) -> tuple[Array, Arra
     """
     if area is None and scene.canopy is not None:
         voxels = scene.canopy.voxels
-        return voxels.origin[:2], voxels.voxel_size[:2] * jnp.asarray(voxels.shape[:2], float)
+        return jnp.asarray(voxels.origin)[:2], voxels.voxel_size[:2] * jnp.asarray(voxels.shape[:2], float)
     moved_centre, extent = _area_in_view(scene, area)
     if area is not None:
         moved_centre = moved_centre - centre
@@ -386,12 +386,9 @@ def _make_plan(
 
 def _steepest_slope(scene: Scene) -> float:
     """Return the largest slope of all planes of the scene, as a tangent."""
-    slopes = [
-        abs(np.tan(np.deg2rad(concrete_number(surface.slope))))
-        for surface in scene.surfaces
-        if getattr(surface, "slope", None) is not None
-    ]
-    return float(max(slopes, default=0.0))
+    slopes = [getattr(surface, "slope", None) for surface in scene.surfaces]
+    tangents = [abs(np.tan(np.deg2rad(concrete_number(slope)))) for slope in slopes if slope is not None]
+    return float(max(tangents, default=0.0))
 
 
 def _relief(scene: Scene) -> float:
