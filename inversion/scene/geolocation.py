@@ -20,8 +20,8 @@ score vectors s_i = J_i^T r_i of the records and the information F = sum of J_i^
 
     F^-1 (n / (n - p) sum of s_i s_i^T) F^-1    (clusters are the records; Liang and Zeger 1986),
 
-which is F^-1 where there is nothing but the stated noise. It needs more records than parameters; `records`
-fewer than `_MIN_CLUSTERS` have F^-1, times the reduced chi-squared where that exceeds one.
+but in no direction less than F^-1, which it is where there is nothing but the stated noise. Where records are
+fewer than `_MIN_CLUSTERS`, it is F^-1, times the reduced chi-squared if that exceeds one.
 
 **Source:** Golub and Pereyra (1973), SIAM J. Numer. Anal. 10, 413; Liang and Zeger (1986), Biometrika 73, 13;
 for GEDI's footprints over airborne clouds, Hancock et al. (2019), Earth Space Sci. 6, 294.
@@ -329,16 +329,14 @@ def _simulate_nodes(
     between = (1.0 - _NODE_COVARIANCE) * footprint
     reach = _REACH * float(np.sqrt(np.linalg.eigvalsh(between)[-1]))
     position = _grid_about(survey.position, search_radius + reach, spacing)
-    ground = scene.ground
-    if isinstance(ground, Terrain) and ground.sides == "open":
-        # Beyond its terrain a scene returns nothing.
-        low, high = np.asarray(ground.origin, float), ground.end
-        position = position[np.all((position >= low) & (position <= high), axis=1)]
-    if len(position) == 0:
-        raise ValueError("position: all footprints within the search radius lie off the terrain")
     narrow = dataclasses.replace(
         survey.lidar, divergence=survey.lidar.divergence * jnp.sqrt(jnp.asarray(_NODE_COVARIANCE))
     )
+    if isinstance(scene.ground, Terrain) and scene.ground.sides == "open":
+        low, high = _lit_rectangle(scene.ground, 2.0 * float(np.sqrt(_NODE_COVARIANCE * footprint.max())))
+        position = position[np.all((position >= low) & (position <= high), axis=1)]
+    if len(position) == 0:
+        raise ValueError("position: all footprints within the search radius lie off the terrain")
     node_survey = Survey(narrow, position, survey.zenith[0], survey.azimuth[0])
     with warnings.catch_warnings():
         # Beams at the edge of the map are expected: shifts towards it are tried, too.
@@ -347,6 +345,24 @@ def _simulate_nodes(
     height = _heights_of(waves.time, np.cos(np.deg2rad(survey.zenith[0])))
     waveform = np.asarray(waves.reflectance, float)
     return _Nodes(position, waveform, height, np.linalg.inv(between), reach, spacing)
+
+
+def _lit_rectangle(terrain: Terrain, radius: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the south-west and north-east corners, m, of where beams of a radius return light.
+
+    Beams must lie on the terrain, and are dark where it has no reflectance, as beyond a cloud.
+    """
+    # A plan wants terrain below two radii of a beam, and rounding leaves a little less.
+    margin = 2.05 * radius
+    low, spacing = np.asarray(terrain.origin, float), np.asarray(terrain.spacing, float)
+    lowest, highest = low + margin, terrain.end - margin
+    if terrain.pattern is None:
+        return lowest, highest
+    bright = np.argwhere(np.asarray(terrain.reflectance) > 0)
+    if not len(bright):
+        return lowest, highest
+    first, last = low + spacing * bright.min(axis=0), low + spacing * bright.max(axis=0)
+    return np.maximum(lowest, first - radius), np.minimum(highest, last + radius)
 
 
 def _grid_about(
@@ -553,6 +569,21 @@ def _descend(model: _SurveyModel, parameters: np.ndarray) -> _Descent:
     return _Descent(parameters, fit, False)
 
 
+def _robust_covariance(information: np.ndarray, scores: np.ndarray) -> np.ndarray:
+    """Return the covariance by the scatter of the records' scores, and nowhere less than by their noise.
+
+    With few records the scatter is often too small by chance. In coordinates in which the information is the
+    unit matrix, its eigenvalues would be one if there were only the stated noise; smaller ones are raised.
+    """
+    shots, n = scores.shape
+    eigenvalues, axes = np.linalg.eigh(information)
+    root = axes / np.sqrt(np.maximum(eigenvalues, _LEAST_INFORMATION))
+    scatter = shots / (shots - n) * root.T @ scores.T @ scores @ root
+    ratios, directions = np.linalg.eigh(scatter)
+    root = root @ directions
+    return root @ np.diag(np.maximum(ratios, 1.0)) @ root.T
+
+
 def _geolocation(
     model: _SurveyModel, descent: _Descent, search_radius: float, records: object
 ) -> Geolocation:
@@ -566,8 +597,7 @@ def _geolocation(
     inverse = axes @ np.diag(1.0 / np.maximum(eigenvalues, _LEAST_INFORMATION)) @ axes.T
     is_determined = eigenvalues[0] * search_radius**2 > 1.0
     if is_determined and shots >= max(_MIN_CLUSTERS, 2 * n):
-        scatter = shots / (shots - n) * fit.scores.T @ fit.scores
-        covariance = inverse @ scatter @ inverse
+        covariance = _robust_covariance(fit.information, fit.scores)
     else:
         covariance = max(chi_squared, 1.0) * inverse
     status = "converged" if converged else f"no convergence in {_MAX_STEPS} steps"

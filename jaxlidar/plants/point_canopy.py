@@ -39,7 +39,7 @@ Remote Sens. 41, 872.
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy import ndimage, spatial
 
 from jaxlidar._checks import check_kind, check_range, check_shape
@@ -57,8 +57,10 @@ _DENSITY_CELL = 2.0
 _SMOOTHED_RETURNS, _NEIGHBOURHOOD = 20.0, 5.0
 # Largest probability of interception of a voxel: the lowest returns of a column would be a solid layer.
 _MAX_PROBABILITY = 0.98
-# Least height of a voxel above the ground, over its edge, so that returns at the ground have a volume.
+# Least height above the ground of the lowest voxel of a column, over its edge: lower ones have no volume.
 _MIN_HEIGHT = 0.05
+# Distance by which the terrain is continued beyond the points, m, so that footprints lie on it; it is dark.
+_MARGIN = 50.0
 # Largest scan angle, degrees, whose path length is taken as it is: files have larger ones that are wrong.
 _MAX_SCAN_ANGLE = 60.0
 # Ground returns to which a plane is fitted, and the fewest that make a terrain.
@@ -73,7 +75,8 @@ class PointCanopy(NamedTuple):
 
     - `voxels`: a `VoxelMap` of all plant material, wood included, in the coordinates of the cloud.
     - `stderr`: (nx, ny, nz) standard errors of the plant area density, m2/m3.
-    - `terrain`: a `Terrain` from ground returns; None where there are none.
+    - `terrain`: a `Terrain` from ground returns; None where there are none. It goes on 50 m beyond the
+      points, at the height of its rim and without reflectance, so that footprints at the rim lie on it.
 
     **Example:** plant area index, from the voxel map.
 
@@ -117,7 +120,7 @@ def canopy_from_points(
     - `points`: a `PointCloud`, such as `jaxlidar.io.read_las` returns, one point or more.
     - `voxel_size`: voxel edges in m, positive: one number for cubes, or three. Default 1.
     - `leaf_angles`: leaf inclination, as in `VoxelMap.from_lad`. Default "spherical".
-    - `reflectance`: reflectance of the terrain, in [0, 1]. Default 0.3.
+    - `reflectance`: reflectance of the terrain below the points, in [0, 1]. Default 0.3.
     - `origin`, `shape`: lower corner (x, y, z) in m and numbers of voxels (nx, ny, nz) of the grid; give both
       or neither. Default None: the smallest grid that holds all points, with faces at multiples of the edge.
 
@@ -151,14 +154,17 @@ def canopy_from_points(
     low, high = position.min(axis=0), np.nextafter(position.max(axis=0), np.inf)
     grid = Grid.enclosing(low, high, size, origin, shape)
     is_ground = _is_ground(points)
-    surface, terrain = np.full(grid.shape[:2], -np.inf), None
+    surface, terrain = np.full(grid.shape[:2], grid.low[2]), None
     if is_ground.sum() >= _MIN_GROUND:
         spacing = float(np.sqrt(size[0] * size[1]))
         columns = _column_centres(grid)
         surface = _fitted_heights(position[is_ground], columns.reshape(-1, 2), spacing)
         surface = surface.reshape(grid.shape[:2])
         terrain = _terrain(position[is_ground], low[:2], position.max(axis=0)[:2], size[:2], reflectance)
-    probability, entered = _interception(points, position, is_ground, grid, surface)
+    ground_layer = np.clip(
+        np.floor((surface - grid.low[2]) / size[2] + _MIN_HEIGHT).astype(int), 0, grid.shape[2] - 1
+    )
+    probability, entered = _interception(points, position, is_ground, grid, ground_layer)
     # Paths of the voxels that the ground cuts through end there.
     bottom = grid.low[2] + size[2] * np.arange(grid.shape[2])
     height = np.clip((bottom + size[2] - surface[:, :, None]) / size[2], _MIN_HEIGHT, 1.0)
@@ -221,11 +227,12 @@ def _interception(
     position: Float[np.ndarray, "n 3"],
     is_ground: Bool[np.ndarray, " n"],
     grid: Grid,
-    surface: Float[np.ndarray, "nx ny"],
+    ground_layer: Int[np.ndarray, "nx ny"],
 ) -> tuple[Float[np.ndarray, "nx ny nz"], Float[np.ndarray, "nx ny nz"]]:
     """Return the probability of interception of each voxel, and the number of returns that entered it.
 
-    1. Weights of plant returns by voxel, and of ground returns by column.
+    1. Weights of plant returns by voxel, and of ground returns by column. Layers are counted from that of the
+       ground, so that neighbours on a slope are compared at one height above it.
     2. Smoothed over some returns; columns filled up from their neighbourhood.
     3. What entered a voxel is the sum of what was returned in it, below it and from the ground.
     """
@@ -233,7 +240,7 @@ def _interception(
     # Errors of the surface put returns of low plants beneath it, where they would intercept nothing.
     column = np.clip(np.floor((plants[:, :2] - grid.low[:2]) / grid.size[:2]).astype(int), 0, None)
     column = np.minimum(column, np.array(grid.shape[:2]) - 1)
-    lowest = surface[tuple(column.T)] + 0.02 * grid.size[2]
+    lowest = grid.low[2] + grid.size[2] * (ground_layer[tuple(column.T)] + 0.5)
     plants[:, 2] = np.maximum(plants[:, 2], lowest)
 
     def sums(amount: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -241,7 +248,7 @@ def _interception(
         hits, ground = grid.zeros(), grid.zeros()
         grid.accumulate(plants, amount[~is_ground], hits)
         grid.accumulate(position[is_ground], amount[is_ground], ground)
-        return hits, ground.sum(axis=2)
+        return _moved_layers(hits, ground_layer), ground.sum(axis=2)
 
     area = float(grid.size[0] * grid.size[1])
     returns_per_column = len(position) * area / float(np.prod(grid.size[:2] * grid.shape[:2]))
@@ -259,7 +266,20 @@ def _interception(
     probability = np.where(is_lit, hits / np.where(is_lit, entered, 1.0), 0.0)
     # The mean of a Gaussian window of independent returns is as good as that of 4 pi s^2 times the density.
     window = max(1.0, 4.0 * np.pi * sigma**2 / area)
-    return np.clip(probability, 0.0, _MAX_PROBABILITY), window * entering(counted_hits, counted_ground)
+    counted = window * entering(counted_hits, counted_ground)
+    # Back to layers of equal height. Below the ground are no plants, and no returns.
+    probability = np.clip(probability, 0.0, _MAX_PROBABILITY)
+    return _moved_layers(probability, -ground_layer), _moved_layers(counted, -ground_layer)
+
+
+def _moved_layers(
+    values: Float[np.ndarray, "nx ny nz"], layers: Int[np.ndarray, "nx ny"]
+) -> Float[np.ndarray, "nx ny nz"]:
+    """Move every column down by a number of layers; zero where nothing comes from."""
+    count = values.shape[2]
+    source = np.arange(count) + layers[:, :, None]
+    moved = np.take_along_axis(values, np.clip(source, 0, count - 1), axis=2)
+    return np.where((source >= 0) & (source < count), moved, 0.0)
 
 
 def _smooth(values: np.ndarray, sigma: float, grid: Grid) -> np.ndarray:
@@ -347,16 +367,24 @@ def _terrain(
     spacing: Float[np.ndarray, "2"],
     reflectance: float,
 ) -> Terrain:
-    """Return the terrain over the rectangle of all points, with nodes about `spacing` m apart."""
-    # Not beyond the points: ground without a return would be ground without plants.
+    """Return the terrain over the rectangle of all points, with nodes about `spacing` m apart.
+
+    It goes on at the height of its rim, without reflectance: ground without returns has no plants either.
+    """
     extent = np.maximum(high - low, spacing)
     cells = np.maximum(np.ceil(extent / spacing - 1e-9).astype(int), 1)
     step = extent / cells
-    x, y = (low[k] + step[k] * np.arange(cells[k] + 1) for k in range(2))
-    nodes = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
-    heights = _fitted_heights(ground, nodes.reshape(-1, 2), float(np.sqrt(spacing.prod())))
-    heights = heights.reshape(nodes.shape[:2])
-    return Terrain(heights=heights, spacing=step, origin=tuple(low), reflectance=reflectance)
+    margin = np.ceil(_MARGIN / step).astype(int)
+    nodes = [np.arange(-m, n + m + 1) for m, n in zip(margin, cells)]
+    x, y = (low[k] + step[k] * np.clip(nodes[k], 0, cells[k]) for k in range(2))
+    place = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
+    heights = _fitted_heights(ground, place.reshape(-1, 2), float(np.sqrt(spacing.prod())))
+    on_cloud = [(n >= 0) & (n <= count) for n, count in zip(nodes, cells)]
+    raster = reflectance * np.outer(*on_cloud)
+    origin = low - step * margin
+    return Terrain(
+        heights=heights.reshape(place.shape[:2]), spacing=step, origin=tuple(origin), reflectance=raster
+    )
 
 
 def _fitted_heights(
