@@ -18,7 +18,7 @@ from typing import Any, final
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import ArrayLike, Float
+from jaxtyping import ArrayLike, Float, Int
 
 from jaxlidar._checks import (
     as_numpy,
@@ -87,7 +87,7 @@ class Survey(eqx.Module):
     azimuth: Float[np.ndarray, " shots"]
     gps_time: Float[np.ndarray, " shots"] | None
     scan_angle: Float[np.ndarray, " shots"] | None
-    flight_line: Float[np.ndarray, " shots"] | None
+    flight_line: Int[np.ndarray, " shots"] | None
 
     def __init__(
         self,
@@ -113,13 +113,14 @@ class Survey(eqx.Module):
         check_range("zenith", self.zenith, 0.0, MAX_ZENITH)
         self.gps_time = _optional_per_shot("gps_time", gps_time, len(positions))
         self.scan_angle = _optional_per_shot("scan_angle", scan_angle, len(positions))
-        self.flight_line = _optional_per_shot("flight_line", flight_line, len(positions))
+        lines = _optional_per_shot("flight_line", flight_line, len(positions))
         if self.scan_angle is not None:
             check_range("scan_angle", self.scan_angle, -180.0, 180.0)
-        if self.flight_line is not None:
-            check_range("flight_line", self.flight_line, 0, MAX_FLIGHT_LINE)
-            if np.any(self.flight_line != np.floor(self.flight_line)):
+        if lines is not None:
+            check_range("flight_line", lines, 0, MAX_FLIGHT_LINE)
+            if np.any(lines != np.floor(lines)):
                 raise ValueError("flight_line has values that are not whole numbers")
+        self.flight_line = None if lines is None else lines.astype(int)
 
     def __len__(self) -> int:
         return len(self.position)

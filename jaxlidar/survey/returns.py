@@ -112,7 +112,7 @@ class DiscreteReturns(eqx.Module):
     >>> returns = jl.simulate_many(survey, scene, key=jax.random.key(0)).returns()
     >>> print(returns)
     4 returns of 2 shots: 2 ground, 2 plate
-    >>> print(returns.position[:2, 2].round(2), returns.number[:2])
+    >>> print(returns.position[:2, 2].round(1) + 0.0, returns.number[:2])
     [6. 0.] [1 2]
     """
 
@@ -130,7 +130,7 @@ class DiscreteReturns(eqx.Module):
     ground_height: Float[np.ndarray, " returns"]
     gps_time: Float[np.ndarray, " returns"]
     scan_angle: Float[np.ndarray, " returns"]
-    flight_line: Float[np.ndarray, " returns"]
+    flight_line: Int[np.ndarray, " returns"]
     n_shots: int = eqx.field(static=True)
 
     def __len__(self) -> int:
@@ -258,6 +258,7 @@ class DetectorInput:
     - `time`: (samples,) ns. - `recorded`, `energy`, `stderr`: (shots, samples), as those of `Waveforms`.
     - `components`: by material, (shots, samples) apparent reflectance. - `truth`: the same of
       `Truths.returns`, or None.
+    - `surface_height`: of the truth, by surface, (shots,) m; empty without truth.
     - `axes`: of the beams. - `acquisition`: of the shots. - `constant`: radiometric constant, J m2.
     - `ground_height`: (shots,) m.
     """
@@ -268,6 +269,7 @@ class DetectorInput:
     stderr: Float[np.ndarray, "shots samples"]
     components: Mapping[str, Float[np.ndarray, "shots samples"]]
     truth: Mapping[str, Float[np.ndarray, "shots samples"]] | None
+    surface_height: Mapping[str, Float[np.ndarray, " shots"]]
     axes: ShotAxes
     acquisition: Acquisition
     constant: float
@@ -318,6 +320,7 @@ def input_of_waveforms(waves: Any, wavelength: Any) -> DetectorInput:
         stderr=waves.stderr[:, w],
         components={name: a[:, w] for name, a in waves.components.items() if name not in _ORDERS},
         truth=None if waves.truth is None else {name: a[:, w] for name, a in waves.truth.returns.items()},
+        surface_height={} if waves.truth is None else waves.truth.surface_height,
         axes=_shot_axes(waves.position, zenith, azimuth, float(waves.info["altitude"])),
         acquisition=waves.acquisition,
         constant=float(waves.acquisition.radiometric_constant[w]),
@@ -341,8 +344,8 @@ def input_of_waveform(wave: Any, lidar: Any, wavelength: Any) -> DetectorInput:
         return np.asarray(array)[w][None]
 
     truth = wave.truth
-    # The truth has the height of the ground over the footprint.
-    ground = np.nan if truth is None else float(truth.surface_height.get("ground", np.nan))
+    heights = {} if truth is None else truth.surface_height
+    heights = {name: np.asarray(height, float).reshape(1) for name, height in heights.items()}
     return DetectorInput(
         time=np.asarray(wave.time, float),
         recorded=row(wave.recorded),
@@ -350,10 +353,12 @@ def input_of_waveform(wave: Any, lidar: Any, wavelength: Any) -> DetectorInput:
         stderr=row(wave.stderr),
         components={name: row(a) for name, a in wave.components.items() if name not in _ORDERS},
         truth=None if truth is None else {name: row(a) for name, a in truth.returns.items()},
+        surface_height=heights,
         axes=_shot_axes(np.asarray(lidar.position, float)[None], zenith, azimuth, float(lidar.altitude)),
-        acquisition=Acquisition(np.full(1, np.nan), zenith, np.ones(1), sampled_pulse(lidar), constants),
+        acquisition=Acquisition(np.full(1, np.nan), zenith, np.ones(1, int), sampled_pulse(lidar), constants),
         constant=float(constants[w]),
-        ground_height=np.full(1, ground),
+        # The truth has the mean height of the ground over the footprint.
+        ground_height=heights.get("ground", np.full(1, np.nan)),
     )
 
 
@@ -926,6 +931,12 @@ def _true_echoes(
     mean = total(light * time) / reflectance
     variance = total(light * (time - mean[echo]) ** 2) / reflectance
     shot = shots.start + rows[starts]
+    if material in waves.surface_height:
+        # Samples resolve the mean to a part of their length; the height of a surface is exact.
+        axes, height = waves.axes, waves.surface_height[material][shot]
+        rise = (height - axes.origin[shot, 2]) / axes.direction[shot, 2]
+        exact = rise / (0.5 * SPEED_OF_LIGHT)
+        mean = np.where(np.abs(exact - mean) < waves.step, exact, mean)
     (listed,) = np.nonzero(reflectance >= min_reflectance)
     columns = {
         "shot": shot,

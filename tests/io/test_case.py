@@ -68,8 +68,7 @@ EXAMPLES = {
         jl.Lidar(altitude=1 / 3e-4), 6e5 + RANDOM.random((40, 2)), RANDOM.random(40), 1 / 3
     ),
     "Survey, of a scanner": jl.Survey(
-        jl.Lidar(), RANDOM.random((3, 2)), gps_time=3.2e8 + RANDOM.random(3), scan_angle=RANDOM.random(3),
-        flight_line=7,
+        jl.Lidar(), RANDOM.random((3, 2)), gps_time=3.2e8 + RANDOM.random(3), scan_angle=RANDOM.random(3)
     ),
     "EqualAngle": with_ground(law=jl.EqualAngle()),
     "Lambertian": jl.Scene(plates=(jl.Plate(1.0, 0.1, law=jl.Lambertian()),)),
