@@ -19,8 +19,8 @@ waveforms is in the package `inversion`.
 
 ## Surveys of many shots
 
-`Survey`, `AbstractScan`, `Oscillating`, `RotatingPolygon`, `Conical`, `simulate_many`, `Waveforms`,
-`SurveyProgress`, `SceneParts`.
+`Survey`, `Trajectory`, `AbstractScan`, `Oscillating`, `RotatingPolygon`, `Conical`, `ground_position`,
+`simulate_many`, `Waveforms`, `SurveyProgress`, `SceneParts`.
 
 ## Scenes
 
@@ -90,6 +90,7 @@ from jaxlidar.instrument.pulse import (
 from jaxlidar.instrument.receiver import Receiver, first_return_window, record
 from jaxlidar.instrument.scan import AbstractScan, Conical, Oscillating, RotatingPolygon
 from jaxlidar.instrument.survey import Survey
+from jaxlidar.instrument.trajectory import Trajectory
 from jaxlidar.io.netcdf import open, rerun
 from jaxlidar.optics.coefficients import load_coefficients
 from jaxlidar.optics.laws import AbstractLaw, AbstractMirror, EqualAngle, Lambertian, Specular
@@ -121,7 +122,7 @@ from jaxlidar.scenes.terrain import Terrain
 from jaxlidar.scenes.voxels import VoxelMap
 from jaxlidar.simulate import LateLightWarning, UnfollowedLightWarning, simulate
 from jaxlidar.spectral.waveform import Waveform, total_reflectance, waveform_of
-from jaxlidar.survey.coverage import OffMapWarning
+from jaxlidar.survey.coverage import OffMapWarning, ground_position
 from jaxlidar.survey.progress import SurveyProgress
 from jaxlidar.survey.simulate_many import simulate_many
 from jaxlidar.survey.truths import Truths
@@ -155,10 +156,12 @@ __all__ = [
     "PhotonEvents",
     # Surveys of many shots.
     "Survey",
+    "Trajectory",
     "AbstractScan",
     "Oscillating",
     "RotatingPolygon",
     "Conical",
+    "ground_position",
     "simulate_many",
     "Waveforms",
     "SurveyProgress",

@@ -25,6 +25,7 @@ from jaxlidar.io.obj import MeshRead, read_obj
 from jaxlidar.io.pulsewaves import read_pulsewaves
 from jaxlidar.io.qsm import TreeRead, read_qsm
 from jaxlidar.io.rasters import write_raster
+from jaxlidar.io.trajectory import read_trajectory
 from jaxlidar.io.vox import VoxelsRead, read_vox
 
 __all__ = [
@@ -55,6 +56,7 @@ __all__ = [
     "read_obj",
     "read_pulsewaves",
     "read_qsm",
+    "read_trajectory",
     "read_vox",
     "save",
     "stack_shots",

@@ -279,6 +279,9 @@ def _spans(waveforms: Any, survey: Survey, margin: int) -> tuple[np.ndarray, np.
 
     **Raises:** as `write_gedi_l1b`.
     """
+    if survey.altitude is None or np.ptp(survey.altitude) > 0:
+        placed = "by their sensors" if survey.altitude is None else "at several altitudes"
+        raise ValueError(f"survey: its shots are placed {placed}; admissible is one altitude, as an orbit has")
     position = getattr(waveforms, "position", None)
     if position is None:
         check_kind("waveforms", waveforms, Sequence, "the Waveforms of simulate_many, or a list of Waveform")
@@ -290,12 +293,12 @@ def _spans(waveforms: Any, survey: Survey, margin: int) -> tuple[np.ndarray, np.
         raise ValueError("the waveforms have another position than the shots of the survey; give their own")
     if position is not None:
         spans = [_span(waveforms, "waveforms", margin)] * len(survey)
-        _check_lidar(waveforms, "waveforms", survey.lidar)
+        _check_lidar(waveforms, "waveforms", survey[0])
         _check_directions(waveforms, survey)
     else:
         spans = [_span(wave, f"waveforms {i}", margin) for i, wave in enumerate(waveforms)]
         for i, wave in enumerate(waveforms):
-            _check_lidar(wave, f"waveforms {i}", survey.lidar)
+            _check_lidar(wave, f"waveforms {i}", survey[i])
             _check_zenith(wave, f"waveforms {i}", float(survey.zenith[i]))
     first_times, bins = zip(*spans)
     return np.array(first_times), np.array(bins)
@@ -368,7 +371,7 @@ def _span(waves: Any, name: str, margin: int) -> tuple[float, int]:
 
 def _energy_per_reflectance(survey: Survey) -> np.ndarray:
     """Return the energy, J, of a sample per apparent reflectance of it, at the reference plane, (shots,)."""
-    upright = dataclasses.replace(survey.lidar, zenith=0.0)
+    upright = dataclasses.replace(survey[0], zenith=0.0)
     return float(energy_at_reference(upright)[0]) * np.cos(np.deg2rad(survey.zenith)) ** 2
 
 
@@ -466,7 +469,8 @@ def _geolocation(
     of the reference plane. `projection`: of the survey's positions.
     """
     zenith, azimuth = np.deg2rad(survey.zenith), np.deg2rad(survey.azimuth)
-    altitude = concrete_number(survey.lidar.altitude)
+    assert survey.altitude is not None
+    altitude = float(survey.altitude[0])
     last_time = first_time + bins - 1
     # Heights above the reference plane, as those of `Waveform.height`.
     height_per_ns = -0.5 * SPEED_OF_LIGHT * np.cos(zenith)

@@ -17,19 +17,21 @@ from jaxlidar.scenes.scene import Scene
 
 
 def move_aim_to_origin(lidar: Lidar, scene: Scene) -> tuple[Lidar, Scene]:
-    """Return the same lidar and scene, moved so that the lidar aims at x = y = 0.
+    """Return the same lidar and scene, moved so that the lidar aims at x = y = 0, or its sensor is there.
 
     Differences are taken in double precision, and what is returned has JAX's default precision. Where the
     position of the lidar is traced by a JAX transformation, or a surface cannot be moved, nothing is moved.
     """
-    aim = concrete(lidar.position)
-    if aim is None:
+    position = concrete(lidar.position)
+    if position is None:
         return lidar, scene
+    # Of a sensor the height stays.
+    aim, height = position[:2], position[2:]
     # `moved` returns None for surfaces that cannot be moved.
     moved = [surface.moved(-aim) for surface in scene.surfaces]
     stays = not aim.any() or any(surface is None for surface in moved)
     new_aim = aim if stays else np.zeros(2)
-    lidar = eqx.tree_at(lambda a: a.position, lidar, jnp.asarray(new_aim, float))
+    lidar = eqx.tree_at(lambda a: a.position, lidar, jnp.asarray(np.append(new_aim, height), float))
     surfaces = tuple(scene.surfaces if stays else moved)
     # `surfaces` has the ground first, if there is one, then the plates.
     n_grounds = len(surfaces) - len(scene.plates)

@@ -70,7 +70,7 @@ def choose_strategy(
     # Coordinates are relative to the survey's middle, where single precision is fine. A scene that cannot be
     # moved keeps its coordinates, and the lidar its position.
     lidar, _ = move_aim_to_origin(middle, scene)
-    relative_survey = survey.about(concrete_array(middle.position) - concrete_array(lidar.position))
+    relative_survey = survey.about((concrete_array(middle.position) - concrete_array(lidar.position))[:2])
     strategy = _shared_illumination(relative_survey, setup, rtol, shared)
     return PerShotStrategy(setup, relative_survey, rtol) if strategy is None else strategy
 
@@ -164,6 +164,10 @@ def _groups(
 def reason_against_sharing(survey: Survey, setup: Setup, rtol: float) -> str | None:
     """Return the reason why the shots of a survey cannot share light; None where they can."""
     canopy, lidar = setup.scene.canopy, setup.lidar
+    if survey.altitude is None:
+        return "shots are placed by their sensors"
+    if np.ptp(survey.altitude) > 0:
+        return "shots have more than one altitude"
     if not beams_are_parallel(survey):
         return "shots have more than one direction"
     # Such shots share higher orders alone; their first order has rays of its own in either strategy.

@@ -106,6 +106,7 @@ def waveforms_on_disk(
 def _waveforms(
     strategy: AbstractStrategy, fields: dict[str, Any], start_time: float, **info: Any
 ) -> Waveforms:
+    altitude = strategy.setup.lidar.altitude
     return Waveforms(
         time=np.asarray(make_waveform_model(strategy.setup).time),
         wavelength=np.asarray(strategy.setup.lidar.wavelength),
@@ -113,7 +114,7 @@ def _waveforms(
         info={
             "rtol": strategy.rtol,
             "orders": strategy.setup.plan.orders,
-            "altitude": float(strategy.setup.lidar.altitude),
+            "altitude": None if altitude is None else float(altitude),
             "seconds": time.perf_counter() - start_time,
             **strategy.info(),
             **info,

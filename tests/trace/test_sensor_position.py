@@ -1,0 +1,290 @@
+"""A lidar that is placed by its sensor: anywhere, looking anywhere, against closed forms.
+
+Order one of a slab of extinction k of leaves of the reflectance R, seen along a ray of the length s, is
+(2/3) R (1 - exp(-k s)) with the hot spot, whichever way the beam goes. A wall is a plate on edge.
+"""
+
+import jax
+import numpy as np
+import pytest
+
+import jaxlidar as jl
+from tests.helpers import agrees, slab
+
+KEY = jax.random.key(0)
+METRES_PER_NS = 0.5 * jl.SPEED_OF_LIGHT
+# Of a slab 10 m high, on z = 0, of the extinction 0.2 /m.
+EXTINCTION = 0.2
+LEAVES = {"leaf": jl.LeafOptics(0.5, 0.3), "hotspot": True}
+
+
+def canopy(**changes):
+    voxels = slab(10.0 * EXTINCTION, shape=(8, 8, 10))
+    return jl.Canopy(voxels, **{**LEAVES, **changes})
+
+
+def look(sensor, zenith, azimuth=0.0, **changes):
+    return jl.Lidar(sensor=sensor, zenith=zenith, azimuth=azimuth, **changes)
+
+
+def first_order(lidar, scene, **options):
+    return jl.simulate(lidar, scene, key=KEY, max_orders=1, rtol=0.005, **options)
+
+
+def total(wave):
+    return float(np.sum(wave.reflectance))
+
+
+def mean_range(wave):
+    """Range of the centroid of a waveform, m; time zero is the emission."""
+    return float(np.sum(wave.reflectance * wave.time) / np.sum(wave.reflectance)) * METRES_PER_NS
+
+
+# -- planes and shapes -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("zenith", [0.0, 40.0, 75.0])
+def test_ground_is_seen_at_its_range(zenith):
+    """Range H / cos, apparent reflectance rho cos, energy E A rho cos / (pi r^2)."""
+    wave = first_order(
+        look((3.0, -2.0, 12.0), zenith), jl.Scene(ground=jl.Ground(height=2.0, reflectance=0.4))
+    )
+    cosine = np.cos(np.deg2rad(zenith))
+    distance = 10.0 / cosine
+    assert total(wave) == pytest.approx(0.4 * cosine, rel=1e-4)
+    assert mean_range(wave) == pytest.approx(distance, rel=1e-5)
+    energy = 1e-3 * (np.pi * 0.1**2) / (np.pi * distance**2) * 0.4 * cosine
+    assert float(wave.energy.sum()) == pytest.approx(energy, rel=1e-4)
+    peak = int(np.argmax(wave.reflectance))
+    assert float(wave.height[peak]) == pytest.approx(2.0, abs=0.15 * cosine + 1e-3)
+
+
+def test_a_wall_is_seen_by_level_and_inclined_beams():
+    """A vertical plate at x = 20 m, seen along the unit vector w: range 20 / w_x, and rho w_x."""
+    wall = jl.Plate(height=0.0, slope=90.0, aspect=270.0, position=(20.0, 0.0), reflectance=0.6)
+    for zenith, azimuth in ((90.0, 90.0), (70.0, 60.0), (120.0, 110.0)):
+        w_x = np.sin(np.deg2rad(zenith)) * np.sin(np.deg2rad(azimuth))
+        wave = first_order(look((0.0, 0.0, 1.5), zenith, azimuth), jl.Scene(plates=(wall,)))
+        assert total(wave) == pytest.approx(0.6 * w_x, rel=1e-3)
+        assert mean_range(wave) == pytest.approx(20.0 / w_x, rel=1e-4)
+    # Away from the wall there is nothing: a sensor sees what lies before it.
+    assert total(first_order(look((0.0, 0.0, 1.5), 90.0, 270.0), jl.Scene(plates=(wall,)))) == 0.0
+
+
+def test_a_wide_beam_widens_from_the_sensor():
+    """A top-hat beam of the half-angle a on level ground 2 m below: mean range 2 (1 + a^2 / 4)."""
+    a = 0.1
+    lidar = look((0.0, 0.0, 2.0), 0.0, divergence=2e3 * a, profile="top-hat", sampling_interval=0.05)
+    wave = first_order(lidar, jl.Scene(ground=jl.Ground()))
+    # Uniform over the disc at 1 m, whose rays go to r = a sqrt(u): the path is 2 sqrt(1 + r^2).
+    r = a * np.sqrt((np.arange(2000) + 0.5) / 2000)
+    cosine = 1.0 / np.sqrt(1.0 + r**2)
+    assert total(wave) == pytest.approx(float(jl.Ground().reflectance) * cosine.mean(), rel=1e-3)
+    assert mean_range(wave) == pytest.approx(float(np.average(2.0 / cosine, weights=cosine)), rel=1e-4)
+
+
+def test_time_and_light_are_those_of_the_same_lidar_by_its_altitude():
+    scene = jl.Scene(canopy=canopy(), ground=jl.Ground(slope=10.0))
+    options = {"divergence": 20.0, "aperture": 0.05, "profile": "top-hat"}
+    above = jl.Lidar(altitude=80.0, zenith=20.0, azimuth=30.0, position=(2.0, 1.0), **options)
+    sensor = look(np.asarray(above.sensor), 20.0, 30.0, **options)
+    waves = [first_order(lidar, scene, footprint="fixed") for lidar in (above, sensor)]
+    distance = float(above.range_to_reference)
+    assert total(waves[0]) == pytest.approx(total(waves[1]), rel=1e-4)
+    assert float(waves[0].energy.sum()) == pytest.approx(float(waves[1].energy.sum()), rel=1e-3)
+    shift = mean_range(waves[1]) - mean_range(waves[0])
+    assert shift == pytest.approx(distance, abs=1e-3)
+
+
+# -- plants ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("height", "zenith", "length"),
+    [
+        # From below, from within upwards and downwards, level to the side of the map, and from above.
+        (-3.0, 150.0, 10.0 / np.cos(np.deg2rad(30.0))),
+        (4.0, 150.0, 6.0 / np.cos(np.deg2rad(30.0))),
+        (4.0, 20.0, 4.0 / np.cos(np.deg2rad(20.0))),
+        (4.0, 90.0, 20.0),
+        (4.0, 180.0, 6.0),
+        (25.0, 10.0, 10.0 / np.cos(np.deg2rad(10.0))),
+        # From above, looking up.
+        (25.0, 170.0, 0.0),
+    ],
+)
+def test_first_order_of_a_slab_from_anywhere(height, zenith, length):
+    scene = jl.Scene(canopy=canopy())
+    wave = first_order(look((0.0, 0.0, height), zenith), scene)
+    expected = 2.0 / 3.0 * 0.5 * (1.0 - np.exp(-EXTINCTION * length))
+    assert total(wave) == pytest.approx(expected, rel=2e-4, abs=1e-7)
+    # What is behind the sensor, which the wrong sign of the beam would see, is another length.
+    if 0 < length < 10:
+        behind = 2.0 / 3.0 * 0.5 * (1.0 - np.exp(-EXTINCTION * (20.0 - length)))
+        assert abs(total(wave) - behind) > 0.02
+
+
+def test_energy_is_conserved_from_within_a_canopy():
+    """Leaves and ground that absorb nothing, without sides: all light escapes, returns or is in flight."""
+    scene = jl.Scene(
+        canopy=canopy(leaf=jl.LeafOptics(0.6, 0.4), sides="periodic"), ground=jl.Ground(reflectance=1.0)
+    )
+    lidar = look((0.0, 0.0, 3.0), 140.0, sampling_interval=5.0, field_of_view=100.0)
+    wave = jl.simulate(lidar, scene, key=KEY, max_orders=6, n_photons=2048, rtol=0.5, window=(0.0, 4000.0))
+    budget = {name: float(value[0]) for name, value in wave.energy_budget.items()}
+    absorbed = sum(value for name, value in budget.items() if name.startswith("absorbed"))
+    assert absorbed == pytest.approx(0.0, abs=2e-4)
+    stderr = sum(float(value[0]) for value in wave.energy_budget_stderr.values())
+    # Returned light is counted within escaped light as well: it is 1e-3 here.
+    assert agrees(sum(budget.values()) - budget["returned"], stderr, 1.0, bound=1e-3)
+    assert budget["escaped"] > 0.1
+
+
+def isotropic_second_order(extinction, top, sensor_height, albedo, rng, n):
+    """Second-order return of an isotropic slab from a sensor within it that looks straight up, by NumPy.
+
+    Light flies up from z_s, collides at z_1, flies in a direction of uniform distribution, collides at x_2,
+    and returns straight to the sensor: apparent reflectance pi p exp(-k r) (r_t / r)^2 cos, with p = 1 / (4
+    pi), r the distance of x_2 and r_t half the path. The aperture has a radius of 0.1 m.
+    """
+    first = -np.log1p(-rng.random(n) * -np.expm1(-extinction * (top - sensor_height))) / extinction
+    weight = np.full(n, -np.expm1(-extinction * (top - sensor_height)) * albedo**2)
+    cosine, turn = rng.uniform(-1, 1, n), rng.uniform(0, 2 * np.pi, n)
+    sine = np.sqrt(1 - cosine**2)
+    z = sensor_height + first
+    room = np.where(cosine > 0, (top - z) / np.maximum(cosine, 1e-9), z / np.maximum(-cosine, 1e-9))
+    weight = weight * -np.expm1(-extinction * room)
+    second = -np.log1p(-rng.random(n) * -np.expm1(-extinction * room)) / extinction
+    x, up = second * sine * np.cos(turn), z + second * cosine - sensor_height
+    y = second * sine * np.sin(turn)
+    distance = np.sqrt(x * x + y * y + up * up)
+    recorded = 0.5 * (first + second + distance)
+    seen = np.maximum(up, 0.0) / distance * (recorded / np.maximum(distance, 0.1)) ** 2
+    value = weight * 0.25 * np.exp(-extinction * distance) * seen
+    return value.mean(), value.std() / np.sqrt(n)
+
+
+def test_second_order_within_a_slab_agrees_with_another_code():
+    """Fails by 20 standard errors if light from behind the sensor, or without the cosine, were seen."""
+    extinction, albedo, height = 0.3, 0.8, 4.0
+    expected, expected_stderr = isotropic_second_order(
+        extinction, 10.0, height, albedo, np.random.default_rng(0), 400_000
+    )
+    scene = jl.Scene(
+        canopy=jl.Canopy(
+            slab(10.0 * extinction, width=400.0, origin=(-200.0, -200.0, 0.0)),
+            leaf=jl.Isotropic(albedo=albedo),
+            hotspot=True,
+        )
+    )
+    lidar = look((0.0, 0.0, height), 180.0, divergence=1e-3, sampling_interval=2000.0)
+    wave = jl.simulate(
+        lidar, scene, key=KEY, max_orders=2, n_photons=16384, rtol=0.03, window=(900.0, 901.0), bin_width=20.0
+    )
+    higher, stderr = float(wave.components["higher"].sum()), float(wave.stderr.max())
+    assert agrees(higher, np.hypot(stderr, expected_stderr), expected)
+    assert not agrees(higher, np.hypot(stderr, expected_stderr), 1.25 * expected)
+
+
+# -- surveys -----------------------------------------------------------------------------------------------
+
+
+def test_a_terrestrial_scan_of_a_wall_and_ground():
+    """Shots of many directions share one program; ranges and reflectances are those of the planes."""
+    zenith, azimuth = np.array([60.0, 80.0, 90.0, 100.0, 30.0]), np.array([90.0, 80.0, 90.0, 90.0, 0.0])
+    wall = jl.Plate(height=0.0, slope=90.0, aspect=270.0, position=(20.0, 0.0), reflectance=0.6)
+    scene = jl.Scene(ground=jl.Ground(reflectance=0.3), plates=(wall,))
+    survey = jl.Survey(jl.Lidar(), sensor=np.tile([5.0, 3.0, 4.0], (5, 1)), zenith=zenith, azimuth=azimuth)
+    many = jl.simulate_many(survey, scene, key=KEY, max_orders=1, rtol=0.02)
+    w = survey.direction
+    to_wall, to_ground = 15.0 / np.maximum(w[:, 0], 1e-9), 4.0 / np.maximum(-w[:, 2], 1e-9)
+    distance = np.minimum(to_wall, to_ground)
+    cosine = np.where(to_wall < to_ground, 0.6 * w[:, 0], -0.3 * w[:, 2])
+    sums = many.reflectance.sum(axis=(1, 2))
+    centroid = (many.reflectance[:, 0] * many.time).sum(axis=1) / sums * METRES_PER_NS
+    np.testing.assert_allclose(sums, cosine, rtol=2e-3)
+    np.testing.assert_allclose(centroid, distance, rtol=1e-3)
+    ground = survey.sensor + to_ground[:, None] * w
+    goes_down = w[:, 2] < -1e-6
+    np.testing.assert_allclose(many.ground_position[goes_down], ground[goes_down], atol=1e-3)
+    assert np.all(np.isnan(many.ground_position[~goes_down]))
+    np.testing.assert_allclose(many.ground_position, jl.ground_position(survey, scene), atol=1e-4)
+    # A shot alone is that of the survey.
+    wave = jl.simulate(survey[1], scene, key=KEY, max_orders=1)
+    assert total(wave) == pytest.approx(float(sums[1]), rel=1e-3)
+    assert float(many[1].height[0]) == pytest.approx(
+        4.0 - many.time[0] * METRES_PER_NS * np.cos(np.deg2rad(80.0)), abs=1e-3
+    )
+
+
+# -- air ---------------------------------------------------------------------------------------------------
+
+
+def test_air_along_level_and_inclined_beams():
+    air = jl.Atmosphere(visibility=10.0, rayleigh=False, aerosol_scale_height=50.0)
+    k = float(air.extinction(1064.0, 0.0)[()])
+    for zenith in (90.0, 120.0, 60.0):
+        cosine = np.cos(np.deg2rad(zenith))
+        s = np.linspace(0.0, 40.0, 20001)
+        column = np.trapezoid(k * np.exp(-(30.0 - s * cosine) / 50.0), s)
+        transmittance = air.two_way_transmittance_along(1064.0, 40.0, 30.0, zenith)
+        assert float(transmittance) == pytest.approx(np.exp(-2 * column), rel=1e-5)
+    down = air.two_way_transmittance_along(1064.0, 30.0 / 0.5, 30.0, 60.0)
+    assert float(down) == pytest.approx(float(air.two_way_transmittance(1064.0, 0.0, 30.0, 60.0)), rel=1e-5)
+
+
+# -- inadmissible input ------------------------------------------------------------------------------------
+
+
+def test_sensors_that_are_refused():
+    ground = jl.Ground(height=1.0)
+    for lidar, scene, message in (
+        (look((0, 0, 0.5), 0.0), jl.Scene(ground=ground), "below the ground"),
+        (look((0, 0, 2.0), 0.0), jl.Scene(plates=(jl.Plate(height=2.0),)), "in a plate"),
+        (look((0, 0, 2.0), 90.0), jl.Scene(canopy=canopy(sides="periodic")), "level beam"),
+        (
+            look((0, 0, 2.0), 90.0),
+            jl.Scene(ground=jl.Ground(), atmosphere=jl.Atmosphere(lidar_ratio=50.0)),
+            "lidar_ratio",
+        ),
+        (
+            look((5.0, 5.0, 2.9), 90.0),
+            jl.Scene(ground=jl.Terrain(np.full((11, 11), 3.0) + np.eye(11), spacing=1.0)),
+            "below the ground",
+        ),
+    ):
+        with pytest.raises(ValueError, match=message):
+            jl.plan(lidar, scene)
+    scene = jl.Scene(ground=jl.Ground())
+    plan = jl.plan(jl.Lidar(altitude=10.0), scene)
+    with pytest.raises(ValueError, match="placed by its sensor"):
+        jl.simulate(look((0, 0, 10.0), 0.0), scene, key=KEY, plan=plan)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"sensor": (0, 0)}, "sensor"),
+        ({"sensor": (0, 0, np.nan)}, "position"),
+        ({"sensor": (0, 0, 1), "altitude": 10.0}, "altitude is given together with sensor"),
+        ({"sensor": (0, 0, 1), "position": (0, 0)}, "position is given together with sensor"),
+        ({"sensor": (0, 0, 1), "zenith": 181.0}, "zenith"),
+        ({"zenith": 90.0}, "zenith"),
+    ],
+)
+def test_inadmissible_places(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        jl.Lidar(**arguments)
+
+
+def test_a_lidar_with_a_sensor_is_kept_in_files(tmp_path):
+    survey = jl.Survey(jl.Lidar(), sensor=[(1.0, 2.0, 3.0)] * 2, zenith=[80.0, 100.0])
+    case = jl.io.Case(survey=survey, scene=jl.Scene(ground=jl.Ground()))
+    jl.io.write_case(case, tmp_path / "case.toml")
+    read = jl.io.read_case(tmp_path / "case.toml").survey
+    assert read.has_sensor_position
+    np.testing.assert_array_equal(read.sensor, survey.sensor)
+    np.testing.assert_array_equal(read[1].sensor, survey[1].sensor)
+    many = jl.simulate_many(read, case.scene, key=KEY, max_orders=1)
+    many.save(tmp_path / "many.nc", jl.io.Case(survey=read, scene=case.scene))
+    np.testing.assert_array_equal(jl.open(tmp_path / "many.nc").ground_position, many.ground_position)
