@@ -322,7 +322,7 @@ def test_help_begins_with_the_summary_of_a_class():
     assert positions.keys() == PUBLIC.keys()
     assert {name for name, at in positions.items() if not 0 <= at < 800} == set()
     for cls in (jl.Lidar, jl.Scene, jl.Canopy, jl.VoxelMap, jl.Ground, jl.Plate, jl.Prospect):
-        assert positions[f"jaxlidar.{cls.__name__}"] < 400
+        assert positions[f"jaxlidar.{cls.__name__}"] < 440
         assert cls.__final__
 
 
@@ -330,7 +330,13 @@ def test_a_short_signature_keeps_names_and_defaults():
     lidar_parameters = inspect.signature(jl.Lidar).parameters
     # The sensor is an argument, kept as the position.
     assert list(lidar_parameters) == [*(field.name for field in dataclasses.fields(jl.Lidar)), "sensor"]
-    assert (lidar_parameters["divergence"].default, lidar_parameters["profile"].default) == (0.3, "gaussian")
+    names = ("altitude", "position", "divergence", "profile")
+    assert [str(lidar_parameters[name].default) for name in names] == [
+        "1000.0",
+        "(0.0, 0.0)",
+        "0.3",
+        "gaussian",
+    ]
     leaf_parameters = inspect.signature(jl.Prospect).parameters
     assert list(leaf_parameters)[:2] == ["N", "Cab"]
     assert leaf_parameters["Cp"].kind is inspect.Parameter.KEYWORD_ONLY

@@ -50,7 +50,20 @@ from jaxlidar.instrument.receiver import Receiver
 AIM_DISTANCE = 1.0
 # Largest zenith angle, degrees, of a beam that is to meet the reference plane, and of any beam.
 _MAX_ZENITH, STRAIGHT_UP = 89.0, 180.0
-_DEFAULT_ALTITUDE, _DEFAULT_POSITION = 1000.0, (0.0, 0.0)
+
+
+class _Default:
+    """Default of an argument, by its text. It says that the argument was left out, which None does not."""
+
+    def __init__(self, text: str):
+        self.text = text
+
+    def __repr__(self) -> str:
+        return self.text
+
+
+_ALTITUDE, _AIM_POINT = _Default("1000.0"), _Default("(0.0, 0.0)")
+_PULSE, _RECEIVER = _Default("GaussianPulse()"), _Default("Receiver()")
 
 
 def _wavelengths(x: ArrayLike | Sequence[ArrayLike]) -> Float[Array, "..."]:
@@ -95,8 +108,8 @@ class Lidar(eqx.Module):
 
     - `wavelength`: nm, positive, one number or several that increase strictly; stored as (wavelengths,).
       Default 1064.
-    - `altitude`: height of the sensor above the reference plane z = 0 in m, positive. Default None: 1000, or
-      not used where `sensor` is given.
+    - `altitude`: height of the sensor above the reference plane z = 0 in m, positive. Default 1000. The
+      field is None where `sensor` is given.
     - `pulse`: shape of the transmitted pulse, an `AbstractPulse`. Default `GaussianPulse(fwhm=6.0)`.
     - `divergence`: full angle of the beam in mrad, not negative. For a Gaussian beam it is measured between
       the directions at 1/e^2 of the axial irradiance, for a top-hat across the disc. Default 0.3.
@@ -110,7 +123,7 @@ class Lidar(eqx.Module):
     - `profile`: irradiance across the beam, "gaussian" or "top-hat". Default "gaussian".
     - `position`: (x, y) in m where the beam axis meets the reference plane: the centre of the footprint. At
       nadir it is also the sensor's horizontal position. Where `sensor` is given, this field holds that
-      instead. Default None: (0, 0).
+      instead. Default (0, 0).
     - `field_of_view`: full angle of the receiver's field of view in mrad, positive. Default None: no limit.
     - `jitter`: standard deviation of the timing error in ns, not negative. Default 0.
     - `efficiency`: of the optics and the detector together, in (0, 1], one number or one per wavelength.
@@ -119,6 +132,9 @@ class Lidar(eqx.Module):
     - `sensor`: (x, y, z) of the sensor in m, in place of `altitude` and `position`: anywhere, also within or
       below a canopy. Time zero of waveforms is then the emission at the sensor. Default None: above the
       reference plane, by `altitude`.
+
+    A sensor may stand within plants, but not below the ground or in a plate: plans refuse that, as well as a
+    level beam in a canopy with periodic sides.
 
     The receiver of a lidar with `sensor` is a flat aperture across the beam: it sees what lies before it, in
     proportion to the cosine of the angle from the axis, within the field of view.
@@ -179,8 +195,8 @@ class Lidar(eqx.Module):
     def __init__(
         self,
         wavelength: Any = 1064.0,
-        altitude: Any = None,
-        pulse: AbstractPulse | None = None,
+        altitude: Any = _ALTITUDE,
+        pulse: Any = _PULSE,
         divergence: Any = 0.3,
         aperture: Any = 0.2,
         zenith: Any = 0.0,
@@ -188,33 +204,38 @@ class Lidar(eqx.Module):
         energy: Any = 1e-3,
         sampling_interval: Any = 1.0,
         profile: str = "gaussian",
-        position: Any = None,
+        position: Any = _AIM_POINT,
         field_of_view: Any = None,
         jitter: Any = 0.0,
         efficiency: Any = 1.0,
-        receiver: Receiver | None = None,
+        receiver: Any = _RECEIVER,
         sensor: Any = None,
     ):
         if sensor is not None:
             for field, value in (("altitude", altitude), ("position", position)):
-                if value is not None:
+                if not isinstance(value, _Default):
                     raise ValueError(f"{field} is given together with sensor; admissible is one of them")
             if not _is_sensor(sensor):
                 raise ValueError(f"sensor = {sensor!r}; admissible are three numbers: x, y and z, m")
-            position = sensor
-        elif position is not None and _is_sensor(position):
-            # As `dataclasses.replace` passes it.
-            if altitude is not None:
-                raise ValueError("altitude is given to a lidar with a sensor; admissible is one of them")
+            position, altitude = sensor, None
+        elif altitude is None:
+            # A copy by `dataclasses.replace`, or from a file: the position is that of the sensor.
+            if not _is_sensor(position):
+                raise TypeError("altitude is None; admissible is a number, or sensor in place of it")
         else:
-            position = _DEFAULT_POSITION if position is None else position
-            altitude = _DEFAULT_ALTITUDE if altitude is None else altitude
+            altitude = 1000.0 if isinstance(altitude, _Default) else altitude
+            position = (0.0, 0.0) if isinstance(position, _Default) else position
+            if _is_sensor(position):
+                raise ValueError(
+                    "position has shape (3,); admissible is (2,): x and y, or sensor = (x, y, z)"
+                )
         self.wavelength, self.altitude, self.divergence = wavelength, altitude, divergence
         self.aperture, self.zenith, self.azimuth, self.energy = aperture, zenith, azimuth, energy
         self.sampling_interval, self.profile, self.position = sampling_interval, profile, position
         self.field_of_view, self.jitter, self.efficiency = field_of_view, jitter, efficiency
-        self.pulse = GaussianPulse() if pulse is None else pulse
-        self.receiver = Receiver() if receiver is None else receiver
+        # Made here and not with the signature: importing the package starts no device.
+        self.pulse = GaussianPulse() if isinstance(pulse, _Default) else pulse
+        self.receiver = Receiver() if isinstance(receiver, _Default) else receiver
 
     def __check_init__(self):
         check_kind("pulse", self.pulse, AbstractPulse, "a pulse, such as GaussianPulse(fwhm=6.0)")
@@ -274,7 +295,7 @@ class Lidar(eqx.Module):
     def aim_point(self) -> Float[Array, " 3"]:
         """Point (3,) of the beam axis, m, that is the origin of traced coordinates."""
         if self.has_sensor_position:
-            return self.position + AIM_DISTANCE * self.direction
+            return jnp.asarray(self.position, float) + AIM_DISTANCE * self.direction
         return jnp.concatenate([self.position, jnp.zeros_like(self.position[:1])])
 
     @property

@@ -150,8 +150,9 @@ class Survey(eqx.Module):
         def rows(a: np.ndarray | None) -> np.ndarray | None:
             return None if a is None else a[shots]
 
-        fields = ("position", "zenith", "azimuth", "altitude", "time", "scan_angle", "strip")
-        return Survey(self.lidar, **{name: rows(getattr(self, name)) for name in fields})
+        fields = ("zenith", "azimuth", "altitude", "time", "scan_angle", "strip")
+        place = {"sensor" if self.has_sensor_position else "position": self.position[shots]}
+        return Survey(self.lidar, **place, **{name: rows(getattr(self, name)) for name in fields})
 
     def _lidar_at(self, position: Float[np.ndarray, "axes"], shot: int) -> Lidar:
         """Place the lidar at a position, in the direction of a shot."""
@@ -169,8 +170,9 @@ class Survey(eqx.Module):
     @staticmethod
     def of(lidar: Lidar) -> "Survey":
         """Make the survey of one shot: that of a lidar in its own place and direction."""
+        place = {"sensor" if lidar.has_sensor_position else "position": concrete_array(lidar.position)[None]}
         zenith, azimuth = concrete_number(lidar.zenith), concrete_number(lidar.azimuth)
-        return Survey(lidar, concrete_array(lidar.position)[None], zenith, azimuth)
+        return Survey(lidar, **place, zenith=zenith, azimuth=azimuth)
 
     @staticmethod
     def join(surveys: Any) -> "Survey":
@@ -206,14 +208,25 @@ class Survey(eqx.Module):
             arrays = [getattr(survey, name) for survey in surveys]
             return None if any(a is None for a in arrays) else np.concatenate(arrays)
 
-        fields = ("position", "zenith", "azimuth", "altitude", "time", "scan_angle")
+        fields = ("zenith", "azimuth", "altitude", "time", "scan_angle")
+        place = {"sensor" if first.has_sensor_position else "position": rows("position")}
         strip = np.repeat(np.arange(len(surveys)), [len(survey) for survey in surveys])
-        return Survey(first.lidar, **{name: rows(name) for name in fields}, strip=strip)
+        return Survey(first.lidar, **place, **{name: rows(name) for name in fields}, strip=strip)
 
     @property
     def has_sensor_position(self) -> bool:
         """True if shots are placed by their sensors, and time zero is the emission."""
         return self.altitude is None
+
+    @property
+    def aim_position(self) -> Float[np.ndarray, "shots 2"] | None:
+        """The argument `position` that makes this survey; None where that is `sensor`."""
+        return None if self.has_sensor_position else self.position
+
+    @property
+    def sensor_position(self) -> Float[np.ndarray, "shots 3"] | None:
+        """The argument `sensor` that makes this survey; None where that is `position`."""
+        return self.position if self.has_sensor_position else None
 
     @property
     def middle(self) -> Lidar:
@@ -531,17 +544,12 @@ def _place(lidar: Lidar, position: Any, altitude: Any, sensor: Any) -> Float[np.
                 raise ValueError(f"{field} is given together with sensor; admissible is one of them")
     elif position is None:
         raise ValueError("neither position nor sensor is given; admissible is one of them")
-    field, value, sizes = ("position", position, (2, 3)) if sensor is None else ("sensor", sensor, (3,))
+    field, value, size = ("position", position, 2) if sensor is None else ("sensor", sensor, 3)
     check_range(field, value)
     positions = as_numpy(value, field)
-    if positions.ndim != 2 or positions.shape[1] not in sizes or len(positions) == 0:
+    if positions.ndim != 2 or positions.shape[1] != size or len(positions) == 0:
         raise ValueError(
-            f"{field} has shape {positions.shape}; admissible is (shots, {sizes[0]}), one shot or more"
-        )
-    # Three coordinates are those of sensors, as in the fields of a survey that is copied.
-    if field == "position" and positions.shape[1] == 3 and altitude is not None:
-        raise ValueError(
-            f"position has shape {positions.shape}, of sensors, and altitude is given; admissible is one"
+            f"{field} has shape {positions.shape}; admissible is (shots, {size}), one shot or more"
         )
     return positions
 
@@ -550,9 +558,9 @@ def _of_kind(lidar: Lidar, has_sensors: bool) -> Lidar:
     """Return the lidar as one that is placed by its sensor, or by its altitude."""
     if lidar.has_sensor_position == has_sensors:
         return lidar
-    place: dict[str, Any] = {"position": None, "altitude": None}
+    place: dict[str, Any] = {"position": (0.0, 0.0), "altitude": 1000.0}
     if has_sensors:
-        place["sensor"] = concrete_array(lidar.sensor)
+        place = {"position": concrete_array(lidar.sensor), "altitude": None}
     # The angles of shots take the place of the lidar's, which may not be admissible for the other kind.
     return dataclasses.replace(lidar, **place, zenith=0.0)
 

@@ -281,7 +281,9 @@ def _spans(waveforms: Any, survey: Survey, margin: int) -> tuple[np.ndarray, np.
     """
     if survey.altitude is None or np.ptp(survey.altitude) > 0:
         placed = "by their sensors" if survey.altitude is None else "at several altitudes"
-        raise ValueError(f"survey: its shots are placed {placed}; admissible is one altitude, as an orbit has")
+        raise ValueError(
+            f"survey: its shots are placed {placed}; admissible is one altitude, as an orbit has"
+        )
     position = getattr(waveforms, "position", None)
     if position is None:
         check_kind("waveforms", waveforms, Sequence, "the Waveforms of simulate_many, or a list of Waveform")
@@ -293,15 +295,22 @@ def _spans(waveforms: Any, survey: Survey, margin: int) -> tuple[np.ndarray, np.
         raise ValueError("the waveforms have another position than the shots of the survey; give their own")
     if position is not None:
         spans = [_span(waveforms, "waveforms", margin)] * len(survey)
-        _check_lidar(waveforms, "waveforms", survey[0])
+        _check_lidar(waveforms, "waveforms", _lidar_of(survey))
         _check_directions(waveforms, survey)
     else:
         spans = [_span(wave, f"waveforms {i}", margin) for i, wave in enumerate(waveforms)]
         for i, wave in enumerate(waveforms):
-            _check_lidar(wave, f"waveforms {i}", survey[i])
+            _check_lidar(wave, f"waveforms {i}", _lidar_of(survey))
             _check_zenith(wave, f"waveforms {i}", float(survey.zenith[i]))
     first_times, bins = zip(*spans)
     return np.array(first_times), np.array(bins)
+
+
+def _lidar_of(survey: Survey) -> Lidar:
+    """Return the lidar of the first shot, at the altitude that all shots share."""
+    lidar = survey[0]
+    assert isinstance(lidar, Lidar)
+    return lidar
 
 
 def _check_lidar(waves: Any, name: str, lidar: Lidar) -> None:
@@ -310,7 +319,7 @@ def _check_lidar(waves: Any, name: str, lidar: Lidar) -> None:
     Waveforms made by `waveform_of`, and those in files of earlier versions, do not have their altitude.
     """
     altitude = waves.info.get("altitude")
-    pairs = {"wavelength": (waves.wavelength, lidar.wavelength, "nm")}
+    pairs: dict[str, Any] = {"wavelength": (waves.wavelength, lidar.wavelength, "nm")}
     if altitude is not None:
         pairs["altitude"] = (altitude, lidar.altitude, "m")
     for quantity, (of_waves, of_survey, unit) in pairs.items():
@@ -371,7 +380,7 @@ def _span(waves: Any, name: str, margin: int) -> tuple[float, int]:
 
 def _energy_per_reflectance(survey: Survey) -> np.ndarray:
     """Return the energy, J, of a sample per apparent reflectance of it, at the reference plane, (shots,)."""
-    upright = dataclasses.replace(survey[0], zenith=0.0)
+    upright = dataclasses.replace(_lidar_of(survey), zenith=0.0)
     return float(energy_at_reference(upright)[0]) * np.cos(np.deg2rad(survey.zenith)) ** 2
 
 

@@ -47,9 +47,13 @@ _FUNCTIONS: tuple[Callable[..., Any], ...] = (
 # The class of a table without `kind`, by the abstract class that is admissible.
 _DEFAULT_CLASSES = {AbstractGround: Ground, AbstractSheet: Plate}
 # Fields of arguments that are not stored under their own name.
-_FIELD_NAMES = {(SampledPulse, "power"): "samples"}
-# Other ways to give what a further argument holds, which is the one that is written.
-ALTERNATIVE_ARGUMENTS = {(Lidar, "sensor"), (Survey, "sensor")}
+_FIELD_NAMES = {
+    (SampledPulse, "power"): "samples",
+    (Survey, "position"): "aim_position",
+    (Survey, "sensor"): "sensor_position",
+}
+# Another way to give what a further argument holds, which is the one that is written.
+ALTERNATIVE_ARGUMENTS = {(Lidar, "sensor")}
 
 DEGREES = "degrees"
 COMPASS = "degrees clockwise from north"

@@ -126,7 +126,7 @@ def _cells(position: ArrayLike | Sequence, spacing: float) -> _Grid:
     **Raises:** as `write_raster`.
     """
     xy = _horizontal(position, missing=True)
-    has_place = ~np.isnan(xy).any(axis=1)
+    has_place = np.asarray(~np.isnan(xy).any(axis=1))
     if not has_place.any():
         raise ValueError("position is NaN for all shots; admissible is one or more with a position")
     numbers = np.floor(xy[has_place] / spacing)

@@ -279,8 +279,8 @@ def plan(
     plates both reflect and transmit (weights of single precision), for a scene that reaches up to the
     altitude of the sensor, for a `Lidar(sensor=)` below the ground, in a plate, less than 1 degree from the
     level within a canopy with periodic sides, or in air with a lidar ratio, for a footprint that lies partly
-    off the terrain, for what would take more memory than `max_memory`, and if the geometry is being traced by a JAX transformation: make the plan outside and pass
-    it in.
+    off the terrain, for what would take more memory than `max_memory`, and if the geometry is being traced by
+    a JAX transformation: make the plan outside and pass it in.
 
     **Example:**
 

@@ -122,7 +122,7 @@ def _footprints(
     """
     aim = survey.sensor if survey.has_sensor_position else survey.aim_point
     points = np.full_like(aim, np.nan) if scene is None else ground_position(survey, scene)
-    met = np.isfinite(points).all(axis=1)
+    met = np.asarray(np.isfinite(points).all(axis=1))
     points = np.where(met[:, None], points, aim)
     distance = np.linalg.norm(points - survey.sensor, axis=1)
     radius = survey.footprint_radius * distance / survey.slant_range

@@ -5,7 +5,9 @@ import math
 import numpy as np
 
 from jaxlidar._checks import concrete_array, concrete_number
+from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._summary import percent
+from jaxlidar.instrument.lidar import AIM_DISTANCE
 from jaxlidar.instrument.survey import Survey
 from jaxlidar.optics.laws import AbstractMirror
 from jaxlidar.planning.local_origin import move_aim_to_origin
@@ -85,7 +87,11 @@ def _rays_of_batch(plan: Plan, survey: Survey, scene: Scene, rtol: float) -> int
     rays = 10.0 / rtol
     if scene.canopy is not None:
         edge = float(np.min(concrete_array(scene.canopy.voxels.voxel_size)[:2]))
-        columns = (1.0 + 2.0 * float(np.max(survey.footprint_radius)) / edge) ** 2
+        radius = float(np.max(survey.footprint_radius))
+        if survey.has_sensor_position:
+            # The radius is that 1 m ahead of the sensor: the widest footprint is that of the last return.
+            radius *= 0.5 * SPEED_OF_LIGHT * plan.scope.last_return / AIM_DISTANCE
+        columns = (1.0 + 2.0 * radius / edge) ** 2
         rays = min(rays, 32.0 * columns)
     return min(_power_of_two(rays, *_RAYS), plan.n_rays)
 

@@ -1,5 +1,7 @@
 """Coverage of a survey: where its shots meet the ground, and footprints partly outside the map."""
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -101,7 +103,7 @@ def ground_position(survey: Survey, scene: Scene) -> Float[np.ndarray, "shots 3"
         return points
     # About the middle of the survey, as single precision needs.
     origin = 0.5 * (survey.position[:, :2].min(axis=0) + survey.position[:, :2].max(axis=0))
-    moved = ground.moved(-origin)
+    moved: Any = ground.moved(-origin)
     if moved is not None:
         survey, ground = survey.about(origin), moved
     start_distance = AIM_DISTANCE

@@ -76,10 +76,11 @@ class ShotGeometry(NamedTuple):
 
     def as_arrays(self) -> "ShotGeometry":
         """Return the same in JAX's present precision."""
-        number, *geometry = self
-        return ShotGeometry(
-            jnp.asarray(number), *(None if a is None else jnp.asarray(a, float) for a in geometry)
-        )
+
+        def convert(a: Any) -> Any:
+            return None if a is None else jnp.asarray(a, float)
+
+        return ShotGeometry(jnp.asarray(self.number), *map(convert, self[1:]))
 
 
 def shot_geometry(survey: Survey, first: int, count: int) -> ShotGeometry:

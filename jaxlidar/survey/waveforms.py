@@ -45,7 +45,7 @@ class Waveforms(eqx.Module):
     - `error`: (shots,) relative error, as `simulate` defines it. `photons`: (shots,) number traced.
     - `truth`: a `Truths`, what each beam meets in the scene; None unless it was asked for.
     - `info`: dict of "rtol", "orders" followed, "automatic orders" (False where
-      `max_orders` was given), "altitude" of the lidar in m, "seconds" that it took, and
+      `max_orders` was given), "altitude" of the lidar in m (None for sensors), "seconds" that it took, and
       whether light was "shared" (over `SceneParts`: in all tiles). Over one scene with shared light, also the
       spacing in m of the "grid" of nodes at which it entered, and a bound on the fraction of samples that
       "parallel light" changes. Over `SceneParts`, also the number of "parts", the "margin" in m around tiles,
