@@ -43,8 +43,11 @@ from jaxlidar._checks import (
 from jaxlidar._converted import Converted
 from jaxlidar._ranges import Range, check_ranges
 from jaxlidar._signatures import briefly
+from jaxlidar._text import object_text
+from jaxlidar.instrument.photon_counter import PhotonCounter
 from jaxlidar.instrument.pulse import AbstractPulse, GaussianPulse
 from jaxlidar.instrument.receiver import Receiver
+from jaxlidar.instrument.scan import AbstractScan
 
 # Distance, m, from a sensor that is given by its position to its aim point, the origin of traced coordinates.
 AIM_DISTANCE = 1.0
@@ -128,7 +131,10 @@ class Lidar(eqx.Module):
     - `jitter`: standard deviation of the timing error in ns, not negative. Default 0.
     - `efficiency`: of the optics and the detector together, in (0, 1], one number or one per wavelength.
       Default 1.
-    - `receiver`: detection, noise and digitisation. Default `Receiver()`: a perfect record.
+    - `receiver`: detection, noise and digitisation, a `Receiver`; or a `PhotonCounter`, for
+      `jaxlidar.record`: waveforms then hold the expected energies. Default `Receiver()`: a perfect record.
+    - `scan`: the pattern of a scanner, an `AbstractScan` for `Survey.scan` and `Survey.fly`. One shot does
+      not depend on it. Default None.
     - `sensor`: (x, y, z) of the sensor in m, in place of `altitude` and `position`: anywhere, also within or
       below a canopy. Time zero of waveforms is then the emission at the sensor. Default None: above the
       reference plane, by `altitude`.
@@ -174,7 +180,8 @@ class Lidar(eqx.Module):
     field_of_view: Converted[Float[Array, ""] | None] = eqx.field(converter=optional_scalar("field_of_view"))
     jitter: Converted[Float[Array, ""]] = eqx.field(converter=scalar("jitter"))
     efficiency: Converted[Float[Array, "..."]] = eqx.field(converter=array("efficiency"))
-    receiver: Receiver
+    receiver: Receiver | PhotonCounter
+    scan: AbstractScan | None = eqx.field(static=True)
 
     _ranges: ClassVar = {
         "wavelength": Range(0.0, low_open=True, increasing=True),
@@ -209,6 +216,7 @@ class Lidar(eqx.Module):
         jitter: Any = 0.0,
         efficiency: Any = 1.0,
         receiver: Any = _RECEIVER,
+        scan: Any = None,
         sensor: Any = None,
     ):
         if sensor is not None:
@@ -236,10 +244,12 @@ class Lidar(eqx.Module):
         # Made here and not with the signature: importing the package starts no device.
         self.pulse = GaussianPulse() if isinstance(pulse, _Default) else pulse
         self.receiver = Receiver() if isinstance(receiver, _Default) else receiver
+        self.scan = scan
 
     def __check_init__(self):
         check_kind("pulse", self.pulse, AbstractPulse, "a pulse, such as GaussianPulse(fwhm=6.0)")
-        check_kind("receiver", self.receiver, Receiver, "a Receiver")
+        check_kind("receiver", self.receiver, Receiver | PhotonCounter, "a Receiver or a PhotonCounter")
+        check_kind("scan", self.scan, AbstractScan | None, "a scan pattern, or None")
         if self.wavelength.ndim != 1:
             raise ValueError(
                 f"wavelength has shape {self.wavelength.shape}; admissible is one number or (wavelengths,)"
@@ -259,6 +269,20 @@ class Lidar(eqx.Module):
                     f"{self.wavelength.shape}"
                 )
         warn_units(self)
+
+    def __str__(self) -> str:
+        return object_text(self, {"position": "sensor"} if self.has_sensor_position else None)
+
+    @property
+    def opens_at_first_return(self) -> bool:
+        """True if the sampling bins start at the first return."""
+        return isinstance(self.receiver, Receiver) and self.receiver.window == "first return"
+
+    @property
+    def noise(self) -> float | None:
+        """Standard deviation of the receiver's electronic noise, J per sample; None where it has none."""
+        noise = concrete(getattr(self.receiver, "electronic_noise", 0.0))
+        return float(noise) if noise is not None and noise > 0 else None
 
     @property
     def direction(self) -> Float[Array, " 3"]:

@@ -32,6 +32,7 @@ from jaxlidar._checks import (
 )
 from jaxlidar._memory import format_bytes, machine_memory
 from jaxlidar._signatures import briefly
+from jaxlidar._text import number_text
 from jaxlidar.instrument.lidar import AIM_DISTANCE, STRAIGHT_UP, Lidar
 from jaxlidar.instrument.scan import MAX_ZENITH, AbstractScan
 from jaxlidar.instrument.trajectory import Trajectory, rotation_matrix, three_numbers
@@ -39,6 +40,8 @@ from jaxlidar.instrument.trajectory import Trajectory, rotation_matrix, three_nu
 # A length that falls short of a multiple of the spacing by this fraction, as by rounding, counts as the
 # multiple.
 _SPACING_TOLERANCE = 1e-6
+# Point clouds number flight lines with 16 bits.
+MAX_FLIGHT_LINE = 2**16 - 1
 # Bytes of a shot while a survey is made: its position and direction, and the terms of their sums.
 _BYTES_PER_SHOT = 100.0
 # More positions along a line than fit into any memory.
@@ -67,10 +70,12 @@ class Survey(eqx.Module):
       `position`. Default None: the lidar's.
     - `sensor`: (shots, 3) x, y and z of the sensor in m, in place of `position`: anywhere. Time zero of every
       shot is then its emission. Default None.
-    - `time`: (shots,) times of emission, s. Default None: not known.
-    - `scan_angle`: (shots,) angles of the beam from the vertical in degrees, positive to the right of the
-      flight. Default None: not known.
-    - `strip`: (shots,) numbers of flight lines, integers. Default None: not known.
+    - `gps_time`: (shots,) s, as point clouds have it: seconds of the GPS week, or adjusted standard GPS time
+      (GPS time less 1e9 s). Default None: not known.
+    - `scan_angle`: (shots,) angle of the beam to the right of the track in degrees, in [-180, 180]. Default
+      None: not known.
+    - `flight_line`: number of the flight line, an integer in [0, 65535], one number or (shots,). Default
+      None: not known.
 
     **Raises:** ValueError for arrays of other shapes, no shot at all, values outside their ranges, and a
     sensor together with a position or an altitude; TypeError for objects of the wrong type.
@@ -92,9 +97,9 @@ class Survey(eqx.Module):
     zenith: Float[np.ndarray, " shots"]
     azimuth: Float[np.ndarray, " shots"]
     altitude: Float[np.ndarray, " shots"] | None
-    time: Float[np.ndarray, " shots"] | None
+    gps_time: Float[np.ndarray, " shots"] | None
     scan_angle: Float[np.ndarray, " shots"] | None
-    strip: Int[np.ndarray, " shots"] | None
+    flight_line: Float[np.ndarray, " shots"] | None
 
     def __init__(
         self,
@@ -104,9 +109,10 @@ class Survey(eqx.Module):
         azimuth: ArrayLike | Any | None = None,
         altitude: ArrayLike | Any | None = None,
         sensor: Any = None,
-        time: Any = None,
-        scan_angle: Any = None,
-        strip: Any = None,
+        *,
+        gps_time: ArrayLike | Any | None = None,
+        scan_angle: ArrayLike | Any | None = None,
+        flight_line: ArrayLike | Any | None = None,
     ):
         check_kind("lidar", lidar, Lidar, "a Lidar, as in Survey(Lidar(), position=...)")
         position = _place(lidar, position, altitude, sensor)
@@ -128,12 +134,26 @@ class Survey(eqx.Module):
         self.zenith = _per_shot("zenith", lidar.zenith if zenith is None else zenith, shots)
         self.azimuth = _per_shot("azimuth", lidar.azimuth if azimuth is None else azimuth, shots)
         check_range("zenith", self.zenith, 0.0, STRAIGHT_UP if has_sensors else MAX_ZENITH)
-        self.time = None if time is None else _per_shot("time", time, shots)
-        self.scan_angle = None if scan_angle is None else _per_shot("scan_angle", scan_angle, shots)
-        self.strip = None if strip is None else _per_shot("strip", strip, shots).astype(np.int64)
+        self.gps_time = _optional_per_shot("gps_time", gps_time, shots)
+        self.scan_angle = _optional_per_shot("scan_angle", scan_angle, shots)
+        self.flight_line = _optional_per_shot("flight_line", flight_line, shots)
+        if self.scan_angle is not None:
+            check_range("scan_angle", self.scan_angle, -180.0, 180.0)
+        if self.flight_line is not None:
+            check_range("flight_line", self.flight_line, 0, MAX_FLIGHT_LINE)
+            if np.any(self.flight_line != np.floor(self.flight_line)):
+                raise ValueError("flight_line has values that are not whole numbers")
 
     def __len__(self) -> int:
         return len(self.position)
+
+    def __str__(self) -> str:
+        coordinates = zip("xyz", self.position.T, "mmm")
+        columns = (*coordinates, ("zenith", self.zenith, ""))
+        spans = ", ".join(
+            f"{name} {number_text(a.min())} to {number_text(a.max())} {unit}" for name, a, unit in columns
+        )
+        return f"Survey of {len(self):,} shots: {spans}degrees\n{self.lidar}"
 
     def __getitem__(self, shot: int | slice) -> "Lidar | Survey":
         if isinstance(shot, slice):
@@ -150,7 +170,7 @@ class Survey(eqx.Module):
         def rows(a: np.ndarray | None) -> np.ndarray | None:
             return None if a is None else a[shots]
 
-        fields = ("zenith", "azimuth", "altitude", "time", "scan_angle", "strip")
+        fields = ("zenith", "azimuth", "altitude", "gps_time", "scan_angle", "flight_line")
         place = {"sensor" if self.has_sensor_position else "position": self.position[shots]}
         return Survey(self.lidar, **place, **{name: rows(getattr(self, name)) for name in fields})
 
@@ -176,23 +196,24 @@ class Survey(eqx.Module):
 
     @staticmethod
     def join(surveys: Any) -> "Survey":
-        """Join surveys of one lidar, such as the strips of a flight, into one.
+        """Join surveys of one lidar, such as flight lines, into one.
 
         **Arguments:** `surveys`: one or more `Survey`s whose lidars are equal, all placed by their sensors or
         all by their altitude.
 
-        **Returns:** a `Survey` of all shots in that order; its `strip` numbers the surveys from 0, and `time`
-        and `scan_angle` are known where they are for all of them.
+        **Returns:** a `Survey` of all shots in that order. `gps_time` and `scan_angle` are known where they
+        are for all of the surveys, and `flight_line` is theirs; where one has none, it numbers the surveys
+        from 1.
 
         **Raises:** ValueError for no survey, and for lidars that differ; TypeError for other objects.
 
         **Example:**
 
         >>> import jaxlidar as jl
-        >>> strips = [jl.Survey.track(jl.Lidar(), (x, 0), (x, 20), 10.0) for x in (0, 30)]
-        >>> survey = jl.Survey.join(strips)
-        >>> len(survey), survey.strip.tolist()
-        (6, [0, 0, 0, 1, 1, 1])
+        >>> lines = [jl.Survey.track(jl.Lidar(), (x, 0), (x, 20), 10.0) for x in (0, 30)]
+        >>> survey = jl.Survey.join(lines)
+        >>> len(survey), survey.flight_line.tolist()
+        (6, [1.0, 1.0, 1.0, 2.0, 2.0, 2.0])
         """
         surveys = list(surveys)
         if not surveys:
@@ -208,10 +229,12 @@ class Survey(eqx.Module):
             arrays = [getattr(survey, name) for survey in surveys]
             return None if any(a is None for a in arrays) else np.concatenate(arrays)
 
-        fields = ("zenith", "azimuth", "altitude", "time", "scan_angle")
+        fields = ("zenith", "azimuth", "altitude", "gps_time", "scan_angle")
         place = {"sensor" if first.has_sensor_position else "position": rows("position")}
-        strip = np.repeat(np.arange(len(surveys)), [len(survey) for survey in surveys])
-        return Survey(first.lidar, **place, **{name: rows(name) for name in fields}, strip=strip)
+        flight_line = rows("flight_line")
+        if flight_line is None:
+            flight_line = np.repeat(np.arange(1.0, len(surveys) + 1), [len(survey) for survey in surveys])
+        return Survey(first.lidar, **place, **{name: rows(name) for name in fields}, flight_line=flight_line)
 
     @property
     def has_sensor_position(self) -> bool:
@@ -348,12 +371,20 @@ class Survey(eqx.Module):
 
     @staticmethod
     def scan(
-        lidar: Lidar, pattern: AbstractScan, start: Any, end: Any, speed: Any, pulse_rate: Any
+        lidar: Lidar,
+        pattern: AbstractScan,
+        start: Any,
+        end: Any,
+        speed: Any,
+        pulse_rate: Any,
+        *,
+        gps_time: Any = 0.0,
+        flight_line: Any = 1,
     ) -> "Survey":
         """Make a survey of the shots of a scanner on a level platform that flies along a line.
 
-        The platform flies at the lidar's altitude above the reference plane. Zenith and azimuth follow from
-        the pattern.
+        The platform flies at the lidar's altitude above the reference plane. Zenith, azimuth and scan angle
+        (across the track, positive to the right) follow from the pattern.
 
         **Arguments:**
 
@@ -362,6 +393,8 @@ class Survey(eqx.Module):
         - `start`, `end`: (x, y) in m of the platform at the first shot and at the end of the line.
         - `speed`: of the platform in m/s, positive.
         - `pulse_rate`: shots per s, positive.
+        - `gps_time`: GPS time of the first shot in s, as that of `Survey`. Default 0.
+        - `flight_line`: number of the flight line. Default 1.
 
         **Returns:** a `Survey`, its shots in the order of time.
 
@@ -386,6 +419,7 @@ class Survey(eqx.Module):
         first, forward, _, length = _line(start, end)
         check_number("speed", speed, 0.0, low_open=True)
         check_number("pulse_rate", pulse_rate, 0.0, low_open=True)
+        check_number("gps_time", gps_time)
         shots = _count_along(length, float(speed) / float(pulse_rate))
         rate = f"pulse_rate = {float(pulse_rate):g} at speed = {float(speed):g}"
         _check_number_of_shots(rate, shots)
@@ -395,12 +429,14 @@ class Survey(eqx.Module):
         position = np.pad(ends, ((0, 0), (0, 1)), constant_values=float(lidar.altitude))
         yaw = np.rad2deg(np.arctan2(forward[0], forward[1]))
         flight = Trajectory([0.0, duration], position, yaw=yaw)
-        return _strip(lidar, flight.at(np.arange(shots) / float(pulse_rate)), pattern)
+        survey = _strip(lidar, flight.at(np.arange(shots) / float(pulse_rate)), pattern, flight_line)
+        # Added last: GPS times of 3e8 s leave the times since the first shot fewer digits.
+        return eqx.tree_at(lambda s: s.gps_time, survey, float(gps_time) + survey.gps_time)
 
     @staticmethod
     def fly(
         trajectory: Any,
-        scan: AbstractScan,
+        scan: AbstractScan | None = None,
         *,
         lidar: Lidar | None = None,
         pulse_rate: Any = None,
@@ -416,9 +452,10 @@ class Survey(eqx.Module):
 
         **Arguments:**
 
-        - `trajectory`: a `Trajectory`, or a sequence of them: strips, which are joined.
+        - `trajectory`: a `Trajectory`, or a sequence of them: strips, which are joined. Its times are GPS
+          times, as those of `Survey`, if they are to be those of a point cloud.
         - `scan`: an `Oscillating`, a `RotatingPolygon`, a `Conical`, or another `AbstractScan`, in the frame
-          of the scanner. Its time is that since the start of the strip.
+          of the scanner. Its time is that since the start of the strip. Default None: `lidar.scan`.
         - `lidar`: the `Lidar` of all shots. Its own place and direction are not used. Default None:
           `Lidar()`.
         - `pulse_rate`: shots per s, positive, from the start of each strip to its end. Default None: one shot
@@ -430,12 +467,13 @@ class Survey(eqx.Module):
         - `above`: a `Terrain`: heights of the trajectory are then above that, and not above z = 0. Default
           None.
 
-        **Returns:** a `Survey`, its shots in the order of time within each strip, with `time`, `scan_angle`
-        and `strip`.
+        **Returns:** a `Survey`, its shots in the order of time within each strip, with `gps_time`, the time
+        of the trajectory, `scan_angle`, and `flight_line`, which numbers the strips from 1.
 
-        **Raises:** ValueError for values outside their ranges, more shots than memory has room for, a
-        position off the terrain, and shots that look up, or more than 89 degrees from the vertical, or from
-        below the reference plane, with a lidar that has an altitude; TypeError for objects of the wrong type.
+        **Raises:** ValueError for values outside their ranges, no scan pattern, more shots than memory has
+        room for, more than 65535 strips, a position off the terrain, and shots that look up, or more than 89
+        degrees from the vertical, or from below the reference plane, with a lidar that has an altitude;
+        TypeError for objects of the wrong type.
 
         **Source:** see `jaxlidar.instrument.trajectory` for the rotations.
 
@@ -449,6 +487,11 @@ class Survey(eqx.Module):
         """
         lidar = Lidar() if lidar is None else lidar
         check_kind("lidar", lidar, Lidar, "a Lidar, as in Survey.fly(..., lidar=Lidar())")
+        scan = lidar.scan if scan is None else scan
+        if scan is None:
+            raise ValueError(
+                "scan is None, and the lidar has none; admissible is a scan pattern, or lidar.scan"
+            )
         check_kind("scan", scan, AbstractScan, "a scan pattern, as in Conical(half_angle=20, frequency=40)")
         strips = [trajectory] if isinstance(trajectory, Trajectory) else list(trajectory)
         if not strips:
@@ -469,7 +512,9 @@ class Survey(eqx.Module):
             ]
         if above is not None:
             strips = [_lifted(strip, above) for strip in strips]
-        return Survey.join(_strip(lidar, strip, scan, scanner_turn, arm) for strip in strips)
+        return Survey.join(
+            _strip(lidar, strip, scan, number, scanner_turn, arm) for number, strip in enumerate(strips, 1)
+        )
 
 
 def _lifted(flight: Trajectory, terrain: Any) -> Trajectory:
@@ -486,6 +531,7 @@ def _strip(
     lidar: Lidar,
     flight: Trajectory,
     pattern: AbstractScan,
+    flight_line: Any,
     scanner_turn: Float[np.ndarray, "3 3"] | None = None,
     lever_arm: Float[np.ndarray, "3"] | None = None,
 ) -> Survey:
@@ -509,7 +555,7 @@ def _strip(
     # Positive to the right of the platform's heading.
     yaw = np.deg2rad(flight.yaw)
     scan_angle = np.rad2deg(np.arctan2(east * np.cos(yaw) - north * np.sin(yaw), -up))
-    order = {"time": flight.time, "scan_angle": scan_angle}
+    order = {"gps_time": flight.time, "scan_angle": scan_angle, "flight_line": flight_line}
     if lidar.has_sensor_position:
         return Survey(lidar, sensor=sensor, zenith=zenith, azimuth=azimuth, **order)
     # A pattern at the limit may exceed it by rounding.
@@ -530,7 +576,7 @@ def _strip(
 def beam_directions(
     zenith: Float[np.ndarray, " shots"], azimuth: Float[np.ndarray, " shots"]
 ) -> Float[np.ndarray, "shots 3"]:
-    """Return the unit vectors of beams with these zenith and azimuth angles, degrees."""
+    """Compute the unit vectors of beams from zenith and azimuth in degrees."""
     zenith, azimuth = np.deg2rad(zenith), np.deg2rad(azimuth)
     horizontal = np.sin(zenith)
     return np.stack([horizontal * np.sin(azimuth), horizontal * np.cos(azimuth), -np.cos(zenith)], axis=-1)
@@ -574,6 +620,11 @@ def _per_shot(field: str, x: Any, shots: int) -> Float[np.ndarray, " shots"]:
             f"{field} has shape {value.shape}; admissible is one number or ({shots},), as position"
         )
     return np.broadcast_to(value, (shots,)).copy()
+
+
+def _optional_per_shot(field: str, x: Any, shots: int) -> Float[np.ndarray, " shots"] | None:
+    """Convert as `_per_shot`; None stays None."""
+    return None if x is None else _per_shot(field, x, shots)
 
 
 def _horizontal_position(field: str, x: Any) -> Float[np.ndarray, "2"]:

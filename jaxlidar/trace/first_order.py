@@ -34,6 +34,7 @@ from jaxlidar.trace.deposit import add_rows, bspline_row, smooth_bins
 from jaxlidar.trace.device_scene import DeviceScene
 from jaxlidar.trace.extinction_slopes import outer_rows
 from jaxlidar.trace.histories import Histories
+from jaxlidar.trace.meshes import surface_distances
 from jaxlidar.trace.ray_segments import (
     RaySegments,
     add_in_blocks,
@@ -123,7 +124,8 @@ class FootprintRays(NamedTuple):
     """Rays of the footprint: where they start above the scene, their directions, and the surfaces they meet.
 
     - `x`, `w`: start and direction. - `excess`: path from the sensor to the start, m, less the slant range.
-    - `energy`: fraction of the pulse's. - `surface_distances`: to each surface, m; `end`: to the ground.
+    - `energy`: fraction of the pulse's. - `surface_distances`: to each surface, m; `end`: to the ground or a
+      mesh. - `mesh_normal`: of the triangle that is met; None without meshes.
     """
 
     x: Vec
@@ -132,6 +134,7 @@ class FootprintRays(NamedTuple):
     energy: Scalar
     surface_distances: list[Scalar]
     end: Scalar
+    mesh_normal: Vec | None
 
 
 def move_rays(
@@ -153,9 +156,12 @@ def send_rays(scene: DeviceScene, across: tuple[Scalar, Scalar], energy: Scalar)
     point, w, excess = beam.ray(across)
     start_distance = scene.limits.start_distance
     x = along(point, w, jnp.asarray(-start_distance, energy.dtype))
-    distances = [s.distance(x, w) for s in scene.surfaces]
+    distances, mesh_normal = surface_distances(scene, x, w)
     end = distances[0] if config.has_ground else jnp.full_like(energy, FAR)
-    return FootprintRays(x, w, excess - start_distance, energy, distances, end)
+    for surface, distance in zip(scene.surfaces, distances):
+        # Nothing behind a triangle is lit by the ray.
+        end = jnp.minimum(end, distance) if surface.is_mesh else end
+    return FootprintRays(x, w, excess - start_distance, energy, distances, end, mesh_normal)
 
 
 def march_rays(scene: DeviceScene, rays: FootprintRays) -> tuple[RaySegments, list[Scalar], Scalar]:
@@ -262,7 +268,7 @@ def first_order(
         """Trace a chunk of rays by the five steps of `first_order`."""
         # Step 1.
         rays = send_rays(scene, across, energy)
-        x, w, excess, energy, distances, end = rays
+        x, w, excess, energy, distances, end, mesh_normal = rays
         # What the receiver sees of a ray, at the ground or at the reference plane: beams are narrow in angle.
         seen_energy = energy * beam.in_view(along(x, w, jnp.minimum(end, scene.limits.start_distance)))
         returned = jnp.zeros((n_materials * n_histories, bins.padded), energy.dtype)
@@ -309,7 +315,7 @@ def first_order(
             is_met = distances[i] < FAR
             hit_energy = jnp.where((distances[i] <= end) & is_met, surface.coverage * energy, 0.0)
             point = along(x, w, jnp.where(is_met, distances[i], 0.0))
-            normal, back = surface.lit_normal(point, w), scale(w, jnp.asarray(-1.0))
+            normal, back = surface.lit_normal(point, w, mesh_normal), scale(w, jnp.asarray(-1.0))
             for history, factor in one_passage.terms(histories, 0, distances[i], distances):
                 weight = hit_energy * jnp.exp(-depth_at_surfaces[i]) * factor
                 tally_row = scatterer.material * n_histories + history

@@ -49,6 +49,7 @@ from jaxlidar.trace.device_scene import DeviceScene, not_scattered
 from jaxlidar.trace.entry_nodes import EntryNodes
 from jaxlidar.trace.flight import Flight, SurfaceEncounters, meet_surfaces, sample_flights
 from jaxlidar.trace.footprint import GOLDEN, across_beam
+from jaxlidar.trace.meshes import clear_of_mesh
 from jaxlidar.trace.photon_step import collide, passed_plates
 from jaxlidar.trace.photons import CollisionForReturn, Photons, attached_ratio, detach
 from jaxlidar.trace.random_numbers import PhotonDraws, random_words, shifted_lattices, to_unit
@@ -300,7 +301,8 @@ def _trace_order(
     2. Sample the ends of the flight, one in each stratum of u, the transmittance up to the end. The photon
        goes on from one of them.
     3. Apply the plates that the flight passes to weights and histories.
-    4. Deposit the return of every end, except at order one, which `jaxlidar.trace.first_order` deposits.
+    4. Deposit the return of every end, except at order one, which `jaxlidar.trace.first_order` deposits for
+       light that returns along the beam.
     5. Tally light that escapes or would come after the record.
     6. Sample the collision at the selected end, tally what arrives and what goes on, and update the photon.
     """
@@ -323,9 +325,12 @@ def _trace_order(
     u = jnp.maximum(strata, 1e-9)
     flights = sample_flights(scene, p, encounters.nearest_stop, max_length, u)
     # Optimisation barrier: flights serve several results, each of which would compute the march again.
-    stops = (encounters.stops, encounters.nearest_stop)
+    stops = (encounters.stops, encounters.nearest_stop, encounters.mesh_normal)
     p, draws, flights, stops = once((p, draws, flights, stops))
-    encounters = dataclasses.replace(encounters, stops=stops[0], nearest_stop=stops[1])
+    stops, nearest_stop, mesh_normal = stops
+    encounters = dataclasses.replace(
+        encounters, stops=stops, nearest_stop=nearest_stop, mesh_normal=mesh_normal
+    )
 
     # All arrays by end have ends along their first axis; each photon goes on from its own selected one.
     def select_end(a: Array) -> Array:
@@ -337,9 +342,10 @@ def _trace_order(
     # Before deposits: these carry the history with the plates that their flight has passed.
     weight, index, tally = _pass_plates(scene, p, flights, encounters, weight, index, select_end, tally)
 
-    # The first order is deterministic and has been deposited.
+    # The first order is deterministic and has been deposited, unless light returns by another direction.
+    is_deposited = (order > 0) | (scene.beam.return_direction is not None)
     tally = lax.cond(
-        order > 0,
+        is_deposited,
         lambda t: _deposit_flights(scene, p, flights, encounters, weight, index, draws, t),
         lambda t: t,
         tally,
@@ -373,7 +379,7 @@ def _trace_order(
         at_collision = collision_score(scene, flight.cell, flight.collided, collision)
         score = p.score - flight.depth_slopes.T + at_collision
     onward = Photons(
-        x=x,
+        x=clear_of_mesh(scene, x, collision.w, collision.surface, collision.normal),
         w=collision.w,
         path=path,
         weight=weight,
@@ -601,7 +607,7 @@ def _return_through_surfaces(
 ) -> tuple[Scalar, TallyIndex]:
     """Apply the surfaces between `x` and the sensor to the transmittance and the history of the return path.
 
-    For each surface:
+    A mesh in the way lets nothing through. For each other surface:
 
     1. Ground that can hide points below its own slopes lets nothing through. Straight up, along parallel
        light of shared illumination at nadir, nothing is hidden.
@@ -613,15 +619,21 @@ def _return_through_surfaces(
     draws, to_sensor = iter(plate_draws), scene.beam.distance_to_sensor(x)
     # What lies behind the sensor is not crossed.
     end = FAR if to_sensor is None else to_sensor
+    if scene.meshes is not None:
+        start = clear_of_mesh(scene, x, v, collision.surface, collision.normal)
+        is_hidden = scene.meshes.is_met(start, v, transmittance > 0, before=to_sensor)
+        transmittance = jnp.where(is_hidden, 0.0, transmittance)
     for i, (surface, scatterer) in enumerate(zip(scene.surfaces, scene.config.surfaces)):
+        if surface.is_mesh:
+            continue
         if not surface.is_plate:
             # Only a height field can lie in the way of its own return; a plane never does.
-            if surface.shape.lights_itself and not (scene.beam.parallel and scene.config.vertical):
+            if surface.lights_itself and not (scene.beam.parallel and scene.config.vertical):
                 transmittance = jnp.where(surface.distance(x, v) < end, 0.0, transmittance)
             continue
         is_covered = next(draws) < surface.coverage
         is_crossed = surface.distance(x, v) < end
-        if not surface.shape.lights_itself:
+        if not surface.lights_itself:
             # Light that starts on the plate does not meet it again.
             is_crossed &= collision.surface != i
         coverage = jnp.broadcast_to(surface.coverage, transmittance.shape)

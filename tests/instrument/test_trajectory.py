@@ -60,7 +60,7 @@ def test_a_profiler_with_attitude_over_flat_ground(roll, pitch):
     np.testing.assert_allclose(
         survey.zenith, np.rad2deg(np.arccos(np.cos(np.deg2rad(roll)) * np.cos(np.deg2rad(pitch)))), atol=1e-6
     )
-    np.testing.assert_allclose(survey.time, np.arange(11.0))
+    np.testing.assert_allclose(survey.gps_time, np.arange(11.0))
     assert np.all(np.sign(survey.scan_angle) == (-1 if roll else 0)) or roll == 0
 
 
@@ -108,11 +108,39 @@ def test_heights_above_terrain_and_strips_that_are_joined():
     ground = 50.0 + 0.1 * (survey.position[:, 1] + 100.0)
     above = np.repeat([300.0, 400.0], 6)
     np.testing.assert_allclose(survey.altitude - ground, above, rtol=1e-5)
-    assert survey.strip.tolist() == [0] * 6 + [1] * 6
+    assert survey.flight_line.tolist() == [1] * 6 + [2] * 6
     assert float(survey[7].altitude) == pytest.approx(survey.altitude[7])
     part = survey[5:8]
-    assert part.strip.tolist() == [0, 1, 1]
-    assert part.time.tolist() == [10.0, 0.0, 2.0]
+    assert part.flight_line.tolist() == [1, 2, 2]
+    assert part.gps_time.tolist() == [10.0, 0.0, 2.0]
+
+
+def test_a_flight_has_the_scanner_of_its_lidar():
+    lidar = jl.Lidar(altitude=500.0, scan=jl.Conical(half_angle=15.0, frequency=3.0))
+    by_lidar = jl.Survey.fly(flight(), lidar=lidar, pulse_rate=20.0)
+    by_argument = jl.Survey.fly(flight(), lidar.scan, lidar=jl.Lidar(altitude=500.0), pulse_rate=20.0)
+    np.testing.assert_array_equal(by_lidar.position, by_argument.position)
+    # To the right of the track is positive: east of a flight to the north.
+    east = by_lidar.position[:, 0] > 1e-6
+    np.testing.assert_array_equal(by_lidar.scan_angle > 1e-6, east)
+    with pytest.raises(ValueError, match="scan is None"):
+        jl.Survey.fly(flight())
+
+
+def test_flight_lines_of_surveys_that_are_joined():
+    line = {"start": (0, 0), "end": (0, 10), "speed": 50.0, "pulse_rate": 10.0}
+    scans = [
+        jl.Survey.scan(jl.Lidar(), NADIR, **line, gps_time=3.2e8 + number, flight_line=number)
+        for number in (7, 3)
+    ]
+    joined = jl.Survey.join(scans)
+    assert joined.flight_line.tolist() == [7] * 3 + [3] * 3
+    np.testing.assert_array_equal(joined.gps_time, np.concatenate([scan.gps_time for scan in scans]))
+    # Where one survey has no number, all are numbered from 1, and times are not known.
+    track = jl.Survey.track(jl.Lidar(), (0, 0), (0, 10), 10.0)
+    numbered = jl.Survey.join([*scans, track])
+    assert numbered.flight_line.tolist() == [1] * 3 + [2] * 3 + [3] * 2
+    assert numbered.gps_time is None
 
 
 def test_headings_pass_through_north():
