@@ -99,7 +99,7 @@ class Survey(eqx.Module):
     altitude: Float[np.ndarray, " shots"] | None
     gps_time: Float[np.ndarray, " shots"] | None
     scan_angle: Float[np.ndarray, " shots"] | None
-    flight_line: Float[np.ndarray, " shots"] | None
+    flight_line: Int[np.ndarray, " shots"] | None
 
     def __init__(
         self,
@@ -136,13 +136,14 @@ class Survey(eqx.Module):
         check_range("zenith", self.zenith, 0.0, STRAIGHT_UP if has_sensors else MAX_ZENITH)
         self.gps_time = _optional_per_shot("gps_time", gps_time, shots)
         self.scan_angle = _optional_per_shot("scan_angle", scan_angle, shots)
-        self.flight_line = _optional_per_shot("flight_line", flight_line, shots)
+        lines = _optional_per_shot("flight_line", flight_line, shots)
         if self.scan_angle is not None:
             check_range("scan_angle", self.scan_angle, -180.0, 180.0)
-        if self.flight_line is not None:
-            check_range("flight_line", self.flight_line, 0, MAX_FLIGHT_LINE)
-            if np.any(self.flight_line != np.floor(self.flight_line)):
+        if lines is not None:
+            check_range("flight_line", lines, 0, MAX_FLIGHT_LINE)
+            if np.any(lines != np.floor(lines)):
                 raise ValueError("flight_line has values that are not whole numbers")
+        self.flight_line = None if lines is None else lines.astype(int)
 
     def __len__(self) -> int:
         return len(self.position)
@@ -213,7 +214,7 @@ class Survey(eqx.Module):
         >>> lines = [jl.Survey.track(jl.Lidar(), (x, 0), (x, 20), 10.0) for x in (0, 30)]
         >>> survey = jl.Survey.join(lines)
         >>> len(survey), survey.flight_line.tolist()
-        (6, [1.0, 1.0, 1.0, 2.0, 2.0, 2.0])
+        (6, [1, 1, 1, 2, 2, 2])
         """
         surveys = list(surveys)
         if not surveys:
@@ -233,7 +234,7 @@ class Survey(eqx.Module):
         place = {"sensor" if first.has_sensor_position else "position": rows("position")}
         flight_line = rows("flight_line")
         if flight_line is None:
-            flight_line = np.repeat(np.arange(1.0, len(surveys) + 1), [len(survey) for survey in surveys])
+            flight_line = np.repeat(np.arange(1, len(surveys) + 1), [len(survey) for survey in surveys])
         return Survey(first.lidar, **place, **{name: rows(name) for name in fields}, flight_line=flight_line)
 
     @property

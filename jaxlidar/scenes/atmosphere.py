@@ -337,7 +337,7 @@ class Atmosphere(eqx.Module):
         >>> import jaxlidar as jl
         >>> air = jl.Atmosphere(visibility=10.0)
         >>> print(f"{float(air.two_way_transmittance_along(1064.0, 1000.0, 0.0, 90.0)):.3f}")
-        0.715
+        0.716
         """
         wavelength, distance = _checked_wavelength(wavelength), as_array(distance, "distance")
         start, zenith = as_scalar(sensor_height, "sensor_height"), as_scalar(zenith, "zenith")

@@ -5,7 +5,7 @@ from typing import final
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxlidar._checks import briefly, concrete_array, concrete_number
 from jaxlidar.instrument.lidar import Lidar
@@ -45,7 +45,7 @@ class Acquisition(eqx.Module):
 
     gps_time: Float[np.ndarray, " shots"]
     scan_angle: Float[np.ndarray, " shots"]
-    flight_line: Float[np.ndarray, " shots"]
+    flight_line: Int[np.ndarray, " shots"]
     range_at_time_zero: Float[np.ndarray, " shots"]
     pulse: Float[np.ndarray, " lags"]
     radiometric_constant: Float[np.ndarray, " wavelengths"]
@@ -75,7 +75,7 @@ def acquisition_of(survey: Survey) -> Acquisition:
     return Acquisition(
         gps_time=unknown_time if survey.gps_time is None else survey.gps_time,
         scan_angle=survey.zenith if survey.scan_angle is None else survey.scan_angle,
-        flight_line=np.ones(shots) if survey.flight_line is None else survey.flight_line,
+        flight_line=np.ones(shots, int) if survey.flight_line is None else survey.flight_line,
         range_at_time_zero=np.zeros(shots) if survey.has_sensor_position else survey.slant_range,
         pulse=sampled_pulse(survey.lidar),
         radiometric_constant=radiometric_constant(survey.lidar),

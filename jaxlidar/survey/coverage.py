@@ -92,8 +92,8 @@ def ground_position(survey: Survey, scene: Scene) -> Float[np.ndarray, "shots 3"
 
     >>> import jaxlidar as jl
     >>> survey = jl.Survey(jl.Lidar(altitude=500.0), position=[(0, 0)], zenith=45.0, azimuth=90.0)
-    >>> jl.ground_position(survey, jl.Scene(ground=jl.Ground(height=100.0))).round(3).tolist()
-    [[-100.0, 0.0, 100.0]]
+    >>> print(jl.ground_position(survey, jl.Scene(ground=jl.Ground(height=100.0)))[0].round().astype(int))
+    [-100    0  100]
     """
     check_kind("survey", survey, Survey, "a Survey")
     check_kind("scene", scene, Scene, "a Scene")

@@ -71,6 +71,8 @@ _SAMPLES_AT_ONCE = 100_000
 _RECORDS_AT_ONCE = 64
 # Gaps of the signal below this many lengths of the pulse do not divide a record that is decomposed.
 _MIN_GAP_OF_PULSE = 1.0
+# Least cosine of an axis to the vertical for which the height of a surface gives its range.
+_LEAST_SLOPE = 0.01
 _FWHM_OF_STD = 2.0 * np.sqrt(2.0 * np.log(2.0))
 # Materials of samples in which nothing returned, and heights (m above ground) that divide vegetation into the
 # classes 3, 4 and 5 of the LAS specification.
@@ -112,7 +114,7 @@ class DiscreteReturns(eqx.Module):
     >>> returns = jl.simulate_many(survey, scene, key=jax.random.key(0)).returns()
     >>> print(returns)
     4 returns of 2 shots: 2 ground, 2 plate
-    >>> print(returns.position[:2, 2].round(2), returns.number[:2])
+    >>> print(returns.position[:2, 2].round(1) + 0.0, returns.number[:2])
     [6. 0.] [1 2]
     """
 
@@ -130,7 +132,7 @@ class DiscreteReturns(eqx.Module):
     ground_height: Float[np.ndarray, " returns"]
     gps_time: Float[np.ndarray, " returns"]
     scan_angle: Float[np.ndarray, " returns"]
-    flight_line: Float[np.ndarray, " returns"]
+    flight_line: Int[np.ndarray, " returns"]
     n_shots: int = eqx.field(static=True)
 
     def __len__(self) -> int:
@@ -260,6 +262,7 @@ class DetectorInput:
     - `time`: (samples,) ns. - `recorded`, `energy`, `stderr`: (shots, samples), as those of `Waveforms`.
     - `components`: by material, (shots, samples) apparent reflectance. - `truth`: the same of
       `Truths.returns`, or None.
+    - `surface_height`: of the truth, by surface, (shots,) m; empty without truth.
     - `axes`: of the beams. - `acquisition`: of the shots. - `constant`: radiometric constant, J m2.
     - `ground_height`: (shots,) m.
     """
@@ -270,6 +273,7 @@ class DetectorInput:
     stderr: Float[np.ndarray, "shots samples"]
     components: Mapping[str, Float[np.ndarray, "shots samples"]]
     truth: Mapping[str, Float[np.ndarray, "shots samples"]] | None
+    surface_height: Mapping[str, Float[np.ndarray, " shots"]]
     axes: ShotAxes
     acquisition: Acquisition
     constant: float
@@ -320,6 +324,7 @@ def input_of_waveforms(waves: Any, wavelength: Any) -> DetectorInput:
         stderr=waves.stderr[:, w],
         components={name: a[:, w] for name, a in waves.components.items() if name not in _ORDERS},
         truth=None if waves.truth is None else {name: a[:, w] for name, a in waves.truth.returns.items()},
+        surface_height={} if waves.truth is None else waves.truth.surface_height,
         axes=_shot_axes(waves.position, zenith, azimuth, waves.acquisition.range_at_time_zero),
         acquisition=waves.acquisition,
         constant=float(waves.acquisition.radiometric_constant[w]),
@@ -343,8 +348,8 @@ def input_of_waveform(wave: Any, lidar: Any, wavelength: Any) -> DetectorInput:
         return np.asarray(array)[w][None]
 
     truth = wave.truth
-    # The truth has the height of the ground over the footprint.
-    ground = np.nan if truth is None else float(truth.surface_height.get("ground", np.nan))
+    heights = {} if truth is None else truth.surface_height
+    heights = {name: np.asarray(height, float).reshape(1) for name, height in heights.items()}
     return DetectorInput(
         time=np.asarray(wave.time, float),
         recorded=row(wave.recorded),
@@ -352,10 +357,12 @@ def input_of_waveform(wave: Any, lidar: Any, wavelength: Any) -> DetectorInput:
         stderr=row(wave.stderr),
         components={name: row(a) for name, a in wave.components.items() if name not in _ORDERS},
         truth=None if truth is None else {name: row(a) for name, a in truth.returns.items()},
+        surface_height=heights,
         axes=_shot_axes(shot.position, shot.zenith, shot.azimuth, acquisition.range_at_time_zero),
         acquisition=acquisition,
         constant=float(acquisition.radiometric_constant[w]),
-        ground_height=np.full(1, ground),
+        # The truth has the mean height of the ground over the footprint.
+        ground_height=heights.get("ground", np.full(1, np.nan)),
     )
 
 
@@ -940,6 +947,15 @@ def _true_echoes(
     mean = total(light * time) / reflectance
     variance = total(light * (time - mean[echo]) ** 2) / reflectance
     shot = shots.start + rows[starts]
+    if material in waves.surface_height:
+        # Samples resolve the mean to a part of their length; the height of a surface is exact.
+        axes, height = waves.axes, waves.surface_height[material][shot]
+        # On a nearly level axis a height states no exact point.
+        slope = axes.direction[shot, 2]
+        is_inclined = np.abs(slope) > _LEAST_SLOPE
+        rise = (height - axes.origin[shot, 2]) / np.where(is_inclined, slope, 1.0)
+        exact = rise / (0.5 * SPEED_OF_LIGHT)
+        mean = np.where(is_inclined & (np.abs(exact - mean) < waves.step), exact, mean)
     (listed,) = np.nonzero(reflectance >= min_reflectance)
     columns = {
         "shot": shot,

@@ -284,9 +284,10 @@ class Waveforms(eqx.Module):
         """List the true echoes of all shots, to judge what a detector reports.
 
         An echo is a stretch of samples with first-order returns of one material, without a gap: the ground,
-        a plate, a layer of leaves. Its time is the mean of these returns, its width 2.35 times their standard
-        deviation, without the pulse; its amplitude is the energy of all of them. Returns of the
-        simulation's truth are resolved to a sample.
+        a plate, a layer of leaves. Its time is the mean of these returns, resolved to a part of a sample;
+        for the ground, and a single plate, it is that of their mean height in the footprint. Its width is
+        2.35 times the standard deviation of the returns, without the pulse; its amplitude is the energy of
+        all of them.
 
         **Arguments:**
 
@@ -305,7 +306,7 @@ class Waveforms(eqx.Module):
         >>> survey = jl.Survey(jl.Lidar(altitude=500.0), position=[(0, 0)], zenith=[20.0])
         >>> many = jl.simulate_many(survey, scene, key=jax.random.key(0), truth=True)
         >>> print(many.true_returns().material.tolist(), many.true_returns().reflectance.round(3))
-        ['plate', 'ground'] [0.188 0.141]
+        ['plate', 'ground'] [0.188 0.07 ]
         """
         return true_returns_of(input_of_waveforms(self, wavelength), min_reflectance=min_reflectance)
 

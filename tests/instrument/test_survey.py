@@ -205,3 +205,32 @@ def test_a_figure_draws_every_footprint_where_it_lies():
     assert len(dots[0].get_offsets()) == 16
     with pytest.raises(ValueError, match=r"values has shape \(3,\)"):
         jl.plot.survey(distant, None, Figure().subplots(), values=[1, 2, 3])
+
+
+def test_shots_have_times_angles_and_flight_lines(tmp_path):
+    line = {"start": (0, 0), "end": (0, 10), "speed": 50.0, "pulse_rate": 100.0}
+    survey = jl.Survey.scan(jl.Lidar(), jl.Oscillating(20.0, 5.0), **line, gps_time=3.2e8, flight_line=7)
+    np.testing.assert_allclose(survey.gps_time - 3.2e8, np.arange(len(survey)) / 100.0, atol=1e-7)
+    # Across the track, to the right: the zenith angle with a sign.
+    np.testing.assert_allclose(np.abs(survey.scan_angle), survey.zenith, atol=1e-9)
+    np.testing.assert_array_equal(survey[3:5].scan_angle, survey.scan_angle[3:5])
+    assert survey[3:5].flight_line.tolist() == [7, 7]
+    assert survey.about(np.array([1.0, 2.0])).gps_time[0] == 3.2e8
+    jl.io.write_case(tmp_path / "a.toml", jl.io.Case(survey=survey))
+    again = jl.io.read_case(tmp_path / "a.toml").survey
+    for name in ("gps_time", "scan_angle", "flight_line"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(survey, name))
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"flight_line": 70000}, "flight_line = 70000 is outside"),
+        ({"flight_line": 1.5}, "not whole numbers"),
+        ({"scan_angle": 181.0}, "scan_angle = 181 is outside"),
+        ({"gps_time": [1.0, 2.0, 3.0]}, r"gps_time has shape \(3,\)"),
+    ],
+)
+def test_wrong_times_angles_and_flight_lines_are_refused(fields, message):
+    with pytest.raises(ValueError, match=message):
+        jl.Survey(jl.Lidar(), [(0, 0), (1, 0)], **fields)

@@ -20,9 +20,11 @@ def first_returns(extinction, *, pulses, seed, zenith=0.0, ground=0.0):
     is_ground = depth > TOP - BOTTOM
     height = np.where(is_ground, ground, TOP - depth)
     position = np.column_stack([random.uniform(0.0, WIDTH, (pulses, 2)), height])
-    ones = np.ones(pulses, int)
+    numbers = np.ones(pulses, int)
     angle = np.full(pulses, zenith)
-    return PointCloud(position, np.where(is_ground, 2, 5), ones, ones, 20.0 * ones, {}, scan_angle=angle)
+    return PointCloud(
+        position, np.where(is_ground, 2, 5), numbers, numbers, 20.0 * numbers, {}, scan_angle=angle
+    )
 
 
 def gap_z(extinction, cloud, zenith, pulses):
@@ -69,9 +71,9 @@ def test_terrain_is_that_of_ground_returns():
     random = np.random.default_rng(0)
     place = random.uniform(0.0, 30.0, (600, 2))
     height = tilted(*place.T) + random.normal(0.0, 0.05, 600)
-    ones = np.ones(600, int)
+    numbers = np.ones(600, int)
     cloud = jl.canopy_from_points(
-        PointCloud(np.column_stack([place, height]), 2 * ones, ones, ones, 1.0 * ones, {})
+        PointCloud(np.column_stack([place, height]), 2 * numbers, numbers, numbers, 1.0 * numbers, {})
     )
     x, y = np.meshgrid(np.linspace(1.0, 29.0, 15), np.linspace(1.0, 29.0, 15))
     error = np.asarray(cloud.terrain.height_at(x, y)) - tilted(x, y)
@@ -84,9 +86,9 @@ def unclassified_stand(random, returns=12_000):
     place = random.uniform(0.0, 40.0, (returns, 2))
     is_tree = np.all(place % 8.0 < 3.0, axis=1) & (random.uniform(size=returns) < 0.8)
     above = np.where(is_tree, random.uniform(2.0, 6.0, returns), 0.0)
-    ones = np.ones(returns, int)
+    numbers = np.ones(returns, int)
     position = np.column_stack([place, tilted(*place.T) + above + random.normal(0.0, 0.03, returns)])
-    return PointCloud(position, 0 * ones, ones, ones, 1.0 * ones, {}), is_tree
+    return PointCloud(position, 0 * numbers, numbers, numbers, 1.0 * numbers, {}), is_tree
 
 
 def test_ground_is_found_where_nothing_is_classified():
@@ -112,9 +114,9 @@ def test_a_simulation_is_close_to_the_sum_of_points():
     is_ground = random.uniform(size=9000) > 0.9 * (crown > 0)
     height = np.where(is_ground, 0.0, 3.0 + 9.0 * crown - random.exponential(1.5, 9000) * (crown > 0))
     height = np.maximum(height, 0.0)
-    ones = np.ones(9000, int)
+    numbers = np.ones(9000, int)
     points = PointCloud(
-        np.column_stack([place, height]), np.where(is_ground, 2, 5), ones, ones, 1.0 * ones, {}
+        np.column_stack([place, height]), np.where(is_ground, 2, 5), numbers, numbers, 1.0 * numbers, {}
     )
     cloud = jl.canopy_from_points(points)
     canopy = jl.Canopy(cloud.voxels, leaf=jl.LeafOptics(0.45, 0.45))
@@ -141,8 +143,8 @@ def test_a_simulation_is_close_to_the_sum_of_points():
     ],
 )
 def test_points_that_are_no_returns_are_refused(change, message):
-    ones = np.ones(4, int)
-    points = PointCloud(np.zeros((4, 3)), ones, ones, ones, 1.0 * ones, {})
+    numbers = np.ones(4, int)
+    points = PointCloud(np.zeros((4, 3)), numbers, numbers, numbers, 1.0 * numbers, {})
     with pytest.raises(ValueError, match=message):
         jl.canopy_from_points(points._replace(**change))
     with pytest.raises(ValueError, match="voxel_size"):

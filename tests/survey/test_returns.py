@@ -175,8 +175,7 @@ def test_returns_have_the_times_and_angles_of_the_survey(survey, waveforms):
 def test_true_returns_are_the_surfaces_and_detected_ones_agree_with_them(waveforms):
     truth, detected = waveforms.true_returns(), waveforms.returns()
     assert truth.material.tolist() == detected.material.tolist()
-    # Truth is resolved to a sample of 1 ns, 0.15 m.
-    np.testing.assert_allclose(truth.position[:, 2], np.tile([7.03, 1.02], len(waveforms)), atol=0.08)
+    np.testing.assert_allclose(truth.position[:, 2], np.tile([7.03, 1.02], len(waveforms)), atol=1e-3)
     np.testing.assert_allclose(truth.reflectance, detected.reflectance, rtol=0.02)
     np.testing.assert_allclose(truth.width, 0.0, atol=2.0)
     assert len(waveforms.true_returns(min_reflectance=0.14)) < len(truth)

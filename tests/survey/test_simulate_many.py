@@ -522,3 +522,15 @@ def test_a_jax_transformation_is_refused_with_its_cause():
     for transformed in (jax.jit(scaled), jax.jit(of_reflectance), jax.grad(of_reflectance)):
         with pytest.raises(TypeError, match=message):
             transformed(0.3)
+
+
+def test_an_interrupt_says_where_finished_shots_are(tmp_path, monkeypatch):
+    def interrupted(*args):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(sys.modules["jaxlidar.survey.simulate_many"], "_trace", interrupted)
+    survey = jl.Survey(jl.Lidar(), position=[(0, 0), (10, 0)])
+    scene = jl.Scene(ground=jl.Ground())
+    with pytest.raises(KeyboardInterrupt) as interrupt:
+        jl.simulate_many(survey, scene, key=jax.random.key(0), path=tmp_path / "a.nc")
+    assert "a.nc.parts: the same call continues" in interrupt.value.__notes__[0]

@@ -5,6 +5,7 @@ Order one of a slab of extinction k of leaves of the reflectance R, seen along a
 """
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -58,6 +59,16 @@ def test_ground_is_seen_at_its_range(zenith):
     assert float(wave.energy.sum()) == pytest.approx(energy, rel=1e-4)
     peak = int(np.argmax(wave.reflectance))
     assert float(wave.height[peak]) == pytest.approx(2.0, abs=0.15 * cosine + 1e-3)
+
+
+def test_ground_at_a_grazing_angle_is_lost_unless_the_window_has_it():
+    """At 0.2 degrees from the level the ground is 430 m away, beyond the automatic record."""
+    lidar, scene = look((0.0, 0.0, 1.5), 89.8, divergence=0.01), jl.Scene(ground=jl.Ground(reflectance=0.4))
+    expected = 0.4 * np.cos(np.deg2rad(89.8))
+    short, long = first_order(lidar, scene), first_order(lidar, scene, window=(0.0, 3000.0))
+    assert total(short) == 0.0
+    assert float(short.lost[0]) == pytest.approx(expected, rel=1e-2)
+    assert total(long) == pytest.approx(expected, rel=1e-2)
 
 
 # A wall: a plate 0.1 degrees from the vertical through (20, 0, 0), whose normal looks west.
@@ -209,17 +220,27 @@ def test_second_order_within_a_slab_agrees_with_another_code():
 # -- surveys -----------------------------------------------------------------------------------------------
 
 
-def test_a_terrestrial_scan_of_a_wall_and_ground():
-    """Shots of many directions share one program; ranges and reflectances are those of the planes."""
+WALL_AND_GROUND = jl.Scene(ground=jl.Ground(reflectance=0.3), plates=(WALL,))
+
+
+@pytest.fixture(scope="module")
+def terrestrial_scan():
+    """Shots from one place in many directions, their waveforms, and the ranges of what they meet."""
     zenith, azimuth = np.array([60.0, 80.0, 90.0, 100.0, 30.0]), np.array([90.0, 80.0, 90.0, 90.0, 0.0])
-    scene = jl.Scene(ground=jl.Ground(reflectance=0.3), plates=(WALL,))
     survey = jl.Survey(jl.Lidar(), sensor=np.tile([5.0, 3.0, 4.0], (5, 1)), zenith=zenith, azimuth=azimuth)
-    many = jl.simulate_many(survey, scene, key=KEY, max_orders=1, rtol=0.02)
-    w = survey.direction
-    to_wall, wall_cosine = range_and_cosine(survey.sensor[0], w)
-    to_ground = 4.0 / np.maximum(-w[:, 2], 1e-9)
+    many = jl.simulate_many(survey, WALL_AND_GROUND, key=KEY, max_orders=1, rtol=0.02, truth=True)
+    to_wall, _ = range_and_cosine(survey.sensor[0], survey.direction)
+    to_ground = 4.0 / np.maximum(-survey.direction[:, 2], 1e-9)
     hits_wall = (to_wall > 0) & (to_wall < to_ground)
-    distance = np.where(hits_wall, to_wall, to_ground)
+    return survey, many, np.where(hits_wall, to_wall, to_ground), hits_wall
+
+
+def test_a_terrestrial_scan_of_a_wall_and_ground(terrestrial_scan):
+    """Shots of many directions share one program; ranges and reflectances are those of the planes."""
+    survey, many, distance, hits_wall = terrestrial_scan
+    scene, w = WALL_AND_GROUND, survey.direction
+    _, wall_cosine = range_and_cosine(survey.sensor[0], w)
+    to_ground = 4.0 / np.maximum(-w[:, 2], 1e-9)
     cosine = np.where(hits_wall, 0.6 * wall_cosine, -0.3 * w[:, 2])
     sums = many.reflectance.sum(axis=(1, 2))
     centroid = (many.reflectance[:, 0] * many.time).sum(axis=1) / sums * METRES_PER_NS
@@ -236,6 +257,67 @@ def test_a_terrestrial_scan_of_a_wall_and_ground():
     assert float(many[1].height[0]) == pytest.approx(
         4.0 - many.time[0] * METRES_PER_NS * np.cos(np.deg2rad(80.0)), abs=1e-3
     )
+
+
+@pytest.mark.parametrize("detector", ["peak", "constant fraction"])
+def test_returns_of_a_terrestrial_scan_lie_on_the_wall_and_the_ground(detector, terrestrial_scan):
+    """Positions start at the sensor: s + r w, with the ranges of the planes in closed form."""
+    survey, many, distance, hits_wall = terrestrial_scan
+    returns = many.returns(detector)
+    assert returns.shot.tolist() == list(range(5))
+    assert returns.material.tolist() == np.where(hits_wall, "plate", "ground").tolist()
+    np.testing.assert_allclose(returns.range, distance, atol=5e-3)
+    np.testing.assert_allclose(
+        returns.position, survey.sensor + distance[:, None] * survey.direction, atol=5e-3
+    )
+    np.testing.assert_allclose(returns.reflectance, many.reflectance.sum(axis=(1, 2)), rtol=5e-3)
+    # From the wrong end of the axis, 1 m ahead of the sensor, all would be 1 m off.
+    assert np.all(np.abs(returns.range + 1.0 - distance) > 0.9)
+    # A shot alone, and the truth.
+    alone = many[3].returns(survey[3], detector)
+    np.testing.assert_allclose(alone.position[0], returns.position[3], atol=1e-4)
+    true = many.true_returns()
+    np.testing.assert_allclose(true.range, distance, atol=0.02)
+    is_inclined = np.abs(survey.direction[:, 2]) > 0.4
+    np.testing.assert_allclose(true.range[is_inclined], distance[is_inclined], atol=1e-4)
+
+
+def mesh_wall(east, reflectance):
+    """A square of 80 m, of two triangles, across the x axis."""
+    corners = np.array([[east, y, z] for y, z in ((-40, -40), (40, -40), (40, 40), (-40, 40))], float)
+    return jl.MeshSurface((corners, [[0, 1, 2], [0, 2, 3]]), reflectance)
+
+
+def test_a_mesh_is_seen_from_before_it_alone():
+    ahead = jl.Scene(meshes=(mesh_wall(10.0, 0.6),))
+    for zenith, azimuth in ((90.0, 90.0), (60.0, 70.0)):
+        lidar = look((0.0, 0.0, 1.5), zenith, azimuth)
+        cosine = float(lidar.direction[0])
+        wave = first_order(lidar, ahead)
+        assert total(wave) == pytest.approx(0.6 * cosine, rel=1e-4)
+        assert mean_range(wave) == pytest.approx(10.0 / cosine, rel=1e-4)
+    assert total(first_order(look((0.0, 0.0, 1.5), 90.0, 270.0), ahead)) == 0.0
+
+
+def test_a_mesh_behind_the_sensor_hides_nothing():
+    """Light from a wall and the ground: of a mesh, with a black one behind the sensor, as of a plate."""
+    ground = jl.Ground(reflectance=0.8)
+    plate = jl.Plate(height=0.0, slope=89.99, aspect=270.0, position=(10.0, 0.0), reflectance=0.6)
+    scenes = (
+        jl.Scene(ground=ground, plates=(plate,)),
+        jl.Scene(ground=ground, meshes=(mesh_wall(10.0, 0.6), mesh_wall(-2.0, 0.0))),
+    )
+    lidar = look((0.0, 0.0, 1.5), 90.0, 90.0, field_of_view=400.0, sampling_interval=5.0)
+    waves = [
+        jl.simulate(lidar, scene, key=KEY, max_orders=2, n_photons=8192, rtol=0.05, window=(0.0, 200.0))
+        for scene in scenes
+    ]
+    sums = [float(wave.components["higher"].sum()) for wave in waves]
+    stderr = float(np.hypot(*(np.sqrt(np.sum(np.square(wave.stderr))) for wave in waves)))
+    assert sums[0] > 0.01
+    assert agrees(sums[1], stderr, sums[0])
+    # Nothing of the order, which a wall that hides it would leave, differs by much more.
+    assert not agrees(0.0, stderr, sums[0])
 
 
 def test_a_terrestrial_scan_of_a_sphere():
@@ -261,6 +343,20 @@ def test_a_terrestrial_scan_of_a_sphere():
     assert sums[3] == 0.0
     centroid = (many.reflectance[:3, 0] * many.time).sum(axis=1) / sums[:3] * METRES_PER_NS
     np.testing.assert_allclose(centroid, expected[:3], rtol=1e-4)
+
+
+def test_the_range_has_a_derivative_by_the_height_of_the_sensor():
+    """Over level ground seen at the zenith angle 30 degrees, the range is z / cos(30 degrees)."""
+    scene = jl.Scene(ground=jl.Ground())
+    plan = jl.plan(look((0.0, 0.0, 12.0), 30.0), scene, window=(60.0, 130.0))
+
+    def centroid(z):
+        wave = jl.simulate(look((0.0, 0.0, z), 30.0), scene, key=KEY, plan=plan)
+        return jnp.sum(wave.reflectance[0] * wave.time) / jnp.sum(wave.reflectance) * METRES_PER_NS
+
+    value, slope = jax.jvp(centroid, (12.0,), (1.0,))
+    assert float(value) == pytest.approx(12.0 / np.cos(np.deg2rad(30.0)), rel=1e-5)
+    assert float(slope) == pytest.approx(1.0 / np.cos(np.deg2rad(30.0)), rel=1e-3)
 
 
 # -- air ---------------------------------------------------------------------------------------------------
