@@ -19,6 +19,8 @@ waveforms is in the package `inversion`.
 
 ## Surveys of many shots
 
+`Survey`, `Trajectory`, `AbstractScan`, `Oscillating`, `RotatingPolygon`, `Conical`, `ground_position`,
+`simulate_many`, `Waveforms`, `SurveyProgress`, `SceneParts`.
 `Survey`, `AbstractScan`, `Oscillating`, `RotatingPolygon`, `Conical`, `simulate_many`, `Waveforms`,
 `SurveyProgress`, `SceneParts`, `Acquisition`, `DiscreteReturns`.
 
@@ -105,6 +107,7 @@ from jaxlidar.instrument.pulse import (
 from jaxlidar.instrument.receiver import Receiver, first_return_window, record
 from jaxlidar.instrument.scan import AbstractScan, Conical, Oscillating, RotatingPolygon
 from jaxlidar.instrument.survey import Survey
+from jaxlidar.instrument.trajectory import Trajectory
 from jaxlidar.io.netcdf import open, rerun
 from jaxlidar.optics.coefficients import load_coefficients
 from jaxlidar.optics.laws import AbstractLaw, AbstractMirror, EqualAngle, Lambertian, Specular
@@ -142,7 +145,7 @@ from jaxlidar.scenes.voxels import VoxelMap
 from jaxlidar.simulate import LateLightWarning, UnfollowedLightWarning, simulate
 from jaxlidar.spectral.waveform import Waveform, total_reflectance, waveform_of
 from jaxlidar.survey.acquisition import Acquisition
-from jaxlidar.survey.coverage import OffMapWarning
+from jaxlidar.survey.coverage import OffMapWarning, ground_position
 from jaxlidar.survey.progress import SurveyProgress
 from jaxlidar.survey.returns import DiscreteReturns
 from jaxlidar.survey.simulate_many import simulate_many
@@ -181,10 +184,12 @@ __all__ = [
     "PhotonEvents",
     # Surveys of many shots.
     "Survey",
+    "Trajectory",
     "AbstractScan",
     "Oscillating",
     "RotatingPolygon",
     "Conical",
+    "ground_position",
     "simulate_many",
     "Waveforms",
     "SurveyProgress",

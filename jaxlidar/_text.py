@@ -1,6 +1,8 @@
 """Texts of numbers and objects, for messages and for `print`."""
 
 import dataclasses
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
 import jax
@@ -19,12 +21,15 @@ def number_text(x: Any) -> str:
     return f"{value:.10g}" if _COORDINATE <= abs(value) < _HUGE else f"{value:g}"
 
 
-def object_text(x: Any) -> str:
-    """Format an object as its constructor is called, with values; arrays by their shape and range."""
-    return _text(x, 0)
+def object_text(x: Any, names: Mapping[str, str] | None = None) -> str:
+    """Format an object as its constructor is called, with values; arrays by their shape and range.
+
+    `names`: arguments by field, where these differ.
+    """
+    return _text(x, 0, names or {})
 
 
-def _text(x: Any, indent: int) -> str:
+def _text(x: Any, indent: int, names: Mapping[str, str] = MappingProxyType({})) -> str:
     if isinstance(x, Tracer):
         return repr(x)
     if isinstance(x, jax.Array | np.ndarray | np.generic):
@@ -37,7 +42,9 @@ def _text(x: Any, indent: int) -> str:
     if not dataclasses.is_dataclass(x) or isinstance(x, type):
         return getattr(x, "__qualname__", None) or repr(x)
     fields = [(field.name, getattr(x, field.name)) for field in dataclasses.fields(x)]
-    entries = [f"{name}={_text(value, indent + 2)}" for name, value in fields if value is not None]
+    entries = [
+        f"{names.get(name, name)}={_text(value, indent + 2)}" for name, value in fields if value is not None
+    ]
     return _joined(f"{type(x).__name__}(", " " * (indent + 2), entries, ")", indent)
 
 

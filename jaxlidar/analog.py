@@ -189,7 +189,7 @@ def _photon_paths(
 
     _, points = lax.scan(order_step, start, jnp.arange(plan.orders + 1))
     points = jnp.concatenate([jnp.stack(start.x, axis=-1)[None], points])
-    aim = jnp.concatenate([lidar.position, jnp.zeros_like(lidar.position[:1])])
+    aim = lidar.aim_point
     return jnp.moveaxis(points, 0, 1) + aim[None, None, :]
 
 
@@ -203,6 +203,11 @@ class _Arrivals(eqx.Module):
 
 def _build_scene(lidar: Lidar, scene: Scene, plan: Plan) -> DeviceScene:
     """Build the device scene, and refuse scenes that the analog estimator cannot simulate."""
+    if lidar.has_sensor_position:
+        raise ValueError(
+            "the lidar is placed by its sensor; admissible for the analog estimator, which collects photons "
+            "that leave the scene, is one with an altitude"
+        )
     setup = make_setup(lidar, scene, plan)
     canopy = setup.scene.canopy
     if canopy is not None and canopy.hotspot:

@@ -294,7 +294,9 @@ def _make_waveform(tracer: BatchTracer, result: _BatchResults, goal: _Goal) -> W
     if is_traced(wave.energy):
         return wave
     # Heights tell the zenith angle of a waveform's lidar, and nothing else its altitude.
-    wave = dataclasses.replace(wave, info={**result.info, "altitude": float(lidar.altitude)})
+    wave = dataclasses.replace(
+        wave, info={**result.info, "altitude": None if lidar.altitude is None else float(lidar.altitude)}
+    )
     if plan.scope.automatic_window and late_fraction(wave) >= NOTABLE_FRACTION:
         end = plan.sample_start + plan.sample_interval * plan.n_samples
         warnings.warn(

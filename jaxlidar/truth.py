@@ -137,6 +137,8 @@ def compute_labels(scene: DeviceScene, model: WaveformModel) -> Truth:
     returns = component_samples(trace_device_scene(scene, key), model)
     height, samples = height_of(lidar, time), _sample_bins(scene, model)
     axis_heights, (across, energy) = _heights_on_axis(scene), footprint_rays(scene, key)
+    # Traced coordinates are relative to the aim point, heights to the reference plane.
+    aim_height = lidar.aim_point[2]
     sums = _sum_rays(scene, samples, across, energy, axis_heights)
     # A traced value outside its range makes all labels NaN.
     sums = jax.tree.map(lambda a: model.admissible * a, sums)
@@ -147,6 +149,8 @@ def compute_labels(scene: DeviceScene, model: WaveformModel) -> Truth:
     before = jnp.sum(sums.rows[1:, : samples.max_span])
     leaf, bark = inside[:, : samples.count]
     cos_zenith = jnp.cos(jnp.deg2rad(lidar.zenith))
+    # A beam that looks up passes through as much plant area.
+    vertical = jnp.abs(cos_zenith)
     edges = height[0] + cos_zenith * sample_length * (0.5 - np.arange(gap.size))
     names = [scene.config.materials[s.material] for s in scene.config.surfaces]
     mean_height, height_std = _height_moments(sums)
@@ -157,9 +161,9 @@ def compute_labels(scene: DeviceScene, model: WaveformModel) -> Truth:
         gap_probability=gap[1:],
         leaf_area_density=leaf / sample_length,
         bark_area_density=bark / sample_length,
-        plant_area_index=cos_zenith * (before + jnp.cumsum(leaf + bark)),
+        plant_area_index=vertical * (before + jnp.cumsum(leaf + bark)),
         top_height=_height_of_gap(1.0 - TOP_INTERCEPTION, gap, edges),
-        surface_height=dict(zip(names, axis_heights + mean_height)),
+        surface_height=dict(zip(names, aim_height + axis_heights + mean_height)),
         surface_spread=dict(zip(names, height_std)),
     )
 

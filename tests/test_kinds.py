@@ -328,11 +328,15 @@ def test_help_begins_with_the_summary_of_a_class():
 
 def test_a_short_signature_keeps_names_and_defaults():
     lidar_parameters = inspect.signature(jl.Lidar).parameters
-    assert list(lidar_parameters) == [field.name for field in dataclasses.fields(jl.Lidar)]
-    assert (lidar_parameters["altitude"].default, lidar_parameters["position"].default) == (
-        1000.0,
-        (0.0, 0.0),
-    )
+    # The sensor is an argument, kept as the position.
+    assert list(lidar_parameters) == [*(field.name for field in dataclasses.fields(jl.Lidar)), "sensor"]
+    names = ("altitude", "position", "divergence", "profile")
+    assert [str(lidar_parameters[name].default) for name in names] == [
+        "1000.0",
+        "(0.0, 0.0)",
+        "0.3",
+        "gaussian",
+    ]
     leaf_parameters = inspect.signature(jl.Prospect).parameters
     assert list(leaf_parameters)[:2] == ["N", "Cab"]
     assert leaf_parameters["Cp"].kind is inspect.Parameter.KEYWORD_ONLY

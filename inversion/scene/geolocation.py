@@ -150,9 +150,10 @@ def geolocate(
 
     **Returns:** a `Geolocation`.
 
-    **Raises:** ValueError for inadmissible arguments, shots with more than one direction, a lidar with a
-    top-hat beam, without divergence or with a field of view, and positions of which all footprints within the
-    radius lie off the terrain; TypeError for arguments of the wrong type.
+    **Raises:** ValueError for inadmissible arguments, shots with more than one direction or altitude, or that
+    are placed by their sensors, a lidar with a top-hat beam, without divergence or with a field of view, and
+    positions of which all footprints within the radius lie off the terrain; TypeError for arguments of the
+    wrong type.
 
     **Source:** Hancock et al. (2019), Earth and Space Science 6, 294, section 3.4, match footprints to clouds
     likewise, by correlation.
@@ -277,6 +278,9 @@ def _broadcast(field: str, values: np.ndarray, shape: tuple[int, ...]) -> np.nda
 def _footprint_covariance(survey: Survey) -> Float[np.ndarray, "2 2"]:
     """Return the covariance, m2, of the irradiance on the reference plane. **Raises:** as `geolocate`."""
     lidar = survey.lidar
+    if survey.altitude is None or np.ptp(survey.altitude) > 0:
+        placed = "by their sensors" if survey.altitude is None else "at several altitudes"
+        raise ValueError(f"survey: its shots are placed {placed}; admissible is one altitude of all shots")
     for name, angles in (("zenith", survey.zenith), ("azimuth", survey.azimuth)):
         if name == "azimuth" and not np.any(survey.zenith):
             continue
@@ -337,7 +341,8 @@ def _simulate_nodes(
         position = position[np.all((position >= low) & (position <= high), axis=1)]
     if len(position) == 0:
         raise ValueError("position: all footprints within the search radius lie off the terrain")
-    node_survey = Survey(narrow, position, survey.zenith[0], survey.azimuth[0])
+    assert survey.altitude is not None
+    node_survey = Survey(narrow, position, survey.zenith[0], survey.azimuth[0], survey.altitude[0])
     with warnings.catch_warnings():
         # Beams at the edge of the map are expected: shifts towards it are tried, too.
         warnings.simplefilter("ignore", OffMapWarning)

@@ -5,16 +5,23 @@ phi in which light travels, the unit vector of the beam is
 
     w = (sin(theta) sin(phi), sin(theta) cos(phi), -cos(theta)).
 
-The beam axis meets the reference plane at p = (x, y, 0), `position`. At the altitude H the slant range is
-R = H / cos(theta), the sensor stands at p - R w, and the footprint, perpendicular to the beam, has the radius
-R gamma / 2 for the full divergence gamma. Time zero of every waveform is the two-way travel time 2 R / c to
-p, not the emission: at the altitude of a satellite, absolute times in single precision would be off by
-0.1 ns.
+A lidar is placed in one of two ways.
+
+**By its altitude** (`altitude` and `position`), above the scene. The beam axis meets the reference plane at
+p = (x, y, 0), `position`. At the altitude H the slant range is R = H / cos(theta), the sensor stands at
+p - R w, and the footprint, perpendicular to the beam, has the radius R gamma / 2 for the full divergence
+gamma. Time zero of every waveform is the two-way travel time 2 R / c to p, not the emission: at the altitude
+of a satellite, absolute times in single precision would be off by 0.1 ns.
+
+**By its sensor** (`sensor`), anywhere, and looking anywhere. Time zero is the emission at the sensor s, so
+that light of order one that arrives at the time t comes from the range r = c t / 2. The energy of a return of
+the apparent reflectance rho is E eta A rho / (pi r^2) with its own range r, as for any lidar. The "aim point"
+is then the point s + w, 1 m ahead of the sensor: widths of the beam are stated there.
 """
 
 import math
 from collections.abc import Sequence
-from typing import ClassVar, final
+from typing import Any, ClassVar, final
 
 import equinox as eqx
 import jax
@@ -42,9 +49,41 @@ from jaxlidar.instrument.pulse import AbstractPulse, GaussianPulse
 from jaxlidar.instrument.receiver import Receiver
 from jaxlidar.instrument.scan import AbstractScan
 
+# Distance, m, from a sensor that is given by its position to its aim point, the origin of traced coordinates.
+AIM_DISTANCE = 1.0
+# Largest zenith angle, degrees, of a beam that is to meet the reference plane, and of any beam.
+_MAX_ZENITH, STRAIGHT_UP = 89.0, 180.0
+
+
+class _Default:
+    """Default of an argument, by its text. It says that the argument was left out, which None does not."""
+
+    def __init__(self, text: str):
+        self.text = text
+
+    def __repr__(self) -> str:
+        return self.text
+
+
+_ALTITUDE, _AIM_POINT = _Default("1000.0"), _Default("(0.0, 0.0)")
+_PULSE, _RECEIVER = _Default("GaussianPulse()"), _Default("Receiver()")
+
 
 def _wavelengths(x: ArrayLike | Sequence[ArrayLike]) -> Float[Array, "..."]:
     return jnp.atleast_1d(as_array(x, "wavelength"))
+
+
+def _is_sensor(position: Any) -> bool:
+    """Return True for three coordinates: those of a sensor, and not of an aim point."""
+    # Sequences may hold numbers that a JAX transformation traces, of which NumPy makes no array.
+    if isinstance(position, list | tuple):
+        return len(position) == 3
+    return getattr(position, "shape", ()) == (3,)
+
+
+def _position(x: Any) -> Array | np.ndarray:
+    """Convert (x, y) of the aim point, or (x, y, z) of the sensor."""
+    return coordinates("position", 3 if _is_sensor(x) else 2)(x)
 
 
 # Compiled: plans evaluate these often, and dispatching their operations one by one takes longer.
@@ -72,31 +111,44 @@ class Lidar(eqx.Module):
 
     - `wavelength`: nm, positive, one number or several that increase strictly; stored as (wavelengths,).
       Default 1064.
-    - `altitude`: height of the sensor above the reference plane z = 0 in m, positive. Default 1000.
+    - `altitude`: height of the sensor above the reference plane z = 0 in m, positive. Default 1000. The
+      field is None where `sensor` is given.
     - `pulse`: shape of the transmitted pulse, an `AbstractPulse`. Default `GaussianPulse(fwhm=6.0)`.
     - `divergence`: full angle of the beam in mrad, not negative. For a Gaussian beam it is measured between
       the directions at 1/e^2 of the axial irradiance, for a top-hat across the disc. Default 0.3.
     - `aperture`: diameter of the receiver in m, positive. Default 0.2.
-    - `zenith`: angle between the beam and the vertical in degrees, in [0, 89]. Default 0 (nadir).
+    - `zenith`: angle between the beam and straight down (nadir) in degrees, in [0, 89]; with `sensor` in
+      [0, 180], where 90 is level and 180 straight up. Default 0.
     - `azimuth`: compass direction in which the beam travels, degrees clockwise from north (+y). At nadir it
       does not change the beam axis. Default 0.
     - `energy`: transmitted energy per pulse in J, positive, one number or one per wavelength. Default 1e-3.
     - `sampling_interval`: interval between the digitiser's samples in ns, positive. Default 1.
     - `profile`: irradiance across the beam, "gaussian" or "top-hat". Default "gaussian".
     - `position`: (x, y) in m where the beam axis meets the reference plane: the centre of the footprint. At
-      nadir it is also the sensor's horizontal position. Default (0, 0).
+      nadir it is also the sensor's horizontal position. Where `sensor` is given, this field holds that
+      instead. Default (0, 0).
     - `field_of_view`: full angle of the receiver's field of view in mrad, positive. Default None: no limit.
     - `jitter`: standard deviation of the timing error in ns, not negative. Default 0.
     - `efficiency`: of the optics and the detector together, in (0, 1], one number or one per wavelength.
       Default 1.
     - `receiver`: detection, noise and digitisation, a `Receiver`; or a `PhotonCounter`, for
       `jaxlidar.record`: waveforms then hold the expected energies. Default `Receiver()`: a perfect record.
-    - `scan`: the pattern of a scanner, an `AbstractScan` for `Survey.scan`. One shot does not depend on it.
-      Default None.
+    - `scan`: the pattern of a scanner, an `AbstractScan` for `Survey.scan` and `Survey.fly`. One shot does
+      not depend on it. Default None.
+    - `sensor`: (x, y, z) of the sensor in m, in place of `altitude` and `position`: anywhere, also within or
+      below a canopy. Time zero of waveforms is then the emission at the sensor. Default None: above the
+      reference plane, by `altitude`.
+
+    A sensor may stand within plants, but not below the ground or in a plate: plans refuse that, as well as a
+    level beam in a canopy with periodic sides.
+
+    The receiver of a lidar with `sensor` is a flat aperture across the beam: it sees what lies before it, in
+    proportion to the cosine of the angle from the axis, within the field of view.
 
     **Raises:** ValueError for a value outside its range, for wavelengths that do not increase strictly, for
-    an unknown profile, for a position that is not two numbers, and where the energies or efficiencies are
-    neither one number nor one per wavelength; TypeError for an object of the wrong type. A value so far from
+    an unknown profile, for a position that is not two numbers and a sensor that is not three, for a sensor
+    together with an altitude or a position, and where the energies or efficiencies are neither one number
+    nor one per wavelength; TypeError for an object of the wrong type. A value so far from
     that of any instrument that another unit is likely gives a `UnitWarning`.
 
     **Example:**
@@ -107,37 +159,36 @@ class Lidar(eqx.Module):
     range 507.7 m, footprint radius 0.0762 m
     >>> print([f"{x:.1f}" for x in lidar.sensor])
     ['0.0', '-88.2', '500.0']
+    >>> upwards = jl.Lidar(sensor=(2.0, 3.0, 1.5), zenith=150.0, azimuth=30.0)
+    >>> print([f"{x:.3f}" for x in upwards.direction])
+    ['0.250', '0.433', '0.866']
     """
 
-    wavelength: Converted[Float[Array, " wavelengths"]] = eqx.field(converter=_wavelengths, default=1064.0)
-    altitude: Converted[Float[Array, ""]] = eqx.field(converter=scalar("altitude"), default=1000.0)
-    pulse: AbstractPulse = eqx.field(default_factory=GaussianPulse)
-    divergence: Converted[Float[Array, ""]] = eqx.field(converter=scalar("divergence"), default=0.3)
-    aperture: Converted[Float[Array, ""]] = eqx.field(converter=scalar("aperture"), default=0.2)
-    zenith: Converted[Float[Array, ""]] = eqx.field(converter=scalar("zenith"), default=0.0)
-    azimuth: Converted[Float[Array, ""]] = eqx.field(converter=scalar("azimuth"), default=0.0)
-    energy: Converted[Float[Array, "..."]] = eqx.field(converter=array("energy"), default=1e-3)
-    sampling_interval: Converted[Float[Array, ""]] = eqx.field(
-        converter=scalar("sampling_interval"), default=1.0
-    )
-    profile: str = eqx.field(static=True, default="gaussian")
-    position: Converted[Float[Array | np.ndarray, " 2"]] = eqx.field(
-        converter=coordinates("position", 2), default=(0.0, 0.0)
-    )
-    field_of_view: Converted[Float[Array, ""] | None] = eqx.field(
-        converter=optional_scalar("field_of_view"), default=None
-    )
-    jitter: Converted[Float[Array, ""]] = eqx.field(converter=scalar("jitter"), default=0.0)
-    efficiency: Converted[Float[Array, "..."]] = eqx.field(converter=array("efficiency"), default=1.0)
-    receiver: Receiver | PhotonCounter = eqx.field(default_factory=Receiver)
-    scan: AbstractScan | None = eqx.field(static=True, default=None)
+    wavelength: Converted[Float[Array, " wavelengths"]] = eqx.field(converter=_wavelengths)
+    # None where the sensor is given by its position.
+    altitude: Converted[Float[Array, ""] | None] = eqx.field(converter=optional_scalar("altitude"))
+    pulse: AbstractPulse
+    divergence: Converted[Float[Array, ""]] = eqx.field(converter=scalar("divergence"))
+    aperture: Converted[Float[Array, ""]] = eqx.field(converter=scalar("aperture"))
+    zenith: Converted[Float[Array, ""]] = eqx.field(converter=scalar("zenith"))
+    azimuth: Converted[Float[Array, ""]] = eqx.field(converter=scalar("azimuth"))
+    energy: Converted[Float[Array, "..."]] = eqx.field(converter=array("energy"))
+    sampling_interval: Converted[Float[Array, ""]] = eqx.field(converter=scalar("sampling_interval"))
+    profile: str = eqx.field(static=True)
+    # (x, y) of the aim point, or (x, y, z) of the sensor.
+    position: Converted[Float[Array | np.ndarray, " axes"]] = eqx.field(converter=_position)
+    field_of_view: Converted[Float[Array, ""] | None] = eqx.field(converter=optional_scalar("field_of_view"))
+    jitter: Converted[Float[Array, ""]] = eqx.field(converter=scalar("jitter"))
+    efficiency: Converted[Float[Array, "..."]] = eqx.field(converter=array("efficiency"))
+    receiver: Receiver | PhotonCounter
+    scan: AbstractScan | None = eqx.field(static=True)
 
-    ranges: ClassVar = {
+    _ranges: ClassVar = {
         "wavelength": Range(0.0, low_open=True, increasing=True),
         "altitude": Range(0.0, low_open=True),
         "divergence": Range(0.0),
         "aperture": Range(0.0, low_open=True),
-        "zenith": Range(0.0, 89.0, mirrored=True),
+        "zenith": Range(0.0, _MAX_ZENITH, mirrored=True),
         "azimuth": Range(),
         "energy": Range(0.0, low_open=True),
         "sampling_interval": Range(0.0, low_open=True),
@@ -146,6 +197,54 @@ class Lidar(eqx.Module):
         "jitter": Range(0.0),
         "efficiency": Range(0.0, 1.0, low_open=True),
     }
+
+    # Not the one of the dataclass: `sensor` is an argument, and a property that every lidar has.
+    def __init__(
+        self,
+        wavelength: Any = 1064.0,
+        altitude: Any = _ALTITUDE,
+        pulse: Any = _PULSE,
+        divergence: Any = 0.3,
+        aperture: Any = 0.2,
+        zenith: Any = 0.0,
+        azimuth: Any = 0.0,
+        energy: Any = 1e-3,
+        sampling_interval: Any = 1.0,
+        profile: str = "gaussian",
+        position: Any = _AIM_POINT,
+        field_of_view: Any = None,
+        jitter: Any = 0.0,
+        efficiency: Any = 1.0,
+        receiver: Any = _RECEIVER,
+        scan: Any = None,
+        sensor: Any = None,
+    ):
+        if sensor is not None:
+            for field, value in (("altitude", altitude), ("position", position)):
+                if not isinstance(value, _Default):
+                    raise ValueError(f"{field} is given together with sensor; admissible is one of them")
+            if not _is_sensor(sensor):
+                raise ValueError(f"sensor = {sensor!r}; admissible are three numbers: x, y and z, m")
+            position, altitude = sensor, None
+        elif altitude is None:
+            # A copy by `dataclasses.replace`, or from a file: the position is that of the sensor.
+            if not _is_sensor(position):
+                raise TypeError("altitude is None; admissible is a number, or sensor in place of it")
+        else:
+            altitude = 1000.0 if isinstance(altitude, _Default) else altitude
+            position = (0.0, 0.0) if isinstance(position, _Default) else position
+            if _is_sensor(position):
+                raise ValueError(
+                    "position has shape (3,); admissible is (2,): x and y, or sensor = (x, y, z)"
+                )
+        self.wavelength, self.altitude, self.divergence = wavelength, altitude, divergence
+        self.aperture, self.zenith, self.azimuth, self.energy = aperture, zenith, azimuth, energy
+        self.sampling_interval, self.profile, self.position = sampling_interval, profile, position
+        self.field_of_view, self.jitter, self.efficiency = field_of_view, jitter, efficiency
+        # Made here and not with the signature: importing the package starts no device.
+        self.pulse = GaussianPulse() if isinstance(pulse, _Default) else pulse
+        self.receiver = Receiver() if isinstance(receiver, _Default) else receiver
+        self.scan = scan
 
     def __check_init__(self):
         check_kind("pulse", self.pulse, AbstractPulse, "a pulse, such as GaussianPulse(fwhm=6.0)")
@@ -172,7 +271,7 @@ class Lidar(eqx.Module):
         warn_units(self)
 
     def __str__(self) -> str:
-        return object_text(self)
+        return object_text(self, {"position": "sensor"} if self.has_sensor_position else None)
 
     @property
     def opens_at_first_return(self) -> bool:
@@ -191,22 +290,52 @@ class Lidar(eqx.Module):
         return _beam_direction(self.zenith, self.azimuth)
 
     @property
+    def has_sensor_position(self) -> bool:
+        """True if the lidar is placed by its sensor, and time zero is the emission."""
+        return self.altitude is None
+
+    @property
+    def ranges(self) -> dict[str, Range]:
+        """Admissible ranges by field. A beam that is to meet the reference plane must go down."""
+        highest = STRAIGHT_UP if self.has_sensor_position else _MAX_ZENITH
+        return {**self._ranges, "zenith": Range(0.0, highest, mirrored=True)}
+
+    @property
     def range_to_reference(self) -> Float[Array, ""]:
-        """Slant range in m: distance along the beam axis from the sensor to the reference plane."""
+        """Distance in m along the beam axis from the sensor to the aim point.
+
+        The aim point lies on the reference plane, at the slant range; or 1 m ahead of a `sensor`.
+        """
+        if self.altitude is None:
+            return jnp.full_like(self.zenith, AIM_DISTANCE)
         return _slant_range(self.altitude, self.zenith)
+
+    @property
+    def range_at_time_zero(self) -> Float[Array, ""]:
+        """Range in m from which light of order one arrives at time zero: that of the aim point, or zero."""
+        return jnp.zeros_like(self.zenith) if self.has_sensor_position else self.range_to_reference
+
+    @property
+    def aim_point(self) -> Float[Array, " 3"]:
+        """Point (3,) of the beam axis, m, that is the origin of traced coordinates."""
+        if self.has_sensor_position:
+            return jnp.asarray(self.position, float) + AIM_DISTANCE * self.direction
+        return jnp.concatenate([self.position, jnp.zeros_like(self.position[:1])])
 
     @property
     def sensor(self) -> Float[Array, " 3"]:
         """Position (3,) of the sensor in m."""
-        aim_point = jnp.concatenate([self.position, jnp.zeros_like(self.position[:1])])
-        return aim_point - self.range_to_reference * self.direction
+        if self.has_sensor_position:
+            return jnp.asarray(self.position, float)
+        return self.aim_point - self.range_to_reference * self.direction
 
     @property
     def footprint_radius(self) -> Float[Array, ""]:
-        """Radius of the footprint in m: of the beam's cross-section at the reference plane.
+        """Radius of the footprint in m: of the beam's cross-section at the aim point.
 
-        It is taken at 1/e^2 of the axial irradiance, or at the edge of a top-hat, and perpendicular to the
-        beam. On the plane itself the footprint is longer by 1/cos(zenith) along the azimuth.
+        The aim point lies on the reference plane, or 1 m ahead of a `sensor`. The radius is taken at 1/e^2 of
+        the axial irradiance, or at the edge of a top-hat, and perpendicular to the beam. On the plane
+        itself the footprint is longer by 1/cos(zenith) along the azimuth.
         """
         return self.range_to_reference * self.divergence * 0.5e-3
 
@@ -217,7 +346,7 @@ class Lidar(eqx.Module):
 
     @property
     def aperture_half_angle(self) -> Float[Array, ""]:
-        """Half-angle in rad of the aperture as seen from the reference plane."""
+        """Half-angle in rad of the aperture as seen from the aim point."""
         return 0.5 * self.aperture / self.range_to_reference
 
     @property

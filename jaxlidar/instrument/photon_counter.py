@@ -270,7 +270,7 @@ def count_photons(wave: Any, counter: Any, key: Array | None, pulses: int) -> Ph
     photons_per_joule = probability * wavelength / PLANCK_TIMES_LIGHT / counter.pixels
 
     random = np.random.default_rng(np.asarray(jax.random.bits(key, (8,), jnp.uint32)))
-    height_per_time = _height_per_time(wave, sample_time)
+    height_per_time, height_at_zero = _height_of_time(wave, sample_time)
     energies = wave.energy if wave.energy.ndim == 3 else wave.energy[None]
     pixels_per_row, rows_per_shot = counter.pixels * pulses, wavelength.size
     blocks: list[_Draws] = []
@@ -292,14 +292,14 @@ def count_photons(wave: Any, counter: Any, key: Array | None, pulses: int) -> Ph
     channel, time, pulse, shot = draws.channel[order], time[order], pulse[order], shot[order]
     return PhotonEvents(
         time=time,
-        height=height_per_time[shot] * time,
+        height=height_at_zero[shot] + height_per_time[shot] * time,
         shot=shot,
         pulse=pulse,
         pixel=channel % counter.pixels,
         wavelength=wavelength[(channel // pixels_per_row) % rows_per_shot],
         signal=draws.signal[order],
         lost=draws.lost.reshape(-1, rows_per_shot),
-        window=np.sort(height_per_time[:, None] * np.array([start, end]), axis=1),
+        window=np.sort(height_at_zero[:, None] + height_per_time[:, None] * np.array([start, end]), axis=1),
         pulses=pulses,
     )
 
@@ -413,12 +413,20 @@ def _per_wavelength(field: str, x: Array, wavelength: np.ndarray) -> np.ndarray:
     return np.broadcast_to(np.asarray(x, float), wavelength.shape)
 
 
-def _height_per_time(wave: Any, time: np.ndarray) -> np.ndarray:
-    """Compute dz/dt of light that was scattered once, (shots,) in m/ns.
+def _height_of_time(wave: Any, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Compute dz/dt, m/ns, and the height at time zero, m, of light that was scattered once, each (shots,).
 
-    `Waveforms` have the direction of each shot; of a `Waveform`, the latest height and time give it.
+    `Waveforms` have the direction of each shot; of a `Waveform`, the farthest height and time give it. Light
+    of time zero comes from the reference plane, or from the sensor of a lidar that is placed by it.
     """
     if hasattr(wave, "zenith"):
-        return -0.5 * SPEED_OF_LIGHT * np.cos(np.deg2rad(np.asarray(wave.zenith, float)))
-    farthest = np.argmax(np.abs(time))
-    return np.asarray(wave.height, float)[farthest : farthest + 1] / time[farthest]
+        slope = -0.5 * SPEED_OF_LIGHT * np.cos(np.deg2rad(np.asarray(wave.zenith, float)))
+        position = np.asarray(wave.position, float)
+        return slope, position[:, 2] if position.shape[1] == 3 else np.zeros_like(slope)
+    heights, farthest = np.asarray(wave.height, float), int(np.argmax(np.abs(time)))
+    from_sensor = "altitude" in wave.info and wave.info["altitude"] is None
+    # The middle of the time axis differs from its farthest end, whichever that is.
+    origin = time.size // 2 if from_sensor else None
+    start_time, start_height = (0.0, 0.0) if origin is None else (time[origin], heights[origin])
+    slope = (heights[farthest] - start_height) / (time[farthest] - start_time)
+    return np.array([slope]), np.array([start_height - slope * start_time])

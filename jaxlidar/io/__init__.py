@@ -29,6 +29,7 @@ from jaxlidar.io.pulsewaves import read_pulsewaves
 from jaxlidar.io.qsm import TreeRead, read_qsm
 from jaxlidar.io.rasters import write_raster
 from jaxlidar.io.tables import Column, ColumnAxis, ShotTable
+from jaxlidar.io.trajectory import read_trajectory
 from jaxlidar.io.vox import VoxelsRead, read_vox
 from jaxlidar.plants.point_cloud import PointCloud
 
@@ -71,6 +72,7 @@ __all__ = [
     "read_obj",
     "read_pulsewaves",
     "read_qsm",
+    "read_trajectory",
     "read_vox",
     "save",
     "stack_shots",

@@ -321,6 +321,11 @@ def _spans(waveforms: Any, survey: Survey, margin: int) -> tuple[np.ndarray, np.
 
     **Raises:** as `write_gedi_l1b`.
     """
+    if survey.altitude is None or np.ptp(survey.altitude) > 0:
+        placed = "by their sensors" if survey.altitude is None else "at several altitudes"
+        raise ValueError(
+            f"survey: its shots are placed {placed}; admissible is one altitude, as an orbit has"
+        )
     position = getattr(waveforms, "position", None)
     if position is None:
         check_kind("waveforms", waveforms, Sequence, "the Waveforms of simulate_many, or a list of Waveform")
@@ -332,15 +337,22 @@ def _spans(waveforms: Any, survey: Survey, margin: int) -> tuple[np.ndarray, np.
         raise ValueError("the waveforms have another position than the shots of the survey; give their own")
     if position is not None:
         spans = [_span(waveforms, "waveforms", margin)] * len(survey)
-        _check_lidar(waveforms, "waveforms", survey.lidar)
+        _check_lidar(waveforms, "waveforms", _lidar_of(survey))
         _check_directions(waveforms, survey)
     else:
         spans = [_span(wave, f"waveforms {i}", margin) for i, wave in enumerate(waveforms)]
         for i, wave in enumerate(waveforms):
-            _check_lidar(wave, f"waveforms {i}", survey.lidar)
+            _check_lidar(wave, f"waveforms {i}", _lidar_of(survey))
             _check_zenith(wave, f"waveforms {i}", float(survey.zenith[i]))
     first_times, bins = zip(*spans)
     return np.array(first_times), np.array(bins)
+
+
+def _lidar_of(survey: Survey) -> Lidar:
+    """Return the lidar of the first shot, at the altitude that all shots share."""
+    lidar = survey[0]
+    assert isinstance(lidar, Lidar)
+    return lidar
 
 
 def _check_lidar(waves: Any, name: str, lidar: Lidar) -> None:
@@ -349,7 +361,7 @@ def _check_lidar(waves: Any, name: str, lidar: Lidar) -> None:
     Waveforms made by `waveform_of`, and those in files of earlier versions, do not have their altitude.
     """
     altitude = waves.info.get("altitude")
-    pairs = {"wavelength": (waves.wavelength, lidar.wavelength, "nm")}
+    pairs: dict[str, Any] = {"wavelength": (waves.wavelength, lidar.wavelength, "nm")}
     if altitude is not None:
         pairs["altitude"] = (altitude, lidar.altitude, "m")
     for quantity, (of_waves, of_survey, unit) in pairs.items():
@@ -410,7 +422,7 @@ def _span(waves: Any, name: str, margin: int) -> tuple[float, int]:
 
 def _energy_per_reflectance(survey: Survey) -> np.ndarray:
     """Return the energy, J, of a sample per apparent reflectance of it, at the reference plane, (shots,)."""
-    upright = dataclasses.replace(survey.lidar, zenith=0.0)
+    upright = dataclasses.replace(_lidar_of(survey), zenith=0.0)
     return float(energy_at_reference(upright)[0]) * np.cos(np.deg2rad(survey.zenith)) ** 2
 
 
@@ -532,7 +544,8 @@ def _geolocation(
     of the reference plane. `projection`: of the survey's positions.
     """
     zenith, azimuth = np.deg2rad(survey.zenith), np.deg2rad(survey.azimuth)
-    altitude = concrete_number(survey.lidar.altitude)
+    assert survey.altitude is not None
+    altitude = float(survey.altitude[0])
     last_time = first_time + bins - 1
     # Heights above the reference plane, as those of `Waveform.height`.
     height_per_ns = -0.5 * SPEED_OF_LIGHT * np.cos(zenith)

@@ -13,11 +13,14 @@ import equinox as eqx
 from jaxlidar._deprecated import RENAMED, warn_renamed
 from jaxlidar._registry import public_objects
 from jaxlidar.instrument.catalogue import instrument
+from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.instrument.pulse import SampledPulse
 from jaxlidar.instrument.receiver import Receiver
 from jaxlidar.instrument.survey import Survey
+from jaxlidar.instrument.trajectory import Trajectory
 from jaxlidar.io.dem import DemRead, read_dem
 from jaxlidar.io.obj import MeshRead, read_obj
+from jaxlidar.io.trajectory import read_trajectory
 from jaxlidar.io.vox import VoxelsRead, read_vox
 from jaxlidar.optics.coefficients import Coefficients, load_coefficients
 from jaxlidar.optics.leaf_angles import LeafAngles
@@ -40,7 +43,7 @@ _FUNCTIONS: tuple[Callable[..., Any], ...] = (
     *(Branching, Habit, broadleaf, conifer, shrub, spreading_tree, grow, forest),
     *(voxelise, voxelise_mesh, trim_empty_layers),
     *(VoxelMap.from_lad, VoxelMap.from_extinction, VoxelMap.from_probability),
-    *(Survey.grid, Survey.track, Survey.scan, instrument),
+    *(Survey.grid, Survey.track, Survey.scan, Survey.fly, read_trajectory, instrument),
     *(LeafAngles.named, LeafAngles.beta, Prospect.paper),
     *(spectrum, read_spectrum_csv, read_vox, read_dem, read_obj, load_coefficients, Coefficients),
 )
@@ -49,7 +52,13 @@ _DEFAULT_CLASSES = {AbstractGround: Ground, AbstractSheet: Plate}
 # The class of such a table where several are admissible.
 _PREFERRED_CLASSES = {Receiver}
 # Fields of arguments that are not stored under their own name.
-_FIELD_NAMES = {(SampledPulse, "power"): "samples"}
+_FIELD_NAMES = {
+    (SampledPulse, "power"): "samples",
+    (Survey, "position"): "aim_position",
+    (Survey, "sensor"): "sensor_position",
+}
+# Another way to give what a further argument holds, which is the one that is written.
+ALTERNATIVE_ARGUMENTS = {(Lidar, "sensor")}
 
 DEGREES = "degrees"
 COMPASS = "degrees clockwise from north"
@@ -101,15 +110,20 @@ UNITS = {
     "mean": DEGREES,
     "std": DEGREES,
     "max_step": "m",
+    "lever_arm": "m",
     "minimum_distance": "m",
+    "mounting": DEGREES,
     "origin": "m",
     "position": "m",
+    "pitch": DEGREES,
     "pulse_rate": "1/s",
     "rayleigh_scale_height": "m",
+    "roll": DEGREES,
     "roughness": "rad",
     "sampling_interval": "ns",
-    "saturation": "J per sample",
     "scan_angle": DEGREES,
+    "saturation": "J per sample",
+    "sensor": "m",
     "shoot_angle": DEGREES,
     "shoot_length": "m",
     "slope": DEGREES,
@@ -125,6 +139,7 @@ UNITS = {
     "voxel_size": "m",
     "wavelength": "nm",
     "window": "ns",
+    "yaw": COMPASS,
     "zenith": DEGREES,
 }
 # Where the same name has a unit in one class alone.
@@ -133,6 +148,8 @@ UNITS_OF = {
     (read_dem, "fill"): "m",
     (Survey.grid, "low"): "m",
     (Survey.grid, "high"): "m",
+    (Survey, "time"): "s",
+    (Trajectory, "time"): "s",
     (VoxelMap, "leaf"): "1/m",
     (VoxelMap, "bark"): "1/m",
 }

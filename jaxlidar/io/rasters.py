@@ -8,13 +8,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import ArrayLike
 
-from jaxlidar._checks import as_numpy, check_kind, check_range, check_shape
+from jaxlidar._checks import as_numpy, check_kind, check_number, check_range, check_shape
 from jaxlidar._files import atomic_write
 from jaxlidar.io.coordinates import import_rasterio, metric_system
 
 _TIFF = (".tif", ".tiff")
 # Shots lie on a grid if they are off by less than this fraction of its spacing.
 _GRID_TOLERANCE = 1e-3
+# Cells of a raster at most: 8 GB of each band.
+_MAX_CELLS = 1e9
 
 
 def write_raster(
@@ -23,27 +25,33 @@ def write_raster(
     position: ArrayLike | Sequence,
     *,
     crs: str | None = None,
+    spacing: float | None = None,
 ) -> None:
-    """Write maps, such as heights, cover or ground retrieved for the shots of a grid, as a GeoTIFF.
+    """Write maps, such as heights, cover or ground retrieved for the shots of a survey, as a GeoTIFF.
 
-    Every shot is the centre of a cell. Cells without a shot, and those whose number is NaN, have no data:
-    they are NaN, which the file declares as its value of no data. Bands are of float64, so numbers keep their
-    bits.
+    Shots of a grid are the centres of cells. Shots anywhere, such as the ground positions of a scanner, are
+    averaged in cells of the size `spacing`, whose edges lie at multiples of it. Cells without a shot, and
+    those whose number is NaN, have no data: they are NaN, which the file declares as its value of no data.
+    Bands are of float64, so numbers keep their bits.
 
     **Arguments:**
 
     - `path`: the file to write, .tif or .tiff.
     - `values`: (shots,) numbers by name, NaN or masked where there is none; each becomes a band of that name.
-    - `position`: (shots, 2) x and y of the shots in m, on a grid along x and y, such as
-      `Survey.grid(...).position`, in any order.
+    - `position`: (shots, 2) x and y of the shots in m, or (shots, 3), of which z is not used, such as
+      `Waveforms.ground_position`, in any order. Without `spacing` they lie on a grid along x and y, as those
+      of `Survey.grid` do.
     - `crs`: the coordinate reference system of `position`, in metres, such as "EPSG:32633". Default None: not
       known.
+    - `spacing`: edge of the cells in m, positive. Shots whose position is NaN, as that of a beam that meets
+      no ground, are left out, and so is each band's NaN. Default None: one shot for each cell of a grid.
 
     **Returns:** nothing.
 
     **Raises:** ImportError where `rasterio` is not installed, which the extra `io` installs. ValueError for
-    values of another number, infinite ones, shots that are not on a grid or twice in one cell, a `crs` that
-    is not known or not in metres, and another kind of file. OSError for a path that cannot be written.
+    values of another number, infinite ones, shots that are not on a grid or twice in one cell (without
+    `spacing`), no shot with a position, a `crs` that is not known or not in metres, and another kind of file.
+    OSError for a path that cannot be written.
 
     **Source:** OGC GeoTIFF 1.1.
 
@@ -65,16 +73,20 @@ def write_raster(
     check_kind("values", values, Mapping, "a mapping of names to (shots,) numbers")
     if not values:
         raise ValueError("values is empty; admissible is one map or more")
-    cells, origin, spacing, shape = _grid(position)
+    if spacing is not None:
+        check_number("spacing", spacing, 0.0, low_open=True)
+    has_place, cells, origin, cell_size, shape = (
+        _grid(position) if spacing is None else _cells(position, spacing)
+    )
     bands = np.full((len(values), *shape), np.nan)
     for band, (name, shot_values) in zip(bands, values.items()):
         numbers = as_numpy(shot_values, f"values of {name!r}", missing=True)
-        check_shape(f"values of {name!r}", numbers, (len(cells),))
+        check_shape(f"values of {name!r}", numbers, (len(has_place),))
         check_range(f"values of {name!r}", np.where(np.isnan(numbers), 0.0, numbers))
         # Rows run from north to south.
-        band[shape[0] - 1 - cells[:, 1], cells[:, 0]] = numbers
-    west, north = origin[0] - 0.5 * spacing[0], origin[1] + (shape[0] - 0.5) * spacing[1]
-    transform = rasterio.Affine(spacing[0], 0.0, west, 0.0, -spacing[1], north)
+        band[:] = _cell_means(numbers[has_place], cells, shape)[::-1]
+    west, north = origin[0] - 0.5 * cell_size[0], origin[1] + (shape[0] - 0.5) * cell_size[1]
+    transform = rasterio.Affine(cell_size[0], 0.0, west, 0.0, -cell_size[1], north)
     profile: dict[str, Any] = {"driver": "GTiff", "count": len(bands), "dtype": "float64", "nodata": np.nan}
     profile["crs"] = None if crs is None else metric_system("crs", crs).crs
     profile |= {"height": shape[0], "width": shape[1], "transform": transform}
@@ -84,15 +96,56 @@ def write_raster(
             file.set_band_description(number, name)
 
 
-def _grid(position: ArrayLike | Sequence) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[int, int]]:
-    """Return the grid of shots: column and row of each, south-west position, spacing, and (rows, columns).
+# True for shots that have a place, the column and the row of each of these, the centre of the south-west
+# cell, the size of cells, and (rows, columns).
+_Grid = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, tuple[int, int]]
+
+
+def _cell_means(numbers: np.ndarray, cells: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """Return the mean of the numbers in each cell, from south to north; NaN where there is none."""
+    is_known = ~np.isnan(numbers)
+    index = (cells[:, 1] * shape[1] + cells[:, 0])[is_known]
+    count, total = (np.bincount(index, w, shape[0] * shape[1]) for w in (None, numbers[is_known]))
+    # One number divided by one keeps its bits.
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan).reshape(shape)
+
+
+def _horizontal(position: ArrayLike | Sequence, *, missing: bool) -> np.ndarray:
+    """Return x and y of shots; with `missing`, NaN for those without a place."""
+    xy = as_numpy(position, "position", missing=missing)
+    if xy.ndim != 2 or xy.shape[1] not in (2, 3) or len(xy) == 0:
+        raise ValueError(f"position has the shape {xy.shape}; admissible is (shots, 2), one or more")
+    xy = xy[:, :2]
+    check_range("position", np.where(np.isnan(xy), 0.0, xy) if missing else xy)
+    return xy
+
+
+def _cells(position: ArrayLike | Sequence, spacing: float) -> _Grid:
+    """Return the cells of the size `spacing` in which shots lie.
 
     **Raises:** as `write_raster`.
     """
-    xy = as_numpy(position, "position")
-    if xy.ndim != 2 or xy.shape[1] != 2 or len(xy) == 0:
-        raise ValueError(f"position has the shape {xy.shape}; admissible is (shots, 2), one or more")
-    check_range("position", xy)
+    xy = _horizontal(position, missing=True)
+    has_place = np.asarray(~np.isnan(xy).any(axis=1))
+    if not has_place.any():
+        raise ValueError("position is NaN for all shots; admissible is one or more with a position")
+    numbers = np.floor(xy[has_place] / spacing)
+    low, high = numbers.min(axis=0), numbers.max(axis=0)
+    columns, rows = (high - low + 1).tolist()
+    if columns * rows > _MAX_CELLS:
+        raise ValueError(
+            f"spacing = {spacing:g} m makes {columns * rows:.3g} cells; admissible are {_MAX_CELLS:g}"
+        )
+    cells = (numbers - low).astype(int)
+    return has_place, cells, spacing * (low + 0.5), np.full(2, float(spacing)), (int(rows), int(columns))
+
+
+def _grid(position: ArrayLike | Sequence) -> _Grid:
+    """Return the grid of shots.
+
+    **Raises:** as `write_raster`.
+    """
+    xy = _horizontal(position, missing=False)
     low = xy.min(axis=0)
     spacing = np.array([_grid_spacing(xy[:, axis]) for axis in range(2)])
     # A single row or column has the spacing of the other axis.
@@ -114,7 +167,7 @@ def _grid(position: ArrayLike | Sequence) -> tuple[np.ndarray, np.ndarray, np.nd
         raise ValueError(
             f"position: shot {duplicate} lies where another one does; admissible is one for each cell"
         )
-    return cells, low, spacing, (rows, columns)
+    return np.ones(len(xy), bool), cells, low, spacing, (rows, columns)
 
 
 def _grid_spacing(x: np.ndarray) -> float:

@@ -17,6 +17,7 @@ import numpy as np
 
 from jaxlidar._checks import is_traced, kind_of
 from jaxlidar.io.kinds import (
+    ALTERNATIVE_ARGUMENTS,
     Argument,
     admits_mapping,
     admits_numbers_alone,
@@ -83,6 +84,7 @@ def table_of(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
     entries = {
         key: table_of(getattr(value, argument.field), f"{path}.{key}", arrays)
         for key, argument in arguments_of(type(value)).items()
+        if (type(value), key) not in ALTERNATIVE_ARGUMENTS
     }
     defaults = {key: p.default for key, p in inspect.signature(type(value)).parameters.items()}
     # None is left out where it is the default.

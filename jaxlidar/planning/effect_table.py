@@ -58,8 +58,9 @@ def effect_table(
     has, planned = present_effects(lidar, scene), present_effects(*without_effects(lidar, scene, off))
     reasons = dict.fromkeys(EFFECT_NAMES, "in the scene") | {"multiple scattering": order_choice.reason}
     reasons |= _sized_reasons(lidar, scene)
-    # Bounds need values, which are unknown while they are being traced, and hold for planes only.
+    # Bounds need values, which are unknown while they are being traced, and hold for planes below a sensor.
     bounded = not any(is_traced(x) for x in jax.tree.leaves((lidar, scene))) and surfaces_are_planes(scene)
+    bounded = bounded and not lidar.has_sensor_position
 
     # Most rows have the same effects switched off, and share one set of bounds.
     @functools.cache

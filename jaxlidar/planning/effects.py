@@ -257,12 +257,12 @@ def _level_ground(ground: Ground, lidar: Lidar) -> Ground:
     the slope the delay of the axis is then unchanged, and the waveforms differ by the spread alone.
     """
     normal, axis = ground.shape.upward, lidar.direction
-    # The aim point lies in the reference plane, z = 0.
-    normal_distance = normal[2] * ground.height - jnp.sum(normal[:2] * lidar.position)
+    aim = lidar.aim_point
+    normal_distance = normal[2] * ground.height - jnp.sum(normal * aim)
     normal_cosine = jnp.sum(normal * axis)
     # A beam that runs along the slope, or comes from beneath, does not meet it: the height stays. The divisor
     # is replaced there so that derivatives stay finite.
     meets = normal_cosine < -1e-6
-    axis_height = normal_distance / jnp.where(meets, normal_cosine, -1.0) * axis[2]
+    axis_height = aim[2] + normal_distance / jnp.where(meets, normal_cosine, -1.0) * axis[2]
     height = jnp.where(meets, axis_height, ground.height)
     return dataclasses.replace(ground, height=height, slope=jnp.zeros_like(ground.slope))

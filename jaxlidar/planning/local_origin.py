@@ -17,20 +17,22 @@ from jaxlidar.scenes.scene import Scene
 
 
 def move_aim_to_origin(lidar: Lidar, scene: Scene) -> tuple[Lidar, Scene]:
-    """Return the same lidar and scene, moved so that the lidar aims at x = y = 0.
+    """Return the same lidar and scene, moved so that the lidar aims at x = y = 0, or its sensor is there.
 
     Differences are taken in double precision, and what is returned has JAX's default precision. Where the
     position of the lidar is traced by a JAX transformation, or a surface cannot be moved, nothing is moved.
     """
-    aim = concrete(lidar.position)
-    if aim is None:
+    position = concrete(lidar.position)
+    if position is None:
         return lidar, scene
+    # Of a sensor the height stays.
+    aim, height = position[:2], position[2:]
     # `moved` returns None for surfaces that cannot be moved.
     surfaces = (*(() if scene.ground is None else (scene.ground,)), *scene.plates, *scene.meshes)
     moved = [surface.moved(-aim) for surface in surfaces]
     stays = not aim.any() or any(surface is None for surface in moved)
     new_aim = aim if stays else np.zeros(2)
-    lidar = eqx.tree_at(lambda a: a.position, lidar, jnp.asarray(new_aim, float))
+    lidar = eqx.tree_at(lambda a: a.position, lidar, jnp.asarray(np.append(new_aim, height), float))
     surfaces = surfaces if stays else tuple(moved)
     # `surfaces` has the ground first, if there is one, then the plates and the meshes.
     n_grounds = len(surfaces) - len(scene.plates) - len(scene.meshes)

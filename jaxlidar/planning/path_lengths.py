@@ -13,16 +13,22 @@ from jaxtyping import Float
 
 from jaxlidar._checks import concrete_array, concrete_number, is_traced
 from jaxlidar._vectors import FAR
-from jaxlidar.instrument.lidar import Lidar
+from jaxlidar.instrument.lidar import AIM_DISTANCE, Lidar
 from jaxlidar.instrument.survey import Survey
 from jaxlidar.planning.config import KERNEL_BINS
 from jaxlidar.planning.size_buckets import size_bucket
 from jaxlidar.scenes.height_field import HeightField
 from jaxlidar.scenes.mesh_surface import MeshMaterial, MeshSurface
 from jaxlidar.scenes.scene import Scene
-from jaxlidar.scenes.surfaces import AbstractSheet
+from jaxlidar.scenes.shapes import Plane
+from jaxlidar.scenes.surfaces import AbstractSheet, AbstractSurface
 from jaxlidar.scenes.terrain import Terrain
 
+# Least distance, m, of a sensor from a surface, and least angle, degrees, of its beam from the level within a
+# canopy that has no sides.
+LEAST_CLEARANCE, LEAST_ELEVATION = 1e-3, 1.0
+# Beams at a smaller angle, degrees, to a plane meet it beyond the record, which they would make endless.
+LEAST_GRAZING_ANGLE = 0.5
 # A flight crosses at most so many voxels, because a batch waits for its longest flight.
 MAX_VOXELS = 16_384
 # Fine bins of a ray segment at most: all deposits are spread over as many bins as the longest needs.
@@ -70,7 +76,7 @@ def footprint_rims(survey: Survey, n_radii: float) -> FootprintRims:
     points = np.pad(radius[:, None, None] * circle, ((0, 0), (1, 0), (0, 0)))
     rays = (axis * slant_range[:, None])[:, None] + points
     distance = np.linalg.norm(rays, axis=2)
-    aim = np.broadcast_to(np.pad(survey.position, ((0, 0), (0, 1)))[:, None], points.shape)
+    aim = np.broadcast_to(survey.aim_point[:, None], points.shape)
     slant_range = np.broadcast_to(slant_range[:, None], distance.shape)
     return FootprintRims(aim, points, rays / distance[..., None], distance, slant_range)
 
@@ -89,13 +95,23 @@ class PathLengths:
     - `start_distance`: distance before the reference plane, m, at which all rays start.
     - `vertical`: True if all beams are at nadir.
 
-    **Raises:** ValueError where the scene reaches up to the sensor.
+    For shots that are placed by their sensors, paths count from these, and rays start there.
+
+    **Raises:** ValueError where the scene reaches up to the sensor; and for a sensor below the ground or in a
+    plate, and a level beam within a canopy that has no sides.
     """
 
     def __init__(self, lidar: Lidar, scene: Scene, survey: Survey | None = None):
         self.scene = scene
         shots = Survey.of(lidar) if survey is None else survey
-        self.vertical = not np.any(shots.zenith)
+        self.from_sensor = shots.has_sensor_position
+        self.vertical = not np.any(shots.zenith) and not self.from_sensor
+        if scene.canopy is not None:
+            v = scene.canopy.voxels
+            self.size, self.shape = concrete_array(v.voxel_size), np.array(v.shape)
+        if self.from_sensor:
+            self._from_sensors(shots)
+            return
         # Lines of all shots alike.
         aim, points, self.rays, distance, slant_range = (
             array.reshape(-1, *array.shape[2:]) for array in footprint_rims(shots, _PATH_RADII)
@@ -112,9 +128,7 @@ class PathLengths:
         for mesh in scene.meshes:
             crossings.append(_mesh_crossings(mesh, points + aim, self.rays, radius, float(slant_range.min())))
         if scene.canopy is not None:
-            v = scene.canopy.voxels
-            self.size, self.shape = concrete_array(v.voxel_size), np.array(v.shape)
-            low = concrete_array(v.origin)[2]
+            low = concrete_array(scene.canopy.voxels.origin)[2]
             for z in (low, low + self.size[2] * self.shape[2]):
                 crossings.append((z - points[:, 2]) / self.rays[:, 2])
         distances = np.concatenate(crossings) if crossings else np.zeros(0)
@@ -138,6 +152,60 @@ class PathLengths:
                 f"admissible is more than {lowest_altitude:g} m"
             )
 
+    def _from_sensors(self, shots: Survey) -> None:
+        """Set the path lengths of shots that are placed by their sensors.
+
+        1. Refuse sensors within surfaces or below the ground, and endless rays.
+        2. Distances from the sensor at which the lines meet planes, and the boxes of map and terrain.
+        3. Their extremes, with the width of the beam to spare: between the lines it may reach the edge of a
+           box a little earlier or later.
+        """
+        scene = self.scene
+        check_sensors(shots, scene)
+        aim, points, self.rays, distance, _ = (
+            array.reshape(-1, *array.shape[2:]) for array in footprint_rims(shots, _PATH_RADII)
+        )
+        sensor = aim + points - distance[:, None] * self.rays
+        intervals = []
+        radius = _PATH_RADII * float(shots.footprint_radius.max())
+        for mesh in scene.meshes:
+            intervals.append(_mesh_crossings(mesh, sensor, self.rays, radius, AIM_DISTANCE, ahead=True))
+        for s in (surface for surface in scene.surfaces if not isinstance(surface, MeshMaterial)):
+            if isinstance(s, Terrain) and s.relief:
+                low, high = _box_of_terrain(s)
+                enter, leave = _distances_to_box(sensor, self.rays, low, high)
+                met = leave > enter
+            else:
+                crossed, towards = s.shape.crossing(points + aim, self.rays)
+                least = math.sin(math.radians(LEAST_GRAZING_ANGLE))
+                met = np.abs(towards) > least if isinstance(s, AbstractSheet) else towards < -least
+                enter = leave = crossed + distance
+            met = met & (leave > 0)
+            intervals += [enter[met], leave[met]]
+        if scene.canopy is not None:
+            v, sides = scene.canopy.voxels, scene.canopy.sides
+            low, high = concrete_array(v.origin), concrete_array(v.top)
+            if sides == "periodic":
+                low, high = (
+                    np.append(np.full(2, sign * np.inf), z) for sign, z in ((-1, low[2]), (1, high[2]))
+                )
+            enter, leave = _distances_to_box(sensor, self.rays, low, high)
+            met = leave > enter
+            intervals += [enter[met], leave[met]]
+        distances = np.concatenate(intervals) if intervals else np.zeros(0)
+        if distances.size == 0:
+            distances = np.full(1, AIM_DISTANCE)
+        spread = 2.0 * _PATH_RADII * float(shots.footprint_radius.max()) / AIM_DISTANCE
+        nearest = max(float(distances.min()), 0.0) * max(1.0 - spread, 0.0)
+        farthest = float(distances.max()) * (1.0 + spread)
+        self.first_path, self.last_path = 2.0 * nearest, 2.0 * farthest
+        self.start_distance = AIM_DISTANCE
+
+    @property
+    def _least_cosine(self) -> float:
+        """Least cosine of any ray to the vertical; not zero, as level rays have."""
+        return max(float(np.abs(self.rays[:, 2]).min()), 1e-9)
+
     @property
     def longest_chord(self) -> float:
         """Longest chord, m, of a footprint ray within one voxel."""
@@ -145,7 +213,7 @@ class PathLengths:
             return 1e-3
         # A chord ends at the voxel's diagonal, or where the most inclined ray leaves the layer. The relative
         # slack covers the rounding of single precision.
-        least_cosine = float(np.abs(self.rays[:, 2]).min())
+        least_cosine = self._least_cosine
         return float(min(np.linalg.norm(self.size), self.size[2] / least_cosine)) * (1 + 1e-5)
 
     def max_ray_segments(self, max_segment: float) -> int:
@@ -156,13 +224,16 @@ class PathLengths:
         """
         if self.scene.canopy is None:
             return 0
-        least_cosine = np.abs(self.rays[:, 2]).min()
+        least_cosine = self._least_cosine
         height = self.size[2] * self.shape[2]
         columns = np.ceil(np.abs(self.rays[:, :2]).max(0) / least_cosine * height / self.size[:2]) + 1
         if self.scene.canopy.sides == "open":
             # Rays that leave an open map do not come back.
             columns = np.minimum(columns, self.shape[:2])
-        divided = 0 if max_segment >= self.longest_chord else math.ceil(height / least_cosine / max_segment)
+        longest = height / least_cosine
+        if self.scene.canopy.sides == "open":
+            longest = min(longest, float(np.linalg.norm(self.size * self.shape)))
+        divided = 0 if max_segment >= self.longest_chord else math.ceil(longest / max_segment)
         return int(self.shape[2] + columns.sum() + divided + len(self.scene.surfaces) + 2)
 
     def longest_flight(self, path: float) -> float:
@@ -175,6 +246,9 @@ class PathLengths:
         """
         if self.scene.canopy is None or self.scene.canopy.sides == "open":
             return FAR
+        if self.from_sensor:
+            # No flight is longer than the path that it is part of.
+            return float(min(path, self.longest_affordable_flight))
         # Let theta be the beam's zenith angle. A flight of s m within the canopy, up by at most its height,
         # comes closer to the sensor by at most s sin(theta) + height cos(theta). So it lengthens the path by
         # at least s (1 - sin(theta)) - height cos(theta).
@@ -201,26 +275,122 @@ class PathLengths:
         return int(self.shape[2] + sum(math.ceil(flight / s) for s in self.size[:2])) + 3
 
 
+def _box_of_terrain(terrain: Terrain) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lowest and the highest corner, m, of the box that holds a terrain; endless if it repeats."""
+    heights = concrete_array(terrain.heights)
+    low, high = (np.append(a, z) for a, z in zip(_extent(terrain), (heights.min(), heights.max())))
+    # Rounding of single precision, in which rays meet the terrain.
+    slack = np.array([0.0, 0.0, 1e-3 + _ROUNDING * float(np.abs(heights).max())])
+    return low - slack, high + slack
+
+
+def _extent(terrain: Terrain) -> tuple[np.ndarray, np.ndarray]:
+    if terrain.sides == "periodic":
+        return np.full(2, -np.inf), np.full(2, np.inf)
+    return concrete_array(terrain.origin), np.asarray(terrain.end, float)
+
+
+def _distances_to_box(
+    start: Float[np.ndarray, "rays 3"], rays: Float[np.ndarray, "rays 3"], low: np.ndarray, high: np.ndarray
+) -> tuple[Float[np.ndarray, "rays"], Float[np.ndarray, "rays"]]:
+    """Return where rays enter a box, m, zero from within, and leave it; one number where they miss it."""
+    # A ray along a face never crosses it: so far away that it does not count.
+    rate = np.where(np.abs(rays) < 1e-12, 1e-12, rays)
+    a, b = (low - start) / rate, (high - start) / rate
+    enter = np.maximum(np.minimum(a, b).max(axis=1), 0.0)
+    leave = np.maximum(np.maximum(a, b).min(axis=1), enter)
+    return enter, leave
+
+
+def check_sensors(shots: Survey, scene: Scene) -> None:
+    """Refuse sensors below the ground or in a plate, and level beams within a canopy that has no sides.
+
+    **Raises:** ValueError with the shot and the numbers.
+    """
+    sensor, which = shots.sensor, "" if len(shots) == 1 else f" of shot {{}} of {len(shots)}"
+    for surface in scene.surfaces:
+        if isinstance(surface, MeshMaterial):
+            # Meshes need not be closed: none of their sides is the inside.
+            continue
+        height = _height_above(surface, sensor)
+        if height is None:
+            continue
+        is_sheet = isinstance(surface, AbstractSheet)
+        bad = np.abs(height) < LEAST_CLEARANCE if is_sheet else height < LEAST_CLEARANCE
+        if bad.any():
+            i = int(np.argmax(bad))
+            where = "in a plate" if is_sheet else "below the ground"
+            raise ValueError(
+                f"sensor{which.format(i)} = {[round(float(x), 3) for x in sensor[i]]} is {where}, "
+                f"{float(height[i]):.3g} m above it; admissible is more than {LEAST_CLEARANCE:g} m"
+            )
+    canopy = scene.canopy
+    if canopy is None or canopy.sides != "periodic":
+        return
+    off_level = np.abs(shots.zenith - 90.0)
+    if np.any(off_level < LEAST_ELEVATION):
+        i = int(np.argmin(off_level))
+        raise ValueError(
+            f"zenith{which.format(i)} = {float(shots.zenith[i]):g} degrees within a canopy with periodic "
+            f"sides, which a level beam never leaves; admissible is {LEAST_ELEVATION:g} degree or more "
+            "from 90, or sides = 'open'"
+        )
+
+
+def _height_above(surface: AbstractSurface, sensor: Float[np.ndarray, "n 3"]) -> np.ndarray | None:
+    """Return distances, m, of sensors from a surface, positive above it; None where the shape states none.
+
+    In double precision about the first sensor, as map coordinates need.
+    """
+    origin = sensor[0].copy()
+    local = sensor - [origin[0], origin[1], 0.0]
+    if isinstance(surface, Terrain) and surface.relief:
+        ground = np.asarray(surface.height_at(*_clipped(surface, sensor).T), float)
+        return sensor[:, 2] - ground
+    moved = surface.moved(-origin[:2])
+    shape = (surface if moved is None else moved).shape
+    if not isinstance(shape, Plane):
+        return None
+    local = sensor if moved is None else local
+    normal, foot = concrete_array(shape.upward), concrete_array(shape.foot)
+    return (local - foot) @ normal
+
+
+def _clipped(terrain: Terrain, sensor: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
+    """Return horizontal positions, those off the terrain moved to its border."""
+    low, high = _extent(terrain)
+    return np.clip(sensor[:, :2], low, high)
+
+
 def _mesh_crossings(
     mesh: MeshSurface,
     points: Float[np.ndarray, "lines 3"],
     rays: Float[np.ndarray, "lines 3"],
     radius: float,
     slant_range: float,
+    *,
+    ahead: bool = False,
 ) -> Float[np.ndarray, " crossings"]:
-    """Return the distances along lines at which these enter and leave the box around a mesh.
+    """Return the distances from points along lines at which these enter and leave the box around a mesh.
 
     A mesh may lie between the lines of a footprint. A ray of it is displaced from the axis by at most its
-    radius, across the axis: the box is enlarged by that much for each line. Empty where no ray meets it.
+    radius, across the axis: the box is enlarged by that much for each line. Empty where no ray meets it. With
+    `ahead`, the points are sensors, at which lines start: what lies behind them is not met.
     """
     boxes = mesh.bounds()
     low, high = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
-    # Beyond the reference plane, beams are wider.
-    widened = radius * (1.0 + float(np.abs([low[2], high[2]]).max()) / slant_range)
+    # Beyond the aim point, beams are wider.
+    if ahead:
+        # No point of the box is farther from a sensor than the farthest corner.
+        beyond = float(np.linalg.norm(np.maximum(np.abs(low - points), np.abs(high - points)), axis=1).max())
+    else:
+        beyond = float(np.abs([low[2], high[2]]).max())
+    widened = radius * (1.0 + beyond / slant_range)
     margin = widened * np.sqrt(np.maximum(1.0 - rays * rays, 0.0))
     rates = np.where(np.abs(rays) < 1e-12, 1e-12, rays)
     faces = np.stack([(low - margin - points) / rates, (high + margin - points) / rates])
     enter, leave = faces.min(axis=0).max(axis=1), faces.max(axis=0).min(axis=1)
+    enter = np.maximum(enter, 0.0) if ahead else enter
     is_met = enter <= leave
     return np.concatenate([enter[is_met], leave[is_met]])
 
@@ -233,8 +403,13 @@ def meshes_are_in_reach(shots: Lidar | Survey, scene: Scene) -> bool:
     n_radii = _REACH_RADII if survey.lidar.profile == "gaussian" else 1.0
     rims = footprint_rims(survey, n_radii)
     points, rays = (a.reshape(-1, 3) for a in (rims.points + rims.aim, rims.rays))
+    ahead = survey.has_sensor_position
+    if ahead:
+        points = points - rims.distance.reshape(-1, 1) * rays
     radius, slant_range = n_radii * float(survey.footprint_radius.max()), float(rims.slant_range.min())
-    return any(_mesh_crossings(mesh, points, rays, radius, slant_range).size for mesh in scene.meshes)
+    return any(
+        _mesh_crossings(mesh, points, rays, radius, slant_range, ahead=ahead).size for mesh in scene.meshes
+    )
 
 
 def longest_segment(chord: float, bin_length: float, max_step: float | None) -> tuple[float, int]:
@@ -265,6 +440,9 @@ def check_footprints_on_terrain(shots: Lidar | Survey, scene: Scene) -> None:
     if not (isinstance(ground, Terrain) and ground.relief and ground.sides == "open"):
         return
     survey = shots if isinstance(shots, Survey) else Survey.of(shots)
+    # A sensor that may look up or aside sees past the border of the terrain, where nothing is.
+    if survey.has_sensor_position:
+        return
     origin, end, heights = concrete_array(ground.origin), ground.end, concrete_array(ground.heights)
     rims = footprint_rims(survey, _TERRAIN_RADII if survey.lidar.profile == "gaussian" else 1.0)
     # Rays that do not go down meet no ground: a tiny slope puts them far off the terrain.

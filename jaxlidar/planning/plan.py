@@ -80,6 +80,7 @@ DEPOSITS_PER_FLIGHT = 4
 class PlanScope(NamedTuple):
     """The lidars and scenes that a plan was made for; `check_plan` compares others with it.
 
+    - `from_sensor`: True if the lidar is placed by its sensor, and time zero is the emission.
     - `first_return`, `last_return`: times, ns, of the first and the last return of order one.
     - `albedo`: largest reflectance + transmittance of any material and wavelength.
     - `pulse_feature`: scale, ns, of the finest feature of the pulse.
@@ -91,6 +92,7 @@ class PlanScope(NamedTuple):
     - `max_memory`: the user's limit in GB, or None.
     """
 
+    from_sensor: bool
     first_return: float
     last_return: float
     albedo: float
@@ -285,9 +287,10 @@ def plan(
 
     **Raises:** ValueError for inadmissible arguments, for more than 100 orders with histories where leaves or
     plates both reflect and transmit (weights of single precision), for a scene that reaches up to the
-    sensor, for a footprint that lies partly off the terrain, for what would take more memory than
-    `max_memory`, and if the geometry is being traced by a JAX transformation: make the plan outside and pass
-    it in.
+    altitude of the sensor, for a `Lidar(sensor=)` below the ground, in a plate, less than 1 degree from the
+    level within a canopy with periodic sides, or in air with a lidar ratio, for a footprint that lies partly
+    off the terrain, for what would take more memory than `max_memory`, and if the geometry is being traced by
+    a JAX transformation: make the plan outside and pass it in.
 
     **Example:**
 
@@ -314,8 +317,14 @@ def plan(
     check_choice("footprint", footprint, ("random", "fixed"))
     check_kind("histories", histories, bool | None, "True, False or None")
     check_footprints_on_terrain(lidar if survey is None else survey, scene)
+    air = scene.atmosphere
+    if lidar.has_sensor_position and air is not None and air.lidar_ratio is not None:
+        raise ValueError(
+            "lidar_ratio: the return of the air itself is not simulated for a lidar that is placed by its "
+            "sensor; admissible is lidar_ratio = None, or a lidar with an altitude"
+        )
     # From here on x = y = 0 is the aim point, or the middle of the survey (see `local_origin`).
-    survey = None if survey is None else survey.about(concrete_array(lidar.position))
+    survey = None if survey is None else survey.about(concrete_array(lidar.position)[:2])
     lidar, scene = move_aim_to_origin(lidar, scene)
     # 1. Effects: leaf or bark that is zero everywhere, relief of flat terrain, and meshes out of reach are
     # off, then what the user switches off. The table compares with everything else in place.
@@ -479,6 +488,7 @@ def plan(
         rtol=rtol,
         likely_beyond=order_choice.beyond,
         scope=PlanScope(
+            from_sensor=path_lengths.from_sensor,
             first_return=first_return,
             last_return=last_return,
             albedo=largest_albedo(optics),

@@ -108,6 +108,9 @@ def _misfit_materials(plan: Plan, lidar: Lidar, scene: Scene) -> Iterator[str]:
 
 def _misfit_lengths(plan: Plan, lidar: Lidar, scene: Scene) -> Iterator[str]:
     """Yield misfits in the lengths of paths, and in the numbers of loop steps that they need."""
+    if plan.scope.from_sensor != lidar.has_sensor_position:
+        kinds = {True: "a lidar that is placed by its sensor", False: "a lidar with an altitude"}
+        yield f"it is for {kinds[plan.scope.from_sensor]}, and this is {kinds[lidar.has_sensor_position]}"
     lengths, config, limits = PathLengths(lidar, scene), plan.config, plan.limits
     top = -0.5 * lengths.first_path
     if top > limits.start_distance:

@@ -59,7 +59,7 @@ def scene(
     ax = make_axes(ax, (3.5, 4.2))
     across, depth = (0, 1) if along == "y" else (1, 0)
     radius = 0.0 if lidar is None else float(lidar.footprint_radius)
-    centre = np.zeros(2) if lidar is None else np.asarray(lidar.position, dtype=float)
+    centre = np.zeros(2) if lidar is None else np.asarray(lidar.position, dtype=float)[:2]
     low, high, top = centre[across] - 1.3 * radius, centre[across] + 1.3 * radius, 0.0
     middle = centre[depth]
     entries: list[Any] = []
@@ -84,6 +84,8 @@ def scene(
     sides = np.array([low, high])
     profile = _ground_profile(scene.ground, sides, across, middle)
     heights = [top] if scene.canopy is not None or not isinstance(scene.ground, Terrain) else []
+    if lidar is not None and lidar.altitude is None:
+        heights.append(float(lidar.sensor[2]))
     for mesh in scene.meshes:
         outlines = mesh.corners()[:, :, [across, 2]]
         heights += [outlines[..., 1].min(), outlines[..., 1].max()]
@@ -132,6 +134,18 @@ def _draw_voxels(
 
 def _draw_beam(ax: Axes, lidar: Lidar, across: int, bottom: float, top: float) -> list[Any]:
     """Draw the edges of the beam in the plane through its axis, and return their entries for the legend."""
+    name = "beam (1/e²)" if lidar.profile == "gaussian" else "beam"
+    style = {"color": BEAM_COLOUR, "linewidth": 1.0, "linestyle": (0, (4, 2)), "label": name}
+    if lidar.altitude is None:
+        # From the sensor on, as far as the figure may reach: limits cut it off.
+        sensor, direction = (np.asarray(a, dtype=float) for a in (lidar.sensor, lidar.direction))
+        start, towards = sensor[[across, 2]], direction[[across, 2]]
+        length = 2.0 * (abs(top - bottom) + abs(float(sensor[2])) + abs(float(np.ptp(ax.get_xlim()))))
+        slope = 0.5e-3 * float(lidar.divergence)
+        sideways = np.array([towards[1], -towards[0]])
+        ends = [start + length * (towards + side * slope * sideways) for side in (-1, 1)]
+        ax.fill(*np.array([start, *ends]).T, color=BEAM_COLOUR, alpha=0.07, linewidth=0)
+        return [line for end in ends for line in ax.plot(*np.array([start, end]).T, **style)]
     z = np.array([bottom, top])
     zenith, azimuth = np.deg2rad(float(lidar.zenith)), np.deg2rad(float(lidar.azimuth))
     # Change of the horizontal position per metre of height.
@@ -143,8 +157,6 @@ def _draw_beam(ax: Axes, lidar: Lidar, across: int, bottom: float, top: float) -
     stretch = np.sqrt(1.0 + lean**2)
     half_width = float(lidar.footprint_radius) * widening * stretch
     ax.fill_betweenx(z, axis - half_width, axis + half_width, color=BEAM_COLOUR, alpha=0.07, linewidth=0)
-    name = "beam (1/e²)" if lidar.profile == "gaussian" else "beam"
-    style = {"color": BEAM_COLOUR, "linewidth": 1.0, "linestyle": (0, (4, 2)), "label": name}
     return [line for side in (-1, 1) for line in ax.plot(axis + side * half_width, z, **style)]
 
 

@@ -6,12 +6,16 @@ import numpy as np
 from jaxtyping import ArrayLike, Float
 from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection
-from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.colors import LightSource, LinearSegmentedColormap
+from matplotlib.ticker import MaxNLocator
 
 from jaxlidar._checks import as_numpy, check_kind, check_range, check_shape
+from jaxlidar.instrument.scan import MAX_ZENITH
 from jaxlidar.instrument.survey import Survey
 from jaxlidar.plot.style import BEAM_COLOUR, MATERIAL_COLOURS, make_axes
 from jaxlidar.scenes.scene import Scene
+from jaxlidar.scenes.terrain import Terrain
+from jaxlidar.survey.coverage import ground_position
 
 # Footprints smaller than this fraction of the figure are drawn as dots.
 _MIN_FOOTPRINT = 0.006
@@ -25,11 +29,13 @@ def survey(
     values: ArrayLike | None = None,
     label: str = "",
 ) -> Axes:
-    """Draw the shots of a survey from above, over the canopy of a scene.
+    """Draw the shots of a survey from above, over the terrain and the canopy of a scene.
 
-    Every footprint is drawn as it lies on the reference plane, out to 1/e² of the axial irradiance or to the
-    edge of a top-hat; as a dot if it would be too small to see. The canopy is shaded by 1 - exp(-optical
-    depth) straight down.
+    Every footprint is drawn where its beam axis meets the ground of the scene, and as wide as the beam is
+    there, out to 1/e² of the axial irradiance or to the edge of a top-hat; as a dot if it would be too small
+    to see. Without a ground it lies on the reference plane. Shots that are placed by their sensors and meet
+    no ground are drawn as their sensors. Terrain is shaded as if lit from the north-west, the canopy by
+    1 - exp(-optical depth) straight down.
 
     **Arguments:**
 
@@ -57,11 +63,11 @@ def survey(
     check_kind("survey", survey, Survey, "a Survey")
     check_kind("scene", scene, Scene | None, "a Scene or None")
     ax = make_axes(ax, (4.6, 4.6))
-    position, radius = survey.position, survey.footprint_radius
-    # On the reference plane the footprint is an ellipse, longer along the azimuth of the beam.
-    long_radius = radius / np.cos(np.deg2rad(survey.zenith))
+    position, radius, long_radius = _footprints(survey, scene)
     low = (position - long_radius[:, None]).min(axis=0)
     high = (position + long_radius[:, None]).max(axis=0)
+    if scene is not None and isinstance(scene.ground, Terrain):
+        low, high = _draw_relief(ax, scene.ground, low, high)
     canopy = None if scene is None else scene.canopy
     if canopy is not None:
         origin, end = (np.asarray(a, float)[:2] for a in (canopy.voxels.origin, canopy.voxels.top))
@@ -79,6 +85,11 @@ def survey(
     ax.set_xlim(low[0] - margin, high[0] + margin)
     ax.set_ylim(low[1] - margin, high[1] + margin)
     ax.set_aspect("equal")
+    # Map coordinates have seven digits: few ticks, none with an offset or an exponent.
+    for axis in (ax.xaxis, ax.yaxis):
+        axis.set_major_locator(MaxNLocator(nbins=4))
+    ax.ticklabel_format(style="plain", useOffset=False)
+    ax.tick_params(axis="y", labelrotation=90)
     ax.set_xlabel("x, east (m)")
     ax.set_ylabel("y, north (m)")
     colour_values = None if values is None else _checked_values(values, len(survey))
@@ -99,6 +110,47 @@ def survey(
     if colour_values is not None:
         ax.figure.colorbar(footprints, ax=ax, label=label, shrink=0.8)
     return ax
+
+
+def _footprints(
+    survey: Survey, scene: Scene | None
+) -> tuple[Float[np.ndarray, "shots 2"], Float[np.ndarray, " shots"], Float[np.ndarray, " shots"]]:
+    """Return the place, and the radii across and along the beam, of every footprint on the ground.
+
+    A beam that meets the ground at the range r has r / R of the radius that it has at its aim point, at the
+    range R. On level ground the footprint is longer by 1 / cos(zenith) along the azimuth.
+    """
+    aim = survey.sensor if survey.has_sensor_position else survey.aim_point
+    points = np.full_like(aim, np.nan) if scene is None else ground_position(survey, scene)
+    met = np.asarray(np.isfinite(points).all(axis=1))
+    points = np.where(met[:, None], points, aim)
+    distance = np.linalg.norm(points - survey.sensor, axis=1)
+    radius = survey.footprint_radius * distance / survey.slant_range
+    # A level beam that meets no ground is a point, its sensor.
+    cosine = np.maximum(np.abs(np.cos(np.deg2rad(survey.zenith))), np.cos(np.deg2rad(MAX_ZENITH)))
+    return points[:, :2], radius, radius / cosine
+
+
+def _draw_relief(
+    ax: Axes, terrain: Terrain, low: Float[np.ndarray, "2"], high: Float[np.ndarray, "2"]
+) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
+    """Shade a terrain, and return the corners of what is drawn.
+
+    Terrain that repeats has no corners of its own: its first period is drawn.
+    """
+    heights = np.asarray(terrain.heights, float)
+    if min(heights.shape) < 2:
+        return low, high
+    spacing, origin = np.asarray(terrain.spacing, float), np.asarray(terrain.origin, float)
+    light = LightSource(azdeg=315.0, altdeg=45.0)
+    # Rows run from south to north, against those of images.
+    shade = light.hillshade(heights.T[::-1], vert_exag=1.0, dx=spacing[0], dy=spacing[1])
+    # Nodes are the centres of the pixels.
+    corner = origin + spacing * (np.array(heights.shape) - 0.5)
+    extent = (origin[0] - 0.5 * spacing[0], corner[0], origin[1] - 0.5 * spacing[1], corner[1])
+    # Greys from the middle up, so that footprints stay visible.
+    ax.imshow(shade, cmap="gray", vmin=-0.8, vmax=1.0, extent=extent, origin="upper", zorder=0)
+    return np.minimum(low, origin), np.maximum(high, np.asarray(terrain.end, float))
 
 
 def _checked_values(values: Any, shots: int) -> Float[np.ndarray, " shots"]:

@@ -419,10 +419,13 @@ class MeshTree(eqx.Module):
         material = jnp.zeros_like(hit.row) if self.material is None else self.material[hit.row]
         return MeshHit(distance, normal, material)
 
-    def is_met(self, x: Vec, w: Vec, active: Any = None) -> Array:
-        """Return True for rays that meet any triangle."""
+    def is_met(self, x: Vec, w: Vec, active: Any = None, before: Scalar | None = None) -> Array:
+        """Return True for rays that meet any triangle; with `before`, within this distance, m."""
         x = vec(a - b for a, b in zip(x, self.offset))
-        return nearest_triangle(self.tree, x, w, active, any_hit=True).distance < FAR
+        if before is None:
+            return nearest_triangle(self.tree, x, w, active, any_hit=True).distance < FAR
+        # Any triangle may be one beyond the distance: the nearest one decides.
+        return nearest_triangle(self.tree, x, w, active).distance < before
 
     def rounding(self, x: Vec) -> Scalar:
         """Return a bound, m, on the rounding of a point `x` on a triangle."""

@@ -235,6 +235,12 @@ def _atmosphere_in_bins(
 
     The latter is single scattering, from above all of the scene.
     """
+    if lidar.altitude is None:
+        distance = jnp.maximum(_range_at(lidar, time), 0.0)
+        sensor_height = lidar.position[2]
+        return atmosphere.two_way_transmittance_along(
+            lidar.wavelength, distance, sensor_height, lidar.zenith
+        ), None
     # Not quite up to the sensor, where the range is zero.
     heights = jnp.minimum(height_of(lidar, time), 0.999 * lidar.altitude)
     transmittance = atmosphere.two_way_transmittance(lidar.wavelength, heights, lidar.altitude, lidar.zenith)
@@ -253,6 +259,8 @@ _compiled_atmosphere = Program(_atmosphere_in_bins)
 
 def _range_at(lidar: Lidar, time: Float[Array, "bins"]) -> Float[Array, "bins"]:
     """Range (m) from which order one arrives at `time` (ns)."""
+    if lidar.has_sensor_position:
+        return 0.5 * SPEED_OF_LIGHT * time
     return lidar.range_to_reference + 0.5 * SPEED_OF_LIGHT * time
 
 
@@ -274,7 +282,8 @@ def _range_factor(
 
 def height_of(lidar: Lidar, time: Float[Array, "bins"]) -> Float[Array, "bins"]:
     """Height above the reference plane (m) from which order one arrives at `time` (ns)."""
-    return -0.5 * SPEED_OF_LIGHT * time * jnp.cos(jnp.deg2rad(lidar.zenith))
+    height = -0.5 * SPEED_OF_LIGHT * time * jnp.cos(jnp.deg2rad(lidar.zenith))
+    return height + lidar.position[2] if lidar.has_sensor_position else height
 
 
 def apply_optics(

@@ -42,7 +42,8 @@ from jaxlidar.trace.response import Response
 class Waveform(eqx.Module):
     """A simulated waveform: apparent reflectance and received energy by wavelength and sample.
 
-    - `time`: (samples,) ns, centres of the samples. Zero is the two-way travel time of the reference plane.
+    - `time`: (samples,) ns, centres of the samples. Zero is the two-way travel time of the reference plane;
+      of a lidar that is placed by its sensor, the emission.
     - `height`: (samples,) m, the height from which light of order one arrives at that time.
     - `reflectance`: (wavelengths, samples) apparent reflectance per sample, with the transmittance of the
       atmosphere; its sum over samples is that of the target.
@@ -75,7 +76,7 @@ class Waveform(eqx.Module):
     - `info`: dict: "photons", "batches", "seconds" spent, "error" reached, and why the simulation "stopped":
       "nothing is random", "tolerance met", "batches spent" (with `n_photons`, or at the largest number of a
       survey), "time spent", "interrupted", or "orders beyond ... may add ..."; and the "altitude" of the
-      lidar in m.
+      lidar in m, None for one that is placed by its sensor.
     - `truth`: a `Truth`, what the beam meets in the scene; None where it was not asked for.
 
     **Example:**

@@ -21,11 +21,13 @@ _MAX_PULSE_SAMPLES = 1_000_000
 @final
 @briefly
 class Acquisition(eqx.Module):
-    """Times, scan angles and flight lines of shots, and the pulse and radiometry that they share.
+    """Times, scan angles, flight lines and ranges of shots, and the pulse and radiometry that they share.
 
     - `gps_time`: (shots,) s; NaN where the survey has none.
     - `scan_angle`: (shots,) degrees to the right of the track; the zenith angle where the survey has none.
     - `flight_line`: (shots,) number of the flight line; 1 where the survey has none.
+    - `range_at_time_zero`: (shots,) m from the sensor, from which light arrives at time zero: that of the
+      reference plane along the beam, or zero for shots that are placed by their sensors.
     - `pulse`: (lags,) fraction of an echo's energy that a sample records, by the sample's time after the
       echo's time zero, in steps of an eighth of the sampling interval. The middle one is at time zero.
     - `radiometric_constant`: (wavelengths,) J m2: the energy of a return is this times its apparent
@@ -44,6 +46,7 @@ class Acquisition(eqx.Module):
     gps_time: Float[np.ndarray, " shots"]
     scan_angle: Float[np.ndarray, " shots"]
     flight_line: Int[np.ndarray, " shots"]
+    range_at_time_zero: Float[np.ndarray, " shots"]
     pulse: Float[np.ndarray, " lags"]
     radiometric_constant: Float[np.ndarray, " wavelengths"]
 
@@ -56,6 +59,7 @@ keep_as_netcdf(
         "gps_time": ("s", "GPS time: seconds of the week, or adjusted standard GPS time"),
         "scan_angle": ("degree", "angle of the beam to the right of the track"),
         "flight_line": ("1", "number of the flight line"),
+        "range_at_time_zero": ("m", "range from which light arrives at time zero"),
         "pulse": ("1", "fraction of an echo that a sample records, by time from the echo's time zero"),
         "radiometric_constant": ("J m2", "energy times squared range per apparent reflectance"),
     },
@@ -72,6 +76,7 @@ def acquisition_of(survey: Survey) -> Acquisition:
         gps_time=unknown_time if survey.gps_time is None else survey.gps_time,
         scan_angle=survey.zenith if survey.scan_angle is None else survey.scan_angle,
         flight_line=np.ones(shots, int) if survey.flight_line is None else survey.flight_line,
+        range_at_time_zero=np.zeros(shots) if survey.has_sensor_position else survey.slant_range,
         pulse=sampled_pulse(survey.lidar),
         radiometric_constant=radiometric_constant(survey.lidar),
     )

@@ -5,7 +5,9 @@ import math
 import numpy as np
 
 from jaxlidar._checks import concrete_array, concrete_number
+from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._summary import percent
+from jaxlidar.instrument.lidar import AIM_DISTANCE
 from jaxlidar.instrument.survey import Survey
 from jaxlidar.optics.laws import AbstractMirror
 from jaxlidar.planning.local_origin import move_aim_to_origin
@@ -70,7 +72,7 @@ def choose_strategy(
     # Coordinates are relative to the survey's middle, where single precision is fine. A scene that cannot be
     # moved keeps its coordinates, and the lidar its position.
     lidar, _ = move_aim_to_origin(middle, scene)
-    relative_survey = survey.about(concrete_array(middle.position) - concrete_array(lidar.position))
+    relative_survey = survey.about((concrete_array(middle.position) - concrete_array(lidar.position))[:2])
     strategy = _shared_illumination(relative_survey, setup, rtol, shared)
     return PerShotStrategy(setup, relative_survey, rtol) if strategy is None else strategy
 
@@ -86,7 +88,11 @@ def _rays_of_batch(plan: Plan, survey: Survey, scene: Scene, rtol: float) -> int
     rays = 10.0 / rtol
     if scene.canopy is not None and not scene.meshes:
         edge = float(np.min(concrete_array(scene.canopy.voxels.voxel_size)[:2]))
-        columns = (1.0 + 2.0 * float(np.max(survey.footprint_radius)) / edge) ** 2
+        radius = float(np.max(survey.footprint_radius))
+        if survey.has_sensor_position:
+            # The radius is that 1 m ahead of the sensor: the widest footprint is that of the last return.
+            radius *= 0.5 * SPEED_OF_LIGHT * plan.scope.last_return / AIM_DISTANCE
+        columns = (1.0 + 2.0 * radius / edge) ** 2
         rays = min(rays, 32.0 * columns)
     return min(_power_of_two(rays, *_RAYS), plan.n_rays)
 
@@ -165,6 +171,10 @@ def _groups(
 def reason_against_sharing(survey: Survey, setup: Setup, rtol: float) -> str | None:
     """Return the reason why the shots of a survey cannot share light; None where they can."""
     canopy, lidar = setup.scene.canopy, setup.lidar
+    if survey.altitude is None:
+        return "shots are placed by their sensors"
+    if np.ptp(survey.altitude) > 0:
+        return "shots have more than one altitude"
     if not beams_are_parallel(survey):
         return "shots have more than one direction"
     # Such shots share higher orders alone; their first order has rays of its own in either strategy.

@@ -108,13 +108,14 @@ def _rows(value: Any, shots: slice) -> Any:
     """Return the rows of some shots: of an array, or of the fields of an `Acquisition` that have rows."""
     if not isinstance(value, Acquisition):
         return value[shots]
-    columns = ("gps_time", "scan_angle", "flight_line")
+    columns = ("gps_time", "scan_angle", "flight_line", "range_at_time_zero")
     return dataclasses.replace(value, **{name: getattr(value, name)[shots] for name in columns})
 
 
 def _waveforms(
     strategy: AbstractStrategy, fields: dict[str, Any], start_time: float, **info: Any
 ) -> Waveforms:
+    altitude = strategy.setup.lidar.altitude
     return Waveforms(
         time=np.asarray(make_waveform_model(strategy.setup).time),
         wavelength=np.asarray(strategy.setup.lidar.wavelength),
@@ -122,7 +123,7 @@ def _waveforms(
         info={
             "rtol": strategy.rtol,
             "orders": strategy.setup.plan.orders,
-            "altitude": float(strategy.setup.lidar.altitude),
+            "altitude": None if altitude is None else float(altitude),
             "seconds": time.perf_counter() - start_time,
             **strategy.info(),
             **info,

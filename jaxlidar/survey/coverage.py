@@ -1,15 +1,21 @@
-"""Coverage of a survey: heights of the ground below its shots, and footprints partly outside the map."""
+"""Coverage of a survey: where its shots meet the ground, and footprints partly outside the map."""
+
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from jaxlidar._checks import check_kind
 from jaxlidar._summary import NOTABLE_FRACTION, percent
 from jaxlidar._vectors import FAR, vec
+from jaxlidar.instrument.lidar import AIM_DISTANCE
 from jaxlidar.instrument.survey import Survey
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.shapes import Plane
 
+# Cosines of incidence below this count as along the ground.
+_LEAST_COSINE = 1e-6
 # Points of a footprint, and shots that are computed together.
 _POINTS, _SHOTS_PER_BLOCK = 512, 1024
 
@@ -46,16 +52,17 @@ def ground_heights(survey: Survey, scene: Scene, start_distance: float) -> Float
     """
     if scene.ground is None:
         return np.full(len(survey), np.nan)
-    # From where rays start, above the scene: a ray that starts on the reference plane would miss ground above
-    # it.
-    start = np.pad(survey.position, ((0, 0), (0, 1))) - start_distance * survey.direction
+    # From where rays start, above the scene or at the sensor: a ray that starts on the reference plane would
+    # miss ground above it.
+    start = survey.aim_point - start_distance * survey.direction
     x, w = (vec(jnp.asarray(a, float).T) for a in (start, survey.direction))
     shape = scene.ground.shape
     distance = np.asarray(shape.distance(x, w), float)
     # A miss is at FAR; a tenth of that leaves room for rounding.
     hits = distance < 0.1 * FAR
-    # A plane has no rim: an axis that does not meet it runs along it, and has no height.
-    if not hits.all() and not isinstance(shape, Plane):
+    # A plane has no rim: an axis that does not meet it runs along it, and has no height. From a sensor it
+    # may go anywhere.
+    if not hits.all() and not isinstance(shape, Plane) and not survey.has_sensor_position:
         misses = np.flatnonzero(~hits)
         numbers = ", ".join(map(str, misses[:5])) + (", ..." if misses.size > 5 else "")
         raise ValueError(
@@ -64,6 +71,57 @@ def ground_heights(survey: Survey, scene: Scene, start_distance: float) -> Float
         )
     heights = start[:, 2] + np.where(hits, distance, 0.0) * survey.direction[:, 2]
     return np.where(hits, heights, np.nan)
+
+
+def ground_position(survey: Survey, scene: Scene) -> Float[np.ndarray, "shots 3"]:
+    """Find where the beam axes of a survey meet the ground of a scene.
+
+    Nothing is simulated: plants and plates do not count. `Waveforms.ground_position` has the same.
+
+    **Arguments:**
+
+    - `survey`: a `Survey`.
+    - `scene`: a `Scene`.
+
+    **Returns:** (shots, 3) x, y and z, m; NaN where an axis meets no ground.
+
+    **Raises:** ValueError for shots with an altitude that do not meet a ground of finite extent; TypeError
+    for objects of the wrong type.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> survey = jl.Survey(jl.Lidar(altitude=500.0), position=[(0, 0)], zenith=45.0, azimuth=90.0)
+    >>> print(jl.ground_position(survey, jl.Scene(ground=jl.Ground(height=100.0)))[0].round().astype(int))
+    [-100    0  100]
+    """
+    check_kind("survey", survey, Survey, "a Survey")
+    check_kind("scene", scene, Scene, "a Scene")
+    ground, axis = scene.ground, survey.direction
+    points = np.full((len(survey), 3), np.nan)
+    if ground is None:
+        return points
+    # About the middle of the survey, as single precision needs.
+    origin = 0.5 * (survey.position[:, :2].min(axis=0) + survey.position[:, :2].max(axis=0))
+    moved: Any = ground.moved(-origin)
+    if moved is not None:
+        survey, ground = survey.about(origin), moved
+    start_distance = AIM_DISTANCE
+    if not survey.has_sensor_position:
+        # Both bounds of every line, which a shape may return at different lines.
+        lines = (np.repeat(a, 2, axis=0) for a in (survey.aim_point, axis))
+        crossed, towards = ground.shape.crossing(*lines)
+        met = towards < -_LEAST_COSINE
+        start_distance = 1.0 - float(crossed[met].min()) if met.any() else 0.0
+    heights = ground_heights(survey, Scene(ground=ground), start_distance)
+    points = survey.aim_point + ((heights - survey.aim_point[:, 2]) / _off_level(axis[:, 2]))[:, None] * axis
+    points[:, 2] = heights
+    return points + np.append(np.zeros(2) if moved is None else origin, 0.0)
+
+
+def _off_level(cosine: Float[np.ndarray, " shots"]) -> Float[np.ndarray, " shots"]:
+    """Return cosines with the vertical, NaN for level axes: a height states no point of these."""
+    return np.where(np.abs(cosine) > 1e-12, cosine, np.nan)
 
 
 def off_map(survey: Survey, scene: Scene) -> Float[np.ndarray, " shots"]:
@@ -75,7 +133,8 @@ def off_map(survey: Survey, scene: Scene) -> Float[np.ndarray, " shots"]:
     3. Moved along the axis to the heights of the map's top and bottom.
     """
     canopy = scene.canopy
-    if canopy is None or canopy.sides == "periodic":
+    # From a sensor, beams may look past the map on purpose.
+    if canopy is None or canopy.sides == "periodic" or survey.has_sensor_position:
         return np.zeros(len(survey))
     low, high = (np.asarray(a, float) for a in (canopy.voxels.origin, canopy.voxels.top))
     enclosed_energy = (np.arange(_POINTS) + 0.5) / _POINTS

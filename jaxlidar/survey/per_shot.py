@@ -65,35 +65,48 @@ class ShotGeometry(NamedTuple):
     """Geometry of shots; axis 0 is the shots'.
 
     - `number`: of each in the survey. - `position`: m, from the survey's origin. - `zenith`, `azimuth`:
-      degrees.
+      degrees. - `altitude`: m; None where `position` is that of the sensor.
     """
 
     number: Int[Array, "*shots"] | np.ndarray
-    position: Float[Array, "*shots 2"] | np.ndarray
+    position: Float[Array, "*shots axes"] | np.ndarray
     zenith: Float[Array, "*shots"] | np.ndarray
     azimuth: Float[Array, "*shots"] | np.ndarray
+    altitude: Float[Array, "*shots"] | np.ndarray | None
 
     def as_arrays(self) -> "ShotGeometry":
         """Return the same in JAX's present precision."""
-        return ShotGeometry(jnp.asarray(self.number), *(jnp.asarray(a, float) for a in self[1:]))
+
+        def convert(a: Any) -> Any:
+            return None if a is None else jnp.asarray(a, float)
+
+        return ShotGeometry(jnp.asarray(self.number), *map(convert, self[1:]))
 
 
 def shot_geometry(survey: Survey, first: int, count: int) -> ShotGeometry:
     """Return `count` shots from number `first` on; copies of the last one fill up what there are fewer."""
     shots = np.minimum(np.arange(first, first + count), len(survey) - 1)
-    return ShotGeometry(
-        shots.astype(np.int32), survey.position[shots], survey.zenith[shots], survey.azimuth[shots]
-    )
+    altitude = None if survey.altitude is None else survey.altitude[shots]
+    position, zenith, azimuth = (a[shots] for a in (survey.position, survey.zenith, survey.azimuth))
+    return ShotGeometry(shots.astype(np.int32), position, zenith, azimuth, altitude)
 
 
 def setup_of_shot(setup: Setup, shot: ShotGeometry) -> Setup:
     """Return the setup with the lidar aimed at one shot."""
     # `tree_at` sets nested fields without the constructors' checks, which traced values cannot have.
+    names = ("position", "zenith", "azimuth", *(() if shot.altitude is None else ("altitude",)))
     return eqx.tree_at(
-        lambda s: (s.lidar.position, s.lidar.zenith, s.lidar.azimuth),
+        lambda s: tuple(getattr(s.lidar, name) for name in names),
         setup,
-        (shot.position, shot.zenith, shot.azimuth),
+        tuple(getattr(shot, name) for name in names),
     )
+
+
+def aim_offset(setup: Setup, shot: ShotGeometry) -> Float[Array, "axes"]:
+    """Return how far the aim point of a shot lies from that of a setup's lidar, m, east, north (and up)."""
+    if shot.altitude is None:
+        return setup_of_shot(setup, shot).lidar.aim_point - setup.lidar.aim_point
+    return jnp.asarray(shot.position) - setup.lidar.position
 
 
 @dataclasses.dataclass(frozen=True)
@@ -198,7 +211,7 @@ def _trace_shot(
     2. Where nothing is random, trace one batch: its errors are zero.
     3. Otherwise refine the estimate, by more batches or by denser lattices.
     """
-    offset = jnp.asarray(shot.position) - setup.lidar.position
+    offset = aim_offset(setup, shot)
     # The key follows from the shot's number: its waveform does not depend on chunks or workers.
     setup, key = setup_of_shot(setup, shot), jax.random.fold_in(key, shot.number)
     scene, model = aim_at(scene, setup.lidar, offset), make_waveform_model(setup)

@@ -49,10 +49,10 @@ from jaxlidar._checks import (
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._registry import decompose_records
 from jaxlidar.instrument.lidar import Lidar
-from jaxlidar.instrument.survey import beam_directions
+from jaxlidar.instrument.survey import Survey, beam_directions
 from jaxlidar.io.airborne import AirborneShot, Returns, Segment
 from jaxlidar.io.las import write_las
-from jaxlidar.survey.acquisition import PULSE_OVERSAMPLING, Acquisition, radiometric_constant, sampled_pulse
+from jaxlidar.survey.acquisition import PULSE_OVERSAMPLING, Acquisition, acquisition_of
 from jaxlidar.survey.progress import ProgressClock, SurveyProgress
 
 DETECTORS = ("peak", "constant fraction", "leading edge", "decomposition")
@@ -71,6 +71,8 @@ _SAMPLES_AT_ONCE = 100_000
 _RECORDS_AT_ONCE = 64
 # Gaps of the signal below this many lengths of the pulse do not divide a record that is decomposed.
 _MIN_GAP_OF_PULSE = 1.0
+# Least cosine of an axis to the vertical for which the height of a surface gives its range.
+_LEAST_SLOPE = 0.01
 _FWHM_OF_STD = 2.0 * np.sqrt(2.0 * np.log(2.0))
 # Materials of samples in which nothing returned, and heights (m above ground) that divide vegetation into the
 # classes 3, 4 and 5 of the LAS specification.
@@ -219,7 +221,8 @@ class DiscreteReturns(eqx.Module):
 class ShotAxes(NamedTuple):
     """Axes of beams, for the positions and ranges of what returns along them.
 
-    - `origin`: (shots, 3) m, where the axis is at time zero. - `direction`: (shots, 3) unit vectors.
+    - `origin`: (shots, 3) m, where the axis is at time zero: on the reference plane, or at the sensor of a
+      lidar that is placed by it. - `direction`: (shots, 3) unit vectors.
     - `distance`: (shots,) m from the sensor to the origin.
     """
 
@@ -238,14 +241,15 @@ def position_along_beam(
 
 
 def _shot_axes(
-    position: Float[np.ndarray, "shots 2"],
+    position: Float[np.ndarray, "shots axes"],
     zenith: Float[np.ndarray, " shots"],
     azimuth: Float[np.ndarray, " shots"],
-    altitude: float,
+    range_at_time_zero: Float[np.ndarray, " shots"],
 ) -> ShotAxes:
-    """Return the axes of shots that aim at positions of the reference plane, from an altitude above it."""
-    origin = np.pad(np.asarray(position, float), ((0, 0), (0, 1)))
-    return ShotAxes(origin, beam_directions(zenith, azimuth), altitude / np.cos(np.deg2rad(zenith)))
+    """Return the axes of shots; `position` is (x, y) on the reference plane, or (x, y, z) of the sensor."""
+    position = np.asarray(position, float)
+    origin = np.pad(position, ((0, 0), (0, 3 - position.shape[1])))
+    return ShotAxes(origin, beam_directions(zenith, azimuth), np.asarray(range_at_time_zero, float))
 
 
 # -- waveforms as input ------------------------------------------------------------------------------------
@@ -321,7 +325,7 @@ def input_of_waveforms(waves: Any, wavelength: Any) -> DetectorInput:
         components={name: a[:, w] for name, a in waves.components.items() if name not in _ORDERS},
         truth=None if waves.truth is None else {name: a[:, w] for name, a in waves.truth.returns.items()},
         surface_height={} if waves.truth is None else waves.truth.surface_height,
-        axes=_shot_axes(waves.position, zenith, azimuth, float(waves.info["altitude"])),
+        axes=_shot_axes(waves.position, zenith, azimuth, waves.acquisition.range_at_time_zero),
         acquisition=waves.acquisition,
         constant=float(waves.acquisition.radiometric_constant[w]),
         ground_height=np.asarray(waves.ground_height, float),
@@ -337,8 +341,8 @@ def input_of_waveform(wave: Any, lidar: Any, wavelength: Any) -> DetectorInput:
             f"{np.asarray(wave.wavelength).tolist()} nm"
         )
     w = wavelength_index(wavelength, np.asarray(wave.wavelength, float))
-    zenith, azimuth = (np.asarray(a, float).reshape(1) for a in (lidar.zenith, lidar.azimuth))
-    constants = radiometric_constant(lidar)
+    shot = Survey.of(lidar)
+    acquisition = acquisition_of(shot)
 
     def row(array: Any) -> np.ndarray:
         return np.asarray(array)[w][None]
@@ -354,9 +358,9 @@ def input_of_waveform(wave: Any, lidar: Any, wavelength: Any) -> DetectorInput:
         components={name: row(a) for name, a in wave.components.items() if name not in _ORDERS},
         truth=None if truth is None else {name: row(a) for name, a in truth.returns.items()},
         surface_height=heights,
-        axes=_shot_axes(np.asarray(lidar.position, float)[None], zenith, azimuth, float(lidar.altitude)),
-        acquisition=Acquisition(np.full(1, np.nan), zenith, np.ones(1, int), sampled_pulse(lidar), constants),
-        constant=float(constants[w]),
+        axes=_shot_axes(shot.position, shot.zenith, shot.azimuth, acquisition.range_at_time_zero),
+        acquisition=acquisition,
+        constant=float(acquisition.radiometric_constant[w]),
         # The truth has the mean height of the ground over the footprint.
         ground_height=heights.get("ground", np.full(1, np.nan)),
     )
@@ -715,8 +719,7 @@ def _prepare_chunk(
         # The standard error of the simulation, as an energy.
         stderr = np.asarray(waves.stderr[shots])
         if stderr.any():
-            per_reflectance = waves.constant / waves.axes.distance[shots] ** 2
-            noise = stderr * per_reflectance[:, None].astype(record.dtype)
+            noise = stderr * _energy_per_reflectance(waves, shots).astype(record.dtype)
         else:
             noise = np.zeros((len(record), 1), record.dtype)
     else:
@@ -725,6 +728,19 @@ def _prepare_chunk(
         noise = 1.4826 / np.sqrt(2.0) * np.median(differences, axis=1, keepdims=True)
     threshold = None if settings.threshold is None else settings.threshold[shots]
     return record, noise, threshold
+
+
+def _energy_per_reflectance(waves: DetectorInput, shots: slice) -> Float[np.ndarray, "shots samples"]:
+    """Return the energy of a sample per apparent reflectance, J; of an altitude, one number for a shot.
+
+    From an altitude, ranges hardly change over a record. From a sensor they begin at zero: the first sample
+    that begins after the emission stands for those before it.
+    """
+    distance = waves.axes.distance[shots, None]
+    if distance.all():
+        return waves.constant / distance**2
+    ranges = distance + 0.5 * SPEED_OF_LIGHT * np.maximum(waves.time, 0.5 * waves.step)
+    return waves.constant / ranges**2
 
 
 def _detect_chunk(
@@ -934,9 +950,12 @@ def _true_echoes(
     if material in waves.surface_height:
         # Samples resolve the mean to a part of their length; the height of a surface is exact.
         axes, height = waves.axes, waves.surface_height[material][shot]
-        rise = (height - axes.origin[shot, 2]) / axes.direction[shot, 2]
+        # On a nearly level axis a height states no exact point.
+        slope = axes.direction[shot, 2]
+        is_inclined = np.abs(slope) > _LEAST_SLOPE
+        rise = (height - axes.origin[shot, 2]) / np.where(is_inclined, slope, 1.0)
         exact = rise / (0.5 * SPEED_OF_LIGHT)
-        mean = np.where(np.abs(exact - mean) < waves.step, exact, mean)
+        mean = np.where(is_inclined & (np.abs(exact - mean) < waves.step), exact, mean)
     (listed,) = np.nonzero(reflectance >= min_reflectance)
     columns = {
         "shot": shot,

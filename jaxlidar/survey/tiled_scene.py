@@ -110,7 +110,7 @@ def lossless_margin(survey: Survey, longest_path: float, top: float) -> float:
 
 def subset(survey: Survey, shots: Int[np.ndarray, " shots"]) -> Survey:
     """Return the shots of a survey with these numbers."""
-    return Survey(survey.lidar, survey.position[shots], survey.zenith[shots], survey.azimuth[shots])
+    return survey.subset(shots)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -152,6 +152,11 @@ class TiledSceneStrategy(AbstractStrategy):
 
         **Raises:** as `simulate_many`, with the corners of the part.
         """
+        if survey.has_sensor_position:
+            raise ValueError(
+                "survey: its shots are placed by their sensors; admissible over SceneParts, which "
+                "need to know where beams go, are shots with an altitude"
+            )
         starts, ends, longest_paths, orders = [], [], [], []
         for tile in tiles_of(survey, scene):
             plan = _strategy_of(survey, scene, tile, rtol, max_orders, shared, None).setup.plan

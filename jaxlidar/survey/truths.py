@@ -18,7 +18,7 @@ from jaxlidar.io.datasets import keep_as_netcdf
 from jaxlidar.io.netcdf import TRUTH_QUANTITIES
 from jaxlidar.planning.setup import Setup
 from jaxlidar.spectral.apply_optics import make_waveform_model
-from jaxlidar.survey.per_shot import ShotGeometry, setup_of_shot, shot_geometry
+from jaxlidar.survey.per_shot import ShotGeometry, aim_offset, setup_of_shot, shot_geometry
 from jaxlidar.survey.results import ShotResults
 from jaxlidar.survey.strategy import AbstractStrategy
 from jaxlidar.trace.device_scene import DeviceScene, aim_at, build_device_scene
@@ -136,7 +136,7 @@ def truths_of_chunk(setup: Setup, shots: ShotGeometry, key: PRNGKeyArray) -> Tru
 
 def _truth_of_shot(scene: DeviceScene, setup: Setup, shot: ShotGeometry) -> dict[str, Any]:
     """Return the fields of `Truths` for one shot."""
-    offset = jnp.asarray(shot.position) - setup.lidar.position
+    offset = aim_offset(setup, shot)
     setup = setup_of_shot(setup, shot)
     scene = aim_at(scene, setup.lidar, offset)
     truth = vars(compute_labels(scene, make_waveform_model(setup)))

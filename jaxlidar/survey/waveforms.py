@@ -16,6 +16,7 @@ from jaxlidar._deprecated import renamed_property
 from jaxlidar._registry import detect_returns, true_returns
 from jaxlidar._summary import NOTABLE_FRACTION, percent
 from jaxlidar.instrument.lidar import Lidar
+from jaxlidar.instrument.survey import beam_directions
 from jaxlidar.io import netcdf
 from jaxlidar.io.case import Case
 from jaxlidar.io.datasets import datasets_of, keep_as_netcdf
@@ -36,6 +37,9 @@ from jaxlidar.survey.returns import (
 )
 from jaxlidar.survey.truths import Truths
 
+# Least cosine of a beam axis to the vertical for which a height states a point of it.
+_LEAST_COSINE = 1e-12
+
 
 @final
 @briefly
@@ -43,13 +47,14 @@ class Waveforms(eqx.Module):
     """The waveforms of all shots of a survey, on one time axis. `waves[i]` is the `Waveform` of shot i.
 
     - `time`: (samples,) ns, centres of the samples, relative to the two-way travel time of each shot's aim
-      point.
+      point; of shots that are placed by their sensors, relative to their emission.
     - `wavelength`: (wavelengths,) nm.
     - `reflectance`, `stderr`, `energy`, `recorded`: (shots, wavelengths, samples), and
     - `components`, dict of the same shape: as those of `Waveform`.
     - `neglected`, `lost`: (shots, wavelengths), `energy_budget`, `energy_budget_stderr`, dicts of the same
       shape: as those of `Waveform`. `neglected` is zero where one order is followed.
-    - `position`: (shots, 2) m, `zenith`, `azimuth`: (shots,) degrees, as those of `Survey`.
+    - `position`: (shots, 2) m, or (shots, 3) of sensors, `zenith`, `azimuth`: (shots,) degrees, as those of
+      `Survey`.
     - `ground_height`: (shots,) m, true height of the ground where the beam axis meets it; NaN where it meets
       none.
     - `off_map`: (shots,) fraction of the light that falls outside the voxel map.
@@ -57,7 +62,7 @@ class Waveforms(eqx.Module):
     - `truth`: a `Truths`, what each beam meets in the scene; None unless it was asked for.
     - `acquisition`: an `Acquisition`, what else discrete returns need; None for files of earlier versions.
     - `info`: dict of "rtol", "orders" followed, "automatic orders" (False where
-      `max_orders` was given), "altitude" of the lidar in m, "seconds" that it took, and
+      `max_orders` was given), "altitude" of the lidar in m (None for sensors), "seconds" that it took, and
       whether light was "shared" (over `SceneParts`: in all tiles). Over one scene with shared light, also the
       spacing in m of the "grid" of nodes at which it entered, and a bound on the fraction of samples that
       "parallel light" changes. Over `SceneParts`, also the number of "parts", the "margin" in m around tiles,
@@ -89,7 +94,7 @@ class Waveforms(eqx.Module):
     lost: Float[np.ndarray, "shots wavelengths"]
     energy_budget: dict[str, Float[np.ndarray, "shots wavelengths"]]
     energy_budget_stderr: dict[str, Float[np.ndarray, "shots wavelengths"]]
-    position: Float[np.ndarray, "shots 2"]
+    position: Float[np.ndarray, "shots axes"]
     zenith: Float[np.ndarray, " shots"]
     azimuth: Float[np.ndarray, " shots"]
     ground_height: Float[np.ndarray, " shots"]
@@ -108,6 +113,32 @@ class Waveforms(eqx.Module):
         """Fraction of `reflectance` scattered once, (shots, wavelengths); 1 where nothing returns."""
         first, total = (np.sum(a, axis=2) for a in (self.components["first"], self.reflectance))
         return np.where(total > 0, first / np.where(total > 0, total, 1.0), 1.0).astype(total.dtype)
+
+    @property
+    def has_sensor_position(self) -> bool:
+        """True if shots are placed by their sensors, and time zero is the emission."""
+        return self.position.shape[1] == 3
+
+    @property
+    def direction(self) -> Float[np.ndarray, "shots 3"]:
+        """Unit vectors (shots, 3) in which the beams travel, as `Survey.direction`."""
+        return beam_directions(self.zenith, self.azimuth)
+
+    @property
+    def ground_position(self) -> Float[np.ndarray, "shots 3"]:
+        """Positions (shots, 3), m, where the beam axes meet the ground; NaN where they meet none.
+
+        They follow from `ground_height` and the axes. An exactly level axis has no single point at that
+        height, and is NaN, too.
+        """
+        direction, height = self.direction, np.asarray(self.ground_height, float)
+        start = np.asarray(self.position, float)
+        start = start if self.has_sensor_position else np.pad(start, ((0, 0), (0, 1)))
+        is_inclined = np.abs(direction[:, 2]) > _LEAST_COSINE
+        # A vertical axis meets all heights at its own place.
+        distance = (height - start[:, 2]) / np.where(is_inclined, direction[:, 2], np.nan)
+        points = start + distance[:, None] * direction
+        return np.where(np.isnan(points[:, 2:]), np.nan, np.column_stack([points[:, :2], height]))
 
     def __len__(self) -> int:
         return len(self.position)
@@ -140,6 +171,8 @@ class Waveforms(eqx.Module):
 
         # The survey has one time axis and shots of many zenith angles: heights differ between shots.
         height = -0.5 * SPEED_OF_LIGHT * self.time * np.cos(np.deg2rad(self.zenith[i]))
+        if self.has_sensor_position:
+            height = height + self.position[i, 2]
         axes = jnp.asarray(self.time), jnp.asarray(height, self.time.dtype)
         return Waveform(
             time=axes[0],
@@ -402,7 +435,7 @@ keep_as_netcdf(
         "lost": ("1", "apparent reflectance that arrives before or after all fine bins of the plan"),
         "energy_budget": ("1", "fraction of the emitted energy by fate, before the atmosphere"),
         "energy_budget_stderr": ("1", "standard error of the fraction of the emitted energy"),
-        "position": ("m", "x and y where the beam axis meets the reference plane"),
+        "position": ("m", "x and y where the beam axis meets the reference plane, or x, y, z of the sensor"),
         "zenith": ("degree", "angle between the beam and the vertical"),
         "azimuth": ("degree", "direction in which the beam travels, clockwise from north"),
         "ground_height": ("m", "height of the ground where the beam axis meets it"),
@@ -410,7 +443,7 @@ keep_as_netcdf(
         "error": ("1", "relative error of the waveform"),
         "photons": ("1", "photons traced"),
     },
-    dimensions={"shots": "shot", "samples": "time", "wavelengths": "wavelength", "2": "axis"},
+    dimensions={"shots": "shot", "samples": "time", "wavelengths": "wavelength", "axes": "axis"},
     items={"components": "component", "energy_budget": "fate", "energy_budget_stderr": "fate"},
     coordinates={"zenith": "shot", "azimuth": "shot"},
     former_names={"energy_budget": "ledger", "energy_budget_stderr": "ledger_stderr"},

@@ -351,7 +351,7 @@ def intensity_factors(
         # Recomputed from the point, with its derivative: the sampled normal is detached.
         on_surface, normal = collision.surface == i, surface.lit_normal(x, w, collision.normal)
         cosine = dot(normal, v)
-        factor = surface.law.intensity_factor(w, normal, v, scene.beam.half_angle)
+        factor = surface.law.intensity_factor(w, normal, v, scene.beam.aperture_half_angle(x))
         factor = surface.scale_by_pattern(x, factor)
         reflected = jnp.where(on_surface, jnp.where(cosine > 0, factor, 0.0), reflected)
         transmitted = jnp.where(on_surface, jnp.maximum(-cosine, 0.0), transmitted)

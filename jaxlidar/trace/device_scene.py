@@ -227,7 +227,7 @@ def _build_geometry(
     """
     # Coordinates relative to the aim point: map coordinates of millions of m would leave single precision no
     # digits for voxels.
-    aim = jnp.concatenate([lidar.position, jnp.zeros_like(lidar.position[:1])])
+    aim = lidar.aim_point
     # Photons remember their law by number: a Lambertian one, the most common, is always number zero.
     laws: list[AbstractLaw | AbstractPhase] = [Lambertian()]
 
@@ -266,13 +266,13 @@ def _build_geometry(
 compiled_geometry = Program(_build_geometry)
 
 
-def aim_at(scene: DeviceScene, lidar: Lidar, offset: Float[Array, "2"]) -> DeviceScene:
-    """Return the scene for a lidar that aims `offset` m farther to the east and to the north.
+def aim_at(scene: DeviceScene, lidar: Lidar, offset: Float[Array, "axes"]) -> DeviceScene:
+    """Return the scene for a lidar that aims `offset` m farther to the east and to the north, and up.
 
     Map and terrain are shifted, not built again: a shot costs the same over a map of any size.
     """
     # The aim point is the origin: the scene moves against the shot.
-    back = -jnp.concatenate([offset, jnp.zeros_like(offset[:1])])
+    back = -jnp.concatenate([offset, jnp.zeros_like(offset[: 3 - offset.size])])
     medium = scene.medium
     if medium is not None:
         medium = eqx.tree_at(lambda m: m.origin, medium, medium.origin + back)

@@ -329,7 +329,7 @@ def first_order(
             # point itself.
             seen = surface.scale_by_pattern(point, beam.in_view(point))
             if mirror is None:
-                seen = surface.law.intensity_factor(w, normal, back, beam.half_angle) * seen
+                seen = surface.law.intensity_factor(w, normal, back, beam.aperture_half_angle(point)) * seen
             # FAR would overflow when it is converted to bins.
             time = 2.0 * (excess + jnp.minimum(distances[i], 1e9)) / SPEED_OF_LIGHT
             first_bin, row = bspline_row(

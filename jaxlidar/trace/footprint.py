@@ -7,6 +7,10 @@ cancellation as
 
     excess = q / (1 + sqrt(1 + q / R)),   q = 2 x.a + |x|^2 / R.
 
+A lidar that is placed by its sensor (`Lidar(sensor=...)`) has its aim point R = 1 m ahead of that. Path
+lengths are then those from the sensor itself: "excess" is all of |x + R a|, which single precision resolves
+to 6e-5 m at 1 km.
+
 Of a Gaussian beam with the radius w0 (at 1/e^2) the circle of radius r encloses the fraction
 1 - exp(-2 r^2 / w0^2) of the energy; of a top-hat r^2 / w0^2. Rays lie on a Fibonacci disc (Vogel's spiral):
 enclosed fractions in equal steps, so that rays carry equal energies, and directions that turn by the golden
@@ -26,6 +30,8 @@ from jaxlidar.instrument.field_of_view import visible_fraction
 from jaxlidar.instrument.lidar import Lidar
 
 GOLDEN = (np.sqrt(5.0) - 1) / 2
+# Points nearer to the sensor than this, m, count as so far away.
+_LEAST_DISTANCE = 1e-6
 # Half of the angle, rad, that the sun subtends.
 SOLAR_HALF_ANGLE = 4.65e-3
 
@@ -37,6 +43,7 @@ class Beam(eqx.Module):
     - `radius`: of the footprint at 1/e^2 or of the top-hat, m across the beam at the aim point.
     - `half_angle`: that the aperture subtends at the aim point, rad.
     - `view_radius`: of the field of view at the aim point, m across the beam; None where everything is seen.
+    - `from_sensor`: True if path lengths count from the sensor, and not from the aim point.
     - `gaussian`: True for a Gaussian profile. `parallel`: True if all rays are parallel to the axis, as for
       light that shots share; the receiver then sees all of the scene.
     - `return_direction`: unit vector towards the receiver of parallel light where that is not back along the
@@ -51,8 +58,18 @@ class Beam(eqx.Module):
     view_radius: Float[Array, ""] | None
     gaussian: bool = eqx.field(static=True)
     parallel: bool = eqx.field(static=True, default=False)
+    from_sensor: bool = eqx.field(static=True, default=False)
     return_direction: Vec | None = None
     rectangle: tuple[Float[Array, "2"], Float[Array, "2"]] | None = None
+
+    @property
+    def range_at_time_zero(self) -> Scalar:
+        """Distance from the sensor, m, from which path lengths count: the slant range, or zero."""
+        return jnp.zeros_like(self.slant_range) if self.from_sensor else self.slant_range
+
+    def _offset(self, point: Vec) -> Vec:
+        """Vector from the sensor to `point`, m."""
+        return add(scale(self.axis, self.slant_range), point)
 
     def ray(self, across: tuple[Scalar, Scalar]) -> tuple[Vec, Vec, Scalar]:
         """Point, direction and relative distance from the sensor of the ray through `across` (m).
@@ -68,7 +85,11 @@ class Beam(eqx.Module):
         return point, direction, self.excess(point)
 
     def excess(self, point: Vec) -> Scalar:
-        """Distance from the sensor minus the slant range, m, computed without cancellation."""
+        """Distance from the sensor minus the range at time zero, m, computed without cancellation."""
+        if self.from_sensor:
+            offset = self._offset(point)
+            # The floor keeps the derivative of the root finite at the sensor itself.
+            return jnp.sqrt(jnp.maximum(dot(offset, offset), _LEAST_DISTANCE**2))
         if self.parallel:
             # A beam's wave front is curved: its light arrives later by w0^2 / (4 R) in the mean over the
             # footprint.
@@ -92,7 +113,7 @@ class Beam(eqx.Module):
         `max_path` is the length of flight and return path, less the slant range. The points from which light
         returns in time form an ellipsoid with foci `x` and the sensor; the flight may reach its surface.
         """
-        r, out = self.slant_range, self.excess(x)
+        r, zero, out = self.slant_range, self.range_at_time_zero, self.excess(x)
         if self.parallel:
             # The divisor is near zero only for light that flies back to the sensor, which may fly on.
             flight = (max_path - out) / jnp.maximum(1.0 + dot(self.axis, w), 1e-9)
@@ -100,11 +121,15 @@ class Beam(eqx.Module):
         # An ellipse in polar form about the focus `x`; where the divisor is not positive, the flight never
         # leaves it.
         divisor = r * (1.0 + dot(self.axis, w)) + max_path + dot(x, w)
-        flight = 0.5 * (max_path - out) * (2.0 * r + max_path + out) / jnp.where(divisor > 0, divisor, 1.0)
+        if self.from_sensor:
+            divisor = divisor - r
+        flight = 0.5 * (max_path - out) * (2.0 * zero + max_path + out) / jnp.where(divisor > 0, divisor, 1.0)
         return jnp.where(max_path < out, 0.0, jnp.where(divisor > 0, jnp.minimum(flight, FAR), FAR))
 
     def in_view(self, point: Vec) -> Scalar:
         """Fraction of the light from `point` that the receiver sees; the field of view has a soft edge."""
+        if self.from_sensor:
+            return self._in_view_of_aperture(point)
         if self.view_radius is None:
             return jnp.ones_like(point[0])
         beyond_aim = dot(point, self.axis)
@@ -114,6 +139,44 @@ class Beam(eqx.Module):
         # The floor keeps the derivative of the root finite on the axis.
         off_axis = jnp.sqrt(jnp.maximum(off_axis2, 1e-12 * edge * edge))
         return visible_fraction(off_axis / edge)
+
+    def _in_view_of_aperture(self, point: Vec) -> Scalar:
+        """Fraction of the light from `point` that a flat aperture at the sensor sees: none from behind it.
+
+        A flat aperture presents its area times the cosine of the angle from the axis. Within the few mrad of
+        a beam that is 1; multiple scattering comes from all directions. It is zero at right angles, so that
+        nothing jumps where a point passes behind the sensor.
+        """
+        ahead, distance = dot(self._offset(point), self.axis), self.excess(point)
+        cosine = jnp.maximum(ahead, 0.0) / distance
+        if self.view_radius is None:
+            return cosine
+        ahead = jnp.maximum(ahead, _LEAST_DISTANCE)
+        off_axis = jnp.sqrt(jnp.maximum(distance * distance - ahead * ahead, 1e-12 * ahead * ahead))
+        return cosine * visible_fraction(off_axis / ahead / (self.view_radius / self.slant_range))
+
+    def distance_to_sensor(self, point: Vec) -> Scalar | None:
+        """Distance, m, at which return paths from `point` end; None for a sensor above all of the scene."""
+        return self.excess(point) if self.from_sensor else None
+
+    def aperture_half_angle(self, point: Vec) -> Scalar:
+        """Half-angle, rad, of the aperture as seen from `point`; from far above, that at the aim point."""
+        if not self.from_sensor:
+            return self.half_angle
+        radius = self.half_angle * self.slant_range
+        return jnp.arctan2(radius, self.excess(point))
+
+    def range_factor(self, path: Scalar, out: Scalar) -> Scalar:
+        """Squared ratio of the range for which light is recorded to that from which it came.
+
+        Apparent reflectance refers to the range that the time of arrival stands for: light of a long path is
+        recorded at a longer range than that from which it came. `path` is the length flown, `out` the excess
+        of the last scattering. Near the sensor no more light enters the aperture than all of it.
+        """
+        recorded, distance = self.range_at_time_zero + 0.5 * (path + out), self.range_at_time_zero + out
+        if self.from_sensor:
+            distance = jnp.maximum(distance, self.half_angle * self.slant_range)
+        return (recorded / distance) ** 2
 
     def irradiance(self, across: tuple[Scalar, Scalar]) -> Scalar:
         """Fraction of the pulse's energy per m2 across the beam, at x and y across it, m."""
@@ -135,6 +198,7 @@ def make_beam(lidar: Lidar) -> Beam:
         lidar.aperture_half_angle,
         view,
         lidar.profile == "gaussian",
+        from_sensor=lidar.has_sensor_position,
     )
 
 

@@ -524,10 +524,7 @@ def _deposit_collisions(
     transmittance, index = _return_through_surfaces(scene, x, v, collision, plate_draws, transmittance, index)
     out = beam.excess(x)
     time = (path + out) / SPEED_OF_LIGHT
-    # Apparent reflectance refers to the range that the time of arrival stands for: light of a long path is
-    # recorded at a longer range than that from which it came.
-    range_factor = ((beam.slant_range + 0.5 * (path + out)) / (beam.slant_range + out)) ** 2
-    value = weight * transmittance * range_factor * beam.in_view(x)
+    value = weight * transmittance * beam.range_factor(path, out) * beam.in_view(x)
     channel_factors = [(collision.reflection, reflected)]
     if transmitted is not None:
         channel_factors.append((collision.transmission, transmitted))
@@ -567,7 +564,7 @@ def _return_transmittance(
     """Return exp(-tau) of the voxels from `x` to the sensor along `v`, and scores less the derivative of tau.
 
     1. At nadir, tau is looked up in the column of voxels above the point.
-    2. Otherwise rays are marched to where they leave the voxels.
+    2. Otherwise rays are marched to where they leave the voxels, or to a sensor within them.
     """
     medium = scene.medium
     if medium is None:
@@ -578,8 +575,10 @@ def _return_transmittance(
         if score is not None:
             score = score - vertical_depth_slopes(scene, medium, x)
         return transmittance, score
-    # Without targets the march follows rays to where they leave the grid.
+    # Without targets the march follows rays to the sensor, or to where they leave the grid.
+    to_sensor = scene.beam.distance_to_sensor(x)
     no_targets, to_end = jnp.zeros((0, weight.size)), jnp.full_like(weight, FAR)
+    to_end = to_end if to_sensor is None else to_sensor
     return_path = march_to_depths(
         medium,
         x,
@@ -617,20 +616,23 @@ def _return_through_surfaces(
     3. Material of a plate that transmits straight on adds its channel to the history; of another it lets
        nothing through.
     """
-    draws = iter(plate_draws)
+    draws, to_sensor = iter(plate_draws), scene.beam.distance_to_sensor(x)
+    # What lies behind the sensor is not crossed.
+    end = FAR if to_sensor is None else to_sensor
     if scene.meshes is not None:
         start = clear_of_mesh(scene, x, v, collision.surface, collision.normal)
-        transmittance = jnp.where(scene.meshes.is_met(start, v, transmittance > 0), 0.0, transmittance)
+        is_hidden = scene.meshes.is_met(start, v, transmittance > 0, before=to_sensor)
+        transmittance = jnp.where(is_hidden, 0.0, transmittance)
     for i, (surface, scatterer) in enumerate(zip(scene.surfaces, scene.config.surfaces)):
         if surface.is_mesh:
             continue
         if not surface.is_plate:
             # Only a height field can lie in the way of its own return; a plane never does.
             if surface.lights_itself and not (scene.beam.parallel and scene.config.vertical):
-                transmittance = jnp.where(surface.distance(x, v) < FAR, 0.0, transmittance)
+                transmittance = jnp.where(surface.distance(x, v) < end, 0.0, transmittance)
             continue
         is_covered = next(draws) < surface.coverage
-        is_crossed = surface.distance(x, v) < FAR
+        is_crossed = surface.distance(x, v) < end
         if not surface.lights_itself:
             # Light that starts on the plate does not meet it again.
             is_crossed &= collision.surface != i

@@ -199,9 +199,11 @@ def _fade(grid: Grid, point: Vec, height_above: Scalar) -> tuple[Scalar, tuple[S
 def has_moving_rays(scene: DeviceScene) -> bool:
     """Return True if derivatives are taken and the rays of the footprint move with the geometry.
 
-    Over planes alone, where a quadrature rule takes their place, nothing jumps.
+    Over planes alone, where a quadrature rule takes their place, nothing jumps. Rays of a lidar that is
+    placed by its sensor, which may be level, need not land anywhere.
     """
-    return scene.derivatives != "none" and scene.config.n_rays > 1 and not scene.config.uses_quadrature
+    may_jump = scene.config.n_rays > 1 and not scene.config.uses_quadrature
+    return scene.derivatives != "none" and may_jump and not scene.beam.from_sensor
 
 
 def rays_with_grids(

@@ -37,6 +37,11 @@ def small_qsm() -> bytes:
     return QSM.encode()
 
 
+def small_trajectory() -> bytes:
+    rows = (b"%d.5,500%d,52000%d,812,1.5,-2,35%d\n" % (i, i, i, i) for i in range(8))
+    return b"GPSTime,Easting,Northing,Height,Roll,Pitch,Heading\n" + b"".join(rows)
+
+
 def small_obj() -> bytes:
     from tests.plants.test_meshes import OBJ
 
@@ -217,6 +222,11 @@ def plausible_tree(result: Any) -> bool:
     )
 
 
+def plausible_trajectory(result: Any) -> bool:
+    angles = (result.roll, result.pitch, result.yaw)
+    return finite(result.time, result.position, *angles) and bool(np.all(np.diff(result.time) > 0))
+
+
 def plausible_spectrum(result: Any) -> bool:
     rho, wavelength = np.asarray(result.reflectance), np.asarray(result.wavelength)
     rising = np.all(np.diff(wavelength) > 0)
@@ -346,6 +356,7 @@ KINDS = {
     "vox": text_kind("read_vox", ".vox", small_vox, plausible_voxels, "voxels/*.vox"),
     "obj": text_kind("read_obj", ".obj", small_obj, plausible_mesh),
     "qsm": text_kind("read_qsm", ".csv", small_qsm, plausible_tree, "voxels/tree_qsm.csv"),
+    "trajectory": text_kind("read_trajectory", ".csv", small_trajectory, plausible_trajectory),
     "grid": text_kind("read_dem", ".asc", small_grid, plausible_terrain, place=rf"{LINE}|.* x = .*, y = "),
     "tiff": FileKind("binary", "read_dem", ".tif", (small_tiff,), change_bytes, plausible_terrain),
     "spectrum": text_kind("read_spectrum_csv", ".csv", small_spectrum, plausible_spectrum),

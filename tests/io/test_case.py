@@ -70,6 +70,10 @@ EXAMPLES = {
     "Survey, of a scanner": jl.Survey(
         jl.Lidar(), RANDOM.random((3, 2)), gps_time=3.2e8 + RANDOM.random(3), scan_angle=RANDOM.random(3)
     ),
+    "Survey, sensors": jl.Survey(
+        jl.Lidar(), sensor=6e5 + RANDOM.random((3, 3)), zenith=100 / 3, gps_time=RANDOM.random(3)
+    ),
+    "Lidar, sensor": jl.Lidar(sensor=6e5 + RANDOM.random(3), zenith=400 / 3),
     "EqualAngle": with_ground(law=jl.EqualAngle()),
     "Lambertian": jl.Scene(plates=(jl.Plate(1.0, 0.1, law=jl.Lambertian()),)),
     "Specular": with_ground(law=jl.Specular(roughness=0.0123)),
@@ -143,7 +147,10 @@ def test_a_difference_of_one_bit_is_detected():
 def test_every_class_has_an_example():
     classes = {name for name, kind in kinds().items() if isinstance(kind, type)}
     # No lidar, survey or scene holds one of these: they make trees, surveys and the shapes of surfaces.
-    plants, scan_patterns = {"Habit", "Branching"}, {"Oscillating", "RotatingPolygon", "Conical"}
+    plants, scan_patterns = (
+        {"Habit", "Branching"},
+        {"Oscillating", "RotatingPolygon", "Conical", "Trajectory"},
+    )
     examples = {name.partition(",")[0] for name in EXAMPLES}
     assert classes - plants - scan_patterns - {"Plane"} == examples
 
@@ -376,6 +383,26 @@ def test_a_case_defines_a_survey_by_its_flight_line_and_scan_pattern(tmp_path):
         jl.io.Case(survey=case.survey).simulate()
     with pytest.raises(ValueError, match="without a survey"):
         jl.io.Case(jl.Lidar(), case.scene, case.key).simulate(path=tmp_path / "one.nc")
+
+
+FLIGHT = """
+[survey]
+kind = "Survey.fly"
+trajectory = {kind = "read_trajectory", path = "flight.csv"}
+scan = {kind = "Conical", half_angle = 20.0, frequency = 40.0}
+lidar = {altitude = 500}
+lever_arm = [1.0, 0.0, 0.0]
+"""
+
+
+def test_a_case_defines_a_survey_by_a_trajectory(tmp_path):
+    (tmp_path / "flight.csv").write_text("time,x,y,z,roll,pitch,yaw\n0,0,0,500,1,2,3\n1,0,60,500,1,2,3\n")
+    (tmp_path / "a.toml").write_text(FLIGHT)
+    flight = jl.Trajectory([0, 1], [(0, 0, 500), (0, 60, 500)], 1, 2, 3)
+    expected = jl.Survey.fly(
+        flight, jl.Conical(20.0, 40.0), lidar=jl.Lidar(altitude=500), lever_arm=(1, 0, 0)
+    )
+    assert same(jl.io.read_case(tmp_path / "a.toml").survey, expected)
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):

@@ -67,7 +67,7 @@ def test_a_raster_may_have_a_single_row_or_column(tmp_path, axis):
         ({"values": {"x": np.full(COUNT, np.inf)}}, ValueError, "values of 'x' = inf"),
         ({"crs": "EPSG:0"}, ValueError, "crs = 'EPSG:0' is not known"),
         ({"crs": 32632}, TypeError, "crs"),
-        ({"position": np.zeros((COUNT, 3))}, ValueError, r"position has the shape \(15, 3\)"),
+        ({"position": np.zeros((COUNT, 4))}, ValueError, r"position has the shape \(15, 4\)"),
         ({"position": np.zeros((COUNT, 2))}, ValueError, "position: shot 1 lies where another one does"),
         (
             {"position": SURVEY.position + np.array([[1.234, 0.0]]) * (np.arange(COUNT) == 7)[:, None]},
@@ -82,3 +82,21 @@ def test_bad_arguments_are_refused(tmp_path, monkeypatch, arguments, error, mess
     with pytest.raises(error, match=message):
         write_raster(**(good_arguments | arguments))
     assert list(tmp_path.iterdir()) == []
+
+
+def test_shots_anywhere_are_averaged_in_cells(tmp_path):
+    """Ground positions of a scanner: cells at multiples of the spacing, NaN left out."""
+    position = np.array(
+        [(10.5, 20.5, 3.0), (11.5, 21.9, 4.0), (13.0, 20.0, 5.0), (np.nan, np.nan, np.nan), (10.1, 23.0, 1.0)]
+    )
+    values = {"height": position[:, 2], "echo": np.array([1.0, np.nan, 2.0, 7.0, 3.0])}
+    write_raster(tmp_path / "a.tif", values, position, spacing=2.0)
+    with rasterio.open(tmp_path / "a.tif") as file:
+        assert (file.transform.c, file.transform.f, file.transform.a) == (10.0, 24.0, 2.0)
+        # Rows run from north to south.
+        np.testing.assert_array_equal(file.read(1), [[1.0, np.nan], [3.5, 5.0]])
+        np.testing.assert_array_equal(file.read(2), [[3.0, np.nan], [1.0, 2.0]])
+    with pytest.raises(ValueError, match="NaN for all"):
+        write_raster(tmp_path / "b.tif", {"a": [1.0]}, [(np.nan, np.nan)], spacing=1.0)
+    with pytest.raises(ValueError, match="makes 1e"):
+        write_raster(tmp_path / "b.tif", {"a": [1.0, 2.0]}, [(0.0, 0.0), (1e5, 1e5)], spacing=0.1)

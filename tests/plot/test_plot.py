@@ -175,6 +175,31 @@ def test_inadmissible_input_is_refused(wave, call, message):
         call(wave)
 
 
+def test_a_survey_is_drawn_where_its_beams_meet_the_terrain(axes):
+    """At 400 m above sea level an oblique beam meets the ground 400 tan(zenith) before its aim point."""
+    terrain = jl.Terrain(np.full((21, 21), 400.0), spacing=10.0, origin=(5e5 - 100.0, 5.2e6 - 100.0))
+    # The aim point lies 400 m east of where the beam meets the terrain.
+    survey = jl.Survey(
+        jl.Lidar(altitude=1000.0, divergence=20.0), [(5e5 + 400.0, 5.2e6)], zenith=45.0, azimuth=90.0
+    )
+    plot.survey(survey, jl.Scene(ground=terrain), axes)
+    (footprint,) = [c for c in axes.collections if hasattr(c, "_widths")]
+    np.testing.assert_allclose(footprint.get_offsets()[0], [5e5, 5.2e6], atol=0.01)
+    # 600 m of range per 1000 m: widths of the ellipse are in points of data, halved.
+    np.testing.assert_allclose(np.ravel(footprint._heights)[0], 0.6 * 1e-2 * 1000 * np.sqrt(2.0), rtol=1e-3)
+    assert len(axes.images) == 1
+    axes.figure.canvas.draw()
+    labels = [t.get_text() for t in axes.get_xticklabels()]
+    assert 2 <= len(labels) <= 7
+    assert all(len(label) == 6 and label.startswith(("4", "5")) for label in labels if label)
+    # Shots of sensors that meet no ground are drawn as their sensors.
+    sky = jl.Survey(jl.Lidar(), sensor=[(5.0, 6.0, 2.0)], zenith=150.0)
+    ax = Figure().subplots()
+    plot.survey(sky, jl.Scene(ground=jl.Ground()), ax)
+    np.testing.assert_allclose(ax.collections[0].get_offsets()[0], [5.0, 6.0])
+    assert plot.scene(jl.Scene(ground=jl.Ground()), sky[0], Figure().subplots()).lines
+
+
 def test_waveforms_of_a_survey_are_refused_with_what_to_draw():
     """Tests check annotations before the functions do; this is the check of all that draw one waveform."""
     survey = jl.Survey(jl.Lidar(), np.array([[0.0, 0.0], [5.0, 0.0]]))

@@ -121,6 +121,7 @@ def test_drift_and_height_offset_are_found(case, nodes, monkeypatch):
         ({"lidar": jl.Lidar(profile="top-hat")}, "profile"),
         ({"lidar": jl.Lidar(divergence=0.0)}, "divergence"),
         ({"zenith": [0.0, 5.0, 0.0]}, "zenith from 0 to 5"),
+        ({"altitude": [4e5, 4e5, 5e5]}, "at several altitudes"),
         ({"records": np.ones((2, 9))}, "2 shots and survey 3"),
         ({"position": [(500.0, 0.0)] * 3}, "off the terrain"),
     ],
@@ -130,7 +131,8 @@ def test_inadmissible_arguments_are_refused(changes, message):
         k: v for k, v in changes.items() if k in ("noise", "height", "search_radius")
     }
     position = changes.get("position", np.zeros((3, 2)))
-    survey = jl.Survey(changes.get("lidar", LIDAR), position, changes.get("zenith"))
+    place = {name: changes.get(name) for name in ("zenith", "altitude")}
+    survey = jl.Survey(changes.get("lidar", LIDAR), position, **place)
     records = changes.get("records", np.ones((3, 9)))
     with pytest.raises(ValueError, match=message):
         inversion.geolocate(records, survey, ridges(), **arguments)

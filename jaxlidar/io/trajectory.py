@@ -1,0 +1,212 @@
+"""Reader of trajectories: tables of position and attitude, as inertial navigation systems export them."""
+
+import os
+import re
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxlidar.instrument.trajectory import Trajectory
+from jaxlidar.io.checks import MAX_COORDINATE
+from jaxlidar.io.coordinates import metric_system, unit_angle, unit_length
+from jaxlidar.io.text import parse_number, read_lines, split_cells
+
+# Names of columns in files, without case, spaces, underscores and units.
+_NAMES = {
+    "time": (
+        "time",
+        "gpstime",
+        "gpsseconds",
+        "gpstimesow",
+        "timesow",
+        "sow",
+        "utctime",
+        "utcseconds",
+        "secofweek",
+    ),
+    "x": ("x", "easting", "east", "e"),
+    "y": ("y", "northing", "north", "n"),
+    "z": ("z", "height", "altitude", "alt", "elevation", "hell", "hellip", "hmsl", "ellipsoidheight", "h"),
+    "longitude": ("longitude", "lon", "long", "lng"),
+    "latitude": ("latitude", "lat"),
+    "roll": ("roll", "phi"),
+    "pitch": ("pitch", "theta"),
+    "yaw": ("yaw", "heading", "trueheading", "azimuth", "psi", "hdg"),
+}
+_REQUIRED = ("time", "z")
+# Units of times by their names in a header, in s.
+_SECONDS = {"": 1.0, "s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
+_SECONDS |= {"sow": 1.0, "gps": 1.0, "utc": 1.0}
+_NAME_AND_UNIT = re.compile(r"\s*(.*?)\s*([\[(][^\])]*[\])])?\s*$")
+# Half the length, m, of the line along the grid's north whose true direction is taken.
+_HALF_BASELINE = 50.0
+
+
+class _Column(NamedTuple):
+    """A column of the table: its index, its name in the file, and its unit in units of the trajectory."""
+
+    index: int
+    name: str
+    unit: float
+
+
+def read_trajectory(path: str | os.PathLike[str], *, crs: str | None = None) -> Trajectory:
+    r"""Read the trajectory of a platform from a table with one row for each time.
+
+    **Arguments:**
+
+    - `path`: a text file of comma-, semicolon-, tab- or space-separated values. Its first line that does not
+      open with "#", or else the last one that does, names the columns, in any order and case, with spaces or
+      underscores, and with a unit in brackets where it is not the usual one: time (also GPSTime, SOW) in s;
+      x or easting, y or northing, and z, height or altitude in m; roll, pitch, and yaw or heading in
+      degrees. Further columns are not read. Without roll and pitch these are zero; without yaw the platform
+      heads along its course.
+    - `crs`: a map's coordinate reference system in metres, such as "EPSG:32633". Columns longitude and
+      latitude, on WGS 84, are projected to it, and headings, which are from true north, turned to the map's.
+      Default None: the file has x and y.
+
+    **Returns:** a `Trajectory`, in the sense of roll, pitch and yaw that it states.
+
+    **Raises:** FileNotFoundError where there is no such file. ValueError, naming the file and the line, for
+    columns that are missing, or that several columns may be; longitude and latitude without `crs`, and `crs`
+    without these; units that are not known; rows of another length, and cells that are not finite numbers;
+    coordinates that are not on Earth; and what a `Trajectory` refuses. ImportError where `crs` is given and
+    `rasterio`, of the extra `io`, is not installed.
+
+    **Example:**
+
+    >>> import pathlib, tempfile
+    >>> import jaxlidar.io
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "flight.csv"
+    >>> _ = path.write_text("GPSTime (s),Easting,Northing,Height,Roll,Pitch,Heading\n10,5,6,700,1,-2,90\n")
+    >>> flight = jaxlidar.io.read_trajectory(path)
+    >>> flight.position.tolist(), flight.yaw.tolist()
+    ([[5.0, 6.0, 700.0]], [90.0])
+    """
+    path, lines = read_lines(path)
+    head, delimiter, columns = _header(path, lines)
+    location, n_columns = f"{path}: line {head + 1}", len(_cells(path, head + 1, lines[head], delimiter))
+    is_geographic = "longitude" in columns
+    if is_geographic and crs is None:
+        raise ValueError(f"{location}: longitude and latitude; give crs, the map that they are projected to")
+    if crs is not None and not is_geographic:
+        raise ValueError(f"{location}: crs is given, but the columns are x and y; admissible is crs = None")
+    rows, numbers = [], []
+    for number, text in enumerate(lines[head + 1 :], head + 2):
+        if not text.strip() or text.lstrip().startswith("#"):
+            continue
+        cells = split_cells(path, number, text, delimiter, n_columns)
+        rows.append([_value(path, number, column, cells) for column in columns.values()])
+        numbers.append(number)
+    if not rows:
+        raise ValueError(f"{path}: line {len(lines)}: there is no row in the file")
+    values = dict(zip(columns, np.array(rows).T))
+    for name in ("x", "y", "z"):
+        if name in values and np.any(np.abs(values[name]) > MAX_COORDINATE):
+            row = int(np.argmax(np.abs(values[name]) > MAX_COORDINATE))
+            raise ValueError(f"{path}: line {numbers[row]}: {name} lies beyond {MAX_COORDINATE:g} m")
+    turn = 0.0
+    if is_geographic:
+        assert crs is not None
+        values["x"], values["y"], turn = _projected(path, crs, values["longitude"], values["latitude"])
+    yaw = values["yaw"] - turn if "yaw" in values else None
+    position = np.stack([values[axis] for axis in "xyz"], axis=-1)
+    try:
+        return Trajectory(values["time"], position, values.get("roll", 0.0), values.get("pitch", 0.0), yaw)
+    except ValueError as error:
+        raise ValueError(f"{path}: line {numbers[0]} and following: {error}") from error
+
+
+def _header(path: Path, lines: list[str]) -> tuple[int, str, dict[str, _Column]]:
+    """Return the index of the line that names the columns, the delimiter, and the columns in use."""
+    data = [i for i, line in enumerate(lines) if line.strip() and not line.lstrip().startswith("#")]
+    if not data:
+        raise ValueError(f"{path}: line 1: there is no row in the file")
+    head = data[0]
+    # A table may name its columns in a comment: then the first other line has numbers alone.
+    if head > 0 and re.fullmatch(r"[-+\d.eE,;\s]+", lines[head]):
+        head -= 1
+        lines[head] = lines[head].lstrip().lstrip("#")
+    delimiter = max(",;\t ", key=lambda d: (lines[head].count(d) > 0, d != " ", lines[head].count(d)))
+    names = [_NAME_AND_UNIT.match(cell) for cell in _cells(path, head + 1, lines[head], delimiter)]
+    columns = {}
+    for quantity, known_names in _NAMES.items():
+        matches = [
+            (i, match[0].strip(), match[2])
+            for i, match in enumerate(names)
+            if match is not None and re.sub(r"[\s_\-.]", "", match[1].lower()) in known_names
+        ]
+        if len(matches) > 1:
+            raise ValueError(
+                f"{path}: line {head + 1}: {quantity} may be any of the columns "
+                f"{', '.join(repr(name) for _, name, _ in matches)}; rename all but one"
+            )
+        if matches:
+            index, name, unit = matches[0]
+            columns[quantity] = _Column(index, name, _unit(f"{path}: line {head + 1}", quantity, name, unit))
+    _check_columns(f"{path}: line {head + 1}", columns)
+    return head, delimiter, columns
+
+
+def _cells(path: Path, line: int, text: str, delimiter: str) -> list[str]:
+    """Return the names of the columns; those apart by spaces have none, and units are names' own."""
+    return split_cells(path, line, re.sub(r"\s+(?=[\[(])", "", text) if delimiter == " " else text, delimiter)
+
+
+def _check_columns(location: str, columns: dict[str, _Column]) -> None:
+    """Refuse columns that are missing, and coordinates of two kinds."""
+    pairs = [pair for pair in (("x", "y"), ("longitude", "latitude")) if set(pair) & set(columns)]
+    if len(pairs) > 1:
+        raise ValueError(f"{location}: columns of a map and longitude and latitude; remove one pair")
+    required = (*_REQUIRED, *(pairs[0] if pairs else ("x", "y")))
+    # One angle of an attitude is not an attitude; heading alone is.
+    if ("roll" in columns) != ("pitch" in columns):
+        required += ("roll", "pitch")
+    for quantity in required:
+        if quantity not in columns:
+            raise ValueError(
+                f"{location}: no column {quantity}; its name may be {', '.join(_NAMES[quantity])}"
+            )
+
+
+def _unit(location: str, quantity: str, name: str, unit: str | None) -> float:
+    """Return the size of a column's unit in m, degrees or s."""
+    if quantity in ("x", "y", "z"):
+        return unit_length(f"{location}: {quantity}", unit) or 1.0
+    if quantity != "time":
+        return float(np.rad2deg(unit_angle(f"{location}: {quantity}", unit) or np.deg2rad(1.0)))
+    text = (unit or "").strip("[]() ").lower()
+    if text not in _SECONDS:
+        admissible = ", ".join(filter(None, _SECONDS))
+        raise ValueError(f"{location}: {name!r} is in the unknown unit {text!r}; admissible are {admissible}")
+    return _SECONDS[text]
+
+
+def _value(path: Path, line: int, column: _Column, cells: list[str]) -> float:
+    value = parse_number(path, line, column.name, cells[column.index]) * column.unit
+    if not np.isfinite(value):
+        raise ValueError(f"{path}: line {line}: {column.name} is not finite")
+    return value
+
+
+def _projected(
+    path: Path, crs: str, longitude: Float[np.ndarray, " n"], latitude: Float[np.ndarray, " n"]
+) -> tuple[Any, Any, Any]:
+    """Return x and y on a map, m, and the direction of its north in degrees clockwise from true north."""
+    from rasterio.warp import transform
+
+    projection = metric_system("crs", crs).crs
+    for name, values, limit in (("longitude", longitude, 360.0), ("latitude", latitude, 90.0)):
+        if np.any(np.abs(values) > limit):
+            raise ValueError(
+                f"{path}: {name} = {values[np.abs(values) > limit][0]:g} is outside [-{limit:g}, {limit:g}]"
+            )
+    x, y = map(np.array, transform("EPSG:4326", projection, longitude, latitude))
+    if not np.all(np.isfinite(x) & np.isfinite(y)):
+        raise ValueError(f"{path}: a position lies outside the projection {crs}")
+    ends = [transform(projection, "EPSG:4326", x, y + side * _HALF_BASELINE) for side in (-1.0, 1.0)]
+    (west, south), (east, north) = (map(np.array, end) for end in ends)
+    eastward = (np.remainder(east - west + 180.0, 360.0) - 180.0) * np.cos(np.deg2rad(latitude))
+    return x, y, np.rad2deg(np.arctan2(eastward, north - south))
