@@ -1,0 +1,230 @@
+r"""Cotangents of extinction at orders two and above: photons are traced twice more, from the same random numbers.
+
+Extinction does not move paths: points of collision are held at fractions of their chord through a voxel, and
+everything else is drawn from detached densities (`jaxlidar.trace.photons`). It acts through the weights alone.
+With the cotangents y of the response, let D be the deposits of a photon times y. The derivative of each with
+respect to the extinction k_v of voxel v is (`jaxlidar.trace.score_functions`)
+
+    D * (number of collisions in v / k_v  -  length in v,  of the path up to the deposit and of its return).
+
+Hence a flight and its collision count with the sum of all deposits from there on:
+
+1. The first walk sums the deposits D of every photon, S.
+2. In the second walk, S less what has been deposited so far is what lies ahead. The depth of a flight is
+   marched once more, and each voxel on the way gets minus the length in it times that; the voxel of the
+   collision gets it over its extinction, and voxels along return paths minus their lengths times D.
+
+A flight has several ends. Each counts with its own deposit, and the selected one with what lies ahead, too. The
+state of a photon is all that is stored (path replay backpropagation; Vicini, Speierer and Jakob 2021, ACM
+Trans. Graph. 40, 108). Photons never collide where extinction is zero: such voxels get the lengths alone.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int, UInt32
+
+from jaxlidar._vectors import FAR, Scalar, Vec
+from jaxlidar.trace.device_scene import DeviceScene
+from jaxlidar.trace.higher_orders import (
+    FlightEnds,
+    FlownPhotons,
+    HigherOrderTally,
+    Lanes,
+    PhotonBatch,
+    collide_at_ends,
+    deposit_ends,
+    empty_tally,
+    fly,
+    scatter,
+)
+from jaxlidar.trace.random_numbers import PhotonDraws
+from jaxlidar.trace.replay import ExtinctionTables
+from jaxlidar.trace.voxel_traversal import Medium, march_to_depths, voxel_above
+
+
+def pull_back_higher_orders(
+    scene: DeviceScene, words: UInt32[Array, "words"], cotangent: HigherOrderTally
+) -> ExtinctionTables:
+    """Pull cotangents of the result of `trace_photons` back to the extinction of every voxel.
+
+    Returns alone have derivatives; the energy budget has none (`jaxlidar.trace.tally_index`). For each group of
+    photons:
+
+    1. Sum the deposits of every photon, times their cotangents.
+    2. Trace the same photons again, and add to the voxels.
+    """
+    medium, bins = scene.medium, scene.bins
+    assert medium is not None
+    batch, empty = PhotonBatch(scene, words), empty_tally(scene)
+    padded = jax.ShapeDtypeStruct(empty.weights.shape, empty.weights.dtype)
+    # Trimming is linear: its transpose is applied once, to the cotangents.
+    (of_returns,) = jax.linear_transpose(bins.trim, padded)((cotangent.weights, cotangent.outside))
+
+    def trace_group(total: ExtinctionTables, group: UInt32[Array, ""]) -> tuple[ExtinctionTables, None]:
+        first_lane = batch.first_lane(group)
+
+        def number_in_group(lanes: Lanes) -> Int[Array, "photons"]:
+            return (lanes.lane - first_lane).astype(jnp.int32)
+
+        def sum_deposits(in_chunk: Lanes, sums: Array, draws: PhotonDraws, order: Array):
+            flown, _ = fly(scene, in_chunk.photons, empty, draws, order)
+            deposits = jnp.sum(
+                _deposits(scene, flown, collide_at_ends(scene, flown), of_returns, order), axis=0
+            )
+            p, _ = scatter(scene, flown, empty)
+            return Lanes(in_chunk.lane, p), sums.at[number_in_group(in_chunk)].add(deposits)
+
+        def add_to_voxels(in_chunk: Lanes, state: tuple, draws: PhotonDraws, order: Array):
+            tables, ahead = state
+            flown, _ = fly(scene, in_chunk.photons, empty, draws, order)
+            ends, number = collide_at_ends(scene, flown), number_in_group(in_chunk)
+            deposits = _deposits(scene, flown, ends, of_returns, order)
+            p, _ = scatter(scene, flown, empty)
+            before = ahead.at[number].get(mode="promise_in_bounds")
+            # Nothing lies ahead of a photon that has ended; rounding would leave a little.
+            after = jnp.where(p.alive, before - jnp.sum(deposits, axis=0), 0.0)
+            numbers = jnp.arange(len(deposits))[:, None]
+            from_ends_on = deposits + jnp.where(numbers == flown.selected[None], after[None], 0.0)
+            tables = _add_flights(scene, medium, tables, flown, from_ends_on)
+            tables = _add_collisions(scene, medium, tables, ends, from_ends_on.reshape(-1))
+            tables = lax.cond(
+                order > 0,
+                lambda t: _add_return_paths(scene, medium, t, ends, deposits.reshape(-1)),
+                lambda t: t,
+                tables,
+            )
+            ahead = ahead.at[number].set(after, mode="promise_in_bounds")
+            return Lanes(in_chunk.lane, p), (tables, ahead)
+
+        lanes = batch.send(group)
+        nothing = jnp.zeros((batch.group_size,), of_returns.dtype)
+        _, ahead = batch.trace_orders(lanes, nothing, sum_deposits)
+        _, (total, _) = batch.trace_orders(lanes, (total, ahead), add_to_voxels)
+        return total, None
+
+    zero = jax.tree.map(jnp.zeros_like, ExtinctionTables.of(scene))
+    return lax.scan(trace_group, zero, jnp.arange(batch.n_groups, dtype=jnp.uint32))[0]
+
+
+def _deposits(
+    scene: DeviceScene,
+    flown: FlownPhotons,
+    ends: FlightEnds,
+    of_returns: Float[Array, "materials entries padded"],
+    order: Int[Array, ""],
+) -> Float[Array, "ends photons"]:
+    """Return the deposits of every end, times the cotangents of returns; none at order one."""
+
+    def of_order_two_on() -> Float[Array, "ends photons"]:
+        def deposited(weight: Scalar) -> Array:
+            return deposit_ends(scene, ends, weight, None, empty_tally(scene)).weights
+
+        weight = flown.weight.reshape(-1)
+        # Deposits are linear in weights: the transpose looks the cotangents up where a deposit would be made.
+        _, pull = jax.vjp(deposited, weight)
+        return (weight * pull(of_returns)[0]).reshape(flown.weight.shape)
+
+    return lax.cond(order > 0, of_order_two_on, lambda: jnp.zeros_like(flown.weight))
+
+
+class _LengthsInVoxels(NamedTuple):
+    """Sums over segments, as `march_to_depths` takes them: lengths times amounts, subtracted from voxels.
+
+    - `w`: direction of the rays. `amounts`: one for each end of a ray.
+    """
+
+    medium: Medium
+    tables: ExtinctionTables
+    w: Vec
+    amounts: Float[Array, "ends photons"]
+
+    def empty(self, ends: int, like: Float[Array, "photons"]) -> ExtinctionTables:
+        """Return the sums before the first segment."""
+        return self.tables
+
+    def add_segment(
+        self,
+        sums: ExtinctionTables,
+        cell: Int[Array, "photons"],
+        length: Float[Array, "ends photons"],
+        projection_factor: Float[Array, "photons"] | None,
+    ) -> ExtinctionTables:
+        """Add a segment; `length`, m, of it lies before each end."""
+        return sums.add_total(self.medium, cell, self.w, -jnp.sum(self.amounts * length, axis=0))
+
+
+def _add_flights(
+    scene: DeviceScene,
+    medium: Medium,
+    tables: ExtinctionTables,
+    flown: FlownPhotons,
+    amounts: Float[Array, "ends photons"],
+) -> ExtinctionTables:
+    """Subtract, in each voxel that flights cross, the length up to each end times the amount of that end."""
+    p = flown.p
+    max_distance = jnp.minimum(flown.encounters.nearest_stop, flown.max_length)
+    counts = p.alive & jnp.any(amounts != 0.0, axis=0)
+    return march_to_depths(
+        medium,
+        p.x,
+        p.w,
+        -jnp.log(flown.u),
+        max_distance,
+        counts,
+        scene.config.max_faces,
+        scene.occupied_box,
+        sums=_LengthsInVoxels(medium, tables, p.w, amounts),
+    ).segment_sums
+
+
+def _add_collisions(
+    scene: DeviceScene, medium: Medium, tables: ExtinctionTables, ends: FlightEnds, amounts: Scalar
+) -> ExtinctionTables:
+    """Add amounts over the extinction of the material that was hit, in the voxels of collisions."""
+    cell, collision = ends.flights.cell, ends.collision
+    in_voxel = ends.flights.collided & (collision.surface < 0)
+
+    def over_extinction(table: Array | None, is_material: Bool[Array, "ends"]) -> Scalar | None:
+        if table is None:
+            return None
+        k = table.at[cell].get(mode="promise_in_bounds")
+        counts = in_voxel & is_material & (k > 0.0)
+        return jnp.where(counts, amounts / jnp.where(counts, k, 1.0), 0.0)
+
+    config = scene.config
+    by_material = [
+        None if scatterer is None else over_extinction(table, collision.material == scatterer.material)
+        for table, scatterer in ((medium.leaf, config.leaf), (medium.bark, config.bark))
+    ]
+    # The tables themselves: a factor of direction cancels in dk / k.
+    return tables.add_tables(cell, by_material[0], by_material[1])
+
+
+def _add_return_paths(
+    scene: DeviceScene, medium: Medium, tables: ExtinctionTables, ends: FlightEnds, deposits: Scalar
+) -> ExtinctionTables:
+    """Subtract deposits times lengths in the voxels along their return paths.
+
+    At nadir, they are subtracted from the table of depths straight up, whose own derivative goes on to voxels.
+    """
+    if scene.depth_above is not None:
+        cell, above, inside = voxel_above(medium, ends.x)
+        amounts = jnp.where(inside, -deposits, 0.0)
+        up = (jnp.zeros_like(above), jnp.zeros_like(above), jnp.ones_like(above))
+        tables = tables.add_depth_above(cell, amounts)
+        return tables.add_total(medium, cell, up, amounts * above * medium.size[2])
+    v = scene.beam.view(ends.x)
+    no_targets, to_end = jnp.zeros((0, deposits.size)), jnp.full_like(deposits, FAR)
+    return march_to_depths(
+        medium,
+        ends.x,
+        v,
+        no_targets,
+        to_end,
+        deposits != 0.0,
+        scene.config.max_faces,
+        sums=_LengthsInVoxels(medium, tables, v, deposits[None]),
+    ).segment_sums
