@@ -1,8 +1,8 @@
-r"""Cotangents of extinction at orders two and above: photons are traced twice more, from the same random numbers.
+r"""Cotangents of extinction at orders two and above: photons are traced twice more.
 
 Extinction does not move paths: points of collision are held at fractions of their chord through a voxel, and
-everything else is drawn from detached densities (`jaxlidar.trace.photons`). It acts through the weights alone.
-With the cotangents y of the response, let D be the deposits of a photon times y. The derivative of each with
+everything else is drawn from detached densities (`jaxlidar.trace.photons`). It acts on weights alone. With
+the cotangents y of the response, let D be the deposits of a photon times y. The derivative of each with
 respect to the extinction k_v of voxel v is (`jaxlidar.trace.score_functions`)
 
     D * (number of collisions in v / k_v  -  length in v,  of the path up to the deposit and of its return).
@@ -10,12 +10,13 @@ respect to the extinction k_v of voxel v is (`jaxlidar.trace.score_functions`)
 Hence a flight and its collision count with the sum of all deposits from there on:
 
 1. The first walk sums the deposits D of every photon, S.
-2. In the second walk, S less what has been deposited so far is what lies ahead. The depth of a flight is
-   marched once more, and each voxel on the way gets minus the length in it times that; the voxel of the
-   collision gets it over its extinction, and voxels along return paths minus their lengths times D.
+2. In the second walk, from the same random numbers, S less what has been deposited so far is what lies
+   ahead. The depth of a flight is marched once more, and each voxel on the way gets minus the length in it
+   times that; the voxel of the collision gets it over its extinction, and voxels along return paths minus
+   their lengths times D.
 
-A flight has several ends. Each counts with its own deposit, and the selected one with what lies ahead, too. The
-state of a photon is all that is stored (path replay backpropagation; Vicini, Speierer and Jakob 2021, ACM
+A flight has several ends. Each counts with its own deposit, and the selected one with what lies ahead, too.
+The state of a photon is all that is stored (path replay backpropagation; Vicini, Speierer and Jakob 2021, ACM
 Trans. Graph. 40, 108). Photons never collide where extinction is zero: such voxels get the lengths alone.
 """
 
@@ -50,8 +51,8 @@ def pull_back_higher_orders(
 ) -> ExtinctionTables:
     """Pull cotangents of the result of `trace_photons` back to the extinction of every voxel.
 
-    Returns alone have derivatives; the energy budget has none (`jaxlidar.trace.tally_index`). For each group of
-    photons:
+    Returns alone have derivatives; the energy budget has none (`jaxlidar.trace.tally_index`). For each group
+    of photons:
 
     1. Sum the deposits of every photon, times their cotangents.
     2. Trace the same photons again, and add to the voxels.
@@ -69,44 +70,50 @@ def pull_back_higher_orders(
         def number_in_group(lanes: Lanes) -> Int[Array, "photons"]:
             return (lanes.lane - first_lane).astype(jnp.int32)
 
-        def sum_deposits(in_chunk: Lanes, sums: Array, draws: PhotonDraws, order: Array):
-            flown, _ = fly(scene, in_chunk.photons, empty, draws, order)
-            deposits = jnp.sum(
-                _deposits(scene, flown, collide_at_ends(scene, flown), of_returns, order), axis=0
-            )
-            p, _ = scatter(scene, flown, empty)
-            return Lanes(in_chunk.lane, p), sums.at[number_in_group(in_chunk)].add(deposits)
-
-        def add_to_voxels(in_chunk: Lanes, state: tuple, draws: PhotonDraws, order: Array):
-            tables, ahead = state
+        def trace_chunk(in_chunk: Lanes, state: _Walk, draws: PhotonDraws, order: Array):
             flown, _ = fly(scene, in_chunk.photons, empty, draws, order)
             ends, number = collide_at_ends(scene, flown), number_in_group(in_chunk)
             deposits = _deposits(scene, flown, ends, of_returns, order)
             p, _ = scatter(scene, flown, empty)
-            before = ahead.at[number].get(mode="promise_in_bounds")
+            in_order = jnp.sum(deposits, axis=0)
+            before = state.ahead.at[number].get(mode="promise_in_bounds")
             # Nothing lies ahead of a photon that has ended; rounding would leave a little.
-            after = jnp.where(p.alive, before - jnp.sum(deposits, axis=0), 0.0)
-            numbers = jnp.arange(len(deposits))[:, None]
-            from_ends_on = deposits + jnp.where(numbers == flown.selected[None], after[None], 0.0)
-            tables = _add_flights(scene, medium, tables, flown, from_ends_on)
-            tables = _add_collisions(scene, medium, tables, ends, from_ends_on.reshape(-1))
-            tables = lax.cond(
-                order > 0,
-                lambda t: _add_return_paths(scene, medium, t, ends, deposits.reshape(-1)),
-                lambda t: t,
-                tables,
-            )
-            ahead = ahead.at[number].set(after, mode="promise_in_bounds")
-            return Lanes(in_chunk.lane, p), (tables, ahead)
+            after = jnp.where(p.alive, before - in_order, 0.0)
 
-        lanes = batch.send(group)
+            def add(tables: ExtinctionTables) -> ExtinctionTables:
+                numbers = jnp.arange(len(deposits))[:, None]
+                from_end_on = deposits + jnp.where(numbers == flown.selected[None], after[None], 0.0)
+                tables = _add_flights(scene, medium, tables, flown, from_end_on)
+                tables = _add_collisions(scene, medium, tables, ends, from_end_on.reshape(-1))
+                return _add_return_paths(scene, medium, tables, ends, deposits.reshape(-1))
+
+            tables = lax.cond(state.is_second, add, lambda tables: tables, state.tables)
+            ahead = jnp.where(state.is_second, after, before + in_order)
+            ahead = state.ahead.at[number].set(ahead, mode="promise_in_bounds")
+            return Lanes(in_chunk.lane, p), _Walk(state.is_second, tables, ahead)
+
+        def walk(state: tuple[ExtinctionTables, Array], is_second: Bool[Array, ""]):
+            _, end = batch.trace_orders(batch.send(group), _Walk(is_second, *state), trace_chunk)
+            return (end.tables, end.ahead), None
+
         nothing = jnp.zeros((batch.group_size,), of_returns.dtype)
-        _, ahead = batch.trace_orders(lanes, nothing, sum_deposits)
-        _, (total, _) = batch.trace_orders(lanes, (total, ahead), add_to_voxels)
-        return total, None
+        # One loop for both walks: what they share is compiled once.
+        return lax.scan(walk, (total, nothing), jnp.asarray([False, True]))[0][0], None
 
     zero = jax.tree.map(jnp.zeros_like, ExtinctionTables.of(scene))
     return lax.scan(trace_group, zero, jnp.arange(batch.n_groups, dtype=jnp.uint32))[0]
+
+
+class _Walk(NamedTuple):
+    """The state of a walk. `is_second`: True for the walk that adds to the tables.
+
+    `ahead`: for each photon of the group, the deposits of the first walk so far, and those that lie ahead in
+    the second.
+    """
+
+    is_second: Bool[Array, ""]
+    tables: ExtinctionTables
+    ahead: Float[Array, "photons"]
 
 
 def _deposits(
@@ -131,9 +138,10 @@ def _deposits(
 
 
 class _LengthsInVoxels(NamedTuple):
-    """Sums over segments, as `march_to_depths` takes them: lengths times amounts, subtracted from voxels.
+    """Sums over segments, as `march_to_depths` takes them: amounts times lengths, subtracted from voxels.
 
-    - `w`: direction of the rays. `amounts`: one for each end of a ray.
+    - `tables`: to which these are added. `w`: direction of the rays.
+    - `amounts`: one for each end of a ray.
     """
 
     medium: Medium
@@ -142,7 +150,7 @@ class _LengthsInVoxels(NamedTuple):
     amounts: Float[Array, "ends photons"]
 
     def empty(self, ends: int, like: Float[Array, "photons"]) -> ExtinctionTables:
-        """Return the sums before the first segment."""
+        """Return the tables before the first segment."""
         return self.tables
 
     def add_segment(
@@ -208,7 +216,8 @@ def _add_return_paths(
 ) -> ExtinctionTables:
     """Subtract deposits times lengths in the voxels along their return paths.
 
-    At nadir, they are subtracted from the table of depths straight up, whose own derivative goes on to voxels.
+    At nadir, they are subtracted from the table of depths straight up, whose own derivative goes on to
+    voxels.
     """
     if scene.depth_above is not None:
         cell, above, inside = voxel_above(medium, ends.x)
