@@ -85,10 +85,6 @@ class ExtinctionSlopes(eqx.Module):
             total = total + term
         return total
 
-    def empty(self, ends: int, like: Float[Array, "photons"]) -> Float[Array, "ends parameters photons"]:
-        """Return derivatives of depths before the first segment, for so many ends of each ray."""
-        return jnp.zeros((ends, self.count, *like.shape), like.dtype)
-
     def add_segment(
         self,
         depth_slopes: Float[Array, "ends parameters photons"],

@@ -158,9 +158,9 @@ def sample_flights(
             scene.config.max_faces,
             scene.occupied_box,
             reverse=scene.reverse,
-            sums=scene.slopes,
+            slopes=scene.slopes,
         )
-        collided, cell, depth_slopes = crossing.crossed, crossing.cell, crossing.segment_sums
+        collided, cell, depth_slopes = crossing.crossed, crossing.cell, crossing.depth_slopes
         # Looked up again rather than carried through the march, whose loop takes most of the time.
         k = jnp.where(collided, jax.vmap(medium.extinction, (0, None))(cell, p.w), 1.0)
         chord = jnp.where(collided, crossing.chord, 1.0)

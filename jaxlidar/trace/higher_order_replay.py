@@ -27,7 +27,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
-from jaxlidar._vectors import FAR, Scalar, Vec
+from jaxlidar._one_function import once
+from jaxlidar._vectors import Scalar, Vec
 from jaxlidar.trace.device_scene import DeviceScene
 from jaxlidar.trace.higher_orders import (
     FlightEnds,
@@ -43,7 +44,16 @@ from jaxlidar.trace.higher_orders import (
 )
 from jaxlidar.trace.random_numbers import PhotonDraws
 from jaxlidar.trace.replay import ExtinctionTables
-from jaxlidar.trace.voxel_traversal import Medium, march_to_depths, voxel_above
+from jaxlidar.trace.voxel_traversal import (
+    Medium,
+    VoxelRay,
+    cell_index,
+    enter_grid,
+    maximum,
+    minimum,
+    step_voxel,
+    voxel_above,
+)
 
 
 def pull_back_higher_orders(
@@ -83,11 +93,13 @@ def pull_back_higher_orders(
             def add(tables: ExtinctionTables) -> ExtinctionTables:
                 numbers = jnp.arange(len(deposits))[:, None]
                 from_end_on = deposits + jnp.where(numbers == flown.selected[None], after[None], 0.0)
-                tables = _add_flights(scene, medium, tables, flown, from_end_on)
+                tables = _subtract_flights(scene, medium, tables, flown, from_end_on)
                 tables = _add_collisions(scene, medium, tables, ends, from_end_on.reshape(-1))
-                return _add_return_paths(scene, medium, tables, ends, deposits.reshape(-1))
+                return _subtract_return_paths(scene, medium, tables, ends, deposits.reshape(-1))
 
-            tables = lax.cond(state.is_second, add, lambda tables: tables, state.tables)
+            # A loop of one step or none: compilers update its state in place, where `cond` would copy the map.
+            n_steps = state.is_second.astype(jnp.int32)
+            tables = lax.fori_loop(0, n_steps, lambda _, tables: add(tables), state.tables)
             ahead = jnp.where(state.is_second, after, before + in_order)
             ahead = state.ahead.at[number].set(ahead, mode="promise_in_bounds")
             return Lanes(in_chunk.lane, p), _Walk(state.is_second, tables, ahead)
@@ -137,55 +149,84 @@ def _deposits(
     return lax.cond(order > 0, of_order_two_on, lambda: jnp.zeros_like(flown.weight))
 
 
-class _LengthsInVoxels(NamedTuple):
-    """Sums over segments, as `march_to_depths` takes them: amounts times lengths, subtracted from voxels.
+class _March(NamedTuple):
+    """State of the march of rays that subtract from voxels.
 
-    - `tables`: to which these are added. `w`: direction of the rays.
-    - `amounts`: one for each end of a ray.
+    - `distance`, `depth`: length, m, and optical depth up to here. `voxel`: the voxel ahead.
+    - `running`: False for rays that have stopped. `n_steps`: steps so far.
     """
 
-    medium: Medium
+    distance: Float[Array, "photons"]
+    depth: Float[Array, "photons"]
+    voxel: tuple[Int[Array, "photons"], ...]
+    running: Bool[Array, "photons"]
+    n_steps: Int[Array, ""]
     tables: ExtinctionTables
-    w: Vec
-    amounts: Float[Array, "ends photons"]
-
-    def empty(self, ends: int, like: Float[Array, "photons"]) -> ExtinctionTables:
-        """Return the tables before the first segment."""
-        return self.tables
-
-    def add_segment(
-        self,
-        sums: ExtinctionTables,
-        cell: Int[Array, "photons"],
-        length: Float[Array, "ends photons"],
-        projection_factor: Float[Array, "photons"] | None,
-    ) -> ExtinctionTables:
-        """Add a segment; `length`, m, of it lies before each end."""
-        return sums.add_total(self.medium, cell, self.w, -jnp.sum(self.amounts * length, axis=0))
 
 
-def _add_flights(
+def _subtract_lengths(
+    scene: DeviceScene,
+    tables: ExtinctionTables,
+    ray: VoxelRay,
+    w: Vec,
+    targets: Float[Array, "ends photons"],
+    amounts: Float[Array, "ends photons"],
+    max_length: Float[Array, "photons"],
+) -> ExtinctionTables:
+    """Subtract, in each voxel on rays, the length up to each end of a ray times the amount of that end.
+
+    Rays are marched as by `march_to_depths`, without what that finds at their ends. Each step:
+
+    1. Find the nearest face, or the end of the ray, and look up the extinction of the voxel.
+    2. For every end: the length in the voxel as far as the depth of its target.
+    3. Subtract the sum of these lengths times amounts, and go on to the next voxel.
+
+    **Arguments:** `targets`: optical depths of the ends; infinite where all of a ray counts.
+    """
+    medium = scene.medium
+    assert medium is not None
+    end, largest = minimum(ray.leave, max_length), jnp.max(targets, axis=0)
+
+    def step(state: _March) -> _March:
+        distance, depth, voxel, running, n_steps, tables = state
+        faces = ray.face_distances(voxel)
+        to = maximum(distance, minimum(end, minimum(minimum(faces[0], faces[1]), faces[2])))
+        cell = cell_index(medium, voxel)
+        k = medium.extinction(cell, w)
+        to, cell, k = once((to, cell, k))
+        length = jnp.where(running, to - distance, 0.0)
+        to_targets = jnp.clip((targets - depth) / jnp.maximum(k, 1e-30), 0.0, length)
+        tables = tables.add_total(medium, cell, w, -jnp.sum(amounts * to_targets, axis=0))
+        next_depth = depth + k * length
+        goes_on = running & (next_depth <= largest) & (to < end)
+        next_voxel = step_voxel(ray, voxel, faces, to)
+        # The voxel of a ray that has stopped does not matter.
+        distance = jnp.where(running, to, distance)
+        return _March(distance, next_depth, next_voxel, goes_on, n_steps + 1, tables)
+
+    def continue_(state: _March) -> Bool[Array, ""]:
+        return jnp.any(state.running) & (state.n_steps < scene.config.max_faces)
+
+    # Of rays whose amounts are all zero, nothing would be subtracted.
+    running = jnp.any(amounts != 0.0, axis=0) & (ray.enter < end)
+    start, zero = jnp.minimum(ray.enter, end), jnp.zeros_like(end)
+    state = _March(start, zero, ray.voxel, running, jnp.zeros((), jnp.int32), tables)
+    return lax.while_loop(continue_, step, state).tables
+
+
+def _subtract_flights(
     scene: DeviceScene,
     medium: Medium,
     tables: ExtinctionTables,
     flown: FlownPhotons,
     amounts: Float[Array, "ends photons"],
 ) -> ExtinctionTables:
-    """Subtract, in each voxel that flights cross, the length up to each end times the amount of that end."""
+    """Subtract the lengths of flights up to their ends, times the amounts of these."""
     p = flown.p
     max_distance = jnp.minimum(flown.encounters.nearest_stop, flown.max_length)
-    counts = p.alive & jnp.any(amounts != 0.0, axis=0)
-    return march_to_depths(
-        medium,
-        p.x,
-        p.w,
-        -jnp.log(flown.u),
-        max_distance,
-        counts,
-        scene.config.max_faces,
-        scene.occupied_box,
-        sums=_LengthsInVoxels(medium, tables, p.w, amounts),
-    ).segment_sums
+    ray = once(enter_grid(medium, p.x, p.w, scene.occupied_box))
+    amounts = jnp.where(p.alive, amounts, 0.0)
+    return _subtract_lengths(scene, tables, ray, p.w, -jnp.log(flown.u), amounts, max_distance)
 
 
 def _add_collisions(
@@ -211,7 +252,7 @@ def _add_collisions(
     return tables.add_tables(cell, by_material[0], by_material[1])
 
 
-def _add_return_paths(
+def _subtract_return_paths(
     scene: DeviceScene, medium: Medium, tables: ExtinctionTables, ends: FlightEnds, deposits: Scalar
 ) -> ExtinctionTables:
     """Subtract deposits times lengths in the voxels along their return paths.
@@ -226,14 +267,5 @@ def _add_return_paths(
         tables = tables.add_depth_above(cell, amounts)
         return tables.add_total(medium, cell, up, amounts * above * medium.size[2])
     v = scene.beam.view(ends.x)
-    no_targets, to_end = jnp.zeros((0, deposits.size)), jnp.full_like(deposits, FAR)
-    return march_to_depths(
-        medium,
-        ends.x,
-        v,
-        no_targets,
-        to_end,
-        deposits != 0.0,
-        scene.config.max_faces,
-        sums=_LengthsInVoxels(medium, tables, v, deposits[None]),
-    ).segment_sums
+    ray, infinite = once(enter_grid(medium, ends.x, v)), jnp.full_like(deposits, jnp.inf)
+    return _subtract_lengths(scene, tables, ray, v, infinite[None], deposits[None], infinite)

@@ -700,10 +700,11 @@ def _return_transmittance(
         weight > 0,
         scene.config.max_faces,
         reverse=scene.reverse,
-        sums=scene.slopes,
+        slopes=scene.slopes,
     )
     if score is not None:
-        score = score - return_path.segment_sums[0].T
+        assert return_path.depth_slopes is not None
+        score = score - return_path.depth_slopes[0].T
     return jnp.exp(-return_path.total_depth), score
 
 

@@ -13,7 +13,7 @@ A chunk of photons stops as soon as the last of them has stopped.
 """
 
 import dataclasses
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -28,6 +28,7 @@ from jaxlidar.optics.leaf_angles import ANGLE_NODES, LeafAngles
 from jaxlidar.optics.phase import AbstractPhase
 from jaxlidar.planning.size_buckets import size_bucket
 from jaxlidar.scenes.canopy import Canopy
+from jaxlidar.trace.extinction_slopes import ExtinctionSlopes
 
 # Maps of more voxels than this are laid out without room to spare: it would cost more than compiling again.
 MAX_PADDED_VOXELS = 1 << 17
@@ -293,24 +294,6 @@ def occupied_box(medium: Medium) -> VoxelBox:
     return tuple(low), tuple(high)
 
 
-class SegmentSums(Protocol):
-    """Sums over the segments of rays that `march_to_depths` makes on the way."""
-
-    def empty(self, ends: int, like: Float[Array, "photons"]) -> Any:
-        """Return the sums before the first segment, for so many ends of each ray."""
-        ...
-
-    def add_segment(
-        self,
-        sums: Any,
-        cell: Int[Array, "photons"],
-        length: Float[Array, "ends photons"],
-        projection_factor: Float[Array, "photons"] | None,
-    ) -> Any:
-        """Add a segment in a voxel; `length`, m, of it lies before each end."""
-        ...
-
-
 class DepthCrossings(eqx.Module):
     """The points of rays at which their optical depth reaches given targets.
 
@@ -320,9 +303,8 @@ class DepthCrossings(eqx.Module):
     - `depth`: optical depth at `entered`.
     - `distance`, `total_depth`: length, m, and optical depth of the whole ray; without meaning after the last
       target, where rays are not followed.
-    - `segment_sums`: sums over segments up to each target, or up to the end of the ray if there are no
-      targets: with score functions, derivatives of the optical depth with respect to parameters. None if none
-      are asked for.
+    - `depth_slopes`: derivatives, with respect to parameters, of the optical depth up to each target, or up
+      to the end of the ray if there are no targets; None without score functions.
     """
 
     crossed: Bool[Array, "targets photons"]
@@ -332,7 +314,7 @@ class DepthCrossings(eqx.Module):
     depth: Float[Array, "targets photons"]
     distance: Float[Array, "photons"]
     total_depth: Float[Array, "photons"]
-    segment_sums: Any = None
+    depth_slopes: Float[Array, "ends parameters photons"] | None = None
 
 
 class _March(NamedTuple):
@@ -342,7 +324,7 @@ class _March(NamedTuple):
     - `running`: False for rays that have stopped.
     - `crossings`: of every target, distances at which its voxel is entered (-1: not crossed) and left,
       optical depth at the former, and the cell.
-    - `segment_sums`: as in `DepthCrossings`.
+    - `depth_slopes`: as in `DepthCrossings`.
     """
 
     distance: Float[Array, "photons"]
@@ -350,7 +332,7 @@ class _March(NamedTuple):
     voxel: tuple[Int[Array, "photons"], ...]
     running: Bool[Array, "photons"]
     crossings: tuple[Array, ...]
-    segment_sums: Any
+    depth_slopes: Float[Array, "ends parameters photons"] | None
 
 
 def march_to_depths(
@@ -364,7 +346,7 @@ def march_to_depths(
     box: VoxelBox | None = None,
     *,
     reverse: bool = True,
-    sums: SegmentSums | None = None,
+    slopes: ExtinctionSlopes | None = None,
 ) -> DepthCrossings:
     """March rays to their largest target depth, to `max_length`, or until they leave the grid, or `box`.
 
@@ -384,8 +366,7 @@ def march_to_depths(
     - `targets`: optical depths. Without any, rays are followed to their end.
     - `max_faces`: bound on the number of faces crossed.
     - `reverse`: True if reverse-mode derivatives may be taken. Default True.
-    - `sums`: sums over segments, without derivatives: `ExtinctionSlopes` gives derivatives of optical depths.
-      Default None.
+    - `slopes`: extinction derivatives, where derivatives of optical depths are asked for. Default None.
     """
     ray = enter_grid(medium, x, w, box)
     end = minimum(ray.leave, max_length)
@@ -397,11 +378,11 @@ def march_to_depths(
     def for_targets(a: Array) -> Array:
         return jnp.broadcast_to(a, targets.shape)
 
-    projection_factor = None if sums is None else lax.stop_gradient(medium.projection_factor(w))
+    projection_factor = None if slopes is None else lax.stop_gradient(medium.projection_factor(w))
 
     def step(state: _March, _):
         """March all rays by one step, 1 to 4 of `march_to_depths`."""
-        distance, depth, voxel, running, crossings, segment_sums = state
+        distance, depth, voxel, running, crossings, depth_slopes = state
         faces = once(ray.face_distances(voxel))
         # Not before `distance`: a ray that starts on a face would step back by rounding.
         to = maximum(distance, minimum(end, minimum(minimum(faces[0], faces[1]), faces[2])))
@@ -417,18 +398,19 @@ def march_to_depths(
         crossings = tuple(
             select(crossed, for_targets(new), old) for new, old in zip((distance, to, depth, cell), crossings)
         )
-        if sums is not None:
+        if slopes is not None:
             # Up to each target, a segment counts as far as the target, which may lie within it.
             length = jnp.where(running, to - distance, 0.0)[None]
             if len(targets):
                 to_target = (targets - for_targets(depth)) / for_targets(jnp.maximum(k, 1e-30))
                 length = jnp.clip(to_target, 0.0, for_targets(length[0]))
+            assert depth_slopes is not None
             length = lax.stop_gradient(length)
-            segment_sums = sums.add_segment(segment_sums, cell, length, projection_factor)
+            depth_slopes = slopes.add_segment(depth_slopes, cell, length, projection_factor)
         # The voxel of a ray that has stopped does not matter.
         next_voxel = step_voxel(ray, voxel, faces, to)
         distance, depth = select(running, to, distance), select(running, next_depth, depth)
-        return _March(distance, depth, next_voxel, goes_on, crossings, segment_sums), None
+        return _March(distance, depth, next_voxel, goes_on, crossings, depth_slopes), None
 
     # A loop of static length has a reverse derivative; skipping dead blocks gives back the time of a loop
     # that stops early.
@@ -442,9 +424,11 @@ def march_to_depths(
     # Entered at -1: not crossed.
     no_crossings = (zero - 1.0, zero, zero, zero.astype(jnp.int32))
     start = jnp.minimum(ray.enter, end)
-    segment_sums = None if sums is None else sums.empty(max(len(targets), 1), max_length)
+    depth_slopes = None
+    if slopes is not None:
+        depth_slopes = jnp.zeros((max(len(targets), 1), slopes.count, *max_length.shape), max_length.dtype)
     running = active & (ray.enter < end)
-    state = _March(start, jnp.zeros_like(max_length), ray.voxel, running, no_crossings, segment_sums)
+    state = _March(start, jnp.zeros_like(max_length), ray.voxel, running, no_crossings, depth_slopes)
     state = vary_together(state)
 
     def march(state: _March) -> _March:
@@ -460,7 +444,7 @@ def march_to_depths(
         depth=depth,
         distance=state.distance,
         total_depth=state.depth,
-        segment_sums=state.segment_sums,
+        depth_slopes=state.depth_slopes,
     )
 
 
