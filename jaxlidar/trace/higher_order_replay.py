@@ -78,7 +78,10 @@ def pull_back_higher_orders(
         first_lane = batch.first_lane(group)
 
         def number_in_group(lanes: Lanes) -> Int[Array, "photons"]:
-            return (lanes.lane - first_lane).astype(jnp.int32)
+            # Dead photons fill up chunks; the first of the group stands in for them (`compact`), whose sums
+            # they must not change.
+            number = (lanes.lane - first_lane).astype(jnp.int32)
+            return jnp.where(lanes.photons.alive, number, batch.group_size)
 
         def trace_chunk(in_chunk: Lanes, state: _Walk, draws: PhotonDraws, order: Array):
             flown, _ = fly(scene, in_chunk.photons, empty, draws, order)
@@ -86,7 +89,7 @@ def pull_back_higher_orders(
             deposits = _deposits(scene, flown, ends, of_returns, order)
             p, _ = scatter(scene, flown, empty)
             in_order = jnp.sum(deposits, axis=0)
-            before = state.ahead.at[number].get(mode="promise_in_bounds")
+            before = state.ahead.at[number].get(mode="fill", fill_value=0.0)
             # Nothing lies ahead of a photon that has ended; rounding would leave a little.
             after = jnp.where(p.alive, before - in_order, 0.0)
 
@@ -97,11 +100,11 @@ def pull_back_higher_orders(
                 tables = _add_collisions(scene, medium, tables, ends, from_end_on.reshape(-1))
                 return _subtract_return_paths(scene, medium, tables, ends, deposits.reshape(-1))
 
-            # A loop of one step or none: compilers update its state in place, where `cond` would copy the map.
+            # A loop of one step or none: its state is updated in place, where `cond` would copy the map.
             n_steps = state.is_second.astype(jnp.int32)
             tables = lax.fori_loop(0, n_steps, lambda _, tables: add(tables), state.tables)
             ahead = jnp.where(state.is_second, after, before + in_order)
-            ahead = state.ahead.at[number].set(ahead, mode="promise_in_bounds")
+            ahead = state.ahead.at[number].set(ahead, mode="drop")
             return Lanes(in_chunk.lane, p), _Walk(state.is_second, tables, ahead)
 
         def walk(state: tuple[ExtinctionTables, Array], is_second: Bool[Array, ""]):
