@@ -198,7 +198,8 @@ def _subtract_lengths(
         k = medium.extinction(cell, w)
         to, cell, k = once((to, cell, k))
         length = jnp.where(running, to - distance, 0.0)
-        to_targets = jnp.clip((targets - depth) / jnp.maximum(k, 1e-30), 0.0, length)
+        to_targets = (targets - depth[None]) / jnp.maximum(k, 1e-30)[None]
+        to_targets = jnp.clip(to_targets, 0.0, length[None])
         tables = tables.add_total(medium, cell, w, -jnp.sum(amounts * to_targets, axis=0))
         next_depth = depth + k * length
         goes_on = running & (next_depth <= largest) & (to < end)

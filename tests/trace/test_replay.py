@@ -17,7 +17,7 @@ from tests.helpers import agrees
 RANDOM = np.random.default_rng(0)
 LEAF = RANDOM.uniform(0.1, 1.0, (3, 3, 4)) * (RANDOM.uniform(size=(3, 3, 4)) < 0.6)
 BARK = RANDOM.uniform(0.0, 0.3, (3, 3, 4))
-HEIGHTS, SOIL = RANDOM.uniform(-0.3, 0.3, (5, 5)), RANDOM.uniform(0.2, 0.5, (5, 5))
+HEIGHTS, SOIL = RANDOM.uniform(-0.3, 0.3, (7, 7)), RANDOM.uniform(0.2, 0.5, (7, 7))
 ORIGIN = (-1.5, -1.25, 0.5)
 START = {
     name: jnp.asarray(value, float)
@@ -49,7 +49,7 @@ def everything(p):
         canopy=jl.Canopy(map_of(p), leaf=optics, bark=0.3),
         plates=(jl.Plate(height=p["plate height"], reflectance=0.3, transmittance=0.3, coverage=0.5),),
         ground=jl.Terrain(
-            p["terrain heights"], spacing=1.0, origin=(-2.0, -2.0), reflectance=p["raster reflectance"]
+            p["terrain heights"], spacing=1.0, origin=(-3.0, -3.0), reflectance=p["raster reflectance"]
         ),
     )
 
