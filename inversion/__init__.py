@@ -10,6 +10,14 @@
 `cramer_rao`, `CramerRao`, `profile_likelihood`, `Profile`, `judge_fit`, `judge_fits`, `judge_record`,
 `Verdict`.
 
+## Design of instruments
+
+`design`, `Design`.
+
+## Posteriors
+
+`log_density`, `LogDensity`.
+
 ## Echoes and deconvolution
 
 `gaussian_decomposition`, `Echoes`, `echo_points`, `EchoPoints`, `richardson_lucy`, `wiener`.
@@ -21,7 +29,16 @@
 
 ## GEDI and photon counters
 
-`gedi_metrics`, `GediMetrics`, `gedi_settings`, `GediSettings`, `photon_ground_and_canopy`, `PhotonHeights`.
+`gedi_metrics`, `GediMetrics`, `gedi_settings`, `GediSettings`, `gedi_table`, `TableProgress`,
+`photon_ground_and_canopy`, `PhotonHeights`.
+
+## Comparison with references
+
+`compare`, `Comparison`, `ComparisonStatistics`, `ComparedColumn`.
+
+## The scene of many records
+
+`geolocate`, `Geolocation`.
 
 ## Receivers and digitisers
 
@@ -40,8 +57,10 @@ import warnings
 from typing import Any
 
 from inversion import files
+from inversion.fit.design import Design, design
 from inversion.fit.fit_summary import Step
 from inversion.fit.identifiability import CramerRao, Profile, cramer_rao, profile_likelihood
+from inversion.fit.log_density import LogDensity, log_density
 from inversion.fit.priors import LogNormal, Smooth
 from inversion.fit.profiles import AveragingKernel, put_profile
 from inversion.fit.quality import Verdict, judge_fit, judge_fits, judge_record
@@ -50,6 +69,7 @@ from inversion.fit.retrieval import retrieve
 from inversion.fit.retrieval_many import RetrievalProgress, retrieve_many
 from inversion.fit.unknowns import Unknown
 from inversion.leaf.leaves import LeafFit, invert_leaves
+from inversion.metrics.comparison import ComparedColumn, Comparison, ComparisonStatistics, compare
 from inversion.metrics.cover import (
     GroundAndCanopy,
     gap_probability,
@@ -60,12 +80,14 @@ from inversion.metrics.cover import (
 from inversion.metrics.decomposition import Echoes, gaussian_decomposition
 from inversion.metrics.deconvolution import richardson_lucy, wiener
 from inversion.metrics.gedi import GediMetrics, GediSettings, gedi_metrics, gedi_settings
+from inversion.metrics.gedi_table import TableProgress, gedi_table
 from inversion.metrics.heights import SignalEnds, find_ground, relative_heights, signal_ends
 from inversion.metrics.photons import PhotonHeights, photon_ground_and_canopy
 from inversion.metrics.points import EchoPoints, echo_points
 from inversion.receiver.digitiser import Amplitudes, amplitudes, corrected_table
 from inversion.receiver.impulse import receiver_impulse, recorded_pulse
 from inversion.receiver.recorder import Recorder
+from inversion.scene.geolocation import Geolocation, geolocate
 from jaxlidar.extend import shorten_signatures
 
 __all__ = [
@@ -90,6 +112,12 @@ __all__ = [
     "judge_fits",
     "judge_record",
     "Verdict",
+    # Design of instruments.
+    "design",
+    "Design",
+    # Posteriors.
+    "log_density",
+    "LogDensity",
     # Echoes and deconvolution.
     "gaussian_decomposition",
     "Echoes",
@@ -112,8 +140,18 @@ __all__ = [
     "GediMetrics",
     "gedi_settings",
     "GediSettings",
+    "gedi_table",
+    "TableProgress",
     "photon_ground_and_canopy",
     "PhotonHeights",
+    # Comparison with references.
+    "compare",
+    "Comparison",
+    "ComparisonStatistics",
+    "ComparedColumn",
+    # The scene of many records.
+    "geolocate",
+    "Geolocation",
     # Receivers and digitisers.
     "Recorder",
     "receiver_impulse",

@@ -1,4 +1,4 @@
-"""The commands `jaxlidar demo` and `jaxlidar retrieve`.
+"""The commands `jaxlidar demo`, `jaxlidar retrieve` and `jaxlidar gedi`.
 
 `jaxlidar` never imports this package: its command line finds the commands by the group of entry points
 "jaxlidar.commands" in pyproject.toml.
@@ -18,7 +18,12 @@ import jaxlidar as jl
 from inversion import demo as demonstration
 from inversion.fit.retrieval import retrieve as fit_waveform
 from inversion.fit.unknowns import Unknown
+from inversion.metrics.gedi_table import gedi_table
 from jaxlidar.cli.shared import ResultPath, save_figure
+from jaxlidar.io.tables import TABLE_FORMATS
+
+# Seconds between lines of progress in a log file.
+_LOG_SECONDS = 5.0
 
 
 @click.command()
@@ -131,3 +136,58 @@ def retrieve(
         jl.plot.fit(fit.waveform, wave.reflectance, sigma, axes)
         save_figure(axes[0], plot)
     return 0 if fit.converged else 1
+
+
+def _check_table_path(ctx: Any, parameter: Any, path: Path) -> Path:
+    """Refuse a name that ends in no format of tables, before the work."""
+    if path.suffix.lower() not in TABLE_FORMATS:
+        raise click.BadParameter(f"{str(path)!r} ends in none of {', '.join(TABLE_FORMATS)}")
+    return path
+
+
+@click.command()
+@click.argument(
+    "files",
+    nargs=-1,
+    required=True,
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    metavar="FILE...",
+)
+@click.option(
+    "-o",
+    "--out",
+    required=True,
+    type=click.Path(dir_okay=False, path_type=Path),
+    callback=_check_table_path,
+    help="Table to write: .csv, .nc, .parquet or .gpkg.",
+)
+@click.option("--group", type=click.IntRange(1, 6), default=1, help="Setting group of rh and lowest mode.")
+@click.option("--quiet", is_flag=True, help="Show no progress.")
+def gedi(files: tuple[Path, ...], out: Path, group: int, quiet: bool) -> None:
+    """Write a table of GEDI level 1B shots: ground, relative heights, cover and plant area.
+
+    A row for each shot, with standard errors, quality and reasons. Shots that cannot be computed have no
+    numbers, and the reason.
+
+    \b
+    Example:
+      jaxlidar gedi GEDI01_B_2019108080338_O01964_T05337_02_003_01.h5 -o shots.csv
+    """
+    is_terminal = sys.stderr.isatty()
+    last_time = time.perf_counter()
+
+    def report(progress: Any) -> None:
+        nonlocal last_time
+        # A terminal rewrites its line; a log file gets a line every few seconds.
+        is_due = time.perf_counter() - last_time > _LOG_SECONDS or progress.done == progress.total
+        if is_terminal:
+            click.echo(f"\r{progress}", err=True, nl=progress.done == progress.total)
+        elif is_due:
+            click.echo(str(progress), err=True)
+            last_time = time.perf_counter()
+
+    table = gedi_table(list(files), group=group, progress=None if quiet else report)
+    table.save(out)
+    qualities, counts = np.unique(table["quality"], return_counts=True)
+    summary = ", ".join(f"{count} {quality}" for quality, count in zip(qualities, counts))
+    click.echo(f"{len(table)} shots: {summary}; written: {out}")

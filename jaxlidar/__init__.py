@@ -10,8 +10,8 @@ waveforms is in the package `inversion`.
 
 ## The instrument
 
-`Lidar`, `AbstractPulse`, `GaussianPulse`, `ExponentiallyModifiedGaussianPulse`, `RectangularPulse`,
-`SampledPulse`.
+`Lidar`, `instrument`, `instruments`, `instrument_sources`, `InstrumentValue`, `AbstractPulse`,
+`GaussianPulse`, `ExponentiallyModifiedGaussianPulse`, `RectangularPulse`, `SampledPulse`.
 
 ## Record as a receiver does
 
@@ -20,12 +20,16 @@ waveforms is in the package `inversion`.
 ## Surveys of many shots
 
 `Survey`, `AbstractScan`, `Oscillating`, `RotatingPolygon`, `Conical`, `simulate_many`, `Waveforms`,
-`SurveyProgress`, `SceneParts`.
+`SurveyProgress`, `SceneParts`, `Acquisition`, `DiscreteReturns`.
+
+## Many scenes
+
+`simulate_scenes`, `SceneWaveforms`, `plan_scenes`.
 
 ## Scenes
 
-`Scene`, `Canopy`, `VoxelMap`, `Ground`, `Terrain`, `Plate`, `Atmosphere`, `AbstractSurface`,
-`AbstractGround`, `AbstractSheet`, `AbstractShape`, `Plane`.
+`Scene`, `Canopy`, `VoxelMap`, `Ground`, `Terrain`, `Plate`, `MeshSurface`, `MeshInstances`, `Atmosphere`,
+`AbstractSurface`, `AbstractGround`, `AbstractSheet`, `AbstractShape`, `Plane`.
 
 ## Leaf optics and spectra
 
@@ -41,7 +45,12 @@ waveforms is in the package `inversion`.
 
 `Habit`, `Branching`, `broadleaf`, `conifer`, `shrub`, `spreading_tree`, `grow`, `forest`, `Tree`,
 `LSystem`, `Rule`, `Symbol`, `Word`, `turtle`, `voxelise`, `voxelise_points`, `voxelise_mesh`, `Mesh`,
-`trim_empty_layers`.
+`canopy_from_points`, `PointCanopy`, `trim_empty_layers`.
+
+## Sunlight
+
+`reflectance_factor`, `ReflectanceFactor`, `plan_reflectance`.
+`mesh_of`, `trim_empty_layers`.
 
 ## Truth and energy
 
@@ -51,6 +60,10 @@ waveforms is in the package `inversion`.
 
 `plan`, `Plan`, `Effect`, `make_setup`, `Setup`, `trace_scene`, `Response`, `waveform_of`.
 
+## Compiled programs
+
+`compilation_cache`, `CompilationCache`.
+
 ## Paths as the paper traces them
 
 `analog_returns`, `AnalogReturns`, `photon_paths`.
@@ -58,7 +71,7 @@ waveforms is in the package `inversion`.
 ## Warnings and constants
 
 `LateLightWarning`, `UnfollowedLightWarning`, `MisplacedCanopyWarning`, `LostWorkersWarning`, `OffMapWarning`,
-`OutlineWarning`, `UnitWarning`, `SPEED_OF_LIGHT`.
+`OutlineWarning`, `SolidMeshWarning`, `UnitWarning`, `SPEED_OF_LIGHT`.
 
 ## Packages of their own
 
@@ -70,14 +83,17 @@ from typing import TYPE_CHECKING, Any
 
 from jaxlidar import extend, io
 from jaxlidar._checks import UnitWarning
+from jaxlidar._compilation_cache import CompilationCache, compilation_cache
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._deprecated import RENAMED, warn_renamed
+from jaxlidar._fingerprint import version_of
 from jaxlidar._progress import Progress
 from jaxlidar._registry import register_public_objects, waveform_html
 from jaxlidar._signatures import shorten_signatures
 from jaxlidar._workers import LostWorkersWarning
 from jaxlidar.analog import AnalogReturns, analog_returns, photon_paths
 from jaxlidar.energy import EnergyBudget, energy_budget
+from jaxlidar.instrument.catalogue import InstrumentValue, instrument, instrument_sources, instruments
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.instrument.photon_counter import PhotonCounter, PhotonEvents
 from jaxlidar.instrument.pulse import (
@@ -100,18 +116,23 @@ from jaxlidar.optics.phase import AbstractPhase, HenyeyGreenstein, Isotropic
 from jaxlidar.optics.plate_model import plate_model
 from jaxlidar.optics.prospect import Prospect, prospect_jacobian, prospect_spectra
 from jaxlidar.optics.spectra import Spectrum, read_spectrum_csv, spectrum, spectrum_names
+from jaxlidar.passive import ReflectanceFactor, plan_reflectance, reflectance_factor
 from jaxlidar.planning.effects import Effect
 from jaxlidar.planning.plan import Plan, plan
+from jaxlidar.planning.scene_family import plan_scenes
 from jaxlidar.planning.setup import Setup, make_setup
 from jaxlidar.plants.forest import forest
 from jaxlidar.plants.habits import Branching, Habit, broadleaf, conifer, grow, shrub, spreading_tree
 from jaxlidar.plants.lsystem import LSystem, Rule, Symbol, Word
-from jaxlidar.plants.meshes import Mesh, voxelise_mesh
+from jaxlidar.plants.meshes import Mesh, SolidMeshWarning, mesh_of, voxelise_mesh
+from jaxlidar.plants.point_canopy import PointCanopy, canopy_from_points
 from jaxlidar.plants.tree import Tree
 from jaxlidar.plants.turtle import turtle
 from jaxlidar.plants.voxelise import trim_empty_layers, voxelise, voxelise_points
+from jaxlidar.scene_batch import SceneWaveforms, simulate_scenes
 from jaxlidar.scenes.atmosphere import Atmosphere
 from jaxlidar.scenes.canopy import Canopy
+from jaxlidar.scenes.mesh_surface import MeshInstances, MeshSurface
 from jaxlidar.scenes.relative_height import MisplacedCanopyWarning
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.scene_parts import SceneParts
@@ -121,8 +142,10 @@ from jaxlidar.scenes.terrain import Terrain
 from jaxlidar.scenes.voxels import VoxelMap
 from jaxlidar.simulate import LateLightWarning, UnfollowedLightWarning, simulate
 from jaxlidar.spectral.waveform import Waveform, total_reflectance, waveform_of
+from jaxlidar.survey.acquisition import Acquisition
 from jaxlidar.survey.coverage import OffMapWarning
 from jaxlidar.survey.progress import SurveyProgress
+from jaxlidar.survey.returns import DiscreteReturns
 from jaxlidar.survey.simulate_many import simulate_many
 from jaxlidar.survey.truths import Truths
 from jaxlidar.survey.waveforms import Waveforms
@@ -142,6 +165,10 @@ __all__ = [
     "rerun",
     # The instrument.
     "Lidar",
+    "instrument",
+    "instruments",
+    "instrument_sources",
+    "InstrumentValue",
     "AbstractPulse",
     "GaussianPulse",
     "ExponentiallyModifiedGaussianPulse",
@@ -163,6 +190,12 @@ __all__ = [
     "Waveforms",
     "SurveyProgress",
     "SceneParts",
+    # Many scenes.
+    "simulate_scenes",
+    "SceneWaveforms",
+    "plan_scenes",
+    "Acquisition",
+    "DiscreteReturns",
     # Scenes.
     "Scene",
     "Canopy",
@@ -170,6 +203,8 @@ __all__ = [
     "Ground",
     "Terrain",
     "Plate",
+    "MeshSurface",
+    "MeshInstances",
     "Atmosphere",
     "AbstractSurface",
     "AbstractGround",
@@ -216,9 +251,16 @@ __all__ = [
     "turtle",
     "voxelise",
     "voxelise_points",
+    "canopy_from_points",
+    "PointCanopy",
     "voxelise_mesh",
     "Mesh",
+    "mesh_of",
     "trim_empty_layers",
+    # Sunlight.
+    "reflectance_factor",
+    "ReflectanceFactor",
+    "plan_reflectance",
     # Truth and energy.
     "truth_of",
     "Truth",
@@ -234,6 +276,9 @@ __all__ = [
     "trace_scene",
     "Response",
     "waveform_of",
+    # Compiled programs.
+    "compilation_cache",
+    "CompilationCache",
     # Paths as the paper traces them.
     "analog_returns",
     "AnalogReturns",
@@ -245,6 +290,7 @@ __all__ = [
     "LostWorkersWarning",
     "OffMapWarning",
     "OutlineWarning",
+    "SolidMeshWarning",
     "UnitWarning",
     "SPEED_OF_LIGHT",
     # Packages of their own.
@@ -252,6 +298,8 @@ __all__ = [
     "plot",
     "extend",
 ]
+
+__version__ = version_of("jaxlidar")
 
 shorten_signatures(globals())
 

@@ -24,6 +24,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 # For modules that take all helpers of construction from here.
 from jaxlidar._signatures import briefly  # noqa: F401
+from jaxlidar._text import number_text
 
 # Largest distance of times or heights from evenly spaced ones, over their step.
 _UNEVENNESS = 0.05
@@ -219,7 +220,8 @@ def check_range(
         closing = ")" if high_open or high == np.inf else "]"
         first_outside = float(values[~in_range].flat[0])
         raise ValueError(
-            f"{field} = {first_outside:g} is outside the admissible range {opening}{low:g}, {high:g}{closing}"
+            f"{field} = {number_text(first_outside)} is outside the admissible range "
+            f"{opening}{number_text(low)}, {number_text(high)}{closing}"
         )
 
 

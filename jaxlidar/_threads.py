@@ -18,6 +18,10 @@ ONE_CORE: dict[str, Any] = {
         "xla_cpu_enable_concurrency_optimized_scheduler": False,
     }
 }
+if jax.__version_info__ < (0, 11):
+    # The XLA of these versions has a newer generator of kernels, with which compilation takes 1.5 times as
+    # long, and programs run faster by a tenth at most. Later versions do not know the option, and refuse it.
+    ONE_CORE["compiler_options"]["xla_cpu_use_fusion_emitters"] = False
 
 
 @contextlib.contextmanager

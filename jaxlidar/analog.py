@@ -24,6 +24,7 @@ from jaxlidar.scenes.scene import Scene, check_kinds
 from jaxlidar.spectral.apply_optics import setup_optics
 from jaxlidar.trace.device_scene import DeviceScene, build_device_scene
 from jaxlidar.trace.footprint import across_beam
+from jaxlidar.trace.meshes import clear_of_mesh
 from jaxlidar.trace.photon_step import collide, fly_once, passed_plates, start_photons
 from jaxlidar.trace.photons import Photons
 
@@ -260,7 +261,7 @@ def _trace_flight(
     has_hit = flight.has_hit
     x, path, collision = collide(scene, p, flight, encounters, draws)
     onward = Photons(
-        x=x,
+        x=clear_of_mesh(scene, x, collision.w, collision.surface, collision.normal),
         w=collision.w,
         path=path,
         weight=jnp.where(has_hit, weight * collision.weight * collision.onward_weight, 0.0),

@@ -128,9 +128,10 @@ def energy_budget(
     max_photons = check_integer("max_photons", max_photons)
     if illumination == "parallel" and (scene.canopy is None or scene.canopy.sides != "periodic"):
         raise ValueError("illumination = 'parallel'; that is admissible where the canopy has periodic sides")
-    setup = _with_longest_flights(
-        make_setup(lidar, scene, make_plan(lidar, scene, max_orders=1, describe=False))
-    )
+    # Light is followed to its end: it may meet meshes that no ray of order one meets.
+    effects = {"meshes": True} if scene.meshes else None
+    plan = make_plan(lidar, scene, max_orders=1, effects=effects, describe=False)
+    setup = _with_longest_flights(make_setup(lidar, scene, plan))
     start_time = time.perf_counter()
 
     def trace_batch(number: int) -> EnergyFractions:

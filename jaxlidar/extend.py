@@ -21,6 +21,7 @@ For laws, pulses and surfaces of your own, and for packages on top such as `inve
   expression that uses them.
 - `side_by_side` runs compiled programs on as many threads as there are cores; compile them with `ONE_CORE`.
 - `outcomes` runs the tasks that `task` makes, in this process or by the workers of an executor.
+- `decompose_records.register` makes a function the decomposition of `Waveforms.returns`; `inversion` does.
 """
 
 from jaxlidar._checks import (
@@ -41,6 +42,7 @@ from jaxlidar._converted import Converted
 from jaxlidar._fingerprint import fingerprint
 from jaxlidar._one_function import once
 from jaxlidar._ranges import Range, check_ranges, inadmissible, reasons
+from jaxlidar._registry import decompose_records
 from jaxlidar._signatures import briefly, shorten_signatures
 from jaxlidar._threads import ONE_CORE, side_by_side
 from jaxlidar._vectors import (
@@ -84,6 +86,7 @@ __all__ = [
     "check_ranges",
     "concrete",
     "cross",
+    "decompose_records",
     "dot",
     "even_step",
     "fingerprint",

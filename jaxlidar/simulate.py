@@ -306,7 +306,7 @@ def _make_waveform(tracer: BatchTracer, result: _BatchResults, goal: _Goal) -> W
     if result.neglected_fraction > goal.tolerance(plan):
         message = unfollowed_message(plan.orders, result.neglected_fraction)
         warnings.warn(message, UnfollowedLightWarning, stacklevel=3)
-    return open_at_first_return(wave, lidar) if lidar.receiver.window == "first return" else wave
+    return open_at_first_return(wave, lidar) if lidar.opens_at_first_return else wave
 
 
 class UnfollowedLightWarning(UserWarning):

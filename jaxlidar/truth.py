@@ -224,7 +224,7 @@ def _sum_interception(scene: DeviceScene, samples: TimeBins, rays: FootprintRays
     plates = [
         (surface.coverage, jnp.where(distance <= rays.end, distance, FAR))
         for surface, distance in zip(scene.surfaces, rays.surface_distances)
-        if surface.is_plate
+        if surface.is_plate or surface.is_mesh
     ]
 
     def plate_gap(distance: Scalar) -> Scalar:
@@ -255,7 +255,7 @@ def _sum_interception(scene: DeviceScene, samples: TimeBins, rays: FootprintRays
                 deposits.append((row, lengths * (2.0 * energy * table[segments.cell])[None]))
         for row, pieces in deposits:
             rows = add_rows(rows, jnp.full_like(first_bin, row), first_bin, jnp.moveaxis(pieces, 0, -1))
-    plate_depths = [d for d, surface in zip(depths, scene.surfaces) if surface.is_plate]
+    plate_depths = [d for d, surface in zip(depths, scene.surfaces) if surface.is_plate or surface.is_mesh]
     for (coverage, distance), depth in zip(plates, plate_depths):
         is_met = distance < FAR
         stopped = jnp.where(is_met, rays.energy * coverage * plate_gap(distance) * jnp.exp(-depth), 0.0)

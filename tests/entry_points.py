@@ -89,14 +89,24 @@ def observation() -> dict[str, np.ndarray]:
 
 
 @functools.cache
+def point_cloud() -> jl.io.PointCloud:
+    one, position = np.ones(3, int), np.array([[1.0, 1.0, 0.0], [2.0, 3.0, 4.0], [4.0, 1.0, 0.0]])
+    return jl.io.PointCloud(position, np.array([2, 5, 2]), one, one, 1.0 * one, {})
+
+
+@functools.cache
 def events() -> jl.PhotonEvents:
     return jl.record(wave(), mode="photons", receiver=jl.PhotonCounter(), key=KEY, pulses=20)
 
 
 @functools.cache
+def waveforms() -> jl.Waveforms:
+    return jl.simulate_many(SURVEY, GROUND, key=KEY, rtol=0.1, max_orders=1, truth=True)
+
+
+@functools.cache
 def events_of_two_shots() -> jl.PhotonEvents:
-    many = jl.simulate_many(SURVEY, GROUND, key=KEY, rtol=0.1, max_orders=1)
-    return jl.record(many, mode="photons", receiver=jl.PhotonCounter(), key=KEY, pulses=20)
+    return jl.record(waveforms(), mode="photons", receiver=jl.PhotonCounter(), key=KEY, pulses=20)
 
 
 @functools.cache
@@ -134,6 +144,19 @@ def las() -> Path:
 def gedi() -> Path:
     jl.io.write_gedi_l1b(folder() / "a.h5", [wave(), wave()], SURVEY, origin=(14.0, 50.0))
     return folder() / "a.h5"
+
+
+def level_2_file(kind: str) -> Path:
+    from tests.io.test_gedi_level2 import write_level_2
+
+    return write_level_2(folder() / f"{kind}.h5", kind)
+
+
+@functools.cache
+def photon_files() -> tuple[Path, Path]:
+    from tests.io.test_icesat2 import write_heights, write_photons
+
+    return write_photons(folder() / "atl03.h5"), write_heights(folder() / "atl08.h5")
 
 
 # -- calls -------------------------------------------------------------------------------------------------
@@ -184,7 +207,9 @@ ENTRY_POINTS: dict[str, Callable[[], EntryPoint]] = {
     ),
     "Survey": lambda: EntryPoint(
         lambda **arguments: jl.Survey(LIDAR, **arguments),
-        {"position": TWO, "zenith": np.array([0.0, 1.0]), "azimuth": np.array([0.0, 1.0])},
+        {"position": TWO, "zenith": np.array([0.0, 1.0]), "azimuth": np.array([0.0, 1.0])}
+        | {"gps_time": np.array([0.0, 1.0]), "scan_angle": np.array([0.0, 1.0])}
+        | {"flight_line": np.array([1, 2])},
     ),
     "Survey.about": lambda: EntryPoint(SURVEY.about, {"origin": np.array([1.0, 2.0])}),
     "Survey.grid": lambda: EntryPoint(
@@ -197,7 +222,8 @@ ENTRY_POINTS: dict[str, Callable[[], EntryPoint]] = {
     ),
     "Survey.scan": lambda: EntryPoint(
         lambda **arguments: jl.Survey.scan(LIDAR, jl.Oscillating(10.0, 50.0), **arguments),
-        {"start": (0.0, 0.0), "end": (0.5, 0.0), "speed": 50.0, "pulse_rate": 1000.0},
+        {"start": (0.0, 0.0), "end": (0.5, 0.0), "speed": 50.0, "pulse_rate": 1000.0}
+        | {"gps_time": 1.0, "flight_line": 2},
     ),
     "Oscillating": lambda: EntryPoint(jl.Oscillating, {"half_angle": 10.0, "frequency": 50.0}),
     "Oscillating.direction": lambda: EntryPoint(jl.Oscillating(10.0, 50.0).direction, {"time": BINS}),
@@ -254,6 +280,14 @@ ENTRY_POINTS: dict[str, Callable[[], EntryPoint]] = {
         | {"aspect": 5.0, "position": (0.0, 0.0)},
     ),
     "Plate.moved": lambda: EntryPoint(jl.Plate(1.0, 0.2).moved, {"by": np.ones(2)}),
+    "MeshSurface": lambda: EntryPoint(
+        lambda vertices, faces, **optics: jl.MeshSurface((vertices, faces), **optics),
+        {"vertices": np.eye(3), "faces": np.array([[0, 1, 2]]), "reflectance": 0.3, "transmittance": 0.2},
+    ),
+    "MeshSurface.moved": lambda: EntryPoint(jl.MeshSurface(MESH).moved, {"by": np.ones(2)}),
+    "MeshInstances": lambda: EntryPoint(
+        jl.MeshInstances, {"shift": np.zeros((2, 3)), "rotation": np.zeros(2), "scale": np.ones(2)}
+    ),
     "Atmosphere": lambda: EntryPoint(
         jl.Atmosphere,
         {"visibility": 23.0, "rayleigh_scale_height": 8450.0, "aerosol_scale_height": 1400.0}
@@ -359,6 +393,10 @@ ENTRY_POINTS: dict[str, Callable[[], EntryPoint]] = {
         {"voxel_size": 0.5, "leaf_area": 1.0, "samples": 2, "origin": (-1.0, -1.0, 0.0)}
         | {"shape": (4, 4, 4)},
     ),
+    "canopy_from_points": lambda: EntryPoint(
+        lambda **arguments: jl.canopy_from_points(point_cloud(), **arguments),
+        {"voxel_size": 1.0, "reflectance": 0.3, "origin": (0.0, 0.0, 0.0), "shape": (6, 6, 6)},
+    ),
     "voxelise_points": lambda: EntryPoint(
         jl.voxelise_points,
         {"points": np.random.default_rng(0).random((9, 3)), "voxel_size": 0.5, "leaf_area": 1.0}
@@ -368,6 +406,10 @@ ENTRY_POINTS: dict[str, Callable[[], EntryPoint]] = {
         lambda **arguments: jl.voxelise_mesh(MESH, **arguments),
         {"voxel_size": 0.5, "origin": (0.0, 0.0, 0.0), "shape": (3, 3, 3)},
     ),
+    "mesh_of": lambda: EntryPoint(
+        lambda **arguments: jl.mesh_of(TREE, **arguments),
+        {"sides": 6, "leaves": 3, "leaf_length": 0.1, "seed": 0},
+    ),
     "Mesh": lambda: EntryPoint(
         jl.Mesh,
         {"vertices": np.eye(3), "faces": np.array([[0, 1, 2]]), "material": np.array([0])},
@@ -376,6 +418,14 @@ ENTRY_POINTS: dict[str, Callable[[], EntryPoint]] = {
     "simulate": lambda: EntryPoint(
         lambda **arguments: jl.simulate(LIDAR, GROUND, key=KEY, **arguments),
         {"rtol": 0.1, "atol": 0.1, "n_photons": 1000, "max_orders": 1, "max_step": 1.0, "n_rays": 64},
+    ),
+    "Waveforms.returns": lambda: EntryPoint(
+        waveforms().returns,
+        {"wavelength": 1064.0, "record": waveforms().recorded, "background": 0.0, "noise": 1e-18}
+        | {"threshold": 1e-17, "fraction": 0.5, "max_returns": 2},
+    ),
+    "Waveforms.true_returns": lambda: EntryPoint(
+        waveforms().true_returns, {"wavelength": 1064.0, "min_reflectance": 1e-3}
     ),
     "simulate_many": lambda: EntryPoint(
         lambda **arguments: jl.simulate_many(SURVEY, GROUND, key=KEY, **arguments),
@@ -412,7 +462,7 @@ ENTRY_POINTS: dict[str, Callable[[], EntryPoint]] = {
     "io.AirborneShot": lambda: EntryPoint(
         lambda **arguments: jl.io.AirborneShot(returning=(SEGMENT,), **arguments),
         {"index": 0, **LINE, "noise_mean": 0.0, "noise_std": 1.0, "pedestal": 0.0, "pulse_zero": 0.0}
-        | {"metres": np.ones(3), "gps_time": 1.0},
+        | {"metres": np.ones(3), "gps_time": 1.0, "scan_angle": 1.0, "flight_line": 1},
     ),
     "io.AirborneShot.of_channel": lambda: EntryPoint(SHOT.of_channel, {"channel": 0}),
     "io.AirborneShot.time_from": lambda: EntryPoint(SHOT.time_from, {"elevation": 1.0}),
@@ -435,13 +485,31 @@ ENTRY_POINTS: dict[str, Callable[[], EntryPoint]] = {
             folder() / "b.h5", [wave(), wave()], SURVEY, key=KEY, **arguments
         ),
         {"origin": (14.0, 50.0), "elevation": 0.0, "shot_number": [1, 2], "margin": 20, "gain": 1e4}
-        | {"noise_mean": 240.0, "noise_std": 3.0},
+        | {"noise_mean": 240.0, "noise_std": 3.0, "solar_elevation": -20.0},
+    ),
+    "io.read_gedi_l2a": lambda: EntryPoint(
+        lambda shot_number: jl.io.read_gedi_l2a(level_2_file("2A"), shot_number)["rh"],
+        {"shot_number": [1, 2]},
+    ),
+    "io.read_gedi_l2b": lambda: EntryPoint(
+        lambda shot_number: jl.io.read_gedi_l2b(level_2_file("2B"), shot_number)["pai"],
+        {"shot_number": [1, 2]},
+    ),
+    "io.read_atl03": lambda: EntryPoint(
+        lambda stretch: jl.io.read_atl03(photon_files()[0], stretch=stretch).height, {"stretch": (0.0, 90.0)}
+    ),
+    "io.read_atl03 latitude": lambda: EntryPoint(
+        lambda latitude: jl.io.read_atl03(photon_files()[0], latitude=latitude).height,
+        {"latitude": (40.0, 42.0)},
+    ),
+    "io.read_atl08": lambda: EntryPoint(
+        lambda segment: jl.io.read_atl08(photon_files()[1], segment=segment)["ground"], {"segment": 100.0}
     ),
     "io.write_las": lambda: EntryPoint(
         lambda **arguments: jl.io.write_las(folder() / "b.las", **arguments),
         {"position": np.zeros((2, 3)), "intensity": np.ones(2), "return_number": np.array([1, 2])}
         | {"number_of_returns": np.array([2, 2]), "gps_time": np.ones(2)}
-        | {"classification": np.array([1, 2])},
+        | {"classification": np.array([1, 2]), "scan_angle": np.ones(2), "point_source": np.array([1, 2])},
     ),
     "io.write_las_waveforms": lambda: EntryPoint(
         lambda point_format: jl.io.write_las_waveforms(folder() / "c.las", [SHOT], point_format=point_format),
@@ -470,6 +538,12 @@ ENTRY_POINTS: dict[str, Callable[[], EntryPoint]] = {
     "plot.photons": lambda: EntryPoint(
         lambda **arguments: jl.plot.photons(events(), **arguments),
         {"distance": np.zeros(1), "label": np.zeros(len(events().time), int)},
+    ),
+    "plot.comparison": lambda: EntryPoint(
+        with_field(jl.plot.comparison, pairs=lambda x: {"ground": (np.ones(2), x)}),
+        {"pairs": np.ones(2)},
+        missing=("pairs",),
+        messages={"pairs": "ground"},
     ),
     "plot.spectrum": lambda: EntryPoint(
         lambda wavelength: jl.plot.spectrum(PROSPECT, wavelength=wavelength), {"wavelength": BANDS}
@@ -624,6 +698,15 @@ ENTRY_POINTS: dict[str, Callable[[], EntryPoint]] = {
         | {"mode_smoothing": 6.5, "front_threshold": 3.0, "back_threshold": 6.0},
     ),
     "inversion.gedi_settings": lambda: EntryPoint(inversion.gedi_settings, {"group": 1}),
+    "inversion.gedi_table": lambda: EntryPoint(
+        lambda **arguments: inversion.gedi_table([], **arguments)["ground"],
+        {"group": 1, "edges": np.array([0.0, 5.0]), "reflectance_ratio": 1.5, "projection": 0.5}
+        | {"clumping": 1.0},
+    ),
+    "inversion.compare": lambda: EntryPoint(
+        lambda sigmas: inversion.compare({"h": np.ones(2)}, {"h": np.ones(2)}, on=None, sigmas=sigmas),
+        {"sigmas": 2.0},
+    ),
     "inversion.photon_ground_and_canopy": lambda: EntryPoint(
         lambda **arguments: inversion.photon_ground_and_canopy(events(), **arguments),
         {
@@ -633,6 +716,13 @@ ENTRY_POINTS: dict[str, Callable[[], EntryPoint]] = {
             "background_rate": 1.0,
             "least": 5,
         },
+    ),
+    "inversion.geolocate": lambda: EntryPoint(
+        lambda **arguments: inversion.geolocate(
+            survey=jl.Survey(jl.Lidar(divergence=20.0), TWO), scene=GROUND, key=KEY, **arguments
+        ),
+        {"records": np.stack([POWER, POWER]), "height": HEIGHT, "noise": 0.01, "search_radius": 2.0}
+        | {"height_error": 0.1, "max_orders": 1, "rtol": 0.1},
     ),
     "inversion.Recorder": lambda: EntryPoint(
         inversion.Recorder,

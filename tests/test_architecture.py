@@ -41,6 +41,8 @@ LAYERS = (
     "truth",
     "sampling",
     "simulate",
+    "scene_batch",
+    "passive",
     "energy",
     "analog",
     "io",
@@ -49,7 +51,7 @@ LAYERS = (
     "cli",
 )
 # Modules that hand on what others define, or that every layer may use.
-FACADES = {"__init__", "extend"}
+FACADES = {"__init__", "__main__", "extend"}
 PRIVATE_HELPERS = {path.stem for path in (ROOT / "jaxlidar").glob("_*.py")} - FACADES
 SOURCES = sorted((ROOT / "jaxlidar").rglob("*.py"))
 
@@ -294,14 +296,15 @@ def test_private_modules_of_jaxlidar_are_used_by_jaxlidar_alone(folder):
 def test_no_name_hides_its_module():
     """`import jaxlidar.x.y` gives the module: no function or class is exported under the name of a module.
 
-    The exception is `simulate`, whose module exports all of its public names at the top.
+    Exceptions are `simulate`, whose module exports all of its public names at the top, and `instrument`,
+    whose package does.
     """
     for package in (jaxlidar, inversion):
         names = [package.__name__]
         names += [m.name for m in pkgutil.walk_packages(package.__path__, package.__name__ + ".")]
         for name in names:
             parent, _, attribute = name.rpartition(".")
-            if not parent or name == "jaxlidar.simulate":
+            if not parent or name in ("jaxlidar.simulate", "jaxlidar.instrument"):
                 continue
             importlib.import_module(name)
             assert isinstance(getattr(sys.modules[parent], attribute), types.ModuleType), name

@@ -28,6 +28,18 @@ def close(value, exact, stderr, sigmas=4.0):
     return bool(np.all(np.abs(np.asarray(value) - exact) < sigmas * np.asarray(stderr) + 1e-6))
 
 
+def test_black_leaves_let_through_what_beer_and_lambert_say():
+    """exp(-tau) of the light reaches the ground, to a thousandth: flights are drawn from that law."""
+    black = jl.LeafOptics(reflectance=0.0, transmittance=0.0)
+    canopy = jl.Canopy(slab(1.0), leaf=black, sides="periodic")
+    scene = jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=0.0))
+    budget = jl.energy_budget(jl.Lidar(), scene, key=KEY, rtol=3e-4)
+    ground, stderr = budget.absorbed["ground"], budget.stderr["ground"]
+    assert close(ground, np.exp(-1.0), stderr)
+    # Planted: optical depths 1.005 too long.
+    assert not close(ground, np.exp(-1.0 / 1.005), stderr)
+
+
 @pytest.mark.parametrize("transmission", ["straight", "diffuse"])
 def test_a_plate_over_ground(transmission):
     plate = jl.Plate(2.0, PLATE.reflectance, PLATE.transmittance, transmission=transmission)

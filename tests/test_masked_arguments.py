@@ -101,7 +101,7 @@ def test_masks_booleans_and_times(outcomes, name):
 # the others make.
 RESULTS = (
     *("Waveform", "Progress", "PhotonEvents", "Waveforms", "SurveyProgress", "Truth", "Truths"),
-    *("EnergyBudget",),
+    *("EnergyBudget", "Acquisition", "DiscreteReturns", "InstrumentValue"),
     *("Plan", "Effect", "Setup", "Response", "AnalogReturns", "io.DemRead", "io.GediShot", "io.MeshRead"),
     *("io.NeonImpulse", "io.NeonRead", "io.PointCloud", "io.Returns", "io.Scanner", "io.ShotStack"),
     *("io.TreeRead", "io.VoxelsRead", "io.AirborneShots", "inversion.Retrieval", "inversion.Retrievals"),
@@ -110,18 +110,32 @@ RESULTS = (
     *("inversion.SignalEnds", "inversion.GroundAndCanopy", "inversion.GediMetrics"),
     *(
         "inversion.PhotonHeights",
+        "inversion.Geolocation",
+        "PointCanopy",
         "inversion.Amplitudes",
         "inversion.LeafFit",
         "LeafSurface",
         "inversion.GediSettings",
     ),
+    *("io.ColumnAxis", "io.Column", "io.ShotTable", "io.PhotonImpulse", "io.PhotonTrack"),
+    *("inversion.TableProgress", "inversion.Comparison", "inversion.ComparisonStatistics"),
+    *("inversion.ComparedColumn",),
 )
 OF_OBJECTS = (
+    *("instrument", "instruments", "instrument_sources"),
     *("total_reflectance", "open", "rerun", "Scene", "load_coefficients", "spectrum_names"),
     *("read_spectrum_csv", "Symbol", "Word", "LSystem", "trim_empty_layers", "truth_of", "make_setup"),
     *("trace_scene", "waveform_of", "Lambertian", "EqualAngle", "spectrum", "Plane"),
     *("io.atomic_write", "io.keep_as_netcdf", "io.read_case", "io.read_las_waveforms", "io.read_neon"),
-    *("io.read_pulsewaves", "io.save", "io.stack_shots", "io.write_case", "plot.accuracy"),
+    *(
+        "io.read_lvis_l1b",
+        "io.read_lvis_l2",
+        "io.read_pulsewaves",
+        "io.save",
+        "io.stack_shots",
+        "io.write_case",
+        "plot.accuracy",
+    ),
     *("plot.energy_budget", "plot.leaf_on_and_off", "plot.scene", "inversion.judge_fit"),
     *("inversion.judge_fits", "inversion.echo_points"),
 )

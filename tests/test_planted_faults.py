@@ -100,7 +100,7 @@ FAULTS = {
         "trace/flight.py",
         "scene.medium, -jnp.log(u)",
         "scene.medium, -1.005 * jnp.log(u)",
-        "trace/test_slab_all_orders.py",
+        "test_energy.py",
     ),
     "a wider pulse, 1.005": Fault(
         "instrument/pulse.py",

@@ -403,6 +403,26 @@ def profiles(record: dict) -> str:
     )
 
 
+def meshes(record: dict) -> str:
+    rows = [
+        [
+            name,
+            f"{record['triangles'][name]:,}",
+            number(elapsed),
+            number(record["times_voxels_alone"][name]),
+            number(record["seconds_first_call"][name]),
+            number(1e-6 * record["memory_bytes"][name]),
+        ]
+        for name, elapsed in record["seconds"].items()
+    ]
+    return page_of(
+        f"Seconds of `simulate` with {record['photons']:,} photons and {record['orders']} orders: a crown "
+        "of 32³ voxels over the ground, and trunks of triangles beside and within it. A copy of a mesh costs "
+        "its transformation alone.",
+        table(["scene", "triangles", "s", "times voxels alone", "s, first call", "MB, predicted"], rows),
+    )
+
+
 SECTIONS: dict[str, tuple[str, Callable[[dict], str]]] = {
     "accuracy_cost": ("Cost of accuracy", accuracy),
     "simulation_cost": ("Cost of `simulate`", simulation),
@@ -411,6 +431,7 @@ SECTIONS: dict[str, tuple[str, Callable[[dict], str]]] = {
     "peers": ("Other codes", peers),
     "effects_cost": ("Time saved by plans", effects),
     "scaling": ("Scaling of cost", scaling),
+    "meshes": ("Cost of meshes", meshes),
     "python_versions": ("Older Pythons", pythons),
     "first_order_march": ("First order against a kernel written by hand", march),
     "one_trace_all_wavelengths": ("Many wavelengths from one trace", wavelengths),

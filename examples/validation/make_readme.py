@@ -18,6 +18,7 @@ RESULTS = FOLDER / "results"
 ORDER = (
     *("mpmath_plate", "prosail_leaves", "discrete_ordinates", "rami4pilps", "mitransient_crown", "mcx_crown"),
     *("leaf_databases", "recorded_gedi", "recorded_neon", "recorded_riegl", "recorded_flat", "recorded_lvis"),
+    "recorded_clouds",
 )
 
 HEAD = """# Validation: comparisons with references, and their differences

@@ -100,6 +100,8 @@ def with_fixed_window(lidar: Lidar) -> Lidar:
     """Return the lidar with a fixed recording window: the samples of a record lie at known times."""
     check_kind("lidar", lidar, Lidar, "a Lidar")
     # A window that opens at the first return would move with the scene during a fit.
+    if not lidar.opens_at_first_return:
+        return lidar
     return dataclasses.replace(lidar, receiver=dataclasses.replace(lidar.receiver, window="fixed"))
 
 

@@ -6,7 +6,6 @@ quantities that are monotonic in each unknown, such as heights and sizes. Beyond
 are examined (`corner_scenes`).
 """
 
-import dataclasses
 import itertools
 from typing import Any, NamedTuple
 
@@ -19,15 +18,16 @@ from jaxlidar import Lidar, Plan, Scene
 from jaxlidar import plan as make_plan
 from jaxlidar.extend import check_integer, check_kind
 from jaxlidar.planning.effects import find_empty_materials
-from jaxlidar.planning.path_lengths import PathLengths
 from jaxlidar.planning.plan import MIN_BATCHES
 from jaxlidar.planning.plan_check import check_reach
-from jaxlidar.planning.size_buckets import size_bucket
+from jaxlidar.planning.scene_family import union_plan
 
 # Up to this many unknowns that change the response, every corner of the bounds is examined: 2^4 of them.
 _MAX_UNKNOWNS_FOR_ALL_CORNERS = 4
 # Batches of every full evaluation: as few as estimate the noise of a simulation.
 N_BATCHES = MIN_BATCHES
+# Bytes up to which fits keep scattering histories.
+MAX_MEMORY_OF_HISTORIES = 1e9
 # Photons and rays of all batches together, unless they or a plan are given.
 N_PHOTONS, N_RAYS = 65536, 8192
 
@@ -119,6 +119,8 @@ def plan_for_bounds(
         "effects": dict.fromkeys(find_empty_materials(scenes[0]), True),
     }
     first = make_plan(lidar, scenes[0], max_orders=sizes.max_orders, **common)
+    if not first.config.keeps_histories:
+        first = _plan_with_histories(first, lidar, scenes[0], max_orders=sizes.max_orders, **common)
     histories = first.config.keeps_histories
     common.update(max_orders=first.orders, bin_width=first.bins.width, histories=histories)
     if scene.canopy is not None:
@@ -129,32 +131,21 @@ def plan_for_bounds(
             plans.append(make_plan(lidar, corner, **common))
         except ValueError as error:
             raise ValueError(f"at the bounds of the unknowns the scene is inadmissible: {error}") from error
-    # All plans share the bin width, so that the union of their bins is a whole number of bins.
-    start = min(p.bins.start for p in plans)
-    end = max(p.bins.start + p.bins.width * p.bins.count for p in plans)
-    bins = dataclasses.replace(
-        first.bins,
-        start=start,
-        count=round((end - start) / first.bins.width),
-        max_span=max(p.bins.max_span for p in plans),
-    )
-    start_distance = max(p.limits.start_distance for p in plans)
-    max_path = max(p.limits.max_path for p in plans)
-    path_lengths = [PathLengths(lidar, s) for s in scenes]
-    # Rays start above the scene: the distance down to it is part of the path.
-    longest = max_path + start_distance
-    plan = first.with_limits(
-        start_distance=start_distance,
-        max_path=max_path,
-        max_flight=max(p.longest_flight(longest) for p in path_lengths),
-    ).with_config(
-        max_ray_segments=max(p.config.max_ray_segments for p in plans),
-        # A bucket of sizes, so that fits of similar scenes share a compiled program.
-        max_faces=size_bucket(max(p.max_faces(longest) for p in path_lengths)),
-        # A sheet that lets light through at any corner must be able to.
-        covers_fully=tuple(all(c) for c in zip(*(p.config.covers_fully for p in plans))),
-    )
-    return dataclasses.replace(plan, bins=bins)
+    return union_plan(lidar, scenes, plans)
+
+
+def _plan_with_histories(first: Plan, lidar: Lidar, scene: Scene, **options: Any) -> Plan:
+    """Return a plan with scattering histories that follows as much light as `first`, or `first`.
+
+    Derivatives with respect to optics cost next to nothing with histories, and another trace each without.
+    Fits therefore keep larger ones than simulations do.
+    """
+    try:
+        plan = make_plan(lidar, scene, histories=True, **options)
+    except ValueError:
+        return first
+    follows_as_much = plan.orders >= first.orders
+    return plan if follows_as_much and plan.memory <= MAX_MEMORY_OF_HISTORIES else first
 
 
 def checked_plan(

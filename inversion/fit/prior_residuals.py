@@ -74,18 +74,29 @@ class PriorResiduals:
         columns = [slice(a, b) for a, b in itertools.pairwise(edges)]
         self.processes = [_GaussianProcess(u, c) for u, c in zip(unknowns, columns) if u.smooth is not None]
 
+    @property
+    def centre(self) -> np.ndarray:
+        """Values of zero residual; logarithms for log-normal priors."""
+        centre = self.mean.copy()
+        for process in self.processes:
+            centre[process.columns] = process.mean
+        return centre
+
+    @property
+    def whitening(self) -> np.ndarray:
+        """Matrix (n, n) that makes residuals of differences from `centre`: W^T W is the prior precision."""
+        whitening = np.diag(self.weight)
+        for process in self.processes:
+            whitening[process.columns, process.columns] = process.inverse_cholesky / process.strength
+        return whitening
+
     def __call__(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return whitened residuals, one for each value, and their Jacobian (residuals, values)."""
         # x for log-normal priors, else 1: d ln x / dx = 1 / x.
         log_argument = np.where(self.is_log, np.maximum(values, 1e-300), 1.0)
         transformed = np.where(self.is_log, np.log(log_argument), values)
-        residual = (transformed - self.mean) * self.weight
-        jacobian = np.diag(self.weight / log_argument)
-        for process in self.processes:
-            columns = process.columns
-            jacobian[columns, columns] = process.inverse_cholesky / process.strength
-            residual[columns] = jacobian[columns, columns] @ (values[columns] - process.mean)
-        return residual, jacobian
+        whitening = self.whitening
+        return whitening @ (transformed - self.centre), whitening / log_argument
 
     @property
     def basis(self) -> np.ndarray:

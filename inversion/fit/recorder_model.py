@@ -19,7 +19,7 @@ waveform, one return a sample (Lawson and Hanson 1974, Solving Least Squares Pro
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -67,7 +67,7 @@ class RecorderModel:
         has_pulse_noise = float(self.recorder.pulse_noise) > 0
         self.pulse = _pulse_fractions(lidar, bins, interval) if has_pulse_noise else None
 
-    def _split(self, values: np.ndarray) -> tuple[float, np.ndarray, float]:
+    def _split(self, values: Any) -> tuple[Any, Any, Any]:
         """Width, offsets and scale."""
         has_width = self.recorder.width is not None
         # Width first, scale last, offsets in between: the order of `unknowns`.
@@ -84,7 +84,7 @@ class RecorderModel:
 
         **Returns:** the record, and its Jacobian with the columns of the recorder's unknowns appended.
         """
-        width, offsets, scale = self._split(values)
+        width, _, scale = self._split(values)
         received = self.receiver(reflectance, width)
         # The response acts along the last axis, which is that of unknowns in a Jacobian.
         scene_columns = np.moveaxis(self.receiver(np.moveaxis(jacobian, -1, 0), width), 0, -1)
@@ -96,8 +96,20 @@ class RecorderModel:
         )
         if self.has_scale:
             columns.append(received[..., None])
-        record = scale * received + self.offset_columns @ offsets
-        return RecordWithJacobian(record, np.concatenate(columns, axis=-1))
+        return RecordWithJacobian(self.record(reflectance, values), np.concatenate(columns, axis=-1))
+
+    def record(self, reflectance: Any, values: Any) -> Any:
+        """Model the record alone. JAX arrays may be traced and differentiated.
+
+        **Arguments:** as of `__call__`. **Returns:** (wavelengths, bins).
+        """
+        width, offsets, scale = self._split(values)
+        baseline = (self.offset_columns @ offsets).reshape(1, -1)
+        return scale * self.receiver(reflectance, width) + baseline
+
+    def scale_of(self, values: Any) -> Any:
+        """Return the scale among the values of the recorder's unknowns; 1 without such an unknown."""
+        return self._split(values)[2]
 
     def received(self, batches: np.ndarray, values: np.ndarray) -> np.ndarray:
         """Return simulated batches as received and scaled, without offsets."""

@@ -355,7 +355,7 @@ def optical_arrays(scene: Scene) -> frozenset[int]:
                 return scene.ground is None or scene.ground.pattern is None
             case ["canopy", "bark", *_] | ["atmosphere", *_]:
                 return True
-            case ["plates", _, "reflectance" | "transmittance", *_]:
+            case ["plates" | "meshes", _, "reflectance" | "transmittance", *_]:
                 return True
         return False
 

@@ -62,7 +62,7 @@ from inversion.metrics.records import (
     sample_pulse,
     size_bucket,
 )
-from jaxlidar.extend import as_array, check_integer, check_range, concrete
+from jaxlidar.extend import as_array, check_integer, check_range, concrete, decompose_records
 
 _SOLVER = optx.LevenbergMarquardt(rtol=1e-3, atol=1e-3)
 _MAX_STEPS = 40
@@ -217,6 +217,21 @@ def gaussian_decomposition(
         stderr=echoes.stderr * per_parameter,
         model=echoes.model[..., :bins] * unit,
     )
+
+
+@decompose_records.register
+def decompose_shots(
+    time: Float[np.ndarray, " bins"],
+    power: Float[np.ndarray, "shots bins"],
+    noise: Float[np.ndarray, "shots bins"],
+    pulse: Float[np.ndarray, " lags"],
+) -> tuple[Int[Array, " shots"], Array, Array, Array]:
+    """Decompose records into copies of a pulse, for `jaxlidar.Waveforms.returns`.
+
+    **Returns:** number of echoes, and their amplitudes, times and widths, (shots, echoes) each.
+    """
+    echoes = gaussian_decomposition(time, power, noise=noise, pulse=pulse)
+    return echoes.count, echoes.amplitude, echoes.time, echoes.width
 
 
 def _check_noise(noise: ArrayLike) -> None:

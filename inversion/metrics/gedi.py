@@ -154,46 +154,80 @@ def gedi_metrics(shots: Any, settings: GediSettings | None = None) -> GediMetric
     >>> metrics = inversion.gedi_metrics(shots, inversion.gedi_settings(1))  # doctest: +SKIP
     >>> rh98 = metrics.rh[:, 98]  # doctest: +SKIP
     """
-    shots = _list_of_shots(shots)
+    shots = list_of_shots(shots)
     settings = gedi_settings(1) if settings is None else GediSettings(*settings)
     for name, value in settings._asdict().items():
         check_range(name, value, 0.0, low_open=True)
+    return metrics_of_records(pad_shots(shots), settings)
+
+
+class PaddedShots(NamedTuple):
+    """Records of shots in batches of one size, less their noise and over their largest samples.
+
+    - `top`, `step`: (shots,) elevation of the first sample and distance of samples in m.
+    - `batches`: of each batch the numbers of its shots, at most `_CHUNK`, and with rows for `_CHUNK` shots
+      the records, their numbers of samples, and the noise.
+    """
+
+    top: np.ndarray
+    step: np.ndarray
+    batches: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]
+
+
+def pad_shots(shots: list[Any], *, size: int | None = None, is_checked: bool = False) -> PaddedShots:
+    """Check the records of shots and pad them to their size buckets, or all of them to `size` samples.
+
+    **Arguments:** `is_checked`: the records have been checked before, by `record_above_noise` and
+    `even_step`.
+
+    **Raises:** ValueError as `gedi_metrics`.
+    """
+    n_samples = np.array([np.size(shot.waveform) for shot in shots], int)
+    top, step = np.empty((2, len(shots)))
+    sizes = np.array([size_bucket(int(count)) for count in n_samples], int)
+    if size is not None:
+        sizes = np.full_like(sizes, size)
+    batches = []
+    for padded_size in np.unique(sizes):
+        (members,) = np.nonzero(sizes == padded_size)
+        for first in range(0, members.size, _CHUNK):
+            chunk = members[first : first + _CHUNK]
+            # Chunks are filled up to one size, so that all share a program; the filling is records of zeros.
+            records = np.zeros((_CHUNK, padded_size))
+            noise, count = np.ones(_CHUNK), np.full(_CHUNK, 3)
+            for row, i in enumerate(chunk):
+                shot = shots[i]
+                record = shot.waveform - shot.noise_mean if is_checked else record_above_noise(shot)
+                # Over the largest sample, which single precision holds whatever the unit of the record.
+                peak = np.max(np.abs(record)) or 1.0
+                records[row, : n_samples[i]] = record / peak
+                noise[row], count[row] = shot.noise_std / peak, n_samples[i]
+                top[i], bottom = shot.elevation[0], shot.elevation[-1]
+                if not is_checked:
+                    even_step("elevation", shot.elevation, decreasing=True)
+                step[i] = (top[i] - bottom) / (n_samples[i] - 1)
+            batches.append((chunk, records, count, noise))
+    return PaddedShots(top, step, batches)
+
+
+def metrics_of_records(padded: PaddedShots, settings: GediSettings) -> GediMetrics:
+    """Compute the metrics of padded shots: `gedi_metrics` for records that are used with several settings."""
     kernels = [_smoothing_kernel(settings.smoothing), _smoothing_kernel(settings.mode_smoothing)]
     # Of one size for all published settings, so that they share a program.
     half_lags = max(_HALF_LAGS, *(kernel.size // 2 for kernel in kernels))
     kernels = np.stack([np.pad(kernel, half_lags - kernel.size // 2) for kernel in kernels])
     kernels = jnp.asarray(kernels, float)
     thresholds = jnp.asarray((settings.front_threshold, settings.back_threshold), float)
-    n_samples = np.array([np.size(shot.waveform) for shot in shots], int)
-    top, step = np.empty((2, len(shots)))
-    features = {name: np.zeros(len(shots)) for name in _RecordFeatures._fields if name != "rh"}
-    rh_position = np.zeros((len(shots), _RH_FRACTIONS.size))
-    sizes = np.array([size_bucket(int(count)) for count in n_samples])
-    for size in np.unique(sizes):
-        (members,) = np.nonzero(sizes == size)
-        for first in range(0, members.size, _CHUNK):
-            chunk = members[first : first + _CHUNK]
-            # Chunks are filled up to one size, so that all share a program; the filling is records of zeros.
-            records = np.zeros((_CHUNK, size))
-            noise, count = np.ones(_CHUNK), np.full(_CHUNK, 3)
-            for row, i in enumerate(chunk):
-                shot = shots[i]
-                record = _record_above_noise(shot)
-                # Over the largest sample, which single precision holds whatever the unit of the record.
-                peak = np.max(np.abs(record)) or 1.0
-                records[row, : n_samples[i]] = record / peak
-                noise[row], count[row] = shot.noise_std / peak, n_samples[i]
-                top[i], step[i] = shot.elevation[0], even_step("elevation", shot.elevation, decreasing=True)
-            computed = _record_features(
-                jnp.asarray(records, float),
-                jnp.asarray(count),
-                jnp.asarray(noise, float),
-                kernels,
-                thresholds,
-            )
-            for name, values in features.items():
-                values[chunk] = np.asarray(getattr(computed, name))[: chunk.size]
-            rh_position[chunk] = np.asarray(computed.rh)[: chunk.size]
+    top, step = padded.top, padded.step
+    features = {name: np.zeros(len(top)) for name in _RecordFeatures._fields if name != "rh"}
+    rh_position = np.zeros((len(top), _RH_FRACTIONS.size))
+    for chunk, records, count, noise in padded.batches:
+        computed = _record_features(
+            jnp.asarray(records, float), jnp.asarray(count), jnp.asarray(noise, float), kernels, thresholds
+        )
+        for name, values in features.items():
+            values[chunk] = np.asarray(getattr(computed, name))[: chunk.size]
+        rh_position[chunk] = np.asarray(computed.rh)[: chunk.size]
     # Positions count quarter bins downwards from the first sample.
     spacing = step / _SUBDIVISIONS
     has_signal = features["has_signal"] > 0
@@ -208,7 +242,7 @@ def gedi_metrics(shots: Any, settings: GediSettings | None = None) -> GediMetric
     )
 
 
-def _list_of_shots(shots: Any) -> list[Any]:
+def list_of_shots(shots: Any) -> list[Any]:
     """Return shots as a list. **Raises:** TypeError, with the right call, for other things."""
     if isinstance(shots, str | os.PathLike):
         raise TypeError(
@@ -230,7 +264,7 @@ def _list_of_shots(shots: Any) -> list[Any]:
     return shots
 
 
-def _record_above_noise(shot: Any) -> np.ndarray:
+def record_above_noise(shot: Any) -> np.ndarray:
     """Record of a shot less its mean noise. **Raises:** ValueError for shapes or values that do not serve."""
     record, _ = as_numpy(shot.waveform, "waveform"), as_numpy(shot.elevation, "elevation")
     if record.ndim != 1 or record.size < 3 or np.shape(shot.elevation) != record.shape:

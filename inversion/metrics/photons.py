@@ -1,44 +1,85 @@
-"""Ground and canopy in the events of a photon counter, without a model of the scene.
+r"""Ground and canopy in the events of a photon counter, without a model of the scene.
 
-1. **Noise.** Signal is dense. The neighbours of a photon are those within an ellipse that is wider than high
-   (Zhang and Kerekes 2015). By background alone their number is Poisson distributed, with the mean of the
-   ellipse's area times the density of background. A photon is signal where that number or more occur in less
-   than one case of a thousand (compare DRAGANN, Neuenschwander and Pitts 2019).
-2. **Ground.** In each segment of the track it is a straight line, fitted to the signal by iteratively
-   reweighted least squares with weights that fall off quickly above the line and slowly below it,
+1. **Dense surface.** In cells of 20 m by 1 m, slabs of 4 m are compared with the background: n photons
+   where e are expected have the log-likelihood ratio n ln(n / e) - n + e. The path of slabs that maximises
+   its sum, with a cost per metre of change, is the densest surface: the top of a canopy, or open ground.
+2. **Ground.** Below or on that surface, at the height z in cells of 10 m, the rate of photons per metre is
 
-       w(r) = 1 / (1 + (r / s)^4),    s = 1 m for r > 0, 5 m for r < 0,
+       b + N_g g(h - z) + sum_k N_k c_k(h - z)
 
-   so that the line sinks through the canopy (Kraus and Pfeifer 1998); at the end, by photons within a metre.
-3. **Canopy.** Its height is a percentile, ATL08's 98th, of the heights above that line of signal two metres
-   above it and more (Neuenschwander and Pitts 2019).
+   with the background b, the Gaussian g of the ground's echo and hat functions c_k above it, which make up a
+   canopy of any profile. For each z the numbers N are those that maximise the likelihood, with a Dirichlet
+   prior that the ground is not without light (expectation maximisation). Ground heights of neighbouring cells
+   differ as a Laplace distribution with rare jumps: a hidden Markov model, whose forward-backward recursion
+   gives mean and standard deviation of the ground in each cell. It is run twice, about the smoothed surface
+   of the pass before, so that the ground may bend.
+3. **Signal.** The neighbours of a photon are those within an ellipse along the ground that is wider than high
+   (Zhang and Kerekes 2015). By background alone their number is Poisson distributed. A photon is signal where
+   that number or more occur in less than one case of ten thousand (compare DRAGANN, Neuenschwander and
+   Pitts 2019). The background is that of the cells about it.
+4. **Canopy.** Its height is a percentile, ATL08's 98th, of the heights above the ground of signal that clears
+   the ground's echo. There is one if there are more photons than the background gives.
 
-**Source:** Kraus and Pfeifer (1998), ISPRS J. Photogramm. 53, 193; Neuenschwander and Pitts (2019), Remote
-Sens. Environ. 221, 247; Zhang and Kerekes (2015), IEEE Geosci. Remote Sens. Lett. 12, 726.
+**Source:** Neuenschwander and Pitts (2019), Remote Sens. Environ. 221, 247; Zhang and Kerekes (2015), IEEE
+Geosci. Remote Sens. Lett. 12, 726; Rabiner (1989), Proc. IEEE 77, 257, for the recursion.
 """
 
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import ArrayLike, Float, Int
-from scipy import spatial, stats
+from jaxtyping import ArrayLike, Float, Int, Shaped
+from scipy import linalg, spatial, special, stats
 
+from inversion.fit.quality import Verdict
 from jaxlidar import SPEED_OF_LIGHT, PhotonEvents
 from jaxlidar.extend import as_numpy, check_integer, check_kind, check_range
+from jaxlidar.io import PhotonTrack
 
 # Half-axes of the ellipse in m: along the track, in height.
 _ALONG, _HIGH = 10.0, 3.0
 # Probability that background alone passes for signal, and the fewest neighbours of signal.
-_FALSE_ALARM, _FEWEST_NEIGHBOURS = 1e-3, 3
+_FALSE_ALARM, _FEWEST_NEIGHBOURS = 1e-4, 3
+# Probabilities that background alone passes for ground, of which many places are searched; for canopy; and
+# for photons below the ground.
+_FALSE_GROUND, _FALSE_CANOPY, _FALSE_DEPTH = 1e-4, 1e-3, 1e-3
 # Height in m of the cells in which background is counted. Cells this many standard deviations above the mean
 # hold signal.
 _CELL_HEIGHT, _CLIP, _CLIP_ITERATIONS = 5.0, 3.0, 30
-# Residuals in m at which weights are a half, above the ground (Kraus and Pfeifer's) and below.
-_HALF_WEIGHT_ABOVE, _HALF_WEIGHT_BELOW = 1.0, 5.0
-# Iterations of the fit, the first ones with those weights. It starts from this percentile of the heights.
-_ITERATIONS, _WEIGHTED_ITERATIONS, _START_PERCENTILE = 40, 30, 10.0
-# Largest distance of ground from the line, and least height of canopy above it, m.
-_GROUND_RANGE, _CANOPY_CLEARANCE = 1.0, 2.0
+# Local background: counted below and above these distances from the dense surface in m, over the cells of
+# this length, if so much height remains. Least background per square metre: strays are no ground.
+_SURFACE_DEPTH, _SURFACE_HEIGHT, _BACKGROUND_LENGTH = 45.0, 45.0, 100.0
+_MIN_BACKGROUND_HEIGHT, _LEAST_BACKGROUND = 20.0, 1e-3
+# Dense surface: length and height of the cells, height of the slabs, and change in m that costs as much as a
+# factor e in likelihood.
+_SURFACE_CELL, _SURFACE_STEP, _SLAB, _SURFACE_CHANGE = 20.0, 1.0, 4, 4.0
+_CENTRING_PASSES = 3
+# Least log-likelihood ratio of a slab with light, and the weight of cells without any in smooth surfaces.
+_LEAST_EVIDENCE, _EMPTY_WEIGHT = 5.0, 1e-3
+# Ground: length of the cells in m; standard deviation of the echo on level ground and radius (one standard
+# deviation) of the footprint, which widens it on slopes; middles of the hat functions in m above it; strength
+# of the prior; iterations of expectation maximisation.
+_GROUND_CELL, _ECHO_WIDTH, _FOOTPRINT = 10.0, 0.3, 2.75
+_HATS, _GROUND_PRIOR, _EXPECTATIONS = (1.5, 3.5, 7.0, 14.0, 28.0), 0.2, 25
+# Offsets from the surface in m that are tried in the two passes: lowest, highest, step.
+_OFFSETS = ((-40.0, 3.0, 0.25), (-4.0, 4.0, 0.1))
+# Scale in m of the changes of the ground against a smooth surface between cells, and probability of a jump.
+_GROUND_CHANGE, _JUMP = 0.3, 1e-4
+# Length in m over which surfaces are smoothed between the passes, and the standard error in m at which a
+# height has half of its weight.
+_SMOOTHING_LENGTH, _CERTAIN_ERROR = 30.0, 0.5
+# Largest distance of ground photons from the ground in m, and least height of canopy above it, which is also
+# this many standard deviations of the ground's echo.
+_GROUND_RANGE, _CANOPY_CLEARANCE, _CLEARANCE_SIGMAS = 0.75, 1.0, 3.0
+# Errors of the ground in m beside that of the recursion: on open ground, and more at most under a canopy that
+# goes on down to it. Larger errors than the limit make a ground doubtful, and so do fewer photons than these.
+_MODEL_ERROR, _CANOPY_ERROR, _DOUBTFUL_ERROR, _DOUBTFUL_PHOTONS = 0.1, 0.3, 0.7, 3
+# Depths in m below the ground in which photons are counted, and the segments on either side that are counted
+# with each.
+_DEPTH_RANGE, _DEPTH_NEIGHBOURS = (1.0, 12.0), 2
+# Signal photons in a segment, over the fewest of a ground, with which its lower edge is the ground.
+_RICH_SIGNAL = 4.0
+# Length in m of the segments of ATL03. Segments that are printed.
+_PRODUCT_SEGMENT, _PRINTED_SEGMENTS = 20.0, 20
 # Labels of photons.
 _NOISE, _GROUND, _CANOPY, _OTHER_SIGNAL = 0, 1, 2, 3
 
@@ -52,6 +93,10 @@ class PhotonHeights(NamedTuple):
     - `canopy`: (segments,) m, height of the canopy above the ground.
     - `label`: (events,) 0 for noise, 1 for ground, 2 for canopy, and 3 for signal that is neither: between
       the two, below the ground, or in a segment without ground.
+    - `ground_stderr`, `canopy_stderr`: (segments,) m, standard errors.
+    - `quality`: (segments,) "good", "doubtful", or "bad" for a segment without ground.
+    - `reasons`: a text for each segment, empty for a good one.
+    - `segment_id`: (segments,) the product's numbers of the segments of a `PhotonTrack`; else 0, 1, ...
 
     **Example:** the fraction of the photons that were taken for canopy.
 
@@ -67,11 +112,30 @@ class PhotonHeights(NamedTuple):
     slope: Float[np.ndarray, " segments"]
     canopy: Float[np.ndarray, " segments"]
     label: Int[np.ndarray, " events"]
+    ground_stderr: Float[np.ndarray, " segments"] = np.zeros(0)
+    canopy_stderr: Float[np.ndarray, " segments"] = np.zeros(0)
+    quality: Shaped[np.ndarray, " segments"] = np.zeros(0, str)
+    reasons: tuple[str, ...] = ()
+    segment_id: Int[np.ndarray, " segments"] = np.zeros(0, int)
+
+    def __str__(self) -> str:
+        """Return a line for each segment, of at most twenty."""
+        lines = ["distance   ground    s.e.   canopy    s.e.  quality"]
+        for i in range(min(len(self.distance), _PRINTED_SEGMENTS)):
+            numbers = (self.ground[i], self.ground_stderr[i], self.canopy[i], self.canopy_stderr[i])
+            ground, ground_error, canopy, canopy_error = ("-" if np.isnan(x) else f"{x:.2f}" for x in numbers)
+            lines.append(
+                f"{self.distance[i]:8.1f} {ground:>8} {ground_error:>7} {canopy:>8} {canopy_error:>7}  "
+                f"{self.quality[i]} {self.reasons[i]}".rstrip()
+            )
+        if len(self.distance) > _PRINTED_SEGMENTS:
+            lines.append(f"... {len(self.distance) - _PRINTED_SEGMENTS} more segments")
+        return "\n".join(lines)
 
 
 def photon_ground_and_canopy(
-    events: PhotonEvents,
-    distance: Float[ArrayLike, " shots"],
+    events: PhotonEvents | PhotonTrack,
+    distance: Float[ArrayLike, " shots"] | None = None,
     *,
     segment: float = 20.0,
     percentile: float = 98.0,
@@ -82,24 +146,29 @@ def photon_ground_and_canopy(
 
     The method uses neither pulse nor dead time: where echoes are strong, both heights have the bias of first
     photons. The few photons of a thin top are lost with the noise, so canopies read low by a metre or so
-    under sunlight. Light is taken to travel straight down.
+    under sunlight. Light is taken to travel straight down. Under a canopy that lets hardly any photon reach
+    the ground, the ground is the lower edge of what returns, and its quality "doubtful".
 
     **Arguments:**
 
-    - `events`: `PhotonEvents` of a track, as `jaxlidar.record` draws them of `Waveforms`.
-    - `distance`: (shots,) m along the track of each shot, not all equal.
-    - `segment`: length in m over which the ground is a line, positive. Default 20.
+    - `events`: a `PhotonTrack` of `jaxlidar.io.read_atl03`, or `PhotonEvents` of a track, as
+      `jaxlidar.record` draws them of `Waveforms`.
+    - `distance`: (shots,) m along the track of each shot, not all equal. Needed for `PhotonEvents`; photons
+      of a `PhotonTrack` have theirs.
+    - `segment`: length in m over which the ground is given, positive. Default 20: those of a `PhotonTrack`
+      are then its geolocation segments, and rows are those of ATL08 at 20 m.
     - `percentile`: of the heights of canopy photons that is the canopy's, in [0, 100]. Default 98.
     - `background_rate`: events per second of background, not negative. Default None: estimated from the
-      record, which then must be mostly background: see `PhotonCounter.window`.
-    - `least`: fewest photons of a ground, or a canopy, an integer of at least 2. Default 5.
+      record about each place, which then must be mostly background: see `PhotonCounter.window`.
+    - `least`: fewest photons of a canopy, an integer of at least 2. Default 5. A ground needs three, and more
+      than the background gives.
 
     **Returns:** a `PhotonHeights`.
 
     **Raises:** ValueError for inadmissible arguments, TypeError for `events` of another kind.
 
-    **Source:** Neuenschwander and Pitts (2019), Remote Sens. Environ. 221, 247, for noise and canopy; Kraus
-    and Pfeifer (1998), ISPRS J. Photogramm. 53, 193, for the ground.
+    **Source:** Neuenschwander and Pitts (2019), Remote Sens. Environ. 221, 247, for noise and canopy; the
+    ground by a hidden Markov model, as in the module's docstring.
 
     **Example:** flat ground at 3 m, by day.
 
@@ -113,71 +182,430 @@ def photon_ground_and_canopy(
     >>> print(f"{np.mean(heights.ground):.1f} m, {np.isfinite(heights.canopy).sum()} segments with canopy")
     3.0 m, 0 segments with canopy
     """
-    check_kind("events", events, PhotonEvents, "PhotonEvents")
-    check_range("distance", distance)
+    check_kind("events", events, PhotonEvents | PhotonTrack, "PhotonEvents or a PhotonTrack")
+    if distance is not None:
+        check_range("distance", distance)
     check_range("segment", segment, 0.0, low_open=True)
     check_range("percentile", percentile, 0.0, 100.0)
     least = check_integer("least", least, 2)
     if background_rate is not None:
         check_range("background_rate", background_rate, 0.0)
+    if isinstance(events, PhotonTrack):
+        photons = _photons_of_track(events, distance, background_rate)
+        is_of_product = segment == _PRODUCT_SEGMENT
+        starts = (
+            events.segment_start if is_of_product else photons.start + _even_starts(photons.length, segment)
+        )
+        lengths = np.full(starts.shape, float(segment))
+        if is_of_product:
+            is_stated = np.isfinite(events.segment_length) & (events.segment_length > 0)
+            lengths = np.where(is_stated, events.segment_length, lengths)
+        identifiers = events.segment_id if is_of_product else np.arange(starts.size)
+    else:
+        photons = _photons_of_events(events, distance, background_rate)
+        starts = photons.start + _even_starts(photons.length, segment)
+        lengths, identifiers = np.full(starts.shape, float(segment)), np.arange(starts.size)
+    middle = starts + 0.5 * lengths
+    number = np.clip(np.searchsorted(starts, photons.x, side="right") - 1, 0, starts.size - 1)
+
+    surface = _dense_surface(photons)
+    background = _local_background(photons, surface)
+    curve = _ground_curve(photons, surface, background)
+    above = photons.z - curve.height_at(photons.x)
+    expected = background.density_at(middle)
+    slope = curve.slope_at(middle, lengths)
+    is_signal = _count_neighbours(photons.x, above) >= _fewest_neighbours(background.density_at(photons.x))
+
+    # Ground: more photons in its echo than the background gives.
+    n_segments = starts.size
+    is_near = np.abs(above) <= _GROUND_RANGE
+    near = np.bincount(number[is_near], minlength=n_segments)
+    by_background = expected * lengths * 2.0 * _GROUND_RANGE
+    fewest = np.maximum(stats.poisson.isf(_FALSE_GROUND, by_background) + 1.0, _DOUBTFUL_PHOTONS)
+    signal_count = np.bincount(number[is_signal & (above > -_GROUND_RANGE)], minlength=n_segments)
+    # Below a canopy of many photons the lower edge counts as ground, if a doubtful one.
+    has_ground = (near >= fewest) | (signal_count >= _RICH_SIGNAL * fewest)
+
+    # Canopy: what clears the ground's echo, and is more than the background gives.
+    echo_width = np.hypot(_ECHO_WIDTH, _FOOTPRINT * slope)
+    clearance = np.maximum(_CANOPY_CLEARANCE, _CLEARANCE_SIGMAS * echo_width)
+    # A height over the ground needs some photon of the ground.
+    is_canopy = is_signal & (above >= clearance[number]) & (has_ground & (near >= 1))[number]
+    height, count = _percentiles(above[is_canopy], number[is_canopy], n_segments, percentile, least)
+    # Its median tells how deep it is: the percentile may be a stray's.
+    median, _ = _percentiles(above[is_canopy], number[is_canopy], n_segments, 50.0, least)
+    background_count = expected * lengths * np.maximum(np.nan_to_num(median) - clearance, 0.0)
+    fewest_canopy = stats.poisson.isf(_FALSE_CANOPY, background_count) + 1.0
+    has_canopy = np.isfinite(height) & (count >= fewest_canopy)
+    is_canopy &= has_canopy[number]
+    is_ground = is_signal & is_near & has_ground[number]
+    label = np.select([is_ground, is_canopy, is_signal], [_GROUND, _CANOPY, _OTHER_SIGNAL], _NOISE)
+
+    # A canopy that goes on down to the ground hides its echo: where as many photons lie just above the echo
+    # as in it, the ground may be a part of that layer.
+    is_just_above = (above > _GROUND_RANGE) & (above <= 3.0 * _GROUND_RANGE)
+    just_above = np.bincount(number[is_just_above], minlength=n_segments)
+    excess = np.maximum(just_above - by_background, 0.0) / np.maximum(near, 1)
+    model_error = _MODEL_ERROR + _CANOPY_ERROR * np.minimum(excess, 1.0)
+    ground_stderr = np.hypot(curve.stderr_at(middle, lengths), model_error)
+    # Light from below the ground: there is a deeper one. Segments about each are counted together.
+    is_below = (above < -_DEPTH_RANGE[0]) & (above > -_DEPTH_RANGE[1])
+    below = _moving_sum(np.bincount(number[is_below], minlength=n_segments), _DEPTH_NEIGHBOURS)
+    depth_background = _moving_sum(expected * lengths, _DEPTH_NEIGHBOURS) * np.ptp(_DEPTH_RANGE)
+    is_deeper = below > stats.poisson.isf(_FALSE_DEPTH, depth_background)
+    verdicts = [
+        _verdict(
+            bool(has_ground[i]),
+            float(ground_stderr[i]),
+            int(near[i]),
+            float(by_background[i]),
+            bool(is_deeper[i]),
+        )
+        for i in range(n_segments)
+    ]
+    canopy = np.where(has_canopy, height, np.nan)
+    spread = _percentile_error(above[is_canopy], number[is_canopy], n_segments, percentile)
+    return PhotonHeights(
+        distance=middle,
+        ground=np.where(has_ground, curve.height_at(middle), np.nan),
+        slope=np.where(has_ground, slope, np.nan),
+        canopy=canopy,
+        label=label,
+        ground_stderr=np.where(has_ground, ground_stderr, np.nan),
+        canopy_stderr=np.where(has_canopy, np.hypot(spread, ground_stderr), np.nan),
+        quality=np.array([verdict.quality for verdict in verdicts], str),
+        reasons=tuple("; ".join(verdict.reasons) for verdict in verdicts),
+        segment_id=np.asarray(identifiers),
+    )
+
+
+# -- photons -----------------------------------------------------------------------------------------------
+
+
+class _Photons(NamedTuple):
+    """Photons of a track.
+
+    - `x`, `z`: (photons,) m along the track and height.
+    - `start`, `length`: m, of the track.
+    - `window`: heights in m between which photons are recorded.
+    - `density`: background per square metre where it is given, else None.
+    """
+
+    x: np.ndarray
+    z: np.ndarray
+    start: float
+    length: float
+    window: tuple[float, float]
+    density: float | None
+
+
+def _photons_of_events(
+    events: PhotonEvents, distance: ArrayLike | None, background_rate: float | None
+) -> _Photons:
+    if distance is None:
+        raise ValueError("distance is None; admissible for PhotonEvents is the distance of each shot in m")
     along = as_numpy(distance, "distance")
     if along.shape != (len(events.lost),) or np.ptp(along) == 0:
         raise ValueError(
             f"distance has shape {along.shape}; admissible is one for each of the {len(events.lost)} shots "
             "of events, which do not all lie at one place"
         )
-    start, length = along.min(), np.ptp(along)
-    # A track of a whole number of segments has no further one by rounding.
-    n_segments = int(np.ceil(length / segment * (1 - 1e-9)))
-    middle = start + segment * (np.arange(n_segments) + 0.5)
-    x, z = along[events.shot], events.height
-    number = np.clip(((x - start) / segment).astype(int), 0, n_segments - 1)
-    if background_rate is None:
-        density = _background_density(x - start, z, length, events.window)
-    else:
-        rate_per_metre = 1e-9 * background_rate * 2.0 / SPEED_OF_LIGHT
-        density = rate_per_metre * len(along) * events.pulses / length
-
-    is_signal = _count_neighbours(x, z) >= _fewest_neighbours(density)
-    # Lines pass through the middle of their segments, where height and slope are least correlated.
-    x_local = x - middle[number]
-    ground, slope = _fit_ground(x_local[is_signal], z[is_signal], number[is_signal], n_segments)
-    above = z - ground[number] - slope[number] * x_local
-    is_near = is_signal & (np.abs(above) <= _GROUND_RANGE)
-    has_ground = np.bincount(number[is_near], minlength=n_segments) >= least
-    ground, slope = np.where(has_ground, ground, np.nan), np.where(has_ground, slope, np.nan)
-    is_canopy = is_signal & (above >= _CANOPY_CLEARANCE) & has_ground[number]
-    label = np.select(
-        [is_near & has_ground[number], is_canopy, is_signal], [_GROUND, _CANOPY, _OTHER_SIGNAL], _NOISE
-    )
-    return PhotonHeights(
-        distance=middle,
-        ground=ground,
-        slope=slope,
-        canopy=_percentiles(above[is_canopy], number[is_canopy], n_segments, percentile, least),
-        label=label,
-    )
+    length = float(np.ptp(along))
+    density = None
+    if background_rate is not None:
+        density = _per_metre(background_rate) * len(along) * events.pulses / length
+    window = (float(events.window.min()), float(events.window.max()))
+    return _Photons(along[events.shot], events.height, float(along.min()), length, window, density)
 
 
-def _background_density(x: np.ndarray, z: np.ndarray, length: float, window: np.ndarray) -> float:
-    """Background events per square metre of track and height: the mean of cells without signal.
+def _photons_of_track(
+    track: PhotonTrack, distance: ArrayLike | None, background_rate: float | None
+) -> _Photons:
+    if distance is not None:
+        raise ValueError("distance is given; admissible for a PhotonTrack is None: its photons have theirs")
+    density = None
+    if background_rate is not None and len(track):
+        pulses = int(np.ptp(track.pulse)) + 1
+        density = _per_metre(background_rate) * pulses / track.length
+    window = (float(track.height.min()), float(track.height.max())) if len(track) else (0.0, 1.0)
+    start = float(track.segment_start[0])
+    return _Photons(track.distance, track.height, start, track.length, window, density)
+
+
+def _per_metre(rate: float) -> float:
+    """Return events per metre of height and pulse of a rate in events per second."""
+    return 1e-9 * rate * 2.0 / SPEED_OF_LIGHT
+
+
+def _even_starts(length: float, segment: float) -> np.ndarray:
+    """Return the starts of segments; a track of a whole number of them has no further one by rounding."""
+    return segment * np.arange(max(1, int(np.ceil(length / segment * (1 - 1e-9)))))
+
+
+def _cells(photons: _Photons, size: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the number of the cell of each photon, and the middles of the cells, of about `size` m."""
+    count = max(1, round(photons.length / size))
+    size = photons.length / count
+    number = np.clip(((photons.x - photons.start) / size).astype(int), 0, count - 1)
+    return number, photons.start + size * (np.arange(count) + 0.5)
+
+
+# -- dense surface and background --------------------------------------------------------------------------
+
+
+class _Curve(NamedTuple):
+    """Heights at the middles of cells, piecewise linear between them.
+
+    - `x`, `z`: (cells,) m. `stderr`: (cells,) standard errors of the heights in m.
+    - `weight`: (cells,) in (0, 1], small where no photons support the height.
+    """
+
+    x: np.ndarray
+    z: np.ndarray
+    stderr: np.ndarray
+    weight: np.ndarray
+
+    def height_at(self, x: np.ndarray) -> np.ndarray:
+        """Interpolate, and extrapolate by the slope of the outermost cells."""
+        if self.x.size < 2:
+            return np.full(np.shape(x), self.z[0])
+        i = np.clip(np.searchsorted(self.x, x) - 1, 0, self.x.size - 2)
+        fraction = (x - self.x[i]) / (self.x[i + 1] - self.x[i])
+        return self.z[i] + fraction * (self.z[i + 1] - self.z[i])
+
+    def slope_at(self, x: np.ndarray, length: np.ndarray) -> np.ndarray:
+        """Return the mean slope over lengths about places."""
+        half = 0.5 * np.maximum(length, 2.0 * _GROUND_CELL)
+        return (self.height_at(x + half) - self.height_at(x - half)) / (2.0 * half)
+
+    def stderr_at(self, x: np.ndarray, length: np.ndarray) -> np.ndarray:
+        """Return the root mean square error over lengths about places: errors of neighbours are alike."""
+        offsets = np.linspace(-0.5, 0.5, 5)[:, None] * length
+        return np.sqrt(np.mean(np.interp(x + offsets, self.x, self.stderr) ** 2, axis=0))
+
+
+class _Background(NamedTuple):
+    """Background per square metre in the cells of a track, at their middles `x`."""
+
+    x: np.ndarray
+    density: np.ndarray
+
+    def density_at(self, x: np.ndarray) -> np.ndarray:
+        """Interpolate between the middles of cells."""
+        return np.interp(x, self.x, self.density)
+
+
+def _dense_surface(photons: _Photons) -> _Curve:
+    """Return the surface of the most photons: step 1 of the module's docstring.
+
+    Each cell takes the height of the largest max-marginal, by forward and backward passes of the max-product
+    recursion. With a cost in proportion to the change, a pass is two running maxima.
+    """
+    number, middle = _cells(photons, _SURFACE_CELL)
+    low, high = photons.window
+    levels = max(_SLAB, int(np.ceil((high - low) / _SURFACE_STEP)))
+    row = np.clip(((photons.z - low) / _SURFACE_STEP).astype(int), 0, levels - 1)
+    count = np.bincount(number * levels + row, minlength=middle.size * levels).reshape(-1, levels)
+    background = photons.density
+    if background is None:
+        background = _mean_background(photons)
+    area = photons.length / middle.size * _SLAB * _SURFACE_STEP
+    expected = max(background, _LEAST_BACKGROUND) * area
+    slab = np.stack([np.convolve(cell, np.ones(_SLAB), mode="same") for cell in count])
+    ratio = special.xlogy(slab, slab / expected) - slab + expected
+    evidence = np.where(slab > expected, ratio, 0.0)
+    cost = _SURFACE_STEP / _SURFACE_CHANGE * np.arange(levels)
+
+    def best_change(score: np.ndarray) -> np.ndarray:
+        upward = np.maximum.accumulate(score + cost) - cost
+        downward = np.maximum.accumulate((score - cost)[::-1])[::-1] + cost
+        return np.maximum(upward, downward)
+
+    forward, backward = np.zeros_like(evidence), np.zeros_like(evidence)
+    for k in range(1, middle.size):
+        forward[k] = best_change(forward[k - 1] + evidence[k - 1])
+        backward[-k - 1] = best_change(backward[-k] + evidence[-k])
+    height = low + _SURFACE_STEP * np.argmax(forward + evidence + backward, axis=1)
+    at_surface = np.take_along_axis(evidence, np.argmax(forward + evidence + backward, axis=1)[:, None], 1)
+    weight = np.where(at_surface[:, 0] > _LEAST_EVIDENCE, 1.0, _EMPTY_WEIGHT)
+    surface = _Curve(middle, height.astype(float), np.zeros(middle.size), weight)
+    for _ in range(_CENTRING_PASSES):
+        offset = photons.z - surface.height_at(photons.x)
+        near = np.abs(offset) < _SLAB * _SURFACE_STEP
+        shift = _percentiles(offset[near], number[near], middle.size, 50.0, 3)[0]
+        surface = surface._replace(z=surface.z + np.nan_to_num(shift))
+    return surface
+
+
+def _mean_background(photons: _Photons) -> float:
+    """Background per square metre of track and height: the mean of cells without signal.
 
     Sigma clipping of the counts n of cells, Poisson distributed: from the mean m of all cells, the mean of
     those with n <= m + 3 sqrt(m), again and again.
     """
-    low, high = window.min(), window.max()
-    shape = [max(1, round(size / _CELL_HEIGHT)) for size in (4.0 * length / _ALONG, high - low)]
-    counts, _, _ = np.histogram2d(x, z, bins=shape, range=[[0.0, length], [low, high]])
+    low, high = photons.window
+    shape = [max(1, round(size / _CELL_HEIGHT)) for size in (4.0 * photons.length / _ALONG, high - low)]
+    x = photons.x - photons.start
+    counts, _, _ = np.histogram2d(x, photons.z, bins=shape, range=[[0.0, photons.length], [low, high]])
     mean = counts.mean()
     for _ in range(_CLIP_ITERATIONS):
         mean = counts[counts <= mean + _CLIP * np.sqrt(mean)].mean()
-    return float(mean * counts.size / (length * (high - low)))
+    return float(mean * counts.size / (photons.length * (high - low)))
 
 
-def _fewest_neighbours(density: float) -> float:
+def _local_background(photons: _Photons, surface: _Curve) -> _Background:
+    """Return the background along the track: as given, or counted well below and above the surface.
+
+    Where the window leaves too little height there, it is the mean of the track.
+    """
+    number, middle = _cells(photons, _GROUND_CELL)
+    if photons.density is not None:
+        return _Background(middle, np.full(middle.size, max(photons.density, _LEAST_BACKGROUND)))
+    low, high = photons.window
+    below = np.maximum(surface.height_at(middle) - _SURFACE_DEPTH - low, 0.0)
+    above = np.maximum(high - surface.height_at(middle) - _SURFACE_HEIGHT, 0.0)
+    offset = photons.z - surface.height_at(photons.x)
+    is_away = (offset < -_SURFACE_DEPTH) | (offset > _SURFACE_HEIGHT)
+    count = np.bincount(number[is_away], minlength=middle.size)
+    half = max(1, round(0.5 * _BACKGROUND_LENGTH / _GROUND_CELL))
+    length = photons.length / middle.size
+    area = length * (below + above)
+    count, area = _moving_sum(count, half), _moving_sum(area, half)
+    is_enough = below + above >= _MIN_BACKGROUND_HEIGHT
+    density = np.where(is_enough, count / np.maximum(area, 1e-9), _mean_background(photons))
+    return _Background(middle, np.maximum(density, _LEAST_BACKGROUND))
+
+
+def _moving_sum(values: np.ndarray, half: int) -> np.ndarray:
+    """Return the sum of each value and of `half` neighbours on either side, of those that there are."""
+    return np.convolve(np.pad(values, half), np.ones(2 * half + 1), mode="valid")
+
+
+# -- ground ------------------------------------------------------------------------------------------------
+
+
+def _ground_curve(photons: _Photons, surface: _Curve, background: _Background) -> _Curve:
+    """Return the ground along the track: step 2 of the module's docstring."""
+    number, middle = _cells(photons, _GROUND_CELL)
+    order = np.argsort(number, kind="stable")
+    edges = np.searchsorted(number[order], np.arange(middle.size + 1))
+    length = photons.length / middle.size
+    height, stderr = surface.height_at(middle), np.zeros(middle.size)
+    support = np.interp(middle, surface.x, surface.weight)
+    for low, high, step in _OFFSETS:
+        # Heights that are not certain bend the smooth surface less.
+        weight = np.maximum(support / (1.0 + (stderr / _CERTAIN_ERROR) ** 2), _EMPTY_WEIGHT)
+        curve = _Curve(middle, _smoothed(height, weight, length), stderr, weight)
+        offsets = np.arange(low, high + 0.5 * step, step)
+        residual = photons.z - curve.height_at(photons.x)
+        evidence = np.stack(
+            [
+                _log_likelihood(residual[order[a:b]], offsets, float(density), length)
+                for a, b, density in zip(edges[:-1], edges[1:], background.density)
+            ]
+        )
+        posterior = _posterior(evidence, offsets)
+        mean = posterior @ offsets
+        stderr = np.sqrt(np.maximum(posterior @ offsets**2 - mean**2, 0.0))
+        height = curve.z + mean
+    return curve._replace(z=height, stderr=stderr)
+
+
+def _smoothed(height: np.ndarray, weight: np.ndarray, step: float) -> np.ndarray:
+    """Smooth weighted heights by the Whittaker filter: second differences are penalised."""
+    if height.size < 3:
+        return height
+    # The matrix W + p D'D of weights W and second differences D has five diagonals.
+    penalty = (_SMOOTHING_LENGTH / step) ** 4 / 10.0
+    stencil = (1.0, -2.0, 1.0)
+    bands = np.zeros((5, height.size))
+    bands[2] = weight
+    for k, a in enumerate(stencil):
+        for m, b in enumerate(stencil):
+            # In band form, element (row, column) lies at (2 + row - column, column).
+            bands[2 + k - m, m : m + height.size - 2] += penalty * a * b
+    return linalg.solve_banded((2, 2), bands, weight * height)
+
+
+def _log_likelihood(height: np.ndarray, offsets: np.ndarray, background: float, length: float) -> np.ndarray:
+    """Return the log-likelihood of the photons of one cell for each height of the ground, but for a constant.
+
+    **Arguments:** `height`: (photons,) m. `offsets`: (offsets,) heights of the ground in m. `background`: per
+    square metre. `length`: of the cell in m.
+    """
+    low, high = offsets[0] - 3.0, offsets[-1] + _HATS[-1] * 1.4
+    height = height[(height > low) & (height < high)]
+    if height.size == 0:
+        return np.zeros(offsets.size)
+    shapes = _rate_shapes(height[None, :] - offsets[:, None]) / length
+    # Numbers of photons of each component, to start from: equal shares of what is not background.
+    signal = max(height.size - background * length * (high - low), 1.0)
+    numbers = np.full((len(shapes), offsets.size), signal / len(shapes))
+    for _ in range(_EXPECTATIONS):
+        rate = background + np.einsum("ko,kop->op", numbers, shapes)
+        numbers = numbers * np.einsum("kop,op->ko", shapes, 1.0 / rate)
+        numbers[0] += _GROUND_PRIOR
+    rate = background + np.einsum("ko,kop->op", numbers, shapes)
+    prior = _GROUND_PRIOR * np.log(np.maximum(numbers[0], 1e-6))
+    return np.log(rate).sum(axis=1) - numbers.sum(axis=0) + prior
+
+
+def _rate_shapes(above: np.ndarray) -> np.ndarray:
+    """Return the densities, of unit integral, of the ground's echo and of the hat functions above it.
+
+    **Arguments:** `above`: heights of photons above the ground in m, of any shape.
+
+    **Returns:** (components, ...) 1/m.
+    """
+    shapes = [np.exp(-0.5 * (above / _ECHO_WIDTH) ** 2) / (_ECHO_WIDTH * np.sqrt(2.0 * np.pi))]
+    nodes = (0.0, *_HATS, 1.4 * _HATS[-1])
+    for left, middle, right in zip(nodes[:-2], nodes[1:-1], nodes[2:]):
+        rise, fall = (above - left) / (middle - left), (right - above) / (right - middle)
+        shapes.append(np.maximum(np.minimum(rise, fall), 0.0) * 2.0 / (right - left))
+    return np.stack(shapes)
+
+
+def _posterior(evidence: np.ndarray, offsets: np.ndarray) -> np.ndarray:
+    """Return the probability of each offset in each cell by the forward-backward recursion.
+
+    **Arguments:** `evidence`: (cells, offsets) log-likelihoods.
+    """
+    change = np.exp(-np.abs(offsets[:, None] - offsets) / _GROUND_CHANGE)
+    change = (1.0 - _JUMP) * change / change.sum(axis=1, keepdims=True) + _JUMP / offsets.size
+    likelihood = np.exp(evidence - evidence.max(axis=1, keepdims=True))
+    forward, backward = likelihood.copy(), np.ones_like(likelihood)
+    for k in range(len(evidence)):
+        if k:
+            forward[k] *= forward[k - 1] @ change
+        forward[k] /= forward[k].sum()
+    for k in range(len(evidence) - 2, -1, -1):
+        backward[k] = change @ (likelihood[k + 1] * backward[k + 1])
+        backward[k] /= backward[k].sum()
+    posterior = forward * backward
+    return posterior / posterior.sum(axis=1, keepdims=True)
+
+
+def _verdict(has_ground: bool, stderr: float, near: int, by_background: float, is_deeper: bool) -> Verdict:
+    """Return the verdict on the ground of a segment."""
+    if not has_ground:
+        return Verdict("bad", ("no ground: as many photons as the background gives",))
+    verdict = Verdict("good", ())
+    if not stderr <= _DOUBTFUL_ERROR:
+        verdict &= Verdict("doubtful", (f"standard error {stderr:.2f} m",))
+    if near - by_background < _DOUBTFUL_PHOTONS:
+        verdict &= Verdict("doubtful", (f"{near} photons in the ground's echo",))
+    if is_deeper:
+        verdict &= Verdict("doubtful", ("photons below the ground",))
+    return verdict
+
+
+# -- signal and canopy -------------------------------------------------------------------------------------
+
+
+def _fewest_neighbours(density: np.ndarray) -> np.ndarray:
     """Fewest neighbours of signal, by the Poisson distribution of those of background."""
     expected = np.pi * _ALONG * _HIGH * density
-    return max(float(stats.poisson.isf(_FALSE_ALARM, expected)) + 1.0, _FEWEST_NEIGHBOURS)
+    return np.maximum(stats.poisson.isf(_FALSE_ALARM, expected) + 1.0, _FEWEST_NEIGHBOURS)
 
 
 def _count_neighbours(x: np.ndarray, z: np.ndarray) -> np.ndarray:
@@ -188,48 +616,13 @@ def _count_neighbours(x: np.ndarray, z: np.ndarray) -> np.ndarray:
     return spatial.KDTree(scaled).query_ball_point(scaled, 1.0, return_length=True) - 1
 
 
-def _fit_ground(
-    x: np.ndarray, z: np.ndarray, number: np.ndarray, n_segments: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Height at x = 0 and slope of the ground in each segment; arbitrary in segments without photons.
-
-    Weighted least squares of z = height + slope x, all segments at once, each iteration on the residuals of
-    the last one:
-
-    1. Start from a low percentile of the heights, without slope.
-    2. Weights: first those that sink through the canopy, at the end one for photons near the line.
-    3. Solve the 2 x 2 normal equations of each segment for corrections of height and slope.
-    """
-    height, slope = _percentiles(z, number, n_segments, _START_PERCENTILE, 1), np.zeros(n_segments)
-    height = np.nan_to_num(height)
-    for iteration in range(_ITERATIONS):
-        residual = z - height[number] - slope[number] * x
-        if iteration < _WEIGHTED_ITERATIONS:
-            half_weight = np.where(residual > 0, _HALF_WEIGHT_ABOVE, _HALF_WEIGHT_BELOW)
-            weight = 1.0 / (1.0 + (residual / half_weight) ** 4)
-        else:
-            weight = (np.abs(residual) <= _GROUND_RANGE).astype(float)
-        w, wx, wxx, wr, wxr = (
-            np.bincount(number, weight * a, n_segments)
-            for a in (np.ones_like(x), x, x * x, residual, x * residual)
-        )
-        # One is added to the sum of w x^2: a prior that the slope does not change, of the weight of a photon
-        # 1 m from the middle. It fixes the slope of segments in which x hardly varies.
-        determinant = w * wxx - wx**2 + w
-        w = np.maximum(w, 1e-300)
-        slope_change = (w * wxr - wx * wr) / np.maximum(determinant, 1e-300)
-        slope = slope + slope_change
-        height = height + (wr - slope_change * wx) / w
-    return height, slope
-
-
 def _percentiles(
     z: np.ndarray, number: np.ndarray, n_segments: int, percentile: float, least: int
-) -> np.ndarray:
-    """Percentile of the values of each segment, as `numpy.percentile`; NaN for fewer than `least` values.
+) -> tuple[np.ndarray, np.ndarray]:
+    """Percentile of the values of each segment, as `numpy.percentile`, and their number.
 
-    All values are sorted once, by segment and size; a segment's percentile then lies at a position known from
-    its count.
+    NaN for fewer than `least` values. All values are sorted once, by segment and size; a segment's percentile
+    then lies at a position known from its count.
     """
     order = np.lexsort((z, number))
     count = np.bincount(number, minlength=n_segments)
@@ -241,4 +634,29 @@ def _percentiles(
     z = z[order]
     percentiles = np.full(n_segments, np.nan)
     percentiles[filled] = z[low] + (position - low) * (z[high] - z[low])
-    return percentiles
+    return percentiles, count
+
+
+def _percentile_error(z: np.ndarray, number: np.ndarray, n_segments: int, percentile: float) -> np.ndarray:
+    """Standard error of the percentile of each segment, from the spacing of its order statistics.
+
+    The count below a quantile q of n values has the standard deviation sqrt(n q (1 - q)). The percentiles one
+    such deviation lower and higher differ by twice the error; near the top the difference is one-sided.
+    """
+    count = np.maximum(np.bincount(number, minlength=n_segments), 1)
+    q = 0.01 * percentile
+    # At least half a photon: the top of a few values is uncertain by their spacing.
+    deviation = np.maximum(np.sqrt(count * q * (1.0 - q)), 0.5) / count
+    low, high = (
+        np.array(
+            [
+                np.quantile(z[number == i], np.clip(q + side * deviation[i], 0.0, 1.0))
+                if np.any(number == i)
+                else np.nan
+                for i in range(n_segments)
+            ]
+        )
+        for side in (-1.0, 1.0)
+    )
+    spans = np.clip(q + deviation, 0.0, 1.0) - np.clip(q - deviation, 0.0, 1.0)
+    return (high - low) * deviation / np.maximum(spans, 1e-9)

@@ -13,6 +13,7 @@ which is exact for signals that the sampling resolves. Width, offsets and scale 
 from typing import Any, final
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
@@ -144,18 +145,22 @@ class ReceiverResponse:
             # Time zero, the middle lag, becomes the first sample of the transform.
             self.impulse_spectrum = np.fft.rfft(np.roll(samples, -(lags // 2)))
 
-    def __call__(self, waveform: np.ndarray, width: float, *, derivative: bool = False) -> np.ndarray:
+    def __call__(self, waveform: Any, width: Any, *, derivative: bool = False) -> Any:
         """Return the waveform as received, or its derivative with respect to the width.
 
         The Gaussian of width s has the spectrum exp(-(omega s)^2 / 2), with the derivative -omega^2 s times
-        that.
+        that. NumPy arrays give NumPy arrays, in double precision; JAX arrays may be traced.
         """
         if self.is_identity:
             return waveform
+        numpy: Any = jnp if isinstance(waveform, jax.Array) else np
         phase = self.omega * width
         factor = -phase * self.omega if derivative else 1.0
-        spectrum = self.impulse_spectrum * np.exp(-0.5 * phase**2) * factor
-        return np.fft.irfft(np.fft.rfft(waveform, self.size) * spectrum, self.size)[..., : self.bins]
+        spectrum = self.impulse_spectrum * numpy.exp(-0.5 * phase**2) * factor
+        transformed = numpy.fft.rfft(waveform, self.size)
+        # JAX refuses to multiply arrays of unlike rank where a user has told it to.
+        spectrum = spectrum.reshape((1,) * (waveform.ndim - 1) + (-1,))
+        return numpy.fft.irfft(transformed * spectrum, self.size)[..., : self.bins]
 
 
 def _check_bounds(field: str, bounds: Any, least: float) -> None:

@@ -1,7 +1,9 @@
 """The commands `jaxlidar info` and `jaxlidar convert`."""
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import click
 import numpy as np
@@ -25,6 +27,7 @@ from jaxlidar.io import (
 )
 from jaxlidar.io.dem import read_grid
 from jaxlidar.io.las import read_stored_points
+from jaxlidar.io.las_header import read_header
 from jaxlidar.io.las_waveforms import has_packets
 from jaxlidar.io.netcdf import open as open_result
 from jaxlidar.optics.prospect import Prospect
@@ -33,10 +36,13 @@ from jaxlidar.scenes.canopy import Canopy
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.voxels import VoxelMap
 from jaxlidar.spectral.waveform import Waveform
+from jaxlidar.survey.waveforms import Waveforms
 
 FILE_PATH = ResultPath(exists=True)
 # Number of shots of a file that are read for its description: files may be larger than memory.
 MAX_DESCRIBED_SHOTS = 1000
+# A column that tables of cylinders have, in the first line of a file, and the longest such line in bytes.
+TREE_COLUMN, MAX_HEAD = re.compile(r"start_?x", re.IGNORECASE), 10_000
 
 
 # -- info --------------------------------------------------------------------------------------------------
@@ -71,7 +77,15 @@ def describe_points(path: Path) -> str:
         spans = _spans(low * [horizontal, horizontal, vertical], high * [horizontal, horizontal, vertical])
     else:
         spans = ", ".join(f"{axis} {a:.9g} to {b:.9g}" for axis, a, b in zip("xyz", low, high))
-    lines = [f"{len(cloud.position):,} points: {spans}, {system.name}"]
+    with path.open("rb") as file:
+        header = read_header(path, file)
+    compressed = ", compressed" if header.laszip is not None else ""
+    numbers, counts = np.unique(cloud.number_of_returns, return_counts=True)
+    returns = ", ".join(f"{count:,} of pulses with {number}" for number, count in zip(numbers, counts))
+    lines = [
+        f"{len(cloud.position):,} points: {spans}, {system.name}",
+        f"point format {header.point_format}{compressed}; returns: {returns}",
+    ]
     text = _with_counts(lines, cloud.dropped, "points left out: ")
     return "\n".join([text, describe_shots(read_las_waveforms(path))]) if has_packets(path) else text
 
@@ -141,11 +155,13 @@ def describe_terrain(path: Path) -> str:
     grid = read_grid(path)
     nodes = " x ".join(map(str, grid.heights.shape))
     spacings = " x ".join(f"{step:g}" for step in grid.spacing)
+    low, high = grid.origin, grid.origin + grid.spacing * (np.array(grid.heights.shape) - 1)
     heights = grid.heights[np.isfinite(grid.heights)]
     range_of_heights = f"{heights.min():.2f} to {heights.max():.2f} m" if heights.size else "unknown"
     lines = [
         f"terrain of {nodes} nodes, {spacings} m apart",
         f"heights {range_of_heights}, {grid.crs or 'no coordinate reference system'}",
+        f"x {low[0]:.2f} to {high[0]:.2f} m, y {low[1]:.2f} to {high[1]:.2f} m",
     ]
     return _with_counts(lines, {"without data": grid.heights.size - heights.size}, "nodes ")
 
@@ -154,6 +170,13 @@ def describe_spectrum(path: Path) -> str:
     spectrum = read_spectrum_csv(path)
     low, high = float(spectrum.wavelength[0]), float(spectrum.wavelength[-1])
     return f"spectrum {spectrum.name!r} of {spectrum.wavelength.size} samples from {low:g} to {high:g} nm"
+
+
+def describe_csv(path: Path) -> str:
+    """Describe a table of cylinders by the names of its columns, otherwise a spectrum."""
+    with path.open("rb") as file:
+        head = file.readline(MAX_HEAD).decode("utf-8", "replace")
+    return describe_tree(path) if TREE_COLUMN.search(head) else describe_spectrum(path)
 
 
 def _spans(low: np.ndarray, high: np.ndarray) -> str:
@@ -180,7 +203,7 @@ DESCRIPTIONS: dict[str, Callable[[Path], str]] = {
     **dict.fromkeys((".tif", ".tiff", ".asc"), describe_terrain),
     ".qsm": describe_tree,
     ".txt": describe_tree,
-    ".csv": describe_spectrum,
+    ".csv": describe_csv,
 }
 
 
@@ -190,7 +213,7 @@ def info(file: Path) -> None:
     """Describe the content of a file by the ending of its name.
 
     Known are cases (.toml), results (.nc, .zarr), voxels (.vox), points (.las, .laz), airborne waveforms
-    (.las with .wdp, .pls with .wvs, NEON's .npz), GEDI level 1B (.h5), tree models (.qsm, .txt), meshes
+    (.las with .wdp, .pls with .wvs, NEON's .npz), GEDI level 1B (.h5), tree models (.qsm, .txt, .csv), meshes
     (.obj), elevation models (.tif, .tiff, .asc) and spectra (.csv).
 
     \b
@@ -244,6 +267,15 @@ def _shots_to_las(shots: Sequence[AirborneShot], target: Path) -> None:
         click.echo("left out: outgoing pulses, which LAS has no place for", err=True)
 
 
+def _waveforms_to_las(source: Path, target: Path, options: dict[str, Any]) -> None:
+    waves = open_result(source)
+    if not isinstance(waves, Waveforms):
+        raise ValueError(
+            f"{source} holds a {type(waves).__name__}; points are made of the Waveforms of a survey"
+        )
+    click.echo(str(waves.to_las(target, **options)))
+
+
 CONVERSIONS: dict[tuple[str, str], Callable[[Path, Path], None]] = {
     (".nc", ".csv"): _waveform_to_csv,
     (".zarr", ".csv"): _waveform_to_csv,
@@ -254,26 +286,48 @@ CONVERSIONS: dict[tuple[str, str], Callable[[Path, Path], None]] = {
 }
 
 
+# Conversions that take the options of points.
+POINT_CONVERSIONS = {(a, b): _waveforms_to_las for a in (".nc", ".zarr") for b in (".las", ".laz")}
+
+
 @click.command()
 @click.argument("source", type=FILE_PATH)
 @click.argument("target", type=click.Path(dir_okay=False, path_type=Path))
-def convert(source: Path, target: Path) -> None:
+@click.option("--crs", help="Coordinate reference system of points, such as EPSG:32633.")
+@click.option(
+    "--detector",
+    type=click.Choice(["peak", "constant fraction", "leading edge"]),
+    help="Detector of returns, for points.  [default: peak]",
+)
+def convert(source: Path, target: Path, crs: str | None, detector: str | None) -> None:
     """Convert a file, by the endings of both names.
 
     \b
       .nc to .csv     samples of a waveform, as a table; .zarr too
+      .nc to .laz     discrete returns of a survey, as points; .zarr too, and to .las
       .nc to .toml    the case that a waveform was simulated from; .zarr too
       .toml to .toml  the same case with every field written out
       .vox to .toml   a scene of the voxels, with default leaf optics
       .pls to .las    airborne waveforms, as waveform packets; NEON's .npz too
 
     \b
-    Example:
+    Examples:
       jaxlidar convert tree.nc tree.csv
+      jaxlidar convert strip.nc strip.laz --crs EPSG:32633
     """
-    conversion = CONVERSIONS.get((source.suffix.lower(), target.suffix.lower()))
+    endings = source.suffix.lower(), target.suffix.lower()
+    options = {name: value for name, value in (("crs", crs), ("detector", detector)) if value is not None}
+    if endings in POINT_CONVERSIONS:
+        POINT_CONVERSIONS[endings](source, target, options)
+        click.echo(f"written: {target}")
+        return
+    if options:
+        raise click.UsageError(
+            f"--{' and --'.join(options)}: for points (.las, .laz) of waveforms (.nc, .zarr)"
+        )
+    conversion = CONVERSIONS.get(endings)
     if conversion is None:
-        conversions = ", ".join(f"{a} to {b}" for a, b in CONVERSIONS)
+        conversions = ", ".join(f"{a} to {b}" for a, b in [*CONVERSIONS, *POINT_CONVERSIONS])
         raise click.UsageError(
             f"{source.suffix or source} to {target.suffix or target} is none of {conversions}"
         )

@@ -20,6 +20,7 @@ from jaxlidar.cli.shared import (
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.io import Case, read_case
 from jaxlidar.planning.plan import plan as make_plan
+from jaxlidar.survey.simulate_many import checkpoint_path
 
 # Arguments of `simulate` that `jaxlidar.plan` has, too.
 _PLAN_ARGUMENTS = ("rtol", "max_orders", "max_step", "n_rays", "window", "bin_width", "footprint", "effects")
@@ -82,8 +83,18 @@ def simulate(
 
 def _simulate_survey(case: Case, out: Path | None, plot: Path | None, quiet: bool) -> int:
     assert case.survey is not None
-    with survey_progress_bar(quiet, len(case.survey)) as show:
-        waveforms = case.simulate(show, out)
+    try:
+        with survey_progress_bar(quiet, len(case.survey)) as show:
+            waveforms = case.simulate(show, out)
+    except KeyboardInterrupt:
+        if out is None:
+            message = "finished shots are lost: give -o to keep them"
+        else:
+            message = (
+                f"finished shots are kept in {checkpoint_path(out)}: the same command continues with them"
+            )
+        click.echo(f"jaxlidar: interrupted; {message}", err=True)
+        return INTERRUPTED
     click.echo(str(waveforms))
     if out is not None:
         click.echo(f"waveforms: {out}")

@@ -36,8 +36,11 @@ from jaxlidar._checks import (
 from jaxlidar._converted import Converted
 from jaxlidar._ranges import Range, check_ranges
 from jaxlidar._signatures import briefly
+from jaxlidar._text import object_text
+from jaxlidar.instrument.photon_counter import PhotonCounter
 from jaxlidar.instrument.pulse import AbstractPulse, GaussianPulse
 from jaxlidar.instrument.receiver import Receiver
+from jaxlidar.instrument.scan import AbstractScan
 
 
 def _wavelengths(x: ArrayLike | Sequence[ArrayLike]) -> Float[Array, "..."]:
@@ -86,7 +89,10 @@ class Lidar(eqx.Module):
     - `jitter`: standard deviation of the timing error in ns, not negative. Default 0.
     - `efficiency`: of the optics and the detector together, in (0, 1], one number or one per wavelength.
       Default 1.
-    - `receiver`: detection, noise and digitisation. Default `Receiver()`: a perfect record.
+    - `receiver`: detection, noise and digitisation, a `Receiver`; or a `PhotonCounter`, for
+      `jaxlidar.record`: waveforms then hold the expected energies. Default `Receiver()`: a perfect record.
+    - `scan`: the pattern of a scanner, an `AbstractScan` for `Survey.scan`. One shot does not depend on it.
+      Default None.
 
     **Raises:** ValueError for a value outside its range, for wavelengths that do not increase strictly, for
     an unknown profile, for a position that is not two numbers, and where the energies or efficiencies are
@@ -123,7 +129,8 @@ class Lidar(eqx.Module):
     )
     jitter: Converted[Float[Array, ""]] = eqx.field(converter=scalar("jitter"), default=0.0)
     efficiency: Converted[Float[Array, "..."]] = eqx.field(converter=array("efficiency"), default=1.0)
-    receiver: Receiver = eqx.field(default_factory=Receiver)
+    receiver: Receiver | PhotonCounter = eqx.field(default_factory=Receiver)
+    scan: AbstractScan | None = eqx.field(static=True, default=None)
 
     ranges: ClassVar = {
         "wavelength": Range(0.0, low_open=True, increasing=True),
@@ -142,7 +149,8 @@ class Lidar(eqx.Module):
 
     def __check_init__(self):
         check_kind("pulse", self.pulse, AbstractPulse, "a pulse, such as GaussianPulse(fwhm=6.0)")
-        check_kind("receiver", self.receiver, Receiver, "a Receiver")
+        check_kind("receiver", self.receiver, Receiver | PhotonCounter, "a Receiver or a PhotonCounter")
+        check_kind("scan", self.scan, AbstractScan | None, "a scan pattern, or None")
         if self.wavelength.ndim != 1:
             raise ValueError(
                 f"wavelength has shape {self.wavelength.shape}; admissible is one number or (wavelengths,)"
@@ -162,6 +170,20 @@ class Lidar(eqx.Module):
                     f"{self.wavelength.shape}"
                 )
         warn_units(self)
+
+    def __str__(self) -> str:
+        return object_text(self)
+
+    @property
+    def opens_at_first_return(self) -> bool:
+        """True if the sampling bins start at the first return."""
+        return isinstance(self.receiver, Receiver) and self.receiver.window == "first return"
+
+    @property
+    def noise(self) -> float | None:
+        """Standard deviation of the receiver's electronic noise, J per sample; None where it has none."""
+        noise = concrete(getattr(self.receiver, "electronic_noise", 0.0))
+        return float(noise) if noise is not None and noise > 0 else None
 
     @property
     def direction(self) -> Float[Array, " 3"]:

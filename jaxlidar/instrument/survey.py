@@ -31,12 +31,15 @@ from jaxlidar._checks import (
 )
 from jaxlidar._memory import format_bytes, machine_memory
 from jaxlidar._signatures import briefly
+from jaxlidar._text import number_text
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.instrument.scan import MAX_ZENITH, AbstractScan
 
 # A length that falls short of a multiple of the spacing by this fraction, as by rounding, counts as the
 # multiple.
 _SPACING_TOLERANCE = 1e-6
+# Point clouds number flight lines with 16 bits.
+MAX_FLIGHT_LINE = 2**16 - 1
 # Bytes of a shot while a survey is made: its position and direction, and the terms of their sums.
 _BYTES_PER_SHOT = 100.0
 # More positions along a line than fit into any memory.
@@ -60,6 +63,12 @@ class Survey(eqx.Module):
       Default None: the lidar's.
     - `azimuth`: compass direction in which the beam travels in degrees, one number or (shots,). Default None:
       the lidar's.
+    - `gps_time`: (shots,) s, as point clouds have it: seconds of the GPS week, or adjusted standard GPS time
+      (GPS time less 1e9 s). Default None: not known.
+    - `scan_angle`: (shots,) angle of the beam to the right of the track in degrees, in [-180, 180]. Default
+      None: not known.
+    - `flight_line`: number of the flight line, an integer in [0, 65535], one number or (shots,). Default
+      None: not known.
 
     **Raises:** ValueError for arrays of other shapes, no shot at all, and values outside their ranges;
     TypeError for objects of the wrong type.
@@ -76,6 +85,9 @@ class Survey(eqx.Module):
     position: Float[np.ndarray, "shots 2"]
     zenith: Float[np.ndarray, " shots"]
     azimuth: Float[np.ndarray, " shots"]
+    gps_time: Float[np.ndarray, " shots"] | None
+    scan_angle: Float[np.ndarray, " shots"] | None
+    flight_line: Float[np.ndarray, " shots"] | None
 
     def __init__(
         self,
@@ -83,6 +95,10 @@ class Survey(eqx.Module):
         position: Any,
         zenith: ArrayLike | Any | None = None,
         azimuth: ArrayLike | Any | None = None,
+        *,
+        gps_time: ArrayLike | Any | None = None,
+        scan_angle: ArrayLike | Any | None = None,
+        flight_line: ArrayLike | Any | None = None,
     ):
         check_kind("lidar", lidar, Lidar, "a Lidar, as in Survey(Lidar(), position=...)")
         check_range("position", position)
@@ -95,13 +111,40 @@ class Survey(eqx.Module):
         self.zenith = _per_shot("zenith", lidar.zenith if zenith is None else zenith, len(positions))
         self.azimuth = _per_shot("azimuth", lidar.azimuth if azimuth is None else azimuth, len(positions))
         check_range("zenith", self.zenith, 0.0, MAX_ZENITH)
+        self.gps_time = _optional_per_shot("gps_time", gps_time, len(positions))
+        self.scan_angle = _optional_per_shot("scan_angle", scan_angle, len(positions))
+        self.flight_line = _optional_per_shot("flight_line", flight_line, len(positions))
+        if self.scan_angle is not None:
+            check_range("scan_angle", self.scan_angle, -180.0, 180.0)
+        if self.flight_line is not None:
+            check_range("flight_line", self.flight_line, 0, MAX_FLIGHT_LINE)
+            if np.any(self.flight_line != np.floor(self.flight_line)):
+                raise ValueError("flight_line has values that are not whole numbers")
 
     def __len__(self) -> int:
         return len(self.position)
 
+    def __str__(self) -> str:
+        columns = (
+            ("x", self.position[:, 0], "m"),
+            ("y", self.position[:, 1], "m"),
+            ("zenith", self.zenith, ""),
+        )
+        spans = ", ".join(
+            f"{name} {number_text(a.min())} to {number_text(a.max())} {unit}" for name, a, unit in columns
+        )
+        return f"Survey of {len(self):,} shots: {spans}degrees\n{self.lidar}"
+
     def __getitem__(self, shot: int | slice) -> "Lidar | Survey":
         if isinstance(shot, slice):
-            return Survey(self.lidar, self.position[shot], self.zenith[shot], self.azimuth[shot])
+            columns = {name: getattr(self, name) for name in ("gps_time", "scan_angle", "flight_line")}
+            return Survey(
+                self.lidar,
+                self.position[shot],
+                self.zenith[shot],
+                self.azimuth[shot],
+                **{name: None if column is None else column[shot] for name, column in columns.items()},
+            )
         i = self._index(shot)
         return self._lidar_at(self.position[i], i)
 
@@ -135,16 +178,12 @@ class Survey(eqx.Module):
     def about(self, origin: Float[np.ndarray, "2"]) -> "Survey":
         """Make the same survey with positions relative to `origin`, (2,) x and y in m."""
         origin = _horizontal_position("origin", origin)
-        return Survey(self.lidar, self.position - origin, self.zenith, self.azimuth)
+        return dataclasses.replace(self, position=self.position - origin)
 
     @property
     def direction(self) -> Float[np.ndarray, "shots 3"]:
         """Unit vectors (shots, 3) in which the beams travel."""
-        zenith, azimuth = np.deg2rad(self.zenith), np.deg2rad(self.azimuth)
-        horizontal = np.sin(zenith)
-        return np.stack(
-            [horizontal * np.sin(azimuth), horizontal * np.cos(azimuth), -np.cos(zenith)], axis=-1
-        )
+        return beam_directions(self.zenith, self.azimuth)
 
     @property
     def slant_range(self) -> Float[np.ndarray, " shots"]:
@@ -239,12 +278,20 @@ class Survey(eqx.Module):
 
     @staticmethod
     def scan(
-        lidar: Lidar, pattern: AbstractScan, start: Any, end: Any, speed: Any, pulse_rate: Any
+        lidar: Lidar,
+        pattern: AbstractScan,
+        start: Any,
+        end: Any,
+        speed: Any,
+        pulse_rate: Any,
+        *,
+        gps_time: Any = 0.0,
+        flight_line: Any = 1,
     ) -> "Survey":
         """Make a survey of the shots of a scanner on a level platform that flies along a line.
 
-        The platform flies at the lidar's altitude above the reference plane. Zenith and azimuth follow from
-        the pattern.
+        The platform flies at the lidar's altitude above the reference plane. Zenith, azimuth and scan angle
+        (across the track, positive to the right) follow from the pattern.
 
         **Arguments:**
 
@@ -253,6 +300,8 @@ class Survey(eqx.Module):
         - `start`, `end`: (x, y) in m of the platform at the first shot and at the end of the line.
         - `speed`: of the platform in m/s, positive.
         - `pulse_rate`: shots per s, positive.
+        - `gps_time`: GPS time of the first shot in s, as that of `Survey`. Default 0.
+        - `flight_line`: number of the flight line. Default 1.
 
         **Returns:** a `Survey`, its shots in the order of time.
 
@@ -275,6 +324,7 @@ class Survey(eqx.Module):
         first, forward, right, length = _line(start, end)
         check_number("speed", speed, 0.0, low_open=True)
         check_number("pulse_rate", pulse_rate, 0.0, low_open=True)
+        check_number("gps_time", gps_time)
         shots = _count_along(length, float(speed) / float(pulse_rate))
         rate = f"pulse_rate = {float(pulse_rate):g} at speed = {float(speed):g}"
         _check_number_of_shots(rate, shots)
@@ -292,7 +342,24 @@ class Survey(eqx.Module):
         platform = first + (float(speed) * time)[:, None] * forward
         positions = platform + float(lidar.altitude) * horizontal / down[:, None]
         azimuth = np.where(sine > 0, np.rad2deg(np.arctan2(horizontal[:, 0], horizontal[:, 1])) % 360.0, 0.0)
-        return Survey(lidar, positions, np.minimum(zenith, MAX_ZENITH), azimuth)
+        return Survey(
+            lidar,
+            positions,
+            np.minimum(zenith, MAX_ZENITH),
+            azimuth,
+            gps_time=float(gps_time) + time,
+            scan_angle=np.rad2deg(np.arctan2(aside, down)),
+            flight_line=flight_line,
+        )
+
+
+def beam_directions(
+    zenith: Float[np.ndarray, " shots"], azimuth: Float[np.ndarray, " shots"]
+) -> Float[np.ndarray, "shots 3"]:
+    """Compute the unit vectors of beams from zenith and azimuth in degrees."""
+    zenith, azimuth = np.deg2rad(zenith), np.deg2rad(azimuth)
+    horizontal = np.sin(zenith)
+    return np.stack([horizontal * np.sin(azimuth), horizontal * np.cos(azimuth), -np.cos(zenith)], axis=-1)
 
 
 def _per_shot(field: str, x: Any, shots: int) -> Float[np.ndarray, " shots"]:
@@ -304,6 +371,11 @@ def _per_shot(field: str, x: Any, shots: int) -> Float[np.ndarray, " shots"]:
             f"{field} has shape {value.shape}; admissible is one number or ({shots},), as position"
         )
     return np.broadcast_to(value, (shots,)).copy()
+
+
+def _optional_per_shot(field: str, x: Any, shots: int) -> Float[np.ndarray, " shots"] | None:
+    """Convert as `_per_shot`; None stays None."""
+    return None if x is None else _per_shot(field, x, shots)
 
 
 def _horizontal_position(field: str, x: Any) -> Float[np.ndarray, "2"]:

@@ -16,41 +16,57 @@ from jaxlidar.io.checks import FileWarning
 from jaxlidar.io.datasets import keep_as_netcdf
 from jaxlidar.io.dem import DemRead, read_dem
 from jaxlidar.io.gedi import GediShot, read_gedi_l1b
+from jaxlidar.io.gedi_level2 import read_gedi_l2a, read_gedi_l2b
 from jaxlidar.io.gedi_writer import write_gedi_l1b
-from jaxlidar.io.las import PointCloud, read_las, write_las
+from jaxlidar.io.icesat2 import PhotonImpulse, PhotonTrack, read_atl03, read_atl08
+from jaxlidar.io.las import read_las, write_las
 from jaxlidar.io.las_waveforms import read_las_waveforms, write_las_waveforms
+from jaxlidar.io.lvis import read_lvis_l1b, read_lvis_l2
 from jaxlidar.io.neon import NeonImpulse, NeonRead, read_neon
 from jaxlidar.io.netcdf import read_case, save
 from jaxlidar.io.obj import MeshRead, read_obj
 from jaxlidar.io.pulsewaves import read_pulsewaves
 from jaxlidar.io.qsm import TreeRead, read_qsm
 from jaxlidar.io.rasters import write_raster
+from jaxlidar.io.tables import Column, ColumnAxis, ShotTable
 from jaxlidar.io.vox import VoxelsRead, read_vox
+from jaxlidar.plants.point_cloud import PointCloud
 
 __all__ = [
     "AirborneShot",
     "AirborneShots",
     "Case",
+    "Column",
+    "ColumnAxis",
     "DemRead",
     "FileWarning",
     "GediShot",
     "MeshRead",
     "NeonImpulse",
     "NeonRead",
+    "PhotonImpulse",
+    "PhotonTrack",
     "PointCloud",
     "Returns",
     "Scanner",
     "Segment",
     "ShotStack",
+    "ShotTable",
     "TreeRead",
     "VoxelsRead",
     "atomic_write",
     "keep_as_netcdf",
+    "read_atl03",
+    "read_atl08",
     "read_case",
     "read_dem",
     "read_gedi_l1b",
+    "read_gedi_l2a",
+    "read_gedi_l2b",
     "read_las",
     "read_las_waveforms",
+    "read_lvis_l1b",
+    "read_lvis_l2",
     "read_neon",
     "read_obj",
     "read_pulsewaves",

@@ -150,6 +150,8 @@ class AirborneShot:
     - `scanner_channel`: number of the channel of a scanner that sends several beams at one time. Default 0.
     - `crs`: the coordinate reference system of `anchor`, as the file declares it: a code, such as
       "EPSG:32633", or well-known text. Default None: not known.
+    - `scan_angle`: degrees to the right of the track. Default 0.
+    - `flight_line`: number of the flight line or instrument, as a LAS file's point source. Default 0.
 
     **Raises:** ValueError for a shot without a returning segment, for segments whose numbers make no sense,
     for those of a channel that overlap, have different steps or lie too far apart.
@@ -180,14 +182,16 @@ class AirborneShot:
     returns: Returns | None = None
     scanner_channel: int = 0
     crs: str | None = None
+    scan_angle: float = 0.0
+    flight_line: int = 0
 
     def __post_init__(self):
         if not self.returning:
             raise ValueError(f"shot {self.index}: it has no returning segment")
         for name in ("anchor", "direction", "metres"):
             check_shape(name, as_numpy(getattr(self, name), name), (3,))
-        fields = ("index", "noise_mean", "noise_std", "pedestal", "pulse_zero", "gps_time", "scanner_channel")
-        for name in fields:
+        fields = ("index", "noise_mean", "noise_std", "pedestal", "pulse_zero", "gps_time")
+        for name in (*fields, "scanner_channel", "scan_angle", "flight_line"):
             if (number := getattr(self, name)) is not None:
                 check_numbers(name, number)
         for segment in (*self.returning, *self.outgoing):
@@ -349,7 +353,7 @@ class AirborneShots(Sequence, abc.ABC):
     """The shots of a file: a sequence that reads a shot when it is indexed.
 
     `shots[5]` is an `AirborneShot`, `shots[:100]` a list of them. The file is mapped, so it may be larger
-    than memory. `read_pulsewaves` and `read_las_waveforms` return it.
+    than memory. `read_pulsewaves`, `read_las_waveforms` and `read_lvis_l1b` return it.
 
     - `path`: the file.
     - `gps_time`: (shots,) s.
@@ -389,7 +393,10 @@ class AirborneShots(Sequence, abc.ABC):
 
     @abc.abstractmethod
     def _read(self, index: int) -> dict[str, Any]:
-        """Return the arguments of `AirborneShot` but for its noise levels; its index where it is another."""
+        """Return the arguments of `AirborneShot` but for its noise levels; its index where it is another.
+
+        A noise level that the file states for the shot may be among them.
+        """
 
     @functools.cached_property
     def levels(self) -> NoiseLevels:
@@ -414,9 +421,10 @@ class AirborneShots(Sequence, abc.ABC):
         if isinstance(index, slice):
             return [self[i] for i in range(*index.indices(len(self)))]
         i = range(len(self))[index]
-        arguments: dict[str, Any] = {"index": i, **self._read(i)}
+        # Levels of the file are replaced by those that it states for the shot.
+        arguments: dict[str, Any] = {**self.levels._asdict(), "index": i, **self._read(i)}
         try:
-            return AirborneShot(**self.levels._asdict(), **arguments)
+            return AirborneShot(**arguments)
         except ValueError as error:
             raise ValueError(f"{self.path}: {error}") from error
 

@@ -61,6 +61,7 @@ class ResultLayout(NamedTuple):
     coordinates: Mapping[str, str]
     former_names: Mapping[str, str]
     rows: str | None
+    added: Collection[str]
 
     @property
     def row_variables(self) -> RowVariables:
@@ -92,6 +93,7 @@ def keep_as_netcdf(
     coordinates: Mapping[str, str] | None = None,
     former_names: Mapping[str, str] | None = None,
     rows: str | None = None,
+    added: Collection[str] = (),
 ) -> None:
     """Let `save` and `open` know a class of results, an `equinox.Module` whose fields are annotated.
 
@@ -112,6 +114,8 @@ def keep_as_netcdf(
       names now. Default None: none was renamed.
     - `rows`: a dimension of the annotations that is the first of some fields. Their values are written and
       checked some rows at a time, and not read into memory. Default None: none.
+    - `added`: fields that files of earlier versions do not have, which are None where a file lacks them.
+      Default: none.
 
     **Returns:** nothing.
 
@@ -137,6 +141,7 @@ def keep_as_netcdf(
         coordinates or {},
         former_names or {},
         rows,
+        added,
     )
 
 
@@ -399,6 +404,8 @@ class _GroupReader:
         if annotation in _CASE_FIELDS:
             return getattr(self.case(name), _CASE_FIELDS[annotation])
         if name in self.dataset.attrs and self._static(name, annotation) is None:
+            return None
+        if name in layout.added and self.stored.dataset(f"{self.group.rstrip('/')}/{name}") is None:
             return None
         return result_of(self.stored, f"{self.group.rstrip('/')}/{name}")
 

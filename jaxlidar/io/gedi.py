@@ -23,7 +23,6 @@ Level 2 results (L2A `elev_lowestmode`, `rh`; L2B `pai`, `cover`) belong to the 
 import contextlib
 import dataclasses
 import functools
-import math
 import numbers
 import os
 from collections.abc import Sequence
@@ -40,14 +39,14 @@ from jaxlidar.io.checks import (
     MAX_EXACT_INTEGER,
     TWO_WAY_METRES_PER_NS,
     TWO_WAY_TOLERANCE,
-    check_unpacked_size,
-    existing_file,
     refuse_damage,
     warn_of_file,
 )
-from jaxlidar.io.coordinates import check_elevations, unit_angle, unit_length, units_agree
+from jaxlidar.io.coordinates import check_elevations, unit_angle, unit_length
+from jaxlidar.io.hdf5 import ProductFile, open_hdf5
 from jaxlidar.io.noise import above_pedestal
 
+_PRODUCT = "GEDI L1B"
 # Datasets of a beam's group with a number for each shot; start indices of samples may be missing.
 _PER_SHOT = (
     "rx_sample_count",
@@ -74,12 +73,9 @@ _UNITS = {
     **{f"geolocation/{name}_lastbin": (unit_angle, np.pi / 180) for name in ("latitude", "longitude")},
     **{f"geolocation/local_beam_{name}": (unit_angle, 1.0) for name in ("elevation", "azimuth")},
 }
-# Attributes of numbers that are stored as counts.
-_STORED_AS_COUNTS = {"scale_factor": 1.0, "add_offset": 0.0}
-# Datasets of the flags of a GediShot; subsets may have left them out.
+# Datasets of other numbers of a GediShot, and of its flags; subsets may have left them out.
+_OPTIONAL = {"solar_elevation": "geolocation/solar_elevation", "delta_time": "delta_time"}
 _FLAGS = {"degrade": "geolocation/degrade", "stale_return": "stale_return_flag"}
-# The attribute of a dataset with the value that stands for a missing one.
-_FILL_ATTRIBUTE = "_FillValue"
 # Nothing that GEDI sees lies so far below the ellipsoid, m; fill values do.
 _MIN_ELEVATION = -1000.0
 # Equal samples in a row that noise does not make.
@@ -110,6 +106,9 @@ class GediShot:
       in the file.
     - `stale_return`: the product's flag, 1 where no return was detected on board and the place of an earlier
       shot's return chose the samples. Default None: not in the file.
+    - `solar_elevation`: of the sun at the footprint in degrees, below 0 by night. Default None: not in the
+      file.
+    - `delta_time`: of the transmission in s since the beginning of 2018. Default None: not in the file.
 
     **Example:**
 
@@ -139,6 +138,8 @@ class GediShot:
     azimuth: float
     degrade: int | None = None
     stale_return: int | None = None
+    solar_elevation: float | None = None
+    delta_time: float | None = None
 
     @property
     def saturated(self) -> int:
@@ -199,40 +200,65 @@ def read_gedi_l1b(path: str | os.PathLike[str], shot: Any = None) -> list[GediSh
     >>> pulse = jl.SampledPulse(time=shot.pulse_time, power=shot.pulse_power)  # doctest: +SKIP
     >>> lidar = jl.Lidar(pulse=pulse, zenith=shot.zenith, azimuth=shot.azimuth)  # doctest: +SKIP
     """
-    try:
-        import h5py
-    except ImportError as error:
-        raise ImportError('reading HDF5 needs h5py: pip install "jaxlidar[io]"') from error
-    path = existing_file(path)
     requested = None if shot is None else _requested_numbers(shot)
-    with contextlib.ExitStack() as stack:
-        with refuse_damage(f"{path}: not a readable HDF5 file"):
-            file = stack.enter_context(h5py.File(path, "r"))
-            names = [name for name in map(str, file) if name.startswith("BEAM")]
-        if not names:
-            raise ValueError(f"{path}: no group BEAM...: no GEDI L1B product")
-        beams, beam_errors = _open_beams(path, file, names)
-        selected = _select(path, beams, requested)
+    reads, remarks = _read_rows(path, requested)
+    first_error = next((row for row in reads if isinstance(row, IncompleteShot)), None)
+    complete = [row for row in reads if isinstance(row, GediShot)]
+    # What was asked for is read or refused; of all shots those that are not complete are skipped.
+    if first_error is not None and (requested is not None or not complete):
+        raise first_error.error
+    for warning in remarks:
+        warn_of_file(warning)
+    return complete
+
+
+class IncompleteShot(NamedTuple):
+    """A shot of a file that cannot be read: its beam, its number (-1: not readable), and the reason."""
+
+    beam: str
+    shot_number: int
+    error: ValueError
+
+
+def read_gedi_rows(path: str | os.PathLike[str]) -> list[GediShot | IncompleteShot]:
+    """Read all shots of a GEDI L1B file, with those that are not complete in their places.
+
+    **Warns:** `FileWarning` for beams that are skipped, and for start indices that are missing.
+
+    **Raises:** as `read_gedi_l1b`, but for shots that are not complete.
+    """
+    rows, remarks = _read_rows(path, None, counts_skipped=False)
+    for warning in remarks:
+        warn_of_file(warning)
+    return rows
+
+
+def _read_rows(
+    path: str | os.PathLike[str], requested: list[int] | None, *, counts_skipped: bool = True
+) -> tuple[list[GediShot | IncompleteShot], list[str]]:
+    """Return the requested shots of a file, or the reasons why they cannot be read, and remarks on the file.
+
+    **Arguments:** `counts_skipped`: have a remark on each beam with shots that are not complete.
+    """
+    with open_hdf5(path) as file:
+        beams, beam_errors = _open_beams(file, file.groups("BEAM", _PRODUCT))
+        selected = _select(file.path, beams, requested)
         # By beam, so that the samples of neighbouring shots are read together.
         indices_by_beam: dict[_Beam, set[int]] = {}
         for beam, i in selected:
             indices_by_beam.setdefault(beam, set()).add(i)
         reads = {beam: _shots(beam, sorted(indices)) for beam, indices in indices_by_beam.items()}
-    first_error = next((error for _, errors in reads.values() for error in errors.values()), None)
-    complete = [reads[beam][0][i] for beam, i in selected if i in reads[beam][0]]
-    # What was asked for is read or refused; of all shots those that are not complete are skipped.
-    if first_error is not None and (requested is not None or not complete):
-        raise first_error
-    warnings = [f"{error}: the beam is skipped" for error in beam_errors]
-    for beam, (_, errors) in reads.items():
-        if errors:
-            warnings.append(
-                f"{next(iter(errors.values()))}: {len(errors)} of {len(beam)} shots of {beam.name} skipped"
-            )
-        warnings += beam.remarks
-    for warning in warnings:
-        warn_of_file(warning)
-    return complete
+        remarks = [f"{error}: the beam is skipped" for error in beam_errors]
+        for beam, (_, errors) in reads.items():
+            if errors and counts_skipped:
+                first = next(iter(errors.values()))
+                remarks.append(f"{first}: {len(errors)} of {len(beam)} shots of {beam.name} skipped")
+            remarks += beam.remarks
+        rows: list[GediShot | IncompleteShot] = []
+        for beam, i in selected:
+            shots, errors = reads[beam]
+            rows.append(shots[i] if i in shots else IncompleteShot(beam.name, beam.number_of(i), errors[i]))
+    return rows, remarks
 
 
 def _requested_numbers(shot: Any) -> list[int]:
@@ -253,7 +279,7 @@ def _requested_numbers(shot: Any) -> list[int]:
     return [int(number) for number in requested]
 
 
-def _open_beams(path: Path, file: Any, names: list[str]) -> "tuple[list[_Beam], list[ValueError]]":
+def _open_beams(file: ProductFile, names: list[str]) -> "tuple[list[_Beam], list[ValueError]]":
     """Return the beams that have shot numbers, and the errors of the others.
 
     **Raises:** the first of these errors, where no beam has shot numbers.
@@ -261,7 +287,7 @@ def _open_beams(path: Path, file: Any, names: list[str]) -> "tuple[list[_Beam], 
     beams, errors = [], []
     for name in names:
         try:
-            beams.append(_Beam(path, file, name))
+            beams.append(_Beam(file, name))
         except ValueError as error:
             errors.append(error)
     if not beams:
@@ -346,6 +372,8 @@ def _shot(beam: "_Beam", i: int, received: np.ndarray, transmitted: np.ndarray) 
         azimuth=float(np.rad2deg(towards) + 180.0) % 360.0,
         degrade=beam.flag("degrade", i),
         stale_return=beam.flag("stale_return", i),
+        solar_elevation=beam.optional_number("solar_elevation", i),
+        delta_time=beam.optional_number("delta_time", i),
     )
 
 
@@ -359,8 +387,8 @@ class _Beam:
     **Raises:** ValueError where there are no shot numbers.
     """
 
-    def __init__(self, path: Path, file: Any, name: str):
-        self.path, self.file, self.name = path, file, name
+    def __init__(self, file: ProductFile, name: str):
+        self.file, self.name = file, name
         self.remarks: list[str] = []
         self.size = self._dataset("shot_number").shape[0]
 
@@ -369,7 +397,7 @@ class _Beam:
 
     def location(self, field: str, shot: int | None = None) -> str:
         """Return the location of a field, and of a shot in it, for messages."""
-        location = f"{self.path}: /{self.name}/{field}"
+        location = self.file.location(f"{self.name}/{field}")
         return location if shot is None else f"{location}, shot {int(self.shot_number[shot])}"
 
     def number(
@@ -382,6 +410,11 @@ class _Beam:
                 f"{self.location(field, shot)}: {value:g} is outside the admissible range [{low:g}, {high:g}]"
             )
         return value
+
+    def optional_number(self, name: str, shot: int) -> float | None:
+        """Return a number of a shot, or None where the file does not have it."""
+        values = self._optional.get(name)
+        return None if values is None or not np.isfinite(values[shot]) else float(values[shot])
 
     def flag(self, name: str, shot: int) -> int | None:
         """Return a flag of a shot, or None where the file does not have it."""
@@ -457,6 +490,13 @@ class _Beam:
             )
         return None
 
+    def number_of(self, shot: int) -> int:
+        """Return the unique number of a shot; -1 where the file's are no whole numbers."""
+        try:
+            return int(self.shot_number[shot])
+        except ValueError:
+            return -1
+
     @functools.cached_property
     def shot_number(self) -> np.ndarray:
         """(shots,) unique numbers of the product."""
@@ -483,15 +523,10 @@ class _Beam:
 
     def _in_units(self, field: str) -> np.ndarray:
         """Return the numbers of all shots in the unit of `_UNITS`, by the dataset's attribute `units`."""
-        values, dataset = self._read_numbers(field), self._dataset(field)
-        with refuse_damage(f"{self.location(field)}: damaged"):
-            attributes = dataset.attrs
-            stated = next((attributes[name] for name in ("units", "unit") if name in attributes), None)
-        if field not in _UNITS or stated is None:
+        values = self._read_numbers(field)
+        if field not in _UNITS:
             return values
-        read_unit, expected = _UNITS[field]
-        unit = read_unit(self.location(field), stated.decode() if isinstance(stated, bytes) else str(stated))
-        return values if unit is None or units_agree(unit, expected) else values * (unit / expected)
+        return self.file.in_unit(f"{self.name}/{field}", values, *_UNITS[field])
 
     @functools.cached_property
     def _flags(self) -> dict[str, np.ndarray]:
@@ -515,6 +550,20 @@ class _Beam:
                 )
             flags[name] = np.where(wrong, np.nan, values)
         return flags
+
+    @functools.cached_property
+    def _optional(self) -> dict[str, np.ndarray]:
+        """Numbers of shots by name, of those of `_OPTIONAL` that the file has; NaN where they are missing."""
+        columns = {}
+        for name, field in _OPTIONAL.items():
+            if not self._has(field):
+                continue
+            try:
+                self._check_shape(field)
+                columns[name] = self._read_numbers(field)
+            except ValueError as error:
+                self.remarks.append(f"{error}: it is left out")
+        return columns
 
     def _start_indices(self, kind: str) -> np.ndarray:
         """Return the start indices of all shots, from 1; NaN where they are missing."""
@@ -554,53 +603,18 @@ class _Beam:
         return _SampleLocation(start, count, indices, size)
 
     def _has(self, field: str) -> bool:
-        with refuse_damage(f"{self.location(field)}: damaged"):
-            return f"{self.name}/{field}" in self.file
+        return self.file.has(f"{self.name}/{field}")
 
     def _dataset(self, field: str) -> Any:
         """Return a dataset of numbers in one dimension, all of which are stored in the file."""
-        with refuse_damage(f"{self.location(field)}: damaged"):
-            node = self.file.get(f"{self.name}/{field}")
-            shape, kind = getattr(node, "shape", None), getattr(getattr(node, "dtype", None), "kind", None)
-        if shape is None or kind is None:
-            raise ValueError(f"{self.location(field)}: no such dataset; it is part of a GEDI L1B product")
-        if kind not in "iuf":
-            raise ValueError(f"{self.location(field)}: type {node.dtype} where numbers belong")
-        if len(shape) != 1:
-            raise ValueError(f"{self.location(field)}: shape {shape}, where one dimension belongs")
-        with refuse_damage(f"{self.location(field)}: damaged"):
-            # HDF5 returns zeros for what is not stored, as many as are declared.
-            is_elsewhere = node.is_virtual or node.external
-            packed = [
-                name for name, usual in _STORED_AS_COUNTS.items() if node.attrs.get(name, usual) != usual
-            ]
-            (chunk,) = node.chunks or shape
-            chunks = math.ceil(shape[0] / chunk) if chunk else 0
-            contiguous = node.id.get_storage_size() // max(node.nbytes, 1)
-            stored = node.id.get_num_chunks() if node.chunks else contiguous
-        if is_elsewhere or stored < chunks:
-            raise ValueError(
-                f"{self.location(field)}: {shape[0]} numbers are declared, but the file holds {stored} of "
-                f"{chunks} parts of them"
-            )
-        if packed:
-            raise ValueError(f"{self.location(field)}: {', '.join(packed)}: counts, which are not read")
-        check_unpacked_size(self.path, f"/{self.name}/{field}", chunks * chunk * node.dtype.itemsize)
-        return node
+        return self.file.dataset(f"{self.name}/{field}", _PRODUCT)
 
     def _read(self, field: str) -> np.ndarray:
-        dataset = self._dataset(field)
-        with refuse_damage(f"{self.location(field)}: damaged"):
-            return dataset[:]
+        return self.file.read(f"{self.name}/{field}", _PRODUCT)
 
     def _read_numbers(self, field: str) -> np.ndarray:
         """Return the numbers of a dataset in double precision; NaN where they have its fill value."""
-        values = self._read(field)
-        with refuse_damage(f"{self.location(field)}: damaged"):
-            fill = self._dataset(field).attrs.get(_FILL_ATTRIBUTE)
-        is_fill = np.zeros(values.shape, bool) if fill is None else np.isin(values, fill)
-        with np.errstate(over="ignore", invalid="ignore"):
-            return np.where(is_fill, np.nan, values.astype(np.float64))
+        return self.file.numbers(f"{self.name}/{field}", _PRODUCT)
 
 
 class _SampleLocation(NamedTuple):

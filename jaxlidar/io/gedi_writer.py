@@ -1,7 +1,8 @@
 """Writer of simulated waveforms in the layout of GEDI's level 1B product, for the tools that read it.
 
-Datasets without a counterpart in a simulation are left out: the orbit, the fit of the transmitted pulse,
-geophysical corrections, the sun, and the history of processing. Standard errors of positions are zero.
+Datasets without a counterpart in a simulation are left out: the orbit and the history of processing. Standard
+errors, and corrections for tides and the atmosphere, are zero. The extended Gaussian of the transmitted pulse
+(`tx_eg...`: a Gaussian convolved with an exponential) has the area, variance and skewness of the pulse.
 """
 
 import dataclasses
@@ -33,6 +34,7 @@ from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._files import atomic_write
 from jaxlidar._fingerprint import version_of
 from jaxlidar.instrument.lidar import Lidar
+from jaxlidar.instrument.receiver import Receiver
 from jaxlidar.instrument.survey import Survey
 from jaxlidar.io.checks import MAX_COUNTS
 from jaxlidar.io.coordinates import metric_system
@@ -55,6 +57,20 @@ _ORBIT_DIGIT, _BEAM_DIGIT = 10**13, 10**11
 _SHOT_RATE = 242.0
 # The transmitted pulse: samples, pedestal, and counts of its largest sample above the pedestal.
 _PULSE_SAMPLES, _PULSE_PEDESTAL, _PULSE_PEAK = 128, 250.0, 1000.0
+# Datasets of geophysical corrections.
+_CORRECTIONS = (
+    "dynamic_atmosphere_correction",
+    "geoid",
+    "tide_earth",
+    "tide_load",
+    "tide_ocean",
+    "tide_ocean_pole",
+    "tide_pole",
+)
+# Samples of `rx_offset`; the others up to the first one received are those of `rx_open`.
+_RX_OFFSET = 1000
+# Least time constant of the extended Gaussian over the pulse's standard deviation: symmetric ones have none.
+_MIN_TIME_CONSTANT = 0.05
 # Standard deviation in bins of the Gaussian that the product smooths with, and half of its length.
 _SMOOTHING_STD, _SMOOTHING_HALF_LENGTH = 1.7, 8
 # Admissible difference of the sampling interval from 1 ns, which single precision rounds.
@@ -85,13 +101,14 @@ def write_gedi_l1b(
     gain: float = 50_000.0,
     noise_mean: float = 240.0,
     noise_std: float = 3.0,
+    solar_elevation: ArrayLike | Sequence = -90.0,
     key: PRNGKeyArray | None = None,
 ) -> None:
     """Write simulated shots as a GEDI L1B file, which the product's own tools and `read_gedi_l1b` read.
 
-    The file has the groups of all eight beams. Bins have the elevation of `Waveform.height`, and `tx_gloc` is
-    time zero of the lidar's pulse, so that what `read_gedi_l1b` gives fits what was simulated. Where the
-    pulse is not symmetric, the product would have the centre of a Gaussian fit there.
+    The file has a group for each beam that has shots. Bins have the elevation of `Waveform.height`, and
+    `tx_gloc` is time zero of the lidar's pulse, so that what `read_gedi_l1b` gives fits what was simulated.
+    Where the pulse is not symmetric, the product would have the centre of a Gaussian fit there.
 
     **Arguments:**
 
@@ -116,6 +133,8 @@ def write_gedi_l1b(
     - `noise_mean`: counts without light, 0 or more. The receiver's background comes in addition. Default 240.
     - `noise_std`: standard deviation of the noise in counts before the product's smoothing, 0 or more, as
       `noise_stddev_corrected` has it. Default 3.
+    - `solar_elevation`: of the sun in degrees, one number or (shots,), by which tools tell day from night.
+      Default -90: night.
     - `key`: a JAX random key: normal noise is added, smoothed as recorded noise is (a standard deviation of
       0.41 `noise_std`). Default None: no noise is added to `recorded`.
 
@@ -159,9 +178,13 @@ def write_gedi_l1b(
     check_number("gain", gain, 0.0, low_open=True)
     check_number("noise_mean", noise_mean, 0.0)
     check_number("noise_std", noise_std, 0.0)
+    check_range("solar_elevation", solar_elevation, -90.0, 90.0)
+    check_shape("solar_elevation", solar_elevation, (), (shots,))
     if key is not None:
         check_key(key)
     per_joule = gain / _energy_per_reflectance(survey)
+    check_kind("receiver", survey.lidar.receiver, Receiver, "a Receiver: GEDI digitises")
+    assert isinstance(survey.lidar.receiver, Receiver)
     background = concrete_number(survey.lidar.receiver.background)
     pulse, pulse_zero = _transmitted_pulse(survey.lidar)
     columns = {
@@ -172,9 +195,18 @@ def write_gedi_l1b(
         "stale_return_flag": np.zeros(shots, np.uint8),
         "tx_gloc": np.full(shots, pulse_zero, np.float32),
         "tx_sample_count": np.full(shots, pulse.size, np.uint16),
+        **{name: np.full(shots, value) for name, value in _extended_gaussian(pulse, pulse_zero).items()},
+        "tx_egflag": np.ones(shots, np.uint8),
+        "tx_pulseflag": np.ones(shots, np.uint8),
     }
     projection = _projection(origin, crs)
     geolocation = _geolocation(survey, first_time, bins, plane_elevation, projection)
+    geolocation["solar_elevation"] = np.broadcast_to(np.asarray(solar_elevation, np.float32), (shots,))
+    # Samples of 1 ns from the transmission to the first received one; the second number has 16 bits.
+    first_sample = np.rint(2e9 * geolocation["bounce_time_offset_bin0"] + pulse_zero).astype(np.int64)
+    rx_offset = np.minimum(first_sample, _RX_OFFSET)
+    columns["rx_offset"] = rx_offset.astype(np.uint16)
+    columns["rx_open"] = (first_sample - rx_offset).astype(np.uint32)
     digitiser = _Digitiser(
         waveforms=waveforms,
         per_joule=per_joule,
@@ -189,6 +221,9 @@ def write_gedi_l1b(
         _write_description(file, Path(path).name)
         for name in _BEAMS:
             (indices,) = np.nonzero(beams == name)
+            # Tools take a group for a beam with shots.
+            if indices.size == 0:
+                continue
             beam_columns = {field: column[indices] for field, column in columns.items()}
             group = _write_beam(file, name, beam_columns)
             group["txwaveform"] = np.tile(pulse, indices.size)
@@ -198,6 +233,10 @@ def write_gedi_l1b(
                 geolocation_group[field] = column[indices]
             for field in ("delta_time", "shot_number"):
                 geolocation_group[field] = group[field][:]
+            corrections = group.create_group("geophys_corr")
+            corrections["delta_time"] = group["delta_time"][:]
+            for field in _CORRECTIONS:
+                corrections[field] = np.zeros(indices.size, np.float32)
 
 
 def _write_beam(file: Any, name: str, columns: dict[str, np.ndarray]) -> Any:
@@ -210,7 +249,8 @@ def _write_beam(file: Any, name: str, columns: dict[str, np.ndarray]) -> Any:
         group[field] = column
     group["beam"] = np.full(shots, int(name[-4:], 2), np.uint16)
     group["channel"] = np.full(shots, channel, np.uint8)
-    group["delta_time"] = np.arange(shots) / _SHOT_RATE
+    group["delta_time"] = delta_time = np.arange(shots) / _SHOT_RATE
+    group["master_int"], group["master_frac"] = delta_time.astype(np.uint32), delta_time % 1.0
     for kind in ("rx", "tx"):
         count = columns[f"{kind}_sample_count"].astype(np.uint64)
         # The product counts samples from 1.
@@ -222,15 +262,17 @@ def _write_received(group: Any, digitiser: "_Digitiser", indices: np.ndarray) ->
     """Write the received waveforms of a beam's shots, some at a time, and their energies."""
     starts = group["rx_sample_start_index"][:].astype(int) - 1
     received = group.create_dataset("rxwaveform", (int(digitiser.bins[indices].sum()),), np.float32)
-    energy = np.zeros(indices.size)
+    energy, total = np.zeros((2, indices.size))
     for start in range(0, indices.size, _BLOCK):
         block = slice(start, start + _BLOCK)
         waveforms = digitiser.counts(indices[block])
         samples = np.concatenate(waveforms)
         received[starts[start] : starts[start] + samples.size] = samples
         noise_mean = group["noise_mean_corrected"][block]
-        energy[block] = [w.sum(dtype=float) - w.size * mean for w, mean in zip(waveforms, noise_mean)]
+        total[block] = [waveform.sum(dtype=float) for waveform in waveforms]
+        energy[block] = total[block] - digitiser.bins[indices[block]] * noise_mean
     group["rx_energy"] = energy
+    group["all_samples_sum"] = np.rint(np.clip(total, 0, np.iinfo(np.uint32).max)).astype(np.uint32)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -399,6 +441,30 @@ def _transmitted_pulse(lidar: Lidar) -> tuple[np.ndarray, float]:
     return (_PULSE_PEDESTAL + _PULSE_PEAK * power / power.max()).astype(np.float32), float(zero)
 
 
+def _extended_gaussian(pulse: np.ndarray, zero: float) -> dict[str, np.float32]:
+    """Return the product's parameters of an extended Gaussian with the moments of the transmitted waveform.
+
+    A Gaussian of standard deviation s, convolved with an exponential of time constant 1 / gamma, has the
+    variance s^2 + gamma^-2 and the third central moment 2 gamma^-3.
+    """
+    power = pulse.astype(float) - _PULSE_PEDESTAL
+    time = np.arange(pulse.size) - zero
+    area = power.sum()
+    mean = float(np.sum(power * time) / area)
+    variance, third = (float(np.sum(power * (time - mean) ** n) / area) for n in (2, 3))
+    constant = np.cbrt(max(third, 0.0) / 2.0)
+    deviation = math.sqrt(variance)
+    constant = float(np.clip(constant, _MIN_TIME_CONSTANT * deviation, deviation * math.sqrt(0.5)))
+    values = {
+        "tx_egamplitude": area,
+        "tx_egbias": _PULSE_PEDESTAL,
+        "tx_eggamma": 1.0 / constant,
+        "tx_egsigma": math.sqrt(variance - constant**2),
+    }
+    errors = dict.fromkeys((*(f"{name}_error" for name in values), "tx_gloc_error"), 0.0)
+    return {name: np.float32(value) for name, value in (values | errors).items()}
+
+
 @functools.partial(jax.jit, static_argnums=2)
 def _smooth_noise(key: PRNGKeyArray, shots: Array, bins: int) -> Float[Array, "shots bins"]:
     """Return white noise of unit standard deviation, smoothed as the product's waveforms are."""
@@ -490,6 +556,7 @@ def _geolocation(
     columns["local_beam_elevation"] = (0.5 * math.pi - zenith).astype(np.float32)
     columns |= {f"{name}_error": np.zeros(len(survey), np.float32) for name in columns}
     columns["degrade"] = np.zeros(len(survey), np.int8)
+    columns["digital_elevation_model"] = plane_elevation.astype(np.float32)
     return columns
 
 

@@ -12,7 +12,9 @@ import equinox as eqx
 
 from jaxlidar._deprecated import RENAMED, warn_renamed
 from jaxlidar._registry import public_objects
+from jaxlidar.instrument.catalogue import instrument
 from jaxlidar.instrument.pulse import SampledPulse
+from jaxlidar.instrument.receiver import Receiver
 from jaxlidar.instrument.survey import Survey
 from jaxlidar.io.dem import DemRead, read_dem
 from jaxlidar.io.obj import MeshRead, read_obj
@@ -30,19 +32,22 @@ from jaxlidar.scenes.voxels import VoxelMap
 
 # Exported classes of these packages are kinds.
 _PACKAGES = ("jaxlidar.optics.", "jaxlidar.instrument.", "jaxlidar.scenes.")
-# But for receivers and results of photon counting, which come after a simulation.
-_NO_KINDS = ("PhotonCounter", "PhotonEvents")
+# But for results of photon counting, which come after a simulation, and for meshes, whose files are read by
+# `read_obj` or trimesh.
+_NO_KINDS = ("PhotonEvents", "MeshSurface", "MeshInstances")
 # Functions that return scenes or lidars, or objects in them, and classes of other packages.
 _FUNCTIONS: tuple[Callable[..., Any], ...] = (
     *(Branching, Habit, broadleaf, conifer, shrub, spreading_tree, grow, forest),
     *(voxelise, voxelise_mesh, trim_empty_layers),
     *(VoxelMap.from_lad, VoxelMap.from_extinction, VoxelMap.from_probability),
-    *(Survey.grid, Survey.track, Survey.scan),
+    *(Survey.grid, Survey.track, Survey.scan, instrument),
     *(LeafAngles.named, LeafAngles.beta, Prospect.paper),
     *(spectrum, read_spectrum_csv, read_vox, read_dem, read_obj, load_coefficients, Coefficients),
 )
 # The class of a table without `kind`, by the abstract class that is admissible.
 _DEFAULT_CLASSES = {AbstractGround: Ground, AbstractSheet: Plate}
+# The class of such a table where several are admissible.
+_PREFERRED_CLASSES = {Receiver}
 # Fields of arguments that are not stored under their own name.
 _FIELD_NAMES = {(SampledPulse, "power"): "samples"}
 
@@ -59,6 +64,7 @@ UNITS = {
     "aspect": COMPASS,
     "azimuth": COMPASS,
     "background": "J per sample",
+    "background_rate": "1/s",
     "base_height": "m",
     "beam_spacing": "m",
     "bend": DEGREES,
@@ -72,6 +78,7 @@ UNITS = {
     "Cm": "g/cm2",
     "Cp": "g/cm2",
     "Cw": "cm",
+    "dead_time": "ns",
     "decay": "ns",
     "detection_threshold": "J per sample",
     "divergence": "mrad",
@@ -80,6 +87,7 @@ UNITS = {
     "energy": "J",
     "field_of_view": "mrad",
     "frequency": "1/s",
+    "gps_time": "s",
     "fwhm": "ns",
     "half_angle": DEGREES,
     "height": "m",
@@ -101,6 +109,7 @@ UNITS = {
     "roughness": "rad",
     "sampling_interval": "ns",
     "saturation": "J per sample",
+    "scan_angle": DEGREES,
     "shoot_angle": DEGREES,
     "shoot_length": "m",
     "slope": DEGREES,
@@ -226,6 +235,12 @@ def admits_text(annotation: Any) -> bool:
     return any(member is str for member in union_members(annotation))
 
 
+def admits_numbers_alone(annotation: Any) -> bool:
+    """Return True if numbers, arrays of them and None are all that is admissible."""
+    members = [member for member in union_members(annotation) if member is not types.NoneType]
+    return bool(members) and all(hasattr(m, "dim_str") or m in (float, int) for m in members)
+
+
 def admits_mapping(annotation: Any) -> bool:
     """Return True if a mapping is admissible."""
     classes = (getattr(member, "__origin__", member) for member in union_members(annotation))
@@ -236,4 +251,5 @@ def default_kind(annotation: Any) -> Callable[..., Any] | None:
     """Return the class of a table without `kind`: the only one that is admissible, or a default class."""
     classes = {_DEFAULT_CLASSES.get(m, m) for m in union_members(annotation) if isinstance(m, type)}
     admissible = classes & set(kinds().values())
+    admissible = admissible & _PREFERRED_CLASSES or admissible
     return admissible.pop() if len(admissible) == 1 else None

@@ -1,14 +1,15 @@
-"""Point clouds in LAS and LAZ files: reader, and writer of LAS.
+"""Point clouds in LAS and LAZ files: reader and writer.
 
 Source: LAS specification 1.4 (ASPRS).
 """
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from jaxtyping import ArrayLike, Float, Int, Num
+from jaxtyping import ArrayLike, Num
 
 from jaxlidar._checks import as_numpy, check_number, check_range, check_shape, check_unmasked
 from jaxlidar._files import atomic_write
@@ -16,6 +17,7 @@ from jaxlidar.io.checks import MAX_COORDINATE, existing_file
 from jaxlidar.io.coordinates import WKT_RECORD, CoordinateSystem, check_elevations, metric_system
 from jaxlidar.io.las_header import PROJECTION_USER, LasHeader, read_header
 from jaxlidar.io.laz import decompress_points
+from jaxlidar.plants.point_cloud import PointCloud
 
 # Classes of points that are not returns of the scene: low noise and high noise.
 _NOISE_CLASSES = (7, 18)
@@ -23,6 +25,8 @@ _NOISE_CLASSES = (7, 18)
 _MM, _DEGREES = (1e-3, 1e-3, 1e-3), (1e-8, 1e-8, 1e-3)
 # The first point format of LAS 1.4, whose fields hold larger numbers.
 _FORMAT_6 = 6
+# From that format on, scan angles are counted in steps of this size, degrees.
+_SCAN_ANGLE_STEP = 0.006
 # Largest numbers by field: in point formats up to 5, and from 6 on.
 _MAX_NUMBERS = {
     "return_number": (7, 15),
@@ -30,34 +34,14 @@ _MAX_NUMBERS = {
     "classification": (31, 255),
     "intensity": (2**16 - 1, 2**16 - 1),
     "scanner_channel": (0, 3),
+    "point_source_id": (2**16 - 1, 2**16 - 1),
 }
-
-
-class PointCloud(NamedTuple):
-    """Points of a laser scan.
-
-    - `position`: (n, 3) m, as in the file times the scale, in double precision.
-    - `classification`: (n,) classes of the LAS specification: 2 ground, 3 to 5 vegetation, ...
-    - `return_number`, `number_of_returns`: (n,) number of the return, and of all returns of its pulse.
-    - `intensity`: (n,) as recorded.
-    - `dropped`: how many points of the file were left out, by reason.
-
-    **Example:**
-
-    >>> import numpy as np
-    >>> from jaxlidar.io import PointCloud
-    >>> one, two = np.array([1, 1]), np.array([[0.0, 0.0, 1.0], [0.5, 0.0, 9.0]])
-    >>> cloud = PointCloud(two, np.array([2, 5]), one, one, np.array([40.0, 25.0]), {"noise": 0})
-    >>> print(cloud.position[cloud.classification == 5])
-    [[0.5 0.  9. ]]
-    """
-
-    position: Float[np.ndarray, "n 3"]
-    classification: Int[np.ndarray, " n"]
-    return_number: Int[np.ndarray, " n"]
-    number_of_returns: Int[np.ndarray, " n"]
-    intensity: Float[np.ndarray, " n"]
-    dropped: dict[str, int]
+# Scan angles: steps in degrees and the largest angle, in point formats up to 5 and from 6 on.
+_SCAN_ANGLE_STEPS, _MAX_SCAN_ANGLES = (1.0, 0.006), (90.0, 180.0)
+# Smaller GPS times are seconds of the week, larger ones adjusted standard GPS time.
+_SECONDS_OF_WEEK = 604_800
+# Longest description of an extra dimension in a LAS file, and its name.
+_MAX_EXTRA_TEXT = 32
 
 
 def read_las(path: str | os.PathLike[str], *, scale: float | None = None) -> PointCloud:
@@ -150,8 +134,25 @@ def read_stored_points(
         np.asarray(cloud["number_of_returns"]).astype(int)[selected],
         np.asarray(cloud["intensity"]).astype(float)[selected],
         {"noise": int(noise.sum()), "withheld": int(withheld.sum())},
+        scan_angle=_scan_angle(cloud, header.point_format)[selected],
+        gps_time=_gps_time(cloud, selected),
+        source=np.asarray(cloud["point_source_id"]).astype(int)[selected],
     )
     return points, system
+
+
+def _scan_angle(cloud: Any, point_format: int) -> np.ndarray:
+    """Return the scan angles of all points, degrees."""
+    if point_format >= _FORMAT_6:
+        return np.asarray(cloud["scan_angle"], float) * _SCAN_ANGLE_STEP
+    return np.asarray(cloud["scan_angle_rank"], float)
+
+
+def _gps_time(cloud: Any, selected: np.ndarray) -> np.ndarray | None:
+    """Return the GPS times of the selected points, s; None where the point format has none."""
+    if "gps_time" not in cloud.point_format.dimension_names:
+        return None
+    return np.asarray(cloud["gps_time"], float)[selected]
 
 
 def import_laspy(purpose: str) -> Any:
@@ -181,29 +182,39 @@ def write_las(
     number_of_returns: Num[ArrayLike, "..."] | None = None,
     gps_time: Num[ArrayLike, "..."] | None = None,
     classification: Num[ArrayLike, "..."] | None = None,
+    scan_angle: Num[ArrayLike, "..."] | None = None,
+    point_source: Num[ArrayLike, "..."] | None = None,
+    extra: Mapping[str, tuple[str, Num[ArrayLike, "..."]]] | None = None,
     crs: str | None = None,
 ) -> None:
-    """Write points as a LAS 1.4 file (point format 6).
+    """Write points as a LAS 1.4 file (point format 6), or as LAZ.
 
-    This needs laspy (`pip install "jaxlidar[io]"`). An existing file is replaced when the new one is
-    complete.
+    This needs laspy, and lazrs for LAZ (`pip install "jaxlidar[io]"`). An existing file is replaced when
+    the new one is complete. The header says that the coordinate reference system, if any, is well-known
+    text, as the specification asks for from point format 6 on.
 
     **Arguments:**
 
-    - `path`: the file, which ends in ".las".
+    - `path`: the file, which ends in ".las" or ".laz".
     - `position`: (n, 3) m, at least one point. They are rounded to mm.
     - `intensity`: (n,) from 0 to 65535, rounded to whole numbers. Default None: 0.
     - `return_number`, `number_of_returns`: (n,) whole numbers from 0 to 15. Default None: 1.
-    - `gps_time`: (n,) s. Default None: 0.
+    - `gps_time`: (n,) s: of the GPS week where all are from 0 to 604,800, else adjusted standard GPS time
+      (GPS time less 1e9 s); the header says which. Default None: 0.
     - `classification`: (n,) classes of the LAS specification, from 0 to 255. Default None: 0.
+    - `scan_angle`: (n,) degrees from -180 to 180, rounded to 0.006. Default None: 0.
+    - `point_source`: (n,) whole numbers from 0 to 65535, such as those of flight lines. Default None: 0.
+    - `extra`: further numbers by name: (description, (n,) values), written in single precision as extra
+      bytes. Names and descriptions have at most 32 bytes. Default None: none.
     - `crs`: the coordinate reference system of `position`, in metres, such as "EPSG:32633". Default None: not
       known. This needs rasterio.
 
     **Returns:** nothing.
 
-    **Raises:** ImportError without laspy, or without rasterio for `crs`. ValueError for another ending,
-    arrays of different lengths, numbers outside their range, and a `crs` that is not known or not in metres.
-    OSError where the file cannot be written.
+    **Raises:** ImportError without laspy, without lazrs for LAZ, or without rasterio for `crs`. ValueError
+    for another ending, arrays of different lengths, numbers outside their range, names and descriptions
+    that are too long, and a `crs` that is not known or not in metres. OSError where the file cannot be
+    written.
 
     **Example:**
 
@@ -215,7 +226,7 @@ def write_las(
     >>> print(jaxlidar.io.read_las(path).position[:, 2])
     [12.5   0.25]
     """
-    path, coordinates = las_path(path), as_numpy(position, "position")
+    path, coordinates = las_path(path, (".las", ".laz")), as_numpy(position, "position")
     n = len(coordinates)
     if intensity is not None:
         intensity = np.round(as_numpy(intensity, "intensity"))
@@ -225,20 +236,27 @@ def write_las(
         "number_of_returns": np.ones(n, int) if number_of_returns is None else number_of_returns,
         "gps_time": np.zeros(n) if gps_time is None else gps_time,
         "classification": np.zeros(n, int) if classification is None else classification,
+        "scan_angle": np.zeros(n) if scan_angle is None else scan_angle,
+        "point_source_id": np.zeros(n, int) if point_source is None else point_source,
     }
     system = None if crs is None else metric_system("crs", crs)
-    points = las_points(_FORMAT_6, coordinates, fields, system)
+    points = las_points(_FORMAT_6, coordinates, fields, system, extra or {})
     with atomic_write(path) as draft:
-        write_points(points, draft)
+        write_points(points, draft, compressed=path.suffix.lower() == ".laz")
 
 
 def las_points(
-    point_format: int, position: np.ndarray, fields: dict[str, Any], system: CoordinateSystem | None
+    point_format: int,
+    position: np.ndarray,
+    fields: dict[str, Any],
+    system: CoordinateSystem | None,
+    extra: Mapping[str, tuple[str, Any]] | None = None,
 ) -> Any:
     """Return points as a `laspy.LasData`, which is not written yet.
 
-    **Arguments:** `position`: (n, 3) coordinates. `fields`: (n,) numbers by laspy's names. `system`: the
-    coordinate reference system of `position`; None for none.
+    **Arguments:** `position`: (n, 3) coordinates. `fields`: (n,) numbers by laspy's names; scan angles in
+    degrees. `system`: the coordinate reference system of `position`; None for none. `extra`: as for
+    `write_las`.
 
     **Raises:** ValueError for numbers that the point format does not hold.
     """
@@ -250,12 +268,18 @@ def las_points(
     for name, values in fields.items():
         check_unmasked(name, values)
     fields = {name: np.asarray(values) for name, values in fields.items()}
+    is_format_6 = point_format >= _FORMAT_6
+    if "scan_angle" in fields:
+        limit, step = _MAX_SCAN_ANGLES[is_format_6], _SCAN_ANGLE_STEPS[is_format_6]
+        check_range("scan_angle", fields["scan_angle"], -limit, limit)
+        name = "scan_angle" if is_format_6 else "scan_angle_rank"
+        fields[name] = np.round(fields.pop("scan_angle") / step)
     for name, values in fields.items():
         check_shape(name, values, (len(position),))
         if name not in _MAX_NUMBERS:
             check_range(name, values)
             continue
-        check_range(name, values, 0, _MAX_NUMBERS[name][point_format >= _FORMAT_6])
+        check_range(name, values, 0, _MAX_NUMBERS[name][is_format_6])
         if np.any(values != np.floor(values)):
             raise ValueError(f"{name} has values that are not whole numbers")
     is_geographic = system is not None and system.kind == "geographic"
@@ -266,10 +290,23 @@ def las_points(
         raise ValueError(f"position spans {spans}; admissible is 2^31 steps of {scale.tolist()}")
     header = laspy.LasHeader(point_format=point_format, version="1.4")
     header.generating_software, header.scales, header.offsets = "jaxlidar", scale, offset
+    # From format 6 on, the specification admits well-known text alone.
+    header.global_encoding.wkt = is_format_6
     if system is not None and system.crs is not None:
         wkt = system.wkt.encode() + b"\0"
         header.vlrs.append(laspy.VLR(PROJECTION_USER.decode(), WKT_RECORD, "", wkt))
         header.global_encoding.wkt = True
+    gps_time = fields.get("gps_time", np.zeros(1))
+    if gps_time.min() < 0 or gps_time.max() > _SECONDS_OF_WEEK:
+        header.global_encoding.gps_time_type = laspy.header.GpsTimeType.STANDARD
+    extra_values = {}
+    for name, (description, values) in (extra or {}).items():
+        if max(len(name.encode()), len(description.encode())) > _MAX_EXTRA_TEXT:
+            raise ValueError(f"extra: {name!r}, {description!r}: admissible are {_MAX_EXTRA_TEXT} bytes each")
+        check_range(name, values)
+        check_shape(name, values, (len(position),))
+        header.add_extra_dim(laspy.ExtraBytesParams(name, np.float32, description))
+        extra_values[name] = np.asarray(values, np.float32)
     points = laspy.LasData(header, laspy.ScaleAwarePointRecord.zeros(len(position), header=header))
     for axis, values in zip("XYZ", counts.T):
         points[axis] = values.astype(np.int32)
@@ -277,18 +314,29 @@ def las_points(
         # Formats below 6 have no scanner channels; they were checked to be zero.
         if name in points.point_format.dimension_names:
             points[name] = values
+    for name, values in extra_values.items():
+        points[name] = values
     return points
 
 
-def write_points(points: Any, path: Path) -> None:
-    """Write a `laspy.LasData`, not compressed."""
+def scan_angles(points: Any) -> np.ndarray:
+    """Return the scan angles of points of laspy, degrees."""
+    if "scan_angle" in points.point_format.dimension_names:
+        return _SCAN_ANGLE_STEPS[1] * np.asarray(points["scan_angle"], float)
+    return np.asarray(points["scan_angle_rank"], float)
+
+
+def write_points(points: Any, path: Path, *, compressed: bool = False) -> None:
+    """Write a `laspy.LasData`, compressed by lazrs or not. **Raises:** ImportError without lazrs."""
+    if compressed and not import_laspy("writing").LazBackend.detect_available():
+        raise ImportError('writing LAZ needs lazrs: pip install "jaxlidar[io]"')
     with path.open("wb") as file:
-        points.write(file, do_compress=False)
+        points.write(file, do_compress=compressed)
 
 
-def las_path(path: str | os.PathLike[str]) -> Path:
-    """Return a path. **Raises:** ValueError where it does not end in .las."""
+def las_path(path: str | os.PathLike[str], endings: tuple[str, ...] = (".las",)) -> Path:
+    """Return a path. **Raises:** ValueError where it does not end in .las, or another of the endings."""
     path = Path(path)
-    if path.suffix.lower() != ".las":
-        raise ValueError(f"path = {path}: its name does not end in .las")
+    if path.suffix.lower() not in endings:
+        raise ValueError(f"path = {path}: its name does not end in {' or '.join(endings)}")
     return path

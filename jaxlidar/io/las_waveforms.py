@@ -36,8 +36,16 @@ from jaxlidar.io.coordinates import (
     system_of_name,
     wkt_of_units,
 )
-from jaxlidar.io.las import import_laspy, las_path, las_points, point_format_of, write_points
+from jaxlidar.io.las import (
+    import_laspy,
+    las_path,
+    las_points,
+    point_format_of,
+    scan_angles,
+    write_points,
+)
 from jaxlidar.io.las_header import LasHeader, read_header
+from jaxlidar.io.laz import decompress_points
 
 # Point formats with packets.
 _PACKET_FORMATS = (4, 5, 9, 10)
@@ -93,15 +101,16 @@ class PacketLayout(NamedTuple):
 
 
 def read_las_waveforms(path: str | os.PathLike[str]) -> AirborneShots:
-    """Open the shots of a LAS file with waveform packets (point formats 4, 5, 9 and 10).
+    """Open the shots of a LAS or LAZ file with waveform packets (point formats 4, 5, 9 and 10).
 
-    This needs laspy (`pip install "jaxlidar[io]"`). Both files are mapped: samples are read when a shot is
-    indexed. Each shot has its points as `returns`, and no outgoing pulse. Coordinates may be metres, feet or
-    degrees.
+    This needs laspy, and lazrs for LAZ (`pip install "jaxlidar[io]"`). Both files are mapped, but for the
+    points of LAZ, which are unpacked into memory: samples are read when a shot is indexed. Packets that are
+    compressed themselves are refused, as no library reads them. Each shot has its points as `returns`, and no
+    outgoing pulse. Coordinates may be metres, feet or degrees.
 
     **Arguments:**
 
-    - `path`: the .las file; packets lie in it, or in the .wdp file beside it under the same name.
+    - `path`: the .las or .laz file; packets lie in it, or in the .wdp file beside it under the same name.
 
     **Returns:** an `AirborneShots`, in the order of GPS time. Its `dropped` counts points "without a packet".
 
@@ -123,10 +132,10 @@ def read_las_waveforms(path: str | os.PathLike[str]) -> AirborneShots:
 
 
 def has_packets(path: Path) -> bool:
-    """Return True if the points of a LAS file, not compressed, have waveform packets."""
+    """Return True if the points of a LAS or LAZ file have waveform packets."""
     with path.open("rb") as file:
         header = read_header(path, file)
-    return header.point_format in _PACKET_FORMATS and header.laszip is None
+    return header.point_format in _PACKET_FORMATS
 
 
 @final
@@ -148,14 +157,16 @@ class _LasShots(AirborneShots):
                     f"{path}: header: point format {header.point_format} has no packets; {_PACKET_FORMATS} "
                     "have"
                 )
-            if header.laszip is not None:
-                raise ValueError(f"{path}: header: points are compressed: their packets are not read")
             self.layouts = _read_layouts(path, file, header)
             self.system = header.coordinate_system(path, file)
             file.seek(_FLAGS_OFFSET)
             flags = int.from_bytes(file.read(2), "little")
             file.seek(_PACKETS_OFFSET)
             internal_offset = int.from_bytes(file.read(8), "little")
+            # Points of LAZ files are unpacked into memory; those of LAS files are mapped.
+            unpacked = None
+            if header.laszip is not None:
+                unpacked = decompress_points(path, file, header, with_packets=True)
         packet_path, self.packets_offset = path, internal_offset
         if not flags & _INTERNAL_PACKETS:
             packet_path, self.packets_offset = existing_file(_packet_path(path)), 0
@@ -165,9 +176,11 @@ class _LasShots(AirborneShots):
         _check_packets_header(packet_path, self.packet_bytes, self.packets_offset)
         self.scale, self.offset = np.array(header.scales), np.array(header.offsets)
         point_format = point_format_of(header)
-        self.points: Any = laspy.PackedPointRecord(
-            np.memmap(path, point_format.dtype(), "r", header.start, (header.points,)), point_format
-        )
+        if unpacked is None:
+            records: Any = np.memmap(path, point_format.dtype(), "r", header.start, (header.points,))
+        else:
+            records = np.frombuffer(unpacked, point_format.dtype(), header.points)
+        self.points: Any = laspy.PackedPointRecord(records, point_format)
         self._sort_points_and_packets()
 
     def _sort_points_and_packets(self) -> None:
@@ -288,6 +301,8 @@ class _LasShots(AirborneShots):
             "metres": self.units.metres(anchor),
             "gps_time": float(points_of_packets[0]["gps_time"][0]),
             "scanner_channel": int(_scanner_channel(points_of_packets[0])[0]),
+            "scan_angle": float(scan_angles(points_of_packets[0][:1])[0]),
+            "flight_line": int(points_of_packets[0]["point_source_id"][0]),
             "returns": Returns(np.concatenate(positions), np.concatenate(times), *numbers),
             "crs": self.system.text,
         }
@@ -466,7 +481,8 @@ def write_las_waveforms(
     """Write airborne shots as a LAS 1.4 file with waveform packets in a .wdp file beside it.
 
     Samples, their gain, offset and sampling interval, GPS times and scanner channels are kept exactly;
-    positions are rounded to mm, directions to single precision. The shots' returns become points. A segment
+    positions are rounded to mm, directions to single precision, scan angles to 0.006 degrees (whole ones in
+    formats 4 and 5). The shots' returns become points. A segment
     without a return gets one, at its largest sample, flagged as synthetic, because packets are found by their
     points. The format has no place for outgoing pulses. Shots are taken one at a time, so that there may be
     more than memory holds.
@@ -581,6 +597,8 @@ class _PacketWriter:
             "synthetic": is_synthetic.astype(np.uint8),
             "gps_time": np.full(returns.time.size, 0.0 if shot.gps_time is None else shot.gps_time),
             "scanner_channel": np.full(returns.time.size, shot.scanner_channel),
+            "scan_angle": np.full(returns.time.size, shot.scan_angle),
+            "point_source_id": np.full(returns.time.size, shot.flight_line),
             "wavepacket_index": layout[segment_of_return],
             "wavepacket_offset": offset[segment_of_return],
             "wavepacket_size": size[segment_of_return],

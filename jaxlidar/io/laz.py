@@ -8,8 +8,8 @@ Two kinds of damaged bytes also end the process, and are refused:
 
 - An arithmetic-coded stream never begins with four bytes of 255. In one that does, lazrs looks up symbols
   that do not exist.
-- Up to point format 5, lazrs calls itself at each change between sequences of GPS times. Many bytes of 255 in
-  a row decode to so many changes that the stack overflows.
+- lazrs calls itself at each change between sequences of GPS times. Many bytes of 255 in a row decode to so
+  many changes that the stack overflows.
 """
 
 import itertools
@@ -34,7 +34,9 @@ _EXTRA_BYTES, _EXTRA_LAYERS = 0, 14
 # Bytes that lazrs allocates for the statistics of each extra byte.
 _PER_EXTRA_BYTE = 10_000
 # The layers with the fields of a `PointCloud` come first.
-_USED_LAYERS = 5
+_USED_LAYERS = 9
+# Number of the layer with GPS times.
+_TIMES_LAYER = 8
 _TABLE_HEADER = struct.Struct("<2I")
 _IMPOSSIBLE_START, _ENDLESS_TIMES = b"\xff" * 4, b"\xff" * 8
 
@@ -47,8 +49,12 @@ class _Packing(NamedTuple):
     layers: int
 
 
-def decompress_points(path: Path, file: BinaryIO, header: LasHeader) -> bytearray:
+def decompress_points(
+    path: Path, file: BinaryIO, header: LasHeader, *, with_packets: bool = False
+) -> bytearray:
     """Return the binary records of all points, as a LAS file has them.
+
+    **Arguments:** `with_packets`: all fields, those of waveform packets too; else those of a `PointCloud`.
 
     **Raises:** ImportError without lazrs. ValueError, naming the file and the place, where they are damaged.
     """
@@ -62,7 +68,8 @@ def decompress_points(path: Path, file: BinaryIO, header: LasHeader) -> bytearra
         raise ValueError(f"{path}: chunk table: damaged ({error})") from error
     sizes = _chunk_sizes(path, header, packing, entries, table - first)
     if packing.layered:
-        _check_layers(path, file, header, packing.layers, sizes, first)
+        used = packing.layers if with_packets else _USED_LAYERS
+        _check_layers(path, file, header, packing.layers, used, sizes, first)
     else:
         _check_streams(path, file, header, sizes, first)
     points = bytearray(header.points * header.point_size)
@@ -70,7 +77,7 @@ def decompress_points(path: Path, file: BinaryIO, header: LasHeader) -> bytearra
     decompressor = lazrs.ParLasZipDecompressor if chunks > 1 else lazrs.LasZipDecompressor
     file.seek(header.start)
     try:
-        decompressor(file, header.laszip, _selection(lazrs)).decompress_many(points)
+        decompressor(file, header.laszip, _selection(lazrs, with_packets)).decompress_many(points)
     except (RuntimeError, OSError) as error:
         raise ValueError(f"{path}: chunks: damaged ({error})") from error
     return points
@@ -84,9 +91,12 @@ def _import_lazrs() -> Any:
     return lazrs
 
 
-def _selection(lazrs: Any) -> Any:
-    """Return lazrs' selection of the fields that a `PointCloud` holds."""
+def _selection(lazrs: Any, with_packets: bool) -> Any:
+    """Return lazrs' selection of the fields that a `PointCloud` holds, or of all fields."""
+    if with_packets:
+        return lazrs.DecompressionSelection(lazrs.SELECTIVE_DECOMPRESS_ALL)
     names = ("XY_RETURNS_CHANNEL", "Z", "CLASSIFICATION", "FLAGS", "INTENSITY")
+    names += ("SCAN_ANGLE", "POINT_SOURCE_ID", "GPS_TIME")
     return lazrs.DecompressionSelection(sum(getattr(lazrs, f"SELECTIVE_DECOMPRESS_{n}") for n in names))
 
 
@@ -160,9 +170,9 @@ def _chunk_sizes(
 
 
 def _check_layers(
-    path: Path, file: BinaryIO, header: LasHeader, count: int, sizes: list[int], offset: int
+    path: Path, file: BinaryIO, header: LasHeader, count: int, used: int, sizes: list[int], offset: int
 ) -> None:
-    """Refuse chunks whose layers do not fit, or whose used layers cannot be decoded."""
+    """Refuse chunks whose layers, `count`, do not fit, or whose first `used` ones cannot be decoded."""
     # A chunk begins with one point that is not compressed and the number of points. The sizes of the layers
     # follow.
     lead = header.point_size + 4
@@ -174,10 +184,13 @@ def _check_layers(
         if lead + 4 * count + layers.sum() > size:
             raise ValueError(f"{path}: chunk {i}: its layers do not fit into its {size} bytes")
         starts = offset + lead + 4 * count + np.cumsum(layers) - layers
-        for layer in np.flatnonzero(layers[:_USED_LAYERS]):
+        for layer in np.flatnonzero(layers[:used]):
             file.seek(starts[layer])
             if file.read(4) == _IMPOSSIBLE_START:
                 raise ValueError(f"{path}: chunk {i}: layer {layer} is damaged")
+        file.seek(starts[_TIMES_LAYER])
+        if _ENDLESS_TIMES in file.read(int(layers[_TIMES_LAYER])):
+            raise ValueError(f"{path}: chunk {i}: its GPS times are damaged: bytes of 255 in a row")
         offset += size
 
 

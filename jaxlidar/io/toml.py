@@ -19,6 +19,7 @@ from jaxlidar._checks import is_traced, kind_of
 from jaxlidar.io.kinds import (
     Argument,
     admits_mapping,
+    admits_numbers_alone,
     admits_text,
     admits_tuple,
     arguments_of,
@@ -72,7 +73,9 @@ def table_of(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
         return [table_of(item, f"{path}.{i}", arrays) for i, item in enumerate(value)]
     name = type(value).__name__
     if kinds().get(name) is not type(value):
-        description = "a function" if inspect.isroutine(value) else f"{kind_of(value)}, a class of your own"
+        # Meshes are jaxlidar's, but their arrays are too many for a text.
+        author = "" if type(value).__module__.startswith("jaxlidar.") else ", a class of your own"
+        description = "a function" if inspect.isroutine(value) else f"{kind_of(value)}{author}"
         raise TypeError(
             f"{path} is {description}: a file cannot hold the code that makes it. Admissible is what "
             "jaxlidar exports; keep this scene as Python code, or pickle it"
@@ -116,6 +119,9 @@ def value_of(table: Any, argument: Argument, path: str, read_array: ArrayReader,
     valid ones, for missing arguments, and for what the kind itself refuses.
     """
     annotation = argument.annotation
+    if isinstance(table, str) and table != _NONE and admits_numbers_alone(annotation):
+        # Names of all kinds would not help here.
+        raise ValueError(f"{path} = {table!r} is a text; admissible is a number, without quotes")
     if isinstance(table, str) and not admits_text(annotation):
         return _kind_without_arguments(table, path, read_array, folder)
     if isinstance(table, list | tuple):

@@ -92,8 +92,10 @@ class TraceConfig:
 
     - `materials`, `channels`: names of materials ("leaf", "ground"), and of scatterer channels: one for what
       each material reflects ("leaf.R") and one for what it transmits ("leaf.T").
-    - `leaf`, `bark`, `surfaces`: the scatterers; of the surfaces the ground comes first, then plates.
+    - `leaf`, `bark`, `surfaces`: the scatterers; of the surfaces the ground comes first, then plates, then
+      materials of meshes.
     - `covers_fully`, `mirrors`: for each surface, True if no ray slips through, and True if it is a mirror.
+    - `n_mesh_materials`: number of the surfaces, the last ones, that are materials of meshes.
     - `has_ground`, `hotspot`: True if there is a ground, and if the canopy has the hot spot.
     - `vertical`: True if the beam is at nadir.
     - `returns_specular`: True if mirrors return light to the sensor.
@@ -139,6 +141,7 @@ class TraceConfig:
     n_photons: int
     uses_quadrature: bool
     random_footprint: bool
+    n_mesh_materials: int = 0
 
     @property
     def follows_higher_orders(self) -> bool:

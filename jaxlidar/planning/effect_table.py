@@ -24,6 +24,9 @@ from jaxlidar.planning.orders import OrderChoice
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.surfaces import Ground
 
+# Reasons why effects are off that the user has not switched off.
+_REASONS_TO_LEAVE_OUT = {"relief": "the terrain is a plane", "meshes": "met by no ray of order one"}
+
 
 def effect_table(
     lidar: Lidar,
@@ -80,7 +83,7 @@ def effect_table(
         reason, also_off = reasons[name], off
         if name in off:
             # The bound says what switching it on again would change.
-            absent = "the terrain is a plane" if name == "relief" else "zero everywhere"
+            absent = _REASONS_TO_LEAVE_OUT.get(name, "zero everywhere")
             reason = "switched off" if has[name] else absent
             also_off = tuple(n for n in off if n != name)
         elif not has[name] and name not in ("multiple scattering", "hot spot"):

@@ -25,6 +25,7 @@ EFFECT_NAMES = (
     "leaf",
     "bark",
     "plates",
+    "meshes",
     "ground",
     "relief",
     "slope spread",
@@ -131,6 +132,7 @@ def present_effects(lidar: Lidar, scene: Scene) -> dict[str, bool]:
         "leaf": canopy is not None and canopy.voxels.leaf is not None,
         "bark": canopy is not None and canopy.voxels.bark is not None,
         "plates": bool(scene.plates),
+        "meshes": bool(scene.meshes),
         "ground": scene.ground is not None,
         "relief": isinstance(ground, Terrain) and ground.relief,
         "slope spread": isinstance(ground, Ground) and concrete_number(ground.slope) > 0,
@@ -221,6 +223,7 @@ def without_effects(lidar: Lidar, scene: Scene, off: tuple[str, ...]) -> tuple[L
         scene,
         canopy=canopy,
         plates=() if "plates" in off else scene.plates,
+        meshes=() if "meshes" in off else scene.meshes,
         ground=None if "ground" in off else ground,
         atmosphere=None if "atmospheric extinction" in off else air,
     )

@@ -26,20 +26,28 @@ def move_aim_to_origin(lidar: Lidar, scene: Scene) -> tuple[Lidar, Scene]:
     if aim is None:
         return lidar, scene
     # `moved` returns None for surfaces that cannot be moved.
-    moved = [surface.moved(-aim) for surface in scene.surfaces]
+    surfaces = (*(() if scene.ground is None else (scene.ground,)), *scene.plates, *scene.meshes)
+    moved = [surface.moved(-aim) for surface in surfaces]
     stays = not aim.any() or any(surface is None for surface in moved)
     new_aim = aim if stays else np.zeros(2)
     lidar = eqx.tree_at(lambda a: a.position, lidar, jnp.asarray(new_aim, float))
-    surfaces = tuple(scene.surfaces if stays else moved)
-    # `surfaces` has the ground first, if there is one, then the plates.
-    n_grounds = len(surfaces) - len(scene.plates)
+    surfaces = surfaces if stays else tuple(moved)
+    # `surfaces` has the ground first, if there is one, then the plates and the meshes.
+    n_grounds = len(surfaces) - len(scene.plates) - len(scene.meshes)
+    n_planes = n_grounds + len(scene.plates)
     canopy = scene.canopy
     if canopy is not None:
         shift = np.append(aim - new_aim, 0.0)
         origin = _subtract_in_double(canopy.voxels.origin, shift)
         canopy = eqx.tree_at(lambda c: c.voxels.origin, canopy, origin)
     ground = surfaces[0] if n_grounds else None
-    return lidar, dataclasses.replace(scene, canopy=canopy, plates=surfaces[n_grounds:], ground=ground)
+    return lidar, dataclasses.replace(
+        scene,
+        canopy=canopy,
+        plates=surfaces[n_grounds:n_planes],
+        ground=ground,
+        meshes=surfaces[n_planes:],
+    )
 
 
 def _subtract_in_double(a: Array | np.ndarray, b: np.ndarray) -> Array:

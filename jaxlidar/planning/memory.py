@@ -8,11 +8,14 @@ at most `degree` scatterings. Batches run on all cores at once, each with its ow
 
 import math
 import os
+from collections.abc import Sequence
 
 import jax.numpy as jnp
 
 from jaxlidar._memory import format_bytes, machine_memory
 from jaxlidar.planning.config import TimeBins, TraceConfig
+from jaxlidar.scenes.mesh_surface import MeshSurface
+from jaxlidar.scenes.triangle_tree import ROW
 
 # Copies of a batch's response that are alive at once: sums of photons, of groups, and the result.
 _RESPONSE_COPIES = 3
@@ -21,15 +24,23 @@ _RESPONSE_COPIES = 3
 _RESPONSE_TANGENTS = 2
 # Tangents of a photon, and of a ray segment, that are alive at once.
 _STATE_TANGENTS = 4
+# Numbers of a photon, and of a ray segment, that are alive at once.
+_STATE_NUMBERS = 16
 # Footprint rays that are marched at once.
 _RAYS_AT_ONCE = 512
 # Tables with a number for each column and voxel: slopes of leaf, of bark, and of the optical depth above, and
 # the columns' numbers (`jaxlidar.trace.extinction_slopes.ExtinctionSlopes`).
 _SLOPE_TABLES = 4
+# Tables of the trees of meshes that are alive at once.
+_TREE_COPIES = 2
 # Bytes that compiling takes.
 _COMPILATION = 150e6
-# Optics may be applied while light is traced where a response with histories takes more bytes than this ...
-LARGE_RESPONSE = 1e9
+# Optics may be applied while light is traced where one response with histories takes more bytes than
+# this. A program holds some three of them in one buffer. Beyond 32 MB the C library returns a buffer to
+# the system after each call, and the system clears every page of the next one, which took half of all
+# time. (Smaller ones lose a quarter at most so, and with histories a change of the number of wavelengths
+# compiles nothing) ...
+LARGE_RESPONSE = 24e6
 # ... for at most so many wavelengths, whose deposits are then made one by one.
 MAX_APPLIED_WAVELENGTHS = 8
 # The pulse is a dense matrix of fine bins and samples up to so many elements; beyond, it is a band.
@@ -65,15 +76,28 @@ def simulation_bytes(
     return response * (_RESPONSE_COPIES * (os.cpu_count() or 1) + 1) + 2 * pulse + _COMPILATION
 
 
-def keeps_histories(with_histories: float, applied: float, limit: float) -> bool:
+def mesh_bytes(meshes: Sequence[MeshSurface]) -> float:
+    """Return the bytes of the trees of meshes: two rows for each triangle, and its corners and indices.
+
+    While the tree is built, its levels and the table are alive at once.
+    """
+    n_leaves, n_vertices = (
+        sum(map(len, a)) for a in ([m.faces for m in meshes], [m.vertices for m in meshes])
+    )
+    n_instances = sum(len(mesh.instances) for mesh in meshes)
+    numbers = 2 * _TREE_COPIES * ROW * (n_leaves + n_instances) + 9 * n_leaves + 3 * n_vertices
+    return float(_number_bytes() * numbers + 4 * (6 * n_leaves + 3 * n_instances))
+
+
+def keeps_histories(response: float, with_histories: float, applied: float, limit: float) -> bool:
     """Return True if the response shall keep scattering histories, so that one trace serves all optics.
 
-    Otherwise optics are applied while light is traced. That is done where histories take more memory than
-    there is (or than `LARGE_RESPONSE`) and more than applied optics, `with_histories` in place of `applied`
-    bytes. Wavelengths, whose deposits are then made one by one, must be few: at most
-    `MAX_APPLIED_WAVELENGTHS`.
+    Otherwise optics are applied while light is traced. That is done where one `response` with histories is
+    larger than `LARGE_RESPONSE`, or all of them take more memory than there is, and where applied optics take
+    less: `with_histories` and `applied` are the bytes of a simulation. Wavelengths, whose deposits are then
+    made one by one, must be few: at most `MAX_APPLIED_WAVELENGTHS`.
     """
-    affordable = with_histories <= min(limit, LARGE_RESPONSE)
+    affordable = response <= LARGE_RESPONSE and with_histories <= limit
     return affordable or applied >= with_histories
 
 
@@ -90,6 +114,15 @@ def jacobian_bytes(
         _RESPONSE_TANGENTS * response + _STATE_TANGENTS * _photons_and_segments(config) * _number_bytes()
     )
     return (batches + 1) * response + cores * (response + columns * tangents)
+
+
+def transformed_bytes(
+    config: TraceConfig, bins: TimeBins, *, degree: int, n_traces: int, batches: int
+) -> float:
+    """Return the bytes of one simulation within a JAX transformation, which keeps all of its batches."""
+    response = response_bytes(config, bins, degree=degree, n_traces=n_traces)
+    states = _STATE_NUMBERS * _photons_and_segments(config) * _number_bytes()
+    return (batches + _RESPONSE_COPIES) * response + states
 
 
 def scored_bytes(config: TraceConfig, bins: TimeBins, *, cells: int, columns: int, wavelengths: int) -> float:

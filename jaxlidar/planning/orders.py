@@ -101,7 +101,7 @@ def scattered_again(scene: Scene, optics: list[MaterialOptics]) -> float:
 
     1. The least recollision probability times the largest albedo.
     2. A canopy: the decay of the slowest diffusion mode; ground that reflects makes its slab deeper.
-    3. Between two surfaces: the root of the product of their reflectances.
+    3. Between two surfaces, or of a mesh with itself: the root of the product of their reflectances.
 
     q is the largest of these, and at most 1.
     """
@@ -120,6 +120,8 @@ def slowest_decay(scene: Scene, optics: list[MaterialOptics]) -> float:
         if depth > 1.0:
             fraction = max(fraction, albedo * (1.0 - math.pi**2 / 3 / (depth + 1.42) ** 2))
     surfaces = [o.name for o in optics if o.name not in ("leaf", "bark")]
+    # A mesh may face itself, as the walls of a street do.
+    surfaces += [name for name in surfaces if name.partition(":")[0].startswith("mesh")]
     reflectances = sorted((_largest_reflectance(optics, name) for name in surfaces), reverse=True)
     if len(reflectances) > 1:
         fraction = max(fraction, math.sqrt(reflectances[0] * reflectances[1]))

@@ -7,16 +7,18 @@ footprint radii out. All but a negligible fraction of the light lies between the
 import math
 from typing import NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxlidar._checks import concrete_array, concrete_number
+from jaxlidar._checks import concrete_array, concrete_number, is_traced
 from jaxlidar._vectors import FAR
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.instrument.survey import Survey
 from jaxlidar.planning.config import KERNEL_BINS
 from jaxlidar.planning.size_buckets import size_bucket
 from jaxlidar.scenes.height_field import HeightField
+from jaxlidar.scenes.mesh_surface import MeshMaterial, MeshSurface
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.surfaces import AbstractSheet
 from jaxlidar.scenes.terrain import Terrain
@@ -33,6 +35,8 @@ _ROUNDING = 2e-6
 _RIM_POINTS, _COARSE_RIM_POINTS, _MANY_FOOTPRINTS = 32, 8, 1000
 # Footprint radii out to the rim. Outside of 2.5 is 4e-6 of a Gaussian beam, outside of 2 is 3e-4.
 _PATH_RADII, _TERRAIN_RADII = 2.5, 2.0
+# Outside of these of a Gaussian beam is 1e-14 of the light: less than single precision resolves.
+_REACH_RADII = 4.0
 
 
 class FootprintRims(NamedTuple):
@@ -98,19 +102,23 @@ class PathLengths:
         )
         # Distances from the reference plane at which rays meet surfaces, and the map's bottom and top.
         crossings = []
-        for s in scene.surfaces:
+        for s in (surface for surface in scene.surfaces if not isinstance(surface, MeshMaterial)):
             crossed, towards = s.shape.crossing(points + aim, self.rays)
             # Sheets are met from both sides, the ground only from above.
             met = np.abs(towards) > 1e-6 if isinstance(s, AbstractSheet) else towards < -1e-6
             if met.any():
                 crossings.append(crossed[met])
+        radius = _PATH_RADII * float(shots.footprint_radius.max())
+        for mesh in scene.meshes:
+            crossings.append(_mesh_crossings(mesh, points + aim, self.rays, radius, float(slant_range.min())))
         if scene.canopy is not None:
             v = scene.canopy.voxels
             self.size, self.shape = concrete_array(v.voxel_size), np.array(v.shape)
             low = concrete_array(v.origin)[2]
             for z in (low, low + self.size[2] * self.shape[2]):
                 crossings.append((z - points[:, 2]) / self.rays[:, 2])
-        distances = np.concatenate(crossings) if crossings else np.zeros(1)
+        distances = np.concatenate(crossings) if crossings else np.zeros(0)
+        distances = distances if distances.size else np.zeros(1)
         nearest, farthest = float(distances.min()), float(distances.max())
         self.first_path = 2.0 * nearest
         # Rays at the rim are longer than the axis, from which paths are counted.
@@ -191,6 +199,42 @@ class PathLengths:
         """Return a bound on the voxels of a periodic canopy that a flight of that length, m, crosses."""
         # A flight crosses each layer once. Three more, one for each axis, as it starts within a voxel.
         return int(self.shape[2] + sum(math.ceil(flight / s) for s in self.size[:2])) + 3
+
+
+def _mesh_crossings(
+    mesh: MeshSurface,
+    points: Float[np.ndarray, "lines 3"],
+    rays: Float[np.ndarray, "lines 3"],
+    radius: float,
+    slant_range: float,
+) -> Float[np.ndarray, " crossings"]:
+    """Return the distances along lines at which these enter and leave the box around a mesh.
+
+    A mesh may lie between the lines of a footprint. A ray of it is displaced from the axis by at most its
+    radius, across the axis: the box is enlarged by that much for each line. Empty where no ray meets it.
+    """
+    boxes = mesh.bounds()
+    low, high = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
+    # Beyond the reference plane, beams are wider.
+    widened = radius * (1.0 + float(np.abs([low[2], high[2]]).max()) / slant_range)
+    margin = widened * np.sqrt(np.maximum(1.0 - rays * rays, 0.0))
+    rates = np.where(np.abs(rays) < 1e-12, 1e-12, rays)
+    faces = np.stack([(low - margin - points) / rates, (high + margin - points) / rates])
+    enter, leave = faces.min(axis=0).max(axis=1), faces.max(axis=0).min(axis=1)
+    is_met = enter <= leave
+    return np.concatenate([enter[is_met], leave[is_met]])
+
+
+def meshes_are_in_reach(shots: Lidar | Survey, scene: Scene) -> bool:
+    """Return True if unscattered light may meet a mesh; also where JAX is tracing a mesh."""
+    if any(is_traced(x) for mesh in scene.meshes for x in jax.tree.leaves(mesh)):
+        return True
+    survey = shots if isinstance(shots, Survey) else Survey.of(shots)
+    n_radii = _REACH_RADII if survey.lidar.profile == "gaussian" else 1.0
+    rims = footprint_rims(survey, n_radii)
+    points, rays = (a.reshape(-1, 3) for a in (rims.points + rims.aim, rims.rays))
+    radius, slant_range = n_radii * float(survey.footprint_radius.max()), float(rims.slant_range.min())
+    return any(_mesh_crossings(mesh, points, rays, radius, slant_range).size for mesh in scene.meshes)
 
 
 def longest_segment(chord: float, bin_length: float, max_step: float | None) -> tuple[float, int]:

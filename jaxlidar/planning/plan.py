@@ -46,6 +46,8 @@ from jaxlidar.planning.memory import (
     jacobian_bytes,
     keeps_histories,
     memory_limit,
+    mesh_bytes,
+    response_bytes,
     simulation_bytes,
 )
 from jaxlidar.planning.orders import (
@@ -56,7 +58,12 @@ from jaxlidar.planning.orders import (
     order_steps,
 )
 from jaxlidar.planning.parallel_light import beams_are_parallel, parallel_light_bound
-from jaxlidar.planning.path_lengths import PathLengths, check_footprints_on_terrain, longest_segment
+from jaxlidar.planning.path_lengths import (
+    PathLengths,
+    check_footprints_on_terrain,
+    longest_segment,
+    meshes_are_in_reach,
+)
 from jaxlidar.planning.record_times import bins_and_samples, extend_to_air_return, target_bin_width
 from jaxlidar.planning.size_buckets import size_bucket
 from jaxlidar.scenes.scene import Scene, check_kinds
@@ -80,6 +87,7 @@ class PlanScope(NamedTuple):
     - `affordable_orders`: largest number of orders that memory has room for.
     - `flat_terrain`: True if the terrain was found to be a plane, and is simulated as one.
     - `empty_materials`: which of "leaf" and "bark" were found to be zero everywhere, and left out.
+    - `unreached_meshes`: True if no ray was found to meet a mesh, and all meshes are left out.
     - `max_memory`: the user's limit in GB, or None.
     """
 
@@ -92,6 +100,7 @@ class PlanScope(NamedTuple):
     affordable_orders: int
     flat_terrain: bool
     empty_materials: tuple[str, ...]
+    unreached_meshes: bool
     max_memory: float | None
 
 
@@ -167,8 +176,8 @@ class Plan:
     @property
     def degree(self) -> int:
         """Longest history of the orders that are followed; `config.degree` has room for longer ones."""
-        # Surfaces are the ground, if there is one, and plates.
-        n_plates = len(self.config.surfaces) - self.config.has_ground
+        # Surfaces are the ground, if there is one, plates, and materials of meshes.
+        n_plates = len(self.config.surfaces) - self.config.has_ground - self.config.n_mesh_materials
         return max_degree(self.orders, n_plates) if self.config.keeps_histories else 0
 
     @property
@@ -261,14 +270,15 @@ def plan(
     - `footprint`: "random" (each batch shifts the rays, so that the standard error covers them) or "fixed".
       Default "random".
     - `effects`: effects to switch off, by name, as in {"multiple scattering": False}; True asks for what is
-      on anyway and refuses scenes that do not have it. Only leaf or bark that is zero everywhere, and relief
-      of terrain that is a plane, are off unless True asks for them. The names are those of the table's first
-      column. Default None.
+      on anyway and refuses scenes that do not have it. Only leaf or bark that is zero everywhere, relief of
+      terrain that is a plane, and meshes that no ray of a single order meets are off unless True asks for
+      them. The names are those of the table's first column. Default None.
     - `max_memory`: GB that the simulation may take, positive. Default None: a quarter of the machine's.
     - `histories`: True to keep scattering histories, so that one trace serves all optics and wavelengths;
       False to apply optics while light is traced, for at most 8 wavelengths, which has no limit on orders
-      but 1000, and takes less memory. Default None: histories, but where these would take more than 1 GB, or
-      leave out orders that are likely to matter (dense and bright canopies).
+      but 1000, and takes less memory. Default None: histories, but where one response of them would take
+      more than 24 MB (some 18 orders of leaves over ground), or leave out orders that are likely to matter
+      (dense and bright canopies).
     - `describe`: True to make the table of effects with its bounds, which takes some 40 ms. Default True.
 
     **Returns:** a `Plan`; `print` shows it as a table.
@@ -307,15 +317,23 @@ def plan(
     # From here on x = y = 0 is the aim point, or the middle of the survey (see `local_origin`).
     survey = None if survey is None else survey.about(concrete_array(lidar.position))
     lidar, scene = move_aim_to_origin(lidar, scene)
-    # 1. Effects: leaf or bark that is zero everywhere and relief of flat terrain are off, then what the user
-    # switches off. The table compares with everything else in place.
+    # 1. Effects: leaf or bark that is zero everywhere, relief of flat terrain, and meshes out of reach are
+    # off, then what the user switches off. The table compares with everything else in place.
     empty_materials = find_empty_materials(scene, effects)
     scene = without_effects(lidar, scene, empty_materials)[1]
     with_relief, scene = scene, replace_plane_terrain(scene, effects)
     flat_terrain = scene is not with_relief
+    switches = effects or {}
+    # Scattered light may go anywhere; of one order there are only the rays of the footprint.
+    one_order = max_orders == 1 or switches.get("multiple scattering") is False
+    unreached_meshes = bool(scene.meshes) and one_order and switches.get("meshes") is not True
+    unreached_meshes = unreached_meshes and not meshes_are_in_reach(survey or lidar, scene)
+    if unreached_meshes:
+        scene = without_effects(lidar, scene, ("meshes",))[1]
     complete_scene = scene
     off = switched_off_effects(effects, present_effects(lidar, scene), max_orders)
     off = (*off, *(("relief",) if flat_terrain else ()), *empty_materials)
+    off = (*off, *(("meshes",) if unreached_meshes else ()))
     complete_lidar = lidar
     lidar, scene = without_effects(lidar, scene, off)
     # 2. Orders of scattering, from the optics.
@@ -367,6 +385,7 @@ def plan(
             not isinstance(s, AbstractSheet) or concrete_number(s.coverage) == 1.0 for s in scene.surfaces
         ),
         mirrors=tuple(isinstance(s.law, AbstractMirror) for s in scene.surfaces),
+        n_mesh_materials=sum(len(mesh.surfaces) for mesh in scene.meshes),
         has_ground=scene.ground is not None,
         hotspot=scene.canopy is not None and scene.canopy.hotspot,
         vertical=path_lengths.vertical,
@@ -404,22 +423,25 @@ def plan(
     def n_traces(keeps: bool) -> int:
         return wavelengths if straight or not keeps else 1
 
+    def degree_of(orders: int, keeps: bool) -> int:
+        return max_degree(order_steps(orders, n_plates, n_channels), n_plates) if keeps else 0
+
     def memory_of(orders: int, keeps: bool) -> float:
-        degree = max_degree(order_steps(orders, n_plates, n_channels), n_plates) if keeps else 0
         return simulation_bytes(
             config,
             bins,
-            degree=degree,
+            degree=degree_of(orders, keeps),
             n_samples=samples.count,
             pulse_bins=pulse_bins,
             n_traces=n_traces(keeps),
-        )
+        ) + mesh_bytes(scene.meshes)
 
     limit = memory_limit(max_memory)
     if order_choice.needs_applied_optics:
         histories = False
     if histories is None:
-        histories = keeps_histories(memory_of(orders, True), memory_of(orders, False), limit)
+        response = response_bytes(config, bins, degree=degree_of(orders, True), n_traces=n_traces(True))
+        histories = keeps_histories(response, memory_of(orders, True), memory_of(orders, False), limit)
     keeps = histories
     if not keeps:
         config = dataclasses.replace(config, keeps_histories=False, degree=0)
@@ -466,6 +488,7 @@ def plan(
             affordable_orders=next(n for n in possible_orders if memory_of(n, keeps) <= limit),
             flat_terrain=flat_terrain,
             empty_materials=empty_materials,
+            unreached_meshes=unreached_meshes,
             max_memory=max_memory,
         ),
         memory=memory,

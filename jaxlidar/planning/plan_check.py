@@ -11,7 +11,7 @@ from jaxlidar.planning.channels import largest_albedo, number_channels, scene_op
 from jaxlidar.planning.effects import consists_of_planes, find_empty_materials, without_effects
 from jaxlidar.planning.local_origin import move_aim_to_origin
 from jaxlidar.planning.orders import choose_orders
-from jaxlidar.planning.path_lengths import PathLengths, check_footprints_on_terrain
+from jaxlidar.planning.path_lengths import PathLengths, check_footprints_on_terrain, meshes_are_in_reach
 from jaxlidar.planning.plan import Plan
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.surfaces import AbstractSheet
@@ -47,6 +47,10 @@ def _check(plan: Plan, lidar: Lidar, scene: Scene, checks: Sequence[Callable]) -
             raise ValueError(
                 f"the plan does not fit: it is for a map without {name}; make one for this scene"
             )
+    if plan.scope.unreached_meshes and meshes_are_in_reach(lidar, scene):
+        raise ValueError(
+            "the plan does not fit: it is for meshes that no ray meets; make one for this lidar and scene"
+        )
     # The plan is for the scene without the effects that it leaves out: compare like with like.
     lidar, scene = without_effects(*move_aim_to_origin(lidar, scene), plan.off)
     for check in checks:
@@ -146,7 +150,7 @@ def _misfit_times(plan: Plan, lidar: Lidar, scene: Scene) -> Iterator[str]:
 def _misfit_pulse(plan: Plan, lidar: Lidar, scene: Scene) -> Iterator[str]:
     """Yield misfits in the pulse, and in its sampling."""
     interval = concrete_number(lidar.sampling_interval)
-    if lidar.receiver.window == "fixed" and abs(plan.sample_interval - interval) > _ROUNDING * interval:
+    if not lidar.opens_at_first_return and abs(plan.sample_interval - interval) > _ROUNDING * interval:
         yield f"it has samples of {plan.sample_interval:g} ns; sampling_interval = {interval:g} ns"
     jitter = concrete_number(lidar.jitter)
     feature = math.hypot(concrete_number(lidar.pulse.finest), jitter)

@@ -57,7 +57,7 @@ def bins_and_samples(
     # The slack keeps a whole number from being rounded up.
     bins_per_sample = max(math.ceil(interval / target - 1e-6), 1)
     width = interval / bins_per_sample
-    if lidar.receiver.window == "first return":
+    if lidar.opens_at_first_return:
         # Sampled finely here; the digitiser's bins are laid when the time of the first return is known.
         interval, bins_per_sample = width, 1
     first, last = path_lengths.first_path / SPEED_OF_LIGHT, path_lengths.last_path / SPEED_OF_LIGHT

@@ -1,5 +1,6 @@
 """`Setup`: a lidar and a scene without the effects that a plan leaves out."""
 
+import dataclasses
 from typing import final
 
 import equinox as eqx
@@ -61,7 +62,8 @@ def make_setup(lidar: Lidar, scene: Scene, plan: Plan) -> Setup:
     **Returns:** a `Setup`.
 
     **Raises:** TypeError for arguments of another kind; ValueError where heights of terrain are being traced
-    with a plan for a plane, or leaf or bark with a plan for a map that has none.
+    with a plan for a plane, leaf or bark with a plan for a map that has none, or meshes with a plan that
+    leaves them out.
 
     **Example:**
 
@@ -75,6 +77,9 @@ def make_setup(lidar: Lidar, scene: Scene, plan: Plan) -> Setup:
     check_kind("plan", plan, Plan, "a Plan that jaxlidar.plan made")
     # What the plan found to be flat or empty is not simulated: traced, it would lose its derivatives.
     ground = scene.ground
+    if lidar.scan is not None:
+        # Shots do not depend on the scan pattern: lidars with and without one share compiled programs.
+        lidar = dataclasses.replace(lidar, scan=None)
     if plan.scope.flat_terrain and isinstance(ground, Terrain) and is_traced(ground.heights):
         raise ValueError(
             "the plan takes the terrain for a plane, but its heights are being traced by a JAX "
@@ -86,6 +91,11 @@ def make_setup(lidar: Lidar, scene: Scene, plan: Plan) -> Setup:
                 f"the plan is for a map whose {name} is zero everywhere, but {name} is being traced by a JAX "
                 f'transformation; make the plan with effects={{"{name}": True}}'
             )
+    if plan.scope.unreached_meshes and any(is_traced(x) for x in jax.tree.leaves(scene.meshes)):
+        raise ValueError(
+            "the plan leaves out meshes that no ray meets, but they are being traced by a JAX "
+            'transformation; make the plan with effects={"meshes": True}'
+        )
     # A traced value cannot raise an error. NaN in all waveforms cannot be overlooked, and costs one product.
     admissible = jnp.ones(())
     if any(is_traced(x) for x in jax.tree.leaves((lidar, scene))):

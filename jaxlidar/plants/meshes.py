@@ -1,4 +1,6 @@
-"""Voxel maps of triangle meshes: every triangle is cut at the faces of the voxels, and its pieces counted.
+"""Triangle meshes of trees, and voxel maps of meshes.
+
+To voxelise, every triangle is cut at the faces of the voxels, and its pieces are counted.
 
 In a voxel of volume V with the one-sided leaf area L and the bark area B, the leaf area density is L/V and
 the extinction coefficient of bark is B/(4 V) (Cauchy: a convex body's mean projected area is a quarter of its
@@ -18,13 +20,29 @@ from typing import final
 import numpy as np
 from jaxtyping import ArrayLike, Bool, Float, Int
 
-from jaxlidar._checks import briefly, check_kind, check_range, check_shape, check_unmasked
+from jaxlidar._checks import (
+    briefly,
+    check_integer,
+    check_kind,
+    check_number,
+    check_range,
+    check_seed,
+    check_shape,
+    check_unmasked,
+    warn_user,
+)
+from jaxlidar._summary import percent
 from jaxlidar.optics.leaf_angles import ANGLE_CELLS, LeafAngles
 from jaxlidar.plants.grid import Grid, voxel_edges
+from jaxlidar.plants.tree import Tree
 from jaxlidar.scenes.voxels import VoxelMap
 
 # Largest number of pieces in memory at a time, by an upper bound on their number.
 _MAX_PIECES = 1_000_000
+# Share of edges that two triangles have in common from which a surface counts as closed.
+_CLOSED_SHARE = 0.95
+# Irrational numbers, of which sums are the same for the same place alone.
+_PLACE_NUMBERS = np.sqrt([2.0, 3.0, 5.0])
 # A corner closer to a plane of the grid than this, in voxels, is moved into the plane.
 _SNAP_DISTANCE = 1e-9
 
@@ -117,6 +135,132 @@ class Mesh:
         return np.isin(self.material, [self.materials.index(name) for name in names])
 
 
+class SolidMeshWarning(UserWarning):
+    """Warning that a closed surface was voxelised, through which voxels let light pass.
+
+    Voxels scatter light within a volume and cannot stop a beam. `Scene(meshes=)` traces triangles exactly.
+
+    **Example:** a fifth of the light that falls on a box passes its voxels.
+
+    >>> import warnings
+    >>> import jaxlidar as jl
+    >>> corners = [[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]
+    >>> quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    >>> faces = [[q[0], q[1 + k], q[2 + k]] for q in quads for k in (0, 1)]
+    >>> with warnings.catch_warnings(record=True) as caught:
+    ...     warnings.simplefilter("always")
+    ...     voxels = jl.voxelise_mesh(jl.Mesh(corners, faces), 0.5, bark="mesh", leaf=())
+    >>> print(caught[0].category.__name__)
+    SolidMeshWarning
+    """
+
+
+def mesh_of(
+    tree: Tree,
+    *,
+    sides: int = 8,
+    leaves: int = 20,
+    leaf_length: float = 0.1,
+    seed: int | np.random.Generator = 0,
+) -> Mesh:
+    """Make the triangles of a tree: its branches as tapered tubes, and leaves within its leaf clumps.
+
+    Segments are open prisms of cone frustums; the joints between them are not closed. A leaf is a rhombus of
+    two triangles, half as wide as long, at a random place within its clump, of random orientation (a
+    spherical leaf angle distribution).
+
+    **Arguments:**
+
+    - `tree`: a `Tree`, such as `grow`, `turtle` or `jaxlidar.io.read_qsm` give.
+    - `sides`: sides of a branch, at least 3. Default 8. Its triangles have the cross-section of a circle of
+      the branch's radius.
+    - `leaves`: leaves of each clump, 0 or more. Default 20.
+    - `leaf_length`: length of a leaf, m, positive. Default 0.1.
+    - `seed`: a whole number, or a NumPy generator, for places and orientations of leaves. Default 0.
+
+    **Returns:** a `Mesh` with the materials "wood" and "leaf", or the one of them that there is.
+
+    **Raises:** TypeError for an object that is no `Tree`; ValueError for values outside the ranges above, and
+    for a tree without segments or leaves.
+
+    **Example:** a tree as triangles that stop light.
+
+    >>> import jaxlidar as jl
+    >>> mesh = jl.mesh_of(jl.grow(jl.shrub()), leaves=5)
+    >>> surface = jl.MeshSurface(mesh, {"wood": 0.3, "leaf": 0.45}, {"leaf": 0.4})
+    >>> print(mesh.materials, surface.n_triangles > 100)
+    ('wood', 'leaf') True
+    """
+    check_kind("tree", tree, Tree, "a Tree, such as grow gives")
+    sides, leaves = check_integer("sides", sides, 3), check_integer("leaves", leaves, 0)
+    check_number("leaf_length", leaf_length, 0.0, low_open=True)
+    check_seed(seed)
+    corners = {"wood": _tubes(tree, sides), "leaf": _leaves(tree, leaves, leaf_length, seed)}
+    corners = {name: triangles for name, triangles in corners.items() if len(triangles)}
+    if not corners:
+        raise ValueError("tree has no segments and no leaves: nothing has triangles")
+    material = np.repeat(np.arange(len(corners)), [len(triangles) for triangles in corners.values()])
+    triangles = np.concatenate(list(corners.values()))
+    faces = np.arange(3 * len(triangles)).reshape(-1, 3)
+    return Mesh(triangles.reshape(-1, 3), faces, material, tuple(corners))
+
+
+def _frames(axis: Float[np.ndarray, "n 3"]) -> tuple[np.ndarray, np.ndarray]:
+    """Return two unit vectors across each axis, a unit vector, and across each other."""
+    reference = np.where(np.abs(axis[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
+    first = np.cross(reference, axis)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return first, np.cross(axis, first)
+
+
+def _tubes(tree: Tree, sides: int) -> Float[np.ndarray, "triangles 3 3"]:
+    """Return the triangles of all segments that have a length, anticlockwise as seen from outside."""
+    has_length = tree.length > 0
+    start, end = tree.start[has_length], tree.end[has_length]
+    if not len(start):
+        return np.zeros((0, 3, 3))
+    first, second = _frames((end - start) / tree.length[has_length][:, None])
+    turns = 2.0 * np.pi * np.arange(sides) / sides
+    circle = np.cos(turns)[:, None] * first[:, None] + np.sin(turns)[:, None] * second[:, None]
+    # A polygon with the area of the circle: its corners lie outside.
+    widening = np.sqrt(2.0 * np.pi / sides / np.sin(2.0 * np.pi / sides))
+    radii = [widening * r[has_length][:, None, None] for r in (tree.radius_start, tree.radius_end)]
+    lower, upper = (centre[:, None] + r * circle for centre, r in zip((start, end), radii))
+    next_lower, next_upper = (np.roll(ring, -1, axis=1) for ring in (lower, upper))
+    triangles = [(lower, next_lower, next_upper), (lower, next_upper, upper)]
+    return np.concatenate([np.stack(t, axis=2).reshape(-1, 3, 3) for t in triangles])
+
+
+def _leaves(
+    tree: Tree, count: int, length: float, seed: int | np.random.Generator
+) -> Float[np.ndarray, "triangles 3 3"]:
+    """Return the triangles of `count` leaves in each clump."""
+    random = np.random.default_rng(seed)
+    n_leaves = count * len(tree.bud_position)
+    # Uniform within a sphere: directions from a normal distribution, radii as cube roots.
+    places, normals = random.normal(size=(2, n_leaves, 3))
+    places, normals = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (places, normals))
+    radius = np.cbrt(random.uniform(size=n_leaves)) * np.repeat(tree.bud_radius, count)
+    centre = np.repeat(tree.bud_position, count, axis=0) + radius[:, None] * places
+    along, across = _frames(normals)
+    tip, side = 0.5 * length * along, 0.25 * length * across
+    halves = [(centre - tip, centre + side, centre + tip), (centre - tip, centre + tip, centre - side)]
+    return np.concatenate([np.stack(t, axis=1) for t in halves])
+
+
+def _closed_share(mesh: Mesh, selected: Bool[np.ndarray, " n"]) -> float:
+    """Return the share of edges of the selected triangles that two of them have in common.
+
+    Corners at the same place are the same: files often repeat the corners of every triangle.
+    """
+    # One number stands for the place of a corner: rows of three take far longer to sort.
+    _, vertex = np.unique(mesh.vertices @ _PLACE_NUMBERS, return_inverse=True)
+    faces = vertex[mesh.faces[selected]]
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    _, count = np.unique(edges, axis=0, return_counts=True)
+    return float(np.mean(count == 2)) if len(count) else 0.0
+
+
 def voxelise_mesh(
     mesh: Mesh,
     voxel_size: float | tuple[float, float, float],
@@ -152,6 +296,9 @@ def voxelise_mesh(
     leaf and bark, triangles that have no area in all, and a mesh that reaches out of a given grid; TypeError
     for an object that is no `Mesh`.
 
+    **Warns:** `SolidMeshWarning` where triangles of bark, or of one material that is all leaf, form closed
+    surfaces, with the share of light that passes their voxels. `Scene(meshes=)` stops light.
+
     **Source:** Cauchy (1841).
 
     **Example:**
@@ -181,10 +328,33 @@ def voxelise_mesh(
         _area_in_voxels(mesh, selected, area, grid) / size.prod() for selected in (is_leaf, is_bark)
     )
     wood = 0.25 * bark_density if np.any(is_bark) else None
+    for selected, extinction in ((is_bark, 0.25 * bark_density), (is_leaf, 0.5 * leaf_density)):
+        _warn_of_closed_surfaces(mesh, selected, extinction, size)
     if not np.any(is_leaf):
         return VoxelMap.from_extinction(bark=wood, voxel_size=size, origin=grid.low)
     angles = _inclinations(mesh.corners[is_leaf]) if leaf_angles is None else leaf_angles
     return VoxelMap.from_lad(leaf_density, bark=wood, voxel_size=size, origin=grid.low, leaf_angles=angles)
+
+
+def _warn_of_closed_surfaces(
+    mesh: Mesh,
+    selected: Bool[np.ndarray, " n"],
+    extinction: Float[np.ndarray, "nx ny nz"],
+    size: Float[np.ndarray, "3"],
+) -> None:
+    """Warn where triangles are closed surfaces, with the share of vertical light that passes their voxels.
+
+    The share is the mean of exp(-tau) over the columns of voxels that the surfaces touch.
+    """
+    if not np.any(selected) or _closed_share(mesh, selected) < _CLOSED_SHARE:
+        return
+    depth = extinction.sum(axis=2) * size[2]
+    passes = float(np.exp(-depth[depth > 0]).mean())
+    warn_user(
+        f"the mesh is closed, and stops light; its voxels let {percent(passes)} of it pass, straight down. "
+        "Scene(meshes=(MeshSurface(mesh),)) traces its triangles",
+        SolidMeshWarning,
+    )
 
 
 def _areas(corners: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, " n"]:

@@ -51,6 +51,13 @@ class Tree:
     bud_direction: Float[np.ndarray, "m 3"]
     bud_radius: Float[np.ndarray, " m"]
 
+    def __str__(self) -> str:
+        clumps = f" and {len(self.bud_radius):,} leaf clumps" if len(self.bud_radius) else ""
+        return (
+            f"Tree of {len(self.start):,} branch segments{clumps}: {self.height:.2f} m tall, "
+            f"{self.wood_volume:.3g} m3 of wood"
+        )
+
     def __post_init__(self):
         for field in fields(self):
             check_kind(field.name, getattr(self, field.name), np.ndarray, "a NumPy array")

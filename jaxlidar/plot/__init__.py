@@ -8,6 +8,7 @@ from typing import Any
 
 from jaxlidar._deprecated import warn_renamed
 from jaxlidar._signatures import shorten_signatures
+from jaxlidar.plot.comparisons import comparison
 from jaxlidar.plot.fits import fit, residuals
 from jaxlidar.plot.light import accuracy, energy_budget
 from jaxlidar.plot.photon_events import photons
@@ -19,6 +20,7 @@ from jaxlidar.plot.waveforms import waveform
 
 __all__ = [
     "accuracy",
+    "comparison",
     "energy_budget",
     "fit",
     "leaf_on_and_off",

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
 from matplotlib.colors import LinearSegmentedColormap
 
 from jaxlidar.instrument.lidar import Lidar
@@ -25,7 +26,7 @@ def scene(
     along: str = "y",
     legend: bool = True,
 ) -> Axes:
-    """Draw a scene from the side: optical depth of leaf and bark, plates, ground and the beam.
+    """Draw a scene from the side: optical depth of leaf and bark, plates, meshes, ground and the beam.
 
     Leaf and bark are shaded by 1 - exp(-optical depth) of a horizontal view through all of the voxel map.
     Planes and terrain are cut at the middle of the map, or of the footprint if there is no map.
@@ -75,12 +76,20 @@ def scene(
         # Without a canopy and a beam, the figure has the extent of the terrain.
         ends = np.stack([np.asarray(scene.ground.origin, dtype=float), scene.ground.end])
         (low, high), middle = ends[:, across], ends[:, depth].mean()
+    if scene.meshes and high <= low:
+        boxes = np.concatenate([mesh.bounds() for mesh in scene.meshes])
+        low, high = boxes[:, 0, across].min(), boxes[:, 1, across].max()
     if high <= low:
         low, high = centre[across] - 1.0, centre[across] + 1.0
     sides = np.array([low, high])
     profile = _ground_profile(scene.ground, sides, across, middle)
     heights = [top] if scene.canopy is not None or not isinstance(scene.ground, Terrain) else []
-    for surface in scene.surfaces:
+    for mesh in scene.meshes:
+        outlines = mesh.corners()[:, :, [across, 2]]
+        heights += [outlines[..., 1].min(), outlines[..., 1].max()]
+        style = {"facecolors": MATERIAL_COLOURS["mesh"], "linewidths": 0.2, "edgecolors": "white"}
+        entries.append(ax.add_collection(PolyCollection(list(outlines), label="mesh", **style)))
+    for surface in scene.surfaces[: len(scene.surfaces) - sum(len(mesh.surfaces) for mesh in scene.meshes)]:
         z = profile[1] if surface is scene.ground else _heights_at(surface, sides, across, middle)
         heights += z.tolist()
         if isinstance(surface, AbstractSheet):

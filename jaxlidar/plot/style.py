@@ -14,7 +14,13 @@ from jaxlidar._checks import check_kind, check_number
 from jaxlidar.spectral.waveform import Waveform
 from jaxlidar.survey.waveforms import Waveforms
 
-MATERIAL_COLOURS = {"leaf": "#009E73", "bark": "#8C510A", "ground": "#E69F00", "plate": "#56B4E9"}
+MATERIAL_COLOURS = {
+    "leaf": "#009E73",
+    "bark": "#8C510A",
+    "ground": "#E69F00",
+    "plate": "#56B4E9",
+    "mesh": "#CC79A7",
+}
 OTHER_COLOUR = "#999999"
 TOTAL_COLOUR = "#1A1A1A"
 BEAM_COLOUR = "#D55E00"

@@ -52,6 +52,7 @@ from jaxlidar._checks import (
 from jaxlidar._converted import Converted
 from jaxlidar._ranges import Range, check_ranges
 from jaxlidar._signatures import briefly
+from jaxlidar._text import object_text
 
 # Admissible wavelengths, nm. Peck and Reeder's formula is fitted to 230..1690 nm and smooth far beyond; the
 # exponents of aerosol hold to about 2500 nm.
@@ -220,6 +221,9 @@ class Atmosphere(eqx.Module):
         "lidar_ratio": Range(0.0, low_open=True),
         "base_height": Range(-500.0, 9000.0),
     }
+
+    def __str__(self) -> str:
+        return object_text(self)
 
     def __check_init__(self):
         check_flag("rayleigh", self.rayleigh)

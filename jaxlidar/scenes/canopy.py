@@ -26,6 +26,7 @@ from jaxlidar._checks import (
 from jaxlidar._converted import Converted
 from jaxlidar._ranges import FRACTION
 from jaxlidar._signatures import briefly
+from jaxlidar._text import object_text
 from jaxlidar.optics.phase import AbstractPhase
 from jaxlidar.optics.spectra import Spectrum, reflectance_at
 from jaxlidar.scenes.surfaces import Reflectance, check_reflectance, reflectance_field
@@ -81,6 +82,9 @@ class Canopy(eqx.Module):
     sides: str = eqx.field(static=True, default="open")
 
     ranges: ClassVar = {"bark": FRACTION}
+
+    def __str__(self) -> str:
+        return object_text(self)
 
     def __check_init__(self):
         check_kind("voxels", self.voxels, VoxelMap, "a VoxelMap")

@@ -1,4 +1,4 @@
-"""The scene that a lidar observes: canopy, plates, ground and atmosphere, each of them optional."""
+"""The scene that a lidar observes: canopy, plates, ground, atmosphere and meshes, each of them optional."""
 
 import itertools
 from collections.abc import Iterable, Iterator
@@ -13,10 +13,12 @@ from jaxlidar._checks import check_kind, concrete, kind_of
 from jaxlidar._converted import Converted
 from jaxlidar._ranges import Range
 from jaxlidar._signatures import briefly
+from jaxlidar._text import object_text
 from jaxlidar._vectors import FAR
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.scenes.atmosphere import Atmosphere
 from jaxlidar.scenes.canopy import Canopy
+from jaxlidar.scenes.mesh_surface import MeshSurface
 from jaxlidar.scenes.relative_height import check_relative_height
 from jaxlidar.scenes.shapes import Plane
 from jaxlidar.scenes.surfaces import AbstractGround, AbstractSheet, AbstractSurface
@@ -28,14 +30,14 @@ from jaxlidar.scenes.voxels import VoxelMap
 MIN_GAP = 1e-4
 
 
-def _as_plates(x: Any) -> Any:
+def _as_tuple(x: Any) -> Any:
     return tuple(x) if isinstance(x, Iterable) else x
 
 
 @final
 @briefly
 class Scene(eqx.Module):
-    """A scene: the canopy, plates, ground and atmosphere that a lidar observes.
+    """A scene: the canopy, plates, ground, atmosphere and meshes that a lidar observes.
 
     Every element is optional. An element that is None or empty takes no computing time.
 
@@ -45,10 +47,11 @@ class Scene(eqx.Module):
     - `plates`: a sequence of `Plate`, or of other `AbstractSheet`. Default ().
     - `ground`: a `Ground`, a `Terrain`, another `AbstractGround`, or None. Default None.
     - `atmosphere`: an `Atmosphere`, or None. Default None.
+    - `meshes`: a sequence of `MeshSurface`. Default ().
 
     **Raises:** TypeError for an argument of the wrong type; ValueError for a plate in the plane of the
-    ground or of another plate, for a canopy with periodic sides over terrain of another period, and for one
-    that lies below the terrain as a whole.
+    ground or of another plate, for a canopy with periodic sides over terrain of another period, for one
+    that lies below the terrain as a whole, and for meshes beside a canopy or terrain with periodic sides.
 
     **Warns:** `MisplacedCanopyWarning` for plants below the terrain, or far above it.
 
@@ -62,11 +65,15 @@ class Scene(eqx.Module):
     """
 
     canopy: Canopy | None = None
-    plates: Converted[tuple[AbstractSheet, ...]] = eqx.field(converter=_as_plates, default=())
+    plates: Converted[tuple[AbstractSheet, ...]] = eqx.field(converter=_as_tuple, default=())
     ground: AbstractGround | None = None
     atmosphere: Atmosphere | None = None
+    meshes: Converted[tuple[MeshSurface, ...]] = eqx.field(converter=_as_tuple, default=())
 
     ranges: ClassVar = {"gap": Range(MIN_GAP)}
+
+    def __str__(self) -> str:
+        return object_text(self)
 
     def __check_init__(self):
         hint = ", as in Canopy(voxels, leaf=...)" if isinstance(self.canopy, VoxelMap) else ""
@@ -83,6 +90,11 @@ class Scene(eqx.Module):
         for plate in self.plates:
             if not isinstance(plate, AbstractSheet):
                 raise TypeError(f"plates has {kind_of(plate)}; admissible is a tuple of Plate")
+        check_kind("meshes", self.meshes, tuple, "a tuple, as in (mesh,)")
+        for mesh in self.meshes:
+            check_kind("one of meshes", mesh, MeshSurface, "a MeshSurface, as in MeshSurface(mesh)")
+        if self.meshes:
+            check_open_sides(self.canopy, self.ground)
         names = (() if self.ground is None else ("the ground",)) + tuple(
             f"plates[{i}]" for i in range(len(self.plates))
         )
@@ -101,8 +113,9 @@ class Scene(eqx.Module):
 
     @property
     def surfaces(self) -> tuple[AbstractSurface, ...]:
-        """All surfaces in the order in which the tracer numbers them: the ground, if any, then the plates."""
-        return (() if self.ground is None else (self.ground,)) + self.plates
+        """All surfaces in the order in which the tracer numbers them: ground, plates, materials of meshes."""
+        ground = () if self.ground is None else (self.ground,)
+        return (*ground, *self.plates, *itertools.chain(*(mesh.surfaces for mesh in self.meshes)))
 
 
 def _gaps(surfaces: tuple[AbstractSurface, ...]) -> Iterator[tuple[tuple[int, int], Float[Array, ""]]]:
@@ -136,6 +149,19 @@ def check_periods(canopy: Canopy, terrain: Terrain) -> None:
         )
 
 
+def check_open_sides(canopy: Canopy | None, ground: AbstractGround | None) -> None:
+    """Refuse a canopy or terrain that repeats without end: beside it, meshes would stand only once.
+
+    **Raises:** ValueError naming it.
+    """
+    for name, sides in (
+        ("canopy", "open" if canopy is None else canopy.sides),
+        ("terrain", ground.sides if isinstance(ground, Terrain) else "open"),
+    ):
+        if sides != "open":
+            raise ValueError(f"the {name} has sides = {sides!r}; admissible with meshes is 'open'")
+
+
 def check_kinds(lidar: Any, scene: Any) -> None:
     """Refuse objects that are not a lidar and a scene, before anything is computed with them.
 
@@ -167,4 +193,5 @@ _SCENE_ARGUMENTS = {
     "plates=(plate,)": AbstractSheet,
     "ground=ground": AbstractGround,
     "atmosphere=atmosphere": Atmosphere,
+    "meshes=(mesh,)": MeshSurface,
 }

@@ -76,12 +76,14 @@ class SceneParts:
         """Load the scene within a rectangle.
 
         **Raises:** TypeError where the function does not return a `Scene`, ValueError where its voxels extend
-        beyond `z`.
+        beyond `z`, or it has meshes.
         """
         low, high = as_numpy(low, "low"), as_numpy(high, "high")
         call = f"part({low.tolist()}, {high.tolist()})"
         scene = self.part(low, high)
         check_kind(call, scene, Scene, "a Scene")
+        if scene.meshes:
+            raise ValueError(f"{call} has meshes; admissible in scenes of several parts are none")
         if scene.canopy is not None:
             voxels = scene.canopy.voxels
             bottom, top = float(voxels.origin[2]), float(voxels.top[2])

@@ -33,6 +33,7 @@ from jaxlidar._checks import (
 from jaxlidar._converted import Converted
 from jaxlidar._ranges import FRACTION, SUM_OF_FRACTIONS, Range, check_ranges
 from jaxlidar._signatures import briefly
+from jaxlidar._text import object_text
 from jaxlidar.optics.laws import AbstractLaw, Lambertian
 from jaxlidar.optics.spectra import Spectrum
 from jaxlidar.scenes.raster import Raster
@@ -132,6 +133,9 @@ class AbstractSurface(eqx.Module):
 
     reflectance: eqx.AbstractVar[Reflectance]
     law: eqx.AbstractVar[AbstractLaw]
+
+    def __str__(self) -> str:
+        return object_text(self)
 
     @property
     @abc.abstractmethod

@@ -28,6 +28,7 @@ from jaxlidar._checks import (
 from jaxlidar._converted import Converted
 from jaxlidar._ranges import Range, check_ranges
 from jaxlidar._signatures import briefly
+from jaxlidar._text import object_text
 from jaxlidar.optics.leaf_angles import LeafAngles
 from jaxlidar.scenes.terrain import Terrain
 
@@ -104,6 +105,9 @@ class VoxelMap(eqx.Module):
         "voxel_size": Range(0.0, low_open=True),
         "origin": Range(),
     }
+
+    def __str__(self) -> str:
+        return object_text(self)
 
     def __check_init__(self):
         check_kind("leaf_angles", self.leaf_angles, LeafAngles | None, "a LeafAngles or None")

@@ -19,10 +19,10 @@ from jaxtyping import Array, Float
 
 from jaxlidar._checks import briefly, check_range, is_traced
 from jaxlidar._deprecated import renamed_property
-from jaxlidar._registry import save_result, waveform_html
+from jaxlidar._registry import detect_returns, save_result, true_returns, waveform_html
 from jaxlidar._summary import summary
 from jaxlidar.instrument.lidar import Lidar
-from jaxlidar.instrument.receiver import digitise, first_return_window
+from jaxlidar.instrument.receiver import Receiver, digitise, first_return_window
 from jaxlidar.planning.setup import Setup
 from jaxlidar.spectral.apply_optics import (
     WaveformModel,
@@ -141,6 +141,48 @@ class Waveform(eqx.Module):
         **Raises:** what `jaxlidar.io.save` raises.
         """
         save_result(self, path, case)
+
+    def returns(self, lidar: Lidar, detector: str = "peak", **options: Any) -> Any:
+        """Detect the discrete returns of the waveform, as a laser scanner reports them.
+
+        **Arguments:**
+
+        - `lidar`: the `Lidar` that was simulated: its place, pulse and radiometry.
+        - `detector`, `options`: those of `Waveforms.returns`; a `record` is (wavelengths, samples).
+
+        **Returns:** a `DiscreteReturns` of one shot. Its ground height is that of the truth, NaN without one.
+
+        **Raises:** as `Waveforms.returns`; TypeError for something else than a lidar, ValueError for a
+        lidar of other wavelengths.
+
+        **Example:**
+
+        >>> import jax, jaxlidar as jl
+        >>> lidar, scene = jl.Lidar(altitude=500.0), jl.Scene(ground=jl.Ground(height=2.0))
+        >>> wave = jl.simulate(lidar, scene, key=jax.random.key(0))
+        >>> print(wave.returns(lidar, detector="constant fraction").range.round(2))
+        [498.]
+        """
+        return detect_returns(self, lidar, detector, **options)
+
+    def true_returns(self, lidar: Lidar, **options: Any) -> Any:
+        """List the true echoes of the waveform, which was simulated with `truth=True`.
+
+        **Arguments:** `lidar`: the `Lidar` that was simulated. `options`: those of `Waveforms.true_returns`.
+
+        **Returns:** a `DiscreteReturns` of one shot.
+
+        **Raises:** as `returns`; ValueError where there is no truth.
+
+        **Example:**
+
+        >>> import jax, jaxlidar as jl
+        >>> lidar, scene = jl.Lidar(altitude=500.0), jl.Scene(ground=jl.Ground(height=2.0))
+        >>> wave = jl.simulate(lidar, scene, key=jax.random.key(0), truth=True)
+        >>> print(wave.true_returns(lidar).position.round(2).tolist())
+        [[0.0, 0.0, 2.0]]
+        """
+        return true_returns(self, lidar, **options)
 
     def __str__(self) -> str:
         if any(is_traced(x) for x in (self.time, self.reflectance)):
@@ -271,6 +313,7 @@ def open_at_first_return(wave: Waveform, lidar: Lidar) -> Waveform:
     samples are added up as if fully correlated.
     """
     energy = wave.energy
+    assert isinstance(lidar.receiver, Receiver)
     threshold = jnp.maximum(lidar.receiver.detection_threshold, 1e-3 * jnp.max(energy))
     is_open = jnp.cumsum(jnp.any(energy > threshold, axis=0)) > 0
     arrays = [wave.reflectance, energy, wave.stderr, *wave.components.values()]

@@ -78,12 +78,13 @@ def choose_strategy(
 def _rays_of_batch(plan: Plan, survey: Survey, scene: Scene, rtol: float) -> int:
     """Return the number of rays of a footprint in a batch.
 
-    Enough for the tolerance, and at most 32 for each column of voxels: more would meet the same voxels.
+    Enough for the tolerance, and without meshes at most 32 for each column of voxels: more would meet the
+    same voxels.
     """
     # Chosen by trial. If the error of N rays is N^(-3/4) (see `per_shot`), that of eight batches is then 0.2
     # rtol at rtol = 0.01, and less than that at larger ones.
     rays = 10.0 / rtol
-    if scene.canopy is not None:
+    if scene.canopy is not None and not scene.meshes:
         edge = float(np.min(concrete_array(scene.canopy.voxels.voxel_size)[:2]))
         columns = (1.0 + 2.0 * float(np.max(survey.footprint_radius)) / edge) ** 2
         rays = min(rays, 32.0 * columns)

@@ -18,6 +18,7 @@ from jaxlidar.io.netcdf import by_rows
 from jaxlidar.io.rows import unwritten_rows
 from jaxlidar.simulate import LateLightWarning, UnfollowedLightWarning
 from jaxlidar.spectral.apply_optics import make_waveform_model
+from jaxlidar.survey.acquisition import Acquisition
 from jaxlidar.survey.results import ShotResults
 from jaxlidar.survey.strategy import AbstractStrategy
 from jaxlidar.survey.waveforms import Waveforms
@@ -96,11 +97,19 @@ def waveforms_on_disk(
     with by_rows(layout, path, case) as rows:
         # One block of results is in memory at a time, whatever the number of shots.
         for shots, results in itertools.chain([(first_shots, first_results)], blocks):
-            fields = {name: a[shots] for name, a in survey_fields.items()}
+            fields = {name: _rows(value, shots) for name, value in survey_fields.items()}
             rows.add(shots, {**fields, **results._asdict()})
             missing = missing.or_more(_MissingLight.of(results))
     _warn_of_missing_light(strategy, missing)
     return Waveforms.open(path)
+
+
+def _rows(value: Any, shots: slice) -> Any:
+    """Return the rows of some shots: of an array, or of the fields of an `Acquisition` that have rows."""
+    if not isinstance(value, Acquisition):
+        return value[shots]
+    columns = ("gps_time", "scan_angle", "flight_line")
+    return dataclasses.replace(value, **{name: getattr(value, name)[shots] for name in columns})
 
 
 def _waveforms(

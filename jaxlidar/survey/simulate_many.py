@@ -29,6 +29,7 @@ from jaxlidar.io.case import Case, case_text
 from jaxlidar.io.checkpoint import check_same_problem, open_checkpoint
 from jaxlidar.scenes.scene import Scene, check_kinds
 from jaxlidar.scenes.scene_parts import SceneParts
+from jaxlidar.survey.acquisition import acquisition_of
 from jaxlidar.survey.choose_strategy import choose_strategy
 from jaxlidar.survey.collect import StoredResults, waveforms_in_memory, waveforms_on_disk
 from jaxlidar.survey.coverage import OffMapWarning, ground_heights, off_map, off_map_message
@@ -139,10 +140,9 @@ def simulate_many(
     if max_orders is not None:
         max_orders = check_integer("max_orders", max_orders)
     # Waveforms share one time axis, in memory and in files.
-    if survey.lidar.receiver.window != "fixed":
+    if survey.lidar.opens_at_first_return:
         raise ValueError(
-            f"receiver window = {survey.lidar.receiver.window!r} gives every shot a time axis of its own; "
-            "admissible is 'fixed'"
+            "receiver window = 'first return' gives every shot a time axis of its own; admissible is 'fixed'"
         )
     start_time = time.perf_counter()
     if isinstance(scene, SceneParts):
@@ -163,6 +163,7 @@ def simulate_many(
         "azimuth": survey.azimuth,
         "ground_height": heights,
         "off_map": off_map_fractions,
+        "acquisition": acquisition_of(survey),
     }
     run_tasks = functools.partial(outcomes, executor=executor, devices=devices)
     info: dict[str, Any] = {"automatic orders": max_orders is None}
@@ -189,17 +190,29 @@ def simulate_many(
         return _open_complete(path, problem)
     arguments = {"rtol": rtol, "max_orders": max_orders, "shared": shared, "truth": truth}
     case = None if isinstance(scene, SceneParts) else _case(survey, scene, key, arguments)
-    with open_checkpoint(path.with_name(path.name + ".parts"), problem) as checkpoint:
+    with open_checkpoint(checkpoint_path(path), problem) as checkpoint:
         # Another run of the same problem may have ended since.
         if path.exists():
             checkpoint.remove()
             return _open_complete(path, problem)
         stored_results = StoredResults(checkpoint, strategy)
-        task_results = _trace(strategy, key, run_tasks, progress, stored_results)
+        try:
+            task_results = _trace(strategy, key, run_tasks, progress, stored_results)
+        except KeyboardInterrupt as error:
+            error.add_note(
+                f"finished shots are kept in {checkpoint_path(path)}: the same call continues with them"
+            )
+            raise
         info["problem"] = problem
         waveforms = waveforms_on_disk(strategy, survey_fields, task_results, start_time, path, case, **info)
         checkpoint.remove()
     return waveforms
+
+
+def checkpoint_path(path: str | os.PathLike[str]) -> Path:
+    """Return the path of the results so far of a survey that is written to `path`."""
+    path = Path(path)
+    return path.with_name(path.name + ".parts")
 
 
 def _check_not_transformed(survey: Survey, scene: Scene | SceneParts, key: PRNGKeyArray) -> None:

@@ -2,22 +2,38 @@
 
 import operator
 import os
+from collections.abc import Callable
 from typing import Any, final
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import ArrayLike, Float, Int
 
-from jaxlidar._checks import briefly
+from jaxlidar._checks import briefly, check_numbers
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._deprecated import renamed_property
+from jaxlidar._registry import detect_returns, true_returns
 from jaxlidar._summary import NOTABLE_FRACTION, percent
+from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.io import netcdf
 from jaxlidar.io.case import Case
 from jaxlidar.io.datasets import datasets_of, keep_as_netcdf
+from jaxlidar.io.las_waveforms import write_las_waveforms
 from jaxlidar.sampling.adaptive import StopReason
 from jaxlidar.spectral.waveform import Waveform
+from jaxlidar.survey.acquisition import Acquisition
+from jaxlidar.survey.progress import SurveyProgress
+from jaxlidar.survey.returns import (
+    MAX_LAS_RETURNS,
+    DiscreteReturns,
+    airborne_shots,
+    input_of_waveform,
+    input_of_waveforms,
+    returns_of,
+    true_returns_of,
+    wavelength_index,
+)
 from jaxlidar.survey.truths import Truths
 
 
@@ -39,6 +55,7 @@ class Waveforms(eqx.Module):
     - `off_map`: (shots,) fraction of the light that falls outside the voxel map.
     - `error`: (shots,) relative error, as `simulate` defines it. `photons`: (shots,) number traced.
     - `truth`: a `Truths`, what each beam meets in the scene; None unless it was asked for.
+    - `acquisition`: an `Acquisition`, what else discrete returns need; None for files of earlier versions.
     - `info`: dict of "rtol", "orders" followed, "automatic orders" (False where
       `max_orders` was given), "altitude" of the lidar in m, "seconds" that it took, and
       whether light was "shared" (over `SceneParts`: in all tiles). Over one scene with shared light, also the
@@ -81,6 +98,7 @@ class Waveforms(eqx.Module):
     photons: Int[np.ndarray, " shots"]
     info: dict[str, Any] = eqx.field(static=True)
     truth: Truths | None = None
+    acquisition: Acquisition | None = None
 
     ledger = renamed_property("ledger", "energy_budget")
     ledger_stderr = renamed_property("ledger_stderr", "energy_budget_stderr")
@@ -160,6 +178,175 @@ class Waveforms(eqx.Module):
             return f"orders beyond {self.info['orders']} may add {percent(neglected)}"
         return StopReason.TOLERANCE_MET.value
 
+    def returns(
+        self,
+        detector: str = "peak",
+        *,
+        wavelength: ArrayLike | None = None,
+        record: Float[ArrayLike, "shots wavelengths samples"] | None = None,
+        background: ArrayLike | None = None,
+        noise: ArrayLike | None = None,
+        threshold: ArrayLike | None = None,
+        fraction: ArrayLike = 0.5,
+        max_returns: int | None = None,
+        progress: Callable[[SurveyProgress], None] | None = None,
+    ) -> DiscreteReturns:
+        """Detect the discrete returns of all shots, as a laser scanner reports them.
+
+        `jaxlidar.survey.returns` states the detectors. All are calibrated: a flat target across the beam
+        has no error of range.
+
+        **Arguments:**
+
+        - `detector`: "peak", "constant fraction" or "leading edge"; or "decomposition" into echoes of the
+          pulse's shape, which needs `import inversion` and some milliseconds per shot. Default "peak".
+        - `wavelength`: nm, of the channel that detects, one of `wavelength`. Default None: the first.
+        - `record`: (shots, wavelengths, samples) J, one that `jaxlidar.record` gave, with its noise.
+          Default None: `recorded`.
+        - `background`: J per sample to subtract, not negative, one number or (shots,). Default None: what
+          the receiver adds to `energy`; with a `record`, the median of each shot's samples.
+        - `noise`: standard deviation of the record in J per sample, one number, (shots,) or (shots,
+          samples). Default None: the standard error `stderr`; with a `record`, that of the differences of
+          neighbouring samples.
+        - `threshold`: lowest amplitude of a return, and lowest rise of one above the dip before it, in J
+          per sample, positive, one number or (shots,). Default None: the larger of five times the noise,
+          and 1 % of the shot's largest sample.
+        - `fraction`: level of "constant fraction" on the leading edge, over the amplitude, in (0, 1).
+          Default 0.5.
+        - `max_returns`: of a shot with more, the strongest so many are returned. Default None: all.
+        - `progress`: a function called with a `SurveyProgress` after every few thousand shots. Default None.
+
+        **Returns:** a `DiscreteReturns`.
+
+        **Raises:** ValueError for arguments outside their ranges or of other shapes, and for waveforms of a
+        file of an earlier version; RuntimeError for "decomposition" where `inversion` is not imported.
+
+        **Example:**
+
+        >>> import jax, jaxlidar as jl
+        >>> scene = jl.Scene(plates=[jl.Plate(6.0, 0.4, coverage=0.5)], ground=jl.Ground(reflectance=0.3))
+        >>> survey = jl.Survey(jl.Lidar(altitude=500.0), position=[(0, 0)], zenith=[20.0])
+        >>> returns = jl.simulate_many(survey, scene, key=jax.random.key(0)).returns()
+        >>> print(returns.material.tolist(), returns.position[:, 2].round(2), returns.range.round(2))
+        ['plate', 'ground'] [6. 0.] [525.7  532.09]
+        """
+        waves = input_of_waveforms(self, wavelength)
+        if record is not None:
+            record = _at_wavelength(record, self.wavelength, wavelength)
+        return returns_of(
+            waves,
+            detector,
+            record=record,
+            background=background,
+            noise=noise,
+            threshold=threshold,
+            fraction=fraction,
+            max_returns=max_returns,
+            progress=progress,
+        )
+
+    def true_returns(
+        self, *, wavelength: ArrayLike | None = None, min_reflectance: ArrayLike = 1e-4
+    ) -> DiscreteReturns:
+        """List the true echoes of all shots, to judge what a detector reports.
+
+        An echo is a stretch of samples with first-order returns of one material, without a gap: the ground,
+        a plate, a layer of leaves. Its time is the mean of these returns, its width 2.35 times their standard
+        deviation, without the pulse; its amplitude is the energy of all of them. Returns of the
+        simulation's truth are resolved to a sample.
+
+        **Arguments:**
+
+        - `wavelength`: nm, as that of `returns`. Default None: the first.
+        - `min_reflectance`: lowest apparent reflectance of an echo, not negative. Default 1e-4.
+
+        **Returns:** a `DiscreteReturns`.
+
+        **Raises:** ValueError for waveforms without truth (`simulate_many(truth=True)` gives it), and as
+        `returns`.
+
+        **Example:**
+
+        >>> import jax, jaxlidar as jl
+        >>> scene = jl.Scene(plates=[jl.Plate(6.0, 0.4, coverage=0.5)], ground=jl.Ground(reflectance=0.3))
+        >>> survey = jl.Survey(jl.Lidar(altitude=500.0), position=[(0, 0)], zenith=[20.0])
+        >>> many = jl.simulate_many(survey, scene, key=jax.random.key(0), truth=True)
+        >>> print(many.true_returns().material.tolist(), many.true_returns().reflectance.round(3))
+        ['plate', 'ground'] [0.188 0.141]
+        """
+        return true_returns_of(input_of_waveforms(self, wavelength), min_reflectance=min_reflectance)
+
+    def to_las(
+        self, path: str | os.PathLike[str], *, crs: str | None = None, detector: str = "peak", **options: Any
+    ) -> DiscreteReturns:
+        """Write the discrete returns of all shots as a LAS or LAZ file, version 1.4.
+
+        **Arguments:**
+
+        - `path`, `crs`: those of `DiscreteReturns.to_las`.
+        - `detector`, `options`: those of `returns`; `max_returns` is 15 by default, as many as the format
+          holds.
+
+        **Returns:** the `DiscreteReturns` that were written.
+
+        **Raises:** as `returns` and `DiscreteReturns.to_las`.
+
+        **Example:**
+
+        >>> import pathlib, tempfile
+        >>> import jax, jaxlidar as jl
+        >>> survey = jl.Survey.grid(jl.Lidar(), low=(0, 0), high=(10, 0), spacing=10.0)
+        >>> many = jl.simulate_many(survey, jl.Scene(ground=jl.Ground(2.5)), key=jax.random.key(0))
+        >>> path = pathlib.Path(tempfile.mkdtemp()) / "strip.las"
+        >>> print(many.to_las(path, detector="leading edge"))
+        2 returns of 2 shots: 2 ground
+        """
+        returns = self.returns(detector, **{"max_returns": MAX_LAS_RETURNS, **options})
+        returns.to_las(path, crs=crs)
+        return returns
+
+    def to_las_waveforms(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        crs: str | None = None,
+        detector: str = "peak",
+        point_format: int = 9,
+        **options: Any,
+    ) -> DiscreteReturns:
+        """Write waveforms and discrete returns as LAS 1.4 with waveform packets, in a .wdp file.
+
+        A packet has all samples of a shot's record (`recorded`, or a `record` in `options`) in 65,535 steps
+        of the largest sample of the survey, and its gain turns them into J.
+        `jaxlidar.io.read_las_waveforms` reads them. A shot without a return gets a synthetic point, as
+        `jaxlidar.io.write_las_waveforms` states.
+
+        **Arguments:** `point_format`: 4, 5, 9 or 10. Default 9. The others are those of `to_las`; `path`
+        ends in ".las".
+
+        **Returns:** the `DiscreteReturns` that were written.
+
+        **Raises:** as `returns` and `jaxlidar.io.write_las_waveforms`; ValueError for records without light.
+
+        **Example:**
+
+        >>> import pathlib, tempfile
+        >>> import jax, jaxlidar as jl
+        >>> survey = jl.Survey.grid(jl.Lidar(), low=(0, 0), high=(10, 0), spacing=10.0)
+        >>> many = jl.simulate_many(survey, jl.Scene(ground=jl.Ground(2.5)), key=jax.random.key(0))
+        >>> path = pathlib.Path(tempfile.mkdtemp()) / "strip.las"
+        >>> returns = many.to_las_waveforms(path)
+        >>> shots = jl.io.read_las_waveforms(path)
+        >>> print(f"{len(shots)} shots, {shots[0].elevation[shots[0].signal.argmax()]:.1f} m")
+        2 shots, 2.5 m
+        """
+        wavelength, record = options.get("wavelength"), options.get("record")
+        returns = self.returns(detector, **{"max_returns": MAX_LAS_RETURNS, **options})
+        waves = input_of_waveforms(self, wavelength)
+        records = waves.recorded if record is None else _at_wavelength(record, self.wavelength, wavelength)
+        write_las_waveforms(path, airborne_shots(waves, records, returns, crs), point_format=point_format)
+        return returns
+
     def to_xarray(self) -> Any:
         """The waveforms as an `xarray.Dataset` over shots, wavelengths and times, with units.
 
@@ -227,4 +414,37 @@ keep_as_netcdf(
     coordinates={"zenith": "shot", "azimuth": "shot"},
     former_names={"energy_budget": "ledger", "energy_budget_stderr": "ledger_stderr"},
     rows="shots",
+    added=("acquisition",),
 )
+
+
+@detect_returns.register
+def _returns_of_waveform(
+    wave: Waveform, lidar: Lidar, detector: str, *, record: Any = None, wavelength: Any = None, **options: Any
+) -> DiscreteReturns:
+    """Detect the returns of one waveform; see `Waveform.returns`."""
+    waves = input_of_waveform(wave, lidar, wavelength)
+    if record is not None:
+        check_numbers("record", record)
+        record = _at_wavelength(np.asarray(record)[None], wave.wavelength, wavelength)
+    return returns_of(waves, detector, record=record, **options)
+
+
+@true_returns.register
+def _true_returns_of_waveform(
+    wave: Waveform, lidar: Lidar, *, wavelength: Any = None, **options: Any
+) -> DiscreteReturns:
+    """List the true echoes of one waveform; see `Waveform.true_returns`."""
+    return true_returns_of(input_of_waveform(wave, lidar, wavelength), **options)
+
+
+def _at_wavelength(record: Any, wavelengths: Any, wavelength: Any) -> np.ndarray:
+    """Return the samples (shots, samples) at one wavelength of a record. **Raises:** ValueError."""
+    check_numbers("record", record)
+    record, count = np.asarray(record), len(wavelengths)
+    if record.ndim != 3 or record.shape[1] != count:
+        raise ValueError(
+            f"record has shape {record.shape[-3:]}; admissible is (shots, {count}, samples), that of "
+            "jaxlidar.record"
+        )
+    return record[:, wavelength_index(wavelength, np.asarray(wavelengths, float))]

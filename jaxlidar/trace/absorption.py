@@ -22,6 +22,7 @@ from jaxlidar.scenes.height_field import HeightField
 from jaxlidar.trace.device_scene import DeviceScene
 from jaxlidar.trace.flight import SurfaceEncounters
 from jaxlidar.trace.footprint import across_beam
+from jaxlidar.trace.meshes import clear_of_mesh
 from jaxlidar.trace.photon_step import collide, fly_once, passed_plates, start_photons
 from jaxlidar.trace.photons import TRANSMITTED, Photons
 
@@ -181,9 +182,10 @@ def _trace_order(scene: DeviceScene, optics: Array, loop: _PhotonLoop, key: PRNG
     on_ground = fractions.on_ground
     for surface, on_surface, scatterer in zip(scene.surfaces, flight.landed_on(encounters), config.surfaces):
         arriving = jnp.where(on_surface[:, None], energy, 0.0)
-        albedo = surface.scale_by_pattern(x, surface.law.albedo(p.w, surface.lit_normal(x, p.w)))
+        normal = surface.lit_normal(x, p.w, encounters.mesh_normal)
+        albedo = surface.scale_by_pattern(x, surface.law.albedo(p.w, normal))
         absorbed = absorbed.at[scatterer.material].add(absorbed_of(scatterer, arriving, albedo))
-        if not surface.is_plate:
+        if not (surface.is_plate or surface.is_mesh):
             on_ground = on_ground + jnp.sum(arriving, axis=0)
 
     # Photons that hit zeros have the channel -1, and the energy zero.
@@ -195,7 +197,7 @@ def _trace_order(scene: DeviceScene, optics: Array, loop: _PhotonLoop, key: PRNG
     survives = alive & (jax.random.uniform(roulette_key, survival.shape, survival.dtype) < survival)
     energy = jnp.where(survives[:, None], energy / jnp.where(survives, survival, 1.0)[:, None], 0.0)
     photons = Photons(
-        x=x,
+        x=clear_of_mesh(scene, x, collision.w, collision.surface, collision.normal),
         w=collision.w,
         path=path,
         weight=p.weight,

@@ -51,6 +51,7 @@ def sample_collision(
     collided: Bool[Array, "photons"],
     landed: list[Bool[Array, "photons"]],
     draws: PhotonDraws,
+    mesh_normal: Vec | None,
 ) -> Collision:
     """Sample the material that photons hit at `x`, flying along `w`, and the direction in which it scatters.
 
@@ -63,6 +64,7 @@ def sample_collision(
     - `cell`: the voxel. `collided`: True for photons that collide in the voxel.
     - `landed`: for each surface, True for photons that land on it.
     - `draws`: uniform numbers.
+    - `mesh_normal`: of the triangle on which photons land; None without meshes.
     """
     one = jnp.ones_like(w[0])
     minus_one = jnp.full(one.shape, -1, jnp.int32)
@@ -84,12 +86,20 @@ def sample_collision(
     if scene.medium is not None:
         collision = select_collision(collided, _in_medium(scene, scene.medium, w, cell, draws), collision)
     for i, surface in enumerate(scene.surfaces):
-        collision = select_collision(landed[i], _on_surface(scene, surface, i, x, w, draws), collision)
+        collision = select_collision(
+            landed[i], _on_surface(scene, surface, i, x, w, draws, mesh_normal), collision
+        )
     return collision
 
 
 def _on_surface(
-    scene: DeviceScene, surface: TracedSurface, number: int, x: Vec, w: Vec, draws: PhotonDraws
+    scene: DeviceScene,
+    surface: TracedSurface,
+    number: int,
+    x: Vec,
+    w: Vec,
+    draws: PhotonDraws,
+    mesh_normal: Vec | None,
 ) -> Collision:
     """Sample scattering by a surface: reflection by its law, or diffuse transmission by the cosine law.
 
@@ -101,7 +111,7 @@ def _on_surface(
        collision is divided by it.
     """
     q, scatterer, law = scene.limits.reflection_probability, scene.config.surfaces[number], surface.law
-    normal = surface.lit_normal(x, w)
+    normal = surface.lit_normal(x, w, mesh_normal)
     # Directions are decisions: they are drawn from detached inputs, and keep no derivative.
     detached_w, detached_normal = jax.tree.map(detach, (w, normal))
     out = jax.tree.map(detach, law.sample(detached_w, detached_normal, *draws.direction))
@@ -287,7 +297,8 @@ def _leaf_normal(medium: Medium, w: Vec, u: Scalar, v: Scalar) -> tuple[Vec, Sca
 
 def collision_for_return(scene: DeviceScene, collision: Collision) -> CollisionForReturn:
     """Return the fields of a collision that its return depends on; the compiler then drops all else."""
-    needs_normal = scene.medium is not None and scene.medium.angle_tables is not None
+    has_leaf_angles = scene.medium is not None and scene.medium.angle_tables is not None
+    needs_normal = has_leaf_angles or scene.meshes is not None
     return CollisionForReturn(
         collision.material,
         collision.surface,
@@ -338,7 +349,7 @@ def intensity_factors(
             reflected = jnp.where(on_bark, bark, reflected)
     for i, surface in enumerate(scene.surfaces):
         # Recomputed from the point, with its derivative: the sampled normal is detached.
-        on_surface, normal = collision.surface == i, surface.lit_normal(x, w)
+        on_surface, normal = collision.surface == i, surface.lit_normal(x, w, collision.normal)
         cosine = dot(normal, v)
         factor = surface.law.intensity_factor(w, normal, v, scene.beam.half_angle)
         factor = surface.scale_by_pattern(x, factor)

@@ -38,6 +38,7 @@ from jaxlidar.optics.phase import AbstractPhase
 from jaxlidar.planning.channels import channel_optics
 from jaxlidar.planning.config import PathLimits, TimeBins, TraceConfig
 from jaxlidar.planning.setup import Setup
+from jaxlidar.scenes.mesh_surface import MeshTree, build_mesh_tree
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.trace.extinction_slopes import ExtinctionSlopes
 from jaxlidar.trace.footprint import Beam, make_beam
@@ -59,7 +60,8 @@ class DeviceScene(eqx.Module):
     The geometry:
 
     - `beam`, `medium`, `surfaces`: footprint, voxels (None: no canopy), and surfaces, ground first, then
-      plates.
+      plates, then the materials of meshes.
+    - `meshes`: the triangles of all meshes; None without any.
     - `laws`: the laws by which photons are sent on; `surface_laws`, `leaf_law`, `bark_law` are indices of
       these.
     - `depth_above`: optical depth straight up from every voxel's upper face, for a beam at nadir; else None.
@@ -101,6 +103,7 @@ class DeviceScene(eqx.Module):
     shot_views: ShotViews | None = None
     derivatives: Derivatives = eqx.field(static=True, default="all")
     slopes: ExtinctionSlopes | None = None
+    meshes: MeshTree | None = None
 
     @property
     def reverse(self) -> bool:
@@ -239,6 +242,7 @@ def _build_geometry(
         medium = make_medium(scene.canopy, aim)
         leaf_law, bark_law = law_number(medium.leaf_phase), law_number(medium.bark_phase)
     surfaces = traced_surfaces(scene, aim)
+    meshes = build_mesh_tree(scene.meshes).moved(-aim) if scene.meshes else None
     surface_laws = tuple(law_number(s.law) for s in surfaces)
     return DeviceScene(
         beam=make_beam(lidar),
@@ -255,6 +259,7 @@ def _build_geometry(
         leaf_law=leaf_law,
         bark_law=bark_law,
         derivatives="none",
+        meshes=meshes,
     )
 
 
@@ -272,7 +277,8 @@ def aim_at(scene: DeviceScene, lidar: Lidar, offset: Float[Array, "2"]) -> Devic
     if medium is not None:
         medium = eqx.tree_at(lambda m: m.origin, medium, medium.origin + back)
     surfaces = tuple(surface.moved(back) for surface in scene.surfaces)
-    return dataclasses.replace(scene, beam=make_beam(lidar), medium=medium, surfaces=surfaces)
+    meshes = None if scene.meshes is None else scene.meshes.moved(back)
+    return dataclasses.replace(scene, beam=make_beam(lidar), medium=medium, surfaces=surfaces, meshes=meshes)
 
 
 def not_scattered(like: Scalar) -> LastScattering:

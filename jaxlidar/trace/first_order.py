@@ -34,6 +34,7 @@ from jaxlidar.trace.deposit import add_rows, bspline_row, smooth_bins
 from jaxlidar.trace.device_scene import DeviceScene
 from jaxlidar.trace.extinction_slopes import outer_rows
 from jaxlidar.trace.histories import Histories
+from jaxlidar.trace.meshes import surface_distances
 from jaxlidar.trace.ray_segments import (
     RaySegments,
     add_in_blocks,
@@ -125,7 +126,8 @@ class FootprintRays(NamedTuple):
     """Rays of the footprint: where they start above the scene, their directions, and the surfaces they meet.
 
     - `x`, `w`: start and direction. - `excess`: path from the sensor to the start, m, less the slant range.
-    - `energy`: fraction of the pulse's. - `surface_distances`: to each surface, m; `end`: to the ground.
+    - `energy`: fraction of the pulse's. - `surface_distances`: to each surface, m; `end`: to the ground or a
+      mesh. - `mesh_normal`: of the triangle that is met; None without meshes.
     """
 
     x: Vec
@@ -134,6 +136,7 @@ class FootprintRays(NamedTuple):
     energy: Scalar
     surface_distances: list[Scalar]
     end: Scalar
+    mesh_normal: Vec | None
 
 
 def move_rays(
@@ -155,9 +158,12 @@ def send_rays(scene: DeviceScene, across: tuple[Scalar, Scalar], energy: Scalar)
     point, w, excess = beam.ray(across)
     start_distance = scene.limits.start_distance
     x = along(point, w, jnp.asarray(-start_distance, energy.dtype))
-    distances = [s.distance(x, w) for s in scene.surfaces]
+    distances, mesh_normal = surface_distances(scene, x, w)
     end = distances[0] if config.has_ground else jnp.full_like(energy, FAR)
-    return FootprintRays(x, w, excess - start_distance, energy, distances, end)
+    for surface, distance in zip(scene.surfaces, distances):
+        # Nothing behind a triangle is lit by the ray.
+        end = jnp.minimum(end, distance) if surface.is_mesh else end
+    return FootprintRays(x, w, excess - start_distance, energy, distances, end, mesh_normal)
 
 
 def march_rays(scene: DeviceScene, rays: FootprintRays) -> tuple[RaySegments, list[Scalar], Scalar]:
@@ -360,7 +366,7 @@ class FirstOrderTracer:
         """
         scene, bins, config, mirror = self.scene, self.scene.bins, self.scene.config, self.mirror
         histories, (_, n_histories) = scene.first_histories, self.shape
-        x, w, excess, energy, distances, end = rays
+        x, w, excess, energy, distances, end, mesh_normal = rays
         returned, arrived, scattered, _, return_slopes = tally
         for i, (surface, scatterer) in enumerate(zip(scene.surfaces, config.surfaces)):
             if mirror is not None and i != mirror:
@@ -368,7 +374,7 @@ class FirstOrderTracer:
             is_met = distances[i] < FAR
             hit_energy = jnp.where((distances[i] <= end) & is_met, surface.coverage * energy, 0.0)
             point = along(x, w, jnp.where(is_met, distances[i], 0.0))
-            normal, back = surface.lit_normal(point, w), scale(w, jnp.asarray(-1.0))
+            normal, back = surface.lit_normal(point, w, mesh_normal), scale(w, jnp.asarray(-1.0))
             for history, factor in self.one_passage.terms(histories, 0, distances[i], distances):
                 weight = hit_energy * jnp.exp(-depth_at_surfaces[i]) * factor
                 tally_row = scatterer.material * n_histories + history

@@ -25,8 +25,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxlidar._vectors import FAR, Scalar, with_derivative_of
+from jaxlidar._vectors import FAR, Scalar, Vec, with_derivative_of
 from jaxlidar.trace.device_scene import DeviceScene
+from jaxlidar.trace.meshes import surface_distances
 from jaxlidar.trace.photons import GAP, STOPPED, TRANSMITTED, Photons, attached_ratio, detach
 from jaxlidar.trace.voxel_traversal import march_to_depths
 
@@ -67,10 +68,11 @@ class SurfaceEncounters(eqx.Module):
 
     - `distances`: to each surface, m; FAR where it is not met.
     - `outcomes`: for each plate GAP, STOPPED (reflected, absorbed, or transmitted diffusely) or TRANSMITTED
-      (straight on); None for the ground.
-    - `ratios`: for each plate, attached ratio of that outcome; None for the ground.
+      (straight on); None for the ground and for meshes.
+    - `ratios`: for each plate, attached ratio of that outcome; None for the ground and for meshes.
     - `stops`: distance to each surface if the photon will stop there, else FAR.
     - `nearest_stop`: distance to the nearest surface at which the photon stops.
+    - `mesh_normal`: of the triangle that is met; None without meshes.
     """
 
     distances: list[Scalar]
@@ -78,12 +80,13 @@ class SurfaceEncounters(eqx.Module):
     ratios: list[Scalar | None]
     stops: list[Scalar]
     nearest_stop: Scalar
+    mesh_normal: Vec | None
 
 
 def meet_surfaces(scene: DeviceScene, p: Photons, draws: tuple[Scalar, ...]) -> SurfaceEncounters:
     """Find the surfaces ahead of photons, and sample the outcome at each plate.
 
-    1. The distance to each surface. The ground stops every photon that meets it.
+    1. The distance to each surface. The ground and meshes stop every photon that meets them.
     2. A plate of the coverage c: u < c meets its material, else a gap. With straight transmission, u from c q
        to c is transmitted; other photons that meet material stop.
     3. The nearest distance at which the photon stops.
@@ -92,9 +95,9 @@ def meet_surfaces(scene: DeviceScene, p: Photons, draws: tuple[Scalar, ...]) -> 
     """
     distances, outcomes, ratios, stops = [], [], [], []
     remaining_draws = iter(draws)
-    for i, surface in enumerate(scene.surfaces):
-        distance = surface.distance(p.x, p.w)
-        if not surface.shape.lights_itself:
+    distances_ahead, mesh_normal = surface_distances(scene, p.x, p.w)
+    for i, (surface, distance) in enumerate(zip(scene.surfaces, distances_ahead)):
+        if not surface.lights_itself:
             # Light that leaves this surface never meets it again; by rounding, the photon may start below it.
             distance = jnp.where(p.surface == i, FAR, distance)
         distances.append(distance)
@@ -120,7 +123,7 @@ def meet_surfaces(scene: DeviceScene, p: Photons, draws: tuple[Scalar, ...]) -> 
     nearest_stop = jnp.full_like(p.weight, FAR)
     for stop in stops:
         nearest_stop = jnp.minimum(nearest_stop, stop)
-    return SurfaceEncounters(distances, outcomes, ratios, stops, nearest_stop)
+    return SurfaceEncounters(distances, outcomes, ratios, stops, nearest_stop, mesh_normal)
 
 
 def sample_flights(

@@ -26,6 +26,8 @@ from jaxlidar.instrument.field_of_view import visible_fraction
 from jaxlidar.instrument.lidar import Lidar
 
 GOLDEN = (np.sqrt(5.0) - 1) / 2
+# Half of the angle, rad, that the sun subtends.
+SOLAR_HALF_ANGLE = 4.65e-3
 
 
 class Beam(eqx.Module):
@@ -37,6 +39,9 @@ class Beam(eqx.Module):
     - `view_radius`: of the field of view at the aim point, m across the beam; None where everything is seen.
     - `gaussian`: True for a Gaussian profile. `parallel`: True if all rays are parallel to the axis, as for
       light that shots share; the receiver then sees all of the scene.
+    - `return_direction`: unit vector towards the receiver of parallel light where that is not back along the
+      axis; else None. `rectangle`: corner and size, m, of the area of the reference plane over which parallel
+      light enters evenly; None for a disc.
     """
 
     axis: Vec
@@ -46,6 +51,8 @@ class Beam(eqx.Module):
     view_radius: Float[Array, ""] | None
     gaussian: bool = eqx.field(static=True)
     parallel: bool = eqx.field(static=True, default=False)
+    return_direction: Vec | None = None
+    rectangle: tuple[Float[Array, "2"], Float[Array, "2"]] | None = None
 
     def ray(self, across: tuple[Scalar, Scalar]) -> tuple[Vec, Vec, Scalar]:
         """Point, direction and relative distance from the sensor of the ray through `across` (m).
@@ -73,6 +80,8 @@ class Beam(eqx.Module):
 
     def view(self, point: Vec) -> Vec:
         """Unit vector from `point` to the sensor."""
+        if self.return_direction is not None:
+            return vec(jnp.broadcast_to(c, point[0].shape) for c in self.return_direction)
         if self.parallel:
             return vec(jnp.broadcast_to(-c, point[0].shape) for c in self.axis)
         return normalise(add(scale(self.axis, -self.slant_range), scale(point, jnp.asarray(-1.0))))
@@ -135,13 +144,38 @@ def parallel_beam(lidar: Lidar) -> Beam:
     return dataclasses.replace(beam, view_radius=None, gaussian=False, parallel=True)
 
 
+def bistatic_beam(
+    lidar: Lidar, direction: Vec | None, corner: Float[Array, "2"], size: Float[Array, "2"]
+) -> Beam:
+    """Make a beam of parallel light over a rectangle of the reference plane.
+
+    Light returns towards `direction`, or along the axis where that is None, to a receiver that is so far away
+    that ranges do not matter.
+    """
+    beam = parallel_beam(lidar)
+    # Far enough for single precision to see no difference, also in squares of path lengths over the range.
+    far = jnp.full_like(beam.slant_range, 1e9)
+    return dataclasses.replace(
+        beam,
+        slant_range=far,
+        radius=jnp.zeros_like(far),
+        half_angle=jnp.full_like(far, SOLAR_HALF_ANGLE),
+        return_direction=direction,
+        rectangle=(corner, size),
+    )
+
+
 def from_polar(radius: Scalar, turn: Scalar) -> tuple[Scalar, Scalar]:
     """Return x and y of the point at `radius` in the direction `turn`, in whole turns."""
     return radius * jnp.cos(2 * np.pi * turn), radius * jnp.sin(2 * np.pi * turn)
 
 
 def across_beam(beam: Beam, energy_fraction: Scalar, turn: Scalar) -> tuple[Scalar, Scalar]:
-    """Return the point across the beam, m, whose circle encloses `energy_fraction`."""
+    """Return the point across the beam, m, whose circle encloses `energy_fraction`, or of a rectangle."""
+    if beam.rectangle is not None:
+        # Steps in one coordinate and turns by the golden section in the other: a lattice of rank one.
+        corner, size = beam.rectangle
+        return corner[0] + size[0] * energy_fraction, corner[1] + size[1] * (turn - jnp.floor(turn))
     # All of a Gaussian beam's energy is within an infinite circle.
     enclosed = jnp.clip(energy_fraction, 0.0, 1.0 - 1e-7)
     return from_polar(

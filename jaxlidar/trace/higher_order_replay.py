@@ -40,6 +40,7 @@ from jaxlidar.trace.higher_orders import (
     deposit_ends,
     empty_tally,
     fly,
+    is_deposited,
     scatter,
 )
 from jaxlidar.trace.random_numbers import PhotonDraws
@@ -149,7 +150,7 @@ def _deposits(
         _, pull = jax.vjp(deposited, weight)
         return (weight * pull(of_returns)[0]).reshape(flown.weight.shape)
 
-    return lax.cond(order > 0, of_order_two_on, lambda: jnp.zeros_like(flown.weight))
+    return lax.cond(is_deposited(scene, order), of_order_two_on, lambda: jnp.zeros_like(flown.weight))
 
 
 class _March(NamedTuple):

@@ -49,6 +49,7 @@ from jaxlidar.trace.device_scene import DeviceScene, not_scattered
 from jaxlidar.trace.entry_nodes import EntryNodes
 from jaxlidar.trace.flight import Flight, SurfaceEncounters, meet_surfaces, sample_flights
 from jaxlidar.trace.footprint import GOLDEN, across_beam
+from jaxlidar.trace.meshes import clear_of_mesh
 from jaxlidar.trace.photon_step import collide, passed_plates
 from jaxlidar.trace.photons import Collision, CollisionForReturn, Photons, attached_ratio, detach
 from jaxlidar.trace.random_numbers import PhotonDraws, random_words, shifted_lattices, to_unit
@@ -380,9 +381,19 @@ def _trace_order(
 ) -> tuple[Photons, HigherOrderTally]:
     """Trace a chunk of photons through one order of scattering: fly, collide, deposit, scatter."""
     flown, tally = fly(scene, p, tally, draws, order)
-    # The first order is deterministic and has been deposited.
-    tally = lax.cond(order > 0, lambda t: _deposit_flights(scene, flown, t), lambda t: t, tally)
+    tally = lax.cond(
+        is_deposited(scene, order), lambda t: _deposit_flights(scene, flown, t), lambda t: t, tally
+    )
     return scatter(scene, flown, tally)
+
+
+def is_deposited(scene: DeviceScene, order: Int[Array, ""]) -> Bool[Array, ""]:
+    """Return True if photons deposit returns at this order, counted from 0.
+
+    Light of the first order that returns along the beam is deterministic and has been deposited
+    (`jaxlidar.trace.first_order`).
+    """
+    return (order > 0) | (scene.beam.return_direction is not None)
 
 
 def fly(
@@ -414,9 +425,12 @@ def fly(
     u = jnp.maximum(strata, 1e-9)
     flights = sample_flights(scene, p, encounters.nearest_stop, max_length, u)
     # Optimisation barrier: flights serve several results, each of which would compute the march again.
-    stops = (encounters.stops, encounters.nearest_stop)
+    stops = (encounters.stops, encounters.nearest_stop, encounters.mesh_normal)
     p, draws, flights, stops = once((p, draws, flights, stops))
-    encounters = dataclasses.replace(encounters, stops=stops[0], nearest_stop=stops[1])
+    stops, nearest_stop, mesh_normal = stops
+    encounters = dataclasses.replace(
+        encounters, stops=stops, nearest_stop=nearest_stop, mesh_normal=mesh_normal
+    )
     to_ends = functools.partial(jnp.broadcast_to, shape=strata.shape)
     flown = FlownPhotons(
         p=p,
@@ -470,7 +484,7 @@ def scatter(
         at_collision = collision_score(scene, flight.cell, flight.collided, collision)
         score = p.score - flight.depth_slopes.T + at_collision
     onward = Photons(
-        x=x,
+        x=clear_of_mesh(scene, x, collision.w, collision.surface, collision.normal),
         w=collision.w,
         path=path,
         weight=weight,
@@ -719,7 +733,7 @@ def _return_through_surfaces(
 ) -> tuple[Scalar, TallyIndex]:
     """Apply the surfaces between `x` and the sensor to the transmittance and the history of the return path.
 
-    For each surface:
+    A mesh in the way lets nothing through. For each other surface:
 
     1. Ground that can hide points below its own slopes lets nothing through. Straight up, along parallel
        light of shared illumination at nadir, nothing is hidden.
@@ -729,15 +743,20 @@ def _return_through_surfaces(
        nothing through.
     """
     draws = iter(plate_draws)
+    if scene.meshes is not None:
+        start = clear_of_mesh(scene, x, v, collision.surface, collision.normal)
+        transmittance = jnp.where(scene.meshes.is_met(start, v, transmittance > 0), 0.0, transmittance)
     for i, (surface, scatterer) in enumerate(zip(scene.surfaces, scene.config.surfaces)):
+        if surface.is_mesh:
+            continue
         if not surface.is_plate:
             # Only a height field can lie in the way of its own return; a plane never does.
-            if surface.shape.lights_itself and not (scene.beam.parallel and scene.config.vertical):
+            if surface.lights_itself and not (scene.beam.parallel and scene.config.vertical):
                 transmittance = jnp.where(surface.distance(x, v) < FAR, 0.0, transmittance)
             continue
         is_covered = next(draws) < surface.coverage
         is_crossed = surface.distance(x, v) < FAR
-        if not surface.shape.lights_itself:
+        if not surface.lights_itself:
             # Light that starts on the plate does not meet it again.
             is_crossed &= collision.surface != i
         coverage = jnp.broadcast_to(surface.coverage, transmittance.shape)

@@ -57,6 +57,7 @@ def mirror_rays(
     4. Weights by the balance heuristic; for a Gaussian beam scaled to the closed form of their sum.
     """
     assert isinstance(surface.law, AbstractMirror)
+    assert surface.shape is not None
     slant_range, aperture = beam.slant_range, beam.half_angle * beam.slant_range
     # Along the axis; the mirror may lie above the reference plane, before the aim point.
     aim = vec(jnp.zeros(3, slant_range.dtype))

@@ -108,5 +108,7 @@ def collide(
     flown = jnp.where(flight.has_hit, flight.distance, 0.0)
     x = along(p.x, p.w, flown)
     landed = flight.landed_on(encounters)
-    collision = sample_collision(scene, x, p.w, flight.cell, flight.collided, landed, draws)
+    collision = sample_collision(
+        scene, x, p.w, flight.cell, flight.collided, landed, draws, encounters.mesh_normal
+    )
     return x, p.path + flown, collision

@@ -99,7 +99,7 @@ class Collision(eqx.Module):
 class CollisionForReturn(eqx.Module):
     """The fields of a `Collision` on which the light that returns from it to the sensor depends.
 
-    `normal` is None where facets have no preferred direction, so that it does not matter.
+    `normal` is None without meshes where facets have no preferred direction: it does not matter then.
     """
 
     material: Int[Array, "photons"]

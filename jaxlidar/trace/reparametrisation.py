@@ -117,6 +117,10 @@ def landings_with_grids(
     normal, offset = vec(jnp.zeros_like(distance) for _ in range(3)), jnp.zeros_like(distance)
     for surface, stop in zip(scene.surfaces, encounters.stops):
         is_target = stop <= encounters.nearest_stop
+        if surface.shape is None:
+            # A triangle may be vertical: it has no landing point for each column.
+            heading &= ~is_target
+            continue
         surface_normal, surface_offset = surface.shape.tangent(direct)
         normal = vec(jnp.where(is_target, n, m) for n, m in zip(surface_normal, normal))
         offset = jnp.where(is_target, surface_offset, offset)
@@ -214,7 +218,8 @@ def rays_with_grids(
     changed.
     """
     one = jnp.ones_like(across[0])
-    if not has_moving_rays(scene):
+    # Light over a rectangle has no profile that could make up for a motion; the rectangle moves with the map.
+    if not has_moving_rays(scene) or scene.beam.rectangle is not None:
         return across, one
     beam, outlines = scene.beam, _surfaces_with_outline(scene, across)
     if beam.gaussian:
@@ -239,7 +244,9 @@ def _surfaces_with_outline(scene: DeviceScene, across: tuple[Scalar, Scalar]) ->
     return [
         surface
         for surface in scene.surfaces
-        if surface.may_have_outline and surface.shape.outline(point, w) is not None
+        if surface.may_have_outline
+        and surface.shape is not None
+        and surface.shape.outline(point, w) is not None
     ]
 
 
@@ -315,6 +322,7 @@ def _distance_from_outline(
 ) -> Scalar:
     """Return the signed distance, m, of rays through points across the beam from the outline of a shape."""
     point, w, _ = beam.ray(across)
+    assert surface.shape is not None
     distance = surface.shape.outline(along(point, w, jnp.full_like(point[0], -start_distance)), w)
     assert distance is not None
     return jnp.broadcast_to(distance, across[0].shape)

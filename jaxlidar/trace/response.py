@@ -332,7 +332,7 @@ def first_order_response(
             if not (is_straight and channel == scatterer.transmission):
                 remaining = remaining.at[after].add(scattered)
     escaped, none = first.escaped, jnp.zeros_like(remaining)
-    lights_itself = any(surface.shape.lights_itself for surface in scene.surfaces)
+    lights_itself = any(surface.lights_itself for surface in scene.surfaces)
     if len(scatterers) == 1 and not (config.leaf or config.bark or lights_itself):
         escaped, remaining = escaped + remaining, none
     # No light is late: none is followed beyond its first scattering.

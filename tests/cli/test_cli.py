@@ -90,7 +90,9 @@ def test_a_survey_is_simulated_shot_by_shot(tmp_path, capsys, suffix):
     assert cli.main(["info", str(out)]) == 0
     assert capsys.readouterr().out == f"{jl.open(out)}\n"
     assert cli.main(["info", str(case)]) == 0
-    assert "survey: Survey(" in capsys.readouterr().out
+    output = capsys.readouterr().out
+    assert "survey: Survey of 3 shots" in output
+    assert "f32[" not in output
     assert cli.main(["plan", str(case)]) == 0
     assert "slope spread" in capsys.readouterr().out
     # The file includes its case.
@@ -120,6 +122,19 @@ def test_an_interrupted_simulation_is_saved(tmp_path, capsys, monkeypatch):
     assert cli.main(["simulate", str(SCENES / "flat_ground.toml"), "-o", str(tmp_path / "b.nc")]) == 130
     assert capsys.readouterr().err.strip() == "jaxlidar: interrupted"
     assert not (tmp_path / "b.nc").exists()
+
+
+def test_an_interrupted_survey_says_where_finished_shots_are(tmp_path, capsys, monkeypatch):
+    def interrupted(*args, **kwargs):
+        raise KeyboardInterrupt
+
+    case, out = tmp_path / "a.toml", tmp_path / "a.nc"
+    case.write_text(SURVEY)
+    monkeypatch.setattr("jaxlidar.io.case.simulate_survey", interrupted)
+    assert cli.main(["simulate", str(case), "-o", str(out)]) == 130
+    assert f"kept in {out}.parts: the same command continues" in capsys.readouterr().err
+    assert cli.main(["simulate", str(case)]) == 130
+    assert "give -o to keep them" in capsys.readouterr().err
 
 
 def test_plan_is_the_table_of_the_plan(capsys):
@@ -164,7 +179,8 @@ def test_retrieve_finds_the_ground(tmp_path, capsys):
 def test_compiled_programs_are_stored_unless_refused(tmp_path):
     """In the user's cache folder; when the command has ended, JAX has its previous configuration."""
     code = (
-        "import sys, jax; from jaxlidar.cli import cache, main; before = dict(jax.config.values);"
+        "import sys, jax; from jaxlidar import _compilation_cache as cache; from jaxlidar.cli import main;"
+        "before = dict(jax.config.values);"
         # A fast machine compiles all programs of the command in less than the minimum time.
         "cache.MIN_COMPILE_TIME = 0.0;"
         "print(main(sys.argv[1:]), jax.config.values == before)"

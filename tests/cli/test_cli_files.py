@@ -25,7 +25,14 @@ def no_compilation_cache(monkeypatch):
         (
             "a.asc",
             "ncols 3\nnrows 2\nxllcorner 0\nyllcorner 0\ncellsize 10\n1.5 2 3\n4 5 6\n",
-            "terrain of 3 x 2 nodes, 10 x 10 m apart\nheights 1.50 to 6.00 m, no coordinate reference system",
+            "terrain of 3 x 2 nodes, 10 x 10 m apart\n"
+            "heights 1.50 to 6.00 m, no coordinate reference system\n"
+            "x 5.00 to 25.00 m, y 5.00 to 15.00 m",
+        ),
+        (
+            "tree.csv",
+            "ID,parentID,startX,startY,startZ,endX,endY,endZ,radius\n1,-1,0,0,0,0,0,2,0.1\n",
+            "tree of 1 cylinders, 2.00 m tall",
         ),
         (
             "a.obj",
@@ -60,7 +67,8 @@ def test_info_of_recorded_waveforms(tmp_path, capsys):
     for name, description in {
         "a.pls": r"3 airborne shots, GPS times 400000\.0+ to 400002\.0+ s\nscanner a scanner, 1064\.0 nm\n"
         r"5 to 5 samples of 1 ns in up to 2 segments, with outgoing pulses\nzenith 8\.6 to 8\.6 degrees",
-        "small.las": r"7 points: x .*\n4 airborne shots, .*\n10 to 40 samples of 1 ns in up to 2 segments, ",
+        "small.las": r"7 points: x .*\npoint format \d; returns: .*\n"
+        r"4 airborne shots, .*\n10 to 40 samples of 1 ns in up to 2 segments, ",
         "a.npz": r"3 airborne shots\n50 to 65 samples of 1 ns in up to 2 segments, with outgoing pulses\n",
         "a.h5": r"\d+ GEDI shots of BEAM\d+.*\nlatitude ",
     }.items():

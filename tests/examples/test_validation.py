@@ -184,3 +184,19 @@ def test_recorded_shots_of_lvis(run, shared):
     record = run("recorded_lvis", shared / "airborne" / "lvis_example2.pls", "--shots", "8")
     assert holds(record, "apart")
     assert np.median(np.abs(over_error(record, "rms"))) < 1
+
+
+@pytest.mark.slow
+def test_airborne_clouds(run, shared):
+    """Medians over the footprints of two clouds are within the bounds; not with a longer pulse."""
+    als = shared / "als"
+    record = run(
+        "recorded_clouds", als / "gedi_simulator.npz", als / "megaplot.laz", als / "mixedconifer.laz"
+    )
+    assert holds(record, "simulated")
+    assert holds(record, "sum of points")
+
+    def plant(module):
+        module.PULSE = 1.5
+
+    assert not holds(run("recorded_clouds", als / "gedi_simulator.npz", als / "megaplot.laz", planted=plant))

@@ -102,6 +102,33 @@ def small_gedi() -> bytes:
         return write_small(Path(folder) / "small.h5").read_bytes()
 
 
+def small_level_2(kind: str) -> bytes:
+    from tests.io.test_gedi_level2 import write_level_2
+
+    with tempfile.TemporaryDirectory() as folder:
+        return write_level_2(Path(folder) / "small.h5", kind).read_bytes()
+
+
+def small_icesat2(writer: str) -> bytes:
+    from tests.io import test_icesat2
+
+    with tempfile.TemporaryDirectory() as folder:
+        return getattr(test_icesat2, writer)(Path(folder) / "small.h5").read_bytes()
+
+
+def small_lvis() -> bytes:
+    from tests.io.test_lvis import write_level_1
+
+    with tempfile.TemporaryDirectory() as folder:
+        return write_level_1(Path(folder) / "small.h5", 2).read_bytes()
+
+
+def small_lvis_text() -> bytes:
+    names = "# LFID SHOTNUMBER TIME GLON GLAT ZG ZH ZT RH50 RH98"
+    rows = "57 7 6e4 285.5 45 300.25 312 320 4.5 18.5\n57 8 6e4 285 45 301 312 320 4 18"
+    return f"# LVIS\n{names}\n{rows}\n".encode()
+
+
 def small_neon() -> bytes:
     from tests.io.test_neon import write_small
 
@@ -141,6 +168,12 @@ def read_pair(path: Path, index: int, reader: str, make: Callable[[int], bytes],
         return list(getattr(jaxlidar.io, reader)((path, unchanged)[index]))
     finally:
         unchanged.unlink()
+
+
+def read_lvis_shots(path: Path) -> list[Any]:
+    import jaxlidar.io
+
+    return list(jaxlidar.io.read_lvis_l1b(path))
 
 
 def read_pls(path: Path) -> list[Any]:
@@ -225,6 +258,27 @@ def plausible_shots(result: Any) -> bool:
     )
 
 
+def plausible_table(result: Any) -> bool:
+    lengths = {len(result[name]) for name in result}
+    return len(lengths) == 1
+
+
+def plausible_track(result: Any) -> bool:
+    per_photon = (
+        result.distance,
+        result.height,
+        result.time,
+        result.pulse,
+        result.confidence,
+        result.segment,
+    )
+    return (
+        finite(result.distance, result.height, result.segment_start)
+        and {len(column) for column in per_photon} == {len(result)}
+        and bool(np.all((result.segment >= 0) & (result.segment < len(result.segment_id))))
+    )
+
+
 def plausible_neon(result: Any) -> bool:
     steps = [np.linalg.norm(np.diff(s.position, axis=0), axis=1) for s in result.shots]
     return (
@@ -305,6 +359,19 @@ KINDS = {
     "laz": FileKind("binary", "read_las", ".laz", LAZ, change_bytes, plausible_cloud),
     "gedi": FileKind(
         *("binary", "read_gedi_l1b", ".h5", (small_gedi,), change_hdf5, plausible_gedi), recorded="gedi/*.h5"
+    ),
+    **{
+        name: FileKind("binary", reader, ".h5", (make,), change_hdf5, is_plausible)
+        for name, reader, make, is_plausible in (
+            ("gedi 2a", "read_gedi_l2a", lambda: small_level_2("2A"), plausible_table),
+            ("gedi 2b", "read_gedi_l2b", lambda: small_level_2("2B"), plausible_table),
+            ("atl03", "read_atl03", lambda: small_icesat2("write_photons"), plausible_track),
+            ("atl08", "read_atl08", lambda: small_icesat2("write_heights"), plausible_table),
+            ("lvis", "read_lvis_shots", small_lvis, plausible_shots),
+        )
+    },
+    "lvis text": text_kind(
+        "read_lvis_l2", ".txt", small_lvis_text, plausible_table, place=rf"{LINE}|: no line begins"
     ),
     "neon": FileKind(
         *("binary", "read_neon", ".npz", (small_neon,), change_archive, plausible_neon), recorded="neon/*.npz"

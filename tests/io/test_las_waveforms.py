@@ -69,6 +69,23 @@ def small(tmp_path):
     return tmp_path / "small.las"
 
 
+@pytest.mark.parametrize("point_format", [4, 9, 10])
+def test_compressed_points_give_the_same_shots(tmp_path, point_format):
+    pytest.importorskip("lazrs")
+    laspy = pytest.importorskip("laspy")
+    write_las_waveforms(tmp_path / "plain.las", small_shots(), point_format=point_format)
+    laspy.read(tmp_path / "plain.las").write(tmp_path / "packed.laz", do_compress=True)
+    packets = tmp_path / "packed.wdp"
+    packets.write_bytes((tmp_path / "plain.wdp").read_bytes())
+    plain, packed = (read_las_waveforms(tmp_path / name) for name in ("plain.las", "packed.laz"))
+    assert_same(packed, list(plain))
+    damaged = bytearray((tmp_path / "packed.laz").read_bytes())
+    damaged[-20:] = bytes(20)
+    (tmp_path / "packed.laz").write_bytes(damaged)
+    with pytest.raises(ValueError, match=r"packed\.laz: "):
+        read_las_waveforms(tmp_path / "packed.laz")
+
+
 def assert_same(shots, expected_shots, position_tolerance=1e-9):
     """Assert that samples, digitiser and times are equal bit for bit, and positions to some m.
 

@@ -178,7 +178,7 @@ def test_every_quantity_of_a_registered_class_has_units():
     for layout in datasets.LAYOUTS.values():
         if layout.kind.__module__.startswith(("jaxlidar", "inversion")):
             names = {f.name for f in dataclasses.fields(layout.kind) if not f.metadata.get("static")}
-            assert names - {"scene", "waveform", "truth"} == set(layout.quantities)
+            assert names - {"scene", "waveform", "truth", "acquisition"} == set(layout.quantities)
 
 
 @pytest.mark.parametrize("name", ["wave", "fits"])

@@ -15,6 +15,7 @@ import pytest
 import inversion
 import jaxlidar as jl
 from inversion.fit.model import ForwardModel, tangents_per_pass
+from inversion.fit.planning import plan_for_bounds, trace_sizes
 from inversion.fit.unknowns import bind_unknowns
 from jaxlidar.planning import memory
 from jaxlidar.planning.memory import check_memory, format_bytes, memory_limit
@@ -344,3 +345,18 @@ def test_memory_of_a_jacobian_is_as_predicted(orders, layers, end):
     """To 30 %."""
     predicted, measured = predicted_and_measured(EVALUATE_MODEL, orders, layers, end)
     assert measured == pytest.approx(predicted, rel=0.3)
+
+
+@pytest.mark.parametrize(("orders", "keeps"), [(12, True), (24, False)])
+def test_large_histories_are_left_to_fits(orders, keeps):
+    """Simulations apply optics to many orders; derivatives with respect to optics are worth the memory."""
+    leaf = jl.LeafOptics(reflectance=0.4, transmittance=0.4)
+    canopy = jl.Canopy(slab(2.0), leaf=leaf, sides="periodic")
+    scene = jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=0.3))
+    plan = jl.plan(jl.Lidar(), scene, max_orders=orders, describe=False)
+    assert plan.config.keeps_histories is keeps
+    unknown = inversion.Unknown("ground.reflectance", bounds=(0.1, 0.9))
+    time = np.arange(-80.0, 40.0)
+    sizes = trace_sizes(None, None, orders, None)
+    fitted = plan_for_bounds(jl.Lidar(), scene, bind_unknowns([unknown], scene), time, sizes)
+    assert fitted.config.keeps_histories

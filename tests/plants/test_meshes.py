@@ -1,5 +1,7 @@
 """Triangle meshes: areas in voxels against closed forms and another implementation, and files of them."""
 
+import warnings
+
 import numpy as np
 import pytest
 
@@ -7,6 +9,9 @@ import jaxlidar as jl
 from jaxlidar.io import read_case, read_obj
 
 trimesh = pytest.importorskip("trimesh")
+# Spheres and boxes whose area in voxels is known are closed. By its words: naming the class would import the
+# package before the tests' type checks are in place.
+pytestmark = pytest.mark.filterwarnings("ignore:the mesh is closed")
 
 
 def areas(voxels):
@@ -241,3 +246,44 @@ def test_a_case_voxelises_a_mesh(obj_file, tmp_path):
     voxels = read_case(case).scene.canopy.voxels
     assert areas(voxels).sum() == pytest.approx(2.0, rel=1e-6)
     assert float(voxels.bark.sum()) * 0.5**3 == pytest.approx(0.25, rel=1e-6)
+
+
+def test_closed_surfaces_warn_of_the_light_that_passes_their_voxels():
+    """A closed box 2 m wide: tau is a quarter of its 24 m2 over the 4 m2 of the column of its voxel."""
+    box = mesh_of(trimesh.creation.box(bounds=[[0, 0, 0], [2, 2, 2]]))
+    assert np.exp(-24 / 4 / 4) == pytest.approx(0.22, abs=0.005)
+    with pytest.warns(jl.SolidMeshWarning, match=r"voxels let 22 % of it pass.* Scene\(meshes="):
+        jl.voxelise_mesh(box, 2.0, bark="mesh", leaf=())
+    # Without a lid it is open.
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        jl.voxelise_mesh(jl.Mesh(box.vertices, box.faces[2:]), 2.0, bark="mesh", leaf=())
+
+
+def test_a_tree_as_triangles():
+    """Tubes have the volume of their frustums, leaves their area and the spherical distribution."""
+    tree = jl.turtle("F[+FJ]FJ", angle=45, length=2.0, radius=0.1)
+    mesh = jl.mesh_of(tree, sides=12, leaves=500, leaf_length=0.1)
+    assert mesh.materials == ("wood", "leaf")
+    is_leaf = mesh.of("leaf")
+    # Two clumps; a rhombus of 0.1 m by 0.05 m.
+    assert mesh.area[is_leaf].sum() == pytest.approx(2 * 500 * 0.5 * 0.1 * 0.05, rel=1e-9)
+    upright = np.cross(*(mesh.corners[is_leaf][:, k] - mesh.corners[is_leaf][:, 0] for k in (1, 2)))
+    cosine = np.abs(upright[:, 2]) / np.linalg.norm(upright, axis=1)
+    assert cosine.mean() == pytest.approx(0.5, abs=0.03)
+    # Tubes look outwards, and have the volume of prisms: a third of the sum of base heights times areas, with
+    # the lids of their ends, which lie across the axis.
+    for segment in range(len(tree.start)):
+        triangles = mesh.corners[~is_leaf].reshape(2, -1, 12, 3, 3)[:, segment].reshape(-1, 3, 3)
+        outward = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+        from_start = triangles[:, 0] - tree.start[segment]
+        sides = (outward * from_start).sum() / 6
+        top = np.pi / 3 * tree.radius_end[segment] ** 2 * tree.length[segment]
+        a, b = tree.radius_start[segment], tree.radius_end[segment]
+        volume = np.pi / 3 * tree.length[segment] * (a * a + a * b + b * b)
+        assert sides + top == pytest.approx(volume, rel=1e-9)
+    assert jl.mesh_of(tree.leafless()).materials == ("wood",)
+    with pytest.raises(ValueError, match="sides = 2"):
+        jl.mesh_of(tree, sides=2)
+    with pytest.raises(ValueError, match="no segments and no leaves"):
+        jl.mesh_of(jl.turtle("", angle=0, length=1.0, radius=0.1), leaves=0)

@@ -259,6 +259,11 @@ def test_photons_are_drawn_at_their_heights_in_the_colours_of_their_labels(axes)
     plot.photons(events, [70.0], axes, label=label, color="red")
     lines = lines_of(axes)
     assert set(lines) == {"ground", "canopy"}
+    # Photons are large enough to be seen, and the legend stands beside the axes.
+    assert all(line.get_markersize() >= 3 for line in axes.lines)
+    assert axes.get_legend().get_bbox_to_anchor().transformed(axes.transAxes.inverted()).x0 == pytest.approx(
+        1.0
+    )
     assert np.array_equal(lines["canopy"][:, 1], events.height[label == 2])
     assert np.all(lines["canopy"][:, 0] == 70.0)
     assert {line.get_color() for line in axes.lines} == {"red"}
@@ -267,3 +272,36 @@ def test_photons_are_drawn_at_their_heights_in_the_colours_of_their_labels(axes)
         plot.photons(events, [1.0, 2.0], axes)
     with pytest.raises(ValueError, match=r"label = 4 is outside the admissible range \[0, 3\]"):
         plot.photons(events, ax=axes, label=label + 2)
+
+
+def test_a_recorded_track_is_drawn_about_its_ground(axes):
+    n = 50
+    zero, one = np.zeros(n), np.zeros(1)
+    height = np.r_[np.full(25, 100.0), np.linspace(-200.0, 300.0, 25)]
+    track = jl.io.PhotonTrack(
+        beam="gt1r",
+        distance=np.arange(float(n)),
+        height=height,
+        latitude=zero,
+        longitude=zero,
+        time=zero,
+        pulse=np.arange(n),
+        confidence=np.repeat([4, 0], 25),
+        quality=np.zeros(n, int),
+        background_rate=zero,
+        segment=np.zeros(n, int),
+        segment_id=np.array([1]),
+        segment_start=one,
+        segment_length=one + 50.0,
+        segment_latitude=one,
+        segment_longitude=one,
+        solar_elevation=one,
+    )
+    plot.photons(track, ax=axes)
+    assert set(lines_of(axes)) == {"signal", "noise"}
+    axes.clear()
+    plot.photons(track, ax=axes, label=np.repeat([1, 0], 25))
+    assert axes.get_ylim() == (90.0, 110.0)
+    assert axes.get_xlabel() == "distance along the track (m)"
+    with pytest.raises(ValueError, match="distance is given; admissible for a PhotonTrack is None"):
+        plot.photons(track, [1.0], axes)

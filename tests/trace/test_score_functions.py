@@ -153,9 +153,8 @@ def test_more_scores_are_tangents(name, precision):
     assert relative_difference(MORE_CASES[name]) < TOLERANCE[precision]
 
 
-@pytest.mark.parametrize(
-    "left_out", slow_unless(["collision_score"], ["vertical_depth_slopes", "collision_score"])
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("left_out", ["vertical_depth_slopes", "collision_score"])
 def test_a_wrong_score_is_rejected(left_out, monkeypatch):
     """Without the way back to the sensor, or without what collisions add."""
     right = getattr(higher_orders, left_out)

@@ -93,7 +93,7 @@ def test_the_background_is_estimated_from_the_record():
         assert np.mean(with_true_rate == with_estimate) > 0.97
     # Negative control: a wrong rate lets the noise pass.
     without_background = inversion.photon_ground_and_canopy(events, DISTANCE, background_rate=0.0)
-    assert (without_background.label[~events.signal] > 0).mean() > 0.7
+    assert (without_background.label[~events.signal] > 0).mean() > 0.6
 
 
 def test_too_few_photons_are_nan():
@@ -122,13 +122,14 @@ def test_segments_and_percentiles():
     np.testing.assert_allclose(coarse.distance, [50.0, 150.0])
     np.testing.assert_allclose(coarse.canopy, 10.0, atol=0.7)
     repeated = inversion.photon_ground_and_canopy(events, DISTANCE, segment=100.0, percentile=50.0)
-    assert all(np.array_equal(a, b) for a, b in zip(coarse, repeated, strict=True))
+    for a, b in zip(coarse, repeated, strict=True):
+        np.testing.assert_array_equal(a, b)
 
 
 def test_percentiles_are_those_of_numpy():
     random = np.random.default_rng(0)
     z, number = random.normal(size=200), random.integers(0, 7, 200)
-    percentiles = photons._percentiles(z, number, 9, 98.0, 2)
+    percentiles, _ = photons._percentiles(z, number, 9, 98.0, 2)
     for i in range(7):
         np.testing.assert_allclose(percentiles[i], np.percentile(z[number == i], 98.0))
     assert np.all(np.isnan(percentiles[7:]))
@@ -139,6 +140,7 @@ def test_percentiles_are_those_of_numpy():
     [
         ({"distance": DISTANCE[1:]}, r"distance has shape \(285,\); admissible is one for each of the 286"),
         ({"distance": np.zeros(SHOTS)}, "which do not all lie at one place"),
+        ({"distance": None}, "distance is None; admissible for PhotonEvents"),
         ({"segment": 0.0}, r"segment = 0 .*\(0, inf\)"),
         ({"percentile": 101.0}, r"percentile = 101 .*\[0, 100\]"),
         ({"background_rate": -1.0}, "background_rate = -1"),
@@ -149,3 +151,88 @@ def test_inadmissible_arguments_are_refused(arguments, message):
     events = events_of(track(0.0), 0.0)
     with pytest.raises(ValueError, match=message):
         inversion.photon_ground_and_canopy(events, **{"distance": DISTANCE, **arguments})
+
+
+def bent_ground(x):
+    return 3.0 + 6.0 * np.sin(x / 25.0)
+
+
+def test_the_ground_bends_and_may_lie_under_a_tall_canopy():
+    """A dense canopy 5 to 15 m above a ground that returns a tenth of a photon in each pulse, by day."""
+    height = np.arange(80.0, -40.0, -0.1)
+    above = height - bent_ground(DISTANCE)[:, None]
+    echo = np.exp(-0.5 * (above / 0.15) ** 2)
+    layer = ((above > BASE) & (above < TOP)).astype(float)
+    photons_per_pulse = sum(n * s / s.sum(axis=1, keepdims=True) for n, s in ((0.5, echo), (1.5, layer)))
+    wave = SimpleNamespace(
+        time=-2.0 * height / jl.SPEED_OF_LIGHT,
+        wavelength=np.array([532.0]),
+        energy=photons_per_pulse[:, None] * PLANCK_TIMES_LIGHT / 532.0,
+        zenith=np.zeros(SHOTS),
+    )
+    heights = inversion.photon_ground_and_canopy(events_of(wave, 2e6), DISTANCE)
+    error = heights.ground - bent_ground(heights.distance)
+    assert np.median(np.abs(error)) < 0.2
+    assert np.max(np.abs(error[heights.quality == "good"])) < 2.0
+    assert np.isfinite(heights.canopy).mean() >= 0.8
+    assert len(str(heights).splitlines()) == 11
+
+
+def test_standard_errors_hold_and_few_photons_are_doubtful():
+    errors_in_sigmas = []
+    for seed in range(4):
+        events = events_of(track(0.0, ground=0.3, canopy=0.0), 2e6, seed)
+        heights = inversion.photon_ground_and_canopy(events, DISTANCE)
+        has_ground = np.isfinite(heights.ground)
+        errors_in_sigmas.append(((heights.ground - GROUND) / heights.ground_stderr)[has_ground])
+    assert np.mean(np.abs(np.concatenate(errors_in_sigmas)) < 2.0) > 0.9
+    # About two photons of signal in 5 m: many segments still have a ground.
+    assert np.concatenate(errors_in_sigmas).size > 20
+    # Without any ground, the lower edge of the canopy may count as ground, but not as a good one.
+    blocked = inversion.photon_ground_and_canopy(events_of(track(0.0, 0.0, 4.0), 2e6), DISTANCE)
+    assert np.all(np.isnan(blocked.ground) | (blocked.ground > GROUND - 1.0))
+
+
+def test_a_recorded_track_agrees_with_the_product(shared):
+    if not (shared / "icesat2").is_dir():
+        pytest.skip("the recorded track is not beside this checkout")
+    track = jl.io.read_atl03(shared / "icesat2" / "atl03_half.h5")
+    product = jl.io.read_atl08(shared / "icesat2" / "atl08_half.h5", segment=20.0)
+    heights = inversion.photon_ground_and_canopy(track)
+    np.testing.assert_array_equal(heights.segment_id, product["segment_id"])
+    ground, canopy = heights.ground - product["ground"], heights.canopy - product["canopy"]
+    assert np.nanmedian(np.abs(ground)) < 0.3
+    assert np.nanmax(np.abs(ground[heights.quality == "good"])) < 2.0
+    has_canopy = np.isfinite(product["canopy"])
+    assert np.isfinite(heights.canopy[has_canopy]).mean() >= 0.8
+    assert np.nanmedian(np.abs(canopy)) < 1.0
+    assert heights.label.shape == (len(track),)
+    # Canopy is not made of background: few of its photons are those that the product calls noise.
+    assert np.mean(track.confidence[heights.label == 2] <= 0) < 0.35
+    coarse = inversion.photon_ground_and_canopy(track, segment=100.0)
+    assert len(coarse.distance) == 5
+    with pytest.raises(ValueError, match="distance is given; admissible for a PhotonTrack is None"):
+        inversion.photon_ground_and_canopy(track, track.distance)
+
+
+def test_short_tracks_and_tracks_without_photons_have_rows_too():
+    none = np.zeros(0)
+    numbers = {name: none.astype(int) for name in ("pulse", "confidence", "quality", "segment")}
+    columns = dict.fromkeys(("distance", "height", "latitude", "longitude", "time", "background_rate"), none)
+    rows = dict.fromkeys(
+        ("segment_start", "segment_latitude", "segment_longitude", "solar_elevation"), np.zeros(1)
+    )
+    empty = jl.io.PhotonTrack(
+        beam="gt1r",
+        segment_id=np.array([7]),
+        segment_length=np.array([20.0]),
+        **numbers,
+        **columns,
+        **rows,
+    )
+    heights = inversion.photon_ground_and_canopy(empty)
+    assert heights.quality.tolist() == ["bad"]
+    assert np.isnan(heights.ground[0])
+    assert len(heights.label) == 0
+    short = inversion.photon_ground_and_canopy(events_of(track(0.0), 1e6), DISTANCE, segment=150.0)
+    assert short.quality.tolist() == ["good", "good"]

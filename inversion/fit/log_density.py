@@ -1,0 +1,410 @@
+r"""Log-posterior density of the unknowns of one waveform, in unconstrained coordinates, for samplers.
+
+**Coordinates.** An unknown x with the bounds (a, b) is x = a + (b - a) s(u), s(u) = 1 / (1 + exp(-u)), with u
+any real number. The density of u is that of x times
+
+    |dx / du| = (b - a) s(u) s(-u).
+
+**Density.** With w(x) the record of the simulated waveform, y the observed one, C the covariance of their
+difference (`inversion.fit.data`) and q(x) the residuals of the priors (`inversion.fit.prior_residuals`),
+
+    ln p(u) = -1/2 |C^-1/2 (w - y)|^2 - 1/2 ln det C - 1/2 |q|^2 - sum_log ln x + ln |dx / du| + constant.
+
+Unknowns without prior are uniform within their bounds. The sum is over unknowns with a log-normal prior,
+whose density in x itself has the factor 1 / x. A fit leaves out that factor and ln |dx / du|: its estimate
+is the mode in x, or in ln x.
+
+**Noise.** C holds the noise of the measurement, and those of the simulation and of a recorded pulse, both
+times the unknown "scale" where there is one. So ln det C changes with the scale alone. Noise of simulation
+and pulse is that at the initial values: estimated anew at each value from few batches, it would add noise of
+its own to the density.
+
+**Simulation.** All evaluations use the same random numbers, as those of a fit do (`inversion.fit.model`,
+whose functions these are), so that the density is smooth but for small jumps, and each gradient is that of
+the waveform's expectation.
+
+**Source:** transforms and their Jacobians: Carpenter et al. (2017), J. Stat. Softw. 76(1), section on
+constrained variables; Gelman et al. (2013), Bayesian Data Analysis, chapter 12.
+"""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any, final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.scipy.linalg
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, Int, PRNGKeyArray, UInt32
+
+from inversion.fit.data import neighbour_correlation, shared_errors_of_samples
+from inversion.fit.model import ForwardModel, SimulationInputs, Values, batch_stderr, evaluate_scene
+from inversion.fit.planning import checked_plan, trace_sizes
+from inversion.fit.prior_residuals import fixed_priors
+from inversion.fit.recorder_model import RecorderModel
+from inversion.fit.retrieval import checked_problem
+from inversion.fit.solver import DEFAULT_SOLVER
+from inversion.fit.unknowns import Unknown, flat_bounds, flat_labels, flat_start
+from inversion.receiver.recorder import Recorder
+from jaxlidar import Lidar, Plan, Response, Scene, Waveform, total_reflectance
+from jaxlidar.extend import as_numpy, check_key, check_range
+
+Shapes = tuple[tuple[int, ...], ...]
+
+
+def _split_values(flat: Array, shapes: Shapes) -> Values:
+    """Return the values of the unknowns, (..., *shape), from vectors (..., n)."""
+    ends = np.cumsum([int(np.prod(shape)) for shape in shapes])
+    pieces = jnp.split(flat, ends[:-1], axis=-1)
+    return tuple(piece.reshape(*flat.shape[:-1], *shape) for piece, shape in zip(pieces, shapes))
+
+
+class _Simulation(eqx.Module):
+    """Arguments of a simulation that traces photons.
+
+    - `key_data`, `key_impl`: of the batches' random keys: typed keys cannot be pickled.
+    - `order`: sorts the columns of a Jacobian, which are computed by dependence, as the flattened unknowns.
+    """
+
+    inputs: SimulationInputs
+    key_data: UInt32[Array, "batches words"]
+    key_impl: str = eqx.field(static=True)
+    order: Int[Array, " n"]
+    shapes: Shapes = eqx.field(static=True)
+
+    @property
+    def keys(self) -> Array:
+        return jax.random.wrap_key_data(self.key_data, impl=self.key_impl)
+
+    @property
+    def n_batches(self) -> Array:
+        return jnp.asarray(len(self.key_data))
+
+    @property
+    def inputs_without_columns(self) -> SimulationInputs:
+        """Inputs by which the trace computes no column of a Jacobian."""
+        setters = tuple(setter._replace(dependence="optical") for setter in self.inputs.setters)
+        return dataclasses.replace(self.inputs, setters=setters, columns_per_voxel=0)
+
+
+@eqx.filter_custom_jvp
+def _traced_reflectance(simulation: _Simulation, flat: Array) -> Float[Array, "wavelengths bins"]:
+    values = _split_values(flat, simulation.shapes)
+    inputs = simulation.inputs_without_columns
+    return evaluate_scene(inputs, values, simulation.keys, simulation.n_batches)[0]
+
+
+@_traced_reflectance.def_jvp
+def _(primals: Any, tangents: Any) -> tuple[Array, Array]:
+    # One pass gives waveform and Jacobian, each column by its cheapest method. The tangent is linear in that
+    # of the values, so that JAX transposes it: a gradient costs this pass as well.
+    (simulation, flat), (_, flat_tangent) = primals, tangents
+    values = _split_values(flat, simulation.shapes)
+    reflectance, columns, _ = evaluate_scene(simulation.inputs, values, simulation.keys, simulation.n_batches)
+    if flat_tangent is None:
+        return reflectance, jnp.zeros_like(reflectance)
+    return reflectance, jnp.tensordot(flat_tangent, columns[simulation.order], 1)
+
+
+class _RecordNoise(eqx.Module):
+    """Observed samples and the parts of their noise.
+
+    - `samples`: (samples,) indices of the samples that have weight, in the flattened record.
+    - `observed`, `sigma`: their values, and the standard deviation of the measurement.
+    - `simulation_sigma`: standard deviation of the simulation, for a scale of 1.
+    - `shared_errors`, `correlation`: as of `inversion.fit.data.SampleNoise`; the first for a scale of 1.
+    """
+
+    samples: Int[Array, " samples"]
+    observed: Float[Array, " samples"]
+    sigma: Float[Array, " samples"]
+    simulation_sigma: Float[Array, " samples"]
+    shared_errors: Float[Array, "samples errors"] | None
+    correlation: Float[Array, "samples samples"] | None
+
+    def log_likelihood(self, record: Float[Array, "wavelengths bins"], scale: Any) -> Float[Array, ""]:
+        """Return the logarithm of the normal density of the observed samples, up to a constant."""
+        sigma = jnp.hypot(self.sigma, scale * self.simulation_sigma)
+        residual = (record.reshape(-1)[self.samples] - self.observed) / sigma
+        # Relative to the noise of the measurement: logarithms near zero lose least to rounding.
+        log_determinant = jnp.sum(jnp.log(sigma / self.sigma))
+        if self.shared_errors is not None or self.correlation is not None:
+            covariance = jnp.eye(sigma.size) if self.correlation is None else self.correlation
+            if self.shared_errors is not None:
+                shared = scale * self.shared_errors / sigma[:, None]
+                covariance = covariance + shared @ shared.T
+            cholesky = jnp.linalg.cholesky(covariance)
+            residual = jax.scipy.linalg.solve_triangular(cholesky, residual, lower=True)
+            log_determinant += jnp.sum(jnp.log(jnp.diag(cholesky)))
+        return -0.5 * jnp.sum(residual**2) - log_determinant
+
+
+@final
+class LogDensity(eqx.Module):
+    """The result of `log_density`: a log-posterior as a function of unconstrained coordinates.
+
+    `density(x)` is its logarithm up to a constant, compiled, for x of shape (n,);
+    `jax.value_and_grad(density)` its gradient. It serves `jax.vmap` and samplers written in JAX, and can be
+    pickled under the conditions of `Unknown`. Gradients of a density that traces photons are not
+    differentiated again.
+
+    - `initial`: (n,) coordinates of the starting values, with offsets and scale of a recorder fitted to them.
+    - `names`: labels of the n coordinates, with an index for elements of arrays.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> import inversion, jax
+    >>> scene = jl.Scene(ground=jl.Ground(height=0.5))
+    >>> wave = jl.simulate(jl.Lidar(), scene, key=jax.random.key(0))
+    >>> height = inversion.Unknown("ground.height", bounds=(-2.0, 2.0), name="height")
+    >>> density = inversion.log_density(wave, jl.Lidar(), scene, [height], noise=0.01, key=jax.random.key(1))
+    >>> gradient = jax.grad(density)(density.initial)
+    >>> print(density.names, f"{float(density.to_natural(density.initial)['height']):.2f} m")
+    ('height',) 0.50 m
+    """
+
+    initial: Float[Array, " n"]
+    names: tuple[str, ...] = eqx.field(static=True)
+    _unknown_names: tuple[str, ...] = eqx.field(static=True)
+    _shapes: Shapes = eqx.field(static=True)
+    _low: Float[Array, " n"]
+    _width: Float[Array, " n"]
+    _prior_centre: Float[Array, " n_scene"]
+    _prior_whitening: Float[Array, "n_scene n_scene"]
+    _has_log_prior: tuple[bool, ...] = eqx.field(static=True)
+    _simulation: _Simulation
+    # The mean response where no unknown changes it: photons have been traced once.
+    _response: Response | None
+    # None for a recorder that changes nothing, so that densities of many waveforms share one program.
+    _recorder: RecorderModel | None = eqx.field(static=True)
+    _noise: _RecordNoise
+
+    # Compiled as a method: arrays of the density are arguments, and many densities share one program.
+    @eqx.filter_jit
+    def __call__(self, x: Float[Array, "..."]) -> Float[Array, ""]:
+        """Return the log-density at unconstrained coordinates, -inf where the simulation is not finite.
+
+        **Arguments:** `x`: (n,) coordinates, in the order of `names`.
+
+        **Returns:** a scalar, up to a constant.
+
+        **Raises:** ValueError for coordinates of another shape.
+        """
+        x = self._checked(x)
+        if x.ndim != 1:
+            raise ValueError(f"x has the shape {x.shape}; admissible is ({len(self.names)},): use jax.vmap")
+        natural = self._natural(x)
+        # d x / d u, over the width of the bounds, which is a constant.
+        log_jacobian = jnp.sum(jax.nn.log_sigmoid(x) + jax.nn.log_sigmoid(-x))
+        n_scene = self._prior_centre.size
+        scene_values, recorder_values = natural[:n_scene], natural[n_scene:]
+        record, scale = self._reflectance(scene_values), 1.0
+        if self._recorder is not None:
+            record = self._recorder.record(record, recorder_values)
+            scale = self._recorder.scale_of(recorder_values)
+        total = self._noise.log_likelihood(record, scale) + self._log_prior(scene_values) + log_jacobian
+        # Samplers reject a point of density zero; NaN would stop them.
+        return jnp.where(jnp.isfinite(total), total, -jnp.inf)
+
+    def to_natural(self, x: Float[ArrayLike, "... n"]) -> dict[str, Float[Array, "..."]]:
+        """Return values of the unknowns, in their own units and by name, from unconstrained coordinates.
+
+        **Arguments:** `x`: (..., n), such as the draws of a sampler.
+
+        **Returns:** by name, (..., *shape of the unknown).
+
+        **Raises:** ValueError for coordinates of another shape.
+        """
+        natural = self._natural(self._checked(x))
+        return dict(zip(self._unknown_names, _split_values(natural, self._shapes)))
+
+    def to_unconstrained(self, values: Mapping[str, ArrayLike]) -> Float[Array, "... n"]:
+        """Return unconstrained coordinates from values of all unknowns, such as those of a fit.
+
+        **Arguments:** `values`: by name, (..., *shape of the unknown), between their bounds.
+
+        **Returns:** (..., n).
+
+        **Raises:** ValueError for a missing value, and for one outside its bounds or on them.
+        """
+        if missing := [name for name in self._unknown_names if name not in values]:
+            raise ValueError(f"values lacks {', '.join(map(repr, missing))}; admissible are all unknowns")
+        rows, low, width = [], np.asarray(self._low), np.asarray(self._width)
+        column = 0
+        for name, shape in zip(self._unknown_names, self._shapes):
+            value = as_numpy(values[name], name)
+            size, leading = int(np.prod(shape)), value.shape[: value.ndim - len(shape)]
+            if value.shape[len(leading) :] != shape:
+                raise ValueError(f"{name} has the shape {value.shape}; admissible is (..., *{shape})")
+            columns = slice(column, column + size)
+            fraction = (value.reshape(*leading, size) - low[columns]) / width[columns]
+            check_range(
+                f"{name}, in widths of its bounds,", fraction, 0.0, 1.0, low_open=True, high_open=True
+            )
+            rows.append(np.log(fraction) - np.log1p(-fraction))
+            column += size
+        return jnp.asarray(np.concatenate(rows, axis=-1), self.initial.dtype)
+
+    def _checked(self, x: Any) -> Array:
+        x = jnp.asarray(x, self.initial.dtype)
+        if x.ndim == 0 or x.shape[-1] != len(self.names):
+            raise ValueError(f"x has the shape {x.shape}; admissible is (..., {len(self.names)})")
+        return x
+
+    def _natural(self, x: Float[Array, "... n"]) -> Float[Array, "... n"]:
+        # JAX refuses arrays of unlike rank where a user has told it to.
+        low, width = (jnp.broadcast_to(bound, x.shape) for bound in (self._low, self._width))
+        return low + width * jax.nn.sigmoid(x)
+
+    def _reflectance(self, scene_values: Array) -> Float[Array, "wavelengths bins"]:
+        # Optics act on a response after it has been traced: one response serves all values of such unknowns.
+        if self._response is None:
+            return _traced_reflectance(self._simulation, scene_values)
+        values = _split_values(scene_values, self._simulation.shapes)
+        return total_reflectance(self._response, self._simulation.inputs.setup(values))
+
+    def _log_prior(self, scene_values: Array) -> Float[Array, ""]:
+        is_log = np.array(self._has_log_prior)
+        # Elements without a log-normal prior get an argument of 1, which has no logarithm to speak of.
+        tiny = jnp.finfo(scene_values.dtype).tiny
+        logarithm = jnp.log(jnp.where(is_log, jnp.maximum(scene_values, tiny), 1.0))
+        transformed = jnp.where(is_log, logarithm, scene_values)
+        residual = self._prior_whitening @ (transformed - self._prior_centre)
+        return -0.5 * jnp.sum(residual**2) - jnp.sum(logarithm)
+
+
+def log_density(
+    observed: Waveform | ArrayLike | Sequence,
+    lidar: Lidar,
+    scene: Scene,
+    unknowns: Sequence[Unknown],
+    *,
+    noise: ArrayLike | Sequence,
+    key: PRNGKeyArray,
+    time: ArrayLike | Sequence | None = None,
+    plan: Plan | None = None,
+    n_photons: float | None = None,
+    n_rays: float | None = None,
+    max_orders: int | None = None,
+    scale: tuple[float, float] | None = None,
+    recorder: Recorder | None = None,
+    noise_floor: float = 1e-3,
+) -> LogDensity:
+    """Log-posterior density of the unknowns of a scene, given one waveform, for samplers of your choice.
+
+    The prior of an unknown is its `Unknown.prior` within its bounds, or uniform within them; the likelihood
+    is normal, with the noise of the record, of the simulation and of a recorded pulse, the latter two as
+    they are at the starting values. Start from a fit (`scene=fit.scene`) where these matter.
+
+    Photons are traced once where all unknowns act through optics alone (leaf traits, reflectances, the
+    atmosphere), and with the same random numbers at each evaluation otherwise. A gradient costs a simulation
+    with its derivatives in the unknowns that need the trace, as a step of `retrieve` does.
+
+    **Arguments:**
+
+    - `observed`, `lidar`, `scene`, `unknowns`, `noise`, `key`, `time`, `plan`, `n_photons`, `n_rays`,
+      `max_orders`, `scale`, `recorder`, `noise_floor`: as for `retrieve`. The unknowns of scale and recorder
+      are uniform within their bounds. The strength of a `Smooth` prior must be given.
+
+    **Returns:** a `LogDensity`.
+
+    **Raises:** ValueError for inadmissible arguments, among them a `Smooth` prior without strength, and as
+    `retrieve` does. TypeError for arguments of another kind.
+
+    **Example:** the posterior of a reflectance by quadrature.
+
+    >>> import jaxlidar as jl
+    >>> import inversion, jax
+    >>> import jax.numpy as jnp
+    >>> scene = jl.Scene(ground=jl.Ground(reflectance=0.3))
+    >>> wave = jl.simulate(jl.Lidar(), scene, key=jax.random.key(0))
+    >>> unknown = inversion.Unknown("ground.reflectance", bounds=(0.0, 1.0), name="R")
+    >>> density = inversion.log_density(wave, jl.Lidar(), scene, [unknown], noise=0.01, key=jax.random.key(1))
+    >>> x = jnp.linspace(-2.0, 0.0, 201)[:, None]
+    >>> weight = jax.nn.softmax(jax.vmap(density)(x))
+    >>> print(f"{float(weight @ density.to_natural(x)['R']):.2f}")
+    0.30
+    """
+    check_key(key)
+    sizes = trace_sizes(n_photons, n_rays, max_orders, plan)
+    problem = checked_problem(
+        observed,
+        lidar,
+        scene,
+        unknowns,
+        noise=noise,
+        time=time,
+        solver=DEFAULT_SOLVER,
+        max_steps=1,
+        starts=1,
+        scale=scale,
+        recorder=recorder,
+        noise_floor=noise_floor,
+    )
+    observation, scene_unknowns = problem.observed, problem.unknowns
+    priors = fixed_priors(scene_unknowns)
+    plan = checked_plan(plan, problem.lidar, scene, scene_unknowns, observation.time, sizes)
+    model = ForwardModel(problem.lidar, scene, plan, scene_unknowns, key)
+    recorder_model = RecorderModel(recorder, problem.scale, problem.lidar, observation.time.size)
+    start = flat_start(scene_unknowns)
+    evaluation = model(start, with_batches=True)
+    recorder_start = np.zeros(0)
+    if recorder_model.count:
+        recorder_start = recorder_model.fit_linear(
+            flat_start(recorder_model.unknowns),
+            evaluation.reflectance,
+            observation.reflectance,
+            observation.sigma,
+        )
+    all_unknowns = [*scene_unknowns, *recorder_model.unknowns]
+    low, high = flat_bounds(all_unknowns)
+    fraction = (np.concatenate([start, recorder_start]) - low) / (high - low)
+    simulation = _Simulation(
+        inputs=model.inputs,
+        key_data=jnp.stack([jax.random.key_data(batch_key) for batch_key in model.keys]),
+        key_impl=str(jax.random.key_impl(key)),
+        order=jnp.asarray(model.order),
+        shapes=tuple(model.shapes),
+    )
+    records_plainly = recorder_model.receiver.is_identity and not recorder_model.count
+    return LogDensity(
+        initial=jnp.asarray(np.log(fraction) - np.log1p(-fraction)),
+        names=flat_labels(all_unknowns),
+        _unknown_names=tuple(unknown.name for unknown in all_unknowns),
+        _shapes=tuple(unknown.start.shape for unknown in all_unknowns),
+        _low=jnp.asarray(low),
+        _width=jnp.asarray(high - low),
+        _prior_centre=jnp.asarray(priors.centre),
+        _prior_whitening=jnp.asarray(priors.whitening),
+        _has_log_prior=tuple(map(bool, priors.is_log)),
+        _simulation=simulation,
+        _response=None if model.retraces else evaluation.response,
+        _recorder=None if records_plainly else recorder_model,
+        _noise=_record_noise(problem, recorder_model, evaluation, recorder_start),
+    )
+
+
+def _record_noise(
+    problem: Any, recorder_model: RecorderModel, evaluation: Any, recorder_values: np.ndarray
+) -> _RecordNoise:
+    """Return the samples with weight and their noise, that of simulation and pulse at an evaluation."""
+    observation = problem.observed
+    is_fitted = observation.is_fitted
+    scale = recorder_model.scale_of(recorder_values)
+    received = None
+    if evaluation.batches is not None:
+        received = recorder_model.received(evaluation.batches, recorder_values)
+    simulation_sigma = np.broadcast_to(batch_stderr(received), is_fitted.shape)[is_fitted] / scale
+    pulse_errors = recorder_model.pulse_noise(evaluation.reflectance, recorder_values)
+    shared_errors = shared_errors_of_samples(pulse_errors, is_fitted)
+    correlation = neighbour_correlation(float(recorder_model.recorder.correlation), is_fitted)
+    return _RecordNoise(
+        samples=jnp.asarray(np.flatnonzero(is_fitted)),
+        observed=jnp.asarray(observation.reflectance[is_fitted]),
+        sigma=jnp.asarray(observation.sigma[is_fitted]),
+        simulation_sigma=jnp.asarray(simulation_sigma),
+        shared_errors=None if shared_errors is None else jnp.asarray(shared_errors / scale),
+        correlation=None if correlation is None else jnp.asarray(correlation),
+    )

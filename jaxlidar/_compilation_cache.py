@@ -1,0 +1,119 @@
+"""Cache of compiled programs on disk, for later sessions."""
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import jax
+import platformdirs
+from jax.experimental.compilation_cache import compilation_cache as jax_cache
+
+from jaxlidar._executables import ExecutableStore, processor_digest
+from jaxlidar._programs import use_store
+
+# Programs that compile faster than this, s, are not stored.
+MIN_COMPILE_TIME = 0.05
+
+
+def default_folder() -> Path:
+    """Return the folder of compiled programs in the user's cache, which is that of this kind of processor.
+
+    Machines with different processors may share a home folder, and a program may use instructions that only
+    some of them have.
+    """
+    return platformdirs.user_cache_path("jaxlidar") / "programs" / processor_digest()
+
+
+class CompilationCache:
+    """The result of `compilation_cache`: a cache in use until `close`, or until its `with` block ends.
+
+    - `folder`: where programs are stored.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     with jl.compilation_cache(folder) as cache:
+    ...         print(cache.folder.is_dir())
+    True
+    """
+
+    folder: Path
+
+    def __init__(self, folder: Path, previous: Mapping[str, Any]):
+        """Store executables in the folder. `previous`: settings of JAX to which `close` returns."""
+        self.folder, self._previous = folder, dict(previous)
+        self._previous_store, self._is_open = use_store(ExecutableStore(folder)), True
+
+    def close(self) -> None:
+        """Give JAX back the settings that it had before; a second call does nothing."""
+        if self._is_open:
+            _configure(self._previous)
+            use_store(self._previous_store)
+        self._is_open = False
+
+    def __enter__(self) -> "CompilationCache":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def __repr__(self) -> str:
+        return f"CompilationCache({str(self.folder)!r})"
+
+
+def compilation_cache(folder: str | os.PathLike[str] | None = None) -> CompilationCache:
+    """Let JAX store compiled programs in a folder, and read them from there in later sessions.
+
+    Call it once at the start of a session, or use it as a context. It switches on JAX's own persistent cache,
+    for programs of all packages. Programs of jaxlidar are stored as executables as well, which are loaded
+    without being traced again. Importing jaxlidar does neither. Programs depend on the releases of packages,
+    on the processor and on your own functions, and are not reused for others. Nothing is removed from the
+    folder.
+
+    **Arguments:** `folder`: is made if it does not exist; no one else should be able to write to it, as
+    programs are run. Default None: the cache that JAX is configured for already, or else "jaxlidar/programs"
+    in the user's cache folder.
+
+    **Returns:** a `CompilationCache`, with the `folder`, and `close()` to return to JAX's former settings.
+
+    **Raises:** OSError where the folder cannot be made.
+
+    **Example:**
+
+    >>> import tempfile
+    >>> import jax, jaxlidar as jl
+    >>> with tempfile.TemporaryDirectory() as folder, jl.compilation_cache(folder) as cache:
+    ...     wave = jl.simulate(jl.Lidar(), jl.Scene(ground=jl.Ground()), key=jax.random.key(0))
+    ...     print(cache.folder.is_dir())
+    True
+    """
+    configured = jax.config.values.get("jax_compilation_cache_dir")
+    if folder is None and configured:
+        return CompilationCache(Path(configured), {})
+    path = default_folder() if folder is None else Path(folder)
+    path.mkdir(parents=True, exist_ok=True)
+    settings: dict[str, Any] = {
+        "jax_compilation_cache_dir": str(path),
+        "jax_persistent_cache_min_compile_time_secs": MIN_COMPILE_TIME,
+    }
+    if jax.__version_info__ < (0, 11) and jax.config.values.get("jax_logging_level") in (None, "NOTSET"):
+        # These versions log a false error for each program that they read from the cache: XLA compares its
+        # own tuning options with the features of the processor.
+        settings["jax_logging_level"] = "CRITICAL"
+    previous = {name: jax.config.values[name] for name in settings}
+    _configure(settings)
+    return CompilationCache(path, previous)
+
+
+def _configure(settings: Mapping[str, Any]) -> None:
+    for name, value in settings.items():
+        jax.config.update(name, value)
+    if settings:
+        # JAX reads the folder from its configuration at the first compilation only.
+        jax_cache.reset_cache()

@@ -1,0 +1,205 @@
+"""One plan for a family of scenes: many scenes of one structure, such as random ones, or those within bounds.
+
+A compiled simulation has loops of fixed length and a fixed time axis, which have to be long enough for every
+scene. Both are monotonic in quantities such as heights, sizes and slopes, so that scenes at the extremes of
+these decide. Of a stack of scenes, as many as have an extreme value of any array are examined, and two that
+combine the smallest and the largest values of all geometric arrays.
+"""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxlidar._checks import check_kind
+from jaxlidar.instrument.lidar import Lidar
+from jaxlidar.planning.effects import find_empty_materials
+from jaxlidar.planning.path_lengths import PathLengths
+from jaxlidar.planning.plan import Plan, plan
+from jaxlidar.planning.size_buckets import size_bucket
+from jaxlidar.scenes.scene import Scene, check_kinds
+
+
+def union_plan(lidar: Lidar, scenes: Sequence[Scene], plans: Sequence[Plan]) -> Plan:
+    """Return the first plan with fine time bins and loops that are long enough for the scenes of all plans.
+
+    The plans share the width of their bins, the number of orders and the samples. Scatterer channels are
+    those of the first.
+    """
+    first = plans[0]
+    # All plans share the bin width, so that the union of their bins is a whole number of bins.
+    start = min(p.bins.start for p in plans)
+    end = max(p.bins.start + p.bins.width * p.bins.count for p in plans)
+    bins = dataclasses.replace(
+        first.bins,
+        start=start,
+        count=round((end - start) / first.bins.width),
+        max_span=max(p.bins.max_span for p in plans),
+    )
+    start_distance = max(p.limits.start_distance for p in plans)
+    max_path = max(p.limits.max_path for p in plans)
+    path_lengths = [PathLengths(lidar, s) for s in scenes]
+    # Rays start above the scene: the distance down to it is part of the path.
+    longest = max_path + start_distance
+    united = first.with_limits(
+        start_distance=start_distance,
+        max_path=max_path,
+        max_flight=max(p.longest_flight(longest) for p in path_lengths),
+    ).with_config(
+        max_ray_segments=max(p.config.max_ray_segments for p in plans),
+        # A bucket of sizes, so that simulations of similar scenes share a compiled program.
+        max_faces=size_bucket(max(p.max_faces(longest) for p in path_lengths)),
+        # A sheet that lets light through in any scene must be able to.
+        covers_fully=tuple(all(c) for c in zip(*(p.config.covers_fully for p in plans))),
+    )
+    return dataclasses.replace(united, bins=bins)
+
+
+def plan_scenes(
+    lidar: Lidar,
+    scenes: Scene | Sequence[Scene],
+    *,
+    window: tuple[float, float] | None = None,
+    max_orders: int | None = None,
+    effects: Mapping[str, bool] | None = None,
+    **options: Any,
+) -> Plan:
+    """Make one plan that serves all scenes of a family: scenes of one structure with other values.
+
+    Give the scenes at the bounds of the family, or a stack of all of them. Light that a scene returns outside
+    of the fine bins of the plan is in `lost` of its waveform.
+
+    **Arguments:**
+
+    - `lidar`: a `Lidar`.
+    - `scenes`: a sequence of `Scene`, each of which the plan serves; or a stack, one `Scene` whose arrays
+      have a leading axis of scenes: of these, the scenes with extreme values are examined, and two that
+      combine the smallest and the largest values of heights, sizes, slopes and extinctions.
+    - `window`: (first, last) sample time, ns. Default None: covers what `plan` chooses for each scene.
+    - `max_orders`: orders of scattering. Default None: as many as any of the scenes calls for.
+    - `effects`, `options`: further arguments of `plan`.
+
+    **Returns:** a `Plan`.
+
+    **Raises:** ValueError for scenes of different structure, for arrays that are no stack, for a combination
+    of extreme values that is inadmissible, and as `plan` does. TypeError for arguments of another kind.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> low, high = (jl.Scene(ground=jl.Ground(height=z)) for z in (-20.0, 5.0))
+    >>> plan = jl.plan_scenes(jl.Lidar(), [low, high])
+    >>> wide = jl.plan(jl.Lidar(), low).n_samples < plan.n_samples
+    >>> print(wide)
+    True
+    """
+    examined = _extreme_scenes(scenes) if isinstance(scenes, Scene) else _checked_sequence(scenes)
+    for scene in examined:
+        check_kinds(lidar, scene)
+    # An effect that is zero in one scene may not be in another: none is left out.
+    empty_materials = {name for scene in examined for name in find_empty_materials(scene)}
+    effects = {**dict.fromkeys(sorted(empty_materials), True), **({} if effects is None else effects)}
+    common: dict[str, Any] = {**options, "effects": effects, "describe": False}
+    trials = [_plan_of(lidar, s, {**common, "window": window, "max_orders": max_orders}) for s in examined]
+    # A channel of a transmittance that is zero is harmless; one that is missing is not.
+    first = max(range(len(trials)), key=lambda i: len(trials[i].config.channels))
+    if window is None:
+        starts = [p.sample_start for p in trials]
+        ends = [p.sample_start + p.sample_interval * (p.n_samples - 1) for p in trials]
+        # A thousandth of a sample keeps the last one in a window whose end is rounded.
+        window = (min(starts), max(ends) + 1e-3 * trials[first].sample_interval)
+    common |= {
+        "window": window,
+        "max_orders": max(p.orders for p in trials),
+        "histories": all(p.config.keeps_histories for p in trials),
+        "bin_width": min(p.bins.width for p in trials),
+    }
+    if examined[first].canopy is not None:
+        common["max_step"] = max(p.limits.max_segment for p in trials)
+    order = [first, *(i for i in range(len(trials)) if i != first)]
+    plans = [_plan_of(lidar, examined[i], common) for i in order]
+    united = union_plan(lidar, [examined[i] for i in order], plans)
+    scope = united.scope._replace(
+        first_return=min(p.scope.first_return for p in trials),
+        last_return=max(p.scope.last_return for p in trials),
+        albedo=max(p.scope.albedo for p in trials),
+        automatic_orders=max_orders is None and trials[first].scope.automatic_orders,
+        automatic_window=trials[first].scope.automatic_window,
+    )
+    return dataclasses.replace(united, scope=scope)
+
+
+def _plan_of(lidar: Lidar, scene: Scene, options: dict[str, Any]) -> Plan:
+    try:
+        return plan(lidar, scene, **options)
+    except ValueError as error:
+        raise ValueError(f"a scene at the extremes of the family is inadmissible: {error}") from error
+
+
+def _checked_sequence(scenes: Any) -> list[Scene]:
+    check_kind("scenes", scenes, Sequence, "a Scene whose arrays are stacked, or a sequence of Scene")
+    if len(scenes) == 0:
+        raise ValueError("scenes is empty; admissible is one scene or more")
+    for i, scene in enumerate(scenes):
+        check_kind(f"scenes[{i}]", scene, Scene, "a Scene")
+        if jax.tree.structure(scene) != jax.tree.structure(scenes[0]):
+            raise ValueError(
+                f"scenes[{i}] and scenes[0] differ in their structure; admissible is one structure"
+            )
+    return list(scenes)
+
+
+def stack_size(scenes: Scene) -> int:
+    """Return the number of scenes in a stack.
+
+    **Raises:** ValueError for arrays without a common leading axis.
+    """
+    paths = jax.tree_util.tree_leaves_with_path(scenes)
+    sizes = {}
+    for path, leaf in paths:
+        shape = np.shape(leaf)
+        sizes[jax.tree_util.keystr(path).lstrip(".")] = shape[0] if shape else None
+    if not sizes:
+        raise ValueError("scenes has no arrays; admissible is a stack of scenes with a leading axis")
+    number = next(iter(sizes.values()))
+    for name, size in sizes.items():
+        if size is None or size != number or size == 0:
+            lengths = "no leading axis" if size is None else f"a leading axis of {size}"
+            raise ValueError(
+                f"{name} of scenes has {lengths}, where others have {number}; admissible is a stack: each "
+                "array has a leading axis of as many scenes"
+            )
+    return int(number)  # pyright: ignore[reportArgumentType]
+
+
+def scene_of_stack(scenes: Scene, index: int) -> Scene:
+    """Return one scene of a stack."""
+    return jax.tree.map(lambda a: a[index], scenes)
+
+
+def _acts_by_optics(path: tuple[Any, ...]) -> bool:
+    """Return True for arrays of leaf and bark optics, reflectances and the atmosphere."""
+    names = [getattr(entry, "name", None) for entry in path]
+    is_material = names[:2] in (["canopy", "leaf"], ["canopy", "bark"])
+    return is_material or names[:1] == ["atmosphere"] or bool({"reflectance", "transmittance"} & set(names))
+
+
+def _extreme_scenes(stack: Scene) -> list[Scene]:
+    """Return the scenes of a stack that have extreme values, and two that combine those of all geometry."""
+    number = stack_size(stack)
+    leaves, structure = jax.tree_util.tree_flatten_with_path(stack)
+    indices, extremes = {0}, ([], [])
+    for path, leaf in leaves:
+        rows = np.asarray(leaf)
+        flat = rows.reshape(number, -1)
+        if flat.shape[1]:
+            indices |= {int(np.argmin(flat.min(axis=1))), int(np.argmax(flat.max(axis=1)))}
+        # Extremes of optics need not go together: a leaf cannot reflect and transmit all light.
+        varies = np.issubdtype(rows.dtype, np.floating) and not _acts_by_optics(path)
+        for values, extreme in zip(extremes, (np.min, np.max)):
+            values.append(jnp.asarray(extreme(rows, axis=0) if varies else rows[0]))
+    combined = [jax.tree.unflatten(structure, values) for values in extremes]
+    return [scene_of_stack(stack, i) for i in sorted(indices)] + combined

@@ -1,0 +1,476 @@
+r"""Trees of bounding boxes over triangles, and rays that meet them, without a stack.
+
+Both levels of the structure are complete binary trees in heap order: node n has the children 2 n and 2 n + 1,
+the root is 1, and the N = 2^depth leaves are the nodes N to 2 N - 1. The leaves of the upper tree are
+instances of meshes, those of a lower tree the triangles of one mesh. All nodes are rows of one table of
+twelve numbers:
+
+    inner node              lowest corners of the boxes of both children, then their highest corners
+    leaf of the upper tree  the matrix M and the point o: a point x is M (x - o) in coordinates of the mesh
+    leaf of a lower tree    the three corners of a triangle
+
+so that a step of a ray reads one row, whatever its node is. A ray meets the nearer child first. In place of a
+stack it carries a *trail*, a bit for each level above its node: one where the sibling must still be visited
+(Barringer and Akenine-Moeller 2013, J. Comput. Graph. Tech. 2(1), 38). With k the number of zeros at the end
+of the trail, the next node is the sibling of the ancestor k levels up, (n >> k) XOR 1.
+
+Rays meet triangles by signed areas of their edges, seen along the ray (Woop, Benthin and Wald 2013, J.
+Comput. Graph. Tech. 2(1), 65). Neighbours compute the area of a shared edge from the same numbers. An area
+counts as zero, and so as inside, within the rounding of its two products: fused multiplications, by which
+compilers make the areas of neighbours differ, then open no gap.
+
+The search is not differentiated. `triangle_plane` then gives the distance to the plane of the triangle with
+its derivatives.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxlidar._mesh_axes import vary_with
+from jaxlidar._one_function import one_function
+from jaxlidar._vectors import FAR, Scalar, Vec, cross, dot, scale, vec, with_derivative_of
+
+# Numbers in a row of the table.
+ROW = 12
+# Components of directions below this count as this: its inverse times a length stays finite.
+_PARALLEL = 1e-15
+# Coordinate of boxes that no ray meets: beyond `FAR`.
+_NOWHERE = 1e35
+# Rays that are followed at once.
+_LANES = 128
+# Rounding of a signed area, in units of the floating-point precision and of its products.
+_AREA_ROUNDING = 4.0
+# Relative slack of the distances at which a ray leaves a box (Ize 2013, J. Comput. Graph. Tech. 2(2), 12).
+_BOX_ROUNDING = 8.0
+# Smallest cosine of incidence in derivatives: those of grazing rays are bounded.
+_MIN_COSINE = 1e-4
+
+
+class Instance(NamedTuple):
+    """The lower tree of an instance: the row before its root, its number of leaves, and 1 if one-sided."""
+
+    first_row: Int[Array, "*s"] | int
+    n_leaves: Int[Array, "*s"] | int
+    one_sided: Int[Array, "*s"] | int
+
+
+class TriangleTree(eqx.Module):
+    """An upper tree over instances, and the lower trees of their meshes.
+
+    - `table`: rows of all trees; those of the upper tree first.
+    - `instances`: for each leaf of the upper tree, the numbers of its `Instance`.
+    - `box`: the lowest and the highest corner of the box around everything, m.
+    - `uniform`: the `Instance` of all leaves where they have the same numbers; else None.
+    """
+
+    table: Float[Array, "rows 12"]
+    instances: Int[Array, "leaves 3"]
+    box: Float[Array, "2 3"]
+    uniform: tuple[int, int, int] | None = eqx.field(static=True)
+
+    @property
+    def n_leaves(self) -> int:
+        """Number of leaves of the upper tree."""
+        return self.instances.shape[0]
+
+
+class TriangleHit(NamedTuple):
+    """The triangles that rays meet first.
+
+    - `distance`: m; FAR where none is met. - `row`: that of the triangle in the table. - `leaf`: that of the
+      instance among the leaves of the upper tree.
+    """
+
+    distance: Float[Array, "*s"]
+    row: Int[Array, "*s"]
+    leaf: Int[Array, "*s"]
+
+
+def tree_order(corners: Float[np.ndarray, "n 3 3"]) -> Int[np.ndarray, " leaves"]:
+    """Return the triangle of each leaf of a complete tree; some occur twice, to fill up the last level.
+
+    Nodes are split at the median of their triangles' centres along the longest axis, level by level, so that
+    all nodes of a level are split at once.
+    """
+    centre = 0.5 * (corners.min(axis=1) + corners.max(axis=1))
+    n_triangles = len(corners)
+    depth = (n_triangles - 1).bit_length()
+    order = np.arange(1 << depth) % n_triangles
+    for level in range(depth):
+        nodes = order.reshape(1 << level, -1)
+        centres = centre[nodes]
+        axis = np.argmax(centres.max(axis=1) - centres.min(axis=1), axis=1)
+        position = np.take_along_axis(centres, axis[:, None, None], axis=2)[..., 0]
+        order = np.take_along_axis(nodes, np.argsort(position, axis=1, kind="stable"), axis=1).reshape(-1)
+    return order.astype(np.int32)
+
+
+def tree_rows(
+    leaf_rows: Float[Array, "leaves 12"], low: Float[Array, "leaves 3"], high: Float[Array, "leaves 3"]
+) -> tuple[Float[Array, "rows 12"], Float[Array, "2 3"]]:
+    """Return the rows of a tree, the first of which is not used, and the corners of the box of its root.
+
+    `low`, `high`: corners of the boxes of the leaves; of spare leaves the highest lies below the lowest.
+    """
+    levels = [leaf_rows]
+    while len(low) > 1:
+        # Rays meet no box at such a distance. In the union with a sibling, a box turned inside out adds
+        # nothing.
+        corners = [jnp.where(low > high, _NOWHERE, a).reshape(-1, 6) for a in (low, high)]
+        levels.append(jnp.concatenate(corners, axis=1))
+        low, high = (f(a.reshape(-1, 2, 3), axis=1) for f, a in ((jnp.min, low), (jnp.max, high)))
+    rows = jnp.concatenate([jnp.zeros_like(leaf_rows[:1]), *levels[::-1]])
+    return rows, jnp.concatenate([low, high])
+
+
+def triangle_rows(corners: Float[Array, "leaves 3 3"]) -> tuple[Float[Array, "rows 12"], Float[Array, "2 3"]]:
+    """Return the rows of the tree of a mesh, and its bounding box; `corners` in the order of the leaves."""
+    leaf_rows = jnp.pad(corners.reshape(-1, 9), ((0, 0), (0, ROW - 9)))
+    return tree_rows(leaf_rows, jnp.min(corners, axis=1), jnp.max(corners, axis=1))
+
+
+def instance_order(centre: Float[Array, "leaves 3"], is_real: Bool[Array, "leaves"]) -> Int[Array, "leaves"]:
+    """Return instances in the order of a space-filling curve (Morton 1966), spare ones at its end.
+
+    Instances are moved by transformations that JAX may trace: their order is found within the program, by one
+    sort of integers.
+    """
+    centre = lax.stop_gradient(centre)
+    low = jnp.min(jnp.where(is_real[:, None], centre, FAR), axis=0)
+    high = jnp.max(jnp.where(is_real[:, None], centre, -FAR), axis=0)
+    # One scale for all axes, so that cells of the curve are cubes.
+    position = (centre - low[None]) / jnp.maximum(jnp.max(high - low), 1e-30)
+    cell = jnp.clip(position * 1023.0, 0.0, 1023.0).astype(jnp.uint32)
+    code = jnp.zeros(len(centre), jnp.uint32)
+    for bit in range(10):
+        for axis in range(3):
+            code |= ((cell[:, axis] >> bit) & 1) << (3 * bit + axis)
+    return jnp.argsort(jnp.where(is_real, code, jnp.uint32(2**32 - 1)))
+
+
+class _TreeTraversal(eqx.Module):
+    """State of the rays in some lanes on their way through the trees.
+
+    - `ray`: number of the ray in each lane; their count in lanes without one.
+    - `upper_x`, `upper_w`: start and direction of the ray. - `x`, `w`: the same in coordinates of the mesh.
+    - `upper_node`, `upper_trail`: in the upper tree. - `node`, `trail`: in the lower tree.
+    - `inside`: True if the ray is in a lower tree. - `active`: False for rays that have no node left.
+    - `instance`: that of the lower tree, where instances differ.
+    - `distance`, `row`, `leaf`: as in `TriangleHit`.
+    """
+
+    ray: Int[Array, "lanes"]
+    upper_x: Vec
+    upper_w: Vec
+    x: Vec
+    w: Vec
+    upper_node: Int[Array, "lanes"]
+    upper_trail: Int[Array, "lanes"]
+    node: Int[Array, "lanes"]
+    trail: Int[Array, "lanes"]
+    inside: Bool[Array, "lanes"]
+    active: Bool[Array, "lanes"]
+    instance: Instance | None
+    distance: Float[Array, "lanes"]
+    row: Int[Array, "lanes"]
+    leaf: Int[Array, "lanes"]
+
+
+class _RayQueue(eqx.Module):
+    """Rays that wait, those in lanes, and what others have met.
+
+    - `lanes`: the rays that are being followed. - `n_sent`: number of rays of the queue that have been.
+    - `hit`: of all rays, with a spare one at the end.
+    """
+
+    lanes: _TreeTraversal
+    n_sent: Int[Array, ""]
+    hit: TriangleHit
+
+
+def nearest_triangle(
+    tree: TriangleTree, x: Vec, w: Vec, active: Bool[Array, "*s"] | None = None, *, any_hit: bool = False
+) -> TriangleHit:
+    """Find the triangles that rays meet first; with `any_hit`, one that they meet.
+
+    Rays take very different numbers of steps, and most may miss all meshes. All lanes of a loop wait for its
+    last ray, so that rays take turns (persistent threads; Aila and Laine 2009, High Performance Graphics):
+
+    1. Put the rays that meet the box around everything into a queue.
+    2. Follow as many as there are lanes, until half of these are idle (`_visit_node`).
+    3. Note what the finished rays have met, fill their lanes from the queue, and go on with 2.
+
+    **Arguments:** `x`, `w`: starts and directions. `active`: False for rays that need no answer.
+    """
+    shape = jnp.broadcast_shapes(*(a.shape for a in (*x, *w)))
+    tree = jax.tree.map(lax.stop_gradient, tree)
+    x, w = (vec(jnp.broadcast_to(lax.stop_gradient(a), shape).reshape(-1) for a in v) for v in (x, w))
+    n_rays, precision = x[0].size, float(jnp.finfo(tree.table.dtype).eps)
+    low, high = (list(corner) for corner in tree.box)
+    waits, _ = _box_distance(low, high, x, _inverse(w), jnp.full_like(x[0], FAR), precision)
+    if active is not None:
+        waits &= jnp.broadcast_to(active, shape).reshape(-1)
+    zero = jnp.zeros(n_rays + 1, jnp.int32)
+    missed = TriangleHit(jnp.full(n_rays + 1, FAR, tree.table.dtype), zero, zero)
+    n_lanes = min(n_rays, _LANES)
+    # Stream compaction: the numbers of rays that wait, in order.
+    n_waiting = jnp.sum(waits, dtype=jnp.int32)
+    rank = jnp.where(waits, jnp.cumsum(waits, dtype=jnp.int32) - 1, n_rays)
+    numbers = jnp.arange(n_rays, dtype=jnp.int32)
+    queue = jnp.full(n_rays, n_rays, jnp.int32).at[rank].set(numbers, mode="drop")
+
+    def send(ray: Int[Array, "lanes"]) -> _TreeTraversal:
+        """Return rays at the root of the upper tree; lanes whose number is that of no ray are idle."""
+        zero = jnp.zeros_like(ray)
+        number = jnp.minimum(ray, n_rays - 1)
+        start, direction = (vec(a[number] for a in v) for v in (x, w))
+        return _TreeTraversal(
+            ray=ray,
+            upper_x=start,
+            upper_w=direction,
+            x=start,
+            w=direction,
+            upper_node=zero + 1,
+            upper_trail=zero,
+            node=zero + 1,
+            trail=zero,
+            inside=zero > 0,
+            active=ray < n_rays,
+            instance=Instance(zero, zero + 1, zero) if tree.uniform is None else None,
+            distance=jnp.full(ray.shape, FAR, tree.table.dtype),
+            row=zero,
+            leaf=zero,
+        )
+
+    def follow(lanes: _TreeTraversal, n_idle: Int[Array, ""]) -> _TreeTraversal:
+        """Follow rays until more than `n_idle` lanes are idle, or all are."""
+
+        def traverse(state: tuple[_TreeTraversal, Array]) -> tuple[_TreeTraversal, Array]:
+            def continue_(state: tuple[_TreeTraversal, Array]) -> Bool[Array, ""]:
+                n_active = jnp.sum(state[0].active, dtype=jnp.int32)
+                return (n_active > 0) & (n_active >= n_lanes - state[1])
+
+            def visit(state: tuple[_TreeTraversal, Array]) -> tuple[_TreeTraversal, Array]:
+                return _visit_node(tree, state[0], any_hit, precision), state[1]
+
+            return lax.while_loop(continue_, visit, state)
+
+        # The loop is never differentiated, so that it may always be compiled as one function.
+        return one_function(traverse)((lanes, n_idle))[0]
+
+    def note(hit: TriangleHit, lanes: _TreeTraversal) -> TriangleHit:
+        """Note what finished rays have met; idle lanes write to the spare ray."""
+        number = jnp.where(lanes.active, n_rays, lanes.ray)
+        results = (lanes.distance, lanes.row, lanes.leaf)
+        return TriangleHit(*(a.at[number].set(b) for a, b in zip(hit, results)))
+
+    def take_turns(state: _RayQueue) -> _RayQueue:
+        """Fill idle lanes from the queue, and follow rays until half of the lanes are idle."""
+        is_idle = ~state.lanes.active
+        hit = note(state.hit, state.lanes)
+        position = state.n_sent + jnp.cumsum(is_idle, dtype=jnp.int32) - 1
+        is_sent = is_idle & (position < n_waiting)
+        fresh = send(jnp.where(is_sent, queue[jnp.minimum(position, n_rays - 1)], n_rays))
+        lanes = jax.tree.map(lambda a, b: jnp.where(is_idle, a, b), fresh, state.lanes)
+        n_sent = jnp.minimum(state.n_sent + jnp.sum(is_idle, dtype=jnp.int32), n_waiting)
+        # Nobody waits any more: follow the last ones to their ends.
+        n_idle = jnp.where(n_sent < n_waiting, n_lanes // 2, n_lanes)
+        return _RayQueue(follow(lanes, n_idle), n_sent, hit)
+
+    def goes_on(state: _RayQueue) -> Bool[Array, ""]:
+        return (state.n_sent < n_waiting) | jnp.any(state.lanes.active)
+
+    idle = send(jnp.full(n_lanes, n_rays, jnp.int32))
+    state = vary_with(_RayQueue(idle, jnp.zeros((), jnp.int32), missed), (tree, x, w, waits))
+    state = lax.while_loop(goes_on, take_turns, state)
+    hit = note(state.hit, state.lanes)
+    return TriangleHit(*(a[:n_rays].reshape(shape) for a in hit))
+
+
+def _visit_node(tree: TriangleTree, s: _TreeTraversal, any_hit: bool, precision: float) -> _TreeTraversal:
+    """Let the ray of each lane visit one node.
+
+    1. Read the row of the node.
+    2. Of an inner node, intersect both boxes, and go on to the nearer one; the trail notes the other.
+    3. Of an instance, transform the ray, and go on to the root of its tree.
+    4. Of a triangle, intersect it.
+    5. Where nothing below is met, go on to the next node of the trail; at the end of a lower tree, to that of
+       the upper tree; at the end of the latter, stop.
+    """
+    n_upper, instance = tree.n_leaves, s.instance
+    if instance is None:
+        assert tree.uniform is not None
+        instance = Instance(*tree.uniform)
+    # 1.
+    node, trail = jnp.where(s.inside, s.node, s.upper_node), jnp.where(s.inside, s.trail, s.upper_trail)
+    index = jnp.where(s.inside, instance.first_row, 0) + node
+    row = [tree.table.at[index, k].get(mode="promise_in_bounds") for k in range(ROW)]
+    is_leaf = node >= jnp.where(s.inside, instance.n_leaves, n_upper)
+    start, direction = (
+        vec(jnp.where(s.inside, a, b) for a, b in zip(p, q)) for p, q in ((s.x, s.upper_x), (s.w, s.upper_w))
+    )
+    # 2. Boxes beyond the nearest triangle so far are not met.
+    inverse = _inverse(direction)
+    boxes = [
+        _box_distance(row[k : k + 3], row[k + 6 : k + 9], start, inverse, s.distance, precision)
+        for k in (0, 3)
+    ]
+    (first_met, first_near), (second_met, second_near) = boxes
+    descends = ~is_leaf & (first_met | second_met)
+    takes_second = second_met & (~first_met | (second_near < first_near))
+    # 3.
+    enters = ~s.inside & is_leaf
+    leaf = jnp.where(s.inside | enters, s.upper_node - n_upper, 0)
+    local_x, local_w = to_mesh(row, s.upper_x, s.upper_w)
+    next_instance = s.instance
+    if s.instance is not None:
+        entered = [tree.instances.at[leaf, k].get(mode="promise_in_bounds") for k in range(3)]
+        next_instance = Instance(*(jnp.where(enters, a, b) for a, b in zip(entered, s.instance)))
+    # 4.
+    distance = _triangle_distance(row, start, direction, instance.one_sided, precision)
+    is_nearer = s.active & s.inside & is_leaf & (distance < s.distance)
+    nearest = jnp.where(is_nearer, distance, s.distance)
+    # 5.
+    next_node, next_trail, has_ended = _next_on_trail(node, trail)
+    has_ended &= ~descends
+    next_node = jnp.where(descends, 2 * node + takes_second.astype(node.dtype), next_node)
+    next_trail = jnp.where(descends, 2 * trail + (first_met & second_met).astype(trail.dtype), next_trail)
+    leaves_mesh, in_upper = s.inside & has_ended, ~s.inside & ~enters
+    upper_node, upper_trail, upper_has_ended = _next_on_trail(s.upper_node, s.upper_trail)
+    active = s.active & ~(leaves_mesh & upper_has_ended) & ~(in_upper & has_ended)
+    return _TreeTraversal(
+        ray=s.ray,
+        upper_x=s.upper_x,
+        upper_w=s.upper_w,
+        x=vec(jnp.where(enters, a, b) for a, b in zip(local_x, s.x)),
+        w=vec(jnp.where(enters, a, b) for a, b in zip(local_w, s.w)),
+        upper_node=jnp.where(leaves_mesh, upper_node, jnp.where(in_upper, next_node, s.upper_node)),
+        upper_trail=jnp.where(leaves_mesh, upper_trail, jnp.where(in_upper, next_trail, s.upper_trail)),
+        node=jnp.where(enters, 1, next_node),
+        trail=jnp.where(enters, 0, next_trail),
+        inside=enters | (s.inside & ~has_ended),
+        active=active & (nearest >= FAR) if any_hit else active,
+        instance=next_instance,
+        distance=nearest,
+        row=jnp.where(is_nearer, index, s.row),
+        leaf=jnp.where(is_nearer, leaf, s.leaf),
+    )
+
+
+def _inverse(w: Vec) -> Vec:
+    """Return the inverse of each component of directions, finite where a ray is parallel to a plane."""
+    return vec(1.0 / jnp.where(jnp.abs(a) < _PARALLEL, _PARALLEL, a) for a in w)
+
+
+def to_mesh(row: list[Scalar], x: Vec, w: Vec) -> tuple[Vec, Vec]:
+    """Transform rays to coordinates of a mesh, M (x - o) and M w; distances along them stay as they are."""
+    offset = vec(a - b for a, b in zip(x, row[9:12]))
+    matrix = [vec(row[3 * k : 3 * k + 3]) for k in range(3)]
+    return vec(dot(m, offset) for m in matrix), vec(dot(m, w) for m in matrix)
+
+
+def triangle_plane(tree: TriangleTree, hit: TriangleHit, x: Vec, w: Vec) -> tuple[Scalar, Vec]:
+    """Return the distance along rays to the planes of triangles that they meet, and their unit normals.
+
+    Both are differentiated with respect to rays, vertices and instances. The normal n of a plane with the
+    cross product m of its sides in coordinates of the mesh is M^T m over its length. Where nothing is met,
+    the values have no meaning.
+    """
+    corner, transform = (
+        [tree.table.at[number, k].get(mode="promise_in_bounds") for k in range(ROW)]
+        # The upper tree has its leaves in the second half of its rows.
+        for number in (hit.row, hit.leaf + tree.n_leaves)
+    )
+    is_met = hit.distance < FAR
+    a, b, c = (vec(corner[k : k + 3]) for k in (0, 3, 6))
+    sides = [vec(p - q for p, q in zip(other, a)) for other in (b, c)]
+    # A fixed vector where nothing is met keeps quotients finite.
+    local_normal = vec(jnp.where(is_met, m, unit) for m, unit in zip(cross(*sides), (0.0, 0.0, 1.0)))
+    start, direction = to_mesh(transform, x, w)
+    cosine, ahead = dot(local_normal, direction), dot(local_normal, vec(p - q for p, q in zip(a, start)))
+    normal = vec(dot(local_normal, vec(transform[k + 3 * j] for j in range(3))) for k in range(3))
+    normal = vec(jnp.where(is_met, m, unit) for m, unit in zip(normal, (0.0, 0.0, 1.0)))
+    length = jnp.sqrt(dot(normal, normal))
+    # |cosine| of incidence is |local_normal . direction| / |M^T local_normal|, as w has the length one.
+    least = _MIN_COSINE * lax.stop_gradient(length)
+    is_grazing = jnp.abs(cosine) < least
+    cosine = jnp.where(is_grazing, jnp.where(cosine < 0, -least, least), cosine)
+    plane_distance = ahead / cosine
+    # From the areas of a large triangle the distance is known to the rounding of its size, from the plane to
+    # that of the height above it. Grazing rays meet the plane within the triangle by the areas alone.
+    distance = jnp.where(is_met & ~is_grazing, jnp.maximum(plane_distance, 0.0), hit.distance)
+    distance = with_derivative_of(distance, jnp.where(is_met, plane_distance, FAR))
+    return distance, scale(normal, 1.0 / length)
+
+
+def _next_on_trail(node: Array, trail: Array) -> tuple[Array, Array, Array]:
+    """Return the next node of a trail, the trail behind it, and True where the trail has ended."""
+    has_ended = trail == 0
+    # The lowest bit less one has as many ones as the trail has zeros at its end.
+    up = jnp.where(has_ended, 0, lax.population_count((trail & -trail) - 1))
+    # At the end the node stays, so that it is always one of the tree.
+    return jnp.where(has_ended, node, (node >> up) ^ 1), jnp.where(has_ended, 0, (trail >> up) ^ 1), has_ended
+
+
+def _box_distance(
+    low: list[Scalar], high: list[Scalar], x: Vec, inverse: Vec, largest: Scalar, precision: float
+) -> tuple[Bool[Array, "rays"], Scalar]:
+    """Return True where rays meet a box, no farther than `largest`, and where they enter it, m."""
+    enter, leave = jnp.zeros_like(largest), largest
+    for a, b, start, rate in zip(low, high, x, inverse):
+        first, second = (a - start) * rate, (b - start) * rate
+        enter = jnp.maximum(enter, jnp.minimum(first, second))
+        leave = jnp.minimum(leave, jnp.maximum(first, second))
+    return enter <= leave * (1.0 + _BOX_ROUNDING * precision), enter
+
+
+def _triangle_distance(row: list[Scalar], x: Vec, w: Vec, one_sided: Array | int, precision: float) -> Scalar:
+    """Return the distance along rays to triangles, FAR where they are missed (see the module)."""
+    size = [jnp.abs(a) for a in w]
+    z_largest = (size[2] >= size[0]) & (size[2] >= size[1])
+    x_largest = ~z_largest & (size[0] >= size[1])
+
+    def permute(v: Vec) -> Vec:
+        """Permute axes cyclically, so that the largest component of the direction is the last."""
+        return vec(
+            jnp.where(z_largest, v[k], jnp.where(x_largest, v[(k + 1) % 3], v[(k + 2) % 3])) for k in range(3)
+        )
+
+    direction = permute(w)
+    along_last = jnp.where(jnp.abs(direction[2]) > 0, direction[2], 1.0)
+    shear_x, shear_y, inverse = direction[0] / along_last, direction[1] / along_last, 1.0 / along_last
+
+    def seen_along_ray(k: int) -> Vec:
+        """Return a corner, relative to the start, sheared so that the ray is the last axis."""
+        p = permute(vec(a - b for a, b in zip(row[k : k + 3], x)))
+        return p[0] - shear_x * p[2], p[1] - shear_y * p[2], inverse * p[2]
+
+    a, b, c = (seen_along_ray(k) for k in (0, 3, 6))
+    areas, roundings = [], []
+    for p, q in ((c, b), (a, c), (b, a)):
+        first, second = p[0] * q[1], p[1] * q[0]
+        areas.append(first - second)
+        roundings.append(_AREA_ROUNDING * precision * (jnp.abs(first) + jnp.abs(second)))
+    is_inside = jnp.ones_like(z_largest)
+    is_inside_reversed = is_inside
+    for area, rounding in zip(areas, roundings):
+        is_inside &= area >= -rounding
+        is_inside_reversed &= area <= rounding
+    total = areas[0] + areas[1] + areas[2]
+    # Triangles that are seen edge-on have no area, and are met at their neighbours.
+    has_area = jnp.abs(total) > 0
+    numerator = areas[0] * a[2] + areas[1] * b[2] + areas[2] * c[2]
+    distance = numerator / jnp.where(has_area, total, 1.0)
+    # By rounding of areas the quotient may lie beyond the corners.
+    lowest, highest = jnp.minimum(jnp.minimum(a[2], b[2]), c[2]), jnp.maximum(jnp.maximum(a[2], b[2]), c[2])
+    distance = jnp.clip(distance, lowest, highest)
+    is_met = (is_inside | is_inside_reversed) & has_area & (distance > 0)
+    # With corners counter-clockwise as seen from the side of light, `total` has the sign of the direction.
+    is_met &= (one_sided == 0) | (total * along_last > 0)
+    return jnp.where(is_met, distance, FAR)

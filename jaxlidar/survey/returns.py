@@ -1,0 +1,983 @@
+r"""Discrete returns of waveforms: detection of echoes, and their positions, strengths and materials.
+
+With the sample times t_j and a record y(t) in J per sample, less its background:
+
+- **peak**: a return is a local maximum of y that reaches the threshold and exceeds, by the threshold, the
+  lowest sample between it and any higher neighbour (its prominence). Its time and amplitude are those of
+  the apex of the parabola through ln y at three samples, which is exact for a Gaussian.
+- **constant fraction**: a return is such a maximum before which the record falls below a fraction f of it.
+  Its time is that at which the leading edge crosses f times the amplitude.
+- **leading edge**: a return begins when the record rises through the threshold, and ends when it falls
+  below half of that. Its time is that of the crossing.
+- **decomposition**: the record is fitted by copies of the pulse, which may be broadened
+  (`inversion.gaussian_decomposition`).
+
+**Calibration.** A detector reads another time than the pulse's time zero: the time of its peak, or of a
+level on its leading edge. What it reads of the pulse itself, scaled to the amplitude of the return, is
+subtracted, so that a flat target perpendicular to the beam has no error of range. What overlapping or
+broadened echoes add is the detector's error, as in instruments.
+
+**Threshold.** If none is given, it is the larger of five standard deviations of the noise at the sample,
+and 1 % of the largest sample of the shot.
+
+**Extent.** A return owns the samples around its maximum down to the dip between it and the next return, or
+until the record falls to the larger of one standard deviation of the noise and 0.1 % of the shot's largest
+sample. Apparent reflectance, material and ground share are sums over them.
+
+Source: Wagner et al. (2004), Int. Arch. Photogramm. Remote Sens. 35, part B3, 201 (detectors); ASPRS
+(2019), LAS specification 1.4 (return numbers and classes).
+"""
+
+import dataclasses
+import os
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, NamedTuple, final
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Bool, Float, Int, Shaped
+
+from jaxlidar._checks import (
+    as_numpy,
+    briefly,
+    check_choice,
+    check_integer,
+    check_kind,
+    check_number,
+    check_range,
+)
+from jaxlidar._constants import SPEED_OF_LIGHT
+from jaxlidar._registry import decompose_records
+from jaxlidar.instrument.lidar import Lidar
+from jaxlidar.instrument.survey import beam_directions
+from jaxlidar.io.airborne import AirborneShot, Returns, Segment
+from jaxlidar.io.las import write_las
+from jaxlidar.survey.acquisition import PULSE_OVERSAMPLING, Acquisition, radiometric_constant, sampled_pulse
+from jaxlidar.survey.progress import ProgressClock, SurveyProgress
+
+DETECTORS = ("peak", "constant fraction", "leading edge", "decomposition")
+# Largest number of returns of a pulse that LAS 1.4 holds.
+MAX_LAS_RETURNS = 15
+# Threshold in standard deviations of the noise, and over the largest sample of the shot.
+_NOISE_FACTOR, _RELATIVE_THRESHOLD = 5.0, 0.01
+# The samples of a return lie above one standard deviation of the noise and this fraction of the largest
+# sample.
+_RELATIVE_FLOOR = 1e-3
+# A leading edge discriminator is armed again when the record has fallen below this fraction of the threshold.
+_HYSTERESIS = 0.5
+# Samples that are worked on at once: arrays of less than a megabyte stay in a processor's cache.
+_SAMPLES_AT_ONCE = 100_000
+# Records that are decomposed together, by one compiled program; fewer are filled up with empty ones.
+_RECORDS_AT_ONCE = 64
+# Gaps of the signal below this many lengths of the pulse do not divide a record that is decomposed.
+_MIN_GAP_OF_PULSE = 1.0
+_FWHM_OF_STD = 2.0 * np.sqrt(2.0 * np.log(2.0))
+# Materials of samples in which nothing returned, and heights (m above ground) that divide vegetation into the
+# classes 3, 4 and 5 of the LAS specification.
+_NO_MATERIAL = "noise"
+_VEGETATION_LIMITS = (0.5, 2.0)
+_GROUND_CLASS, _UNCLASSIFIED, _LOW_VEGETATION, _LOW_NOISE, _HIGH_NOISE = 2, 1, 3, 7, 18
+# Intensity, of 16 bits, of an apparent reflectance of one.
+_FULL_INTENSITY = 65535
+_ORDERS = ("first", "higher")
+
+
+@final
+@briefly
+class DiscreteReturns(eqx.Module):
+    """Discrete returns of the shots of a survey, by shot and range. `len(returns)` is their number.
+
+    - `shot`: (returns,) number of the shot, from 0.
+    - `time`: (returns,) ns on the shot's time axis. `range`: (returns,) m from the sensor.
+    - `position`: (returns, 3) m, on the axis of the beam, in double precision.
+    - `amplitude`: (returns,) J per sample, largest value of the echo; of a truth, J in all.
+    - `width`: (returns,) ns, full width at half maximum.
+    - `reflectance`: (returns,) apparent reflectance, the sum over the samples of the return.
+    - `number`, `n_returns`: (returns,) number of the return in its shot, from 1, and how many the shot has.
+    - `material`: (returns,) material that most of the return's light was last scattered by: "ground", "leaf",
+      "bark", "plate", "air"; "noise" where nothing returned. `ground_share`: (returns,) fraction that was
+      scattered last by the ground.
+    - `ground_height`: (returns,) m, of the ground below, where the beam's axis meets it; NaN where there is
+      none.
+    - `gps_time`: (returns,) s, NaN if unknown; `scan_angle`: (returns,) degrees; `flight_line`: (returns,).
+
+    Material and ground share are from the simulation; instruments do not record them.
+
+    **Example:**
+
+    >>> import jax, jaxlidar as jl
+    >>> plate = jl.Plate(height=6.0, reflectance=0.4, coverage=0.5)
+    >>> scene = jl.Scene(plates=[plate], ground=jl.Ground(reflectance=0.3))
+    >>> survey = jl.Survey.grid(jl.Lidar(), low=(0, 0), high=(10, 0), spacing=10.0)
+    >>> returns = jl.simulate_many(survey, scene, key=jax.random.key(0)).returns()
+    >>> print(returns)
+    4 returns of 2 shots: 2 ground, 2 plate
+    >>> print(returns.position[:2, 2].round(2), returns.number[:2])
+    [6. 0.] [1 2]
+    """
+
+    shot: Int[np.ndarray, " returns"]
+    time: Float[np.ndarray, " returns"]
+    range: Float[np.ndarray, " returns"]
+    position: Float[np.ndarray, "returns 3"]
+    amplitude: Float[np.ndarray, " returns"]
+    width: Float[np.ndarray, " returns"]
+    reflectance: Float[np.ndarray, " returns"]
+    number: Int[np.ndarray, " returns"]
+    n_returns: Int[np.ndarray, " returns"]
+    material: Shaped[np.ndarray, " returns"]
+    ground_share: Float[np.ndarray, " returns"]
+    ground_height: Float[np.ndarray, " returns"]
+    gps_time: Float[np.ndarray, " returns"]
+    scan_angle: Float[np.ndarray, " returns"]
+    flight_line: Float[np.ndarray, " returns"]
+    n_shots: int = eqx.field(static=True)
+
+    def __len__(self) -> int:
+        return len(self.shot)
+
+    def __str__(self) -> str:
+        names, counts = np.unique(self.material, return_counts=True)
+        materials = ", ".join(f"{count:,} {name}" for name, count in zip(names, counts)) or "none"
+        plural = "s" * (self.n_shots != 1)
+        return f"{len(self):,} returns of {self.n_shots:,} shot{plural}: {materials}"
+
+    @property
+    def classification(self) -> Int[np.ndarray, " returns"]:
+        """Classes of the LAS specification, (returns,), by the true material.
+
+        2 ground; 3, 4 and 5 leaf and bark up to 0.5 m, up to 2 m and higher above the ground (5 also where
+        there is none); 1 plates; 18 air; 7 noise.
+        """
+        height = self.position[:, 2] - self.ground_height
+        # Comparisons with NaN are false: without ground, vegetation is high.
+        vegetation = np.full(len(self), _LOW_VEGETATION + len(_VEGETATION_LIMITS))
+        for number, limit in reversed(list(enumerate(_VEGETATION_LIMITS))):
+            vegetation[height <= limit] = _LOW_VEGETATION + number
+        classes = np.where(np.isin(self.material, ("leaf", "bark")), vegetation, _UNCLASSIFIED)
+        for name, number in (("ground", _GROUND_CLASS), ("air", _HIGH_NOISE), (_NO_MATERIAL, _LOW_NOISE)):
+            classes[self.material == name] = number
+        return classes
+
+    @property
+    def intensity(self) -> Int[np.ndarray, " returns"]:
+        """Apparent reflectance in whole steps, (returns,): 65535 is one, or the largest above one."""
+        largest = max(1.0, float(np.max(self.reflectance, initial=0.0)))
+        return np.round(np.maximum(self.reflectance, 0.0) * (_FULL_INTENSITY / largest)).astype(int)
+
+    def to_las(self, path: str | os.PathLike[str], *, crs: str | None = None) -> None:
+        """Write the returns as a LAS or LAZ file: version 1.4, point format 6.
+
+        Points have return numbers, `classification`, `intensity`, GPS time (0 if unknown), scan angle, the
+        flight line as point source, and as extra bytes "width" (ns), "reflectance", "amplitude" (J) and
+        "ground share". `jaxlidar.io.read_las` drops points of noise (classes 7 and 18).
+
+        **Arguments:**
+
+        - `path`: the file, which ends in ".las" or ".laz".
+        - `crs`: coordinate reference system of the scene, in metres, such as "EPSG:32633". Default None: not
+          known. This needs rasterio.
+
+        **Raises:** as `jaxlidar.io.write_las`; ValueError where there is no return, and for more than 15 of
+        one shot (`max_returns` of `Waveforms.returns`).
+
+        **Example:**
+
+        >>> import pathlib, tempfile
+        >>> import jax, jaxlidar as jl
+        >>> survey = jl.Survey.grid(jl.Lidar(), low=(0, 0), high=(10, 0), spacing=10.0)
+        >>> many = jl.simulate_many(survey, jl.Scene(ground=jl.Ground(2.5)), key=jax.random.key(0))
+        >>> path = pathlib.Path(tempfile.mkdtemp()) / "strip.laz"
+        >>> many.returns().to_las(path)
+        >>> cloud = jl.io.read_las(path)
+        >>> print(cloud.position[:, 2].round(2), cloud.classification)
+        [2.5 2.5] [2 2]
+        """
+        write_las(
+            path,
+            self.position,
+            intensity=self.intensity,
+            return_number=self.number,
+            number_of_returns=self.n_returns,
+            gps_time=np.where(np.isnan(self.gps_time), 0.0, self.gps_time),
+            classification=self.classification,
+            scan_angle=self.scan_angle,
+            point_source=self.flight_line,
+            extra={
+                "width": ("full width at half maximum, ns", self.width),
+                "reflectance": ("apparent reflectance", self.reflectance),
+                "amplitude": ("peak energy per sample, J", self.amplitude),
+                "ground share": ("fraction scattered by ground", self.ground_share),
+            },
+            crs=crs,
+        )
+
+
+# -- geometry ----------------------------------------------------------------------------------------------
+
+
+class ShotAxes(NamedTuple):
+    """Axes of beams, for the positions and ranges of what returns along them.
+
+    - `origin`: (shots, 3) m, where the axis is at time zero. - `direction`: (shots, 3) unit vectors.
+    - `distance`: (shots,) m from the sensor to the origin.
+    """
+
+    origin: Float[np.ndarray, "shots 3"]
+    direction: Float[np.ndarray, "shots 3"]
+    distance: Float[np.ndarray, " shots"]
+
+
+def position_along_beam(
+    origin: Float[np.ndarray, "n 3"],
+    direction: Float[np.ndarray, "n 3"],
+    two_way_time: Float[np.ndarray, " n"],
+) -> Float[np.ndarray, "n 3"]:
+    """Return where light is scattered that returns `two_way_time` ns after light from the origin, m."""
+    return origin + (0.5 * SPEED_OF_LIGHT) * two_way_time[:, None] * direction
+
+
+def _shot_axes(
+    position: Float[np.ndarray, "shots 2"],
+    zenith: Float[np.ndarray, " shots"],
+    azimuth: Float[np.ndarray, " shots"],
+    altitude: float,
+) -> ShotAxes:
+    """Return the axes of shots that aim at positions of the reference plane, from an altitude above it."""
+    origin = np.pad(np.asarray(position, float), ((0, 0), (0, 1)))
+    return ShotAxes(origin, beam_directions(zenith, azimuth), altitude / np.cos(np.deg2rad(zenith)))
+
+
+# -- waveforms as input ------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class DetectorInput:
+    """The waveforms of shots at one wavelength, and what is known of the shots.
+
+    - `time`: (samples,) ns. - `recorded`, `energy`, `stderr`: (shots, samples), as those of `Waveforms`.
+    - `components`: by material, (shots, samples) apparent reflectance. - `truth`: the same of
+      `Truths.returns`, or None.
+    - `axes`: of the beams. - `acquisition`: of the shots. - `constant`: radiometric constant, J m2.
+    - `ground_height`: (shots,) m.
+    """
+
+    time: Float[np.ndarray, " samples"]
+    recorded: Float[np.ndarray, "shots samples"]
+    energy: Float[np.ndarray, "shots samples"]
+    stderr: Float[np.ndarray, "shots samples"]
+    components: Mapping[str, Float[np.ndarray, "shots samples"]]
+    truth: Mapping[str, Float[np.ndarray, "shots samples"]] | None
+    axes: ShotAxes
+    acquisition: Acquisition
+    constant: float
+    ground_height: Float[np.ndarray, " shots"]
+
+    def __len__(self) -> int:
+        return len(self.recorded)
+
+    @property
+    def step(self) -> float:
+        """Time from sample to sample, ns."""
+        return float(self.time[-1] - self.time[0]) / max(self.time.size - 1, 1)
+
+    @property
+    def chunks(self) -> Iterator[slice]:
+        """Slices of shots that are worked on at once."""
+        size = max(_SAMPLES_AT_ONCE // self.time.size, 1)
+        return (slice(i, min(i + size, len(self))) for i in range(0, len(self), size))
+
+    def range_at(self, shot: np.ndarray, time: np.ndarray) -> np.ndarray:
+        """Distances in m from the sensor, of light that returns at times in ns."""
+        return self.axes.distance[shot] + 0.5 * SPEED_OF_LIGHT * time
+
+
+def wavelength_index(wavelength: Any, wavelengths: np.ndarray) -> int:
+    """Return the index of a wavelength in nm; None is the first."""
+    if wavelength is None:
+        return 0
+    check_number("wavelength", wavelength, 0.0, low_open=True)
+    (matches,) = np.nonzero(np.isclose(wavelengths, float(wavelength), rtol=1e-6))
+    if matches.size == 0:
+        raise ValueError(f"wavelength = {float(wavelength):g} nm is none of {wavelengths.tolist()}")
+    return int(matches[0])
+
+
+def input_of_waveforms(waves: Any, wavelength: Any) -> DetectorInput:
+    """Return the input of a `Waveforms`. **Raises:** ValueError for those of an earlier version's file."""
+    if waves.acquisition is None:
+        raise ValueError(
+            "the waveforms have no acquisition, which files of earlier versions lack: simulate them again"
+        )
+    w = wavelength_index(wavelength, np.asarray(waves.wavelength, float))
+    zenith, azimuth = np.asarray(waves.zenith, float), np.asarray(waves.azimuth, float)
+    return DetectorInput(
+        time=np.asarray(waves.time, float),
+        recorded=waves.recorded[:, w],
+        energy=waves.energy[:, w],
+        stderr=waves.stderr[:, w],
+        components={name: a[:, w] for name, a in waves.components.items() if name not in _ORDERS},
+        truth=None if waves.truth is None else {name: a[:, w] for name, a in waves.truth.returns.items()},
+        axes=_shot_axes(waves.position, zenith, azimuth, float(waves.info["altitude"])),
+        acquisition=waves.acquisition,
+        constant=float(waves.acquisition.radiometric_constant[w]),
+        ground_height=np.asarray(waves.ground_height, float),
+    )
+
+
+def input_of_waveform(wave: Any, lidar: Any, wavelength: Any) -> DetectorInput:
+    """Return the input of a `Waveform` and its lidar. **Raises:** as `Waveform.returns`."""
+    check_kind("lidar", lidar, Lidar, "the Lidar of the waveform")
+    if not np.array_equal(np.asarray(lidar.wavelength), np.asarray(wave.wavelength)):
+        raise ValueError(
+            f"lidar has {np.asarray(lidar.wavelength).tolist()} nm, the waveform "
+            f"{np.asarray(wave.wavelength).tolist()} nm"
+        )
+    w = wavelength_index(wavelength, np.asarray(wave.wavelength, float))
+    zenith, azimuth = (np.asarray(a, float).reshape(1) for a in (lidar.zenith, lidar.azimuth))
+    constants = radiometric_constant(lidar)
+
+    def row(array: Any) -> np.ndarray:
+        return np.asarray(array)[w][None]
+
+    truth = wave.truth
+    # The truth has the height of the ground over the footprint.
+    ground = np.nan if truth is None else float(truth.surface_height.get("ground", np.nan))
+    return DetectorInput(
+        time=np.asarray(wave.time, float),
+        recorded=row(wave.recorded),
+        energy=row(wave.energy),
+        stderr=row(wave.stderr),
+        components={name: row(a) for name, a in wave.components.items() if name not in _ORDERS},
+        truth=None if truth is None else {name: row(a) for name, a in truth.returns.items()},
+        axes=_shot_axes(np.asarray(lidar.position, float)[None], zenith, azimuth, float(lidar.altitude)),
+        acquisition=Acquisition(np.full(1, np.nan), zenith, np.ones(1), sampled_pulse(lidar), constants),
+        constant=float(constants[w]),
+        ground_height=np.full(1, ground),
+    )
+
+
+# -- detection ---------------------------------------------------------------------------------------------
+
+
+class _Echoes(NamedTuple):
+    """Echoes of some records, in order of records and times; times and widths are in samples.
+
+    - `row`: number of the record. - `time`: from the first sample. - `amplitude`: J per sample. - `width`:
+      full width at half maximum. - `start`, `end`: the first sample of the echo, and the one after its last.
+    """
+
+    row: Int[np.ndarray, " echoes"]
+    time: Float[np.ndarray, " echoes"]
+    amplitude: Float[np.ndarray, " echoes"]
+    width: Float[np.ndarray, " echoes"]
+    start: Int[np.ndarray, " echoes"]
+    end: Int[np.ndarray, " echoes"]
+
+
+class _Peaks(NamedTuple):
+    """Largest samples of echoes, as indices of records one after another; `row`: number of the record.
+
+    - `first`: the first local maximum of each echo.
+    - `before`, `after`: the ends of the record, or the lowest sample between the echo and its neighbour.
+    """
+
+    index: Int[np.ndarray, " echoes"]
+    row: Int[np.ndarray, " echoes"]
+    first: Int[np.ndarray, " echoes"]
+    before: Int[np.ndarray, " echoes"]
+    after: Int[np.ndarray, " echoes"]
+
+
+def _find_echoes(
+    detector: str,
+    record: Float[np.ndarray, "shots samples"],
+    noise: Float[np.ndarray, "..."],
+    threshold: Float[np.ndarray, " shots"] | None,
+    fraction: float,
+    pulse: Float[np.ndarray, " lags"],
+) -> _Echoes:
+    """Detect echoes in records without background; see the module's docstring.
+
+    **Arguments:** `noise`: (shots, 1) or (shots, samples) standard deviation. `threshold`: (shots,), or
+    None for the default.
+    """
+    shots, samples = record.shape
+    # A sample of zero before and after each record, so that records can lie one after another in one array.
+    width = samples + 2
+    padded = np.zeros((shots, width), record.dtype)
+    padded[:, 1:-1] = record
+    largest = record.max(axis=1)
+    if threshold is None:
+        levels = np.maximum(_NOISE_FACTOR * noise, _RELATIVE_THRESHOLD * largest[:, None])
+    else:
+        levels = threshold[:, None].astype(record.dtype)
+    flat = padded.ravel()
+    # The first sample of a plateau counts. Records without light have no threshold above zero.
+    is_maximum = (record >= levels) & (record > 0) & (record > padded[:, :-2]) & (record >= padded[:, 2:])
+    rows, columns = np.divmod(np.flatnonzero(is_maximum), samples)
+    level = levels[rows, columns if levels.shape[1] > 1 else 0]
+    peaks = _group_maxima(detector, flat, rows * width + columns + 1, rows, level, fraction, width)
+    if peaks.index.size == 0:
+        empty, none = np.zeros(0), np.zeros(0, int)
+        return _Echoes(none, empty, empty, empty, none, none)
+
+    position, amplitude = _apex(flat, peaks.index)
+    half_width_before = position - _crossing(flat, peaks.index, -1, 0.5 * amplitude, peaks.before)
+    half_width_after = _crossing(flat, peaks.index, 1, 0.5 * amplitude, peaks.after) - position
+    # One side alone falls to half where echoes overlap. If neither does, the dips bound the echo.
+    half_width_before = np.where(np.isnan(half_width_before), half_width_after, half_width_before)
+    half_width_after = np.where(np.isnan(half_width_after), half_width_before, half_width_after)
+    full_width = half_width_before + half_width_after
+    full_width = np.where(np.isnan(full_width), peaks.after - peaks.before, full_width)
+
+    if detector == "constant fraction":
+        position = _crossing(flat, peaks.index, -1, fraction * amplitude, peaks.before)
+    elif detector == "leading edge":
+        first_amplitude = _apex(flat, peaks.first)[1]
+        # The threshold where the record crosses it, which is about that at the first maximum.
+        crossed = levels[peaks.row, (peaks.first % width) - 1 if levels.shape[1] > 1 else 0]
+        position = _crossing(flat, peaks.first, -1, crossed, peaks.before, logarithmic=True)
+        fraction = crossed / first_amplitude
+    position -= PULSE_OVERSAMPLING**-1 * _reading_of_pulse(detector, pulse, fraction)
+
+    floor = np.maximum(noise.max(axis=1), _RELATIVE_FLOOR * largest)
+    start, end = _extents(padded, peaks, floor)
+    first_sample = peaks.row * width + 1
+    return _Echoes(
+        peaks.row, position - first_sample, amplitude, full_width, start - first_sample, end - first_sample
+    )
+
+
+def _group_maxima(
+    detector: str,
+    flat: np.ndarray,
+    maximum: np.ndarray,
+    row: np.ndarray,
+    level: np.ndarray,
+    fraction: float,
+    width: int,
+) -> _Peaks:
+    """Group local maxima into echoes.
+
+    Two neighbours are separated where the lowest sample between them, the dip, is low enough. Else the
+    lower one is dropped, until all are separated. `level`: the threshold at each maximum.
+    """
+    if maximum.size == 0:
+        return _Peaks(maximum, row, maximum, maximum, maximum)
+    height = flat[maximum]
+    # The lowest sample from each maximum to the next one of the same record.
+    dip = np.minimum.reduceat(flat, maximum)
+    if detector == "leading edge":
+        # The discriminator does not know of maxima: an echo is all until the record has fallen.
+        is_separated = (row[1:] != row[:-1]) | (dip[:-1] < _HYSTERESIS * np.minimum(level[1:], level[:-1]))
+        starts = np.flatnonzero(np.r_[True, is_separated])
+        highest = np.repeat(np.maximum.reduceat(height, starts), np.diff(np.r_[starts, maximum.size]))
+        group = np.cumsum(np.r_[False, is_separated])
+        (is_highest,) = np.nonzero(height == highest)
+        index = maximum[is_highest[np.searchsorted(group[is_highest], np.arange(starts.size))]]
+        first, row = maximum[starts], row[starts]
+    else:
+        while True:
+            is_pair = row[1:] == row[:-1]
+            lower = np.minimum(height[1:], height[:-1])
+            limit = lower - np.where(height[1:] < height[:-1], level[1:], level[:-1])
+            if detector == "constant fraction":
+                # The leading edge of the later echo must begin below its fraction.
+                limit = np.minimum(limit, fraction * height[1:])
+            is_joined = is_pair & (dip[:-1] > limit)
+            if not is_joined.any():
+                break
+            is_dropped = np.zeros(maximum.size, bool)
+            is_dropped[1:] |= is_joined & (height[1:] <= height[:-1])
+            is_dropped[:-1] |= is_joined & (height[1:] > height[:-1])
+            (remaining,) = np.nonzero(~is_dropped)
+            dip = np.minimum.reduceat(dip, remaining)
+            maximum, row, height, level = (a[remaining] for a in (maximum, row, height, level))
+        index = first = maximum
+    before, after = row * width, (row + 1) * width - 1
+    (pair,) = np.nonzero(row[1:] == row[:-1])
+    if pair.size:
+        lowest = _first_minimum(flat, index[pair], index[pair + 1])
+        after[pair] = before[pair + 1] = lowest
+    return _Peaks(index, row, first, before, after)
+
+
+def _first_minimum(flat: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Return the index of the smallest value in each range [start, end); the first of equal ones."""
+    lengths = end - start
+    offsets = np.cumsum(lengths) - lengths
+    index = np.arange(lengths.sum()) + np.repeat(start - offsets, lengths)
+    values = flat[index]
+    (is_smallest,) = np.nonzero(values == np.repeat(np.minimum.reduceat(values, offsets), lengths))
+    return index[is_smallest[np.searchsorted(is_smallest, offsets)]]
+
+
+def _apex(flat: np.ndarray, peak: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the positions and values of maxima between samples; the middle of a plateau."""
+    centre, before, after = (flat[peak + k].astype(float) for k in (0, -1, 1))
+    # Parabola through logarithms; where a neighbour is not positive, through the values themselves.
+    has_logarithm = (before > 0) & (after > 0)
+    curves = [
+        np.where(has_logarithm, np.log(np.where(has_logarithm, y, 1.0)), y / centre) for y in (before, after)
+    ]
+    middle = np.where(has_logarithm, np.log(centre), 1.0)
+    slope, curvature = 0.5 * (curves[1] - curves[0]), curves[1] - 2.0 * middle + curves[0]
+    shift = np.clip(-slope / np.where(curvature < 0, curvature, -1.0), -0.5, 0.5)
+    top = middle + 0.5 * slope * shift
+    value = np.where(has_logarithm, np.exp(np.where(has_logarithm, top, 0.0)), top * centre)
+    # A saturated record repeats its largest value.
+    last = peak.copy()
+    growing = np.flatnonzero(after == centre)
+    while growing.size:
+        last[growing] += 1
+        growing = growing[flat[last[growing] + 1] == flat[peak[growing]]]
+    # Two equal samples lie on either side of an apex.
+    is_plateau = last > peak + 1
+    return (
+        np.where(is_plateau, 0.5 * (peak + last), peak + shift),
+        np.where(is_plateau, centre, value),
+    )
+
+
+def _crossing(
+    flat: np.ndarray,
+    start: np.ndarray,
+    direction: int,
+    level: np.ndarray,
+    bound: np.ndarray,
+    *,
+    logarithmic: bool = False,
+) -> np.ndarray:
+    """Return where records fall below levels, walking from `start` in a direction (1 or -1).
+
+    All echoes walk at once, a sample at a time. Positions are interpolated between two samples, linearly or
+    in logarithms.
+
+    **Returns:** positions; NaN where the record does not fall below the level up to `bound`.
+    """
+    position = np.full(start.size, np.nan)
+    current, walking = start.copy(), np.arange(start.size)
+    while walking.size:
+        following = current[walking] + direction
+        value = flat[following]
+        is_below = value < level[walking]
+        crossing = walking[is_below]
+        inner, outer, target = (
+            a.astype(float) for a in (flat[current[crossing]], value[is_below], level[crossing])
+        )
+        # The level was interpolated: it may lie above the sample at which the walk starts.
+        inner = np.maximum(inner, target)
+        step = (inner - target) / (inner - outer)
+        if logarithmic:
+            is_positive = outer > 0
+            safe = np.where(is_positive, outer, 0.5 * target)
+            step = np.where(is_positive, np.log(inner / target) / np.log(inner / safe), step)
+        position[crossing] = current[crossing] + direction * step
+        walking = walking[~is_below & (following != bound[walking])]
+        current[walking] += direction
+    return position
+
+
+def _reading_of_pulse(detector: str, pulse: np.ndarray, fraction: Any) -> Any:
+    """Return the time that a detector reads of the pulse itself, from its time zero, in steps of the lags.
+
+    `fraction`: level over amplitude, of an edge detector; a number, or one for each echo.
+    """
+    middle, flat = pulse.size // 2, np.r_[0.0, pulse, 0.0]
+    peak = np.array([int(np.argmax(flat))])
+    if detector == "peak":
+        return _apex(flat, peak)[0][0] - 1 - middle
+    # The leading edge, where it rises: the last crossing of each level before the peak.
+    edge = flat[: peak[0] + 1] / flat[peak[0]]
+    rising = np.minimum.accumulate(edge[::-1])[::-1]
+    return np.interp(fraction, rising, np.arange(edge.size)) - 1 - middle
+
+
+def _extents(
+    padded: np.ndarray, peaks: _Peaks, floor: np.ndarray
+) -> tuple[Int[np.ndarray, " echoes"], Int[np.ndarray, " echoes"]]:
+    """Return the first sample of each echo and the one after its last, as indices of the flat records."""
+    # The zeros before and after each record are never above the floor.
+    low = np.flatnonzero(padded <= floor[:, None])
+    following = np.searchsorted(low, peaks.index, "right")
+    before, after = low[following - 1], low[np.minimum(following, low.size - 1)]
+    # The dip between two echoes belongs to the later one.
+    start = np.maximum(
+        before + 1, np.where(peaks.before % padded.shape[1] == 0, peaks.before + 1, peaks.before)
+    )
+    return np.minimum(start, peaks.index), np.maximum(np.minimum(after, peaks.after), peaks.index + 1)
+
+
+def _sums_over_extents(array: np.ndarray, echoes: _Echoes) -> Float[np.ndarray, " echoes"]:
+    """Return the sums of (shots, samples) over the samples of each echo."""
+    # One more value: the last range may end at the end of the array.
+    flat = np.append(np.ascontiguousarray(array).ravel(), 0.0)
+    first = echoes.row * array.shape[1]
+    edges = np.stack([first + echoes.start, first + echoes.end], axis=1).ravel()
+    return np.add.reduceat(flat, edges, dtype=float)[::2] if edges.size else np.zeros(0)
+
+
+# -- assembly ----------------------------------------------------------------------------------------------
+
+
+def returns_of(
+    waves: DetectorInput,
+    detector: str,
+    *,
+    record: Any = None,
+    background: Any = None,
+    noise: Any = None,
+    threshold: Any = None,
+    fraction: Any = 0.5,
+    max_returns: int | None = None,
+    progress: Callable[[SurveyProgress], None] | None = None,
+) -> DiscreteReturns:
+    """Detect the returns of waveforms. Arguments are those of `Waveforms.returns`."""
+    check_choice("detector", detector, DETECTORS)
+    check_number("fraction", fraction, 0.0, 1.0, low_open=True, high_open=True)
+    check_kind("progress", progress, Callable | None, "a function, or None")
+    if max_returns is not None:
+        max_returns = check_integer("max_returns", max_returns)
+    shape, is_own_record = waves.recorded.shape, record is None
+    records = waves.recorded if is_own_record else np.asarray(record)
+    if records.shape != shape:
+        raise ValueError(f"record has shape {records.shape} at one wavelength; admissible is {shape}")
+    settings = _Settings(detector, float(fraction), *_limits(shape, background, noise, threshold))
+    clock, blocks = ProgressClock(len(waves), 0), []
+    if is_own_record and settings.background is None:
+        settings = settings._replace(background=np.full(shape[0], _recorded_background(waves)))
+    for shots in waves.chunks:
+        if detector == "decomposition":
+            for block in _decompose_chunk(waves, records[shots], shots, settings, is_own_record):
+                blocks.append(block)
+        else:
+            blocks.append(_detect_chunk(waves, records[shots], shots, settings, is_own_record))
+        clock.done = shots.stop
+        if progress is not None:
+            progress(SurveyProgress(clock.done, len(waves), clock.seconds, clock.rate, clock.seconds_left))
+    echoes = {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
+    return _assemble(waves, echoes, max_returns)
+
+
+class _Settings(NamedTuple):
+    """Arguments of detection: (shots,) or (shots, samples), or None for the default."""
+
+    detector: str
+    fraction: float
+    background: np.ndarray | None
+    noise: np.ndarray | None
+    threshold: np.ndarray | None
+
+
+def _limits(shape: tuple[int, ...], background: Any, noise: Any, threshold: Any) -> list[np.ndarray | None]:
+    """Convert background, noise and threshold to arrays by shot."""
+    limits: list[np.ndarray | None] = []
+    for name, value in (("background", background), ("noise", noise), ("threshold", threshold)):
+        if value is None:
+            limits.append(None)
+            continue
+        check_range(name, value, 0.0, low_open=name == "threshold")
+        array = as_numpy(value, name)
+        shapes = [(), shape[:1], shape] if name == "noise" else [(), shape[:1]]
+        if array.shape not in shapes:
+            raise ValueError(f"{name} has shape {array.shape}; admissible is {' or '.join(map(str, shapes))}")
+        limits.append(array if array.ndim == 2 else np.broadcast_to(array, shape[:1]))
+    return limits
+
+
+def _recorded_background(waves: DetectorInput) -> float:
+    """Return the background that the receiver adds, J per sample: the median of record less signal."""
+    shots = slice(None, None, max(len(waves) // 64, 1))
+    difference = np.asarray(waves.recorded[shots], float) - np.asarray(waves.energy[shots], float)
+    return max(float(np.median(difference)), 0.0)
+
+
+def _prepare_chunk(
+    waves: DetectorInput, record: np.ndarray, shots: slice, settings: _Settings, is_own_record: bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Return the records without background, their noise, and the threshold of each, of a chunk of shots."""
+    record = np.ascontiguousarray(record)
+    if settings.background is not None:
+        level = settings.background[shots, None]
+        record = record - level.astype(record.dtype) if level.any() else record
+    else:
+        record = record - np.median(record, axis=1, keepdims=True)
+    if settings.noise is not None:
+        noise = settings.noise[shots].astype(record.dtype)
+        noise = noise if noise.ndim == 2 else noise[:, None]
+    elif is_own_record:
+        # The standard error of the simulation, as an energy.
+        stderr = np.asarray(waves.stderr[shots])
+        if stderr.any():
+            per_reflectance = waves.constant / waves.axes.distance[shots] ** 2
+            noise = stderr * per_reflectance[:, None].astype(record.dtype)
+        else:
+            noise = np.zeros((len(record), 1), record.dtype)
+    else:
+        # Differences of neighbours have twice the variance; the median ignores the echoes.
+        differences = np.abs(np.diff(record, axis=1)) if record.shape[1] > 1 else np.zeros((len(record), 1))
+        noise = 1.4826 / np.sqrt(2.0) * np.median(differences, axis=1, keepdims=True)
+    threshold = None if settings.threshold is None else settings.threshold[shots]
+    return record, noise, threshold
+
+
+def _detect_chunk(
+    waves: DetectorInput, record: np.ndarray, shots: slice, settings: _Settings, is_own_record: bool
+) -> dict[str, np.ndarray]:
+    """Return the columns of the returns of a chunk of shots, which the first three detectors find."""
+    record, noise, threshold = _prepare_chunk(waves, record, shots, settings, is_own_record)
+    pulse = waves.acquisition.pulse
+    echoes = _find_echoes(settings.detector, record, noise, threshold, settings.fraction, pulse)
+    return _columns(waves, record, shots, echoes)
+
+
+def _columns(
+    waves: DetectorInput, record: np.ndarray, shots: slice, echoes: _Echoes
+) -> dict[str, np.ndarray]:
+    """Return the columns of returns that differ between the echoes of a shot."""
+    shot, time = shots.start + echoes.row, waves.time[0] + waves.step * echoes.time
+    ranges = waves.range_at(shot, time)
+    by_material = {
+        name: _sums_over_extents(np.asarray(a[shots]), echoes) for name, a in waves.components.items()
+    }
+    return {
+        "shot": shot,
+        "time": time,
+        "amplitude": echoes.amplitude.astype(float),
+        "width": waves.step * echoes.width,
+        "reflectance": _sums_over_extents(record, echoes) * ranges**2 / waves.constant,
+        **_materials(by_material, shot.size),
+    }
+
+
+def _materials(by_material: Mapping[str, np.ndarray], count: int) -> dict[str, np.ndarray]:
+    """Return the material with the largest sum of each return, and the share of the ground."""
+    names = np.array([*by_material, _NO_MATERIAL])
+    # Noise of higher orders may make a sum negative.
+    sums = np.maximum(np.stack([*by_material.values(), np.zeros(count)]), 0.0)
+    total = sums.sum(axis=0)
+    largest = np.where(total > 0, np.argmax(sums, axis=0), len(names) - 1)
+    ground = np.maximum(by_material.get("ground", np.zeros(count)), 0.0)
+    share = np.where(total > 0, ground / np.where(total > 0, total, 1.0), 0.0)
+    return {"material": names[largest], "ground_share": share}
+
+
+def _assemble(
+    waves: DetectorInput, echoes: dict[str, np.ndarray], max_returns: int | None
+) -> DiscreteReturns:
+    """Sort echoes by shot and time, drop the weakest beyond `max_returns` of a shot, and number them."""
+    order = np.lexsort((echoes["time"], echoes["shot"]))
+    if max_returns is not None:
+        by_strength = np.lexsort((-echoes["amplitude"], echoes["shot"]))
+        rank = np.empty(order.size, int)
+        rank[by_strength] = _number_in_shot(echoes["shot"][by_strength])
+        order = order[rank[order] <= max_returns]
+    columns = {name: values[order] for name, values in echoes.items()}
+    shot, time = columns["shot"], columns["time"]
+    axes, acquisition = waves.axes, waves.acquisition
+    counts = np.bincount(shot, minlength=len(waves))
+    return DiscreteReturns(
+        **columns,
+        range=waves.range_at(shot, time),
+        position=position_along_beam(axes.origin[shot], axes.direction[shot], time),
+        number=_number_in_shot(shot),
+        n_returns=counts[shot],
+        ground_height=waves.ground_height[shot],
+        gps_time=acquisition.gps_time[shot],
+        scan_angle=acquisition.scan_angle[shot],
+        flight_line=acquisition.flight_line[shot],
+        n_shots=len(waves),
+    )
+
+
+def _number_in_shot(shot: Int[np.ndarray, " returns"]) -> Int[np.ndarray, " returns"]:
+    """Return the numbers, from 1, of returns in their shots; those of a shot follow one another."""
+    if shot.size == 0:
+        return shot
+    starts = np.flatnonzero(np.r_[True, shot[1:] != shot[:-1]])
+    return np.arange(shot.size) - np.repeat(starts, np.diff(np.r_[starts, shot.size])) + 1
+
+
+# -- decomposition -----------------------------------------------------------------------------------------
+
+
+def _decompose_chunk(
+    waves: DetectorInput, record: np.ndarray, shots: slice, settings: _Settings, is_own_record: bool
+) -> Iterator[dict[str, np.ndarray]]:
+    """Decompose the records of a chunk of shots where there is signal, a batch of windows at a time.
+
+    1. Find the stretches of each record in which it exceeds the threshold, a pulse's length more at either
+    end. 2. Sort them by length, and decompose as many at once as one compiled program takes.
+    """
+    record, noise, threshold = _prepare_chunk(waves, record, shots, settings, is_own_record)
+    largest = record.max(axis=1, initial=0.0)[:, None]
+    if threshold is None:
+        threshold = np.maximum(_NOISE_FACTOR * noise, _RELATIVE_THRESHOLD * largest)
+    else:
+        threshold = threshold[:, None]
+    pulse = waves.acquisition.pulse[
+        waves.acquisition.pulse.size // 2 % PULSE_OVERSAMPLING :: PULSE_OVERSAMPLING
+    ]
+    margin = pulse.size // 2 + 1
+    windows = _signal_windows((record >= threshold) & (record > 0), margin)
+    # Noise-free records are decomposed to the precision of the threshold.
+    sigma = np.broadcast_to(np.maximum(noise, 0.2 * _RELATIVE_THRESHOLD * largest), record.shape)
+    order = np.argsort([end - start for _, start, end in windows], kind="stable")
+    for first in range(0, len(order), _RECORDS_AT_ONCE):
+        batch = [windows[k] for k in order[first : first + _RECORDS_AT_ONCE]]
+        yield _columns(waves, record, shots, _decompose_windows(record, sigma, threshold, batch, pulse))
+    if not windows:
+        none = np.zeros(0, int)
+        empty = _Echoes(none, np.zeros(0), np.zeros(0), np.zeros(0), none, none)
+        yield _columns(waves, record, shots, empty)
+
+
+def _signal_windows(is_signal: Bool[np.ndarray, "shots samples"], margin: int) -> list[tuple[int, int, int]]:
+    """Return (row, start, end) of samples with signal, widened by `margin` and joined."""
+    shots, samples = is_signal.shape
+    wide = np.zeros((shots, samples + 2), np.int32)
+    # Differences of the number of windows that are open: signal opens one `margin` samples before it.
+    rows, columns = np.nonzero(is_signal)
+    np.add.at(wide, (rows, np.maximum(columns - margin, 0)), 1)
+    np.add.at(wide, (rows, np.minimum(columns + margin + 1, samples)), -1)
+    is_open = np.cumsum(wide, axis=1) > 0
+    edges = np.diff(np.pad(is_open, ((0, 0), (1, 0))).astype(np.int8), axis=1)
+    start_rows, starts = np.nonzero(edges == 1)
+    _, ends = np.nonzero(edges == -1)
+    return list(zip(start_rows.tolist(), starts.tolist(), ends.tolist()))
+
+
+def _decompose_windows(
+    record: np.ndarray,
+    sigma: np.ndarray,
+    threshold: np.ndarray,
+    windows: list[tuple[int, int, int]],
+    pulse: np.ndarray,
+) -> _Echoes:
+    """Decompose windows of records, at most `_RECORDS_AT_ONCE` of them."""
+    length = max(end - start for _, start, end in windows)
+    power, noise = np.zeros((_RECORDS_AT_ONCE, length)), np.full((_RECORDS_AT_ONCE, length), np.inf)
+    # Records that fill up the batch have one sample with weight, and no echo.
+    noise[:, 0] = 1.0
+    for k, (row, start, end) in enumerate(windows):
+        power[k, : end - start], noise[k, : end - start] = record[row, start:end], sigma[row, start:end]
+    fitted = decompose_records(np.arange(float(length)), power, noise, pulse)
+    rows, starts, ends = (np.array(column) for column in zip(*windows))
+    count, amplitude, time, std = (np.asarray(a, float)[: len(windows)] for a in fitted)
+    # Broadened by a Gaussian, a copy of the pulse is lower by the ratio of the widths.
+    pulse_std = pulse.sum() / (np.sqrt(2.0 * np.pi) * pulse.max())
+    height = amplitude * pulse_std / np.hypot(pulse_std, std)
+    sample = np.clip(np.round(time), 0, (ends - starts)[:, None] - 1).astype(int) + starts[:, None]
+    limit = np.take_along_axis(np.broadcast_to(threshold, record.shape)[rows], sample, axis=1)
+    window, echo = np.nonzero((np.arange(amplitude.shape[1]) < count[:, None]) & (height >= limit))
+    order = np.lexsort((time[window, echo], window))
+    window, echo = window[order], echo[order]
+    first_sample = starts[window]
+    centre = time[window, echo]
+    # Echoes of one window share its samples: each has those nearer to it than to its neighbours.
+    start, end = first_sample.copy(), ends[window].copy()
+    (pair,) = np.nonzero(window[1:] == window[:-1])
+    middle = np.ceil(0.5 * (centre[pair] + centre[pair + 1])).astype(int) + first_sample[pair]
+    end[pair] = start[pair + 1] = np.clip(middle, start[pair], end[pair])
+    return _Echoes(
+        rows[window],
+        first_sample + centre,
+        height[window, echo],
+        _FWHM_OF_STD * np.hypot(pulse_std, std[window, echo]),
+        start,
+        np.maximum(end, start + 1),
+    )
+
+
+# -- truth -------------------------------------------------------------------------------------------------
+
+
+def true_returns_of(waves: DetectorInput, *, min_reflectance: Any = 1e-4) -> DiscreteReturns:
+    """List the true echoes of waveforms. Arguments are those of `Waveforms.true_returns`."""
+    check_number("min_reflectance", min_reflectance, 0.0)
+    if waves.truth is None:
+        raise ValueError("the waveforms have no truth: simulate them with truth=True")
+    blocks = [
+        _true_echoes(waves, name, np.asarray(array[shots]), shots, float(min_reflectance))
+        for shots in waves.chunks
+        for name, array in waves.truth.items()
+    ]
+    return _assemble(
+        waves, {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}, None
+    )
+
+
+def _true_echoes(
+    waves: DetectorInput, material: str, returns: np.ndarray, shots: slice, min_reflectance: float
+) -> dict[str, np.ndarray]:
+    """Return the columns of the echoes of one material: stretches of samples in which it returns light."""
+    index = np.flatnonzero(returns > 0)
+    light = returns.ravel()[index].astype(float)
+    rows, samples = np.divmod(index, returns.shape[1])
+    (starts,) = np.nonzero((np.diff(index, prepend=-2) != 1) | (samples == 0))
+    echo = np.repeat(np.arange(starts.size), np.diff(np.r_[starts, rows.size]))
+    time = waves.time[samples]
+
+    def total(values: np.ndarray) -> np.ndarray:
+        return np.bincount(echo, values, starts.size)
+
+    reflectance = total(light)
+    mean = total(light * time) / reflectance
+    variance = total(light * (time - mean[echo]) ** 2) / reflectance
+    shot = shots.start + rows[starts]
+    (listed,) = np.nonzero(reflectance >= min_reflectance)
+    columns = {
+        "shot": shot,
+        "time": mean,
+        "amplitude": reflectance * waves.constant / waves.range_at(shot, mean) ** 2,
+        "width": _FWHM_OF_STD * np.sqrt(variance),
+        "reflectance": reflectance,
+        "material": np.full(shot.size, material),
+        "ground_share": np.full(shot.size, float(material == "ground")),
+    }
+    return {name: values[listed] for name, values in columns.items()}
+
+
+# -- waveforms in LAS --------------------------------------------------------------------------------------
+
+
+def airborne_shots(
+    waves: DetectorInput,
+    records: Float[np.ndarray, "shots samples"],
+    returns: DiscreteReturns,
+    crs: str | None,
+) -> Iterator[AirborneShot]:
+    """Yield shots with their discrete returns and their record, in whole steps of the largest sample."""
+    largest = max(float(np.max(records[shots])) for shots in waves.chunks)
+    if not largest > 0:
+        raise ValueError("record has no sample above zero; admissible is one with light")
+    gain, start = largest / _FULL_INTENSITY, float(waves.time[0])
+    first = np.searchsorted(returns.shot, np.arange(len(waves) + 1))
+    intensity, classification = returns.intensity, returns.classification
+    for i in range(len(waves)):
+        rows = slice(first[i], first[i + 1])
+        # Electronic noise may be negative: the offset of the digitiser lies below it.
+        record = np.asarray(records[i], float)
+        offset = min(float(record.min()), 0.0)
+        counts = np.round((record - offset) / gain)
+        counts = counts.astype(np.uint32 if counts.max() > _FULL_INTENSITY else np.uint16)
+        time = waves.acquisition.gps_time[i]
+        yield AirborneShot(
+            index=i,
+            anchor=waves.axes.origin[i],
+            direction=0.5 * SPEED_OF_LIGHT * waves.axes.direction[i],
+            returning=(Segment(counts, start, waves.step, gain=gain, offset=offset),),
+            gps_time=None if np.isnan(time) else float(time),
+            returns=Returns(
+                position=returns.position[rows],
+                time=returns.time[rows],
+                intensity=intensity[rows],
+                number=returns.number[rows],
+                count=returns.n_returns[rows],
+                classification=classification[rows],
+            ),
+            scan_angle=float(waves.acquisition.scan_angle[i]),
+            flight_line=int(waves.acquisition.flight_line[i]),
+            crs=crs,
+        )

@@ -1,0 +1,230 @@
+"""Meshes as surfaces: rays against an independent intersector, instances, plans, refused input."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import trimesh
+
+import jaxlidar as jl
+from jaxlidar._vectors import FAR, vec
+from jaxlidar.scenes.mesh_surface import build_mesh_tree
+from jaxlidar.scenes.scene import check_kinds
+from tests.helpers import BY_PRECISION
+
+CORNERS = np.array([[-5.0, -5, 6], [5, -5, 6], [5, 5, 6], [-5, 5, 6]])
+ROOF = (CORNERS, np.array([[0, 1, 2], [0, 2, 3]]))
+
+
+def meet(surfaces, x, w):
+    """Return distances and normals of the triangles that rays meet first."""
+    hit = jax.jit(lambda s, x, w: build_mesh_tree(s).meet(vec(x.T), vec(w.T)))(
+        tuple(surfaces), jnp.asarray(x, float), jnp.asarray(w, float)
+    )
+    return np.asarray(hit.distance, float), np.stack(hit.normal, axis=-1)
+
+
+def directions(count, random):
+    w = random.normal(size=(count, 3))
+    return w / np.linalg.norm(w, axis=1, keepdims=True)
+
+
+def nearest_by_all_pairs(corners, x, w):
+    """Return distances by the algorithm of Moeller and Trumbore (1997), every ray with every triangle."""
+    first, side, other = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    distances = np.full(len(x), FAR)
+    for n, (start, direction) in enumerate(zip(x, w)):
+        p = np.cross(direction, other)
+        determinant = (side * p).sum(axis=1)
+        safe = np.where(np.abs(determinant) > 1e-14, determinant, np.inf)
+        offset = start - first
+        u, q = (offset * p).sum(axis=1) / safe, np.cross(offset, side)
+        v, t = (direction * q).sum(axis=1) / safe, (other * q).sum(axis=1) / safe
+        met = t[(u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0) & np.isfinite(safe)]
+        distances[n] = met.min(initial=FAR)
+    return distances
+
+
+@BY_PRECISION
+def test_rays_meet_the_nearest_triangle(precision):
+    random = np.random.default_rng(0)
+    corners = random.uniform(-5, 5, (300, 1, 3)) + random.normal(0.0, 0.8, (300, 3, 3))
+    x, w = random.uniform(-8, 8, (10_000, 3)), directions(10_000, random)
+    surface = jl.MeshSurface((corners.reshape(-1, 3), np.arange(900).reshape(-1, 3)))
+    distance, normal = meet([surface], x, w)
+    expected = nearest_by_all_pairs(corners, x, w)
+    is_met = expected < FAR
+    assert 0.2 < is_met.mean() < 0.9
+    # A ray may pass an edge within rounding.
+    differs = (distance < FAR) != is_met
+    assert differs.sum() <= 2
+    both = is_met & ~differs
+    tolerance = 1e-5 if precision == "float32" else 1e-10
+    wrong = np.abs(distance - expected)[both] > tolerance * np.maximum(expected[both], 1.0)
+    # Grazing rays magnify the rounding of their position.
+    cosine = np.abs((normal * w).sum(axis=1))[both]
+    assert not wrong[cosine > 0.05].any()
+    assert wrong.sum() <= 5
+    np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1.0, atol=1e-6)
+
+
+@BY_PRECISION
+def test_no_ray_slips_through_edges_or_corners(precision):
+    sphere = trimesh.creation.icosphere(subdivisions=3, radius=2.0)
+    sphere.apply_translation([0.3, -0.2, 0.1])
+    random = np.random.default_rng(1)
+    on_edge = sphere.vertices[sphere.edges_unique]
+    fraction = random.uniform(0, 1, (len(on_edge), 1))
+    targets = np.concatenate([sphere.vertices, fraction * on_edge[:, 0] + (1 - fraction) * on_edge[:, 1]])
+    for start in ([0.3, -0.2, 0.1], [1.1, 0.4, -0.6]):
+        w = targets - start
+        w /= np.linalg.norm(w, axis=1, keepdims=True)
+        distance, _ = meet([jl.MeshSurface(sphere)], np.broadcast_to(start, w.shape), w)
+        assert np.all(distance < 5.0)
+
+
+def test_instances_are_scaled_rotated_and_shifted_copies():
+    random = np.random.default_rng(2)
+    mesh = trimesh.creation.icosphere(subdivisions=1, radius=1.0)
+    mesh.vertices[:, 0] *= 2.0
+    shift, angle, scale = (
+        random.uniform(-6, 6, (5, 3)),
+        random.uniform(0, 360, 5),
+        random.uniform(0.3, 1.5, 5),
+    )
+    instances = jl.MeshInstances(shift, angle, scale)
+    copies = []
+    for d, a, s in zip(shift, np.deg2rad(angle), scale):
+        # Clockwise from above: an azimuth.
+        turn = np.array([[np.cos(a), np.sin(a), 0], [-np.sin(a), np.cos(a), 0], [0, 0, 1]])
+        copies.append(s * mesh.vertices @ turn.T + d)
+    x, w = random.uniform(-8, 8, (2000, 3)), directions(2000, random)
+    distance, _ = meet([jl.MeshSurface(mesh, instances=instances)], x, w)
+    corners = np.concatenate([c[mesh.faces] for c in copies])
+    expected = nearest_by_all_pairs(corners, x, w)
+    same = (distance < FAR) == (expected < FAR)
+    assert (~same).sum() <= 2
+    np.testing.assert_allclose(distance[same], expected[same], rtol=1e-4, atol=1e-5)
+    low = jl.MeshSurface(mesh, instances=instances).bounds().min(axis=(0, 1))
+    assert np.all(low <= corners.min(axis=(0, 1)) + 1e-6)
+    # A rotation vector along the downward axis is the same turn.
+    vectors = jl.MeshInstances(shift, np.outer(angle, [0, 0, -1]), scale)
+    np.testing.assert_allclose(vectors.matrices(), instances.matrices(), atol=1e-6)
+
+
+def test_one_sided_triangles_are_passed_from_behind():
+    x = np.array([[0.0, 1, 9], [0, 1, 1]])
+    w = np.array([[0.0, 0, -1], [0, 0, 1]])
+    for two_sided, expected in ((True, [3.0, 5.0]), (False, [3.0, FAR])):
+        distance, _ = meet([jl.MeshSurface(ROOF, two_sided=two_sided)], x, w)
+        np.testing.assert_allclose(distance, expected, rtol=1e-6)
+
+
+def test_map_coordinates_lose_nothing():
+    """A mesh at coordinates of millions of metres, moved to the aim point."""
+    far_away = np.array([651_234.567, 5_412_345.678])
+    surface = jl.MeshSurface((CORNERS + np.append(far_away, 0.0), ROOF[1])).moved(-far_away)
+    distance, _ = meet([surface], [[4.999, 4.999, 10.0], [5.001, 0.0, 10.0]], [[0, 0, -1.0]] * 2)
+    np.testing.assert_allclose(distance, [4.0, FAR], rtol=1e-5)
+
+
+def test_meshes_out_of_reach_are_left_out():
+    lidar = jl.Lidar(divergence=1.0)
+    aside = jl.MeshSurface(ROOF, instances=jl.MeshInstances([[30.0, 0, 0]]))
+    scene = jl.Scene(meshes=(aside,), ground=jl.Ground())
+
+    def row(plan):
+        return {effect.name: effect for effect in plan.effects}["meshes"]
+
+    plan = jl.plan(lidar, scene, max_orders=1)
+    assert plan.off == ("meshes",)
+    assert (row(plan).simulated, row(plan).reason) == (False, "met by no ray of order one")
+    # Light of higher orders may come there, and the user may ask for it.
+    assert row(jl.plan(lidar, scene)).simulated
+    assert row(jl.plan(lidar, scene, max_orders=1, effects={"meshes": True})).simulated
+    near = dataclasses.replace(scene, meshes=(jl.MeshSurface(ROOF),))
+    with pytest.raises(ValueError, match="does not fit: it is for meshes that no ray meets"):
+        jl.simulate(lidar, near, plan=plan, key=jax.random.key(0))
+    off = jl.plan(lidar, near, effects={"meshes": False}, max_orders=1)
+    assert (row(off).simulated, row(off).reason) == (False, "switched off")
+    # A wire between the lines of a footprint is in reach.
+    wire = jl.MeshSurface((CORNERS * [1.0, 0.002, 1.0] + [0.0, 0.2, 0.0], ROOF[1]))
+    assert row(jl.plan(lidar, jl.Scene(meshes=(wire,)), max_orders=1)).simulated
+
+
+def test_plans_predict_memory_linear_in_triangles():
+    def memory(subdivisions, count=1):
+        sphere = trimesh.creation.icosphere(subdivisions=subdivisions)
+        instances = jl.MeshInstances(np.zeros((count, 3)))
+        scene = jl.Scene(meshes=(jl.MeshSurface(sphere, instances=instances),))
+        return jl.plan(jl.Lidar(), scene, max_orders=1, describe=False).memory
+
+    small, large = memory(1), memory(6)
+    per_triangle = (large - small) / (131072 - 128)
+    assert 100 < per_triangle < 400
+    # An instance costs its transformation.
+    assert (memory(1, 1024) - small) / 1024 < 400
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "says"),
+    [
+        (
+            {"mesh": "roof.obj"},
+            TypeError,
+            "mesh is a str; admissible is a Mesh, a trimesh.Trimesh, or a tuple",
+        ),
+        ({"mesh": (CORNERS, np.array([[0, 1, 9]]))}, ValueError, r"faces = 9 .* \[0, 3\]"),
+        ({"mesh": (CORNERS, np.array([[0.0, 1, 2]]))}, TypeError, "faces is an array of float64"),
+        ({"mesh": (CORNERS[:, :2], ROOF[1])}, ValueError, r"vertices has shape \(4, 2\)"),
+        ({"mesh": (CORNERS * np.nan, ROOF[1])}, ValueError, "vertices"),
+        ({"mesh": (CORNERS, np.array([[0, 1, 1]]))}, ValueError, "no triangle with an area"),
+        ({"reflectance": 1.2}, ValueError, "reflectance = 1.2"),
+        ({"reflectance": 0.6, "transmittance": 0.6}, ValueError, r"reflectance \+ transmittance = 1.2"),
+        ({"reflectance": {"tile": 0.2}}, ValueError, "'tile' is no material of the mesh; it has mesh"),
+        ({"transmittance": {}, "reflectance": {}}, ValueError, "reflectance has no 'mesh'"),
+        ({"law": jl.Specular(roughness=0.1)}, ValueError, "law is a mirror"),
+    ],
+)
+def test_inadmissible_surfaces_are_refused(arguments, error, says):
+    with pytest.raises(error, match=says):
+        jl.MeshSurface(**({"mesh": ROOF} | arguments))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ({"shift": [0.0, 0, 0]}, r"shift has shape \(3,\); admissible is \(n, 3\)"),
+        ({"shift": [[0.0, 0, np.inf]]}, "shift"),
+        ({"shift": [[0.0, 0, 0]], "rotation": [0.0, 1.0]}, "rotation has shape"),
+        ({"shift": [[0.0, 0, 0]], "scale": [0.0]}, r"scale = 0.* \(0, inf\)"),
+    ],
+)
+def test_inadmissible_instances_are_refused(arguments, says):
+    with pytest.raises(ValueError, match=says):
+        jl.MeshInstances(**arguments)
+
+
+def test_scenes_refuse_what_meshes_do_not_go_with():
+    surface = jl.MeshSurface(ROOF)
+    voxels = jl.VoxelMap.from_lad(np.ones((2, 2, 2)), voxel_size=1.0)
+    canopy = jl.Canopy(voxels, leaf=jl.LeafOptics(0.4, 0.4), sides="periodic")
+    with pytest.raises(ValueError, match="canopy has sides = 'periodic'; admissible with meshes is 'open'"):
+        jl.Scene(canopy=canopy, meshes=(surface,))
+    terrain = jl.Terrain(np.random.default_rng(0).uniform(size=(4, 4)), 1.0, sides="periodic")
+    with pytest.raises(ValueError, match="terrain has sides = 'periodic'"):
+        jl.Scene(ground=terrain, meshes=(surface,))
+    with pytest.raises(TypeError, match="one of meshes is a tuple"):
+        jl.Scene(meshes=(ROOF,))
+    with pytest.raises(TypeError, match="scene is a MeshSurface; admissible is a Scene, as in"):
+        check_kinds(jl.Lidar(), surface)
+    with pytest.raises(TypeError, match="mesh is being traced"):
+        jax.jit(lambda v: jl.MeshSurface((v, ROOF[1])).vertices)(CORNERS)
+
+
+def test_case_files_refuse_meshes(tmp_path):
+    scene = jl.Scene(meshes=(jl.MeshSurface(ROOF),))
+    with pytest.raises(TypeError, match=r"meshes.* is a MeshSurface"):
+        jl.io.write_case(tmp_path / "roof.toml", jl.io.Case(scene=scene))

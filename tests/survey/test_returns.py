@@ -1,0 +1,282 @@
+"""Discrete returns: detectors against echoes in closed form, and against the surfaces of scenes."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+import inversion
+import jaxlidar as jl
+from jaxlidar.survey.acquisition import PULSE_OVERSAMPLING, sampled_pulse
+from jaxlidar.survey.returns import _find_echoes, position_along_beam
+
+DETECTORS = ("peak", "constant fraction", "leading edge")
+STD = 3.0
+FWHM = 2.0 * np.sqrt(2.0 * np.log(2.0)) * STD
+LAGS = np.arange(-20 * PULSE_OVERSAMPLING, 20 * PULSE_OVERSAMPLING + 1) / PULSE_OVERSAMPLING
+PULSE = np.exp(-0.5 * (LAGS / STD) ** 2) / (STD * np.sqrt(2.0 * np.pi))
+
+
+def gaussian_record(*echoes, samples=120):
+    """Record of Gaussian echoes, each (amplitude, time in samples)."""
+    time = np.arange(samples)
+    return sum(a * np.exp(-0.5 * ((time - t) / STD) ** 2) for a, t in echoes)
+
+
+def find(detector, *records, noise=0.0, threshold=None, fraction=0.5):
+    records = np.stack(records)
+    limits = None if threshold is None else np.full(len(records), threshold)
+    return _find_echoes(detector, records, np.full((len(records), 1), noise), limits, fraction, PULSE)
+
+
+# -- detectors ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("detector", DETECTORS)
+def test_times_of_gaussian_echoes_are_exact_at_every_phase_of_the_samples(detector):
+    """Separate echoes of any amplitude and phase: the calibration by the pulse leaves no walk."""
+    times = 30.0 + np.arange(16) / 16.0
+    records = [
+        gaussian_record((a, t), (0.3 * a, t + 50.3)) for t, a in zip(times, np.geomspace(1e-16, 1.0, 16))
+    ]
+    echoes = find(detector, *records)
+    assert echoes.row.tolist() == np.repeat(np.arange(16), 2).tolist()
+    # Edges are interpolated between samples, linearly or in logarithms; 0.015 samples of 1 ns are 2.2 mm.
+    tolerance = {"peak": 1e-4, "constant fraction": 0.015, "leading edge": 0.03}[detector]
+    np.testing.assert_allclose(echoes.time, np.stack([times, times + 50.3], axis=1).ravel(), atol=tolerance)
+    expected = np.stack([np.geomspace(1e-16, 1.0, 16), 0.3 * np.geomspace(1e-16, 1.0, 16)], axis=1).ravel()
+    np.testing.assert_allclose(echoes.amplitude, expected, rtol=1e-3)
+    np.testing.assert_allclose(echoes.width, FWHM, rtol=0.01)
+
+
+def test_peaks_that_rise_less_than_the_threshold_above_the_dip_are_one():
+    resolved, merged = gaussian_record((1.0, 40.0), (0.8, 49.0)), gaussian_record((1.0, 40.0), (0.8, 46.5))
+    assert find("peak", resolved, merged).row.tolist() == [0, 0, 1]
+    # The dip of the first lies at half of the lower one.
+    assert find("peak", resolved, threshold=0.5).row.tolist() == [0]
+
+
+def test_constant_fraction_needs_an_edge_and_leading_edge_a_fall():
+    overlapping = gaussian_record((1.0, 40.0), (0.8, 48.0))
+    assert find("peak", overlapping).row.size == 2
+    assert find("constant fraction", overlapping).row.size == 1
+    assert find("constant fraction", overlapping, fraction=0.95).row.size == 2
+    assert find("leading edge", overlapping).row.size == 1
+
+
+def test_a_prominent_peak_next_to_small_ones_is_the_only_one():
+    """Ripples on both flanks and on the top are dropped, whatever their order."""
+    time = np.arange(120)
+    record = gaussian_record((1.0, 60.0)) * (1.0 + 0.002 * (-1.0) ** time)
+    echoes = find("peak", record, threshold=0.01)
+    assert echoes.row.size == 1
+    assert echoes.time[0] == pytest.approx(60.0, abs=0.5)
+
+
+def test_a_saturated_echo_is_at_the_middle_of_its_plateau():
+    echoes = find("peak", np.minimum(gaussian_record((5.0, 60.0)), 1.0))
+    assert echoes.time[0] == pytest.approx(60.0)
+    assert echoes.amplitude[0] == 1.0
+
+
+def test_noise_is_not_detected_and_the_threshold_is_five_standard_deviations():
+    noise = np.random.default_rng(0).normal(0.0, 0.01, (200, 120))
+    signal = np.stack([gaussian_record((a, 60.0)) for a in np.repeat([0.01, 0.09], 100)])
+    echoes = find("peak", *(signal + noise), noise=0.01)
+    counts = np.bincount(echoes.row, minlength=200)
+    assert counts[:100].mean() < 0.05
+    assert counts[100:].mean() == pytest.approx(1.0, abs=0.02)
+    # The planted wrong answer: at a fifth of the threshold, noise is detected.
+    assert np.bincount(find("peak", *(signal + noise), threshold=0.01).row).mean() > 3
+
+
+def test_extents_hold_all_light_of_an_echo_and_none_of_its_neighbour():
+    record = gaussian_record((1.0, 30.0), (0.5, 80.0), (0.4, 90.0))
+    echoes = find("peak", record)
+    sums = [record[a:b].sum() for a, b in zip(echoes.start, echoes.end)]
+    area = STD * np.sqrt(2.0 * np.pi)
+    np.testing.assert_allclose(sums, [area, 0.5 * area, 0.4 * area], rtol=0.1)
+    assert sums[0] == pytest.approx(area, rel=2e-3)
+    assert sums[1] + sums[2] == pytest.approx(0.9 * area, rel=2e-3)
+    assert echoes.end[1] == echoes.start[2]
+
+
+@pytest.mark.parametrize("detector", DETECTORS)
+def test_records_without_light_have_no_return(detector):
+    assert find(detector, np.zeros(50), np.zeros(50)).row.size == 0
+
+
+def test_echoes_at_the_ends_of_a_record_are_kept():
+    echoes = find("peak", gaussian_record((1.0, 0.0)), gaussian_record((1.0, 119.0)))
+    np.testing.assert_allclose(echoes.time, [0.0, 119.0], atol=0.5)
+
+
+# -- returns of a survey -----------------------------------------------------------------------------------
+
+SCENE = jl.Scene(
+    plates=[jl.Plate(height=7.03, reflectance=0.4, coverage=0.5)],
+    ground=jl.Ground(height=1.02, reflectance=0.3),
+)
+LIDAR = jl.Lidar(altitude=500.0, pulse=jl.GaussianPulse(fwhm=4.0))
+LINE = {"start": (5e5, 5.2e6), "end": (5e5, 5.2e6 + 40.0), "speed": 40.0, "pulse_rate": 20.0}
+
+
+@pytest.fixture(scope="module")
+def survey():
+    return jl.Survey.scan(LIDAR, jl.Oscillating(20.0, 3.0), **LINE, gps_time=3.2e8, flight_line=7)
+
+
+@pytest.fixture(scope="module")
+def waveforms(survey):
+    return jl.simulate_many(survey, SCENE, key=jax.random.key(0), truth=True, max_orders=1)
+
+
+@pytest.mark.parametrize("detector", DETECTORS)
+def test_returns_lie_on_the_surfaces_of_the_scene(detector, survey, waveforms):
+    returns = waveforms.returns(detector)
+    shots = np.arange(len(survey))
+    assert returns.shot.tolist() == np.repeat(shots, 2).tolist()
+    assert returns.number.tolist() == [1, 2] * len(survey)
+    assert set(returns.n_returns.tolist()) == {2}
+    assert returns.material.tolist() == ["plate", "ground"] * len(survey)
+    height = np.tile([7.03, 1.02], len(survey))
+    # Closed form: where the axis meets each plane, from the sensor's position.
+    distance = (survey.sensor[returns.shot, 2] - height) / -survey.direction[returns.shot, 2]
+    position = survey.sensor[returns.shot] + distance[:, None] * survey.direction[returns.shot]
+    np.testing.assert_allclose(returns.range, distance, atol=0.006)
+    np.testing.assert_allclose(returns.position, position, atol=0.006)
+    # Oblique beams spread the echo over the footprint of 0.15 m by less than a per cent.
+    np.testing.assert_allclose(returns.width, np.hypot(4.0, 0.6), rtol=0.03)
+
+
+def test_reflectance_and_shares_are_those_of_the_simulation(waveforms):
+    returns = waveforms.returns()
+    total = np.bincount(returns.shot, returns.reflectance)
+    np.testing.assert_allclose(total, waveforms.reflectance[:, 0].sum(axis=1), rtol=5e-3)
+    expected = np.stack(
+        [waveforms.components[name][:, 0].sum(axis=1) for name in ("plate", "ground")], axis=1
+    )
+    np.testing.assert_allclose(returns.reflectance, expected.ravel(), rtol=0.02)
+    np.testing.assert_allclose(returns.ground_share, np.tile([0.0, 1.0], len(waveforms)), atol=0.01)
+
+
+def test_returns_have_the_times_and_angles_of_the_survey(survey, waveforms):
+    returns = waveforms.returns()
+    np.testing.assert_array_equal(returns.gps_time, 3.2e8 + returns.shot / 20.0)
+    np.testing.assert_array_equal(returns.scan_angle, survey.scan_angle[returns.shot])
+    # To the right of a track northward is east.
+    np.testing.assert_array_equal(
+        np.sign(survey.scan_angle.round(6)), np.sign(survey.direction[:, 0].round(6))
+    )
+    assert set(returns.flight_line.tolist()) == {7}
+
+
+def test_true_returns_are_the_surfaces_and_detected_ones_agree_with_them(waveforms):
+    truth, detected = waveforms.true_returns(), waveforms.returns()
+    assert truth.material.tolist() == detected.material.tolist()
+    # Truth is resolved to a sample of 1 ns, 0.15 m.
+    np.testing.assert_allclose(truth.position[:, 2], np.tile([7.03, 1.02], len(waveforms)), atol=0.08)
+    np.testing.assert_allclose(truth.reflectance, detected.reflectance, rtol=0.02)
+    np.testing.assert_allclose(truth.width, 0.0, atol=2.0)
+    assert len(waveforms.true_returns(min_reflectance=0.14)) < len(truth)
+
+
+def test_a_waveform_has_the_returns_of_its_shot(survey, waveforms):
+    returns, shot_returns = (
+        waveforms.returns("constant fraction"),
+        waveforms[3].returns(survey[3], "constant fraction"),
+    )
+    rows = returns.shot == 3
+    np.testing.assert_allclose(shot_returns.position, returns.position[rows], atol=1e-3)
+    np.testing.assert_allclose(shot_returns.reflectance, returns.reflectance[rows], rtol=1e-3)
+    assert shot_returns.material.tolist() == returns.material[rows].tolist()
+    truth = waveforms[3].true_returns(survey[3])
+    np.testing.assert_allclose(truth.reflectance, waveforms.true_returns().reflectance[rows], rtol=1e-4)
+
+
+def test_a_noisy_record_is_detected_above_its_noise_and_background(waveforms):
+    receiver = jl.Receiver(background=3e-16, electronic_noise=2e-17)
+    record = np.asarray(jl.record(waveforms, receiver=receiver, key=jax.random.key(1)))
+    returns = waveforms.returns(record=record)
+    assert np.mean(returns.n_returns == 2) > 0.95
+    main = returns.n_returns == 2
+    np.testing.assert_allclose(
+        returns.position[main, 2], np.tile([7.03, 1.02], len(waveforms))[: main.sum()], atol=0.5
+    )
+    stated = waveforms.returns(record=record, background=3e-16, noise=2e-17)
+    np.testing.assert_allclose(np.median(stated.reflectance), np.median(returns.reflectance), rtol=0.05)
+
+
+def test_the_strongest_returns_are_taken_where_there_are_too_many(waveforms):
+    returns = waveforms.returns(max_returns=1)
+    strongest = waveforms.returns()
+    assert set(returns.n_returns.tolist()) == {1}
+    np.testing.assert_allclose(returns.amplitude, strongest.amplitude.reshape(-1, 2).max(axis=1))
+
+
+def test_decomposition_agrees_with_the_scene(survey, waveforms):
+    """Over the first shots; `inversion` is imported above."""
+    assert inversion.gaussian_decomposition is not None
+    reports = []
+    returns = waveforms[2].returns(survey[2], "decomposition", progress=reports.append)
+    np.testing.assert_allclose(returns.position[:, 2], [7.03, 1.02], atol=0.01)
+    np.testing.assert_allclose(returns.width, np.hypot(4.0, 0.6), rtol=0.05)
+    assert returns.material.tolist() == ["plate", "ground"]
+    assert reports[-1].done == 1
+
+
+def test_files_hold_the_acquisition(tmp_path, waveforms):
+    waveforms.save(tmp_path / "a.nc")
+    again = jl.open(tmp_path / "a.nc")
+    for name, value in vars(waveforms.acquisition).items():
+        np.testing.assert_array_equal(getattr(again.acquisition, name), value)
+    np.testing.assert_array_equal(again.returns().position, waveforms.returns().position)
+    dataclasses.replace(waveforms, acquisition=None).save(tmp_path / "old.nc")
+    with pytest.raises(ValueError, match="no acquisition"):
+        jl.open(tmp_path / "old.nc").returns()
+
+
+def test_surveys_that_are_written_as_they_come_have_returns(tmp_path, survey, waveforms):
+    on_disk = jl.simulate_many(
+        survey, SCENE, key=jax.random.key(0), truth=True, max_orders=1, path=tmp_path / "a.nc"
+    )
+    np.testing.assert_array_equal(on_disk.returns().position, waveforms.returns().position)
+
+
+def test_the_pulse_of_an_acquisition_is_that_of_the_lidar(waveforms):
+    pulse = waveforms.acquisition.pulse
+    lags = np.arange(pulse.size) - pulse.size // 2
+    assert pulse[::PULSE_OVERSAMPLING].sum() == pytest.approx(1.0, abs=1e-5)
+    assert (lags * pulse).sum() / pulse.sum() == pytest.approx(0.0, abs=1e-4)
+    skewed = sampled_pulse(jl.Lidar(pulse=jl.ExponentiallyModifiedGaussianPulse(fwhm=4.0, decay=3.0)))
+    assert skewed[::PULSE_OVERSAMPLING].sum() == pytest.approx(1.0, abs=1e-3)
+
+
+def test_positions_follow_from_the_two_way_time():
+    origin, direction = np.array([[5e5, 4e6, 0.0]]), np.array([[0.6, 0.0, -0.8]])
+    position = position_along_beam(origin, direction, np.array([-20.0]))
+    np.testing.assert_allclose(position - origin, -20.0 * 0.5 * 0.299792458 * direction, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"detector": "zero crossing"}, "detector = 'zero crossing' is none of"),
+        ({"fraction": 1.0}, "fraction = 1 is outside"),
+        ({"threshold": 0.0}, "threshold = 0 is outside"),
+        ({"noise": -1.0}, "noise = -1 is outside"),
+        ({"background": np.zeros(3)}, r"background has shape \(3,\)"),
+        ({"record": np.zeros((2, 1, 5))}, "record has shape"),
+        ({"wavelength": 532.0}, "wavelength = 532 nm is none of"),
+        ({"max_returns": 0}, "max_returns = 0 is outside"),
+    ],
+)
+def test_wrong_arguments_are_refused(waveforms, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        waveforms.returns(**arguments)
+
+
+def test_truth_is_needed_for_true_returns(waveforms):
+    with pytest.raises(ValueError, match="simulate them with truth=True"):
+        dataclasses.replace(waveforms, truth=None).true_returns()

@@ -1,0 +1,139 @@
+"""Discrete returns and waveforms as LAS and LAZ, read back by laspy: every number is the simulation's."""
+
+import jax
+import laspy
+import numpy as np
+import pytest
+
+import jaxlidar as jl
+from jaxlidar import cli
+
+# A zone of UTM, in metres.
+CRS = "EPSG:32633"
+SCENE = jl.Scene(
+    plates=[jl.Plate(height=7.03, reflectance=0.4, coverage=0.5)],
+    ground=jl.Ground(height=1.02, reflectance=0.3),
+)
+LINE = {"start": (5e5, 5.2e6), "end": (5e5, 5.2e6 + 20.0), "speed": 40.0, "pulse_rate": 20.0}
+
+
+def simulate(gps_time=3.2e8):
+    lidar = jl.Lidar(altitude=500.0, pulse=jl.GaussianPulse(fwhm=4.0))
+    survey = jl.Survey.scan(lidar, jl.Oscillating(20.0, 3.0), **LINE, gps_time=gps_time, flight_line=7)
+    return jl.simulate_many(survey, SCENE, key=jax.random.key(0), max_orders=1)
+
+
+@pytest.fixture(scope="module")
+def waveforms():
+    return simulate()
+
+
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+def test_points_have_the_numbers_of_the_returns(tmp_path, waveforms, suffix):
+    path = tmp_path / f"strip{suffix}"
+    returns = waveforms.to_las(path, crs=CRS)
+    cloud = laspy.read(path)
+    header = cloud.header
+    assert (header.version.major, header.version.minor, header.point_format.id) == (1, 4, 6)
+    assert header.are_points_compressed == (suffix == ".laz")
+    assert header.global_encoding.wkt
+    # 3.2e8 s are no seconds of a week.
+    assert header.global_encoding.gps_time_type == laspy.header.GpsTimeType.STANDARD
+    (wkt,) = [vlr.string for vlr in header.vlrs if vlr.record_id == 2112]
+    assert "UTM zone 33N" in wkt
+    np.testing.assert_allclose(cloud.xyz, returns.position, atol=0.5001e-3)
+    np.testing.assert_array_equal(cloud.return_number, returns.number)
+    np.testing.assert_array_equal(cloud.number_of_returns, returns.n_returns)
+    np.testing.assert_array_equal(cloud.gps_time, returns.gps_time)
+    np.testing.assert_allclose(0.006 * cloud.scan_angle, returns.scan_angle, atol=0.0031)
+    np.testing.assert_array_equal(cloud.point_source_id, 7)
+    np.testing.assert_array_equal(cloud.classification, np.tile([1, 2], len(waveforms)))
+    np.testing.assert_array_equal(cloud.intensity, np.round(65535 * returns.reflectance))
+    extra = {"width": "width", "reflectance": "reflectance", "amplitude": "amplitude"}
+    for name, field in (*extra.items(), ("ground share", "ground_share")):
+        np.testing.assert_array_equal(cloud[name], getattr(returns, field).astype(np.float32))
+    # The package's own reader and command agree.
+    np.testing.assert_allclose(jl.io.read_las(path).position, cloud.xyz, atol=1e-9)
+
+
+def test_seconds_of_a_week_are_flagged_as_such(tmp_path):
+    simulate(gps_time=1000.0).to_las(tmp_path / "a.las")
+    cloud = laspy.read(tmp_path / "a.las")
+    assert cloud.header.global_encoding.gps_time_type == laspy.header.GpsTimeType.WEEK_TIME
+    assert cloud.gps_time[0] == 1000.0
+
+
+def test_surveys_without_a_track_have_no_time_and_zenith_angles(tmp_path):
+    survey = jl.Survey(jl.Lidar(altitude=500.0), [(0, 0), (10, 0)], zenith=[0.0, 12.0])
+    jl.simulate_many(survey, SCENE, key=jax.random.key(0), max_orders=1).to_las(tmp_path / "a.las")
+    cloud = laspy.read(tmp_path / "a.las")
+    assert set(np.asarray(cloud.gps_time)) == {0.0}
+    np.testing.assert_allclose(0.006 * cloud.scan_angle, [0, 0, 12, 12], atol=0.003)
+
+
+@pytest.mark.parametrize("point_format", [4, 9])
+def test_packets_have_the_samples_of_the_records(tmp_path, waveforms, point_format):
+    path = tmp_path / "strip.las"
+    returns = waveforms.to_las_waveforms(path, crs=CRS, point_format=point_format)
+    cloud = laspy.read(path)
+    assert cloud.header.global_encoding.wkt
+    assert cloud.header.global_encoding.gps_time_type == laspy.header.GpsTimeType.STANDARD
+    np.testing.assert_allclose(cloud.xyz, returns.position, atol=0.5001e-3)
+    np.testing.assert_array_equal(cloud.point_source_id, 7)
+    shots = jl.io.read_las_waveforms(path)
+    assert len(shots) == len(waveforms)
+    largest = waveforms.recorded.max()
+    for i in (0, 5, len(waveforms) - 1):
+        shot = shots[i]
+        np.testing.assert_allclose(shot.waveform, waveforms.recorded[i, 0], atol=0.51 * largest / 65535)
+        # Positions of samples: the time zero of a shot is at its aim point.
+        height = -0.5 * jl.SPEED_OF_LIGHT * waveforms.time * np.cos(np.deg2rad(waveforms.zenith[i]))
+        np.testing.assert_allclose(shot.elevation, height, atol=0.002)
+        assert shot.gps_time == waveforms.acquisition.gps_time[i]
+        assert shot.flight_line == 7
+        step = 0.006 if point_format == 9 else 1.0
+        assert shot.scan_angle == pytest.approx(waveforms.acquisition.scan_angle[i], abs=0.51 * step)
+
+
+def test_formats_from_6_on_declare_well_known_text_without_a_system_too(tmp_path, waveforms):
+    waveforms.to_las(tmp_path / "a.las")
+    waveforms.to_las_waveforms(tmp_path / "b.las")
+    waveforms.to_las_waveforms(tmp_path / "c.las", point_format=4)
+    flags = [laspy.read(tmp_path / f"{name}.las").header.global_encoding.wkt for name in "abc"]
+    assert flags == [True, True, False]
+
+
+def test_the_command_converts_waveforms_to_points(tmp_path, waveforms, capsys):
+    waveforms.save(tmp_path / "strip.nc")
+    source, target = str(tmp_path / "strip.nc"), str(tmp_path / "strip.laz")
+    assert cli.main(["convert", source, target, "--crs", CRS, "--detector", "constant fraction"]) == 0
+    assert f"{2 * len(waveforms)} returns of {len(waveforms)} shots" in capsys.readouterr().out
+    expected = waveforms.returns("constant fraction")
+    np.testing.assert_allclose(laspy.read(target).xyz, expected.position, atol=0.5001e-3)
+    assert cli.main(["info", target]) == 0
+    output = capsys.readouterr().out
+    assert "UTM zone 33N" in output
+    assert "point format 6, compressed" in output
+    assert f"{2 * len(waveforms)} of pulses with 2" in output
+    assert cli.main(["convert", source, str(tmp_path / "a.toml"), "--crs", CRS]) == 2
+
+
+def test_what_a_file_cannot_hold_is_refused(tmp_path, waveforms):
+    with pytest.raises(ValueError, match=r"does not end in \.las or \.laz"):
+        waveforms.to_las(tmp_path / "strip.xyz")
+    with pytest.raises(ValueError, match="position holds no point"):
+        waveforms.to_las(tmp_path / "strip.las", threshold=1.0)
+    with pytest.raises(ValueError, match="no sample above zero"):
+        waveforms.to_las_waveforms(tmp_path / "strip.las", record=np.zeros_like(waveforms.recorded))
+
+
+def test_numbers_that_point_formats_do_not_hold_are_refused(tmp_path):
+    point, value = np.zeros((1, 3)), np.ones(1)
+    for fields, message in (
+        ({"scan_angle": 181.0 * value}, "scan_angle = 181 is outside"),
+        ({"point_source": 70000 * value}, "point_source_id = 70000 is outside"),
+        ({"extra": {"x" * 33: ("text", value)}}, "admissible are 32 bytes"),
+        ({"extra": {"a": ("text", np.ones(2))}}, r"a has shape \(2,\)"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            jl.io.write_las(tmp_path / "a.las", point, **fields)
