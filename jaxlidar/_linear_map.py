@@ -14,6 +14,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
@@ -23,7 +24,11 @@ FlatMap = Callable[[list[Array], list[Array]], Sequence[Array]]
 
 
 def linear_map(
-    function: FlatMap, transpose: FlatMap, residuals: Sequence[Array], arguments: Sequence[Array]
+    function: FlatMap,
+    transpose: FlatMap,
+    residuals: Sequence[Array],
+    arguments: Sequence[Array],
+    results: Sequence[Any],
 ) -> list[Array]:
     """Return `function(residuals, arguments)`, whose transpose is `transpose(residuals, cotangents)`.
 
@@ -33,14 +38,25 @@ def linear_map(
       argument. Neither may use traced values other than its arguments, and both must have forward derivatives
       by the residuals, if second derivatives are taken.
     - `residuals`: arrays on which both depend. `arguments`: arrays of real numbers.
+    - `results`: arrays, or types of arrays, of the shapes and types of the results. So the function that is
+      not used, here or in the transpose, need not be traced.
     """
     return _linear_map_p.bind(
-        *residuals, *arguments, function=function, transpose=transpose, n_residuals=len(residuals)
+        *residuals,
+        *arguments,
+        function=function,
+        transpose=transpose,
+        n_residuals=len(residuals),
+        result_types=_types(results),
     )
 
 
-def _evaluate(*operands: Array, function: FlatMap, transpose: FlatMap, n_residuals: int) -> list[Array]:
-    del transpose
+def _types(arrays: Sequence[Any]) -> tuple[ShapedArray, ...]:
+    return tuple(ShapedArray(a.shape, a.dtype) for a in arrays)
+
+
+def _evaluate(*operands: Array, function: FlatMap, n_residuals: int, **other_parameters: Any) -> list[Array]:
+    del other_parameters
     return list(function(list(operands[:n_residuals]), list(operands[n_residuals:])))
 
 
@@ -49,17 +65,15 @@ def _evaluate_compiled(*operands: Array, **parameters: Any) -> list[Array]:
     return jax.jit(lambda *operands: _evaluate(*operands, **parameters))(*operands)
 
 
-def _result_types(*operands: Any, **parameters: Any) -> list[Any]:
-    types = [jax.ShapeDtypeStruct(a.shape, a.dtype) for a in operands]
-    results = jax.eval_shape(lambda *operands: _evaluate(*operands, **parameters), *types)
-    return [jax.core.ShapedArray(a.shape, a.dtype) for a in results]
+def _result_types(*operands: Any, **parameters: Any) -> list[ShapedArray]:
+    return list(parameters["result_types"])
 
 
 def _push_forward(primals: Sequence[Any], tangents: Sequence[Any], **parameters: Any) -> tuple[Any, Any]:
     """Apply the map to tangents of its arguments; where residuals vary, differentiate through it."""
     results = _linear_map_p.bind(*primals, **parameters)
     n = parameters["n_residuals"]
-    total = [ad.Zero(jax.core.ShapedArray(a.shape, a.dtype)) for a in results]
+    total = [ad.Zero(a) for a in parameters["result_types"]]
     if any(not isinstance(t, ad.Zero) for t in tangents[n:]):
         of_arguments = [ad.instantiate_zeros(t) for t in tangents[n:]]
         total = _linear_map_p.bind(*primals[:n], *of_arguments, **parameters)
@@ -78,11 +92,18 @@ def _push_forward(primals: Sequence[Any], tangents: Sequence[Any], **parameters:
 
 
 def _pull_back(
-    cotangents: Sequence[Any], *operands: Any, function: FlatMap, transpose: FlatMap, n_residuals: int
+    cotangents: Sequence[Any],
+    *operands: Any,
+    function: FlatMap,
+    transpose: FlatMap,
+    n_residuals: int,
+    result_types: tuple[ShapedArray, ...],
 ) -> list[Any]:
     residuals, arguments = operands[:n_residuals], operands[n_residuals:]
     of_results = [ad.instantiate_zeros(c) for c in cotangents]
-    pulled = linear_map(transpose, function, residuals, of_results)
+    # Of arguments that the map is not transposed by, their values are at hand, of others their types.
+    types = [a.aval if ad.is_undefined_primal(a) else a for a in arguments]
+    pulled = linear_map(transpose, function, residuals, of_results, types)
     # Tangents that are known are zeros: nothing is asked of them.
     of_arguments = [c if ad.is_undefined_primal(a) else None for c, a in zip(pulled, arguments)]
     return [None] * n_residuals + of_arguments
@@ -95,6 +116,7 @@ def _batch(
     function: FlatMap,
     transpose: FlatMap,
     n_residuals: int,
+    result_types: tuple[ShapedArray, ...],
 ) -> tuple[list[Array], list[int]]:
     """Map the function and its transpose over a batch.
 
@@ -113,7 +135,8 @@ def _batch(
         # Every result has the batch axis in front.
         return jax.vmap(lambda r, a: list(of_one(r, a)), (residual_axes, 0))
 
-    results = linear_map(over_batch(function), over_batch(transpose), residuals, arguments)
+    types = [ShapedArray((size, *t.shape), t.dtype) for t in result_types]
+    results = linear_map(over_batch(function), over_batch(transpose), residuals, arguments, types)
     return results, [0] * len(results)
 
 

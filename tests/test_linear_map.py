@@ -26,8 +26,9 @@ def _(primals, tangents):
         CALLS.append("pull")
         return [MATRIX.T @ (jnp.cos(MATRIX @ residuals[0]) * cotangents[0])]
 
-    (tangent,) = linear_map(push, pull, [primals[0]], [tangents[0]])
-    return function(primals[0]), tangent
+    value = function(primals[0])
+    (tangent,) = linear_map(push, pull, [primals[0]], [tangents[0]], [value])
+    return value, tangent
 
 
 def plain(x):

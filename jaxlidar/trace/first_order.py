@@ -388,7 +388,10 @@ class FirstOrderTracer:
             # point itself.
             seen = surface.scale_by_pattern(point, scene.beam.in_view(point))
             if mirror is None:
-                seen = surface.law.intensity_factor(w, normal, back, scene.beam.aperture_half_angle(point)) * seen
+                seen = (
+                    surface.law.intensity_factor(w, normal, back, scene.beam.aperture_half_angle(point))
+                    * seen
+                )
             # FAR would overflow when it is converted to bins.
             time = 2.0 * (excess + jnp.minimum(distances[i], 1e9)) / SPEED_OF_LIGHT
             first_bin, row = bspline_row(

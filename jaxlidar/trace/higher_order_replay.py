@@ -37,10 +37,10 @@ from jaxlidar.trace.higher_orders import (
     Lanes,
     PhotonBatch,
     collide_at_ends,
-    deposit_ends,
     empty_tally,
     fly,
     is_deposited,
+    returns_of_ends,
     scatter,
 )
 from jaxlidar.trace.random_numbers import PhotonDraws
@@ -142,18 +142,19 @@ def _deposits(
     """Return the deposits of every end, times the cotangents of returns; none at order one."""
 
     def of_order_two_on() -> Float[Array, "ends photons"]:
-        def deposited(weight: Scalar) -> Array:
-            return deposit_ends(scene, ends, weight, None, empty_tally(scene)).weights
-
-        weight = flown.weight.reshape(-1)
-        # Deposits are linear in weights: the transpose looks the cotangents up where a deposit would be made.
-        _, pull = jax.vjp(deposited, weight)
-        return (weight * pull(of_returns)[0]).reshape(flown.weight.shape)
+        returns = returns_of_ends(scene, ends, flown.weight.reshape(-1), None, of_returns.shape[1])
+        bins = returns.first_bin[:, None] + jnp.arange(returns.row.shape[-1])[None]
+        deposits = jnp.zeros_like(returns.row)
+        for tally_row, values in returns.rows:
+            places = tally_row[:, None] * scene.bins.padded + bins
+            looked_up = of_returns.reshape(-1).at[places].get(mode="promise_in_bounds")
+            deposits = deposits + values * looked_up
+        return jnp.sum(deposits, axis=-1).reshape(flown.weight.shape)
 
     return lax.cond(is_deposited(scene, order), of_order_two_on, lambda: jnp.zeros_like(flown.weight))
 
 
-class _March(NamedTuple):
+class _SubtractingMarch(NamedTuple):
     """State of the march of rays that subtract from voxels.
 
     - `distance`, `depth`: length, m, and optical depth up to here. `voxel`: the voxel ahead.
@@ -191,7 +192,7 @@ def _subtract_lengths(
     assert medium is not None
     end, largest = minimum(ray.leave, max_length), jnp.max(targets, axis=0)
 
-    def step(state: _March) -> _March:
+    def step(state: _SubtractingMarch) -> _SubtractingMarch:
         distance, depth, voxel, running, n_steps, tables = state
         faces = ray.face_distances(voxel)
         to = maximum(distance, minimum(end, minimum(minimum(faces[0], faces[1]), faces[2])))
@@ -207,15 +208,15 @@ def _subtract_lengths(
         next_voxel = step_voxel(ray, voxel, faces, to)
         # The voxel of a ray that has stopped does not matter.
         distance = jnp.where(running, to, distance)
-        return _March(distance, next_depth, next_voxel, goes_on, n_steps + 1, tables)
+        return _SubtractingMarch(distance, next_depth, next_voxel, goes_on, n_steps + 1, tables)
 
-    def continue_(state: _March) -> Bool[Array, ""]:
+    def continue_(state: _SubtractingMarch) -> Bool[Array, ""]:
         return jnp.any(state.running) & (state.n_steps < scene.config.max_faces)
 
     # Of rays whose amounts are all zero, nothing would be subtracted.
     running = jnp.any(amounts != 0.0, axis=0) & (ray.enter < end)
     start, zero = jnp.minimum(ray.enter, end), jnp.zeros_like(end)
-    state = _March(start, zero, ray.voxel, running, jnp.zeros((), jnp.int32), tables)
+    state = _SubtractingMarch(start, zero, ray.voxel, running, jnp.zeros((), jnp.int32), tables)
     return lax.while_loop(continue_, step, state).tables
 
 

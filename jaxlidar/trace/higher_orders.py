@@ -290,7 +290,7 @@ def trace_photons(
 def empty_tally(scene: DeviceScene, nodes: EntryNodes | None = None) -> HigherOrderTally:
     """Return a tally of zeros; its bins have both margins.
 
-    Returns are tallied by history; by wavelength where optics are applied; by node, or shot, and wavelength
+    BinnedReturns are tallied by history; by wavelength where optics are applied; by node, or shot, and wavelength
     where light is shared. The energy budget has no shots: it is tallied by node.
     """
     n_wavelengths = 0 if scene.optics is None else scene.optics.shape[1]
@@ -298,7 +298,7 @@ def empty_tally(scene: DeviceScene, nodes: EntryNodes | None = None) -> HigherOr
         n_entries = scene.histories.count
     else:
         n_entries = n_wavelengths * (1 if nodes is None else len(nodes.position))
-    # Returns are tallied by shot; what no receiver sees (absorption, escape) by node.
+    # BinnedReturns are tallied by shot; what no receiver sees (absorption, escape) by node.
     n_return_entries = n_entries if scene.shot_views is None else n_wavelengths * scene.shot_views.n_shots
     n_materials, bins, slopes = len(scene.config.materials), scene.bins, scene.slopes
     return HigherOrderTally(
@@ -590,23 +590,46 @@ def _deposit_flights(scene: DeviceScene, flown: FlownPhotons, tally: HigherOrder
         score = score[None] - jnp.swapaxes(depth_slopes, 1, 2)
         score = score.reshape(-1, score.shape[-1])
         score = score + collision_score(scene, ends.flights.cell, ends.flights.collided, ends.collision)
-    return deposit_ends(scene, ends, flown.weight.reshape(-1), score, tally)
+    n_entries = tally.weights.shape[1]
+    returns = returns_of_ends(scene, ends, flown.weight.reshape(-1), score, n_entries)
+    return _add_returns(scene, returns, tally)
 
 
-def deposit_ends(
+class BinnedReturns(NamedTuple):
+    """What returns to the sensor from collisions, spread over time bins.
+
+    - `first_bin`: index of the first bin of each return. `rows`: pairs of tally rows, and values in the bins
+      from the first on, for each channel by which light returns, shot and wavelength.
+    - `row`: the values without the factors of channels. `channel_factors`: channels by which light returns,
+      with intensity factors. `index`: tally index with the plates on the return path.
+    - `score`: that of the path with its return, or None.
+    """
+
+    first_bin: Int[Array, "..."]
+    rows: list[tuple[Int[Array, "..."], Float[Array, "... kernel"]]]
+    row: Float[Array, "... kernel"]
+    channel_factors: list[tuple[Array, Scalar]]
+    index: TallyIndex
+    score: Float[Array, "photons parameters"] | None
+
+
+def returns_of_ends(
     scene: DeviceScene,
     ends: FlightEnds,
     weight: Scalar,
     score: Float[Array, "photons parameters"] | None,
-    tally: HigherOrderTally,
-) -> HigherOrderTally:
-    """Deposit the expected return of ends of flights, with the weights there; linear in these."""
+    n_entries: int,
+) -> BinnedReturns:
+    """Compute the expected returns of ends of flights, with the weights there.
+
+    `n_entries`: of the tally that returns are added to, for each material.
+    """
     # Each end stands for its stratum: an equal share of the probability.
     n_ends = scene.config.deposits_per_flight
     value = jnp.where(ends.flights.has_hit, weight, 0.0) * ends.collision.weight / n_ends
     # Optimisation barrier: of the collision only what its return depends on passes, so that directions onward
     # are not computed.
-    deposits = once(
+    w, x, path, value, index, collision, plate_draws, score = once(
         (
             ends.p.w,
             ends.x,
@@ -618,12 +641,33 @@ def deposit_ends(
             score,
         )
     )
-    return _deposit_collisions(scene, tally, *deposits)
+    return _returns_of_collisions(
+        scene, w, x, path, value, index, collision, plate_draws, score, n_entries=n_entries
+    )
 
 
-def _deposit_collisions(
+def _add_returns(scene: DeviceScene, returns: BinnedReturns, tally: HigherOrderTally) -> HigherOrderTally:
+    """Add returns, and their derivatives with score functions, to a tally."""
+    weights = tally.weights.reshape(-1, scene.bins.padded)
+    for tally_row, values in returns.rows:
+        weights = add_rows(weights, tally_row, returns.first_bin, values)
+    if returns.score is not None:
+        assert tally.weight_slopes is not None
+        weight_slopes = add_derivatives_of_returns(
+            scene,
+            tally.weight_slopes,
+            returns.first_bin,
+            returns.row,
+            returns.score,
+            returns.channel_factors,
+            returns.index,
+        )
+        tally = eqx.tree_at(lambda t: t.weight_slopes, tally, weight_slopes)
+    return eqx.tree_at(lambda t: t.weights, tally, weights.reshape(tally.weights.shape))
+
+
+def _returns_of_collisions(
     scene: DeviceScene,
-    tally: HigherOrderTally,
     w: Vec,
     x: Vec,
     path: Scalar,
@@ -632,13 +676,15 @@ def _deposit_collisions(
     collision: CollisionForReturn,
     plate_draws: tuple[Scalar, ...],
     score: Float[Array, "photons parameters"] | None,
-) -> HigherOrderTally:
-    """Deposit the expected return of collisions at `x`, of light that flew along `w`.
+    *,
+    n_entries: int,
+) -> BinnedReturns:
+    """Compute the expected returns of collisions at `x`, of light that flew along `w`.
 
     1. Intensity factors towards the sensor.
     2. Transmittance of the return path: voxels, ground that hides its own slopes, and plates.
     3. Time of arrival, and the value at the range for which that time stands.
-    4. Spread over time bins, add to the tally: for each channel by which light returns, shot, and wavelength.
+    4. Spread over time bins: for each channel by which light returns, shot, and wavelength.
     """
     beam, bins = scene.beam, scene.bins
     v = beam.view(x)
@@ -661,22 +707,15 @@ def _deposit_collisions(
         time, value, material = time[:, None] + delay, value[:, None] * seen, material[:, None]
     # One row serves all channels and wavelengths, which differ by factors alone.
     first_bin, row = once(bspline_row(bins, time, value))
-    n_entries = tally.weights.shape[1]
-    weights = tally.weights.reshape(-1, bins.padded)
+    rows = []
     for channel, factor in channel_factors:
         factor = jnp.where(channel >= 0, factor, 0.0)
         for tally_row, optical_weight in index.after(scene, channel).rows(shots):
             # Optimisation barrier: fused into the rows, the factor would be computed again for each bin.
             scaled = once(factor if optical_weight is None else factor * optical_weight)
             scaled = scaled.reshape(scaled.shape + (1,) * (row.ndim - 1))
-            weights = add_rows(weights, material * n_entries + tally_row, first_bin, row * scaled)
-    if score is not None:
-        assert tally.weight_slopes is not None
-        weight_slopes = add_derivatives_of_returns(
-            scene, tally.weight_slopes, first_bin, row, score, channel_factors, index
-        )
-        tally = eqx.tree_at(lambda t: t.weight_slopes, tally, weight_slopes)
-    return eqx.tree_at(lambda t: t.weights, tally, weights.reshape(tally.weights.shape))
+            rows.append((material * n_entries + tally_row, row * scaled))
+    return BinnedReturns(first_bin, rows, row, channel_factors, index, score)
 
 
 def _return_transmittance(

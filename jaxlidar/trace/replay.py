@@ -126,9 +126,9 @@ def with_replay(
     def pull_back_leaves(leaves: list[Array], varying: list[int], cotangent: Traced) -> list[Array]:
         """Return the cotangents of leaves: of tables of extinction by the replay, of others by JAX."""
         # The position of every table among the leaves.
-        numbered, _ = eqx.combine(jax.tree.unflatten(treedef, range(len(leaves))), static)
-        tables = ExtinctionTables.of(numbered)
-        by_leaf: dict[int, Array] = {}
+        numbered: Any = eqx.combine(jax.tree.unflatten(treedef, range(len(leaves))), static)[0]
+        tables: Any = ExtinctionTables.of(numbered)
+        by_leaf: dict[int, Any] = {}
         if any(number in tables for number in varying):
             pulled = pull_back(*scene_and_numbers(leaves, "none"), cotangent)
             by_leaf = {number: c for number, c in zip(tables, pulled) if number is not None}
@@ -153,7 +153,8 @@ def with_replay(
             for i, (a, t) in enumerate(zip(leaves, tangent))
             if not isinstance(t, SymbolicZero) and jnp.issubdtype(a.dtype, jnp.inexact)
         ]
-        result_structure = jax.tree.structure(jax.eval_shape(value, leaves))
+        result = differentiable(leaves)
+        results, result_structure = jax.tree.flatten(result)
 
         def function(leaves: list[Array], tangents: list[Array]) -> list[Array]:
             def of_varying(values: list[Array]) -> Traced:
@@ -164,8 +165,9 @@ def with_replay(
         def transpose(leaves: list[Array], cotangents: list[Array]) -> list[Array]:
             return pull_back_leaves(leaves, varying, jax.tree.unflatten(result_structure, cotangents))
 
-        result_tangent = linear_map(function, transpose, leaves, [tangent[i] for i in varying])
-        return differentiable(leaves), jax.tree.unflatten(result_structure, result_tangent)
+        tangents_of_varying = [tangent[i] for i in varying]
+        result_tangent = linear_map(function, transpose, leaves, tangents_of_varying, results)
+        return result, jax.tree.unflatten(result_structure, result_tangent)
 
     differentiable.defjvp(push_forward, symbolic_zeros=True)
     return differentiable(leaves)
