@@ -169,6 +169,11 @@ ENTRY_POINTS: dict[str, Callable[[], EntryPoint]] = {
         | {"zenith": 1.0, "azimuth": 2.0, "energy": 1e-3, "sampling_interval": 1.0}
         | {"position": (0.0, 1.0), "field_of_view": 1.0, "jitter": 0.1, "efficiency": 0.9},
     ),
+    "Trajectory": lambda: EntryPoint(
+        jl.Trajectory,
+        {"time": np.arange(2.0), "position": np.array([[0.0, 0.0, 50.0], [0.0, 9.0, 50.0]])}
+        | {"roll": 1.0, "pitch": 2.0, "yaw": 3.0},
+    ),
     "GaussianPulse": lambda: EntryPoint(jl.GaussianPulse, {"fwhm": 6.0}),
     "GaussianPulse.cumulative": lambda: EntryPoint(
         PULSE.cumulative, {"t": np.array([0.0, 1.0]), "jitter": 0.1}

@@ -290,7 +290,7 @@ def trace_photons(
 def empty_tally(scene: DeviceScene, nodes: EntryNodes | None = None) -> HigherOrderTally:
     """Return a tally of zeros; its bins have both margins.
 
-    BinnedReturns are tallied by history; by wavelength where optics are applied; by node, or shot, and wavelength
+    Returns are tallied by history; by wavelength where optics are applied; by node, or shot, and wavelength
     where light is shared. The energy budget has no shots: it is tallied by node.
     """
     n_wavelengths = 0 if scene.optics is None else scene.optics.shape[1]
@@ -298,7 +298,7 @@ def empty_tally(scene: DeviceScene, nodes: EntryNodes | None = None) -> HigherOr
         n_entries = scene.histories.count
     else:
         n_entries = n_wavelengths * (1 if nodes is None else len(nodes.position))
-    # BinnedReturns are tallied by shot; what no receiver sees (absorption, escape) by node.
+    # Returns are tallied by shot; what no receiver sees (absorption, escape) by node.
     n_return_entries = n_entries if scene.shot_views is None else n_wavelengths * scene.shot_views.n_shots
     n_materials, bins, slopes = len(scene.config.materials), scene.bins, scene.slopes
     return HigherOrderTally(

@@ -109,7 +109,7 @@ def test_cases_name_instruments_and_hold_scans_and_counters(tmp_path):
     for name in ("ATLAS weak", "Leica TerrainMapper"):
         lidar = jl.instrument(name)
         jl.io.write_case(path, jl.io.Case(lidar=lidar))
-        again = jl.io.read_case(path).lidar
-        assert again.scan == lidar.scan
-        assert type(again.receiver) is type(lidar.receiver)
-        assert float(again.energy) == float(lidar.energy)
+        read_lidar = jl.io.read_case(path).lidar
+        assert read_lidar.scan == lidar.scan
+        assert type(read_lidar.receiver) is type(lidar.receiver)
+        assert float(read_lidar.energy) == float(lidar.energy)

@@ -217,9 +217,9 @@ def test_shots_have_times_angles_and_flight_lines(tmp_path):
     assert survey[3:5].flight_line.tolist() == [7, 7]
     assert survey.about(np.array([1.0, 2.0])).gps_time[0] == 3.2e8
     jl.io.write_case(tmp_path / "a.toml", jl.io.Case(survey=survey))
-    again = jl.io.read_case(tmp_path / "a.toml").survey
+    read_survey = jl.io.read_case(tmp_path / "a.toml").survey
     for name in ("gps_time", "scan_angle", "flight_line"):
-        np.testing.assert_array_equal(getattr(again, name), getattr(survey, name))
+        np.testing.assert_array_equal(getattr(read_survey, name), getattr(survey, name))
 
 
 @pytest.mark.parametrize(

@@ -110,9 +110,9 @@ def test_heights_above_terrain_and_strips_that_are_joined():
     np.testing.assert_allclose(survey.altitude - ground, above, rtol=1e-5)
     assert survey.flight_line.tolist() == [1] * 6 + [2] * 6
     assert float(survey[7].altitude) == pytest.approx(survey.altitude[7])
-    part = survey[5:8]
-    assert part.flight_line.tolist() == [1, 2, 2]
-    assert part.gps_time.tolist() == [10.0, 0.0, 2.0]
+    middle_shots = survey[5:8]
+    assert middle_shots.flight_line.tolist() == [1, 2, 2]
+    assert middle_shots.gps_time.tolist() == [10.0, 0.0, 2.0]
 
 
 def test_a_flight_has_the_scanner_of_its_lidar():

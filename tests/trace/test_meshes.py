@@ -266,12 +266,12 @@ def test_many_shots_are_single_simulations(shared):
     positions = [(0, 0), (3, 0), (6, 0), (9, 0), (3, 3)]
     survey = jl.Survey(lidar, position=positions)
     options = {"rtol": 0.02, "max_orders": 4}
-    many = jl.simulate_many(survey, scene, key=jax.random.key(0), shared=shared, **options)
-    assert bool(many.info["shared"]) == shared
+    waveforms = jl.simulate_many(survey, scene, key=jax.random.key(0), shared=shared, **options)
+    assert bool(waveforms.info["shared"]) == shared
     for number in (0, 1, 3):
         wave = jl.simulate(survey[number], scene, key=jax.random.key(1), **options)
         for name in ("mesh", "ground"):
-            one, several = (np.asarray(w.components[name]).sum() for w in (wave, many[number]))
+            one, several = (np.asarray(w.components[name]).sum() for w in (wave, waveforms[number]))
             assert one == pytest.approx(several, abs=0.015), (number, name)
 
 

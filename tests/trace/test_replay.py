@@ -132,10 +132,10 @@ def test_empty_voxels_have_their_derivative_at_first_order():
     gradient = gradient[tuple(empty.T)]
     step, value = 0.02, jax.jit(jax.vmap(lambda leaf: loss(START | {"leaf": leaf}, key)))
     # Of second order, from one side: extinction is not negative.
-    more = np.stack([np.asarray(START["leaf"])] * (2 * len(empty) + 1))
+    maps = np.stack([np.asarray(START["leaf"])] * (2 * len(empty) + 1))
     for n, voxel in enumerate(empty):
-        more[(2 * n, *voxel)], more[(2 * n + 1, *voxel)] = step, 2.0 * step
-    values = np.asarray(value(jnp.asarray(more, START["leaf"].dtype)), float)
+        maps[(2 * n, *voxel)], maps[(2 * n + 1, *voxel)] = step, 2.0 * step
+    values = np.asarray(value(jnp.asarray(maps, START["leaf"].dtype)), float)
     one, two, none = values[0:-1:2], values[1:-1:2], values[-1]
     difference = (4.0 * one - two - 3.0 * none) / (2.0 * step)
     np.testing.assert_allclose(gradient, difference, atol=0.02 * np.max(np.abs(difference)))
@@ -163,9 +163,9 @@ def test_simulate_uses_the_replay_unasked(monkeypatch):
         return jnp.sum(wave.reflectance)
 
     leaf = START["leaf"]
-    jax.eval_shape(lambda leaf: jax.jvp(total, (leaf,), (leaf,)), leaf)
+    jax.jit(lambda leaf: jax.jvp(total, (leaf,), (leaf,))).lower(leaf)
     assert not pulled
-    jax.eval_shape(jax.grad(total), leaf)
+    jax.jit(jax.grad(total)).lower(leaf)
     assert pulled
 
 
@@ -179,16 +179,16 @@ def temporaries(orders, **sizes):
 
 
 def test_memory_does_not_grow_with_rays():
-    few, many = (temporaries(1, n_rays=n) for n in (1024, 16_384))
+    small, large = (temporaries(1, n_rays=n) for n in (1024, 16_384))
     # Positions of the rays themselves: three numbers each, in few copies.
-    assert many - few < 16_384 * 100
-    assert many < 10e6
+    assert large - small < 16_384 * 100
+    assert large < 10e6
 
 
 @pytest.mark.slow
 def test_memory_does_not_grow_with_photons():
-    few, many = (temporaries(6, n_photons=n) for n in (16_384, 131_072))
-    assert many < 1.1 * few
+    small, large = (temporaries(6, n_photons=n) for n in (16_384, 131_072))
+    assert large < 1.1 * small
 
 
 @pytest.mark.slow
