@@ -225,58 +225,58 @@ WALL_AND_GROUND = jl.Scene(ground=jl.Ground(reflectance=0.3), plates=(WALL,))
 
 @pytest.fixture(scope="module")
 def terrestrial_scan():
-    """Shots from one place in many directions, their waveforms, and the ranges of what they meet."""
+    """Shots from one place in waveforms directions, their waveforms, and the ranges of what they meet."""
     zenith, azimuth = np.array([60.0, 80.0, 90.0, 100.0, 30.0]), np.array([90.0, 80.0, 90.0, 90.0, 0.0])
     survey = jl.Survey(jl.Lidar(), sensor=np.tile([5.0, 3.0, 4.0], (5, 1)), zenith=zenith, azimuth=azimuth)
-    many = jl.simulate_many(survey, WALL_AND_GROUND, key=KEY, max_orders=1, rtol=0.02, truth=True)
+    waveforms = jl.simulate_many(survey, WALL_AND_GROUND, key=KEY, max_orders=1, rtol=0.02, truth=True)
     to_wall, _ = range_and_cosine(survey.sensor[0], survey.direction)
     to_ground = 4.0 / np.maximum(-survey.direction[:, 2], 1e-9)
     hits_wall = (to_wall > 0) & (to_wall < to_ground)
-    return survey, many, np.where(hits_wall, to_wall, to_ground), hits_wall
+    return survey, waveforms, np.where(hits_wall, to_wall, to_ground), hits_wall
 
 
 def test_a_terrestrial_scan_of_a_wall_and_ground(terrestrial_scan):
-    """Shots of many directions share one program; ranges and reflectances are those of the planes."""
-    survey, many, distance, hits_wall = terrestrial_scan
+    """Shots of waveforms directions share one program; ranges and reflectances are those of the planes."""
+    survey, waveforms, distance, hits_wall = terrestrial_scan
     scene, w = WALL_AND_GROUND, survey.direction
     _, wall_cosine = range_and_cosine(survey.sensor[0], w)
     to_ground = 4.0 / np.maximum(-w[:, 2], 1e-9)
     cosine = np.where(hits_wall, 0.6 * wall_cosine, -0.3 * w[:, 2])
-    sums = many.reflectance.sum(axis=(1, 2))
-    centroid = (many.reflectance[:, 0] * many.time).sum(axis=1) / sums * METRES_PER_NS
+    sums = waveforms.reflectance.sum(axis=(1, 2))
+    centroid = (waveforms.reflectance[:, 0] * waveforms.time).sum(axis=1) / sums * METRES_PER_NS
     np.testing.assert_allclose(sums, cosine, rtol=2e-3)
     np.testing.assert_allclose(centroid, distance, rtol=1e-3)
     ground = survey.sensor + to_ground[:, None] * w
     goes_down = w[:, 2] < -1e-6
-    np.testing.assert_allclose(many.ground_position[goes_down], ground[goes_down], atol=1e-3)
-    assert np.all(np.isnan(many.ground_position[~goes_down]))
-    np.testing.assert_allclose(many.ground_position, jl.ground_position(survey, scene), atol=1e-4)
+    np.testing.assert_allclose(waveforms.ground_position[goes_down], ground[goes_down], atol=1e-3)
+    assert np.all(np.isnan(waveforms.ground_position[~goes_down]))
+    np.testing.assert_allclose(waveforms.ground_position, jl.ground_position(survey, scene), atol=1e-4)
     # A shot alone is that of the survey.
     wave = jl.simulate(survey[1], scene, key=KEY, max_orders=1)
     assert total(wave) == pytest.approx(float(sums[1]), rel=1e-3)
-    assert float(many[1].height[0]) == pytest.approx(
-        4.0 - many.time[0] * METRES_PER_NS * np.cos(np.deg2rad(80.0)), abs=1e-3
+    assert float(waveforms[1].height[0]) == pytest.approx(
+        4.0 - waveforms.time[0] * METRES_PER_NS * np.cos(np.deg2rad(80.0)), abs=1e-3
     )
 
 
 @pytest.mark.parametrize("detector", ["peak", "constant fraction"])
 def test_returns_of_a_terrestrial_scan_lie_on_the_wall_and_the_ground(detector, terrestrial_scan):
     """Positions start at the sensor: s + r w, with the ranges of the planes in closed form."""
-    survey, many, distance, hits_wall = terrestrial_scan
-    returns = many.returns(detector)
+    survey, waveforms, distance, hits_wall = terrestrial_scan
+    returns = waveforms.returns(detector)
     assert returns.shot.tolist() == list(range(5))
     assert returns.material.tolist() == np.where(hits_wall, "plate", "ground").tolist()
     np.testing.assert_allclose(returns.range, distance, atol=5e-3)
     np.testing.assert_allclose(
         returns.position, survey.sensor + distance[:, None] * survey.direction, atol=5e-3
     )
-    np.testing.assert_allclose(returns.reflectance, many.reflectance.sum(axis=(1, 2)), rtol=5e-3)
+    np.testing.assert_allclose(returns.reflectance, waveforms.reflectance.sum(axis=(1, 2)), rtol=5e-3)
     # From the wrong end of the axis, 1 m ahead of the sensor, all would be 1 m off.
     assert np.all(np.abs(returns.range + 1.0 - distance) > 0.9)
     # A shot alone, and the truth.
-    alone = many[3].returns(survey[3], detector)
+    alone = waveforms[3].returns(survey[3], detector)
     np.testing.assert_allclose(alone.position[0], returns.position[3], atol=1e-4)
-    true = many.true_returns()
+    true = waveforms.true_returns()
     np.testing.assert_allclose(true.range, distance, atol=0.02)
     is_inclined = np.abs(survey.direction[:, 2]) > 0.4
     np.testing.assert_allclose(true.range[is_inclined], distance[is_inclined], atol=1e-4)
@@ -334,14 +334,14 @@ def test_a_terrestrial_scan_of_a_sphere():
         zenith=90.0 + off_centre,
         azimuth=90.0,
     )
-    many = jl.simulate_many(survey, scene, key=KEY, max_orders=1, rtol=0.02)
+    waveforms = jl.simulate_many(survey, scene, key=KEY, max_orders=1, rtol=0.02)
     angle = np.deg2rad(off_centre)
     half_chord = np.sqrt(np.maximum(radius**2 - (distance * np.sin(angle)) ** 2, 0.0))
     expected = distance * np.cos(angle) - half_chord
-    sums = many.reflectance.sum(axis=(1, 2))
+    sums = waveforms.reflectance.sum(axis=(1, 2))
     np.testing.assert_allclose(sums, SPHERE * half_chord / radius, rtol=2e-3, atol=1e-9)
     assert sums[3] == 0.0
-    centroid = (many.reflectance[:3, 0] * many.time).sum(axis=1) / sums[:3] * METRES_PER_NS
+    centroid = (waveforms.reflectance[:3, 0] * waveforms.time).sum(axis=1) / sums[:3] * METRES_PER_NS
     np.testing.assert_allclose(centroid, expected[:3], rtol=1e-4)
 
 
@@ -427,6 +427,6 @@ def test_a_lidar_with_a_sensor_is_kept_in_files(tmp_path):
     assert read.has_sensor_position
     np.testing.assert_array_equal(read.sensor, survey.sensor)
     np.testing.assert_array_equal(read[1].sensor, survey[1].sensor)
-    many = jl.simulate_many(read, case.scene, key=KEY, max_orders=1)
-    many.save(tmp_path / "many.nc", jl.io.Case(survey=read, scene=case.scene))
-    np.testing.assert_array_equal(jl.open(tmp_path / "many.nc").ground_position, many.ground_position)
+    waveforms = jl.simulate_many(read, case.scene, key=KEY, max_orders=1)
+    waveforms.save(tmp_path / "many.nc", jl.io.Case(survey=read, scene=case.scene))
+    np.testing.assert_array_equal(jl.open(tmp_path / "many.nc").ground_position, waveforms.ground_position)
