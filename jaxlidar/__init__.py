@@ -46,13 +46,12 @@ waveforms is in the package `inversion`.
 ## Plants
 
 `Habit`, `Branching`, `broadleaf`, `conifer`, `shrub`, `spreading_tree`, `grow`, `forest`, `Tree`,
-`LSystem`, `Rule`, `Symbol`, `Word`, `turtle`, `voxelise`, `voxelise_points`, `voxelise_mesh`, `Mesh`,
-`canopy_from_points`, `PointCanopy`, `trim_empty_layers`.
+`LSystem`, `Rule`, `Symbol`, `Word`, `turtle`, `voxelise`, `voxelise_points`, `canopy_from_points`,
+`PointCanopy`, `voxelise_mesh`, `Mesh`, `mesh_of`, `trim_empty_layers`.
 
 ## Sunlight
 
 `reflectance_factor`, `ReflectanceFactor`, `plan_reflectance`.
-`mesh_of`, `trim_empty_layers`.
 
 ## Truth and energy
 
@@ -195,12 +194,12 @@ __all__ = [
     "Waveforms",
     "SurveyProgress",
     "SceneParts",
+    "Acquisition",
+    "DiscreteReturns",
     # Many scenes.
     "simulate_scenes",
     "SceneWaveforms",
     "plan_scenes",
-    "Acquisition",
-    "DiscreteReturns",
     # Scenes.
     "Scene",
     "Canopy",

@@ -84,7 +84,8 @@ def _target(path: Path) -> Path:
     **Raises:** OSError for what cannot be written to.
     """
     target = path if _is_stream(path) else Path(os.path.realpath(path))
-    if target.exists() and not os.access(target, os.W_OK):
+    # Asked again at the end: another process that replaces a folder removes it for an instant.
+    if target.exists() and not os.access(target, os.W_OK) and target.exists():
         raise PermissionError(errno.EACCES, "write-protected", str(path))
     return target
 

@@ -436,6 +436,22 @@ ENTRY_POINTS: dict[str, Callable[[], EntryPoint]] = {
         {"rtol": 0.1, "max_orders": 1, "max_step": 1.0, "n_photons": 1000, "n_rays": 64}
         | {"window": (-20.0, 40.0), "bin_width": 0.5, "max_memory": 1e9},
     ),
+    "plan_scenes": lambda: EntryPoint(
+        lambda **arguments: jl.plan_scenes(LIDAR, [GROUND], **arguments),
+        {"rtol": 0.1, "max_orders": 1, "n_photons": 1000, "n_rays": 64, "window": (-20.0, 40.0)},
+    ),
+    "reflectance_factor": lambda: EntryPoint(
+        lambda **arguments: jl.reflectance_factor(GROUND, key=KEY, **arguments),
+        {"sun": (30.0, 0.0), "view": (0.0, 0.0), "wavelengths": (650.0, 850.0), "n_photons": 1000}
+        | {"max_orders": 1},
+        messages={"wavelengths": "wavelength"},
+    ),
+    "plan_reflectance": lambda: EntryPoint(
+        lambda **arguments: jl.plan_reflectance(GROUND, **arguments),
+        {"sun": (30.0, 0.0), "view": (0.0, 0.0), "wavelengths": (650.0, 850.0), "n_photons": 1000}
+        | {"max_orders": 1},
+        messages={"wavelengths": "wavelength"},
+    ),
     "energy_budget": lambda: EntryPoint(
         lambda **arguments: jl.energy_budget(LIDAR, GROUND, key=KEY, **arguments),
         {"rtol": 0.1, "max_orders": 10, "max_photons": 1000},
@@ -570,6 +586,13 @@ ENTRY_POINTS: dict[str, Callable[[], EntryPoint]] = {
             jl.Scene(canopy=jl.Canopy(VOXELS, leaf=LEAF, hotspot=False)), density
         ),
         {"density": np.ones(2)},
+    ),
+    "inversion.log_density": lambda: EntryPoint(
+        lambda observed, noise, time, **options: inversion.log_density(
+            observed, unknowns=[UNKNOWN], noise=noise, time=time, plan=plan(), **FIT, **options
+        ),
+        {"observed": observation()["observed"], "noise": 0.01, "time": observation()["time"]}
+        | {"noise_floor": 0.01, "scale": (0.5, 2.0)},
     ),
     "inversion.retrieve": lambda: EntryPoint(
         lambda observed, noise, time, **options: inversion.retrieve(

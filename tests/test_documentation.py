@@ -153,6 +153,9 @@ def actual_default(value, name):
 def equals_stated(stated, actual):
     """True if a default has the value that the docstring states; None if the text is no value."""
     scope = {"inf": np.inf, "infinity": np.inf, **{n: getattr(jaxlidar, n) for n in jaxlidar.__all__}}
+    if type(actual).__name__ == "_Default":
+        # It stands for a value by its text.
+        actual = eval(str(actual), scope)
     words = {"zero": 0, "one": 1, "two": 2, "three": 3, "four": 4, "eight": 8, "none": None, "north": None}
     text = stated.replace(",", "") if re.fullmatch(r"[\d,]+", stated) else stated
     try:

@@ -101,7 +101,8 @@ def test_masks_booleans_and_times(outcomes, name):
 # the others make.
 RESULTS = (
     *("Waveform", "Progress", "PhotonEvents", "Waveforms", "SurveyProgress", "Truth", "Truths"),
-    *("EnergyBudget", "Acquisition", "DiscreteReturns", "InstrumentValue"),
+    *("EnergyBudget", "Acquisition", "DiscreteReturns", "InstrumentValue", "CompilationCache"),
+    *("SceneWaveforms", "ReflectanceFactor", "inversion.Design", "inversion.LogDensity"),
     *("Plan", "Effect", "Setup", "Response", "AnalogReturns", "io.DemRead", "io.GediShot", "io.MeshRead"),
     *("io.NeonImpulse", "io.NeonRead", "io.PointCloud", "io.Returns", "io.Scanner", "io.ShotStack"),
     *("io.TreeRead", "io.VoxelsRead", "io.AirborneShots", "inversion.Retrieval", "inversion.Retrievals"),
@@ -122,7 +123,9 @@ RESULTS = (
     *("inversion.ComparedColumn",),
 )
 OF_OBJECTS = (
-    *("instrument", "instruments", "instrument_sources"),
+    *("instrument", "instruments", "instrument_sources", "compilation_cache", "simulate_scenes"),
+    # Its numbers are those of a lidar, and of `plan`; the noise may be a function.
+    "inversion.design",
     *("total_reflectance", "open", "rerun", "Scene", "load_coefficients", "spectrum_names"),
     *("read_spectrum_csv", "Symbol", "Word", "LSystem", "trim_empty_layers", "truth_of", "make_setup"),
     *("trace_scene", "waveform_of", "Lambertian", "EqualAngle", "spectrum", "Plane"),

@@ -66,7 +66,7 @@ class _Default:
 
 
 _ALTITUDE, _AIM_POINT = _Default("1000.0"), _Default("(0.0, 0.0)")
-_PULSE, _RECEIVER = _Default("GaussianPulse()"), _Default("Receiver()")
+_PULSE, _RECEIVER = _Default("GaussianPulse(fwhm=6.0)"), _Default("Receiver()")
 
 
 def _wavelengths(x: ArrayLike | Sequence[ArrayLike]) -> Float[Array, "..."]:

@@ -365,7 +365,7 @@ def first_order(
 
     if n_rays <= RAYS_AT_ONCE:
         returned, budget, weight_slopes = trace_chunk(across, energy)
-    elif medium is None:
+    elif medium is None and scene.meshes is None:
         # Without a march all chunks fit into the memory at once, and no loop is compiled.
         chunks = jax.vmap(chunk)(*padded)
         returned, budget, weight_slopes = jax.tree.map(lambda a: jnp.sum(a, axis=0), chunks)

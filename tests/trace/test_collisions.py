@@ -36,7 +36,7 @@ def test_the_mean_direction_onward_and_its_derivative(material):
         one = jnp.ones(COUNT)
         w = vec((jnp.sin(angle) * one, 0.0 * one, -jnp.cos(angle) * one))
         cell, x = jnp.zeros(COUNT, jnp.int32), vec((0.0 * one, 0.0 * one, one))
-        collision = sample_collision(device_scene, x, w, cell, cell == 0, [], draws)
+        collision = sample_collision(device_scene, x, w, cell, cell == 0, [], draws, None)
         is_reflected = collision.channel == collision.reflection
         along = jnp.stack(collision.w) * (collision.weight * collision.onward_weight)[None]
         is_reflected = jnp.broadcast_to(is_reflected[None], along.shape)
