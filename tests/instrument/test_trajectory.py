@@ -55,10 +55,8 @@ def test_a_profiler_with_attitude_over_flat_ground(roll, pitch):
     """A beam down in the body meets level ground H tan(roll) / cos(pitch) left, H tan(pitch) ahead."""
     survey = jl.Survey.fly(flight(roll=roll, pitch=pitch), NADIR, lidar=jl.Lidar(), pulse_rate=1.0)
     offset = survey.position - survey.sensor[:, :2]
-    leftwards, forwards = (
-        500 * np.tan(np.deg2rad(roll)) / np.cos(np.deg2rad(pitch)),
-        500 * np.tan(np.deg2rad(pitch)),
-    )
+    leftwards = 500 * np.tan(np.deg2rad(roll)) / np.cos(np.deg2rad(pitch))
+    forwards = 500 * np.tan(np.deg2rad(pitch))
     np.testing.assert_allclose(offset, np.tile([-leftwards, forwards], (11, 1)), atol=1e-5)
     np.testing.assert_allclose(
         survey.zenith, np.rad2deg(np.arccos(np.cos(np.deg2rad(roll)) * np.cos(np.deg2rad(pitch)))), atol=1e-6

@@ -225,7 +225,7 @@ WALL_AND_GROUND = jl.Scene(ground=jl.Ground(reflectance=0.3), plates=(WALL,))
 
 @pytest.fixture(scope="module")
 def terrestrial_scan():
-    """Shots from one place in waveforms directions, their waveforms, and the ranges of what they meet."""
+    """Shots from one place in many directions, their waveforms, and the ranges of what they meet."""
     zenith, azimuth = np.array([60.0, 80.0, 90.0, 100.0, 30.0]), np.array([90.0, 80.0, 90.0, 90.0, 0.0])
     survey = jl.Survey(jl.Lidar(), sensor=np.tile([5.0, 3.0, 4.0], (5, 1)), zenith=zenith, azimuth=azimuth)
     waveforms = jl.simulate_many(survey, WALL_AND_GROUND, key=KEY, max_orders=1, rtol=0.02, truth=True)
@@ -236,7 +236,7 @@ def terrestrial_scan():
 
 
 def test_a_terrestrial_scan_of_a_wall_and_ground(terrestrial_scan):
-    """Shots of waveforms directions share one program; ranges and reflectances are those of the planes."""
+    """Shots of many directions share one program; ranges and reflectances are those of the planes."""
     survey, waveforms, distance, hits_wall = terrestrial_scan
     scene, w = WALL_AND_GROUND, survey.direction
     _, wall_cosine = range_and_cosine(survey.sensor[0], w)
