@@ -20,9 +20,7 @@ waveforms is in the package `inversion`.
 ## Surveys of many shots
 
 `Survey`, `Trajectory`, `AbstractScan`, `Oscillating`, `RotatingPolygon`, `Conical`, `ground_position`,
-`simulate_many`, `Waveforms`, `SurveyProgress`, `SceneParts`.
-`Survey`, `AbstractScan`, `Oscillating`, `RotatingPolygon`, `Conical`, `simulate_many`, `Waveforms`,
-`SurveyProgress`, `SceneParts`, `Acquisition`, `DiscreteReturns`.
+`simulate_many`, `Waveforms`, `SurveyProgress`, `SceneParts`, `Acquisition`, `DiscreteReturns`.
 
 ## Many scenes
 

@@ -28,6 +28,11 @@ def _varying_axes(tree: Any) -> set[str]:
     return {axis for x in tracers for axis in jax.typeof(x).manual_axis_type.varying}
 
 
+def varies(tree: Any) -> bool:
+    """Return True if any array of a pytree may vary along a manual axis of the mesh."""
+    return bool(_varying_axes(tree))
+
+
 def vary_with(tree: Tree, like: Any) -> Tree:
     """Return a pytree whose arrays vary along all mesh axes along which any array of `like` does."""
     axes = _varying_axes(like)

@@ -124,6 +124,7 @@ RESULTS = (
 )
 OF_OBJECTS = (
     *("instrument", "instruments", "instrument_sources", "compilation_cache", "simulate_scenes"),
+    *("ground_position", "io.read_trajectory"),
     # Its numbers are those of a lidar, and of `plan`; the noise may be a function.
     "inversion.design",
     *("total_reflectance", "open", "rerun", "Scene", "load_coefficients", "spectrum_names"),

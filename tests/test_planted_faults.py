@@ -59,8 +59,8 @@ FAULTS = {
     ),
     "paths in and out exchanged for the hot spot": Fault(
         "trace/first_order.py",
-        "kappa = 1.0 if config.hotspot else 2.0",
-        "kappa = 2.0 if config.hotspot else 1.0",
+        "self.kappa = 1.0 if scene.config.hotspot else 2.0",
+        "self.kappa = 2.0 if scene.config.hotspot else 1.0",
         "trace/test_slab_first_order.py",
     ),
     "half a bin": Fault(

@@ -177,6 +177,41 @@ def jacobian(record: dict) -> str:
     return page_of(f"{record['photons']:,} photons.", table(["columns", "s", "simulations"], rows))
 
 
+def gradients(record: dict) -> str:
+    rows = [
+        [
+            f"{c['side']}³",
+            str(c["orders"]),
+            number(c["seconds"]["gradient"]),
+            number(c["ratio"]),
+            number(c["ratio_as_called"]),
+            number(c["MB"]),
+            number(c["MB_four_times_the_photons"]),
+            number(c["compilation"]["gradient"]),
+            number(c["compilation"]["gradient"] / c["compilation"]["simulation"]),
+        ]
+        for c in record["cases"]
+    ]
+    head = [
+        "voxels",
+        "orders",
+        "CPU s",
+        "simulations",
+        "calls of `simulate`",
+        "MB",
+        "MB, four times the photons",
+        "compilation, s",
+        "times that of a simulation",
+    ]
+    return page_of(
+        "The gradient of a function of the waveform with respect to the leaf area density of every voxel, "
+        f"with its value, by `jax.grad` of `simulate(..., plan=)`: {record['photons']:,} photons, "
+        f"{record['rays']:,} rays. Times are compared with a compiled simulation of the same photons, and "
+        "with `simulate` as it is called outside of a transformation. Memory is that of temporaries.",
+        table(head, rows),
+    )
+
+
 def fits(record: dict) -> str:
     rows = [
         [
@@ -401,6 +436,7 @@ SECTIONS: dict[str, tuple[str, Callable[[dict], str]]] = {
     "first_order_march": ("First order against a kernel written by hand", march),
     "one_trace_all_wavelengths": ("Many wavelengths from one trace", wavelengths),
     "jacobian_cost": ("Jacobians of a waveform", jacobian),
+    "gradient_cost": ("Gradients in every voxel", gradients),
     "fit_speed": ("Fits against scipy", fits),
     "retrieval_coverage": ("Accuracy and coverage of retrievals", coverage),
     "profiles": ("Vertical profiles against the closed form", profiles),

@@ -14,8 +14,8 @@ once on the way out.
 """
 
 import itertools
-from collections.abc import Iterator
-from typing import NamedTuple
+from collections.abc import Callable, Iterator
+from typing import NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -46,6 +46,8 @@ from jaxlidar.trace.reparametrisation import rays_with_grids
 from jaxlidar.trace.score_functions import add_parameter_rows, segment_derivatives, with_depth_slopes
 from jaxlidar.trace.surfaces import TracedSurface
 from jaxlidar.trace.voxel_traversal import Medium
+
+Tally = TypeVar("Tally")
 
 # Rays that are marched at once, so that their segments stay in the processor's cache.
 RAYS_AT_ONCE = 512
@@ -180,12 +182,243 @@ def march_rays(scene: DeviceScene, rays: FootprintRays) -> tuple[RaySegments, li
 class _FirstOrderTally(NamedTuple):
     """Sums over rays while they are deposited, in rows (axis `entries`): materials times histories.
 
-    `returned`: by row and padded bin. `arrived`: by row. `slopes`: derivatives of `returned`, or None.
+    `returned`: by row and padded bin. `arrived`, `scattered`: by row. `escaped`: by history. `slopes`:
+    derivatives of `returned`, or None.
     """
 
     returned: Float[Array, "entries padded"]
     arrived: Float[Array, "entries"]
+    scattered: Float[Array, "entries"]
+    escaped: Float[Array, "histories"]
     slopes: Float[Array, "entries padded parameters"] | None
+
+    @property
+    def of_medium(self) -> tuple[Array, Array, Array | None]:
+        """The sums to which the segments of the medium add."""
+        return self.returned, self.arrived, self.slopes
+
+
+class ChunkTally(NamedTuple):
+    """Sums over a chunk of rays: returns by row and padded bin, energies, and derivatives of returns."""
+
+    returned: Float[Array, "entries padded"]
+    arrived: Float[Array, "materials histories"]
+    scattered: Float[Array, "materials histories"]
+    escaped: Float[Array, "histories"]
+    slopes: Float[Array, "materials histories bins parameters"] | None
+
+
+class FirstOrderTracer:
+    """Deposits the returns of chunks of rays, and the energy that arrives, in parts that reverse mode shares.
+
+    With `mirror`, the rays carry what that surface returns of them (see `jaxlidar.trace.mirror_return`), and
+    nothing else is deposited.
+    """
+
+    def __init__(self, scene: DeviceScene, mirror: int | None = None):
+        self.scene, self.mirror = scene, mirror
+        self.one_passage = PlateTransmission(scene.surfaces, scene.config, 1)
+        self.two_passages = PlateTransmission(scene.surfaces, scene.config, 2)
+        self.kappa = 1.0 if scene.config.hotspot else 2.0
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Numbers of materials and of histories, whose product is that of the rows of a tally."""
+        return len(self.scene.config.materials), self.scene.first_histories.count
+
+    def trace_chunk(self, across: tuple[Scalar, Scalar], energy: Scalar) -> ChunkTally:
+        """Trace a chunk of rays by the five steps of `first_order`."""
+        scene, config, slopes = self.scene, self.scene.config, self.scene.slopes
+        # Step 1.
+        rays = send_rays(scene, across, energy)
+        depth_at_surfaces = [jnp.zeros_like(energy) for _ in rays.surface_distances]
+        total_depth, slopes_at_surfaces = jnp.zeros_like(energy), []
+        tally = self.empty_tally(energy)
+        if scene.medium is not None:
+            segments, depth_at_surfaces, total_depth = march_rays(scene, rays)
+            if slopes is not None:
+                segments, slopes_at_surfaces = with_depth_slopes(
+                    scene, segments, rays.w, rays.surface_distances
+                )
+
+            # Step 2.
+            per_ray = (rays, self.seen_energy(rays))
+            if scene.reverse:
+
+                def step(tally, segments):
+                    return self.deposit_segments(tally, segments, per_ray), None
+
+                # Blocks are a loop of unknown length, which has no reverse derivative.
+                tally = lax.scan(step, tally, segments)[0]
+            else:
+                # Segments of zero extinction return nothing, but have derivatives.
+                contributes = segments.extinction > 0.0 if scene.derivatives == "none" else None
+                tally = add_in_blocks(self.deposit_segments, tally, segments, per_ray, contributes)
+            # Step 3. All energy that collides in the medium is scattered.
+            tally = tally._replace(returned=smooth_padded(tally.returned), scattered=tally.arrived)
+            if tally.slopes is not None:
+                smooth = smooth_bins(jnp.swapaxes(tally.slopes, 1, 2))[..., 1:-1]
+                tally = tally._replace(slopes=jnp.swapaxes(smooth, 1, 2))
+        # Steps 4 and 5.
+        tally = self.deposit_surfaces(tally, rays, depth_at_surfaces, slopes_at_surfaces)
+        tally = self.add_escape(tally, rays, total_depth)
+        if tally.slopes is not None:
+            bins = scene.bins
+            inside = tally.slopes[:, bins.max_span : bins.max_span + bins.count]
+            tally = tally._replace(slopes=inside.reshape(*self.shape, bins.count, -1))
+        shape = (len(config.materials), scene.first_histories.count)
+        arrived, scattered = tally.arrived.reshape(shape), tally.scattered.reshape(shape)
+        return ChunkTally(tally.returned, arrived, scattered, tally.escaped, tally.slopes)
+
+    def empty_tally(self, energy: Scalar) -> _FirstOrderTally:
+        """Return a tally of zeros for rays with these fractions of the energy."""
+        scene, (n_materials, n_histories) = self.scene, self.shape
+        n_rows, padded = n_materials * n_histories, scene.bins.padded
+        return_slopes = None
+        if scene.slopes is not None:
+            return_slopes = jnp.zeros((n_rows, padded, scene.slopes.count), energy.dtype)
+        tally = _FirstOrderTally(
+            returned=jnp.zeros((n_rows, padded), energy.dtype),
+            arrived=jnp.zeros((n_rows,), energy.dtype),
+            scattered=jnp.zeros((n_rows,), energy.dtype),
+            escaped=jnp.zeros((n_histories,), energy.dtype),
+            slopes=return_slopes,
+        )
+        return vary_with(tally, scene)
+
+    def seen_energy(self, rays: FootprintRays) -> Scalar:
+        """Return what the receiver sees of rays, at the ground or at the reference plane."""
+        # One fraction for all of a ray: beams are narrow in angle.
+        end = jnp.minimum(rays.end, self.scene.limits.start_distance)
+        return rays.energy * self.scene.beam.in_view(along(rays.x, rays.w, end))
+
+    # Materials are deposited one after the other, so that each has its own histories and intensity factor.
+    def deposit_segments(
+        self,
+        tally: _FirstOrderTally,
+        segments: RaySegments,
+        per_ray: tuple[FootprintRays, Scalar],
+        extinctions: tuple[Scalar | None, Scalar | None] | None = None,
+    ) -> _FirstOrderTally:
+        """Add segments to a tally.
+
+        `per_ray`: the ray of each, and its seen energy. `extinctions`: those of leaf and of bark, 1/m; None
+        looks them up.
+
+        1. Integrate exp(-kappa tau) ds over each segment, bin by bin.
+        2. For each material, and each term of the plates in the path: add V_m k_m times these integrals.
+        3. With score functions, add their derivatives.
+        4. Add the energy that arrives, k_m times the integral of exp(-tau) ds.
+        """
+        scene, bins, config, kappa = self.scene, self.scene.bins, self.scene.config, self.kappa
+        histories, (_, n_histories) = scene.first_histories, self.shape
+        leaf_material = -1 if config.leaf is None else config.leaf.material
+        assert scene.medium is not None
+        (returned, arrived, return_slopes), (rays, seen_energy) = tally.of_medium, per_ray
+        k, w, distances = segments.extinction, rays.w, rays.surface_distances
+        start_position = bins.position(2.0 * (rays.excess + segments.start) / SPEED_OF_LIGHT)
+        first_bin, pieces = integrate_over_bins(bins, start_position, segments, kappa)
+        # Integral of exp(-tau) ds over the segment: what arrives is attenuated once.
+        attenuated_length = jnp.exp(-segments.depth) * mean_decay(k * segments.length) * segments.length
+        middle = segments.start + 0.5 * segments.length
+        if extinctions is None:
+            extinctions = material_extinctions(scene.medium, segments, w)
+        materials = _medium_materials(scene.medium, config, extinctions, w)
+        for m, material in materials if self.mirror is None else ():
+            value = material.extinction * (material.intensity_factor * seen_energy)
+            scattered_history = int(histories.next_history[0, material.channel])
+            for history, factor in self.two_passages.terms(histories, scattered_history, middle, distances):
+                tally_row = jnp.broadcast_to(m * n_histories + history, first_bin.shape)
+                # Optimisation barriers: fused, the factor would be computed again for each piece, out of
+                # order.
+                row = once(pieces * once(value * factor)[None])
+                row = jnp.moveaxis(row, 0, -1)
+                returned = add_rows(returned, tally_row, first_bin, row)
+                if scene.slopes is not None:
+                    assert return_slopes is not None
+                    rows = segment_derivatives(
+                        scene,
+                        m == leaf_material,
+                        w,
+                        start_position,
+                        segments,
+                        kappa,
+                        material.extinction,
+                        material.intensity_factor * seen_energy * factor,
+                    )
+                    return_slopes = add_parameter_rows(return_slopes, tally_row, first_bin, rows)
+            for history, factor in self.one_passage.terms(histories, 0, middle, distances):
+                weight = material.extinction * attenuated_length * factor * rays.energy
+                arrived = _add(arrived, m * n_histories + history, weight)
+        return tally._replace(returned=returned, arrived=arrived, slopes=return_slopes)
+
+    def deposit_surfaces(
+        self,
+        tally: _FirstOrderTally,
+        rays: FootprintRays,
+        depth_at_surfaces: list[Scalar],
+        slopes_at_surfaces: list[Float[Array, "rays parameters"]],
+    ) -> _FirstOrderTally:
+        """Deposit the return of every surface at an instant, and the energy that arrives there.
+
+        `slopes_at_surfaces`: derivatives of the depths with respect to parameters; empty without score
+        functions.
+        """
+        scene, bins, config, mirror = self.scene, self.scene.bins, self.scene.config, self.mirror
+        histories, (_, n_histories) = scene.first_histories, self.shape
+        x, w, excess, energy, distances, end, mesh_normal = rays
+        returned, arrived, scattered, _, return_slopes = tally
+        for i, (surface, scatterer) in enumerate(zip(scene.surfaces, config.surfaces)):
+            if mirror is not None and i != mirror:
+                continue
+            is_met = distances[i] < FAR
+            hit_energy = jnp.where((distances[i] <= end) & is_met, surface.coverage * energy, 0.0)
+            point = along(x, w, jnp.where(is_met, distances[i], 0.0))
+            normal, back = surface.lit_normal(point, w, mesh_normal), scale(w, jnp.asarray(-1.0))
+            for history, factor in self.one_passage.terms(histories, 0, distances[i], distances):
+                weight = hit_energy * jnp.exp(-depth_at_surfaces[i]) * factor
+                tally_row = scatterer.material * n_histories + history
+                arrived = _add(arrived, tally_row, weight)
+                # What a law does not reflect per unit reflectance is absorbed, not scattered.
+                albedo = surface.scale_by_pattern(point, surface.law.albedo(w, normal))
+                scattered = _add(scattered, tally_row, weight * albedo)
+            if mirror is None and isinstance(surface.law, AbstractMirror):
+                continue
+            # A plate may lie far above the ground, where the field of view is narrower: it is taken at the
+            # point itself.
+            seen = surface.scale_by_pattern(point, scene.beam.in_view(point))
+            if mirror is None:
+                seen = (
+                    surface.law.intensity_factor(w, normal, back, scene.beam.aperture_half_angle(point))
+                    * seen
+                )
+            # FAR would overflow when it is converted to bins.
+            time = 2.0 * (excess + jnp.minimum(distances[i], 1e9)) / SPEED_OF_LIGHT
+            first_bin, row = bspline_row(
+                bins, time, hit_energy * seen * jnp.exp(-self.kappa * depth_at_surfaces[i])
+            )
+            reflected_history = int(histories.next_history[0, scatterer.reflection])
+            terms = self.two_passages.terms(histories, reflected_history, distances[i], distances)
+            for history, factor in terms:
+                tally_row = jnp.broadcast_to(scatterer.material * n_histories + history, first_bin.shape)
+                returned = add_rows(returned, tally_row, first_bin, row * factor[:, None])
+                if return_slopes is not None:
+                    values = lax.stop_gradient(row * factor[:, None])
+                    rows = outer_rows(values, -self.kappa * slopes_at_surfaces[i])
+                    return_slopes = add_parameter_rows(return_slopes, tally_row, first_bin, rows)
+        return tally._replace(returned=returned, arrived=arrived, scattered=scattered, slopes=return_slopes)
+
+    def add_escape(
+        self, tally: _FirstOrderTally, rays: FootprintRays, total_depth: Scalar
+    ) -> _FirstOrderTally:
+        """Add what is left of rays that meet no ground."""
+        escaped = tally.escaped
+        # Rays that meet the ground end there; only those that fly past it escape.
+        unscattered = jnp.where(rays.end < FAR, 0.0, rays.energy * jnp.exp(-total_depth))
+        terms = self.one_passage.terms(self.scene.first_histories, 0, rays.end, rays.surface_distances)
+        for history, factor in terms:
+            escaped = _add(escaped, history, unscattered * factor)
+        return tally._replace(escaped=escaped)
 
 
 def first_order(
@@ -209,181 +442,49 @@ def first_order(
     4. Deposit the return of every surface at an instant, and the energy that arrives there.
     5. What is left of rays that meet no ground escapes.
     """
-    beam, medium, surfaces = scene.beam, scene.medium, scene.surfaces
-    config, histories, bins = scene.config, scene.first_histories, scene.bins
-    n_histories, leaf_material = histories.count, -1 if config.leaf is None else config.leaf.material
-    one_passage = PlateTransmission(surfaces, config, 1)
-    two_passages = PlateTransmission(surfaces, config, 2)
-    kappa = 1.0 if config.hotspot else 2.0
-    next_history = histories.next_history
-    n_materials, slopes = len(config.materials), scene.slopes
+    tracer, bins = FirstOrderTracer(scene, mirror), scene.bins
 
-    # Materials are deposited one after the other, so that each has its own histories and intensity factor.
-    def add_segments(tally, segments, per_ray):
-        """Add segments to a `_FirstOrderTally`; `per_ray`: the ray of each, and its seen energy.
+    def trace_chunk(x: Scalar, y: Scalar, energy: Scalar) -> ChunkTally:
+        return tracer.trace_chunk((x, y), energy)
 
-        1. Integrate exp(-kappa tau) ds over each segment, bin by bin.
-        2. For each material, and each term of the plates in the path: add V_m k_m times these integrals.
-        3. With score functions, add their derivatives.
-        4. Add the energy that arrives, k_m times the integral of exp(-tau) ds.
-        """
-        assert medium is not None
-        (returned, arrived, return_slopes), (rays, seen_energy) = tally, per_ray
-        k, w, distances = segments.extinction, rays.w, rays.surface_distances
-        start_position = bins.position(2.0 * (rays.excess + segments.start) / SPEED_OF_LIGHT)
-        first_bin, pieces = integrate_over_bins(bins, start_position, segments, kappa)
-        # Integral of exp(-tau) ds over the segment: what arrives is attenuated once.
-        attenuated_length = jnp.exp(-segments.depth) * mean_decay(k * segments.length) * segments.length
-        middle = segments.start + 0.5 * segments.length
-        materials = _medium_materials(medium, config, segments, w)
-        for m, material in materials if mirror is None else ():
-            value = material.extinction * (material.intensity_factor * seen_energy)
-            scattered_history = int(next_history[0, material.channel])
-            for history, factor in two_passages.terms(histories, scattered_history, middle, distances):
-                tally_row = jnp.broadcast_to(m * n_histories + history, first_bin.shape)
-                # Optimisation barriers: fused, the factor would be computed again for each piece, out of
-                # order.
-                row = once(pieces * once(value * factor)[None])
-                row = jnp.moveaxis(row, 0, -1)
-                returned = add_rows(returned, tally_row, first_bin, row)
-                if slopes is not None:
-                    assert return_slopes is not None
-                    rows = segment_derivatives(
-                        scene,
-                        m == leaf_material,
-                        w,
-                        start_position,
-                        segments,
-                        kappa,
-                        material.extinction,
-                        material.intensity_factor * seen_energy * factor,
-                    )
-                    return_slopes = add_parameter_rows(return_slopes, tally_row, first_bin, rows)
-            for history, factor in one_passage.terms(histories, 0, middle, distances):
-                weight = material.extinction * attenuated_length * factor * rays.energy
-                arrived = _add(arrived, m * n_histories + history, weight)
-        return _FirstOrderTally(returned, arrived, return_slopes)
-
-    def trace_chunk(across, energy):
-        """Trace a chunk of rays by the five steps of `first_order`."""
-        # Step 1.
-        rays = send_rays(scene, across, energy)
-        x, w, excess, energy, distances, end, mesh_normal = rays
-        # What the receiver sees of a ray, at the ground or at the reference plane: beams are narrow in angle.
-        seen_energy = energy * beam.in_view(along(x, w, jnp.minimum(end, scene.limits.start_distance)))
-        returned = jnp.zeros((n_materials * n_histories, bins.padded), energy.dtype)
-        arrived = jnp.zeros((n_materials * n_histories,), energy.dtype)
-        scattered, escaped = arrived, jnp.zeros((n_histories,), energy.dtype)
-        depth_at_surfaces, total_depth = [jnp.zeros_like(energy) for _ in distances], jnp.zeros_like(energy)
-        return_slopes, slopes_at_surfaces = None, []
-        if slopes is not None:
-            return_slopes = jnp.zeros((n_materials * n_histories, bins.padded, slopes.count), energy.dtype)
-        returned, arrived, scattered, escaped, return_slopes = vary_with(
-            (returned, arrived, scattered, escaped, return_slopes), scene
-        )
-
-        if medium is not None:
-            segments, depth_at_surfaces, total_depth = march_rays(scene, rays)
-            if slopes is not None:
-                segments, slopes_at_surfaces = with_depth_slopes(scene, segments, w, distances)
-
-            # Step 2.
-            tally, per_ray = _FirstOrderTally(returned, arrived, return_slopes), (rays, seen_energy)
-            if scene.reverse:
-
-                def step(tally, segments):
-                    return add_segments(tally, segments, per_ray), None
-
-                # Blocks are a loop of unknown length, which has no reverse derivative.
-                returned, arrived, return_slopes = lax.scan(step, tally, segments)[0]
-            else:
-                # Segments of zero extinction return nothing, but have derivatives.
-                contributes = segments.extinction > 0.0 if scene.derivatives == "none" else None
-                returned, arrived, return_slopes = add_in_blocks(
-                    add_segments, tally, segments, per_ray, contributes
-                )
-            # Step 3. All energy that collides in the medium is scattered.
-            returned, scattered = _smooth_padded(returned), arrived
-            if return_slopes is not None:
-                smooth = smooth_bins(jnp.swapaxes(return_slopes, 1, 2))[..., 1:-1]
-                return_slopes = jnp.swapaxes(smooth, 1, 2)
-
-        # Step 4.
-        for i, (surface, scatterer) in enumerate(zip(surfaces, config.surfaces)):
-            if mirror is not None and i != mirror:
-                continue
-            is_met = distances[i] < FAR
-            hit_energy = jnp.where((distances[i] <= end) & is_met, surface.coverage * energy, 0.0)
-            point = along(x, w, jnp.where(is_met, distances[i], 0.0))
-            normal, back = surface.lit_normal(point, w, mesh_normal), scale(w, jnp.asarray(-1.0))
-            for history, factor in one_passage.terms(histories, 0, distances[i], distances):
-                weight = hit_energy * jnp.exp(-depth_at_surfaces[i]) * factor
-                tally_row = scatterer.material * n_histories + history
-                arrived = _add(arrived, tally_row, weight)
-                # What a law does not reflect per unit reflectance is absorbed, not scattered.
-                albedo = surface.scale_by_pattern(point, surface.law.albedo(w, normal))
-                scattered = _add(scattered, tally_row, weight * albedo)
-            if mirror is None and isinstance(surface.law, AbstractMirror):
-                continue
-            # A plate may lie far above the ground, where the field of view is narrower: it is taken at the
-            # point itself.
-            seen = surface.scale_by_pattern(point, beam.in_view(point))
-            if mirror is None:
-                seen = surface.law.intensity_factor(w, normal, back, beam.aperture_half_angle(point)) * seen
-            # FAR would overflow when it is converted to bins.
-            time = 2.0 * (excess + jnp.minimum(distances[i], 1e9)) / SPEED_OF_LIGHT
-            first_bin, row = bspline_row(
-                bins, time, hit_energy * seen * jnp.exp(-kappa * depth_at_surfaces[i])
-            )
-            reflected_history = int(next_history[0, scatterer.reflection])
-            terms = two_passages.terms(histories, reflected_history, distances[i], distances)
-            for history, factor in terms:
-                tally_row = jnp.broadcast_to(scatterer.material * n_histories + history, first_bin.shape)
-                returned = add_rows(returned, tally_row, first_bin, row * factor[:, None])
-                if return_slopes is not None:
-                    values = lax.stop_gradient(row * factor[:, None])
-                    rows = outer_rows(values, -kappa * slopes_at_surfaces[i])
-                    return_slopes = add_parameter_rows(return_slopes, tally_row, first_bin, rows)
-
-        # Step 5. Rays that meet the ground end there; only those that fly past it escape.
-        unscattered = jnp.where(end < FAR, 0.0, energy * jnp.exp(-total_depth))
-        for history, factor in one_passage.terms(histories, 0, end, distances):
-            escaped = _add(escaped, history, unscattered * factor)
-        shape = (n_materials, n_histories)
-        if return_slopes is not None:
-            return_slopes = return_slopes[:, bins.max_span : bins.max_span + bins.count]
-            return_slopes = return_slopes.reshape(*shape, bins.count, -1)
-        return returned, (arrived.reshape(shape), scattered.reshape(shape), escaped), return_slopes
-
+    # Reverse mode traces each chunk again, and keeps the intermediate values of one chunk at a time.
+    chunk = jax.checkpoint(trace_chunk) if scene.reverse else trace_chunk
     across, energy = move_rays(scene, across, energy)
     n_rays = energy.shape[0]
-    fill = -n_rays % RAYS_AT_ONCE
-    padded = [jnp.pad(a, (0, fill)).reshape(-1, RAYS_AT_ONCE) for a in (*across, energy)]
-
-    def chunk(x, y, e):
-        return trace_chunk((x, y), e)
-
     if n_rays <= RAYS_AT_ONCE:
-        returned, budget, weight_slopes = trace_chunk(across, energy)
-    elif medium is None and scene.meshes is None:
+        total = chunk(*across, energy)
+    elif scene.medium is None and scene.meshes is None:
         # Without a march all chunks fit into the memory at once, and no loop is compiled.
-        chunks = jax.vmap(chunk)(*padded)
-        returned, budget, weight_slopes = jax.tree.map(lambda a: jnp.sum(a, axis=0), chunks)
+        chunks = jax.vmap(chunk)(*ray_chunks(across, energy))
+        total = jax.tree.map(lambda a: jnp.sum(a, axis=0), chunks)
     else:
-        # The loop needs zeros of the result's shape; evaluating shapes compiles nothing.
-        shapes = jax.eval_shape(trace_chunk, across, energy)
-        zero = vary_with(jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), shapes), scene)
-
-        def add(total, rays):
-            return jax.tree.map(jnp.add, total, chunk(*rays)), None
-
-        returned, budget, weight_slopes = lax.scan(add, zero, padded)[0]
-    weights, outside = bins.trim(returned.reshape(n_materials, n_histories, bins.padded))
-    arrived, scattered, escaped = budget
-    return FirstOrder(weights, outside, arrived, scattered, escaped, weight_slopes)
+        total = sum_over_chunks(scene, chunk, ray_chunks(across, energy))
+    weights, outside = bins.trim(total.returned.reshape(*tracer.shape, bins.padded))
+    return FirstOrder(weights, outside, total.arrived, total.scattered, total.escaped, total.slopes)
 
 
-def _smooth_padded(returned: Float[Array, "entries padded"]) -> Float[Array, "entries padded"]:
+def ray_chunks(across: tuple[Scalar, Scalar], energy: Scalar) -> list[Float[Array, "chunks rays"]]:
+    """Arrange x and y across the beam, and energies, in chunks; rays without energy fill up the last."""
+    size = min(RAYS_AT_ONCE, energy.shape[0])
+    fill = -energy.shape[0] % size
+    return [jnp.pad(a, (0, fill)).reshape(-1, size) for a in (*across, energy)]
+
+
+def sum_over_chunks(
+    scene: DeviceScene, chunk: Callable[..., Tally], chunks: list[Float[Array, "chunks rays"]]
+) -> Tally:
+    """Sum the results of chunks of rays, one after the other."""
+    # The loop needs zeros of the result's shape; evaluating shapes compiles nothing.
+    shapes = jax.eval_shape(chunk, *(a[0] for a in chunks))
+    zero = vary_with(jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), shapes), scene)
+
+    def add(total: Tally, rays: list[Scalar]) -> tuple[Tally, None]:
+        return jax.tree.map(jnp.add, total, chunk(*rays)), None
+
+    return lax.scan(add, zero, chunks)[0]
+
+
+def smooth_padded(returned: Float[Array, "entries padded"]) -> Float[Array, "entries padded"]:
     """Smooth bins with their margins; what would leave these at either end stays in the outermost bin."""
     smooth = smooth_bins(returned)
     return smooth[:, 1:-1].at[:, 0].add(smooth[:, 0]).at[:, -1].add(smooth[:, -1])
@@ -405,24 +506,34 @@ class MediumMaterial(eqx.Module):
     channel: int = eqx.field(static=True)
 
 
+def material_extinctions(
+    medium: Medium, segments: RaySegments, w: Vec
+) -> tuple[Scalar | None, Scalar | None]:
+    """Look up the extinction of leaf and of bark along segments, 1/m; None where there is none."""
+    if medium.leaf is None or medium.bark is None:
+        # Without the other material, the segment's extinction is this material's: no second look-up.
+        return (
+            None if medium.leaf is None else segments.extinction,
+            None if medium.bark is None else segments.extinction,
+        )
+    return medium.leaf_extinction(segments.cell, w), medium.bark_extinction(segments.cell)
+
+
 def _medium_materials(
-    medium: Medium, config: TraceConfig, segments: RaySegments, w: Vec
+    medium: Medium, config: TraceConfig, extinctions: tuple[Scalar | None, Scalar | None], w: Vec
 ) -> Iterator[tuple[int, MediumMaterial]]:
     """Yield the number of each material of the medium, and its properties along segments."""
-    back = scale(w, jnp.asarray(-1.0))
-    if medium.leaf is not None and config.leaf is not None:
-        # Without the other material, the segment's extinction is this material's: no second look-up.
-        k = segments.extinction if medium.bark is None else medium.leaf_extinction(segments.cell, w)
+    back, (leaf_k, bark_k) = scale(w, jnp.asarray(-1.0)), extinctions
+    if leaf_k is not None and config.leaf is not None:
         factor = FACET_BACKSCATTER
         if medium.leaf_phase is not None:
             factor = medium.leaf_phase.intensity_factor(w, back)
         elif medium.angle_tables is not None:
             # Mean of |n.w| |n.back| over facets that are hit, with density g(n) |n.w| / G.
             factor = medium.angle_tables.squared_cosine_at(w) / medium.angle_tables.projection_at(w)
-        yield config.leaf.material, MediumMaterial(k, factor, config.leaf.reflection)
-    if medium.bark is not None and config.bark is not None:
-        k = segments.extinction if medium.leaf is None else medium.bark_extinction(segments.cell)
+        yield config.leaf.material, MediumMaterial(leaf_k, factor, config.leaf.reflection)
+    if bark_k is not None and config.bark is not None:
         factor = FACET_BACKSCATTER
         if medium.bark_phase is not None:
             factor = medium.bark_phase.intensity_factor(w, back)
-        yield config.bark.material, MediumMaterial(k, factor, config.bark.reflection)
+        yield config.bark.material, MediumMaterial(bark_k, factor, config.bark.reflection)

@@ -30,7 +30,7 @@ collide where the extinction coefficient is exactly zero, and the derivative wit
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -51,7 +51,7 @@ from jaxlidar.trace.flight import Flight, SurfaceEncounters, meet_surfaces, samp
 from jaxlidar.trace.footprint import GOLDEN, across_beam
 from jaxlidar.trace.meshes import clear_of_mesh
 from jaxlidar.trace.photon_step import collide, passed_plates
-from jaxlidar.trace.photons import CollisionForReturn, Photons, attached_ratio, detach
+from jaxlidar.trace.photons import Collision, CollisionForReturn, Photons, attached_ratio, detach
 from jaxlidar.trace.random_numbers import PhotonDraws, random_words, shifted_lattices, to_unit
 from jaxlidar.trace.reparametrisation import (
     has_moving_landings,
@@ -61,6 +61,8 @@ from jaxlidar.trace.reparametrisation import (
 from jaxlidar.trace.score_functions import add_derivatives_of_returns, collision_score, vertical_depth_slopes
 from jaxlidar.trace.tally_index import TallyIndex, add_to_tally
 from jaxlidar.trace.voxel_traversal import depth_to_top, march_to_depths
+
+Sums = TypeVar("Sums")
 
 # Photons that are traced together, so that their state stays in the processor's cache.
 PHOTONS_PER_CHUNK = 256
@@ -104,59 +106,72 @@ class HigherOrderTally(eqx.Module):
         return eqx.tree_at(lambda t: t.departed, self, departed)
 
 
-class _Lanes(NamedTuple):
+class Lanes(NamedTuple):
     """Photons, and the number of each in its batch, which its random numbers depend on."""
 
     lane: UInt32[Array, "*photons"]
     photons: Photons
 
 
-def trace_higher_orders(
-    scene: DeviceScene, key: PRNGKeyArray, nodes: EntryNodes | None = None
-) -> HigherOrderTally:
-    """Trace a batch of photons through up to `limits.orders` scatterings; sums are means per photon.
+# Traces the photons of a chunk through one order, and adds to sums; its arguments are these two, the photons'
+# random numbers and the order.
+TraceChunk = Callable[[Lanes, Sums, PhotonDraws, Int[Array, ""]], tuple[Lanes, Sums]]
 
-    With `nodes`, light enters about these and is tallied by node: sums are means per photon of a node.
 
-    1. Draw the random words of the batch: shifts of lattices for every order and dimension.
-    2. For each group of chunks: send photons from the sensor.
-    3. For each order: compact living photons, and trace chunk after chunk through `_trace_order`.
-    4. Tally the weight of photons that still live after the last order.
+class PhotonBatch:
+    """The photons of a batch: their random numbers, their division into chunks and groups, and their orders.
+
+    - `n_groups`, `group_size`: number of groups of chunks, and photons of each.
+    - `n_words`: number of random words that a batch takes; the first two shift the footprint of order one.
     """
-    config, bins, slopes = scene.config, scene.bins, scene.slopes
-    n_photons = config.n_photons if nodes is None else nodes.n_photons
-    dimensions = PhotonDraws.dimensions(scene.n_plates)
-    # The first two words shift the footprint of order one (`jaxlidar.trace.response`) from the same key. The
-    # next two shift the disc from which photons start, and every order and dimension takes a step and a
-    # shift.
-    words = random_words(key, 4 + 2 * config.order_steps * dimensions)[2:]
-    footprint_shift = to_unit(words[:2])
-    lattices = shifted_lattices(words[2:], config.order_steps, dimensions)
-    node_key = None if nodes is None else jax.random.split(key)[0]
-    chunk_size = min(PHOTONS_PER_CHUNK, n_photons)
-    n_chunks = -(-n_photons // chunk_size)
-    # Groups are made equally large, so that the last one is not mostly padding.
-    n_groups = -(-n_chunks * chunk_size // (CHUNKS_PER_GROUP * PHOTONS_PER_CHUNK))
-    chunks_per_group = -(-n_chunks // n_groups)
 
-    def send(lane: UInt32[Array, "photons"]) -> _Lanes:
-        if nodes is not None:
-            assert node_key is not None
-            return _Lanes(*nodes.send_photons(scene, lane, node_key))
-        return _Lanes(lane, _send_photons(scene, lane, footprint_shift))
+    def __init__(
+        self,
+        scene: DeviceScene,
+        words: UInt32[Array, "words"],
+        nodes: EntryNodes | None = None,
+        node_key: PRNGKeyArray | None = None,
+    ):
+        """`words`: the random words. `nodes`, `node_key`: about which light enters, and a key for that."""
+        self.scene, self.nodes, self.node_key = scene, nodes, node_key
+        n_photons = scene.config.n_photons if nodes is None else nodes.n_photons
+        # The first two words shift the footprint of order one (`jaxlidar.trace.response`) from the same key.
+        # The next two shift the disc from which photons start, and every order and dimension takes a step and
+        # a shift.
+        words = words[2:]
+        self.footprint_shift = to_unit(words[:2])
+        dimensions = PhotonDraws.dimensions(scene.n_plates)
+        self.lattices = shifted_lattices(words[2:], scene.config.order_steps, dimensions)
+        self.chunk_size = min(PHOTONS_PER_CHUNK, n_photons)
+        n_chunks = -(-n_photons // self.chunk_size)
+        # Groups are made equally large, so that the last one is not mostly padding.
+        self.n_groups = -(-n_chunks * self.chunk_size // (CHUNKS_PER_GROUP * PHOTONS_PER_CHUNK))
+        self.chunks_per_group = -(-n_chunks // self.n_groups)
+        self.group_size = self.chunks_per_group * self.chunk_size
 
-    empty = vary_with(_empty_tally(scene, nodes), scene)
+    @staticmethod
+    def n_words(scene: DeviceScene) -> int:
+        """Return the number of random words that a batch takes."""
+        return 4 + 2 * scene.config.order_steps * PhotonDraws.dimensions(scene.n_plates)
 
-    def trace_group(total: HigherOrderTally, group: UInt32[Array, ""]):
-        """Trace all orders of a group of chunks, and add its tally to the total.
+    def first_lane(self, group: UInt32[Array, ""]) -> UInt32[Array, ""]:
+        """Return the lane of the first photon of a group."""
+        return group * self.group_size
 
-        1. Send photons, and arrange them in chunks.
-        2. Trace order after order.
-        3. Tally the weight that is still in flight.
-        """
-        # A group is a loop body, so that memory for photons does not grow with the batch.
-        first = group * (chunks_per_group * chunk_size)
-        lane = first + jnp.arange(chunks_per_group * chunk_size, dtype=jnp.uint32)
+    def send(self, group: UInt32[Array, ""]) -> Lanes:
+        """Send the photons of a group from the sensor, arranged in chunks."""
+        lane = self.first_lane(group) + jnp.arange(self.group_size, dtype=jnp.uint32)
+        if self.nodes is not None:
+            assert self.node_key is not None
+            lanes = Lanes(*self.nodes.send_photons(self.scene, lane, self.node_key))
+        else:
+            lanes = Lanes(lane, _send_photons(self.scene, lane, self.footprint_shift))
+        shape = (self.chunks_per_group, self.chunk_size)
+        return jax.tree.map(lambda a: a.reshape(*shape, *a.shape[1:]), vary_with(lanes, self.scene))
+
+    def trace_orders(self, lanes: Lanes, sums: Sums, trace_chunk: TraceChunk) -> tuple[Lanes, Sums]:
+        """Trace all orders of a group of photons by `trace_chunk`, which adds to `sums`."""
+        scene, chunk_size = self.scene, self.chunk_size
 
         def one_order(carry, order):
             """Trace one order of all chunks.
@@ -165,7 +180,7 @@ def trace_higher_orders(
             2. Gather a chunk of photons in that order.
             3. Trace it, if any of them lives, and put it in its place; chunk after chunk.
             """
-            lanes, tally = carry
+            lanes, sums = carry
             # Late orders have few photons left, and their paths differ in length: sorted, whole chunks are
             # dead or end together, and can be skipped.
             source, n_living = compact(scene, lanes.photons)
@@ -173,55 +188,97 @@ def trace_higher_orders(
             # all of it through memory.
             flat = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), lanes)
 
-            def gather(chunk) -> _Lanes:
+            def gather(chunk) -> Lanes:
                 number = source[chunk]
                 in_chunk = jax.tree.map(lambda a: a.at[number].get(mode="promise_in_bounds"), flat)
                 alive = chunk * chunk_size + jnp.arange(chunk_size) < n_living
                 return once(eqx.tree_at(lambda c: c.photons.alive, in_chunk, alive))
 
-            def trace(in_chunk, tally):
-                draws = PhotonDraws.from_numbers(lattices(in_chunk.lane, order), scene.n_plates)
-                p, tally = _trace_order(scene, in_chunk.photons, tally, draws, order)
-                return _Lanes(in_chunk.lane, p), tally
+            def trace(in_chunk, sums):
+                draws = PhotonDraws.from_numbers(self.lattices(in_chunk.lane, order), scene.n_plates)
+                return trace_chunk(in_chunk, sums, draws, order)
 
-            def skip(in_chunk, tally):
-                return in_chunk, tally
+            # Reverse mode traces each chunk again, and keeps the intermediate values of one at a time.
+            trace_again = jax.checkpoint(trace) if scene.reverse else trace
 
-            def scanned_chunk(tally, chunk):
+            def skip(in_chunk, sums):
+                return in_chunk, sums
+
+            def scanned_chunk(sums, chunk):
                 in_chunk = gather(chunk)
-                in_chunk, tally = lax.cond(jnp.any(in_chunk.photons.alive), trace, skip, in_chunk, tally)
-                return tally, in_chunk
+                in_chunk, sums = lax.cond(jnp.any(in_chunk.photons.alive), trace_again, skip, in_chunk, sums)
+                return sums, in_chunk
 
             def looped_chunk(chunk, state):
-                lanes, tally = state
-                in_chunk, tally = trace(gather(chunk), tally)
-                return jax.tree.map(lambda a, b: a.at[chunk].set(b), lanes, in_chunk), tally
+                lanes, sums = state
+                in_chunk, sums = trace(gather(chunk), sums)
+                return jax.tree.map(lambda a, b: a.at[chunk].set(b), lanes, in_chunk), sums
 
             if scene.reverse:
                 # Chunks of dead photons are skipped. The loop has a static length, as reverse mode needs.
-                tally, lanes = lax.scan(scanned_chunk, tally, jnp.arange(chunks_per_group))
-                return lanes, tally
+                sums, lanes = lax.scan(scanned_chunk, sums, jnp.arange(self.chunks_per_group))
+                return lanes, sums
             # Chunks of dead photons are not even looked at.
             none_alive = jnp.zeros_like(lanes.photons.alive)
             all_dead = eqx.tree_at(lambda c: c.photons.alive, lanes, none_alive)
             n_living_chunks = -(-n_living // chunk_size)
-            return lax.fori_loop(0, n_living_chunks, looped_chunk, (all_dead, tally))
+            return lax.fori_loop(0, n_living_chunks, looped_chunk, (all_dead, sums))
 
         def order_step(carry, order):
             # The loop is as long as its size bucket; orders beyond the plan's are passed over.
             return lax.cond(order < scene.limits.orders, one_order, lambda c, _: c, carry, order), None
 
-        shape = (chunks_per_group, chunk_size)
-        lanes = jax.tree.map(lambda a: a.reshape(*shape, *a.shape[1:]), vary_with(send(lane), scene))
-        orders = jnp.arange(config.order_steps)
-        (lanes, tally), _ = lax.scan(order_step, (lanes, empty), orders)
+        return lax.scan(order_step, (lanes, sums), jnp.arange(scene.config.order_steps))[0]
+
+
+def trace_higher_orders(
+    scene: DeviceScene,
+    key: PRNGKeyArray,
+    nodes: EntryNodes | None = None,
+) -> HigherOrderTally:
+    """Trace a batch of photons through up to `limits.orders` scatterings; sums are means per photon.
+
+    With `nodes`, light enters about these and is tallied by node: sums are means per photon of a node.
+    """
+    words = random_words(key, PhotonBatch.n_words(scene))
+    node_key = None if nodes is None else jax.random.split(key)[0]
+    return trace_photons(scene, words, nodes, node_key)
+
+
+def trace_photons(
+    scene: DeviceScene,
+    words: UInt32[Array, "words"],
+    nodes: EntryNodes | None = None,
+    node_key: PRNGKeyArray | None = None,
+) -> HigherOrderTally:
+    """Trace a batch of photons with given random words, as `trace_higher_orders`.
+
+    1. Shift the lattices of random numbers for every order and dimension.
+    2. For each group of chunks: send photons from the sensor.
+    3. For each order: compact living photons, and trace chunk after chunk through `_trace_order`.
+    4. Tally the weight of photons that still live after the last order.
+    """
+    bins, slopes = scene.bins, scene.slopes
+    batch = PhotonBatch(scene, words, nodes, node_key)
+    empty = vary_with(empty_tally(scene, nodes), scene)
+
+    def trace_chunk(in_chunk: Lanes, tally: HigherOrderTally, draws: PhotonDraws, order: Int[Array, ""]):
+        p, tally = _trace_order(scene, in_chunk.photons, tally, draws, order)
+        return Lanes(in_chunk.lane, p), tally
+
+    def trace_group(total: HigherOrderTally, group: UInt32[Array, ""]):
+        """Trace all orders of a group of chunks, and add its tally to the total."""
+        # A group is a loop body, so that memory for photons does not grow with the batch.
+        lanes, tally = batch.trace_orders(batch.send(group), empty, trace_chunk)
         p = lanes.photons
         weight = jnp.where(p.alive, p.weight, 0.0)
         remaining = add_to_tally(tally.remaining, (), TallyIndex.of(p), weight)
         tally = eqx.tree_at(lambda t: t.remaining, tally, remaining)
         return jax.tree.map(jnp.add, total, tally), None
 
-    tally, _ = lax.scan(trace_group, empty, jnp.arange(n_groups, dtype=jnp.uint32))
+    # Likewise with groups, whose photons are kept for each order.
+    step = jax.checkpoint(trace_group) if scene.reverse else trace_group
+    tally, _ = lax.scan(step, empty, jnp.arange(batch.n_groups, dtype=jnp.uint32))
     if slopes is not None:
         assert tally.weight_slopes is not None
         # Derivatives outside the record have no use, unlike the energy there, which `trim` sums up.
@@ -230,10 +287,10 @@ def trace_higher_orders(
     return eqx.tree_at(lambda t: (t.weights, t.outside), tally, bins.trim(tally.weights))
 
 
-def _empty_tally(scene: DeviceScene, nodes: EntryNodes | None) -> HigherOrderTally:
+def empty_tally(scene: DeviceScene, nodes: EntryNodes | None = None) -> HigherOrderTally:
     """Return a tally of zeros; its bins have both margins.
 
-    Returns are tallied by history; by wavelength where optics are applied; by node, or shot, and wavelength
+    BinnedReturns are tallied by history; by wavelength where optics are applied; by node, or shot, and wavelength
     where light is shared. The energy budget has no shots: it is tallied by node.
     """
     n_wavelengths = 0 if scene.optics is None else scene.optics.shape[1]
@@ -241,7 +298,7 @@ def _empty_tally(scene: DeviceScene, nodes: EntryNodes | None) -> HigherOrderTal
         n_entries = scene.histories.count
     else:
         n_entries = n_wavelengths * (1 if nodes is None else len(nodes.position))
-    # Returns are tallied by shot; what no receiver sees (absorption, escape) by node.
+    # BinnedReturns are tallied by shot; what no receiver sees (absorption, escape) by node.
     n_return_entries = n_entries if scene.shot_views is None else n_wavelengths * scene.shot_views.n_shots
     n_materials, bins, slopes = len(scene.config.materials), scene.bins, scene.slopes
     return HigherOrderTally(
@@ -292,19 +349,62 @@ def _send_photons(scene: DeviceScene, lane: UInt32[Array, "photons"], shift: Flo
     )
 
 
+class FlownPhotons(NamedTuple):
+    """A chunk of photons at the ends of their flights, several for each photon.
+
+    - `p`, `draws`: the photons before, and their random numbers. `flights`, `encounters`: their flights.
+    - `weight`, `index`: weight and tally index at each end, with the plates that were passed.
+    - `selected`: the end from which each photon goes on.
+    - `u`: transmittance up to each end, by which its optical depth -ln u was chosen.
+    - `max_length`: how far flights can be recorded, m.
+    """
+
+    p: Photons
+    draws: PhotonDraws
+    flights: Flight
+    encounters: SurfaceEncounters
+    weight: Float[Array, "ends photons"]
+    index: TallyIndex
+    selected: Int[Array, "photons"]
+    u: Float[Array, "ends photons"]
+    max_length: Float[Array, "photons"]
+
+    # All arrays by end have ends along their first axis; each photon goes on from its own selected one.
+    def select_end(self, a: Array) -> Array:
+        """Return an array by end at the selected end of each photon."""
+        number = self.selected.reshape((1,) * (a.ndim - 1) + self.selected.shape)
+        return jnp.take_along_axis(a, number, 0, mode="promise_in_bounds")[0]
+
+
 def _trace_order(
     scene: DeviceScene, p: Photons, tally: HigherOrderTally, draws: PhotonDraws, order: Int[Array, ""]
 ) -> tuple[Photons, HigherOrderTally]:
-    """Trace a chunk of photons through one order of scattering: fly, collide, deposit, scatter.
+    """Trace a chunk of photons through one order of scattering: fly, collide, deposit, scatter."""
+    flown, tally = fly(scene, p, tally, draws, order)
+    tally = lax.cond(
+        is_deposited(scene, order), lambda t: _deposit_flights(scene, flown, t), lambda t: t, tally
+    )
+    return scatter(scene, flown, tally)
+
+
+def is_deposited(scene: DeviceScene, order: Int[Array, ""]) -> Bool[Array, ""]:
+    """Return True if photons deposit returns at this order, counted from 0.
+
+    Light of the first order that returns along the beam is deterministic and has been deposited
+    (`jaxlidar.trace.first_order`).
+    """
+    return (order > 0) | (scene.beam.return_direction is not None)
+
+
+def fly(
+    scene: DeviceScene, p: Photons, tally: HigherOrderTally, draws: PhotonDraws, order: Int[Array, ""]
+) -> tuple[FlownPhotons, HigherOrderTally]:
+    """Let a chunk of photons fly, and tally the energy that arrives at plates on the way.
 
     1. Find the surfaces ahead, and sample which plates will stop the photon or let it pass.
     2. Sample the ends of the flight, one in each stratum of u, the transmittance up to the end. The photon
        goes on from one of them.
     3. Apply the plates that the flight passes to weights and histories.
-    4. Deposit the return of every end, except at order one, which `jaxlidar.trace.first_order` deposits for
-       light that returns along the beam.
-    5. Tally light that escapes or would come after the record.
-    6. Sample the collision at the selected end, tally what arrives and what goes on, and update the photon.
     """
     ends = scene.config.deposits_per_flight
     encounters = meet_surfaces(scene, p, draws.plates_ahead)
@@ -331,29 +431,34 @@ def _trace_order(
     encounters = dataclasses.replace(
         encounters, stops=stops, nearest_stop=nearest_stop, mesh_normal=mesh_normal
     )
-
-    # All arrays by end have ends along their first axis; each photon goes on from its own selected one.
-    def select_end(a: Array) -> Array:
-        number = selected.astype(jnp.int32).reshape((1,) * (a.ndim - 1) + selected.shape)
-        return jnp.take_along_axis(a, number, 0, mode="promise_in_bounds")[0]
-
     to_ends = functools.partial(jnp.broadcast_to, shape=strata.shape)
-    weight, index = to_ends(p.weight) * flights.ratio, jax.tree.map(to_ends, TallyIndex.of(p))
-    # Before deposits: these carry the history with the plates that their flight has passed.
-    weight, index, tally = _pass_plates(scene, p, flights, encounters, weight, index, select_end, tally)
-
-    # The first order is deterministic and has been deposited, unless light returns by another direction.
-    is_deposited = (order > 0) | (scene.beam.return_direction is not None)
-    tally = lax.cond(
-        is_deposited,
-        lambda t: _deposit_flights(scene, p, flights, encounters, weight, index, draws, t),
-        lambda t: t,
-        tally,
+    flown = FlownPhotons(
+        p=p,
+        draws=draws,
+        flights=flights,
+        encounters=encounters,
+        weight=to_ends(p.weight) * flights.ratio,
+        index=jax.tree.map(to_ends, TallyIndex.of(p)),
+        selected=selected.astype(jnp.int32),
+        u=u,
+        max_length=max_length,
     )
+    # Before deposits: these carry the history with the plates that their flight has passed.
+    return _pass_plates(scene, flown, tally)
 
+
+def scatter(
+    scene: DeviceScene, flown: FlownPhotons, tally: HigherOrderTally
+) -> tuple[Photons, HigherOrderTally]:
+    """Let a chunk of photons go on from their selected ends.
+
+    1. Tally light that escapes or would come after the record.
+    2. Sample the collision at the selected end, tally what arrives and what goes on, and update the photon.
+    """
+    p, draws, encounters = flown.p, flown.draws, flown.encounters
     # The selected end is distributed as the end of a flight with one uniform number: to go on from it needs
     # no weight.
-    flight, weight, index = jax.tree.map(select_end, (flights, weight, index))
+    flight, weight, index = jax.tree.map(flown.select_end, (flown.flights, flown.weight, flown.index))
     escaped = add_to_tally(tally.escaped, (), index, jnp.where(flight.escaped, weight, 0.0))
     late = add_to_tally(tally.late, (), index, jnp.where(flight.late, weight, 0.0))
     tally = eqx.tree_at(lambda t: (t.escaped, t.late), tally, (escaped, late))
@@ -395,15 +500,8 @@ def _trace_order(
 
 
 def _pass_plates(
-    scene: DeviceScene,
-    p: Photons,
-    flights: Flight,
-    encounters: SurfaceEncounters,
-    weight: Float[Array, "ends photons"],
-    index: TallyIndex,
-    select_end: Callable[[Array], Array],
-    tally: HigherOrderTally,
-) -> tuple[Float[Array, "ends photons"], TallyIndex, HigherOrderTally]:
+    scene: DeviceScene, flown: FlownPhotons, tally: HigherOrderTally
+) -> tuple[FlownPhotons, HigherOrderTally]:
     """Apply the plates that flights pass, by a gap or straight through, to weights and histories.
 
     1. Every plate that was passed, or is landed on, multiplies the weight by the ratio of its sampled
@@ -413,9 +511,10 @@ def _pass_plates(
        optics does not depend on the order of plates, but what arrives at each does: nearer plates come first.
     """
     config, limits = scene.config, scene.limits
+    weight, index, encounters, select_end = flown.weight, flown.index, flown.encounters, flown.select_end
     to_ends = functools.partial(jnp.broadcast_to, shape=weight.shape)
     transmits: dict[int, Bool[Array, "ends photons"]] = {}
-    for passage in passed_plates(scene, p, flights, encounters):
+    for passage in passed_plates(scene, flown.p, flown.flights, encounters):
         ratio = encounters.ratios[passage.plate]
         assert ratio is not None
         # The ratio of the outcome belongs to passed plates and to the plate that was hit; plates behind the
@@ -442,63 +541,133 @@ def _pass_plates(
         tally = tally.with_departure(scatterer.material, onward, arriving_weight / transmission_probability)
         index = index.after_where(transmitted, scene, scatterer.transmission)
         weight = jnp.where(transmitted, weight / transmission_probability, weight)
-    return weight, index, tally
+    return flown._replace(weight=weight, index=index), tally
 
 
-def _deposit_flights(
-    scene: DeviceScene,
-    p: Photons,
-    flights: Flight,
-    encounters: SurfaceEncounters,
-    weight: Float[Array, "ends photons"],
-    index: TallyIndex,
-    draws: PhotonDraws,
-    tally: HigherOrderTally,
-) -> HigherOrderTally:
-    """Deposit the expected return of every end of the flights, each with an equal share of the weight.
+class FlightEnds(NamedTuple):
+    """The ends of the flights of a chunk of photons, and their collisions, all along one axis.
 
-    1. With score functions: the score at each end, that of the photon less the derivative of the depth flown.
-    2. Flatten all ends into one axis of photons, so that one program serves them.
-    3. Sample the collision at each end, and add its score.
-    4. Deposit the return, with the weight divided by the number of ends.
+    - `p`, `flights`, `draws`, `index`: as in `FlownPhotons`.
+    - `x`, `path`, `collision`: position, path length and collision.
     """
-    ends, score = scene.config.deposits_per_flight, None
-    if p.score is not None:
-        assert flights.depth_slopes is not None
-        score = p.score[None] - jnp.swapaxes(flights.depth_slopes, 1, 2)
-        score = score.reshape(-1, score.shape[-1])
-    # Scores have an axis of parameters, and were flattened above.
-    p, flights = dataclasses.replace(p, score=None), dataclasses.replace(flights, depth_slopes=None)
+
+    p: Photons
+    flights: Flight
+    draws: PhotonDraws
+    index: TallyIndex
+    x: Vec
+    path: Scalar
+    collision: Collision
+
+
+def collide_at_ends(scene: DeviceScene, flown: FlownPhotons) -> FlightEnds:
+    """Sample the collision at each end of flights; ends lie along one axis, so that one program serves all.
+
+    Scores and derivatives of depths, which have an axis of parameters, are left out.
+    """
+    ends = scene.config.deposits_per_flight
 
     def flatten(tree):
         return jax.tree.map(lambda a: jnp.broadcast_to(a, (ends, a.shape[-1])).reshape(-1), tree)
 
-    p, flights, encounters, draws, index = flatten((p, flights, encounters, draws, index))
-    x, path, collision = collide(scene, p, flights, encounters, draws)
-    # Each end stands for its stratum: an equal share of the probability.
-    value = jnp.where(flights.has_hit, flatten(weight), 0.0) * collision.weight / ends
+    p = dataclasses.replace(flown.p, score=None)
+    flights = dataclasses.replace(flown.flights, depth_slopes=None)
+    p, flights, encounters, draws, index = flatten((p, flights, flown.encounters, flown.draws, flown.index))
+    return FlightEnds(p, flights, draws, index, *collide(scene, p, flights, encounters, draws))
+
+
+def _deposit_flights(scene: DeviceScene, flown: FlownPhotons, tally: HigherOrderTally) -> HigherOrderTally:
+    """Deposit the expected return of every end of the flights, each with an equal share of the weight.
+
+    1. With score functions: the score at each end, that of the photon less the derivative of the depth flown.
+    2. Sample the collision at each end, and add its score.
+    3. Deposit the return, with the weight divided by the number of ends.
+    """
+    score, depth_slopes = flown.p.score, flown.flights.depth_slopes
+    ends = collide_at_ends(scene, flown)
     if score is not None:
-        score = score + collision_score(scene, flights.cell, flights.collided, collision)
+        assert depth_slopes is not None
+        score = score[None] - jnp.swapaxes(depth_slopes, 1, 2)
+        score = score.reshape(-1, score.shape[-1])
+        score = score + collision_score(scene, ends.flights.cell, ends.flights.collided, ends.collision)
+    n_entries = tally.weights.shape[1]
+    returns = returns_of_ends(scene, ends, flown.weight.reshape(-1), score, n_entries)
+    return _add_returns(scene, returns, tally)
+
+
+class BinnedReturns(NamedTuple):
+    """What returns to the sensor from collisions, spread over time bins.
+
+    - `first_bin`: index of the first bin of each return. `rows`: pairs of tally rows, and values in the bins
+      from the first on, for each channel by which light returns, shot and wavelength.
+    - `row`: the values without the factors of channels. `channel_factors`: channels by which light returns,
+      with intensity factors. `index`: tally index with the plates on the return path.
+    - `score`: that of the path with its return, or None.
+    """
+
+    first_bin: Int[Array, "..."]
+    rows: list[tuple[Int[Array, "..."], Float[Array, "... kernel"]]]
+    row: Float[Array, "... kernel"]
+    channel_factors: list[tuple[Array, Scalar]]
+    index: TallyIndex
+    score: Float[Array, "photons parameters"] | None
+
+
+def returns_of_ends(
+    scene: DeviceScene,
+    ends: FlightEnds,
+    weight: Scalar,
+    score: Float[Array, "photons parameters"] | None,
+    n_entries: int,
+) -> BinnedReturns:
+    """Compute the expected returns of ends of flights, with the weights there.
+
+    `n_entries`: of the tally that returns are added to, for each material.
+    """
+    # Each end stands for its stratum: an equal share of the probability.
+    n_ends = scene.config.deposits_per_flight
+    value = jnp.where(ends.flights.has_hit, weight, 0.0) * ends.collision.weight / n_ends
     # Optimisation barrier: of the collision only what its return depends on passes, so that directions onward
     # are not computed.
-    deposits = once(
+    w, x, path, value, index, collision, plate_draws, score = once(
         (
-            p.w,
-            x,
-            path,
+            ends.p.w,
+            ends.x,
+            ends.path,
             value,
-            index,
-            collision_for_return(scene, collision),
-            draws.plates_behind,
+            ends.index,
+            collision_for_return(scene, ends.collision),
+            ends.draws.plates_behind,
             score,
         )
     )
-    return _deposit_collisions(scene, tally, *deposits)
+    return _returns_of_collisions(
+        scene, w, x, path, value, index, collision, plate_draws, score, n_entries=n_entries
+    )
 
 
-def _deposit_collisions(
+def _add_returns(scene: DeviceScene, returns: BinnedReturns, tally: HigherOrderTally) -> HigherOrderTally:
+    """Add returns, and their derivatives with score functions, to a tally."""
+    weights = tally.weights.reshape(-1, scene.bins.padded)
+    for tally_row, values in returns.rows:
+        weights = add_rows(weights, tally_row, returns.first_bin, values)
+    if returns.score is not None:
+        assert tally.weight_slopes is not None
+        weight_slopes = add_derivatives_of_returns(
+            scene,
+            tally.weight_slopes,
+            returns.first_bin,
+            returns.row,
+            returns.score,
+            returns.channel_factors,
+            returns.index,
+        )
+        tally = eqx.tree_at(lambda t: t.weight_slopes, tally, weight_slopes)
+    return eqx.tree_at(lambda t: t.weights, tally, weights.reshape(tally.weights.shape))
+
+
+def _returns_of_collisions(
     scene: DeviceScene,
-    tally: HigherOrderTally,
     w: Vec,
     x: Vec,
     path: Scalar,
@@ -507,13 +676,15 @@ def _deposit_collisions(
     collision: CollisionForReturn,
     plate_draws: tuple[Scalar, ...],
     score: Float[Array, "photons parameters"] | None,
-) -> HigherOrderTally:
-    """Deposit the expected return of collisions at `x`, of light that flew along `w`.
+    *,
+    n_entries: int,
+) -> BinnedReturns:
+    """Compute the expected returns of collisions at `x`, of light that flew along `w`.
 
     1. Intensity factors towards the sensor.
     2. Transmittance of the return path: voxels, ground that hides its own slopes, and plates.
     3. Time of arrival, and the value at the range for which that time stands.
-    4. Spread over time bins, add to the tally: for each channel by which light returns, shot, and wavelength.
+    4. Spread over time bins: for each channel by which light returns, shot, and wavelength.
     """
     beam, bins = scene.beam, scene.bins
     v = beam.view(x)
@@ -536,22 +707,15 @@ def _deposit_collisions(
         time, value, material = time[:, None] + delay, value[:, None] * seen, material[:, None]
     # One row serves all channels and wavelengths, which differ by factors alone.
     first_bin, row = once(bspline_row(bins, time, value))
-    n_entries = tally.weights.shape[1]
-    weights = tally.weights.reshape(-1, bins.padded)
+    rows = []
     for channel, factor in channel_factors:
         factor = jnp.where(channel >= 0, factor, 0.0)
         for tally_row, optical_weight in index.after(scene, channel).rows(shots):
             # Optimisation barrier: fused into the rows, the factor would be computed again for each bin.
             scaled = once(factor if optical_weight is None else factor * optical_weight)
             scaled = scaled.reshape(scaled.shape + (1,) * (row.ndim - 1))
-            weights = add_rows(weights, material * n_entries + tally_row, first_bin, row * scaled)
-    if score is not None:
-        assert tally.weight_slopes is not None
-        weight_slopes = add_derivatives_of_returns(
-            scene, tally.weight_slopes, first_bin, row, score, channel_factors, index
-        )
-        tally = eqx.tree_at(lambda t: t.weight_slopes, tally, weight_slopes)
-    return eqx.tree_at(lambda t: t.weights, tally, weights.reshape(tally.weights.shape))
+            rows.append((material * n_entries + tally_row, row * scaled))
+    return BinnedReturns(first_bin, rows, row, channel_factors, index, score)
 
 
 def _return_transmittance(

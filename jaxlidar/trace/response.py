@@ -27,10 +27,13 @@ from jaxlidar._mesh_axes import vary_together, vary_with, with_automatic_axes
 from jaxlidar.planning.setup import Setup
 from jaxlidar.trace.device_scene import DeviceScene, build_device_scene
 from jaxlidar.trace.first_order import FirstOrder, first_order
+from jaxlidar.trace.first_order_replay import pull_back_first_order
 from jaxlidar.trace.footprint import ALL_RAYS, RaySlice, fibonacci_disc, product_rule
-from jaxlidar.trace.higher_orders import HigherOrderTally, trace_higher_orders
+from jaxlidar.trace.higher_order_replay import pull_back_higher_orders
+from jaxlidar.trace.higher_orders import HigherOrderTally, PhotonBatch, trace_higher_orders, trace_photons
 from jaxlidar.trace.mirror_return import mirror_rays
 from jaxlidar.trace.random_numbers import random_words, to_unit
+from jaxlidar.trace.replay import ExtinctionTables, with_replay
 
 Traced = TypeVar("Traced")
 
@@ -183,7 +186,8 @@ def trace_higher(scene: DeviceScene, key: PRNGKeyArray) -> HigherOrderTally:
 
     def trace(scene: DeviceScene) -> HigherOrderTally:
         # The same key as for the footprint: photons leave out the random words with which that is shifted.
-        tally = trace_higher_orders(scene, key)
+        words = random_words(key, PhotonBatch.n_words(scene))
+        tally = with_replay(trace_photons, pull_back_higher_orders, scene, words)
         if scene.optics is None:
             return jax.tree.map(lambda a: a[None], tally)
         # Wavelengths, in place of histories, become traces with one history each.
@@ -235,29 +239,65 @@ def _first(
     scene: DeviceScene, key: PRNGKeyArray, ray_slice: RaySlice = ALL_RAYS
 ) -> tuple[FirstOrder, Float[Array, "materials first_histories bins"]]:
     """Trace order one; also return its weights together with the returns of mirrors."""
-    across, energy = vary_with(footprint_rays(scene, key, ray_slice), scene)
-    first = first_order(scene, across, energy)
+    shift = _footprint_shift(scene, key)
+    return with_replay(_first_of_shift, _pull_back_first, scene, (shift, ray_slice))
+
+
+def _first_of_shift(
+    scene: DeviceScene, footprint: tuple[Float[Array, "2"], RaySlice]
+) -> tuple[FirstOrder, Float[Array, "materials first_histories bins"]]:
+    first = first_order(scene, *vary_with(_footprint_rays(scene, *footprint), scene))
     weights, slopes = first.weights, first.weight_slopes
-    for i, is_mirror in enumerate(scene.config.mirrors):
-        if is_mirror and scene.config.returns_specular:
-            rays = vary_with(mirror_rays(scene.beam, scene.surfaces[i]), scene)
-            mirrored = first_order(scene, *rays, mirror=i)
-            weights, slopes = jax.tree.map(
-                jnp.add, (weights, slopes), (mirrored.weights, mirrored.weight_slopes)
-            )
+    for i in _returning_mirrors(scene):
+        rays = vary_with(mirror_rays(scene.beam, scene.surfaces[i]), scene)
+        mirrored = first_order(scene, *rays, mirror=i)
+        weights, slopes = jax.tree.map(jnp.add, (weights, slopes), (mirrored.weights, mirrored.weight_slopes))
     return dataclasses.replace(first, weight_slopes=slopes), weights
+
+
+def _pull_back_first(
+    scene: DeviceScene,
+    footprint: tuple[Float[Array, "2"], RaySlice],
+    cotangents: tuple[FirstOrder, Float[Array, "materials first_histories bins"]],
+) -> ExtinctionTables:
+    """Pull cotangents of the results of `_first_of_shift` back to the extinction of voxels."""
+    of_first, of_weights = cotangents
+    of_first = dataclasses.replace(of_first, weights=of_first.weights + of_weights)
+    tables = pull_back_first_order(scene, *_footprint_rays(scene, *footprint), of_first)
+    # Of the rays to a mirror nothing counts but what returns.
+    of_mirrored = dataclasses.replace(jax.tree.map(jnp.zeros_like, of_first), weights=of_weights)
+    for i in _returning_mirrors(scene):
+        rays = mirror_rays(scene.beam, scene.surfaces[i])
+        tables = jax.tree.map(jnp.add, tables, pull_back_first_order(scene, *rays, of_mirrored, mirror=i))
+    return tables
+
+
+def _returning_mirrors(scene: DeviceScene) -> list[int]:
+    """Return the numbers of the surfaces that are mirrors, if these return light to the sensor."""
+    if not scene.config.returns_specular:
+        return []
+    return [i for i, is_mirror in enumerate(scene.config.mirrors) if is_mirror]
 
 
 def footprint_rays(
     scene: DeviceScene, key: PRNGKeyArray, ray_slice: RaySlice = ALL_RAYS
 ) -> tuple[tuple[Float[Array, "rays"], Float[Array, "rays"]], Float[Array, "rays"]]:
     """Return the positions of the footprint's rays across the beam, and their fractions of its energy."""
-    if scene.config.uses_quadrature:
-        return product_rule(scene.beam)
+    return _footprint_rays(scene, _footprint_shift(scene, key), ray_slice)
+
+
+def _footprint_shift(scene: DeviceScene, key: PRNGKeyArray) -> Float[Array, "2"]:
     # Shifted at random, rays are an unbiased sample of the footprint; not shifted, they are the same for
     # every key.
-    random = scene.config.random_footprint
-    shift = to_unit(random_words(key, 2)) if random else jnp.asarray([0.5, 0.0])
+    is_random = scene.config.random_footprint and not scene.config.uses_quadrature
+    return to_unit(random_words(key, 2)) if is_random else jnp.asarray([0.5, 0.0])
+
+
+def _footprint_rays(
+    scene: DeviceScene, shift: Float[Array, "2"], ray_slice: RaySlice
+) -> tuple[tuple[Float[Array, "rays"], Float[Array, "rays"]], Float[Array, "rays"]]:
+    if scene.config.uses_quadrature:
+        return product_rule(scene.beam)
     return fibonacci_disc(scene.beam, scene.config.n_rays, shift, ray_slice)
 
 

@@ -428,5 +428,7 @@ def test_a_lidar_with_a_sensor_is_kept_in_files(tmp_path):
     np.testing.assert_array_equal(read.sensor, survey.sensor)
     np.testing.assert_array_equal(read[1].sensor, survey[1].sensor)
     waveforms = jl.simulate_many(read, case.scene, key=KEY, max_orders=1)
-    waveforms.save(tmp_path / "many.nc", jl.io.Case(survey=read, scene=case.scene))
-    np.testing.assert_array_equal(jl.open(tmp_path / "many.nc").ground_position, waveforms.ground_position)
+    waveforms.save(tmp_path / "waveforms.nc", jl.io.Case(survey=read, scene=case.scene))
+    np.testing.assert_array_equal(
+        jl.open(tmp_path / "waveforms.nc").ground_position, waveforms.ground_position
+    )

@@ -1,0 +1,136 @@
+"""Gradients in every voxel against one simulation, by `jax.grad` of `simulate`: time, memory, compilation.
+
+Run it as `python examples/benchmarks/gradient_cost.py [--out figures] [--rounds 3]`.
+
+A map of 20 m x 20 m x 20 m of leaves over ground, in 20^3 and in 100^3 voxels, at first order and with eight
+orders, seen from nadir by a beam of 10 m. The gradient is that of a linear function of the waveform with
+respect to the leaf area density of every voxel. Compared are programs of `jax.jit`: `simulate`, and
+the gradient with the value (within a transformation each simulates eight batches); further, `simulate` as
+users call it, with the same photons. Seconds are of the processor, the fastest of some rounds in turns: other
+load of the machine matters less. Memory is what the compiler reserves beside arguments and results; it is
+given for four times the rays and photons, too. Reverse mode by replay is explained in
+`jaxlidar/trace/replay.py`.
+"""
+
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from _common import machine, new_figure, options, print_table, save_figure, write_json
+
+import jaxlidar as jl
+
+SIZE, ORDERS = 20.0, 8
+CASES = [(side, orders) for side in (20, 100) for orders in (1, ORDERS)]
+KEY = jax.random.key(0)
+
+
+def problem(side: int, orders: int, photons: int, rays: int):
+    """Return leaf area densities, and functions: `simulate`, the same as called, and the gradient."""
+    lidar = jl.Lidar(wavelength=1064.0, divergence=10.0)
+    lad = jnp.asarray(np.random.default_rng(0).uniform(0.0, 0.5, (side, side, side)), float)
+
+    def scene(lad) -> jl.Scene:
+        voxels = jl.VoxelMap.from_lad(lad, voxel_size=SIZE / side, origin=(-SIZE / 2, -SIZE / 2, 1.0))
+        return jl.Scene(
+            canopy=jl.Canopy(voxels, leaf=jl.LeafOptics(0.45, 0.4)), ground=jl.Ground(reflectance=0.3)
+        )
+
+    window = (-150.0, 150.0)
+    plan = jl.plan(lidar, scene(lad), max_orders=orders, n_photons=photons, n_rays=rays, window=window)
+    factors = jnp.sin(jnp.arange(plan.n_samples))
+
+    def simulate(lad, key):
+        return jl.simulate(lidar, scene(lad), plan=plan, key=key).reflectance
+
+    def as_called(lad, key):
+        wave = jl.simulate(lidar, scene(lad), plan=plan, key=key, n_photons=8 * photons)
+        return wave.reflectance
+
+    def loss(lad, key):
+        return jnp.sum(simulate(lad, key) @ factors)
+
+    return lad, simulate, as_called, jax.value_and_grad(loss)
+
+
+def compiled(function, lad) -> tuple[object, dict[str, float]]:
+    """Compile a function; return it with the seconds that took and the memory of temporaries in MB."""
+    start = time.perf_counter()
+    lowered = jax.jit(function).lower(lad, KEY)
+    tracing = time.perf_counter() - start
+    program = lowered.compile()
+    seconds = time.perf_counter() - start
+    memory = program.memory_analysis().temp_size_in_bytes / 1e6
+    return program, {"tracing": tracing, "compilation": seconds - tracing, "MB": memory}
+
+
+def main() -> None:
+    arguments = options("Cost of a gradient in every voxel.", photons=8192, rays=1024, rounds=3)
+    cases = []
+    for side, orders in CASES:
+        lad, simulate, as_called, gradient = problem(side, orders, arguments.photons, arguments.rays)
+        programs, costs = {}, {}
+        for name, function in {"simulation": simulate, "gradient": gradient}.items():
+            programs[name], costs[name] = compiled(function, lad)
+        programs["simulate, as called"] = as_called
+        times: dict[str, list[float]] = {name: [] for name in programs}
+        for program in programs.values():
+            jax.block_until_ready(program(lad, KEY))
+        for _ in range(arguments.rounds):
+            for name, program in programs.items():
+                start = time.process_time()
+                jax.block_until_ready(program(lad, KEY))
+                times[name].append(time.process_time() - start)
+        fastest = {name: min(values) for name, values in times.items()}
+        lad, _, _, gradient = problem(side, orders, 4 * arguments.photons, 4 * arguments.rays)
+        _, more = compiled(gradient, lad)
+        cases.append(
+            {
+                "side": side,
+                "orders": orders,
+                "seconds": fastest,
+                "ratio": fastest["gradient"] / fastest["simulation"],
+                "ratio_as_called": fastest["gradient"] / fastest["simulate, as called"],
+                "compilation": {name: cost["compilation"] for name, cost in costs.items()},
+                "tracing": {name: cost["tracing"] for name, cost in costs.items()},
+                "MB": costs["gradient"]["MB"],
+                "MB_simulation": costs["simulation"]["MB"],
+                "MB_four_times_the_photons": more["MB"],
+                "MB_voxels": lad.size * lad.dtype.itemsize / 1e6,
+            }
+        )
+    record = {
+        "machine": machine(),
+        "photons": 8 * arguments.photons,
+        "rays": 8 * arguments.rays,
+        "cases": cases,
+    }
+    write_json(arguments.out / "gradient_cost.json", record)
+
+    figure, axes = new_figure(size=(7, 2.5))
+    names = [f"{c['side']}³ voxels, {c['orders']} order{'s' * (c['orders'] > 1)}" for c in cases][::-1]
+    axes.barh(names, [c["ratio"] for c in cases][::-1])
+    axes.axvline(3.0, color="black", linestyle="--", label="three simulations")
+    axes.set(xlabel="times one simulation", title="Gradient in every voxel")
+    axes.legend()
+    save_figure(figure, arguments.out / "gradient_cost.png")
+    print_table(
+        ("", "s", "times one", "times one, as called", "MB", "MB, 4 times as many", "compiled, s"),
+        [
+            (
+                name,
+                c["seconds"]["gradient"],
+                c["ratio"],
+                c["ratio_as_called"],
+                c["MB"],
+                c["MB_four_times_the_photons"],
+                c["compilation"]["gradient"],
+            )
+            for name, c in zip(names[::-1], cases)
+        ],
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,119 @@
+r"""Cotangents of extinction at first order: each ray is marched once more, and its segments taken in reverse.
+
+With the cotangents y of the response, a segment of the extinction k and the length l, before which the
+optical depth is tau, contributes
+
+    D(k, tau, ...) = sum over bins and materials of y * (what it returns) + (the same of what arrives)
+
+to the loss. Extinction acts on it in three ways: as k itself, as the extinction k_m of each material, and by
+the depth tau, to which every segment in front adds its k l. So
+
+    dL / dk of segment i = dD_i / dk + l_i * sum over j behind i of dD_j / dtau,
+
+and surfaces and what escapes, which depend on depths as segments do, are the first terms of that sum.
+Segments are taken from the last to the first, and the sum is carried along. Nothing is stored but the
+segments of the chunk of rays that is being marched; voxels of zero extinction have derivatives like all
+others.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from jaxlidar._vectors import Scalar
+from jaxlidar.trace.device_scene import DeviceScene
+from jaxlidar.trace.first_order import (
+    FirstOrder,
+    FirstOrderTracer,
+    march_rays,
+    material_extinctions,
+    move_rays,
+    ray_chunks,
+    send_rays,
+    smooth_padded,
+)
+from jaxlidar.trace.replay import ExtinctionTables
+
+
+def pull_back_first_order(
+    scene: DeviceScene,
+    across: tuple[Float[Array, "rays"], Float[Array, "rays"]],
+    energy: Float[Array, "rays"],
+    cotangent: FirstOrder,
+    *,
+    mirror: int | None = None,
+) -> ExtinctionTables:
+    """Pull cotangents of the results of `first_order` back to the extinction of every voxel.
+
+    For each chunk of rays:
+
+    1. Send the rays, and march them into segments.
+    2. Cotangents of the depths at surfaces, and of the whole depth, by which light escapes.
+    3. From the last step to the first: cotangents of the extinction of segments and of the depths before
+       them; the former, with the sum over what lies behind, are added to the voxels.
+    """
+    assert scene.medium is not None
+    medium, bins, tracer = scene.medium, scene.bins, FirstOrderTracer(scene, mirror)
+    n_rows = tracer.shape[0] * tracer.shape[1]
+
+    def trim(returned: Array) -> tuple[Array, Array]:
+        return bins.trim(returned.reshape(*tracer.shape, bins.padded))
+
+    # Trimming and smoothing are linear: their transposes are applied once, to the cotangents.
+    rows = jax.ShapeDtypeStruct((n_rows, bins.padded), energy.dtype)
+    (of_returned,) = jax.linear_transpose(trim, rows)((cotangent.weights, cotangent.outside))
+    (of_unsmoothed,) = jax.linear_transpose(smooth_padded, rows)(of_returned)
+    of_arrived, of_scattered = cotangent.arrived.reshape(-1), cotangent.scattered.reshape(-1)
+
+    def add_chunk(tables: ExtinctionTables, chunk: list[Scalar]) -> tuple[ExtinctionTables, None]:
+        # Step 1.
+        x, y, energy = chunk
+        rays = send_rays(scene, (x, y), energy)
+        segments, depth_at_surfaces, total_depth = march_rays(scene, rays)
+        per_ray, empty = (rays, tracer.seen_energy(rays)), tracer.empty_tally(energy)
+
+        # Step 2.
+        def without_medium(depth_at_surfaces: list[Scalar], total_depth: Scalar) -> tuple[Array, ...]:
+            tally = tracer.deposit_surfaces(empty, rays, depth_at_surfaces, [])
+            tally = tracer.add_escape(tally, rays, total_depth)
+            return tally.returned, tally.arrived, tally.scattered, tally.escaped
+
+        _, pull = jax.vjp(without_medium, depth_at_surfaces, total_depth)
+        of_depths, of_total_depth = pull((of_returned, of_arrived, of_scattered, cotangent.escaped))
+
+        # Step 3. The loop ends with the last step at which any ray is still in the medium.
+        numbers = jnp.arange(segments.length.shape[0])
+        n_steps = jnp.max(jnp.where(jnp.any(segments.length > 0.0, axis=1), numbers + 1, 0))
+
+        def add_step(n, state: tuple[ExtinctionTables, Scalar]) -> tuple[ExtinctionTables, Scalar]:
+            tables, of_depth_behind = state
+            step = jax.tree.map(lambda a: a[n_steps - 1 - n], segments)
+
+            def deposited(k: Scalar, depth: Scalar, extinctions):
+                changed = dataclasses.replace(step, extinction=k, depth=depth)
+                tally = tracer.deposit_segments(empty, changed, per_ray, extinctions)
+                return tally.returned, tally.arrived
+
+            extinctions = material_extinctions(medium, step, rays.w)
+            _, pull = jax.vjp(deposited, step.extinction, step.depth, extinctions)
+            # All energy that collides in the medium is scattered.
+            of_k, of_depth, of_extinctions = pull((of_unsmoothed, of_arrived + of_scattered))
+            of_k = of_k + step.length * of_depth_behind
+            end = step.start + step.length
+            for stop, of_stop in zip(rays.surface_distances, of_depths):
+                # What of the segment lies before the surface.
+                of_k = of_k + of_stop * (jnp.clip(stop, step.start, end) - step.start)
+            if medium.leaf is not None and medium.bark is not None:
+                tables = tables.add_materials(medium, step.cell, rays.w, of_extinctions)
+            else:
+                of_k = of_k + sum(c for c in of_extinctions if c is not None)
+            tables = tables.add_total(medium, step.cell, rays.w, of_k)
+            return tables, of_depth_behind + of_depth
+
+        return lax.fori_loop(0, n_steps, add_step, (tables, of_total_depth))[0], None
+
+    zero = jax.tree.map(jnp.zeros_like, ExtinctionTables.of(scene))
+    return lax.scan(add_chunk, zero, ray_chunks(*move_rays(scene, across, energy)))[0]

@@ -1,0 +1,220 @@
+"""Reverse mode by replay against forward mode and finite differences, and its memory.
+
+Along random directions in each kind of parameter, the product with the gradient is the derivative by forward
+mode, for the same key: replay walks the same paths. Forward mode itself is compared with differences in
+`test_derivatives.py`; here reverse mode is, for single voxels, by a z-test.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxlidar as jl
+from jaxlidar.trace import replay
+from tests.helpers import agrees
+
+RANDOM = np.random.default_rng(0)
+LEAF = RANDOM.uniform(0.1, 1.0, (3, 3, 4)) * (RANDOM.uniform(size=(3, 3, 4)) < 0.6)
+BARK = RANDOM.uniform(0.0, 0.3, (3, 3, 4))
+HEIGHTS, SOIL = RANDOM.uniform(-0.3, 0.3, (7, 7)), RANDOM.uniform(0.2, 0.5, (7, 7))
+ORIGIN = (-1.5, -1.25, 0.5)
+START = {
+    name: jnp.asarray(value, float)
+    for name, value in {
+        "leaf": LEAF,
+        "bark": BARK,
+        "voxel size": 1.0,
+        "terrain heights": HEIGHTS,
+        "raster reflectance": SOIL,
+        "plate height": 2.1,
+        "leaf reflectance": 0.4,
+    }.items()
+}
+
+
+def map_of(p, leaf_angles=None, with_bark=True):
+    if leaf_angles is not None:
+        return jl.VoxelMap.from_lad(
+            p["leaf"], voxel_size=p["voxel size"], origin=ORIGIN, leaf_angles=leaf_angles
+        )
+    bark = p["bark"] if with_bark else None
+    return jl.VoxelMap.from_extinction(leaf=p["leaf"], bark=bark, voxel_size=p["voxel size"], origin=ORIGIN)
+
+
+def everything(p):
+    """Return leaf, bark, a plate, and terrain whose reflectance varies."""
+    optics = jl.LeafOptics(reflectance=p["leaf reflectance"], transmittance=0.3)
+    return jl.Scene(
+        canopy=jl.Canopy(map_of(p), leaf=optics, bark=0.3),
+        plates=(jl.Plate(height=p["plate height"], reflectance=0.3, transmittance=0.3, coverage=0.5),),
+        ground=jl.Terrain(
+            heights=p["terrain heights"],
+            spacing=1.0,
+            origin=(-3.0, -3.0),
+            reflectance=p["raster reflectance"],
+        ),
+    )
+
+
+def leaves_over_ground(p, leaf_angles=None):
+    """Return leaf alone over a plane, with independent paths in and out."""
+    voxels = map_of(p, leaf_angles, with_bark=False)
+    canopy = jl.Canopy(voxels, leaf=jl.LeafOptics(0.4, 0.3), hotspot=False)
+    return jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=0.5))
+
+
+def planophile(p):
+    return leaves_over_ground(p, "planophile")
+
+
+def problem(build, zenith, orders, n_rays=600, n_photons=300):
+    """Return a loss of parameters and a key: it is not linear in the waveform."""
+    lidar = jl.Lidar(divergence=2.0, zenith=zenith, azimuth=0.0, wavelength=1064.0)
+    plan = jl.plan(
+        lidar, build(START), max_orders=orders, n_rays=n_rays, n_photons=n_photons, window=(-60.0, 40.0)
+    )
+
+    def loss(p, key):
+        setup = jl.make_setup(lidar, build(p), plan)
+        samples = jl.total_reflectance(jl.trace_scene(setup, key), setup)[0]
+        return jnp.sum(samples**2 * jnp.arange(samples.size))
+
+    return loss
+
+
+def forward_and_reverse(loss, names):
+    """Return derivatives along a random direction in each of the parameters, by both modes."""
+    directions = {n: jnp.asarray(np.random.default_rng(2).normal(size=START[n].shape)) for n in names}
+    varied, key = {n: START[n] for n in names}, jax.random.key(1)
+
+    def of_varied(p):
+        return loss(START | p, key)
+
+    gradient = jax.jit(jax.grad(of_varied))(varied)
+    reverse = [float(jnp.sum(gradient[n] * directions[n])) for n in names]
+    # One parameter varies at a time.
+    one_by_one = {
+        n: jnp.stack([directions[n] * (n == m) for m in names]).astype(START[n].dtype) for n in names
+    }
+    push = jax.jit(jax.vmap(lambda t: jax.jvp(of_varied, (varied,), (t,))[1]))
+    return np.asarray(push(one_by_one)), np.asarray(reverse)
+
+
+CASES = [
+    ("everything", everything, 12.0, 1, tuple(START)),
+    ("voxels at nadir", leaves_over_ground, 0.0, 3, ("leaf",)),
+    pytest.param("everything", everything, 12.0, 2, tuple(START), marks=pytest.mark.slow),
+    pytest.param("everything", everything, 12.0, 6, tuple(START), marks=pytest.mark.slow),
+    pytest.param("voxels off nadir", everything, 12.0, 3, ("leaf", "bark"), marks=pytest.mark.slow),
+    pytest.param("leaf angles", planophile, 8.0, 1, ("leaf",), marks=pytest.mark.slow),
+    pytest.param("leaf angles", planophile, 0.0, 3, ("leaf", "voxel size"), marks=pytest.mark.slow),
+]
+
+
+@pytest.mark.parametrize(("name", "build", "zenith", "orders", "names"), CASES)
+def test_forward_and_reverse_agree(name, build, zenith, orders, names):
+    forward, reverse = forward_and_reverse(problem(build, zenith, orders), names)
+    scale = np.max(np.abs(forward))
+    np.testing.assert_allclose(reverse, forward, rtol=2e-4, atol=2e-5 * scale)
+    assert np.all(forward != 0.0)
+    # Planted: what lies behind a segment forgotten, or a derivative 1 % off.
+    with pytest.raises(AssertionError):
+        np.testing.assert_allclose(1.01 * reverse, forward, rtol=2e-4, atol=2e-5 * scale)
+
+
+def test_empty_voxels_have_their_derivative_at_first_order():
+    """The gradient in a voxel of zero extinction is the difference to a little leaf there."""
+    loss, key = problem(leaves_over_ground, 0.0, 1), jax.random.key(1)
+    empty = np.argwhere(np.asarray(START["leaf"]) == 0.0)
+    assert len(empty) > 5
+    gradient = jax.jit(jax.grad(lambda leaf: loss(START | {"leaf": leaf}, key)))(START["leaf"])
+    gradient = gradient[tuple(empty.T)]
+    step, value = 0.02, jax.jit(jax.vmap(lambda leaf: loss(START | {"leaf": leaf}, key)))
+    # Of second order, from one side: extinction is not negative.
+    more = np.stack([np.asarray(START["leaf"])] * (2 * len(empty) + 1))
+    for n, voxel in enumerate(empty):
+        more[(2 * n, *voxel)], more[(2 * n + 1, *voxel)] = step, 2.0 * step
+    values = np.asarray(value(jnp.asarray(more, START["leaf"].dtype)), float)
+    one, two, none = values[0:-1:2], values[1:-1:2], values[-1]
+    difference = (4.0 * one - two - 3.0 * none) / (2.0 * step)
+    np.testing.assert_allclose(gradient, difference, atol=0.02 * np.max(np.abs(difference)))
+    assert np.max(np.abs(gradient)) > 0.1 * np.max(np.abs(difference)) > 0.0
+
+
+def test_simulate_uses_the_replay_unasked(monkeypatch):
+    """`jax.grad` of `simulate` with a plan runs the replay, and `jax.jvp` of it does not."""
+    pulled = []
+    original = replay.linear_map
+
+    def linear_map(function, transpose, residuals, arguments, results):
+        def spied(residuals, cotangents):
+            pulled.append(len(cotangents))
+            return transpose(residuals, cotangents)
+
+        return original(function, spied, residuals, arguments, results)
+
+    monkeypatch.setattr(replay, "linear_map", linear_map)
+    lidar, scene = jl.Lidar(), leaves_over_ground(START)
+    plan, key = jl.plan(lidar, scene, max_orders=1, n_rays=64), jax.random.key(0)
+
+    def total(leaf):
+        wave = jl.simulate(lidar, leaves_over_ground(START | {"leaf": leaf}), plan=plan, key=key)
+        return jnp.sum(wave.reflectance)
+
+    leaf = START["leaf"]
+    jax.eval_shape(lambda leaf: jax.jvp(total, (leaf,), (leaf,)), leaf)
+    assert not pulled
+    jax.eval_shape(jax.grad(total), leaf)
+    assert pulled
+
+
+def temporaries(orders, **sizes):
+    """Return the memory, in bytes, that a compiled gradient in voxels takes beside arguments and results."""
+    loss = problem(leaves_over_ground, 0.0, orders, **sizes)
+    gradient = jax.jit(jax.grad(lambda leaf: loss(START | {"leaf": leaf}, jax.random.key(0))))
+    memory = gradient.lower(START["leaf"]).compile().memory_analysis()
+    assert memory is not None
+    return memory.temp_size_in_bytes
+
+
+def test_memory_does_not_grow_with_rays():
+    few, many = (temporaries(1, n_rays=n) for n in (1024, 16_384))
+    # Positions of the rays themselves: three numbers each, in few copies.
+    assert many - few < 16_384 * 100
+    assert many < 10e6
+
+
+@pytest.mark.slow
+def test_memory_does_not_grow_with_photons():
+    few, many = (temporaries(6, n_photons=n) for n in (16_384, 131_072))
+    assert many < 1.1 * few
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("orders", [1, 2, 6])
+def test_gradients_in_voxels_agree_with_differences(orders):
+    """Means over keys: the gradient along directions that hold single voxels, against central differences."""
+    loss = problem(everything, 12.0, orders, n_photons=4096)
+    voxels = np.argwhere(LEAF > 0.3)[:3]
+    step, keys = 0.1, 24
+
+    def along_voxels(gradient):
+        return jnp.stack([gradient[tuple(v)] for v in voxels])
+
+    gradient = jax.jit(jax.grad(lambda leaf, key: loss(START | {"leaf": leaf}, key)))
+    value = jax.jit(lambda leaf, key: loss(START | {"leaf": leaf}, key))
+    leaf = START["leaf"]
+    estimates = [along_voxels(gradient(leaf, k)) for k in jax.random.split(jax.random.key(3), keys)]
+    differences = []
+    for k in jax.random.split(jax.random.key(4), keys):
+        pairs = [[value(leaf.at[tuple(v)].add(s), k) for s in (step, -step)] for v in voxels]
+        differences.append([(high - low) / (2.0 * step) for high, low in pairs])
+    estimates, differences = np.asarray(estimates, float), np.asarray(differences, float)
+    stderr = np.sqrt((np.var(estimates, axis=0) + np.var(differences, axis=0)) / (keys - 1))
+    # The noise of a sample biases its square, alike on both sides; a margin for curvature.
+    mean, expected = estimates.mean(axis=0), differences.mean(axis=0)
+    stderr = stderr + 0.01 * np.abs(expected)
+    assert agrees(mean, stderr, expected, sigmas=3.5)
+    # Planted: a derivative of the wrong sign.
+    assert not agrees(-mean, stderr, expected, sigmas=3.5)
