@@ -225,6 +225,23 @@ ENTRY_POINTS: dict[str, Callable[[], EntryPoint]] = {
         {"start": (0.0, 0.0), "end": (0.5, 0.0), "speed": 50.0, "pulse_rate": 1000.0}
         | {"gps_time": 1.0, "flight_line": 2},
     ),
+    "Survey sensors": lambda: EntryPoint(
+        lambda **arguments: jl.Survey(LIDAR, **arguments), {"sensor": np.ones((2, 3))}
+    ),
+    "Trajectory": lambda: EntryPoint(
+        jl.Trajectory,
+        {"time": np.array([0.0, 2.0]), "position": np.ones((2, 3)), "roll": np.zeros(2)}
+        | {"pitch": np.zeros(2), "yaw": np.zeros(2)},
+    ),
+    "Trajectory.at": lambda: EntryPoint(
+        jl.Trajectory([0.0, 2.0], np.ones((2, 3))).at, {"time": np.array([0.5, 1.0])}
+    ),
+    "Survey.fly": lambda: EntryPoint(
+        lambda **arguments: jl.Survey.fly(
+            jl.Trajectory([0.0, 2.0], np.ones((2, 3))), jl.Oscillating(10.0, 50.0), **arguments
+        ),
+        {"pulse_rate": 2.0, "mounting": np.zeros(3), "lever_arm": np.zeros(3)},
+    ),
     "Oscillating": lambda: EntryPoint(jl.Oscillating, {"half_angle": 10.0, "frequency": 50.0}),
     "Oscillating.direction": lambda: EntryPoint(jl.Oscillating(10.0, 50.0).direction, {"time": BINS}),
     "RotatingPolygon": lambda: EntryPoint(jl.RotatingPolygon, {"half_angle": 10.0, "line_rate": 50.0}),
