@@ -169,11 +169,6 @@ ENTRY_POINTS: dict[str, Callable[[], EntryPoint]] = {
         | {"zenith": 1.0, "azimuth": 2.0, "energy": 1e-3, "sampling_interval": 1.0}
         | {"position": (0.0, 1.0), "field_of_view": 1.0, "jitter": 0.1, "efficiency": 0.9},
     ),
-    "Trajectory": lambda: EntryPoint(
-        jl.Trajectory,
-        {"time": np.arange(2.0), "position": np.array([[0.0, 0.0, 50.0], [0.0, 9.0, 50.0]])}
-        | {"roll": 1.0, "pitch": 2.0, "yaw": 3.0},
-    ),
     "GaussianPulse": lambda: EntryPoint(jl.GaussianPulse, {"fwhm": 6.0}),
     "GaussianPulse.cumulative": lambda: EntryPoint(
         PULSE.cumulative, {"t": np.array([0.0, 1.0]), "jitter": 0.1}
@@ -229,6 +224,23 @@ ENTRY_POINTS: dict[str, Callable[[], EntryPoint]] = {
         lambda **arguments: jl.Survey.scan(LIDAR, jl.Oscillating(10.0, 50.0), **arguments),
         {"start": (0.0, 0.0), "end": (0.5, 0.0), "speed": 50.0, "pulse_rate": 1000.0}
         | {"gps_time": 1.0, "flight_line": 2},
+    ),
+    "Survey sensors": lambda: EntryPoint(
+        lambda **arguments: jl.Survey(LIDAR, **arguments), {"sensor": np.ones((2, 3))}
+    ),
+    "Trajectory": lambda: EntryPoint(
+        jl.Trajectory,
+        {"time": np.array([0.0, 2.0]), "position": np.ones((2, 3)), "roll": np.zeros(2)}
+        | {"pitch": np.zeros(2), "yaw": np.zeros(2)},
+    ),
+    "Trajectory.at": lambda: EntryPoint(
+        jl.Trajectory([0.0, 2.0], np.ones((2, 3))).at, {"time": np.array([0.5, 1.0])}
+    ),
+    "Survey.fly": lambda: EntryPoint(
+        lambda **arguments: jl.Survey.fly(
+            jl.Trajectory([0.0, 2.0], np.ones((2, 3))), jl.Oscillating(10.0, 50.0), **arguments
+        ),
+        {"pulse_rate": 2.0, "mounting": np.zeros(3), "lever_arm": np.zeros(3)},
     ),
     "Oscillating": lambda: EntryPoint(jl.Oscillating, {"half_angle": 10.0, "frequency": 50.0}),
     "Oscillating.direction": lambda: EntryPoint(jl.Oscillating(10.0, 50.0).direction, {"time": BINS}),

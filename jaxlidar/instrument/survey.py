@@ -430,9 +430,10 @@ class Survey(eqx.Module):
         position = np.pad(ends, ((0, 0), (0, 1)), constant_values=float(lidar.altitude))
         yaw = np.rad2deg(np.arctan2(forward[0], forward[1]))
         flight = Trajectory([0.0, duration], position, yaw=yaw)
-        survey = _strip(lidar, flight.at(np.arange(shots) / float(pulse_rate)), pattern, flight_line)
+        time = np.arange(shots) / float(pulse_rate)
+        survey = _strip(lidar, flight.at(time), pattern, flight_line)
         # Added last: GPS times of 3e8 s leave the times since the first shot fewer digits.
-        return eqx.tree_at(lambda s: s.gps_time, survey, float(gps_time) + survey.gps_time)
+        return eqx.tree_at(lambda s: s.gps_time, survey, float(gps_time) + time)
 
     @staticmethod
     def fly(

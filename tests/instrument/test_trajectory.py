@@ -55,8 +55,9 @@ def test_a_profiler_with_attitude_over_flat_ground(roll, pitch):
     """A beam down in the body meets level ground H tan(roll) / cos(pitch) left, H tan(pitch) ahead."""
     survey = jl.Survey.fly(flight(roll=roll, pitch=pitch), NADIR, lidar=jl.Lidar(), pulse_rate=1.0)
     offset = survey.position - survey.sensor[:, :2]
-    left, ahead = 500 * np.tan(np.deg2rad(roll)) / np.cos(np.deg2rad(pitch)), 500 * np.tan(np.deg2rad(pitch))
-    np.testing.assert_allclose(offset, np.tile([-left, ahead], (11, 1)), atol=1e-5)
+    leftwards = 500 * np.tan(np.deg2rad(roll)) / np.cos(np.deg2rad(pitch))
+    forwards = 500 * np.tan(np.deg2rad(pitch))
+    np.testing.assert_allclose(offset, np.tile([-leftwards, forwards], (11, 1)), atol=1e-5)
     np.testing.assert_allclose(
         survey.zenith, np.rad2deg(np.arccos(np.cos(np.deg2rad(roll)) * np.cos(np.deg2rad(pitch)))), atol=1e-6
     )
@@ -110,9 +111,9 @@ def test_heights_above_terrain_and_strips_that_are_joined():
     np.testing.assert_allclose(survey.altitude - ground, above, rtol=1e-5)
     assert survey.flight_line.tolist() == [1] * 6 + [2] * 6
     assert float(survey[7].altitude) == pytest.approx(survey.altitude[7])
-    middle_shots = survey[5:8]
-    assert middle_shots.flight_line.tolist() == [1, 2, 2]
-    assert middle_shots.gps_time.tolist() == [10.0, 0.0, 2.0]
+    middle = survey[5:8]
+    assert middle.flight_line.tolist() == [1, 2, 2]
+    assert middle.gps_time.tolist() == [10.0, 0.0, 2.0]
 
 
 def test_a_flight_has_the_scanner_of_its_lidar():
