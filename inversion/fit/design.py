@@ -476,7 +476,7 @@ def _cramer_rao(
     push = jax.vmap(column, out_axes=(None, 0))
     reflectance, columns = push(traced.slopes, jnp.eye(flat.size, dtype=flat.dtype))
     sigma = noise(lidar, reflectance) if callable(noise) else noise
-    whitened = columns / jnp.broadcast_to(sigma, reflectance.shape)[None]
+    whitened = columns / jnp.broadcast_to(jnp.asarray(sigma), reflectance.shape)[None]
     rows = whitened.reshape(flat.size, -1).T * traced.width[None]
     least = np.sqrt(_LEAST_PRECISION) * jnp.eye(flat.size, dtype=flat.dtype)
     triangle = jnp.linalg.qr(jnp.concatenate([rows, traced.prior_rows, least]), mode="r")
