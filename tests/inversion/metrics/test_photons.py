@@ -35,6 +35,7 @@ def track(slope, ground=2.0, canopy=2.0):
         wavelength=np.array([532.0]),
         energy=photons[:, None] * PLANCK_TIMES_LIGHT / 532.0,
         zenith=np.zeros(SHOTS),
+        position=np.zeros((SHOTS, 2)),
     )
 
 
@@ -169,6 +170,7 @@ def test_the_ground_bends_and_may_lie_under_a_tall_canopy():
         wavelength=np.array([532.0]),
         energy=photons_per_pulse[:, None] * PLANCK_TIMES_LIGHT / 532.0,
         zenith=np.zeros(SHOTS),
+        position=np.zeros((SHOTS, 2)),
     )
     heights = inversion.photon_ground_and_canopy(events_of(wave, 2e6), DISTANCE)
     error = heights.ground - bent_ground(heights.distance)
