@@ -323,7 +323,7 @@ def _write_parquet(table: ShotTable, path: Path) -> None:
 
 def _write_geopackage(table: ShotTable, path: Path) -> None:
     try:
-        import pyogrio  # pyright: ignore[reportMissingImports]
+        import pyogrio.raw  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise ImportError(_missing_package("pyogrio")) from error
     for name in _COORDINATES:
