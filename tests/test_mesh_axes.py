@@ -98,7 +98,7 @@ def run_on_two_devices(code, axes, orders=1, zenith=0.0, ground="jl.Ground(slope
     settings = f"AXES, ORDERS, ZENITH = {axes!r}, {orders}, {zenith}\n"
     start = START.replace("ground=GROUND", f"ground={ground}")
     environment = os.environ | {
-        "XLA_FLAGS": "--xla_force_host_platform_device_count=2",
+        "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2",
         "PYTHONPATH": str(Path(__file__).resolve().parents[1]),
     }
     arguments = [sys.executable, "-W", "ignore", "-c", settings + start + code]

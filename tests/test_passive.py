@@ -106,7 +106,8 @@ def test_ground_alone_has_its_reflectance_whatever_its_slope():
     np.testing.assert_allclose(factor, gain * spectrum, rtol=1e-4)
 
 
-@pytest.mark.parametrize("hotspot", slow_unless([True], [True, False]))
+@pytest.mark.slow
+@pytest.mark.parametrize("hotspot", [True, False])
 def test_the_direction_of_the_sun_is_that_of_a_lidar(hotspot):
     scene = slab(1.0, jl.LeafOptics(0.45, 0.4), 0.2, hotspot=hotspot)
     lidar = jl.Lidar(altitude=4e5, divergence=1e-3)

@@ -73,14 +73,14 @@ def test_chunks_and_other_scenes_change_nothing(waves, plan_of_two_orders):
 
 
 def test_the_plan_of_a_stack_serves_all_of_its_scenes():
-    scenes = random_stands(40)
+    scenes = random_stands(10)
     plan = jl.plan_scenes(LIDAR, scenes, n_rays=8)
-    for i in range(40):
+    for i in range(10):
         check_plan(plan, LIDAR, scene_number(scenes, i))
     # So do the bounds of the family, without any of its scenes.
     corners = [stand(d, b, h, 0.4) for d in (0.02, 0.3) for b in (1.0, 8.0) for h in (-3.0, 0.5)]
     by_bounds = jl.plan_scenes(LIDAR, corners, n_rays=8)
-    for i in range(40):
+    for i in range(10):
         check_plan(by_bounds, LIDAR, scene_number(scenes, i))
     # The plan of the lowest scene alone does not serve the highest.
     by_one = jl.plan(LIDAR, corners[0], n_rays=8)
@@ -88,6 +88,7 @@ def test_the_plan_of_a_stack_serves_all_of_its_scenes():
         check_plan(by_one, LIDAR, corners[-1])
 
 
+@pytest.mark.slow
 def test_effects_that_are_absent_from_one_scene_are_planned():
     empty, leafy = (stand(density, 2.0, 0.0, 0.3) for density in (0.0, 0.2))
     plan = jl.plan_scenes(LIDAR, [empty, leafy], max_orders=1, n_rays=8)

@@ -6,6 +6,7 @@ import jax
 import pytest
 
 import jaxlidar as jl
+from tests.helpers import slow_unless
 
 KEY = jax.random.key(0)
 LIDAR = jl.Lidar()
@@ -28,14 +29,14 @@ def batch_photons(monkeypatch):
     return photons
 
 
-@pytest.mark.parametrize(("n_photons", "traced"), [(1, 8), (96, 96), (100, 104)])
+@pytest.mark.parametrize(("n_photons", "traced"), slow_unless([(100, 104)], [(1, 8), (96, 96), (100, 104)]))
 def test_eight_batches_have_at_least_as_many_photons(n_photons, traced):
     wave = jl.simulate(LIDAR, SCENE, key=KEY, max_orders=2, n_photons=n_photons, n_rays=8)
     assert (wave.info["batches"], wave.info["photons"]) == (8, traced)
     assert wave.info["stopped"] == "batches spent"
 
 
-@pytest.mark.parametrize("n_photons", [1, 100, 600_000])
+@pytest.mark.parametrize("n_photons", slow_unless([100], [1, 100, 600_000]))
 def test_a_transformation_traces_as_many_photons(n_photons, batch_photons):
     """A program has eight batches: they are as large as it takes. 600,000 were 524,288, and 100 were 96."""
     plan = jl.plan(LIDAR, SCENE, max_orders=2, n_rays=8, describe=False)

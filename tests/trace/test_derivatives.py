@@ -1,10 +1,10 @@
 """Derivatives by automatic differentiation against central differences of converged means.
 
 A crown of 6 x 5 x 8 random voxels of leaf and bark over ground (and, in the second scene, a half-open plate
-beneath it), five orders. The functionals are the first three moments of the waveform in time: the zeroth
-depends on the returned energy, the others on its times. Both sides are means over independent keys, and their
-difference is tested against its standard error. The level is Sidak's for all comparisons of one scene at 1 in
-1,000.
+beneath it), five orders. The default test takes five of the parameters. The functionals are the first three
+moments of the waveform in time: the zeroth depends on the returned energy, the others on its times. Both
+sides are means over independent keys, and their difference is tested against its standard error. The level is
+Sidak's for all comparisons of one scene at 1 in 1,000.
 """
 
 import equinox as eqx
@@ -15,6 +15,7 @@ import pytest
 from scipy.stats import norm
 
 import jaxlidar as jl
+from tests.helpers import slow_unless
 
 KEYS = 12
 RANDOM = np.random.default_rng(5)
@@ -31,14 +32,17 @@ COMMON = {
     "leaf reflectance": (0.4, 0.05),
     "ground reflectance": (0.5, 0.05),
 }
+FEW = ("one voxel", "voxel size", "canopy height", "ground reflectance")
 SCENES = {
+    "nadir, slope, few": (0.0, {name: COMMON[name] for name in FEW} | {"slope": (10.0, 1.0)}),
     "nadir, slope": (0.0, COMMON | {"slope": (10.0, 1.0)}),
     "off nadir, plate": (12.0, COMMON | {"plate height": (0.7, 0.05), "coverage": (0.5, 0.05)}),
 }
 
 
 def build(p):
-    """Return the scene of a dict of parameters."""
+    """Return the scene of a dict of parameters; those that it lacks have their values of `COMMON`."""
+    p = {name: jnp.asarray(value) for name, (value, _) in COMMON.items()} | p
     leaf = jnp.asarray(LEAF) * p["leaf extinction"]
     leaf = leaf.at[2, 2, 6].mul(p["one voxel"])
     voxels = jl.VoxelMap.from_extinction(
@@ -66,7 +70,7 @@ def build(p):
 
 @pytest.fixture(
     scope="module",
-    params=["nadir, slope", pytest.param("off nadir, plate", marks=pytest.mark.slow)],
+    params=slow_unless(["nadir, slope, few"], SCENES),
 )
 def estimates(request):
     """Derivatives by AD and by differences for every parameter, of shape (keys, moments) each."""

@@ -102,8 +102,8 @@ def forward_and_reverse(loss, names):
 
 
 CASES = [
-    ("everything", everything, 12.0, 1, tuple(START)),
     ("voxels at nadir", leaves_over_ground, 0.0, 3, ("leaf",)),
+    pytest.param("everything", everything, 12.0, 1, tuple(START), marks=pytest.mark.slow),
     pytest.param("everything", everything, 12.0, 2, tuple(START), marks=pytest.mark.slow),
     pytest.param("everything", everything, 12.0, 6, tuple(START), marks=pytest.mark.slow),
     pytest.param("voxels off nadir", everything, 12.0, 3, ("leaf", "bark"), marks=pytest.mark.slow),

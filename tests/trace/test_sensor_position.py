@@ -299,6 +299,7 @@ def test_a_mesh_is_seen_from_before_it_alone():
     assert total(first_order(look((0.0, 0.0, 1.5), 90.0, 270.0), ahead)) == 0.0
 
 
+@pytest.mark.slow
 def test_a_mesh_behind_the_sensor_hides_nothing():
     """Light from a wall and the ground: of a mesh, with a black one behind the sensor, as of a plate."""
     ground = jl.Ground(reflectance=0.8)

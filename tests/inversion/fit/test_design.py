@@ -55,6 +55,7 @@ def test_costs_are_those_of_cramer_rao(best):
     assert [bound.labels for bound in best.bounds] == [("Cab", "height", "soil")] * 2
 
 
+@pytest.mark.slow
 def test_the_minimum_is_that_of_brute_force(best):
     scenes = [stand(), stand(Cab=60.0, density=0.2)]
     wavelengths = np.linspace(510.0, 790.0, 15)
@@ -68,6 +69,7 @@ def test_the_minimum_is_that_of_brute_force(best):
     assert reference_cost(wavelengths[np.argmin(costs)], 12.0, scenes) > min(costs)
 
 
+@pytest.mark.slow
 def test_costs_and_noise_are_functions_of_your_own():
     def noise(lidar, reflectance):
         # Background noise in energy: its part of the apparent reflectance falls with the energy sent.

@@ -74,7 +74,8 @@ def dependences(model):
 
 
 @BY_PRECISION
-@pytest.mark.parametrize("dense_columns", [4, pytest.param(8, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("dense_columns", [4, 8])
+@pytest.mark.slow
 def test_jacobians_are_the_same_as_with_tangents(monkeypatch, precision, dense_columns):
     """With voxels that list the two columns which move them, and with derivatives of all columns in each."""
     monkeypatch.setattr(fit_model, "DENSE_COLUMNS", dense_columns)

@@ -131,6 +131,7 @@ def test_all_points_of_a_profile_are_weighted_alike():
     assert np.allclose(result.chi2, z**2, rtol=0.05, atol=0.05)
 
 
+@pytest.mark.slow
 def test_a_profile_does_not_move_smoothness_priors():
     """A prior without mean is about the mean of the start, not of the neighbour's estimate."""
     voxels = jl.VoxelMap.from_lad(

@@ -81,6 +81,7 @@ def test_the_shift_is_found_from_waveforms(case):
     assert place.fitted.shape == waves.reflectance.shape
 
 
+@pytest.mark.slow
 def test_standard_errors_hold_over_draws_of_noise(case, nodes, monkeypatch):
     random, (_, _, waves) = np.random.default_rng(0), case
     clean = np.asarray(waves.reflectance)[:, 0]
