@@ -1,4 +1,5 @@
-"""Figures: waveforms and photons with height upward, scenes from the side, surveys from above, fits, spectra.
+"""Figures: waveforms and photons with height upward, scenes from the side, surveys and returns from above,
+fits, spectra.
 
 Every function draws on the given axes, or on those of a new figure, and returns them; it neither shows nor
 saves the figure. The package, and matplotlib with it, is imported when it is first used.
@@ -12,11 +13,12 @@ from jaxlidar.plot.comparisons import comparison
 from jaxlidar.plot.fits import fit, residuals
 from jaxlidar.plot.light import accuracy, energy_budget
 from jaxlidar.plot.photon_events import photons
+from jaxlidar.plot.returns import points, section
 from jaxlidar.plot.scenes import scene
 from jaxlidar.plot.spectra import spectrum
 from jaxlidar.plot.surveys import survey
 from jaxlidar.plot.trees import leaf_on_and_off, tree
-from jaxlidar.plot.waveforms import waveform
+from jaxlidar.plot.waveforms import waterfall, waveform
 
 __all__ = [
     "accuracy",
@@ -25,11 +27,14 @@ __all__ = [
     "fit",
     "leaf_on_and_off",
     "photons",
+    "points",
     "residuals",
     "scene",
+    "section",
     "spectrum",
     "survey",
     "tree",
+    "waterfall",
     "waveform",
 ]
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
+from matplotlib.ticker import MaxNLocator
 
 from jaxlidar._checks import check_kind, check_number
 from jaxlidar.spectral.waveform import Waveform
@@ -29,6 +30,11 @@ WAVELENGTH_COLOURS = ("#0072B2", "#D55E00", "#CC79A7", "#009E73", "#E69F00", "#5
 VISIBLE_FRACTION = 0.004
 
 
+def material_colour(name: str) -> str:
+    """Return the colour of a material; several plates are called "plate 1", "plate 2"."""
+    return MATERIAL_COLOURS.get(name.split()[0], OTHER_COLOUR)
+
+
 def check_waveform(wave: Any) -> None:
     """Refuse an object that is not one waveform, such as those of a survey.
 
@@ -37,12 +43,12 @@ def check_waveform(wave: Any) -> None:
     if isinstance(wave, Waveforms):
         raise TypeError(
             f"wave is a Waveforms of {len(wave)} shots; admissible is the Waveform of one shot, as in "
-            "many[0]; jaxlidar.plot.survey draws numbers of all shots"
+            "many[0]; jaxlidar.plot.waterfall draws those of many shots"
         )
     check_kind("wave", wave, Waveform, "a Waveform")
 
 
-def wavelength_rows(wave: Waveform, wavelength: float | None) -> Sequence[int]:
+def wavelength_rows(wave: Waveform | Waveforms, wavelength: float | None) -> Sequence[int]:
     """Return the row of the waveform at `wavelength` (nm), or all rows for None."""
     wavelengths = np.asarray(wave.wavelength, dtype=float)
     if wavelength is None:
@@ -65,6 +71,18 @@ def limit_height(ax: Axes, height: Float[np.ndarray, " bins"], total: np.ndarray
         margin = 0.03 * np.ptp(visible)
         ax.set_ylim(visible.min() - margin, visible.max() + margin)
     ax.set_ylabel("height (m)")
+
+
+def label_map(ax: Axes) -> None:
+    """Set equal scales and the labels of a map."""
+    ax.set_aspect("equal")
+    # Map coordinates have seven digits: few ticks, none with an offset or an exponent.
+    for axis in (ax.xaxis, ax.yaxis):
+        axis.set_major_locator(MaxNLocator(nbins=4))
+    ax.ticklabel_format(style="plain", useOffset=False)
+    ax.tick_params(axis="y", labelrotation=90)
+    ax.set_xlabel("x, east (m)")
+    ax.set_ylabel("y, north (m)")
 
 
 def make_axes(ax: Axes | None, size: tuple[float, float]) -> Axes:

@@ -7,12 +7,11 @@ from jaxtyping import ArrayLike, Float
 from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection
 from matplotlib.colors import LightSource, LinearSegmentedColormap
-from matplotlib.ticker import MaxNLocator
 
 from jaxlidar._checks import as_numpy, check_kind, check_range, check_shape
 from jaxlidar.instrument.scan import MAX_ZENITH
 from jaxlidar.instrument.survey import Survey
-from jaxlidar.plot.style import BEAM_COLOUR, MATERIAL_COLOURS, make_axes
+from jaxlidar.plot.style import BEAM_COLOUR, MATERIAL_COLOURS, label_map, make_axes
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.terrain import Terrain
 from jaxlidar.survey.coverage import ground_position
@@ -84,14 +83,7 @@ def survey(
     margin = 0.03 * max(float(np.max(high - low)), 1e-3)
     ax.set_xlim(low[0] - margin, high[0] + margin)
     ax.set_ylim(low[1] - margin, high[1] + margin)
-    ax.set_aspect("equal")
-    # Map coordinates have seven digits: few ticks, none with an offset or an exponent.
-    for axis in (ax.xaxis, ax.yaxis):
-        axis.set_major_locator(MaxNLocator(nbins=4))
-    ax.ticklabel_format(style="plain", useOffset=False)
-    ax.tick_params(axis="y", labelrotation=90)
-    ax.set_xlabel("x, east (m)")
-    ax.set_ylabel("y, north (m)")
+    label_map(ax)
     colour_values = None if values is None else _checked_values(values, len(survey))
     if float(np.max(radius)) < _MIN_FOOTPRINT * float(np.max(high - low)):
         colours = BEAM_COLOUR if colour_values is None else colour_values

@@ -3,20 +3,30 @@
 from typing import Any
 
 import numpy as np
+from jaxtyping import ArrayLike, Float
 from matplotlib.axes import Axes
+from matplotlib.patches import Patch
 
-from jaxlidar._checks import check_number
+from jaxlidar._checks import as_numpy, check_choice, check_kind, check_number, check_range, check_shape
 from jaxlidar.plot.style import (
-    MATERIAL_COLOURS,
+    BEAM_COLOUR,
     OTHER_COLOUR,
     TOTAL_COLOUR,
+    VISIBLE_FRACTION,
     WAVELENGTH_COLOURS,
     check_waveform,
     limit_height,
     make_axes,
+    material_colour,
     wavelength_rows,
 )
 from jaxlidar.spectral.waveform import Waveform
+from jaxlidar.survey.waveforms import Waveforms
+
+# Components that are no materials.
+_ORDERS = ("first", "higher")
+# Shots over which a waterfall is legible; more need `shots`.
+_MAX_STACKED = 400
 
 
 def waveform(
@@ -105,13 +115,12 @@ def waveform(
 def _draw_components(ax: Axes, wave: Waveform, i: int) -> None:
     """Draw the returns of materials, the strongest one below the others, and of higher orders."""
     height = np.asarray(wave.height)
-    names = [n for n in wave.components if n not in ("first", "higher")]
+    names = [n for n in wave.components if n not in _ORDERS]
     peaks = {n: float(np.max(np.asarray(wave.components[n][i]), initial=0.0)) for n in names}
     for name in sorted(names, key=lambda n: -peaks[n]):
         if peaks[name] > 0:
             component = np.asarray(wave.components[name][i])
-            # Several plates are called "plate 1", "plate 2".
-            colour = MATERIAL_COLOURS.get(name.split()[0], OTHER_COLOUR)
+            colour = material_colour(name)
             ax.fill_betweenx(height, 0.0, component, color=colour, alpha=0.45, linewidth=0, label=name)
             ax.plot(component, height, color=colour, linewidth=0.8)
     higher = np.asarray(wave.components["higher"][i])
@@ -124,3 +133,139 @@ def _draw_components(ax: Axes, wave: Waveform, i: int) -> None:
             linestyle=(0, (4, 2)),
             label="scattered twice\nor more",
         )
+
+
+def waterfall(
+    waves: Waveforms,
+    ax: Axes | None = None,
+    *,
+    shots: ArrayLike | slice | None = None,
+    distance: ArrayLike | None = None,
+    wavelength: float | None = None,
+    quantity: str = "reflectance",
+    overlap: float = 1.5,
+    legend: bool = True,
+) -> Axes:
+    """Draw the waveforms of shots along a track as a stack, each at its distance, height upward.
+
+    Each waveform is drawn from its place on the track to the right: the total as a line, and the returns of
+    materials as areas. All have one scale: the largest sample of all reaches over `overlap` times the median
+    distance of neighbouring shots. The true height of the ground is a dashed line.
+
+    **Arguments:**
+
+    - `waves`: the `Waveforms` of a survey.
+    - `ax`: the axes to draw on. Default None: those of a new figure.
+    - `shots`: numbers of the shots to draw, or a slice, at most 400. Default None: all.
+    - `distance`: (shots,) m along the track of the shots that are drawn. Default None: that of where their
+      beams meet the ground, or of the places of the shots without ground, along the line from the first to
+      the last one.
+    - `wavelength`: in nm, one of the waveforms'. Default None: the first.
+    - `quantity`: "reflectance" (apparent reflectance), "energy" or "recorded" (J; without materials). Default
+      "reflectance".
+    - `overlap`: positive; see above. Default 1.5.
+    - `legend`: True to add a legend. Default True.
+
+    **Returns:** the axes.
+
+    **Raises:** ValueError for no shot or more than 400, for numbers that are no shots, for distances of
+    another shape, and as `waveform`; TypeError for objects of the wrong type.
+
+    **Example:**
+
+    >>> import jax, jaxlidar as jl
+    >>> import jaxlidar.plot
+    >>> from matplotlib.figure import Figure
+    >>> survey = jl.Survey.track(jl.Lidar(), start=(0, 0), end=(40, 0), spacing=10.0)
+    >>> many = jl.simulate_many(survey, jl.Scene(ground=jl.Ground(slope=5.0)), key=jax.random.key(0))
+    >>> ax = jaxlidar.plot.waterfall(many, Figure().subplots())
+    >>> print(ax.get_xlabel(), len(ax.collections))
+    distance along the track (m) 5
+    """
+    check_kind("waves", waves, Waveforms, "the Waveforms of a survey")
+    check_choice("quantity", quantity, ("reflectance", "energy", "recorded"))
+    check_number("overlap", overlap, 0.0, low_open=True)
+    rows = _chosen_shots(waves, shots)
+    w = 0 if wavelength is None else wavelength_rows(waves, wavelength)[0]
+    if distance is None:
+        places = _distance_along_track(waves, rows)
+    else:
+        check_range("distance", distance)
+        check_shape("distance", distance, rows.shape)
+        places = as_numpy(distance, "distance")
+    power = np.asarray(getattr(waves, quantity)[rows, w], float)
+    largest = float(power.max())
+    gaps = np.diff(np.sort(places))
+    spacing = float(np.median(gaps[gaps > 0])) if np.any(gaps > 0) else 1.0
+    scale = overlap * spacing / (largest if largest > 0 else 1.0)
+    ax = make_axes(ax, (7.4, 3.6))
+    components = {}
+    if quantity == "reflectance":
+        stored = {n: np.asarray(a[rows, w], float) for n, a in waves.components.items() if n not in _ORDERS}
+        components = dict(sorted(stored.items(), key=lambda item: -float(item[1].max())))
+    lowest, highest = np.inf, -np.inf
+    drawn_materials: dict[str, str] = {}
+    # From the right: each waveform may reach over its neighbour to the right, and is drawn in front of it.
+    for i in np.argsort(-places, kind="stable"):
+        height = np.asarray(waves[int(rows[i])].height, float)
+        (visible,) = np.nonzero(np.abs(power[i]) > VISIBLE_FRACTION * max(largest, 1e-300))
+        if visible.size == 0:
+            continue
+        shown = slice(max(visible[0] - 1, 0), visible[-1] + 2)
+        areas = {n: (material_colour(n), a[i, shown]) for n, a in components.items() if np.any(a[i, shown])}
+        for colour, values in areas.values() or [(OTHER_COLOUR, power[i, shown])]:
+            edge = places[i] + scale * values
+            ax.fill_betweenx(height[shown], places[i], edge, color=colour, alpha=0.6, linewidth=0)
+        ax.plot(places[i] + scale * power[i, shown], height[shown], color=TOTAL_COLOUR, linewidth=0.5)
+        drawn_materials |= {n: colour for n, (colour, _) in areas.items()}
+        lowest, highest = min(lowest, height[shown].min()), max(highest, height[shown].max())
+    ground = np.asarray(waves.ground_height, float)[rows]
+    if np.isfinite(ground).any():
+        order = np.argsort(places, kind="stable")
+        look = {"color": BEAM_COLOUR, "linewidth": 1.0, "linestyle": (0, (4, 2)), "label": "true ground"}
+        ax.plot(places[order], ground[order], **look)
+        lowest, highest = min(lowest, np.nanmin(ground)), max(highest, np.nanmax(ground))
+    if legend:
+        entries = [*ax.get_legend_handles_labels()[0]]
+        entries += [Patch(color=colour, alpha=0.6, label=name) for name, colour in drawn_materials.items()]
+        # Beside the axes: within them it would cover waveforms.
+        ax.legend(
+            handles=entries, frameon=False, fontsize="small", loc="upper left", bbox_to_anchor=(1.0, 1.0)
+        )
+    if np.isfinite(lowest):
+        margin = max(0.04 * (highest - lowest), 0.5)
+        ax.set_ylim(lowest - margin, highest + margin)
+    ax.set_xlim(places.min() - 0.5 * spacing, places.max() + (overlap + 0.2) * spacing)
+    ax.set_xlabel("distance along the track (m)")
+    ax.set_ylabel("height (m)")
+    unit = "apparent reflectance per sample" if quantity == "reflectance" else "J per sample"
+    ax.set_title(f"{float(waves.wavelength[w]):g} nm, largest {largest:.2g} {unit}", fontsize="medium")
+    return ax
+
+
+def _chosen_shots(waves: Waveforms, shots: Any) -> np.ndarray:
+    """Return the numbers of the shots to draw. **Raises:** ValueError."""
+    count = len(waves)
+    if shots is None or isinstance(shots, slice):
+        rows = np.arange(count)[shots if isinstance(shots, slice) else slice(None)]
+    else:
+        rows = np.atleast_1d(np.asarray(shots))
+        if rows.ndim != 1 or not np.issubdtype(rows.dtype, np.integer):
+            raise ValueError("shots are no row of whole numbers; admissible are numbers of shots, or a slice")
+        check_range("shots", rows, -count, count - 1)
+    if not 0 < rows.size <= _MAX_STACKED:
+        raise ValueError(
+            f"shots has {rows.size} shots; admissible are 1 to {_MAX_STACKED}, as in shots=slice(0, 100)"
+        )
+    return rows % count
+
+
+def _distance_along_track(waves: Waveforms, rows: np.ndarray) -> Float[np.ndarray, " shots"]:
+    """Return the distances of shots along the line from the first to the last one, m."""
+    places = np.asarray(waves.ground_position, float)[rows, :2]
+    if not np.isfinite(places).all():
+        places = np.asarray(waves.position, float)[rows, :2]
+    line = places[-1] - places[0]
+    length = float(np.linalg.norm(line))
+    # Shots at one place have no track: they are drawn side by side.
+    return (places - places[0]) @ line / length if length > 0 else np.arange(len(rows), dtype=float)
