@@ -228,9 +228,9 @@ def _draw_coloured(
     for group in np.argsort(-counts, kind="stable"):
         if counts[group] == 0:
             continue
-        chosen = rows[numbers[rows] == group]
+        name, chosen = str(names[group]), rows[numbers[rows] == group]
         look = {"linestyle": "none", "marker": "o", "markersize": size, "markeredgewidth": 0}
-        ax.plot(*position[chosen].T, color=colours[names[group]], label=names[group], **look)
+        ax.plot(*position[chosen].T, color=colours[name], label=name, **look)
     if legend:
         # Beside the axes: within them it would cover points. Three-dimensional ones have room at the top.
         place: dict[str, Any] = {"loc": "upper right"}
