@@ -44,8 +44,8 @@ waveforms is in the package `inversion`.
 ## Plants
 
 `Habit`, `Branching`, `broadleaf`, `conifer`, `shrub`, `spreading_tree`, `grow`, `forest`, `Tree`,
-`LSystem`, `Rule`, `Symbol`, `Word`, `turtle`, `voxelise`, `voxelise_points`, `canopy_from_points`,
-`PointCanopy`, `voxelise_mesh`, `Mesh`, `mesh_of`, `trim_empty_layers`.
+`LSystem`, `Rule`, `Symbol`, `Word`, `turtle`, `voxelise`, `voxelise_copies`, `voxelise_points`,
+`canopy_from_points`, `PointCanopy`, `voxelise_mesh`, `Mesh`, `mesh_of`, `trim_empty_layers`.
 
 ## Sunlight
 
@@ -128,7 +128,7 @@ from jaxlidar.plants.meshes import Mesh, SolidMeshWarning, mesh_of, voxelise_mes
 from jaxlidar.plants.point_canopy import PointCanopy, canopy_from_points
 from jaxlidar.plants.tree import Tree
 from jaxlidar.plants.turtle import turtle
-from jaxlidar.plants.voxelise import trim_empty_layers, voxelise, voxelise_points
+from jaxlidar.plants.voxelise import trim_empty_layers, voxelise, voxelise_copies, voxelise_points
 from jaxlidar.scene_batch import SceneWaveforms, simulate_scenes
 from jaxlidar.scenes.atmosphere import Atmosphere
 from jaxlidar.scenes.canopy import Canopy
@@ -252,6 +252,7 @@ __all__ = [
     "Word",
     "turtle",
     "voxelise",
+    "voxelise_copies",
     "voxelise_points",
     "canopy_from_points",
     "PointCanopy",

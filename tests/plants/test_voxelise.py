@@ -231,3 +231,42 @@ TREE, POINTS = one_segment((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 0.1), np.zeros((2, 
 def test_bad_input_is_refused(call, message):
     with pytest.raises(ValueError, match=message):
         call()
+
+
+def test_copies_on_the_nodes_of_the_fine_grid_are_those_of_direct_voxelisation():
+    """Places and azimuths that need no rounding, in map coordinates; others conserve the leaf area."""
+    shrub = jl.grow(jl.shrub(height=1.0, stems=1))
+    random = np.random.default_rng(0)
+    place = np.round(random.uniform(0.0, 6.0, (12, 3)) * [1, 1, 0] / 0.125) * 0.125
+    azimuth = 90.0 * (np.arange(12) % 4)
+    how = {"leaf_area": 0.001, "wood": "surface"}
+    copies = jl.voxelise_copies(shrub, place, 0.5, azimuth=azimuth, azimuths=4, **how)
+    trees = [shrub.translated(-shrub.base).rotated(a).translated(p) for p, a in zip(place, azimuth)]
+    direct = jl.voxelise(trees, 0.5, **how)
+    np.testing.assert_array_equal(copies.origin, direct.origin)
+    np.testing.assert_allclose(copies.leaf, direct.leaf, rtol=1e-5, atol=1e-6)
+    # Points on wood differ, as the fine grid is aligned with the copy.
+    assert np.allclose(copies.bark.sum(), direct.bark.sum(), rtol=1e-4)
+    shifted = jl.voxelise_copies(
+        shrub, np.add(place, (5e5 + 0.03, 5.2e6 - 0.04, 0.0)), 0.5, azimuth=17.0 + azimuth, **how
+    )
+    area = 2.0 * float(np.asarray(shifted.leaf, float).sum()) * 0.5**3
+    assert np.isclose(area, 12 * 0.001 * len(shrub.bud_position), rtol=1e-5)
+    # A copy that is moved by a voxel is another map.
+    other = jl.voxelise_copies(shrub, np.add(place, (0.125, 0, 0)), 0.5, azimuth=azimuth, azimuths=4, **how)
+    assert other.shape != direct.shape or not np.allclose(other.leaf, direct.leaf)
+
+
+def test_copies_of_several_individuals_and_refused_arguments():
+    small, tall = (jl.grow(jl.shrub(height=h, stems=1)) for h in (1.0, 2.0))
+    place = np.array([[0.0, 0.0, 0.0], [4.0, 0.0, 0.0]])
+    stand = jl.voxelise_copies([small, tall], place, 0.5, individual=np.array([1, 0]), leaf_area=0.001)
+    area = 2.0 * float(np.asarray(stand.leaf, float).sum()) * 0.5**3
+    assert np.isclose(area, 0.001 * (len(small.bud_position) + len(tall.bud_position)), rtol=1e-5)
+    assert float(stand.top[2]) >= tall.height
+    with pytest.raises(ValueError, match=r"individual = 2 is outside the admissible range \[0, 1\]"):
+        jl.voxelise_copies([small, tall], place, 0.5, individual=np.array([2, 0]))
+    with pytest.raises(ValueError, match=r"position has shape \(0, 3\)"):
+        jl.voxelise_copies(small, np.zeros((0, 3)), 0.5)
+    with pytest.raises(ValueError, match="individuals is empty"):
+        jl.voxelise_copies([], place, 0.5)
