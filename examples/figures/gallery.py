@@ -29,6 +29,7 @@ CHOSEN = {
     "ground_under_trees": 2,
     "peak_detectors": 0,
     "hectare": 1,
+    "strip": 2,
     "recorded_shots": 0,
 }
 

@@ -66,6 +66,7 @@ def test_there_are_notebooks():
         "leaf_traits",
         "peak_detectors",
         "recorded_shots",
+        "strip",
     ]
 
 
