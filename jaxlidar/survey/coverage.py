@@ -7,17 +7,21 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxlidar._checks import check_kind
+from jaxlidar._programs import Program
 from jaxlidar._summary import NOTABLE_FRACTION, percent
 from jaxlidar._vectors import FAR, vec
 from jaxlidar.instrument.lidar import AIM_DISTANCE
 from jaxlidar.instrument.survey import Survey
+from jaxlidar.planning.size_buckets import size_bucket
 from jaxlidar.scenes.scene import Scene
-from jaxlidar.scenes.shapes import Plane
+from jaxlidar.scenes.shapes import AbstractShape, Plane
 
 # Cosines of incidence below this count as along the ground.
 _LEAST_COSINE = 1e-6
 # Points of a footprint, and shots that are computed together.
 _POINTS, _SHOTS_PER_BLOCK = 512, 1024
+# Beam axes whose distances to the ground are computed together.
+_AXES_PER_BLOCK = 8192
 
 
 class OffMapWarning(UserWarning):
@@ -55,9 +59,8 @@ def ground_heights(survey: Survey, scene: Scene, start_distance: float) -> Float
     # From where rays start, above the scene or at the sensor: a ray that starts on the reference plane would
     # miss ground above it.
     start = survey.aim_point - start_distance * survey.direction
-    x, w = (vec(jnp.asarray(a, float).T) for a in (start, survey.direction))
     shape = scene.ground.shape
-    distance = np.asarray(shape.distance(x, w), float)
+    distance = _distances(shape, start, survey.direction)
     # A miss is at FAR; a tenth of that leaves room for rounding.
     hits = distance < 0.1 * FAR
     # A plane has no rim: an axis that does not meet it runs along it, and has no height. From a sensor it
@@ -71,6 +74,30 @@ def ground_heights(survey: Survey, scene: Scene, start_distance: float) -> Float
         )
     heights = start[:, 2] + np.where(hits, distance, 0.0) * survey.direction[:, 2]
     return np.where(hits, heights, np.nan)
+
+
+def _distance_along_axes(
+    shape: AbstractShape, x: Float[Any, "shots 3"], w: Float[Any, "shots 3"]
+) -> Float[Any, " shots"]:
+    return shape.distance(vec(x.T), vec(w.T))
+
+
+_compiled_distance = Program(_distance_along_axes)
+
+
+def _distances(
+    shape: AbstractShape, x: Float[np.ndarray, "shots 3"], w: Float[np.ndarray, "shots 3"]
+) -> Float[np.ndarray, " shots"]:
+    """Return the distances, m, to a shape from many points, block by block."""
+    # Blocks of few sizes share compiled programs: outside of one, the loop over cells of a height field would
+    # be compiled by every call.
+    size = min(size_bucket(len(x)), _AXES_PER_BLOCK)
+    distances = []
+    for first in range(0, len(x), size):
+        block = (a[first : first + size] for a in (x, w))
+        rows = (np.concatenate([a, np.repeat(a[-1:], size - len(a), axis=0)]) for a in block)
+        distances.append(np.asarray(_compiled_distance(shape, *(jnp.asarray(a, float) for a in rows)), float))
+    return np.concatenate(distances)[: len(x)]
 
 
 def ground_position(survey: Survey, scene: Scene) -> Float[np.ndarray, "shots 3"]:
@@ -131,6 +158,8 @@ def off_map(survey: Survey, scene: Scene) -> Float[np.ndarray, " shots"]:
        r^2) of a Gaussian and r^2 of a top hat, and angles advance by the golden angle (a Fibonacci lattice).
     2. Stretched by the footprint's radius, and by 1 / cos(zenith) along the beam's azimuth.
     3. Moved along the axis to the heights of the map's top and bottom.
+
+    Only footprints near the rim of the map have any points outside; the others are not looked at.
     """
     canopy = scene.canopy
     # From a sensor, beams may look past the map on purpose.
@@ -142,10 +171,18 @@ def off_map(survey: Survey, scene: Scene) -> Float[np.ndarray, " shots"]:
     radius = np.sqrt(-0.5 * np.log1p(-enclosed_energy) if gaussian else enclosed_energy)
     angle = np.pi * (np.sqrt(5.0) - 1.0) * np.arange(_POINTS)
     disc = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=-1)
-    fractions = []
-    for first in range(0, len(survey), _SHOTS_PER_BLOCK):
-        block = survey[first : first + _SHOTS_PER_BLOCK]
-        assert isinstance(block, Survey)
+    fractions = np.zeros(len(survey))
+    # A disc around the longest side of the stretched footprint.
+    direction = survey.direction
+    reach = (survey.footprint_radius * radius.max() / -direction[:, 2])[:, None]
+    near_rim = np.zeros(len(survey), bool)
+    for z in (low[2], high[2]):
+        middle = survey.position + z * direction[:, :2] / direction[:, 2:]
+        near_rim |= np.any((middle - reach < low[:2]) | (middle + reach > high[:2]), axis=-1)
+    shots = np.flatnonzero(near_rim)
+    for first in range(0, len(shots), _SHOTS_PER_BLOCK):
+        numbers = shots[first : first + _SHOTS_PER_BLOCK]
+        block = survey.subset(numbers)
         axis, azimuth = block.direction, np.deg2rad(block.azimuth)
         across = np.stack([np.cos(azimuth), -np.sin(azimuth)], axis=-1)
         along = np.stack([-across[:, 1], across[:, 0]], axis=-1) / -axis[:, 2:]
@@ -155,8 +192,8 @@ def off_map(survey: Survey, scene: Scene) -> Float[np.ndarray, " shots"]:
         for z in (low[2], high[2]):
             position = points + (z * axis[:, :2] / axis[:, 2:])[:, None]
             outside |= np.any((position < low[:2]) | (position > high[:2]), axis=-1)
-        fractions.append(outside.mean(axis=1))
-    return np.concatenate(fractions)
+        fractions[numbers] = outside.mean(axis=1)
+    return fractions
 
 
 def off_map_message(fractions: Float[np.ndarray, " shots"]) -> str | None:

@@ -17,6 +17,8 @@ import pytest
 
 import jaxlidar as jl
 from jaxlidar.sampling.adaptive import StopReason
+from jaxlidar.survey import coverage
+from jaxlidar.survey.coverage import ground_heights, off_map
 
 KEY = jax.random.key(5)
 
@@ -534,3 +536,30 @@ def test_an_interrupt_says_where_finished_shots_are(tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt) as interrupt:
         jl.simulate_many(survey, scene, key=jax.random.key(0), path=tmp_path / "a.nc")
     assert "a.nc.parts: the same call continues" in interrupt.value.__notes__[0]
+
+
+def test_light_off_the_map_is_that_of_a_circular_segment():
+    # A disc of radius r whose middle lies h r inside of a straight rim: acos(h) - h sqrt(1 - h^2) over pi.
+    voxels = jl.VoxelMap.from_lad(np.ones((40, 40, 1)), voxel_size=1.0)
+    scene = jl.Scene(canopy=jl.Canopy(voxels, leaf=jl.LeafOptics(0.4, 0.4)))
+    inside = np.array([-1.5, -0.9, -0.3, 0.0, 0.4, 0.8, 0.999, 1.001, 1.5, 8.0])
+    beam = jl.Lidar(altitude=1e6, divergence=4e-3, profile="top-hat")
+    radius = float(beam.footprint_radius)
+    survey = jl.Survey(beam, np.column_stack([radius * inside, np.full(inside.size, 20.0)]))
+    h = np.clip(inside, -1.0, 1.0)
+    expected = (np.arccos(h) - h * np.sqrt(1.0 - h**2)) / np.pi
+    fractions = off_map(survey, scene)
+    assert np.allclose(fractions, expected, atol=0.01)
+    assert not np.allclose(fractions, expected[::-1], atol=0.01)
+    assert np.all(fractions[inside > 1.0] == 0.0)
+
+
+def test_heights_of_terrain_are_compiled_once():
+    terrain = jl.Terrain(np.add.outer(np.arange(9.0), np.zeros(9)), 10.0, (-40.0, -40.0))
+    surveys = [jl.Survey(lidar(), np.full((count, 2), 3.0)) for count in (20, 22)]
+    heights = [ground_heights(survey, jl.Scene(ground=terrain), 50.0) for survey in surveys]
+    assert np.allclose(np.concatenate(heights), 4.3, atol=1e-4)
+    n_versions = len(coverage._compiled_distance.versions)
+    assert n_versions >= 1
+    ground_heights(surveys[0], jl.Scene(ground=terrain), 50.0)
+    assert len(coverage._compiled_distance.versions) == n_versions
