@@ -15,7 +15,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from jaxlidar._checks import (
     as_array,
@@ -64,6 +64,8 @@ MAX_TRIANGLES = 1 << 28
 _INSTANCE_ROUNDING = 16.0
 # Rounding of a point on a triangle, in units of the floating-point precision and of its coordinates.
 _POSITION_ROUNDING = 8.0
+# Periods by which copies of an instance that crosses sides of a cell lie away from it.
+_COPIES = ((0, 0), (1, 0), (0, 1), (1, 1))
 # Squared angle, rad2, below which the coefficients of a rotation are their series.
 _SMALL_ANGLE = 1e-4
 
@@ -208,6 +210,8 @@ class MeshSurface(eqx.Module):
     materials: tuple[str, ...] = eqx.field(static=True)
     two_sided: bool = eqx.field(static=True)
     n_triangles: int = eqx.field(static=True)
+    # That of a scene with periodic sides, where what repeats is left out of a simulation; else None.
+    period: Float[Array, "2"] | None
 
     ranges: ClassVar = {"vertices": Range(), "optics": SUM_OF_FRACTIONS}
 
@@ -247,6 +251,7 @@ class MeshSurface(eqx.Module):
         numbers = np.searchsorted(np.unique(group), group) if by_material else np.zeros(len(faces), int)
         self.group = numbers[order].astype(np.int32)
         self.instances = MeshInstances(np.zeros((1, 3))) if instances is None else instances
+        self.period = None
 
     @property
     def optics(self) -> Float[Array, " values"]:
@@ -280,6 +285,10 @@ class MeshSurface(eqx.Module):
             shift = arrays[0] + _matrices(arrays[1], arrays[2], np) @ self.origin + by
         # The origin of the mesh is part of the shift from here on.
         return eqx.tree_at(lambda s: (s.origin, s.instances.shift), self, (np.zeros_like(self.origin), shift))
+
+    def repeated(self, period: Float[Array, "2"] | None) -> "MeshSurface":
+        """Return the mesh of a scene that repeats with `period`, m; None: of one that does not."""
+        return eqx.tree_at(lambda s: s.period, self, period, is_leaf=lambda x: x is None)
 
     def corners(self) -> Float[np.ndarray, "triangles 3 3"]:
         """Return the corners of the triangles of all instances, m, one instance after the other.
@@ -436,16 +445,21 @@ class MeshTree(eqx.Module):
         return _POSITION_ROUNDING * float(jnp.finfo(size.dtype).eps) * size
 
 
-def build_mesh_tree(meshes: Sequence[MeshSurface]) -> MeshTree:
+def build_mesh_tree(meshes: Sequence[MeshSurface], period: Float[Array, "2"] | None = None) -> MeshTree:
     """Build the tree of all instances of some meshes: an upper tree over them, and one of each mesh.
 
+    `period`: those of a scene that repeats along x and y, m; None for one that does not.
+
     1. The lower trees, each with the box of its root.
-    2. The boxes of instances, and their order along a curve.
-    3. The upper tree, before the lower ones in one table.
+    2. The boxes of instances. Where the scene repeats: in one cell of it, from 0 to the period, and copies of
+       those that cross its sides.
+    3. The order of instances along a curve.
+    4. The upper tree, before the lower ones in one table.
     """
     lower, boxes, numbers, longest_sides = [], [], [], []
     transforms, shifts = [], []
-    n_instances = sum(len(mesh.instances) for mesh in meshes)
+    n_copies = 1 if period is None else len(_COPIES)
+    n_instances = n_copies * sum(len(mesh.instances) for mesh in meshes)
     n_leaves = 1 << (n_instances - 1).bit_length()
     first_row = 2 * n_leaves
     materials, first_material = [jnp.zeros(first_row, jnp.int32)], 0
@@ -467,6 +481,12 @@ def build_mesh_tree(meshes: Sequence[MeshSurface]) -> MeshTree:
     matrix, shift, box = (jnp.concatenate(a) for a in (transforms, shifts, boxes))
     middle = jnp.einsum("nij,nj->ni", matrix, 0.5 * (box[:, 0] + box[:, 1])) + shift
     half = jnp.einsum("nij,nj->ni", jnp.abs(matrix), 0.5 * (box[:, 1] - box[:, 0]))
+    is_real = jnp.ones(len(shift), bool)
+    if period is not None:
+        move, is_real = _copies_in_cell(middle, half, period)
+        matrix, half = (jnp.tile(a, (n_copies, *[1] * (a.ndim - 1))) for a in (matrix, half))
+        middle, shift = (jnp.tile(a, (n_copies, 1)) + move for a in (middle, shift))
+        numbers = numbers * n_copies
     extent = lax.stop_gradient(jnp.max(jnp.abs(middle) + half))
     half = half + _INSTANCE_ROUNDING * float(jnp.finfo(half.dtype).eps) * extent
     n_spare = n_leaves - n_instances
@@ -475,22 +495,43 @@ def build_mesh_tree(meshes: Sequence[MeshSurface]) -> MeshTree:
         return jnp.concatenate([a, jnp.full((n_spare, *a.shape[1:]), value, a.dtype)])
 
     # The inverse of s R is its transpose over s^2.
-    scale = jnp.concatenate([mesh.instances.scale for mesh in meshes])
+    scale = jnp.tile(jnp.concatenate([mesh.instances.scale for mesh in meshes]), n_copies)
     inverse = jnp.swapaxes(matrix, 1, 2) / (scale * scale)[:, None, None]
     leaf_rows = fill(jnp.concatenate([inverse.reshape(-1, 9), shift], axis=1), 0.0)
     assert leaf_rows.shape[1] == ROW
-    order = instance_order(fill(middle, 0.0), jnp.arange(n_leaves) < n_instances)
-    low, high = fill(middle - half, FAR), fill(middle + half, -FAR)
+    order = instance_order(fill(middle, 0.0), fill(is_real, 0))
+    low, high = (
+        fill(jnp.where(is_real[:, None], middle + sign * half, -sign * FAR), -sign * FAR) for sign in (-1, 1)
+    )
     upper, box = tree_rows(leaf_rows[order], low[order], high[order])
     instances = fill(jnp.asarray(numbers, jnp.int32), 0)[order]
     uniform = numbers[0] if len(set(numbers)) == 1 else None
-    tree = TriangleTree(jnp.concatenate([upper, *lower]), instances, box, uniform)
+    tree = TriangleTree(jnp.concatenate([upper, *lower]), instances, box, uniform, period)
     return MeshTree(
         tree,
         jnp.zeros_like(shift[0]),
         jnp.concatenate(materials) if first_material > 1 else None,
         lax.stop_gradient(jnp.max(jnp.stack(longest_sides))),
     )
+
+
+def _copies_in_cell(
+    middle: Float[Array, "n 3"], half: Float[Array, "n 3"], period: Float[Array, "2"]
+) -> tuple[Float[Array, "copies 3"], Bool[Array, "copies"]]:
+    """Return displacements of copies of instances into the cell from 0 to the period, and which are needed.
+
+    An instance is moved by whole periods until its lowest corner lies in the cell. No instance is wider than
+    a period, so that it crosses at most the far sides; it enters by the near ones as a copy.
+    """
+    low, high = middle[:, :2] - half[:, :2], middle[:, :2] + half[:, :2]
+    period = period[None]
+    number = lax.stop_gradient(jnp.floor(low / period))
+    crosses = high - number * period > period
+    moves, is_needed = [], []
+    for copy in _COPIES:
+        moves.append(jnp.pad(-(number + np.array([copy])) * period, ((0, 0), (0, 1))))
+        is_needed.append(jnp.all(crosses | ~np.array([copy], bool), axis=1))
+    return jnp.concatenate(moves), jnp.concatenate(is_needed)
 
 
 @final
