@@ -203,8 +203,8 @@ class MeshSurface(eqx.Module):
     faces: Int[np.ndarray, "leaves 3"]
     group: Int[np.ndarray, " leaves"]
     origin: Float[np.ndarray, "3"]
-    reflectance: Any
-    transmittance: Any
+    reflectance: Any | Mapping[str, Any]
+    transmittance: Any | Mapping[str, Any]
     law: AbstractLaw
     instances: MeshInstances
     materials: tuple[str, ...] = eqx.field(static=True)
@@ -218,8 +218,8 @@ class MeshSurface(eqx.Module):
     def __init__(
         self,
         mesh: Any,
-        reflectance: Any = 0.3,
-        transmittance: Any = 0.0,
+        reflectance: float | Sequence[float] | ArrayLike | Spectrum | Mapping[str, Any] = 0.3,
+        transmittance: float | Sequence[float] | ArrayLike | Spectrum | Mapping[str, Any] = 0.0,
         law: AbstractLaw = Lambertian(),  # noqa: B008 - laws are immutable
         two_sided: bool = True,
         instances: MeshInstances | None = None,
@@ -285,10 +285,6 @@ class MeshSurface(eqx.Module):
             shift = arrays[0] + _matrices(arrays[1], arrays[2], np) @ self.origin + by
         # The origin of the mesh is part of the shift from here on.
         return eqx.tree_at(lambda s: (s.origin, s.instances.shift), self, (np.zeros_like(self.origin), shift))
-
-    def repeated(self, period: Float[Array, "2"] | None) -> "MeshSurface":
-        """Return the mesh of a scene that repeats with `period`, m; None: of one that does not."""
-        return eqx.tree_at(lambda s: s.period, self, period, is_leaf=lambda x: x is None)
 
     def corners(self) -> Float[np.ndarray, "triangles 3 3"]:
         """Return the corners of the triangles of all instances, m, one instance after the other.

@@ -116,7 +116,7 @@ class Scene(eqx.Module):
 
     @property
     def period(self) -> Float[Array, "2"] | None:
-        """Periods along x and y, m, of a canopy or terrain with periodic sides; None where nothing repeats."""
+        """Periods along x and y, m, of a canopy or terrain with periodic sides; None without."""
         if self.canopy is not None and self.canopy.sides == "periodic":
             voxels = self.canopy.voxels
             return voxels.voxel_size[:2] * np.array(voxels.shape[:2])

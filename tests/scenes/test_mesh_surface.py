@@ -258,7 +258,38 @@ def test_scenes_refuse_what_meshes_do_not_go_with():
         jax.jit(lambda v: jl.MeshSurface((v, ROOF[1])).vertices)(CORNERS)
 
 
-def test_case_files_refuse_meshes(tmp_path):
-    scene = jl.Scene(meshes=(jl.MeshSurface(ROOF),))
-    with pytest.raises(TypeError, match=r"meshes.* is a MeshSurface"):
-        jl.io.write_case(tmp_path / "roof.toml", jl.io.Case(scene=scene))
+def test_case_files_hold_meshes(tmp_path):
+    """Exactly: materials, optics by material, one of them a spectrum, and instances."""
+    mesh = jl.Mesh(CORNERS + np.array([651_234.5, 0.25, 0.0]), ROOF[1], [1, 0], ["tile", "glass"])
+    instances = jl.MeshInstances([[0.1, 0.2, 5_412_345.678], [1.0, 2.0, 3.0]], [10, 20], [1.0, 0.3])
+    reflectance = {"tile": jl.spectrum("soil-medium"), "glass": 0.1}
+    meshes = (
+        jl.MeshSurface(mesh, reflectance, {"glass": 0.8}, two_sided=False, instances=instances),
+        jl.MeshSurface(ROOF, 0.25),
+    )
+    path = tmp_path / "roof.toml"
+    jl.io.write_case(path, jl.io.Case(scene=jl.Scene(meshes=meshes)))
+    copies = jl.io.read_case(path).scene.meshes
+    for copy, original in zip(copies, meshes, strict=True):
+        assert jax.tree.structure(copy) == jax.tree.structure(original)
+        np.testing.assert_array_equal(copy.corners(), original.corners())
+        for a, b in zip(jax.tree.leaves(copy.instances), jax.tree.leaves(original.instances), strict=True):
+            np.testing.assert_array_equal(a, b)
+        assert copy.group.tolist() == original.group.tolist()
+    assert float(copies[0].reflectance["glass"]) == np.float32(0.1)
+
+
+def test_case_files_name_files_of_meshes(tmp_path):
+    lines = [f"v {x} {y} {z}" for x, y, z in CORNERS]
+    (tmp_path / "roof.obj").write_text("\n".join([*lines, "usemtl tile", "f 1 2 3", "f 1 3 4"]))
+    (tmp_path / "case.toml").write_text(
+        """
+        [[scene.meshes]]
+        mesh = {kind = "read_obj", path = "roof.obj"}
+        reflectance = {tile = 0.4}
+        instances = {shift = [[0.0, 0.0, 1.0], [20.0, 0.0, 0.0]]}
+        """
+    )
+    (surface,) = jl.io.read_case(tmp_path / "case.toml").scene.meshes
+    assert surface.materials == ("tile",)
+    assert surface.bounds()[:, 1].tolist() == [[5.0, 5.0, 7.0], [25.0, 5.0, 6.0]]
