@@ -270,7 +270,7 @@ class MeshSurface(eqx.Module):
         if self.materials:
             optics = {f"mesh:{n}": (self.reflectance[n], self.transmittance[n]) for n in self.materials}
         return tuple(
-            MeshMaterial(reflectance=r, transmittance=t, law=self.law, mesh=self, label=name)
+            MeshMaterial(reflectance=r, transmittance=t, law=self.law, mesh=self, label=name)  # pyright: ignore[reportArgumentType]
             for name, (r, t) in optics.items()
         )
 
