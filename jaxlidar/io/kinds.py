@@ -9,7 +9,9 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import numpy as np
 
+from jaxlidar._checks import concrete_array
 from jaxlidar._deprecated import RENAMED, warn_renamed
 from jaxlidar._registry import public_objects
 from jaxlidar.instrument.catalogue import instrument
@@ -28,20 +30,20 @@ from jaxlidar.optics.prospect import Prospect
 from jaxlidar.optics.spectra import read_spectrum_csv, spectrum
 from jaxlidar.plants.forest import forest
 from jaxlidar.plants.habits import Branching, Habit, broadleaf, conifer, grow, shrub, spreading_tree
-from jaxlidar.plants.meshes import voxelise_mesh
+from jaxlidar.plants.meshes import Mesh, voxelise_mesh
 from jaxlidar.plants.voxelise import trim_empty_layers, voxelise
+from jaxlidar.scenes.mesh_surface import MeshInstances, MeshSurface
 from jaxlidar.scenes.surfaces import AbstractGround, AbstractSheet, Ground, Plate
 from jaxlidar.scenes.voxels import VoxelMap
 
 # Exported classes of these packages are kinds.
 _PACKAGES = ("jaxlidar.optics.", "jaxlidar.instrument.", "jaxlidar.scenes.")
-# But for results of photon counting, which come after a simulation, and for meshes, whose files are read by
-# `read_obj` or trimesh.
-_NO_KINDS = ("PhotonEvents", "MeshSurface", "MeshInstances")
+# But for results of photon counting, which come after a simulation.
+_NO_KINDS = ("PhotonEvents",)
 # Functions that return scenes or lidars, or objects in them, and classes of other packages.
 _FUNCTIONS: tuple[Callable[..., Any], ...] = (
     *(Branching, Habit, broadleaf, conifer, shrub, spreading_tree, grow, forest),
-    *(voxelise, voxelise_mesh, trim_empty_layers),
+    *(voxelise, voxelise_mesh, trim_empty_layers, Mesh),
     *(VoxelMap.from_lad, VoxelMap.from_extinction, VoxelMap.from_probability),
     *(Survey.grid, Survey.track, Survey.scan, Survey.fly, read_trajectory, instrument),
     *(LeafAngles.named, LeafAngles.beta, Prospect.paper),
@@ -122,6 +124,7 @@ UNITS = {
     "roughness": "rad",
     "sampling_interval": "ns",
     "scan_angle": DEGREES,
+    "shift": "m",
     "saturation": "J per sample",
     "sensor": "m",
     "shoot_angle": DEGREES,
@@ -146,6 +149,8 @@ UNITS = {
 UNITS_OF = {
     (Branching, "divergence"): DEGREES,
     (read_dem, "fill"): "m",
+    (MeshInstances, "rotation"): DEGREES,
+    (Mesh, "vertices"): "m",
     (Survey.grid, "low"): "m",
     (Survey.grid, "high"): "m",
     (Survey, "time"): "s",
@@ -205,6 +210,20 @@ def arguments_of(kind: Callable[..., Any]) -> Mapping[str, Argument]:
         unit = UNITS_OF.get((kind, name), UNITS.get(name, ""))  # pyright: ignore[reportArgumentType, reportCallIssue]
         arguments[name] = Argument(annotation, parameter.default is parameter.empty, unit, field)
     return arguments
+
+
+def argument_value(value: Any, name: str, argument: Argument) -> Any:
+    """Return what an object was made of, as the argument with this name."""
+    if isinstance(value, MeshSurface) and name == "mesh":
+        return _mesh_of_surface(value)
+    return getattr(value, argument.field)
+
+
+def _mesh_of_surface(surface: MeshSurface) -> Mesh:
+    """Return the mesh of a surface, without the triangles that fill up its tree."""
+    rows = np.unique(np.column_stack([surface.faces, surface.group]), axis=0)
+    vertices = concrete_array(surface.vertices) + surface.origin
+    return Mesh(vertices, rows[:, :3], rows[:, 3], surface.materials or ("mesh",))
 
 
 def call_kind(kind: Callable[..., Any], arguments: Mapping[str, Any]) -> Any:

@@ -23,6 +23,7 @@ from jaxlidar.io.kinds import (
     admits_numbers_alone,
     admits_text,
     admits_tuple,
+    argument_value,
     arguments_of,
     call_kind,
     current_kind,
@@ -74,7 +75,6 @@ def table_of(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
         return [table_of(item, f"{path}.{i}", arrays) for i, item in enumerate(value)]
     name = type(value).__name__
     if kinds().get(name) is not type(value):
-        # Meshes are jaxlidar's, but their arrays are too many for a text.
         author = "" if type(value).__module__.startswith("jaxlidar.") else ", a class of your own"
         description = "a function" if inspect.isroutine(value) else f"{kind_of(value)}{author}"
         raise TypeError(
@@ -82,7 +82,7 @@ def table_of(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
             "jaxlidar exports; keep this scene as Python code, or pickle it"
         )
     entries = {
-        key: table_of(getattr(value, argument.field), f"{path}.{key}", arrays)
+        key: table_of(argument_value(value, key, argument), f"{path}.{key}", arrays)
         for key, argument in arguments_of(type(value)).items()
         if (type(value), key) not in ALTERNATIVE_ARGUMENTS
     }
@@ -143,7 +143,12 @@ def value_of(table: Any, argument: Argument, path: str, read_array: ArrayReader,
         if kind is not None:
             return _call(kind, table, path, read_array, folder)
         if admits_mapping(annotation):
-            return dict(table)
+            # Such as reflectances by material, of which each may be a spectrum.
+            item = argument._replace(annotation=Any)
+            return {
+                name: value_of(entry, item, f"{path}.{name}", read_array, folder)
+                for name, entry in table.items()
+            }
         raise ValueError(f"{path}: kind is missing: which class it is, or which function makes it")
     name = table["kind"]
     if isinstance(name, str):

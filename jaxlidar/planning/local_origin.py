@@ -43,12 +43,17 @@ def move_aim_to_origin(lidar: Lidar, scene: Scene) -> tuple[Lidar, Scene]:
         origin = _subtract_in_double(canopy.voxels.origin, shift)
         canopy = eqx.tree_at(lambda c: c.voxels.origin, canopy, origin)
     ground = surfaces[0] if n_grounds else None
+    # Meshes go on to repeat where a simulation leaves out the canopy or the terrain with which they do.
+    meshes = tuple(
+        eqx.tree_at(lambda s: s.period, mesh, scene.period, is_leaf=lambda x: x is None)
+        for mesh in surfaces[n_planes:]
+    )
     return lidar, dataclasses.replace(
         scene,
         canopy=canopy,
         plates=surfaces[n_grounds:n_planes],
         ground=ground,
-        meshes=surfaces[n_planes:],
+        meshes=meshes,
     )
 
 

@@ -35,6 +35,8 @@ MAX_VOXELS = 16_384
 _MAX_SEGMENT_BINS = 64
 # Bins that a segment touches besides those of its length: partial bins at both ends, and the kernel's.
 _SEGMENT_MARGIN = 3
+# Distance, m, beyond which nothing that repeats counts.
+_ENDLESS = 1e7
 # Bound on the rounding of positions in single precision: 16 units in the last place of their distance.
 _ROUNDING = 2e-6
 # Points of the rim of a footprint; those where footprints are many, and how many that is.
@@ -126,7 +128,11 @@ class PathLengths:
                 crossings.append(crossed[met])
         radius = _PATH_RADII * float(shots.footprint_radius.max())
         for mesh in scene.meshes:
-            crossings.append(_mesh_crossings(mesh, points + aim, self.rays, radius, float(slant_range.min())))
+            crossings.append(
+                _mesh_crossings(
+                    mesh, points + aim, self.rays, radius, float(slant_range.min()), scene.period is not None
+                )
+            )
         if scene.canopy is not None:
             low = concrete_array(scene.canopy.voxels.origin)[2]
             for z in (low, low + self.size[2] * self.shape[2]):
@@ -169,7 +175,10 @@ class PathLengths:
         intervals = []
         radius = _PATH_RADII * float(shots.footprint_radius.max())
         for mesh in scene.meshes:
-            intervals.append(_mesh_crossings(mesh, sensor, self.rays, radius, AIM_DISTANCE, ahead=True))
+            repeats = scene.period is not None
+            intervals.append(
+                _mesh_crossings(mesh, sensor, self.rays, radius, AIM_DISTANCE, repeats, ahead=True)
+            )
         for s in (surface for surface in scene.surfaces if not isinstance(surface, MeshMaterial)):
             if isinstance(s, Terrain) and s.relief:
                 low, high = _box_of_terrain(s)
@@ -368,6 +377,7 @@ def _mesh_crossings(
     rays: Float[np.ndarray, "lines 3"],
     radius: float,
     slant_range: float,
+    repeats: bool,
     *,
     ahead: bool = False,
 ) -> Float[np.ndarray, " crossings"]:
@@ -375,12 +385,18 @@ def _mesh_crossings(
 
     A mesh may lie between the lines of a footprint. A ray of it is displaced from the axis by at most its
     radius, across the axis: the box is enlarged by that much for each line. Empty where no ray meets it. With
-    `ahead`, the points are sensors, at which lines start: what lies behind them is not met.
+    `ahead`, the points are sensors, at which lines start: what lies behind them is not met. With `repeats`
+    copies of the mesh fill the layer in which it lies.
     """
     boxes = mesh.bounds()
     low, high = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
+    if repeats:
+        low[:2], high[:2] = points[:, :2].min(axis=0) - _ENDLESS, points[:, :2].max(axis=0) + _ENDLESS
     # Beyond the aim point, beams are wider.
-    if ahead:
+    if ahead and repeats:
+        depth = np.maximum(np.abs(low[2] - points[:, 2]), np.abs(high[2] - points[:, 2]))
+        beyond = float((depth / np.maximum(np.abs(rays[:, 2]), 1e-3)).max())
+    elif ahead:
         # No point of the box is farther from a sensor than the farthest corner.
         beyond = float(np.linalg.norm(np.maximum(np.abs(low - points), np.abs(high - points)), axis=1).max())
     else:
@@ -408,7 +424,8 @@ def meshes_are_in_reach(shots: Lidar | Survey, scene: Scene) -> bool:
         points = points - rims.distance.reshape(-1, 1) * rays
     radius, slant_range = n_radii * float(survey.footprint_radius.max()), float(rims.slant_range.min())
     return any(
-        _mesh_crossings(mesh, points, rays, radius, slant_range, ahead=ahead).size for mesh in scene.meshes
+        _mesh_crossings(mesh, points, rays, radius, slant_range, scene.period is not None, ahead=ahead).size
+        for mesh in scene.meshes
     )
 
 

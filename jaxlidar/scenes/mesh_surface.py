@@ -15,7 +15,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from jaxlidar._checks import (
     as_array,
@@ -64,6 +64,8 @@ MAX_TRIANGLES = 1 << 28
 _INSTANCE_ROUNDING = 16.0
 # Rounding of a point on a triangle, in units of the floating-point precision and of its coordinates.
 _POSITION_ROUNDING = 8.0
+# Periods by which copies of an instance that crosses sides of a cell lie away from it.
+_COPIES = ((0, 0), (1, 0), (0, 1), (1, 1))
 # Squared angle, rad2, below which the coefficients of a rotation are their series.
 _SMALL_ANGLE = 1e-4
 
@@ -201,21 +203,23 @@ class MeshSurface(eqx.Module):
     faces: Int[np.ndarray, "leaves 3"]
     group: Int[np.ndarray, " leaves"]
     origin: Float[np.ndarray, "3"]
-    reflectance: Any
-    transmittance: Any
+    reflectance: Any | Mapping[str, Any]
+    transmittance: Any | Mapping[str, Any]
     law: AbstractLaw
     instances: MeshInstances
     materials: tuple[str, ...] = eqx.field(static=True)
     two_sided: bool = eqx.field(static=True)
     n_triangles: int = eqx.field(static=True)
+    # That of a scene with periodic sides, where what repeats is left out of a simulation; else None.
+    period: Float[Array, "2"] | None
 
     ranges: ClassVar = {"vertices": Range(), "optics": SUM_OF_FRACTIONS}
 
     def __init__(
         self,
         mesh: Any,
-        reflectance: Any = 0.3,
-        transmittance: Any = 0.0,
+        reflectance: float | Sequence[float] | ArrayLike | Spectrum | Mapping[str, Any] = 0.3,
+        transmittance: float | Sequence[float] | ArrayLike | Spectrum | Mapping[str, Any] = 0.0,
         law: AbstractLaw = Lambertian(),  # noqa: B008 - laws are immutable
         two_sided: bool = True,
         instances: MeshInstances | None = None,
@@ -247,6 +251,7 @@ class MeshSurface(eqx.Module):
         numbers = np.searchsorted(np.unique(group), group) if by_material else np.zeros(len(faces), int)
         self.group = numbers[order].astype(np.int32)
         self.instances = MeshInstances(np.zeros((1, 3))) if instances is None else instances
+        self.period = None
 
     @property
     def optics(self) -> Float[Array, " values"]:
@@ -265,7 +270,7 @@ class MeshSurface(eqx.Module):
         if self.materials:
             optics = {f"mesh:{n}": (self.reflectance[n], self.transmittance[n]) for n in self.materials}
         return tuple(
-            MeshMaterial(reflectance=r, transmittance=t, law=self.law, mesh=self, label=name)
+            MeshMaterial(reflectance=r, transmittance=t, law=self.law, mesh=self, label=name)  # pyright: ignore[reportArgumentType]
             for name, (r, t) in optics.items()
         )
 
@@ -436,16 +441,21 @@ class MeshTree(eqx.Module):
         return _POSITION_ROUNDING * float(jnp.finfo(size.dtype).eps) * size
 
 
-def build_mesh_tree(meshes: Sequence[MeshSurface]) -> MeshTree:
+def build_mesh_tree(meshes: Sequence[MeshSurface], period: Float[Array, "2"] | None = None) -> MeshTree:
     """Build the tree of all instances of some meshes: an upper tree over them, and one of each mesh.
 
+    `period`: those of a scene that repeats along x and y, m; None for one that does not.
+
     1. The lower trees, each with the box of its root.
-    2. The boxes of instances, and their order along a curve.
-    3. The upper tree, before the lower ones in one table.
+    2. The boxes of instances. Where the scene repeats: in one cell of it, from 0 to the period, and copies of
+       those that cross its sides.
+    3. The order of instances along a curve.
+    4. The upper tree, before the lower ones in one table.
     """
     lower, boxes, numbers, longest_sides = [], [], [], []
     transforms, shifts = [], []
-    n_instances = sum(len(mesh.instances) for mesh in meshes)
+    n_copies = 1 if period is None else len(_COPIES)
+    n_instances = n_copies * sum(len(mesh.instances) for mesh in meshes)
     n_leaves = 1 << (n_instances - 1).bit_length()
     first_row = 2 * n_leaves
     materials, first_material = [jnp.zeros(first_row, jnp.int32)], 0
@@ -467,6 +477,12 @@ def build_mesh_tree(meshes: Sequence[MeshSurface]) -> MeshTree:
     matrix, shift, box = (jnp.concatenate(a) for a in (transforms, shifts, boxes))
     middle = jnp.einsum("nij,nj->ni", matrix, 0.5 * (box[:, 0] + box[:, 1])) + shift
     half = jnp.einsum("nij,nj->ni", jnp.abs(matrix), 0.5 * (box[:, 1] - box[:, 0]))
+    is_real = jnp.ones(len(shift), bool)
+    if period is not None:
+        move, is_real = _copies_in_cell(middle, half, period)
+        matrix, half = (jnp.tile(a, (n_copies, *[1] * (a.ndim - 1))) for a in (matrix, half))
+        middle, shift = (jnp.tile(a, (n_copies, 1)) + move for a in (middle, shift))
+        numbers = numbers * n_copies
     extent = lax.stop_gradient(jnp.max(jnp.abs(middle) + half))
     half = half + _INSTANCE_ROUNDING * float(jnp.finfo(half.dtype).eps) * extent
     n_spare = n_leaves - n_instances
@@ -475,22 +491,43 @@ def build_mesh_tree(meshes: Sequence[MeshSurface]) -> MeshTree:
         return jnp.concatenate([a, jnp.full((n_spare, *a.shape[1:]), value, a.dtype)])
 
     # The inverse of s R is its transpose over s^2.
-    scale = jnp.concatenate([mesh.instances.scale for mesh in meshes])
+    scale = jnp.tile(jnp.concatenate([mesh.instances.scale for mesh in meshes]), n_copies)
     inverse = jnp.swapaxes(matrix, 1, 2) / (scale * scale)[:, None, None]
     leaf_rows = fill(jnp.concatenate([inverse.reshape(-1, 9), shift], axis=1), 0.0)
     assert leaf_rows.shape[1] == ROW
-    order = instance_order(fill(middle, 0.0), jnp.arange(n_leaves) < n_instances)
-    low, high = fill(middle - half, FAR), fill(middle + half, -FAR)
+    order = instance_order(fill(middle, 0.0), fill(is_real, 0))
+    low, high = (
+        fill(jnp.where(is_real[:, None], middle + sign * half, -sign * FAR), -sign * FAR) for sign in (-1, 1)
+    )
     upper, box = tree_rows(leaf_rows[order], low[order], high[order])
     instances = fill(jnp.asarray(numbers, jnp.int32), 0)[order]
     uniform = numbers[0] if len(set(numbers)) == 1 else None
-    tree = TriangleTree(jnp.concatenate([upper, *lower]), instances, box, uniform)
+    tree = TriangleTree(jnp.concatenate([upper, *lower]), instances, box, uniform, period)
     return MeshTree(
         tree,
         jnp.zeros_like(shift[0]),
         jnp.concatenate(materials) if first_material > 1 else None,
         lax.stop_gradient(jnp.max(jnp.stack(longest_sides))),
     )
+
+
+def _copies_in_cell(
+    middle: Float[Array, "n 3"], half: Float[Array, "n 3"], period: Float[Array, "2"]
+) -> tuple[Float[Array, "copies 3"], Bool[Array, "copies"]]:
+    """Return displacements of copies of instances into the cell from 0 to the period, and which are needed.
+
+    An instance is moved by whole periods until its lowest corner lies in the cell. No instance is wider than
+    a period, so that it crosses at most the far sides; it enters by the near ones as a copy.
+    """
+    low, high = middle[:, :2] - half[:, :2], middle[:, :2] + half[:, :2]
+    period = period[None]
+    number = lax.stop_gradient(jnp.floor(low / period))
+    crosses = high - number * period > period
+    moves, is_needed = [], []
+    for copy in _COPIES:
+        moves.append(jnp.pad(-(number + np.array([copy])) * period, ((0, 0), (0, 1))))
+        is_needed.append(jnp.all(crosses | ~np.array([copy], bool), axis=1))
+    return jnp.concatenate(moves), jnp.concatenate(is_needed)
 
 
 @final

@@ -5,11 +5,12 @@ from collections.abc import Iterable, Iterator
 from typing import Any, ClassVar, final
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxlidar._checks import check_kind, concrete, kind_of
+from jaxlidar._checks import check_kind, concrete, is_traced, kind_of
 from jaxlidar._converted import Converted
 from jaxlidar._ranges import Range
 from jaxlidar._signatures import briefly
@@ -47,11 +48,13 @@ class Scene(eqx.Module):
     - `plates`: a sequence of `Plate`, or of other `AbstractSheet`. Default ().
     - `ground`: a `Ground`, a `Terrain`, another `AbstractGround`, or None. Default None.
     - `atmosphere`: an `Atmosphere`, or None. Default None.
-    - `meshes`: a sequence of `MeshSurface`. Default ().
+    - `meshes`: a sequence of `MeshSurface`. Beside a canopy or terrain with periodic sides, they repeat with
+      it; one that crosses a side enters by the opposite one. Default ().
 
     **Raises:** TypeError for an argument of the wrong type; ValueError for a plate in the plane of the
     ground or of another plate, for a canopy with periodic sides over terrain of another period, for one
-    that lies below the terrain as a whole, and for meshes beside a canopy or terrain with periodic sides.
+    that lies below the terrain as a whole, and for meshes that are wider than the period of a canopy or
+    terrain with periodic sides, with which they repeat.
 
     **Warns:** `MisplacedCanopyWarning` for plants below the terrain, or far above it.
 
@@ -94,7 +97,7 @@ class Scene(eqx.Module):
         for mesh in self.meshes:
             check_kind("one of meshes", mesh, MeshSurface, "a MeshSurface, as in MeshSurface(mesh)")
         if self.meshes:
-            check_open_sides(self.canopy, self.ground)
+            check_mesh_widths(self.meshes, self.period)
         names = (() if self.ground is None else ("the ground",)) + tuple(
             f"plates[{i}]" for i in range(len(self.plates))
         )
@@ -110,6 +113,17 @@ class Scene(eqx.Module):
         """Smallest distance, m, between parallel planes of the scene; None with fewer than two planes."""
         gaps = [gap for _, gap in _gaps(self.surfaces)]
         return jnp.min(jnp.stack(gaps)) if gaps else None
+
+    @property
+    def period(self) -> Float[Array, "2"] | None:
+        """Periods along x and y, m, of a canopy or terrain with periodic sides; None without."""
+        if self.canopy is not None and self.canopy.sides == "periodic":
+            voxels = self.canopy.voxels
+            return voxels.voxel_size[:2] * np.array(voxels.shape[:2])
+        if isinstance(self.ground, Terrain) and self.ground.sides == "periodic":
+            return self.ground.spacing * np.array(self.ground.heights.shape)
+        # Of what a simulation leaves out meshes know the period.
+        return self.meshes[0].period if self.meshes else None
 
     @property
     def surfaces(self) -> tuple[AbstractSurface, ...]:
@@ -149,17 +163,26 @@ def check_periods(canopy: Canopy, terrain: Terrain) -> None:
         )
 
 
-def check_open_sides(canopy: Canopy | None, ground: AbstractGround | None) -> None:
-    """Refuse a canopy or terrain that repeats without end: beside it, meshes would stand only once.
+def check_mesh_widths(meshes: tuple[MeshSurface, ...], period: Float[Array, "2"] | None) -> None:
+    """Refuse meshes that are wider than the period with which they repeat: their copies would overlap.
 
-    **Raises:** ValueError naming it.
+    **Raises:** ValueError naming the instance, its width and the period.
     """
-    for name, sides in (
-        ("canopy", "open" if canopy is None else canopy.sides),
-        ("terrain", ground.sides if isinstance(ground, Terrain) else "open"),
-    ):
-        if sides != "open":
-            raise ValueError(f"the {name} has sides = {sides!r}; admissible with meshes is 'open'")
+    period_value = None if period is None else concrete(period)
+    if period_value is None or any(is_traced(x) for x in jax.tree.leaves(meshes)):
+        return
+    for number, mesh in enumerate(meshes):
+        boxes = mesh.bounds()
+        width = boxes[:, 1, :2] - boxes[:, 0, :2]
+        # The slack is the rounding of single precision.
+        too_wide = np.argwhere(width > period_value * (1.0 + 1e-5))
+        if len(too_wide):
+            instance, axis = too_wide[0]
+            raise ValueError(
+                f"meshes[{number}]: instance {instance} is {width[instance, axis]:.6g} m wide along "
+                f"{'xy'[axis]}; admissible with periodic sides is at most the period, "
+                f"{period_value[axis]:.6g} m"
+            )
 
 
 def check_kinds(lidar: Any, scene: Any) -> None:

@@ -25,7 +25,9 @@ class SceneParts:
       the `Scene` there, in the coordinates of the large scene: it covers at least the rectangle, or as much
       of it as the large scene does. All rectangles of a survey have one size, and corners at multiples of a
       tenth of `tile`. The function may read a Zarr array, a memory-mapped file, or a window of a raster. It
-      is pickled for the workers of an executor. It must return the same scene for the same rectangle.
+      is pickled for the workers of an executor. It must return the same scene for the same rectangle. Meshes
+      may extend beyond the rectangle. Parts whose meshes differ in their numbers of triangles, materials or
+      instances have compiled programs of their own.
     - `z`: (low, high), m, between which all of the scene lies. With tilted beams, the extent of the
       rectangles depends on it.
     - `tile`: edge of the tiles in m, positive. Default 100.
@@ -75,20 +77,20 @@ class SceneParts:
     def between(self, low: Float[np.ndarray, "2"], high: Float[np.ndarray, "2"]) -> Scene:
         """Load the scene within a rectangle.
 
-        **Raises:** TypeError where the function does not return a `Scene`, ValueError where its voxels extend
-        beyond `z`, or it has meshes.
+        **Raises:** TypeError where the function does not return a `Scene`, ValueError where its voxels or
+        meshes extend beyond `z`.
         """
         low, high = as_numpy(low, "low"), as_numpy(high, "high")
         call = f"part({low.tolist()}, {high.tolist()})"
         scene = self.part(low, high)
         check_kind(call, scene, Scene, "a Scene")
-        if scene.meshes:
-            raise ValueError(f"{call} has meshes; admissible in scenes of several parts are none")
+        for mesh in scene.meshes:
+            self._check_heights(call, "meshes", mesh.bounds()[:, 0, 2].min(), mesh.bounds()[:, 1, 2].max())
         if scene.canopy is not None:
             voxels = scene.canopy.voxels
-            bottom, top = float(voxels.origin[2]), float(voxels.top[2])
-            if bottom < self.z[0] - 1e-3 or top > self.z[1] + 1e-3:
-                raise ValueError(
-                    f"{call} has voxels from {bottom:g} m to {top:g} m; admissible is z = {self.z}"
-                )
+            self._check_heights(call, "voxels", float(voxels.origin[2]), float(voxels.top[2]))
         return scene
+
+    def _check_heights(self, call: str, name: str, bottom: float, top: float) -> None:
+        if bottom < self.z[0] - 1e-3 or top > self.z[1] + 1e-3:
+            raise ValueError(f"{call} has {name} from {bottom:g} m to {top:g} m; admissible is z = {self.z}")

@@ -19,10 +19,15 @@ Comput. Graph. Tech. 2(1), 65). Neighbours compute the area of a shared edge fro
 counts as zero, and so as inside, within the rounding of its two products: fused multiplications, by which
 compilers make the areas of neighbours differ, then open no gap.
 
+Where the scene repeats, with the period L along x and y, the upper tree holds what lies in one cell of L x L,
+whole instances: those that cross its sides lie on both. A ray is followed from cell to cell, in each with its
+start shifted by whole periods, and stops at the first triangle that it meets before it leaves the cell.
+
 The search is not differentiated. `triangle_plane` then gives the distance to the plane of the triangle with
 its derivatives.
 """
 
+import dataclasses
 from typing import NamedTuple
 
 import equinox as eqx
@@ -48,6 +53,9 @@ _LANES = 128
 _AREA_ROUNDING = 4.0
 # Relative slack of the distances at which a ray leaves a box (Ize 2013, J. Comput. Graph. Tech. 2(2), 12).
 _BOX_ROUNDING = 8.0
+# Cells of a repeating scene through which a ray is followed: so many, that only rays which are level to one
+# part in thousands may meet a triangle farther away.
+MAX_PERIODS = 4096
 # Smallest cosine of incidence in derivatives: those of grazing rays are bounded.
 _MIN_COSINE = 1e-4
 
@@ -67,12 +75,15 @@ class TriangleTree(eqx.Module):
     - `instances`: for each leaf of the upper tree, the numbers of its `Instance`.
     - `box`: the lowest and the highest corner of the box around everything, m.
     - `uniform`: the `Instance` of all leaves where they have the same numbers; else None.
+    - `period`: those along x and y, m, of a scene that repeats: its cells have corners at multiples of these.
+      None for one that does not.
     """
 
     table: Float[Array, "rows 12"]
     instances: Int[Array, "leaves 3"]
     box: Float[Array, "2 3"]
     uniform: tuple[int, int, int] | None = eqx.field(static=True)
+    period: Float[Array, "2"] | None = None
 
     @property
     def n_leaves(self) -> int:
@@ -85,11 +96,13 @@ class TriangleHit(NamedTuple):
 
     - `distance`: m; FAR where none is met. - `row`: that of the triangle in the table. - `leaf`: that of the
       instance among the leaves of the upper tree.
+    - `cell`: the cell along x and y in which that is, where the scene repeats; else None.
     """
 
     distance: Float[Array, "*s"]
     row: Int[Array, "*s"]
     leaf: Int[Array, "*s"]
+    cell: tuple[Int[Array, "*s"], Int[Array, "*s"]] | None = None
 
 
 def tree_order(corners: Float[np.ndarray, "n 3 3"]) -> Int[np.ndarray, " leaves"]:
@@ -154,6 +167,21 @@ def instance_order(centre: Float[Array, "leaves 3"], is_real: Bool[Array, "leave
     return jnp.argsort(jnp.where(is_real, code, jnp.uint32(2**32 - 1)))
 
 
+class _CellWalk(eqx.Module):
+    """Where rays are in a scene that repeats.
+
+    - `start`: x and y at which rays start. - `cell`: numbers of the cell along x and y.
+    - `leave`: distance at which rays leave the cell, m. - `last`: distance beyond which nothing lies.
+    - `count`: number of cells so far.
+    """
+
+    start: tuple[Float[Array, "lanes"], Float[Array, "lanes"]]
+    cell: tuple[Int[Array, "lanes"], Int[Array, "lanes"]]
+    leave: Float[Array, "lanes"]
+    last: Float[Array, "lanes"]
+    count: Int[Array, "lanes"]
+
+
 class _TreeTraversal(eqx.Module):
     """State of the rays in some lanes on their way through the trees.
 
@@ -162,7 +190,9 @@ class _TreeTraversal(eqx.Module):
     - `upper_node`, `upper_trail`: in the upper tree. - `node`, `trail`: in the lower tree.
     - `inside`: True if the ray is in a lower tree. - `active`: False for rays that have no node left.
     - `instance`: that of the lower tree, where instances differ.
-    - `distance`, `row`, `leaf`: as in `TriangleHit`.
+    - `distance`, `row`, `leaf`: as in `TriangleHit`; until a triangle is met, `distance` is that beyond which
+      none counts, and `row` is zero.
+    - `walk`: where the ray is in a scene that repeats; else None.
     """
 
     ray: Int[Array, "lanes"]
@@ -180,6 +210,7 @@ class _TreeTraversal(eqx.Module):
     distance: Float[Array, "lanes"]
     row: Int[Array, "lanes"]
     leaf: Int[Array, "lanes"]
+    walk: _CellWalk | None
 
 
 class _RayQueue(eqx.Module):
@@ -213,11 +244,16 @@ def nearest_triangle(
     x, w = (vec(jnp.broadcast_to(lax.stop_gradient(a), shape).reshape(-1) for a in v) for v in (x, w))
     n_rays, precision = x[0].size, float(jnp.finfo(tree.table.dtype).eps)
     low, high = (list(corner) for corner in tree.box)
+    if tree.period is not None:
+        # Copies stand everywhere: what counts is the layer in which they lie.
+        endless = jnp.full_like(low[2], _NOWHERE)
+        low, high = [-endless, -endless, low[2]], [endless, endless, high[2]]
     waits, _ = _box_distance(low, high, x, _inverse(w), jnp.full_like(x[0], FAR), precision)
     if active is not None:
         waits &= jnp.broadcast_to(active, shape).reshape(-1)
     zero = jnp.zeros(n_rays + 1, jnp.int32)
-    missed = TriangleHit(jnp.full(n_rays + 1, FAR, tree.table.dtype), zero, zero)
+    cell = None if tree.period is None else (zero, zero)
+    missed = TriangleHit(jnp.full(n_rays + 1, FAR, tree.table.dtype), zero, zero, cell)
     n_lanes = min(n_rays, _LANES)
     # Stream compaction: the numbers of rays that wait, in order.
     n_waiting = jnp.sum(waits, dtype=jnp.int32)
@@ -230,6 +266,10 @@ def nearest_triangle(
         zero = jnp.zeros_like(ray)
         number = jnp.minimum(ray, n_rays - 1)
         start, direction = (vec(a[number] for a in v) for v in (x, w))
+        distance, walk = jnp.full(ray.shape, FAR, tree.table.dtype), None
+        if tree.period is not None:
+            walk = _enter_cells(tree, start, direction, precision)
+            start, distance = _start_in_cell(tree.period, walk, start), walk.leave
         return _TreeTraversal(
             ray=ray,
             upper_x=start,
@@ -243,9 +283,10 @@ def nearest_triangle(
             inside=zero > 0,
             active=ray < n_rays,
             instance=Instance(zero, zero + 1, zero) if tree.uniform is None else None,
-            distance=jnp.full(ray.shape, FAR, tree.table.dtype),
+            distance=distance,
             row=zero,
             leaf=zero,
+            walk=walk,
         )
 
     def follow(lanes: _TreeTraversal, n_idle: Int[Array, ""]) -> _TreeTraversal:
@@ -267,8 +308,10 @@ def nearest_triangle(
     def note(hit: TriangleHit, lanes: _TreeTraversal) -> TriangleHit:
         """Note what finished rays have met; idle lanes write to the spare ray."""
         number = jnp.where(lanes.active, n_rays, lanes.ray)
-        results = (lanes.distance, lanes.row, lanes.leaf)
-        return TriangleHit(*(a.at[number].set(b) for a, b in zip(hit, results)))
+        distance = jnp.where(lanes.row > 0, lanes.distance, FAR)
+        cell = None if lanes.walk is None else lanes.walk.cell
+        results = TriangleHit(distance, lanes.row, lanes.leaf, cell)
+        return jax.tree.map(lambda a, b: a.at[number].set(b), hit, results)
 
     def take_turns(state: _RayQueue) -> _RayQueue:
         """Fill idle lanes from the queue, and follow rays until half of the lanes are idle."""
@@ -290,7 +333,52 @@ def nearest_triangle(
     state = vary_with(_RayQueue(idle, jnp.zeros((), jnp.int32), missed), (tree, x, w, waits))
     state = lax.while_loop(goes_on, take_turns, state)
     hit = note(state.hit, state.lanes)
-    return TriangleHit(*(a[:n_rays].reshape(shape) for a in hit))
+    return jax.tree.map(lambda a: a[:n_rays].reshape(shape), hit)
+
+
+def _enter_cells(tree: TriangleTree, x: Vec, w: Vec, precision: float) -> _CellWalk:
+    """Return rays in the cell of a repeating scene in which they enter the layer of its triangles."""
+    assert tree.period is not None
+    inverse, (low, high) = _inverse(w), tree.box
+    ends = [(corner[2] - x[2]) * inverse[2] for corner in (low, high)]
+    enter = jnp.maximum(jnp.minimum(*ends), 0.0)
+    last = jnp.maximum(*ends) * (1.0 + _BOX_ROUNDING * precision)
+    position = [(a + enter * b) / length for a, b, length in zip(x, w, tree.period)]
+    cell = (jnp.floor(position[0]).astype(jnp.int32), jnp.floor(position[1]).astype(jnp.int32))
+    walk = _CellWalk((x[0], x[1]), cell, enter, last, jnp.zeros_like(cell[0]))
+    leave = jnp.minimum(*_cell_sides(tree.period, walk, w))
+    return eqx.tree_at(lambda a: a.leave, walk, jnp.maximum(leave, enter) * (1.0 + _BOX_ROUNDING * precision))
+
+
+def _cell_sides(period: Array, walk: _CellWalk, w: Vec) -> list[Scalar]:
+    """Return the distances at which rays cross the sides of their cells ahead, along x and y."""
+    sides = []
+    for n, a, length, x in zip(walk.cell, w, period, walk.start):
+        ahead = (n + (a > 0)).astype(a.dtype) * length - x
+        is_parallel = jnp.abs(a) < _PARALLEL
+        sides.append(jnp.where(is_parallel, FAR, ahead / jnp.where(is_parallel, 1.0, a)))
+    return sides
+
+
+def _start_in_cell(period: Array, walk: _CellWalk, x: Vec) -> Vec:
+    """Return the starts of rays, shifted by as many periods as their cell lies away."""
+    shifted = [a - n.astype(a.dtype) * length for a, n, length in zip(walk.start, walk.cell, period)]
+    return vec([*shifted, x[2]])
+
+
+def _next_cell(period: Array, walk: _CellWalk, w: Vec, precision: float) -> tuple[_CellWalk, Array]:
+    """Return rays in the cell behind theirs, and True where there may be anything."""
+    sides = _cell_sides(period, walk, w)
+    is_x = sides[0] <= sides[1]
+    goes_on = (jnp.minimum(*sides) < walk.last) & (walk.count < MAX_PERIODS)
+    steps = [jnp.where(a > 0, 1, -1).astype(jnp.int32) for a in w[:2]]
+    cell = (
+        walk.cell[0] + jnp.where(is_x, steps[0], 0),
+        walk.cell[1] + jnp.where(is_x, 0, steps[1]),
+    )
+    entered = _CellWalk(walk.start, cell, walk.leave, walk.last, walk.count + 1)
+    leave = jnp.minimum(*_cell_sides(period, entered, w)) * (1.0 + _BOX_ROUNDING * precision)
+    return eqx.tree_at(lambda a: a.leave, entered, jnp.maximum(leave, walk.leave)), goes_on
 
 
 def _visit_node(tree: TriangleTree, s: _TreeTraversal, any_hit: bool, precision: float) -> _TreeTraversal:
@@ -302,6 +390,7 @@ def _visit_node(tree: TriangleTree, s: _TreeTraversal, any_hit: bool, precision:
     4. Of a triangle, intersect it.
     5. Where nothing below is met, go on to the next node of the trail; at the end of a lower tree, to that of
        the upper tree; at the end of the latter, stop.
+    6. Where the scene repeats and nothing was met, begin again in the next cell.
     """
     n_upper, instance = tree.n_leaves, s.instance
     if instance is None:
@@ -343,8 +432,11 @@ def _visit_node(tree: TriangleTree, s: _TreeTraversal, any_hit: bool, precision:
     next_trail = jnp.where(descends, 2 * trail + (first_met & second_met).astype(trail.dtype), next_trail)
     leaves_mesh, in_upper = s.inside & has_ended, ~s.inside & ~enters
     upper_node, upper_trail, upper_has_ended = _next_on_trail(s.upper_node, s.upper_trail)
-    active = s.active & ~(leaves_mesh & upper_has_ended) & ~(in_upper & has_ended)
-    return _TreeTraversal(
+    has_ended_all = (leaves_mesh & upper_has_ended) | (in_upper & has_ended)
+    next_row = jnp.where(is_nearer, index, s.row)
+    active = s.active & ~has_ended_all
+    active = active & (next_row == 0) if any_hit else active
+    visited = _TreeTraversal(
         ray=s.ray,
         upper_x=s.upper_x,
         upper_w=s.upper_w,
@@ -355,11 +447,32 @@ def _visit_node(tree: TriangleTree, s: _TreeTraversal, any_hit: bool, precision:
         node=jnp.where(enters, 1, next_node),
         trail=jnp.where(enters, 0, next_trail),
         inside=enters | (s.inside & ~has_ended),
-        active=active & (nearest >= FAR) if any_hit else active,
+        active=active,
         instance=next_instance,
         distance=nearest,
-        row=jnp.where(is_nearer, index, s.row),
+        row=next_row,
         leaf=jnp.where(is_nearer, leaf, s.leaf),
+        walk=s.walk,
+    )
+    if s.walk is None:
+        return visited
+    # 6.
+    assert tree.period is not None
+    next_walk, goes_on = _next_cell(tree.period, s.walk, s.upper_w, precision)
+    goes_on &= s.active & has_ended_all & (next_row == 0)
+    walk = jax.tree.map(lambda a, b: jnp.where(goes_on, a, b), next_walk, s.walk)
+    upper_x = vec(
+        jnp.where(goes_on, a, b) for a, b in zip(_start_in_cell(tree.period, walk, s.upper_x), s.upper_x)
+    )
+    return dataclasses.replace(
+        visited,
+        upper_x=upper_x,
+        upper_node=jnp.where(goes_on, 1, visited.upper_node),
+        upper_trail=jnp.where(goes_on, 0, visited.upper_trail),
+        inside=visited.inside & ~goes_on,
+        active=visited.active | goes_on,
+        distance=jnp.where(goes_on, walk.leave, visited.distance),
+        walk=walk,
     )
 
 
@@ -388,6 +501,10 @@ def triangle_plane(tree: TriangleTree, hit: TriangleHit, x: Vec, w: Vec) -> tupl
         for number in (hit.row, hit.leaf + tree.n_leaves)
     )
     is_met = hit.distance < FAR
+    if tree.period is not None:
+        assert hit.cell is not None
+        shifted = [p - n.astype(p.dtype) * length for p, n, length in zip(x, hit.cell, tree.period)]
+        x = vec([*shifted, x[2]])
     a, b, c = (vec(corner[k : k + 3]) for k in (0, 3, 6))
     sides = [vec(p - q for p, q in zip(other, a)) for other in (b, c)]
     # A fixed vector where nothing is met keeps quotients finite.

@@ -242,7 +242,7 @@ def _build_geometry(
         medium = make_medium(scene.canopy, aim)
         leaf_law, bark_law = law_number(medium.leaf_phase), law_number(medium.bark_phase)
     surfaces = traced_surfaces(scene, aim)
-    meshes = build_mesh_tree(scene.meshes).moved(-aim) if scene.meshes else None
+    meshes = build_mesh_tree(scene.meshes, scene.period).moved(-aim) if scene.meshes else None
     surface_laws = tuple(law_number(s.law) for s in surfaces)
     return DeviceScene(
         beam=make_beam(lidar),

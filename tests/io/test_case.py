@@ -151,8 +151,10 @@ def test_every_class_has_an_example():
         {"Habit", "Branching"},
         {"Oscillating", "RotatingPolygon", "Conical", "Trajectory"},
     )
+    # Their arrays of whole numbers have tests of their own, in tests/scenes/test_mesh_surface.py.
+    meshes = {"Mesh", "MeshSurface", "MeshInstances"}
     examples = {name.partition(",")[0] for name in EXAMPLES}
-    assert classes - plants - scan_patterns - {"Plane"} == examples
+    assert classes - plants - scan_patterns - meshes - {"Plane"} == examples
 
 
 def numeric_arguments(kind):

@@ -114,6 +114,39 @@ def test_instances_are_scaled_rotated_and_shifted_copies():
     np.testing.assert_allclose(vectors.matrices(), instances.matrices(), atol=1e-6)
 
 
+@BY_PRECISION
+def test_rays_meet_meshes_that_repeat(precision):
+    """The nearest of explicit copies, by trimesh; two of the instances cross sides, one a corner."""
+    random = np.random.default_rng(3)
+    mesh = trimesh.creation.icosphere(subdivisions=1)
+    shift = [[4.0, 3.0, 0.0], [8.9, 2.0, 2.0], [-14.0, 13.8, 3.0], [8.5, 0.2, 5.0]]
+    instances = jl.MeshInstances(shift, [0, 30, 60, 90], [1.0, 0.5, 1.5, 0.8])
+    surface, period = jl.MeshSurface(mesh, instances=instances), np.array([9.0, 7.0])
+    x = np.c_[random.uniform(-30, 30, (3000, 2)), random.uniform(-5, 14, 3000)]
+    w = directions(3000, random)
+    # Along axes, and along the sides of a cell.
+    w[:300], w[300:400], x[400:450, 0] = [0, 0, -1], [1, 0, 0], 9.0
+    w[400:450] = [0, 0.6, -0.8]
+    tree = jax.jit(lambda s, p, x, w: build_mesh_tree(s, p).meet(vec(x.T), vec(w.T)))
+    hit = tree((surface,), jnp.asarray(period, float), jnp.asarray(x, float), jnp.asarray(w, float))
+    steps = np.stack(np.meshgrid(*[np.arange(-12, 13)] * 2), axis=-1).reshape(-1, 2) * period
+    corners = surface.corners() + np.pad(steps, ((0, 0), (0, 1)))[:, None, None, None]
+    copies = trimesh.Trimesh(**trimesh.triangles.to_kwargs(corners.reshape(-1, 3, 3)), process=False)
+    place, ray, _ = copies.ray.intersects_location(x, w, multiple_hits=False)
+    expected = np.full(len(x), FAR)
+    expected[ray] = np.linalg.norm(place - x[ray], axis=1)
+    # Beyond, there are no explicit copies.
+    near = np.minimum(hit.distance, expected) < 50.0
+    assert near.sum() > 400
+    tolerance = 2e-4 if precision == "float32" else 1e-5
+    wrong = np.abs(np.asarray(hit.distance) - expected)[near] > tolerance
+    # Rays may pass the outline of a sphere within rounding.
+    assert wrong.sum() <= 2
+    # Without copies most of these rays meet nothing, or a triangle farther away.
+    alone, _ = meet([surface], x, w)
+    assert np.mean(np.abs(alone - expected)[near] > 1.0) > 0.5
+
+
 def test_one_sided_triangles_are_passed_from_behind():
     x = np.array([[0.0, 1, 9], [0, 1, 1]])
     w = np.array([[0.0, 0, -1], [0, 0, 1]])
@@ -211,10 +244,11 @@ def test_scenes_refuse_what_meshes_do_not_go_with():
     surface = jl.MeshSurface(ROOF)
     voxels = jl.VoxelMap.from_lad(np.ones((2, 2, 2)), voxel_size=1.0)
     canopy = jl.Canopy(voxels, leaf=jl.LeafOptics(0.4, 0.4), sides="periodic")
-    with pytest.raises(ValueError, match="canopy has sides = 'periodic'; admissible with meshes is 'open'"):
+    too_wide = r"meshes\[0\]: instance 0 is 10 m wide along x; .* at most the period, {} m"
+    with pytest.raises(ValueError, match=too_wide.format(2)):
         jl.Scene(canopy=canopy, meshes=(surface,))
     terrain = jl.Terrain(np.random.default_rng(0).uniform(size=(4, 4)), 1.0, sides="periodic")
-    with pytest.raises(ValueError, match="terrain has sides = 'periodic'"):
+    with pytest.raises(ValueError, match=too_wide.format(4)):
         jl.Scene(ground=terrain, meshes=(surface,))
     with pytest.raises(TypeError, match="one of meshes is a tuple"):
         jl.Scene(meshes=(ROOF,))
@@ -224,7 +258,38 @@ def test_scenes_refuse_what_meshes_do_not_go_with():
         jax.jit(lambda v: jl.MeshSurface((v, ROOF[1])).vertices)(CORNERS)
 
 
-def test_case_files_refuse_meshes(tmp_path):
-    scene = jl.Scene(meshes=(jl.MeshSurface(ROOF),))
-    with pytest.raises(TypeError, match=r"meshes.* is a MeshSurface"):
-        jl.io.write_case(tmp_path / "roof.toml", jl.io.Case(scene=scene))
+def test_case_files_hold_meshes(tmp_path):
+    """Exactly: materials, optics by material, one of them a spectrum, and instances."""
+    mesh = jl.Mesh(CORNERS + np.array([651_234.5, 0.25, 0.0]), ROOF[1], [1, 0], ["tile", "glass"])
+    instances = jl.MeshInstances([[0.1, 0.2, 5_412_345.678], [1.0, 2.0, 3.0]], [10, 20], [1.0, 0.3])
+    reflectance = {"tile": jl.spectrum("soil-medium"), "glass": 0.1}
+    meshes = (
+        jl.MeshSurface(mesh, reflectance, {"glass": 0.8}, two_sided=False, instances=instances),
+        jl.MeshSurface(ROOF, 0.25),
+    )
+    path = tmp_path / "roof.toml"
+    jl.io.write_case(path, jl.io.Case(scene=jl.Scene(meshes=meshes)))
+    copies = jl.io.read_case(path).scene.meshes
+    for copy, original in zip(copies, meshes, strict=True):
+        assert jax.tree.structure(copy) == jax.tree.structure(original)
+        np.testing.assert_array_equal(copy.corners(), original.corners())
+        for a, b in zip(jax.tree.leaves(copy.instances), jax.tree.leaves(original.instances), strict=True):
+            np.testing.assert_array_equal(a, b)
+        assert copy.group.tolist() == original.group.tolist()
+    assert float(copies[0].reflectance["glass"]) == np.float32(0.1)
+
+
+def test_case_files_name_files_of_meshes(tmp_path):
+    lines = [f"v {x} {y} {z}" for x, y, z in CORNERS]
+    (tmp_path / "roof.obj").write_text("\n".join([*lines, "usemtl tile", "f 1 2 3", "f 1 3 4"]))
+    (tmp_path / "case.toml").write_text(
+        """
+        [[scene.meshes]]
+        mesh = {kind = "read_obj", path = "roof.obj"}
+        reflectance = {tile = 0.4}
+        instances = {shift = [[0.0, 0.0, 1.0], [20.0, 0.0, 0.0]]}
+        """
+    )
+    (surface,) = jl.io.read_case(tmp_path / "case.toml").scene.meshes
+    assert surface.materials == ("tile",)
+    assert surface.bounds()[:, 1].tolist() == [[5.0, 5.0, 7.0], [25.0, 5.0, 6.0]]

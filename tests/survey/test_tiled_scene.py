@@ -194,3 +194,31 @@ def test_inadmissible_input_is_refused_before_any_work():
         simulate_forest(jl.SceneParts(Forest(), z=(0, 5)))
     with pytest.raises(TypeError, match="Scene"):
         jl.simulate(jl.Lidar(), tiled(Forest()), key=jax.random.key(0))  # pyright: ignore[reportArgumentType]
+
+
+class Street:
+    """A function of parts: a house in the rectangle of each tile, over ground."""
+
+    def __init__(self, top=6.0):
+        self.top = top
+
+    def __call__(self, low, high):
+        corners = np.array([[10.0, 10, 0], [14, 10, 0], [14, 16, 0], [10, 16, 0]])
+        corners[:, 2] = self.top
+        roof = (corners, [[0, 1, 2], [0, 2, 3]])
+        centre = 20.0 * np.floor((low + high) / 40.0)
+        house = jl.MeshSurface(roof, 0.6, instances=jl.MeshInstances([[*centre, 0.0]]))
+        return jl.Scene(meshes=(house,), ground=jl.Ground(reflectance=0.3))
+
+
+def test_parts_may_have_meshes():
+    shots = jl.Survey(
+        jl.Lidar(altitude=500.0, divergence=1.0), position=[(12, 13), (32, 13), (12, 33), (36, 33)]
+    )
+    options = {"survey": shots, "max_orders": 1}
+    many = simulate_forest(jl.SceneParts(Street(), z=(0.0, TALL), tile=20.0), **options)
+    roofs, ground = (many.components[name].sum(axis=(1, 2)) for name in ("mesh", "ground"))
+    np.testing.assert_allclose(roofs, [0.6, 0.6, 0.6, 0.0], atol=1e-3)
+    np.testing.assert_allclose(ground, [0.0, 0.0, 0.0, 0.3], atol=1e-3)
+    with pytest.raises(ValueError, match=r"has meshes from 60 m to 60 m; admissible is z"):
+        simulate_forest(jl.SceneParts(Street(60.0), z=(0.0, TALL), tile=20.0), **options)

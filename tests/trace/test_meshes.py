@@ -5,6 +5,7 @@ rays of a lattice; their error is far below the tolerances. Energy is that of on
 times do not matter.
 """
 
+import dataclasses
 import warnings
 
 import equinox as eqx
@@ -247,6 +248,58 @@ def test_a_mesh_within_voxels():
     expected = np.array([rho * passes, 2 / 3 * 0.45 * (1 - passes), 0.0])
     np.testing.assert_allclose(value, expected, atol=2e-5)
     np.testing.assert_allclose(slope, [k * rho * passes, -k * 2 / 3 * 0.45 * passes, 0.0], atol=2e-5)
+
+
+def repeating(period=8.0, leaf=0.3, **elements):
+    """Return a canopy with periodic sides, over ground that it shades evenly."""
+    voxels = jl.VoxelMap.from_extinction(
+        leaf=np.full((2, 2, 4), leaf / 8.0), voxel_size=(period / 2, period / 2, 2.0), origin=(0.0, 0.0, 0.0)
+    )
+    canopy = jl.Canopy(voxels, leaf=jl.LeafOptics(0.45, 0.4), sides="periodic")
+    return jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=0.3), **elements)
+
+
+@pytest.mark.parametrize("max_orders", slow_unless([1], [1, 5]))
+def test_a_level_mesh_that_repeats_is_a_plate(max_orders):
+    """A square as wide as the period has no gaps, under a beam many periods wide; off nadir."""
+    square = [[1.0, 1, 3], [9, 1, 3], [9, 9, 3], [1, 9, 3]]
+    mesh = jl.MeshSurface((square, [[0, 1, 2], [0, 2, 3]]), reflectance=0.4, transmittance=0.2)
+    plate = jl.Plate(3.0, 0.4, 0.2, transmission="diffuse")
+    lidar = wide_lidar(30.0, zenith=20.0)
+    options = {"max_orders": max_orders, "rtol": 0.01, **SINGLE_SAMPLE}
+    waves = [
+        jl.simulate(lidar, scene, key=jax.random.key(n), **options)
+        for n, scene in enumerate([repeating(meshes=(mesh,)), repeating(plates=(plate,))])
+    ]
+    for name, other in (("mesh", "plate"), ("leaf", "leaf"), ("ground", "ground")):
+        value, expected = waves[0].components[name].sum(), waves[1].components[other].sum()
+        assert float(value) == pytest.approx(float(expected), abs=2e-5 if max_orders == 1 else 0.004), name
+    assert float(waves[0].components["mesh"].sum()) > 0.2
+
+
+def test_a_mesh_across_sides_of_a_period_is_whole():
+    """A box at a corner of the period is that in its middle, for beams that move with it."""
+    heights = np.zeros((8, 8))
+    heights[0, 0] = 1e-3
+    terrain = jl.Terrain(heights, 1.0, reflectance=0.3, sides="periodic")
+    for scene in (repeating(), jl.Scene(ground=terrain)):
+        sums = []
+        for x, y in ((4.0, 4.0), (-16.0, 8.0)):
+            shift = jl.MeshInstances([[x, y, 0.0]])
+            mesh = box([-2, -1, 2], [2, 1, 4], reflectance=0.5, instances=shift)
+            beams = wide_lidar(3.0, position=(4.0 * (x == 4.0), 4.0 * (y == 4.0)))
+            sums.append(first_sums(beams, dataclasses.replace(scene, meshes=(mesh,)), n_rays=4096))
+        for name, value in sums[0].items():
+            assert sums[1][name] == pytest.approx(value, abs=2e-3), name
+        assert sums[0]["mesh"] > 0.1
+
+
+def test_meshes_repeat_without_the_canopy_that_is_left_out():
+    square = [[1.0, 1, 3], [9, 1, 3], [9, 9, 3], [1, 9, 3]]
+    scene = repeating(meshes=(jl.MeshSurface((square, [[0, 1, 2], [0, 2, 3]]), reflectance=0.4),))
+    sums = first_sums(wide_lidar(30.0), scene, effects={"leaf": False}, n_rays=1024)
+    assert sums["mesh"] == pytest.approx(0.4, abs=1e-5)
+    assert sums["ground"] == pytest.approx(0.0, abs=1e-5)
 
 
 def test_truth_counts_meshes_among_what_intercepts():
