@@ -38,7 +38,7 @@
 
 ## The scene of many records
 
-`geolocate`, `Geolocation`.
+`retrieve_scene`, `SceneRetrieval`, `SceneStep`, `MarkovField`, `geolocate`, `Geolocation`.
 
 ## Receivers and digitisers
 
@@ -61,7 +61,7 @@ from inversion.fit.design import Design, design
 from inversion.fit.fit_summary import Step
 from inversion.fit.identifiability import CramerRao, Profile, cramer_rao, profile_likelihood
 from inversion.fit.log_density import LogDensity, log_density
-from inversion.fit.priors import LogNormal, Smooth
+from inversion.fit.priors import LogNormal, MarkovField, Smooth
 from inversion.fit.profiles import AveragingKernel, put_profile
 from inversion.fit.quality import Verdict, judge_fit, judge_fits, judge_record
 from inversion.fit.result import Retrieval, Retrievals
@@ -88,6 +88,8 @@ from inversion.receiver.digitiser import Amplitudes, amplitudes, corrected_table
 from inversion.receiver.impulse import receiver_impulse, recorded_pulse
 from inversion.receiver.recorder import Recorder
 from inversion.scene.geolocation import Geolocation, geolocate
+from inversion.scene.retrieval import SceneStep, retrieve_scene
+from inversion.scene.scene_retrieval import SceneRetrieval
 from jaxlidar.extend import shorten_signatures
 
 __all__ = [
@@ -150,6 +152,10 @@ __all__ = [
     "ComparisonStatistics",
     "ComparedColumn",
     # The scene of many records.
+    "retrieve_scene",
+    "SceneRetrieval",
+    "SceneStep",
+    "MarkovField",
     "geolocate",
     "Geolocation",
     # Receivers and digitisers.

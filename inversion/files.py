@@ -1,10 +1,11 @@
-"""Registration of `Retrieval` and `Retrievals` with `jaxlidar.io.save` and `jaxlidar.open`.
+"""Registration of results of retrievals with `jaxlidar.io.save` and `jaxlidar.open`.
 
-The group of entry points "jaxlidar.files" in pyproject.toml names this module for both classes, so that
+The group of entry points "jaxlidar.files" in pyproject.toml names this module for each class, so that
 `jaxlidar.open` finds it by the name of the class in a file.
 """
 
 from inversion.fit.result import Retrieval, Retrievals
+from inversion.scene.scene_retrieval import SceneRetrieval
 from jaxlidar.io import keep_as_netcdf
 
 # The unit of an unknown is that of the scene's array, or of `apply`: it cannot be known here.
@@ -51,4 +52,22 @@ keep_as_netcdf(
         "fitted": ("1", "fitted apparent reflectance per sample, before the recorder"),
     },
     dimensions={"n": "labels", "footprints": "footprint", "bins": "time", "wavelengths": "wavelength"},
+)
+keep_as_netcdf(
+    SceneRetrieval,
+    "a scene retrieved from many lidar waveforms",
+    {
+        **{name: _QUANTITIES[name] for name in ("values", "stderr", "at_bound", "averaging", "bounds")},
+        "draws": (_UNIT_OF_UNKNOWN, "draws of the error of an unknown"),
+        "places": ("1", "indices of the values whose averaging kernels are in averaging"),
+        "time": ("ns", "time of the samples"),
+        "wavelength": ("nm", "wavelength"),
+        "fitted": ("units of the records", "fitted records, with gain and offset"),
+        "residuals": ("1", "observed minus fitted, over the noise"),
+        "held_out": ("1", "1 for shots that were not fitted"),
+        "misfit": ("1", "chi-squared of the fitted shots over their number of samples"),
+        "held_out_misfit": ("1", "chi-squared of the shots held out over their number of samples"),
+        "history": ("1", "misfit, held-out misfit and objective after each step"),
+    },
+    dimensions={"samples": "time", "wavelengths": "wavelength", "shots": "shot", "3": "quantity"},
 )

@@ -18,12 +18,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from inversion.fit.priors import LogNormal, Smooth
+from inversion.fit.priors import LogNormal, MarkovField, Smooth
 from jaxlidar import Scene
 from jaxlidar.extend import Converted, as_array, check_kind, check_range
 
 # (mean, standard deviation), or one of the named priors.
-Prior = tuple[Float[Array, "..."], Float[Array, "..."]] | LogNormal | Smooth
+Prior = tuple[Float[Array, "..."], Float[Array, "..."]] | LogNormal | Smooth | MarkovField
 # Least distance of a starting value from its bounds, over the bounds' width: at a bound, such as a
 # reflectance of zero, the waveform may not depend on other unknowns.
 MARGIN = 0.01
@@ -38,13 +38,13 @@ def _as_bounds(x: Any) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
 
 
 def _as_optional_prior(x: Any) -> Prior | None:
-    if x is None or isinstance(x, LogNormal | Smooth):
+    if x is None or isinstance(x, LogNormal | Smooth | MarkovField):
         return x
     try:
         mean, std = x
     except (TypeError, ValueError):
         raise ValueError(
-            f"prior = {x!r} is no LogNormal, no Smooth and no pair (mean, standard deviation)"
+            f"prior = {x!r} is no LogNormal, Smooth, MarkovField and no pair (mean, standard deviation)"
         ) from None
     return as_array(mean, "prior mean"), as_array(std, "prior standard deviation")
 
@@ -68,8 +68,8 @@ class Unknown(eqx.Module):
       broadcast to the value.
     - `name`: key of the result; needed with `apply`. Default None: the path of `where`.
     - `prior`: (mean, standard deviation) of a normal prior, numbers or arrays, a `LogNormal`, which needs
-      bounds of 0 or above, or a `Smooth`, for profiles: arrays of two values or more along one axis. Default
-      None: no prior.
+      bounds of 0 or above, a `Smooth`, for profiles: arrays of two values or more along one axis, or, for
+      `retrieve_scene`, a `MarkovField`, for maps. Default None: no prior.
     - `start`: starting value within the bounds; needed with `apply`. Default None: the scene's value.
     - `apply`: a function `apply(scene, value) -> scene`, given instead of `where`, for values that change
       several arrays at once. It must be differentiable and keep the tree structure of the scene. Unknowns are
@@ -166,7 +166,7 @@ class BoundUnknown(NamedTuple):
     """An unknown bound to a scene. Arrays have the value's shape, in double precision (`start`: JAX's).
 
     - `prior`: mean and standard deviation, of the logarithm if `is_log_prior`; None without such a prior.
-    - `smooth`: a smoothness prior, or None.
+    - `smooth`: a smoothness prior, or None. `field`: the prior of a map, or None.
     - `smooth_level`: mean of the common level of a smoothness prior without mean. Default None: that of the
       start.
     """
@@ -180,6 +180,7 @@ class BoundUnknown(NamedTuple):
     is_log_prior: bool = False
     smooth: Smooth | None = None
     smooth_level: float | None = None
+    field: MarkovField | None = None
 
     @property
     def prior_level(self) -> float:
@@ -187,14 +188,21 @@ class BoundUnknown(NamedTuple):
         return float(np.mean(self.start)) if self.smooth_level is None else self.smooth_level
 
 
-def bind_unknowns(unknowns: Sequence[Unknown], scene: Scene) -> list[BoundUnknown]:
-    """Locate the unknowns in the scene. **Raises:** ValueError for unknowns that cannot be retrieved."""
+def bind_unknowns(unknowns: Sequence[Unknown], scene: Scene, *, of_maps: bool = False) -> list[BoundUnknown]:
+    """Locate the unknowns in the scene.
+
+    `of_maps`: True for a fit of many records, which takes a `MarkovField` and no `Smooth`.
+
+    **Raises:** ValueError for unknowns that cannot be retrieved.
+    """
     check_kind("scene", scene, Scene, "a Scene")
     check_kind("unknowns", unknowns, Sequence, "a sequence of Unknown")
     for i, unknown in enumerate(unknowns):
         check_kind(f"unknowns[{i}]", unknown, Unknown, "an Unknown")
     if len(unknowns) == 0:
         raise ValueError("unknowns is empty; admissible is one unknown or more")
+    for unknown in unknowns:
+        _check_prior_kind(unknown, of_maps)
     arrays_by_dependence: list[tuple[Dependence, frozenset[int]]] = [
         ("optical", optical_arrays(scene)),
         ("extinction", extinction_arrays(scene)),
@@ -211,6 +219,16 @@ def bind_unknowns(unknowns: Sequence[Unknown], scene: Scene) -> list[BoundUnknow
         if u.setter.array_index is not None and indices.count(u.setter.array_index) > 1:
             raise ValueError(f"unknown {u.name!r} picks an array of the scene that another one picks as well")
     return bound
+
+
+def _check_prior_kind(unknown: Unknown, of_maps: bool) -> None:
+    """Refuse the prior of a map in a fit of profiles, and that of a profile in one of maps."""
+    refused, admissible = (Smooth, MarkovField) if of_maps else (MarkovField, Smooth)
+    if isinstance(unknown.prior, refused):
+        raise ValueError(
+            f"{_label(unknown.name)}: prior is a {refused.__name__}; admissible here is a "
+            f"{admissible.__name__}, a LogNormal or a pair (mean, standard deviation)"
+        )
 
 
 def _bind(
@@ -251,6 +269,14 @@ def _bind(
             )
         if smooth.mean is not None:
             _broadcast(name, "mean", smooth.mean, start.shape)
+    elif isinstance(u.prior, MarkovField):
+        if u.prior.difference.ndim and u.prior.difference.size != start.ndim:
+            raise ValueError(
+                f"unknown {name!r}: difference has {u.prior.difference.size} values; admissible is one, or "
+                f"one for each of its {start.ndim} axes"
+            )
+        if u.prior.mean is not None:
+            check_range(f"{_label(name)}: lower bound, with the mean of an exponential prior,", low, 0.0)
     elif u.prior is not None:
         mean_and_std = (u.prior.median, u.prior.spread) if isinstance(u.prior, LogNormal) else u.prior
         mean, std = (np.asarray(_broadcast(name, "prior", p, start.shape), float) for p in mean_and_std)
@@ -258,7 +284,9 @@ def _bind(
     # The first kind that covers all changed arrays; a mixture is geometric.
     matches: list[Dependence] = [kind for kind, arrays in arrays_by_dependence if changed_arrays <= arrays]
     setter = Setter(array_index, u.apply, matches[0] if matches else "geometric")
-    return with_start(BoundUnknown(name, setter, start, low, high, prior, is_log_prior, smooth), start)
+    field = u.prior if isinstance(u.prior, MarkovField) else None
+    bound = BoundUnknown(name, setter, start, low, high, prior, is_log_prior, smooth, field=field)
+    return with_start(bound, start)
 
 
 def with_start(unknown: BoundUnknown, start: Array) -> BoundUnknown:

@@ -16,6 +16,7 @@ import numpy as np
 
 from jaxlidar._checks import check_kind
 from jaxlidar.instrument.lidar import Lidar
+from jaxlidar.instrument.survey import Survey
 from jaxlidar.planning.effects import find_empty_materials
 from jaxlidar.planning.path_lengths import PathLengths
 from jaxlidar.planning.plan import Plan, plan
@@ -23,11 +24,13 @@ from jaxlidar.planning.size_buckets import size_bucket
 from jaxlidar.scenes.scene import Scene, check_kinds
 
 
-def union_plan(lidar: Lidar, scenes: Sequence[Scene], plans: Sequence[Plan]) -> Plan:
+def union_plan(
+    lidar: Lidar, scenes: Sequence[Scene], plans: Sequence[Plan], survey: Survey | None = None
+) -> Plan:
     """Return the first plan with fine time bins and loops that are long enough for the scenes of all plans.
 
     The plans share the width of their bins, the number of orders and the samples. Scatterer channels are
-    those of the first.
+    those of the first. With a `survey` the plans are those of all its shots.
     """
     first = plans[0]
     # All plans share the bin width, so that the union of their bins is a whole number of bins.
@@ -41,7 +44,7 @@ def union_plan(lidar: Lidar, scenes: Sequence[Scene], plans: Sequence[Plan]) -> 
     )
     start_distance = max(p.limits.start_distance for p in plans)
     max_path = max(p.limits.max_path for p in plans)
-    path_lengths = [PathLengths(lidar, s) for s in scenes]
+    path_lengths = [PathLengths(lidar, s, survey) for s in scenes]
     # Rays start above the scene: the distance down to it is part of the path.
     longest = max_path + start_distance
     united = first.with_limits(

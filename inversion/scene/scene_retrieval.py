@@ -1,0 +1,184 @@
+"""`SceneRetrieval`: the result of a fit of many records of one scene."""
+
+import os
+from collections.abc import Mapping, Sequence
+from typing import Any, final
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from inversion.fit.fit_summary import short_text
+from inversion.fit.unknowns import BoundUnknown, bounds_by_name, split_by_name
+from jaxlidar import Scene
+from jaxlidar.io import save
+from jaxlidar.io.datasets import datasets_of, variables_by_item
+
+# Distance from a bound, over the width of the bounds, at which a value counts as at it.
+_AT_BOUND = 1e-6
+# Values of an unknown beyond which a summary shows quantiles.
+_FEW_VALUES = 8
+
+
+@final
+class SceneRetrieval(eqx.Module):
+    """The result of `retrieve_scene`: values of all unknowns, their errors, and the fitted scene.
+
+    Unknowns are in their natural units, keyed by name; "gain" and "offset" are those of groups of shots.
+    `print(fit)` shows a summary.
+
+    - `values`: best values, in the shapes of the unknowns.
+    - `stderr`: one standard error each, from the draws; NaN without draws. An unknown that neither data nor
+      priors determine has that of a uniform distribution within its bounds.
+    - `draws`: (draws, ...) draws of the error. The standard deviation of a sum, or of another linear function
+      of values, is that of the same function of the draws, about zero: see `stderr_of`.
+    - `at_bound`: True for values at one of their bounds.
+    - `averaging`: (places, ...) rows of the averaging kernel, d estimate at the place / d truth in each value
+      of the unknown. `places`: (places, axes) their indices. Empty where none were asked for.
+    - `bounds`: (2, ...) lower and upper bounds.
+    - `scene`: the fitted scene.
+    - `time`: (samples,) ns. `wavelength`: (wavelengths,) nm.
+    - `fitted`: (shots, wavelengths, samples) fitted records, with gain and offset.
+    - `residuals`: (shots, wavelengths, samples) observed minus fitted, over the noise; zero for samples that
+      were left out.
+    - `held_out`: (shots,) True for shots that were not fitted.
+    - `misfit`: chi-squared of the fitted shots over their number of samples. `held_out_misfit`: that of the
+      shots held out, the fair one of the two: it is above one where the model or the scene is wrong.
+    - `history`: (steps, 3) misfit, held-out misfit and objective after each step.
+    - `converged`: True if the fit ended by its stopping rule. `status`: a sentence on its end.
+
+    **Example:** standard error of a mean.
+
+    >>> import jax, jaxlidar as jl, inversion
+    >>> survey = jl.Survey.grid(jl.Lidar(), (0, 0), (20, 20), 10.0)
+    >>> waves = jl.simulate_many(survey, jl.Scene(ground=jl.Ground(height=0.5)), key=jax.random.key(0))
+    >>> height = inversion.Unknown("ground.height", bounds=(-2.0, 2.0), name="height")
+    >>> start = jl.Scene(ground=jl.Ground())
+    >>> fit = inversion.retrieve_scene(waves, survey, start, [height], noise=0.01, key=jax.random.key(1))
+    >>> fit.stderr_of("height", lambda height: height).shape, fit.converged
+    ((), True)
+    """
+
+    values: dict[str, Float[Array, "..."]]
+    stderr: dict[str, Float[Array, "..."]]
+    draws: dict[str, Float[Array, "draws ..."]]
+    at_bound: dict[str, Bool[Array, "..."]]
+    averaging: dict[str, Float[Array, "places ..."]]
+    places: dict[str, Int[Array, "places axes"]]
+    bounds: dict[str, Float[Array, "2 ..."]]
+    scene: Scene
+    time: Float[Array, " samples"]
+    wavelength: Float[Array, " wavelengths"]
+    fitted: Float[Array, "shots wavelengths samples"]
+    residuals: Float[Array, "shots wavelengths samples"]
+    held_out: Bool[Array, " shots"]
+    misfit: Float[Array, ""]
+    held_out_misfit: Float[Array, ""]
+    history: Float[Array, "steps 3"]
+    converged: bool = eqx.field(static=True)
+    status: str = eqx.field(static=True)
+
+    def stderr_of(self, name: str, function: Any) -> Float[np.ndarray, "..."]:
+        """Return one standard error of a linear function of an unknown, such as a sum or a profile.
+
+        **Arguments:** `name`: of the unknown. `function`: a linear function of its values, an array.
+
+        **Returns:** an array of the shape of the function's result; NaN without draws.
+        """
+        if name not in self.draws:
+            raise ValueError(f"name = {name!r}; admissible are {', '.join(map(repr, self.draws))}")
+        results = [np.asarray(function(draw)) for draw in np.asarray(self.draws[name])]
+        if not results:
+            return np.full(np.shape(function(np.asarray(self.values[name]))), np.nan)
+        return np.asarray(np.sqrt(np.mean(np.square(results), axis=0)))
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the result as a netCDF file, which `jaxlidar.open` reads.
+
+        **Arguments:** `path`: the file to write.
+
+        **Raises:** what `jaxlidar.io.save` raises.
+        """
+        save(self, path)
+
+    def to_xarray(self) -> Any:
+        """The unknowns and the records as an `xarray.Dataset`.
+
+        **Returns:** an `xarray.Dataset` with a variable for each unknown, over dimensions of its own, "...
+        stderr" and "... at bound", and `fitted`, `residuals` and `held_out` over shots.
+
+        **Raises:** ImportError where xarray is not installed.
+        """
+        import xarray
+
+        stored = datasets_of(self)["/"]
+        columns: dict[str, Any] = {}
+        for field in ("values", "stderr", "at_bound"):
+            suffix = "" if field == "values" else f" {field.replace('_', ' ')}"
+            for name, variable in variables_by_item(stored, field).items():
+                axes = {axis: f"{name} {i}" for i, axis in enumerate(stored[variable].dims)}
+                columns[f"{name}{suffix}"] = stored[variable].rename(axes)
+        for name in ("fitted", "residuals", "held_out"):
+            columns[name] = stored[name]
+        return xarray.Dataset(columns)
+
+    def __str__(self) -> str:
+        width = max(map(len, self.values))
+        rows = []
+        for name, value in self.values.items():
+            label, error = name.ljust(width), np.asarray(self.stderr[name])
+            if value.size <= _FEW_VALUES:
+                rows.append(f"{label}  {short_text(value)} +- {short_text(error)}")
+                continue
+            low, middle, high = np.quantile(np.asarray(value), (0.05, 0.5, 0.95))
+            shape = " x ".join(map(str, value.shape))
+            rows.append(
+                f"{label}  {shape} values: mean {float(value.mean()):.4g}, quantiles (5, 50, 95 %) "
+                f"{low:.4g}, {middle:.4g}, {high:.4g}; median standard error {float(np.median(error)):.2g}; "
+                f"{float(np.mean(np.asarray(self.at_bound[name]))):.0%} at a bound"
+            )
+        shots, held_out = self.held_out.size, int(np.sum(np.asarray(self.held_out)))
+        misfits = f"misfit {float(self.misfit):.3g} over {shots - held_out} shots"
+        if held_out:
+            misfits += f", {float(self.held_out_misfit):.3g} over {held_out} held out"
+        return "\n".join([*rows, f"{misfits}; {self.status}"])
+
+
+def make_scene_retrieval(
+    *,
+    unknowns: Sequence[BoundUnknown],
+    values: Float[np.ndarray, " n"],
+    draws: Float[np.ndarray, "draws n"],
+    kernels: Mapping[str, np.ndarray],
+    kernel_places: Mapping[str, np.ndarray],
+    scene: Scene,
+    **quantities: Any,
+) -> SceneRetrieval:
+    """Return the result, with flattened quantities split by name of unknown."""
+    bounds = bounds_by_name(unknowns)
+    by_name = split_by_name(values, unknowns)
+    stderr = np.sqrt(np.mean(draws**2, axis=0)) if len(draws) else np.full(values.size, np.nan)
+    at_bound = {}
+    for name, value in by_name.items():
+        low, high = bounds[name]
+        margin = _AT_BOUND * (high - low)
+        at_bound[name] = (value <= low + margin) | (value >= high - margin)
+    static = {name: quantities.pop(name) for name in ("converged", "status")}
+    arrays = {
+        "values": by_name,
+        "stderr": split_by_name(stderr, unknowns),
+        "draws": split_by_name(draws, unknowns),
+        "at_bound": at_bound,
+        "averaging": dict(kernels),
+        "places": dict(kernel_places),
+        "bounds": bounds,
+        **quantities,
+    }
+    return SceneRetrieval(**{n: _as_jax(a) for n, a in arrays.items()}, scene=scene, **static)
+
+
+def _as_jax(quantity: Any) -> Any:
+    if isinstance(quantity, dict):
+        return {name: jnp.asarray(a) for name, a in quantity.items()}
+    return jnp.asarray(quantity)

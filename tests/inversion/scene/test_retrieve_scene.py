@@ -1,0 +1,380 @@
+"""Retrieval of one scene from many records: Jacobians, priors, stopping, errors, checkpoints."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import inversion
+import jaxlidar as jl
+from inversion.fit.unknowns import bind_unknowns, flat_start
+from inversion.scene.map_priors import MapPriors
+from inversion.scene.retrieval import _plan_for_survey, _shot_groups, no_longer_falls
+from inversion.scene.survey_model import SurveyModel
+
+LIDAR = jl.Lidar(wavelength=1064.0, altitude=1000.0, divergence=4.0, pulse=jl.GaussianPulse(4.0))
+# G of spherical leaf angles.
+G = 0.5
+
+
+def stand(lad):
+    voxels = jl.VoxelMap.from_lad(lad, voxel_size=1.0)
+    return jl.Scene(
+        canopy=jl.Canopy(voxels, leaf=jl.LeafOptics(0.45, 0.4)), ground=jl.Ground(reflectance=0.3)
+    )
+
+
+def crowns():
+    lad = np.zeros((10, 10, 10))
+    lad[2:5, 2:6, 3:9], lad[6:9, 5:9, 2:6] = 0.5, 0.4
+    return lad
+
+
+def with_noise(waves, seed=0, fraction=0.02):
+    noise = fraction * float(waves.reflectance.max())
+    random = np.random.default_rng(seed)
+    return waves.reflectance + noise * random.normal(size=waves.reflectance.shape), noise
+
+
+@pytest.fixture(scope="module")
+def small_stand():
+    """Retrieve a stand of 1000 voxels from 16 footprints."""
+    survey = jl.Survey.grid(LIDAR, (2.0, 2.0), (8.0, 8.0), 2.0)
+    with pytest.warns(jl.OffMapWarning):
+        waves = jl.simulate_many(survey, stand(crowns()), key=jax.random.key(0), max_orders=1)
+    observed, noise = with_noise(waves)
+    prior = inversion.MarkovField(0.1)
+    start = np.full((10, 10, 10), 0.05)
+    unknown = inversion.Unknown(
+        "canopy.voxels.leaf", bounds=(0.0, 1.0), name="leaf", start=start, prior=prior
+    )
+    steps = []
+    fit = inversion.retrieve_scene(
+        observed,
+        survey,
+        stand(crowns()),
+        [unknown],
+        noise=noise,
+        time=waves.time,
+        key=jax.random.key(1),
+        max_orders=1,
+        draws=4,
+        kernels={"leaf": [(3, 3, 7)]},
+        progress=steps.append,
+    )
+    return fit, steps
+
+
+# -- a stand -----------------------------------------------------------------------------------------------
+
+
+def test_a_small_stand_has_its_leaf_area_and_profile(small_stand):
+    fit, _ = small_stand
+    lad, truth = np.asarray(fit.values["leaf"]) / G, crowns()
+    assert abs(lad.sum() / truth.sum() - 1.0) < 0.06
+    assert np.corrcoef(lad.sum(axis=(0, 1)), truth.sum(axis=(0, 1)))[0, 1] > 0.95
+    # The start, which has as much leaf area in every layer, would not pass.
+    assert np.corrcoef(lad.ravel(), truth.ravel())[0, 1] > 0.7
+    assert fit.converged
+    assert float(fit.misfit) < 1.15
+
+
+def test_the_fit_ends_at_the_least_held_out_misfit(small_stand):
+    fit, steps = small_stand
+    history = np.asarray(fit.history)
+    assert float(fit.held_out_misfit) == pytest.approx(history[:, 1].min(), rel=1e-4)
+    assert int(np.sum(np.asarray(fit.held_out))) == 2
+    assert [s.stage for s in steps].count("fit") == len(history)
+    assert str(steps[0]).startswith("fit 1: misfit ")
+
+
+def test_total_leaf_area_is_better_determined_than_voxels(small_stand):
+    fit, _ = small_stand
+    error_of_total = float(fit.stderr_of("leaf", np.sum)) / float(fit.values["leaf"].sum())
+    error_of_voxel = float(np.median(np.asarray(fit.stderr["leaf"]))) / float(fit.values["leaf"].mean())
+    assert 0.0 < error_of_total < 0.2
+    assert error_of_voxel > 0.5
+    # The kernel spreads over the footprint, and lies about its own height.
+    kernel = np.asarray(fit.averaging["leaf"][0])
+    assert 0.5 < kernel.sum() < 1.5
+    assert abs(kernel.sum(axis=(0, 1)).argmax() - 7) <= 1
+
+
+def test_a_result_is_printed_on_a_screen_and_stored(small_stand, tmp_path):
+    fit, _ = small_stand
+    assert len(str(fit).splitlines()) < 20
+    fit.save(tmp_path / "fit.nc")
+    stored = jl.open(tmp_path / "fit.nc")
+    assert stored.status == fit.status
+    np.testing.assert_array_equal(stored.draws["leaf"], fit.draws["leaf"])
+    dataset = fit.to_xarray()
+    assert dataset["leaf"].shape == (10, 10, 10)
+    assert dataset["leaf stderr"].dims == dataset["leaf"].dims
+
+
+# -- products with the Jacobian ----------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def model():
+    """Return a model of narrow oblique shots with windows, gains and offsets, over a map with gaps."""
+    lad = np.zeros((12, 12, 4))
+    lad[::2, :, 1:3] = 0.4
+    scene = stand(lad)
+    random = np.random.default_rng(0)
+    lidar = jl.Lidar(altitude=1000.0, divergence=0.5, pulse=jl.GaussianPulse(4.0))
+    angles = {"zenith": random.uniform(0, 10, 24), "azimuth": random.uniform(0, 360, 24)}
+    survey = jl.Survey(lidar, random.uniform(1.0, 11.0, (24, 2)), **angles)
+    unknown = inversion.Unknown("canopy.voxels.leaf", bounds=(0.0, 1.0), start=jnp.asarray(0.5 * lad))
+    bound = bind_unknowns([unknown], scene, of_maps=True)
+    # The empty voxels stay empty: starts of fits keep off the bounds.
+    bound = [bound[0]._replace(start=jnp.asarray(0.5 * lad))]
+    groups = _shot_groups((0.5, 2.0), (-0.1, 0.1), np.arange(24) // 8, 24, bound)
+    time = np.arange(-40.0, 10.0)
+    plan = _plan_for_survey(survey, scene, bound, time, max_orders=1, n_rays=8, n_photons=None)
+    observed = random.uniform(0.0, 0.02, (24, 1, time.size))
+    weight = random.uniform(10.0, 30.0, observed.shape)
+    return SurveyModel(survey, scene, plan, bound, groups, observed, weight, jax.random.key(3)), observed
+
+
+def perturbation(model, seed=1):
+    """Return a change of all unknowns that leaves extinction non-negative."""
+    random = np.random.default_rng(seed)
+    change = random.uniform(0.0, 1.0, sum(model.sizes))
+    change[-6:] = random.normal(size=6)
+    return change
+
+
+@pytest.mark.slow
+def test_chunks_have_windows_and_give_the_waveforms_of_the_complete_map(model):
+    model, _ = model
+    assert model.inputs.window_shape is not None
+    x = flat_start(model.all_unknowns)
+    with_windows = model.gradient(x)
+    inputs = model.inputs
+    model.inputs = dataclasses.replace(inputs, window_shape=None)
+    try:
+        complete = model.gradient(x)
+    finally:
+        model.inputs = inputs
+    np.testing.assert_allclose(with_windows.records, complete.records, atol=1e-7)
+    np.testing.assert_allclose(with_windows.gradient, complete.gradient, rtol=1e-3, atol=1e-3)
+    # Records of other shots differ by far more than the tolerance.
+    assert np.ptp(complete.records, axis=0).max() > 1e-4
+
+
+def test_gradients_are_those_of_finite_differences(model):
+    model, observed = model
+    x, change, step = flat_start(model.all_unknowns), perturbation(model), 2e-3
+
+    def half_chi_squared(x):
+        return 0.5 * np.sum(((model.gradient(x).records - observed) * model.weight) ** 2)
+
+    # One-sided, as empty voxels have no negative extinction: second order in the step.
+    f0, f1, f2 = (half_chi_squared(x + k * step * change) for k in range(3))
+    expected = (4.0 * f1 - 3.0 * f0 - f2) / (2.0 * step)
+    assert model.gradient(x).gradient @ change == pytest.approx(expected, rel=2e-3)
+    empty = np.append(x[:-6] == 0.0, np.zeros(6, bool))
+    assert abs(model.gradient(x).gradient[empty] @ change[empty]) > 0.01 * abs(expected)
+
+
+@pytest.mark.slow
+def test_gauss_newton_products_are_those_of_finite_differences(model):
+    model, _ = model
+    x, v, step = flat_start(model.all_unknowns), perturbation(model), 2e-3
+    m0, m1, m2 = (model.gradient(x + k * step * v).records for k in range(3))
+    pushed = (4.0 * m1 - 3.0 * m0 - m2) / (2.0 * step)
+    expected = np.sum((pushed * model.weight) ** 2)
+    assert v @ model.gauss_newton_product(x, v) == pytest.approx(expected, rel=5e-3)
+    # J^T c for another vector than the residuals.
+    c = np.random.default_rng(2).normal(size=pushed.shape)
+    assert v @ model.pull_back(x, c) == pytest.approx(np.sum(c * pushed), rel=0.02, abs=0.02)
+
+
+# -- priors ------------------------------------------------------------------------------------------------
+
+
+def test_priors_have_the_gradients_and_products_of_their_residuals():
+    scene = jl.Scene(
+        canopy=jl.Canopy(
+            jl.VoxelMap.from_lad(np.ones((3, 4, 2)), voxel_size=1.0), leaf=jl.LeafOptics(0.4, 0.4)
+        ),
+        ground=jl.Ground(),
+    )
+    field = inversion.MarkovField((0.2, np.inf, 0.4), mean=0.3)
+    unknowns = bind_unknowns(
+        [
+            inversion.Unknown("canopy.voxels.leaf", bounds=(0.0, 2.0), prior=field),
+            inversion.Unknown("ground.reflectance", bounds=(0.0, 1.0), prior=inversion.LogNormal(0.3, 0.5)),
+            inversion.Unknown("ground.height", bounds=(-1.0, 1.0), prior=(0.1, 0.2)),
+        ],
+        scene,
+        of_maps=True,
+    )
+    priors, random = MapPriors(unknowns), np.random.default_rng(0)
+    x, v = random.uniform(0.1, 0.9, 26), random.normal(size=26)
+
+    def cost(x):
+        k = x[:24].reshape(3, 4, 2)
+        differences = np.sum(np.diff(k, axis=0) ** 2) / 0.2**2 + np.sum(np.diff(k, axis=2) ** 2) / 0.4**2
+        others = (np.log(x[24] / 0.3) / 0.5) ** 2 + ((x[25] - 0.1) / 0.2) ** 2
+        return 0.5 * (differences + others) + np.sum(k) / 0.3
+
+    value, gradient = priors.cost_and_gradient(x)
+    assert value == pytest.approx(cost(x), rel=1e-5)
+    assert gradient @ v == pytest.approx((cost(x + 1e-5 * v) - cost(x - 1e-5 * v)) / 2e-5, rel=1e-5)
+    # The diagonal and the products are those of one matrix, which is symmetric.
+    matrix = np.stack([priors.pull_back(x, priors.push_forward(x, e)) for e in np.eye(26)])
+    np.testing.assert_allclose(matrix, matrix.T, atol=1e-12)
+    np.testing.assert_allclose(priors.diagonal(x), np.diag(matrix), rtol=1e-10)
+
+
+def test_markov_fields_and_smooth_priors_are_refused_where_they_do_not_serve():
+    scene = stand(crowns())
+    field = inversion.Unknown("canopy.voxels.leaf", bounds=(0.0, 1.0), prior=inversion.MarkovField(0.1))
+    with pytest.raises(ValueError, match="prior is a MarkovField; admissible here is a Smooth"):
+        bind_unknowns([field], scene)
+    smooth = inversion.Unknown("ground.height", bounds=(0, 1), prior=inversion.Smooth(2.0))
+    with pytest.raises(ValueError, match="prior is a Smooth; admissible here is a MarkovField"):
+        bind_unknowns([smooth], scene, of_maps=True)
+    prior = inversion.MarkovField((0.1, 0.2))
+    unknown = inversion.Unknown("canopy.voxels.leaf", bounds=(0.0, 1.0), prior=prior)
+    with pytest.raises(ValueError, match="difference has 2 values; admissible is one, or one for each"):
+        bind_unknowns([unknown], scene, of_maps=True)
+    with pytest.raises(ValueError, match="difference"):
+        inversion.MarkovField(0.0)
+
+
+# -- stopping, groups, errors and checkpoints, without a canopy --------------------------------------------
+
+
+def test_the_stopping_rule_waits_for_ten_steps_without_a_gain():
+    falling = np.geomspace(10.0, 1.0, 30)
+    assert not no_longer_falls(falling)
+    assert not no_longer_falls(np.append(falling, np.ones(9)))
+    assert no_longer_falls(np.append(falling, np.ones(10)))
+
+
+def flat_case(height=0.3, gains=(1.0, 1.2, 0.8)):
+    """Return a survey over a plane, and its records in three groups."""
+    survey = jl.Survey.grid(jl.Lidar(), (0, 0), (30, 20), 10.0)
+    waves = jl.simulate_many(
+        survey,
+        jl.Scene(ground=jl.Ground(height=height, reflectance=0.4)),
+        key=jax.random.key(0),
+        max_orders=1,
+    )
+    groups = np.arange(len(survey)) % 3
+    records = waves.reflectance * np.array(gains)[groups][:, None, None] + 0.001
+    return survey, waves, records, groups
+
+
+HEIGHT = inversion.Unknown("ground.height", bounds=(-2.0, 2.0), name="height")
+START = jl.Scene(ground=jl.Ground(reflectance=0.4))
+KEY = jax.random.key(1)
+
+
+def test_gains_and_offsets_of_groups_are_fitted_with_the_scene():
+    survey, waves, records, groups = flat_case()
+    shared = {"noise": 1e-4, "time": waves.time, "key": KEY, "max_orders": 1, "draws": 0}
+    shots = {"gain": (0.3, 3.0), "offset": (-0.01, 0.01), "groups": groups}
+    fit = inversion.retrieve_scene(records, survey, START, [HEIGHT], **shared, **shots)
+    np.testing.assert_allclose(fit.values["gain"], [1.0, 1.2, 0.8], rtol=2e-3)
+    np.testing.assert_allclose(fit.values["offset"], 0.001, atol=1e-4)
+    assert float(fit.values["height"]) == pytest.approx(0.3, abs=2e-3)
+    assert np.all(np.isnan(fit.stderr["height"]))
+    # Held-out shots have gains of their own here: they get the best for their records.
+    each = inversion.retrieve_scene(
+        records, survey, START, [HEIGHT], **shared, gain=(0.3, 3.0), offset=(0, 0.1)
+    )
+    assert float(each.held_out_misfit) < 2.0
+
+
+def test_standard_errors_are_those_of_the_inverse_of_the_matrix():
+    survey, waves, _, _ = flat_case()
+    observed, noise = with_noise(waves)
+    brightness = inversion.Unknown("ground.reflectance", bounds=(0.1, 0.9), name="brightness")
+    fit = inversion.retrieve_scene(
+        observed,
+        survey,
+        START,
+        [HEIGHT, brightness],
+        noise=noise,
+        time=waves.time,
+        key=KEY,
+        max_orders=1,
+        draws=64,
+        held_out=0.0,
+    )
+    # An independent matrix, by finite differences of simulations.
+    h, r = (float(fit.values[name]) for name in ("height", "brightness"))
+    window = {"window": (float(waves.time[0]), float(waves.time[-1]))}
+
+    def record(height, reflectance):
+        scene = jl.Scene(ground=jl.Ground(height=height, reflectance=reflectance))
+        return np.asarray(jl.simulate(jl.Lidar(), scene, key=KEY, max_orders=1, **window).reflectance)
+
+    by_height = (record(h + 0.01, r) - record(h - 0.01, r)) / 0.02
+    by_reflectance = (record(h, r + 0.01) - record(h, r - 0.01)) / 0.02
+    columns = np.stack([by_height.ravel(), by_reflectance.ravel()]) / noise
+    expected = np.sqrt(np.diag(np.linalg.inv(len(survey) * columns @ columns.T)))
+    for name, error in zip(("height", "brightness"), expected):
+        # Of 64 draws: chi-squared with 64 degrees of freedom, three standard deviations are 27 %.
+        assert float(fit.stderr[name]) == pytest.approx(error, rel=0.27)
+    truth = {"height": 0.3, "brightness": 0.4}
+    assert all(abs(float(fit.values[n]) - truth[n]) < 4.0 * float(fit.stderr[n]) for n in truth)
+
+
+def test_an_interrupted_run_goes_on_and_another_problem_is_refused(tmp_path):
+    survey, waves, _, groups = flat_case()
+    path = tmp_path / "fit.sqlite"
+    shared = {"noise": 1e-3, "time": waves.time, "max_orders": 1, "draws": 3, "held_out": 0.0}
+    shared |= {"gain": (0.3, 3.0), "groups": groups}
+    records = np.asarray(waves.reflectance)
+
+    def interrupt(step):
+        if step.stage == "errors" and step.number == 2:
+            raise KeyboardInterrupt
+
+    def run(key=KEY, **more):
+        return inversion.retrieve_scene(
+            records, survey, START, [HEIGHT], key=key, path=path, **shared, **more
+        )
+
+    with pytest.raises(KeyboardInterrupt):
+        run(progress=interrupt)
+    steps = []
+    resumed = run(progress=steps.append)
+    # The fit and two draws were done.
+    assert [(s.stage, s.number) for s in steps] == [("errors", 3)]
+    uninterrupted = inversion.retrieve_scene(records, survey, START, [HEIGHT], key=KEY, **shared)
+    np.testing.assert_allclose(resumed.draws["height"], uninterrupted.draws["height"], rtol=1e-6)
+    with pytest.raises(ValueError, match="another problem, which differs in key"):
+        run(key=jax.random.key(7))
+
+
+def test_bad_arguments_are_refused_by_name():
+    survey, waves, records, _ = flat_case()
+
+    def run(observed=records, **changes):
+        arguments = {"noise": 1e-3, "time": waves.time, "key": KEY, "max_orders": 1} | changes
+        return inversion.retrieve_scene(observed, survey, START, [HEIGHT], **arguments)
+
+    cases = [
+        ({"observed": records[:3]}, r"waveforms has the shape \(3, 1, "),
+        ({"noise": 0.0}, r"noise = 0 is outside the admissible range \(0, inf\]"),
+        ({"noise": np.inf}, "noise is infinite throughout"),
+        ({"time": None}, "time = None, but waveforms is an array"),
+        ({"held_out": 1.0}, "held_out = 1"),
+        ({"gain": (2.0, 1.0)}, r"gain = \(2.0, 1.0\) is not low < high"),
+        ({"gain": (-1.0, 1.0)}, "gain"),
+        ({"groups": [0.5] * 12}, "groups has values that are no whole numbers"),
+        ({"kernels": {"depth": [()]}}, "kernels has 'depth'; admissible are 'height'"),
+    ]
+    for changes, message in cases:
+        with pytest.raises(ValueError, match=message):
+            run(**changes)
+    with pytest.raises(ValueError, match="time is given with Waveforms"):
+        run(observed=waves)
