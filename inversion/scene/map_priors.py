@@ -30,6 +30,7 @@ class MapPriors:
     def cost_and_gradient(self, x: Float[np.ndarray, " n"]) -> tuple[float, Float[np.ndarray, " n"]]:
         """Return -ln of the prior density up to a constant, and its gradient."""
         residual = self.residuals(x)
+        # The exponential prior is linear in x, and has no residual.
         cost = 0.5 * sum(float(np.sum(r**2)) for r in residual) + float(self.rate @ x)
         return cost, self.pull_back(x, residual) + self.rate
 
@@ -75,6 +76,7 @@ class MapPriors:
             total = np.zeros(value.shape)
             if u.prior is not None:
                 total += 1.0 / _spread(u, value) ** 2
+            # A value is in the difference to each of its neighbours: one at an end, two between.
             for axis, size in _differences(u):
                 along = np.moveaxis(total, axis, 0)
                 along[1:] += 1.0 / size**2

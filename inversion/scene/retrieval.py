@@ -219,6 +219,7 @@ def retrieve_scene(
     shot_groups = _shot_groups(gain, offset, groups, len(survey), bound)
     places = _kernel_places({} if kernels is None else kernels, bound)
     sizes = {"max_orders": max_orders, "n_rays": n_rays, "n_photons": n_photons}
+    # Everything that the result depends on: a checkpoint of another problem is refused.
     parts = {
         "waveforms": records.observed,
         "noise": records.sigma,
@@ -238,9 +239,11 @@ def retrieve_scene(
         plan = _plan_for_survey(survey, scene, bound, records.time, **sizes)
     elif any(value is not None for value in sizes.values()):
         raise ValueError("plan is given together with max_orders, n_rays or n_photons; admissible is either")
+    # The host draws shots to hold out and signs; their numbers must not be those of the light.
     trace_key, host_key = jax.random.split(key)
     random = np.random.default_rng(np.asarray(jax.random.key_data(host_key)).ravel())
     is_held_out = _choose_held_out(len(survey), float(held_out), random)
+    # Infinite noise leaves a sample out, and a weight of zero leaves out a shot, with no second code path.
     weight = np.where(np.isfinite(records.sigma), 1.0 / records.sigma, 0.0)
     fitted_weight = np.where(is_held_out[:, None, None], 0.0, weight)
     model = SurveyModel(survey, scene, plan, bound, shot_groups, records.observed, fitted_weight, trace_key)
@@ -274,7 +277,7 @@ def retrieve_scene(
 # -- arguments ---------------------------------------------------------------------------------------------
 
 
-class _Records(NamedTuple):
+class _CheckedRecords(NamedTuple):
     """Records and their noise, (shots, wavelengths, samples) each, and the (samples,) times, ns."""
 
     observed: np.ndarray
@@ -288,7 +291,7 @@ def _with_fixed_window(survey: Survey) -> Survey:
     return survey if lidar is survey.lidar else dataclasses.replace(survey, lidar=lidar)
 
 
-def _observed_records(waveforms: Any, time: Any, noise: Any, survey: Survey) -> _Records:
+def _observed_records(waveforms: Any, time: Any, noise: Any, survey: Survey) -> _CheckedRecords:
     """Check records, their times and their noise. **Raises:** as `retrieve_scene`."""
     if isinstance(waveforms, Waveforms):
         if time is not None:
@@ -312,13 +315,14 @@ def _observed_records(waveforms: Any, time: Any, noise: Any, survey: Survey) -> 
         raise ValueError("noise is infinite throughout, which leaves no sample to fit")
     check_range("waveforms", observed[is_used])
     # Samples that are left out may be NaN, which a weight of zero would not remove.
-    return _Records(np.where(is_used, observed, 0.0), sigma, times)
+    return _CheckedRecords(np.where(is_used, observed, 0.0), sigma, times)
 
 
 def _shot_groups(
     gain: Any, offset: Any, groups: Any, shots: int, unknowns: Sequence[BoundUnknown]
 ) -> ShotGroups:
     """Return the gains and offsets of groups of shots. **Raises:** as `retrieve_scene`."""
+    # Without groups each shot is one of its own.
     numbers = np.arange(shots) if groups is None else as_numpy(groups, "groups")
     if numbers.shape != (shots,):
         raise ValueError(f"groups has the shape {numbers.shape}; admissible is (shots,) = ({shots},)")
@@ -339,6 +343,7 @@ def _shot_groups(
             raise ValueError(f"{name} = {bounds!r} is not low < high")
         if name in [u.name for u in unknowns]:
             raise ValueError(f"name = {name!r} is given to an unknown; with {name} = ... it is that of shots")
+        # No gain and no offset is the natural start, where the bounds admit it.
         values = np.full(n_groups, float(np.clip(start, low, high)))
         bound = BoundUnknown(
             name,
@@ -375,6 +380,7 @@ def _kernel_places(
 def _choose_held_out(shots: int, fraction: float, random: np.random.Generator) -> Bool[np.ndarray, " shots"]:
     """Choose the shots that are not fitted: one at least, if any, and never all."""
     is_held_out = np.zeros(shots, bool)
+    # Fractions of few shots round to none or all of them.
     count = min(max(round(fraction * shots), 1), shots - 1) if fraction > 0 else 0
     is_held_out[random.permutation(shots)[:count]] = True
     return is_held_out
@@ -411,6 +417,7 @@ def _plan_for_survey(
         "describe": False,
         "effects": effects,
     }
+    # The other corners take bins and orders of the first: plans can be united only where these are equal.
     first = make_plan(survey, scenes[0], max_orders=max_orders, **options)
     options |= {
         "max_orders": first.orders,
@@ -433,6 +440,7 @@ def _rays(survey: Survey, scene: Scene) -> int:
     if scene.canopy is None:
         return _RAYS[1]
     edge = float(np.min(np.asarray(scene.canopy.voxels.voxel_size)[:2]))
+    # Rays are spread over the footprint by a lattice: one for each column meets every voxel of the map.
     columns = (1.0 + 2.0 * float(np.max(survey.footprint_radius)) / edge) ** 2
     return int(np.clip(2 ** np.ceil(np.log2(columns)), *_RAYS))
 
@@ -473,6 +481,7 @@ class _Problem:
             for u in model.all_unknowns
         ]
         self.low = np.minimum(np.maximum(self.low, np.concatenate(medians_low)), self.high)
+        # That of a uniform distribution between the bounds: H is then regular whatever the data determine.
         self.bounds_precision = 12.0 / (self.high - self.low) ** 2
 
     def evaluate(self, x: Float[np.ndarray, " n"]) -> _Evaluation:
@@ -481,6 +490,7 @@ class _Problem:
         squares = ((pulled.records - self.observed) * self.model.weight) ** 2
         prior_cost, prior_gradient = self.priors.cost_and_gradient(x)
         objective = 0.5 * float(np.sum(squares)) + prior_cost
+        # Weights are zero for held-out shots, so that squares are those of fitted shots alone.
         n_fitted = max(int(np.sum(self.model.weight > 0)), 1)
         return _Evaluation(
             np.array(x),
@@ -497,6 +507,7 @@ class _Problem:
             return float("nan")
         w, y = self.weight[self.is_held_out], self.observed[self.is_held_out]
         records = pulled.records[self.is_held_out]
+        # The gain of a group whose shots are all held out is not fitted, and says nothing of the scene.
         groups = self.model.groups
         if groups.unknowns:
             records = _best_gains(pulled.waveforms[self.is_held_out], y, w, groups)
@@ -507,6 +518,7 @@ class _Problem:
 
         For signs e, (J^T e)_k^2 has the expectation (J^T J)_kk.
         """
+        # Exact for the priors; a few random signs do for the data, as the diagonal only scales the unknowns.
         diagonal = self.priors.diagonal(x) + self.bounds_precision
         for _ in range(_SCALE_DRAWS):
             signs = random.choice([-1.0, 1.0], size=self.model.weight.shape)
@@ -532,6 +544,7 @@ def _best_gains(
     waveforms: np.ndarray, observed: np.ndarray, weight: np.ndarray, groups: ShotGroups
 ) -> np.ndarray:
     """Return records with the gain and the offset that fit each record best, within their bounds."""
+    # Normal equations of a straight line y = s m + o for each record.
     w2 = weight**2
     total, ones = np.sum(w2, axis=(1, 2)), np.ones_like(waveforms)
     sums = {
@@ -543,6 +556,7 @@ def _best_gains(
             ("y", observed, ones),
         )
     }
+    # A record without weight has sums of zero, and its misfit is zero whatever its gain.
     tiny = 1e-300
     gain = np.ones(len(waveforms))
     if groups.gain is not None:
@@ -606,6 +620,7 @@ def _fit(
         x, best_x = stored["x"], stored["best_x"]
         history = [tuple(row) for row in stored["history"]]
         stopped, at_minimum = bool(stored["stopped"]), bool(stored["at_minimum"])
+    # Unregularised maps go on to fit noise after the scene is found. Held-out shots show when this begins.
     has_held_out = bool(np.any(problem.is_held_out))
     latest: _Evaluation | None = None
 
@@ -614,12 +629,14 @@ def _fit(
 
     def objective(scaled: np.ndarray) -> tuple[float, np.ndarray]:
         nonlocal latest
+        # Division and multiplication by the scale may leave the bounds by rounding.
         latest = problem.evaluate(np.clip(scaled * scale, problem.low, problem.high))
         return latest.objective, latest.gradient * scale
 
     def after_step(intermediate_result: Any) -> None:
         nonlocal best_x, stopped
         at = np.clip(intermediate_result.x * scale, problem.low, problem.high)
+        # The last point of a line search is usually the accepted one; another has to be evaluated again.
         if latest is None or not np.array_equal(latest.x, at):
             objective(intermediate_result.x)
         assert latest is not None
@@ -638,6 +655,7 @@ def _fit(
         )
         if progress is not None:
             progress(SceneStep("fit", len(history), latest.misfit, latest.held_out_misfit))
+        # SciPy ends the minimisation at this exception, and returns its result as usual.
         if stopped:
             raise StopIteration
 
@@ -649,8 +667,10 @@ def _fit(
             method="L-BFGS-B",
             bounds=np.stack([problem.low / scale, problem.high / scale], axis=1),
             callback=after_step,
+            # The stopping rule above ends the fit; the tolerance is for objectives without noise.
             options={"maxiter": max_steps - len(history), "maxcor": _MEMORY, "ftol": 1e-9, "maxfun": 10**9},
         )
+        # Status 1 is the limit of steps.
         at_minimum = not stopped and result.status != 1
         if history:
             # A run that goes on from here does not repeat the fit.
@@ -684,6 +704,7 @@ def no_longer_falls(values: Float[np.ndarray, " steps"]) -> bool:
     """Return True if the last steps have not brought values below the least one before by a fraction."""
     if len(values) <= _PATIENCE:
         return False
+    # A single step may rise by chance: the least of several counts.
     before, since = np.min(values[:-_PATIENCE]), np.min(values[-_PATIENCE:])
     return bool(since > before - _LEAST_GAIN * abs(before))
 
@@ -708,6 +729,7 @@ def _draws_of_error(
         # The numbers of a draw do not depend on where a run was interrupted.
         seed = jax.random.key_data(jax.random.fold_in(key, number))
         random = np.random.default_rng(np.asarray(seed).ravel())
+        # The right side has the covariance H, so that H^-1 of it has the posterior's covariance H^-1.
         weight = problem.model.weight
         of_data = problem.model.pull_back(end.x, random.normal(size=weight.shape) * weight)
         of_priors = [random.normal(size=r.shape) for r in problem.priors.residuals(end.x)]
@@ -740,6 +762,7 @@ def _averaging_kernels(
             if stored is None:
                 unit = np.zeros(end.x.size)
                 unit[flat] = 1.0
+                # A row of H^-1 J^T J: by symmetry, J^T J times a column of H^-1.
                 row = problem.model.gauss_newton_product(end.x, problem.solve(end, unit))
                 store.add(_FIRST_KERNEL + number, row=row)
             else:

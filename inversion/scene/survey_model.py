@@ -49,7 +49,7 @@ _CHUNK_FIRST_ORDER, _CHUNK_HIGHER_ORDERS = 128, 16
 _BEAM_RADII = 2.9
 
 
-class SimulationInputs(eqx.Module):
+class SurveyInputs(eqx.Module):
     """Inputs of a simulation of shots, except the values of the unknowns.
 
     - `lidar`: that of the survey's middle. - `window_shape`: voxels of a window along x and y; None: no
@@ -79,13 +79,15 @@ class ShotChunk(NamedTuple):
 
 
 def _waveforms(
-    inputs: SimulationInputs, values: Values, shots: ShotChunk
+    inputs: SurveyInputs, values: Values, shots: ShotChunk
 ) -> Float[Array, "shots wavelengths samples"]:
     """Simulate the shots of a chunk, one after the other."""
     scene = set_values(inputs.scene, inputs.setters, values)
+    # After the values are set: derivatives then go through the slice, and cotangents outside of it are zero.
     if inputs.window_shape is not None:
         scene = _windowed(scene, shots.window, inputs.window_shape)
     setup = make_setup(inputs.lidar, scene, inputs.plan)
+    # What does not depend on the shot is computed once for the chunk, outside of the loop over its shots.
     device_scene = build_device_scene(setup, derivatives="all")
 
     def waveform(shot: ShotGeometry) -> Float[Array, "wavelengths samples"]:
@@ -94,6 +96,7 @@ def _waveforms(
         response = trace_device_scene(scene_here, jax.random.fold_in(inputs.key, shot.number))
         return total_reflectance(response, setup_here)
 
+    # One after the other: a loop keeps the temporaries of one shot, where vmap would keep those of all.
     return lax.map(waveform, shots.geometry)
 
 
@@ -106,6 +109,7 @@ def _windowed(scene: Scene, window: Int[Array, "2"], shape: tuple[int, int]) -> 
     def cut(a: Array | None) -> Array | None:
         return None if a is None else lax.dynamic_slice(a, (window[0], window[1], 0), (*shape, nz))
 
+    # The window stays where it lies in the scene, so that shots keep their coordinates.
     origin = jnp.asarray(voxels.origin) + voxels.voxel_size * jnp.append(window, 0)
     return eqx.tree_at(
         lambda s: (s.canopy.voxels.leaf, s.canopy.voxels.bark, s.canopy.voxels.origin),
@@ -116,7 +120,7 @@ def _windowed(scene: Scene, window: Int[Array, "2"], shape: tuple[int, int]) -> 
 
 
 def _pull_back(
-    inputs: SimulationInputs,
+    inputs: SurveyInputs,
     values: Values,
     shots: ShotChunk,
     gain: Float[Array, " shots"],
@@ -131,12 +135,14 @@ def _pull_back(
     waveforms, pull = jax.vjp(lambda values: _waveforms(inputs, values, shots), values)
     per_shot = (..., None, None)
     residual = (gain[per_shot] * waveforms + offset[per_shot] - shots.observed) * shots.weight
+    # Chosen by a value and not by a Python condition: a second program would compile as long as the first.
     c = jnp.where(is_gradient > 0, residual * shots.weight, cotangent)
+    # The gain is not an argument of `pull`: its own product with c is summed by group, on the host.
     return waveforms, c, pull(gain[per_shot] * c)[0]
 
 
 def _gauss_newton_product(
-    inputs: SimulationInputs,
+    inputs: SurveyInputs,
     values: Values,
     shots: ShotChunk,
     gain: Float[Array, " shots"],
@@ -149,14 +155,17 @@ def _gauss_newton_product(
     def simulate(values: Values) -> Array:
         return _waveforms(inputs, values, shots)
 
+    # Two traces of one key: both see the same paths, so that J^T J is symmetric.
     pushed = jax.jvp(simulate, (values,), (tangents,))[1]
     waveforms, pull = jax.vjp(simulate, values)
     per_shot = (..., None, None)
+    # Product rule of s w + o.
     change = gain[per_shot] * pushed + gain_tangent[per_shot] * waveforms + offset_tangent[per_shot]
     c = change * shots.weight**2
     return waveforms, c, pull(gain[per_shot] * c)[0]
 
 
+# Threads run chunks side by side; a program that took all cores would wait for the others.
 _compiled_pull_back = eqx.filter_jit(_pull_back, **ONE_CORE)
 _compiled_product = eqx.filter_jit(_gauss_newton_product, **ONE_CORE)
 
@@ -217,17 +226,19 @@ class SurveyModel:
         # Within a program nothing is moved to the origin: coordinates are those of the scene.
         middle = survey.middle
         check_position(middle)
+        # Eight chunks at least, where there are shots enough: they keep all cores busy until the end.
         largest = _CHUNK_HIGHER_ORDERS if plan.orders > 1 else _CHUNK_FIRST_ORDER
         n_chunks = -(-len(survey) // min(largest, max(1, len(survey) // 8)))
         self.chunks = _chunks_of_neighbours(survey, n_chunks)
         windows, window_shape = _windows(survey, scene, plan, self.chunks)
         setters = tuple(u.setter for u in unknowns)
-        self.inputs = SimulationInputs(middle, scene, key, plan, setters, window_shape)
+        self.inputs = SurveyInputs(middle, scene, key, plan, setters, window_shape)
         # A chunk that is not full has copies of its last shot, with weights of zero.
         size = max(len(chunk) for chunk in self.chunks)
         self.rows = [np.concatenate([c, np.repeat(c[-1:], size - len(c))]) for c in self.chunks]
         self.shots = []
         for chunk, rows, window in zip(self.chunks, self.rows, windows):
+            # Random numbers follow from a shot's number in the survey, not from that in its chunk.
             geometry = shot_geometry(survey.subset(rows), 0, size)._replace(number=rows.astype(np.int32))
             is_copy = (np.arange(size) >= len(chunk))[:, None, None]
             self.shots.append(
@@ -238,6 +249,7 @@ class SurveyModel:
                     jnp.asarray(window, jnp.int32),
                 )
             )
+        # All chunks have this shape. It is an argument also where the program does not look at it.
         self.zero_cotangent = jnp.zeros_like(self.shots[0].observed)
 
     def split(self, flat: Float[np.ndarray, " n"]) -> tuple[Values, np.ndarray, np.ndarray]:
@@ -246,6 +258,7 @@ class SurveyModel:
         values = tuple(
             jnp.asarray(p.reshape(u.start.shape), u.start.dtype) for p, u in zip(pieces, self.unknowns)
         )
+        # Gains and offsets come last, if they are unknowns at all.
         of_groups = iter(pieces[len(self.unknowns) :])
         shots = len(self.groups.group)
         gain = np.ones(shots) if self.groups.gain is None else next(of_groups)[self.groups.group]
@@ -254,6 +267,7 @@ class SurveyModel:
 
     def split_tangent(self, flat: Float[np.ndarray, " n"]) -> tuple[Values, np.ndarray, np.ndarray]:
         """Return the same of a tangent: gains that are not unknown do not change."""
+        # `split` gives fixed gains their value 1, which as a tangent would be a change.
         values, gain, offset = self.split(flat)
         return values, np.zeros_like(gain) if self.groups.gain is None else gain, offset
 
@@ -306,16 +320,19 @@ class SurveyModel:
     def _sum_chunks(self, run: Any) -> tuple[np.ndarray, np.ndarray]:
         """Run a program over all chunks; return waveforms of all shots, and the sum of products with J^T."""
         shots, groups = len(self.groups.group), self.groups
+        # Sums over thousands of shots are in double precision, whatever that of the programs.
         waveforms = np.zeros((shots, *self.zero_cotangent.shape[1:]))
         totals = [np.zeros(u.start.shape) for u in self.all_unknowns]
         with side_by_side() as run_on_threads:
             for number, (w, c, pulled) in enumerate(run_on_threads(run, range(len(self.rows)))):
                 rows, n = self.chunks[number], len(self.chunks[number])
+                # Without the copies that fill up the chunk.
                 w, c = np.asarray(w, float)[:n], np.asarray(c, float)[:n]
                 waveforms[rows] = w
                 for total, cotangent in zip(totals, pulled):
                     total += np.asarray(cotangent, float)
                 of_groups = iter(totals[len(self.unknowns) :])
+                # d record / d gain is w, and d record / d offset is one.
                 if groups.gain is not None:
                     np.add.at(next(of_groups), groups.group[rows], np.sum(c * w, axis=(1, 2)))
                 if groups.offset is not None:
@@ -330,10 +347,12 @@ def _chunks_of_neighbours(survey: Survey, n_chunks: int) -> list[Int[np.ndarray,
     """
     x, y = survey.position[:, 0], survey.position[:, 1]
     extent = np.maximum([np.ptp(x), np.ptp(y)], 1e-9)
+    # As many strips as make chunks about square: their windows are smallest then.
     n_strips = int(np.clip(np.round(np.sqrt(n_chunks * extent[0] / extent[1])), 1, n_chunks))
     strips = np.array_split(np.argsort(x, kind="stable"), n_strips)
     chunks = []
     for number, strip in enumerate(strips):
+        # The remainder of the division goes to the first strips, one chunk each.
         of_strip = n_chunks // n_strips + (number < n_chunks % n_strips)
         chunks += np.array_split(
             strip[np.argsort(y[strip], kind="stable")], max(1, min(of_strip, len(strip)))
@@ -367,10 +386,13 @@ def _windows(
     # Another voxel on either side: rounding may put a ray on a face.
     low = np.floor((axes.min(axis=1) - radius[:, None] - origin[:2]) / size[:2]).astype(int) - 1
     high = np.floor((axes.max(axis=1) + radius[:, None] - origin[:2]) / size[:2]).astype(int) + 2
+    # One shape for all windows, that of the largest: chunks share a compiled program.
     first = np.array([low[chunk].min(axis=0) for chunk in chunks])
     last = np.array([high[chunk].max(axis=0) for chunk in chunks])
     first, last = np.clip(first, 0, shape - 1), np.clip(last, 1, shape)
     window_shape = np.minimum(np.max(last - first, axis=0), shape)
+    # Cutting costs a copy of the window in each product.
     if np.prod(window_shape) > 0.5 * np.prod(shape):
         return none
+    # A window at the rim is moved inward, so that it has its full size.
     return np.clip(first, 0, shape - window_shape), (int(window_shape[0]), int(window_shape[1]))

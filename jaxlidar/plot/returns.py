@@ -129,7 +129,9 @@ def section(
     - `ax`: the axes to draw on. Default None: those of a new figure.
     - `width`: returns at most half of this from the line are drawn, m, positive. Default 2.
     - `scene`: the `Scene` whose ground below the line is drawn. Default None: none.
-    - `colour_by`, `size`, `legend`: as those of `points`. Default "class", 2 and True.
+    - `colour_by`: as that of `points`. Default "class".
+    - `size`: as that of `points`. Default 2.
+    - `legend`: as that of `points`. Default True.
 
     **Returns:** the axes; the horizontal one is the distance from `start` along the line.
 

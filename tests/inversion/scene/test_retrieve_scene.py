@@ -70,6 +70,7 @@ def small_stand():
 # -- a stand -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_small_stand_has_its_leaf_area_and_profile(small_stand):
     fit, _ = small_stand
     lad, truth = np.asarray(fit.values["leaf"]) / G, crowns()
@@ -81,6 +82,7 @@ def test_a_small_stand_has_its_leaf_area_and_profile(small_stand):
     assert float(fit.misfit) < 1.15
 
 
+@pytest.mark.slow
 def test_the_fit_ends_at_the_least_held_out_misfit(small_stand):
     fit, steps = small_stand
     history = np.asarray(fit.history)
@@ -90,6 +92,7 @@ def test_the_fit_ends_at_the_least_held_out_misfit(small_stand):
     assert str(steps[0]).startswith("fit 1: misfit ")
 
 
+@pytest.mark.slow
 def test_total_leaf_area_is_better_determined_than_voxels(small_stand):
     fit, _ = small_stand
     error_of_total = float(fit.stderr_of("leaf", np.sum)) / float(fit.values["leaf"].sum())
@@ -102,6 +105,7 @@ def test_total_leaf_area_is_better_determined_than_voxels(small_stand):
     assert abs(kernel.sum(axis=(0, 1)).argmax() - 7) <= 1
 
 
+@pytest.mark.slow
 def test_a_result_is_printed_on_a_screen_and_stored(small_stand, tmp_path):
     fit, _ = small_stand
     assert len(str(fit).splitlines()) < 20
@@ -219,8 +223,8 @@ def test_priors_have_the_gradients_and_products_of_their_residuals():
     def cost(x):
         k = x[:24].reshape(3, 4, 2)
         differences = np.sum(np.diff(k, axis=0) ** 2) / 0.2**2 + np.sum(np.diff(k, axis=2) ** 2) / 0.4**2
-        others = (np.log(x[24] / 0.3) / 0.5) ** 2 + ((x[25] - 0.1) / 0.2) ** 2
-        return 0.5 * (differences + others) + np.sum(k) / 0.3
+        priors_of_ground = (np.log(x[24] / 0.3) / 0.5) ** 2 + ((x[25] - 0.1) / 0.2) ** 2
+        return 0.5 * (differences + priors_of_ground) + np.sum(k) / 0.3
 
     value, gradient = priors.cost_and_gradient(x)
     assert value == pytest.approx(cost(x), rel=1e-5)
@@ -286,12 +290,13 @@ def test_gains_and_offsets_of_groups_are_fitted_with_the_scene():
     assert float(fit.values["height"]) == pytest.approx(0.3, abs=2e-3)
     assert np.all(np.isnan(fit.stderr["height"]))
     # Held-out shots have gains of their own here: they get the best for their records.
-    each = inversion.retrieve_scene(
+    fit_by_shot = inversion.retrieve_scene(
         records, survey, START, [HEIGHT], **shared, gain=(0.3, 3.0), offset=(0, 0.1)
     )
-    assert float(each.held_out_misfit) < 2.0
+    assert float(fit_by_shot.held_out_misfit) < 2.0
 
 
+@pytest.mark.slow
 def test_standard_errors_are_those_of_the_inverse_of_the_matrix():
     survey, waves, _, _ = flat_case()
     observed, noise = with_noise(waves)
@@ -338,9 +343,9 @@ def test_an_interrupted_run_goes_on_and_another_problem_is_refused(tmp_path):
         if step.stage == "errors" and step.number == 2:
             raise KeyboardInterrupt
 
-    def run(key=KEY, **more):
+    def run(key=KEY, **arguments):
         return inversion.retrieve_scene(
-            records, survey, START, [HEIGHT], key=key, path=path, **shared, **more
+            records, survey, START, [HEIGHT], key=key, path=path, **shared, **arguments
         )
 
     with pytest.raises(KeyboardInterrupt):
