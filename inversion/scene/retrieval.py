@@ -533,10 +533,10 @@ class _Problem:
     def solve(self, end: "_FitEnd", b: np.ndarray) -> Float[np.ndarray, " n"]:
         """Return H^-1 b by conjugate gradients, preconditioned by the diagonal of H."""
         n = b.size
-        matrix = sparse_linalg.LinearOperator((n, n), matvec=lambda v: self.product(end.x, v), dtype=float)
-        inverse_diagonal = sparse_linalg.LinearOperator(
-            (n, n), matvec=lambda v: end.scale**2 * v, dtype=float
-        )
+        # SciPy's stubs know the constructor of the base class alone, without its functions.
+        operator: Any = sparse_linalg.LinearOperator
+        matrix = operator((n, n), matvec=lambda v: self.product(end.x, v), dtype=float)
+        inverse_diagonal = operator((n, n), matvec=lambda v: end.scale**2 * v, dtype=float)
         return sparse_linalg.cg(matrix, b, rtol=_CG_RTOL, maxiter=_CG_STEPS, M=inverse_diagonal)[0]
 
 
