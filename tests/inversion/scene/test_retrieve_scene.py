@@ -383,3 +383,45 @@ def test_bad_arguments_are_refused_by_name():
             run(**changes)
     with pytest.raises(ValueError, match="time is given with Waveforms"):
         run(observed=waves)
+
+
+# -- maps of the ground ------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_heights_and_reflectance_of_a_terrain_are_maps_of_their_own():
+    """Nodes that footprints see are found; a plane, which the fit starts from, is far off."""
+    x = np.arange(0.0, 31.0, 5.0)
+    heights = np.sin(x / 6.0)[:, None] + np.cos(x / 8.0)
+    brightness = 0.3 + 0.1 * np.sin(x / 5.0)[:, None] * np.ones_like(x)
+
+    def terrain(heights, reflectance):
+        return jl.Scene(ground=jl.Terrain(heights, spacing=5.0, origin=(0.0, 0.0), reflectance=reflectance))
+
+    lidar = jl.Lidar(altitude=1000.0, divergence=3.0, pulse=jl.GaussianPulse(4.0))
+    survey = jl.Survey.grid(lidar, (5.0, 5.0), (25.0, 25.0), 2.5)
+    waves = jl.simulate_many(survey, terrain(heights, brightness), key=jax.random.key(0), max_orders=1)
+    observed, noise = with_noise(waves)
+    unknowns = [
+        inversion.Unknown(
+            "ground.heights", bounds=(-4.0, 4.0), name="heights", prior=inversion.MarkovField(2.0)
+        ),
+        inversion.Unknown(
+            "ground.reflectance", bounds=(0.05, 0.9), name="brightness", prior=inversion.MarkovField(0.2)
+        ),
+    ]
+    fit = inversion.retrieve_scene(
+        observed,
+        survey,
+        terrain(np.full_like(heights, 0.5), np.full_like(brightness, 0.3)),
+        unknowns,
+        noise=noise,
+        time=waves.time,
+        key=KEY,
+        max_orders=1,
+        draws=0,
+    )
+    inner = (slice(1, -1), slice(1, -1))
+    for name, truth, start in (("heights", heights, 0.5), ("brightness", brightness, 0.3)):
+        error = np.asarray(fit.values[name])[inner] - truth[inner]
+        assert np.sqrt(np.mean(error**2)) < 0.2 * np.sqrt(np.mean((truth[inner] - start) ** 2)), name
