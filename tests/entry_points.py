@@ -410,6 +410,11 @@ ENTRY_POINTS: dict[str, Callable[[], EntryPoint]] = {
         {"voxel_size": 0.5, "leaf_area": 1.0, "samples": 2, "origin": (-1.0, -1.0, 0.0)}
         | {"shape": (4, 4, 4)},
     ),
+    "voxelise_copies": lambda: EntryPoint(
+        lambda **arguments: jl.voxelise_copies(TREE, **arguments),
+        {"position": np.zeros((2, 3)), "voxel_size": 0.5, "leaf_area": 1.0, "samples": 2}
+        | {"individual": np.zeros(2, int), "azimuth": np.zeros(2), "offsets": 1, "azimuths": 1},
+    ),
     "canopy_from_points": lambda: EntryPoint(
         lambda **arguments: jl.canopy_from_points(point_cloud(), **arguments),
         {"voxel_size": 1.0, "reflectance": 0.3, "origin": (0.0, 0.0, 0.0), "shape": (6, 6, 6)},
@@ -757,6 +762,7 @@ ENTRY_POINTS: dict[str, Callable[[], EntryPoint]] = {
             "least": 5,
         },
     ),
+    "inversion.MarkovField": lambda: EntryPoint(inversion.MarkovField, {"difference": 0.1, "mean": 0.2}),
     "inversion.geolocate": lambda: EntryPoint(
         lambda **arguments: inversion.geolocate(
             survey=jl.Survey(jl.Lidar(divergence=20.0), TWO), scene=GROUND, key=KEY, **arguments

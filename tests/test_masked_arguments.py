@@ -120,13 +120,15 @@ RESULTS = (
     ),
     *("io.ColumnAxis", "io.Column", "io.ShotTable", "io.PhotonImpulse", "io.PhotonTrack"),
     *("inversion.TableProgress", "inversion.Comparison", "inversion.ComparisonStatistics"),
-    *("inversion.ComparedColumn",),
+    *("inversion.ComparedColumn", "inversion.SceneRetrieval", "inversion.SceneStep"),
 )
 OF_OBJECTS = (
     *("instrument", "instruments", "instrument_sources", "compilation_cache", "simulate_scenes"),
     *("ground_position", "io.read_trajectory"),
     # Its numbers are those of a lidar, and of `plan`; the noise may be a function.
     "inversion.design",
+    # Their numbers are those of `retrieve` and of `plan`, and sizes of drawings.
+    *("inversion.retrieve_scene", "plot.points", "plot.section", "plot.waterfall"),
     *("total_reflectance", "open", "rerun", "Scene", "load_coefficients", "spectrum_names"),
     *("read_spectrum_csv", "Symbol", "Word", "LSystem", "trim_empty_layers", "truth_of", "make_setup"),
     *("trace_scene", "waveform_of", "Lambertian", "EqualAngle", "spectrum", "Plane"),

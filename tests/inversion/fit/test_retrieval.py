@@ -498,7 +498,7 @@ LOW_PLAN = jl.plan(PLAIN, ground_scene(), window=(-20.0, 20.0), describe=False)
         (retrieval_of(bounds=3.0), "not a pair"),
         (retrieval_of(bounds=((0.0, 1.0), 2.0)), "does not broadcast"),
         (retrieval_of(prior=(0.0, 0.0)), "prior standard deviation = 0"),
-        (retrieval_of(prior=1.0), "prior = 1.0 is no LogNormal, no Smooth"),
+        (retrieval_of(prior=1.0), "prior = 1.0 is no LogNormal, Smooth, MarkovField"),
         (retrieval_of("ground.hight"), "where = 'ground.hight' is no array .* nearest are 'ground.height'"),
         (retrieval_of(lambda s: s.canopy.leaf.Cab), "where picks nothing in this scene"),
         (retrieval_of(lambda s: s.canopy), r"where picks nothing \(None\)"),
