@@ -589,6 +589,18 @@ ENTRY_POINTS: dict[str, Callable[[], EntryPoint]] = {
     "plot.survey": lambda: EntryPoint(
         lambda values: jl.plot.survey(SURVEY, values=values), {"values": np.ones(2)}, missing=("values",)
     ),
+    "plot.points": lambda: EntryPoint(
+        lambda **arguments: jl.plot.points(waveforms().returns(), **arguments),
+        {"size": 1.0, "elevation": 25.0, "azimuth": 200.0},
+    ),
+    "plot.section": lambda: EntryPoint(
+        lambda **arguments: jl.plot.section(waveforms().returns(), **arguments),
+        {"start": np.array([-1.0, 0.0]), "end": np.array([9.0, 0.0]), "width": 20.0, "size": 1.0},
+    ),
+    "plot.waterfall": lambda: EntryPoint(
+        lambda **arguments: jl.plot.waterfall(waveforms(), **arguments),
+        {"shots": np.arange(2), "distance": np.array([0.0, 1.0]), "wavelength": 1064.0, "overlap": 1.5},
+    ),
     "plot.tree": lambda: EntryPoint(
         lambda **arguments: jl.plot.tree(TREE, **arguments),
         {"alpha": 0.5, "max_buds": 10, "elevation": 8.0, "azimuth": 20.0},
@@ -769,6 +781,18 @@ ENTRY_POINTS: dict[str, Callable[[], EntryPoint]] = {
         ),
         {"records": np.stack([POWER, POWER]), "height": HEIGHT, "noise": 0.01, "search_radius": 2.0}
         | {"height_error": 0.1, "max_orders": 1, "rtol": 0.1},
+    ),
+    "inversion.retrieve_scene": lambda: EntryPoint(
+        lambda **arguments: inversion.retrieve_scene(
+            survey=SURVEY, scene=GROUND, unknowns=[UNKNOWN], key=KEY, **arguments
+        ),
+        {
+            "waveforms": np.asarray(waveforms().reflectance),
+            "time": np.asarray(waveforms().time),
+            "noise": 0.01,
+        }
+        | {"gain": (0.5, 2.0), "offset": (-0.1, 0.1), "groups": np.zeros(2, int), "held_out": 0.0}
+        | {"max_steps": 2, "draws": 1, "max_orders": 1, "n_rays": 8, "n_photons": 8},
     ),
     "inversion.Recorder": lambda: EntryPoint(
         inversion.Recorder,

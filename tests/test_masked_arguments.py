@@ -127,8 +127,6 @@ OF_OBJECTS = (
     *("ground_position", "io.read_trajectory"),
     # Its numbers are those of a lidar, and of `plan`; the noise may be a function.
     "inversion.design",
-    # Their numbers are those of `retrieve` and of `plan`, and sizes of drawings.
-    *("inversion.retrieve_scene", "plot.points", "plot.section", "plot.waterfall"),
     *("total_reflectance", "open", "rerun", "Scene", "load_coefficients", "spectrum_names"),
     *("read_spectrum_csv", "Symbol", "Word", "LSystem", "trim_empty_layers", "truth_of", "make_setup"),
     *("trace_scene", "waveform_of", "Lambertian", "EqualAngle", "spectrum", "Plane"),

@@ -7,7 +7,15 @@ from jaxtyping import ArrayLike, Float
 from matplotlib.axes import Axes
 from matplotlib.patches import Patch
 
-from jaxlidar._checks import as_numpy, check_choice, check_kind, check_number, check_range, check_shape
+from jaxlidar._checks import (
+    as_numpy,
+    check_choice,
+    check_kind,
+    check_number,
+    check_numbers,
+    check_range,
+    check_shape,
+)
 from jaxlidar.plot.style import (
     BEAM_COLOUR,
     OTHER_COLOUR,
@@ -249,6 +257,7 @@ def _chosen_shots(waves: Waveforms, shots: Any) -> np.ndarray:
     if shots is None or isinstance(shots, slice):
         rows = np.arange(count)[shots if isinstance(shots, slice) else slice(None)]
     else:
+        check_numbers("shots", shots)
         rows = np.atleast_1d(np.asarray(shots))
         if rows.ndim != 1 or not np.issubdtype(rows.dtype, np.integer):
             raise ValueError("shots are no row of whole numbers; admissible are numbers of shots, or a slice")
