@@ -128,11 +128,8 @@ class PathLengths:
                 crossings.append(crossed[met])
         radius = _PATH_RADII * float(shots.footprint_radius.max())
         for mesh in scene.meshes:
-            crossings.append(
-                _mesh_crossings(
-                    mesh, points + aim, self.rays, radius, float(slant_range.min()), scene.period is not None
-                )
-            )
+            lines = (points + aim, self.rays, radius, float(slant_range.min()))
+            crossings.append(_mesh_crossings(mesh, *lines, repeats=scene.period is not None))
         if scene.canopy is not None:
             low = concrete_array(scene.canopy.voxels.origin)[2]
             for z in (low, low + self.size[2] * self.shape[2]):
@@ -175,10 +172,8 @@ class PathLengths:
         intervals = []
         radius = _PATH_RADII * float(shots.footprint_radius.max())
         for mesh in scene.meshes:
-            repeats = scene.period is not None
-            intervals.append(
-                _mesh_crossings(mesh, sensor, self.rays, radius, AIM_DISTANCE, repeats, ahead=True)
-            )
+            lines, repeats = (sensor, self.rays, radius, AIM_DISTANCE), scene.period is not None
+            intervals.append(_mesh_crossings(mesh, *lines, repeats=repeats, ahead=True))
         for s in (surface for surface in scene.surfaces if not isinstance(surface, MeshMaterial)):
             if isinstance(s, Terrain) and s.relief:
                 low, high = _box_of_terrain(s)
@@ -377,8 +372,8 @@ def _mesh_crossings(
     rays: Float[np.ndarray, "lines 3"],
     radius: float,
     slant_range: float,
-    repeats: bool,
     *,
+    repeats: bool,
     ahead: bool = False,
 ) -> Float[np.ndarray, " crossings"]:
     """Return the distances from points along lines at which these enter and leave the box around a mesh.
@@ -394,6 +389,7 @@ def _mesh_crossings(
         low[:2], high[:2] = points[:, :2].min(axis=0) - _ENDLESS, points[:, :2].max(axis=0) + _ENDLESS
     # Beyond the aim point, beams are wider.
     if ahead and repeats:
+        # Level beams end where the tracer gives up, far beyond any record.
         depth = np.maximum(np.abs(low[2] - points[:, 2]), np.abs(high[2] - points[:, 2]))
         beyond = float((depth / np.maximum(np.abs(rays[:, 2]), 1e-3)).max())
     elif ahead:
@@ -423,8 +419,9 @@ def meshes_are_in_reach(shots: Lidar | Survey, scene: Scene) -> bool:
     if ahead:
         points = points - rims.distance.reshape(-1, 1) * rays
     radius, slant_range = n_radii * float(survey.footprint_radius.max()), float(rims.slant_range.min())
+    repeats = scene.period is not None
     return any(
-        _mesh_crossings(mesh, points, rays, radius, slant_range, scene.period is not None, ahead=ahead).size
+        _mesh_crossings(mesh, points, rays, radius, slant_range, repeats=repeats, ahead=ahead).size
         for mesh in scene.meshes
     )
 

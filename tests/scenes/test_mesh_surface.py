@@ -116,7 +116,8 @@ def test_instances_are_scaled_rotated_and_shifted_copies():
 
 @BY_PRECISION
 def test_rays_meet_meshes_that_repeat(precision):
-    """The nearest of explicit copies, by trimesh; two of the instances cross sides, one a corner."""
+    """The nearest of explicit copies, by Embree; two of the instances cross sides, one a corner."""
+    pytest.importorskip("embreex")
     random = np.random.default_rng(3)
     mesh = trimesh.creation.icosphere(subdivisions=1)
     shift = [[4.0, 3.0, 0.0], [8.9, 2.0, 2.0], [-14.0, 13.8, 3.0], [8.5, 0.2, 5.0]]
