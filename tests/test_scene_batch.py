@@ -73,14 +73,14 @@ def test_chunks_and_other_scenes_change_nothing(waves, plan_of_two_orders):
 
 
 def test_the_plan_of_a_stack_serves_all_of_its_scenes():
-    scenes = random_stands(10)
+    scenes = random_stands(40)
     plan = jl.plan_scenes(LIDAR, scenes, n_rays=8)
-    for i in range(10):
+    for i in range(40):
         check_plan(plan, LIDAR, scene_number(scenes, i))
     # So do the bounds of the family, without any of its scenes.
     corners = [stand(d, b, h, 0.4) for d in (0.02, 0.3) for b in (1.0, 8.0) for h in (-3.0, 0.5)]
     by_bounds = jl.plan_scenes(LIDAR, corners, n_rays=8)
-    for i in range(10):
+    for i in range(40):
         check_plan(by_bounds, LIDAR, scene_number(scenes, i))
     # The plan of the lowest scene alone does not serve the highest.
     by_one = jl.plan(LIDAR, corners[0], n_rays=8)
@@ -97,6 +97,19 @@ def test_effects_that_are_absent_from_one_scene_are_planned():
     leaf = np.asarray(waves.waveforms.components["leaf"]).sum(axis=(1, 2))
     assert leaf[0] == 0
     assert leaf[1] > 0.05
+
+
+def test_terrain_that_is_flat_in_one_scene_is_planned_with_relief():
+    def hills(height):
+        heights = height * jnp.sin(jnp.arange(9.0))[:, None] * jnp.ones((9, 9))
+        return jl.Scene(ground=jl.Terrain(heights, spacing=20.0, origin=(-80.0, -80.0), reflectance=0.3))
+
+    flat, hilly = hills(0.0), hills(3.0)
+    plan = jl.plan_scenes(LIDAR, [flat, hilly], max_orders=1, n_rays=64)
+    waves = jl.simulate_scenes(LIDAR, jax.tree.map(lambda *a: jnp.stack(a), flat, hilly), plan=plan, key=KEY)
+    assert np.max(np.abs(waves.reflectance[1] - waves.reflectance[0])) > 0.1 * np.max(waves.reflectance)
+    # Beside terrain whose heights never change, a plane remains a plane.
+    assert jl.plan_scenes(LIDAR, [flat, flat], max_orders=1, n_rays=64).scope.flat_terrain
 
 
 def test_the_result_is_differentiated():

@@ -14,10 +14,10 @@ import numpy as np
 from jaxtyping import Float
 
 from inversion.fit.unknowns import BoundUnknown, set_values
-from jaxlidar import Lidar, Plan, Scene
+from jaxlidar import Lidar, Plan, Scene, Survey
 from jaxlidar import plan as make_plan
 from jaxlidar.extend import check_integer, check_kind
-from jaxlidar.planning.effects import find_empty_materials
+from jaxlidar.planning.effects import effects_of_family
 from jaxlidar.planning.plan import MIN_BATCHES
 from jaxlidar.planning.plan_check import check_reach
 from jaxlidar.planning.scene_family import union_plan
@@ -88,7 +88,7 @@ def corner_scenes(scene: Scene, unknowns: list[BoundUnknown]) -> list[Scene]:
 
 
 def plan_for_bounds(
-    lidar: Lidar,
+    shots: Lidar | Survey,
     scene: Scene,
     unknowns: list[BoundUnknown],
     time: Float[np.ndarray, " samples"],
@@ -96,7 +96,8 @@ def plan_for_bounds(
 ) -> Plan:
     """Plan the starting scene, with loops and fine time bins long enough for all `corner_scenes`.
 
-    Fine time bins are those in which light is collected; `time` has the samples of the record.
+    Fine time bins are those in which light is collected; `time` has the samples of the record. With
+    a `Survey` the plan serves all of its shots.
 
     Scatterer channels, orders and step lengths are those of the starting scene.
 
@@ -106,6 +107,8 @@ def plan_for_bounds(
 
     **Raises:** ValueError for an inadmissible corner, such as a canopy that reaches above the sensor.
     """
+    survey = shots if isinstance(shots, Survey) else None
+    lidar = shots if survey is None else survey.middle
     interval = float(lidar.sampling_interval)
     # A thousandth of a sample keeps the last one in a window whose end is rounded.
     window = (float(time[0]), float(time[0]) + (time.size - 1 + 1e-3) * interval)
@@ -115,11 +118,11 @@ def plan_for_bounds(
         "n_photons": sizes.photons_per_batch,
         "n_rays": sizes.rays_per_batch,
         "describe": False,
-        # An effect that is zero at the start may not be at other values: none is left out.
-        "effects": dict.fromkeys(find_empty_materials(scenes[0]), True),
+        "effects": effects_of_family(scenes),
     }
-    first = make_plan(lidar, scenes[0], max_orders=sizes.max_orders, **common)
-    if not first.config.keeps_histories:
+    first = make_plan(shots, scenes[0], max_orders=sizes.max_orders, **common)
+    # Fits of surveys trace all derivatives, and many shots at once.
+    if survey is None and not first.config.keeps_histories:
         first = _plan_with_histories(first, lidar, scenes[0], max_orders=sizes.max_orders, **common)
     histories = first.config.keeps_histories
     common.update(max_orders=first.orders, bin_width=first.bins.width, histories=histories)
@@ -128,10 +131,10 @@ def plan_for_bounds(
     plans = [first]
     for corner in scenes[1:]:
         try:
-            plans.append(make_plan(lidar, corner, **common))
+            plans.append(make_plan(shots, corner, **common))
         except ValueError as error:
             raise ValueError(f"at the bounds of the unknowns the scene is inadmissible: {error}") from error
-    return union_plan(lidar, scenes, plans)
+    return union_plan(lidar, scenes, plans, survey)
 
 
 def _plan_with_histories(first: Plan, lidar: Lidar, scene: Scene, **options: Any) -> Plan:

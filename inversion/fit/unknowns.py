@@ -44,7 +44,7 @@ def _as_optional_prior(x: Any) -> Prior | None:
         mean, std = x
     except (TypeError, ValueError):
         raise ValueError(
-            f"prior = {x!r} is no LogNormal, Smooth, MarkovField and no pair (mean, standard deviation)"
+            f"prior = {x!r} is no LogNormal, no Smooth, no MarkovField and no pair (mean, standard deviation)"
         ) from None
     return as_array(mean, "prior mean"), as_array(std, "prior standard deviation")
 

@@ -44,7 +44,7 @@ from scipy import optimize
 from scipy.sparse import linalg as sparse_linalg
 
 from inversion.fit.data import as_noise, as_sample_times, with_fixed_window
-from inversion.fit.planning import corner_scenes
+from inversion.fit.planning import TraceSizes, plan_for_bounds
 from inversion.fit.retrieval import check_progress
 from inversion.fit.unknowns import (
     BoundUnknown,
@@ -58,8 +58,7 @@ from inversion.fit.unknowns import (
 from inversion.scene.map_priors import MapPriors
 from inversion.scene.scene_retrieval import SceneRetrieval, make_scene_retrieval
 from inversion.scene.survey_model import Pulled, ShotGroups, SurveyModel
-from jaxlidar import Plan, Scene, Survey, Terrain, Waveforms
-from jaxlidar import plan as make_plan
+from jaxlidar import Plan, Scene, Survey, Waveforms
 from jaxlidar.extend import (
     as_numpy,
     check_integer,
@@ -71,8 +70,6 @@ from jaxlidar.extend import (
     fingerprint,
 )
 from jaxlidar.io.checkpoint import Checkpoint, open_checkpoint
-from jaxlidar.planning.effects import find_empty_materials
-from jaxlidar.planning.scene_family import union_plan
 
 # Rays of a footprint unless they are given: one for each column of voxels in it, within limits; photons.
 _RAYS, _PHOTONS = (32, 512), 2048
@@ -147,14 +144,14 @@ def retrieve_scene(
     that overlap, with noise that grows quickly as detail becomes finer, and from the priors. Leaves in clumps
     smaller than a footprint, such as crowns, let more light through than the same leaves spread evenly, and
     records of wide footprints do not tell the two apart: with a smooth prior the result is the effective leaf
-    area, which may be half of the true one. Standard errors and draws do not contain
-    this. The shape of the profile suffers less. Little light comes from below dense leaves.
-    Waveforms determine the product of area and reflectance better than either: keep leaf
-    and ground reflectance fixed or give them priors; and a free gain is the same as a common factor of all
-    reflectances. Look at `stderr`, at the kernels of some places (`kernels=`), and at the draws for sums.
-    Standard errors are those of a linear approximation within a Gaussian posterior; they do not know of
-    errors of the model (positions of footprints, leaf angles, orders beyond `max_orders`), nor of the
-    simulation's own noise: use more rays and photons until the result no longer changes.
+    area, which may be half of the true one. Standard errors and draws do not contain this. The shape of the
+    profile suffers less. Little light comes from below dense leaves. Waveforms determine the product of area
+    and reflectance better than either: keep leaf and ground reflectance fixed or give them priors; and a free
+    gain is the same as a common factor of all reflectances. Look at `stderr`, at the kernels of some places
+    (`kernels=`), and at the draws for sums. Standard errors are those of a linear approximation within a
+    Gaussian posterior; they do not know of errors of the model (positions of footprints, leaf angles, orders
+    beyond `max_orders`), nor of the simulation's own noise: use more rays and photons until the result no
+    longer changes.
 
     **Arguments:**
 
@@ -236,7 +233,7 @@ def retrieve_scene(
         **sizes,
     }
     if plan is None:
-        plan = _plan_for_survey(survey, scene, bound, records.time, **sizes)
+        plan = plan_for_bounds(survey, scene, bound, records.time, _trace_sizes(survey, scene, **sizes))
     elif any(value is not None for value in sizes.values()):
         raise ValueError("plan is given together with max_orders, n_rays or n_photons; admissible is either")
     # The host draws shots to hold out and signs; their numbers must not be those of the light.
@@ -386,53 +383,15 @@ def _choose_held_out(shots: int, fraction: float, random: np.random.Generator) -
     return is_held_out
 
 
-def _plan_for_survey(
-    survey: Survey,
-    scene: Scene,
-    unknowns: list[BoundUnknown],
-    time: Float[np.ndarray, " samples"],
-    *,
-    max_orders: int | None,
-    n_rays: int | None,
-    n_photons: int | None,
-) -> Plan:
-    """Make a plan that serves all shots of the survey, and all scenes within the bounds.
-
-    As `inversion.fit.planning.plan_for_bounds` does for one shot: loops and time bins are long enough for
-    the corners of the bounds.
-
-    **Raises:** ValueError for an inadmissible corner.
-    """
-    interval = float(survey.lidar.sampling_interval)
-    scenes = corner_scenes(scene, unknowns)
-    # An effect that is zero at the start may not be at other values: none is left out.
-    effects = dict.fromkeys(find_empty_materials(scenes[0]), True)
-    if isinstance(scene.ground, Terrain):
-        effects["relief"] = True
-    options: dict[str, Any] = {
-        # A thousandth of a sample keeps the last one in a window whose end is rounded.
-        "window": (float(time[0]), float(time[0]) + (time.size - 1 + 1e-3) * interval),
-        "n_photons": _PHOTONS if n_photons is None else check_integer("n_photons", n_photons),
-        "n_rays": _rays(survey, scene) if n_rays is None else check_integer("n_rays", n_rays),
-        "describe": False,
-        "effects": effects,
-    }
-    # The other corners take bins and orders of the first: plans can be united only where these are equal.
-    first = make_plan(survey, scenes[0], max_orders=max_orders, **options)
-    options |= {
-        "max_orders": first.orders,
-        "bin_width": first.bins.width,
-        "histories": first.config.keeps_histories,
-    }
-    if scene.canopy is not None:
-        options["max_step"] = first.limits.max_segment
-    plans = [first]
-    for corner in scenes[1:]:
-        try:
-            plans.append(make_plan(survey, corner, **options))
-        except ValueError as error:
-            raise ValueError(f"at the bounds of the unknowns the scene is inadmissible: {error}") from error
-    return union_plan(survey.middle, scenes, plans, survey)
+def _trace_sizes(
+    survey: Survey, scene: Scene, max_orders: int | None, n_rays: int | None, n_photons: int | None
+) -> TraceSizes:
+    """Return the size of the simulation of a shot, which is one batch. **Raises:** ValueError."""
+    return TraceSizes(
+        _PHOTONS if n_photons is None else check_integer("n_photons", n_photons),
+        _rays(survey, scene) if n_rays is None else check_integer("n_rays", n_rays),
+        max_orders,
+    )
 
 
 def _rays(survey: Survey, scene: Scene) -> int:

@@ -7,9 +7,10 @@ or scene, in which the effect is absent, so that the tracer needs no switches.
 """
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import jax.numpy as jnp
+import numpy as np
 
 from jaxlidar._checks import concrete, concrete_number
 from jaxlidar.instrument.lidar import Lidar
@@ -109,6 +110,20 @@ def find_empty_materials(scene: Scene, effects: Mapping[str, bool] | None = None
         if extinction is not None and not extinction.any() and effects.get(name) is not True:
             empty.append(name)
     return tuple(empty)
+
+
+def effects_of_family(scenes: Sequence[Scene]) -> dict[str, bool]:
+    """Return the effects to ask for in a plan of several scenes of one structure: name and True.
+
+    What is zero in one of them may not be in another: a material that is absent from one, and the relief of
+    terrain that is a plane in one, where its heights change. Their arrays are concrete.
+    """
+    names = {name for scene in scenes for name in find_empty_materials(scene)}
+    terrains = [scene.ground for scene in scenes if isinstance(scene.ground, Terrain)]
+    change = any(not np.array_equal(t.heights, terrains[0].heights) for t in terrains)
+    if change and any(is_plane_terrain(t) for t in terrains):
+        names.add("relief")
+    return dict.fromkeys(sorted(names), True)
 
 
 def without_relief(scene: Scene) -> Scene:

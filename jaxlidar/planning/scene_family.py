@@ -17,7 +17,7 @@ import numpy as np
 from jaxlidar._checks import check_kind
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.instrument.survey import Survey
-from jaxlidar.planning.effects import find_empty_materials
+from jaxlidar.planning.effects import effects_of_family
 from jaxlidar.planning.path_lengths import PathLengths
 from jaxlidar.planning.plan import Plan, plan
 from jaxlidar.planning.size_buckets import size_bucket
@@ -102,9 +102,7 @@ def plan_scenes(
     examined = _extreme_scenes(scenes) if isinstance(scenes, Scene) else _checked_sequence(scenes)
     for scene in examined:
         check_kinds(lidar, scene)
-    # An effect that is zero in one scene may not be in another: none is left out.
-    empty_materials = {name for scene in examined for name in find_empty_materials(scene)}
-    effects = {**dict.fromkeys(sorted(empty_materials), True), **({} if effects is None else effects)}
+    effects = {**effects_of_family(examined), **({} if effects is None else effects)}
     common: dict[str, Any] = {**options, "effects": effects, "describe": False}
     trials = [_plan_of(lidar, s, {**common, "window": window, "max_orders": max_orders}) for s in examined]
     # A channel of a transmittance that is zero is harmless; one that is missing is not.

@@ -10,7 +10,7 @@ from jaxlidar.sampling.errors import student_widening
 from tests.helpers import slab, slow_unless
 
 LIDAR = jl.Lidar(wavelength=1064.0)
-SEEDS = 120
+SEEDS = 200
 
 
 def clumps():

@@ -226,7 +226,7 @@ def test_unknowns_that_are_no_profile_are_refused():
     profile = profile_of(4, Smooth(2.0, mean=np.ones(3)))
     assert_refused(profile, "mean has the shape")
     assert_refused(profile_of(4, Smooth(2.0)), "solver", solver=optx.LevenbergMarquardt(rtol=0.1, atol=0.1))
-    with pytest.raises(ValueError, match="is no LogNormal, Smooth, MarkovField"):
+    with pytest.raises(ValueError, match="is no LogNormal, no Smooth"):
         profile_of(4, 3.0)
 
 

@@ -498,7 +498,7 @@ LOW_PLAN = jl.plan(PLAIN, ground_scene(), window=(-20.0, 20.0), describe=False)
         (retrieval_of(bounds=3.0), "not a pair"),
         (retrieval_of(bounds=((0.0, 1.0), 2.0)), "does not broadcast"),
         (retrieval_of(prior=(0.0, 0.0)), "prior standard deviation = 0"),
-        (retrieval_of(prior=1.0), "prior = 1.0 is no LogNormal, Smooth, MarkovField"),
+        (retrieval_of(prior=1.0), "prior = 1.0 is no LogNormal, no Smooth"),
         (retrieval_of("ground.hight"), "where = 'ground.hight' is no array .* nearest are 'ground.height'"),
         (retrieval_of(lambda s: s.canopy.leaf.Cab), "where picks nothing in this scene"),
         (retrieval_of(lambda s: s.canopy), r"where picks nothing \(None\)"),
@@ -514,3 +514,21 @@ LOW_PLAN = jl.plan(PLAIN, ground_scene(), window=(-20.0, 20.0), describe=False)
 def test_inadmissible_arguments_are_refused(call, message):
     with pytest.raises(ValueError, match=message):
         call()
+
+
+def test_relief_is_found_from_terrain_that_is_flat_at_the_start():
+    key = jax.random.key(0)
+    x = np.arange(-20.0, 21.0, 10.0)
+    bowl = np.add.outer(x, np.zeros(5)) ** 2 / 200.0
+
+    def scene(depth):
+        ground = jl.Terrain(depth * bowl, spacing=10.0, origin=(-20.0, -20.0), reflectance=0.3)
+        return jl.Scene(ground=ground)
+
+    lidar = jl.Lidar(altitude=1000.0, divergence=8.0, pulse=jl.GaussianPulse(4.0))
+    wave = jl.simulate(lidar, scene(1.5), key=key, window=(-60.0, 60.0))
+    depth = Unknown(apply=lambda s, d: scene(d), bounds=(-3.0, 3.0), start=0.0, name="depth")
+    fit = inversion.retrieve(
+        wave.reflectance, lidar, scene(0.0), [depth], noise=1e-4, time=wave.time, key=key, max_orders=1
+    )
+    assert float(fit.values["depth"]) == pytest.approx(1.5, abs=0.02)

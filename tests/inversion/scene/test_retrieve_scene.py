@@ -9,9 +9,10 @@ import pytest
 
 import inversion
 import jaxlidar as jl
+from inversion.fit.planning import TraceSizes, plan_for_bounds
 from inversion.fit.unknowns import bind_unknowns, flat_start
 from inversion.scene.map_priors import MapPriors
-from inversion.scene.retrieval import _plan_for_survey, _shot_groups, no_longer_falls
+from inversion.scene.retrieval import _shot_groups, no_longer_falls
 from inversion.scene.survey_model import SurveyModel
 
 LIDAR = jl.Lidar(wavelength=1064.0, altitude=1000.0, divergence=4.0, pulse=jl.GaussianPulse(4.0))
@@ -118,6 +119,35 @@ def test_a_result_is_printed_on_a_screen_and_stored(small_stand, tmp_path):
     assert dataset["leaf stderr"].dims == dataset["leaf"].dims
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("crown", "low", "high"), [(None, -0.06, 0.06), (3, -0.65, -0.35)])
+def test_wide_footprints_determine_effective_leaf_area(crown, low, high):
+    """Leaves spread evenly have their area; of crowns of 3 m, footprints of 12 m miss about half."""
+    profile = np.array([0, 0, 0.1, 0.2, 0.3, 0.4, 0.4, 0.3, 0.2, 0.1, 0, 0])
+    cover = np.ones((30, 30))
+    if crown is not None:
+        cover = np.kron(np.random.default_rng(0).uniform(size=(10, 10)) < 0.35, np.ones((crown, crown)))
+    lad = profile * cover[:, :, None] / cover.mean()
+    lidar = jl.Lidar(wavelength=1064.0, altitude=1000.0, divergence=12.0, pulse=jl.GaussianPulse(4.0))
+    survey = jl.Survey.grid(lidar, (9.0, 9.0), (21.0, 21.0), 3.0)
+    waves = jl.simulate_many(survey, stand(lad), key=jax.random.key(0), max_orders=1)
+    observed, noise = with_noise(waves)
+    unknown = inversion.Unknown(
+        "canopy.voxels.leaf",
+        bounds=(0.0, 1.0),
+        name="leaf",
+        start=np.full(lad.shape, 0.05),
+        prior=inversion.MarkovField(0.1),
+    )
+    options = {"noise": noise, "time": waves.time, "key": KEY, "max_orders": 1, "draws": 0}
+    fit = inversion.retrieve_scene(observed, survey, stand(lad), [unknown], **options)
+    inner = (slice(8, -8), slice(8, -8))
+    error = np.asarray(fit.values["leaf"])[inner].sum() / (G * lad[inner].sum()) - 1.0
+    assert low < error < high
+    # The records do not show it.
+    assert float(fit.misfit) < 1.1
+
+
 # -- products with the Jacobian ----------------------------------------------------------------------------
 
 
@@ -137,7 +167,7 @@ def model():
     bound = [bound[0]._replace(start=jnp.asarray(0.5 * lad))]
     groups = _shot_groups((0.5, 2.0), (-0.1, 0.1), np.arange(24) // 8, 24, bound)
     time = np.arange(-40.0, 10.0)
-    plan = _plan_for_survey(survey, scene, bound, time, max_orders=1, n_rays=8, n_photons=None)
+    plan = plan_for_bounds(survey, scene, bound, time, TraceSizes(2048, 8, 1))
     observed = random.uniform(0.0, 0.02, (24, 1, time.size))
     weight = random.uniform(10.0, 30.0, observed.shape)
     return SurveyModel(survey, scene, plan, bound, groups, observed, weight, jax.random.key(3)), observed
