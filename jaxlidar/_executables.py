@@ -6,16 +6,19 @@ depends on before it is traced: the code of its function, its static arguments, 
 options, settings of JAX, the releases of packages, the source files of this one, and the processor.
 """
 
+import contextlib
 import hashlib
 import os
 import pickle
 import platform
+import threading
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import jax.monitoring
 from jax.experimental import serialize_executable
 
 from jaxlidar._files import atomic_write
@@ -87,6 +90,25 @@ class ExecutableStore:
                 draft.write_bytes(content)
         except OSError as error:
             warnings.warn(f"{path}: a compiled program is not kept: {error}", stacklevel=2)
+
+
+@contextlib.contextmanager
+def noting_cache_hits() -> Iterator[list[str]]:
+    """Note whether JAX takes executables from its own persistent cache, in this thread.
+
+    **Returns:** a context, with a list that is empty as long as it does not.
+    """
+    thread, hits = threading.get_ident(), []
+
+    def listen(event: str, **_: Any) -> None:
+        if event == "/jax/compilation_cache/cache_hits" and threading.get_ident() == thread:
+            hits.append(event)
+
+    jax.monitoring.register_event_listener(listen)
+    try:
+        yield hits
+    finally:
+        jax.monitoring.unregister_event_listener(listen)
 
 
 def _source_stamp() -> list[tuple[str, int, int]]:

@@ -20,7 +20,7 @@ import jax
 import numpy as np
 
 from jaxlidar._checks import is_traced
-from jaxlidar._executables import ExecutableStore
+from jaxlidar._executables import ExecutableStore, noting_cache_hits
 
 # A compiled simulation takes 50 to 250 MB.
 MAX_VERSIONS = 16
@@ -237,8 +237,10 @@ class _Version:
 
     def _compile(self, lowered: Any, store: ExecutableStore | None) -> None:
         """Compile, and add the executable to the store."""
-        compiled = lowered.compile()
-        if store is not None and self.path is not None:
+        with noting_cache_hits() as hits:
+            compiled = lowered.compile()
+        # XLA writes an executable that it has read itself without machine code: it would fail when called.
+        if store is not None and self.path is not None and not hits:
             shapes = [jax.ShapeDtypeStruct(shape.shape, shape.dtype) for shape in self.result_shapes]
             store.save(self.path, compiled, _unflatten(self.result, iter(shapes)))
 

@@ -63,7 +63,10 @@ def cosine_or_sine(scale, name):
 
 
 @pytest.mark.parametrize("ahead", [False, True])
-def test_executables_are_loaded_without_being_traced(tmp_path, ahead):
+def test_executables_are_loaded_without_being_traced(tmp_path, ahead, monkeypatch):
+    # JAX's own cache takes no part, however long a busy machine compiles.
+    monkeypatch.setattr(_compilation_cache, "MIN_COMPILE_TIME", np.inf)
+
     def run(function, scale, name):
         """Run a program that this process has not compiled yet; return its result, and if it was traced."""
         TRACES.clear()
@@ -99,6 +102,21 @@ def test_executables_are_loaded_without_being_traced(tmp_path, ahead):
         assert run(cosine, scale, "a")[1]
         assert not run(cosine, scale, "a")[1]
     assert run(cosine, scale, "a")[1]
+
+
+def test_programs_from_the_cache_of_jax_are_not_stored_as_executables(tmp_path, monkeypatch):
+    """XLA writes what it has read without machine code, and such an executable cannot be called."""
+    monkeypatch.setattr(_compilation_cache, "MIN_COMPILE_TIME", -1.0)
+    scale = np.linspace(0.0, 1.0, 4, dtype=np.float32)
+    expected = np.cos(scale)
+    with jl.compilation_cache(tmp_path):
+        for stored in (True, False, False):
+            TRACES.clear()
+            np.testing.assert_allclose(Program(cosine)(scale, "a").values, expected, rtol=1e-6)
+            assert any(tmp_path.glob("*.executable")) is stored
+            # JAX's cache has the program, its executable is lost.
+            for path in tmp_path.glob("*.executable"):
+                path.unlink()
 
 
 def test_a_call_switches_the_cache_on_until_it_is_closed(tmp_path):
