@@ -107,8 +107,7 @@ def plan_for_bounds(
 
     **Raises:** ValueError for an inadmissible corner, such as a canopy that reaches above the sensor.
     """
-    survey = shots if isinstance(shots, Survey) else None
-    lidar = shots if survey is None else survey.middle
+    survey, lidar = (shots, shots.middle) if isinstance(shots, Survey) else (None, shots)
     interval = float(lidar.sampling_interval)
     # A thousandth of a sample keeps the last one in a window whose end is rounded.
     window = (float(time[0]), float(time[0]) + (time.size - 1 + 1e-3) * interval)
