@@ -302,7 +302,9 @@ def _oblique_axes(
     middle = 0.5 * (low + high)
     for name, centre, side in zip(("xlim", "ylim", "zlim"), middle, sides):
         ax.set(**{name: (centre - 0.5 * side, centre + 0.5 * side)})
-    ax.set_box_aspect(sides.tolist())
+    # The corners of a wide box, and their labels, would extend beyond the edges of the axes.
+    zoom: Any = 0.8
+    ax.set_box_aspect(sides.tolist(), zoom=zoom)
     # matplotlib's azimuth is counted from the x axis, counterclockwise.
     ax.view_init(elev=elevation, azim=90.0 - azimuth)
     ax.set(xlabel="x, east (m)", ylabel="y, north (m)", zlabel="height (m)")

@@ -76,9 +76,10 @@ def limit_height(ax: Axes, height: Float[np.ndarray, " bins"], total: np.ndarray
 def label_map(ax: Axes) -> None:
     """Set equal scales and the labels of a map."""
     ax.set_aspect("equal")
-    # Map coordinates have seven digits: few ticks, none with an offset or an exponent.
-    for axis in (ax.xaxis, ax.yaxis):
-        axis.set_major_locator(MaxNLocator(nbins=4))
+    # Map coordinates have seven digits: few ticks, none with an offset or an exponent, and none at the lower
+    # left, where both axes would have one.
+    for axis, prune in ((ax.xaxis, None), (ax.yaxis, "lower")):
+        axis.set_major_locator(MaxNLocator(nbins=4, prune=prune))
     ax.ticklabel_format(style="plain", useOffset=False)
     ax.tick_params(axis="y", labelrotation=90)
     ax.set_xlabel("x, east (m)")
