@@ -9,11 +9,14 @@ import jax
 import pytest
 from jaxtyping import install_import_hook
 
+from tests.long_examples import LONG_EXAMPLES
+
 # Most of the time of the tests is compilation, which takes far longer than execution here: optimise machine
 # code little and leave out, in the XLA of JAX 0.10, its newer and slower generator of kernels. (No
-# optimisation at all saves nothing more, and long traces take three times as long.) With XLA_FLAGS set, if
-# only to an empty text, tests run the code that users run. XLA reads it when JAX is first used.
-QUICK_COMPILATION = ["--xla_backend_optimization_level=1"]
+# optimisation at all saves nothing more, and long traces take three times as long. Nor is it worth while to
+# split programs, most of them small, into parts that compile side by side.) With XLA_FLAGS set, if only to an
+# empty text, tests run the code that users run. XLA reads it when JAX is first used.
+QUICK_COMPILATION = ["--xla_backend_optimization_level=1", "--xla_cpu_parallel_codegen_split_count=1"]
 if jax.__version__.startswith("0.10."):
     QUICK_COMPILATION.append("--xla_cpu_use_fusion_emitters=false")
 os.environ.setdefault("XLA_FLAGS", " ".join(QUICK_COMPILATION))
@@ -36,6 +39,14 @@ MAPPINGS = 40_000
 # Tests between two looks at the mappings: to list tens of thousands of them takes some 30 ms.
 TESTS_BETWEEN_COUNTS = 10
 _tests_run = itertools.count(1)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    """Mark long examples in docstrings as slow, where decorators cannot."""
+    for item in items:
+        if item.name in LONG_EXAMPLES and isinstance(item, pytest.DoctestItem):
+            item.add_marker(pytest.mark.slow)
 
 
 @pytest.fixture(autouse=True)

@@ -70,6 +70,7 @@ def test_absorption_is_split_between_two_plates():
     assert close(budget.below, 0.1, budget.stderr["below"])
 
 
+@pytest.mark.slow
 def test_albedo_one_returns_everything():
     canopy = jl.Canopy(slab(2.0), leaf=jl.Isotropic(albedo=1.0), sides="periodic", hotspot=False)
     scene = jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=1.0))

@@ -47,7 +47,7 @@ XS = jnp.stack([X, 2.0 * X])
         lambda f: jax.grad(lambda x: jnp.sum(f(x) ** 2)),
         lambda f: jax.jit(jax.grad(lambda x: jnp.sum(f(x) ** 2))),
         lambda f: jax.hessian(lambda x: jnp.sum(f(x) ** 2)),
-        lambda f: jax.jacrev(jax.grad(lambda x: jnp.sum(f(x) ** 2))),
+        pytest.param(lambda f: jax.jacrev(jax.grad(lambda x: jnp.sum(f(x) ** 2))), marks=pytest.mark.slow),
         lambda f: lambda x: jax.jvp(f, (x,), (x,))[1],
         lambda f: jax.grad(lambda x: jnp.sum(jax.checkpoint(f)(x) ** 2)),
         lambda f: jax.grad(lambda x: jnp.sum(jax.lax.map(lambda s: f(s * x), jnp.arange(3.0)) ** 2)),

@@ -205,6 +205,7 @@ def test_a_masked_node_of_a_terrain_is_refused():
         jl.Terrain(heights, spacing=1.0)
 
 
+@pytest.mark.slow
 def test_masked_bands_of_a_leaf_are_left_out():
     """Bands below the mask hold a number that would move N from 1.6 to 1.9."""
     bands = np.arange(500.0, 2400.0, 50.0)

@@ -106,11 +106,13 @@ def run_on_two_devices(code, axes, orders=1, zenith=0.0, ground="jl.Ground(slope
     assert process.returncode == 0, process.stderr[-2000:]
 
 
-@pytest.mark.parametrize("axes", ["Explicit", pytest.param("Auto", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("axes", ["Explicit", "Auto"])
 def test_the_first_order_within_shard_map(axes):
     run_on_two_devices(VALUES_WITHIN_SHARD_MAP, axes)
 
 
+@pytest.mark.slow
 def test_the_first_order_with_explicit_axes():
     run_on_two_devices(VALUES_UNDER_VMAP, "Explicit")
 

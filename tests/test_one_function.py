@@ -57,6 +57,7 @@ def test_a_loop_becomes_one_function():
     assert " while(" not in program, program
 
 
+@pytest.mark.slow
 def test_a_scene_can_be_traced_for_forward_derivatives_alone():
     lidar = jl.Lidar(divergence=10.0)
     voxels = jl.VoxelMap.from_extinction(

@@ -1,5 +1,6 @@
 """Pages of documentation: their examples run, their links have targets, and the API reference builds."""
 
+import pkgutil
 import re
 import shlex
 import subprocess
@@ -12,6 +13,7 @@ import pytest
 
 import inversion
 import jaxlidar
+from tests.long_examples import LONG_EXAMPLES
 
 matplotlib.use("agg")
 ROOT = Path(__file__).resolve().parents[1]
@@ -27,9 +29,14 @@ def blocks(path, language):
     return re.findall(rf"^```{language}\n(.*?)^```", path.read_text(), re.MULTILINE | re.DOTALL)
 
 
-# The last one of the front page simulates a hectare.
+# Those that take longer than the front page's first ones; its last one simulates a hectare.
+LONG = {
+    "README.md": {3},
+    "jaxlidar/README.md": {0, 1, 2, 5, 8, 9},
+    "inversion/README.md": {2, 3},
+}
 EXAMPLES = [
-    pytest.param(path, number, marks=pytest.mark.slow if (path, number) == (ROOT / "README.md", 3) else ())
+    pytest.param(path, number, marks=pytest.mark.slow if number in LONG.get(page_name(path), ()) else ())
     for path in PAGES
     for number in range(len(blocks(path, "python")))
 ]
@@ -44,6 +51,11 @@ def test_examples_run_as_printed(path, number, tmp_path, monkeypatch):
     exec(compile(blocks(path, "python")[number], page_name(path), "exec"), names)
     if "wave" in names:
         assert np.all(np.isfinite(np.asarray(names["wave"].reflectance)))
+
+
+def test_long_examples_are_examples():
+    for name in LONG_EXAMPLES:
+        assert ">>>" in pkgutil.resolve_name(name).__doc__, name
 
 
 NUMBER = r"-?\d+(?:\.\d+)?(?:e[-+]\d+)?"
@@ -107,6 +119,7 @@ def test_every_public_name_has_its_place_under_one_topic(package):
     assert [name for topic in topics for name in re.findall(r"`(\w+)`", topic)] == package.__all__
 
 
+@pytest.mark.slow
 def test_the_reference_builds_without_a_warning_and_its_links_have_targets(tmp_path):
     command = [sys.executable, "-W", "error::UserWarning", "-m", "jaxlidar.cli", "reference", "-o", tmp_path]
     process = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)

@@ -67,6 +67,7 @@ CASES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("tau", "ground", "sun_zenith", "stream", "relative_azimuth"), slow_unless(CASES[1:2], CASES)
 )

@@ -43,6 +43,7 @@ def waves(plan_of_two_orders):
     return jl.simulate_scenes(LIDAR, random_stands(), plan=plan_of_two_orders, key=KEY, chunk=3)
 
 
+@pytest.mark.slow
 def test_each_waveform_is_that_of_its_scene_alone(waves, plan_of_two_orders):
     simulate = eqx.filter_jit(lambda scene, key: jl.simulate(LIDAR, scene, plan=plan_of_two_orders, key=key))
     scenes = random_stands()
@@ -99,6 +100,7 @@ def test_effects_that_are_absent_from_one_scene_are_planned():
     assert leaf[1] > 0.05
 
 
+@pytest.mark.slow
 def test_terrain_that_is_flat_in_one_scene_is_planned_with_relief():
     def hills(height):
         heights = height * jnp.sin(jnp.arange(9.0))[:, None] * jnp.ones((9, 9))

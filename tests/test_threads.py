@@ -52,6 +52,7 @@ def test_waiting_tasks_are_dropped_after_an_error():
     assert len(started) <= 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("double", slow_unless([True], [False, True]))
 def test_simulate_keeps_the_precision(double, monkeypatch):
     expected = "float64" if double else "float32"

@@ -41,6 +41,7 @@ def sample_ends(truth):
     return height + 0.5 * np.diff(height)[0]
 
 
+@pytest.mark.slow
 @BY_PRECISION
 @pytest.mark.parametrize(
     ("zenith", "angles"), slow_unless([(40.0, "spherical")], [(0.0, "planophile"), (40.0, "spherical")])
@@ -250,6 +251,7 @@ def test_absent_quantities_are_nan_and_all_others_finite():
     assert float(none.gap_probability[-1]) == pytest.approx(0.0, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_a_window_that_opens_at_the_first_return_has_finer_truth():
     lidar = jl.Lidar(receiver=jl.Receiver(window="first return"), **NARROW_BEAM)
     wave = jl.simulate(lidar, jl.Scene(ground=jl.Ground()), key=KEY, truth=True)

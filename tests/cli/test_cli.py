@@ -76,6 +76,7 @@ slope = 5.0
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", slow_unless([".nc"], [".nc", ".zarr"]))
 def test_a_survey_is_simulated_shot_by_shot(tmp_path, capsys, suffix):
     case, out, plot = tmp_path / "a.toml", tmp_path / f"a{suffix}", tmp_path / "a.png"
@@ -176,6 +177,7 @@ def test_retrieve_finds_the_ground(tmp_path, capsys):
     assert "has no standard errors: give --noise" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_compiled_programs_are_stored_unless_refused(tmp_path):
     """In the user's cache folder; when the command has ended, JAX has its previous configuration."""
     code = (

@@ -144,6 +144,7 @@ def test_refused(example, tmp_path, monkeypatch, case):
         example("fit_airborne").main(arguments)
 
 
+@pytest.mark.slow
 def test_echoes_decide_which_scene_is_fitted(example, tmp_path, monkeypatch, capsys):
     """One echo: ground; two: ground and canopy; none: a row with the reason."""
     module = example("fit_airborne")

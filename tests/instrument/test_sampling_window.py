@@ -40,6 +40,7 @@ def test_energy_is_conserved_and_the_record_starts_with_the_first_return():
         )
 
 
+@pytest.mark.slow
 def test_the_ground_peak_depends_on_the_scene_above_it():
     """The height of the plate changes the samples of the ground, unless they lie at fixed instants."""
     grounds = {}

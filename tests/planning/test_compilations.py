@@ -71,7 +71,9 @@ def compiled():
     return count
 
 
-@pytest.mark.parametrize("name", CHANGES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow if name == "tolerance" else ()) for name in CHANGES]
+)
 def test_everyday_changes_compile_nothing(compiled, name):
     before = compiled()
     wave = simulate(**CHANGES[name])

@@ -52,6 +52,7 @@ SCENES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", slow_unless(["leaf and bark over ground"], SCENES))
 def test_optics_applied_while_light_is_traced_give_the_same(name):
     """The photons are the same, and so are waveform, errors and energy budget, to rounding."""

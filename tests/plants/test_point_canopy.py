@@ -106,6 +106,7 @@ def test_a_classified_cloud_without_ground_has_no_terrain():
     assert cloud.terrain is None
 
 
+@pytest.mark.slow
 def test_a_simulation_is_close_to_the_sum_of_points():
     """First order, with leaves as bright as the ground: 2/3 of their reflectance is the ground's."""
     random = np.random.default_rng(4)

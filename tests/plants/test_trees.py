@@ -37,6 +37,7 @@ def test_the_default_is_table_2(seed):
     assert (tree.bud_position + tree.bud_radius[:, None])[:, 2].max() == pytest.approx(15.0, rel=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", HABITS)
 def test_sizes_are_met_by_every_individual(name, individuals):
     habit = HABITS[name]()
@@ -59,6 +60,7 @@ def test_da_vincis_rule_holds_at_every_node(name, individuals):
         assert np.abs(excess).max() < 1e-9
 
 
+@pytest.mark.slow
 def test_da_vincis_exponent_is_a_parameter():
     tree = jl.grow(jl.broadleaf(exponent=2.4), seed=1)
     assert np.abs(excess_at_nodes(tree, 2.4)).max() < 1e-9

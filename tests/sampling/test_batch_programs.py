@@ -32,7 +32,7 @@ def same(plan):
     ("orders", "transmission", "change"),
     [
         (1, "diffuse", same),
-        (2, "diffuse", same),
+        pytest.param(2, "diffuse", same, marks=pytest.mark.slow),
         pytest.param(2, "straight", same, marks=pytest.mark.slow),
         pytest.param(2, "diffuse", with_applied_optics, marks=pytest.mark.slow),
     ],
@@ -61,6 +61,7 @@ def test_a_batch_is_the_trace_of_its_key(orders, transmission, change):
     np.testing.assert_allclose(estimate.neglected, terms.neglected, atol=2e-3)
 
 
+@pytest.mark.slow
 def test_traces_begin_to_compile_before_the_waveform_model_is_made(monkeypatch):
     """The program that takes longest begins first, in another thread."""
     batch_programs._compiled_higher.versions.clear()

@@ -7,7 +7,7 @@ import scipy.stats
 
 import jaxlidar as jl
 from jaxlidar.sampling.errors import student_widening
-from tests.helpers import slab, slow_unless
+from tests.helpers import slab
 
 LIDAR = jl.Lidar(wavelength=1064.0)
 SEEDS = 200
@@ -34,7 +34,8 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", slow_unless(["plate, eight batches"], CASES))
+@pytest.mark.slow
+@pytest.mark.parametrize("case", CASES)
 def test_the_truth_lies_within_two_reported_errors(case):
     scene, rtol = CASES[case]
     plan = jl.plan(LIDAR, scene, max_orders=4, n_photons=1024, n_rays=256, window=(-80.0, 60.0))

@@ -36,6 +36,7 @@ def test_eight_batches_have_at_least_as_many_photons(n_photons, traced):
     assert wave.info["stopped"] == "batches spent"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n_photons", slow_unless([100], [1, 100, 600_000]))
 def test_a_transformation_traces_as_many_photons(n_photons, batch_photons):
     """A program has eight batches: they are as large as it takes. 600,000 were 524,288, and 100 were 96."""

@@ -144,6 +144,7 @@ def test_backscatter_value():
     assert float(air.backscatter(532.0, 100.0, 100.0)) == pytest.approx(expected, rel=1e-5)
 
 
+@pytest.mark.slow
 @BY_PRECISION
 def test_derivatives(precision):
     air = Atmosphere(visibility=15.0, lidar_ratio=50.0, base_height=200.0)

@@ -114,6 +114,7 @@ def test_instances_are_scaled_rotated_and_shifted_copies():
     np.testing.assert_allclose(vectors.matrices(), instances.matrices(), atol=1e-6)
 
 
+@pytest.mark.slow
 @BY_PRECISION
 def test_rays_meet_meshes_that_repeat(precision):
     """The nearest of explicit copies, by Embree; two of the instances cross sides, one a corner."""

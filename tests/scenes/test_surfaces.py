@@ -99,6 +99,7 @@ def test_first_order_of_a_disc(reflectance, transmittance):
     assert not agrees(mean["disc"], stderr["disc"], 1.02 * reflectance * fraction, sigmas=4.0)
 
 
+@pytest.mark.slow
 def test_a_disc_in_the_energy_budget_and_in_the_plan():
     disc_scene = scene(0.7, reflectance=0.5, transmittance=0.3)
     wave = jl.simulate(

@@ -138,6 +138,7 @@ def test_terrain_in_a_plane_is_traced_as_a_plane():
     np.testing.assert_allclose(waves[0].reflectance, waves[1].reflectance, atol=1e-4 * peak)
 
 
+@pytest.mark.slow
 def test_a_plane_traced_as_heights():
     """Every ray meets the same slope, and the mean height is that on the axis."""
     flat = jl.Scene(ground=jl.Terrain(SLOPE * X, 1.0, (-10.0, -8.0), 0.4))
@@ -162,6 +163,7 @@ def moments(wave):
     return total, middle, jnp.sum(wave.reflectance[0] * (wave.time - middle) ** 2) / total
 
 
+@pytest.mark.slow
 def test_a_roof():
     roof = jl.Scene(
         ground=jl.Terrain([[-20 * SLOPE] * 2, [0.0] * 2, [-20 * SLOPE] * 2], 20.0, (-20, -10), 0.4)
@@ -212,6 +214,7 @@ def test_no_light_leaks_through_white_terrain():
 # -- reflectance by position -------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_raster_of_reflectance():
     """On a plane with rho = a + b x, the footprint returns the reflectance at its centre."""
     lidar, level = single_sample_lidar(divergence=0.005), np.zeros_like(HILLS)

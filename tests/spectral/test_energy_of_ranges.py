@@ -77,6 +77,7 @@ def test_the_pulse_changes_no_energy():
     np.testing.assert_allclose(energies[0], energies[1], rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_energy_of_the_air():
     """What the air returns, from a short pulse, over R^2 and convolved with the long one."""
     air = jl.Atmosphere(visibility=2.0, lidar_ratio=40.0)
@@ -102,6 +103,7 @@ def test_energy_of_the_air():
     assert abs(wrong[middle][0] / expected[middle][0] - 1.0) > 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("shared", "field_of_view"),
     slow_unless([(True, None)], [(False, None), (True, None), (True, 50.0)]),

@@ -66,9 +66,8 @@ def test_the_number_of_pivots_does_not_follow_the_optics():
     assert len(sizes) == 1
 
 
-@pytest.mark.parametrize(
-    "air", [None, pytest.param(jl.Atmosphere(visibility=5.0), marks=pytest.mark.slow)], ids=["clear", "hazy"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("air", [None, jl.Atmosphere(visibility=5.0)], ids=["clear", "hazy"])
 def test_a_batch_at_pivots_gives_the_batch(air):
     """Samples and energy budget, with an atmosphere whose transmittance differs between wavelengths too."""
     wavelength = WAVELENGTH[::10]

@@ -152,6 +152,7 @@ def test_finite_and_not_negative_and_no_more_than_was_emitted(precision, p):
         assert float(wave.energy_budget[name][0]) >= -1e-6, name
 
 
+@pytest.mark.slow
 @usually(max_examples=20)
 @given(scenes(), fractions)
 def test_brighter_ground_never_darkens(p, other_reflectance):
@@ -163,6 +164,7 @@ def test_brighter_ground_never_darkens(p, other_reflectance):
         assert np.max(bright - dark) > 0
 
 
+@pytest.mark.slow
 @usually(max_examples=20)
 @given(scenes(), st.floats(-300.0, 300.0), st.floats(-300.0, 300.0))
 def test_moving_everything_sideways(p, east, north):
@@ -178,6 +180,7 @@ def test_moving_everything_sideways(p, east, north):
     assert_alike(moved_wave.reflectance, wave.reflectance)
 
 
+@pytest.mark.slow
 @usually(max_examples=20)
 @given(scenes(), st.integers(1, 3))
 def test_turning_everything_about_the_vertical(p, quarters):

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import jaxlidar as jl
 from jaxlidar.trace.footprint import RaySlice, fibonacci_disc, make_beam
@@ -40,6 +41,7 @@ def test_slices_of_a_lattice_make_up_that_lattice(precision):
     assert np.abs(angle).max() < 1e-4
 
 
+@pytest.mark.slow
 def test_every_shot_has_the_error_that_it_reports_within_the_tolerance():
     survey, scene, rtol = shots(), edge(), 0.01
     waveforms = jl.simulate_many(survey, scene, key=KEY, max_orders=1, rtol=rtol, shared=False)
@@ -62,6 +64,7 @@ def test_every_shot_has_the_error_that_it_reports_within_the_tolerance():
     assert chi_squared(wrong).mean() > 100.0
 
 
+@pytest.mark.slow
 def test_a_tolerance_out_of_reach_is_reported():
     waveforms = jl.simulate_many(shots(1), edge(), key=KEY, max_orders=1, rtol=1e-6, shared=False)
     assert 1e-6 < float(waveforms.error[0]) < 1e-3

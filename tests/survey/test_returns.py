@@ -214,6 +214,7 @@ def test_the_strongest_returns_are_taken_where_there_are_too_many(waveforms):
     np.testing.assert_allclose(returns.amplitude, strongest.amplitude.reshape(-1, 2).max(axis=1))
 
 
+@pytest.mark.slow
 def test_decomposition_agrees_with_the_scene(survey, waveforms):
     """Over the first shots; `inversion` is imported above."""
     assert inversion.gaussian_decomposition is not None

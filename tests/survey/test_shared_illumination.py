@@ -130,6 +130,7 @@ def test_splines_fit_footprints():
         assert np.allclose(mean, survey.position[:, axis], atol=1e-2)
 
 
+@pytest.mark.slow
 def test_light_is_shared_where_footprints_overlap():
     overlapping = jl.Survey.grid(lidar(), (-6, -6), (6, 6), 3.0)
     assert jl.simulate_many(overlapping, stand(), key=KEY, **FAST).info["shared"]

@@ -143,6 +143,7 @@ def test_shots_agree_with_single_simulations(kind, shared, shots):
     assert not agree(deviations(jl.simulate_many(shifted, scene, key=KEY, **options), waves))
 
 
+@pytest.mark.slow
 def test_deterministic_shots_equal_single_simulations():
     survey = jl.Survey(lidar(wavelength=(532.0, 1064.0)), [(0, 0), (40, 5)], [0.0, 30.0], [0.0, 70.0])
     scene = jl.Scene(

@@ -69,6 +69,7 @@ def untiled_and_tiled() -> tuple[jl.Waveforms, jl.Waveforms]:
     return untiled, in_tiles
 
 
+@pytest.mark.slow
 def test_the_same_waveforms_as_of_the_untiled_scene_at_first_order(untiled_and_tiled):
     untiled, in_tiles = untiled_and_tiled
     np.testing.assert_array_equal(untiled.time, in_tiles.time)
@@ -151,6 +152,7 @@ def test_an_interrupted_run_continues_with_the_same_results(tmp_path):
         simulate_forest(tiled(Forest(density=0.9 * DENSITY)), **options)
 
 
+@pytest.mark.slow
 def test_coordinates_of_millions_of_metres_change_nothing_and_bare_tiles_have_all_materials():
     density = DENSITY.copy()
     density[:26, :26] = 0.0
@@ -166,6 +168,7 @@ def test_coordinates_of_millions_of_metres_change_nothing_and_bare_tiles_have_al
     np.testing.assert_allclose(total, 1.0, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_truth_is_that_of_the_untiled_scene(untiled_and_tiled, tmp_path):
     """In memory and from a file, in the survey's order."""
     untiled, in_tiles = untiled_and_tiled
@@ -211,6 +214,7 @@ class Street:
         return jl.Scene(meshes=(house,), ground=jl.Ground(reflectance=0.3))
 
 
+@pytest.mark.slow
 def test_parts_may_have_meshes():
     shots = jl.Survey(
         jl.Lidar(altitude=500.0, divergence=1.0), position=[(12, 13), (32, 13), (12, 33), (36, 33)]

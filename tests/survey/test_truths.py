@@ -51,6 +51,7 @@ def near(a, b, tolerance=1e-3):
     )
 
 
+@pytest.mark.slow
 def test_truths_are_those_of_each_shot_alone(waveforms):
     plan = jl.plan(OBLIQUE, SCENE, max_orders=1, n_rays=512)
     assert waveforms.info["shared"] is False

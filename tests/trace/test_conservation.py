@@ -85,6 +85,7 @@ def test_small_deposits_on_large_sums():
     np.testing.assert_allclose(sum(wave.energy_budget.values()), 1.0, atol=2e-4)
 
 
+@pytest.mark.slow
 def test_light_outside_the_record_is_all_counted():
     """A record far below the slab holds nothing: all returns of order one are outside of it."""
     lidar = jl.Lidar(divergence=2.0)
@@ -99,6 +100,7 @@ def test_light_outside_the_record_is_all_counted():
     np.testing.assert_allclose(outside[1], outside[0], rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_plate_behind_the_end_of_the_record_absorbs_nothing():
     """The record ends between two black plates that transmit: the lower one is not reached any more."""
     plates = (jl.Plate(5.0, 0.0, 0.5), jl.Plate(30.0, 0.0, 0.5))

@@ -1,10 +1,10 @@
 """Derivatives by automatic differentiation against central differences of converged means.
 
 A crown of 6 x 5 x 8 random voxels of leaf and bark over ground (and, in the second scene, a half-open plate
-beneath it), five orders. The default test takes five of the parameters. The functionals are the first three
-moments of the waveform in time: the zeroth depends on the returned energy, the others on its times. Both
-sides are means over independent keys, and their difference is tested against its standard error. The level is
-Sidak's for all comparisons of one scene at 1 in 1,000.
+beneath it), five orders. The functionals are the first three moments of the waveform in time: the zeroth
+depends on the returned energy, the others on its times. Both sides are means over independent keys, and their
+difference is tested against its standard error. The level is Sidak's for all comparisons of one scene at 1 in
+1,000.
 """
 
 import equinox as eqx
@@ -15,7 +15,8 @@ import pytest
 from scipy.stats import norm
 
 import jaxlidar as jl
-from tests.helpers import slow_unless
+
+pytestmark = pytest.mark.slow
 
 KEYS = 12
 RANDOM = np.random.default_rng(5)
@@ -32,9 +33,7 @@ COMMON = {
     "leaf reflectance": (0.4, 0.05),
     "ground reflectance": (0.5, 0.05),
 }
-FEW = ("one voxel", "voxel size", "canopy height", "ground reflectance")
 SCENES = {
-    "nadir, slope, few": (0.0, {name: COMMON[name] for name in FEW} | {"slope": (10.0, 1.0)}),
     "nadir, slope": (0.0, COMMON | {"slope": (10.0, 1.0)}),
     "off nadir, plate": (12.0, COMMON | {"plate height": (0.7, 0.05), "coverage": (0.5, 0.05)}),
 }
@@ -68,10 +67,7 @@ def build(p):
     )
 
 
-@pytest.fixture(
-    scope="module",
-    params=slow_unless(["nadir, slope, few"], SCENES),
-)
+@pytest.fixture(scope="module", params=SCENES)
 def estimates(request):
     """Derivatives by AD and by differences for every parameter, of shape (keys, moments) each."""
     zenith, table = SCENES[request.param]
@@ -138,7 +134,6 @@ def test_derivatives_are_not_noisier_than_their_differences(estimates):
         assert np.all(np.std(exact, axis=0) < 10 * np.std(difference, axis=0)), name
 
 
-@pytest.mark.slow
 def test_forward_and_reverse_agree():
     """The derivative along v by forward mode is the product of v and the gradient by reverse mode."""
     _, table = SCENES["nadir, slope"]

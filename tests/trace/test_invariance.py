@@ -91,6 +91,7 @@ def test_the_chunk_size_does_not_matter(reference_wave, monkeypatch):
     assert float(np.max(wave.components["higher"])) > 0.01 * float(np.max(wave.reflectance))
 
 
+@pytest.mark.slow
 def test_one_trace_serves_every_wavelength(reference_wave):
     plan, wave = reference_wave
     for i in range(3):

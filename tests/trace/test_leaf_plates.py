@@ -62,6 +62,7 @@ def all_orders(coverage=1.0, denominator=None, passing=None):
     return coverage * R + passing**2 * RHO / denominator
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("transmission", slow_unless(["diffuse"], ["straight", "diffuse"]))
 @pytest.mark.parametrize("coverage", slow_unless([0.6], [0.6, 1.0]))
 def test_all_orders(transmission, coverage):

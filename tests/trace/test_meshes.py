@@ -85,6 +85,7 @@ def test_a_box_and_its_shadow():
     assert abs(sums["ground"] - 0.3 * cosine * (1.0 - top)) > 0.02
 
 
+@pytest.mark.slow
 def test_a_sphere_is_resolved_in_time():
     """A Lambertian sphere of radius a in a top-hat beam of radius w.
 
@@ -125,6 +126,7 @@ def test_a_wire():
     assert abs(expected - rho * erf(np.sqrt(2) * r / w)) > 0.1 * expected
 
 
+@pytest.mark.slow
 def test_two_facing_sheets_by_their_series():
     """A sheet of R, T over ground of r returns R + T^2 r / (1 - R r); both are meshes of 2 triangles."""
     sheet = level(3e3, 2.0, reflectance=0.4, transmittance=0.3)
@@ -175,6 +177,7 @@ def test_materials_share_one_mesh():
     assert sums["ground"] == pytest.approx(0.0, abs=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reverse", slow_unless([False], [False, True]))
 def test_derivatives_of_smooth_returns(reverse):
     """A tilted mesh returns rho cos(tilt), its mean time is -2 h / c; and an OutlineWarning is given."""
@@ -222,6 +225,7 @@ def test_derivatives_of_smooth_returns(reverse):
         np.testing.assert_allclose(backward, forward, rtol=1e-3, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_mesh_within_voxels():
     """Below a depth d of leaf of extinction k a mesh returns rho exp(-k d), with the derivative k in height.
 
@@ -259,6 +263,7 @@ def repeating(period=8.0, leaf=0.3, **elements):
     return jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=0.3), **elements)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("max_orders", slow_unless([1], [1, 5]))
 def test_a_level_mesh_that_repeats_is_a_plate(max_orders):
     """A square as wide as the period has no gaps, under a beam many periods wide; off nadir."""
@@ -277,6 +282,7 @@ def test_a_level_mesh_that_repeats_is_a_plate(max_orders):
     assert float(waves[0].components["mesh"].sum()) > 0.2
 
 
+@pytest.mark.slow
 def test_a_mesh_across_sides_of_a_period_is_whole():
     """A box at a corner of the period is that in its middle, for beams that move with it."""
     heights = np.zeros((8, 8))
@@ -294,6 +300,7 @@ def test_a_mesh_across_sides_of_a_period_is_whole():
         assert sums[0]["mesh"] > 0.1
 
 
+@pytest.mark.slow
 def test_meshes_repeat_without_the_canopy_that_is_left_out():
     square = [[1.0, 1, 3], [9, 1, 3], [9, 9, 3], [1, 9, 3]]
     scene = repeating(meshes=(jl.MeshSurface((square, [[0, 1, 2], [0, 2, 3]]), reflectance=0.4),))
@@ -302,6 +309,7 @@ def test_meshes_repeat_without_the_canopy_that_is_left_out():
     assert sums["ground"] == pytest.approx(0.0, abs=1e-5)
 
 
+@pytest.mark.slow
 def test_truth_counts_meshes_among_what_intercepts():
     scene = jl.Scene(meshes=(level(1.0, 3.0),), ground=jl.Ground())
     truth = jl.truth_of(wide_lidar(1.0, profile="top-hat", sampling_interval=1.0), scene)

@@ -84,6 +84,7 @@ def test_blocks_hold_every_segment_once(block: int, monkeypatch: pytest.MonkeyPa
     np.testing.assert_array_equal(sums, np.where((length > 0) & (extinction > 0), ray_weight, 0.0))
 
 
+@pytest.mark.slow
 def test_empty_voxels_have_their_derivatives():
     """Forward, in reverse, and as differences; skipping empty voxels would make them zero."""
     with jax.enable_x64(True):

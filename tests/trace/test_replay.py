@@ -112,6 +112,7 @@ CASES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "build", "zenith", "orders", "names"), CASES)
 def test_forward_and_reverse_agree(name, build, zenith, orders, names):
     forward, reverse = forward_and_reverse(problem(build, zenith, orders), names)
@@ -178,6 +179,7 @@ def temporaries(orders, **sizes):
     return memory.temp_size_in_bytes
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_rays():
     small, large = (temporaries(1, n_rays=n) for n in (1024, 16_384))
     # Positions of the rays themselves: three numbers each, in few copies.

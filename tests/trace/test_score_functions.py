@@ -20,7 +20,7 @@ from jaxlidar.trace import higher_orders
 from jaxlidar.trace.device_scene import build_device_scene
 from jaxlidar.trace.response import trace_with_scores
 from jaxlidar.trace.score_functions import make_slopes
-from tests.helpers import BY_PRECISION, slow_unless
+from tests.helpers import BY_PRECISION
 
 RANDOM = np.random.default_rng(5)
 LEAF, BARK = RANDOM.uniform(0, 1, (6, 5, 8)), RANDOM.uniform(0, 0.3, (6, 5, 8))
@@ -141,8 +141,9 @@ def relative_difference(case: ScoreCase) -> float:
 TOLERANCE = {"float32": 1e-5, "float64": 1e-13}
 
 
+@pytest.mark.slow
 @BY_PRECISION
-@pytest.mark.parametrize("name", slow_unless(["layers"], CASES))
+@pytest.mark.parametrize("name", CASES)
 def test_scores_are_tangents(name, precision):
     assert relative_difference(CASES[name]) < TOLERANCE[precision]
 

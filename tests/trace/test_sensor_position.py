@@ -115,6 +115,7 @@ def test_a_wide_beam_widens_from_the_sensor():
     assert abs(mean - 2.0) > 100 * 1e-5
 
 
+@pytest.mark.slow
 def test_time_and_light_are_those_of_the_same_lidar_by_its_altitude():
     scene = jl.Scene(canopy=canopy(), ground=jl.Ground(slope=10.0))
     options = {"divergence": 20.0, "aperture": 0.05, "profile": "top-hat"}
@@ -135,12 +136,12 @@ def test_time_and_light_are_those_of_the_same_lidar_by_its_altitude():
     ("height", "zenith", "length"),
     [
         # From below, from within upwards and downwards, level to the side of the map, and from above.
-        (-3.0, 150.0, 10.0 / np.cos(np.deg2rad(30.0))),
-        (4.0, 150.0, 6.0 / np.cos(np.deg2rad(30.0))),
+        pytest.param(-3.0, 150.0, 10.0 / np.cos(np.deg2rad(30.0)), marks=pytest.mark.slow),
+        pytest.param(4.0, 150.0, 6.0 / np.cos(np.deg2rad(30.0)), marks=pytest.mark.slow),
         (4.0, 20.0, 4.0 / np.cos(np.deg2rad(20.0))),
         (4.0, 90.0, 20.0),
-        (4.0, 180.0, 6.0),
-        (25.0, 10.0, 10.0 / np.cos(np.deg2rad(10.0))),
+        pytest.param(4.0, 180.0, 6.0, marks=pytest.mark.slow),
+        pytest.param(25.0, 10.0, 10.0 / np.cos(np.deg2rad(10.0)), marks=pytest.mark.slow),
         # From above, looking up.
         (25.0, 170.0, 0.0),
     ],
@@ -195,6 +196,7 @@ def isotropic_second_order(extinction, top, sensor_height, albedo, rng, n):
     return value.mean(), value.std() / np.sqrt(n)
 
 
+@pytest.mark.slow
 def test_second_order_within_a_slab_agrees_with_another_code():
     """Fails by 20 standard errors if light from behind the sensor, or without the cosine, were seen."""
     extinction, albedo, height = 0.3, 0.8, 4.0
@@ -288,6 +290,7 @@ def mesh_wall(east, reflectance):
     return jl.MeshSurface((corners, [[0, 1, 2], [0, 2, 3]]), reflectance)
 
 
+@pytest.mark.slow
 def test_a_mesh_is_seen_from_before_it_alone():
     ahead = jl.Scene(meshes=(mesh_wall(10.0, 0.6),))
     for zenith, azimuth in ((90.0, 90.0), (60.0, 70.0)):
@@ -346,6 +349,7 @@ def test_a_terrestrial_scan_of_a_sphere():
     np.testing.assert_allclose(centroid, expected[:3], rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_the_range_has_a_derivative_by_the_height_of_the_sensor():
     """Over level ground seen at the zenith angle 30 degrees, the range is z / cos(30 degrees)."""
     scene = jl.Scene(ground=jl.Ground())

@@ -137,7 +137,8 @@ def ross_brf(reflectance, transmittance, tau, ground, streams=48):
     return discrete_ordinates(moments, reflectance + transmittance, tau, ground)
 
 
-@pytest.mark.parametrize("g", [0.5, pytest.param(-0.3, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("g", [0.5, -0.3])
 def test_henyey_greenstein_scattering(g):
     value, stderr, neglected = simulated(1.0, jl.HenyeyGreenstein(albedo=0.9, g=g), 0.2, 20, 1 << 17, seed=5)
     moments = g ** np.arange(64)
@@ -150,9 +151,10 @@ def test_henyey_greenstein_scattering(g):
         assert abs(value - discrete_ordinates(wrong ** np.arange(64), 0.9, 1.0, 0.2)) > 5 * bound
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("reflectance", "transmittance", "tau", "ground"),
-    [(0.4, 0.3, 1.0, 0.2), pytest.param(0.1, 0.6, 2.0, 0.3, marks=pytest.mark.slow)],
+    [(0.4, 0.3, 1.0, 0.2), (0.1, 0.6, 2.0, 0.3)],
 )
 def test_bi_lambertian_leaves(reflectance, transmittance, tau, ground):
     leaf = jl.LeafOptics(reflectance=reflectance, transmittance=transmittance)

@@ -55,9 +55,9 @@ def expected(case, kappa, mu, path):
 @pytest.mark.parametrize(
     ("case", "zenith", "hotspot"),
     [
-        ("leaf", 0.0, False),
+        pytest.param("leaf", 0.0, False, marks=pytest.mark.slow),
         ("isotropic", 0.0, True),
-        ("bark", 0.0, False),
+        pytest.param("bark", 0.0, False, marks=pytest.mark.slow),
         ("isotropic bark", 0.0, True),
         ("leaf and bark", 30.0, False),
         pytest.param("leaf and bark", 30.0, True, marks=pytest.mark.slow),

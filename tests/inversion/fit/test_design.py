@@ -46,6 +46,7 @@ def reference_cost(wavelength, fwhm, scenes, plan_window=(-120.0, 60.0)):
     return np.mean(costs)
 
 
+@pytest.mark.slow
 def test_costs_are_those_of_cramer_rao(best):
     scenes = [stand(), stand(Cab=60.0, density=0.2)]
     assert best.initial_cost == pytest.approx(reference_cost(680.0, 8.0, scenes), rel=0.02)

@@ -62,6 +62,7 @@ def test_priors_add_to_the_information():
     assert np.allclose(bound.stderr["reflectance"], expected, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_chlorophyll_is_invisible_at_1064_nm():
     leaf = jl.Prospect(Cab=40.0, Cw=0.012)
     voxels = jl.VoxelMap.from_lad(
@@ -114,6 +115,7 @@ def test_a_profile_of_a_linear_problem_is_the_standard_error(target):
     assert result.others["reflectance"].shape == (9, 2)
 
 
+@pytest.mark.slow
 def test_all_points_of_a_profile_are_weighted_alike():
     """Noise of the pulse grows with the echo: weighted by its own noise, bright ground would fit best."""
     lidar, recorder = dataclasses.replace(LIDAR, wavelength=np.array([1064.0])), Recorder(pulse_noise=0.1)

@@ -125,6 +125,7 @@ def stand_density():
     return inversion.log_density(observed, LIDAR, stand((0.2, 0.2, 0.2), 0.1), unknowns, **options)
 
 
+@pytest.mark.slow
 def test_gradients_are_those_of_finite_differences(stand_density):
     x = stand_density.initial
     value, gradient = jax.value_and_grad(stand_density)(x)

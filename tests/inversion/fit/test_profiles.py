@@ -275,6 +275,7 @@ def profile_of(layers, prior):
     )
 
 
+@pytest.mark.slow
 def test_layers_lie_on_the_ground():
     density = np.array([0.4, 0.1, 0.3])
     flat = stand(density, below=2).canopy.voxels
@@ -312,6 +313,7 @@ def first_column_at(slope):
 SHARP = {"divergence": 1e-3, "altitude": 4e5, "sampling_interval": 0.25}
 
 
+@pytest.mark.slow
 def test_the_closed_form_is_exact_for_a_sharp_pulse():
     """The closed form assumes a hot spot, single scattering, and the ratio of reflectances that is given."""
     density = np.array([0.0, 0.1, 0.3, 0.2, 0.05])

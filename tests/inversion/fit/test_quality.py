@@ -225,6 +225,7 @@ def test_undetermined_and_collinear_unknowns_have_a_finite_sandwich():
     assert 0 < covariance.independent_samples <= 50
 
 
+@pytest.mark.slow
 def test_one_fit_and_many_give_the_same_evidence():
     """Verdict and errors of a fit from two starts, alone and among many; robust errors are never narrower."""
     scene = jl.Scene(ground=jl.Ground(height=0.5, reflectance=0.3))
@@ -251,6 +252,7 @@ def test_one_fit_and_many_give_the_same_evidence():
     assert "height at bound" in fits.to_xarray()
 
 
+@pytest.mark.slow
 def test_starts_that_end_elsewhere_at_the_same_misfit_are_doubt():
     """Below a slanting beam, slopes of 10 and 30 degrees broaden the echo alike."""
     lidar = jl.Lidar(altitude=500.0, divergence=10.0, zenith=20.0, azimuth=90.0)

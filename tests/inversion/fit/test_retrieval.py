@@ -226,6 +226,7 @@ def retrieve_ground(observed=None, unknowns=GROUND, noise=1e-3, scene=None, lida
     return inversion.retrieve(observed, lidar, scene, unknowns, noise=noise, key=jax.random.key(0), **options)
 
 
+@pytest.mark.slow
 @BY_PRECISION
 def test_errors_are_as_large_as_stated(precision):
     """Over realisations of the noise, deviations over standard errors have variance 1, chi2 has mean 1."""
@@ -335,6 +336,7 @@ def test_failure_is_a_status_and_raised_on_request_only():
     assert np.isinf(fit.stderr["broken"])
 
 
+@pytest.mark.slow
 def test_a_step_to_a_simulation_that_is_not_finite_is_rejected():
     """Beyond a factor of 0.9 the simulation fails; the truth is at 1."""
     unknown = Unknown(
@@ -516,6 +518,7 @@ def test_inadmissible_arguments_are_refused(call, message):
         call()
 
 
+@pytest.mark.slow
 def test_relief_is_found_from_terrain_that_is_flat_at_the_start():
     key = jax.random.key(0)
     x = np.arange(-20.0, 21.0, 10.0)

@@ -49,6 +49,7 @@ def fit(footprints, lidar=LIDAR, scene=START, unknowns=UNKNOWNS, **options):
     return inversion.retrieve_many(observed, lidar, scene, unknowns, **options)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options", slow_unless([{}], [{}, {"starts": 2}, {"max_orders": 2, "n_photons": 1024, "max_steps": 3}])
 )
@@ -65,6 +66,7 @@ def test_workers_give_the_same_fits(footprints, options):
     assert [p.done for p in reports] == list(range(1, COUNT + 1))
 
 
+@pytest.mark.slow
 def test_a_worker_that_dies_costs_its_fits_a_second_try(footprints, tmp_path):
     expected, path = fit(footprints, lanes=2), tmp_path / "fits.sqlite"
     dying = Dying([1])
@@ -120,6 +122,7 @@ def test_a_failed_fit_does_not_affect_its_neighbours(footprints):
     assert np.all(np.isfinite(fits.values["height"]))
 
 
+@pytest.mark.slow
 def test_each_footprint_may_have_its_own_pulse_and_start(footprints):
     wide_pulse = dataclasses.replace(LIDAR, pulse=jl.GaussianPulse(fwhm=6.0))
     lidars = [LIDAR if i % 2 else wide_pulse for i in range(COUNT)]
@@ -159,6 +162,7 @@ def test_an_interrupted_run_goes_on_from_its_checkpoint(footprints, tmp_path):
         fit((observed + 0.1, noise, time), path=path)
 
 
+@pytest.mark.slow
 def test_several_starts_find_a_minimum_that_one_start_misses(footprints):
     observed, noise, time = footprints
     far_start = jl.Scene(ground=jl.Ground(height=-1.9, reflectance=np.array([0.3, 0.3])))

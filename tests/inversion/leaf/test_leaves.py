@@ -38,6 +38,7 @@ def spectra(traits, bands=BANDS):
     return (np.array(s) for s in jl.prospect_spectra(leaves, bands))
 
 
+@pytest.mark.slow
 @BY_PRECISION
 def test_traits_without_noise(precision):
     truth = random_traits(45)
@@ -64,6 +65,7 @@ def errors_are_as_stated(fit, truth):
     return bool(np.all(np.abs(mean) < 4 / np.sqrt(n)) and np.all(np.abs(variance - 1) < 4 * np.sqrt(2 / n)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [NOISE, None])
 def test_errors_are_as_stated(noisy_leaves, noise):
     truth, data = noisy_leaves
@@ -121,6 +123,7 @@ def test_a_missing_sample_is_left_out(noisy_leaves):
         np.testing.assert_allclose(nan_in_both.stderr[name], without_band.stderr[name], rtol=0.1)
 
 
+@pytest.mark.slow
 def test_a_leaf_that_fails_does_not_affect_others(noisy_leaves):
     _, data = noisy_leaves
     R, T = (s[:30].copy() for s in data)
@@ -237,6 +240,7 @@ def coverage(fit, truth):
     return {n: float(np.mean(np.abs(fit.traits[n] - truth[n]) < 2 * fit.stderr[n])) for n in fit.traits}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("domain", slow_unless([None], [None, "recommended"]))
 def test_errors_cover_model_errors(noisy_leaves, domain):
     """2 standard errors cover 95.4 %; of 200 leaves the mean within 92 to 98, no trait below 88."""
@@ -338,6 +342,7 @@ def error_of(fit, record):
     }
 
 
+@pytest.mark.slow
 def test_measured_leaves_of_angers(shared):
     """Errors are at most 5 % above those of PROSPECT-D with scipy on all ANGERS leaves; here every second."""
     record = measured(shared, "angers_half.npz")

@@ -185,6 +185,7 @@ def test_ground_is_the_lowest_mode_above_the_threshold():
     assert np.isnan(find_ground(height, power, threshold=2.0))
 
 
+@pytest.mark.slow
 def test_plant_area_of_a_simulated_canopy():
     """With the hot spot, the simulation has the gap-probability model: the leaf area index is retrieved.
 

@@ -151,6 +151,7 @@ def recorded(shared):
     return path
 
 
+@pytest.mark.slow
 def test_recorded_shots_agree_with_the_product(recorded, shared, tmp_path):
     table = inversion.gedi_table(recorded)
     assert len(table) == 300
@@ -171,6 +172,7 @@ def test_recorded_shots_agree_with_the_product(recorded, shared, tmp_path):
     assert np.mean(table["quality"] == "good") > 0.6
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_table(recorded, tmp_path, monkeypatch, capsys):
     from inversion.commands import gedi
 

@@ -213,6 +213,7 @@ def test_steps_of_rounded_heights_are_even():
         np.testing.assert_allclose(lifted, expected, atol=0.02)
 
 
+@pytest.mark.slow
 def test_each_shot_has_its_step():
     """A pulse in ns spans twice as many samples in a record of half the step."""
     pulse = jl.GaussianPulse(fwhm=12.0)
@@ -281,6 +282,7 @@ def test_plant_area_of_missing_and_closed_canopies():
             plant_area_index(np.array([0.5, np.nan, gap]))
 
 
+@pytest.mark.slow
 def test_records_of_zeros_in_a_batch():
     """They have no ground, no ends and no echoes, and the others are as alone."""
     y = np.stack([noisy_record(), 0.0 * HEIGHT])

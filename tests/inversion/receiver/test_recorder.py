@@ -72,6 +72,7 @@ def interleaved():
     return records, pulse, height, offsets
 
 
+@pytest.mark.slow
 def test_offsets_and_width_are_found_with_errors_as_stated(interleaved):
     records, pulse, height, offsets = interleaved
     recorder = Recorder(width=(0.2, 5.0), offset=(-1.0, 1.0), interleaved=2)
@@ -93,6 +94,7 @@ def test_offsets_and_width_are_found_with_errors_as_stated(interleaved):
     assert chi2 == pytest.approx(fits.reduced_chi2[0], rel=1e-3)
 
 
+@pytest.mark.slow
 def test_an_impulse_is_a_width_of_its_own_shape(interleaved):
     """The same receiver, given as an impulse instead of a width."""
     records, pulse, height, _ = interleaved
@@ -184,6 +186,7 @@ def test_one_fit_is_that_of_a_batch(interleaved):
         np.testing.assert_allclose(batch.values[name][0], value, rtol=1e-3, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_checkpoints_refuse_another_recorder(interleaved, tmp_path):
     records, pulse, *_ = interleaved
     path = tmp_path / "fits.sqlite"
@@ -255,6 +258,7 @@ def test_bad_hard_targets_are_refused(changes, message):
         inversion.receiver_impulse(**arguments)
 
 
+@pytest.mark.slow
 def test_a_recorded_pulse_is_simulated_as_it_was_recorded():
     """Samples of the pulse, as means over bins, are those of the record."""
     time = np.arange(-8.0, 9.0)
@@ -322,6 +326,7 @@ def test_other_bad_input_is_refused():
         )
 
 
+@pytest.mark.slow
 def test_correlated_noise_is_noise_of_the_fit():
     """Standard errors and chi-squared are as stated; with noise taken as independent they are not."""
     random, pulse, rho = np.random.default_rng(11), jl.SampledPulse(LAG, POWER), 0.6

@@ -50,6 +50,7 @@ def locate(case, records, monkeypatch, nodes, **changes):
     return inversion.geolocate(records, survey, scene, **({"height": height} | arguments))
 
 
+@pytest.mark.slow
 def test_footprints_are_sums_of_narrow_beams_with_exact_derivatives(case, nodes):
     _, survey, waves = case
     records = geolocation._observed_records(waves, None, 1e-3, survey)
@@ -100,6 +101,7 @@ def test_standard_errors_hold_over_draws_of_noise(case, nodes, monkeypatch):
     assert np.mean(np.abs(2.0 * z) < 2.0) < 0.85
 
 
+@pytest.mark.slow
 def test_drift_and_height_offset_are_found(case, nodes, monkeypatch):
     _, _, waves = case
     clean = np.asarray(waves.reflectance)[:, 0]

@@ -310,6 +310,7 @@ START = jl.Scene(ground=jl.Ground(reflectance=0.4))
 KEY = jax.random.key(1)
 
 
+@pytest.mark.slow
 def test_gains_and_offsets_of_groups_are_fitted_with_the_scene():
     survey, waves, records, groups = flat_case()
     shared = {"noise": 1e-4, "time": waves.time, "key": KEY, "max_orders": 1, "draws": 0}
@@ -362,6 +363,7 @@ def test_standard_errors_are_those_of_the_inverse_of_the_matrix():
     assert all(abs(float(fit.values[n]) - truth[n]) < 4.0 * float(fit.stderr[n]) for n in truth)
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_goes_on_and_another_problem_is_refused(tmp_path):
     survey, waves, _, groups = flat_case()
     path = tmp_path / "fit.sqlite"

@@ -1,0 +1,30 @@
+"""Names of the docstrings whose examples are long; conftest marks them slow."""
+
+# Examples that take longer than some six seconds.
+LONG_EXAMPLES = {
+    "inversion.fit.design.design",
+    "inversion.leaf.leaves.LeafFit",
+    "inversion.leaf.leaves.invert_leaves",
+    "inversion.metrics.gedi_table.gedi_table",
+    "inversion.receiver.recorder.Recorder",
+    "inversion.scene.geolocation.geolocate",
+    "inversion.scene.retrieval.retrieve_scene",
+    "inversion.scene.scene_retrieval.SceneRetrieval",
+    "jaxlidar.analog.photon_paths",
+    "jaxlidar.energy.energy_budget",
+    "jaxlidar.passive.plan_reflectance",
+    "jaxlidar.passive.reflectance_factor",
+    "jaxlidar.plot.returns.points",
+    "jaxlidar.scenes.mesh_surface.MeshSurface",
+    "jaxlidar.scenes.scene_parts.SceneParts",
+    "jaxlidar.scenes.terrain.Terrain",
+    "jaxlidar.simulate.LateLightWarning",
+    "jaxlidar.simulate.UnfollowedLightWarning",
+    "jaxlidar.spectral.waveform.Waveform.true_returns",
+    "jaxlidar.survey.returns.DiscreteReturns",
+    "jaxlidar.survey.coverage.OffMapWarning",
+    "jaxlidar.survey.truths.Truths",
+    "jaxlidar.survey.waveforms.Waveforms.returns",
+    "jaxlidar.survey.waveforms.Waveforms.true_returns",
+    "jaxlidar.truth.truth_of",
+}
