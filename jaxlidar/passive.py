@@ -45,6 +45,7 @@ from jaxlidar._checks import (
     concrete_number,
     is_traced,
 )
+from jaxlidar._products import matmul
 from jaxlidar._programs import Program
 from jaxlidar._threads import ONE_CORE, side_by_side
 from jaxlidar._vectors import Vec, vec
@@ -429,7 +430,7 @@ def _trace_batch(
         if scene.straight_transmittance is not None:
             # Traces are wavelengths, as extinction depends on them.
             return jnp.sum(by_trace.T * monomials, axis=0)
-        return by_trace[0] @ monomials
+        return matmul(by_trace[0], monomials)
 
     returned = of_wavelengths(jnp.sum(higher.weights, axis=-1) + higher.outside, scene.histories)
     if is_hot_spot:

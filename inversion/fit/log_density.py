@@ -48,6 +48,7 @@ from inversion.fit.solver import DEFAULT_SOLVER
 from inversion.fit.unknowns import Unknown, flat_bounds, flat_labels, flat_start
 from inversion.receiver.recorder import Recorder
 from jaxlidar import Lidar, Plan, Response, Scene, Waveform, total_reflectance
+from jaxlidar._products import matmul, tensordot
 from jaxlidar.extend import as_numpy, check_key, check_range
 
 Shapes = tuple[tuple[int, ...], ...]
@@ -104,7 +105,7 @@ def _(primals: Any, tangents: Any) -> tuple[Array, Array]:
     reflectance, columns, _ = evaluate_scene(simulation.inputs, values, simulation.keys, simulation.n_batches)
     if flat_tangent is None:
         return reflectance, jnp.zeros_like(reflectance)
-    return reflectance, jnp.tensordot(flat_tangent, columns[simulation.order], 1)
+    return reflectance, tensordot(flat_tangent, columns[simulation.order], 1)
 
 
 class _RecordNoise(eqx.Module):
@@ -133,7 +134,7 @@ class _RecordNoise(eqx.Module):
             covariance = jnp.eye(sigma.size) if self.correlation is None else self.correlation
             if self.shared_errors is not None:
                 shared = scale * self.shared_errors / sigma[:, None]
-                covariance = covariance + shared @ shared.T
+                covariance = covariance + matmul(shared, shared.T)
             cholesky = jnp.linalg.cholesky(covariance)
             residual = jax.scipy.linalg.solve_triangular(cholesky, residual, lower=True)
             log_determinant += jnp.sum(jnp.log(jnp.diag(cholesky)))
@@ -271,7 +272,7 @@ class LogDensity(eqx.Module):
         tiny = jnp.finfo(scene_values.dtype).tiny
         logarithm = jnp.log(jnp.where(is_log, jnp.maximum(scene_values, tiny), 1.0))
         transformed = jnp.where(is_log, logarithm, scene_values)
-        residual = self._prior_whitening @ (transformed - self._prior_centre)
+        residual = matmul(self._prior_whitening, transformed - self._prior_centre)
         return -0.5 * jnp.sum(residual**2) - jnp.sum(logarithm)
 
 

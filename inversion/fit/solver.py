@@ -82,6 +82,7 @@ from inversion.fit.unknowns import (
     flat_start,
     split_by_name,
 )
+from jaxlidar._products import matmul
 
 # A fit has converged if a Gauss-Newton step would move it by less than this many standard errors.
 _SMALL_STEP = 0.05
@@ -161,7 +162,7 @@ def _linear_model(y: Array, args: tuple[Array, Array, Array]) -> tuple[Array, No
     data, and the solver compiles once for all fits of equal shapes.
     """
     y0, residual, jacobian = args
-    return residual + jacobian @ (y - y0), None
+    return residual + matmul(jacobian, y - y0), None
 
 
 @eqx.filter_jit

@@ -40,6 +40,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from inversion.leaf.solver import map_in_chunks, residual_rounding
+from jaxlidar._products import einsum
 from jaxlidar.extend import once
 from jaxlidar.optics.leaf_surface import LeafSurface
 from jaxlidar.optics.plate_model import plate_model_slopes
@@ -165,7 +166,6 @@ def _trait_errors(
     correlation = jnp.exp(-distance[None] / jnp.asarray(_LENGTHS, dtype)[:, None, None])
     # Correlation of each mean with the one before.
     decay = jnp.exp(-jnp.diff(centre, prepend=centre[:1])[:, None] / lengths[None]).astype(dtype)
-    einsum = partial(jnp.einsum, precision=lax.Precision.HIGHEST)
 
     def sum_in_means(x: Array) -> Array:
         """Sum the last axis over the bands of each mean."""

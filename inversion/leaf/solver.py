@@ -38,6 +38,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
+from jaxlidar._products import matmul
 from jaxlidar.extend import once
 from jaxlidar.optics.leaf_surface import LeafSurface
 from jaxlidar.optics.plate_model import plate_model_slopes
@@ -166,7 +167,7 @@ def _fit_leaf(
 
     def evaluate(x: Array) -> NormalEquations:
         """Run PROSPECT at x and accumulate its normal equations (columns: see the module's docstring)."""
-        k = jnp.dot(x[1:], absorption, precision=lax.Precision.HIGHEST) / x[0]
+        k = matmul(x[1:], absorption) / x[0]
         values, dR_dk, dR_dN = (jnp.stack(v[:2]) for v in plate_model_slopes(k, x[0], surface))
         # Optimisation barrier: without it the compiler would compute the model again for every sum below.
         values, dR_dk, dR_dN = once((values, dR_dk, dR_dN))
@@ -177,7 +178,7 @@ def _fit_leaf(
         # s residual, one product with the table gives all elements that involve contents.
         rows = jnp.stack([jnp.sum(s * N_column, axis=0), jnp.sum(s * residual, axis=0)])
         rows = jnp.concatenate([absorption * jnp.sum(s * s, axis=0)[None], rows])
-        rows = jnp.dot(rows, absorption.T, precision=lax.Precision.HIGHEST)
+        rows = matmul(rows, absorption.T)
         mixed, corner = rows[-2], jnp.sum(N_column * N_column)
         normal = jnp.block([[corner[None, None], mixed[None]], [mixed[:, None], rows[:-2]]])
         gradient = jnp.concatenate([jnp.sum(N_column * residual)[None], rows[-1]])
@@ -198,7 +199,7 @@ def _fit_leaf(
     def has_converged(point: NormalEquations) -> Array:
         """True if an undamped step promises no measurable or relevant fall of chi-squared."""
         undamped = step(point, _LEAST_DAMPING)
-        fall = -jnp.dot(point.gradient, undamped, precision=lax.Precision.HIGHEST)
+        fall = -matmul(point.gradient, undamped)
         small = _SMALL_STEP**2 * jnp.maximum(point.chi2 / degrees_of_freedom, rounding_floor)
         small = jnp.maximum(small, _CHI2_UNITS * jnp.finfo(fall.dtype).eps * point.chi2)
         return (fall <= small) & jnp.isfinite(point.chi2)

@@ -62,6 +62,7 @@ from inversion.metrics.records import (
     sample_pulse,
     size_bucket,
 )
+from jaxlidar._products import matmul
 from jaxlidar.extend import as_array, check_integer, check_range, concrete, decompose_records
 
 _SOLVER = optx.LevenbergMarquardt(rtol=1e-3, atol=1e-3)
@@ -543,6 +544,6 @@ def _standard_errors(
     norm = jnp.sqrt(jnp.sum(columns**2, axis=0))
     norm = jnp.where(norm > 0, norm, 1.0)
     columns = columns / norm[None, :]
-    variance = jnp.diagonal(jnp.linalg.pinv(columns.T @ columns + jnp.diag(idle.reshape(-1))))
+    variance = jnp.diagonal(jnp.linalg.pinv(matmul(columns.T, columns) + jnp.diag(idle.reshape(-1))))
     errors = (jnp.sqrt(jnp.maximum(variance, 0.0)) / norm).reshape(-1, 3)
     return jnp.where(idle > 0, 0.0, errors) * unit

@@ -42,6 +42,7 @@ from jaxlidar._checks import (
 )
 from jaxlidar._constants import PLANCK_TIMES_LIGHT
 from jaxlidar._converted import Converted
+from jaxlidar._products import einsum
 from jaxlidar._ranges import Range, check_ranges
 from jaxlidar._signatures import briefly
 from jaxlidar.instrument.photon_counter import (
@@ -372,4 +373,4 @@ def first_return_window(
     fine_edges = (np.arange(centres.size) - first)[None, :]
     overlap = jnp.clip(jnp.minimum(edges[1:], fine_edges + 1) - jnp.maximum(edges[:-1], fine_edges), 0.0)
     times = centres[0] + step * (first + ratio * np.arange(samples) + 0.5 * ratio - 0.5)
-    return times, jnp.einsum("...b,sb->...s", energy, overlap)
+    return times, einsum("...b,sb->...s", energy, overlap)

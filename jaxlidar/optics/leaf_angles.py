@@ -31,6 +31,7 @@ from jaxtyping import Array, Float
 
 from jaxlidar._checks import array, as_scalar, briefly, check_choice, check_range, concrete
 from jaxlidar._converted import Converted
+from jaxlidar._products import matmul
 from jaxlidar._ranges import Range, check_ranges
 
 # Cells of inclination, one degree wide; nodes of |cos zenith| of the tables of G.
@@ -159,4 +160,4 @@ class LeafAngles(eqx.Module):
         mean_cosine = np.where(c >= s, c, oblique)
         mean_square = c**2 + s**2 / 2
         p = self.normalised()
-        return jnp.asarray(mean_cosine, p.dtype) @ p, jnp.asarray(mean_square, p.dtype) @ p
+        return matmul(jnp.asarray(mean_cosine, p.dtype), p), matmul(jnp.asarray(mean_square, p.dtype), p)

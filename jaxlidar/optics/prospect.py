@@ -54,6 +54,7 @@ from jaxlidar._checks import (
     warn_units,
 )
 from jaxlidar._one_function import once
+from jaxlidar._products import tensordot
 from jaxlidar._ranges import Range, check_ranges
 from jaxlidar.optics.coefficients import TRAITS, Coefficients, shipped
 from jaxlidar.optics.leaf_surface import LeafSurface, leaf_surface
@@ -231,7 +232,7 @@ class Prospect(eqx.Module):
 @jax.jit
 def _optical_depth(contents: list[Array], absorption: Array, N: Array) -> Array:
     # The highest precision: some accelerators multiply matrices of single precision with fewer digits.
-    return jnp.tensordot(jnp.stack(contents), absorption, 1, precision=jax.lax.Precision.HIGHEST) / N
+    return tensordot(jnp.stack(contents), absorption, 1) / N
 
 
 def _trait(name: str, value: ArrayLike) -> Float[Array, ""]:

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
+from jaxlidar._products import matmul
 from jaxlidar._programs import Program
 from jaxlidar.sampling.errors import relative_error, student_widening
 from jaxlidar.sampling.moments import RunningMoments, scaled_deviation
@@ -130,7 +131,7 @@ def _add_squares(
     # One by one: a whole block at all wavelengths does not fit into a processor's cache.
     total = jnp.zeros(()) if squares is None else squares
     for deviation in deviations:
-        total = total + (interpolation.T @ deviation) ** 2
+        total = total + matmul(interpolation.T, deviation) ** 2
     return total
 
 
@@ -146,7 +147,7 @@ def _errors(
     `variance_scale`: squared standard error of the mean over squared deviations.
     """
     squares = _add_squares(deviations, interpolation, squares)
-    mean, stderr = interpolation.T @ mean, jnp.sqrt(variance_scale * squares)
+    mean, stderr = matmul(interpolation.T, mean), jnp.sqrt(variance_scale * squares)
     errors = WaveformErrors(jnp.sum(mean, axis=1), stderr, relative_error(mean, stderr), jnp.max(stderr))
     return errors, squares
 

@@ -33,6 +33,7 @@ from jaxlidar._checks import (
     kind_of,
 )
 from jaxlidar._converted import Converted
+from jaxlidar._products import einsum, matmul
 from jaxlidar._ranges import SUM_OF_FRACTIONS, Range, check_ranges
 from jaxlidar._signatures import briefly
 from jaxlidar._vectors import FAR, Scalar, Vec, along, dot, vec
@@ -279,7 +280,7 @@ class MeshSurface(eqx.Module):
         arrays = [concrete(a) for a in (self.instances.shift, self.instances.rotation, self.instances.scale)]
         by = np.append(as_numpy(by, "by"), 0.0)
         if any(a is None for a in arrays):
-            offset = self.instances.matrices() @ jnp.asarray(self.origin, float)
+            offset = matmul(self.instances.matrices(), jnp.asarray(self.origin, float))
             shift = jnp.asarray(self.instances.shift, float) + offset + jnp.asarray(by, float)[None]
         else:
             shift = arrays[0] + _matrices(arrays[1], arrays[2], np) @ self.origin + by
@@ -465,7 +466,7 @@ def build_mesh_tree(meshes: Sequence[MeshSurface], period: Float[Array, "2"] | N
         longest = jnp.max(jnp.abs(corners - jnp.roll(corners, 1, axis=1)))
         longest_sides.append(longest * jnp.max(mesh.instances.scale))
         matrices = mesh.instances.matrices()
-        offset = matrices @ jnp.asarray(mesh.origin, matrices.dtype)
+        offset = matmul(matrices, jnp.asarray(mesh.origin, matrices.dtype))
         transforms.append(matrices)
         shifts.append(jnp.asarray(mesh.instances.shift, matrices.dtype) + offset)
         boxes.append(jnp.broadcast_to(box, (len(matrices), 2, 3)))
@@ -475,8 +476,8 @@ def build_mesh_tree(meshes: Sequence[MeshSurface], period: Float[Array, "2"] | N
         materials.append(jnp.concatenate([jnp.zeros(len(rows) - len(group), jnp.int32), group]))
         first_row, first_material = first_row + len(rows), first_material + len(mesh.surfaces)
     matrix, shift, box = (jnp.concatenate(a) for a in (transforms, shifts, boxes))
-    middle = jnp.einsum("nij,nj->ni", matrix, 0.5 * (box[:, 0] + box[:, 1])) + shift
-    half = jnp.einsum("nij,nj->ni", jnp.abs(matrix), 0.5 * (box[:, 1] - box[:, 0]))
+    middle = einsum("nij,nj->ni", matrix, 0.5 * (box[:, 0] + box[:, 1])) + shift
+    half = einsum("nij,nj->ni", jnp.abs(matrix), 0.5 * (box[:, 1] - box[:, 0]))
     is_real = jnp.ones(len(shift), bool)
     if period is not None:
         move, is_real = _copies_in_cell(middle, half, period)

@@ -20,10 +20,10 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Float
 
 from jaxlidar._constants import SPEED_OF_LIGHT
+from jaxlidar._products import einsum
 from jaxlidar._programs import Program
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.planning.channels import channel_optics
@@ -297,9 +297,9 @@ def apply_optics(
     """
     weights = weights[..., : table.count, :]
     if len(weights) == 1:
-        return jnp.einsum("hw,...hc->...wc", table.monomials(optics), weights[0])
+        return einsum("hw,...hc->...wc", table.monomials(optics), weights[0])
     # Each trace has one wavelength.
-    return jnp.einsum("hw,w...hc->...wc", table.monomials(optics), weights)
+    return einsum("hw,w...hc->...wc", table.monomials(optics), weights)
 
 
 def response_samples(
@@ -438,7 +438,7 @@ def sum_response(response: Response, model: WaveformModel) -> ResponseSums:
 
     def rows_of_returns(weights: Array, outside: Array) -> list[Array]:
         # One product reads the response, which is large, once for both sums.
-        by_material = jnp.einsum("tmhb,bk->tmhk", weights, factors, precision=lax.Precision.HIGHEST)
+        by_material = einsum("tmhb,bk->tmhk", weights, factors)
         returned, relative_energy = jnp.moveaxis(jnp.sum(by_material, axis=1), -1, 0)
         return [returned, jnp.sum(outside, axis=1), relative_energy]
 

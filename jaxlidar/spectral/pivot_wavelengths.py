@@ -18,6 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jaxlidar._products import einsum
+
 # Random polynomials that sample the matrix.
 _N_POLYNOMIALS = 64
 # Norm of the residual of any column, of the norm 1, at which the decomposition stops.
@@ -41,7 +43,7 @@ class PivotWavelengths(eqx.Module):
         self, spectra: Float[Array, "*rest pivots columns"]
     ) -> Float[Array, "*rest wavelengths columns"]:
         """Return spectra at all wavelengths from those at the pivots."""
-        return jnp.einsum("...fc,fw->...wc", spectra, self.coefficients)
+        return einsum("...fc,fw->...wc", spectra, self.coefficients)
 
 
 def find_pivots(optics: Float[Array, "channels wavelengths"], degree: int) -> PivotWavelengths | None:

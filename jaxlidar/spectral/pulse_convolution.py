@@ -23,6 +23,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jaxlidar._one_function import once
+from jaxlidar._products import FULL_PRECISION, einsum
 from jaxlidar._programs import Program
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.instrument.pulse import AbstractPulse
@@ -60,7 +61,7 @@ class PulseConvolution(eqx.Module):
     def __call__(self, fine: Float[Array, "*s bins"]) -> Float[Array, "*s samples"]:
         """Return the samples of returns in fine bins."""
         if self.is_dense:
-            return jnp.einsum("...b,bs->...s", fine, self.matrix())
+            return einsum("...b,bs->...s", fine, self.matrix())
         return self._convolve(fine)
 
     def _convolve(self, fine: Float[Array, "*s bins"]) -> Float[Array, "*s samples"]:
@@ -74,7 +75,7 @@ class PulseConvolution(eqx.Module):
         rows = fine.reshape(-1, 1, fine.shape[-1])
         rows = jnp.pad(rows, ((0, 0), (0, 0), (before, after)))[..., start : start + length]
         out = lax.conv_general_dilated(
-            rows, self.fractions[::-1][None, None, :], (stride,), "VALID", precision=lax.Precision.HIGHEST
+            rows, self.fractions[::-1][None, None, :], (stride,), "VALID", precision=FULL_PRECISION
         )
         return out.reshape(*fine.shape[:-1], self.n_samples)
 

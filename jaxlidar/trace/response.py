@@ -24,6 +24,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from jaxlidar._checks import briefly, check_flag, check_key, check_kind
 from jaxlidar._deprecated import renamed_property
 from jaxlidar._mesh_axes import vary_together, vary_with, with_automatic_axes
+from jaxlidar._products import einsum
 from jaxlidar.planning.setup import Setup
 from jaxlidar.trace.device_scene import DeviceScene, build_device_scene
 from jaxlidar.trace.first_order import FirstOrder, first_order
@@ -138,7 +139,7 @@ def trace_with_scores(
     first, weights = _first(scene, key)
     assert first.weight_slopes is not None
     # Derivatives of all materials together: Jacobians are of the recorded sum.
-    derivatives = jnp.einsum("hw,mhbc->bcw", scene.first_histories.monomials(optics), first.weight_slopes)
+    derivatives = einsum("hw,mhbc->bcw", scene.first_histories.monomials(optics), first.weight_slopes)
     if not scene.config.follows_higher_orders:
         return first_order_response(scene, first, weights), jnp.moveaxis(derivatives, 0, 2)
     higher = trace_higher_orders(scene, key)
@@ -175,7 +176,7 @@ def trace_first(scene: DeviceScene, key: PRNGKeyArray) -> FirstOrderResponse:
             return FirstOrderResponse(weights[None], first.outside[None])
         # With optics applied there is one trace per wavelength, with one history.
         monomials = scene.first_histories.monomials(scene.optics)
-        by_wavelength = (jnp.einsum("hw,mh...->wm...", monomials, a) for a in (weights, first.outside))
+        by_wavelength = (einsum("hw,mh...->wm...", monomials, a) for a in (weights, first.outside))
         return FirstOrderResponse(*(jnp.expand_dims(a, 2) for a in by_wavelength))
 
     return _for_each_trace(trace, scene)

@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
+from jaxlidar._products import einsum
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.trace.device_scene import DeviceScene, aim_at
 from jaxlidar.trace.entry_nodes import EntryNodes
@@ -85,7 +86,7 @@ def _apply_optics(
     optics: Float[Array, "channels wavelengths"],
 ) -> Float[Array, "nodes wavelengths *rows 1 bins"]:
     """Sum weights over histories with optics; wavelengths become the second axis."""
-    by_wavelength = jnp.einsum("hw,...hc->...wc", histories.monomials(optics), weights)
+    by_wavelength = einsum("hw,...hc->...wc", histories.monomials(optics), weights)
     return jnp.expand_dims(jnp.moveaxis(by_wavelength, -2, 1), -2)
 
 
@@ -138,7 +139,7 @@ def trace_shots(scene: DeviceScene, lidar: Lidar, nodes: EntryNodes, key: PRNGKe
     # which is tolerable for what no receiver records.
     def from_nodes(a: Array) -> Array:
         by_node = a.reshape(*a.shape[:-1], -1, n_wavelengths)
-        return jnp.einsum("sn,...nw->sw...", views.node_coefficients, by_node)[..., None]
+        return einsum("sn,...nw->sw...", views.node_coefficients, by_node)[..., None]
 
     first = jax.tree.map(to_all_shots, trace_first_of_shots(scene, lidar, views.first_order_shots, ray_key))
     response = Response(
