@@ -19,6 +19,8 @@ For laws, pulses and surfaces of your own, and for packages on top such as `inve
 - `fingerprint` is a hash of everything that a result depends on, to compare with that of a stored result.
 - `once` is an optimisation barrier: the compiler computes its arguments once, instead of again in each
   expression that uses them.
+- `einsum`, `matmul` and `tensordot` are those of `jax.numpy`, in full precision on every device: by default,
+  GPUs round their factors.
 - `side_by_side` runs compiled programs on as many threads as there are cores; compile them with `ONE_CORE`.
 - `outcomes` runs the tasks that `task` makes, in this process or by the workers of an executor.
 - `decompose_records.register` makes a function the decomposition of `Waveforms.returns`; `inversion` does.
@@ -41,6 +43,7 @@ from jaxlidar._checks import (
 from jaxlidar._converted import Converted
 from jaxlidar._fingerprint import fingerprint
 from jaxlidar._one_function import once
+from jaxlidar._products import einsum, matmul, tensordot
 from jaxlidar._ranges import Range, check_ranges, inadmissible, reasons
 from jaxlidar._registry import decompose_records
 from jaxlidar._signatures import briefly, shorten_signatures
@@ -88,10 +91,12 @@ __all__ = [
     "cross",
     "decompose_records",
     "dot",
+    "einsum",
     "even_step",
     "fingerprint",
     "from_frame",
     "inadmissible",
+    "matmul",
     "normalise",
     "once",
     "outcomes",
@@ -101,6 +106,7 @@ __all__ = [
     "shorten_signatures",
     "side_by_side",
     "task",
+    "tensordot",
     "vec",
 ]
 

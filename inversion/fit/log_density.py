@@ -48,8 +48,7 @@ from inversion.fit.solver import DEFAULT_SOLVER
 from inversion.fit.unknowns import Unknown, flat_bounds, flat_labels, flat_start
 from inversion.receiver.recorder import Recorder
 from jaxlidar import Lidar, Plan, Response, Scene, Waveform, total_reflectance
-from jaxlidar._products import matmul, tensordot
-from jaxlidar.extend import as_numpy, check_key, check_range
+from jaxlidar.extend import as_numpy, check_key, check_range, matmul, tensordot
 
 Shapes = tuple[tuple[int, ...], ...]
 

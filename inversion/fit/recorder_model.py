@@ -28,7 +28,6 @@ from scipy import linalg, optimize
 from inversion.fit.unknowns import MARGIN, BoundUnknown, Setter, with_start
 from inversion.receiver.recorder import OFFSET_NAME, WIDTH_NAME, ReceiverResponse, Recorder
 from jaxlidar import Lidar
-from jaxlidar._products import matmul
 from jaxlidar.extend import concrete
 
 # Returns of the scene below this fraction of the strongest one are rounding.
@@ -105,7 +104,8 @@ class RecorderModel:
         **Arguments:** as of `__call__`. **Returns:** (wavelengths, bins).
         """
         width, offsets, scale = self._split(values)
-        baseline = matmul(self.offset_columns, offsets).reshape(1, -1)
+        # No matrix product, which GPUs would round.
+        baseline = (self.offset_columns * offsets[None]).sum(axis=1).reshape(1, -1)
         return scale * self.receiver(reflectance, width) + baseline
 
     def scale_of(self, values: Any) -> Any:

@@ -82,7 +82,7 @@ from inversion.fit.unknowns import (
     flat_start,
     split_by_name,
 )
-from jaxlidar._products import matmul
+from jaxlidar.extend import matmul
 
 # A fit has converged if a Gauss-Newton step would move it by less than this many standard errors.
 _SMALL_STEP = 0.05

@@ -40,8 +40,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from inversion.leaf.solver import map_in_chunks, residual_rounding
-from jaxlidar._products import einsum
-from jaxlidar.extend import once
+from jaxlidar.extend import einsum, once
 from jaxlidar.optics.leaf_surface import LeafSurface
 from jaxlidar.optics.plate_model import plate_model_slopes
 

@@ -38,8 +38,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from jaxlidar._products import matmul
-from jaxlidar.extend import once
+from jaxlidar.extend import matmul, once
 from jaxlidar.optics.leaf_surface import LeafSurface
 from jaxlidar.optics.plate_model import plate_model_slopes
 

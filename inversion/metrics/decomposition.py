@@ -62,8 +62,7 @@ from inversion.metrics.records import (
     sample_pulse,
     size_bucket,
 )
-from jaxlidar._products import matmul
-from jaxlidar.extend import as_array, check_integer, check_range, concrete, decompose_records
+from jaxlidar.extend import as_array, check_integer, check_range, concrete, decompose_records, matmul
 
 _SOLVER = optx.LevenbergMarquardt(rtol=1e-3, atol=1e-3)
 _MAX_STEPS = 40
