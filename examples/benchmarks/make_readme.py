@@ -9,7 +9,6 @@ import statistics
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from _gpu import PAGE
 from _writing import number, page_of, table
 
 from jaxlidar.io import atomic_write
@@ -33,7 +32,9 @@ Times are seconds of wall time, warm: programs are compiled before. A tilde mark
 
 
 def machine(record: dict) -> str:
-    """Return a sentence on the machine of a record."""
+    """Return a sentence on the machine of a record, or on the machines of a record of several."""
+    if "machine" not in record:
+        return " ".join(machine(part) for part in record.values())
     m = record["machine"]
     return f"Measured on {m['cores']} cores ({m['processor']}), Python {m['python']}, jax {m['jax']}."
 
@@ -423,6 +424,56 @@ def meshes(record: dict) -> str:
     )
 
 
+def devices(record: dict) -> str:
+    def rows(kind: str, key: str) -> list[list[str]]:
+        """Return a row for each number of traces, with a column for each device and order."""
+        parts = [part["side by side"][kind] for part in record.values()]
+        columns = [{r["traces"]: r for r in records} for part in parts for records in part.values()]
+        counts = sorted({count for column in columns for count in column})
+        return [
+            [f"{count:,}", *(number(column[count][key]) if count in column else "" for column in columns)]
+            for count in counts
+        ]
+
+    def head(kind: str) -> list[str]:
+        names = [f"{name}, {n}" for name, part in record.items() for n in part["side by side"][kind]]
+        return ["traces", *names]
+
+    def single(name: str, value: Callable[[dict], float]) -> list[str]:
+        return [name, *(number(value(part)) for part in record.values())]
+
+    calls = [
+        *(
+            single(f"`simulate` to 3 %, {n}, s", lambda part, n=n: part["simulate"][n]["warm"])
+            for n in ("orders: 1", "orders: 5")
+        ),
+        single("its first call, orders: 5, s", lambda part: part["simulate"]["orders: 5"]["first"]),
+        single(
+            "`simulate_many`, first order, to 2 %, ms a shot",
+            lambda part: 1e3 * part["survey"]["warm"] / part["survey"]["shots"],
+        ),
+        single(
+            "PROSPECT, 2,101 wavelengths, us a leaf",
+            lambda part: 1e6 * part["leaves"][-1]["warm"] / part["leaves"][-1]["leaves"],
+        ),
+    ]
+    return page_of(
+        "The tracer is plain JAX and runs on GPUs as it is; products of arrays are computed in full single "
+        "precision there as well. What a GPU gains depends on how much light is traced at once. The table "
+        "has photons per second of traces side by side: independent keys of one crown of 64³ voxels under "
+        "`jax.vmap`, with 256 photons and 256 rays each. (The times of the H200 are from before products asked "
+        "for full precision; they are a small part of a trace.)",
+        table(head("values"), rows("values", "photons per second")),
+        "The same for gradients in every voxel, by reverse mode:",
+        table(head("gradient"), rows("gradient", "photons per second")),
+        "A single simulation or shot is too small for a GPU: photons march in chunks that fit a processor's "
+        "cache, one chunk after the other, and each step is several kernels whose launches take longer than "
+        "their work. Batches of keys, scenes or shots under `jax.vmap` are the way to use one; PROSPECT is "
+        "one batch anyway.",
+        table(["one call", *record], calls),
+    )
+
+
 SECTIONS: dict[str, tuple[str, Callable[[dict], str]]] = {
     "accuracy_cost": ("Cost of accuracy", accuracy),
     "simulation_cost": ("Cost of `simulate`", simulation),
@@ -442,6 +493,7 @@ SECTIONS: dict[str, tuple[str, Callable[[dict], str]]] = {
     "profiles": ("Vertical profiles against the closed form", profiles),
     "prospect_speed": ("PROSPECT against prosail", prospect),
     "leaf_inversion": ("Traits of measured leaves", leaves),
+    "devices": ("On a GPU", devices),
 }
 
 
@@ -457,7 +509,6 @@ def page() -> str:
         paragraphs.append(f"## {title}\n\n`{name}.py`. {machine(record)}\n\n{section(record)}\n")
         if path.with_suffix(".png").exists():
             paragraphs.append(f"![{title}](results/{name}.png)\n")
-    paragraphs.append(PAGE)
     return "\n".join(paragraphs)
 
 
