@@ -2,10 +2,13 @@
 
 # Examples that take longer than some six seconds.
 LONG_EXAMPLES = {
+    "inversion.fit.design.Design",
     "inversion.fit.design.design",
+    "inversion.fit.log_density.LogDensity",
     "inversion.leaf.leaves.LeafFit",
     "inversion.leaf.leaves.invert_leaves",
     "inversion.metrics.gedi_table.gedi_table",
+    "inversion.metrics.points.echo_points",
     "inversion.receiver.recorder.Recorder",
     "inversion.scene.geolocation.geolocate",
     "inversion.scene.retrieval.retrieve_scene",

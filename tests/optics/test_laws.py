@@ -255,6 +255,7 @@ def total_return(wave):
     return wave.reflectance.sum(axis=1)
 
 
+@pytest.mark.slow
 def test_scattering_between_surfaces_follows_the_law():
     """Three scatterings: a plate that transmits all light diffusely, Minnaert's ground, and the plate again.
 

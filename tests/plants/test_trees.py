@@ -257,6 +257,7 @@ def test_a_forest_mixes_habits_by_shares_and_sizes():
     assert 0.5 <= min(heights) <= max(heights) <= 1.0
 
 
+@pytest.mark.slow
 def test_a_hundred_default_trees():
     trees = jl.forest(density=400.0, area=(50.0, 50.0), minimum_distance=3.0, individuals=2)
     assert len(trees) == 100

@@ -29,6 +29,7 @@ def batch_photons(monkeypatch):
     return photons
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("n_photons", "traced"), slow_unless([(100, 104)], [(1, 8), (96, 96), (100, 104)]))
 def test_eight_batches_have_at_least_as_many_photons(n_photons, traced):
     wave = jl.simulate(LIDAR, SCENE, key=KEY, max_orders=2, n_photons=n_photons, n_rays=8)

@@ -202,6 +202,7 @@ def test_facets_of_a_valley_light_each_other():
     assert not agrees(total, e1 + 1e-5, 1.005 * expected[0])
 
 
+@pytest.mark.slow
 def test_no_light_leaks_through_white_terrain():
     scene = jl.Scene(ground=hills(reflectance=1.0, sides="periodic"))
     budget = jl.energy_budget(jl.Lidar(divergence=5.0, zenith=30.0), scene, key=KEY, rtol=0.01)

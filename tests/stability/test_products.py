@@ -49,9 +49,17 @@ SCENES = {
 }
 
 
-@pytest.mark.parametrize("histories", [True, False], ids=["histories", "optics applied"])
-@pytest.mark.parametrize("derivatives", [False, True], ids=["values", "derivatives"])
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize(
+    ("name", "derivatives", "histories"),
+    [
+        ("canopy", False, False),
+        ("canopy", True, True),
+        ("plate", False, True),
+        pytest.param("plate", False, False, marks=pytest.mark.slow),
+        pytest.param("plate", True, True, marks=pytest.mark.slow),
+        pytest.param("plate", True, False, marks=pytest.mark.slow),
+    ],
+)
 def test_simulations(name, derivatives, histories):
     lidar = jl.Lidar(wavelength=(532.0, 1064.0), pulse=jl.GaussianPulse(fwhm=4.0))
     scene = SCENES[name]

@@ -123,6 +123,7 @@ def test_truth_is_none_unless_asked_for(tmp_path):
         jl.simulate_many(jl.Survey.of(jl.Lidar()), scene, key=KEY, truth=1)  # pyright: ignore
 
 
+@pytest.mark.slow
 def test_a_case_file_may_ask_for_truth(tmp_path):
     scene = jl.Scene(plates=[jl.Plate(3.0, 0.4, coverage=0.5)])
     survey = jl.Survey(jl.Lidar(), [(0, 0), (1, 0)])

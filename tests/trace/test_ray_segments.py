@@ -46,6 +46,7 @@ def scenes() -> dict[str, jl.Scene]:
 LIDAR = jl.Lidar(altitude=500.0, divergence=6.0, zenith=12.0, pulse=jl.GaussianPulse(fwhm=4.0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", slow_unless(["bark"], scenes()))
 def test_skipped_segments_add_nothing(kind: str):
     scene = scenes()[kind]

@@ -163,6 +163,7 @@ def test_a_wrong_score_is_rejected(left_out, monkeypatch):
     assert relative_difference(CASES["layers"]) > 1e-2
 
 
+@pytest.mark.slow
 def test_a_voxel_that_too_many_columns_move_is_not_a_number():
     """A wrong promise spoils the derivatives, rather than being believed."""
     (_, _), (_, scored) = tangents_and_scores(

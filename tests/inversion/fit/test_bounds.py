@@ -62,6 +62,7 @@ def test_a_fit_that_came_to_a_bound_leaves_it(truth, start):
     assert fit.quality.quality == "good"
 
 
+@pytest.mark.slow
 def test_many_fits_leave_their_bounds():
     truths, starts = zip(*FAR_STARTS)
     waves = [wave_of(*truth) for truth in truths]

@@ -83,6 +83,7 @@ def test_errors_are_as_stated(noisy_leaves, noise):
     np.testing.assert_allclose(jnp.mean(fit.rmse), NOISE, rtol=0.02)
 
 
+@pytest.mark.slow
 def test_errors_of_unequal_noise(noisy_leaves):
     truth, (R, T) = noisy_leaves
     added_noise = np.random.default_rng(2).normal(size=T.shape)
