@@ -461,8 +461,8 @@ def devices(record: dict) -> str:
         "The tracer is plain JAX and runs on GPUs as it is; products of arrays are computed in full single "
         "precision there as well. What a GPU gains depends on how much light is traced at once. The table "
         "has photons per second of traces side by side: independent keys of one crown of 64³ voxels under "
-        "`jax.vmap`, with 256 photons and 256 rays each. (The times of the H200 are from before products asked "
-        "for full precision; they are a small part of a trace.)",
+        "`jax.vmap`, with 256 photons and 256 rays each. (The times of the H200 are from before products "
+        "asked for full precision; they are a small part of a trace.)",
         table(head("values"), rows("values", "photons per second")),
         "The same for gradients in every voxel, by reverse mode:",
         table(head("gradient"), rows("gradient", "photons per second")),
