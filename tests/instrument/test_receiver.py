@@ -43,6 +43,7 @@ def test_the_default_changes_nothing_without_a_key(precision):
     np.testing.assert_array_equal(record(energy, WAVELENGTH, Receiver()), energy)
 
 
+@pytest.mark.slow
 @BY_PRECISION
 def test_shot_noise_is_poisson_at_all_levels(precision):
     """Mean, variance and skewness from 1e3 to 1e7 photons, on both sides of the change of method at 1e4."""

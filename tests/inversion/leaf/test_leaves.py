@@ -65,8 +65,7 @@ def errors_are_as_stated(fit, truth):
     return bool(np.all(np.abs(mean) < 4 / np.sqrt(n)) and np.all(np.abs(variance - 1) < 4 * np.sqrt(2 / n)))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("noise", [NOISE, None])
+@pytest.mark.parametrize("noise", [pytest.param(NOISE, marks=pytest.mark.slow), None])
 def test_errors_are_as_stated(noisy_leaves, noise):
     truth, data = noisy_leaves
     fit = invert_leaves(BANDS, *data, noise=noise)

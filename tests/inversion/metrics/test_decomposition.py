@@ -48,6 +48,7 @@ def decompositions():
     return jax.jit(jax.vmap(lambda y: gaussian_decomposition(TIME, y, noise=0.02, width=3.0)))(waves)
 
 
+@pytest.mark.slow
 def test_the_number_of_echoes_is_found(decompositions):
     """A superfluous echo lowers chi2 by more than 3 ln(121) in few of 100 waveforms."""
     count = np.asarray(decompositions.count)
